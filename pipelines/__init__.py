@@ -1,0 +1,1 @@
+"""Commands: read, call pure code, write.  Files, tracking and screens live here."""

@@ -1,0 +1,25 @@
+"""Exceptions: every one is the user's to mend, and its message says how.
+
+The command line prints the message of a :class:`TerrainError` as one sentence and exits with code 2;
+anything else that is raised is a fault of this package and keeps its traceback.
+"""
+
+
+class TerrainError(Exception):
+    """Base of every error that input, options or files can cause."""
+
+
+class LogError(TerrainError):
+    """A run log cannot be read as it stands: the message names file, row and value."""
+
+
+class ConfigError(TerrainError):
+    """An option, a mapping or a YAML file holds something that is not accepted."""
+
+
+class DataError(TerrainError):
+    """The data are readable but cannot answer the question asked (one class only, too few runs...)."""
+
+
+class ModelError(TerrainError):
+    """A model file is damaged, foreign, or does not fit the data it is given."""

@@ -1,0 +1,1 @@
+"""Run logs: channels and units, readers, writers, and whether two loggers keep one clock."""

@@ -1,0 +1,254 @@
+"""Reader of any CSV files, told by a small YAML mapping where things are.
+
+::
+
+    robot: husky
+    run_id: "{terrain}_{run}"        # may be left out: the fields of the file patterns, joined by _
+    terrain: "{terrain}"             # or a fixed word; left out: the runs are unlabelled
+    streams:
+      imu:
+        file: "{terrain}/imu {run}.csv"
+        time: {column: stamp, unit: ms}
+        channels:
+          gyro_z_radps: {column: yaw rate, unit: deg/s, scale: -1}
+      wheels:
+        file: "{terrain}/wheels {run}.csv"
+        delimiter: ";"
+        time: {column: t, unit: s}
+        channels:
+          speed_left_mps: {column: vl, unit: km/h}
+          speed_right_mps: {column: vr, unit: km/h, offset: -0.2}
+
+A word in braces stands for any text without a slash, and the files of which all such words agree make one
+run; every stream has the same words.  Several streams may name one file.  A cell becomes
+``(scale * cell + offset)`` in the unit given, and then SI; the unit must suit the name of the channel.
+"""
+
+from __future__ import annotations
+
+import glob
+import re
+from collections import Counter
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import yaml
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, ValidationError
+
+from terrain.errors import ConfigError, LogError
+from terrain.logs.borealtc import whole_run_label
+from terrain.logs.csv_table import data_row, read_columns, short_name
+from terrain.logs.samples import checked_stream, refuse_apart
+from terrain.logs.schema import UNIT_SCALES, unit_of
+from terrain.records import RunLog, Stream
+
+_FIELD = re.compile(r"\{(\w+)\}")
+
+Unit = Annotated[str, BeforeValidator(lambda unit: unit if isinstance(unit, str) else repr(unit))]
+Word = Annotated[str, Field(min_length=1)]
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Column(_Strict):
+    """Where a channel is: ``(scale * cell + offset)`` is in ``unit``."""
+
+    column: Word
+    unit: Unit
+    scale: FiniteFloat = 1.0
+    offset: FiniteFloat = 0.0
+
+
+class TimeColumn(_Strict):
+    """Where the time is."""
+
+    column: Word
+    unit: Unit
+
+
+class StreamMapping(_Strict):
+    """Where a stream is."""
+
+    file: Word
+    time: TimeColumn
+    channels: Annotated[dict[str, Column], Field(min_length=1)]
+    delimiter: Annotated[str, Field(min_length=1, max_length=1)] = ","
+
+
+class Mapping(_Strict):
+    """How CSV files become run logs."""
+
+    robot: Word
+    streams: Annotated[dict[Word, StreamMapping], Field(min_length=1)]
+    run_id: Word = ""
+    terrain: str = ""
+
+
+def load_mapping(path: str | Path) -> Mapping:
+    """Return the mapping that a YAML file describes.
+
+    Raises
+    ------
+    ConfigError
+        if the file cannot be read, a key is unknown or missing, a unit is unknown or does not suit its
+        channel, or the file patterns do not agree on the words in braces.
+    """
+    path = Path(path)
+    try:
+        described = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be opened ({error.strerror})") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: is no YAML ({' '.join(str(error).split())})") from error
+    try:
+        mapping = Mapping.model_validate(described)
+    except ValidationError as error:
+        raise ConfigError(f"{path.name}: {_first_fault(error)}") from error
+    _check_units(path.name, mapping)
+    _check_fields(path.name, mapping)
+    return mapping
+
+
+def find_runs(folder: Path, mapping: Mapping) -> list[Callable[..., RunLog]]:
+    """Return one reader per run that the mapping finds under ``folder``; call it with ``repair=``.
+
+    Raises
+    ------
+    LogError
+        if no file fits.
+    """
+    found: dict[str, dict[str, str]] = {}
+    for stream in mapping.streams.values():
+        pattern = _pattern(stream.file)
+        wild = "".join(
+            "*" if part.startswith("{") else glob.escape(part) for part in re.split(r"(\{\w+\})", stream.file)
+        )
+        for path in folder.glob(wild):
+            match = pattern.fullmatch(path.relative_to(folder).as_posix())
+            if match:
+                found[repr(sorted(match.groupdict().items()))] = match.groupdict()
+    if not found:
+        patterns = ", ".join(stream.file for stream in mapping.streams.values())
+        raise LogError(f"{folder}: no file there fits the mapping ({patterns})")
+    return [partial(read_run, folder, mapping, words) for _, words in sorted(found.items())]
+
+
+def read_run(folder: Path, mapping: Mapping, words: dict[str, str], *, repair: bool = False) -> RunLog:
+    """Return the run whose files have ``words`` in the place of the words in braces.
+
+    Parameters
+    ----------
+    folder : folder that the file patterns start from
+    mapping : as :func:`load_mapping` returns it
+    words : text for each word in braces
+    repair : drop and count what a strict read refuses
+
+    Raises
+    ------
+    LogError
+        if a file is missing, empty or broken, or the streams do not overlap in time.
+    """
+    dropped: Counter[str] = Counter()
+    streams: dict[str, Stream] = {}
+    files = []
+    for name, stream in mapping.streams.items():
+        path = folder / stream.file.format(**words)
+        files.append(path.relative_to(folder).as_posix())
+        columns = list(stream.channels.values())
+        table = read_columns(
+            path,
+            [stream.time.column, *(column.column for column in columns)],
+            delimiter=stream.delimiter,
+            repair=repair,
+            dropped=dropped,
+        )
+        scale, offset, factor = np.array([(c.scale, c.offset, UNIT_SCALES[c.unit][1]) for c in columns]).T
+        streams[name] = checked_stream(
+            short_name(path),
+            table[:, 0] * UNIT_SCALES[stream.time.unit][1],
+            (table[:, 1:] * scale + offset) * factor,
+            list(stream.channels),
+            row_of=partial(data_row, path, delimiter=stream.delimiter),
+            repair=repair,
+            dropped=dropped,
+        )
+    run_id = (mapping.run_id or "_".join(f"{{{word}}}" for word in words)).format(**words)
+    refuse_apart(run_id, streams)
+    terrain = mapping.terrain.format(**words)
+    return RunLog(
+        run_id,
+        mapping.robot,
+        streams,
+        (whole_run_label(streams, terrain),) if terrain else (),
+        source=f"{' and '.join(dict.fromkeys(files))}, by a mapping",
+        dropped=dropped,
+    )
+
+
+def _pattern(file: str) -> re.Pattern[str]:
+    seen: set[str] = set()
+    pattern = ""
+    for part in re.split(r"(\{\w+\})", file):
+        word = _FIELD.fullmatch(part)
+        if word is None:
+            pattern += re.escape(part)
+        elif word[1] in seen:
+            pattern += f"(?P={word[1]})"
+        else:
+            pattern += f"(?P<{word[1]}>[^/]+)"
+            seen.add(word[1])
+    return re.compile(pattern)
+
+
+def _check_units(file: str, mapping: Mapping) -> None:
+    for name, stream in mapping.streams.items():
+        _si_word(f"{file}: stream {name}: time", stream.time.unit, "s")
+        for channel, column in stream.channels.items():
+            place = f"{file}: stream {name}: channel {channel}"
+            try:
+                wanted = unit_of(channel)
+            except LogError as error:
+                raise ConfigError(f"{file}: stream {name}: {error}") from error
+            _si_word(place, column.unit, wanted)
+
+
+def _si_word(place: str, unit: str, wanted: str) -> None:
+    suitable = ", ".join(name for name, (word, _) in UNIT_SCALES.items() if word == wanted)
+    if unit not in UNIT_SCALES:
+        raise ConfigError(f"{place}: unit {unit!r} is unknown (accepted here: {suitable})")
+    if UNIT_SCALES[unit][0] != wanted:
+        raise ConfigError(f"{place}: unit {unit!r} does not suit it (accepted here: {suitable})")
+
+
+def _check_fields(file: str, mapping: Mapping) -> None:
+    words = {name: set(_FIELD.findall(stream.file)) for name, stream in mapping.streams.items()}
+    first = next(iter(words))
+    for name, stream in mapping.streams.items():
+        if words[name] != words[first]:
+            raise ConfigError(f"{file}: streams {first} and {name} do not have the same words in braces")
+        if re.search(r"[{}]", _FIELD.sub("", stream.file)):
+            raise ConfigError(f"{file}: stream {name}: file {stream.file!r} has a brace without its partner")
+        if Path(stream.file).is_absolute() or ".." in Path(stream.file).parts:
+            raise ConfigError(f"{file}: stream {name}: file {stream.file!r} must lie under the data folder")
+    if not words[first] and not mapping.run_id:
+        raise ConfigError(f"{file}: key 'run_id' is missing (the file patterns have no words in braces)")
+    for key, rule in (("run_id", mapping.run_id), ("terrain", mapping.terrain)):
+        strange = set(_FIELD.findall(rule)) - words[first]
+        if strange or re.search(r"[{}]", _FIELD.sub("", rule)):
+            known = ", ".join(f"{{{word}}}" for word in sorted(words[first])) or "none"
+            raise ConfigError(f"{file}: {key} {rule!r} uses a word that the files lack (they have {known})")
+
+
+def _first_fault(error: ValidationError) -> str:
+    fault: dict[str, Any] = dict(error.errors()[0])
+    place = ".".join(str(part) for part in fault["loc"]) or "the file"
+    if fault["type"] == "extra_forbidden":
+        return f"key {place!r} is unknown"
+    if fault["type"] == "missing":
+        return f"key {place!r} is missing"
+    return f"{place} is {fault['input']!r}: {fault['msg'][0].lower()}{fault['msg'][1:]}"

@@ -1,0 +1,149 @@
+"""From arrays to a :class:`~terrain.records.Stream`: the one place where a log is judged.
+
+Every reader hands its arrays to :func:`checked_stream`.  A strict read refuses times that are not finite,
+go back or repeat, channels with nothing finite in them and streams of fewer than two samples.  A
+repairing read drops the rows at fault, keeps a dead channel as NaN (all runs of a data set must have the
+same channels), and counts what it did.  NaN among finite values is no fault: it stays NaN, infinite values
+become NaN, and the windows that touch them are dropped and counted later.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+
+from terrain.errors import LogError
+from terrain.records import Array, Stream
+
+BAD_TIME = "rows with a bad time"
+BAD_CELL = "cells that are no number"
+SHORT_ROW = "rows with missing or extra cells"
+DEAD_CHANNEL = "channels with nothing finite"
+
+
+def longest_rise(time_s: Array) -> Array:
+    """Return the indices of the longest strictly increasing subsequence of finite times.
+
+    One forward spike costs one row and not the rest of the run, as dropping whatever is not later than
+    the row before would.
+
+    Parameters
+    ----------
+    time_s : (n,) finite
+
+    Returns
+    -------
+    (m,) indices, increasing
+
+    Examples
+    --------
+    >>> longest_rise(np.array([0.0, 0.1, 99.0, 0.2, 0.2, 0.3])).tolist()
+    [0, 1, 3, 5]
+    """
+    last_times: list[float] = []  # last_times[k]: smallest end of a rise of k + 1 samples
+    last_rows: list[int] = []
+    before = np.full(time_s.size, -1)
+    for row, time in enumerate(time_s.tolist()):
+        length = bisect_left(last_times, time)
+        if length:
+            before[row] = last_rows[length - 1]
+        if length == len(last_times):
+            last_times.append(time)
+            last_rows.append(row)
+        elif time < last_times[length]:
+            last_times[length] = time
+            last_rows[length] = row
+    chain = []
+    row = last_rows[-1] if last_rows else -1
+    while row >= 0:
+        chain.append(row)
+        row = int(before[row])
+    return np.array(chain[::-1], dtype=np.intp)
+
+
+def checked_stream(
+    name: str,
+    time_s: Array,
+    values: Array,
+    channels: Sequence[str],
+    *,
+    row_of: Callable[[int], int],
+    repair: bool = False,
+    dropped: Counter[str] | None = None,
+) -> Stream:
+    """Return the stream that the arrays hold, or say what is wrong with them.
+
+    Parameters
+    ----------
+    name : what the message calls the file
+    time_s : (n,) seconds
+    values : (n, c) SI units
+    channels : c names
+    row_of : row number in the file of a sample, for the message
+    repair : drop and count what would otherwise be refused
+    dropped : counts by kind, added to when repairing
+
+    Raises
+    ------
+    LogError
+        if the times are not finite or not strictly increasing, a channel has nothing finite in it, or
+        fewer than two samples are there (the last also when repairing).
+
+    Examples
+    --------
+    >>> time_s, values = np.array([0.0, 0.2, 0.1]), np.ones((3, 1))
+    >>> checked_stream("a.csv", time_s, values, ["gyro_z_radps"], row_of=lambda i: i + 2)
+    Traceback (most recent call last):
+    terrain.errors.LogError: a.csv: time goes back at row 4 (0.1 s after 0.2 s)
+    """
+    counts: Counter[str] = Counter() if dropped is None else dropped
+    values = np.where(np.isfinite(values), values, np.nan)
+    if repair:
+        kept = np.flatnonzero(np.isfinite(time_s))
+        if np.any(np.diff(time_s[kept]) <= 0.0):
+            kept = kept[longest_rise(time_s[kept])]
+        if kept.size < time_s.size:
+            counts[BAD_TIME] += time_s.size - kept.size
+            time_s, values = time_s[kept], values[kept]
+    else:
+        _refuse_bad_time(name, time_s, row_of)
+    if time_s.size < 2:
+        raise LogError(f"{name}: has {time_s.size} usable rows of data, at least 2 are needed")
+    dead = [
+        channel for channel, column in zip(channels, values.T, strict=True) if not np.isfinite(column).any()
+    ]
+    if dead and not repair:
+        raise LogError(f"{name}: channel {dead[0]} has nothing finite in its {time_s.size} rows")
+    if dead:
+        counts[DEAD_CHANNEL] += len(dead)
+    return Stream(time_s, values, tuple(channels))
+
+
+def _refuse_bad_time(name: str, time_s: Array, row_of: Callable[[int], int]) -> None:
+    broken = np.flatnonzero(~np.isfinite(time_s))
+    if broken.size:
+        row = int(broken[0])
+        raise LogError(f"{name}: time at row {row_of(row)} is not finite ({time_s[row]})")
+    fallen = np.flatnonzero(np.diff(time_s) <= 0.0)
+    if fallen.size:
+        row = int(fallen[0]) + 1
+        now, then = float(time_s[row]), float(time_s[row - 1])
+        if now == then:
+            raise LogError(f"{name}: time repeats at row {row_of(row)} ({now:.15g} s twice)")
+        raise LogError(f"{name}: time goes back at row {row_of(row)} ({now:.15g} s after {then:.15g} s)")
+
+
+def refuse_apart(run_id: str, streams: Mapping[str, Stream]) -> None:
+    """Raise :class:`LogError` when no instant is covered by every stream of a run.
+
+    Examples
+    --------
+    >>> early = Stream([0.0, 1.0], [[1.0], [2.0]], ("gyro_z_radps",))
+    >>> refuse_apart("SNOW_01", {"imu": early, "wheels": early})
+    """
+    if max(s.time_s[0] for s in streams.values()) >= min(s.time_s[-1] for s in streams.values()):
+        spans = ", ".join(f"{n} {s.time_s[0]:.15g} to {s.time_s[-1]:.15g} s" for n, s in streams.items())
+        raise LogError(f"{run_id}: the streams do not overlap in time ({spans})")

@@ -1,0 +1,102 @@
+"""Names, units and signal sets of the channels of a run log.
+
+A channel is named ``<quantity>_<place>_<unit>``: ``gyro_z_radps``, ``speed_left_mps``, ``current_3_a``.
+The unit is the last word; the quantity is the first and decides the signal set by which features are
+switched on and off.
+"""
+
+from __future__ import annotations
+
+from terrain.errors import LogError
+
+SCHEMA_VERSION = 1
+
+UNIT_SYMBOLS: dict[str, str] = {
+    "s": "s",
+    "m": "m",
+    "mps": "m/s",
+    "mps2": "m/s^2",
+    "rad": "rad",
+    "radps": "rad/s",
+    "a": "A",
+    "v": "V",
+    "nm": "Nm",
+    "n": "N",
+    "ratio": "1",
+    "k": "K",
+}
+"""Unit word at the end of a channel name, and how it is printed."""
+
+UNIT_SCALES: dict[str, tuple[str, float]] = {
+    "s": ("s", 1.0),
+    "ms": ("s", 1e-3),
+    "us": ("s", 1e-6),
+    "ns": ("s", 1e-9),
+    "m": ("m", 1.0),
+    "mm": ("m", 1e-3),
+    "m/s": ("mps", 1.0),
+    "km/h": ("mps", 1.0 / 3.6),
+    "m/s^2": ("mps2", 1.0),
+    "g": ("mps2", 9.80665),
+    "rad": ("rad", 1.0),
+    "deg": ("rad", 0.017453292519943295),
+    "rad/s": ("radps", 1.0),
+    "deg/s": ("radps", 0.017453292519943295),
+    "rpm": ("radps", 0.10471975511965977),
+    "A": ("a", 1.0),
+    "mA": ("a", 1e-3),
+    "V": ("v", 1.0),
+    "Nm": ("nm", 1.0),
+    "N": ("n", 1.0),
+    "1": ("ratio", 1.0),
+    "%": ("ratio", 1e-2),
+    "K": ("k", 1.0),
+}
+"""Unit accepted in a mapping file: the SI unit word it becomes, and the factor.
+
+``g`` is standard gravity, 9.80665 m/s^2 (CGPM 1901)."""
+
+SIGNAL_SETS: tuple[str, ...] = ("imu", "wheels", "currents", "slip", "estimator")
+"""Groups of signals that can be switched off by name."""
+
+_SET_OF_QUANTITY: dict[str, str] = {
+    "gyro": "imu",
+    "accel": "imu",
+    "speed": "wheels",
+    "current": "currents",
+    "slip": "slip",
+}
+_SET_OF_STREAM: dict[str, str] = {"estimator": "estimator", "slip": "slip"}
+
+
+def unit_of(channel: str) -> str:
+    """Return the SI unit word of a channel name.
+
+    Raises
+    ------
+    LogError
+        if the name does not end in a known unit.
+
+    Examples
+    --------
+    >>> unit_of("accel_z_mps2")
+    'mps2'
+    """
+    unit = channel.rpartition("_")[2]
+    if unit not in UNIT_SYMBOLS:
+        known = ", ".join(UNIT_SYMBOLS)
+        raise LogError(f"channel {channel!r} does not end in a known unit (one of {known})")
+    return unit
+
+
+def signal_set_of(stream: str, channel: str) -> str | None:
+    """Return the signal set a channel belongs to, None when no feature is made of it.
+
+    Examples
+    --------
+    >>> signal_set_of("wheels", "current_left_a"), signal_set_of("truth", "speed_x_mps")
+    ('currents', None)
+    """
+    if stream in ("truth", "commands"):
+        return None
+    return _SET_OF_STREAM.get(stream) or _SET_OF_QUANTITY.get(channel.partition("_")[0])

@@ -1,0 +1,94 @@
+"""Writer of run folders (``terrain.logs.read`` documents the format)."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+from terrain.atomic import atomic_folder
+from terrain.errors import LogError
+from terrain.logs.schema import SCHEMA_VERSION, unit_of
+from terrain.records import RunLog, Stream
+
+_PLAIN_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9 ._+-]*")
+
+
+def run_folder(run_id: str, folder: str | Path) -> Path:
+    """Return where a run lies within a data-set folder.
+
+    Raises
+    ------
+    LogError
+        if the id cannot be the name of a folder.
+
+    Examples
+    --------
+    >>> run_folder("../SNOW", "logs")
+    Traceback (most recent call last):
+    terrain.errors.LogError: run id '../SNOW' cannot name a folder: use letters, digits and ' ._+-'
+    """
+    if not _PLAIN_NAME.fullmatch(run_id):
+        raise LogError(f"run id {run_id!r} cannot name a folder: use letters, digits and ' ._+-'")
+    return Path(folder) / run_id
+
+
+def write_run(run: RunLog, folder: str | Path, *, replace: bool = False) -> Path:
+    """Write one run as ``<folder>/<run_id>/`` and return that folder.
+
+    The run folder appears whole or not at all, and the same run gives the same bytes.
+
+    Parameters
+    ----------
+    run : run log with at least one stream
+    folder : folder of the data set; made when missing
+    replace : replace a run folder of that name; refused otherwise
+
+    Raises
+    ------
+    LogError
+        if the run is there already, or its id, a stream or a channel has a name that is not accepted.
+    TerrainError
+        if the place cannot be written; nothing is left behind.
+    """
+    target = run_folder(run.run_id, folder)
+    if target.exists() and not (replace and (target / "run.json").is_file()):
+        kind = "a run folder" if (target / "run.json").is_file() else "something else"
+        raise LogError(f"{target}: {kind} is there already, and is left as it is")
+    head = {
+        "schema_version": SCHEMA_VERSION,
+        "run_id": run.run_id,
+        "robot": run.robot,
+        "source": run.source,
+        "labels": [label._asdict() for label in run.labels],
+        "streams": {
+            name: {
+                "file": _file_name(name),
+                "channels": {channel: unit_of(channel) for channel in stream.channels},
+            }
+            for name, stream in run.streams.items()
+        },
+        "dropped": dict(sorted(run.dropped.items())),
+    }
+    with atomic_folder(target) as unfinished:
+        for name, stream in run.streams.items():
+            _write_parquet(stream, unfinished / _file_name(name))
+        (unfinished / "run.json").write_text(
+            json.dumps(head, indent=2, allow_nan=False) + "\n", encoding="utf-8"
+        )
+    return target
+
+
+def _file_name(stream: str) -> str:
+    if not _PLAIN_NAME.fullmatch(stream):
+        raise LogError(f"stream {stream!r} cannot name a file: use letters, digits and ' ._+-'")
+    return f"{stream}.parquet"
+
+
+def _write_parquet(stream: Stream, path: Path) -> None:
+    import pyarrow
+    from pyarrow import parquet
+
+    columns = {"time_s": stream.time_s}
+    columns |= {channel: stream.channel(channel) for channel in stream.channels}
+    parquet.write_table(pyarrow.table(columns), path, compression="zstd")

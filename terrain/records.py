@@ -1,0 +1,233 @@
+"""The frozen records that pass between the stages, and nothing else.
+
+``RunLog -> SlipTrack -> Windows -> features -> terrain class -> SlipTarget``.  Records hold read-only
+arrays in SI units; units stand in the names.  They check their own shapes on construction, so that a
+function given a record may trust it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[Any]
+
+
+def read_only(array: Any, dtype: Any = np.float64) -> Array:
+    """Return ``array`` as a C-contiguous array that nobody can write to (copied only when writable).
+
+    Examples
+    --------
+    >>> read_only([1, 2]).flags.writeable
+    False
+    """
+    fixed = np.ascontiguousarray(array, dtype=dtype)
+    if fixed.flags.writeable:
+        fixed = fixed.copy()
+        fixed.flags.writeable = False
+    return fixed
+
+
+class Label(NamedTuple):
+    """The terrain under the robot between two times; ``[start_s, end_s)`` on the clock of the run."""
+
+    start_s: float
+    end_s: float
+    terrain: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Stream:
+    """What one logger wrote: ``values[i]`` was sampled at ``time_s[i]``.
+
+    Parameters
+    ----------
+    time_s : (n,) seconds, strictly increasing
+    values : (n, c) SI units; NaN where a sample is missing
+    channels : c names, each ending in its unit (``gyro_z_radps``)
+    """
+
+    time_s: Array
+    values: Array
+    channels: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "time_s", read_only(self.time_s))
+        object.__setattr__(self, "values", read_only(self.values))
+        object.__setattr__(self, "channels", tuple(self.channels))
+        if self.values.shape != (self.time_s.size, len(self.channels)):
+            raise ValueError(
+                f"values have shape {self.values.shape}, times and channels ask for "
+                f"{(self.time_s.size, len(self.channels))}"
+            )
+
+    def __len__(self) -> int:
+        return int(self.time_s.size)
+
+    @property
+    def rate_hz(self) -> float:
+        """Median sampling rate in Hz; NaN with fewer than two samples."""
+        return float(1.0 / np.median(np.diff(self.time_s))) if len(self) > 1 else float("nan")
+
+    @property
+    def duration_s(self) -> float:
+        """Time from the first to the last sample in seconds; 0 for an empty stream."""
+        return float(self.time_s[-1] - self.time_s[0]) if len(self) else 0.0
+
+    def channel(self, name: str) -> Array:
+        """Values (n,) of one channel; ``KeyError`` when the stream has no such channel."""
+        try:
+            return self.values[:, self.channels.index(name)]
+        except ValueError:
+            raise KeyError(name) from None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RunLog:
+    """One uninterrupted recording of one robot: several streams at their own rates, and its labels.
+
+    Parameters
+    ----------
+    run_id : unique within a data set
+    robot : name of a robot description (``data/robots/<robot>.yaml``)
+    streams : by name: ``imu``, ``wheels``, ``steering``, ``odometry``, ``commands``, ``slip``,
+        ``estimator``, ``truth``
+    labels : terrain intervals; one for the whole run in the simple case, none when unlabelled
+    source : where the log comes from, in words
+    dropped : what a repairing reader took away, as counts by kind; empty after a strict read
+    """
+
+    run_id: str
+    robot: str
+    streams: Mapping[str, Stream]
+    labels: tuple[Label, ...] = ()
+    source: str = ""
+    dropped: Mapping[str, int] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "streams", MappingProxyType(dict(self.streams)))
+        object.__setattr__(self, "labels", tuple(Label(*label) for label in self.labels))
+        object.__setattr__(self, "dropped", MappingProxyType(dict(self.dropped)))
+
+    @property
+    def start_s(self) -> float:
+        """First instant at which every stream has begun."""
+        return float(max(stream.time_s[0] for stream in self.streams.values()))
+
+    @property
+    def end_s(self) -> float:
+        """Last instant at which every stream still runs."""
+        return float(min(stream.time_s[-1] for stream in self.streams.values()))
+
+    @property
+    def terrains(self) -> tuple[str, ...]:
+        """The distinct terrain labels in order of appearance."""
+        return tuple(dict.fromkeys(label.terrain for label in self.labels))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SlipTrack:
+    """Longitudinal slip of each wheel over time; NaN where it is undefined, never a silent 0.
+
+    Parameters
+    ----------
+    time_s : (n,) seconds
+    slip_ratio : (n, wheels), positive in traction
+    slip_std : (n, wheels), one standard deviation
+    wheels : name of each wheel
+    """
+
+    time_s: Array
+    slip_ratio: Array
+    slip_std: Array
+    wheels: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        for name in ("time_s", "slip_ratio", "slip_std"):
+            object.__setattr__(self, name, read_only(getattr(self, name)))
+        shape = (self.time_s.size, len(self.wheels))
+        if self.slip_ratio.shape != shape or self.slip_std.shape != shape:
+            raise ValueError(f"slip_ratio and slip_std must both have shape {shape}")
+
+    def as_stream(self) -> Stream:
+        """Return the slip ratios as the run-log stream ``slip`` (``slip_<wheel>_ratio``)."""
+        return Stream(self.time_s, self.slip_ratio, tuple(f"slip_{wheel}_ratio" for wheel in self.wheels))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Windows:
+    """Equal cuts from run logs: the samples that scikit-learn sees.
+
+    Supports ``len``, ``shape`` and indexing by an integer or boolean array or a slice, so that
+    ``cross_validate(recipe, windows, windows.terrain, groups=windows.run_id)`` works.
+
+    Parameters
+    ----------
+    values : per stream ``(n_windows, n_channels, n_samples)``
+    channels : per stream the channel names
+    rate_hz : per stream the sampling rate
+    length_s : nominal length of a window
+    start_s : (n_windows,) start on the clock of the run
+    run_id : (n_windows,) run of each window
+    terrain : (n_windows,) label, ``""`` where there is none
+    """
+
+    values: Mapping[str, Array]
+    channels: Mapping[str, tuple[str, ...]]
+    rate_hz: Mapping[str, float]
+    length_s: float
+    start_s: Array
+    run_id: Array
+    terrain: Array
+
+    def __post_init__(self) -> None:
+        for name in ("values", "channels", "rate_hz"):
+            object.__setattr__(self, name, dict(getattr(self, name)))
+        n = len(self.start_s)
+        for name, values in self.values.items():
+            if values.ndim != 3 or values.shape[:2] != (n, len(self.channels[name])):
+                raise ValueError(f"stream {name}: shape {values.shape} does not fit {n} windows")
+        if len(self.run_id) != n or len(self.terrain) != n:
+            raise ValueError("start_s, run_id and terrain must have one entry a window")
+
+    def __len__(self) -> int:
+        return len(self.start_s)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(n_windows, total samples a window), as scikit-learn reads the size of ``X``."""
+        return len(self), sum(v.shape[1] * v.shape[2] for v in self.values.values())
+
+    def __getitem__(self, index: Any) -> Windows:
+        if isinstance(index, int | np.integer):
+            index = [int(index)]
+        return Windows(
+            {name: values[index] for name, values in self.values.items()},
+            self.channels,
+            self.rate_hz,
+            self.length_s,
+            self.start_s[index],
+            self.run_id[index],
+            self.terrain[index],
+        )
+
+
+class SlipTarget(NamedTuple):
+    """Slip ratio to aim for on a terrain in a drive state.
+
+    ``status`` is ``unestimated`` (a number somebody assumed), ``estimated`` (learned from
+    ``n_runs`` runs) or ``invalid``.  ``slip_std`` is NaN where nobody measured it.
+    """
+
+    terrain: str
+    drive_state: str
+    slip_ratio: float
+    slip_std: float
+    n_runs: int
+    status: str
+    source: str
