@@ -50,6 +50,24 @@ def atomic_write(path: str | Path, content: bytes | str) -> None:
         raise _not_written(path, error) from error
 
 
+def ensure_writable(folder: str | Path) -> None:
+    """Make a folder and try to write there, so that long work does not end in a refusal.
+
+    Raises
+    ------
+    TerrainError
+        if the folder cannot be made or written; nothing is left behind.
+    """
+    folder = Path(folder)
+    probe = _name_beside(folder / "probe")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise _not_written(folder, error) from error
+
+
 @contextmanager
 def atomic_folder(path: Path) -> Iterator[Path]:
     """Give an empty folder to fill; when the block ends well it becomes ``path``, else it is removed.

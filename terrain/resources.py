@@ -1,4 +1,4 @@
-"""Where the YAML that travels with the package lies (``data/`` in a checkout, ``terrain/_data`` in a wheel)."""
+"""Where the packaged YAML lies: ``data/`` in a checkout, ``terrain/_data`` in a wheel."""
 
 from __future__ import annotations
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import settings
 
 from terrain.records import Label, RunLog, Stream
 
@@ -83,3 +84,7 @@ def edit():
         path.write_text("\n".join(change(path.read_text().splitlines())) + "\n")
 
     return apply
+
+# Machines that run tests are shared: a slow example is no fault.  Examples are the same in every run.
+settings.register_profile("house", deadline=None, derandomize=True)
+settings.load_profile("house")

@@ -97,6 +97,6 @@ def signal_set_of(stream: str, channel: str) -> str | None:
     >>> signal_set_of("wheels", "current_left_a"), signal_set_of("truth", "speed_x_mps")
     ('currents', None)
     """
-    if stream in ("truth", "commands"):
+    if stream in ("truth", "commands", "odometry"):
         return None
     return _SET_OF_STREAM.get(stream) or _SET_OF_QUANTITY.get(channel.partition("_")[0])

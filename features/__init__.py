@@ -1,0 +1,1 @@
+"""Windows and feature arrays, for whole logs and sample by sample."""

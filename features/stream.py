@@ -1,0 +1,293 @@
+"""The windows of :mod:`features.windows`, cut sample by sample while the robot drives.
+
+:func:`~features.windows.cut_at` cuts here as well, on short buffers, so that a classifier sees live what it
+would have seen in the log.  The window ``k`` starts at ``s = start + k step``; it is cut as soon as every
+stream reaches its end, which is the moment from which a log would hold it too.
+
+A live chain does not stop for a bad sample: what cannot be used is dropped, counted and named, and a
+stream that falls silent costs windows and no memory.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from features.windows import TIME_TOLERANCE_S, Layout, WindowRule, cut_at, wheel_speeds
+from terrain.errors import ConfigError
+from terrain.records import Array, Stream, Windows
+
+PATIENCE_S = 5.0
+"""A stream that lies further behind the others has fallen silent: longer than a logger flushes its buffer,
+shorter than an operator waits."""
+
+BUFFER_MARGIN = 4
+"""Room of a buffer over what its nominal rate fills; a stream that overruns it loses its oldest samples."""
+
+_MIN_BUFFER = 64
+
+
+class _Buffer:
+    """Accepted samples of one stream, oldest first, in arrays that are made once."""
+
+    __slots__ = ("end", "first_s", "last_s", "n_channels", "suspect", "time_s", "values")
+
+    def __init__(self, capacity: int, n_channels: int) -> None:
+        self.time_s = np.empty(capacity)
+        self.values = np.empty((capacity, n_channels))
+        self.n_channels = n_channels
+        self.end = 0
+        self.first_s = math.nan
+        self.last_s = math.nan
+        self.suspect: tuple[float, Array] | None = None
+
+    def append(self, time_s: float, values: Sequence[float] | Array) -> None:
+        self.values[self.end] = values
+        self.time_s[self.end] = time_s
+        self.end += 1
+        self.last_s = time_s
+
+    def first_at(self, time_s: float) -> int:
+        return int(np.searchsorted(self.time_s[: self.end], time_s - TIME_TOLERANCE_S))
+
+    def forget(self, n: int) -> None:
+        """Remove the oldest ``n`` samples."""
+        kept = self.end - n
+        self.time_s[:kept] = self.time_s[n : self.end]
+        self.values[:kept] = self.values[n : self.end]
+        self.end = kept
+
+
+class WindowStream:
+    """Cut windows from samples as they arrive.
+
+    Fed with the samples of a log in order of time, it returns the windows that
+    :func:`~features.windows.cut_windows` cuts from that log with the same rule and layout, bit for bit,
+    and counts the same drops; samples of different streams may arrive out of order by up to ``patience_s``.
+    Streams that pause for longer than ``patience_s`` may differ in the reason that is counted, and where
+    one never comes back, windows that a log would not hold at all are counted as ``gap``.
+
+    A stamp that is further ahead than ``patience_s``, like the first one of a stream, is held back until
+    the next sample confirms it, so that one wild stamp costs one sample and not the rest of the drive.  A
+    clock that starts again from an earlier time needs a new ``WindowStream``.
+
+    Parameters
+    ----------
+    rule : how to cut
+    layout : streams, channels (in the order in which their values are pushed) and rates
+    run_id : run of the windows
+    patience_s : how far the others run ahead before a stream counts as silent and the windows that wait
+        for it are dropped
+
+    Attributes
+    ----------
+    dropped : windows dropped so far, by reason (:data:`~features.windows.DROP_REASONS`)
+    dropped_samples : samples dropped so far, by stream and reason
+
+    Raises
+    ------
+    ConfigError
+        if ``patience_s`` is not longer than the longest step between two samples that is no gap.
+    DataError
+        if a window holds too few samples of a stream, or steady motion is asked for without wheel speeds.
+
+    Examples
+    --------
+    >>> layout = Layout({"wheels": ("speed_left_mps",)}, {"wheels": 10.0})
+    >>> stream = WindowStream(WindowRule(length_s=1.0), layout)
+    >>> for i in range(25):
+    ...     for windows in stream.push("wheels", i / 10, [0.5]):
+    ...         print(i, windows.start_s, windows.values["wheels"].shape)
+    9 [0.] (1, 1, 10)
+    19 [1.] (1, 1, 10)
+    >>> stream.push("wheels", 2.0, [0.5]), dict(stream.dropped_samples)
+    ([], {('wheels', 'time goes back or repeats'): 1})
+    """
+
+    def __init__(
+        self, rule: WindowRule, layout: Layout, run_id: str = "live", patience_s: float = PATIENCE_S
+    ) -> None:
+        longest_step_s = max(rule.max_gap_periods / rate for rate in layout.rate_hz.values())
+        if not (math.isfinite(patience_s) and patience_s > longest_step_s):
+            raise ConfigError(
+                f"patience_s is {patience_s}; it must be finite and over {longest_step_s:.3g} s, the longest "
+                "step between two samples that is no gap"
+            )
+        self.rule = rule
+        self.layout = layout
+        self.run_id = run_id
+        self.patience_s = float(patience_s)
+        self.dropped: Counter[str] = Counter()
+        self.dropped_samples: Counter[tuple[str, str]] = Counter()
+        self._n_samples = {name: layout.n_samples(name, rule.length_s) for name in layout.channels}
+        if rule.steady is not None:
+            nothing = {name: np.empty((0, len(channels), 0)) for name, channels in layout.channels.items()}
+            wheel_speeds(nothing, layout.channels)  # refused now and not at the first window
+        self._period_s = {name: 1 / layout.rate_hz[name] for name in layout.channels}
+        span_s = rule.length_s + rule.step_s + self.patience_s
+        self._buffers = {
+            name: _Buffer(
+                max(_MIN_BUFFER, math.ceil(BUFFER_MARGIN * span_s * layout.rate_hz[name])), len(channels)
+            )
+            for name, channels in layout.channels.items()
+        }
+        self._start_s = math.nan  # of window 0, once every stream has begun
+        self._next = 0  # number of the window that comes next
+        self._due_s = dict.fromkeys(layout.channels, -math.inf)  # no sample before this can finish it
+
+    @property
+    def silent_streams(self) -> tuple[str, ...]:
+        """Streams that lie further behind the others than ``patience_s``, or have not begun by then."""
+        begun = [b.last_s for b in self._buffers.values() if b.end]
+        if not begun:
+            return ()
+        earliest, front = min(b.first_s for b in self._buffers.values() if b.end), max(begun)
+        return tuple(
+            name
+            for name, buffer in self._buffers.items()
+            if front - (buffer.last_s if buffer.end else earliest) > self.patience_s
+        )
+
+    def push(self, stream: str, time_s: float, values: Sequence[float] | Array) -> list[Windows]:
+        """Take one sample and return the windows that it completes, each a ``Windows`` of length 1.
+
+        A sample whose time is not finite, goes back or repeats is dropped and counted.
+
+        Parameters
+        ----------
+        stream : name of a stream of the layout
+        time_s : time of the sample
+        values : one number a channel, in the order of the layout; NaN where one is missing
+
+        Raises
+        ------
+        ConfigError
+            if the layout has no such stream.
+        ValueError
+            if there are not as many values as channels.
+        """
+        try:
+            buffer = self._buffers[stream]
+        except KeyError:
+            known = ", ".join(self._buffers)
+            raise ConfigError(f"there is no stream {stream!r} in the layout; it has {known}") from None
+        if len(values) != buffer.n_channels:
+            raise ValueError(
+                f"stream {stream!r} has {buffer.n_channels} channels; the sample has {len(values)} values"
+            )
+        if buffer.suspect is None and 0.0 < time_s - buffer.last_s <= self.patience_s:  # False for NaN
+            if buffer.end == len(buffer.time_s):
+                self._make_room(stream)
+            buffer.append(time_s, values)
+            return self._advance() if time_s >= self._due_s[stream] else []
+        return self._push_doubtful(stream, buffer, float(time_s), values)
+
+    def _push_doubtful(
+        self, stream: str, buffer: _Buffer, time_s: float, values: Sequence[float] | Array
+    ) -> list[Windows]:
+        """Judge the first sample of a stream, one with a wild stamp, and the one after such a sample."""
+        suspect = buffer.suspect
+        if not math.isfinite(time_s):
+            self.dropped_samples[stream, "time not finite"] += 1
+            return []
+        if time_s <= buffer.last_s or (suspect and time_s == suspect[0]):
+            self.dropped_samples[stream, "time goes back or repeats"] += 1
+            return []
+        if suspect and not 0.0 < time_s - suspect[0] <= self.patience_s:
+            self.dropped_samples[stream, "time jumps ahead"] += 1
+            suspect = buffer.suspect = None
+        if suspect is None and not time_s - buffer.last_s <= self.patience_s:
+            buffer.suspect = (time_s, np.array(values, dtype=float))
+            return []
+        buffer.suspect = None
+        for sample in (suspect, (time_s, values)):
+            if sample is not None:
+                if buffer.end == len(buffer.time_s):
+                    self._make_room(stream)
+                buffer.append(*sample)
+        if math.isnan(buffer.first_s) and suspect is not None:
+            buffer.first_s = suspect[0]
+            self._begin()
+        return self._advance() if time_s >= self._due_s[stream] else []
+
+    def _begin(self) -> None:
+        first = [buffer.first_s for buffer in self._buffers.values()]
+        if not any(math.isnan(time_s) for time_s in first):
+            self._start_s = max(first)
+            self._set_due()
+
+    def _set_due(self) -> None:
+        end_s = self._start_of(self._next) + self.rule.length_s - 2 * TIME_TOLERANCE_S
+        for name, period_s in self._period_s.items():
+            self._due_s[name] = end_s - period_s
+
+    def _start_of(self, number: int) -> float:
+        return self._start_s + self.rule.step_s * number
+
+    def _advance(self) -> list[Windows]:
+        """Decide all windows that can be decided now."""
+        if math.isnan(self._start_s):
+            return []
+        found: list[Windows] = []
+        front_s = max(buffer.last_s for buffer in self._buffers.values())
+        reached_s = min(buffer.last_s + self._period_s[name] for name, buffer in self._buffers.items())
+        # The numbers of windows that fit, by the formula of `regular_starts`, and that wait no longer.
+        n_fit = self._n_windows(reached_s)
+        n_overdue = self._n_windows(front_s - self.patience_s)
+        while self._next < max(n_fit, n_overdue):
+            start_s = self._start_of(self._next)
+            first = {name: buffer.first_at(start_s) for name, buffer in self._buffers.items()}
+            if all(first[name] + n <= self._buffers[name].end for name, n in self._n_samples.items()):
+                found += self._cut(start_s, first)
+                self._next += 1
+            elif self._next < n_overdue:
+                # A window that lacks samples is followed by windows that lack them too.
+                self.dropped["gap"] += n_overdue - self._next
+                self._next = n_overdue
+            else:
+                break
+        self._set_due()
+        return found
+
+    def _n_windows(self, end_s: float) -> int:
+        rule = self.rule
+        return int(math.floor((end_s - self._start_s - rule.length_s + TIME_TOLERANCE_S) / rule.step_s) + 1)
+
+    def _cut(self, start_s: float, first: Mapping[str, int]) -> list[Windows]:
+        streams = {}
+        for name, buffer in self._buffers.items():
+            rows = slice(first[name], first[name] + self._n_samples[name])
+            streams[name] = Stream(buffer.time_s[rows], buffer.values[rows], self.layout.channels[name])
+        at = np.array([start_s])
+        values, reason = cut_at(streams, at, self.rule, self.layout)
+        if reason[0]:
+            self.dropped[str(reason[0])] += 1
+            return []
+        return [
+            Windows(
+                values,
+                self.layout.channels,
+                self.layout.rate_hz,
+                self.rule.length_s,
+                at,
+                np.array([self.run_id], dtype=object),
+                np.array([""], dtype=object),
+            )
+        ]
+
+    def _make_room(self, stream: str) -> None:
+        """Forget what no window will ask for, and the oldest samples where that is not enough."""
+        buffer = self._buffers[stream]
+        if math.isnan(self._start_s):
+            needed_from_s = max(b.last_s for b in self._buffers.values() if b.end) - self.patience_s
+        else:
+            needed_from_s = self._start_of(self._next)
+        n = buffer.first_at(needed_from_s)
+        enough = len(buffer.time_s) // BUFFER_MARGIN
+        if n < enough:
+            self.dropped_samples[stream, "faster than its rate"] += enough - n
+            n = enough
+        buffer.forget(n)

@@ -1,0 +1,365 @@
+"""Windows of equal length over streams of different rates.
+
+A window of length ``L`` that starts at ``t0`` holds, of each stream, the first ``floor(L rate)`` samples
+at or after ``t0``.  Nothing is interpolated: each stream keeps its own rate, and what a window holds is
+what the sensor said.  :func:`cut_at` is the one place where samples are cut; whole logs, the papers'
+partitions and the sample-by-sample form of :mod:`features.stream` all go through it.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from terrain.errors import ConfigError, DataError
+from terrain.logs.schema import signal_set_of
+from terrain.records import Array, RunLog, Stream, Windows
+
+TIME_TOLERANCE_S = 1e-6
+"""Stamps are compared to this; it covers the rounding of decimal stamps, far below any sample period."""
+
+MAX_RATE_DEVIATION = 0.03
+"""Runs whose rates differ by more than this cannot share windows of one length; real loggers keep 2 %."""
+
+NAN_TOLERANT_STREAMS = ("slip",)
+"""Streams whose NaN is a value (slip is undefined at a standstill) and drops no window."""
+
+SPAN_TOLERANCE = 0.1
+"""A window whose samples span this much more or less time than they should, and one period, was not sampled
+at the rate it is read with: a slow or a hasty stretch of a logger, or a live stream set to another rate."""
+
+DROP_REASONS = ("gap", "wrong rate", "not finite", "not moving", "not steady")
+
+
+@dataclass(frozen=True, slots=True)
+class SteadyMotion:
+    """When a window counts as steady motion (thesis 8.1 asks for it and gives no numbers: both assumed).
+
+    Parameters
+    ----------
+    min_speed_mps : the mean speed of the faster wheel must reach this
+    max_accel_mps2 : the mean speeds of a wheel in the two halves of the window may differ by at most
+        this acceleration times half the length; means, because single wheel readings are noisy
+    """
+
+    min_speed_mps: float = 0.03
+    max_accel_mps2: float = 0.25
+
+
+@dataclass(frozen=True, slots=True)
+class WindowRule:
+    """How runs are cut.
+
+    Parameters
+    ----------
+    length_s : length of a window (thesis 8.1: 2 s)
+    stride_s : from start to start; ``None`` means one length, that is no overlap
+    steady : the rule of steady motion, ``None`` to keep every window
+    max_gap_periods : a longer step between two samples, in sample periods, is a gap; 1.8 lets jitter
+        through and catches one lost sample
+
+    Raises
+    ------
+    ConfigError
+        if a number is not positive and finite.
+    """
+
+    length_s: float = 2.0
+    stride_s: float | None = None
+    steady: SteadyMotion | None = field(default_factory=SteadyMotion)
+    max_gap_periods: float = 1.8
+
+    def __post_init__(self) -> None:
+        for name in ("length_s", "stride_s", "max_gap_periods"):
+            value = getattr(self, name)
+            if value is not None and not (np.isfinite(value) and value > 0):
+                raise ConfigError(f"window {name} is {value}; it must be positive and finite")
+
+    @property
+    def step_s(self) -> float:
+        """Distance from one start to the next."""
+        return self.length_s if self.stride_s is None else self.stride_s
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WindowCut:
+    """Windows, and how many were dropped for which reason (:data:`DROP_REASONS`)."""
+
+    windows: Windows
+    dropped: Mapping[str, int]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Layout:
+    """What every run of a data set must bring: channels and rate of each stream that features use."""
+
+    channels: Mapping[str, tuple[str, ...]]
+    rate_hz: Mapping[str, float]
+
+    def n_samples(self, stream: str, length_s: float) -> int:
+        """Return how many samples of a stream a window holds; ``DataError`` when fewer than four."""
+        n = int(np.floor(length_s * self.rate_hz[stream] + 1e-3))
+        if n < 4:
+            raise DataError(
+                f"a window of {length_s:g} s holds {n} samples of stream {stream!r} at "
+                f"{self.rate_hz[stream]:.4g} Hz; at least 4 are needed"
+            )
+        return n
+
+
+def layout_of(runs: Sequence[RunLog]) -> Layout:
+    """Return the streams, channels and rates that all runs have in common.
+
+    Only streams with at least one channel in a signal set count.  The rate is the median over runs.
+
+    Raises
+    ------
+    DataError
+        if there is no run, a run lacks a channel that others have, or its rate differs by over 3 %.
+    """
+    if not runs:
+        raise DataError("there is no run to cut windows from")
+    names = dict.fromkeys(
+        name
+        for run in runs
+        for name, stream in run.streams.items()
+        if any(signal_set_of(name, channel) for channel in stream.channels)
+    )
+    channels: dict[str, tuple[str, ...]] = {}
+    rate_hz: dict[str, float] = {}
+    for name in names:
+        for run in runs:
+            if name not in run.streams:
+                raise DataError(f"run {run.run_id} has no stream {name!r}, which other runs have")
+        wanted = runs[0].streams[name].channels
+        for run in runs:
+            differing = sorted(set(run.streams[name].channels) ^ set(wanted))
+            if differing:
+                raise DataError(
+                    f"run {run.run_id}, stream {name!r}: channel {differing[0]!r} is not in all runs"
+                )
+        rates = np.array([run.streams[name].rate_hz for run in runs])
+        channels[name], rate_hz[name] = wanted, float(np.median(rates))
+    layout = Layout(channels, rate_hz)
+    for run in runs:
+        check_layout(run, layout)
+    if not channels:
+        raise DataError(f"run {runs[0].run_id} has no channel that features are made of")
+    return layout
+
+
+def check_layout(run: RunLog, layout: Layout) -> None:
+    """Raise ``DataError`` when a run lacks a stream, a channel or the rate of ``layout``."""
+    for name, channels in layout.channels.items():
+        if name not in run.streams:
+            raise DataError(f"run {run.run_id} has no stream {name!r}, which is needed")
+        stream = run.streams[name]
+        missing = [channel for channel in channels if channel not in stream.channels]
+        if missing:
+            raise DataError(f"run {run.run_id}, stream {name!r}: channel {missing[0]!r} is missing")
+        if not abs(stream.rate_hz / layout.rate_hz[name] - 1) <= MAX_RATE_DEVIATION:
+            raise DataError(
+                f"run {run.run_id}, stream {name!r} runs at {stream.rate_hz:.4g} Hz where "
+                f"{layout.rate_hz[name]:.4g} Hz is expected (within {MAX_RATE_DEVIATION:.0%})"
+            )
+
+
+def cut_at(
+    streams: Mapping[str, Stream], starts_s: Array, rule: WindowRule, layout: Layout
+) -> tuple[dict[str, Array], Array]:
+    """Cut one run's streams at the given starts.
+
+    Parameters
+    ----------
+    streams : the streams of one run
+    starts_s : (k,) starts of windows
+    rule : length, gap and steady-motion rule; its stride is not used
+    layout : which channels, in which order, at which rate
+
+    Returns
+    -------
+    values : per stream ``(k, channels, samples)``; rows of windows that are not kept hold anything
+    reason : (k,) of str: ``""`` where the window is kept, a :data:`DROP_REASONS` where it is dropped,
+        ``"incomplete"`` where a stream ends before the window does
+    """
+    reason = np.full(len(starts_s), "", dtype="<U10")
+    values: dict[str, Array] = {}
+    for name, channels in layout.channels.items():
+        stream = streams[name]
+        n = layout.n_samples(name, rule.length_s)
+        limit_s = rule.max_gap_periods / layout.rate_hz[name]
+        first = np.searchsorted(stream.time_s, starts_s - TIME_TOLERANCE_S)
+        complete = first + n <= len(stream)
+        first = np.where(complete, first, 0)
+        if len(stream) < n:
+            values[name] = np.zeros((len(starts_s), len(channels), n))
+            reason[:] = "incomplete"
+            continue
+        order = [stream.channels.index(channel) for channel in channels]
+        samples = stream.values[:, order]
+        gaps_before = np.concatenate(([0], np.cumsum(np.diff(stream.time_s) > limit_s)))
+        bad = ~np.isfinite(samples).all(axis=1) & (name not in NAN_TOLERANT_STREAMS)
+        bad_before = np.concatenate(([0], np.cumsum(bad)))
+        has_gap = (gaps_before[first + n - 1] > gaps_before[first]) | (
+            stream.time_s[first] - starts_s > limit_s
+        )
+        reason[(reason == "") & has_gap] = "gap"
+        period_s = 1 / layout.rate_hz[name]
+        excess_s = stream.time_s[first + n - 1] - stream.time_s[first] - (n - 1) * period_s
+        off_rate = np.abs(excess_s) > SPAN_TOLERANCE * (n - 1) * period_s + period_s
+        reason[(reason == "") & off_rate] = "wrong rate"
+        reason[(reason == "") & (bad_before[first + n] > bad_before[first])] = "not finite"
+        reason[~complete] = "incomplete"
+        # Contiguous, so that numpy adds one window's samples in the same order as those of many.
+        values[name] = np.ascontiguousarray(samples[first[:, None] + np.arange(n)].transpose(0, 2, 1))
+    if rule.steady is not None:
+        _mark_unsteady(values, rule, rule.steady, layout, reason)
+    return values, reason
+
+
+def _mark_unsteady(
+    values: Mapping[str, Array], rule: WindowRule, steady: SteadyMotion, layout: Layout, reason: Array
+) -> None:
+    judged = reason == ""
+    speeds = np.ascontiguousarray(wheel_speeds(values, layout.channels)[judged])
+    half = speeds.shape[2] // 2
+    before, after = speeds[:, :, :half].mean(axis=2), speeds[:, :, -half:].mean(axis=2)
+    moving = np.abs(speeds).mean(axis=2).max(axis=1) >= steady.min_speed_mps
+    even = np.abs(after - before).max(axis=1) <= steady.max_accel_mps2 * rule.length_s / 2
+    reason[judged] = np.where(moving, np.where(even, "", "not steady"), "not moving")
+
+
+def wheel_speeds(values: Mapping[str, Array], channels: Mapping[str, tuple[str, ...]]) -> Array:
+    """Return the wheel speeds (n_windows, wheels, samples) in m/s.
+
+    Raises
+    ------
+    DataError
+        if there is no wheel speed, so that steady motion cannot be judged.
+    """
+    for name, names in channels.items():
+        rows = [i for i, channel in enumerate(names) if signal_set_of(name, channel) == "wheels"]
+        if rows:
+            return values[name][:, rows]
+    raise DataError("steady motion cannot be judged without wheel speeds; switch the rule off")
+
+
+def label_windows(run: RunLog, starts_s: Array, length_s: float) -> Array:
+    """Return the terrain (k,) under each window, ``""`` where a label does not cover all of it."""
+    terrain = np.full(len(starts_s), "", dtype=object)
+    for label in run.labels:
+        inside = (starts_s >= label.start_s - TIME_TOLERANCE_S) & (
+            starts_s + length_s <= label.end_s + TIME_TOLERANCE_S
+        )
+        terrain[inside] = label.terrain
+    return terrain
+
+
+def regular_starts(start_s: float, end_s: float, length_s: float, step_s: float) -> Array:
+    """Return the starts of all windows of ``length_s`` that fit between two times.
+
+    Examples
+    --------
+    >>> regular_starts(0.0, 6.0, 2.0, 2.0)
+    array([0., 2., 4.])
+    """
+    n = int(np.floor((end_s - start_s - length_s + TIME_TOLERANCE_S) / step_s)) + 1
+    return start_s + step_s * np.arange(max(n, 0))
+
+
+def span_of(run: RunLog, layout: Layout) -> tuple[float, float]:
+    """Return from when to when all streams of ``layout`` run; the last sample's own period included."""
+    streams = [(run.streams[name], layout.rate_hz[name]) for name in layout.channels]
+    return (
+        float(max(stream.time_s[0] for stream, _ in streams)),
+        float(min(stream.time_s[-1] + 1 / rate for stream, rate in streams)),
+    )
+
+
+def cut_windows(
+    runs: Sequence[RunLog],
+    rule: WindowRule | None = None,
+    *,
+    layout: Layout | None = None,
+    starts_s: Mapping[str, Array] | None = None,
+    skip_short: bool = False,
+) -> WindowCut:
+    """Cut all runs into windows.
+
+    Parameters
+    ----------
+    runs : run logs
+    rule : how to cut; 2 s without overlap in steady motion by default
+    layout : channels and rates to expect; what the runs have in common by default
+    starts_s : starts by run id, where they are not the regular ones of ``rule``
+    skip_short : leave out runs that are shorter than a window instead of refusing them
+
+    Returns
+    -------
+    WindowCut
+        the windows, run by run and in order of time, and what was dropped; a window whose samples lie
+        under two labels keeps ``terrain == ""`` and is no sample for training.
+
+    Raises
+    ------
+    DataError
+        if a run lacks a channel, has another rate, or is shorter than a window.
+
+    Examples
+    --------
+    >>> from terrain.records import Stream, RunLog
+    >>> time = np.arange(0, 5, 0.1)
+    >>> wheels = Stream(time, np.ones((50, 2)), ("speed_left_mps", "speed_right_mps"))
+    >>> cut = cut_windows([RunLog("a", "husky", {"wheels": wheels}, ((0.0, 5.0, "grass"),))])
+    >>> len(cut.windows), cut.windows.values["wheels"].shape, list(cut.windows.terrain)
+    (2, (2, 2, 20), ['grass', 'grass'])
+    """
+    rule = WindowRule() if rule is None else rule
+    if layout is None:
+        layout = layout_of(runs)
+    else:
+        for run in runs:
+            check_layout(run, layout)
+    parts: dict[str, list[Array]] = {
+        name: [np.empty((0, len(channels), layout.n_samples(name, rule.length_s)))]
+        for name, channels in layout.channels.items()
+    }
+    starts: list[Array] = [np.empty(0)]
+    ids: list[Array] = [np.empty(0, dtype=object)]
+    terrains: list[Array] = [np.empty(0, dtype=object)]
+    dropped: Counter[str] = Counter()
+    for run in runs:
+        begin_s, end_s = span_of(run, layout)
+        if end_s - begin_s + TIME_TOLERANCE_S < rule.length_s:
+            if not skip_short:
+                raise DataError(
+                    f"run {run.run_id} lasts {max(end_s - begin_s, 0):.2f} s, "
+                    f"shorter than a window of {rule.length_s:g} s"
+                )
+            dropped["run too short"] += 1
+            continue
+        if starts_s is None:
+            at = regular_starts(begin_s, end_s, rule.length_s, rule.step_s)
+        else:
+            at = np.asarray(starts_s.get(run.run_id, ()), dtype=float)
+        values, reason = cut_at(run.streams, at, rule, layout)
+        kept = reason == ""
+        dropped.update(str(r) for r in reason[~kept] if r != "incomplete")
+        for name, array in values.items():
+            parts[name].append(array[kept])
+        starts.append(at[kept])
+        ids.append(np.full(int(kept.sum()), run.run_id, dtype=object))
+        terrains.append(label_windows(run, at[kept], rule.length_s))
+    windows = Windows(
+        {name: np.concatenate(arrays) for name, arrays in parts.items()},
+        layout.channels,
+        layout.rate_hz,
+        rule.length_s,
+        np.concatenate(starts),
+        np.concatenate(ids),
+        np.concatenate(terrains),
+    )
+    return WindowCut(windows, dict(dropped))

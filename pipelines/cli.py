@@ -1,0 +1,274 @@
+"""The command ``terrain``.  Nothing heavy is imported before a command needs it."""
+
+from __future__ import annotations
+
+import json
+import sys
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from terrain.errors import ConfigError, TerrainError
+
+app = typer.Typer(
+    name="terrain",
+    help="Terrain classification and slip learning for off-road robots.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    add_completion=False,
+    rich_markup_mode=None,
+)
+
+
+class Format(StrEnum):
+    """Layouts of a folder of runs."""
+
+    auto = "auto"
+    runs = "runs"
+    borealtc = "borealtc"
+    csv = "csv"
+
+
+class Protocol(StrEnum):
+    """Protocols of cross-validation."""
+
+    grouped = "grouped"
+    leave_one_run_out = "leave-one-run-out"
+    published = "published"
+
+
+class Recipe(StrEnum):
+    """Recipes from windows to terrain."""
+
+    svm = "svm"
+
+
+Data = Annotated[Path, typer.Option("--data", help="Folder of runs in any readable layout.")]
+Json = Annotated[
+    Path | None,
+    typer.Option(
+        "--json", help="Write the result to this file as JSON.", callback=lambda path: _checked(path)
+    ),
+]
+FormatOption = Annotated[Format, typer.Option("--format", help="Layout of the folder.")]
+Mapping = Annotated[Path | None, typer.Option(help="YAML file that says how to read CSV files.")]
+Repair = Annotated[bool, typer.Option("--repair", help="Drop and count what a strict read refuses.")]
+Align = Annotated[
+    bool,
+    typer.Option("--align", help="Bring the wheel stream onto the IMU's clock where both see the turns."),
+]
+Window = Annotated[float | None, typer.Option(help="Window length in s (2; 1.7 under 'published').")]
+Stride = Annotated[float | None, typer.Option(help="From window to window in s; one length by default.")]
+Steady = Annotated[bool, typer.Option(help="Keep windows of steady motion only.")]
+Signals = Annotated[
+    str, typer.Option(help="Signal sets to use, by commas; leave one out to see what it is worth.")
+]
+Seed = Annotated[int, typer.Option(min=0, help="Deals runs into folds.")]
+Repeats = Annotated[int | None, typer.Option(min=1, help="Fold assignments (5).")]
+Jobs = Annotated[int, typer.Option(min=0, help="Processes at once; 0 for one a core.")]
+ALL_SIGNALS = "imu,wheels,currents,slip,estimator"
+
+
+@app.command("import")
+def import_command(
+    folder: Annotated[Path, typer.Argument(help="Folder to read.")],
+    out: Annotated[Path, typer.Option(help="Folder of the new run folders.")],
+    layout: FormatOption = Format.auto,
+    mapping: Mapping = None,
+    repair: Repair = False,
+    json_file: Json = None,
+) -> None:
+    """Turn logs of any readable layout into run folders."""
+    from pipelines.import_logs import import_logs
+
+    result = import_logs(folder, out, layout=layout.value, mapping=mapping, repair=repair)
+    for sentence in result["skipped"]:
+        typer.echo(f"skipped: {sentence}")
+    counts = "".join(f", {n} {kind}" for kind, n in result["dropped"].items())
+    typer.echo(f"{result['n_runs']} runs written to {out}{counts}")
+    _write_json(json_file, result)
+
+
+@app.command("inspect")
+def inspect_command(
+    folder: Annotated[Path, typer.Argument(help="Folder to read.")],
+    layout: FormatOption = Format.auto,
+    mapping: Mapping = None,
+    repair: Repair = False,
+    json_file: Json = None,
+) -> None:
+    """Show rates, lengths, gaps, stuck channels, and whether two loggers keep one clock."""
+    from pipelines.inspect_logs import inspect_logs, print_inspection
+
+    result = inspect_logs(folder, layout=layout.value, mapping=mapping, repair=repair)
+    print_inspection(result, _console())
+    _write_json(json_file, result)
+
+
+@app.command("crossval")
+def crossval_command(
+    data: Data,
+    recipe: Annotated[Recipe, typer.Option(help="What to evaluate.")] = Recipe.svm,
+    protocol: Annotated[
+        Protocol, typer.Option(help="Which windows teach and which test.")
+    ] = Protocol.grouped,
+    window: Window = None,
+    stride: Stride = None,
+    steady: Steady = True,
+    signals: Signals = ALL_SIGNALS,
+    repeats: Repeats = None,
+    seed: Seed = 0,
+    extras: Annotated[bool, typer.Option(help="Speed alone, slow against fast, learning curve.")] = True,
+    jobs: Jobs = 0,
+    layout: FormatOption = Format.auto,
+    mapping: Mapping = None,
+    repair: Repair = False,
+    align: Align = False,
+    json_file: Json = None,
+) -> None:
+    """Tell how well a recipe does on runs it has not seen."""
+    from pipelines.crossval import CrossvalSettings, crossval
+    from pipelines.datasets import data_digest, load_runs
+    from pipelines.screens import print_crossval, progress_bar
+
+    settings = CrossvalSettings(
+        recipe.value, protocol.value, window, stride, steady, repeats, seed, _names(signals), extras, jobs
+    )
+    runs = load_runs(data, layout=layout.value, mapping=mapping, repair=repair, align=align)
+    with progress_bar() as progress:
+        report = crossval(runs, settings, progress)
+    result = {"dataset": data.resolve().name, "data_digest": data_digest(runs), **report}
+    print_crossval(result, _console())
+    _write_json(json_file, result)
+
+
+@app.command("train")
+def train_command(
+    data: Data,
+    name: Annotated[str, typer.Option(help="Name of the registered model.")],
+    recipe: Annotated[Recipe, typer.Option(help="What to train.")] = Recipe.svm,
+    window: Window = None,
+    stride: Stride = None,
+    steady: Steady = True,
+    signals: Signals = ALL_SIGNALS,
+    repeats: Repeats = None,
+    seed: Seed = 0,
+    jobs: Jobs = 0,
+    layout: FormatOption = Format.auto,
+    mapping: Mapping = None,
+    repair: Repair = False,
+    align: Align = False,
+    json_file: Json = None,
+) -> None:
+    """Evaluate on held-out runs, fit on all of them, track in MLflow and register."""
+    from pipelines.crossval import CrossvalSettings
+    from pipelines.datasets import load_runs
+    from pipelines.screens import print_crossval, print_training, progress_bar
+    from pipelines.train import train
+
+    settings = CrossvalSettings(
+        recipe.value, "grouped", window, stride, steady, repeats, seed, _names(signals), False, jobs
+    )
+    runs = load_runs(data, layout=layout.value, mapping=mapping, repair=repair, align=align)
+    with progress_bar() as progress:
+        result = train(runs, settings, name, data.resolve().name, progress)
+    print_crossval({**result["crossval"], "dataset": result["dataset"]}, _console())
+    print_training(result, _console())
+    _write_json(json_file, result)
+
+
+@app.command("predict")
+def predict_command(
+    model: Annotated[str, typer.Option(help="models:/NAME@champion, models:/NAME/3, or a model folder.")],
+    data: Data,
+    table: Annotated[
+        Path | None, typer.Option(help="Table of target slips; the packaged one by default.")
+    ] = None,
+    layout: FormatOption = Format.auto,
+    mapping: Mapping = None,
+    repair: Repair = False,
+    align: Align = False,
+    json_file: Json = None,
+) -> None:
+    """Print terrain, probability and target slip."""
+    from pipelines.datasets import load_runs
+    from pipelines.predict import predict
+    from pipelines.screens import print_predictions
+    from pipelines.tracking import load_model
+    from terrain.control.slip_table import load_slip_table
+
+    slip_table = load_slip_table(table)
+    runs = load_runs(data, layout=layout.value, mapping=mapping, repair=repair, align=align)
+    result = {"model": model, "dataset": data.resolve().name, **predict(runs, load_model(model), slip_table)}
+    print_predictions(result, _console())
+    _write_json(json_file, result)
+
+
+@app.command("quickstart")
+def quickstart_command(
+    data: Data,
+    out: Annotated[Path, typer.Option(help="Folder of the imported runs and the report.")] = Path(
+        "terrain-report"
+    ),
+    name: Annotated[str, typer.Option(help="Name of the registered model.")] = "quickstart",
+    seed: Seed = 0,
+    jobs: Jobs = 0,
+    json_file: Json = None,
+) -> None:
+    """Import, cross-validate, train, predict, and write a report."""
+    from pipelines.crossval import CrossvalSettings
+    from pipelines.quickstart import quickstart
+    from pipelines.screens import print_crossval, print_predictions, print_training, progress_bar
+
+    with progress_bar() as progress:
+        result = quickstart(data, out, CrossvalSettings(seed=seed, n_jobs=jobs), name, progress)
+    print_crossval(result["crossval"], _console())
+    print_training(result["train"], _console())
+    print_predictions(result["predict"], _console())
+    typer.echo(f"report: {result['report']}")
+    _write_json(json_file, result)
+
+
+def _console() -> Any:
+    from rich.console import Console
+
+    return Console(soft_wrap=True, width=None if sys.stdout.isatty() else 110)
+
+
+def _names(signals: str) -> tuple[str, ...]:
+    names = tuple(name.strip() for name in signals.split(",") if name.strip())
+    if not names:
+        raise ConfigError(f"no signal set is named; there are {ALL_SIGNALS}")
+    return names
+
+
+def _checked(path: Path | None) -> Path | None:
+    """Refuse a place that cannot be written before the work is done, not after."""
+    if path is not None:
+        from terrain.atomic import ensure_writable
+
+        if path.is_dir():
+            raise ConfigError(f"{path}: is a folder; --json names a file")
+        ensure_writable(path.parent)
+    return path
+
+
+def _write_json(path: Path | None, result: dict[str, Any]) -> None:
+    if path is not None:
+        from terrain.atomic import atomic_write
+
+        atomic_write(path, json.dumps(result, indent=2, allow_nan=False) + "\n")
+
+
+def main() -> None:
+    """Run the command line: a user's mistake is one sentence and exit code 2, a fault keeps its traceback."""
+    try:
+        app()
+    except TerrainError as error:
+        typer.echo(f"error: {error}", err=True)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        typer.echo("stopped", err=True)
+        sys.exit(130)

@@ -1,0 +1,161 @@
+"""Figures of merit from held-out predictions: plain arrays in, plain numbers out."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from sklearn.metrics import confusion_matrix, precision_recall_fscore_support
+
+from terrain.records import Array
+
+CALIBRATION_BINS = 15
+VOTE_SPAN_S = 5.0
+INTERVAL = 0.95
+N_BOOTSTRAP = 2000
+TIME_TOLERANCE_S = 1e-6
+
+
+def class_figures(y: Array, predicted: Array, classes: Array) -> dict[str, Any]:
+    """Return accuracy, balanced accuracy, macro F1, per-class figures and the confusion matrix.
+
+    Parameters
+    ----------
+    y, predicted : (n,) classes
+    classes : (k,) order of rows and columns; rows of ``confusion`` are the true classes
+
+    Examples
+    --------
+    >>> figures = class_figures(np.array(["a", "a", "b"]), np.array(["a", "b", "b"]), np.array(["a", "b"]))
+    >>> figures["confusion"], round(figures["balanced_accuracy"], 2)
+    ([[1, 1], [0, 1]], 0.75)
+    """
+    precision, recall, f1, support = precision_recall_fscore_support(
+        y, predicted, labels=classes, zero_division=0.0
+    )
+    tested = support > 0
+    return {
+        "accuracy": float(np.mean(y == predicted)),
+        "balanced_accuracy": float(recall[tested].mean()),
+        "macro_f1": float(f1[tested].mean()),
+        "per_class": {
+            str(name): {
+                "precision": float(precision[i]),
+                "recall": float(recall[i]),
+                "f1": float(f1[i]),
+                "n_windows": int(support[i]),
+            }
+            for i, name in enumerate(classes)
+        },
+        "confusion": confusion_matrix(y, predicted, labels=classes).tolist(),
+    }
+
+
+def calibration(confidence: Array, correct: Array, n_bins: int = CALIBRATION_BINS) -> dict[str, Any]:
+    """Return the expected calibration error of the top label over bins of equal mass.
+
+    ``ece = sum_b n_b / n |accuracy_b - confidence_b|`` with the windows sorted by confidence and cut into
+    ``n_bins`` bins of equal count (Guo et al. 2017, eq. 3, equal mass instead of equal width).
+
+    Examples
+    --------
+    >>> calibration(np.full(100, 0.9), np.arange(100) < 60, 1)["ece"]
+    0.3
+    """
+    order = np.argsort(confidence, kind="stable")
+    bins = [part for part in np.array_split(order, n_bins) if len(part)]
+    table = [
+        {
+            "confidence": float(confidence[part].mean()),
+            "accuracy": float(correct[part].mean()),
+            "n_windows": len(part),
+        }
+        for part in bins
+    ]
+    ece = sum(row["n_windows"] * abs(row["accuracy"] - row["confidence"]) for row in table) / len(order)
+    return {"ece": round(float(ece), 12), "reliability": table}
+
+
+def vote(
+    probability: Array, segment: Array, start_s: Array, length_s: float, span_s: float = VOTE_SPAN_S
+) -> Array:
+    """Return the class index voted by the windows that lie within the last ``span_s`` seconds.
+
+    A window that ends at t votes together with the windows of its own segment that lie wholly in
+    ``[t - span_s, t]``; a tie goes to the class with the higher summed probability.
+
+    Parameters
+    ----------
+    probability : (n, k)
+    segment : (n,) stretch of a run that was tested in one piece; votes do not cross its ends
+    start_s : (n,) start of each window
+    length_s : length of a window
+    """
+    ballots = np.eye(probability.shape[1])[probability.argmax(axis=1)]
+    voted = np.empty(len(probability), dtype=int)
+    for name in np.unique(segment):
+        rows = np.flatnonzero(segment == name)
+        rows = rows[np.argsort(start_s[rows], kind="stable")]
+        starts = start_s[rows]
+        first = np.searchsorted(starts, starts + length_s - span_s - TIME_TOLERANCE_S)
+        for position, row in enumerate(rows):
+            voters = rows[min(first[position], position) : position + 1]
+            count, weight = ballots[voters].sum(axis=0), probability[voters].sum(axis=0)
+            voted[row] = np.lexsort((weight, count))[-1]
+    return voted
+
+
+def run_bootstrap(
+    correct: Array, run_id: Array, terrain: Array, rng: np.random.Generator
+) -> tuple[float, float]:
+    """Return a 95 % interval of the accuracy by resampling whole runs within their classes.
+
+    Windows of one run are not independent, so runs are drawn, with replacement, as many a class as the
+    class has.  A class with one run adds no spread: the interval is too narrow by what that run hides.
+
+    Parameters
+    ----------
+    correct : (n,) share of repeats in which each window was right
+    run_id, terrain : (n,) run and class of each window
+    rng : source of the draws
+    """
+    runs, run_of = np.unique(run_id, return_inverse=True)
+    hits = np.bincount(run_of, weights=correct)
+    sizes = np.bincount(run_of)
+    class_of = np.empty(len(runs), dtype=object)
+    class_of[run_of] = terrain
+    n_hits, n_windows = np.zeros(N_BOOTSTRAP), np.zeros(N_BOOTSTRAP)
+    for name in np.unique(terrain):
+        members = np.flatnonzero(class_of == name)
+        drawn = members[rng.integers(len(members), size=(N_BOOTSTRAP, len(members)))]
+        n_hits += hits[drawn].sum(axis=1)
+        n_windows += sizes[drawn].sum(axis=1)
+    low, high = np.quantile(n_hits / n_windows, [(1 - INTERVAL) / 2, (1 + INTERVAL) / 2])
+    return float(low), float(high)
+
+
+def per_run_figures(
+    correct: Array, predicted: Array, voted_correct: Array, run_id: Array, terrain: Array
+) -> list[dict[str, Any]]:
+    """Return accuracy, voted accuracy and the most frequent wrong answer of each run.
+
+    Parameters
+    ----------
+    correct, voted_correct : (n,) or (repeats, n)
+    predicted : (n,) predictions of one repeat
+    """
+    figures = []
+    for name in np.unique(run_id):
+        rows = run_id == name
+        wrong, counts = np.unique(predicted[rows & (predicted != terrain)], return_counts=True)
+        figures.append(
+            {
+                "run_id": str(name),
+                "terrain": str(terrain[rows][0]),
+                "n_windows": int(rows.sum()),
+                "accuracy": float(np.mean(correct[..., rows])),
+                "vote_accuracy": float(np.mean(voted_correct[..., rows])),
+                "mistaken_for": str(wrong[counts.argmax()]) if len(wrong) else None,
+            }
+        )
+    return figures

@@ -1,0 +1,83 @@
+"""``terrain predict``: terrain, probability and target slip of every window of a log."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from features.windows import cut_windows
+from pipelines.models import TerrainModel
+from terrain.control.slip_table import DRIVE_STATES, SlipTable
+from terrain.records import RunLog
+
+
+def predict(runs: Sequence[RunLog], model: TerrainModel, table: SlipTable) -> dict[str, Any]:
+    """Predict every window that the model's own rule keeps.
+
+    Parameters
+    ----------
+    runs : run logs, labelled or not
+    model : fitted recipe with the rule by which its windows are cut
+    table : target slips
+
+    Returns
+    -------
+    dict that JSON can hold
+        ``windows``: ``run_id, start_s, terrain, probability, target_slip`` (by drive state), ``status`` and
+        ``slip_entry`` (the entry of the table, which is the fallback's where the terrain has none);
+        ``accuracy`` over windows whose label the model knows, None where there are none;
+        ``unknown_labels`` counts windows by labels that the model never saw; ``dropped`` and ``table``.
+
+    Raises
+    ------
+    DataError
+        if a run lacks a channel or has another rate than the model was taught.
+    """
+    layout = model.recipe[0].layout_
+    cut = cut_windows(runs, model.rule, layout=layout)
+    windows = cut.windows
+    classes = np.asarray(model.recipe.classes_, dtype=str)
+    probability = model.recipe.predict_proba(windows) if len(windows) else np.zeros((0, len(classes)))
+    best = probability.argmax(axis=1)
+    predicted, label = classes[best], windows.terrain.astype(str)
+    targets = {terrain: table.lookup(terrain) for terrain in classes}
+    rows = [
+        {
+            "run_id": str(windows.run_id[i]),
+            "start_s": float(windows.start_s[i]),
+            "terrain": str(predicted[i]),
+            "probability": float(probability[i, best[i]]),
+            "target_slip": {state: targets[predicted[i]][state].slip_ratio for state in DRIVE_STATES},
+            "slip_entry": targets[predicted[i]]["traction"].terrain,
+            "status": {state: targets[predicted[i]][state].status for state in DRIVE_STATES},
+            "label": str(label[i]) or None,
+        }
+        for i in range(len(windows))
+    ]
+    known = np.isin(label, classes)
+    strange, counts = np.unique(label[(label != "") & ~known], return_counts=True)
+    return {
+        "windows": rows,
+        "n_windows": len(rows),
+        "n_runs": len(runs),
+        "classes": [str(c) for c in classes],
+        "accuracy": float(np.mean(predicted[known] == label[known])) if known.any() else None,
+        "n_judged": int(known.sum()),
+        "unknown_labels": {str(name): int(count) for name, count in zip(strange, counts, strict=True)},
+        "n_unknown_labels": int(counts.sum()),
+        "dropped": dict(cut.dropped),
+        "table_name": table.name,
+        "table": {terrain: _table_row(table, terrain) for terrain in classes},
+    }
+
+
+def _table_row(table: SlipTable, terrain: str) -> dict[str, Any]:
+    targets = table.lookup(terrain)
+    return {
+        **{state: targets[state].slip_ratio for state in DRIVE_STATES},
+        "entry": targets["traction"].terrain,
+        "status": ", ".join(dict.fromkeys(targets[state].status for state in DRIVE_STATES)),
+        "source": "; ".join(dict.fromkeys(targets[state].source for state in DRIVE_STATES)),
+    }

@@ -1,0 +1,178 @@
+"""The protocols of cross-validation: which windows teach and which test.
+
+``grouped`` is the headline: whole runs are held out.  ``leave-one-run-out`` holds out one run at a time.
+``published`` deals 5 s partitions of runs at random into folds, as the papers do, so that a test
+partition nearly always has its own run in training; it is there to compare with papers, no more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from sklearn.model_selection import StratifiedKFold
+
+from features.windows import (
+    TIME_TOLERANCE_S,
+    Layout,
+    WindowCut,
+    WindowRule,
+    cut_windows,
+    layout_of,
+    regular_starts,
+    span_of,
+)
+from terrain.classify.folds import block_groups, single_run_classes, split_runs
+from terrain.errors import DataError
+from terrain.records import Array, RunLog
+
+PROTOCOLS = ("grouped", "leave-one-run-out", "published")
+N_FOLDS = 5
+PARTITION_S = 5.0
+PUBLISHED_STRIDE_S = 0.1
+PUBLISHED_WINDOW_S = 1.7
+
+
+class Fold(NamedTuple):
+    """Rows that teach and rows that test; ``repeat`` numbers the fold assignment."""
+
+    repeat: int
+    number: int
+    train: Array
+    test: Array
+
+
+class Samples(NamedTuple):
+    """Windows with what protocols need to know of them.
+
+    ``group`` is what must not be split: the run, or the partition under ``published``.
+    """
+
+    cut: WindowCut
+    group: Array
+    gap: int
+
+
+def grouped_samples(runs: Sequence[RunLog], rule: WindowRule) -> Samples:
+    """Cut windows by the rule, labelled ones only; the group of a window is its run."""
+    cut = labelled(cut_windows(runs, rule))
+    gap = int(np.ceil(rule.length_s / rule.step_s))
+    return Samples(cut, cut.windows.run_id, gap)
+
+
+def labelled(cut: WindowCut) -> WindowCut:
+    """Keep the windows that lie under one label; the others are counted as ``no single label``."""
+    known = cut.windows.terrain != ""
+    if not known.any():
+        raise DataError("no window has a terrain label: nothing can be learned or judged")
+    if known.all():
+        return cut
+    return WindowCut(cut.windows[known], {**cut.dropped, "no single label": int((~known).sum())})
+
+
+def published_samples(runs: Sequence[RunLog], rule: WindowRule) -> Samples:
+    """Cut windows as the papers do: slid inside 5 s partitions, classes balanced by stride.
+
+    The class with the fewest partitions is cut every 0.1 s, the others in proportion to their number.
+    No rule of steady motion is applied.
+    """
+    layout = layout_of(runs)
+    places = [
+        (run.run_id, run.labels[0].terrain, start_s)
+        for run in runs
+        for start_s in _partition_starts(run, layout)
+        if run.labels
+    ]
+    if not places:
+        raise DataError(f"no labelled run is as long as a partition of {PARTITION_S:g} s")
+    terrain = np.array([place[1] for place in places])
+    names, counts = np.unique(terrain, return_counts=True)
+    stride_s = dict(zip(names, PUBLISHED_STRIDE_S * counts / counts.min(), strict=True))
+    starts: dict[str, list[float]] = {}
+    for run_id, name, begin_s in places:
+        starts.setdefault(run_id, []).extend(
+            regular_starts(begin_s, begin_s + PARTITION_S, rule.length_s, stride_s[name])
+        )
+    plain = WindowRule(rule.length_s, rule.stride_s, None, rule.max_gap_periods)
+    cut = labelled(
+        cut_windows(
+            runs, plain, layout=layout, starts_s={k: np.array(v) for k, v in starts.items()}, skip_short=True
+        )
+    )
+    begin_s = {run.run_id: span_of(run, layout)[0] for run in runs}
+    windows = cut.windows
+    number = [
+        int((start - begin_s[run_id] + TIME_TOLERANCE_S) // PARTITION_S)
+        for start, run_id in zip(windows.start_s, windows.run_id, strict=True)
+    ]
+    group = np.array([f"{run} part {n}" for run, n in zip(windows.run_id, number, strict=True)], dtype=object)
+    return Samples(cut, group, 0)
+
+
+def _partition_starts(run: RunLog, layout: Layout) -> Array:
+    begin_s, end_s = span_of(run, layout)
+    return regular_starts(begin_s, end_s, PARTITION_S, PARTITION_S)
+
+
+def folds_of(samples: Samples, protocol: str, repeats: int, seed: int) -> list[Fold]:
+    """Return the folds of a protocol, repeat by repeat.
+
+    Each repeat deals anew from ``(seed, repeat)``; ``leave-one-run-out`` leaves nothing to deal and has
+    one repeat.
+
+    Raises
+    ------
+    DataError
+        if there is one class only, or there are fewer runs than folds.
+    """
+    y, group = samples.cut.windows.terrain.astype(str), samples.group
+    if protocol == "leave-one-run-out":
+        return _leave_one_out(y, group, samples.gap)
+    n_runs = len(np.unique(samples.cut.windows.run_id.astype(str)))
+    if protocol == "grouped" and n_runs < N_FOLDS:
+        raise DataError(f"{n_runs} runs are fewer than {N_FOLDS} folds")
+    folds = []
+    for repeat in range(repeats):
+        rng = np.random.default_rng((seed, repeat))
+        splits = (
+            split_runs(y, group, N_FOLDS, rng, samples.gap)
+            if protocol == "grouped"
+            else _stratified_partitions(y, group, rng)
+        )
+        folds += [Fold(repeat, number, train, test) for number, (train, test) in enumerate(splits)]
+    return folds
+
+
+def _leave_one_out(y: Array, run_id: Array, gap: int) -> list[Fold]:
+    alone = single_run_classes(y, run_id)
+    if len(np.unique(y)) < 2:
+        raise DataError(f"all windows are {y[0]!r}: a classifier needs at least two classes")
+    group = block_groups(y, run_id, N_FOLDS)
+    folds = []
+    for number, name in enumerate(dict.fromkeys(group)):
+        testing = group == name
+        training = ~testing
+        rows = np.flatnonzero(y == y[testing][0])
+        if y[testing][0] in alone:
+            at = np.flatnonzero(testing[rows])
+            training[rows[max(at[0] - gap, 0) : at[-1] + gap + 1]] = False
+        folds.append(Fold(0, number, np.flatnonzero(training), np.flatnonzero(testing)))
+    return folds
+
+
+def _stratified_partitions(y: Array, group: Array, rng: np.random.Generator) -> list[tuple[Array, Array]]:
+    names, first, group_of = np.unique(group.astype(str), return_index=True, return_inverse=True)
+    labels = y[first]
+    counts = dict(zip(*np.unique(labels, return_counts=True), strict=True))
+    if len(counts) < 2:
+        raise DataError(f"all windows are {labels[0]!r}: a classifier needs at least two classes")
+    short = [f"{name} ({n})" for name, n in counts.items() if n < N_FOLDS]
+    if short:
+        raise DataError(f"fewer than {N_FOLDS} partitions of {PARTITION_S:g} s: {', '.join(short)}")
+    deal = StratifiedKFold(N_FOLDS, shuffle=True, random_state=int(rng.integers(2**31)))
+    splits = []
+    for _, test in deal.split(names, labels):
+        testing = np.isin(group_of, test)
+        splits.append((np.flatnonzero(~testing), np.flatnonzero(testing)))
+    return splits

@@ -1,0 +1,1 @@
+"""Terrain classifiers as scikit-learn estimators on feature vectors."""

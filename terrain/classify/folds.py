@@ -1,0 +1,114 @@
+"""Folds that keep runs whole: one implementation for the outer evaluation and the inner choices.
+
+Runs are dealt at random, class by class, each to the fold that so far holds the fewest runs of that class
+and, among those, the fewest windows.  (scikit-learn's ``StratifiedGroupKFold`` sorts groups by size before
+dealing; with runs of unequal length nearly every seed gives the same folds, and a spread over seeds says
+nothing.)  A class that has a single run cannot be held out whole and be learned as well: its run is
+cut into contiguous blocks, and training windows beside a test block are left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from terrain.errors import DataError
+from terrain.records import Array
+
+
+def single_run_classes(y: Array, groups: Array) -> list[Any]:
+    """Return the classes that have one run only.
+
+    Examples
+    --------
+    >>> single_run_classes(np.array(["ice", "ice", "sand"]), np.array(["a", "b", "c"]))
+    ['sand']
+    """
+    return [c for c in np.unique(y).tolist() if len(np.unique(groups[y == c])) == 1]
+
+
+def block_groups(y: Array, groups: Array, n_blocks: int) -> Array:
+    """Return groups in which the run of each single-run class is cut into contiguous blocks by row order."""
+    cut = np.asarray(groups, dtype=object).copy()
+    for terrain in single_run_classes(y, groups):
+        rows = np.flatnonzero(y == terrain)
+        for number, block in enumerate(np.array_split(rows, n_blocks)):
+            cut[block] = f"{groups[rows[0]]} block {number + 1}"
+    return cut
+
+
+def fold_numbers(y: Array, groups: Array, n_folds: int, rng: np.random.Generator) -> Array:
+    """Deal whole groups into folds at random, evenly within each class.
+
+    Parameters
+    ----------
+    y : (n,) class of each window
+    groups : (n,) group of each window; a group with several classes counts for its most frequent one
+    n_folds : at least 2
+    rng : source of the deal
+
+    Returns
+    -------
+    (n,) int
+        the fold that tests each window.
+
+    Raises
+    ------
+    DataError
+        if there is one class only, or fewer groups than folds.
+    """
+    if len(np.unique(y)) < 2:
+        raise DataError(f"all windows are {str(np.unique(y)[0])!r}: a classifier needs at least two classes")
+    names, group_of = np.unique(np.asarray(groups, dtype=str), return_inverse=True)
+    if len(names) < n_folds:
+        raise DataError(f"{len(names)} runs are fewer than {n_folds} folds")
+    classes, class_of = np.unique(y, return_inverse=True)
+    table = np.zeros((len(names), len(classes)), dtype=int)
+    np.add.at(table, (group_of, class_of), 1)
+    sizes, main_class = table.sum(axis=1), table.argmax(axis=1)
+    fold_of_group = np.empty(len(names), dtype=int)
+    n_windows = np.zeros(n_folds, dtype=int)
+    for c in rng.permutation(len(classes)):
+        n_runs = np.zeros(n_folds, dtype=int)
+        for group in rng.permutation(np.flatnonzero(main_class == c)):
+            fold = np.lexsort((n_windows, n_runs))[0]
+            fold_of_group[group] = fold
+            n_runs[fold] += 1
+            n_windows[fold] += sizes[group]
+    return fold_of_group[group_of]
+
+
+def split_runs(
+    y: Array, groups: Array, n_folds: int, rng: np.random.Generator, gap: int = 1
+) -> Iterator[tuple[Array, Array]]:
+    """Yield training and test rows of folds that keep runs whole.
+
+    Parameters
+    ----------
+    y, groups : (n,) class and run of each window; windows of a run are in order of time
+    n_folds : at least 2
+    rng : source of the deal
+    gap : training windows left out on each side of a test block, where a single run had to be cut
+
+    Examples
+    --------
+    >>> y = np.array(["ice"] * 4 + ["sand"] * 6)
+    >>> runs = np.array(["a", "a", "b", "b"] + ["c"] * 6)
+    >>> for train, test in split_runs(y, runs, 2, np.random.default_rng(0)):
+    ...     print(train, test)
+    [2 3 8 9] [0 1 4 5 6]
+    [0 1 4 5] [2 3 7 8 9]
+    """
+    fold = fold_numbers(y, block_groups(y, groups, n_folds), n_folds, rng)
+    cut_runs = [np.flatnonzero(y == terrain) for terrain in single_run_classes(y, groups)]
+    for number in range(n_folds):
+        testing = fold == number
+        training = ~testing
+        for rows in cut_runs:
+            beside = np.flatnonzero(testing[rows])
+            for shift in range(-gap, gap + 1):
+                neighbours = beside + shift
+                training[rows[neighbours[(neighbours >= 0) & (neighbours < len(rows))]]] = False
+        yield np.flatnonzero(training), np.flatnonzero(testing)

@@ -1,0 +1,1 @@
+"""From a terrain to the slip to aim for."""

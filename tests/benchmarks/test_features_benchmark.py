@@ -1,0 +1,117 @@
+"""How long features take, beside tsfel on the same windows: ``pytest tests/benchmarks --benchmark-enable``.
+
+Calls of one group do the same windows, so that their times can be divided; all of it runs on one core.
+"""
+
+import numpy as np
+import pytest
+import tsfel
+
+from features.extractor import FeatureExtractor
+from features.stream import WindowStream
+from features.windows import WindowRule, cut_windows, layout_of
+from pipelines.datasets import load_runs
+from terrain.records import RunLog, Stream
+
+N_COMPARED = 8
+"""tsfel takes about a tenth of a second a window."""
+
+
+def synthetic_run(duration_s=60.0):
+    rng = np.random.default_rng(0)
+    streams = {}
+    for name, rate_hz, channels in (
+        ("imu", 100.0, [f"gyro_{a}_radps" for a in "xyz"] + [f"accel_{a}_mps2" for a in "xyz"]),
+        ("wheels", 6.5, ["speed_left_mps", "speed_right_mps", "current_left_a", "current_right_a"]),
+    ):
+        time_s = np.arange(0, duration_s, 1 / rate_hz)
+        streams[name] = Stream(time_s, rng.normal(0.5, 0.1, (time_s.size, len(channels))), tuple(channels))
+    return RunLog("noise", "husky", streams)
+
+
+@pytest.fixture(scope="module")
+def borealtc_windows(datasets_dir):
+    return cut_windows(load_runs(datasets_dir / "borealtc")).windows
+
+
+@pytest.fixture(params=["synthetic", "borealtc"])
+def compared(request):
+    """Windows to compare on, and the name of the group."""
+    if request.param == "synthetic":
+        windows = cut_windows([synthetic_run()]).windows
+    else:
+        windows = request.getfixturevalue("borealtc_windows")
+    rows = np.linspace(0, len(windows) - 1, N_COMPARED).astype(int)
+    return windows[rows], f"{N_COMPARED} windows, {request.param}"
+
+
+def warmed_up(windows):
+    extractor = FeatureExtractor().fit(windows)
+    extractor.transform(windows[:1])
+    return extractor
+
+
+def report(benchmark, n_windows, n_features):
+    benchmark.extra_info["n_features"] = n_features
+    if benchmark.stats:  # absent where benchmarks are off
+        benchmark.extra_info["ms_per_window"] = 1e3 * benchmark.stats.stats.median / n_windows
+
+
+def test_ours_all_at_once(benchmark, compared):
+    windows, benchmark.group = compared
+    table = benchmark(warmed_up(windows).transform, windows)
+    report(benchmark, *table.shape)
+
+
+def test_ours_one_by_one(benchmark, compared):
+    windows, benchmark.group = compared
+    extractor = warmed_up(windows)
+    rows = benchmark(lambda: [extractor.transform(windows[i]) for i in range(len(windows))])
+    report(benchmark, len(rows), rows[0].shape[1])
+
+
+@pytest.mark.filterwarnings("ignore:Precision loss occurred in moment calculation:RuntimeWarning")
+def test_tsfel_statistical_and_spectral(benchmark, compared):
+    windows, benchmark.group = compared
+    domains = tsfel.get_features_by_domain()
+    chosen = {name: domains[name] for name in ("statistical", "spectral")}
+    arrays = [
+        (values[i].T, windows.rate_hz[name])
+        for name, values in windows.values.items()
+        for i in range(len(windows))
+    ]
+
+    def extract():
+        return [
+            tsfel.time_series_features_extractor(chosen, array, fs=rate_hz, verbose=0)
+            for array, rate_hz in arrays
+        ]
+
+    tables = benchmark.pedantic(extract, rounds=3)
+    report(benchmark, len(windows), sum(table.shape[1] for table in tables) // len(windows))
+
+
+@pytest.mark.benchmark(group="all windows of borealtc, bar 0.5 s")
+def test_all_windows_of_borealtc(benchmark, borealtc_windows):
+    table = benchmark(warmed_up(borealtc_windows).transform, borealtc_windows)
+    report(benchmark, *table.shape)
+    assert len(table) > 1600
+
+
+@pytest.mark.benchmark(group="one minute, sample by sample")
+def test_windows_of_a_minute_sample_by_sample(benchmark):
+    run = synthetic_run()
+    layout = layout_of([run])
+    samples = sorted(
+        (time_s, name, row.tolist())
+        for name, stream in run.streams.items()
+        for time_s, row in zip(stream.time_s.tolist(), stream.values, strict=True)
+    )
+
+    def cut():
+        stream = WindowStream(WindowRule(), layout)
+        return [window for time_s, name, row in samples for window in stream.push(name, time_s, row)]
+
+    found = benchmark(cut)
+    benchmark.extra_info["n_samples"] = len(samples)
+    assert len(found) == 30

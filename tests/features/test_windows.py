@@ -1,0 +1,228 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from features.windows import (
+    DROP_REASONS,
+    Layout,
+    SteadyMotion,
+    WindowRule,
+    cut_at,
+    cut_windows,
+    label_windows,
+    layout_of,
+    regular_starts,
+)
+from terrain.errors import ConfigError, DataError
+from terrain.records import Label, RunLog, Stream
+
+WHEELS = ("speed_left_mps", "speed_right_mps")
+ANY_MOTION = WindowRule(steady=None)
+
+
+def make_run(run_id="a", imu_hz=50.0, wheels_hz=10.0, duration_s=8.0, speed_mps=1.0, **changes):
+    """IMU whose values are the sample's own number, wheels at a constant speed."""
+    imu_s, wheels_s = np.arange(0, duration_s, 1 / imu_hz), np.arange(0, duration_s, 1 / wheels_hz)
+    streams = {
+        "imu": Stream(imu_s, np.arange(imu_s.size, dtype=float)[:, None], ("accel_z_mps2",)),
+        "wheels": Stream(wheels_s, np.full((wheels_s.size, 2), speed_mps), WHEELS),
+    }
+    return RunLog(run_id, "husky", streams | changes, (Label(0.0, duration_s, "grass"),))
+
+
+def replaced(stream, rows, **fields):
+    """Return a stream without some rows, or with other values in them."""
+    time_s, values = stream.time_s.copy(), stream.values.copy()
+    if "values" in fields:
+        values[rows] = fields["values"]
+        return Stream(time_s, values, stream.channels)
+    return Stream(np.delete(time_s, rows), np.delete(values, rows, axis=0), stream.channels)
+
+
+@settings(deadline=None)
+@given(
+    length_s=st.floats(0.5, 3.0),
+    stride_s=st.floats(0.05, 3.0),
+    imu_hz=st.floats(20.0, 200.0),
+    wheels_hz=st.floats(9.0, 40.0),
+)
+def test_a_window_holds_the_first_samples_at_or_after_its_start(length_s, stride_s, imu_hz, wheels_hz):
+    run = make_run(imu_hz=imu_hz, wheels_hz=wheels_hz)
+    cut = cut_windows([run], WindowRule(length_s, stride_s, steady=None))
+    layout = layout_of([run])
+    assert not cut.dropped
+    assert len(cut.windows)
+    np.testing.assert_allclose(np.diff(cut.windows.start_s), stride_s)
+    for name, values in cut.windows.values.items():
+        n = layout.n_samples(name, length_s)
+        assert values.shape[2] == n
+        assert n <= length_s * layout.rate_hz[name] + 1e-3 < n + 1
+    number = cut.windows.values["imu"][:, 0]
+    assert (np.diff(number, axis=1) == 1).all()  # every sample once, none made up
+    first_s = run.streams["imu"].time_s[number[:, 0].astype(int)]
+    assert (first_s >= cut.windows.start_s - 1e-6).all()
+    assert (first_s < cut.windows.start_s + 1 / imu_hz + 1e-6).all()
+
+
+def test_windows_without_overlap_hold_every_sample_of_a_whole_number_of_windows_once():
+    run = make_run(duration_s=8.0)
+    number = cut_windows([run], ANY_MOTION).windows.values["imu"].ravel()
+    np.testing.assert_array_equal(number, np.arange(400))
+
+
+def test_the_order_of_runs_and_of_channels_changes_nothing():
+    one, two = make_run("a"), make_run("b", speed_mps=0.5)
+    wheels = one.streams["wheels"]
+    swapped = make_run("a", wheels=Stream(wheels.time_s, wheels.values[:, ::-1], wheels.channels[::-1]))
+    layout = layout_of([one])
+    there, back = (cut_windows(runs, layout=layout).windows for runs in ([one, two], [two, swapped]))
+    rows = np.concatenate([np.flatnonzero(back.run_id == run_id) for run_id in "ab"])
+    for name in there.values:
+        np.testing.assert_array_equal(there.values[name], back.values[name][rows])
+
+
+@pytest.mark.parametrize(
+    ("stream", "change", "reason"),
+    [
+        ("imu", lambda s: replaced(s, [120]), "gap"),
+        ("imu", lambda s: replaced(s, [100, 101]), "gap"),  # at the very start of the window
+        ("imu", lambda s: replaced(s, [199]), "gap"),  # between the last two samples
+        ("imu", lambda s: replaced(s, slice(120, 170)), "gap"),
+        ("imu", lambda s: replaced(s, [199], values=np.nan), "not finite"),
+        ("wheels", lambda s: replaced(s, [20], values=np.inf), "not finite"),
+        ("wheels", lambda s: replaced(s, slice(20, 40), values=0.0), "not moving"),
+        ("wheels", lambda s: replaced(s, slice(20, 30), values=0.5), "not steady"),
+    ],
+)
+def test_a_fault_drops_the_windows_that_it_touches_and_no_other(stream, change, reason):
+    run = make_run()
+    faulty = make_run(**{stream: change(run.streams[stream])})
+    cut = cut_windows([faulty])
+    assert cut.windows.start_s.tolist() == [0.0, 4.0, 6.0]
+    assert cut.dropped == {reason: 1}
+    assert reason in DROP_REASONS
+
+
+def test_one_lost_sample_of_jittered_stamps_is_a_gap_and_jitter_is_none():
+    rng = np.random.default_rng(0)
+    time_s = np.arange(400) / 50 + np.append(0.0, rng.uniform(-0.005, 0.005, 399))
+    imu = Stream(time_s, np.ones((400, 1)), ("accel_z_mps2",))
+    assert not cut_windows([make_run(imu=imu)]).dropped
+    assert cut_windows([make_run(imu=replaced(imu, [250]))]).dropped == {"gap": 1}
+
+
+@pytest.mark.parametrize("factor", [0.7, 1.5])
+def test_a_stretch_at_another_rate_is_no_window_of_this_length(factor):
+    imu = make_run(duration_s=20.0).streams["imu"]
+    steps = np.full(len(imu), 0.02)
+    steps[300:500] = 0.02 / factor
+    slow = Stream(np.cumsum(steps) - 0.02, imu.values, imu.channels)
+    cut = cut_windows([make_run(duration_s=20.0, imu=slow)])
+    assert set(cut.dropped) == {"wrong rate"}
+    spans = [np.ptp(slow.time_s[w.astype(int)]) for w in cut.windows.values["imu"][:, 0]]
+    assert max(abs(span - 1.98) for span in spans) <= 0.2 + 0.02
+
+
+def test_steady_motion_is_judged_on_means_of_the_faster_wheel():
+    rng = np.random.default_rng(1)
+    time_s = np.arange(0, 8, 0.1)
+
+    def dropped(left, right):
+        noise = 0.05 * rng.standard_normal((80, 2))
+        wheels = Stream(time_s, np.stack([left, right], axis=1) + noise, WHEELS)
+        return dict(cut_windows([make_run(wheels=wheels)]).dropped)
+
+    still, fast = np.zeros(80), np.ones(80)
+    rule = SteadyMotion()
+    assert dropped(still + 0.02, fast) == {}  # turning about one wheel is motion
+    assert dropped(fast, fast + 0.8 * rule.max_accel_mps2 * time_s) == {}
+    assert dropped(fast, fast + 1.3 * rule.max_accel_mps2 * time_s) == {"not steady": 4}
+    assert dropped(-fast, -fast - 1.3 * rule.max_accel_mps2 * time_s) == {"not steady": 4}
+
+
+def test_nan_in_slip_is_a_value_and_drops_nothing():
+    slip = Stream(np.arange(0, 8, 0.1), np.full((80, 1), np.nan), ("slip_left_ratio",))
+    cut = cut_windows([make_run(slip=slip)])
+    assert len(cut.windows) == 4
+    assert np.isnan(cut.windows.values["slip"]).all()
+
+
+def test_a_window_across_a_boundary_of_labels_has_no_label():
+    run = RunLog("a", "husky", make_run().streams, (Label(0, 3, "ice"), Label(3, 8, "snow")))
+    assert label_windows(run, np.array([0.0, 1.0, 1.5, 3.0, 6.0, 6.5]), 2.0).tolist() == [
+        *("ice", "ice", "", "snow", "snow", ""),
+    ]
+    assert list(cut_windows([run]).windows.terrain) == ["ice", "", "snow", "snow"]
+
+
+@given(
+    start_s=st.floats(-1e3, 1e3),
+    n=st.integers(0, 50),
+    length_s=st.floats(0.1, 5),
+    step_s=st.floats(0.05, 5),
+)
+def test_regular_starts_are_all_that_fit(start_s, n, length_s, step_s):
+    end_s = start_s + n * step_s + length_s * 0.999
+    starts_s = regular_starts(start_s, end_s, length_s, step_s)
+    assert (starts_s + length_s <= end_s + 2e-6).all()
+    following_s = start_s + step_s * len(starts_s)
+    assert following_s + length_s > end_s - 1e-6
+
+
+def test_chosen_starts_replace_the_regular_ones_and_incomplete_windows_vanish_uncounted():
+    run = make_run()
+    cut = cut_windows([run], ANY_MOTION, starts_s={"a": np.array([0.25, 3.0, 6.5])})
+    assert cut.windows.start_s.tolist() == [0.25, 3.0]
+    assert cut.dropped == {}
+    assert cut_at(run.streams, np.array([6.5]), ANY_MOTION, layout_of([run]))[1].tolist() == ["incomplete"]
+
+
+@pytest.mark.parametrize("name", ["length_s", "stride_s", "max_gap_periods"])
+@pytest.mark.parametrize("value", [0.0, -1.0, np.nan, np.inf])
+def test_a_rule_refuses_what_is_not_positive(name, value):
+    with pytest.raises(ConfigError, match=f"window {name} is {value}; it must be positive and finite"):
+        WindowRule(**{name: value})
+
+
+def test_runs_that_do_not_fit_together_are_refused_by_name():
+    run = make_run()
+    imu = run.streams["imu"]
+    turned = make_run("b", imu=Stream(imu.time_s, imu.values, ("accel_x_mps2",)))
+    with pytest.raises(DataError, match="run b has no stream 'imu', which other runs have"):
+        layout_of([run, RunLog("b", "husky", {"wheels": run.streams["wheels"]})])
+    with pytest.raises(DataError, match=r"run b, stream 'imu': channel 'accel_\w_mps2' is not in all runs"):
+        layout_of([run, turned])
+    with pytest.raises(DataError, match="run c, stream 'imu' runs at 55 Hz where 50 Hz is expected"):
+        cut_windows([run, make_run("b"), make_run("c", imu_hz=55.0)])
+    with pytest.raises(DataError, match="run b, stream 'imu': channel 'accel_z_mps2' is missing"):
+        cut_windows([turned], layout=layout_of([run]))
+    with pytest.raises(DataError, match=r"run a lasts 1\.00 s, shorter than a window of 2 s"):
+        cut_windows([make_run(duration_s=1.0)])
+    with pytest.raises(DataError, match="holds 3 samples of stream 'wheels' at 10 Hz; at least 4"):
+        cut_windows([run], WindowRule(0.3))
+    with pytest.raises(DataError, match="steady motion cannot be judged without wheel speeds"):
+        cut_windows([RunLog("a", "husky", {"imu": imu})])
+    with pytest.raises(DataError, match="there is no run"):
+        layout_of([])
+
+
+def test_streams_that_do_not_overlap_give_one_clear_sentence():
+    run = make_run()
+    wheels = run.streams["wheels"]
+    late = Stream(wheels.time_s + 100, wheels.values, wheels.channels)
+    with pytest.raises(DataError, match=r"run a lasts 0\.00 s"):
+        cut_windows([make_run(wheels=late)])
+
+
+def test_short_runs_can_be_skipped_and_are_counted():
+    cut = cut_windows([make_run("a"), make_run("b", duration_s=1.0)], skip_short=True)
+    assert cut.dropped == {"run too short": 1}
+    assert set(cut.windows.run_id) == {"a"}
+    nothing = cut_windows([make_run("b", duration_s=1.0)], skip_short=True).windows
+    assert len(nothing) == 0
+    assert nothing.values["imu"].shape == (0, 1, 100)
+
+
+def test_rates_near_a_whole_number_do_not_lose_a_sample():
+    assert Layout({"imu": ("accel_z_mps2",)}, {"imu": 99.9999}).n_samples("imu", 2.0) == 200

@@ -1,0 +1,100 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from terrain.classify.folds import block_groups, fold_numbers, single_run_classes, split_runs
+from terrain.errors import DataError
+
+
+def draw_runs(n_runs, rng, dtype=str):
+    """Return the class and the run of each window; runs are of unequal length and stand in any order."""
+    y, groups = [], []
+    names = [(terrain, run) for terrain, n in n_runs.items() for run in range(n)]
+    for i in rng.permutation(len(names)):
+        terrain, run = names[i]
+        n = int(rng.integers(8, 60))
+        y += [terrain] * n
+        groups += [f"{terrain}_{run}"] * n
+    return np.array(y, dtype=dtype), np.array(groups, dtype=dtype)
+
+
+@settings(deadline=None, max_examples=80)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    n_runs=st.lists(st.integers(1, 9), min_size=2, max_size=5),
+    n_folds=st.integers(2, 5),
+    gap=st.integers(0, 2),
+    dtype=st.sampled_from([str, object]),
+)
+def test_laws_of_folds(seed, n_runs, n_folds, gap, dtype):
+    rng = np.random.default_rng(seed)
+    y, groups = draw_runs({f"class {i}": n for i, n in enumerate(n_runs)}, rng, dtype)
+    if len(np.unique(block_groups(y, groups, n_folds))) < n_folds:
+        return
+    alone = single_run_classes(y, groups)
+    assert alone == [f"class {i}" for i, n in enumerate(n_runs) if n == 1]
+    tested = np.zeros(len(y), dtype=int)
+    runs_of_class = {c: [] for c in np.unique(y)}
+    for train, test in split_runs(y, groups, n_folds, rng, gap):
+        tested[test] += 1
+        shared = set(groups[train]) & set(groups[test])
+        assert shared <= {f"{c}_0" for c in alone}
+        left_out = np.setdiff1d(np.arange(len(y)), np.union1d(train, test))
+        assert set(y[left_out]) <= set(alone)
+        assert set(y[train]) == set(y)
+        for c in alone:
+            rows = np.flatnonzero(y == c)
+            place = np.searchsorted(rows, test[y[test] == c])
+            assert (np.diff(place) == 1).all()  # one contiguous block
+            expected = set(range(place[0] - gap, place[-1] + gap + 1)) - set(place)
+            expected &= set(range(len(rows)))
+            assert {int(np.searchsorted(rows, row)) for row in left_out[y[left_out] == c]} == expected
+        for c, counts in runs_of_class.items():
+            counts.append(len(set(groups[test][y[test] == c])))
+    assert (tested == 1).all()
+    for counts in runs_of_class.values():
+        assert max(counts) - min(counts) <= 1  # every class is dealt evenly
+
+
+def test_different_seeds_give_different_folds_though_runs_are_of_unequal_length():
+    y, groups = draw_runs({"ice": 9, "snow": 11, "sand": 7}, np.random.default_rng(0))
+    runs = np.unique(groups)
+    together = np.zeros((40, len(runs), len(runs)), dtype=bool)
+    for seed in range(40):
+        fold = fold_numbers(y, groups, 5, np.random.default_rng(seed))
+        of_run = np.array([fold[groups == run][0] for run in runs])
+        together[seed] = of_run[:, None] == of_run
+    assert len({t.tobytes() for t in together}) == 40
+    share = together.mean(axis=0)[np.triu_indices(len(runs), 1)]
+    assert share.max() < 0.6  # no two runs always meet
+    np.testing.assert_array_equal(
+        fold_numbers(y, groups, 5, np.random.default_rng(7)),
+        fold_numbers(y, groups, 5, np.random.default_rng(7)),
+    )
+
+
+def test_folds_are_of_similar_size():
+    y, groups = draw_runs({"ice": 10, "snow": 15, "sand": 12}, np.random.default_rng(1))
+    sizes = [
+        np.bincount(fold_numbers(y, groups, 5, np.random.default_rng(seed)), minlength=5)
+        for seed in range(20)
+    ]
+    assert np.max(sizes) < 1.7 * len(y) / 5
+    assert np.min(sizes) > 0.4 * len(y) / 5
+
+
+def test_classes_and_runs_may_be_numbers():
+    y, groups = np.repeat([3, 3, 8], 6), np.repeat([0, 1, 2], 6)
+    assert single_run_classes(y, groups) == [8]
+    for train, test in split_runs(y, groups, 2, np.random.default_rng(0)):
+        assert set(y[train]) == set(y[test]) == {3, 8}
+
+
+def test_what_cannot_be_split_is_refused():
+    rng = np.random.default_rng(0)
+    with pytest.raises(DataError, match="all windows are 'ice': a classifier needs at least two classes"):
+        next(split_runs(np.array(["ice"] * 4), np.array(list("aabb")), 2, rng))
+    y, groups = np.repeat(["ice", "ice", "snow", "snow"], 3), np.repeat(list("abcd"), 3)
+    with pytest.raises(DataError, match="4 runs are fewer than 5 folds"):
+        next(split_runs(y, groups, 5, rng))

@@ -1,0 +1,173 @@
+import numpy as np
+import pytest
+from scipy.special import expit
+from sklearn.base import clone
+from sklearn.utils.estimator_checks import parametrize_with_checks
+
+from terrain.classify import svm
+from terrain.classify.svm import CANDIDATES, GroupedSVC
+from terrain.errors import DataError
+
+TERRAINS = np.array(["ice", "sand", "snow"])
+
+
+def draw_runs(n_runs=4, n_windows=12, run_std=0.3, seed=0, n_features=6):
+    """Return features, classes and runs; a class has its own mean, and so has, less so, a run."""
+    rng = np.random.default_rng(seed)
+    terrain = np.repeat(np.arange(len(TERRAINS)), n_runs)
+    centre = np.random.default_rng(99).normal(0, 1.5, (len(TERRAINS), n_features))
+    of_run = centre[terrain] + rng.normal(0, run_std, (len(terrain), n_features))
+    X = np.repeat(of_run, n_windows, axis=0) + rng.standard_normal((len(terrain) * n_windows, n_features))
+    runs = np.repeat(np.arange(len(terrain)), n_windows)
+    return X, TERRAINS[terrain[runs]], runs
+
+
+EXPECTED_FAILURES = {
+    "check_classifiers_one_label": "one class is refused, and a constant answer never given",
+    "check_fit2d_1sample": "one class is refused with DataError, which the command line prints",
+}
+
+
+@parametrize_with_checks(
+    [GroupedSVC(candidates=((10.0, 0.4, 100.0),))], expected_failed_checks=lambda _: EXPECTED_FAILURES
+)
+@pytest.mark.filterwarnings("ignore::sklearn.exceptions.SkipTestWarning")
+def test_contract_of_scikit_learn(estimator, check):
+    check(estimator)
+
+
+@pytest.mark.parametrize("terrains", [["ice", "snow"], ["ice", "sand", "snow"]])
+def test_probabilities_sum_to_one_and_agree_with_the_answer(terrains):
+    X, y, runs = draw_runs()
+    kept = np.isin(y, terrains)
+    model = GroupedSVC().fit(X[kept], y[kept], groups=runs[kept])
+    new, truth, _ = draw_runs(seed=1)
+    probability = model.predict_proba(new)
+    assert model.classes_.tolist() == terrains
+    assert probability.shape == (len(new), len(terrains))
+    np.testing.assert_allclose(probability.sum(axis=1), 1.0)
+    assert (probability > 0).all()
+    np.testing.assert_array_equal(model.classes_[probability.argmax(axis=1)], model.predict(new))
+    known = np.isin(truth, terrains)
+    assert np.mean(model.predict(new)[known] == truth[known]) > 0.85
+
+
+def test_the_choice_is_the_best_held_out_candidate_and_costs_few_fits():
+    X, y, runs = draw_runs()
+    model = GroupedSVC().fit(X, y, groups=runs)
+    assert model.n_inner_fits_ == 3 * len(CANDIDATES) <= 20
+    assert len(model.inner_scores_) == len(CANDIDATES)
+    assert model.best_ == CANDIDATES[int(model.inner_scores_.argmax())]
+    hopeless = (1e-6, 1e-6, 100.0)
+    for candidates in ([hopeless, CANDIDATES[3]], [CANDIDATES[3], hopeless]):
+        assert GroupedSVC(candidates).fit(X, y, groups=runs).best_ == CANDIDATES[3]
+
+
+class SpyOnPreparation:
+    """Stands in for the scaling and selection, and writes down which runs it sees (in column 0)."""
+
+    def __init__(self, make, seen):
+        self.pipeline, self.seen = make, seen
+
+    def fit_transform(self, X, y):
+        self.fitted = set(X[:, 0].astype(int))
+        self.seen.append((self.fitted, set()))
+        return self.pipeline.fit_transform(X, y)
+
+    def transform(self, X):
+        self.seen[-1] = (self.fitted, set(X[:, 0].astype(int)))
+        return self.pipeline.transform(X)
+
+
+def test_inner_folds_never_split_a_run(monkeypatch):
+    X, y, runs = draw_runs(n_runs=5)
+    X[:, 0] = runs
+    seen, original = [], svm._preparation
+    monkeypatch.setattr(svm, "_preparation", lambda share: SpyOnPreparation(original(share), seen))
+    GroupedSVC().fit(X, y, groups=runs)
+    *inner, (final, held_out_at_the_end) = seen
+    assert len(inner) == 3 * len({candidate.percentile for candidate in CANDIDATES})
+    for fitted, held_out in inner:
+        assert held_out
+        assert fitted.isdisjoint(held_out)
+        assert fitted | held_out == set(runs)
+    assert final == set(runs)
+    assert not held_out_at_the_end
+
+
+def test_labels_that_belong_to_runs_alone_give_scores_of_chance():
+    scores, split = [], []
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        runs = np.repeat(np.arange(24), 8)
+        y = np.array(["ice", "snow"])[rng.permutation(np.arange(24) % 2)][runs]
+        X = rng.normal(0, 3, (24, 6))[runs] + 0.3 * rng.standard_normal((192, 6))
+        candidates = CANDIDATES[3:4]  # the best of many would be above chance by luck
+        scores.append(GroupedSVC(candidates, seed=seed).fit(X, y, groups=runs).inner_scores_[0])
+        split.append(GroupedSVC(candidates, seed=seed).fit(X, y).inner_scores_[0])
+    # 24 runs are 24 coin tosses: a standard deviation of 0.10 for one, of 0.04 for the mean of six.
+    assert abs(np.mean(scores) - 0.5) < 0.13
+    assert np.mean(split) > 0.95  # the test can fail: folds that split runs look perfect
+
+
+def test_probabilities_are_as_sure_as_they_are_right():
+    rng = np.random.default_rng(0)
+
+    def draw(n):
+        y = rng.integers(0, 2, n)
+        return rng.normal(0, 1, (n, 3)) + np.array([1.2, 0.0, 0.0]) * y[:, None], y
+
+    X, y = draw(900)
+    new, truth = draw(6000)
+    model = GroupedSVC(((1.0, 0.2, 100.0), (10.0, 0.4, 100.0))).fit(X, y)
+    probability = model.predict_proba(new)
+    sure, right = probability.max(axis=1), model.predict(new) == truth
+    parts = np.array_split(np.argsort(sure), 15)
+    ece = sum(len(part) / len(sure) * abs(sure[part].mean() - right[part].mean()) for part in parts)
+    assert ece < 0.06  # of which 0.02 is the chance of 400 samples a bin
+    posterior = expit(1.2 * new[:, 0] - 0.72)
+    assert np.mean(np.abs(posterior - probability[:, 1])) < 0.1
+    uncalibrated = svm.softmax(model._decisions(new) / 0.2, axis=1).max(axis=1)
+    assert abs(uncalibrated.mean() - right.mean()) > 3 * abs(sure.mean() - right.mean())
+
+
+def test_fit_is_deterministic_and_clone_learns_the_same():
+    X, y, runs = draw_runs()
+    models = [GroupedSVC(seed=3).fit(X, y, groups=runs) for _ in range(2)]
+    models.append(clone(models[0]).fit(X, y, groups=runs.astype(str)))
+    for model in models[1:]:
+        np.testing.assert_array_equal(model.predict_proba(X), models[0].predict_proba(X))
+
+
+def test_features_that_are_missing_constant_or_wild_do_no_harm():
+    X, y, runs = draw_runs()
+    new, truth, _ = draw_runs(seed=1)
+    clean = np.mean(GroupedSVC().fit(X, y, groups=runs).predict(new) == truth)
+    extra = np.full((len(X), 2), [np.nan, 7.0])
+    X[::7, 1] = np.nan
+    model = GroupedSVC().fit(np.hstack([X, extra]), y, groups=runs)
+    faulty = np.hstack([new, extra])
+    faulty[:, 2][::5] = np.nan
+    faulty[3, 3] = 1e12
+    assert np.mean(model.predict(faulty) == truth) > clean - 0.08
+    assert np.isfinite(model.predict_proba(faulty)).all()
+
+
+def test_a_class_with_a_single_run_is_learned_all_the_same():
+    X, y, runs = draw_runs()
+    kept = (y != "sand") | (runs == runs[y == "sand"][0])
+    model = GroupedSVC().fit(X[kept], y[kept], groups=runs[kept])
+    assert model.classes_.tolist() == TERRAINS.tolist()
+    assert np.mean(model.predict(X[y == "sand"]) == "sand") > 0.5
+
+
+def test_what_cannot_be_learned_is_refused():
+    X, y, runs = draw_runs()
+    with pytest.raises(DataError, match="all windows are 'ice': a classifier needs at least two classes"):
+        GroupedSVC().fit(X[y == "ice"], y[y == "ice"])
+    few = np.r_[np.flatnonzero(y == "ice"), np.flatnonzero(y == "snow")[:1]]
+    with pytest.raises(DataError, match="there is one window of class 'snow'; at least 2 are needed"):
+        GroupedSVC().fit(X[few], y[few], groups=runs[few])
+    both = np.r_[np.flatnonzero(y == "ice")[:2], np.flatnonzero(y == "snow")[:2]]
+    with pytest.raises(DataError, match="too few to hold some of them out"):
+        GroupedSVC().fit(X[both], y[both], groups=np.array(list("aabb")))

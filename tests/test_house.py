@@ -1,0 +1,128 @@
+"""The rules of the house: who imports whom, what a wheel carries, what README promises."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+HEAVY = ("numpy", "pandas", "sklearn", "scipy", "numba", "mlflow", "torch", "matplotlib", "pyarrow")
+
+
+def test_imports_follow_the_arrows():
+    done = subprocess.run(
+        [sys.executable, "-c", "from importlinter.cli import lint_imports_command as c; c()", "--no-cache"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    kept = re.search(r"Contracts: (\d+) kept, 0 broken", done.stdout)
+    contracts = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
+    assert kept, done.stdout
+    assert int(kept[1]) == len(contracts)
+
+
+def test_help_loads_nothing_heavy():
+    code = (
+        "import sys; sys.argv = ['terrain', '--help']\n"
+        "from pipelines.cli import main\n"
+        "try:\n    main()\nexcept SystemExit as end:\n    assert not end.code\n"
+        "import json; print('LOADED', json.dumps(sorted({name.split('.')[0] for name in sys.modules})))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
+    assert "quickstart" in done.stdout
+    loaded = json.loads(done.stdout.rpartition("LOADED ")[2])
+    assert not set(HEAVY) & set(loaded)
+
+
+@pytest.fixture(scope="module")
+def installed_wheel(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("wheel")
+    subprocess.run(
+        [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(folder), str(ROOT)],
+        check=True,
+        capture_output=True,
+    )
+    (wheel,) = folder.glob("*.whl")
+    target = folder / "site"
+    subprocess.run(
+        [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--target", str(target), str(wheel)],
+        check=True,
+        capture_output=True,
+    )
+    return target
+
+
+def test_the_wheel_runs_elsewhere_with_its_yaml(installed_wheel, tmp_path):
+    environment = {**os.environ, "PYTHONPATH": str(installed_wheel)}
+    code = (
+        "import terrain, pipelines.cli\n"
+        "from terrain.robots import load_robot\n"
+        "from terrain.control.slip_table import load_slip_table\n"
+        "print(terrain.__file__, load_robot('husky').track_m, load_slip_table().fallback)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    place, track_m, fallback = done.stdout.split()
+    assert Path(place).is_relative_to(installed_wheel)
+    assert (float(track_m), fallback) == (0.5708, "unknown")
+    packaged = {file.name for file in (installed_wheel / "terrain" / "_data").rglob("*.yaml")}
+    assert packaged == {file.name for file in (ROOT / "data").rglob("*.yaml")}
+
+    for number, spread in (("a", 0.1), ("b", 0.5)):
+        lines = [f"{i / 50},{','.join([str(spread * ((i * 7919) % 13 - 6))] * 6)}" for i in range(200)]
+        run = tmp_path / "logs" / number.upper()
+        run.mkdir(parents=True)
+        (run / "imu_1.csv").write_text("time,wx,wy,wz,ax,ay,az\n" + "\n".join(lines))
+        pro = [f"{i / 10},1,1,0.5,0.5" for i in range(40)]
+        (run / "pro_1.csv").write_text("time,curL,curR,velL,velR\n" + "\n".join(pro))
+    terrain = str(installed_wheel / "bin" / "terrain")
+    command = [terrain, "import", "logs", "--out", "runs", "--json", "out.json"]
+    subprocess.run(command, cwd=tmp_path, env=environment, check=True, capture_output=True)
+    assert json.loads((tmp_path / "out.json").read_text())["run_ids"] == ["A_1", "B_1"]
+
+
+def test_readme_names_every_command_that_there_is():
+    done = subprocess.run(
+        [sys.executable, "-c", "from pipelines.cli import main; main()", "--help"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    commands = re.findall(r"^  ([a-z]+)  +\S", done.stdout.partition("Commands:")[2], flags=re.MULTILINE)
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert len(commands) >= 6
+    assert not [command for command in commands if f"terrain {command}" not in readme]
+
+
+def test_every_number_in_the_yaml_has_a_source():
+    import yaml
+
+    def bare_numbers(node: object, path: str) -> list[str]:
+        if isinstance(node, dict):
+            if node.get("source"):
+                return []
+            return [found for key, child in node.items() for found in bare_numbers(child, f"{path}/{key}")]
+        if isinstance(node, list):
+            return [found for i, child in enumerate(node) for found in bare_numbers(child, f"{path}/{i}")]
+        return [path] if isinstance(node, int | float) and not isinstance(node, bool) else []
+
+    files = sorted((ROOT / "data").rglob("*.yaml"))
+    assert files
+    content = {file.name: yaml.safe_load(file.read_text()) for file in files}
+    assert [found for name, node in content.items() for found in bare_numbers(node, name)] == []
