@@ -85,9 +85,9 @@ def slow_fast_split(samples: Samples) -> dict[str, Any]:
         for name, side in (("slow", slow), ("fast", fast)):
             time_s = sum(covered_s(windows.start_s[(run_id == run) & (y == terrain)], windows.length_s) for run in side)
             if len(side) < MIN_RUNS_A_SIDE:
-                reason = reason or f"{len(side)} {name} runs"
+                reason = reason or f"{name} runs: {len(side)}"
             elif time_s < MIN_TIME_A_SIDE_S:
-                reason = reason or f"{time_s:.0f} s of {name} runs"
+                reason = reason or f"{name} runs: {time_s:.0f} s"
         if reason:
             left_out[str(terrain)] = reason
             continue

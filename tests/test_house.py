@@ -126,3 +126,18 @@ def test_every_number_in_the_yaml_has_a_source():
     assert files
     content = {file.name: yaml.safe_load(file.read_text()) for file in files}
     assert [found for name, node in content.items() for found in bare_numbers(node, name)] == []
+
+
+def test_the_mapping_in_readme_is_accepted(tmp_path):
+    from terrain.logs.mapping import find_runs, load_mapping
+
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    (tmp_path / "mapping.yaml").write_text(re.search(r"```yaml\n(.*?)```", readme, flags=re.DOTALL)[1])
+    (tmp_path / "ICE").mkdir()
+    (tmp_path / "ICE" / "imu 1.csv").write_text("stamp,yaw rate\n0,90\n20,180\n")
+    (tmp_path / "ICE" / "wheels 1.csv").write_text("t,vl,vr\n0,3.6,7.2\n0.02,3.6,7.2\n")
+    (read,) = find_runs(tmp_path, load_mapping(tmp_path / "mapping.yaml"))
+    run = read(repair=False)
+    assert run.terrains == ("ICE",)
+    assert run.streams["imu"].values[:, 0] == pytest.approx([-1.5708, -3.1416], abs=1e-4)
+    assert run.streams["wheels"].values[0] == pytest.approx([1.0, 2.0])
