@@ -134,7 +134,17 @@ def crossval_command(
     from pipelines.screens import print_crossval, progress_bar
 
     settings = CrossvalSettings(
-        recipe.value, protocol.value, window, stride, steady, repeats, seed, _names(signals), extras, jobs
+        recipe.value,
+        protocol.value,
+        window,
+        stride,
+        steady,
+        repeats,
+        seed,
+        _names(signals),
+        extras,
+        jobs,
+        repair,
     )
     runs = load_runs(data, layout=layout.value, mapping=mapping, repair=repair, align=align)
     with progress_bar() as progress:
@@ -169,7 +179,7 @@ def train_command(
     from pipelines.train import train
 
     settings = CrossvalSettings(
-        recipe.value, "grouped", window, stride, steady, repeats, seed, _names(signals), False, jobs
+        recipe.value, "grouped", window, stride, steady, repeats, seed, _names(signals), False, jobs, repair
     )
     runs = load_runs(data, layout=layout.value, mapping=mapping, repair=repair, align=align)
     with progress_bar() as progress:
@@ -201,7 +211,8 @@ def predict_command(
 
     slip_table = load_slip_table(table)
     runs = load_runs(data, layout=layout.value, mapping=mapping, repair=repair, align=align)
-    result = {"model": model, "dataset": data.resolve().name, **predict(runs, load_model(model), slip_table)}
+    predicted = predict(runs, load_model(model), slip_table, skip_short=repair)
+    result = {"model": model, "dataset": data.resolve().name, **predicted}
     print_predictions(result, _console())
     _write_json(json_file, result)
 

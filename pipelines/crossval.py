@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -36,7 +37,8 @@ DEFAULT_REPEATS = {"grouped": 5, "leave-one-run-out": 1, "published": 5}
 class CrossvalSettings:
     """What to evaluate and how.
 
-    ``window_s`` and ``repeats`` default to what the protocol asks for (2 s; 1.7 s under ``published``).
+    ``window_s`` and ``repeats`` default to what the protocol asks for (2 s; 1.7 s under ``published``);
+    ``skip_short`` leaves out and counts runs shorter than a window instead of refusing them.
     """
 
     recipe: str = "svm"
@@ -49,12 +51,16 @@ class CrossvalSettings:
     signal_sets: tuple[str, ...] = SIGNAL_SETS
     extras: bool = True
     n_jobs: int = 0
+    skip_short: bool = False
 
     def __post_init__(self) -> None:
         if self.protocol not in PROTOCOLS:
             raise ConfigError(f"there is no protocol {self.protocol!r}; there are {', '.join(PROTOCOLS)}")
         if self.repeats is not None and self.repeats < 1:
             raise ConfigError(f"{self.repeats} repeats are none; at least 1 is needed")
+        for name in self.signal_sets:
+            if name not in SIGNAL_SETS:
+                raise ConfigError(f"unknown signal set {name!r}; there are {', '.join(SIGNAL_SETS)}")
 
     @property
     def rule(self) -> WindowRule:
@@ -80,7 +86,7 @@ def crossval(
     dict that JSON can hold
         ``protocol, recipe, window_s, n_windows, n_runs, accuracy, accuracy_ci, accuracy_spread,
         balanced_accuracy, macro_f1, per_class, confusion, classes, folds, per_run, vote_accuracy, ece,
-        reliability, dropped, notes`` and, with extras under ``grouped``, ``speed_only_accuracy``,
+        reliability, dropped, repaired, notes`` and, with extras under ``grouped``, ``speed_only_accuracy``,
         ``slow_fast`` and ``learning_curve``.
 
     Raises
@@ -110,6 +116,7 @@ def crossval(
         **summarise(pool(results, y), samples, settings.seed),
         "n_features": features.shape[1],
         "dropped": dict(samples.cut.dropped),
+        "repaired": dict(sum((Counter(run.dropped) for run in runs), Counter())),
         "notes": notes(samples, settings),
     }
     if settings.extras and settings.protocol == "grouped":
@@ -136,8 +143,9 @@ def crossval(
 
 def samples_of(runs: Sequence[RunLog], settings: CrossvalSettings) -> Samples:
     """Cut the windows that the protocol asks for."""
-    cut = published_samples if settings.protocol == "published" else grouped_samples
-    return cut(runs, settings.rule)
+    if settings.protocol == "published":
+        return published_samples(runs, settings.rule)
+    return grouped_samples(runs, settings.rule, skip_short=settings.skip_short)
 
 
 def notes(samples: Samples, settings: CrossvalSettings) -> list[str]:

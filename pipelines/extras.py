@@ -83,7 +83,9 @@ def slow_fast_split(samples: Samples) -> dict[str, Any]:
         fast = [run for run in runs if speeds[run] > np.median(speed)]
         reason = None
         for name, side in (("slow", slow), ("fast", fast)):
-            time_s = sum(covered_s(windows.start_s[(run_id == run) & (y == terrain)], windows.length_s) for run in side)
+            time_s = sum(
+                covered_s(windows.start_s[(run_id == run) & (y == terrain)], windows.length_s) for run in side
+            )
             if len(side) < MIN_RUNS_A_SIDE:
                 reason = reason or f"{name} runs: {len(side)}"
             elif time_s < MIN_TIME_A_SIDE_S:

@@ -8,12 +8,15 @@ from typing import Any
 import numpy as np
 
 from features.windows import cut_windows
+from pipelines.datasets import data_digest
 from pipelines.models import TerrainModel
 from terrain.control.slip_table import DRIVE_STATES, SlipTable
 from terrain.records import RunLog
 
 
-def predict(runs: Sequence[RunLog], model: TerrainModel, table: SlipTable) -> dict[str, Any]:
+def predict(
+    runs: Sequence[RunLog], model: TerrainModel, table: SlipTable, *, skip_short: bool = False
+) -> dict[str, Any]:
     """Predict every window that the model's own rule keeps.
 
     Parameters
@@ -21,6 +24,7 @@ def predict(runs: Sequence[RunLog], model: TerrainModel, table: SlipTable) -> di
     runs : run logs, labelled or not
     model : fitted recipe with the rule by which its windows are cut
     table : target slips
+    skip_short : leave out and count runs that are shorter than a window instead of refusing them
 
     Returns
     -------
@@ -28,6 +32,7 @@ def predict(runs: Sequence[RunLog], model: TerrainModel, table: SlipTable) -> di
         ``windows``: ``run_id, start_s, terrain, probability, target_slip`` (by drive state), ``status`` and
         ``slip_entry`` (the entry of the table, which is the fallback's where the terrain has none);
         ``accuracy`` over windows whose label the model knows, None where there are none;
+        ``taught_on_these_runs`` says that this accuracy is memory and no measure of skill;
         ``unknown_labels`` counts windows by labels that the model never saw; ``dropped`` and ``table``.
 
     Raises
@@ -36,7 +41,7 @@ def predict(runs: Sequence[RunLog], model: TerrainModel, table: SlipTable) -> di
         if a run lacks a channel or has another rate than the model was taught.
     """
     layout = model.recipe[0].layout_
-    cut = cut_windows(runs, model.rule, layout=layout)
+    cut = cut_windows(runs, model.rule, layout=layout, skip_short=skip_short)
     windows = cut.windows
     classes = np.asarray(model.recipe.classes_, dtype=str)
     probability = model.recipe.predict_proba(windows) if len(windows) else np.zeros((0, len(classes)))
@@ -65,6 +70,7 @@ def predict(runs: Sequence[RunLog], model: TerrainModel, table: SlipTable) -> di
         "classes": [str(c) for c in classes],
         "accuracy": float(np.mean(predicted[known] == label[known])) if known.any() else None,
         "n_judged": int(known.sum()),
+        "taught_on_these_runs": model.info.get("data_digest") == data_digest(runs),
         "unknown_labels": {str(name): int(count) for name, count in zip(strange, counts, strict=True)},
         "n_unknown_labels": int(counts.sum()),
         "dropped": dict(cut.dropped),

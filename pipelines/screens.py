@@ -19,15 +19,21 @@ MAX_ROWS = 12
 def progress_bar() -> Iterator[evaluation.Progress]:
     """Show one bar a task on stderr; give the function that moves them."""
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
-    with Progress(*columns, console=Console(stderr=True)) as bars:
-        tasks: dict[str, TaskID] = {}
+    bars = Progress(*columns, console=Console(stderr=True))
+    tasks: dict[str, TaskID] = {}
 
-        def show(task: str, done: int, total: int) -> None:
-            if task not in tasks:
-                tasks[task] = bars.add_task(task, total=total)
-            bars.update(tasks[task], completed=done, total=total)
+    def show(task: str, done: int, total: int) -> None:
+        if not tasks:
+            bars.start()  # not before: data that are refused at once are one line on stderr
+        if task not in tasks:
+            tasks[task] = bars.add_task(task, total=total)
+        bars.update(tasks[task], completed=done, total=total)
 
+    try:
         yield show
+    finally:
+        if tasks:
+            bars.stop()
 
 
 def percent(value: float | None) -> str:
@@ -125,8 +131,11 @@ def print_predictions(result: dict[str, Any], console: Console) -> None:
             f"target slips from the table {result['table_name']!r} are unestimated: nobody measured them"
         )
     if result["accuracy"] is not None:
+        caution = (
+            ", on runs it was taught: memory, no measure of skill" if result["taught_on_these_runs"] else ""
+        )
         console.print(
-            f"accuracy {percent(result['accuracy'])} over {result['n_judged']} labelled windows",
+            f"accuracy {percent(result['accuracy'])} over {result['n_judged']} labelled windows{caution}",
             highlight=False,
         )
     for name, count in result["unknown_labels"].items():

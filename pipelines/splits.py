@@ -54,9 +54,9 @@ class Samples(NamedTuple):
     gap: int
 
 
-def grouped_samples(runs: Sequence[RunLog], rule: WindowRule) -> Samples:
+def grouped_samples(runs: Sequence[RunLog], rule: WindowRule, *, skip_short: bool = False) -> Samples:
     """Cut windows by the rule, labelled ones only; the group of a window is its run."""
-    cut = labelled(cut_windows(runs, rule))
+    cut = labelled(cut_windows(runs, rule, skip_short=skip_short))
     gap = int(np.ceil(rule.length_s / rule.step_s))
     return Samples(cut, cut.windows.run_id, gap)
 
@@ -64,6 +64,9 @@ def grouped_samples(runs: Sequence[RunLog], rule: WindowRule) -> Samples:
 def labelled(cut: WindowCut) -> WindowCut:
     """Keep the windows that lie under one label; the others are counted as ``no single label``."""
     known = cut.windows.terrain != ""
+    if not len(known):
+        reasons = ", ".join(f"{n} {reason}" for reason, n in sorted(cut.dropped.items()))
+        raise DataError(f"not one window is left: {reasons or 'no run is long enough'}")
     if not known.any():
         raise DataError("no window has a terrain label: nothing can be learned or judged")
     if known.all():
@@ -147,7 +150,7 @@ def folds_of(samples: Samples, protocol: str, repeats: int, seed: int) -> list[F
 def _leave_one_out(y: Array, run_id: Array, gap: int) -> list[Fold]:
     alone = single_run_classes(y, run_id)
     if len(np.unique(y)) < 2:
-        raise DataError(f"all windows are {y[0]!r}: a classifier needs at least two classes")
+        raise DataError(f"all windows are {str(y[0])!r}: a classifier needs at least two classes")
     group = block_groups(y, run_id, N_FOLDS)
     folds = []
     for number, name in enumerate(dict.fromkeys(group)):
@@ -166,7 +169,7 @@ def _stratified_partitions(y: Array, group: Array, rng: np.random.Generator) -> 
     labels = y[first]
     counts = dict(zip(*np.unique(labels, return_counts=True), strict=True))
     if len(counts) < 2:
-        raise DataError(f"all windows are {labels[0]!r}: a classifier needs at least two classes")
+        raise DataError(f"all windows are {str(labels[0])!r}: a classifier needs at least two classes")
     short = [f"{name} ({n})" for name, n in counts.items() if n < N_FOLDS]
     if short:
         raise DataError(f"fewer than {N_FOLDS} partitions of {PARTITION_S:g} s: {', '.join(short)}")

@@ -126,6 +126,13 @@ def _connect(mlflow: Any, *, create: bool) -> None:
     os.environ.pop("MLFLOW_TRACKING_URI", None)  # MLflow sets it itself; it is the user's word, not ours
 
 
+def _failures(mlflow: Any) -> tuple[type[Exception], ...]:
+    """Return what MLflow raises when a server, a database or a folder does not do its part."""
+    from sqlalchemy.exc import SQLAlchemyError
+
+    return (mlflow.exceptions.MlflowException, SQLAlchemyError, OSError)
+
+
 def log_training(
     name: str,
     recipe: WindowPipeline,
@@ -171,7 +178,7 @@ def log_training(
             return _promote(
                 mlflow, name, str(logged.registered_model_version), run.info.run_id, info, metrics
             )
-        except mlflow.exceptions.MlflowException as error:
+        except _failures(mlflow) as error:
             raise TerrainError(f"MLflow: {' '.join(str(error).split())[:300]}") from error
 
 
@@ -244,6 +251,6 @@ def load_model(uri: str) -> TerrainModel:
         _connect(mlflow, create=False)
         try:
             folder = mlflow.artifacts.download_artifacts(uri)
-        except (mlflow.exceptions.MlflowException, OSError) as error:
+        except (*_failures(mlflow), ImportError) as error:  # some kinds of storage want a package of their own
             raise ModelError(f"{uri}: cannot be loaded ({' '.join(str(error).split())[:200]})") from error
         return read_model(Path(folder))
