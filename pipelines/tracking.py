@@ -249,8 +249,12 @@ def load_model(uri: str) -> TerrainModel:
         raise ModelError(f"{uri}: is neither a folder nor a model URI such as models:/NAME@champion")
     with _quiet() as mlflow:
         _connect(mlflow, create=False)
+        failures: tuple[type[Exception], ...] = (
+            *_failures(mlflow),
+            ImportError,
+        )  # some storages want a package
         try:
             folder = mlflow.artifacts.download_artifacts(uri)
-        except (*_failures(mlflow), ImportError) as error:  # some kinds of storage want a package of their own
+        except failures as error:
             raise ModelError(f"{uri}: cannot be loaded ({' '.join(str(error).split())[:200]})") from error
         return read_model(Path(folder))

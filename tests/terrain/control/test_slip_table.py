@@ -28,7 +28,17 @@ def write(folder, content):
 
 def test_the_packaged_table_has_a_sound_and_sourced_number_everywhere():
     table = load_slip_table()
-    measured = {"ASPHALT", "FLOORING", "ICE", "SANDY_LOAM", "SNOW", "CONCRETE", "DIRT_ROAD", "PLOUGHED", "UNPLOUGHED"}
+    measured = {
+        "ASPHALT",
+        "FLOORING",
+        "ICE",
+        "SANDY_LOAM",
+        "SNOW",
+        "CONCRETE",
+        "DIRT_ROAD",
+        "PLOUGHED",
+        "UNPLOUGHED",
+    }
     assert measured | {table.fallback} <= set(table.targets)
     for terrain, by_state in table.targets.items():
         assert tuple(by_state) == DRIVE_STATES
@@ -86,9 +96,9 @@ def test_a_number_that_is_not_accepted_is_named(tmp_path, number, fault):
     ("content", "fault"),
     [
         ("a: [1", "is no YAML"),
-        ("", "holds just the keys name, fallback and terrains"),
-        ("- 1", "holds just the keys name, fallback and terrains"),
-        (table_with() | {"extra": 1}, "holds just the keys name, fallback and terrains"),
+        ("", "a slip table holds just the keys name, fallback and terrains"),
+        ("- 1", "a slip table holds just the keys name, fallback and terrains"),
+        (table_with() | {"extra": 1}, "a slip table holds just the keys name, fallback and terrains"),
         (table_with() | {"fallback": "LAVA"}, "the fallback 'LAVA' is no entry of terrains"),
         (table_with() | {"fallback": ["SNOW"]}, "the fallback .*SNOW.* is no entry of terrains"),
         (table_with() | {"terrains": ["SNOW"]}, "the fallback 'unknown' is no entry of terrains"),
