@@ -84,6 +84,11 @@ class WindowRule:
         """Distance from one start to the next."""
         return self.length_s if self.stride_s is None else self.stride_s
 
+    @property
+    def overlap(self) -> int:
+        """How many windows on either side of a window may share samples with it; at least its neighbour."""
+        return int(np.ceil(self.length_s / self.step_s))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WindowCut:

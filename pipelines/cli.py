@@ -245,7 +245,8 @@ def quickstart_command(
 def _console() -> Any:
     from rich.console import Console
 
-    return Console(soft_wrap=True, width=None if sys.stdout.isatty() else 110)
+    # names come from the user's files: brackets in them are no markup
+    return Console(soft_wrap=True, markup=False, width=None if sys.stdout.isatty() else 110)
 
 
 def _names(signals: str) -> tuple[str, ...]:

@@ -14,7 +14,7 @@ from features.extractor import FeatureExtractor
 from features.windows import WindowRule
 from pipelines.evaluation import Progress, fit_folds, pool, silent, summarise
 from pipelines.extras import fold_accuracy, has_speed, learning_curve, slow_fast
-from pipelines.recipes import feature_matrix, make_recipe
+from pipelines.recipes import WindowPipeline, feature_matrix, make_recipe
 from pipelines.splits import (
     N_FOLDS,
     PROTOCOLS,
@@ -70,6 +70,10 @@ class CrossvalSettings:
         steady = WindowRule().steady if self.steady else None
         return WindowRule(length_s, self.stride_s, steady)
 
+    def new_recipe(self) -> WindowPipeline:
+        """Return the recipe, unfitted."""
+        return make_recipe(self.recipe, self.signal_sets, gap=self.rule.overlap, seed=self.seed)
+
     @property
     def jobs(self) -> int:
         """Processes at once: what was asked for, or one a core."""
@@ -99,7 +103,7 @@ def crossval(
     y = windows.terrain.astype(str)
     repeats = settings.repeats or DEFAULT_REPEATS[settings.protocol]
     folds = folds_of(samples, settings.protocol, repeats, settings.seed)
-    recipe = make_recipe(settings.recipe, settings.signal_sets, seed=settings.seed)
+    recipe = settings.new_recipe()
     progress("features", 0, 1)
     features = feature_matrix(recipe, windows)
     progress("features", 1, 1)

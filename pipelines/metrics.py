@@ -111,7 +111,8 @@ def run_bootstrap(
     """Return a 95 % interval of the accuracy by resampling whole runs within their classes.
 
     Windows of one run are not independent, so runs are drawn, with replacement, as many a class as the
-    class has.  A class with one run adds no spread: the interval is too narrow by what that run hides.
+    class has.  A class with one run adds no spread, and with three or four a class the interval is still
+    too narrow.
 
     Parameters
     ----------

@@ -32,7 +32,11 @@ class WindowPipeline(Pipeline):  # type: ignore[misc]
 
 
 def make_recipe(
-    name: str, signal_sets: Iterable[str] = SIGNAL_SETS, level_sets: Iterable[str] = (), seed: int = 0
+    name: str,
+    signal_sets: Iterable[str] = SIGNAL_SETS,
+    level_sets: Iterable[str] = (),
+    gap: int = 1,
+    seed: int = 0,
 ) -> WindowPipeline:
     """Return an unfitted recipe.
 
@@ -40,6 +44,7 @@ def make_recipe(
     ----------
     name : one of :data:`RECIPES`
     signal_sets, level_sets : as :class:`~features.extractor.FeatureExtractor`
+    gap : windows left out beside an inner test block; as many as share samples with a window
     seed : deals runs into the inner folds
 
     Raises
@@ -57,7 +62,7 @@ def make_recipe(
     return WindowPipeline(
         [
             ("features", FeatureExtractor(tuple(signal_sets), tuple(level_sets))),
-            ("classifier", GroupedSVC(seed=seed)),
+            ("classifier", GroupedSVC(gap=gap, seed=seed)),
         ]
     )
 

@@ -47,12 +47,11 @@ def print_crossval(report: dict[str, Any], console: Console) -> None:
     spread = report["accuracy_spread"]
     repeats = f", spread over {report['repeats']} fold assignments {spread:.1%}" if spread is not None else ""
     console.print(
-        f"[bold]{report['dataset']}[/bold], protocol {report['protocol']}, recipe {report['recipe']}: "
+        f"{report['dataset']}, protocol {report['protocol']}, recipe {report['recipe']}: "
         f"{report['n_windows']} windows of {report['window_s']:g} s from {report['n_runs']} runs"
     )
     console.print(
-        f"accuracy [bold]{percent(report['accuracy'])}[/bold] "
-        f"(95 % over runs: {low:.1%} to {high:.1%}{repeats})",
+        f"accuracy {percent(report['accuracy'])} (95 % over runs: {low:.1%} to {high:.1%}{repeats})",
         highlight=False,
     )
     console.print(

@@ -19,6 +19,7 @@ from features.windows import (
     WindowCut,
     WindowRule,
     cut_windows,
+    label_windows,
     layout_of,
     regular_starts,
     span_of,
@@ -57,8 +58,7 @@ class Samples(NamedTuple):
 def grouped_samples(runs: Sequence[RunLog], rule: WindowRule, *, skip_short: bool = False) -> Samples:
     """Cut windows by the rule, labelled ones only; the group of a window is its run."""
     cut = labelled(cut_windows(runs, rule, skip_short=skip_short))
-    gap = int(np.ceil(rule.length_s / rule.step_s))
-    return Samples(cut, cut.windows.run_id, gap)
+    return Samples(cut, cut.windows.run_id, rule.overlap)
 
 
 def labelled(cut: WindowCut) -> WindowCut:
@@ -82,13 +82,13 @@ def published_samples(runs: Sequence[RunLog], rule: WindowRule) -> Samples:
     """
     layout = layout_of(runs)
     places = [
-        (run.run_id, run.labels[0].terrain, start_s)
+        (run.run_id, terrain, start_s)
         for run in runs
-        for start_s in _partition_starts(run, layout)
-        if run.labels
+        for start_s, terrain in zip(*_partitions(run, layout), strict=True)
+        if terrain
     ]
     if not places:
-        raise DataError(f"no labelled run is as long as a partition of {PARTITION_S:g} s")
+        raise DataError(f"no partition of {PARTITION_S:g} s lies under one label")
     terrain = np.array([place[1] for place in places])
     names, counts = np.unique(terrain, return_counts=True)
     stride_s = dict(zip(names, PUBLISHED_STRIDE_S * counts / counts.min(), strict=True))
@@ -113,9 +113,10 @@ def published_samples(runs: Sequence[RunLog], rule: WindowRule) -> Samples:
     return Samples(cut, group, 0)
 
 
-def _partition_starts(run: RunLog, layout: Layout) -> Array:
-    begin_s, end_s = span_of(run, layout)
-    return regular_starts(begin_s, end_s, PARTITION_S, PARTITION_S)
+def _partitions(run: RunLog, layout: Layout) -> tuple[Array, Array]:
+    """Return the starts of a run's partitions, and the terrain where one label covers all of it."""
+    starts_s = regular_starts(*span_of(run, layout), PARTITION_S, PARTITION_S)
+    return starts_s, label_windows(run, starts_s, PARTITION_S)
 
 
 def folds_of(samples: Samples, protocol: str, repeats: int, seed: int) -> list[Fold]:

@@ -12,7 +12,7 @@ from pipelines.crossval import CrossvalSettings, crossval, samples_of
 from pipelines.datasets import data_digest
 from pipelines.evaluation import Progress, silent
 from pipelines.importance import channel_importance
-from pipelines.recipes import feature_matrix, make_recipe
+from pipelines.recipes import feature_matrix
 from pipelines.splits import folds_of
 from terrain import __version__
 from terrain.errors import ConfigError
@@ -63,12 +63,12 @@ def train(
     samples = samples_of(runs, settings)
     windows = samples.cut.windows
     y = windows.terrain.astype(str)
-    recipe = make_recipe(settings.recipe, settings.signal_sets, seed=settings.seed)
+    recipe = settings.new_recipe()
     progress("fit on all runs", 0, 1)
     recipe.fit(windows, y)
     progress("fit on all runs", 1, 1)
     importance = channel_importance(
-        make_recipe(settings.recipe, settings.signal_sets, seed=settings.seed)[-1],
+        settings.new_recipe()[-1],
         feature_matrix(recipe, windows),
         list(recipe[0].get_feature_names_out()),
         y,

@@ -85,6 +85,7 @@ def edit():
 
     return apply
 
+
 # Machines that run tests are shared: a slow example is no fault.  Examples are the same in every run.
 settings.register_profile("house", deadline=None, derandomize=True)
 settings.load_profile("house")

@@ -74,6 +74,8 @@ class GroupedSVC(ClassifierMixin, BaseEstimator):
     ----------
     candidates : sequence of :class:`Candidate` to choose from
     n_inner_folds : inner folds; the number of inner fits is this times the number of candidates
+    gap : windows left out beside an inner test block, where the only run of a class is cut; as many as
+        share samples with a window
     seed : deals runs into inner folds
 
     Attributes
@@ -88,10 +90,12 @@ class GroupedSVC(ClassifierMixin, BaseEstimator):
         self,
         candidates: Sequence[Sequence[float]] = CANDIDATES,
         n_inner_folds: int = 3,
+        gap: int = 1,
         seed: int = 0,
     ) -> None:
         self.candidates = candidates
         self.n_inner_folds = n_inner_folds
+        self.gap = gap
         self.seed = seed
 
     def fit(self, X: Array, y: Array, groups: Array | None = None) -> GroupedSVC:
@@ -119,11 +123,12 @@ class GroupedSVC(ClassifierMixin, BaseEstimator):
             rare = str(self.classes_[counts.argmin()])
             raise DataError(f"there is one window of class {rare!r}; at least 2 are needed")
         groups = np.arange(len(y)) if groups is None else np.asarray(groups)
-        rng = np.random.default_rng(self.seed)
         candidates = [Candidate(*candidate) for candidate in self.candidates]
-        thin = slice(None, None, -(-len(y) // MAX_INNER_ROWS))
-        inner_y = y[thin]
-        held_out, decisions = self._inner_decisions(X[thin], inner_y, groups[thin], candidates, rng)
+        step = -(-len(y) // MAX_INNER_ROWS)
+        inner_y, gap = y[::step], -(-self.gap // step)
+        held_out, decisions = self._inner_decisions(
+            X[::step], inner_y, groups[::step], gap, np.random.default_rng(self.seed), candidates
+        )
         self.inner_scores_ = np.array(
             [
                 accuracy_score(inner_y[held_out], self.classes_[decision[held_out].argmax(axis=1)])
@@ -140,13 +145,19 @@ class GroupedSVC(ClassifierMixin, BaseEstimator):
         return self
 
     def _inner_decisions(
-        self, X: Array, y: Array, groups: Array, candidates: Sequence[Candidate], rng: np.random.Generator
+        self,
+        X: Array,
+        y: Array,
+        groups: Array,
+        gap: int,
+        rng: np.random.Generator,
+        candidates: Sequence[Candidate],
     ) -> tuple[Array, Array]:
         n_folds = min(self.n_inner_folds, *np.unique(y, return_counts=True)[1])
         decisions = np.zeros((len(candidates), len(y), len(self.classes_)))
         held_out = np.zeros(len(y), dtype=bool)
         self.n_inner_fits_ = 0
-        for train, test in split_runs(y, groups, n_folds, rng):
+        for train, test in split_runs(y, groups, n_folds, rng, gap):
             if len(np.unique(y[train])) < 2:
                 continue  # the gap beside a short block has left out all windows of a class
             held_out[test] = True

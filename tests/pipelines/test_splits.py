@@ -164,7 +164,7 @@ def test_what_cannot_be_split_is_refused(drive, drive_all):
     unlabelled = [drive(f"r{i}", "GRASS", i, label=None) for i in range(6)]
     with pytest.raises(DataError, match="no window has a terrain label"):
         samples(unlabelled)
-    with pytest.raises(DataError, match="no labelled run is as long as a partition of 5 s"):
+    with pytest.raises(DataError, match="no partition of 5 s lies under one label"):
         published_samples(unlabelled, PUBLISHED_RULE)
     with pytest.raises(DataError, match="all windows are 'GRASS'"):
         folds_of(published_samples(drive_all(("GRASS",), 2), PUBLISHED_RULE), "published", 1, 0)
