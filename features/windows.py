@@ -9,13 +9,13 @@ partitions and the sample-by-sample form of :mod:`features.stream` all go throug
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from terrain.errors import ConfigError, DataError
-from terrain.logs.schema import signal_set_of
+from terrain.logs.schema import SIGNAL_SETS, signal_set_of
 from terrain.records import Array, RunLog, Stream, Windows
 
 TIME_TOLERANCE_S = 1e-6
@@ -116,10 +116,14 @@ class Layout:
         return n
 
 
-def layout_of(runs: Sequence[RunLog]) -> Layout:
+def layout_of(
+    runs: Sequence[RunLog], signal_sets: Iterable[str] = SIGNAL_SETS, *, speeds: bool = True
+) -> Layout:
     """Return the streams, channels and rates that all runs have in common.
 
-    Only streams with at least one channel in a signal set count.  The rate is the median over runs.
+    Only channels of the chosen signal sets count, and wheel speeds besides where ``speeds`` says that the
+    rule of steady motion needs them: what is not used cannot drop a window.  The rate is the median over
+    runs.
 
     Raises
     ------
@@ -128,21 +132,21 @@ def layout_of(runs: Sequence[RunLog]) -> Layout:
     """
     if not runs:
         raise DataError("there is no run to cut windows from")
-    names = dict.fromkeys(
-        name
-        for run in runs
-        for name, stream in run.streams.items()
-        if any(signal_set_of(name, channel) for channel in stream.channels)
-    )
+    wanted_sets = {*signal_sets, *(("wheels",) if speeds else ())}
+
+    def used(name: str, stream: Stream) -> tuple[str, ...]:
+        return tuple(c for c in stream.channels if signal_set_of(name, c) in wanted_sets)
+
+    names = dict.fromkeys(name for run in runs for name, stream in run.streams.items() if used(name, stream))
     channels: dict[str, tuple[str, ...]] = {}
     rate_hz: dict[str, float] = {}
     for name in names:
         for run in runs:
             if name not in run.streams:
                 raise DataError(f"run {run.run_id} has no stream {name!r}, which other runs have")
-        wanted = runs[0].streams[name].channels
+        wanted = used(name, runs[0].streams[name])
         for run in runs:
-            differing = sorted(set(run.streams[name].channels) ^ set(wanted))
+            differing = sorted(set(used(name, run.streams[name])) ^ set(wanted))
             if differing:
                 raise DataError(
                     f"run {run.run_id}, stream {name!r}: channel {differing[0]!r} is not in all runs"
@@ -329,6 +333,12 @@ def cut_windows(
     else:
         for run in runs:
             check_layout(run, layout)
+    fastest_s = 1 / max(layout.rate_hz.values())
+    if starts_s is None and rule.step_s < (1 - MAX_RATE_DEVIATION) * fastest_s:
+        raise ConfigError(
+            f"window stride_s is {rule.step_s:g}; at least the shortest sample period, {fastest_s:g} s, "
+            "is needed"
+        )
     parts: dict[str, list[Array]] = {
         name: [np.empty((0, len(channels), layout.n_samples(name, rule.length_s)))]
         for name, channels in layout.channels.items()

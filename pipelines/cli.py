@@ -146,10 +146,13 @@ def crossval_command(
         jobs,
         repair,
     )
-    runs = load_runs(data, layout=layout.value, mapping=mapping, repair=repair, align=align)
+    skipped: list[str] = []
+    runs = load_runs(
+        data, layout=layout.value, mapping=mapping, repair=repair, align=align, on_skip=skipped.append
+    )
     with progress_bar() as progress:
         report = crossval(runs, settings, progress)
-    result = {"dataset": data.resolve().name, "data_digest": data_digest(runs), **report}
+    result = {"dataset": data.resolve().name, "data_digest": data_digest(runs), **report, "skipped": skipped}
     print_crossval(result, _console())
     _write_json(json_file, result)
 
@@ -181,10 +184,13 @@ def train_command(
     settings = CrossvalSettings(
         recipe.value, "grouped", window, stride, steady, repeats, seed, _names(signals), False, jobs, repair
     )
-    runs = load_runs(data, layout=layout.value, mapping=mapping, repair=repair, align=align)
+    skipped: list[str] = []
+    runs = load_runs(
+        data, layout=layout.value, mapping=mapping, repair=repair, align=align, on_skip=skipped.append
+    )
     with progress_bar() as progress:
-        result = train(runs, settings, name, data.resolve().name, progress)
-    print_crossval({**result["crossval"], "dataset": result["dataset"]}, _console())
+        result = {**train(runs, settings, name, data.resolve().name, progress), "skipped": skipped}
+    print_crossval({**result["crossval"], "dataset": result["dataset"], "skipped": skipped}, _console())
     print_training(result, _console())
     _write_json(json_file, result)
 
@@ -210,9 +216,12 @@ def predict_command(
     from terrain.control.slip_table import load_slip_table
 
     slip_table = load_slip_table(table)
-    runs = load_runs(data, layout=layout.value, mapping=mapping, repair=repair, align=align)
+    skipped: list[str] = []
+    runs = load_runs(
+        data, layout=layout.value, mapping=mapping, repair=repair, align=align, on_skip=skipped.append
+    )
     predicted = predict(runs, load_model(model), slip_table, skip_short=repair)
-    result = {"model": model, "dataset": data.resolve().name, **predicted}
+    result = {"model": model, "dataset": data.resolve().name, **predicted, "skipped": skipped}
     print_predictions(result, _console())
     _write_json(json_file, result)
 

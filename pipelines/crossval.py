@@ -58,6 +58,12 @@ class CrossvalSettings:
             raise ConfigError(f"there is no protocol {self.protocol!r}; there are {', '.join(PROTOCOLS)}")
         if self.repeats is not None and self.repeats < 1:
             raise ConfigError(f"{self.repeats} repeats are none; at least 1 is needed")
+        if self.protocol == "published" and (self.stride_s is not None or not self.steady):
+            raise ConfigError(
+                "'published' sets its own strides and keeps all motion: stride and steady do not apply"
+            )
+        if self.protocol == "leave-one-run-out" and (self.repeats or 1) > 1:
+            raise ConfigError("'leave-one-run-out' leaves nothing to deal anew: it has one repeat")
         for name in self.signal_sets:
             if name not in SIGNAL_SETS:
                 raise ConfigError(f"unknown signal set {name!r}; there are {', '.join(SIGNAL_SETS)}")
@@ -111,17 +117,20 @@ def crossval(
     results = fit_folds(
         classifier, features, y, samples.group, folds, settings.jobs, settings.protocol, progress
     )
+    repaired = dict(sum((Counter(run.dropped) for run in runs), Counter()))
     report = {
         "protocol": settings.protocol,
         "recipe": settings.recipe,
         "window_s": settings.rule.length_s,
+        "stride_s": None if settings.protocol == "published" else settings.rule.step_s,
+        "steady": settings.rule.steady is not None and settings.protocol != "published",
         "signal_sets": list(settings.signal_sets),
         "seed": settings.seed,
         **summarise(pool(results, y), samples, settings.seed),
         "n_features": features.shape[1],
         "dropped": dict(samples.cut.dropped),
-        "repaired": dict(sum((Counter(run.dropped) for run in runs), Counter())),
-        "notes": notes(samples, settings),
+        "repaired": repaired,
+        "notes": notes(samples, settings, repaired),
     }
     if settings.extras and settings.protocol == "grouped":
         first = [fold for fold in folds if fold.repeat == 0]
@@ -148,11 +157,11 @@ def crossval(
 def samples_of(runs: Sequence[RunLog], settings: CrossvalSettings) -> Samples:
     """Cut the windows that the protocol asks for."""
     if settings.protocol == "published":
-        return published_samples(runs, settings.rule)
-    return grouped_samples(runs, settings.rule, skip_short=settings.skip_short)
+        return published_samples(runs, settings.rule, settings.signal_sets)
+    return grouped_samples(runs, settings.rule, settings.signal_sets, skip_short=settings.skip_short)
 
 
-def notes(samples: Samples, settings: CrossvalSettings) -> list[str]:
+def notes(samples: Samples, settings: CrossvalSettings, repaired: dict[str, int]) -> list[str]:
     """Return in sentences what a reader of the figures must know."""
     said = []
     windows = samples.cut.windows
@@ -170,4 +179,7 @@ def notes(samples: Samples, settings: CrossvalSettings) -> list[str]:
     if samples.cut.dropped:
         counts = ", ".join(f"{n} {reason}" for reason, n in sorted(samples.cut.dropped.items()))
         said.append(f"windows left out: {counts}")
+    if repaired:
+        counts = ", ".join(f"{n} {kind}" for kind, n in sorted(repaired.items()))
+        said.append(f"dropped to repair the logs: {counts}")
     return said

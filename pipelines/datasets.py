@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -57,20 +56,22 @@ def load_runs(
     """
     folder = Path(folder)
     runs = []
+    places: dict[str, list[str]] = {}
     for read in _readers(folder, layout, mapping):
         try:
-            runs.append(read(repair=repair))
+            run = read(repair=repair)
         except LogError as error:
             if not repair:
                 raise
             on_skip(f"run skipped: {error}")
+            continue
+        runs.append(run)
+        places.setdefault(run.run_id, []).append(_place(read, run))
     if not runs:
         raise LogError(f"{folder}: not one run could be read")
-    ids = Counter(run.run_id for run in runs)
-    for run_id, n in ids.items():
-        if n > 1:
-            sources = " and ".join(run.source for run in runs if run.run_id == run_id)
-            raise LogError(f"{folder}: {n} runs have the id {run_id!r} ({sources})")
+    for run_id, found in places.items():
+        if len(found) > 1:
+            raise LogError(f"{folder}: {len(found)} runs have the id {run_id!r} ({' and '.join(found)})")
     runs.sort(key=lambda run: run.run_id)
     return [_aligned(run) for run in runs] if align else runs
 
@@ -108,6 +109,12 @@ def data_digest(runs: Sequence[RunLog]) -> str:
 def _canonical_bytes(array: Array) -> bytes:
     """Return little-endian doubles with one form of NaN and one of zero."""
     return (np.where(np.isnan(array), np.nan, array) + 0.0).astype("<f8").tobytes()
+
+
+def _place(read: Callable[..., RunLog], run: RunLog) -> str:
+    """Return where a run was found: its run folder, else what the reader calls its source."""
+    first = getattr(read, "args", (None,))[0]
+    return str(first) if isinstance(first, Path) and (first / "run.json").is_file() else run.source
 
 
 def _readers(folder: Path, layout: str, mapping: str | Path | None) -> list[Callable[..., RunLog]]:

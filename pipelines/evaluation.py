@@ -9,7 +9,14 @@ import numpy as np
 from joblib import Parallel, delayed
 from sklearn.base import BaseEstimator, clone
 
-from pipelines.metrics import calibration, class_figures, per_run_figures, run_bootstrap, vote
+from pipelines.metrics import (
+    calibration,
+    class_figures,
+    per_run_figures,
+    run_bootstrap,
+    runs_by_terrain,
+    vote,
+)
 from pipelines.splits import Fold, Samples
 from terrain.records import Array
 
@@ -106,6 +113,7 @@ def summarise(held_out: HeldOut, samples: Samples, seed: int) -> dict[str, Any]:
     """
     windows = samples.cut.windows
     y, classes = windows.terrain.astype(str), held_out.classes
+    run_id = runs_by_terrain(windows.run_id.astype(str), y)
     predicted = classes[held_out.probability.argmax(axis=2)]
     correct = predicted == y
     voted = np.stack(
@@ -128,9 +136,7 @@ def summarise(held_out: HeldOut, samples: Samples, seed: int) -> dict[str, Any]:
         "accuracy": float(accuracies.mean()),
         "accuracy_spread": float(accuracies.std(ddof=1)) if n_repeats > 1 else None,
         "accuracy_per_repeat": accuracies.tolist(),
-        "accuracy_ci": list(
-            run_bootstrap(correct.mean(axis=0), windows.run_id.astype(str), y, np.random.default_rng(seed))
-        ),
+        "accuracy_ci": list(run_bootstrap(correct.mean(axis=0), run_id, y, np.random.default_rng(seed))),
         "balanced_accuracy": float(np.mean([repeat["balanced_accuracy"] for repeat in repeats])),
         "macro_f1": float(np.mean([repeat["macro_f1"] for repeat in repeats])),
         "per_class": pooled["per_class"],
@@ -138,7 +144,7 @@ def summarise(held_out: HeldOut, samples: Samples, seed: int) -> dict[str, Any]:
         "vote_accuracy": float(np.mean(voted == y)),
         "ece": float(np.mean([figures["ece"] for figures in calibrated])),
         "reliability": calibration(confidence.ravel(), correct.ravel())["reliability"],
-        "per_run": per_run_figures(correct, predicted[0], voted == y, windows.run_id.astype(str), y),
+        "per_run": per_run_figures(correct, predicted[0], voted == y, run_id, y),
         "folds": [
             {
                 "repeat": result.fold.repeat,

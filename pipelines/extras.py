@@ -36,9 +36,8 @@ def has_speed(windows: Windows) -> bool:
     )
 
 
-def run_speeds(samples: Samples) -> dict[str, float]:
+def run_speeds(windows: Windows) -> dict[str, float]:
     """Return the median speed (m/s) of each run's faster wheel where it moves; NaN if it never does."""
-    windows = samples.cut.windows
     if not has_speed(windows):
         return dict.fromkeys(np.unique(windows.run_id.astype(str)), float("nan"))
     fastest = np.abs(wheel_speeds(windows.values, windows.channels)).max(axis=1)
@@ -62,21 +61,21 @@ def covered_s(start_s: Array, length_s: float) -> float:
 
 
 def slow_fast_split(samples: Samples) -> dict[str, Any]:
-    """Split the runs of each class at their median speed.
+    """Split the runs of each class at their median speed, taken over the run's time on that class.
 
     Returns
     -------
     dict
         ``status`` (``applicable`` or ``not applicable``), ``classes`` with the speeds of both sides,
-        ``left_out`` with the reason for each class, and ``slow`` and ``fast`` run ids.
+        ``left_out`` with the reason for each class, and ``slow`` and ``fast`` (run, class) pairs.
     """
     windows = samples.cut.windows
     run_id, y = windows.run_id.astype(str), windows.terrain.astype(str)
-    speeds = run_speeds(samples)
-    sides: dict[str, list[str]] = {"slow": [], "fast": []}
+    sides: dict[str, list[tuple[str, str]]] = {"slow": [], "fast": []}
     kept: dict[str, dict[str, float]] = {}
     left_out: dict[str, str] = {}
     for terrain in np.unique(y):
+        speeds = run_speeds(windows[y == terrain])
         runs = [run for run in np.unique(run_id[y == terrain]) if np.isfinite(speeds[run])]
         speed = np.array([speeds[run] for run in runs])
         slow = [run for run in runs if speeds[run] <= np.median(speed)]
@@ -97,8 +96,8 @@ def slow_fast_split(samples: Samples) -> dict[str, Any]:
             "slow_mps": float(np.median([speeds[run] for run in slow])),
             "fast_mps": float(np.median([speeds[run] for run in fast])),
         }
-        sides["slow"] += slow
-        sides["fast"] += fast
+        sides["slow"] += [(run, str(terrain)) for run in slow]
+        sides["fast"] += [(run, str(terrain)) for run in fast]
     status = "applicable" if len(kept) >= MIN_CLASSES else "not applicable"
     return {"status": status, "classes": kept, "left_out": left_out, **sides}
 
@@ -106,16 +105,22 @@ def slow_fast_split(samples: Samples) -> dict[str, Any]:
 def slow_fast(
     classifier: BaseEstimator, features: Array, samples: Samples, n_jobs: int, progress: Progress = silent
 ) -> dict[str, Any]:
-    """Train on the slow runs of each class and test on the fast ones, and back."""
+    """Train on the slow runs of each class and test on the fast ones, and back.
+
+    A run that is slow on one class and fast on another has no part in either.
+    """
     split = slow_fast_split(samples)
     slow, fast = split.pop("slow"), split.pop("fast")
     if split["status"] != "applicable":
         return {**split, "slow_to_fast": None, "fast_to_slow": None}
     windows = samples.cut.windows
     run_id, y = windows.run_id.astype(str), windows.terrain.astype(str)
-    kept = np.isin(y, list(split["classes"]))
-    rows_slow = np.flatnonzero(np.isin(run_id, slow) & kept)
-    rows_fast = np.flatnonzero(np.isin(run_id, fast) & kept)
+    both = {run for run, _ in slow} & {run for run, _ in fast}
+    pairs = list(zip(run_id, y, strict=True))
+    rows_slow, rows_fast = (
+        np.array([i for i, pair in enumerate(pairs) if pair in set(side) and pair[0] not in both])
+        for side in (slow, fast)
+    )
     folds = [Fold(0, 0, rows_slow, rows_fast), Fold(0, 1, rows_fast, rows_slow)]
     results = fit_folds(classifier, features, y, samples.group, folds, n_jobs, "slow to fast", progress)
     accuracy = [_accuracy([result], y) for result in results]
@@ -257,7 +262,7 @@ def enough_runs(runs_per_class: Array, accuracy: Array) -> dict[str, Any]:
     return {
         "enough_runs": enough,
         "statement": (
-            f"{verdict}: {enough} runs a class would be enough "
+            f"{verdict}: {enough} {'run' if enough == 1 else 'runs'} a class would be enough "
             f"(doubling them gains under {ENOUGH_GAIN:.0%}); "
             f"the data have {largest:.1f} on average, doubling which would gain {slack:.1%}"
         ),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -51,11 +52,17 @@ def import_logs(
             raise LogError(f"{target}: is there already, and is left as it is; import into another folder")
     dropped: Counter[str] = Counter()
     labels: Counter[str] = Counter()
-    for run in runs:
-        write_run(run, out)
-        dropped.update(run.dropped)
-        labels.update(run.terrains)
-        progress(run.run_id)
+    written: list[Path] = []
+    try:
+        for run in runs:
+            written.append(write_run(run, out))
+            dropped.update(run.dropped)
+            labels.update(run.terrains)
+            progress(run.run_id)
+    except BaseException:
+        for target in written:
+            shutil.rmtree(target, ignore_errors=True)
+        raise
     return {
         "out": str(out),
         "n_runs": len(runs),

@@ -105,6 +105,19 @@ def vote(
     return voted
 
 
+def runs_by_terrain(run_id: Array, terrain: Array) -> Array:
+    """Return the run of each window, with the terrain added where a run has several.
+
+    Examples
+    --------
+    >>> runs_by_terrain(np.array(["a", "a", "b"]), np.array(["ice", "snow", "ice"])).tolist()
+    ['a (ice)', 'a (snow)', 'b']
+    """
+    mixed = [run for run in np.unique(run_id) if len(np.unique(terrain[run_id == run])) > 1]
+    pairs = zip(run_id, terrain, strict=True)
+    return np.array([f"{run} ({name})" if run in mixed else run for run, name in pairs])
+
+
 def run_bootstrap(
     correct: Array, run_id: Array, terrain: Array, rng: np.random.Generator
 ) -> tuple[float, float]:

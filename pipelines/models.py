@@ -12,14 +12,15 @@ import zipfile
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from features.windows import SteadyMotion, WindowRule
+from features.windows import Layout, SteadyMotion, WindowRule
 from pipelines.recipes import WindowPipeline
 from terrain.atomic import atomic_write
-from terrain.errors import ConfigError, ModelError
+from terrain.errors import ConfigError, DataError, ModelError
 
 MODEL_FILE = "model.skops"
 INFO_FILE = "terrain_model.json"
 INFO_VERSION = 1
+INFO_KEYS = {"window_s", "stride_s", "steady", "classes", "channels", "rate_hz", "run_digests"}
 
 TRUSTED_TYPES: tuple[str, ...] = (
     "builtins.frozenset",
@@ -29,9 +30,9 @@ TRUSTED_TYPES: tuple[str, ...] = (
     "numpy.clip",
     "numpy.dtype",
     "pipelines.recipes.WindowPipeline",
-    "sklearn.feature_selection._univariate_selection.f_classif",
     "terrain.classify.svm.Candidate",
     "terrain.classify.svm.GroupedSVC",
+    "terrain.classify.svm.f_score",
 )
 """Types beyond those that skops trusts itself which a model of this package may hold."""
 
@@ -53,12 +54,18 @@ _LOADER_ERRORS = (
 class TerrainModel(NamedTuple):
     """A fitted recipe and what is known of it.
 
-    ``info`` holds ``version, sha256, recipe, classes, window_s, stride_s, steady, data_digest, seed`` and
-    the version of the package.
+    ``info`` holds ``version, sha256, recipe, classes, window_s, stride_s, steady, channels, rate_hz, seed,
+    data_digest, run_digests`` and the version of the package.
     """
 
     recipe: WindowPipeline
     info: dict[str, Any]
+
+    @property
+    def layout(self) -> Layout:
+        """Channels and rates that a log must bring."""
+        channels = {stream: tuple(names) for stream, names in self.info["channels"].items()}
+        return Layout(channels, self.info["rate_hz"])
 
     @property
     def rule(self) -> WindowRule:
@@ -88,8 +95,7 @@ def read_model(folder: Path) -> TerrainModel:
     try:
         info = json.loads(info_file.read_text(encoding="utf-8"))
         version, expected = info["version"], info["sha256"]
-        model_keys = {"window_s", "stride_s", "steady", "classes"}
-        missing = model_keys - set(info)
+        missing = INFO_KEYS - set(info)
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ModelError(f"{info_file}: is damaged ({error})") from error
     if version != INFO_VERSION or missing:
@@ -100,8 +106,9 @@ def read_model(folder: Path) -> TerrainModel:
         raise ModelError(f"{file}: is damaged (SHA-256 {found[:12]}..., {str(expected)[:12]}... expected)")
     model = TerrainModel(_load(file, content), info)
     try:
-        model.rule  # noqa: B018
-    except (TypeError, ConfigError) as error:
+        for stream in model.layout.channels:
+            model.layout.n_samples(stream, model.rule.length_s)
+    except (TypeError, KeyError, AttributeError, ConfigError, DataError) as error:
         raise ModelError(f"{info_file}: is damaged ({error})") from error
     return model
 

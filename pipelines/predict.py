@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
@@ -32,7 +33,8 @@ def predict(
         ``windows``: ``run_id, start_s, terrain, probability, target_slip`` (by drive state), ``status`` and
         ``slip_entry`` (the entry of the table, which is the fallback's where the terrain has none);
         ``accuracy`` over windows whose label the model knows, None where there are none;
-        ``taught_on_these_runs`` says that this accuracy is memory and no measure of skill;
+        ``taught_runs`` names runs the model was taught, on which accuracy is memory and no measure of
+        skill; ``repaired`` counts what a repairing reader dropped;
         ``unknown_labels`` counts windows by labels that the model never saw; ``dropped`` and ``table``.
 
     Raises
@@ -40,8 +42,7 @@ def predict(
     DataError
         if a run lacks a channel or has another rate than the model was taught.
     """
-    layout = model.recipe[0].layout_
-    cut = cut_windows(runs, model.rule, layout=layout, skip_short=skip_short)
+    cut = cut_windows(runs, model.rule, layout=model.layout, skip_short=skip_short)
     windows = cut.windows
     classes = np.asarray(model.recipe.classes_, dtype=str)
     probability = model.recipe.predict_proba(windows) if len(windows) else np.zeros((0, len(classes)))
@@ -70,7 +71,8 @@ def predict(
         "classes": [str(c) for c in classes],
         "accuracy": float(np.mean(predicted[known] == label[known])) if known.any() else None,
         "n_judged": int(known.sum()),
-        "taught_on_these_runs": model.info.get("data_digest") == data_digest(runs),
+        "taught_runs": [run.run_id for run in runs if data_digest([run]) in model.info["run_digests"]],
+        "repaired": dict(sum((Counter(run.dropped) for run in runs), Counter())),
         "unknown_labels": {str(name): int(count) for name, count in zip(strange, counts, strict=True)},
         "n_unknown_labels": int(counts.sum()),
         "dropped": dict(cut.dropped),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -44,9 +45,11 @@ def quickstart(
     began_s = time.monotonic()
     ensure_writable(out)
     ensure_tracking()
-    runs, imported = _import(data, out / "runs", progress)
+    runs = load_runs(data)
+    _refuse_other_runs(runs, data, out / "runs")
     dataset = data.resolve().name
     report = {"dataset": dataset, "data_digest": data_digest(runs), **crossval(runs, settings, progress)}
+    imported = _import(runs, data, out / "runs", progress)
     trained = train(runs, settings, name, dataset, progress, evaluation=report)
     progress("predict", 0, 1)
     predicted = predict(runs, load_model(trained["model_uri"]), load_slip_table())
@@ -66,6 +69,7 @@ def quickstart(
             f"terrain predict --model {trained['model_uri']} --data {data}",
         ],
         "report": str(out / REPORT_FILE),
+        "created": datetime.now(UTC).isoformat(timespec="seconds"),
         "elapsed_s": time.monotonic() - began_s,
     }
     progress("report", 0, 1)
@@ -75,18 +79,20 @@ def quickstart(
     return result
 
 
-def _import(data: Path, folder: Path, progress: Progress) -> tuple[list[RunLog], dict[str, Any]]:
+def _refuse_other_runs(runs: list[RunLog], data: Path, folder: Path) -> None:
+    if folder.exists() and data_digest(load_runs(folder)) != data_digest(runs):
+        raise DataError(f"{folder}: holds other runs than {data}; choose another --out")
+
+
+def _import(runs: list[RunLog], data: Path, folder: Path, progress: Progress) -> dict[str, Any]:
     """Import into ``folder``; an earlier import of the same data is used as it lies."""
-    runs = load_runs(data)
     if folder.exists():
-        if data_digest(load_runs(folder)) != data_digest(runs):
-            raise DataError(f"{folder}: holds other runs than {data}; choose another --out")
         progress("import", len(runs), len(runs))
-        return runs, {"out": str(folder), "n_runs": len(runs), "reused": True}
+        return {"out": str(folder), "n_runs": len(runs), "reused": True}
     done: list[str] = []
 
     def show(run_id: str) -> None:
         done.append(run_id)
         progress("import", len(done), len(runs))
 
-    return runs, {**import_logs(data, folder, progress=show), "reused": False}
+    return {**import_logs(data, folder, progress=show), "reused": False}

@@ -36,6 +36,17 @@ def progress_bar() -> Iterator[evaluation.Progress]:
             bars.stop()
 
 
+def counted(counts: dict[str, int]) -> str:
+    """Return counts by kind in words.
+
+    Examples
+    --------
+    >>> counted({"gap": 2, "not moving": 1})
+    '2 gap, 1 not moving'
+    """
+    return ", ".join(f"{n} {kind}" for kind, n in sorted(counts.items()))
+
+
 def percent(value: float | None) -> str:
     """Return a share as a percentage with one decimal, ``-`` for None."""
     return "-" if value is None else f"{value:.1%}"
@@ -73,7 +84,7 @@ def print_crossval(report: dict[str, Any], console: Console) -> None:
         )
         print_slow_fast(report["slow_fast"], console)
         console.print(f"runs: {report['learning_curve']['statement']}", highlight=False)
-    for note in report["notes"]:
+    for note in (*report["notes"], *report.get("skipped", [])):
         console.print(f"note: {note}", highlight=False)
 
 
@@ -130,8 +141,9 @@ def print_predictions(result: dict[str, Any], console: Console) -> None:
             f"target slips from the table {result['table_name']!r} are unestimated: nobody measured them"
         )
     if result["accuracy"] is not None:
+        taught = len(result["taught_runs"])
         caution = (
-            ", on runs it was taught: memory, no measure of skill" if result["taught_on_these_runs"] else ""
+            f"; {taught} of {result['n_runs']} runs taught the model: memory, no skill" if taught else ""
         )
         console.print(
             f"accuracy {percent(result['accuracy'])} over {result['n_judged']} labelled windows{caution}",
@@ -141,9 +153,11 @@ def print_predictions(result: dict[str, Any], console: Console) -> None:
         console.print(
             f"{count} windows are labelled {name}, which the model never saw: not judged", highlight=False
         )
-    if result["dropped"]:
-        counts = ", ".join(f"{n} {reason}" for reason, n in sorted(result["dropped"].items()))
-        console.print(f"windows left out: {counts}", highlight=False)
+    for words, counts in (("windows left out", result["dropped"]), ("repaired", result["repaired"])):
+        if counts:
+            console.print(f"{words}: {counted(counts)}", highlight=False)
+    for sentence in result.get("skipped", []):
+        console.print(sentence, highlight=False)
 
 
 def _stretches(windows: list[dict[str, Any]]) -> Iterator[list[dict[str, Any]]]:

@@ -7,7 +7,7 @@ partition nearly always has its own run in training; it is there to compare with
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -25,7 +25,8 @@ from features.windows import (
     span_of,
 )
 from terrain.classify.folds import block_groups, single_run_classes, split_runs
-from terrain.errors import DataError
+from terrain.errors import ConfigError, DataError
+from terrain.logs.schema import SIGNAL_SETS
 from terrain.records import Array, RunLog
 
 PROTOCOLS = ("grouped", "leave-one-run-out", "published")
@@ -55,9 +56,16 @@ class Samples(NamedTuple):
     gap: int
 
 
-def grouped_samples(runs: Sequence[RunLog], rule: WindowRule, *, skip_short: bool = False) -> Samples:
+def grouped_samples(
+    runs: Sequence[RunLog],
+    rule: WindowRule,
+    signal_sets: Iterable[str] = SIGNAL_SETS,
+    *,
+    skip_short: bool = False,
+) -> Samples:
     """Cut windows by the rule, labelled ones only; the group of a window is its run."""
-    cut = labelled(cut_windows(runs, rule, skip_short=skip_short))
+    layout = layout_of(runs, signal_sets, speeds=rule.steady is not None)
+    cut = labelled(cut_windows(runs, rule, layout=layout, skip_short=skip_short))
     return Samples(cut, cut.windows.run_id, rule.overlap)
 
 
@@ -74,13 +82,19 @@ def labelled(cut: WindowCut) -> WindowCut:
     return WindowCut(cut.windows[known], {**cut.dropped, "no single label": int((~known).sum())})
 
 
-def published_samples(runs: Sequence[RunLog], rule: WindowRule) -> Samples:
+def published_samples(
+    runs: Sequence[RunLog], rule: WindowRule, signal_sets: Iterable[str] = SIGNAL_SETS
+) -> Samples:
     """Cut windows as the papers do: slid inside 5 s partitions, classes balanced by stride.
 
     The class with the fewest partitions is cut every 0.1 s, the others in proportion to their number.
     No rule of steady motion is applied.
     """
-    layout = layout_of(runs)
+    if rule.length_s > PARTITION_S:
+        raise ConfigError(
+            f"a window of {rule.length_s:g} s does not fit into a partition of {PARTITION_S:g} s"
+        )
+    layout = layout_of(runs, signal_sets, speeds=False)
     places = [
         (run.run_id, terrain, start_s)
         for run in runs

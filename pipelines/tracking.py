@@ -8,6 +8,7 @@ from __future__ import annotations
 import io
 import logging
 import os
+import socket
 import subprocess
 import warnings
 from collections.abc import Iterator, Mapping
@@ -16,6 +17,7 @@ from importlib.metadata import version
 from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, NamedTuple
+from urllib.parse import urlsplit
 
 from pipelines.models import TRUSTED_TYPES, TerrainModel, read_model, write_info
 from pipelines.recipes import WindowPipeline
@@ -29,6 +31,7 @@ if TYPE_CHECKING:
 FOLDER = "mlruns"
 EXPERIMENT = "terrain"
 CHAMPION = "champion"
+SERVER_TIMEOUT_S = 5.0
 REQUIREMENTS = ("terrain-slip", "scikit-learn", "numpy", "scipy", "numba", "skops")
 
 
@@ -90,9 +93,18 @@ def code_commit() -> str:
 
 
 def ensure_tracking() -> None:
-    """Raise ``TerrainError`` early where the embedded tracking folder cannot be written."""
-    if not os.environ.get("MLFLOW_TRACKING_URI"):
+    """Raise ``TerrainError`` early where the server cannot be reached or the folder cannot be written."""
+    uri = os.environ.get("MLFLOW_TRACKING_URI")
+    if not uri:
         ensure_writable(FOLDER)
+        return
+    server = urlsplit(uri)
+    if server.scheme in ("http", "https") and server.hostname:
+        try:
+            port = server.port or (443 if server.scheme == "https" else 80)
+            socket.create_connection((server.hostname, port), timeout=SERVER_TIMEOUT_S).close()
+        except (OSError, ValueError) as error:
+            raise TerrainError(f"MLFLOW_TRACKING_URI={uri}: cannot be reached ({error})") from error
 
 
 @contextmanager
@@ -120,6 +132,7 @@ def _connect(mlflow: Any, *, create: bool) -> None:
         )
     if create:
         ensure_writable(folder)
+        folder.mkdir(exist_ok=True)
     uri = f"sqlite:///{folder / 'mlflow.db'}"
     mlflow.set_tracking_uri(uri)
     mlflow.set_registry_uri(uri)
@@ -245,8 +258,10 @@ def load_model(uri: str) -> TerrainModel:
     """
     if Path(uri).exists():
         return read_model(Path(uri))
-    if ":/" not in uri:
+    if not uri.startswith(("models:/", "runs:/")):
         raise ModelError(f"{uri}: is neither a folder nor a model URI such as models:/NAME@champion")
+    if os.environ.get("MLFLOW_TRACKING_URI"):
+        ensure_tracking()
     with _quiet() as mlflow:
         _connect(mlflow, create=False)
         failures: tuple[type[Exception], ...] = (

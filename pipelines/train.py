@@ -16,7 +16,7 @@ from pipelines.recipes import feature_matrix
 from pipelines.splits import folds_of
 from terrain import __version__
 from terrain.errors import ConfigError
-from terrain.records import RunLog
+from terrain.records import RunLog, Windows
 
 METRICS = ("accuracy", "balanced_accuracy", "macro_f1", "vote_accuracy", "ece", "speed_only_accuracy")
 
@@ -80,23 +80,14 @@ def train(
     )
     rule = settings.rule
     chosen = recipe[-1].best_._asdict()
-    info = {
-        "recipe": settings.recipe,
-        "classes": [str(c) for c in np.unique(y)],
-        "window_s": rule.length_s,
-        "stride_s": rule.stride_s,
-        "steady": dataclasses.asdict(rule.steady) if rule.steady is not None else None,
-        "signal_sets": list(settings.signal_sets),
-        "seed": settings.seed,
-        "data_digest": data_digest(runs),
-        "dataset": dataset,
-        "commit": code_commit(),
-        "package_version": __version__,
-    }
+    info = model_info(runs, settings, windows, dataset, code_commit())
     params = {
         "recipe": settings.recipe,
         "window_s": rule.length_s,
+        "stride_s": rule.step_s,
         "steady": rule.steady is not None,
+        "seed": settings.seed,
+        "skip_short": settings.skip_short,
         "signal_sets": ",".join(settings.signal_sets),
         "repeats": report["repeats"],
         "n_windows": len(windows),
@@ -123,4 +114,27 @@ def train(
         "chosen": chosen,
         "importance": importance,
         "crossval": report,
+    }
+
+
+def model_info(
+    runs: Sequence[RunLog], settings: CrossvalSettings, windows: Windows, dataset: str, commit: str
+) -> dict[str, Any]:
+    """Return how the training windows were cut, as a new log must be, and where they came from."""
+    rule = settings.rule
+    return {
+        "recipe": settings.recipe,
+        "classes": [str(c) for c in np.unique(windows.terrain.astype(str))],
+        "window_s": rule.length_s,
+        "stride_s": rule.stride_s,
+        "steady": dataclasses.asdict(rule.steady) if rule.steady is not None else None,
+        "signal_sets": list(settings.signal_sets),
+        "channels": {stream: list(names) for stream, names in windows.channels.items()},
+        "rate_hz": dict(windows.rate_hz),
+        "seed": settings.seed,
+        "data_digest": data_digest(runs),
+        "run_digests": [data_digest([run]) for run in runs],
+        "dataset": dataset,
+        "commit": commit,
+        "package_version": __version__,
     }

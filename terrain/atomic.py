@@ -51,14 +51,15 @@ def atomic_write(path: str | Path, content: bytes | str) -> None:
 
 
 def ensure_writable(folder: str | Path) -> None:
-    """Make a folder and try to write there, so that long work does not end in a refusal.
+    """Find out whether a folder can be made and written, so that long work does not end in a refusal.
 
     Raises
     ------
     TerrainError
         if the folder cannot be made or written; nothing is left behind.
     """
-    folder = Path(folder)
+    folder = Path(folder).absolute()
+    made = [parent for parent in (folder, *folder.parents) if not parent.exists()]
     probe = _name_beside(folder / "probe")
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -66,6 +67,10 @@ def ensure_writable(folder: str | Path) -> None:
         probe.unlink()
     except OSError as error:
         raise _not_written(folder, error) from error
+    finally:
+        for parent in made:
+            if parent.is_dir():
+                parent.rmdir()
 
 
 @contextmanager

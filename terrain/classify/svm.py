@@ -13,6 +13,7 @@ everything.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -29,7 +30,7 @@ from sklearn.svm import SVC
 from sklearn.utils.multiclass import check_classification_targets
 from sklearn.utils.validation import check_is_fitted, validate_data
 
-from terrain.classify.folds import split_runs
+from terrain.classify.folds import block_groups, split_runs
 from terrain.errors import DataError
 from terrain.records import Array
 
@@ -153,7 +154,8 @@ class GroupedSVC(ClassifierMixin, BaseEstimator):
         rng: np.random.Generator,
         candidates: Sequence[Candidate],
     ) -> tuple[Array, Array]:
-        n_folds = min(self.n_inner_folds, *np.unique(y, return_counts=True)[1])
+        n_groups = len(np.unique(block_groups(y, groups, self.n_inner_folds).astype(str)))
+        n_folds = min(self.n_inner_folds, n_groups, *np.unique(y, return_counts=True)[1])
         decisions = np.zeros((len(candidates), len(y), len(self.classes_)))
         held_out = np.zeros(len(y), dtype=bool)
         self.n_inner_fits_ = 0
@@ -229,6 +231,14 @@ def fit_temperature(decisions: Array, class_index: Array) -> float:
     return float(np.exp(found.x))
 
 
+def f_score(X: Array, y: Array) -> tuple[Array, Array]:
+    """Return the F test of each feature; a feature that is constant within every class divides by zero."""
+    with np.errstate(divide="ignore", invalid="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        scores: tuple[Array, Array] = f_classif(X, y)
+    return scores
+
+
 def _preparation(percentile: float) -> Pipeline:
     return Pipeline(
         [
@@ -236,7 +246,7 @@ def _preparation(percentile: float) -> Pipeline:
             ("constant", VarianceThreshold()),
             ("scale", StandardScaler()),
             ("clip", FunctionTransformer(np.clip, kw_args={"a_min": -CLIP_STD, "a_max": CLIP_STD})),
-            ("select", SelectPercentile(f_classif, percentile=percentile)),
+            ("select", SelectPercentile(f_score, percentile=percentile)),
         ]
     )
 

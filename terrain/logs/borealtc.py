@@ -98,6 +98,7 @@ def read_run(class_folder: Path, number: str, *, repair: bool = False) -> RunLog
             table[:, 1:],
             list(columns),
             row_of=partial(data_row, path),
+            columns=list(columns.values()),
             repair=repair,
             dropped=dropped,
         )

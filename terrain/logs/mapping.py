@@ -174,6 +174,7 @@ def read_run(folder: Path, mapping: Mapping, words: dict[str, str], *, repair: b
             (table[:, 1:] * scale + offset) * factor,
             list(stream.channels),
             row_of=partial(data_row, path, delimiter=stream.delimiter),
+            columns=[column.column for column in columns],
             repair=repair,
             dropped=dropped,
         )

@@ -71,6 +71,7 @@ def checked_stream(
     channels: Sequence[str],
     *,
     row_of: Callable[[int], int],
+    columns: Sequence[str] = (),
     repair: bool = False,
     dropped: Counter[str] | None = None,
 ) -> Stream:
@@ -83,6 +84,7 @@ def checked_stream(
     values : (n, c) SI units
     channels : c names
     row_of : row number in the file of a sample, for the message
+    columns : c names of the columns in the file, for the message, where they are not the channels
     repair : drop and count what would otherwise be refused
     dropped : counts by kind, added to when repairing
 
@@ -116,7 +118,8 @@ def checked_stream(
         channel for channel, column in zip(channels, values.T, strict=True) if not np.isfinite(column).any()
     ]
     if dead and not repair:
-        raise LogError(f"{name}: channel {dead[0]} has nothing finite in its {time_s.size} rows")
+        column = f" (column {columns[list(channels).index(dead[0])]})" if columns else ""
+        raise LogError(f"{name}: channel {dead[0]}{column} has nothing finite in its {time_s.size} rows")
     if dead:
         counts[DEAD_CHANNEL] += len(dead)
     return Stream(time_s, values, tuple(channels))

@@ -84,7 +84,7 @@ SPOILT_FILES = {
     ),
     "dead channel": (
         lambda lines: [lines[0], *(line.rpartition(",")[0] + ",nan" for line in lines[1:])],
-        "imu_01.csv: channel accel_z_mps2 has nothing finite in its 200 rows",
+        "imu_01.csv: channel accel_z_mps2 (column az) has nothing finite in its 200 rows",
     ),
     "empty file": (lambda lines: [], "imu_01.csv: is empty"),
     "no number": (

@@ -32,7 +32,7 @@ def test_run_folders_and_a_single_run_folder_are_found(tmp_path, make_run):
 def test_two_runs_with_one_id_are_refused(tmp_path, make_run):
     write_run(make_run("SNOW_01"), tmp_path)
     shutil.copytree(tmp_path / "SNOW_01", tmp_path / "copy")
-    with pytest.raises(LogError, match=r"2 runs have the id 'SNOW_01' \(noise and noise\)"):
+    with pytest.raises(LogError, match=r"2 runs have the id 'SNOW_01' \(.*/SNOW_01 and .*/copy\)"):
         load_runs(tmp_path)
 
 

@@ -1,3 +1,5 @@
+import contextlib
+
 import numpy as np
 import pytest
 
@@ -40,7 +42,7 @@ def test_the_speed_of_a_run_is_that_of_its_faster_wheel_where_it_moves(drive):
     still = RunLog(
         "s", "husky", {**run.streams, "wheels": Stream(wheels.time_s, values, wheels.channels)}, run.labels
     )
-    speeds = run_speeds(grouped_samples([moved, still], PLAIN))
+    speeds = run_speeds(grouped_samples([moved, still], PLAIN).cut.windows)
     assert speeds["r"] == pytest.approx(0.6)
     assert np.isnan(speeds["s"])
 
@@ -51,7 +53,7 @@ def test_each_class_is_split_at_its_own_median_speed(runs_at):
         grouped_samples([r for t, s in plan.items() for r in runs_at(t, s)], WindowRule())
     )
     assert (split["status"], split["left_out"]) == ("applicable", {})
-    assert set(split["slow"]) == {
+    assert {run for run, _ in split["slow"]} == {
         "ASPHALT_0",
         "ASPHALT_1",
         "GRASS_1",
@@ -60,7 +62,14 @@ def test_each_class_is_split_at_its_own_median_speed(runs_at):
         "GRAVEL_1",
         "GRAVEL_2",
     }
-    assert set(split["fast"]) == {"ASPHALT_2", "ASPHALT_3", "GRASS_0", "GRASS_2", "GRAVEL_3", "GRAVEL_4"}
+    assert {run for run, _ in split["fast"]} == {
+        "ASPHALT_2",
+        "ASPHALT_3",
+        "GRASS_0",
+        "GRASS_2",
+        "GRAVEL_3",
+        "GRAVEL_4",
+    }
     assert split["classes"]["GRASS"]["slow_mps"] == pytest.approx(0.55, abs=0.02)
     assert split["classes"]["GRASS"]["fast_mps"] == pytest.approx(0.95, abs=0.02)
 
@@ -72,7 +81,7 @@ def test_a_class_with_too_little_on_a_side_is_left_out_and_named(runs_at):
     assert split["left_out"] == {"GRAVEL": "fast runs: 1"}
     assert set(split["classes"]) == {"ASPHALT", "GRASS"}
     assert split["status"] == "not applicable"  # two classes remain, three are needed
-    assert not [run for run in split["slow"] + split["fast"] if run.startswith("GRAVEL")]
+    assert not [run for run, _ in split["slow"] + split["fast"] if run.startswith("GRAVEL")]
     # 2 x 28 s a side are too short; windows that overlap cover no more of them, though they are more.
     short = runs_at("GRAVEL", SPEEDS, 28.0)
     for stride_s in (None, 0.5):
@@ -182,3 +191,52 @@ def test_a_curve_that_still_climbs_gives_no_number():
         enough_runs(m[:3], m[:3] / 4)["statement"] == "3 sizes are too few to tell how many runs are enough"
     )
     assert enough_runs(m, np.full(4, 0.8))["enough_runs"] == 1
+
+
+def test_a_run_slow_on_one_class_and_fast_on_another_is_on_no_side(runs_at, settings, monkeypatch):
+    """Its windows would otherwise teach and test at once."""
+    folds = []
+    monkeypatch.setattr(extras, "fit_folds", lambda *args: folds.extend(args[4]) or [])
+    monkeypatch.setattr(extras, "_accuracy", lambda *_: 0.5)
+    runs = [run for terrain in ("ASPHALT", "GRASS", "GRAVEL") for run in runs_at(terrain, SPEEDS)]
+    slow_grass, fast_gravel = (next(r for r in runs if r.run_id == name) for name in ("GRASS_0", "GRAVEL_3"))
+    joined = {}
+    for name in slow_grass.streams:
+        first, second = slow_grass.streams[name], fast_gravel.streams[name]
+        joined[name] = Stream(
+            np.concatenate([first.time_s, second.time_s + 32.0]),
+            np.concatenate([first.values, second.values]),
+            first.channels,
+        )
+    labels = ((0.0, 32.0, "GRASS"), (32.0, 64.0, "GRAVEL"))
+    mixed = RunLog("mixed", "husky", joined, labels)
+    samples = grouped_samples([r for r in runs if r not in (slow_grass, fast_gravel)] + [mixed], WindowRule())
+    split = slow_fast_split(samples)
+    assert ("mixed", "GRASS") in split["slow"]
+    assert ("mixed", "GRAVEL") in split["fast"]
+    with contextlib.suppress(IndexError):
+        slow_fast(None, None, samples, 1)
+    assert len(folds) == 2
+    run_id = samples.cut.windows.run_id
+    for fold in folds:
+        assert not set(run_id[fold.train]) & set(run_id[fold.test])
+        assert "mixed" not in run_id[np.concatenate([fold.train, fold.test])]
+
+
+def test_runs_with_several_labels_can_be_learned_from_few(drive, settings):
+    """One group may hold all classes: the inner folds are then as many as the groups allow."""
+    runs = []
+    for number in range(6):
+        a, b = (drive(f"r{number}", terrain, number, 12.0) for terrain in ("GRASS", "GRAVEL"))
+        streams = {
+            name: Stream(
+                np.concatenate([a.streams[name].time_s, b.streams[name].time_s + 12.0]),
+                np.concatenate([a.streams[name].values, b.streams[name].values]),
+                a.streams[name].channels,
+            )
+            for name in a.streams
+        }
+        runs.append(RunLog(f"r{number}", "husky", streams, ((0.0, 12.0, "GRASS"), (12.0, 24.0, "GRAVEL"))))
+    report = crossval(runs, settings(repeats=1, extras=True))
+    assert report["learning_curve"]["runs_per_class"][0] == 1.0
+    assert {row["run_id"] for row in report["per_run"]} >= {"r0 (GRASS)", "r0 (GRAVEL)"}

@@ -9,7 +9,7 @@ import pytest
 from features.windows import cut_windows
 from pipelines.datasets import data_digest
 from pipelines.models import read_model
-from pipelines.tracking import load_model, log_training
+from pipelines.tracking import ensure_tracking, load_model, log_training
 from terrain.errors import ModelError, TerrainError
 
 
@@ -147,7 +147,6 @@ def test_the_server_that_is_named_is_the_one_that_is_used(tracked, log, tmp_path
         "models:/drawn@nobody",
         "models:/",
         "runs:/0123/model",
-        "sftp:/x",
     ],
 )
 def test_a_model_that_is_not_there_is_one_sentence(in_tracked, uri):
@@ -155,6 +154,19 @@ def test_a_model_that_is_not_there_is_one_sentence(in_tracked, uri):
         load_model(uri)
     assert str(error.value).startswith(uri)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("uri", ["sftp:/x", "http://x", "s3:/bucket/model", "nowhere"])
+def test_a_model_from_elsewhere_is_not_fetched(uri):
+    with pytest.raises(ModelError, match="is neither a folder nor a model URI"):
+        load_model(uri)
+
+
+def test_a_server_that_does_not_answer_is_named_before_the_work(monkeypatch):
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", "http://127.0.0.1:1")
+    for act in (ensure_tracking, lambda: load_model("models:/m@champion")):
+        with pytest.raises(TerrainError, match=r"MLFLOW_TRACKING_URI=http://127.0.0.1:1: cannot be reached"):
+            act()
 
 
 def test_looking_for_a_model_makes_nothing(tmp_path, monkeypatch):

@@ -4,9 +4,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipelines.models import read_model
+from pipelines.crossval import samples_of
+from pipelines.import_logs import import_logs
+from pipelines.models import TerrainModel, read_model
 from pipelines.predict import predict
-from pipelines.train import train
+from pipelines.train import model_info, train
 from terrain.control.slip_table import DRIVE_STATES, SlipTable, load_slip_table
 from terrain.errors import ConfigError, DataError, TerrainError
 from terrain.logs.write import write_run
@@ -41,11 +43,35 @@ def test_new_runs_of_known_terrain_are_predicted(model, drive_all):
     for row in result["windows"]:
         assert 1 / 3 <= row["probability"] <= 1
         assert set(row["target_slip"]) == set(DRIVE_STATES)
-    assert not result["taught_on_these_runs"]
+    assert result["taught_runs"] == []
 
 
 def test_accuracy_on_the_very_runs_that_were_taught_is_called_memory(model, runs):
-    assert predict(runs, model, load_slip_table())["taught_on_these_runs"]
+    assert predict(runs, model, load_slip_table())["taught_runs"] == [run.run_id for run in runs]
+
+
+def test_one_taught_run_among_new_ones_is_named(model, runs, drive):
+    result = predict([runs[0], drive("new", "GRASS", 8)], model, load_slip_table())
+    assert result["taught_runs"] == [runs[0].run_id]
+
+
+@pytest.mark.parametrize(
+    ("options", "streams"),
+    [
+        ({"signal_sets": ("imu",)}, {"imu", "wheels"}),
+        ({"signal_sets": ("imu",), "steady": False}, {"imu"}),
+        ({"signal_sets": ("currents",)}, {"wheels"}),
+    ],
+)
+def test_a_model_of_some_signals_needs_no_others(runs, drive, settings, options, streams):
+    """The steady-motion rule needs wheel speeds; beyond these a log needs what the features are made of."""
+    chosen = settings(**options)
+    windows = samples_of(runs, chosen).cut.windows
+    recipe = chosen.new_recipe().fit(windows, windows.terrain.astype(str))
+    model = TerrainModel(recipe, model_info(runs, chosen, windows, "drawn", "none"))
+    new = drive("new", "GRASS", 8)
+    bare = RunLog("new", "husky", {name: new.streams[name] for name in streams}, new.labels)
+    assert predict([bare], model, load_slip_table())["n_windows"] == 12
 
 
 def test_labels_the_model_never_saw_are_predicted_counted_and_not_judged(model, drive, drive_all):
@@ -187,9 +213,12 @@ def test_quickstart_reuses_its_own_import_and_no_other(drive_all, drive, setting
     monkeypatch.setattr(module, "crossval", lambda *_: (_ for _ in ()).throw(DataError("as far as this")))
     for run in drive_all(n_runs=1, duration_s=4.0):
         write_run(run, tmp_path / "data")
-    for _ in range(2):
-        with pytest.raises(DataError, match="as far as this"):
-            module.quickstart(tmp_path / "data", tmp_path / "out", settings(), "quick")
+    with pytest.raises(DataError, match="as far as this"):
+        module.quickstart(tmp_path / "data", tmp_path / "out", settings(), "quick")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["data"]  # a refusal leaves nothing
+    import_logs(tmp_path / "data", tmp_path / "out" / "runs")
+    with pytest.raises(DataError, match="as far as this"):
+        module.quickstart(tmp_path / "data", tmp_path / "out", settings(), "quick")
     imported = sorted(path.name for path in (tmp_path / "out" / "runs").iterdir())
     assert imported == ["ASPHALT_1", "GRASS_1", "GRAVEL_1"]
     write_run(drive("GRASS_2", "GRASS", 0, 4.0), tmp_path / "data")
