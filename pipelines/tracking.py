@@ -76,20 +76,23 @@ def champion_decision(champion: Standing | None, candidate: Standing) -> tuple[b
 
 
 def code_commit() -> str:
-    """Return the commit of the code, with ``+`` when files were changed since; else the version."""
-    folder = Path(__file__).resolve().parent
-    try:
-        described = subprocess.run(
-            ["git", "describe", "--always", "--abbrev=40", "--exclude=*", "--dirty=+"],
-            cwd=folder,
-            capture_output=True,
-            text=True,
-            check=True,
-            timeout=10,
+    """Return the commit of the code, with ``+`` when files were changed since.
+
+    An installed package is no checkout, whatever repository it happens to lie in: its version is returned.
+    """
+    file = Path(__file__).resolve()
+
+    def git(*words: str) -> str:
+        done = subprocess.run(
+            ["git", *words], cwd=file.parent, capture_output=True, text=True, check=True, timeout=10
         )
+        return done.stdout.strip()
+
+    try:
+        git("ls-files", "--error-unmatch", file.name)
+        return git("describe", "--always", "--abbrev=40", "--exclude=*", "--dirty=+")
     except (OSError, subprocess.SubprocessError):
         return f"version {version('terrain-slip')}"
-    return described.stdout.strip()
 
 
 def ensure_tracking() -> None:
