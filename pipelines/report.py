@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from importlib import metadata
+from pathlib import Path
 from platform import python_version
 from typing import Any
 
@@ -20,6 +21,8 @@ from pipelines.figures import NOT_KNOWN, percent, sentence, svg_text
 from pipelines.metrics import VOTE_SPAN_S
 
 Result = Mapping[str, Any]
+
+STYLE_FILE = Path(__file__).with_name("report.css")
 
 PACKAGES = (
     "terrain-slip",
@@ -101,7 +104,7 @@ def html_report(result: Result, figures: Mapping[str, Figure]) -> str:
 <meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <title>{escape(title)}</title>
-<style>{STYLE}</style>
+<style>{STYLE_FILE.read_text(encoding="utf-8")}</style>
 </head>
 <body>
 <main>
@@ -486,105 +489,3 @@ def _listed(names: Sequence[str]) -> str:
 
 def _plural(count: int, what: str) -> str:
     return f"{count} {what}{'' if count == 1 else 's'}"
-
-
-STYLE = """
-:root { color-scheme: light dark; --ink: #1f2933; --faint: #5b6672; --page: #f5f6f8; --sheet: #fff;
-  --rule: #dde2e7; --accent: #0072b2; --warn: #8a3c00; --warn-page: #fdf1e7; --weak: #fbeade; }
-@media (prefers-color-scheme: dark) {
-  :root { --ink: #e6e9ec; --faint: #a3adb8; --page: #14181c; --sheet: #1d2329; --rule: #36404a;
-    --accent: #62b8e8; --warn: #f5b98a; --warn-page: #33251a; --weak: #3a2a1e; } }
-* { box-sizing: border-box; }
-body { margin: 0; background: var(--page); color: var(--ink);
-  font: 15px/1.5 system-ui, -apple-system, "Segoe UI", "Helvetica Neue", Arial, "DejaVu Sans", sans-serif; }
-main { max-width: 1160px; margin: 0 auto; padding: 28px 20px 60px; }
-h1 { font-size: 30px; line-height: 1.2; margin: 0; overflow-wrap: anywhere; }
-h2 { font-size: 19px; margin: 0 0 12px; }
-h3 { font-size: 15px; margin: 18px 0 6px; }
-p { margin: 0 0 10px; }
-.kind { margin: 0; color: var(--accent); font-weight: 600; }
-.lead, .small, figcaption { color: var(--faint); }
-.lead { margin: 4px 0 20px; }
-.small, figcaption { font-size: 13px; }
-section { background: var(--sheet); border: 1px solid var(--rule); border-radius: 8px; padding: 20px 22px;
-  margin: 0 0 18px; }
-section > :last-child { margin-bottom: 0; }
-.big { display: flex; gap: 24px; align-items: center; }
-.number { font-size: 60px; line-height: 1; font-weight: 700; letter-spacing: -0.02em; margin: 0;
-  font-variant-numeric: tabular-nums; color: var(--accent); }
-.words { font-size: 18px; font-weight: 600; margin: 0 0 4px; }
-.big div p:last-child { margin: 0; }
-.scale { margin: 22px 0 18px; }
-.scale .line { position: relative; height: 10px; border-radius: 5px; background: var(--rule); }
-.scale i { position: absolute; display: block; }
-.band { top: 0; height: 10px; background: var(--accent); opacity: .45; border-radius: 3px; }
-.dot { top: -3px; width: 16px; height: 16px; margin-left: -8px; border-radius: 50%; background: var(--accent);
-  border: 2px solid var(--sheet); }
-.guess, .speed { top: -4px; width: 3px; height: 18px; margin-left: -1.5px; background: var(--faint); }
-.speed { background: #d55e00; }
-.ends { display: flex; justify-content: space-between; font-size: 12px; color: var(--faint);
-  margin-top: 4px; }
-.legend { display: flex; flex-wrap: wrap; gap: 2px 20px; font-size: 13px; margin: 2px 0 0; }
-.legend span { display: inline-flex; align-items: center; gap: 7px; }
-.scale i.key { position: static; margin: 0; flex: none; }
-.scale i.key.band { width: 22px; }
-.cards { display: grid; grid-template-columns: repeat(4, 1fr); gap: 12px; margin: 0; }
-.card { border-top: 3px solid var(--rule); padding-top: 8px; }
-.card dt { font-weight: 600; }
-.card dd { margin: 0; font-size: 26px; font-weight: 700; font-variant-numeric: tabular-nums; }
-.card p { margin: 0; font-size: 13px; color: var(--faint); line-height: 1.35; }
-.notes, .warning { background: var(--warn-page); }
-.notes { border-color: var(--warn); border-left-width: 5px; }
-.notes h2, .warning { color: var(--warn); }
-.notes ul { margin: 0; padding-left: 20px; }
-.notes h2 { margin-bottom: 4px; }
-.warning { padding: 8px 12px; border-radius: 5px; }
-.figures { display: grid; grid-template-columns: repeat(2, minmax(0, 1fr)); gap: 24px 28px;
-  align-items: start; }
-figure { margin: 0; min-width: 0; }
-figure img { display: block; width: 100%; height: auto; background: #fff; border-radius: 4px; }
-figure.wide { grid-column: 1 / -1; max-width: 860px; width: 100%; justify-self: center; }
-figcaption { margin-top: 6px; }
-.scroll { overflow-x: auto; margin-bottom: 10px; }
-table { border-collapse: collapse; width: 100%; font-size: 14px; font-variant-numeric: tabular-nums; }
-th, td { padding: 5px 10px; text-align: right; border-bottom: 1px solid var(--rule); vertical-align: top; }
-thead th { color: var(--faint); font-weight: 600; border-bottom: 2px solid var(--rule);
-  vertical-align: bottom; }
-tbody th { text-align: left; font-weight: 600; }
-th.text, td.text { text-align: left; }
-td.text:not(.long) { white-space: nowrap; }
-.dense table { font-size: 13px; }
-.dense th, .dense td { padding: 4px 6px; }
-td.long { min-width: 220px; }
-tr.weak > * { background: var(--weak); }
-.questions dt { font-weight: 600; }
-.questions dd { margin: 0 0 12px; }
-.pairs { display: grid; grid-template-columns: max-content minmax(0, 1fr); gap: 4px 18px; margin: 0; }
-.pairs dt { color: var(--faint); }
-.pairs dd { margin: 0; overflow-wrap: anywhere; }
-code, pre { font-family: ui-monospace, SFMono-Regular, Menlo, Consolas, "DejaVu Sans Mono", monospace;
-  font-size: 13px; }
-pre { background: var(--page); border: 1px solid var(--rule); border-radius: 5px; padding: 10px 12px;
-  margin: 0; overflow-x: auto; white-space: pre-wrap; overflow-wrap: anywhere; }
-@media screen and (max-width: 860px) {
-  .figures { grid-template-columns: minmax(0, 1fr); }
-  .cards { grid-template-columns: repeat(2, 1fr); }
-  .number { font-size: 46px; } }
-@media screen and (max-width: 520px) {
-  .big { display: block; } main { padding: 16px 10px; } section { padding: 14px; } }
-@media print {
-  :root { color-scheme: light; --ink: #000; --faint: #444; --page: #fff; --sheet: #fff; --rule: #ccc;
-    --accent: #0072b2; --warn: #8a3c00; --warn-page: #fff; --weak: #f3f3f3; }
-  body { font-size: 11px; print-color-adjust: exact; -webkit-print-color-adjust: exact; }
-  main { max-width: none; padding: 0; }
-  section { border: 0; border-radius: 0; padding: 0; margin-bottom: 18px; }
-  section.notes { border: 1px solid var(--warn); padding: 8px 12px; }
-  table, .dense table { font-size: 10px; }
-  .scroll { overflow: visible; }
-  figure, tr, .headline, pre { break-inside: avoid; }
-  h2, h3 { break-after: avoid; }
-  .figures { display: block; }
-  figure { max-width: 150mm; margin: 0 auto 14px; }
-  figure.wide { max-width: 170mm; }
-  figure.wide img { max-height: 240mm; object-fit: contain; } }
-"""
