@@ -6,11 +6,15 @@ import json
 import sys
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from terrain.errors import ConfigError, TerrainError
+from terrain.logs.schema import SIGNAL_SETS
+
+if TYPE_CHECKING:
+    from terrain.records import RunLog
 
 app = typer.Typer(
     name="terrain",
@@ -68,7 +72,7 @@ Signals = Annotated[
 Seed = Annotated[int, typer.Option(min=0, help="Deals runs into folds.")]
 Repeats = Annotated[int | None, typer.Option(min=1, help="Fold assignments (5).")]
 Jobs = Annotated[int, typer.Option(min=0, help="Processes at once; 0 for one a core.")]
-ALL_SIGNALS = "imu,wheels,currents,slip,estimator"
+ALL_SIGNALS = ",".join(SIGNAL_SETS)
 
 
 @app.command("import")
@@ -130,26 +134,23 @@ def crossval_command(
 ) -> None:
     """Tell how well a recipe does on runs it has not seen."""
     from pipelines.crossval import CrossvalSettings, crossval
-    from pipelines.datasets import data_digest, load_runs
+    from pipelines.datasets import data_digest
     from pipelines.screens import print_crossval, progress_bar
 
     settings = CrossvalSettings(
-        recipe.value,
-        protocol.value,
-        window,
-        stride,
-        steady,
-        repeats,
-        seed,
-        _names(signals),
-        extras,
-        jobs,
-        repair,
+        recipe=recipe.value,
+        protocol=protocol.value,
+        window_s=window,
+        stride_s=stride,
+        steady=steady,
+        repeats=repeats,
+        seed=seed,
+        signal_sets=_names(signals),
+        extras=extras,
+        n_jobs=jobs,
+        skip_short=repair,
     )
-    skipped: list[str] = []
-    runs = load_runs(
-        data, layout=layout.value, mapping=mapping, repair=repair, align=align, on_skip=skipped.append
-    )
+    runs, skipped = _load(data, layout, mapping, repair, align)
     with progress_bar() as progress:
         report = crossval(runs, settings, progress)
     result = {"dataset": data.resolve().name, "data_digest": data_digest(runs), **report, "skipped": skipped}
@@ -177,17 +178,22 @@ def train_command(
 ) -> None:
     """Evaluate on held-out runs, fit on all of them, track in MLflow and register."""
     from pipelines.crossval import CrossvalSettings
-    from pipelines.datasets import load_runs
     from pipelines.screens import print_crossval, print_training, progress_bar
     from pipelines.train import train
 
     settings = CrossvalSettings(
-        recipe.value, "grouped", window, stride, steady, repeats, seed, _names(signals), False, jobs, repair
+        recipe=recipe.value,
+        window_s=window,
+        stride_s=stride,
+        steady=steady,
+        repeats=repeats,
+        seed=seed,
+        signal_sets=_names(signals),
+        extras=False,
+        n_jobs=jobs,
+        skip_short=repair,
     )
-    skipped: list[str] = []
-    runs = load_runs(
-        data, layout=layout.value, mapping=mapping, repair=repair, align=align, on_skip=skipped.append
-    )
+    runs, skipped = _load(data, layout, mapping, repair, align)
     with progress_bar() as progress:
         result = {**train(runs, settings, name, data.resolve().name, progress), "skipped": skipped}
     print_crossval({**result["crossval"], "dataset": result["dataset"], "skipped": skipped}, _console())
@@ -209,17 +215,13 @@ def predict_command(
     json_file: Json = None,
 ) -> None:
     """Print terrain, probability and target slip."""
-    from pipelines.datasets import load_runs
     from pipelines.predict import predict
     from pipelines.screens import print_predictions
     from pipelines.tracking import load_model
     from terrain.control.slip_table import load_slip_table
 
     slip_table = load_slip_table(table)
-    skipped: list[str] = []
-    runs = load_runs(
-        data, layout=layout.value, mapping=mapping, repair=repair, align=align, on_skip=skipped.append
-    )
+    runs, skipped = _load(data, layout, mapping, repair, align)
     predicted = predict(runs, load_model(model), slip_table, skip_short=repair)
     result = {"model": model, "dataset": data.resolve().name, **predicted, "skipped": skipped}
     print_predictions(result, _console())
@@ -256,6 +258,18 @@ def _console() -> Any:
 
     # names come from the user's files: brackets in them are no markup
     return Console(soft_wrap=True, markup=False, width=None if sys.stdout.isatty() else 110)
+
+
+def _load(
+    data: Path, layout: Format, mapping: Path | None, repair: bool, align: bool
+) -> tuple[list[RunLog], list[str]]:
+    """Return the runs, and a sentence for each that a repairing read had to skip."""
+    from pipelines.datasets import load_runs
+
+    skipped: list[str] = []
+    return load_runs(
+        data, layout=layout.value, mapping=mapping, repair=repair, align=align, on_skip=skipped.append
+    ), skipped
 
 
 def _names(signals: str) -> tuple[str, ...]:

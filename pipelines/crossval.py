@@ -20,6 +20,7 @@ from pipelines.splits import (
     PROTOCOLS,
     PUBLISHED_WINDOW_S,
     Samples,
+    counted,
     folds_of,
     grouped_samples,
     published_samples,
@@ -177,9 +178,7 @@ def notes(samples: Samples, settings: CrossvalSettings, repaired: dict[str, int]
             "for comparison with papers only"
         )
     if samples.cut.dropped:
-        counts = ", ".join(f"{n} {reason}" for reason, n in sorted(samples.cut.dropped.items()))
-        said.append(f"windows left out: {counts}")
+        said.append(f"windows left out: {counted(samples.cut.dropped)}")
     if repaired:
-        counts = ", ".join(f"{n} {kind}" for kind, n in sorted(repaired.items()))
-        said.append(f"dropped to repair the logs: {counts}")
+        said.append(f"dropped to repair the logs: {counted(repaired)}")
     return said

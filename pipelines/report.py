@@ -19,6 +19,7 @@ from matplotlib.figure import Figure
 from pipelines.extras import MIN_CLASSES
 from pipelines.figures import NOT_KNOWN, percent, sentence, svg_text
 from pipelines.metrics import VOTE_SPAN_S
+from terrain.control.slip_table import DRIVE_STATES
 
 Result = Mapping[str, Any]
 
@@ -37,7 +38,6 @@ PACKAGES = (
 )
 """Packages whose versions decide what numbers come out."""
 
-DRIVE_STATES = ("traction", "braking", "steady")
 WEAK_BELOW = 0.5
 WIDE = ("per_run",)
 """Figures that take the whole width; they come after those that stand side by side."""

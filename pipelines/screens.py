@@ -11,6 +11,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from rich.table import Table
 
 from pipelines import evaluation
+from pipelines.splits import counted
+from terrain.control.slip_table import DRIVE_STATES
 
 MAX_ROWS = 12
 
@@ -34,17 +36,6 @@ def progress_bar() -> Iterator[evaluation.Progress]:
     finally:
         if tasks:
             bars.stop()
-
-
-def counted(counts: dict[str, int]) -> str:
-    """Return counts by kind in words.
-
-    Examples
-    --------
-    >>> counted({"gap": 2, "not moving": 1})
-    '2 gap, 1 not moving'
-    """
-    return ", ".join(f"{n} {kind}" for kind, n in sorted(counts.items()))
 
 
 def percent(value: float | None) -> str:
@@ -126,7 +117,7 @@ def print_predictions(result: dict[str, Any], console: Console) -> None:
             str(len(rows)),
             rows[0]["terrain"],
             f"{probability:.2f}",
-            *(f"{slip[state]:+.2f}" for state in ("traction", "braking", "steady")),
+            *(f"{slip[state]:+.2f}" for state in DRIVE_STATES),
         )
     console.print(table)
     if len(stretches) > MAX_ROWS:

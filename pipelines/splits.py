@@ -7,7 +7,7 @@ partition nearly always has its own run in training; it is there to compare with
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -69,12 +69,22 @@ def grouped_samples(
     return Samples(cut, cut.windows.run_id, rule.overlap)
 
 
+def counted(counts: Mapping[str, int]) -> str:
+    """Return counts by kind in words.
+
+    Examples
+    --------
+    >>> counted({"not moving": 1, "gap": 2})
+    '2 gap, 1 not moving'
+    """
+    return ", ".join(f"{n} {kind}" for kind, n in sorted(counts.items()))
+
+
 def labelled(cut: WindowCut) -> WindowCut:
     """Keep the windows that lie under one label; the others are counted as ``no single label``."""
     known = cut.windows.terrain != ""
     if not len(known):
-        reasons = ", ".join(f"{n} {reason}" for reason, n in sorted(cut.dropped.items()))
-        raise DataError(f"not one window is left: {reasons or 'no run is long enough'}")
+        raise DataError(f"not one window is left: {counted(cut.dropped) or 'no run is long enough'}")
     if not known.any():
         raise DataError("no window has a terrain label: nothing can be learned or judged")
     if known.all():

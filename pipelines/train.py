@@ -12,7 +12,6 @@ from pipelines.crossval import CrossvalSettings, crossval, samples_of
 from pipelines.datasets import data_digest
 from pipelines.evaluation import Progress, silent
 from pipelines.importance import channel_importance
-from pipelines.recipes import feature_matrix
 from pipelines.splits import folds_of
 from terrain import __version__
 from terrain.errors import ConfigError
@@ -69,7 +68,7 @@ def train(
     progress("fit on all runs", 1, 1)
     importance = channel_importance(
         settings.new_recipe()[-1],
-        feature_matrix(recipe, windows),
+        recipe[:-1].transform(windows),
         list(recipe[0].get_feature_names_out()),
         y,
         samples.group,

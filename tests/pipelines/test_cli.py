@@ -281,3 +281,14 @@ def test_the_command_itself_ends_with_code_2_and_one_line(tmp_path):
     assert (found.returncode, found.stdout) == (2, "")
     assert found.stderr.startswith(f"error: {tmp_path}: holds no run")
     assert found.stderr.count("\n") == 1
+
+
+def test_the_choices_of_the_command_line_are_those_that_there_are():
+    """They are written twice, so that help need not load what offers them."""
+    from pipelines import cli
+    from pipelines.datasets import LAYOUTS
+    from pipelines.recipes import RECIPES
+    from pipelines.splits import PROTOCOLS
+
+    for choices, offered in ((cli.Format, LAYOUTS), (cli.Protocol, PROTOCOLS), (cli.Recipe, RECIPES)):
+        assert {choice.value for choice in choices} == set(offered)

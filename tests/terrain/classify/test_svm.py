@@ -5,6 +5,7 @@ from sklearn.base import clone
 from sklearn.utils.estimator_checks import parametrize_with_checks
 
 from terrain.classify import svm
+from terrain.classify.folds import split_runs
 from terrain.classify.svm import CANDIDATES, GroupedSVC
 from terrain.errors import DataError
 
@@ -171,3 +172,23 @@ def test_what_cannot_be_learned_is_refused():
     both = np.r_[np.flatnonzero(y == "ice")[:2], np.flatnonzero(y == "snow")[:2]]
     with pytest.raises(DataError, match="too few to hold some of them out"):
         GroupedSVC().fit(X[both], y[both], groups=np.array(list("aabb")))
+
+
+def test_inner_folds_leave_out_what_shares_samples_with_a_test_block(monkeypatch):
+    """The only run of a class is cut into inner blocks: windows that overlap one must not teach."""
+    splits = []
+
+    def spy(*args):
+        for train, test in split_runs(*args):
+            splits.append((train, test))
+            yield train, test
+
+    monkeypatch.setattr(svm, "split_runs", spy)
+    rng = np.random.default_rng(0)
+    y = np.repeat(["ice", "snow"], 60)
+    groups = np.where(y == "ice", "only", np.repeat([f"r{i}" for i in range(12)], 10))
+    GroupedSVC(gap=4).fit(rng.normal(size=(120, 3)) + (y == "ice")[:, None], y, groups=groups)
+    assert splits
+    for train, test in splits:
+        ice_train, ice_test = train[train < 60], test[test < 60]
+        assert np.abs(ice_train[:, None] - ice_test).min() == 5
