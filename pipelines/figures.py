@@ -1,25 +1,31 @@
-"""The figures of an evaluation: a report dict goes in, a matplotlib figure comes out.
-
-Figures are made with the object-oriented interface and an own style, so that nothing global is changed and
-a user's matplotlib settings do not show.  The same report gives the same bytes.
-"""
+"""The figures of an evaluation: a report dict goes in, a matplotlib figure comes out."""
 
 from __future__ import annotations
 
-import io
 import textwrap
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-import matplotlib.style
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import MaxNLocator, PercentFormatter
 
+from pipelines.drawing import (
+    BARE,
+    BLUE,
+    CLASS_COLOURS,
+    FAINT_INK,
+    INK,
+    NOT_KNOWN,
+    VERMILION,
+    finished,
+    new_figure,
+    percent,
+    sentence,
+    shorten,
+    styled,
+)
 from terrain.records import Array
 
 Report = Mapping[str, Any]
@@ -30,87 +36,8 @@ MAX_RUNS = 120
 MAX_COUNTED_CLASSES = 10
 """Beyond this many classes a cell has no room for the number of windows below the share."""
 MISTAKEN_BELOW = 0.5
-NOT_KNOWN = "\N{EN DASH}"
-PNG_DPI = 160
 WHOLE_STEPS = (1, 2, 5, 10)
 """Steps between ticks of a percentage; 2.5 would be rounded into uneven numbers."""
-
-TITLE_LETTERS_AN_INCH = 11
-
-INK = "#1f2933"
-FAINT_INK = "#66717d"
-GRID = "#dde2e7"
-BLUE = "#0072b2"
-VERMILION = "#d55e00"
-BARE = {"facecolor": "white", "edgecolor": "none", "pad": 0.7}
-"""Behind a text that would else be crossed by lines of the grid."""
-CLASS_COLOURS = (BLUE, "#e69f00", "#009e73", "#cc79a7", "#56b4e9", VERMILION, "#8c8c8c")
-"""Okabe and Ito (2008), without black and yellow, and grey: told apart by colour-blind readers, too."""
-
-STYLE = {
-    "font.family": ["DejaVu Sans"],
-    "font.size": 9.0,
-    "axes.titlesize": 10.0,
-    "axes.labelsize": 9.0,
-    "axes.labelcolor": INK,
-    "axes.edgecolor": FAINT_INK,
-    "axes.linewidth": 0.8,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.axisbelow": True,
-    "text.color": INK,
-    "text.parse_math": False,
-    "text.hinting": "none",
-    "xtick.color": FAINT_INK,
-    "ytick.color": FAINT_INK,
-    "xtick.labelcolor": INK,
-    "ytick.labelcolor": INK,
-    "grid.color": GRID,
-    "grid.linewidth": 0.8,
-    "figure.facecolor": "white",
-    "savefig.facecolor": "white",
-    "svg.fonttype": "path",
-    "svg.hashsalt": "terrain",
-    "path.simplify": False,
-}
-"""Names of runs are drawn as they are: a dollar sign in one starts no formula.  Without hinting a text is
-as wide in one resolution as in another, so that a layout made for one fits the other."""
-
-
-def percent(share: float, digits: int = 1) -> str:
-    """Return a share as a percentage.
-
-    Examples
-    --------
-    >>> percent(0.8134), percent(1.0, 0)
-    ('81.3%', '100%')
-    """
-    return f"{share:.{digits}%}"
-
-
-def shorten(text: str, width: int) -> str:
-    """Cut the middle out of a text that is too long; both ends of an id tell something.
-
-    Examples
-    --------
-    >>> shorten("2024-05-01_field_north_run_17", 16)
-    '2024-05…h_run_17'
-    """
-    if len(text) <= width:
-        return text
-    tail = width // 2
-    return f"{text[: width - tail - 1]}…{text[-tail:]}"
-
-
-def sentence(text: str) -> str:
-    """Write a remark as a sentence.
-
-    Examples
-    --------
-    >>> sentence("not enough yet")
-    'Not enough yet.'
-    """
-    return f"{text[:1].upper()}{text[1:]}{'' if text.endswith('.') else '.'}"
 
 
 def all_figures(report: Report, importances: Sequence[Mapping[str, Any]] | None = None) -> dict[str, Figure]:
@@ -136,22 +63,6 @@ def all_figures(report: Report, importances: Sequence[Mapping[str, Any]] | None 
     return figures
 
 
-def png_bytes(figure: Figure) -> bytes:
-    """Return a figure as PNG: the same bytes for the same figure, with no date and no version inside."""
-    with _style():
-        file = io.BytesIO()
-        figure.savefig(file, format="png", dpi=PNG_DPI, metadata={"Software": None})
-    return file.getvalue()
-
-
-def svg_text(figure: Figure) -> str:
-    """Return a figure as SVG: the same text for the same figure; letters are drawn, no font is needed."""
-    with _style():
-        file = io.BytesIO()
-        figure.savefig(file, format="svg", metadata={"Date": None, "Creator": None})
-    return file.getvalue().decode()
-
-
 def confusion_figure(report: Report) -> Figure:
     """Draw the confusion matrix: true classes down, predicted ones across.
 
@@ -168,8 +79,8 @@ def confusion_figure(report: Report) -> Figure:
     share = np.divide(counts, total, out=np.full_like(counts, np.nan), where=total > 0)
     k = len(classes)
     side_in = min(3.4 + 0.45 * k, 11.0)
-    with _style():
-        figure = _figure(side_in + 0.45, side_in)
+    with styled():
+        figure = new_figure(side_in + 0.45, side_in)
         axes = figure.add_subplot()
         axes.pcolormesh(np.ma.masked_invalid(share), cmap="Blues", vmin=0, vmax=1, edgecolors="white", lw=1.5)
         axes.set(xlim=(0, k), ylim=(k, 0), aspect="equal")
@@ -189,7 +100,7 @@ def confusion_figure(report: Report) -> Figure:
         axes.set_title(
             f"share of the windows of the true terrain{below}", loc="left", fontsize=8, color=FAINT_INK
         )
-        return _finished(figure, _title("Confusion", report))
+        return finished(figure, _title("Confusion", report))
 
 
 def _cell(axes: Axes, row: int, column: int, share: float, count: float, k: int) -> None:
@@ -224,8 +135,8 @@ def reliability_figure(report: Report) -> Figure:
     accuracy = np.array([row["accuracy"] for row in table])
     gap = accuracy - confidence
     low = max(np.floor(20 * (min(confidence.min(), accuracy.min()) - 0.01)) / 20, 0.0)
-    with _style():
-        figure = _figure(5.6, 5.4)
+    with styled():
+        figure = new_figure(5.6, 5.4)
         axes, strip = figure.subplots(2, 1, sharex=True, height_ratios=[12, 1])
         axes.plot([low, 1], [low, 1], color=FAINT_INK, lw=1, ls="--", label="calibrated")
         for side, colour, label in (
@@ -255,7 +166,7 @@ def reliability_figure(report: Report) -> Figure:
             part.xaxis.set_major_formatter(PercentFormatter(1, decimals=0))
         axes.yaxis.set_major_locator(MaxNLocator(8, steps=WHOLE_STEPS))
         axes.yaxis.set_major_formatter(PercentFormatter(1, decimals=0))
-        return _finished(figure, f"{_title('Reliability', report)}: ECE {percent(report['ece'])}")
+        return finished(figure, f"{_title('Reliability', report)}: ECE {percent(report['ece'])}")
 
 
 def per_run_figure(report: Report) -> Figure:
@@ -274,8 +185,8 @@ def per_run_figure(report: Report) -> Figure:
     worst = sorted(range(len(runs)), key=lambda i: runs[i]["accuracy"])[:MAX_RUNS]
     drawn = {name: [runs[i] for i in sorted(worst) if runs[i]["terrain"] == name] for name in names}
     n_rows = len(worst) + 1.5 * sum(bool(group) for group in drawn.values())
-    with _style():
-        figure = _figure(7.6, 1.2 + 0.19 * n_rows)
+    with styled():
+        figure = new_figure(7.6, 1.2 + 0.19 * n_rows)
         axes = figure.add_subplot()
         row = 0.0
         ticks: list[float] = []
@@ -302,7 +213,7 @@ def per_run_figure(report: Report) -> Figure:
         title = _title("Accuracy of each run", report)
         if len(worst) < len(runs):
             title += f", the worst {len(worst)} of {len(runs)}"
-        return _finished(figure, title)
+        return finished(figure, title)
 
 
 def _draw_class(
@@ -349,8 +260,8 @@ def learning_curve_figure(report: Report) -> Figure:
     accuracy = np.array(curve["accuracy"], dtype=float)
     spread = np.array([np.nan if std is None else std for std in curve["accuracy_spread"]])
     subset = np.isfinite(spread)
-    with _style():
-        figure = _figure(5.6, 4.4)
+    with styled():
+        figure = new_figure(5.6, 4.4)
         axes = figure.add_subplot()
         axes.plot(runs, accuracy, color=BLUE, lw=1.2, alpha=0.6)
         axes.errorbar(
@@ -379,7 +290,7 @@ def learning_curve_figure(report: Report) -> Figure:
         axes.legend(loc="lower left", bbox_to_anchor=(0, 1), frameon=False, borderpad=0, fontsize=8)
         statement = textwrap.fill(sentence(curve["statement"]), 82)
         figure.supxlabel(statement, x=0.015, ha="left", fontsize=8.5, multialignment="left")
-        return _finished(figure, _title("Learning curve", report))
+        return finished(figure, _title("Learning curve", report))
 
 
 def importance_figure(importances: Sequence[Mapping[str, Any]]) -> Figure:
@@ -394,8 +305,8 @@ def importance_figure(importances: Sequence[Mapping[str, Any]]) -> Figure:
     drops = np.array([100 * row["drop"] for row in ranked])
     stds = np.array([100 * (row.get("std") or 0.0) for row in ranked])
     rows = np.arange(len(ranked))
-    with _style():
-        figure = _figure(6.4, 1.3 + 0.24 * len(ranked))
+    with styled():
+        figure = new_figure(6.4, 1.3 + 0.24 * len(ranked))
         axes = figure.add_subplot()
         axes.barh(rows, drops, height=0.7, color=BLUE)
         axes.errorbar(drops, rows, xerr=stds, fmt="none", ecolor=INK, lw=1, capsize=2.5)
@@ -408,30 +319,7 @@ def importance_figure(importances: Sequence[Mapping[str, Any]]) -> Figure:
         meaning = "drop of balanced accuracy when shuffled, percentage points; line: ± 1 standard deviation"
         axes.set_xlabel(meaning, fontsize=8, x=1.0, ha="right")
         shown = "" if len(ranked) == len(importances) else f", {len(ranked)} of {len(importances)}"
-        return _finished(figure, f"Permutation importance{shown}")
-
-
-@contextmanager
-def _style() -> Iterator[None]:
-    with matplotlib.style.context(["default", STYLE]):
-        yield
-
-
-def _figure(width_in: float, height_in: float) -> Figure:
-    figure = Figure(
-        figsize=(width_in, height_in), dpi=PNG_DPI, layout=ConstrainedLayoutEngine(w_pad=0.08, h_pad=0.05)
-    )
-    FigureCanvasAgg(figure)
-    return figure
-
-
-def _finished(figure: Figure, title: str) -> Figure:
-    """Title a figure and fix its layout, so that every later rendering has the same one."""
-    width = int(TITLE_LETTERS_AN_INCH * figure.get_figwidth())
-    figure.suptitle(textwrap.fill(title, width), x=0.015, ha="left", fontsize=10.5, fontweight="bold")
-    figure.draw_without_rendering()
-    figure.set_layout_engine("none")
-    return figure
+        return finished(figure, f"Permutation importance{shown}")
 
 
 PROTOCOL_WORDS = {

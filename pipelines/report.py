@@ -16,8 +16,8 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
+from pipelines.drawing import NOT_KNOWN, percent, sentence, svg_text
 from pipelines.extras import MIN_CLASSES
-from pipelines.figures import NOT_KNOWN, percent, sentence, svg_text
 from pipelines.metrics import VOTE_SPAN_S
 from terrain.control.slip_table import DRIVE_STATES
 

@@ -8,18 +8,16 @@ import pytest
 from matplotlib.collections import LineCollection
 from matplotlib.container import BarContainer, ErrorbarContainer
 
+from pipelines.drawing import NOT_KNOWN, png_bytes, svg_text
 from pipelines.figures import (
     MAX_FEATURES,
     MAX_RUNS,
-    NOT_KNOWN,
     all_figures,
     confusion_figure,
     importance_figure,
     learning_curve_figure,
     per_run_figure,
-    png_bytes,
     reliability_figure,
-    svg_text,
 )
 
 
@@ -214,7 +212,7 @@ def test_no_global_state_is_touched():
         "import sys, matplotlib\n"
         "settings = lambda: {k: v for k, v in matplotlib.rcParams.copy().items() if k != 'backend'}\n"
         "before = settings()\n"
-        "from pipelines.figures import confusion_figure, svg_text\n"
+        "from pipelines.drawing import svg_text\nfrom pipelines.figures import confusion_figure\n"
         "svg_text(confusion_figure({'classes': ['a', 'b'], 'confusion': [[1, 0], [0, 1]]}))\n"
         "assert settings() == before, 'settings changed'\n"
         "assert 'matplotlib.pyplot' not in sys.modules, 'pyplot imported'\n"

@@ -5,7 +5,8 @@ from html.parser import HTMLParser
 
 import pytest
 
-from pipelines.figures import NOT_KNOWN, confusion_figure
+from pipelines.drawing import NOT_KNOWN
+from pipelines.figures import confusion_figure
 from pipelines.report import CAPTIONS, html_report, versions
 
 MINUS_0_07 = "\N{MINUS SIGN}0.070"
