@@ -130,6 +130,63 @@ class RunLog:
         return tuple(dict.fromkeys(label.terrain for label in self.labels))
 
 
+ABSENT, USED, GATED, REOPENED = 0, 1, 2, 3
+"""What became of a sensor's measurement at one step of a filter (:attr:`StateTrack.use`)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StateTrack:
+    """What a filter believes over time, and how well its measurements agreed with it.
+
+    Parameters
+    ----------
+    time_s : (n,) seconds
+    mean : (n, d) state after the measurements of that instant
+    cov : (n, d, d) its covariance
+    states : name of each state, ending in its unit
+    nis : (n, k) squared innovation of each sensor over its covariance; NaN where it gave nothing
+    nis_dof : (n, k) number of measurements in it
+    use : (n, k) :data:`ABSENT`, :data:`USED`, :data:`GATED` or :data:`REOPENED`
+    sensors : name of each of the k sensors
+    reference_age_s : (n,) time since a sensor of speed over ground was last used; infinite before the first
+    log_likelihood : of all measurements that were used
+    dropped : what the filter did not take, as counts by kind
+    """
+
+    time_s: Array
+    mean: Array
+    cov: Array
+    states: tuple[str, ...]
+    nis: Array
+    nis_dof: Array
+    use: Array
+    sensors: tuple[str, ...]
+    reference_age_s: Array
+    log_likelihood: float
+    dropped: Mapping[str, int] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name in ("time_s", "mean", "cov", "nis", "reference_age_s"):
+            object.__setattr__(self, name, read_only(getattr(self, name)))
+        for name in ("nis_dof", "use"):
+            object.__setattr__(self, name, read_only(getattr(self, name), np.int8))
+        object.__setattr__(self, "dropped", MappingProxyType(dict(self.dropped)))
+        n, d, k = self.time_s.size, len(self.states), len(self.sensors)
+        shapes = {"mean": (n, d), "cov": (n, d, d), "nis": (n, k), "nis_dof": (n, k), "use": (n, k)}
+        for name, shape in (shapes | {"reference_age_s": (n,)}).items():
+            if getattr(self, name).shape != shape:
+                raise ValueError(f"{name} has shape {getattr(self, name).shape}, {shape} is needed")
+
+    def state(self, name: str) -> Array:
+        """Return the mean (n,) of one state; ``ValueError`` when there is none of that name."""
+        return self.mean[:, self.states.index(name)]
+
+    def std(self, name: str) -> Array:
+        """Return the standard deviation (n,) of one state."""
+        i = self.states.index(name)
+        return np.sqrt(self.cov[:, i, i])
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class SlipTrack:
     """Longitudinal slip of each wheel over time; NaN where it is undefined, never a silent 0.
@@ -140,19 +197,25 @@ class SlipTrack:
     slip_ratio : (n, wheels), positive in traction
     slip_std : (n, wheels), one standard deviation
     wheels : name of each wheel
+    stale : (n,) true where the speed over ground was not measured lately; never by default
     """
 
     time_s: Array
     slip_ratio: Array
     slip_std: Array
     wheels: tuple[str, ...]
+    stale: Array = field(default_factory=lambda: np.zeros(0, dtype=bool))
 
     def __post_init__(self) -> None:
         for name in ("time_s", "slip_ratio", "slip_std"):
             object.__setattr__(self, name, read_only(getattr(self, name)))
+        stale = self.stale if len(self.stale) else np.zeros(self.time_s.size, dtype=bool)
+        object.__setattr__(self, "stale", read_only(stale, np.bool_))
         shape = (self.time_s.size, len(self.wheels))
         if self.slip_ratio.shape != shape or self.slip_std.shape != shape:
             raise ValueError(f"slip_ratio and slip_std must both have shape {shape}")
+        if self.stale.shape != shape[:1]:
+            raise ValueError(f"stale must have shape {shape[:1]}")
 
     def as_stream(self) -> Stream:
         """Return the slip ratios as the run-log stream ``slip`` (``slip_<wheel>_ratio``)."""

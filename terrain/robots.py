@@ -1,40 +1,176 @@
-"""Robots: their geometry and mass, read from YAML.
+"""Robots: geometry, masses, motors, steering and sensors, read from YAML.
 
 Each number of a description carries its unit and its source, or ``source: assumed`` where nobody knows
-better::
+better, and, where it was calibrated, the interval that holds it with 95 %::
 
-    name: husky
-    drive: skid_steer
-    wheel_radius_m: {value: 0.165, unit: m, source: "maker's nominal geometry"}
+    name: agrimaro
+    drive: swerve
+    wheel_radius_m: {value: 0.2, unit: m, source: assumed}
+    sensors:
+      gyro_bias_z_radps: {value: 0.0021, unit: radps, source: "terrain calibrate", interval: [0.0019, 0.0023]}
+
+Geometry and mass are asked of every robot; the sections ``body``, ``motors``, ``steering``, ``camera`` and
+``sensors`` only by what simulates a robot or filters its log.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from types import UnionType
+from typing import Any, NamedTuple, get_args, get_type_hints
 
-import yaml
+import numpy as np
 
+from terrain.descriptions import check_keys, number, read_yaml
 from terrain.errors import ConfigError
+from terrain.records import Array, read_only
 from terrain.resources import data_folder
 
-DRIVES = ("skid_steer",)
+WHEELS_OF_DRIVE: dict[str, tuple[str, ...]] = {"skid_steer": ("left", "right"), "swerve": ("1", "2", "3")}
+"""Kinds of robots and how the channels of their wheels are called (``speed_left_mps``, ``motor_2_radps``)."""
+
+
+def _signed() -> Any:
+    """Return a field that may hold any finite number; a plain one has to be above zero."""
+    return field(metadata={"low": -math.inf})
+
+
+def _not_negative() -> Any:
+    return field(metadata={"low": 0.0})
 
 
 @dataclass(frozen=True, slots=True)
+class Body:
+    """What moves: masses, tyres, and how far the track can be adjusted."""
+
+    footprint_min_m: float
+    footprint_max_m: float
+    tyre_width_m: float
+    yaw_inertia_kgm2: float
+    com_x_m: float = _signed()
+    com_y_m: float = _signed()
+    com_height_m: float = _not_negative()
+    wheel_inertia_kgm2: float = field()
+    contact_length_m: float = field()
+    relaxation_length_m: float = field()
+    tyre_stiffness_npm: float = field()
+    tyre_damping_nspm: float = field()
+
+
+@dataclass(frozen=True, slots=True)
+class Motors:
+    """Hub motors behind a reduction, and the speed loop of their drivers; torques and gains at the wheel."""
+
+    reduction_ratio: float
+    torque_constant_nmpa: float
+    efficiency_ratio: float
+    torque_max_nm: float
+    supply_v: float
+    speed_max_radps: float
+    torque_time_constant_s: float = _not_negative()
+    friction_nm: float = _not_negative()
+    speed_gain_nmspr: float = field()
+    speed_integral_nmpr: float = _not_negative()
+    speed_estimate_time_constant_s: float = _not_negative()
+
+
+@dataclass(frozen=True, slots=True)
+class Steering:
+    """Steering of each wheel: how fast, how dead, and where its encoder's zero lies."""
+
+    rate_max_radps: float
+    accel_max_radps2: float
+    dead_band_rad: float = _not_negative()
+    torque_max_nm: float = field()
+    zero_1_rad: float = _signed()
+    zero_2_rad: float = _signed()
+    zero_3_rad: float = _signed()
+
+
+@dataclass(frozen=True, slots=True)
+class Camera:
+    """Tracking camera: where it sits on the body, and how its pose stream behaves."""
+
+    lever_x_m: float = _signed()
+    lever_y_m: float = _signed()
+    lever_z_m: float = _signed()
+    rate_hz: float = field()
+    latency_s: float = _not_negative()
+    time_constant_s: float = _not_negative()
+    speed_std_mps: float = field()
+    yaw_rate_std_radps: float = field()
+    yaw_std_rad: float = field()
+    position_std_m: float = field()
+    dropout_rate_hz: float = _not_negative()
+    dropout_length_s: float = field()
+    jump_rate_hz: float = _not_negative()
+    jump_std_m: float = _not_negative()
+
+
+@dataclass(frozen=True, slots=True)
+class Sensors:
+    """Rates, noise, bias and delay of everything but the camera.
+
+    ``*_std`` of a sample are those of the robot standing still; ``*_bias_std`` tell how far a bias differs
+    from one power-on to the next, ``*_walk`` how fast it moves (per root second).
+    """
+
+    wheels_rate_hz: float
+    hall_steps_ratio: float
+    encoder_time_constant_s: float = _not_negative()
+    motor_std_radps: float = field()
+    current_std_a: float = field()
+    steering_rate_hz: float = field()
+    steering_steps_ratio: float = field()
+    steering_std_rad: float = field()
+    imu_rate_hz: float = field()
+    imu_latency_s: float = _not_negative()
+    gyro_std_radps: float = field()
+    gyro_bias_x_radps: float = _signed()
+    gyro_bias_y_radps: float = _signed()
+    gyro_bias_z_radps: float = _signed()
+    gyro_bias_std_radps: float = _not_negative()
+    gyro_walk_radps: float = _not_negative()
+    accel_std_mps2: float = field()
+    accel_bias_x_mps2: float = _signed()
+    accel_bias_y_mps2: float = _signed()
+    accel_bias_z_mps2: float = _signed()
+    accel_bias_std_mps2: float = _not_negative()
+    accel_scale_x_ratio: float = field()
+    accel_scale_y_ratio: float = field()
+    accel_scale_z_ratio: float = field()
+    tilt_std_rad: float = field()
+    yaw_std_rad: float = field()
+
+
+class Equipment(NamedTuple):
+    """Every section of a description."""
+
+    body: Body
+    motors: Motors
+    steering: Steering
+    camera: Camera
+    sensors: Sensors
+
+
+@dataclass(frozen=True)
 class Robot:
-    """A wheeled robot.
+    """A wheeled robot; frames are body x forward, y left, z up.
 
     Parameters
     ----------
     name : what run logs call it
-    drive : ``skid_steer``: the wheels of a side turn together, and a difference of the sides turns it
+    drive : ``skid_steer``: the wheels of a side turn together, and a difference of the sides turns it;
+        ``swerve``: three wheels that are driven and steered each (thesis 7.2: two on the body's x axis, the
+        third to the right of it)
     wheel_radius_m : nominal radius of a wheel
-    track_m : distance between the wheel centres of the two sides
-    wheelbase_m : distance between front and rear axle
-    mass_kg : total mass
+    track_m : distance between the two sides; of a swerve robot, from the third wheel to the others' line
+    wheelbase_m : distance between front and rear wheel
+    mass_kg : total mass without payload
+    body, motors, steering, camera, sensors : None where the description has none
     """
 
     name: str
@@ -43,10 +179,81 @@ class Robot:
     track_m: float
     wheelbase_m: float
     mass_kg: float
+    body: Body | None = None
+    motors: Motors | None = None
+    steering: Steering | None = None
+    camera: Camera | None = None
+    sensors: Sensors | None = None
 
+    @property
+    def wheels(self) -> tuple[str, ...]:
+        """The wheels' names as channels have them."""
+        return WHEELS_OF_DRIVE[self.drive]
 
-NUMBERS = tuple(field.name for field in fields(Robot) if field.name not in ("name", "drive"))
-"""Fields of a robot that are numbers; the unit is the last word of the name."""
+    @cached_property
+    def wheel_positions_m(self) -> Array:
+        """Position (wheels, 2) of each wheel in the body frame.
+
+        Examples
+        --------
+        >>> load_robot("agrimaro").wheel_positions_m
+        array([[-0.5075,  0.    ],
+               [ 0.5075,  0.    ],
+               [ 0.    , -0.756 ]])
+        """
+        half_m = self.wheelbase_m / 2
+        if self.drive == "swerve":
+            return read_only([[-half_m, 0.0], [half_m, 0.0], [0.0, -self.track_m]])
+        return read_only([[0.0, self.track_m / 2], [0.0, -self.track_m / 2]])
+
+    def has(self, *sections: str) -> None:
+        """Make sure that the description has the sections named.
+
+        Raises
+        ------
+        ConfigError
+            if one is missing.
+
+        Examples
+        --------
+        >>> load_robot("husky").has("motors")
+        Traceback (most recent call last):
+        terrain.errors.ConfigError: robot husky: its description has no section 'motors', which is needed here
+        """
+        for section in sections:
+            if getattr(self, section) is None:
+                raise ConfigError(
+                    f"robot {self.name}: its description has no section {section!r}, which is needed here"
+                )
+
+    @cached_property
+    def equipment(self) -> Equipment:
+        """All sections of the description; ``ConfigError`` where one is missing.
+
+        Examples
+        --------
+        >>> load_robot("agrimaro").equipment.motors.torque_max_nm
+        60.0
+        """
+        self.has(*Equipment._fields)
+        return Equipment(*(getattr(self, name) for name in Equipment._fields))
+
+    def with_track(self, track_m: float) -> Robot:
+        """Return the robot with its adjustable track set.
+
+        Raises
+        ------
+        ConfigError
+            if the track is out of the reach of its adjustment.
+
+        Examples
+        --------
+        >>> load_robot("agrimaro").with_track(1.0).wheel_positions_m[2]
+        array([ 0., -1.])
+        """
+        changed = replace(self, track_m=float(track_m))
+        _check_geometry(f"robot {self.name}", changed)
+        return changed
 
 
 def load_robot(name_or_path: str | Path) -> Robot:
@@ -54,18 +261,30 @@ def load_robot(name_or_path: str | Path) -> Robot:
 
     Parameters
     ----------
-    name_or_path : ``husky``, or the path of a file that ends in ``.yaml`` or ``.yml``
+    name_or_path : ``agrimaro``, ``husky``, or the path of a file that ends in ``.yaml`` or ``.yml``
 
     Raises
     ------
     ConfigError
         if there is no such robot, a key is unknown or missing, a unit is not the field's own, a source is
-        missing, or a number is not positive and finite.
+        missing, a number is out of its range, or the geometry is impossible.
 
     Examples
     --------
     >>> load_robot("husky").track_m
     0.5708
+    """
+    file, described = read_description(name_or_path)
+    return robot_from(file, described)
+
+
+def read_description(name_or_path: str | Path) -> tuple[str, Any]:
+    """Return the file name and the YAML content of a robot's description, unchecked.
+
+    Raises
+    ------
+    ConfigError
+        if there is no such robot, or the file is no YAML.
     """
     path = Path(name_or_path)
     if path.suffix not in (".yaml", ".yml"):
@@ -73,43 +292,81 @@ def load_robot(name_or_path: str | Path) -> Robot:
         if path.parent != data_folder("robots") or not path.is_file():
             known = ", ".join(sorted(file.stem for file in data_folder("robots").glob("*.yaml")))
             raise ConfigError(f"robot {str(name_or_path)!r} is unknown: give one of {known}, or a .yaml file")
-    try:
-        described = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be opened ({error.strerror})") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: is no YAML ({' '.join(str(error).split())})") from error
-    return _robot(path.name, described)
+    return path.name, read_yaml(path)
 
 
-def _robot(file: str, described: Any) -> Robot:
-    _check_keys(file, described, [field.name for field in fields(Robot)])
+def robot_from(file: str, described: Any) -> Robot:
+    """Return the robot that the content of a description says; ``file`` is what messages call it.
+
+    Raises
+    ------
+    ConfigError
+        as :func:`load_robot` does.
+    """
+    hints = get_type_hints(Robot)
+    sections = {
+        name: next(kind for kind in get_args(hint) if is_dataclass(kind))
+        for name, hint in hints.items()
+        if isinstance(hint, UnionType)
+    }
+    required = [item.name for item in fields(Robot) if item.name not in sections]
+    check_keys(file, described, required, optional=tuple(sections))
     if not isinstance(described["name"], str) or not described["name"]:
         raise ConfigError(f"{file}: name is {described['name']!r}, a word is wanted")
-    if described["drive"] not in DRIVES:
-        raise ConfigError(f"{file}: drive {described['drive']!r} is unknown: use one of {', '.join(DRIVES)}")
-    numbers = {key: _number(f"{file}: {key}", described[key], key.rpartition("_")[2]) for key in NUMBERS}
-    return Robot(described["name"], described["drive"], **numbers)
+    if described["drive"] not in WHEELS_OF_DRIVE:
+        known = ", ".join(WHEELS_OF_DRIVE)
+        raise ConfigError(f"{file}: drive {described['drive']!r} is unknown: use one of {known}")
+    numbers = {
+        item.name: number(f"{file}: {item.name}", described[item.name], item.name.rpartition("_")[2])
+        for item in fields(Robot)
+        if item.type == "float"
+    }
+    parts = {
+        name: _section(f"{file}: {name}", kind, described[name])
+        for name, kind in sections.items()
+        if described.get(name) is not None
+    }
+    robot = Robot(described["name"], described["drive"], **numbers, **parts)
+    _check_geometry(file, robot)
+    return robot
 
 
-def _number(place: str, entry: Any, unit: str) -> float:
-    _check_keys(place, entry, ["value", "unit", "source"])
-    if entry["unit"] != unit:
-        raise ConfigError(f"{place} has the unit {entry['unit']!r}, {unit!r} is wanted")
-    if not isinstance(entry["source"], str) or not entry["source"].strip():
-        raise ConfigError(f"{place} has no source: say where the number is from, or 'assumed'")
-    value = entry["value"]
-    if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 < value < math.inf:
-        raise ConfigError(f"{place} is {value!r}, a number above zero is wanted")
-    return float(value)
+def _section(place: str, kind: Any, described: Any) -> Any:
+    items = fields(kind)
+    check_keys(place, described, [item.name for item in items])
+    return kind(
+        **{
+            item.name: number(
+                f"{place}: {item.name}",
+                described[item.name],
+                item.name.rpartition("_")[2],
+                item.metadata.get("low"),
+            )
+            for item in items
+        }
+    )
 
 
-def _check_keys(place: str, entry: Any, wanted: list[str]) -> None:
-    if not isinstance(entry, dict):
-        raise ConfigError(f"{place} is {entry!r}, a mapping with {', '.join(wanted)} is wanted")
-    unknown = [str(key) for key in entry if key not in wanted]
-    missing = [key for key in wanted if key not in entry]
-    if unknown:
-        raise ConfigError(f"{place}: key {unknown[0]!r} is unknown (accepted: {', '.join(wanted)})")
-    if missing:
-        raise ConfigError(f"{place}: key {missing[0]!r} is missing")
+def _check_geometry(place: str, robot: Robot) -> None:
+    """Refuse what no body can be."""
+    body = robot.body
+    if robot.wheelbase_m <= 0 or robot.track_m <= 0:
+        raise ConfigError(f"{place}: track_m and wheelbase_m must be above zero")
+    if body is None:
+        return
+    if body.footprint_min_m > body.footprint_max_m:
+        raise ConfigError(f"{place}: footprint_min_m {body.footprint_min_m} is over footprint_max_m")
+    low_m, high_m = (edge - body.tyre_width_m for edge in (body.footprint_min_m, body.footprint_max_m))
+    if not low_m <= robot.track_m <= high_m:
+        raise ConfigError(
+            f"{place}: track_m is {robot.track_m:g}; the footprint allows {low_m:g} to {high_m:g} m"
+        )
+    if robot.drive == "swerve":
+        share_3 = -body.com_y_m / robot.track_m
+        share_2 = (1 - share_3) / 2 + body.com_x_m / robot.wheelbase_m
+        shares = np.array([1 - share_2 - share_3, share_2, share_3])
+        if shares.min() <= 0:
+            raise ConfigError(
+                f"{place}: the centre of mass ({body.com_x_m:g}, {body.com_y_m:g}) m lies outside the "
+                f"triangle of the wheels: wheel {int(shares.argmin()) + 1} would carry nothing"
+            )

@@ -24,6 +24,7 @@ UNIT_SYMBOLS: dict[str, str] = {
     "n": "N",
     "ratio": "1",
     "k": "K",
+    "kg": "kg",
 }
 """Unit word at the end of a channel name, and how it is printed."""
 

@@ -1,0 +1,1 @@
+"""From body motion to wheel motion and back."""

@@ -1,0 +1,45 @@
+"""Rim speeds: how fast each wheel's tread runs, from what the motor's driver reports."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from terrain.records import RunLog, Stream
+from terrain.robots import Robot
+
+
+def with_rim_speeds(run: RunLog, robot: Robot) -> RunLog:
+    """Return a run whose stream ``wheels`` has rim speeds (``speed_1_mps``) beside its motor rates.
+
+    A run that has rim speeds already, or no motor rates, comes back as it is.
+
+    Parameters
+    ----------
+    run : log
+    robot : gives reduction ratio and nominal wheel radius
+
+    Raises
+    ------
+    ConfigError
+        if the run has motor rates and the robot's description no motors.
+
+    Examples
+    --------
+    >>> from terrain.robots import load_robot
+    >>> rates = Stream(np.arange(2.0), np.full((2, 3), 50.0), [f"motor_{i}_radps" for i in (1, 2, 3)])
+    >>> run = with_rim_speeds(RunLog("a", "agrimaro", {"wheels": rates}), load_robot("agrimaro"))
+    >>> run.streams["wheels"].channel("speed_1_mps")
+    array([1., 1.])
+    """
+    wheels = run.streams.get("wheels")
+    motors = [f"motor_{wheel}_radps" for wheel in robot.wheels]
+    rims = tuple(f"speed_{wheel}_mps" for wheel in robot.wheels)
+    if wheels is None or not set(motors) <= set(wheels.channels) or set(rims) <= set(wheels.channels):
+        return run
+    robot.has("motors")
+    assert robot.motors is not None
+    rate = np.column_stack([wheels.channel(channel) for channel in motors])
+    rim = rate / robot.motors.reduction_ratio * robot.wheel_radius_m
+    streams = dict(run.streams)
+    streams["wheels"] = Stream(wheels.time_s, np.hstack([wheels.values, rim]), wheels.channels + rims)
+    return RunLog(run.run_id, run.robot, streams, run.labels, run.source, run.dropped)

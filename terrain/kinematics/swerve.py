@@ -1,0 +1,432 @@
+"""Kinematics of a robot whose wheels are all driven and steered: twist to wheels, wheels to twist, limits.
+
+With wheel i at ``(x_i, y_i)``, steered by ``d_i`` and turning at ``w_i``, radius r::
+
+    velocity of its centre    p_i' = (v_x - y_i g', v_y + x_i g')                        (2.2)
+    rolling without slip      p_i' = r w_i (cos d_i, sin d_i)                            (2.1)
+    all wheels                S(d) w = H V, V = H^+ S(d) w                               (2.3), (2.4)
+    the other way             d_i = atan2(p_iy', p_ix') + k pi, w_i = (-1)^k |p_i'| / r  (2.5)
+    no motor saturates        |p_i'| <= r w_max                                          (2.6)-(2.10)
+
+A twist is an array ``(..., 3)`` ordered ``(speed_x_mps, speed_y_mps, yaw_rate_radps)`` everywhere here; the
+source puts the yaw rate first, and the columns of its H are reordered accordingly.
+
+Source: Danzi, AgriMaRo thesis, 2.3.  Corrected: one table of wheel positions, ``robot.wheel_positions_m``
+(its 7.2), because (2.3) numbers the wheels of the x axis the other way round; rows of H are
+``[-y_i 1 0; x_i 0 1]``; S is block-diagonal, 6 x 3; (2.6)-(2.9) have ``y' + x_i g'`` and ``x' - y_i g'`` with
+each wheel's own position.  The admissible region is convex, but no polyhedron: each wheel bounds it by a
+cylinder.
+
+Functions check what they are given; :func:`wheel_command_step` alone trusts it.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import njit, types
+
+from terrain.errors import ConfigError
+from terrain.records import Array
+
+STANDING_MPS = 1e-6
+"""A wheel slower than this stands: below, its direction is rounding, and nobody's wish."""
+
+FAR_RAD = 0.35
+"""A wheel steered further than this from where it should be holds back the drive of all (20 degrees)."""
+
+# Signatures that any float array fits, read-only or strided: nothing is compiled in the middle of a drive.
+_ROW = types.Array(types.float64, 1, "A", readonly=True)
+_TABLE = types.Array(types.float64, 2, "A", readonly=True)
+_F8 = types.float64
+
+
+def wheel_velocities(positions_m: Array, twist: Array) -> Array:
+    """Return the velocity (..., wheels, 2) of the wheel centres in the body frame, equation (2.2).
+
+    Raises
+    ------
+    ConfigError
+        if ``positions_m`` is no (wheels, 2), ``twist`` no (..., 3), or either is not finite.
+
+    Examples
+    --------
+    >>> wheel_velocities([[-0.5, 0.0], [0.5, 0.0], [0.0, -0.75]], [1.0, 0.0, 0.2])
+    array([[ 1.  , -0.1 ],
+           [ 1.  ,  0.1 ],
+           [ 1.15,  0.  ]])
+    """
+    return _velocities(_positions(positions_m), _numbers("twist", twist, 3))
+
+
+def forward(positions_m: Array, radius_m: float, wheel_radps: Array, steer_rad: Array) -> tuple[Array, Array]:
+    """Return the twist that fits the wheels best, and how far they contradict each other.
+
+    Parameters
+    ----------
+    positions_m : (wheels, 2)
+    radius_m : of the wheels
+    wheel_radps, steer_rad : (..., wheels); NaN is a missing sample
+
+    Returns
+    -------
+    twist : (..., 3) the least-squares solution (2.4); NaN where a sample is missing
+    residual_mps : (...) norm of ``S w - H V`` over all wheels: 0 when a rigid body rolls without slip
+
+    Raises
+    ------
+    ConfigError
+        for shapes that do not fit, infinite values or a radius that is not above zero.
+
+    Examples
+    --------
+    >>> twist, residual_mps = forward([[-0.5, 0.0], [0.5, 0.0]], 0.2, [5.0, 5.0], [-0.1, 0.1])
+    >>> twist.round(3), residual_mps.round(3)
+    (array([0.995, 0.   , 0.2  ]), np.float64(0.0))
+    """
+    positions = _positions(positions_m)
+    radius = _above_zero("radius_m", radius_m)
+    wheel = _numbers("wheel_radps", wheel_radps, len(positions), missing=True)
+    steer = _numbers("steer_rad", steer_rad, len(positions), missing=True)
+    wheel, steer = _together(wheel_radps=wheel, steer_rad=steer)
+    rim = np.stack([np.cos(steer), np.sin(steer)], axis=-1) * (radius * wheel)[..., None]
+    seen = rim.reshape(*wheel.shape[:-1], -1)
+    rows = _rows(positions)
+    twist = seen @ np.linalg.pinv(rows).T
+    return twist, np.linalg.norm(seen - twist @ rows.T, axis=-1)
+
+
+def inverse(positions_m: Array, radius_m: float, twist: Array, steer_now_rad: Array) -> tuple[Array, Array]:
+    """Return wheel speeds and steering angles for a twist, equation (2.5).
+
+    Of the two solutions of a wheel, half a turn apart, it is the one that moves the steering least.  Angles
+    are not wrapped: slip rings let the steering turn for ever, and the result lies within a quarter turn of
+    ``steer_now_rad``.  A wheel that stands still keeps its steering.
+
+    Parameters
+    ----------
+    positions_m : (wheels, 2)
+    radius_m : of the wheels
+    twist : (..., 3)
+    steer_now_rad : (..., wheels) where the steering is; broadcast against the twist
+
+    Returns
+    -------
+    wheel_radps, steer_rad : (..., wheels)
+
+    Raises
+    ------
+    ConfigError
+        for shapes that do not fit, values that are not finite or a radius that is not above zero.
+
+    Examples
+    --------
+    >>> inverse([[-0.5, 0.0], [0.5, 0.0]], 0.2, [-1.0, 0.0, 0.0], [0.0, 7.0])
+    (array([-5., -5.]), array([0.        , 6.28318531]))
+    """
+    positions = _positions(positions_m)
+    radius = _above_zero("radius_m", radius_m)
+    velocity = _velocities(positions, _numbers("twist", twist, 3))
+    now = _numbers("steer_now_rad", steer_now_rad, len(positions))
+    along, across, now = _together(twist=velocity[..., 0], _=velocity[..., 1], steer_now_rad=now)
+    wheel, steer = np.empty(now.shape), np.empty(now.shape)
+    _aim_all(along.ravel(), across.ravel(), radius, now.ravel(), wheel.reshape(-1), steer.reshape(-1))
+    return wheel, steer
+
+
+def admissible_scale(positions_m: Array, radius_m: float, twist: Array, speed_max_radps: float) -> Array:
+    """Return the largest k (...), at most 1, with which ``k * twist`` saturates no wheel, (2.10).
+
+    Raises
+    ------
+    ConfigError
+        as :func:`inverse` does, and for a limit that is not above zero.
+
+    Examples
+    --------
+    >>> admissible_scale([[-0.5, 0.0], [0.5, 0.0]], 0.2, [[4.0, 0.0, 0.0], [1.0, 0.0, 0.0]], 10.0)
+    array([0.5, 1. ])
+    """
+    limit_mps = _above_zero("radius_m", radius_m) * _above_zero("speed_max_radps", speed_max_radps)
+    velocity = wheel_velocities(positions_m, twist)
+    fastest_mps = np.hypot(velocity[..., 0], velocity[..., 1]).max(axis=-1)
+    return np.asarray(limit_mps / np.maximum(fastest_mps, limit_mps))
+
+
+def scaled(positions_m: Array, radius_m: float, twist: Array, speed_max_radps: float) -> Array:
+    """Return the twist (..., 3) in its own direction, shortened until no wheel saturates.
+
+    The direction is kept, so the centre of rotation and the path are: the robot is slower on the same curve.
+
+    Raises
+    ------
+    ConfigError
+        as :func:`admissible_scale` does.
+
+    Examples
+    --------
+    >>> scaled([[-0.5, 0.0], [0.5, 0.0]], 0.2, [2.4, 0.0, 3.6], 10.0)
+    array([1.6, 0. , 2.4])
+    """
+    scale = admissible_scale(positions_m, radius_m, twist, speed_max_radps)
+    return np.asarray(np.asarray(twist, dtype=np.float64) * scale[..., None])
+
+
+def admissible_yaw_rate(
+    positions_m: Array, radius_m: float, speed_x_mps: Array, speed_y_mps: Array, speed_max_radps: float
+) -> tuple[Array, Array]:
+    """Return the lowest and the highest yaw rate (...) that saturate no wheel at a given translation.
+
+    The boundary of the admissible region: with v_max = r w_max, (2.6) corrected asks of every wheel
+    ``(x_i^2 + y_i^2) g'^2 + 2 (x_i v_y - y_i v_x) g' + v_x^2 + v_y^2 - v_max^2 <= 0``, an interval of g'.
+    Figure 2.8 and its dimensionless twist (2.11) come of positions in half wheelbases, radius and limit 1.
+
+    Parameters
+    ----------
+    positions_m : (wheels, 2)
+    radius_m : of the wheels
+    speed_x_mps, speed_y_mps : (...) broadcast against each other
+    speed_max_radps : limit of the wheels
+
+    Returns
+    -------
+    low_radps, high_radps : (...); NaN where no yaw rate is admissible
+
+    Raises
+    ------
+    ConfigError
+        for shapes that do not fit, values that are not finite, a radius or limit that is not above zero.
+
+    Examples
+    --------
+    >>> xi = 1.5  # track over half the wheelbase
+    >>> admissible_yaw_rate([[-1, 0], [1, 0], [0, -xi]], 1.0, [0.0, 0.7], 0.0, 1.0)
+    (array([-0.66666667, -0.71414284]), array([0.66666667, 0.2       ]))
+    """
+    positions = _positions(positions_m)
+    limit_mps = _above_zero("radius_m", radius_m) * _above_zero("speed_max_radps", speed_max_radps)
+    x_mps, y_mps = _together(
+        speed_x_mps=_numbers("speed_x_mps", speed_x_mps), speed_y_mps=_numbers("speed_y_mps", speed_y_mps)
+    )
+    x, y = positions.T
+    square = x * x + y * y
+    across = x * y_mps[..., None] - y * x_mps[..., None]
+    away = x * x_mps[..., None] + y * y_mps[..., None]
+    # across^2 + away^2 = square * speed^2 turns the discriminant into one that cancels nothing
+    inside = square * limit_mps**2 - away**2
+    # a wheel at the origin does not feel the yaw rate: it bounds the translation alone
+    free = np.where(np.hypot(x_mps, y_mps) <= limit_mps, np.inf, np.nan)[..., None]
+    root = np.sqrt(np.where(inside >= 0, inside, np.nan))
+    pivot = np.where(square > 0, square, 1.0)
+    low = np.where(square > 0, (-across - root) / pivot, -free).max(axis=-1)
+    high = np.where(square > 0, (-across + root) / pivot, free).min(axis=-1)
+    return np.where(low <= high, low, np.nan), np.where(low <= high, high, np.nan)
+
+
+def wheel_commands(
+    positions_m: Array,
+    radius_m: float,
+    speed_max_radps: float,
+    rate_max_radps: float,
+    dt_s: float,
+    twists: Array,
+    steer_0: Array,
+    far_rad: float = FAR_RAD,
+) -> tuple[Array, Array, Array]:
+    """Return what the wheels are told, step by step, to drive a row of twists.
+
+    Parameters
+    ----------
+    positions_m : (wheels, 2)
+    radius_m : of the wheels
+    speed_max_radps : limit of the wheels; twists beyond are shortened
+    rate_max_radps : limit of the steering's rate
+    dt_s : time from one twist to the next
+    twists : (n, 3)
+    steer_0 : (wheels,) steering before the first step, rad
+    far_rad : see :func:`wheel_command_step`
+
+    Returns
+    -------
+    twist_admitted : (n, 3) the twists within the admissible region
+    wheel_radps, steer_rad : (n, wheels)
+
+    Raises
+    ------
+    ConfigError
+        for shapes that do not fit, values that are not finite, limits that are not above zero.
+
+    Examples
+    --------
+    >>> wheels_m = [[-0.5, 0.0], [0.5, 0.0]]
+    >>> _, wheel, steer = wheel_commands(wheels_m, 0.2, 10.0, 2.0, 0.1, [[0.0, 0.4, 0.0]] * 9, [0.0, 0.0])
+    >>> steer[:, 0].round(2)
+    array([0.2 , 0.4 , 0.6 , 0.8 , 1.  , 1.2 , 1.4 , 1.57, 1.57])
+    >>> wheel[:, 0].round(2)
+    array([0.4 , 0.78, 1.13, 1.43, 1.68, 1.86, 2.  , 2.  , 2.  ])
+    """
+    positions = _positions(positions_m)
+    wanted = np.atleast_2d(_numbers("twists", twists, 3))
+    if wanted.ndim != 2:
+        raise ConfigError(f"twists have shape {wanted.shape}, (n, 3) is wanted")
+    steer = _numbers("steer_0", steer_0, len(positions))
+    if steer.ndim != 1:
+        raise ConfigError(f"steer_0 has shape {steer.shape}, ({len(positions)},) is wanted")
+    limits = {
+        "radius_m": radius_m,
+        "speed_max_radps": speed_max_radps,
+        "rate_max_radps": rate_max_radps,
+        "dt_s": dt_s,
+        "far_rad": far_rad,
+    }
+    numbers = [_above_zero(name, value) for name, value in limits.items()]
+    return _commands(positions, *numbers, wanted, steer)  # type: ignore[no-any-return]
+
+
+@njit(types.UniTuple(_F8, 2)(_F8, _F8, _F8, _F8), cache=True)
+def _aim(along_mps: float, across_mps: float, radius_m: float, now_rad: float) -> tuple[float, float]:
+    """Return speed and steering of one wheel, (2.5) with the k that moves the steering least."""
+    speed_mps = math.hypot(along_mps, across_mps)
+    if speed_mps < STANDING_MPS:
+        return 0.0, now_rad
+    heading_rad = math.atan2(across_mps, along_mps)
+    k = np.rint((heading_rad - now_rad) / math.pi)
+    sign = 1.0 if k % 2 == 0 else -1.0
+    return sign * speed_mps / radius_m, heading_rad - k * math.pi
+
+
+@njit(types.void(_ROW, _ROW, _F8, _ROW, _F8[:], _F8[:]), cache=True)
+def _aim_all(
+    along_mps: Array, across_mps: Array, radius_m: float, now_rad: Array, wheel_radps: Array, steer_rad: Array
+) -> None:
+    for i in range(now_rad.size):
+        wheel_radps[i], steer_rad[i] = _aim(along_mps[i], across_mps[i], radius_m, now_rad[i])
+
+
+@njit(types.UniTuple(_F8[::1], 3)(_TABLE, _F8, _F8, _F8, _F8, _F8, _ROW, _ROW), cache=True)
+def wheel_command_step(
+    positions_m: Array,
+    radius_m: float,
+    speed_max_radps: float,
+    rate_max_radps: float,
+    dt_s: float,
+    far_rad: float,
+    twist: Array,
+    steer_rad: Array,
+) -> tuple[Array, Array, Array]:
+    """Return what the wheels are told for one twist; compiled, callable from compiled code, checks nothing.
+
+    The twist is shortened to the admissible region, each wheel aims (:func:`inverse`) from where its steering
+    was told to be last, and the steering moves there no faster than it can.  While it is on its way, the
+    wheels' rolling directions contradict each other: as long as one wheel is further than ``far_rad`` from
+    its aim, the speeds of all are multiplied by ``max(0, cos(error))`` of the worst one, so that none scrubs.
+    This drive law is ours: the thesis says only that steering takes its time.
+
+    Parameters
+    ----------
+    positions_m : (wheels, 2)
+    radius_m, speed_max_radps, rate_max_radps, dt_s, far_rad : as in :func:`wheel_commands`
+    twist : (3,)
+    steer_rad : (wheels,) the steering told last
+
+    Returns
+    -------
+    twist_admitted : (3,) within the admissible region; what the drive law takes away is not in it
+    wheel_radps, steer_rad : (wheels,)
+    """
+    wheels = positions_m.shape[0]
+    along, across = np.empty(wheels), np.empty(wheels)
+    fastest = limit = radius_m * speed_max_radps
+    for i in range(wheels):
+        along[i] = twist[0] - positions_m[i, 1] * twist[2]
+        across[i] = twist[1] + positions_m[i, 0] * twist[2]
+        fastest = max(fastest, math.hypot(along[i], across[i]))
+    scale = limit / fastest
+    admitted, speed, steer = np.empty(3), np.empty(wheels), np.empty(wheels)
+    for j in range(3):
+        admitted[j] = scale * twist[j]
+    reach = rate_max_radps * dt_s
+    worst = 0.0
+    for i in range(wheels):
+        speed[i], aim = _aim(scale * along[i], scale * across[i], radius_m, steer_rad[i])
+        move = aim - steer_rad[i]
+        steer[i] = aim if abs(move) <= reach else steer_rad[i] + math.copysign(reach, move)
+        worst = max(worst, abs(aim - steer[i]))
+    if worst > far_rad:
+        for i in range(wheels):
+            speed[i] *= max(0.0, math.cos(worst))
+    return admitted, speed, steer
+
+
+@njit(types.UniTuple(_F8[:, ::1], 3)(_TABLE, _F8, _F8, _F8, _F8, _F8, _TABLE, _ROW), cache=True)
+def _commands(
+    positions_m: Array,
+    radius_m: float,
+    speed_max_radps: float,
+    rate_max_radps: float,
+    dt_s: float,
+    far_rad: float,
+    twists: Array,
+    steer_0: Array,
+) -> tuple[Array, Array, Array]:
+    n, wheels = len(twists), len(positions_m)
+    admitted, speed, steer = np.empty((n, 3)), np.empty((n, wheels)), np.empty((n, wheels))
+    last = steer_0.copy()
+    for k in range(n):
+        admitted[k], speed[k], last = wheel_command_step(
+            positions_m, radius_m, speed_max_radps, rate_max_radps, dt_s, far_rad, twists[k], last
+        )
+        steer[k] = last
+    return admitted, speed, steer
+
+
+def _rows(positions: Array) -> Array:
+    """Return H (2 wheels, 3) of (2.3), its columns in the order of a twist here."""
+    x, y = positions.T
+    one, none = np.ones_like(x), np.zeros_like(x)
+    return np.stack([np.stack([one, none, -y], -1), np.stack([none, one, x], -1)], 1).reshape(-1, 3)
+
+
+def _velocities(positions: Array, twist: Array) -> Array:
+    flat = twist @ _rows(positions).T
+    return np.asarray(flat.reshape(*flat.shape[:-1], len(positions), 2))
+
+
+def _numbers(name: str, given: Any, size: int | None = None, missing: bool = False) -> Array:
+    """Return ``given`` as an array of finite floats with ``size`` columns; NaN too where samples may miss."""
+    try:
+        array = np.asarray(given, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ConfigError(f"{name} cannot be read as an array of numbers") from None
+    if size is not None and array.shape[-1:] != (size,):
+        raise ConfigError(f"{name} has shape {array.shape}, (..., {size}) is wanted")
+    bad = np.isinf(array) if missing else ~np.isfinite(array)
+    if bad.any():
+        raise ConfigError(f"{name} holds {array[bad].flat[0]}, finite numbers are wanted")
+    return array
+
+
+def _positions(given: Any) -> Array:
+    positions = _numbers("positions_m", given, 2)
+    if positions.ndim != 2 or len(positions) < 2:
+        raise ConfigError(f"positions_m has shape {positions.shape}, (wheels, 2) with two wheels is wanted")
+    if (positions == positions[0]).all():
+        raise ConfigError("positions_m holds one place only: wheels in one place do not tell the yaw rate")
+    return positions
+
+
+def _above_zero(name: str, given: Any) -> float:
+    value = _numbers(name, given)
+    if value.ndim or not value > 0:
+        raise ConfigError(f"{name} is {given!r}, a number above zero is wanted")
+    return float(value)
+
+
+def _together(**arrays: Array) -> list[Array]:
+    try:
+        return list(np.broadcast_arrays(*arrays.values()))
+    except ValueError:
+        names = " and ".join(f"{name} {array.shape}" for name, array in arrays.items() if name != "_")
+        raise ConfigError(f"shapes do not fit together: {names}") from None

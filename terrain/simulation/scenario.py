@@ -1,0 +1,447 @@
+"""What is driven, and on what: twists wanted over time, and terrains by distance travelled.
+
+A drive is a list of legs.  A leg goes from the twist before it to its own in a ramp that keeps the
+accelerations in bounds, and holds it.  From rest and to rest the ratio of the three components stays what it
+is, so the centre of rotation does not move during such a ramp and the steering stands.
+
+Sources: Danzi, AgriMaRo thesis, 7.2.3 (``straight``: 1 m/s^2 to 1 m/s) and 6.2 (``complex``: curves, forward
+and backward, in both directions; the order and the speeds are ours).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from terrain.errors import ConfigError
+from terrain.kinematics.swerve import scaled
+from terrain.records import Array, read_only
+from terrain.robots import Robot
+
+RATE_HZ = 50.0
+"""Rate of the twists: that of a run log's commands."""
+
+ACCEL_MPS2 = 1.0
+"""Change of the velocity in ramps, and the most in any; thesis 7.2.3."""
+
+YAW_ACCEL_RADPS2 = 1.0
+"""The most that the yaw rate changes in ramps: at the third wheel less than :data:`ACCEL_MPS2`."""
+
+STAND_S = 1.0
+"""Rest before the first leg, and the least after the last."""
+
+YAW_RATE_RADPS = 0.3
+"""Of ``arc`` and the curves of ``complex``."""
+
+SPOT_RADPS = 0.6
+"""Of ``spot_turn``."""
+
+PATCH_M = (6.0, 12.0)
+"""Length of a terrain patch of ``course``."""
+
+SLIP_MARGIN = 1.25
+"""A slipping robot gets less far than it is told: ``course`` drives this much further than its patches are
+long, so that with 20 % of slip the last one is crossed as well."""
+
+LONGEST_S = 86400.0
+
+
+class Patch(NamedTuple):
+    """A terrain from ``start_m`` of distance travelled on, to where the next one starts."""
+
+    start_m: float
+    terrain: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scenario:
+    """What is driven, and on what.
+
+    Parameters
+    ----------
+    name : of the drive
+    rate_hz : of the twists
+    time_s : (n,) from 0 to the duration, both included
+    twist : (n, 3) wanted ``(speed_x_mps, speed_y_mps, yaw_rate_radps)``, no wheel beyond the robot's limit
+    patches : terrains in order; the first starts at 0, the last has no end
+    """
+
+    name: str
+    rate_hz: float
+    time_s: Array
+    twist: Array
+    patches: tuple[Patch, ...]
+
+    def __post_init__(self) -> None:
+        for name in ("time_s", "twist"):
+            object.__setattr__(self, name, read_only(getattr(self, name)))
+        object.__setattr__(self, "patches", tuple(Patch(*patch) for patch in self.patches))
+        if self.twist.shape != (self.time_s.size, 3):
+            raise ValueError(f"twist has shape {self.twist.shape}, {(self.time_s.size, 3)} is needed")
+        starts_m = [patch.start_m for patch in self.patches]
+        if starts_m[:1] != [0.0] or any(b <= a for a, b in pairwise(starts_m)):
+            raise ValueError(f"patches start at {starts_m} m, a rising row from 0 on is needed")
+
+    @property
+    def distance_m(self) -> Array:
+        """Distance (n,) that the body's origin would have travelled, were the twists followed."""
+        return _distance_m(self.time_s, self.twist)
+
+
+class _Leg(NamedTuple):
+    """A twist to go to, within the robot's limits, for how long it is held, and how fast it is gone to."""
+
+    twist: Array
+    hold_s: float
+    accel_mps2: float = ACCEL_MPS2
+
+
+class _Order(NamedTuple):
+    """What every drive is made from; ``limit`` shortens a twist to what the robot can."""
+
+    speed_mps: float
+    limit: Callable[[Any], Array]
+    rng: np.random.Generator
+
+
+_STAND = read_only(np.zeros(3))
+
+
+def make_scenario(
+    name: str,
+    robot: Robot,
+    terrains: str | Sequence[str],
+    duration_s: float | None = None,
+    speed_mps: float = 1.0,
+    seed: int | np.random.Generator = 0,
+) -> Scenario:
+    """Return a scenario by name; all start at rest, all but ``straight`` and ``course`` end there.
+
+    ============= ===================================================================================
+    stand         standing still, for calibration
+    straight      1 s of rest, 1 m/s^2 up to the speed, held to the end
+    arc           the same with 0.3 rad/s, and down to rest
+    starts        from rest at 1 m/s^2 to the speed, 3 s, and down at 1 m/s^2, again and again
+    spot_turn     in place to the left, to the right, at 0.6 rad/s, several times
+    complex       forward, curves to both sides, backward with curves, sideways, diagonally; smooth
+    survey        labelled runs: stretches of 4 to 6 s, straight and in gentle arcs, now and then a stop, a
+                  stretch backward or a turn on the spot; drawn
+    course        over patches of 6 to 12 m of every terrain in turn, in drawn order, at changing speed
+    ============= ===================================================================================
+
+    Parameters
+    ----------
+    name : one of :data:`SCENARIOS`
+    robot : a swerve robot with motors; no twist saturates its wheels
+    terrains : of the ground, one unless the scenario is ``course``; the names are not looked up
+    duration_s : what the scenario is made for by default; taken to a whole number of samples
+    speed_mps : cruising speed; ``survey`` and ``course`` draw from 0.4 to 1.2 times it, backward and sideways
+        ``complex`` is slower
+    seed : of everything drawn; the same gives the same bytes
+
+    Raises
+    ------
+    ConfigError
+        for an unknown name, terrains that do not fit it, a duration too short for it, a speed beyond the
+        robot, a robot without steered wheels.
+
+    Examples
+    --------
+    >>> from terrain.robots import load_robot
+    >>> straight = make_scenario("straight", load_robot("agrimaro"), "grass")
+    >>> straight.time_s[[0, 75, -1]], straight.twist[[0, 75, -1], 0], straight.patches
+    (array([ 0. ,  1.5, 20. ]), array([0. , 0.5, 1. ]), (Patch(start_m=0.0, terrain='grass'),))
+    """
+    if name not in SCENARIOS:
+        raise ConfigError(f"scenario {name!r} is unknown: use one of {', '.join(SCENARIOS)}")
+    grounds = (terrains,) if isinstance(terrains, str) else tuple(terrains or ())
+    if not grounds or not all(isinstance(terrain, str) and terrain for terrain in grounds):
+        raise ConfigError(f"terrains are {terrains!r}: one name or several are wanted")
+    if len(grounds) > 1 and name != "course":
+        raise ConfigError(
+            f"scenario {name!r} is driven on one terrain, {len(grounds)} are given: use 'course'"
+        )
+    order = _Order(*_ability(robot, speed_mps), _generator(seed))
+    wanted_s = _duration(duration_s)
+    if name == "course":
+        time_s, twist, patches = _course(order, wanted_s, grounds)
+    else:
+        default_s, drive, smooth = _DRIVES[name]
+        length_s = default_s if wanted_s is None else wanted_s
+        time_s = _times(length_s)
+        twist = _twists(drive(order, length_s), time_s, smooth)
+        patches = (Patch(0.0, grounds[0]),)
+    return Scenario(name, RATE_HZ, time_s, twist, patches)
+
+
+def _stand(order: _Order, length_s: float) -> list[_Leg]:
+    return [_Leg(_STAND, length_s)]
+
+
+def _straight(order: _Order, length_s: float) -> list[_Leg]:
+    ramp_s = order.speed_mps / ACCEL_MPS2
+    hold_s = _rest("straight", length_s, STAND_S + ramp_s, at_least_s=1.0)
+    return [_Leg(_STAND, STAND_S), _Leg(order.limit((order.speed_mps, 0.0, 0.0)), hold_s)]
+
+
+def _arc(order: _Order, length_s: float) -> list[_Leg]:
+    twist = order.limit((order.speed_mps, 0.0, YAW_RATE_RADPS))
+    hold_s = _rest("arc", length_s, 2 * STAND_S + 2 * _ramp_s(twist), at_least_s=1.0)
+    return [_Leg(_STAND, STAND_S), _Leg(twist, hold_s), _Leg(_STAND, STAND_S)]
+
+
+def _starts(order: _Order, length_s: float) -> list[_Leg]:
+    drive_s = 3.0 + 2 * order.speed_mps / ACCEL_MPS2
+    n = max(1, int((length_s - STAND_S) / (drive_s + STAND_S)))
+    stand_s = _rest("starts", length_s, n * drive_s, at_least_s=(n + 1) * STAND_S) / (n + 1)
+    once = [_Leg(order.limit((order.speed_mps, 0.0, 0.0)), 3.0), _Leg(_STAND, stand_s)]
+    return [_Leg(_STAND, stand_s), *once * n]
+
+
+def _spot_turn(order: _Order, length_s: float) -> list[_Leg]:
+    left = order.limit((0.0, 0.0, SPOT_RADPS))
+    around_s = 2 * _ramp_s(left) + STAND_S
+    n = 2 * max(1, int((length_s - STAND_S) / (2 * (around_s + 2.0))))
+    hold_s = _rest("spot_turn", length_s, STAND_S + n * around_s, at_least_s=n * 1.0) / n
+    both = [_Leg(left, hold_s), _Leg(_STAND, STAND_S), _Leg(-left, hold_s), _Leg(_STAND, STAND_S)]
+    return [_Leg(_STAND, STAND_S), *both * (n // 2)]
+
+
+_COMPLEX: tuple[tuple[float, float, float, float], ...] = (
+    # speed_x and speed_y in cruising speeds, yaw rate in YAW_RATE_RADPS, share of the time that is held
+    (1.0, 0.0, 0.0, 4.0),
+    (0.8, 0.0, 1.0, 4.0),
+    (0.8, 0.0, -1.0, 4.0),
+    (0.0, 0.0, 0.0, 1.0),
+    (-0.8, 0.0, 0.0, 3.0),
+    (-0.6, 0.0, 1.0, 4.0),
+    (-0.6, 0.0, -1.0, 4.0),
+    (0.0, 0.0, 0.0, 1.5),
+    (0.0, 0.5, 0.0, 3.0),
+    (0.0, 0.0, 0.0, 1.0),
+    (0.0, -0.5, 0.0, 3.0),
+    (0.0, 0.0, 0.0, 1.5),
+    (0.5, 0.5, 0.0, 3.0),
+    (0.0, 0.0, 0.0, 1.5),
+    (0.5, -0.5, 0.0, 3.0),
+)
+
+
+def _complex(order: _Order, length_s: float) -> list[_Leg]:
+    table = np.array(_COMPLEX)
+    twists = order.limit(table[:, :3] * (order.speed_mps, order.speed_mps, YAW_RATE_RADPS))
+    ramps_s = sum(_ramp_s(b - a, smooth=True) for a, b in pairwise([_STAND, *twists, _STAND]))
+    shares = table[:, 3] / table[:, 3].sum()
+    held_s = _rest("complex", length_s, 2 * STAND_S + ramps_s, at_least_s=10.0)
+    legs = [_Leg(twist, share * held_s) for twist, share in zip(twists, shares, strict=True)]
+    return [_Leg(_STAND, STAND_S), *legs, _Leg(_STAND, STAND_S)]
+
+
+def _survey(order: _Order, length_s: float) -> list[_Leg]:
+    """Draw legs, and brake in time to be at rest at the end."""
+    fastest = order.limit((1.2 * order.speed_mps, 0.0, 0.0))
+    brake_s = max(_ramp_s(fastest), SPOT_RADPS / YAW_ACCEL_RADPS2)
+    driven_s = _rest("survey", length_s, brake_s + STAND_S, at_least_s=6.0)
+    legs, over_s = _fill(_survey_legs(order), driven_s)
+    hold_s = legs[-1].hold_s - over_s
+    if hold_s < 0:  # braking starts in the middle of a ramp, from the twist that was reached there
+        legs[-1] = legs[-1]._replace(twist=_twists(legs, np.array([driven_s]))[0])
+    legs[-1] = legs[-1]._replace(hold_s=max(0.0, hold_s))
+    return [*legs, _Leg(_STAND, length_s)]
+
+
+def _survey_legs(order: _Order) -> Iterator[_Leg]:
+    rng = order.rng
+    yield _Leg(_STAND, STAND_S)
+    yield _stretch(order, 1.0, gentle_1pm=0.2)
+    while True:
+        kind = rng.choice(["stretch", "stop", "backward", "spot"], p=[0.7, 0.1, 0.1, 0.1])
+        if kind == "stretch":
+            yield _stretch(order, 1.0, gentle_1pm=0.2)
+            continue
+        yield _Leg(_STAND, rng.uniform(1.0, 2.0), rng.uniform(0.5, 1.0))
+        if kind == "backward":
+            yield _stretch(order, -1.0, gentle_1pm=0.2)
+            yield _Leg(_STAND, rng.uniform(1.0, 2.0), rng.uniform(0.5, 1.0))
+        elif kind == "spot":
+            yaw_radps = rng.choice([-1.0, 1.0]) * rng.uniform(0.3, SPOT_RADPS)
+            yield _Leg(order.limit((0.0, 0.0, yaw_radps)), rng.uniform(3.0, 5.0))
+            yield _Leg(_STAND, 1.0)
+
+
+def _stretch(order: _Order, direction: float, gentle_1pm: float) -> _Leg:
+    """Draw a stretch of steady speed, every other one an arc of at most this curvature."""
+    rng = order.rng
+    speed_mps = direction * rng.uniform(0.4, 1.2) * order.speed_mps
+    curvature_1pm = rng.integers(2) * rng.uniform(-gentle_1pm, gentle_1pm)
+    twist = order.limit((speed_mps, 0.0, curvature_1pm * speed_mps))
+    return _Leg(twist, rng.uniform(4.0, 6.0), rng.uniform(0.5, 1.0))
+
+
+def _course(
+    order: _Order, wanted_s: float | None, terrains: tuple[str, ...]
+) -> tuple[Array, Array, tuple[Patch, ...]]:
+    """Lay patches and drive over them; a given duration lays as many as are reached in it."""
+    ground, driver = order.rng.spawn(2)
+    order = order._replace(rng=driver)
+    rounds = _rounds(terrains, ground)
+    laid, end_m = next(rounds)
+    if wanted_s is None:
+        slowest_mps = order.limit((0.4 * order.speed_mps, 0.0, 0.4 * order.speed_mps * 0.15))[0]
+        length_s = 2 * STAND_S + 2 * order.speed_mps / ACCEL_MPS2 + SLIP_MARGIN * end_m / slowest_mps
+    else:
+        length_s = wanted_s
+        _rest("course", length_s, STAND_S + 1.2 * order.speed_mps / 0.5, at_least_s=3.0)
+    time_s = _times(length_s)
+    twist = _twists(_fill(_course_legs(order), length_s)[0], time_s)
+    reached_m = _distance_m(time_s, twist) / SLIP_MARGIN
+    if wanted_s is None:
+        n = int(np.searchsorted(reached_m, end_m)) + 1
+        return time_s[:n], twist[:n], tuple(laid)
+    while end_m < reached_m[-1]:
+        patches, end_m = next(rounds)
+        laid += patches
+    return time_s, twist, tuple(patch for patch in laid if patch.start_m < reached_m[-1])
+
+
+def _course_legs(order: _Order) -> Iterator[_Leg]:
+    yield _Leg(_STAND, STAND_S)
+    while True:
+        yield _stretch(order, 1.0, gentle_1pm=0.15)
+
+
+def _rounds(terrains: tuple[str, ...], rng: np.random.Generator) -> Iterator[tuple[list[Patch], float]]:
+    """Yield round after round of patches, every terrain once in each, and where the round ends."""
+    start_m, last = 0.0, ""
+    while True:
+        names = [terrains[i] for i in rng.permutation(len(terrains))]
+        if names[0] == last:
+            names.append(names.pop(0))  # a change of terrain at every boundary, where there are two
+        patches = []
+        for terrain in names:
+            patches.append(Patch(start_m, terrain))
+            start_m += rng.uniform(*PATCH_M)
+        last = names[-1]
+        yield patches, start_m
+
+
+_DRIVES: dict[str, tuple[float, Callable[[_Order, float], list[_Leg]], bool]] = {
+    # what it lasts by default, its legs, and whether its ramps are smooth
+    "stand": (20.0, _stand, False),
+    "straight": (20.0, _straight, False),
+    "arc": (20.0, _arc, False),
+    "starts": (30.0, _starts, False),
+    "spot_turn": (30.0, _spot_turn, False),
+    "complex": (60.0, _complex, True),
+    "survey": (40.0, _survey, False),
+}
+
+SCENARIOS: tuple[str, ...] = (*_DRIVES, "course")
+"""Names that :func:`make_scenario` knows."""
+
+
+def _ramp_s(change: Any, accel_mps2: float = ACCEL_MPS2, smooth: bool = False) -> float:
+    """Return how long a change of twist takes; the peak of a smooth one is pi/2 times its mean."""
+    x_mps, y_mps, yaw_radps = change
+    linear_s = float(max(math.hypot(x_mps, y_mps) / accel_mps2, abs(yaw_radps) / YAW_ACCEL_RADPS2))
+    return linear_s * math.pi / 2 if smooth else linear_s
+
+
+def _fill(legs: Iterator[_Leg], length_s: float) -> tuple[list[_Leg], float]:
+    """Take legs until they last this long; return them and by how much they last longer."""
+    taken: list[_Leg] = []
+    end_s, before = 0.0, _STAND
+    while end_s < length_s:
+        leg = next(legs)
+        end_s += _ramp_s(leg.twist - before, leg.accel_mps2) + leg.hold_s
+        before = leg.twist
+        taken.append(leg)
+    return taken, end_s - length_s
+
+
+def _twists(legs: Sequence[_Leg], time_s: Array, smooth: bool = False) -> Array:
+    """Return the twist (n, 3) at each time, the last one held on after the end.
+
+    The admissible region is convex: with both ends of a ramp in it, all of the ramp is.
+    """
+    knots_s, knots = [0.0], [_STAND]
+    for leg in legs:
+        ramp_s = _ramp_s(leg.twist - knots[-1], leg.accel_mps2, smooth)
+        for length_s in (ramp_s, leg.hold_s):
+            if length_s > 0:
+                knots_s.append(knots_s[-1] + length_s)
+                knots.append(leg.twist)
+    place = np.interp(time_s, knots_s, np.arange(len(knots_s)))
+    before = np.minimum(place.astype(int), len(knots) - 2)
+    part = place - before
+    if smooth:
+        part = (1 - np.cos(np.pi * part)) / 2
+    twists = np.array(knots)
+    return np.asarray(twists[before] + part[:, None] * (twists[before + 1] - twists[before]))
+
+
+def _times(length_s: float) -> Array:
+    return np.arange(round(length_s * RATE_HZ) + 1) / RATE_HZ
+
+
+def _distance_m(time_s: Array, twist: Array) -> Array:
+    speed_mps = np.hypot(twist[:, 0], twist[:, 1])
+    steps_m = np.diff(time_s) * (speed_mps[1:] + speed_mps[:-1]) / 2
+    return np.concatenate([[0.0], np.cumsum(steps_m)])
+
+
+def _rest(name: str, length_s: float, taken_s: float, at_least_s: float) -> float:
+    """Return what is left of the time, once the parts of a fixed length are taken away."""
+    if length_s < taken_s + at_least_s - 1e-9:
+        shortest_s = math.ceil(10 * (taken_s + at_least_s)) / 10
+        raise ConfigError(
+            f"duration_s is {length_s:g}, too short for {name!r} at this speed: at least {shortest_s:g} s"
+        )
+    return length_s - taken_s
+
+
+def _duration(duration_s: float | None) -> float | None:
+    if duration_s is None:
+        return None
+    if not _is_number(duration_s) or not 1 / RATE_HZ <= duration_s <= LONGEST_S:
+        raise ConfigError(
+            f"duration_s is {duration_s!r}, a time from {1 / RATE_HZ:g} to {LONGEST_S:g} s is wanted"
+        )
+    return float(duration_s)
+
+
+def _ability(robot: Robot, speed_mps: float) -> tuple[float, Callable[[Any], Array]]:
+    """Return the speed, checked, and what shortens a twist to what the robot can."""
+    if robot.drive != "swerve":
+        raise ConfigError(
+            f"robot {robot.name} has the drive {robot.drive!r}: scenarios are for 'swerve' alone"
+        )
+    positions_m, radius_m = robot.wheel_positions_m, robot.wheel_radius_m
+    speed_max_radps = robot.equipment.motors.speed_max_radps
+    if not _is_number(speed_mps) or not 0 < speed_mps <= radius_m * speed_max_radps:
+        raise ConfigError(
+            f"speed_mps is {speed_mps!r}: robot {robot.name} drives above 0 and up to "
+            f"{radius_m * speed_max_radps:g} m/s"
+        )
+    return float(speed_mps), lambda twist: scaled(positions_m, radius_m, twist, speed_max_radps)
+
+
+def _generator(seed: int | np.random.Generator) -> np.random.Generator:
+    if isinstance(seed, np.random.Generator):
+        return seed
+    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
+        raise ConfigError(f"seed is {seed!r}, a whole number from 0 up is wanted")
+    return np.random.default_rng(seed)
+
+
+def _is_number(value: Any) -> bool:
+    return (
+        isinstance(value, int | float | np.integer | np.floating)
+        and not isinstance(value, bool)
+        and math.isfinite(value)
+    )

@@ -1,0 +1,1 @@
+"""Wheel on ground: described soils, force against slip, and what resists rolling."""

@@ -1,0 +1,243 @@
+"""Soils: the numbers of a ground's traction, sinkage and roughness, read from YAML (``data/soils``).
+
+Each number carries its unit and its source and, where it differs from place to place, how much: a coefficient
+of variation from one run to the next and, of friction and rolling resistance, along the ground within a run::
+
+    name: dry_sand
+    law: janosi
+    friction_angle_rad:
+      value: 0.489
+      unit: rad
+      source: "Wong, Theory of Ground Vehicles, table 2.3"
+      scatter: {run: 0.08, field: 0.05, source: "Phoon and Kulhawy 1999"}
+
+``law`` names the traction law: ``janosi`` on ground that shears, ``magic`` on hard ground; a description has
+the numbers of its own law and no other.  Ground that shears may also have Bekker's three numbers of sinkage.
+The unit of his moduli depends on the exponent n: ``npmn1`` is N/m^(n+1), ``npmn2`` is N/m^(n+2).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from terrain.descriptions import check_keys, number, read_yaml
+from terrain.errors import ConfigError
+from terrain.resources import data_folder
+
+LAWS: dict[str, tuple[str, ...]] = {
+    "janosi": ("cohesion_pa", "friction_angle_rad", "shear_modulus_m"),
+    "magic": ("stiffness_ratio", "shape_ratio", "peak_friction_ratio", "curvature_ratio"),
+}
+"""The numbers of each traction law."""
+
+RESISTANCE = ("rolling_resistance_ratio", "slip_sinkage_ratio")
+SINKAGE = ("kc_npmn1", "kphi_npmn2", "sinkage_exponent_ratio")
+
+RANGES: dict[str, tuple[float | None, float]] = {
+    "rolling_resistance_ratio": (0.0, 1.0),
+    "slip_sinkage_ratio": (0.0, 5.0),
+    "roughness_m3": (0.0, 1.0),
+    "cohesion_pa": (0.0, 1e6),
+    "friction_angle_rad": (None, 1.2),
+    "shear_modulus_m": (None, 1.0),
+    "stiffness_ratio": (None, 100.0),
+    "shape_ratio": (None, 3.0),
+    "peak_friction_ratio": (None, 3.0),
+    "curvature_ratio": (-math.inf, 1.0),
+    "kc_npmn1": (0.0, 1e9),
+    "kphi_npmn2": (None, 1e12),
+    "sinkage_exponent_ratio": (None, 2.0),
+}
+"""Lowest and highest value of each number, so that an angle in degrees is noticed; None: above zero.
+
+The sinkage of a rigid wheel has no root for an exponent of 3, and near it is no approximation any more."""
+
+FRICTION = {"janosi": "friction_angle_rad", "magic": "peak_friction_ratio"}
+"""The number of each law whose ``field`` is that of the thrust."""
+
+
+class Scatter(NamedTuple):
+    """How much one number of a soil differs, as coefficients of variation."""
+
+    parameter: str
+    run_ratio: float
+    field_ratio: float
+
+
+@dataclass(frozen=True, slots=True)
+class Soil:
+    """One kind of ground; numbers that its law does not have, or that nobody gave, are NaN.
+
+    Parameters
+    ----------
+    name : the terrain's label
+    law : ``janosi`` or ``magic``
+    rolling_resistance_ratio : resistance of the rolling wheel over its load, without compaction
+    slip_sinkage_ratio : exponent by which sinkage grows with slip; 0 where it does not
+    roughness_m3 : ISO 8608 displacement spectral density at 0.1 cycles/m, of waviness 2
+    cohesion_pa, friction_angle_rad, shear_modulus_m : c and phi of Mohr and Coulomb, K of Janosi and Hanamoto
+    stiffness_ratio, shape_ratio, peak_friction_ratio, curvature_ratio : B, C, D, E of the Magic Formula
+    kc_npmn1, kphi_npmn2, sinkage_exponent_ratio : kc, kphi and n of Bekker
+    scatter : how numbers differ from run to run and along a run
+    """
+
+    name: str
+    law: str
+    rolling_resistance_ratio: float
+    slip_sinkage_ratio: float
+    roughness_m3: float
+    cohesion_pa: float = math.nan
+    friction_angle_rad: float = math.nan
+    shear_modulus_m: float = math.nan
+    stiffness_ratio: float = math.nan
+    shape_ratio: float = math.nan
+    peak_friction_ratio: float = math.nan
+    curvature_ratio: float = math.nan
+    kc_npmn1: float = math.nan
+    kphi_npmn2: float = math.nan
+    sinkage_exponent_ratio: float = math.nan
+    scatter: tuple[Scatter, ...] = ()
+
+    @property
+    def thrust_field_ratio(self) -> float:
+        """Coefficient of variation of the thrust along a run: that of the friction; 0 where none is given."""
+        return self._field(FRICTION[self.law])
+
+    @property
+    def resistance_field_ratio(self) -> float:
+        """Coefficient of variation of the resistance along a run: that of rolling; 0 where none is given."""
+        return self._field("rolling_resistance_ratio")
+
+    def _field(self, parameter: str) -> float:
+        return next((entry.field_ratio for entry in self.scatter if entry.parameter == parameter), 0.0)
+
+
+def soil_names() -> tuple[str, ...]:
+    """Return the names of the soils that travel with the package.
+
+    Examples
+    --------
+    >>> soil_names()
+    ('asphalt', 'clay', 'dry_sand', 'firm_soil_gravel', 'grass', 'snow', 'tiles', 'tilled_loam')
+    """
+    return tuple(sorted(file.stem for file in data_folder("soils").glob("*.yaml")))
+
+
+def load_soil(name_or_path: str | Path) -> Soil:
+    """Return a soil that travels with the package, by name, or the one that a YAML file describes.
+
+    Parameters
+    ----------
+    name_or_path : one of :func:`soil_names`, or the path of a file that ends in ``.yaml`` or ``.yml``
+
+    Raises
+    ------
+    ConfigError
+        if there is no such soil or law, a key is unknown or missing, a unit is not the field's own, a source
+        is missing, or a number is out of its range.
+
+    Examples
+    --------
+    >>> soil = load_soil("clay")
+    >>> soil.law, soil.cohesion_pa
+    ('janosi', 4140.0)
+    """
+    path = Path(name_or_path)
+    if path.suffix not in (".yaml", ".yml"):
+        if str(name_or_path) not in soil_names():
+            known = ", ".join(soil_names())
+            raise ConfigError(f"soil {str(name_or_path)!r} is unknown: give one of {known}, or a .yaml file")
+        path = data_folder("soils") / f"{name_or_path}.yaml"
+    return soil_from(path.name, read_yaml(path))
+
+
+def soil_from(file: str, described: Any) -> Soil:
+    """Return the soil that the content of a description says; ``file`` is what messages call it.
+
+    Raises
+    ------
+    ConfigError
+        as :func:`load_soil` does.
+    """
+    check_keys(file, described, ["name", "law"], optional=tuple(RANGES))
+    name, law = described["name"], described["law"]
+    if not isinstance(name, str) or not name:
+        raise ConfigError(f"{file}: name is {name!r}, a word is wanted")
+    if not isinstance(law, str) or law not in LAWS:
+        raise ConfigError(f"{file}: law {law!r} is unknown: use one of {', '.join(LAWS)}")
+    sinks = law == "janosi" and any(key in described for key in SINKAGE)
+    parameters = [*RESISTANCE, "roughness_m3", *LAWS[law], *(SINKAGE if sinks else ())]
+    check_keys(file, described, ["name", "law", *parameters])
+    numbers = {key: _parameter(f"{file}: {key}", key, described[key]) for key in parameters}
+    scatter = tuple(
+        _scatter(f"{file}: {key}: scatter", key, described[key]["scatter"])
+        for key in parameters
+        if "scatter" in described[key]
+    )
+    return Soil(name, law, **numbers, scatter=scatter)
+
+
+def scattered(soil: Soil, rng: np.random.Generator) -> Soil:
+    """Return the soil of one run, drawn around its description.
+
+    Each number with a scatter is multiplied by its own log-normal factor of median 1, whose coefficient of
+    variation is ``run_ratio`` and whose logarithm is cut at two standard deviations; of a friction angle, the
+    tangent is.  A number that would leave :data:`RANGES` stops there.
+
+    Parameters
+    ----------
+    soil : what to draw around
+    rng : source of the draw; the same state gives the same soil
+
+    Examples
+    --------
+    >>> sand = load_soil("dry_sand")
+    >>> drawn = scattered(sand, np.random.default_rng(0))
+    >>> drawn.kphi_npmn2 != sand.kphi_npmn2, drawn.name
+    (True, 'dry_sand')
+    """
+    drawn: dict[str, Any] = {}
+    for entry in soil.scatter:
+        sigma = math.sqrt(math.log1p(entry.run_ratio**2))
+        factor = math.exp(sigma * min(max(rng.standard_normal(), -2.0), 2.0))
+        value = getattr(soil, entry.parameter)
+        if entry.parameter == "friction_angle_rad":
+            value = math.atan(math.tan(value) * factor)
+        else:
+            value *= factor
+        drawn[entry.parameter] = min(value, RANGES[entry.parameter][1])
+    return replace(soil, **drawn)
+
+
+def _parameter(place: str, key: str, entry: Any) -> float:
+    check_keys(place, entry, ["value", "unit", "source"], optional=("scatter",))
+    plain = {part: entry[part] for part in ("value", "unit", "source")}
+    return _within(place, plain, key.rpartition("_")[2], *RANGES[key])
+
+
+def _scatter(place: str, key: str, entry: Any) -> Scatter:
+    has_field = key in ("rolling_resistance_ratio", *FRICTION.values())
+    check_keys(place, entry, ["run", "source"], optional=("field",) if has_field else ())
+    ratios = (
+        _within(
+            f"{place}: {part}",
+            {"value": entry.get(part, 0.0), "unit": "ratio", "source": entry["source"]},
+            "ratio",
+            0.0,
+            1.0,
+        )
+        for part in ("run", "field")
+    )
+    return Scatter(key, *ratios)
+
+
+def _within(place: str, entry: dict[str, Any], unit: str, low: float | None, high: float) -> float:
+    value = number(place, entry, unit, low)
+    if value > high:
+        raise ConfigError(f"{place} is {value:g}, at most {high:g} is accepted")
+    return value

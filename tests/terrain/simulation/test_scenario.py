@@ -1,0 +1,276 @@
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from terrain.errors import ConfigError
+from terrain.kinematics.swerve import forward, wheel_commands, wheel_velocities
+from terrain.robots import load_robot
+from terrain.simulation.scenario import (
+    ACCEL_MPS2,
+    PATCH_M,
+    SCENARIOS,
+    SLIP_MARGIN,
+    YAW_ACCEL_RADPS2,
+    Patch,
+    Scenario,
+    make_scenario,
+)
+
+ROBOT = load_robot("agrimaro")
+DRAWN = ("survey", "course")
+TERRAINS = ("grass", "gravel", "sand", "tiles")
+
+
+def make(name, **options):
+    return make_scenario(name, ROBOT, TERRAINS if name == "course" else "grass", **options)
+
+
+def resting(scenario):
+    return (scenario.twist == 0).all(axis=1)
+
+
+@pytest.mark.parametrize("speed_mps", [0.3, 1.0, 2.0])
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_every_scenario_can_be_driven_by_the_robot_and_is_at_rest_where_it_says(name, speed_mps):
+    for seed in range(5 if name in DRAWN else 1):
+        drive = make(name, speed_mps=speed_mps, seed=seed)
+        assert drive.time_s[0] == 0
+        np.testing.assert_allclose(np.diff(drive.time_s), 1 / drive.rate_hz)
+        rest = resting(drive)
+        assert rest[drive.time_s <= 1.0].all()
+        assert rest[-1] == (name not in ("straight", "course"))
+        assert rest.all() == (name == "stand")
+        change = np.abs(np.diff(drive.twist, axis=0)) * drive.rate_hz
+        assert np.hypot(change[:, 0], change[:, 1]).max() <= ACCEL_MPS2 * (1 + 1e-9)
+        assert change[:, 2].max() <= YAW_ACCEL_RADPS2 * (1 + 1e-9)
+        rim_mps = np.linalg.norm(wheel_velocities(ROBOT.wheel_positions_m, drive.twist), axis=-1)
+        assert rim_mps.max() <= ROBOT.wheel_radius_m * ROBOT.motors.speed_max_radps * (1 + 1e-9)
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_wheels_follow_but_for_the_moment_in_which_they_are_steered(name):
+    drive = make(name, seed=2)
+    geometry = ROBOT.wheel_positions_m, ROBOT.wheel_radius_m
+    admitted, wheel, steer = wheel_commands(
+        *geometry,
+        ROBOT.motors.speed_max_radps,
+        ROBOT.steering.rate_max_radps,
+        1 / drive.rate_hz,
+        drive.twist,
+        np.zeros(3),
+    )
+    np.testing.assert_array_equal(admitted, drive.twist)  # nothing is left for the limiter to do
+    twist, residual_mps = forward(*geometry, wheel, steer)
+    off = np.abs(twist - drive.twist).max(axis=1) > 1e-6
+    assert off.mean() < 0.15
+    assert residual_mps[~off].max(initial=0.0) < 1e-6
+    started = np.flatnonzero(~resting(drive)[1:] & resting(drive)[:-1])
+    if name in ("straight", "starts"):
+        assert not off.any()
+    if name in ("complex", "spot_turn"):  # steered only in the second after a start
+        assert all(0 <= k - started[started <= k].max() <= drive.rate_hz for k in np.flatnonzero(off))
+
+
+DEFAULT_S = {
+    "stand": 20,
+    "straight": 20,
+    "arc": 20,
+    "starts": 30,
+    "spot_turn": 30,
+    "complex": 60,
+    "survey": 40,
+}
+
+
+@pytest.mark.parametrize(("name", "default_s"), list(DEFAULT_S.items()))
+def test_a_scenario_lasts_exactly_as_long_as_it_should(name, default_s):
+    assert make(name).time_s[-1] == default_s
+    for duration_s in (45.5, 47.02, 83.0, 240.0):
+        for chosen in (name, "course"):
+            drive = make(chosen, duration_s=duration_s, seed=4)
+            assert drive.time_s[-1] == duration_s
+            assert resting(drive)[-1] == (chosen not in ("straight", "course"))
+
+
+def test_straight_is_the_run_of_the_thesis():
+    drive = make("straight", speed_mps=0.8)
+    expected = np.clip(drive.time_s - 1.0, 0.0, 0.8)
+    np.testing.assert_allclose(drive.twist[:, 0], expected, atol=1e-12)
+    assert (drive.twist[:, 1:] == 0).all()
+    assert drive.distance_m[-1] == pytest.approx(0.8 * 18.2 + 0.32, abs=1e-3)
+
+
+def test_the_radius_of_an_arc_is_constant_from_the_start():
+    drive = make("arc")
+    moving = ~resting(drive)
+    np.testing.assert_allclose(drive.twist[moving, 0] / drive.twist[moving, 2], 1 / 0.3)
+    assert drive.twist.max(axis=0) == pytest.approx([1.0, 0.0, 0.3])
+    fast = make("arc", speed_mps=2.0).twist  # the third wheel saturates: slower, on the same arc
+    assert fast[:, 0].max() == pytest.approx(2.0 / (1 + 0.756 * 0.3 / 2.0))
+    assert (fast[:, 2] * 2.0 / 0.3) == pytest.approx(fast[:, 0])
+
+
+def test_starts_are_repeated():
+    drive = make("starts")
+    at_speed = drive.twist[:, 0] > 1 - 1e-9
+    edges = np.flatnonzero(np.diff(at_speed.astype(int)))
+    assert len(edges) == 8  # four times up and down
+    np.testing.assert_allclose(np.diff(edges)[::2] / drive.rate_hz, 3.0, atol=0.05)
+    assert (np.diff(np.flatnonzero(np.diff(resting(drive).astype(int)) > 0)) >= 5 * drive.rate_hz).all()
+
+
+def test_spot_turns_go_round_both_ways_and_nowhere_else():
+    drive = make("spot_turn")
+    assert (drive.twist[:, :2] == 0).all()
+    yaw = drive.twist[:, 2]
+    assert (yaw.max(), yaw.min(), yaw.sum()) == pytest.approx((0.6, -0.6, 0.0), abs=1e-9)
+    assert len(np.flatnonzero(np.diff(np.sign(yaw)))) == 12  # three turns each way
+    assert drive.distance_m[-1] == 0
+
+
+def test_complex_holds_every_kind_of_motion():
+    drive = make("complex")
+    x, y, yaw = drive.twist.T
+    held = (np.abs(np.diff(drive.twist, axis=0, append=0)) == 0).all(axis=1)
+    ahead, back = held & (x > 0), held & (x < 0)
+    for kind in (
+        ahead & (yaw == 0) & (y == 0),
+        back & (yaw == 0),
+        *(side & (yaw * sign > 0.29) for side in (ahead, back) for sign in (1, -1)),
+        *(held & (x == 0) & (y * sign > 0) for sign in (1, -1)),
+        *(ahead & (y * sign > 0) for sign in (1, -1)),
+    ):
+        assert kind.sum() >= 2 * drive.rate_hz
+    assert x.max() == pytest.approx(1.0)
+    bent = np.abs(np.diff(drive.twist, n=2, axis=0)).max() * drive.rate_hz**2
+    assert bent < 10.0  # m/s^3; where a linear ramp of 1 m/s^2 begins it is 50
+
+
+@pytest.mark.parametrize("name", DRAWN)
+def test_same_seed_same_bytes_other_seed_other_drive(name):
+    one, same, other = (make(name, seed=seed) for seed in (7, np.random.default_rng(7), 8))
+    assert one.twist.tobytes() == same.twist.tobytes()
+    assert one.patches == same.patches
+    assert one.twist.tobytes() != other.twist.tobytes()
+    longer = make(name, seed=7, duration_s=100.0)
+    n = int(25 * one.rate_hz)
+    np.testing.assert_array_equal(one.twist[:n], longer.twist[:n])  # a longer one goes on from there
+
+
+def test_surveys_hold_stretches_of_steady_speed_and_now_and_then_something_else():
+    held, stops, backs, spots, arcs = [], 0, 0, 0, 0
+    for seed in range(30):
+        drive = make("survey", seed=seed)
+        x, y, yaw = drive.twist.T
+        assert (y == 0).all()
+        assert np.abs(x).max() <= 1.2
+        gentle = np.abs(x) > 0.01
+        assert np.abs(yaw[gentle] / x[gentle]).max() <= 0.2 + 1e-9
+        assert (~resting(drive)).mean() > 0.6
+        steady = (np.diff(drive.twist, axis=0) == 0).all(axis=1) & (x[1:] > 0)
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], steady.astype(int), [0]])))
+        held += list((edges[1::2] - edges[::2])[:-1] / drive.rate_hz)  # the last one may be cut
+        stops += len(np.flatnonzero(np.diff(resting(drive).astype(int)) > 0)) > 1
+        backs += bool((x < 0).any())
+        spots += bool(((x == 0) & (yaw != 0)).any())
+        arcs += bool(((x > 0) & (yaw != 0)).any())
+    held = np.array(held)
+    assert held.min() > 3.9
+    assert held.max() < 6.0
+    assert len(held) > 90
+    for count in (stops, backs, spots):
+        assert 3 < count < 30
+    assert arcs > 25
+
+
+def test_a_course_is_driven_over_every_terrain_in_a_drawn_order():
+    orders = set()
+    for seed in range(12):
+        drive = make("course", seed=seed)
+        starts_m = np.array([patch.start_m for patch in drive.patches])
+        names = tuple(patch.terrain for patch in drive.patches)
+        assert sorted(names) == sorted(TERRAINS)
+        orders.add(names)
+        lengths_m = np.diff(starts_m, append=drive.distance_m[-1] / SLIP_MARGIN)
+        assert starts_m[0] == 0
+        assert lengths_m.min() >= PATCH_M[0]
+        assert lengths_m.max() <= PATCH_M[1] + 0.02
+        crossing = np.searchsorted(drive.distance_m, starts_m[1:])
+        assert (drive.twist[crossing, 0] > 0).all()  # changes are under way
+        speeds = drive.twist[drive.time_s > 4.0, 0]
+        assert speeds.min() >= 0.4
+        assert speeds.max() <= 1.2
+        assert np.ptp(speeds) > 0.1
+        assert np.abs(drive.twist[1:, 2]).max() <= 0.15 * 1.2
+    assert len(orders) > 6
+
+
+def test_a_long_course_goes_round_again_and_a_short_one_is_cut():
+    long = make("course", duration_s=300.0, seed=3)
+    names = [patch.terrain for patch in long.patches]
+    starts_m = np.array([patch.start_m for patch in long.patches])
+    assert all(a != b for a, b in pairwise(names))
+    counts = [names.count(terrain) for terrain in TERRAINS]
+    assert max(counts) - min(counts) <= 1
+    assert starts_m[-1] < long.distance_m[-1] / SLIP_MARGIN <= starts_m[-1] + PATCH_M[1]
+    short = make("course", duration_s=15.0, seed=3)
+    assert 1 <= len(short.patches) < 4
+    assert short.patches == long.patches[: len(short.patches)]
+    assert make_scenario("course", ROBOT, ["grass"], seed=1).patches == (Patch(0.0, "grass"),)
+
+
+@pytest.mark.parametrize("name", [name for name in SCENARIOS if name != "course"])
+def test_other_scenarios_are_driven_on_one_terrain(name):
+    assert make_scenario(name, ROBOT, ["sand"]).patches == (Patch(0.0, "sand"),)
+    with pytest.raises(ConfigError, match="is driven on one terrain, 2 are given: use 'course'"):
+        make_scenario(name, ROBOT, ["sand", "grass"])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"name": "zigzag"}, "scenario 'zigzag' is unknown: use one of stand, straight"),
+        ({"terrains": []}, r"terrains are \[\]: one name or several are wanted"),
+        ({"terrains": ""}, "terrains are ''"),
+        ({"terrains": ["grass", 3]}, r"terrains are \['grass', 3\]"),
+        ({"duration_s": -1.0}, "duration_s is -1.0, a time from"),
+        ({"duration_s": 0}, "duration_s is 0, a time from"),
+        ({"duration_s": math.nan}, "duration_s is nan"),
+        ({"duration_s": math.inf}, "duration_s is inf"),
+        ({"duration_s": 1e12}, "duration_s is 1000000000000.0, a time from 0.02 to 86400 s is wanted"),
+        ({"duration_s": "long"}, "duration_s is 'long'"),
+        ({"speed_mps": 2.1}, "speed_mps is 2.1: robot agrimaro drives above 0 and up to 2 m/s"),
+        ({"speed_mps": 0.0}, "speed_mps is 0.0"),
+        ({"speed_mps": math.nan}, "speed_mps is nan"),
+        ({"seed": -3}, "seed is -3, a whole number from 0 up"),
+        ({"seed": None}, "seed is None"),
+        ({"robot": load_robot("husky")}, "robot husky has the drive 'skid_steer'"),
+    ],
+)
+def test_what_cannot_be_driven_is_refused_in_one_sentence(options, message):
+    given = {"name": "survey", "robot": ROBOT, "terrains": "grass"} | options
+    with pytest.raises(ConfigError, match=message) as error:
+        make_scenario(**given)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("name", [name for name in SCENARIOS if name != "stand"])
+def test_too_short_a_time_is_refused_and_the_message_says_what_is_long_enough(name):
+    with pytest.raises(ConfigError, match=f"duration_s is 1.5, too short for '{name}'") as error:
+        make(name, duration_s=1.5)
+    enough_s = float(str(error.value).split("at least ")[1].split(" s")[0])
+    assert make(name, duration_s=enough_s).time_s[-1] == pytest.approx(enough_s)
+    with pytest.raises(ConfigError, match="too short"):
+        make(name, duration_s=enough_s - 0.12)
+
+
+def test_a_scenario_of_ones_own_is_checked():
+    time_s = np.arange(3) / 50
+    assert not Scenario("mine", 50.0, time_s, np.zeros((3, 3)), ((0.0, "ice"),)).twist.flags.writeable
+    with pytest.raises(ValueError, match=r"twist has shape \(3, 2\)"):
+        Scenario("mine", 50.0, time_s, np.zeros((3, 2)), ((0.0, "ice"),))
+    for patches in ((), ((1.0, "ice"),), ((0.0, "ice"), (0.0, "sand"))):
+        with pytest.raises(ValueError, match="a rising row from 0 on is needed"):
+            Scenario("mine", 50.0, time_s, np.zeros((3, 3)), patches)

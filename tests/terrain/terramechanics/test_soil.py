@@ -1,0 +1,132 @@
+import math
+from dataclasses import fields
+
+import numpy as np
+import pytest
+import yaml
+
+from terrain.errors import ConfigError
+from terrain.resources import data_folder
+from terrain.terramechanics.soil import LAWS, RANGES, SINKAGE, Soil, load_soil, scattered, soil_names
+
+
+def test_the_eight_classes_are_there_and_have_the_numbers_of_their_law():
+    assert set(soil_names()) == {
+        "tiles",
+        "asphalt",
+        "firm_soil_gravel",
+        "grass",
+        "tilled_loam",
+        "clay",
+        "snow",
+        "dry_sand",
+    }
+    for name in soil_names():
+        soil = load_soil(name)
+        assert soil.name == name
+        has = {key for key in RANGES if math.isfinite(getattr(soil, key))}
+        assert has - set(SINKAGE) == {
+            "rolling_resistance_ratio",
+            "slip_sinkage_ratio",
+            "roughness_m3",
+            *LAWS[soil.law],
+        }
+        assert has & set(SINKAGE) in (set(), set(SINKAGE))
+        assert soil.thrust_field_ratio > 0
+        assert soil.resistance_field_ratio > 0
+
+
+def test_every_number_of_a_soil_has_a_range():
+    assert set(RANGES) == {item.name for item in fields(Soil) if item.type == "float"}
+
+
+def scatter_of(entry):
+    return entry["friction_angle_rad"]["scatter"]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda d: d.pop("law"), "key 'law' is missing"),
+        (lambda d: d.update(law="pacejka"), "law 'pacejka' is unknown: use one of janosi, magic"),
+        (lambda d: d.update(law=["janosi"]), "law ['janosi'] is unknown"),
+        (lambda d: d.update(name=7), "name is 7, a word is wanted"),
+        (lambda d: d.update(colour="red"), "key 'colour' is unknown"),
+        (lambda d: d.update(law="magic"), "key 'cohesion_pa' is unknown (accepted: name, law,"),
+        (lambda d: d.pop("shear_modulus_m"), "key 'shear_modulus_m' is missing"),
+        (lambda d: d.pop("kc_npmn1"), "key 'kc_npmn1' is missing"),
+        (lambda d: d["kc_npmn1"].update(unit="npm"), "kc_npmn1 has the unit 'npm', 'npmn1' is wanted"),
+        (lambda d: d["friction_angle_rad"].update(value=28.0), "friction_angle_rad is 28, at most 1.2"),
+        (lambda d: d["shear_modulus_m"].update(value=0.0), "shear_modulus_m is 0.0, a number above zero"),
+        (lambda d: d["cohesion_pa"].update(value=-1.0), "cohesion_pa is -1.0, a number from zero up"),
+        (lambda d: d["cohesion_pa"].update(value=math.nan), "cohesion_pa is nan"),
+        (lambda d: d["cohesion_pa"].update(value="soft"), "cohesion_pa is 'soft'"),
+        (lambda d: d["sinkage_exponent_ratio"].update(value=3.0), "sinkage_exponent_ratio is 3, at most 2"),
+        (lambda d: d["cohesion_pa"].update(interval=[1, 2]), "key 'interval' is unknown"),
+        (lambda d: d["cohesion_pa"].pop("source"), "cohesion_pa: key 'source' is missing"),
+        (lambda d: d["cohesion_pa"].update(source=""), "cohesion_pa has no source"),
+        (lambda d: d.update(cohesion_pa=4140.0), "cohesion_pa is 4140.0, a mapping with value, unit, source"),
+        (lambda d: d["cohesion_pa"].update(scatter=0.2), "cohesion_pa: scatter is 0.2, a mapping with run"),
+        (lambda d: scatter_of(d).pop("source"), "friction_angle_rad: scatter: key 'source' is missing"),
+        (lambda d: scatter_of(d).update(source=" "), "friction_angle_rad: scatter: run has no source"),
+        (lambda d: scatter_of(d).update(run=-0.1), "scatter: run is -0.1, a number from zero up"),
+        (lambda d: scatter_of(d).update(field=8.0), "scatter: field is 8, at most 1"),
+        (
+            lambda d: d["cohesion_pa"]["scatter"].update(field=0.1),
+            "cohesion_pa: scatter: key 'field' is unknown",
+        ),
+    ],
+)
+def test_an_impossible_soil_is_refused_in_one_sentence(tmp_path, change, message):
+    described = yaml.safe_load((data_folder("soils") / "clay.yaml").read_text())
+    change(described)
+    path = tmp_path / "mine.yaml"
+    path.write_text(yaml.safe_dump(described))
+    with pytest.raises(ConfigError, match=r"^mine\.yaml") as error:
+        load_soil(path)
+    assert message in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("name", ["mud", "../soils/clay", "none.yaml"])
+def test_an_unknown_soil_is_named(name):
+    with pytest.raises(ConfigError, match=name.replace(".", r"\.")):
+        load_soil(name)
+
+
+def test_a_file_that_is_no_mapping_is_refused(tmp_path):
+    path = tmp_path / "list.yaml"
+    path.write_text("- clay\n")
+    with pytest.raises(ConfigError, match=r"list\.yaml is \['clay'\], a mapping with name, law is wanted"):
+        load_soil(path)
+
+
+@pytest.mark.parametrize("name", soil_names())
+def test_scatter_has_the_spread_and_the_bounds_that_the_description_states(name):
+    soil = load_soil(name)
+    rng = np.random.default_rng(5)
+    draws = [scattered(soil, rng) for _ in range(2000)]
+    told = {entry.parameter: entry.run_ratio for entry in soil.scatter}
+    for key in RANGES:
+        values = np.array([getattr(draw, key) for draw in draws])
+        nominal = getattr(soil, key)
+        if key not in told:
+            np.testing.assert_array_equal(values, nominal)
+            continue
+        if key == "friction_angle_rad":
+            values, nominal = np.tan(values), math.tan(nominal)
+        if nominal == 0:
+            continue
+        sigma = math.sqrt(math.log1p(told[key] ** 2))
+        log = np.log(values / nominal)
+        assert np.abs(log).max() <= 2 * sigma * (1 + 1e-12)
+        # A normal cut at two sigma (with its tails left on the cut) keeps 0.96 of its standard deviation.
+        assert abs(log.mean()) < 4 * sigma / math.sqrt(2000)
+        assert log.std() == pytest.approx(0.96 * sigma, rel=0.06)
+
+
+def test_scatter_is_seeded_and_leaves_the_description_alone():
+    sand = load_soil("dry_sand")
+    assert scattered(sand, np.random.default_rng(3)) == scattered(sand, np.random.default_rng(3))
+    assert scattered(sand, np.random.default_rng(3)) != scattered(sand, np.random.default_rng(4))
+    assert sand == load_soil("dry_sand")

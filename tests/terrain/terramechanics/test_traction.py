@@ -1,0 +1,235 @@
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from scipy.integrate import quad
+
+from terrain.robots import load_robot
+from terrain.terramechanics.soil import load_soil, scattered, soil_names
+from terrain.terramechanics.traction import (
+    GROUND_SIZE,
+    equilibrium_slip,
+    friction_limit,
+    ground_array,
+    janosi_force,
+    magic_force,
+    mobilised_ratio,
+    net_pull,
+    wheel_ground,
+)
+
+ROBOT = load_robot("agrimaro")
+GEOMETRY = (ROBOT.wheel_radius_m, ROBOT.body.tyre_width_m, ROBOT.body.contact_length_m)
+NORMAL_N = ROBOT.mass_kg * 9.80665 / 3
+START_N = ROBOT.mass_kg / 3 * 1.0
+"""What each wheel has to pull beside its resistance in the thesis' start at 1 m/s^2."""
+
+slips = st.floats(-1.0, 1.0)
+names = st.sampled_from(soil_names())
+
+
+def plain(soil, normal_n, slip_x, slip_y):
+    """The laws written once more in plain numpy, without series, limits of range or compiled code."""
+    radius, width, tyre = GEOMETRY
+    if normal_n <= 0:
+        return np.zeros(4)
+    sinkage, compaction = 0.0, 0.0
+    if np.isfinite(soil.kphi_npmn2):
+        n, k = soil.sinkage_exponent_ratio, soil.kc_npmn1 + width * soil.kphi_npmn2
+        sinkage = (3 * normal_n / ((3 - n) * k * np.sqrt(2 * radius))) ** (2 / (2 * n + 1))
+        sinkage *= ((1 + abs(slip_x)) / (1 - abs(slip_x) / 2)) ** soil.slip_sinkage_ratio
+        sinkage = min(sinkage, radius)
+        compaction = k * sinkage ** (n + 1) / (n + 1)
+    resistance = soil.rolling_resistance_ratio * normal_n + compaction
+    slip = np.hypot(slip_x, slip_y)
+    if slip == 0:
+        return np.array([0.0, 0.0, resistance, sinkage])
+    if soil.law == "magic":
+        b, c, d, e = soil.stiffness_ratio, soil.shape_ratio, soil.peak_friction_ratio, soil.curvature_ratio
+        force = normal_n * d * np.sin(c * np.arctan(b * slip - e * (b * slip - np.arctan(b * slip))))
+    else:
+        length = max(tyre, radius * np.arccos(1 - sinkage / radius))
+        limit = soil.cohesion_pa * width * length + normal_n * np.tan(soil.friction_angle_rad)
+        x = np.longdouble(slip) * length / soil.shear_modulus_m
+        force = float(limit * (1 + np.expm1(-x) / x)) if x > 1e-9 else limit * float(x) / 2
+    return np.array([force * slip_x / slip, force * slip_y / slip, resistance, sinkage])
+
+
+@given(x=st.floats(0.0, 200.0))
+@example(x=0.00999)
+@example(x=0.01001)
+def test_mobilised_share_is_the_mean_of_the_shear_along_the_contact(x):
+    mean, _ = quad(lambda u: -math.expm1(-x * u), 0.0, 1.0, points=[min(1.0, 5 / (1 + x))])
+    assert mobilised_ratio(x) == pytest.approx(mean, rel=1e-8, abs=1e-15)
+
+
+@given(
+    slip=st.floats(1e-6, 1.0),
+    more=st.floats(1e-3, 0.5),
+    limit_n=st.floats(1.0, 1e4),
+    length_m=st.floats(0.05, 0.5),
+    k_m=st.floats(0.002, 0.1),
+)
+def test_laws_of_ground_that_shears(slip, more, limit_n, length_m, k_m):
+    force_n = janosi_force(slip, limit_n, length_m, k_m)
+    assert janosi_force(-slip, limit_n, length_m, k_m) == -force_n
+    assert 0 < force_n < janosi_force(slip + more, limit_n, length_m, k_m) < limit_n
+    assert janosi_force(1e9, limit_n, length_m, k_m) == pytest.approx(limit_n, rel=1e-6)
+    # the corrected curve starts at 0 with Fmax l / (2 K)
+    tiny = 1e-9
+    assert janosi_force(tiny, limit_n, length_m, k_m) / tiny == pytest.approx(
+        limit_n * length_m / (2 * k_m), rel=1e-6
+    )
+    assert janosi_force(0.0, limit_n, length_m, k_m) == 0
+
+
+def test_the_curve_is_smooth_where_series_and_closed_form_meet():
+    x = 0.01 * (1 + np.linspace(-1e-6, 1e-6, 21))
+    slope = np.diff([mobilised_ratio(value) for value in x]) / np.diff(x)
+    np.testing.assert_allclose(slope, 0.5 - 0.01 / 3 + 0.01**2 / 8, rtol=1e-4)
+
+
+@given(
+    slip=slips,
+    normal_n=st.floats(0.0, 1e4),
+    b=st.floats(0.1, 30.0),
+    c=st.floats(0.5, 3.0),
+    d=st.floats(0.05, 1.5),
+    e=st.floats(-5.0, 1.0),
+)
+def test_laws_of_hard_ground(slip, normal_n, b, c, d, e):
+    force_n = magic_force(slip, normal_n, b, c, d, e)
+    assert magic_force(-slip, normal_n, b, c, d, e) == -force_n
+    assert abs(force_n) <= normal_n * d
+    assert force_n * slip >= 0
+    tiny = 1e-7
+    assert magic_force(tiny, normal_n, b, c, d, e) == pytest.approx(normal_n * b * c * d * tiny, rel=1e-5)
+
+
+@settings(max_examples=300)
+@given(
+    name=names,
+    normal_n=st.floats(-50.0, 1500.0),
+    slip_x=slips,
+    slip_y=st.floats(-3.0, 3.0),
+    slip_sinkage=st.sampled_from([0.0, 0.5, 1.0]),
+)
+@example(name="dry_sand", normal_n=0.0, slip_x=0.0, slip_y=0.0, slip_sinkage=0.0)
+@example(name="clay", normal_n=300.0, slip_x=0.0, slip_y=0.0, slip_sinkage=1.0)
+@example(name="snow", normal_n=300.0, slip_x=-1.0, slip_y=3.0, slip_sinkage=0.0)
+def test_the_compiled_wheel_is_the_plain_one_and_stays_on_the_friction_circle(
+    name, normal_n, slip_x, slip_y, slip_sinkage
+):
+    soil = replace(load_soil(name), slip_sinkage_ratio=slip_sinkage)
+    ground = ground_array(soil, *GEOMETRY)
+    assert ground.shape == (GROUND_SIZE,)
+    found = wheel_ground(ground, normal_n, slip_x, slip_y)
+    np.testing.assert_allclose(found, plain(soil, normal_n, slip_x, slip_y), rtol=1e-9, atol=1e-9)
+    thrust_n, side_n, resistance_n, sinkage_m = found
+    assert thrust_n * slip_x >= 0
+    assert side_n * slip_y >= 0
+    assert resistance_n >= 0
+    assert 0 <= sinkage_m <= GEOMETRY[0]
+    if normal_n > 0:
+        contact_m = max(GEOMETRY[2], GEOMETRY[0] * math.acos(1 - sinkage_m / GEOMETRY[0]))
+        limit_n = (
+            normal_n * soil.peak_friction_ratio
+            if soil.law == "magic"
+            else friction_limit(
+                normal_n, GEOMETRY[1] * contact_m, soil.cohesion_pa, math.tan(soil.friction_angle_rad)
+            )
+        )
+        assert math.hypot(thrust_n, side_n) <= limit_n * (1 + 1e-12)
+    else:
+        assert found == (0.0, 0.0, 0.0, 0.0)
+
+
+@given(
+    name=names,
+    normal_n=st.floats(-1e9, 1e9),
+    slip_x=st.floats(-1e200, 1e200),
+    slip_y=st.floats(-1e200, 1e200),
+    slip_sinkage=st.floats(0.0, 5.0),
+)
+@example(name="dry_sand", normal_n=5e-324, slip_x=5e-324, slip_y=-5e-324, slip_sinkage=5.0)
+def test_nothing_finite_makes_nan(name, normal_n, slip_x, slip_y, slip_sinkage):
+    soil = replace(load_soil(name), slip_sinkage_ratio=slip_sinkage)
+    assert np.isfinite(wheel_ground(ground_array(soil, *GEOMETRY), normal_n, slip_x, slip_y)).all()
+
+
+@given(name=names, slip=st.floats(1e-6, 1.0), angle_rad=st.floats(-math.pi, math.pi))
+def test_ground_is_isotropic(name, slip, angle_rad):
+    ground = ground_array(load_soil(name), *GEOMETRY)
+    ahead_n = wheel_ground(ground, NORMAL_N, slip, 0.0)[0]
+    turned = wheel_ground(ground, NORMAL_N, slip * math.cos(angle_rad), slip * math.sin(angle_rad))
+    np.testing.assert_allclose(
+        turned[:2], [ahead_n * math.cos(angle_rad), ahead_n * math.sin(angle_rad)], rtol=1e-9, atol=1e-9
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "low", "high"),
+    [
+        ("tiles", 0.0, 0.005),
+        ("asphalt", 0.0, 0.005),
+        ("snow", 0.01, 0.02),
+        ("clay", 0.05, 0.1),
+        ("grass", 0.116, 0.135),  # thesis 7.2.3
+        ("firm_soil_gravel", 0.122, 0.146),  # thesis 7.2.3
+        ("tilled_loam", 0.13, 0.2),
+        ("dry_sand", 0.15, 0.25),
+    ],
+)
+def test_steady_slip_on_level_ground(name, low, high):
+    soil = load_soil(name)
+    slip = equilibrium_slip(soil, NORMAL_N, 0.0, *GEOMETRY)
+    assert low < slip < high
+    assert net_pull(soil, NORMAL_N, np.array([slip]), *GEOMETRY)[0] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_a_start_slips_most_where_the_friction_limit_is_lowest():
+    tiles, grass, gravel = (
+        equilibrium_slip(load_soil(name), NORMAL_N, START_N, *GEOMETRY)
+        for name in ("tiles", "grass", "firm_soil_gravel")
+    )
+    assert tiles < grass < gravel
+    # thesis 7.2.3 saw peaks of 0.339 and 0.475
+    assert grass == pytest.approx(0.339, abs=0.03)
+    assert gravel == pytest.approx(0.475, abs=0.03)
+
+
+@pytest.mark.parametrize("name", soil_names())
+def test_no_run_is_stuck_on_level_ground(name):
+    soil = load_soil(name)
+    rng = np.random.default_rng(0)
+    steady = [equilibrium_slip(scattered(soil, rng), NORMAL_N, 0.0, *GEOMETRY) for _ in range(40)]
+    assert np.isfinite(steady).all()
+    assert max(steady) < 0.5
+
+
+@pytest.mark.parametrize("name", soil_names())
+def test_equilibrium_is_the_first_root_of_the_net_pull_on_both_sides(name):
+    soil = load_soil(name)
+    level_n = net_pull(soil, NORMAL_N, np.array([0.0]), *GEOMETRY)[0]
+    best_n = net_pull(soil, NORMAL_N, np.linspace(0, 1, 1001), *GEOMETRY).max()
+    for pull_n in (level_n - 20.0, level_n + 20.0, 0.9 * best_n):
+        slip = equilibrium_slip(soil, NORMAL_N, pull_n, *GEOMETRY)
+        assert (slip > 0) == (pull_n > level_n)
+        before = net_pull(soil, NORMAL_N, np.linspace(0, slip, 200)[:-1], *GEOMETRY)
+        assert ((before < pull_n) if slip > 0 else (before > pull_n)).all()
+    assert equilibrium_slip(soil, NORMAL_N, level_n, *GEOMETRY) == 0.0
+    assert math.isnan(equilibrium_slip(soil, NORMAL_N, best_n + 1.0, *GEOMETRY))
+    assert math.isnan(equilibrium_slip(soil, NORMAL_N, level_n - 1000.0, *GEOMETRY))
+    assert math.isnan(equilibrium_slip(soil, 0.0, 0.0, *GEOMETRY))
+
+
+def test_slip_sinkage_makes_sand_a_trap():
+    sand = load_soil("dry_sand")
+    sinking = replace(sand, slip_sinkage_ratio=1.0)
+    at = np.array([0.0, 0.3, 0.6])
+    loss_n = net_pull(sand, NORMAL_N, at, *GEOMETRY) - net_pull(sinking, NORMAL_N, at, *GEOMETRY)
+    assert loss_n[0] == 0.0
+    assert (np.diff(loss_n) > 0).all()
