@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from features.statistics import channel_correlations
-from terrain.logs.schema import UNIT_SYMBOLS, unit_of
+from terrain.logs.schema import UNIT_SYMBOLS, signal_set_of, unit_of
 from terrain.records import Array
 
 MIN_SPEED_MPS = 0.05
@@ -129,7 +129,14 @@ def speed_features(
     -------
     features, and their values (n_windows, n_features); none without wheel speeds
     """
-    wheel_stream = next((name for name in channels if rows_of(channels[name], "speed")), None)
+    wheel_stream = next(
+        (
+            stream
+            for stream, names in channels.items()
+            if any(signal_set_of(stream, name) == "wheels" for name in names)
+        ),
+        None,
+    )
     n = len(next(iter(values.values())))
     features: list[Feature] = []
     columns: list[Array] = []
@@ -155,6 +162,8 @@ def speed_features(
 
     for stream, names in channels.items():
         for i in rows_of(names, "gyro") + rows_of(names, "accel"):
+            if signal_set_of(stream, names[i]) != "imu":
+                continue
             unit = UNIT_SYMBOLS[unit_of(names[i])]
             features.append(
                 Feature(

@@ -26,9 +26,14 @@ from terrain.records import Array, Windows
 LEVEL_STATISTICS = frozenset({"mean", "min", "max", "q05", "q25", "median", "q75", "q95", "rms", "mean_abs"})
 """Statistics that move with the level of a signal."""
 
-LEFT_OUT = {"imu": frozenset({"mean", "median"}), "wheels": LEVEL_STATISTICS}
+LEFT_OUT = {
+    "imu": frozenset({"mean", "median"}),
+    "wheels": LEVEL_STATISTICS,
+    "driving": LEVEL_STATISTICS,
+}
 """Statistics that are made only when asked for.  Where an IMU channel sits is its mounting, its bias and the
-tilt of the ground on that day; the level of a wheel speed is how the robot was driven.  Neither is terrain.
+tilt of the ground on that day; the level of a speed, measured or estimated, is how the robot was driven.
+Neither is terrain.  ``driving``: speeds and yaw rates among the estimator's states.
 """
 
 
@@ -187,9 +192,11 @@ class FeatureExtractor(TransformerMixin, BaseEstimator):
         features, kept = [], np.zeros(table.shape[1:], dtype=bool)
         for i, name in enumerate(names):
             signal_set = signal_set_of(stream, name) or ""
+            driving = signal_set == "estimator" and name.startswith(("speed_", "yaw_"))
+            left_out = LEFT_OUT.get("driving" if driving else signal_set, frozenset())
             unit = UNIT_SYMBOLS[unit_of(name)]
             for j, (statistic, statistic_unit) in enumerate(columns):
-                if statistic in LEFT_OUT.get(signal_set, ()) and signal_set not in self.level_sets:
+                if statistic in left_out and signal_set not in self.level_sets:
                     continue
                 kept[i, j] = True
                 features.append(

@@ -7,6 +7,7 @@ switched on and off.
 
 from __future__ import annotations
 
+from terrain.constants import GRAVITY_MPS2
 from terrain.errors import LogError
 
 SCHEMA_VERSION = 1
@@ -38,7 +39,7 @@ UNIT_SCALES: dict[str, tuple[str, float]] = {
     "m/s": ("mps", 1.0),
     "km/h": ("mps", 1.0 / 3.6),
     "m/s^2": ("mps2", 1.0),
-    "g": ("mps2", 9.80665),
+    "g": ("mps2", GRAVITY_MPS2),
     "rad": ("rad", 1.0),
     "deg": ("rad", 0.017453292519943295),
     "rad/s": ("radps", 1.0),
@@ -55,7 +56,7 @@ UNIT_SCALES: dict[str, tuple[str, float]] = {
 }
 """Unit accepted in a mapping file: the SI unit word it becomes, and the factor.
 
-``g`` is standard gravity, 9.80665 m/s^2 (CGPM 1901)."""
+``g`` is standard gravity."""
 
 SIGNAL_SETS: tuple[str, ...] = ("imu", "wheels", "currents", "slip", "estimator")
 """Groups of signals that can be switched off by name."""

@@ -18,7 +18,7 @@ CHANNELS = {
     ),
     "wheels": ("speed_left_mps", "speed_right_mps", "current_left_a", "current_right_a"),
     "slip": ("slip_left_ratio", "slip_right_ratio"),
-    "estimator": ("track_width_m",),
+    "estimator": ("track_width_m", "speed_x_mps"),
 }
 RATE_HZ = {"imu": 100.0, "wheels": 6.5, "slip": 20.0, "estimator": 10.0}
 
@@ -88,10 +88,11 @@ def test_levels_that_are_no_terrain_are_left_out_unless_asked_for():
         f"{stream}.{channel}.{statistic}"
         for stream, channel in [
             *(("wheels", f"speed_{side}") for side in ("left", "right")),
+            ("estimator", "speed_x"),
             *(("imu", name.rpartition("_")[0]) for name in CHANNELS["imu"]),
             *(("imu", name) for name in ("gyro_norm", "accel_norm")),
         ]
-        for statistic in LEFT_OUT["wheels" if stream == "wheels" else "imu"]
+        for statistic in LEFT_OUT["imu" if stream == "imu" else "wheels"]
     }
     assert by_default < all_levels
 
