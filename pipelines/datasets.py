@@ -50,7 +50,8 @@ def load_runs(
     LogError
         if nothing readable is there, a run cannot be read, or two runs have one id.
     ConfigError
-        if the layout is unknown, the mapping is not accepted, or (to align) a robot is unknown.
+        if the layout is unknown, the mapping is not accepted, or a robot is unknown (to align, or to turn
+        motor rates into rim speeds).
     DataError
         if a run that is to be aligned has no gyro or no wheel speeds.
     """
@@ -72,7 +73,7 @@ def load_runs(
     for run_id, found in places.items():
         if len(found) > 1:
             raise LogError(f"{folder}: {len(found)} runs have the id {run_id!r} ({' and '.join(found)})")
-    runs.sort(key=lambda run: run.run_id)
+    runs = sorted(map(_with_rim_speeds, runs), key=lambda run: run.run_id)
     return [_aligned(run) for run in runs] if align else runs
 
 
@@ -146,6 +147,17 @@ def _some(readers: list[Callable[..., RunLog]], folder: Path) -> list[Callable[.
     if not readers:
         raise LogError(f"{folder}: holds no run; {ACCEPTED}")
     return readers
+
+
+def _with_rim_speeds(run: RunLog) -> RunLog:
+    """Add rim speeds where a log has motor rates, so that windows know how fast the robot drove."""
+    wheels = run.streams.get("wheels")
+    if wheels is None or not any(channel.startswith("motor_") for channel in wheels.channels):
+        return run
+    from terrain.kinematics.rim import with_rim_speeds
+    from terrain.robots import load_robot
+
+    return with_rim_speeds(run, load_robot(run.robot))
 
 
 def _aligned(run: RunLog) -> RunLog:

@@ -11,7 +11,7 @@ from terrain.robots import Robot
 def with_rim_speeds(run: RunLog, robot: Robot) -> RunLog:
     """Return a run whose stream ``wheels`` has rim speeds (``speed_1_mps``) beside its motor rates.
 
-    A run that has rim speeds already, or no motor rates, comes back as it is.
+    Rim speeds that are there already are made anew; a run without motor rates comes back as it is.
 
     Parameters
     ----------
@@ -34,12 +34,17 @@ def with_rim_speeds(run: RunLog, robot: Robot) -> RunLog:
     wheels = run.streams.get("wheels")
     motors = [f"motor_{wheel}_radps" for wheel in robot.wheels]
     rims = tuple(f"speed_{wheel}_mps" for wheel in robot.wheels)
-    if wheels is None or not set(motors) <= set(wheels.channels) or set(rims) <= set(wheels.channels):
+    if wheels is None or not set(motors) <= set(wheels.channels):
         return run
     robot.has("motors")
     assert robot.motors is not None
     rate = np.column_stack([wheels.channel(channel) for channel in motors])
     rim = rate / robot.motors.reduction_ratio * robot.wheel_radius_m
     streams = dict(run.streams)
-    streams["wheels"] = Stream(wheels.time_s, np.hstack([wheels.values, rim]), wheels.channels + rims)
+    kept = [i for i, channel in enumerate(wheels.channels) if channel not in rims]
+    streams["wheels"] = Stream(
+        wheels.time_s,
+        np.hstack([wheels.values[:, kept], rim]),
+        (*(wheels.channels[i] for i in kept), *rims),
+    )
     return RunLog(run.run_id, run.robot, streams, run.labels, run.source, run.dropped)

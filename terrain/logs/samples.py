@@ -74,6 +74,7 @@ def checked_stream(
     columns: Sequence[str] = (),
     repair: bool = False,
     dropped: Counter[str] | None = None,
+    unknown_is_a_value: bool = False,
 ) -> Stream:
     """Return the stream that the arrays hold, or say what is wrong with them.
 
@@ -87,6 +88,7 @@ def checked_stream(
     columns : c names of the columns in the file, for the message, where they are not the channels
     repair : drop and count what would otherwise be refused
     dropped : counts by kind, added to when repairing
+    unknown_is_a_value : a channel may hold nothing but NaN, as slip does that nobody could observe
 
     Raises
     ------
@@ -115,7 +117,9 @@ def checked_stream(
     if time_s.size < 2:
         raise LogError(f"{name}: has {time_s.size} usable rows of data, at least 2 are needed")
     dead = [
-        channel for channel, column in zip(channels, values.T, strict=True) if not np.isfinite(column).any()
+        channel
+        for channel, column in zip(channels, values.T, strict=True)
+        if not np.isfinite(column).any() and not unknown_is_a_value
     ]
     if dead and not repair:
         column = f" (column {columns[list(channels).index(dead[0])]})" if columns else ""

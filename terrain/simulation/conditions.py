@@ -1,0 +1,153 @@
+"""What differs from run to run on one terrain: load, slope, tyres, roughness."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from terrain.descriptions import read_yaml
+from terrain.errors import ConfigError
+from terrain.records import Array
+from terrain.resources import data_folder
+
+_ANY = (-math.inf, math.inf, "a finite number")
+_ABOVE_ZERO = (1e-6, math.inf, "a number above zero")
+_FROM_ZERO = (0.0, math.inf, "a number from zero up")
+_SLOPE = (-1.0, 1.0, "a gradient from -1 to 1")
+
+_RANGES: dict[str, tuple[float, float, str]] = {
+    "payload_kg": _FROM_ZERO,
+    "payload_m": _ANY,
+    "grade_ratio": _SLOPE,
+    "swell_ratio": _SLOPE,
+    "swell_length_m": _ABOVE_ZERO,
+    "radius_factors": _ABOVE_ZERO,
+    "roughness_factor": _FROM_ZERO,
+    "field_length_m": _ABOVE_ZERO,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Conditions:
+    """Conditions of one run; the defaults are a level, nominal day.
+
+    Parameters
+    ----------
+    payload_kg, payload_m : load, and where it lies (x, y) from the empty robot's centre of mass, body axes
+    grade_ratio : (2,) mean gradient of the ground along world x and y, uphill positive
+    swell_ratio, swell_length_m : a gradient along world x that comes and goes on the way; its wave length
+    radius_factors : (3,) true rolling radius of each wheel over the nominal one
+    roughness_factor : roughness over that of the soil's description
+    field_length_m : over which length the ground changes along the way
+
+    Raises
+    ------
+    ConfigError
+        if a number is not finite, a load or a roughness below zero, a length or a radius not above it, or the
+        ground steeper than 1 along an axis.
+    """
+
+    payload_kg: float = 0.0
+    payload_m: tuple[float, float] = (0.0, 0.0)
+    grade_ratio: tuple[float, float] = (0.0, 0.0)
+    swell_ratio: float = 0.0
+    swell_length_m: float = 15.0
+    radius_factors: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    roughness_factor: float = 1.0
+    field_length_m: float = 0.5
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            value = getattr(self, item.name)
+            low, high, wanted = _RANGES[item.name]
+            for number in value if isinstance(value, tuple) else (value,):
+                if not (math.isfinite(number) and low <= number <= high):
+                    raise ConfigError(f"conditions: {item.name} is {value!r}, {wanted} is wanted")
+
+
+@dataclass(frozen=True, slots=True)
+class Spread:
+    """How wide :class:`Conditions` scatter (``data/spread/field.yaml`` has the sources)."""
+
+    payload_max_kg: float
+    payload_offset_m: float
+    grade_std_ratio: float
+    swell_std_ratio: float
+    swell_length_m: float
+    radius_std_ratio: float
+    roughness_log_std_ratio: float
+    field_length_m: float
+
+
+def load_spread() -> Spread:
+    """Return the spread that travels with the package.
+
+    Examples
+    --------
+    >>> load_spread().grade_std_ratio
+    0.035
+    """
+    described = read_yaml(data_folder("spread") / "field.yaml")
+    return Spread(**{item.name: float(described[item.name]["value"]) for item in fields(Spread)})
+
+
+def draw_conditions(
+    spread: Spread, rng: np.random.Generator, nominal: Conditions | None = None
+) -> Conditions:
+    """Return the conditions of one run, drawn around the nominal ones.
+
+    Normal draws are cut at two standard deviations, so that no run is impossible.  Lengths are the spread's.
+    """
+    nominal = Conditions() if nominal is None else nominal
+
+    def normal(std: float, n: int) -> Array:
+        return std * np.clip(rng.standard_normal(n), -2.0, 2.0)
+
+    grade = np.array(nominal.grade_ratio) + normal(spread.grade_std_ratio, 2)
+    radius = np.array(nominal.radius_factors) * (1.0 + normal(spread.radius_std_ratio, 3))
+    offset = np.array(nominal.payload_m) + rng.uniform(-spread.payload_offset_m, spread.payload_offset_m, 2)
+    return Conditions(
+        payload_kg=nominal.payload_kg + float(rng.uniform(0.0, spread.payload_max_kg)),
+        payload_m=(float(offset[0]), float(offset[1])),
+        grade_ratio=(float(grade[0]), float(grade[1])),
+        swell_ratio=nominal.swell_ratio + float(normal(spread.swell_std_ratio, 1)[0]),
+        swell_length_m=spread.swell_length_m,
+        radius_factors=(float(radius[0]), float(radius[1]), float(radius[2])),
+        roughness_factor=nominal.roughness_factor
+        * float(np.exp(normal(spread.roughness_log_std_ratio, 1)[0])),
+        field_length_m=spread.field_length_m,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Faults:
+    """What goes wrong with the sensors on purpose, beside what they do by themselves.
+
+    Parameters
+    ----------
+    camera_lost_s, gnss_lost_s : intervals (start, end) without a sample
+    by_chance : dropouts and jumps of the camera at the rates of its description
+
+    Raises
+    ------
+    ConfigError
+        if an interval does not end after it starts.
+    """
+
+    camera_lost_s: tuple[tuple[float, float], ...] = ()
+    gnss_lost_s: tuple[tuple[float, float], ...] = ()
+    by_chance: bool = True
+
+    def __post_init__(self) -> None:
+        for name in ("camera_lost_s", "gnss_lost_s"):
+            for start_s, end_s in getattr(self, name):
+                if not start_s < end_s:
+                    raise ConfigError(
+                        f"faults: {name} has ({start_s!r}, {end_s!r}), start before end is wanted"
+                    )
+
+
+NO_FAULTS: Faults = Faults()
+"""Nothing on purpose."""

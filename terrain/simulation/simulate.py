@@ -1,0 +1,210 @@
+"""One simulated run: a robot, a scenario and its ground in, an ordinary run log with its truth out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from itertools import pairwise
+
+import numpy as np
+from scipy.signal import lfilter
+
+from terrain.errors import ConfigError
+from terrain.kinematics.swerve import wheel_commands
+from terrain.records import Array, Label, RunLog, Stream
+from terrain.robots import Robot
+from terrain.simulation.conditions import NO_FAULTS, Conditions, Faults
+from terrain.simulation.scenario import Scenario
+from terrain.simulation.sensors import (
+    Gnss,
+    Motion,
+    camera_stream,
+    gnss_stream,
+    imu_stream,
+    steering_stream,
+    truth_stream,
+    wheels_stream,
+)
+from terrain.simulation.vehicle import (
+    FIELD_STEP_M,
+    N_RECORD,
+    STEP_S,
+    Plant,
+    advance,
+    make_plant,
+    settle,
+    start_state,
+)
+from terrain.terramechanics.soil import Soil
+from terrain.terramechanics.traction import ground_array
+
+MIN_LABEL_S = 0.5
+"""A shorter stay on one ground gets no label."""
+
+COMMAND_CHANNELS = (
+    "speed_x_mps",
+    "speed_y_mps",
+    "yaw_rate_radps",
+    *(f"wheel_{i}_radps" for i in (1, 2, 3)),
+    *(f"steer_{i}_rad" for i in (1, 2, 3)),
+)
+"""The admitted twist of the body, and what it asks of the wheels."""
+
+
+def simulate(
+    robot: Robot,
+    scenario: Scenario,
+    soils: Mapping[str, Soil],
+    seed: int | np.random.SeedSequence,
+    *,
+    run_id: str = "run",
+    conditions: Conditions | None = None,
+    faults: Faults = NO_FAULTS,
+    gnss: Gnss | None = None,
+) -> RunLog:
+    """Drive a scenario and return what the loggers wrote, with the truth beside it.
+
+    Parameters
+    ----------
+    robot : swerve robot with all sections
+    scenario : what is driven, and on which ground
+    soils : by the terrain names of the scenario
+    seed : of everything that is drawn; the same seed gives the same log, and a sequence is left as it is
+    run_id : name of the run
+    conditions : load, slope, tyres, roughness; a level, nominal day by default
+    faults : what the sensors suffer on purpose
+    gnss : receiver on board, if any
+
+    Returns
+    -------
+    RunLog
+        streams wheels, steering, imu, odometry, commands, truth, and gnss where there is a receiver; what was
+        lost throughout is no stream.  A label for each stretch in which all wheels are on one ground.
+
+    Raises
+    ------
+    ConfigError
+        if the robot is no swerve robot, lacks a section or is tipped over by its load, a terrain of the
+        scenario has no soil, or its twists do not come every so many whole steps.
+
+    Examples
+    --------
+    >>> from terrain.robots import load_robot
+    >>> from terrain.simulation.scenario import make_scenario
+    >>> from terrain.terramechanics.soil import load_soil
+    >>> robot = load_robot("agrimaro")
+    >>> drive = make_scenario("straight", robot, ["grass"], 5.0)
+    >>> run = simulate(robot, drive, {"grass": load_soil("grass")}, seed=0)
+    >>> sorted(run.streams), run.terrains
+    (['commands', 'imu', 'odometry', 'steering', 'truth', 'wheels'], ('grass',))
+    """
+    if robot.drive != "swerve":
+        raise ConfigError(f"robot {robot.name}: drive {robot.drive!r} is not simulated, only 'swerve' is")
+    conditions = Conditions() if conditions is None else conditions
+    substeps = round(1 / (scenario.rate_hz * STEP_S))
+    if abs(substeps * scenario.rate_hz * STEP_S - 1.0) > 1e-9:
+        raise ConfigError(
+            f"scenario {scenario.name}: rate_hz is {scenario.rate_hz:g}, it must divide {1 / STEP_S:g}"
+        )
+    sequence = seed if isinstance(seed, np.random.SeedSequence) else np.random.SeedSequence(seed)
+    # One generator a purpose: a sensor more or less changes nothing about the others.
+    ground, road, start, wheels, steering, imu, camera, receiver = (
+        np.random.default_rng(np.random.SeedSequence(sequence.entropy, spawn_key=(*sequence.spawn_key, i)))
+        for i in range(8)
+    )
+    admitted, wheel_radps, steer_rad = _commands(robot, scenario)
+    plant = _plant(robot, scenario, soils, conditions, ground)
+    n_steps = len(scenario.time_s) * substeps
+    state = start_state(plant, plant.play_rad * start.uniform(-1.0, 1.0, 3))
+    settle(plant, state)
+    record = np.empty((n_steps, N_RECORD))
+    advance(plant, state, wheel_radps, steer_rad, substeps, road.standard_normal((n_steps, 3)), record)
+    motion = Motion(record)
+    imu_log, gyro_bias = imu_stream(motion, robot, imu)
+    streams = {
+        "wheels": wheels_stream(motion, robot, wheels),
+        "steering": steering_stream(motion, robot, steering),
+        "imu": imu_log,
+        "odometry": camera_stream(motion, robot, camera, faults),
+    }
+    if gnss is not None:
+        streams["gnss"] = gnss_stream(motion, gnss, receiver, faults)
+    streams["commands"] = Stream(
+        scenario.time_s, np.hstack([admitted, wheel_radps, steer_rad]), COMMAND_CHANNELS
+    )
+    streams["truth"] = truth_stream(motion, gyro_bias, imu_log.time_s)
+    streams = {name: stream for name, stream in streams.items() if len(stream) > 1}
+    return RunLog(
+        run_id, robot.name, streams, _labels(motion, scenario), source=f"simulated, {scenario.name}"
+    )
+
+
+def _commands(robot: Robot, scenario: Scenario) -> tuple[Array, Array, Array]:
+    _, motors, steering, _, _ = robot.equipment
+    return wheel_commands(
+        robot.wheel_positions_m,
+        robot.wheel_radius_m,
+        motors.speed_max_radps,
+        steering.rate_max_radps,
+        1 / scenario.rate_hz,
+        scenario.twist,
+        np.zeros(3),
+    )
+
+
+def _plant(
+    robot: Robot,
+    scenario: Scenario,
+    soils: Mapping[str, Soil],
+    conditions: Conditions,
+    rng: np.random.Generator,
+) -> Plant:
+    body, motors = robot.equipment.body, robot.equipment.motors
+    for patch in scenario.patches:
+        if patch.terrain not in soils:
+            raise ConfigError(f"scenario {scenario.name}: terrain {patch.terrain!r} has no soil")
+    on = [soils[patch.terrain] for patch in scenario.patches]
+    starts_m = np.array([patch.start_m for patch in scenario.patches])
+    farthest_m = 2.0 * robot.wheel_radius_m * motors.speed_max_radps * scenario.time_s[-1]
+    n_cells = math.ceil(farthest_m / FIELD_STEP_M) + 1
+    keep = math.exp(-FIELD_STEP_M / conditions.field_length_m)
+    white = rng.standard_normal((2, 3, n_cells))
+    white[:, :, 1:] *= math.sqrt(1.0 - keep**2)
+    unit = lfilter([1.0], [1.0, -keep], white, axis=2)
+    patch_of_cell = np.searchsorted(starts_m, np.arange(n_cells) * FIELD_STEP_M, side="right") - 1
+    spread = np.array([[soil.thrust_field_ratio, soil.resistance_field_ratio] for soil in on])[
+        patch_of_cell
+    ].T
+    field = np.exp(spread[:, None, :] * unit - 0.5 * spread[:, None, :] ** 2)
+    return make_plant(
+        robot,
+        payload_kg=conditions.payload_kg,
+        payload_m=conditions.payload_m,
+        radius_factors=np.array(conditions.radius_factors),
+        grade_ratio=conditions.grade_ratio,
+        swell_ratio=conditions.swell_ratio,
+        swell_length_m=conditions.swell_length_m,
+        grounds=np.array(
+            [
+                ground_array(soil, robot.wheel_radius_m, body.tyre_width_m, body.contact_length_m)
+                for soil in on
+            ]
+        ),
+        roughness_m3=np.array([soil.roughness_m3 * conditions.roughness_factor for soil in on]),
+        patch_start_m=starts_m,
+        field=field,
+    )
+
+
+def _labels(motion: Motion, scenario: Scenario) -> tuple[Label, ...]:
+    """One label a stretch in which all three wheels are on the same ground."""
+    patch = motion.wheel("patch_ratio")
+    one = np.where((patch == patch[:, :1]).all(axis=1), patch[:, 0], -1)
+    edges = np.concatenate([[0], np.flatnonzero(np.diff(one)) + 1, [len(one)]])
+    labels: list[Label] = []
+    for begin, end in pairwise(edges):
+        start_s, end_s = float(begin * STEP_S), float(end * STEP_S)
+        if one[begin] < 0 or end_s - start_s < MIN_LABEL_S:
+            continue
+        labels.append(Label(round(start_s, 3), round(end_s, 3), scenario.patches[int(one[begin])].terrain))
+    return tuple(labels)

@@ -1,0 +1,305 @@
+"""Slip of wheels: the ratio and the angle, from speeds and from what a filter believes.
+
+With the rim speed ``w r`` and the speed v of the wheel's centre along the wheel (Danzi, AgriMaRo thesis,
+(7.3) to (7.7))::
+
+    v = (v_x - g' y_i) cos d_i + (v_y + g' x_i) sin d_i
+    s = (w r - v) / max(|w r|, |v|)
+
+(7.1) and (7.2), the two regimes of the SAE, are this for v > 0 only; the larger absolute value is safe
+everywhere.  The sign of s is that of the slip speed **along the wheel's own x axis**: positive in traction
+and negative in braking where the wheel rolls forward, and the reverse where it rolls backward, be it that the
+robot backs or that its steering stands beyond 90 degrees.  ``s * sign(v)`` is positive in traction whichever
+way it rolls.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from terrain.errors import ConfigError, DataError
+from terrain.estimation.measurements import MeasurementTable
+from terrain.records import Array, SlipTrack, StateTrack, read_only
+from terrain.robots import Robot
+
+MIN_SPEED_MPS = 0.05
+"""With rim and ground both slower the slip is noise over noise (thesis 7.2.1)."""
+
+STALE_AFTER_S = 0.15
+"""Age of the last speed over ground beyond which slip counts as stale: one and a half periods of GNSS, at 10
+Hz the slowest sensor of it, so that no sound one is called so; a 1 m/s^2 start gains 0.15 m/s unseen."""
+
+STEADY_SPEED_MPS = 0.2
+"""Slower, 1 cm/s of error in the speed is over 5 % of slip."""
+
+STEADY_CHANGE_MPS = 0.1
+"""Largest change of speed over :data:`STEADY_BEFORE_S` that counts as none: 0.1 m/s^2 asks for a hundredth of
+the weight in traction, little beside what rolling on soft ground does."""
+
+STEADY_BEFORE_S, STEADY_AFTER_S = 1.0, 0.25
+"""How long the speed has to have been steady, for transients to have died out, and how long it has to remain
+so, for the start of a braking not to count before it shows."""
+
+
+def slip_ratio(
+    rim_speed_mps: Any,
+    ground_speed_mps: Any,
+    min_speed_mps: float = MIN_SPEED_MPS,
+    stationary: float = float("nan"),
+) -> Array:
+    """Return the slip ratio, positive in traction of a wheel that rolls forward; within [-1, 1].
+
+    Parameters
+    ----------
+    rim_speed_mps, ground_speed_mps : of a wheel's rim and of its centre along it; they broadcast
+    min_speed_mps : with both slower the wheel is stationary
+    stationary : slip of a stationary wheel: NaN in analysis, where it has none; 0 for a controller (7.2.1)
+
+    Raises
+    ------
+    ConfigError
+        if the least speed is not above zero.
+
+    Notes
+    -----
+    (7.7), clipped: a wheel that turns against its way would come out at up to 2.  Where one speed is unknown
+    the slip is NaN, stationary or not.
+
+    Examples
+    --------
+    >>> slip_ratio([1.0, 0.8, -1.0, 1.0, 0.01], [0.8, 1.0, -0.8, -0.5, 0.0])
+    array([ 0.2, -0.2, -0.2,  1. ,  nan])
+    """
+    if not 0 < min_speed_mps < np.inf:
+        raise ConfigError(f"min_speed_mps is {min_speed_mps:g}, a speed above zero is wanted")
+    rim, ground = np.broadcast_arrays(*(np.asarray(v, float) for v in (rim_speed_mps, ground_speed_mps)))
+    fastest = np.maximum(np.abs(rim), np.abs(ground))
+    known = np.isfinite(fastest)
+    slip = np.where(known & (fastest < min_speed_mps), stationary, np.nan)
+    moving = known & (fastest >= min_speed_mps)
+    np.divide(rim - ground, fastest, out=slip, where=moving)
+    return np.clip(slip, -1.0, 1.0)
+
+
+def slip_angle(forward_mps: Any, left_mps: Any, min_speed_mps: float = MIN_SPEED_MPS) -> Array:
+    """Return the angle in rad from a wheel's plane to where its centre goes; positive to the wheel's left.
+
+    Parameters
+    ----------
+    forward_mps, left_mps : velocity of the wheel's centre in the wheel's axes, arrays that broadcast
+    min_speed_mps : NaN when the centre is slower
+
+    Notes
+    -----
+    ``atan2(v_y, |v_x|)``: within a quarter turn; the ground's side force opposes it whichever way it rolls.
+
+    Examples
+    --------
+    >>> slip_angle([1.0, -1.0, 0.0], [0.1, 0.1, -0.02]).round(4)
+    array([0.0997, 0.0997,    nan])
+    """
+    forward, left = np.broadcast_arrays(*(np.asarray(v, float) for v in (forward_mps, left_mps)))
+    moving = np.hypot(forward, left) >= min_speed_mps
+    return np.where(moving, np.arctan2(left, np.abs(forward)), np.nan)
+
+
+def wheel_slip(
+    track: StateTrack, table: MeasurementTable, robot: Robot, rim_std_mps: float | None = None
+) -> SlipTrack:
+    """Return the slip of each wheel by what a filter believes; NaN unless it measured the speed over ground.
+
+    Parameters
+    ----------
+    track : of any filter with the states ``speed_x_mps`` (or ``speed_mps``) and ``yaw_rate_radps``, and
+        ``speed_y_mps`` and ``steer_<i>_rad`` where the robot can have them
+    table : what the filter measured, on the same clock
+    robot : places and radius of the wheels
+    rim_std_mps : standard deviation of a rim speed; by default that of the robot's file, unknown without
+
+    Raises
+    ------
+    DataError
+        if the clocks differ, or a state or a row is missing.
+
+    Notes
+    -----
+    A filter with slip speeds l_i among its states (``slip_speed_<i>_mps``) gives
+    ``s = l / max(|v + l|, |v|)`` from the state alone.  It goes on when the speed over ground is not measured
+    for a while, ``stale`` and with the growing uncertainty of its state.  For any other the rim speed is the
+    encoders' own, no filter's (thesis 7.2); its slip falls to 0 of itself as soon as only the wheels hold the
+    speed: NaN where stale.
+
+    ``slip_std`` is to first order ``sqrt(g P g')`` with the state's whole covariance, and the rim speed's
+    variance added where that is not in the state.
+    """
+    slip = _slip(track, table, robot, rim_std_mps)
+    unseen = np.isinf(track.reference_age_s)
+    if not _has_slip_speed(track, robot):
+        unseen = unseen | slip.stale
+    ratio, std = (np.where(unseen[:, None], np.nan, v) for v in (slip.slip_ratio, slip.slip_std))
+    return SlipTrack(slip.time_s, ratio, std, slip.wheels, slip.stale)
+
+
+def blind_slip(track: StateTrack, table: MeasurementTable, robot: Robot) -> SlipTrack:
+    """Return the slip by encoders and a filter's speed, whether or not it ever measured that over ground.
+
+    For showing what a filter without such a sensor is blind to: it takes the wheels' speed for the robot's,
+    and the figure is close to 0 on any ground (thesis 4.6).  :func:`wheel_slip`, for use, gives NaN there.
+    """
+    return _slip(track, table, robot, None, from_encoders=True)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SlipFigures:
+    """Slip of a run in a few figures, all ratios; NaN where there was nothing to take them from.
+
+    Parameters
+    ----------
+    steady : (n,) where the robot drove steadily
+    steady_s : for how long
+    steady_mean, steady_std : over all wheels then
+    peak : largest absolute slip of any wheel while the robot moved and not steadily
+    wheel_mean, wheel_std, wheel_peak : (wheels,) the same of each wheel
+    """
+
+    steady: Array
+    steady_s: float
+    steady_mean: float
+    steady_std: float
+    peak: float
+    wheel_mean: Array
+    wheel_std: Array
+    wheel_peak: Array
+
+
+def slip_figures(slip: SlipTrack, speed_mps: Array, time_s: Array) -> SlipFigures:
+    """Return the figures of a run: steady slip, and the peak of its transients.
+
+    Parameters
+    ----------
+    slip : of a filter; stale samples count as long as they are no NaN
+    speed_mps, time_s : (k,) speed of the robot, on any clock
+
+    Notes
+    -----
+    Steady is faster than :data:`STEADY_SPEED_MPS`, with a speed that stays within :data:`STEADY_CHANGE_MPS`
+    from :data:`STEADY_BEFORE_S` before to :data:`STEADY_AFTER_S` after.
+    """
+    known = np.isfinite(speed_mps)
+    speed = np.full(slip.time_s.size, np.nan)
+    if known.any():
+        speed = np.abs(np.interp(slip.time_s, time_s[known], speed_mps[known], left=np.nan, right=np.nan))
+    first = np.searchsorted(slip.time_s, slip.time_s - STEADY_BEFORE_S - 1e-9)
+    last = np.searchsorted(slip.time_s, slip.time_s + STEADY_AFTER_S + 1e-9)
+    change = np.array([np.ptp(speed[a:b]) for a, b in zip(first, last, strict=True)])
+    started = slip.time_s - slip.time_s[:1] >= STEADY_BEFORE_S - 1e-9
+    moving = speed > STEADY_SPEED_MPS
+    steady = moving & started & (change < STEADY_CHANGE_MPS)
+    calm, wild = slip.slip_ratio[steady], np.abs(slip.slip_ratio[moving & ~steady])
+    wheel_peak = np.array([_of_known(np.max, wheel) for wheel in wild.T])
+    return SlipFigures(
+        steady=read_only(steady, np.bool_),
+        steady_s=float(np.diff(slip.time_s, append=slip.time_s[-1:])[steady].sum()),
+        steady_mean=_of_known(np.mean, calm),
+        steady_std=_of_known(np.std, calm),
+        peak=_of_known(np.max, wheel_peak),
+        wheel_mean=read_only([_of_known(np.mean, wheel) for wheel in calm.T]),
+        wheel_std=read_only([_of_known(np.std, wheel) for wheel in calm.T]),
+        wheel_peak=read_only(wheel_peak),
+    )
+
+
+def _of_known(statistic: Callable[[Array], Any], slip: Array) -> float:
+    known = slip[np.isfinite(slip)]
+    return float(statistic(known)) if known.size else float("nan")
+
+
+def _has_slip_speed(track: StateTrack, robot: Robot) -> bool:
+    return f"slip_speed_{robot.wheels[0]}_mps" in track.states
+
+
+def _slip(
+    track: StateTrack,
+    table: MeasurementTable,
+    robot: Robot,
+    rim_std_mps: float | None,
+    from_encoders: bool = False,
+) -> SlipTrack:
+    """Slip and its standard deviation, measured over ground or not."""
+    if not np.array_equal(track.time_s, table.time_s):
+        raise DataError("the track and the measurements are not on one clock: filter this table")
+    in_state = _has_slip_speed(track, robot) and not from_encoders
+    ratio, std = np.full((2, track.time_s.size, len(robot.wheels)), np.nan)
+    for i, wheel in enumerate(robot.wheels):
+        ground, d_ground = _ground_speed(track, robot, i)
+        if in_state:
+            slip_speed = _state(track, f"slip_speed_{wheel}_mps")
+            rim, d_rim, rim_variance = ground + slip_speed, d_ground.copy(), 0.0
+            d_rim[:, track.states.index(f"slip_speed_{wheel}_mps")] += 1.0
+        else:
+            rim, d_rim = _rim_speed(table, robot, wheel), np.zeros_like(d_ground)
+            rim_variance = (_rim_std_mps(robot) if rim_std_mps is None else rim_std_mps) ** 2
+        ratio[:, i] = slip_ratio(rim, ground)
+        by_rim, by_ground = _slopes(rim, ground)
+        gradient = by_rim[:, None] * d_rim + by_ground[:, None] * d_ground
+        variance = np.einsum("ni,nij,nj->n", gradient, track.cov, gradient) + by_rim**2 * rim_variance
+        std[:, i] = np.sqrt(np.maximum(variance, 0.0))
+    return SlipTrack(track.time_s, ratio, std, robot.wheels, track.reference_age_s > STALE_AFTER_S)
+
+
+def _state(track: StateTrack, name: str) -> Array:
+    if name not in track.states:
+        raise DataError(f"the track has no state {name!r}, only {', '.join(track.states)}")
+    return track.state(name)
+
+
+def _ground_speed(track: StateTrack, robot: Robot, wheel: int) -> tuple[Array, Array]:
+    """Return the speed (n,) of a wheel's centre along it, (7.3)-(7.5), and its slopes (n, d) by the state."""
+    x, y = robot.wheel_positions_m[wheel]
+    speed_name = "speed_mps" if "speed_mps" in track.states else "speed_x_mps"
+    steer_name = f"steer_{robot.wheels[wheel]}_rad"
+    zero = np.zeros(track.time_s.size)
+    across, steer = zero, zero  # what a robot without steered wheels cannot have
+    if robot.drive == "swerve":
+        across, steer = _state(track, "speed_y_mps"), _state(track, steer_name)
+    turn = _state(track, "yaw_rate_radps")
+    ahead, left = _state(track, speed_name) - turn * y, across + turn * x
+    cos, sin = np.cos(steer), np.sin(steer)
+    slopes = {
+        speed_name: cos,
+        "speed_y_mps": sin,
+        "yaw_rate_radps": x * sin - y * cos,
+        steer_name: left * cos - ahead * sin,
+    }
+    gradient = np.zeros((track.time_s.size, len(track.states)))
+    for name, slope in slopes.items():
+        if name in track.states:
+            gradient[:, track.states.index(name)] = slope
+    return ahead * cos + left * sin, gradient
+
+
+def _slopes(rim: Array, ground: Array) -> tuple[Array, Array]:
+    """Return the derivatives of the slip ratio by the rim speed and by the speed over ground."""
+    traction = np.abs(rim) >= np.abs(ground)
+    fastest = np.where(traction, rim, ground)
+    fastest = np.where(np.abs(fastest) < MIN_SPEED_MPS, np.nan, fastest)
+    sign = np.sign(fastest)
+    by_rim = np.where(traction, sign * ground / fastest**2, 1.0 / np.abs(fastest))
+    by_ground = np.where(traction, -1.0 / np.abs(fastest), -sign * rim / fastest**2)
+    return by_rim, by_ground
+
+
+def _rim_speed(table: MeasurementTable, robot: Robot, wheel: str) -> Array:
+    if robot.drive == "swerve":
+        return table.columns([f"wheel_{wheel}_radps"])[:, 0] * robot.wheel_radius_m
+    return table.columns([f"wheel_{wheel}_mps"])[:, 0]
+
+
+def _rim_std_mps(robot: Robot) -> float:
+    if robot.sensors is None or robot.motors is None:
+        return float("nan")
+    return robot.sensors.motor_std_radps / robot.motors.reduction_ratio * robot.wheel_radius_m

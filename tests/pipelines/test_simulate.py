@@ -1,0 +1,116 @@
+import json
+
+import numpy as np
+import pytest
+
+from pipelines.simulate import simulate_run, simulate_runs
+from terrain.errors import ConfigError, LogError
+from terrain.logs.read import find_runs, read_run
+from terrain.robots import load_robot
+from terrain.simulation.conditions import Conditions, Faults
+from terrain.simulation.sensors import Gnss
+from terrain.terramechanics.soil import soil_names
+
+ROBOT = load_robot("agrimaro")
+
+
+def bytes_of(folder):
+    return {file.name: file.read_bytes() for file in folder.iterdir()}
+
+
+def values_of(run):
+    return {name: stream.values.tobytes() for name, stream in run.streams.items()}
+
+
+def test_a_run_is_the_same_whatever_is_simulated_beside_it(tmp_path):
+    alone = simulate_runs(
+        "agrimaro", "grass", "straight", tmp_path / "alone", runs=1, duration_s=4.0, vary=True
+    )
+    beside = simulate_runs("agrimaro", "all", "straight", tmp_path / "all", runs=2, duration_s=4.0, vary=True)
+    assert alone["run_ids"] == ["grass_straight_01"]
+    assert beside["n_runs"] == 2 * len(soil_names()) == len(set(beside["run_ids"]))
+    assert bytes_of(tmp_path / "alone" / "grass_straight_01") == bytes_of(
+        tmp_path / "all" / "grass_straight_01"
+    )
+    run = simulate_run(ROBOT, "grass", "straight", 0, 2, duration_s=4.0, vary=True)
+    assert values_of(run) == values_of(read_run(tmp_path / "all" / "grass_straight_02"))
+    assert {read().terrains for read in find_runs(tmp_path / "all")} == {(name,) for name in soil_names()}
+    assert json.loads(json.dumps(beside)) == beside
+    assert beside["duration_s"] == pytest.approx(16 * 4.01, abs=0.01)
+
+
+def test_runs_differ_by_number_seed_and_terrain_and_more_so_where_they_vary():
+    def slip(number=1, seed=0, terrain="grass", vary=False):
+        truth = simulate_run(ROBOT, terrain, "straight", seed, number, duration_s=6.0, vary=vary).streams[
+            "truth"
+        ]
+        slips = np.column_stack([truth.channel(f"slip_{i}_ratio") for i in (1, 2, 3)])
+        return slips[truth.time_s > 3.0].mean()
+
+    nominal = [slip(number) for number in range(1, 7)]
+    varied = [slip(number, vary=True) for number in range(1, 7)]
+    assert len({*nominal, slip(seed=1), slip(terrain="clay")}) == 8
+    assert np.std(varied) > 5 * np.std(nominal)
+
+
+def test_options_reach_the_run():
+    given = {"duration_s": 10.0, "conditions": Conditions(grade_ratio=(0.1, 0.0)), "gnss": Gnss()}
+    run = simulate_run(ROBOT, "tiles", "survey", 3, faults=Faults(camera_lost_s=((2.0, 4.0),)), **given)
+    odometry = run.streams["odometry"]
+    assert run.streams["truth"].time_s[-1] == pytest.approx(10.01)
+    assert not ((odometry.time_s >= 2.0) & (odometry.time_s < 4.0)).any()
+    assert "gnss" in run.streams
+    assert run.streams["imu"].channel("accel_x_mps2")[:50].mean() == pytest.approx(0.976, abs=0.1)
+    drawn = simulate_run(ROBOT, "tiles", "survey", 3, vary=True, **given)
+    assert drawn.streams["imu"].channel("accel_x_mps2")[:50].mean() == pytest.approx(0.976, abs=0.8)
+
+
+def test_a_course_goes_over_all_grounds(tmp_path):
+    result = simulate_runs("agrimaro", "course", "course", tmp_path, duration_s=30.0)
+    assert result["run_ids"] == ["course_01"]
+    run = read_run(tmp_path / "course_01")
+    assert len(run.terrains) >= 2
+    assert set(run.terrains) <= set(soil_names())
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"robot_name": "husky"}, "husky"),
+        ({"robot_name": "nobody"}, "robot 'nobody' is unknown"),
+        ({"terrain": "lava"}, "soil 'lava' is unknown"),
+        ({"scenario": "dance"}, "scenario 'dance' is unknown"),
+        ({"terrain": "course"}, "go together"),
+        ({"scenario": "course"}, "go together"),
+        ({"terrain": "all", "scenario": "course"}, "go together"),
+        ({"duration_s": 0.5}, "duration_s is 0.5, too short"),
+        ({"duration_s": float("nan")}, "duration_s is nan"),
+        ({"conditions": Conditions(payload_kg=500.0, payload_m=(0.0, 0.7))}, "tips it over"),
+    ],
+)
+def test_what_is_not_accepted_is_refused_and_nothing_is_written(tmp_path, options, message):
+    given = {"robot_name": "agrimaro", "terrain": "grass", "scenario": "straight", "out": tmp_path / "runs"}
+    with pytest.raises(ConfigError, match=message):
+        simulate_runs(**given | options)
+    assert not (tmp_path / "runs").exists()
+
+
+def test_a_run_that_is_there_is_left_alone_and_nothing_else_is_written(tmp_path):
+    (tmp_path / "grass_straight_02").mkdir()
+    with pytest.raises(LogError, match="grass_straight_02: is there already"):
+        simulate_runs("agrimaro", "grass", "straight", tmp_path, runs=3, duration_s=4.0)
+    assert [path.name for path in tmp_path.iterdir()] == ["grass_straight_02"]
+
+
+def test_progress_counts_the_runs(tmp_path):
+    told = []
+    simulate_runs(
+        "agrimaro",
+        "snow",
+        "stand",
+        tmp_path,
+        runs=2,
+        duration_s=1.0,
+        progress=lambda *args: told.append(args),
+    )
+    assert told == [("simulate", 1, 2), ("simulate", 2, 2)]

@@ -1,0 +1,437 @@
+"""The motions are made by hand: what a sensor says is held against what is known to have happened."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2, poisson
+
+from terrain.estimation.camera import body_motion
+from terrain.robots import load_robot
+from terrain.simulation.conditions import NO_FAULTS, Faults
+from terrain.simulation.sensors import (
+    IMU_BANDWIDTH_HZ,
+    TILT_NOISE_RAD,
+    Gnss,
+    Motion,
+    camera_stream,
+    gnss_stream,
+    imu_stream,
+    steering_stream,
+    truth_stream,
+    wheels_stream,
+)
+from terrain.simulation.vehicle import (
+    BODY_RECORD,
+    GRAVITY_MPS2,
+    N_BODY_RECORD,
+    N_RECORD,
+    STEP_S,
+    WHEEL_RECORD,
+)
+
+ROBOT = load_robot("agrimaro")
+QUIET = Faults(by_chance=False)
+G = GRAVITY_MPS2
+
+
+def with_changes(section, **changes):
+    return dataclasses.replace(ROBOT, **{section: dataclasses.replace(getattr(ROBOT, section), **changes)})
+
+
+def silenced(section):
+    """Return the robot with all noise, scatter and drift of a section at 0."""
+    part = getattr(ROBOT, section)
+    names = [item.name for item in dataclasses.fields(part)]
+    return with_changes(section, **{name: 0.0 for name in names if "_std_" in name or "_walk_" in name})
+
+
+SILENT_IMU, SILENT_CAMERA = silenced("sensors"), silenced("camera")
+
+
+def motion_of(duration_s, **columns):
+    """Return a motion that is 0 but for the columns given: numbers, (n,) or, for wheels, (n, 3) arrays."""
+    record = np.zeros((round(duration_s / STEP_S), N_RECORD))
+    for name, values in columns.items():
+        if name in BODY_RECORD:
+            record[:, BODY_RECORD.index(name)] = values
+        else:
+            first = N_BODY_RECORD + WHEEL_RECORD.index(name)
+            record[:, first :: len(WHEEL_RECORD)] = values
+    return Motion(record)
+
+
+def clock(duration_s):
+    return np.arange(round(duration_s / STEP_S)) * STEP_S
+
+
+def assert_std(values, std, centre=None):
+    """Noise (n, ...) is of the std put in, to one in 1e5 a channel, and of the mean put in."""
+    values = np.atleast_2d(np.asarray(values).T).T
+    n = len(values)
+    low, high = np.sqrt(chi2.ppf([1e-5, 1 - 1e-5], n - 1) / (n - 1))
+    ratio = values.std(axis=0, ddof=1) / std
+    assert ((ratio > low) & (ratio < high)).all(), ratio
+    if centre is not None:
+        assert (np.abs(values.mean(axis=0) - centre) < 4.5 * np.asarray(std) / math.sqrt(n)).all()
+
+
+def delay_s(time_s, values, frequency_hz):
+    """Return by how much a sampled sine lags, from its phase."""
+    turn = 2 * math.pi * frequency_hz * time_s
+    sine, cosine, _ = np.linalg.lstsq(
+        np.column_stack([np.sin(turn), np.cos(turn), np.ones_like(turn)]), values, rcond=None
+    )[0]
+    return -math.atan2(cosine, sine) / (2 * math.pi * frequency_hz)
+
+
+def rng(seed=0):
+    return np.random.default_rng(seed)
+
+
+def columns_of(stream, pattern, names):
+    return np.column_stack([stream.channel(pattern.format(name)) for name in names])
+
+
+def test_every_logger_keeps_its_own_rate_and_begins_at_0():
+    motion = motion_of(2.02)
+    for stream, rate_hz, n in (
+        (wheels_stream(motion, ROBOT, rng()), 50, 101),
+        (steering_stream(motion, ROBOT, rng()), 50, 101),
+        (imu_stream(motion, ROBOT, rng())[0], 100, 202),
+        (camera_stream(motion, ROBOT, rng(), QUIET), 200, 404),
+        (gnss_stream(motion, Gnss(), rng(), QUIET), 10, 20),
+        (gnss_stream(motion, Gnss(rate_hz=7.0), rng(), QUIET), 7, 14),
+        (truth_stream(motion, np.zeros(202), np.arange(202) / 100), 100, 202),
+    ):
+        np.testing.assert_allclose(stream.time_s, np.arange(n) / rate_hz, rtol=0, atol=1e-12)
+
+
+def test_noise_at_rest_is_that_of_the_description():
+    motion = motion_of(60.0)
+    sensors, camera = ROBOT.sensors, ROBOT.camera
+    still = with_changes(
+        "sensors", gyro_bias_std_radps=0.0, gyro_walk_radps=0.0, accel_bias_std_mps2=0.0, tilt_std_rad=0.0
+    )
+    imu, bias = imu_stream(motion, still, rng())
+    assert not bias.any()
+    assert_std(columns_of(imu, "gyro_{}_radps", "xyz"), sensors.gyro_std_radps, 0.0)
+    assert_std(columns_of(imu, "accel_{}_mps2", "xyz"), sensors.accel_std_mps2, [0.0, 0.0, G])
+    assert_std(columns_of(imu, "{}_rad", ["roll", "pitch"]), TILT_NOISE_RAD, 0.0)
+    assert_std(imu.channel("yaw_rad"), sensors.yaw_std_rad, 0.0)
+
+    seen = camera_stream(motion, ROBOT, rng(), QUIET)
+    assert (seen.channel("confidence_ratio") == 1.0).all()
+    assert_std(columns_of(seen, "velocity_{}_mps", "xyz"), camera.speed_std_mps, 0.0)
+    assert_std(columns_of(seen, "rate_{}_radps", "xyz"), camera.yaw_rate_std_radps, 0.0)
+    assert_std(np.diff(body_motion(seen, ROBOT.camera).yaw_rad)[::2], math.sqrt(2) * camera.yaw_std_rad, 0.0)
+    # the plane of the camera's fixed frame: x right, z back; from sample to sample it hardly drifts
+    wheel = with_changes("camera", yaw_std_rad=0.0)
+    place = columns_of(camera_stream(motion, wheel, rng(), QUIET), "position_{}_m", "xz")
+    assert_std(np.diff(place, axis=0)[::2], math.sqrt(2) * camera.position_std_m, 0.0)
+
+    fixed = gnss_stream(motion_of(200.0), Gnss(fix_length_s=1e9), rng(), QUIET)
+    assert_std(columns_of(fixed, "position_{}_m", "xy"), 0.02, 0.0)
+    assert_std(columns_of(fixed, "velocity_{}_mps", "xy"), 0.03, 0.0)
+    wheels = wheels_stream(motion, ROBOT, rng())
+    assert_std(columns_of(wheels, "current_{}_a", "123"), sensors.current_std_a, 0.0)
+    assert not columns_of(wheels, "motor_{}_radps", "123").any()  # no Hall step, no rate
+    rolling = wheels_stream(motion_of(60.0, reported_radps=2.0), ROBOT, rng())
+    assert_std(columns_of(rolling, "motor_{}_radps", "123"), sensors.motor_std_radps, 20.0)
+    step_rad = 2 * math.pi / sensors.steering_steps_ratio
+    angle = columns_of(steering_stream(motion, ROBOT, rng()), "angle_{}_rad", "123")
+    assert_std(angle, math.hypot(sensors.steering_std_rad, step_rad / math.sqrt(12)), 0.0)
+
+
+def test_biases_stay_for_a_run_and_differ_between_runs():
+    sensors = ROBOT.sensors
+    calibrated = with_changes(
+        "sensors",
+        gyro_walk_radps=0.0,
+        gyro_bias_z_radps=0.01,
+        accel_bias_y_mps2=-0.3,
+        accel_scale_z_ratio=1.02,
+    )
+    motion, gyro, accel, tilt, told = motion_of(2.0), [], [], [], []
+    for seed in range(150):
+        imu, bias = imu_stream(motion, calibrated, rng(seed))
+        assert np.ptp(bias) == 0.0
+        told.append(bias[0])
+        gyro.append(columns_of(imu, "gyro_{}_radps", "xyz").mean(axis=0))
+        accel.append(columns_of(imu, "accel_{}_mps2", "xyz").mean(axis=0))
+        tilt.append(columns_of(imu, "{}_rad", ["roll", "pitch"]).mean(axis=0))
+    within = 1 / math.sqrt(200)
+    assert np.abs(np.array(gyro)[:, 2] - told).max() < 4.5 * sensors.gyro_std_radps * within
+    assert_std(
+        gyro, math.hypot(sensors.gyro_bias_std_radps, sensors.gyro_std_radps * within), [0.0, 0.0, 0.01]
+    )
+    accel_std = math.hypot(sensors.accel_bias_std_mps2, sensors.accel_std_mps2 * within)
+    assert_std(accel, accel_std, [0.0, -0.3, 1.02 * G])
+    assert_std(tilt, math.hypot(sensors.tilt_std_rad, TILT_NOISE_RAD * within), 0.0)
+
+
+def test_a_bias_walks_and_the_yaw_drifts_with_it():
+    sensors = ROBOT.sensors
+    imu, bias = imu_stream(motion_of(100.0, yaw_rad=0.7), ROBOT, rng(4))
+    assert_std(np.diff(bias), sensors.gyro_walk_radps / math.sqrt(100), 0.0)
+    drift = np.concatenate([[0.0], np.cumsum(bias[1:])]) / 100
+    assert abs(drift[-1]) > 0.05
+    assert_std(
+        imu.channel("yaw_rad") - drift, sensors.yaw_std_rad, 0.0
+    )  # it begins at 0, whatever the heading
+    truth = truth_stream(motion_of(100.0), bias, imu.time_s)
+    np.testing.assert_allclose(truth.channel("gyro_bias_z_radps"), bias, rtol=0, atol=1e-15)
+
+
+def test_latency_and_lag_come_back_from_the_phase_of_a_sine():
+    frequency_hz, time_s = 3.0, clock(30.0)
+    sine, turn = np.sin(2 * math.pi * frequency_hz * time_s), 2 * math.pi * frequency_hz
+    motion = motion_of(
+        30.0,
+        yaw_rate_radps=sine,
+        accel_x_mps2=sine,
+        ride_z_mps2=sine,
+        speed_x_mps=sine,
+        position_y_m=sine,
+        steer_rad=sine[:, None],
+    )
+
+    def lag_s(time_constant_s, latency_s=0.0):
+        return latency_s + math.atan(turn * time_constant_s) / turn
+
+    imu, _ = imu_stream(motion, ROBOT, rng())
+    latency_s = ROBOT.sensors.imu_latency_s
+    gyro_s, accel_s = (
+        lag_s(1 / (2 * math.pi * IMU_BANDWIDTH_HZ[name]), latency_s) for name in ("gyro", "accel")
+    )
+    camera = ROBOT.camera
+    seen = camera_stream(motion, with_changes("camera", lever_x_m=0.0, lever_y_m=0.0), rng(), QUIET)
+    speed_s = lag_s(camera.time_constant_s, camera.latency_s)
+    gnss = gnss_stream(motion, Gnss(rate_hz=20.0), rng(), QUIET)
+    steering = steering_stream(motion, ROBOT, rng())
+    for stream, channel, sign, expected_s, within_s in (
+        (imu, "gyro_z_radps", 1, gyro_s, 6e-4),  # the low-pass works in steps of 1 ms: half a step early
+        (imu, "accel_x_mps2", 1, accel_s, 6e-4),
+        (imu, "accel_z_mps2", 1, accel_s, 6e-4),
+        (seen, "velocity_z_mps", -1, speed_s, 6e-4),
+        (seen, "rate_y_radps", 1, speed_s, 6e-4),
+        (seen, "position_x_m", -1, camera.latency_s, 1e-4),
+        (gnss, "position_y_m", 1, 0.1, 5e-4),
+        (steering, "angle_2_rad", 1, 0.0, 1e-4),
+    ):
+        late = stream.time_s > 1.0
+        found_s = delay_s(stream.time_s[late], sign * stream.channel(channel)[late], frequency_hz)
+        assert found_s == pytest.approx(expected_s, abs=within_s), channel
+
+
+def test_steering_is_seen_in_whole_steps_with_its_zero_and_wrapped():
+    angle = np.linspace(-7.0, 7.0, 20_000)
+    robot = with_changes("steering", zero_1_rad=0.5, zero_3_rad=-3.0)
+    seen = columns_of(
+        steering_stream(motion_of(20.0, steer_rad=angle[:, None]), robot, rng()), "angle_{}_rad", "123"
+    )
+    step_rad = 2 * math.pi / 4096
+    place = (seen - step_rad / 2) / step_rad
+    np.testing.assert_allclose(place, np.round(place), atol=1e-6)
+    assert (seen > -math.pi).all()
+    assert (seen <= math.pi).all()
+    assert np.ptp(seen, axis=0).min() > 2 * math.pi - 0.02
+    error = np.angle(np.exp(1j * (seen - angle[::20, None] - [0.5, 0.0, -3.0])))
+    assert np.abs(error).max() < step_rad / 2 + 5 * ROBOT.sensors.steering_std_rad
+    assert np.abs(error.mean(axis=0)).max() < 4.5 * 0.0011 / math.sqrt(1000)
+
+
+def test_current_times_its_constants_is_the_torque():
+    robot = with_changes("sensors", current_std_a=0.0)
+    torque = np.column_stack([np.linspace(-60, 60, 1000), np.full(1000, 6.0), np.zeros(1000)])
+    stream = wheels_stream(motion_of(1.0, torque_nm=torque), robot, rng())
+    motors = ROBOT.motors
+    back = columns_of(stream, "current_{}_a", "123") * (
+        motors.torque_constant_nmpa * motors.reduction_ratio * motors.efficiency_ratio
+    )
+    np.testing.assert_allclose(back, torque[::20], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("grade_x", "grade_y"), [(0.15, 0.0), (-0.1, 0.0), (0.0, 0.12), (0.0, -0.2), (0.1, 0.1)]
+)
+def test_at_rest_on_a_slope_the_imu_reads_gravity(grade_x, grade_y):
+    motion = motion_of(0.5, grade_x_ratio=grade_x, grade_y_ratio=grade_y)
+    imu, bias = imu_stream(motion, SILENT_IMU, rng())
+    force = columns_of(imu, "accel_{}_mps2", "xyz")[-1]
+    up = np.array([grade_x, grade_y, 1.0])  # nose up and left up: positive
+    np.testing.assert_allclose(force, G * up / np.linalg.norm(up), atol=1e-9)
+    truth = truth_stream(motion, bias, imu.time_s)
+    roll, pitch = truth.channel("roll_rad")[-1], truth.channel("pitch_rad")[-1]
+    np.testing.assert_allclose(
+        Rotation.from_euler("ZYX", [0.4, pitch, roll]).apply(force), [0.0, 0.0, G], atol=1e-9
+    )
+    assert np.sign([-pitch, roll]).tolist() == np.sign([grade_x, grade_y]).tolist()
+
+
+def test_turning_on_an_even_slope_rolls_nothing_and_a_swell_pitches():
+    time_s = clock(10.0)
+    yaw = 0.5 * time_s
+    turning = motion_of(
+        10.0,
+        yaw_rad=yaw,
+        yaw_rate_radps=0.5,
+        grade_x_ratio=0.1 * np.cos(yaw),
+        grade_y_ratio=-0.1 * np.sin(yaw),
+    )
+    gyro = columns_of(imu_stream(turning, SILENT_IMU, rng())[0], "gyro_{}_radps", "xyz")[10:]
+    np.testing.assert_allclose(gyro, [[0.0, 0.0, 0.5]] * len(gyro), atol=1e-6)  # 0.05 were it Euler's angles
+    swell = motion_of(10.0, grade_x_ratio=0.05 * np.sin(time_s), grade_y_ratio=0.03 * np.sin(2 * time_s))
+    imu, _ = imu_stream(swell, SILENT_IMU, rng())
+    for axis, angle in (("x", "roll"), ("y", "pitch")):
+        turned = np.cumsum(imu.channel(f"gyro_{axis}_radps")) / 100
+        told = imu.channel(f"{angle}_rad")
+        assert np.abs(turned - (told - told[0])).max() < 8 * TILT_NOISE_RAD
+        assert np.ptp(told) > 0.05
+
+
+def test_the_ride_shakes_the_imu_where_it_sits():
+    """It is over the origin, as high as the centre of mass: pitching moves it along x, rolling along y."""
+    imu, _ = imu_stream(
+        motion_of(1.0, ride_z_mps2=0.7, ride_roll_radps2=0.3, ride_pitch_radps2=-0.4), SILENT_IMU, rng()
+    )
+    np.testing.assert_allclose(
+        columns_of(imu, "accel_{}_mps2", "xyz")[-1], [-0.2, -0.15, G + 0.7], atol=1e-12
+    )
+
+
+def circle(duration_s, radius_m=2.0, speed_mps=0.8, lateral_mps=0.1):
+    """A circle driven at a constant drift angle, from the origin with heading 0."""
+    time_s, turn = clock(duration_s), speed_mps / radius_m
+    yaw = turn * time_s
+    step = (speed_mps + 1j * lateral_mps) / (1j * turn) * (np.exp(1j * yaw) - 1)
+    return motion_of(
+        duration_s,
+        yaw_rad=yaw,
+        yaw_rate_radps=turn,
+        speed_x_mps=speed_mps,
+        speed_y_mps=lateral_mps,
+        position_x_m=step.real,
+        position_y_m=step.imag,
+    )
+
+
+def test_what_the_camera_tells_in_its_own_frames_is_the_motion():
+    motion = circle(12.0)
+    robot = dataclasses.replace(
+        SILENT_CAMERA, camera=dataclasses.replace(SILENT_CAMERA.camera, time_constant_s=0.0)
+    )
+    camera = robot.camera
+    back = body_motion(camera_stream(motion, robot, rng(), QUIET), camera)
+    told = np.maximum(np.round((back.time_s - camera.latency_s) / STEP_S).astype(int), 0)
+    np.testing.assert_allclose(back.yaw_rate_radps, 0.4, atol=1e-9)
+    # at the camera: v + w x r
+    at_camera = [0.8 - 0.4 * camera.lever_y_m, 0.1 + 0.4 * camera.lever_x_m]
+    np.testing.assert_allclose(back.speed_mps, [at_camera] * len(told), atol=1e-9)
+    np.testing.assert_allclose(back.yaw_rad, motion.body("yaw_rad")[told], atol=1e-9)
+    position = np.column_stack([motion.body("position_x_m"), motion.body("position_y_m")])[told]
+    np.testing.assert_allclose(back.position_m, position, atol=1e-9)
+
+
+def test_the_camera_tells_the_slope_it_is_on():
+    motion = motion_of(1.0, speed_x_mps=1.0, grade_x_ratio=0.1, grade_y_ratio=-0.05)
+    back = body_motion(camera_stream(motion, SILENT_CAMERA, rng(), QUIET), ROBOT.camera)
+    turned = Rotation.from_euler("ZYX", [0.0, back.pitch_rad[-1], back.roll_rad[-1]]).as_matrix()
+    np.testing.assert_allclose(turned[2], np.array([0.1, -0.05, 1.0]) / math.sqrt(1.0125), atol=1e-9)
+    np.testing.assert_allclose(back.speed_mps[-1], [1.0, 0.0], atol=1e-9)
+
+
+def test_a_lost_camera_is_missing_for_exactly_that_long_and_else_the_same():
+    motion = circle(10.0)
+    whole = camera_stream(motion, ROBOT, rng(3), QUIET)
+    lost = camera_stream(
+        motion, ROBOT, rng(3), Faults(camera_lost_s=((2.0, 5.0), (7.0, 7.5)), by_chance=False)
+    )
+    t = whole.time_s
+    kept = ~(((t >= 2.0) & (t < 5.0)) | ((t >= 7.0) & (t < 7.5)))
+    assert (~kept).sum() == 3.5 * 200
+    np.testing.assert_array_equal(lost.time_s, t[kept])
+    np.testing.assert_array_equal(lost.values, whole.values[kept])
+    assert len(camera_stream(motion, ROBOT, rng(3), Faults(camera_lost_s=((0.0, math.inf),)))) == 0
+
+
+def test_dropouts_and_jumps_come_by_chance_at_their_rates():
+    rates = {"dropout_rate_hz": 0.2, "dropout_length_s": 0.25, "jump_rate_hz": 0.3, "jump_std_m": 0.2}
+    robot = dataclasses.replace(SILENT_CAMERA, camera=dataclasses.replace(SILENT_CAMERA.camera, **rates))
+    motion = motion_of(50.0)
+    dropouts, lengths, jumps = 0, [], []
+    for seed in range(12):
+        stream = camera_stream(motion, robot, rng(seed), NO_FAULTS)
+        gap = np.diff(stream.time_s) - 1 / 200
+        dropouts += (gap > 1e-6).sum()
+        lengths += gap[gap > 1e-6].tolist()
+        no_loss = dataclasses.replace(robot.camera, dropout_rate_hz=0.0)
+        whole = camera_stream(motion, dataclasses.replace(robot, camera=no_loss), rng(seed), NO_FAULTS)
+        assert len(whole) == 10_000
+        steps = np.diff(columns_of(whole, "position_{}_m", "xyz"), axis=0)
+        jumped = steps[np.abs(steps).max(axis=1) > 1e-9]
+        jumps += jumped.tolist()
+        # a jump is a wrong speed for four samples: it shows in the plane, and its integral is the step
+        shown = columns_of(whole, "velocity_{}_mps", "xyz")
+        assert (np.abs(shown) > 1e-9).any(axis=1).sum() <= 4 * len(jumped) + 4
+        np.testing.assert_allclose(shown[:-4].sum(axis=0) / 200, jumped.sum(axis=0), atol=1e-9)
+    low, high = poisson.ppf([1e-4, 1 - 1e-4], [[0.2 * 600], [0.3 * 600]]).T
+    assert low[0] * 0.9 <= dropouts <= high[0]  # some run into each other
+    assert low[1] <= len(jumps) <= high[1]
+    assert np.mean(lengths) == pytest.approx(0.25, rel=0.45)
+    right, up, back = np.array(jumps).T
+    assert not up.any()
+    assert_std(np.column_stack([right, back]), 0.2, 0.0)
+    assert len(camera_stream(motion, robot, rng(1), QUIET)) == 10_000
+
+
+def test_gnss_tells_where_the_robot_was_and_how_well_it_knows():
+    motion = circle(60.0)
+    receiver = Gnss(fix_length_s=3.0, float_length_s=1.0)
+    seen = [gnss_stream(motion, receiver, rng(seed), QUIET) for seed in range(10)]
+    fixed = np.concatenate([stream.channel("fix_ratio") for stream in seen]).astype(bool)
+    assert fixed.mean() == pytest.approx(0.75, abs=0.12)  # 150 stretches of either kind
+    changes = np.diff(fixed.astype(int))
+    assert poisson.cdf((changes == -1).sum(), fixed.sum() / 10 / 3.0) == pytest.approx(0.5, abs=0.4999)
+    std = np.concatenate([stream.channel("std_position_m") for stream in seen])
+    np.testing.assert_array_equal(std, np.where(fixed, 0.02, 0.5))
+    then = np.maximum(np.round((seen[0].time_s - 0.1) / STEP_S).astype(int), 0)
+    position = np.column_stack([motion.body("position_x_m"), motion.body("position_y_m")])[then]
+    yaw = motion.body("yaw_rad")[then]
+    velocity = np.column_stack([0.8 * np.cos(yaw) - 0.1 * np.sin(yaw), 0.8 * np.sin(yaw) + 0.1 * np.cos(yaw)])
+    errors = np.vstack([columns_of(stream, "position_{}_m", "xy") - position for stream in seen])
+    assert_std(errors[fixed], 0.02, 0.0)
+    assert_std(errors[~fixed], 0.5, 0.0)
+    assert_std(
+        np.vstack([columns_of(stream, "velocity_{}_mps", "xy") - velocity for stream in seen]), 0.03, 0.0
+    )
+    lost = gnss_stream(motion, receiver, rng(0), Faults(gnss_lost_s=((10.0, 20.0),)))
+    kept = (seen[0].time_s < 10.0) | (seen[0].time_s >= 20.0)
+    assert (~kept).sum() == 100
+    np.testing.assert_array_equal(lost.values, seen[0].values[kept])
+
+
+def test_the_truth_is_what_happened_and_a_slip_that_never_was_is_no_channel():
+    slip = np.full((500, 3), np.nan)
+    slip[:, 1] = np.linspace(0.0, 0.5, 500)
+    motion = motion_of(
+        0.5,
+        slip_ratio=slip,
+        normal_n=[[1.0, 2.0, 3.0]],
+        ride_roll_rad=0.01,
+        grade_y_ratio=0.1,
+        accel_y_mps2=0.3,
+    )
+    truth = truth_stream(motion, np.array([0.1, 0.2]), np.array([0.0, 0.5]))
+    assert "slip_1_ratio" not in truth.channels
+    np.testing.assert_array_equal(truth.channel("slip_2_ratio"), slip[::10, 1])
+    assert truth.values[7, [truth.channels.index(f"normal_{i}_n") for i in (1, 2, 3)]].tolist() == [
+        1.0,
+        2.0,
+        3.0,
+    ]
+    np.testing.assert_allclose(truth.channel("roll_rad"), math.atan(0.1) + 0.01)
+    np.testing.assert_allclose(truth.channel("gyro_bias_z_radps")[25], 0.15)
+    assert np.isfinite(truth.values).all()

@@ -1,0 +1,348 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from terrain.errors import ConfigError, DataError
+from terrain.estimation.camera import odometry_stream
+from terrain.estimation.measurements import GNSS_ROWS, ROWS_OF_DRIVE, MeasurementTable, measurement_table
+from terrain.records import ABSENT, RunLog, SlipTrack, StateTrack, Stream
+from terrain.robots import load_robot
+from terrain.slip import STALE_AFTER_S, blind_slip, slip_angle, slip_figures, slip_ratio, wheel_slip
+
+ROBOT = load_robot("agrimaro")
+HUSKY = load_robot("husky")
+MOTION = ("speed_x_mps", "speed_y_mps", "yaw_rate_radps")
+STEER = tuple(f"steer_{i}_rad" for i in (1, 2, 3))
+SLIP_SPEED = tuple(f"slip_speed_{i}_mps" for i in (1, 2, 3))
+WITH_SLIP = (*MOTION, *STEER, *SLIP_SPEED)
+WITHOUT = (*MOTION, *STEER)
+
+
+def make_track(mean, states, cov=None, age_s=0.0, dt_s=0.02):
+    mean = np.atleast_2d(mean)
+    n, d = mean.shape
+    none = np.zeros((n, 1))
+    return StateTrack(
+        np.arange(n) * dt_s,
+        mean,
+        np.broadcast_to(np.zeros((d, d)) if cov is None else cov, (n, d, d)),
+        states,
+        none,
+        none,
+        none + ABSENT,
+        ("camera_speed",),
+        np.broadcast_to(age_s, n),
+        0.0,
+    )
+
+
+def make_table(track, rim_mps, robot=ROBOT):
+    """Return measurements of which only the wheels are known."""
+    rows = ROWS_OF_DRIVE[robot.drive]
+    z = np.full((track.time_s.size, len(rows)), np.nan)
+    z[:, : len(robot.wheels)] = rim_mps
+    if robot.drive == "swerve":
+        z[:, :3] /= robot.wheel_radius_m
+    return MeasurementTable(track.time_s, rows, z, np.full((track.time_s.size, len(GNSS_ROWS)), np.nan))
+
+
+# definitions
+
+speeds = st.floats(-5, 5, allow_subnormal=False)
+
+
+@given(rim=speeds, ground=speeds)
+def test_laws_of_the_slip_ratio(rim, ground):
+    slip = slip_ratio(rim, ground)
+    if max(abs(rim), abs(ground)) < 0.05:
+        assert np.isnan(slip)
+        assert slip_ratio(rim, ground, stationary=0.0) == 0.0
+        return
+    assert -1 <= slip <= 1
+    assert slip == slip_ratio(rim, ground, stationary=0.0)
+    assert slip == -slip_ratio(ground, rim)  # what drives the one brakes the other
+    assert slip == -slip_ratio(-rim, -ground)
+    assert slip * (rim - ground) >= 0
+    if rim > ground > 0:
+        assert slip == pytest.approx((rim - ground) / rim)  # (7.1)
+    if ground > rim > 0:
+        assert slip == pytest.approx((rim - ground) / ground)  # (7.2)
+
+
+def test_singular_points_of_the_slip_ratio():
+    inf, nan = np.inf, np.nan
+    rim = np.array([0.0, 1.0, 0.0, 0.05, 0.0499, 1.0, nan, 0.0, inf, 0.0])
+    ground = np.array([0.0, 0.0, 1.0, 0.0, 0.0499, -1.0, 1.0, nan, 1.0, 1e-320])
+    expected = np.array([nan, 1.0, -1.0, 1.0, nan, 1.0, nan, nan, nan, nan])
+    np.testing.assert_array_equal(slip_ratio(rim, ground), expected)
+    for_control = np.array([0.0, 1.0, -1.0, 1.0, 0.0, 1.0, nan, nan, nan, 0.0])
+    np.testing.assert_array_equal(slip_ratio(rim, ground, stationary=0.0), for_control)
+    assert slip_ratio(np.ones((4, 1)), np.zeros(3)).shape == (4, 3)
+    for least in (0.0, -1.0, nan):
+        with pytest.raises(ConfigError, match="a speed above zero is wanted"):
+            slip_ratio(rim, ground, min_speed_mps=least)
+
+
+def test_slip_angle_is_that_of_the_slide_to_the_left_whichever_way_the_wheel_rolls():
+    np.testing.assert_allclose(
+        slip_angle([1.0, -1.0, 1.0], [0.2, 0.2, -0.2]), np.arctan(0.2) * np.array([1, 1, -1])
+    )
+    np.testing.assert_allclose(slip_angle(0.0, [1.0, -1.0]), [np.pi / 2, -np.pi / 2])
+    assert np.isnan(slip_angle([0.01, np.nan], [0.02, 1.0])).all()
+
+
+# from a filter's track
+
+
+@pytest.mark.parametrize(
+    ("steer", "rolls", "goes"),
+    [
+        (0.0, 1, 1),
+        (0.3, 1, 1),
+        (-1.5, 1, 1),
+        (0.0, -1, -1),  # the robot backs
+        (np.pi, -1, 1),  # it goes forward on wheels that are turned round and roll backward
+        (2.5, -1, 1),
+        (np.pi, 1, -1),  # both
+    ],
+)
+@pytest.mark.parametrize("traction", [0.125, -0.2])
+def test_sign_of_slip_is_that_along_the_wheel(steer, rolls, goes, traction):
+    """A wheel slips by +12.5 % as it pushes the robot on; along its own axis that may be the reverse."""
+    ground = 0.8 * rolls
+    velocity = ground * np.array([np.cos(steer), np.sin(steer)])
+    assert np.sign(velocity[0]) == goes
+    rim = ground / (1 - traction) if traction > 0 else ground * (1 + traction)
+    mean = [*velocity, 0.0, *[steer] * 3, *[rim - ground] * 3]
+    track = make_track(mean, WITH_SLIP)
+    table = make_table(track, rim)
+    slip = wheel_slip(track, table, ROBOT).slip_ratio
+    np.testing.assert_allclose(slip, rolls * traction)
+    np.testing.assert_allclose(slip * np.sign(ground), traction)
+    encoders = wheel_slip(make_track(mean[:6], WITHOUT), table, ROBOT).slip_ratio
+    np.testing.assert_allclose(encoders, slip)
+
+
+def test_each_wheel_has_its_own_way_in_a_turn():
+    turn = 0.6
+    mean = np.zeros(9)
+    mean[:3] = 0.5, 0.1, turn
+    x, y = ROBOT.wheel_positions_m.T
+    velocity = np.column_stack([0.5 - turn * y, 0.1 + turn * x])
+    mean[3:6] = np.arctan2(velocity[:, 1], velocity[:, 0])  # every wheel points where it goes
+    ground = np.hypot(*velocity.T)
+    mean[6:] = ground * (1 / (1 - np.array([0.1, 0.2, 0.3])) - 1)
+    track = make_track(mean, WITH_SLIP)
+    slip = wheel_slip(track, make_table(track, ground), ROBOT)
+    np.testing.assert_allclose(slip.slip_ratio, [[0.1, 0.2, 0.3]])
+    assert slip.wheels == ("1", "2", "3")
+    encoders = wheel_slip(make_track(mean[:6], WITHOUT), make_table(track, ground + mean[6:]), ROBOT)
+    np.testing.assert_allclose(encoders.slip_ratio, slip.slip_ratio)
+
+
+@pytest.mark.parametrize("slip_speed", [0.12, -0.15])  # traction, braking
+@pytest.mark.parametrize("way", [1.0, -1.0])
+@pytest.mark.parametrize("with_slip", [True, False])
+def test_uncertainty_of_slip_is_that_of_the_state(slip_speed, way, with_slip):
+    """First order against a Monte Carlo of the states, correlations and all."""
+    rng = np.random.default_rng(5)
+    states = WITH_SLIP if with_slip else WITHOUT
+    mean = np.array([0.7 * way, 0.15, 0.3, 0.4, -0.3, 0.2, *[slip_speed * way] * 3])[: len(states)]
+    root = 0.004 * rng.standard_normal((len(states), len(states)))
+    cov = root @ root.T
+    track = make_track(mean, states, cov)
+    rim_std = 0.01
+    along = track_ground(mean)
+    rim = along + slip_speed * way
+    slip = wheel_slip(track, make_table(track, rim), ROBOT, rim_std_mps=rim_std)
+    n = 40000
+    drawn = make_track(rng.multivariate_normal(mean, cov, n), states)
+    rims = make_table(drawn, rim + rim_std * rng.standard_normal((n, 3)))
+    scatter = wheel_slip(drawn, rims, ROBOT)
+    assert np.sign(slip.slip_ratio[0]).tolist() == [np.sign(slip_speed * way)] * 3
+    # 0.5 % by chance, the rest is second order at 3 % of relative noise
+    np.testing.assert_allclose(scatter.slip_ratio.std(axis=0), slip.slip_std[0], rtol=0.03)
+
+
+def track_ground(mean):
+    x, y = ROBOT.wheel_positions_m.T
+    steer = mean[3:6]
+    return (mean[0] - mean[2] * y) * np.cos(steer) + (mean[1] + mean[2] * x) * np.sin(steer)
+
+
+def test_uncertainty_of_the_rim_is_by_default_the_robots_own():
+    track = make_track([0.8, *[0.0] * 5], WITHOUT)
+    table = make_table(track, 1.0)
+    rim_std = ROBOT.sensors.motor_std_radps / ROBOT.motors.reduction_ratio * ROBOT.wheel_radius_m
+    np.testing.assert_allclose(wheel_slip(track, table, ROBOT).slip_std, 0.8 * rim_std)
+    nameless = replace(ROBOT, sensors=None)
+    assert np.isnan(wheel_slip(track, table, nameless).slip_std).all()
+    np.testing.assert_allclose(wheel_slip(track, table, nameless).slip_ratio, 0.2)
+
+
+def test_slip_is_unknown_where_the_ground_was_never_seen_and_stale_where_not_lately():
+    age = np.array([np.inf, np.inf, 0.0, 0.02, 0.15, 0.151, 3.0, 0.0])
+    never, stale = age == np.inf, age > STALE_AFTER_S
+    mean = np.tile([0.875, *[0.0] * 5, *[0.125] * 3], (8, 1))
+    cov = np.eye(9) * 1e-4 * np.arange(1, 9)[:, None, None]
+    track = make_track(mean, WITH_SLIP, cov, age)
+    table = make_table(track, 1.0)
+    slip = wheel_slip(track, table, ROBOT)
+    np.testing.assert_array_equal(np.isnan(slip.slip_ratio).all(axis=1), never)
+    np.testing.assert_array_equal(np.isnan(slip.slip_std).any(axis=1), never)
+    np.testing.assert_array_equal(slip.stale, stale)
+    np.testing.assert_allclose(slip.slip_ratio[~never], 0.125)
+    assert (np.diff(slip.slip_std[2:, 0]) > 0).all()  # as the state's does
+    # a filter that leans on the wheels then would say 0
+    leaning = make_track(mean[:, :6], WITHOUT, cov[:, :6, :6], age)
+    encoders = wheel_slip(leaning, table, ROBOT)
+    np.testing.assert_array_equal(np.isnan(encoders.slip_ratio).all(axis=1), stale)
+    np.testing.assert_array_equal(np.isnan(encoders.slip_std).all(axis=1), stale)
+    np.testing.assert_array_equal(encoders.stale, stale)
+
+
+def test_a_filter_of_encoders_alone_has_no_slip_but_a_figure_to_show():
+    """It believes the wheels, at whatever speed the robot goes."""
+    track = make_track(np.tile([1.0, *[0.0] * 5], (5, 1)), WITHOUT, age_s=np.inf)
+    table = make_table(track, 1.001)
+    slip = wheel_slip(track, table, ROBOT)
+    assert np.isnan(slip.slip_ratio).all()
+    assert np.isnan(slip.slip_std).all()
+    np.testing.assert_allclose(blind_slip(track, table, ROBOT).slip_ratio, 0.001, atol=1e-6)
+    # with a slip ratio for a state too: nothing determines it
+    more = make_track(
+        np.tile([1.0, *[0.0] * 5, *[0.4] * 3], (5, 1)), (*WITHOUT, "slip_1_ratio", "b", "c"), age_s=np.inf
+    )
+    assert np.isnan(wheel_slip(more, table, ROBOT).slip_ratio).all()
+
+
+@pytest.mark.parametrize("speed_name", ["speed_x_mps", "speed_mps"])
+def test_sides_of_a_skid_steered_robot(speed_name):
+    half = HUSKY.track_m / 2
+    track = make_track([0.9, 0.5], (speed_name, "yaw_rate_radps"), np.diag([1e-4, 4e-4]))
+    left, right = 0.9 - 0.5 * half, 0.9 + 0.5 * half
+    slip = wheel_slip(track, make_table(track, [left / 0.8, right * 0.9], HUSKY), HUSKY, rim_std_mps=0.01)
+    np.testing.assert_allclose(slip.slip_ratio, [[0.2, -0.1]])
+    assert slip.wheels == ("left", "right")
+    ground_std = np.sqrt(1e-4 + half**2 * 4e-4)
+    rim = left / 0.8
+    np.testing.assert_allclose(slip.slip_std[0, 0], np.hypot(ground_std / rim, 0.01 * left / rim**2))
+
+
+def test_what_does_not_fit_is_refused():
+    track = make_track(np.zeros((3, 9)), WITH_SLIP)
+    with pytest.raises(DataError, match="are not on one clock"):
+        wheel_slip(track, make_table(make_track(np.zeros((4, 9)), WITH_SLIP), 1.0), ROBOT)
+    with pytest.raises(DataError, match="no state 'steer_2_rad', only speed_x_mps, "):
+        wheel_slip(make_track(np.zeros((3, 4)), WITHOUT[:4]), make_table(track, 1.0), ROBOT)
+    with pytest.raises(DataError, match="no measurement 'wheel_1_radps'"):
+        wheel_slip(make_track(np.zeros((3, 6)), WITHOUT), make_table(track, [1, 1], HUSKY), ROBOT)
+
+
+# through the measurements: a start as in thesis 7.2.2
+
+
+def lagged(speed, tau, dt=0.001):
+    """First-order lag of a signal from rest, in small steps."""
+    out = np.zeros_like(speed)
+    for k in range(1, speed.size):
+        out[k] = out[k - 1] + (speed[k - 1] - out[k - 1]) * dt / tau
+    return out
+
+
+def start_of_a_run(slip, camera_s=0.0):
+    """Return a 1 m/s^2 start to 1 m/s: encoders behind 50 ms, a camera behind what is said."""
+    rng = np.random.default_rng(0)
+    fine = np.arange(0, 4.0, 0.001)
+    speed = np.clip(fine - 0.5, 0.0, 1.0)
+    rim = lagged(speed / (1 - slip), 0.05)
+    t = np.arange(200) / 50
+    motor = np.interp(t, fine, rim) / ROBOT.wheel_radius_m * ROBOT.motors.reduction_ratio
+    motor = motor + ROBOT.sensors.motor_std_radps * rng.standard_normal(motor.size)
+    wheels = Stream(t, np.tile(motor[:, None], 3), [f"motor_{i}_radps" for i in (1, 2, 3)])
+    t = np.arange(800) / 200
+    seen = np.interp(t - 0.006, fine, lagged(speed, camera_s) if camera_s else speed)
+    seen = np.column_stack([seen, 0 * t]) + 0.001 * rng.standard_normal((t.size, 2))
+    zero = np.zeros(t.size)
+    pose = odometry_stream(t, np.zeros((t.size, 2)), zero, zero, zero, seen, zero, ROBOT.camera, 0.0)
+    return RunLog("start", "agrimaro", {"wheels": wheels, "odometry": pose})
+
+
+def raw_slip(run, robot, **options):
+    """Slip of wheel 1 by what the table holds: encoders against the camera."""
+    table = measurement_table(run, robot, **options)
+    rim, ground = table.columns(["wheel_1_radps", "camera_speed_x_mps"]).T
+    return slip_ratio(rim * robot.wheel_radius_m, ground)
+
+
+@pytest.mark.parametrize("camera_s", [0.0, 0.02])
+def test_a_start_has_no_false_braking_once_the_delays_match(camera_s):
+    robot = replace(ROBOT, camera=replace(ROBOT.camera, time_constant_s=camera_s))
+    run = start_of_a_run(0.125, camera_s)
+    apart, matched = raw_slip(run, robot, time_constant_s=0.0), raw_slip(run, robot)
+    assert np.nanmin(apart) < -0.05
+    assert np.nanmin(matched) > -0.01
+    assert np.nanmin(raw_slip(run, robot, ema_alpha=0.2)) < -0.05  # a quarter of a tick is no 50 ms
+    # not only is there no dip: the slip is right from the first tick that has one
+    fast = np.isfinite(matched)
+    assert np.abs(matched[fast] - 0.125).max() < 0.06
+    assert np.abs(matched[60:] - 0.125).max() < 0.01
+
+
+# figures of a run
+
+
+def drive(slip, dt=0.02):
+    """Return a track and its speed: a 1 m/s^2 start, 5 s steady, a stop, and 5 s of standing."""
+    time = np.arange(0, 12, dt)
+    speed = np.clip(np.minimum(time, 7.0 - time), 0.0, 1.0)
+    steady, transient = (time > 1.0) & (time < 6.0), (time <= 1.0) | (time >= 6.0)
+    ratio = np.where(steady[:, None], slip, np.nan)
+    ratio[transient] = np.where(time[transient, None] < 2, 0.4, -0.6)
+    ratio[speed < 0.05] = np.nan
+    return SlipTrack(time, ratio, np.full_like(ratio, 0.01), ("1", "2", "3")), speed, time
+
+
+def test_figures_of_a_run_come_from_its_steady_and_its_transient_parts():
+    rng = np.random.default_rng(2)
+    mean, noise = np.array([0.11, 0.125, 0.14]), 0.02
+    slip, speed, time = drive(mean + noise * rng.standard_normal((600, 3)))
+    figures = slip_figures(slip, speed + 0.005 * rng.standard_normal(600), time)
+    n = figures.steady_s * 50
+    # the start's last 0.1 m/s and the second after it; the end of steady driving is seen coming
+    assert figures.steady_s == pytest.approx(5.0 - 1.0 + 0.1 - 0.25 + 0.1, abs=0.1)
+    np.testing.assert_allclose(figures.wheel_mean, mean, atol=4 * noise / np.sqrt(n))
+    np.testing.assert_allclose(figures.wheel_std, noise, rtol=0.25)
+    assert figures.steady_mean == pytest.approx(0.125, abs=4 * noise / np.sqrt(3 * n))
+    assert figures.steady_std == pytest.approx(np.hypot(noise, mean.std()), rel=0.15)
+    np.testing.assert_array_equal(figures.wheel_peak, 0.6)
+    assert figures.peak == 0.6
+    assert not figures.steady[(time < 1.5) | (time > 6.0)].any()
+    # the speed may come from another clock
+    coarse = slip_figures(slip, speed[::5], time[::5])
+    assert coarse.steady_mean == pytest.approx(figures.steady_mean, abs=0.002)
+
+
+def test_figures_that_nothing_gives_are_unknown():
+    slip, speed, time = drive(np.full((600, 3), 0.1))
+    standing = slip_figures(slip, np.zeros(600), time)
+    short = slip_figures(
+        SlipTrack(time[:20], slip.slip_ratio[:20], slip.slip_std[:20], slip.wheels), speed, time
+    )
+    unknown = slip_figures(slip, np.full(600, np.nan), time)
+    for figures in (standing, short, unknown):
+        assert np.isnan(
+            [figures.steady_mean, figures.steady_std, *figures.wheel_mean, *figures.wheel_std]
+        ).all()
+        assert figures.steady_s == 0.0
+    for figures in (standing, unknown):
+        assert np.isnan([figures.peak, *figures.wheel_peak]).all()
+    one_lost = np.array(slip.slip_ratio)
+    one_lost[:, 1] = np.nan
+    figures = slip_figures(SlipTrack(time, one_lost, one_lost, slip.wheels), speed, time)
+    np.testing.assert_allclose(figures.wheel_mean, [0.1, np.nan, 0.1])
+    assert figures.steady_mean == pytest.approx(0.1)
+    assert figures.peak == 0.6
