@@ -16,11 +16,11 @@ Geometry and mass are asked of every robot; the sections ``body``, ``motors``, `
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from types import UnionType
-from typing import Any, NamedTuple, get_args, get_type_hints
+from typing import Annotated, Any, NamedTuple, get_args, get_type_hints
 
 import numpy as np
 
@@ -33,13 +33,11 @@ WHEELS_OF_DRIVE: dict[str, tuple[str, ...]] = {"skid_steer": ("left", "right"), 
 """Kinds of robots and how the channels of their wheels are called (``speed_left_mps``, ``motor_2_radps``)."""
 
 
-def _signed() -> Any:
-    """Return a field that may hold any finite number; a plain one has to be above zero."""
-    return field(metadata={"low": -math.inf})
+Signed = Annotated[float, -math.inf]
+"""A number of a description that may be any; a plain ``float`` has to be above zero."""
 
-
-def _not_negative() -> Any:
-    return field(metadata={"low": 0.0})
+NotNegative = Annotated[float, 0.0]
+"""A number that may be zero."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,14 +48,14 @@ class Body:
     footprint_max_m: float
     tyre_width_m: float
     yaw_inertia_kgm2: float
-    com_x_m: float = _signed()
-    com_y_m: float = _signed()
-    com_height_m: float = _not_negative()
-    wheel_inertia_kgm2: float = field()
-    contact_length_m: float = field()
-    relaxation_length_m: float = field()
-    tyre_stiffness_npm: float = field()
-    tyre_damping_nspm: float = field()
+    com_x_m: Signed
+    com_y_m: Signed
+    com_height_m: NotNegative
+    wheel_inertia_kgm2: float
+    contact_length_m: float
+    relaxation_length_m: float
+    tyre_stiffness_npm: float
+    tyre_damping_nspm: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,11 +68,11 @@ class Motors:
     torque_max_nm: float
     supply_v: float
     speed_max_radps: float
-    torque_time_constant_s: float = _not_negative()
-    friction_nm: float = _not_negative()
-    speed_gain_nmspr: float = field()
-    speed_integral_nmpr: float = _not_negative()
-    speed_estimate_time_constant_s: float = _not_negative()
+    torque_time_constant_s: NotNegative
+    friction_nm: NotNegative
+    speed_gain_nmspr: float
+    speed_integral_nmpr: NotNegative
+    speed_estimate_time_constant_s: NotNegative
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,31 +81,31 @@ class Steering:
 
     rate_max_radps: float
     accel_max_radps2: float
-    dead_band_rad: float = _not_negative()
-    torque_max_nm: float = field()
-    zero_1_rad: float = _signed()
-    zero_2_rad: float = _signed()
-    zero_3_rad: float = _signed()
+    dead_band_rad: NotNegative
+    torque_max_nm: float
+    zero_1_rad: Signed
+    zero_2_rad: Signed
+    zero_3_rad: Signed
 
 
 @dataclass(frozen=True, slots=True)
 class Camera:
     """Tracking camera: where it sits on the body, and how its pose stream behaves."""
 
-    lever_x_m: float = _signed()
-    lever_y_m: float = _signed()
-    lever_z_m: float = _signed()
-    rate_hz: float = field()
-    latency_s: float = _not_negative()
-    time_constant_s: float = _not_negative()
-    speed_std_mps: float = field()
-    yaw_rate_std_radps: float = field()
-    yaw_std_rad: float = field()
-    position_std_m: float = field()
-    dropout_rate_hz: float = _not_negative()
-    dropout_length_s: float = field()
-    jump_rate_hz: float = _not_negative()
-    jump_std_m: float = _not_negative()
+    lever_x_m: Signed
+    lever_y_m: Signed
+    lever_z_m: Signed
+    rate_hz: float
+    latency_s: NotNegative
+    time_constant_s: NotNegative
+    speed_std_mps: float
+    yaw_rate_std_radps: float
+    yaw_std_rad: float
+    position_std_m: float
+    dropout_rate_hz: NotNegative
+    dropout_length_s: float
+    jump_rate_hz: NotNegative
+    jump_std_m: NotNegative
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,30 +118,30 @@ class Sensors:
 
     wheels_rate_hz: float
     hall_steps_ratio: float
-    encoder_time_constant_s: float = _not_negative()
-    motor_std_radps: float = field()
-    current_std_a: float = field()
-    steering_rate_hz: float = field()
-    steering_steps_ratio: float = field()
-    steering_std_rad: float = field()
-    imu_rate_hz: float = field()
-    imu_latency_s: float = _not_negative()
-    gyro_std_radps: float = field()
-    gyro_bias_x_radps: float = _signed()
-    gyro_bias_y_radps: float = _signed()
-    gyro_bias_z_radps: float = _signed()
-    gyro_bias_std_radps: float = _not_negative()
-    gyro_walk_radps: float = _not_negative()
-    accel_std_mps2: float = field()
-    accel_bias_x_mps2: float = _signed()
-    accel_bias_y_mps2: float = _signed()
-    accel_bias_z_mps2: float = _signed()
-    accel_bias_std_mps2: float = _not_negative()
-    accel_scale_x_ratio: float = field()
-    accel_scale_y_ratio: float = field()
-    accel_scale_z_ratio: float = field()
-    tilt_std_rad: float = field()
-    yaw_std_rad: float = field()
+    encoder_time_constant_s: NotNegative
+    motor_std_radps: float
+    current_std_a: float
+    steering_rate_hz: float
+    steering_steps_ratio: float
+    steering_std_rad: float
+    imu_rate_hz: float
+    imu_latency_s: NotNegative
+    gyro_std_radps: float
+    gyro_bias_x_radps: Signed
+    gyro_bias_y_radps: Signed
+    gyro_bias_z_radps: Signed
+    gyro_bias_std_radps: NotNegative
+    gyro_walk_radps: NotNegative
+    accel_std_mps2: float
+    accel_bias_x_mps2: Signed
+    accel_bias_y_mps2: Signed
+    accel_bias_z_mps2: Signed
+    accel_bias_std_mps2: NotNegative
+    accel_scale_x_ratio: float
+    accel_scale_y_ratio: float
+    accel_scale_z_ratio: float
+    tilt_std_rad: float
+    yaw_std_rad: float
 
 
 class Equipment(NamedTuple):
@@ -316,12 +314,12 @@ def robot_from(file: str, described: Any) -> Robot:
     if described["drive"] not in WHEELS_OF_DRIVE:
         known = ", ".join(WHEELS_OF_DRIVE)
         raise ConfigError(f"{file}: drive {described['drive']!r} is unknown: use one of {known}")
-    numbers = {
+    numbers: dict[str, Any] = {
         item.name: number(f"{file}: {item.name}", described[item.name], item.name.rpartition("_")[2])
         for item in fields(Robot)
         if item.type == "float"
     }
-    parts = {
+    parts: dict[str, Any] = {
         name: _section(f"{file}: {name}", kind, described[name])
         for name, kind in sections.items()
         if described.get(name) is not None
@@ -332,17 +330,17 @@ def robot_from(file: str, described: Any) -> Robot:
 
 
 def _section(place: str, kind: Any, described: Any) -> Any:
-    items = fields(kind)
-    check_keys(place, described, [item.name for item in items])
+    hints = get_type_hints(kind, include_extras=True)
+    check_keys(place, described, list(hints))
     return kind(
         **{
-            item.name: number(
-                f"{place}: {item.name}",
-                described[item.name],
-                item.name.rpartition("_")[2],
-                item.metadata.get("low"),
+            name: number(
+                f"{place}: {name}",
+                described[name],
+                name.rpartition("_")[2],
+                next(iter(getattr(hint, "__metadata__", ())), None),
             )
-            for item in items
+            for name, hint in hints.items()
         }
     )
 

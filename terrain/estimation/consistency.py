@@ -1,0 +1,261 @@
+"""Whether a filter is as wrong as it says: squared innovations, and squared errors where the truth is known.
+
+NIS nu' S^-1 nu and NEES e' P^-1 e follow a chi-square law with as many degrees of freedom as nu and e have
+entries (Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, 5.4):
+on average one a degree.  Over that, the filter is overconfident; under it, conservative.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import boolean, float64, njit, types, void
+from scipy.special import chdtri
+
+from terrain.errors import DataError
+from terrain.estimation.ekf import FilterModel, Noise, initial_state
+from terrain.estimation.kernel import OBSERVE, PROPAGATE, wrap
+from terrain.records import GATED, USED, Array, StateTrack
+
+OUTSIDE = 0.05
+"""Share that bounds leave outside, half on each side."""
+
+MOST_GATED = 0.01
+"""A sensor of which more is left out does not have the noise that the filter believes: 0.01 % is expected."""
+
+
+class Consistency(NamedTuple):
+    """How one sensor, or one group of states, agrees with what the filter says of it.
+
+    ``n_independent`` is how many of the n values count: those that follow closely repeat each other.
+    ``verdict`` is ``consistent``, ``overconfident``, ``conservative``, or ``unknown`` where there is nothing.
+    """
+
+    name: str
+    n: int
+    n_independent: float
+    mean_per_dof: float
+    low: float
+    high: float
+    share_outside: float
+    share_gated: float
+    verdict: str
+
+
+class ConsistencyReport(NamedTuple):
+    """NIS of each sensor, and NEES of each group of states of which the truth is known."""
+
+    sensors: tuple[Consistency, ...]
+    states: tuple[Consistency, ...]
+
+
+def consistency_report(track: StateTrack, truth: Array | None = None) -> ConsistencyReport:
+    """Judge a track by its innovations, and by the truth where there is one.
+
+    Parameters
+    ----------
+    track : what the filter gave
+    truth : (n, d) in the order of the track's states and at its times; NaN where it is not known
+
+    Returns
+    -------
+    ConsistencyReport
+        the mean per degree of freedom is judged by the two-sided 95 % bounds for as many independent
+        values as there are.  States are grouped as their names are (``speed`` has x and y), and all that
+        are known together are ``all``.
+
+    Raises
+    ------
+    DataError
+        where the shape of the truth does not fit.
+    """
+    sensors = []
+    for k, name in enumerate(track.sensors):
+        used, gated = track.use[:, k] == USED, track.use[:, k] == GATED
+        came = int(used.sum() + gated.sum())
+        share_gated = float(gated.sum() / came) if came else 0.0
+        sensors.append(_judge(name, track.nis[used, k], track.nis_dof[used, k], share_gated))
+    states = []
+    if truth is not None:
+        values = _fitting(truth, track, track.states)
+        known = [state for j, state in enumerate(track.states) if np.isfinite(values[:, j]).any()]
+        groups: dict[str, list[str]] = {}
+        for state in known:
+            groups.setdefault(_group_of(state), []).append(state)
+        if len(groups) > 1:
+            groups["all"] = known
+        for name, members in groups.items():
+            squares = nees(track, values[:, [track.states.index(state) for state in members]], members)
+            squares = squares[np.isfinite(squares)]
+            states.append(_judge(name, squares, np.full(squares.size, len(members)), 0.0))
+    return ConsistencyReport(tuple(sensors), tuple(states))
+
+
+def nees(track: StateTrack, truth: Array, states: Sequence[str] | None = None) -> Array:
+    """Return the squared error of each instant over its covariance (n,); NaN where the truth is.
+
+    Parameters
+    ----------
+    track : what the filter gave
+    truth : (n, d) at the track's times, one column a state
+    states : the d states in question; all of them without.  Errors of angles (names in ``rad``) are wrapped
+
+    Raises
+    ------
+    DataError
+        where the shape does not fit, or there is no such state.
+    """
+    states = track.states if states is None else tuple(states)
+    for unknown in (state for state in states if state not in track.states):
+        raise DataError(f"the track has no state {unknown!r}: it has {', '.join(track.states)}")
+    values = _fitting(truth, track, states)
+    index = [track.states.index(state) for state in states]
+    error = track.mean[:, index] - values
+    angles = [i for i, state in enumerate(states) if state.endswith("_rad")]
+    error[:, angles] = np.pi - (np.pi - error[:, angles]) % (2 * np.pi)
+    solved = np.linalg.solve(track.cov[:, index][:, :, index], error[..., None])[..., 0]
+    squares: Array = np.einsum("ni,ni->n", error, solved)
+    return squares
+
+
+def _fitting(truth: Array, track: StateTrack, states: Sequence[str]) -> Array:
+    values = np.asarray(truth, dtype=np.float64)
+    if values.shape != (track.time_s.size, len(states)):
+        raise DataError(f"truth has shape {values.shape}, {(track.time_s.size, len(states))} is needed")
+    return values
+
+
+def sample_from_model(
+    model: FilterModel, noise: Noise, n: int, dt_s: float, rng: np.random.Generator
+) -> tuple[Array, Array, Array]:
+    """Draw a truth and its measurements from a filter's own equations: on these it has to be consistent.
+
+    Parameters
+    ----------
+    model, noise : the filter; the truth starts from its initial mean and variance
+    n : number of samples
+    dt_s : their spacing
+    rng : source of the noise
+
+    Returns
+    -------
+    time_s (n,), truth (n, d), z (n, m)
+    """
+    d, m = len(model.states), len(model.rows)
+    start = initial_state(model, noise)
+    x = start.mean + np.linalg.cholesky(start.cov) @ rng.standard_normal(d)
+    values, vectors = np.linalg.eigh(noise.process_variance * dt_s)
+    walk = rng.standard_normal((n, d)) @ (vectors * np.sqrt(np.maximum(values, 0.0))).T
+    z = rng.standard_normal((n, m)) * np.sqrt(noise.measurement_variance)
+    truth = np.empty((n, d))
+    is_angle_state, is_angle_row = (
+        np.array([name in angles for name in names], dtype=np.bool_)
+        for names, angles in ((model.states, model.angle_states), (model.rows, model.angle_rows))
+    )
+    _draw(
+        model.propagate,
+        model.observe,
+        model.params.copy(),
+        is_angle_state,
+        is_angle_row,
+        dt_s,
+        x,
+        walk,
+        truth,
+        z,
+    )
+    return np.arange(n) * dt_s, truth, z
+
+
+@njit(
+    void(
+        types.FunctionType(PROPAGATE),
+        types.FunctionType(OBSERVE),
+        float64[::1],
+        boolean[::1],
+        boolean[::1],
+        float64,
+        float64[::1],
+        *(float64[:, ::1],) * 3,
+    ),
+    cache=True,
+)
+def _draw(
+    propagate: Any,
+    observe: Any,
+    params: Array,
+    is_angle_state: Array,
+    is_angle_row: Array,
+    dt: float,
+    x: Array,
+    walk: Array,
+    truth: Array,
+    z: Array,
+) -> None:
+    """Fill the truth, and add what is expected to the noise in z."""
+    d, m = x.size, z.shape[1]
+    x_next, z_hat, f, h = np.zeros(d), np.zeros(m), np.zeros((d, d)), np.zeros((m, d))
+    for n in range(truth.shape[0]):
+        if n > 0:
+            f[:] = 0.0
+            propagate(x, dt, params, x_next, f)
+            for i in range(d):
+                x[i] = x_next[i] + walk[n, i]
+                if is_angle_state[i]:
+                    x[i] = wrap(x[i])
+        truth[n] = x
+        h[:] = 0.0
+        observe(x, params, z_hat, h)
+        for i in range(m):
+            z[n, i] += z_hat[i]
+            if is_angle_row[i]:
+                z[n, i] = wrap(z[n, i])
+
+
+def _judge(name: str, squares: Array, dof: Array, share_gated: float) -> Consistency:
+    """Compare squares (n,), each of so many degrees of freedom, with chi-square."""
+    if not squares.size:
+        nan = float("nan")
+        return Consistency(
+            name, 0, 0.0, nan, nan, nan, nan, share_gated, "overconfident" if share_gated else "unknown"
+        )
+    dof = dof.astype(np.float64)
+    n_independent = _independent(squares / dof)
+    total = n_independent * dof.mean()
+    low, high = (float(chdtri(total, p)) / total for p in (1 - OUTSIDE / 2, OUTSIDE / 2))
+    mean = float(squares.sum() / dof.sum())
+    outside = (squares < chdtri(dof, 1 - OUTSIDE / 2)) | (squares > chdtri(dof, OUTSIDE / 2))
+    verdict = "overconfident" if mean > high or share_gated > MOST_GATED else "consistent"
+    if mean < low and share_gated <= MOST_GATED:
+        verdict = "conservative"
+    return Consistency(
+        name, squares.size, n_independent, mean, low, high, float(outside.mean()), share_gated, verdict
+    )
+
+
+def _independent(values: Array) -> float:
+    """Return how many independent values say as much on the mean: n over the autocorrelation time."""
+    n = values.size
+    centred = values - values.mean()
+    spectrum = np.fft.rfft(centred, 2 * n)
+    correlation = np.fft.irfft(spectrum * spectrum.conj())[:n]
+    if correlation[0] <= 0:
+        return float(n)
+    rho = correlation / correlation[0]
+    negative = np.flatnonzero(rho <= 0)
+    end = int(negative[0]) if negative.size else n
+    return float(n / max(1.0, 1 + 2 * rho[1:end].sum()))
+
+
+def _group_of(state: str) -> str:
+    """Return a state's name without axis, number and unit.
+
+    Examples
+    --------
+    >>> _group_of("slip_speed_2_mps"), _group_of("yaw_rad")
+    ('slip_speed', 'yaw')
+    """
+    return re.sub(r"(_[xyz\d])?_[a-z0-9]+$", "", state)

@@ -1,0 +1,60 @@
+"""What each measurement said beyond its prediction, to look at: a filter keeps only the squares."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from terrain.estimation.ekf import FilterModel, Noise
+from terrain.records import Array, StateTrack
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Innovations:
+    """Measurement minus prediction at each instant of a track; NaN at the first and where none was.
+
+    Parameters
+    ----------
+    time_s : (n,)
+    rows : name of each of the m measurements
+    value : (n, m)
+    std : (n, m) what the filter expected of it, ``sqrt(diag(H P H' + R))`` with the predicted P
+    """
+
+    time_s: Array
+    rows: tuple[str, ...]
+    value: Array
+    std: Array
+
+    def row(self, name: str) -> tuple[Array, Array]:
+        """Return value (n,) and std (n,) of one measurement."""
+        i = self.rows.index(name)
+        return self.value[:, i], self.std[:, i]
+
+
+def innovations(model: FilterModel, noise: Noise, track: StateTrack, z: Array) -> Innovations:
+    """Return the innovations of a track, from one step to the next.
+
+    Parameters
+    ----------
+    model, noise : of the filter that made the track
+    track : its states
+    z : (n, m) the measurements at the track's times
+    """
+    n, d, m = len(track.time_s), len(model.states), len(model.rows)
+    value, std = np.full((2, n, m), np.nan)
+    variance = np.broadcast_to(noise.measurement_variance, (n, m))
+    x_next, z_hat, params = np.zeros(d), np.zeros(m), np.array(model.params)
+    is_angle = np.array([row in model.angle_rows for row in model.rows])
+    for k in range(1, n):
+        dt_s = track.time_s[k] - track.time_s[k - 1]
+        f, h = np.zeros((d, d)), np.zeros((m, d))
+        model.propagate(np.array(track.mean[k - 1]), dt_s, params, x_next, f)
+        model.observe(x_next, params, z_hat, h)
+        predicted = f @ track.cov[k - 1] @ f.T + noise.process_variance * dt_s
+        value[k] = z[k] - z_hat
+        std[k] = np.sqrt(np.einsum("ij,jk,ik->i", h, predicted, h) + variance[k])
+    value[:, is_angle] = np.pi - (np.pi - value[:, is_angle]) % (2 * np.pi)
+    std[np.isnan(value)] = np.nan
+    return Innovations(track.time_s, model.rows, value, std)

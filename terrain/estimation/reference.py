@@ -1,0 +1,83 @@
+"""The truth of a simulated run, in the states of a filter.
+
+A filter's inputs come behind one low-pass (``terrain.estimation.measurements``), so what it estimates is the
+motion behind that low-pass.  It is judged against the truth behind the same one: else every ramp of 1 m/s^2
+would count 5 cm/s of known delay as an error.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from terrain.errors import DataError
+from terrain.estimation.measurements import low_pass
+from terrain.records import Array, RunLog, StateTrack, Stream
+from terrain.robots import Robot
+
+LONGEST_STEP_S = 0.1
+"""A longer step in the truth is a gap."""
+
+
+def true_states(run: RunLog, track: StateTrack, robot: Robot, time_constant_s: float) -> Array | None:
+    """Return the truth (n, d) at each instant of a track, or None where the log has none.
+
+    States that the truth does not know (an effective track) are NaN, and so is what lies outside its time.
+
+    Parameters
+    ----------
+    run : log with the stream ``truth`` as ``terrain.simulation`` writes it
+    track : of a filter on that log
+    robot : as the filter was given it: slip speeds are those against its nominal radius
+    time_constant_s : of the low-pass on the filter's inputs
+    """
+    truth = run.streams.get("truth")
+    if truth is None:
+        return None
+    out = np.full(track.mean.shape, np.nan)
+    for j, state in enumerate(track.states):
+        values = _true_state(truth, state, robot)
+        if values is not None:
+            known = np.isfinite(values)
+            time_s = truth.time_s[known]
+            smooth = low_pass(time_s, values[known], time_constant_s, LONGEST_STEP_S)
+            out[:, j] = np.interp(track.time_s, time_s, smooth, left=np.nan, right=np.nan)
+    return out
+
+
+def rim_and_ground_speed(truth: Stream, robot: Robot) -> tuple[Array, Array]:
+    """Return the true rim speed and speed over ground along each wheel, both (n, wheels) in m/s.
+
+    Parameters
+    ----------
+    truth : stream as ``terrain.simulation`` writes it
+    robot : gives the nominal radius and the wheels' places
+    """
+    steer = _wheels(truth, robot, "steer_{}_rad")
+    positions_m = robot.wheel_positions_m
+    turn = truth.channel("yaw_rate_radps")[:, None]
+    along = truth.channel("speed_x_mps")[:, None] - turn * positions_m[:, 1]
+    across = truth.channel("speed_y_mps")[:, None] + turn * positions_m[:, 0]
+    rim = _wheels(truth, robot, "wheel_{}_radps") * robot.wheel_radius_m
+    return rim, along * np.cos(steer) + across * np.sin(steer)
+
+
+def _wheels(truth: Stream, robot: Robot, pattern: str) -> Array:
+    return np.column_stack([truth.channel(pattern.format(wheel)) for wheel in robot.wheels])
+
+
+def _true_state(truth: Stream, state: str, robot: Robot) -> Array | None:
+    if state == "yaw_rad":
+        yaw = np.unwrap(truth.channel("yaw_rad"))
+        return np.asarray(yaw - yaw[0])
+    if state in truth.channels:
+        return truth.channel(state)
+    if state == "gyro_bias_radps" and "gyro_bias_z_radps" in truth.channels:
+        offset = robot.sensors.gyro_bias_z_radps if robot.sensors else 0.0
+        return np.asarray(truth.channel("gyro_bias_z_radps") - offset)
+    if state.startswith("slip_speed_"):
+        rim, along = rim_and_ground_speed(truth, robot)
+        wheel = state.split("_")[2]
+        if wheel not in robot.wheels:
+            raise DataError(f"state {state!r} is of a wheel that robot {robot.name} does not have")
+        return np.asarray((rim - along)[:, robot.wheels.index(wheel)])
+    return None

@@ -1,0 +1,59 @@
+"""Innovations of a right filter are white and as large as it says; they are the NIS that the filter keeps."""
+
+import numpy as np
+
+from terrain.estimation.consistency import sample_from_model
+from terrain.estimation.ekf import FilterSettings, Noise, run_filter
+from terrain.estimation.innovations import innovations
+from terrain.estimation.swerve_filters import default_noise, make_filter
+from terrain.robots import load_robot
+
+ROBOT = load_robot("agrimaro")
+
+
+def calm_noise(model):
+    """Walks of a robot's size: what is drawn stays where a linearisation holds."""
+    default = default_noise("vio15", ROBOT)
+    walk, start = np.diag(default.process_variance).copy(), np.diag(default.initial_variance).copy()
+    for i, state in enumerate(model.states):
+        if state.startswith(("accel", "yaw_rate", "steer")):
+            walk[i], start[i] = 0.05**2, 0.05**2
+        if state.startswith(("speed", "slip_speed", "yaw")):
+            start[i] = 0.1**2
+    return Noise(walk, default.measurement_variance, start)
+
+
+def filtered(seed=0):
+    model = make_filter("vio15", ROBOT)
+    noise = calm_noise(model)
+    time_s, _, drawn = sample_from_model(model, noise, 1500, 0.02, np.random.default_rng(seed))
+    z = np.array(drawn)
+    z[200:250, model.rows.index("camera_speed_x_mps")] = np.nan
+    track = run_filter(model, noise, time_s, z, FilterSettings(gate_probability=1.0))
+    return model, track, innovations(model, noise, track, z)
+
+
+def test_scaled_innovations_have_unit_variance_and_no_memory():
+    _, _, found = filtered()
+    scaled = (found.value / found.std)[50:]
+    assert np.isnan(found.value[0]).all()
+    for column in scaled.T:
+        column = column[np.isfinite(column)]
+        assert abs(column.var() - 1.0) < 5 * np.sqrt(2 / column.size)
+        assert abs(np.mean(column[1:] * column[:-1])) < 5 / np.sqrt(column.size)
+
+
+def test_the_first_sensor_of_a_step_has_the_square_that_the_filter_kept():
+    model, track, found = filtered()
+    _, rows = model.sensors[0]  # conditioned on first: its prediction is that of the step
+    assert len(rows) == 1
+    value, std = found.row(rows[0])
+    np.testing.assert_allclose((value / std)[1:] ** 2, track.nis[1:, 0], rtol=1e-6, atol=1e-9)
+
+
+def test_what_was_not_measured_has_none():
+    _, _, found = filtered()
+    value, std = found.row("camera_speed_x_mps")
+    assert np.isnan(value[200:250]).all()
+    assert np.isnan(std[200:250]).all()
+    assert np.isfinite(value[251:]).all()

@@ -1,0 +1,68 @@
+"""The truth of a simulated run is told in the states of each filter."""
+
+import numpy as np
+import pytest
+
+from pipelines.simulate import simulate_run
+from terrain.errors import DataError
+from terrain.estimation.measurements import low_pass
+from terrain.estimation.reference import rim_and_ground_speed, true_states
+from terrain.records import RunLog, StateTrack
+from terrain.robots import load_robot
+
+ROBOT = load_robot("agrimaro")
+STATES = ("yaw_rad", "speed_x_mps", "steer_2_rad", "gyro_bias_radps", "slip_speed_3_mps", "effective_track_m")
+
+
+@pytest.fixture(scope="module")
+def run():
+    return simulate_run(ROBOT, "grass", "arc", 0, duration_s=10.0)
+
+
+def empty_track(states, time_s):
+    n, d = len(time_s), len(states)
+    none = np.zeros((n, 1))
+    return StateTrack(
+        time_s,
+        np.zeros((n, d)),
+        np.tile(np.eye(d), (n, 1, 1)),
+        states,
+        none,
+        none,
+        none,
+        ("s",),
+        np.zeros(n),
+        0.0,
+    )
+
+
+def test_truth_comes_behind_the_low_pass_that_the_filter_was_fed_through(run):
+    time_s = np.arange(0.5, 9.0, 0.02)
+    truth = run.streams["truth"]
+    found = true_states(run, empty_track(STATES, time_s), ROBOT, 0.05)
+    speed = low_pass(truth.time_s, truth.channel("speed_x_mps"), 0.05, 1.0)
+    np.testing.assert_allclose(found[:, 1], np.interp(time_s, truth.time_s, speed), atol=1e-9)
+    plain = true_states(run, empty_track(STATES, time_s), ROBOT, 0.0)
+    rising = (time_s > 1.3) & (time_s < 1.7)
+    lag_s = (plain - found)[rising, 1].mean() / np.gradient(plain[rising, 1], time_s[rising]).mean()
+    assert lag_s == pytest.approx(0.05, abs=0.01)
+    assert found[0, 0] == pytest.approx(0.0, abs=0.02)
+    assert np.isnan(found[:, 5]).all()  # nobody knows an effective track
+
+
+def test_slip_speed_and_slip_ratio_are_two_ways_to_say_one_thing(run):
+    truth = run.streams["truth"]
+    rim, ground = rim_and_ground_speed(truth, ROBOT)
+    for i in range(3):
+        slip = truth.channel(f"slip_{i + 1}_ratio")
+        fastest = np.maximum(np.abs(rim[:, i]), np.abs(ground[:, i]))
+        moving = np.isfinite(slip) & (fastest > 0.2)
+        np.testing.assert_allclose((rim - ground)[moving, i] / fastest[moving], slip[moving], atol=0.01)
+
+
+def test_no_truth_is_none_and_a_wheel_too_many_is_said(run):
+    streams = {name: stream for name, stream in run.streams.items() if name != "truth"}
+    track = empty_track(("speed_x_mps",), np.arange(0.0, 1.0, 0.1))
+    assert true_states(RunLog("a", "agrimaro", streams), track, ROBOT, 0.05) is None
+    with pytest.raises(DataError, match="slip_speed_4_mps"):
+        true_states(run, empty_track(("slip_speed_4_mps",), np.arange(0.0, 1.0, 0.1)), ROBOT, 0.05)

@@ -1,0 +1,498 @@
+import dataclasses
+
+import numpy as np
+import pytest
+from numba import njit
+from scipy.stats import chi2
+
+from terrain.errors import ConfigError
+from terrain.estimation.consistency import nees, sample_from_model
+from terrain.estimation.ekf import FilterSettings, Noise, run_filter
+from terrain.estimation.kernel import OBSERVE, PROPAGATE
+from terrain.estimation.swerve_filters import (
+    FILTERS,
+    adaptive_noise,
+    default_noise,
+    make_filter,
+    thesis_noise,
+)
+from terrain.estimation.swerve_model import observe_slip_ratio, observe_without_slip, propagate
+from terrain.robots import load_robot
+
+ROBOT = load_robot("agrimaro")
+DT_S = 0.02
+SLIP = 0.125
+ALL_BELIEVED = FilterSettings(gate_probability=1.0)
+
+
+def drive(model, yaw_rate_radps=0.0, duration_s=20.0, seed=0, noise=1.0):
+    """Start to 1 m/s within 2 s, straight or in a circle; every wheel rolls and slips by SLIP.
+
+    Returns time_s, z in the model's rows, and the true speeds of the wheels over ground (n, 3).
+    """
+    time_s = np.arange(0, duration_s, DT_S)
+    up = np.minimum(time_s / 2, 1)
+    speed, turn = up, yaw_rate_radps * up
+    yaw = np.cumsum(turn) * DT_S - turn * DT_S
+    x_m, y_m = ROBOT.wheel_positions_m.T
+    along = np.hypot(speed[:, None] - turn[:, None] * y_m, turn[:, None] * x_m)
+    camera = ROBOT.camera
+    columns = {
+        **{f"wheel_{i + 1}_radps": along[:, i] / (1 - SLIP) / ROBOT.wheel_radius_m for i in range(3)},
+        **{
+            f"steer_{i + 1}_rad": np.full_like(
+                time_s, np.arctan2(yaw_rate_radps * x_m[i], 1 - yaw_rate_radps * y_m[i])
+            )
+            for i in range(3)
+        },
+        "accel_x_mps2": np.where(time_s < 2, 0.5, 0.0),
+        "accel_y_mps2": turn * speed,
+        "gyro_z_radps": turn,
+        "imu_yaw_rad": yaw,
+        "camera_speed_x_mps": speed - turn * camera.lever_y_m,
+        "camera_speed_y_mps": turn * camera.lever_x_m,
+        "camera_yaw_rate_radps": turn,
+        "camera_yaw_rad": yaw,
+    }
+    std = {"wheel": 0.02, "steer": 0.001, "accel": 0.05, "gyro": 0.005, "imu": 0.005, "camera": 0.003}
+    rng = np.random.default_rng(seed)
+    z = np.column_stack(
+        [
+            columns[row] + noise * std[row.split("_")[0]] * rng.standard_normal(time_s.size)
+            for row in model.rows
+        ]
+    )
+    return time_s, z, along
+
+
+def raw_slip(model, track, z):
+    """Slip (n, 3) of the wheels as measured against the speed as estimated."""
+    slips = []
+    for i, (x_m, y_m) in enumerate(ROBOT.wheel_positions_m):
+        steer, turn = track.state(f"steer_{i + 1}_rad"), track.state("yaw_rate_radps")
+        along, across = track.state("speed_x_mps") - turn * y_m, track.state("speed_y_mps") + turn * x_m
+        speed = along * np.cos(steer) + across * np.sin(steer)
+        rim = z[:, model.rows.index(f"wheel_{i + 1}_radps")] * ROBOT.wheel_radius_m
+        slips.append((rim - speed) / np.maximum(np.abs(rim), np.abs(speed)))
+    return np.column_stack(slips)
+
+
+def jacobians(model, x, dt=DT_S):
+    d, m = len(model.states), len(model.rows)
+    x_next, f, z_hat, h = np.zeros(d), np.zeros((d, d)), np.zeros(m), np.zeros((m, d))
+    model.propagate(x, dt, model.params.copy(), x_next, f)
+    model.observe(x, model.params.copy(), z_hat, h)
+    return x_next, f, z_hat, h
+
+
+@pytest.mark.parametrize("with_gnss", [False, True])
+@pytest.mark.parametrize("name", FILTERS)
+def test_jacobians_are_those_of_finite_differences(name, with_gnss):
+    model = make_filter(name, ROBOT, with_gnss, antenna_m=(0.3, -0.2))
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        x = rng.normal(0, 1, len(model.states))
+        if name == "slip14":
+            x[8:11] = rng.uniform(-0.5, 0.8, 3)
+        _, f, _, h = jacobians(model, x)
+        step = 1e-6
+        for j in range(x.size):
+            up, down = x.copy(), x.copy()
+            up[j] += step
+            down[j] -= step
+            (next_up, _, z_up, _), (next_down, _, z_down, _) = jacobians(model, up), jacobians(model, down)
+            np.testing.assert_allclose(f[:, j], (next_up - next_down) / (2 * step), atol=1e-8)
+            np.testing.assert_allclose(h[:, j], (z_up - z_down) / (2 * step), rtol=1e-6, atol=1e-6)
+
+
+def test_states_and_rows_stand_in_the_order_of_the_thesis():
+    vio = make_filter("vio12", ROBOT)
+    assert vio.states[5:8] == ("yaw_rate_radps", "accel_x_mps2", "accel_y_mps2")  # (6.1), not (4.44)
+    assert vio.rows[10:] == (
+        "camera_speed_x_mps",
+        "camera_speed_y_mps",
+        "camera_yaw_rate_radps",
+        "camera_yaw_rad",
+    )
+    sizes = {name: (len(m.states), len(m.rows)) for name in FILTERS for m in [make_filter(name, ROBOT)]}
+    assert sizes == {"encoder12": (12, 10), "slip14": (14, 10), "vio12": (12, 14), "vio15": (15, 14)}
+    assert len(make_filter("slip14", ROBOT, with_gnss=True).rows) == 14
+
+
+def test_the_noise_of_the_thesis_is_that_of_its_tables_per_second():
+    noise = thesis_noise("vio12", ROBOT, sample_time_s=0.02)
+    np.testing.assert_allclose(
+        noise.process_variance.diagonal() * 0.02, [0.5, 0.5, 0.08, 0.08, 0.08, 0.15, 0.12, 0.12, *[0.002] * 4]
+    )
+    np.testing.assert_allclose(
+        noise.measurement_variance[[0, 3, 5, 6, 7, 10, 12, 13]],
+        [0.05, 0.001, 0.001, 0.01, 1e-5, 5e-5, 0.001, 5e-4],
+    )
+    slip14 = thesis_noise("slip14", ROBOT)
+    np.testing.assert_allclose(
+        slip14.initial_variance.diagonal(), [*[1e-6] * 6, *[1e-3] * 2, *[1e-6] * 3, *[0.1] * 3]
+    )
+    np.testing.assert_allclose(slip14.measurement_variance, [*[1e-5] * 7, *[7.2e-5] * 3])
+
+
+@pytest.mark.parametrize("yaw_rate_radps", [0.0, 0.3])
+def test_who_sees_the_slip_and_who_is_blind_to_it(yaw_rate_radps):
+    """Thesis 4.6, 6.1: slip reads 0 without a speed over ground, and low with wheel rows that know none."""
+    found = {}
+    for name, noise in (("encoder12", default_noise), ("vio12", thesis_noise), ("vio15", default_noise)):
+        model = make_filter(name, ROBOT)
+        time_s, z, _ = drive(model, yaw_rate_radps)
+        track = run_filter(model, noise(name, ROBOT), time_s, z)
+        found[name] = raw_slip(model, track, z)[time_s > 10].mean(axis=0)
+    # In a curve the wheels, an eighth too fast, contradict the gyro: what is left is spread over them.
+    assert np.abs(found["encoder12"]).max() < (0.015 if yaw_rate_radps else 0.005)
+    assert abs(found["encoder12"].mean()) < 0.005
+    assert (np.abs(found["vio12"] - 0.115) < 0.005).all()
+    assert (np.abs(found["vio15"] - SLIP) < 0.002).all()
+
+
+@pytest.mark.parametrize("yaw_rate_radps", [0.0, 0.3])
+def test_a_lost_camera_costs_vio15_certainty_and_vio12_the_slip(yaw_rate_radps):
+    half_a_second = np.ones(25) / 25
+    for name, noise in (("vio12", thesis_noise), ("vio15", default_noise)):
+        model = make_filter(name, ROBOT)
+        time_s, z, _ = drive(model, yaw_rate_radps)
+        lost = (time_s > 12) & (time_s < 15)
+        z[np.ix_(lost, [row.startswith("camera") for row in model.rows])] = np.nan
+        track = run_filter(model, noise(name, ROBOT), time_s, z)
+        slip = np.apply_along_axis(np.convolve, 0, raw_slip(model, track, z), half_a_second, "same")[lost]
+        if name == "vio12":
+            assert np.abs(slip[50:-15]).max() < 0.005  # within a second, and nothing tells
+        else:
+            assert np.abs(slip - SLIP).max() < 0.01
+            std = track.std("slip_speed_1_mps")
+            assert (np.diff(std[lost]) > 0).mean() > 0.9
+            assert std[lost][-1] > 3 * std[time_s < 12][-1]
+        assert track.reference_age_s[lost].max() == pytest.approx(2.98)
+
+
+def observable_rank(model, speeds):
+    """Rank of the local observability matrix along half a second steps from a state."""
+    x = np.zeros(len(model.states))
+    for state, value in speeds.items():
+        x[model.states.index(state)] = value
+    blocks, transition = [], np.eye(x.size)
+    for _ in range(x.size):
+        x_next, f, _, h = jacobians(model, x, 0.5)
+        blocks.append(h @ transition)
+        x, transition = x_next, f @ transition
+    return np.linalg.matrix_rank(np.vstack(blocks), tol=1e-9)
+
+
+@njit
+def _print_accelerations(x, z_hat, h):
+    z_hat[3], z_hat[4] = -x[5] * x[4], x[5] * x[3]
+    h[3:5] = 0.0
+    h[3, 4], h[3, 5], h[4, 3], h[4, 5] = -x[5], -x[4], x[5], x[3]
+
+
+@njit(OBSERVE)
+def observe_as_printed_4_28(x, params, z_hat, h):
+    observe_slip_ratio(x, params, z_hat, h)
+    _print_accelerations(x, z_hat, h)
+
+
+@njit(OBSERVE)
+def observe_as_printed_4_48(x, params, z_hat, h):
+    observe_without_slip(x, params, z_hat, h)
+    _print_accelerations(x, z_hat, h)
+
+
+@njit(PROPAGATE)
+def propagate_as_printed_6_2(x, dt, params, x_next, f):
+    propagate(x, dt, params, x_next, f)
+    x_next[3], x_next[4] = x[3] + dt * (x[6] - x[5] * x[4]), x[4] + dt * (x[7] + x[5] * x[3])
+    f[3, 4], f[3, 5], f[4, 3], f[4, 5] = -dt * x[5], -dt * x[4], dt * x[5], dt * x[3]
+
+
+def as_printed(name):
+    printed = {"encoder12": observe_as_printed_4_48, "slip14": observe_as_printed_4_28}
+    return dataclasses.replace(make_filter(name, ROBOT), observe=printed[name])
+
+
+def test_what_driving_straight_leaves_unobserved():
+    """Positions are measured by GNSS only; of the other 12 states of slip14 as printed 9 are left."""
+    straight = {"speed_x_mps": 1.0} | {f"slip_{i}_ratio": SLIP for i in (1, 2, 3)}
+    straight = {
+        name: {s: v for s, v in straight.items() if s in make_filter(name, ROBOT).states} for name in FILTERS
+    }
+    ranks = {name: observable_rank(make_filter(name, ROBOT), straight[name]) for name in FILTERS}
+    assert ranks == {"encoder12": 9, "slip14": 10, "vio12": 10, "vio15": 13}
+    assert observable_rank(as_printed("slip14"), straight["slip14"]) == 9
+    assert observable_rank(make_filter("vio15", ROBOT, with_gnss=True), straight["vio15"]) == 15
+
+
+def test_slip14_ends_with_the_speed_that_it_was_started_with():
+    """The same measurements at constant speed, two beliefs: neither is corrected; vio15 forgets both."""
+    for name in ("slip14", "vio15"):
+        model = make_filter(name, ROBOT)
+        time_s, z, _ = drive(model, duration_s=30.0)
+        time_s, z = time_s[150:], z[150:]
+        speeds = []
+        for speed in (0.9, 1.1):
+            mean = np.zeros(len(model.states))
+            mean[3] = speed
+            if name == "slip14":
+                mean[8:11] = 1 - speed / (1 / (1 - SLIP))
+            started = dataclasses.replace(model, initial_mean=mean)
+            track = run_filter(started, default_noise(name, ROBOT), time_s, z)
+            speeds.append(track.state("speed_x_mps")[-1])
+        assert (speeds[1] - speeds[0] > 0.1) if name == "slip14" else (abs(speeds[1] - speeds[0]) < 1e-4)
+
+
+@pytest.mark.parametrize("name", ["encoder12", "slip14"])
+def test_accelerations_as_printed_make_a_straight_run_diverge(name):
+    """(4.28), (4.48): rows 4, 5 do not measure the acceleration, which walks off, and the speed with it."""
+    errors = {}
+    for model in (make_filter(name, ROBOT), as_printed(name)):
+        time_s, z, along = drive(model, duration_s=60.0)
+        track = run_filter(model, thesis_noise(name, ROBOT), time_s, z, ALL_BELIEVED)
+        error = np.hypot(track.state("speed_x_mps") - along[:, 0], track.state("speed_y_mps"))
+        errors[model.observe] = np.sqrt(np.mean(error**2))
+    right, printed = errors.values()
+    assert right < 5
+    assert printed > 100
+
+
+def test_coriolis_signs_as_printed_cost_the_speed_when_the_camera_is_lost_in_a_curve():
+    model = make_filter("vio15", ROBOT)
+    time_s, z, _ = drive(model, 0.3)
+    lost = (time_s > 12) & (time_s < 15)
+    z[np.ix_(lost, [row.startswith("camera") for row in model.rows])] = np.nan
+    worst = []
+    for tried in (model, dataclasses.replace(model, propagate=propagate_as_printed_6_2)):
+        track = run_filter(tried, default_noise("vio15", ROBOT), time_s, z)
+        error = np.hypot(track.state("speed_x_mps") - 1, track.state("speed_y_mps"))
+        worst.append(error[lost].max())
+    assert worst[0] < 0.05
+    assert worst[1] > 0.5
+    assert worst[1] > 20 * worst[0]
+
+
+def test_adaptive_tuning_has_two_horns():
+    """Thesis 4.6.1: mild factors leave slip at zero, strong ones the speed to the accelerometer's bias."""
+    model = make_filter("encoder12", ROBOT)
+    time_s, z, _ = drive(model, duration_s=62.0)
+    z[:, model.rows.index("accel_x_mps2")] += 0.02
+    for factor in (1.0, 10.0, 100.0):
+        track = run_filter(model, adaptive_noise(ROBOT, factor), time_s, z)
+        assert np.abs(raw_slip(model, track, z)[time_s > 5].mean(axis=0)).max() < 0.02
+    track = run_filter(model, adaptive_noise(ROBOT, 1e8), time_s, z)
+    speed = track.state("speed_x_mps")
+    assert speed[-1] - speed[time_s > 2][0] > 0.5
+    assert raw_slip(model, track, z)[-1].max() < -0.2  # for + 0.125: no better than zero
+
+
+# Standard deviations of a robot's size: the walks of default_noise let a filter follow anything, and a truth
+# drawn from them for 40 s would reach thousands of metres a second, where no linearisation holds.
+WALK = {
+    "position": 1e-3,
+    "yaw_rad": 1e-4,
+    "speed": 0.02,
+    "yaw_rate": 0.1,
+    "accel": 0.05,
+    "steer": 0.1,
+    "gyro_bias": 2e-4,
+    "slip_speed": 0.05,
+}
+START = {
+    "position": 1e-3,
+    "yaw_rad": 0.05,
+    "speed": 0.3,
+    "yaw_rate": 0.1,
+    "accel": 0.05,
+    "steer": 0.05,
+    "gyro_bias": 0.01,
+    "slip_speed": 0.1,
+}
+SAMPLE = {
+    "wheel": 0.1,
+    "accel": 0.15,
+    "gyro": 0.01,
+    "imu_yaw": 0.05,
+    "steer": 0.003,
+    "camera_speed": 0.008,
+    "camera_yaw_rate": 0.01,
+    "camera_yaw_rad": 0.005,
+    "gnss_position": 0.02,
+    "gnss_speed": 0.03,
+}
+
+
+def calm_noise(model):
+    def variances(stds, names):
+        return np.array(
+            [next(std for kind, std in stds.items() if name.startswith(kind)) ** 2 for name in names]
+        )
+
+    return Noise(variances(WALK, model.states), variances(SAMPLE, model.rows), variances(START, model.states))
+
+
+def test_vio15_is_consistent_on_what_its_own_equations_draw():
+    model, n_runs, n = make_filter("vio15", ROBOT), 50, 2001
+    noise = calm_noise(model)
+    instants = np.arange(100, n, 100)  # 20, two seconds apart: errors last; innovations do not
+    squares = {"nees": np.zeros(20), "nis": np.zeros(n)}
+    for seed in range(n_runs):
+        time_s, truth, z = sample_from_model(model, noise, n, DT_S, np.random.default_rng(seed))
+        track = run_filter(model, noise, time_s, z, ALL_BELIEVED)
+        squares["nees"] += nees(track, truth)[instants] / n_runs
+        squares["nis"] += track.nis.sum(axis=1) / n_runs
+    for kind, dof in (("nees", 15), ("nis", 14)):
+        low, high = chi2.ppf([0.025, 0.975], dof * n_runs) / n_runs
+        assert ((squares[kind] >= low) & (squares[kind] <= high)).mean() >= 0.9
+    assert chi2.ppf([0.025, 0.975], 15 * n_runs) / n_runs == pytest.approx([13.52, 16.56], abs=0.01)
+
+
+def test_gnss_is_another_reference():
+    """Without a camera: position, heading of the world and slip come from the antenna alone."""
+    model = make_filter("vio15", ROBOT, with_gnss=True, antenna_m=(0.2, -0.3))
+    calm = calm_noise(model)
+    start = np.maximum(calm.initial_variance.diagonal(), model.initial_std**2)
+    noise = Noise(calm.process_variance, calm.measurement_variance, start)
+    time_s, truth, z = sample_from_model(model, noise, 2001, DT_S, np.random.default_rng(0))
+    z[:, [row.startswith(("camera", "imu_yaw")) for row in model.rows]] = np.nan
+    z[np.arange(2001) % 5 > 0, 14:] = np.nan  # 10 Hz
+    track = run_filter(model, noise, time_s, z)
+    late = time_s > 20
+    for state, widest in (
+        ("position_x_m", 0.05),
+        ("speed_x_mps", 0.1),
+        ("yaw_rad", 0.2),
+        ("slip_speed_1_mps", 0.1),
+    ):
+        error, std = track.state(state) - truth[:, model.states.index(state)], track.std(state)
+        assert (np.abs(error[late]) < 4 * std[late]).all(), state
+        assert std[-1] < widest, state
+    assert track.reference_age_s[late].max() == pytest.approx(0.08)
+
+
+FAULTS = {"missing": np.nan, "infinite": np.inf, "huge": 1e300, "spikes": 30.0, "frozen": None}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize("sensor", [name for name, _ in make_filter("vio15", ROBOT).sensors])
+def test_a_broken_sensor_is_counted_by_its_name_and_costs_little(sensor, fault):
+    """Four seconds from the start on, over the ramp, so that a frozen sensor shows."""
+    model = make_filter("vio15", ROBOT)
+    time_s, z, along = drive(model, 0.3)
+    columns = [model.rows.index(row) for row in dict(model.sensors)[sensor]]
+    rows = np.arange(20, 200, 25 if fault == "spikes" else 1)
+    z[np.ix_(rows, columns)] = z[20, columns] if fault == "frozen" else FAULTS[fault]
+    track = run_filter(model, default_noise("vio15", ROBOT), time_s, z)
+    assert np.isfinite(track.mean).all()
+    assert np.isfinite(track.cov).all()
+    kinds = {"infinite": "not finite", "huge": "not finite", "spikes": "gated"}
+    if fault in kinds:
+        assert track.dropped[f"{sensor} {kinds[fault]}"] >= 7
+    late = time_s > 8
+    assert np.abs(track.state("speed_x_mps")[late] - 1).max() < 0.05
+    lambdas = np.column_stack([track.state(f"slip_speed_{i}_mps") for i in (1, 2, 3)])[late]
+    assert np.abs(lambdas - along[late] * SLIP / (1 - SLIP)).max() < 0.05
+
+
+@pytest.mark.parametrize(
+    ("row", "value"),
+    [
+        ("accel_x_mps2", 20.0),
+        ("gyro_z_radps", 3.0),
+        ("imu_yaw_rad", 2.0),
+        ("camera_speed_x_mps", 5.0),
+        ("camera_yaw_rate_radps", 2.0),
+        ("camera_yaw_rad", 2.0),
+        ("steer_1_rad", 1.5),
+        ("wheel_1_radps", 30.0),
+    ],
+)
+def test_what_a_sensor_made_up_for_four_seconds_is_gone_three_seconds_later(row, value):
+    model = make_filter("vio15", ROBOT)
+    time_s, z, along = drive(model)
+    z[400:600, model.rows.index(row)] = value
+    track = run_filter(model, default_noise("vio15", ROBOT), time_s, z)
+    sensor = next(name for name, rows in model.sensors if row in rows)
+    assert track.dropped[f"{sensor} gated"] >= 50
+    late = slice(750, None)
+    assert np.hypot(track.state("speed_x_mps")[late] - 1, track.state("speed_y_mps")[late]).max() < 0.03
+    for i in range(3):
+        assert (
+            np.abs(track.state(f"slip_speed_{i + 1}_mps") - along[:, i] * SLIP / (1 - SLIP))[late].max()
+            < 0.03
+        )
+
+
+GARBAGE = np.array([np.nan, np.inf, 1e300, 1e9, -1e9, 1e6, -1e6, 1e3, 0.0, 3.0])
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_after_two_seconds_of_garbage_on_every_row_it_is_back_in_three(seed):
+    model = make_filter("vio15", ROBOT)
+    time_s, z, _ = drive(model, seed=seed)
+    rng, shape = np.random.default_rng(seed), (100, z.shape[1])
+    z[300:400] = (
+        rng.choice(GARBAGE, shape),
+        np.repeat(rng.choice(GARBAGE, (4, shape[1])), 25, axis=0),
+        rng.standard_normal(shape) * 10 ** rng.uniform(-3, 10, shape[1]),
+        np.tile(10 ** rng.uniform(-3, 9, shape[1]), (100, 1)),
+    )[seed % 4]
+    track = run_filter(model, default_noise("vio15", ROBOT), time_s, z)
+    late = slice(550, None)
+    assert np.hypot(track.state("speed_x_mps")[late] - 1, track.state("speed_y_mps")[late]).max() < 0.03
+    for i in (1, 2, 3):
+        assert np.abs(track.state(f"slip_speed_{i}_mps")[late] - SLIP / (1 - SLIP)).max() < 0.03
+
+
+def test_a_stream_that_ends_early_leaves_its_states_less_and_less_known():
+    model = make_filter("vio15", ROBOT)
+    time_s, z, _ = drive(model)
+    z[500:] = np.nan
+    track = run_filter(model, default_noise("vio15", ROBOT), time_s, z)
+    assert np.isfinite(track.cov).all()
+    assert (np.diff(track.std("speed_x_mps")[500:]) > 0).all()
+    assert track.reference_age_s[-1] == pytest.approx(time_s[-1] - time_s[499])
+
+
+@pytest.mark.parametrize("bad_s", [3600.0, -3600.0, 0.0])
+def test_stamps_that_are_wrong_cost_a_row(bad_s):
+    model = make_filter("vio15", ROBOT)
+    time_s, z, _ = drive(model)
+    stamps = time_s.copy()
+    stamps[300] = stamps[299] + bad_s
+    track = run_filter(model, default_noise("vio15", ROBOT), stamps, z)
+    np.testing.assert_array_equal(track.time_s, np.delete(time_s, 300))
+    assert track.dropped["clock jump" if bad_s else "time did not advance"] == 1
+    assert np.abs(raw_slip(model, track, np.delete(z, 300, axis=0))[500:].mean(axis=0) - SLIP).max() < 0.002
+
+
+def test_wheels_at_right_angles_at_the_start_are_found():
+    """Linearised where all is zero, a wheel that stands across says the wrong thing once, and is left out."""
+    model = make_filter("vio15", ROBOT)
+    time_s, z, _ = drive(model)
+    z[:, 7:10] += np.pi / 2
+    z[:, 3:5] = z[:, [4, 3]]
+    z[:, 10:12] = z[:, [11, 10]]  # sideways: to the left
+    track = run_filter(model, default_noise("vio15", ROBOT), time_s[150:], z[150:])
+    assert np.abs(track.state("speed_y_mps")[100:] - 1).max() < 0.05
+    assert np.abs(track.state("slip_speed_2_mps")[300:] - SLIP / (1 - SLIP)).max() < 0.05
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (
+            lambda: make_filter("vio16", ROBOT),
+            "filter 'vio16' is unknown: use one of encoder12, slip14, vio12, vio15",
+        ),
+        (lambda: default_noise("vio15", load_robot("husky")), "robot husky has the drive 'skid_steer'"),
+        (lambda: make_filter("vio15", dataclasses.replace(ROBOT, camera=None)), "has no section 'camera'"),
+        (lambda: thesis_noise("vio12", ROBOT, 0.0), "sample_time_s is 0.0, seconds above zero are wanted"),
+        (lambda: adaptive_noise(ROBOT, -1.0), "factor is -1.0, a number above zero is wanted"),
+    ],
+)
+def test_what_is_no_filter_is_refused(call, message):
+    with pytest.raises(ConfigError, match=message):
+        call()
