@@ -1,0 +1,127 @@
+"""What logs tell of one number of a robot's description, and what they cannot tell."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy import stats
+
+from terrain.records import Array
+
+CONFIDENCE = 0.95
+"""Of every interval."""
+
+
+class Finding(NamedTuple):
+    """One number as the logs have it; ``value`` is NaN where they cannot tell, and ``note`` says why.
+
+    Parameters
+    ----------
+    parameter : place in the description, ``sensors.gyro_bias_z_radps``
+    value, low, high : the number and its 95 % interval
+    n, counted : how many of what it rests on (12, ``"stretches"``)
+    runs : ids of the runs used
+    note : what is assumed; or why nothing can be told
+    """
+
+    parameter: str
+    value: float
+    low: float
+    high: float
+    n: int
+    counted: str
+    runs: tuple[str, ...]
+    note: str = ""
+
+    @property
+    def told(self) -> bool:
+        """Whether there is a value."""
+        return math.isfinite(self.value)
+
+
+def untold(parameters: Sequence[str], reason: str) -> list[Finding]:
+    """Return a finding without a value for each parameter."""
+    return [Finding(name, math.nan, math.nan, math.nan, 0, "", (), reason) for name in parameters]
+
+
+def half_width(std: Array | float, dof: float) -> Array:
+    """Return half the interval of a normal number whose standard deviation has ``dof`` degrees of freedom.
+
+    Examples
+    --------
+    >>> half_width(1.0, 10.0).round(2), half_width(1.0, float("inf")).round(2)
+    (np.float64(2.23), np.float64(1.96))
+    """
+    return np.float64(stats.t.ppf((1 + CONFIDENCE) / 2, dof)) * np.asarray(std)
+
+
+def std_interval(variance: float, dof: float) -> tuple[float, float]:
+    """Return the interval of a standard deviation whose variance was found with ``dof`` degrees of freedom.
+
+    Examples
+    --------
+    >>> low, high = std_interval(4.0, 100.0)
+    >>> round(low, 2), round(high, 2)
+    (1.76, 2.32)
+    """
+    low, high = stats.chi2.ppf([(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2], dof)
+    return math.sqrt(variance * dof / high), math.sqrt(variance * dof / low)
+
+
+def biases(
+    parameters: Sequence[str],
+    std_parameter: str,
+    found: Array,
+    variance: Array,
+    described_std: float,
+    n: int,
+    counted: str,
+    runs: tuple[str, ...],
+) -> list[Finding]:
+    """Return what biases in single power-ons tell of those to come, and of how much these differ.
+
+    Parameters
+    ----------
+    parameters, std_parameter : places of the three biases and of their scatter from power-on to power-on
+    found, variance : (k, 3) biases in each power-on, and the variances of their errors
+    described_std : the scatter, taken for true where there is one power-on alone
+    n, counted, runs : what they rest on; each run is a power-on
+
+    Notes
+    -----
+    However well a bias is known in one power-on, it tells of the next only as much as the scatter lets it.
+    The axes share one scatter, as the description has it: k power-ons give 3 (k - 1) degrees of freedom.
+    """
+    k = len(found)
+    mean = found.mean(axis=0)
+    note = "each run is taken for a power-on"
+    if k == 1:
+        note = f"one power-on: the next differs by {described_std:g}, as described"
+        half = half_width(np.sqrt(variance[0] + described_std**2), math.inf)
+        between = math.nan
+    else:
+        between = float(((found - mean) ** 2).sum() / (3 * (k - 1)))
+        half = np.broadcast_to(half_width(math.sqrt(between / k), 3 * (k - 1)), 3)
+    told = [
+        Finding(
+            name, float(mean[i]), float(mean[i] - half[i]), float(mean[i] + half[i]), n, counted, runs, note
+        )
+        for i, name in enumerate(parameters)
+    ]
+    if k < MIN_POWER_ONS:
+        return told + untold(
+            [std_parameter], f"{k} power-ons: {MIN_POWER_ONS} at least show how much they differ"
+        )
+    # What a single power-on's own error adds to the scatter is taken off.
+    low, std, high = (
+        math.sqrt(max(edge**2 - float(variance.mean()), 0.0))
+        for edge in sorted((*std_interval(between, 3 * (k - 1)), math.sqrt(between)))
+    )
+    return [*told, Finding(std_parameter, std, low, high, k, "power-ons", runs, note)]
+
+
+MIN_POWER_ONS = 3
+"""From two, the upper end of a scatter's interval is four times the scatter."""

@@ -1,0 +1,119 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from terrain.calibration.steady import direction_of, steady_stretches, why_none
+from terrain.calibration.wheels import reduction_ratio, steering_zeros
+from terrain.records import RunLog
+from terrain.simulation.conditions import Conditions
+
+HARD = ("tiles", "asphalt")
+N_SEEDS = 20
+
+
+def stretches_of(runs, robot, hard=HARD):
+    return [stretch for run in runs for stretch in steady_stretches(run, robot, hard)]
+
+
+def zeros_of(runs, robot):
+    return np.array([finding.value for finding in steering_zeros(stretches_of(runs, robot), robot)])
+
+
+@pytest.fixture(scope="module")
+def found(drive, nominal):
+    """Findings and plain means of one complex run for each of many seeds."""
+    out = []
+    for seed in range(N_SEEDS):
+        stretches = stretches_of([drive("complex", seed)], nominal)
+        findings = [*steering_zeros(stretches, nominal), reduction_ratio(stretches, nominal)]
+        out.append((findings, np.mean([stretch.off_rad for stretch in stretches], axis=0)))
+    return out
+
+
+def test_zeros_and_ratio_come_back(found, coverage, truth):
+    held = coverage([findings for findings, _ in found])
+    assert len(held) == 4
+    assert min(held.values()) >= 0.8
+    zeros = [truth(f"steering.zero_{i}_rad") for i in (1, 2, 3)]
+    errors = np.array([[finding.value for finding in findings[:3]] for findings, _ in found]) - zeros
+    assert np.abs(errors).max() < 0.0015
+    # Side slip is no noise: the plain mean of angle less direction is off, and alike in every run.
+    plain = np.array([mean for _, mean in found]) - zeros
+    assert np.abs(plain.mean(axis=0)).max() > 5 * np.abs(errors.mean(axis=0)).max()
+    assert np.abs(plain.mean(axis=0)).max() > 0.003
+    ratios = [findings[3].value for findings, _ in found]
+    assert np.mean(ratios) == pytest.approx(truth("motors.reduction_ratio"), rel=6e-4)
+    for findings, _ in found:
+        assert all(finding.high - finding.low < 0.006 for finding in findings[:3])
+        assert findings[3].high - findings[3].low < 0.02 * findings[3].value
+
+
+def test_forward_and_backward_driving_agree_on_a_side_slope(drive, nominal, truth):
+    tilted = Conditions(grade_ratio=(0.02, 0.05))
+    stretches = stretches_of([drive("complex", seed, conditions=tilted) for seed in (1, 2)], nominal)
+    for finding in steering_zeros(stretches, nominal):
+        assert finding.low <= truth(finding.parameter) <= finding.high
+        assert finding.high - finding.low < 0.003
+
+
+def test_load_and_tyres_of_the_day_do_not_matter(drive, nominal, truth):
+    runs = [
+        drive("complex", 1, conditions=Conditions(radius_factors=(1.006, 0.996, 1.0))),
+        drive("complex", 2, conditions=Conditions(payload_kg=25.0, payload_m=(0.1, 0.1))),
+        drive("complex", 3, conditions=Conditions(radius_factors=(1.0, 1.004, 0.994), payload_kg=10.0)),
+    ]
+    stretches = stretches_of(runs, nominal)
+    findings = [*steering_zeros(stretches, nominal), reduction_ratio(stretches, nominal)]
+    for finding in findings:
+        assert finding.low <= truth(finding.parameter) <= finding.high
+    assert findings[3].runs == tuple(run.run_id for run in runs)
+
+
+@pytest.mark.parametrize("zeros", [(2.5, -1.2, 3.13), (-3.1, 0.0, 1.6)])
+def test_zeros_may_lie_anywhere_on_the_turn(zeros, drive, nominal, hidden):
+    names = ("zero_1_rad", "zero_2_rad", "zero_3_rad")
+    robot = replace(hidden, steering=replace(hidden.steering, **dict(zip(names, zeros, strict=True))))
+    found = zeros_of([drive("complex", 4, robot=robot)], nominal)
+    np.testing.assert_allclose(np.angle(np.exp(1j * (found - zeros))), 0.0, atol=0.0015)
+    assert (np.abs(found) <= np.pi).all()
+
+
+def test_only_the_ratio_over_the_radius_is_seen(drive, nominal):
+    stretches = stretches_of([drive("starts", 1)], nominal)
+    one, twice = (
+        reduction_ratio(stretches, replace(nominal, wheel_radius_m=radius)).value for radius in (0.2, 0.4)
+    )
+    assert twice == pytest.approx(2 * one)
+
+
+def test_driving_one_way_tells_no_zero_but_the_ratio(drive, nominal):
+    stretches = stretches_of([drive("starts", seed) for seed in range(4)], nominal)
+    assert {direction_of(stretch) for stretch in stretches} == {"forward"}
+    for finding in steering_zeros(stretches, nominal):
+        assert not finding.told
+        assert (
+            "driven forward, cannot tell: drive straight forward, backward and to both sides" in finding.note
+        )
+    assert reduction_ratio(stretches, nominal).told
+
+
+def test_stretches_are_steady_straight_and_on_hard_ground(drive, nominal, hidden):
+    run = drive("complex", 5)
+    directions = [direction_of(stretch) for stretch in steady_stretches(run, nominal, HARD)]
+    assert set(directions) == {"forward", "backward", "left", "right", "diagonally"}
+    # all starts of a run stand with their plays alike: one stretch
+    assert len(steady_stretches(drive("starts", 5), nominal, HARD)) == 1
+    assert steady_stretches(drive("arc", 5), nominal, HARD) == []
+    assert steady_stretches(drive("complex", 5, terrain="grass"), nominal, HARD) == []
+
+
+def test_the_reason_why_there_is_none(drive, nominal):
+    run = drive("straight", 1)
+    blind = RunLog("r", run.robot, {k: v for k, v in run.streams.items() if k != "odometry"}, run.labels)
+    assert why_none([blind], nominal, HARD) == "no run has a camera (stream 'odometry')"
+    soft = drive("straight", 1, terrain="grass")
+    assert why_none([soft], nominal, HARD) == "no run is labelled with hard ground (tiles, asphalt)"
+    assert "never move" in why_none([drive("stand", 1)], nominal, HARD)
+    assert "no straight driving" in why_none([drive("arc", 1)], nominal, HARD)
+    assert not reduction_ratio([], nominal).told
