@@ -43,6 +43,30 @@ class Protocol(StrEnum):
     published = "published"
 
 
+class FilterName(StrEnum):
+    """Filters; the numbers are those of their states."""
+
+    encoder12 = "encoder12"
+    slip14 = "slip14"
+    vio12 = "vio12"
+    vio15 = "vio15"
+    skid = "skid"
+
+
+class Tuning(StrEnum):
+    """Where a filter's noise comes from."""
+
+    physical = "physical"
+    thesis = "thesis"
+    likelihood = "likelihood"
+
+
+class Paper(StrEnum):
+    """Papers that can be reproduced."""
+
+    danzi = "danzi"
+
+
 class Recipe(StrEnum):
     """Recipes from windows to terrain."""
 
@@ -73,6 +97,7 @@ Seed = Annotated[int, typer.Option(min=0, help="Deals runs into folds.")]
 Repeats = Annotated[int | None, typer.Option(min=1, help="Fold assignments (5).")]
 Jobs = Annotated[int, typer.Option(min=0, help="Processes at once; 0 for one a core.")]
 ALL_SIGNALS = ",".join(SIGNAL_SETS)
+MAX_GRADE_DEG = 30.0
 
 
 @app.command("import")
@@ -228,24 +253,173 @@ def predict_command(
     _write_json(json_file, result)
 
 
+@app.command("simulate")
+def simulate_command(
+    robot: Annotated[str, typer.Option(help="Robot by name, or its YAML file.")],
+    terrain: Annotated[str, typer.Option(help="Name of a soil, 'all' for each in turn, or 'course'.")],
+    scenario: Annotated[str, typer.Option(help="What is driven; 'course' goes with the terrain 'course'.")],
+    out: Annotated[Path, typer.Option(help="Folder of the new run folders.")],
+    runs: Annotated[int, typer.Option(min=1, help="Runs a terrain.")] = 1,
+    duration: Annotated[float | None, typer.Option(help="Length of a run in s.")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Of everything that is drawn.")] = 0,
+    vary: Annotated[
+        bool, typer.Option("--vary", help="Draw soil, slope, load and tyres anew for each run.")
+    ] = False,
+    grade: Annotated[
+        float, typer.Option(help="Slope along the start's heading in degrees, uphill > 0.")
+    ] = 0.0,
+    payload: Annotated[float, typer.Option(min=0.0, help="Load in kg.")] = 0.0,
+    camera_lost: Annotated[
+        list[str] | None, typer.Option(help="START:END in s without the camera; may be given again.")
+    ] = None,
+    gnss: Annotated[bool, typer.Option("--gnss", help="With an RTK receiver on board.")] = False,
+    json_file: Json = None,
+) -> None:
+    """Simulate runs: ordinary run folders, with the truth beside what the sensors say."""
+    import math
+
+    from pipelines.screens import progress_bar
+    from pipelines.simulate import simulate_runs
+    from terrain.simulation.conditions import Conditions, Faults
+
+    if not abs(grade) <= MAX_GRADE_DEG:
+        raise ConfigError(
+            f"--grade is {grade:g}; {-MAX_GRADE_DEG:g} to {MAX_GRADE_DEG:g} degrees are accepted"
+        )
+    with progress_bar() as progress:
+        result = simulate_runs(
+            robot,
+            terrain,
+            scenario,
+            out,
+            runs=runs,
+            duration_s=duration,
+            seed=seed,
+            vary=vary,
+            conditions=Conditions(payload_kg=payload, grade_ratio=(math.tan(math.radians(grade)), 0.0)),
+            faults=Faults(camera_lost_s=tuple(_interval(text) for text in camera_lost or ())),
+            gnss=gnss,
+            progress=progress,
+        )
+    typer.echo(f"{result['n_runs']} runs of {result['duration_s']:.0f} s in all written to {out}")
+    _write_json(json_file, result)
+
+
+@app.command("estimate")
+def estimate_command(
+    data: Data,
+    filter_name: Annotated[FilterName, typer.Option("--filter", help="Which filter.")],
+    out: Annotated[
+        Path | None, typer.Option(help="Folder of new run folders with state and slip, and of pictures.")
+    ] = None,
+    robot: Annotated[
+        str | None, typer.Option(help="Robot or its YAML file, in place of the one that a run names.")
+    ] = None,
+    tuning: Annotated[
+        Tuning | None, typer.Option(help="Noise; the thesis' own for vio12, else physical.")
+    ] = None,
+    tune_on: Annotated[
+        str | None, typer.Option(help="Runs, by commas, that teach the tuning 'likelihood'; the first three.")
+    ] = None,
+    figures: Annotated[bool, typer.Option(help="Draw pictures into OUT/figures.")] = True,
+    layout: FormatOption = Format.auto,
+    mapping: Mapping = None,
+    repair: Repair = False,
+    json_file: Json = None,
+) -> None:
+    """Estimate motion and slip, and say how well."""
+    from pipelines.estimate import estimate
+    from pipelines.screens import print_estimates, progress_bar
+
+    runs, skipped = _load(data, layout, mapping, repair, align=False)
+    with progress_bar() as progress:
+        result = estimate(
+            runs,
+            filter_name.value,
+            robot=robot,
+            tuning=tuning and tuning.value,
+            out=out,
+            figures=figures,
+            tune_on=None if tune_on is None else [name.strip() for name in tune_on.split(",")],
+            progress=progress,
+        )
+    print_estimates({**result, "skipped": skipped}, _console())
+    _write_json(json_file, {**result, "skipped": skipped})
+
+
+@app.command("calibrate")
+def calibrate_command(
+    data: Data,
+    robot: Annotated[str, typer.Option(help="Robot by name, or its YAML file, to start from.")],
+    out: Annotated[Path | None, typer.Option(help="New YAML file with what was found.")] = None,
+    hard: Annotated[
+        str | None,
+        typer.Option(help="Labels of hard ground, by commas; those that slip next to nothing by default."),
+    ] = None,
+    layout: FormatOption = Format.auto,
+    mapping: Mapping = None,
+    repair: Repair = False,
+    json_file: Json = None,
+) -> None:
+    """Find zeros, ratio, biases, noise and time constants of a robot from its logs."""
+    from pipelines.calibrate import calibrate, print_calibration
+
+    result = calibrate(
+        data,
+        robot,
+        out,
+        hard=None if hard is None else [name.strip() for name in hard.split(",")],
+        layout=layout.value,
+        mapping=mapping,
+        repair=repair,
+    )
+    print_calibration(result, _console())
+    _write_json(json_file, result)
+
+
+@app.command("reproduce")
+def reproduce_command(
+    paper: Annotated[Paper, typer.Argument(help="Whose experiments to rerun in simulation.")],
+    out: Annotated[Path, typer.Option(help="Folder of the page.")] = Path("terrain-reproduce"),
+    seed: Annotated[int, typer.Option(min=0, help="Of all runs.")] = 0,
+    json_file: Json = None,
+) -> None:
+    """Rerun a paper's experiments in simulation, its figures beside ours."""
+    from pipelines.reproduce import print_reproduction, reproduce
+    from pipelines.screens import progress_bar
+
+    with progress_bar() as progress:
+        result = reproduce(paper.value, out, seed, progress)
+    print_reproduction(result, _console())
+    _write_json(json_file, result)
+
+
 @app.command("quickstart")
 def quickstart_command(
-    data: Data,
-    out: Annotated[Path, typer.Option(help="Folder of the imported runs and the report.")] = Path(
-        "terrain-report"
-    ),
+    data: Annotated[
+        Path | None, typer.Option("--data", help="Folder of labelled runs; without, runs are simulated.")
+    ] = None,
+    out: Annotated[Path, typer.Option(help="Folder of the runs and the report.")] = Path("terrain-report"),
     name: Annotated[str, typer.Option(help="Name of the registered model.")] = "quickstart",
     seed: Seed = 0,
     jobs: Jobs = 0,
     json_file: Json = None,
 ) -> None:
-    """Import, cross-validate, train, predict, and write a report."""
+    """Import or simulate runs, cross-validate, train, predict, and write a report."""
     from pipelines.crossval import CrossvalSettings
     from pipelines.quickstart import quickstart
-    from pipelines.screens import print_crossval, print_predictions, print_training, progress_bar
+    from pipelines.screens import (
+        print_crossval,
+        print_predictions,
+        print_slip,
+        print_training,
+        progress_bar,
+    )
 
     with progress_bar() as progress:
         result = quickstart(data, out, CrossvalSettings(seed=seed, n_jobs=jobs), name, progress)
+    if result["slip"]:
+        print_slip(result["slip"], _console())
     print_crossval(result["crossval"], _console())
     print_training(result["train"], _console())
     print_predictions(result["predict"], _console())
@@ -270,6 +444,18 @@ def _load(
     return load_runs(
         data, layout=layout.value, mapping=mapping, repair=repair, align=align, on_skip=skipped.append
     ), skipped
+
+
+def _interval(text: str) -> tuple[float, float]:
+    """Read ``START:END``."""
+    start, _, end = text.partition(":")
+    try:
+        interval = float(start), float(end)
+    except ValueError:
+        interval = 0.0, 0.0
+    if not 0.0 <= interval[0] < interval[1]:
+        raise ConfigError(f"--camera-lost is {text!r}; START:END in seconds is wanted, as in 10:13")
+    return interval
 
 
 def _names(signals: str) -> tuple[str, ...]:

@@ -39,7 +39,7 @@ PACKAGES = (
 """Packages whose versions decide what numbers come out."""
 
 WEAK_BELOW = 0.5
-WIDE = ("per_run",)
+WIDE = ("per_run", "motion", "slip")
 """Figures that take the whole width; they come after those that stand side by side."""
 
 HEADLINES = {
@@ -66,6 +66,14 @@ CAPTIONS = {
         "The curve shows what each further run brought; where it is still rising at its right end, more runs "
         "help."
     ),
+    "motion": (
+        "One run on grass: the filter (band: two standard deviations) beside what each sensor says of speed "
+        "and yaw rate, and its innovations, which should fill the grey band and no more."
+    ),
+    "slip": (
+        "The same run: rim speeds over the speed over ground, and the slip of each wheel between them, with "
+        "two standard deviations."
+    ),
     "importance": (
         "A long bar is an input that the model needs; related inputs share their weight, so that each "
         "alone looks small."
@@ -89,6 +97,7 @@ def html_report(result: Result, figures: Mapping[str, Figure]) -> str:
     sections = [
         _headline(crossval),
         _notes(crossval),
+        _slip_found(result.get("slip")),
         _figures(figures),
         _per_class(crossval),
         _extras(crossval),
@@ -219,6 +228,30 @@ def _figures(figures: Mapping[str, Figure]) -> str:
             f"<figcaption><b>Figure {number}.</b> {caption}</figcaption></figure>"
         )
     return f'<section><h2>Figures</h2><div class="figures">{"".join(drawn)}</div></section>'
+
+
+def _slip_found(rows: Sequence[Result] | None) -> str:
+    if not rows:
+        return ""
+    cells = [
+        f"<tr><th scope=row>{escape(str(row['terrain']))}</th><td>{row['n_runs']}</td>"
+        + "".join(
+            f"<td>{NOT_KNOWN if row[key] is None else format(row[key], form)}</td>"
+            for key, form in (
+                ("slip_mean", ".3f"),
+                ("slip_true_mean", ".3f"),
+                ("slip_rmse", ".4f"),
+                ("nees", ".2f"),
+            )
+        )
+        + "</tr>"
+        for row in rows
+    ]
+    head = ["terrain", "runs", "slip", "true slip", "RMSE of a run's mean", "NEES a state"]
+    return f"""<section><h2>From logs to slip</h2>{_table(head, cells, text=(0,))}
+<p class="small">The runs are simulated, with soil, slope, load, tyres and driving drawn anew for each; their
+steady slip is estimated from what the sensors say and set beside the truth. NEES: squared error over the
+variance that the filter states, 1 where it is honest.</p></section>"""
 
 
 def _per_class(crossval: Result) -> str:

@@ -8,7 +8,7 @@ from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
-from rich.table import Table
+from rich.table import Column, Table
 
 from pipelines import evaluation
 from pipelines.splits import counted
@@ -160,3 +160,61 @@ def _stretches(windows: list[dict[str, Any]]) -> Iterator[list[dict[str, Any]]]:
         rows.append(window)
     if rows:
         yield rows
+
+
+def print_estimates(result: dict[str, Any], console: Console) -> None:
+    """Print slip, its truth where it is known, and how consistent the filter was, a run a line."""
+    table = Table(
+        "run",
+        *(Column(name, justify="right") for name in ("slip", "std", "true", "stale s", "NEES", "NIS cam.")),
+        *(Column(name, justify="right") for name in ("speed RMSE", "dropped", "gated")),
+        title=f"filter {result['filter']}, {result['tuning']} noise",
+    )
+    for row in result["runs"]:
+        table.add_row(
+            row["run_id"],
+            _figure(row["slip_mean"], "{:+.4f}") + ("" if row["slip_observable"] else " blind"),
+            _figure(row["slip_std"], "{:.4f}"),
+            _figure(row["slip_true_mean"], "{:+.4f}"),
+            f"{row['stale_s']:.1f}",
+            _figure(row["nees"], "{:.2f}"),
+            _figure(row["nis"].get("camera_speed"), "{:.2f}"),
+            _figure(row["speed_rmse_mps"], "{:.4f}"),
+            str(row["n_dropped"]),
+            str(row["n_gated"]),
+        )
+    console.print(table)
+    if result["tuned"]:
+        scales = ", ".join(
+            f"{name} {scale:.3g} ({result['tuned']['status'][name]})"
+            for name, scale in result["tuned"]["scales"].items()
+        )
+        console.print(f"process variances scaled on {', '.join(result['tuned']['runs'])}: {scales}")
+    if not all(row["slip_observable"] for row in result["runs"]):
+        console.print(
+            "blind: nothing measured the speed over ground, so the figure is the wheels against themselves, "
+            "and the slip in the tracks is NaN"
+        )
+    if result["out"]:
+        console.print(f"runs with state and slip written to {result['out']}", highlight=False)
+    for sentence in result.get("skipped", []):
+        console.print(sentence, highlight=False)
+
+
+def print_slip(rows: list[dict[str, Any]], console: Console) -> None:
+    """Print estimated and true slip a terrain."""
+    right = [Column(name, justify="right") for name in ("runs", "slip", "true slip", "RMSE", "NEES")]
+    table = Table("terrain", *right, title="steady slip of the simulated runs")
+    for row in rows:
+        table.add_row(
+            row["terrain"],
+            str(row["n_runs"]),
+            *(_figure(row[key], "{:+.3f}") for key in ("slip_mean", "slip_true_mean")),
+            _figure(row["slip_rmse"], "{:.4f}"),
+            _figure(row["nees"], "{:.2f}"),
+        )
+    console.print(table)
+
+
+def _figure(value: float | None, form: str) -> str:
+    return "-" if value is None else form.format(value)

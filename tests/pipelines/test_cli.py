@@ -185,6 +185,50 @@ def test_an_output_that_cannot_be_written_is_told_before_the_work(refused, place
     refused(cannot, "predict", "--data", data, "--model", "m", "--json", place / "file" / "p.json")
 
 
+def test_what_cannot_be_simulated_or_estimated_is_one_sentence(refused, place, drive):
+    ask = ("simulate", "--robot", "agrimaro", "--out", place / "runs")
+    straight = ("--terrain", "grass", "--scenario", "straight")
+    refused("soil 'lava' is unknown", *ask, "--terrain", "lava", "--scenario", "straight")
+    refused("scenario 'loop' is unknown", *ask, "--terrain", "grass", "--scenario", "loop")
+    refused("go together", *ask, "--terrain", "course", "--scenario", "straight")
+    refused(
+        "too short for 'straight'", *ask, "--terrain", "grass", "--scenario", "straight", "--duration", "2"
+    )
+    refused("--grade is 60", *ask, *straight, "--grade", "60")
+    refused("--camera-lost is '9'; START:END", *ask, *straight, "--camera-lost", "9")
+    refused("--camera-lost is '9:4'; START:END", *ask, *straight, "--camera-lost", "9:4")
+    husky = ("simulate", "--robot", "husky", "--out", place / "runs", "--terrain", "grass")
+    refused("robot husky has the drive 'skid_steer'", *husky, "--scenario", "straight")
+    (place / "mine.yaml").write_text("name: mine\ndrive: swerve\nwheels: 3\n")
+    refused("key 'wheels' is unknown", "simulate", "--robot", place / "mine.yaml", *ask[3:], *straight)
+
+    data = keep([drive("r", "GRASS", 0, 4.0)], place)
+    refused("filter 'vio15' is not for robot husky", "estimate", "--data", data, "--filter", "vio15")
+    refused("is there already", "estimate", "--data", data, "--filter", "skid", "--out", data)
+    refused("husky", "calibrate", "--data", data, "--robot", "husky")
+    refused("is one of robot 'husky'", "calibrate", "--data", data, "--robot", "agrimaro")
+
+
+def test_from_simulated_logs_to_slip_on_the_command_line(terrain, place):
+    words = ("--robot", "agrimaro", "--terrain", "grass", "--scenario", "straight", "--duration", "8")
+    code, out, _ = terrain("simulate", *words, "--out", "logs", "--json", "sim.json")
+    assert (code, out) == (0, "1 runs of 8 s in all written to logs\n")
+    assert json.loads((place / "sim.json").read_text())["run_ids"] == ["grass_straight_01"]
+    code, _, err = terrain("simulate", *words, "--out", "logs")
+    assert code == 2
+    assert "is there already, and is left as it is" in err
+
+    ask = ("estimate", "--data", "logs", "--filter", "vio15", "--out", "runs", "--json", "est.json")
+    code, out, err = terrain(*ask)
+    assert code == 0, err
+    (row,) = json.loads((place / "est.json").read_text())["runs"]
+    assert f"{row['slip_mean']:+.4f}" in out
+    assert (place / "runs" / "grass_straight_01" / "slip.parquet").is_file()
+    code, out, _ = terrain("estimate", "--data", "logs", "--filter", "encoder12")
+    assert code == 0
+    assert "blind" in out
+
+
 @pytest.mark.parametrize(
     "words",
     [
@@ -271,7 +315,10 @@ def test_help_loads_nothing_heavy(tmp_path):
     found = python("-c", code, cwd=tmp_path)
     assert found.returncode == 0, found.stderr
     assert "loaded: []" in found.stdout
-    for command in ("import", "inspect", "train", "crossval", "predict", "quickstart"):
+    for command in (
+        *("import", "inspect", "train", "crossval", "predict", "quickstart"),
+        *("simulate", "estimate", "calibrate", "reproduce"),
+    ):
         assert command in found.stdout
     assert "numpy" in python("-X", "importtime", "-c", "import features.windows").stderr  # the test can fail
 
@@ -287,8 +334,17 @@ def test_the_choices_of_the_command_line_are_those_that_there_are():
     """They are written twice, so that help need not load what offers them."""
     from pipelines import cli
     from pipelines.datasets import LAYOUTS
+    from pipelines.estimate import FILTERS, TUNINGS
     from pipelines.recipes import RECIPES
+    from pipelines.reproduce import PAPERS
     from pipelines.splits import PROTOCOLS
 
-    for choices, offered in ((cli.Format, LAYOUTS), (cli.Protocol, PROTOCOLS), (cli.Recipe, RECIPES)):
+    for choices, offered in (
+        (cli.Format, LAYOUTS),
+        (cli.Protocol, PROTOCOLS),
+        (cli.Recipe, RECIPES),
+        (cli.FilterName, FILTERS),
+        (cli.Tuning, TUNINGS),
+        (cli.Paper, PAPERS),
+    ):
         assert {choice.value for choice in choices} == set(offered)

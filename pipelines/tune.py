@@ -1,0 +1,77 @@
+"""Process noise of a filter from runs, by likelihood: ``terrain estimate --tuning likelihood``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from terrain.errors import DataError
+from terrain.estimation.ekf import FilterModel, Noise
+from terrain.estimation.measurements import measurement_table
+from terrain.estimation.tuning import NoiseGroup, tune_noise
+from terrain.records import RunLog
+from terrain.robots import Robot
+
+MAX_RUNS = 3
+"""So many runs teach unless they are named: the likelihood of each is asked for a hundred times."""
+
+MAX_EVALUATIONS = 200
+
+GROUPS = ("speed", "yaw_rate", "accel", "steer", "slip", "effective_track", "gyro_bias")
+"""States are tuned together whose names begin alike.
+
+Measurement noise stays: behind the common low-pass an error outlives a sample, and a likelihood that takes
+each for new would drive the variances of the sensors to nothing."""
+
+
+def chosen_runs(runs: Sequence[RunLog], names: Sequence[str] | None) -> list[RunLog]:
+    """Return the runs named, or the first few.
+
+    Raises
+    ------
+    DataError
+        if there is no run of a name.
+    """
+    if names is None:
+        return list(runs[:MAX_RUNS])
+    known = {run.run_id: run for run in runs}
+    for name in names:
+        if name not in known:
+            raise DataError(f"there is no run {name!r} to tune on; there are {', '.join(known)}")
+    return [known[name] for name in names]
+
+
+def tuned_noise(
+    model: FilterModel, noise: Noise, runs: Sequence[RunLog], robot: Robot
+) -> tuple[Noise, dict[str, Any]]:
+    """Return noise under which the runs are most likely, and what became of each group.
+
+    Parameters
+    ----------
+    model : the filter
+    noise : where to start
+    runs : to tune on
+    robot : whose runs they are
+
+    Returns
+    -------
+    Noise, dict that JSON can hold
+        ``runs, log_likelihood_before, log_likelihood_after, scales`` (of variances) and ``status`` by group.
+    """
+    tables = []
+    for run in runs:
+        table = measurement_table(run, robot)
+        tables.append((table.time_s, table.columns(model.rows)))
+    grouped = [
+        NoiseGroup(name, tuple(state for state in model.states if state.startswith(name))) for name in GROUPS
+    ]
+    found, report = tune_noise(
+        model, tables, noise, [group for group in grouped if group.states], MAX_EVALUATIONS
+    )
+    return found, {
+        "runs": [run.run_id for run in runs],
+        "log_likelihood_before": report.log_likelihood_before,
+        "log_likelihood_after": report.log_likelihood_after,
+        "scales": {group.name: group.scale for group in report.groups},
+        "status": {group.name: group.status for group in report.groups},
+    }
