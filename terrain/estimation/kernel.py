@@ -209,7 +209,6 @@ def _condition_on(
     gain: Array,
     left: Array,
     step: Array,
-    variance: Array,
 ) -> bool:
     """Condition dx and P on one row; return False, and leave them, where that leads out of this world.
 
@@ -218,17 +217,14 @@ def _condition_on(
     """
     d = dx.size
     per_s = 1.0 / (spread + r)
-    for i in range(d):
-        gain[i] = g[i] * per_s
-    for i in range(d):
-        left[i] = r * gain[i] - (g[i] - gain[i] * spread)
-    for i in range(d):
-        step[i] = dx[i] + gain[i] * nu
-    for i in range(d):
-        variance[i] = (p[i, i] - gain[i] * g[i]) + left[i] * gain[i]
     n_bad = 0
     for i in range(d):
-        n_bad += not ((abs(x[i] + step[i]) <= LARGEST) & (variance[i] > 0.0) & (variance[i] <= _WIDEST))
+        k = g[i] * per_s
+        rest = r * k - (g[i] - k * spread)
+        moved = dx[i] + k * nu
+        variance = (p[i, i] - k * g[i]) + rest * k
+        gain[i], left[i], step[i] = k, rest, moved
+        n_bad += not ((abs(x[i] + moved) <= LARGEST) & (variance > 0.0) & (variance <= _WIDEST))
     if n_bad > 0:
         return False
     for i in range(d):
@@ -316,8 +312,8 @@ def run(
     h, h_cols, n_h_cols = np.zeros((m, d)), np.zeros((m, d), np.int64), np.zeros(m, np.int64)
     z_hat, nus, rows = np.zeros(m), np.zeros(m), np.zeros(m, np.int64)
     x_next, x_before, p_before, chosen = np.zeros(d), np.zeros(d), np.zeros((d, d)), np.zeros(d, np.bool_)
-    dx, dx_before, g, gain, left = np.zeros(d), np.zeros(d), np.zeros(d), np.zeros(d), np.zeros(d)
-    step, variance = np.zeros(d), np.zeros(d)
+    dx, dx_before = np.zeros(d), np.zeros(d)
+    g, gain, left, step = np.zeros(d), np.zeros(d), np.zeros(d), np.zeros(d)
     uses, squares, dofs = np.zeros(n_sensors, np.int64), np.zeros(n_sensors), np.zeros(n_sensors, np.int64)
     keep = mean.shape[0] > 0
 
@@ -386,7 +382,7 @@ def run(
                         total += nu * nu / s
                         likelihood -= 0.5 * (math.log(2.0 * math.pi * s) + nu * nu / s)
                         if definite and (c < n_rows - 1 or total <= threshold):
-                            sound &= _condition_on(nu, spread, r, x, dx, p, g, gain, left, step, variance)
+                            sound &= _condition_on(nu, spread, r, x, dx, p, g, gain, left, step)
                     if attempt == 0:
                         square = total
                     if total <= threshold and sound and definite:

@@ -194,7 +194,7 @@ def test_quickstart_goes_all_the_way_to_a_report_in_one_file(
     assert "http://" not in page.replace("http://www.w3.org", "")
     assert "<script" not in page
     assert {task for task, _, _ in told} >= {
-        "import",
+        "write runs",
         "features",
         "grouped",
         "fit on all runs",
