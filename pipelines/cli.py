@@ -256,8 +256,13 @@ def predict_command(
 @app.command("simulate")
 def simulate_command(
     robot: Annotated[str, typer.Option(help="Robot by name, or its YAML file.")],
-    terrain: Annotated[str, typer.Option(help="Name of a soil, 'all' for each in turn, or 'course'.")],
-    scenario: Annotated[str, typer.Option(help="What is driven; 'course' goes with the terrain 'course'.")],
+    terrain: Annotated[
+        str, typer.Option(help="Name of a soil, 'all' for each in turn, 'course' or 'bench'.")
+    ],
+    scenario: Annotated[
+        str,
+        typer.Option(help="What is driven; 'course' on 'course', 'six_positions' on 'bench'."),
+    ],
     out: Annotated[Path, typer.Option(help="Folder of the new run folders.")],
     runs: Annotated[int, typer.Option(min=1, help="Runs a terrain.")] = 1,
     duration: Annotated[float | None, typer.Option(help="Length of a run in s.")] = None,

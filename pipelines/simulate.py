@@ -14,6 +14,7 @@ from terrain.errors import ConfigError, LogError
 from terrain.logs.write import run_folder, write_run
 from terrain.records import RunLog
 from terrain.robots import Robot, load_robot
+from terrain.simulation.bench import POSITIONS, TURN_S, six_positions_log
 from terrain.simulation.conditions import Conditions, Faults, draw_conditions, load_spread
 from terrain.simulation.scenario import make_scenario
 from terrain.simulation.sensors import Gnss
@@ -22,6 +23,9 @@ from terrain.terramechanics.soil import load_soil, scattered, soil_names
 
 COURSE = "course"
 """Word for a way over all terrains instead of the name of one."""
+
+BENCH = "six_positions"
+"""Word for the IMU alone on a bench, in place of a scenario; the terrain ``bench`` goes with it."""
 
 EVERY = "all"
 """Word for each terrain in turn."""
@@ -49,7 +53,8 @@ def simulate_run(
     ----------
     robot : robot with all sections
     terrain : name of a soil, or ``course`` for all of them in one run
-    scenario : name of a scenario; ``course`` goes with the terrain ``course``
+    scenario : name of a scenario; ``course`` goes with the terrain ``course``, ``six_positions`` (the IMU
+        alone, for calibration) with ``bench``
     seed, number : which draw
     duration_s : length; the scenario's own by default
     vary : draw soil, slope, load, tyres and roughness for this run as ``data/soils`` and ``data/spread`` tell
@@ -62,6 +67,8 @@ def simulate_run(
     ConfigError
         if the terrain or scenario is unknown or they do not go together.
     """
+    if scenario == BENCH:
+        return _bench(robot, terrain, seed, number, duration_s)
     if (terrain == COURSE) != (scenario == COURSE):
         raise ConfigError("terrain 'course' and scenario 'course' go together: give both or neither")
     names = soil_names() if terrain == COURSE else (terrain,)
@@ -83,6 +90,17 @@ def simulate_run(
         conditions=conditions,
         faults=Faults() if faults is None else faults,
         gnss=gnss,
+    )
+
+
+def _bench(robot: Robot, terrain: str, seed: int, number: int, duration_s: float | None) -> RunLog:
+    """Return the log of an IMU that is held still in six positions, for ``terrain calibrate``."""
+    if terrain != "bench":
+        raise ConfigError(f"scenario {BENCH!r} is done on a bench: give the terrain 'bench', not {terrain!r}")
+    hold_s = 5.0 if duration_s is None else duration_s / len(POSITIONS) - TURN_S
+    key = np.random.SeedSequence([seed, zlib.crc32(BENCH.encode()), number])
+    return six_positions_log(
+        robot, key, hold_s=hold_s, run_id=run_id_of(terrain, scenario=BENCH, number=number)
     )
 
 
@@ -148,7 +166,7 @@ def simulate_runs(
         )
         write_run(run, out)
         run_ids.append(run.run_id)
-        total_s += run.streams["truth"].duration_s
+        total_s += run.streams["imu"].duration_s
         progress("simulate", done + 1, len(jobs))
     return {
         "out": str(out),

@@ -114,3 +114,13 @@ def test_progress_counts_the_runs(tmp_path):
         progress=lambda *args: told.append(args),
     )
     assert told == [("simulate", 1, 2), ("simulate", 2, 2)]
+
+
+def test_an_imu_on_a_bench_is_simulated_for_calibration(tmp_path):
+    result = simulate_runs("agrimaro", "bench", "six_positions", tmp_path / "logs", runs=2)
+    assert result["run_ids"] == ["bench_six_positions_01", "bench_six_positions_02"]
+    one, two = (read_run(tmp_path / "logs" / run_id) for run_id in result["run_ids"])
+    assert set(one.streams) == {"imu"}
+    assert one.streams["imu"].values[0, 0] != two.streams["imu"].values[0, 0]
+    with pytest.raises(ConfigError, match="give the terrain 'bench', not 'grass'"):
+        simulate_runs("agrimaro", "grass", "six_positions", tmp_path / "more")
