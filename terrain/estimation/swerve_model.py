@@ -15,21 +15,26 @@ from terrain.records import Array
 LARGEST_SLIP_RATIO = 0.95
 """slip14's wheel row has a pole at 1: it is evaluated no nearer."""
 
-# Places in `params`: radius, places of the wheels, of camera and antenna, and which of the latter there are.
+# Places in `params`: radius, places of the wheels, of camera and antenna, which of the latter there are, and
+# how fast an acceleration fades, in 1/s.
 _RADIUS, _WHEELS, _CAMERA_X, _CAMERA_Y, _ANTENNA_X, _ANTENNA_Y = 0, 1, 7, 8, 9, 10
-_HAS_CAMERA, _HAS_GNSS = 11, 12
+_HAS_CAMERA, _HAS_GNSS, _FADING = 11, 12, 13
 # Places in the state that all filters share.
 _X, _Y, _YAW, _VX, _VY, _W, _AX, _AY = range(8)
 
 
 @njit(PROPAGATE, cache=True)
 def propagate(x: Array, dt: float, params: Array, x_next: Array, f: Array) -> None:
-    """(4.30)-(4.35): the motion; whatever comes behind its eight states is a random walk."""
+    """(4.30)-(4.35): the motion, accelerations that fade; what comes behind these eight is a random walk."""
     cos, sin = math.cos(x[_YAW]), math.sin(x[_YAW])
     east, north = x[_VX] * cos - x[_VY] * sin, x[_VX] * sin + x[_VY] * cos
     for i in range(x.size):
         x_next[i] = x[i]
         f[i, i] = 1.0
+    left = math.exp(-dt * params[_FADING])
+    for i in (_AX, _AY):
+        x_next[i] = left * x[i]
+        f[i, i] = left
     x_next[_X] += dt * east
     f[_X, _YAW], f[_X, _VX], f[_X, _VY] = -dt * north, dt * cos, -dt * sin
     x_next[_Y] += dt * north

@@ -3,7 +3,7 @@
 import numpy as np
 
 from terrain.estimation.consistency import sample_from_model
-from terrain.estimation.ekf import FilterSettings, Noise, run_filter
+from terrain.estimation.ekf import FilterSettings, run_filter
 from terrain.estimation.innovations import innovations
 from terrain.estimation.swerve_filters import default_noise, make_filter
 from terrain.robots import load_robot
@@ -11,21 +11,9 @@ from terrain.robots import load_robot
 ROBOT = load_robot("agrimaro")
 
 
-def calm_noise(model):
-    """Walks of a robot's size: what is drawn stays where a linearisation holds."""
-    default = default_noise("vio15", ROBOT)
-    walk, start = np.diag(default.process_variance).copy(), np.diag(default.initial_variance).copy()
-    for i, state in enumerate(model.states):
-        if state.startswith(("accel", "yaw_rate", "steer")):
-            walk[i], start[i] = 0.05**2, 0.05**2
-        if state.startswith(("speed", "slip_speed", "yaw")):
-            start[i] = 0.1**2
-    return Noise(walk, default.measurement_variance, start)
-
-
 def filtered(seed=0):
     model = make_filter("vio15", ROBOT)
-    noise = calm_noise(model)
+    noise = default_noise("vio15", ROBOT)
     time_s, _, drawn = sample_from_model(model, noise, 1500, 0.02, np.random.default_rng(seed))
     z = np.array(drawn)
     z[200:250, model.rows.index("camera_speed_x_mps")] = np.nan

@@ -335,7 +335,7 @@ def calm_noise(model):
 
 def test_vio15_is_consistent_on_what_its_own_equations_draw():
     model, n_runs, n = make_filter("vio15", ROBOT), 50, 2001
-    noise = calm_noise(model)
+    noise = default_noise("vio15", ROBOT)
     instants = np.arange(100, n, 100)  # 20, two seconds apart: errors last; innovations do not
     squares = {"nees": np.zeros(20), "nis": np.zeros(n)}
     for seed in range(n_runs):
