@@ -240,7 +240,10 @@ def summary(estimate: Estimate) -> dict[str, Any]:
 def enriched(estimate: Estimate) -> RunLog:
     """Return the run with what was estimated beside what was measured.
 
-    Rim speeds join the stream ``wheels``; the streams ``estimator`` and ``slip`` are new.
+    Rim speeds join the stream ``wheels``.  New are ``slip``; ``estimator``, the states that windows are made
+    of; and ``state``, of which no features are made: every state and ``std_<state>``,
+    ``std_slip_<wheel>_ratio``, ``stale_ratio`` (1 where nothing measured the speed over ground lately) and
+    ``nis_<sensor>_ratio``.
     """
     run = with_rim_speeds(estimate.run, estimate.robot)
     track = estimate.track
@@ -249,7 +252,20 @@ def enriched(estimate: Estimate) -> RunLog:
     streams = dict(run.streams)
     streams["estimator"] = Stream(track.time_s, values, channels)
     streams["slip"] = estimate.slip.as_stream()
+    streams["state"] = _state_stream(estimate)
     return RunLog(run.run_id, run.robot, streams, run.labels, run.source, run.dropped)
+
+
+def _state_stream(estimate: Estimate) -> Stream:
+    """Return all that the filter says; what it never knew is left out."""
+    track, slip = estimate.track, estimate.slip
+    columns = {state: track.state(state) for state in track.states}
+    columns |= {f"std_{state}": track.std(state) for state in track.states}
+    columns |= {f"std_slip_{wheel}_ratio": slip.slip_std[:, i] for i, wheel in enumerate(slip.wheels)}
+    columns["stale_ratio"] = slip.stale.astype(float)
+    columns |= {f"nis_{sensor}_ratio": track.nis[:, k] for k, sensor in enumerate(track.sensors)}
+    known = {name: column for name, column in columns.items() if np.isfinite(column).any()}
+    return Stream(track.time_s, np.column_stack(list(known.values())), tuple(known))
 
 
 def estimate(

@@ -61,6 +61,9 @@ UNIT_SCALES: dict[str, tuple[str, float]] = {
 SIGNAL_SETS: tuple[str, ...] = ("imu", "wheels", "currents", "slip", "estimator")
 """Groups of signals that can be switched off by name."""
 
+NO_FEATURES: tuple[str, ...] = ("truth", "commands", "odometry", "state")
+"""Streams that no feature is made of."""
+
 _SET_OF_QUANTITY: dict[str, str] = {
     "gyro": "imu",
     "accel": "imu",
@@ -99,6 +102,6 @@ def signal_set_of(stream: str, channel: str) -> str | None:
     >>> signal_set_of("wheels", "current_left_a"), signal_set_of("truth", "speed_x_mps")
     ('currents', None)
     """
-    if stream in ("truth", "commands", "odometry"):
+    if stream in NO_FEATURES:
         return None
     return _SET_OF_STREAM.get(stream) or _SET_OF_QUANTITY.get(channel.partition("_")[0])

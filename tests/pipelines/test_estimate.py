@@ -10,6 +10,7 @@ from pipelines.estimate import FILTERS, enriched, estimate, estimate_run, summar
 from pipelines.simulate import simulate_run
 from terrain.errors import ConfigError, DataError, LogError
 from terrain.logs.read import read_run
+from terrain.logs.schema import signal_set_of
 from terrain.records import RunLog, Stream
 from terrain.robots import load_robot
 from terrain.simulation.conditions import Faults
@@ -251,6 +252,12 @@ def test_runs_are_written_with_their_tracks_and_pictures(straight, tmp_path):
     run = read_run(tmp_path / straight.run_id)
     assert run.streams["slip"].channels == ("slip_1_ratio", "slip_2_ratio", "slip_3_ratio")
     assert run.streams["estimator"].channels[0] == "speed_x_mps"
+    state = run.streams["state"]
+    assert {"slip_speed_1_mps", "std_slip_1_ratio", "stale_ratio", "nis_camera_speed_ratio"} <= set(
+        state.channels
+    )
+    assert (state.channel("std_speed_x_mps") > 0).all()
+    assert all(signal_set_of("state", channel) is None for channel in state.channels)
     assert {"speed_1_mps", "current_1_a", "motor_1_radps"} <= set(run.streams["wheels"].channels)
     assert run.labels == straight.labels
     assert sorted(file.name for file in (tmp_path / "figures").iterdir()) == [
