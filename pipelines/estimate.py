@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ from terrain.atomic import ensure_writable
 from terrain.errors import ConfigError, LogError
 from terrain.estimation.consistency import consistency_report, nees
 from terrain.estimation.ekf import FilterModel, FilterSettings, Noise, run_filter
+from terrain.estimation.heading import gnss_heading
 from terrain.estimation.innovations import Innovations, innovations
 from terrain.estimation.measurements import GNSS_ROWS, MeasurementTable, measurement_table
 from terrain.estimation.reference import true_states
@@ -22,7 +23,7 @@ from terrain.estimation.skid_filter import make_skid_filter, skid_noise
 from terrain.estimation.swerve_filters import default_noise, make_filter, thesis_noise
 from terrain.kinematics.rim import with_rim_speeds
 from terrain.logs.write import run_folder, write_run
-from terrain.records import GATED, Array, RunLog, SlipTrack, StateTrack, Stream
+from terrain.records import GATED, USED, Array, RunLog, SlipTrack, StateTrack, Stream
 from terrain.robots import Robot, load_robot
 from terrain.slip import SlipFigures, blind_slip, slip_figures, wheel_slip
 
@@ -38,6 +39,9 @@ OWN_TUNING = {"vio12": "thesis"}
 
 GATE_PROBABILITY = 1.0 - 1e-6
 """Five standard deviations: a wheel that starts to slip is a surprise of four, and no fault."""
+
+REOPEN_AFTER_S = 0.2
+"""Spikes last a sample or two; what disagrees for longer is the ground's doing, a brake or a bump."""
 
 THESIS_SAMPLE_TIME_S = 0.02
 """Q of the thesis is a step's; the sample time that it does not print is that of the wheels stream."""
@@ -101,7 +105,7 @@ def estimate_run(
     *,
     tuning: str | None = None,
     noise: Noise | None = None,
-    initial_yaw_rad: float = 0.0,
+    initial_yaw_rad: float | None = None,
 ) -> Estimate:
     """Filter one run.
 
@@ -112,7 +116,8 @@ def estimate_run(
     name : one of :data:`FILTERS`
     tuning : one of :data:`TUNINGS`; the filter's own (:data:`OWN_TUNING`) by default
     noise : what was tuned on chosen runs, or any other noise, in place of the physical
-    initial_yaw_rad : heading at the start in the frame of the GNSS, east 0
+    initial_yaw_rad : heading at the start in the frame of the GNSS, east 0; found from the drive by default,
+        and where the drive does not tell it the GNSS is left out and counted
 
     Raises
     ------
@@ -123,14 +128,20 @@ def estimate_run(
     """
     model, usual = model_and_noise(run, robot, name, tuning)
     thesis = _tuning(name, tuning) == "thesis"
-    table = measurement_table(
-        run,
-        robot,
-        ema_alpha=THESIS_EMA_ALPHA if thesis and name == "vio12" else None,
-        initial_yaw_rad=initial_yaw_rad,
-    )
+    ema_alpha = THESIS_EMA_ALPHA if thesis and name == "vio12" else None
+    yaw_rad = initial_yaw_rad or 0.0
+    table = measurement_table(run, robot, ema_alpha=ema_alpha, initial_yaw_rad=yaw_rad)
+    if initial_yaw_rad is None and set(GNSS_ROWS) & set(model.rows) and name != "skid":
+        yaw_rad = gnss_heading(table, robot)
+        if math.isnan(yaw_rad):
+            n_unused = len(run.streams["gnss"])
+            run = replace(run, streams={kind: run.streams[kind] for kind in run.streams if kind != "gnss"})
+            found = estimate_run(run, robot, name, tuning=tuning, initial_yaw_rad=0.0)
+            dropped = {**found.table.dropped, "gnss: heading not told by the drive": n_unused}
+            return replace(found, table=replace(found.table, dropped=dropped))
+        table = measurement_table(run, robot, ema_alpha=ema_alpha, initial_yaw_rad=yaw_rad)
     noise = _with_gnss_variance(noise or usual, model, table)
-    settings = FilterSettings(gate_probability=1.0 if thesis else GATE_PROBABILITY)
+    settings = FilterSettings(1.0 if thesis else GATE_PROBABILITY, REOPEN_AFTER_S)
     track = run_filter(model, noise, table.time_s, table.columns(model.rows), settings)
     table = table.at(track.time_s)
     slip, blind = wheel_slip(track, table, robot), blind_slip(track, table, robot)
@@ -149,9 +160,16 @@ def estimate_run(
         track,
         slip,
         blind,
-        slip_figures(shown, speed_mps, track.time_s),
-        true_states(run, track, robot, lag_s),
+        slip_figures(shown, speed_mps, track.time_s, _rolling(table, robot)),
+        true_states(run, track, robot, lag_s, yaw_rad),
     )
+
+
+def _rolling(table: MeasurementTable, robot: Robot) -> Array:
+    """Return the direction (n, wheels) in which each wheel rolls: -1 backward, else 1."""
+    unit = "radps" if robot.drive == "swerve" else "mps"
+    rates = table.columns([f"wheel_{wheel}_{unit}" for wheel in robot.wheels])
+    return np.where(rates < 0.0, -1.0, 1.0)
 
 
 def model_and_noise(
@@ -198,19 +216,20 @@ def _with_gnss_variance(noise: Noise, model: FilterModel, table: MeasurementTabl
 def summary(estimate: Estimate) -> dict[str, Any]:
     """Return what ``terrain estimate --json`` holds of a run; None where something is not known.
 
-    ``slip_mean`` of a filter without a reference of speed is its blind figure, and ``slip_observable`` is
-    false.  ``nis`` is the mean squared innovation a degree of freedom of each sensor, ``nees`` the mean
-    squared error of speeds, yaw rate and slip speeds over its covariance, a state.  ``consistency`` says of
-    each sensor (NIS) and, where there is a truth, of each group of states (NEES) whether it is within its
-    chi-square bounds.
+    Slips are positive in traction whichever way a wheel rolls.  ``slip_mean`` of a filter without a
+    reference of speed is its blind figure, and ``slip_observable`` is false.  ``nis`` is the mean squared
+    innovation a degree of freedom of each sensor, of what was used; ``nees`` the mean squared error of
+    speeds, yaw rate and slip speeds over its covariance, a state.  ``consistency`` says of each sensor (NIS)
+    and, where there is a truth, of each group of states (NEES) whether it is within its chi-square bounds.
     """
     track, slip = estimate.track, estimate.slip
     steady = estimate.figures.steady
     steps_s = np.diff(track.time_s, append=track.time_s[-1:])
+    used = track.use == USED
     counted = {
-        sensor: float(np.nansum(track.nis[:, k]) / dof)
+        sensor: float(np.nansum(track.nis[used[:, k], k]) / dof)
         for k, sensor in enumerate(track.sensors)
-        if (dof := int(track.nis_dof[:, k].sum()))
+        if (dof := int(track.nis_dof[used[:, k], k].sum()))
     }
     return {
         "run_id": estimate.run.run_id,
@@ -306,16 +325,20 @@ def estimate(
         for run in runs:
             if (folder := run_folder(run.run_id, out)).exists():
                 raise LogError(f"{folder}: is there already, and is left as it is; choose another --out")
-    tuning, noise, tuned = _tuning(name, tuning), None, None
+    tuning, taught_noise, tuned = _tuning(name, tuning), None, None
     if tuning == "likelihood":
         from pipelines.tune import chosen_runs, tuned_noise
 
         teachers = chosen_runs(runs, tune_on)
         taught = load_robot(robot or teachers[0].robot)
-        noise, tuned = tuned_noise(*model_and_noise(teachers[0], taught, name), teachers, taught)
+        taught_noise, tuned = tuned_noise(*model_and_noise(teachers[0], taught, name), teachers, taught)
     rows = []
     for done, run in enumerate(runs):
-        found = estimate_run(run, load_robot(robot or run.robot), name, tuning=tuning, noise=noise)
+        described, noise = load_robot(robot or run.robot), None
+        if taught_noise is not None:  # of the process alone: not every run has the teachers' sensors
+            _, own = model_and_noise(run, described, name, tuning)
+            noise = Noise(taught_noise.process_variance, own.measurement_variance, own.initial_variance)
+        found = estimate_run(run, described, name, tuning=tuning, noise=noise)
         rows.append(summary(found))
         if out is not None:
             write_run(enriched(found), out)
@@ -334,7 +357,7 @@ def estimate(
 
 
 def _true_slip(estimate: Estimate) -> Array:
-    """Return the true slip ratio (n, wheels) at each instant of the track; NaN where there is no truth."""
+    """Return the true slip (n, wheels), positive in traction, at each instant; NaN without a truth."""
     shape = estimate.slip.slip_ratio.shape
     truth = estimate.run.streams.get("truth")
     if truth is None:
@@ -343,7 +366,8 @@ def _true_slip(estimate: Estimate) -> Array:
     for wheel in estimate.slip.wheels:
         slip = truth.channel(f"slip_{wheel}_ratio")
         at = np.clip(np.searchsorted(truth.time_s, estimate.track.time_s), 0, len(truth) - 1)
-        columns.append(slip[at])
+        rolling = np.where(truth.channel(f"wheel_{wheel}_radps") < 0.0, -1.0, 1.0)
+        columns.append((slip * rolling)[at])
     return np.column_stack(columns)
 
 

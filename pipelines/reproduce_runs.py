@@ -11,13 +11,12 @@ from matplotlib.figure import Figure
 from pipelines.drawing import finished, new_figure, styled
 from pipelines.estimate import Estimate
 from pipelines.simulate import simulate_run
-from terrain.estimation.measurements import low_pass
-from terrain.estimation.reference import LONGEST_STEP_S, rim_and_ground_speed
+from terrain.estimation.reference import lagged_slip
 from terrain.records import Array, RunLog
 from terrain.robots import Robot
 from terrain.simulation.conditions import Faults
 from terrain.simulation.scenario import STAND_S
-from terrain.slip import slip_figures, slip_ratio
+from terrain.slip import slip_figures
 
 RUNS, FEW_RUNS = 5, 2
 """How many runs a figure is the mean of, and how many when it is only tried out."""
@@ -55,11 +54,8 @@ def lagged_truth(run: RunLog, robot: Robot) -> Curve:
     """Return the true slip behind the encoders' low-pass: the best that can be estimated."""
     truth = run.streams["truth"]
     lag_s = robot.equipment.sensors.encoder_time_constant_s
-    rim, ground = (
-        np.column_stack([low_pass(truth.time_s, wheel, lag_s, LONGEST_STEP_S) for wheel in speeds.T])
-        for speeds in rim_and_ground_speed(truth, robot)
-    )
-    return truth.time_s, slip_ratio(rim, ground), ground.mean(axis=1)
+    slip, ground = lagged_slip(truth, robot, lag_s)
+    return truth.time_s, slip, ground.mean(axis=1)
 
 
 def true_slip(found: Estimate) -> Array:

@@ -23,11 +23,9 @@ from pipelines.drawing import (
 )
 from pipelines.estimate import Estimate
 from terrain.atomic import atomic_write
-from terrain.estimation.measurements import low_pass
-from terrain.estimation.reference import rim_and_ground_speed
+from terrain.estimation.reference import lagged_slip
 from terrain.kinematics.swerve import forward
 from terrain.records import GATED, Array
-from terrain.slip import slip_ratio
 
 GREEN = CLASS_COLOURS[2]
 ORANGE = CLASS_COLOURS[1]
@@ -183,12 +181,8 @@ def _true_slip(estimate: Estimate) -> Array | None:
     if truth is None:
         return None
     lag_s = estimate.robot.sensors.encoder_time_constant_s if estimate.robot.sensors else 0.0
-    speeds = []
-    for speed in rim_and_ground_speed(truth, estimate.robot):
-        smooth = [low_pass(truth.time_s, column, lag_s, np.inf) for column in speed.T]
-        speeds.append(np.column_stack([np.interp(estimate.track.time_s, truth.time_s, s) for s in smooth]))
-    rim, ground = speeds
-    return slip_ratio(rim, ground)
+    slip, _ = lagged_slip(truth, estimate.robot, lag_s)
+    return np.column_stack([np.interp(estimate.track.time_s, truth.time_s, wheel) for wheel in slip.T])
 
 
 def _encoder_twist(estimate: Estimate) -> Array:

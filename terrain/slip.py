@@ -176,13 +176,17 @@ class SlipFigures:
     wheel_peak: Array
 
 
-def slip_figures(slip: SlipTrack, speed_mps: Array, time_s: Array) -> SlipFigures:
+def slip_figures(
+    slip: SlipTrack, speed_mps: Array, time_s: Array, rolling: Array | None = None
+) -> SlipFigures:
     """Return the figures of a run: steady slip, and the peak of its transients.
 
     Parameters
     ----------
     slip : of a filter; stale samples count as long as they are no NaN
     speed_mps, time_s : (k,) speed of the robot, on any clock
+    rolling : (n, wheels) -1 where a wheel rolls backward, else 1: means are of slip positive in traction
+        then, so that ways ahead and back do not cancel; without, slip counts as it is
 
     Notes
     -----
@@ -199,7 +203,8 @@ def slip_figures(slip: SlipTrack, speed_mps: Array, time_s: Array) -> SlipFigure
     started = slip.time_s - slip.time_s[:1] >= STEADY_BEFORE_S - 1e-9
     moving = speed > STEADY_SPEED_MPS
     steady = moving & started & (change < STEADY_CHANGE_MPS)
-    calm, wild = slip.slip_ratio[steady], np.abs(slip.slip_ratio[moving & ~steady])
+    ratio = slip.slip_ratio if rolling is None else slip.slip_ratio * rolling
+    calm, wild = ratio[steady], np.abs(ratio[moving & ~steady])
     wheel_peak = np.array([_of_known(np.max, wheel) for wheel in wild.T])
     return SlipFigures(
         steady=read_only(steady, np.bool_),
@@ -300,6 +305,16 @@ def _rim_speed(table: MeasurementTable, robot: Robot, wheel: str) -> Array:
 
 
 def _rim_std_mps(robot: Robot) -> float:
-    if robot.sensors is None or robot.motors is None:
+    """Return the scatter of a rim speed: the driver's noise, and the ripple of Hall steps.
+
+    Each step of the wheel by ``2 pi / steps`` lifts what the driver's low-pass reports by that over its time
+    constant, and until the next it falls again: a saw-tooth of standard deviation height / sqrt(12).
+    """
+    sensors, motors = robot.sensors, robot.motors
+    if sensors is None or motors is None:
         return float("nan")
-    return robot.sensors.motor_std_radps / robot.motors.reduction_ratio * robot.wheel_radius_m
+    noise = sensors.motor_std_radps / motors.reduction_ratio
+    step_rad = 2 * np.pi / (sensors.hall_steps_ratio * motors.reduction_ratio)
+    lag_s = sensors.encoder_time_constant_s
+    ripple = step_rad / lag_s / np.sqrt(12.0) if lag_s > 0 else 0.0
+    return float(np.hypot(noise, ripple) * robot.wheel_radius_m)

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from terrain.estimation.ekf import FilterModel, Noise
+from terrain.estimation.ekf import FilterModel, FilterSettings, Noise
 from terrain.records import Array, StateTrack
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Innovations:
-    """Measurement minus prediction at each instant of a track; NaN at the first and where none was.
+    """Measurement minus prediction at each instant of a track; NaN where there is none, as after a gap.
 
     Parameters
     ----------
@@ -33,7 +33,13 @@ class Innovations:
         return self.value[:, i], self.std[:, i]
 
 
-def innovations(model: FilterModel, noise: Noise, track: StateTrack, z: Array) -> Innovations:
+def innovations(
+    model: FilterModel,
+    noise: Noise,
+    track: StateTrack,
+    z: Array,
+    max_gap_s: float = FilterSettings.max_gap_s,
+) -> Innovations:
     """Return the innovations of a track, from one step to the next.
 
     Parameters
@@ -41,6 +47,7 @@ def innovations(model: FilterModel, noise: Noise, track: StateTrack, z: Array) -
     model, noise : of the filter that made the track
     track : its states
     z : (n, m) the measurements at the track's times
+    max_gap_s : of the filter: over more than that nothing was predicted
     """
     n, d, m = len(track.time_s), len(model.states), len(model.rows)
     value, std = np.full((2, n, m), np.nan)
@@ -49,6 +56,8 @@ def innovations(model: FilterModel, noise: Noise, track: StateTrack, z: Array) -
     is_angle = np.array([row in model.angle_rows for row in model.rows])
     for k in range(1, n):
         dt_s = track.time_s[k] - track.time_s[k - 1]
+        if dt_s > max_gap_s:
+            continue
         f, h = np.zeros((d, d)), np.zeros((m, d))
         model.propagate(np.array(track.mean[k - 1]), dt_s, params, x_next, f)
         model.observe(x_next, params, z_hat, h)

@@ -249,7 +249,7 @@ def _read_stamp(time_s: float, clock: Array, max_gap_s: float, counts: Array) ->
     if not np.isfinite(time_s) or (kind == _STEP and dt <= 0.0):
         counts[_NOT_ADVANCED] += 1
         return _SKIP, dt
-    if kind == _LEAP and not (since_leap_s > 0.0 and since_leap_s < abs(dt)):  # does not follow one before
+    if kind == _LEAP and not (since_leap_s > 0.0 and since_leap_s <= max_gap_s):  # does not follow one before
         counts[_JUMPED] += 1
         clock[PENDING] = time_s
         return _SKIP, dt

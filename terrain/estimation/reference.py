@@ -13,12 +13,15 @@ from terrain.errors import DataError
 from terrain.estimation.measurements import low_pass
 from terrain.records import Array, RunLog, StateTrack, Stream
 from terrain.robots import Robot
+from terrain.slip import slip_ratio
 
 LONGEST_STEP_S = 0.1
 """A longer step in the truth is a gap."""
 
 
-def true_states(run: RunLog, track: StateTrack, robot: Robot, time_constant_s: float) -> Array | None:
+def true_states(
+    run: RunLog, track: StateTrack, robot: Robot, time_constant_s: float, initial_yaw_rad: float = 0.0
+) -> Array | None:
     """Return the truth (n, d) at each instant of a track, or None where the log has none.
 
     States that the truth does not know (an effective track) are NaN, and so is what lies outside its time.
@@ -29,13 +32,14 @@ def true_states(run: RunLog, track: StateTrack, robot: Robot, time_constant_s: f
     track : of a filter on that log
     robot : as the filter was given it: slip speeds are those against its nominal radius
     time_constant_s : of the low-pass on the filter's inputs
+    initial_yaw_rad : what the filter calls the heading of the start
     """
     truth = run.streams.get("truth")
     if truth is None:
         return None
     out = np.full(track.mean.shape, np.nan)
     for j, state in enumerate(track.states):
-        values = _true_state(truth, state, robot)
+        values = _true_state(truth, state, robot, initial_yaw_rad)
         if values is not None:
             known = np.isfinite(values)
             time_s = truth.time_s[known]
@@ -61,14 +65,34 @@ def rim_and_ground_speed(truth: Stream, robot: Robot) -> tuple[Array, Array]:
     return rim, along * np.cos(steer) + across * np.sin(steer)
 
 
+def lagged_slip(truth: Stream, robot: Robot, time_constant_s: float) -> tuple[Array, Array]:
+    """Return the true slip ratio and speed over ground of each wheel, both (n, wheels), behind a low-pass.
+
+    Of slip between speeds that come behind it, this is the best that can be estimated.
+
+    Parameters
+    ----------
+    truth : stream as ``terrain.simulation`` writes it
+    robot : gives the nominal radius and the wheels' places
+    time_constant_s : of the low-pass on the filter's inputs
+    """
+    rim, ground = (
+        np.column_stack(
+            [low_pass(truth.time_s, wheel, time_constant_s, LONGEST_STEP_S) for wheel in speeds.T]
+        )
+        for speeds in rim_and_ground_speed(truth, robot)
+    )
+    return slip_ratio(rim, ground), ground
+
+
 def _wheels(truth: Stream, robot: Robot, pattern: str) -> Array:
     return np.column_stack([truth.channel(pattern.format(wheel)) for wheel in robot.wheels])
 
 
-def _true_state(truth: Stream, state: str, robot: Robot) -> Array | None:
+def _true_state(truth: Stream, state: str, robot: Robot, initial_yaw_rad: float) -> Array | None:
     if state == "yaw_rad":
         yaw = np.unwrap(truth.channel("yaw_rad"))
-        return np.asarray(yaw - yaw[0])
+        return np.asarray(yaw - yaw[0] + initial_yaw_rad)
     if state in truth.channels:
         return truth.channel(state)
     if state == "gyro_bias_radps" and "gyro_bias_z_radps" in truth.channels:

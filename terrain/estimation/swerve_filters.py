@@ -201,7 +201,7 @@ _WALK_STD = {
     "steer_rad": 0.1,
     "gyro_bias_radps": 2e-4,
     "slip_ratio": 0.05,
-    "slip_speed_mps": 0.03,
+    "slip_speed_mps": 0.04,
 }
 # and of what a sample scatters by on a robot that moves, with vibration and delays.  Chosen on simulated runs
 # so that the errors of vio15 are on average those that it states; likelihood is no guide where a low-pass
@@ -232,8 +232,29 @@ def _initial_std(name: str, with_gnss: bool) -> Array:
     return np.array([stds[_kind(state)] for state in _LAYOUTS[name].states])
 
 
+def _described_std(robot: Robot) -> dict[str, float]:
+    """Return what the sensors scatter by as described; of n samples a tick, by 1 / sqrt(n) of it."""
+    sensors, camera = robot.sensors, robot.camera
+    found = {}
+    if sensors is not None:
+        imu = math.sqrt(sensors.wheels_rate_hz / max(sensors.imu_rate_hz, sensors.wheels_rate_hz))
+        found["accel_mps2"] = sensors.accel_std_mps2 * imu
+        found["gyro_z_radps"] = sensors.gyro_std_radps * imu
+        found["imu_yaw_rad"] = sensors.yaw_std_rad * imu
+        found["steer_rad"] = sensors.steering_std_rad
+    if sensors is not None and camera is not None:
+        seen = math.sqrt(sensors.wheels_rate_hz / max(camera.rate_hz, sensors.wheels_rate_hz))
+        found["camera_speed_mps"] = camera.speed_std_mps * seen
+        found["camera_yaw_rate_radps"] = camera.yaw_rate_std_radps * seen
+        found["camera_yaw_rad"] = camera.yaw_std_rad * seen
+    return found
+
+
 def default_noise(name: str, robot: Robot, with_gnss: bool = False) -> Noise:
     """Return physical noise for a filter: how fast a robot changes and what its sensors scatter by.
+
+    A sensor scatters by what vibration and delays do to it on any robot, or by what the description says of
+    it, whichever is more.
 
     Raises
     ------
@@ -249,6 +270,8 @@ def default_noise(name: str, robot: Robot, with_gnss: bool = False) -> Noise:
     layout = _layout(name, robot)
     rim_std_mps = _SLIP_STD_MPS if name == "vio12" else _RIM_STD_MPS
     sample_std = _SAMPLE_STD | {"wheel_radps": rim_std_mps / robot.wheel_radius_m}
+    for kind, std in _described_std(robot).items():
+        sample_std[kind] = max(sample_std[kind], std)
     return Noise(
         np.array([_WALK_STD[_kind(state)] ** 2 for state in layout.states]),
         np.array([sample_std[_kind(row)] ** 2 for row in _rows(name, with_gnss)]),

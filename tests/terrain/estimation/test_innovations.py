@@ -45,3 +45,15 @@ def test_what_was_not_measured_has_none():
     assert np.isnan(value[200:250]).all()
     assert np.isnan(std[200:250]).all()
     assert np.isfinite(value[251:]).all()
+
+
+def test_nothing_is_predicted_over_a_gap_and_so_nothing_is_an_innovation_after_it():
+    model, noise = make_filter("vio15", ROBOT), default_noise("vio15", ROBOT)
+    time_s, _, z = sample_from_model(model, noise, 400, 0.02, np.random.default_rng(1))
+    time_s = np.where(np.arange(400) < 200, time_s, time_s + 6.0)
+    track = run_filter(model, noise, time_s, z)
+    found = innovations(model, noise, track, z[np.searchsorted(time_s, track.time_s)])
+    after = int(np.flatnonzero(np.diff(track.time_s) > 1.0)[0]) + 1
+    assert np.isnan(found.value[after]).all()
+    assert np.isnan(found.std[after]).all()
+    assert np.isfinite(found.value[after + 1 :]).all()

@@ -6,7 +6,7 @@ import pytest
 from pipelines.simulate import simulate_run
 from terrain.errors import DataError
 from terrain.estimation.measurements import low_pass
-from terrain.estimation.reference import rim_and_ground_speed, true_states
+from terrain.estimation.reference import lagged_slip, rim_and_ground_speed, true_states
 from terrain.records import RunLog, StateTrack
 from terrain.robots import load_robot
 
@@ -58,6 +58,17 @@ def test_slip_speed_and_slip_ratio_are_two_ways_to_say_one_thing(run):
         fastest = np.maximum(np.abs(rim[:, i]), np.abs(ground[:, i]))
         moving = np.isfinite(slip) & (fastest > 0.2)
         np.testing.assert_allclose((rim - ground)[moving, i] / fastest[moving], slip[moving], atol=0.01)
+
+
+def test_slip_behind_the_low_pass_is_the_slip_where_driving_is_steady(run):
+    truth = run.streams["truth"]
+    slip, ground = lagged_slip(truth, ROBOT, 0.05)
+    np.testing.assert_array_equal(lagged_slip(truth, ROBOT, 0.0)[1], rim_and_ground_speed(truth, ROBOT)[1])
+    steady = (truth.time_s > 4.0) & (truth.time_s < 7.0)
+    told = np.column_stack([truth.channel(f"slip_{i}_ratio") for i in (1, 2, 3)])
+    assert np.abs(slip[steady].mean(axis=0) - told[steady].mean(axis=0)).max() < 0.002
+    assert np.isnan(slip[truth.time_s < 0.9]).all()  # it stands
+    assert (ground[steady] > 0.5).all()
 
 
 def test_no_truth_is_none_and_a_wheel_too_many_is_said(run):

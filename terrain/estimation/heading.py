@@ -1,0 +1,59 @@
+"""Heading of the start in the frame of a GNSS: what turns speeds over ground into those that it tells."""
+
+from __future__ import annotations
+
+import cmath
+import math
+
+import numpy as np
+
+from terrain.estimation.measurements import MeasurementTable
+from terrain.kinematics.swerve import forward
+from terrain.records import Array
+from terrain.robots import Robot
+
+MIN_SPEED_MPS = 0.2
+"""Slower, a course is noise."""
+
+MAX_STD_RAD = 0.05
+"""A heading that is known no better is not known: at 1 m/s it would be 5 cm/s of sideways speed."""
+
+
+def gnss_heading(table: MeasurementTable, robot: Robot, speed_std_mps: float = 0.03) -> float:
+    """Return the world's heading in rad of what the yaw rows call 0; NaN where the drive does not tell.
+
+    Parameters
+    ----------
+    table : measurements with yaw rows that are 0 at the start
+    robot : a swerve robot
+    speed_std_mps : of the receiver's speed
+
+    Notes
+    -----
+    The rotation that brings the speeds over ground v, by the camera or else by the wheels, onto those of
+    the receiver u with the least squared error, both as complex numbers: the angle of
+    ``sum u conj(v e^(i yaw))``.  Its standard deviation is ``speed_std / sqrt(sum |v|^2)``.
+    """
+    yaw = table.columns(["camera_yaw_rad", "imu_yaw_rad"])
+    yaw_rad = np.where(np.isfinite(yaw[:, 0]), yaw[:, 0], yaw[:, 1])
+    told = table.columns(["gnss_speed_x_mps", "gnss_speed_y_mps"]) @ np.array([1.0, 1.0j])
+    seen = _speed_over_ground(table, robot) * np.exp(1j * yaw_rad)
+    good = np.isfinite(told) & np.isfinite(seen) & (np.abs(seen) > MIN_SPEED_MPS)
+    weight = float(np.sum(np.abs(seen[good]) ** 2))
+    if weight == 0.0 or speed_std_mps / math.sqrt(weight) > MAX_STD_RAD:
+        return math.nan
+    return cmath.phase(complex(np.sum(told[good] * np.conj(seen[good]))))
+
+
+def _speed_over_ground(table: MeasurementTable, robot: Robot) -> Array:
+    """Return the speed (n,) of the origin in body axes, forward + 1j left: the camera's, or the wheels'."""
+    camera = robot.camera
+    rates = table.columns([f"wheel_{wheel}_radps" for wheel in robot.wheels])
+    steer = table.columns([f"steer_{wheel}_rad" for wheel in robot.wheels])
+    twist, _ = forward(robot.wheel_positions_m, robot.wheel_radius_m, rates, steer)
+    speed = twist[:, 0] + 1j * twist[:, 1]
+    if camera is None:
+        return np.asarray(speed)
+    x, y, turn = table.columns(["camera_speed_x_mps", "camera_speed_y_mps", "camera_yaw_rate_radps"]).T
+    by_camera = (x + turn * camera.lever_y_m) + 1j * (y - turn * camera.lever_x_m)
+    return np.where(np.isfinite(by_camera), by_camera, speed)
