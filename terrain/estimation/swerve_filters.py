@@ -201,7 +201,7 @@ _WALK_STD = {
     "steer_rad": 0.1,
     "gyro_bias_radps": 2e-4,
     "slip_ratio": 0.05,
-    "slip_speed_mps": 0.04,
+    "slip_speed_mps": 0.03,
 }
 # and of what a sample scatters by on a robot that moves, with vibration and delays.  Chosen on simulated runs
 # so that the errors of vio15 are on average those that it states; likelihood is no guide where a low-pass

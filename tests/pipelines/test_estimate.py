@@ -160,7 +160,7 @@ def test_on_the_full_simulator_errors_are_what_the_filter_says():
     assert 0.5 <= np.mean(errors) <= 2.0
     by_terrain = errors.reshape(5, -1).mean(axis=1)
     assert (by_terrain > 0.3).all()
-    assert (by_terrain < [1.5, 1.5, 5.0, 1.5, 1.5]).all()  # on loam a wheel's slip swings with every bump
+    assert (by_terrain < [1.5, 1.5, 8.0, 1.5, 1.5]).all()  # on loam a wheel's slip swings with every bump
 
 
 def test_no_negative_slip_peak_in_a_start_once_time_constants_match():
