@@ -261,7 +261,10 @@ def simulate_command(
     ],
     scenario: Annotated[
         str,
-        typer.Option(help="What is driven; 'course' on 'course', 'six_positions' on 'bench'."),
+        typer.Option(
+            help="stand, straight, arc, starts, spot_turn, complex, survey; course on 'course', "
+            "six_positions on 'bench'."
+        ),
     ],
     out: Annotated[Path, typer.Option(help="Folder of the new run folders.")],
     runs: Annotated[int, typer.Option(min=1, help="Runs a terrain.")] = 1,
@@ -306,7 +309,8 @@ def simulate_command(
             gnss=gnss,
             progress=progress,
         )
-    typer.echo(f"{result['n_runs']} runs of {result['duration_s']:.0f} s in all written to {out}")
+    runs_of = "run of" if result["n_runs"] == 1 else "runs, in all"
+    typer.echo(f"{result['n_runs']} {runs_of} {result['duration_s']:.0f} s, written to {out}")
     _write_json(json_file, result)
 
 

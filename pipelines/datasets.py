@@ -57,6 +57,7 @@ def load_runs(
     """
     folder = Path(folder)
     runs = []
+    skipped: list[str] = []
     places: dict[str, list[str]] = {}
     for read in _readers(folder, layout, mapping):
         try:
@@ -65,11 +66,12 @@ def load_runs(
             if not repair:
                 raise
             on_skip(f"run skipped: {error}")
+            skipped.append(str(error))
             continue
         runs.append(run)
         places.setdefault(run.run_id, []).append(_place(read, run))
     if not runs:
-        raise LogError(f"{folder}: not one run could be read")
+        raise LogError(f"{folder}: not one run could be read, the first for this: {skipped[0]}")
     for run_id, found in places.items():
         if len(found) > 1:
             raise LogError(f"{folder}: {len(found)} runs have the id {run_id!r} ({' and '.join(found)})")

@@ -325,6 +325,8 @@ def estimate(
         for run in runs:
             if (folder := run_folder(run.run_id, out)).exists():
                 raise LogError(f"{folder}: is there already, and is left as it is; choose another --out")
+    if tune_on is not None and _tuning(name, tuning) != "likelihood":
+        raise ConfigError(f"runs to tune on go with the tuning 'likelihood', not {_tuning(name, tuning)!r}")
     tuning, taught_noise, tuned = _tuning(name, tuning), None, None
     if tuning == "likelihood":
         from pipelines.tune import chosen_runs, tuned_noise

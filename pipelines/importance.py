@@ -12,7 +12,7 @@ from pipelines.evaluation import Progress, silent
 from pipelines.splits import Fold
 from terrain.records import Array
 
-N_PERMUTATIONS = 5
+N_PERMUTATIONS = 3
 
 
 def channel_of(feature: str) -> str:

@@ -36,7 +36,8 @@ def inspect_logs(
     ``terrains``, ``dropped``, ``streams`` (``n``, ``rate_hz``, ``duration_s``, ``n_gaps``, ``longest_gap_s``,
     ``longest_gap_at_s``, ``jitter_s``, ``stuck``, ``n_nonfinite`` by channel, ``longest_constant_s`` by
     channel) and ``clock`` (the fields of :class:`~terrain.logs.clock.ClockEstimate`; None for what is not
-    estimated, and for ``clock`` as a whole where the run has no gyro or no wheels, or its robot is unknown)
+    estimated, and for ``clock`` as a whole where the run has no gyro or no speeds of a left and a right
+    wheel, or its robot is unknown)
 
     Raises
     ------
@@ -69,7 +70,7 @@ def print_inspection(report: dict[str, Any], console: Console) -> None:
         ("stuck", False),
         ("clock of the wheels against the IMU", False),
     ):
-        table.add_column(heading, justify="right" if right else "left")
+        table.add_column(heading, justify="right" if right else "left", overflow="fold")
     for run in report["runs"]:
         for name, stream in run["streams"].items():
             table.add_row(
@@ -126,7 +127,7 @@ def _none_for_nan(values: dict[str, Any]) -> dict[str, Any]:
 
 def _clock_words(clock: dict[str, Any] | None) -> str:
     if clock is None:
-        return "no gyro, no wheels or an unknown robot"
+        return "no gyro, no speeds of a left and a right wheel, or an unknown robot"
     if clock["offset_s"] is None:
         return str(clock["status"])
     words = f"{clock['status']}: offset {clock['offset_s']:+.3f} ± {clock['offset_std_s']:.3f} s"

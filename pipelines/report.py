@@ -1,7 +1,4 @@
-"""One self-contained HTML page that says how good a classifier is, and what stands behind the numbers.
-
-The page needs no network, no script and no font of its own: style and figures are inside it.
-"""
+"""One self-contained HTML page that says how good a classifier is, and what stands behind the numbers."""
 
 from __future__ import annotations
 
@@ -10,7 +7,6 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from importlib import metadata
-from pathlib import Path
 from platform import python_version
 from typing import Any
 
@@ -19,11 +15,10 @@ from matplotlib.figure import Figure
 from pipelines.drawing import NOT_KNOWN, percent, sentence, svg_text
 from pipelines.extras import MIN_CLASSES
 from pipelines.metrics import VOTE_SPAN_S
+from pipelines.page import page
 from terrain.control.slip_table import DRIVE_STATES
 
 Result = Mapping[str, Any]
-
-STYLE_FILE = Path(__file__).with_name("report.css")
 
 PACKAGES = (
     "terrain-slip",
@@ -93,7 +88,6 @@ def html_report(result: Result, figures: Mapping[str, Figure]) -> str:
     figures : figures by name, as :func:`pipelines.figures.all_figures` makes them
     """
     crossval = result["crossval"]
-    title = f"Terrain classification: {result.get('dataset') or 'unnamed data set'}"
     sections = [
         _headline(crossval),
         _notes(crossval),
@@ -106,25 +100,9 @@ def html_report(result: Result, figures: Mapping[str, Figure]) -> str:
         _target_slip(result.get("predict")),
         _provenance(result),
     ]
-    body = "\n".join(section for section in sections if section)
-    return f"""<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{escape(title)}</title>
-<style>{STYLE_FILE.read_text(encoding="utf-8")}</style>
-</head>
-<body>
-<main>
-<header><p class="kind">Terrain classification</p>
-<h1>{escape(str(result.get("dataset") or "unnamed data set"))}</h1>
-<p class="lead">{_lead(crossval, result)}</p></header>
-{body}
-</main>
-</body>
-</html>
-"""
+    name = str(result.get("dataset") or "unnamed data set")
+    title = f"Terrain classification: {name}"
+    return page("Terrain classification", name, title, _lead(crossval, result), sections)
 
 
 def versions() -> dict[str, str]:

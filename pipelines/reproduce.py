@@ -326,7 +326,7 @@ def html_page(result: Result, pictures: Sequence[Picture]) -> str:
     result : what :func:`reproduce` returns
     pictures : figures in their order
     """
-    from pipelines.report import STYLE_FILE
+    from pipelines.page import page
 
     title = f"{result['title']}: its experiments in simulation"
     sections = [
@@ -336,25 +336,7 @@ def html_page(result: Result, pictures: Sequence[Picture]) -> str:
         _assumed(result["assumed"]),
         _again(result),
     ]
-    body = "\n".join(section for section in sections if section)
-    return f"""<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{escape(title)}</title>
-<style>{STYLE_FILE.read_text(encoding="utf-8")}</style>
-</head>
-<body>
-<main>
-<header><p class="kind">Reproduced in simulation</p>
-<h1>{escape(result["title"])}</h1>
-<p class="lead">{escape(result["about"])}</p></header>
-{body}
-</main>
-</body>
-</html>
-"""
+    return page("Reproduced in simulation", result["title"], title, escape(result["about"]), sections)
 
 
 def _headline(result: Result) -> str:

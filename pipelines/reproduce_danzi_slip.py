@@ -239,7 +239,7 @@ def slip_on_terrains(seed: int, quick: bool) -> Finding:
             printed="0.16, 0.339, 0.475",
             printed_interval=(1.0, 1.0),
             ours=in_order,
-            unit="of all runs",
+            unit="(share of the runs)",
             verdict=verdict_of(in_order, (1.0, 1.0)),
             why="Gravel has the least traction to spare in a start, tiles the most. Grass and gravel have "
             "the same shear modulus.",

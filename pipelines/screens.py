@@ -165,7 +165,7 @@ def _stretches(windows: list[dict[str, Any]]) -> Iterator[list[dict[str, Any]]]:
 def print_estimates(result: dict[str, Any], console: Console) -> None:
     """Print slip, its truth where it is known, and how consistent the filter was, a run a line."""
     table = Table(
-        "run",
+        Column("run", overflow="fold"),
         *(Column(name, justify="right") for name in ("slip", "std", "true", "stale s", "NEES", "NIS cam.")),
         *(Column(name, justify="right") for name in ("speed RMSE", "dropped", "gated")),
         title=f"filter {result['filter']}, {result['tuning']} noise",

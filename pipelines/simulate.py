@@ -25,7 +25,10 @@ COURSE = "course"
 """Word for a way over all terrains instead of the name of one."""
 
 BENCH = "six_positions"
-"""Word for the IMU alone on a bench, in place of a scenario; the terrain ``bench`` goes with it."""
+"""Word for the IMU alone on a bench, in place of a scenario."""
+
+BENCH_TERRAIN = "bench"
+"""The terrain that goes with it."""
 
 EVERY = "all"
 """Word for each terrain in turn."""
@@ -52,7 +55,7 @@ def simulate_run(
     Parameters
     ----------
     robot : robot with all sections
-    terrain : name of a soil, or ``course`` for all of them in one run
+    terrain : name of a soil or path of its YAML file, or ``course`` for all soils in one run
     scenario : name of a scenario; ``course`` goes with the terrain ``course``, ``six_positions`` (the IMU
         alone, for calibration) with ``bench``
     seed, number : which draw
@@ -71,8 +74,9 @@ def simulate_run(
         return _bench(robot, terrain, seed, number, duration_s)
     if (terrain == COURSE) != (scenario == COURSE):
         raise ConfigError("terrain 'course' and scenario 'course' go together: give both or neither")
-    names = soil_names() if terrain == COURSE else (terrain,)
-    soils = {name: load_soil(name) for name in names}
+    soils = {soil.name: soil for soil in map(load_soil, soil_names() if terrain == COURSE else (terrain,))}
+    names = list(soils)
+    terrain = terrain if terrain == COURSE else names[0]
     key = [seed, zlib.crc32(terrain.encode()), zlib.crc32(scenario.encode()), number]
     drawn, driven, simulated = np.random.SeedSequence(key).spawn(3)
     if vary:
@@ -80,7 +84,7 @@ def simulate_run(
         soils = {name: scattered(soil, rng) for name, soil in soils.items()}
         conditions = draw_conditions(load_spread(), rng, conditions)
     drive_seed = int(driven.generate_state(1)[0])
-    drive = make_scenario(scenario, robot, list(names), duration_s, seed=drive_seed)
+    drive = make_scenario(scenario, robot, names, duration_s, seed=drive_seed)
     return simulate(
         robot,
         drive,
@@ -95,8 +99,10 @@ def simulate_run(
 
 def _bench(robot: Robot, terrain: str, seed: int, number: int, duration_s: float | None) -> RunLog:
     """Return the log of an IMU that is held still in six positions, for ``terrain calibrate``."""
-    if terrain != "bench":
-        raise ConfigError(f"scenario {BENCH!r} is done on a bench: give the terrain 'bench', not {terrain!r}")
+    if terrain != BENCH_TERRAIN:
+        raise ConfigError(
+            f"scenario {BENCH!r} is done on a bench: give the terrain {BENCH_TERRAIN!r}, not {terrain!r}"
+        )
     hold_s = 5.0 if duration_s is None else duration_s / len(POSITIONS) - TURN_S
     key = np.random.SeedSequence([seed, zlib.crc32(BENCH.encode()), number])
     return six_positions_log(
@@ -124,7 +130,7 @@ def simulate_runs(
     Parameters
     ----------
     robot_name : name of a robot or path of its YAML file
-    terrain : name of a soil, ``all`` for each in turn, or ``course``
+    terrain : name of a soil or path of its YAML file, ``all`` for each in turn, or ``course``
     scenario : name of a scenario
     out : folder of the new run folders
     runs : runs a terrain
@@ -147,7 +153,8 @@ def simulate_runs(
     terrains = soil_names() if terrain == EVERY else (terrain,)
     jobs = [(name, number) for name in terrains for number in range(1, runs + 1)]
     for name, number in jobs:
-        if (folder := run_folder(run_id_of(name, scenario, number), out)).exists():
+        ground = name if name in (COURSE, BENCH_TERRAIN) else load_soil(name).name
+        if (folder := run_folder(run_id_of(ground, scenario, number), out)).exists():
             raise LogError(f"{folder}: is there already, and is left as it is; choose another --out")
     run_ids: list[str] = []
     total_s = 0.0

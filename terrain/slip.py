@@ -33,6 +33,9 @@ STALE_AFTER_S = 0.15
 """Age of the last speed over ground beyond which slip counts as stale: one and a half periods of GNSS, at 10
 Hz the slowest sensor of it, so that no sound one is called so; a 1 m/s^2 start gains 0.15 m/s unseen."""
 
+UNHEARD_AFTER_S = 0.5
+"""A wheel that has told neither rate nor angle for so long may turn and stand as it likes."""
+
 STEADY_SPEED_MPS = 0.2
 """Slower, 1 cm/s of error in the speed is over 5 % of slip."""
 
@@ -140,8 +143,25 @@ def wheel_slip(
     unseen = np.isinf(track.reference_age_s)
     if not _has_slip_speed(track, robot):
         unseen = unseen | slip.stale
-    ratio, std = (np.where(unseen[:, None], np.nan, v) for v in (slip.slip_ratio, slip.slip_std))
+    unknown = unseen[:, None] | _unheard(table, robot)
+    ratio, std = (np.where(unknown, np.nan, v) for v in (slip.slip_ratio, slip.slip_std))
     return SlipTrack(slip.time_s, ratio, std, slip.wheels, slip.stale)
+
+
+def _unheard(table: MeasurementTable, robot: Robot) -> Array:
+    """Return where (n, wheels) a wheel's rate or angle was not measured for :data:`UNHEARD_AFTER_S`."""
+    rows = {
+        wheel: [f"wheel_{wheel}_radps", f"steer_{wheel}_rad"]
+        if robot.drive == "swerve"
+        else [f"wheel_{wheel}_mps"]
+        for wheel in robot.wheels
+    }
+    columns = []
+    for names in rows.values():
+        heard = np.isfinite(table.columns(names))
+        last_s = np.maximum.accumulate(np.where(heard, table.time_s[:, None], -np.inf), axis=0)
+        columns.append((table.time_s[:, None] - last_s > UNHEARD_AFTER_S).any(axis=1))
+    return np.column_stack(columns)
 
 
 def blind_slip(track: StateTrack, table: MeasurementTable, robot: Robot) -> SlipTrack:

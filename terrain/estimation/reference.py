@@ -40,8 +40,7 @@ def true_states(
     out = np.full(track.mean.shape, np.nan)
     for j, state in enumerate(track.states):
         values = _true_state(truth, state, robot, initial_yaw_rad)
-        if values is not None:
-            known = np.isfinite(values)
+        if values is not None and (known := np.isfinite(values)).any():
             time_s = truth.time_s[known]
             smooth = low_pass(time_s, values[known], time_constant_s, LONGEST_STEP_S)
             out[:, j] = np.interp(track.time_s, time_s, smooth, left=np.nan, right=np.nan)

@@ -93,7 +93,7 @@ def read_run(folder: str | Path, *, repair: bool = False) -> RunLog:
             row_of=lambda index: index + 1,
             repair=repair,
             dropped=dropped,
-            unknown_is_a_value=name == "slip",
+            unknown_is_a_value=name in ("slip", "truth"),
         )
     if not streams:
         raise LogError(f"{place}: the run has no stream")

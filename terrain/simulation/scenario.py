@@ -48,7 +48,8 @@ SLIP_MARGIN = 1.25
 """A slipping robot gets less far than it is told: ``course`` drives this much further than its patches are
 long, so that with 20 % of slip the last one is crossed as well."""
 
-LONGEST_S = 86400.0
+LONGEST_S = 3600.0
+"""A run is held whole in memory, step by step: an hour is a gigabyte and a half."""
 
 
 class Patch(NamedTuple):

@@ -26,6 +26,7 @@ from terrain.simulation.sensors import (
     wheels_stream,
 )
 from terrain.simulation.vehicle import (
+    BODY_RECORD,
     FIELD_STEP_M,
     N_RECORD,
     STEP_S,
@@ -40,6 +41,15 @@ from terrain.terramechanics.traction import ground_array
 
 MIN_LABEL_S = 0.5
 """A shorter stay on one ground gets no label."""
+
+MAX_FIELD_CELLS = 5 * 10**6
+"""Cells of ground up to where the fastest wheel can come; a day at 2 m/s takes 3.5 million."""
+
+MAX_WHEEL_SPEEDS = 100.0
+"""No wheel turns so many times as fast as its motor can: then the steps are too long for the robot, as with a
+load of 1000 t on 90 kg."""
+
+_SENSOR_RATES = ("wheels_rate_hz", "steering_rate_hz", "imu_rate_hz")
 
 COMMAND_CHANNELS = (
     "speed_x_mps",
@@ -84,8 +94,9 @@ def simulate(
     Raises
     ------
     ConfigError
-        if the robot is no swerve robot, lacks a section or is tipped over by its load, a terrain of the
-        scenario has no soil, or its twists do not come every so many whole steps.
+        if the robot is no swerve robot, lacks a section, is tipped over by its load or has a number so far
+        out of scale that its motion cannot be integrated, a sensor is faster than the simulation's steps, a
+        terrain of the scenario has no soil, or its twists do not come every so many whole steps.
 
     Examples
     --------
@@ -106,6 +117,7 @@ def simulate(
         raise ConfigError(
             f"scenario {scenario.name}: rate_hz is {scenario.rate_hz:g}, it must divide {1 / STEP_S:g}"
         )
+    _check_rates(robot)
     sequence = seed if isinstance(seed, np.random.SeedSequence) else np.random.SeedSequence(seed)
     # One generator a purpose: a sensor more or less changes nothing about the others.
     ground, road, start, wheels, steering, imu, camera, receiver = (
@@ -120,6 +132,7 @@ def simulate(
     record = np.empty((n_steps, N_RECORD))
     advance(plant, state, wheel_radps, steer_rad, substeps, road.standard_normal((n_steps, 3)), record)
     motion = Motion(record)
+    _check_motion(motion, robot)
     imu_log, gyro_bias = imu_stream(motion, robot, imu)
     streams = {
         "wheels": wheels_stream(motion, robot, wheels),
@@ -137,6 +150,30 @@ def simulate(
     return RunLog(
         run_id, robot.name, streams, _labels(motion, scenario), source=f"simulated, {scenario.name}"
     )
+
+
+def _check_rates(robot: Robot) -> None:
+    _, _, _, camera, sensors = robot.equipment
+    rates_hz = {
+        "camera: rate_hz": camera.rate_hz,
+        **{f"sensors: {name}": getattr(sensors, name) for name in _SENSOR_RATES},
+    }
+    for name, rate_hz in rates_hz.items():
+        if rate_hz > 1 / STEP_S:
+            raise ConfigError(
+                f"robot {robot.name}: {name} is {rate_hz:g}, at most {1 / STEP_S:g} is simulated"
+            )
+
+
+def _check_motion(motion: Motion, robot: Robot) -> None:
+    lost = [name for name in BODY_RECORD if not np.isfinite(motion.body(name)).all()]
+    fastest_radps = float(np.abs(motion.wheel("wheel_radps")).max())
+    limit_radps = MAX_WHEEL_SPEEDS * robot.equipment.motors.speed_max_radps
+    if lost or not fastest_radps <= limit_radps:
+        raise ConfigError(
+            f"robot {robot.name}: its motion cannot be integrated in steps of {STEP_S:g} s; a mass, an "
+            "inertia, a stiffness, a gain or the load is out of scale with the rest"
+        )
 
 
 def _commands(robot: Robot, scenario: Scenario) -> tuple[Array, Array, Array]:
@@ -167,6 +204,11 @@ def _plant(
     starts_m = np.array([patch.start_m for patch in scenario.patches])
     farthest_m = 2.0 * robot.wheel_radius_m * motors.speed_max_radps * scenario.time_s[-1]
     n_cells = math.ceil(farthest_m / FIELD_STEP_M) + 1
+    if n_cells > MAX_FIELD_CELLS:
+        raise ConfigError(
+            f"robot {robot.name}: its wheels can come {farthest_m / 2e3:g} km far in this run, "
+            f"{MAX_FIELD_CELLS * FIELD_STEP_M / 2e3:g} km of ground are simulated at most"
+        )
     keep = math.exp(-FIELD_STEP_M / conditions.field_length_m)
     white = rng.standard_normal((2, 3, n_cells))
     white[:, :, 1:] *= math.sqrt(1.0 - keep**2)

@@ -212,7 +212,7 @@ def test_what_cannot_be_simulated_or_estimated_is_one_sentence(refused, place, d
 def test_from_simulated_logs_to_slip_on_the_command_line(terrain, place):
     words = ("--robot", "agrimaro", "--terrain", "grass", "--scenario", "straight", "--duration", "8")
     code, out, _ = terrain("simulate", *words, "--out", "logs", "--json", "sim.json")
-    assert (code, out) == (0, "1 runs of 8 s in all written to logs\n")
+    assert (code, out) == (0, "1 run of 8 s, written to logs\n")
     assert json.loads((place / "sim.json").read_text())["run_ids"] == ["grass_straight_01"]
     code, _, err = terrain("simulate", *words, "--out", "logs")
     assert code == 2

@@ -71,7 +71,9 @@ def test_repair_skips_what_cannot_be_read_and_says_so(borealtc_dir, caplog):
     load_runs(borealtc_dir, repair=True)
     assert "run skipped: SNOW/pro_01.csv: is missing" in caplog.text
     (borealtc_dir / "SNOW" / "pro_02.csv").unlink()
-    with pytest.raises(LogError, match="not one run could be read"):
+    with pytest.raises(
+        LogError, match=r"not one run could be read, the first for this: ICE/imu_01\.csv: is empty"
+    ):
         load_runs(borealtc_dir, repair=True, on_skip=told.append)
 
 

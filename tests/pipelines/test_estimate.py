@@ -268,10 +268,25 @@ def test_a_stream_that_is_missing_is_missed_and_no_more(straight, missing):
     found = estimate_run(replace(straight, streams=streams), ROBOT, "vio15")
     row = summary(found)
     assert row["finite"]
-    assert row["slip_observable"] is (missing != "odometry")
+    assert row["slip_observable"] is (missing not in ("odometry", "steering"))
     if missing == "truth":
         assert row["nees"] is None
         assert row["slip_true_mean"] is None
+
+
+@pytest.mark.parametrize(("stream", "channel"), [("wheels", "motor_1_radps"), ("steering", "angle_1_rad")])
+def test_a_wheel_that_falls_silent_has_no_slip_to_tell(straight, stream, channel):
+    column = straight.streams[stream].channels.index(channel)
+
+    def silent(time_s, values):
+        values[time_s > 10.0, column] = np.nan
+        return time_s, values
+
+    slip = estimate_run(spoilt(straight, stream, silent), ROBOT, "vio15").slip
+    late = slip.time_s > 10.7
+    assert np.isnan(slip.slip_ratio[late, 0]).all()
+    assert np.isfinite(slip.slip_ratio[late, 1:]).all()
+    assert np.isfinite(slip.slip_ratio[(slip.time_s > 5.0) & (slip.time_s < 10.4)]).all()
 
 
 def test_a_skid_steer_robot_without_a_reference_has_no_slip_to_show(datasets_dir, tmp_path):
@@ -322,6 +337,8 @@ def test_process_noise_is_tuned_on_chosen_runs():
     assert all(row["finite"] and row["slip_observable"] for row in result["runs"])
     with pytest.raises(DataError, match="no run 'grass_7' to tune on"):
         estimate(runs, "vio15", tuning="likelihood", tune_on=["grass_7"])
+    with pytest.raises(ConfigError, match="go with the tuning 'likelihood', not 'physical'"):
+        estimate(runs, "vio15", tune_on=[runs[0].run_id])
 
 
 @pytest.mark.parametrize("teacher", [0, 1])

@@ -103,5 +103,5 @@ def test_runs_without_wheels_or_with_a_foreign_robot_are_inspected_too(tmp_path,
     assert report["runs"][0]["terrains"] == []
     text = io.StringIO()
     print_inspection(report, Console(file=text, width=200))
-    assert "no gyro, no wheels or an unknown robot" in text.getvalue()
+    assert "no gyro, no speeds of a left and a right wheel, or an unknown robot" in text.getvalue()
     assert np.isfinite(report["runs"][1]["streams"]["wheels"]["rate_hz"])

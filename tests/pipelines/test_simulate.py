@@ -6,12 +6,17 @@ import pytest
 from pipelines.simulate import simulate_run, simulate_runs
 from terrain.errors import ConfigError, LogError
 from terrain.logs.read import find_runs, read_run
+from terrain.resources import data_folder
 from terrain.robots import load_robot
 from terrain.simulation.conditions import Conditions, Faults
 from terrain.simulation.sensors import Gnss
 from terrain.terramechanics.soil import soil_names
 
 ROBOT = load_robot("agrimaro")
+
+
+def read_soil(name):
+    return (data_folder("soils") / f"{name}.yaml").read_text(encoding="utf-8")
 
 
 def bytes_of(folder):
@@ -100,6 +105,16 @@ def test_a_run_that_is_there_is_left_alone_and_nothing_else_is_written(tmp_path)
     with pytest.raises(LogError, match="grass_straight_02: is there already"):
         simulate_runs("agrimaro", "grass", "straight", tmp_path, runs=3, duration_s=4.0)
     assert [path.name for path in tmp_path.iterdir()] == ["grass_straight_02"]
+
+
+def test_a_soil_of_ones_own_goes_by_its_name(tmp_path):
+    own = tmp_path / "field 7.yaml"
+    own.write_text(read_soil("grass").replace("name: grass", "name: orchard"))
+    result = simulate_runs("agrimaro", str(own), "straight", tmp_path / "runs", duration_s=4.0)
+    assert result["run_ids"] == ["orchard_straight_01"]
+    assert read_run(tmp_path / "runs" / "orchard_straight_01").terrains == ("orchard",)
+    with pytest.raises(LogError, match="orchard_straight_01: is there already"):
+        simulate_runs("agrimaro", str(own), "straight", tmp_path / "runs", duration_s=4.0)
 
 
 def test_progress_counts_the_runs(tmp_path):

@@ -41,12 +41,13 @@ def make_track(mean, states, cov=None, age_s=0.0, dt_s=0.02):
 
 
 def make_table(track, rim_mps, robot=ROBOT):
-    """Return measurements of which only the wheels are known."""
+    """Return measurements of which only the wheels, and how they are steered, are known."""
     rows = ROWS_OF_DRIVE[robot.drive]
     z = np.full((track.time_s.size, len(rows)), np.nan)
     z[:, : len(robot.wheels)] = rim_mps
     if robot.drive == "swerve":
         z[:, :3] /= robot.wheel_radius_m
+        z[:, [row.startswith("steer") for row in rows]] = 0.0
     return MeasurementTable(track.time_s, rows, z, np.full((track.time_s.size, len(GNSS_ROWS)), np.nan))
 
 

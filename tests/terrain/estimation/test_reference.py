@@ -7,7 +7,7 @@ from pipelines.simulate import simulate_run
 from terrain.errors import DataError
 from terrain.estimation.measurements import low_pass
 from terrain.estimation.reference import lagged_slip, rim_and_ground_speed, true_states
-from terrain.records import RunLog, StateTrack
+from terrain.records import RunLog, StateTrack, Stream
 from terrain.robots import load_robot
 
 ROBOT = load_robot("agrimaro")
@@ -75,5 +75,9 @@ def test_no_truth_is_none_and_a_wheel_too_many_is_said(run):
     streams = {name: stream for name, stream in run.streams.items() if name != "truth"}
     track = empty_track(("speed_x_mps",), np.arange(0.0, 1.0, 0.1))
     assert true_states(RunLog("a", "agrimaro", streams), track, ROBOT, 0.05) is None
+    nothing = Stream(
+        run.streams["truth"].time_s, np.full((len(run.streams["truth"]), 1), np.nan), ("speed_x_mps",)
+    )
+    assert np.isnan(true_states(RunLog("a", "agrimaro", {"truth": nothing}), track, ROBOT, 0.05)).all()
     with pytest.raises(DataError, match="slip_speed_4_mps"):
         true_states(run, empty_track(("slip_speed_4_mps",), np.arange(0.0, 1.0, 0.1)), ROBOT, 0.05)

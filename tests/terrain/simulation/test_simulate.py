@@ -26,6 +26,10 @@ HILLY = Conditions(
 )
 
 
+def with_part(section, **changes):
+    return dataclasses.replace(ROBOT, **{section: dataclasses.replace(getattr(ROBOT, section), **changes)})
+
+
 def run_of(scenario, terrain, seed=0, duration_s=None, **options):
     drive = (
         scenario if isinstance(scenario, Scenario) else make_scenario(scenario, ROBOT, terrain, duration_s)
@@ -296,6 +300,15 @@ def test_a_course_is_labelled_ground_by_ground():
             {"scenario": Scenario("odd", 60.0, np.arange(9) / 60, np.zeros((9, 3)), ((0.0, "grass"),))},
             "scenario odd: rate_hz is 60, it must divide 1000",
         ),
+        ({"conditions": Conditions(payload_kg=1e6)}, "its motion cannot be integrated"),
+        ({"robot": dataclasses.replace(ROBOT, mass_kg=1e9)}, "its motion cannot be integrated"),
+        ({"robot": with_part("body", yaw_inertia_kgm2=1e-9)}, "its motion cannot be integrated"),
+        ({"robot": with_part("body", tyre_stiffness_npm=1e12)}, "its motion cannot be integrated"),
+        (
+            {"robot": with_part("sensors", imu_rate_hz=1e9)},
+            "sensors: imu_rate_hz is 1e[+]09, at most 1000",
+        ),
+        ({"robot": with_part("motors", speed_max_radps=1e6)}, "km of ground are simulated at most"),
     ],
 )
 def test_what_cannot_be_simulated_is_refused_in_one_sentence(changed, message):
