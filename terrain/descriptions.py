@@ -11,6 +11,20 @@ import yaml
 from terrain.errors import ConfigError
 
 
+class _NoKeyTwice(yaml.SafeLoader):
+    """A safe loader that refuses a key given twice, of which plain YAML takes the last."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        """Construct a mapping whose keys differ."""
+        keys = [key.value for key, _ in node.value]
+        for key in keys:
+            if keys.count(key) > 1:
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"key {key!r} is given twice", node.start_mark
+                )
+        return super().construct_mapping(node, deep=deep)
+
+
 def read_yaml(path: Path) -> Any:
     """Return what a YAML file holds, unchecked; no file can run code.
 
@@ -20,7 +34,7 @@ def read_yaml(path: Path) -> Any:
         if it cannot be opened or is no YAML.
     """
     try:
-        return yaml.safe_load(path.read_text(encoding="utf-8"))
+        return yaml.load(path.read_text(encoding="utf-8"), Loader=_NoKeyTwice)  # a SafeLoader
     except OSError as error:
         raise ConfigError(f"{path}: cannot be opened ({error.strerror})") from error
     except (yaml.YAMLError, UnicodeDecodeError) as error:

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from terrain.calibration.finding import Finding, biases, untold
+from terrain.logs.schema import IMU_CHANNELS
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import Robot
 
@@ -35,8 +36,7 @@ BATCH_S = 1.0
 
 NO_STANDING = f"no run has a standing stretch of {MIN_STANDING_S:g} s: let the robot stand, switched on"
 
-GYRO = tuple(f"gyro_{axis}_radps" for axis in "xyz")
-ACCEL = tuple(f"accel_{axis}_mps2" for axis in "xyz")
+GYRO, ACCEL = IMU_CHANNELS[:3], IMU_CHANNELS[3:6]
 
 
 class Stretch(NamedTuple):

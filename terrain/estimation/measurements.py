@@ -28,6 +28,7 @@ from terrain.errors import ConfigError, DataError
 from terrain.estimation.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.estimation.camera import body_motion, unwrapped
 from terrain.logs.samples import longest_rise
+from terrain.logs.schema import GNSS_CHANNELS, IMU_CHANNELS
 from terrain.records import Array, RunLog, Stream, read_only
 from terrain.robots import Camera, Robot, Steering
 
@@ -229,7 +230,7 @@ def measurement_table(
         rates = np.where(wild, np.nan, rates)
     z |= dict(zip(rows, rates.T, strict=False))
 
-    imu = _clean(run, "imu", _IMU_CHANNELS, dropped, frozen=_IMU_CHANNELS[:6])
+    imu = _clean(run, "imu", IMU_CHANNELS, dropped, frozen=IMU_CHANNELS[:6])
     if imu is not None:
         time_s = imu.time_s - (sensors.imu_latency_s if sensors else 0.0)
         told = _without_leaps("imu", time_s, _imu_rows(imu, robot), dropped)
@@ -249,7 +250,7 @@ def measurement_table(
         taken = _on_clock(clock, time_s, told, own_s)
         z |= taken if ema_alpha is None else {row: _ema(value, ema_alpha) for row, value in taken.items()}
 
-    gnss = _clean(run, "gnss", _GNSS_CHANNELS, dropped)
+    gnss = _clean(run, "gnss", GNSS_CHANNELS, dropped)
     if gnss is not None:
         told, variance_of_told = _gnss_rows(gnss)
         z |= _on_clock(clock, gnss.time_s - gnss_latency_s, told, lag_s)
@@ -308,23 +309,6 @@ def _low_pass(time_s: Array, value: Array, time_constant_s: float, gap_s: float)
         lead = time_constant_s * (value[k] - value[k - 1]) / step_s
         out[k] = value[k] - lead + np.exp(-step_s / time_constant_s) * (out[k - 1] - value[k - 1] + lead)
     return out
-
-
-_IMU_CHANNELS = (
-    *(f"gyro_{axis}_radps" for axis in "xyz"),
-    *(f"accel_{axis}_mps2" for axis in "xyz"),
-    "roll_rad",
-    "pitch_rad",
-    "yaw_rad",
-)
-_GNSS_CHANNELS = (
-    "position_x_m",
-    "position_y_m",
-    "velocity_x_mps",
-    "velocity_y_mps",
-    "std_position_m",
-    "fix_ratio",
-)
 
 
 def _check(time_constant_s: float | None, ema_alpha: float | None, gnss_latency_s: float) -> None:

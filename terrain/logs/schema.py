@@ -58,6 +58,19 @@ UNIT_SCALES: dict[str, tuple[str, float]] = {
 
 ``g`` is standard gravity."""
 
+IMU_CHANNELS: tuple[str, ...] = (
+    *(f"gyro_{axis}_radps" for axis in "xyz"),
+    *(f"accel_{axis}_mps2" for axis in "xyz"),
+    *("roll_rad", "pitch_rad", "yaw_rad"),
+)
+"""Channels of an IMU that fuses its attitude; the accelerometer tells specific force."""
+
+GNSS_CHANNELS: tuple[str, ...] = (
+    *("position_x_m", "position_y_m", "velocity_x_mps", "velocity_y_mps"),
+    *("std_position_m", "fix_ratio"),
+)
+"""Channels of a receiver: the antenna, east and north."""
+
 SIGNAL_SETS: tuple[str, ...] = ("imu", "wheels", "currents", "slip", "estimator")
 """Groups of signals that can be switched off by name."""
 

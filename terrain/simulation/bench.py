@@ -9,9 +9,9 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from terrain.constants import GRAVITY_MPS2
 from terrain.errors import ConfigError
-from terrain.records import RunLog, Stream
+from terrain.records import RunLog
 from terrain.robots import Robot
-from terrain.simulation.sensors import TILT_NOISE_RAD
+from terrain.simulation.sensors import imu_samples
 
 TURN_S = 1.5
 """Time by hand from one position to the next; assumed."""
@@ -85,30 +85,12 @@ def six_positions_log(
     now, soon = attitude(time_s), attitude(np.minimum(time_s + period_s, knots_s[-1]))
     force = now.inv().apply([0.0, 0.0, GRAVITY_MPS2])
     rate = (now.inv() * soon).as_rotvec() / period_s
-    axes = "xyz"
-    scale = np.array([getattr(sensors, f"accel_scale_{axis}_ratio") for axis in axes])
-    accel_bias = np.array([getattr(sensors, f"accel_bias_{axis}_mps2") for axis in axes])
-    accel_bias = accel_bias + sensors.accel_bias_std_mps2 * rng.standard_normal(3)
-    gyro_bias = np.array([getattr(sensors, f"gyro_bias_{axis}_radps") for axis in axes])
-    gyro_bias = gyro_bias + sensors.gyro_bias_std_radps * rng.standard_normal(3)
-    walk = sensors.gyro_walk_radps * math.sqrt(period_s) * rng.standard_normal((n, 3)).cumsum(axis=0)
-    accel = scale * force + accel_bias + sensors.accel_std_mps2 * rng.standard_normal((n, 3))
-    gyro = rate + gyro_bias + walk + sensors.gyro_std_radps * rng.standard_normal((n, 3))
     turned = now.as_matrix()
     roll, pitch = (
         np.arctan2(turned[:, 2, 1], turned[:, 2, 2]),
         -np.arcsin(np.clip(turned[:, 2, 0], -1.0, 1.0)),
     )
     yaw = np.arctan2(turned[:, 1, 0], turned[:, 0, 0])
-    fused = np.column_stack([roll, pitch]) + TILT_NOISE_RAD * rng.standard_normal((n, 2))
-    yaw = yaw - yaw[0] + sensors.yaw_std_rad * rng.standard_normal(n)
-    yaw = math.pi - np.mod(math.pi - yaw, 2 * math.pi)
-    channels = (
-        *(f"gyro_{axis}_radps" for axis in axes),
-        *(f"accel_{axis}_mps2" for axis in axes),
-        "roll_rad",
-        "pitch_rad",
-        "yaw_rad",
-    )
-    imu = Stream(time_s, np.column_stack([gyro, accel, fused, yaw]), channels)
+    tilt = np.column_stack([roll, pitch])
+    imu, _ = imu_samples(sensors, time_s, force, rate, tilt, np.unwrap(yaw) - yaw[0], rng)
     return RunLog(run_id, robot.name, {"imu": imu}, source="simulated, six positions on a bench")

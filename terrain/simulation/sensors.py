@@ -15,8 +15,9 @@ from scipy.signal import lfilter
 
 from terrain.constants import GRAVITY_MPS2
 from terrain.estimation.camera import odometry_stream, to_camera
+from terrain.logs.schema import GNSS_CHANNELS, IMU_CHANNELS
 from terrain.records import Array, Stream
-from terrain.robots import Robot
+from terrain.robots import Robot, Sensors
 from terrain.simulation.conditions import Faults
 from terrain.simulation.vehicle import BODY_RECORD, N_BODY_RECORD, STEP_S, WHEEL_RECORD
 
@@ -148,31 +149,52 @@ def imu_stream(motion: Motion, robot: Robot, rng: np.random.Generator) -> tuple[
     )
     force = _low_pass(force, 1 / (2 * math.pi * IMU_BANDWIDTH_HZ["accel"]))[rows]
     rate = _low_pass(rate, 1 / (2 * math.pi * IMU_BANDWIDTH_HZ["gyro"]))[rows]
-    scale = np.array([sensors.accel_scale_x_ratio, sensors.accel_scale_y_ratio, sensors.accel_scale_z_ratio])
-    accel_bias = np.array([sensors.accel_bias_x_mps2, sensors.accel_bias_y_mps2, sensors.accel_bias_z_mps2])
+    yaw = motion.body("yaw_rad")[rows] - motion.body("yaw_rad")[0]
+    return imu_samples(sensors, time_s, force, rate, np.column_stack([roll, pitch])[rows], yaw, rng)
+
+
+def imu_samples(
+    sensors: Sensors,
+    time_s: Array,
+    force_mps2: Array,
+    rate_radps: Array,
+    tilt_rad: Array,
+    yaw_rad: Array,
+    rng: np.random.Generator,
+) -> tuple[Stream, Array]:
+    """Return what an IMU tells of a motion, and the bias (n,) of its yaw gyro.
+
+    Each power-on has biases of its own about those described; the gyro's walk, and the fused yaw sums them.
+
+    Parameters
+    ----------
+    sensors : scales, biases and noise
+    time_s : (n,) evenly spaced
+    force_mps2, rate_radps : (n, 3) specific force and body rates, behind the sensor's own low-pass
+    tilt_rad : (n, 2) roll and pitch
+    yaw_rad : (n,) counted from the start
+    rng : source of biases and noise
+    """
+    n = len(time_s)
+    scale, accel_bias, gyro_bias = (
+        np.array([getattr(sensors, pattern.format(axis)) for axis in "xyz"])
+        for pattern in ("accel_scale_{}_ratio", "accel_bias_{}_mps2", "gyro_bias_{}_radps")
+    )
     accel_bias = accel_bias + sensors.accel_bias_std_mps2 * rng.standard_normal(3)
-    gyro_bias = np.array([sensors.gyro_bias_x_radps, sensors.gyro_bias_y_radps, sensors.gyro_bias_z_radps])
     gyro_bias = gyro_bias + sensors.gyro_bias_std_radps * rng.standard_normal(3)
     period_s = 1 / sensors.imu_rate_hz
-    walk = sensors.gyro_walk_radps * math.sqrt(period_s) * rng.standard_normal((len(rows), 3)).cumsum(axis=0)
+    walk = sensors.gyro_walk_radps * math.sqrt(period_s) * rng.standard_normal((n, 3)).cumsum(axis=0)
     bias = gyro_bias + walk
-    accel = scale * force + accel_bias + sensors.accel_std_mps2 * rng.standard_normal(force.shape)
-    gyro = rate + bias + sensors.gyro_std_radps * rng.standard_normal(rate.shape)
+    accel = scale * force_mps2 + accel_bias + sensors.accel_std_mps2 * rng.standard_normal((n, 3))
+    gyro = rate_radps + bias + sensors.gyro_std_radps * rng.standard_normal((n, 3))
     mounting = sensors.tilt_std_rad * rng.standard_normal(2)
-    fused = np.column_stack([roll[rows], pitch[rows]]) + mounting
-    fused = fused + TILT_NOISE_RAD * rng.standard_normal(fused.shape)
+    fused = tilt_rad + mounting
+    fused = fused + TILT_NOISE_RAD * rng.standard_normal((n, 2))
     drift = np.concatenate([[0.0], np.cumsum(bias[1:, 2]) * period_s])
-    yaw = motion.body("yaw_rad")[rows] - motion.body("yaw_rad")[0] + drift
-    yaw = yaw + sensors.yaw_std_rad * rng.standard_normal(len(rows))
+    yaw = yaw_rad + drift
+    yaw = yaw + sensors.yaw_std_rad * rng.standard_normal(n)
     yaw = math.pi - np.mod(math.pi - yaw, 2 * math.pi)
-    channels = (
-        *(f"gyro_{axis}_radps" for axis in "xyz"),
-        *(f"accel_{axis}_mps2" for axis in "xyz"),
-        "roll_rad",
-        "pitch_rad",
-        "yaw_rad",
-    )
-    return Stream(time_s, np.column_stack([gyro, accel, fused, yaw]), channels), bias[:, 2]
+    return Stream(time_s, np.column_stack([gyro, accel, fused, yaw]), IMU_CHANNELS), bias[:, 2]
 
 
 def camera_stream(motion: Motion, robot: Robot, rng: np.random.Generator, faults: Faults) -> Stream:
@@ -254,15 +276,7 @@ def gnss_stream(motion: Motion, receiver: Gnss, rng: np.random.Generator, faults
     kept = np.ones(n, dtype=bool)
     for start_s, end_s in faults.gnss_lost_s:
         kept &= ~((time_s >= start_s) & (time_s < end_s))
-    channels = (
-        "position_x_m",
-        "position_y_m",
-        "velocity_x_mps",
-        "velocity_y_mps",
-        "std_position_m",
-        "fix_ratio",
-    )
-    return Stream(time_s[kept], np.column_stack([position, velocity, std, fixed])[kept], channels)
+    return Stream(time_s[kept], np.column_stack([position, velocity, std, fixed])[kept], GNSS_CHANNELS)
 
 
 def truth_stream(

@@ -55,6 +55,13 @@ def test_an_unknown_robot_is_named(name):
         load_robot(name)
 
 
+def test_a_key_given_twice_is_refused(tmp_path, husky_yaml):
+    path = tmp_path / "mine.yaml"
+    path.write_text(yaml.safe_dump(husky_yaml) + "drive: swerve\n")
+    with pytest.raises(ConfigError, match="'drive' is given twice"):
+        load_robot(path)
+
+
 def test_yaml_cannot_run_code(tmp_path):
     path = tmp_path / "bad.yaml"
     path.write_text(f"!!python/object/apply:pathlib.Path.touch [{tmp_path}/touched]")
