@@ -11,10 +11,10 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from terrain.angles import unwrapped
 from terrain.calibration.finding import Finding, std_interval, untold
 from terrain.calibration.motion import seen_motion
 from terrain.calibration.standing import ACCEL, GYRO, NO_STANDING, Stretch, batches
-from terrain.estimation.camera import unwrapped
 from terrain.records import Array, Stream
 from terrain.robots import Robot
 

@@ -18,6 +18,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from terrain.angles import unwrapped
 from terrain.records import Array, Stream, read_only
 from terrain.robots import Camera
 
@@ -174,20 +175,6 @@ def to_camera(vectors: Array) -> Array:
     """Return vectors (..., 3) given in the body's axes in the camera's."""
     turned: Array = vectors[..., [1, 2, 0]] * [-1.0, 1.0, -1.0]
     return turned
-
-
-def unwrapped(angle_rad: Array) -> Array:
-    """Return an angle (n,) without jumps of a turn from one known sample to the next; NaN stays NaN.
-
-    Examples
-    --------
-    >>> unwrapped(np.array([3.0, np.nan, -3.0])).round(3)
-    array([3.   ,   nan, 3.283])
-    """
-    out = np.array(angle_rad)
-    known = np.isfinite(out)
-    out[known] = np.unwrap(out[known])
-    return out
 
 
 def _channels(stream: Stream, name: str, axes: str) -> Array:

@@ -15,6 +15,7 @@ import numpy as np
 from numba import boolean, float64, njit, types, void
 from scipy.special import chdtri
 
+from terrain.angles import wrapped
 from terrain.errors import DataError
 from terrain.estimation.ekf import FilterModel, Noise, initial_state
 from terrain.estimation.kernel import OBSERVE, PROPAGATE, wrap
@@ -115,7 +116,7 @@ def nees(track: StateTrack, truth: Array, states: Sequence[str] | None = None) -
     index = [track.states.index(state) for state in states]
     error = track.mean[:, index] - values
     angles = [i for i, state in enumerate(states) if state.endswith("_rad")]
-    error[:, angles] = np.pi - (np.pi - error[:, angles]) % (2 * np.pi)
+    error[:, angles] = wrapped(error[:, angles])
     solved = np.linalg.solve(track.cov[:, index][:, :, index], error[..., None])[..., 0]
     squares: Array = np.einsum("ni,ni->n", error, solved)
     return squares

@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from terrain.estimation.measurements import MeasurementTable
+from terrain.estimation.measurements import GNSS_SPEED_STD_MPS, MeasurementTable
 from terrain.kinematics.swerve import forward
 from terrain.records import Array
 from terrain.robots import Robot
@@ -19,14 +19,13 @@ MAX_STD_RAD = 0.05
 """A heading that is known no better is not known: at 1 m/s it would be 5 cm/s of sideways speed."""
 
 
-def gnss_heading(table: MeasurementTable, robot: Robot, speed_std_mps: float = 0.03) -> float:
+def gnss_heading(table: MeasurementTable, robot: Robot) -> float:
     """Return the world's heading in rad of what the yaw rows call 0; NaN where the drive does not tell.
 
     Parameters
     ----------
     table : measurements with yaw rows that are 0 at the start
     robot : a swerve robot
-    speed_std_mps : of the receiver's speed
 
     Notes
     -----
@@ -40,7 +39,7 @@ def gnss_heading(table: MeasurementTable, robot: Robot, speed_std_mps: float = 0
     seen = _speed_over_ground(table, robot) * np.exp(1j * yaw_rad)
     good = np.isfinite(told) & np.isfinite(seen) & (np.abs(seen) > MIN_SPEED_MPS)
     weight = float(np.sum(np.abs(seen[good]) ** 2))
-    if weight == 0.0 or speed_std_mps / math.sqrt(weight) > MAX_STD_RAD:
+    if weight == 0.0 or GNSS_SPEED_STD_MPS / math.sqrt(weight) > MAX_STD_RAD:
         return math.nan
     return cmath.phase(complex(np.sum(told[good] * np.conj(seen[good]))))
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from terrain.angles import wrapped
 from terrain.estimation.ekf import FilterModel, FilterSettings, Noise
 from terrain.records import Array, StateTrack
 
@@ -64,6 +65,6 @@ def innovations(
         predicted = f @ track.cov[k - 1] @ f.T + noise.process_variance * dt_s
         value[k] = z[k] - z_hat
         std[k] = np.sqrt(np.einsum("ij,jk,ik->i", h, predicted, h) + variance[k])
-    value[:, is_angle] = np.pi - (np.pi - value[:, is_angle]) % (2 * np.pi)
+    value[:, is_angle] = wrapped(value[:, is_angle])
     std[np.isnan(value)] = np.nan
     return Innovations(track.time_s, model.rows, value, std)

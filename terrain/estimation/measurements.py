@@ -4,51 +4,36 @@ The clock is that of the wheels, whose rates come behind the driver's low-pass. 
 of them makes the slip of a start look negative (Danzi, AgriMaRo thesis, 7.2.2), so every other signal goes
 through a low-pass too, and its own lag and the filter's together are the encoders'.  In order:
 
-1. samples that cannot be true are left out and counted (:func:`_clean`);
+1. samples that cannot be true are left out and counted (``terrain.estimation.cleaning``);
 2. known latencies are taken off the stamps;
 3. calibration, gravity and the camera's axes are taken off, angles are unwrapped;
-4. :func:`low_pass`, at each sensor's own rate;
-5. at each tick the last sample at or before it, unless it is too old (:func:`_held`); the low-pass runs on to
-   the tick with that sample as its input, which leaves no delay of the holding.
+4. a low-pass, at each sensor's own rate;
+5. at each tick the last sample at or before it, unless it is too old; the low-pass runs on to the tick with
+   that sample as its input, which leaves no delay of the holding (``terrain.estimation.resampling``).
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
 
 import numpy as np
-from numba import njit
-from scipy.signal import lfilter
 
+from terrain.angles import unwrapped, wrapped
 from terrain.constants import GRAVITY_MPS2
 from terrain.errors import ConfigError, DataError
 from terrain.estimation.camera import CHANNELS as CAMERA_CHANNELS
-from terrain.estimation.camera import body_motion, unwrapped
-from terrain.logs.samples import longest_rise
+from terrain.estimation.camera import body_motion
+from terrain.estimation.cleaning import clean_stream, without_leaps
+from terrain.estimation.resampling import ema, on_clock
 from terrain.logs.schema import GNSS_CHANNELS, IMU_CHANNELS
 from terrain.records import Array, RunLog, Stream, read_only
 from terrain.robots import Camera, Robot, Steering
 
-FROZEN_S = 0.25
-"""Noise that repeats exactly for so long is none: 50 samples of the camera, 25 of the IMU."""
-
-MIN_CONFIDENCE_RATIO = 0.34
-"""The camera tells 0, 1/3, 2/3 or 1; at 1/3 (low) and below it has lost its features."""
-
-MAX_AGE_PERIODS = 1.5
-"""A value is held until the next one is due and half a period more, of the slower of sensor and clock."""
-
-GAP_PERIODS = 5.0
-"""After a longer gap the low-pass starts anew: what it remembers is not the past of what comes."""
-
 WILD_FACTOR = 2.0
 """No wheel turns so many times faster than its motor can drive it."""
-
-OFF_CLOCK_S = 1.0
-"""A sample that is further from every tick is of no use to anyone: its clock leapt."""
 
 LATE_S = 0.5
 """A camera whose first sample comes later than this after the clock's may have missed a turn."""
@@ -67,23 +52,6 @@ GNSS_STD_M = {True: 0.02, False: 0.5}
 
 GNSS_SPEED_STD_MPS = 0.03
 """Of the Doppler speed; assumed, as in the simulated receiver."""
-
-LEAPS: dict[str, tuple[float, float]] = {
-    "accel_x_mps2": (20.0, 1000.0),
-    "accel_y_mps2": (20.0, 1000.0),
-    "gyro_z_radps": (0.5, 20.0),
-    "imu_yaw_rad": (0.1, 4.0),
-    **dict.fromkeys((f"steer_{i}_rad" for i in (1, 2, 3)), (0.1, 5.0)),
-    "camera_speed_x_mps": (0.1, 5.0),
-    "camera_speed_y_mps": (0.1, 5.0),
-    "camera_yaw_rate_radps": (0.2, 20.0),
-    "camera_yaw_rad": (0.1, 4.0),
-}
-"""What a sensor's noise may do between two samples and, a second, what a robot may: half a g, two thirds of a
-turn, twice the fastest steering; an accelerometer on rough ground sees several g."""
-
-BELIEVED_S = 0.1
-"""A value that has leapt and stays is believed after this long: it is left to the filter's gate."""
 
 CAMERA_ROWS = ("camera_speed_x_mps", "camera_speed_y_mps", "camera_yaw_rate_radps", "camera_yaw_rad")
 GNSS_ROWS = ("gnss_position_x_m", "gnss_position_y_m", "gnss_speed_x_mps", "gnss_speed_y_mps")
@@ -104,9 +72,6 @@ ROWS_OF_DRIVE: dict[str, tuple[str, ...]] = {
 
 Positions and GNSS speeds are in the world frame, east and north from where the antenna first was; yaw counts
 from east once the heading at the start is given; all else is in body axes."""
-
-_TICK_S = 1e-9
-"""Stamps that differ by less are the same instant, written by two clocks' arithmetic."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -219,7 +184,7 @@ def measurement_table(
     z: dict[str, Array] = {}
     variance: dict[str, Array] = {}
 
-    wheels = _clean(run, "wheels", _wheel_channels(run, robot), dropped)
+    wheels = clean_stream(run, "wheels", _wheel_channels(run, robot), dropped)
     if wheels is None:
         raise DataError(f"run {run.run_id}: the stream 'wheels', which gives the clock, is empty")
     clock = wheels.time_s
@@ -230,31 +195,31 @@ def measurement_table(
         rates = np.where(wild, np.nan, rates)
     z |= dict(zip(rows, rates.T, strict=False))
 
-    imu = _clean(run, "imu", IMU_CHANNELS, dropped, frozen=IMU_CHANNELS[:6])
+    imu = clean_stream(run, "imu", IMU_CHANNELS, dropped, frozen=IMU_CHANNELS[:6])
     if imu is not None:
         time_s = imu.time_s - (sensors.imu_latency_s if sensors else 0.0)
-        told = _without_leaps("imu", time_s, _imu_rows(imu, robot), dropped)
-        z |= _on_clock(clock, time_s, told, lag_s)
+        told = without_leaps("imu", time_s, _imu_rows(imu, robot), dropped)
+        z |= on_clock(clock, time_s, told, lag_s)
 
-    steering = _clean(run, "steering", [f"angle_{i}_rad" for i in robot.wheels], dropped)
+    steering = clean_stream(run, "steering", [f"angle_{i}_rad" for i in robot.wheels], dropped)
     if steering is not None and robot.steering is not None:
         told = _steering_rows(steering, robot.steering)
-        told = _without_leaps("steering", steering.time_s, told, dropped)
-        z |= _on_clock(clock, steering.time_s, told, lag_s)
+        told = without_leaps("steering", steering.time_s, told, dropped)
+        z |= on_clock(clock, steering.time_s, told, lag_s)
 
-    odometry = _clean(run, "odometry", CAMERA_CHANNELS, dropped, frozen=CAMERA_CHANNELS[3:13])
+    odometry = clean_stream(run, "odometry", CAMERA_CHANNELS, dropped, frozen=CAMERA_CHANNELS[3:13])
     if odometry is not None and camera is not None:
         own_s = max(encoder_s - camera.time_constant_s, 0.0) if smooth_s is None else smooth_s
         time_s = odometry.time_s - camera.latency_s
-        told = _without_leaps("odometry", time_s, _camera_rows(odometry, camera, dropped), dropped)
-        taken = _on_clock(clock, time_s, told, own_s)
-        z |= taken if ema_alpha is None else {row: _ema(value, ema_alpha) for row, value in taken.items()}
+        told = without_leaps("odometry", time_s, _camera_rows(odometry, camera, dropped), dropped)
+        taken = on_clock(clock, time_s, told, own_s)
+        z |= taken if ema_alpha is None else {row: ema(value, ema_alpha) for row, value in taken.items()}
 
-    gnss = _clean(run, "gnss", GNSS_CHANNELS, dropped)
+    gnss = clean_stream(run, "gnss", GNSS_CHANNELS, dropped)
     if gnss is not None:
         told, variance_of_told = _gnss_rows(gnss)
-        z |= _on_clock(clock, gnss.time_s - gnss_latency_s, told, lag_s)
-        variance |= _on_clock(clock, gnss.time_s - gnss_latency_s, variance_of_told, 0.0)
+        z |= on_clock(clock, gnss.time_s - gnss_latency_s, told, lag_s)
+        variance |= on_clock(clock, gnss.time_s - gnss_latency_s, variance_of_told, 0.0)
 
     unknown = np.full(clock.size, np.nan)
     table = {row: z.get(row, unknown) for row in rows}
@@ -268,47 +233,6 @@ def measurement_table(
         np.column_stack([variance.get(row, unknown) for row in GNSS_ROWS]),
         {kind: n for kind, n in dropped.items() if n},
     )
-
-
-def low_pass(time_s: Array, value: Array, time_constant_s: float, gap_s: float) -> Array:
-    """Return a signal (n,) behind a first-order low-pass, exact if it runs straight from sample to sample.
-
-    Parameters
-    ----------
-    time_s : (n,) strictly increasing, in any steps
-    value : (n,) finite
-    time_constant_s : tau; 0 gives the signal back
-    gap_s : the filter starts anew at the first sample, and after every longer step
-
-    Notes
-    -----
-    ``tau y' + y = x`` over a step dt from x_0 to x_1, with ``a = exp(-dt/tau)`` and m the slope::
-
-        y_1 = x_1 - tau m + a (y_0 - x_0 + tau m)
-
-    so that a ramp is delayed by tau at any rate.  (The usual ``y_1 = a y_0 + (1 - a) x_1`` falls short of it
-    by half a step: 10 ms at 50 Hz.)
-
-    Examples
-    --------
-    >>> time_s = np.array([0.0, 0.1, 0.3, 0.9])
-    >>> (2.0 * time_s - low_pass(time_s, 2.0 * time_s, 0.05, 1.0)).round(4)  # on its way to 2.0 * 0.05
-    array([0.    , 0.0865, 0.0998, 0.1   ])
-    """
-    return _low_pass(time_s, value, time_constant_s, gap_s) if time_constant_s > 0 else value
-
-
-@njit(cache=True)
-def _low_pass(time_s: Array, value: Array, time_constant_s: float, gap_s: float) -> Array:
-    out = np.empty_like(value)
-    for k in range(value.size):
-        step_s = time_s[k] - time_s[k - 1]
-        if k == 0 or step_s > gap_s:
-            out[k] = value[k]
-            continue
-        lead = time_constant_s * (value[k] - value[k - 1]) / step_s
-        out[k] = value[k] - lead + np.exp(-step_s / time_constant_s) * (out[k - 1] - value[k - 1] + lead)
-    return out
 
 
 def _check(time_constant_s: float | None, ema_alpha: float | None, gnss_latency_s: float) -> None:
@@ -336,61 +260,6 @@ def _wheel_channels(run: RunLog, robot: Robot) -> list[str]:
     return channels
 
 
-def _clean(
-    run: RunLog, name: str, channels: Sequence[str], dropped: Counter[str], frozen: Sequence[str] = ()
-) -> Stream | None:
-    """Return the channels named of a stream without what cannot be true, or None where nothing is left.
-
-    Stamps increase strictly, numbers are finite or NaN, channels that the log lacks are NaN.  A camera or IMU
-    all of whose noisy channels (``frozen``) repeat is left out from the first repetition on.
-    """
-    stream = run.streams.get(name)
-    if stream is None:
-        return None
-    clock_s = run.streams["wheels"].time_s if "wheels" in run.streams else stream.time_s
-    known_s = clock_s[np.isfinite(clock_s)]
-    present = [channel for channel in channels if channel in stream.channels]
-    values = np.full((len(stream), len(channels)), np.nan)
-    for channel in present:
-        values[:, channels.index(channel)] = stream.channel(channel)
-    kept = _increasing(stream.time_s)
-    dropped[f"{name}: stamp does not increase"] += len(stream) - len(kept)
-    time_s, values = stream.time_s[kept], values[kept]
-    if known_s.size:
-        off = (time_s < known_s.min() - OFF_CLOCK_S) | (time_s > known_s.max() + OFF_CLOCK_S)
-        dropped[f"{name}: off the clock"] += int(off.sum())
-    there = [channels.index(channel) for channel in present]
-    finite = np.isfinite(values[:, there]).all(axis=1)
-    dropped[f"{name}: not finite"] += int((~finite).sum())
-    values[~np.isfinite(values)] = np.nan
-    kept = np.ones(len(time_s), dtype=bool)
-    noisy = [channels.index(channel) for channel in frozen if channel in present]
-    if noisy and finite.any():
-        kept[finite] = ~_frozen(time_s[finite], values[finite][:, noisy])
-        dropped[f"{name}: frozen"] += int((~kept).sum())
-    if "confidence_ratio" in present:
-        unsure = kept & (values[:, channels.index("confidence_ratio")] < MIN_CONFIDENCE_RATIO)
-        dropped[f"{name}: low confidence"] += int(unsure.sum())
-        kept &= ~unsure
-    return Stream(time_s[kept], values[kept], tuple(channels)) if kept.any() else None
-
-
-def _increasing(time_s: Array) -> Array:
-    """Return the most rows whose stamps are finite and increase: one far ahead costs itself only."""
-    rows = np.flatnonzero(np.isfinite(time_s))
-    return rows if (np.diff(time_s[rows]) > 0).all() else rows[longest_rise(time_s[rows])]
-
-
-def _frozen(time_s: Array, values: Array) -> Array:
-    """Return which rows (n,) repeat the one before, in stretches of at least :data:`FROZEN_S`."""
-    same = np.zeros(len(time_s), dtype=bool)
-    same[1:] = (values[1:] == values[:-1]).all(axis=1)
-    first = np.flatnonzero(~same)
-    last = np.append(first[1:], len(time_s)) - 1
-    lasting = np.repeat(time_s[last] - time_s[first] >= FROZEN_S - _TICK_S, last - first + 1)
-    return np.asarray(same & lasting)
-
-
 def _imu_rows(imu: Stream, robot: Robot) -> dict[str, Array]:
     """Calibrated yaw rate, acceleration of the body without gravity, and yaw.
 
@@ -416,8 +285,8 @@ def _imu_rows(imu: Stream, robot: Robot) -> dict[str, Array]:
 def _steering_rows(steering: Stream, described: Steering) -> dict[str, Array]:
     """Steering angles without their zeros; the first one lies within half a turn."""
     zeros_rad = (described.zero_1_rad, described.zero_2_rad, described.zero_3_rad)
-    wrapped = np.pi - np.mod(np.pi - (steering.values - zeros_rad), 2 * np.pi)
-    return {f"steer_{i + 1}_rad": unwrapped(wrapped[:, i]) for i in range(3)}
+    angles = wrapped(steering.values - zeros_rad)
+    return {f"steer_{i + 1}_rad": unwrapped(angles[:, i]) for i in range(3)}
 
 
 def _camera_rows(odometry: Stream, camera: Camera, dropped: Counter[str]) -> dict[str, Array]:
@@ -442,84 +311,6 @@ def _gnss_rows(gnss: Stream) -> tuple[dict[str, Array], dict[str, Array]]:
     variance = np.column_stack([std, std, *[np.full(std.size, GNSS_SPEED_STD_MPS)] * 2]) ** 2
     variance[np.isnan(values)] = np.nan
     return dict(zip(GNSS_ROWS, values.T, strict=True)), dict(zip(GNSS_ROWS, variance.T, strict=True))
-
-
-def _without_leaps(
-    stream: str, time_s: Array, signals: dict[str, Array], dropped: Counter[str]
-) -> dict[str, Array]:
-    """Take out what no robot does from one sample to the next, before a low-pass smears it over many.
-
-    A camera that finds its place again shows speeds of several m/s for some samples; a spike is one sample.
-    """
-    leaping = np.zeros(time_s.size, dtype=bool)
-    kept = dict(signals)
-    for row, (least, per_second) in LEAPS.items():
-        if row in signals:
-            leaps = _leaps(time_s, signals[row], least, per_second)
-            kept[row] = np.where(leaps, np.nan, signals[row])
-            leaping |= leaps
-    dropped[f"{stream}: leap"] += int(leaping.sum())
-    return kept
-
-
-@njit(cache=True)
-def _leaps(time_s: Array, value: Array, least: float, per_second: float) -> Array:
-    """Mark samples (n,) that are further from the last one kept than a robot gets, for at most BELIEVED_S."""
-    leaps = np.zeros(value.size, dtype=np.bool_)
-    last, last_s, since_s = np.nan, np.nan, np.nan
-    for k in range(value.size):
-        if np.isnan(value[k]):
-            continue
-        if abs(value[k] - last) > least + per_second * (time_s[k] - last_s):
-            if np.isnan(since_s):
-                since_s = time_s[k]
-            if time_s[k] - since_s < BELIEVED_S:
-                leaps[k] = True
-                continue
-        last, last_s, since_s = value[k], time_s[k], np.nan
-    return leaps
-
-
-def _on_clock(
-    clock: Array, time_s: Array, signals: Mapping[str, Array], time_constant_s: float
-) -> dict[str, Array]:
-    """Return each signal behind the low-pass, at the ticks of the clock."""
-    period_s = float(np.median(np.diff(time_s))) if time_s.size > 1 else np.nan
-    rows = {}
-    for row, signal in signals.items():
-        known = np.isfinite(signal)
-        stamps, values = time_s[known], signal[known]
-        held = _held(clock, stamps, period_s)
-        taken = held[held >= 0]
-        at_tick = values[taken]
-        if time_constant_s > 0:
-            behind = low_pass(stamps, values, time_constant_s, GAP_PERIODS * period_s)[taken] - at_tick
-            at_tick = at_tick + behind * np.exp((stamps[taken] - clock[held >= 0]) / time_constant_s)
-        rows[row] = np.full(clock.size, np.nan)
-        rows[row][held >= 0] = at_tick
-    return rows
-
-
-def _held(clock: Array, time_s: Array, period_s: float) -> Array:
-    """Return which sample (n,) each tick takes: the last at or before it, or -1 where that is too old."""
-    tick_s = float(np.median(np.diff(clock))) if clock.size > 1 else np.nan
-    held = np.searchsorted(time_s, clock + _TICK_S, side="right") - 1
-    taken = held >= 0
-    age_s = clock[taken] - time_s[held[taken]]
-    taken[taken] = age_s <= MAX_AGE_PERIODS * np.fmax(period_s, tick_s) + _TICK_S
-    if period_s > MAX_AGE_PERIODS * tick_s:
-        taken[1:] &= held[1:] != held[:-1]
-    return np.where(taken, held, -1)
-
-
-def _ema(value: Array, alpha: float) -> Array:
-    """Smooth the known values (n,) one after the other, whatever the time between them (7.8)."""
-    out = np.array(value)
-    known = np.isfinite(value)
-    if known.any():
-        start = [alpha * value[known][0]]
-        out[known] = lfilter([1.0 - alpha], [1.0, -alpha], value[known], zi=start)[0]
-    return out
 
 
 def _refer_yaw(table: dict[str, Array], clock: Array, rim_mps: Array, initial_yaw_rad: float) -> None:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.signal import lfilter
 
+from terrain.angles import wrapped
 from terrain.constants import GRAVITY_MPS2
 from terrain.estimation.camera import odometry_stream, to_camera
 from terrain.logs.schema import GNSS_CHANNELS, IMU_CHANNELS
@@ -113,7 +114,7 @@ def steering_stream(motion: Motion, robot: Robot, rng: np.random.Generator) -> S
     angle = angle + sensors.steering_std_rad * rng.standard_normal(angle.shape)
     step_rad = 2 * math.pi / sensors.steering_steps_ratio
     angle = np.floor(angle / step_rad) * step_rad + step_rad / 2
-    return Stream(time_s, math.pi - np.mod(math.pi - angle, 2 * math.pi), _named("angle_{}_rad"))
+    return Stream(time_s, wrapped(angle), _named("angle_{}_rad"))
 
 
 def tilt(motion: Motion) -> tuple[Array, Array]:
@@ -193,8 +194,7 @@ def imu_samples(
     drift = np.concatenate([[0.0], np.cumsum(bias[1:, 2]) * period_s])
     yaw = yaw_rad + drift
     yaw = yaw + sensors.yaw_std_rad * rng.standard_normal(n)
-    yaw = math.pi - np.mod(math.pi - yaw, 2 * math.pi)
-    return Stream(time_s, np.column_stack([gyro, accel, fused, yaw]), IMU_CHANNELS), bias[:, 2]
+    return Stream(time_s, np.column_stack([gyro, accel, fused, wrapped(yaw)]), IMU_CHANNELS), bias[:, 2]
 
 
 def camera_stream(motion: Motion, robot: Robot, rng: np.random.Generator, faults: Faults) -> Stream:

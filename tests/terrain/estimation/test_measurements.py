@@ -7,16 +7,16 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
+from terrain.constants import GRAVITY_MPS2
 from terrain.errors import ConfigError, DataError
 from terrain.estimation.camera import odometry_stream
 from terrain.estimation.measurements import (
     CAMERA_ROWS,
     GNSS_ROWS,
-    GRAVITY_MPS2,
     ROWS_OF_DRIVE,
-    low_pass,
     measurement_table,
 )
+from terrain.estimation.resampling import low_pass
 from terrain.records import RunLog, Stream
 from terrain.robots import load_robot
 
