@@ -16,6 +16,16 @@ def by_name(imu, wheels, wheel_channels=WHEELS):
     return dict(zip([feature.name for feature in features], table.T, strict=True))
 
 
+def test_what_a_filter_estimates_is_no_imu_and_no_wheel():
+    values = {"imu": np.ones((2, 6, 50)), "estimator": np.ones((2, 2, 50))}
+    channels = {"imu": IMU, "estimator": ("speed_x_mps", "accel_x_mps2")}
+    assert speed_features(values, channels)[0] == []  # an estimated speed is none of the wheels'
+    values["wheels"], channels["wheels"] = np.ones((2, 4, 13)), WHEELS
+    names = [feature.name for feature in speed_features(values, channels)[0]]
+    assert any(name.startswith("imu.accel_x") for name in names)
+    assert not any(name.startswith("estimator") for name in names)
+
+
 def turning_windows(track_m, n_windows=30, noise_radps=0.02, seed=0):
     """Windows of 2 s of a robot that follows random turns on an effective track width."""
     rng = np.random.default_rng(seed)

@@ -286,6 +286,14 @@ def test_a_clock_that_was_set_back_goes_on_live():
     assert len(track.time_s) == 200
 
 
+def test_two_wild_stamps_one_after_the_other_cost_two_rows():
+    time_s, _, z = ridden()
+    time_s[200], time_s[201] = 1e5, 1.5e5
+    track = run_filter(CARRIAGE, CARRIAGE_NOISE, time_s, z)
+    assert len(track.time_s) == time_s.size - 2
+    assert track.time_s[-1] == time_s[-1]
+
+
 def test_a_sensor_that_was_rejected_is_believed_once_a_second():
     time_s, _, z = ridden(600)
     z[100:300, 1] += 2.0  # 40 standard deviations, for 4 s
