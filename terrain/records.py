@@ -130,6 +130,46 @@ class RunLog:
         return tuple(dict.fromkeys(label.terrain for label in self.labels))
 
 
+class Reading(NamedTuple):
+    """Samples of one stream that arrived together: stamps ``time_s (k,)`` and ``values (k, c)``."""
+
+    time_s: Array
+    values: Array
+
+
+class Sample(NamedTuple):
+    """What a controller is given at one of its steps.
+
+    Parameters
+    ----------
+    time_s : of the step
+    twist : (3,) wanted ``(speed_x_mps, speed_y_mps, yaw_rate_radps)``
+    readings : by stream, what arrived since the step before; a stream that was silent is missing
+    terrain : the ground under the wheels where somebody knows it, as a simulation does; else empty
+    """
+
+    time_s: float
+    twist: Array
+    readings: Mapping[str, Reading]
+    terrain: str = ""
+
+
+class Command(NamedTuple):
+    """What a controller tells the wheels.
+
+    Parameters
+    ----------
+    wheel_radps, steer_rad : (wheels,)
+    twist : (3,) what of the wanted twist is driven
+    status : numbers that say why, by name ending in a unit; always the same names
+    """
+
+    wheel_radps: Array
+    steer_rad: Array
+    twist: Array
+    status: Mapping[str, float]
+
+
 ABSENT, USED, GATED, REOPENED = 0, 1, 2, 3
 """What became of a sensor's measurement at one step of a filter (:attr:`StateTrack.use`)."""
 

@@ -58,6 +58,15 @@ UNIT_SCALES: dict[str, tuple[str, float]] = {
 
 ``g`` is standard gravity."""
 
+WHEELS_CHANNELS: tuple[str, ...] = (
+    *(f"motor_{i}_radps" for i in (1, 2, 3)),
+    *(f"current_{i}_a" for i in (1, 2, 3)),
+)
+"""Channels of the drivers of a swerve robot: motor rates and motor currents."""
+
+STEERING_CHANNELS: tuple[str, ...] = tuple(f"angle_{i}_rad" for i in (1, 2, 3))
+"""Channels of its steering encoders."""
+
 IMU_CHANNELS: tuple[str, ...] = (
     *(f"gyro_{axis}_radps" for axis in "xyz"),
     *(f"accel_{axis}_mps2" for axis in "xyz"),

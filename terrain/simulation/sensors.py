@@ -16,7 +16,7 @@ from scipy.signal import lfilter
 from terrain.angles import wrapped
 from terrain.constants import GRAVITY_MPS2
 from terrain.estimation.camera import odometry_stream, to_camera
-from terrain.logs.schema import GNSS_CHANNELS, IMU_CHANNELS
+from terrain.logs.schema import GNSS_CHANNELS, IMU_CHANNELS, STEERING_CHANNELS, WHEELS_CHANNELS
 from terrain.records import Array, Stream
 from terrain.robots import Robot, Sensors
 from terrain.simulation.conditions import Faults
@@ -88,10 +88,6 @@ def _low_pass(values: Array, time_constant_s: float) -> Array:
     return np.asarray(lfilter([1.0 - keep], [1.0, -keep], values - start, axis=0) + start)
 
 
-def _named(pattern: str) -> tuple[str, ...]:
-    return tuple(pattern.format(i) for i in (1, 2, 3))
-
-
 def wheels_stream(motion: Motion, robot: Robot, rng: np.random.Generator) -> Stream:
     """Motor rates behind the driver's low-pass on quantised Hall steps, and motor currents."""
     motors, sensors = robot.equipment.motors, robot.equipment.sensors
@@ -102,7 +98,7 @@ def wheels_stream(motion: Motion, robot: Robot, rng: np.random.Generator) -> Str
     per_amp_nm = motors.torque_constant_nmpa * motors.reduction_ratio * motors.efficiency_ratio
     current = motion.wheel("torque_nm")[rows] / per_amp_nm
     current = current + sensors.current_std_a * rng.standard_normal(current.shape)
-    return Stream(time_s, np.hstack([motor, current]), _named("motor_{}_radps") + _named("current_{}_a"))
+    return Stream(time_s, np.hstack([motor, current]), WHEELS_CHANNELS)
 
 
 def steering_stream(motion: Motion, robot: Robot, rng: np.random.Generator) -> Stream:
@@ -114,7 +110,7 @@ def steering_stream(motion: Motion, robot: Robot, rng: np.random.Generator) -> S
     angle = angle + sensors.steering_std_rad * rng.standard_normal(angle.shape)
     step_rad = 2 * math.pi / sensors.steering_steps_ratio
     angle = np.floor(angle / step_rad) * step_rad + step_rad / 2
-    return Stream(time_s, wrapped(angle), _named("angle_{}_rad"))
+    return Stream(time_s, wrapped(angle), STEERING_CHANNELS)
 
 
 def tilt(motion: Motion) -> tuple[Array, Array]:
