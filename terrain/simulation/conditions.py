@@ -1,4 +1,4 @@
-"""What differs from run to run on one terrain: load, slope, tyres, roughness."""
+"""What differs from run to run on one terrain: load, slope, tyres, roughness, play."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ _ANY = (-math.inf, math.inf, "a finite number")
 _ABOVE_ZERO = (1e-6, math.inf, "a number above zero")
 _FROM_ZERO = (0.0, math.inf, "a number from zero up")
 _SLOPE = (-1.0, 1.0, "a gradient from -1 to 1")
+_PLAY = (0.0, 0.5, "an angle from 0 to 0.5 rad")
 
 _RANGES: dict[str, tuple[float, float, str]] = {
     "payload_kg": _FROM_ZERO,
@@ -26,6 +27,7 @@ _RANGES: dict[str, tuple[float, float, str]] = {
     "radius_factors": _ABOVE_ZERO,
     "roughness_factor": _FROM_ZERO,
     "field_length_m": _ABOVE_ZERO,
+    "leg_play_rad": _PLAY,
 }
 
 
@@ -41,12 +43,13 @@ class Conditions:
     radius_factors : (3,) true rolling radius of each wheel over the nominal one
     roughness_factor : roughness over that of the soil's description
     field_length_m : over which length the ground changes along the way
+    leg_play_rad : by how much the third leg swings to either side on its hinge (thesis, conclusions)
 
     Raises
     ------
     ConfigError
-        if a number is not finite, a load or a roughness below zero, a length or a radius not above it, or the
-        ground steeper than 1 along an axis.
+        if a number is not finite, a load or a roughness below zero, a length or a radius not above it, the
+        ground steeper than 1 along an axis, or the leg's play beyond half a radian.
     """
 
     payload_kg: float = 0.0
@@ -57,6 +60,7 @@ class Conditions:
     radius_factors: tuple[float, float, float] = (1.0, 1.0, 1.0)
     roughness_factor: float = 1.0
     field_length_m: float = 0.5
+    leg_play_rad: float = 0.0
 
     def __post_init__(self) -> None:
         for item in fields(self):
@@ -118,6 +122,7 @@ def draw_conditions(
         roughness_factor=nominal.roughness_factor
         * float(np.exp(normal(spread.roughness_log_std_ratio, 1)[0])),
         field_length_m=spread.field_length_m,
+        leg_play_rad=nominal.leg_play_rad,
     )
 
 

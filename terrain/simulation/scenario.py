@@ -41,6 +41,15 @@ YAW_RATE_RADPS = 0.3
 SPOT_RADPS = 0.6
 """Of ``spot_turn``."""
 
+CIRCLE_M = 1.5
+"""Radius of ``circle``."""
+
+CIRCLE_MPS = 0.5
+"""Speed of ``circle``, unless a lower one is asked for."""
+
+BRAKE_S = 4.0
+"""Of ``brake``: how long the speed is held before the stop, and the rest after it."""
+
 PATCH_M = (6.0, 12.0)
 """Length of a terrain patch of ``course``."""
 
@@ -67,7 +76,7 @@ class Scenario:
     ----------
     name : of the drive
     rate_hz : of the twists
-    time_s : (n,) from 0 to the duration, both included
+    time_s : (n,) from 0 to the duration, both included, at that rate
     twist : (n, 3) wanted ``(speed_x_mps, speed_y_mps, yaw_rate_radps)``, no wheel beyond the robot's limit
     patches : terrains in order; the first starts at 0, the last has no end
     """
@@ -84,6 +93,8 @@ class Scenario:
         object.__setattr__(self, "patches", tuple(Patch(*patch) for patch in self.patches))
         if self.twist.shape != (self.time_s.size, 3):
             raise ValueError(f"twist has shape {self.twist.shape}, {(self.time_s.size, 3)} is needed")
+        if not np.allclose(self.time_s * self.rate_hz, np.arange(self.time_s.size), rtol=0, atol=1e-6):
+            raise ValueError(f"time_s is not evenly spaced from 0 at {self.rate_hz:g} Hz")
         starts_m = [patch.start_m for patch in self.patches]
         if starts_m[:1] != [0.0] or any(b <= a for a, b in pairwise(starts_m)):
             raise ValueError(f"patches start at {starts_m} m, a rising row from 0 on is needed")
@@ -108,6 +119,7 @@ class _Order(NamedTuple):
     speed_mps: float
     limit: Callable[[Any], Array]
     rng: np.random.Generator
+    accel_mps2: float
 
 
 _STAND = read_only(np.zeros(3))
@@ -120,12 +132,17 @@ def make_scenario(
     duration_s: float | None = None,
     speed_mps: float = 1.0,
     seed: int | np.random.Generator = 0,
+    accel_mps2: float = ACCEL_MPS2,
 ) -> Scenario:
-    """Return a scenario by name; all start at rest, all but ``straight`` and ``course`` end there.
+    """Return a scenario by name; all start at rest, all but ``straight``, ``climb`` and ``course`` end there.
 
     ============= ===================================================================================
     stand         standing still, for calibration
     straight      1 s of rest, 1 m/s^2 up to the speed, held to the end
+    climb         the same for 15 s, for a slope
+    brake         1 s of rest, 1 m/s^2 up to the speed, held for 4 s, and told to stand at once; 4 s of rest
+    circle        a full turn and more to the left on a radius of 1.5 m, at 0.5 m/s at most
+    crab          backward, forward, to both sides and along both diagonals, each way and back again; smooth
     arc           the same with 0.3 rad/s, and down to rest
     starts        from rest at 1 m/s^2 to the speed, 3 s, and down at 1 m/s^2, again and again
     spot_turn     in place to the left, to the right, at 0.6 rad/s, several times
@@ -142,14 +159,16 @@ def make_scenario(
     terrains : of the ground, one unless the scenario is ``course``; the names are not looked up
     duration_s : what the scenario is made for by default; taken to a whole number of samples
     speed_mps : cruising speed; ``survey`` and ``course`` draw from 0.4 to 1.2 times it, backward and sideways
-        ``complex`` is slower
+        ``complex`` is slower, and so is all of ``crab``
     seed : of everything drawn; the same gives the same bytes
+    accel_mps2 : of the ramps of ``straight``, ``climb`` and ``starts``; infinite, they are steps
 
     Raises
     ------
     ConfigError
         for an unknown name, terrains that do not fit it, a duration too short for it, a speed beyond the
-        robot, a robot without steered wheels.
+        robot, an acceleration that is none or that the scenario does not take, or a robot without steered
+        wheels.
 
     Examples
     --------
@@ -167,12 +186,14 @@ def make_scenario(
         raise ConfigError(
             f"scenario {name!r} is driven on one terrain, {len(grounds)} are given: use 'course'"
         )
-    order = _Order(*_ability(robot, speed_mps), _generator(seed))
+    order = _Order(*_ability(robot, speed_mps), _generator(seed), _accel(name, accel_mps2))
     wanted_s = _duration(duration_s)
     if name == "course":
         time_s, twist, patches = _course(order, wanted_s, grounds)
     else:
         default_s, drive, smooth = _DRIVES[name]
+        if callable(default_s):
+            default_s = default_s(order)
         length_s = default_s if wanted_s is None else wanted_s
         time_s = _times(length_s)
         twist = _twists(drive(order, length_s), time_s, smooth)
@@ -185,9 +206,47 @@ def _stand(order: _Order, length_s: float) -> list[_Leg]:
 
 
 def _straight(order: _Order, length_s: float) -> list[_Leg]:
-    ramp_s = order.speed_mps / ACCEL_MPS2
-    hold_s = _rest("straight", length_s, STAND_S + ramp_s, at_least_s=1.0)
-    return [_Leg(_STAND, STAND_S), _Leg(order.limit((order.speed_mps, 0.0, 0.0)), hold_s)]
+    return _ahead("straight", order, length_s)
+
+
+def _climb(order: _Order, length_s: float) -> list[_Leg]:
+    return _ahead("climb", order, length_s)
+
+
+def _ahead(name: str, order: _Order, length_s: float) -> list[_Leg]:
+    ramp_s = order.speed_mps / order.accel_mps2
+    hold_s = _rest(name, length_s, STAND_S + ramp_s, at_least_s=1.0)
+    ahead = order.limit((order.speed_mps, 0.0, 0.0))
+    return [_Leg(_STAND, STAND_S), _Leg(ahead, hold_s, order.accel_mps2)]
+
+
+def _brake_s(order: _Order) -> float:
+    return STAND_S + order.speed_mps / ACCEL_MPS2 + 2 * BRAKE_S
+
+
+def _brake(order: _Order, length_s: float) -> list[_Leg]:
+    taken_s = STAND_S + order.speed_mps / ACCEL_MPS2 + BRAKE_S
+    hold_s = _rest("brake", length_s, taken_s, at_least_s=1.0)
+    ahead = order.limit((order.speed_mps, 0.0, 0.0))
+    return [_Leg(_STAND, STAND_S), _Leg(ahead, hold_s), _Leg(_STAND, BRAKE_S, math.inf)]
+
+
+def _circle_twist(order: _Order) -> Array:
+    speed_mps = min(order.speed_mps, CIRCLE_MPS)
+    return order.limit((speed_mps, 0.0, speed_mps / CIRCLE_M))
+
+
+def _circle_s(order: _Order) -> float:
+    twist = _circle_twist(order)
+    turn_s = 2 * math.pi / float(twist[2])
+    return math.ceil(2 * STAND_S + 2 * _ramp_s(twist) + turn_s)
+
+
+def _circle(order: _Order, length_s: float) -> list[_Leg]:
+    twist = _circle_twist(order)
+    turn_s = 2 * math.pi / float(twist[2])
+    hold_s = _rest("circle", length_s, 2 * STAND_S + 2 * _ramp_s(twist), at_least_s=turn_s)
+    return [_Leg(_STAND, STAND_S), _Leg(twist, hold_s), _Leg(_STAND, STAND_S)]
 
 
 def _arc(order: _Order, length_s: float) -> list[_Leg]:
@@ -197,10 +256,11 @@ def _arc(order: _Order, length_s: float) -> list[_Leg]:
 
 
 def _starts(order: _Order, length_s: float) -> list[_Leg]:
-    drive_s = 3.0 + 2 * order.speed_mps / ACCEL_MPS2
+    drive_s = 3.0 + 2 * order.speed_mps / order.accel_mps2
     n = max(1, int((length_s - STAND_S) / (drive_s + STAND_S)))
     stand_s = _rest("starts", length_s, n * drive_s, at_least_s=(n + 1) * STAND_S) / (n + 1)
-    once = [_Leg(order.limit((order.speed_mps, 0.0, 0.0)), 3.0), _Leg(_STAND, stand_s)]
+    ahead = order.limit((order.speed_mps, 0.0, 0.0))
+    once = [_Leg(ahead, 3.0, order.accel_mps2), _Leg(_STAND, stand_s, order.accel_mps2)]
     return [_Leg(_STAND, stand_s), *once * n]
 
 
@@ -233,14 +293,40 @@ _COMPLEX: tuple[tuple[float, float, float, float], ...] = (
 )
 
 
+_CRAB: tuple[tuple[float, float, float, float], ...] = (
+    # as above; the steering stands through each reversal and turns at the start after each rest
+    (-0.6, 0.0, 0.0, 3.0),
+    (0.6, 0.0, 0.0, 3.0),
+    (0.0, 0.0, 0.0, 1.0),
+    (0.0, 0.5, 0.0, 3.0),
+    (0.0, -0.5, 0.0, 3.0),
+    (0.0, 0.0, 0.0, 1.0),
+    (0.4, 0.4, 0.0, 3.0),
+    (-0.4, -0.4, 0.0, 3.0),
+    (0.0, 0.0, 0.0, 1.0),
+    (-0.4, 0.4, 0.0, 3.0),
+    (0.4, -0.4, 0.0, 3.0),
+)
+
+
 def _complex(order: _Order, length_s: float) -> list[_Leg]:
-    table = np.array(_COMPLEX)
+    return _tour("complex", _COMPLEX, order, length_s)
+
+
+def _crab(order: _Order, length_s: float) -> list[_Leg]:
+    return _tour("crab", _CRAB, order, length_s)
+
+
+def _tour(
+    name: str, legs: tuple[tuple[float, float, float, float], ...], order: _Order, length_s: float
+) -> list[_Leg]:
+    table = np.array(legs)
     twists = order.limit(table[:, :3] * (order.speed_mps, order.speed_mps, YAW_RATE_RADPS))
     ramps_s = sum(_ramp_s(b - a, smooth=True) for a, b in pairwise([_STAND, *twists, _STAND]))
     shares = table[:, 3] / table[:, 3].sum()
-    held_s = _rest("complex", length_s, 2 * STAND_S + ramps_s, at_least_s=10.0)
-    legs = [_Leg(twist, share * held_s) for twist, share in zip(twists, shares, strict=True)]
-    return [_Leg(_STAND, STAND_S), *legs, _Leg(_STAND, STAND_S)]
+    held_s = _rest(name, length_s, 2 * STAND_S + ramps_s, at_least_s=10.0)
+    driven = [_Leg(twist, share * held_s) for twist, share in zip(twists, shares, strict=True)]
+    return [_Leg(_STAND, STAND_S), *driven, _Leg(_STAND, STAND_S)]
 
 
 def _survey(order: _Order, length_s: float) -> list[_Leg]:
@@ -331,7 +417,7 @@ def _rounds(terrains: tuple[str, ...], rng: np.random.Generator) -> Iterator[tup
         yield patches, start_m
 
 
-_DRIVES: dict[str, tuple[float, Callable[[_Order, float], list[_Leg]], bool]] = {
+_DRIVES: dict[str, tuple[float | Callable[[_Order], float], Callable[[_Order, float], list[_Leg]], bool]] = {
     # what it lasts by default, its legs, and whether its ramps are smooth
     "stand": (20.0, _stand, False),
     "straight": (20.0, _straight, False),
@@ -340,7 +426,14 @@ _DRIVES: dict[str, tuple[float, Callable[[_Order, float], list[_Leg]], bool]] = 
     "spot_turn": (30.0, _spot_turn, False),
     "complex": (60.0, _complex, True),
     "survey": (40.0, _survey, False),
+    "climb": (15.0, _climb, False),
+    "brake": (_brake_s, _brake, False),
+    "circle": (_circle_s, _circle, False),
+    "crab": (45.0, _crab, True),
 }
+
+_RAMPED = ("straight", "climb", "starts")
+"""Those whose acceleration can be chosen."""
 
 SCENARIOS: tuple[str, ...] = (*_DRIVES, "course")
 """Names that :func:`make_scenario` knows."""
@@ -373,8 +466,8 @@ def _twists(legs: Sequence[_Leg], time_s: Array, smooth: bool = False) -> Array:
     knots_s, knots = [0.0], [_STAND]
     for leg in legs:
         ramp_s = _ramp_s(leg.twist - knots[-1], leg.accel_mps2, smooth)
-        for length_s in (ramp_s, leg.hold_s):
-            if length_s > 0:
+        for length_s, there in ((ramp_s, bool((leg.twist == knots[-1]).all())), (leg.hold_s, True)):
+            if length_s > 0 or not there:  # a step takes no time
                 knots_s.append(knots_s[-1] + length_s)
                 knots.append(leg.twist)
     place = np.interp(time_s, knots_s, np.arange(len(knots_s)))
@@ -430,6 +523,17 @@ def _ability(robot: Robot, speed_mps: float) -> tuple[float, Callable[[Any], Arr
             f"{radius_m * speed_max_radps:g} m/s"
         )
     return float(speed_mps), lambda twist: scaled(positions_m, radius_m, twist, speed_max_radps)
+
+
+def _accel(name: str, accel_mps2: float) -> float:
+    if not (_is_number(accel_mps2) or accel_mps2 == math.inf) or not accel_mps2 > 0:
+        raise ConfigError(f"accel_mps2 is {accel_mps2!r}, a number above zero is wanted, inf for steps")
+    if accel_mps2 != ACCEL_MPS2 and name not in _RAMPED:
+        raise ConfigError(
+            f"accel_mps2 is {accel_mps2:g}: scenario {name!r} has ramps of its own, "
+            f"only {', '.join(_RAMPED)} take it"
+        )
+    return float(accel_mps2)
 
 
 def _generator(seed: int | np.random.Generator) -> np.random.Generator:

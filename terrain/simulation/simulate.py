@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from itertools import pairwise
 
 import numpy as np
@@ -11,19 +11,21 @@ from scipy.signal import lfilter
 
 from terrain.errors import ConfigError
 from terrain.kinematics.swerve import wheel_commands
-from terrain.records import Array, Label, RunLog, Stream
+from terrain.records import Array, Command, Label, RunLog, Sample, Stream
 from terrain.robots import Robot
 from terrain.simulation.conditions import NO_FAULTS, Conditions, Faults
+from terrain.simulation.loop import Drive, in_loop
 from terrain.simulation.scenario import Scenario
 from terrain.simulation.sensors import (
+    CameraSensor,
     Gnss,
+    GnssSensor,
+    ImuSensor,
     Motion,
-    camera_stream,
-    gnss_stream,
-    imu_stream,
-    steering_stream,
+    Sensor,
+    SteeringSensor,
+    WheelSensor,
     truth_stream,
-    wheels_stream,
 )
 from terrain.simulation.vehicle import (
     BODY_RECORD,
@@ -49,6 +51,9 @@ MAX_WHEEL_SPEEDS = 100.0
 """No wheel turns so many times as fast as its motor can: then the steps are too long for the robot, as with a
 load of 1000 t on 90 kg."""
 
+MAX_COMMAND_DELAY_S = 0.5
+"""Longest way of a command to the wheels; what comes later is no control."""
+
 _SENSOR_RATES = ("wheels_rate_hz", "steering_rate_hz", "imu_rate_hz")
 
 COMMAND_CHANNELS = (
@@ -71,8 +76,14 @@ def simulate(
     conditions: Conditions | None = None,
     faults: Faults = NO_FAULTS,
     gnss: Gnss | None = None,
+    controller: Callable[[Sample], Command] | None = None,
+    command_delay_s: float = 0.0,
 ) -> RunLog:
     """Drive a scenario and return what the loggers wrote, with the truth beside it.
+
+    Without a controller the wheels are told what the wanted twists ask of them.  With one the loop is
+    closed: at each instant of the scenario it is given what has arrived since the one before, just as it will
+    stand in the log, and what it answers is what the wheels are told.
 
     Parameters
     ----------
@@ -84,19 +95,29 @@ def simulate(
     conditions : load, slope, tyres, roughness; a level, nominal day by default
     faults : what the sensors suffer on purpose
     gnss : receiver on board, if any
+    controller : called once an instant of the scenario; without a command yet, wheels are told to stand and
+        the steering to stay at 0
+    command_delay_s : from that instant to when the wheels are told, in whole steps; the step that starts at
+        the instant always runs with the command before
 
     Returns
     -------
     RunLog
-        streams wheels, steering, imu, odometry, commands, truth, and gnss where there is a receiver; what was
-        lost throughout is no stream.  A label for each stretch in which all wheels are on one ground.
+        streams wheels, steering, imu, odometry, commands, truth, gnss where there is a receiver, and control,
+        the status of the controller's commands, where there is any; commands are those decided at each
+        instant.  What was lost throughout is no stream.  A label for each stretch in which all wheels are on
+        one ground.
 
     Raises
     ------
     ConfigError
         if the robot is no swerve robot, lacks a section, is tipped over by its load or has a number so far
         out of scale that its motion cannot be integrated, a sensor is faster than the simulation's steps, a
-        terrain of the scenario has no soil, or its twists do not come every so many whole steps.
+        terrain of the scenario has no soil, its twists do not come every so many whole steps, or the delay is
+        not from 0 to 0.5 s.
+    DataError
+        if a command is not one finite number a wheel, or its status not numbers by names that end in a unit,
+        the same names throughout.
 
     Examples
     --------
@@ -118,38 +139,62 @@ def simulate(
             f"scenario {scenario.name}: rate_hz is {scenario.rate_hz:g}, it must divide {1 / STEP_S:g}"
         )
     _check_rates(robot)
+    delay_steps = _delay_steps(command_delay_s)
     sequence = seed if isinstance(seed, np.random.SeedSequence) else np.random.SeedSequence(seed)
     # One generator a purpose: a sensor more or less changes nothing about the others.
     ground, road, start, wheels, steering, imu, camera, receiver = (
         np.random.default_rng(np.random.SeedSequence(sequence.entropy, spawn_key=(*sequence.spawn_key, i)))
         for i in range(8)
     )
-    admitted, wheel_radps, steer_rad = _commands(robot, scenario)
     plant = _plant(robot, scenario, soils, conditions, ground)
     n_steps = len(scenario.time_s) * substeps
     state = start_state(plant, plant.play_rad * start.uniform(-1.0, 1.0, 3))
     settle(plant, state)
-    record = np.empty((n_steps, N_RECORD))
-    advance(plant, state, wheel_radps, steer_rad, substeps, road.standard_normal((n_steps, 3)), record)
-    motion = Motion(record)
-    _check_motion(motion, robot)
-    imu_log, gyro_bias = imu_stream(motion, robot, imu)
-    streams = {
-        "wheels": wheels_stream(motion, robot, wheels),
-        "steering": steering_stream(motion, robot, steering),
-        "imu": imu_log,
-        "odometry": camera_stream(motion, robot, camera, faults),
+    noise = road.standard_normal((n_steps, 3))
+    motion = Motion(np.empty((n_steps, N_RECORD)), 0)
+    imu_sensor = ImuSensor(motion, robot, imu)
+    sensors: dict[str, Sensor] = {
+        "wheels": WheelSensor(motion, robot, wheels),
+        "steering": SteeringSensor(motion, robot, steering),
+        "imu": imu_sensor,
+        "odometry": CameraSensor(motion, robot, camera, faults),
     }
     if gnss is not None:
-        streams["gnss"] = gnss_stream(motion, gnss, receiver, faults)
-    streams["commands"] = Stream(
-        scenario.time_s, np.hstack([admitted, wheel_radps, steer_rad]), COMMAND_CHANNELS
-    )
-    streams["truth"] = truth_stream(motion, gyro_bias, imu_log.time_s)
+        sensors["gnss"] = GnssSensor(motion, gnss, receiver, faults)
+    status: dict[str, Array] = {}
+    if controller is None:
+        admitted, wheel_radps, steer_rad = _commands(robot, scenario)
+        advance(plant, state, wheel_radps, steer_rad, substeps, noise, motion.record)
+        decided = np.hstack([admitted, wheel_radps, steer_rad])
+    else:
+        drive = Drive(plant, state, noise, motion.record)
+        decided, status = in_loop(controller, delay_steps, scenario, substeps, drive, motion, sensors)
+    _check_motion(motion, robot)
+    motion.grow(n_steps)
+    streams: dict[str, Stream] = {}
+    for name, sensor in sensors.items():
+        sensor.hear()
+        streams[name] = sensor.stream()
+    streams["commands"] = Stream(scenario.time_s, decided, COMMAND_CHANNELS)
+    if status:
+        streams["control"] = Stream(scenario.time_s, np.column_stack(list(status.values())), tuple(status))
+    streams["truth"] = truth_stream(motion, imu_sensor.yaw_bias_radps, imu_sensor.time_s)
     streams = {name: stream for name, stream in streams.items() if len(stream) > 1}
     return RunLog(
         run_id, robot.name, streams, _labels(motion, scenario), source=f"simulated, {scenario.name}"
     )
+
+
+def _delay_steps(delay_s: float) -> int:
+    if (
+        isinstance(delay_s, bool)
+        or not isinstance(delay_s, int | float | np.integer | np.floating)
+        or not 0 <= delay_s <= MAX_COMMAND_DELAY_S
+    ):
+        raise ConfigError(
+            f"command_delay_s is {delay_s!r}, a time from 0 to {MAX_COMMAND_DELAY_S:g} s is wanted"
+        )
+    return round(delay_s / STEP_S)
 
 
 def _check_rates(robot: Robot) -> None:
@@ -226,6 +271,7 @@ def _plant(
         grade_ratio=conditions.grade_ratio,
         swell_ratio=conditions.swell_ratio,
         swell_length_m=conditions.swell_length_m,
+        leg_play_rad=conditions.leg_play_rad,
         grounds=np.array(
             [
                 ground_array(soil, robot.wheel_radius_m, body.tyre_width_m, body.contact_length_m)

@@ -14,6 +14,10 @@ States are integrated with semi-implicit steps of :data:`STEP_S`.  What acts, in
   ``du/dt = (w r - v_long) - max(|w r|, |v_long|) u / sigma``, so that ``u / sigma`` settles at the slip
   ratio and stays finite at rest; ``terrain.terramechanics`` turns deflection and load into thrust, side force
   and resistance.
+- **leg**: the third wheel's leg swings about a hinge on the line of the other two, within
+  :attr:`Plant.leg_play_rad`, to where the ground pushes its wheel; that turns the wheel's heading, which its
+  steering encoder below the hinge does not see (thesis, conclusions: play of the third leg's opening system).
+  What the swing moves the wheel's centre by, and its friction's own moment, are left out.
 - **body**: ``m (dv/dt + w x v) = sum F - m g grad``, ``I dw/dt = sum (r_i - r_com) x F_i``.
 
 Resistance acts at the axle, against the rolling of the wheel; hence in steady motion the thrust balances it
@@ -42,6 +46,13 @@ DEFLECTION_DAMPING_S = 0.005
 
 ROLLING_SPEED_MPS = 0.02
 """Speed over which a resistance takes its full size: it opposes rolling and pushes nobody at rest."""
+
+LEG_RATE_RADPS = 0.5
+"""How fast the third leg swings through its play; assumed, it crosses one degree in 35 ms."""
+
+LEG_FRICTION_NM = 5.0
+"""Moment about its hinge below which the third leg stays where it is; assumed, 7 N on the wheel: a start at
+1 m/s^2 gives three times as much, steady rolling less."""
 
 ROUGHNESS_WAVENUMBER = 0.1
 """Reference wave number of ISO 8608 in cycles/m."""
@@ -80,11 +91,12 @@ BODY_STATES = (
     "path_m",
     "accel_x_mps2",
     "accel_y_mps2",
+    "leg_rad",
 )
 """Position is that of the body's origin; speeds and accelerations (dv/dt + w x v, of the step before) are
-those of its centre of mass in body axes."""
+those of its centre of mass in body axes; the third leg is at 0 in the middle of its play."""
 
-SPEED_X, YAW_RATE, PATH = 3, 5, 6
+SPEED_X, YAW_RATE, PATH, LEG = 3, 5, 6, 9
 N_BODY = len(BODY_STATES)
 N_WHEEL = len(WHEEL_STATES)
 (
@@ -120,6 +132,7 @@ BODY_RECORD = (
     "ride_roll_radps2",
     "ride_pitch_radps2",
     "path_m",
+    "leg_rad",
 )
 WHEEL_RECORD = (
     "wheel_radps",
@@ -132,8 +145,11 @@ WHEEL_RECORD = (
     "sinkage_m",
     "reported_radps",
     "patch_ratio",
+    "side_n",
 )
-"""What is recorded each step, at the body's origin and at each wheel."""
+"""What is recorded each step, at the body's origin and at each wheel.  Steering angles are true headings in
+the body; traction and side force are those of the contact, along the wheel and to its left, so that it takes
+up ``traction (w r - v_along) - side v_across``."""
 
 N_BODY_RECORD = len(BODY_RECORD)
 N_RECORD = N_BODY_RECORD + 3 * len(WHEEL_RECORD)
@@ -168,6 +184,7 @@ class Plant(NamedTuple):
     steer_rate_max_radps: float
     steer_accel_max_radps2: float
     play_rad: float
+    leg_play_rad: float
     grade_ratio: Array
     swell_ratio: float
     swell_length_m: float
@@ -186,6 +203,7 @@ def make_plant(
     grade_ratio: tuple[float, float],
     swell_ratio: float,
     swell_length_m: float,
+    leg_play_rad: float,
     grounds: Array,
     roughness_m3: Array,
     patch_start_m: Array,
@@ -200,6 +218,7 @@ def make_plant(
     radius_factors : (3,) true rolling radius of each wheel over the nominal one
     grade_ratio : (2,) mean gradient of the ground along world x and y, uphill positive
     swell_ratio, swell_length_m : amplitude of a gradient that changes along the way, and its wave length
+    leg_play_rad : half the play of the third leg's hinge
     grounds : (patches, GROUND_SIZE) of ``terrain.terramechanics``
     roughness_m3 : (patches,) ISO 8608 roughness
     patch_start_m : (patches,) path length at which each begins, the first at 0
@@ -249,6 +268,7 @@ def make_plant(
         steer_rate_max_radps=steering.rate_max_radps,
         steer_accel_max_radps2=steering.accel_max_radps2,
         play_rad=steering.dead_band_rad,
+        leg_play_rad=float(leg_play_rad),
         grade_ratio=np.array(grade_ratio, dtype=float),
         swell_ratio=float(swell_ratio),
         swell_length_m=float(swell_length_m),
@@ -321,7 +341,7 @@ def advance(
         steepness = math.sqrt(1.0 + grade_x * grade_x + grade_y * grade_y)
         g_normal = GRAVITY_MPS2 / steepness
         row = record[k]
-        force_x, force_y, moment = 0.0, 0.0, 0.0
+        force_x, force_y, moment, leg_nm = 0.0, 0.0, 0.0, 0.0
         # speeds of the wheel centres, and which way the body goes
         for i in range(3):
             speeds[i, 0] = state[3] - state[5] * (plant.wheels_m[i, 1] - plant.com_m[1])
@@ -330,7 +350,10 @@ def advance(
         for i in range(3):
             w = state[N_BODY + i * N_WHEEL : N_BODY + (i + 1) * N_WHEEL]
             _steer(plant, w, steer_rad[command, i], dt)
-            cos_steer, sin_steer = math.cos(w[STEER]), math.sin(w[STEER])
+            heading = w[STEER]
+            if i == 2 and plant.leg_play_rad > 0.0:
+                heading += state[LEG]
+            cos_steer, sin_steer = math.cos(heading), math.sin(heading)
             along = cos_steer * speeds[i, 0] + sin_steer * speeds[i, 1]
             across = -sin_steer * speeds[i, 0] + cos_steer * speeds[i, 1]
             rim = w[RATE] * plant.radius_m[i]
@@ -354,12 +377,14 @@ def advance(
             thrust, side, resistance, sinkage = wheel_ground(
                 plant.grounds[patch], normal_n, min(max(slip_x, -1.0), 1.0), slip_y
             )
-            cell = min(int(state[6] / FIELD_STEP_M), plant.field.shape[2] - 1)
+            cell = min(max(int(state[6] / FIELD_STEP_M), 0), plant.field.shape[2] - 1)  # a NaN is no place
             thrust *= plant.field[0, i, cell]
             side *= plant.field[0, i, cell]
             pull = thrust - resistance * plant.field[1, i, cell] * math.tanh(along / ROLLING_SPEED_MPS)
             fx = cos_steer * pull - sin_steer * side
             fy = sin_steer * pull + cos_steer * side
+            if i == 2:
+                leg_nm = -plant.wheels_m[i, 1] * fx
             force_x += fx
             force_y += fy
             moment += (plant.wheels_m[i, 0] - plant.com_m[0]) * fy - (
@@ -373,7 +398,7 @@ def advance(
             w[DEFLECTION_Y] = min(max(w[DEFLECTION_Y] + dt * rate_y, -limit), limit)
             at = N_BODY_RECORD + i * len(WHEEL_RECORD)
             row[at] = rim / plant.radius_m[i]  # of this instant, as the slip is
-            row[at + 1] = w[STEER]
+            row[at + 1] = heading
             row[at + 2] = (rim - along) / fastest if fastest >= 0.05 else np.nan
             row[at + 3] = math.atan2(across, abs(along)) if math.hypot(along, across) >= 0.05 else np.nan
             row[at + 4] = normal_n
@@ -382,6 +407,7 @@ def advance(
             row[at + 7] = sinkage
             row[at + 8] = w[REPORTED]
             row[at + 9] = patch
+            row[at + 10] = side
         accel[0] = force_x / plant.mass_kg - GRAVITY_MPS2 * grade_x / steepness
         accel[1] = force_y / plant.mass_kg - GRAVITY_MPS2 * grade_y / steepness
         accel[2] = moment / plant.yaw_inertia_kgm2
@@ -398,6 +424,8 @@ def advance(
         state[2] += dt * state[5]
         state[6] += dt * math.sqrt(origin_x * origin_x + origin_y * origin_y)
         state[7], state[8] = accel[0], accel[1]
+        if plant.leg_play_rad > 0.0:
+            state[LEG] = _swing(plant, state[LEG], leg_nm, dt)
 
 
 @njit(cache=True)
@@ -430,6 +458,15 @@ def _steer(plant: Plant, w: Array, command_rad: float, dt: float) -> None:
     w[MOTOR_RATE] += min(max(wanted - w[MOTOR_RATE], -change), change)
     w[MOTOR] += dt * w[MOTOR_RATE]
     w[STEER] = min(max(w[STEER], w[MOTOR] - plant.play_rad), w[MOTOR] + plant.play_rad)
+
+
+@njit(cache=True)
+def _swing(plant: Plant, leg_rad: float, moment_nm: float, dt: float) -> float:
+    """Swing the third leg through its play to where its wheel is pushed, if that is hard enough."""
+    if abs(moment_nm) <= LEG_FRICTION_NM:
+        return leg_rad
+    turned_rad = leg_rad + math.copysign(LEG_RATE_RADPS * dt, moment_nm)
+    return min(max(turned_rad, -plant.leg_play_rad), plant.leg_play_rad)
 
 
 @njit(cache=True)
@@ -497,3 +534,4 @@ def _record_body(
     row[13] = (0.5 * (a[0] + a[1]) - a[2]) / track_m
     row[14] = -(a[1] - a[0]) / base_m
     row[15] = state[6]
+    row[16] = state[LEG]

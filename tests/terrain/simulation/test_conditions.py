@@ -20,6 +20,8 @@ from terrain.simulation.conditions import Conditions, Faults, draw_conditions, l
         ({"swell_length_m": 0.0}, "swell_length_m is 0.0, a number above zero"),
         ({"radius_factors": (1.0, 0.0, 1.0)}, r"radius_factors is \(1.0, 0.0, 1.0\), a number above zero"),
         ({"roughness_factor": -0.1}, "roughness_factor is -0.1, a number from zero up"),
+        ({"leg_play_rad": -0.01}, "leg_play_rad is -0.01, an angle from 0 to 0.5 rad"),
+        ({"leg_play_rad": math.nan}, "leg_play_rad is nan"),
         ({"field_length_m": math.nan}, "field_length_m is nan"),
     ],
 )
@@ -79,6 +81,10 @@ def test_the_same_generator_draws_the_same_day_and_no_spread_draws_the_nominal_o
         **lengths,
     )
     nominal = Conditions(
-        payload_kg=3.0, payload_m=(0.1, 0.0), grade_ratio=(0.1, 0.0), radius_factors=(0.99, 1.0, 1.0)
+        payload_kg=3.0,
+        payload_m=(0.1, 0.0),
+        grade_ratio=(0.1, 0.0),
+        radius_factors=(0.99, 1.0, 1.0),
+        leg_play_rad=0.02,
     )
     assert draw_conditions(none, np.random.default_rng(0), nominal) == nominal

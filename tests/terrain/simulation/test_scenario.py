@@ -9,6 +9,7 @@ from terrain.kinematics.swerve import forward, wheel_commands, wheel_velocities
 from terrain.robots import load_robot
 from terrain.simulation.scenario import (
     ACCEL_MPS2,
+    CIRCLE_M,
     PATCH_M,
     SCENARIOS,
     SLIP_MARGIN,
@@ -20,6 +21,7 @@ from terrain.simulation.scenario import (
 
 ROBOT = load_robot("agrimaro")
 DRAWN = ("survey", "course")
+UNENDED = ("straight", "climb", "course")
 TERRAINS = ("grass", "gravel", "sand", "tiles")
 
 
@@ -40,9 +42,12 @@ def test_every_scenario_can_be_driven_by_the_robot_and_is_at_rest_where_it_says(
         np.testing.assert_allclose(np.diff(drive.time_s), 1 / drive.rate_hz)
         rest = resting(drive)
         assert rest[drive.time_s <= 1.0].all()
-        assert rest[-1] == (name not in ("straight", "course"))
+        assert rest[-1] == (name not in UNENDED)
         assert rest.all() == (name == "stand")
         change = np.abs(np.diff(drive.twist, axis=0)) * drive.rate_hz
+        if name == "brake":  # but for the one step
+            assert change.max() == pytest.approx(speed_mps * drive.rate_hz)
+            change[change[:, 0].argmax()] = 0.0
         assert np.hypot(change[:, 0], change[:, 1]).max() <= ACCEL_MPS2 * (1 + 1e-9)
         assert change[:, 2].max() <= YAW_ACCEL_RADPS2 * (1 + 1e-9)
         rim_mps = np.linalg.norm(wheel_velocities(ROBOT.wheel_positions_m, drive.twist), axis=-1)
@@ -67,9 +72,9 @@ def test_wheels_follow_but_for_the_moment_in_which_they_are_steered(name):
     assert off.mean() < 0.15
     assert residual_mps[~off].max(initial=0.0) < 1e-6
     started = np.flatnonzero(~resting(drive)[1:] & resting(drive)[:-1])
-    if name in ("straight", "starts"):
+    if name in ("straight", "starts", "climb", "brake"):
         assert not off.any()
-    if name in ("complex", "spot_turn"):  # steered only in the second after a start
+    if name in ("complex", "spot_turn", "crab"):  # steered only in the second after a start
         assert all(0 <= k - started[started <= k].max() <= drive.rate_hz for k in np.flatnonzero(off))
 
 
@@ -81,6 +86,10 @@ DEFAULT_S = {
     "spot_turn": 30,
     "complex": 60,
     "survey": 40,
+    "climb": 15,
+    "brake": 10,
+    "circle": 22,
+    "crab": 45,
 }
 
 
@@ -91,7 +100,7 @@ def test_a_scenario_lasts_exactly_as_long_as_it_should(name, default_s):
         for chosen in (name, "course"):
             drive = make(chosen, duration_s=duration_s, seed=4)
             assert drive.time_s[-1] == duration_s
-            assert resting(drive)[-1] == (chosen not in ("straight", "course"))
+            assert resting(drive)[-1] == (chosen not in UNENDED)
 
 
 def test_straight_is_the_run_of_the_thesis():
@@ -146,6 +155,61 @@ def test_complex_holds_every_kind_of_motion():
     assert x.max() == pytest.approx(1.0)
     bent = np.abs(np.diff(drive.twist, n=2, axis=0)).max() * drive.rate_hz**2
     assert bent < 10.0  # m/s^3; where a linear ramp of 1 m/s^2 begins it is 50
+
+
+@pytest.mark.parametrize("speed_mps", [0.3, 0.5, 1.0])
+def test_brake_holds_its_speed_and_is_told_to_stand_at_once(speed_mps):
+    drive = make("brake", speed_mps=speed_mps)
+    x = drive.twist[:, 0]
+    assert (drive.twist[:, 1:] == 0).all()
+    held = np.flatnonzero(x == x.max())
+    assert len(held) / drive.rate_hz == pytest.approx(4.0, abs=0.03)
+    assert (x[held[-1] + 1 :] == 0).all()
+    assert drive.time_s[-1] - drive.time_s[held[-1]] == pytest.approx(4.0, abs=0.03)
+
+
+@pytest.mark.parametrize(("speed_mps", "driven_mps"), [(0.3, 0.3), (0.5, 0.5), (1.0, 0.5)])
+def test_a_circle_comes_round_to_where_it_began(speed_mps, driven_mps):
+    drive = make("circle", speed_mps=speed_mps)
+    assert drive.twist.max(axis=0) == pytest.approx([driven_mps, 0.0, driven_mps / CIRCLE_M])
+    yaw = np.concatenate([[0.0], np.cumsum((drive.twist[1:, 2] + drive.twist[:-1, 2]) / 2) / drive.rate_hz])
+    assert 2 * math.pi < yaw[-1] < 2.2 * math.pi
+    place = np.cumsum(drive.twist[:, 0] * np.exp(1j * yaw)) / drive.rate_hz
+    np.testing.assert_allclose(np.abs(place - 1j * CIRCLE_M), CIRCLE_M, atol=0.01)
+    assert np.abs(place[yaw > 2 * math.pi]).min() < 0.02
+
+
+def test_crab_goes_every_way_without_turning_and_starts_backward():
+    drive = make("crab")
+    x, y, yaw = drive.twist.T
+    assert (yaw == 0).all()
+    assert x[~resting(drive)][0] < 0
+    held = (np.diff(drive.twist, axis=0, append=0) == 0).all(axis=1) & ~resting(drive)
+    way = np.round(np.degrees(np.arctan2(y, x)[held])) % 360
+    for degrees in range(0, 360, 45):
+        assert (way == degrees).sum() >= 1.5 * drive.rate_hz
+
+
+@pytest.mark.parametrize("name", ["straight", "climb", "starts"])
+def test_ramps_take_the_acceleration_that_is_asked_for_and_may_be_steps(name):
+    plain = make(name)
+    np.testing.assert_array_equal(make(name, accel_mps2=ACCEL_MPS2).twist, plain.twist)
+    for accel_mps2 in (0.4, 2.5):
+        change = np.diff(make(name, accel_mps2=accel_mps2).twist[:, 0]) * plain.rate_hz
+        assert change.max() == pytest.approx(accel_mps2)
+    for accel_mps2 in (1e300, math.inf):
+        step = make(name, accel_mps2=accel_mps2)
+        assert set(step.twist[:, 0]) == {0.0, 1.0}
+        assert step.twist.sum() > plain.twist.sum()
+    if name != "starts":
+        assert step.time_s[step.twist[:, 0] > 0][0] == 1.0
+
+
+@pytest.mark.parametrize("name", [name for name in SCENARIOS if name not in ("straight", "climb", "starts")])
+def test_an_acceleration_that_would_change_nothing_is_refused(name):
+    assert make(name, accel_mps2=1.0).twist.tobytes() == make(name).twist.tobytes()
+    with pytest.raises(ConfigError, match=f"accel_mps2 is 2: scenario '{name}' has ramps of its own"):
+        make(name, accel_mps2=2.0)
 
 
 @pytest.mark.parametrize("name", DRAWN)
@@ -244,6 +308,9 @@ def test_other_scenarios_are_driven_on_one_terrain(name):
         ({"speed_mps": 2.1}, "speed_mps is 2.1: robot agrimaro drives above 0 and up to 2 m/s"),
         ({"speed_mps": 0.0}, "speed_mps is 0.0"),
         ({"speed_mps": math.nan}, "speed_mps is nan"),
+        ({"accel_mps2": 0.0}, "accel_mps2 is 0.0, a number above zero"),
+        ({"accel_mps2": math.nan}, "accel_mps2 is nan"),
+        ({"accel_mps2": "fast"}, "accel_mps2 is 'fast'"),
         ({"seed": -3}, "seed is -3, a whole number from 0 up"),
         ({"seed": None}, "seed is None"),
         ({"robot": load_robot("husky")}, "robot husky has the drive 'skid_steer'"),
@@ -271,6 +338,8 @@ def test_a_scenario_of_ones_own_is_checked():
     assert not Scenario("mine", 50.0, time_s, np.zeros((3, 3)), ((0.0, "ice"),)).twist.flags.writeable
     with pytest.raises(ValueError, match=r"twist has shape \(3, 2\)"):
         Scenario("mine", 50.0, time_s, np.zeros((3, 2)), ((0.0, "ice"),))
+    with pytest.raises(ValueError, match="not evenly spaced from 0 at 50 Hz"):
+        Scenario("mine", 50.0, time_s + 0.02, np.zeros((3, 3)), ((0.0, "ice"),))
     for patches in ((), ((1.0, "ice"),), ((0.0, "ice"), (0.0, "sand"))):
         with pytest.raises(ValueError, match="a rising row from 0 on is needed"):
             Scenario("mine", 50.0, time_s, np.zeros((3, 3)), patches)

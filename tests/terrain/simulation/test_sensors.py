@@ -8,20 +8,20 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, poisson
 
-from terrain.estimation.camera import body_motion
+from terrain.estimation.camera import body_motion, odometry_stream
 from terrain.robots import load_robot
 from terrain.simulation.conditions import NO_FAULTS, Faults
 from terrain.simulation.sensors import (
     IMU_BANDWIDTH_HZ,
     TILT_NOISE_RAD,
+    CameraSensor,
     Gnss,
+    GnssSensor,
+    ImuSensor,
     Motion,
-    camera_stream,
-    gnss_stream,
-    imu_stream,
-    steering_stream,
+    SteeringSensor,
+    WheelSensor,
     truth_stream,
-    wheels_stream,
 )
 from terrain.simulation.vehicle import (
     BODY_RECORD,
@@ -61,6 +61,32 @@ def motion_of(duration_s, **columns):
             first = N_BODY_RECORD + WHEEL_RECORD.index(name)
             record[:, first :: len(WHEEL_RECORD)] = values
     return Motion(record)
+
+
+def heard(sensor):
+    sensor.hear()
+    return sensor.stream()
+
+
+def wheels_stream(*given):
+    return heard(WheelSensor(*given))
+
+
+def steering_stream(*given):
+    return heard(SteeringSensor(*given))
+
+
+def imu_stream(*given):
+    sensor = ImuSensor(*given)
+    return heard(sensor), sensor.yaw_bias_radps
+
+
+def camera_stream(*given):
+    return heard(CameraSensor(*given))
+
+
+def gnss_stream(*given):
+    return heard(GnssSensor(*given))
 
 
 def clock(duration_s):
@@ -107,6 +133,73 @@ def test_every_logger_keeps_its_own_rate_and_begins_at_0():
         (truth_stream(motion, np.zeros(202), np.arange(202) / 100), 100, 202),
     ):
         np.testing.assert_allclose(stream.time_s, np.arange(n) / rate_hz, rtol=0, atol=1e-12)
+
+
+def wild_motion(n=700):
+    """A motion in which nothing stands still."""
+    draw = rng(11)
+    record = 0.05 * draw.standard_normal((n, N_RECORD)).cumsum(axis=0)
+    record[:, BODY_RECORD.index("grade_x_ratio")] = 0.2 * np.sin(np.arange(n) / 50)
+    return record
+
+
+@pytest.mark.parametrize("cuts", [range(1, 700), range(1, 700, 20), [1, 2, 3, 250, 251, 699]])
+def test_a_motion_in_blocks_gives_the_bytes_of_the_motion_in_one(cuts):
+    odd = dataclasses.replace(
+        with_changes("sensors", imu_rate_hz=128.0, imu_latency_s=0.0, wheels_rate_hz=30.0),
+        camera=dataclasses.replace(
+            ROBOT.camera, dropout_rate_hz=3.0, dropout_length_s=0.02, jump_rate_hz=4.0
+        ),
+    )
+    faults = Faults(camera_lost_s=((0.1, 0.2),), gnss_lost_s=((0.3, 0.4),))
+    whole, parts = Motion(wild_motion()), Motion(wild_motion(), 0)
+    for robot in (ROBOT, odd):
+        pairs = [
+            [
+                WheelSensor(motion, robot, rng()),
+                SteeringSensor(motion, robot, rng()),
+                ImuSensor(motion, robot, rng()),
+                CameraSensor(motion, robot, rng(), faults),
+                GnssSensor(motion, Gnss(rate_hz=70.0, latency_s=0.02), rng(), faults),
+            ]
+            for motion in (whole, parts)
+        ]
+        parts.n_rows = 0
+        for n_rows in (*cuts, 700):
+            parts.grow(n_rows)
+            for sensor in pairs[1]:
+                sensor.hear()
+        for one, other in zip(*pairs, strict=True):
+            batch, blocks = heard(one), other.stream()
+            assert len(batch) > 20
+            assert np.isfinite(batch.values).all()
+            assert batch.time_s.tobytes() == blocks.time_s.tobytes()
+            assert batch.values.tobytes() == blocks.values.tobytes(), type(one).__name__
+
+
+def test_no_sample_tells_of_what_comes_after_it_and_each_arrives_once():
+    record, later = wild_motion(), wild_motion()
+    later[301:] += 1.0
+    told = []
+    for rows in (record, later):
+        motion = Motion(rows, 0)
+        robot = with_changes("sensors", imu_latency_s=0.0)
+        sensors = [
+            WheelSensor(motion, robot, rng()),
+            SteeringSensor(motion, robot, rng()),
+            ImuSensor(motion, robot, rng()),
+            CameraSensor(motion, robot, rng(), QUIET),
+        ]
+        motion.grow(301)
+        for sensor in sensors:
+            sensor.hear()
+        told.append([sensor.arrived(0.3) for sensor in sensors])
+        assert all(sensor.arrived(0.3) is None for sensor in sensors)
+        assert [reading.time_s[-1] for reading in told[-1]] == [0.3, 0.3, 0.3, 0.3]
+        assert [len(reading.time_s) for reading in told[-1]] == [16, 16, 31, 61]
+        assert not any(array.flags.writeable for reading in told[-1] for array in reading)
+    for one, other in zip(*told, strict=True):
+        assert one.values.tobytes() == other.values.tobytes()
 
 
 def test_noise_at_rest_is_that_of_the_description():
@@ -243,6 +336,16 @@ def test_steering_is_seen_in_whole_steps_with_its_zero_and_wrapped():
     assert np.abs(error.mean(axis=0)).max() < 4.5 * 0.0011 / math.sqrt(1000)
 
 
+def test_the_third_encoder_does_not_see_its_leg_swing():
+    leg = np.linspace(-0.03, 0.03, 1000)
+    swung = np.column_stack([np.full(1000, 0.2), np.full(1000, -0.1), 0.3 + leg])
+    told = [
+        steering_stream(motion_of(1.0, steer_rad=steer, leg_rad=swing), ROBOT, rng(1)).values
+        for steer, swing in ((swung, leg), (np.array([[0.2, -0.1, 0.3]]), 0.0))
+    ]
+    np.testing.assert_allclose(told[0], told[1], rtol=0, atol=1e-12)
+
+
 def test_current_times_its_constants_is_the_torque():
     robot = with_changes("sensors", current_std_a=0.0)
     torque = np.column_stack([np.linspace(-60, 60, 1000), np.full(1000, 6.0), np.zeros(1000)])
@@ -335,6 +438,25 @@ def test_what_the_camera_tells_in_its_own_frames_is_the_motion():
     np.testing.assert_allclose(back.position_m, position, atol=1e-9)
 
 
+def test_the_camera_tells_what_its_stream_without_noise_says():
+    camera = dataclasses.replace(SILENT_CAMERA.camera, time_constant_s=0.0, lever_z_m=0.3)
+    motion = Motion(wild_motion())
+    told = camera_stream(motion, dataclasses.replace(SILENT_CAMERA, camera=camera), rng(), QUIET)
+    _, rows = motion.at(camera.rate_hz, camera.latency_s)
+    seen = odometry_stream(
+        told.time_s,
+        motion.record[rows, :2],
+        motion.body("yaw_rad")[rows],
+        *motion.tilt_rad[rows].T,
+        motion.record[rows, 3:5],
+        motion.body("yaw_rate_radps")[rows],
+        camera,
+        yaw_0=motion.body("yaw_rad")[0],
+    )
+    assert told.channels == seen.channels
+    np.testing.assert_allclose(told.values, seen.values, rtol=0, atol=1e-12)
+
+
 def test_the_camera_tells_the_slope_it_is_on():
     motion = motion_of(1.0, speed_x_mps=1.0, grade_x_ratio=0.1, grade_y_ratio=-0.05)
     back = body_motion(camera_stream(motion, SILENT_CAMERA, rng(), QUIET), ROBOT.camera)
@@ -423,6 +545,7 @@ def test_the_truth_is_what_happened_and_a_slip_that_never_was_is_no_channel():
         ride_roll_rad=0.01,
         grade_y_ratio=0.1,
         accel_y_mps2=0.3,
+        side_n=[[4.0, 5.0, 6.0]],
     )
     truth = truth_stream(motion, np.array([0.1, 0.2]), np.array([0.0, 0.5]))
     assert "slip_1_ratio" not in truth.channels
@@ -432,6 +555,7 @@ def test_the_truth_is_what_happened_and_a_slip_that_never_was_is_no_channel():
         2.0,
         3.0,
     ]
+    assert [truth.channel(f"side_{i}_n")[7] for i in (1, 2, 3)] == [4.0, 5.0, 6.0]
     np.testing.assert_allclose(truth.channel("roll_rad"), math.atan(0.1) + 0.01)
     np.testing.assert_allclose(truth.channel("gyro_bias_z_radps")[25], 0.15)
     assert np.isfinite(truth.values).all()

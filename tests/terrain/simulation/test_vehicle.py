@@ -13,13 +13,17 @@ from terrain.simulation.vehicle import (
     DEFLECTION_DAMPING_S,
     FIELD_STEP_M,
     GRAVITY_MPS2,
+    LEG_FRICTION_NM,
+    LEG_RATE_RADPS,
     N_BODY,
+    N_BODY_RECORD,
     N_RECORD,
     N_WHEEL,
     ROLLING_SPEED_MPS,
     ROUGHNESS_CUTOFF,
     ROUGHNESS_WAVENUMBER,
     STEP_S,
+    WHEEL_RECORD,
     WHEEL_STATES,
     advance,
     make_plant,
@@ -54,6 +58,7 @@ def plant_of(*soils, roughness_m3=0.0, starts_m=(0.0,), play_rad=0.0, com_height
         "grade_ratio": (0.0, 0.0),
         "swell_ratio": 0.0,
         "swell_length_m": 15.0,
+        "leg_play_rad": 0.0,
         "field": np.ones((2, 3, 1)),
     }
     plant = make_plant(
@@ -91,6 +96,15 @@ def ramp(duration_s, radps=5.0, rise_s=1.0):
     )
 
 
+def smoothly(plant, wheel_radps):
+    """Return what happens straight ahead under commands (n,) at 1 kHz: those that come in steps jerk."""
+    n = len(wheel_radps)
+    record, state = np.empty((n, N_RECORD)), start_state(plant, np.zeros(3))
+    wheel = np.repeat(wheel_radps[:, None], 3, axis=1)
+    advance(plant, state, wheel, np.zeros((n, 3)), 1, np.zeros((n, 3)), record)
+    return Motion(record)
+
+
 def steady_slip(plant, radps=5.0, duration_s=10.0):
     return drive(plant, ramp(duration_s, radps), settled=True).wheel("slip_ratio")[-1]
 
@@ -106,7 +120,7 @@ def reference(plant, wheel_radps, steer_rad, substeps, noise, dt_s=STEP_S, steer
     v, accel, yaw, turn, path = np.zeros(2), np.zeros(2), 0.0, 0.0, 0.0
     rate, motor, motor_rate, torque, integral, estimate = np.zeros((6, 3))
     road, contact, ride, ride_rate, angle, count, reported = np.zeros((7, 3))
-    deflection, steer = np.zeros((2, 3)), np.full(3, steer_0)
+    deflection, steer, leg = np.zeros((2, 3)), np.full(3, steer_0), 0.0
     rows = []
     for k in range(len(noise)):
         c, s = math.cos(yaw), math.sin(yaw)
@@ -124,7 +138,8 @@ def reference(plant, wheel_radps, steer_rad, substeps, noise, dt_s=STEP_S, steer
         motor = motor + dt_s * motor_rate
         steer = np.clip(steer, motor - plant.play_rad, motor + plant.play_rad)
 
-        ahead = np.array([np.cos(steer), np.sin(steer)])
+        heading = steer + np.array([0.0, 0.0, leg])
+        ahead = np.array([np.cos(heading), np.sin(heading)])
         left = np.array([-ahead[1], ahead[0]])
         centre = np.array([v[0] - turn * y, v[1] + turn * x])
         along, across = (ahead * centre).sum(axis=0), (left * centre).sum(axis=0)
@@ -177,7 +192,7 @@ def reference(plant, wheel_radps, steer_rad, substeps, noise, dt_s=STEP_S, steer
         torque = torque + (asked - torque) * dt_s / plant.torque_time_constant_s
         rest = torque - plant.friction_nm * np.tanh(rate / 0.1) - thrust * plant.radius_m
         rows.append(
-            [*v, yaw, turn, path, *rate, *steer, *normal, *(rim - along), *torque, *ride, *reported, *patch]
+            [*v, yaw, turn, path, *rate, *heading, *normal, *(rim - along), *torque, *ride, *reported, *patch]
         )
         rate = rate + dt_s * rest / plant.wheel_inertia_kgm2
         estimate = estimate + (rate - estimate) * dt_s / plant.estimate_time_constant_s
@@ -190,6 +205,10 @@ def reference(plant, wheel_radps, steer_rad, substeps, noise, dt_s=STEP_S, steer
         slide = creep(rate * plant.radius_m)
         deflection = np.clip(deflection + dt_s * slide, -plant.relaxation_m, plant.relaxation_m)
 
+        leg_nm = -plant.wheels_m[2, 1] * force[0, 2]
+        if abs(leg_nm) > LEG_FRICTION_NM:
+            swung = leg + dt_s * LEG_RATE_RADPS * np.sign(leg_nm)
+            leg = float(np.clip(swung, -plant.leg_play_rad, plant.leg_play_rad))
         accel = force.sum(axis=1) / mass - normal_g * grade
         v = v + dt_s * (accel + turn * np.array([v[1], -v[0]]))
         turn = turn + dt_s * moment / plant.yaw_inertia_kgm2
@@ -218,6 +237,7 @@ def test_a_drive_with_everything_in_it_is_that_of_the_plain_form():
         grade_ratio=(0.04, -0.06),
         swell_ratio=0.03,
         swell_length_m=2.0,
+        leg_play_rad=0.03,
         field=rng.uniform(0.8, 1.2, (2, 3, 9)),
     )
     wheel, steer = 6 * rng.random((75, 3)), np.cumsum(0.1 * rng.standard_normal((75, 3)), axis=0)
@@ -228,6 +248,7 @@ def test_a_drive_with_everything_in_it_is_that_of_the_plain_form():
     advance(plant, state, wheel, steer, SUBSTEPS, noise, record)
     motion = Motion(record)
     assert plain["path"][-1] > 0.7  # on all three grounds
+    assert np.ptp(motion.body("leg_rad")) > 0.03  # and through its play
     for name, twin in (("yaw_rad", "yaw"), ("yaw_rate_radps", "turn"), ("path_m", "path")):
         np.testing.assert_allclose(motion.body(name), plain[twin], rtol=0, atol=1e-9, err_msg=name)
     np.testing.assert_allclose(
@@ -258,7 +279,9 @@ def test_a_drive_with_everything_in_it_is_that_of_the_plain_form():
 
 
 def test_a_drive_in_two_parts_is_one_drive():
-    plant = plant_of(load_soil("grass"), roughness_m3=1e-3, grade_ratio=(0.05, 0.02), play_rad=0.02)
+    plant = plant_of(
+        load_soil("grass"), roughness_m3=1e-3, grade_ratio=(0.05, 0.02), play_rad=0.02, leg_play_rad=0.02
+    )
     rng = np.random.default_rng(0)
     wheel, steer, noise = 5 * rng.random((20, 3)), 0.3 * rng.random((20, 3)), rng.standard_normal((400, 3))
     whole, parts = np.empty((400, N_RECORD)), np.empty((400, N_RECORD))
@@ -489,6 +512,61 @@ def test_what_the_motors_give_is_what_is_stored_lifted_and_lost():
     assert given > lifted + friction + rolling
 
 
+@pytest.mark.parametrize("leg_play_rad", [0.0, 0.03])
+def test_what_the_motors_give_in_curves_is_lost_in_the_contacts_to_the_side_as_well(leg_play_rad):
+    soil = load_soil("grass")
+    plant = plant_of(soil, leg_play_rad=leg_play_rad)
+    at = np.arange(400)[:, None]
+    steer = np.clip(0.8 * np.sin(at / 60), -0.5, 0.5) * [-1.0, 1.0, 0.4]
+    motion = drive(plant, ramp(8.0, 7.0), steer, settled=True)
+    turn, heading, rate = (
+        motion.body("yaw_rate_radps"),
+        motion.wheel("steer_rad"),
+        motion.wheel("wheel_radps"),
+    )
+    x, y = ROBOT.wheel_positions_m.T
+    centre_x = motion.body("speed_x_mps")[:, None] - turn[:, None] * y
+    centre_y = motion.body("speed_y_mps")[:, None] + turn[:, None] * x
+    along = np.cos(heading) * centre_x + np.sin(heading) * centre_y
+    across = -np.sin(heading) * centre_x + np.cos(heading) * centre_y
+    thrust, side = motion.wheel("traction_n"), motion.wheel("side_n")
+    resistance = soil.rolling_resistance_ratio * motion.wheel("normal_n") * np.tanh(along / ROLLING_SPEED_MPS)
+    given = (motion.wheel("torque_nm") * rate).sum() * STEP_S
+    friction = (plant.friction_nm * np.tanh(rate / 0.1) * rate).sum() * STEP_S
+    rolling = (resistance * along).sum() * STEP_S
+    slipping = (thrust * (0.2 * rate - along)).sum() * STEP_S
+    sliding = (side * -across).sum() * STEP_S
+    v = np.array([motion.body("speed_x_mps")[-1] - turn[-1] * plant.com_m[1], motion.body("speed_y_mps")[-1]])
+    stored = 0.5 * (90 * v @ v + 20.0 * turn[-1] ** 2 + plant.wheel_inertia_kgm2 * rate[-1] @ rate[-1])
+    assert sliding > 0.02 * given
+    assert given == pytest.approx(stored + friction + rolling + slipping + sliding, rel=5e-3)
+
+
+def test_the_third_leg_swings_to_where_its_wheel_is_pushed_and_no_further():
+    play_rad = 0.03
+    plant = plant_of(load_soil("grass"), leg_play_rad=play_rad)
+    wanted = np.interp(np.arange(3500) * STEP_S, [0.0, 0.5, 1.5, 2.5, 3.5], [0.0, 0.0, 5.0, 5.0, 0.0])
+    motion = smoothly(plant, wanted)
+    leg, heading, t = motion.body("leg_rad"), motion.wheel("steer_rad"), motion.time_s
+    assert np.abs(np.diff(leg)).max() <= LEG_RATE_RADPS * STEP_S * (1 + 1e-9)
+    assert not leg[t < 0.5].any()
+    # a start pushes the wheel, on the right, forward: the leg to the left
+    assert (leg[(t > 0.9) & (t < 1.5)] == play_rad).all()
+    assert (leg[(t > 2.9) & (t < 3.4)] == -play_rad).all()  # braking: the other way
+    crossing_s = (np.flatnonzero(leg == play_rad)[0] - np.flatnonzero(leg)[0] + 1) * STEP_S
+    assert crossing_s >= play_rad / LEG_RATE_RADPS - STEP_S
+    np.testing.assert_array_equal(heading[:, 2], leg)  # nothing was steered
+    assert not heading[:, :2].any()
+
+
+def test_a_leg_that_is_hardly_pushed_stays_where_it_is():
+    slow = 0.5 * LEG_FRICTION_NM / 0.756 / 30.0  # half of what moves it, on a third of the mass
+    plant = plant_of(STICKY, leg_play_rad=0.03, com_height_m=0.0)
+    motion = smoothly(plant, slow / 0.2 * np.arange(4000) * STEP_S)
+    assert motion.body("speed_x_mps")[-1] == pytest.approx(4.0 * slow, rel=0.1)
+    assert not motion.body("leg_rad").any()
+
+
 @pytest.mark.parametrize("name", ["snow", "grass"])
 def test_the_ground_gives_no_more_than_friction(name):
     soil, grade = load_soil(name), np.array([0.05, 0.1])
@@ -620,7 +698,11 @@ def test_a_wheel_in_the_air_does_nothing_and_breaks_nothing():
     assert normal[:, 2].min() == 0.0
     assert (motion.wheel("traction_n")[normal[:, 2] == 0.0, 2] == 0.0).all()
     assert np.isfinite(
-        np.delete(motion.record, [16 + 10 * i + j for i in range(3) for j in (2, 3)], axis=1)
+        np.delete(
+            motion.record,
+            [N_BODY_RECORD + len(WHEEL_RECORD) * i + j for i in range(3) for j in (2, 3)],
+            axis=1,
+        )
     ).all()
 
 
