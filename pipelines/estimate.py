@@ -14,7 +14,14 @@ from pipelines.evaluation import Progress, silent
 from terrain.atomic import ensure_writable
 from terrain.errors import ConfigError, LogError
 from terrain.estimation.consistency import consistency_report, nees
-from terrain.estimation.ekf import FilterModel, FilterSettings, Noise, run_filter
+from terrain.estimation.ekf import (
+    GATE_PROBABILITY,
+    REOPEN_AFTER_S,
+    FilterModel,
+    FilterSettings,
+    Noise,
+    run_filter,
+)
 from terrain.estimation.heading import gnss_heading
 from terrain.estimation.innovations import Innovations, innovations
 from terrain.estimation.measurements import GNSS_ROWS, MeasurementTable, measurement_table
@@ -36,12 +43,6 @@ fitted to chosen runs."""
 
 OWN_TUNING = {"vio12": "thesis"}
 """Tuning unless another is asked for: vio12 is the thesis' own filter, all others are physical."""
-
-GATE_PROBABILITY = 1.0 - 1e-6
-"""Five standard deviations: a wheel that starts to slip is a surprise of four, and no fault."""
-
-REOPEN_AFTER_S = 0.2
-"""Spikes last a sample or two; what disagrees for longer is the ground's doing, a brake or a bump."""
 
 THESIS_SAMPLE_TIME_S = 0.02
 """Q of the thesis is a step's; the sample time that it does not print is that of the wheels stream."""

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numba import float64, int64, njit, void
 
 from terrain.errors import ConfigError, DataError
 from terrain.estimation.measurements import MeasurementTable
@@ -267,7 +268,7 @@ def _slip(
             d_rim[:, track.states.index(f"slip_speed_{wheel}_mps")] += 1.0
         else:
             rim, d_rim = _rim_speed(table, robot, wheel), np.zeros_like(d_ground)
-            rim_variance = (_rim_std_mps(robot) if rim_std_mps is None else rim_std_mps) ** 2
+            rim_variance = (rim_scatter_mps(robot) if rim_std_mps is None else rim_std_mps) ** 2
         ratio[:, i] = slip_ratio(rim, ground)
         by_rim, by_ground = _slopes(rim, ground)
         gradient = by_rim[:, None] * d_rim + by_ground[:, None] * d_ground
@@ -318,14 +319,58 @@ def _slopes(rim: Array, ground: Array) -> tuple[Array, Array]:
     return by_rim, by_ground
 
 
+@njit(
+    void(float64[::1], float64[:, ::1], float64[:, ::1], int64[::1], float64[::1], float64, float64[:, ::1]),
+    cache=True,
+    error_model="numpy",
+)
+def instant_slip(
+    mean: Array, cov: Array, places_m: Array, at: Array, rim_mps: Array, rim_variance: float, slip: Array
+) -> None:
+    """Write ratio and standard deviation (2, wheels) of the slip of one instant: :func:`wheel_slip`, live.
+
+    ``at`` says where in the state stand speed_x, speed_y, yaw rate, the steering angles and the slip speeds,
+    the latter -1 where the state has none and ``rim_mps`` (wheels,) holds.
+    """
+    n = places_m.shape[0]
+    states, slopes = np.empty(5, np.int64), np.empty(5)
+    states[:3] = at[:3]
+    for i in range(n):
+        states[3], states[4] = at[3 + i], at[3 + n + i]
+        x, y = places_m[i, 0], places_m[i, 1]
+        turn = mean[at[2]]
+        ahead, left = mean[at[0]] - turn * y, mean[at[1]] + turn * x
+        cos, sin = np.cos(mean[states[3]]), np.sin(mean[states[3]])
+        ground = ahead * cos + left * sin
+        in_state = states[4] >= 0
+        rim = ground + mean[states[4]] if in_state else rim_mps[i]
+        traction = abs(rim) >= abs(ground)
+        fastest = rim if traction else ground
+        slip[:, i] = np.nan
+        if not (abs(fastest) >= MIN_SPEED_MPS and np.isfinite(rim)):
+            continue
+        size, sign = abs(fastest), np.sign(fastest)
+        by_rim = sign * ground / fastest**2 if traction else 1.0 / size
+        by_ground = -1.0 / size if traction else -sign * rim / fastest**2
+        along = by_rim + by_ground if in_state else by_ground  # the state's ground speed moves its rim too
+        slopes[0], slopes[1], slopes[2] = along * cos, along * sin, along * (x * sin - y * cos)
+        slopes[3], slopes[4] = along * (left * cos - ahead * sin), by_rim
+        variance = 0.0 if in_state else by_rim**2 * rim_variance
+        for j in range(4 + in_state):
+            for k in range(4 + in_state):
+                variance += slopes[j] * cov[states[j], states[k]] * slopes[k]
+        slip[0, i] = min(max((rim - ground) / size, -1.0), 1.0)
+        slip[1, i] = np.sqrt(max(variance, 0.0))
+
+
 def _rim_speed(table: MeasurementTable, robot: Robot, wheel: str) -> Array:
     if robot.drive == "swerve":
         return table.columns([f"wheel_{wheel}_radps"])[:, 0] * robot.wheel_radius_m
     return table.columns([f"wheel_{wheel}_mps"])[:, 0]
 
 
-def _rim_std_mps(robot: Robot) -> float:
-    """Return the scatter of a rim speed: the driver's noise, and the ripple of Hall steps.
+def rim_scatter_mps(robot: Robot) -> float:
+    """Return the scatter of a rim speed: the driver's noise and the ripple of Hall steps; NaN where unknown.
 
     Each step of the wheel by ``2 pi / steps`` lifts what the driver's low-pass reports by that over its time
     constant, and until the next it falls again: a saw-tooth of standard deviation height / sqrt(12).

@@ -137,6 +137,7 @@ def measurement_table(
     ema_alpha: float | None = None,
     initial_yaw_rad: float = 0.0,
     gnss_latency_s: float = GNSS_LATENCY_S,
+    causal: bool = False,
 ) -> MeasurementTable:
     """Return the measurements of a run, ready for a filter.
 
@@ -151,6 +152,8 @@ def measurement_table(
         tick on the camera's rows (7.8), at 0.2 a delay of a quarter of a tick; the other rows stay raw
     initial_yaw_rad : heading of the start in the world frame, to which all yaw rows are referred
     gnss_latency_s : age of a position when it arrives
+    causal : whether a tick takes only what had arrived by then, as a live filter has to; cleaning looks ahead
+        all the same
 
     Raises
     ------
@@ -161,12 +164,14 @@ def measurement_table(
 
     Notes
     -----
-    With latencies taken off, a row holds what the sensor said of that instant, which arrives only later: a
-    live filter has to wait for the longest latency.
+    With latencies taken off, a row holds what the sensor said of that instant, which arrives only later.
+    ``causal``, it holds the last that had arrived, at most a latency and a period old: the low-pass runs on
+    from the sample's own instant to the tick.
 
-    A yaw row is ``initial_yaw_rad`` on average while the robot stands at the start, or at its first sample.
-    A camera that starts late takes the IMU's yaw of that instant instead, and after a loss the turn nearest
-    to it.  The origin of positions is the first with a fix, or the first of all where no fix ever comes.
+    A yaw row is ``initial_yaw_rad`` on average while the robot stands at the start, or at its first sample;
+    ``causal``, the average is that of the ticks so far.  A camera that starts late takes the IMU's yaw of
+    that instant instead, and after a loss the turn nearest to it.  The origin of positions is the first with
+    a fix, or the first of all where no fix ever comes, or if ``causal``.
 
     A sensor slower than the clock gives each of its samples once, so that no filter counts it several times.
 
@@ -195,37 +200,40 @@ def measurement_table(
         rates = np.where(wild, np.nan, rates)
     z |= dict(zip(rows, rates.T, strict=False))
 
+    def at_ticks(stream: Stream, time_s: Array, told: dict[str, Array], behind_s: float) -> dict[str, Array]:
+        return on_clock(clock, time_s, told, behind_s, stream.time_s if causal else time_s)
+
     imu = clean_stream(run, "imu", IMU_CHANNELS, dropped, frozen=IMU_CHANNELS[:6])
     if imu is not None:
         time_s = imu.time_s - (sensors.imu_latency_s if sensors else 0.0)
         told = without_leaps("imu", time_s, _imu_rows(imu, robot), dropped)
-        z |= on_clock(clock, time_s, told, lag_s)
+        z |= at_ticks(imu, time_s, told, lag_s)
 
     steering = clean_stream(run, "steering", [f"angle_{i}_rad" for i in robot.wheels], dropped)
     if steering is not None and robot.steering is not None:
         told = _steering_rows(steering, robot.steering)
         told = without_leaps("steering", steering.time_s, told, dropped)
-        z |= on_clock(clock, steering.time_s, told, lag_s)
+        z |= at_ticks(steering, steering.time_s, told, lag_s)
 
     odometry = clean_stream(run, "odometry", CAMERA_CHANNELS, dropped, frozen=CAMERA_CHANNELS[3:13])
     if odometry is not None and camera is not None:
         own_s = max(encoder_s - camera.time_constant_s, 0.0) if smooth_s is None else smooth_s
         time_s = odometry.time_s - camera.latency_s
         told = without_leaps("odometry", time_s, _camera_rows(odometry, camera, dropped), dropped)
-        taken = on_clock(clock, time_s, told, own_s)
+        taken = at_ticks(odometry, time_s, told, own_s)
         z |= taken if ema_alpha is None else {row: ema(value, ema_alpha) for row, value in taken.items()}
 
     gnss = clean_stream(run, "gnss", GNSS_CHANNELS, dropped)
     if gnss is not None:
-        told, variance_of_told = _gnss_rows(gnss)
-        z |= on_clock(clock, gnss.time_s - gnss_latency_s, told, lag_s)
-        variance |= on_clock(clock, gnss.time_s - gnss_latency_s, variance_of_told, 0.0)
+        told, variance_of_told = _gnss_rows(gnss, causal)
+        z |= at_ticks(gnss, gnss.time_s - gnss_latency_s, told, lag_s)
+        variance |= at_ticks(gnss, gnss.time_s - gnss_latency_s, variance_of_told, 0.0)
 
     unknown = np.full(clock.size, np.nan)
     table = {row: z.get(row, unknown) for row in rows}
     if robot.drive == "swerve":
         rim_mps = np.column_stack([table[row] for row in rows[:3]]) * robot.wheel_radius_m
-        _refer_yaw(table, clock, rim_mps, initial_yaw_rad)
+        _refer_yaw(table, clock, rim_mps, initial_yaw_rad, causal)
     return MeasurementTable(
         clock,
         rows,
@@ -297,13 +305,13 @@ def _camera_rows(odometry: Stream, camera: Camera, dropped: Counter[str]) -> dic
     return dict(zip(CAMERA_ROWS, columns, strict=True))
 
 
-def _gnss_rows(gnss: Stream) -> tuple[dict[str, Array], dict[str, Array]]:
-    """Positions from the first fixed one, speeds, and the variances of both; NaN together."""
+def _gnss_rows(gnss: Stream, causal: bool) -> tuple[dict[str, Array], dict[str, Array]]:
+    """Positions from the first (fixed) one, speeds, and the variances of both; NaN together."""
     values = np.array(gnss.values[:, :4])
     values[np.isnan(values[:, :2]).any(axis=1), :2] = np.nan
     fixed = gnss.channel("fix_ratio") >= 0.5
     placed = np.isfinite(values[:, 0])
-    origin = placed & fixed if (placed & fixed).any() else placed
+    origin = placed & fixed if (placed & fixed).any() and not causal else placed
     if origin.any():
         values[:, :2] -= values[origin.argmax(), :2]
     std = gnss.channel("std_position_m")
@@ -313,7 +321,9 @@ def _gnss_rows(gnss: Stream) -> tuple[dict[str, Array], dict[str, Array]]:
     return dict(zip(GNSS_ROWS, values.T, strict=True)), dict(zip(GNSS_ROWS, variance.T, strict=True))
 
 
-def _refer_yaw(table: dict[str, Array], clock: Array, rim_mps: Array, initial_yaw_rad: float) -> None:
+def _refer_yaw(
+    table: dict[str, Array], clock: Array, rim_mps: Array, initial_yaw_rad: float, causal: bool
+) -> None:
     """Count the yaw rows of a table from the start, and keep the camera's on the turn that the IMU is on."""
     moving = (np.abs(rim_mps) > STANDING_SPEED_MPS).any(axis=1) | (clock > clock[0] + STANDING_S)
     standing = ~np.logical_or.accumulate(moving)
@@ -321,7 +331,11 @@ def _refer_yaw(table: dict[str, Array], clock: Array, rim_mps: Array, initial_ya
         known = np.isfinite(table[row])
         if known.any():
             first = known & standing if (known & standing).any() else np.arange(clock.size) == known.argmax()
-            table[row] = table[row] - table[row][first].mean() + initial_yaw_rad
+            reference = table[row][first].mean()
+            if causal:
+                so_far = np.maximum(np.cumsum(first), 1)
+                reference = np.cumsum(np.where(first, table[row], 0.0)) / so_far
+            table[row] = table[row] - reference + initial_yaw_rad
     imu, camera = table["imu_yaw_rad"], table["camera_yaw_rad"]
     both = np.isfinite(imu) & np.isfinite(camera)
     start = int(np.isfinite(camera).argmax())

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 
 import numpy as np
 from numba import njit
-from scipy.signal import lfilter
 
 from terrain.records import Array
 
@@ -62,15 +61,22 @@ def _low_pass(time_s: Array, value: Array, time_constant_s: float, gap_s: float)
 
 
 def on_clock(
-    clock: Array, time_s: Array, signals: Mapping[str, Array], time_constant_s: float
+    clock: Array,
+    time_s: Array,
+    signals: Mapping[str, Array],
+    time_constant_s: float,
+    arrived_s: Array | None = None,
 ) -> dict[str, Array]:
-    """Return each signal behind the low-pass, at the ticks of the clock."""
+    """Return each signal behind the low-pass, at the ticks of the clock.
+
+    ``time_s`` (n,) is the instant that a sample tells of, ``arrived_s`` (n,) when it came: the same without.
+    """
     period_s = float(np.median(np.diff(time_s))) if time_s.size > 1 else np.nan
     rows = {}
     for row, signal in signals.items():
         known = np.isfinite(signal)
         stamps, values = time_s[known], signal[known]
-        held = _held(clock, stamps, period_s)
+        held = _held(clock, stamps if arrived_s is None else arrived_s[known], period_s)
         taken = held[held >= 0]
         at_tick = values[taken]
         if time_constant_s > 0:
@@ -95,6 +101,8 @@ def _held(clock: Array, time_s: Array, period_s: float) -> Array:
 
 def ema(value: Array, alpha: float) -> Array:
     """Smooth the known values (n,) one after the other, whatever the time between them (7.8)."""
+    from scipy.signal import lfilter  # half a second of import, which only the thesis' smoothing needs
+
     out = np.array(value)
     known = np.isfinite(value)
     if known.any():

@@ -11,7 +11,15 @@ from terrain.estimation.camera import odometry_stream
 from terrain.estimation.measurements import GNSS_ROWS, ROWS_OF_DRIVE, MeasurementTable, measurement_table
 from terrain.records import ABSENT, RunLog, SlipTrack, StateTrack, Stream
 from terrain.robots import load_robot
-from terrain.slip import STALE_AFTER_S, blind_slip, slip_angle, slip_figures, slip_ratio, wheel_slip
+from terrain.slip import (
+    STALE_AFTER_S,
+    blind_slip,
+    instant_slip,
+    slip_angle,
+    slip_figures,
+    slip_ratio,
+    wheel_slip,
+)
 
 ROBOT = load_robot("agrimaro")
 HUSKY = load_robot("husky")
@@ -352,3 +360,26 @@ def test_figures_that_nothing_gives_are_unknown():
     np.testing.assert_allclose(figures.wheel_mean, [0.1, np.nan, 0.1])
     assert figures.steady_mean == pytest.approx(0.1)
     assert figures.peak == 0.6
+
+
+@pytest.mark.parametrize("states", [WITH_SLIP, WITHOUT])
+def test_slip_of_one_instant_is_that_of_the_track(states):
+    rng = np.random.default_rng(0)
+    n, d = 300, len(states)
+    mean = rng.normal(0.0, 1.0, (n, d)) * rng.choice([0.0, 0.02, 1.0], (n, 1))
+    root = rng.normal(0.0, 0.1, (d, d))
+    rim_mps = rng.normal(0.0, 1.0, (n, 3)) * rng.choice([0.0, 0.02, 1.0, np.nan], (n, 3))
+    track = make_track(mean, states, root @ root.T)
+    slip = wheel_slip(track, make_table(track, rim_mps), ROBOT, rim_std_mps=0.05)
+    at = np.array([states.index(s) if s in states else -1 for s in WITH_SLIP])
+    found = np.empty((n, 2, 3))
+    for k in range(n):
+        instant_slip(
+            mean[k], root @ root.T, np.array(ROBOT.wheel_positions_m), at, rim_mps[k], 0.05**2, found[k]
+        )
+    heard = np.maximum.accumulate(np.where(np.isfinite(rim_mps), track.time_s[:, None], -1.0))
+    found = np.where((track.time_s[:, None] - heard > 0.5)[:, None], np.nan, found)
+    np.testing.assert_allclose(found[:, 0], slip.slip_ratio, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(found[:, 1], slip.slip_std, rtol=1e-9, atol=1e-14)
+    assert np.isfinite(found).any()
+    assert np.isnan(found).any()

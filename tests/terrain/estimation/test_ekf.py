@@ -12,6 +12,7 @@ from terrain.estimation.ekf import (
     FilterModel,
     FilterSettings,
     Noise,
+    ResidentFilter,
     filter_step,
     initial_state,
     log_likelihood,
@@ -445,3 +446,38 @@ def test_what_does_not_fit_the_model_is_refused(noise, z, message):
 def test_settings_that_are_none_are_refused():
     with pytest.raises(ConfigError, match="reopen_after_s is 0, seconds above zero are wanted"):
         FilterSettings(reopen_after_s=0)
+
+
+stamp_steps = st.one_of(st.floats(-0.05, 0.1), st.sampled_from([0.0, 0.02, 3.0, -3.0, np.nan, np.inf, 1e300]))
+
+
+@settings(deadline=None, max_examples=30)
+@given(st.lists(stamp_steps, min_size=1, max_size=30), st.integers(0, 9))
+def test_a_resident_filter_takes_the_same_steps_to_the_last_bit(steps, seed):
+    model, rng = flight(), np.random.default_rng(seed)
+    noise = Noise(np.full(5, 0.01), np.full(5, 0.01))
+    state, resident, last_s = initial_state(model, noise), ResidentFilter(model, noise), 0.0
+    for step_s in steps:
+        time_s = last_s + step_s
+        last_s = time_s if abs(step_s) < 10.0 else last_s
+        z = np.where(rng.random(5) < 0.2, np.nan, rng.normal([1000.0, 0.3, 1.0, 0.0, 0.0], 0.1))
+        variance = rng.uniform(0.01, 0.1, 5) if rng.random() < 0.5 else None
+        follows, before_s = resident.follows(time_s), state.time_s
+        state = filter_step(model, noise, state, time_s, z, measurement_variance=variance)
+        taken = resident.step(time_s, z, variance)
+        assert taken == (follows != 0)
+        assert taken == (state.time_s == time_s and before_s != time_s)
+        assert not taken or (follows < 0) == (time_s < before_s)
+        for ours, theirs in (
+            (resident.mean, state.mean),
+            (resident.cov, state.cov),
+            (resident.use, state.use),
+            (resident.reference_age_s, state.reference_age_s),
+        ):
+            np.testing.assert_array_equal(ours, theirs)
+        assert resident.dropped == state.dropped
+
+
+def test_a_resident_filter_wants_one_variance_a_row():
+    with pytest.raises(DataError, match="must be \\(m,\\)"):
+        ResidentFilter(flight(), Noise(np.ones(5), np.ones((3, 5))))

@@ -592,3 +592,25 @@ def test_a_robot_has_to_describe_the_sensors_it_is_asked_of():
         measurement_table(RUN, replace(ROBOT, camera=None))
     blind = replace(ROBOT, camera=None)
     assert measurement_table(without(RUN, "odometry"), blind).time_s.size == 300
+
+
+def test_a_causal_table_knows_nothing_of_what_comes_later():
+    robot = bare(
+        sensors={"imu_latency_s": 0.005, "encoder_time_constant_s": 0.05}, camera={"latency_s": 0.006}
+    )
+    whole, plain = measurement_table(RUN, robot, causal=True), measurement_table(RUN, robot)
+    for end_s in (0.5, 1.5, 3.0):
+        cut = RUN
+        for name in RUN.streams:
+            cut = change(cut, name, lambda t, v, _, end_s=end_s: (t[t <= end_s], v[t <= end_s]))
+        table = measurement_table(cut, robot, causal=True)
+        n = table.time_s.size
+        np.testing.assert_allclose(table.z, whole.z[:n], rtol=0, atol=1e-12)
+        np.testing.assert_array_equal(table.gnss_variance, whole.gnss_variance[:n])
+        ahead = (
+            rows_of(measurement_table(cut, robot), "camera_yaw_rad") != rows_of(plain, "camera_yaw_rad")[:n]
+        )
+        assert ahead.any()  # the other one does
+    within = 6 * NOISE + 0.4 * 0.02  # a latency and a period at 0.4 rad/s
+    apart = rows_of(whole, *CAMERA_ROWS)[60:] - rows_of(plain, *CAMERA_ROWS)[60:]
+    assert np.ptp(apart, axis=0).max() < within

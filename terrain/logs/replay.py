@@ -1,0 +1,101 @@
+"""A log told again as it came: step by step, what each sensor had sent since the step before."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from terrain.errors import ConfigError, DataError
+from terrain.logs.samples import longest_rise
+from terrain.records import Array, Reading, RunLog, Sample
+
+SENSORS: tuple[str, ...] = ("wheels", "steering", "imu", "odometry", "gnss")
+"""Streams that a robot's sensors write; the others are commands, truth and what was made of them."""
+
+TWIST: tuple[str, ...] = ("speed_x_mps", "speed_y_mps", "yaw_rate_radps")
+"""Channels of the wanted motion in the stream ``commands``."""
+
+_SLACK_S = 1e-9  # stamps that differ by less are the same instant, written by two clocks' arithmetic
+
+
+def replay(run: RunLog, rate_hz: float = 50.0) -> Iterator[Sample]:
+    """Yield what a controller would have been given at each of its steps.
+
+    Parameters
+    ----------
+    run : with at least one of :data:`SENSORS`
+    rate_hz : of the steps, the first one at the first stamp of the wheels or, without wheels, of any sensor
+
+    Yields
+    ------
+    Sample
+        with the readings stamped after the step before and up to this one, in the order of the log, and all
+        channels of it; the last twist wanted by then, zeros where the log has none; the label there
+
+    Raises
+    ------
+    ConfigError
+        if the rate is not above zero.
+    DataError
+        if no sensor has a sample.
+
+    Notes
+    -----
+    A stamp is taken for the instant at which a sample came.  One that is out of order, or no number, came
+    with the next one in order.
+
+    Examples
+    --------
+    >>> from terrain.records import Stream
+    >>> imu = Stream([0.0, 0.01, 0.02, 0.03], np.zeros((4, 1)), ("gyro_z_radps",))
+    >>> [sample.readings["imu"].time_s.tolist() for sample in replay(RunLog("a", "agrimaro", {"imu": imu}))]
+    [[0.0], [0.01, 0.02], [0.03]]
+    """
+    if not 0 < rate_hz < np.inf:
+        raise ConfigError(f"rate_hz is {rate_hz:g}, a rate above zero is wanted")
+    came = {name: _came(run.streams[name].time_s) for name in SENSORS if name in run.streams}
+    came = {name: time_s for name, time_s in came.items() if time_s.size}
+    if not came:
+        raise DataError(f"run {run.run_id}: there is no sensor to replay, none of {', '.join(SENSORS)}")
+    return _steps(run, came, 1.0 / rate_hz)
+
+
+def _steps(run: RunLog, came: dict[str, Array], step_s: float) -> Iterator[Sample]:
+    start_s = float(came["wheels"][0] if "wheels" in came else min(c[0] for c in came.values()))
+    end_s = float(max(c[-1] for c in came.values()))
+    ticks = start_s + step_s * np.arange(np.ceil((end_s - start_s - _SLACK_S) / step_s) + 1)
+    ends = {name: np.searchsorted(c, ticks + _SLACK_S, side="right") for name, c in came.items()}
+    twists = _twists(run, ticks)
+    for k, tick_s in enumerate(ticks.tolist()):
+        readings = {}
+        for name, end in ends.items():
+            part = slice(end[k - 1] if k else 0, end[k])
+            if part.start < part.stop:
+                stream = run.streams[name]
+                readings[name] = Reading(stream.time_s[part], stream.values[part])
+        terrain = next((label.terrain for label in run.labels if label.start_s <= tick_s < label.end_s), "")
+        yield Sample(tick_s, twists[k], readings, terrain)
+
+
+def _came(time_s: Array) -> Array:
+    """Return when each sample (n,) came: by its stamp, or with the next in order, or with the last."""
+    known = np.flatnonzero(np.isfinite(time_s))
+    rising = known[longest_rise(time_s[known])]
+    if not rising.size:
+        return np.empty(0)
+    came = np.full(time_s.size, time_s[rising[-1]])
+    came[rising] = time_s[rising]
+    return np.minimum.accumulate(came[::-1])[::-1]
+
+
+def _twists(run: RunLog, ticks: Array) -> Array:
+    """Return the twist (n, 3) wanted at each tick."""
+    twists = np.zeros((ticks.size, 3))
+    commands = run.streams.get("commands")
+    if commands is None or not set(TWIST) <= set(commands.channels):
+        return twists
+    wanted = np.column_stack([commands.channel(channel) for channel in TWIST])
+    last = np.searchsorted(commands.time_s, ticks + _SLACK_S, side="right") - 1
+    twists[last >= 0] = wanted[last[last >= 0]]
+    return twists

@@ -1,0 +1,26 @@
+"""How long live estimation takes a tick: ``pytest tests/benchmarks --benchmark-enable``."""
+
+import time
+
+import pytest
+
+from pipelines.simulate import simulate_run
+from terrain.estimation.live import LiveEstimator
+from terrain.logs.replay import replay
+from terrain.robots import load_robot
+
+MOST_US = 150.0
+
+
+@pytest.mark.benchmark(timer=time.process_time)
+def test_a_live_step_leaves_a_control_loop_its_time(benchmark):
+    robot = load_robot("agrimaro")
+    samples = list(replay(simulate_run(robot, "grass", "straight", 0, duration_s=16.0)))
+
+    def drive():
+        estimator = LiveEstimator(robot)
+        return sum(len(estimator.step(sample.readings)) for sample in samples)
+
+    assert benchmark(drive) >= len(samples) - 1
+    if benchmark.stats:  # absent where benchmarks are off
+        assert benchmark.stats.stats.min / len(samples) * 1e6 < MOST_US
