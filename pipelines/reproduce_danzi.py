@@ -1,7 +1,7 @@
 """The experiments of Danzi, AgriMaRo thesis, on simulated runs.
 
 Each function is one experiment and says what it drives, filters and compares; those on slip are in
-:mod:`pipelines.reproduce_danzi_slip`.
+:mod:`pipelines.reproduce_danzi_slip`, those on traction control in :mod:`pipelines.reproduce_danzi_control`.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from pipelines.drawing import (
 )
 from pipelines.estimate import THESIS_SAMPLE_TIME_S, Estimate, estimate_run, summary
 from pipelines.reproduce import Experiment, Finding, Picture, Row, equation_verdict, holds, said, verdict_of
+from pipelines.reproduce_danzi_control import traction_control
 from pipelines.reproduce_danzi_slip import (
     NO_SLIP_RATIO,
     ROBOT,
@@ -601,5 +602,6 @@ EXPERIMENTS: tuple[Experiment, ...] = (
     Experiment("Slip on three grounds (7.2.3)", slip_on_terrains),
     Experiment("What the zero-slip wheel rows cost (6.1)", known_bias),
     Experiment("The camera lost (6.1)", camera_lost),
+    Experiment("Traction control, case by case (8.3.2)", traction_control),
 )
 """In the order of the page."""

@@ -244,6 +244,16 @@ def test_slip_is_what_the_thesis_and_its_corrections_make_it(danzi):
     assert abs(off) < 3 * ours["beside"]["its own standard deviation"]
 
 
+def test_table_8_1_comes_out_as_printed_and_its_iteration_corrected(danzi):
+    cases = find(danzi, "Rate sent to the wheel, case")
+    assert [case["verdict"] for case in cases] == ["as printed"] * 8
+    assert [round(case["ours"], 3) for case in cases] == [case["printed_interval"][0] for case in cases]
+    swinging, normalised = find(danzi, "Share of the")
+    assert {swinging["verdict"], normalised["verdict"]} == {"corrected"}
+    assert swinging["ours"] == pytest.approx(1.0)
+    assert normalised["spread"] == pytest.approx([0.5, 0.56], abs=0.005)
+
+
 def test_the_same_seed_gives_the_same_rows_and_another_others(danzi):
     for experiment, run in (("zero-slip wheel rows", known_bias), ("The camera lost", camera_lost)):
         rows = [found for found in danzi["rows"] if experiment in found["experiment"]]

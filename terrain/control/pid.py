@@ -1,0 +1,140 @@
+"""PID controller as one pure step: gains, state and error in, output, next state and a status out.
+
+(8.2) of Danzi, AgriMaRo thesis, in steps of dt::
+
+    I' = I + K_I e dt                         d = (x' - x) / dt,  x' = x + (1 - exp(-dt / tau)) (e - x)
+    u = clip(K_P e + I' + K_D d, -limit, limit)
+
+The thesis prints neither anti-windup nor a clamp nor a filter on the derivative.  Here the integral is
+conditional: it stands while the sum is beyond the limit and the error would drive it further.  The derivative
+is that of the error behind a low-pass of time constant tau; there is none at the first error, nor at the
+first after a gap.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from numba import njit, types
+
+from terrain.errors import ConfigError
+
+LONGEST_STEP_S = 0.5
+"""After a longer silence the last error tells nothing of this one."""
+
+OK, CLAMPED, BAD_TIME, NO_ERROR = range(4)
+"""What a step did: went, went against the limit, or had no time step or no error to go by."""
+
+STATUSES = ("ok", "clamped", "bad time", "no error")
+"""Names of the statuses by their code."""
+
+
+class Gains(NamedTuple):
+    """What a controller is set to; output and limits have one unit.
+
+    Parameters
+    ----------
+    kp, ki, kd : output by error, by error and second, by error a second
+    limit : largest output either way
+    integral_limit : largest integral either way; infinite where the limit does
+    derivative_time_constant_s : of the low-pass on the error whose derivative counts; 0 for none
+    """
+
+    kp: float
+    ki: float
+    kd: float
+    limit: float
+    integral_limit: float = math.inf
+    derivative_time_constant_s: float = 0.0
+
+
+class PidState(NamedTuple):
+    """What a controller remembers: its integral, in units of the output, and the smoothed error or NaN."""
+
+    integral: float = 0.0
+    error: float = math.nan
+
+
+GAINS = types.NamedUniTuple(types.float64, len(Gains._fields), Gains)
+PID_STATE = types.NamedUniTuple(types.float64, len(PidState._fields), PidState)
+"""The two as compiled signatures name them; their numbers have to be floats."""
+
+
+def check_gains(gains: Gains) -> Gains:
+    """Return gains that can be used, as floats.
+
+    Raises
+    ------
+    ConfigError
+        if a gain or the time constant is negative or not finite, or a limit not above zero.
+
+    Examples
+    --------
+    >>> check_gains(Gains(1, 0, 0, limit=2)).limit
+    2.0
+    >>> check_gains(Gains(1, -1, 0, limit=2))
+    Traceback (most recent call last):
+    terrain.errors.ConfigError: gain ki is -1, a finite number from zero up is wanted
+    """
+    for name, value in gains._asdict().items():
+        given = value if isinstance(value, int | float) and not isinstance(value, bool) else math.nan
+        if name == "integral_limit":
+            if not given > 0:
+                raise ConfigError(f"gain {name} is {value!r}, a number above zero is wanted")
+        elif name == "limit":
+            if not 0 < given < math.inf:
+                raise ConfigError(f"gain {name} is {value!r}, a finite number above zero is wanted")
+        elif not 0 <= given < math.inf:
+            raise ConfigError(f"gain {name} is {value!r}, a finite number from zero up is wanted")
+    return Gains(*(float(value) for value in gains))
+
+
+@njit(
+    types.Tuple((types.float64, PID_STATE, types.int64))(GAINS, PID_STATE, types.float64, types.float64),
+    cache=True,
+)
+def pid_step(gains: Gains, state: PidState, error: float, dt_s: float) -> tuple[float, PidState, int]:
+    """Return output, next state and status of one step; compiled, callable from compiled code.
+
+    Parameters
+    ----------
+    gains : as :func:`check_gains` gives them
+    state : ``PidState()`` at first, then what the step before returned
+    error : desired less measured
+    dt_s : since the step before
+
+    Returns
+    -------
+    output : within the limit; 0 where there is no error (NaN or infinite) or the time step is not above 0 and
+        up to :data:`LONGEST_STEP_S`
+    state : then with its integral as it was, and without a memory of the error
+    status : :data:`OK`, :data:`CLAMPED`, :data:`BAD_TIME` or :data:`NO_ERROR`
+
+    Examples
+    --------
+    >>> gains = check_gains(Gains(kp=1.0, ki=0.5, kd=0.0, limit=1.0))
+    >>> pid_step(gains, PidState(), 0.4, 0.1)
+    (0.42000000000000004, PidState(integral=0.020000000000000004, error=0.4), 0)
+    >>> pid_step(gains, PidState(), 2.0, 0.1)
+    (1.0, PidState(integral=0.0, error=2.0), 1)
+    >>> pid_step(gains, PidState(0.2), float("nan"), 0.1)
+    (0.0, PidState(integral=0.2, error=nan), 3)
+    """
+    if not 0.0 < dt_s <= LONGEST_STEP_S:
+        return 0.0, PidState(state.integral, math.nan), BAD_TIME
+    if not math.isfinite(error):
+        return 0.0, PidState(state.integral, math.nan), NO_ERROR
+    smooth, rate = error, 0.0
+    if not math.isnan(state.error):
+        tau_s = gains.derivative_time_constant_s
+        change = (error - state.error) * (-math.expm1(-dt_s / tau_s) if tau_s > 0.0 else 1.0)
+        smooth, rate = state.error + change, change / dt_s
+    without = gains.kp * error + gains.kd * rate
+    integral = state.integral + gains.ki * error * dt_s
+    integral = min(max(integral, -gains.integral_limit), gains.integral_limit)
+    if abs(without + integral) > gains.limit and (without + integral) * error > 0.0:
+        integral = state.integral
+    wanted = without + integral
+    output = min(max(wanted, -gains.limit), gains.limit)
+    return output, PidState(integral, smooth), OK if output == wanted else CLAMPED

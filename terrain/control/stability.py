@@ -1,0 +1,308 @@
+"""Whether gains of a slip controller are stable on a robot: its sampled loop, linearised, at its limits.
+
+Small changes about steady rolling of one wheel that carries a third of the robot, with rate w, ground speed
+v, ``V = max(w r, v)``, slip s, share k of it that the contact has taken up over its relaxation length,
+torque T, the driver's PI (q its integral, e its estimate of w, g its gains) and y, the slip as a controller
+sees it::
+
+    s = (r (1 - s_0) w - v) / V  (traction)   or   (r w - (1 + s_0) v) / V  (braking)
+    k' = (s - k) V / sigma                    thrust F = c (k + damping k')
+    J w' = T - r F,   (m / 3) v' = F          T' = (g_P (u - e) + q - T) / tau_T,  q' = g_I (u - e)
+    e' = (w - e) / tau_e                      y' = (s - y) / tau_encoder
+
+The controller gives its output u once in a sample time, after a delay (whole samples, rounded up), and
+between samples u is held; so the loop is a matrix from one sample to the next, and it is stable where all
+eigenvalues are inside the unit circle.  One is always 1 and is taken out: w, v and u can shift together
+without a change of slip, which no controller of slip can see.  It is how a target beside the balance slip
+makes a robot drift, and no oscillation.
+
+The limits: V from the low speed of the controller to the motors' own, traction and braking, and ground whose
+thrust rises with slip from hardly at all (a wheel that slides) to twice as steeply as on tiles.  By the
+first equation one rad/s changes the slip by r / V: the printed form's gain is K_P r / V and is largest at the
+lowest speed; the normalised form's is K_P.  For AgriMaRo with a delay of 0.05 s and K_P alone, the printed
+form is unstable from K_P = 0.38 rad/s on (at 0.05 m/s; at 0.5 m/s from 3.8, at 2 m/s from 15), the normalised
+one from 1.53 at any speed.
+
+The body's friction with the ground, the limits of torque and output, and the falling branch beyond the peak
+of a thrust curve are not in it.  Encoders and speed over ground are taken to be behind the same low-pass, as
+they have to be for slip to mean anything (thesis 7.2.2).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+
+from terrain.constants import GRAVITY_MPS2
+from terrain.control.pid import Gains, check_gains
+from terrain.control.thesis import FORMS, LOW_SPEED_MPS
+from terrain.errors import ConfigError
+from terrain.records import Array
+from terrain.robots import Robot
+from terrain.simulation.vehicle import DEFLECTION_DAMPING_S, STEP_S
+
+SAMPLE_TIME_S = 0.02
+"""Of the commands, assumed: the thesis prints none."""
+
+DELAY_S = 0.05
+"""From the instant that a measurement describes to the command made of it; assumed."""
+
+LONGEST_DELAY_S = 1.0
+
+N_SPEEDS = 24
+SLIPS = (-0.2, 0.2)
+"""Braking has the full gain, traction 1 - s of it."""
+
+SLOPES = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
+"""Rise of the thrust with slip, in loads: turf at its balance slip has 0.6, tiles have 15."""
+
+LARGEST_FACTOR = 1e3
+"""Gains that can be raised so much have no margin worth a number."""
+
+(RATE, SPEED, CONTACT, TORQUE, INTEGRAL, ESTIMATE, SEEN, COMMAND) = range(8)
+_HALVINGS, _TAYLOR_ORDER = 12, 8
+# All at once by a series, and squared: scipy's expm, matrix by matrix, takes seconds where cores are busy.
+
+_PID, _ERROR, _DELAYED = 7, 8, 9  # places after the plant's seven states
+
+
+class Stability(NamedTuple):
+    """How stable a loop is, and where it is least so.
+
+    Parameters
+    ----------
+    radius_ratio : largest magnitude of an eigenvalue; stable below 1
+    speed_mps, slip_ratio, slope_ratio : where that is
+    gain_margin_ratio : factor on all gains from which on the loop is unstable somewhere; infinite for none
+    """
+
+    radius_ratio: float
+    speed_mps: float
+    slip_ratio: float
+    slope_ratio: float
+    gain_margin_ratio: float
+
+
+class _Point(NamedTuple):
+    """The plant from sample to sample at one speed, slip and ground."""
+
+    speed_mps: float
+    slip_ratio: float
+    slope_ratio: float
+    keep: Array
+    drive: Array
+
+
+def check_stable(
+    robot: Robot,
+    gains: Gains,
+    form: str = "normalised",
+    delay_s: float = DELAY_S,
+    *,
+    dt_s: float = SAMPLE_TIME_S,
+    low_speed_mps: float = LOW_SPEED_MPS,
+) -> Stability:
+    """Return how stable the loop is at the robot's limits.
+
+    Parameters
+    ----------
+    robot : with its sections
+    gains : of :class:`terrain.control.pid.Gains`; the limits play no part
+    form : ``printed`` or ``normalised``, see :mod:`terrain.control.thesis`
+    delay_s : from measurement to command, beside the encoders' low-pass
+    dt_s : sample time
+    low_speed_mps : below which the controller does nothing
+
+    Raises
+    ------
+    ConfigError
+        if the loop is unstable at some speed, or a gain, the form, the delay or a time is not accepted.
+
+    Examples
+    --------
+    >>> from terrain.robots import load_robot
+    >>> robot = load_robot("agrimaro")
+    >>> found = check_stable(robot, Gains(0.5, 0.5, 0.0, limit=5.0))
+    >>> found.radius_ratio < 1, round(found.gain_margin_ratio, 1)
+    (True, 3.0)
+    >>> check_stable(robot, Gains(1.0, 0.0, 0.0, limit=5.0), "printed")
+    Traceback (most recent call last):
+    terrain.errors.ConfigError: robot agrimaro: slip control (printed, kp 1, ki 0, kd 0) with a delay of
+    0.05 s is unstable from 0.05 to 0.131 m/s; of all its gains 0.38 times as much is stable
+    """
+    gains = check_gains(gains)
+    points = _points(robot, delay_s, dt_s, low_speed_mps)
+
+    n_delayed = _n_delayed(delay_s, dt_s)
+    without, loops = (
+        np.array([_closed(robot, given, form, n_delayed, dt_s, point) for point in points])
+        for given in (gains._replace(kp=0.0, ki=0.0, kd=0.0), gains)
+    )
+
+    def radii(factor: float) -> Array:  # with all gains times as large: each enters the matrix but once
+        return np.asarray(np.abs(np.linalg.eigvals(without + factor * (loops - without))).max(axis=1))
+
+    found = radii(1.0)
+    margin = _gain_margin(radii)
+    if found.max() >= 1.0:
+        speeds = [point.speed_mps for point, radius in zip(points, found, strict=True) if radius >= 1.0]
+        raise ConfigError(
+            f"robot {robot.name}: slip control ({form}, kp {gains.kp:g}, ki {gains.ki:g}, kd {gains.kd:g}) "
+            f"with a delay of {delay_s:g} s is unstable from {min(speeds):.3g} to {max(speeds):.3g} m/s; "
+            f"of all its gains {margin:.2g} times as much is stable"
+        )
+    worst = points[int(found.argmax())]
+    return Stability(float(found.max()), *worst[:3], margin)
+
+
+def loop_matrix(
+    robot: Robot,
+    gains: Gains,
+    form: str,
+    delay_s: float,
+    speed_mps: float,
+    slip_ratio: float,
+    slope_ratio: float,
+    *,
+    dt_s: float = SAMPLE_TIME_S,
+) -> Array:
+    """Return the closed loop from one sample to the next at one speed, slip and ground; without the drift.
+
+    Parameters
+    ----------
+    robot, gains, form, delay_s, dt_s : as :func:`check_stable` takes them
+    speed_mps : V, the larger of rim and ground speed
+    slip_ratio : s_0
+    slope_ratio : c in loads
+
+    Raises
+    ------
+    ConfigError
+        if the form, a gain or a time is not accepted.
+    """
+    n_delayed = _n_delayed(delay_s, dt_s)
+    (point,) = _sampled(robot, [(speed_mps, slip_ratio, slope_ratio)], dt_s)
+    return _closed(robot, check_gains(gains), form, n_delayed, dt_s, point)
+
+
+def plant_matrix(robot: Robot, speed_mps: float, slip_ratio: float, slope_ratio: float) -> Array:
+    """Return how fast (8, 8) the plant's states and the command change by each of them; the last row is 0.
+
+    In the order of ``w, v, k, T, q, e, y, u`` of the module's equations.
+    """
+    body, motors, _, _, sensors = robot.equipment
+    radius_m, one = robot.wheel_radius_m, np.eye(8)
+    third_kg = robot.mass_kg / 3
+    slip = (
+        radius_m * (1 - slip_ratio) * one[RATE] - one[SPEED]
+        if slip_ratio > 0
+        else radius_m * one[RATE] - (1 + slip_ratio) * one[SPEED]
+    ) / speed_mps
+    taken_up = (slip - one[CONTACT]) * speed_mps / body.relaxation_length_m
+    thrust = slope_ratio * third_kg * GRAVITY_MPS2 * (one[CONTACT] + DEFLECTION_DAMPING_S * taken_up)
+    lacking = one[COMMAND] - one[ESTIMATE]
+    wanted = motors.speed_gain_nmspr * lacking + one[INTEGRAL]
+    # no lag is shorter than the simulator's step, as there
+    torque_s, estimate_s, encoder_s = (
+        max(lag_s, STEP_S)
+        for lag_s in (
+            motors.torque_time_constant_s,
+            motors.speed_estimate_time_constant_s,
+            sensors.encoder_time_constant_s,
+        )
+    )
+    change = np.zeros((8, 8))
+    change[RATE] = (one[TORQUE] - radius_m * thrust) / body.wheel_inertia_kgm2
+    change[SPEED] = thrust / third_kg
+    change[CONTACT] = taken_up
+    change[TORQUE] = (wanted - one[TORQUE]) / torque_s
+    change[INTEGRAL] = motors.speed_integral_nmpr * lacking
+    change[ESTIMATE] = (one[RATE] - one[ESTIMATE]) / estimate_s
+    change[SEEN] = (slip - one[SEEN]) / encoder_s
+    return change
+
+
+def spectral_radius(matrix: Array) -> float:
+    """Return the largest magnitude of an eigenvalue.
+
+    Examples
+    --------
+    >>> round(spectral_radius(np.array([[0.0, -0.5], [0.5, 0.0]])), 3)
+    0.5
+    """
+    return float(np.abs(np.linalg.eigvals(matrix)).max())
+
+
+def _points(robot: Robot, delay_s: float, dt_s: float, low_speed_mps: float) -> list[_Point]:
+    """Return the plant at all limits of the robot; ``ConfigError`` where there are none."""
+    _n_delayed(delay_s, dt_s)
+    fastest_mps = robot.wheel_radius_m * robot.equipment.motors.speed_max_radps
+    if not 0 < low_speed_mps < fastest_mps:
+        raise ConfigError(f"low_speed_mps is {low_speed_mps!r}, above 0 and below {fastest_mps:g} is wanted")
+    speeds_mps = np.geomspace(low_speed_mps, fastest_mps, N_SPEEDS).tolist()
+    return _sampled(robot, list(product(speeds_mps, SLIPS, SLOPES)), dt_s)
+
+
+def _sampled(robot: Robot, places: Sequence[tuple[float, float, float]], dt_s: float) -> list[_Point]:
+    """Return the plant over one sample at each place (speed, slip, slope): the exponential of its matrix."""
+    short = np.array([plant_matrix(robot, *place) for place in places]) * (dt_s / 2**_HALVINGS)
+    moved = one = np.eye(len(short[0]))
+    for order in range(_TAYLOR_ORDER, 0, -1):
+        moved = one + short @ moved / order
+    for _ in range(_HALVINGS):
+        moved = moved @ moved
+    return [
+        _Point(*place, over[:COMMAND, :COMMAND], over[:COMMAND, COMMAND])
+        for place, over in zip(places, moved, strict=True)
+    ]
+
+
+def _n_delayed(delay_s: float, dt_s: float) -> int:
+    if not 0 < dt_s <= LONGEST_DELAY_S:
+        raise ConfigError(f"dt_s is {dt_s!r}, above 0 and up to {LONGEST_DELAY_S:g} s is wanted")
+    if not 0 <= delay_s <= LONGEST_DELAY_S:
+        raise ConfigError(f"delay_s is {delay_s!r}, 0 to {LONGEST_DELAY_S:g} s is wanted")
+    return math.ceil(delay_s / dt_s - 1e-9)
+
+
+def _closed(robot: Robot, gains: Gains, form: str, n_delayed: int, dt_s: float, point: _Point) -> Array:
+    """Return the loop of ``pid_step``, its output held back by some samples, and the plant."""
+    if form not in FORMS:
+        raise ConfigError(f"form {form!r} is unknown: use one of {', '.join(FORMS)}")
+    radius_m, slip = robot.wheel_radius_m, point.slip_ratio
+    size = _DELAYED + n_delayed
+    one, loop = np.eye(size), np.zeros((size, size))
+    error = -one[SEEN] * (point.speed_mps / radius_m if form == "normalised" else 1.0)
+    tau_s = gains.derivative_time_constant_s
+    change = (error - one[_ERROR]) * (-math.expm1(-dt_s / tau_s) if tau_s > 0 else 1.0)
+    loop[:_PID, :_PID] = point.keep
+    loop[_PID] = one[_PID] + gains.ki * dt_s * error
+    loop[_ERROR] = one[_ERROR] + change
+    output = gains.kp * error + loop[_PID] + gains.kd / dt_s * change
+    if n_delayed:
+        loop[_DELAYED] = output
+        loop[_DELAYED + 1 :] = one[_DELAYED:-1]
+        output = one[-1]
+    loop[:_PID] += np.outer(point.drive, output)
+    together = np.zeros(size)
+    together[[RATE, ESTIMATE, _PID]] = 1.0
+    together[_DELAYED:] = 1.0
+    together[SPEED] = radius_m * (1 - slip) if slip > 0 else radius_m / (1 + slip)
+    # What is left of the loop on the directions across one that it maps to itself: its other eigenvalues.
+    across = np.linalg.svd(together[None])[2][1:]
+    return np.asarray(across @ loop @ across.T)
+
+
+def _gain_margin(radii: Callable[[float], Array]) -> float:
+    """Return the factor on all gains at which the loop turns unstable; it is stable at no gain."""
+    if radii(LARGEST_FACTOR).max() < 1.0:
+        return math.inf
+    low, high = 1 / LARGEST_FACTOR, LARGEST_FACTOR
+    while high / low > 1.003:
+        middle = math.sqrt(low * high)
+        low, high = (middle, high) if radii(middle).max() < 1.0 else (low, middle)
+    return low

@@ -1,0 +1,220 @@
+import math
+
+import numpy as np
+import pytest
+
+from terrain.constants import GRAVITY_MPS2
+from terrain.control.pid import Gains, PidState, check_gains, pid_step
+from terrain.control.stability import DELAY_S, SLOPES, check_stable, loop_matrix, spectral_radius
+from terrain.control.thesis import FORMS, new_state, thesis_settings, thesis_step
+from terrain.errors import ConfigError
+from terrain.robots import load_robot
+from terrain.simulation.vehicle import (
+    BODY_RECORD,
+    DEFLECTION_DAMPING_S,
+    N_BODY_RECORD,
+    N_RECORD,
+    WHEEL_RECORD,
+    advance,
+    make_plant,
+    start_state,
+)
+from terrain.terramechanics.soil import load_soil
+from terrain.terramechanics.traction import equilibrium_slip, ground_array, net_pull
+
+ROBOT = load_robot("agrimaro")
+DT_S = 0.02
+RADIUS_M = ROBOT.wheel_radius_m
+GEOMETRY = RADIUS_M, ROBOT.body.tyre_width_m, ROBOT.body.contact_length_m
+LOAD_N = ROBOT.mass_kg / 3 * GRAVITY_MPS2
+MOST_RADPS = 1e300
+
+
+def critical_gain(form, delay_s, *where, robot=ROBOT):
+    """The proportional gain from which on the loop is unstable, by halving."""
+    low, high = 1e-3, 1e3
+    while high / low > 1.0001:
+        middle = math.sqrt(low * high)
+        gains = Gains(middle, 0.0, 0.0, 1.0)
+        stable = spectral_radius(loop_matrix(robot, gains, form, delay_s, *where)) < 1
+        low, high = (middle, high) if stable else (low, middle)
+    return low
+
+
+def small_changes(gains, form, n_delayed, speed_mps, slip_ratio, slope_ratio, n_samples):
+    """Slip (n,) as seen at each sample after a change of the rate: the same loop by ``pid_step`` and Heun."""
+    body, motors, sensors = ROBOT.body, ROBOT.motors, ROBOT.sensors
+
+    def slip_of(w, v):
+        if slip_ratio > 0:
+            return (RADIUS_M * (1 - slip_ratio) * w - v) / speed_mps
+        return (RADIUS_M * w - (1 + slip_ratio) * v) / speed_mps
+
+    def change(x, u):
+        w, v, taken, torque, integral, estimate, seen = x
+        slip = slip_of(w, v)
+        rate = speed_mps / body.relaxation_length_m * (slip - taken)
+        thrust_n = slope_ratio * LOAD_N * (taken + DEFLECTION_DAMPING_S * rate)
+        wanted = motors.speed_gain_nmspr * (u - estimate) + integral
+        return np.array(
+            [
+                (torque - RADIUS_M * thrust_n) / body.wheel_inertia_kgm2,
+                thrust_n / (ROBOT.mass_kg / 3),
+                rate,
+                (wanted - torque) / motors.torque_time_constant_s,
+                motors.speed_integral_nmpr * (u - estimate),
+                (w - estimate) / motors.speed_estimate_time_constant_s,
+                (slip - seen) / sensors.encoder_time_constant_s,
+            ]
+        )
+
+    x, pid, queue, found = np.array([0.01, 0, 0, 0, 0, 0, 0.0]), PidState(0.0, 0.0), [0.0] * n_delayed, []
+    steps = 40
+    for _ in range(n_samples):
+        error = -x[6] * (speed_mps / RADIUS_M if form == "normalised" else 1.0)
+        output, pid, _ = pid_step(gains, pid, float(error), DT_S)
+        queue.append(output)
+        u = queue.pop(0)
+        for _ in range(steps):
+            first = change(x, u)
+            x = x + DT_S / steps * 0.5 * (first + change(x + DT_S / steps * first, u))
+        found.append(x[6])
+    return np.array(found)
+
+
+@pytest.mark.parametrize(
+    ("numbers", "form", "n_delayed", "where"),
+    [
+        ((3.5, 1.0, 0.0, 0.0), "normalised", 3, (1.0, 0.13, 0.6)),
+        ((2.0, 0.5, 0.0, 0.0), "normalised", 2, (0.2, -0.2, 0.1)),
+        ((1.5, 0.0, 0.02, 0.1), "printed", 0, (0.05, 0.2, 0.3)),
+        ((0.3, 2.0, 0.0, 0.0), "printed", 3, (0.05, -0.1, 1.0)),
+        ((2.0, 2.0, 0.05, 0.05), "printed", 1, (0.1, 0.2, 3.0)),
+    ],
+)
+def test_a_small_change_grows_or_dies_as_the_largest_eigenvalue_says(numbers, form, n_delayed, where):
+    kp, ki, kd, tau_s = numbers
+    gains = check_gains(Gains(kp, ki, kd, MOST_RADPS, derivative_time_constant_s=tau_s))
+    matrix = loop_matrix(ROBOT, gains, form, n_delayed * DT_S, *where)
+    slip = np.abs(small_changes(gains, form, n_delayed, *where, 500))
+    early, late = slip[150:250].max(), slip[400:500].max()  # a hundred samples hold a whole swing
+    assert (late / early) ** (1 / 250) == pytest.approx(spectral_radius(matrix), rel=2e-3)
+
+
+def on_grass(settings, target, rim_mps, n_delayed, duration_s=14.0):
+    """Slip at each sample; from 3 s on under control, at 5 s a kick. Truth behind the encoders' low-pass."""
+    plant = make_plant(
+        ROBOT,
+        payload_kg=0.0,
+        payload_m=(0.0, 0.0),
+        radius_factors=np.ones(3),
+        grade_ratio=(0.0, 0.0),
+        swell_ratio=0.0,
+        swell_length_m=15.0,
+        leg_play_rad=0.0,
+        grounds=np.array([ground_array(load_soil("grass"), *GEOMETRY)]),
+        roughness_m3=np.zeros(1),
+        patch_start_m=np.zeros(1),
+        field=np.ones((2, 3, 1)),
+    )
+    state, memory, record = start_state(plant, np.zeros(3)), new_state(), np.zeros((20, N_RECORD))
+    queue, found = [np.zeros(3)] * n_delayed, []
+    rate, speed, share = np.zeros(3), 0.0, 0.001 / ROBOT.sensors.encoder_time_constant_s
+    for k in range(round(duration_s / DT_S)):
+        command, added = np.full(3, min(k * DT_S, 1.0) * rim_mps / RADIUS_M), np.zeros(3)
+        if k >= 150:
+            added, *_, memory = thesis_step(
+                settings,
+                memory,
+                command,
+                rate,
+                np.full(3, speed),
+                np.zeros(3),
+                speed,
+                np.full(3, target),
+                DT_S,
+            )
+        queue.append(added + (0.2 * command if 250 <= k < 255 else 0.0))
+        sent = (command + queue.pop(0))[None]
+        advance(plant, state, sent, np.zeros((1, 3)), 20, np.zeros((20, 3)), record)
+        for row in record:
+            rate = rate + share * (row[N_BODY_RECORD :: len(WHEEL_RECORD)] - rate)
+            speed += share * (row[BODY_RECORD.index("speed_x_mps")] - speed)
+        found.append(record[-1, N_BODY_RECORD + WHEEL_RECORD.index("slip_ratio")])
+    return np.array(found)
+
+
+@pytest.mark.parametrize(("form", "rim_mps"), [("printed", 0.1), ("printed", 0.5), ("normalised", 1.0)])
+def test_the_full_robot_on_grass_settles_under_the_critical_gain_and_swings_over_it(form, rim_mps):
+    soil, aside = load_soil("grass"), 1e-4
+    balance = equilibrium_slip(soil, LOAD_N, 0.0, *GEOMETRY)
+    below, above = net_pull(soil, LOAD_N, np.array([balance - aside, balance + aside]), *GEOMETRY)
+    slope = (above - below) / (2 * aside) / LOAD_N
+    gain = critical_gain(form, 3 * DT_S, rim_mps, balance, slope)
+    settled, swinging = (
+        on_grass(
+            thesis_settings(RADIUS_M, Gains(factor * gain, 0.0, 0.0, 2 * rim_mps / RADIUS_M), form),
+            balance,
+            rim_mps,
+            3,
+        )[-100:]
+        for factor in (0.85, 1.2)
+    )
+    assert np.ptp(settled) < 1e-3
+    assert settled[-1] == pytest.approx(balance, abs=1e-3)
+    assert np.ptp(swinging) > 0.5
+
+
+def test_the_printed_form_loses_its_margin_with_speed_and_the_normalised_one_does_not():
+    """The figures in the module's docstring."""
+    least = {
+        (form, speed): min(critical_gain(form, DELAY_S, speed, -0.2, slope) for slope in SLOPES)
+        for form in FORMS
+        for speed in (0.05, 0.5, 2.0)
+    }
+    printed, normalised = ([least[form, speed] for speed in (0.05, 0.5, 2.0)] for form in FORMS)
+    assert printed == pytest.approx([0.38, 3.8, 15.3], rel=0.02)
+    assert normalised == pytest.approx([1.53] * 3, rel=0.02)
+    margin = check_stable(ROBOT, Gains(0.19, 0.0, 0.0, 5.0), "printed").gain_margin_ratio
+    assert margin == pytest.approx(least["printed", 0.05] / 0.19, rel=0.01)
+
+
+def test_margins_shrink_with_gain_delay_and_sample_time():
+    def margin(factor=1.0, **options):
+        gains = Gains(0.2 * factor, 0.4 * factor, 0.0, 5.0)
+        return check_stable(ROBOT, gains, **options).gain_margin_ratio
+
+    assert margin(2.0) == pytest.approx(margin() / 2, rel=0.01)
+    by_delay = [margin(delay_s=delay_s) for delay_s in (0.0, 0.05, 0.15)]
+    assert by_delay == sorted(by_delay, reverse=True)
+    assert margin(delay_s=0.0, dt_s=0.05) < margin(delay_s=0.0)
+    assert margin(form="printed", low_speed_mps=0.1) == pytest.approx(2 * margin(form="printed"), rel=0.02)
+
+
+def test_without_gains_nothing_turns_unstable():
+    found = check_stable(ROBOT, Gains(0.0, 0.0, 0.0, 1.0))
+    assert found.radius_ratio < 1
+    assert found.gain_margin_ratio == math.inf
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"gains": Gains(2.0, 0.0, 0.0, 5.0)}, r"unstable from 0\.05 to 2 m/s; of all its gains 0\.76 times"),
+        (
+            {"form": "printed"},
+            r"^robot agrimaro: slip control \(printed, kp 1, .* unstable from 0\.05 to 0\.1",
+        ),
+        ({"gains": Gains(-1.0, 0.0, 0.0, 5.0)}, "^gain kp is -1"),
+        ({"form": "new"}, "^form 'new' is unknown: use one of printed, normalised"),
+        ({"delay_s": math.nan}, "^delay_s is nan, 0 to 1 s is wanted"),
+        ({"delay_s": -0.1}, "^delay_s is -0.1"),
+        ({"dt_s": 0.0}, "^dt_s is 0.0"),
+        ({"low_speed_mps": 2.0}, "^low_speed_mps is 2.0, above 0 and below 2 is wanted"),
+        ({"robot": load_robot("husky")}, "^robot husky: its description has no section"),
+    ],
+)
+def test_an_unstable_loop_or_bad_input_is_refused_in_one_sentence(arguments, words):
+    with pytest.raises(ConfigError, match=words) as refused:
+        check_stable(**{"robot": ROBOT, "gains": Gains(1.0, 0.0, 0.0, 5.0)} | arguments)
+    assert "\n" not in str(refused.value)
