@@ -7,6 +7,7 @@ thesis' own dead band of 0.05 m/s on: between the two, a centimetre a second of 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -129,7 +130,7 @@ def _filtered(runs: Sequence[RunLog], robot: Robot) -> tuple[list[Estimate], lis
     )
 
 
-def _slip_with(run: RunLog, robot: Robot, **smoothing: float) -> Curve:
+def _slip_with(run: RunLog, robot: Robot, **smoothing: Any) -> Curve:
     """Return the slip by the thesis' filter, ungated, on signals that are smoothed in some way."""
     table = measurement_table(run, robot, **smoothing)
     model = make_filter("vio12", robot)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from pipelines.evaluation import Progress, silent
+from pipelines.slip_drives import learning_run
 from terrain.atomic import ensure_writable
 from terrain.errors import ConfigError, LogError
 from terrain.logs.write import run_folder, write_run
@@ -29,6 +30,9 @@ BENCH = "six_positions"
 
 BENCH_TERRAIN = "bench"
 """The terrain that goes with it."""
+
+SLIP = "slip"
+"""Word for drives that take the wheels through their slips, for ``terrain learn-slip``."""
 
 EVERY = "all"
 """Word for each terrain in turn."""
@@ -57,7 +61,7 @@ def simulate_run(
     robot : robot with all sections
     terrain : name of a soil or path of its YAML file, or ``course`` for all soils in one run
     scenario : name of a scenario; ``course`` goes with the terrain ``course``, ``six_positions`` (the IMU
-        alone, for calibration) with ``bench``
+        alone, for calibration) with ``bench``; ``slip`` takes the wheels through their slips on varied days
     seed, number : which draw
     duration_s : length; the scenario's own by default
     vary : draw soil, slope, load, tyres and roughness for this run as ``data/soils`` and ``data/spread`` tell
@@ -72,6 +76,8 @@ def simulate_run(
     """
     if scenario == BENCH:
         return _bench(robot, terrain, seed, number, duration_s)
+    if scenario == SLIP:
+        return _through_slips(robot, terrain, seed, number, duration_s, conditions, faults, gnss)
     if (terrain == COURSE) != (scenario == COURSE):
         raise ConfigError("terrain 'course' and scenario 'course' go together: give both or neither")
     soils = {soil.name: soil for soil in map(load_soil, soil_names() if terrain == COURSE else (terrain,))}
@@ -95,6 +101,27 @@ def simulate_run(
         faults=Faults() if faults is None else faults,
         gnss=gnss,
     )
+
+
+def _through_slips(
+    robot: Robot,
+    terrain: str,
+    seed: int,
+    number: int,
+    duration_s: float | None,
+    conditions: Conditions | None,
+    faults: Faults | None,
+    gnss: Gnss | None,
+) -> RunLog:
+    """Return one of the drives of :mod:`pipelines.slip_drives`, which draw everything of their day."""
+    if terrain == COURSE:
+        raise ConfigError(f"scenario {SLIP!r} is driven on one terrain, not on 'course'")
+    if duration_s is not None or conditions not in (None, Conditions()) or gnss is not None:
+        raise ConfigError(f"scenario {SLIP!r} draws its own day: leave duration, grade, payload and gnss out")
+    if faults not in (None, Faults()):
+        raise ConfigError(f"scenario {SLIP!r} has no faults on purpose: leave the camera's loss out")
+    ground = load_soil(terrain).name
+    return learning_run(robot, terrain, seed, number, run_id=run_id_of(ground, SLIP, number))
 
 
 def _bench(robot: Robot, terrain: str, seed: int, number: int, duration_s: float | None) -> RunLog:

@@ -198,6 +198,48 @@ def log_training(
             raise TerrainError(f"MLflow: {' '.join(str(error).split())[:300]}") from error
 
 
+def log_learning(
+    name: str,
+    params: Mapping[str, Any],
+    metrics: Mapping[str, float],
+    tags: Mapping[str, str],
+    texts: Mapping[str, str],
+    documents: Mapping[str, Any],
+    figures: Mapping[str, Figure],
+) -> str:
+    """Log a run in which something other than a model was learned; return its id.
+
+    Parameters
+    ----------
+    name : of the run
+    params, metrics, tags : as MLflow holds them
+    texts, documents : text files and JSON documents by file name
+    figures : figures by name, logged as PNG
+
+    Raises
+    ------
+    TerrainError
+        if the tracking folder cannot be written or the server cannot be reached.
+    """
+    with _quiet() as mlflow:
+        _connect(mlflow, create=True)
+        try:
+            mlflow.set_experiment(EXPERIMENT)
+            with mlflow.start_run(run_name=name) as run:
+                mlflow.log_params(dict(params))
+                mlflow.log_metrics(dict(metrics))
+                mlflow.set_tags(dict(tags))
+                for file, text in texts.items():
+                    mlflow.log_text(text, file)
+                for file, document in documents.items():
+                    mlflow.log_dict(document, file)
+                for figure_name, figure in figures.items():
+                    mlflow.log_figure(figure, f"figures/{figure_name}.png")
+            return str(run.info.run_id)
+        except _failures(mlflow) as error:
+            raise TerrainError(f"MLflow: {' '.join(str(error).split())[:300]}") from error
+
+
 def _log_model(
     mlflow: Any, name: str, recipe: WindowPipeline, windows: Windows, info: Mapping[str, Any]
 ) -> Any:

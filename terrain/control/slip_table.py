@@ -1,19 +1,25 @@
 """Target slip by terrain and drive state, from a YAML table in which every number has its source.
 
-See ``data/target_slip/default.yaml`` for the form.  A number with runs behind it (``n_runs`` and
-``slip_std``) is ``estimated``; one without is ``unestimated``, whoever wrote it.
+Two forms are read.  That of ``data/target_slip/default.yaml`` has numbers that somebody wrote; one with runs
+behind it (``n_runs`` and ``slip_std``) is ``estimated``, one without ``unestimated``, whoever wrote it.
+``terrain learn-slip`` writes the other, ``schema: 2``: for one robot, each number with its status, and beside
+the numbers the curve that they are from.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
-import numpy as np
 import yaml
 
+from terrain.atomic import atomic_write
+from terrain.control.slip_curve import LAW_PARAMETERS
+from terrain.descriptions import check_keys, read_yaml
 from terrain.errors import ConfigError
 from terrain.records import SlipTarget
 from terrain.resources import data_folder
@@ -23,7 +29,54 @@ DRIVE_STATES = ("traction", "braking", "steady")
 SIGN = {"traction": 1, "braking": -1, "steady": 1}
 """Slip is positive in traction and negative in braking; steady motion needs traction against resistance."""
 
+SCHEMA = 2
+"""Newest form that is read, and the one that is written."""
+
+STATUSES = ("unestimated", "estimated", "invalid")
+PEAK_STATUSES = ("peak", "no_peak")
+
 _NUMBER_KEYS = {"slip_ratio", "source", "slip_std", "n_runs"}
+_HEADER = """\
+# Slip to aim for on each terrain, positive in traction (s = (w r - v) / max(|w r|, |v|)).
+# Written by terrain learn-slip.  estimated: learned from n_runs runs; unestimated: too little was driven, the
+# number is assumed; invalid: what was learned contradicts itself, the fallback stands in.
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class CurveEntry:
+    """What a table holds of a learned curve; numbers as they stand in the file, None where nobody knows.
+
+    Parameters
+    ----------
+    law, parameters : by :data:`terrain.control.slip_curve.LAW_PARAMETERS`
+    peak_slip_ratio, peak_interval_ratio, peak_status : of the net pull
+        (:mod:`terrain.control.slip_curve`); the interval holds it with 90 %
+    slip_range_ratio : slips that were seen
+    resistance_ratio, resistance_std : over load
+    balance_slip_ratio : where thrust is resistance
+    peak_based_slip_ratio, working_slip_ratio : what the target of traction is the lesser of
+    traction_efficiency_ratio : tractive efficiency there
+    traction_energy_jpm, braking_energy_jpm, steady_energy_jpm : of the unladen robot a metre at each target
+    n_runs : behind it
+    """
+
+    law: str
+    parameters: Mapping[str, float]
+    peak_slip_ratio: float
+    peak_interval_ratio: tuple[float, float]
+    peak_status: str
+    slip_range_ratio: tuple[float, float]
+    resistance_ratio: float
+    resistance_std: float
+    balance_slip_ratio: float
+    peak_based_slip_ratio: float
+    working_slip_ratio: float | None
+    traction_efficiency_ratio: float
+    traction_energy_jpm: float
+    braking_energy_jpm: float
+    steady_energy_jpm: float
+    n_runs: int
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,16 +86,28 @@ class SlipTable:
     Parameters
     ----------
     name : name of the table
-    fallback : the entry that stands in for a terrain without one
+    fallback : the entry that stands in for a terrain without a valid one
     targets : by terrain, then by drive state
+    robot : whose slips they are; empty where the table is for none in particular
+    curves : by terrain, where one was learned
+    reasons : by terrain, why its numbers are not learned or not used
     """
 
     name: str
     fallback: str
     targets: Mapping[str, Mapping[str, SlipTarget]]
+    robot: str = ""
+    curves: Mapping[str, CurveEntry] = field(default_factory=dict)
+    reasons: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name in ("targets", "curves", "reasons"):
+            object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
 
     def lookup(self, terrain: str) -> Mapping[str, SlipTarget]:
         """Return the targets for a terrain, or those of the fallback; each says whose entry it is.
+
+        An entry with an ``invalid`` number is no entry.
 
         Examples
         --------
@@ -50,59 +115,212 @@ class SlipTable:
         >>> table.lookup("ICE")["traction"].terrain, table.lookup("mud")["traction"].terrain
         ('ICE', 'unknown')
         """
-        return self.targets.get(terrain, self.targets[self.fallback])
+        entry = self.targets.get(terrain)
+        if entry is None or any(target.status == "invalid" for target in entry.values()):
+            return self.targets[self.fallback]
+        return entry
 
 
-def load_slip_table(path: str | Path | None = None) -> SlipTable:
+def load_slip_table(path: str | Path | None = None, robot: str | None = None) -> SlipTable:
     """Read a table; the packaged ``default`` one without a path.
+
+    Parameters
+    ----------
+    path : YAML file
+    robot : name of the robot that is to be driven; any by default
 
     Raises
     ------
     ConfigError
-        if the file cannot be read, holds an unknown key, lacks a drive state or a source, or holds a slip
-        that is not finite, not within [-1, 1] or of the wrong sign.
+        if the file cannot be read or is of a newer schema, a key is unknown, missing or given twice, the
+        table is another robot's, has no fallback or an invalid one, lacks a drive state or a source, or holds
+        a slip that is not finite, not within [-1, 1], of the wrong sign, or targets that do not rise from
+        braking over steady to traction.
     """
     file = data_folder("target_slip") / "default.yaml" if path is None else Path(path)
-    try:
-        content = yaml.safe_load(file.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{file}: cannot be read ({getattr(error, 'strerror', None) or error})") from error
-    except yaml.YAMLError as error:
-        raise ConfigError(f"{file}: is no YAML ({' '.join(str(error).split())})") from error
-    if not isinstance(content, dict) or set(content) != {"name", "fallback", "terrains"}:
+    content = read_yaml(file)
+    schema = content.get("schema", 1) if isinstance(content, dict) else 1
+    if isinstance(schema, bool) or not isinstance(schema, int) or schema < 1:
+        raise ConfigError(f"{file}: schema is {schema!r}, 1 or {SCHEMA} is wanted")
+    if schema > SCHEMA:
+        raise ConfigError(f"{file}: schema {schema} is newer than {SCHEMA}, the newest that is read here")
+    keys = ["name", "fallback", "terrains"]
+    if schema == 1 and not (isinstance(content, dict) and set(content) - {"schema"} == set(keys)):
         raise ConfigError(f"{file}: a slip table holds just the keys name, fallback and terrains")
+    if schema > 1:
+        check_keys(str(file), content, ["schema", "name", "robot", "fallback", "terrains"])
     terrains, fallback = content["terrains"], content["fallback"]
     if not isinstance(terrains, dict) or not isinstance(fallback, str) or fallback not in terrains:
         raise ConfigError(f"{file}: the fallback {fallback!r} is no entry of terrains")
-    targets = {str(terrain): _entry(file, str(terrain), entry) for terrain, entry in terrains.items()}
-    return SlipTable(str(content["name"]), str(fallback), targets)
+    of_robot = content.get("robot", "")
+    if schema > 1 and not (isinstance(of_robot, str) and of_robot):
+        raise ConfigError(f"{file}: robot is {of_robot!r}, the name of one is wanted")
+    if robot is not None and of_robot and of_robot != robot:
+        raise ConfigError(f"{file}: the table is for robot {of_robot!r}, not for {robot!r}")
+    targets, curves, reasons = {}, {}, {}
+    for key, entry in terrains.items():
+        terrain = str(key)
+        extra = {"curve", "reason"} if schema > 1 else set()
+        if not isinstance(entry, dict) or not set(DRIVE_STATES) <= set(entry) <= set(DRIVE_STATES) | extra:
+            raise ConfigError(f"{file}: {terrain} needs just the drive states {', '.join(DRIVE_STATES)}")
+        targets[terrain] = {
+            state: _target(file, terrain, state, entry[state], schema) for state in DRIVE_STATES
+        }
+        _check_order(file, terrain, targets[terrain])
+        if "curve" in entry:
+            curves[terrain] = _curve(f"{file}: {terrain}, curve", entry["curve"])
+        if "reason" in entry:
+            if not isinstance(entry["reason"], str):
+                raise ConfigError(f"{file}: {terrain}: reason is {entry['reason']!r}, a text is wanted")
+            reasons[terrain] = entry["reason"]
+    if any(target.status == "invalid" for target in targets[fallback].values()):
+        raise ConfigError(
+            f"{file}: the fallback {fallback!r} is invalid: nothing could stand in for anything"
+        )
+    return SlipTable(str(content["name"]), fallback, targets, of_robot, curves, reasons)
 
 
-def _entry(file: Path, terrain: str, entry: Any) -> dict[str, SlipTarget]:
-    if not isinstance(entry, dict) or set(entry) != set(DRIVE_STATES):
-        raise ConfigError(f"{file}: {terrain} needs just the drive states {', '.join(DRIVE_STATES)}")
-    return {state: _target(file, terrain, state, entry[state]) for state in DRIVE_STATES}
+def write_slip_table(table: SlipTable, path: str | Path) -> None:
+    """Write a table as a file of schema 2, whole or not at all; reading it gives the same table.
+
+    Raises
+    ------
+    ConfigError
+        if it is no robot's.
+    TerrainError
+        if the place cannot be written.
+    """
+    if not table.robot:
+        raise ConfigError(f"table {table.name!r} is no robot's: a learned table names the one it is for")
+    body = yaml.safe_dump(
+        table_content(table), sort_keys=False, default_flow_style=None, width=200, allow_unicode=True
+    )
+    atomic_write(path, _HEADER + body)
 
 
-def _target(file: Path, terrain: str, state: str, number: Any) -> SlipTarget:
+def table_content(table: SlipTable) -> dict[str, Any]:
+    """Return what the file of a table holds."""
+    terrains: dict[str, Any] = {}
+    for terrain, by_state in table.targets.items():
+        entry: dict[str, Any] = {state: _number(by_state[state]) for state in DRIVE_STATES}
+        if terrain in table.reasons:
+            entry["reason"] = table.reasons[terrain]
+        if (curve := table.curves.get(terrain)) is not None:
+            entry["curve"] = {
+                item.name: _plain(getattr(curve, item.name))
+                for item in fields(CurveEntry)
+                if getattr(curve, item.name) is not None
+            }
+        terrains[terrain] = entry
+    return {
+        "schema": SCHEMA,
+        "name": table.name,
+        "robot": table.robot,
+        "fallback": table.fallback,
+        "terrains": terrains,
+    }
+
+
+def _number(target: SlipTarget) -> dict[str, Any]:
+    known = {} if math.isnan(target.slip_std) else {"slip_std": float(target.slip_std)}
+    runs = {"n_runs": int(target.n_runs)} if target.n_runs else {}
+    return {
+        "slip_ratio": float(target.slip_ratio),
+        **known,
+        **runs,
+        "status": target.status,
+        "source": target.source,
+    }
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: float(number) for key, number in value.items()}
+    return [float(number) for number in value] if isinstance(value, tuple) else value
+
+
+def _target(file: Path, terrain: str, state: str, number: Any, schema: int) -> SlipTarget:
     where = f"{file}: {terrain}, {state}"
-    if not isinstance(number, dict) or not {"slip_ratio", "source"} <= set(number) <= _NUMBER_KEYS:
-        raise ConfigError(f"{where}: needs slip_ratio and source, and accepts slip_std and n_runs besides")
+    accepted = _NUMBER_KEYS | ({"status"} if schema > 1 else set())
+    needed = accepted - {"slip_std", "n_runs"}
+    if not isinstance(number, dict) or not needed <= set(number) <= accepted:
+        words = "slip_ratio and source" if schema == 1 else "slip_ratio, status and source"
+        raise ConfigError(f"{where}: needs {words}, and accepts slip_std and n_runs besides")
     slip, std, n_runs = number["slip_ratio"], number.get("slip_std"), number.get("n_runs", 0)
-    if isinstance(slip, bool) or not isinstance(slip, int | float) or not np.isfinite(slip) or abs(slip) > 1:
+    if not _is_number(slip) or abs(slip) > 1:
         raise ConfigError(f"{where}: slip_ratio is {slip!r}; it must be a number within [-1, 1]")
     if slip * SIGN[state] < 0:
         sign = "negative" if SIGN[state] > 0 else "positive"
         raise ConfigError(f"{where}: slip_ratio is {slip:g}; {state} slip cannot be {sign}")
     if not isinstance(number["source"], str) or not number["source"].strip():
         raise ConfigError(f"{where}: source must be a text, or 'assumed'")
-    is_number = isinstance(std, int | float) and not isinstance(std, bool)
-    if std is not None and not (is_number and np.isfinite(std) and std >= 0):
+    if std is not None and not (_is_number(std) and std >= 0):
         raise ConfigError(f"{where}: slip_std is {std!r}; it must be a number of at least 0")
     if isinstance(n_runs, bool) or not isinstance(n_runs, int) or n_runs < 0:
         raise ConfigError(f"{where}: n_runs is {n_runs!r}; it must be a whole number of at least 0")
-    if (std is None) != (n_runs == 0):
+    status = number.get("status", "estimated" if n_runs else "unestimated")
+    if status not in STATUSES:
+        raise ConfigError(f"{where}: status is {status!r}; it must be one of {', '.join(STATUSES)}")
+    if (schema == 1 or status == "estimated") and (std is None) != (n_runs == 0):
         raise ConfigError(f"{where}: slip_std and n_runs go together")
-    status = "estimated" if n_runs else "unestimated"
-    slip_std = float("nan") if std is None else float(std)
+    if status == "estimated" and n_runs == 0:
+        raise ConfigError(f"{where}: status is 'estimated', and no runs are behind it")
+    slip_std = math.nan if std is None else float(std)
     return SlipTarget(terrain, state, float(slip), slip_std, n_runs, status, number["source"])
+
+
+def _check_order(file: Path, terrain: str, targets: Mapping[str, SlipTarget]) -> None:
+    steady, traction = targets["steady"].slip_ratio, targets["traction"].slip_ratio
+    if steady > traction:
+        raise ConfigError(
+            f"{file}: {terrain}: steady slip {steady:g} is over that of traction, {traction:g}; "
+            "targets must rise"
+        )
+
+
+def _curve(where: str, content: Any) -> CurveEntry:
+    names = [item.name for item in fields(CurveEntry)]
+    check_keys(where, content, [n for n in names if n != "working_slip_ratio"], ("working_slip_ratio",))
+    law, n_runs = content["law"], content["n_runs"]
+    if not isinstance(law, str) or law not in LAW_PARAMETERS:
+        raise ConfigError(f"{where}: law is {law!r}; it must be one of {', '.join(LAW_PARAMETERS)}")
+    if content["peak_status"] not in PEAK_STATUSES:
+        raise ConfigError(
+            f"{where}: peak_status is {content['peak_status']!r}; "
+            f"it must be one of {', '.join(PEAK_STATUSES)}"
+        )
+    if isinstance(n_runs, bool) or not isinstance(n_runs, int) or n_runs < 1:
+        raise ConfigError(f"{where}: n_runs is {n_runs!r}; it must be a whole number of at least 1")
+    parameters = content["parameters"]
+    check_keys(f"{where}: parameters", parameters, list(LAW_PARAMETERS[law]))
+    values: dict[str, Any] = {"law": law, "peak_status": content["peak_status"], "n_runs": n_runs}
+    values["parameters"] = {name: _finite(f"{where}: {name}", value) for name, value in parameters.items()}
+    values["working_slip_ratio"] = None
+    for name in names:
+        if (name in values and name != "working_slip_ratio") or name not in content:
+            continue
+        value = content[name]
+        if name in ("peak_interval_ratio", "slip_range_ratio"):
+            if not isinstance(value, list) or len(value) != 2:
+                raise ConfigError(f"{where}: {name} is {value!r}; two numbers are wanted")
+            low, high = (_finite(f"{where}: {name}", edge) for edge in value)
+            if not -1 <= low <= high <= 1:
+                raise ConfigError(
+                    f"{where}: {name} is {value!r}; two rising numbers within [-1, 1] are wanted"
+                )
+            values[name] = (low, high)
+            continue
+        values[name] = _finite(f"{where}: {name}", value)
+        if "slip_ratio" in name and abs(values[name]) > 1:
+            raise ConfigError(f"{where}: {name} is {value!r}; it must be within [-1, 1]")
+    return CurveEntry(**values)
+
+
+def _finite(where: str, value: Any) -> float:
+    if not _is_number(value):
+        raise ConfigError(f"{where} is {value!r}; it must be a finite number")
+    return float(value)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)

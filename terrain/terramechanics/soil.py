@@ -118,7 +118,7 @@ class Soil:
 
 
 def soil_names() -> tuple[str, ...]:
-    """Return the names of the soils that travel with the package.
+    """Return the names of the soils that travel with the package and are classes of terrain.
 
     Examples
     --------
@@ -128,12 +128,24 @@ def soil_names() -> tuple[str, ...]:
     return tuple(sorted(file.stem for file in data_folder("soils").glob("*.yaml")))
 
 
+def extra_soil_names() -> tuple[str, ...]:
+    """Return the names of soils that show an effect, and are no classes of labelled runs.
+
+    Examples
+    --------
+    >>> extra_soil_names()
+    ('digging_sand', 'wet_floor')
+    """
+    return tuple(sorted(file.stem for file in (data_folder("soils") / "extra").glob("*.yaml")))
+
+
 def load_soil(name_or_path: str | Path) -> Soil:
     """Return a soil that travels with the package, by name, or the one that a YAML file describes.
 
     Parameters
     ----------
-    name_or_path : one of :func:`soil_names`, or the path of a file that ends in ``.yaml`` or ``.yml``
+    name_or_path : one of :func:`soil_names` or :func:`extra_soil_names`, or the path of a file that ends in
+        ``.yaml`` or ``.yml``
 
     Raises
     ------
@@ -149,10 +161,12 @@ def load_soil(name_or_path: str | Path) -> Soil:
     """
     path = Path(name_or_path)
     if path.suffix not in (".yaml", ".yml"):
-        if str(name_or_path) not in soil_names():
-            known = ", ".join(soil_names())
+        extra = extra_soil_names()
+        if str(name_or_path) not in (*soil_names(), *extra):
+            known = ", ".join((*soil_names(), *extra))
             raise ConfigError(f"soil {str(name_or_path)!r} is unknown: give one of {known}, or a .yaml file")
-        path = data_folder("soils") / f"{name_or_path}.yaml"
+        folder = data_folder("soils")
+        path = (folder / "extra" if str(name_or_path) in extra else folder) / f"{name_or_path}.yaml"
     return soil_from(path.name, read_yaml(path))
 
 

@@ -1,10 +1,22 @@
 import math
+from dataclasses import replace
 
 import pytest
 import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from terrain.control.slip_table import DRIVE_STATES, load_slip_table
-from terrain.errors import ConfigError
+from terrain.control.slip_curve import LAW_PARAMETERS
+from terrain.control.slip_table import (
+    DRIVE_STATES,
+    CurveEntry,
+    SlipTable,
+    load_slip_table,
+    table_content,
+    write_slip_table,
+)
+from terrain.errors import ConfigError, TerrainError
+from terrain.records import SlipTarget
 from terrain.resources import data_folder
 
 
@@ -112,8 +124,227 @@ def test_a_file_that_is_no_table_is_refused(tmp_path, content, fault):
 
 
 def test_a_file_that_cannot_be_read_is_named(tmp_path):
-    with pytest.raises(ConfigError, match=r"nowhere\.yaml: cannot be read \(No such file"):
+    with pytest.raises(ConfigError, match=r"nowhere\.yaml: cannot be opened \(No such file"):
         load_slip_table(tmp_path / "nowhere.yaml")
     (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x00\x80")
-    with pytest.raises(ConfigError, match=r"binary\.yaml: cannot be read"):
+    with pytest.raises(ConfigError, match=r"binary\.yaml: is no YAML"):
         load_slip_table(tmp_path / "binary.yaml")
+
+
+def learned_with(place=(), value=..., **top):
+    """Return the content of a small table of schema 2, what lies at a place replaced or removed."""
+    entry = {
+        "traction": {
+            "slip_ratio": 0.2,
+            "slip_std": 0.01,
+            "n_runs": 6,
+            "status": "estimated",
+            "source": "runs",
+        },
+        "braking": {
+            "slip_ratio": -0.3,
+            "slip_std": 0.01,
+            "n_runs": 6,
+            "status": "estimated",
+            "source": "runs",
+        },
+        "steady": {"slip_ratio": 0.1, "slip_std": 0.01, "n_runs": 6, "status": "estimated", "source": "runs"},
+        "curve": {
+            "law": "janosi",
+            "parameters": {"limit_ratio": 0.5, "shear_ratio": 0.2},
+            "peak_slip_ratio": 0.6,
+            "peak_interval_ratio": [0.5, 0.7],
+            "peak_status": "no_peak",
+            "slip_range_ratio": [0.0, 0.7],
+            "resistance_ratio": 0.1,
+            "resistance_std": 0.01,
+            "balance_slip_ratio": 0.1,
+            "peak_based_slip_ratio": 0.54,
+            "traction_efficiency_ratio": 0.3,
+            "traction_energy_jpm": 150.0,
+            "braking_energy_jpm": -80.0,
+            "steady_energy_jpm": 90.0,
+            "n_runs": 6,
+        },
+    }
+    unknown = {
+        state: {"slip_ratio": entry[state]["slip_ratio"], "status": "unestimated", "source": "median"}
+        for state in DRIVE_STATES
+    }
+    content = {
+        "schema": 2,
+        "name": "own",
+        "robot": "agrimaro",
+        "fallback": "unknown",
+        "terrains": {"unknown": unknown, "sand": entry},
+    } | top
+    *path, last = place or (None,)
+    inner = content
+    for key in path:
+        inner = inner[key]
+    if place and value is ...:
+        del inner[last]
+    elif place:
+        inner[last] = value
+    return content
+
+
+def test_a_learned_table_is_read_with_its_curve(tmp_path):
+    table = load_slip_table(write(tmp_path, learned_with()), robot="agrimaro")
+    assert table.lookup("sand")["traction"] == ("sand", "traction", 0.2, 0.01, 6, "estimated", "runs")
+    assert table.curves["sand"].peak_interval_ratio == (0.5, 0.7)
+    assert table.curves["sand"].working_slip_ratio is None
+    assert table.lookup("lava")["steady"].status == "unestimated"
+
+
+SAND = ("terrains", "sand")
+CURVE = (*SAND, "curve")
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "fault"),
+    [
+        (("schema",), 3, "schema 3 is newer than 2"),
+        (("schema",), "2", "schema is '2', 1 or 2 is wanted"),
+        (("robot",), ..., "key 'robot' is missing"),
+        (("robot",), "", "robot is '', the name of one"),
+        (("robot",), "husky", "the table is for robot 'husky', not for 'agrimaro'"),
+        (("made_by",), "me", "key 'made_by' is unknown"),
+        (("fallback",), "lava", "the fallback 'lava' is no entry"),
+        (("terrains", "unknown", "steady", "status"), "invalid", "the fallback 'unknown' is invalid"),
+        ((*SAND, "steady"), ..., "sand needs just the drive states"),
+        ((*SAND, "colour"), "red", "sand needs just the drive states"),
+        ((*SAND, "steady", "slip_ratio"), 0.25, "sand: steady slip 0.25 is over that of traction, 0.2"),
+        (
+            (*SAND, "braking", "slip_ratio"),
+            0.1,
+            "sand, braking: slip_ratio is 0.1; braking slip cannot be pos",
+        ),
+        ((*SAND, "traction", "slip_ratio"), float("nan"), "sand, traction: slip_ratio is nan"),
+        ((*SAND, "traction", "slip_std"), float("inf"), "sand, traction: slip_std is inf"),
+        ((*SAND, "traction", "status"), ..., "sand, traction: needs slip_ratio, status and source"),
+        ((*SAND, "traction", "status"), "good", "sand, traction: status is 'good'"),
+        ((*SAND, "traction", "n_runs"), ..., "slip_std and n_runs go together"),
+        ((*SAND, "reason"), 3, "sand: reason is 3"),
+        ((*CURVE, "law"), "linear", "curve: law is 'linear'"),
+        ((*CURVE, "parameters", "limit_ratio"), ..., "parameters: key 'limit_ratio' is missing"),
+        ((*CURVE, "parameters", "shear_ratio"), float("nan"), "shear_ratio is nan"),
+        ((*CURVE, "peak_status"), "top", "peak_status is 'top'"),
+        ((*CURVE, "peak_interval_ratio"), [0.7, 0.5], "peak_interval_ratio is .0.7, 0.5.; two rising"),
+        ((*CURVE, "slip_range_ratio"), 0.5, "slip_range_ratio is 0.5; two numbers"),
+        ((*CURVE, "peak_slip_ratio"), 7, "peak_slip_ratio is 7; it must be within"),
+        ((*CURVE, "n_runs"), 0, "n_runs is 0"),
+        ((*CURVE, "steady_energy_jpm"), "much", "steady_energy_jpm is 'much'"),
+        ((*CURVE, "extra"), 1, "key 'extra' is unknown"),
+    ],
+)
+def test_a_learned_table_that_is_not_accepted_is_told_in_one_sentence(tmp_path, place, value, fault):
+    path = write(tmp_path, learned_with(place, value))
+    with pytest.raises(ConfigError, match=rf"table\.yaml.*{fault}") as told:
+        load_slip_table(path, robot="agrimaro")
+    assert "\n" not in str(told.value)
+
+
+def test_a_key_given_twice_is_refused(tmp_path):
+    text = yaml.safe_dump(learned_with()) + "name: again\n"
+    with pytest.raises(ConfigError, match="key 'name' is given twice"):
+        load_slip_table(write(tmp_path, text))
+
+
+def test_an_old_table_is_nobodys_and_must_rise_too(tmp_path):
+    assert load_slip_table(write(tmp_path, table_with()), robot="agrimaro").robot == ""
+    falling = table_with(slip_ratio=0.1)
+    falling["terrains"]["SNOW"]["steady"]["slip_ratio"] = 0.2
+    path = write(tmp_path, falling)
+    with pytest.raises(ConfigError, match=r"SNOW: steady slip 0\.2 is over that of traction, 0\.1"):
+        load_slip_table(path)
+
+
+def test_an_invalid_entry_falls_back(tmp_path):
+    content = learned_with((*SAND, "traction", "status"), "invalid")
+    table = load_slip_table(write(tmp_path, content))
+    assert table.lookup("sand") == table.targets["unknown"]
+    assert table.targets["sand"]["traction"].status == "invalid"
+
+
+def ratio(low, high):
+    return st.floats(low, high, allow_nan=False)
+
+
+words = st.text(
+    st.characters(codec="utf-8", exclude_categories=["Cs", "Cc"]), min_size=1, max_size=12
+).filter(lambda text: text.strip() == text)
+
+
+@st.composite
+def targets(draw, terrain):
+    steady, traction = sorted(draw(st.tuples(ratio(0, 1), ratio(0, 1))))
+    slips = {"traction": traction, "braking": draw(ratio(-1, 0)), "steady": steady}
+    learned = draw(st.booleans())
+    return {
+        state: SlipTarget(
+            terrain,
+            state,
+            slips[state],
+            draw(ratio(0, 1)) if learned else math.nan,
+            draw(st.integers(1, 99)) if learned else 0,
+            "estimated" if learned else "unestimated",
+            draw(words),
+        )
+        for state in DRIVE_STATES
+    }
+
+
+@st.composite
+def curves(draw):
+    law = draw(st.sampled_from(sorted(LAW_PARAMETERS)))
+    number = ratio(-1, 1)
+    pair = st.tuples(number, number).map(lambda edges: (min(edges), max(edges)))
+    energy = ratio(-1e4, 1e4)
+    return CurveEntry(
+        law,
+        {name: draw(ratio(-1e3, 1e3)) for name in LAW_PARAMETERS[law]},
+        draw(number),
+        draw(pair),
+        draw(st.sampled_from(["peak", "no_peak"])),
+        draw(pair),
+        *(draw(number) for _ in range(4)),
+        draw(st.none() | number),
+        draw(number),
+        *(draw(energy) for _ in range(3)),
+        draw(st.integers(1, 99)),
+    )
+
+
+@st.composite
+def tables(draw):
+    terrains = draw(st.lists(words, min_size=1, max_size=4, unique=True))
+    some = draw(st.lists(st.sampled_from(terrains), unique=True))
+    return SlipTable(
+        draw(words),
+        terrains[0],
+        {terrain: draw(targets(terrain)) for terrain in terrains},
+        draw(words),
+        {terrain: draw(curves()) for terrain in some},
+        {terrain: draw(words) for terrain in some},
+    )
+
+
+@settings(max_examples=60, deadline=None)
+@given(table=tables())
+def test_what_is_written_is_read(tmp_path_factory, table):
+    path = tmp_path_factory.getbasetemp() / "written.yaml"
+    write_slip_table(table, path)
+    found = load_slip_table(path, robot=table.robot)
+    assert table_content(found) == table_content(table)
+    assert (found.curves, found.reasons, found.robot) == (table.curves, table.reasons, table.robot)
+
+
+def test_only_a_robots_table_is_written_and_whole_or_not_at_all(tmp_path):
+    table = load_slip_table(write(tmp_path, learned_with()))
+    with pytest.raises(ConfigError, match="is no robot's"):
+        write_slip_table(replace(table, robot=""), tmp_path / "new.yaml")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(TerrainError, match="cannot be written"):
+        write_slip_table(table, tmp_path / "file" / "new.yaml")
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["file", "table.yaml"]
