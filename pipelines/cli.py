@@ -97,6 +97,7 @@ Seed = Annotated[int, typer.Option(min=0, help="Deals runs into folds.")]
 Repeats = Annotated[int | None, typer.Option(min=1, help="Fold assignments (5).")]
 Jobs = Annotated[int, typer.Option(min=0, help="Processes at once; 0 for one a core.")]
 ALL_SIGNALS = ",".join(SIGNAL_SETS)
+DRIVE_CONTROLLERS = ("plain", "ramp", "thesis", "fixed", "learned", "oracle")
 MAX_GRADE_DEG = 30.0
 
 
@@ -262,8 +263,8 @@ def simulate_command(
     scenario: Annotated[
         str,
         typer.Option(
-            help="stand, straight, arc, starts, spot_turn, complex, survey; course on 'course', "
-            "six_positions on 'bench'."
+            help="stand, straight, arc, starts, climb, brake, circle, crab, spot_turn, complex, survey; "
+            "slip, for learn-slip; course on 'course', six_positions on 'bench'."
         ),
     ],
     out: Annotated[Path, typer.Option(help="Folder of the new run folders.")],
@@ -356,6 +357,41 @@ def estimate_command(
     _write_json(json_file, {**result, "skipped": skipped})
 
 
+@app.command("learn-slip")
+def learn_slip_command(
+    data: Data,
+    robot: Annotated[str, typer.Option(help="Swerve robot by name, or its YAML file.")],
+    out: Annotated[Path, typer.Option(help="YAML file of the table of target slips.")],
+    figures: Annotated[
+        Path | None, typer.Option(help="Folder of the pictures; MLflow gets them anyway.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Of the bootstrap.")] = 0,
+    layout: FormatOption = Format.auto,
+    mapping: Mapping = None,
+    repair: Repair = False,
+    json_file: Json = None,
+) -> None:
+    """Learn slip curves of labelled runs, and which slip to aim for on each terrain."""
+    from pipelines.learn_slip import learn_slip
+    from pipelines.screens import print_learned_slip, progress_bar
+
+    runs, skipped = _load(data, layout, mapping, repair, align=False)
+    with progress_bar() as progress:
+        result = learn_slip(
+            runs,
+            robot,
+            out,
+            dataset=data.resolve().name,
+            figures=figures,
+            seed=seed,
+            skip_faulty=repair,
+            on_skip=skipped.append,
+            progress=progress,
+        )
+    print_learned_slip({**result, "skipped": skipped}, _console())
+    _write_json(json_file, {**result, "skipped": skipped})
+
+
 @app.command("calibrate")
 def calibrate_command(
     data: Data,
@@ -383,6 +419,110 @@ def calibrate_command(
         repair=repair,
     )
     print_calibration(result, _console())
+    _write_json(json_file, result)
+
+
+@app.command("drive")
+def drive_command(
+    robot: Annotated[str, typer.Option(help="Robot by name, or its YAML file.")] = "agrimaro",
+    scenario: Annotated[
+        str,
+        typer.Option(
+            help="starts, straight, slope, brake, circle, crab; course and mixed on the terrain 'course'; or "
+            "any of simulate."
+        ),
+    ] = "starts",
+    terrain: Annotated[
+        str, typer.Option(help="Name of a soil, its YAML file, or 'course' for all.")
+    ] = "grass",
+    controllers: Annotated[
+        str,
+        typer.Option(
+            help="By commas: plain, ramp, thesis, fixed, learned, oracle, told:NAME (always told that "
+            "ground), target:SLIP."
+        ),
+    ] = ",".join(DRIVE_CONTROLLERS),
+    table: Annotated[
+        Path | None, typer.Option(help="Table of target slips; the packaged one by default.")
+    ] = None,
+    model: Annotated[
+        str | None,
+        typer.Option(help="Classifier of 'learned': models:/NAME@champion or a folder; taught anew without."),
+    ] = None,
+    seeds: Annotated[int, typer.Option(min=1, help="Days: draws of load, soil, tyres and noise.")] = 20,
+    seed: Annotated[int, typer.Option(min=0, help="The first of them.")] = 0,
+    delay: Annotated[float, typer.Option(help="From a sample to the wheel in s.")] = 0.05,
+    ramp: Annotated[
+        float | None,
+        typer.Option(help="Rise of speed of 'ramp' in m/s^2; without, as fast as gets as far as ours."),
+    ] = None,
+    duration: Annotated[float | None, typer.Option(help="Length of a drive in s.")] = None,
+    speed: Annotated[float, typer.Option(help="Cruising speed in m/s.")] = 1.0,
+    accel: Annotated[float, typer.Option(help="Rise of the wanted speed in m/s^2; inf for a step.")] = 1.0,
+    grade: Annotated[float, typer.Option(help="Slope in degrees, uphill > 0.")] = 0.0,
+    radius: Annotated[
+        str | None,
+        typer.Option(help="True radius of each wheel over the believed one, as in 1,1.02,1; drawn without."),
+    ] = None,
+    plant: Annotated[
+        str | None, typer.Option(help="Robot as it really is, where it is not what --robot believes.")
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder of the page with its pictures.")] = None,
+    jobs: Jobs = 0,
+    json_file: Json = None,
+) -> None:
+    """Drive controllers side by side in the closed loop, and compare what it costs."""
+    import os
+
+    from pipelines.drive import DriveSettings, drive, example_runs, taught_classifier
+    from pipelines.screens import print_drive, progress_bar
+    from terrain.control.slip_table import load_slip_table
+    from terrain.robots import load_robot
+
+    if not abs(grade) <= MAX_GRADE_DEG:
+        raise ConfigError(
+            f"--grade is {grade:g}; {-MAX_GRADE_DEG:g} to {MAX_GRADE_DEG:g} degrees are accepted"
+        )
+    described = load_robot(robot)
+    slip_table = load_slip_table(table, described.name)
+    settings = DriveSettings(
+        scenario=scenario,
+        terrain=terrain,
+        controllers=tuple(name.strip() for name in controllers.split(",") if name.strip()),
+        seeds=seeds,
+        first_seed=seed,
+        delay_s=delay,
+        ramp_mps2=ramp,
+        duration_s=duration,
+        speed_mps=speed,
+        accel_mps2=accel,
+        grade_deg=grade,
+        radius_factors=_radii(radius),
+        plant=None if plant is None else load_robot(plant),
+    )
+    settings.check(described, slip_table)
+    if out is not None:
+        from terrain.atomic import ensure_writable
+
+        ensure_writable(out)
+    with progress_bar() as progress:
+        classifier = None
+        if "learned" in settings.controllers:
+            if model is None:
+                classifier = taught_classifier(described, seed, progress)
+            else:
+                from pipelines.tracking import load_model
+
+                classifier = load_model(model)
+        result = drive(described, slip_table, settings, classifier, progress, jobs or os.cpu_count() or 1)
+        if out is not None:
+            from pipelines.drive_page import write_drive_page
+
+            examples = example_runs(described, slip_table, settings, result["ramp_mps2"], classifier)
+            write_drive_page(out, result, examples, slip_table)
+    print_drive(result, _console())
+    if out is not None:
+        typer.echo(f"page: {out / 'drive.html'}")
     _write_json(json_file, result)
 
 
@@ -465,6 +605,17 @@ def _interval(text: str) -> tuple[float, float]:
     if not 0.0 <= interval[0] < interval[1]:
         raise ConfigError(f"--camera-lost is {text!r}; START:END in seconds is wanted, as in 10:13")
     return interval
+
+
+def _radii(text: str | None) -> tuple[float, float, float] | None:
+    """Read ``A,B,C``."""
+    if text is None:
+        return None
+    try:
+        one, two, three = (float(part) for part in text.split(","))
+    except ValueError:
+        raise ConfigError(f"--radius is {text!r}; three ratios are wanted, as in 1,1.02,1") from None
+    return one, two, three
 
 
 def _names(signals: str) -> tuple[str, ...]:

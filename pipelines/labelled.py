@@ -12,7 +12,7 @@ from pipelines.estimate import Estimate, enriched, estimate_run, summary
 from pipelines.evaluation import Progress, silent
 from pipelines.simulate import simulate_run
 from terrain.records import RunLog
-from terrain.robots import load_robot
+from terrain.robots import Robot, load_robot
 from terrain.terramechanics.soil import soil_names
 
 ROBOT = "agrimaro"
@@ -22,7 +22,10 @@ RUNS_A_TERRAIN = 6
 
 
 def labelled_runs(
-    seed: int, runs_a_terrain: int = RUNS_A_TERRAIN, progress: Progress = silent
+    seed: int,
+    runs_a_terrain: int = RUNS_A_TERRAIN,
+    progress: Progress = silent,
+    robot: Robot | None = None,
 ) -> tuple[list[RunLog], list[dict[str, Any]], Estimate]:
     """Simulate and filter runs on every terrain, with varied speed, slope, load, tyres and soil.
 
@@ -30,6 +33,7 @@ def labelled_runs(
     ----------
     seed : of everything that is drawn
     runs_a_terrain : how many
+    robot : whose; :data:`ROBOT` by default
 
     Returns
     -------
@@ -41,7 +45,7 @@ def labelled_runs(
     example
         the estimate of one run, to be drawn
     """
-    robot = load_robot(ROBOT)
+    robot = load_robot(ROBOT) if robot is None else robot
     terrains = soil_names()
     runs, rows = [], []
     for terrain in terrains:

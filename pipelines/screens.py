@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
+from rich.box import SIMPLE
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Column, Table
@@ -201,6 +202,50 @@ def print_estimates(result: dict[str, Any], console: Console) -> None:
         console.print(sentence, highlight=False)
 
 
+def print_learned_slip(result: dict[str, Any], console: Console) -> None:
+    """Print curve and targets a terrain, and why some are not learned."""
+    right = ("runs", "slips seen", "peak", "90 %", *DRIVE_STATES, "effic.", "J/m")
+    table = Table(
+        Column("terrain", overflow="fold"),
+        "status",
+        *(Column(name, justify="right") for name in right),
+        title=f"target slip of {result['robot']}, learned from {result['n_runs']} runs",
+        box=SIMPLE,
+        padding=(0, 1, 0, 0),
+    )
+    for terrain, row in result["terrains"].items():
+        reach, interval = row["slip_range"], row["peak_slip_ci"]
+        peak = _figure(row["peak_slip"], "{:.3f}") + ("*" if row["peak_status"] == "no_peak" else "")
+        table.add_row(
+            terrain,
+            row["status"],
+            str(row["n_runs"]),
+            "-" if reach is None else f"{reach[0]:.2f}-{reach[1]:.2f}",
+            peak,
+            "-" if interval is None else f"{interval[0]:.3f}-{interval[1]:.3f}",
+            *(f"{row['targets'][state]['slip_ratio']:+.3f}" for state in DRIVE_STATES),
+            _figure(row.get("traction_efficiency"), "{:.2f}"),
+            _figure(row["energy_jpm"]["traction"] if "energy_jpm" in row else None, "{:.0f}"),
+        )
+    console.print(table)
+    if any(row["peak_status"] == "no_peak" for row in result["terrains"].values()):
+        console.print(
+            "* no peak within the slips seen: the slip at 95 % of the largest net pull seen", highlight=False
+        )
+    for terrain, row in result["terrains"].items():
+        if row["status"] != "estimated":
+            source = row["targets"]["traction"]["source"]
+            console.print(
+                f"{terrain} is {row['status']}: {row['reason']}; its numbers are assumed ({source})",
+                highlight=False,
+            )
+    if result["n_unlabelled"]:
+        console.print(f"runs without a label, left out: {result['n_unlabelled']}", highlight=False)
+    console.print(f"table written to {result['table']}", highlight=False)
+    for sentence in result.get("skipped", []):
+        console.print(sentence, highlight=False)
+
+
 def print_slip(rows: list[dict[str, Any]], console: Console) -> None:
     """Print estimated and true slip a terrain."""
     right = [Column(name, justify="right") for name in ("runs", "slip", "true slip", "RMSE", "NEES")]
@@ -218,3 +263,29 @@ def print_slip(rows: list[dict[str, Any]], console: Console) -> None:
 
 def _figure(value: float | None, form: str) -> str:
     return "-" if value is None else form.format(value)
+
+
+def print_drive(result: dict[str, Any], console: Console) -> None:
+    """Print what each controller's drives cost, with their 95 % intervals over days."""
+    ramp = result["ramp_mps2"]
+    console.print(
+        f"{result['robot']}, {result['scenario']} on {result['terrain']}, {len(result['seeds'])} days, table "
+        f"{result['table']}, delay {result['delay_s']:g} s"
+        + (f", ramp {ramp:.2f} m/s^2" if ramp is not None else ""),
+        highlight=False,
+    )
+    controllers = result["controllers"]
+    table = Table("", *controllers, title="mean over days, with its 95 % interval")
+    for key in next(iter(controllers.values())):
+        figures = [controllers[name][key] for name in controllers]
+        if all(figure["mean"] is None for figure in figures):
+            continue
+        table.add_row(key, *(_with_interval(figure) for figure in figures))
+    console.print(table)
+
+
+def _with_interval(figure: dict[str, Any]) -> str:
+    if figure["mean"] is None:
+        return "-"
+    half = f" ± {(figure['ci'][1] - figure['ci'][0]) / 2:.2g}" if figure["ci"] else ""
+    return f"{figure['mean']:.4g}{half}"

@@ -1,0 +1,350 @@
+"""The whole chain from samples to wheel commands: estimate, recognise, look up, correct.
+
+One :meth:`LivePilot.step` takes what the sensors wrote since the last one and returns what the wheels are
+told, with its reasons.  It imports neither a tracking library nor a web server; the simulator and the
+service on the robot call the same object.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from pipelines.live.watch import Nobody, Watch, readable
+from terrain.constants import GRAVITY_MPS2
+from terrain.control.pid import Gains
+from terrain.control.slick import braking_by_slip
+from terrain.control.slip_table import SlipTable, load_slip_table
+from terrain.control.stability import check_stable
+from terrain.control.switching import (
+    NOTHING,
+    SWITCHING,
+    Belief,
+    SwitchSettings,
+    approach,
+    check_switching,
+    hear,
+)
+from terrain.control.thesis import new_state, thesis_settings, thesis_step
+from terrain.control.traction import (
+    BAD_TIME,
+    MAX_STEP_S,
+    NO_SLIP,
+    OK,
+    SETTINGS,
+    STEADY,
+    Ground,
+    TractionSettings,
+    check_settings,
+    forget_ground,
+    initial_state,
+    traction_step,
+    with_driver,
+)
+from terrain.errors import ConfigError
+from terrain.estimation.live import LiveEstimate, LiveEstimator
+from terrain.kinematics.swerve import FAR_RAD, wheel_command_step
+from terrain.logs.schema import IMU_CHANNELS
+from terrain.records import Array, Command, Sample
+from terrain.robots import Robot
+from terrain.slip import MIN_SPEED_MPS
+
+CONTROLLERS = ("plain", "ramp", "thesis", "traction")
+"""As the kinematics commands; with a bounded rise of speed; the thesis' PID on each wheel; ours."""
+
+THESIS_GAINS = Gains(0.5, 0.5, 0.0, limit=2.0)
+"""The thesis prints none; these are stable threefold on the simulated robot (``check_stable``)."""
+
+MARGIN_MAX_RATIO = 0.06
+"""A table says by its targets of traction and of steady motion how much slip over the balance gives the pull
+that is worked with; up to this much is added to the balance that is measured.  More is a table that aims for
+a peak."""
+
+PERIOD_S = 0.02
+"""Of the loop; what is counted with where the clock gives no sense."""
+
+_ROLL, _PITCH = IMU_CHANNELS.index("roll_rad"), IMU_CHANNELS.index("pitch_rad")
+
+
+@dataclass(frozen=True, slots=True)
+class PilotSettings:
+    """How a pilot drives.
+
+    Parameters
+    ----------
+    controller : one of :data:`CONTROLLERS`
+    ramp_mps2 : rise of the speed of the fastest wheel, of ``ramp``
+    traction, switching : of ``traction``
+    gains, form : of ``thesis``
+    delay_s : from a sample to the wheel; what gains have to be stable with
+    """
+
+    controller: str = "traction"
+    ramp_mps2: float = 0.5
+    traction: TractionSettings = SETTINGS
+    switching: SwitchSettings = SWITCHING
+    gains: Gains = THESIS_GAINS
+    form: str = "normalised"
+    delay_s: float = 0.05
+
+
+@dataclass(slots=True)
+class _Memory:
+    """All that a pilot carries from step to step."""
+
+    steer: Array
+    traction: Array
+    thesis: Array
+    time_s: float = math.nan
+    driven_mps: float = 0.0
+    belief: Belief = NOTHING
+    target_ratio: float = math.nan
+    estimate: LiveEstimate | None = None
+    tilt_rad: tuple[float, float] = (0.0, 0.0)
+    switches: int = field(default=0)
+
+
+class LivePilot:
+    """Drive a robot through its wanted twists.
+
+    Parameters
+    ----------
+    robot : a swerve robot with all sections
+    table : target slips
+    watch : who says what the ground is; nobody by default
+    settings : how to drive
+    steer_rad : (3,) where the steering was told to be last
+
+    Raises
+    ------
+    ConfigError
+        if the controller is unknown, a setting is none, the table is another robot's, or the gains make the
+        loop unstable at the robot's limits.
+
+    Examples
+    --------
+    >>> from terrain.robots import load_robot
+    >>> pilot = LivePilot(load_robot("agrimaro"), load_slip_table())
+    >>> command = pilot.step(Sample(0.0, np.array([0.5, 0.0, 0.0]), {}))  # nothing is known yet
+    >>> command.wheel_radps, command.status["why_ratio"] == NO_SLIP
+    (array([0.1, 0.1, 0.1]), True)
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        table: SlipTable | None = None,
+        watch: Watch | None = None,
+        settings: PilotSettings = PilotSettings(),
+        steer_rad: Array | None = None,
+    ) -> None:
+        if settings.controller not in CONTROLLERS:
+            raise ConfigError(
+                f"controller {settings.controller!r} is unknown: use one of {', '.join(CONTROLLERS)}"
+            )
+        if robot.drive != "swerve":
+            raise ConfigError(f"robot {robot.name}: drive {robot.drive!r} has no pilot, only 'swerve' has")
+        if not (math.isfinite(settings.ramp_mps2) and settings.ramp_mps2 > 0):
+            raise ConfigError(f"ramp_mps2 is {settings.ramp_mps2!r}, a number above zero is wanted")
+        table = load_slip_table() if table is None else table
+        if table.robot and table.robot != robot.name:
+            raise ConfigError(
+                f"slip table {table.name}: is of the robot {table.robot!r}, not of {robot.name!r}"
+            )
+        check_switching(settings.switching)
+        if settings.controller == "thesis":
+            check_stable(robot, settings.gains, settings.form, settings.delay_s)
+        self._robot, self._table, self._settings = robot, table, settings
+        self._watch = Nobody() if watch is None else watch
+        self._terrains = {terrain: index for index, terrain in enumerate(table.targets)}
+        self._braking = {name: braking_by_slip(curve) for name, curve in table.curves.items()}
+        self._traction = with_driver(check_settings(settings.traction), robot)
+        self._thesis = thesis_settings(robot.wheel_radius_m, settings.gains, settings.form)
+        motors = robot.equipment.motors
+        self._per_amp_nm = motors.torque_constant_nmpa * motors.reduction_ratio * motors.efficiency_ratio
+        self._positions_m = np.array(robot.wheel_positions_m)
+        self._limits = (
+            robot.wheel_radius_m,
+            motors.speed_max_radps,
+            robot.equipment.steering.rate_max_radps,
+        )
+        self._blind = settings.controller in ("plain", "ramp")
+        self._estimator = None if self._blind else LiveEstimator(robot)
+        if self._estimator is not None:
+            self._steer_states = [self._estimator.states.index(f"steer_{i}_rad") for i in robot.wheels]
+        steer = np.zeros(3) if steer_rad is None else np.array(steer_rad, dtype=np.float64)
+        self._now = _Memory(steer, initial_state(), new_state())
+
+    @property
+    def terrains(self) -> tuple[str, ...]:
+        """Entries of the table, by the number that the status ``terrain_ratio`` gives; -1 is unknown."""
+        return tuple(self._terrains)
+
+    def step(self, sample: Sample) -> Command:
+        """Take what arrived, and return what the wheels are told; nothing that arrives makes it raise.
+
+        The ``status`` holds ``why_ratio`` (:data:`terrain.control.traction.STATUS_NAMES`), ``terrain_ratio`` and
+        ``probability_ratio`` of the ground believed, ``target_ratio``, ``aimed_ratio`` (the target with its
+        floor), ``balance_ratio``, ``slip_ratio``, ``slip_std_ratio``, ``stale_s``, ``drive_state_ratio`` (place
+        in ``slip_table.DRIVE_STATES``; -1 for not known), ``driven_mps`` and ``wanted_mps``.
+        """
+        now, robot = self._now, self._robot
+        dt_s = sample.time_s - now.time_s
+        first = math.isnan(now.time_s) and math.isfinite(sample.time_s)
+        sound = first or 0.0 < dt_s <= MAX_STEP_S
+        if math.isfinite(sample.time_s):
+            now.time_s = sample.time_s
+        known_dt_s = dt_s if sound and not first else PERIOD_S
+        twist = np.asarray(sample.twist, dtype=np.float64)
+        if twist.shape != (3,) or not np.isfinite(twist).all():
+            twist = np.zeros(3)
+        self._perceive(sample)
+        target = self._target(known_dt_s)
+        admitted, wheel, steer = wheel_command_step(
+            self._positions_m, *self._limits, known_dt_s, FAR_RAD, twist, now.steer
+        )
+        now.steer = steer
+        wanted_mps = float(np.abs(wheel).max()) * robot.wheel_radius_m
+        if self._blind:
+            told, said = self._ramp(wheel, wanted_mps, known_dt_s)
+        else:
+            told, said = self._correct(sample.time_s, wheel, target, dt_s if not first else PERIOD_S)
+        status = {
+            "why_ratio": said[5],
+            "terrain_ratio": float(self._terrains.get(now.belief.terrain, -1)),
+            "probability_ratio": now.belief.probability,
+            "target_ratio": now.target_ratio,
+            "aimed_ratio": said[1],
+            "balance_ratio": said[2],
+            "slip_ratio": said[3],
+            "slip_std_ratio": said[6],
+            "stale_s": said[7],
+            "drive_state_ratio": said[4],
+            "driven_mps": said[0],
+            "wanted_mps": wanted_mps,
+        }
+        scale = said[0] / wanted_mps if wanted_mps > 0.0 else 0.0
+        return Command(told, steer, admitted * scale, status)
+
+    def _perceive(self, sample: Sample) -> None:
+        """Estimate, and hear what the ground is."""
+        if self._estimator is None:
+            return
+        now = self._now
+        estimates = self._estimator.step(sample.readings)
+        if estimates:
+            now.estimate = estimates[-1]
+        imu = readable(sample.readings.get("imu"), len(IMU_CHANNELS))
+        if imu is not None:
+            roll, pitch = float(imu.values[-1, _ROLL]), float(imu.values[-1, _PITCH])
+            if math.isfinite(roll) and math.isfinite(pitch):
+                now.tilt_rad = roll, pitch
+        believed = now.belief.terrain
+        for word in self._watch.hear(sample, estimates):
+            if self._watch.sure:
+                now.belief = Belief(word.terrain, word.probability, word.terrain, word.time_s, word.time_s)
+            else:
+                now.belief = hear(
+                    now.belief, word.time_s, word.terrain, word.probability, self._settings.switching
+                )
+        if now.belief.terrain != believed:
+            now.traction = forget_ground(now.traction)
+            now.switches += 1
+
+    def _target(self, dt_s: float) -> Ground:
+        """Return what is aimed for, on its way from what was aimed for on the ground before."""
+        now = self._now
+        entry = self._table.lookup(now.belief.terrain)
+        now.target_ratio = approach(
+            now.target_ratio, entry["traction"].slip_ratio, self._settings.switching.rate_ratio, dt_s
+        )
+        braking = self._braking.get(entry["traction"].terrain)
+        margin = min(entry["traction"].slip_ratio - entry["steady"].slip_ratio, MARGIN_MAX_RATIO)
+        if braking is None:
+            return Ground(now.target_ratio, margin_ratio=margin)
+        roll, pitch = now.tilt_rad
+        way = now.estimate
+        speed_mps = math.hypot(way.speed_x_mps, way.speed_y_mps) if way is not None else 0.0
+        uphill_mps2 = 0.0
+        if way is not None and speed_mps > MIN_SPEED_MPS:
+            along, across = way.speed_x_mps / speed_mps, way.speed_y_mps / speed_mps
+            uphill_mps2 = GRAVITY_MPS2 * (-math.sin(pitch) * along + math.sin(roll) * across)
+        mps2 = max(braking.mps2 + uphill_mps2, 0.0)
+        return Ground(now.target_ratio, braking.slip_ratio, mps2, margin)
+
+    def _ramp(self, wheel: Array, wanted_mps: float, dt_s: float) -> tuple[Array, tuple[float, ...]]:
+        now = self._now
+        rise = self._settings.ramp_mps2 * dt_s if self._settings.controller == "ramp" else math.inf
+        now.driven_mps = min(wanted_mps, now.driven_mps + rise)
+        nan = math.nan
+        told = wheel * (now.driven_mps / wanted_mps) if wanted_mps > 0.0 else wheel
+        return told, (now.driven_mps, nan, nan, nan, float(STEADY), float(OK), nan, nan)
+
+    def _correct(
+        self, time_s: float, wheel: Array, ground: Ground, dt_s: float
+    ) -> tuple[Array, tuple[float, ...]]:
+        now, robot = self._now, self._robot
+        seen = now.estimate
+        speed, gain, slip, std, torque = np.full((5, 3), math.nan)
+        stale_s = math.inf
+        if seen is not None:
+            stale_s = seen.reference_age_s + max(time_s - seen.time_s, 0.0)
+            steer = seen.mean[self._steer_states]
+            cos, sin = np.cos(steer), np.sin(steer)
+            x, y = self._positions_m.T
+            speed = (seen.speed_x_mps - seen.yaw_rate_radps * y) * cos
+            speed = speed + (seen.speed_y_mps + seen.yaw_rate_radps * x) * sin
+            gain = seen.accel_x_mps2 * cos + seen.accel_y_mps2 * sin
+            fastest = np.maximum(np.abs(seen.rim_mps), np.abs(speed))
+            # a wheel stands by the filter's rate, which is not quite the reported one
+            standing = fastest < np.where(np.isnan(seen.slip_ratio), 2.0, 1.0) * MIN_SPEED_MPS
+            slip = np.where(standing & ~math.isinf(stale_s), 0.0, seen.slip_ratio)
+            std = np.where(standing, 0.0, seen.slip_std)
+            torque = seen.current_a * self._per_amp_nm
+        if self._settings.controller == "thesis":
+            return self._thesis_correct(wheel, speed, gain, slip, std, stale_s, dt_s)
+        told, now.traction, said = traction_step(
+            self._traction,
+            now.traction,
+            ground,
+            robot.wheel_radius_m,
+            wheel,
+            speed,
+            gain,
+            slip,
+            std,
+            stale_s,
+            torque,
+            dt_s,
+        )
+        return told, (*said.tolist(), float(std.max()), stale_s)
+
+    def _thesis_correct(
+        self, wheel: Array, speed: Array, gain: Array, slip: Array, std: Array, stale_s: float, dt_s: float
+    ) -> tuple[Array, tuple[float, ...]]:
+        now, settings = self._now, self._settings
+        entry = self._table.lookup(now.belief.terrain)
+        targets = np.array([entry[state].slip_ratio for state in ("traction", "braking", "steady")])
+        seen = now.estimate
+        if seen is None or stale_s > settings.traction.stale_max_s:
+            speed = np.full(3, math.nan)
+        rate = np.full(3, math.nan) if seen is None else seen.rim_mps / self._robot.wheel_radius_m
+        chassis_mps = math.nan if seen is None else math.hypot(seen.speed_x_mps, seen.speed_y_mps)
+        added, desired, drive, _, now.thesis = thesis_step(
+            self._thesis, now.thesis, wheel, rate, speed, gain, chassis_mps, targets, dt_s
+        )
+        why = BAD_TIME if not 0.0 < dt_s <= MAX_STEP_S else OK if np.isfinite(desired).all() else NO_SLIP
+        driven_mps = float(np.abs(wheel + added).max()) * self._robot.wheel_radius_m
+        aimed, largest = float(np.abs(desired).max()), float(np.max(np.where(wheel < 0.0, -slip, slip)))
+        return wheel + added, (
+            driven_mps,
+            aimed,
+            math.nan,
+            largest,
+            float(drive[0]),
+            float(why),
+            float(std.max()),
+            stale_s,
+        )
