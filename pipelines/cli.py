@@ -439,7 +439,7 @@ def drive_command(
         str,
         typer.Option(
             help="By commas: plain, ramp, thesis, fixed, learned, oracle, told:NAME (always told that "
-            "ground), target:SLIP."
+            "ground), target:SLIP; ours also as NAME+track, held to its way."
         ),
     ] = ",".join(DRIVE_CONTROLLERS),
     table: Annotated[
@@ -464,6 +464,7 @@ def drive_command(
         str | None,
         typer.Option(help="True radius of each wheel over the believed one, as in 1,1.02,1; drawn without."),
     ] = None,
+    leg_play: Annotated[float, typer.Option(help="Play of the third leg in rad.")] = 0.0,
     plant: Annotated[
         str | None, typer.Option(help="Robot as it really is, where it is not what --robot believes.")
     ] = None,
@@ -498,6 +499,7 @@ def drive_command(
         accel_mps2=accel,
         grade_deg=grade,
         radius_factors=_radii(radius),
+        leg_play_rad=leg_play,
         plant=None if plant is None else load_robot(plant),
     )
     settings.check(described, slip_table)

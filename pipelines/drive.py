@@ -21,6 +21,7 @@ from pipelines.drive_metrics import (
     lock_s,
     roughness,
     slip_peak,
+    standing_from,
     stop_distance,
 )
 from pipelines.drives import SLOPE, Situation, brake_time, changes_of, situation, start_times
@@ -37,7 +38,7 @@ from terrain.simulation.simulate import simulate
 CONTROLLERS = ("plain", "ramp", "thesis", "fixed", "learned", "oracle")
 """Commands as they are; with a bounded rise; the thesis' PID on the table's fallback; ours on the fallback,
 on what a classifier says, on the true ground.  Also ``told:NAME``, ours and always told that ground, and
-``target:0.2``, ours with that target."""
+``target:0.2``, ours with that target; and each of ours with ``+track``: held to its way."""
 
 FIRST_M = 4.0
 """Way of a start over which energy is compared."""
@@ -75,6 +76,7 @@ class DriveSettings:
     delay_s : from a sample to the wheel
     ramp_mps2 : of the fixed ramp; without, as fast as gets as far as the best of ours
     duration_s, speed_mps, accel_mps2, grade_deg, radius_factors : of the scenario
+    leg_play_rad : play of the third leg
     plant : the robot as it is, where that is not what the controllers believe
     """
 
@@ -90,6 +92,7 @@ class DriveSettings:
     accel_mps2: float = 1.0
     grade_deg: float = 0.0
     radius_factors: tuple[float, float, float] | None = None
+    leg_play_rad: float = 0.0
     plant: Robot | None = None
 
     def check(self, robot: Robot, table: SlipTable) -> None:
@@ -129,6 +132,7 @@ class DriveSettings:
             accel_mps2=self.accel_mps2,
             grade_deg=self.grade_deg if grade_deg is None else grade_deg,
             radius_factors=self.radius_factors,
+            leg_play_rad=self.leg_play_rad,
         )
 
 
@@ -158,6 +162,10 @@ def make_driver(name: str, table: SlipTable, delay_s: float, ramp_mps2: float = 
     ConfigError
         if there is none of that name, or its ground or target is none.
     """
+    bare, track, rest = name.partition("+track")
+    if track and not rest:
+        driver = make_driver(bare, table, delay_s, ramp_mps2)
+        return replace(driver, name=name, pilot=replace(driver.pilot, track=True))
     kind, _, what = name.partition(":")
     ours = PilotSettings(delay_s=delay_s)
     if name in ("plain", "ramp", "thesis"):
@@ -172,7 +180,7 @@ def make_driver(name: str, table: SlipTable, delay_s: float, ramp_mps2: float = 
     if kind == "target":
         return Driver(name, ours, _only(table, name, what))
     raise ConfigError(
-        f"controller {name!r} is unknown: use {', '.join(CONTROLLERS)}, told:NAME or target:SLIP"
+        f"controller {name!r} is unknown: use {', '.join(CONTROLLERS)}, told:NAME, target:SLIP; +track"
     )
 
 
@@ -291,7 +299,9 @@ def judge(run: RunLog, robot: Robot, where: Situation, driver: Driver) -> dict[s
     if where.scenario.name == "starts":
         row |= _starts(course, starts)
     if where.scenario.name == "brake":
-        row["stop_m"] = stop_distance(course, brake_time(where.scenario))
+        told_s = brake_time(where.scenario)
+        row["stop_m"] = stop_distance(course, told_s)
+        row["lock_s"] = lock_s(course, told_s, standing_from(course, told_s))
     return row
 
 

@@ -26,6 +26,9 @@ SMOOTH_S = 0.05
 LOCKED_SHARE, LOCKED_ABOVE_MPS = 0.1, 0.1
 """A wheel is locked where its rim does less than this share of its way over ground, above this speed."""
 
+STOOD_MPS = 0.02
+"""A robot that goes slower than this stands."""
+
 STUCK_MPS, STUCK_S, WANTED_MPS = 0.03, 2.0, 0.2
 """A robot that is to go faster than the last, and is slower than the first for so long, is stuck."""
 
@@ -38,8 +41,10 @@ class Course(NamedTuple):
 
     Parameters
     ----------
-    time_s, speed_mps, distance_m, energy_j, scrub_j, scrub_along_j : (n,); speed over ground whichever way,
-        all else summed up; what the contacts take up, and the part of it along the wheels
+    time_s, speed_mps, velocity_mps : (n,), (n,), (n, 2); speed over ground whichever way, velocity in body
+        axes
+    distance_m, energy_j, scrub_j, scrub_along_j : (n,) summed up; scrub is what the contacts take up, and the
+        part of it along the wheels
     rim_mps, ground_mps, slip_ratio : (n, wheels) along each wheel; slip positive in traction whichever way,
         behind the low-pass, NaN at rest
     sinkage_m : (n,) the deepest wheel's
@@ -48,6 +53,7 @@ class Course(NamedTuple):
 
     time_s: Array
     speed_mps: Array
+    velocity_mps: Array
     distance_m: Array
     energy_j: Array
     scrub_j: Array
@@ -91,13 +97,17 @@ def course_of(
     along_w = (traction * (rim - ground)).sum(axis=1)
     lost_w = along_w - (side * sideways).sum(axis=1)
     speed = np.hypot(along, across)
-    signed = np.column_stack([truth.channel(f"slip_{wheel}_ratio") for wheel in wheels])
+    signed = np.full(rim.shape, math.nan)
+    for i, wheel in enumerate(wheels):
+        if f"slip_{wheel}_ratio" in truth.channels:  # a slip that no instant has is no channel
+            signed[:, i] = truth.channel(f"slip_{wheel}_ratio")
     slip = _smooth(np.nan_to_num(signed * np.sign(ground)), step_s)
     slip[np.isnan(signed)] = np.nan
     sinkage = np.column_stack([truth.channel(f"sinkage_{wheel}_m") for wheel in wheels])
     return Course(
         truth.time_s,
         speed,
+        np.column_stack([along, across]),
         np.cumsum(speed) * step_s,
         np.cumsum(power_w) * step_s,
         np.cumsum(lost_w) * step_s,
@@ -145,12 +155,13 @@ def distance_after(course: Course, start_s: float, length_s: float) -> float:
     return float(course.distance_m[min(last, len(course.distance_m) - 1)] - course.distance_m[first])
 
 
-def lock_s(course: Course) -> float:
-    """Return for how long in s the wheel that was locked longest was."""
+def lock_s(course: Course, start_s: float = 0.0, end_s: float = math.inf) -> float:
+    """Return for how long in s, of a stretch, the wheel that was locked longest was."""
+    within = (course.time_s >= start_s) & (course.time_s <= end_s)
     step_s = course.time_s[1] - course.time_s[0]
     moving = np.abs(course.ground_mps) > LOCKED_ABOVE_MPS
     locked = moving & (course.rim_mps * np.sign(course.ground_mps) < LOCKED_SHARE * np.abs(course.ground_mps))
-    return float(locked.sum(axis=0).max() * step_s)
+    return float(locked[within].sum(axis=0).max() * step_s)
 
 
 def immobilised(course: Course, control: Stream) -> int:
@@ -172,13 +183,21 @@ def final_speed(course: Course) -> float:
     return float(course.speed_mps[course.time_s > course.time_s[-1] - length_s].mean())
 
 
+def standing_from(course: Course, start_s: float) -> float:
+    """Return when the robot first stood, or turned round, after an instant at which it drove; NaN if never.
+
+    A robot that is braked hard may swing back: what counts is the first standstill.
+    """
+    first = int(np.searchsorted(course.time_s, start_s - 1e-9))
+    way = course.velocity_mps[first] / max(course.speed_mps[first], 1e-9)
+    stood = np.flatnonzero(course.velocity_mps[first:] @ way < STOOD_MPS)
+    return float(course.time_s[first + stood[0]]) if stood.size else math.nan
+
+
 def stop_distance(course: Course, start_s: float) -> float:
     """Return how far in m the robot went from an instant on until it stood; NaN where it did not."""
-    after = course.time_s >= start_s
-    stood = np.flatnonzero(after & (course.speed_mps < 0.02))
-    if not stood.size:
-        return math.nan
-    return float(course.distance_m[stood[0]] - course.distance_m[after.argmax()])
+    end_s = standing_from(course, start_s)
+    return distance_after(course, start_s, end_s - start_s) if math.isfinite(end_s) else math.nan
 
 
 def adapt_times(control: Stream, changes: Sequence[tuple[float, float]], close: float = 0.02) -> list[float]:

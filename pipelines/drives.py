@@ -53,6 +53,7 @@ def situation(
     accel_mps2: float = 1.0,
     grade_deg: float = 0.0,
     radius_factors: tuple[float, float, float] | None = None,
+    leg_play_rad: float = 0.0,
 ) -> Situation:
     """Return a situation; what is drawn depends on the seed and the terrain alone.
 
@@ -68,6 +69,7 @@ def situation(
     duration_s, speed_mps, accel_mps2 : of the scenario
     grade_deg : uphill along the start's heading
     radius_factors : true radius of each wheel over the believed one; drawn by default
+    leg_play_rad : play of the third leg
 
     Raises
     ------
@@ -90,6 +92,8 @@ def situation(
     conditions = draw_conditions(load_spread(), rng)
     if not over_all:
         conditions = replace(conditions, grade_ratio=(0.0, 0.0), swell_ratio=0.0)
+    if leg_play_rad:
+        conditions = replace(conditions, leg_play_rad=leg_play_rad)
     if grade_deg:
         conditions = replace(conditions, grade_ratio=(math.tan(math.radians(grade_deg)), 0.0))
     if radius_factors is not None:

@@ -14,6 +14,14 @@ import numpy as np
 
 from pipelines.live.watch import Nobody, Watch, readable
 from terrain.constants import GRAVITY_MPS2
+from terrain.control.path_tracking import (
+    NO_POSE,
+    TrackSettings,
+    check_tracking,
+    initial_tracking,
+    track_step,
+)
+from terrain.control.path_tracking import SETTINGS as TRACKING
 from terrain.control.pid import Gains
 from terrain.control.slick import braking_by_slip
 from terrain.control.slip_table import SlipTable, load_slip_table
@@ -79,6 +87,9 @@ class PilotSettings:
     traction, switching : of ``traction``
     gains, form : of ``thesis``
     delay_s : from a sample to the wheel; what gains have to be stable with
+    track : hold heading and place to what the wanted twists add up to; not with ``plain`` and ``ramp``, which
+        know neither
+    tracking : of that
     """
 
     controller: str = "traction"
@@ -88,6 +99,8 @@ class PilotSettings:
     gains: Gains = THESIS_GAINS
     form: str = "normalised"
     delay_s: float = 0.05
+    track: bool = False
+    tracking: TrackSettings = TRACKING
 
 
 @dataclass(slots=True)
@@ -97,6 +110,7 @@ class _Memory:
     steer: Array
     traction: Array
     thesis: Array
+    tracking: Array
     time_s: float = math.nan
     driven_mps: float = 0.0
     belief: Belief = NOTHING
@@ -154,6 +168,10 @@ class LivePilot:
                 f"slip table {table.name}: is of the robot {table.robot!r}, not of {robot.name!r}"
             )
         check_switching(settings.switching)
+        if settings.track and settings.controller in ("plain", "ramp"):
+            raise ConfigError(
+                f"controller {settings.controller!r} knows no place: it cannot be held to a way"
+            )
         if settings.controller == "thesis":
             check_stable(robot, settings.gains, settings.form, settings.delay_s)
         self._robot, self._table, self._settings = robot, table, settings
@@ -173,9 +191,13 @@ class LivePilot:
         self._blind = settings.controller in ("plain", "ramp")
         self._estimator = None if self._blind else LiveEstimator(robot)
         if self._estimator is not None:
+            if settings.track:
+                self._tracking = check_tracking(robot, settings.tracking, settings.delay_s)
+            pose = ("position_x_m", "position_y_m", "yaw_rad")
+            self._place_states = [self._estimator.states.index(state) for state in pose]
             self._steer_states = [self._estimator.states.index(f"steer_{i}_rad") for i in robot.wheels]
         steer = np.zeros(3) if steer_rad is None else np.array(steer_rad, dtype=np.float64)
-        self._now = _Memory(steer, initial_state(), new_state())
+        self._now = _Memory(steer, initial_state(), new_state(), initial_tracking())
 
     @property
     def terrains(self) -> tuple[str, ...]:
@@ -185,10 +207,12 @@ class LivePilot:
     def step(self, sample: Sample) -> Command:
         """Take what arrived, and return what the wheels are told; nothing that arrives makes it raise.
 
-        The ``status`` holds ``why_ratio`` (:data:`terrain.control.traction.STATUS_NAMES`), ``terrain_ratio`` and
-        ``probability_ratio`` of the ground believed, ``target_ratio``, ``aimed_ratio`` (the target with its
-        floor), ``balance_ratio``, ``slip_ratio``, ``slip_std_ratio``, ``stale_s``, ``drive_state_ratio`` (place
-        in ``slip_table.DRIVE_STATES``; -1 for not known), ``driven_mps`` and ``wanted_mps``.
+        The ``status`` holds ``why_ratio`` (:data:`terrain.control.traction.STATUS_NAMES`), ``terrain_ratio``
+        and ``probability_ratio`` of the ground believed, ``target_ratio``, ``aimed_ratio`` (the target with
+        its floor), ``balance_ratio``, ``slip_ratio``, ``slip_std_ratio``, ``stale_s``, ``drive_state_ratio``
+        (place in ``slip_table.DRIVE_STATES``; -1 for not known), ``driven_mps`` and ``wanted_mps``; and, with
+        ``track``, ``off_heading_rad`` and ``off_way_m`` of the reference, and ``track_ratio``
+        (:data:`terrain.control.path_tracking.STATUS_NAMES`).
         """
         now, robot = self._now, self._robot
         dt_s = sample.time_s - now.time_s
@@ -202,6 +226,7 @@ class LivePilot:
             twist = np.zeros(3)
         self._perceive(sample)
         target = self._target(known_dt_s)
+        twist, off = self._hold(twist, sample.time_s, dt_s if not first else PERIOD_S)
         admitted, wheel, steer = wheel_command_step(
             self._positions_m, *self._limits, known_dt_s, FAR_RAD, twist, now.steer
         )
@@ -224,9 +249,31 @@ class LivePilot:
             "drive_state_ratio": said[4],
             "driven_mps": said[0],
             "wanted_mps": wanted_mps,
+            "off_heading_rad": off[0],
+            "off_way_m": off[1],
+            "track_ratio": off[2],
         }
         scale = said[0] / wanted_mps if wanted_mps > 0.0 else 0.0
         return Command(told, steer, admitted * scale, status)
+
+    def _hold(self, twist: Array, time_s: float, dt_s: float) -> tuple[Array, tuple[float, float, float]]:
+        """Return the twist that holds the way, and how far off it the robot is, and why nothing is held."""
+        now, seen = self._now, self._now.estimate
+        if not self._settings.track or self._estimator is None or seen is None:
+            return twist, (math.nan, math.nan, float(NO_POSE))
+        place, yaw = self._place_states[:2], self._place_states[2]
+        held, now.tracking, said = track_step(
+            self._tracking,
+            now.tracking,
+            twist,
+            seen.mean[place],
+            seen.mean[yaw],
+            np.array([seen.speed_x_mps, seen.speed_y_mps, seen.yaw_rate_radps]),
+            seen.std[yaw],
+            seen.reference_age_s + max(time_s - seen.time_s, 0.0),
+            dt_s,
+        )
+        return held, (float(said[0]), float(said[1]), float(said[3]))
 
     def _perceive(self, sample: Sample) -> None:
         """Estimate, and hear what the ground is."""

@@ -25,7 +25,7 @@ class Word(NamedTuple):
 
 
 def readable(reading: Reading | None, n_columns: int) -> Reading | None:
-    """Return a reading as arrays (k,) and (k, n_columns) with at least one sample; None where it is not that."""
+    """Return a reading as arrays (k,) and (k, n_columns), k at least 1; None where it is not that."""
     try:
         time_s, values = (np.asarray(part, dtype=np.float64) for part in reading or ())
     except (TypeError, ValueError):

@@ -22,12 +22,13 @@ speed of the ground under it, along it, and s* the slip to aim for::
 - q is old by the filter's lag and the command takes its way; t leads by both, with the acceleration a that
   was measured and no more than a start on soft ground has, since that of the first tenths is not going to
   last.
-- s* is the target of the ground, and no less than a floor: what steady motion was seen to balance, plus a
-  margin, as ``F(s*) > R`` is what accelerates; and where d is held back and the robot hardly gains speed, the
-  floor rises.  So a target that is too low, or a slope, costs time and never the way.
+- s* is the target of the ground until steady motion has shown what slip it balances; from then on that slip
+  and a margin, as ``F(s*) > R`` is what accelerates, and more of it buys nothing.  Where d is held back and
+  the robot hardly gains speed, s* rises.  So a target that is too low, or a slope, costs time and never the
+  way.
 - Wheels that fight each other (a radius or a place that is not what it is believed to be) show in torque, not
   in slip, which is computed from the same belief.  Each wheel gives way by a little speed a torque over the
-  mean: a droop, behind a low-pass that keeps it slower than the contact.
+  mean: a droop, behind a low-pass that keeps it slower than the contact, and only where the ground grips.
 - Braking is left to the drivers but on ground that is slick and hard: soil resists most where the wheels
   stop, hard ground where they slip a little.  There d falls no faster than ``q (1 - s_b)``, with q carried
   over the lag by the deceleration that such ground can give.
@@ -108,8 +109,9 @@ _USUAL_STEP_S = 0.02  # what a fade goes on with where the clock gives no sense
 _STEADY_MPS = 0.1
 _BALANCE_S = 1.0
 _FLOOR_MAX = 0.95
+_GRIP = 0.03  # up to this slip wheels fight; ground that gives way by twice as much lets them
 _SHARE = 0.3  # a wheel near the turning centre, slower than this share of the fastest, tells nothing about it
-_BRAKE_END_MPS = 0.1  # slower than that, stopping is a matter of a wheel's turn
+_BRAKE_END_MPS = 0.05  # slower than that, stopping is a matter of a wheel's turn
 _BRAKE_MPS2 = 0.5  # a command that falls faster than the resistances slow the robot is a braking
 
 (
@@ -122,8 +124,9 @@ _BRAKE_MPS2 = 0.5  # a command that falls faster than the resistances slow the r
     _FLOOR,
     _HELD,
     _BRAKING,
+    _BRAKED_FROM,
     _DROOP,
-) = range(10)
+) = range(11)
 _PATTERN = _DROOP + 3
 STATE_SIZE = _PATTERN + 3
 
@@ -288,7 +291,7 @@ def traction_step(
         slip = max(slip, sign * slip_ratio[i])
         shared += sign * slip_ratio[i] / n
         fastest = abs(ground_mps[i]) / max(1.0 - max(sign * slip_ratio[i], 0.0), 0.05)
-        std = max(std, slip_std[i] * fastest / max(fastest, settings.launch_mps))
+        std = max(std, slip_std[i] * fastest / max(fastest, settings.launch_mps, state[_BRAKED_FROM]))
         if speed >= _SHARE:
             seen = sign * ground_mps[i] / speed
             if seen < q:
@@ -313,7 +316,11 @@ def traction_step(
     rising = wanted > was + 1e-9
     falling = was_wanted - wanted > _BRAKE_MPS2 * dt_s
     after[_WANTED] = wanted
-    target = max(ground.traction_ratio, state[_FLOOR])
+    margin = max(settings.balance_margin_ratio, ground.margin_ratio)
+    target = ground.traction_ratio
+    if math.isfinite(state[_BALANCE]):
+        target = min(target, max(state[_BALANCE], 0.0) + margin)
+    target = max(target, state[_FLOOR])
     drive_state = STEADY
     if rising:
         drive_state = TRACTION
@@ -342,6 +349,7 @@ def traction_step(
             if ahead <= max(wanted, _BRAKE_END_MPS):
                 driven, braking_s = wanted, 0.0
     after[_BRAKING] = braking_s
+    after[_BRAKED_FROM] = 0.0 if braking_s == 0.0 else max(state[_BRAKED_FROM], was)
     after[_DRIVEN] = driven
 
     # what steady motion balances, and whether the robot gains speed
@@ -356,7 +364,6 @@ def traction_step(
         if after[_CONSTANT] > _CONSTANT_S and abs(gained) < _STEADY_MPS2 and q > _STEADY_MPS:
             before = state[_BALANCE] if math.isfinite(state[_BALANCE]) else shared
             after[_BALANCE] = before + (shared - before) * min(dt_s / _BALANCE_S, 1.0)
-            margin = max(settings.balance_margin_ratio, ground.margin_ratio)
             floor = min(max(after[_BALANCE], 0.0) + margin, _FLOOR_MAX)
             after[_FLOOR] = floor if driven >= wanted else max(after[_FLOOR], floor)
 
@@ -369,10 +376,11 @@ def traction_step(
         keep = math.exp(-dt_s / settings.droop_time_s)
         after[_DROOP + i] = keep * state[_DROOP + i] + (1.0 - keep) * seen
         mean += after[_DROOP + i] / n
+    grip = min(max(2.0 - abs(shared) / _GRIP, 0.0), 1.0)
     for i in range(n):
         told[i] = after[_PATTERN + i] * driven
         if status == OK:
-            room = settings.droop_max_ratio * abs(told[i])
+            room = grip * settings.droop_max_ratio * abs(told[i])
             give = settings.droop_radps_per_nm * (after[_DROOP + i] - mean)
             told[i] -= (1.0 if after[_PATTERN + i] >= 0.0 else -1.0) * min(max(give, -room), room)
     if status == NO_SLIP:

@@ -1,0 +1,89 @@
+"""How long a control step takes: ``pytest tests/benchmarks --benchmark-enable``.
+
+Calls of one group correct the same wheels, so that their times can be divided; all of it runs on one core,
+and is timed in seconds of that core.
+"""
+
+import time
+
+import numpy as np
+import pytest
+
+from pipelines.live.pilot import LivePilot, PilotSettings
+from pipelines.simulate import simulate_run
+from terrain.control.pid import Gains
+from terrain.control.thesis import new_state, thesis_settings, thesis_step
+from terrain.control.traction import SETTINGS, Ground, initial_state, traction_step
+from terrain.logs.replay import replay
+from terrain.robots import load_robot
+
+N_STEPS = 2000
+MOST_US = {"traction": 30.0, "thesis": 60.0}
+"""Of a step called from the interpreter, which is most of it: a thousandth of a period of 20 ms."""
+MOST_PILOT_US = 400.0
+"""Of a whole step of the chain: a fiftieth of its period."""
+ROBOT = load_robot("agrimaro")
+GAINS = Gains(0.5, 0.5, 0.0, 2.0)
+DT_S = 0.02
+
+
+def rows():
+    """What three wheels do in a start: command, rate, ground speed, acceleration, slip, torque (n, 3)."""
+    rng = np.random.default_rng(0)
+    wanted = np.minimum(np.arange(N_STEPS) * 0.1, 5.0)[:, None] * np.ones(3)
+    ground = 0.17 * wanted + 0.01 * rng.standard_normal((N_STEPS, 3))
+    accel = 0.3 * rng.standard_normal((N_STEPS, 3))
+    slip = np.clip(1 - ground / np.maximum(0.2 * wanted, 0.05), -1, 1)
+    return wanted, wanted, ground, accel, slip, 10 + rng.standard_normal((N_STEPS, 3))
+
+
+def with_traction(wanted, rate, ground, accel, slip, torque):
+    state, std, aim = initial_state(), np.full(3, 0.005), Ground(0.1)
+    for u, v, a, s, t in zip(wanted, ground, accel, slip, torque, strict=True):
+        told, state, _ = traction_step(SETTINGS, state, aim, 0.2, u, v, a, s, std, 0.0, t, DT_S)
+    return told
+
+
+def with_thesis(wanted, rate, ground, accel, slip, torque):
+    settings, state, targets = thesis_settings(0.2, GAINS), new_state(), np.array([0.1, -0.15, 0.05])
+    for u, w, v, a in zip(wanted, rate, ground, accel, strict=True):
+        added, _, _, _, state = thesis_step(settings, state, u, w, v, a, float(v[0]), targets, DT_S)
+    return u + added
+
+
+def with_python(wanted, rate, ground, accel, slip, torque):
+    """(8.1) to (8.3) with a clamp, wheel by wheel, in the interpreter."""
+    integral = [0.0] * 3
+    for us, vs, ss in zip(wanted.tolist(), ground.tolist(), slip.tolist(), strict=True):
+        told = []
+        for i in range(3):
+            error = (0.05 - ss[i]) * max(us[i] * 0.2, abs(vs[i])) / 0.2
+            integral[i] = min(max(integral[i] + GAINS.ki * error * DT_S, -GAINS.limit), GAINS.limit)
+            told.append(us[i] + min(max(GAINS.kp * error + integral[i], -GAINS.limit), GAINS.limit))
+    return np.array(told)
+
+
+@pytest.mark.benchmark(group=f"{N_STEPS} control steps of three wheels", timer=time.process_time)
+@pytest.mark.parametrize("drive", [with_traction, with_thesis, with_python])
+def test_a_control_step(benchmark, drive):
+    given = rows()
+    assert np.isfinite(benchmark(drive, *given)).all()
+    name = drive.__name__.removeprefix("with_")
+    if benchmark.stats and name in MOST_US:  # absent where benchmarks are off
+        assert benchmark.stats.stats.min / N_STEPS * 1e6 < MOST_US[name]
+
+
+@pytest.mark.benchmark(group="the whole chain", timer=time.process_time)
+@pytest.mark.parametrize("controller", ["traction", "thesis"])
+def test_a_step_of_the_pilot_leaves_the_loop_its_time(benchmark, controller):
+    samples = list(replay(simulate_run(ROBOT, "grass", "straight", 0, duration_s=16.0)))
+
+    def new():
+        return (LivePilot(ROBOT, settings=PilotSettings(controller=controller)),), {}
+
+    def drive(pilot):
+        return [pilot.step(sample) for sample in samples]
+
+    assert len(benchmark.pedantic(drive, setup=new, rounds=5)) == len(samples)
+    if benchmark.stats:
+        assert benchmark.stats.stats.min / len(samples) * 1e6 < MOST_PILOT_US

@@ -1,0 +1,173 @@
+"""What a classifier is shown live is what it was taught on, and nothing it is shown stops the robot."""
+
+import numpy as np
+import pytest
+
+from features.windows import cut_windows
+from pipelines.crossval import CrossvalSettings, samples_of
+from pipelines.estimate import enriched, estimate_run
+from pipelines.live.pilot import LivePilot
+from pipelines.live.watch import Classifier, Nobody, Told
+from pipelines.models import TerrainModel
+from pipelines.simulate import simulate_run
+from pipelines.train import model_info
+from terrain.control.slip_table import load_slip_table
+from terrain.errors import DataError
+from terrain.estimation.live import LiveEstimator
+from terrain.kinematics.rim import with_rim_speeds
+from terrain.logs.replay import replay
+from terrain.records import Reading, RunLog, Sample, Stream
+from terrain.robots import load_robot
+
+ROBOT = load_robot("agrimaro")
+TERRAINS = ("grass", "tiles")
+
+
+@pytest.fixture(scope="module")
+def model():
+    """Taught on two short runs of each of two grounds."""
+    runs = [
+        enriched(
+            estimate_run(simulate_run(ROBOT, terrain, "survey", 5, number, duration_s=25.0), ROBOT, "vio15")
+        )
+        for terrain in TERRAINS
+        for number in (1, 2)
+    ]
+    settings = CrossvalSettings()
+    windows = samples_of(runs, settings).cut.windows
+    recipe = settings.new_recipe().fit(windows, windows.terrain.astype(str))
+    return TerrainModel(recipe, model_info(runs, settings, windows, "drawn", ""))
+
+
+@pytest.fixture(scope="module")
+def log():
+    return simulate_run(ROBOT, "grass", "survey", 6, duration_s=25.0)
+
+
+def estimated(run):
+    """The run with the streams that ``enriched`` adds, of the estimator on the robot."""
+    estimator = LiveEstimator(ROBOT)
+    told = [estimate for sample in replay(run) for estimate in estimator.step(sample.readings)]
+    time_s = [estimate.time_s for estimate in told]
+    channels = ("speed_x_mps", "speed_y_mps", "yaw_rate_radps", "accel_x_mps2", "accel_y_mps2")
+    streams = dict(with_rim_speeds(run, ROBOT).streams)
+    streams["estimator"] = Stream(time_s, [[getattr(e, name) for name in channels] for e in told], channels)
+    slip = [estimate.slip_ratio for estimate in told]
+    streams["slip"] = Stream(time_s, slip, tuple(f"slip_{i}_ratio" for i in (1, 2, 3)))
+    return RunLog(run.run_id, run.robot, streams, run.labels)
+
+
+def live(classifier, run, change=lambda sample: sample):
+    """What a classifier says of a run told again, and the windows that it was shown."""
+    estimator, shown, words = LiveEstimator(ROBOT), [], []
+    push = classifier._stream.push
+
+    def keep(*sample):
+        windows = push(*sample)
+        shown.extend(windows)
+        return windows
+
+    classifier._stream.push = keep
+    for sample in map(change, replay(run)):
+        words += classifier.hear(sample, estimator.step(sample.readings))
+    return words, shown
+
+
+def test_live_windows_are_those_of_the_enriched_log_and_so_is_what_is_said(model, log):
+    words, shown = live(Classifier(model), log)
+    batch = cut_windows([estimated(log)], model.rule, layout=model.layout).windows
+    assert len(shown) == len(batch) == len(words) > 5
+    for k, window in enumerate(shown):
+        assert window.start_s[0] == batch.start_s[k]
+        for stream, values in batch.values.items():
+            np.testing.assert_array_equal(window.values[stream][0], values[k], err_msg=stream)
+    probability = model.recipe.predict_proba(batch)
+    classes = model.recipe.classes_
+    assert [word.terrain for word in words] == [classes[best] for best in probability.argmax(axis=1)]
+    assert [word.probability for word in words] == pytest.approx(probability.max(axis=1), abs=1e-12)
+    ends_s = batch.start_s + model.rule.length_s
+    late_s = np.array([word.time_s for word in words]) - ends_s
+    assert (np.abs(late_s) < 0.05).all()
+
+
+def test_a_pilot_comes_to_believe_it(model, log):
+    driver = LivePilot(ROBOT, load_slip_table(), Classifier(model))
+    believed = [driver.step(sample).status["terrain_ratio"] for sample in replay(log)]
+    assert driver.terrains[int(believed[-1])] == "grass"
+    assert set(believed) == {-1.0, believed[-1]}
+
+
+WIDTHS = {"wheels": 6, "imu": 9}
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda width: Reading(np.array([9.0]), np.full((1, width), np.nan)),
+        lambda width: Reading(np.array([np.nan]), np.zeros((1, width))),
+        lambda width: Reading(np.array([5.0]), np.zeros((1, width))),
+        lambda width: Reading(np.empty(0), np.empty((0, width))),
+        lambda width: Reading(np.array([9.0, 9.1]), np.zeros((1, width))),
+        lambda width: Reading(np.array([9.0]), np.zeros((1, 2 * width))),
+        lambda width: Reading([9.0], [["a"] * width]),
+        lambda width: Reading(None, None),
+    ],
+)
+def test_readings_that_are_none_cost_windows_and_no_more(model, log, make):
+    def spoil(sample):
+        if not 9.0 <= sample.time_s < 9.1:
+            return sample
+        return sample._replace(readings={name: make(width) for name, width in WIDTHS.items()})
+
+    words, _ = live(Classifier(model), log, spoil)
+    whole, _ = live(Classifier(model), log)
+    assert [word[:2] for word in words[-3:]] == [word[:2] for word in whole[-3:]]
+    assert [word.probability for word in words[-3:]] == pytest.approx(
+        [word.probability for word in whole[-3:]], abs=0.01
+    )
+    assert len(whole) - 2 <= len(words) <= len(whole)
+
+
+def test_a_window_that_the_model_refuses_is_counted_and_no_error(model, log):
+    class Refusing:
+        classes_ = model.recipe.classes_
+        asked = 0
+
+        def predict_proba(self, windows):
+            self.asked += 1
+            if self.asked % 2:
+                raise ValueError("Input X contains NaN.")
+            return model.recipe.predict_proba(windows)
+
+    classifier = Classifier(model._replace(recipe=Refusing()))
+    words, shown = live(classifier, log)
+    assert classifier.failed == {"Input X contains NaN.": (len(shown) + 1) // 2}
+    assert len(words) == len(shown) // 2
+
+
+@pytest.mark.parametrize(
+    ("stream", "channel"), [("imu", "accel_q_mps2"), ("gnss", "speed_x_mps"), ("estimator", "speed_z_mps")]
+)
+def test_a_model_that_wants_what_is_not_made_live_is_refused(model, stream, channel):
+    channels = dict(model.info["channels"])
+    channels[stream] = [*channels.get(stream, []), channel]
+    rates = {**model.info["rate_hz"], stream: 50.0}
+    wanting = model._replace(info={**model.info, "channels": channels, "rate_hz": rates})
+    with pytest.raises(DataError) as refused:
+        Classifier(wanting)
+    assert (
+        str(refused.value) == f"the model wants {channel!r} of the stream {stream!r}, which is not made live"
+    )
+
+
+def test_who_is_told_says_each_change_once_and_who_is_nobody_nothing():
+    told = Told(lambda ground: {"clay": "grass"}.get(ground, ground))
+    grounds = ["", "clay", "clay", "", "clay", "snow", "snow", ""]
+    samples = [Sample(float(k), np.zeros(3), {}, ground) for k, ground in enumerate(grounds)]
+    said = [word for sample in samples for word in told.hear(sample, [])]
+    assert [(word.time_s, word.terrain, word.probability) for word in said] == [
+        (1.0, "grass", 1.0),
+        (5.0, "snow", 1.0),
+    ]
+    assert not any(Nobody().hear(sample, []) for sample in samples)
+    assert (told.sure, Nobody.sure, Classifier.sure) == (True, False, False)
