@@ -428,8 +428,8 @@ def drive_command(
     scenario: Annotated[
         str,
         typer.Option(
-            help="starts, straight, slope, brake, circle, crab; course and mixed on the terrain 'course'; or "
-            "any of simulate."
+            help="starts, straight, slope (the steepest; else level), brake, circle, crab; course and mixed "
+            "on the terrain 'course'; or any of simulate."
         ),
     ] = "starts",
     terrain: Annotated[
@@ -509,7 +509,7 @@ def drive_command(
         ensure_writable(out)
     with progress_bar() as progress:
         classifier = None
-        if "learned" in settings.controllers:
+        if any(name.partition("+")[0] == "learned" for name in settings.controllers):
             if model is None:
                 classifier = taught_classifier(described, seed, progress)
             else:

@@ -46,6 +46,9 @@ FIRST_M = 4.0
 AFTER_S = 5.0
 """Time of a start after which distance is."""
 
+TARGET_CHANGE = 0.02
+"""Targets that differ by less count as one."""
+
 STEEPEST_DEG = 25.0
 SLOPE_STEPS = 8
 
@@ -274,7 +277,7 @@ def judge(run: RunLog, robot: Robot, where: Situation, driver: Driver) -> dict[s
     starts = start_times(where.scenario)
     row = {
         "distance_m": float(course.distance_m[-1]),
-        "mean_speed_mps": float(course.speed_mps.mean()),
+        "mean_speed_mps": float(course.progress_mps.mean()),
         "final_speed_mps": final_speed(course),
         "slip_peak": slip_peak(course),
         "lock_s": lock_s(course),
@@ -288,10 +291,7 @@ def judge(run: RunLog, robot: Robot, where: Situation, driver: Driver) -> dict[s
         "command_mps2": roughness(commands) * robot.wheel_radius_m,
         "yaw_drift_rad": float(abs(course.yaw_rad[-1] - course.yaw_rad[0])),
     }
-    changes = [
-        (time_s, driver.table.lookup(ground)["traction"].slip_ratio)
-        for time_s, ground in changes_of(run.labels)
-    ]
+    changes = _changes(run, driver)
     if changes and driver.says in ("classifier", "truth"):
         times = np.array(adapt_times(control, changes))
         row["adapted_ratio"] = float(np.isfinite(times).mean())
@@ -303,6 +303,17 @@ def judge(run: RunLog, robot: Robot, where: Situation, driver: Driver) -> dict[s
         row["stop_m"] = stop_distance(course, told_s)
         row["lock_s"] = lock_s(course, told_s, standing_from(course, told_s))
     return row
+
+
+def _changes(run: RunLog, driver: Driver) -> list[tuple[float, float]]:
+    """Return when the ground asked for another target, and which; one that stays asks for nothing."""
+    found, before = [], math.nan
+    for time_s, ground in [(0.0, run.labels[0].terrain), *changes_of(run.labels)] if run.labels else []:
+        wanted = driver.table.lookup(ground)["traction"].slip_ratio
+        if abs(wanted - before) > TARGET_CHANGE:
+            found.append((time_s, wanted))
+        before = wanted
+    return found
 
 
 def _slip_error(run: RunLog) -> float:
@@ -369,7 +380,7 @@ def drive(
     ramp = settings.ramp_mps2
     named = [name for name in settings.controllers if name != "ramp"]
     drivers = {name: make_driver(name, table, settings.delay_s) for name in named}
-    if "learned" in drivers and model is None:
+    if model is None and any(driver.says == "classifier" for driver in drivers.values()):
         raise ConfigError("controller 'learned' needs a classifier: give a model")
     seeds = range(settings.first_seed, settings.first_seed + settings.seeds)
     n = len(seeds) * len(settings.controllers)
@@ -423,7 +434,7 @@ def _drive_all(
 
     jobs = [(driver, seed) for seed in seeds for driver in drivers]
     rows: dict[str, list[dict[str, Any]]] = {driver.name: [] for driver in drivers}
-    pool = Parallel(n_jobs=min(n_jobs, len(jobs)), return_as="generator")
+    pool = Parallel(n_jobs=max(min(n_jobs, len(jobs)), 1), return_as="generator")
     work = pool(
         delayed(_job)(robot, driver, settings, seed, model if driver.says == "classifier" else None)
         for driver, seed in jobs
@@ -447,7 +458,11 @@ def _job(
     if settings.scenario == SLOPE:
         row["steepest_deg"] = steepest(robot, driver, settings, seed, model)
     course = course_of(run, settings.plant or robot)
-    row["_energy"] = (course.distance_m, course.energy_j)
+    told_s = where.scenario.time_s[np.flatnonzero(np.abs(where.scenario.twist).max(axis=1) > 0.0)]
+    driven = course.time_s <= (
+        told_s[-1] if told_s.size else 0.0
+    )  # a coast after the last stop costs nothing
+    row["_energy"] = (np.maximum.accumulate(course.distance_m[driven]), course.energy_j[driven])
     return row
 
 
@@ -480,7 +495,8 @@ def _matching_ramp(
     n_jobs: int,
 ) -> float:
     """Return the ramp that gets as far as the first of ours among the controllers, on the same days."""
-    ours = [name for name in ("oracle", "learned", "fixed") if name in rows]
+    kinds = ("oracle", "learned", "fixed")
+    ours = [name for kind in kinds for name in rows if name in (kind, f"{kind}+track")]
     others = [name for name in rows if name.startswith(("told:", "target:"))]
     if not ours + others:
         return PilotSettings().ramp_mps2
@@ -498,7 +514,10 @@ def _matching_ramp(
 
 
 def _share_distance(rows: Mapping[str, list[dict[str, Any]]]) -> None:
-    """Add ``energy_j_per_m``, over the way that all made that day who made half of the longest."""
+    """Add ``energy_j_per_m``, over the way that all made that day who made half of the longest.
+
+    It depends on who else is driven, as the way does; one who made less than half has none that day.
+    """
     for day in zip(*rows.values(), strict=True):
         ways = [float(row["_energy"][0][-1]) for row in day]
         shared = min(way for way in ways if way >= max(ways) / 2)

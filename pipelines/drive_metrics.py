@@ -43,6 +43,7 @@ class Course(NamedTuple):
     ----------
     time_s, speed_mps, velocity_mps : (n,), (n,), (n, 2); speed over ground whichever way, velocity in body
         axes
+    progress_mps : (n,) along what is wanted; negative where the robot slides back
     distance_m, energy_j, scrub_j, scrub_along_j : (n,) summed up; scrub is what the contacts take up, and the
         part of it along the wheels
     rim_mps, ground_mps, slip_ratio : (n, wheels) along each wheel; slip positive in traction whichever way,
@@ -54,6 +55,7 @@ class Course(NamedTuple):
     time_s: Array
     speed_mps: Array
     velocity_mps: Array
+    progress_mps: Array
     distance_m: Array
     energy_j: Array
     scrub_j: Array
@@ -97,6 +99,7 @@ def course_of(
     along_w = (traction * (rim - ground)).sum(axis=1)
     lost_w = along_w - (side * sideways).sum(axis=1)
     speed = np.hypot(along, across)
+    progress = _progress(truth.time_s, np.column_stack([along, across]), run.streams.get("commands"))
     signed = np.full(rim.shape, math.nan)
     for i, wheel in enumerate(wheels):
         if f"slip_{wheel}_ratio" in truth.channels:  # a slip that no instant has is no channel
@@ -108,7 +111,8 @@ def course_of(
         truth.time_s,
         speed,
         np.column_stack([along, across]),
-        np.cumsum(speed) * step_s,
+        progress,
+        np.cumsum(progress) * step_s,
         np.cumsum(power_w) * step_s,
         np.cumsum(lost_w) * step_s,
         np.cumsum(along_w) * step_s,
@@ -118,6 +122,23 @@ def course_of(
         sinkage.max(axis=1),
         truth.channel("yaw_rad"),
     )
+
+
+def _progress(time_s: Array, velocity: Array, commands: Stream | None) -> Array:
+    """Return the speed (n,) along what is wanted, or was last: to slide back down a slope is no way made.
+
+    Where no translation was wanted yet, as in a turn on the spot, or nobody says what is, it is the speed
+    whichever way.
+    """
+    if commands is None:
+        return np.asarray(np.linalg.norm(velocity, axis=1))
+    wanted = np.column_stack([commands.channel("speed_x_mps"), commands.channel("speed_y_mps")])
+    size = np.linalg.norm(wanted, axis=1)
+    last = np.maximum.accumulate(np.where(size > 0.0, np.arange(size.size), -1))
+    at = last[np.clip(np.searchsorted(commands.time_s, time_s, side="right") - 1, 0, size.size - 1)]
+    way = wanted[at] / np.maximum(size[at], 1e-9)[:, None]
+    along = np.where(at < 0, np.linalg.norm(velocity, axis=1), np.einsum("ij,ij->i", velocity, way))
+    return np.asarray(along)
 
 
 def _smooth(values: Array, step_s: float) -> Array:
@@ -168,10 +189,12 @@ def immobilised(course: Course, control: Stream) -> int:
     """Return how often the robot was stuck: to go, and not going, for :data:`STUCK_S`.
 
     It is to go by the pilot's ``wanted_mps``, and not by what wheels are told: a controller that stops the
-    robot is no excuse.
+    robot is no excuse.  It goes where a wheel makes way in the direction that it turns: one that turns on the
+    spot is not stuck, one that slides back down a slope is.
     """
     wanted = np.interp(course.time_s, control.time_s, control.channel("wanted_mps"))
-    stuck = (wanted > WANTED_MPS) & (course.speed_mps < STUCK_MPS)
+    going_mps = (course.ground_mps * np.sign(course.rim_mps)).max(axis=1)
+    stuck = (wanted > WANTED_MPS) & (going_mps < STUCK_MPS)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], stuck, [False]]).astype(int)))
     step_s = course.time_s[1] - course.time_s[0]
     return int(((edges[1::2] - edges[::2]) * step_s >= STUCK_S).sum())
@@ -180,7 +203,7 @@ def immobilised(course: Course, control: Stream) -> int:
 def final_speed(course: Course) -> float:
     """Return the mean speed in m/s at the end of a drive."""
     length_s = min(FINAL_S, course.time_s[-1] / 3)
-    return float(course.speed_mps[course.time_s > course.time_s[-1] - length_s].mean())
+    return float(course.progress_mps[course.time_s > course.time_s[-1] - length_s].mean())
 
 
 def standing_from(course: Course, start_s: float) -> float:

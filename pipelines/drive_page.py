@@ -270,6 +270,9 @@ def _verdict(result: Result) -> str:
 
 
 def _about(name: str, ramp_mps2: float | None) -> str:
+    bare, track, _ = name.partition("+track")
+    if track:
+        return f"{_about(bare, ramp_mps2)} Held to its way."
     kind, _, what = name.partition(":")
     if kind == "told" and what:
         return f"Ours, always told that the ground is {what}."

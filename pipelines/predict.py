@@ -12,6 +12,7 @@ from features.windows import cut_windows
 from pipelines.datasets import data_digest
 from pipelines.models import TerrainModel
 from terrain.control.slip_table import DRIVE_STATES, SlipTable
+from terrain.errors import ConfigError
 from terrain.records import RunLog
 
 
@@ -41,7 +42,14 @@ def predict(
     ------
     DataError
         if a run lacks a channel or has another rate than the model was taught.
+    ConfigError
+        if the table is for another robot than a run is of.
     """
+    other = next((run for run in runs if table.robot and run.robot != table.robot), None)
+    if other is not None:
+        raise ConfigError(
+            f"table {table.name} is for robot {table.robot!r}, run {other.run_id} is of {other.robot!r}"
+        )
     cut = cut_windows(runs, model.rule, layout=model.layout, skip_short=skip_short)
     windows = cut.windows
     classes = np.asarray(model.recipe.classes_, dtype=str)

@@ -56,12 +56,12 @@ def sheet(learned: Sequence[Learned], robot: str) -> Figure:
     """Draw all terrains beside each other, with the same slip axis."""
     n_rows = math.ceil(len(learned) / SHEET_COLUMNS)
     with styled():
-        figure = new_figure(10.0, 0.8 + 2.9 * n_rows)
+        figure = new_figure(10.0, 0.8 + 3.0 * n_rows)
         panels = np.atleast_1d(figure.subplots(n_rows, SHEET_COLUMNS, squeeze=False)).ravel()
         for axes, entry in zip(panels, learned, strict=False):
             draw_curve(axes, entry)
             axes.set_title(
-                f"{shorten(entry.terrain, 24)}: {_headline(entry)}", loc="left", fontsize=8, color=INK
+                f"{shorten(entry.terrain, 24)}\n{_headline(entry)}", loc="left", fontsize=8, color=INK
             )
         for axes in panels[len(learned) :]:
             axes.set_axis_off()

@@ -113,6 +113,7 @@ class _Memory:
     tracking: Array
     time_s: float = math.nan
     driven_mps: float = 0.0
+    wheel: Array = field(default_factory=lambda: np.zeros(3))
     belief: Belief = NOTHING
     target_ratio: float = math.nan
     estimate: LiveEstimate | None = None
@@ -324,7 +325,8 @@ class LivePilot:
     def _ramp(self, wheel: Array, wanted_mps: float, dt_s: float) -> tuple[Array, tuple[float, ...]]:
         now = self._now
         rise = self._settings.ramp_mps2 * dt_s if self._settings.controller == "ramp" else math.inf
-        now.driven_mps = min(wanted_mps, now.driven_mps + rise)
+        before_mps = now.driven_mps if float(wheel @ now.wheel) >= 0.0 else 0.0
+        now.wheel, now.driven_mps = wheel, min(wanted_mps, before_mps + rise)
         nan = math.nan
         told = wheel * (now.driven_mps / wanted_mps) if wanted_mps > 0.0 else wheel
         return told, (now.driven_mps, nan, nan, nan, float(STEADY), float(OK), nan, nan)
@@ -384,7 +386,7 @@ class LivePilot:
         )
         why = BAD_TIME if not 0.0 < dt_s <= MAX_STEP_S else OK if np.isfinite(desired).all() else NO_SLIP
         driven_mps = float(np.abs(wheel + added).max()) * self._robot.wheel_radius_m
-        aimed, largest = float(np.abs(desired).max()), float(np.max(np.where(wheel < 0.0, -slip, slip)))
+        aimed, largest = (float(np.where(wheel < 0.0, -s, s).max()) for s in (desired, slip))
         return wheel + added, (
             driven_mps,
             aimed,

@@ -76,7 +76,8 @@ class TractionSettings(NamedTuple):
     fade_mps2 : how fast d goes to w where no correction may be made
     droop_radps_per_nm, droop_max_ratio, droop_time_s : speed a wheel gives way a torque over the mean; at
         most that share of its speed; behind that time constant
-    std_max_ratio, stale_max_s : slip that is more uncertain, or older, is no slip to correct by
+    std_max_ratio, stale_max_s : slip that is more uncertain, or older, is no slip to correct by; below one
+        and a half launch speeds, and in a controlled braking, the error of the speed counts as at that speed
     brake_lead_s : how long the ground speed of a braking goes unseen
     charge_mps_per_mps2, charge_time_s : what a driver's integral takes to carry the torque of a braking, as a
         speed by its proportional gain, and how long; of the robot, see :func:`with_driver`
@@ -109,6 +110,7 @@ _USUAL_STEP_S = 0.02  # what a fade goes on with where the clock gives no sense
 _STEADY_MPS = 0.1
 _BALANCE_S = 1.0
 _FLOOR_MAX = 0.95
+_JUDGED = 1.5  # of the launch speed: slower, what is corrected is a speed, and its error is judged as one
 _GRIP = 0.03  # up to this slip wheels fight; ground that gives way by twice as much lets them
 _SHARE = 0.3  # a wheel near the turning centre, slower than this share of the fastest, tells nothing about it
 _BRAKE_END_MPS = 0.05  # slower than that, stopping is a matter of a wheel's turn
@@ -269,9 +271,11 @@ def traction_step(
     """
     n = wheel_radps.size
     told, after, said = np.empty(n), state.copy(), np.empty(6)
-    wanted = 0.0
+    wanted, along = 0.0, 0.0
     for i in range(n):
         wanted = max(wanted, abs(wheel_radps[i]) * radius_m)
+        along += wheel_radps[i] * state[_PATTERN + i]
+    before = state[_DRIVEN] if along >= 0.0 else 0.0  # the other way at once is a start from rest
     status = OK
     # what is known of the ground
     q, gain, slip, shared, std = math.inf, 0.0, -math.inf, 0.0, 0.0
@@ -291,7 +295,8 @@ def traction_step(
         slip = max(slip, sign * slip_ratio[i])
         shared += sign * slip_ratio[i] / n
         fastest = abs(ground_mps[i]) / max(1.0 - max(sign * slip_ratio[i], 0.0), 0.05)
-        std = max(std, slip_std[i] * fastest / max(fastest, settings.launch_mps, state[_BRAKED_FROM]))
+        judged = max(fastest, _JUDGED * settings.launch_mps, state[_BRAKED_FROM])
+        std = max(std, slip_std[i] * fastest / judged)
         if speed >= _SHARE:
             seen = sign * ground_mps[i] / speed
             if seen < q:
@@ -305,14 +310,14 @@ def traction_step(
     if not (0.0 < dt_s <= MAX_STEP_S):
         status = BAD_TIME
     if status == BAD_TIME:
-        driven = min(wanted, state[_DRIVEN] + settings.fade_mps2 * _USUAL_STEP_S)
+        driven = min(wanted, before + settings.fade_mps2 * _USUAL_STEP_S)
         after[_DRIVEN] = driven
         for i in range(n):
             told[i] = after[_PATTERN + i] * driven
         _say(said, driven, ground.traction_ratio, state[_BALANCE], math.nan, STEADY, BAD_TIME)
         return told, after, said
 
-    was, was_wanted = state[_DRIVEN], state[_WANTED]
+    was, was_wanted = before, state[_WANTED]
     rising = wanted > was + 1e-9
     falling = was_wanted - wanted > _BRAKE_MPS2 * dt_s
     after[_WANTED] = wanted
@@ -362,8 +367,8 @@ def traction_step(
             after[_REFERENCE], after[_CONSTANT] = driven, 0.0
         after[_CONSTANT] += dt_s
         if after[_CONSTANT] > _CONSTANT_S and abs(gained) < _STEADY_MPS2 and q > _STEADY_MPS:
-            before = state[_BALANCE] if math.isfinite(state[_BALANCE]) else shared
-            after[_BALANCE] = before + (shared - before) * min(dt_s / _BALANCE_S, 1.0)
+            seen = state[_BALANCE] if math.isfinite(state[_BALANCE]) else shared
+            after[_BALANCE] = seen + (shared - seen) * min(dt_s / _BALANCE_S, 1.0)
             floor = min(max(after[_BALANCE], 0.0) + margin, _FLOOR_MAX)
             after[_FLOOR] = floor if driven >= wanted else max(after[_FLOOR], floor)
 

@@ -141,6 +141,15 @@ def test_stuck_is_to_go_and_not_to_go_for_long_whatever_the_wheels_are_told():
     assert immobilised(course(duration_s=20.0, speed_x_mps=speed), control) == 2
 
 
+def test_to_turn_on_the_spot_is_to_go_and_to_slide_back_is_not():
+    control = Stream(time_of(5.0), np.ones((500, 1)), ("wanted_mps",))
+    steer = {
+        f"steer_{i}_rad": math.atan2(x_m, -y_m) for i, (x_m, y_m) in enumerate(ROBOT.wheel_positions_m, 1)
+    }
+    assert immobilised(course(duration_s=5.0, yaw_rate_radps=1.0, **steer), control) == 0
+    assert immobilised(course(duration_s=5.0, speed_x_mps=-0.5), control) == 1
+
+
 def test_final_speed_and_stopping_distance():
     time_s = time_of(30.0)
     speed = np.where(time_s < 20, 0.5, 0.8)

@@ -93,7 +93,7 @@ def rows_of(page):
 
 
 def test_the_page_names_every_controller_and_figure_and_fetches_nothing():
-    names = (*CONTROLLERS, "told:clay", "target:0.2")
+    names = (*CONTROLLERS, "told:clay", "target:0.2", "oracle+track")
     page = drive_page(a_result(names), {"oracle": a_run()}, TABLE)
     for name in names:
         assert f"<dt>{name}</dt>" in page
@@ -101,6 +101,8 @@ def test_the_page_names_every_controller_and_figure_and_fetches_nothing():
     assert all(f"<code>{key}</code>" in page for key in KEYS)
     assert rows_of(page)["slip_peak"][2] == ["1", "0.9", "to", "1.1"]
     assert "no more than 0.658 m/s²" in page
+    assert f"<dd>{NOT_KNOWN}</dd>" not in page
+    assert "would bring. Held to its way." in page
     assert not re.search(r'(src|href)="(?!data:)', page)
 
 

@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -109,6 +110,14 @@ def test_a_terrain_without_an_entry_gets_the_named_fallback(model, drive_all):
         for state in DRIVE_STATES:
             target = bare.targets[row["slip_entry"]][state]
             assert (row["target_slip"][state], row["status"][state]) == (target.slip_ratio, target.status)
+
+
+def test_a_table_of_another_robot_is_refused(model, drive):
+    run = drive("r", "GRASS", 3)
+    table = load_slip_table()
+    assert predict([run], model, replace(table, robot=run.robot))["n_runs"] == 1
+    with pytest.raises(ConfigError, match="is for robot 'agrimaro', run r is of 'husky'"):
+        predict([run], model, replace(table, robot="agrimaro"))
 
 
 def test_windows_that_are_dropped_are_counted_and_the_others_do_not_change(model, drive):

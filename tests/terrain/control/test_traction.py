@@ -68,6 +68,8 @@ def plain(using, m, aim, radius, wheel, ground, accel, slips, stds, stale, torqu
     """The step of the module's docstring, wheel by wheel, on a dict; (told, driven, target, status)."""
     u = [w * radius for w in wheel]
     w = max(abs(x) for x in u)
+    if sum(x * s for x, s in zip(u, m["share"], strict=True)) < 0:
+        m["d"] = 0.0
     if w > 0:
         m["share"] = [x / w for x in u]
     way = [-1.0 if share < 0 else 1.0 for share in m["share"]]
@@ -82,7 +84,7 @@ def plain(using, m, aim, radius, wheel, ground, accel, slips, stds, stale, torqu
     for i in range(3):
         if known[i]:
             rim = abs(ground[i]) / max(1 - max(way[i] * slips[i], 0), 0.05)
-            largest = max(largest, stds[i] * rim / max(rim, using.launch_mps, m["from"]))
+            largest = max(largest, stds[i] * rim / max(rim, 1.5 * using.launch_mps, m["from"]))
     sure = not largest > using.std_max_ratio
     fresh = stale <= using.stale_max_s
     status = NO_SLIP if not all(known) else STALE if not fresh else UNCERTAIN if not sure else OK
@@ -275,7 +277,7 @@ def test_a_torque_that_is_not_known_is_not_taken_for_none():
 FAULTS = [
     *[({name: value}, NO_SLIP) for name in ("ground_mps", "accel", "slip", "std") for value in (NAN, INF)],
     ({"ground_mps": [0.9, NAN, 0.9]}, NO_SLIP),
-    ({"std": 0.021}, UNCERTAIN),
+    ({"std": 0.03}, UNCERTAIN),
     *[({"stale_s": value}, STALE) for value in (3.01, INF, NAN)],
     *[({"dt_s": value}, BAD_TIME) for value in BAD_TIMES],
 ]
