@@ -363,7 +363,7 @@ def learn_slip_command(
     robot: Annotated[str, typer.Option(help="Swerve robot by name, or its YAML file.")],
     out: Annotated[Path, typer.Option(help="YAML file of the table of target slips.")],
     figures: Annotated[
-        Path | None, typer.Option(help="Folder of the pictures; MLflow gets them anyway.")
+        Path | None, typer.Option(help="Folder of a page and its pictures; MLflow gets them anyway.")
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of the bootstrap.")] = 0,
     layout: FormatOption = Format.auto,
@@ -389,7 +389,8 @@ def learn_slip_command(
             progress=progress,
         )
     print_learned_slip({**result, "skipped": skipped}, _console())
-    _write_json(json_file, {**result, "skipped": skipped})
+    named = {key: value for key, value in result.items() if key != "tracking_run_id"}  # drawn by MLflow anew
+    _write_json(json_file, {**named, "skipped": skipped})
 
 
 @app.command("calibrate")
@@ -503,13 +504,16 @@ def drive_command(
         plant=None if plant is None else load_robot(plant),
     )
     settings.check(described, slip_table)
+    needs_model = any(name.partition("+")[0] == "learned" for name in settings.controllers)
+    if model is not None and not needs_model:
+        raise ConfigError("--model is the classifier of 'learned', which is not among the controllers")
     if out is not None:
         from terrain.atomic import ensure_writable
 
         ensure_writable(out)
     with progress_bar() as progress:
         classifier = None
-        if any(name.partition("+")[0] == "learned" for name in settings.controllers):
+        if needs_model:
             if model is None:
                 classifier = taught_classifier(described, seed, progress)
             else:
@@ -616,7 +620,9 @@ def _radii(text: str | None) -> tuple[float, float, float] | None:
     try:
         one, two, three = (float(part) for part in text.split(","))
     except ValueError:
-        raise ConfigError(f"--radius is {text!r}; three ratios are wanted, as in 1,1.02,1") from None
+        one = two = three = 0.0
+    if not all(0.5 <= ratio <= 2.0 for ratio in (one, two, three)):
+        raise ConfigError(f"--radius is {text!r}; three ratios from 0.5 to 2 are wanted, as in 1,1.02,1")
     return one, two, three
 
 

@@ -43,6 +43,7 @@ from terrain.slip import rim_scatter_mps
 
 FILTER = "vio15"
 FALLBACK = "unknown"
+PAGE_FILE = "slip.html"
 DIGITS = 4
 """Of slips and shares of load in the table: a hundredth of what is known of them."""
 
@@ -89,7 +90,7 @@ def learn_slip(
     robot_name : name of a swerve robot or path of its YAML file
     out : YAML file of the table; what is there is replaced at once, when all is done
     dataset : name of the data set, for the record
-    figures : folder of the pictures; none are written without, MLflow gets them anyway
+    figures : folder of the pictures and of a page with them; without, only MLflow gets the pictures
     seed : of the bootstrap
     skip_faulty : leave a run out that lacks what is needed, and tell ``on_skip``, in place of refusing
     progress : told of runs and terrains that are done
@@ -153,6 +154,11 @@ def learn_slip(
     drawn = curve_figures(learned, robot.name)
     write_slip_table(table, out)
     files = _write_figures(drawn, figures)
+    if figures is not None:
+        from pipelines.slip_page import slip_page
+
+        atomic_write(figures / PAGE_FILE, slip_page(rows, drawn, table, len(used)))
+        files.append(str(figures / PAGE_FILE))
     run_id = log_learning(
         out.stem,
         {

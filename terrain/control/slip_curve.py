@@ -101,10 +101,12 @@ _MAGIC_PRIOR = {"shape_ratio": (1.65, 1.0), "curvature_ratio": (0.5, 2.0)}
 """Pacejka's usual C of pure longitudinal slip, and E up to 1: they matter where the data stop before the
 peak."""
 
-_BOUNDS = {
+LAW_BOUNDS = {
     "janosi": ((1e-3, 1e-3), (5.0, 20.0)),
     "magic": ((0.1, 1.0, 1e-3, -5.0), (200.0, 2.3, 5.0, 1.0)),
 }
+"""Least and most of each law's parameters, in their order."""
+
 _LEAST_VARIANCE = 1e-9
 
 
@@ -241,7 +243,7 @@ def fit_curve(law: str, runs: Sequence[RunBins], start: Sequence[float] | None =
     sought and then renewed.  Sought together, a steep curve would excuse its own residuals.
     """
     pooled = _Pooled(runs)
-    low, high = (np.array(bound) for bound in _BOUNDS[law])
+    low, high = (np.array(bound) for bound in LAW_BOUNDS[law])
     starts = [np.asarray(start)] if start is not None else _starts(law, pooled)
     best: tuple[float, Array] | None = None
     for guess in starts:

@@ -18,7 +18,7 @@ from typing import Any
 import yaml
 
 from terrain.atomic import atomic_write
-from terrain.control.slip_curve import LAW_PARAMETERS
+from terrain.control.slip_curve import LAW_BOUNDS, LAW_PARAMETERS
 from terrain.descriptions import check_keys, read_yaml
 from terrain.errors import ConfigError
 from terrain.records import SlipTarget
@@ -295,6 +295,11 @@ def _curve(where: str, content: Any) -> CurveEntry:
     check_keys(f"{where}: parameters", parameters, list(LAW_PARAMETERS[law]))
     values: dict[str, Any] = {"law": law, "peak_status": content["peak_status"], "n_runs": n_runs}
     values["parameters"] = {name: _finite(f"{where}: {name}", value) for name, value in parameters.items()}
+    for name, least, most in zip(LAW_PARAMETERS[law], *LAW_BOUNDS[law], strict=True):
+        if not least <= values["parameters"][name] <= most:
+            raise ConfigError(
+                f"{where}: {name} is {values['parameters'][name]:g}; {least:g} to {most:g} are accepted"
+            )
     values["working_slip_ratio"] = None
     for name in names:
         if (name in values and name != "working_slip_ratio") or name not in content:

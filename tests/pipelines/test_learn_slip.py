@@ -102,7 +102,9 @@ def test_json_has_peaks_intervals_and_counts(learned):
     run = next(row for row in result["runs"] if row["run_id"].startswith("snow_sweep"))
     assert run["n_samples"] > 50
     assert {"slip known", "speed fresh", "moving", "torque free"} <= set(run["left_out"])
-    assert len(result["figures"]) == 8
+    assert "tracking_run_id" not in result  # the same runs and seed give the same bytes
+    assert len(result["figures"]) == 9
+    assert result["figures"][-1].endswith("slip.html")
     for file in result["figures"]:
         assert (place / file).stat().st_size > 5000
 
@@ -114,7 +116,9 @@ def test_the_run_is_logged_with_table_pictures_and_digest(learned, monkeypatch):
     monkeypatch.chdir(place)
     result = json.loads((place / "result.json").read_text())
     client = mlflow.MlflowClient(tracking_uri=f"sqlite:///{place / 'mlruns' / 'mlflow.db'}")
-    run = client.get_run(result["tracking_run_id"])
+    (run,) = client.search_runs(
+        [item.experiment_id for item in client.search_experiments()], "tags.kind = 'slip table'"
+    )
     assert run.data.tags["data_digest"] == result["data_digest"]
     assert run.data.params["robot"] == "agrimaro"
     assert run.data.metrics["snow.peak_slip"] == pytest.approx(result["terrains"]["snow"]["peak_slip"])
@@ -229,3 +233,26 @@ def test_intervals_hold_the_true_peaks_of_two_terrains():
     assert low == 0.0
     assert high == pytest.approx(1 - 0.025 ** (1 / 5))
     assert math.isclose(clopper_pearson(5, 5)[0], 0.025 ** (1 / 5))
+
+
+def test_the_page_holds_every_terrain_and_no_name_breaks_it():
+    from matplotlib.figure import Figure
+
+    from pipelines.slip_page import slip_page
+    from terrain.control.slip_table import load_slip_table
+
+    row = {
+        "status": "unestimated",
+        "reason": "one run <only>",
+        "n_runs": 1,
+        "slip_range": None,
+        "peak_slip": None,
+        "peak_slip_ci": None,
+        "peak_status": None,
+        "targets": {state: {"slip_ratio": 0.1, "source": "assumed"} for state in DRIVE_STATES},
+    }
+    found = slip_page({"<mud>": row}, {"<mud>": Figure(figsize=(1, 1))}, load_slip_table(), 1)
+    assert "&lt;mud&gt;" in found
+    assert "<mud>" not in found
+    assert "one run &lt;only&gt;" in found
+    assert found == slip_page({"<mud>": row}, {"<mud>": Figure(figsize=(1, 1))}, load_slip_table(), 1)

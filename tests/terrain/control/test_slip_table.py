@@ -6,7 +6,7 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from terrain.control.slip_curve import LAW_PARAMETERS
+from terrain.control.slip_curve import LAW_BOUNDS, LAW_PARAMETERS
 from terrain.control.slip_table import (
     DRIVE_STATES,
     CurveEntry,
@@ -229,6 +229,8 @@ CURVE = (*SAND, "curve")
         ((*CURVE, "law"), "linear", "curve: law is 'linear'"),
         ((*CURVE, "parameters", "limit_ratio"), ..., "parameters: key 'limit_ratio' is missing"),
         ((*CURVE, "parameters", "shear_ratio"), float("nan"), "shear_ratio is nan"),
+        ((*CURVE, "parameters", "shear_ratio"), 0.0, "shear_ratio is 0; 0.001 to 20 are accepted"),
+        ((*CURVE, "parameters", "limit_ratio"), -1, "limit_ratio is -1; 0.001 to 5 are accepted"),
         ((*CURVE, "peak_status"), "top", "peak_status is 'top'"),
         ((*CURVE, "peak_interval_ratio"), [0.7, 0.5], "peak_interval_ratio is .0.7, 0.5.; two rising"),
         ((*CURVE, "slip_range_ratio"), 0.5, "slip_range_ratio is 0.5; two numbers"),
@@ -303,7 +305,10 @@ def curves(draw):
     energy = ratio(-1e4, 1e4)
     return CurveEntry(
         law,
-        {name: draw(ratio(-1e3, 1e3)) for name in LAW_PARAMETERS[law]},
+        {
+            name: draw(ratio(least, most))
+            for name, least, most in zip(LAW_PARAMETERS[law], *LAW_BOUNDS[law], strict=True)
+        },
         draw(number),
         draw(pair),
         draw(st.sampled_from(["peak", "no_peak"])),
