@@ -476,7 +476,8 @@ def drive_command(
     """Drive controllers side by side in the closed loop, and compare what it costs."""
     import os
 
-    from pipelines.drive import DriveSettings, drive, example_runs, taught_classifier
+    from pipelines.drive import DriveSettings, drive, example_runs
+    from pipelines.drivers import taught_classifier
     from pipelines.screens import print_drive, progress_bar
     from terrain.control.slip_table import load_slip_table
     from terrain.robots import load_robot

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 
 from terrain.errors import ConfigError
-from terrain.records import Array
+from terrain.records import Label
 from terrain.robots import Robot
 from terrain.simulation.conditions import Conditions, Faults, draw_conditions, load_spread
 from terrain.simulation.scenario import RATE_HZ, SCENARIOS, Patch, Scenario, make_scenario
@@ -145,10 +146,15 @@ def start_times(scenario: Scenario) -> list[float]:
     return [float(time_s) for time_s in scenario.time_s[:-1][np.diff(wanted.astype(int)) == 1]]
 
 
+def wanted_until(scenario: Scenario) -> float:
+    """Return the last instant at which the robot is to move; 0 where it never is."""
+    wanted = np.flatnonzero(np.abs(scenario.twist).max(axis=1) > 0)
+    return float(scenario.time_s[wanted[-1]]) if wanted.size else 0.0
+
+
 def brake_time(scenario: Scenario) -> float:
     """Return the instant from which on the robot is told to stand, to the end."""
-    wanted = np.abs(scenario.twist).max(axis=1) > 0
-    return float(scenario.time_s[np.flatnonzero(wanted)[-1] + 1])
+    return float(scenario.time_s[scenario.time_s > wanted_until(scenario)][0])
 
 
 def _patches(names: list[str], scenario: Scenario, rng: np.random.Generator) -> tuple[Patch, ...]:
@@ -161,12 +167,10 @@ def _patches(names: list[str], scenario: Scenario, rng: np.random.Generator) -> 
     return tuple(patches)
 
 
-def changes_of(labels: tuple[Array, ...] | tuple[tuple[float, float, str], ...]) -> list[tuple[float, str]]:
+def changes_of(labels: Sequence[Label]) -> list[tuple[float, str]]:
     """Return when each new ground begins, and which, of a run's labels."""
-    found: list[tuple[float, str]] = []
-    before = ""
-    for start_s, _, terrain in labels:
-        if before and terrain != before:
-            found.append((float(start_s), str(terrain)))
-        before = str(terrain)
-    return found
+    return [
+        (after.start_s, after.terrain)
+        for before, after in pairwise(labels)
+        if after.terrain != before.terrain
+    ]

@@ -181,15 +181,8 @@ def log_training(
         try:
             mlflow.set_experiment(EXPERIMENT)
             with mlflow.start_run(run_name=name) as run:
-                mlflow.log_params(dict(params))
-                mlflow.log_metrics(dict(metrics))
-                mlflow.set_tags(
-                    {"data_digest": info["data_digest"], "commit": info["commit"], "seed": info["seed"]}
-                )
-                for file, document in documents.items():
-                    mlflow.log_dict(document, file)
-                for figure_name, figure in figures.items():
-                    mlflow.log_figure(figure, f"figures/{figure_name}.png")
+                tags = {key: info[key] for key in ("data_digest", "commit", "seed")}
+                _log(mlflow, params, metrics, tags, documents, figures)
                 logged = _log_model(mlflow, name, recipe, windows, info)
             return _promote(
                 mlflow, name, str(logged.registered_model_version), run.info.run_id, info, metrics
@@ -226,18 +219,30 @@ def log_learning(
         try:
             mlflow.set_experiment(EXPERIMENT)
             with mlflow.start_run(run_name=name) as run:
-                mlflow.log_params(dict(params))
-                mlflow.log_metrics(dict(metrics))
-                mlflow.set_tags(dict(tags))
+                _log(mlflow, params, metrics, tags, documents, figures)
                 for file, text in texts.items():
                     mlflow.log_text(text, file)
-                for file, document in documents.items():
-                    mlflow.log_dict(document, file)
-                for figure_name, figure in figures.items():
-                    mlflow.log_figure(figure, f"figures/{figure_name}.png")
             return str(run.info.run_id)
         except _failures(mlflow) as error:
             raise TerrainError(f"MLflow: {' '.join(str(error).split())[:300]}") from error
+
+
+def _log(
+    mlflow: Any,
+    params: Mapping[str, Any],
+    metrics: Mapping[str, float],
+    tags: Mapping[str, Any],
+    documents: Mapping[str, Any],
+    figures: Mapping[str, Figure],
+) -> None:
+    """Log what every run has into the one that is open."""
+    mlflow.log_params(dict(params))
+    mlflow.log_metrics(dict(metrics))
+    mlflow.set_tags(dict(tags))
+    for file, document in documents.items():
+        mlflow.log_dict(document, file)
+    for name, figure in figures.items():
+        mlflow.log_figure(figure, f"figures/{name}.png")
 
 
 def _log_model(

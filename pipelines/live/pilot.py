@@ -118,7 +118,6 @@ class _Memory:
     target_ratio: float = math.nan
     estimate: LiveEstimate | None = None
     tilt_rad: tuple[float, float] = (0.0, 0.0)
-    switches: int = field(default=0)
 
 
 class LivePilot:
@@ -299,7 +298,6 @@ class LivePilot:
                 )
         if now.belief.terrain != believed:
             now.traction = forget_ground(now.traction)
-            now.switches += 1
 
     def _target(self, dt_s: float) -> Ground:
         """Return what is aimed for, on its way from what was aimed for on the ground before."""

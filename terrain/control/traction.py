@@ -187,8 +187,7 @@ def with_driver(settings: TractionSettings, robot: Robot) -> TractionSettings:
     """Return the settings with what a robot's drivers take to change their torque.
 
     A PI loop of speed carries a change of torque by its error until its integral has it: ``T / K_P``, for
-    about
-    ``K_P / K_I``.  Of a deceleration a, each of n wheels takes ``T = a m r / n``.
+    about ``K_P / K_I``.  Of a deceleration a, each of n wheels takes ``T = a m r / n``.
 
     Examples
     --------
@@ -275,7 +274,7 @@ def traction_step(
     for i in range(n):
         wanted = max(wanted, abs(wheel_radps[i]) * radius_m)
         along += wheel_radps[i] * state[_PATTERN + i]
-    before = state[_DRIVEN] if along >= 0.0 else 0.0  # the other way at once is a start from rest
+    was = state[_DRIVEN] if along >= 0.0 else 0.0  # the other way at once is a start from rest
     status = OK
     # what is known of the ground
     q, gain, slip, shared, std = math.inf, 0.0, -math.inf, 0.0, 0.0
@@ -310,16 +309,15 @@ def traction_step(
     if not (0.0 < dt_s <= MAX_STEP_S):
         status = BAD_TIME
     if status == BAD_TIME:
-        driven = min(wanted, before + settings.fade_mps2 * _USUAL_STEP_S)
+        driven = min(wanted, was + settings.fade_mps2 * _USUAL_STEP_S)
         after[_DRIVEN] = driven
         for i in range(n):
             told[i] = after[_PATTERN + i] * driven
         _say(said, driven, ground.traction_ratio, state[_BALANCE], math.nan, STEADY, BAD_TIME)
         return told, after, said
 
-    was, was_wanted = before, state[_WANTED]
     rising = wanted > was + 1e-9
-    falling = was_wanted - wanted > _BRAKE_MPS2 * dt_s
+    falling = state[_WANTED] - wanted > _BRAKE_MPS2 * dt_s
     after[_WANTED] = wanted
     margin = max(settings.balance_margin_ratio, ground.margin_ratio)
     target = ground.traction_ratio

@@ -11,6 +11,7 @@ length: a run in one block and a run tick by tick give the same bytes.
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import numpy as np
@@ -101,7 +102,7 @@ class Motion:
         return time_s, np.maximum(np.round((time_s - latency_s) / STEP_S).astype(int), 0)
 
 
-class Sensor:
+class Sensor(ABC):
     """One sensor of one run, and what it wrote so far.
 
     Parameters
@@ -142,8 +143,9 @@ class Sensor:
         """Carry on what has a memory; return up to which row samples can be written."""
         return self.motion.n_rows
 
+    @abstractmethod
     def _write(self, new: slice, rows: Array) -> None:
-        raise NotImplementedError
+        """Write samples ``new`` of what the motion's ``rows`` tell."""
 
 
 class WheelSensor(Sensor):

@@ -12,11 +12,11 @@ from pipelines.drive import (
     DriveSettings,
     _share_distance,
     drive,
-    drive_once,
     judge,
-    make_driver,
     steepest,
 )
+from pipelines.drive_metrics import course_of
+from pipelines.drivers import CONTROLLERS, drive_once, make_driver
 from terrain.control.slip_table import load_slip_table
 from terrain.errors import ConfigError
 from terrain.robots import load_robot
@@ -69,10 +69,27 @@ def test_ours_starts_gently_whichever_way_it_is_told_to_go():
         turned = where._replace(scenario=replace(where.scenario, twist=twist))
         for name in ("plain", "fixed"):
             driver = make_driver(name, TABLE, 0.05)
-            row = judge(drive_once(ROBOT, driver, turned, 0.05), ROBOT, turned, driver)
+            run = drive_once(ROBOT, driver, turned, 0.05)
+            course = course_of(run, ROBOT, turned.conditions.radius_factors)
+            row = judge(run, course, ROBOT, turned, driver)
             peaks[name, angle] = row["slip_peak"]
         assert peaks["plain", angle] > 1.6 * peaks["fixed", angle], angle
     assert peaks["fixed", 0.5 * math.pi] == pytest.approx(peaks["fixed", 0.0], rel=0.15)
+
+
+def test_a_drive_that_is_held_to_its_way_keeps_its_heading():
+    names = ("fixed", "fixed+track")
+    settings = replace(SHORT, controllers=names, duration_s=15.0, leg_play_rad=0.02)
+    free, held = (
+        drive(ROBOT, TABLE, settings)["controllers"][name]["yaw_drift_rad"]["mean"] for name in names
+    )
+    assert held < 0.2 * free
+
+
+def test_the_command_line_names_the_controllers_that_there_are():
+    from pipelines.cli import DRIVE_CONTROLLERS
+
+    assert DRIVE_CONTROLLERS == CONTROLLERS
 
 
 def test_a_robot_that_slides_back_makes_no_way():

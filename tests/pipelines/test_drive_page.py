@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from pipelines.drawing import NOT_KNOWN, png_bytes
-from pipelines.drive import CONTROLLERS, KEYS
+from pipelines.drive import KEYS
 from pipelines.drive_figures import bars_figure, drawn, ground_strips, run_figures
 from pipelines.drive_page import difference, drive_figures, drive_page, shown_keys, write_drive_page
+from pipelines.drivers import CONTROLLERS
 from terrain.control.slip_table import CurveEntry, SlipTable, load_slip_table
 from terrain.control.traction import BRAKING, STEADY, TRACTION
 from terrain.records import RunLog, Stream

@@ -1,7 +1,5 @@
 import json
 import math
-import os
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -45,13 +43,12 @@ def folder(runs, tmp_path_factory):
 @pytest.fixture(scope="module")
 def learned(folder, tmp_path_factory):
     """The command over two terrains that were driven enough, and one that was not."""
-    place, before = tmp_path_factory.mktemp("learned"), Path.cwd()
-    os.chdir(place)
-    try:
+    place = tmp_path_factory.mktemp("learned")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.delenv("MLFLOW_TRACKING_URI", raising=False)
+        patch.chdir(place)
         words = ["learn-slip", "--data", str(folder), "--robot", "agrimaro", "--out", "table.yaml"]
         done = CliRunner().invoke(app, [*words, "--json", "result.json", "--figures", "figures"])
-    finally:
-        os.chdir(before)
     assert done.exception is None, done.output
     return place, done.output
 

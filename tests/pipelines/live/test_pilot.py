@@ -11,8 +11,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from pipelines.drive import drive_once, make_driver
 from pipelines.drive_metrics import course_of, distance_after, final_speed, slip_peak
+from pipelines.drivers import drive_once, make_driver
 from pipelines.drives import situation, start_times
 from pipelines.live.pilot import CONTROLLERS, LivePilot, PilotSettings
 from pipelines.live.watch import Told
