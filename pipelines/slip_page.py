@@ -24,7 +24,7 @@ def slip_page(
     Parameters
     ----------
     rows : by terrain, as ``terrain learn-slip --json`` has them
-    figures : by name, the sheet of all terrains first
+    figures : by name, in the order in which they are shown
     table : that was learned
     n_runs : behind it
     """
