@@ -13,12 +13,13 @@ import numpy as np
 from terrain.errors import ConfigError, LogError
 from terrain.records import Array, RunLog
 
-LAYOUTS = ("auto", "runs", "borealtc", "csv")
-"""``runs``: run folders as this package writes them; ``csv``: any CSV, by a mapping file."""
+LAYOUTS = ("auto", "runs", "borealtc", "csv", "drive")
+"""``runs``: run folders as this package writes them; ``csv``: any CSV, by a mapping file; ``drive``: the
+file ``samples.csv.gz`` of the Husky log of DRIVE."""
 
 ACCEPTED = (
     "accepted are run folders (run.json), the BorealTC layout (<CLASS>/imu_N.csv and pro_N.csv), "
-    "and any CSV with a mapping file"
+    "the DRIVE layout (samples.csv.gz), and any CSV with a mapping file"
 )
 
 _log = logging.getLogger(__name__)
@@ -37,8 +38,8 @@ def load_runs(
 
     Parameters
     ----------
-    folder : a run folder, a folder of run folders, a folder in the BorealTC layout, or the folder that the
-        files of ``mapping`` are found under
+    folder : a run folder, a folder of run folders, a folder in the BorealTC or the DRIVE layout, or the
+        folder that the files of ``mapping`` are found under
     layout : one of ``LAYOUTS``; ``auto`` looks
     mapping : YAML file that says how to read CSV files (``terrain.logs.mapping``)
     repair : drop and count what a strict read refuses, and skip runs that cannot be read at all
@@ -126,7 +127,7 @@ def _readers(folder: Path, layout: str, mapping: str | Path | None) -> list[Call
     if not folder.is_dir():
         fault = "is no folder" if folder.exists() else "does not exist"
         raise LogError(f"{folder}: {fault}; {ACCEPTED}")
-    if (mapping is not None) and layout in ("runs", "borealtc"):
+    if (mapping is not None) and layout in ("runs", "borealtc", "drive"):
         raise ConfigError(f"a mapping file is for CSV files, not for the layout {layout!r}")
     if mapping is not None or layout == "csv":
         if mapping is None:
@@ -140,9 +141,15 @@ def _readers(folder: Path, layout: str, mapping: str | Path | None) -> list[Call
         readers = read.find_runs(folder)
         if readers or layout == "runs":
             return _some(readers, folder)
-    from terrain.logs import borealtc
+    if layout in ("auto", "borealtc"):
+        from terrain.logs import borealtc
 
-    return _some(borealtc.find_runs(folder), folder)
+        readers = borealtc.find_runs(folder)
+        if readers or layout == "borealtc":
+            return _some(readers, folder)
+    from terrain.logs import drive
+
+    return _some(drive.find_runs(folder), folder)
 
 
 def _some(readers: list[Callable[..., RunLog]], folder: Path) -> list[Callable[..., RunLog]]:

@@ -2,15 +2,19 @@
 
 The fast route is pyarrow's reader.  Where it stumbles, the plain route goes cell by cell: it names the row
 and the cell, or, when repairing, turns the cell into NaN and counts it.  Rows are numbered as an editor
-shows them, the header being row 1.  An empty cell, ``nan`` and ``NA`` are missing values.
+shows them, the header being row 1.  An empty cell, ``nan`` and ``NA`` are missing values.  A file whose
+name ends in ``.gz`` is unpacked as it is read.
 """
 
 from __future__ import annotations
 
 import csv
+import gzip
+import zlib
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import TextIO
 
 import numpy as np
 
@@ -20,6 +24,8 @@ from terrain.records import Array
 
 MISSING = ("", "nan", "NaN", "NAN", "NA")
 """Cells that stand for a missing value."""
+
+_UNREADABLE = (OSError, EOFError, zlib.error, UnicodeDecodeError, csv.Error)
 
 
 def short_name(path: Path) -> str:
@@ -92,11 +98,17 @@ def data_row(path: Path, index: int, *, delimiter: str = ",") -> int:
     raise IndexError(index)
 
 
+def _open(path: Path) -> TextIO:
+    if path.suffix == ".gz":
+        return gzip.open(path, "rt", encoding="utf-8-sig", newline="")
+    return path.open(encoding="utf-8-sig", newline="")
+
+
 def _header(path: Path, delimiter: str) -> list[str]:
     try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
+        with _open(path) as file:
             first = next(csv.reader(file, delimiter=delimiter), [])
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+    except _UNREADABLE as error:
         raise _unreadable(path, error) from error
     names = [name.strip() for name in first]
     if not any(names):
@@ -130,13 +142,13 @@ def _fast_columns(path: Path, header: list[str], columns: Sequence[str], delimit
 
 def _rows(path: Path, delimiter: str) -> Iterator[tuple[int, list[str]]]:
     try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
+        with _open(path) as file:
             reader = csv.reader(file, delimiter=delimiter)
             next(reader, None)
             for cells in reader:
                 if cells:
                     yield reader.line_num, cells
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+    except _UNREADABLE as error:
         raise _unreadable(path, error) from error
 
 
@@ -153,6 +165,8 @@ def _number(cell: str) -> float | None:
 def _unreadable(path: Path, error: Exception) -> LogError:
     if isinstance(error, FileNotFoundError):
         return LogError(f"{short_name(path)}: is missing")
+    if isinstance(error, gzip.BadGzipFile | EOFError | zlib.error):
+        return LogError(f"{short_name(path)}: is no whole gzip file ({error})")
     if isinstance(error, OSError):
         return LogError(f"{short_name(path)}: cannot be opened ({error.strerror})")
     return LogError(f"{short_name(path)}: is no CSV text ({error})")

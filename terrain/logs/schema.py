@@ -83,7 +83,7 @@ GNSS_CHANNELS: tuple[str, ...] = (
 SIGNAL_SETS: tuple[str, ...] = ("imu", "wheels", "currents", "slip", "estimator")
 """Groups of signals that can be switched off by name."""
 
-NO_FEATURES: tuple[str, ...] = ("truth", "commands", "control", "odometry", "state")
+NO_FEATURES: tuple[str, ...] = ("truth", "commands", "control", "odometry", "state", "lidar")
 """Streams that no feature is made of."""
 
 _SET_OF_QUANTITY: dict[str, str] = {
