@@ -63,8 +63,8 @@ def calibrate(
     LogError
         if a run cannot be read.
     ConfigError
-        if the robot's description is not accepted or lacks a section, or ``out`` is there already or is no
-        YAML file.
+        if the robot's description is not accepted, lacks a section or has effects, or ``out`` is there
+        already or is no YAML file.
     DataError
         if the robot is no swerve robot, a run is another robot's, or the runs tell nothing.
     """
@@ -75,6 +75,11 @@ def calibrate(
             f"robot {robot.name}: drive {robot.drive!r} is not calibrated from logs, only 'swerve' is"
         )
     robot.has("body", "motors", "steering", "camera", "sensors")
+    if robot.effects:  # what is calibrated would hold them a second time
+        raise ConfigError(
+            f"robot {robot.name}: {file} is extended by effects; calibrate the description without them, "
+            "then explain again"
+        )
     out = None if out is None else _new_file(Path(out))
     runs = load_runs(data, layout=layout, mapping=mapping, repair=repair)
     for run in runs:

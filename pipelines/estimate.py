@@ -28,6 +28,7 @@ from terrain.estimation.measurements import GNSS_ROWS, MeasurementTable, measure
 from terrain.estimation.reference import true_states
 from terrain.estimation.skid_filter import make_skid_filter, skid_noise
 from terrain.estimation.swerve_filters import default_noise, make_filter, thesis_noise
+from terrain.extension import corrected, corrected_log
 from terrain.kinematics.rim import with_rim_speeds
 from terrain.logs.write import run_folder, write_run
 from terrain.records import GATED, USED, Array, RunLog, SlipTrack, StateTrack, Stream
@@ -63,12 +64,12 @@ class Estimate:
 
     Parameters
     ----------
-    run : the log
-    robot : whose log it is
+    run : the log, as measured
+    robot : whose log it is, as the filter believes it: without the effects of an extended one
     name : of the filter
     model : the filter
     noise : what it took model and sensors to be off by
-    table : its measurements
+    table : its measurements, of the log without the robot's effects
     track : its states
     slip : NaN where the speed over ground is not observed
     blind : the slip that the filter's own speed gives; of a filter without a reference that is no slip
@@ -113,7 +114,7 @@ def estimate_run(
     Parameters
     ----------
     run : log of the robot
-    robot : its description
+    robot : its description; the effects of an extended one are taken off the log before it is filtered
     name : one of :data:`FILTERS`
     tuning : one of :data:`TUNINGS`; the filter's own (:data:`OWN_TUNING`) by default
     noise : what was tuned on chosen runs, or any other noise, in place of the physical
@@ -127,6 +128,7 @@ def estimate_run(
     DataError
         if the log has no wheels.
     """
+    measured, run, robot = run, corrected_log(run, robot), corrected(robot)
     model, usual = model_and_noise(run, robot, name, tuning)
     thesis = _tuning(name, tuning) == "thesis"
     ema_alpha = THESIS_EMA_ALPHA if thesis and name == "vio12" else None
@@ -136,10 +138,13 @@ def estimate_run(
         yaw_rad = gnss_heading(table, robot)
         if math.isnan(yaw_rad):
             n_unused = len(run.streams["gnss"])
-            run = replace(run, streams={kind: run.streams[kind] for kind in run.streams if kind != "gnss"})
+            run, measured = (
+                replace(log, streams={kind: log.streams[kind] for kind in log.streams if kind != "gnss"})
+                for log in (run, measured)
+            )
             found = estimate_run(run, robot, name, tuning=tuning, initial_yaw_rad=0.0)
             dropped = {**found.table.dropped, "gnss: heading not told by the drive": n_unused}
-            return replace(found, table=replace(found.table, dropped=dropped))
+            return replace(found, run=measured, table=replace(found.table, dropped=dropped))
         table = measurement_table(run, robot, ema_alpha=ema_alpha, initial_yaw_rad=yaw_rad)
     noise = _with_gnss_variance(noise or usual, model, table)
     settings = FilterSettings(1.0 if thesis else GATE_PROBABILITY, REOPEN_AFTER_S)
@@ -150,9 +155,8 @@ def estimate_run(
     if name != "skid":
         speed_mps = np.hypot(speed_mps, track.state("speed_y_mps"))
     shown = slip if np.isfinite(slip.slip_ratio).any() else blind
-    lag_s = robot.sensors.encoder_time_constant_s if robot.sensors else 0.0
     return Estimate(
-        run,
+        measured,
         robot,
         name,
         model,
@@ -162,7 +166,7 @@ def estimate_run(
         slip,
         blind,
         slip_figures(shown, speed_mps, track.time_s, _rolling(table, robot)),
-        true_states(run, track, robot, lag_s, yaw_rad),
+        true_states(run, track, robot, robot.encoder_lag_s, yaw_rad),
     )
 
 
@@ -188,7 +192,7 @@ def model_and_noise(
         raise ConfigError(
             f"filter {name!r} is not for robot {robot.name}, whose drive is {robot.drive}: use {fits}"
         )
-    tuning = _tuning(name, tuning)
+    robot, tuning = corrected(robot), _tuning(name, tuning)
     if name == "skid":
         return make_skid_filter(robot), skid_noise(robot)
     if tuning == "thesis":
@@ -334,7 +338,8 @@ def estimate(
 
         teachers = chosen_runs(runs, tune_on)
         taught = load_robot(robot or teachers[0].robot)
-        taught_noise, tuned = tuned_noise(*model_and_noise(teachers[0], taught, name), teachers, taught)
+        told = [corrected_log(teacher, taught) for teacher in teachers]
+        taught_noise, tuned = tuned_noise(*model_and_noise(told[0], taught, name), told, corrected(taught))
     rows = []
     for done, run in enumerate(runs):
         described, noise = load_robot(robot or run.robot), None

@@ -37,6 +37,7 @@ from terrain.control.slip_table import (
 from terrain.control.slip_targets import Targets, energy_jpm, targets_of, tractive_efficiency
 from terrain.control.wheel_pull import Balance, body_balance, pull_samples, wheel_pull
 from terrain.errors import ConfigError, DataError
+from terrain.extension import corrected, corrected_log
 from terrain.records import RunLog, SlipTarget
 from terrain.robots import Robot, load_robot
 from terrain.slip import rim_scatter_mps
@@ -203,6 +204,7 @@ def run_parts(run: RunLog, robot: Robot) -> list[RunPart]:
         raise DataError(
             f"run {run.run_id} is of robot {run.robot!r}: a table is learned for one, {robot.name!r}"
         )
+    run, robot = corrected_log(run, robot), corrected(robot)
     found = estimate_run(run, robot, FILTER)
     pull = wheel_pull(run, robot, found.track, found.table, found.slip)
     parts = []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zlib
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +14,18 @@ from pipelines.slip_drives import learning_run
 from terrain.atomic import ensure_writable
 from terrain.errors import ConfigError, LogError
 from terrain.logs.write import run_folder, write_run
-from terrain.records import RunLog
+from terrain.records import Array, RunLog, Stream
 from terrain.robots import Robot, load_robot
 from terrain.simulation.bench import POSITIONS, TURN_S, six_positions_log
 from terrain.simulation.conditions import Conditions, Faults, draw_conditions, load_spread
+from terrain.simulation.effects import read_effect
+from terrain.simulation.planar_ground import planar_ground
+from terrain.simulation.planar_noise import load_noise, load_scatter
+from terrain.simulation.planar_run import Hills, simulate_planar
 from terrain.simulation.scenario import make_scenario
 from terrain.simulation.sensors import Gnss
 from terrain.simulation.simulate import simulate
-from terrain.terramechanics.soil import load_soil, scattered, soil_names
+from terrain.terramechanics.soil import Soil, load_soil, scattered, soil_names
 
 COURSE = "course"
 """Word for a way over all terrains instead of the name of one."""
@@ -50,15 +55,16 @@ def simulate_run(
     conditions: Conditions | None = None,
     faults: Faults | None = None,
     gnss: Gnss | None = None,
+    effects: Mapping[str, float] | None = None,
 ) -> RunLog:
     """Return one simulated run.
 
     What is drawn depends on ``seed``, ``terrain``, ``scenario`` and ``number`` alone: a run is the same
-    whatever is simulated beside it.
+    whatever is simulated beside it.  A skid-steer robot goes to the planar simulation.
 
     Parameters
     ----------
-    robot : robot with all sections
+    robot : swerve robot with all sections, or skid-steer robot with all but steering
     terrain : name of a soil or path of its YAML file, or ``course`` for all soils in one run
     scenario : name of a scenario; ``course`` goes with the terrain ``course``, ``six_positions`` (the IMU
         alone, for calibration) with ``bench``; ``slip`` takes the wheels through their slips on varied days
@@ -68,12 +74,15 @@ def simulate_run(
     conditions : nominal conditions
     faults : what the sensors suffer on purpose
     gnss : receiver on board, if any
+    effects : parameters of :mod:`terrain.simulation.effects` that act
 
     Raises
     ------
     ConfigError
-        if the terrain or scenario is unknown or they do not go together.
+        if the terrain or scenario is unknown or they do not go together, or the robot cannot do it.
     """
+    if effects and scenario in (BENCH, SLIP):
+        raise ConfigError(f"scenario {scenario!r} is simulated without effects: leave them out")
     if scenario == BENCH:
         return _bench(robot, terrain, seed, number, duration_s)
     if scenario == SLIP:
@@ -90,7 +99,23 @@ def simulate_run(
         soils = {name: scattered(soil, rng) for name, soil in soils.items()}
         conditions = draw_conditions(load_spread(), rng, conditions)
     drive_seed = int(driven.generate_state(1)[0])
+    if robot.drive != "swerve" and terrain == COURSE:
+        raise ConfigError(f"robot {robot.name}: scenario {COURSE!r} is for swerve robots")
     drive = make_scenario(scenario, robot, names, duration_s, seed=drive_seed)
+    if robot.drive != "swerve":
+        if gnss is not None:
+            raise ConfigError(f"robot {robot.name}: its simulation has no receiver, leave gnss out")
+        log = _planar_run(
+            robot,
+            soils[terrain],
+            drive.twist,
+            simulated,
+            run_id_of(terrain, scenario, number),
+            conditions or Conditions(),
+            vary,
+            effects or {},
+        )
+        return log if faults is None else _without_camera(log, faults)
     return simulate(
         robot,
         drive,
@@ -100,7 +125,52 @@ def simulate_run(
         conditions=conditions,
         faults=Faults() if faults is None else faults,
         gnss=gnss,
+        effects=effects,
     )
+
+
+def _planar_run(
+    robot: Robot,
+    soil: Soil,
+    twist: Array,
+    seed: np.random.SeedSequence,
+    run_id: str,
+    conditions: Conditions,
+    vary: bool,
+    effects: Mapping[str, float],
+) -> RunLog:
+    """Return a run of the planar simulation; what its sensors scatter, they do on a nominal day too."""
+    scatter = load_scatter()
+    if not vary:
+        tyres_and_ground = ("wheel_radius", "one_sided_radius", "rolling_resistance", "force_slip")
+        fixed = [f"{name}_ratio" for name in (*tyres_and_ground, "effective_track")]
+        scatter = scatter._replace(**dict.fromkeys(fixed, 0.0))
+    load = conditions.payload_kg / robot.mass_kg
+    return simulate_planar(
+        robot,
+        twist,
+        seed,
+        ground=planar_ground(robot, soil),
+        effects={**effects, "payload_ratio": effects.get("payload_ratio", 0.0) + load},
+        scatter=scatter,
+        hills=Hills(conditions.grade_ratio, conditions.swell_ratio, conditions.swell_length_m),
+        noise=load_noise(),
+        run_id=run_id,
+        terrain=soil.name,
+    )
+
+
+def _without_camera(run: RunLog, faults: Faults) -> RunLog:
+    """Return the run without the camera's samples of the times in which it is lost."""
+    seen = run.streams["odometry"]
+    kept = np.ones(len(seen), dtype=bool)
+    for start_s, end_s in faults.camera_lost_s:
+        kept &= (seen.time_s < start_s) | (seen.time_s >= end_s)
+    left = Stream(seen.time_s[kept], seen.values[kept], seen.channels)
+    streams = {name: left if name == "odometry" else stream for name, stream in run.streams.items()}
+    if len(left) < 2:
+        del streams["odometry"]
+    return RunLog(run.run_id, run.robot, streams, run.labels, run.source)
 
 
 def _through_slips(
@@ -150,6 +220,7 @@ def simulate_runs(
     conditions: Conditions | None = None,
     faults: Faults | None = None,
     gnss: bool = False,
+    effects: Sequence[str] = (),
     progress: Progress = silent,
 ) -> dict[str, Any]:
     """Simulate runs and write them as run folders.
@@ -161,12 +232,13 @@ def simulate_runs(
     scenario : name of a scenario
     out : folder of the new run folders
     runs : runs a terrain
+    effects : what acts, each ``NAME=VALUE`` as :func:`terrain.simulation.effects.read_effect` takes it
     others : as :func:`simulate_run`
 
     Returns
     -------
     dict that JSON can hold
-        ``out, robot, scenario, seed, n_runs, run_ids, duration_s``
+        ``out, robot, scenario, seed, effects, n_runs, run_ids, duration_s``
 
     Raises
     ------
@@ -176,6 +248,7 @@ def simulate_runs(
         if a run of that name is there already; nothing is written then.
     """
     robot = load_robot(robot_name)
+    acting = _effects(effects, robot.drive)
     ensure_writable(out)
     terrains = soil_names() if terrain == EVERY else (terrain,)
     jobs = [(name, number) for name in terrains for number in range(1, runs + 1)]
@@ -197,6 +270,7 @@ def simulate_runs(
             conditions=conditions,
             faults=faults,
             gnss=Gnss() if gnss else None,
+            effects=acting,
         )
         write_run(run, out)
         run_ids.append(run.run_id)
@@ -207,10 +281,22 @@ def simulate_runs(
         "robot": robot.name,
         "scenario": scenario,
         "seed": seed,
+        "effects": acting,
         "n_runs": len(run_ids),
         "run_ids": run_ids,
         "duration_s": total_s,
     }
+
+
+def _effects(given: Sequence[str], drive: str) -> dict[str, float]:
+    """Return the parameters that all ``NAME=VALUE`` set together."""
+    acting: dict[str, float] = {}
+    for text in given:
+        for name, value in read_effect(text, drive).items():
+            if name in acting:
+                raise ConfigError(f"effect {text.partition('=')[0]!r} is given twice")
+            acting[name] = value
+    return acting
 
 
 def run_id_of(terrain: str, scenario: str, number: int) -> str:

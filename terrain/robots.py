@@ -10,20 +10,23 @@ better, and, where it was calibrated, the interval that holds it with 95 %::
       gyro_bias_z_radps: {value: 0.0021, unit: radps, source: "terrain calibrate", interval: [0.0019, 0.0023]}
 
 Geometry and mass are asked of every robot; the sections ``body``, ``motors``, ``steering``, ``camera`` and
-``sensors`` only by what simulates a robot or filters its log.
+``sensors`` only by what simulates a robot or filters its log.  The section ``effects`` of an extended robot
+(:mod:`terrain.described_effects`) says what else acts; :mod:`terrain.extension` makes use of it.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, is_dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from types import UnionType
+from types import MappingProxyType, UnionType
 from typing import Annotated, Any, NamedTuple, get_args, get_type_hints
 
 import numpy as np
 
+from terrain.described_effects import read_effects
 from terrain.descriptions import check_keys, number, read_yaml
 from terrain.errors import ConfigError
 from terrain.records import Array, read_only
@@ -169,6 +172,8 @@ class Robot:
     wheelbase_m : distance between front and rear wheel
     mass_kg : total mass without payload
     body, motors, steering, camera, sensors : None where the description has none
+    effects : parameters of :mod:`terrain.simulation.effects` that are not 0, by name
+    effects_cov : (n, n) covariance of the effects in their order; NaN where nobody knows it
     """
 
     name: str
@@ -182,6 +187,27 @@ class Robot:
     steering: Steering | None = None
     camera: Camera | None = None
     sensors: Sensors | None = None
+    effects: Mapping[str, float] = field(default_factory=dict, hash=False)
+    effects_cov: Array = field(default_factory=lambda: np.empty((0, 0)), compare=False)
+
+    def __post_init__(self) -> None:
+        n = len(self.effects)
+        cov = self.effects_cov if np.isfinite(self.effects_cov).any() else np.full((n, n), np.nan)
+        if cov.shape != (n, n):
+            raise ValueError(f"effects_cov has shape {cov.shape}, {(n, n)} is needed")
+        object.__setattr__(self, "effects", MappingProxyType(dict(self.effects)))
+        object.__setattr__(self, "effects_cov", read_only(cov))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Travel to another process, which a read-only view of a mapping does not by itself."""
+        values = (getattr(self, item.name) for item in fields(self))
+        return type(self), tuple(dict(v) if isinstance(v, MappingProxyType) else v for v in values)
+
+    @property
+    def encoder_lag_s(self) -> float:
+        """Time constant of the low-pass that wheel rates come behind; 0 where nobody knows of any."""
+        told = self.sensors.encoder_time_constant_s if self.sensors else 0.0
+        return told + self.effects.get("encoder_lag_s", 0.0)
 
     @property
     def wheels(self) -> tuple[str, ...]:
@@ -214,7 +240,7 @@ class Robot:
 
         Examples
         --------
-        >>> load_robot("husky").has("motors")
+        >>> replace(load_robot("husky"), motors=None).has("motors")
         Traceback (most recent call last):
         terrain.errors.ConfigError: robot husky: its description has no section 'motors', which is needed here
         """
@@ -284,13 +310,25 @@ def read_description(name_or_path: str | Path) -> tuple[str, Any]:
     ConfigError
         if there is no such robot, or the file is no YAML.
     """
+    path = description_file(name_or_path)
+    return path.name, read_yaml(path)
+
+
+def description_file(name_or_path: str | Path) -> Path:
+    """Return the file of a robot's description: the path itself, or that of a robot of the package.
+
+    Raises
+    ------
+    ConfigError
+        if there is no robot of that name.
+    """
     path = Path(name_or_path)
     if path.suffix not in (".yaml", ".yml"):
         path = data_folder("robots") / f"{name_or_path}.yaml"
         if path.parent != data_folder("robots") or not path.is_file():
             known = ", ".join(sorted(file.stem for file in data_folder("robots").glob("*.yaml")))
             raise ConfigError(f"robot {str(name_or_path)!r} is unknown: give one of {known}, or a .yaml file")
-    return path.name, read_yaml(path)
+    return path
 
 
 def robot_from(file: str, described: Any) -> Robot:
@@ -307,8 +345,9 @@ def robot_from(file: str, described: Any) -> Robot:
         for name, hint in hints.items()
         if isinstance(hint, UnionType)
     }
-    required = [item.name for item in fields(Robot) if item.name not in sections]
-    check_keys(file, described, required, optional=tuple(sections))
+    extension = ("effects", "effects_cov")
+    required = [item.name for item in fields(Robot) if item.name not in (*sections, *extension)]
+    check_keys(file, described, required, optional=(*sections, "effects"))
     if not isinstance(described["name"], str) or not described["name"]:
         raise ConfigError(f"{file}: name is {described['name']!r}, a word is wanted")
     if described["drive"] not in WHEELS_OF_DRIVE:
@@ -324,6 +363,9 @@ def robot_from(file: str, described: Any) -> Robot:
         for name, kind in sections.items()
         if described.get(name) is not None
     }
+    if "effects" in described:
+        read = read_effects(f"{file}: effects", described["effects"], described["drive"])
+        parts |= dict(zip(extension, read, strict=True))
     robot = Robot(described["name"], described["drive"], **numbers, **parts)
     _check_geometry(file, robot)
     return robot

@@ -50,6 +50,7 @@ from terrain.estimation.live_rows import (
 from terrain.estimation.measurements import CAMERA_ROWS, GNSS_LATENCY_S, GNSS_ROWS, WILD_FACTOR
 from terrain.estimation.resampling import GAP_PERIODS, MAX_AGE_PERIODS
 from terrain.estimation.swerve_filters import default_noise, make_filter
+from terrain.extension import Correction, corrected
 from terrain.logs.schema import WHEELS_CHANNELS
 from terrain.records import Array, Reading
 from terrain.robots import Robot
@@ -104,7 +105,8 @@ class LiveEstimator:
 
     Parameters
     ----------
-    robot : a swerve robot with motors, steering and sensors, and a camera for vio12 and vio15
+    robot : a swerve robot with motors, steering and sensors, and a camera for vio12 and vio15; effects of an
+        extended one are taken off what arrives
     filter_name : one of :data:`~terrain.estimation.swerve_filters.FILTERS`
     channels : names of the columns of each stream's readings, in their order; by default those of the schema.
         A stream that is not named is not read
@@ -148,6 +150,9 @@ class LiveEstimator:
         if gnss_latency_s < 0:
             raise ConfigError(f"gnss_latency_s is {gnss_latency_s:g}, a time from zero up is wanted")
         has_gnss = initial_yaw_rad is not None and "gnss" in channels
+        self._measured, self._channels = robot, channels
+        self._correction: Correction | None = None
+        robot = corrected(robot)
         self._model = make_filter(filter_name, robot, with_gnss=has_gnss)
         robot.has("motors", "steering", "sensors")
         noise = default_noise(filter_name, robot, has_gnss) if noise is None else noise
@@ -295,11 +300,19 @@ class LiveEstimator:
             self._unreadable[name] = self._unreadable.get(name, 0) + 1
             return None
         if time_s.ndim == 1 and values.shape == (time_s.size, self._n_columns[name]):
-            return time_s, values
+            return self._corrected(name, time_s, values) if self._measured.effects else (time_s, values)
         self._unreadable[name] = self._unreadable.get(name, 0) + max(time_s.size, 1)
         if name == "wheels" and time_s.ndim == 1:
             return time_s, np.full((time_s.size, self._n_columns[name]), np.nan)
         return None
+
+    def _corrected(self, name: str, time_s: Array, values: Array) -> tuple[Array, Array]:
+        """Return samples without the robot's effects; drifts count from the first stamp that ever comes."""
+        if self._correction is None and np.isfinite(time_s).any():
+            self._correction = Correction(self._measured, float(time_s[np.isfinite(time_s)][0]))
+        if self._correction is None:
+            return time_s, values
+        return self._correction(name, self._channels[name], time_s, values)
 
     def _tick(self, time_s: float, wheels: Array) -> LiveEstimate | None:
         follows = self._filter.follows(time_s)

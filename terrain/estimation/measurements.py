@@ -181,7 +181,7 @@ def measurement_table(
     if robot.drive == "swerve":
         robot.has("motors", "steering", "sensors", *(["camera"] if "odometry" in run.streams else []))
     sensors, camera = robot.sensors, robot.camera
-    encoder_s = sensors.encoder_time_constant_s if sensors else 0.0
+    encoder_s = robot.encoder_lag_s
     smooth_s = 0.0 if ema_alpha is not None else time_constant_s
     lag_s = encoder_s if smooth_s is None else smooth_s
     rows = ROWS_OF_DRIVE[robot.drive]
@@ -193,8 +193,9 @@ def measurement_table(
     if wheels is None:
         raise DataError(f"run {run.run_id}: the stream 'wheels', which gives the clock, is empty")
     clock = wheels.time_s
-    rates = wheels.values / (robot.motors.reduction_ratio if robot.motors else 1.0)
-    if robot.motors is not None:
+    rates = wheels.values
+    if robot.drive == "swerve" and robot.motors is not None:  # the others' rows are rim speeds
+        rates = wheels.values / robot.motors.reduction_ratio
         wild = np.abs(rates) > WILD_FACTOR * robot.motors.speed_max_radps
         dropped["wheels: beyond the motors"] += int(wild.any(axis=1).sum())
         rates = np.where(wild, np.nan, rates)

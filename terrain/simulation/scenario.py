@@ -120,6 +120,7 @@ class _Order(NamedTuple):
     limit: Callable[[Any], Array]
     rng: np.random.Generator
     accel_mps2: float
+    steered: bool
 
 
 _STAND = read_only(np.zeros(3))
@@ -152,10 +153,13 @@ def make_scenario(
     course        over patches of 6 to 12 m of every terrain in turn, in drawn order, at changing speed
     ============= ===================================================================================
 
+    A robot without steered wheels has no ``crab`` and no ``course``, and in ``complex`` turns on the spot
+    instead of driving sideways.
+
     Parameters
     ----------
     name : one of :data:`SCENARIOS`
-    robot : a swerve robot with motors; no twist saturates its wheels
+    robot : with motors; no twist saturates its wheels
     terrains : of the ground, one unless the scenario is ``course``; the names are not looked up
     duration_s : what the scenario is made for by default; taken to a whole number of samples
     speed_mps : cruising speed; ``survey`` and ``course`` draw from 0.4 to 1.2 times it, backward and sideways
@@ -167,8 +171,8 @@ def make_scenario(
     ------
     ConfigError
         for an unknown name, terrains that do not fit it, a duration too short for it, a speed beyond the
-        robot, an acceleration that is none or that the scenario does not take, or a robot without steered
-        wheels.
+        robot, an acceleration that is none or that the scenario does not take, or a scenario that the robot
+        cannot drive.
 
     Examples
     --------
@@ -186,7 +190,10 @@ def make_scenario(
         raise ConfigError(
             f"scenario {name!r} is driven on one terrain, {len(grounds)} are given: use 'course'"
         )
-    order = _Order(*_ability(robot, speed_mps), _generator(seed), _accel(name, accel_mps2))
+    steered = robot.drive == "swerve"
+    if not steered and name in _STEERED:
+        raise ConfigError(f"scenario {name!r} is not for robot {robot.name} with the drive {robot.drive!r}")
+    order = _Order(*_ability(robot, speed_mps), _generator(seed), _accel(name, accel_mps2), steered)
     wanted_s = _duration(duration_s)
     if name == "course":
         time_s, twist, patches = _course(order, wanted_s, grounds)
@@ -293,6 +300,13 @@ _COMPLEX: tuple[tuple[float, float, float, float], ...] = (
 )
 
 
+_ON_THE_SPOT: tuple[tuple[float, float, float, float], ...] = (
+    # as above
+    (0.0, 0.0, 2.0, 4.0),
+    (0.0, 0.0, 0.0, 1.0),
+    (0.0, 0.0, -2.0, 4.0),
+)
+
 _CRAB: tuple[tuple[float, float, float, float], ...] = (
     # as above; the steering stands through each reversal and turns at the start after each rest
     (-0.6, 0.0, 0.0, 3.0),
@@ -310,7 +324,10 @@ _CRAB: tuple[tuple[float, float, float, float], ...] = (
 
 
 def _complex(order: _Order, length_s: float) -> list[_Leg]:
-    return _tour("complex", _COMPLEX, order, length_s)
+    if order.steered:
+        return _tour("complex", _COMPLEX, order, length_s)
+    ahead = tuple(leg for leg in _COMPLEX if not leg[1])
+    return _tour("complex", (*ahead[:8], *_ON_THE_SPOT), order, length_s)
 
 
 def _crab(order: _Order, length_s: float) -> list[_Leg]:
@@ -435,6 +452,9 @@ _DRIVES: dict[str, tuple[float | Callable[[_Order], float], Callable[[_Order, fl
 _RAMPED = ("straight", "climb", "starts")
 """Those whose acceleration can be chosen."""
 
+_STEERED = ("crab", "course")
+"""Those that only steered wheels drive, or only the simulation of a robot that has them."""
+
 SCENARIOS: tuple[str, ...] = (*_DRIVES, "course")
 """Names that :func:`make_scenario` knows."""
 
@@ -511,12 +531,10 @@ def _duration(duration_s: float | None) -> float | None:
 
 def _ability(robot: Robot, speed_mps: float) -> tuple[float, Callable[[Any], Array]]:
     """Return the speed, checked, and what shortens a twist to what the robot can."""
-    if robot.drive != "swerve":
-        raise ConfigError(
-            f"robot {robot.name} has the drive {robot.drive!r}: scenarios are for 'swerve' alone"
-        )
+    robot.has("motors")
+    assert robot.motors is not None
     positions_m, radius_m = robot.wheel_positions_m, robot.wheel_radius_m
-    speed_max_radps = robot.equipment.motors.speed_max_radps
+    speed_max_radps = robot.motors.speed_max_radps
     if not _is_number(speed_mps) or not 0 < speed_mps <= radius_m * speed_max_radps:
         raise ConfigError(
             f"speed_mps is {speed_mps!r}: robot {robot.name} drives above 0 and up to "

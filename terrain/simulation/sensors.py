@@ -19,12 +19,12 @@ from numba import njit
 
 from terrain.angles import wrapped
 from terrain.constants import GRAVITY_MPS2
-from terrain.estimation.camera import CHANNELS, to_camera
+from terrain.estimation.camera import CHANNELS, to_camera, turned
 from terrain.logs.schema import GNSS_CHANNELS, IMU_CHANNELS, STEERING_CHANNELS, WHEELS_CHANNELS
 from terrain.records import Array, Reading, Stream
 from terrain.robots import Robot, Sensors
 from terrain.simulation.conditions import Faults
-from terrain.simulation.vehicle import BODY_RECORD, N_BODY_RECORD, STEP_S, WHEEL_RECORD
+from terrain.simulation.vehicle import BODY_RECORD, N_BODY_RECORD, N_RECORD, STEP_S, WHEEL_RECORD
 
 IMU_BANDWIDTH_HZ = {"accel": 62.5, "gyro": 47.0}
 """Bandwidths of the BNO055 in its fusion modes (Bosch data sheet)."""
@@ -121,6 +121,11 @@ class Sensor(ABC):
             array.flags.writeable = False
         self._n_written = self._n_given = 0
 
+    def stamp(self, offset_s: float, rate_ratio: float) -> None:
+        """Stamp by a clock of its own, ``t' = (1 + r) t + T``; samples arrive when they did."""
+        self._shown = ((1.0 + rate_ratio) * self.time_s + offset_s, self._shown[1])
+        self._shown[0].flags.writeable = False
+
     def hear(self) -> None:
         """Write the samples that the motion's rows allow by now."""
         told = self._follow()
@@ -137,7 +142,7 @@ class Sensor(ABC):
 
     def stream(self) -> Stream:
         """Return all that it wrote, once the motion is complete."""
-        return Stream(self.time_s, self.values, self.channels)
+        return Stream(*self._shown, self.channels)
 
     def _follow(self) -> int:
         """Carry on what has a memory; return up to which row samples can be written."""
@@ -149,7 +154,10 @@ class Sensor(ABC):
 
 
 class WheelSensor(Sensor):
-    """Motor rates behind the driver's low-pass on quantised Hall steps, and motor currents."""
+    """Motor rates behind the driver's low-pass on quantised Hall steps, and motor currents.
+
+    Of the robot's effects it knows motor_drift.
+    """
 
     def __init__(self, motion: Motion, robot: Robot, rng: np.random.Generator) -> None:
         motors, sensors = robot.equipment.motors, robot.equipment.sensors
@@ -159,19 +167,22 @@ class WheelSensor(Sensor):
         self._per_amp_nm = motors.torque_constant_nmpa * motors.reduction_ratio * motors.efficiency_ratio
         self._motor_noise = sensors.motor_std_radps * rng.standard_normal((n, 3))
         self._current_noise = sensors.current_std_a * rng.standard_normal((n, 3))
+        self._warm = 1.0 + robot.effects.get("motor_drift_ratio", 0.0) * self.time_s[:, None] / 60.0
         self._reported, self._torque = motion.wheel("reported_radps"), motion.wheel("torque_nm")
 
     def _write(self, new: slice, rows: Array) -> None:
         motor = self._reported[rows] * self._reduction
         moving = np.abs(motor) > 1e-3  # a Hall sensor that sees no step says nothing but zero
         self.values[new, :3] = motor + self._motor_noise[new] * moving
-        self.values[new, 3:] = self._torque[rows] / self._per_amp_nm + self._current_noise[new]
+        current = self._torque[rows] / self._per_amp_nm * self._warm[new]
+        self.values[new, 3:] = current + self._current_noise[new]
 
 
 class SteeringSensor(Sensor):
     """Absolute encoders: whole steps a turn (Gray code errs by one at most), the zero not taken off.
 
-    The third one sits below the hinge of its leg, and does not see it swing.
+    The third one sits below the hinge of its leg, and does not see it swing; none sees what the linkage to
+    its wheel does (:func:`terrain.simulation.vehicle.record_width`).
     """
 
     def __init__(self, motion: Motion, robot: Robot, rng: np.random.Generator) -> None:
@@ -183,8 +194,11 @@ class SteeringSensor(Sensor):
         self._steer, self._leg = motion.wheel("steer_rad"), motion.body("leg_rad")
 
     def _write(self, new: slice, rows: Array) -> None:
-        steer = self._steer[rows]
-        steer[:, 2] -= self._leg[rows]
+        if self.motion.record.shape[1] > N_RECORD:
+            steer = self.motion.record[rows, N_RECORD:]
+        else:
+            steer = self._steer[rows]
+            steer[:, 2] -= self._leg[rows]
         angle = steer + self._zeros + self._noise[new]
         angle = np.floor(angle / self._step_rad) * self._step_rad + self._step_rad / 2
         self.values[new] = wrapped(angle)
@@ -196,7 +210,7 @@ class ImuSensor(Sensor):
     The specific force is acceleration minus gravity: +g on z at rest, ``+g sin`` on x with the nose up.
     Rates are those of the body: turning on an even slope rolls nothing.  They come of central differences of
     the attitude, so the latency is one step at least; in the first row, which has none before it, nothing
-    rolls or pitches.
+    rolls or pitches.  Of the robot's effects it knows gyro_scale, which the fused yaw has too.
     """
 
     def __init__(self, motion: Motion, robot: Robot, rng: np.random.Generator) -> None:
@@ -204,7 +218,7 @@ class ImuSensor(Sensor):
         stamps = motion.at(sensors.imu_rate_hz, max(sensors.imu_latency_s, STEP_S))
         super().__init__(motion, IMU_CHANNELS, *stamps)
         self._com_height_m = body.com_height_m
-        self._errors = ImuErrors(sensors, len(self.rows), rng)
+        self._errors = ImuErrors(sensors, len(self.rows), rng, robot.effects.get("gyro_scale_ratio", 0.0))
         self._up = np.empty((len(motion.record), 3))
         cutoffs_hz = [IMU_BANDWIDTH_HZ[name] for name in ("accel", "accel", "accel", "gyro", "gyro", "gyro")]
         self._low_pass = LowPass([1 / (2 * math.pi * cutoff_hz) for cutoff_hz in cutoffs_hz])
@@ -242,9 +256,13 @@ class ImuErrors:
     """What an IMU of these sensors adds to ``n`` samples.
 
     Each power-on has biases of its own about those described; the gyro's walk, and the fused yaw sums them.
+    ``gyro_scale_ratio`` is by how much the yaw gyro reads too much.
     """
 
-    def __init__(self, sensors: Sensors, n: int, rng: np.random.Generator) -> None:
+    def __init__(
+        self, sensors: Sensors, n: int, rng: np.random.Generator, gyro_scale_ratio: float = 0.0
+    ) -> None:
+        self.gyro_scale = 1.0 + gyro_scale_ratio
         self.scale, accel_bias, gyro_bias = (
             np.array([getattr(sensors, pattern.format(axis)) for axis in "xyz"])
             for pattern in ("accel_scale_{}_ratio", "accel_bias_{}_mps2", "gyro_bias_{}_radps")
@@ -274,10 +292,12 @@ class ImuErrors:
         yaw_rad : (k,) counted from the start
         """
         told = np.empty((len(yaw_rad), 9))
-        told[:, :3] = rate_radps + self.bias_radps[which] + self.gyro_noise[which]
+        told[:, :3] = (
+            rate_radps * [1.0, 1.0, self.gyro_scale] + self.bias_radps[which] + self.gyro_noise[which]
+        )
         told[:, 3:6] = self.scale * force_mps2 + self.accel_bias_mps2 + self.accel_noise[which]
         told[:, 6:8] = tilt_rad + self.mounting_rad + self.tilt_noise[which]
-        told[:, 8] = wrapped(yaw_rad + self.drift_rad[which] + self.yaw_noise[which])
+        told[:, 8] = wrapped(self.gyro_scale * yaw_rad + self.drift_rad[which] + self.yaw_noise[which])
         return told
 
 
@@ -285,6 +305,7 @@ class CameraSensor(Sensor):
     """Tracking camera in its own frames: drifting pose, noisy speed, dropouts and relocalisation jumps.
 
     What it tells without noise is :func:`terrain.estimation.camera.odometry_stream`; lost samples are none.
+    Of the robot's effects it knows camera_yaw.
     """
 
     def __init__(self, motion: Motion, robot: Robot, rng: np.random.Generator, faults: Faults) -> None:
@@ -315,6 +336,7 @@ class CameraSensor(Sensor):
             [drift, position_noise, moved, yaw_noise, speed_noise, rate_noise],
         )[~lost]
         self._lever_m = np.array([camera.lever_x_m, camera.lever_y_m, camera.lever_z_m])
+        self._mounting_rad = robot.effects.get("camera_yaw_rad", 0.0)
         self._yaw_noise_0 = yaw_noise[0] if n else 0.0
         self._low_pass = LowPass([camera.time_constant_s] * 6)
         self._first, self._seen = 0, np.empty((0, 6))
@@ -339,6 +361,8 @@ class CameraSensor(Sensor):
             record[0, _YAW] + self._yaw_noise_0,
             self.values[new],
         )
+        if self._mounting_rad:
+            turned(self.values[new], self.channels, self._mounting_rad)
 
 
 class GnssSensor(Sensor):

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 from scipy.signal import lfilter
 
+from terrain.described_effects import checked_effects
 from terrain.errors import ConfigError
+from terrain.extension import OTHER_LOGGER, moved
 from terrain.kinematics.swerve import wheel_commands
 from terrain.records import Array, Command, Label, RunLog, Sample, Stream
 from terrain.robots import Robot
@@ -30,11 +33,11 @@ from terrain.simulation.sensors import (
 from terrain.simulation.vehicle import (
     BODY_RECORD,
     FIELD_STEP_M,
-    N_RECORD,
     STEP_S,
     Plant,
     advance,
     make_plant,
+    record_width,
     settle,
     start_state,
 )
@@ -78,6 +81,7 @@ def simulate(
     gnss: Gnss | None = None,
     controller: Callable[[Sample], Command] | None = None,
     command_delay_s: float = 0.0,
+    effects: Mapping[str, float] | None = None,
 ) -> RunLog:
     """Drive a scenario and return what the loggers wrote, with the truth beside it.
 
@@ -99,6 +103,8 @@ def simulate(
         the steering to stay at 0
     command_delay_s : from that instant to when the wheels are told, in whole steps; the step that starts at
         the instant always runs with the command before
+    effects : parameters of :mod:`terrain.simulation.effects` that act on this robot and its sensors, beside
+        those of its own description or in place of them; the commands know of none, and no log says so
 
     Returns
     -------
@@ -113,8 +119,8 @@ def simulate(
     ConfigError
         if the robot is no swerve robot, lacks a section, is tipped over by its load or has a number so far
         out of scale that its motion cannot be integrated, a sensor is faster than the simulation's steps, a
-        terrain of the scenario has no soil, its twists do not come every so many whole steps, or the delay is
-        not from 0 to 0.5 s.
+        terrain of the scenario has no soil, its twists do not come every so many whole steps, the delay is
+        not from 0 to 0.5 s, or an effect cannot befall the robot or is out of its bounds.
     DataError
         if a command is not one finite number a wheel, or its status not numbers by names that end in a unit,
         the same names throughout.
@@ -146,21 +152,26 @@ def simulate(
         np.random.default_rng(np.random.SeedSequence(sequence.entropy, spawn_key=(*sequence.spawn_key, i)))
         for i in range(8)
     )
-    plant = _plant(robot, scenario, soils, conditions, ground)
+    built = _built(robot, effects or {})
+    plant = _plant(built, scenario, soils, conditions, ground)
     n_steps = len(scenario.time_s) * substeps
     state = start_state(plant, plant.play_rad * start.uniform(-1.0, 1.0, 3))
     settle(plant, state)
     noise = road.standard_normal((n_steps, 3))
-    motion = Motion(np.empty((n_steps, N_RECORD)), 0)
-    imu_sensor = ImuSensor(motion, robot, imu)
+    motion = Motion(np.empty((n_steps, record_width(plant))), 0)
+    imu_sensor = ImuSensor(motion, built, imu)
     sensors: dict[str, Sensor] = {
-        "wheels": WheelSensor(motion, robot, wheels),
-        "steering": SteeringSensor(motion, robot, steering),
+        "wheels": WheelSensor(motion, built, wheels),
+        "steering": SteeringSensor(motion, built, steering),
         "imu": imu_sensor,
-        "odometry": CameraSensor(motion, robot, camera, faults),
+        "odometry": CameraSensor(motion, built, camera, faults),
     }
     if gnss is not None:
         sensors["gnss"] = GnssSensor(motion, gnss, receiver, faults)
+    offset_s, rate = (built.effects.get(name, 0.0) for name in ("clock_offset_s", "clock_rate_ratio"))
+    if offset_s or rate:
+        for name in sensors.keys() & set(OTHER_LOGGER):
+            sensors[name].stamp(offset_s, rate)
     status: dict[str, Array] = {}
     if controller is None:
         admitted, wheel_radps, steer_rad = _commands(robot, scenario)
@@ -183,6 +194,22 @@ def simulate(
     return RunLog(
         run_id, robot.name, streams, _labels(motion, scenario), source=f"simulated, {scenario.name}"
     )
+
+
+_IN_DESCRIPTION = (
+    *("gyro_bias_radps", "accel_bias_mps2", "motor_constant_ratio", "encoder_lag_s"),
+    *("camera_latency_s", "lever_x_m", "lever_y_m"),
+)
+"""Effects that are no more than another number of the description; plant and sensors take the others."""
+
+
+def _built(robot: Robot, effects: Mapping[str, float]) -> Robot:
+    """Return the robot that drives, which the one that is commanded is taken for."""
+    if not robot.effects and not effects:
+        return robot
+    acting = checked_effects("effects", {**robot.effects, **effects}, robot.drive)
+    n = len(acting)
+    return moved(replace(robot, effects=acting, effects_cov=np.full((n, n), np.nan)), _IN_DESCRIPTION)
 
 
 def _delay_steps(delay_s: float) -> int:

@@ -22,6 +22,21 @@ States are integrated with semi-implicit steps of :data:`STEP_S`.  What acts, in
 
 Resistance acts at the axle, against the rolling of the wheel; hence in steady motion the thrust balances it
 and the slip follows from the ground, not from the speed.
+
+Effects of the robot (:mod:`terrain.simulation.effects`) act where a real robot would have them:
+
+- **wheel_radius, one_sided_radius**: true radii of the wheels, of which the commands know nothing;
+- **steering_delay, steering_play, steering_offset_i**: between the encoder, which the steering motor obeys,
+  and the wheel: ``wheel(t) = play(encoder(t - T)) + d0``;
+- **force_slip, shear_slip**: a creep of the contact on top of the ground's own slip.  Its deflection follows
+  ``du/dt = (w r - v) - max(|w r|, |v|) (u / sigma + c f)`` with ``f = 3 F_i / W``, so that it settles
+  where slip is that of the ground plus ``c f``, and no equation has to be solved for a force;
+  of a shear curve ``c f`` is bent as in :func:`terrain.simulation.planar.shear_slip`, up to the wheel's own
+  limit.  A negative creep leaves a tenth of the ground's slip: no contact is stiffer than ten times it;
+- **side_hill_slip**: the ground goes by sideways: wheels roll without side force where they drift downhill by
+  ``c ph |v|``;
+- **rolling_resistance, slip_resistance, viscous_drag**: more resistance at each axle, by its load, its slip
+  and its share of the speed; what is less than none is none.
 """
 
 from __future__ import annotations
@@ -36,6 +51,8 @@ from terrain.constants import GRAVITY_MPS2
 from terrain.errors import ConfigError
 from terrain.records import Array
 from terrain.robots import Robot
+from terrain.simulation.planar import shear_slip
+from terrain.terramechanics import traction
 from terrain.terramechanics.traction import wheel_ground
 
 STEP_S = 0.001
@@ -151,6 +168,19 @@ WHEEL_RECORD = (
 the body; traction and side force are those of the contact, along the wheel and to its left, so that it takes
 up ``traction (w r - v_along) - side v_across``."""
 
+EFFECT_STATES = (
+    "steps_ratio",
+    *(f"heading_{i}_rad" for i in (1, 2, 3)),
+    *(f"creep_{i}_ratio" for i in (1, 2, 3)),
+)
+"""What effects remember, at the end of a state: steps so far, headings of the wheels in the play of their
+linkage, and their creep over the slip of the ground; then the encoders' angles that have not reached the
+wheels yet, three a step."""
+
+STEPS, HEADING, CREEP, LATE = 0, 1, 4, len(EFFECT_STATES)
+STIFFEST = -0.9
+"""Least creep over the slip of the ground."""
+
 N_BODY_RECORD = len(BODY_RECORD)
 N_RECORD = N_BODY_RECORD + 3 * len(WHEEL_RECORD)
 
@@ -192,6 +222,18 @@ class Plant(NamedTuple):
     roughness_m3: Array
     patch_start_m: Array
     field: Array
+    linked: bool
+    steer_offset_rad: Array
+    steer_play_rad: float
+    steer_delay_steps: int
+    hidden: bool
+    weight_n: float
+    force_slip_ratio: float
+    shear_slip_ratio: float
+    slip_resistance_ratio: float
+    rolling_ratio: float
+    drag_nspm: float
+    side_hill_ratio: float
 
 
 def make_plant(
@@ -213,7 +255,8 @@ def make_plant(
 
     Parameters
     ----------
-    robot : with sections body, motors, steering and sensors
+    robot : with sections body, motors, steering and sensors; of its effects those act that are listed above,
+        and a payload
     payload_kg, payload_m : load on top and where it lies from the empty robot's centre of mass, body axes
     radius_factors : (3,) true rolling radius of each wheel over the nominal one
     grade_ratio : (2,) mean gradient of the ground along world x and y, uphill positive
@@ -230,7 +273,10 @@ def make_plant(
         if the load takes the centre of mass out of the triangle of the wheels.
     """
     body, motors, steering, _, sensors = robot.equipment
-    mass_kg = robot.mass_kg + payload_kg
+    effects = dict.fromkeys(_LINKAGE + _GROUND + _OTHER, 0.0) | dict(robot.effects)
+    mass_kg = robot.mass_kg * (1.0 + effects["payload_ratio"]) + payload_kg
+    half = 0.5 * effects["one_sided_radius_ratio"]
+    rolling = (1.0 + effects["wheel_radius_ratio"]) * np.array([1.0 - half, 1.0 - half, 1.0 + half])
     com_m = np.array([body.com_x_m, body.com_y_m]) + payload_kg / mass_kg * np.asarray(payload_m)
     # Rows: vertical force, moment about y (x arm), moment about x (y arm); columns: the three wheels.
     balance = np.vstack([np.ones(3), robot.wheel_positions_m.T])
@@ -247,7 +293,7 @@ def make_plant(
         com_height_m=body.com_height_m,
         mass_kg=mass_kg,
         yaw_inertia_kgm2=body.yaw_inertia_kgm2 * mass_kg / robot.mass_kg,
-        radius_m=robot.wheel_radius_m * np.asarray(radius_factors, dtype=float),
+        radius_m=robot.wheel_radius_m * np.asarray(radius_factors, dtype=float) * rolling,
         wheel_inertia_kgm2=body.wheel_inertia_kgm2,
         relaxation_m=body.relaxation_length_m,
         contact_length_m=body.contact_length_m,
@@ -276,7 +322,32 @@ def make_plant(
         roughness_m3=np.ascontiguousarray(roughness_m3, dtype=float),
         patch_start_m=np.ascontiguousarray(patch_start_m, dtype=float),
         field=np.ascontiguousarray(field, dtype=float),
+        linked=any(effects[name] != 0.0 for name in _LINKAGE),
+        steer_offset_rad=np.array([effects[f"steering_offset_{i}_rad"] for i in (1, 2, 3)]),
+        steer_play_rad=effects["steering_play_rad"],
+        steer_delay_steps=round(effects["steering_delay_s"] / STEP_S),
+        hidden=any(effects[name] != 0.0 for name in _GROUND),
+        weight_n=robot.mass_kg * GRAVITY_MPS2,
+        force_slip_ratio=effects["force_slip_ratio"],
+        shear_slip_ratio=effects["shear_slip_ratio"],
+        slip_resistance_ratio=effects["slip_resistance_ratio"],
+        rolling_ratio=effects["rolling_resistance_ratio"],
+        drag_nspm=effects["viscous_drag_nspm"],
+        side_hill_ratio=effects["side_hill_slip_ratio"],
     )
+
+
+_LINKAGE = (*(f"steering_offset_{i}_rad" for i in (1, 2, 3)), "steering_play_rad", "steering_delay_s")
+_GROUND = (
+    *("force_slip_ratio", "shear_slip_ratio", "slip_resistance_ratio", "rolling_resistance_ratio"),
+    *("viscous_drag_nspm", "side_hill_slip_ratio"),
+)
+_OTHER = ("payload_ratio", "one_sided_radius_ratio", "wheel_radius_ratio")
+
+
+def record_width(plant: Plant) -> int:
+    """Return how many numbers are recorded a step: what the encoders see where a linkage hides the wheels."""
+    return N_RECORD + 3 * plant.linked
 
 
 def start_state(plant: Plant, steer_rad: Array) -> Array:
@@ -287,10 +358,13 @@ def start_state(plant: Plant, steer_rad: Array) -> Array:
     plant : of the robot
     steer_rad : (3,) where its wheels hang in their play
     """
-    state = np.zeros(N_BODY + 3 * N_WHEEL)
+    state = np.zeros(N_BODY + 3 * N_WHEEL + LATE + 3 * plant.steer_delay_steps)
     for i in range(3):
         wheel = state[N_BODY + i * N_WHEEL : N_BODY + (i + 1) * N_WHEEL]
         wheel[STEER] = steer_rad[i]
+    tail = state[N_BODY + 3 * N_WHEEL :]
+    tail[HEADING : HEADING + 3] = steer_rad
+    tail[LATE:] = np.tile(steer_rad, plant.steer_delay_steps)
     return state
 
 
@@ -301,7 +375,7 @@ def settle(plant: Plant, state: Array) -> None:
     For four of five seconds the speeds are taken away ten times a second, so that it does not swing; where it
     stands afterwards is the origin.  Ground too steep to stand on lets it slide.
     """
-    stand, record = np.zeros((1, 3)), np.empty((100, N_RECORD))
+    stand, record = np.zeros((1, 3)), np.empty((100, record_width(plant)))
     for tenth in range(50):
         advance(plant, state, stand, stand, 100, np.zeros((100, 3)), record)
         if tenth < 40:
@@ -328,9 +402,11 @@ def advance(
     wheel_radps, steer_rad : (n, 3) commands
     substeps : steps of :data:`STEP_S` a command
     road_noise : (n * substeps, 3) standard normal numbers, the roughness under each wheel
-    record : (n * substeps, N_RECORD) is written: :data:`BODY_RECORD`, then :data:`WHEEL_RECORD` a wheel
+    record : (n * substeps, record_width) is written: :data:`BODY_RECORD`, then :data:`WHEEL_RECORD` a wheel,
+        then the encoders' angles where a linkage hides the wheels
     """
     dt = STEP_S
+    tail = state[N_BODY + 3 * N_WHEEL :]
     accel = np.array([state[7], state[8], 0.0])  # of the last step; the third is dw/dt
     speeds = np.zeros((3, 2))
     ride = np.zeros(3)  # vertical acceleration of each corner
@@ -351,6 +427,9 @@ def advance(
             w = state[N_BODY + i * N_WHEEL : N_BODY + (i + 1) * N_WHEEL]
             _steer(plant, w, steer_rad[command, i], dt)
             heading = w[STEER]
+            if plant.linked:
+                heading = _linkage(plant, tail, w[STEER], i)
+                row[N_RECORD + i] = w[STEER]
             if i == 2 and plant.leg_play_rad > 0.0:
                 heading += state[LEG]
             cos_steer, sin_steer = math.cos(heading), math.sin(heading)
@@ -372,6 +451,9 @@ def advance(
             normal_n = max(normal_n + ride_n, 0.0)
             rate_x = rim - along - fastest / plant.relaxation_m * w[DEFLECTION_X]
             rate_y = -across - fastest / plant.relaxation_m * w[DEFLECTION_Y]
+            if plant.hidden:
+                rate_x -= tail[CREEP + i] * fastest / plant.relaxation_m * w[DEFLECTION_X]
+                rate_y -= plant.side_hill_ratio * math.atan(grade_y) * abs(along)
             slip_x = (w[DEFLECTION_X] + DEFLECTION_DAMPING_S * rate_x) / plant.relaxation_m
             slip_y = (w[DEFLECTION_Y] + DEFLECTION_DAMPING_S * rate_y) / plant.relaxation_m
             thrust, side, resistance, sinkage = wheel_ground(
@@ -380,7 +462,13 @@ def advance(
             cell = min(max(int(state[6] / FIELD_STEP_M), 0), plant.field.shape[2] - 1)  # a NaN is no place
             thrust *= plant.field[0, i, cell]
             side *= plant.field[0, i, cell]
-            pull = thrust - resistance * plant.field[1, i, cell] * math.tanh(along / ROLLING_SPEED_MPS)
+            resistance *= plant.field[1, i, cell]
+            if plant.hidden:
+                tail[CREEP + i] = _creep(plant, patch, normal_n, slip_x, thrust)
+                slip = abs(slip_x) * (1.0 + tail[CREEP + i])
+                resistance += (plant.rolling_ratio + plant.slip_resistance_ratio * slip) * normal_n
+                resistance = max(resistance + plant.drag_nspm * abs(along) / 3.0, 0.0)
+            pull = thrust - resistance * math.tanh(along / ROLLING_SPEED_MPS)
             fx = cos_steer * pull - sin_steer * side
             fy = sin_steer * pull + cos_steer * side
             if i == 2:
@@ -394,7 +482,11 @@ def advance(
             # the contact follows with the wheel's new rate: semi-implicit
             rate_x = w[RATE] * plant.radius_m[i] - along - fastest / plant.relaxation_m * w[DEFLECTION_X]
             limit = plant.relaxation_m
-            w[DEFLECTION_X] = min(max(w[DEFLECTION_X] + dt * rate_x, -limit), limit)
+            deflection = w[DEFLECTION_X] + dt * rate_x
+            if plant.hidden:  # implicit: a contact that creeps fast is stiff
+                creep = tail[CREEP + i] * fastest / plant.relaxation_m
+                deflection /= 1.0 + dt * creep
+            w[DEFLECTION_X] = min(max(deflection, -limit), limit)
             w[DEFLECTION_Y] = min(max(w[DEFLECTION_Y] + dt * rate_y, -limit), limit)
             at = N_BODY_RECORD + i * len(WHEEL_RECORD)
             row[at] = rim / plant.radius_m[i]  # of this instant, as the slip is
@@ -458,6 +550,34 @@ def _steer(plant: Plant, w: Array, command_rad: float, dt: float) -> None:
     w[MOTOR_RATE] += min(max(wanted - w[MOTOR_RATE], -change), change)
     w[MOTOR] += dt * w[MOTOR_RATE]
     w[STEER] = min(max(w[STEER], w[MOTOR] - plant.play_rad), w[MOTOR] + plant.play_rad)
+
+
+@njit(cache=True)
+def _linkage(plant: Plant, tail: Array, encoder_rad: float, i: int) -> float:
+    """Return the heading of a wheel behind delay, play and offset of its linkage."""
+    late = encoder_rad
+    if plant.steer_delay_steps > 0:
+        place = LATE + 3 * (int(tail[STEPS]) % plant.steer_delay_steps) + i
+        late, tail[place] = tail[place], encoder_rad
+        tail[STEPS] += i == 2
+    tail[HEADING + i] = min(max(tail[HEADING + i], late - plant.steer_play_rad), late + plant.steer_play_rad)
+    return float(tail[HEADING + i] + plant.steer_offset_rad[i])
+
+
+@njit(cache=True)
+def _creep(plant: Plant, patch: int, normal_n: float, slip: float, thrust_n: float) -> float:
+    """Return what a contact creeps by beside the slip of the ground, over that slip."""
+    if abs(slip) < 1e-6 or normal_n <= 0.0:
+        return 0.0
+    ground, force_ratio = plant.grounds[patch], 3.0 * thrust_n / plant.weight_n
+    creep = plant.force_slip_ratio * force_ratio
+    if plant.shear_slip_ratio != 0.0:
+        grip_ratio = ground[traction.PEAK]
+        if ground[traction.HARD] == 0.0:
+            area_m2 = ground[traction.CONTACT] * ground[traction.WIDTH]
+            grip_ratio = ground[traction.TAN_FRICTION] + ground[traction.COHESION] * area_m2 / normal_n
+        creep += plant.shear_slip_ratio * shear_slip(force_ratio, grip_ratio)
+    return max(creep / slip, STIFFEST)
 
 
 @njit(cache=True)

@@ -12,7 +12,7 @@ from terrain.simulation.conditions import Conditions, Faults
 from terrain.simulation.sensors import Gnss
 from terrain.terramechanics.soil import soil_names
 
-ROBOT = load_robot("agrimaro")
+ROBOT, HUSKY = load_robot("agrimaro"), load_robot("husky")
 
 
 def read_soil(name):
@@ -78,10 +78,50 @@ def test_a_course_goes_over_all_grounds(tmp_path):
     assert set(run.terrains) <= set(soil_names())
 
 
+def test_a_skid_steered_robot_makes_runs_too(tmp_path):
+    given = {"scenario": "complex", "duration_s": 30.0, "vary": True, "effects": ["effective_track=0.6"]}
+    result = simulate_runs("husky", "all", out=tmp_path, **given)
+    assert result["effects"] == {"effective_track_ratio": 0.6}
+    assert result["n_runs"] == len(soil_names())
+    run = read_run(tmp_path / "grass_complex_01")
+    again = simulate_run(HUSKY, "grass", "complex", 0, duration_s=30.0, vary=True, effects=result["effects"])
+    assert values_of(run) == values_of(again)
+    assert run.terrains == ("grass",)
+    speeds = run.streams["wheels"].values[:, :2]
+    asked = (speeds[:, 1] - speeds[:, 0]) / HUSKY.track_m
+    turned = run.streams["imu"].channel("gyro_z_radps")[::2]
+    assert np.polyfit(asked, turned, 1)[0] == pytest.approx(1 / 1.6, abs=0.04)
+
+
+def test_load_slope_and_a_lost_camera_reach_a_skid_steered_run():
+    given = {"conditions": Conditions(payload_kg=25.0, grade_ratio=(0.1, 0.0)), "duration_s": 10.0}
+    lost = Faults(camera_lost_s=((2.0, 4.0),))
+    run, bare = (
+        simulate_run(HUSKY, "tiles", "straight", 3, **options)
+        for options in (given | {"faults": lost}, {"duration_s": 10.0})
+    )
+    time_s = run.streams["odometry"].time_s
+    assert not ((time_s >= 2.0) & (time_s < 4.0)).any()
+    assert run.streams["imu"].channel("pitch_rad").mean() == pytest.approx(-0.1, abs=0.01)
+    current, level = (log.streams["wheels"].values[250:, 2:].sum(axis=1).mean() for log in (run, bare))
+    amps_per_n = HUSKY.wheel_radius_m / (0.044 * 78.71 * 0.7)
+    slope_n = 75.0 * 9.80665 * np.sin(np.arctan(0.1))
+    assert (current - level) / amps_per_n == pytest.approx(slope_n, rel=0.1)
+    blind = simulate_run(HUSKY, "tiles", "straight", 3, duration_s=5.0, faults=Faults(((0.0, 9.0),)))
+    assert "odometry" not in blind.streams
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"robot_name": "husky"}, "husky"),
+        ({"robot_name": "husky", "scenario": "crab"}, "scenario 'crab' is not for robot husky"),
+        ({"robot_name": "husky", "terrain": "course", "scenario": "course"}, "'course' is for swerve"),
+        ({"robot_name": "husky", "scenario": "slip"}, "robot husky"),
+        ({"robot_name": "husky", "gnss": True}, "has no receiver"),
+        ({"robot_name": "husky", "effects": ["steering_play=0.1"]}, "cannot befall"),
+        ({"effects": ["wheel_radius=9"]}, "-0.3 to 0.3 is accepted"),
+        ({"effects": ["wheel_radius=0.1", "encoder_scale=0.1"]}, "effect 'encoder_scale' is given twice"),
+        ({"scenario": "slip", "effects": ["wheel_radius=0.1"]}, "without effects"),
         ({"robot_name": "nobody"}, "robot 'nobody' is unknown"),
         ({"terrain": "lava"}, "soil 'lava' is unknown"),
         ({"scenario": "dance"}, "scenario 'dance' is unknown"),

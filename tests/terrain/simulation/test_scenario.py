@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -19,7 +20,7 @@ from terrain.simulation.scenario import (
     make_scenario,
 )
 
-ROBOT = load_robot("agrimaro")
+ROBOT, HUSKY = load_robot("agrimaro"), load_robot("husky")
 DRAWN = ("survey", "course")
 UNENDED = ("straight", "climb", "course")
 TERRAINS = ("grass", "gravel", "sand", "tiles")
@@ -52,6 +53,20 @@ def test_every_scenario_can_be_driven_by_the_robot_and_is_at_rest_where_it_says(
         assert change[:, 2].max() <= YAW_ACCEL_RADPS2 * (1 + 1e-9)
         rim_mps = np.linalg.norm(wheel_velocities(ROBOT.wheel_positions_m, drive.twist), axis=-1)
         assert rim_mps.max() <= ROBOT.wheel_radius_m * ROBOT.motors.speed_max_radps * (1 + 1e-9)
+
+
+@pytest.mark.parametrize("name", [name for name in SCENARIOS if name not in ("crab", "course")])
+def test_a_robot_without_steering_drives_all_but_what_takes_it_sideways(name):
+    drive = make_scenario(name, HUSKY, "grass", speed_mps=1.0, seed=3)
+    assert (drive.twist[:, 1] == 0).all()
+    sides = drive.twist[:, :1] + 0.5 * HUSKY.track_m * drive.twist[:, 2:] * [-1.0, 1.0]
+    limit_mps = HUSKY.wheel_radius_m * HUSKY.motors.speed_max_radps
+    assert np.abs(sides).max() <= limit_mps * (1 + 1e-9)
+    assert resting(drive).all() == (name == "stand")
+    if name in ("complex", "spot_turn"):  # to both sides, on the spot too
+        on_the_spot = drive.twist[drive.twist[:, 0] == 0, 2]
+        assert on_the_spot.min() == -0.6
+        assert on_the_spot.max() == 0.6
 
 
 @pytest.mark.parametrize("name", SCENARIOS)
@@ -313,7 +328,9 @@ def test_other_scenarios_are_driven_on_one_terrain(name):
         ({"accel_mps2": "fast"}, "accel_mps2 is 'fast'"),
         ({"seed": -3}, "seed is -3, a whole number from 0 up"),
         ({"seed": None}, "seed is None"),
-        ({"robot": load_robot("husky")}, "robot husky has the drive 'skid_steer'"),
+        ({"robot": HUSKY, "name": "crab"}, "scenario 'crab' is not for robot husky"),
+        ({"robot": HUSKY, "name": "course"}, "scenario 'course' is not for robot husky"),
+        ({"robot": replace(HUSKY, motors=None)}, "no section 'motors'"),
     ],
 )
 def test_what_cannot_be_driven_is_refused_in_one_sentence(options, message):

@@ -11,8 +11,10 @@ from terrain.simulation.sensors import Motion
 from terrain.simulation.vehicle import (
     BODY_STATES,
     DEFLECTION_DAMPING_S,
+    EFFECT_STATES,
     FIELD_STEP_M,
     GRAVITY_MPS2,
+    LATE,
     LEG_FRICTION_NM,
     LEG_RATE_RADPS,
     N_BODY,
@@ -717,6 +719,6 @@ def test_states_and_records_are_as_many_as_their_names():
     plant = plant_of(STICKY)
     assert (
         start_state(plant, np.zeros(3)).size
-        == len(BODY_STATES) + 3 * len(WHEEL_STATES)
-        == N_BODY + 3 * N_WHEEL
+        == len(BODY_STATES) + 3 * len(WHEEL_STATES) + len(EFFECT_STATES)
+        == N_BODY + 3 * N_WHEEL + LATE
     )

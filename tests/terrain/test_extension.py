@@ -1,0 +1,342 @@
+"""Extended robots: what a file may say of effects, and that a correction takes off just what they put on."""
+
+import math
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import yaml
+
+from terrain.described_effects import parameters_of
+from terrain.errors import ConfigError
+from terrain.estimation.camera import body_motion
+from terrain.estimation.live import LiveEstimator
+from terrain.estimation.measurements import measurement_table
+from terrain.extension import Correction, corrected, corrected_log, extended_yaml, moved, write_extended
+from terrain.logs.replay import replay
+from terrain.records import RunLog, Stream
+from terrain.resources import data_folder
+from terrain.robots import load_robot, robot_from
+from terrain.simulation.scenario import make_scenario
+from terrain.simulation.simulate import simulate
+from terrain.terramechanics.soil import load_soil
+
+ROBOT, HUSKY = load_robot("agrimaro"), load_robot("husky")
+BARE = replace(HUSKY, body=None, motors=None, camera=None, sensors=None)
+VALUES = {"wheel_radius_ratio": 0.031234567, "camera_yaw_rad": -0.012, "force_slip_ratio": 0.3}
+ROOT = np.array([[2e-3, 0.0, 0.0], [1e-3, 5e-4, 0.0], [0.01, -0.02, 0.03]])
+COV = ROOT @ ROOT.T
+INTERVALS = {name: (value - 0.05, value + 0.05) for name, value in VALUES.items()}
+EVERY = {name: 0.6 * p.high * 0.1 for name, p in parameters_of("swerve").items()}
+
+
+def extended(**effects):
+    return replace(ROBOT, effects=effects)
+
+
+def described(**changes):
+    text = extended_yaml("agrimaro", VALUES, COV, INTERVALS, "terrain explain, 8 runs")
+    content = yaml.safe_load(text)
+    content["effects"] |= changes
+    return {name: entry for name, entry in content.items() if entry is not None}
+
+
+def run_of(scenario="complex", length_s=30.0, effects=None):
+    drive = make_scenario(scenario, ROBOT, "grass", length_s)
+    return simulate(ROBOT, drive, {"grass": load_soil("grass")}, 4, effects=effects)
+
+
+def test_an_extended_file_is_the_robots_own_with_effects_at_its_end(tmp_path):
+    out = tmp_path / "mine.yaml"
+    written = write_extended(out, "agrimaro", VALUES, COV, INTERVALS, "terrain explain, 8 runs")
+    robot = load_robot(out)
+    assert robot == written
+    assert replace(robot, effects={}, effects_cov=np.empty((0, 0))) == ROBOT
+    assert list(robot.effects) == list(VALUES)
+    np.testing.assert_allclose(list(robot.effects.values()), list(VALUES.values()), rtol=1e-6)
+    np.testing.assert_allclose(robot.effects_cov, COV, rtol=1e-6)
+    own = (data_folder("robots") / "agrimaro.yaml").read_text()
+    assert out.read_text().startswith(own.rstrip("\n"))
+    again = extended_yaml(
+        out, {"gyro_scale_ratio": 0.01}, np.eye(1), {"gyro_scale_ratio": (0.0, 0.02)}, "again"
+    )
+    assert again.startswith(own.rstrip("\n"))
+    assert dict(robot_from("again", yaml.safe_load(again)).effects) == {"gyro_scale_ratio": 0.01}
+    with pytest.raises(ConfigError, match="there already"):
+        write_extended(out, "agrimaro", VALUES, COV, INTERVALS, "twice")
+
+
+def test_a_file_that_is_one_line_is_not_extended(tmp_path):
+    path = tmp_path / "flat.yaml"
+    path.write_text(yaml.safe_dump(yaml.safe_load((data_folder("robots") / "husky.yaml").read_text())))
+    value, interval = {"gyro_scale_ratio": 0.01}, {"gyro_scale_ratio": (0.0, 0.02)}
+    assert robot_from("a", yaml.safe_load(extended_yaml(path, value, np.eye(1), interval, "a"))).effects
+    path.write_text(yaml.safe_dump(yaml.safe_load(path.read_text()), default_flow_style=True))
+    with pytest.raises(ConfigError, match="one section a line is wanted"):
+        extended_yaml(path, value, np.eye(1), interval, "a")
+
+
+def test_effects_cannot_be_changed_and_travel():
+    robot = robot_from("mine.yaml", described())
+    with pytest.raises(TypeError):
+        robot.effects["wheel_radius_ratio"] = 1.0
+    with pytest.raises(ValueError, match="read-only"):
+        robot.effects_cov[0, 0] = 1.0
+    there = pickle.loads(pickle.dumps(robot))
+    assert there == robot
+    np.testing.assert_array_equal(there.effects_cov, robot.effects_cov)
+    assert hash(there) == hash(robot)
+    unknown = described()
+    del unknown["effects"]["covariance"]
+    assert np.isnan(robot_from("mine.yaml", unknown).effects_cov).all()
+
+
+def entry(value, unit="ratio"):
+    return {"value": value, "unit": unit, "source": "by hand"}
+
+
+def spoiled(row, column, value):
+    cov = described()["effects"]["covariance"]
+    cov[row][column] = value
+    return {"covariance": cov}
+
+
+R, Y, F = VALUES
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"schema": 2}, "schema 2 is newer than this version"),
+        ({"schema": "one"}, "schema is 'one'"),
+        ({"schema": 0}, "schema is 0"),
+        ({"warp_ratio": entry(0.1)}, "warp_ratio is no parameter of an effect"),
+        ({"pitch_offset_rad": entry(0.1, "rad")}, "pitch_offset_rad is no parameter"),
+        ({"yaw_delay_s": entry(0.1, "s")}, "yaw_delay_s cannot befall a robot with the drive 'swerve'"),
+        ({R: entry(math.nan)}, f"{R} is nan"),
+        ({R: entry(math.inf)}, f"{R} is inf"),
+        ({R: entry(0.5)}, f"{R} is 0.5, a number from -0.3 to 0.3"),
+        ({R: entry(0.1, "m")}, f"{R} has the unit 'm'"),
+        ({R: 0.1}, f"{R} is 0.1, a mapping"),
+        ({"gyro_scale_ratio": entry(0.1)}, "covariance: key 'gyro_scale_ratio' is missing"),
+        ({"covariance": {R: {R: 1.0}}}, f"covariance: key {Y!r} is missing"),
+        ({"covariance": [[1.0]]}, r"covariance is [[1.0]], a mapping"),
+        (spoiled(R, Y, 1.0), "is not symmetric"),
+        (spoiled(R, R, -1.0), "not positive semi-definite"),
+        (spoiled(R, R, 1e-9), "not positive semi-definite"),
+        (spoiled(R, R, math.nan), f"{R}, {R} is nan"),
+        (spoiled(R, R, "big"), f"{R}, {R} is 'big'"),
+    ],
+)
+def test_effects_that_cannot_be_are_refused_in_one_sentence(changes, message):
+    with pytest.raises(ConfigError, match=r"mine\.yaml: effects") as error:
+        robot_from("mine.yaml", described(**changes))
+    assert message in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("section", [None, [], {}, {R: entry(0.1)}])
+def test_a_section_without_a_schema_is_refused(section):
+    with pytest.raises(ConfigError, match="a mapping with schema"):
+        robot_from("mine.yaml", described() | {"effects": section})
+
+
+@pytest.mark.parametrize(
+    ("values", "cov", "intervals", "message"),
+    [
+        ({"gyro_scale_ratio": 0.1}, np.eye(2), {"gyro_scale_ratio": (0.0, 0.2)}, "shape"),
+        ({"gyro_scale_ratio": 0.1}, np.eye(1), {"gyro_scale_ratio": (0.2, 0.3)}, "must hold it"),
+        ({"gyro_scale_ratio": 0.1}, np.eye(1), {}, "must hold it"),
+        ({"yaw_delay_s": 0.1}, np.eye(1), {"yaw_delay_s": (0.0, 0.2)}, "cannot befall"),
+        ({"gyro_scale_ratio": 0.1}, -np.eye(1), {"gyro_scale_ratio": (0.0, 0.2)}, "variance"),
+    ],
+)
+def test_what_cannot_be_read_is_not_written(tmp_path, values, cov, intervals, message):
+    with pytest.raises(ConfigError, match=message):
+        write_extended(tmp_path / "mine.yaml", "agrimaro", values, cov, intervals, "nobody")
+    assert not list(tmp_path.iterdir())
+
+
+def test_no_effects_change_nothing():
+    run = run_of()
+    assert corrected(ROBOT) is ROBOT
+    assert corrected_log(run, ROBOT) is run
+    still = replace(ROBOT, effects=dict.fromkeys(EVERY, 0.0))
+    for name, stream in corrected_log(run, still).streams.items():
+        np.testing.assert_array_equal(stream.time_s, run.streams[name].time_s)
+        np.testing.assert_allclose(stream.values, run.streams[name].values, rtol=0, atol=1e-12)
+
+
+def test_each_effect_goes_where_the_description_has_it():
+    robot = corrected(extended(**EVERY))
+    e = EVERY
+    assert robot.wheel_radius_m == pytest.approx(0.2 * (1 + e["wheel_radius_ratio"]))
+    assert robot.mass_kg == pytest.approx(90.0 * (1 + e["payload_ratio"]))
+    assert robot.body.yaw_inertia_kgm2 == pytest.approx(20.0 * (1 + e["payload_ratio"]))
+    assert robot.motors.torque_constant_nmpa == pytest.approx(0.25 / (1 + e["motor_constant_ratio"]))
+    for i in (1, 2, 3):
+        assert getattr(robot.steering, f"zero_{i}_rad") == -e[f"steering_offset_{i}_rad"]
+    assert robot.sensors.gyro_bias_z_radps == e["gyro_bias_radps"]
+    assert robot.sensors.accel_bias_x_mps2 == e["accel_bias_mps2"]
+    assert robot.encoder_lag_s == robot.sensors.encoder_time_constant_s == 0.05 + e["encoder_lag_s"]
+    assert robot.camera.latency_s == pytest.approx(0.006 + e["camera_latency_s"])
+    assert robot.camera.lever_x_m == pytest.approx(0.6685 + e["lever_x_m"])
+    assert robot.camera.lever_y_m == pytest.approx(-0.26875 + e["lever_y_m"])
+    left = {
+        "force_slip",
+        "shear_slip",
+        "slip_resistance",
+        "rolling_resistance",
+        "viscous_drag",
+        "side_hill_slip",
+    }
+    assert {name.rpartition("_")[0] for name in robot.effects} == left
+    assert robot.effects_cov.shape == (6, 6)
+    assert corrected(robot) is robot
+    skid = corrected(replace(HUSKY, effects={"effective_track_ratio": 0.8, "turning_slip_ratio": 0.1}))
+    assert skid.track_m == pytest.approx(1.8 * HUSKY.track_m)
+    assert dict(skid.effects) == {"turning_slip_ratio": 0.1}
+    assert corrected(replace(BARE, effects={"encoder_lag_s": 0.1})).encoder_lag_s == 0.1
+
+
+def test_the_covariance_of_what_stays_is_that_of_the_rest():
+    robot = replace(ROBOT, effects=VALUES, effects_cov=COV)
+    np.testing.assert_array_equal(moved(robot).effects_cov, COV[1:, 1:])
+    np.testing.assert_array_equal(corrected(robot).effects_cov, COV[2:, 2:])
+
+
+def test_what_is_corrected_once_is_not_corrected_twice():
+    run = run_of(effects=EVERY)
+    once = corrected_log(run, extended(**EVERY))
+    assert corrected(extended(**EVERY)).effects
+    for name, stream in corrected_log(once, corrected(extended(**EVERY))).streams.items():
+        np.testing.assert_array_equal(stream.time_s, once.streams[name].time_s)
+        np.testing.assert_array_equal(stream.values, once.streams[name].values)
+
+
+SENSED = {
+    "camera_yaw_rad": 0.2,
+    "gyro_scale_ratio": -0.1,
+    "gyro_bias_radps": 0.02,
+    "accel_bias_mps2": 0.3,
+    "clock_offset_s": 0.1,
+    "clock_rate_ratio": 0.003,
+    "motor_drift_ratio": 0.3,
+    "motor_constant_ratio": 0.1,
+}
+
+
+@pytest.mark.parametrize("names", [*([name] for name in SENSED), list(SENSED)])
+def test_a_correction_is_the_inverse_of_what_sensors_do(names):
+    """All streams come back but for the noise of the sensors, which is scaled with them."""
+    effects = {name: SENSED[name] for name in names}
+    clean, run = run_of(), run_of(effects=effects)
+    back, robot = corrected_log(run, extended(**effects)), corrected(extended(**effects))
+    for name, stream in clean.streams.items():
+        np.testing.assert_allclose(back.streams[name].time_s, stream.time_s, atol=1e-9)
+    camera, other = clean.streams["odometry"], back.streams["odometry"]
+    np.testing.assert_allclose(other.values[:, :7], camera.values[:, :7], atol=0.02)
+    np.testing.assert_allclose(other.values, camera.values, atol=8 * ROBOT.camera.yaw_rate_std_radps)
+    table, plain = measurement_table(back, robot), measurement_table(clean, ROBOT)
+    worst = {"accel": 1e-9, "gyro": 1e-3, "imu_yaw": 0.01, "camera_speed": 0.01, "camera_yaw": 0.02}
+    for row, column, wanted in zip(table.rows, table.z.T, plain.z.T, strict=True):
+        allowed = next((limit for start, limit in worst.items() if row.startswith(start)), 1e-9)
+        np.testing.assert_allclose(column, wanted, atol=allowed, err_msg=row)
+    per_a = robot.motors.torque_constant_nmpa / ROBOT.motors.torque_constant_nmpa
+    current = per_a * back.streams["wheels"].values[:, 3:]
+    np.testing.assert_allclose(current, clean.streams["wheels"].values[:, 3:], atol=0.15)
+
+
+@pytest.mark.parametrize("block", [1, 7, 1000])
+def test_block_by_block_is_the_whole_run(block):
+    effects = EVERY | {"steering_play_rad": 0.05}
+    run = run_of(effects=effects)
+    robot = extended(**effects)
+    whole = corrected_log(run, robot)
+    correction = Correction(robot, float(run.streams["wheels"].time_s[0]))
+    for name, stream in run.streams.items():
+        parts = [
+            correction(name, stream.channels, stream.time_s[at : at + block], stream.values[at : at + block])
+            for at in range(0, min(len(stream), 3000), block)
+        ]
+        n = min(len(stream), sum(len(times) for times, _ in parts))
+        np.testing.assert_array_equal(
+            np.concatenate([t for t, _ in parts])[:n], whole.streams[name].time_s[:n]
+        )
+        values = np.concatenate([v for _, v in parts])[:n]
+        np.testing.assert_allclose(values, whole.streams[name].values[:n], atol=1e-12)
+
+
+def test_samples_that_are_no_numbers_stay_what_they_are():
+    run = run_of()
+    streams = {}
+    for name, stream in run.streams.items():
+        values = np.array(stream.values)
+        values[100] = np.nan
+        values[200] = np.inf
+        streams[name] = Stream(stream.time_s, values, stream.channels)
+    back = corrected_log(replace(run, streams=streams), extended(**EVERY))
+    plain = corrected_log(run, extended(**EVERY))
+    for name in ("wheels", "steering", "imu"):
+        values = back.streams[name].values
+        assert not np.isfinite(values[[100, 200]]).any()
+        rest = np.setdiff1d(np.arange(len(values)), [100, 200])
+        np.testing.assert_allclose(values[rest], plain.streams[name].values[rest], atol=0.02)
+
+
+def test_a_skid_steer_robot_without_sections_is_corrected_in_its_samples():
+    time_s = np.arange(0.0, 20.0, 0.02)
+    left, right = 0.8 + 0.2 * np.sin(time_s), 0.8 - 0.2 * np.sin(0.7 * time_s)
+    turn = (right - left) / BARE.track_m
+    channels = ("speed_left_mps", "speed_right_mps", "current_left_a", "current_right_a")
+    effects = {
+        "wheel_radius_ratio": 0.1,
+        "one_sided_radius_ratio": 0.06,
+        "gyro_bias_radps": 0.02,
+        "gyro_scale_ratio": 0.05,
+        "motor_constant_ratio": 0.2,
+        "clock_offset_s": 0.3,
+        "yaw_delay_s": 0.1,
+    }
+    told = [left / 1.1 / 0.97, right / 1.1 / 1.03, np.full(time_s.size, 1.2), np.full(time_s.size, 2.4)]
+    gyro = 1.05 * turn + 0.02
+    streams = {
+        "wheels": Stream(time_s, np.column_stack(told), channels),
+        "imu": Stream(time_s + 0.3, gyro[:, None], ("gyro_z_radps",)),
+    }
+    back = corrected_log(RunLog("a", "husky", streams), replace(BARE, effects=effects))
+    np.testing.assert_allclose(back.streams["imu"].time_s, time_s, atol=1e-12)
+    np.testing.assert_allclose(back.streams["imu"].values[:, 0], turn, atol=1e-12)
+    wheels = back.streams["wheels"].values
+    np.testing.assert_allclose(wheels[:, 2:], np.broadcast_to([1.0, 2.0], (time_s.size, 2)))
+    np.testing.assert_allclose(wheels[:, 0] + wheels[:, 1], left + right, atol=1e-12)
+    late = np.interp(time_s - 0.1, time_s, right - left)
+    np.testing.assert_allclose(wheels[:, 1] - wheels[:, 0], late, atol=1e-12)
+
+
+def test_a_turned_camera_tells_of_the_same_robot():
+    effects = {"camera_yaw_rad": 0.3}
+    clean, run = run_of(), run_of(effects=effects)
+    seen, wrong = (body_motion(log.streams["odometry"], ROBOT.camera) for log in (clean, run))
+    cos, sin = math.cos(0.3), math.sin(0.3)
+    turned_mps = seen.speed_mps @ np.array([[cos, sin], [-sin, cos]])
+    np.testing.assert_allclose(wrong.speed_mps, turned_mps, atol=0.01)  # it tilts with the body as well
+    np.testing.assert_allclose(wrong.yaw_rate_radps, seen.yaw_rate_radps, atol=1e-9)
+
+
+def test_live_is_live_on_the_corrected_log():
+    effects = {name: EVERY[name] for name in EVERY if not name.startswith("clock")}
+    run, robot = run_of("straight", 12.0, effects), extended(**effects)
+    channels = {name: run.streams[name].channels for name in ("wheels", "steering", "imu", "odometry")}
+    raw, plain = LiveEstimator(robot, "vio15", channels), LiveEstimator(corrected(robot), "vio15", channels)
+    unshifted = replace(robot, effects={n: v for n, v in effects.items() if n != "steering_delay_s"})
+    raw_now = LiveEstimator(unshifted, "vio15", channels)
+    told, wanted = [], []
+    log = corrected_log(run, unshifted)
+    for one, other in zip(replay(run, 50.0), replay(log, 50.0), strict=True):
+        told += raw_now.step(one.readings)
+        wanted += plain.step(other.readings)
+        assert all(np.isfinite(estimate.mean).all() for estimate in raw.step(one.readings))
+    np.testing.assert_allclose([t.mean for t in told], [w.mean for w in wanted], atol=1e-9)
+    np.testing.assert_allclose([t.slip_ratio for t in told], [w.slip_ratio for w in wanted], atol=1e-9)
