@@ -246,6 +246,104 @@ def print_learned_slip(result: dict[str, Any], console: Console) -> None:
         console.print(sentence, highlight=False)
 
 
+def print_explain(result: dict[str, Any], console: Console) -> None:
+    """Print what the simulation lacks, how sure that is, what it is worth, and what was not seen."""
+    from pipelines.explain_page import gain_words, quantity, verdict_words, words_of
+
+    console.print(f"{result['robot']}, {result['n_runs']} runs: {result['verdict']}", highlight=False)
+    console.print(verdict_words(result), highlight=False)
+    if result["causes"]:
+        table = Table(
+            Column("cause", overflow="fold"),
+            *(Column(name, justify="right") for name in ("value", "95 %", "held-out gain", "z")),
+            box=SIMPLE,
+            padding=(0, 1, 0, 0),
+        )
+        for cause in result["causes"]:
+            for place, each in enumerate(cause["parameters"]):
+                first = place == 0
+                table.add_row(
+                    words_of(cause["name"]) if first else "",
+                    f"{each['value']:.4g} {each['unit']}",
+                    f"{each['ci'][0]:.4g} to {each['ci'][1]:.4g}",
+                    percent(cause["held_out_gain"]) if first else "",
+                    f"{cause['z']:.1f}" if first else "",
+                )
+        console.print(table)
+    for left in result["unexplained"]:
+        console.print(f"without a name: {left['channel']} follows {left['input']}", highlight=False)
+    if result["not_excited"]:
+        names = ", ".join(limit["name"] for limit in result["not_excited"])
+        console.print(f"the driving would not have shown: {names}", highlight=False)
+    for effect in result["causes"]:
+        if effect["aliases"]:
+            console.print(
+                f"no log tells {effect['name']} from {', '.join(effect['aliases'])}", highlight=False
+            )
+    for names in result["ambiguous_sets"]:
+        told = ", ".join(
+            f"{name} {quantity(each['name'], each['value'])}"
+            for name in names
+            for each in result["ambiguous_values"].get(name, ())
+        )
+        console.print(f"one of: {told}", highlight=False)
+    if result["next_drive"] is not None:
+        told = ", ".join(f"{key} {value}" for key, value in result["next_drive"].items())
+        console.print(f"what to drive next: {told}", highlight=False)
+    for run in result["excluded_runs"]:
+        console.print(f"left out: {run['run_id']}: {run['reason']}", highlight=False)
+    gained = result["gain"]
+    if gained["measured"]:
+        console.print(gain_words(gained), highlight=False)
+    else:
+        console.print(f"gain on untouched runs not measured: {gained['reason']}", highlight=False)
+    for sentence in result.get("skipped", []):
+        console.print(sentence, highlight=False)
+    if result["extended"]:
+        console.print(f"extended description: {result['extended']['file']}", highlight=False)
+    console.print(f"page: {result['page']}", highlight=False)
+
+
+def print_explain_trials(result: dict[str, Any], console: Console) -> None:
+    """Print how often blind trials came out right, beside the bars, and how small an effect is found."""
+    from pipelines.explain_trials import FOUND_TRIALS
+
+    right = [Column(name, justify="right") for name in ("of", "rate", "95 %")]
+    table = Table(
+        Column("figure", overflow="fold"), *right, "wanted", "met", box=SIMPLE, padding=(0, 1, 0, 0)
+    )
+    for name, rate in result["table"].items():
+        table.add_row(
+            name,
+            f"{rate['hits']}/{rate['of']}",
+            percent(rate["rate"]),
+            f"{rate['low']:.1%} to {rate['high']:.1%}",
+            rate["bar"],
+            ("yes" if rate["met"] else "no") if rate["bar"] else "",
+        )
+    console.print(table)
+    if "found" in result["rows"]:
+        found = result["found_from"]
+        names = sorted({effect for effects in found.values() for effect in effects})
+        if names:
+            columns = [Column(robot, justify="right") for robot in found]
+            table = Table(
+                "nine in ten are found from, over the limit", *columns, box=SIMPLE, padding=(0, 1, 0, 0)
+            )
+            for effect in names:
+                cells = [f"{found[r][effect]:.2f}" if effect in found[r] else "" for r in found]
+                table.add_row(effect, *cells)
+            console.print(table)
+        else:
+            console.print(f"row found: no effect had {FOUND_TRIALS} trials; --n is too small to say more")
+    seconds = result["seconds"]
+    console.print(
+        f"{len(result['trials'])} trials of {result['runs']} runs, seed {result['seed']}; a diagnosis took "
+        f"{seconds['median']:.2f} s in the middle, {seconds['worst']:.2f} s at worst",
+        highlight=False,
+    )
+
+
 def print_slip(rows: list[dict[str, Any]], console: Console) -> None:
     """Print estimated and true slip a terrain."""
     right = [Column(name, justify="right") for name in ("runs", "slip", "true slip", "RMSE", "NEES")]

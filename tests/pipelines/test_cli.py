@@ -198,7 +198,8 @@ def test_what_cannot_be_simulated_or_estimated_is_one_sentence(refused, place, d
     refused("--camera-lost is '9'; START:END", *ask, *straight, "--camera-lost", "9")
     refused("--camera-lost is '9:4'; START:END", *ask, *straight, "--camera-lost", "9:4")
     husky = ("simulate", "--robot", "husky", "--out", place / "runs", "--terrain", "grass")
-    refused("robot husky has the drive 'skid_steer'", *husky, "--scenario", "straight")
+    refused("scenario 'crab' is not for robot husky", *husky, "--scenario", "crab")
+    refused("effect 'magic' is unknown", *husky, "--scenario", "straight", "--effect", "magic=1")
     (place / "mine.yaml").write_text("name: mine\ndrive: swerve\nwheels: 3\n")
     refused("key 'wheels' is unknown", "simulate", "--robot", place / "mine.yaml", *ask[3:], *straight)
 

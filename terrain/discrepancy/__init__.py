@@ -1,0 +1,1 @@
+"""What a simulation gets wrong about measured runs: shown, named, built in, and the gain measured."""

@@ -1,0 +1,226 @@
+"""What an extension is worth, on runs that had no say in it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from terrain.discrepancy.health import unfit_runs
+from terrain.discrepancy.information import N_BLOCKS, Information, information_at
+from terrain.discrepancy.residuals import low_pass_of, measured_channels
+from terrain.discrepancy.search import names_of
+from terrain.discrepancy.selection import MIN_CLUSTERS
+from terrain.discrepancy.signals import signals_of
+from terrain.discrepancy.simulation import Simulation
+from terrain.discrepancy.verdict import Excluded
+from terrain.errors import ConfigError, DataError
+from terrain.records import Array, RunLog
+from terrain.simulation.effects import CHANNELS
+
+N_BOOTSTRAP = 2000
+
+MIN_JUDGED = 3
+"""Runs among which one can be seen not to belong."""
+
+
+class Reduction(NamedTuple):
+    """Share of a square that an extension takes away, and its 95 % interval by bootstrap over clusters.
+
+    Examples
+    --------
+    >>> Reduction(0.4, 0.1, 0.6).refused, Reduction(0.4, -0.1, 0.6).refused
+    (False, True)
+    """
+
+    share: float
+    low: float
+    high: float
+
+    @property
+    def refused(self) -> bool:
+        """Whether no gain can be claimed: the interval includes zero, or lies below."""
+        return not self.low > 0.0
+
+
+class ChannelGain(NamedTuple):
+    """Measured minus simulated in one channel, before and after.
+
+    Parameters
+    ----------
+    rms_before, rms_after : behind the common low-pass, in the channel's unit
+    white_before, white_after : behind the whitening filter, too; noise alone has 1
+    reduction : of the square behind the low-pass
+    """
+
+    rms_before: float
+    rms_after: float
+    white_before: float
+    white_after: float
+    reduction: Reduction
+
+
+class Gain(NamedTuple):
+    """What an extension is worth.
+
+    Parameters
+    ----------
+    run_ids : of the runs on which it was measured
+    excluded : those that were given and do not belong
+    clusters : ``runs``, or ``thirds of runs`` where runs are few
+    channels : by name
+    reduction : of the whitened square of all channels, with what scatters from run to run taken out
+    """
+
+    run_ids: tuple[str, ...]
+    excluded: tuple[Excluded, ...]
+    clusters: str
+    channels: dict[str, ChannelGain]
+    reduction: Reduction
+
+    @property
+    def refused(self) -> bool:
+        """Whether no gain can be claimed."""
+        return self.reduction.refused
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the gain as JSON has it; what is not known is null."""
+        return {
+            "runs": list(self.run_ids),
+            "excluded_runs": [run._asdict() for run in self.excluded],
+            "clusters": self.clusters,
+            **_reduction_json(self.reduction),
+            "channels": {
+                name: {
+                    key: _number(getattr(found, key))
+                    for key in ("rms_before", "rms_after", "white_before", "white_after")
+                }
+                | _reduction_json(found.reduction)
+                for name, found in self.channels.items()
+            },
+        }
+
+
+def gain(simulation: Simulation, extended: Simulation, runs: Sequence[RunLog], seed: int = 0) -> Gain:
+    """Return what an extension takes off the residual of runs that were not used to find it.
+
+    One low-pass and one whitening filter serve before and after: that of the noise which the whole library,
+    let go around the extension, leaves.
+
+    Parameters
+    ----------
+    simulation, extended : before and after
+    runs : that had no say in the extension
+    seed : of the bootstrap
+
+    Raises
+    ------
+    ConfigError
+        if the two are of different robots.
+    DataError
+        if there is no run, or none that belongs.
+    """
+    if simulation.robot.name != extended.robot.name:
+        raise ConfigError(
+            f"the extension is of the robot {extended.robot.name!r}, not of {simulation.robot.name!r}"
+        )
+    if not runs:
+        raise DataError("gain: there is no run that was not used in the diagnosis")
+    signals = tuple(signals_of(run, simulation.robot) for run in runs)
+    low_pass = low_pass_of(signals)
+    names = names_of(extended.library)
+    after = information_at(signals, extended, extended.vector, names, low_pass)
+    excluded = unfit_runs(signals, after) if len(signals) >= MIN_JUDGED else ()
+    if excluded:
+        gone = {run.run_id for run in excluded}
+        signals = tuple(run for run in signals if run.run_id not in gone)
+        if not signals:
+            raise DataError(f"gain: none of {len(runs)} runs is fit to be compared ({excluded[0].reason})")
+        after = information_at(signals, extended, extended.vector, names, low_pass)
+    before = information_at(signals, simulation, simulation.vector, (), low_pass, after.noise)
+    by_run = len(signals) >= MIN_CLUSTERS
+    rng = np.random.default_rng(seed)
+    n = len(signals) * (1 if by_run else N_BLOCKS)
+    weights = rng.multinomial(n, np.full(n, 1 / n), N_BOOTSTRAP)
+    channels = {}
+    for name in measured_channels(after.rows):
+        c = CHANNELS.index(name)
+        plain = [_squares([run.residual[:, c] for run in info.rows], by_run) for info in (before, after)]
+        white = [
+            _squares([np.where(r[:, c] == 0.0, np.nan, r[:, c]) for r in info.white_residual], by_run)
+            for info in (before, after)
+        ]
+        channels[name] = ChannelGain(
+            _rms(plain[0]),
+            _rms(plain[1]),
+            _rms(white[0]),
+            _rms(white[1]),
+            _reduction(plain[0][:, 0], plain[1][:, 0], weights),
+        )
+    cost = [_costs(info, by_run) for info in (before, after)]
+    return Gain(
+        tuple(run.run_id for run in signals),
+        tuple(excluded),
+        "runs" if by_run else "thirds of runs",
+        channels,
+        _reduction(cost[0], cost[1], weights),
+    )
+
+
+def _squares(residuals: Sequence[Array], by_run: bool) -> Array:
+    """Return sum of squares and count (clusters, 2), a cluster a run or a third of one."""
+    out = []
+    for values in residuals:
+        for part in _clusters(values, by_run):
+            known = part[np.isfinite(part)]
+            out.append((float(known @ known), known.size))
+    return np.array(out)
+
+
+def _costs(info: Information, by_run: bool) -> Array:
+    """Return what each cluster (n,) adds to minus twice the log-likelihood, its own scatter integrated out.
+
+    Thirds of a run are given a scatter each, since shares of one that is common to them need not be positive.
+    """
+    prior = np.diag(1.0 / info.nuisance_std**2)
+    costs = []
+    for residual, change in zip(info.white_residual, info.white_change, strict=True):
+        scatter = change[info.nuisances].transpose(1, 0, 2)  # rows first, so that clusters are cut of both
+        for r, n in zip(_clusters(residual, by_run), _clusters(scatter, by_run), strict=True):
+            shown = np.einsum("mqc,mc->q", n, r)
+            inner = np.einsum("mqc,mpc->qp", n, n) + prior
+            costs.append(float((r**2).sum() - shown @ np.linalg.solve(inner, shown)))
+    return np.array(costs)
+
+
+def _clusters(values: Array, by_run: bool) -> list[Array]:
+    return [values] if by_run else np.array_split(values, N_BLOCKS)
+
+
+def _rms(squares: Array) -> float:
+    total, count = squares.sum(axis=0)
+    return float(np.sqrt(total / count)) if count else float("nan")
+
+
+def _reduction(before: Array, after: Array, weights: Array) -> Reduction:
+    drawn, left = weights @ before, weights @ after
+    with np.errstate(divide="ignore", invalid="ignore"):
+        shares = 1.0 - left / drawn
+        share = 1.0 - after.sum() / before.sum()
+    if not np.isfinite(shares).any():
+        return Reduction(float("nan"), float("nan"), float("nan"))
+    low, high = np.nanquantile(shares, [0.025, 0.975])
+    return Reduction(float(share), float(low), float(high))
+
+
+def _reduction_json(found: Reduction) -> dict[str, Any]:
+    return {
+        "reduction": _number(found.share),
+        "ci": [_number(found.low), _number(found.high)],
+        "refused": found.refused,
+    }
+
+
+def _number(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None

@@ -1,0 +1,282 @@
+"""Runs that do not belong, before any cause is looked for.
+
+A run is unfit for what it has alone: a channel that is dead or stands still, a clock of its own, wheels that
+turn under a body that stays, or another robot and ground than it is said to be of.  What all runs share is
+no fault of a run: it is what the diagnosis looks for.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from terrain.discrepancy.clocks import CLOCKED, MAX_LAG_S, MIN_LAG_S, Shift, offsets_of, shifts_of
+from terrain.discrepancy.information import PRIOR_STD, Information
+from terrain.discrepancy.residuals import Rows
+from terrain.discrepancy.signals import Signals
+from terrain.discrepancy.verdict import Clock, Excluded
+from terrain.records import Array
+from terrain.simulation.effects import CHANNELS, CURRENT, GYRO, INDEX, SPEED_X, SPEED_Y
+
+CLOCK_S, CLOCK_SIGMAS, CLOCK_SCATTER_S = 0.12, 6.0, 0.01
+"""A clock is a run's own if it is off by the first, and by so many times its error and the scatter of the
+others, which is the third at the least."""
+
+STUCK_S, STUCK_STRETCH_S = 2.0, 1.0
+"""A run is stuck that is for the first in all, counted in stretches of the second at the least; where its
+clock is not known, in stretches over all that a clock may be off."""
+
+STUCK_MPS, STUCK_RADPS = 0.15, 0.2
+"""What has to be expected of a body before it can be said to stay."""
+
+STUCK_SHARE = 0.05
+"""Share of what is expected, below which a body stays; no slip of the library goes below 0.1."""
+
+STUCK_FLOOR_MPS, STUCK_FLOOR_RADPS = 0.015, 0.02
+"""What a camera and a gyro show of a body that stays."""
+
+STILL_MPS, VARIES_MPS, MOVING_MPS = 0.002, 0.05, 0.2
+"""Spread of a rim's speed that never changes, of one that does, and a speed at which no wheels stand."""
+
+MIN_FINITE_SHARE, USUAL_FINITE_SHARE = 0.3, 0.7
+"""A channel is dead in a run that has some of it but less than the first, the others over the second."""
+
+FROZEN_S, CLIPPED_S, CLIPPED_SHARE = 2.0, 1.0, 0.03
+"""A channel is frozen that stands still for the first at a time, and clipped that is at its end for the
+second in all and the third of a run, while something else is expected."""
+
+MARGIN_S = 0.6
+"""What is expected may come so much earlier or later."""
+
+FROZEN_RANGE, CLIPPED_SPREAD = 0.5, 0.1
+"""Of what is expected meanwhile: range and spread over its spread in the run."""
+
+FAR_END = 0.5
+"""The end of a range is so far out at the least, over the largest size: idle currents rest at the other."""
+
+MIN_OTHERS = 3
+"""A run is judged by so many others of its terrain: of three runs two may be wrong."""
+
+UNLIKE_RATIO, UNLIKE_SHARE = 12.0, 0.2
+"""A run is unlike the others if a simulation in common with them costs it so many times what one in common
+costs them among themselves, and so many variances of the noise a row.  Of 15 000 simulated runs without a
+fault, whatever was hidden in all runs of a set, one passed both."""
+
+_SPEEDS = [CHANNELS.index(SPEED_X), CHANNELS.index(SPEED_Y)]
+_CURRENT = CHANNELS.index(CURRENT)
+
+
+def unfit_runs(
+    signals: Sequence[Signals], info: Information, shift: Shift | None = None
+) -> tuple[Excluded, ...]:
+    """Return the runs that do not belong, each with the first reason that is found.
+
+    Parameters
+    ----------
+    signals : of all runs
+    info : what they say around the simulation as it is given, in the same order
+    shift : of these runs, where it is known already
+
+    Raises
+    ------
+    DataError
+        if most runs' clocks are further apart than is searched.
+    """
+    shift = shifts_of(info) if shift is None else shift
+    reasons: dict[int, str] = {}
+    for found in (_dead(signals, info), _late(info, shift), _stuck(info, shift), _frozen(signals, info)):
+        reasons = found | reasons
+    reasons |= _unlike(info, [i for i in range(len(signals)) if i not in reasons])
+    return tuple(Excluded(signals[i].run_id, reasons[i]) for i in sorted(reasons))
+
+
+def clocks_of(info: Information, shift: Shift | None = None) -> tuple[Clock, ...]:
+    """Return how far IMU and camera are behind the wheels at the middle of each run, NaN where unknown."""
+    offset_s, std_s = offsets_of(shifts_of(info) if shift is None else shift)
+    built_in = info.vector[INDEX["clock_offset_s"]]
+    return tuple(
+        Clock(run.run_id, float(offset + built_in), float(std))
+        for run, offset, std in zip(info.rows, offset_s, std_s, strict=True)
+    )
+
+
+def _dead(signals: Sequence[Signals], info: Information) -> dict[int, str]:
+    """Return runs with a wheel or a channel of which hardly anything is there."""
+    reasons: dict[int, str] = {}
+    share = np.array([np.isfinite(run.measured).mean(axis=0) for run in signals])
+    usual = np.median(share, axis=0)
+    for i, run in enumerate(signals):
+        dead = (share[i] > 0) & (share[i] < MIN_FINITE_SHARE) & (usual > USUAL_FINITE_SHARE)
+        if run.steer_rad.any():
+            dead[_CURRENT] = False  # it is looked at only while the wheels are parallel
+        for c in np.flatnonzero(dead):
+            reasons[i] = f"its {CHANNELS[c]} is there in {share[i, c]:.0%} of its samples"
+        known = np.isfinite(run.rim_mps).all(axis=1)
+        if known.mean() < MIN_FINITE_SHARE:
+            reasons[i] = f"its wheels are there in {known.mean():.0%} of its samples"
+            continue
+        spread = run.rim_mps[known].std(axis=0)
+        if spread.min() < STILL_MPS and spread.max() > VARIES_MPS:
+            reasons[i] = f"its wheel {int(np.argmin(spread)) + 1} never turns faster or slower, the others do"
+        elif np.abs(run.rim_mps[known]).max() < STILL_MPS:
+            shown = info.rows[i].measured[:, _SPEEDS]
+            if shown.size and np.nanmax(np.hypot(*np.nan_to_num(shown).T)) > MOVING_MPS:
+                reasons[i] = "its wheels stand, its camera moves"
+    return reasons
+
+
+def _late(info: Information, shift: Shift) -> dict[int, str]:
+    """Return runs whose clock is not that of the others: all channels that tell one are off, and alike."""
+    offset_s = offsets_of(shift)[0] + info.vector[INDEX["clock_offset_s"]]
+    reasons: dict[int, str] = {}
+    for i in range(len(offset_s)):
+        if shift.lost[i]:
+            reasons[i] = f"its IMU and camera are not {MIN_LAG_S:g} to {MAX_LAG_S:g} s behind its wheels"
+        others = np.arange(len(offset_s)) != i
+        off, error = [], []
+        for c in np.flatnonzero(np.isfinite(shift.lag_s[i])):
+            lag_s = shift.lag_s[others & np.isfinite(shift.lag_s[:, c]), c]
+            if lag_s.size < 2:
+                continue
+            middle_s = float(np.median(lag_s))
+            scatter_s = max(1.48 * float(np.median(np.abs(lag_s - middle_s))), CLOCK_SCATTER_S)
+            off.append(float(shift.lag_s[i, c]) - middle_s)
+            error.append(math.hypot(float(shift.std_s[i, c]), scatter_s))
+        own = all(abs(a) > max(CLOCK_S, CLOCK_SIGMAS * b) for a, b in zip(off, error, strict=True))
+        if off and own and max(off) - min(off) < CLOCK_S + CLOCK_SIGMAS * max(error):
+            own_s, usual_s = float(offset_s[i]), float(np.nanmedian(offset_s[others]))
+            reasons[i] = (
+                f"its IMU and camera are {_behind(own_s)} its wheels, {_behind(usual_s)} in the other runs"
+            )
+    return reasons
+
+
+def _behind(offset_s: float) -> str:
+    return f"{abs(offset_s):.2f} s {'behind' if offset_s >= 0 else 'ahead of'}"
+
+
+def _stuck(info: Information, shift: Shift) -> dict[int, str]:
+    """Return runs in which wheels turn and the body stays, far longer than in the others."""
+    reasons: dict[int, str] = {}
+    if len(info.rows) < 2:
+        return reasons
+    stays_s = np.array([_stays_s(run, shift.lag_s[i], shift.rate) for i, run in enumerate(info.rows)])
+    for i, time_s in enumerate(stays_s):
+        usual_s = float(np.median(np.delete(stays_s, i)))
+        if time_s > STUCK_S + 3.0 * usual_s:
+            reasons[i] = f"it is stuck for {time_s:.1f} s in all: its wheels turn, its body stays"
+    return reasons
+
+
+def _stays_s(run: Rows, lag_s: Array, rate: float) -> float:
+    """Return for how long, in stretches that count, a body stays that is expected to move."""
+    known = np.isfinite(lag_s)
+    usual_s = float(np.median(lag_s[known])) if known.any() else 0.0
+    centred_s = run.time_s - 0.5 * (run.time_s[0] + run.time_s[-1])
+
+    def pair(name: str) -> tuple[Array, Array]:
+        c = CHANNELS.index(name)
+        own = CLOCKED.index(name) if name in CLOCKED else CLOCKED.index(SPEED_X)
+        late_s = lag_s[own] if known[own] else usual_s
+        at_s = run.time_s - late_s - rate * centred_s
+        return run.measured[:, c], np.interp(at_s, run.time_s, run.predicted[:, c])
+
+    gyro, turn = pair(GYRO)
+    calm = np.isfinite(gyro) & (np.abs(turn) < 0.1 * STUCK_RADPS)
+    bias = float(np.median(gyro[calm])) if calm.sum() >= 10 else np.nan
+    turns = np.abs(gyro - bias) > STUCK_SHARE * np.abs(turn) + STUCK_FLOOR_RADPS
+    (x, along), (y, across) = pair(SPEED_X), pair(SPEED_Y)
+    expected = np.hypot(along, across)
+    seen = np.hypot(x, np.where(np.isfinite(y), y, 0.0))
+    if np.isfinite(seen).any():
+        stays = (expected > STUCK_MPS) & (seen < STUCK_SHARE * expected + STUCK_FLOOR_MPS) & ~turns
+    else:
+        stays = (np.abs(turn) > STUCK_RADPS) & np.isfinite(gyro - bias) & ~turns
+    row_s = float(np.median(np.diff(run.time_s)))
+    least_s = STUCK_STRETCH_S if known.any() else MAX_LAG_S + MARGIN_S
+    return row_s * sum(b - a for a, b in _stretches(stays) if (b - a) * row_s >= least_s)
+
+
+def _stretches(where: Array) -> list[tuple[int, int]]:
+    """Return starts and ends, not included, of the stretches in which something holds."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], where, [False]]).astype(np.int8)))
+    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
+
+
+def _frozen(signals: Sequence[Signals], info: Information) -> dict[int, str]:
+    """Return runs with a channel that stands still, or at the end of its range, against what is expected."""
+    reasons: dict[int, str] = {}
+    for i, (run, rows) in enumerate(zip(signals, info.rows, strict=True)):
+        for c in np.flatnonzero(np.isfinite(run.measured).any(axis=0)):
+            values, expected = run.measured[:, c], rows.predicted[:, c]
+            spread = float(np.std(expected))
+            if not spread > 0:
+                continue
+            for a, b in _stretches(values[1:] == values[:-1]):
+                start_s, end_s = a * run.dt_s, b * run.dt_s
+                inside = (rows.time_s > start_s + MARGIN_S) & (rows.time_s < end_s - MARGIN_S)
+                if end_s - start_s > FROZEN_S and np.ptp(expected[inside]) > FROZEN_RANGE * spread:
+                    reasons[i] = (
+                        f"its {CHANNELS[c]} stands still for {end_s - start_s:.1f} s while it should change"
+                    )
+            for end in (np.nanmax(values), np.nanmin(values)):
+                there = np.flatnonzero(values == end)
+                if len(there) < max(CLIPPED_S / run.dt_s, CLIPPED_SHARE * len(values)):
+                    continue
+                if abs(end) < FAR_END * np.nanmax(np.abs(values)):  # what rests is no end of a range
+                    continue
+                if np.std(np.interp(there * run.dt_s, rows.time_s, expected)) > CLIPPED_SPREAD * spread:
+                    reasons[i] = (
+                        f"its {CHANNELS[c]} is clipped at {end:.3g} for {len(there) * run.dt_s:.1f} s"
+                    )
+    return reasons
+
+
+def _unlike(info: Information, among: Sequence[int]) -> dict[int, str]:
+    """Return runs that no simulation in common with those of the same terrain fits, or none at all."""
+    reasons: dict[int, str] = {}
+    for terrain in dict.fromkeys(info.rows[i].terrain for i in among):
+        left = [i for i in among if info.rows[i].terrain == terrain]
+        most = (len(left) - 1) // MIN_OTHERS
+        while most > 0 and (odd := _oddest(info, left)) is not None:
+            reasons[odd[0]] = odd[1]
+            left.remove(odd[0])
+            most -= 1
+    return reasons
+
+
+def _oddest(info: Information, left: Sequence[int]) -> tuple[int, str] | None:
+    """Return the run that fits the others worst, if it is one of another kind, and why."""
+    ratio, share = oddness(info, left)
+    worst = int(np.argmax(ratio))
+    if ratio[worst] > UNLIKE_RATIO and share[worst] > UNLIKE_SHARE:
+        return left[worst], (
+            f"it is unlike the other runs: in common with them it fits {ratio[worst]:.0f} times worse than "
+            "they do among themselves"
+        )
+    return None
+
+
+def oddness(info: Information, left: Sequence[int]) -> tuple[Array, Array]:
+    """Return what a simulation in common costs each run, over what it costs the others, and in noise a row.
+
+    The cost is that in minus twice the log-likelihood, over a fit of each run by itself.
+    """
+    prior = np.diag(1.0 / np.array([PRIOR_STD.get(name, 1e-6) for name in info.parameters]) ** 2)
+    a, g, c = info.a[left], info.g[left], info.c[left]
+    n, k = len(left), len(prior)
+
+    def loss(a: Array, g: Array) -> Array:
+        x = np.linalg.solve(a + prior, g[..., None])[..., 0]
+        return np.asarray(-(x * g).sum(axis=-1))
+
+    own = loss(a, g)
+    n_rows = np.array([int((info.white_residual[i] != 0.0).sum()) for i in left])
+    noise = float(np.median((c + own) / n_rows))
+    without = loss(a.sum(axis=0) - a, g.sum(axis=0) - g)
+    cost = float(loss(a.sum(axis=0), g.sum(axis=0))) - own.sum()
+    others = without - (own.sum() - own)
+    alone = cost - others
+    return alone / (others / max(n - 2, 1) + k * noise), alone / (noise * n_rows)

@@ -1,0 +1,208 @@
+"""What runs say of the simulation's parameters: a quadratic form a run, what scatters by itself taken out.
+
+With whitened residual ``r``, sensitivities ``J`` and, of each run, deviations ``b ~ N(0, D)`` of the
+parameters that scatter (sensitivities ``N``), minus twice the log-likelihood of a change ``x`` is, up to a
+constant,
+
+    c - 2 g'x + x'A x,   A = J'V J,  g = J'V r,  V = I - N (N'N + D^-1)^-1 N'
+
+summed over runs.  All selection works on these small matrices; sensitivities are taken anew where a fit has
+moved far.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from terrain.discrepancy.noise import ORDER, Noise, noise_of, whitened
+from terrain.discrepancy.residuals import LowPass, Rows, rows_of
+from terrain.discrepancy.signals import Signals
+from terrain.discrepancy.simulation import Simulation
+from terrain.records import Array
+from terrain.simulation.effects import INDEX, LIBRARY
+
+N_BLOCKS = 3
+"""Time blocks of a run; they serve as clusters where runs are few."""
+
+PRIOR_STD = {p.name: 0.5 * max(abs(p.low), p.high) for effect in LIBRARY for p in effect.parameters}
+"""How wide a parameter is let go when the whole library is fitted to see what noise is left."""
+
+
+class Information(NamedTuple):
+    """What runs say, around one point of the parameters.
+
+    Parameters
+    ----------
+    parameters : names of the k parameters
+    vector : the point, (len(PARAMETERS),)
+    a, g, c : (runs, k, k), (runs, k) and (runs,) of the quadratic form
+    a_blocks, g_blocks : (runs, N_BLOCKS, k, k) and (runs, N_BLOCKS, k), which sum up to ``a`` and ``g``
+    rows, noise : from which they come
+    white_residual, white_change : of each run (rows, channels) and (k, rows, channels), 0 where nothing was
+        measured
+    nuisances : (q,) indices into ``parameters`` of what scatters from run to run
+    nuisance_std : (q,)
+    shift : of each run (q, k + 1): deviation of its nuisances per unit of each parameter's change (negative),
+        and that which its residual shows
+    inner : of each run (q, q): covariance of its nuisances given the parameters
+    """
+
+    parameters: tuple[str, ...]
+    vector: Array
+    a: Array
+    g: Array
+    c: Array
+    a_blocks: Array
+    g_blocks: Array
+    rows: tuple[Rows, ...]
+    noise: Noise
+    white_residual: tuple[Array, ...]
+    white_change: tuple[Array, ...]
+    nuisances: Array
+    nuisance_std: Array
+    shift: tuple[Array, ...]
+    inner: tuple[Array, ...]
+
+    def index(self, names: Sequence[str]) -> list[int]:  # type: ignore[override]
+        """Return where parameters stand."""
+        return [self.parameters.index(name) for name in names]
+
+
+def information_at(
+    signals: Sequence[Signals],
+    simulation: Simulation,
+    vector: Array,
+    parameters: Sequence[str],
+    low_pass: LowPass,
+    noise: Noise | None = None,
+) -> Information:
+    """Return what runs say around a point; the noise is that which the whole library leaves, unless given."""
+    planar = simulation.planar
+    scattered = [name for name in simulation.scatter if simulation.scatter[name] > 0]
+    names = tuple(dict.fromkeys([*parameters, *scattered]))
+    rows = tuple(rows_of(run, planar, vector, names, low_pass) for run in signals)
+    nuisances = np.array([names.index(name) for name in scattered], dtype=int)
+    std = np.array([simulation.scatter[name] for name in scattered])
+    if noise is None:
+        speeds = [run.pace_mps for run in rows]
+        noise = noise_of([run.residual for run in rows], speeds, 0)
+        for _ in range(2):
+            loose = _summed(names, vector, rows, noise, nuisances, std)
+            left, n_fitted = _left_of_all(loose)
+            noise = noise_of(left, speeds, n_fitted)
+    return _summed(names, vector, rows, noise, nuisances, std)
+
+
+def _summed(
+    names: tuple[str, ...],
+    vector: Array,
+    rows: tuple[Rows, ...],
+    noise: Noise,
+    nuisances: Array,
+    std: Array,
+) -> Information:
+    k, n = len(names), len(rows)
+    a, g, c = np.empty((n, k, k)), np.empty((n, k)), np.empty(n)
+    a_blocks, g_blocks = np.empty((n, N_BLOCKS, k, k)), np.empty((n, N_BLOCKS, k))
+    white_r, white_j, shifts, inners = [], [], [], []
+    for i, run in enumerate(rows):
+        residual, change = _whitened(noise, run)
+        both = np.concatenate([change, residual[None]]).transpose(1, 0, 2)
+        edges = [len(both) * b // N_BLOCKS for b in range(N_BLOCKS + 1)]
+        parts = [both[edges[b] : edges[b + 1]].transpose(1, 0, 2).reshape(k + 1, -1) for b in range(N_BLOCKS)]
+        grams = np.array([part @ part.T for part in parts])
+        gram = grams.sum(axis=0)
+        inner = np.linalg.inv(gram[np.ix_(nuisances, nuisances)] + np.diag(1.0 / std**2))
+        shift = inner @ gram[nuisances]
+        taken = gram - gram[:, nuisances] @ shift
+        a[i], g[i], c[i] = taken[:k, :k], taken[:k, k], taken[k, k]
+        for b in range(N_BLOCKS):
+            part = grams[b] - shift.T @ grams[b][nuisances]
+            a_blocks[i, b], g_blocks[i, b] = part[:k, :k], part[:k, k]
+        white_r.append(residual)
+        white_j.append(change)
+        shifts.append(shift)
+        inners.append(inner)
+    return Information(
+        names,
+        vector,
+        a,
+        g,
+        c,
+        a_blocks,
+        g_blocks,
+        rows,
+        noise,
+        tuple(white_r),
+        tuple(white_j),
+        nuisances,
+        std,
+        tuple(shifts),
+        tuple(inners),
+    )
+
+
+def _whitened(noise: Noise, run: Rows) -> tuple[Array, Array]:
+    """Return residual (m, c) and sensitivities (k, m, c) whitened, both 0 where the residual is not known."""
+    residual = run.residual
+    known = np.isfinite(residual)
+    measured = np.isfinite(noise.filters).all(axis=1)
+    valid = known & measured
+    for lag in range(1, ORDER + 1):
+        used = measured & (noise.filters[:, lag] != 0.0)
+        valid[lag:] &= known[:-lag] | ~used
+        valid[:lag] &= ~used
+    both = np.concatenate([residual[None], run.sensitivity]) / noise.size(run.pace_mps)
+    white = whitened(noise.filters, both)
+    white *= valid
+    return white[0], white[1:]
+
+
+def _left_of_all(info: Information) -> tuple[list[Array], float]:
+    """Return what the whole library, let go, and each run's deviations leave; and how much they fitted."""
+    prior = np.array([PRIOR_STD.get(name, 1e-6) for name in info.parameters])
+    x = np.linalg.solve(info.a.sum(axis=0) + np.diag(1.0 / prior**2), info.g.sum(axis=0))
+    left = []
+    for run, shift in zip(info.rows, info.shift, strict=True):
+        move = x.copy()
+        move[info.nuisances] += shift[:, -1] - shift[:, :-1] @ x
+        left.append(run.residual - np.tensordot(move, run.sensitivity, axes=1))
+    total = info.a.sum(axis=0)
+    n_fitted = float(np.trace(np.linalg.solve(total + np.diag(1.0 / prior**2), total)))
+    for inner in info.inner:
+        n_fitted += info.nuisances.size - float((np.diag(inner) / info.nuisance_std**2).sum())
+    return left, n_fitted
+
+
+def counted_from(info: Information, base: Array) -> Information:
+    """Return the same with changes counted from another point, to which the form is carried on straight."""
+    away = np.array([info.vector[INDEX[name]] - base[INDEX[name]] for name in info.parameters])
+    return info._replace(
+        vector=base,
+        g=info.g + info.a @ away,
+        g_blocks=info.g_blocks + info.a_blocks @ away,
+    )
+
+
+def loss_of(info: Information, names: Sequence[str]) -> float:
+    """Return minus twice the log-likelihood of the best fit of parameters, up to what no fit changes."""
+    at = info.index(names)
+    a, g = info.a[:, at][:, :, at].sum(axis=0), info.g[:, at].sum(axis=0)
+    return -float(g @ np.linalg.lstsq(a, g, rcond=1e-10)[0]) if at else 0.0
+
+
+def moved(info: Information, names: Sequence[str], change: Array) -> Array:
+    """Return the point that lies a change of the parameters named away, kept in the bounds of the library."""
+    vector = info.vector.copy()
+    for name, value in zip(names, change, strict=True):
+        vector[INDEX[name]] += value
+        if name in BOUNDS:
+            vector[INDEX[name]] = np.clip(vector[INDEX[name]], *BOUNDS[name])
+    return vector
+
+
+BOUNDS = {p.name: (p.low, p.high) for effect in LIBRARY for p in effect.parameters}
+"""Of each parameter of the library."""

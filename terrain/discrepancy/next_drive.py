@@ -1,0 +1,329 @@
+"""What to drive next: the scenario that parts best what the runs did not, or shows what they did not show.
+
+Every scenario of ``terrain simulate`` that the robot can drive is driven without noise, on the level and
+uphill, and the sensitivities of the effects in question are whitened like those of the runs, with what
+scatters by itself taken out.  Two effects are told apart by their collinearity index ``1 / sqrt(1 - r)``,
+``r`` the largest correlation of a change by the one with a change by the other: 1 is orthogonal, above 10
+they cannot be told apart (Brun et al., Water Resources Research 2001, of two normalised columns).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+from scipy.signal import lfilter
+
+from terrain.discrepancy.information import BOUNDS, Information, information_at
+from terrain.discrepancy.noise import ORDER, Noise
+from terrain.discrepancy.residuals import low_pass_of, measured_channels
+from terrain.discrepancy.selection import Z_EFFECT
+from terrain.discrepancy.signals import PARALLEL, Signals
+from terrain.discrepancy.simulation import Simulation
+from terrain.discrepancy.verdict import Limit, NextDrive
+from terrain.errors import ConfigError
+from terrain.kinematics.swerve import wheel_commands
+from terrain.records import Array
+from terrain.robots import Robot
+from terrain.simulation.effects import (
+    ACCEL,
+    CHANNELS,
+    CURRENT,
+    GYRO,
+    HEADING,
+    SPEED_X,
+    SPEED_Y,
+    TURNING_CURRENT,
+    effect_named,
+)
+from terrain.simulation.planar import TRUTH, move
+from terrain.simulation.scenario import RATE_HZ, SCENARIOS, make_scenario
+
+GRADES_DEG = (0.0, 6.0)
+"""Level, and a slope that every robot here climbs."""
+
+LONGEST_S = 40.0
+"""Of a scenario that would last longer: what it is good for shows by then."""
+
+CLOCK_HZ = RATE_HZ / 2
+"""Of the replay: half the rate of the commands is five times what they hold."""
+
+FOLLOW_S = 0.1
+"""Lag of wheels and steering behind their commands; assumed."""
+
+PARTED_INDEX = 10.0
+"""Collinearity index over which two effects are not told apart, whatever the amplitude."""
+
+EXACT_INDEX = 100.0
+"""Over it two effects count as one."""
+
+WORTH_A_DRIVE = 1.5
+"""So much has to be won, as a ratio, for a drive to be told."""
+
+SHARE_OF_BOUND = 0.3
+"""An effect is shown whose detection limit is within this share of what it may be."""
+
+Z_SHOWN = Z_EFFECT + 1.28
+"""Evidence that nine drives in ten exceed the threshold with."""
+
+TYPICAL_STD = {
+    GYRO: 0.01,
+    SPEED_X: 0.005,
+    SPEED_Y: 0.005,
+    ACCEL: 0.1,
+    CURRENT: 1.0,
+    TURNING_CURRENT: 1.0,
+    HEADING: 0.02,
+}
+"""Noise of channels of which the runs tell none; assumed, white."""
+
+
+class _Drive(NamedTuple):
+    """A scenario, and what it would say (k, k) of the parameters."""
+
+    scenario: str
+    grade_deg: float
+    a: Array
+
+
+class _Parted(NamedTuple):
+    """Worst collinearity index of any pair, and sigmas of one at its bounds that the other cannot take."""
+
+    collinearity: float
+    power: float
+
+
+def next_drive(
+    simulation: Simulation,
+    sets: Sequence[tuple[str, ...]],
+    missed: Sequence[Limit],
+    info: Information | None = None,
+) -> NextDrive | None:
+    """Return what to drive next, None where nothing is to be parted or no scenario helps.
+
+    Parameters
+    ----------
+    simulation : with what is built in so far
+    sets : effects of which one is there, and the runs do not tell which
+    missed : what the runs could not have shown; asked for only where nothing is to be parted
+    info : what the runs say; without it channels and noise are typical ones, and nothing is compared
+
+    Where a set cannot be parted by any drive with the channels that are logged, but could be with one more,
+    the reason names it.
+    """
+    if sets:
+        return _parting(simulation, sets, info)
+    return _showing(simulation, missed, info) if missed else None
+
+
+def _parting(
+    simulation: Simulation, sets: Sequence[tuple[str, ...]], info: Information | None
+) -> NextDrive | None:
+    """Return the drive that parts all sets best; if none does, the one that does with a channel more."""
+    logged = _logged(simulation.robot, info)
+    names = list(dict.fromkeys(p for group in sets for effect in group for p in _parameters(effect)))
+    wanted = [
+        channel
+        for group in sets
+        for effect in group
+        for twin, channel in effect_named(effect).twins
+        if twin in group and channel not in logged
+    ]
+    told = " and ".join(dict.fromkeys(_listed(group) for group in sets))
+    now = _Parted(np.inf, 0.0)
+    if info is not None:
+        at = info.index(names)
+        now = _parted(sets, names, info.a[:, at][:, :, at].sum(axis=0))
+    for channels in (logged, (*logged, *wanted)) if wanted else (logged,):
+        drives = _drives(simulation, names, channels, info)
+        found = [(_parted(sets, names, drive.a), drive) for drive in drives]
+        found = [pair for pair in found if pair[0].collinearity < PARTED_INDEX]
+        if not found:
+            continue
+        parted, drive = max(found, key=lambda pair: pair[0].power)
+        index = f"{parted.collinearity:.2g}"
+        if channels is not logged:
+            lacking = _listed(list(dict.fromkeys(wanted)))
+            reason = f"{told} are one without {lacking}; with it logged, their collinearity index is {index}"
+        elif info is None:
+            reason = f"the collinearity index of {told} would be {index}"
+        elif now.collinearity > WORTH_A_DRIVE * parted.collinearity:
+            reason = f"the collinearity index of {told} falls from {_told(now.collinearity)} to {index}"
+        else:
+            times = parted.power / max(now.power / math.sqrt(len(info.a)), 1e-9)
+            if times < WORTH_A_DRIVE:
+                return None
+            reason = f"it parts {told} by {times:.2g} times as many sigmas as one of the runs"
+        return NextDrive(drive.scenario, drive.grade_deg, reason)
+    return None
+
+
+def _showing(simulation: Simulation, missed: Sequence[Limit], info: Information | None) -> NextDrive | None:
+    """Return the drive that shows the most of what was not shown."""
+    names = [limit.name for limit in missed]
+    before = np.array([limit.value for limit in missed])
+    bound = np.array([max(abs(value) for value in BOUNDS[name]) for name in names])
+    best: tuple[float, _Drive, Array] | None = None
+    for drive in _drives(simulation, names, _logged(simulation.robot, info), info):
+        with np.errstate(divide="ignore"):
+            limit = Z_SHOWN / np.sqrt(np.maximum(np.diag(drive.a), 0.0))
+        shown = (limit < SHARE_OF_BOUND * bound) & (WORTH_A_DRIVE * limit < before)
+        # as many as possible; the size of the limits decides between equals
+        score = shown.sum() + float(np.mean(1.0 / (1.0 + np.minimum(limit / bound, 1e6))))
+        if shown.any() and (best is None or score > best[0]):
+            best = score, drive, np.where(shown, limit, np.inf)
+    if best is None:
+        return None
+    _, drive, limit = best
+    k = int(np.argmin(limit / bound))
+    others = int(np.isfinite(limit).sum()) - 1
+    beside = f", and {others} more that the runs do not show" if others else ""
+    was = f"from {before[k]:.2g}" if math.isfinite(before[k]) else "from infinite"
+    reason = f"the detection limit of {names[k]} falls {was} to {limit[k]:.2g} {missed[k].unit}{beside}"
+    return NextDrive(drive.scenario, drive.grade_deg, reason)
+
+
+def _parted(sets: Sequence[tuple[str, ...]], names: Sequence[str], a: Array) -> _Parted:
+    """Return how well an information matrix (k, k) of parameters parts the worst pair of any set."""
+    index, power = 1.0, np.inf
+    for group in sets:
+        for pair in combinations(group, 2):
+            one, other = ([names.index(name) for name in _parameters(effect)] for effect in pair)
+            r = _correlation(a, one, other)
+            index = max(index, math.inf if r >= 1.0 else 1.0 / math.sqrt(1.0 - r))
+            power = min(power, _free(a, names, one, other), _free(a, names, other, one))
+    return _Parted(index, power)
+
+
+def _correlation(a: Array, one: list[int], other: list[int]) -> float:
+    """Return the largest correlation of changes by the one and the other, 1 where one does nothing."""
+    roots = []
+    for at in (one, other):
+        values, vectors = np.linalg.eigh(a[np.ix_(at, at)])
+        if not values[-1] > 1e-12:
+            return 1.0
+        kept = values > 1e-9 * values[-1]
+        roots.append(vectors[:, kept] / np.sqrt(values[kept]))
+    between = roots[0].T @ a[np.ix_(one, other)] @ roots[1]
+    return min(float(np.linalg.norm(between, 2)), 1.0)
+
+
+def _free(a: Array, names: Sequence[str], one: list[int], other: list[int]) -> float:
+    """Return the evidence, in sigmas, of the one at its bounds that the other cannot take."""
+    cross = a[np.ix_(one, other)]
+    free = a[np.ix_(one, one)] - cross @ np.linalg.pinv(a[np.ix_(other, other)], hermitian=True) @ cross.T
+    size = np.array([max(abs(value) for value in BOUNDS[names[k]]) for k in one])
+    return math.sqrt(max(float(np.linalg.eigvalsh(free * np.outer(size, size))[0]), 0.0))
+
+
+def _parameters(effect: str) -> tuple[str, ...]:
+    return tuple(p.name for p in effect_named(effect).parameters)
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(names[:-1]) + " and " + names[-1] if len(names) > 1 else names[0]
+
+
+def _told(index: float) -> str:
+    return f"{index:.2g}" if index < EXACT_INDEX else f"over {EXACT_INDEX:g}"
+
+
+def _logged(robot: Robot, info: Information | None) -> tuple[str, ...]:
+    """Return the channels of the runs, or those that the robot's description lets expect."""
+    if info is not None:
+        return measured_channels(info.rows)
+    own = [GYRO, ACCEL]
+    own += [SPEED_X, SPEED_Y] if robot.camera is not None else []
+    own += [CURRENT, TURNING_CURRENT] if robot.motors is not None else []
+    return tuple(name for name in own if name != TURNING_CURRENT or robot.drive != "swerve")
+
+
+def _drives(
+    simulation: Simulation, names: Sequence[str], channels: Sequence[str], info: Information | None
+) -> list[_Drive]:
+    """Return what each scenario on each grade would say of parameters in channels."""
+    told, signals = [], []
+    for name in SCENARIOS:
+        inputs = _inputs(simulation.robot, name)
+        for grade_deg in GRADES_DEG if inputs is not None else ():
+            assert inputs is not None
+            told.append((name, grade_deg))
+            signals.append(_signals(simulation, *inputs, grade_deg, channels))
+    if not signals:
+        return []
+    vector = simulation.vector if info is None else info.vector
+    said = information_at(signals, simulation, vector, names, low_pass_of(signals), _noise(info))
+    at = said.index(names)
+    return [
+        _Drive(name, grade_deg, a[np.ix_(at, at)]) for (name, grade_deg), a in zip(told, said.a, strict=True)
+    ]
+
+
+def _inputs(robot: Robot, name: str) -> tuple[Array, Array] | None:
+    """Return rim speeds and steering (n, wheels) of a scenario, or None if the robot cannot drive it."""
+    speed_mps = 0.6 * robot.wheel_radius_m * (robot.motors.speed_max_radps if robot.motors else 0.0)
+    try:
+        scenario = make_scenario(name, robot, "ground", speed_mps=min(speed_mps, 1.0))
+    except ConfigError:
+        return None
+    assert robot.motors is not None
+    twist = scenario.twist[: round(LONGEST_S * RATE_HZ)]
+    if robot.drive == "swerve":
+        assert robot.steering is not None
+        _, wheel_radps, steer_rad = wheel_commands(
+            robot.wheel_positions_m,
+            robot.wheel_radius_m,
+            robot.motors.speed_max_radps,
+            robot.steering.rate_max_radps,
+            1.0 / RATE_HZ,
+            twist,
+            np.zeros(3),
+        )
+        rim_mps = wheel_radps * robot.wheel_radius_m
+    else:
+        turn = 0.5 * robot.track_m * twist[:, 2]
+        rim_mps, steer_rad = (
+            np.column_stack([twist[:, 0] - turn, twist[:, 0] + turn]),
+            np.zeros((len(twist), 2)),
+        )
+    keep = math.exp(-1.0 / (RATE_HZ * FOLLOW_S))
+    every = round(RATE_HZ / CLOCK_HZ)
+    rim_mps, steer_rad = (lfilter([1 - keep], [1, -keep], x, axis=0)[::every] for x in (rim_mps, steer_rad))
+    return rim_mps, steer_rad
+
+
+def _signals(
+    simulation: Simulation, rim_mps: Array, steer_rad: Array, grade_deg: float, channels: Sequence[str]
+) -> Signals:
+    """Return a drive as a log without noise would have it; what was measured is not looked at, only where."""
+    level, vector = np.zeros(len(rim_mps)), simulation.vector
+    measured = np.full((len(rim_mps), len(CHANNELS)), np.nan)
+    measured[:, [CHANNELS.index(name) for name in channels]] = 0.0
+    if simulation.robot.drive == "swerve":
+        parallel = np.abs(np.exp(1j * steer_rad).mean(axis=1)) > PARALLEL
+        measured[~parallel, CHANNELS.index(CURRENT)] = np.nan
+    grade, roll = level, level
+    if grade_deg:
+        flat = move(
+            simulation.planar, vector, 1.0 / CLOCK_HZ, rim_mps, steer_rad, level, level, np.zeros((0, 3))
+        )
+        yaw = np.cumsum(flat[:, TRUTH.index("yaw_rate_radps")]) / CLOCK_HZ
+        steepness = math.tan(math.radians(grade_deg))
+        ahead, left = steepness * np.cos(yaw), -steepness * np.sin(yaw)
+        grade, roll = np.arctan(ahead / np.hypot(1.0, left)), np.arctan(left)
+    return Signals("", "", 1.0 / CLOCK_HZ, 0.0, rim_mps, steer_rad, grade, roll, measured)
+
+
+def _noise(info: Information | None) -> Noise:
+    """Return the noise of the runs, and what is typical where they tell none."""
+    std = np.array([TYPICAL_STD[name] for name in CHANNELS])
+    growth, filters = np.zeros((len(CHANNELS), 3)), np.zeros((len(CHANNELS), ORDER + 1))
+    growth[:, 0], filters[:, 0] = std**2, 1.0
+    if info is not None:
+        known = np.isfinite(info.noise.filters).all(axis=1)
+        growth[known], filters[known] = info.noise.growth[known], info.noise.filters[known]
+        std[known] = info.noise.std[known]
+    return Noise(growth, filters, std)

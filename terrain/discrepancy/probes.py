@@ -1,0 +1,193 @@
+"""Questions without a name: whether what is left follows an input, its square or rate, or a wheel's turn."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.stats import chi2
+
+from terrain.discrepancy.information import Information
+from terrain.discrepancy.noise import whitened
+from terrain.discrepancy.residuals import INPUTS, Rows
+from terrain.discrepancy.selection import weighed_variance, z_of, z_of_t
+from terrain.records import Array
+from terrain.simulation.effects import CHANNELS
+
+Z_PROBE = 4.5
+"""Evidence that a probe needs: 7e-6, of some two hundred that are asked."""
+
+CRAWL_MPS = 0.2
+"""Speed below which a robot crawls."""
+
+STANDSTILL_MPS = 0.05
+
+HARMONICS = (1, 2)
+"""Of a wheel's turn: an eccentric wheel, an oval one."""
+
+
+class Answer(NamedTuple):
+    """Evidence of one probe.
+
+    Parameters
+    ----------
+    z : as of :class:`terrain.discrepancy.selection.Evidence`
+    gain : fall of minus twice the log-likelihood, were it built in
+    """
+
+    z: float
+    gain: float
+
+    @property
+    def stands(self) -> bool:
+        """Whether something is there."""
+        return self.z > Z_PROBE
+
+
+def probe_inputs(rows: Rows, rate_hz: float) -> dict[str, Array]:
+    """Return the inputs (m,) that residuals are held against, by name."""
+    speed, turn, steer, grade, roll, force = (rows.inputs[:, i] for i in range(6))
+    accel = np.gradient(speed) * rate_hz if len(speed) > 1 else np.zeros_like(speed)
+    tau = rows.time_s / 60.0 - 0.5
+    way = np.tanh(speed / STANDSTILL_MPS)
+    crawl = np.exp(-((speed / CRAWL_MPS) ** 2)) * np.abs(way)
+    return {
+        "constant": np.ones_like(speed),
+        "time": tau,
+        "time^2": tau**2,
+        "speed": speed,
+        "|speed|": np.abs(speed),
+        "speed |speed|": speed * np.abs(speed),
+        "direction": way,
+        "crawling": crawl,
+        "crawling direction": crawl * way,
+        "turn": turn,
+        "|turn|": np.abs(turn),
+        "turn |turn|": turn * np.abs(turn),
+        "speed turn": speed * turn,
+        "steering": steer,
+        "steering rate": np.gradient(steer) * rate_hz if len(steer) > 1 else np.zeros_like(steer),
+        "acceleration": accel,
+        "jerk": np.gradient(accel) * rate_hz if len(accel) > 1 else np.zeros_like(accel),
+        "grade": grade,
+        "roll": roll,
+        "roll |speed|": roll * np.abs(speed),
+        "grade |speed|": grade * np.abs(speed),
+        "force": force,
+        "force |force|": force * np.abs(force),
+        "force |speed|": force * np.abs(speed),
+        "time speed": tau * speed,
+        "time turn": tau * turn,
+        "time force": tau * force,
+        "time acceleration": tau * accel,
+    }
+
+
+def ask(info: Information, names: Sequence[str], change: Array) -> dict[tuple[str, str], Answer]:
+    """Return the answer of every probe, by channel and input.
+
+    Parameters
+    ----------
+    info : what the runs say at the fit; changes counted from wherever
+    names, change : parameters that were selected, and their fitted change: a probe has to tell more than they
+    """
+    rate_hz = 1 / float(np.median(np.diff(info.rows[0].time_s)))
+    answers: dict[tuple[str, str], Answer] = {}
+    inputs = [probe_inputs(run, rate_hz) for run in info.rows]
+    for c, channel in enumerate(CHANNELS):
+        if not any(residual[:, c].any() for residual in info.white_residual):
+            continue
+        columns = []
+        for run, given, residual in zip(info.rows, inputs, info.white_residual, strict=True):
+            columns.append(_white(info, run, c, np.array(list(given.values())), residual))
+        for name, answer in zip(inputs[0], _answers(info, names, change, c, columns), strict=True):
+            answers[channel, name] = answer
+        n_wheels = info.rows[0].inputs.shape[1] - len(INPUTS) + 1
+        for wheel in range(n_wheels):
+            for harmonic in HARMONICS:
+                pairs = []
+                for run, residual in zip(info.rows, info.white_residual, strict=True):
+                    phase = harmonic * run.inputs[:, len(INPUTS) - 1 + wheel]
+                    pair = run.inputs[:, 0] * np.array([np.cos(phase), np.sin(phase)])
+                    pairs.append(_white(info, run, c, pair, residual))
+                name = f"wheel {wheel + 1} turn" + ("" if harmonic == 1 else f" x{harmonic}")
+                answers[channel, name] = _turning(info, c, pairs)
+    return answers
+
+
+def drift_of(info: Information, names: Sequence[str], change: Array) -> dict[str, Answer]:
+    """Return, of each selected parameter, whether it changes from the start of runs to their end."""
+    if not names:
+        return {}
+    columns = [
+        white[info.index(names)] * (run.time_s / 60.0 - 0.5)[None, :, None]
+        for run, white in zip(info.rows, info.white_change, strict=True)
+    ]
+    flat = [column.reshape(len(names), -1) for column in columns]
+    return dict(zip(names, _answers(info, names, change, None, flat), strict=True))
+
+
+def _white(info: Information, run: Rows, c: int, columns: Array, residual: Array) -> Array:
+    """Whiten columns (q, m) as channel c, 0 where its residual is not known."""
+    scaled = columns / info.noise.size(run.pace_mps)[:, c]
+    white = whitened(info.noise.filters[c : c + 1], np.ascontiguousarray(scaled[:, :, None]))[:, :, 0]
+    return np.asarray(white * (residual[:, c] != 0.0))
+
+
+def _answers(
+    info: Information, names: Sequence[str], change: Array, c: int | None, columns: list[Array]
+) -> list[Answer]:
+    """Return the answers of columns (q, m) a run, in channel c or, where it is None, flat in all of them."""
+    at = info.index(names)
+    n_runs, q = len(columns), columns[0].shape[0]
+    own, cross, score = np.empty((n_runs, q)), np.empty((n_runs, q, len(at))), np.empty((n_runs, q))
+    for i, x in enumerate(columns):
+        white, residual = info.white_change[i], info.white_residual[i]
+        j = white.reshape(len(white), -1) if c is None else white[:, :, c]
+        r = residual.ravel() if c is None else residual[:, c]
+        xn = x @ j[info.nuisances].T
+        own[i] = (x * x).sum(axis=1) - np.einsum("qi,ij,qj->q", xn, info.inner[i], xn)
+        cross[i] = x @ j[at].T - xn @ info.shift[i][:, at]
+        score[i] = x @ r - xn @ info.shift[i][:, -1]
+    a = info.a[:, at][:, :, at]
+    g = info.g[:, at] - a @ change  # at the fit
+    follow = np.zeros((0, q))
+    if at:
+        follow = np.linalg.lstsq(a.sum(axis=0), cross.sum(axis=0).T, rcond=1e-10)[0]
+    free = own.sum(axis=0) - (cross.sum(axis=0) * follow.T).sum(axis=1)
+    share = own - 2 * np.einsum("rqs,sq->rq", cross, follow) + np.einsum("sq,rst,tq->rq", follow, a, follow)
+    part = score - np.einsum("rs,sq->rq", g, follow)
+    total = part.sum(axis=0)
+    enough = free > 1e-6 * np.maximum(own.sum(axis=0), 1e-12)
+    free = np.where(enough, free, np.inf)
+    size = total / free
+    answers = []
+    for k in range(q):
+        if not enough[k]:
+            answers.append(Answer(0.0, 0.0))
+            continue
+        part_k = part[:, k] - share[:, k] * size[k]
+        dispersion, dof = weighed_variance(part_k, np.clip(share[:, k] / free[k], 0.0, 0.9), free[k])
+        z = z_of_t(abs(total[k]) / np.sqrt(free[k] * dispersion), dof)
+        answers.append(Answer(z, float(total[k] ** 2 / free[k])))
+    return answers
+
+
+def _turning(info: Information, c: int, pairs: list[Array]) -> Answer:
+    """Return the answer of a wave that starts anywhere in each run: two columns a run, each run its own."""
+    statistic, each = 0.0, []
+    for i, x in enumerate(pairs):
+        j, r = info.white_change[i][:, :, c], info.white_residual[i][:, c]
+        xn = x @ j[info.nuisances].T
+        own = x @ x.T - xn @ info.inner[i] @ xn.T
+        score = x @ r - xn @ info.shift[i][:, -1]
+        if np.linalg.eigvalsh(own)[0] > 1e-6:
+            each.append(float(score @ np.linalg.solve(own, score)))
+            statistic += each[-1]
+    if not each:
+        return Answer(0.0, 0.0)
+    z = z_of(float(chi2.logsf(statistic, 2 * len(each))))
+    shown = float(np.median(each)) > 2 * math.log(2.0) * 1.5  # the median of chi^2 with 2 degrees is 2 log 2
+    return Answer(z if shown else 0.0, statistic - 2 * len(each))

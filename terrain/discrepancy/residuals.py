@@ -1,0 +1,298 @@
+"""Measured against simulated, and what each parameter of the simulation would change, behind one low-pass.
+
+Measurement, prediction and sensitivities pass the **same** low-pass: an encoder that is differentiated has
+its errors in what the prediction is made from, and without it they look like latency or mass.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from terrain.constants import GRAVITY_MPS2
+from terrain.discrepancy.signals import Signals
+from terrain.errors import DataError
+from terrain.records import Array
+from terrain.simulation.effects import CHANNELS, INDEX, LIBRARY
+from terrain.simulation.planar import SENSED_ONLY, Planar, move, replay, sense, undone
+
+CUTOFF_HZ = 2.5
+"""Cut-off of the common low-pass at the full clock; what a wheeled robot is told changes within 2 Hz."""
+
+INPUT_CUTOFFS = 2.4
+"""Cut-off of what drives the simulation, over that of the common low-pass."""
+
+SAME_CLOCK = 0.05
+"""Share by which the runs' clocks may differ: one window serves all of them."""
+
+CLOCKS_PER_CUTOFF = 10.0
+"""Rate of the replay's clock over the cut-off of the common low-pass."""
+
+ROWS_PER_CUTOFF = 2.5
+"""Rows a second over the cut-off: the low-pass is down by 50 dB at half the rate of the rows."""
+
+TAPS_PER_CUTOFF = 2.4
+"""Half length of the low-pass times its cut-off."""
+
+MIN_KNOWN = 0.75
+"""Share of the low-pass's weight that has to be known for a row, where a channel has holes."""
+
+SETTLE_S = 0.5
+"""Start and end of a run left out, beside what the low-pass takes: the replay starts as if steady."""
+
+STEPS = {p.name: p.step for effect in LIBRARY for p in effect.parameters} | {
+    "pitch_offset_rad": 0.005,
+    "roll_offset_rad": 0.005,
+}
+"""Over which change of a parameter its sensitivity is taken."""
+
+
+ONE_SIDED = ("steering_play_rad",)
+"""Parameters that are not taken below 0: a play is not negative.  All others are taken to both sides:
+a delay to one side alone is half a step off, and then noise of the wheels looks like it."""
+
+
+class LowPass(NamedTuple):
+    """A symmetric window, and what is written of what passes it.
+
+    Parameters
+    ----------
+    taps : on the clock of the replay
+    every : samples of that clock a row
+    rate_hz : of the rows
+    cutoff_hz : of the window
+    inputs_every : samples of the signals' clock a sample of the replay's; 0 where that clock is too slow for
+        a window of its own in between
+    """
+
+    taps: Array
+    every: int
+    rate_hz: float
+    cutoff_hz: float
+    inputs_every: int
+
+
+class Rows(NamedTuple):
+    """A run behind the low-pass: what is compared, row by row.
+
+    Parameters
+    ----------
+    run_id, terrain : of the run
+    time_s : (m,) from the start of the run
+    measured, predicted : (m, channels)
+    sensitivity : (parameters, m, channels) change of the prediction per change of each parameter asked for
+    inputs : (m, len(INPUTS) - 1 + wheels) what drives the simulation, for looking where a residual comes from
+    """
+
+    run_id: str
+    terrain: str
+    time_s: Array
+    measured: Array
+    predicted: Array
+    sensitivity: Array
+    inputs: Array
+
+    @property
+    def residual(self) -> Array:
+        """Measured minus predicted (m, channels)."""
+        return self.measured - self.predicted
+
+    @property
+    def pace_mps(self) -> Array:
+        """How fast (m,) the wheels turn, straight ahead or against each other."""
+        return np.maximum(np.abs(self.inputs[:, 0]), 0.5 * np.abs(self.inputs[:, 1]))
+
+
+INPUTS: tuple[str, ...] = (
+    "speed_mps",
+    "turn_mps",
+    "steer_rad",
+    "grade_rad",
+    "roll_rad",
+    "force_ratio",
+    "wheel_phase_rad",
+)
+"""Mean rim speed, right minus left (last minus first) rim speed, mean steering, tilt, traction over weight,
+and how far the wheels have turned: a column for each of them."""
+
+
+def low_pass_of(signals: Sequence[Signals]) -> LowPass:
+    """Return the low-pass of runs on one clock, which the slowest logger sets.
+
+    Raises
+    ------
+    DataError
+        if the runs' clocks differ by more than a twentieth.
+    """
+    slow, fast = (pick(signals, key=lambda run: 1 / run.dt_s) for pick in (min, max))
+    rate_hz = 1 / slow.dt_s
+    if 1 / fast.dt_s > (1 + SAME_CLOCK) * rate_hz:
+        raise DataError(
+            f"runs: {slow.run_id} is on a clock of {rate_hz:.3g} Hz, {fast.run_id} on one of "
+            f"{1 / fast.dt_s:.3g} Hz; clocks within {SAME_CLOCK:.0%} of each other are wanted"
+        )
+    cutoff_hz = min(CUTOFF_HZ, rate_hz / 5.0)
+    near = 1 + SAME_CLOCK  # a logger of 49.9 Hz is one of 50
+    inputs_every = int(near * rate_hz / (CLOCKS_PER_CUTOFF * cutoff_hz))
+    clock_hz = rate_hz / max(inputs_every, 1)
+    every = max(int(near * clock_hz / (ROWS_PER_CUTOFF * cutoff_hz)), 1)
+    return LowPass(_window(cutoff_hz, clock_hz), every, clock_hz / every, cutoff_hz, inputs_every)
+
+
+def _window(cutoff_hz: float, rate_hz: float) -> Array:
+    half = math.ceil(TAPS_PER_CUTOFF / cutoff_hz / 2 * rate_hz)
+    k = np.arange(-half, half + 1)
+    taps = np.sinc(2 * cutoff_hz / rate_hz * k) * np.hamming(k.size)
+    return np.asarray(taps / taps.sum())
+
+
+def rows_of(
+    signals: Signals, planar: Planar, vector: Array, parameters: Sequence[str], low_pass: LowPass
+) -> Rows:
+    """Return a run behind the low-pass, and the sensitivities of the parameters named.
+
+    Parameters
+    ----------
+    signals, planar : the run, and the simulation
+    vector : (len(PARAMETERS),) where the prediction and its sensitivities are taken
+    parameters : names
+    low_pass : of all runs
+    """
+    dt, rim, steer, grade, roll, measured = _prepared(signals, low_pass)
+    n_rows = max((len(rim) - low_pass.taps.size) // low_pass.every + 1, 0)
+    first = low_pass.taps.size // 2
+    skip = math.ceil(SETTLE_S * low_pass.rate_hz)
+    keep = slice(skip, max(n_rows - skip, skip))
+
+    known = np.isfinite(measured)
+    whole = bool(known[:, known.any(axis=0)].all())
+
+    def plain(values: Array) -> Array:
+        rows: Array = decimated(np.ascontiguousarray(values), low_pass.taps, low_pass.every)
+        return rows[keep]
+
+    def smooth(values: Array) -> Array:
+        if whole:
+            return plain(values)
+        rows: Array = holed(np.ascontiguousarray(values), known, low_pass.taps, low_pass.every)
+        return rows[keep]
+
+    true_rim, true_grade, true_roll = undone(planar, vector, dt, rim, grade, roll)
+    truth = move(planar, vector, dt, true_rim, steer, true_grade, true_roll, np.zeros((0, 3)))
+
+    def predicted(p: Array, name: str = "") -> Array:
+        if name in SENSED_ONLY:
+            return smooth(sense(planar, p, dt, truth))
+        return smooth(replay(planar, p, dt, rim, steer, grade, roll))
+
+    now = predicted(vector, SENSED_ONLY[0])
+    change = np.empty((len(parameters), *now.shape))
+    for j, name in enumerate(parameters):
+        ahead, back = vector.copy(), vector.copy()
+        ahead[INDEX[name]] += STEPS[name]
+        both = name not in ONE_SIDED or vector[INDEX[name]] >= STEPS[name]
+        if both:
+            back[INDEX[name]] -= STEPS[name]
+        change[j] = predicted(ahead, name) - (predicted(back, name) if both else now)
+        change[j] /= ahead[INDEX[name]] - back[INDEX[name]]
+    speed = rim.mean(axis=1)
+    force = truth[:, 4] / (GRAVITY_MPS2 * planar.mass_kg)
+    inputs = np.column_stack([speed, rim[:, -1] - rim[:, 0], steer.mean(axis=1), grade, roll, force])
+    phase = np.cumsum(rim, axis=0) * (dt / planar.radius_m)
+    at = first + low_pass.every * np.arange(n_rows)[keep]
+    return Rows(
+        signals.run_id,
+        signals.terrain,
+        at * dt,
+        smooth(measured),
+        now,
+        change,
+        np.column_stack([plain(inputs), phase[at]]),
+    )
+
+
+def _prepared(signals: Signals, low_pass: LowPass) -> tuple[float, Array, Array, Array, Array, Array]:
+    """Return the clock's period, rims, steering, grade, roll and what is measured, as the low-pass wants.
+
+    Holes of what drives the simulation are bridged, and what is measured there is dropped.  Both pass a
+    window far above the low-pass: what is bent in the simulation, as friction about rest, turns noise of the
+    wheels into something that does not average out.
+    """
+    columns = np.column_stack([signals.rim_mps, signals.steer_rad, signals.grade_rad, signals.roll_rad])
+    measured = np.array(signals.measured)
+    holes = ~np.isfinite(columns).all(axis=1)
+    if holes.any():
+        at = np.arange(len(columns))
+        for column in columns.T:
+            known = np.isfinite(column)
+            column[:] = np.interp(at, at[known], column[known]) if known.any() else 0.0
+        measured[holes] = np.nan
+    every = low_pass.inputs_every
+    if every > 0:
+        taps = _window(INPUT_CUTOFFS * low_pass.cutoff_hz, 1 / signals.dt_s)
+        both = np.column_stack([columns, measured])
+        half = taps.size // 2
+        padded = np.pad(both, ((half, half), (0, 0)), mode="edge")
+        both = decimated(padded, taps, every)
+        columns, measured = both[:, : columns.shape[1]], both[:, columns.shape[1] :]
+    wheels = signals.rim_mps.shape[1]
+    rim, steer, tilt = np.split(columns, [wheels, 2 * wheels], axis=1)
+    return (
+        signals.dt_s * max(every, 1),
+        np.ascontiguousarray(rim),
+        np.ascontiguousarray(steer),
+        np.ascontiguousarray(tilt[:, 0]),
+        np.ascontiguousarray(tilt[:, 1]),
+        measured,
+    )
+
+
+@njit(cache=True)
+def decimated(values: Array, taps: Array, every: int) -> Array:
+    """Return columns (m, c) of ``values`` (n, c) behind a window, every so many samples; a NaN spreads."""
+    n, c = values.shape
+    m = max((n - taps.size) // every + 1, 0)
+    out = np.zeros((m, c))
+    for row in range(m):
+        start = row * every
+        for t in range(taps.size):
+            for j in range(c):
+                out[row, j] += taps[t] * values[start + t, j]
+    return out
+
+
+@njit(cache=True)
+def holed(values: Array, known: Array, taps: Array, every: int) -> Array:
+    """Return the same of columns with holes: the window's mean over what is known (n, c) of each.
+
+    The same samples have to be left out of whatever is compared.  Where less than :data:`MIN_KNOWN` of the
+    window's weight is known, it is the mean over all: NaN, if there is one among them.
+    """
+    n, c = values.shape
+    m = max((n - taps.size) // every + 1, 0)
+    out = np.empty((m, c))
+    whole = np.abs(taps).sum()
+    for row in range(m):
+        start = row * every
+        for j in range(c):
+            total, weight, there, plain = 0.0, 0.0, 0.0, 0.0
+            for t in range(taps.size):
+                plain += taps[t] * values[start + t, j]
+                if known[start + t, j]:
+                    total += taps[t] * values[start + t, j]
+                    weight += taps[t]
+                    there += abs(taps[t])
+            out[row, j] = total / weight if there >= MIN_KNOWN * whole else plain
+    return out
+
+
+def measured_channels(rows: Sequence[Rows]) -> tuple[str, ...]:
+    """Return the channels that any run has, in the order of ``CHANNELS``."""
+    seen = np.zeros(len(CHANNELS), dtype=bool)
+    for run in rows:
+        seen |= np.isfinite(run.measured).any(axis=0)
+    return tuple(name for name, there in zip(CHANNELS, seen, strict=True) if there)

@@ -1,0 +1,300 @@
+"""The search for causes: greedy addition, refit where sensitivities have changed, drop, swap and rivals."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from terrain.discrepancy.information import Information, counted_from, information_at, loss_of, moved
+from terrain.discrepancy.noise import Noise
+from terrain.discrepancy.residuals import LowPass
+from terrain.discrepancy.selection import Evidence, evidence, fitted
+from terrain.discrepancy.signals import Signals
+from terrain.discrepancy.simulation import Simulation
+from terrain.records import Array
+from terrain.simulation.effects import Effect
+
+MAX_CAUSES = 6
+"""More are not looked for: by then the simulation is of another robot."""
+
+MAX_STEPS = 12
+"""How often something is added or tried in vain."""
+
+MUCH_GAIN, CLOSE_GAIN, MAX_FITTED = 200.0, 0.3, 6
+"""Gain from which on the first few are fitted in earnest: those with that share of the first one's, so
+many at most."""
+
+RIVAL_LOSS = 8.0
+"""Two causes whose best fits differ by less in minus twice the log-likelihood are not told apart: the wrong
+one of two is that much ahead with a chance of 0.3 % at most, whatever the size of the effect."""
+
+PARAMETER_LOSS = 4.0
+"""What a fit has to gain by each of its parameters before it counts as better than one with fewer."""
+
+RIVAL_LINEAR = 80.0
+"""Worse than that before sensitivities are taken anew, and a rival is not tried: it gains less by it."""
+
+Z_PAIR = 4.6
+"""Evidence that each of two effects needs beside the other, where neither stands alone: 4e-6, 300 pairs."""
+
+RIVAL_REFITS = 3
+"""The same, of a rival."""
+
+ALIKE = 0.99
+"""Two effects whose sensitivities correlate more are not taken for a pair."""
+
+MAX_REFITS, SETTLED = 8, 0.3
+"""How often sensitivities of what is selected are taken anew, until a fit moves by less than that share of
+its standard deviation."""
+
+
+class Problem(NamedTuple):
+    """Runs, the simulation, and the low-pass of all."""
+
+    signals: tuple[Signals, ...]
+    simulation: Simulation
+    low_pass: LowPass
+    library: tuple[Effect, ...]
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Of the library."""
+        return tuple(p.name for effect in self.library for p in effect.parameters)
+
+    def at(
+        self, vector: Array, names: Sequence[str] | None = None, noise: Noise | None = None
+    ) -> Information:
+        """Return what the runs say around a point."""
+        wanted = self.parameters if names is None else names
+        return information_at(self.signals, self.simulation, vector, wanted, self.low_pass, noise)
+
+
+class Found(NamedTuple):
+    """Where the search ended.
+
+    Parameters
+    ----------
+    causes : effects selected, in the order in which they came
+    info : what the runs say there, changes counted from the simulation that was given
+    change : (k,) of the parameters ``names``, and its covariance
+    rivals : by cause, the effects that fit as well in its place
+    tried : last evidence of every effect
+    """
+
+    causes: tuple[Effect, ...]
+    info: Information
+    names: tuple[str, ...]
+    change: Array
+    cov: Array
+    rivals: dict[str, tuple[str, ...]]
+    tried: dict[str, Evidence]
+
+
+def names_of(effects: Sequence[Effect]) -> tuple[str, ...]:
+    """Return the parameters of effects, each once.
+
+    Examples
+    --------
+    >>> from terrain.simulation.effects import effect_named
+    >>> names_of([effect_named("lever_arm")])
+    ('lever_x_m', 'lever_y_m')
+    """
+    return tuple(dict.fromkeys(p.name for effect in effects for p in effect.parameters))
+
+
+def search(problem: Problem, start: Information) -> Found:
+    """Return the causes that the runs ask for.
+
+    Parameters
+    ----------
+    problem : of what
+    start : what the runs say around the simulation as it is given
+    """
+    base = start.vector
+    info = start
+    causes: list[Effect] = []
+    barred: set[str] = set()  # came beside the causes that there are, and did not stay
+    for _ in range(MAX_STEPS):
+        new = _next(problem, info, base, causes, barred)
+        if not new or len(causes) + len(new) > MAX_CAUSES:
+            break
+        more, at = _standing(problem, info, base, [*causes, *new])
+        if len(more) > len(causes) or {cause.name for cause in more} != {cause.name for cause in causes}:
+            more, at = _swapped(problem, at, base, more)
+            if {cause.name for cause in more} != {cause.name for cause in causes}:
+                barred = set()
+            causes, info = more, at
+        barred |= {effect.name for effect in new if effect not in causes}
+    names = names_of(causes)
+    change, cov = fitted(info, names)
+    rivals = {cause.name: _rivals(problem, info, base, causes, cause) for cause in causes}
+    tried = {
+        effect.name: evidence(info, [n for n in names if n not in names_of([effect])], effect)
+        for effect in problem.library
+    }
+    return Found(tuple(causes), info, names, change, cov, rivals, tried)
+
+
+def _next(
+    problem: Problem, info: Information, base: Array, causes: Sequence[Effect], barred: set[str]
+) -> list[Effect]:
+    """Return the effect that helps most on runs left out, or a pair where none does alone; else nothing.
+
+    Where much is wrong, what a straight line promises is far off: then the first few are fitted in earnest.
+    """
+    left = [effect for effect in problem.library if effect not in causes and effect.name not in barred]
+    found = [(evidence(info, names_of(causes), effect), effect) for effect in left]
+    standing = [(float(each.gain.sum()), effect) for each, effect in found if each.stands]
+    if not standing:
+        return _pair(info, causes, left)
+    standing.sort(key=lambda pair: -pair[0])
+    best = standing[0][0]
+    close = [effect for gain, effect in standing[:MAX_FITTED] if gain > CLOSE_GAIN * best]
+    if best < MUCH_GAIN or len(close) == 1:
+        return [standing[0][1]]
+    return [min(close, key=lambda effect: _refit_loss(problem, info, base, names_of([*causes, effect])))]
+
+
+def _standing(
+    problem: Problem, info: Information, base: Array, causes: list[Effect]
+) -> tuple[list[Effect], Information]:
+    """Refit causes, and drop the weakest until all stand beside the others."""
+    at = _refitted(problem, info, base, causes)
+    while causes:
+        weak = _weakest(at, causes)
+        if weak is None:
+            break
+        causes = [cause for i, cause in enumerate(causes) if i != weak]
+        at = _refitted(problem, at, base, causes)
+    return causes, at
+
+
+def _swapped(
+    problem: Problem, info: Information, base: Array, causes: list[Effect]
+) -> tuple[list[Effect], Information]:
+    """Swap a cause for an effect that fits better in its place, as long as there is one."""
+    for _ in range(MAX_CAUSES):
+        better = _better(info, causes, problem.library)
+        if better is None:
+            break
+        swapped, at = _standing(problem, info, base, better)
+        if len(swapped) < len(causes):
+            break
+        causes, info = swapped, at
+    return causes, info
+
+
+def _pair(info: Information, causes: Sequence[Effect], library: Sequence[Effect]) -> list[Effect]:
+    """Return two effects that stand beside each other and the causes, where neither stands alone.
+
+    Two that pull the other way, as an offset and a rate of a clock, hide each other.
+    """
+    left = [effect for effect in library if len(effect.parameters) == 1]
+    base, own = info.index(names_of(causes)), info.index(names_of(left))
+    a, g = info.a.sum(axis=0), info.g.sum(axis=0)
+    if base:
+        follow = np.linalg.lstsq(a[np.ix_(base, base)], a[np.ix_(base, own)], rcond=1e-10)[0]
+    else:
+        follow = np.zeros((0, len(own)))
+    a_free = a[np.ix_(own, own)] - a[np.ix_(own, base)] @ follow
+    g_free = g[own] - g[base] @ follow
+    size = np.maximum(np.diag(a_free), 1e-12)
+    z, rho = g_free / np.sqrt(size), a_free / np.sqrt(np.outer(size, size))
+    np.fill_diagonal(rho, 0.0)
+    apart = np.maximum(1.0 - rho**2, 1.0 - ALIKE**2)
+    beside = (z[:, None] - rho * z[None, :]) / np.sqrt(apart)  # of the first, given the second
+    both = np.minimum(np.abs(beside), np.abs(beside.T)) * (np.abs(rho) < ALIKE)
+    for flat in np.argsort(-both, axis=None)[:8:2]:
+        i, j = np.unravel_index(flat, both.shape)
+        if both[i, j] < Z_PAIR:
+            break
+        pair = [left[int(i)], left[int(j)]]
+        found = [
+            evidence(info, (*names_of(causes), *names_of([other])), one) for one, other in (pair, pair[::-1])
+        ]
+        if all(one.stands and one.z > Z_PAIR for one in found):
+            return pair
+    return []
+
+
+def _refitted(problem: Problem, info: Information, base: Array, causes: Sequence[Effect]) -> Information:
+    """Fit, and take sensitivities anew where the fit has gone."""
+    names = names_of(causes)
+    at = info
+    for _ in range(MAX_REFITS):
+        change, cov = fitted(at, names)
+        at = counted_from(problem.at(moved(at, names, change), names, info.noise), base)
+        step = fitted(at, names)[0] - change
+        if (np.abs(step) < SETTLED * np.sqrt(np.maximum(np.diag(cov), 1e-30))).all():
+            break
+    change, _ = fitted(at, names)
+    return counted_from(problem.at(moved(at, names, change)), base)
+
+
+def _weakest(info: Information, causes: Sequence[Effect]) -> int | None:
+    """Return which cause no longer stands beside the others, the weakest of them."""
+    z = []
+    for cause in causes:
+        others = names_of([other for other in causes if other is not cause])
+        found = evidence(info, others, cause)
+        z.append(np.inf if found.stands else found.z)
+    weakest = int(np.argmin(z))
+    return weakest if np.isfinite(z[weakest]) else None
+
+
+def _better(info: Information, causes: Sequence[Effect], library: Sequence[Effect]) -> list[Effect] | None:
+    """Return the causes with one swapped for an effect that fits better in its place, if there is one."""
+    now = _penalised(info, causes)
+    best: tuple[float, list[Effect]] = (now - RIVAL_LOSS, [])
+    for i, cause in enumerate(causes):
+        others = [other for other in causes if other is not cause]
+        for effect in library:
+            if effect in causes or not evidence(info, names_of(others), effect).stands:
+                continue
+            swapped = [*causes[:i], effect, *causes[i + 1 :]]
+            loss = _penalised(info, swapped)
+            if loss < best[0]:
+                best = loss, swapped
+    return best[1] or None
+
+
+def _penalised(info: Information, causes: Sequence[Effect]) -> float:
+    names = names_of(causes)
+    return loss_of(info, names) + PARAMETER_LOSS * len(names)
+
+
+def _rivals(
+    problem: Problem, info: Information, base: Array, causes: Sequence[Effect], cause: Effect
+) -> tuple[str, ...]:
+    """Return all effects that, refitted in a cause's place, fit as well as it does."""
+    names = names_of(causes)
+    others = [other for other in causes if other is not cause]
+    now = loss_of(info, names)
+    near = []
+    for effect in problem.library:
+        if effect in causes:
+            continue
+        swapped = names_of([*others, effect])
+        if loss_of(info, swapped) - now < RIVAL_LINEAR and evidence(info, names_of(others), effect).inside:
+            near.append(effect)
+    if not near:
+        return ()
+    here = _refit_loss(problem, info, base, names)
+    losses = {
+        effect.name: _refit_loss(problem, info, base, names_of([*others, effect])) - here for effect in near
+    }
+    return tuple(name for name, loss in sorted(losses.items(), key=lambda item: item[1]) if loss < RIVAL_LOSS)
+
+
+def _refit_loss(problem: Problem, info: Information, base: Array, names: Sequence[str]) -> float:
+    """Return minus twice the log-likelihood of a nonlinear fit of parameters, with the noise as it is."""
+    at = info
+    loss = np.inf
+    for _ in range(RIVAL_REFITS):
+        change, _ = fitted(at, names)
+        point = problem.at(moved(at, names, change), names, info.noise)
+        loss = min(loss, float(point.c.sum()) + loss_of(point, names))
+        at = counted_from(point, base)
+    return loss + PARAMETER_LOSS * len(names)

@@ -1,0 +1,188 @@
+"""Which effects the runs ask for: one after the other, judged on runs left out and clustered by run."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.stats import chi2, norm
+from scipy.stats import t as student
+
+from terrain.discrepancy.information import BOUNDS, N_BLOCKS, Information
+from terrain.records import Array
+from terrain.simulation.effects import INDEX, Effect
+
+Z_EFFECT = 4.0
+"""Evidence an effect needs, as a standard normal number: 6e-5, times a library of 26."""
+
+TRUST_DOF = 8.0
+"""How many clusters' worth the noise that whitening found counts, beside the scatter between clusters."""
+
+MIN_CLUSTERS = 6
+"""With fewer runs, their time blocks are the clusters."""
+
+N_BOOTSTRAP = 1000
+
+
+class Evidence(NamedTuple):
+    """What speaks for an effect beside those selected.
+
+    Parameters
+    ----------
+    name : of the effect
+    change : (p,) of its parameters, fitted together with the selected ones
+    z : evidence as a standard normal number of the same improbability: the fit over its noise, whose variance
+        is weighed from whitening and from the scatter between clusters, as a t statistic
+    dispersion : scatter between clusters over that which the noise allows, as variances
+    gain : (runs,) fall of minus twice the log-likelihood of each run when it is left out of the fit
+    inside : whether the fitted values lie within their bounds
+    """
+
+    name: str
+    change: Array
+    z: float
+    dispersion: float
+    gain: Array
+    inside: bool
+
+    @property
+    def stands(self) -> bool:
+        """Whether all that is asked for is there."""
+        return self.inside and self.z > Z_EFFECT and gain_interval(self.gain)[0] > 0
+
+    @property
+    def inflation(self) -> float:
+        """By how much the variance of its values is larger than the noise alone tells; 1 at the least."""
+        return max(self.dispersion, 1.0)
+
+
+def fitted(info: Information, names: Sequence[str]) -> tuple[Array, Array]:
+    """Return the change (k,) of parameters that fits all runs best, and its covariance by the noise."""
+    at = info.index(names)
+    a = info.a[:, at][:, :, at].sum(axis=0)
+    cov = np.linalg.pinv(a, hermitian=True)
+    return cov @ info.g[:, at].sum(axis=0), cov
+
+
+def evidence(info: Information, selected: Sequence[str], effect: Effect) -> Evidence:
+    """Return what speaks for an effect beside the parameters selected."""
+    own = [p.name for p in effect.parameters]
+    base, new = info.index([name for name in selected if name not in own]), info.index(own)
+    both = base + new
+    a, g = info.a[:, both][:, :, both], info.g[:, both]
+    total, score = a.sum(axis=0), g.sum(axis=0)
+    n = len(base)
+    if not np.diag(total)[n:].min() > 1e-12:
+        return Evidence(effect.name, np.zeros(len(own)), 0.0, 0.0, np.zeros(len(a)), False)
+    # direction in which the new ones change while the selected ones follow
+    follow = np.linalg.lstsq(total[:n, :n], total[:n, n:], rcond=1e-10)[0] if n else np.zeros((0, len(own)))
+    free = total[n:, n:] - total[n:, :n] @ follow
+    own_score = score[n:] - follow.T @ score[:n]
+    if not np.linalg.eigvalsh(free)[0] > 1e-9 * np.diag(total)[n:].min():
+        free = free + 1e-9 * np.diag(np.diag(total)[n:])
+    change = np.linalg.solve(free, own_score)
+    statistic = float(own_score @ change)
+    now = np.array([info.vector[INDEX[name]] for name in own]) + change
+    inside = all(
+        BOUNDS[name][0] - 1e-9 <= value <= BOUNDS[name][1] for name, value in zip(own, now, strict=True)
+    )
+    dispersion, dof = _dispersion(info, both, n, follow, free, change)
+    z = z_of_t(math.sqrt(_one_degree(statistic, len(own))) / math.sqrt(dispersion), dof)
+    return Evidence(effect.name, change, z, dispersion, held_out_gain(info, base, both), inside)
+
+
+def _one_degree(statistic: float, degrees: int) -> float:
+    """Return the chi^2 of one degree that is as improbable as one of several."""
+    return statistic if degrees == 1 else z_of(float(chi2.logsf(statistic, degrees))) ** 2
+
+
+def _dispersion(
+    info: Information, both: list[int], n: int, follow: Array, free: Array, change: Array
+) -> tuple[float, float]:
+    """Return the variance of a change along itself over that from the noise, and its degrees of freedom.
+
+    The scatter between clusters (runs; time blocks where runs are few) says one thing with as many degrees as
+    there are clusters that tell, the noise says 1 with :data:`TRUST_DOF`; both are weighed by them.
+    """
+    runs = len(info.a) >= MIN_CLUSTERS
+    a = info.a if runs else info.a_blocks.reshape(-1, *info.a.shape[1:])
+    g = info.g if runs else info.g_blocks.reshape(-1, info.g.shape[1])
+    a, g = a[:, both][:, :, both], g[:, both]
+    direction = np.concatenate([-follow @ change, change])
+    size = float(change @ free @ change)
+    if not size > 0:
+        return 1.0, TRUST_DOF
+    x = np.concatenate([np.zeros(n), change])
+    if n:
+        total, score = a.sum(axis=0), g.sum(axis=0)
+        x[:n] = np.linalg.lstsq(total[:n, :n], score[:n] - total[:n, n:] @ change, rcond=1e-10)[0]
+    part = (g - a @ x) @ direction
+    share = np.clip(np.einsum("i,kij,j->k", direction, a, direction) / size, 0.0, 0.9)
+    return weighed_variance(part, share, size)
+
+
+def weighed_variance(part: Array, share: Array, size: float) -> tuple[float, float]:
+    """Return a variance over that from the noise, and its degrees of freedom.
+
+    Parameters
+    ----------
+    part : (clusters,) what is left of each cluster's score at the fit
+    share : (clusters,) of the information that comes from each; they sum up to 1
+    size : information in all, which is the variance of the score by the noise
+    """
+    m = len(part)
+    variance = float(((part / (1.0 - share)) ** 2).sum()) * (m - 1) / m / size
+    dof = max(min(1.0 / (float((share**2).sum()) + 1e-12), m) - 1.0, 1.0)
+    both = TRUST_DOF + dof * variance
+    # Satterthwaite: where clusters scatter far more than the noise allows, only their degrees count
+    return both / (TRUST_DOF + dof), both**2 / (TRUST_DOF + dof * variance**2)
+
+
+def z_of_t(t: float, dof: float) -> float:
+    """Return the normal number that is as improbable as a t statistic, both two-sided."""
+    return z_of(float(student.logsf(t, dof)) + math.log(2.0))
+
+
+def z_of(log_p: float) -> float:
+    """Return the normal number of a two-sided log probability.
+
+    Examples
+    --------
+    >>> round(z_of(math.log(0.05)), 2)
+    1.96
+    """
+    if log_p > -600.0:
+        return max(float(norm.isf(math.exp(log_p) / 2)), 0.0)
+    return math.sqrt(-2.0 * log_p)
+
+
+def held_out_gain(info: Information, base: list[int], both: list[int]) -> Array:
+    """Return the fall (runs,) of each run's loss when it is left out, of ``both`` over ``base``."""
+    return _left_out_loss(info, base) - _left_out_loss(info, both)
+
+
+def _left_out_loss(info: Information, at: list[int]) -> Array:
+    if not at:
+        return np.zeros(len(info.a))
+    a, g = info.a[:, at][:, :, at], info.g[:, at]
+    rest = a.sum(axis=0) - a
+    rest = rest + 1e-9 * np.einsum("kii->ki", rest)[:, :, None] * np.eye(len(at))
+    x = np.linalg.solve(rest, (g.sum(axis=0) - g)[:, :, None])[:, :, 0]
+    loss: Array = np.einsum("ki,kij,kj->k", x, a, x) - 2 * (x * g).sum(axis=1)
+    return loss
+
+
+def gain_interval(gain: Array, seed: int = 0) -> tuple[float, float]:
+    """Return the 95 % interval of the summed gain, by bootstrap over runs."""
+    weights = np.random.default_rng(seed).multinomial(
+        len(gain), np.full(len(gain), 1 / len(gain)), N_BOOTSTRAP
+    )
+    low, high = np.quantile(weights @ gain, [0.025, 0.975])
+    return float(low), float(high)
+
+
+def n_clusters(info: Information) -> int:
+    """Return how many clusters the t statistic has."""
+    return len(info.a) if len(info.a) >= MIN_CLUSTERS else len(info.a) * N_BLOCKS

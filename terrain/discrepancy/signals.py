@@ -1,0 +1,220 @@
+"""From streams to signals on one clock: what drives the simulation, and what it is held against."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import median_filter
+
+from terrain.angles import unwrapped
+from terrain.errors import DataError
+from terrain.estimation.camera import CHANNELS as POSE_CHANNELS
+from terrain.estimation.camera import body_motion
+from terrain.records import Array, RunLog, Stream, read_only
+from terrain.robots import Robot
+from terrain.simulation.effects import (
+    ACCEL,
+    CHANNELS,
+    CURRENT,
+    GYRO,
+    HEADING,
+    SPEED_X,
+    SPEED_Y,
+    TURNING_CURRENT,
+)
+
+MAX_RATE_HZ = 50.0
+"""Clock of the replay, unless the wheels are logged slower."""
+
+MAX_GAP_PERIODS = 3.5
+"""Longest hole of a stream that is bridged by a straight line, in its own periods."""
+
+MIN_LENGTH_S = 4.0
+"""A shorter run has no stretch left once filters have settled."""
+
+JUMP_S, JUMP_MPS, JUMP_SIGMAS = 0.05, 0.1, 8.0
+"""A speed of the camera is no speed but a jump of its map, if it is off the median of so long before and
+after by the second, and by so many times what its speeds are usually off."""
+
+PARALLEL = 0.95
+"""Mean of the wheels' unit vectors from which on the sum of currents tells traction: within 18 degrees."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Signals:
+    """A run on one clock.
+
+    Parameters
+    ----------
+    run_id, terrain : of the run; the terrain is empty where it has no label or several
+    dt_s : period of the clock
+    start_s : first instant on the run's own clock
+    rim_mps : (n, wheels) rim speeds with the nominal radius; NaN where a logger was silent
+    steer_rad : (n, wheels) steering angles, zeros taken off; 0 for a robot that has none
+    grade_rad, roll_rad : (n,) measured tilt, uphill and left side up positive; 0 where none is measured
+    measured : (n, len(CHANNELS)) what the simulation is held against; NaN where nothing was measured
+    """
+
+    run_id: str
+    terrain: str
+    dt_s: float
+    start_s: float
+    rim_mps: Array
+    steer_rad: Array
+    grade_rad: Array
+    roll_rad: Array
+    measured: Array
+
+    def __post_init__(self) -> None:
+        for name in ("rim_mps", "steer_rad", "grade_rad", "roll_rad", "measured"):
+            object.__setattr__(self, name, read_only(getattr(self, name)))
+
+    def __len__(self) -> int:
+        return len(self.measured)
+
+    @property
+    def time_s(self) -> Array:
+        """Time (n,) on the run's own clock."""
+        return self.start_s + self.dt_s * np.arange(len(self))
+
+
+def signals_of(run: RunLog, robot: Robot) -> Signals:
+    """Return what a run says, on one clock.
+
+    Raises
+    ------
+    DataError
+        if the run is of another robot or lacks what drives the simulation, if none of its channels is
+        simulated, or if it is too short.
+    """
+    if run.robot != robot.name:
+        raise DataError(
+            f"run {run.run_id} is of the robot {run.robot!r}, the simulation is of {robot.name!r}"
+        )
+    if "wheels" not in run.streams:
+        raise DataError(f"run {run.run_id}: it has no stream 'wheels', which drives the simulation")
+    wheels = run.streams["wheels"]
+    rims = _rims(run, wheels, robot)
+    swerve = robot.drive == "swerve"
+    if swerve and "steering" not in run.streams:
+        raise DataError(f"run {run.run_id}: it has no stream 'steering', which drives the simulation")
+    used = ["wheels", *(["steering"] if swerve else [])]
+    others = [name for name in ("imu", "odometry", "lidar") if name in run.streams]
+    start_s = max(float(run.streams[name].time_s[0]) for name in (*used, *others))
+    end_s = min(float(run.streams[name].time_s[-1]) for name in (*used, *others))
+    rate_hz = min(MAX_RATE_HZ, wheels.rate_hz)
+    n = math.floor((end_s - start_s) * rate_hz + 1e-6) + 1 if end_s > start_s else 0
+    if n < MIN_LENGTH_S * rate_hz:
+        raise DataError(
+            f"run {run.run_id}: its streams have {max(end_s - start_s, 0.0):.1f} s in common, "
+            f"{MIN_LENGTH_S:g} s at the least are wanted"
+        )
+    time_s = start_s + np.arange(n) / rate_hz
+    steer = np.zeros((n, len(robot.wheels)))
+    if swerve:
+        robot.has("steering")
+        assert robot.steering is not None
+        stream = run.streams["steering"]
+        for i in range(3):
+            raw = unwrapped(stream.channel(f"angle_{i + 1}_rad"))
+            zero = getattr(robot.steering, f"zero_{i + 1}_rad")
+            turn = 2 * math.pi * np.round((raw[np.isfinite(raw)][:1].sum() - zero) / (2 * math.pi))
+            steer[:, i] = _at(time_s, stream.time_s, raw - zero - turn)
+    grade = roll = np.zeros(n)
+    measured = np.full((n, len(CHANNELS)), np.nan)
+    if (imu := run.streams.get("imu")) is not None:
+        tilted = {"roll_rad", "pitch_rad"} <= set(imu.channels)
+        if tilted:
+            grade = -_at(time_s, imu.time_s, imu.channel("pitch_rad"))
+            roll = _at(time_s, imu.time_s, imu.channel("roll_rad"))
+        _put(measured, GYRO, time_s, imu, "gyro_z_radps")
+        if tilted:
+            _put(measured, ACCEL, time_s, imu, "accel_x_mps2")
+    if (seen := run.streams.get("odometry")) is not None:
+        if set(POSE_CHANNELS) <= set(seen.channels):
+            robot.has("camera")
+            assert robot.camera is not None
+            speed = _without_jumps(seen, body_motion(seen, robot.camera).speed_mps)
+            measured[:, CHANNELS.index(SPEED_X)] = _at(time_s, seen.time_s, speed[:, 0])
+            measured[:, CHANNELS.index(SPEED_Y)] = _at(time_s, seen.time_s, speed[:, 1])
+        else:
+            _put(measured, SPEED_X, time_s, seen, "speed_x_mps")
+            _put(measured, SPEED_Y, time_s, seen, "speed_y_mps")
+    if (lidar := run.streams.get("lidar")) is not None:
+        _put(measured, SPEED_X, time_s, lidar, "speed_x_mps")
+        _put(measured, SPEED_Y, time_s, lidar, "speed_y_mps")
+        _put(measured, HEADING, time_s, lidar, "yaw_rate_radps")
+    currents = [f"current_{wheel}_a" for wheel in robot.wheels]
+    if set(currents) <= set(wheels.channels):
+        each = [_at(time_s, wheels.time_s, wheels.channel(name)) for name in currents]
+        measured[:, CHANNELS.index(CURRENT)] = np.sum(each, axis=0)
+        if swerve:
+            parallel = np.abs(np.exp(1j * steer).mean(axis=1)) > PARALLEL
+            measured[~parallel, CHANNELS.index(CURRENT)] = np.nan
+        else:
+            measured[:, CHANNELS.index(TURNING_CURRENT)] = each[1] - each[0]
+    if not np.isfinite(measured).any():
+        raise DataError(
+            f"run {run.run_id}: none of its channels is simulated; a gyro, currents of all wheels, a speed "
+            "over ground or an accelerometer with its tilt is wanted"
+        )
+    return Signals(
+        run.run_id,
+        run.terrains[0] if len(run.terrains) == 1 else "",
+        1 / rate_hz,
+        start_s,
+        np.column_stack([_at(time_s, wheels.time_s, rims[:, i]) for i in range(rims.shape[1])]),
+        steer,
+        grade,
+        roll,
+        measured,
+    )
+
+
+def _rims(run: RunLog, wheels: Stream, robot: Robot) -> Array:
+    """Rim speeds (n, wheels), from rim speeds or from the motors' rates."""
+    for pattern in ("motor_{}_radps", "speed_{}_mps"):
+        names = [pattern.format(wheel) for wheel in robot.wheels]
+        if set(names) <= set(wheels.channels):
+            rates = np.column_stack([wheels.channel(name) for name in names])
+            if pattern.startswith("speed"):
+                return rates
+            robot.has("motors")
+            assert robot.motors is not None
+            return rates * (robot.wheel_radius_m / robot.motors.reduction_ratio)
+    raise DataError(
+        f"run {run.run_id}: its wheels have the channels {', '.join(wheels.channels)}; a speed of each of "
+        f"{', '.join(robot.wheels)} is wanted"
+    )
+
+
+def _without_jumps(seen: Stream, speed_mps: Array) -> Array:
+    """Return speeds (n, 2) with those missing at which the camera found its place anew."""
+    width = 2 * round(JUMP_S * seen.rate_hz) + 1
+    off = np.abs(speed_mps - median_filter(speed_mps, (width, 1), mode="nearest"))
+    usual = 1.48 * np.nanmedian(off, axis=0) if len(off) else np.zeros(2)
+    jumps = (off > np.maximum(JUMP_MPS, JUMP_SIGMAS * usual)).any(axis=1)
+    return np.where(jumps[:, None], np.nan, speed_mps)
+
+
+def _put(measured: Array, channel: str, time_s: Array, stream: Stream, name: str) -> None:
+    if name in stream.channels:
+        measured[:, CHANNELS.index(channel)] = _at(time_s, stream.time_s, stream.channel(name))
+
+
+def _at(time_s: Array, stamps_s: Array, values: Array) -> Array:
+    """Return a signal on the clock by straight lines between its samples; NaN in its holes."""
+    known = np.isfinite(values)
+    if known.sum() < 2:
+        return np.full(time_s.size, np.nan)
+    stamps, told = stamps_s[known], values[known]
+    period_s = float(np.median(np.diff(stamps_s)))
+    at = np.interp(time_s, stamps, told)
+    after = np.searchsorted(stamps, time_s, side="left").clip(1, stamps.size - 1)
+    hole = (stamps[after] - stamps[after - 1]) > MAX_GAP_PERIODS * period_s
+    inside = (time_s > stamps[after - 1]) & (time_s < stamps[after])
+    outside = (time_s < stamps[0] - period_s) | (time_s > stamps[-1] + period_s)
+    at[(hole & inside) | outside] = np.nan
+    return at

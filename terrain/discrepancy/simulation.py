@@ -1,0 +1,74 @@
+"""The simulation under test: a robot, its ground, the effects built in, and what scatters by itself."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
+
+from terrain.errors import ConfigError
+from terrain.records import Array
+from terrain.robots import Robot
+from terrain.simulation.effects import NUISANCES, PARAMETERS, Effect, library_of, vector_of
+from terrain.simulation.planar import Ground, Planar, make_planar
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Simulation:
+    """What :func:`terrain.discrepancy.diagnose.diagnose` holds against measured runs.
+
+    Parameters
+    ----------
+    robot : of the runs
+    ground : on which it is taken to drive
+    effects : parameters of the effects that are built in already; those not named are 0
+    scatter : standard deviation from run to run of parameters in :data:`NUISANCES`; those not named are 0
+
+    Raises
+    ------
+    ConfigError
+        for a parameter that is unknown, or a scatter of something that is no nuisance.
+    """
+
+    robot: Robot
+    ground: Ground = field(default_factory=Ground)
+    effects: Mapping[str, float] = field(default_factory=dict)
+    scatter: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        vector_of(self.effects)
+        for name, std in self.scatter.items():
+            if name not in NUISANCES or not std >= 0:
+                raise ConfigError(f"scatter: {name} is {std!r}; a standard deviation of a nuisance is wanted")
+        object.__setattr__(self, "effects", MappingProxyType(dict(self.effects)))
+        object.__setattr__(self, "scatter", MappingProxyType(dict(self.scatter)))
+
+    @property
+    def library(self) -> tuple[Effect, ...]:
+        """Effects that can befall this robot."""
+        return library_of(self.robot.drive)
+
+    @property
+    def planar(self) -> Planar:
+        """Numbers for the kernels."""
+        return make_planar(self.robot, self.ground)
+
+    @property
+    def vector(self) -> Array:
+        """Parameters (len(PARAMETERS),) of the effects built in."""
+        return vector_of(self.effects)
+
+    @property
+    def scatter_std(self) -> Array:
+        """Scatter (len(PARAMETERS),) of each parameter from run to run, 0 where there is none."""
+        return vector_of(self.scatter)
+
+    def with_effects(self, values: Mapping[str, float]) -> Simulation:
+        """Return the same with more effects built in; what is there already grows by what is given."""
+        grown = {name: self.effects.get(name, 0.0) + value for name, value in values.items()}
+        return replace(self, effects={**self.effects, **grown})
+
+
+def named(vector: Array) -> dict[str, float]:
+    """Return the parameters of a vector that are not 0, by name."""
+    return {name: float(value) for name, value in zip(PARAMETERS, vector, strict=True) if value != 0.0}

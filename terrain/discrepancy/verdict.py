@@ -1,0 +1,234 @@
+"""The answer: what the simulation gets wrong, how sure that is, and what could not have been seen."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+from terrain.records import Array
+
+NONE, EXPLAINED, AMBIGUOUS, UNEXPLAINED, NOT_EXCITED = (
+    "none",
+    "explained",
+    "ambiguous",
+    "unexplained",
+    "not_excited",
+)
+VERDICTS = (NONE, EXPLAINED, AMBIGUOUS, UNEXPLAINED, NOT_EXCITED)
+
+
+class Value(NamedTuple):
+    """A parameter that was found, and the interval (low, high) that holds it with 95 %."""
+
+    name: str
+    value: float
+    unit: str
+    low: float
+    high: float
+
+
+class Cause(NamedTuple):
+    """An effect that the measured runs have and the simulation lacks.
+
+    Parameters
+    ----------
+    name, aliases : of the effect
+    values : its parameters, over what the simulation has of them already
+    gain, gain_low, gain_high : share of the whitened residual's square that it takes from runs left out of
+        its fit, and its 95 % interval by bootstrap over runs
+    channels : where it shows, the clearest first
+    z, dispersion : its evidence, see :class:`terrain.discrepancy.selection.Evidence`
+    """
+
+    name: str
+    aliases: tuple[str, ...]
+    values: tuple[Value, ...]
+    gain: float
+    gain_low: float
+    gain_high: float
+    channels: tuple[str, ...]
+    z: float
+    dispersion: float
+
+
+class Leftover(NamedTuple):
+    """A channel whose residual follows an input, and no effect that says why.
+
+    Parameters
+    ----------
+    channel, input : names
+    z : evidence, in standard deviations
+    share : of the channel's whitened residual that follows it
+    """
+
+    channel: str
+    input: str
+    z: float
+    share: float
+
+
+class Limit(NamedTuple):
+    """The smallest value of an effect that these runs would have shown nine times in ten."""
+
+    name: str
+    value: float
+    unit: str
+    needs: str
+
+
+class RuledOut(NamedTuple):
+    """An effect that is not the answer, and why."""
+
+    name: str
+    reason: str
+    z: float
+
+
+class Excluded(NamedTuple):
+    """A run that does not belong, and why."""
+
+    run_id: str
+    reason: str
+
+
+class Clock(NamedTuple):
+    """By how much the IMU's and the camera's logger is behind the wheels' in a run, and how sure that is."""
+
+    run_id: str
+    offset_s: float
+    std_s: float
+
+
+class Residual(NamedTuple):
+    """How far measured and simulated are apart in one channel, behind the common low-pass.
+
+    Parameters
+    ----------
+    rms : of measured minus simulated
+    noise : of what is left when everything in the library is let go
+    systematic : share of the square that is not noise, from 0 to 1
+    """
+
+    rms: float
+    noise: float
+    systematic: float
+
+
+class NextDrive(NamedTuple):
+    """What to drive next: a scenario of ``terrain simulate``, and how far it parts what is not parted."""
+
+    scenario: str
+    grade_deg: float
+    reason: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Diagnosis:
+    """What :func:`terrain.discrepancy.diagnose.diagnose` found.
+
+    Parameters
+    ----------
+    robot : name
+    verdict : one of :data:`VERDICTS`; ``explained`` where a cause is named, also when something else is left
+    causes : named beyond doubt
+    parameters, cov : names (k,) of their parameters, and the covariance (k, k) of the values
+    ambiguous_sets : effects of which one is there, and these runs do not tell which; the best fit first
+    ambiguous_values : fitted values of each of them, by the effect's name
+    unexplained : channels that follow an input without a name for it
+    limits : detection limit of every effect
+    not_excited : those whose limit is beyond what an effect may be
+    ruled_out : effects that are not the answer
+    excluded_runs, clocks : by run
+    next_drive : None where nothing is to be parted
+    residual_before, residual_after : by channel, with the simulation given and with the causes built in
+    n_runs : that were compared
+    """
+
+    robot: str
+    verdict: str
+    causes: tuple[Cause, ...]
+    parameters: tuple[str, ...]
+    cov: Array
+    ambiguous_sets: tuple[tuple[str, ...], ...]
+    ambiguous_values: dict[str, tuple[Value, ...]]
+    unexplained: tuple[Leftover, ...]
+    limits: tuple[Limit, ...]
+    not_excited: tuple[Limit, ...]
+    ruled_out: tuple[RuledOut, ...]
+    excluded_runs: tuple[Excluded, ...]
+    clocks: tuple[Clock, ...]
+    next_drive: NextDrive | None
+    residual_before: dict[str, Residual]
+    residual_after: dict[str, Residual]
+    n_runs: int
+    notes: tuple[str, ...] = field(default=())
+
+    @property
+    def values(self) -> dict[str, float]:
+        """The parameters of all named causes."""
+        return {value.name: value.value for cause in self.causes for value in cause.values}
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the answer as JSON has it; what is not known is null."""
+        limits = [
+            {"name": x.name, "detection_limit": _number(x.value), "unit": x.unit, "needs": x.needs}
+            for x in self.limits
+        ]
+        missed = {x.name for x in self.not_excited}
+        return {
+            "robot": self.robot,
+            "verdict": self.verdict,
+            "causes": [
+                {
+                    "name": cause.name,
+                    "aliases": list(cause.aliases),
+                    "parameters": [_value(value) for value in cause.values],
+                    "held_out_gain": _number(cause.gain),
+                    "gain_ci": [_number(cause.gain_low), _number(cause.gain_high)],
+                    "channels": list(cause.channels),
+                    "z": _number(cause.z),
+                    "dispersion": _number(cause.dispersion),
+                }
+                for cause in self.causes
+            ],
+            "covariance": {"parameters": list(self.parameters), "matrix": self.cov.tolist()},
+            "ambiguous_sets": [list(names) for names in self.ambiguous_sets],
+            "ambiguous_values": {
+                name: [_value(value) for value in values] for name, values in self.ambiguous_values.items()
+            },
+            "unexplained": [
+                {"channel": x.channel, "input": x.input, "z": _number(x.z), "share": _number(x.share)}
+                for x in self.unexplained
+            ],
+            "not_excited": [limit for limit in limits if limit["name"] in missed],
+            "detection_limits": limits,
+            "ruled_out": [{"name": x.name, "reason": x.reason, "z": _number(x.z)} for x in self.ruled_out],
+            "excluded_runs": [x._asdict() for x in self.excluded_runs],
+            "clocks": [
+                {"run_id": x.run_id, "offset_s": _number(x.offset_s), "std_s": _number(x.std_s)}
+                for x in self.clocks
+            ],
+            "next_drive": None if self.next_drive is None else self.next_drive._asdict(),
+            "residual_before": {name: _residual(x) for name, x in self.residual_before.items()},
+            "residual_after": {name: _residual(x) for name, x in self.residual_after.items()},
+            "n_runs": self.n_runs,
+            "notes": list(self.notes),
+        }
+
+
+def _value(value: Value) -> dict[str, Any]:
+    return {
+        "name": value.name,
+        "value": _number(value.value),
+        "unit": value.unit,
+        "ci": [_number(value.low), _number(value.high)],
+    }
+
+
+def _residual(residual: Residual) -> dict[str, Any]:
+    return {name: _number(value) for name, value in residual._asdict().items()}
+
+
+def _number(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None

@@ -1,0 +1,198 @@
+"""Attribution: hide an effect, and it is named; hide none, and none is; what no log tells is not claimed."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipelines.explain_trials import simulation_of
+from pipelines.hidden_effects import confusable_class, hidden_runs, limits_of, rich_drives
+from terrain.discrepancy.diagnose import MIN_RUNS, diagnose
+from terrain.discrepancy.verdict import AMBIGUOUS, EXPLAINED, NONE, UNEXPLAINED
+from terrain.errors import DataError
+from terrain.records import Stream
+from terrain.robots import load_robot
+from terrain.simulation.effects import GYRO, HEADING, effect_named
+
+OVER = 4.0
+"""Times the smallest amplitude that these drives could show."""
+
+EFFECTS = {
+    "husky": (
+        *("wheel_radius", "one_sided_radius", "effective_track", "camera_latency", "lever_arm", "clock_rate"),
+        *("payload", "motor_drift", "scrub", "side_hill_slip"),
+    ),
+    "agrimaro": (
+        *("steering_offset_2", "steering_play", "encoder_lag", "camera_yaw", "gyro_scale", "accel_bias"),
+        *("force_slip", "viscous_drag"),
+    ),
+}
+"""Of wheels, steering, sensors, clocks, masses, motors and the ground; some of each robot."""
+
+
+class World:
+    """A robot, what it drives, and how small effects these drives could show."""
+
+    def __init__(self, name):
+        self.robot = load_robot(name)
+        self.simulation = simulation_of(self.robot)
+        self.drives = rich_drives(self.robot, np.random.default_rng(3), 6, 40.0)
+        self.limits = limits_of(self.robot, self.drives)
+
+    def runs(self, hidden, outside=None, seed=11):
+        return hidden_runs(self.robot, self.drives, np.random.SeedSequence(seed), hidden, outside)
+
+    def hidden(self, name, over=OVER):
+        effect = effect_named(name)
+        direction = np.ones(len(effect.parameters)) / np.sqrt(len(effect.parameters))
+        size = over * self.limits.of(effect, direction)
+        return {p.name: size * x for p, x in zip(effect.parameters, direction, strict=True)}
+
+    def twins(self, name):
+        effect = effect_named(name)
+        own = confusable_class(self.limits, effect, self.robot.drive)
+        return own | {name, *(twin for twin, _ in effect.twins)}
+
+
+@pytest.fixture(scope="module")
+def worlds():
+    return {name: World(name) for name in EFFECTS}
+
+
+def named(found):
+    return [cause.name for cause in found.causes]
+
+
+def test_where_nothing_is_hidden_nothing_is_named(worlds):
+    for name, world in worlds.items():
+        found = diagnose(world.runs({}), world.simulation)
+        assert (found.verdict, found.robot, found.n_runs) == (NONE, name, 6)
+        assert (found.causes, found.ambiguous_sets, found.unexplained, found.excluded_runs) == (
+            (),
+            (),
+            (),
+            (),
+        )
+        assert {limit.name for limit in found.limits} >= {"payload_ratio", "gyro_bias_radps"}
+        assert len(found.ruled_out) == len(world.simulation.library)
+        assert all(abs(clock.offset_s) < 0.02 for clock in found.clocks)
+        # what is apart is noise, and what scatters from run to run: biases of the gyro
+        apart = {channel: told.systematic for channel, told in found.residual_before.items()}
+        assert all(share < 0.4 for channel, share in apart.items() if channel != GYRO), apart
+        assert json.loads(json.dumps(found.as_json(), allow_nan=False))["verdict"] == NONE
+
+
+@pytest.mark.parametrize(("robot", "name"), [(robot, name) for robot in EFFECTS for name in EFFECTS[robot]])
+def test_a_hidden_effect_is_named_with_its_value_and_nothing_beside_it(worlds, robot, name):
+    world = worlds[robot]
+    hidden = world.hidden(name)
+    found = diagnose(world.runs(hidden), world.simulation)
+    sets = [set(names) for names in found.ambiguous_sets]
+    assert named(found) == [name] or (named(found) == [] and sets and name in sets[0] <= world.twins(name))
+    if found.causes:
+        assert found.verdict == EXPLAINED
+        for value in found.causes[0].values:
+            std = (value.high - value.low) / (2 * 2.13)
+            assert abs(value.value - hidden[value.name]) < 4 * std, value
+        assert found.causes[0].gain_low > 0
+        after = sum(x.systematic for x in found.residual_after.values())
+        assert after < sum(x.systematic for x in found.residual_before.values())
+
+
+@pytest.mark.parametrize(
+    ("robot", "names"),
+    [("husky", ("effective_track", "payload")), ("agrimaro", ("steering_offset_1", "camera_latency"))],
+)
+def test_of_two_hidden_effects_both_are_named(worlds, robot, names):
+    world = worlds[robot]
+    hidden = {key: value for name in names for key, value in world.hidden(name).items()}
+    found = diagnose(world.runs(hidden), world.simulation)
+    assert sorted(named(found)) == sorted(names)
+    assert found.cov.shape == (len(found.parameters),) * 2
+    assert set(found.parameters) == set(hidden) == set(found.values)
+
+
+def test_what_is_built_in_is_not_found_again_and_what_is_half_built_in_is_found_by_half(worlds):
+    world = worlds["husky"]
+    hidden = world.hidden("effective_track", over=8.0)
+    runs = world.runs(hidden)
+    assert diagnose(runs, world.simulation.with_effects(hidden)).verdict == NONE
+    half = {name: 0.5 * value for name, value in hidden.items()}
+    (cause,) = diagnose(runs, world.simulation.with_effects(half)).causes
+    assert cause.name == "effective_track"
+    assert cause.values[0].low < half["effective_track_ratio"] < cause.values[0].high
+
+
+def test_what_no_library_has_gets_no_name(worlds):
+    for world in worlds.values():
+        found = diagnose(world.runs({}, {"wheel_eccentricity_ratio": 0.03}), world.simulation)
+        assert found.verdict == UNEXPLAINED
+        assert named(found) == []
+        assert any("wheel" in left.input for left in found.unexplained)
+
+
+def test_an_effect_whose_entry_is_taken_out_gets_no_other_name(worlds):
+    world = worlds["husky"]
+    library = [effect for effect in world.simulation.library if effect.name != "motor_drift"]
+    found = diagnose(world.runs(world.hidden("motor_drift", over=8.0)), world.simulation, library)
+    assert named(found) == []
+    assert found.verdict == UNEXPLAINED
+    assert any(left.channel == "current_a" and "time" in left.input for left in found.unexplained)
+
+
+def test_exact_twins_are_a_set_and_the_channel_that_parts_them_is_told(worlds):
+    """Without camera, heading and currents a gyro's scale and an effective track are one and the same."""
+    world = worlds["husky"]
+    runs = []
+    for run in world.runs({"gyro_scale_ratio": 0.1}):
+        wheels = run.streams["wheels"]
+        speeds = Stream(wheels.time_s, wheels.values[:, :2], wheels.channels[:2])
+        runs.append(replace(run, streams={"wheels": speeds, "imu": run.streams["imu"]}))
+    found = diagnose(runs, world.simulation)
+    assert found.verdict == AMBIGUOUS
+    assert named(found) == []
+    assert {"gyro_scale", "effective_track"} <= set(found.ambiguous_sets[0])
+    told = {value.name: value.value for values in found.ambiguous_values.values() for value in values}
+    assert told["gyro_scale_ratio"] == pytest.approx(0.1, abs=0.01)
+    assert 1 / (1 + told["effective_track_ratio"]) == pytest.approx(1.1, abs=0.02)
+    assert found.next_drive is not None
+    assert HEADING in found.next_drive.reason
+
+
+def test_a_run_that_does_not_belong_is_left_out_and_the_rest_is_diagnosed(worlds):
+    world = worlds["husky"]
+    runs = list(world.runs(world.hidden("payload")))
+    imu = runs[2].streams["imu"]
+    frozen = imu.values.copy()
+    at = imu.channels.index("gyro_z_radps")
+    frozen[1500:, at] = frozen[1500, at]
+    runs[2] = replace(runs[2], streams={**runs[2].streams, "imu": replace(imu, values=frozen)})
+    found = diagnose(runs, world.simulation)
+    assert [run.run_id for run in found.excluded_runs] == [runs[2].run_id]
+    assert (found.n_runs, len(found.clocks)) == (5, 5)
+    assert named(found) == ["payload"]
+    with pytest.raises(DataError, match="only 2 of 3 are fit to be compared") as error:
+        diagnose(runs[:3], world.simulation)
+    assert "\n" not in str(error.value)
+
+
+def test_the_same_runs_give_the_same_answer(worlds):
+    world = worlds["husky"]
+    runs = world.runs(world.hidden("camera_yaw"))
+    one, other = (diagnose(runs, world.simulation).as_json() for _ in range(2))
+    assert json.dumps(one) == json.dumps(other)
+
+
+def test_runs_that_cannot_be_diagnosed_are_refused_in_one_sentence(worlds):
+    world = worlds["husky"]
+    runs = world.runs({})
+    for given, message in (
+        (runs[: MIN_RUNS - 1], "there are 2, 3 at the least"),
+        ([*runs, runs[0]], "'run_01' is the id of 2 runs"),
+        ([*runs, replace(worlds["agrimaro"].runs({})[0], run_id="x")], "run x is of the robot 'agrimaro'"),
+    ):
+        with pytest.raises(DataError) as error:
+            diagnose(given, world.simulation)
+        assert message in str(error.value)
+        assert "\n" not in str(error.value)

@@ -1,0 +1,83 @@
+"""A gain is what an extension takes off runs that had no say in it; none is claimed that is not there."""
+
+import numpy as np
+import pytest
+
+from terrain.discrepancy.gain import gain
+from terrain.discrepancy.simulation import Simulation
+from terrain.errors import ConfigError, DataError
+from terrain.robots import load_robot
+from terrain.simulation.planar_noise import load_noise, load_scatter
+from terrain.simulation.planar_run import simulate_planar
+
+HUSKY = load_robot("husky")
+LONGER = {"wheel_radius_ratio": 0.03}
+
+
+def twist(duration_s=30.0):
+    """Forward, back and around, at several speeds."""
+    time_s = np.arange(round(50 * duration_s)) / 50
+    ahead = 0.5 * np.sin(0.5 * time_s) + 0.2 * np.sin(1.7 * time_s)
+    return np.column_stack([ahead, np.zeros_like(ahead), 0.4 * np.sin(0.9 * time_s)])
+
+
+def runs(n, effects):
+    day = {"effects": effects, "scatter": load_scatter(), "noise": load_noise()}
+    return [simulate_planar(HUSKY, twist(), i, run_id=f"r{i}", **day) for i in range(n)]
+
+
+@pytest.fixture(scope="module")
+def longer():
+    return runs(7, LONGER)
+
+
+def simulation(effects=None, scatter=True):
+    return Simulation(HUSKY, effects=effects or {}, scatter=load_scatter()._asdict() if scatter else {})
+
+
+def test_the_true_extension_leaves_noise_and_what_scatters(longer):
+    found = gain(simulation(), simulation(LONGER), longer)
+    ahead = found.channels["speed_x_mps"]
+    assert not found.refused
+    assert found.clusters == "runs"
+    assert ahead.reduction.low > 0.5
+    # what is left ahead: noise, and radii that scatter by 0.003 of 0.4 m/s
+    assert ahead.rms_after < 0.006 < ahead.rms_before
+    assert ahead.white_after < 1.3
+    assert found.channels["turning_current_a"].reduction.refused
+
+
+def test_no_gain_is_claimed_for_nothing_for_the_wrong_sign_or_where_nothing_is_hidden(longer):
+    nothing = gain(simulation(), simulation(), longer)
+    assert nothing.reduction == (0.0, 0.0, 0.0)
+    assert nothing.refused
+    wrong = gain(simulation(), simulation({"wheel_radius_ratio": -0.03}), longer)
+    assert wrong.reduction.high < 0.0
+    assert wrong.refused
+    assert gain(simulation(), simulation(LONGER), runs(6, {})).refused
+
+
+def test_without_scatter_the_gain_is_that_of_the_whitened_squares(longer):
+    """Two routes: the form that has scatter integrated out, and plain sums over the channels."""
+    found = gain(simulation(scatter=False), simulation(LONGER, scatter=False), longer)
+    before, after = (
+        sum(getattr(channel, key) ** 2 for channel in found.channels.values())
+        for key in ("white_before", "white_after")
+    )
+    # channels have all the same rows here
+    assert found.reduction.share == pytest.approx(1.0 - after / before, rel=1e-9)
+
+
+def test_few_runs_are_cut_into_thirds_and_the_same_seed_gives_the_same_gain(longer):
+    few = gain(simulation(), simulation(LONGER), longer[:2], seed=3)
+    assert few.clusters == "thirds of runs"
+    assert not few.refused
+    assert few.as_json() == gain(simulation(), simulation(LONGER), longer[:2], seed=3).as_json()
+    assert few.as_json()["ci"] != gain(simulation(), simulation(LONGER), longer[:2], seed=4).as_json()["ci"]
+
+
+def test_what_cannot_be_measured_is_refused(longer):
+    with pytest.raises(DataError, match="no run that was not used"):
+        gain(simulation(), simulation(LONGER), [])
+    with pytest.raises(ConfigError, match="'agrimaro', not of 'husky'"):
+        gain(simulation(), Simulation(load_robot("agrimaro")), longer)

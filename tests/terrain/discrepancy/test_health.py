@@ -1,0 +1,192 @@
+"""What a run has alone makes it unfit; what all have does not."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from terrain.discrepancy.clocks import shifts_of
+from terrain.discrepancy.health import clocks_of, unfit_runs
+from terrain.discrepancy.information import Information
+from terrain.discrepancy.residuals import low_pass_of
+from terrain.discrepancy.search import Problem
+from terrain.discrepancy.signals import Signals, signals_of
+from terrain.discrepancy.simulation import Simulation
+from terrain.discrepancy.verdict import Excluded
+from terrain.errors import DataError
+from terrain.records import Array, RunLog
+from terrain.robots import load_robot
+from terrain.simulation.planar import Ground
+from terrain.simulation.planar_noise import load_noise, load_scatter
+from terrain.simulation.planar_run import Hills, simulate_planar
+from terrain.simulation.scenario import make_scenario
+
+HUSKY, AGRIMARO = load_robot("husky"), load_robot("agrimaro")
+ODD = 2
+"""Which of the runs has the fault."""
+
+
+def drive(robot=HUSKY, seed=0, name="survey", duration_s=40.0, **told) -> RunLog:
+    twist = make_scenario(name, robot, "grass", duration_s, 0.6, seed=seed).twist
+    return simulate_planar(
+        robot,
+        twist,
+        seed,
+        scatter=load_scatter(),
+        noise=load_noise(),
+        hills=Hills((0.04, 0.02), 0.03),
+        run_id=f"run_{seed}",
+        terrain="grass",
+        **told,
+    )
+
+
+def looked_at(runs: Sequence[RunLog]) -> tuple[tuple[Signals, ...], Information]:
+    robot = HUSKY if runs[0].robot == "husky" else AGRIMARO
+    scatter = load_scatter()._asdict()
+    if robot is AGRIMARO:
+        del scatter["effective_track_ratio"]
+    simulation = Simulation(robot, scatter=scatter)
+    signals = tuple(signals_of(run, robot) for run in runs)
+    problem = Problem(signals, simulation, low_pass_of(signals), simulation.library)
+    return signals, problem.at(simulation.vector)
+
+
+def excluded(runs: Sequence[RunLog]) -> tuple[Excluded, ...]:
+    return unfit_runs(*looked_at(runs))
+
+
+def edited(run: RunLog, stream: str, edit: Callable[[Array, Array, list[str]], None]) -> RunLog:
+    was = run.streams[stream]
+    values = was.values.copy()
+    edit(values, was.time_s, list(was.channels))
+    return replace(run, streams={**run.streams, stream: replace(was, values=values)})
+
+
+def late(run: RunLog, by_s: float) -> RunLog:
+    moved = {
+        name: replace(run.streams[name], time_s=run.streams[name].time_s + by_s)
+        for name in ("imu", "odometry")
+    }
+    return replace(run, streams={**run.streams, **moved})
+
+
+@pytest.fixture(scope="module")
+def sound() -> list[RunLog]:
+    return [drive(seed=seed, name="complex" if seed == ODD else "survey") for seed in range(6)]
+
+
+@pytest.mark.parametrize(
+    ("robot", "effects"),
+    [
+        (HUSKY, {}),
+        (AGRIMARO, {}),
+        (HUSKY, {"effective_track_ratio": 1.0, "rolling_resistance_ratio": 0.2}),
+        (HUSKY, {"clock_rate_ratio": 0.015, "camera_latency_s": 0.3}),
+        (HUSKY, {"yaw_delay_s": 0.4, "gyro_scale_ratio": -0.3}),
+        (AGRIMARO, {"encoder_lag_s": 0.3, "force_slip_ratio": 2.0}),
+        (AGRIMARO, {"clock_offset_s": 0.5, "steering_offset_1_rad": 0.2}),
+    ],
+)
+def test_what_all_runs_have_makes_none_unfit(robot, effects):
+    names = ["survey", "complex", "survey", "starts", "spot_turn"]
+    for first in (10, 20):
+        runs = [drive(robot, first + i, name, effects=effects) for i, name in enumerate(names)]
+        assert excluded(runs) == ()
+
+
+def test_a_clock_of_its_own_is_told_to_the_hundredth(sound):
+    runs = [late(run, 0.84 if i == ODD else 0.02) for i, run in enumerate(sound)]
+    signals, info = looked_at(runs)
+    assert unfit_runs(signals, info) == (
+        (f"run_{ODD}", "its IMU and camera are 0.84 s behind its wheels, 0.02 s behind in the other runs"),
+    )
+    clocks = clocks_of(info)
+    assert [clock.run_id for clock in clocks] == [run.run_id for run in runs]
+    assert_allclose(
+        [clock.offset_s for clock in clocks], [0.84 if i == ODD else 0.02 for i in range(6)], atol=0.01
+    )
+    assert all(0 < clock.std_s < 0.01 for clock in clocks)
+
+
+def test_a_clock_needs_something_to_go_by_and_an_offset_of_all_is_no_fault(sound):
+    runs = [late(run, 0.3) for run in [*sound[:3], drive(seed=7, name="stand")]]
+    signals, info = looked_at(runs)
+    assert unfit_runs(signals, info) == ()
+    offset_s = [clock.offset_s for clock in clocks_of(info)]
+    assert_allclose(offset_s[:3], 0.3, atol=0.01)
+    assert np.isnan(offset_s[3])
+    assert np.isnan(clocks_of(info)[3].std_s)
+
+
+def test_clocks_out_of_reach_are_refused_of_most_runs_and_exclude_one(sound):
+    one = excluded([late(run, 5.0) if i == ODD else run for i, run in enumerate(sound)])
+    assert [run.run_id for run in one] == [f"run_{ODD}"]
+    assert "not -0.5 to 2 s behind" in one[0].reason
+    with pytest.raises(DataError, match="unsynchronised clocks beyond the search in 6 of 6"):
+        excluded([late(run, 5.0) for run in sound])
+
+
+def stuck(run: RunLog) -> RunLog:
+    """Let a body stay for four seconds of driving."""
+
+    def stay(values: Array, time_s: Array, channels: list[str]) -> None:
+        still = (time_s > 14) & (time_s < 18)
+        for name in {"gyro_z_radps", "speed_x_mps", "speed_y_mps"} & set(channels):
+            values[still, channels.index(name)] = 0.002 * np.sin(37 * time_s[still])
+
+    return edited(edited(run, "imu", stay), "odometry", stay)
+
+
+def gyro(change: Callable[[Array, Array], Array]) -> Callable[[RunLog], RunLog]:
+    def edit(values: Array, time_s: Array, channels: list[str]) -> None:
+        at = channels.index("gyro_z_radps")
+        values[:, at] = change(time_s, values[:, at])
+
+    return lambda run: edited(run, "imu", edit)
+
+
+def dead_wheel(run: RunLog) -> RunLog:
+    def edit(values: Array, time_s: Array, channels: list[str]) -> None:
+        values[:, channels.index("speed_left_mps")] = 0.0
+
+    return edited(run, "wheels", edit)
+
+
+@pytest.mark.parametrize(
+    ("fault", "reason"),
+    [
+        (stuck, "it is stuck"),
+        (gyro(lambda t, w: np.where(t < 15, w, w[t < 15][-1])), "yaw_rate_radps stands still"),
+        (gyro(lambda t, w: np.clip(w, *np.quantile(w, [0.1, 0.9]))), "yaw_rate_radps is clipped"),
+        (gyro(lambda t, w: np.where(t < 6, w, np.nan)), "yaw_rate_radps is there in 1"),
+        (gyro(lambda t, w: -w), "it is unlike the other runs"),
+        (dead_wheel, "its wheel 1 never turns faster or slower"),
+        (
+            lambda run: drive(seed=ODD, name="complex", ground=Ground(1.2, 0.35, 0.15, 0.3)),
+            "it is unlike the other runs",
+        ),
+    ],
+)
+def test_a_fault_of_one_run_is_found_and_no_other_run_goes(sound, fault, reason):
+    found = excluded([fault(run) if i == ODD else run for i, run in enumerate(sound)])
+    assert [run.run_id for run in found] == [f"run_{ODD}"]
+    assert reason in found[0].reason
+
+
+def test_a_run_alone_is_not_judged_by_others_and_clocks_that_are_known_are_not_sought_again(sound):
+    signals, info = looked_at(sound[:1])
+    assert unfit_runs(signals, info) == ()
+    signals, info = looked_at([late(run, 0.84 if i == ODD else 0.02) for i, run in enumerate(sound)])
+    shift = shifts_of(info)
+    assert unfit_runs(signals, info, shift) == unfit_runs(signals, info)
+    assert clocks_of(info, shift) == clocks_of(info)
+
+
+def test_of_three_runs_none_is_unlike_and_a_terrain_of_its_own_is_not_judged(sound):
+    sand = drive(seed=ODD, ground=Ground(1.2, 0.35, 0.15, 0.3))
+    assert excluded([sound[0], sound[1], sand]) == ()
+    labelled = replace(sand, labels=(sand.labels[0]._replace(terrain="sand"),))
+    assert excluded([*sound[:2], *sound[3:], labelled]) == ()

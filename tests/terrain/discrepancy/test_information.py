@@ -1,0 +1,144 @@
+"""The quadratic form is generalised least squares with the scatter of each run written out."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from terrain.discrepancy.information import (
+    BOUNDS,
+    N_BLOCKS,
+    counted_from,
+    information_at,
+    loss_of,
+    moved,
+)
+from terrain.discrepancy.residuals import low_pass_of
+from terrain.discrepancy.selection import fitted
+from terrain.discrepancy.signals import signals_of
+from terrain.discrepancy.simulation import Simulation
+from terrain.robots import load_robot
+from terrain.simulation.effects import CHANNELS, INDEX, SPEED_X, vector_of
+from terrain.simulation.planar_noise import load_noise, load_scatter
+from terrain.simulation.planar_run import Hills, simulate_planar
+
+HUSKY = load_robot("husky")
+SCATTER = load_scatter()
+SIMULATION = Simulation(HUSKY, scatter=SCATTER._asdict())
+NAMES = ("payload_ratio", "camera_yaw_rad", "camera_latency_s", "lever_x_m", "rolling_resistance_ratio")
+HIDDEN = {"camera_yaw_rad": 0.03}
+
+
+@pytest.fixture(scope="module")
+def signals():
+    runs = []
+    for seed in range(3):
+        t = np.arange(1251) / 50
+        ahead = 0.5 * np.sin(0.6 * t + seed) * np.minimum(t, 1.0) + 0.2 * np.sin(1.9 * t)
+        twist = np.column_stack([ahead, np.zeros_like(t), 0.5 * np.sin(0.9 * t)])
+        run = simulate_planar(
+            HUSKY,
+            twist,
+            seed,
+            effects=HIDDEN,
+            scatter=SCATTER,
+            noise=load_noise(),
+            hills=Hills((0.05, 0.03), 0.02),
+        )
+        runs.append(signals_of(run, HUSKY))
+    holes = runs[1].measured.copy()
+    holes[500:600, CHANNELS.index(SPEED_X)] = np.nan
+    return [runs[0], replace(runs[1], measured=holes), runs[2]]
+
+
+@pytest.fixture(scope="module")
+def info(signals):
+    return information_at(signals, SIMULATION, SIMULATION.vector, NAMES, low_pass_of(signals))
+
+
+def dense(info, i):
+    """Whitened sensitivities (k, m), residual (m,), inverse covariance (m, m) of a run, by plain sums."""
+    run = info.rows[i]
+    residual, size = run.residual, info.noise.size(run.pace_mps)
+    n, channels = residual.shape
+    order = info.noise.filters.shape[1] - 1
+    rows_j, rows_r = [], []
+    for c in range(channels):
+        taps = info.noise.filters[c]
+        if not np.isfinite(taps).all():
+            continue
+        for k in range(n):
+            used = [lag for lag in range(order + 1) if taps[lag] != 0.0]
+            if k - max(used) < 0 or not all(np.isfinite(residual[k - lag, c]) for lag in used):
+                continue
+            rows_r.append(sum(taps[lag] * residual[k - lag, c] / size[k - lag, c] for lag in used))
+            rows_j.append(sum(taps[lag] * run.sensitivity[:, k - lag, c] / size[k - lag, c] for lag in used))
+    j, r = np.array(rows_j).T, np.array(rows_r)
+    scatter = j[info.nuisances]
+    cov = np.eye(r.size) + scatter.T @ np.diag(info.nuisance_std**2) @ scatter
+    return j, r, np.linalg.inv(cov)
+
+
+def test_the_form_is_generalised_least_squares_with_scatter_written_out(info):
+    total_a, total_g = 0.0, 0.0
+    for i in range(len(info.rows)):
+        j, r, weight = dense(info, i)
+        a, g, c = j @ weight @ j.T, j @ weight @ r, r @ weight @ r
+        scale = np.sqrt(np.outer(a.diagonal(), a.diagonal()))
+        assert np.abs((info.a[i] - a) / np.maximum(scale, 1e-12)).max() < 1e-6
+        assert_allclose(info.g[i], g, atol=1e-6 * np.sqrt(a.diagonal().max() * c))
+        assert info.c[i] == pytest.approx(c)
+        total_a, total_g = total_a + a, total_g + g
+    at = [info.parameters.index(name) for name in NAMES]
+    change, cov = fitted(info, NAMES)
+    expected = np.linalg.solve(total_a[np.ix_(at, at)], total_g[at])
+    std = np.sqrt(np.diag(cov))
+    assert_allclose(change / std, expected / std, atol=1e-5)
+    assert_allclose(cov, np.linalg.inv(total_a[np.ix_(at, at)]), rtol=1e-5, atol=1e-12)
+    assert loss_of(info, NAMES) == pytest.approx(-total_g[at] @ expected)
+    assert loss_of(info, ()) == 0.0
+    off = change[1] - HIDDEN["camera_yaw_rad"]
+    assert abs(off) < 4 * std[1]
+
+
+def test_what_scatters_is_a_parameter_too_and_its_scatter_widens_what_is_known_of_it(info, signals):
+    assert info.parameters[: len(NAMES)] == NAMES
+    assert set(np.array(info.parameters)[info.nuisances]) == set(SCATTER._fields)
+    firm = information_at(signals, Simulation(HUSKY), info.vector, NAMES, low_pass_of(signals), info.noise)
+    name = ["rolling_resistance_ratio"]  # which scatters
+    wide, narrow = fitted(info, name)[1][0, 0], fitted(firm, name)[1][0, 0]
+    # the mean over runs cannot be better known than its scatter lets
+    assert wide > SCATTER.rolling_resistance_ratio**2 / len(signals) > narrow
+    assert firm.nuisances.size == 0
+
+
+def test_blocks_sum_up_to_the_whole(info):
+    assert info.a_blocks.shape[1] == N_BLOCKS
+    scale = np.abs(info.a).max()
+    assert_allclose(info.a_blocks.sum(axis=1), info.a, atol=1e-9 * scale)
+    assert_allclose(info.g_blocks.sum(axis=1), info.g, atol=1e-9 * np.abs(info.g).max())
+
+
+def test_changes_counted_from_another_point_end_at_the_same_values(signals, info):
+    base = info.vector
+    there = vector_of({"camera_yaw_rad": 0.02, "payload_ratio": 0.05})
+    low_pass = low_pass_of(signals)
+    moved_info = information_at(signals, SIMULATION, there, NAMES, low_pass, info.noise)
+    here = counted_from(moved_info, base)
+    names = list(NAMES[:2])
+    change, _ = fitted(moved_info, names)
+    again, cov = fitted(here, names)
+    assert_allclose(again, change + [there[INDEX[name]] for name in names], atol=1e-9)
+    # the simulation is all but straight in these two: sensitivities taken elsewhere give the same answer
+    direct, _ = fitted(info, names)
+    assert (np.abs(again - direct) < np.sqrt(np.diag(cov))).all()
+    assert_allclose(here.vector, base)
+
+
+def test_a_point_that_is_moved_to_keeps_within_bounds(info):
+    point = moved(info, ["payload_ratio", "camera_latency_s", "pitch_offset_rad"], np.array([9.0, -0.1, 0.3]))
+    assert point[INDEX["payload_ratio"]] == BOUNDS["payload_ratio"][1]
+    assert point[INDEX["camera_latency_s"]] == 0.0
+    assert point[INDEX["pitch_offset_rad"]] == 0.3
+    assert not info.vector.any()

@@ -1,0 +1,101 @@
+"""The drive that is told parts what it says, when it is driven."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from terrain.discrepancy.information import Information, information_at
+from terrain.discrepancy.next_drive import next_drive
+from terrain.discrepancy.residuals import low_pass_of
+from terrain.discrepancy.signals import signals_of
+from terrain.discrepancy.simulation import Simulation
+from terrain.discrepancy.verdict import Limit, NextDrive
+from terrain.records import RunLog
+from terrain.robots import load_robot
+from terrain.simulation.planar_noise import load_noise, load_scatter
+from terrain.simulation.planar_run import Hills, simulate_planar
+from terrain.simulation.scenario import make_scenario
+
+SCATTER = load_scatter()._asdict()
+HUSKY = Simulation(load_robot("husky"), scatter=SCATTER)
+AGRIMARO = Simulation(
+    load_robot("agrimaro"), scatter={k: v for k, v in SCATTER.items() if k != "effective_track_ratio"}
+)
+
+
+def drive(simulation: Simulation, name: str, grade_deg: float = 0.0, seed: int = 0) -> RunLog:
+    twist = make_scenario(name, simulation.robot, "grass", speed_mps=0.6, seed=seed).twist
+    hills = Hills((np.tan(np.radians(grade_deg)), 0.0))
+    return simulate_planar(simulation.robot, twist, seed, hills=hills, noise=load_noise(), run_id=f"{seed}")
+
+
+def said(simulation: Simulation, runs: list[RunLog], names: list[str]) -> Information:
+    signals = [signals_of(run, simulation.robot) for run in runs]
+    return information_at(signals, simulation, simulation.vector, names, low_pass_of(signals))
+
+
+def collinearity(info: Information, names: list[str]) -> float:
+    """Index of two parameters of one number each, by its definition."""
+    at = info.index(names)
+    a = info.a[:, at][:, :, at].sum(axis=0)
+    return float(1 / np.sqrt(1 - abs(a[0, 1]) / np.sqrt(a[0, 0] * a[1, 1])))
+
+
+@pytest.mark.parametrize(
+    ("simulation", "group", "names"),
+    [
+        (HUSKY, ("rolling_resistance", "viscous_drag"), ["rolling_resistance_ratio", "viscous_drag_nspm"]),
+        (HUSKY, ("force_slip", "shear_slip"), ["force_slip_ratio", "shear_slip_ratio"]),
+        (AGRIMARO, ("steering_offset_1", "gyro_bias"), ["steering_offset_1_rad", "gyro_bias_radps"]),
+    ],
+)
+def test_the_drive_that_is_told_has_the_index_that_is_told(simulation, group, names):
+    before = said(simulation, [drive(simulation, "straight", seed=seed) for seed in range(3)], names)
+    told = next_drive(simulation, [group], (), before)
+    assert told is not None
+    index = re.search(r"falls from ([\d.]+) to ([\d.]+)$", told.reason)
+    assert index is not None
+    was, comes = float(index[1]), float(index[2])
+    assert was == pytest.approx(collinearity(before, names), rel=0.05)
+    assert comes < 0.5 * was
+    driven = said(simulation, [drive(simulation, told.scenario, told.grade_deg, seed=9)], names)
+    assert collinearity(driven, names) < max(1.5 * comes, 0.5 * was)
+
+
+def test_twins_need_a_sensor_and_the_reason_names_it():
+    runs = [drive(HUSKY, "complex", seed=seed) for seed in range(3)]
+    blind = [replace(run, streams={k: s for k, s in run.streams.items() if k != "odometry"}) for run in runs]
+    names = ["gyro_scale_ratio", "effective_track_ratio"]
+    told = next_drive(
+        replace(HUSKY, scatter={}),
+        [("effective_track", "gyro_scale")],
+        (),
+        said(replace(HUSKY, scatter={}), blind, names),
+    )
+    assert told is not None
+    assert "one without heading_rate_radps" in told.reason
+
+
+def test_what_was_not_shown_is_asked_for_and_its_limit_is_told():
+    names = ["side_hill_slip_ratio", "camera_yaw_rad"]
+    before = said(AGRIMARO, [drive(AGRIMARO, "straight", seed=seed) for seed in range(3)], names)
+    missed = [Limit("side_hill_slip_ratio", np.inf, "ratio", "both signs of roll")]
+    told = next_drive(AGRIMARO, (), missed, before)
+    assert told is not None
+    assert told.grade_deg > 0  # there is no roll on the level
+    limit = re.search(r"from infinite to ([\d.]+) ratio", told.reason)
+    assert limit is not None
+    info = said(AGRIMARO, [drive(AGRIMARO, told.scenario, told.grade_deg)], names)
+    at = info.index(names[:1])[0]
+    assert 5.48 / np.sqrt(info.a[0, at, at]) == pytest.approx(float(limit[1]), rel=0.6)
+
+
+def test_nothing_is_told_where_there_is_nothing_to_part_or_nothing_parts_it():
+    assert next_drive(HUSKY, (), ()) is None
+    bare = replace(HUSKY, robot=replace(HUSKY.robot, motors=None))
+    assert next_drive(bare, [("wheel_radius", "force_slip")], ()) is None
+    typical = next_drive(AGRIMARO, [("steering_play", "steering_delay")], ())
+    assert isinstance(typical, NextDrive)
+    assert "would be" in typical.reason

@@ -1,0 +1,93 @@
+"""Noise that is coloured and grows with speed comes out white, of size one."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from terrain.discrepancy.noise import ORDER, noise_of, whitened
+
+GROWTH = np.array([[0.2, 0.0, 0.8], [1e-4, 3e-4, 0.0]])
+"""Coefficients of the variance in 1, v and v^2, of two channels."""
+
+KEEP = np.array([0.8, 0.3])
+"""Of each channel's noise, from row to row."""
+
+
+def runs(n_runs, n_rows, seed=0):
+    """Return speeds and noise of runs: AR(1) times what speed makes of it."""
+    rng = np.random.default_rng(seed)
+    speeds, residuals = [], []
+    for _ in range(n_runs):
+        speed = np.abs(0.6 * np.sin(0.01 * np.arange(n_rows) + rng.uniform(0, 6)) + 0.3)
+        x = np.zeros((n_rows, 2))
+        x[0] = rng.standard_normal(2)
+        for k in range(1, n_rows):
+            x[k] = KEEP * x[k - 1] + np.sqrt(1 - KEEP**2) * rng.standard_normal(2)
+        speeds.append(speed)
+        residuals.append(x * np.sqrt(np.column_stack([speed**0, speed, speed**2]) @ GROWTH.T))
+    return speeds, residuals
+
+
+def test_coloured_noise_that_grows_with_speed_comes_out_white():
+    speeds, residuals = runs(8, 1500)
+    noise = noise_of(residuals, speeds, 0)
+    at = np.array([0.1, 0.4, 0.8])
+    expected = np.sqrt(np.column_stack([at**0, at, at**2]) @ GROWTH.T)
+    assert_allclose(noise.size(at), expected, rtol=0.12)
+    assert_allclose(noise.size(-at), noise.size(at))
+    assert_allclose(
+        noise.std, [np.std(np.concatenate([r[:, c] for r in residuals])) for c in (0, 1)], rtol=0.02
+    )
+    white = np.concatenate(
+        [
+            whitened(noise.filters, (r / noise.size(v))[None])[0, ORDER:]
+            for r, v in zip(residuals, speeds, strict=True)
+        ]
+    )
+    fast = np.concatenate([v[ORDER:] for v in speeds]) > 0.5
+    std = 1 / np.sqrt(2 * len(white))
+    for c in (0, 1):
+        assert np.std(white[:, c]) == pytest.approx(1.0, abs=4 * std)
+        assert np.std(white[fast, c]) == pytest.approx(np.std(white[~fast, c]), rel=0.08)
+        for lag in (1, 2, 5):
+            correlation = np.corrcoef(white[lag:, c], white[:-lag, c])[0, 1]
+            assert abs(correlation) < 4 / np.sqrt(len(white)), (c, lag)
+
+
+def test_what_was_fitted_has_made_residuals_smaller():
+    """A hundred numbers take a hundred degrees of freedom away, shared by the two channels."""
+    speeds, residuals = runs(2, 300)
+    plain, fitted = (noise_of(residuals, speeds, n) for n in (0, 100))
+    grown = np.sqrt(1 / (1 - 100 / (2 * 2 * 300)))
+    assert_allclose(fitted.std / plain.std, grown, rtol=0.005)
+    assert_allclose(plain.filters[:, 0] / fitted.filters[:, 0], grown, rtol=0.005)
+
+
+def test_the_filter_is_a_convolution_and_stops_where_something_is_unknown():
+    rng = np.random.default_rng(1)
+    x = rng.standard_normal((3, 50, 2))
+    x[1, 20, 0] = np.nan
+    filters = rng.standard_normal((2, ORDER + 1))
+    out = whitened(filters, x)
+    for j in range(3):
+        for c in range(2):
+            expected = np.convolve(x[j, :, c], filters[c])[:50]
+            expected[:ORDER] = 0.0
+            expected[np.isnan(expected)] = 0.0
+            assert_allclose(out[j, :, c], expected, atol=1e-12)
+    assert (out[1, 20 : 21 + ORDER, 0] == 0).all()
+
+
+def test_a_channel_that_is_hardly_measured_or_never_differs_has_no_filter():
+    speeds, residuals = runs(3, 300)
+    gone = [
+        np.column_stack([r[:, 0], np.where(np.arange(300) < 12, r[:, 1], np.nan), 0 * r[:, 0]])
+        for r in residuals
+    ]
+    noise = noise_of(gone, speeds, 0)
+    assert np.isfinite(noise.filters).all(axis=1).tolist() == [True, False, False]
+    assert np.isfinite(noise.std).tolist() == [True, False, False]
+    holes = [r.copy() for r in residuals]
+    for r in holes:
+        r[100:140] = np.nan
+    assert_allclose(noise_of(holes, speeds, 0).std, noise_of(residuals, speeds, 0).std, rtol=0.15)

@@ -1,0 +1,214 @@
+"""Measured, predicted and sensitivities behind one low-pass."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from terrain.discrepancy.residuals import (
+    ONE_SIDED,
+    STEPS,
+    _prepared,
+    decimated,
+    holed,
+    low_pass_of,
+    measured_channels,
+    rows_of,
+)
+from terrain.discrepancy.signals import Signals, signals_of
+from terrain.discrepancy.simulation import Simulation
+from terrain.errors import DataError
+from terrain.robots import load_robot
+from terrain.simulation.effects import (
+    ACCEL,
+    CHANNELS,
+    CURRENT,
+    GYRO,
+    HEADING,
+    INDEX,
+    SPEED_X,
+    SPEED_Y,
+    TURNING_CURRENT,
+    vector_of,
+)
+from terrain.simulation.planar import replay
+from terrain.simulation.planar_run import Hills, simulate_planar
+
+ROBOTS = {"husky": load_robot("husky"), "agrimaro": load_robot("agrimaro")}
+HIDDEN = {
+    "husky": {
+        "payload_ratio": 0.2,
+        "effective_track_ratio": 0.3,
+        "camera_latency_s": 0.06,
+        "clock_offset_s": 0.1,
+    },
+    "agrimaro": {
+        "payload_ratio": 0.2,
+        "steering_offset_2_rad": 0.05,
+        "encoder_lag_s": 0.05,
+        "lever_x_m": 0.1,
+    },
+}
+NOISE = {
+    GYRO: 0.01,
+    SPEED_X: 0.005,
+    SPEED_Y: 0.005,
+    ACCEL: 0.1,
+    CURRENT: 1.0,
+    TURNING_CURRENT: 1.0,
+    HEADING: 0.02,
+}
+"""About what sensors of these robots show of nothing."""
+
+
+def drive(robot, effects):
+    t = np.arange(1501) / 50
+    start = np.minimum(t, 1.0)
+    speed = 0.5 * np.sin(0.8 * t) + 0.2 * np.sin(1.9 * t)
+    twist = np.column_stack([speed, np.zeros_like(t), 0.3 * np.sin(1.1 * t)]) * start[:, None]
+    if robot is ROBOTS["agrimaro"]:
+        twist[:, 0] += 0.7 * start  # where it stops, its steering turns in no time
+    return simulate_planar(
+        robot, twist, 1, effects=effects, hills=Hills((0.05, 0.02), 0.02), heading=robot is ROBOTS["husky"]
+    )
+
+
+@pytest.fixture(scope="module", params=ROBOTS)
+def looked_at(request):
+    """Robot, its simulation, and the signals of a noise-free drive with effects hidden."""
+    robot = ROBOTS[request.param]
+    effects = HIDDEN[request.param]
+    return Simulation(robot), effects, signals_of(drive(robot, effects), robot)
+
+
+def test_with_the_right_effects_hardly_anything_is_left_and_without_them_much(looked_at):
+    simulation, effects, signals = looked_at
+    low_pass = low_pass_of([signals])
+    noise = np.array([NOISE[channel] for channel in CHANNELS])
+    right, wrong = (
+        rows_of(signals, simulation.planar, vector_of(values), (), low_pass) for values in (effects, {})
+    )
+    there = np.isfinite(right.residual).any(axis=0)
+    left, much = (
+        np.sqrt(np.nanmean((rows.residual / noise)[:, there] ** 2, axis=0)) for rows in (right, wrong)
+    )
+    assert left.max() < 0.15, dict(zip(measured_channels([right]), left, strict=True))
+    assert much.max() > 3.0
+    assert measured_channels([right]) == tuple(np.array(CHANNELS)[there])
+
+
+def test_sensitivities_are_differences_of_full_replays(looked_at):
+    """Two routes: effects of sensors alone reuse the motion, and here all is replayed."""
+    simulation, effects, signals = looked_at
+    low_pass, point = low_pass_of([signals]), vector_of(effects)
+    names = [p.name for effect in simulation.library for p in effect.parameters]
+    rows = rows_of(
+        signals, simulation.planar, point, [*names, "pitch_offset_rad", "roll_offset_rad"], low_pass
+    )
+    for name, change in zip([*names, "pitch_offset_rad", "roll_offset_rad"], rows.sensitivity, strict=True):
+        step = STEPS[name]
+        ahead, back = point.copy(), point.copy()
+        ahead[INDEX[name]] += step
+        if name not in ONE_SIDED:
+            back[INDEX[name]] -= step
+        far, near = (rows_of(signals, simulation.planar, p, (), low_pass).predicted for p in (ahead, back))
+        expected = (far - near) / (ahead - back)[INDEX[name]]
+        assert_allclose(change, expected, atol=1e-9 * np.nanmax(np.abs(expected)) + 1e-12, err_msg=name)
+
+
+def test_measured_and_predicted_pass_the_same_window(looked_at):
+    """A prediction that is fed back as what was measured leaves nothing, holes or none."""
+    simulation, effects, signals = looked_at
+    low_pass = low_pass_of([signals])
+    dt, rim, steer, grade, roll, _ = _prepared(signals, low_pass)
+    shown = replay(simulation.planar, vector_of(effects), dt, rim, steer, grade, roll)
+    own = low_pass._replace(inputs_every=0)
+    fed = {"rim_mps": rim, "steer_rad": steer, "grade_rad": grade, "roll_rad": roll}
+    same = replace(signals, dt_s=dt, measured=shown, **fed)
+    rows = rows_of(same, simulation.planar, vector_of(effects), (), own)
+    assert_array_equal(rows.measured, rows.predicted)
+    holes = shown.copy()
+    holes[300:320] = holes[500:503] = np.nan
+    rows = rows_of(replace(same, measured=holes), simulation.planar, vector_of(effects), (), own)
+    known = np.isfinite(rows.residual)
+    assert 0.8 < known.mean() < 1.0
+    assert_allclose(rows.residual[known], 0.0, atol=1e-12)
+
+
+def test_the_window_passes_what_is_slow_and_stops_what_rows_cannot_hold():
+    signals = fake(0.02)
+    low_pass = low_pass_of([signals])
+    clock_hz = low_pass.rate_hz * low_pass.every
+    n = np.arange(-(low_pass.taps.size // 2), low_pass.taps.size // 2 + 1)
+
+    def gain(frequency_hz):
+        return abs(np.sum(low_pass.taps * np.exp(2j * np.pi * frequency_hz / clock_hz * n)))
+
+    assert gain(0.0) == pytest.approx(1.0)
+    assert gain(0.4 * low_pass.cutoff_hz) == pytest.approx(1.0, abs=0.02)
+    assert gain(low_pass.cutoff_hz) == pytest.approx(0.5, abs=0.02)
+    stopped = np.linspace(1.9 * low_pass.cutoff_hz, clock_hz / 2, 50)
+    assert max(gain(f) for f in stopped) < 0.01
+
+
+def test_decimation_is_a_convolution_and_holes_are_weighed_out():
+    rng = np.random.default_rng(0)
+    values, taps = rng.standard_normal((200, 2)), np.hamming(21) / np.hamming(21).sum()
+    expected = np.column_stack([np.convolve(column, taps, mode="valid")[::4] for column in values.T])
+    assert_allclose(decimated(values, taps, 4), expected)
+    assert_allclose(holed(values, np.ones((200, 2), dtype=bool), taps, 4), expected)
+    known = np.ones((200, 2), dtype=bool)
+    known[50:52, 0] = False
+    known[100:140, 1] = False
+    told = holed(np.where(known, values, np.nan), known, taps, 4)
+    for row in range(len(told)):
+        window = slice(4 * row, 4 * row + 21)
+        for c in range(2):
+            weight = taps * known[window, c]
+            if weight.sum() >= 0.75:
+                mean = np.sum(weight * np.nan_to_num(values[window, c])) / weight.sum()
+                assert told[row, c] == pytest.approx(mean)
+            else:
+                assert np.isnan(told[row, c])
+    assert np.isnan(told).sum(axis=0).tolist() == [0, 12]
+
+
+def test_a_hole_stays_unknown_and_nothing_else_is_lost(looked_at):
+    simulation, effects, signals = looked_at
+    measured, rim = signals.measured.copy(), signals.rim_mps.copy()
+    time_s = signals.time_s
+    c = CHANNELS.index(SPEED_X)
+    measured[(time_s > 8.0) & (time_s < 11.0), c] = np.nan
+    rim[(time_s > 15.0) & (time_s < 16.0)] = np.nan
+    low_pass = low_pass_of([signals])
+    holes = replace(signals, measured=measured, rim_mps=rim)
+    point = vector_of(effects)
+    rows = rows_of(holes, simulation.planar, point, ["payload_ratio"], low_pass)
+    before = rows_of(signals, simulation.planar, point, ["payload_ratio"], low_pass)
+    inside = (rows.time_s > 8.3) & (rows.time_s < 10.7)
+    assert np.isnan(rows.measured[inside, c]).all()
+    assert np.isnan(rows.measured[(rows.time_s > 15.3) & (rows.time_s < 15.7)]).all()
+    assert np.isfinite(rows.predicted[:, c]).all()
+    assert np.isfinite(rows.sensitivity).all()
+    away = (np.abs(rows.time_s - 9.5) > 2.5) & (np.abs(rows.time_s - 15.5) > 1.5)
+    assert_allclose(rows.residual[away, c], before.residual[away, c], atol=2e-3)
+    assert np.isfinite(rows.residual[away, c]).all()
+
+
+def fake(dt_s, run_id="a", n=400):
+    """Return signals of a robot that rolls."""
+    still = np.zeros(n)
+    rim = np.full((n, 2), 0.5)
+    return Signals(run_id, "", dt_s, 0.0, rim, np.zeros((n, 2)), still, still, np.zeros((n, len(CHANNELS))))
+
+
+def test_the_slowest_clock_sets_the_low_pass_whichever_run_has_it():
+    fast, slow = fake(0.02), fake(0.0208, "b")
+    assert low_pass_of([fast, slow]).rate_hz == low_pass_of([slow, fast]).rate_hz
+    assert low_pass_of([fast, slow]).rate_hz < low_pass_of([fast]).rate_hz
+    crawling = low_pass_of([fake(0.1)])  # 10 Hz
+    assert crawling.cutoff_hz == pytest.approx(2.0)
+    assert crawling.inputs_every == 0
+    with pytest.raises(DataError, match="b is on a clock of 10 Hz, a on one of 50 Hz; clocks within 5% of"):
+        low_pass_of([fast, fake(0.1, "b")])

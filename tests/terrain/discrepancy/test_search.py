@@ -1,0 +1,95 @@
+"""The search on runs in which it is known what is there."""
+
+import numpy as np
+import pytest
+
+from pipelines.explain_trials import simulation_of
+from pipelines.hidden_effects import hidden_runs, rich_drives
+from terrain.discrepancy.residuals import low_pass_of
+from terrain.discrepancy.search import Problem, names_of, search
+from terrain.discrepancy.selection import fitted
+from terrain.discrepancy.signals import signals_of
+from terrain.robots import load_robot
+from terrain.simulation.effects import INDEX, LIBRARY, effect_named
+
+HUSKY = load_robot("husky")
+HIDDEN = {"camera_latency_s": 0.15, "payload_ratio": 0.25, "camera_yaw_rad": 0.03}
+
+
+def problem(hidden, library=None, built_in=None):
+    simulation = simulation_of(HUSKY).with_effects(built_in or {})
+    drives = rich_drives(HUSKY, np.random.default_rng(5), 6, 40.0)
+    runs = hidden_runs(HUSKY, drives, np.random.SeedSequence(2), hidden)
+    signals = tuple(signals_of(run, HUSKY) for run in runs)
+    library = simulation.library if library is None else tuple(effect_named(name) for name in library)
+    return Problem(signals, simulation, low_pass_of(signals), library)
+
+
+def searched(asked):
+    return search(asked, asked.at(asked.simulation.vector))
+
+
+@pytest.fixture(scope="module")
+def three():
+    asked = problem(HIDDEN)
+    return asked, searched(asked)
+
+
+def test_three_causes_are_found_with_their_values_by_refits_where_the_fit_has_gone(three):
+    _, found = three
+    assert {cause.name for cause in found.causes} == {"camera_latency", "payload", "camera_yaw"}
+    assert set(found.names) == set(HIDDEN)
+    std = np.sqrt(np.diag(found.cov))
+    off = found.change - [HIDDEN[name] for name in found.names]
+    assert (np.abs(off) < 4 * std).all(), dict(zip(found.names, off / std, strict=True))
+    # the latency is far from where sensitivities were taken first
+    assert (
+        abs(found.change[found.names.index("camera_latency_s")])
+        > 20 * std[found.names.index("camera_latency_s")]
+    )
+    assert found.rivals == {cause.name: () for cause in found.causes}
+
+
+def test_evidence_is_told_of_every_effect_and_only_the_causes_stand(three):
+    asked, found = three
+    assert set(found.tried) == {effect.name for effect in asked.library}
+    standing = {name for name, told in found.tried.items() if told.stands}
+    assert standing == {cause.name for cause in found.causes}
+
+
+def test_changes_are_counted_from_the_simulation_that_was_given(three):
+    _, found = three
+    half = {name: 0.5 * value for name, value in HIDDEN.items()}
+    again = searched(problem(HIDDEN, built_in=half))
+    assert {cause.name for cause in again.causes} == {cause.name for cause in found.causes}
+    std = np.sqrt(np.diag(found.cov))
+    for name, value, own in zip(found.names, found.change, std, strict=True):
+        told = again.change[again.names.index(name)]
+        assert told + half[name] == pytest.approx(value, abs=own)
+    at_fit = fitted(again.info, again.names)[0]
+    np.testing.assert_allclose(at_fit, again.change)
+
+
+def test_without_its_entry_in_the_library_a_cause_that_nothing_resembles_is_left():
+    names = ["camera_latency", "gyro_bias", "accel_bias", "scrub"]
+    found = searched(problem({"camera_yaw_rad": 0.05}, names))
+    assert found.causes == ()
+    assert found.names == ()
+    assert found.change.shape == (0,)
+
+
+def test_an_offset_and_a_rate_of_a_clock_that_hide_each_other_are_found_as_a_pair():
+    """Halfway through 40 s the two add up to nothing."""
+    hidden = {"clock_offset_s": 0.06, "clock_rate_ratio": -0.003}
+    found = searched(problem(hidden))
+    assert {cause.name for cause in found.causes} == {"clock_offset", "clock_rate"}
+    for name, value in zip(found.names, found.change, strict=True):
+        std = np.sqrt(np.diag(found.cov))[found.names.index(name)]
+        assert abs(value - hidden[name]) < 4 * std
+
+
+def test_names_come_once_and_in_order():
+    lever, payload = effect_named("lever_arm"), effect_named("payload")
+    assert names_of([lever, payload, lever]) == ("lever_x_m", "lever_y_m", "payload_ratio")
+    assert set(names_of(LIBRARY)) <= set(INDEX)
+    assert names_of([]) == ()

@@ -1,0 +1,182 @@
+"""Evidence of linear problems whose answer is known."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.stats import norm
+from scipy.stats import t as student
+
+from terrain.discrepancy.information import N_BLOCKS
+from terrain.discrepancy.selection import (
+    MIN_CLUSTERS,
+    N_BOOTSTRAP,
+    TRUST_DOF,
+    evidence,
+    fitted,
+    gain_interval,
+    held_out_gain,
+    n_clusters,
+    weighed_variance,
+    z_of,
+    z_of_t,
+)
+from terrain.simulation.effects import INDEX, effect_named
+
+PARAMETERS = ("payload_ratio", "gyro_bias_radps", "lever_x_m", "lever_y_m", "wheel_radius_ratio")
+N_RUNS, N_ROWS = 8, 120
+
+
+def problem(true, seed=0, n_runs=N_RUNS, scatter=0.0, alike=0.0):
+    """Return a linear problem with white noise of size one, in the form of an Information.
+
+    Parameters
+    ----------
+    true : (k,) what is there
+    scatter : standard deviation from run to run of the first parameter
+    alike : correlation of the sensitivities of the first and the last parameter
+    """
+    rng = np.random.default_rng(seed)
+    k = len(PARAMETERS)
+    a, g = np.empty((n_runs, k, k)), np.empty((n_runs, k))
+    a_blocks, g_blocks = np.empty((n_runs, N_BLOCKS, k, k)), np.empty((n_runs, N_BLOCKS, k))
+    for i in range(n_runs):
+        j = rng.standard_normal((k, N_ROWS)) * 100.0
+        j[-1] = alike * j[0] + np.sqrt(1 - alike**2) * j[-1]
+        own = np.asarray(true) + np.eye(k)[0] * scatter * rng.standard_normal()
+        r = own @ j + rng.standard_normal(N_ROWS)
+        for b, rows in enumerate(np.array_split(np.arange(N_ROWS), N_BLOCKS)):
+            a_blocks[i, b], g_blocks[i, b] = j[:, rows] @ j[:, rows].T, j[:, rows] @ r[rows]
+        a[i], g[i] = a_blocks[i].sum(axis=0), g_blocks[i].sum(axis=0)
+    return SimpleNamespace(
+        parameters=PARAMETERS,
+        vector=np.zeros(len(INDEX)),
+        a=a,
+        g=g,
+        a_blocks=a_blocks,
+        g_blocks=g_blocks,
+        index=lambda names: [PARAMETERS.index(name) for name in names],
+    )
+
+
+STD = 1 / (100.0 * np.sqrt(N_RUNS * N_ROWS))
+"""Of an estimate."""
+
+PAYLOAD, LEVER = effect_named("payload"), effect_named("lever_arm")
+
+
+def true(payload=0.0, lever=0.0):
+    return [payload * STD, 0.0, lever * STD, 0.0, 0.0]
+
+
+def test_evidence_is_the_fit_over_its_noise():
+    z = np.array([evidence(problem(true(10.0), seed), (), PAYLOAD).z for seed in range(60)])
+    # a t statistic of ten or so, told as a normal number, is less: its variance is not known for sure
+    dof = TRUST_DOF + N_RUNS - 1
+    assert np.median(z) == pytest.approx(z_of_t(10.0, dof), rel=0.1)
+    found = evidence(problem(true(10.0)), (), PAYLOAD)
+    assert found.stands
+    assert abs(found.change[0] - 10 * STD) < 4 * STD
+    assert_allclose(found.change, fitted(problem(true(10.0)), ["payload_ratio"])[0])
+
+
+def test_where_nothing_is_hidden_evidence_is_as_rare_as_it_says():
+    z = np.array([evidence(problem(true(), seed), ("gyro_bias_radps",), PAYLOAD).z for seed in range(300)])
+    for limit in (1.0, 2.0, 3.0):
+        expected = 2 * norm.sf(limit)
+        assert (z > limit).mean() < expected + 3 * np.sqrt(expected / 300)
+    assert (z > 1.0).mean() > 0.2
+
+
+def test_of_several_parameters_evidence_is_that_of_all_together():
+    z = np.array([evidence(problem(true(), seed), (), LEVER).z for seed in range(200)])
+    assert (z > 2.0).mean() < 0.0455 + 3 * np.sqrt(0.0455 / 200)
+    assert evidence(problem(true(lever=12.0)), (), LEVER).stands
+
+
+def test_what_differs_from_run_to_run_tells_less():
+    same, other = (problem(true(40.0), scatter=scatter) for scatter in (0.0, 100 * STD))
+    assert evidence(same, (), PAYLOAD).dispersion == pytest.approx(1.0, abs=0.6)
+    found = evidence(other, (), PAYLOAD)
+    assert found.dispersion > 10.0
+    assert found.inflation == found.dispersion
+    assert found.z < 0.3 * evidence(same, (), PAYLOAD).z
+
+
+def test_a_cause_that_is_selected_takes_away_what_another_could_tell():
+    info = problem(true(30.0), alike=0.98)
+    radius = effect_named("wheel_radius")
+    assert evidence(info, (), radius).z > 6.0
+    assert evidence(info, ("payload_ratio",), radius).z < 4.0
+    assert evidence(info, ("wheel_radius_ratio",), PAYLOAD).z > 3.0
+
+
+def test_out_of_bounds_or_without_any_information_nothing_stands():
+    high = PAYLOAD.parameters[0].high
+    far = problem([1.2 * high, 0.0, 0.0, 0.0, 0.0])
+    found = evidence(far, (), PAYLOAD)
+    assert (found.inside, found.stands) == (False, False)
+    blind = problem(true())
+    blind.a[:, 0] = blind.a[:, :, 0] = blind.g[:, 0] = 0.0
+    found = evidence(blind, (), PAYLOAD)
+    assert (found.z, found.stands) == (0.0, False)
+
+
+@pytest.mark.parametrize("n_runs", [3, N_RUNS])
+def test_held_out_gain_is_that_of_fits_without_each_run(n_runs):
+    info = problem(true(5.0), n_runs=n_runs)
+    base, both = [1], [1, 0]
+
+    def loss(i, at):
+        rest = [k for k in range(n_runs) if k != i]
+        a, g = info.a[rest].sum(axis=0)[np.ix_(at, at)], info.g[rest].sum(axis=0)[at]
+        x = np.linalg.solve(a, g)
+        return x @ info.a[i][np.ix_(at, at)] @ x - 2 * x @ info.g[i][at]
+
+    expected = [loss(i, base) - loss(i, both) for i in range(n_runs)]
+    assert_allclose(held_out_gain(info, base, both), expected, rtol=1e-5, atol=1e-6)
+    plain = [-loss(i, both) for i in range(n_runs)]
+    assert_allclose(held_out_gain(info, [], both), plain, rtol=1e-5, atol=1e-6)
+
+
+def test_a_variance_is_weighed_from_noise_and_clusters():
+    share = np.full(12, 1 / 12)
+    size = 50.0
+    fits = (1 - share) * np.sqrt(size / 12) * np.sqrt(12 / 11)  # clusters that scatter as the noise lets them
+    variance, dof = weighed_variance(fits, share, size)
+    assert variance == pytest.approx(1.0)
+    assert dof == pytest.approx(TRUST_DOF + 11)
+    none, _ = weighed_variance(np.zeros(12), share, size)
+    assert none == pytest.approx(TRUST_DOF / (TRUST_DOF + 11))  # noise alone is believed so far
+    wild, dof = weighed_variance(1000 * fits, share, size)
+    assert wild == pytest.approx(1e6 * 11 / (TRUST_DOF + 11), rel=1e-3)
+    assert dof == pytest.approx(11, rel=1e-3)
+    one_tells = np.array([0.9, *np.full(11, 0.1 / 11)])
+    _, dof = weighed_variance(1000 * (1 - one_tells) * np.sqrt(size / 12), one_tells, size)
+    assert dof < 1.5
+
+
+def test_numbers_of_evidence_are_as_improbable_as_what_they_stand_for():
+    for t, dof in ((2.0, 5.0), (8.0, 15.0)):
+        assert 2 * norm.sf(z_of_t(t, dof)) == pytest.approx(2 * student.sf(t, dof))
+    assert z_of(np.log(2 * norm.sf(3.0))) == pytest.approx(3.0)
+    assert z_of(0.0) == 0.0
+    assert z_of(-599.0) == pytest.approx(z_of(-601.0), rel=0.02)
+    assert z_of(-1e4) > z_of(-601.0)
+
+
+def test_the_interval_of_a_gain_holds_its_spread_over_runs():
+    rng = np.random.default_rng(0)
+    gain = 10.0 + 4.0 * rng.standard_normal(20)
+    low, high = gain_interval(gain)
+    half = 1.96 * np.std(gain) * np.sqrt(len(gain))
+    assert low == pytest.approx(gain.sum() - half, abs=4 * half / np.sqrt(N_BOOTSTRAP) * 2)
+    assert high == pytest.approx(gain.sum() + half, abs=4 * half / np.sqrt(N_BOOTSTRAP) * 2)
+    assert gain_interval(gain) == (low, high)
+
+
+def test_with_few_runs_thirds_of_them_are_the_clusters():
+    assert n_clusters(problem(true(), n_runs=MIN_CLUSTERS)) == MIN_CLUSTERS
+    assert n_clusters(problem(true(), n_runs=MIN_CLUSTERS - 1)) == N_BLOCKS * (MIN_CLUSTERS - 1)
+    assert evidence(problem(true(10.0), n_runs=3), (), PAYLOAD).stands

@@ -1,0 +1,179 @@
+"""From streams to one clock: what a run says comes through, what it does not say stays unknown."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from terrain.discrepancy.signals import PARALLEL, signals_of
+from terrain.errors import DataError
+from terrain.records import Label, Stream
+from terrain.robots import load_robot
+from terrain.simulation.effects import (
+    ACCEL,
+    CHANNELS,
+    CURRENT,
+    GYRO,
+    HEADING,
+    SPEED_X,
+    SPEED_Y,
+    TURNING_CURRENT,
+)
+from terrain.simulation.planar_run import Hills, simulate_planar
+
+HUSKY, AGRIMARO = load_robot("husky"), load_robot("agrimaro")
+
+
+def drive(robot, **told):
+    t = np.arange(1001) / 50
+    twist = np.column_stack([0.4 * np.sin(0.8 * t), np.zeros_like(t), 0.3 * np.sin(1.1 * t)])
+    if robot is AGRIMARO:
+        twist[:, 1] = 0.2 * np.sin(0.5 * t)
+    return simulate_planar(robot, twist, 1, hills=Hills((0.05, 0.0), 0.02), terrain="grass", **told)
+
+
+@pytest.fixture(scope="module")
+def husky():
+    return drive(HUSKY, heading=True)
+
+
+@pytest.fixture(scope="module")
+def agrimaro():
+    return drive(AGRIMARO)
+
+
+def channel(signals, name):
+    return signals.measured[:, CHANNELS.index(name)]
+
+
+def with_stream(run, name, stream):
+    streams = {key: value for key, value in run.streams.items() if key != name}
+    return replace(run, streams=streams if stream is None else {**streams, name: stream})
+
+
+def kept(stream, rows):
+    return Stream(stream.time_s[rows], stream.values[rows], stream.channels)
+
+
+def test_streams_of_a_skid_steer_robot_come_to_one_clock(husky):
+    signals = signals_of(husky, HUSKY)
+    wheels, imu, seen = (husky.streams[name] for name in ("wheels", "imu", "odometry"))
+    assert (signals.run_id, signals.terrain, signals.dt_s, len(signals)) == ("run", "grass", 0.02, 1001)
+    assert_allclose(signals.time_s, wheels.time_s)
+    assert_array_equal(signals.rim_mps, wheels.values[:, :2])
+    assert not signals.steer_rad.any()
+    assert_allclose(signals.grade_rad, -imu.channel("pitch_rad")[::2], atol=1e-12)
+    assert_allclose(signals.roll_rad, imu.channel("roll_rad")[::2], atol=1e-12)
+    assert_allclose(channel(signals, GYRO), imu.channel("gyro_z_radps")[::2], atol=1e-12)
+    assert_allclose(channel(signals, ACCEL), imu.channel("accel_x_mps2")[::2], atol=1e-12)
+    assert_allclose(channel(signals, SPEED_X), seen.values[:, 0], atol=1e-12)
+    assert_allclose(channel(signals, SPEED_Y), seen.values[:, 1], atol=1e-12)
+    assert_allclose(channel(signals, HEADING), husky.streams["lidar"].values[:, 0], atol=1e-12)
+    left, right = wheels.values[:, 2:].T
+    assert_allclose(channel(signals, CURRENT), left + right)
+    assert_allclose(channel(signals, TURNING_CURRENT), right - left)
+    with pytest.raises(ValueError, match="read-only"):
+        signals.measured[0, 0] = 1.0
+
+
+def test_a_tracking_camera_shows_the_speed_of_its_own_point_in_body_axes(agrimaro):
+    signals, truth, camera = signals_of(agrimaro, AGRIMARO), agrimaro.streams["truth"], AGRIMARO.camera
+    late_s = signals.time_s - camera.latency_s - camera.time_constant_s
+    x, y, turn = (
+        np.interp(late_s, truth.time_s, truth.channel(name))
+        for name in ("speed_x_mps", "speed_y_mps", "yaw_rate_radps")
+    )
+    # straight lines between samples of the truth
+    assert_allclose(channel(signals, SPEED_X), x - camera.lever_y_m * turn, atol=2e-3)
+    assert_allclose(channel(signals, SPEED_Y), y + camera.lever_x_m * turn, atol=2e-3)
+    assert np.isnan(channel(signals, HEADING)).all()
+
+
+def test_steering_loses_its_zeros_and_turns_and_rates_of_motors_become_rims(agrimaro):
+    signals, truth = signals_of(agrimaro, AGRIMARO), agrimaro.streams["truth"]
+    for i in range(3):
+        assert_allclose(signals.steer_rad[:, i], truth.channel(f"steer_{i + 1}_rad")[::2], atol=1e-9)
+    wheels = agrimaro.streams["wheels"]
+    per_motor = AGRIMARO.wheel_radius_m / AGRIMARO.motors.reduction_ratio
+    assert_allclose(signals.rim_mps, wheels.values[:, :3] * per_motor)
+    steering = agrimaro.streams["steering"]
+    turned = replace(steering, values=np.angle(np.exp(1j * (steering.values + 2 * np.pi))))
+    assert_allclose(
+        signals_of(with_stream(agrimaro, "steering", turned), AGRIMARO).steer_rad,
+        signals.steer_rad,
+        atol=1e-9,
+    )
+
+
+def test_the_sum_of_currents_counts_only_while_the_wheels_are_parallel(agrimaro):
+    signals = signals_of(agrimaro, AGRIMARO)
+    parallel = np.abs(np.exp(1j * signals.steer_rad).mean(axis=1)) > PARALLEL
+    assert 0.1 < parallel.mean() < 0.9
+    assert_array_equal(np.isfinite(channel(signals, CURRENT)), parallel)
+    assert np.isnan(channel(signals, TURNING_CURRENT)).all()
+
+
+def test_long_holes_stay_holes_and_short_ones_are_bridged(husky):
+    seen, wheels, imu = (husky.streams[name] for name in ("odometry", "wheels", "imu"))
+    lost = (seen.time_s > 5.0) & (seen.time_s < 7.0)
+    short = (seen.time_s > 9.995) & (seen.time_s < 10.025)
+    run = with_stream(husky, "odometry", kept(seen, ~lost & ~short))
+    blank = wheels.values.copy()
+    blank[(wheels.time_s > 12.0) & (wheels.time_s < 13.0), 0] = np.nan
+    run = with_stream(run, "wheels", replace(wheels, values=blank))
+    signals = signals_of(run, HUSKY)
+    known = np.isfinite(channel(signals, SPEED_X))
+    expected = ~((signals.time_s > 5.0 + 1e-9) & (signals.time_s < 7.0 - 1e-9))
+    assert_array_equal(known, expected)
+    assert_allclose(channel(signals, SPEED_X)[known], seen.values[known, 0], atol=1e-3)
+    assert_array_equal(
+        np.isfinite(signals.rim_mps[:, 0]), ~((signals.time_s > 12.0) & (signals.time_s < 13.0 - 1e-9))
+    )
+    assert np.isfinite(signals.rim_mps[:, 1]).all()
+    nothing = replace(imu, values=np.full_like(imu.values, np.nan))
+    signals = signals_of(with_stream(husky, "imu", nothing), HUSKY)
+    assert np.isnan(channel(signals, GYRO)).all()
+
+
+def test_the_clock_is_that_of_slow_wheels_and_runs_as_long_as_all_streams(husky):
+    slow = kept(husky.streams["wheels"], slice(None, None, 5))
+    late = kept(husky.streams["imu"], slice(300, 1500))
+    signals = signals_of(with_stream(with_stream(husky, "wheels", slow), "imu", late), HUSKY)
+    assert (signals.dt_s, signals.start_s, len(signals)) == pytest.approx((0.1, 3.0, 120))
+
+
+def test_without_tilt_the_accelerometer_tells_nothing_and_with_two_labels_no_terrain_is_named(husky):
+    imu = husky.streams["imu"]
+    gyro = Stream(imu.time_s, imu.values[:, 2:4], imu.channels[2:4])
+    run = replace(
+        with_stream(husky, "imu", gyro), labels=(Label(0.0, 9.0, "grass"), Label(9.0, 20.0, "gravel"))
+    )
+    signals = signals_of(run, HUSKY)
+    assert signals.terrain == ""
+    assert np.isnan(channel(signals, ACCEL)).all()
+    assert np.isfinite(channel(signals, GYRO)).all()
+    assert not signals.grade_rad.any()
+
+
+def test_a_run_that_cannot_be_compared_is_refused_in_one_sentence(husky, agrimaro):
+    wheels = husky.streams["wheels"]
+    short = replace(husky, streams={name: kept(s, s.time_s < 3.0) for name, s in husky.streams.items()})
+    apart = with_stream(
+        husky, "imu", replace(husky.streams["imu"], time_s=husky.streams["imu"].time_s + 30.0)
+    )
+    one_side = with_stream(husky, "wheels", Stream(wheels.time_s, wheels.values[:, :1], wheels.channels[:1]))
+    speeds = Stream(wheels.time_s, wheels.values[:, :2], wheels.channels[:2])
+    for run, robot, message in (
+        (husky, AGRIMARO, "is of the robot 'husky', the simulation is of 'agrimaro'"),
+        (with_stream(husky, "wheels", None), HUSKY, "no stream 'wheels'"),
+        (with_stream(agrimaro, "steering", None), AGRIMARO, "no stream 'steering'"),
+        (one_side, HUSKY, "a speed of each of left, right is wanted"),
+        (short, HUSKY, "have 3.0 s in common, 4 s at the least"),
+        (apart, HUSKY, "have 0.0 s in common"),
+        (replace(husky, streams={"wheels": speeds}), HUSKY, "none of its channels is simulated"),
+    ):
+        with pytest.raises(DataError) as error:
+            signals_of(run, robot)
+        assert message in str(error.value)
+        assert "\n" not in str(error.value)
