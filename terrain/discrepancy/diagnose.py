@@ -269,8 +269,8 @@ def _rival_values(
                     p.name,
                     float(change[k]),
                     p.unit,
-                    float(change[k] - 1.96 * np.sqrt(cov[k, k])),
-                    float(change[k] + 1.96 * np.sqrt(cov[k, k])),
+                    float(change[k] - INTERVAL_T * np.sqrt(cov[k, k])),
+                    float(change[k] + INTERVAL_T * np.sqrt(cov[k, k])),
                 )
                 for k, p in zip(
                     range(len(wanted) - len(own), len(wanted)), by_name[name].parameters, strict=True

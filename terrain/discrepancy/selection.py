@@ -167,9 +167,10 @@ def _left_out_loss(info: Information, at: list[int]) -> Array:
     if not at:
         return np.zeros(len(info.a))
     a, g = info.a[:, at][:, :, at], info.g[:, at]
-    rest = a.sum(axis=0) - a
-    rest = rest + 1e-9 * np.einsum("kii->ki", rest)[:, :, None] * np.eye(len(at))
-    x = np.linalg.solve(rest, (g.sum(axis=0) - g)[:, :, None])[:, :, 0]
+    # in units of what each parameter is known by; one that the other runs know nothing of stays where it is
+    unit = np.sqrt(np.maximum(np.einsum("kii->i", a), 1e-30))
+    rest = (a.sum(axis=0) - a) / np.outer(unit, unit) + 1e-9 * np.eye(len(at))
+    x = np.linalg.solve(rest, ((g.sum(axis=0) - g) / unit)[:, :, None])[:, :, 0] / unit
     loss: Array = np.einsum("ki,kij,kj->k", x, a, x) - 2 * (x * g).sum(axis=1)
     return loss
 

@@ -38,6 +38,9 @@ JUMP_S, JUMP_MPS, JUMP_SIGMAS = 0.05, 0.1, 8.0
 """A speed of the camera is no speed but a jump of its map, if it is off the median of so long before and
 after by the second, and by so many times what its speeds are usually off."""
 
+BACKWARD_MPS, MIN_BACKWARD = 0.02, 5
+"""A wheel turns backward that is so fast on so many samples."""
+
 PARALLEL = 0.95
 """Mean of the wheels' unit vectors from which on the sum of currents tells traction: within 18 degrees."""
 
@@ -148,7 +151,10 @@ def signals_of(run: RunLog, robot: Robot) -> Signals:
         _put(measured, HEADING, time_s, lidar, "yaw_rate_radps")
     currents = [f"current_{wheel}_a" for wheel in robot.wheels]
     if set(currents) <= set(wheels.channels):
-        each = [_at(time_s, wheels.time_s, wheels.channel(name)) for name in currents]
+        each = [
+            _at(time_s, wheels.time_s, _signed(wheels.channel(name), rims[:, i]))
+            for i, name in enumerate(currents)
+        ]
         measured[:, CHANNELS.index(CURRENT)] = np.sum(each, axis=0)
         if swerve:
             parallel = np.abs(np.exp(1j * steer).mean(axis=1)) > PARALLEL
@@ -197,6 +203,18 @@ def _without_jumps(seen: Stream, speed_mps: Array) -> Array:
     usual = 1.48 * np.nanmedian(off, axis=0) if len(off) else np.zeros(2)
     jumps = (off > np.maximum(JUMP_MPS, JUMP_SIGMAS * usual)).any(axis=1)
     return np.where(jumps[:, None], np.nan, speed_mps)
+
+
+def _signed(current_a: Array, rim_mps: Array) -> Array:
+    """Return currents (n,) with the sign of the wheel's turning, where the driver logs only their size.
+
+    It does, if a wheel turns backward and its current is never below zero.  That a motor brakes cannot be told
+    from such a log.
+    """
+    backward = rim_mps < -BACKWARD_MPS
+    if backward.sum() < MIN_BACKWARD or np.nanmin(current_a) < 0:
+        return current_a
+    return np.asarray(current_a * np.sign(rim_mps))
 
 
 def _put(measured: Array, channel: str, time_s: Array, stream: Stream, name: str) -> None:

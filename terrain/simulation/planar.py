@@ -383,15 +383,17 @@ def _move_swerve(
     n = out.shape[0]
     u, pace, mean_rim, heading = _rolled(planar, p, dt, rim_mps, steer_rad)
     weight = planar.mass_kg * GRAVITY_MPS2
-    mass = planar.mass_kg * (1.0 + p[_PAYLOAD])
-    carried = weight * (1.0 + planar.load_ratio * p[_PAYLOAD])
-    spin_kg = max(planar.yaw_inertia_kgm2 / planar.spread_m**2, LIGHTEST_KG) * (1.0 + p[_PAYLOAD])
+    load = 1.0 + p[_PAYLOAD]
+    pressed = load / (1.0 + planar.load_ratio * p[_PAYLOAD])
+    mass = planar.mass_kg * load
+    spin_kg = max(planar.yaw_inertia_kgm2 / planar.spread_m**2, LIGHTEST_KG) * load
     rolling = (planar.rolling_ratio + p[_ROLLING]) * (1.0 + p[_PAYLOAD]) * weight
     gravity = GRAVITY_MPS2 * planar.felt_ratio
     ground, sigma, damping = planar.soft_ratio, max(planar.relaxation_m, SHORTEST_M), DEFLECTION_DAMPING_S
     by_sigma, by_dt, by_spread = 1.0 / sigma, 1.0 / dt, 1.0 / planar.spread_m
-    yielding = mass / carried, mass / carried, spin_kg / carried
-    resisting = carried / mass, carried / mass, carried / spin_kg
+    # the contact springs as much whatever it carries
+    resisting = load * weight / mass, load * weight / mass, load * weight / spin_kg
+    yielding = 1.0 / resisting[0], 1.0 / resisting[1], 1.0 / resisting[2]
     by_mass, by_spin = 1.0 / mass, 1.0 / spin_kg
     if disturbance.shape[0] > 0:
         u[0] -= pace * disturbance[:, 0]
@@ -417,10 +419,10 @@ def _move_swerve(
         soft = max(_slip_at(ground, max(1.5 * size - 0.5 * size_before, 0.0)), STIFFEST_GROUND)
         more = p[_FORCE_SLIP]
         if p[_SHEAR_SLIP] != 0.0:
-            more += p[_SHEAR_SLIP] * _sheared(math.sqrt(f[0] * f[0] + f[1] * f[1]), planar.grip_ratio)
+            more += p[_SHEAR_SLIP] * _sheared(load * math.sqrt(f[0] * f[0] + f[1] * f[1]), planar.grip_ratio)
         roll = 0.5 * (pace[k] + pace[k - 1]) if k > 0 else pace[0]
         by_soft = 1.0 / soft
-        creep_now = max(1.0 + more * by_soft, STIFFEST)
+        creep_now = max(pressed + load * more * by_soft, STIFFEST)
         creep, creep_now = roll * creep_now, pace[k] * creep_now
         size_before, size = size, 0.0
         for i in range(3):
@@ -446,14 +448,14 @@ def _move_swerve(
                 f[i] = (z[i] + damping * by_sigma * (lost[i] - creep_now * z[i])) * by_soft
             pushed_before[i] = pushed[i]
             size += z[i] * z[i]
-        size = math.sqrt(size)
+        size = pressed * math.sqrt(size)
         w = (u[2, k] - lost[2]) * by_spread
         out[k, _VX] = u[0, k] - lost[0] + w * planar.com_y_m
         out[k, _VY] = u[1, k] - lost[1] - w * planar.com_x_m
         out[k, _W] = w
-        out[k, _F] = carried * f[0]
-        out[k, _S] = (soft + more) * f[0]
-        out[k, _I] = carried * (heading[0, k] * f[0] + heading[1, k] * f[1] + heading[2, k] * f[2])
+        out[k, _F] = load * weight * f[0]
+        out[k, _S] = (pressed * soft + load * more) * f[0]
+        out[k, _I] = load * weight * (heading[0, k] * f[0] + heading[1, k] * f[1] + heading[2, k] * f[2])
     spun = slopes(mean_rim, dt)
     for k in range(n):
         torque = (out[k, _I] + planar.rotating_kg * spun[k]) * planar.radius_m
