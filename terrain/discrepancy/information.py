@@ -80,10 +80,10 @@ def information_at(
     noise: Noise | None = None,
 ) -> Information:
     """Return what runs say around a point; the noise is that which the whole library leaves, unless given."""
-    planar = simulation.planar
+    planar = {terrain: simulation.planar_on(terrain) for terrain in {run.terrain for run in signals}}
     scattered = [name for name in simulation.scatter if simulation.scatter[name] > 0]
     names = tuple(dict.fromkeys([*parameters, *scattered]))
-    rows = tuple(rows_of(run, planar, vector, names, low_pass) for run in signals)
+    rows = tuple(rows_of(run, planar[run.terrain], vector, names, low_pass) for run in signals)
     nuisances = np.array([names.index(name) for name in scattered], dtype=int)
     std = np.array([simulation.scatter[name] for name in scattered])
     if noise is None:

@@ -183,22 +183,13 @@ def rows_of(
 
     true_rim, true_grade, true_roll = undone(planar, vector, dt, rim, grade, roll)
     truth = move(planar, vector, dt, true_rim, steer, true_grade, true_roll, np.zeros((0, 3)))
-
-    def predicted(p: Array, name: str = "") -> Array:
-        if name in SENSED_ONLY:
-            return smooth(sense(planar, p, dt, truth))
-        return smooth(replay(planar, p, dt, rim, steer, grade, roll))
-
-    now = predicted(vector, SENSED_ONLY[0])
-    change = np.empty((len(parameters), *now.shape))
-    for j, name in enumerate(parameters):
-        ahead, back = vector.copy(), vector.copy()
-        ahead[INDEX[name]] += STEPS[name]
-        both = name not in ONE_SIDED or vector[INDEX[name]] >= STEPS[name]
-        if both:
-            back[INDEX[name]] -= STEPS[name]
-        change[j] = predicted(ahead, name) - (predicted(back, name) if both else now)
-        change[j] /= ahead[INDEX[name]] - back[INDEX[name]]
+    points, sensed, spans = _points(vector, parameters)
+    holes = np.zeros((0, 0), dtype=np.bool_) if whole else known
+    told = _predictions(
+        planar, points, sensed, dt, rim, steer, grade, roll, truth, holes, low_pass.taps, low_pass.every
+    )[:, keep]
+    now = told[0]
+    change = (told[1::2] - told[2::2]) / spans[:, None, None]
     speed = rim.mean(axis=1)
     force = truth[:, 4] / (GRAVITY_MPS2 * planar.mass_kg)
     inputs = np.column_stack([speed, rim[:, -1] - rim[:, 0], steer.mean(axis=1), grade, roll, force])
@@ -213,6 +204,56 @@ def rows_of(
         change,
         np.column_stack([plain(inputs), phase[at]]),
     )
+
+
+def _points(vector: Array, parameters: Sequence[str]) -> tuple[Array, Array, Array]:
+    """Return the points at which the simulation is asked: here, and ahead and back in each parameter.
+
+    The second are those at which sensors alone change; the third how far ahead and back lie apart.
+    """
+    points = np.tile(vector, (1 + 2 * len(parameters), 1))
+    sensed = np.zeros(len(points), dtype=np.bool_)
+    sensed[0] = True
+    for j, name in enumerate(parameters):
+        i, step = INDEX[name], STEPS[name]
+        points[1 + 2 * j, i] += step
+        if name not in ONE_SIDED or vector[i] >= step:
+            points[2 + 2 * j, i] -= step
+        sensed[1 + 2 * j : 3 + 2 * j] = name in SENSED_ONLY
+    at = [INDEX[name] for name in parameters]
+    rows = np.arange(len(at))
+    return points, sensed, points[1 + 2 * rows, at] - points[2 + 2 * rows, at]
+
+
+@njit(cache=True)
+def _predictions(
+    planar: Planar,
+    points: Array,
+    sensed: Array,
+    dt: float,
+    rim_mps: Array,
+    steer_rad: Array,
+    grade_rad: Array,
+    roll_rad: Array,
+    truth: Array,
+    known: Array,
+    taps: Array,
+    every: int,
+) -> Array:
+    """Return what the simulation predicts at each point, behind the low-pass: (points, rows, channels).
+
+    ``truth`` is what the body does at the first point, and at all where sensors alone change; ``known`` says
+    where something was measured, or is empty where that is everywhere.
+    """
+    m = max((rim_mps.shape[0] - taps.size) // every + 1, 0)
+    out = np.empty((points.shape[0], m, 7))
+    for i in range(points.shape[0]):
+        if sensed[i]:
+            shown = sense(planar, points[i], dt, truth)
+        else:
+            shown = replay(planar, points[i], dt, rim_mps, steer_rad, grade_rad, roll_rad)
+        out[i] = holed(shown, known, taps, every) if known.shape[0] > 0 else decimated(shown, taps, every)
+    return out
 
 
 def _prepared(signals: Signals, low_pass: LowPass) -> tuple[float, Array, Array, Array, Array, Array]:

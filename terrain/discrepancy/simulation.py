@@ -21,6 +21,7 @@ class Simulation:
     ----------
     robot : of the runs
     ground : on which it is taken to drive
+    grounds : by the label of a run, where that is another one
     effects : parameters of the effects that are built in already; those not named are 0
     scatter : standard deviation from run to run of parameters in :data:`NUISANCES`; those not named are 0
 
@@ -34,6 +35,7 @@ class Simulation:
     ground: Ground = field(default_factory=Ground)
     effects: Mapping[str, float] = field(default_factory=dict)
     scatter: Mapping[str, float] = field(default_factory=dict)
+    grounds: Mapping[str, Ground] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         vector_of(self.effects)
@@ -42,6 +44,7 @@ class Simulation:
                 raise ConfigError(f"scatter: {name} is {std!r}; a standard deviation of a nuisance is wanted")
         object.__setattr__(self, "effects", MappingProxyType(dict(self.effects)))
         object.__setattr__(self, "scatter", MappingProxyType(dict(self.scatter)))
+        object.__setattr__(self, "grounds", MappingProxyType(dict(self.grounds)))
 
     @property
     def library(self) -> tuple[Effect, ...]:
@@ -50,8 +53,12 @@ class Simulation:
 
     @property
     def planar(self) -> Planar:
-        """Numbers for the kernels."""
+        """Numbers for the kernels, on the ground that no label tells."""
         return make_planar(self.robot, self.ground)
+
+    def planar_on(self, terrain: str) -> Planar:
+        """Return the numbers for the kernels on the ground of a label."""
+        return make_planar(self.robot, self.grounds.get(terrain, self.ground))
 
     @property
     def vector(self) -> Array:

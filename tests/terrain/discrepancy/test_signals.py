@@ -114,6 +114,26 @@ def test_the_sum_of_currents_counts_only_while_the_wheels_are_parallel(agrimaro)
     assert np.isnan(channel(signals, TURNING_CURRENT)).all()
 
 
+def test_currents_that_are_sizes_get_the_sign_of_their_wheel_and_others_stay():
+    # on the spot: the sides turn against each other, and both motors drive
+    t = np.arange(1001) / 50
+    twist = np.column_stack([np.zeros_like(t), np.zeros_like(t), 0.8 * np.minimum(t, 1.0)])
+    run = simulate_planar(HUSKY, twist, 1, terrain="grass")
+    wheels = run.streams["wheels"]
+    values = np.array(wheels.values)
+    at = [wheels.channels.index(f"current_{side}_a") for side in ("left", "right")]
+    values[:, at] = np.abs(values[:, at])
+    sizes = with_stream(run, "wheels", Stream(wheels.time_s, values, wheels.channels))
+    signed, told = signals_of(run, HUSKY), signals_of(sizes, HUSKY)
+    steady = signed.time_s > 2.0
+    assert_allclose(channel(told, TURNING_CURRENT)[steady], channel(signed, TURNING_CURRENT)[steady])
+    assert channel(told, TURNING_CURRENT)[steady].mean() > 1.0
+    braked = np.array(values)
+    braked[500, at[0]] = -0.1  # one sample below zero: the driver logs signs
+    logged = signals_of(with_stream(run, "wheels", Stream(wheels.time_s, braked, wheels.channels)), HUSKY)
+    assert abs(channel(logged, TURNING_CURRENT)[steady].mean()) < 0.1
+
+
 def test_long_holes_stay_holes_and_short_ones_are_bridged(husky):
     seen, wheels, imu = (husky.streams[name] for name in ("odometry", "wheels", "imu"))
     lost = (seen.time_s > 5.0) & (seen.time_s < 7.0)
