@@ -445,6 +445,12 @@ def explain_command(
         int | None,
         typer.Option(min=0, help="Runs kept to measure the gain; a quarter of six or more by default."),
     ] = None,
+    classifier: Annotated[
+        bool,
+        typer.Option(
+            "--classifier", help="Also teach a classifier in simulation, before and after; takes a minute."
+        ),
+    ] = False,
     seed: Annotated[int, typer.Option(min=0, help="Of which runs are kept, and of the bootstrap.")] = 0,
     layout: FormatOption = Format.auto,
     mapping: Mapping = None,
@@ -470,6 +476,7 @@ def explain_command(
             hold_out=hold_out,
             seed=seed,
             dataset=data.resolve().name,
+            classifier=classifier,
             progress=progress,
         )
     print_explain({**result, "skipped": skipped}, _console())

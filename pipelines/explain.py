@@ -13,6 +13,8 @@ import numpy as np
 
 from pipelines.datasets import data_digest
 from pipelines.evaluation import Progress, silent
+from pipelines.explain_classifier import classifier_gain
+from pipelines.explain_ground import ground_notes, simulation_for
 from terrain.atomic import atomic_write, ensure_writable
 from terrain.discrepancy.diagnose import INTERVAL_T, MIN_RUNS, diagnose
 from terrain.discrepancy.extend import extend
@@ -29,8 +31,6 @@ from terrain.kinematics.rim import with_rim_speeds
 from terrain.records import Array, RunLog
 from terrain.robots import Robot, load_robot
 from terrain.simulation.effects import Effect, effect_named, library_of
-from terrain.simulation.planar import Ground
-from terrain.simulation.planar_noise import load_scatter
 
 if TYPE_CHECKING:
     from pipelines.estimate import Estimate
@@ -85,6 +85,7 @@ def explain(
     hold_out: int | None = None,
     seed: int = 0,
     dataset: str = "",
+    classifier: bool = False,
     progress: Progress = silent,
 ) -> dict[str, Any]:
     """Diagnose runs, extend the simulation, measure the gain, and write the page.
@@ -100,13 +101,14 @@ def explain(
     hold_out : runs kept for the gain; a quarter of six or more by default
     seed : of which runs are kept, and of the bootstrap
     dataset : name of the data set, for the record
+    classifier : measure what the extension is worth to a classifier taught in simulation, too
     progress : told of steps that are done
 
     Returns
     -------
     dict that JSON can hold
         that of :meth:`terrain.discrepancy.verdict.Diagnosis.as_json` with ``data, data_digest, model,
-        built_in, terrain, effects, seed, used, held_out, gain, extended, page``.
+        built_in, grounds, notes, terrain, effects, seed, used, held_out, gain, extended, page``.
 
     Raises
     ------
@@ -128,7 +130,9 @@ def explain(
     ensure_writable(out)
     chosen = _of_terrain(runs, terrain)
     _check_robots(chosen, robot)
-    found = explained(chosen, robot, library, hold_out=hold_out, seed=seed, progress=progress)
+    found = explained(
+        chosen, robot, library, hold_out=hold_out, seed=seed, classifier=classifier, progress=progress
+    )
     described = model or robot_name
     result: dict[str, Any] = {
         "data": dataset,
@@ -159,12 +163,13 @@ def explained(
     *,
     hold_out: int | None = None,
     seed: int = 0,
+    classifier: bool = False,
     progress: Progress = silent,
 ) -> Explained:
     """Return the diagnosis of runs and the gain; see :func:`explain`."""
     runs = [with_rim_speeds(run, robot) for run in sorted(runs, key=lambda run: run.run_id)]
     used, held = split_runs(runs, hold_out, seed)
-    simulation = Simulation(robot, Ground(), effects=robot.effects, scatter=load_scatter()._asdict())
+    simulation, grounds = simulation_for(used, robot, library)
     diagnosis = diagnose(used, simulation, library)
     progress("diagnose", 1, 1)
     extended = extend(simulation, diagnosis) if diagnosis.causes else None
@@ -183,6 +188,10 @@ def explained(
         except DataError as error:
             told = {"measured": False, "reason": str(error)}
         told["filter"] = filter_gain(held, robot, extended, seed)
+        if classifier:
+            told["classifier"] = classifier_gain(
+                held, robot, simulation.effects, extended.effects, seed, progress=progress
+            )
         progress("gain", 1, 1)
     gone = {run.run_id for run in diagnosis.excluded_runs}
     signals = tuple(signals_of(run, robot) for run in used if run.run_id not in gone)
@@ -191,6 +200,8 @@ def explained(
     noise = problem.at(simulation.vector).noise
     result = diagnosis.as_json() | {
         "built_in": dict(simulation.effects),
+        "grounds": grounds,
+        "notes": ground_notes(grounds),
         "effects": [effect.name for effect in library],
         "seed": seed,
         "used": [run.run_id for run in used],
@@ -317,7 +328,7 @@ def extended_numbers(
 def rows_before_after(found: Explained, run: RunLog) -> tuple[Rows, Rows | None]:
     """Return a run behind the low-pass, with the simulation that was given and with the extended one."""
     signals = signals_of(run, found.simulation.robot)
-    planar = found.simulation.planar
+    planar = found.simulation.planar_on(signals.terrain)
     before = rows_of(signals, planar, found.simulation.vector, (), found.low_pass)
     if found.extended is None:
         return before, None

@@ -26,6 +26,7 @@ from pipelines.explain_figures import (
     titled,
     typical,
 )
+from pipelines.explain_ground import ground_words
 from pipelines.page import page
 from pipelines.report import versions
 from pipelines.reproduce import MAX_SVG_BYTES, said
@@ -609,6 +610,7 @@ def _provenance(result: Result) -> str:
         ("data", f"{result['data']} ({result['data_digest'][:12]})"),
         ("description", result["model"] or result["description"]),
         ("effects built in already", built_in or "none"),
+        ("ground it drives on", ground_words(result.get("grounds", ()))),
         ("effects that may be named", f"{len(result['effects'])}: {_listed(result['effects'])}"),
         ("runs behind the diagnosis", _listed(result["used"])),
     ]

@@ -292,9 +292,19 @@ def print_explain(result: dict[str, Any], console: Console) -> None:
         console.print(f"what to drive next: {told}", highlight=False)
     for run in result["excluded_runs"]:
         console.print(f"left out: {run['run_id']}: {run['reason']}", highlight=False)
+    for note in result.get("notes", ()):
+        console.print(note, highlight=False)
     gained = result["gain"]
     if gained["measured"]:
         console.print(gain_words(gained), highlight=False)
+        if taught := gained.get("classifier"):
+            if taught["reason"]:
+                told = f"not measured: {taught['reason']}"
+            else:
+                accuracy = taught["errors"]["accuracy"]
+                told = "{:.1%} right before, {:.1%} after".format(accuracy["before"], accuracy["after"])
+                told += ", change {:+.1%} to {:+.1%}".format(*accuracy["change_ci"])
+            console.print(f"classifier taught in simulation, on measured runs: {told}", highlight=False)
     else:
         console.print(f"gain on untouched runs not measured: {gained['reason']}", highlight=False)
     for sentence in result.get("skipped", []):

@@ -208,8 +208,8 @@ def _without_jumps(seen: Stream, speed_mps: Array) -> Array:
 def _signed(current_a: Array, rim_mps: Array) -> Array:
     """Return currents (n,) with the sign of the wheel's turning, where the driver logs only their size.
 
-    It does, if a wheel turns backward and its current is never below zero.  That a motor brakes cannot be told
-    from such a log.
+    It does, if a wheel turns backward and its current is never below zero.  That a motor brakes cannot be
+    told from such a log.
     """
     backward = rim_mps < -BACKWARD_MPS
     if backward.sum() < MIN_BACKWARD or np.nanmin(current_a) < 0:

@@ -1,8 +1,8 @@
-"""Is the tilt that was measured a slope that the robot drives up, or a body that rides over bumps?
+"""How much of the measured tilt is a slope to drive up, and how much a body that rides over bumps.
 
-A tilt that is no slope takes no traction, yet it looks like one to a simulation that is fed with it: then mass,
-resistance and slip are all off.  Which it is, the runs of a ground tell: with no more than a share of the tilt felt
-as a slope, and everything in the library let go, they fit best.
+A tilt that is no slope takes no traction, yet it looks like one to a simulation that is fed with it: then
+mass, resistance and slip are all off.  Which it is, the runs of a ground tell: with no more than a share of
+the tilt felt as a slope, and everything in the library let go, they fit best.
 """
 
 from __future__ import annotations
@@ -25,11 +25,14 @@ SHARES = (0.0, 0.5, 1.0)
 """That are tried; the best lies on the parabola through their losses."""
 
 FELT_LOSS = 20.0
-"""A tilt counts as felt throughout, unless a smaller share fits better by that in minus twice the log-likelihood."""
+"""A tilt counts as felt throughout, unless a smaller share fits better by that in minus twice the
+log-likelihood."""
 
 
-def with_felt_tilt(simulation: Simulation, signals: Sequence[Signals], library: Sequence[Effect]) -> Simulation:
-    """Return the simulation with the share of the tilt that each of its labelled grounds makes the robot feel.
+def with_felt_tilt(
+    simulation: Simulation, signals: Sequence[Signals], library: Sequence[Effect]
+) -> Simulation:
+    """Return the simulation with the share of the tilt that the robot feels on each labelled ground.
 
     Parameters
     ----------

@@ -16,8 +16,8 @@ says they did; whatever is wrong about it is a parameter of :mod:`terrain.simula
   and scrub;
 - **sensors**: gyro, accelerometer and camera with bias, scale, mounting, latency and their logger's clock.
 
-Load transfer, roughness and, of a skid-steer robot, lateral slip beside that on a side hill are left out: what
-they do to a log is noise here.  Sources stand with the effects.
+Load transfer, roughness and, of a skid-steer robot, lateral slip beside that on a side hill are left out:
+what they do to a log is noise here.  Sources stand with the effects.
 """
 
 from __future__ import annotations
@@ -36,6 +36,9 @@ from terrain.simulation.effects import INDEX
 STANDSTILL_MPS = 0.05
 """Speed over which a resistance takes its full size: it opposes motion and pushes nobody at rest."""
 
+ROLLING_MPS = 0.02
+"""The same of wheels that roll on contacts of their own; as in the dynamic simulation."""
+
 ENDO_POWER = 0.5
 """Exponent n of the turning slip; assumed, Endo et al. fitted one to each ground."""
 
@@ -47,11 +50,14 @@ SENSED_ONLY: tuple[str, ...] = (
 
 MAX_SLIP = 0.9
 
+IMU_LAG_S = 0.003
+"""Lag of a swerve robot's IMU behind its latency: bandwidths of 47 and 62.5 Hz (Bosch BNO055 data sheet)."""
+
 STIFFEST, STIFFEST_GROUND = 0.1, 1e-6
-"""Slip per traction that an effect leaves of the ground's own at the least, and that of the stiffest ground."""
+"""Slip per traction that an effect leaves of the ground's own at the least, and that of the stiffest."""
 
 SHORTEST_M, LIGHTEST_KG = 1e-3, 1e-3
-"""Relaxation length of a contact that has none, and what a body without yaw inertia weighs where its wheels are."""
+"""Relaxation length of a contact that has none, and what a body without yaw inertia weighs at its wheels."""
 
 DEFLECTION_DAMPING_S = 0.005
 """Damping of the contact as a lead on its deflection; it vanishes in steady rolling and so moves no slip."""
@@ -152,7 +158,8 @@ class Ground(NamedTuple):
     thrust_ratio : traction over weight at slips evenly spaced from 0 to 1, which takes the place of
         ``slip_ratio``; without any the thrust curve is straight
     load_ratio : by how much the traction at a slip grows with a load, as a share of the load's own share
-    felt_ratio : share of the measured tilt that is a slope to drive up; the rest is a body that rides over bumps
+    felt_ratio : share of the measured tilt that is a slope to drive up; the rest is a body that rides over
+        bumps
     """
 
     slip_ratio: float = 0.3
@@ -180,6 +187,7 @@ class Planar(NamedTuple):
     lever_y_m: float
     latency_s: float
     imu_latency_s: float
+    imu_lag_s: float
     encoder_lag_s: float
     slip_ratio: float
     soft_ratio: Array
@@ -227,6 +235,7 @@ def make_planar(robot: Robot, ground: Ground) -> Planar:
         lever_y_m=0.0 if camera is None else camera.lever_y_m,
         latency_s=0.0 if camera is None else camera.latency_s + camera.time_constant_s,
         imu_latency_s=0.0 if robot.sensors is None else robot.sensors.imu_latency_s,
+        imu_lag_s=IMU_LAG_S if swerve else 0.0,
         encoder_lag_s=0.0 if robot.sensors is None else robot.sensors.encoder_time_constant_s,
         slip_ratio=ground.slip_ratio,
         soft_ratio=_slip_per_traction(ground),
@@ -410,7 +419,7 @@ def _move_swerve(
         v_x = u[0, k] - 2.0 * lost[0] + lost_before[0]  # as slip goes on
         v_y = u[1, k] - 2.0 * lost[1] + lost_before[1]
         v_w = u[2, k] - 2.0 * lost[2] + lost_before[2]
-        fast = math.sqrt(v_x * v_x + v_y * v_y + v_w * v_w + STANDSTILL_MPS * STANDSTILL_MPS)
+        fast = math.sqrt(v_x * v_x + v_y * v_y + v_w * v_w + ROLLING_MPS * ROLLING_MPS)
         resists = (rolling + p[_SLIP_RESISTANCE] * size * weight) / fast + p[_DRAG]
         w, resists_by_mass = v_w * by_spread, resists * by_mass
         pushed[0] = changing[0, k] + gravity * math.sin(grade_rad[k]) - w * v_y + resists_by_mass * v_x
@@ -459,7 +468,8 @@ def _move_swerve(
     spun = slopes(mean_rim, dt)
     for k in range(n):
         torque = (out[k, _I] + planar.rotating_kg * spun[k]) * planar.radius_m
-        out[k, _I] = (torque + planar.friction_nm * direction(mean_rim[k])) / planar.nm_per_a
+        way = mean_rim[k] / math.sqrt(mean_rim[k] * mean_rim[k] + ROLLING_MPS * ROLLING_MPS)
+        out[k, _I] = (torque + planar.friction_nm * way) / planar.nm_per_a
 
 
 _COSH = tuple(1.0 / math.factorial(2 * i) for i in range(1, 6))
@@ -497,8 +507,10 @@ def _decayed(half_trace: float, determinant: float, dt: float) -> tuple[float, f
 def _rolled(
     planar: Planar, p: Array, dt: float, rim_mps: Array, steer_rad: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Return the twist without slip (3, n), root mean square and mean of the rim speeds (n,), and what a
-    traction in each direction of the twist pulls along the wheels (3, n)."""
+    """Return the twist without slip, the rims' root mean square and mean, and what tractions pull.
+
+    (3, n), (n,), (n,), and (3, n): what a traction in each direction of the twist pulls along the wheels.
+    """
     n = rim_mps.shape[0]
     scale = 1.0 + p[_RADIUS]
     right, left = 1.0 + 0.5 * p[_ONE_SIDED], 1.0 - 0.5 * p[_ONE_SIDED]
@@ -628,7 +640,7 @@ def sense(planar: Planar, p: Array, dt: float, truth: Array) -> Array:
         out[k, 5] = truth[k, _TURN_I] * warm
         out[k, 6] = w
     offset, rate = p[_CLOCK_OFFSET] / dt, p[_CLOCK_RATE]
-    camera, imu = (planar.latency_s + p[_LATENCY]) / dt, planar.imu_latency_s / dt
+    camera, imu = (planar.latency_s + p[_LATENCY]) / dt, (planar.imu_latency_s + planar.imu_lag_s) / dt
     for c in (0, 1, 2, 3, 6):
         late = offset + (imu if c in (0, 3) else camera)
         if late != 0.0 or rate != 0.0:

@@ -1,4 +1,4 @@
-"""A soil as the planar simulation knows it: a thrust curve, its end, how it grows with load, and resistances."""
+"""A soil as the planar simulation knows it: thrust curve, its end, growth with load, and resistances."""
 
 from __future__ import annotations
 

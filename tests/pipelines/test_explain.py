@@ -23,7 +23,7 @@ HIDDEN = {"camera_yaw_rad": 0.04}
 HUSKY = load_robot("husky")
 
 
-def a_run(i, robot=HUSKY, effects=HIDDEN, terrain="grass"):
+def a_run(i, robot=HUSKY, effects=HIDDEN, terrain="field"):
     time_s = np.arange(1250) / 50
     ahead = 0.5 * np.sin(0.6 * time_s + i) + 0.2 * np.sin(1.9 * time_s)
     twist = np.column_stack([ahead, np.zeros_like(ahead), 0.5 * np.sin(0.9 * time_s + 0.3 * i)])
@@ -119,7 +119,7 @@ def test_the_hidden_cause_is_named_built_in_and_gone_when_tested_again(terrain, 
     undrawn()
     words = ("--data", data, "--robot", "husky", "--model", extended, "--json", "again.json", "--effects")
     code, out, err = terrain(
-        *words, "camera_yaw,lever_arm,gyro_scale", "--out", "again", "--terrain", "grass"
+        *words, "camera_yaw,lever_arm,gyro_scale", "--out", "again", "--terrain", "field"
     )
     assert code == 0, err
     again = json.loads((tmp_path / "again.json").read_text())
@@ -153,7 +153,7 @@ def test_a_users_mistake_is_one_sentence_and_nothing_is_written(refused, data, t
     refused("effect 'gravity' is unknown", *here, "--effects", "gravity")
     refused("cannot befall a robot with the drive 'skid_steer'", *here, "--effects", "steering_play")
     refused("--effects names none", *here, "--effects", ",")
-    refused("no run is labelled 'sand' throughout; labels are grass", *here, "--terrain", "sand")
+    refused("no run is labelled 'sand' throughout; labels are field", *here, "--terrain", "sand")
     refused("--hold-out is 5 of 7 runs; the diagnosis wants 3", *here, "--hold-out", "5")
     refused("7 of 7 runs are of the robot 'husky'", *here[:2], "--robot", "agrimaro", "--out", "out")
     refused("--model is of the robot 'agrimaro', --robot is 'husky'", *here, "--model", "agrimaro")
