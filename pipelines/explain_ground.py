@@ -56,7 +56,7 @@ def _ground(robot: Robot, label: str) -> Ground | None:
 def ground_notes(told: Sequence[dict[str, Any]]) -> list[str]:
     """Return what a reader has to know of the grounds, in sentences."""
     return [
-        f"On {each['terrain']} the runs fit best if {100.0 * each['felt_ratio']:.0f} % of the measured tilt is "
+        f"On {each['terrain']} runs fit best if {100.0 * each['felt_ratio']:.0f} % of the measured tilt is "
         "a slope to drive up; the rest is taken for a body that rides over bumps, which takes no traction."
         for each in told
         if each["felt_ratio"] is not None and each["felt_ratio"] < 1.0
