@@ -40,7 +40,7 @@ def parameters_of(drive: str) -> dict[str, Parameter]:
     Examples
     --------
     >>> parameters_of("skid_steer")["effective_track_ratio"].high
-    2.0
+    4.0
     """
     return {parameter.name: parameter for effect in library_of(drive) for parameter in effect.parameters}
 

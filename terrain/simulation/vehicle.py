@@ -51,15 +51,12 @@ from terrain.constants import GRAVITY_MPS2
 from terrain.errors import ConfigError
 from terrain.records import Array
 from terrain.robots import Robot
-from terrain.simulation.planar import shear_slip
+from terrain.simulation.planar import DEFLECTION_DAMPING_S, shear_slip
 from terrain.terramechanics import traction
 from terrain.terramechanics.traction import wheel_ground
 
 STEP_S = 0.001
 """The contact's fastest mode is near 170 rad/s: a sixth of a radian a step."""
-
-DEFLECTION_DAMPING_S = 0.005
-"""Damping of the contact as a lead on its deflection; it vanishes in steady rolling and so moves no slip."""
 
 ROLLING_SPEED_MPS = 0.02
 """Speed over which a resistance takes its full size: it opposes rolling and pushes nobody at rest."""

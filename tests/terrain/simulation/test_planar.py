@@ -22,7 +22,10 @@ from terrain.simulation.effects import (
     vector_of,
 )
 from terrain.simulation.planar import (
+    DEFLECTION_DAMPING_S,
     ENDO_POWER,
+    ROLLING_MPS,
+    STANDSTILL_MPS,
     TRUTH,
     Ground,
     delayed,
@@ -115,8 +118,11 @@ def test_an_effect_shows_most_where_the_library_says(drive):
     for effect in LIBRARY:
         values = {p.name: 10 * p.step for p in effect.parameters}
         change = np.sqrt(((shown(values) - neutral) ** 2).mean(axis=0)) / size
-        # yaw rate and heading, both currents and both speeds stand for each other
+        # yaw rate and heading, both currents and both speeds stand for each other; what shifts a speed in
+        # time shifts its slope, and most where friction turns about
         alike = {GYRO: HEADING, CURRENT: TURNING_CURRENT, SPEED_X: SPEED_Y}
+        if effect.name == "clock_rate" or any(p.unit == "s" for p in effect.parameters):
+            alike[GYRO] = ACCEL
         told_of = np.isin(CHANNELS, [*effect.channels, *(alike.get(c, c) for c in effect.channels)])
         if effect not in library_of(drive):
             assert (change == 0).all(), effect.name
@@ -157,6 +163,78 @@ def test_slip_follows_the_force_as_its_equation_says():
     for c in ({"force_slip_ratio": 0.6}, {"force_slip_ratio": 0.6, "shear_slip_ratio": 0.0}):
         free = told(still(HUSKY), c, np.column_stack([u, u]), grade=grade, ground=FREE, dt=dt)
         np.testing.assert_allclose(free[SPEED_X], shown[SPEED_X])
+
+
+def a_contact_for_each_wheel(robot, ground, rim, steer, dt):
+    """Return speeds and yaw rate (n, 3) of the origin: each wheel slips by itself, by Euler's small steps."""
+    wheels, body = robot.wheel_positions_m, robot.body
+    com = np.array([body.com_x_m, body.com_y_m])
+    arm, load_n = wheels - com, robot.mass_kg * GRAVITY_MPS2 / 3
+    sigma, slip = body.relaxation_length_m, np.zeros((3, 2))
+    v, w = np.zeros(2), 0.0
+    out = np.zeros((len(rim), 3))
+    for k in range(len(rim)):
+        heading = np.column_stack([np.cos(steer[k]), np.sin(steer[k])])
+        over = v + w * np.column_stack([-arm[:, 1], arm[:, 0]])
+        rate = (rim[k][:, None] * heading - over - np.abs(rim[k])[:, None] * slip) / sigma
+        push = load_n / ground.slip_ratio * (slip + DEFLECTION_DAMPING_S * rate)
+        along = (over * heading).sum(axis=1)
+        resist = ground.rolling_ratio * load_n * along / np.hypot(along, ROLLING_MPS)
+        force = push - resist[:, None] * heading
+        moment = (arm[:, 0] * force[:, 1] - arm[:, 1] * force[:, 0]).sum()
+        slip = slip + dt * rate
+        v = v + dt * (force.sum(axis=0) / robot.mass_kg - w * np.array([-v[1], v[0]]))
+        w += dt * moment / body.yaw_inertia_kgm2
+        out[k] = v[0] + w * com[1], v[1] - w * com[0], w
+    return out
+
+
+def test_three_wheels_that_slip_each_by_itself_move_as_one_twist_that_slips():
+    robot, dt, n = still(AGRIMARO), 1e-3, 12000
+    robot = replace(robot, sensors=replace(robot.sensors, encoder_time_constant_s=0.0, imu_latency_s=0.0))
+    ground = Ground(slip_ratio=1.2, rolling_ratio=0.08)
+    t = dt * np.arange(n)
+    ramp = np.clip(t, 0.0, 1.0)
+    twist = np.column_stack([0.6 * ramp, 0.2 * ramp * np.sin(0.8 * t), 0.3 * ramp * np.sin(1.1 * t)])
+    rolled = [inverse(robot.wheel_positions_m, 1.0, wanted, np.zeros(3)) for wanted in twist]
+    rim, steer = (np.array(part) for part in zip(*rolled, strict=True))
+    rim, steer = np.ascontiguousarray(rim), np.unwrap(steer, axis=0)
+    each = a_contact_for_each_wheel(robot, ground, rim, steer, dt)
+    level = np.zeros(n)
+    planar = make_planar(robot, ground)
+    one = move(planar, vector_of({}), dt, rim, steer, level, level, np.zeros((0, 3)))[:, :3]
+    lost = np.abs(each - twist)[1000:].mean(axis=0)
+    assert (np.abs(one - each)[1000:].mean(axis=0) < 0.1 * lost).all()
+    coarse = [np.ascontiguousarray(x[::40]) for x in (rim, steer, level)]
+    coarse = move(planar, vector_of({}), 40 * dt, *coarse, coarse[-1], np.zeros((0, 3)))[:, :3]
+    assert (np.abs(coarse - one[::40])[25:].mean(axis=0) < 0.01 * lost).all()
+
+
+def test_a_bent_thrust_curve_slips_by_its_inverse_and_a_load_presses_as_much_as_it_weighs():
+    share = 1 - (1 - np.exp(-3 * (s := np.linspace(1e-9, 1.0, 101)))) / (3 * s)
+    ground = Ground(rolling_ratio=0.1, thrust_ratio=tuple(0.4 * share), load_ratio=1.0)
+    for robot in ROBOTS.values():
+        n = len(robot.wheels)
+        for grade in (0.0, 0.05):
+            shown = told(still(robot), {}, at_rate([0.5] * n), grade=grade, ground=ground)[SPEED_X][-1]
+            wanted = 0.1 * shown / math.hypot(shown, ROLLING_MPS) + math.sin(grade)
+            if robot is HUSKY:
+                wanted = 0.1 * direction(shown) + math.sin(grade)
+            assert 1 - shown / 0.5 == pytest.approx(np.interp(wanted, 0.4 * share, s), rel=2e-3)
+            loaded = told(
+                still(robot), {"payload_ratio": 0.5}, at_rate([0.5] * n), grade=grade, ground=ground
+            )
+            assert loaded[SPEED_X][-1] == pytest.approx(shown, rel=1e-6)
+
+
+def test_a_tilt_that_is_not_felt_takes_no_traction_and_still_shows_in_the_accelerometer():
+    unfelt = Ground(felt_ratio=0.0)
+    for robot in ROBOTS.values():
+        rim = at_rate([0.5] * len(robot.wheels))
+        level, tilted = (told(still(robot), {}, rim, grade=g, roll=g, ground=unfelt) for g in (0.0, 0.1))
+        for channel in (SPEED_X, SPEED_Y, CURRENT):
+            np.testing.assert_allclose(tilted[channel], level[channel])
+        assert tilted[ACCEL][-1] - level[ACCEL][-1] == pytest.approx(GRAVITY_MPS2 * math.sin(0.1))
 
 
 def test_shear_slip_is_the_inverse_of_its_curve_and_starts_with_slope_one():
@@ -258,6 +336,11 @@ def test_forces_and_currents_balance(robot):
     planar = make_planar(robot, ground)
     weight = robot.mass_kg * GRAVITY_MPS2
     grade, speed = 0.07, 0.5
+    slow = ROLLING_MPS if robot is AGRIMARO else STANDSTILL_MPS
+
+    def direction(speed_mps):
+        return speed_mps / math.hypot(speed_mps, slow)
+
     friction_n = len(robot.wheels) * robot.motors.friction_nm / robot.wheel_radius_m * direction(speed)
 
     def steady(**values):
