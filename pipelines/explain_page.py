@@ -31,7 +31,7 @@ from pipelines.page import page
 from pipelines.report import versions
 from pipelines.reproduce import MAX_SVG_BYTES, said
 from terrain.atomic import atomic_write
-from terrain.simulation.effects import INDEX, LIBRARY
+from terrain.simulation.effects import BOUNDS, LIBRARY
 
 if TYPE_CHECKING:
     from pipelines.explain import Explained
@@ -528,15 +528,11 @@ def limit_words(limit: Mapping[str, Any], missed: bool) -> str:
         return f"{article} {name} of any size would not have been seen."
     off = "off by " if limit["name"] in MISTAKEN else ""
     under = f"{off}under {quantity(limit['name'], limit['detection_limit'])}"
-    low, high = _BOUNDS[limit["name"]]
+    low, high = BOUNDS[limit["name"]]
     most = max(-low, high)
     if missed and limit["detection_limit"] >= most:
         under = f"of any size that is likely (up to {quantity(limit['name'], most)})"
     return f"{article} {name} {under} would not have been seen."
-
-
-_BOUNDS = {p.name: (p.low, p.high) for effect in LIBRARY for p in effect.parameters}
-assert set(_BOUNDS) <= set(INDEX)
 
 
 def _limits(result: Result) -> str:
@@ -569,7 +565,7 @@ def _limit_row(limit: Mapping[str, Any], missed: bool) -> str:
 def _ruled_out(result: Result) -> str:
     rows = [
         f"<tr><th scope=row>{escape(words_of(effect['name']))}</th>"
-        f'<td class="text long">{escape(effect["reason"])}</td>'
+        f'<td class="text long">{escape(effect["reason"])}{_fitted(effect["parameters"])}</td>'
         f"<td>{NOT_KNOWN if effect['z'] is None else said(round(effect['z'], 1))}</td></tr>"
         for effect in result["ruled_out"]
     ]
@@ -578,6 +574,16 @@ def _ruled_out(result: Result) -> str:
     return (
         f'<section class="dense"><h2>Ruled out</h2>{_table(["effect", "why", "z"], rows, (0, 1))}</section>'
     )
+
+
+def _fitted(parameters: Sequence[Mapping[str, Any]]) -> str:
+    """Return the values that would fit, in words; nothing where none were fitted."""
+    told = [
+        f"{quantity(p['name'], p['value'])} ({quantity(p['name'], p['ci'][0])} to "
+        f"{quantity(p['name'], p['ci'][1])})"
+        for p in parameters
+    ]
+    return f"; it would be {' and '.join(told)}" if told else ""
 
 
 def _health(result: Result) -> str:

@@ -146,7 +146,7 @@ def run_trial(case: Case) -> Trial:
     key = [case.seed, case.number, ROWS.index(case.row), case.n_runs]
     drawn, noise = np.random.SeedSequence(key).spawn(2)
     rng = np.random.default_rng(drawn)
-    rich = rich_drives(robot, rng, case.n_runs)
+    rich = rich_drives(rng, case.n_runs)
     drives = poor_drives(rng, case.n_runs) if case.row == "poor" else rich
     limits = None if case.row == "none" else limits_of(robot, rich)
     hidden, causes, over, outside, library = _hidden(case, robot, limits, rng)

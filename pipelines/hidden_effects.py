@@ -34,9 +34,11 @@ from terrain.simulation.effects import (
     library_of,
     vector_of,
 )
-from terrain.simulation.planar import SENSED_ONLY, Ground, Planar, make_planar, move, sense
-from terrain.simulation.planar_noise import RIM, Noise, Scatter, load_noise, load_scatter, noise_psd
+from terrain.simulation.planar import Ground, Planar, make_planar
+from terrain.simulation.planar_motion import move
+from terrain.simulation.planar_noise import RIM, Noise, load_noise, load_scatter, noise_psd
 from terrain.simulation.planar_run import Hills, simulate_planar
+from terrain.simulation.planar_sensors import SENSED_ONLY, sense
 
 TEST_SIZE = 0.02
 """Size of the test over the whole library, to which limits refer."""
@@ -96,9 +98,7 @@ class Limits(NamedTuple):
         return math.sqrt(max(float(np.linalg.eigvals(shared).real.max()), 0.0)) > CONFUSABLE
 
 
-def rich_drives(
-    robot: Robot, rng: np.random.Generator, n_runs: int, duration_s: float = DURATION_S
-) -> Drives:
+def rich_drives(rng: np.random.Generator, n_runs: int, duration_s: float = DURATION_S) -> Drives:
     """Return drives that excite all: steps of speed and turn, stops, reversals, spot turns, hills."""
     return Drives(
         tuple(_mixed(rng, duration_s) for _ in range(n_runs)),
@@ -142,10 +142,20 @@ def _mixed(rng: np.random.Generator, duration_s: float) -> Array:
         wanted[k : k + length] = speed, 0.0, turn
         k += length
     wanted[n - round(3.0 * STEP_HZ) :] = 0.0
+    return _ramped(wanted)
+
+
+def _ramped(wanted: Array) -> Array:
+    """Return twists (n, 3) from rest that change by 1 m/s^2 and 1 rad/s^2 at the most."""
+    limit = 1.0 / STEP_HZ
     twist = np.zeros_like(wanted)
-    limit = np.ones(3) / STEP_HZ
-    for i in range(1, n):
-        twist[i] = twist[i - 1] + np.clip(wanted[i] - twist[i - 1], -limit, limit)
+    for axis, goals in enumerate(wanted.T.tolist()):  # numbers of Python's own: arrays of three are slow
+        value, values = 0.0, [0.0]
+        for goal in goals[1:]:
+            change = goal - value
+            value += limit if change > limit else -limit if change < -limit else change
+            values.append(value)
+        twist[:, axis] = values
     return twist
 
 
@@ -282,6 +292,3 @@ def _density(noise: Noise, robot: Robot, planar: Planar, channel: str, f: Array,
 def confusable_class(limits: Limits, effect: Effect, drive: str) -> set[str]:
     """Return the names of all effects that no log of these drives tells from one, and its own."""
     return {other.name for other in library_of(drive) if other is effect or limits.alike(effect, other)}
-
-
-__all__ = ["Scatter", "confusable_class", "hidden_runs", "limits_of", "poor_drives", "rich_drives"]

@@ -14,14 +14,27 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 
 
 @pytest.fixture(scope="session")
-def datasets_dir():
-    """Folder that holds borealtc/ and vulpi/: ``$TERRAIN_DATA``, or shared/datasets beside the repository."""
+def measured():
+    """Return a function that gives a path in ``$TERRAIN_DATA``, or in shared/datasets beside the repository.
+
+    A test that asks for what is not there is skipped.
+    """
     named = os.environ.get("TERRAIN_DATA")
     folder = Path(named) if named else REPOSITORY.parent / "shared" / "datasets"
-    for name in ("borealtc", "vulpi"):
-        if not (folder / name).is_dir():
+
+    def there(name):
+        if not (folder / name).exists():
             pytest.skip(f"measured data are not there: {folder / name} (set TERRAIN_DATA)")
-    return folder
+        return folder / name
+
+    return there
+
+
+@pytest.fixture(scope="session")
+def datasets_dir(measured):
+    """Folder that holds borealtc/ and vulpi/."""
+    borealtc, _ = measured("borealtc"), measured("vulpi")
+    return borealtc.parent
 
 
 def noisy_run(run_id="SNOW_01", terrain="SNOW", seed=0, duration_s=4.0):

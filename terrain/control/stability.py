@@ -43,7 +43,7 @@ from terrain.control.thesis import FORMS, LOW_SPEED_MPS
 from terrain.errors import ConfigError
 from terrain.records import Array
 from terrain.robots import Robot
-from terrain.simulation.planar import DEFLECTION_DAMPING_S
+from terrain.simulation.planar_contact import DEFLECTION_DAMPING_S
 from terrain.simulation.vehicle import STEP_S
 
 SAMPLE_TIME_S = 0.02

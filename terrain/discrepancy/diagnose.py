@@ -9,14 +9,14 @@ questions without a name for what is left.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import combinations
 
 import numpy as np
 
 from terrain.discrepancy.clocks import shifts_of
 from terrain.discrepancy.health import clocks_of, unfit_runs
-from terrain.discrepancy.information import BOUNDS, Information
+from terrain.discrepancy.information import Information, rest_beside
 from terrain.discrepancy.next_drive import next_drive
 from terrain.discrepancy.probes import Answer, ask, drift_of
 from terrain.discrepancy.residuals import low_pass_of, measured_channels
@@ -40,7 +40,7 @@ from terrain.discrepancy.verdict import (
 )
 from terrain.errors import DataError
 from terrain.records import RunLog
-from terrain.simulation.effects import CHANNELS, INDEX, Effect
+from terrain.simulation.effects import BOUNDS, CHANNELS, INDEX, Effect
 
 MIN_RUNS = 3
 """Fewer runs, and there is nothing left to judge a fit by."""
@@ -113,7 +113,8 @@ def diagnose_signals(
     answers = ask(at_fit, found.names, found.change)
     drifts = drift_of(at_fit, found.names, found.change)
     leftovers = _leftovers(at_fit, answers)
-    named, sets, withdrawn = _sorted_out(found, drifts, answers)
+    withdrawn = _withdrawn(found, drifts, answers)
+    named, sets = _sorted_out(found, [cause for cause in found.causes if cause.name not in withdrawn])
     leftovers = _with_drifts(leftovers, found, withdrawn, drifts)
     limits = tuple(_limits(found, problem.library))
     missed = tuple(limit for limit in limits if limit.value > SEEN_SHARE * _bound(limit.name))
@@ -141,7 +142,7 @@ def diagnose_signals(
         unexplained=leftovers,
         limits=limits,
         not_excited=missed,
-        ruled_out=tuple(_ruled_out(found, named, sets, problem.library)),
+        ruled_out=tuple(_ruled_out(found, named, sets, withdrawn, problem.library)),
         excluded_runs=excluded,
         clocks=clocks_of(start, shift),
         next_drive=next_drive(simulation, sets, missed, found.info),
@@ -161,36 +162,49 @@ def _leftovers(info: Information, answers: dict[tuple[str, str], Answer]) -> tup
     return tuple(sorted(best.values(), key=lambda left: -left.z))
 
 
-def _sorted_out(
+def _withdrawn(
     found: Found, drifts: dict[str, Answer], answers: dict[tuple[str, str], Answer]
-) -> tuple[list[Effect], list[tuple[str, ...]], list[Effect]]:
-    """Return the causes that are named, the sets of which one is there, and those that are withdrawn."""
-    named: list[Effect] = []
-    sets: list[tuple[str, ...]] = []
-    withdrawn: list[Effect] = []
+) -> dict[str, str]:
+    """Return the causes that fit and are still not it, by name, and why."""
+    why = {}
     for cause in found.causes:
         own = found.tried[cause.name]
-        drift = max((drifts[p.name] for p in cause.parameters), key=lambda answer: answer.z)
-        main = _channels(found, cause)
-        beside = max(
-            (answer.gain for (channel, _), answer in answers.items() if channel in main and answer.stands),
-            default=0.0,
-        )
         if not own.stands:
             continue
-        if (drift.stands and drift.gain > DRIFT_SHARE * own.z**2) or beside > PROBE_SHARE * own.z**2:
-            withdrawn.append(cause)
-        elif rivals := found.rivals[cause.name]:
+        told = own.z**2
+        drift = _drift(drifts, cause)
+        main = _channels(found, cause)
+        beside = {at: answer for at, answer in answers.items() if at[0] in main and answer.stands}
+        most = max(beside, key=lambda at: beside[at].gain, default=None)
+        if drift.stands and drift.gain > DRIFT_SHARE * told:
+            why[cause.name] = f"it helps, but changes from the start of runs to their end (z {drift.z:.1f})"
+        elif most is not None and beside[most].gain > PROBE_SHARE * told:
+            why[cause.name] = f"it helps, but {most[0]} follows {most[1]} beside it (z {beside[most].z:.1f})"
+    return why
+
+
+def _drift(drifts: dict[str, Answer], cause: Effect) -> Answer:
+    return max((drifts[p.name] for p in cause.parameters), key=lambda answer: answer.z)
+
+
+def _sorted_out(found: Found, causes: Sequence[Effect]) -> tuple[list[Effect], list[tuple[str, ...]]]:
+    """Return the causes that are named, and the sets of which one is there."""
+    named: list[Effect] = []
+    sets: list[tuple[str, ...]] = []
+    for cause in causes:
+        if not found.tried[cause.name].stands:
+            continue
+        if rivals := found.rivals[cause.name]:
             sets.append((cause.name, *rivals))
         else:
             named.append(cause)
-    for one, other in combinations([cause for cause in found.causes if cause not in withdrawn], 2):
+    for one, other in combinations(causes, 2):
         if (one in named or other in named) and _entangled(found, one, other):
             sets = [names for names in sets if names[0] not in (one.name, other.name)]
             members = (one.name, *found.rivals[one.name], other.name, *found.rivals[other.name])
             sets.append(tuple(dict.fromkeys(members)))
             named = [cause for cause in named if cause not in (one, other)]
-    return named, sets, withdrawn
+    return named, sets
 
 
 def _entangled(found: Found, one: Effect, other: Effect) -> bool:
@@ -202,15 +216,14 @@ def _entangled(found: Found, one: Effect, other: Effect) -> bool:
 
 
 def _with_drifts(
-    leftovers: tuple[Leftover, ...], found: Found, withdrawn: Sequence[Effect], drifts: dict[str, Answer]
+    leftovers: tuple[Leftover, ...], found: Found, withdrawn: Mapping[str, str], drifts: dict[str, Answer]
 ) -> tuple[Leftover, ...]:
-    """Add the channels of causes that were withdrawn to what is not explained."""
+    """Add the channels of causes that were withdrawn since they drift to what is not explained."""
     channels = {left.channel for left in leftovers}
     more = []
-    for cause in withdrawn:
-        channel = _channels(found, cause)[0]
-        if channel not in channels:
-            drift = max((drifts[p.name] for p in cause.parameters), key=lambda answer: answer.z)
+    for cause in found.causes:
+        channel, drift = _channels(found, cause)[0], _drift(drifts, cause)
+        if cause.name in withdrawn and drift.stands and channel not in channels:
             more.append(Leftover(channel, "time", drift.z, 0.0))
             channels.add(channel)
     return (*leftovers, *more)
@@ -219,27 +232,32 @@ def _with_drifts(
 def _channels(found: Found, cause: Effect) -> tuple[str, ...]:
     """Return the channels in which a cause shows, the clearest first."""
     info = found.info
-    at = info.index([p.name for p in cause.parameters])
+    at = info.places([p.name for p in cause.parameters])
     own = found.tried[cause.name].change
     power = sum((np.tensordot(own, white[at], axes=1) ** 2).sum(axis=0) for white in info.white_change)
     order = np.argsort(-np.asarray(power))
     return tuple(CHANNELS[i] for i in order if power[i] > 0.1 * power[order[0]])
 
 
-def _cause(found: Found, start: Information, effect: Effect) -> Cause:
-    own = found.tried[effect.name]
+def _values(found: Found, effect: Effect) -> tuple[Value, ...]:
+    """Return the fitted values of a cause."""
     values = []
     for parameter in effect.parameters:
         at = found.names.index(parameter.name)
-        half = INTERVAL_T * float(np.sqrt(found.cov[at, at] * own.inflation))
+        half = INTERVAL_T * float(np.sqrt(found.cov[at, at] * found.tried[effect.name].inflation))
         value = float(found.change[at])
         values.append(Value(parameter.name, value, parameter.unit, value - half, value + half))
+    return tuple(values)
+
+
+def _cause(found: Found, start: Information, effect: Effect) -> Cause:
+    own = found.tried[effect.name]
     size = float(start.c.sum())
     low, high = gain_interval(own.gain)
     return Cause(
         effect.name,
         effect.aliases,
-        tuple(values),
+        _values(found, effect),
         float(own.gain.sum()) / size,
         low / size,
         high / size,
@@ -260,7 +278,7 @@ def _rival_values(
         for name in names:
             own = [p.name for p in by_name[name].parameters]
             wanted = [*[other for other in others if other not in own], *own]
-            at = found.info.index(wanted)
+            at = found.info.places(wanted)
             a = found.info.a[:, at][:, :, at].sum(axis=0)
             cov = np.linalg.pinv(a, hermitian=True)
             change = cov @ found.info.g[:, at].sum(axis=0)
@@ -282,16 +300,14 @@ def _rival_values(
 def _limits(found: Found, library: Sequence[Effect]) -> list[Limit]:
     """Return the detection limit of every effect beside what was found."""
     info, limits = found.info, []
+    a = info.a.sum(axis=0)
     for effect in library:
         others = [name for name in found.names if name not in names_of([effect])]
-        base = info.index(others)
+        base = info.places(others)
         for parameter in effect.parameters:
-            own = info.index([parameter.name])[0]
-            a = info.a.sum(axis=0)
-            free = a[own, own]
-            if base:
-                free -= a[own, base] @ np.linalg.lstsq(a[np.ix_(base, base)], a[base, own], rcond=1e-10)[0]
-            known = free > 1e-9 * max(a[own, own], 1e-12)
+            own = info.places([parameter.name])
+            free = float(rest_beside(a, base, own)[1][0, 0])
+            known = free > 1e-9 * max(a[own[0], own[0]], 1e-12)
             value = (Z_EFFECT + POWER_Z) / float(np.sqrt(free)) if known else np.inf
             limits.append(Limit(parameter.name, value, parameter.unit, effect.needs))
     return limits
@@ -303,7 +319,11 @@ def _bound(parameter: str) -> float:
 
 
 def _ruled_out(
-    found: Found, named: Sequence[Effect], sets: Sequence[tuple[str, ...]], library: Sequence[Effect]
+    found: Found,
+    named: Sequence[Effect],
+    sets: Sequence[tuple[str, ...]],
+    withdrawn: Mapping[str, str],
+    library: Sequence[Effect],
 ) -> list[RuledOut]:
     told = {effect.name for effect in named} | {name for names in sets for name in names}
     out = []
@@ -311,15 +331,17 @@ def _ruled_out(
         if effect.name in told:
             continue
         own = found.tried[effect.name]
+        values: tuple[Value, ...] = ()
         if effect in found.causes:
-            reason = "it would not stay the same, or something without a name is beside it in its channel"
+            reason = withdrawn.get(effect.name, "it does not stand beside the others that were found")
+            values = _values(found, effect)
         elif not own.inside:
             reason = "the value that would fit is out of its bounds"
         elif own.z <= Z_EFFECT:
             reason = "the runs show nothing of it beside what was found"
         else:
             reason = "it does not help on runs that were left out, or differs from run to run"
-        out.append(RuledOut(effect.name, reason, own.z))
+        out.append(RuledOut(effect.name, reason, own.z, values))
     return out
 
 

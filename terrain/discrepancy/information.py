@@ -22,12 +22,12 @@ from terrain.discrepancy.residuals import LowPass, Rows, rows_of
 from terrain.discrepancy.signals import Signals
 from terrain.discrepancy.simulation import Simulation
 from terrain.records import Array
-from terrain.simulation.effects import INDEX, LIBRARY
+from terrain.simulation.effects import BOUNDS, INDEX
 
 N_BLOCKS = 3
 """Time blocks of a run; they serve as clusters where runs are few."""
 
-PRIOR_STD = {p.name: 0.5 * max(abs(p.low), p.high) for effect in LIBRARY for p in effect.parameters}
+PRIOR_STD = {name: 0.5 * max(abs(low), high) for name, (low, high) in BOUNDS.items()}
 """How wide a parameter is let go when the whole library is fitted to see what noise is left."""
 
 
@@ -66,8 +66,8 @@ class Information(NamedTuple):
     shift: tuple[Array, ...]
     inner: tuple[Array, ...]
 
-    def index(self, names: Sequence[str]) -> list[int]:  # type: ignore[override]
-        """Return where parameters stand."""
+    def places(self, names: Sequence[str]) -> list[int]:
+        """Return where parameters stand in the matrices."""
         return [self.parameters.index(name) for name in names]
 
 
@@ -187,9 +187,28 @@ def counted_from(info: Information, base: Array) -> Information:
     )
 
 
+def rest_beside(a: Array, base: Sequence[int], own: Sequence[int]) -> tuple[Array, Array]:
+    """Return what an information matrix says of parameters beside others that are fitted with them.
+
+    Parameters
+    ----------
+    a : (k, k)
+    base, own : places of the n others and of the q parameters
+
+    Returns
+    -------
+    follow : (n, q) by how much the others go back where the parameters go ahead
+    free : (q, q) information that is left, the Schur complement
+    """
+    if not len(base):
+        return np.zeros((0, len(own))), a[np.ix_(own, own)]
+    follow = np.linalg.lstsq(a[np.ix_(base, base)], a[np.ix_(base, own)], rcond=1e-10)[0]
+    return follow, a[np.ix_(own, own)] - a[np.ix_(own, base)] @ follow
+
+
 def loss_of(info: Information, names: Sequence[str]) -> float:
     """Return minus twice the log-likelihood of the best fit of parameters, up to what no fit changes."""
-    at = info.index(names)
+    at = info.places(names)
     a, g = info.a[:, at][:, :, at].sum(axis=0), info.g[:, at].sum(axis=0)
     return -float(g @ np.linalg.lstsq(a, g, rcond=1e-10)[0]) if at else 0.0
 
@@ -202,7 +221,3 @@ def moved(info: Information, names: Sequence[str], change: Array) -> Array:
         if name in BOUNDS:
             vector[INDEX[name]] = np.clip(vector[INDEX[name]], *BOUNDS[name])
     return vector
-
-
-BOUNDS = {p.name: (p.low, p.high) for effect in LIBRARY for p in effect.parameters}
-"""Of each parameter of the library."""

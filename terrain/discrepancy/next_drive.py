@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.signal import lfilter
 
-from terrain.discrepancy.information import BOUNDS, Information, information_at
+from terrain.discrepancy.information import Information, information_at, rest_beside
 from terrain.discrepancy.noise import ORDER, Noise
 from terrain.discrepancy.residuals import low_pass_of, measured_channels
 from terrain.discrepancy.selection import Z_EFFECT
@@ -30,6 +30,7 @@ from terrain.records import Array
 from terrain.robots import Robot
 from terrain.simulation.effects import (
     ACCEL,
+    BOUNDS,
     CHANNELS,
     CURRENT,
     GYRO,
@@ -39,7 +40,8 @@ from terrain.simulation.effects import (
     TURNING_CURRENT,
     effect_named,
 )
-from terrain.simulation.planar import TRUTH, move
+from terrain.simulation.planar import TRUTH
+from terrain.simulation.planar_motion import move
 from terrain.simulation.scenario import RATE_HZ, SCENARIOS, make_scenario
 
 GRADES_DEG = (0.0, 6.0)
@@ -135,7 +137,7 @@ def _parting(
     told = " and ".join(dict.fromkeys(_listed(group) for group in sets))
     now = _Parted(np.inf, 0.0)
     if info is not None:
-        at = info.index(names)
+        at = info.places(names)
         now = _parted(sets, names, info.a[:, at][:, :, at].sum(axis=0))
     for channels in (logged, (*logged, *wanted)) if wanted else (logged,):
         drives = _drives(simulation, names, channels, info)
@@ -213,8 +215,7 @@ def _correlation(a: Array, one: list[int], other: list[int]) -> float:
 
 def _free(a: Array, names: Sequence[str], one: list[int], other: list[int]) -> float:
     """Return the evidence, in sigmas, of the one at its bounds that the other cannot take."""
-    cross = a[np.ix_(one, other)]
-    free = a[np.ix_(one, one)] - cross @ np.linalg.pinv(a[np.ix_(other, other)], hermitian=True) @ cross.T
+    free = rest_beside(a, other, one)[1]
     size = np.array([max(abs(value) for value in BOUNDS[names[k]]) for k in one])
     return math.sqrt(max(float(np.linalg.eigvalsh(free * np.outer(size, size))[0]), 0.0))
 
@@ -256,7 +257,7 @@ def _drives(
         return []
     vector = simulation.vector if info is None else info.vector
     said = information_at(signals, simulation, vector, names, low_pass_of(signals), _noise(info))
-    at = said.index(names)
+    at = said.places(names)
     return [
         _Drive(name, grade_deg, a[np.ix_(at, at)]) for (name, grade_deg), a in zip(told, said.a, strict=True)
     ]

@@ -20,8 +20,7 @@ FLOOR = 0.2
 simulated less well than its noise there would ask for."""
 
 ORDER = 6
-"""Of the autoregression: 0.6 s at ten rows a second."""
-
+"""Of the autoregression: about a second at the rate of the rows."""
 
 ORDERS = (ORDER, 3, 1)
 """What is tried: a channel with many holes has few stretches that fill a long one."""

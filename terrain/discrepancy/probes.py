@@ -122,7 +122,7 @@ def drift_of(info: Information, names: Sequence[str], change: Array) -> dict[str
     if not names:
         return {}
     columns = [
-        white[info.index(names)] * (run.time_s / 60.0 - 0.5)[None, :, None]
+        white[info.places(names)] * (run.time_s / 60.0 - 0.5)[None, :, None]
         for run, white in zip(info.rows, info.white_change, strict=True)
     ]
     flat = [column.reshape(len(names), -1) for column in columns]
@@ -140,7 +140,7 @@ def _answers(
     info: Information, names: Sequence[str], change: Array, c: int | None, columns: list[Array]
 ) -> list[Answer]:
     """Return the answers of columns (q, m) a run, in channel c or, where it is None, flat in all of them."""
-    at = info.index(names)
+    at = info.places(names)
     n_runs, q = len(columns), columns[0].shape[0]
     own, cross, score = np.empty((n_runs, q)), np.empty((n_runs, q, len(at))), np.empty((n_runs, q))
     for i, x in enumerate(columns):

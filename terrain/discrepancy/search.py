@@ -7,7 +7,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from terrain.discrepancy.information import Information, counted_from, information_at, loss_of, moved
+from terrain.discrepancy.information import (
+    Information,
+    counted_from,
+    information_at,
+    loss_of,
+    moved,
+    rest_beside,
+)
 from terrain.discrepancy.noise import Noise
 from terrain.discrepancy.residuals import LowPass
 from terrain.discrepancy.selection import Evidence, evidence, fitted
@@ -39,15 +46,15 @@ RIVAL_LINEAR = 80.0
 Z_PAIR = 4.6
 """Evidence that each of two effects needs beside the other, where neither stands alone: 4e-6, 300 pairs."""
 
-RIVAL_REFITS = 3
-"""The same, of a rival."""
-
 ALIKE = 0.99
 """Two effects whose sensitivities correlate more are not taken for a pair."""
 
 MAX_REFITS, SETTLED = 8, 0.3
 """How often sensitivities of what is selected are taken anew, until a fit moves by less than that share of
 its standard deviation."""
+
+RIVAL_REFITS = 3
+"""How often those of a rival are taken anew."""
 
 
 class Problem(NamedTuple):
@@ -192,13 +199,9 @@ def _pair(info: Information, causes: Sequence[Effect], library: Sequence[Effect]
     Two that pull the other way, as an offset and a rate of a clock, hide each other.
     """
     left = [effect for effect in library if len(effect.parameters) == 1]
-    base, own = info.index(names_of(causes)), info.index(names_of(left))
+    base, own = info.places(names_of(causes)), info.places(names_of(left))
     a, g = info.a.sum(axis=0), info.g.sum(axis=0)
-    if base:
-        follow = np.linalg.lstsq(a[np.ix_(base, base)], a[np.ix_(base, own)], rcond=1e-10)[0]
-    else:
-        follow = np.zeros((0, len(own)))
-    a_free = a[np.ix_(own, own)] - a[np.ix_(own, base)] @ follow
+    follow, a_free = rest_beside(a, base, own)
     g_free = g[own] - g[base] @ follow
     size = np.maximum(np.diag(a_free), 1e-12)
     z, rho = g_free / np.sqrt(size), a_free / np.sqrt(np.outer(size, size))

@@ -10,9 +10,9 @@ import numpy as np
 from scipy.stats import chi2, norm
 from scipy.stats import t as student
 
-from terrain.discrepancy.information import BOUNDS, N_BLOCKS, Information
+from terrain.discrepancy.information import Information, rest_beside
 from terrain.records import Array
-from terrain.simulation.effects import INDEX, Effect
+from terrain.simulation.effects import BOUNDS, INDEX, Effect
 
 Z_EFFECT = 4.0
 """Evidence an effect needs, as a standard normal number: 6e-5, times a library of 26."""
@@ -60,7 +60,7 @@ class Evidence(NamedTuple):
 
 def fitted(info: Information, names: Sequence[str]) -> tuple[Array, Array]:
     """Return the change (k,) of parameters that fits all runs best, and its covariance by the noise."""
-    at = info.index(names)
+    at = info.places(names)
     a = info.a[:, at][:, :, at].sum(axis=0)
     cov = np.linalg.pinv(a, hermitian=True)
     return cov @ info.g[:, at].sum(axis=0), cov
@@ -69,7 +69,7 @@ def fitted(info: Information, names: Sequence[str]) -> tuple[Array, Array]:
 def evidence(info: Information, selected: Sequence[str], effect: Effect) -> Evidence:
     """Return what speaks for an effect beside the parameters selected."""
     own = [p.name for p in effect.parameters]
-    base, new = info.index([name for name in selected if name not in own]), info.index(own)
+    base, new = info.places([name for name in selected if name not in own]), info.places(own)
     both = base + new
     a, g = info.a[:, both][:, :, both], info.g[:, both]
     total, score = a.sum(axis=0), g.sum(axis=0)
@@ -77,8 +77,7 @@ def evidence(info: Information, selected: Sequence[str], effect: Effect) -> Evid
     if not np.diag(total)[n:].min() > 1e-12:
         return Evidence(effect.name, np.zeros(len(own)), 0.0, 0.0, np.zeros(len(a)), False)
     # direction in which the new ones change while the selected ones follow
-    follow = np.linalg.lstsq(total[:n, :n], total[:n, n:], rcond=1e-10)[0] if n else np.zeros((0, len(own)))
-    free = total[n:, n:] - total[n:, :n] @ follow
+    follow, free = rest_beside(total, range(n), range(n, len(both)))
     own_score = score[n:] - follow.T @ score[:n]
     if not np.linalg.eigvalsh(free)[0] > 1e-9 * np.diag(total)[n:].min():
         free = free + 1e-9 * np.diag(np.diag(total)[n:])
@@ -182,8 +181,3 @@ def gain_interval(gain: Array, seed: int = 0) -> tuple[float, float]:
     )
     low, high = np.quantile(weights @ gain, [0.025, 0.975])
     return float(low), float(high)
-
-
-def n_clusters(info: Information) -> int:
-    """Return how many clusters the t statistic has."""
-    return len(info.a) if len(info.a) >= MIN_CLUSTERS else len(info.a) * N_BLOCKS

@@ -9,7 +9,7 @@ from types import MappingProxyType
 from terrain.errors import ConfigError
 from terrain.records import Array
 from terrain.robots import Robot
-from terrain.simulation.effects import NUISANCES, PARAMETERS, Effect, library_of, vector_of
+from terrain.simulation.effects import NUISANCES, Effect, library_of, vector_of
 from terrain.simulation.planar import Ground, Planar, make_planar
 
 
@@ -65,17 +65,7 @@ class Simulation:
         """Parameters (len(PARAMETERS),) of the effects built in."""
         return vector_of(self.effects)
 
-    @property
-    def scatter_std(self) -> Array:
-        """Scatter (len(PARAMETERS),) of each parameter from run to run, 0 where there is none."""
-        return vector_of(self.scatter)
-
     def with_effects(self, values: Mapping[str, float]) -> Simulation:
         """Return the same with more effects built in; what is there already grows by what is given."""
         grown = {name: self.effects.get(name, 0.0) + value for name, value in values.items()}
         return replace(self, effects={**self.effects, **grown})
-
-
-def named(vector: Array) -> dict[str, float]:
-    """Return the parameters of a vector that are not 0, by name."""
-    return {name: float(value) for name, value in zip(PARAMETERS, vector, strict=True) if value != 0.0}

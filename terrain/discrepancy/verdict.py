@@ -78,11 +78,20 @@ class Limit(NamedTuple):
 
 
 class RuledOut(NamedTuple):
-    """An effect that is not the answer, and why."""
+    """An effect that is not the answer, and why.
+
+    Parameters
+    ----------
+    name : of the effect
+    reason : in words
+    z : its evidence
+    values : those that fit, of an effect that was withdrawn although it helps
+    """
 
     name: str
     reason: str
     z: float
+    values: tuple[Value, ...] = ()
 
 
 class Excluded(NamedTuple):
@@ -203,7 +212,15 @@ class Diagnosis:
             ],
             "not_excited": [limit for limit in limits if limit["name"] in missed],
             "detection_limits": limits,
-            "ruled_out": [{"name": x.name, "reason": x.reason, "z": _number(x.z)} for x in self.ruled_out],
+            "ruled_out": [
+                {
+                    "name": x.name,
+                    "reason": x.reason,
+                    "z": _number(x.z),
+                    "parameters": [_value(value) for value in x.values],
+                }
+                for x in self.ruled_out
+            ],
             "excluded_runs": [x._asdict() for x in self.excluded_runs],
             "clocks": [
                 {"run_id": x.run_id, "offset_s": _number(x.offset_s), "std_s": _number(x.std_s)}

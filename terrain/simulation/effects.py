@@ -370,6 +370,11 @@ PARAMETERS: tuple[str, ...] = tuple(
 
 INDEX: dict[str, int] = {name: i for i, name in enumerate(PARAMETERS)}
 
+BOUNDS: dict[str, tuple[float, float]] = {
+    p.name: (p.low, p.high) for effect in LIBRARY for p in effect.parameters
+}
+"""Of each parameter of the library: what it may physically be."""
+
 
 def effect_named(name: str) -> Effect:
     """Return the effect of a name or an alias.

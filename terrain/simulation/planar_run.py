@@ -1,9 +1,10 @@
 """One run of the planar simulation: twists wanted in, an ordinary run log with its truth out.
 
 Twists become speeds of wheels and steering angles that a driver would command with the described geometry;
-the drives follow them with a lag and bounded rates; :func:`terrain.simulation.planar.move` tells the motion
-on hilly ground, :func:`~terrain.simulation.planar.sense` what sensors without noise would show of it; loggers
-add noise, bias and quantisation.  A hidden effect is a number in the same vector that a replay has.
+the drives follow them with a lag and bounded rates; :func:`~terrain.simulation.planar_motion.move` tells the
+motion on hilly ground, :func:`~terrain.simulation.planar_sensors.sense` what sensors without noise would show
+of it; loggers add noise, bias and quantisation.  A hidden effect is a number in the same vector that a replay
+has.
 
 The hills are those along the path that the wheels would roll without slip.
 """
@@ -36,7 +37,8 @@ from terrain.simulation.effects import (
     TURNING_CURRENT,
     vector_of,
 )
-from terrain.simulation.planar import TRUTH, Ground, Planar, delayed, make_planar, move, sense
+from terrain.simulation.planar import AX, VX, VY, Ground, Planar, W, make_planar
+from terrain.simulation.planar_motion import move
 from terrain.simulation.planar_noise import (
     CAMERA_HZ,
     IMU_HZ,
@@ -47,6 +49,8 @@ from terrain.simulation.planar_noise import (
     coloured,
     lag_weights,
 )
+from terrain.simulation.planar_sensors import sense
+from terrain.simulation.planar_signals import delayed
 from terrain.slip import slip_ratio
 
 COMMANDS_HZ = 50.0
@@ -76,9 +80,6 @@ own phase, and spikes of the current at crawling speed."""
 
 _PURPOSES = ("scatter", "hills", "ground", "wheels", "steering", "imu", "camera", "outside", "lidar")
 
-_VX, _VY, _W, _AX = (
-    TRUTH.index(name) for name in ("speed_x_mps", "speed_y_mps", "yaw_rate_radps", "accel_x_mps2")
-)
 _SEEN_X = CHANNELS.index(SPEED_X)
 assert CHANNELS[_SEEN_X + 1] == SPEED_Y
 
@@ -341,9 +342,9 @@ def _pose(truth: Array, dt: float) -> Array:
     n = truth.shape[0]
     pose = np.zeros((n, 3))
     for k in range(1, n):
-        yaw = pose[k - 1, 2] + 0.5 * dt * (truth[k - 1, _W] + truth[k, _W])
+        yaw = pose[k - 1, 2] + 0.5 * dt * (truth[k - 1, W] + truth[k, W])
         middle = 0.5 * (yaw + pose[k - 1, 2])
-        x, y = 0.5 * (truth[k - 1, _VX] + truth[k, _VX]), 0.5 * (truth[k - 1, _VY] + truth[k, _VY])
+        x, y = 0.5 * (truth[k - 1, VX] + truth[k, VX]), 0.5 * (truth[k - 1, VY] + truth[k, VY])
         cos, sin = math.cos(middle), math.sin(middle)
         pose[k, 0] = pose[k - 1, 0] + dt * (x * cos - y * sin)
         pose[k, 1] = pose[k - 1, 1] + dt * (x * sin + y * cos)
@@ -508,7 +509,7 @@ def _imu(
     rows, time_s = _samples(motion, IMU_HZ, dt)
     n, late_s = len(rows), sensors.imu_latency_s
     cos = np.cos(motion.grade_rad)
-    turn, v_x, v_y = (motion.truth[:, column] for column in (_W, _VX, _VY))
+    turn, v_x, v_y = (motion.truth[:, column] for column in (W, VX, VY))
     roll, pitch = (
         _clocked(motion.roll_rad, p, dt, late_s)[rows],
         -_clocked(motion.grade_rad, p, dt, late_s)[rows],
@@ -594,8 +595,8 @@ def _truth(robot: Robot, p: Array, dt: float, motion: _Motion) -> Stream:
     assert robot.sensors is not None
     rows, time_s = _samples(motion, IMU_HZ, dt)
     n = len(rows)
-    v_x, v_y, turn = (motion.truth[rows, column] for column in (_VX, _VY, _W))
-    accel_x = motion.truth[rows, _AX] - GRAVITY_MPS2 * np.sin(motion.grade_rad[rows])
+    v_x, v_y, turn = (motion.truth[rows, column] for column in (VX, VY, W))
+    accel_x = motion.truth[rows, AX] - GRAVITY_MPS2 * np.sin(motion.grade_rad[rows])
     accel_y = np.gradient(v_y, 1.0 / IMU_HZ) + turn * v_x
     rim, steer = motion.rim_mps[rows], motion.steer_rad[rows]
     x, y = robot.wheel_positions_m.T

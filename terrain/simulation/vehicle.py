@@ -31,8 +31,9 @@ Effects of the robot (:mod:`terrain.simulation.effects`) act where a real robot 
 - **force_slip, shear_slip**: a creep of the contact on top of the ground's own slip.  Its deflection follows
   ``du/dt = (w r - v) - max(|w r|, |v|) (u / sigma + c f)`` with ``f = 3 F_i / W``, so that it settles
   where slip is that of the ground plus ``c f``, and no equation has to be solved for a force;
-  of a shear curve ``c f`` is bent as in :func:`terrain.simulation.planar.shear_slip`, up to the wheel's own
-  limit.  A negative creep leaves a tenth of the ground's slip: no contact is stiffer than ten times it;
+  of a shear curve ``c f`` is bent as in :func:`~terrain.simulation.planar_contact.shear_slip`, up to the
+  wheel's own limit.  A negative creep leaves a tenth of the ground's slip: no contact is stiffer than ten
+  times it;
 - **side_hill_slip**: the ground goes by sideways: wheels roll without side force where they drift downhill by
   ``c ph |v|``;
 - **rolling_resistance, slip_resistance, viscous_drag**: more resistance at each axle, by its load, its slip
@@ -51,7 +52,7 @@ from terrain.constants import GRAVITY_MPS2
 from terrain.errors import ConfigError
 from terrain.records import Array
 from terrain.robots import Robot
-from terrain.simulation.planar import DEFLECTION_DAMPING_S, shear_slip
+from terrain.simulation.planar_contact import DEFLECTION_DAMPING_S, shear_slip
 from terrain.terramechanics import traction
 from terrain.terramechanics.traction import wheel_ground
 

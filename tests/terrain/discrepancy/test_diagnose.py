@@ -37,7 +37,7 @@ class World:
     def __init__(self, name):
         self.robot = load_robot(name)
         self.simulation = simulation_of(self.robot)
-        self.drives = rich_drives(self.robot, np.random.default_rng(3), 6, 40.0)
+        self.drives = rich_drives(np.random.default_rng(3), 6, 40.0)
         self.limits = limits_of(self.robot, self.drives)
 
     def runs(self, hidden, outside=None, seed=11):

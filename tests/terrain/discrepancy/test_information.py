@@ -7,7 +7,6 @@ import pytest
 from numpy.testing import assert_allclose
 
 from terrain.discrepancy.information import (
-    BOUNDS,
     N_BLOCKS,
     counted_from,
     information_at,
@@ -19,7 +18,7 @@ from terrain.discrepancy.selection import fitted
 from terrain.discrepancy.signals import signals_of
 from terrain.discrepancy.simulation import Simulation
 from terrain.robots import load_robot
-from terrain.simulation.effects import CHANNELS, INDEX, SPEED_X, vector_of
+from terrain.simulation.effects import BOUNDS, CHANNELS, INDEX, SPEED_X, vector_of
 from terrain.simulation.planar_noise import load_noise, load_scatter
 from terrain.simulation.planar_run import Hills, simulate_planar
 

@@ -38,7 +38,7 @@ def said(simulation: Simulation, runs: list[RunLog], names: list[str]) -> Inform
 
 def collinearity(info: Information, names: list[str]) -> float:
     """Index of two parameters of one number each, by its definition."""
-    at = info.index(names)
+    at = info.places(names)
     a = info.a[:, at][:, :, at].sum(axis=0)
     return float(1 / np.sqrt(1 - abs(a[0, 1]) / np.sqrt(a[0, 0] * a[1, 1])))
 
@@ -88,7 +88,7 @@ def test_what_was_not_shown_is_asked_for_and_its_limit_is_told():
     limit = re.search(r"from infinite to ([\d.]+) ratio", told.reason)
     assert limit is not None
     info = said(AGRIMARO, [drive(AGRIMARO, told.scenario, told.grade_deg)], names)
-    at = info.index(names[:1])[0]
+    at = info.places(names[:1])[0]
     assert 5.48 / np.sqrt(info.a[0, at, at]) == pytest.approx(float(limit[1]), rel=0.6)
 
 

@@ -32,7 +32,7 @@ from terrain.simulation.effects import (
     TURNING_CURRENT,
     vector_of,
 )
-from terrain.simulation.planar import replay
+from terrain.simulation.planar_replay import replay
 from terrain.simulation.planar_run import Hills, simulate_planar
 
 ROBOTS = {"husky": load_robot("husky"), "agrimaro": load_robot("agrimaro")}

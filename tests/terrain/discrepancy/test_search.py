@@ -18,7 +18,7 @@ HIDDEN = {"camera_latency_s": 0.15, "payload_ratio": 0.25, "camera_yaw_rad": 0.0
 
 def problem(hidden, library=None, built_in=None):
     simulation = simulation_of(HUSKY).with_effects(built_in or {})
-    drives = rich_drives(HUSKY, np.random.default_rng(5), 6, 40.0)
+    drives = rich_drives(np.random.default_rng(5), 6, 40.0)
     runs = hidden_runs(HUSKY, drives, np.random.SeedSequence(2), hidden)
     signals = tuple(signals_of(run, HUSKY) for run in runs)
     library = simulation.library if library is None else tuple(effect_named(name) for name in library)

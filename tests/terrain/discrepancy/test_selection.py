@@ -10,14 +10,12 @@ from scipy.stats import t as student
 
 from terrain.discrepancy.information import N_BLOCKS
 from terrain.discrepancy.selection import (
-    MIN_CLUSTERS,
     N_BOOTSTRAP,
     TRUST_DOF,
     evidence,
     fitted,
     gain_interval,
     held_out_gain,
-    n_clusters,
     weighed_variance,
     z_of,
     z_of_t,
@@ -56,7 +54,7 @@ def problem(true, seed=0, n_runs=N_RUNS, scatter=0.0, alike=0.0):
         g=g,
         a_blocks=a_blocks,
         g_blocks=g_blocks,
-        index=lambda names: [PARAMETERS.index(name) for name in names],
+        places=lambda names: [PARAMETERS.index(name) for name in names],
     )
 
 
@@ -177,6 +175,4 @@ def test_the_interval_of_a_gain_holds_its_spread_over_runs():
 
 
 def test_with_few_runs_thirds_of_them_are_the_clusters():
-    assert n_clusters(problem(true(), n_runs=MIN_CLUSTERS)) == MIN_CLUSTERS
-    assert n_clusters(problem(true(), n_runs=MIN_CLUSTERS - 1)) == N_BLOCKS * (MIN_CLUSTERS - 1)
     assert evidence(problem(true(10.0), n_runs=3), (), PAYLOAD).stands

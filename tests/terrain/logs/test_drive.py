@@ -269,15 +269,18 @@ def test_import_writes_what_was_read(tmp_path):
 
 
 @pytest.fixture(scope="module")
-def husky_runs(datasets_dir):
-    if not (datasets_dir / "drive_husky" / FILE_NAME).is_file():
-        pytest.skip("the Husky log of DRIVE is not there")
-    return load_runs(datasets_dir / "drive_husky")
+def husky_file(measured):
+    return measured(f"drive_husky/{FILE_NAME}")
 
 
-def test_the_published_file_agrees_with_the_plain_csv_module(datasets_dir, husky_runs):
+@pytest.fixture(scope="module")
+def husky_runs(husky_file):
+    return load_runs(husky_file.parent)
+
+
+def test_the_published_file_agrees_with_the_plain_csv_module(husky_file, husky_runs):
     """Two routes, every cell: nothing is lost but the samples that two windows share."""
-    with gzip.open(datasets_dir / "drive_husky" / FILE_NAME, "rt", newline="") as file:
+    with gzip.open(husky_file, "rt", newline="") as file:
         rows = list(csv.DictReader(file))
     assert [run.run_id for run in husky_runs] == [f"step_{i:03d}" for i in range(201)]
     assert sum(len(run.streams["imu"]) for run in husky_runs) == len(rows) - 42

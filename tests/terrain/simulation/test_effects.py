@@ -24,7 +24,8 @@ from terrain.simulation.effects import (
     read_effect,
     vector_of,
 )
-from terrain.simulation.planar import Ground, make_planar, replay
+from terrain.simulation.planar import Ground, make_planar
+from terrain.simulation.planar_replay import replay
 
 ROBOTS = {"skid_steer": load_robot("husky"), "swerve": load_robot("agrimaro")}
 NOISE = {

@@ -17,7 +17,7 @@ from terrain.kinematics.swerve import forward
 from terrain.robots import load_robot
 from terrain.simulation.conditions import Conditions, Faults
 from terrain.simulation.effects import library_of
-from terrain.simulation.planar import shear_slip
+from terrain.simulation.planar_contact import shear_slip
 from terrain.simulation.scenario import make_scenario
 from terrain.simulation.sensors import Gnss
 from terrain.simulation.simulate import simulate

@@ -21,21 +21,14 @@ from terrain.simulation.effects import (
     library_of,
     vector_of,
 )
-from terrain.simulation.planar import (
-    DEFLECTION_DAMPING_S,
-    ENDO_POWER,
-    ROLLING_MPS,
-    STANDSTILL_MPS,
-    TRUTH,
-    Ground,
-    delayed,
-    direction,
-    make_planar,
-    move,
-    replay,
-    sense,
-    shear_slip,
-)
+from terrain.simulation.planar import TRUTH, Ground, make_planar
+from terrain.simulation.planar_contact import DEFLECTION_DAMPING_S, shear_slip
+from terrain.simulation.planar_motion import move
+from terrain.simulation.planar_replay import replay
+from terrain.simulation.planar_sensors import sense
+from terrain.simulation.planar_signals import delayed
+from terrain.simulation.planar_skid import ENDO_POWER, STANDSTILL_MPS, direction
+from terrain.simulation.planar_swerve import ROLLING_MPS
 
 HUSKY, AGRIMARO = load_robot("husky"), load_robot("agrimaro")
 ROBOTS = {"skid_steer": HUSKY, "swerve": AGRIMARO}

@@ -24,9 +24,10 @@ from terrain.simulation.effects import (
     TURNING_CURRENT,
     vector_of,
 )
-from terrain.simulation.planar import Ground, make_planar, replay
+from terrain.simulation.planar import Ground, make_planar
 from terrain.simulation.planar_ground import planar_ground
 from terrain.simulation.planar_noise import load_noise, load_scatter, noise_psd
+from terrain.simulation.planar_replay import replay
 from terrain.simulation.planar_run import Hills, simulate_planar
 from terrain.simulation.scenario import make_scenario
 from terrain.terramechanics.soil import load_soil
