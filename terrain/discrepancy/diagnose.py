@@ -16,12 +16,12 @@ import numpy as np
 
 from terrain.discrepancy.clocks import shifts_of
 from terrain.discrepancy.health import clocks_of, unfit_runs
-from terrain.discrepancy.information import Information, rest_beside
+from terrain.discrepancy.information import Information, counted_from, rest_beside
 from terrain.discrepancy.next_drive import next_drive
 from terrain.discrepancy.probes import Answer, ask, drift_of
 from terrain.discrepancy.residuals import low_pass_of, measured_channels
 from terrain.discrepancy.search import Found, Problem, names_of, search
-from terrain.discrepancy.selection import Z_EFFECT, gain_interval
+from terrain.discrepancy.selection import Z_EFFECT, fitted, gain_interval
 from terrain.discrepancy.signals import Signals, signals_of
 from terrain.discrepancy.simulation import Simulation
 from terrain.discrepancy.verdict import (
@@ -51,11 +51,15 @@ POWER_Z = 1.28
 SEEN_SHARE = 0.3
 """An effect whose detection limit is over this share of its bounds counts as not excited."""
 
-BLIND_SHARE = 0.25
+BLIND_SHARE = 0.05
 """Where so large a share of the library is not excited, finding nothing is no answer."""
 
 DRIFT_SHARE, PROBE_SHARE = 0.05, 0.15
 """A cause whose drift, or a nameless input in its channel, tells that share of what it tells is not it."""
+
+CALMER, CALMER_Z, CALMER_SHARE = 0.5, 3.0, 0.3
+"""A cause whose value differs by that many standard deviations and by that share of it, where sensitivities
+are taken along inputs of that share of the cut-off, is not it."""
 
 ENTANGLED = 0.97
 """Two causes whose fitted values correlate more are one answer with two names: a collinearity index of 6."""
@@ -113,7 +117,7 @@ def diagnose_signals(
     answers = ask(at_fit, found.names, found.change)
     drifts = drift_of(at_fit, found.names, found.change)
     leftovers = _leftovers(at_fit, answers)
-    withdrawn = _withdrawn(found, drifts, answers)
+    withdrawn = _withdrawn(found, drifts, answers) | _unsteady(problem, found)
     named, sets = _sorted_out(found, [cause for cause in found.causes if cause.name not in withdrawn])
     leftovers = _with_drifts(leftovers, found, withdrawn, drifts)
     limits = tuple(_limits(found, problem.library))
@@ -180,6 +184,28 @@ def _withdrawn(
             why[cause.name] = f"it helps, but changes from the start of runs to their end (z {drift.z:.1f})"
         elif most is not None and beside[most].gain > PROBE_SHARE * told:
             why[cause.name] = f"it helps, but {most[0]} follows {most[1]} beside it (z {beside[most].z:.1f})"
+    return why
+
+
+def _unsteady(problem: Problem, found: Found) -> dict[str, str]:
+    """Return the causes whose values are others where quick motion is not looked at, by name, and why.
+
+    Both are estimates of one thing, so they agree but for what the calmer one knows less (Hausman,
+    Econometrica 1978): where they do not, the cause stands for noise of the wheels that drive the simulation.
+    """
+    if not found.causes:
+        return {}
+    calmer = problem._replace(low_pass=problem.low_pass._replace(calm_hz=CALMER * problem.low_pass.calm_hz))
+    info = calmer.at(found.info.vector, found.names, found.info.noise)
+    value, cov = fitted(counted_from(info, problem.simulation.vector), found.names)
+    why = {}
+    for cause in found.causes:
+        at = [found.names.index(p.name) for p in cause.parameters]
+        size = found.change[at]
+        var = np.maximum(np.diag(cov - found.cov)[at], 0.0) * found.tried[cause.name].inflation
+        apart = np.abs(value[at] - size)
+        if (apart > np.maximum(CALMER_Z * np.sqrt(var), CALMER_SHARE * np.abs(size))).any():
+            why[cause.name] = "it helps, but has another value in slow motion alone: noise of the wheels"
     return why
 
 

@@ -206,6 +206,22 @@ def rest_beside(a: Array, base: Sequence[int], own: Sequence[int]) -> tuple[Arra
     return follow, a[np.ix_(own, own)] - a[np.ix_(own, base)] @ follow
 
 
+def correlation(a: Array, one: Sequence[int], other: Sequence[int]) -> float:
+    """Return the largest correlation of what parameters at the places one and other change.
+
+    It is 1 where one of them does nothing.
+    """
+    roots = []
+    for at in (one, other):
+        values, vectors = np.linalg.eigh(a[np.ix_(at, at)])
+        if not values[-1] > 1e-12:
+            return 1.0
+        kept = values > 1e-9 * values[-1]
+        roots.append(vectors[:, kept] / np.sqrt(values[kept]))
+    between = roots[0].T @ a[np.ix_(one, other)] @ roots[1]
+    return min(float(np.linalg.norm(between, 2)), 1.0)
+
+
 def loss_of(info: Information, names: Sequence[str]) -> float:
     """Return minus twice the log-likelihood of the best fit of parameters, up to what no fit changes."""
     at = info.places(names)
@@ -213,9 +229,72 @@ def loss_of(info: Information, names: Sequence[str]) -> float:
     return -float(g @ np.linalg.lstsq(a, g, rcond=1e-10)[0]) if at else 0.0
 
 
-def moved(info: Information, names: Sequence[str], change: Array) -> Array:
+class Nearby(NamedTuple):
+    """What runs say of a few parameters at another point, by the noise and the scatter of an information.
+
+    Parameters
+    ----------
+    vector : the point
+    a, g : (k, k) and (k,) of the quadratic form of the parameters asked for, all runs together
+    white_residual : of each run (rows, channels)
+    """
+
+    vector: Array
+    a: Array
+    g: Array
+    white_residual: tuple[Array, ...]
+
+
+def nearby(
+    info: Information,
+    signals: Sequence[Signals],
+    simulation: Simulation,
+    vector: Array,
+    parameters: Sequence[str],
+    low_pass: LowPass,
+) -> Nearby:
+    """Return what the runs of an information say at another point; much quicker than anew."""
+    planar = {terrain: simulation.planar_on(terrain) for terrain in {run.terrain for run in signals}}
+    k, white = len(parameters), []
+    a, g = np.zeros((k, k)), np.zeros(k)
+    for run, its_change, inner in zip(signals, info.white_change, info.inner, strict=True):
+        rows = rows_of(run, planar[run.terrain], vector, parameters, low_pass)
+        residual, change = _whitened(info.noise, rows)
+        nuisances = its_change[info.nuisances].reshape(len(info.nuisances), -1)
+        both = np.concatenate([change, residual[None]]).reshape(k + 1, -1)
+        along = nuisances @ both.T
+        gram = both @ both.T - along.T @ inner @ along
+        a, g = a + gram[:k, :k], g + gram[:k, k]
+        white.append(residual)
+    return Nearby(vector, a, g, tuple(white))
+
+
+def misfit_of(info: Information, white_residual: Sequence[Array]) -> float:
+    """Return what the whole library could still take from residuals (rows, channels) at another point.
+
+    Parameters
+    ----------
+    info : whose sensitivities and noise are the measure
+    white_residual : of each run, whitened by the noise of ``info``
+
+    Notes
+    -----
+    Up to a constant it is minus twice the log-likelihood there, as far as sensitivities can tell.  The sum of
+    squares itself will not do: the noise of the wheels is in the prediction, and a cause that makes it larger
+    or smaller, as a mass does, would be judged by it.
+    """
+    score = np.zeros(len(info.parameters))
+    for residual, change, shift in zip(white_residual, info.white_change, info.shift, strict=True):
+        flat = change.reshape(len(change), -1) @ residual.ravel()
+        score += flat - shift[:, : len(flat)].T @ flat[info.nuisances]
+    prior = np.array([PRIOR_STD.get(name, 1e-6) for name in info.parameters])
+    total = info.a.sum(axis=0) + np.diag(1.0 / prior**2)
+    return float(score @ np.linalg.solve(total, score))
+
+
+def moved(point: Array, names: Sequence[str], change: Array) -> Array:
     """Return the point that lies a change of the parameters named away, kept in the bounds of the library."""
-    vector = info.vector.copy()
+    vector = point.copy()
     for name, value in zip(names, change, strict=True):
         vector[INDEX[name]] += value
         if name in BOUNDS:

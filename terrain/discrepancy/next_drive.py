@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.signal import lfilter
 
-from terrain.discrepancy.information import Information, information_at, rest_beside
+from terrain.discrepancy.information import Information, correlation, information_at, rest_beside
 from terrain.discrepancy.noise import ORDER, Noise
 from terrain.discrepancy.residuals import low_pass_of, measured_channels
 from terrain.discrepancy.selection import Z_EFFECT
@@ -194,23 +194,10 @@ def _parted(sets: Sequence[tuple[str, ...]], names: Sequence[str], a: Array) -> 
     for group in sets:
         for pair in combinations(group, 2):
             one, other = ([names.index(name) for name in _parameters(effect)] for effect in pair)
-            r = _correlation(a, one, other)
+            r = correlation(a, one, other)
             index = max(index, math.inf if r >= 1.0 else 1.0 / math.sqrt(1.0 - r))
             power = min(power, _free(a, names, one, other), _free(a, names, other, one))
     return _Parted(index, power)
-
-
-def _correlation(a: Array, one: list[int], other: list[int]) -> float:
-    """Return the largest correlation of changes by the one and the other, 1 where one does nothing."""
-    roots = []
-    for at in (one, other):
-        values, vectors = np.linalg.eigh(a[np.ix_(at, at)])
-        if not values[-1] > 1e-12:
-            return 1.0
-        kept = values > 1e-9 * values[-1]
-        roots.append(vectors[:, kept] / np.sqrt(values[kept]))
-    between = roots[0].T @ a[np.ix_(one, other)] @ roots[1]
-    return min(float(np.linalg.norm(between, 2)), 1.0)
 
 
 def _free(a: Array, names: Sequence[str], one: list[int], other: list[int]) -> float:

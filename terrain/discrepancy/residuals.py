@@ -29,6 +29,10 @@ CUTOFF_HZ = 2.5
 INPUT_CUTOFFS = 2.4
 """Cut-off of what drives the simulation, over that of the common low-pass."""
 
+CALM_CUTOFF = 0.6
+"""Cut-off of the rim speeds that sensitivities are taken along, over that of the common low-pass: see
+:func:`rows_of`."""
+
 SAME_CLOCK = 0.05
 """Share by which the runs' clocks may differ: one window serves all of them."""
 
@@ -70,6 +74,8 @@ class LowPass(NamedTuple):
     cutoff_hz : of the window
     inputs_every : samples of the signals' clock a sample of the replay's; 0 where that clock is too slow for
         a window of its own in between
+    calm_hz : cut-off of the rim speeds that sensitivities are taken along, see :func:`rows_of`; infinite for
+        those of the prediction
     """
 
     taps: Array
@@ -77,6 +83,7 @@ class LowPass(NamedTuple):
     rate_hz: float
     cutoff_hz: float
     inputs_every: int
+    calm_hz: float
 
 
 class Rows(NamedTuple):
@@ -143,7 +150,14 @@ def low_pass_of(signals: Sequence[Signals]) -> LowPass:
     inputs_every = int(near * rate_hz / (CLOCKS_PER_CUTOFF * cutoff_hz))
     clock_hz = rate_hz / max(inputs_every, 1)
     every = max(int(near * clock_hz / (ROWS_PER_CUTOFF * cutoff_hz)), 1)
-    return LowPass(_window(cutoff_hz, clock_hz), every, clock_hz / every, cutoff_hz, inputs_every)
+    return LowPass(
+        _window(cutoff_hz, clock_hz),
+        every,
+        clock_hz / every,
+        cutoff_hz,
+        inputs_every,
+        CALM_CUTOFF * cutoff_hz,
+    )
 
 
 def _window(cutoff_hz: float, rate_hz: float) -> Array:
@@ -164,6 +178,14 @@ def rows_of(
     vector : (len(PARAMETERS),) where the prediction and its sensitivities are taken
     parameters : names
     low_pass : of all runs
+
+    Notes
+    -----
+    The prediction holds the noise of the wheels that drive it, and so does the residual, turned about.  A
+    sensitivity along the same wheels holds it too, and where a robot hardly changes its motion, that is most
+    of it: residual and sensitivity agree by their noise, and an acceleration that never was looks like too
+    much of a mass.  Sensitivities are therefore taken along calmer wheels, as instruments: noise of a
+    differentiated encoder grows with frequency, what a robot was told to do does not.
     """
     dt, rim, steer, grade, roll, measured = _prepared(signals, low_pass)
     n_rows = max((len(rim) - low_pass.taps.size) // low_pass.every + 1, 0)
@@ -188,11 +210,13 @@ def rows_of(
     truth = move(planar, vector, dt, true_rim, steer, true_grade, true_roll, np.zeros((0, 3)))
     points, sensed, spans = _points(vector, parameters)
     holes = np.zeros((0, 0), dtype=np.bool_) if whole else known
-    told = _predictions(
-        planar, points, sensed, dt, rim, steer, grade, roll, truth, holes, low_pass.taps, low_pass.every
-    )[:, keep]
-    now = told[0]
-    change = (told[1::2] - told[2::2]) / spans[:, None, None]
+    window = holes, low_pass.taps, low_pass.every
+    now = _predictions(planar, points[:1], sensed[:1], dt, rim, steer, grade, roll, truth, *window)[0, keep]
+    rim = _calm(rim, low_pass, dt)
+    true_rim, true_grade, true_roll = undone(planar, vector, dt, rim, grade, roll)
+    truth = move(planar, vector, dt, true_rim, steer, true_grade, true_roll, np.zeros((0, 3)))
+    told = _predictions(planar, points[1:], sensed[1:], dt, rim, steer, grade, roll, truth, *window)[:, keep]
+    change = (told[::2] - told[1::2]) / spans[:, None, None]
     speed = rim.mean(axis=1)
     force = truth[:, 4] / (GRAVITY_MPS2 * planar.mass_kg)
     inputs = np.column_stack([speed, rim[:, -1] - rim[:, 0], steer.mean(axis=1), grade, roll, force])
@@ -207,6 +231,15 @@ def rows_of(
         change,
         np.column_stack([plain(inputs), phase[at]]),
     )
+
+
+def _calm(rim: Array, low_pass: LowPass, dt: float) -> Array:
+    """Return rim speeds (n, wheels) behind the low-pass of the sensitivities, as long as they were."""
+    if not math.isfinite(low_pass.calm_hz):
+        return rim
+    taps = _window(low_pass.calm_hz, 1.0 / dt)
+    half = taps.size // 2
+    return np.asarray(decimated(np.pad(rim, ((half, half), (0, 0)), mode="edge"), taps, 1))
 
 
 def _points(vector: Array, parameters: Sequence[str]) -> tuple[Array, Array, Array]:

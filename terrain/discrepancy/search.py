@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from terrain.discrepancy.information import (
     Information,
+    Nearby,
+    correlation,
     counted_from,
     information_at,
     loss_of,
+    misfit_of,
     moved,
+    nearby,
     rest_beside,
 )
 from terrain.discrepancy.noise import Noise
@@ -21,7 +25,7 @@ from terrain.discrepancy.selection import Evidence, evidence, fitted
 from terrain.discrepancy.signals import Signals
 from terrain.discrepancy.simulation import Simulation
 from terrain.records import Array
-from terrain.simulation.effects import Effect
+from terrain.simulation.effects import INDEX, Effect
 
 MAX_CAUSES = 6
 """More are not looked for: by then the simulation is of another robot."""
@@ -36,6 +40,10 @@ many at most."""
 RIVAL_LOSS = 8.0
 """Two causes whose best fits differ by less in minus twice the log-likelihood are not told apart: the wrong
 one of two is that much ahead with a chance of 0.3 % at most, whatever the size of the effect."""
+
+TWIN, TWIN_LOSS = 0.985, 20.0
+"""The same of two whose sensitivities correlate more, a collinearity index of 8: all that parts them is a
+small share of what they explain, and as much the simulation's own fault as theirs."""
 
 PARAMETER_LOSS = 4.0
 """What a fit has to gain by each of its parameters before it counts as better than one with fewer."""
@@ -76,6 +84,10 @@ class Problem(NamedTuple):
         """Return what the runs say around a point."""
         wanted = self.parameters if names is None else names
         return information_at(self.signals, self.simulation, vector, wanted, self.low_pass, noise)
+
+    def near(self, info: Information, vector: Array, names: Sequence[str]) -> Nearby:
+        """Return what the runs say of a few parameters at another point, by the noise of an information."""
+        return nearby(info, self.signals, self.simulation, vector, names, self.low_pass)
 
 
 class Found(NamedTuple):
@@ -136,7 +148,7 @@ def search(problem: Problem, start: Information) -> Found:
         barred |= {effect.name for effect in new if effect not in causes}
     names = names_of(causes)
     change, cov = fitted(info, names)
-    rivals = {cause.name: _rivals(problem, info, base, causes, cause) for cause in causes}
+    rivals = {cause.name: _rivals(problem, info, start, causes, cause) for cause in causes}
     tried = {
         effect.name: evidence(info, [n for n in names if n not in names_of([effect])], effect)
         for effect in problem.library
@@ -222,18 +234,27 @@ def _pair(info: Information, causes: Sequence[Effect], library: Sequence[Effect]
     return []
 
 
-def _refitted(problem: Problem, info: Information, base: Array, causes: Sequence[Effect]) -> Information:
-    """Fit, and take sensitivities anew where the fit has gone."""
-    names = names_of(causes)
-    at = info
-    for _ in range(MAX_REFITS):
-        change, cov = fitted(at, names)
-        at = counted_from(problem.at(moved(at, names, change), names, info.noise), base)
-        step = fitted(at, names)[0] - change
-        if (np.abs(step) < SETTLED * np.sqrt(np.maximum(np.diag(cov), 1e-30))).all():
+def _steps(
+    problem: Problem, info: Information, base: Array, names: Sequence[str], n_most: int
+) -> Iterator[Nearby]:
+    """Yield what the runs say at the points to which a nonlinear fit of parameters goes, until it settles."""
+    change, _ = fitted(info, names)
+    for _ in range(n_most):
+        point = problem.near(info, moved(base, names, change), names)
+        yield point
+        cov = np.linalg.pinv(point.a, hermitian=True)
+        now = point.vector[[INDEX[name] for name in names]] - base[[INDEX[name] for name in names]]
+        before, change = change, now + cov @ point.g
+        if (np.abs(change - before) < SETTLED * np.sqrt(np.maximum(np.diag(cov), 1e-30))).all():
             break
-    change, _ = fitted(at, names)
-    return counted_from(problem.at(moved(at, names, change)), base)
+
+
+def _refitted(problem: Problem, info: Information, base: Array, causes: Sequence[Effect]) -> Information:
+    """Fit, and take everything anew where the fit has gone."""
+    point = base
+    for near in _steps(problem, info, base, names_of(causes), MAX_REFITS):
+        point = near.vector
+    return counted_from(problem.at(point), base)
 
 
 def _weakest(info: Information, causes: Sequence[Effect]) -> int | None:
@@ -269,9 +290,13 @@ def _penalised(info: Information, causes: Sequence[Effect]) -> float:
 
 
 def _rivals(
-    problem: Problem, info: Information, base: Array, causes: Sequence[Effect], cause: Effect
+    problem: Problem, info: Information, start: Information, causes: Sequence[Effect], cause: Effect
 ) -> tuple[str, ...]:
-    """Return all effects that, refitted in a cause's place, fit as well as it does."""
+    """Return all effects that, refitted in a cause's place, fit as well as it does.
+
+    It is judged by the noise that the causes leave and by that of the simulation as it is given: a cause that
+    takes something for noise is ahead by the one alone.
+    """
     names = names_of(causes)
     others = [other for other in causes if other is not cause]
     now = loss_of(info, names)
@@ -284,20 +309,25 @@ def _rivals(
             near.append(effect)
     if not near:
         return ()
-    here = _refit_loss(problem, info, base, names)
-    losses = {
-        effect.name: _refit_loss(problem, info, base, names_of([*others, effect])) - here for effect in near
-    }
-    return tuple(name for name, loss in sorted(losses.items(), key=lambda item: item[1]) if loss < RIVAL_LOSS)
+    ahead: dict[str, float] = {}
+    for judge in (info, start):
+        here = _refit_loss(problem, judge, start.vector, names)
+        for effect in near:
+            loss = _refit_loss(problem, judge, start.vector, names_of([*others, effect])) - here
+            ahead[effect.name] = min(ahead.get(effect.name, np.inf), loss)
+    allowed = {effect.name: _allowed(info, others, cause, effect) for effect in near}
+    return tuple(sorted((name for name in ahead if ahead[name] < allowed[name]), key=ahead.__getitem__))
+
+
+def _allowed(info: Information, others: Sequence[Effect], cause: Effect, rival: Effect) -> float:
+    """Return by how much a rival may fit worse than a cause and still be one."""
+    base, own, its = (info.places(names_of(effects)) for effects in (others, [cause], [rival]))
+    free = rest_beside(info.a.sum(axis=0), base, [*own, *its])[1]
+    alike = correlation(free, range(len(own)), range(len(own), len(own) + len(its)))
+    return TWIN_LOSS if alike > TWIN else RIVAL_LOSS
 
 
 def _refit_loss(problem: Problem, info: Information, base: Array, names: Sequence[str]) -> float:
-    """Return minus twice the log-likelihood of a nonlinear fit of parameters, with the noise as it is."""
-    at = info
-    loss = np.inf
-    for _ in range(RIVAL_REFITS):
-        change, _ = fitted(at, names)
-        point = problem.at(moved(at, names, change), names, info.noise)
-        loss = min(loss, float(point.c.sum()) + loss_of(point, names))
-        at = counted_from(point, base)
-    return loss + PARAMETER_LOSS * len(names)
+    """Return how badly a nonlinear fit of parameters fits, as minus twice a log-likelihood; see misfit_of."""
+    points = _steps(problem, info, base, names, RIVAL_REFITS)
+    return min(misfit_of(info, near.white_residual) for near in points) + PARAMETER_LOSS * len(names)

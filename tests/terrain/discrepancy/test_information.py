@@ -136,7 +136,9 @@ def test_changes_counted_from_another_point_end_at_the_same_values(signals, info
 
 
 def test_a_point_that_is_moved_to_keeps_within_bounds(info):
-    point = moved(info, ["payload_ratio", "camera_latency_s", "pitch_offset_rad"], np.array([9.0, -0.1, 0.3]))
+    point = moved(
+        info.vector, ["payload_ratio", "camera_latency_s", "pitch_offset_rad"], np.array([9.0, -0.1, 0.3])
+    )
     assert point[INDEX["payload_ratio"]] == BOUNDS["payload_ratio"][1]
     assert point[INDEX["camera_latency_s"]] == 0.0
     assert point[INDEX["pitch_offset_rad"]] == 0.3

@@ -101,7 +101,7 @@ def test_with_the_right_effects_hardly_anything_is_left_and_without_them_much(lo
 def test_sensitivities_are_differences_of_full_replays(looked_at):
     """Two routes: effects of sensors alone reuse the motion, and here all is replayed."""
     simulation, effects, signals = looked_at
-    low_pass, point = low_pass_of([signals]), vector_of(effects)
+    low_pass, point = low_pass_of([signals])._replace(calm_hz=np.inf), vector_of(effects)
     names = [p.name for effect in simulation.library for p in effect.parameters]
     rows = rows_of(
         signals, simulation.planar, point, [*names, "pitch_offset_rad", "roll_offset_rad"], low_pass
