@@ -21,7 +21,7 @@ from terrain.discrepancy.next_drive import next_drive
 from terrain.discrepancy.probes import Answer, ask, drift_of
 from terrain.discrepancy.residuals import low_pass_of, measured_channels
 from terrain.discrepancy.search import Found, Problem, names_of, search
-from terrain.discrepancy.selection import Z_EFFECT, fitted, gain_interval
+from terrain.discrepancy.selection import SEEN_SHARE, Z_EFFECT, fitted, gain_interval
 from terrain.discrepancy.signals import Signals, signals_of
 from terrain.discrepancy.simulation import Simulation
 from terrain.discrepancy.verdict import (
@@ -47,9 +47,6 @@ MIN_RUNS = 3
 
 POWER_Z = 1.28
 """Beyond the threshold, so that nine in ten are seen."""
-
-SEEN_SHARE = 0.3
-"""An effect whose detection limit is over this share of its bounds counts as not excited."""
 
 BLIND_SHARE = 0.05
 """Where so large a share of the library is not excited, finding nothing is no answer."""

@@ -20,7 +20,7 @@ from scipy.signal import lfilter
 from terrain.discrepancy.information import Information, correlation, information_at, rest_beside
 from terrain.discrepancy.noise import ORDER, Noise
 from terrain.discrepancy.residuals import low_pass_of, measured_channels
-from terrain.discrepancy.selection import Z_EFFECT
+from terrain.discrepancy.selection import SEEN_SHARE, Z_EFFECT
 from terrain.discrepancy.signals import PARALLEL, Signals
 from terrain.discrepancy.simulation import Simulation
 from terrain.discrepancy.verdict import Limit, NextDrive
@@ -64,9 +64,6 @@ EXACT_INDEX = 100.0
 
 WORTH_A_DRIVE = 1.5
 """So much has to be won, as a ratio, for a drive to be told."""
-
-SHARE_OF_BOUND = 0.3
-"""An effect is shown whose detection limit is within this share of what it may be."""
 
 Z_SHOWN = Z_EFFECT + 1.28
 """Evidence that nine drives in ten exceed the threshold with."""
@@ -172,7 +169,7 @@ def _showing(simulation: Simulation, missed: Sequence[Limit], info: Information 
     for drive in _drives(simulation, names, _logged(simulation.robot, info), info):
         with np.errstate(divide="ignore"):
             limit = Z_SHOWN / np.sqrt(np.maximum(np.diag(drive.a), 0.0))
-        shown = (limit < SHARE_OF_BOUND * bound) & (WORTH_A_DRIVE * limit < before)
+        shown = (limit < SEEN_SHARE * bound) & (WORTH_A_DRIVE * limit < before)
         # as many as possible; the size of the limits decides between equals
         score = shown.sum() + float(np.mean(1.0 / (1.0 + np.minimum(limit / bound, 1e6))))
         if shown.any() and (best is None or score > best[0]):

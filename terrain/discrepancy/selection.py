@@ -17,6 +17,9 @@ from terrain.simulation.effects import BOUNDS, INDEX, Effect
 Z_EFFECT = 4.0
 """Evidence an effect needs, as a standard normal number: 6e-5, times a library of 26."""
 
+SEEN_SHARE = 0.1
+"""An effect whose detection limit is over this share of what it may be counts as not excited."""
+
 TRUST_DOF = 8.0
 """How many clusters' worth the noise that whitening found counts, beside the scatter between clusters."""
 

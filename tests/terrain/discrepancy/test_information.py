@@ -8,10 +8,14 @@ from numpy.testing import assert_allclose
 
 from terrain.discrepancy.information import (
     N_BLOCKS,
+    correlation,
     counted_from,
     information_at,
     loss_of,
+    misfit_of,
     moved,
+    nearby,
+    rest_beside,
 )
 from terrain.discrepancy.residuals import low_pass_of
 from terrain.discrepancy.selection import fitted
@@ -133,6 +137,62 @@ def test_changes_counted_from_another_point_end_at_the_same_values(signals, info
     direct, _ = fitted(info, names)
     assert (np.abs(again - direct) < np.sqrt(np.diag(cov))).all()
     assert_allclose(here.vector, base)
+
+
+def test_nearby_is_the_same_form_at_another_point_by_the_same_noise(signals, info):
+    low_pass, names = low_pass_of(signals), list(NAMES[:3])
+    at = info.places(names)
+    here = nearby(info, signals, SIMULATION, info.vector, names, low_pass)
+    scale = np.sqrt(here.a.diagonal())
+    assert_allclose(here.a / np.outer(scale, scale), info.a[:, at][:, :, at].sum(0) / np.outer(scale, scale))
+    assert_allclose(here.g / scale, info.g[:, at].sum(0) / scale, atol=1e-9)
+    there = moved(info.vector, names, np.array([0.05, 0.02, 0.02]))
+    direct = information_at(signals, SIMULATION, there, names, low_pass, info.noise)
+    near = nearby(info, signals, SIMULATION, there, names, low_pass)
+    at = direct.places(names)
+    assert_allclose(near.a, direct.a[:, at][:, :, at].sum(0), rtol=0.02, atol=0.01 * near.a.max())
+    for white, told in zip(near.white_residual, direct.white_residual, strict=True):
+        assert_allclose(white, told)
+
+
+def test_two_points_differ_in_misfit_as_their_likelihoods_do(signals, info):
+    low_pass, names = low_pass_of(signals), ["camera_yaw_rad", "payload_ratio"]
+    change, _ = fitted(info, names)
+    before = misfit_of(info, info.white_residual)
+    point = nearby(info, signals, SIMULATION, moved(info.vector, names, change), names, low_pass)
+    after = misfit_of(info, point.white_residual)
+    assert before - after == pytest.approx(-loss_of(info, names), rel=0.02)
+
+
+def test_the_noise_of_wheels_does_not_part_two_scales_of_one_current(signals, info):
+    """By sums of squares the mass, which enlarges that noise, would be ahead or behind by far more."""
+    low_pass = low_pass_of(signals)
+    ahead = {}
+    for name, change in (("payload_ratio", 0.05), ("camera_yaw_rad", 0.0)):
+        there = moved(info.vector, [name], np.array([change]))
+        point = nearby(info, signals, SIMULATION, there, [name], low_pass)
+        squares = sum(float((white**2).sum()) for white in point.white_residual)
+        ahead[name] = squares, misfit_of(info, point.white_residual)
+    k = info.places(["payload_ratio"])[0]
+    a, g = info.a.sum(0)[k, k], info.g.sum(0)[k]
+    expected = a * 0.05**2 - 2 * g * 0.05
+    fell = ahead["payload_ratio"][1] - ahead["camera_yaw_rad"][1]
+    assert fell == pytest.approx(expected, abs=0.1 * a * 0.05**2 + 1.0)
+
+
+def test_correlation_is_the_largest_of_any_change_by_the_one_and_the_other():
+    rng = np.random.default_rng(0)
+    columns = rng.standard_normal((3, 200))
+    alike = np.vstack([columns, columns[0] + columns[1]])
+    a = alike @ alike.T
+    assert correlation(a, [0, 1], [3]) == pytest.approx(1.0)
+    cosine = a[0, 2] / np.sqrt(a[0, 0] * a[2, 2])
+    assert correlation(a, [0], [2]) == pytest.approx(abs(cosine))
+    assert correlation(np.diag([1.0, 0.0]), [0], [1]) == 1.0
+    follow, free = rest_beside(a, [0, 1], [2, 3])
+    assert free[1, 1] == pytest.approx(0.0, abs=1e-9 * a[3, 3])
+    assert_allclose(follow[:, 1], [1.0, 1.0])
+    assert_allclose(np.linalg.inv(free[:1, :1]), np.linalg.inv(a[:3, :3])[2:, 2:])
 
 
 def test_a_point_that_is_moved_to_keeps_within_bounds(info):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from terrain.discrepancy.information import information_at
 from terrain.discrepancy.residuals import (
     ONE_SIDED,
     STEPS,
@@ -16,6 +17,7 @@ from terrain.discrepancy.residuals import (
     measured_channels,
     rows_of,
 )
+from terrain.discrepancy.selection import fitted
 from terrain.discrepancy.signals import Signals, signals_of
 from terrain.discrepancy.simulation import Simulation
 from terrain.errors import DataError
@@ -32,6 +34,7 @@ from terrain.simulation.effects import (
     TURNING_CURRENT,
     vector_of,
 )
+from terrain.simulation.planar_noise import load_noise
 from terrain.simulation.planar_replay import replay
 from terrain.simulation.planar_run import Hills, simulate_planar
 
@@ -212,3 +215,24 @@ def test_the_slowest_clock_sets_the_low_pass_whichever_run_has_it():
     assert crawling.inputs_every == 0
     with pytest.raises(DataError, match="b is on a clock of 10 Hz, a on one of 50 Hz; clocks within 5% of"):
         low_pass_of([fast, fake(0.1, "b")])
+
+
+def test_noise_of_the_wheels_is_not_taken_for_a_mass_or_a_motor():
+    """At one speed the wheels' acceleration is all noise, in the residual and in what a mass would change."""
+    robot = ROBOTS["agrimaro"]
+    time_s = np.arange(2001) / 50
+    twist = np.zeros((time_s.size, 3))
+    twist[:, 0] = np.clip(0.5 * time_s, 0.0, 0.7)
+    runs = [simulate_planar(robot, twist, seed, noise=load_noise(), run_id=str(seed)) for seed in range(6)]
+    signals, simulation = [signals_of(run, robot) for run in runs], Simulation(robot)
+    low_pass = low_pass_of(signals)
+    off = {}
+    for calm_hz in (low_pass.calm_hz, np.inf):
+        same = low_pass._replace(calm_hz=calm_hz)
+        names = ["motor_constant_ratio", "rolling_resistance_ratio", "accel_bias_mps2"]
+        info = information_at(signals, simulation, simulation.vector, names, same)
+        change, cov = fitted(info, names)
+        off[calm_hz] = change[0], change[0] / np.sqrt(cov[0, 0])
+    assert off[np.inf][1] < -4.0
+    assert abs(off[low_pass.calm_hz][0]) < 0.5 * abs(off[np.inf][0])
+    assert abs(off[low_pass.calm_hz][1]) < 3.0
