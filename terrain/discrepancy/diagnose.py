@@ -16,7 +16,7 @@ import numpy as np
 
 from terrain.discrepancy.clocks import shifts_of
 from terrain.discrepancy.health import clocks_of, unfit_runs
-from terrain.discrepancy.information import Information, counted_from, rest_beside
+from terrain.discrepancy.information import Information, counted_from, moved, rest_beside
 from terrain.discrepancy.next_drive import next_drive
 from terrain.discrepancy.probes import Answer, ask, drift_of
 from terrain.discrepancy.residuals import low_pass_of, measured_channels
@@ -193,7 +193,8 @@ def _unsteady(problem: Problem, found: Found) -> dict[str, str]:
     if not found.causes:
         return {}
     calmer = problem._replace(low_pass=problem.low_pass._replace(calm_hz=CALMER * problem.low_pass.calm_hz))
-    info = calmer.at(found.info.vector, found.names, found.info.noise)
+    there = moved(found.info.vector, found.names, found.change)
+    info = calmer.at(there, found.names, found.info.noise)
     value, cov = fitted(counted_from(info, problem.simulation.vector), found.names)
     why = {}
     for cause in found.causes:
