@@ -139,7 +139,7 @@ def diagnose_signals(
         parameters=parameters,
         cov=found.cov[np.ix_(at, at)] * np.sqrt(np.outer(grown, grown)),
         ambiguous_sets=tuple(sets),
-        ambiguous_values=_rival_values(found, sets, problem.library),
+        ambiguous_values=_rival_values(found, sets),
         unexplained=leftovers,
         limits=limits,
         not_excited=missed,
@@ -218,17 +218,21 @@ def _sorted_out(found: Found, causes: Sequence[Effect]) -> tuple[list[Effect], l
     for cause in causes:
         if not found.tried[cause.name].stands:
             continue
-        if rivals := found.rivals[cause.name]:
-            sets.append((cause.name, *rivals))
+        if found.rivals[cause.name]:
+            sets.append((cause.name, *_rival_names(found, cause)))
         else:
             named.append(cause)
     for one, other in combinations(causes, 2):
         if (one in named or other in named) and _entangled(found, one, other):
             sets = [names for names in sets if names[0] not in (one.name, other.name)]
-            members = (one.name, *found.rivals[one.name], other.name, *found.rivals[other.name])
+            members = (one.name, *_rival_names(found, one), other.name, *_rival_names(found, other))
             sets.append(tuple(dict.fromkeys(members)))
             named = [cause for cause in named if cause not in (one, other)]
     return named, sets
+
+
+def _rival_names(found: Found, cause: Effect) -> list[str]:
+    return [rival.effect.name for rival in found.rivals[cause.name]]
 
 
 def _entangled(found: Found, one: Effect, other: Effect) -> bool:
@@ -291,34 +295,20 @@ def _cause(found: Found, start: Information, effect: Effect) -> Cause:
     )
 
 
-def _rival_values(
-    found: Found, sets: Sequence[tuple[str, ...]], library: Sequence[Effect]
-) -> dict[str, tuple[Value, ...]]:
+def _rival_values(found: Found, sets: Sequence[tuple[str, ...]]) -> dict[str, tuple[Value, ...]]:
     """Return the values that every member of an ambiguous set would have."""
-    values: dict[str, tuple[Value, ...]] = {}
-    by_name = {effect.name: effect for effect in library}
-    for names in sets:
-        others = [name for name in found.names if name not in names_of([by_name[names[0]]])]
-        for name in names:
-            own = [p.name for p in by_name[name].parameters]
-            wanted = [*[other for other in others if other not in own], *own]
-            at = found.info.places(wanted)
-            a = found.info.a[:, at][:, :, at].sum(axis=0)
-            cov = np.linalg.pinv(a, hermitian=True)
-            change = cov @ found.info.g[:, at].sum(axis=0)
-            values[name] = tuple(
-                Value(
-                    p.name,
-                    float(change[k]),
-                    p.unit,
-                    float(change[k] - INTERVAL_T * np.sqrt(cov[k, k])),
-                    float(change[k] + INTERVAL_T * np.sqrt(cov[k, k])),
-                )
-                for k, p in zip(
-                    range(len(wanted) - len(own), len(wanted)), by_name[name].parameters, strict=True
-                )
+    values = {cause.name: _values(found, cause) for cause in found.causes}
+    for rivals in found.rivals.values():
+        for rival in rivals:
+            half = INTERVAL_T * rival.std
+            values.setdefault(
+                rival.effect.name,
+                tuple(
+                    Value(p.name, float(x), p.unit, float(x - h), float(x + h))
+                    for p, x, h in zip(rival.effect.parameters, rival.change, half, strict=True)
+                ),
             )
-    return values
+    return {name: values[name] for names in sets for name in names}
 
 
 def _limits(found: Found, library: Sequence[Effect]) -> list[Limit]:

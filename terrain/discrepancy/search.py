@@ -90,6 +90,30 @@ class Problem(NamedTuple):
         return nearby(info, self.signals, self.simulation, vector, names, self.low_pass)
 
 
+class Rival(NamedTuple):
+    """An effect that fits as well as a cause in its place.
+
+    Parameters
+    ----------
+    effect : that
+    behind : by how much it fits worse, as minus twice a log-likelihood
+    change, std : (p,) of its parameters, by a fit of its own; a value may stand at its bound
+    """
+
+    effect: Effect
+    behind: float
+    change: Array
+    std: Array
+
+
+class _Refit(NamedTuple):
+    """How badly a nonlinear fit fits, as minus twice a log-likelihood (see misfit_of), and what it fits."""
+
+    loss: float
+    change: Array
+    std: Array
+
+
 class Found(NamedTuple):
     """Where the search ended.
 
@@ -107,7 +131,7 @@ class Found(NamedTuple):
     names: tuple[str, ...]
     change: Array
     cov: Array
-    rivals: dict[str, tuple[str, ...]]
+    rivals: dict[str, tuple[Rival, ...]]
     tried: dict[str, Evidence]
 
 
@@ -173,7 +197,7 @@ def _next(
     close = [effect for gain, effect in standing[:MAX_FITTED] if gain > CLOSE_GAIN * best]
     if best < MUCH_GAIN or len(close) == 1:
         return [standing[0][1]]
-    return [min(close, key=lambda effect: _refit_loss(problem, info, base, names_of([*causes, effect])))]
+    return [min(close, key=lambda effect: _refit(problem, info, base, names_of([*causes, effect])).loss)]
 
 
 def _standing(
@@ -291,13 +315,13 @@ def _penalised(info: Information, causes: Sequence[Effect]) -> float:
 
 def _rivals(
     problem: Problem, info: Information, start: Information, causes: Sequence[Effect], cause: Effect
-) -> tuple[str, ...]:
-    """Return all effects that, refitted in a cause's place, fit as well as it does.
+) -> tuple[Rival, ...]:
+    """Return all effects that, refitted in a cause's place, fit as well as it does, the best first.
 
     It is judged by the noise that the causes leave and by that of the simulation as it is given: a cause that
     takes something for noise is ahead by the one alone.
     """
-    names = names_of(causes)
+    names, base = names_of(causes), start.vector
     others = [other for other in causes if other is not cause]
     now = loss_of(info, names)
     near = []
@@ -309,14 +333,16 @@ def _rivals(
             near.append(effect)
     if not near:
         return ()
-    ahead: dict[str, float] = {}
-    for judge in (info, start):
-        here = _refit_loss(problem, judge, start.vector, names)
-        for effect in near:
-            loss = _refit_loss(problem, judge, start.vector, names_of([*others, effect])) - here
-            ahead[effect.name] = min(ahead.get(effect.name, np.inf), loss)
-    allowed = {effect.name: _allowed(info, others, cause, effect) for effect in near}
-    return tuple(sorted((name for name in ahead if ahead[name] < allowed[name]), key=ahead.__getitem__))
+    first = {judge is info: _refit(problem, judge, base, names) for judge in (info, start)}
+    found = []
+    for effect in near:
+        swapped = names_of([*others, effect])
+        here, there = (_refit(problem, judge, base, swapped) for judge in (info, start))
+        behind = min(here.loss - first[True].loss, there.loss - first[False].loss)
+        if behind < _allowed(info, others, cause, effect):
+            at = [swapped.index(p.name) for p in effect.parameters]
+            found.append(Rival(effect, behind, here.change[at], here.std[at]))
+    return tuple(sorted(found, key=lambda rival: rival.behind))
 
 
 def _allowed(info: Information, others: Sequence[Effect], cause: Effect, rival: Effect) -> float:
@@ -327,7 +353,15 @@ def _allowed(info: Information, others: Sequence[Effect], cause: Effect, rival: 
     return TWIN_LOSS if alike > TWIN else RIVAL_LOSS
 
 
-def _refit_loss(problem: Problem, info: Information, base: Array, names: Sequence[str]) -> float:
-    """Return how badly a nonlinear fit of parameters fits, as minus twice a log-likelihood; see misfit_of."""
-    points = _steps(problem, info, base, names, RIVAL_REFITS)
-    return min(misfit_of(info, near.white_residual) for near in points) + PARAMETER_LOSS * len(names)
+def _refit(problem: Problem, info: Information, base: Array, names: Sequence[str]) -> _Refit:
+    """Return the best point of a nonlinear fit of parameters."""
+    best: tuple[float, Nearby] | None = None
+    for near in _steps(problem, info, base, names, RIVAL_REFITS):
+        misfit = misfit_of(info, near.white_residual)
+        if best is None or misfit < best[0]:
+            best = misfit, near
+    assert best is not None
+    misfit, near = best
+    at = [INDEX[name] for name in names]
+    std = np.sqrt(np.maximum(np.diag(np.linalg.pinv(near.a, hermitian=True)), 0.0))
+    return _Refit(misfit + PARAMETER_LOSS * len(names), near.vector[at] - base[at], std)
