@@ -119,7 +119,7 @@ def diagnose_signals(
     leftovers = _with_drifts(leftovers, found, withdrawn, drifts)
     limits = tuple(_limits(found, problem.library))
     missed = tuple(limit for limit in limits if limit.value > SEEN_SHARE * _bound(limit.name))
-    causes = tuple(_cause(found, start, effect) for effect in named)
+    causes = tuple(_cause(found, effect) for effect in named)
     parameters = names_of(named)
     at = [found.names.index(name) for name in parameters]
     grown = np.array([found.tried[effect.name].inflation for effect in named for _ in effect.parameters])
@@ -278,9 +278,9 @@ def _values(found: Found, effect: Effect) -> tuple[Value, ...]:
     return tuple(values)
 
 
-def _cause(found: Found, start: Information, effect: Effect) -> Cause:
+def _cause(found: Found, effect: Effect) -> Cause:
     own = found.tried[effect.name]
-    size = float(start.c.sum())
+    size = float(found.info.c.sum())
     low, high = gain_interval(own.gain)
     return Cause(
         effect.name,

@@ -182,6 +182,7 @@ def counted_from(info: Information, base: Array) -> Information:
     away = np.array([info.vector[INDEX[name]] - base[INDEX[name]] for name in info.parameters])
     return info._replace(
         vector=base,
+        c=info.c + 2.0 * info.g @ away + away @ info.a @ away,
         g=info.g + info.a @ away,
         g_blocks=info.g_blocks + info.a_blocks @ away,
     )

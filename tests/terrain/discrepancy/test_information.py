@@ -137,6 +137,8 @@ def test_changes_counted_from_another_point_end_at_the_same_values(signals, info
     direct, _ = fitted(info, names)
     assert (np.abs(again - direct) < np.sqrt(np.diag(cov))).all()
     assert_allclose(here.vector, base)
+    # and with the same likelihood there
+    assert_allclose(here.c.sum() + loss_of(here, names), moved_info.c.sum() + loss_of(moved_info, names))
 
 
 def test_nearby_is_the_same_form_at_another_point_by_the_same_noise(signals, info):
