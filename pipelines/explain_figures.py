@@ -32,7 +32,10 @@ CHANNEL_WORDS = {
 """What a channel is called, and its unit."""
 
 STRETCH_S = 20.0
-"""Of the typical run that is drawn large."""
+"""Of the telling run that is drawn large."""
+
+TELLING = 0.8
+"""Share of the runs, and of the stretches of one, with less to explain than the one that is drawn."""
 
 STRETCH_STEP_S = 1.0
 BAND_STDS = 2.0
@@ -100,17 +103,17 @@ def size_of(run: Shown, noise: Noise) -> float:
     return float(known.mean()) if known.size else math.nan
 
 
-def typical(runs: Sequence[Shown], noise: Noise, span_s: float = STRETCH_S) -> Shown:
-    """Return the stretch of the run whose squared residuals over the noise are the median of all."""
-    run = _median(runs, lambda one: size_of(one, noise))
+def telling(runs: Sequence[Shown], noise: Noise, span_s: float = STRETCH_S) -> Shown:
+    """Return the stretch of a run with larger residuals over the noise than most, and not the largest."""
+    run = _telling(runs, lambda one: size_of(one, noise))
     starts = np.arange(run.time_s[0], max(run.time_s[-1] - span_s, run.time_s[0]) + 1e-9, STRETCH_STEP_S)
-    return _median([run.part(start, start + span_s) for start in starts], lambda one: size_of(one, noise))
+    return _telling([run.part(start, start + span_s) for start in starts], lambda one: size_of(one, noise))
 
 
-def _median(runs: Sequence[Shown], size: Callable[[Shown], float]) -> Shown:
+def _telling(runs: Sequence[Shown], size: Callable[[Shown], float]) -> Shown:
     sizes = np.array([size(run) for run in runs])
     order = [i for i in np.argsort(sizes, kind="stable") if np.isfinite(sizes[i])]
-    return runs[order[(len(order) - 1) // 2]] if order else runs[0]
+    return runs[order[round(TELLING * (len(order) - 1))]] if order else runs[0]
 
 
 def channels_of(runs: Sequence[Shown]) -> list[str]:

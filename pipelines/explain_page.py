@@ -23,8 +23,8 @@ from pipelines.explain_figures import (
     run_figure,
     share_figure,
     spectra_figure,
+    telling,
     titled,
-    typical,
 )
 from pipelines.explain_ground import ground_words
 from pipelines.page import page
@@ -165,10 +165,10 @@ def shown_runs(found: Explained) -> list[Shown]:
 def explain_figures(found: Explained, runs: Sequence[Shown], result: Result) -> dict[str, Figure]:
     """Return the figures by name; all but the first are of the runs behind the diagnosis."""
     used = [run for run in runs if not run.held_out]
-    example = typical(used, found.noise)
+    example = telling(used, found.noise)
     extended = found.extended is not None
     return {
-        "stretch": run_figure(example, found.noise, f"A typical stretch: {titled(example, whole=False)}"),
+        "stretch": run_figure(example, found.noise, f"A telling stretch: {titled(example, whole=False)}"),
         "shares": share_figure(result["residual_before"], result["residual_after"], extended),
         "spectra": spectra_figure(used, found.noise, found.low_pass.cutoff_hz),
         "dependence": dependence_figure(used, found.noise),

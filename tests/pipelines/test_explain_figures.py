@@ -1,4 +1,4 @@
-"""What pictures of a diagnosis are made from: spectra, means with intervals, and the typical stretch."""
+"""What pictures of a diagnosis are made from: spectra, means with intervals, and the telling stretch."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ from pipelines.explain_figures import (
     share_figure,
     spectra_figure,
     spectrum,
-    typical,
+    telling,
 )
 from terrain.discrepancy.noise import Noise, noise_of
 from terrain.simulation.effects import CHANNELS
@@ -101,12 +101,12 @@ def test_bins_want_rows_and_intervals_want_runs():
     assert binned([np.full(9, np.nan)], [np.ones(9)])[0].size == 0
 
 
-def test_the_typical_stretch_is_of_the_middle_run():
+def test_the_telling_stretch_is_of_a_run_with_more_to_explain_than_most():
     runs = [a_run(f"r{i}", off=0.02 * i, seed=i) for i in (3, 0, 2, 4, 1)]
-    found = typical(runs, a_noise())
-    assert found.run_id == "r2"
+    found = telling(runs, a_noise())
+    assert found.run_id == "r3"
     assert 19.0 < found.time_s[-1] - found.time_s[0] <= 20.0
-    short = typical([a_run(n=50)], a_noise())
+    short = telling([a_run(n=50)], a_noise())
     assert len(short.time_s) == 50
 
 
