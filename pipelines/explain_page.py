@@ -74,8 +74,8 @@ MISTAKEN = (
 CAPTIONS = {
     "stretch": "Left: what was measured, and what the simulation makes of the logged wheels, steering and "
     "tilt. Right: the difference, over a band that 95 % of the noise stays in. Drawn are {span} s of a "
-    "run with a larger squared residual over the noise than four in five, not the largest. All have passed the "
-    "same low-pass.",
+    "run with a larger squared residual over the noise than four in five, not the largest. All have passed "
+    "the same low-pass.",
     "shares": "A full bar is the squared residual of a channel. Grey is what is left of it when every effect "
     "of the library is let go: noise, as far as anybody knows. What differs from run to run by itself, as "
     "tyre pressure does, counts as systematic.",
