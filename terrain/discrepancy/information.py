@@ -163,18 +163,23 @@ def _whitened(noise: Noise, run: Rows) -> tuple[Array, Array]:
 
 def _left_of_all(info: Information) -> tuple[list[Array], float]:
     """Return what the whole library, let go, and each run's deviations leave; and how much they fitted."""
-    prior = np.array([PRIOR_STD.get(name, 1e-6) for name in info.parameters])
-    x = np.linalg.solve(info.a.sum(axis=0) + np.diag(1.0 / prior**2), info.g.sum(axis=0))
+    total, bound = info.a.sum(axis=0), _let_go(info)
+    x = np.linalg.solve(bound, info.g.sum(axis=0))
     left = []
     for run, shift in zip(info.rows, info.shift, strict=True):
         move = x.copy()
         move[info.nuisances] += shift[:, -1] - shift[:, :-1] @ x
         left.append(run.residual - np.tensordot(move, run.sensitivity, axes=1))
-    total = info.a.sum(axis=0)
-    n_fitted = float(np.trace(np.linalg.solve(total + np.diag(1.0 / prior**2), total)))
+    n_fitted = float(np.trace(np.linalg.solve(bound, total)))
     for inner in info.inner:
         n_fitted += info.nuisances.size - float((np.diag(inner) / info.nuisance_std**2).sum())
     return left, n_fitted
+
+
+def _let_go(info: Information) -> Array:
+    """Return the information (k, k) of all runs where every parameter is let go as far as it may be."""
+    prior = np.array([PRIOR_STD.get(name, 1e-6) for name in info.parameters])
+    return np.asarray(info.a.sum(axis=0) + np.diag(1.0 / prior**2))
 
 
 def counted_from(info: Information, base: Array) -> Information:
@@ -288,9 +293,7 @@ def misfit_of(info: Information, white_residual: Sequence[Array]) -> float:
     for residual, change, shift in zip(white_residual, info.white_change, info.shift, strict=True):
         flat = change.reshape(len(change), -1) @ residual.ravel()
         score += flat - shift[:, : len(flat)].T @ flat[info.nuisances]
-    prior = np.array([PRIOR_STD.get(name, 1e-6) for name in info.parameters])
-    total = info.a.sum(axis=0) + np.diag(1.0 / prior**2)
-    return float(score @ np.linalg.solve(total, score))
+    return float(score @ np.linalg.solve(_let_go(info), score))
 
 
 def moved(point: Array, names: Sequence[str], change: Array) -> Array:

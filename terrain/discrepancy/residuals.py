@@ -206,21 +206,19 @@ def rows_of(
         rows: Array = holed(np.ascontiguousarray(values), known, low_pass.taps, low_pass.every)
         return rows[keep]
 
-    true_rim, true_grade, true_roll = undone(planar, vector, dt, rim, grade, roll)
+    calm = _calm(rim, low_pass, dt)
+    true_rim, true_grade, true_roll = undone(planar, vector, dt, calm, grade, roll)
     truth = move(planar, vector, dt, true_rim, steer, true_grade, true_roll, np.zeros((0, 3)))
     points, sensed, spans = _points(vector, parameters)
     holes = np.zeros((0, 0), dtype=np.bool_) if whole else known
     window = holes, low_pass.taps, low_pass.every
     now = _predictions(planar, points[:1], sensed[:1], dt, rim, steer, grade, roll, truth, *window)[0, keep]
-    rim = _calm(rim, low_pass, dt)
-    true_rim, true_grade, true_roll = undone(planar, vector, dt, rim, grade, roll)
-    truth = move(planar, vector, dt, true_rim, steer, true_grade, true_roll, np.zeros((0, 3)))
-    told = _predictions(planar, points[1:], sensed[1:], dt, rim, steer, grade, roll, truth, *window)[:, keep]
+    told = _predictions(planar, points[1:], sensed[1:], dt, calm, steer, grade, roll, truth, *window)[:, keep]
     change = (told[::2] - told[1::2]) / spans[:, None, None]
-    speed = rim.mean(axis=1)
+    speed = calm.mean(axis=1)
     force = truth[:, 4] / (GRAVITY_MPS2 * planar.mass_kg)
-    inputs = np.column_stack([speed, rim[:, -1] - rim[:, 0], steer.mean(axis=1), grade, roll, force])
-    phase = np.cumsum(rim, axis=0) * (dt / planar.radius_m)
+    inputs = np.column_stack([speed, calm[:, -1] - calm[:, 0], steer.mean(axis=1), grade, roll, force])
+    phase = np.cumsum(calm, axis=0) * (dt / planar.radius_m)
     at = first + low_pass.every * np.arange(n_rows)[keep]
     return Rows(
         signals.run_id,
@@ -249,7 +247,6 @@ def _points(vector: Array, parameters: Sequence[str]) -> tuple[Array, Array, Arr
     """
     points = np.tile(vector, (1 + 2 * len(parameters), 1))
     sensed = np.zeros(len(points), dtype=np.bool_)
-    sensed[0] = True
     for j, name in enumerate(parameters):
         i, step = INDEX[name], STEPS[name]
         points[1 + 2 * j, i] += step
@@ -278,8 +275,8 @@ def _predictions(
 ) -> Array:
     """Return what the simulation predicts at each point, behind the low-pass: (points, rows, channels).
 
-    ``truth`` is what the body does at the first point, and at all where sensors alone change; ``known`` says
-    where something was measured, or is empty where that is everywhere.
+    ``truth`` is what the body does at all points where sensors alone change; ``known`` says where something
+    was measured, or is empty where that is everywhere.
     """
     m = max((rim_mps.shape[0] - taps.size) // every + 1, 0)
     out = np.empty((points.shape[0], m, 7))

@@ -333,12 +333,12 @@ def _rivals(
             near.append(effect)
     if not near:
         return ()
-    first = {judge is info: _refit(problem, judge, base, names) for judge in (info, start)}
+    by_info, by_start = (_refit(problem, judge, base, names).loss for judge in (info, start))
     found = []
     for effect in near:
         swapped = names_of([*others, effect])
         here, there = (_refit(problem, judge, base, swapped) for judge in (info, start))
-        behind = min(here.loss - first[True].loss, there.loss - first[False].loss)
+        behind = min(here.loss - by_info, there.loss - by_start)
         if behind < _allowed(info, others, cause, effect):
             at = [swapped.index(p.name) for p in effect.parameters]
             found.append(Rival(effect, behind, here.change[at], here.std[at]))

@@ -8,7 +8,10 @@ import pytest
 
 from pipelines.explain_trials import simulation_of
 from pipelines.hidden_effects import confusable_class, hidden_runs, limits_of, rich_drives
-from terrain.discrepancy.diagnose import MIN_RUNS, diagnose
+from terrain.discrepancy.diagnose import MIN_RUNS, _unsteady, diagnose
+from terrain.discrepancy.residuals import low_pass_of
+from terrain.discrepancy.search import Problem, search
+from terrain.discrepancy.signals import signals_of
 from terrain.discrepancy.verdict import AMBIGUOUS, EXPLAINED, NONE, UNEXPLAINED
 from terrain.errors import DataError
 from terrain.records import Stream
@@ -196,3 +199,14 @@ def test_runs_that_cannot_be_diagnosed_are_refused_in_one_sentence(worlds):
             diagnose(given, world.simulation)
         assert message in str(error.value)
         assert "\n" not in str(error.value)
+
+
+def test_a_cause_that_is_another_in_slow_motion_is_withdrawn(worlds):
+    world = worlds["husky"]
+    signals = tuple(signals_of(run, world.robot) for run in world.runs(world.hidden("camera_yaw")))
+    asked = Problem(signals, world.simulation, low_pass_of(signals), world.simulation.library)
+    found = search(asked, asked.at(world.simulation.vector))
+    assert [cause.name for cause in found.causes] == ["camera_yaw"]
+    assert _unsteady(asked, found) == {}
+    # as if quick motion had asked for twice of it
+    assert list(_unsteady(asked, found._replace(change=2 * found.change))) == ["camera_yaw"]
