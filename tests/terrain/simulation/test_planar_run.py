@@ -81,8 +81,9 @@ def replayed(run, robot, values, ground):
     if robot.drive == "swerve":
         rim = rim / robot.motors.reduction_ratio * robot.wheel_radius_m
         steer = np.unwrap(run.streams["steering"].values, axis=0)
-    grade, roll = -imu.channel("pitch_rad")[::2], imu.channel("roll_rad")[::2]
-    return replay(make_planar(robot, ground), vector_of(values), 0.02, rim, steer, grade, roll)
+    given = rim, steer, -imu.channel("pitch_rad")[::2], imu.channel("roll_rad")[::2]
+    given = [np.array(each, order="C") for each in given]  # as in use, or the kernels are compiled anew
+    return replay(make_planar(robot, ground), vector_of(values), 0.02, *given)
 
 
 EFFECTS = [
