@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Sequence, Set
 from typing import NamedTuple
 
 import numpy as np
@@ -48,8 +48,9 @@ small share of what they explain, and as much the simulation's own fault as thei
 PARAMETER_LOSS = 4.0
 """What a fit has to gain by each of its parameters before it counts as better than one with fewer."""
 
-RIVAL_LINEAR = 80.0
-"""Worse than that before sensitivities are taken anew, and a rival is not tried: it gains less by it."""
+RIVAL_LINEAR, RIVAL_SHARE = 80.0, 0.5
+"""Worse than that, or than that share of what the cause gains, before sensitivities are taken anew, and a
+rival is not tried: it gains less by it."""
 
 Z_PAIR = 4.6
 """Evidence that each of two effects needs beside the other, where neither stands alone: 4e-6, 300 pairs."""
@@ -159,20 +160,22 @@ def search(problem: Problem, start: Information) -> Found:
     info = start
     causes: list[Effect] = []
     barred: set[str] = set()  # came beside the causes that there are, and did not stay
+    seen = {_set_of([])}  # what was held for the causes; none of it twice, or the search goes in circles
     for _ in range(MAX_STEPS):
         new = _next(problem, info, base, causes, barred)
         if not new or len(causes) + len(new) > MAX_CAUSES:
             break
-        more, at = _standing(problem, info, base, [*causes, *new])
-        if len(more) > len(causes) or {cause.name for cause in more} != {cause.name for cause in causes}:
+        more, at = _standing(problem, info, base, [*causes, *new], seen)
+        if at is not info:
             more, at = _swapped(problem, at, base, more)
-            if {cause.name for cause in more} != {cause.name for cause in causes}:
-                barred = set()
+        if _set_of(more) not in seen:
+            seen.add(_set_of(more))
+            barred = set()
             causes, info = more, at
         barred |= {effect.name for effect in new if effect not in causes}
     names = names_of(causes)
     change, cov = fitted(info, names)
-    rivals = {cause.name: _rivals(problem, info, start, causes, cause) for cause in causes}
+    rivals = _rivals(problem, info, start, causes)
     tried = {
         effect.name: evidence(info, [n for n in names if n not in names_of([effect])], effect)
         for effect in problem.library
@@ -201,17 +204,28 @@ def _next(
 
 
 def _standing(
-    problem: Problem, info: Information, base: Array, causes: list[Effect]
+    problem: Problem,
+    info: Information,
+    base: Array,
+    causes: list[Effect],
+    seen: Set[frozenset[str]] = frozenset(),
 ) -> tuple[list[Effect], Information]:
-    """Refit causes, and drop the weakest until all stand beside the others."""
-    at = _refitted(problem, info, base, causes)
-    while causes:
-        weak = _weakest(at, causes)
-        if weak is None:
-            break
-        causes = [cause for i, cause in enumerate(causes) if i != weak]
+    """Refit causes, and drop the weakest until all stand beside the others.
+
+    Where that leads to causes that were seen, they are not fitted again: the information is the one given.
+    """
+    at = info
+    while _set_of(causes) not in seen:
         at = _refitted(problem, at, base, causes)
-    return causes, at
+        weak = _weakest(at, causes) if causes else None
+        if weak is None:
+            return causes, at
+        causes = [cause for i, cause in enumerate(causes) if i != weak]
+    return causes, info
+
+
+def _set_of(causes: Sequence[Effect]) -> frozenset[str]:
+    return frozenset(cause.name for cause in causes)
 
 
 def _swapped(
@@ -314,35 +328,44 @@ def _penalised(info: Information, causes: Sequence[Effect]) -> float:
 
 
 def _rivals(
-    problem: Problem, info: Information, start: Information, causes: Sequence[Effect], cause: Effect
-) -> tuple[Rival, ...]:
-    """Return all effects that, refitted in a cause's place, fit as well as it does, the best first.
+    problem: Problem, info: Information, start: Information, causes: Sequence[Effect]
+) -> dict[str, tuple[Rival, ...]]:
+    """Return by cause all effects that, refitted in its place, fit as well as it does, the best first.
 
     It is judged by the noise that the causes leave and by that of the simulation as it is given: a cause that
     takes something for noise is ahead by the one alone.
     """
-    names, base = names_of(causes), start.vector
-    others = [other for other in causes if other is not cause]
-    now = loss_of(info, names)
-    near = []
-    for effect in problem.library:
-        if effect in causes:
-            continue
-        swapped = names_of([*others, effect])
-        if loss_of(info, swapped) - now < RIVAL_LINEAR and evidence(info, names_of(others), effect).inside:
-            near.append(effect)
-    if not near:
-        return ()
-    by_info, by_start = (_refit(problem, judge, base, names).loss for judge in (info, start))
-    found = []
-    for effect in near:
-        swapped = names_of([*others, effect])
-        here, there = (_refit(problem, judge, base, swapped) for judge in (info, start))
-        behind = min(here.loss - by_info, there.loss - by_start)
-        if behind < _allowed(info, others, cause, effect):
-            at = [swapped.index(p.name) for p in effect.parameters]
-            found.append(Rival(effect, behind, here.change[at], here.std[at]))
-    return tuple(sorted(found, key=lambda rival: rival.behind))
+    base, judges = start.vector, (info, start)
+    own: list[float] = []  # losses of the causes by both judges, where anything comes near
+    rivals = {}
+    for cause in causes:
+        others = [other for other in causes if other is not cause]
+        found = []
+        for effect in _near(problem, info, cause, others):
+            own = own or [_refit(problem, judge, base, names_of(causes)).loss for judge in judges]
+            swapped = names_of([*others, effect])
+            here, there = (_refit(problem, judge, base, swapped) for judge in judges)
+            behind = min(here.loss - own[0], there.loss - own[1])
+            if behind < _allowed(info, others, cause, effect):
+                at = [swapped.index(p.name) for p in effect.parameters]
+                found.append(Rival(effect, behind, here.change[at], here.std[at]))
+        rivals[cause.name] = tuple(sorted(found, key=lambda rival: rival.behind))
+    return rivals
+
+
+def _near(problem: Problem, info: Information, cause: Effect, others: Sequence[Effect]) -> list[Effect]:
+    """Return the effects that come near a cause beside the others, as far as sensitivities tell."""
+    causes = [*others, cause]
+    now = loss_of(info, names_of(causes))
+    gain = loss_of(info, names_of(others)) - now
+    most = min(RIVAL_LINEAR, RIVAL_LOSS + RIVAL_SHARE * gain)
+    return [
+        effect
+        for effect in problem.library
+        if effect not in causes
+        and loss_of(info, names_of([*others, effect])) - now < most
+        and evidence(info, names_of(others), effect).inside
+    ]
 
 
 def _allowed(info: Information, others: Sequence[Effect], cause: Effect, rival: Effect) -> float:

@@ -70,6 +70,38 @@ def test_changes_are_counted_from_the_simulation_that_was_given(three):
     np.testing.assert_allclose(at_fit, again.change)
 
 
+def test_causes_that_were_held_once_are_not_held_again(three, monkeypatch):
+    """One comes, drives another out and goes itself: what is left was there before, and so it would go on."""
+    asked, found = three
+    first, second, third = (effect_named(name) for name in ("payload", "camera_yaw", "gyro_bias"))
+    fits = []
+
+    def refitted(problem, info, base, causes):
+        fits.append({cause.name for cause in causes})
+        return found.info
+
+    def weakest(info, causes):
+        others = [i for i, cause in enumerate(causes) if cause is not first]
+        return others[0] if third in causes else None
+
+    def following(problem, info, base, causes, barred):
+        left = [each for each in (first, second, third) if each not in causes and each.name not in barred]
+        return left[:1]
+
+    monkeypatch.setattr("terrain.discrepancy.search._refitted", refitted)
+    monkeypatch.setattr("terrain.discrepancy.search._weakest", weakest)
+    monkeypatch.setattr("terrain.discrepancy.search._next", following)
+    monkeypatch.setattr("terrain.discrepancy.search._better", lambda *_: None)
+    held = search(asked, found.info)
+    assert [cause.name for cause in held.causes] == ["payload", "camera_yaw"]
+    assert fits == [
+        {"payload"},
+        {"payload", "camera_yaw"},
+        {"payload", "camera_yaw", "gyro_bias"},
+        {"payload", "gyro_bias"},
+    ]
+
+
 def test_without_its_entry_in_the_library_a_cause_that_nothing_resembles_is_left():
     names = ["camera_latency", "gyro_bias", "accel_bias", "scrub"]
     found = searched(problem({"camera_yaw_rad": 0.05}, names))
