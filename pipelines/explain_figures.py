@@ -54,6 +54,12 @@ MIN_IN_BIN = 5
 SEGMENT_ROWS = 64
 """Of a spectrum: some 10 s."""
 
+MIN_SEGMENT_ROWS = 8
+"""Shortest segment of a spectrum, in rows."""
+
+COVARIANCE_ROWS = 8192
+"""Grid of the spectrum from which the covariance of coloured noise is taken."""
+
 COLUMNS = 3
 BEFORE, AFTER = "simulated", "with the causes built in"
 
@@ -221,7 +227,7 @@ def spectra_figure(runs: Sequence[Shown], noise: Noise, cutoff_hz: float) -> Fig
                     continue
                 frequency, density = spectrum([_residual(run, after)[:, c] for run in runs], rate_hz)
                 axes.plot(frequency, density, color=colour, lw=1.3, label=kind)
-            frequency = np.linspace(rate_hz / SEGMENT_ROWS, rate_hz / 2, 200)
+            frequency = np.linspace(frequency[0], rate_hz / 2, 200)
             density = power * noise_spectrum(noise.filters[c], frequency, rate_hz)
             axes.plot(frequency, density, color=INK, lw=1.0, ls="--", label="noise")
             axes.set_xscale("log")
@@ -242,16 +248,22 @@ def spectra_figure(runs: Sequence[Shown], noise: Noise, cutoff_hz: float) -> Fig
 
 
 def spectrum(residuals: Sequence[Array], rate_hz: float) -> tuple[Array, Array]:
-    """Return frequencies and one-sided density of residuals of several runs, of stretches without a hole."""
-    total, weight = np.zeros(SEGMENT_ROWS // 2 + 1), 0
-    for values in residuals:
-        for part in _whole(values):
-            if len(part) >= SEGMENT_ROWS:
-                _, power = welch(part, rate_hz, nperseg=SEGMENT_ROWS, detrend=False)
-                total += len(part) * power
-                weight += len(part)
-    frequency = np.fft.rfftfreq(SEGMENT_ROWS, 1.0 / rate_hz)
-    return frequency[1:], (total / weight if weight else np.full(total.size, np.nan))[1:]
+    """Return frequencies and one-sided density of residuals of several runs, of stretches without a hole.
+
+    Segments are as short as it takes for half of what is known to lie in stretches of that length; where not
+    even :data:`MIN_SEGMENT_ROWS` will do, the density is NaN.
+    """
+    parts = [part for values in residuals for part in _whole(values)]
+    n_known = sum(map(len, parts))
+    n_rows = SEGMENT_ROWS
+    while n_rows > MIN_SEGMENT_ROWS and 2 * sum(len(part) for part in parts if len(part) >= n_rows) < n_known:
+        n_rows //= 2
+    long = [part for part in parts if len(part) >= n_rows]
+    total = np.zeros(n_rows // 2 + 1) if long else np.full(n_rows // 2 + 1, np.nan)
+    for part in long:
+        total += len(part) * welch(part, rate_hz, nperseg=n_rows, detrend=False)[1]
+    frequency = np.fft.rfftfreq(n_rows, 1.0 / rate_hz)
+    return frequency[1:], total[1:] / max(sum(map(len, long)), 1)
 
 
 def noise_spectrum(weights: Array, frequency_hz: Array, rate_hz: float) -> Array:
@@ -356,13 +368,19 @@ def run_means(residuals: Sequence[Array], sizes: Sequence[Array], weights: Array
     sizes : (m,) of the noise
     weights : of the filter that whitens it
     """
+    covariance = np.fft.irfft(1.0 / np.abs(np.fft.rfft(weights, COVARIANCE_ROWS)) ** 2)
     means, halves = [], []
     for left, size in zip(residuals, sizes, strict=True):
         known = np.isfinite(left)
-        n = max(int(known.sum()), 1)
-        means.append(float(left[known].sum() / n) if known.any() else math.nan)
-        rms = math.sqrt(float((size[known] ** 2).sum()) / n)
-        halves.append(1.96 * rms / (abs(float(weights.sum())) * math.sqrt(n)) if known.any() else math.nan)
+        n = int(known.sum())
+        if not n:
+            means.append(math.nan)
+            halves.append(math.nan)
+            continue
+        lags = np.arange(1, min(n, COVARIANCE_ROWS // 2))
+        spread = (covariance[0] + 2.0 * float(((1.0 - lags / n) * covariance[lags]).sum())) / n
+        means.append(float(left[known].mean()))
+        halves.append(1.96 * math.sqrt(float((size[known] ** 2).mean()) * max(spread, 0.0)))
     return np.array(means), np.array(halves)
 
 

@@ -318,10 +318,10 @@ def _drawn(name: str, svg: str, png: bytes) -> str:
 def _runs(runs: Sequence[RunPicture]) -> str:
     if not runs:
         return ""
-    parts = []
+    parts, links = [], []
     for run in runs:
         if run.content is None:
-            parts.append(f'<p><a href="{escape(run.file, quote=True)}">{escape(run.title)}</a></p>')
+            links.append(f'<a href="{escape(run.file, quote=True)}">{escape(run.title)}</a>')
             continue
         source = base64.b64encode(run.content).decode()
         parts.append(
@@ -329,11 +329,7 @@ def _runs(runs: Sequence[RunPicture]) -> str:
             f'<img src="data:image/png;base64,{source}" alt="{escape(run.title, quote=True)}" '
             'style="width:100%;height:auto;background:#fff"></details>'
         )
-    more = (
-        f'<p class="small">Pictures of the runs after the first {MAX_EMBEDDED} lie beside the page.</p>'
-        if any(run.content is None for run in runs)
-        else ""
-    )
+    more = f'<p class="small">Beside the page: {" · ".join(links)}</p>' if links else ""
     return f"<section><h2>Every run</h2>{''.join(parts)}{more}</section>"
 
 

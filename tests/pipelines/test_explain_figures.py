@@ -69,13 +69,22 @@ def test_the_spectrum_of_coloured_noise_is_that_of_the_filter_that_whitens_it():
     assert held == pytest.approx(1.0, rel=0.05)
 
 
-def test_a_hole_parts_a_spectrum_and_a_short_stretch_has_none():
+def test_a_hole_parts_a_spectrum_and_the_shortest_stretches_have_none():
     whole = coloured(2000, 1)
     holed = np.concatenate([whole[:1000], [np.nan], whole[1000:]])
     np.testing.assert_allclose(
         spectrum([holed], RATE_HZ)[1], spectrum([whole[:1000], whole[1000:]], RATE_HZ)[1]
     )
-    assert np.isnan(spectrum([whole[:20]], RATE_HZ)[1]).all()
+    assert np.isnan(spectrum([whole[:7]], RATE_HZ)[1]).all()
+
+
+def test_of_short_runs_a_spectrum_is_taken_over_short_segments():
+    white = np.random.default_rng(3).standard_normal(40 * 300)
+    frequency, power = spectrum([*np.split(white, 300), np.full(5, np.nan)], RATE_HZ)
+    np.testing.assert_allclose(frequency, np.fft.rfftfreq(32, 1 / RATE_HZ)[1:])
+    np.testing.assert_allclose(power[:-1], 2.0 / RATE_HZ, rtol=0.3)
+    frequency, _ = spectrum([*np.split(white, 300), white], RATE_HZ)  # half of it is in one run
+    assert frequency[0] == pytest.approx(RATE_HZ / 64)
 
 
 def test_intervals_hold_the_mean_of_nothing_as_often_as_they_say():
@@ -90,6 +99,18 @@ def test_intervals_hold_the_mean_of_nothing_as_often_as_they_say():
     # 360 of either; bins of one day have little in common
     assert 0.02 < np.mean(missed_runs) < 0.09
     assert 0.02 < np.mean(missed_bins) < 0.09
+
+
+def test_the_mean_of_a_short_run_scatters_no_more_than_the_noise_itself():
+    """25 rows of noise that remembers 33 of them: as many runs averaged would say far too much."""
+    rng, n, kept = np.random.default_rng(4), 25, 0.97
+    noise = np.empty((600, n))
+    noise[:, 0] = rng.standard_normal(600) / np.sqrt(1 - kept**2)
+    for i in range(1, n):
+        noise[:, i] = kept * noise[:, i - 1] + rng.standard_normal(600)
+    mean, half = run_means(list(noise), [np.ones(n)] * 600, np.array([1.0, -kept]))
+    assert 0.03 < np.mean(np.abs(mean) > half) < 0.08
+    assert half[0] < 1.96 / np.sqrt(1 - kept**2)
 
 
 def test_bins_want_rows_and_intervals_want_runs():
