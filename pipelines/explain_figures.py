@@ -48,7 +48,7 @@ EDGE_SHARE = 0.01
 MIN_SPREAD = 0.01
 """Range of an input in its own unit, below which nothing can be seen to follow it."""
 
-MIN_IN_BIN = 5
+MIN_IN_BIN = 3
 """Rows of a run in a bin, without which it has no mean there."""
 
 SEGMENT_ROWS = 64
