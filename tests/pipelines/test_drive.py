@@ -25,16 +25,18 @@ ROBOT, TABLE = load_robot("agrimaro"), load_slip_table()
 SHORT = DriveSettings("straight", "grass", ("plain", "target:0.15"), seeds=2, first_seed=300, duration_s=6.0)
 
 
+ALL = replace(SHORT, controllers=("plain", "ramp", "thesis", "fixed", "oracle+track", "told:clay"))
+
+
 def test_processes_change_nothing():
-    settings = replace(SHORT, controllers=("ramp", "oracle+track"), duration_s=3.0)
+    settings = replace(ALL, duration_s=3.0)
     one, two = (drive(ROBOT, TABLE, settings, n_jobs=n) for n in (1, 2))
     assert json.dumps(one, allow_nan=False) == json.dumps(two, allow_nan=False)
 
 
 def test_every_controller_has_every_figure():
-    settings = replace(SHORT, controllers=("plain", "ramp", "thesis", "fixed", "oracle+track", "told:clay"))
-    one = drive(ROBOT, TABLE, settings)
-    assert tuple(one["controllers"]) == settings.controllers
+    one = drive(ROBOT, TABLE, ALL)
+    assert tuple(one["controllers"]) == ALL.controllers
     for figures in one["controllers"].values():
         assert set(KEYS) <= set(figures)
         assert figures["energy_j_per_m"]["n"] == figures["distance_m"]["n"] == 2
