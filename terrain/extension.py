@@ -1,6 +1,6 @@
 """Extended robots: a description with what its simulation lacked, and what filters make of it.
 
-An effect (:mod:`terrain.simulation.effects`) either has a home in the description, as a wheel's radius has,
+An effect (:mod:`terrain.effects.catalogue`) either has a home in the description, as a wheel's radius has,
 or it can be taken from the samples, as a gyro's scale can, or it is one of the ground or of the way the
 robot turns, which filters do not model.  :func:`corrected` deals with the first, :class:`Correction` with the
 second; together they are a robot and a log without those effects::
@@ -45,11 +45,11 @@ import numpy as np
 import yaml
 
 from terrain.angles import unwrapped, wrapped
-from terrain.atomic import atomic_write
-from terrain.described_effects import SCHEMA, checked_covariance, checked_effects, parameters_of
-from terrain.descriptions import read_yaml
+from terrain.effects.described import SCHEMA, checked_covariance, checked_effects, parameters_of
 from terrain.errors import ConfigError
-from terrain.estimation.camera import turned
+from terrain.files.atomic import atomic_write
+from terrain.files.descriptions import read_yaml
+from terrain.kinematics.camera import turned
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import Robot, description_file, robot_from
 

@@ -11,7 +11,7 @@ better, and, where it was calibrated, the interval that holds it with 95 %::
 
 Geometry and mass are asked of every robot; the sections ``body``, ``motors``, ``steering``, ``camera`` and
 ``sensors`` only by what simulates a robot or filters its log.  The section ``effects`` of an extended robot
-(:mod:`terrain.described_effects`) says what else acts; :mod:`terrain.extension` makes use of it.
+(:mod:`terrain.effects.described`) says what else acts; :mod:`terrain.extension` makes use of it.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from typing import Annotated, Any, NamedTuple, get_args, get_type_hints
 
 import numpy as np
 
-from terrain.described_effects import read_effects
-from terrain.descriptions import check_keys, number, read_yaml
+from terrain.effects.described import read_effects
 from terrain.errors import ConfigError
+from terrain.files.descriptions import check_keys, number, read_yaml
+from terrain.files.resources import data_folder
 from terrain.records import Array, read_only
-from terrain.resources import data_folder
 
 WHEELS_OF_DRIVE: dict[str, tuple[str, ...]] = {"skid_steer": ("left", "right"), "swerve": ("1", "2", "3")}
 """Kinds of robots and how the channels of their wheels are called (``speed_left_mps``, ``motor_2_radps``)."""
@@ -172,7 +172,7 @@ class Robot:
     wheelbase_m : distance between front and rear wheel
     mass_kg : total mass without payload
     body, motors, steering, camera, sensors : None where the description has none
-    effects : parameters of :mod:`terrain.simulation.effects` that are not 0, by name
+    effects : parameters of :mod:`terrain.effects.catalogue` that are not 0, by name
     effects_cov : (n, n) covariance of the effects in their order; NaN where nobody knows it
     """
 

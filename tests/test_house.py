@@ -34,7 +34,7 @@ def test_imports_follow_the_arrows():
 def test_help_loads_nothing_heavy():
     code = (
         "import sys; sys.argv = ['terrain', '--help']\n"
-        "from pipelines.cli import main\n"
+        "from pipelines.cli.main import main\n"
         "try:\n    main()\nexcept SystemExit as end:\n    assert not end.code\n"
         "import json; print('LOADED', json.dumps(sorted({name.split('.')[0] for name in sys.modules})))"
     )
@@ -65,7 +65,7 @@ def installed_wheel(tmp_path_factory):
 def test_the_wheel_runs_elsewhere_with_its_yaml(installed_wheel, tmp_path):
     environment = {**os.environ, "PYTHONPATH": str(installed_wheel)}
     code = (
-        "import terrain, pipelines.cli\n"
+        "import terrain, pipelines.cli.main\n"
         "from terrain.robots import load_robot\n"
         "from terrain.control.slip_table import load_slip_table\n"
         "print(terrain.__file__, load_robot('husky').track_m, load_slip_table().fallback)"
@@ -81,7 +81,7 @@ def test_the_wheel_runs_elsewhere_with_its_yaml(installed_wheel, tmp_path):
     place, track_m, fallback = done.stdout.split()
     assert Path(place).is_relative_to(installed_wheel)
     assert (float(track_m), fallback) == (0.5708, "unknown")
-    assert (installed_wheel / "pipelines" / "report.css").is_file()
+    assert (installed_wheel / "pipelines" / "reporting" / "templates" / "report.css").is_file()
     packaged = {file.name for file in (installed_wheel / "terrain" / "_data").rglob("*.yaml")}
     assert packaged == {file.name for file in (ROOT / "data").rglob("*.yaml")}
 
@@ -100,7 +100,7 @@ def test_the_wheel_runs_elsewhere_with_its_yaml(installed_wheel, tmp_path):
 
 def test_readme_names_every_command_that_there_is():
     done = subprocess.run(
-        [sys.executable, "-c", "from pipelines.cli import main; main()", "--help"],
+        [sys.executable, "-c", "from pipelines.cli.main import main; main()", "--help"],
         capture_output=True,
         text=True,
         check=True,

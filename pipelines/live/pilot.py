@@ -14,6 +14,7 @@ import numpy as np
 
 from pipelines.live.watch import Nobody, Watch, readable
 from terrain.constants import GRAVITY_MPS2
+from terrain.control.danzi_pid import new_state, thesis_settings, thesis_step
 from terrain.control.path_tracking import (
     NO_POSE,
     TrackSettings,
@@ -35,7 +36,6 @@ from terrain.control.switching import (
     check_switching,
     hear,
 )
-from terrain.control.thesis import new_state, thesis_settings, thesis_step
 from terrain.control.traction import (
     BAD_TIME,
     MAX_STEP_S,

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from features.stream import WindowStream
-from pipelines.models import TerrainModel
+from pipelines.models.model_files import TerrainModel
 from terrain.errors import DataError
 from terrain.estimation.live import LiveEstimate
 from terrain.logs.schema import IMU_CHANNELS
@@ -102,8 +102,8 @@ _COLUMNS: dict[str, tuple[str, ...]] = {
 class Classifier:
     """Says what a model makes of each live window, cut as the model was taught.
 
-    Windows are made of what ``pipelines.estimate.enriched`` writes into a log, live: rim speeds beside motor
-    rates, the estimator's states, slip, and the IMU.
+    Windows are made of what ``pipelines.estimate.estimate.enriched`` writes into a log, live: rim speeds
+    beside motor rates, the estimator's states, slip, and the IMU.
 
     Parameters
     ----------

@@ -19,7 +19,8 @@ UNKNOWN = -1
 
 POWER_THRESHOLD_WPKG = 0.1
 """Assumed, the thesis prints none: 0.1 m/s^2 at 1 m/s, which is what counts as a steady speed elsewhere
-(``terrain.slip.STEADY_CHANGE_MPS``), and over five times what an accelerometer's bias makes of it."""
+(``terrain.estimation.slip_figures.STEADY_CHANGE_MPS``), and over five times what an accelerometer's bias
+makes of it."""
 
 
 @njit(types.int64(types.float64, types.float64, types.float64), cache=True)

@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from terrain.constants import GRAVITY_MPS2
-from terrain.control.slip_curve import LAW_PARAMETERS, traction_ratio
 from terrain.control.slip_table import CurveEntry
+from terrain.slip_learning.slip_curve import LAW_PARAMETERS, traction_ratio
 
 SLICK_RATIO = 0.5
 """Thrust over load at the peak, up to which ground counts as slick: a robot that grips more stops from 1

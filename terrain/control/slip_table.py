@@ -17,12 +17,12 @@ from typing import Any
 
 import yaml
 
-from terrain.atomic import atomic_write
-from terrain.control.slip_curve import LAW_BOUNDS, LAW_PARAMETERS
-from terrain.descriptions import check_keys, read_yaml
 from terrain.errors import ConfigError
+from terrain.files.atomic import atomic_write
+from terrain.files.descriptions import check_keys, read_yaml
+from terrain.files.resources import data_folder
 from terrain.records import SlipTarget
-from terrain.resources import data_folder
+from terrain.slip_learning.slip_curve import LAW_BOUNDS, LAW_PARAMETERS
 
 DRIVE_STATES = ("traction", "braking", "steady")
 
@@ -49,9 +49,9 @@ class CurveEntry:
 
     Parameters
     ----------
-    law, parameters : by :data:`terrain.control.slip_curve.LAW_PARAMETERS`
+    law, parameters : by :data:`terrain.slip_learning.slip_curve.LAW_PARAMETERS`
     peak_slip_ratio, peak_interval_ratio, peak_status : of the net pull
-        (:mod:`terrain.control.slip_curve`); the interval holds it with 90 %
+        (:mod:`terrain.slip_learning.slip_curve`); the interval holds it with 90 %
     slip_range_ratio : slips that were seen
     resistance_ratio, resistance_std : over load
     balance_slip_ratio : where thrust is resistance

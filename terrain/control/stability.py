@@ -38,13 +38,13 @@ from typing import NamedTuple
 import numpy as np
 
 from terrain.constants import GRAVITY_MPS2
+from terrain.control.danzi_pid import FORMS, LOW_SPEED_MPS
 from terrain.control.pid import Gains, check_gains
-from terrain.control.thesis import FORMS, LOW_SPEED_MPS
 from terrain.errors import ConfigError
 from terrain.records import Array
 from terrain.robots import Robot
-from terrain.simulation.planar_contact import DEFLECTION_DAMPING_S
-from terrain.simulation.vehicle import STEP_S
+from terrain.simulation.contact import DEFLECTION_DAMPING_S
+from terrain.simulation.dynamic.vehicle import STEP_S
 
 SAMPLE_TIME_S = 0.02
 """Of the commands, assumed: the thesis prints none."""
@@ -113,7 +113,7 @@ def check_stable(
     ----------
     robot : with its sections
     gains : of :class:`terrain.control.pid.Gains`; the limits play no part
-    form : ``printed`` or ``normalised``, see :mod:`terrain.control.thesis`
+    form : ``printed`` or ``normalised``, see :mod:`terrain.control.danzi_pid`
     delay_s : from measurement to command, beside the encoders' low-pass
     dt_s : sample time
     low_speed_mps : below which the controller does nothing

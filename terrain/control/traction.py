@@ -2,7 +2,7 @@
 
 In steady motion the slip of a wheel is set by what resists it, ``F(s) = R``, and not by how fast it is told
 to turn: a controller that integrates the error of slip towards a target under that balance slows the robot
-to a standstill, one over it runs away (``tests/terrain/control/test_thesis.py`` has both).  What a speed
+to a standstill, one over it runs away (``tests/terrain/control/test_danzi_pid.py`` has both).  What a speed
 command does decide is how much *more* slip a start takes, and that is what is held back here.
 
 With w the speed wanted of the fastest wheel, d the speed driven, u_i the speed wanted of wheel i, g_i the
@@ -16,7 +16,7 @@ speed of the ground under it, along it, and s* the slip to aim for::
 - The cap restrains the rise of d and nothing else.  A cap that may fall stalls: less speed, less pull, less
   ground speed, less cap.
 - It is the normalised P controller of slip, ``d + K (s* - s) d`` with ``s = 1 - q / d`` and ``K = 1 / (1 -
-  s*)`` (as :mod:`terrain.control.thesis` normalises it), acting on the chassis in place of each wheel, and
+  s*)`` (as :mod:`terrain.control.danzi_pid` normalises it), acting on the chassis in place of each wheel, and
   guarded.
 - Under v_l the slip ratio says little about the ground: the robot counts as that fast.
 - q is old by the filter's lag and the command takes its way; t leads by both, with the acceleration a that

@@ -17,9 +17,9 @@ from scipy.interpolate import CubicSpline
 
 from terrain.discrepancy.information import Information
 from terrain.discrepancy.residuals import Rows
+from terrain.effects.catalogue import CHANNELS, GYRO, HEADING, SPEED_X
 from terrain.errors import DataError
 from terrain.records import Array
-from terrain.simulation.effects import CHANNELS, GYRO, HEADING, SPEED_X
 
 MIN_LAG_S, MAX_LAG_S = -0.5, 2.0
 """Loggers of a run are started together, the wheels' first; the other sign is what an encoder's low-pass

@@ -38,9 +38,9 @@ from terrain.discrepancy.verdict import (
     RuledOut,
     Value,
 )
+from terrain.effects.catalogue import BOUNDS, CHANNELS, INDEX, Effect
 from terrain.errors import DataError
 from terrain.records import RunLog
-from terrain.simulation.effects import BOUNDS, CHANNELS, INDEX, Effect
 
 MIN_RUNS = 3
 """Fewer runs, and there is nothing left to judge a fit by."""

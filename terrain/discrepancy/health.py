@@ -17,8 +17,8 @@ from terrain.discrepancy.information import PRIOR_STD, Information
 from terrain.discrepancy.residuals import Rows
 from terrain.discrepancy.signals import Signals
 from terrain.discrepancy.verdict import Clock, Excluded
+from terrain.effects.catalogue import CHANNELS, CURRENT, GYRO, INDEX, SPEED_X, SPEED_Y
 from terrain.records import Array
-from terrain.simulation.effects import CHANNELS, CURRENT, GYRO, INDEX, SPEED_X, SPEED_Y
 
 CLOCK_S, CLOCK_SIGMAS, CLOCK_SCATTER_S = 0.12, 6.0, 0.01
 """A clock is a run's own if it is off by the first, and by so many times its error and the scatter of the

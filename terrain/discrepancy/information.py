@@ -21,8 +21,8 @@ from terrain.discrepancy.noise import ORDER, Noise, noise_of, whitened
 from terrain.discrepancy.residuals import LowPass, Rows, rows_of
 from terrain.discrepancy.signals import Signals
 from terrain.discrepancy.simulation import Simulation
+from terrain.effects.catalogue import BOUNDS, INDEX
 from terrain.records import Array
-from terrain.simulation.effects import BOUNDS, INDEX
 
 N_BLOCKS = 3
 """Time blocks of a run; they serve as clusters where runs are few."""

@@ -24,11 +24,7 @@ from terrain.discrepancy.selection import SEEN_SHARE, Z_EFFECT
 from terrain.discrepancy.signals import PARALLEL, Signals
 from terrain.discrepancy.simulation import Simulation
 from terrain.discrepancy.verdict import Limit, NextDrive
-from terrain.errors import ConfigError
-from terrain.kinematics.swerve import wheel_commands
-from terrain.records import Array
-from terrain.robots import Robot
-from terrain.simulation.effects import (
+from terrain.effects.catalogue import (
     ACCEL,
     BOUNDS,
     CHANNELS,
@@ -40,8 +36,12 @@ from terrain.simulation.effects import (
     TURNING_CURRENT,
     effect_named,
 )
-from terrain.simulation.planar import TRUTH
-from terrain.simulation.planar_motion import move
+from terrain.errors import ConfigError
+from terrain.kinematics.swerve import wheel_commands
+from terrain.records import Array
+from terrain.robots import Robot
+from terrain.simulation.planar.model import TRUTH
+from terrain.simulation.planar.motion import move
 from terrain.simulation.scenario import RATE_HZ, SCENARIOS, make_scenario
 
 GRADES_DEG = (0.0, 6.0)

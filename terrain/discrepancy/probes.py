@@ -13,8 +13,8 @@ from terrain.discrepancy.information import Information
 from terrain.discrepancy.noise import whitened
 from terrain.discrepancy.residuals import INPUTS, Rows
 from terrain.discrepancy.selection import weighed_variance, z_of, z_of_t
+from terrain.effects.catalogue import CHANNELS
 from terrain.records import Array
-from terrain.simulation.effects import CHANNELS
 
 Z_PROBE = 4.5
 """Evidence that a probe needs: 7e-6, of some two hundred that are asked."""

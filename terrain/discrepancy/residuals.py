@@ -15,13 +15,13 @@ from numba import njit
 
 from terrain.constants import GRAVITY_MPS2
 from terrain.discrepancy.signals import Signals
+from terrain.effects.catalogue import CHANNELS, INDEX, LIBRARY
 from terrain.errors import DataError
 from terrain.records import Array
-from terrain.simulation.effects import CHANNELS, INDEX, LIBRARY
-from terrain.simulation.planar import Planar
-from terrain.simulation.planar_motion import move
-from terrain.simulation.planar_replay import replay, undone
-from terrain.simulation.planar_sensors import SENSED_ONLY, sense
+from terrain.simulation.planar.model import Planar
+from terrain.simulation.planar.motion import move
+from terrain.simulation.planar.replay import replay, undone
+from terrain.simulation.planar.sensors import SENSED_ONLY, sense
 
 CUTOFF_HZ = 2.5
 """Cut-off of the common low-pass at the full clock; what a wheeled robot is told changes within 2 Hz."""

@@ -24,8 +24,8 @@ from terrain.discrepancy.residuals import LowPass
 from terrain.discrepancy.selection import Evidence, evidence, fitted
 from terrain.discrepancy.signals import Signals
 from terrain.discrepancy.simulation import Simulation
+from terrain.effects.catalogue import INDEX, Effect
 from terrain.records import Array
-from terrain.simulation.effects import INDEX, Effect
 
 MAX_CAUSES = 6
 """More are not looked for: by then the simulation is of another robot."""
@@ -141,7 +141,7 @@ def names_of(effects: Sequence[Effect]) -> tuple[str, ...]:
 
     Examples
     --------
-    >>> from terrain.simulation.effects import effect_named
+    >>> from terrain.effects.catalogue import effect_named
     >>> names_of([effect_named("lever_arm")])
     ('lever_x_m', 'lever_y_m')
     """

@@ -11,8 +11,8 @@ from scipy.stats import chi2, norm
 from scipy.stats import t as student
 
 from terrain.discrepancy.information import Information, rest_beside
+from terrain.effects.catalogue import BOUNDS, INDEX, Effect
 from terrain.records import Array
-from terrain.simulation.effects import BOUNDS, INDEX, Effect
 
 Z_EFFECT = 4.0
 """Evidence an effect needs, as a standard normal number: 6e-5, times a library of 26."""

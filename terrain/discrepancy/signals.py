@@ -9,12 +9,7 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 from terrain.angles import unwrapped
-from terrain.errors import DataError
-from terrain.estimation.camera import CHANNELS as POSE_CHANNELS
-from terrain.estimation.camera import body_motion
-from terrain.records import Array, RunLog, Stream, read_only
-from terrain.robots import Robot
-from terrain.simulation.effects import (
+from terrain.effects.catalogue import (
     ACCEL,
     CHANNELS,
     CURRENT,
@@ -24,6 +19,11 @@ from terrain.simulation.effects import (
     SPEED_Y,
     TURNING_CURRENT,
 )
+from terrain.errors import DataError
+from terrain.kinematics.camera import CHANNELS as POSE_CHANNELS
+from terrain.kinematics.camera import body_motion
+from terrain.records import Array, RunLog, Stream, read_only
+from terrain.robots import Robot
 
 MAX_RATE_HZ = 50.0
 """Clock of the replay, unless the wheels are logged slower."""

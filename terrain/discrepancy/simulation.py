@@ -6,11 +6,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
+from terrain.effects.catalogue import NUISANCES, Effect, library_of, vector_of
 from terrain.errors import ConfigError
 from terrain.records import Array
 from terrain.robots import Robot
-from terrain.simulation.effects import NUISANCES, Effect, library_of, vector_of
-from terrain.simulation.planar import Ground, Planar, make_planar
+from terrain.simulation.planar.model import Ground, Planar, make_planar
 
 
 @dataclass(frozen=True, slots=True, eq=False)

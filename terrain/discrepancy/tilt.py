@@ -17,9 +17,9 @@ from terrain.discrepancy.residuals import low_pass_of
 from terrain.discrepancy.search import names_of
 from terrain.discrepancy.signals import Signals
 from terrain.discrepancy.simulation import Simulation
+from terrain.effects.catalogue import Effect
 from terrain.records import Array
-from terrain.simulation.effects import Effect
-from terrain.simulation.planar import Ground
+from terrain.simulation.planar.model import Ground
 
 SHARES = (0.0, 0.5, 1.0)
 """That are tried; the best lies on the parabola through their losses."""

@@ -1,9 +1,9 @@
 """Live estimation of a swerve robot's motion and slip, sample by sample.
 
 The chain of :func:`~terrain.estimation.measurements.measurement_table` with ``causal=True``,
-:func:`~terrain.estimation.ekf.run_filter` and :func:`~terrain.slip.wheel_slip`, with the same numbers, on
-memory of a fixed size.  Each sample of the wheels is a tick, told of as soon as it is there; nothing waits
-for a sensor that is late.
+:func:`~terrain.estimation.ekf.run_filter` and :func:`~terrain.estimation.wheel_slip.wheel_slip`, with the
+same numbers, on memory of a fixed size.  Each sample of the wheels is a tick, told of as soon as it is there;
+nothing waits for a sensor that is late.
 
 What differs from the batch is what has to look ahead there:
 
@@ -50,11 +50,11 @@ from terrain.estimation.live_rows import (
 from terrain.estimation.measurements import CAMERA_ROWS, GNSS_LATENCY_S, GNSS_ROWS, WILD_FACTOR
 from terrain.estimation.resampling import GAP_PERIODS, MAX_AGE_PERIODS
 from terrain.estimation.swerve_filters import default_noise, make_filter
+from terrain.estimation.wheel_slip import STALE_AFTER_S, instant_slip, rim_scatter_mps
 from terrain.extension import Correction, corrected
 from terrain.logs.schema import WHEELS_CHANNELS
 from terrain.records import Array, Reading
 from terrain.robots import Robot
-from terrain.slip import STALE_AFTER_S, instant_slip, rim_scatter_mps
 
 GNSS_PERIOD_S = 0.1
 """Between two positions; no robot's description tells it."""

@@ -13,8 +13,6 @@ import numpy as np
 from numba import boolean, float64, int64, njit, types, void
 
 from terrain.constants import GRAVITY_MPS2
-from terrain.estimation.camera import CHANNELS as CAMERA_CHANNELS
-from terrain.estimation.camera import QUATERNION_TOLERANCE
 from terrain.estimation.cleaning import BELIEVED_S, MIN_CONFIDENCE_RATIO, OFF_CLOCK_S
 from terrain.estimation.measurements import (
     GNSS_SPEED_STD_MPS,
@@ -25,9 +23,11 @@ from terrain.estimation.measurements import (
     STANDING_SPEED_MPS,
 )
 from terrain.estimation.resampling import TICK_S
+from terrain.estimation.wheel_slip import UNHEARD_AFTER_S
+from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
+from terrain.kinematics.camera import QUATERNION_TOLERANCE
 from terrain.logs.schema import GNSS_CHANNELS, IMU_CHANNELS, STEERING_CHANNELS
 from terrain.records import Array
-from terrain.slip import UNHEARD_AFTER_S
 
 ROWS = ROWS_OF_DRIVE["swerve"]
 STREAMS = {

@@ -24,10 +24,10 @@ import numpy as np
 from terrain.angles import unwrapped, wrapped
 from terrain.constants import GRAVITY_MPS2
 from terrain.errors import ConfigError, DataError
-from terrain.estimation.camera import CHANNELS as CAMERA_CHANNELS
-from terrain.estimation.camera import body_motion
 from terrain.estimation.cleaning import clean_stream, without_leaps
 from terrain.estimation.resampling import ema, on_clock
+from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
+from terrain.kinematics.camera import body_motion
 from terrain.logs.schema import GNSS_CHANNELS, IMU_CHANNELS
 from terrain.records import Array, RunLog, Stream, read_only
 from terrain.robots import Camera, Robot, Steering

@@ -6,8 +6,8 @@ import json
 import re
 from pathlib import Path
 
-from terrain.atomic import atomic_folder
 from terrain.errors import LogError
+from terrain.files.atomic import atomic_folder
 from terrain.logs.schema import SCHEMA_VERSION, unit_of
 from terrain.records import RunLog, Stream
 

@@ -7,10 +7,10 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from terrain.descriptions import read_yaml
 from terrain.errors import ConfigError
+from terrain.files.descriptions import read_yaml
+from terrain.files.resources import data_folder
 from terrain.records import Array
-from terrain.resources import data_folder
 
 _ANY = (-math.inf, math.inf, "a finite number")
 _ABOVE_ZERO = (1e-6, math.inf, "a number above zero")

@@ -1,8 +1,8 @@
 """Sensors: from what happened, step by step, to what each logger wrote at its own rate.
 
-Each sensor follows the recorded motion at :data:`~terrain.simulation.vehicle.STEP_S`, adds what it does to it
-(low-pass, latency, bias, noise, quantisation, loss) and writes one stream.  A stamp is the time at which the
-sample arrived; what it tells is older by the sensor's latency.
+Each sensor follows the recorded motion at :data:`~terrain.simulation.dynamic.vehicle.STEP_S`, adds what it
+does to it (low-pass, latency, bias, noise, quantisation, loss) and writes one stream.  A stamp is the time at
+which the sample arrived; what it tells is older by the sensor's latency.
 
 All that is drawn is drawn when a sensor is made.  After that it is told of the motion in blocks of any
 length: a run in one block and a run tick by tick give the same bytes.
@@ -19,12 +19,12 @@ from numba import njit
 
 from terrain.angles import wrapped
 from terrain.constants import GRAVITY_MPS2
-from terrain.estimation.camera import CHANNELS, to_camera, turned
+from terrain.kinematics.camera import CHANNELS, to_camera, turned
 from terrain.logs.schema import GNSS_CHANNELS, IMU_CHANNELS, STEERING_CHANNELS, WHEELS_CHANNELS
 from terrain.records import Array, Reading, Stream
 from terrain.robots import Robot, Sensors
 from terrain.simulation.conditions import Faults
-from terrain.simulation.vehicle import BODY_RECORD, N_BODY_RECORD, N_RECORD, STEP_S, WHEEL_RECORD
+from terrain.simulation.dynamic.vehicle import BODY_RECORD, N_BODY_RECORD, N_RECORD, STEP_S, WHEEL_RECORD
 
 IMU_BANDWIDTH_HZ = {"accel": 62.5, "gyro": 47.0}
 """Bandwidths of the BNO055 in its fusion modes (Bosch data sheet)."""
@@ -58,7 +58,7 @@ class Motion:
 
     Parameters
     ----------
-    record : (n, N_RECORD) for :func:`terrain.simulation.vehicle.advance` to write
+    record : (n, N_RECORD) for :func:`terrain.simulation.dynamic.vehicle.advance` to write
     n_rows : rows that are written; all by default
 
     Attributes
@@ -182,7 +182,7 @@ class SteeringSensor(Sensor):
     """Absolute encoders: whole steps a turn (Gray code errs by one at most), the zero not taken off.
 
     The third one sits below the hinge of its leg, and does not see it swing; none sees what the linkage to
-    its wheel does (:func:`terrain.simulation.vehicle.record_width`).
+    its wheel does (:func:`terrain.simulation.dynamic.vehicle.record_width`).
     """
 
     def __init__(self, motion: Motion, robot: Robot, rng: np.random.Generator) -> None:
@@ -304,7 +304,7 @@ class ImuErrors:
 class CameraSensor(Sensor):
     """Tracking camera in its own frames: drifting pose, noisy speed, dropouts and relocalisation jumps.
 
-    What it tells without noise is :func:`terrain.estimation.camera.odometry_stream`; lost samples are none.
+    What it tells without noise is :func:`terrain.kinematics.camera.odometry_stream`; lost samples are none.
     Of the robot's effects it knows camera_yaw.
     """
 
@@ -512,7 +512,7 @@ def _pose(position_m: Array, seen: Array, noise: Array, lever_m: Array, yaw_0: f
     """Write the camera's samples (n, 14): the quaternion of yaw, pitch and roll in turn, and what it turns.
 
     ``seen`` holds speed x and y, yaw rate, roll, pitch and yaw; ``noise`` drift, position noise and jumps
-    (two columns each), yaw, speed and rate noise.  Axes go as in :func:`terrain.estimation.camera.to_camera`.
+    (two columns each), yaw, speed and rate noise.  Axes go as in :func:`terrain.kinematics.camera.to_camera`.
     """
     w_0, z_0 = math.cos(-yaw_0 / 2), math.sin(-yaw_0 / 2)
     for i in range(seen.shape[0]):

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from pipelines.live.pilot import LivePilot, PilotSettings
-from pipelines.simulate import simulate_run
+from pipelines.runs.simulate import simulate_run
+from terrain.control.danzi_pid import new_state, thesis_settings, thesis_step
 from terrain.control.pid import Gains
-from terrain.control.thesis import new_state, thesis_settings, thesis_step
 from terrain.control.traction import SETTINGS, Ground, initial_state, traction_step
 from terrain.logs.replay import replay
 from terrain.robots import load_robot

@@ -4,7 +4,7 @@ import time
 
 import pytest
 
-from pipelines.simulate import simulate_run
+from pipelines.runs.simulate import simulate_run
 from terrain.estimation.live import LiveEstimator
 from terrain.logs.replay import replay
 from terrain.robots import load_robot

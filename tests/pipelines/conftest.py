@@ -103,7 +103,7 @@ def runs():
 @pytest.fixture(scope="session")
 def settings():
     """Return a maker of settings for one process, one repeat and no extras unless asked for."""
-    from pipelines.crossval import CrossvalSettings
+    from pipelines.classify.crossval import CrossvalSettings
 
     def make(**options):
         return CrossvalSettings(**({"repeats": 1, "extras": False, "n_jobs": 1} | options))
@@ -117,7 +117,7 @@ def tracked(tmp_path_factory, runs, settings):
 
     Made once: a new tracking database costs seconds.  ``model/`` beside ``mlruns/`` is the model by itself.
     """
-    from pipelines.train import train
+    from pipelines.classify.train import train
 
     folder = tmp_path_factory.mktemp("tracked")
     before, named = Path.cwd(), os.environ.pop("MLFLOW_TRACKING_URI", None)

@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 import yaml
 
-from terrain.described_effects import parameters_of
+from terrain.effects.described import parameters_of
 from terrain.errors import ConfigError
-from terrain.estimation.camera import body_motion
 from terrain.estimation.live import LiveEstimator
 from terrain.estimation.measurements import measurement_table
 from terrain.extension import Correction, corrected, corrected_log, extended_yaml, moved, write_extended
+from terrain.files.resources import data_folder
+from terrain.kinematics.camera import body_motion
 from terrain.logs.replay import replay
 from terrain.records import RunLog, Stream
-from terrain.resources import data_folder
 from terrain.robots import load_robot, robot_from
+from terrain.simulation.dynamic.simulate import simulate
 from terrain.simulation.scenario import make_scenario
-from terrain.simulation.simulate import simulate
 from terrain.terramechanics.soil import load_soil
 
 ROBOT, HUSKY = load_robot("agrimaro"), load_robot("husky")

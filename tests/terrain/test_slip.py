@@ -7,19 +7,13 @@ from hypothesis import strategies as st
 from scipy.signal import lfilter
 
 from terrain.errors import ConfigError, DataError
-from terrain.estimation.camera import odometry_stream
 from terrain.estimation.measurements import GNSS_ROWS, ROWS_OF_DRIVE, MeasurementTable, measurement_table
+from terrain.estimation.slip_figures import slip_figures
+from terrain.estimation.wheel_slip import STALE_AFTER_S, blind_slip, instant_slip, wheel_slip
+from terrain.kinematics.camera import odometry_stream
 from terrain.records import ABSENT, RunLog, SlipTrack, StateTrack, Stream
 from terrain.robots import load_robot
-from terrain.slip import (
-    STALE_AFTER_S,
-    blind_slip,
-    instant_slip,
-    slip_angle,
-    slip_figures,
-    slip_ratio,
-    wheel_slip,
-)
+from terrain.slip import slip_angle, slip_ratio
 
 ROBOT = load_robot("agrimaro")
 HUSKY = load_robot("husky")

@@ -11,14 +11,13 @@ from functools import cache
 import numpy as np
 import pytest
 
-from pipelines.drive_metrics import course_of, distance_after, final_speed, slip_peak
-from pipelines.drivers import drive_once, make_driver
-from pipelines.drives import situation, start_times
+from pipelines.drive.controllers import drive_once, make_driver
+from pipelines.drive.drives import situation, start_times
 from pipelines.live.pilot import CONTROLLERS, LivePilot, PilotSettings
 from pipelines.live.watch import Told
-from pipelines.simulate import simulate_run
+from pipelines.runs.simulate import simulate_run
+from terrain.control.drive_metrics import course_of, distance_after, final_speed, slip_peak
 from terrain.control.pid import Gains
-from terrain.control.slip_curve import LAW_PARAMETERS
 from terrain.control.slip_table import CurveEntry, load_slip_table
 from terrain.control.traction import BAD_TIME, NO_SLIP, OK, SETTINGS, STALE, UNCERTAIN
 from terrain.errors import ConfigError
@@ -26,6 +25,7 @@ from terrain.logs.replay import replay
 from terrain.records import Reading, Sample
 from terrain.robots import load_robot
 from terrain.simulation.conditions import Faults
+from terrain.slip_learning.slip_curve import LAW_PARAMETERS
 
 ROBOT, TABLE = load_robot("agrimaro"), load_slip_table()
 DT_S, DELAY_S = 0.02, 0.05

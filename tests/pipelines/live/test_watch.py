@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from features.windows import cut_windows
-from pipelines.crossval import CrossvalSettings, samples_of
-from pipelines.estimate import enriched, estimate_run
+from pipelines.classify.crossval import CrossvalSettings, samples_of
+from pipelines.classify.train import model_info
+from pipelines.estimate.estimate import enriched, estimate_run
 from pipelines.live.pilot import LivePilot
 from pipelines.live.watch import Classifier, Nobody, Told
-from pipelines.models import TerrainModel
-from pipelines.simulate import simulate_run
-from pipelines.train import model_info
+from pipelines.models.model_files import TerrainModel
+from pipelines.runs.simulate import simulate_run
 from terrain.control.slip_table import load_slip_table
 from terrain.errors import DataError
 from terrain.estimation.live import LiveEstimator

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from terrain.robots import load_robot
+from terrain.simulation.dynamic.simulate import simulate
 from terrain.simulation.scenario import make_scenario
-from terrain.simulation.simulate import simulate
 from terrain.terramechanics.soil import load_soil
 
 NOMINAL = load_robot("agrimaro")

@@ -3,8 +3,8 @@ import pytest
 
 from terrain.constants import GRAVITY_MPS2
 from terrain.control.slick import LOCKED_RATIO, SHARE, SLICK_RATIO, braking_by_slip
-from terrain.control.slip_curve import LAW_PARAMETERS, traction_ratio
 from terrain.control.slip_table import CurveEntry
+from terrain.slip_learning.slip_curve import LAW_PARAMETERS, traction_ratio
 
 
 def curve(law, *parameters, resistance=0.02):

@@ -6,7 +6,6 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from terrain.control.slip_curve import LAW_BOUNDS, LAW_PARAMETERS
 from terrain.control.slip_table import (
     DRIVE_STATES,
     CurveEntry,
@@ -16,8 +15,9 @@ from terrain.control.slip_table import (
     write_slip_table,
 )
 from terrain.errors import ConfigError, TerrainError
+from terrain.files.resources import data_folder
 from terrain.records import SlipTarget
-from terrain.resources import data_folder
+from terrain.slip_learning.slip_curve import LAW_BOUNDS, LAW_PARAMETERS
 
 
 def table_with(**number):

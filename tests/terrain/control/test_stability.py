@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from terrain.constants import GRAVITY_MPS2
+from terrain.control.danzi_pid import FORMS, new_state, thesis_settings, thesis_step
 from terrain.control.pid import Gains, PidState, check_gains, pid_step
 from terrain.control.stability import DELAY_S, SLOPES, check_stable, loop_matrix, spectral_radius
-from terrain.control.thesis import FORMS, new_state, thesis_settings, thesis_step
 from terrain.errors import ConfigError
 from terrain.robots import load_robot
-from terrain.simulation.vehicle import (
+from terrain.simulation.dynamic.vehicle import (
     BODY_RECORD,
     DEFLECTION_DAMPING_S,
     N_BODY_RECORD,

@@ -6,17 +6,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipelines.explain_trials import simulation_of
-from pipelines.hidden_effects import confusable_class, hidden_runs, limits_of, rich_drives
+from pipelines.explain.trials import simulation_of
 from terrain.discrepancy.diagnose import MIN_RUNS, _unsteady, diagnose
 from terrain.discrepancy.residuals import low_pass_of
 from terrain.discrepancy.search import Problem, search
 from terrain.discrepancy.signals import signals_of
+from terrain.discrepancy.trials.hidden_effects import confusable_class, hidden_runs, limits_of, rich_drives
 from terrain.discrepancy.verdict import AMBIGUOUS, EXPLAINED, NONE, UNEXPLAINED
+from terrain.effects.catalogue import GYRO, HEADING, effect_named
 from terrain.errors import DataError
 from terrain.records import Stream
 from terrain.robots import load_robot
-from terrain.simulation.effects import GYRO, HEADING, effect_named
 
 OVER = 4.0
 """Times the smallest amplitude that these drives could show."""

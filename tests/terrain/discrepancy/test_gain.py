@@ -7,8 +7,8 @@ from terrain.discrepancy.gain import gain
 from terrain.discrepancy.simulation import Simulation
 from terrain.errors import ConfigError, DataError
 from terrain.robots import load_robot
-from terrain.simulation.planar_noise import load_noise, load_scatter
-from terrain.simulation.planar_run import simulate_planar
+from terrain.simulation.planar.noise import load_noise, load_scatter
+from terrain.simulation.planar.run import simulate_planar
 
 HUSKY = load_robot("husky")
 LONGER = {"wheel_radius_ratio": 0.03}

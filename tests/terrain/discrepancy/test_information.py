@@ -21,10 +21,10 @@ from terrain.discrepancy.residuals import low_pass_of
 from terrain.discrepancy.selection import fitted
 from terrain.discrepancy.signals import signals_of
 from terrain.discrepancy.simulation import Simulation
+from terrain.effects.catalogue import BOUNDS, CHANNELS, INDEX, SPEED_X, vector_of
 from terrain.robots import load_robot
-from terrain.simulation.effects import BOUNDS, CHANNELS, INDEX, SPEED_X, vector_of
-from terrain.simulation.planar_noise import load_noise, load_scatter
-from terrain.simulation.planar_run import Hills, simulate_planar
+from terrain.simulation.planar.noise import load_noise, load_scatter
+from terrain.simulation.planar.run import Hills, simulate_planar
 
 HUSKY = load_robot("husky")
 SCATTER = load_scatter()

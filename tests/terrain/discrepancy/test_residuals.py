@@ -20,9 +20,7 @@ from terrain.discrepancy.residuals import (
 from terrain.discrepancy.selection import fitted
 from terrain.discrepancy.signals import Signals, signals_of
 from terrain.discrepancy.simulation import Simulation
-from terrain.errors import DataError
-from terrain.robots import load_robot
-from terrain.simulation.effects import (
+from terrain.effects.catalogue import (
     ACCEL,
     CHANNELS,
     CURRENT,
@@ -34,9 +32,11 @@ from terrain.simulation.effects import (
     TURNING_CURRENT,
     vector_of,
 )
-from terrain.simulation.planar_noise import load_noise
-from terrain.simulation.planar_replay import replay
-from terrain.simulation.planar_run import Hills, simulate_planar
+from terrain.errors import DataError
+from terrain.robots import load_robot
+from terrain.simulation.planar.noise import load_noise
+from terrain.simulation.planar.replay import replay
+from terrain.simulation.planar.run import Hills, simulate_planar
 
 ROBOTS = {"husky": load_robot("husky"), "agrimaro": load_robot("agrimaro")}
 HIDDEN = {

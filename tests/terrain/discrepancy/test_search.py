@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from pipelines.explain_trials import simulation_of
-from pipelines.hidden_effects import hidden_runs, rich_drives
+from pipelines.explain.trials import simulation_of
 from terrain.discrepancy.residuals import low_pass_of
 from terrain.discrepancy.search import Problem, names_of, search
 from terrain.discrepancy.selection import fitted
 from terrain.discrepancy.signals import signals_of
+from terrain.discrepancy.trials.hidden_effects import hidden_runs, rich_drives
+from terrain.effects.catalogue import INDEX, LIBRARY, effect_named
 from terrain.robots import load_robot
-from terrain.simulation.effects import INDEX, LIBRARY, effect_named
 
 HUSKY = load_robot("husky")
 HIDDEN = {"camera_latency_s": 0.15, "payload_ratio": 0.25, "camera_yaw_rad": 0.03}

@@ -7,10 +7,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from terrain.discrepancy.signals import PARALLEL, signals_of
-from terrain.errors import DataError
-from terrain.records import Label, Stream
-from terrain.robots import load_robot
-from terrain.simulation.effects import (
+from terrain.effects.catalogue import (
     ACCEL,
     CHANNELS,
     CURRENT,
@@ -20,7 +17,10 @@ from terrain.simulation.effects import (
     SPEED_Y,
     TURNING_CURRENT,
 )
-from terrain.simulation.planar_run import Hills, simulate_planar
+from terrain.errors import DataError
+from terrain.records import Label, Stream
+from terrain.robots import load_robot
+from terrain.simulation.planar.run import Hills, simulate_planar
 
 HUSKY, AGRIMARO = load_robot("husky"), load_robot("agrimaro")
 

@@ -8,21 +8,21 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipelines.simulate import simulate_run
+from pipelines.runs.simulate import simulate_run
 from terrain.errors import ConfigError
-from terrain.estimation.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.estimation.ekf import GATE_PROBABILITY, REOPEN_AFTER_S, FilterSettings, Noise, run_filter
 from terrain.estimation.live import CHANNELS, LiveEstimator
 from terrain.estimation.live_rows import QUEUE
 from terrain.estimation.measurements import GNSS_ROWS, ROWS_OF_DRIVE, measurement_table
 from terrain.estimation.swerve_filters import default_noise, make_filter
+from terrain.estimation.wheel_slip import wheel_slip
+from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.kinematics.rim import with_rim_speeds
 from terrain.logs.replay import replay
 from terrain.records import Reading, Stream
 from terrain.robots import load_robot
 from terrain.simulation.conditions import Faults
 from terrain.simulation.sensors import Gnss
-from terrain.slip import wheel_slip
 
 ROBOT = load_robot("agrimaro")
 ODD = replace(

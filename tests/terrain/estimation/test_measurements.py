@@ -9,7 +9,6 @@ from scipy.spatial.transform import Rotation
 
 from terrain.constants import GRAVITY_MPS2
 from terrain.errors import ConfigError, DataError
-from terrain.estimation.camera import odometry_stream
 from terrain.estimation.measurements import (
     CAMERA_ROWS,
     GNSS_ROWS,
@@ -17,6 +16,7 @@ from terrain.estimation.measurements import (
     measurement_table,
 )
 from terrain.estimation.resampling import low_pass
+from terrain.kinematics.camera import odometry_stream
 from terrain.records import RunLog, Stream
 from terrain.robots import load_robot
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipelines.simulate import simulate_run
+from pipelines.runs.simulate import simulate_run
 from terrain.errors import DataError
 from terrain.estimation.reference import lagged_slip, rim_and_ground_speed, true_states
 from terrain.estimation.resampling import low_pass

@@ -4,8 +4,8 @@ import gzip
 import numpy as np
 import pytest
 
-from pipelines.datasets import data_digest, load_runs
-from pipelines.import_logs import import_logs
+from pipelines.runs.datasets import data_digest, load_runs
+from pipelines.runs.import_logs import import_logs
 from terrain.errors import LogError
 from terrain.logs.drive import FILE_NAME, STREAMS, WHEEL_RADIUS_M, body_twists, find_runs
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import yaml
 
-from pipelines.datasets import data_digest, load_runs
+from pipelines.runs.datasets import data_digest, load_runs
 from terrain.errors import ConfigError, LogError
 from terrain.logs.mapping import find_runs, load_mapping
 

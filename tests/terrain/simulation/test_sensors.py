@@ -8,9 +8,17 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, poisson
 
-from terrain.estimation.camera import body_motion, odometry_stream
+from terrain.kinematics.camera import body_motion, odometry_stream
 from terrain.robots import load_robot
 from terrain.simulation.conditions import NO_FAULTS, Faults
+from terrain.simulation.dynamic.vehicle import (
+    BODY_RECORD,
+    GRAVITY_MPS2,
+    N_BODY_RECORD,
+    N_RECORD,
+    STEP_S,
+    WHEEL_RECORD,
+)
 from terrain.simulation.sensors import (
     IMU_BANDWIDTH_HZ,
     TILT_NOISE_RAD,
@@ -22,14 +30,6 @@ from terrain.simulation.sensors import (
     SteeringSensor,
     WheelSensor,
     truth_stream,
-)
-from terrain.simulation.vehicle import (
-    BODY_RECORD,
-    GRAVITY_MPS2,
-    N_BODY_RECORD,
-    N_RECORD,
-    STEP_S,
-    WHEEL_RECORD,
 )
 
 ROBOT = load_robot("agrimaro")

@@ -1,0 +1,1 @@
+"""``terrain crossval``, ``train`` and ``predict``."""

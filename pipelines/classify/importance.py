@@ -1,0 +1,100 @@
+"""Permutation importance of whole channels, on windows that the classifier has not seen."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from joblib import Parallel, delayed
+from sklearn.base import BaseEstimator, clone
+
+from pipelines.classify.splits import Fold
+from pipelines.reporting.progress import Progress, silent
+from terrain.records import Array
+
+N_PERMUTATIONS = 3
+
+
+def channel_of(feature: str) -> str:
+    """Return the stream and channel that a feature is made of.
+
+    Examples
+    --------
+    >>> channel_of("imu.accel_z.std [m/s^2]"), channel_of("wheels.log_drive_effort [log10 A m/s]")
+    ('imu.accel_z', 'wheels.log_drive_effort')
+    >>> channel_of("imu.gyro_x~accel_y.correlation [1]")
+    'imu.correlations'
+    """
+    name = feature.partition(" [")[0]
+    stream, channel = name.split(".")[:2]
+    return f"{stream}.correlations" if "~" in channel else f"{stream}.{channel}"
+
+
+def channel_importance(
+    classifier: BaseEstimator,
+    features: Array,
+    names: Sequence[str],
+    y: Array,
+    group: Array,
+    folds: Sequence[Fold],
+    seed: int,
+    n_jobs: int,
+    progress: Progress = silent,
+) -> list[dict[str, float | str]]:
+    """Return by how much balanced accuracy drops when all features of a channel are shuffled together.
+
+    Single features are nearly useless to shuffle: their neighbours say the same.  Each fold's classifier
+    is judged on that fold's test windows; drops are means over folds and shuffles, largest first.
+
+    Parameters
+    ----------
+    classifier : unfitted, with ``fit(X, y, groups)``
+    features, names : (n, f) and the name of each column
+    y, group : (n,) class and group of each row
+    folds : the folds of one repeat
+
+    Returns
+    -------
+    list of dict
+        ``feature`` (stream and channel), ``drop`` and ``std`` (over folds).
+    """
+    channels = np.array([channel_of(name) for name in names])
+    jobs = (delayed(_fold_drops)(classifier, features, channels, y, group, fold, seed) for fold in folds)
+    drops = []
+    progress("importance", 0, len(folds))
+    for drop in Parallel(n_jobs=min(n_jobs, len(folds)), return_as="generator")(jobs):
+        drops.append(drop)
+        progress("importance", len(drops), len(folds))
+    table = np.array(drops)
+    unique = np.unique(channels)
+    order = np.argsort(-table.mean(axis=0), kind="stable")
+    return [
+        {"feature": str(unique[i]), "drop": float(table[:, i].mean()), "std": float(table[:, i].std(ddof=1))}
+        for i in order
+    ]
+
+
+def _fold_drops(
+    classifier: BaseEstimator, features: Array, channels: Array, y: Array, group: Array, fold: Fold, seed: int
+) -> list[float]:
+    fitted = clone(classifier).fit(features[fold.train], y[fold.train], groups=group[fold.train])
+    test, truth = features[fold.test], y[fold.test]
+    present = np.isin(truth, fitted.classes_)
+    test, truth = test[present], truth[present]
+    baseline = _balanced_accuracy(truth, fitted.predict(test))
+    rng = np.random.default_rng((seed, fold.number))
+    drops = []
+    for channel in np.unique(channels):
+        columns = np.flatnonzero(channels == channel)
+        scores = []
+        for _ in range(N_PERMUTATIONS):
+            shuffled = test.copy()
+            shuffled[:, columns] = test[rng.permutation(len(test))][:, columns]
+            scores.append(_balanced_accuracy(truth, fitted.predict(shuffled)))
+        drops.append(float(baseline - np.mean(scores)))
+    return drops
+
+
+def _balanced_accuracy(truth: Array, predicted: Array) -> float:
+    """Return the mean recall of the classes that are there; a fold need not hold all that are predicted."""
+    return float(np.mean([np.mean(predicted[truth == name] == name) for name in np.unique(truth)]))

@@ -1,0 +1,75 @@
+"""Labelled runs from nothing: simulated on each terrain, filtered, with slip beside what was measured."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from pipelines.estimate.estimate import Estimate, enriched, estimate_run, summary
+from pipelines.reporting.progress import Progress, silent
+from pipelines.runs.simulate import simulate_run
+from terrain.records import RunLog
+from terrain.robots import Robot, load_robot
+from terrain.terramechanics.soil import soil_names
+
+ROBOT = "agrimaro"
+SCENARIO = "survey"
+FILTER = "vio15"
+RUNS_A_TERRAIN = 6
+
+
+def labelled_runs(
+    seed: int,
+    runs_a_terrain: int = RUNS_A_TERRAIN,
+    progress: Progress = silent,
+    robot: Robot | None = None,
+) -> tuple[list[RunLog], list[dict[str, Any]], Estimate]:
+    """Simulate and filter runs on every terrain, with varied speed, slope, load, tyres and soil.
+
+    Parameters
+    ----------
+    seed : of everything that is drawn
+    runs_a_terrain : how many
+    robot : whose; :data:`ROBOT` by default
+
+    Returns
+    -------
+    runs
+        with the streams ``estimator`` and ``slip``, sorted by id
+    rows
+        one a terrain: ``terrain, n_runs, slip_mean, slip_true_mean, slip_rmse, nees``; of the runs' steady
+        slips, and None where the slip was nowhere steady
+    example
+        the estimate of one run, to be drawn
+    """
+    robot = load_robot(ROBOT) if robot is None else robot
+    terrains = soil_names()
+    runs, rows = [], []
+    for terrain in terrains:
+        found = []
+        for number in range(1, runs_a_terrain + 1):
+            run = simulate_run(robot, terrain, SCENARIO, seed, number, vary=True)
+            estimate = estimate_run(run, robot, FILTER)
+            runs.append(enriched(estimate))
+            found.append(summary(estimate))
+            progress("simulate and filter", len(runs), runs_a_terrain * len(terrains))
+            if terrain == "grass" and number == 1:
+                example = estimate
+        rows.append(_row(terrain, found))
+    return sorted(runs, key=lambda run: run.run_id), rows, example
+
+
+def _row(terrain: str, found: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    pairs = [(row["slip_mean"], row["slip_true_mean"]) for row in found if row["slip_true_mean"] is not None]
+    estimated, true = np.array(pairs).T if pairs else (np.array([math.nan]), np.array([math.nan]))
+    values = {
+        "slip_mean": float(estimated.mean()),
+        "slip_true_mean": float(true.mean()),
+        "slip_rmse": float(np.sqrt(np.mean((estimated - true) ** 2))),
+        "nees": float(np.mean([row["nees"] for row in found])),
+    }
+    known = {key: value if math.isfinite(value) else None for key, value in values.items()}
+    return {"terrain": terrain, "n_runs": len(found), **known}

@@ -1,0 +1,1 @@
+"""Settings of commands: one model a command, the only place of its defaults."""

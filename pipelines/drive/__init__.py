@@ -1,0 +1,1 @@
+"""``terrain drive``: closed-loop comparisons."""

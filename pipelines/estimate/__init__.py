@@ -1,0 +1,1 @@
+"""``terrain estimate`` and ``terrain calibrate``."""

@@ -1,0 +1,234 @@
+"""``terrain calibrate``: what run logs tell of a robot's description, written as a new description."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import yaml
+
+from pipelines.runs.datasets import load_runs
+from terrain.calibration.finding import Finding
+from terrain.calibration.lag import starts_and_stops, time_constants
+from terrain.calibration.noise import measurement_variances, sensor_noise
+from terrain.calibration.six_positions import MIN_POSITION_S, accelerometer
+from terrain.calibration.standing import gyro_bias, standing
+from terrain.calibration.steady import steady_stretches, why_none
+from terrain.calibration.wheels import SLIP_RATIO, reduction_ratio, steering_zeros
+from terrain.errors import ConfigError, DataError
+from terrain.files.atomic import atomic_write, ensure_writable
+from terrain.records import RunLog
+from terrain.robots import Robot, read_description, robot_from
+from terrain.terramechanics.soil import load_soil, soil_names
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+MAX_NAMED_RUNS = 4
+"""A source names that many runs, and counts more."""
+
+
+def calibrate(
+    data: str | Path,
+    robot_name: str,
+    out: str | Path | None = None,
+    *,
+    hard: Sequence[str] | None = None,
+    layout: str = "auto",
+    mapping: str | Path | None = None,
+    repair: bool = False,
+) -> dict[str, Any]:
+    """Calibrate a robot's description from its runs, and write it.
+
+    Parameters
+    ----------
+    data, layout, mapping, repair : as in :func:`pipelines.runs.datasets.load_runs`
+    robot_name : name of a robot or path of its YAML file, from which the calibration starts
+    out : new YAML file; nothing is written without
+    hard : terrain labels of ground on which wheels slip next to nothing; :func:`hard_grounds` by default
+
+    Returns
+    -------
+    dict that JSON can hold
+        ``robot``, ``out``, ``hard``, ``run_ids``; ``findings``, for each number ``parameter``, ``unit``,
+        ``described`` (before), ``value``, ``low``, ``high`` (95 %), ``n``, ``counted``, ``runs``, ``note``
+        (what is assumed, or why there is no value); ``measurement_variances`` of the calibrated robot by
+        the filters' rows
+
+    Raises
+    ------
+    LogError
+        if a run cannot be read.
+    ConfigError
+        if the robot's description is not accepted, lacks a section or has effects, or ``out`` is there
+        already or is no YAML file.
+    DataError
+        if the robot is no swerve robot, a run is another robot's, or the runs tell nothing.
+    """
+    file, described = read_description(robot_name)
+    robot = robot_from(file, described)
+    if robot.drive != "swerve":
+        raise DataError(
+            f"robot {robot.name}: drive {robot.drive!r} is not calibrated from logs, only 'swerve' is"
+        )
+    robot.has("body", "motors", "steering", "camera", "sensors")
+    if robot.effects:  # what is calibrated would hold them a second time
+        raise ConfigError(
+            f"robot {robot.name}: {file} is extended by effects; calibrate the description without them, "
+            "then explain again"
+        )
+    out = None if out is None else _new_file(Path(out))
+    runs = load_runs(data, layout=layout, mapping=mapping, repair=repair)
+    for run in runs:
+        if run.robot != robot.name:
+            raise DataError(
+                f"run {run.run_id} is one of robot {run.robot!r}, and {robot.name!r} is calibrated"
+            )
+    grounds = hard_grounds() if hard is None else tuple(hard)
+    findings = find(runs, described, robot, grounds)
+    if not any(finding.told for finding in findings):
+        reasons = "; ".join(dict.fromkeys(finding.note for finding in findings))
+        raise DataError(f"{data}: nothing of robot {robot.name} can be calibrated from this: {reasons}")
+    name = file if out is None else out.name
+    calibrated = described_with(described, findings)
+    result = {
+        "robot": robot.name,
+        "out": None if out is None else str(out),
+        "hard": list(grounds),
+        "run_ids": [run.run_id for run in runs],
+        "findings": [_finding_dict(finding, described) for finding in findings],
+        "measurement_variances": measurement_variances(robot_from(name, calibrated)),
+    }
+    if out is not None:
+        head = f"# Calibrated from {len(runs)} runs; what they could not tell is as it was in {file}.\n"
+        atomic_write(out, head + _yaml_text(calibrated))
+    return result
+
+
+def hard_grounds() -> tuple[str, ...]:
+    """Return the soils on which a rolling wheel slips no more than the calibration of the ratio allows for.
+
+    Examples
+    --------
+    >>> hard_grounds()
+    ('asphalt', 'tiles')
+    """
+    soils = [load_soil(name) for name in soil_names()]
+    return tuple(
+        soil.name
+        for soil in soils
+        if soil.law == "magic"
+        and soil.rolling_resistance_ratio
+        <= SLIP_RATIO[1] * soil.stiffness_ratio * soil.shape_ratio * soil.peak_friction_ratio
+    )
+
+
+def find(runs: Sequence[RunLog], described: Any, robot: Robot, hard: Sequence[str]) -> list[Finding]:
+    """Return what runs tell of each number that logs can tell of, and why they do not of the others."""
+    resting = [stretch for run in runs for stretch in standing(run, robot)]
+    held = [stretch for run in runs for stretch in standing(run, robot, MIN_POSITION_S)]
+    findings = [*gyro_bias(resting, robot), *accelerometer(held, robot), *sensor_noise(resting, robot)]
+    steady = [stretch for run in runs for stretch in steady_stretches(run, robot, hard)]
+    driven = [*steering_zeros(steady, robot), reduction_ratio(steady, robot)]
+    findings += (
+        driven if steady else [finding._replace(note=why_none(runs, robot, hard)) for finding in driven]
+    )
+    # Starts are told from turns by where the wheels point: with the zeros that have just been found.
+    better = robot_from(robot.name, described_with(described, findings))
+    events = [event for run in runs for event in starts_and_stops(run, better, hard)]
+    lags = time_constants(events)
+    return findings + (
+        lags if events else [finding._replace(note=why_none(runs, robot, hard)) for finding in lags]
+    )
+
+
+def described_with(described: Any, findings: Sequence[Finding]) -> Any:
+    """Return a description with the numbers that were found, rounded to a hundredth of their intervals."""
+    found = copy.deepcopy(described)
+    for finding in findings:
+        section, _, name = finding.parameter.partition(".")
+        if not finding.told or name not in found.get(section, {}):
+            continue
+        half = (finding.high - finding.low) / 2
+        digits = 2 - math.floor(math.log10(half)) if half > 0 else 12
+        named = ": " + ", ".join(finding.runs) if len(finding.runs) <= MAX_NAMED_RUNS else ""
+        found[section][name] = {
+            "value": round(finding.value, digits),
+            "unit": found[section][name]["unit"],
+            "source": f"terrain calibrate, {len(finding.runs)} run{'s' * (len(finding.runs) > 1)}{named}",
+            "interval": [round(finding.low, digits), round(finding.high, digits)],
+        }
+    return found
+
+
+def print_calibration(result: dict[str, Any], console: Console) -> None:
+    """Print what :func:`calibrate` returns: what was found, then what was not and why."""
+    from rich.table import Table
+
+    told = [finding for finding in result["findings"] if finding["value"] is not None]
+    table = Table(title=f"{result['robot']}: {len(told)} numbers from {len(result['run_ids'])} runs")
+    for heading, right in (("number", False), ("was", True), ("is", True), ("95 % from", True), ("to", True)):
+        table.add_column(heading, justify="right" if right else "left")
+    table.add_column("of")
+    for finding in told:
+        figures = (finding["described"], finding["value"], finding["low"], finding["high"])
+        runs = len(finding["runs"])
+        table.add_row(
+            finding["parameter"],
+            *("" if figure is None else f"{figure:.4g}" for figure in figures),
+            f"{finding['n']} {finding['counted']}, {runs} run{'s' * (runs > 1)}",
+        )
+    console.print(table)
+    for title, chosen in (("not told", False), ("assumed", True)):
+        notes: dict[str, list[str]] = {}
+        for finding in result["findings"]:
+            if finding["note"] and (finding["value"] is not None) == chosen:
+                notes.setdefault(finding["note"], []).append(finding["parameter"])
+        for note, parameters in notes.items():
+            console.print(f"{title}: {', '.join(parameters)}: {note}", highlight=False)
+    if result["out"] is not None:
+        console.print(f"written to {result['out']}", highlight=False)
+
+
+def _new_file(out: Path) -> Path:
+    if out.suffix not in (".yaml", ".yml"):
+        raise ConfigError(f"{out}: a robot's description is a .yaml file")
+    if out.exists():
+        raise ConfigError(f"{out}: is there already, and is left as it is; choose another --out")
+    ensure_writable(out.absolute().parent)
+    return out
+
+
+def _finding_dict(finding: Finding, described: Any) -> dict[str, Any]:
+    section, _, name = finding.parameter.partition(".")
+    entry = described.get(section, {}).get(name)
+    numbers = {key: getattr(finding, key) for key in ("value", "low", "high")}
+    return {
+        "parameter": finding.parameter,
+        "unit": entry["unit"] if entry else "s",
+        "described": float(entry["value"]) if entry else None,
+        **{key: float(number) if math.isfinite(number) else None for key, number in numbers.items()},
+        "n": finding.n,
+        "counted": finding.counted,
+        "runs": list(finding.runs),
+        "note": finding.note,
+    }
+
+
+def _yaml_text(described: Any) -> str:
+    """Return a description as YAML with one number a line."""
+    lines = []
+    for key, entry in described.items():
+        section = isinstance(entry, dict) and "value" not in entry
+        lines += [f"{key}:"] if section else [f"{key}: {_flow(entry)}"]
+        if section:
+            lines += [f"  {name}: {_flow(number)}" for name, number in entry.items()]
+    return "\n".join(lines) + "\n"
+
+
+def _flow(entry: Any) -> str:
+    text = yaml.safe_dump(entry, default_flow_style=True, sort_keys=False, allow_unicode=True, width=math.inf)
+    return str(text).removesuffix("...\n").strip()

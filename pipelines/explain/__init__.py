@@ -1,0 +1,1 @@
+"""``terrain explain`` and ``terrain explain-trials``."""

@@ -1,0 +1,1 @@
+"""Recipes, model files and tracking."""

@@ -1,0 +1,132 @@
+"""A fitted recipe on disk: ``model.skops``, and ``terrain_model.json`` with its checksum beside it.
+
+Models are loaded by skops with the fixed list of types below and nothing else, so that a file cannot bring
+code of its own; the checksum tells a damaged file from a whole one.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import zipfile
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from features.windows import Layout, SteadyMotion, WindowRule
+from pipelines.models.recipes import WindowPipeline
+from terrain.errors import ConfigError, DataError, ModelError
+from terrain.files.atomic import atomic_write
+
+MODEL_FILE = "model.skops"
+INFO_FILE = "terrain_model.json"
+INFO_VERSION = 1
+INFO_KEYS = {"window_s", "stride_s", "steady", "classes", "channels", "rate_hz", "run_digests"}
+
+TRUSTED_TYPES: tuple[str, ...] = (
+    "builtins.frozenset",
+    "features.cross_channel.Feature",
+    "features.extractor.FeatureExtractor",
+    "features.windows.Layout",
+    "numpy.clip",
+    "numpy.dtype",
+    "pipelines.models.recipes.WindowPipeline",
+    "terrain.classify.svm.Candidate",
+    "terrain.classify.svm.GroupedSVC",
+    "terrain.classify.svm.f_score",
+)
+"""Types beyond those that skops trusts itself which a model of this package may hold."""
+
+
+_LOADER_ERRORS = (
+    zipfile.BadZipFile,
+    ValueError,
+    LookupError,
+    TypeError,
+    AttributeError,
+    ImportError,
+    RuntimeError,
+    OSError,
+    EOFError,
+)
+"""What skops lets through when a file is damaged, or made by somebody else."""
+
+
+class TerrainModel(NamedTuple):
+    """A fitted recipe and what is known of it.
+
+    ``info`` holds ``version, sha256, recipe, classes, window_s, stride_s, steady, channels, rate_hz, seed,
+    data_digest, run_digests`` and the version of the package.
+    """
+
+    recipe: WindowPipeline
+    info: dict[str, Any]
+
+    @property
+    def layout(self) -> Layout:
+        """Channels and rates that a log must bring."""
+        channels = {stream: tuple(names) for stream, names in self.info["channels"].items()}
+        return Layout(channels, self.info["rate_hz"])
+
+    @property
+    def rule(self) -> WindowRule:
+        """How windows must be cut for this model."""
+        steady = SteadyMotion(**self.info["steady"]) if self.info["steady"] is not None else None
+        return WindowRule(self.info["window_s"], self.info["stride_s"], steady)
+
+
+def write_info(folder: Path, info: dict[str, Any]) -> None:
+    """Write ``terrain_model.json`` beside a ``model.skops``, with the checksum of the latter."""
+    sha256 = hashlib.sha256((folder / MODEL_FILE).read_bytes()).hexdigest()
+    content = {"version": INFO_VERSION, "sha256": sha256, **info}
+    atomic_write(folder / INFO_FILE, json.dumps(content, indent=2, sort_keys=True) + "\n")
+
+
+def read_model(folder: Path) -> TerrainModel:
+    """Read a model folder.
+
+    Raises
+    ------
+    ModelError
+        if it is no model of this package, is damaged, or holds a type that is not on the list.
+    """
+    file, info_file = folder / MODEL_FILE, folder / INFO_FILE
+    if not file.is_file() or not info_file.is_file():
+        raise ModelError(f"{folder}: holds no model of this package ({MODEL_FILE} and {INFO_FILE})")
+    try:
+        info = json.loads(info_file.read_text(encoding="utf-8"))
+        version, expected = info["version"], info["sha256"]
+        missing = INFO_KEYS - set(info)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ModelError(f"{info_file}: is damaged ({error})") from error
+    if version != INFO_VERSION or missing:
+        raise ModelError(f"{info_file}: has version {version!r}; version {INFO_VERSION} is read here")
+    content = file.read_bytes()
+    found = hashlib.sha256(content).hexdigest()
+    if found != expected:
+        raise ModelError(f"{file}: is damaged (SHA-256 {found[:12]}..., {str(expected)[:12]}... expected)")
+    model = TerrainModel(_load(file, content), info)
+    try:
+        for stream in model.layout.channels:
+            model.layout.n_samples(stream, model.rule.length_s)
+    except (TypeError, KeyError, AttributeError, ConfigError, DataError) as error:
+        raise ModelError(f"{info_file}: is damaged ({error})") from error
+    return model
+
+
+def _load(file: Path, content: bytes) -> WindowPipeline:
+    from skops import io
+
+    try:
+        foreign = sorted(set(io.get_untrusted_types(data=content)) - set(TRUSTED_TYPES))
+        if foreign:
+            raise ModelError(f"{file}: holds {foreign[0]}, a type that models of this package do not hold")
+        recipe = io.loads(content, trusted=list(TRUSTED_TYPES))
+    except ModelError:
+        raise
+    except _LOADER_ERRORS as error:
+        raise ModelError(f"{file}: cannot be loaded ({' '.join(str(error).split())[:200]})") from error
+    if not isinstance(recipe, WindowPipeline):
+        raise ModelError(f"{file}: holds a {type(recipe).__name__}, not a recipe of this package")
+    if not hasattr(recipe[0], "layout_"):
+        raise ModelError(f"{file}: holds a recipe that was never fitted")
+    return recipe

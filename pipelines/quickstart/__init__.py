@@ -1,0 +1,1 @@
+"""``terrain quickstart``: the whole job in one command, and its report."""

@@ -1,0 +1,1 @@
+"""Pages, drawing, numbers, terminal output and progress."""

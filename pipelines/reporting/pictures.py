@@ -1,0 +1,45 @@
+"""Figures inside a page: SVG, or PNG where that would be large, as data URIs."""
+
+from __future__ import annotations
+
+import base64
+from typing import NamedTuple
+
+from matplotlib.figure import Figure
+
+from pipelines.reporting.drawing import png_bytes, svg_text
+
+MAX_SVG_BYTES = 500_000
+"""A figure that needs more as lines goes on the page as points."""
+
+
+class Image(NamedTuple):
+    """A picture as templates take it.
+
+    Parameters
+    ----------
+    source : data URI
+    alt : what is said of it where it cannot be seen
+    caption : below it, or empty
+    """
+
+    source: str
+    alt: str
+    caption: str = ""
+
+
+def svg_or_png(figure: Figure, alt: str, caption: str = "", max_svg_bytes: int = MAX_SVG_BYTES) -> Image:
+    """Return a figure as SVG, or as PNG where that is larger than ``max_svg_bytes``."""
+    content, kind = svg_text(figure).encode(), "svg+xml"
+    if len(content) > max_svg_bytes:
+        content, kind = png_bytes(figure), "png"
+    return Image(_data_uri(content, kind), alt, caption)
+
+
+def png(figure: Figure, alt: str, caption: str = "") -> Image:
+    """Return a figure as PNG."""
+    return Image(_data_uri(png_bytes(figure), "png"), alt, caption)
+
+
+def _data_uri(content: bytes, kind: str) -> str:
+    return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"

@@ -1,0 +1,1 @@
+"""``terrain reproduce``: one folder a paper."""

@@ -1,0 +1,1 @@
+"""The AgriMaRo thesis."""

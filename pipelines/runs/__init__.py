@@ -1,0 +1,1 @@
+"""Import, inspect, simulate and load runs."""

@@ -1,0 +1,1 @@
+"""Blind trials of the diagnosis: effects are hidden in simulated runs."""

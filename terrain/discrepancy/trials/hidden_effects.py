@@ -1,0 +1,294 @@
+"""Blind trials' other side: hides effects in simulated runs, and says how small they could be and be seen.
+
+Nothing here is known to the diagnosis: it gets run logs without truth and without source.  The *limit* of an
+effect is the amplitude that a test at the size corrected for the library would find nine times in ten, by the
+Cramer-Rao bound of the very drives, with everything that scatters from run to run left free: from
+sensitivities of the true motion and from spectra of the noise as it is put in, not from anything that the
+diagnosis computes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.stats import norm
+
+from terrain.effects.catalogue import (
+    ACCEL,
+    CHANNELS,
+    CURRENT,
+    GYRO,
+    INDEX,
+    LIBRARY,
+    NUISANCES,
+    SPEED_X,
+    SPEED_Y,
+    TURNING_CURRENT,
+    Effect,
+    library_of,
+    vector_of,
+)
+from terrain.records import Array, RunLog, Stream
+from terrain.robots import Robot
+from terrain.simulation.planar.model import Ground, Planar, make_planar
+from terrain.simulation.planar.motion import move
+from terrain.simulation.planar.noise import RIM, Noise, load_noise, load_scatter, noise_psd
+from terrain.simulation.planar.run import Hills, simulate_planar
+from terrain.simulation.planar.sensors import SENSED_ONLY, sense
+
+TEST_SIZE = 0.02
+"""Size of the test over the whole library, to which limits refer."""
+
+POWER = 0.9
+
+CONFUSABLE = 0.99
+"""Two effects whose sensitivities correlate more than that, nuisances taken out, are of one class: a
+collinearity index of 10."""
+
+DURATION_S = 60.0
+
+STEP_HZ = 50.0
+
+
+class Drives(NamedTuple):
+    """What is driven in a trial: twists and hills of each run."""
+
+    twists: tuple[Array, ...]
+    hills: tuple[Hills, ...]
+
+
+class Limits(NamedTuple):
+    """What the drives of a trial could show.
+
+    Parameters
+    ----------
+    names : parameters (k,)
+    information : (k, k) of all runs, nuisances free
+    """
+
+    names: tuple[str, ...]
+    information: Array
+
+    def of(self, effect: Effect, direction: Array | None = None) -> float:
+        """Return the smallest amplitude that would be seen, along a direction (p,) or the first parameter."""
+        at = [self.names.index(p.name) for p in effect.parameters]
+        along = np.eye(len(at))[0] if direction is None else direction
+        size = float(along @ self.information[np.ix_(at, at)] @ along)
+        wanted = norm.isf(TEST_SIZE / 2 / self.library_size) + norm.ppf(POWER)
+        return float(wanted / math.sqrt(size)) if size > 0 else math.inf
+
+    @property
+    def library_size(self) -> int:
+        """How many effects are tested."""
+        return sum(all(p.name in self.names for p in effect.parameters) for effect in LIBRARY)
+
+    def alike(self, one: Effect, other: Effect) -> bool:
+        """Return whether two effects are of one confusable class."""
+        i, j = ([self.names.index(p.name) for p in effect.parameters] for effect in (one, other))
+        own, its = self.information[np.ix_(i, i)], self.information[np.ix_(j, j)]
+        cross = self.information[np.ix_(i, j)]
+        if min(np.diag(own).min(), np.diag(its).min()) <= 0:
+            return True
+        # the largest cosine between a change of the one and a change of the other
+        shared = np.linalg.solve(own, cross) @ np.linalg.solve(its, cross.T)
+        return math.sqrt(max(float(np.linalg.eigvals(shared).real.max()), 0.0)) > CONFUSABLE
+
+
+def rich_drives(rng: np.random.Generator, n_runs: int, duration_s: float = DURATION_S) -> Drives:
+    """Return drives that excite all: steps of speed and turn, stops, reversals, spot turns, hills."""
+    return Drives(
+        tuple(_mixed(rng, duration_s) for _ in range(n_runs)),
+        tuple(
+            Hills((rng.normal(0.0, 0.04), rng.normal(0.0, 0.04)), abs(rng.normal(0.0, 0.03)))
+            for _ in range(n_runs)
+        ),
+    )
+
+
+def poor_drives(rng: np.random.Generator, n_runs: int, duration_s: float = DURATION_S) -> Drives:
+    """Return drives that excite next to nothing: one speed, level ground, hardly any steering."""
+    n = round(duration_s * STEP_HZ) + 1
+    time_s = np.arange(n) / STEP_HZ
+    twists = []
+    for _ in range(n_runs):
+        twist = np.zeros((n, 3))
+        twist[:, 0] = np.clip(0.5 * (time_s - 0.5), 0.0, rng.uniform(0.65, 0.75))
+        phase = rng.uniform(0.0, 2 * math.pi)
+        twist[:, 2] = 0.01 * np.sin(2 * math.pi * time_s / 20.0 + phase) * (time_s > 5.0)
+        twists.append(twist)
+    return Drives(tuple(twists), tuple(Hills() for _ in range(n_runs)))
+
+
+def _mixed(rng: np.random.Generator, duration_s: float) -> Array:
+    n = round(duration_s * STEP_HZ) + 1
+    wanted = np.zeros((n, 3))
+    k = round(1.5 * STEP_HZ)
+    while k < n - round(3.0 * STEP_HZ):
+        length = round(rng.uniform(2.0, 5.0) * STEP_HZ)
+        kind = rng.choice(["ahead", "stop", "back", "spot", "turn"], p=[0.4, 0.1, 0.15, 0.1, 0.25])
+        speed, turn = rng.uniform(0.3, 1.0), 0.0
+        if kind == "stop":
+            speed = 0.0
+        elif kind == "back":
+            speed, turn = -rng.uniform(0.3, 0.8), rng.uniform(-0.4, 0.4) * rng.integers(2)
+        elif kind == "spot":
+            speed, turn = 0.0, rng.choice([-1.0, 1.0]) * rng.uniform(0.3, 0.8)
+        elif kind == "turn":
+            turn = rng.choice([-1.0, 1.0]) * rng.uniform(0.1, 0.6)
+        wanted[k : k + length] = speed, 0.0, turn
+        k += length
+    wanted[n - round(3.0 * STEP_HZ) :] = 0.0
+    return _ramped(wanted)
+
+
+def _ramped(wanted: Array) -> Array:
+    """Return twists (n, 3) from rest that change by 1 m/s^2 and 1 rad/s^2 at the most."""
+    limit = 1.0 / STEP_HZ
+    twist = np.zeros_like(wanted)
+    for axis, goals in enumerate(wanted.T.tolist()):  # numbers of Python's own: arrays of three are slow
+        value, values = 0.0, [0.0]
+        for goal in goals[1:]:
+            change = goal - value
+            value += limit if change > limit else -limit if change < -limit else change
+            values.append(value)
+        twist[:, axis] = values
+    return twist
+
+
+def hidden_runs(
+    robot: Robot,
+    drives: Drives,
+    seed: np.random.SeedSequence,
+    effects: Mapping[str, float],
+    outside: Mapping[str, float] | None = None,
+) -> tuple[RunLog, ...]:
+    """Return the logs of drives with effects hidden in all of them; truth and source are kept back."""
+    scatter, noise = load_scatter(), load_noise()
+    runs = []
+    for i, (twist, hills) in enumerate(zip(drives.twists, drives.hills, strict=True)):
+        run = simulate_planar(
+            robot,
+            twist,
+            np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, i)),
+            effects=effects,
+            scatter=scatter,
+            noise=noise,
+            hills=hills,
+            outside=outside,
+            run_id=f"run_{i + 1:02d}",
+            terrain="ground",
+        )
+        shown = {name: stream for name, stream in run.streams.items() if name not in ("truth", "commands")}
+        runs.append(replace(run, streams=shown, source=""))
+    return tuple(runs)
+
+
+def limits_of(robot: Robot, drives: Drives) -> Limits:
+    """Return what drives could show of each effect, by the Cramer-Rao bound."""
+    planar, noise, scatter = make_planar(robot, Ground()), load_noise(), load_scatter()
+    names = tuple(dict.fromkeys([p.name for effect in library_of(robot.drive) for p in effect.parameters]))
+    extra = tuple(name for name in NUISANCES if name not in names)
+    if robot.drive == "swerve":
+        extra = tuple(name for name in extra if name != "effective_track_ratio")
+    every = (*names, *extra)
+    free = [every.index(name) for name in NUISANCES if name in every]
+    std = np.array([getattr(scatter, every[i]) for i in free])
+    total = np.zeros((len(names), len(names)))
+    for twist, hills in zip(drives.twists, drives.hills, strict=True):
+        gram = _gram(robot, planar, noise, twist, hills, every)
+        inner = np.linalg.inv(gram[np.ix_(free, free)] + np.diag(1.0 / std**2))
+        left = gram - gram[:, free] @ inner @ gram[free]
+        total += left[: len(names), : len(names)]
+    return Limits(names, total)
+
+
+def _gram(
+    robot: Robot, planar: Planar, noise: Noise, twist: Array, hills: Hills, names: Sequence[str]
+) -> Array:
+    """Return the information (k, k) of one run, nothing free."""
+    run = simulate_planar(robot, twist, 0, hills=hills)
+    truth = run.streams["truth"]
+    even = slice(0, len(truth) // 100 * 100, 2)  # a length that its Fourier transform is quick with
+    truth = Stream(truth.time_s[even], truth.values[even], truth.channels)
+    rate_hz = truth.rate_hz
+    wheels = robot.wheels
+    rim = np.column_stack([truth.channel(f"wheel_{w}_radps") for w in wheels]) * robot.wheel_radius_m
+    steer = (
+        np.column_stack([truth.channel(f"steer_{w}_rad") for w in wheels])
+        if robot.drive == "swerve"
+        else np.zeros_like(rim)
+    )
+    grade, roll = -truth.channel("pitch_rad"), truth.channel("roll_rad").copy()
+    rim, steer = np.ascontiguousarray(rim), np.ascontiguousarray(steer)
+    shown = np.ones((len(rim), len(CHANNELS)))
+    if robot.drive == "swerve":  # the sum of currents tells the traction where wheels point one way
+        shown[np.abs(np.exp(1j * steer).mean(axis=1)) < 0.95, CHANNELS.index(CURRENT)] = 0.0
+    channels = [GYRO, SPEED_X, SPEED_Y, ACCEL, CURRENT]
+    if robot.drive != "swerve":
+        channels.append(TURNING_CURRENT)
+    n = len(rim)
+    frequency_hz = np.fft.rfftfreq(n, 1 / rate_hz)
+    used = frequency_hz < 0.4 * STEP_HZ
+    f = frequency_hz[used]
+    both_sides = np.where(f > 0, 4.0, 2.0)
+    pace = float(np.abs(rim).mean(axis=1)[np.abs(rim).mean(axis=1) > 0.05].mean())
+    density = {name: _density(noise, robot, planar, name, f, pace) for name in channels}
+    waves = {name: np.empty((len(names), f.size), dtype=complex) for name in channels}
+    steps = {p.name: p.step for effect in LIBRARY for p in effect.parameters}
+    plain = move(planar, vector_of({}), 1 / rate_hz, rim, steer, grade, roll, np.zeros((0, 3)))
+    for j, name in enumerate(names):
+        step = steps.get(name, 0.005)
+        both = []
+        for sign in (1.0, 0.0) if name == "steering_play_rad" else (1.0, -1.0):
+            p = vector_of({name: sign * step})
+            if name in SENSED_ONLY:
+                both.append(sense(planar, p, 1 / rate_hz, plain))
+            else:
+                both.append(_shown(planar, p, 1 / rate_hz, rim, steer, grade, roll))
+        span = step if name == "steering_play_rad" else 2 * step
+        change = (both[0] - both[1]) / span * shown
+        for channel in channels:
+            waves[channel][j] = np.fft.rfft(change[:, CHANNELS.index(channel)])[used] / rate_hz
+    gram = np.zeros((len(names), len(names)))
+    for channel in channels:
+        weighed = waves[channel] * (both_sides / density[channel] * rate_hz / n)
+        gram += np.real(weighed @ waves[channel].conj().T)
+    return gram
+
+
+def _shown(planar: Planar, p: Array, dt: float, rim: Array, steer: Array, grade: Array, roll: Array) -> Array:
+    """Return what a replay of measured wheels and tilt would predict, as far as linear in what differs."""
+    lag = p[INDEX["encoder_lag_s"]]
+    rims = rim + lag * np.gradient(rim, dt, axis=0) if lag else rim
+    tilt = grade - p[INDEX["pitch_offset_rad"]], roll - p[INDEX["roll_offset_rad"]]
+    truth = move(planar, p, dt, rims, steer, *tilt, np.zeros((0, 3)))
+    return np.asarray(sense(planar, p, dt, truth))
+
+
+def _density(noise: Noise, robot: Robot, planar: Planar, channel: str, f: Array, pace: float) -> Array:
+    """Return the one-sided spectrum of what parts measured from replayed: noise of channel and wheels."""
+    own = noise_psd(noise, robot, planar, channel, f, pace)
+    rim = noise_psd(noise, robot, planar, RIM, f, pace)
+    lag_s = robot.sensors.encoder_time_constant_s if robot.sensors is not None else 0.0
+    rim = rim * (1.0 + (2 * math.pi * f * lag_s) ** 2)  # the lag is undone
+    n = planar.n_wheels
+    mean, rate = rim / n, (2 * math.pi * f) ** 2
+    if channel == GYRO:
+        turn = np.sum(planar.to_twist[2] ** 2) / 2 if robot.drive == "swerve" else 2.0 / planar.track_m**2
+        return own + rim * turn
+    if channel == SPEED_X:
+        return own + mean
+    if channel == ACCEL:
+        return own + mean * rate
+    if channel == CURRENT:
+        return own + mean * rate * (planar.mass_kg * planar.radius_m / planar.nm_per_a) ** 2
+    return own
+
+
+def confusable_class(limits: Limits, effect: Effect, drive: str) -> set[str]:
+    """Return the names of all effects that no log of these drives tells from one, and its own."""
+    return {other.name for other in library_of(drive) if other is effect or limits.alike(effect, other)}

@@ -1,0 +1,1 @@
+"""The dynamic simulation of a swerve robot in closed loop."""

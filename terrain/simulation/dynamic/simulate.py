@@ -1,0 +1,325 @@
+"""One simulated run: a robot, a scenario and its ground in, an ordinary run log with its truth out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+from scipy.signal import lfilter
+
+from terrain.effects.described import checked_effects
+from terrain.errors import ConfigError
+from terrain.extension import OTHER_LOGGER, moved
+from terrain.kinematics.swerve import wheel_commands
+from terrain.records import Array, Command, Label, RunLog, Sample, Stream
+from terrain.robots import Robot
+from terrain.simulation.conditions import NO_FAULTS, Conditions, Faults
+from terrain.simulation.dynamic.loop import Drive, in_loop
+from terrain.simulation.dynamic.vehicle import (
+    BODY_RECORD,
+    FIELD_STEP_M,
+    STEP_S,
+    Plant,
+    advance,
+    make_plant,
+    record_width,
+    settle,
+    start_state,
+)
+from terrain.simulation.scenario import Scenario
+from terrain.simulation.sensors import (
+    CameraSensor,
+    Gnss,
+    GnssSensor,
+    ImuSensor,
+    Motion,
+    Sensor,
+    SteeringSensor,
+    WheelSensor,
+    truth_stream,
+)
+from terrain.terramechanics.soil import Soil
+from terrain.terramechanics.traction import ground_array
+
+MIN_LABEL_S = 0.5
+"""A shorter stay on one ground gets no label."""
+
+MAX_FIELD_CELLS = 5 * 10**6
+"""Cells of ground up to where the fastest wheel can come; a day at 2 m/s takes 3.5 million."""
+
+MAX_WHEEL_SPEEDS = 100.0
+"""No wheel turns so many times as fast as its motor can: then the steps are too long for the robot, as with a
+load of 1000 t on 90 kg."""
+
+MAX_COMMAND_DELAY_S = 0.5
+"""Longest way of a command to the wheels; what comes later is no control."""
+
+_SENSOR_RATES = ("wheels_rate_hz", "steering_rate_hz", "imu_rate_hz")
+
+COMMAND_CHANNELS = (
+    "speed_x_mps",
+    "speed_y_mps",
+    "yaw_rate_radps",
+    *(f"wheel_{i}_radps" for i in (1, 2, 3)),
+    *(f"steer_{i}_rad" for i in (1, 2, 3)),
+)
+"""The admitted twist of the body, and what it asks of the wheels."""
+
+
+def simulate(
+    robot: Robot,
+    scenario: Scenario,
+    soils: Mapping[str, Soil],
+    seed: int | np.random.SeedSequence,
+    *,
+    run_id: str = "run",
+    conditions: Conditions | None = None,
+    faults: Faults = NO_FAULTS,
+    gnss: Gnss | None = None,
+    controller: Callable[[Sample], Command] | None = None,
+    command_delay_s: float = 0.0,
+    effects: Mapping[str, float] | None = None,
+) -> RunLog:
+    """Drive a scenario and return what the loggers wrote, with the truth beside it.
+
+    Without a controller the wheels are told what the wanted twists ask of them.  With one the loop is
+    closed: at each instant of the scenario it is given what has arrived since the one before, just as it will
+    stand in the log, and what it answers is what the wheels are told.
+
+    Parameters
+    ----------
+    robot : swerve robot with all sections
+    scenario : what is driven, and on which ground
+    soils : by the terrain names of the scenario
+    seed : of everything that is drawn; the same seed gives the same log, and a sequence is left as it is
+    run_id : name of the run
+    conditions : load, slope, tyres, roughness; a level, nominal day by default
+    faults : what the sensors suffer on purpose
+    gnss : receiver on board, if any
+    controller : called once an instant of the scenario; without a command yet, wheels are told to stand and
+        the steering to stay at 0
+    command_delay_s : from that instant to when the wheels are told, in whole steps; the step that starts at
+        the instant always runs with the command before
+    effects : parameters of :mod:`terrain.effects.catalogue` that act on this robot and its sensors, beside
+        those of its own description or in place of them; the commands know of none, and no log says so
+
+    Returns
+    -------
+    RunLog
+        streams wheels, steering, imu, odometry, commands, truth, gnss where there is a receiver, and control,
+        the status of the controller's commands, where there is any; commands are those decided at each
+        instant.  What was lost throughout is no stream.  A label for each stretch in which all wheels are on
+        one ground.
+
+    Raises
+    ------
+    ConfigError
+        if the robot is no swerve robot, lacks a section, is tipped over by its load or has a number so far
+        out of scale that its motion cannot be integrated, a sensor is faster than the simulation's steps, a
+        terrain of the scenario has no soil, its twists do not come every so many whole steps, the delay is
+        not from 0 to 0.5 s, or an effect cannot befall the robot or is out of its bounds.
+    DataError
+        if a command is not one finite number a wheel, or its status not numbers by names that end in a unit,
+        the same names throughout.
+
+    Examples
+    --------
+    >>> from terrain.robots import load_robot
+    >>> from terrain.simulation.scenario import make_scenario
+    >>> from terrain.terramechanics.soil import load_soil
+    >>> robot = load_robot("agrimaro")
+    >>> drive = make_scenario("straight", robot, ["grass"], 5.0)
+    >>> run = simulate(robot, drive, {"grass": load_soil("grass")}, seed=0)
+    >>> sorted(run.streams), run.terrains
+    (['commands', 'imu', 'odometry', 'steering', 'truth', 'wheels'], ('grass',))
+    """
+    if robot.drive != "swerve":
+        raise ConfigError(f"robot {robot.name}: drive {robot.drive!r} is not simulated, only 'swerve' is")
+    conditions = Conditions() if conditions is None else conditions
+    substeps = round(1 / (scenario.rate_hz * STEP_S))
+    if abs(substeps * scenario.rate_hz * STEP_S - 1.0) > 1e-9:
+        raise ConfigError(
+            f"scenario {scenario.name}: rate_hz is {scenario.rate_hz:g}, it must divide {1 / STEP_S:g}"
+        )
+    _check_rates(robot)
+    delay_steps = _delay_steps(command_delay_s)
+    sequence = seed if isinstance(seed, np.random.SeedSequence) else np.random.SeedSequence(seed)
+    # One generator a purpose: a sensor more or less changes nothing about the others.
+    ground, road, start, wheels, steering, imu, camera, receiver = (
+        np.random.default_rng(np.random.SeedSequence(sequence.entropy, spawn_key=(*sequence.spawn_key, i)))
+        for i in range(8)
+    )
+    built = _built(robot, effects or {})
+    plant = _plant(built, scenario, soils, conditions, ground)
+    n_steps = len(scenario.time_s) * substeps
+    state = start_state(plant, plant.play_rad * start.uniform(-1.0, 1.0, 3))
+    settle(plant, state)
+    noise = road.standard_normal((n_steps, 3))
+    motion = Motion(np.empty((n_steps, record_width(plant))), 0)
+    imu_sensor = ImuSensor(motion, built, imu)
+    sensors: dict[str, Sensor] = {
+        "wheels": WheelSensor(motion, built, wheels),
+        "steering": SteeringSensor(motion, built, steering),
+        "imu": imu_sensor,
+        "odometry": CameraSensor(motion, built, camera, faults),
+    }
+    if gnss is not None:
+        sensors["gnss"] = GnssSensor(motion, gnss, receiver, faults)
+    offset_s, rate = (built.effects.get(name, 0.0) for name in ("clock_offset_s", "clock_rate_ratio"))
+    if offset_s or rate:
+        for name in sensors.keys() & set(OTHER_LOGGER):
+            sensors[name].stamp(offset_s, rate)
+    status: dict[str, Array] = {}
+    if controller is None:
+        admitted, wheel_radps, steer_rad = _commands(robot, scenario)
+        advance(plant, state, wheel_radps, steer_rad, substeps, noise, motion.record)
+        decided = np.hstack([admitted, wheel_radps, steer_rad])
+    else:
+        drive = Drive(plant, state, noise, motion.record)
+        decided, status = in_loop(controller, delay_steps, scenario, substeps, drive, motion, sensors)
+    _check_motion(motion, robot)
+    motion.grow(n_steps)
+    streams: dict[str, Stream] = {}
+    for name, sensor in sensors.items():
+        sensor.hear()
+        streams[name] = sensor.stream()
+    streams["commands"] = Stream(scenario.time_s, decided, COMMAND_CHANNELS)
+    if status:
+        streams["control"] = Stream(scenario.time_s, np.column_stack(list(status.values())), tuple(status))
+    streams["truth"] = truth_stream(motion, imu_sensor.yaw_bias_radps, imu_sensor.time_s)
+    streams = {name: stream for name, stream in streams.items() if len(stream) > 1}
+    return RunLog(
+        run_id, robot.name, streams, _labels(motion, scenario), source=f"simulated, {scenario.name}"
+    )
+
+
+_IN_DESCRIPTION = (
+    *("gyro_bias_radps", "accel_bias_mps2", "motor_constant_ratio", "encoder_lag_s"),
+    *("camera_latency_s", "lever_x_m", "lever_y_m"),
+)
+"""Effects that are no more than another number of the description; plant and sensors take the others."""
+
+
+def _built(robot: Robot, effects: Mapping[str, float]) -> Robot:
+    """Return the robot that drives, which the one that is commanded is taken for."""
+    if not robot.effects and not effects:
+        return robot
+    acting = checked_effects("effects", {**robot.effects, **effects}, robot.drive)
+    n = len(acting)
+    return moved(replace(robot, effects=acting, effects_cov=np.full((n, n), np.nan)), _IN_DESCRIPTION)
+
+
+def _delay_steps(delay_s: float) -> int:
+    if (
+        isinstance(delay_s, bool)
+        or not isinstance(delay_s, int | float | np.integer | np.floating)
+        or not 0 <= delay_s <= MAX_COMMAND_DELAY_S
+    ):
+        raise ConfigError(
+            f"command_delay_s is {delay_s!r}, a time from 0 to {MAX_COMMAND_DELAY_S:g} s is wanted"
+        )
+    return round(delay_s / STEP_S)
+
+
+def _check_rates(robot: Robot) -> None:
+    _, _, _, camera, sensors = robot.equipment
+    rates_hz = {
+        "camera: rate_hz": camera.rate_hz,
+        **{f"sensors: {name}": getattr(sensors, name) for name in _SENSOR_RATES},
+    }
+    for name, rate_hz in rates_hz.items():
+        if rate_hz > 1 / STEP_S:
+            raise ConfigError(
+                f"robot {robot.name}: {name} is {rate_hz:g}, at most {1 / STEP_S:g} is simulated"
+            )
+
+
+def _check_motion(motion: Motion, robot: Robot) -> None:
+    lost = [name for name in BODY_RECORD if not np.isfinite(motion.body(name)).all()]
+    fastest_radps = float(np.abs(motion.wheel("wheel_radps")).max())
+    limit_radps = MAX_WHEEL_SPEEDS * robot.equipment.motors.speed_max_radps
+    if lost or not fastest_radps <= limit_radps:
+        raise ConfigError(
+            f"robot {robot.name}: its motion cannot be integrated in steps of {STEP_S:g} s; a mass, an "
+            "inertia, a stiffness, a gain or the load is out of scale with the rest"
+        )
+
+
+def _commands(robot: Robot, scenario: Scenario) -> tuple[Array, Array, Array]:
+    _, motors, steering, _, _ = robot.equipment
+    return wheel_commands(
+        robot.wheel_positions_m,
+        robot.wheel_radius_m,
+        motors.speed_max_radps,
+        steering.rate_max_radps,
+        1 / scenario.rate_hz,
+        scenario.twist,
+        np.zeros(3),
+    )
+
+
+def _plant(
+    robot: Robot,
+    scenario: Scenario,
+    soils: Mapping[str, Soil],
+    conditions: Conditions,
+    rng: np.random.Generator,
+) -> Plant:
+    body, motors = robot.equipment.body, robot.equipment.motors
+    for patch in scenario.patches:
+        if patch.terrain not in soils:
+            raise ConfigError(f"scenario {scenario.name}: terrain {patch.terrain!r} has no soil")
+    on = [soils[patch.terrain] for patch in scenario.patches]
+    starts_m = np.array([patch.start_m for patch in scenario.patches])
+    farthest_m = 2.0 * robot.wheel_radius_m * motors.speed_max_radps * scenario.time_s[-1]
+    n_cells = math.ceil(farthest_m / FIELD_STEP_M) + 1
+    if n_cells > MAX_FIELD_CELLS:
+        raise ConfigError(
+            f"robot {robot.name}: its wheels can come {farthest_m / 2e3:g} km far in this run, "
+            f"{MAX_FIELD_CELLS * FIELD_STEP_M / 2e3:g} km of ground are simulated at most"
+        )
+    keep = math.exp(-FIELD_STEP_M / conditions.field_length_m)
+    white = rng.standard_normal((2, 3, n_cells))
+    white[:, :, 1:] *= math.sqrt(1.0 - keep**2)
+    unit = lfilter([1.0], [1.0, -keep], white, axis=2)
+    patch_of_cell = np.searchsorted(starts_m, np.arange(n_cells) * FIELD_STEP_M, side="right") - 1
+    spread = np.array([[soil.thrust_field_ratio, soil.resistance_field_ratio] for soil in on])[
+        patch_of_cell
+    ].T
+    field = np.exp(spread[:, None, :] * unit - 0.5 * spread[:, None, :] ** 2)
+    return make_plant(
+        robot,
+        payload_kg=conditions.payload_kg,
+        payload_m=conditions.payload_m,
+        radius_factors=np.array(conditions.radius_factors),
+        grade_ratio=conditions.grade_ratio,
+        swell_ratio=conditions.swell_ratio,
+        swell_length_m=conditions.swell_length_m,
+        leg_play_rad=conditions.leg_play_rad,
+        grounds=np.array(
+            [
+                ground_array(soil, robot.wheel_radius_m, body.tyre_width_m, body.contact_length_m)
+                for soil in on
+            ]
+        ),
+        roughness_m3=np.array([soil.roughness_m3 * conditions.roughness_factor for soil in on]),
+        patch_start_m=starts_m,
+        field=field,
+    )
+
+
+def _labels(motion: Motion, scenario: Scenario) -> tuple[Label, ...]:
+    """One label a stretch in which all three wheels are on the same ground."""
+    patch = motion.wheel("patch_ratio")
+    one = np.where((patch == patch[:, :1]).all(axis=1), patch[:, 0], -1)
+    edges = np.concatenate([[0], np.flatnonzero(np.diff(one)) + 1, [len(one)]])
+    labels: list[Label] = []
+    for begin, end in pairwise(edges):
+        start_s, end_s = float(begin * STEP_S), float(end * STEP_S)
+        if one[begin] < 0 or end_s - start_s < MIN_LABEL_S:
+            continue
+        labels.append(Label(round(start_s, 3), round(end_s, 3), scenario.patches[int(one[begin])].terrain))
+    return tuple(labels)

@@ -1,0 +1,1 @@
+"""The planar simulation that takes any wheeled robot and replays logs."""

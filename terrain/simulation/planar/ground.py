@@ -1,0 +1,70 @@
+"""A soil as the planar simulation knows it: thrust curve, its end, growth with load, and resistances."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from terrain.constants import GRAVITY_MPS2
+from terrain.errors import ConfigError
+from terrain.robots import Robot
+from terrain.simulation.planar.model import Ground
+from terrain.terramechanics.soil import Soil
+from terrain.terramechanics.traction import equilibrium_slip, ground_array, wheel_ground
+
+SCRUB_SHARE = 0.4
+"""Resistance to turning over the ground's grip; assumed: wheels of a side skid sideways on half their way."""
+
+_SLIPS = np.linspace(0.0, 1.0, 101)
+
+_MORE = 1.01
+"""Load for which growth with load is taken."""
+
+_TYRES = {"swerve": 3, "skid_steer": 4}
+
+
+def planar_ground(robot: Robot, soil: Soil) -> Ground:
+    """Return what a soil is to a robot that carries its weight on all tyres alike.
+
+    The thrust curve is that of one tyre with its share of the weight; ``slip_ratio`` is its chord through the
+    slip at which the robot drives steadily on the level.  How thrust grows with load is taken there, too.
+
+    Parameters
+    ----------
+    robot : with a body
+    soil : the ground
+
+    Raises
+    ------
+    ConfigError
+        if the robot has no body, or is stuck on that soil.
+
+    Examples
+    --------
+    >>> from terrain.robots import load_robot
+    >>> from terrain.terramechanics.soil import load_soil
+    >>> ground = planar_ground(load_robot("agrimaro"), load_soil("grass"))
+    >>> [round(number, 3) for number in ground[:4]], round(ground.load_ratio, 2)
+    ([1.569, 0.347, 0.08, 0.139], 0.76)
+    """
+    robot.has("body")
+    assert robot.body is not None
+    wheel = robot.wheel_radius_m, robot.body.tyre_width_m, robot.body.contact_length_m
+    normal_n = robot.mass_kg * GRAVITY_MPS2 / _TYRES[robot.drive]
+    slip = equilibrium_slip(soil, normal_n, 0.0, *wheel)
+    if math.isnan(slip):
+        raise ConfigError(f"robot {robot.name}: it gets stuck on terrain {soil.name!r}")
+    ground = ground_array(soil, *wheel)
+    thrust_n = wheel_ground(ground, normal_n, max(slip, 1e-3), 0.0)[0]
+    more_n = wheel_ground(ground, _MORE * normal_n, max(slip, 1e-3), 0.0)[0]
+    thrusts = [wheel_ground(ground, normal_n, float(s), 0.0)[0] / normal_n for s in _SLIPS]
+    grip = max(thrusts)
+    return Ground(
+        slip_ratio=max(slip, 1e-3) * normal_n / thrust_n,
+        grip_ratio=grip,
+        rolling_ratio=wheel_ground(ground, normal_n, slip, 0.0)[2] / normal_n,
+        scrub_ratio=SCRUB_SHARE * grip,
+        thrust_ratio=tuple(thrusts),
+        load_ratio=(more_n / thrust_n - 1.0) / (_MORE - 1.0),
+    )

@@ -1,0 +1,58 @@
+"""What a body on wheels does: motion by its kind of drive, and what a side hill and the ground add to it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from terrain.constants import GRAVITY_MPS2
+from terrain.effects.catalogue import INDEX
+from terrain.records import Array
+from terrain.simulation.planar.model import AX, SWERVE_WHEELS, VX, VY, Planar, W
+from terrain.simulation.planar.signals import slopes
+from terrain.simulation.planar.skid_steer import move_skid
+from terrain.simulation.planar.swerve import move_swerve
+
+_SIDE_HILL = INDEX["side_hill_slip_ratio"]
+
+
+@njit(cache=True)
+def move(
+    planar: Planar,
+    p: Array,
+    dt: float,
+    rim_mps: Array,
+    steer_rad: Array,
+    grade_rad: Array,
+    roll_rad: Array,
+    disturbance: Array,
+) -> Array:
+    """Return what the body does, (n, len(TRUTH)).
+
+    Parameters
+    ----------
+    planar, p : the simulation, and its parameters in the order of ``effects.PARAMETERS``
+    dt : step in s
+    rim_mps : (n, wheels) wheel rates times the nominal radius
+    steer_rad : (n, wheels) angles as encoders without error show them; not looked at for a skid-steer robot
+    grade_rad, roll_rad : (n,) true tilt
+    disturbance : (n, 3) what the ground adds to speeds (shares of ``|u|``, along and across) and yaw rate
+        (rad/s), or none: (0, 3)
+    """
+    out = np.zeros((rim_mps.shape[0], 8))
+    if planar.n_wheels == SWERVE_WHEELS:
+        move_swerve(planar, p, dt, rim_mps, steer_rad, grade_rad, roll_rad, disturbance, out)
+    else:
+        move_skid(planar, p, dt, rim_mps, grade_rad, disturbance, out)
+    for k in range(out.shape[0]):
+        fast = math.sqrt(out[k, VX] * out[k, VX] + out[k, VY] * out[k, VY])
+        out[k, VY] -= p[_SIDE_HILL] * planar.felt_ratio * roll_rad[k] * fast
+        if disturbance.shape[0] > 0:
+            out[k, VY] += fast * disturbance[k, 1]
+            out[k, W] += disturbance[k, 2]
+    accel = slopes(out[:, VX].copy(), dt)
+    for k in range(out.shape[0]):
+        out[k, AX] = accel[k] - out[k, W] * out[k, VY] + GRAVITY_MPS2 * math.sin(grade_rad[k])
+    return out

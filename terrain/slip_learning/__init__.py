@@ -1,0 +1,1 @@
+"""From measured slip and force to slip curves and target slips."""

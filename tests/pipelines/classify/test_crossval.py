@@ -1,0 +1,162 @@
+import json
+
+import numpy as np
+import pytest
+
+from pipelines.classify.crossval import CrossvalSettings, crossval
+from pipelines.runs.datasets import load_runs
+from terrain.errors import ConfigError, DataError
+from terrain.records import RunLog, Stream
+
+PROMISED = {
+    "protocol",
+    "recipe",
+    "window_s",
+    "n_windows",
+    "n_runs",
+    "accuracy",
+    "accuracy_ci",
+    "accuracy_spread",
+    "balanced_accuracy",
+    "macro_f1",
+    "per_class",
+    "confusion",
+    "classes",
+    "folds",
+    "per_run",
+    "vote_accuracy",
+    "ece",
+    "dropped",
+    "repaired",
+    "notes",
+}
+
+
+@pytest.fixture(scope="module")
+def report(runs, settings):
+    return crossval(runs, settings(repeats=2))
+
+
+def test_the_report_has_what_is_promised_and_is_json(report, runs):
+    assert set(report) >= PROMISED
+    assert json.loads(json.dumps(report, allow_nan=False)) == report
+    assert (report["n_runs"], report["n_windows"], report["window_s"]) == (12, 144, 2.0)
+    assert (len(report["folds"]), len(report["per_run"]), report["repeats"]) == (10, 12, 2)
+    assert np.sum(report["confusion"]) == 2 * 144
+    low, high = report["accuracy_ci"]
+    assert 0.5 < low <= report["accuracy"] <= high <= 1.0  # terrains that differ are told apart
+    assert report["accuracy"] == pytest.approx(np.trace(report["confusion"]) / 288)
+    assert report["dropped"] == {}
+
+
+def test_one_seed_gives_one_report_and_another_seed_another(report, runs, settings):
+    assert crossval(runs, settings(repeats=2)) == report
+    other = crossval(runs, settings(seed=1))
+    assert other["accuracy_per_repeat"][0] not in report["accuracy_per_repeat"]
+    assert other["per_run"] != report["per_run"]
+
+
+def test_where_labels_are_but_names_of_runs_grouped_says_chance_and_published_is_fooled(drive, settings):
+    def mislabelled(seed):
+        """Eight runs, each with a vibration of its own; what they are called says nothing of it."""
+        rng = np.random.default_rng(seed)
+        names = rng.permutation(["ICE"] * 4 + ["MUD"] * 4)
+        levels, colours = (
+            rng.permutation(np.geomspace(0.3, 3.0, 8)),
+            rng.permutation(np.linspace(0.05, 0.9, 8)),
+        )
+        return [
+            drive(f"run_{i}", "GRASS", int(rng.integers(2**31)), 16.0, rng.uniform(0.3, 0.9), level=levels[i],
+                  smoothness=colours[i], label=str(names[i]))
+            for i in range(8)
+        ]  # fmt: skip
+
+    grouped = [crossval(mislabelled(seed), settings())["accuracy"] for seed in range(3)]
+    published = crossval(mislabelled(0), settings(protocol="published"))
+    # Eight tosses of a coin have a standard deviation of 0.18, the mean of three draws one of 0.10; that
+    # a held-out run leaves more runs of the other name in training pulls below one half.
+    assert np.mean(grouped) < 0.68
+    assert published["accuracy"] > 0.9
+    assert any("both sides of the split" in note for note in published["notes"])
+
+
+def test_gaps_and_missing_values_drop_the_windows_they_touch_and_are_counted(runs, settings):
+    victim = runs[0]
+    imu = victim.streams["imu"]
+    values = imu.values.copy()
+    values[250:253, 4] = np.nan  # from 5.00 s: within the window from 4 s
+    values[401, 0] = np.inf  # 8.02 s
+    kept = np.r_[0:700, 720:1200]  # 14.0 to 14.4 s
+    streams = {**victim.streams, "imu": Stream(imu.time_s[kept], values[kept], imu.channels)}
+    report = crossval([RunLog(victim.run_id, "husky", streams, victim.labels), *runs[1:]], settings())
+    assert report["dropped"] == {"gap": 1, "not finite": 2}
+    assert report["n_windows"] == 144 - 3
+    assert "windows left out: 1 gap, 2 not finite" in report["notes"]
+
+
+def test_signal_sets_are_switched_off_by_name(runs, settings, report):
+    def n_features(*names):
+        return crossval(runs, settings(signal_sets=names))["n_features"]
+
+    imu, wheels = n_features("imu"), n_features("wheels", "currents")
+    assert 0 < wheels < imu < imu + wheels < report["n_features"]  # together they give features of both
+    with pytest.raises(ConfigError, match="unknown signal set 'sonar'; there are imu, wheels"):
+        n_features("sonar")
+    with pytest.raises(DataError, match="no channel of the signal sets slip"):
+        n_features("slip")
+
+
+def test_a_signal_set_carries_what_it_knows_and_no_more(drive_all, settings):
+    alike = {"level": 0.8, "smoothness": 0.4}  # only the currents differ from terrain to terrain
+    runs = [
+        run
+        for terrain, current_a in (("ASPHALT", 1.0), ("GRASS", 2.0), ("GRAVEL", 4.0))
+        for run in drive_all((terrain,), 4, seed=int(current_a), current_a=current_a, **alike)
+    ]
+    assert crossval(runs, settings(signal_sets=("currents",)))["accuracy"] > 0.95
+    assert crossval(runs, settings(signal_sets=("imu",)))["accuracy"] < 0.6
+
+
+def test_leave_one_run_out_and_single_runs(drive, drive_all, settings):
+    runs = [*drive_all(("ASPHALT", "GRASS"), 3, duration_s=16.0), drive("GRAVEL_1", "GRAVEL", 3, 40.0)]
+    report = crossval(runs, settings(protocol="leave-one-run-out"))
+    assert (len(report["folds"]), report["repeats"], report["accuracy_spread"]) == (6 + 5, 1, None)
+    assert any(
+        note.startswith("GRAVEL: one run only, cut into 5 contiguous blocks") for note in report["notes"]
+    )
+
+
+def test_extras_do_without_what_the_data_lack(drive, settings):
+    """No wheels, and one run a class: no speed to learn from, and no learning curve to draw."""
+    runs = []
+    for i, level in enumerate((0.3, 0.6, 1.2, 2.4, 4.8)):
+        run = drive(f"T{i}_1", "GRASS", i, 30.0, level=level, label=f"T{i}")
+        runs.append(RunLog(run.run_id, "husky", {"imu": run.streams["imu"]}, run.labels))
+    report = crossval(runs, settings(extras=True, steady=False))
+    json.dumps(report, allow_nan=False)
+    assert report["speed_only_accuracy"] is None
+    assert report["slow_fast"]["status"] == "not applicable"
+    assert set(report["slow_fast"]["left_out"]) == {f"T{i}" for i in range(5)}
+    assert report["learning_curve"]["enough_runs"] is None
+    assert report["learning_curve"]["accuracy"] == pytest.approx([report["accuracy"]])
+
+
+def test_settings_that_make_no_sense_are_refused():
+    with pytest.raises(
+        ConfigError, match="there is no protocol 'lucky'; there are grouped, leave-one-run-out, published"
+    ):
+        CrossvalSettings(protocol="lucky")
+    with pytest.raises(ConfigError, match="0 repeats are none"):
+        CrossvalSettings(repeats=0)
+    with pytest.raises(ConfigError, match="window length_s is -1"):
+        _ = CrossvalSettings(window_s=-1).rule
+    assert CrossvalSettings(protocol="published").rule.length_s == 1.7
+    assert CrossvalSettings().rule.length_s == 2.0
+
+
+def test_vulpi_is_told_apart_on_runs_that_were_held_out(datasets_dir, settings):
+    report = crossval(load_runs(datasets_dir / "vulpi"), settings())
+    assert report["accuracy"] > 0.90
+    assert report["ece"] < 0.08
+    assert report["n_runs"] == 18
+    assert any(note.startswith("DIRT_ROAD: one run only") for note in report["notes"])

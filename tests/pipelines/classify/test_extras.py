@@ -1,0 +1,249 @@
+import contextlib
+
+import numpy as np
+import pytest
+
+from features.windows import WindowRule
+from pipelines.classify import extras
+from pipelines.classify.crossval import crossval
+from pipelines.classify.evaluation import fit_folds
+from pipelines.classify.extras import (
+    CURVE_DRAWS,
+    enough_runs,
+    learning_curve,
+    run_speeds,
+    slow_fast,
+    slow_fast_split,
+)
+from pipelines.classify.splits import folds_of, grouped_samples
+from pipelines.models.recipes import feature_matrix, make_recipe
+from terrain.records import RunLog, Stream
+
+SPEEDS = (0.3, 0.4, 0.7, 0.8)
+PLAIN = WindowRule(steady=None)
+
+
+@pytest.fixture
+def runs_at(drive):
+    """Return a maker of runs of one terrain, one a speed."""
+
+    def make(terrain, speeds, duration_s=32.0, **options):
+        return [
+            drive(f"{terrain}_{i}", terrain, 10 * i + len(terrain), duration_s, speed_mps=speed, **options)
+            for i, speed in enumerate(speeds)
+        ]
+
+    return make
+
+
+def test_the_speed_of_a_run_is_that_of_its_faster_wheel_where_it_moves(drive):
+    run = drive("r", "GRASS", 0, 40.0)
+    wheels = run.streams["wheels"]
+    values = wheels.values.copy()
+    values[:, 0], values[:, 1] = 0.2, -0.6  # turning: the right wheel is faster, backwards
+    values[:240, :2] = [0.02, -0.01]  # it creeps, or stands, for 24 of 40 s
+    moved = RunLog(
+        "r", "husky", {**run.streams, "wheels": Stream(wheels.time_s, values, wheels.channels)}, run.labels
+    )
+    values[:, :2] = 0.0
+    still = RunLog(
+        "s", "husky", {**run.streams, "wheels": Stream(wheels.time_s, values, wheels.channels)}, run.labels
+    )
+    speeds = run_speeds(grouped_samples([moved, still], PLAIN).cut.windows)
+    assert speeds["r"] == pytest.approx(0.6)
+    assert np.isnan(speeds["s"])
+
+
+def test_each_class_is_split_at_its_own_median_speed(runs_at):
+    plan = {"ASPHALT": SPEEDS, "GRASS": (0.9, 0.5, 1.0, 0.6), "GRAVEL": (0.1, 0.2, 0.3, 0.4, 0.5)}
+    split = slow_fast_split(
+        grouped_samples([r for t, s in plan.items() for r in runs_at(t, s)], WindowRule())
+    )
+    assert (split["status"], split["left_out"]) == ("applicable", {})
+    assert {run for run, _ in split["slow"]} == {
+        "ASPHALT_0",
+        "ASPHALT_1",
+        "GRASS_1",
+        "GRASS_3",
+        "GRAVEL_0",
+        "GRAVEL_1",
+        "GRAVEL_2",
+    }
+    assert {run for run, _ in split["fast"]} == {
+        "ASPHALT_2",
+        "ASPHALT_3",
+        "GRASS_0",
+        "GRASS_2",
+        "GRAVEL_3",
+        "GRAVEL_4",
+    }
+    assert split["classes"]["GRASS"]["slow_mps"] == pytest.approx(0.55, abs=0.02)
+    assert split["classes"]["GRASS"]["fast_mps"] == pytest.approx(0.95, abs=0.02)
+
+
+def test_a_class_with_too_little_on_a_side_is_left_out_and_named(runs_at):
+    enough = [*runs_at("ASPHALT", SPEEDS), *runs_at("GRASS", SPEEDS)]
+    three = runs_at("GRAVEL", (0.3, 0.4, 0.8), 64.0)
+    split = slow_fast_split(grouped_samples(enough + three, WindowRule()))
+    assert split["left_out"] == {"GRAVEL": "fast runs: 1"}
+    assert set(split["classes"]) == {"ASPHALT", "GRASS"}
+    assert split["status"] == "not applicable"  # two classes remain, three are needed
+    assert not [run for run, _ in split["slow"] + split["fast"] if run.startswith("GRAVEL")]
+    # 2 x 28 s a side are too short; windows that overlap cover no more of them, though they are more.
+    short = runs_at("GRAVEL", SPEEDS, 28.0)
+    for stride_s in (None, 0.5):
+        split = slow_fast_split(grouped_samples(enough + short, WindowRule(2.0, stride_s)))
+        assert split["left_out"] == {"GRAVEL": "slow runs: 56 s"}
+
+
+def test_what_is_learned_slow_and_does_not_hold_fast_is_found_out(runs_at, settings):
+    """The vibration of a fast run is that of the next terrain driven slowly; in the control it is its own."""
+    levels = {"ASPHALT": 0.3, "GRASS": 0.8, "GRAVEL": 2.0}
+    following = dict(zip(levels, [*list(levels.values())[1:], levels["ASPHALT"]], strict=True))
+    common = {"smoothness": 0.4, "current_a": 2.0}
+    accuracy = {}
+    for name, fast_levels in (("own", levels), ("next", following)):
+        runs = [
+            run
+            for terrain in levels
+            for side, fast in (((0.3, 0.4), False), ((0.7, 0.8), True))
+            for run in runs_at(
+                terrain, (0.0, 0.0, *side) if fast else side,
+                level=(fast_levels if fast else levels)[terrain], **common,
+            )[2 if fast else 0 :]
+        ]  # fmt: skip
+        samples = grouped_samples(runs, WindowRule())
+        recipe = make_recipe("svm", ("imu",))
+        accuracy[name] = slow_fast(recipe[-1], feature_matrix(recipe, samples.cut.windows), samples, 1)
+    assert accuracy["own"]["slow_to_fast"] > 0.9
+    assert accuracy["own"]["fast_to_slow"] > 0.9
+    assert accuracy["next"]["slow_to_fast"] < 0.1
+    assert accuracy["next"]["fast_to_slow"] < 0.1
+
+
+def test_speed_alone_is_right_just_where_terrains_were_driven_at_speeds_of_their_own(
+    drive, settings, monkeypatch
+):
+    alike = {"level": 0.8, "smoothness": 0.4, "current_a": 2.0, "duration_s": 12.0}
+    monkeypatch.setattr(extras, "CURVE_RUNS", ())
+    accuracy = []
+    for own_speeds in (True, False):
+        runs = [
+            drive(
+                f"{t}_{i}",
+                t,
+                7 * i + k,
+                speed_mps=0.3 + 0.2 * (k if own_speeds else i % 4) + 0.01 * i,
+                **alike,
+            )
+            for k, t in enumerate(("ASPHALT", "GRASS", "GRAVEL"))
+            for i in range(5)
+        ]
+        accuracy.append(crossval(runs, settings(extras=True))["speed_only_accuracy"])
+    assert accuracy[0] > 0.95
+    assert accuracy[1] < 0.55
+
+
+def test_the_learning_curve_draws_that_many_runs_and_leaves_test_folds_alone(drive_all, drive, monkeypatch):
+    runs = [*drive_all(("ASPHALT", "GRASS"), 5, duration_s=10.0), drive("GRAVEL_1", "GRAVEL", 1, 40.0)]
+    samples = grouped_samples(runs, WindowRule())
+    windows = samples.cut.windows
+    recipe = make_recipe("svm")
+    folds = folds_of(samples, "grouped", 1, 0)
+    seen = []
+
+    def spy(classifier, features, y, group, drawn, *rest):
+        seen.extend(drawn)
+        return fit_folds(classifier, features, y, group, drawn, *rest)
+
+    monkeypatch.setattr(extras, "fit_folds", spy)
+    curve = learning_curve(recipe[-1], feature_matrix(recipe, windows), samples, folds, 0.77, 0, 1)
+    assert len(seen) == 3 * CURVE_DRAWS * len(folds)  # 1, 2 and 3 of the 4 runs that each fold can teach
+    for fold in seen:
+        (original,) = [f for f in folds if np.array_equal(f.test, fold.test)]
+        assert set(fold.train) <= set(original.train)
+        for terrain, n_runs in (("ASPHALT", fold.number), ("GRASS", fold.number), ("GRAVEL", 1)):
+            drawn = set(windows.run_id[fold.train][windows.terrain[fold.train] == terrain])
+            assert len(drawn) == n_runs
+        kept = set(windows.run_id[fold.train])  # a run that is drawn is drawn whole
+        np.testing.assert_array_equal(
+            fold.train, original.train[np.isin(windows.run_id[original.train], list(kept))]
+        )
+    draws = [
+        {tuple(f.train) for f in seen if f.number == 1 and f.repeat == draw} for draw in range(CURVE_DRAWS)
+    ]
+    assert draws[0] != draws[1]
+    assert curve["runs_per_class"] == pytest.approx([1.0, (2 + 2 + 1) / 3, (3 + 3 + 1) / 3, (4 + 4 + 1) / 3])
+    assert curve["accuracy"][-1] == 0.77
+    assert curve["accuracy_spread"][-1] is None
+    assert all(0 <= share <= 1 for share in curve["accuracy"])
+
+
+@pytest.mark.parametrize(("scale", "power"), [(0.3, 1.0), (0.2, 0.6), (0.4, 1.5)])
+def test_enough_runs_of_a_known_law(scale, power):
+    m = np.array([1.0, 2.0, 3.0, 5.0, 8.0, 12.0])
+    found = enough_runs(m, 0.95 - scale * m**-power)
+    # Doubling m gains scale m^-power (1 - 2^-power); solved for a gain of one per cent.
+    law = (100 * scale * (1 - 2.0**-power)) ** (1 / power)
+    assert found["enough_runs"] == pytest.approx(law, abs=1.05)
+    assert found["statement"].startswith("enough:" if found["enough_runs"] <= 12 else "not enough yet:")
+
+
+def test_a_curve_that_still_climbs_gives_no_number():
+    m = np.array([1.0, 2.0, 3.0, 4.0])
+    found = enough_runs(m, 0.1 + 0.1 * np.log2(m))
+    assert found["enough_runs"] is None
+    assert found["statement"].startswith("not enough yet: doubling the 4.0 runs a class would still gain")
+    assert (
+        enough_runs(m[:3], m[:3] / 4)["statement"] == "3 sizes are too few to tell how many runs are enough"
+    )
+    assert enough_runs(m, np.full(4, 0.8))["enough_runs"] == 1
+
+
+def test_a_run_slow_on_one_class_and_fast_on_another_is_on_no_side(runs_at, settings, monkeypatch):
+    """Its windows would otherwise teach and test at once."""
+    folds = []
+    monkeypatch.setattr(extras, "fit_folds", lambda *args: folds.extend(args[4]) or [])
+    monkeypatch.setattr(extras, "_accuracy", lambda *_: 0.5)
+    runs = [run for terrain in ("ASPHALT", "GRASS", "GRAVEL") for run in runs_at(terrain, SPEEDS)]
+    slow_grass, fast_gravel = (next(r for r in runs if r.run_id == name) for name in ("GRASS_0", "GRAVEL_3"))
+    joined = {}
+    for name in slow_grass.streams:
+        first, second = slow_grass.streams[name], fast_gravel.streams[name]
+        joined[name] = Stream(
+            np.concatenate([first.time_s, second.time_s + 32.0]),
+            np.concatenate([first.values, second.values]),
+            first.channels,
+        )
+    labels = ((0.0, 32.0, "GRASS"), (32.0, 64.0, "GRAVEL"))
+    mixed = RunLog("mixed", "husky", joined, labels)
+    samples = grouped_samples([r for r in runs if r not in (slow_grass, fast_gravel)] + [mixed], WindowRule())
+    split = slow_fast_split(samples)
+    assert ("mixed", "GRASS") in split["slow"]
+    assert ("mixed", "GRAVEL") in split["fast"]
+    with contextlib.suppress(IndexError):
+        slow_fast(None, None, samples, 1)
+    assert len(folds) == 2
+    run_id = samples.cut.windows.run_id
+    for fold in folds:
+        assert not set(run_id[fold.train]) & set(run_id[fold.test])
+        assert "mixed" not in run_id[np.concatenate([fold.train, fold.test])]
+
+
+def test_runs_with_several_labels_can_be_learned_from_few(drive, settings):
+    """One group may hold all classes: the inner folds are then as many as the groups allow."""
+    runs = []
+    for number in range(6):
+        a, b = (drive(f"r{number}", terrain, number, 12.0) for terrain in ("GRASS", "GRAVEL"))
+        streams = {
+            name: Stream(
+                np.concatenate([a.streams[name].time_s, b.streams[name].time_s + 12.0]),
+                np.concatenate([a.streams[name].values, b.streams[name].values]),
+                a.streams[name].channels,
+            )
+            for name in a.streams
+        }
+        runs.append(RunLog(f"r{number}", "husky", streams, ((0.0, 12.0, "GRASS"), (12.0, 24.0, "GRAVEL"))))
+    report = crossval(runs, settings(repeats=1, extras=True))
+    assert report["learning_curve"]["runs_per_class"][0] == 1.0
+    assert {row["run_id"] for row in report["per_run"]} >= {"r0 (GRASS)", "r0 (GRAVEL)"}

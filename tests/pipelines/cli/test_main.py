@@ -1,0 +1,353 @@
+import json
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from sklearn.linear_model import LogisticRegression
+from skops import io as skops_io
+
+from pipelines.cli import main as cli
+from pipelines.models.model_files import INFO_FILE, MODEL_FILE, write_info
+from terrain.logs.write import write_run
+from terrain.records import RunLog, Stream
+
+HEAVY = ("sklearn", "mlflow", "numba", "torch", "matplotlib", "pandas", "pyarrow", "scipy", "skops")
+
+
+@pytest.fixture
+def terrain(monkeypatch, capsys):
+    """Return a function that runs the command in this process: exit code, stdout and stderr."""
+
+    def run(*words):
+        monkeypatch.setattr(sys, "argv", ["terrain", *map(str, words)])
+        try:
+            cli.main()
+            code = 0
+        except SystemExit as stop:
+            code = stop.code or 0
+        said = capsys.readouterr()
+        return code, said.out, said.err
+
+    return run
+
+
+def tree(folder):
+    return {path: path.read_bytes() if path.is_file() else None for path in sorted(folder.rglob("*"))}
+
+
+@pytest.fixture
+def place(tmp_path, monkeypatch):
+    """An empty folder to work in, with no tracking server named."""
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+    folder = tmp_path / "place"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    return folder
+
+
+@pytest.fixture
+def refused(terrain, place):
+    """Return a function that asserts that a command is refused in one clear sentence and touches nothing."""
+
+    def check(sentence, *words):
+        before = tree(place)
+        code, out, err = terrain(*words)
+        assert (code, out) == (2, "")
+        assert err.startswith("error: "), err
+        assert err.count("\n") == 1, err
+        assert sentence in err
+        after = tree(place)
+        assert {path: after.get(path) for path in before} == before
+        new = {path for path in after if path not in before}
+        assert {path.name for path in new} <= {"mlruns"}  # an empty folder, to see that it can be written
+        assert all(content is None for path, content in after.items() if path in new)
+
+    return check
+
+
+def keep(runs, place):
+    for run in runs:
+        write_run(run, place / "data")
+    return place / "data"
+
+
+SPOILT_FILES = {
+    "missing column": (
+        lambda lines: [line.rpartition(",")[0] for line in lines],
+        "imu_01.csv: column 'az' is missing",
+    ),
+    "time goes back": (
+        lambda lines: [*lines[:9], "0.01" + lines[9][lines[9].index(",") :], *lines[10:]],
+        "imu_01.csv: time goes back at row 10 (0.01 s after 0.14 s)",
+    ),
+    "dead channel": (
+        lambda lines: [lines[0], *(line.rpartition(",")[0] + ",nan" for line in lines[1:])],
+        "imu_01.csv: channel accel_z_mps2 (column az) has nothing finite in its 200 rows",
+    ),
+    "empty file": (lambda lines: [], "imu_01.csv: is empty"),
+    "no number": (
+        lambda lines: [*lines[:7], "half" + lines[7][lines[7].index(",") :], *lines[8:]],
+        "imu_01.csv: time at row 8 is 'half', which is no number",
+    ),
+    "streams apart": (
+        lambda lines: [
+            lines[0],
+            *(str(900 + i / 50) + line[line.index(",") :] for i, line in enumerate(lines[1:])),
+        ],
+        "SNOW_01: the streams do not overlap in time",
+    ),
+}
+
+
+@pytest.mark.parametrize("command", ["import", "crossval"])
+@pytest.mark.parametrize("fault", SPOILT_FILES)
+def test_a_spoilt_log_is_one_sentence(refused, borealtc_dir, place, edit, fault, command):
+    change, sentence = SPOILT_FILES[fault]
+    data = place / "logs"
+    shutil.copytree(borealtc_dir, data)
+    edit(data / "SNOW" / "imu_01.csv", change)
+    if command == "import":
+        refused(sentence, "import", data, "--out", place / "out")
+    else:
+        refused(sentence, "crossval", "--data", data, "--json", place / "report.json")
+
+
+def test_two_runs_with_one_id_are_one_sentence(refused, place, make_run):
+    data = keep([make_run("SNOW_01")], place)
+    shutil.copytree(data / "SNOW_01", data / "copy")
+    refused("2 runs have the id 'SNOW_01'", "inspect", data)
+
+
+def test_a_unit_that_is_unknown_is_one_sentence(refused, place):
+    (place / "map.yaml").write_text(
+        "robot: husky\nstreams:\n  imu:\n    file: '{run}.csv'\n    time: {column: t, unit: s}\n"
+        "    channels:\n      gyro_z_radps: {column: wz, unit: furlong}\n"
+    )
+    (place / "a.csv").write_text("t,wz\n0,1\n0.1,2\n")
+    refused("furlong", "inspect", place, "--format", "csv", "--mapping", place / "map.yaml")
+
+
+def test_data_that_cannot_answer_are_one_sentence(refused, place, drive, drive_all):
+    keep(drive_all(("GRASS",), 6, duration_s=8.0), place)
+    quick = ("--data", place / "data", "--jobs", 1)
+    for command in (("crossval",), ("crossval", "--protocol", "leave-one-run-out"), ("train", "--name", "m")):
+        refused("all windows are 'GRASS': a classifier needs at least two classes", *command, *quick)
+    shutil.rmtree(place / "data")
+    keep(drive_all(("GRASS", "GRAVEL"), 2, duration_s=8.0), place)
+    refused("4 runs are fewer than 5 folds", "crossval", *quick)
+    refused("4 runs are fewer than 5 folds", "train", "--name", "m", *quick)
+    refused("fewer than 5 partitions of 5 s", "crossval", "--protocol", "published", *quick)
+    keep([drive("GRASS_9", "GRASS", 0, duration_s=1.2)], place)
+    refused("run GRASS_9 lasts 1.20 s, shorter than a window of 2 s", "crossval", *quick)
+    refused("window length_s is 0.0; it must be positive and finite", "crossval", *quick, "--window", 0)
+    refused("no signal set is named", "crossval", *quick, "--signals", ",")
+    refused("unknown signal set 'sonar'", "crossval", *quick, "--signals", "imu,sonar")
+
+
+def test_a_folder_without_runs_is_one_sentence(refused, place):
+    refused("nowhere: does not exist; accepted are", "inspect", place / "nowhere")
+    (place / "empty").mkdir()
+    for command in (("crossval",), ("train", "--name", "m"), ("predict", "--model", "m")):
+        refused("empty: holds no run; accepted are", *command, "--data", place / "empty")
+
+
+def test_a_model_that_cannot_be_trusted_is_one_sentence(refused, place, drive, tracked):
+    data = keep([drive("r", "GRASS", 0)], place)
+    model = shutil.copytree(tracked[0] / "model", place / "model")
+    ask = ("predict", "--data", data, "--model")
+    refused("neither a folder nor a model URI", *ask, "nothing")
+    refused("mlflow.db does not exist: train a model here first", *ask, "models:/drawn@champion")
+    content = bytearray((model / MODEL_FILE).read_bytes())
+    content[len(content) // 2] ^= 4
+    (model / MODEL_FILE).write_bytes(content)
+    refused("model.skops: is damaged (SHA-256", *ask, model)
+    (model / MODEL_FILE).write_bytes(skops_io.dumps(LogisticRegression().fit([[0.0], [1.0]], [0, 1])))
+    info = json.loads((model / INFO_FILE).read_text())
+    write_info(model, {key: value for key, value in info.items() if key not in ("version", "sha256")})
+    refused("holds a LogisticRegression, not a recipe of this package", *ask, model)
+    (place / "table.yaml").write_text("name: [")
+    refused("table.yaml: is no YAML", *ask, tracked[0] / "model", "--table", place / "table.yaml")
+
+
+def test_an_output_that_cannot_be_written_is_told_before_the_work(refused, place, drive_all, monkeypatch):
+    data = keep(drive_all(n_runs=2, duration_s=4.0), place)
+    (place / "file").write_text("in the way")
+    (place / "mlruns").write_text("in the way")
+    monkeypatch.setattr("pipelines.classify.crossval.fit_folds", lambda *_: pytest.fail("the work was begun"))
+    cannot = "cannot be written"
+    refused(cannot, "import", data, "--out", place / "file" / "out")
+    refused(cannot, "crossval", "--data", data, "--json", place / "file" / "report.json")
+    refused("is a folder; --json names a file", "crossval", "--data", data, "--json", data)
+    refused(cannot, "train", "--data", data, "--name", "m")
+    refused(cannot, "quickstart", "--data", data, "--out", place / "file" / "out")
+    refused(cannot, "predict", "--data", data, "--model", "m", "--json", place / "file" / "p.json")
+
+
+def test_what_cannot_be_simulated_or_estimated_is_one_sentence(refused, place, drive):
+    ask = ("simulate", "--robot", "agrimaro", "--out", place / "runs")
+    straight = ("--terrain", "grass", "--scenario", "straight")
+    refused("soil 'lava' is unknown", *ask, "--terrain", "lava", "--scenario", "straight")
+    refused("scenario 'loop' is unknown", *ask, "--terrain", "grass", "--scenario", "loop")
+    refused("go together", *ask, "--terrain", "course", "--scenario", "straight")
+    refused(
+        "too short for 'straight'", *ask, "--terrain", "grass", "--scenario", "straight", "--duration", "2"
+    )
+    refused("--grade is 60", *ask, *straight, "--grade", "60")
+    refused("--camera-lost is '9'; START:END", *ask, *straight, "--camera-lost", "9")
+    refused("--camera-lost is '9:4'; START:END", *ask, *straight, "--camera-lost", "9:4")
+    husky = ("simulate", "--robot", "husky", "--out", place / "runs", "--terrain", "grass")
+    refused("scenario 'crab' is not for robot husky", *husky, "--scenario", "crab")
+    refused("effect 'magic' is unknown", *husky, "--scenario", "straight", "--effect", "magic=1")
+    (place / "mine.yaml").write_text("name: mine\ndrive: swerve\nwheels: 3\n")
+    refused("key 'wheels' is unknown", "simulate", "--robot", place / "mine.yaml", *ask[3:], *straight)
+
+    data = keep([drive("r", "GRASS", 0, 4.0)], place)
+    refused("filter 'vio15' is not for robot husky", "estimate", "--data", data, "--filter", "vio15")
+    refused("is there already", "estimate", "--data", data, "--filter", "skid", "--out", data)
+    refused("husky", "calibrate", "--data", data, "--robot", "husky")
+    refused("is one of robot 'husky'", "calibrate", "--data", data, "--robot", "agrimaro")
+
+
+def test_from_simulated_logs_to_slip_on_the_command_line(terrain, place):
+    words = ("--robot", "agrimaro", "--terrain", "grass", "--scenario", "straight", "--duration", "8")
+    code, out, _ = terrain("simulate", *words, "--out", "logs", "--json", "sim.json")
+    assert (code, out) == (0, "1 run of 8 s, written to logs\n")
+    assert json.loads((place / "sim.json").read_text())["run_ids"] == ["grass_straight_01"]
+    code, _, err = terrain("simulate", *words, "--out", "logs")
+    assert code == 2
+    assert "is there already, and is left as it is" in err
+
+    ask = ("estimate", "--data", "logs", "--filter", "vio15", "--out", "runs", "--json", "est.json")
+    code, out, err = terrain(*ask)
+    assert code == 0, err
+    (row,) = json.loads((place / "est.json").read_text())["runs"]
+    assert f"{row['slip_mean']:+.4f}" in out
+    assert (place / "runs" / "grass_straight_01" / "slip.parquet").is_file()
+    code, out, _ = terrain("estimate", "--data", "logs", "--filter", "encoder12")
+    assert code == 0
+    assert "blind" in out
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("crossval", "--data", ".", "--guess"),
+        ("crossval", "--data", ".", "--protocol", "lucky"),
+        ("crossval", "--data", ".", "--repeats", "0"),
+        ("crossval",),
+        ("fly",),
+    ],
+)
+def test_usage_errors_are_code_2_too(terrain, place, words):
+    code, out, err = terrain(*words)
+    assert (code, out) == (2, "")
+    assert "Traceback" not in err
+
+
+def test_a_fault_of_the_package_keeps_its_traceback(terrain, place, drive, monkeypatch):
+    data = keep([drive("r", "GRASS", 0, 4.0)], place)
+    monkeypatch.setattr("pipelines.runs.datasets.data_digest", lambda runs: 1 / 0)
+    monkeypatch.setattr("pipelines.classify.crossval.crossval", lambda *_: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        terrain("crossval", "--data", data)
+
+
+def test_crossval_writes_what_it_prints(terrain, place, drive_all):
+    data = keep(drive_all(duration_s=12.0), place)
+    words = ("crossval", "--data", data, "--repeats", 1, "--no-extras", "--jobs", 1, "--seed", 4)
+    code, out, _ = terrain(*words, "--json", place / "new" / "report.json")
+    assert code == 0
+    report = json.loads((place / "new" / "report.json").read_text())
+    assert (report["dataset"], report["seed"], report["n_windows"]) == ("data", 4, 72)
+    assert f"accuracy {report['accuracy']:.1%}" in out
+    assert "72 windows of 2 s from 12 runs" in out
+    assert sorted(path.name for path in place.iterdir()) == ["data", "new"]  # no tracking without training
+
+
+def test_predict_prints_terrain_probability_and_target_slip(terrain, place, drive, tracked):
+    run = drive("r", "GRAVEL", 0, label="LAVA")
+    imu = run.streams["imu"]
+    values = imu.values.copy()
+    values[:10] = np.nan
+    streams = {**run.streams, "imu": Stream(imu.time_s, values, imu.channels)}
+    data = keep([RunLog("r", "husky", streams, run.labels), drive("s", "ASPHALT", 1, label=None)], place)
+    table = place / "own.yaml"
+    entry = "{traction: {slip_ratio: 0.31, source: assumed}, braking: {slip_ratio: -0.32, source: assumed}, "
+    entry += "steady: {slip_ratio: 0.07, source: assumed}}"
+    table.write_text(f"name: own\nfallback: any\nterrains:\n  any: {entry}\n")
+    words = (
+        "predict",
+        "--model",
+        tracked[0] / "model",
+        "--data",
+        data,
+        "--table",
+        table,
+        "--json",
+        place / "p.json",
+    )
+    code, out, err = terrain(*words)
+    assert (code, err) == (0, "")
+    for words in (
+        "+0.31", "-0.32", "+0.07", "the fallback 'any' stands in", "nobody measured them",
+        "11 windows are labelled LAVA, which the model never saw", "windows left out: 1 not finite",
+    ):  # fmt: skip
+        assert words in out
+    result = json.loads((place / "p.json").read_text())
+    assert result["accuracy"] is None
+    assert len(result["windows"]) == 23
+    row = result["windows"][0]
+    assert {"run_id", "start_s", "terrain", "probability", "target_slip"} <= set(row)
+    assert row["target_slip"] == {"traction": 0.31, "braking": -0.32, "steady": 0.07}
+
+
+def python(*words, **options):
+    return subprocess.run([sys.executable, *words], capture_output=True, text=True, timeout=120, **options)
+
+
+def test_help_loads_nothing_heavy(tmp_path):
+    code = (
+        "import sys\nfrom pipelines.cli.main import main\nsys.argv = ['terrain', '--help']\n"
+        "try:\n    main()\nexcept SystemExit as stop:\n    assert not stop.code\n"
+        f"print('loaded:', [name for name in {HEAVY} if name in sys.modules])"
+    )
+    found = python("-c", code, cwd=tmp_path)
+    assert found.returncode == 0, found.stderr
+    assert "loaded: []" in found.stdout
+    for command in (
+        *("import", "inspect", "train", "crossval", "predict", "quickstart"),
+        *("simulate", "estimate", "calibrate", "reproduce"),
+    ):
+        assert command in found.stdout
+    assert "numpy" in python("-X", "importtime", "-c", "import features.windows").stderr  # the test can fail
+
+
+def test_the_command_itself_ends_with_code_2_and_one_line(tmp_path):
+    found = python(
+        "-c", "from pipelines.cli.main import main; main()", "inspect", str(tmp_path), cwd=tmp_path
+    )
+    assert (found.returncode, found.stdout) == (2, "")
+    assert found.stderr.startswith(f"error: {tmp_path}: holds no run")
+    assert found.stderr.count("\n") == 1
+
+
+def test_the_choices_of_the_command_line_are_those_that_there_are():
+    """They are written twice, so that help need not load what offers them."""
+    from pipelines.classify.splits import PROTOCOLS
+    from pipelines.cli import main as cli
+    from pipelines.estimate.estimate import FILTERS, TUNINGS
+    from pipelines.models.recipes import RECIPES
+    from pipelines.reproduce.reproduce import PAPERS
+    from pipelines.runs.datasets import LAYOUTS
+
+    for choices, offered in (
+        (cli.Format, LAYOUTS),
+        (cli.Protocol, PROTOCOLS),
+        (cli.Recipe, RECIPES),
+        (cli.FilterName, FILTERS),
+        (cli.Tuning, TUNINGS),
+        (cli.Paper, PAPERS),
+    ):
+        assert {choice.value for choice in choices} == set(offered)

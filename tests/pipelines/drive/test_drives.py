@@ -1,0 +1,125 @@
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from pipelines.drive.drives import (
+    COURSE,
+    DRIVES,
+    LOSS_S,
+    MIXED,
+    N_STARTS,
+    STARTS_HOLD_S,
+    brake_time,
+    changes_of,
+    situation,
+    start_times,
+)
+from terrain.errors import ConfigError
+from terrain.records import Label
+from terrain.robots import load_robot
+from terrain.terramechanics.soil import load_soil
+
+ROBOT = load_robot("agrimaro")
+
+
+def ground_of(name):
+    return COURSE if name in (COURSE, MIXED) else "grass"
+
+
+@pytest.mark.parametrize("name", DRIVES)
+def test_a_seed_is_a_day_and_nothing_else_is_drawn(name):
+    one, again, other = (situation(name, ROBOT, ground_of(name), seed) for seed in (3, 3, 4))
+    assert one.conditions == again.conditions != other.conditions
+    assert np.array_equal(one.scenario.twist, again.scenario.twist)
+    assert one.scenario.patches == again.scenario.patches
+    assert dict(one.soils) == dict(again.soils) != dict(other.soils)
+    assert one.seed.generate_state(4).tolist() == again.seed.generate_state(4).tolist()
+    assert (one.scenario.twist[0] == 0).all()
+    assert one.scenario.name == {"slope": "climb"}.get(name, name)
+
+
+def test_the_day_is_the_same_whatever_is_driven_and_is_no_nominal_one():
+    days = [situation(name, ROBOT, "grass", 5) for name in DRIVES if ground_of(name) == "grass"]
+    assert len({day.conditions for day in days}) == 1
+    assert len({tuple(day.soils.items()) for day in days}) == 1
+    assert days[0].soils["grass"] != load_soil("grass")
+    assert days[0].conditions.grade_ratio == (0.0, 0.0)
+    assert days[0].conditions.swell_ratio == 0.0
+    assert situation(COURSE, ROBOT, COURSE, 5).conditions.grade_ratio != (0.0, 0.0)
+
+
+def test_slopes_and_radii_are_what_is_asked_for():
+    asked = situation("slope", ROBOT, "grass", 5, grade_deg=10.0, radius_factors=(1.02, 1.0, 1.0)).conditions
+    drawn = situation("slope", ROBOT, "grass", 5).conditions
+    assert asked.grade_ratio == (pytest.approx(math.tan(math.radians(10))), 0.0)
+    assert asked.radius_factors == (1.02, 1.0, 1.0) != drawn.radius_factors
+    assert asked.payload_kg == drawn.payload_kg
+
+
+@pytest.mark.parametrize(("speed_mps", "accel_mps2"), [(1.0, 1.0), (2.0, 0.05), (1.5, math.inf)])
+def test_starts_come_from_rest_and_go_on_for_as_long_as_is_judged(speed_mps, accel_mps2):
+    scenario = situation("starts", ROBOT, "grass", 0, speed_mps=speed_mps, accel_mps2=accel_mps2).scenario
+    time_s, speed = scenario.time_s, scenario.twist[:, 0]
+    starts = start_times(scenario)
+    assert len(starts) == N_STARTS
+    assert speed.max() == speed_mps
+    assert speed[-1] == 0.0
+    for start_s in starts:
+        ramp_s = speed_mps / accel_mps2
+        assert speed[np.searchsorted(time_s, start_s)] == 0.0
+        driving = (time_s > start_s + ramp_s + 0.03) & (time_s < start_s + ramp_s + STARTS_HOLD_S - 0.03)
+        assert (speed[driving] == speed_mps).all()
+    if math.isfinite(accel_mps2):
+        assert np.abs(np.diff(speed)).max() == pytest.approx(accel_mps2 / scenario.rate_hz)
+
+
+def test_a_braking_begins_where_the_command_first_says_stand():
+    scenario = situation("brake", ROBOT, "grass", 0).scenario
+    at = int(np.searchsorted(scenario.time_s, brake_time(scenario)))
+    assert scenario.twist[at - 1, 0] == 1.0
+    assert not scenario.twist[at:].any()
+
+
+def test_mixed_changes_ground_all_along_and_loses_its_camera():
+    mixed = situation(MIXED, ROBOT, COURSE, 1)
+    patches = mixed.scenario.patches
+    lengths = np.diff([patch.start_m for patch in patches])
+    assert lengths.min() >= 5.0
+    assert lengths.max() <= 9.0
+    assert patches[-1].start_m > mixed.scenario.distance_m[-1] - 9.0
+    assert all(a.terrain != b.terrain for a, b in pairwise(patches))
+    assert {patch.terrain for patch in patches} <= set(mixed.soils)
+    assert mixed.faults.camera_lost_s == (LOSS_S,)
+    assert mixed.scenario.time_s[-1] > LOSS_S[1]
+
+
+def test_changes_are_where_another_ground_begins():
+    labels = (Label(0, 4, "a"), Label(4.5, 6, "a"), Label(7, 9, "b"), Label(9, 11, "a"))
+    assert changes_of(labels) == [(7.0, "b"), (9.0, "a")]
+    assert changes_of(labels[:2]) == changes_of(()) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "terrain", "options", "words"),
+    [
+        ("race", "grass", {}, "scenario 'race' is unknown: use one of starts, straight"),
+        ("starts", COURSE, {}, "scenario 'starts' does not go with terrain 'course'"),
+        (MIXED, "grass", {}, "scenario 'mixed' does not go with terrain 'grass'"),
+        ("starts", "cheese", {}, "soil 'cheese' is unknown"),
+        ("starts", "grass", {"duration_s": 20.0}, "scenario 'starts' is as long as its 3 starts"),
+        *[("starts", "grass", {"speed_mps": value}, "speed_mps is") for value in (0.0, -1.0, 5.0, math.nan)],
+        *[("starts", "grass", {"accel_mps2": value}, "accel_mps2 is") for value in (0.0, -1.0, math.nan)],
+        ("brake", "grass", {"accel_mps2": 2.0}, "accel_mps2 is 2: scenario 'brake' has ramps of its own"),
+        (MIXED, COURSE, {"accel_mps2": 2.0}, "accel_mps2 is 2: scenario 'complex' has ramps of its own"),
+        (MIXED, COURSE, {"duration_s": 0.0}, "duration_s is 0.0"),
+        ("slope", "grass", {"grade_deg": 60.0}, "conditions: grade_ratio is"),
+        ("circle", "tiles", {"radius_factors": (0.0, 1.0, 1.0)}, "conditions: radius_factors is"),
+    ],
+)
+def test_what_cannot_be_driven_is_refused_in_one_sentence(name, terrain, options, words):
+    with pytest.raises(ConfigError) as refused:
+        situation(name, ROBOT, terrain, 0, **options)
+    assert str(refused.value).startswith(words)
+    assert "\n" not in str(refused.value)

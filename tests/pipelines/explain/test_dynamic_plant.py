@@ -1,0 +1,109 @@
+"""`terrain explain` on logs of the dynamic simulator, a richer model than the one held against them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipelines.explain.classifier import classifier_gain, compared
+from pipelines.explain.ground import ground_notes, simulation_for
+from pipelines.runs.simulate import simulate_run
+from terrain.discrepancy.diagnose import diagnose
+from terrain.effects.catalogue import library_of
+from terrain.records import Label
+from terrain.robots import load_robot
+from terrain.simulation.planar.ground import planar_ground
+from terrain.simulation.planar.model import Ground
+from terrain.terramechanics.soil import load_soil
+
+AGRIMARO, HUSKY = load_robot("agrimaro"), load_robot("husky")
+LIBRARY = library_of("swerve")
+
+
+def runs_of(effects=None, robot=AGRIMARO, terrain="grass", n=6, seed=0, **options):
+    return [simulate_run(robot, terrain, "survey", seed, i + 1, effects=effects, **options) for i in range(n)]
+
+
+def explained(runs):
+    simulation, _ = simulation_for(runs, AGRIMARO, LIBRARY)
+    return diagnose(runs, simulation, LIBRARY)
+
+
+@pytest.mark.parametrize("terrain", ["grass", "firm_soil_gravel"])
+def test_of_a_plain_days_logs_nothing_is_named(terrain):
+    found = explained(runs_of(terrain=terrain))
+    assert (found.causes, found.ambiguous_sets, found.excluded_runs) == ((), (), ())
+
+
+@pytest.mark.parametrize(
+    ("parameter", "value"),
+    [
+        ("wheel_radius_ratio", 0.05),
+        ("camera_yaw_rad", 0.05),
+        ("camera_latency_s", 0.1),
+        ("gyro_scale_ratio", 0.1),
+        ("payload_ratio", 0.3),
+    ],
+)
+def test_what_was_hidden_in_the_plant_is_named_and_nothing_else(parameter, value):
+    found = explained(runs_of({parameter: value}))
+    assert list(found.values) == [parameter]
+    assert found.values[parameter] == pytest.approx(value, rel=0.15)
+    assert found.ambiguous_sets == ()
+
+
+def test_a_run_drives_on_the_soil_of_its_label_and_elsewhere_on_a_ground_like_any():
+    runs = runs_of(n=2, duration_s=10.0)
+    unknown = [replace(run, run_id=f"u{i}", labels=(Label(0.0, 5.0, "moon"),)) for i, run in enumerate(runs)]
+    several = replace(runs[0], run_id="s", labels=(Label(0.0, 5.0, "grass"), Label(5.0, 9.0, "snow")))
+    simulation, told = simulation_for([*runs, *unknown, several], AGRIMARO, LIBRARY)
+    assert [(each["terrain"], each["soil"]) for each in told] == [
+        ("", None),
+        ("grass", "grass"),
+        ("moon", None),
+    ]
+    soil = planar_ground(AGRIMARO, load_soil("grass"))
+    assert simulation.grounds["grass"]._replace(felt_ratio=1.0) == soil
+    assert simulation.ground == Ground()
+    assert simulation.planar_on("grass").slip_ratio == soil.slip_ratio
+    assert simulation.planar_on("moon").slip_ratio == simulation.planar.slip_ratio == Ground().slip_ratio
+    bare = replace(AGRIMARO, body=None)  # without a tyre there is no soil
+    assert simulation_for(unknown, bare, LIBRARY)[0].grounds == {}
+
+
+def test_tilt_is_felt_where_it_is_a_slope_and_not_where_a_body_rides_over_bumps():
+    for robot, felt in ((AGRIMARO, 0.0), (HUSKY, 1.0)):
+        runs = runs_of(robot=robot, n=3, vary=robot is HUSKY)
+        simulation, told = simulation_for(runs, robot, library_of(robot.drive))
+        assert simulation.grounds["grass"].felt_ratio == pytest.approx(felt, abs=0.05)
+        assert len(ground_notes(told)) == (felt < 0.95)
+
+
+def test_a_classifier_gains_where_what_was_built_in_matters_and_says_why_where_it_cannot_be_judged():
+    effects = {"slip_resistance_ratio": 3.0}
+    grounds = ("asphalt", "snow", "tiles")
+    held = [run for g in grounds for run in runs_of(effects, terrain=g, n=4, seed=9, vary=True)]
+    found = classifier_gain(held, AGRIMARO, {}, effects, 0, runs_a_terrain=5)
+    assert (found["reason"], found["n_runs"], found["terrains"]) == (None, 12, sorted(grounds))
+    accuracy = found["errors"]["accuracy"]
+    assert 0.0 < accuracy["change_ci"][0] < accuracy["after"] - accuracy["before"] < accuracy["change_ci"][1]
+    same = classifier_gain(held, AGRIMARO, {}, {}, 0, runs_a_terrain=2)["errors"]["accuracy"]
+    assert (same["before"], same["change_ci"]) == (same["after"], [0.0, 0.0])
+    for few, reason in ((held[:3], "1 known terrain,"), (held[3:6], "3 runs are held out")):
+        told = classifier_gain(few, AGRIMARO, {}, effects, 0)
+        assert told["errors"] == {}
+        assert reason in told["reason"]
+    slow = [replace(run, streams={"imu": run.streams["imu"]}) for run in held]
+    assert "wheel" in classifier_gain(slow, AGRIMARO, {}, effects, 0, runs_a_terrain=2)["reason"]
+
+
+def test_the_interval_of_an_accuracy_is_over_runs():
+    rng = np.random.default_rng(0)
+    run_id = np.repeat([f"r{i}" for i in range(20)], 10)
+    before = rng.random(200) < 0.6
+    each = np.repeat(rng.random(20) < 0.5, 10)  # whole runs are put right
+    change = compared(before, before | each, run_id, 0)["change_ci"]
+    gained = (before | each).mean() - before.mean()
+    assert change[0] < gained < change[1]
+    spread = np.array([(each & ~before)[run_id == name].mean() for name in np.unique(run_id)]).std()
+    assert change[1] - change[0] == pytest.approx(2 * 1.96 * spread / np.sqrt(20), rel=0.2)

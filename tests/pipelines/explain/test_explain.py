@@ -1,0 +1,231 @@
+"""`terrain explain` from logs to the extended robot, and what it refuses."""
+
+import json
+import re
+import sys
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from pipelines.cli import main as cli
+from pipelines.explain import page as explain_page
+from pipelines.explain.explain import EXTENDED_FILE, PAGE_FILE, extended_numbers, split_runs
+from terrain.discrepancy.diagnose import INTERVAL_T
+from terrain.errors import ConfigError, DataError
+from terrain.logs.write import write_run
+from terrain.records import RunLog
+from terrain.robots import load_robot
+from terrain.simulation.planar.noise import load_noise, load_scatter
+from terrain.simulation.planar.run import simulate_planar
+
+HIDDEN = {"camera_yaw_rad": 0.04}
+HUSKY = load_robot("husky")
+
+
+def a_run(i, robot=HUSKY, effects=HIDDEN, terrain="field"):
+    time_s = np.arange(1250) / 50
+    ahead = 0.5 * np.sin(0.6 * time_s + i) + 0.2 * np.sin(1.9 * time_s)
+    twist = np.column_stack([ahead, np.zeros_like(ahead), 0.5 * np.sin(0.9 * time_s + 0.3 * i)])
+    twist[:50] *= np.linspace(0, 1, 50)[:, None]
+    return simulate_planar(
+        robot,
+        twist,
+        i,
+        effects=effects,
+        scatter=load_scatter(),
+        noise=load_noise(),
+        run_id=f"{robot.name}_{i}",
+        terrain=terrain,
+    )
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs")
+    for i in range(7):
+        write_run(a_run(i), folder)
+    return folder
+
+
+@pytest.fixture
+def terrain(monkeypatch, capsys, tmp_path):
+    """Return a function that runs the command in this process: exit code, stdout and stderr."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(*words):
+        monkeypatch.setattr(sys, "argv", ["terrain", "explain", *map(str, words)])
+        try:
+            cli.main()
+            code = 0
+        except SystemExit as stop:
+            code = stop.code or 0
+        said = capsys.readouterr()
+        return code, said.out, said.err
+
+    return run
+
+
+@pytest.fixture
+def refused(terrain, tmp_path):
+    def check(sentence, *words):
+        before = sorted(tmp_path.rglob("*"))
+        code, out, err = terrain(*words)
+        assert (code, out) == (2, ""), err
+        assert err.startswith("error: "), err
+        assert err.count("\n") == 1, err
+        assert sentence in err
+        assert sorted(tmp_path.rglob("*")) == before
+
+    return check
+
+
+@pytest.fixture
+def undrawn(monkeypatch):
+    """No picture of a whole run is rendered, after a call none at all: they would take most of the time."""
+    monkeypatch.setattr(explain_page, "_small_png", lambda _: b"png")
+
+    def stop():
+        monkeypatch.setattr(explain_page, "explain_figures", lambda *_: {})
+        monkeypatch.setattr(explain_page, "run_figure", lambda *_: None)
+
+    return stop
+
+
+def test_the_hidden_cause_is_named_built_in_and_gone_when_tested_again(terrain, data, tmp_path, undrawn):
+    code, out, err = terrain("--data", data, "--robot", "husky", "--out", "found", "--json", "found.json")
+    assert code == 0, err
+    found = json.loads((tmp_path / "found.json").read_text())
+    assert [cause["name"] for cause in found["causes"]] == ["camera_yaw"]
+    (told,) = found["causes"][0]["parameters"]
+    std = (told["ci"][1] - told["ci"][0]) / (2 * INTERVAL_T)
+    assert abs(told["value"] - HIDDEN["camera_yaw_rad"]) < 4 * std
+    assert "camera yaw" in out
+    assert sorted(found["used"] + found["held_out"]) == [f"husky_{i}" for i in range(7)]
+    assert len(found["held_out"]) == 2
+    assert found["gain"]["measured"]
+    assert not found["gain"]["refused"]
+    assert found["gain"]["runs"] == found["held_out"]
+    assert found["gain"]["filter"]["errors"]["speed_mps"]["before"] > 0.0
+
+    page = (tmp_path / "found" / PAGE_FILE).read_text()
+    assert re.findall(r'(?:src|href)="(?!data:)', page) == []
+    pictures = {path.name for path in (tmp_path / "found" / "pictures").iterdir()}
+    assert {"stretch.svg", "shares.png", "spectra.png", "dependence.png"} <= pictures
+    assert sum(name.startswith("run_") for name in pictures) == 7
+
+    extended = tmp_path / "found" / EXTENDED_FILE
+    assert load_robot(extended).effects == pytest.approx({"camera_yaw_rad": told["value"]}, rel=1e-6)
+    undrawn()
+    words = ("--data", data, "--robot", "husky", "--model", extended, "--json", "again.json", "--effects")
+    code, out, err = terrain(
+        *words, "camera_yaw,lever_arm,gyro_scale", "--out", "again", "--terrain", "field"
+    )
+    assert code == 0, err
+    again = json.loads((tmp_path / "again.json").read_text())
+    assert (again["verdict"], again["causes"]) == ("none", [])
+    assert again["effects"] == ["gyro_scale", "camera_yaw", "lever_arm"]
+    assert not (tmp_path / "again" / EXTENDED_FILE).exists()
+    assert "not measured: no cause was named" in out
+
+
+def test_few_runs_keep_none_unless_asked_and_the_same_seed_gives_the_same_page(terrain, tmp_path, undrawn):
+    undrawn()
+    few = tmp_path / "few"
+    for i in range(4):
+        write_run(a_run(i), few)
+    words = ("--data", few, "--robot", "husky", "--json", "j.json", "--effects", "camera_yaw")
+    code, out, err = terrain(*words, "--out", "none")
+    assert code == 0, err
+    assert "gain on untouched runs not measured: no run was kept from the diagnosis" in out
+    pages = []
+    for out in ("a", "b"):
+        code, _, err = terrain(*words, "--out", out, "--hold-out", "1", "--seed", "3")
+        assert code == 0, err
+        found = json.loads((tmp_path / "j.json").read_text())
+        assert found["gain"]["measured"]
+        pages.append((tmp_path / out / PAGE_FILE).read_text().replace(f"{out}/{EXTENDED_FILE}", ""))
+    assert pages[0] == pages[1]
+
+
+def test_a_users_mistake_is_one_sentence_and_nothing_is_written(refused, data, tmp_path):
+    here = ("--data", data, "--robot", "husky", "--out", "out")
+    refused("effect 'gravity' is unknown", *here, "--effects", "gravity")
+    refused("cannot befall a robot with the drive 'skid_steer'", *here, "--effects", "steering_play")
+    refused("--effects names none", *here, "--effects", ",")
+    refused("no run is labelled 'sand' throughout; labels are field", *here, "--terrain", "sand")
+    refused("--hold-out is 5 of 7 runs; the diagnosis wants 3", *here, "--hold-out", "5")
+    refused("7 of 7 runs are of the robot 'husky'", *here[:2], "--robot", "agrimaro", "--out", "out")
+    refused("--model is of the robot 'agrimaro', --robot is 'husky'", *here, "--model", "agrimaro")
+    refused("does not exist", "--data", tmp_path / "nowhere", *here[2:])
+    (tmp_path / "empty").mkdir()
+    refused("holds no run", "--data", tmp_path / "empty", *here[2:])
+
+
+def test_a_model_that_cannot_be_trusted_is_one_sentence(refused, data, tmp_path):
+    text = (load_husky_text()).rstrip() + "\neffects:\n"
+    model = tmp_path / "model.yaml"
+    model.write_text(text + "  schema: 99\n")
+    here = ("--data", data, "--robot", "husky", "--model", model, "--out", "out")
+    refused("schema 99 is newer", *here)
+    model.write_text(text + "  schema: 1\n  camera_yaw_rad: {value: 0.01, unit: rad, source: me}\n")
+    refused("its effects have no covariance", *here)
+
+
+def load_husky_text():
+    from terrain.robots import description_file
+
+    return description_file("husky").read_text(encoding="utf-8")
+
+
+def test_runs_that_cannot_be_compared_are_one_sentence(refused, tmp_path):
+    bare = tmp_path / "bare"
+    for i in range(3):
+        run = a_run(i)
+        wheels = run.streams["wheels"]
+        keep = ["speed_left_mps", "speed_right_mps"]
+        columns = wheels.values[:, [wheels.channels.index(name) for name in keep]]
+        only = type(wheels)(wheels.time_s, columns, tuple(keep))
+        write_run(RunLog(run.run_id, run.robot, {"wheels": only}, run.labels), bare)
+    refused("none of its channels is simulated", "--data", bare, "--robot", "husky", "--out", "out")
+    two = tmp_path / "two"
+    for i in range(2):
+        write_run(a_run(i), two)
+    refused("there are 2, 3 at the least", "--data", two, "--robot", "husky", "--out", "out")
+
+
+def test_an_extended_description_that_is_there_is_left_as_it_is(refused, data, tmp_path):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / EXTENDED_FILE).write_text("mine")
+    refused("is there already", "--data", data, "--robot", "husky", "--out", "out")
+    assert (tmp_path / "out" / EXTENDED_FILE).read_text() == "mine"
+
+
+def test_every_terrain_gives_its_share_to_the_gain_and_the_seed_says_which():
+    runs = [RunLog(f"{name}{i}", "husky", {}, ((0.0, 1.0, name),)) for name in "ab" for i in range(8)]
+    used, held = split_runs(runs, None, 0)
+    assert sorted(run.terrains for run in held) == [("a",)] * 2 + [("b",)] * 2
+    assert {run.run_id for run in used} | {run.run_id for run in held} == {run.run_id for run in runs}
+    assert split_runs(runs, None, 0) == (used, held)
+    assert any(split_runs(runs, None, seed)[1] != held for seed in range(1, 4))
+    assert split_runs(runs[:5], None, 0) == (runs[:5], [])
+    assert split_runs(runs, 0, 0) == (runs, [])
+    with pytest.raises(DataError, match="--hold-out is 14 of 16"):
+        split_runs(runs, 14, 0)
+
+
+def test_what_is_found_again_takes_the_place_of_what_was_known():
+    diagnosis = SimpleNamespace(
+        parameters=("lever_x_m", "lever_y_m"),
+        values={"lever_x_m": 0.1, "lever_y_m": -0.05},
+        cov=np.array([[4.0, 1.0], [1.0, 9.0]]) * 1e-6,
+    )
+    known = {"lever_x_m": 0.2, "payload_ratio": 0.1}
+    robot = replace(HUSKY, effects=known, effects_cov=np.array([[1.0, 0.5], [0.5, 16.0]]) * 1e-4)
+    values, cov, intervals = extended_numbers(robot, diagnosis)
+    assert values == pytest.approx({"lever_x_m": 0.3, "payload_ratio": 0.1, "lever_y_m": -0.05})
+    np.testing.assert_allclose(cov, [[4e-6, 0, 1e-6], [0, 16e-4, 0], [1e-6, 0, 9e-6]])
+    assert intervals["payload_ratio"] == pytest.approx((0.1 - INTERVAL_T * 0.04, 0.1 + INTERVAL_T * 0.04))
+    with pytest.raises(ConfigError, match="no covariance"):
+        extended_numbers(replace(HUSKY, effects=known), diagnosis)

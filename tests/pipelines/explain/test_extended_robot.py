@@ -1,0 +1,108 @@
+"""What an extended description is worth to the filters, against the truth of simulated runs."""
+
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+import pytest
+import yaml
+
+from pipelines.estimate.calibrate import calibrate
+from pipelines.estimate.estimate import enriched, estimate, estimate_run, summary
+from pipelines.live.pilot import LivePilot
+from pipelines.slip.learn_slip import run_parts
+from terrain.errors import ConfigError
+from terrain.extension import write_extended
+from terrain.robots import load_robot
+from terrain.simulation.dynamic.simulate import simulate
+from terrain.simulation.scenario import make_scenario
+from terrain.simulation.sensors import Gnss
+from terrain.terramechanics.soil import load_soil
+
+ROBOT = load_robot("agrimaro")
+ASKED = {"wheel_radius_ratio": 0.04, "camera_yaw_rad": 0.05, "gyro_scale_ratio": 0.08}
+# effects, and how much worse speed and slip are for them: the errors without them are 0.0028 m/s and 0.012
+CASES = {
+    "radius, camera and gyro": (ASKED, 8.0, 2.5),
+    "clocks": ({"clock_offset_s": 0.1, "clock_rate_ratio": 0.001}, 8.0, 1.3),
+    "latency": ({"camera_latency_s": 0.08}, 6.0, 1.1),
+    "lever": ({"lever_x_m": 0.2, "lever_y_m": -0.15}, 8.0, 2.5),
+    "one side": ({"one_sided_radius_ratio": 0.06}, None, 2.0),
+    "biases": ({"gyro_bias_radps": 0.03, "accel_bias_mps2": 0.5}, None, None),
+    "steering": (
+        {"steering_offset_1_rad": 0.05, "steering_play_rad": 0.03, "steering_delay_s": 0.08},
+        *(None, None),
+    ),
+    "many": (
+        ASKED | {"clock_offset_s": 0.1, "encoder_lag_s": 0.05, "gyro_bias_radps": 0.02, "lever_x_m": 0.1},
+        *(8.0, 2.5),
+    ),
+}
+
+
+@lru_cache
+def driven(effects=(), gnss=None, scenario="complex", length_s=60.0):
+    drive = make_scenario(scenario, ROBOT, "grass", length_s)
+    return simulate(ROBOT, drive, {"grass": load_soil("grass")}, 1, effects=dict(effects), gnss=gnss)
+
+
+def errors(found):
+    """Root mean square errors of speed (m/s) and of steady slip, against the truth of wheels and ground."""
+    truth, track = found.run.streams["truth"], found.track
+    true = np.column_stack(
+        [np.interp(track.time_s, truth.time_s, truth.channel(f"slip_{i}_ratio")) for i in (1, 2, 3)]
+    )
+    error = (found.slip.slip_ratio - true)[found.figures.steady]
+    return summary(found)["speed_rmse_mps"], float(np.sqrt(np.nanmean(error**2)))
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_filter_of_an_extended_robot_is_as_good_as_without_effects(name):
+    effects, speed_gain, slip_gain = CASES[name]
+    run, extended = driven(tuple(effects.items())), replace(ROBOT, effects=effects)
+    clean = errors(estimate_run(driven(), ROBOT, "vio15"))
+    before = errors(estimate_run(run, ROBOT, "vio15"))
+    found = estimate_run(run, extended, "vio15")
+    after = errors(found)
+    assert after[0] < 1.5 * clean[0]
+    assert after[1] < 1.2 * clean[1]
+    if speed_gain:
+        assert before[0] > speed_gain * after[0]
+    if slip_gain:
+        assert before[1] > slip_gain * after[1]
+    assert summary(found)["nees"] < 2.0
+    assert found.run is run
+
+
+def test_a_position_that_drifts_with_the_gyro_comes_back():
+    effects = {"gyro_bias_radps": 0.03, "accel_bias_mps2": 0.5}
+    run = driven(tuple(effects.items()), Gnss())
+    before = errors(estimate_run(run, ROBOT, "vio15"))[0]
+    after = errors(estimate_run(run, replace(ROBOT, effects=effects), "vio15"))[0]
+    assert after < 0.005 < 0.05 < before
+
+
+def test_what_is_written_holds_what_was_measured_and_the_true_rim_speeds():
+    run = driven(tuple(ASKED.items()))
+    written = enriched(estimate_run(run, replace(ROBOT, effects=ASKED), "vio15"))
+    assert written.streams["imu"] is run.streams["imu"]
+    wheels = written.streams["wheels"]
+    rim = wheels.channel("motor_1_radps") / ROBOT.motors.reduction_ratio * ROBOT.wheel_radius_m * 1.04
+    np.testing.assert_allclose(wheels.channel("speed_1_mps"), rim)
+
+
+def test_files_pass_through_the_commands(tmp_path):
+    names = list(ASKED)
+    intervals = {name: (value - 0.01, value + 0.01) for name, value in ASKED.items()}
+    out = tmp_path / "extended.yaml"
+    robot = write_extended(out, "agrimaro", ASKED, 1e-6 * np.eye(len(names)), intervals, "a test")
+    run = driven(tuple(ASKED.items()), None, "straight", 8.0)
+    for tuning in ("physical", "likelihood"):
+        told = estimate([run], "vio15", robot=str(out), tuning=tuning, figures=False)["runs"][0]
+        assert told["speed_rmse_mps"] < 0.006
+    assert np.isfinite(run_parts(run, robot)[0].balance.mass_kg)
+    assert LivePilot(robot)._robot.wheel_radius_m == pytest.approx(0.208)
+    with pytest.raises(ConfigError, match="is extended by effects"):
+        calibrate(tmp_path, out)
+    content = yaml.safe_load(out.read_text())
+    assert content["effects"]["schema"] == 1

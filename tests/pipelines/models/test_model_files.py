@@ -1,0 +1,147 @@
+import io
+import json
+import os
+import pickle
+import zipfile
+
+import numpy as np
+import pytest
+from sklearn.linear_model import LogisticRegression
+from sklearn.preprocessing import FunctionTransformer, StandardScaler
+from skops import io as skops_io
+
+from features.windows import SteadyMotion, WindowRule, cut_windows
+from pipelines.models.model_files import INFO_FILE, MODEL_FILE, TRUSTED_TYPES, read_model, write_info
+from pipelines.models.recipes import WindowPipeline, make_recipe
+from terrain.errors import ModelError
+
+
+def put(folder, content, **changed):
+    """Put other bytes in place of the model, with a checksum that says they are right."""
+    info = json.loads((folder / INFO_FILE).read_text()) | changed
+    (folder / MODEL_FILE).write_bytes(content)
+    write_info(folder, {key: value for key, value in info.items() if key not in ("version", "sha256")})
+
+
+def test_what_is_saved_says_the_same_to_the_last_bit(model_dir, runs):
+    model = read_model(model_dir)
+    windows = cut_windows(runs, model.rule).windows
+    live = make_recipe("svm").fit(windows, windows.terrain.astype(str))
+    assert np.array_equal(model.recipe.predict_proba(windows), live.predict_proba(windows))
+    assert model.recipe.classes_.tolist() == model.info["classes"] == ["ASPHALT", "GRASS", "GRAVEL"]
+    assert model.rule == WindowRule(2.0, None, SteadyMotion())
+    assert set(skops_io.get_untrusted_types(file=model_dir / MODEL_FILE)) <= set(TRUSTED_TYPES)
+
+
+@pytest.mark.parametrize("place", [0.0, 0.1, 0.5, 0.9, 0.999])
+def test_one_flipped_bit_anywhere_is_seen(model_dir, place):
+    content = bytearray((model_dir / MODEL_FILE).read_bytes())
+    content[int(place * len(content))] ^= 1
+    (model_dir / MODEL_FILE).write_bytes(content)
+    with pytest.raises(ModelError, match=r"model\.skops: is damaged \(SHA-256 .* expected\)"):
+        read_model(model_dir)
+
+
+def test_damage_that_the_checksum_covers_up_ends_in_one_sentence(model_dir):
+    whole = (model_dir / MODEL_FILE).read_bytes()
+    rng = np.random.default_rng(0)
+    refusals = []
+    for _ in range(60):
+        content = bytearray(whole[: rng.integers(len(whole))] if rng.random() < 0.3 else whole)
+        for place in rng.integers(max(len(content) - 4000, 0), max(len(content), 1), 3 if content else 0):
+            content[place] = rng.integers(256)
+        put(model_dir, bytes(content))
+        try:
+            read_model(model_dir)
+        except ModelError as error:
+            refusals.append(str(error))
+    assert len(refusals) > 50  # bytes that say nothing may change unseen; nothing else is ever raised
+    assert not [sentence for sentence in refusals if "\n" in sentence]
+
+
+def test_a_model_of_another_package_is_foreign(model_dir, tmp_path):
+    other = LogisticRegression().fit([[0.0], [1.0]], [0, 1])
+    put(model_dir, skops_io.dumps(other))
+    with pytest.raises(ModelError, match="holds a LogisticRegression, not a recipe of this package"):
+        read_model(model_dir)
+    put(model_dir, skops_io.dumps(make_recipe("svm")))
+    with pytest.raises(ModelError, match="holds a recipe that was never fitted"):
+        read_model(model_dir)
+    put(model_dir, skops_io.dumps(WindowPipeline([("scale", StandardScaler()), ("classify", other)])))
+    with pytest.raises(ModelError, match="holds a recipe that was never fitted"):
+        read_model(model_dir)
+
+
+def test_a_type_that_is_not_on_the_list_is_named_and_never_called(model_dir, tmp_path):
+    marker = tmp_path / "called"
+    hostile = FunctionTransformer(os.mkdir, kw_args={"path": str(marker)})
+    put(model_dir, skops_io.dumps(WindowPipeline([("features", hostile), ("last", LogisticRegression())])))
+    with pytest.raises(
+        ModelError, match=r"holds posix\.mkdir, a type that models of this package do not hold"
+    ):
+        read_model(model_dir)
+    assert not marker.exists()
+
+
+class Bomb:
+    """Leaves a mark when it is unpickled."""
+
+    def __init__(self, marker):
+        self.marker = marker
+
+    def __reduce__(self):
+        return os.mkdir, (str(self.marker),)
+
+
+def test_nothing_is_ever_unpickled(model_dir, tmp_path):
+    marker = tmp_path / "unpickled"
+    bomb = pickle.dumps(Bomb(marker))
+    put(model_dir, bomb)
+    with pytest.raises(ModelError, match="cannot be loaded"):
+        read_model(model_dir)
+    # Arrays inside a model file are files of their own, and one of objects is a pickle.
+    objects = io.BytesIO()
+    np.save(objects, np.array([Bomb(marker)], dtype=object), allow_pickle=True)
+    changed = io.BytesIO()
+    put(model_dir, whole := skops_io.dumps(np.arange(3.0)))
+    with zipfile.ZipFile(io.BytesIO(whole)) as source, zipfile.ZipFile(changed, "w") as target:
+        for name in source.namelist():
+            target.writestr(name, objects.getvalue() if name.endswith(".npy") else source.read(name))
+    put(model_dir, changed.getvalue())
+    with pytest.raises(ModelError, match="cannot be loaded"):
+        read_model(model_dir)
+    assert not marker.exists()
+    pickle.loads(bomb)
+    assert marker.is_dir()  # the test can fail
+
+
+@pytest.mark.parametrize("missing", [MODEL_FILE, INFO_FILE])
+def test_a_folder_that_lacks_a_file_holds_no_model(model_dir, missing):
+    (model_dir / missing).unlink()
+    with pytest.raises(
+        ModelError, match=r"holds no model of this package \(model\.skops and terrain_model\.json\)"
+    ):
+        read_model(model_dir)
+
+
+@pytest.mark.parametrize(
+    ("change", "fault"),
+    [
+        (lambda info: "{", "is damaged"),
+        (lambda info: "[]", "is damaged"),
+        (
+            lambda info: json.dumps({k: v for k, v in info.items() if k != "sha256"}),
+            r"is damaged \('sha256'\)",
+        ),
+        (lambda info: json.dumps(info | {"version": 99}), "has version 99; version 1 is read here"),
+        (lambda info: json.dumps(info | {"window_s": "two"}), "is damaged"),
+        (lambda info: json.dumps(info | {"window_s": -2.0}), r"is damaged \(window length_s is -2\.0"),
+        (lambda info: json.dumps(info | {"steady": {"speed": 1}}), "is damaged"),
+        (lambda info: json.dumps(info | {"sha256": 5}), r"is damaged \(SHA-256"),
+    ],
+)
+def test_a_spoilt_sidecar_is_named(model_dir, change, fault):
+    file = model_dir / INFO_FILE
+    file.write_text(change(json.loads(file.read_text())))
+    with pytest.raises(ModelError, match=fault):
+        read_model(model_dir)

@@ -1,0 +1,190 @@
+import json
+import shutil
+import sqlite3
+import warnings
+
+import numpy as np
+import pytest
+
+from features.windows import cut_windows
+from pipelines.models.model_files import read_model
+from pipelines.models.tracking import ensure_tracking, load_model, log_training
+from pipelines.runs.datasets import data_digest
+from terrain.errors import ModelError, TerrainError
+
+
+@pytest.fixture
+def mlflow(in_tracked):
+    """The package, set to the database of the folder, with its own warnings off."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        import mlflow
+
+        mlflow.set_tracking_uri("sqlite:///mlruns/mlflow.db")
+        mlflow.set_registry_uri("sqlite:///mlruns/mlflow.db")
+        yield mlflow
+
+
+@pytest.fixture
+def log(tracked, runs):
+    """Return a function that logs the trained model once more, under a name, with a macro F1 and a digest."""
+    model = read_model(tracked[0] / "model")
+    windows = cut_windows(runs[:1], model.rule).windows
+    info = {key: value for key, value in model.info.items() if key not in ("version", "sha256")}
+
+    def again(name, macro_f1, digest="aa"):
+        return log_training(
+            name, model.recipe, windows, info | {"data_digest": digest}, {"recipe": "svm"},
+            {"macro_f1": macro_f1}, {}, {},
+        )  # fmt: skip
+
+    return again
+
+
+def test_a_training_run_holds_what_is_needed_to_judge_and_repeat_it(in_tracked, mlflow, runs):
+    result = in_tracked
+    run = mlflow.get_run(result["run_id"])
+    assert run.data.params["window_s"] == "2.0"
+    assert run.data.params["n_runs"] == "12"
+    assert run.data.params["chosen_C"] == str(result["chosen"]["C"])
+    report = result["crossval"]
+    for metric in ("accuracy", "balanced_accuracy", "macro_f1", "vote_accuracy", "ece"):
+        assert run.data.metrics[metric] == pytest.approx(report[metric])
+    assert run.data.tags["data_digest"] == data_digest(runs)
+    assert run.data.tags["seed"] == "0"
+    assert run.data.tags["commit"] == result["commit"]
+    client = mlflow.MlflowClient()
+    figures = {file.path for file in client.list_artifacts(result["run_id"], "figures")}
+    assert figures == {
+        f"figures/{name}.png" for name in ("confusion", "reliability", "per_run", "importance")
+    }
+    logged = mlflow.artifacts.load_text(f"runs:/{result['run_id']}/crossval.json")
+    assert json.loads(logged)["accuracy"] == report["accuracy"]
+    version = client.get_model_version("drawn", result["version"])
+    assert version.run_id == result["run_id"]
+    signature = mlflow.models.get_model_info(result["model_uri"]).signature
+    assert {(spec.name, spec.shape) for spec in signature.inputs} == {
+        ("imu", (-1, 6, 100)),
+        ("wheels", (-1, 4, 20)),
+    }
+
+
+def test_the_pyfunc_flavour_says_what_the_recipe_says(in_tracked, mlflow, runs):
+    model = load_model(in_tracked["model_uri"])
+    windows = cut_windows(runs, model.rule).windows
+    served = mlflow.pyfunc.load_model(in_tracked["model_uri"]).predict(windows.values)
+    np.testing.assert_array_equal(served, model.recipe.predict(windows))
+
+
+def test_a_model_is_loaded_by_alias_version_run_and_folder(in_tracked, runs, tracked):
+    uris = [
+        "models:/drawn@champion",
+        "models:/drawn/1",
+        f"runs:/{in_tracked['run_id']}/model",
+        str(tracked[0] / "model"),
+    ]
+    models = [load_model(uri) for uri in uris]
+    windows = cut_windows(runs[::4], models[0].rule).windows
+    for model in models:
+        assert model.info == models[0].info
+        np.testing.assert_array_equal(
+            model.recipe.predict_proba(windows), models[0].recipe.predict_proba(windows)
+        )
+
+
+def champion_of(name):
+    with sqlite3.connect("mlruns/mlflow.db") as database:
+        rows = database.execute(
+            "SELECT version FROM registered_model_aliases WHERE name = ?", (name,)
+        ).fetchall()
+    database.close()
+    return [str(version) for (version,) in rows]
+
+
+def test_the_champion_moves_by_the_rule(in_tracked, log):
+    told = []
+    for macro_f1, digest, champion in (
+        (0.80, "aa", "1"),  # the first
+        (0.80, "aa", "1"),  # no better
+        (0.85, "aa", "3"),  # better on the same data
+        (0.84, "aa", "3"),  # worse than the champion, though better than the first
+        (0.20, "bb", "5"),  # worse, on new data
+    ):
+        registered = log("by_rule", macro_f1, digest)
+        told.append(registered.alias_reason)
+        assert registered.alias_moved == (registered.version == champion)
+        assert champion_of("by_rule") == [champion]
+    assert told == [
+        "first version",
+        "macro F1 0.8000 is not better than 0.8000 of version 1 on the same data",
+        "macro F1 0.8500 is better than 0.8000 of version 1 on the same data",
+        "macro F1 0.8400 is not better than 0.8500 of version 3 on the same data",
+        "new data: the digest differs from that of version 3",
+    ]
+    assert load_model("models:/by_rule@champion").info["data_digest"] == "bb"
+    assert in_tracked["alias_reason"] == "first version"
+
+
+def test_the_server_that_is_named_is_the_one_that_is_used(tracked, log, tmp_path, monkeypatch):
+    shutil.copy(tracked[0] / "mlruns" / "mlflow.db", tmp_path / "other.db")
+    (tmp_path / "work").mkdir()
+    monkeypatch.chdir(tmp_path / "work")
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", f"sqlite:///{tmp_path / 'other.db'}")
+    log("elsewhere", 0.5)
+    assert load_model("models:/elsewhere@champion").info["data_digest"] == "aa"
+    assert list((tmp_path / "work").iterdir()) == []  # no ./mlruns beside the server that was named
+    monkeypatch.delenv("MLFLOW_TRACKING_URI")
+    monkeypatch.chdir(tracked[0])
+    with pytest.raises(ModelError, match="elsewhere"):
+        load_model("models:/elsewhere@champion")
+
+
+@pytest.mark.parametrize(
+    "uri",
+    [
+        "models:/nobody@champion",
+        "models:/drawn/99",
+        "models:/drawn@nobody",
+        "models:/",
+        "runs:/0123/model",
+    ],
+)
+def test_a_model_that_is_not_there_is_one_sentence(in_tracked, uri):
+    with pytest.raises(ModelError, match="cannot be loaded") as error:
+        load_model(uri)
+    assert str(error.value).startswith(uri)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("uri", ["sftp:/x", "http://x", "s3:/bucket/model", "nowhere"])
+def test_a_model_from_elsewhere_is_not_fetched(uri):
+    with pytest.raises(ModelError, match="is neither a folder nor a model URI"):
+        load_model(uri)
+
+
+def test_a_server_that_does_not_answer_is_named_before_the_work(monkeypatch):
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", "http://127.0.0.1:1")
+    for act in (ensure_tracking, lambda: load_model("models:/m@champion")):
+        with pytest.raises(TerrainError, match=r"MLFLOW_TRACKING_URI=http://127.0.0.1:1: cannot be reached"):
+            act()
+
+
+def test_looking_for_a_model_makes_nothing(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+    with pytest.raises(ModelError, match=r"mlflow\.db does not exist: train a model here first"):
+        load_model("models:/drawn@champion")
+    with pytest.raises(ModelError, match="nowhere: is neither a folder nor a model URI"):
+        load_model("nowhere")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_database_that_is_none_is_one_sentence(tmp_path, monkeypatch, log):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+    (tmp_path / "mlruns").mkdir()
+    (tmp_path / "mlruns" / "mlflow.db").write_text("no database, though as long as one. " * 100)
+    for use in (lambda: load_model("models:/drawn@champion"), lambda: log("drawn", 0.5)):
+        with pytest.raises(TerrainError) as error:
+            use()
+        assert "\n" not in str(error.value)

@@ -1,0 +1,116 @@
+import shutil
+
+import numpy as np
+import pytest
+
+from pipelines.runs.datasets import data_digest, load_runs
+from terrain.errors import ConfigError, LogError
+from terrain.logs.write import write_run
+from terrain.records import Label, RunLog, Stream
+
+
+def test_the_measured_data_sets_are_read_whole(datasets_dir):
+    borealtc, vulpi = (load_runs(datasets_dir / name) for name in ("borealtc", "vulpi"))
+    assert (len(borealtc), len(vulpi)) == (51, 18)
+    assert {label.terrain for run in vulpi for label in run.labels} == {
+        "CONCRETE", "DIRT_ROAD", "PLOUGHED", "UNPLOUGHED",
+    }  # fmt: skip
+    assert [run.run_id for run in borealtc] == sorted(run.run_id for run in borealtc)
+    assert sum(len(run.streams["imu"]) for run in borealtc) == pytest.approx(340_000, rel=0.1)
+    for run in borealtc + vulpi:  # columns are taken by name: gravity is on z, wheels turn at walking speed
+        assert 8.0 < np.mean(run.streams["imu"].channel("accel_z_mps2")) < 11.0
+        assert np.max(np.abs(run.streams["wheels"].channel("speed_left_mps"))) < 1.6
+
+
+def test_run_folders_and_a_single_run_folder_are_found(tmp_path, make_run):
+    for run_id in ("SNOW_02", "SNOW_01"):
+        write_run(make_run(run_id), tmp_path)
+    assert [run.run_id for run in load_runs(tmp_path)] == ["SNOW_01", "SNOW_02"]
+    assert [run.run_id for run in load_runs(tmp_path / "SNOW_02")] == ["SNOW_02"]
+
+
+def test_two_runs_with_one_id_are_refused(tmp_path, make_run):
+    write_run(make_run("SNOW_01"), tmp_path)
+    shutil.copytree(tmp_path / "SNOW_01", tmp_path / "copy")
+    with pytest.raises(LogError, match=r"2 runs have the id 'SNOW_01' \(.*/SNOW_01 and .*/copy\)"):
+        load_runs(tmp_path)
+
+
+@pytest.mark.parametrize("layout", ["auto", "runs", "borealtc"])
+def test_a_folder_without_runs_says_what_is_accepted(tmp_path, layout):
+    with pytest.raises(LogError, match=r"holds no run; accepted are run folders \(run.json\), the BorealTC"):
+        load_runs(tmp_path, layout=layout)
+    with pytest.raises(LogError, match="nowhere: does not exist; accepted are"):
+        load_runs(tmp_path / "nowhere", layout=layout)
+    (tmp_path / "file.csv").touch()
+    with pytest.raises(LogError, match=r"file.csv: is no folder"):
+        load_runs(tmp_path / "file.csv", layout=layout)
+
+
+def test_options_that_do_not_go_together_are_refused(borealtc_dir, tmp_path):
+    with pytest.raises(ConfigError, match="layout 'bag' is unknown: choose one of auto, runs, borealtc, csv"):
+        load_runs(borealtc_dir, layout="bag")
+    with pytest.raises(ConfigError, match="the layout 'csv' needs a mapping file"):
+        load_runs(borealtc_dir, layout="csv")
+    with pytest.raises(ConfigError, match="a mapping file is for CSV files, not for the layout 'runs'"):
+        load_runs(borealtc_dir, layout="runs", mapping=tmp_path / "map.yaml")
+
+
+def test_repair_skips_what_cannot_be_read_and_says_so(borealtc_dir, caplog):
+    (borealtc_dir / "SNOW" / "pro_01.csv").unlink()
+    (borealtc_dir / "ICE" / "imu_01.csv").write_text("")
+    with pytest.raises(LogError):
+        load_runs(borealtc_dir)
+    told = []
+    runs = load_runs(borealtc_dir, repair=True, on_skip=told.append)
+    assert [run.run_id for run in runs] == ["SNOW_02"]
+    assert told == [
+        "run skipped: ICE/imu_01.csv: is empty (a header and at least 2 rows are needed)",
+        "run skipped: SNOW/pro_01.csv: is missing",
+    ]
+    load_runs(borealtc_dir, repair=True)
+    assert "run skipped: SNOW/pro_01.csv: is missing" in caplog.text
+    (borealtc_dir / "SNOW" / "pro_02.csv").unlink()
+    with pytest.raises(
+        LogError, match=r"not one run could be read, the first for this: ICE/imu_01\.csv: is empty"
+    ):
+        load_runs(borealtc_dir, repair=True, on_skip=told.append)
+
+
+def test_align_moves_the_wheels_of_runs_that_tell_their_clocks(datasets_dir, tmp_path):
+    for name in ("imu_04.csv", "pro_04.csv"):
+        (tmp_path / "ASPHALT").mkdir(exist_ok=True)
+        shutil.copy(datasets_dir / "borealtc" / "ASPHALT" / name, tmp_path / "ASPHALT")
+    (plain,), (aligned,) = load_runs(tmp_path), load_runs(tmp_path, align=True)
+    assert data_digest([plain]) != data_digest([aligned])
+    assert aligned.streams["imu"] is not None
+    # The wheel file is 1.07 s shorter; on the clock of the IMU the two end together within half a second.
+    assert plain.streams["imu"].time_s[-1] - plain.streams["wheels"].time_s[-1] > 1.0
+    assert abs(aligned.streams["imu"].time_s[-1] - aligned.streams["wheels"].time_s[-1]) < 0.6
+
+
+def test_the_digest_sees_content_and_nothing_else(make_run):
+    run = make_run()
+    imu = run.streams["imu"]
+    digest = data_digest([run])
+
+    def with_imu(stream, **changes):
+        fields = {"run_id": run.run_id, "robot": run.robot, "labels": run.labels} | changes
+        return data_digest([RunLog(streams={"wheels": run.streams["wheels"], "imu": stream}, **fields)])
+
+    swapped = Stream(imu.time_s, imu.values[:, ::-1], imu.channels[::-1])
+    assert with_imu(imu, source="elsewhere", dropped={"rows": 1}) == digest
+    assert with_imu(swapped) == digest
+    other = imu.values.copy()
+    other[7, 2] = np.nextafter(other[7, 2], 9.0)
+    changed = [
+        with_imu(Stream(imu.time_s, other, imu.channels)),
+        with_imu(Stream(imu.time_s + 1e-9, imu.values, imu.channels)),
+        with_imu(Stream(imu.time_s, imu.values, imu.channels[::-1])),
+        with_imu(imu, run_id="SNOW_09"),
+        with_imu(imu, robot="jackal"),
+        with_imu(imu, labels=(Label(0.0, 4.0, "ICE"),)),
+    ]
+    assert len({digest, *changed}) == 7
+    other = make_run("SNOW_02", seed=1)
+    assert data_digest([run, other]) == data_digest([other, run]) != digest

@@ -1,0 +1,181 @@
+import json
+
+import numpy as np
+import pytest
+
+from pipelines.runs.simulate import simulate_run, simulate_runs
+from terrain.errors import ConfigError, LogError
+from terrain.files.resources import data_folder
+from terrain.logs.read import find_runs, read_run
+from terrain.robots import load_robot
+from terrain.simulation.conditions import Conditions, Faults
+from terrain.simulation.sensors import Gnss
+from terrain.terramechanics.soil import soil_names
+
+ROBOT, HUSKY = load_robot("agrimaro"), load_robot("husky")
+
+
+def read_soil(name):
+    return (data_folder("soils") / f"{name}.yaml").read_text(encoding="utf-8")
+
+
+def bytes_of(folder):
+    return {file.name: file.read_bytes() for file in folder.iterdir()}
+
+
+def values_of(run):
+    return {name: stream.values.tobytes() for name, stream in run.streams.items()}
+
+
+def test_a_run_is_the_same_whatever_is_simulated_beside_it(tmp_path):
+    alone = simulate_runs(
+        "agrimaro", "grass", "straight", tmp_path / "alone", runs=1, duration_s=4.0, vary=True
+    )
+    beside = simulate_runs("agrimaro", "all", "straight", tmp_path / "all", runs=2, duration_s=4.0, vary=True)
+    assert alone["run_ids"] == ["grass_straight_01"]
+    assert beside["n_runs"] == 2 * len(soil_names()) == len(set(beside["run_ids"]))
+    assert bytes_of(tmp_path / "alone" / "grass_straight_01") == bytes_of(
+        tmp_path / "all" / "grass_straight_01"
+    )
+    run = simulate_run(ROBOT, "grass", "straight", 0, 2, duration_s=4.0, vary=True)
+    assert values_of(run) == values_of(read_run(tmp_path / "all" / "grass_straight_02"))
+    assert {read().terrains for read in find_runs(tmp_path / "all")} == {(name,) for name in soil_names()}
+    assert json.loads(json.dumps(beside)) == beside
+    assert beside["duration_s"] == pytest.approx(16 * 4.01, abs=0.01)
+
+
+def test_runs_differ_by_number_seed_and_terrain_and_more_so_where_they_vary():
+    def slip(number=1, seed=0, terrain="grass", vary=False):
+        truth = simulate_run(ROBOT, terrain, "straight", seed, number, duration_s=6.0, vary=vary).streams[
+            "truth"
+        ]
+        slips = np.column_stack([truth.channel(f"slip_{i}_ratio") for i in (1, 2, 3)])
+        return slips[truth.time_s > 3.0].mean()
+
+    nominal = [slip(number) for number in range(1, 7)]
+    varied = [slip(number, vary=True) for number in range(1, 7)]
+    assert len({*nominal, slip(seed=1), slip(terrain="clay")}) == 8
+    assert np.std(varied) > 5 * np.std(nominal)
+
+
+def test_options_reach_the_run():
+    given = {"duration_s": 10.0, "conditions": Conditions(grade_ratio=(0.1, 0.0)), "gnss": Gnss()}
+    run = simulate_run(ROBOT, "tiles", "survey", 3, faults=Faults(camera_lost_s=((2.0, 4.0),)), **given)
+    odometry = run.streams["odometry"]
+    assert run.streams["truth"].time_s[-1] == pytest.approx(10.01)
+    assert not ((odometry.time_s >= 2.0) & (odometry.time_s < 4.0)).any()
+    assert "gnss" in run.streams
+    assert run.streams["imu"].channel("accel_x_mps2")[:50].mean() == pytest.approx(0.976, abs=0.1)
+    drawn = simulate_run(ROBOT, "tiles", "survey", 3, vary=True, **given)
+    assert drawn.streams["imu"].channel("accel_x_mps2")[:50].mean() == pytest.approx(0.976, abs=0.8)
+
+
+def test_a_course_goes_over_all_grounds(tmp_path):
+    result = simulate_runs("agrimaro", "course", "course", tmp_path, duration_s=30.0)
+    assert result["run_ids"] == ["course_01"]
+    run = read_run(tmp_path / "course_01")
+    assert len(run.terrains) >= 2
+    assert set(run.terrains) <= set(soil_names())
+
+
+def test_a_skid_steered_robot_makes_runs_too(tmp_path):
+    given = {"scenario": "complex", "duration_s": 30.0, "vary": True, "effects": ["effective_track=0.6"]}
+    result = simulate_runs("husky", "all", out=tmp_path, **given)
+    assert result["effects"] == {"effective_track_ratio": 0.6}
+    assert result["n_runs"] == len(soil_names())
+    run = read_run(tmp_path / "grass_complex_01")
+    again = simulate_run(HUSKY, "grass", "complex", 0, duration_s=30.0, vary=True, effects=result["effects"])
+    assert values_of(run) == values_of(again)
+    assert run.terrains == ("grass",)
+    speeds = run.streams["wheels"].values[:, :2]
+    asked = (speeds[:, 1] - speeds[:, 0]) / HUSKY.track_m
+    turned = run.streams["imu"].channel("gyro_z_radps")[::2]
+    assert np.polyfit(asked, turned, 1)[0] == pytest.approx(1 / 1.6, abs=0.04)
+
+
+def test_load_slope_and_a_lost_camera_reach_a_skid_steered_run():
+    given = {"conditions": Conditions(payload_kg=25.0, grade_ratio=(0.1, 0.0)), "duration_s": 10.0}
+    lost = Faults(camera_lost_s=((2.0, 4.0),))
+    run, bare = (
+        simulate_run(HUSKY, "tiles", "straight", 3, **options)
+        for options in (given | {"faults": lost}, {"duration_s": 10.0})
+    )
+    time_s = run.streams["odometry"].time_s
+    assert not ((time_s >= 2.0) & (time_s < 4.0)).any()
+    assert run.streams["imu"].channel("pitch_rad").mean() == pytest.approx(-0.1, abs=0.01)
+    current, level = (log.streams["wheels"].values[250:, 2:].sum(axis=1).mean() for log in (run, bare))
+    amps_per_n = HUSKY.wheel_radius_m / (0.044 * 78.71 * 0.7)
+    slope_n = 75.0 * 9.80665 * np.sin(np.arctan(0.1))
+    assert (current - level) / amps_per_n == pytest.approx(slope_n, rel=0.1)
+    blind = simulate_run(HUSKY, "tiles", "straight", 3, duration_s=5.0, faults=Faults(((0.0, 9.0),)))
+    assert "odometry" not in blind.streams
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"robot_name": "husky", "scenario": "crab"}, "scenario 'crab' is not for robot husky"),
+        ({"robot_name": "husky", "terrain": "course", "scenario": "course"}, "'course' is for swerve"),
+        ({"robot_name": "husky", "scenario": "slip"}, "robot husky"),
+        ({"robot_name": "husky", "gnss": True}, "has no receiver"),
+        ({"robot_name": "husky", "effects": ["steering_play=0.1"]}, "cannot befall"),
+        ({"effects": ["wheel_radius=9"]}, "-0.3 to 0.3 is accepted"),
+        ({"effects": ["wheel_radius=0.1", "encoder_scale=0.1"]}, "effect 'encoder_scale' is given twice"),
+        ({"scenario": "slip", "effects": ["wheel_radius=0.1"]}, "without effects"),
+        ({"robot_name": "nobody"}, "robot 'nobody' is unknown"),
+        ({"terrain": "lava"}, "soil 'lava' is unknown"),
+        ({"scenario": "dance"}, "scenario 'dance' is unknown"),
+        ({"terrain": "course"}, "go together"),
+        ({"scenario": "course"}, "go together"),
+        ({"terrain": "all", "scenario": "course"}, "go together"),
+        ({"duration_s": 0.5}, "duration_s is 0.5, too short"),
+        ({"duration_s": float("nan")}, "duration_s is nan"),
+        ({"conditions": Conditions(payload_kg=500.0, payload_m=(0.0, 0.7))}, "tips it over"),
+    ],
+)
+def test_what_is_not_accepted_is_refused_and_nothing_is_written(tmp_path, options, message):
+    given = {"robot_name": "agrimaro", "terrain": "grass", "scenario": "straight", "out": tmp_path / "runs"}
+    with pytest.raises(ConfigError, match=message):
+        simulate_runs(**given | options)
+    assert not (tmp_path / "runs").exists()
+
+
+def test_a_run_that_is_there_is_left_alone_and_nothing_else_is_written(tmp_path):
+    (tmp_path / "grass_straight_02").mkdir()
+    with pytest.raises(LogError, match="grass_straight_02: is there already"):
+        simulate_runs("agrimaro", "grass", "straight", tmp_path, runs=3, duration_s=4.0)
+    assert [path.name for path in tmp_path.iterdir()] == ["grass_straight_02"]
+
+
+def test_a_soil_of_ones_own_goes_by_its_name(tmp_path):
+    own = tmp_path / "field 7.yaml"
+    own.write_text(read_soil("grass").replace("name: grass", "name: orchard"))
+    result = simulate_runs("agrimaro", str(own), "straight", tmp_path / "runs", duration_s=4.0)
+    assert result["run_ids"] == ["orchard_straight_01"]
+    assert read_run(tmp_path / "runs" / "orchard_straight_01").terrains == ("orchard",)
+    with pytest.raises(LogError, match="orchard_straight_01: is there already"):
+        simulate_runs("agrimaro", str(own), "straight", tmp_path / "runs", duration_s=4.0)
+
+
+def test_progress_counts_the_runs(tmp_path):
+    told = []
+    simulate_runs(
+        "agrimaro",
+        "snow",
+        "stand",
+        tmp_path,
+        runs=2,
+        duration_s=1.0,
+        progress=lambda *args: told.append(args),
+    )
+    assert told == [("simulate", 1, 2), ("simulate", 2, 2)]
+
+
+def test_an_imu_on_a_bench_is_simulated_for_calibration(tmp_path):
+    result = simulate_runs("agrimaro", "bench", "six_positions", tmp_path / "logs", runs=2)
+    assert result["run_ids"] == ["bench_six_positions_01", "bench_six_positions_02"]
+    one, two = (read_run(tmp_path / "logs" / run_id) for run_id in result["run_ids"])
+    assert set(one.streams) == {"imu"}
+    assert one.streams["imu"].values[0, 0] != two.streams["imu"].values[0, 0]
+    with pytest.raises(ConfigError, match="give the terrain 'bench', not 'grass'"):
+        simulate_runs("agrimaro", "grass", "six_positions", tmp_path / "more")

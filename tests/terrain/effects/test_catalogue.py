@@ -1,0 +1,164 @@
+"""The catalogue of effects is consistent, and each shows where it says."""
+
+import numpy as np
+import pytest
+
+from terrain.effects.catalogue import (
+    ACCEL,
+    BOTH,
+    CHANNELS,
+    CURRENT,
+    GYRO,
+    HEADING,
+    INDEX,
+    LIBRARY,
+    NUISANCES,
+    PARAMETERS,
+    SPEED_X,
+    SPEED_Y,
+    TURNING_CURRENT,
+    effect_named,
+    library_of,
+    read_effect,
+    vector_of,
+)
+from terrain.errors import ConfigError
+from terrain.robots import load_robot
+from terrain.simulation.planar.model import Ground, make_planar
+from terrain.simulation.planar.replay import replay
+
+ROBOTS = {"skid_steer": load_robot("husky"), "swerve": load_robot("agrimaro")}
+NOISE = {
+    GYRO: 0.01,
+    SPEED_X: 0.005,
+    SPEED_Y: 0.005,
+    ACCEL: 0.1,
+    CURRENT: 1.0,
+    TURNING_CURRENT: 1.0,
+    HEADING: 0.02,
+}
+"""About what sensors of these robots show of nothing."""
+
+NOTICEABLE, CLEAR = 0.1, 0.2
+"""Response over noise, over that of the clearest channel, from which on one may be named and has to be."""
+
+DT = 0.02
+
+
+def rich_drive(drive):
+    """Return rims, steering, grade and roll of a drive that shows every effect."""
+    t = DT * np.arange(1500)
+    speed, turn = 0.5 * np.sin(0.9 * t) + 0.35 * np.sin(0.31 * t), 0.5 * np.sin(0.53 * t + 1.0)
+    grade, roll = 0.08 * np.sin(0.23 * t), 0.06 * np.cos(0.29 * t)
+    if drive == "skid_steer":
+        half = 0.5 * ROBOTS[drive].track_m * turn
+        return np.column_stack([speed - half, speed + half]), np.zeros((t.size, 2)), grade, roll
+    steer = np.column_stack([0.5 * np.sin(0.7 * t), -0.4 * np.sin(0.6 * t), 0.2 * np.sin(0.8 * t)])
+    return np.column_stack([speed, 0.9 * speed, 1.1 * speed]), steer, grade, roll
+
+
+@pytest.fixture(scope="module")
+def responses():
+    """By drive and effect, the response of each channel over its noise and over the clearest one's."""
+    noise = np.array([NOISE[channel] for channel in CHANNELS])
+    found = {}
+    for drive, robot in ROBOTS.items():
+        planar, inputs = make_planar(robot, Ground()), rich_drive(drive)
+        neutral = replay(planar, vector_of({}), DT, *inputs)
+        for effect in LIBRARY:
+            power = np.zeros(len(CHANNELS))
+            for p in effect.parameters:
+                shown = replay(planar, vector_of({p.name: p.step}), DT, *inputs)
+                power += (((shown - neutral) / noise)[50:-50] ** 2).mean(axis=0)
+            found[drive, effect.name] = np.sqrt(power)
+    return found
+
+
+def test_names_are_unique_and_the_neutral_value_lies_within_the_bounds():
+    names = [name for effect in LIBRARY for name in (effect.name, *effect.aliases)]
+    parameters = [p.name for effect in LIBRARY for p in effect.parameters]
+    assert len(set(names)) == len(names)
+    assert len(set(parameters)) == len(parameters)
+    assert set(PARAMETERS) == {*parameters, *NUISANCES}
+    assert [INDEX[name] for name in PARAMETERS] == list(range(len(PARAMETERS)))
+    for effect in LIBRARY:
+        assert set(effect.drives) <= set(BOTH)
+        assert set(effect.channels) <= set(CHANNELS)
+        assert effect.formula
+        assert effect.source
+        assert effect.needs
+        for p in effect.parameters:
+            assert p.low <= 0.0 < p.high
+            assert 0.0 < p.step < 0.1 * p.high
+            assert p.unit in ("ratio", "rad", "s", "m", "radps", "mps2", "nspm")
+
+
+@pytest.mark.parametrize("drive", ROBOTS)
+def test_an_effect_changes_the_replay_of_the_robots_that_it_can_befall_and_of_no_others(responses, drive):
+    for effect in LIBRARY:
+        response = responses[drive, effect.name]
+        if effect in library_of(drive):
+            assert response.max() > 0.01, effect.name  # over the noise, at a step that counts as small
+        else:
+            assert not response.any(), effect.name
+
+
+def test_an_effect_shows_in_the_channels_that_it_names_and_in_no_others(responses):
+    for effect in LIBRARY:
+        share = np.max(
+            [responses[d, effect.name] / responses[d, effect.name].max() for d in effect.drives], axis=0
+        )
+        clear, noticeable = (set(np.array(CHANNELS)[share > least]) for least in (CLEAR, NOTICEABLE))
+        assert clear <= set(effect.channels) <= noticeable, effect.name
+
+
+def test_twins_are_twins_of_each_other_and_part_where_they_say(responses):
+    for effect in LIBRARY:
+        for name, channel in effect.twins:
+            twin = effect_named(name)
+            assert (effect.name, channel) in twin.twins
+            drives = set(effect.drives) & set(twin.drives)
+            assert drives
+            for drive in drives:  # one of the two shows in the channel that parts them, the other does not
+                c = CHANNELS.index(channel)
+                one, other = (
+                    responses[drive, e.name] / responses[drive, e.name].max() for e in (effect, twin)
+                )
+                assert min(one[c], other[c]) < 1e-3 < NOTICEABLE < max(one[c], other[c])
+
+
+def test_an_alias_is_the_effect():
+    for effect in LIBRARY:
+        for name in (effect.name, *effect.aliases):
+            assert effect_named(name) is effect
+    assert read_effect("encoder_scale=0.02", "swerve") == {"wheel_radius_ratio": 0.02}
+
+
+@pytest.mark.parametrize(
+    ("text", "drive", "message"),
+    [
+        ("gravity=1", "swerve", "effect 'gravity' is unknown: use one of wheel_radius,"),
+        ("steering_play=0.01", "skid_steer", "cannot befall a robot with the drive 'skid_steer'"),
+        ("payload", "swerve", "payload=VALUE with payload_ratio is wanted"),
+        ("payload=heavy", "swerve", "payload=VALUE with payload_ratio is wanted"),
+        ("payload=0.1,0.2", "swerve", "payload=VALUE with payload_ratio is wanted"),
+        ("lever_arm=0.1", "swerve", "lever_arm=VALUE with lever_x_m,lever_y_m is wanted"),
+        ("payload=1.6", "swerve", "payload_ratio is 1.6, -0.5 to 1.5 is accepted"),
+        ("payload=nan", "swerve", "payload_ratio is nan, -0.5 to 1.5 is accepted"),
+        ("steering_play=-0.01", "swerve", "steering_play_rad is -0.01, 0 to 0.2 is accepted"),
+    ],
+)
+def test_an_effect_that_cannot_be_is_refused_in_one_sentence(text, drive, message):
+    with pytest.raises(ConfigError) as error:
+        read_effect(text, drive)
+    assert message in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_a_vector_takes_known_finite_numbers():
+    assert (
+        vector_of({"payload_ratio": 0.5}).sum() == vector_of({"payload_ratio": 0.5})[INDEX["payload_ratio"]]
+    )
+    for values in ({"payload": 0.5}, {"payload_ratio": float("inf")}):
+        with pytest.raises(ConfigError, match="a finite number of a known parameter"):
+            vector_of(values)

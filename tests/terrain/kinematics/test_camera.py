@@ -1,0 +1,176 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from terrain.kinematics.camera import body_motion, odometry_stream, to_body, to_camera
+from terrain.records import Stream
+from terrain.robots import load_robot
+
+CAMERA = load_robot("agrimaro").camera
+LEVER_M = np.array([CAMERA.lever_x_m, CAMERA.lever_y_m])
+Q_ALIGN = Rotation.from_euler("X", -90, degrees=True) * Rotation.from_euler("Z", 90, degrees=True)
+
+
+def drive(speed_x, speed_y, yaw_rate, *, yaw_0=0.0, roll=0.0, pitch=0.0, n=1001, dt=0.005):
+    """Return plain motion of constant or given rates, integrated by midpoints."""
+    time = np.arange(n) * dt
+    speed = np.column_stack([np.broadcast_to(speed_x, n), np.broadcast_to(speed_y, n)])
+    rate = np.broadcast_to(yaw_rate, n)
+    yaw = yaw_0 + np.r_[0.0, np.cumsum((rate[1:] + rate[:-1]) / 2 * dt)]
+    velocity = turn(speed, yaw)
+    position = np.vstack([np.zeros(2), np.cumsum((velocity[1:] + velocity[:-1]) / 2 * dt, axis=0)])
+    return time, position, yaw, np.broadcast_to(roll, n), np.broadcast_to(pitch, n), speed, rate
+
+
+def turn(vectors, yaw):
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    return np.stack(
+        [cos * vectors[..., 0] - sin * vectors[..., 1], sin * vectors[..., 0] + cos * vectors[..., 1]],
+        axis=-1,
+    )
+
+
+def with_channels(stream, **columns):
+    values = np.array(stream.values)
+    for name, column in columns.items():
+        values[:, stream.channels.index(name)] = column
+    return Stream(stream.time_s, values, stream.channels)
+
+
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    yaw_0=st.floats(-10, 10),
+    tilt=st.sampled_from([0.0, 0.05, 0.4]),
+    lever_z=st.sampled_from([0.0, 0.7]),
+)
+def test_a_stream_gives_back_the_motion_it_was_made_of(seed, yaw_0, tilt, lever_z):
+    camera = replace(CAMERA, lever_z_m=lever_z)
+    rng = np.random.default_rng(seed)
+    n = 60  # rough steps, as noise in every array would make them; each turn stays under half a circle
+    yaw = yaw_0 + np.cumsum(rng.uniform(-2, 2, n))
+    roll, pitch = tilt * rng.standard_normal((2, n)).clip(-2, 2)
+    position, speed = rng.standard_normal((n, 2)).cumsum(axis=0), rng.standard_normal((n, 2))
+    rate = rng.standard_normal(n)
+    stream = odometry_stream(
+        np.arange(n) / 200, position, yaw, roll, pitch, speed, rate, camera, float(rng.uniform(-4, 4))
+    )
+    seen = body_motion(stream, camera)
+    lever = np.column_stack([-rate * LEVER_M[1], rate * LEVER_M[0]])
+    np.testing.assert_allclose(seen.speed_mps, speed + lever, atol=1e-9)
+    np.testing.assert_allclose(seen.yaw_rate_radps, rate, atol=1e-12)
+    np.testing.assert_allclose(seen.roll_rad, roll, atol=1e-9)
+    np.testing.assert_allclose(seen.pitch_rad, pitch, atol=1e-9)
+    np.testing.assert_allclose(seen.yaw_rad, yaw - yaw[0], atol=1e-9)
+    np.testing.assert_allclose(seen.position_m, turn(position - position[0], -yaw[0]), atol=1e-9)
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+def test_renaming_axes_is_the_quaternion_product_of_the_thesis_and_its_matrices(seed):
+    rng = np.random.default_rng(seed)
+    sensor = Rotation.random(20, rng=rng)
+    vectors = rng.standard_normal((20, 3))
+    # the columns of the body's axes in the camera's: forward -z, left -x, up y
+    matrix = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]])
+    np.testing.assert_allclose(Q_ALIGN.as_matrix(), matrix, atol=1e-15)
+    np.testing.assert_allclose(to_camera(vectors), vectors @ matrix.T, atol=1e-15)
+    np.testing.assert_allclose(to_body(to_camera(vectors)), vectors)
+    by_product = (Q_ALIGN.inv() * sensor * Q_ALIGN).as_quat()
+    by_name = np.column_stack([to_body(sensor.as_quat()[:, :3]), sensor.as_quat()[:, 3]])
+    np.testing.assert_allclose(np.abs((by_product * by_name).sum(axis=1)), 1.0)
+    np.testing.assert_allclose(
+        Rotation.from_quat(by_name).as_matrix(), matrix.T @ sensor.as_matrix() @ matrix, atol=1e-12
+    )
+
+
+def test_a_yaw_of_30_degrees_is_one():
+    # turned left about the camera's own y axis, which points up
+    sensor = Rotation.from_euler("Y", 30, degrees=True)
+    stream = odometry_stream(*drive(0.0, 0.0, 0.0, n=2), CAMERA, 0.0)
+    x, y, z, w = sensor.as_quat()
+    quaternions = {
+        f"quaternion_{axis}_ratio": [start, value]
+        for axis, start, value in zip("xyzw", (0, 0, 0, 1), (x, y, z, w), strict=True)
+    }
+    seen = body_motion(with_channels(stream, **quaternions), CAMERA)
+    angles = np.degrees([seen.roll_rad[1], seen.pitch_rad[1], seen.yaw_rad[1]])
+    np.testing.assert_allclose(angles, [0.0, 0.0, 30.0], atol=1e-9)
+    imu_align = Rotation.from_euler("X", -90, degrees=True) * Rotation.from_euler("Z", -90, degrees=True)
+    printed = (imu_align * sensor).as_euler("ZYX", degrees=True)[::-1]
+    np.testing.assert_allclose(printed, [0.0, -60.0, -90.0], atol=1e-6)  # what (5.6) gives as printed
+
+
+def test_signs_of_what_the_camera_says():
+    nose_up = body_motion(odometry_stream(*drive(1.0, 0.0, 0.0, pitch=-0.1), CAMERA, 0.0), CAMERA)
+    np.testing.assert_allclose(nose_up.pitch_rad, -0.1)
+    np.testing.assert_allclose(nose_up.speed_mps, np.broadcast_to([1.0, 0.0], (1001, 2)), atol=1e-12)
+    for heading in np.radians([0.0, 30.0, 90.0, -135.0, 180.0]):
+        stream = odometry_stream(*drive(0.7, 0.2, 0.0, yaw_0=heading), CAMERA, 0.0)
+        seen = body_motion(stream, CAMERA)
+        np.testing.assert_allclose(seen.speed_mps, np.broadcast_to([0.7, 0.2], (1001, 2)), atol=1e-12)
+        np.testing.assert_allclose(seen.position_m[-1], [3.5, 1.0], atol=1e-9)
+    ahead = odometry_stream(*drive(0.7, 0.0, 0.0), CAMERA, 0.0)
+    np.testing.assert_allclose(ahead.channel("velocity_z_mps"), -0.7)  # z points backward
+    left = odometry_stream(*drive(0.0, 0.0, 0.5), CAMERA, 0.0)
+    np.testing.assert_allclose(left.channel("rate_y_radps"), 0.5)  # y points up
+    seen = body_motion(left, CAMERA)
+    np.testing.assert_allclose(seen.yaw_rate_radps, 0.5)
+    np.testing.assert_allclose(seen.yaw_rad[-1], 2.5)
+    # ahead of the origin and to its right: a left turn carries the camera forward and to the left
+    assert (seen.speed_mps > 0).all()
+
+
+def test_a_turn_on_the_spot_moves_the_camera_and_not_the_robot():
+    stream = odometry_stream(*drive(0.0, 0.0, 2.0, yaw_0=1.0), CAMERA, 0.3)
+    seen = body_motion(stream, CAMERA)
+    moved = np.linalg.norm(stream.values[:, [0, 2]] - stream.values[0, [0, 2]], axis=1)
+    assert moved.max() > 1.4  # twice the lever arm
+    np.testing.assert_allclose(seen.position_m, 0.0, atol=1e-9)
+    np.testing.assert_allclose(seen.yaw_rad[-1], 10.0)  # unwrapped
+    np.testing.assert_allclose(np.linalg.norm(seen.speed_mps, axis=1), 2.0 * np.hypot(*LEVER_M))
+
+
+def test_position_is_the_integral_of_speed():
+    time = np.arange(1001) * 0.005
+    plain = drive(1 + 0.3 * np.sin(time), 0.2 * np.cos(time), np.sin(2 * time), yaw_0=0.4)
+    seen = body_motion(odometry_stream(*plain, CAMERA, 0.4), CAMERA)
+    origin = seen.speed_mps - seen.yaw_rate_radps[:, None] * np.array([-LEVER_M[1], LEVER_M[0]])
+    ground = turn(origin, seen.yaw_rad)
+    walked = np.cumsum((ground[1:] + ground[:-1]) / 2 * 0.005, axis=0)
+    np.testing.assert_allclose(seen.position_m[1:], walked, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "quaternion", [(0, 0, 0, 0), (0, 0, 0, np.nan), (0.5, 0.5, 0.5, 0.9), (np.inf, 0, 0, 0)]
+)
+def test_what_is_no_rotation_is_unknown(quaternion):
+    plain = drive(1.0, 0.0, 0.5, yaw_0=0.3)
+    good = odometry_stream(*plain, CAMERA, 0.0)
+    rows = np.isin(np.arange(1001), [0, 1, 500])
+    bad = with_channels(
+        good,
+        **{
+            f"quaternion_{axis}_ratio": np.where(rows, value, good.channel(f"quaternion_{axis}_ratio"))
+            for axis, value in zip("xyzw", quaternion, strict=True)
+        },
+    )
+    seen, whole = body_motion(bad, CAMERA), body_motion(good, CAMERA)
+    for name in ("speed_mps", "yaw_rate_radps", "roll_rad", "pitch_rad", "yaw_rad", "position_m"):
+        value = getattr(seen, name)
+        assert np.isnan(value[rows]).all()
+        assert np.isfinite(value[~rows]).all()
+    np.testing.assert_allclose(seen.speed_mps[~rows], whole.speed_mps[~rows])
+    # zero is the first sample that is one
+    np.testing.assert_allclose(seen.yaw_rad[~rows], whole.yaw_rad[~rows] - whole.yaw_rad[2], atol=1e-12)
+    np.testing.assert_allclose(seen.position_m[2], 0.0, atol=1e-12)
+
+
+def test_a_stream_without_one_good_sample_is_unknown_throughout():
+    stream = odometry_stream(*drive(1.0, 0.0, 0.0, n=5), CAMERA, 0.0)
+    lost = with_channels(stream, quaternion_w_ratio=np.nan)
+    assert np.isnan(body_motion(lost, CAMERA).position_m).all()
+    empty = Stream([], np.zeros((0, len(stream.channels))), stream.channels)
+    assert body_motion(empty, CAMERA).speed_mps.shape == (0, 2)

@@ -1,0 +1,724 @@
+import math
+
+import numpy as np
+import pytest
+from scipy.integrate import quad, solve_ivp
+
+from terrain.errors import ConfigError
+from terrain.kinematics.swerve import wheel_commands
+from terrain.robots import load_robot
+from terrain.simulation.dynamic.vehicle import (
+    BODY_STATES,
+    DEFLECTION_DAMPING_S,
+    EFFECT_STATES,
+    FIELD_STEP_M,
+    GRAVITY_MPS2,
+    LATE,
+    LEG_FRICTION_NM,
+    LEG_RATE_RADPS,
+    N_BODY,
+    N_BODY_RECORD,
+    N_RECORD,
+    N_WHEEL,
+    ROLLING_SPEED_MPS,
+    ROUGHNESS_CUTOFF,
+    ROUGHNESS_WAVENUMBER,
+    STEP_S,
+    WHEEL_RECORD,
+    WHEEL_STATES,
+    advance,
+    make_plant,
+    settle,
+    start_state,
+)
+from terrain.simulation.sensors import Motion
+from terrain.terramechanics.soil import Soil, load_soil
+from terrain.terramechanics.traction import equilibrium_slip, friction_limit, ground_array, wheel_ground
+
+ROBOT = load_robot("agrimaro")
+GEOMETRY = ROBOT.wheel_radius_m, ROBOT.body.tyre_width_m, ROBOT.body.contact_length_m
+SUBSTEPS = 20
+STICKY = Soil(
+    "sticky",
+    "magic",
+    0.0,
+    0.0,
+    0.0,
+    stiffness_ratio=30.0,
+    shape_ratio=1.6,
+    peak_friction_ratio=1.5,
+    curvature_ratio=0.5,
+)
+
+
+def plant_of(*soils, roughness_m3=0.0, starts_m=(0.0,), play_rad=0.0, com_height_m=None, **changes):
+    """Return the plant of the robot on even ground without scatter; no play unless it is asked for."""
+    given = {
+        "payload_kg": 0.0,
+        "payload_m": (0.0, 0.0),
+        "radius_factors": np.ones(3),
+        "grade_ratio": (0.0, 0.0),
+        "swell_ratio": 0.0,
+        "swell_length_m": 15.0,
+        "leg_play_rad": 0.0,
+        "field": np.ones((2, 3, 1)),
+    }
+    plant = make_plant(
+        ROBOT,
+        grounds=np.array([ground_array(soil, *GEOMETRY) for soil in soils]),
+        roughness_m3=np.full(len(soils), roughness_m3),
+        patch_start_m=np.array(starts_m),
+        **given | changes,
+    )
+    if com_height_m is not None:
+        plant = plant._replace(
+            com_height_m=com_height_m,
+            load_per_force_ratio=plant.load_per_force_ratio * com_height_m / plant.com_height_m,
+        )
+    return plant._replace(play_rad=play_rad)
+
+
+def drive(plant, wheel_radps, steer_rad=None, seed=None, settled=False):
+    """Return what happened under commands (n, 3) at 50 Hz, from rest."""
+    wheel = np.array(wheel_radps, dtype=float)
+    steer = np.zeros_like(wheel) if steer_rad is None else np.array(steer_rad, dtype=float)
+    n = len(wheel) * SUBSTEPS
+    noise = np.zeros((n, 3)) if seed is None else np.random.default_rng(seed).standard_normal((n, 3))
+    record, state = np.empty((n, N_RECORD)), start_state(plant, np.zeros(3))
+    if settled:
+        settle(plant, state)
+    advance(plant, state, wheel, steer, SUBSTEPS, noise, record)
+    return Motion(record)
+
+
+def ramp(duration_s, radps=5.0, rise_s=1.0):
+    """Return equal wheel commands (n, 3) that rise to a rate in that time."""
+    return np.repeat(
+        radps * np.minimum(np.arange(round(duration_s * 50)) / 50 / rise_s, 1.0)[:, None], 3, axis=1
+    )
+
+
+def smoothly(plant, wheel_radps):
+    """Return what happens straight ahead under commands (n,) at 1 kHz: those that come in steps jerk."""
+    n = len(wheel_radps)
+    record, state = np.empty((n, N_RECORD)), start_state(plant, np.zeros(3))
+    wheel = np.repeat(wheel_radps[:, None], 3, axis=1)
+    advance(plant, state, wheel, np.zeros((n, 3)), 1, np.zeros((n, 3)), record)
+    return Motion(record)
+
+
+def steady_slip(plant, radps=5.0, duration_s=10.0):
+    return drive(plant, ramp(duration_s, radps), settled=True).wheel("slip_ratio")[-1]
+
+
+def reference(plant, wheel_radps, steer_rad, substeps, noise, dt_s=STEP_S, steer_0=0.0):
+    """Return speeds of the centre of mass, yaw, wheel rates, loads, slips and torques (n, ...): plain numpy.
+
+    Written from the equations of the module's docstring; loads come of solving the balance of moments.
+    """
+    x, y = (plant.wheels_m - plant.com_m).T
+    mass, height = plant.mass_kg, plant.com_height_m
+    balance = np.vstack([np.ones(3), plant.wheels_m.T])
+    v, accel, yaw, turn, path = np.zeros(2), np.zeros(2), 0.0, 0.0, 0.0
+    rate, motor, motor_rate, torque, integral, estimate = np.zeros((6, 3))
+    road, contact, ride, ride_rate, angle, count, reported = np.zeros((7, 3))
+    deflection, steer, leg = np.zeros((2, 3)), np.full(3, steer_0), 0.0
+    rows = []
+    for k in range(len(noise)):
+        c, s = math.cos(yaw), math.sin(yaw)
+        swell = plant.swell_ratio * math.sin(2 * math.pi * path / plant.swell_length_m)
+        world = plant.grade_ratio + np.array([swell, 0.0])
+        grade = np.array([[c, s], [-s, c]]) @ world
+        normal_g = GRAVITY_MPS2 / math.sqrt(1 + grade @ grade)
+
+        error = steer_rad[k // substeps] - motor
+        wanted = np.sign(error) * np.sqrt(2 * plant.steer_accel_max_radps2 * abs(error))
+        wanted = np.clip(wanted, -plant.steer_rate_max_radps, plant.steer_rate_max_radps)
+        wanted = np.where(abs(error) < 1e-4, error / dt_s, wanted)
+        most = plant.steer_accel_max_radps2 * dt_s
+        motor_rate = motor_rate + np.clip(wanted - motor_rate, -most, most)
+        motor = motor + dt_s * motor_rate
+        steer = np.clip(steer, motor - plant.play_rad, motor + plant.play_rad)
+
+        heading = steer + np.array([0.0, 0.0, leg])
+        ahead = np.array([np.cos(heading), np.sin(heading)])
+        left = np.array([-ahead[1], ahead[0]])
+        centre = np.array([v[0] - turn * y, v[1] + turn * x])
+        along, across = (ahead * centre).sum(axis=0), (left * centre).sum(axis=0)
+        rim = rate * plant.radius_m
+        fastest = np.maximum(abs(rim), abs(along))
+
+        speed = math.hypot(*v)
+        reach = plant.wheels_m @ v / speed if speed > 0.05 else np.zeros(3)
+        patch = np.maximum(np.searchsorted(plant.patch_start_m, path + reach, side="right") - 1, 0)
+
+        rolled = np.hypot(along, across)
+        white = noise[k] / math.sqrt(2 * dt_s)
+        road = road + dt_s * 2 * math.pi * (
+            ROUGHNESS_WAVENUMBER * np.sqrt(plant.roughness_m3[patch] * rolled) * white
+            - ROUGHNESS_CUTOFF * rolled * road
+        )
+        contact_rate = (road - contact) * np.minimum(2 * rolled / plant.contact_length_m, 1 / dt_s)
+        contact = contact + dt_s * contact_rate
+        ride_n = plant.ride_stiffness_npm * (contact - ride) + plant.ride_damping_nspm * (
+            contact_rate - ride_rate
+        )
+        ride_rate = ride_rate + dt_s * ride_n / (mass * plant.load_share)
+        ride = ride + dt_s * ride_rate
+
+        pushed = mass * (accel + normal_g * grade)  # what the ground gives along the body's axes
+        arms = mass * normal_g * plant.com_m - height * pushed
+        normal = np.maximum(np.linalg.solve(balance, [mass * normal_g, *arms]) + ride_n, 0.0)
+
+        def creep(rim, along=along, across=across, fastest=fastest, deflection=deflection):
+            return np.array([rim - along, -across]) - fastest / plant.relaxation_m * deflection
+
+        slip = (deflection + DEFLECTION_DAMPING_S * creep(rim)) / plant.relaxation_m
+        got = np.array(
+            [
+                wheel_ground(plant.grounds[patch[i]], normal[i], np.clip(slip[0, i], -1, 1), slip[1, i])
+                for i in range(3)
+            ]
+        ).T
+        cell = min(int(path / FIELD_STEP_M), plant.field.shape[2] - 1)
+        thrust, side = got[:2] * plant.field[0, :, cell]
+        pull = thrust - got[2] * plant.field[1, :, cell] * np.tanh(along / ROLLING_SPEED_MPS)
+        force = ahead * pull + left * side
+        moment = (x * force[1] - y * force[0]).sum()
+
+        lag = wheel_radps[k // substeps].clip(-plant.speed_max_radps, plant.speed_max_radps) - estimate
+        asked = plant.speed_gain * lag + integral
+        free = (abs(asked) <= plant.torque_max_nm) | (asked * lag < 0)
+        integral = integral + np.where(free, dt_s * plant.speed_integral * lag, 0.0)
+        asked = np.clip(asked, -plant.torque_max_nm, plant.torque_max_nm)
+        torque = torque + (asked - torque) * dt_s / plant.torque_time_constant_s
+        rest = torque - plant.friction_nm * np.tanh(rate / 0.1) - thrust * plant.radius_m
+        rows.append(
+            [*v, yaw, turn, path, *rate, *heading, *normal, *(rim - along), *torque, *ride, *reported, *patch]
+        )
+        rate = rate + dt_s * rest / plant.wheel_inertia_kgm2
+        estimate = estimate + (rate - estimate) * dt_s / plant.estimate_time_constant_s
+        angle = angle + dt_s * rate
+        seen = np.floor(angle * plant.hall_steps) - count
+        count = count + seen
+        reported = (
+            reported + (seen / plant.hall_steps / dt_s - reported) * dt_s / plant.report_time_constant_s
+        )
+        slide = creep(rate * plant.radius_m)
+        deflection = np.clip(deflection + dt_s * slide, -plant.relaxation_m, plant.relaxation_m)
+
+        leg_nm = -plant.wheels_m[2, 1] * force[0, 2]
+        if abs(leg_nm) > LEG_FRICTION_NM:
+            swung = leg + dt_s * LEG_RATE_RADPS * np.sign(leg_nm)
+            leg = float(np.clip(swung, -plant.leg_play_rad, plant.leg_play_rad))
+        accel = force.sum(axis=1) / mass - normal_g * grade
+        v = v + dt_s * (accel + turn * np.array([v[1], -v[0]]))
+        turn = turn + dt_s * moment / plant.yaw_inertia_kgm2
+        yaw = yaw + dt_s * turn
+        path = path + dt_s * math.hypot(v[0] + turn * plant.com_m[1], v[1] - turn * plant.com_m[0])
+    names = ("speed_x", "speed_y", "yaw", "turn", "path")
+    wheels = ("rate", "steer", "normal", "sliding", "torque", "ride", "reported", "patch")
+    table = np.array(rows)
+    return {name: table[:, i] for i, name in enumerate(names)} | {
+        name: table[:, 5 + 3 * i : 8 + 3 * i] for i, name in enumerate(wheels)
+    }
+
+
+def test_a_drive_with_everything_in_it_is_that_of_the_plain_form():
+    rng = np.random.default_rng(3)
+    plant = plant_of(
+        load_soil("tiles"),
+        load_soil("clay"),
+        load_soil("grass"),
+        roughness_m3=5e-4,
+        starts_m=(0.0, 0.2, 0.6),
+        play_rad=0.02,
+        payload_kg=25.0,
+        payload_m=(0.1, -0.08),
+        radius_factors=np.array([1.01, 0.99, 1.0]),
+        grade_ratio=(0.04, -0.06),
+        swell_ratio=0.03,
+        swell_length_m=2.0,
+        leg_play_rad=0.03,
+        field=rng.uniform(0.8, 1.2, (2, 3, 9)),
+    )
+    wheel, steer = 6 * rng.random((75, 3)), np.cumsum(0.1 * rng.standard_normal((75, 3)), axis=0)
+    wheel[:5] *= -1.0
+    noise = rng.standard_normal((75 * SUBSTEPS, 3))
+    plain = reference(plant, wheel, steer, SUBSTEPS, noise, steer_0=0.015)
+    record, state = np.empty((len(noise), N_RECORD)), start_state(plant, np.full(3, 0.015))
+    advance(plant, state, wheel, steer, SUBSTEPS, noise, record)
+    motion = Motion(record)
+    assert plain["path"][-1] > 0.7  # on all three grounds
+    assert np.ptp(motion.body("leg_rad")) > 0.03  # and through its play
+    for name, twin in (("yaw_rad", "yaw"), ("yaw_rate_radps", "turn"), ("path_m", "path")):
+        np.testing.assert_allclose(motion.body(name), plain[twin], rtol=0, atol=1e-9, err_msg=name)
+    np.testing.assert_allclose(
+        motion.body("speed_x_mps"), plain["speed_x"] + plain["turn"] * plant.com_m[1], rtol=0, atol=1e-9
+    )
+    np.testing.assert_allclose(
+        motion.body("speed_y_mps"), plain["speed_y"] - plain["turn"] * plant.com_m[0], rtol=0, atol=1e-9
+    )
+    for name, twin, atol in (
+        ("wheel_radps", "rate", 1e-9),
+        ("steer_rad", "steer", 1e-12),
+        ("normal_n", "normal", 1e-6),
+        ("torque_nm", "torque", 1e-7),
+        ("patch_ratio", "patch", 0),
+    ):
+        np.testing.assert_allclose(motion.wheel(name), plain[twin], rtol=0, atol=atol, err_msg=name)
+    np.testing.assert_allclose(motion.wheel("reported_radps")[:-1], plain["reported"][1:], rtol=0, atol=1e-7)
+    # acceleration at the origin is what its speed does
+    turn, along, across = (motion.body(name) for name in ("yaw_rate_radps", "speed_x_mps", "speed_y_mps"))
+    told = [motion.body(name)[:-1] for name in ("accel_x_mps2", "accel_y_mps2")]
+    np.testing.assert_allclose(told[0], np.diff(along) / STEP_S - (turn * across)[:-1], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(told[1], np.diff(across) / STEP_S + (turn * along)[:-1], rtol=0, atol=1e-9)
+    # roll and pitch of the plane through the corners
+    roll = (plain["ride"][:, :2].mean(axis=1) - plain["ride"][:, 2]) / 0.756
+    np.testing.assert_allclose(motion.body("ride_roll_rad"), roll, rtol=0, atol=1e-9)
+    pitch = (plain["ride"][:, 0] - plain["ride"][:, 1]) / 1.015
+    np.testing.assert_allclose(motion.body("ride_pitch_rad"), pitch, rtol=0, atol=1e-9)
+
+
+def test_a_drive_in_two_parts_is_one_drive():
+    plant = plant_of(
+        load_soil("grass"), roughness_m3=1e-3, grade_ratio=(0.05, 0.02), play_rad=0.02, leg_play_rad=0.02
+    )
+    rng = np.random.default_rng(0)
+    wheel, steer, noise = 5 * rng.random((20, 3)), 0.3 * rng.random((20, 3)), rng.standard_normal((400, 3))
+    whole, parts = np.empty((400, N_RECORD)), np.empty((400, N_RECORD))
+    one, two = start_state(plant, np.zeros(3)), start_state(plant, np.zeros(3))
+    advance(plant, one, wheel, steer, SUBSTEPS, noise, whole)
+    for part in range(20):
+        rows = slice(part * SUBSTEPS, (part + 1) * SUBSTEPS)
+        advance(
+            plant, two, wheel[part : part + 1], steer[part : part + 1], SUBSTEPS, noise[rows], parts[rows]
+        )
+    np.testing.assert_array_equal(one, two)
+    np.testing.assert_array_equal(whole, parts)
+
+
+def test_a_straight_start_is_that_of_the_equations_integrated_by_scipy():
+    """With the centre of mass on the ground no load is transferred: one wheel stands for all."""
+    soil = load_soil("grass")
+    plant = plant_of(soil, com_height_m=0.0)
+    load_n = plant.mass_kg * GRAVITY_MPS2 / 3
+    radius, sigma, ground = ROBOT.wheel_radius_m, plant.relaxation_m, plant.grounds[0]
+
+    def change(t, state):
+        v, rate, deflection, torque, integral, estimate = state
+        rim = rate * radius
+        creep = rim - v - max(abs(rim), abs(v)) / sigma * deflection
+        thrust, _, resistance, _ = wheel_ground(
+            ground, load_n, (deflection + DEFLECTION_DAMPING_S * creep) / sigma, 0.0
+        )
+        lag = 5.0 * min(t, 1.0) - estimate
+        return [
+            3 * (thrust - resistance * math.tanh(v / ROLLING_SPEED_MPS)) / plant.mass_kg,
+            (torque - plant.friction_nm * math.tanh(rate / 0.1) - thrust * radius) / plant.wheel_inertia_kgm2,
+            creep,
+            (plant.speed_gain * lag + integral - torque) / plant.torque_time_constant_s,
+            plant.speed_integral * lag,
+            (rate - estimate) / plant.estimate_time_constant_s,
+        ]
+
+    exact = solve_ivp(
+        change, (0, 3), np.zeros(6), method="LSODA", rtol=1e-8, atol=1e-10, max_step=0.005, dense_output=True
+    )
+    # commands are held, not drawn out: at 1 kHz they are a ramp
+    wheel = ramp(60.0, rise_s=20.0)
+    record, state = np.empty((3000, N_RECORD)), start_state(plant, np.zeros(3))
+    advance(plant, state, wheel, np.zeros_like(wheel), 1, np.zeros((3000, 3)), record)
+    motion = Motion(record)
+    v, rate = exact.sol(motion.time_s)[:2]
+    assert np.abs(motion.body("speed_x_mps") - v).max() < 0.004
+    assert np.abs(motion.wheel("wheel_radps") - rate[:, None]).max() < 0.03
+    assert np.abs(motion.body("speed_y_mps")).max() < 1e-9
+    late = motion.time_s > 2.5
+    assert np.abs(motion.body("speed_x_mps") - v)[late].max() < 3e-5
+
+
+def test_half_the_step_changes_little():
+    plant = plant_of(load_soil("firm_soil_gravel"), grade_ratio=(0.03, 0.03))
+    wheel = ramp(2.0)
+    steer = np.repeat(0.3 * np.sin(np.arange(100) / 15)[:, None], 3, axis=1) * [-1.0, 1.0, 0.0]
+    runs = [
+        reference(plant, wheel, steer, n, np.zeros((100 * n, 3)), 0.02 / n) for n in (SUBSTEPS, 2 * SUBSTEPS)
+    ]
+    for name, atol in (("speed_x", 3e-3), ("speed_y", 3e-3), ("turn", 5e-3), ("path", 2e-3), ("rate", 0.04)):
+        coarse, fine = runs[0][name], runs[1][name][::2]
+        assert np.abs(coarse - fine).max() < atol, name
+        assert np.abs(fine).max() > 10 * atol or name == "speed_y", name
+
+
+@pytest.mark.parametrize(
+    "name", ["asphalt", "tiles", "snow", "grass", "firm_soil_gravel", "clay", "dry_sand"]
+)
+@pytest.mark.parametrize("grade", [0.0, 0.03, -0.03])
+def test_steady_slip_is_that_at_which_a_wheel_pulls_its_share_of_the_hill(name, grade):
+    soil = load_soil(name)
+    plant = plant_of(soil, grade_ratio=(grade, 0.0), com_height_m=0.0)
+    load_n = plant.mass_kg * GRAVITY_MPS2 / math.hypot(1.0, grade) / 3
+    expected = equilibrium_slip(soil, load_n, load_n * grade, *GEOMETRY)
+    np.testing.assert_allclose(steady_slip(plant, duration_s=15.0), expected, atol=1e-4)
+
+
+@pytest.mark.parametrize("name", ["grass", "clay", "dry_sand", "tilled_loam"])
+def test_slip_rises_with_the_hill_and_on_soil_that_yields_with_the_load(name):
+    soil = load_soil(name)
+    down, level, up = (steady_slip(plant_of(soil, grade_ratio=(g, 0.0))).mean() for g in (-0.04, 0.0, 0.04))
+    assert down < level - 0.01 < level + 0.01 < up
+    loaded = steady_slip(plant_of(soil, payload_kg=30.0)).mean()
+    if name == "grass":
+        assert loaded > level  # its cohesion does not grow with the load
+    else:
+        assert loaded > level + 0.002
+
+
+def test_loads_are_those_of_the_balance_of_moments():
+    grade = np.array([0.06, -0.04])
+    plant = plant_of(load_soil("tiles"), grade_ratio=tuple(grade), payload_kg=20.0, payload_m=(0.05, 0.1))
+    wheel, steer = ramp(4.0, 6.0), np.tile([-0.2, 0.2, 0.0], (200, 1))
+    motion = drive(plant, wheel, steer, settled=True)
+    normal = motion.wheel("normal_n")
+    yaw, turn = motion.body("yaw_rad"), motion.body("yaw_rate_radps")
+    assert np.ptp(yaw) > 0.5
+    mass, g = 110.0, GRAVITY_MPS2 / math.sqrt(1 + grade @ grade)
+    com = np.array([0.0, -0.252]) + 20 / 110 * np.array([0.05, 0.1])
+    np.testing.assert_allclose(normal.sum(axis=1), mass * g, rtol=1e-12)
+    # acceleration of the centre of mass from the speeds alone
+    v = np.column_stack(
+        [motion.body("speed_x_mps") - turn * com[1], motion.body("speed_y_mps") + turn * com[0]]
+    )
+    accel = np.diff(v, axis=0) / STEP_S + turn[:-1, None] * np.column_stack([-v[:-1, 1], v[:-1, 0]])
+    c, s = np.cos(yaw[1:]), np.sin(yaw[1:])  # a load is that of the force of the step before
+    pushed = accel + g * np.column_stack([c * grade[0] + s * grade[1], -s * grade[0] + c * grade[1]])
+    arm_x = (normal @ ROBOT.wheel_positions_m[:, 0]) / mass
+    arm_y = (normal @ ROBOT.wheel_positions_m[:, 1]) / mass
+    np.testing.assert_allclose(arm_x[1:-1], g * com[0] - 0.5 * pushed[:-1, 0], atol=1e-9)
+    np.testing.assert_allclose(arm_y[1:-1], g * com[1] - 0.5 * pushed[:-1, 1], atol=1e-9)
+
+
+def test_a_steady_start_lightens_the_front_wheel_by_m_a_h_over_the_wheelbase():
+    motion = drive(plant_of(STICKY), ramp(3.0, 9.0, rise_s=4.5))  # 2 rad/s2, 0.4 m/s2
+    rear, front, third = motion.wheel("normal_n")[-1000:].mean(axis=0)  # commands come in steps of 20 ms
+    assert motion.body("accel_x_mps2")[-1000:].mean() == pytest.approx(0.4, rel=5e-3)
+    assert rear - front == pytest.approx(2 * 90.0 * 0.4 * 0.5 / 1.015, rel=5e-3)
+    assert third == pytest.approx(90.0 * GRAVITY_MPS2 / 3, rel=1e-3)
+
+
+def test_at_rest_on_the_level_nothing_at_all_happens():
+    motion = drive(plant_of(load_soil("grass"), roughness_m3=1e-3, play_rad=0.02), np.zeros((100, 3)), seed=0)
+    assert np.ptp(np.nan_to_num(motion.record), axis=0).max() == 0.0
+    assert np.isnan(motion.wheel("slip_ratio")).all()
+    assert np.isnan(motion.wheel("slip_angle_rad")).all()
+    plant = plant_of(load_soil("grass"))
+    state = start_state(plant, np.zeros(3))
+    settle(plant, state)
+    np.testing.assert_array_equal(state, start_state(plant, np.zeros(3)))
+
+
+@pytest.mark.parametrize("name", ["tiles", "grass", "snow", "dry_sand"])
+@pytest.mark.parametrize("way_rad", [0.0, 1.5, 2.4, 4.0])
+def test_at_rest_on_a_slope_of_5_degrees_it_stays(name, way_rad):
+    tan = math.tan(math.radians(5.0))
+    plant = plant_of(
+        load_soil(name), grade_ratio=(tan * math.cos(way_rad), tan * math.sin(way_rad)), play_rad=0.02
+    )
+    motion = drive(plant, np.zeros((500, 3)), settled=True)
+    moved_m = np.hypot(motion.body("position_x_m"), motion.body("position_y_m"))
+    assert moved_m.max() < 5e-3  # sand, whose resistance is a viscous one at a crawl, takes its time
+    assert moved_m[-1] - moved_m[-1001] < 1e-4
+    assert np.abs(motion.body("yaw_rad")).max() < 1e-3
+    assert np.abs(motion.body("accel_x_mps2")).max() < 0.02
+    assert np.abs(motion.body("accel_y_mps2")).max() < 0.02
+    np.testing.assert_allclose(
+        motion.wheel("normal_n").sum(axis=1), 90 * GRAVITY_MPS2 * math.cos(math.radians(5.0))
+    )
+
+
+def test_mirrored_commands_give_mirrored_motion():
+    """Fore and aft are alike: wheels 1 and 2 change places, angles and rates their signs."""
+    rng = np.random.default_rng(2)
+    wheel, steer = 5 * rng.random((100, 3)), np.cumsum(0.08 * rng.standard_normal((100, 3)), axis=0)
+    noise, swap = rng.standard_normal((2000, 3)), [1, 0, 2]
+    motions = []
+    for sign, order in ((1.0, [0, 1, 2]), (-1.0, swap)):
+        plant = plant_of(
+            load_soil("grass"), roughness_m3=1e-3, grade_ratio=(sign * 0.05, 0.03), play_rad=0.02
+        )
+        record, state = np.empty((2000, N_RECORD)), start_state(plant, np.zeros(3))
+        args = (np.ascontiguousarray(sign * a[:, order]) for a in (wheel, steer))
+        advance(plant, state, *args, SUBSTEPS, np.ascontiguousarray(noise[:, order]), record)
+        motions.append(Motion(record))
+    there, mirrored = motions
+    for name, sign in (
+        ("position_x_m", -1),
+        ("position_y_m", 1),
+        ("yaw_rad", -1),
+        ("speed_x_mps", -1),
+        ("yaw_rate_radps", -1),
+        ("accel_y_mps2", 1),
+        ("ride_z_mps2", 1),
+        ("ride_roll_rad", 1),
+        ("ride_pitch_rad", -1),
+    ):
+        np.testing.assert_allclose(
+            mirrored.body(name), sign * there.body(name), rtol=0, atol=1e-7, err_msg=name
+        )
+    for name, sign in (
+        ("wheel_radps", -1),
+        ("steer_rad", -1),
+        ("normal_n", 1),
+        ("slip_ratio", -1),
+        ("torque_nm", -1),
+    ):
+        np.testing.assert_allclose(
+            mirrored.wheel(name), sign * there.wheel(name)[:, swap], rtol=0, atol=1e-4, err_msg=name
+        )
+
+
+@pytest.mark.parametrize(
+    "twist",
+    [(0.8, 0.0, 0.0), (-0.6, 0.0, 0.3), (0.0, 0.5, 0.0), (0.4, -0.3, -0.2), (0.0, 0.0, 0.6), (0.5, 0.2, 0.5)],
+)
+def test_where_nothing_slips_the_twist_is_the_one_told(twist):
+    plant = plant_of(STICKY, com_height_m=0.0)
+    wanted = np.tile(twist, (300, 1)) * np.minimum(np.arange(300) / 75, 1.0)[:, None]
+    _, wheel, steer = wheel_commands(ROBOT.wheel_positions_m, 0.2, 10.0, 2.0, 0.02, wanted, np.zeros(3))
+    motion = drive(plant, wheel, steer)
+    reached = [motion.body(name)[-1] for name in ("speed_x_mps", "speed_y_mps", "yaw_rate_radps")]
+    np.testing.assert_allclose(reached, twist, atol=5e-3)
+    np.testing.assert_allclose(motion.wheel("slip_ratio")[-1], 0.0, atol=6e-3)
+
+
+def test_what_the_motors_give_is_what_is_stored_lifted_and_lost():
+    soil, grade = load_soil("grass"), 0.05
+    plant = plant_of(soil, grade_ratio=(grade, 0.0))
+    motion = drive(plant, np.vstack([ramp(4.0), ramp(2.0, -3.0), ramp(2.0)]), settled=True)
+    rate, thrust = motion.wheel("wheel_radps"), motion.wheel("traction_n")
+    along = (
+        motion.body("speed_x_mps")[:, None]
+        - motion.body("yaw_rate_radps")[:, None] * ROBOT.wheel_positions_m[:, 1]
+    )
+    resistance = soil.rolling_resistance_ratio * motion.wheel("normal_n") * np.tanh(along / ROLLING_SPEED_MPS)
+    given = (motion.wheel("torque_nm") * rate).sum() * STEP_S
+    friction = (plant.friction_nm * np.tanh(rate / 0.1) * rate).sum() * STEP_S
+    rolling = (resistance * along).sum() * STEP_S
+    slipping = (thrust * (0.2 * rate - along)).sum() * STEP_S
+    lifted = 90 * GRAVITY_MPS2 * grade / math.hypot(1, grade) * motion.body("position_x_m")[-1]
+    speed = motion.body("speed_x_mps")[-1]
+    stored = 0.5 * 90 * speed**2 + 0.5 * plant.wheel_inertia_kgm2 * (rate[-1] ** 2).sum()
+    assert min(friction, rolling, slipping, stored) > 1.0
+    assert given == pytest.approx(stored + lifted + friction + rolling + slipping, rel=5e-3)
+    assert given > lifted + friction + rolling
+
+
+@pytest.mark.parametrize("leg_play_rad", [0.0, 0.03])
+def test_what_the_motors_give_in_curves_is_lost_in_the_contacts_to_the_side_as_well(leg_play_rad):
+    soil = load_soil("grass")
+    plant = plant_of(soil, leg_play_rad=leg_play_rad)
+    at = np.arange(400)[:, None]
+    steer = np.clip(0.8 * np.sin(at / 60), -0.5, 0.5) * [-1.0, 1.0, 0.4]
+    motion = drive(plant, ramp(8.0, 7.0), steer, settled=True)
+    turn, heading, rate = (
+        motion.body("yaw_rate_radps"),
+        motion.wheel("steer_rad"),
+        motion.wheel("wheel_radps"),
+    )
+    x, y = ROBOT.wheel_positions_m.T
+    centre_x = motion.body("speed_x_mps")[:, None] - turn[:, None] * y
+    centre_y = motion.body("speed_y_mps")[:, None] + turn[:, None] * x
+    along = np.cos(heading) * centre_x + np.sin(heading) * centre_y
+    across = -np.sin(heading) * centre_x + np.cos(heading) * centre_y
+    thrust, side = motion.wheel("traction_n"), motion.wheel("side_n")
+    resistance = soil.rolling_resistance_ratio * motion.wheel("normal_n") * np.tanh(along / ROLLING_SPEED_MPS)
+    given = (motion.wheel("torque_nm") * rate).sum() * STEP_S
+    friction = (plant.friction_nm * np.tanh(rate / 0.1) * rate).sum() * STEP_S
+    rolling = (resistance * along).sum() * STEP_S
+    slipping = (thrust * (0.2 * rate - along)).sum() * STEP_S
+    sliding = (side * -across).sum() * STEP_S
+    v = np.array([motion.body("speed_x_mps")[-1] - turn[-1] * plant.com_m[1], motion.body("speed_y_mps")[-1]])
+    stored = 0.5 * (90 * v @ v + 20.0 * turn[-1] ** 2 + plant.wheel_inertia_kgm2 * rate[-1] @ rate[-1])
+    assert sliding > 0.02 * given
+    assert given == pytest.approx(stored + friction + rolling + slipping + sliding, rel=5e-3)
+
+
+def test_the_third_leg_swings_to_where_its_wheel_is_pushed_and_no_further():
+    play_rad = 0.03
+    plant = plant_of(load_soil("grass"), leg_play_rad=play_rad)
+    wanted = np.interp(np.arange(3500) * STEP_S, [0.0, 0.5, 1.5, 2.5, 3.5], [0.0, 0.0, 5.0, 5.0, 0.0])
+    motion = smoothly(plant, wanted)
+    leg, heading, t = motion.body("leg_rad"), motion.wheel("steer_rad"), motion.time_s
+    assert np.abs(np.diff(leg)).max() <= LEG_RATE_RADPS * STEP_S * (1 + 1e-9)
+    assert not leg[t < 0.5].any()
+    # a start pushes the wheel, on the right, forward: the leg to the left
+    assert (leg[(t > 0.9) & (t < 1.5)] == play_rad).all()
+    assert (leg[(t > 2.9) & (t < 3.4)] == -play_rad).all()  # braking: the other way
+    crossing_s = (np.flatnonzero(leg == play_rad)[0] - np.flatnonzero(leg)[0] + 1) * STEP_S
+    assert crossing_s >= play_rad / LEG_RATE_RADPS - STEP_S
+    np.testing.assert_array_equal(heading[:, 2], leg)  # nothing was steered
+    assert not heading[:, :2].any()
+
+
+def test_a_leg_that_is_hardly_pushed_stays_where_it_is():
+    slow = 0.5 * LEG_FRICTION_NM / 0.756 / 30.0  # half of what moves it, on a third of the mass
+    plant = plant_of(STICKY, leg_play_rad=0.03, com_height_m=0.0)
+    motion = smoothly(plant, slow / 0.2 * np.arange(4000) * STEP_S)
+    assert motion.body("speed_x_mps")[-1] == pytest.approx(4.0 * slow, rel=0.1)
+    assert not motion.body("leg_rad").any()
+
+
+@pytest.mark.parametrize("name", ["snow", "grass"])
+def test_the_ground_gives_no_more_than_friction(name):
+    soil, grade = load_soil(name), np.array([0.05, 0.1])
+    plant = plant_of(soil, grade_ratio=tuple(grade))
+    rng = np.random.default_rng(5)
+    wheel, steer = (
+        np.repeat(rng.uniform(-10, 10, (30, 3)), 15, axis=0),
+        np.repeat(rng.uniform(-3, 3, (30, 3)), 15, axis=0),
+    )
+    motion = drive(plant, wheel, steer)
+    normal, turn, yaw = motion.wheel("normal_n"), motion.body("yaw_rate_radps"), motion.body("yaw_rad")[:-1]
+    area, tan = GEOMETRY[1] * GEOMETRY[2], math.tan(soil.friction_angle_rad)
+    limit = (
+        soil.peak_friction_ratio * normal
+        if soil.law == "magic"
+        else friction_limit(normal, area, soil.cohesion_pa, tan)
+    )
+    assert (np.abs(motion.wheel("traction_n")) <= limit * (1 + 1e-12)).all()
+    assert (np.abs(motion.wheel("torque_nm")) <= plant.torque_max_nm).all()
+    v = np.column_stack([motion.body("speed_x_mps") - turn * plant.com_m[1], motion.body("speed_y_mps")])
+    accel = np.diff(v, axis=0) / STEP_S + turn[:-1, None] * np.column_stack([-v[:-1, 1], v[:-1, 0]])
+    c, s = np.cos(yaw), np.sin(yaw)
+    uphill = np.column_stack([c * grade[0] + s * grade[1], -s * grade[0] + c * grade[1]]) / math.sqrt(
+        1 + grade @ grade
+    )
+    pushed = 90 * np.linalg.norm(accel + GRAVITY_MPS2 * uphill, axis=1)
+    most = limit.sum(axis=1) + soil.rolling_resistance_ratio * normal.sum(axis=1)
+    assert (pushed <= most[:-1] + 1e-6).all()
+    assert pushed.max() > 0.5 * most.max()  # it was driven near the limit
+
+
+def test_a_slope_beyond_friction_is_not_climbed():
+    snow = load_soil("snow")
+    assert drive(plant_of(snow, grade_ratio=(0.2, 0.0)), ramp(6.0)).body("position_x_m")[-1] > 2.0
+    beyond = drive(plant_of(snow, grade_ratio=(0.32, 0.0)), ramp(6.0))
+    assert beyond.body("speed_x_mps")[-1] < 0.0
+    assert (beyond.wheel("slip_ratio")[-1] > 0.9).all()
+
+
+def test_the_speed_loop_reaches_its_speed_and_does_not_wind_up():
+    motion = drive(plant_of(STICKY), np.full((200, 3), 30.0))  # three times what it can
+    torque, rate = motion.wheel("torque_nm"), motion.wheel("wheel_radps")
+    assert 59.0 < torque.max() <= 60.0
+    assert rate.max() < 12.0
+    np.testing.assert_allclose(rate[-1], 10.0, atol=0.02)
+    # too weak for the hill it rolls back for two seconds; told to go that way, it does so at once
+    weak = plant_of(STICKY, grade_ratio=(0.05, 0.0))._replace(torque_max_nm=2.0)
+    torque = drive(weak, np.vstack([np.full((100, 3), 5.0), np.full((20, 3), -9.0)])).wheel("torque_nm")
+    np.testing.assert_allclose(torque[500:2000], 2.0, rtol=1e-6)
+    assert (torque[2100:] < -1.9).all()
+
+
+def test_steering_keeps_its_limits_overshoots_nothing_and_hangs_in_its_play():
+    steer = np.tile([1.2, -0.7, 0.05], (100, 1))
+    steer[60:] = 0.0
+    motion = drive(plant_of(load_soil("tiles"), play_rad=0.02), np.zeros((100, 3)), steer)
+    angle = motion.wheel("steer_rad")
+    assert np.abs(np.diff(angle, axis=0)).max() <= 2.0944 * STEP_S * (1 + 1e-9)
+    assert np.abs(np.diff(angle[:1150, 0], n=2)).max() < 2.1 * STEP_S  # it picks the wheel up, no more
+    # it stops short by the play on either way
+    np.testing.assert_allclose(angle[1199], [1.18, -0.68, 0.03], atol=1.5e-3)
+    np.testing.assert_allclose(angle[-1], [0.02, -0.02, 0.02], atol=1.5e-3)
+    assert (angle.max(axis=0) <= [1.1815, 0.0, 0.0315]).all()
+    # fastest move: the rate limit and two ramps, but for the last hundredth
+    fastest_s = 1.2 / 2.0944 + 2.0944 / 20 - math.sqrt(2 * 0.01 / 20)
+    assert np.flatnonzero(angle[:, 0] > 1.17)[0] * STEP_S == pytest.approx(fastest_s, abs=0.005)
+
+
+def test_each_wheel_changes_ground_where_it_stands():
+    plant = plant_of(load_soil("tiles"), load_soil("grass"), starts_m=(0.0, 2.0))
+    motion = drive(plant, ramp(5.0))
+    patch, path = motion.wheel("patch_ratio"), motion.body("path_m")
+    crossed = [path[np.flatnonzero(patch[:, i])[0]] for i in range(3)]
+    np.testing.assert_allclose(crossed, [2.5075, 1.4925, 2.0], atol=2e-3)
+    assert (np.diff(patch, axis=0) >= 0).all()
+    assert motion.wheel("slip_ratio")[-1].mean() > 0.1 > motion.wheel("slip_ratio")[2000].mean()
+
+
+def test_hall_steps_show_at_a_crawl_and_tell_the_rate_in_the_mean():
+    crawl = drive(plant_of(load_soil("tiles")), ramp(10.0, 0.05))
+    reported, rate = crawl.wheel("reported_radps")[5000:], crawl.wheel("wheel_radps")[5000:]
+    steps = np.diff(reported, axis=0).max(axis=0)
+    np.testing.assert_allclose(steps, 2 * math.pi / 900 / 0.05, rtol=0.02)  # one step through the low-pass
+    assert reported.std() > 0.5 * rate.mean()
+    fast = drive(plant_of(load_soil("tiles")), ramp(6.0, 5.0))
+    reported, rate = fast.wheel("reported_radps")[3000:], fast.wheel("wheel_radps")[3000:]
+    np.testing.assert_allclose(reported.mean(axis=0), rate.mean(axis=0), rtol=1e-3)
+    assert np.abs(reported - rate).max() < 2 * math.pi / 900 / 0.05
+
+
+@pytest.mark.parametrize("speed_mps", [0.5, 1.6])
+def test_vibration_is_that_of_the_spectrum_of_the_road(speed_mps):
+    """Two routes: the simulated corner, and ISO 8608 through the transfer functions of contact and tyre."""
+    roughness_m3 = 64e-6
+    plant = plant_of(STICKY, roughness_m3=roughness_m3)
+    motion = drive(plant, ramp(40.0, speed_mps / 0.2), seed=1)
+    seen = motion.body("ride_z_mps2")[2000:].std()
+    mass, stiffness, damping = 30.0, ROBOT.body.tyre_stiffness_npm, ROBOT.body.tyre_damping_nspm
+
+    def density(f):
+        road = (
+            ROUGHNESS_WAVENUMBER**2 * roughness_m3 * speed_mps / (f**2 + (ROUGHNESS_CUTOFF * speed_mps) ** 2)
+        )
+        s = 2j * math.pi * f
+        contact = 1 / (1 + s * 0.5 * ROBOT.body.contact_length_m / speed_mps)
+        tyre = s**2 * (damping * s + stiffness) / (mass * s**2 + damping * s + stiffness)
+        return road * abs(contact * tyre) ** 2
+
+    corner = math.sqrt(quad(density, 0.0, 500.0, points=[5.0, 7.0, 9.0, 50.0], limit=500)[0])
+    assert seen == pytest.approx(
+        corner / math.sqrt(2), rel=0.08
+    )  # the mean of two corners; 40 s tell it to 2 %
+    rougher = drive(plant._replace(roughness_m3=4 * plant.roughness_m3), ramp(2.0, speed_mps / 0.2), seed=1)
+    smooth = motion.body("ride_z_mps2")[:2000]
+    np.testing.assert_allclose(rougher.body("ride_z_mps2"), 2 * smooth, rtol=0.02, atol=0.02 * smooth.std())
+
+
+def test_a_larger_wheel_is_faster():
+    motion = drive(plant_of(STICKY, radius_factors=np.full(3, 1.02)), ramp(4.0))
+    assert motion.body("speed_x_mps")[-1] == pytest.approx(1.02, abs=1e-3)
+
+
+def test_a_wheel_in_the_air_does_nothing_and_breaks_nothing():
+    plant = plant_of(STICKY, payload_kg=60.0, payload_m=(0.0, 0.37))  # nearly over the line of wheels 1 and 2
+    assert plant.load_share[2] < 0.15
+    steer = np.tile([0.4, -0.4, 0.0], (150, 1))
+    motion = drive(plant, ramp(3.0, 9.0) * [1.0, 1.0, 0.4], steer)
+    normal = motion.wheel("normal_n")
+    assert normal[:, 2].min() == 0.0
+    assert (motion.wheel("traction_n")[normal[:, 2] == 0.0, 2] == 0.0).all()
+    assert np.isfinite(
+        np.delete(
+            motion.record,
+            [N_BODY_RECORD + len(WHEEL_RECORD) * i + j for i in range(3) for j in (2, 3)],
+            axis=1,
+        )
+    ).all()
+
+
+def test_a_load_that_tips_it_over_is_refused():
+    with pytest.raises(
+        ConfigError, match=r"payload of 200 kg at \(0, 0.6\) m .* tips it over: wheel 3 would carry"
+    ):
+        plant_of(STICKY, payload_kg=200.0, payload_m=(0.0, 0.6))
+
+
+def test_states_and_records_are_as_many_as_their_names():
+    plant = plant_of(STICKY)
+    assert (
+        start_state(plant, np.zeros(3)).size
+        == len(BODY_STATES) + 3 * len(WHEEL_STATES) + len(EFFECT_STATES)
+        == N_BODY + 3 * N_WHEEL + LATE
+    )

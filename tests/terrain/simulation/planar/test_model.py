@@ -1,0 +1,424 @@
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.interpolate import CubicSpline
+
+from terrain.constants import GRAVITY_MPS2
+from terrain.effects.catalogue import (
+    ACCEL,
+    CHANNELS,
+    CURRENT,
+    GYRO,
+    HEADING,
+    LIBRARY,
+    SPEED_X,
+    SPEED_Y,
+    TURNING_CURRENT,
+    library_of,
+    vector_of,
+)
+from terrain.kinematics.swerve import inverse
+from terrain.robots import load_robot
+from terrain.simulation.contact import DEFLECTION_DAMPING_S, shear_slip
+from terrain.simulation.planar.model import TRUTH, Ground, make_planar
+from terrain.simulation.planar.motion import move
+from terrain.simulation.planar.replay import replay
+from terrain.simulation.planar.sensors import sense
+from terrain.simulation.planar.signals import delayed
+from terrain.simulation.planar.skid_steer import ENDO_POWER, STANDSTILL_MPS, direction
+from terrain.simulation.planar.swerve import ROLLING_MPS
+
+HUSKY, AGRIMARO = load_robot("husky"), load_robot("agrimaro")
+ROBOTS = {"skid_steer": HUSKY, "swerve": AGRIMARO}
+FREE = Ground(slip_ratio=0.0, grip_ratio=0.5, rolling_ratio=0.0, scrub_ratio=0.0)
+"""Ground that takes neither slip nor resistance: kinematics alone."""
+
+DT = 0.02
+N = 1500
+TIME_S = DT * np.arange(N)
+TWISTS = {
+    "straight": (0.8, 0.0, 0.0),
+    "backward": (-0.8, 0.0, 0.0),
+    "crab": (0.0, 0.5, 0.0),
+    "diagonal": (0.4, -0.3, 0.0),
+    "arc": (0.6, 0.0, 0.3),
+    "spot": (0.0, 0.0, 0.5),
+}
+
+
+def still(robot):
+    """Return the robot with a camera over its origin that tells at once."""
+    camera = {"lever_x_m": 0.0, "lever_y_m": 0.0, "latency_s": 0.0, "time_constant_s": 0.0}
+    return replace(robot, camera=replace(robot.camera, **camera))
+
+
+def at_rate(value, n=N):
+    return np.tile(np.asarray(value, dtype=float), (n, 1))
+
+
+def skid(robot, speed, turn):
+    half = 0.5 * robot.track_m * np.asarray(turn)
+    return np.column_stack([speed - half, speed + half])
+
+
+def rich(robot, dt=DT, length_s=30.0):
+    """Return rims, steering, grade and roll of a drive that shows most effects."""
+    t = dt * np.arange(round(length_s / dt))
+    speed = 0.5 * np.sin(0.9 * t) + 0.35 * np.sin(0.31 * t)
+    turn = 0.5 * np.sin(0.53 * t + 1.0)
+    grade, roll = 0.08 * np.sin(0.23 * t), 0.06 * np.cos(0.29 * t)
+    if robot.drive == "skid_steer":
+        return skid(robot, speed, turn), np.zeros((t.size, 2)), grade, roll
+    steer = np.column_stack([0.5 * np.sin(0.7 * t), -0.4 * np.sin(0.6 * t), 0.2 * np.sin(0.8 * t)])
+    return np.column_stack([speed, 0.9 * speed, 1.1 * speed]), steer, grade, roll
+
+
+def told(robot, values, rim, steer=None, grade=None, roll=None, ground=FREE, dt=DT):
+    """Return channels (n,) by name."""
+    n = len(rim)
+    steer = np.zeros((n, rim.shape[1])) if steer is None else steer
+    grade = np.full(n, grade or 0.0) if np.ndim(grade) == 0 else grade
+    roll = np.full(n, roll or 0.0) if np.ndim(roll) == 0 else roll
+    shown = replay(make_planar(robot, ground), vector_of(values), dt, rim, steer, grade, roll)
+    return dict(zip(CHANNELS, shown.T, strict=True))
+
+
+@pytest.mark.parametrize("twist", TWISTS.values(), ids=TWISTS)
+def test_the_wheels_of_a_twist_move_the_robot_by_that_twist(twist):
+    robot = still(AGRIMARO)
+    wheel, steer = inverse(robot.wheel_positions_m, robot.wheel_radius_m, np.array(twist), np.zeros(3))
+    shown = told(robot, {}, at_rate(wheel * robot.wheel_radius_m), at_rate(steer))
+    for channel, value in zip((SPEED_X, SPEED_Y, GYRO), twist, strict=True):
+        np.testing.assert_allclose(shown[channel], value, atol=1e-7)  # no contact is quite rigid
+    if not twist[1]:
+        shown = told(still(HUSKY), {}, at_rate(skid(HUSKY, twist[0], twist[2])[0]))
+        np.testing.assert_allclose([shown[SPEED_X][-1], shown[GYRO][-1]], [twist[0], twist[2]], atol=1e-12)
+
+
+@pytest.mark.parametrize("drive", ROBOTS)
+def test_an_effect_shows_most_where_the_library_says(drive):
+    robot = still(ROBOTS[drive])
+    rim, steer, grade, roll = rich(robot)
+    inputs = (make_planar(robot, Ground()), DT, rim, steer, grade, roll)
+
+    def shown(values):
+        return replay(inputs[0], vector_of(values), *inputs[1:])
+
+    neutral = shown({})
+    size = neutral.std(axis=0) + 1e-9
+    for effect in LIBRARY:
+        values = {p.name: 10 * p.step for p in effect.parameters}
+        change = np.sqrt(((shown(values) - neutral) ** 2).mean(axis=0)) / size
+        # yaw rate and heading, both currents and both speeds stand for each other; what shifts a speed in
+        # time shifts its slope, and most where friction turns about
+        alike = {GYRO: HEADING, CURRENT: TURNING_CURRENT, SPEED_X: SPEED_Y}
+        if effect.name == "clock_rate" or any(p.unit == "s" for p in effect.parameters):
+            alike[GYRO] = ACCEL
+        told_of = np.isin(CHANNELS, [*effect.channels, *(alike.get(c, c) for c in effect.channels)])
+        if effect not in library_of(drive):
+            assert (change == 0).all(), effect.name
+            continue
+        assert change[told_of].max() > 1e-3, effect.name
+        # through force and slip some of everything is everywhere
+        assert (change[~told_of] <= 0.8 * change[told_of].max() + 1e-9).all(), (effect.name, change)
+
+
+@pytest.mark.parametrize("drive", ROBOTS)
+@pytest.mark.parametrize(
+    "values", [{}, {"force_slip_ratio": 0.5, "turning_slip_ratio": 0.3, "payload_ratio": 0.5}]
+)
+def test_the_answer_hardly_depends_on_the_step(drive, values):
+    robot = ROBOTS[drive]
+    coarse, fine = (
+        replay(make_planar(robot, Ground()), vector_of(values), dt, *rich(robot, dt)) for dt in (0.02, 0.005)
+    )
+    for c, channel in enumerate(CHANNELS):
+        off = np.std((fine[::4, c] - coarse[:, c])[5:-5])
+        assert off <= 0.02 * np.std(fine[:, c]) + 1e-12, channel
+
+
+def test_slip_follows_the_force_as_its_equation_says():
+    """v = u - |u| c f with f = (m v' + m g sin th + R) / (m g), integrated by Euler in small steps."""
+    ground = Ground(slip_ratio=0.6, rolling_ratio=0.0)
+    dt, n = 1e-3, 12000
+    t = dt * np.arange(n)
+    u, grade = 0.7 + 0.3 * np.sin(2.5 * t), 0.1 * np.sin(0.8 * t)
+    v = np.empty(n)
+    v[0] = u[0]
+    for k in range(n - 1):
+        accel = ((u[k] - v[k]) / (abs(u[k]) * 0.6) - math.sin(grade[k])) * GRAVITY_MPS2
+        v[k + 1] = v[k] + dt * accel
+    shown = told(still(HUSKY), {}, np.column_stack([u, u]), grade=grade, ground=ground, dt=dt)
+    np.testing.assert_allclose(shown[SPEED_X][500:], v[500:], atol=1e-4)
+    # the same compliance as an effect, or shared
+    for c in ({"force_slip_ratio": 0.6}, {"force_slip_ratio": 0.6, "shear_slip_ratio": 0.0}):
+        free = told(still(HUSKY), c, np.column_stack([u, u]), grade=grade, ground=FREE, dt=dt)
+        np.testing.assert_allclose(free[SPEED_X], shown[SPEED_X])
+
+
+def a_contact_for_each_wheel(robot, ground, rim, steer, dt):
+    """Return speeds and yaw rate (n, 3) of the origin: each wheel slips by itself, by Euler's small steps."""
+    wheels, body = robot.wheel_positions_m, robot.body
+    com = np.array([body.com_x_m, body.com_y_m])
+    arm, load_n = wheels - com, robot.mass_kg * GRAVITY_MPS2 / 3
+    sigma, slip = body.relaxation_length_m, np.zeros((3, 2))
+    v, w = np.zeros(2), 0.0
+    out = np.zeros((len(rim), 3))
+    for k in range(len(rim)):
+        heading = np.column_stack([np.cos(steer[k]), np.sin(steer[k])])
+        over = v + w * np.column_stack([-arm[:, 1], arm[:, 0]])
+        rate = (rim[k][:, None] * heading - over - np.abs(rim[k])[:, None] * slip) / sigma
+        push = load_n / ground.slip_ratio * (slip + DEFLECTION_DAMPING_S * rate)
+        along = (over * heading).sum(axis=1)
+        resist = ground.rolling_ratio * load_n * along / np.hypot(along, ROLLING_MPS)
+        force = push - resist[:, None] * heading
+        moment = (arm[:, 0] * force[:, 1] - arm[:, 1] * force[:, 0]).sum()
+        slip = slip + dt * rate
+        v = v + dt * (force.sum(axis=0) / robot.mass_kg - w * np.array([-v[1], v[0]]))
+        w += dt * moment / body.yaw_inertia_kgm2
+        out[k] = v[0] + w * com[1], v[1] - w * com[0], w
+    return out
+
+
+def test_three_wheels_that_slip_each_by_itself_move_as_one_twist_that_slips():
+    robot, dt, n = still(AGRIMARO), 1e-3, 12000
+    robot = replace(robot, sensors=replace(robot.sensors, encoder_time_constant_s=0.0, imu_latency_s=0.0))
+    ground = Ground(slip_ratio=1.2, rolling_ratio=0.08)
+    t = dt * np.arange(n)
+    ramp = np.clip(t, 0.0, 1.0)
+    twist = np.column_stack([0.6 * ramp, 0.2 * ramp * np.sin(0.8 * t), 0.3 * ramp * np.sin(1.1 * t)])
+    rolled = [inverse(robot.wheel_positions_m, 1.0, wanted, np.zeros(3)) for wanted in twist]
+    rim, steer = (np.array(part) for part in zip(*rolled, strict=True))
+    rim, steer = np.ascontiguousarray(rim), np.unwrap(steer, axis=0)
+    each = a_contact_for_each_wheel(robot, ground, rim, steer, dt)
+    level = np.zeros(n)
+    planar = make_planar(robot, ground)
+    one = move(planar, vector_of({}), dt, rim, steer, level, level, np.zeros((0, 3)))[:, :3]
+    lost = np.abs(each - twist)[1000:].mean(axis=0)
+    assert (np.abs(one - each)[1000:].mean(axis=0) < 0.1 * lost).all()
+    coarse = [np.ascontiguousarray(x[::40]) for x in (rim, steer, level)]
+    coarse = move(planar, vector_of({}), 40 * dt, *coarse, coarse[-1], np.zeros((0, 3)))[:, :3]
+    assert (np.abs(coarse - one[::40])[25:].mean(axis=0) < 0.01 * lost).all()
+
+
+def test_a_bent_thrust_curve_slips_by_its_inverse_and_a_load_presses_as_much_as_it_weighs():
+    share = 1 - (1 - np.exp(-3 * (s := np.linspace(1e-9, 1.0, 101)))) / (3 * s)
+    ground = Ground(rolling_ratio=0.1, thrust_ratio=tuple(0.4 * share), load_ratio=1.0)
+    for robot in ROBOTS.values():
+        n = len(robot.wheels)
+        for grade in (0.0, 0.05):
+            shown = told(still(robot), {}, at_rate([0.5] * n), grade=grade, ground=ground)[SPEED_X][-1]
+            wanted = 0.1 * shown / math.hypot(shown, ROLLING_MPS) + math.sin(grade)
+            if robot is HUSKY:
+                wanted = 0.1 * direction(shown) + math.sin(grade)
+            assert 1 - shown / 0.5 == pytest.approx(np.interp(wanted, 0.4 * share, s), rel=2e-3)
+            loaded = told(
+                still(robot), {"payload_ratio": 0.5}, at_rate([0.5] * n), grade=grade, ground=ground
+            )
+            assert loaded[SPEED_X][-1] == pytest.approx(shown, rel=1e-6)
+
+
+def test_a_tilt_that_is_not_felt_takes_no_traction_and_still_shows_in_the_accelerometer():
+    unfelt = Ground(felt_ratio=0.0)
+    for robot in ROBOTS.values():
+        rim = at_rate([0.5] * len(robot.wheels))
+        level, tilted = (told(still(robot), {}, rim, grade=g, roll=g, ground=unfelt) for g in (0.0, 0.1))
+        for channel in (SPEED_X, SPEED_Y, CURRENT):
+            np.testing.assert_allclose(tilted[channel], level[channel])
+        assert tilted[ACCEL][-1] - level[ACCEL][-1] == pytest.approx(GRAVITY_MPS2 * math.sin(0.1))
+
+
+def test_shear_slip_is_the_inverse_of_its_curve_and_starts_with_slope_one():
+    for grip in (0.3, 0.8):
+        for force in np.linspace(-0.9, 0.9, 37) * grip:
+            slip = shear_slip(force, grip)
+            x = 2 * abs(slip) / grip  # s l / K with K/l = f_max / 2
+            mobilised = 1 - (1 - math.exp(-x)) / x if x > 1e-6 else 0.0
+            assert math.copysign(grip * mobilised, slip) == pytest.approx(force, abs=1e-6)
+        assert shear_slip(1e-4, grip) == pytest.approx(1e-4, rel=1e-3)
+        assert math.isfinite(shear_slip(5.0, grip))
+
+
+def speeds(rim_mps, values, **options):
+    return told(still(HUSKY), values, at_rate(rim_mps), **options)
+
+
+def test_kinematic_effects_do_what_their_formulas_say():
+    b = HUSKY.track_m
+    assert speeds([0.5, 0.5], {"wheel_radius_ratio": 0.1})[SPEED_X][-1] == pytest.approx(0.55)
+    one_sided = speeds([0.5, 0.5], {"one_sided_radius_ratio": 0.1})
+    assert one_sided[GYRO][-1] == pytest.approx(0.1 * 0.5 / b)
+    assert one_sided[SPEED_X][-1] == pytest.approx(0.5)
+    dv = 0.2
+    assert speeds([0.4, 0.6], {"effective_track_ratio": 0.6})[GYRO][-1] == pytest.approx(dv / (1.6 * b))
+    lost = 0.3 * dv / (dv + 1.0) * dv  # k q dv
+    slipping = speeds([0.4, 0.6], {"turning_slip_ratio": 0.3})
+    assert slipping[GYRO][-1] == pytest.approx((dv - lost) / b)
+    right, left = 0.6 ** (1 - ENDO_POWER), 0.4 ** (1 - ENDO_POWER)
+    shared = 0.5 * (lost * right - lost * left) / (right + left)
+    assert slipping[SPEED_X][-1] == pytest.approx(0.5 - shared)
+    spot = speeds([-0.1, 0.1], {"turning_slip_ratio": 0.3})
+    assert spot[GYRO][-1] == pytest.approx(0.7 * dv / b)
+    assert spot[SPEED_X][-1] == pytest.approx(0.0, abs=1e-12)
+    for roll in (0.1, -0.1):
+        for speed in (0.5, -0.5):
+            aside = speeds([speed, speed], {"side_hill_slip_ratio": 0.4}, roll=roll)[SPEED_Y][-1]
+            assert aside == pytest.approx(-0.4 * roll * 0.5)  # downhill, whichever way it drives
+
+
+def test_steering_effects_do_what_their_formulas_say():
+    robot = still(AGRIMARO)
+    wheel, steer = inverse(
+        robot.wheel_positions_m, robot.wheel_radius_m, np.array([0.6, 0.0, 0.2]), np.zeros(3)
+    )
+    right, rim = told(robot, {}, at_rate(wheel * robot.wheel_radius_m), at_rate(steer)), at_rate(wheel * 0.2)
+    offsets = {f"steering_offset_{i}_rad": 0.03 * i for i in (1, 2, 3)}
+    put_off = told(robot, offsets, rim, at_rate(steer - 0.03 * np.arange(1, 4)))
+    for channel in (GYRO, SPEED_X, SPEED_Y):
+        np.testing.assert_allclose(put_off[channel], right[channel], atol=1e-9)
+    swing = at_rate(steer) + 0.1 * np.sin(2 * TIME_S)[:, None]
+    late = told(robot, {"steering_delay_s": 0.1}, rim, swing)
+    moved = told(robot, {}, rim, np.vstack([np.repeat(swing[:1], 5, axis=0), swing[:-5]]))
+    np.testing.assert_allclose(late[SPEED_Y], moved[SPEED_Y], atol=1e-12)
+    narrow = told(robot, {"steering_play_rad": 0.2}, rim, swing)  # wider than the swing
+    np.testing.assert_allclose(narrow[SPEED_Y], right[SPEED_Y], atol=1e-9)
+    with_play = told(robot, {"steering_play_rad": 0.02}, rim, swing)[SPEED_Y]
+    assert 0.7 < np.ptp(with_play[N // 2 :]) / np.ptp(told(robot, {}, rim, swing)[SPEED_Y]) < 0.9
+
+
+def test_effects_of_sensors_do_what_their_formulas_say():
+    rim = skid(HUSKY, 0.5 + 0.2 * np.sin(1.5 * TIME_S), 0.4 * np.sin(1.1 * TIME_S))
+    robot = still(HUSKY)
+    plain = told(robot, {}, rim)
+
+    def change(**values):
+        return told(robot, values, rim)
+
+    w, v = plain[GYRO], plain[SPEED_X]
+    np.testing.assert_allclose(change(gyro_bias_radps=0.02)[GYRO], w + 0.02)
+    np.testing.assert_allclose(change(gyro_scale_ratio=0.1)[GYRO], 1.1 * w)
+    np.testing.assert_allclose(change(gyro_scale_ratio=0.1)[HEADING], w)
+    np.testing.assert_allclose(change(accel_bias_mps2=0.1)[ACCEL], plain[ACCEL] + 0.1)
+    turned = change(camera_yaw_rad=0.1)
+    np.testing.assert_allclose(turned[SPEED_X] + 1j * turned[SPEED_Y], v * np.exp(0.1j))
+    lever = change(lever_x_m=0.3, lever_y_m=-0.2)
+    np.testing.assert_allclose(lever[SPEED_X], v + 0.2 * w)
+    np.testing.assert_allclose(lever[SPEED_Y], plain[SPEED_Y] + 0.3 * w)
+    late = change(camera_latency_s=0.1)
+    np.testing.assert_allclose(late[SPEED_X][5:], v[:-5], atol=1e-12)
+    np.testing.assert_allclose(late[GYRO], w)
+    offset = change(clock_offset_s=0.06)
+    np.testing.assert_allclose(offset[GYRO][3:], w[:-3], atol=1e-12)
+    np.testing.assert_allclose(offset[CURRENT], plain[CURRENT])
+    rated = change(clock_rate_ratio=0.01)[GYRO]
+    np.testing.assert_allclose(rated[5:], CubicSpline(TIME_S, w)(0.99 * TIME_S)[5:], atol=1e-7)
+    np.testing.assert_allclose(change(yaw_delay_s=0.04)[GYRO][2:], w[:-2], atol=1e-12)
+    lagged, lag_s = rim.copy(), 0.1
+    for k in range(1, N):  # T y' + y = x by the trapezoidal rule
+        push = 0.5 * DT * (rim[k - 1] + rim[k] - lagged[k - 1])
+        lagged[k] = (lag_s * lagged[k - 1] + push) / (lag_s + 0.5 * DT)
+    undone = told(robot, {"encoder_lag_s": lag_s}, lagged)
+    np.testing.assert_allclose(undone[SPEED_X][60:-1], v[60:-1], atol=1e-3)
+
+
+@pytest.mark.parametrize("robot", ROBOTS.values(), ids=ROBOTS)
+def test_forces_and_currents_balance(robot):
+    ground = Ground(slip_ratio=0.3, rolling_ratio=0.06, scrub_ratio=0.0)
+    planar = make_planar(robot, ground)
+    weight = robot.mass_kg * GRAVITY_MPS2
+    grade, speed = 0.07, 0.5
+    slow = ROLLING_MPS if robot is AGRIMARO else STANDSTILL_MPS
+
+    def direction(speed_mps):
+        return speed_mps / math.hypot(speed_mps, slow)
+
+    friction_n = len(robot.wheels) * robot.motors.friction_nm / robot.wheel_radius_m * direction(speed)
+
+    def steady(**values):
+        """Return pull, both speeds over the rim's, and the accelerometer, of a robot that climbs steadily."""
+        shown = told(still(robot), values, at_rate([speed] * len(robot.wheels)), grade=grade, ground=ground)
+        pull_n = shown[CURRENT][-1] * planar.nm_per_a / planar.radius_m - friction_n
+        return pull_n, shown[SPEED_X][-1] / speed, shown[ACCEL][-1]
+
+    pull, share, accel = steady()
+    way = direction(share * speed)
+    assert pull == pytest.approx(weight * (math.sin(grade) + 0.06 * way))
+    assert share == pytest.approx(1 - 0.3 * pull / weight)
+    assert accel == pytest.approx(GRAVITY_MPS2 * math.sin(grade))
+    near = {"rel": 1e-4}  # the direction at the standstill's scale feels a slower drive
+    assert steady(payload_ratio=0.2)[0] == pytest.approx(1.2 * pull, **near)
+    assert steady(motor_constant_ratio=0.1)[0] == pytest.approx(1.1 * pull + 0.1 * friction_n)
+    drift = 0.1 * TIME_S[-1] / 60
+    assert steady(motor_drift_ratio=0.1)[0] == pytest.approx(pull + drift * (pull + friction_n))
+    assert steady(rolling_resistance_ratio=0.02)[0] == pytest.approx(pull + 0.02 * way * weight, **near)
+    more, slower, _ = steady(viscous_drag_nspm=50.0)
+    assert more == pytest.approx(pull + 50.0 * slower * speed, **near)
+    more, slower, _ = steady(slip_resistance_ratio=0.5)
+    assert more == pytest.approx(pull + 0.5 * weight * (1 - slower) * way, **near)
+    assert steady(force_slip_ratio=0.2)[1] == pytest.approx(1 - 0.5 * pull / weight, **near)
+    bent = 0.2 * shear_slip(pull / weight, ground.grip_ratio)
+    assert steady(shear_slip_ratio=0.2)[1] == pytest.approx(1 - 0.3 * pull / weight - bent, **near)
+
+
+def test_turning_takes_current_of_the_difference_of_the_sides():
+    ground = Ground(scrub_ratio=0.2)
+    planar = make_planar(HUSKY, ground)
+    n_per_a = planar.nm_per_a / planar.radius_m
+    weight = HUSKY.mass_kg * GRAVITY_MPS2
+    for way in (1.0, -1.0):
+        spot = told(HUSKY, {"scrub_ratio": 0.1}, at_rate([-0.3 * way, 0.3 * way]), ground=ground)
+        assert spot[TURNING_CURRENT][-1] * n_per_a == pytest.approx(0.3 * weight * direction(0.6 * way))
+        assert spot[CURRENT][-1] == pytest.approx(0.0, abs=1e-9)
+    spin = 0.4 / TIME_S[-1]
+    speeding = told(HUSKY, {}, skid(HUSKY, np.full(N, 0.6), spin * TIME_S))
+    moment = planar.yaw_inertia_kgm2 * spin
+    assert speeding[TURNING_CURRENT][N // 2] * n_per_a == pytest.approx(2 * moment / HUSKY.track_m)
+
+
+@pytest.mark.parametrize("drive", ROBOTS)
+def test_nothing_moves_and_nothing_pulls_where_wheels_stand(drive):
+    robot = ROBOTS[drive]
+    shown = told(robot, {}, at_rate([0.0] * len(robot.wheels)), ground=Ground())
+    for channel in CHANNELS:
+        np.testing.assert_allclose(shown[channel], 0.0, atol=1e-12)
+    on_a_slope = told(robot, {}, at_rate([0.0] * len(robot.wheels)), grade=0.1, ground=Ground())
+    np.testing.assert_allclose(on_a_slope[SPEED_X], 0.0, atol=1e-12)
+    assert on_a_slope[CURRENT][-1] > 0.0  # motors hold it
+
+
+def test_the_ground_disturbs_speeds_by_shares_and_the_yaw_rate_as_it_is():
+    planar, p = make_planar(still(AGRIMARO), FREE), vector_of({})
+    rim, steer, level = at_rate([0.5] * 3), np.zeros((N, 3)), np.zeros(N)
+    push = np.column_stack([np.full(N, 0.02), np.full(N, 0.03), np.full(N, 0.01)])
+    pushed = dict(zip(TRUTH, move(planar, p, DT, rim, steer, level, level, push).T, strict=True))
+    assert pushed["speed_x_mps"][-1] == pytest.approx(0.5 * 0.98)
+    assert pushed["speed_y_mps"][-1] == pytest.approx(0.5 * 0.98 * 0.03)
+    assert pushed["yaw_rate_radps"][-1] == pytest.approx(0.01)
+
+
+def test_a_delay_holds_its_ends_and_whole_samples_are_a_shift():
+    x = np.sin(0.3 * np.arange(50))
+    np.testing.assert_array_equal(delayed(x, 3.0, 0.0)[3:], x[:-3])
+    np.testing.assert_array_equal(delayed(x, 3.0, 0.0)[:3], x[0])
+    np.testing.assert_array_equal(delayed(x, -2.0, 0.0)[-2:], x[-1])
+    back = delayed(delayed(x, 4.0, 0.002), -4.0, -0.002)
+    np.testing.assert_allclose(back[8:-8], x[8:-8], atol=0.02)
+
+
+def test_sensors_that_are_right_show_the_truth():
+    planar, p = make_planar(still(HUSKY), Ground()), vector_of({})
+    rim, steer, grade, roll = rich(HUSKY)
+    truth = move(planar, p, DT, rim, steer, grade, roll, np.zeros((0, 3)))
+    shown = sense(planar, p, DT, truth)
+    for channel, name in (
+        (GYRO, "yaw_rate_radps"),
+        (SPEED_X, "speed_x_mps"),
+        (SPEED_Y, "speed_y_mps"),
+        (ACCEL, "accel_x_mps2"),
+        (CURRENT, "current_a"),
+        (TURNING_CURRENT, "turning_current_a"),
+        (HEADING, "yaw_rate_radps"),
+    ):
+        np.testing.assert_array_equal(shown[:, CHANNELS.index(channel)], truth[:, TRUTH.index(name)])

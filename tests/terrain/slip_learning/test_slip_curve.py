@@ -1,0 +1,210 @@
+import math
+
+import numpy as np
+import pytest
+
+from terrain.robots import load_robot
+from terrain.slip_learning.slip_curve import (
+    BIN_EDGES,
+    WORKING_PULL_RATIO,
+    RunBins,
+    chosen_law,
+    contradiction,
+    expanded_interval,
+    fit_curve,
+    learn_curve,
+    left_out_scores,
+    net_peak,
+    run_bins,
+    slip_at,
+    slip_range,
+    too_little,
+    traction_ratio,
+    weighted_resistance,
+)
+from terrain.slip_learning.targets import (
+    BRAKING_CAP_SLIP,
+    MIN_ABOVE_BALANCE_SLIP,
+    PEAK_SHARE,
+    energy_jpm,
+    targets_of,
+    tractive_efficiency,
+)
+from terrain.terramechanics.traction import janosi_force, magic_force
+
+SAND = "janosi", (0.6, 0.16)
+SNOW = "magic", (5.0, 2.0, 0.3, 1.0)
+
+
+def drawn_runs(law, theta, rng, n=6, noise=0.01, run_std=0.1, offset_std=0.003, reach=0.6):
+    """Return runs whose factor, offset and shape differ as runs do."""
+    runs = []
+    for number in range(n):
+        slip = np.linspace(0.005, reach * rng.uniform(0.8, 1.0), 18)
+        factor = math.exp(run_std * rng.standard_normal())
+        mu = factor * traction_ratio(law, theta, slip + offset_std * rng.standard_normal())
+        mu = mu + noise * rng.standard_normal(len(mu))
+        runs.append(RunBins(f"run {number}", slip, np.full(18, 0.003), mu, np.full(18, noise)))
+    return runs
+
+
+def rho_of(n, value=0.1):
+    return np.column_stack([np.full(n, value), np.full(n, 0.01)])
+
+
+def test_laws_are_those_of_the_simulated_ground():
+    slips = np.array([-0.3, -1e-5, 0.0, 1e-5, 0.02, 0.2, 0.9])
+    np.testing.assert_allclose(
+        traction_ratio(*SAND, slips), [janosi_force(s, 0.6, 1.0, 0.16) for s in slips], rtol=1e-9, atol=1e-15
+    )
+    np.testing.assert_allclose(
+        traction_ratio(*SNOW, slips), [magic_force(s, 1.0, *SNOW[1]) for s in slips], rtol=1e-12
+    )
+
+
+@pytest.mark.parametrize(("law", "theta"), [SAND, SNOW])
+def test_the_law_behind_runs_is_chosen_and_its_numbers_come_back(law, theta):
+    runs = drawn_runs(law, theta, np.random.default_rng(3))
+    assert chosen_law(left_out_scores(runs)) == law
+    fit = fit_curve(law, runs)
+    slips = np.linspace(0.05, 0.45, 20)
+    np.testing.assert_allclose(
+        traction_ratio(law, fit.parameters, slips), traction_ratio(law, theta, slips), rtol=0.12
+    )
+    assert 0.5 < fit.misfit < 1.5
+
+
+def test_a_run_with_many_samples_counts_once():
+    rng = np.random.default_rng(0)
+    few, many = (
+        run_bins(
+            "r",
+            np.column_stack(
+                [
+                    rng.uniform(0.2, 0.3, n),
+                    np.full(n, 0.01),
+                    0.3 + 0.02 * rng.standard_normal(n),
+                    np.full((n, 2), 0.01),
+                ]
+            ),
+        )
+        for n in (40, 40_000)
+    )
+    assert len(few.slip_ratio) == len(many.slip_ratio)
+    assert (many.traction_std > 0.3 * few.traction_std).all()
+
+
+def test_steep_law_does_not_excuse_its_own_residuals():
+    """Slips that are off by more than the curve's rise must not make the curve steeper and higher."""
+    rng = np.random.default_rng(5)
+    runs = drawn_runs("magic", (10.0, 1.9, 0.8, 0.97), rng, offset_std=0.006)
+    law, parameters, factors, _ = fit_curve("magic", runs)
+    assert traction_ratio(law, parameters, np.array([0.18]))[0] == pytest.approx(0.8, abs=0.12)
+    assert np.mean(factors) == pytest.approx(1.0, abs=0.05)
+
+
+@pytest.mark.parametrize(("law", "theta"), [SAND, SNOW])
+def test_interval_holds_the_true_peak_of_drawn_terrains(law, theta):
+    rho, hits, n = 0.1 if law == "janosi" else 0.04, 0, 8
+    for seed in range(n):
+        rng = np.random.default_rng(100 + seed)
+        runs = drawn_runs(law, theta, rng)
+        curve = learn_curve(runs, rho_of(len(runs), rho), rng, n_bootstrap=40)
+        true = net_peak(lambda s: traction_ratio(law, theta, s) - rho, *curve.slip_range)
+        hits += curve.peak_interval[0] <= true.slip_ratio <= curve.peak_interval[1]
+    assert hits >= 5  # of 8 at 90 %: fewer one time in two hundred
+
+
+def test_peak_and_no_peak_are_told_apart_and_stay_in_range():
+    hump = net_peak(lambda s: -((s - 0.3) ** 2), 0.0, 0.8)
+    assert hump == (0.3, "peak")
+    assert net_peak(lambda s: -((s - 0.79) ** 2) + 1, 0.0, 0.8).status == "no_peak"
+    rising = net_peak(lambda s: traction_ratio(*SAND, s) - 0.1, 0.05, 0.7)
+    net = traction_ratio(*SAND, np.array([rising.slip_ratio, 0.7])) - 0.1
+    assert rising.status == "no_peak"
+    assert net[0] / net[1] == pytest.approx(0.95, abs=1e-3)
+    assert net_peak(lambda s: s - 2.0, 0.0, 0.5) == (0.5, "no_peak")  # never pulls
+
+
+def test_slip_at_inverts_the_law():
+    for slip in (0.01, 0.1, 0.25):
+        f = traction_ratio(*SNOW, np.array([slip]))[0]
+        assert slip_at(*SNOW, f) == pytest.approx(slip, abs=1e-4)
+    assert math.isnan(slip_at(*SNOW, 0.31))
+    assert slip_at(*SNOW, -0.1) == 0.0
+
+
+def test_coverage_is_asked_for_before_anything_is_believed():
+    rng = np.random.default_rng(0)
+    assert "2 runs" in too_little(drawn_runs(*SAND, rng, n=2))
+    assert "of range is needed" in too_little(drawn_runs(*SAND, rng, reach=0.08))
+    runs = drawn_runs(*SAND, rng, n=4)
+    assert too_little(runs) is None
+    empty = RunBins("empty", *np.zeros((4, 0)))
+    assert too_little([empty, empty, *runs[:2]]) is not None
+    assert all(math.isnan(edge) for edge in slip_range([empty, empty]))
+    with pytest.raises(ValueError, match="are needed"):
+        learn_curve(runs[:2], rho_of(2), rng)
+
+
+@pytest.mark.parametrize(
+    ("theta", "rho", "words"),
+    [
+        (SAND[1], -0.1, "negative"),
+        ((0.01, 0.16), 0.001, "does not rise"),
+        (SAND[1], 0.9, "more thrust than the resistance"),
+    ],
+)
+def test_a_curve_that_contradicts_itself_is_told(theta, rho, words):
+    rng = np.random.default_rng(1)
+    runs = drawn_runs("janosi", theta, rng, noise=0.004)
+    curve = learn_curve(runs, rho_of(len(runs), rho), rng, n_bootstrap=5)
+    assert words in contradiction(curve)
+
+
+def test_points_without_a_curve_are_invalid():
+    rng = np.random.default_rng(2)
+    runs = [
+        RunBins(f"r{i}", s, np.full(12, 0.003), rng.normal(0.3, 0.1, 12), np.full(12, 0.01))
+        for i, s in enumerate(np.tile(np.linspace(0.02, 0.6, 12), (5, 1)))
+    ]
+    curve = learn_curve(runs, rho_of(5), rng, n_bootstrap=5)
+    assert contradiction(curve) is not None
+
+
+def test_interval_of_few_runs_is_wider_than_its_percentiles():
+    draws = np.random.default_rng(0).normal(0.3, 0.02, 4000)
+    low, high = expanded_interval(draws, 5, 0.3)
+    assert high - low > 1.25 * (np.quantile(draws, 0.95) - np.quantile(draws, 0.05))
+    assert expanded_interval(np.full(50, 0.3), 5, 0.3) == pytest.approx((0.2918, 0.3082), abs=1e-3)
+
+
+def test_resistance_weighs_runs_by_what_they_know():
+    mean, std = weighted_resistance(np.array([[0.1, 0.01], [0.3, 1.0], [np.nan, np.nan]]))
+    assert mean == pytest.approx(0.1, abs=1e-3)
+    assert std >= 0.0099
+    assert all(math.isnan(value) for value in weighted_resistance(np.full((3, 2), np.nan)))
+
+
+@pytest.mark.parametrize(("law", "theta", "rho"), [(*SAND, 0.2), (*SNOW, 0.04)])
+def test_targets_rise_and_do_what_they_are_for(law, theta, rho):
+    rng = np.random.default_rng(4)
+    runs = drawn_runs(law, theta, rng, noise=0.003, run_std=0.02)
+    curve = learn_curve(runs, rho_of(len(runs), rho), rng, n_bootstrap=20)
+    targets, robot = targets_of(curve), load_robot("agrimaro")
+    steady, traction = targets.steady.slip_ratio, targets.traction.slip_ratio
+    assert -BRAKING_CAP_SLIP <= targets.braking.slip_ratio < 0 <= steady < traction or law == "magic"
+    f = traction_ratio(curve.law, curve.parameters, np.array([steady, traction]))
+    assert f[0] == pytest.approx(curve.resistance_ratio, abs=1e-3)
+    assert traction >= steady + MIN_ABOVE_BALANCE_SLIP - 1e-9
+    assert traction <= max(PEAK_SHARE * curve.peak.slip_ratio, steady + MIN_ABOVE_BALANCE_SLIP) + 1e-9
+    assert f[1] - curve.resistance_ratio >= WORKING_PULL_RATIO - 0.001
+    assert 0 < tractive_efficiency(curve, traction) < 1
+    assert tractive_efficiency(curve, steady) == pytest.approx(0.0, abs=1e-3)
+    energies = [energy_jpm(curve, s, robot) for s in (-0.2, steady, traction, curve.peak.slip_ratio)]
+    assert energies[0] < 0 < energies[1]
+    assert energies == sorted(energies)
+
+
+def test_bins_rise_without_gaps():
+    assert (np.diff(BIN_EDGES) > 0).all()
