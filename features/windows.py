@@ -132,10 +132,10 @@ def layout_of(
     """
     if not runs:
         raise DataError("there is no run to cut windows from")
-    wanted_sets = {*signal_sets, *(("wheels",) if speeds else ())}
+    desired_sets = {*signal_sets, *(("wheels",) if speeds else ())}
 
     def used(name: str, stream: Stream) -> tuple[str, ...]:
-        return tuple(c for c in stream.channels if signal_set_of(name, c) in wanted_sets)
+        return tuple(c for c in stream.channels if signal_set_of(name, c) in desired_sets)
 
     names = dict.fromkeys(name for run in runs for name, stream in run.streams.items() if used(name, stream))
     channels: dict[str, tuple[str, ...]] = {}
@@ -144,15 +144,15 @@ def layout_of(
         for run in runs:
             if name not in run.streams:
                 raise DataError(f"run {run.run_id} has no stream {name!r}, which other runs have")
-        wanted = used(name, runs[0].streams[name])
+        desired = used(name, runs[0].streams[name])
         for run in runs:
-            differing = sorted(set(used(name, run.streams[name])) ^ set(wanted))
+            differing = sorted(set(used(name, run.streams[name])) ^ set(desired))
             if differing:
                 raise DataError(
                     f"run {run.run_id}, stream {name!r}: channel {differing[0]!r} is not in all runs"
                 )
         rates = np.array([run.streams[name].rate_hz for run in runs])
-        channels[name], rate_hz[name] = wanted, float(np.median(rates))
+        channels[name], rate_hz[name] = desired, float(np.median(rates))
     layout = Layout(channels, rate_hz)
     for run in runs:
         check_layout(run, layout)

@@ -10,7 +10,7 @@ second; together they are a robot and a log without those effects::
 ========================= ===================================================================================
 effect                    where it goes
 ========================= ===================================================================================
-wheel_radius              wheel_radius_m, and rim speeds that a log has
+wheel_radius              wheel_radius_m, and wheel speeds that a log has
 steering_offset_i         steering.zero_i_rad, less by d0: the true angle is raw - zero + d0
 gyro_bias                 sensors.gyro_bias_z_radps; and off the fused yaw, which sums it
 accel_bias                sensors.accel_bias_x_mps2
@@ -19,9 +19,9 @@ encoder_lag               sensors.encoder_time_constant_s: behind as much of a l
 payload                   mass_kg, and with it the yaw inertia
 motor_constant            motors.torque_constant_nmpa
 effective_track           track_m of a skid-steer robot, where its filter starts
-one_sided_radius          rates and rim speeds of each side
-steering_play, -_delay    the steering angles go through the play; their stamps are later
-yaw_delay                 the difference of the sides' rim speeds comes later
+one_sided_radius          rates and wheel speeds of each side
+steering_backlash, -_delay    the steering angles go through the play; their stamps are later
+yaw_delay                 the difference of the sides' wheel speeds comes later
 gyro_scale                gyro about its bias, and the fused yaw
 camera_yaw                the camera's frames are turned back
 clock_offset, -_rate      stamps of imu, odometry, gnss and lidar, on the clock of the wheels
@@ -104,7 +104,7 @@ HOMES: Mapping[str, tuple[str | None, Callable[[Robot, float], Robot]]] = {
 """Section that an effect needs, if any, and what it makes of a robot."""
 
 _IN_SAMPLES = (
-    *("one_sided_radius_ratio", "steering_play_rad", "steering_delay_s", "yaw_delay_s"),
+    *("one_sided_radius_ratio", "steering_backlash_rad", "steering_delay_s", "yaw_delay_s"),
     *("gyro_bias_radps", "gyro_scale_ratio", "accel_bias_mps2", "camera_yaw_rad"),
     *("clock_offset_s", "clock_rate_ratio", "motor_constant_ratio", "motor_drift_ratio"),
 )
@@ -190,7 +190,7 @@ def corrected_log(run: RunLog, robot: Robot) -> RunLog:
 
 
 def _turning_later(wheels: Stream, late_s: float) -> Stream:
-    """Delay the difference of the sides' rim speeds, and leave their mean."""
+    """Delay the difference of the sides' wheel speeds, and leave their mean."""
     names = [f"speed_{side}_mps" for side in ("left", "right")]
     if not set(names) <= set(wheels.channels):
         return wheels
@@ -226,7 +226,7 @@ class Correction:
         half = 0.5 * self._p["one_sided_radius_ratio"]
         swerve = robot.drive == "swerve"
         self._side = {wheel: 1.0 + half if wheel in ("3", "right") else 1.0 - half for wheel in robot.wheels}
-        self._has_play = swerve and self._p["steering_play_rad"] > 0.0
+        self._has_backlash = swerve and self._p["steering_backlash_rad"] > 0.0
         self._follower, self._angle, self._yaw = np.full(3, np.nan), np.full(3, np.nan), (np.nan, np.nan)
         self._steps: Mapping[str, Callable[[tuple[str, ...], Array, Array], None]] = {
             "wheels": self._wheels,
@@ -264,19 +264,19 @@ class Correction:
 
     def _wheels(self, channels: tuple[str, ...], time_s: Array, values: Array) -> None:
         warm = 1.0 + self._p["motor_drift_ratio"] * (time_s - self._start_s) / 60.0
-        rim = 1.0 + self._p["wheel_radius_ratio"]
+        wheel_speed = 1.0 + self._p["wheel_radius_ratio"]
         for i, channel in enumerate(channels):
             quantity, _, rest = channel.partition("_")
             wheel = rest.rpartition("_")[0]
             if quantity == "current":
                 values[:, i] /= self._current * warm
             elif wheel in self._side and quantity in ("motor", "speed", "wheel"):
-                values[:, i] *= self._side[wheel] * (rim if quantity == "speed" else 1.0)
+                values[:, i] *= self._side[wheel] * (wheel_speed if quantity == "speed" else 1.0)
 
     def _steering(self, channels: tuple[str, ...], time_s: Array, values: Array) -> None:
-        if not self._has_play:
+        if not self._has_backlash:
             return
-        half = self._p["steering_play_rad"]
+        half = self._p["steering_backlash_rad"]
         for wheel in range(3):
             if f"angle_{wheel + 1}_rad" not in channels:
                 continue
@@ -363,7 +363,7 @@ def extended_yaml(
     cov = checked_covariance("effects: covariance", np.asarray(covariance, dtype=float))
     if cov.shape != (len(names), len(names)):
         raise ConfigError(
-            f"effects: covariance has the shape {cov.shape}, {(len(names), len(names))} is wanted"
+            f"effects: covariance has the shape {cov.shape}, {(len(names), len(names))} is required"
         )
     known = parameters_of(robot.drive)
     section: dict[str, Any] = {"schema": SCHEMA}
@@ -393,7 +393,7 @@ def extended_yaml(
         content = None
     others = {name: entry for name, entry in described.items() if name != "effects"}
     if not isinstance(content, dict) or {n: e for n, e in content.items() if n != "effects"} != others:
-        raise ConfigError(f"{path}: cannot be extended as it is written: one section a line is wanted")
+        raise ConfigError(f"{path}: cannot be extended as it is written: one section a line is required")
     robot_from(path.name, content)
     return text
 

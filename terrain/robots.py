@@ -349,7 +349,7 @@ def robot_from(file: str, described: Any) -> Robot:
     required = [item.name for item in fields(Robot) if item.name not in (*sections, *extension)]
     check_keys(file, described, required, optional=(*sections, "effects"))
     if not isinstance(described["name"], str) or not described["name"]:
-        raise ConfigError(f"{file}: name is {described['name']!r}, a word is wanted")
+        raise ConfigError(f"{file}: name is {described['name']!r}, a word is required")
     if described["drive"] not in WHEELS_OF_DRIVE:
         known = ", ".join(WHEELS_OF_DRIVE)
         raise ConfigError(f"{file}: drive {described['drive']!r} is unknown: use one of {known}")

@@ -27,7 +27,7 @@ MIN_SPEED_MPS = 0.05
 
 
 def slip_ratio(
-    rim_speed_mps: Any,
+    wheel_speed_mps: Any,
     ground_speed_mps: Any,
     min_speed_mps: float = MIN_SPEED_MPS,
     stationary: float = float("nan"),
@@ -36,7 +36,7 @@ def slip_ratio(
 
     Parameters
     ----------
-    rim_speed_mps, ground_speed_mps : of a wheel's rim and of its centre along it; they broadcast
+    wheel_speed_mps, ground_speed_mps : of a wheel's rim and of its centre along it; they broadcast
     min_speed_mps : with both slower the wheel is stationary
     stationary : slip of a stationary wheel: NaN in analysis, where it has none; 0 for a controller (7.2.1)
 
@@ -56,13 +56,15 @@ def slip_ratio(
     array([ 0.2, -0.2, -0.2,  1. ,  nan])
     """
     if not 0 < min_speed_mps < np.inf:
-        raise ConfigError(f"min_speed_mps is {min_speed_mps:g}, a speed above zero is wanted")
-    rim, ground = np.broadcast_arrays(*(np.asarray(v, float) for v in (rim_speed_mps, ground_speed_mps)))
-    fastest = np.maximum(np.abs(rim), np.abs(ground))
+        raise ConfigError(f"min_speed_mps is {min_speed_mps:g}, a speed above zero is required")
+    wheel_speed, ground = np.broadcast_arrays(
+        *(np.asarray(v, float) for v in (wheel_speed_mps, ground_speed_mps))
+    )
+    fastest = np.maximum(np.abs(wheel_speed), np.abs(ground))
     known = np.isfinite(fastest)
     slip = np.where(known & (fastest < min_speed_mps), stationary, np.nan)
     moving = known & (fastest >= min_speed_mps)
-    np.divide(rim - ground, fastest, out=slip, where=moving)
+    np.divide(wheel_speed - ground, fastest, out=slip, where=moving)
     return np.clip(slip, -1.0, 1.0)
 
 

@@ -556,7 +556,7 @@ def drive_command(
         str | None,
         typer.Option(help="True radius of each wheel over the believed one, as in 1,1.02,1; drawn without."),
     ] = None,
-    leg_play: Annotated[float, typer.Option(help="Play of the third leg in rad.")] = 0.0,
+    leg_backlash: Annotated[float, typer.Option(help="Play of the third leg in rad.")] = 0.0,
     plant: Annotated[
         str | None, typer.Option(help="Robot as it really is, where it is not what --robot believes.")
     ] = None,
@@ -592,7 +592,7 @@ def drive_command(
         accel_mps2=accel,
         grade_deg=grade,
         radius_factors=_radii(radius),
-        leg_play_rad=leg_play,
+        leg_backlash_rad=leg_backlash,
         plant=None if plant is None else load_robot(plant),
     )
     settings.check(described, slip_table)
@@ -701,7 +701,7 @@ def _interval(text: str) -> tuple[float, float]:
     except ValueError:
         interval = 0.0, 0.0
     if not 0.0 <= interval[0] < interval[1]:
-        raise ConfigError(f"--camera-lost is {text!r}; START:END in seconds is wanted, as in 10:13")
+        raise ConfigError(f"--camera-lost is {text!r}; START:END in seconds is required, as in 10:13")
     return interval
 
 
@@ -714,7 +714,7 @@ def _radii(text: str | None) -> tuple[float, float, float] | None:
     except ValueError:
         one = two = three = 0.0
     if not all(0.5 <= ratio <= 2.0 for ratio in (one, two, three)):
-        raise ConfigError(f"--radius is {text!r}; three ratios from 0.5 to 2 are wanted, as in 1,1.02,1")
+        raise ConfigError(f"--radius is {text!r}; three ratios from 0.5 to 2 are required, as in 1,1.02,1")
     return one, two, three
 
 

@@ -77,7 +77,7 @@ def _only(table: SlipTable, name: str, slip: str) -> SlipTable:
     except ValueError:
         ratio = math.nan
     if not 0.0 <= ratio < 1.0:
-        raise ConfigError(f"controller {name!r}: a slip from 0 to below 1 is wanted")
+        raise ConfigError(f"controller {name!r}: a slip from 0 to below 1 is required")
     entry = dict(table.targets[table.fallback])
     entry["traction"] = SlipTarget(table.fallback, "traction", ratio, math.nan, 0, "unestimated", "given")
     return replace(table, targets={table.fallback: entry}, curves={}, reasons={})

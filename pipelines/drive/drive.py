@@ -16,9 +16,9 @@ from pipelines.drive.drives import (
     Situation,
     brake_time,
     changes_of,
+    desired_until,
     situation,
     start_times,
-    wanted_until,
 )
 from pipelines.live.pilot import LivePilot, PilotSettings
 from pipelines.models.model_files import TerrainModel
@@ -81,7 +81,7 @@ class DriveSettings:
     delay_s : from a sample to the wheel
     ramp_mps2 : of the fixed ramp; without, as fast as gets as far as the best of ours
     duration_s, speed_mps, accel_mps2, grade_deg, radius_factors : of the scenario
-    leg_play_rad : play of the third leg
+    leg_backlash_rad : play of the third leg
     plant : the robot as it is, where that is not what the controllers believe
     """
 
@@ -97,7 +97,7 @@ class DriveSettings:
     accel_mps2: float = 1.0
     grade_deg: float = 0.0
     radius_factors: tuple[float, float, float] | None = None
-    leg_play_rad: float = 0.0
+    leg_backlash_rad: float = 0.0
     plant: Robot | None = None
 
     def check(self, robot: Robot, table: SlipTable) -> None:
@@ -114,7 +114,7 @@ class DriveSettings:
         if repeated:
             raise ConfigError(f"controllers name {min(repeated)!r} twice")
         if self.seeds < 1:
-            raise ConfigError(f"seeds is {self.seeds}, at least 1 is wanted")
+            raise ConfigError(f"seeds is {self.seeds}, at least 1 is required")
         if not 0.0 <= self.delay_s <= 0.5:
             raise ConfigError(f"delay_s is {self.delay_s!r}, 0 to 0.5 s are accepted")
         if self.scenario == SLOPE and self.grade_deg:
@@ -137,7 +137,7 @@ class DriveSettings:
             accel_mps2=self.accel_mps2,
             grade_deg=self.grade_deg if grade_deg is None else grade_deg,
             radius_factors=self.radius_factors,
-            leg_play_rad=self.leg_play_rad,
+            leg_backlash_rad=self.leg_backlash_rad,
         )
 
 
@@ -182,10 +182,10 @@ def _changes(run: RunLog, driver: Driver) -> list[tuple[float, float]]:
     """Return when the ground asked for another target, and which; one that stays asks for nothing."""
     found, before = [], math.nan
     for time_s, ground in [(0.0, run.labels[0].terrain), *changes_of(run.labels)] if run.labels else []:
-        wanted = driver.table.lookup(ground)["traction"].slip_ratio
-        if abs(wanted - before) > TARGET_CHANGE:
-            found.append((time_s, wanted))
-        before = wanted
+        desired = driver.table.lookup(ground)["traction"].slip_ratio
+        if abs(desired - before) > TARGET_CHANGE:
+            found.append((time_s, desired))
+        before = desired
     return found
 
 
@@ -194,7 +194,7 @@ def _slip_error(run: RunLog) -> float:
     control = run.streams["control"]
     if "aimed_ratio" not in control.channels or "slip_ratio" not in control.channels:
         return math.nan
-    held = control.channel("driven_mps") < control.channel("wanted_mps") - 1e-6
+    held = control.channel("driven_mps") < control.channel("desired_mps") - 1e-6
     error = np.abs(control.channel("slip_ratio") - control.channel("aimed_ratio"))[held]
     return float(np.nanmean(error)) if np.isfinite(error).any() else math.nan
 
@@ -332,7 +332,7 @@ def _job(
     row: dict[str, Any] = judge(run, course, plant, where, driver)
     if settings.scenario == SLOPE:
         row["steepest_deg"] = steepest(robot, driver, settings, seed, model)
-    driven = course.time_s <= wanted_until(where.scenario)  # a coast after the last stop costs nothing
+    driven = course.time_s <= desired_until(where.scenario)  # a coast after the last stop costs nothing
     row["_energy"] = (np.maximum.accumulate(course.distance_m[driven]), course.energy_j[driven])
     return row
 
@@ -372,14 +372,14 @@ def _matching_ramp(
     if not ours + others:
         return PilotSettings().ramp_mps2
     key = f"distance_{AFTER_S:g}s_m" if settings.scenario == "starts" else "distance_m"
-    wanted = np.mean([row[key] for row in rows[(ours + others)[0]]])
+    desired = np.mean([row[key] for row in rows[(ours + others)[0]]])
     seeds = range(settings.first_seed, settings.first_seed + settings.seeds)
     low, high = 0.1, 2.0 * settings.accel_mps2 if math.isfinite(settings.accel_mps2) else 10.0
     for _ in range(7):
         middle = math.sqrt(low * high)
         driver = make_driver("ramp", table, settings.delay_s, middle)
         got = _drive_all(robot, [driver], settings, seeds, None, n_jobs, silent, (0, 1))
-        short = np.mean([row[key] for row in got["ramp"]]) < wanted
+        short = np.mean([row[key] for row in got["ramp"]]) < desired
         low, high = (middle, high) if short else (low, middle)
     return math.sqrt(low * high)
 

@@ -54,11 +54,11 @@ def situation(
     accel_mps2: float = 1.0,
     grade_deg: float = 0.0,
     radius_factors: tuple[float, float, float] | None = None,
-    leg_play_rad: float = 0.0,
+    leg_backlash_rad: float = 0.0,
 ) -> Situation:
     """Return a situation; what is drawn depends on the seed and the terrain alone.
 
-    Load, soil, tyres, roughness and noise are drawn.  ``course`` and ``mixed`` have slopes and swells as
+    Load, soil, tyres, roughness and noise are drawn.  ``course`` and ``mixed`` have slopes and undulations as
     fields have (``data/spread``); everything else is as steep as it is told.
 
     Parameters
@@ -70,7 +70,7 @@ def situation(
     duration_s, speed_mps, accel_mps2 : of the scenario
     grade_deg : uphill along the start's heading
     radius_factors : true radius of each wheel over the believed one; drawn by default
-    leg_play_rad : play of the third leg
+    leg_backlash_rad : play of the third leg
 
     Raises
     ------
@@ -93,9 +93,9 @@ def situation(
     soils = {soil: scattered(described, rng) for soil, described in soils.items()}
     conditions = draw_conditions(load_spread(), rng)
     if not over_all:
-        conditions = replace(conditions, grade_ratio=(0.0, 0.0), swell_ratio=0.0)
-    if leg_play_rad:
-        conditions = replace(conditions, leg_play_rad=leg_play_rad)
+        conditions = replace(conditions, grade_ratio=(0.0, 0.0), undulation_ratio=0.0)
+    if leg_backlash_rad:
+        conditions = replace(conditions, leg_backlash_rad=leg_backlash_rad)
     if grade_deg:
         conditions = replace(conditions, grade_ratio=(math.tan(math.radians(grade_deg)), 0.0))
     if radius_factors is not None:
@@ -142,19 +142,19 @@ def _starts(robot: Robot, terrain: str, speed_mps: float, accel_mps2: float) -> 
 
 def start_times(scenario: Scenario) -> list[float]:
     """Return the instants at which a robot that is to stand is to start."""
-    wanted = np.abs(scenario.twist).max(axis=1) > 0
-    return [float(time_s) for time_s in scenario.time_s[:-1][np.diff(wanted.astype(int)) == 1]]
+    desired = np.abs(scenario.twist).max(axis=1) > 0
+    return [float(time_s) for time_s in scenario.time_s[:-1][np.diff(desired.astype(int)) == 1]]
 
 
-def wanted_until(scenario: Scenario) -> float:
+def desired_until(scenario: Scenario) -> float:
     """Return the last instant at which the robot is to move; 0 where it never is."""
-    wanted = np.flatnonzero(np.abs(scenario.twist).max(axis=1) > 0)
-    return float(scenario.time_s[wanted[-1]]) if wanted.size else 0.0
+    desired = np.flatnonzero(np.abs(scenario.twist).max(axis=1) > 0)
+    return float(scenario.time_s[desired[-1]]) if desired.size else 0.0
 
 
 def brake_time(scenario: Scenario) -> float:
     """Return the instant from which on the robot is told to stand, to the end."""
-    return float(scenario.time_s[scenario.time_s > wanted_until(scenario)][0])
+    return float(scenario.time_s[scenario.time_s > desired_until(scenario)][0])
 
 
 def _patches(names: list[str], scenario: Scenario, rng: np.random.Generator) -> tuple[Patch, ...]:

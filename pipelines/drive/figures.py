@@ -61,7 +61,7 @@ class Panel(NamedTuple):
     values: Mapping[str, tuple[float | None, Sequence[float] | None]]
 
 
-def bars_figure(panels: Sequence[Panel], n_days: int) -> Figure:
+def bars_figure(panels: Sequence[Panel], n_seeds: int) -> Figure:
     """Draw a small chart a figure, a bar a controller, with its 95 % interval and its number beside it."""
     n_rows = math.ceil(len(panels) / COLUMNS)
     n_bars = max(len(panel.values) for panel in panels)
@@ -74,7 +74,9 @@ def bars_figure(panels: Sequence[Panel], n_days: int) -> Figure:
                 continue
             _bars(axes, panels[number], named=number % COLUMNS == 0)
         days = (
-            "One day, which shows no spread" if n_days == 1 else f"Mean and 95 % interval over {n_days} days"
+            "One day, which shows no spread"
+            if n_seeds == 1
+            else f"Mean and 95 % interval over {n_seeds} days"
         )
         return finished(figure, days)
 
@@ -169,7 +171,7 @@ def run_figures(examples: Mapping[str, RunLog], table: SlipTable) -> dict[str, F
     if not shown:
         return {}
     fastest = max(float(part.true_mps.max()) for part in shown.values())
-    fastest = max(fastest, *(float(np.nanmax(part.control["wanted_mps"])) for part in shown.values()))
+    fastest = max(fastest, *(float(np.nanmax(part.control["desired_mps"])) for part in shown.values()))
     slips = np.concatenate(
         [values for part in shown.values() for values in (part.slip_least, part.slip_largest, part.aimed)]
     )
@@ -195,7 +197,7 @@ def _run_figure(
         panels = figure.subplots(len(ratios), 1, sharex=True, height_ratios=ratios)
         above, below = panels[:2]
         _shade(above, part, named=False)
-        _line(above, part.control_s, part.control["wanted_mps"], INK, "wanted, fastest wheel", 0.9, "--")
+        _line(above, part.control_s, part.control["desired_mps"], INK, "wanted, fastest wheel", 0.9, "--")
         _line(above, part.control_s, part.control["driven_mps"], VERMILION, "driven, fastest wheel", 1.2)
         _line(above, part.true_s, part.true_mps, BLUE, "true, over ground", 1.5)
         above.set(ylim=limits[0], ylabel="speed [m/s]")
@@ -239,7 +241,7 @@ def _said(axes: Axes, part: Drawn) -> None:
     ):
         if np.isfinite(values).any():
             _line(axes, part.control_s, values, colour, label, width, style)
-    why = control["why_ratio"]
+    why = control["status_code"]
     refused = why != 0
     if refused.any():
         reasons = [word for code, word in enumerate(STATUS_NAMES) if code and (why == code).any()]

@@ -345,14 +345,14 @@ def _gain_cell(gained: Difference | None, key: str) -> str:
 
 
 def _numbers(result: Result) -> str:
-    controllers, n_days = result["controllers"], len(result["seeds"])
+    controllers, n_seeds = result["controllers"], len(result["seeds"])
     known = list(dict.fromkeys(key for figures in controllers.values() for key in figures))
     rows, bare = [], []
     for key in sorted(
         known, key=lambda key: key not in (shown := shown_keys(result)) or -len(shown) + shown.index(key)
     ):
         words, unit = _words(key)
-        cells = [_cell(result, name, key, n_days) for name in controllers]
+        cells = [_cell(result, name, key, n_seeds) for name in controllers]
         if all(cell == NOT_KNOWN for cell in cells):
             bare.append(f"{escape(words)} (<code>{escape(key)}</code>)")
             continue
@@ -368,7 +368,9 @@ def _numbers(result: Result) -> str:
     )
     why = " Who hears nothing of the ground has no time to its target." if deaf else ""
     days = (
-        "One day. Days" if n_days == 1 else f"Means over {n_days} days, with their 95&nbsp;% intervals. Days"
+        "One day. Days"
+        if n_seeds == 1
+        else f"Means over {n_seeds} days, with their 95&nbsp;% intervals. Days"
     )
     return f"""<section class="dense"><h2>All figures</h2>
 {_table(["figure", "key", *controllers], rows, text=2)}
@@ -377,13 +379,13 @@ A number in brackets is of days: it was defined on those alone. {NOT_KNOWN}: on 
 </section>"""
 
 
-def _cell(result: Result, name: str, key: str, n_days: int) -> str:
+def _cell(result: Result, name: str, key: str, n_seeds: int) -> str:
     mean, interval = _value(result, name, key)
     if mean is None:
         return NOT_KNOWN
     text = said(mean)
-    n = result["controllers"][name][key].get("n", n_days)
-    if n != n_days:
+    n = result["controllers"][name][key].get("n", n_seeds)
+    if n != n_seeds:
         text += f" ({n})"
     if interval is not None and interval[1] > interval[0]:
         text += f'<br><span class="small">{said(interval[0])} to {said(interval[1])}</span>'
@@ -419,7 +421,7 @@ def _named(key: str) -> str:
 CAPTIONS = {
     "bars": "A bar is the mean over days, the line its 95 % interval. A day is the same for all, so that "
     "bars whose lines overlap may still be told apart, day by day.",
-    "run": "Above: what is wanted and driven, and the speed over ground. Below: the slip that was (blue, "
+    "run": "Above: what is required and driven, and the speed over ground. Below: the slip that was (blue, "
     "with the spread of the wheels), as the pilot saw it, the target, and what was aimed for: no less than "
     "what steady motion balances, and a margin. Yellow: speed rises; hatched: braking; a black bar on top: "
     "no correction was made. Below {speed} no slip is drawn.",

@@ -31,7 +31,7 @@ from terrain.estimation.swerve_filters import default_noise, make_filter, thesis
 from terrain.estimation.wheel_slip import blind_slip, wheel_slip
 from terrain.extension import corrected, corrected_log
 from terrain.files.atomic import ensure_writable
-from terrain.kinematics.rim import with_rim_speeds
+from terrain.kinematics.wheel_speed import with_wheel_speeds
 from terrain.logs.write import run_folder, write_run
 from terrain.records import GATED, USED, Array, RunLog, SlipTrack, StateTrack, Stream
 from terrain.robots import Robot, load_robot
@@ -265,12 +265,12 @@ def summary(estimate: Estimate) -> dict[str, Any]:
 def enriched(estimate: Estimate) -> RunLog:
     """Return the run with what was estimated beside what was measured.
 
-    Rim speeds join the stream ``wheels``.  New are ``slip``; ``estimator``, the states that windows are made
-    of; and ``state``, of which no features are made: every state and ``std_<state>``,
+    Wheel speeds join the stream ``wheels``.  New are ``slip``; ``estimator``, the states that windows are
+    made of; and ``state``, of which no features are made: every state and ``std_<state>``,
     ``std_slip_<wheel>_ratio``, ``stale_ratio`` (1 where nothing measured the speed over ground lately) and
     ``nis_<sensor>_ratio``.
     """
-    run = with_rim_speeds(estimate.run, estimate.robot)
+    run = with_wheel_speeds(estimate.run, estimate.robot)
     track = estimate.track
     channels = tuple(state for state in ESTIMATOR_CHANNELS if state in track.states)
     values = np.column_stack([track.state(state) for state in channels])
@@ -337,10 +337,10 @@ def estimate(
     if tuning == "likelihood":
         from pipelines.estimate.tune import chosen_runs, tuned_noise
 
-        teachers = chosen_runs(runs, tune_on)
-        taught = load_robot(robot or teachers[0].robot)
-        told = [corrected_log(teacher, taught) for teacher in teachers]
-        taught_noise, tuned = tuned_noise(*model_and_noise(told[0], taught, name), told, corrected(taught))
+        training_runs = chosen_runs(runs, tune_on)
+        trained = load_robot(robot or training_runs[0].robot)
+        told = [corrected_log(training_run, trained) for training_run in training_runs]
+        taught_noise, tuned = tuned_noise(*model_and_noise(told[0], trained, name), told, corrected(trained))
     rows = []
     for done, run in enumerate(runs):
         described, noise = load_robot(robot or run.robot), None

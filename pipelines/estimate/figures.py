@@ -143,13 +143,13 @@ def slip_figure(estimate: Estimate) -> Figure:
     with styled():
         figure = new_figure(9.0, 6.6)
         above, below = figure.subplots(2, 1, sharex=True, height_ratios=[1, 2])
-        rim = estimate.table.columns([f"wheel_{wheel}_radps" for wheel in slip.wheels])
+        wheel_speed = estimate.table.columns([f"wheel_{wheel}_radps" for wheel in slip.wheels])
         _line(above, track.time_s, track.state("speed_x_mps"), INK, "speed over ground, estimated", lw=1.4)
         for i, wheel in enumerate(slip.wheels):
             _line(
                 above,
                 estimate.table.time_s,
-                rim[:, i] * estimate.robot.wheel_radius_m,
+                wheel_speed[:, i] * estimate.robot.wheel_radius_m,
                 CLASS_COLOURS[i],
                 f"rim of wheel {wheel}",
                 lw=0.7,

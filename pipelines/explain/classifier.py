@@ -15,7 +15,7 @@ from pipelines.classify.splits import labelled
 from pipelines.reporting.progress import Progress, silent
 from pipelines.runs.simulate import simulate_run
 from terrain.errors import DataError, TerrainError
-from terrain.kinematics.rim import with_rim_speeds
+from terrain.kinematics.wheel_speed import with_wheel_speeds
 from terrain.logs.schema import SIGNAL_SETS
 from terrain.records import Array, RunLog, Windows
 from terrain.robots import Robot
@@ -61,22 +61,22 @@ def classifier_gain(
     found["errors"] = {}
     if len(terrains) < MIN_TERRAINS:
         told = f"the held-out runs are on {len(terrains)} known terrain{'s' * (len(terrains) != 1)}, "
-        return found | {"reason": f"{told}{MIN_TERRAINS} at the least are wanted"}
+        return found | {"reason": f"{told}{MIN_TERRAINS} at the least are required"}
     if len(known) < MIN_RUNS:
-        return found | {"reason": f"{len(known)} runs are held out, {MIN_RUNS} at the least are wanted"}
+        return found | {"reason": f"{len(known)} runs are held out, {MIN_RUNS} at the least are required"}
     bare = replace(robot, effects={}, effects_cov=np.empty((0, 0)))
     try:
         right = []
         for step, effects in enumerate((before, after)):
-            taught = [
-                with_rim_speeds(
+            trained = [
+                with_wheel_speeds(
                     simulate_run(bare, terrain, SCENARIO, seed, number, vary=True, effects=dict(effects)),
                     bare,
                 )
                 for terrain in terrains
                 for number in range(1, runs_a_terrain + 1)
             ]
-            right.append(_right(taught, [with_rim_speeds(run, bare) for run in known], settings))
+            right.append(_right(trained, [with_wheel_speeds(run, bare) for run in known], settings))
             progress("classifier", step + 1, 2)
     except TerrainError as error:
         return found | {"reason": str(error)}
@@ -85,20 +85,20 @@ def classifier_gain(
 
 
 def _right(
-    taught: Sequence[RunLog], known: Sequence[RunLog], settings: CrossvalSettings
+    trained: Sequence[RunLog], known: Sequence[RunLog], settings: CrossvalSettings
 ) -> tuple[Array, Array]:
     """Return which windows (n,) of the known runs are told right, and the runs (n,) that they are of."""
-    layout = _shared_layout(taught, known, settings)
-    lessons, exam = (_windows(runs, settings, layout) for runs in (taught, known))
+    layout = _shared_layout(trained, known, settings)
+    lessons, exam = (_windows(runs, settings, layout) for runs in (trained, known))
     recipe = settings.new_recipe()
     recipe.fit(lessons, lessons.terrain.astype(str))
     said = np.asarray(recipe.predict(exam)).astype(str)
     return said == exam.terrain.astype(str), exam.run_id.astype(str)
 
 
-def _shared_layout(taught: Sequence[RunLog], known: Sequence[RunLog], settings: CrossvalSettings) -> Layout:
+def _shared_layout(trained: Sequence[RunLog], known: Sequence[RunLog], settings: CrossvalSettings) -> Layout:
     """Return the channels that simulated and measured runs both have."""
-    own, theirs = (layout_of(runs, SIGNAL_SETS, speeds=True) for runs in (taught, known))
+    own, theirs = (layout_of(runs, SIGNAL_SETS, speeds=True) for runs in (trained, known))
     channels = {
         stream: both
         for stream, names in own.channels.items()

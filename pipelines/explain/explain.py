@@ -28,7 +28,7 @@ from terrain.effects.catalogue import Effect, effect_named, library_of
 from terrain.errors import ConfigError, DataError, TerrainError
 from terrain.extension import extended_yaml
 from terrain.files.atomic import atomic_write, ensure_writable
-from terrain.kinematics.rim import with_rim_speeds
+from terrain.kinematics.wheel_speed import with_wheel_speeds
 from terrain.records import Array, RunLog
 from terrain.robots import Robot, load_robot
 
@@ -167,7 +167,7 @@ def explained(
     progress: Progress = silent,
 ) -> Explained:
     """Return the diagnosis of runs and the gain; see :func:`explain`."""
-    runs = [with_rim_speeds(run, robot) for run in sorted(runs, key=lambda run: run.run_id)]
+    runs = [with_wheel_speeds(run, robot) for run in sorted(runs, key=lambda run: run.run_id)]
     used, held = split_runs(runs, hold_out, seed)
     simulation, grounds = simulation_for(used, robot, library)
     diagnosis = diagnose(used, simulation, library)
@@ -365,13 +365,13 @@ def _library(robot: Robot, names: Sequence[str] | None) -> tuple[Effect, ...]:
     there = library_of(robot.drive)
     if names is None:
         return there
-    wanted = [effect_named(name) for name in names]
-    if not wanted:
+    desired = [effect_named(name) for name in names]
+    if not desired:
         raise ConfigError("--effects names none; leave it out for all of them")
-    for effect in wanted:
+    for effect in desired:
         if effect not in there:
             raise ConfigError(f"effect {effect.name} cannot befall a robot with the drive {robot.drive!r}")
-    return tuple(effect for effect in there if effect in wanted)
+    return tuple(effect for effect in there if effect in desired)
 
 
 def _of_terrain(runs: Sequence[RunLog], terrain: str | None) -> list[RunLog]:

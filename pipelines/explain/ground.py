@@ -7,7 +7,7 @@ from typing import Any
 
 from terrain.discrepancy.signals import signals_of
 from terrain.discrepancy.simulation import Simulation
-from terrain.discrepancy.tilt import with_felt_tilt
+from terrain.discrepancy.tilt import with_effective_tilt
 from terrain.effects.catalogue import Effect
 from terrain.errors import ConfigError
 from terrain.records import RunLog
@@ -21,7 +21,7 @@ from terrain.terramechanics.soil import extra_soil_names, load_soil, soil_names
 def simulation_for(
     runs: Sequence[RunLog], robot: Robot, library: Sequence[Effect]
 ) -> tuple[Simulation, list[dict[str, Any]]]:
-    """Return the simulation, and ``terrain, soil, felt_ratio`` of each label; None where nothing is known.
+    """Return the simulation, and ``terrain, soil, effective_ratio`` of each label; None where not known.
 
     A label that is the name of a soil of the package is driven on that soil, all others on a ground like any.
     """
@@ -30,7 +30,7 @@ def simulation_for(
     simulation = Simulation(robot, Ground(), robot.effects, load_scatter()._asdict(), grounds)
     if grounds:
         signals = [signals_of(run, robot) for run in runs]
-        simulation = with_felt_tilt(simulation, signals, library)
+        simulation = with_effective_tilt(simulation, signals, library)
     told = []
     for label in labels:
         ground = simulation.grounds.get(label)
@@ -38,7 +38,7 @@ def simulation_for(
             {
                 "terrain": label,
                 "soil": None if ground is None else label,
-                "felt_ratio": None if ground is None else ground.felt_ratio,
+                "effective_ratio": None if ground is None else ground.effective_ratio,
             }
         )
     return simulation, told
@@ -56,10 +56,11 @@ def _ground(robot: Robot, label: str) -> Ground | None:
 def ground_notes(told: Sequence[dict[str, Any]]) -> list[str]:
     """Return what a reader has to know of the grounds, in sentences."""
     return [
-        f"On {each['terrain']} runs fit best if {100.0 * each['felt_ratio']:.0f} % of the measured tilt is "
-        "a slope to drive up; the rest is taken for a body that rides over bumps, which takes no traction."
+        f"On {each['terrain']} runs fit best where {100.0 * each['effective_ratio']:.0f} % of the measured "
+        "tilt is a slope to drive up; the rest is taken for a body that rides over bumps, which takes no "
+        "traction."
         for each in told
-        if each["felt_ratio"] is not None and each["felt_ratio"] < 1.0
+        if each["effective_ratio"] is not None and each["effective_ratio"] < 1.0
     ]
 
 

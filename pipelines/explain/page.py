@@ -83,7 +83,7 @@ CAPTIONS = {
     "beyond which nothing is compared.",
     "dependence": "A residual that is noise follows nothing: its means lie on the line. Intervals are over "
     "runs; those of single runs come from the noise, and what differs from run to run by itself lies beyond "
-    "them. Turn: rim speed right minus left, or last minus first wheel.",
+    "them. Turn: wheel speed right minus left, or last minus first wheel.",
 }
 DRAWN = {
     "stretch": "Measured against simulated",

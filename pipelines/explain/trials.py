@@ -433,11 +433,11 @@ def explain_trials(
     """
     unknown = [row for row in rows if row not in ROWS]
     if unknown or not rows or len(set(rows)) < len(rows):
-        raise ConfigError(f"--rows is {','.join(rows)!r}; some of {','.join(ROWS)} are wanted, each once")
+        raise ConfigError(f"--rows is {','.join(rows)!r}; some of {','.join(ROWS)} are required, each once")
     if n < 1:
-        raise ConfigError(f"--n is {n}; 1 trial of each row at the least is wanted")
+        raise ConfigError(f"--n is {n}; 1 trial of each row at the least is required")
     if n_runs < MIN_RUNS:
-        raise ConfigError(f"--runs is {n_runs}; {MIN_RUNS} at the least are wanted, to hold some out")
+        raise ConfigError(f"--runs is {n_runs}; {MIN_RUNS} at the least are required, to hold some out")
     trials = run_trials([case for row in rows for case in cases_of(row, n, seed, n_runs)], n_jobs, progress)
     seconds = [trial.seconds for trial in trials]
     return {

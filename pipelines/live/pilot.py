@@ -143,7 +143,7 @@ class LivePilot:
     >>> from terrain.robots import load_robot
     >>> pilot = LivePilot(load_robot("agrimaro"), load_slip_table())
     >>> command = pilot.step(Sample(0.0, np.array([0.5, 0.0, 0.0]), {}))  # nothing is known yet
-    >>> command.wheel_radps, command.status["why_ratio"] == NO_SLIP
+    >>> command.wheel_radps, command.status["status_code"] == NO_SLIP
     (array([0.1, 0.1, 0.1]), True)
     """
 
@@ -162,7 +162,7 @@ class LivePilot:
         if robot.drive != "swerve":
             raise ConfigError(f"robot {robot.name}: drive {robot.drive!r} has no pilot, only 'swerve' has")
         if not (math.isfinite(settings.ramp_mps2) and settings.ramp_mps2 > 0):
-            raise ConfigError(f"ramp_mps2 is {settings.ramp_mps2!r}, a number above zero is wanted")
+            raise ConfigError(f"ramp_mps2 is {settings.ramp_mps2!r}, a number above zero is required")
         table = load_slip_table() if table is None else table
         if table.robot and table.robot != robot.name:
             raise ConfigError(
@@ -209,12 +209,12 @@ class LivePilot:
     def step(self, sample: Sample) -> Command:
         """Take what arrived, and return what the wheels are told; nothing that arrives makes it raise.
 
-        The ``status`` holds ``why_ratio`` (:data:`terrain.control.traction.STATUS_NAMES`), ``terrain_ratio``
-        and ``probability_ratio`` of the ground believed, ``target_ratio``, ``aimed_ratio`` (the target with
-        its floor), ``balance_ratio``, ``slip_ratio``, ``slip_std_ratio``, ``stale_s``, ``drive_state_ratio``
-        (place in ``slip_table.DRIVE_STATES``; -1 for not known), ``driven_mps`` and ``wanted_mps``; and, with
-        ``track``, ``off_heading_rad`` and ``off_way_m`` of the reference, and ``track_ratio``
-        (:data:`terrain.control.path_tracking.STATUS_NAMES`).
+        The ``status`` holds ``status_code`` (:data:`terrain.control.traction.STATUS_NAMES`),
+        ``terrain_ratio`` and ``probability_ratio`` of the ground believed, ``target_ratio``, ``aimed_ratio``
+        (the target with its floor), ``balance_ratio``, ``slip_ratio``, ``slip_std_ratio``, ``stale_s``,
+        ``drive_state_ratio`` (place in ``slip_table.DRIVE_STATES``; -1 for not known), ``driven_mps`` and
+        ``desired_mps``; and, with ``track``, ``off_heading_rad`` and ``cross_track_m`` of the reference, and
+        ``track_ratio`` (:data:`terrain.control.path_tracking.STATUS_NAMES`).
         """
         now, robot = self._now, self._robot
         dt_s = sample.time_s - now.time_s
@@ -233,13 +233,13 @@ class LivePilot:
             self._positions_m, *self._limits, known_dt_s, FAR_RAD, twist, now.steer
         )
         now.steer = steer
-        wanted_mps = float(np.abs(wheel).max()) * robot.wheel_radius_m
+        desired_mps = float(np.abs(wheel).max()) * robot.wheel_radius_m
         if self._blind:
-            told, said = self._ramp(wheel, wanted_mps, known_dt_s)
+            told, said = self._ramp(wheel, desired_mps, known_dt_s)
         else:
             told, said = self._correct(sample.time_s, wheel, target, dt_s if not first else PERIOD_S)
         status = {
-            "why_ratio": said[5],
+            "status_code": said[5],
             "terrain_ratio": float(self._terrains.get(now.belief.terrain, -1)),
             "probability_ratio": now.belief.probability,
             "target_ratio": now.target_ratio,
@@ -250,12 +250,12 @@ class LivePilot:
             "stale_s": said[7],
             "drive_state_ratio": said[4],
             "driven_mps": said[0],
-            "wanted_mps": wanted_mps,
+            "desired_mps": desired_mps,
             "off_heading_rad": off[0],
-            "off_way_m": off[1],
+            "cross_track_m": off[1],
             "track_ratio": off[2],
         }
-        scale = said[0] / wanted_mps if wanted_mps > 0.0 else 0.0
+        scale = said[0] / desired_mps if desired_mps > 0.0 else 0.0
         return Command(told, steer, admitted * scale, status)
 
     def _hold(self, twist: Array, time_s: float, dt_s: float) -> tuple[Array, tuple[float, float, float]]:
@@ -322,13 +322,13 @@ class LivePilot:
         mps2 = max(braking.mps2 + uphill_mps2, 0.0)
         return Ground(now.target_ratio, braking.slip_ratio, mps2, margin)
 
-    def _ramp(self, wheel: Array, wanted_mps: float, dt_s: float) -> tuple[Array, tuple[float, ...]]:
+    def _ramp(self, wheel: Array, desired_mps: float, dt_s: float) -> tuple[Array, tuple[float, ...]]:
         now = self._now
         rise = self._settings.ramp_mps2 * dt_s if self._settings.controller == "ramp" else math.inf
         before_mps = now.driven_mps if float(wheel @ now.wheel) >= 0.0 else 0.0
-        now.wheel, now.driven_mps = wheel, min(wanted_mps, before_mps + rise)
+        now.wheel, now.driven_mps = wheel, min(desired_mps, before_mps + rise)
         nan = math.nan
-        told = wheel * (now.driven_mps / wanted_mps) if wanted_mps > 0.0 else wheel
+        told = wheel * (now.driven_mps / desired_mps) if desired_mps > 0.0 else wheel
         return told, (now.driven_mps, nan, nan, nan, float(STEADY), float(OK), nan, nan)
 
     def _correct(
@@ -346,7 +346,7 @@ class LivePilot:
             speed = (seen.speed_x_mps - seen.yaw_rate_radps * y) * cos
             speed = speed + (seen.speed_y_mps + seen.yaw_rate_radps * x) * sin
             gain = seen.accel_x_mps2 * cos + seen.accel_y_mps2 * sin
-            fastest = np.maximum(np.abs(seen.rim_mps), np.abs(speed))
+            fastest = np.maximum(np.abs(seen.wheel_speed_mps), np.abs(speed))
             # a wheel stands by the filter's rate, which is not quite the reported one
             standing = fastest < np.where(np.isnan(seen.slip_ratio), 2.0, 1.0) * MIN_SPEED_MPS
             slip = np.where(standing & ~math.isinf(stale_s), 0.0, seen.slip_ratio)
@@ -379,7 +379,7 @@ class LivePilot:
         seen = now.estimate
         if seen is None or stale_s > settings.traction.stale_max_s:
             speed = np.full(3, math.nan)
-        rate = np.full(3, math.nan) if seen is None else seen.rim_mps / self._robot.wheel_radius_m
+        rate = np.full(3, math.nan) if seen is None else seen.wheel_speed_mps / self._robot.wheel_radius_m
         chassis_mps = math.nan if seen is None else math.hypot(seen.speed_x_mps, seen.speed_y_mps)
         added, desired, drive, _, now.thesis = thesis_step(
             self._thesis, now.thesis, wheel, rate, speed, gain, chassis_mps, targets, dt_s

@@ -77,7 +77,9 @@ class Told:
 
 
 _MADE: dict[str, Callable[[LiveEstimate], Array]] = {
-    "wheels": lambda estimate: np.concatenate([estimate.motor_radps, estimate.current_a, estimate.rim_mps]),
+    "wheels": lambda estimate: np.concatenate(
+        [estimate.motor_radps, estimate.current_a, estimate.wheel_speed_mps]
+    ),
     "estimator": lambda estimate: np.array(
         [
             estimate.speed_x_mps,
@@ -102,7 +104,7 @@ _COLUMNS: dict[str, tuple[str, ...]] = {
 class Classifier:
     """Says what a model makes of each live window, cut as the model was taught.
 
-    Windows are made of what ``pipelines.estimate.estimate.enriched`` writes into a log, live: rim speeds
+    Windows are made of what ``pipelines.estimate.estimate.enriched`` writes into a log, live: wheel speeds
     beside motor rates, the estimator's states, slip, and the IMU.
 
     Parameters

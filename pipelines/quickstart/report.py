@@ -66,7 +66,7 @@ CAPTIONS = {
         "and yaw rate, and its innovations, which should fill the grey band and no more."
     ),
     "slip": (
-        "The same run: rim speeds over the speed over ground, and the slip of each wheel between them, with "
+        "The same run: wheel speeds beside the speed over ground, and the slip of each wheel, with "
         "two standard deviations."
     ),
     "importance": (
@@ -403,7 +403,7 @@ def _target_slip(predict: Result | None) -> str:
         )
     return f"""<section><h2>Target slip</h2>{warning}
 {_table(["terrain", *DRIVE_STATES, "status", "source"], rows, text=(0, 4, 5))}
-<p class="small">Slip ratio: rim speed less ground speed, over the faster of the two; positive in traction.
+<p class="small">Slip ratio: wheel speed less ground speed, over the faster of the two; positive in traction.
 </p></section>"""
 
 

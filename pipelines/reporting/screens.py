@@ -133,9 +133,9 @@ def print_predictions(result: dict[str, Any], console: Console) -> None:
             f"target slips from the table {result['table_name']!r} are unestimated: nobody measured them"
         )
     if result["accuracy"] is not None:
-        taught = len(result["taught_runs"])
+        trained = len(result["taught_runs"])
         caution = (
-            f"; {taught} of {result['n_runs']} runs taught the model: memory, no skill" if taught else ""
+            f"; {trained} of {result['n_runs']} runs taught the model: memory, no skill" if trained else ""
         )
         console.print(
             f"accuracy {percent(result['accuracy'])} over {result['n_judged']} labelled windows{caution}",
@@ -297,11 +297,11 @@ def print_explain(result: dict[str, Any], console: Console) -> None:
     gained = result["gain"]
     if gained["measured"]:
         console.print(gain_words(gained), highlight=False)
-        if taught := gained.get("classifier"):
-            if taught["reason"]:
-                told = f"not measured: {taught['reason']}"
+        if trained := gained.get("classifier"):
+            if trained["reason"]:
+                told = f"not measured: {trained['reason']}"
             else:
-                accuracy = taught["errors"]["accuracy"]
+                accuracy = trained["errors"]["accuracy"]
                 told = "{:.1%} right before, {:.1%} after".format(accuracy["before"], accuracy["after"])
                 told += ", change {:+.1%} to {:+.1%}".format(*accuracy["change_ci"])
             console.print(f"classifier taught in simulation, on measured runs: {told}", highlight=False)

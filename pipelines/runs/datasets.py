@@ -52,7 +52,7 @@ def load_runs(
         if nothing readable is there, a run cannot be read, or two runs have one id.
     ConfigError
         if the layout is unknown, the mapping is not accepted, or a robot is unknown (to align, or to turn
-        motor rates into rim speeds).
+        motor rates into wheel speeds).
     DataError
         if a run that is to be aligned has no gyro or no wheel speeds.
     """
@@ -76,7 +76,7 @@ def load_runs(
     for run_id, found in places.items():
         if len(found) > 1:
             raise LogError(f"{folder}: {len(found)} runs have the id {run_id!r} ({' and '.join(found)})")
-    runs = sorted(map(_with_rim_speeds, runs), key=lambda run: run.run_id)
+    runs = sorted(map(_with_wheel_speeds, runs), key=lambda run: run.run_id)
     return [_aligned(run) for run in runs] if align else runs
 
 
@@ -158,15 +158,15 @@ def _some(readers: list[Callable[..., RunLog]], folder: Path) -> list[Callable[.
     return readers
 
 
-def _with_rim_speeds(run: RunLog) -> RunLog:
-    """Add rim speeds where a log has motor rates, so that windows know how fast the robot drove."""
+def _with_wheel_speeds(run: RunLog) -> RunLog:
+    """Add wheel speeds where a log has motor rates, so that windows know how fast the robot drove."""
     wheels = run.streams.get("wheels")
     if wheels is None or not any(channel.startswith("motor_") for channel in wheels.channels):
         return run
-    from terrain.kinematics.rim import with_rim_speeds
+    from terrain.kinematics.wheel_speed import with_wheel_speeds
     from terrain.robots import load_robot
 
-    return with_rim_speeds(run, load_robot(run.robot))
+    return with_wheel_speeds(run, load_robot(run.robot))
 
 
 def _aligned(run: RunLog) -> RunLog:

@@ -153,7 +153,7 @@ def _planar_run(
         ground=planar_ground(robot, soil),
         effects={**effects, "payload_ratio": effects.get("payload_ratio", 0.0) + load},
         scatter=scatter,
-        hills=Hills(conditions.grade_ratio, conditions.swell_ratio, conditions.swell_length_m),
+        hills=Hills(conditions.grade_ratio, conditions.undulation_ratio, conditions.undulation_length_m),
         noise=load_noise(),
         run_id=run_id,
         terrain=soil.name,

@@ -23,7 +23,7 @@ from terrain.control.slip_table import (
     write_slip_table,
 )
 from terrain.errors import ConfigError, DataError
-from terrain.estimation.wheel_slip import rim_scatter_mps
+from terrain.estimation.wheel_slip import wheel_speed_scatter_mps
 from terrain.extension import corrected, corrected_log
 from terrain.files.atomic import atomic_write, ensure_writable
 from terrain.records import RunLog, SlipTarget
@@ -211,7 +211,7 @@ def run_parts(run: RunLog, robot: Robot) -> list[RunPart]:
     for terrain in run.terrains:
         on = pull.on(run.labels, terrain)
         balance = body_balance(pull, robot, on)
-        samples = pull_samples(pull, balance.mass_kg, on, rim_scatter_mps(robot))
+        samples = pull_samples(pull, balance.mass_kg, on, wheel_speed_scatter_mps(robot))
         left_out = Counter({name: int((~good[on]).sum()) for name, good in pull.sound.items()})
         bins = run_bins(run.run_id, samples)
         parts.append(RunPart(run.run_id, terrain, bins, balance, dict(left_out), len(samples)))

@@ -152,16 +152,16 @@ def _within(stretch: Stretch, robot: Robot) -> list[Event]:
     time_s = wheels.time_s
     zeros = (steering.zero_1_rad, steering.zero_2_rad, steering.zero_3_rad)
     steer = at_times(Stream(angles.time_s, np.unwrap(angles.values, axis=0) - zeros, angles.channels), time_s)
-    rim, _ = forward(
+    wheel_speed, _ = forward(
         robot.wheel_positions_m, robot.wheel_radius_m, wheels.values / motors.reduction_ratio, steer
     )
     imu = Stream(imu.time_s - sensors.imu_latency_s, imu.values, imu.channels)
     found = []
-    for start_s, end_s in _ramps(time_s, rim[:, :2]):
+    for start_s, end_s in _ramps(time_s, wheel_speed[:, :2]):
         rows = (time_s >= start_s) & (time_s <= end_s)
         turned = np.ptp(steer[rows], axis=0).max()
-        change = rim[rows][-1, :2] - rim[rows][0, :2]
-        straight = np.abs(rim[rows, 2]).max() <= MAX_YAW_RATE_RADPS and turned <= MAX_STEER_CHANGE_RAD
+        change = wheel_speed[rows][-1, :2] - wheel_speed[rows][0, :2]
+        straight = np.abs(wheel_speed[rows, 2]).max() <= MAX_YAW_RATE_RADPS and turned <= MAX_STEER_CHANGE_RAD
         if not (straight and np.linalg.norm(change) >= MIN_CHANGE_MPS):
             continue
         along = change / np.linalg.norm(change)
@@ -171,7 +171,7 @@ def _within(stretch: Stretch, robot: Robot) -> list[Event]:
         told = (time_s >= grid_s[0]) & (time_s <= grid_s[-1])
         gaps = np.diff(seen.time_s[viewed], prepend=grid_s[0], append=grid_s[-1])
         if np.isfinite(accel).all() and gaps.max() <= MAX_GAP_S:
-            of_wheels = (time_s[told], rim[told, :2] @ along)
+            of_wheels = (time_s[told], wheel_speed[told, :2] @ along)
             of_camera = (seen.time_s[viewed], seen.values[viewed, :2] @ along)
             found.append(Event(stretch.run.run_id, grid_s, accel, of_wheels, of_camera))
     return found

@@ -84,8 +84,8 @@ def standing(run: RunLog, robot: Robot, min_s: float = MIN_STANDING_S) -> list[S
     quiet &= (np.abs(values[:, :, :3].mean(axis=1)) < MAX_BIAS_RADPS).all(axis=1)
     wheels = Stretch(run).of("wheels", [f"motor_{wheel}_radps" for wheel in robot.wheels])
     if wheels is not None:
-        rim_mps = np.abs(wheels.values).max(axis=1) / motors.reduction_ratio * robot.wheel_radius_m
-        moving_s = wheels.time_s[rim_mps > STANDING_MPS]
+        wheel_speed_mps = np.abs(wheels.values).max(axis=1) / motors.reduction_ratio * robot.wheel_radius_m
+        moving_s = wheels.time_s[wheel_speed_mps > STANDING_MPS]
         quiet &= np.searchsorted(moving_s, time_s[:, 0]) == np.searchsorted(moving_s, time_s[:, -1])
         quiet &= (time_s[:, 0] >= wheels.time_s[0]) & (time_s[:, -1] <= wheels.time_s[-1] + BLOCK_S)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], quiet.astype(int), [0]]))).reshape(-1, 2)

@@ -110,7 +110,7 @@ def _within(stretch: Stretch, robot: Robot) -> list[Steady]:
     unwrapped = Stream(steering.time_s, np.unwrap(steering.values, axis=0), steering.channels)
     angle = at_times(unwrapped, time_s)
     motor, current = wheels.values[:, :3], wheels.values[:, 3:]
-    rim = motor / robot.equipment.motors.reduction_ratio * robot.wheel_radius_m
+    wheel_speed = motor / robot.equipment.motors.reduction_ratio * robot.wheel_radius_m
     known = np.isfinite(twist).all(axis=1) & np.isfinite(angle).all(axis=1)
     centre = np.full((len(time_s), 3, 2), np.nan)
     centre[known] = wheel_velocities(robot.wheel_positions_m, twist[known])
@@ -120,7 +120,7 @@ def _within(stretch: Stretch, robot: Robot) -> list[Steady]:
     steady = known & (np.abs(twist[:, 2]) <= MAX_YAW_RATE_RADPS)
     steady &= (np.linalg.norm(centre, axis=2) >= MIN_SPEED_MPS).all(axis=1)
     steady &= _change(np.nan_to_num(angle), n) <= MAX_STEER_CHANGE_RAD
-    steady &= _change(rim, n) <= MAX_SPEED_CHANGE_MPS
+    steady &= _change(wheel_speed, n) <= MAX_SPEED_CHANGE_MPS
     edges = np.flatnonzero(np.diff(np.concatenate([[0], steady.astype(int), [0]]))).reshape(-1, 2)
     found = []
     for first, end in edges:

@@ -129,7 +129,7 @@ def thesis_settings(
     }
     for name, value in numbers.items():
         if not 0 < value < math.inf:
-            raise ConfigError(f"{name} is {value!r}, a finite number above zero is wanted")
+            raise ConfigError(f"{name} is {value!r}, a finite number above zero is required")
     radius_m, low_mps, chassis_mps, power_wpkg = (float(value) for value in numbers.values())
     return ThesisSettings(radius_m, FORMS.index(form), low_mps, chassis_mps, power_wpkg, check_gains(gains))
 
@@ -140,7 +140,7 @@ def new_state(wheels: int = 3) -> Array:
 
 
 @njit(types.UniTuple(_F8, 2)(_F8, _F8, _F8), cache=True)
-def conditioned_slip(rim_mps: float, speed_mps: float, low_speed_mps: float) -> tuple[float, float]:
+def conditioned_slip(wheel_speed_mps: float, speed_mps: float, low_speed_mps: float) -> tuple[float, float]:
     """Return slip (8.4) and its denominator (8.5); slip is 0 where both speeds are low, NaN where unknown.
 
     Examples
@@ -148,8 +148,8 @@ def conditioned_slip(rim_mps: float, speed_mps: float, low_speed_mps: float) -> 
     >>> conditioned_slip(-0.39, -0.5, 0.05), conditioned_slip(0.01, -0.04, 0.05)
     ((0.21999999999999997, 0.5), (0.0, 0.04))
     """
-    fastest_mps = max(abs(rim_mps), abs(speed_mps))
-    slip_mps = rim_mps - speed_mps
+    fastest_mps = max(abs(wheel_speed_mps), abs(speed_mps))
+    slip_mps = wheel_speed_mps - speed_mps
     if math.isnan(slip_mps):
         return math.nan, math.nan
     return (0.0 if fastest_mps < low_speed_mps else slip_mps / fastest_mps), fastest_mps
@@ -217,14 +217,14 @@ def thesis_step(
     radius, low = settings.wheel_radius_m, settings.low_speed_mps
     normalised = settings.form == NORMALISED
     for i in range(wheels):
-        rim, speed = wheel_radps[i] * radius, speed_mps[i]
-        wanted = command_radps[i] * radius
+        wheel_speed, speed = wheel_radps[i] * radius, speed_mps[i]
+        reference = command_radps[i] * radius
         integral[i], memory[i], direction[i] = state[0, i], np.nan, state[2, i]
-        if abs(wanted) > low and wanted * direction[i] <= 0.0:
-            direction[i] = math.copysign(1.0, wanted)
+        if abs(reference) > low and reference * direction[i] <= 0.0:
+            direction[i] = math.copysign(1.0, reference)
             if normalised:
                 integral[i] = 0.0
-        slip, fastest = conditioned_slip(rim, speed, low)
+        slip, fastest = conditioned_slip(wheel_speed, speed, low)
         drive_state[i] = power_state(accel_mps2[i], speed, settings.power_threshold_wpkg)
         desired[i] = desired_slip(
             drive_state[i], direction[i] if normalised else np.sign(speed), target_ratio

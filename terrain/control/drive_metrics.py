@@ -43,11 +43,11 @@ class Course(NamedTuple):
     ----------
     time_s, speed_mps, velocity_mps : (n,), (n,), (n, 2); speed over ground whichever way, velocity in body
         axes
-    progress_mps : (n,) along what is wanted; negative where the robot slides back
+    progress_mps : (n,) along what is required; negative where the robot slides back
     distance_m, energy_j, scrub_j, scrub_along_j : (n,) summed up; scrub is what the contacts take up, and the
         part of it along the wheels
-    rim_mps, ground_mps, slip_ratio : (n, wheels) along each wheel; slip positive in traction whichever way,
-        behind the low-pass, NaN at rest
+    wheel_speed_mps, ground_mps, slip_ratio : (n, wheels) along each wheel; slip positive in traction
+        whichever way, behind the low-pass, NaN at rest
     sinkage_m : (n,) the deepest wheel's
     yaw_rad : (n,)
     """
@@ -60,7 +60,7 @@ class Course(NamedTuple):
     energy_j: Array
     scrub_j: Array
     scrub_along_j: Array
-    rim_mps: Array
+    wheel_speed_mps: Array
     ground_mps: Array
     slip_ratio: Array
     sinkage_m: Array
@@ -93,14 +93,14 @@ def course_of(
         ground[:, i], sideways[:, i] = ahead * cos + left * sin, left * cos - ahead * sin
     torque = np.column_stack([truth.channel(f"torque_{wheel}_nm") for wheel in wheels])
     power_w = np.maximum(torque * rate, 0.0).sum(axis=1)
-    rim = rate * robot.wheel_radius_m * np.asarray(radius_factors)
+    wheel_speed = rate * robot.wheel_radius_m * np.asarray(radius_factors)
     traction = np.column_stack([truth.channel(f"traction_{wheel}_n") for wheel in wheels])
     side = np.column_stack([truth.channel(f"side_{wheel}_n") for wheel in wheels])
-    along_w = (traction * (rim - ground)).sum(axis=1)
+    along_w = (traction * (wheel_speed - ground)).sum(axis=1)
     lost_w = along_w - (side * sideways).sum(axis=1)
     speed = np.hypot(along, across)
     progress = _progress(truth.time_s, np.column_stack([along, across]), run.streams.get("commands"))
-    signed = np.full(rim.shape, math.nan)
+    signed = np.full(wheel_speed.shape, math.nan)
     for i, wheel in enumerate(wheels):
         if f"slip_{wheel}_ratio" in truth.channels:  # a slip that no instant has is no channel
             signed[:, i] = truth.channel(f"slip_{wheel}_ratio")
@@ -116,7 +116,7 @@ def course_of(
         np.cumsum(power_w) * step_s,
         np.cumsum(lost_w) * step_s,
         np.cumsum(along_w) * step_s,
-        rim,
+        wheel_speed,
         ground,
         slip,
         sinkage.max(axis=1),
@@ -125,18 +125,18 @@ def course_of(
 
 
 def _progress(time_s: Array, velocity: Array, commands: Stream | None) -> Array:
-    """Return the speed (n,) along what is wanted, or was last: to slide back down a slope is no way made.
+    """Return the speed (n,) along what is required, or was last: to slide back down a slope is no way made.
 
     Where no translation was wanted yet, as in a turn on the spot, or nobody says what is, it is the speed
     whichever way.
     """
     if commands is None:
         return np.asarray(np.linalg.norm(velocity, axis=1))
-    wanted = np.column_stack([commands.channel("speed_x_mps"), commands.channel("speed_y_mps")])
-    size = np.linalg.norm(wanted, axis=1)
+    desired = np.column_stack([commands.channel("speed_x_mps"), commands.channel("speed_y_mps")])
+    size = np.linalg.norm(desired, axis=1)
     last = np.maximum.accumulate(np.where(size > 0.0, np.arange(size.size), -1))
     at = last[np.clip(np.searchsorted(commands.time_s, time_s, side="right") - 1, 0, size.size - 1)]
-    way = wanted[at] / np.maximum(size[at], 1e-9)[:, None]
+    way = desired[at] / np.maximum(size[at], 1e-9)[:, None]
     along = np.where(at < 0, np.linalg.norm(velocity, axis=1), np.einsum("ij,ij->i", velocity, way))
     return np.asarray(along)
 
@@ -181,20 +181,22 @@ def lock_s(course: Course, start_s: float = 0.0, end_s: float = math.inf) -> flo
     within = (course.time_s >= start_s) & (course.time_s <= end_s)
     step_s = course.time_s[1] - course.time_s[0]
     moving = np.abs(course.ground_mps) > LOCKED_ABOVE_MPS
-    locked = moving & (course.rim_mps * np.sign(course.ground_mps) < LOCKED_SHARE * np.abs(course.ground_mps))
+    locked = moving & (
+        course.wheel_speed_mps * np.sign(course.ground_mps) < LOCKED_SHARE * np.abs(course.ground_mps)
+    )
     return float(locked[within].sum(axis=0).max() * step_s)
 
 
 def immobilised(course: Course, control: Stream) -> int:
     """Return how often the robot was stuck: to go, and not going, for :data:`STUCK_S`.
 
-    It is to go by the pilot's ``wanted_mps``, and not by what wheels are told: a controller that stops the
+    It is to go by the pilot's ``desired_mps``, and not by what wheels are told: a controller that stops the
     robot is no excuse.  It goes where a wheel makes way in the direction that it turns: one that turns on the
     spot is not stuck, one that slides back down a slope is.
     """
-    wanted = np.interp(course.time_s, control.time_s, control.channel("wanted_mps"))
-    going_mps = (course.ground_mps * np.sign(course.rim_mps)).max(axis=1)
-    stuck = (wanted > WANTED_MPS) & (going_mps < STUCK_MPS)
+    desired = np.interp(course.time_s, control.time_s, control.channel("desired_mps"))
+    going_mps = (course.ground_mps * np.sign(course.wheel_speed_mps)).max(axis=1)
+    stuck = (desired > WANTED_MPS) & (going_mps < STUCK_MPS)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], stuck, [False]]).astype(int)))
     step_s = course.time_s[1] - course.time_s[0]
     return int(((edges[1::2] - edges[::2]) * step_s >= STUCK_S).sum())
@@ -238,9 +240,9 @@ def adapt_times(control: Stream, changes: Sequence[tuple[float, float]], close: 
         in s; NaN where it did not before the next change
     """
     target, found = control.channel("target_ratio"), []
-    for i, (change_s, wanted) in enumerate(changes):
+    for i, (change_s, desired) in enumerate(changes):
         end_s = changes[i + 1][0] if i + 1 < len(changes) else math.inf
-        near = (control.time_s >= change_s) & (control.time_s < end_s) & (np.abs(target - wanted) <= close)
+        near = (control.time_s >= change_s) & (control.time_s < end_s) & (np.abs(target - desired) <= close)
         found.append(float(control.time_s[near.argmax()] - change_s) if near.any() else math.nan)
     return found
 

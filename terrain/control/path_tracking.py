@@ -12,7 +12,7 @@ headings times L::
     u + |u| (c - d (c . d))                            (what is told)
 
 - The reference moves by the way that is made, not by the clock: slip, or a traction controller that holds
-  back, is no error, and a correction neither drives nor brakes.  What counts as way is whatever is wanted:
+  back, is no error, and a correction neither drives nor brakes.  What counts as way is whatever is required:
   forward, backward, sideways, along an arc, or the angle of a turn on the spot, where the place is held.
 - Gains are for a metre of way: an error means the same steering angle at any speed.  Above ``fastest / k``
   they fall with the speed, for the delays are in seconds.
@@ -59,7 +59,7 @@ class TrackSettings(NamedTuple):
     heading_max_rad : clamp, as a steering angle: four times the play
     cross_max_rad : the same; a side slope of 5 degrees on grass takes 0.2, which no play does
     heading_fastest_ps, cross_fastest_ps : bandwidths from which on the delays would be felt
-    lag_s : from a twist that is wanted to the motion that is seen: delay, speed loop, steering and filter
+    lag_s : from a twist that is required to the motion that is seen: delay, speed loop, steering and filter
     yaw_std_max_rad : a heading less certain is none; what counts is how it changes, which is known better
     stale_max_s : without a measured speed over ground for longer, the place is none
     """
@@ -85,7 +85,7 @@ _AWAY_MPS = 0.05  # a motion that has a direction
 _TURNED = 0.5  # cosine of 60 degrees
 _LEAP_M, _LEAP_RAD = 0.02, 0.02  # a filter moves its pose by less than a tenth of it beside the motion
 _BLIND_S = 0.5  # longer without a pose, and the reference is lost
-_BACK, _AHEAD = 1.0, 3.0  # how fast the reference goes after the robot, of what is wanted
+_BACK, _AHEAD = 1.0, 3.0  # how fast the reference goes after the robot, of what is required
 
 _POSE, _SEEN, _INTEGRAL, _LAST, _BLIND, _ANCHORED = 0, 3, 9, 12, 15, 16
 STATE_SIZE = 17
@@ -138,12 +138,12 @@ def check_tracking(
         zero = name in ("lag_s",) or "integral" in name or name.endswith("_pm")
         sound = not isinstance(value, bool) and isinstance(value, int | float) and math.isfinite(value)
         if not sound or not (value >= 0.0 if zero else value > 0.0):
-            wanted = "a number from zero up" if zero else "a number above zero"
-            raise ConfigError(f"path tracking: {name} is {value!r}, {wanted} is wanted")
+            desired = "a number from zero up" if zero else "a number above zero"
+            raise ConfigError(f"path tracking: {name} is {value!r}, {desired} is required")
     for name, value, least in (("delay_s", delay_s, 0.0), ("dt_s", dt_s, 1e-3)):
         if not least <= value <= LONGEST_STEP_S:
             raise ConfigError(
-                f"path tracking: {name} is {value!r}, {least:g} to {LONGEST_STEP_S:g} s is wanted"
+                f"path tracking: {name} is {value!r}, {least:g} to {LONGEST_STEP_S:g} s is required"
             )
     fastest_mps = robot.wheel_radius_m * robot.equipment.motors.speed_max_radps
     speeds_mps = np.geomspace(_AWAY_MPS, fastest_mps, 12).tolist()
@@ -202,7 +202,7 @@ def _wrapped(angle_rad: float) -> float:
 def track_step(
     settings: TrackSettings,
     state: Array,
-    wanted_twist: Array,
+    desired_twist: Array,
     position_m: Array,
     yaw_rad: float,
     ground_twist: Array,
@@ -216,7 +216,7 @@ def track_step(
     ----------
     settings : as :func:`check_tracking` gives them
     state : :func:`initial_tracking` at first, then what the step before returned
-    wanted_twist : (3,) finite
+    desired_twist : (3,) finite
     position_m : (2,) of the body's origin in the world, as estimated
     yaw_rad : heading; turns do not count
     ground_twist : (3,) as estimated
@@ -242,7 +242,7 @@ def track_step(
     """
     arm = settings.arm_m
     told, after, said = np.empty(3), state.copy(), np.full(4, math.nan)
-    told[0], told[1], told[2] = wanted_twist[0], wanted_twist[1], wanted_twist[2]
+    told[0], told[1], told[2] = desired_twist[0], desired_twist[1], desired_twist[2]
     said[2] = 0.0
     if not 0.0 < dt_s <= LONGEST_STEP_S:
         said[3] = BAD_TIME
@@ -288,7 +288,7 @@ def track_step(
         said[3] = STANDING
         return told, after, said
 
-    # what is wanted, as late as it is seen
+    # what is required, as late as it is seen
     keep = math.exp(-2.0 * dt_s / settings.lag_s) if settings.lag_s > 0.0 else 0.0
     same, late2, ground2, moved = 0.0, 0.0, 0.0, 0.0
     for j in range(3):

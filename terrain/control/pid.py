@@ -75,18 +75,18 @@ def check_gains(gains: Gains) -> Gains:
     2.0
     >>> check_gains(Gains(1, -1, 0, limit=2))
     Traceback (most recent call last):
-    terrain.errors.ConfigError: gain ki is -1, a finite number from zero up is wanted
+    terrain.errors.ConfigError: gain ki is -1, a finite number from zero up is required
     """
     for name, value in gains._asdict().items():
         given = value if isinstance(value, int | float) and not isinstance(value, bool) else math.nan
         if name == "integral_limit":
             if not given > 0:
-                raise ConfigError(f"gain {name} is {value!r}, a number above zero is wanted")
+                raise ConfigError(f"gain {name} is {value!r}, a number above zero is required")
         elif name == "limit":
             if not 0 < given < math.inf:
-                raise ConfigError(f"gain {name} is {value!r}, a finite number above zero is wanted")
+                raise ConfigError(f"gain {name} is {value!r}, a finite number above zero is required")
         elif not 0 <= given < math.inf:
-            raise ConfigError(f"gain {name} is {value!r}, a finite number from zero up is wanted")
+            raise ConfigError(f"gain {name} is {value!r}, a finite number from zero up is required")
     return Gains(*(float(value) for value in gains))
 
 
@@ -135,6 +135,6 @@ def pid_step(gains: Gains, state: PidState, error: float, dt_s: float) -> tuple[
     integral = min(max(integral, -gains.integral_limit), gains.integral_limit)
     if abs(without + integral) > gains.limit and (without + integral) * error > 0.0:
         integral = state.integral
-    wanted = without + integral
-    output = min(max(wanted, -gains.limit), gains.limit)
-    return output, PidState(integral, smooth), OK if output == wanted else CLAMPED
+    desired = without + integral
+    output = min(max(desired, -gains.limit), gains.limit)
+    return output, PidState(integral, smooth), OK if output == desired else CLAMPED

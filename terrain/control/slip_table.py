@@ -141,7 +141,7 @@ def load_slip_table(path: str | Path | None = None, robot: str | None = None) ->
     content = read_yaml(file)
     schema = content.get("schema", 1) if isinstance(content, dict) else 1
     if isinstance(schema, bool) or not isinstance(schema, int) or schema < 1:
-        raise ConfigError(f"{file}: schema is {schema!r}, 1 or {SCHEMA} is wanted")
+        raise ConfigError(f"{file}: schema is {schema!r}, 1 or {SCHEMA} is required")
     if schema > SCHEMA:
         raise ConfigError(f"{file}: schema {schema} is newer than {SCHEMA}, the newest that is read here")
     keys = ["name", "fallback", "terrains"]
@@ -154,7 +154,7 @@ def load_slip_table(path: str | Path | None = None, robot: str | None = None) ->
         raise ConfigError(f"{file}: the fallback {fallback!r} is no entry of terrains")
     of_robot = content.get("robot", "")
     if schema > 1 and not (isinstance(of_robot, str) and of_robot):
-        raise ConfigError(f"{file}: robot is {of_robot!r}, the name of one is wanted")
+        raise ConfigError(f"{file}: robot is {of_robot!r}, the name of one is required")
     if robot is not None and of_robot and of_robot != robot:
         raise ConfigError(f"{file}: the table is for robot {of_robot!r}, not for {robot!r}")
     targets, curves, reasons = {}, {}, {}
@@ -171,7 +171,7 @@ def load_slip_table(path: str | Path | None = None, robot: str | None = None) ->
             curves[terrain] = _curve(f"{file}: {terrain}, curve", entry["curve"])
         if "reason" in entry:
             if not isinstance(entry["reason"], str):
-                raise ConfigError(f"{file}: {terrain}: reason is {entry['reason']!r}, a text is wanted")
+                raise ConfigError(f"{file}: {terrain}: reason is {entry['reason']!r}, a text is required")
             reasons[terrain] = entry["reason"]
     if any(target.status == "invalid" for target in targets[fallback].values()):
         raise ConfigError(
@@ -307,11 +307,11 @@ def _curve(where: str, content: Any) -> CurveEntry:
         value = content[name]
         if name in ("peak_interval_ratio", "slip_range_ratio"):
             if not isinstance(value, list) or len(value) != 2:
-                raise ConfigError(f"{where}: {name} is {value!r}; two numbers are wanted")
+                raise ConfigError(f"{where}: {name} is {value!r}; two numbers are required")
             low, high = (_finite(f"{where}: {name}", edge) for edge in value)
             if not -1 <= low <= high <= 1:
                 raise ConfigError(
-                    f"{where}: {name} is {value!r}; two rising numbers within [-1, 1] are wanted"
+                    f"{where}: {name} is {value!r}; two rising numbers within [-1, 1] are required"
                 )
             values[name] = (low, high)
             continue

@@ -206,7 +206,7 @@ def plant_matrix(robot: Robot, speed_mps: float, slip_ratio: float, slope_ratio:
     taken_up = (slip - one[CONTACT]) * speed_mps / body.relaxation_length_m
     thrust = slope_ratio * third_kg * GRAVITY_MPS2 * (one[CONTACT] + DEFLECTION_DAMPING_S * taken_up)
     lacking = one[COMMAND] - one[ESTIMATE]
-    wanted = motors.speed_gain_nmspr * lacking + one[INTEGRAL]
+    desired = motors.speed_gain_nmspr * lacking + one[INTEGRAL]
     # no lag is shorter than the simulator's step, as there
     torque_s, estimate_s, encoder_s = (
         max(lag_s, STEP_S)
@@ -220,7 +220,7 @@ def plant_matrix(robot: Robot, speed_mps: float, slip_ratio: float, slope_ratio:
     change[RATE] = (one[TORQUE] - radius_m * thrust) / body.wheel_inertia_kgm2
     change[SPEED] = thrust / third_kg
     change[CONTACT] = taken_up
-    change[TORQUE] = (wanted - one[TORQUE]) / torque_s
+    change[TORQUE] = (desired - one[TORQUE]) / torque_s
     change[INTEGRAL] = motors.speed_integral_nmpr * lacking
     change[ESTIMATE] = (one[RATE] - one[ESTIMATE]) / estimate_s
     change[SEEN] = (slip - one[SEEN]) / encoder_s
@@ -243,7 +243,9 @@ def _points(robot: Robot, delay_s: float, dt_s: float, low_speed_mps: float) -> 
     _n_delayed(delay_s, dt_s)
     fastest_mps = robot.wheel_radius_m * robot.equipment.motors.speed_max_radps
     if not 0 < low_speed_mps < fastest_mps:
-        raise ConfigError(f"low_speed_mps is {low_speed_mps!r}, above 0 and below {fastest_mps:g} is wanted")
+        raise ConfigError(
+            f"low_speed_mps is {low_speed_mps!r}, above 0 and below {fastest_mps:g} is required"
+        )
     speeds_mps = np.geomspace(low_speed_mps, fastest_mps, N_SPEEDS).tolist()
     return _sampled(robot, list(product(speeds_mps, SLIPS, SLOPES)), dt_s)
 
@@ -264,9 +266,9 @@ def _sampled(robot: Robot, places: Sequence[tuple[float, float, float]], dt_s: f
 
 def _n_delayed(delay_s: float, dt_s: float) -> int:
     if not 0 < dt_s <= LONGEST_DELAY_S:
-        raise ConfigError(f"dt_s is {dt_s!r}, above 0 and up to {LONGEST_DELAY_S:g} s is wanted")
+        raise ConfigError(f"dt_s is {dt_s!r}, above 0 and up to {LONGEST_DELAY_S:g} s is required")
     if not 0 <= delay_s <= LONGEST_DELAY_S:
-        raise ConfigError(f"delay_s is {delay_s!r}, 0 to {LONGEST_DELAY_S:g} s is wanted")
+        raise ConfigError(f"delay_s is {delay_s!r}, 0 to {LONGEST_DELAY_S:g} s is required")
     return math.ceil(delay_s / dt_s - 1e-9)
 
 

@@ -45,14 +45,14 @@ class Belief(NamedTuple):
     ----------
     terrain : believed; :data:`UNKNOWN` at first
     probability : with which it was said last; NaN before
-    candidate, since_s, heard_s : what was said last, since when without interruption, and when last
+    candidate, since_s, received_s : what was said last, since when without interruption, and when last
     """
 
     terrain: str = UNKNOWN
     probability: float = math.nan
     candidate: str = UNKNOWN
     since_s: float = math.nan
-    heard_s: float = math.nan
+    received_s: float = math.nan
 
 
 NOTHING = Belief()
@@ -70,13 +70,13 @@ def check_switching(settings: SwitchSettings) -> None:
     --------
     >>> check_switching(SWITCHING._replace(probability_least=1.5))
     Traceback (most recent call last):
-    terrain.errors.ConfigError: switching: probability_least is 1.5, a number from 0 to 1 is wanted
+    terrain.errors.ConfigError: switching: probability_least is 1.5, a number from 0 to 1 is required
     """
     for name, value in settings._asdict().items():
-        most, wanted = (1.0, "from 0 to 1") if name == "probability_least" else (math.inf, "from zero up")
+        most, desired = (1.0, "from 0 to 1") if name == "probability_least" else (math.inf, "from zero up")
         number = isinstance(value, int | float) and not isinstance(value, bool)
         if not (number and math.isfinite(value) and 0.0 <= value <= most):
-            raise ConfigError(f"switching: {name} is {value!r}, a number {wanted} is wanted")
+            raise ConfigError(f"switching: {name} is {value!r}, a number {desired} is required")
 
 
 def hear(
@@ -93,10 +93,10 @@ def hear(
     >>> belief.terrain, hear(belief, 4.0, "grass", 0.8).terrain
     ('', 'grass')
     """
-    if not math.isfinite(time_s) or time_s <= belief.heard_s:
+    if not math.isfinite(time_s) or time_s <= belief.received_s:
         return belief
     said = terrain if probability >= settings.probability_least else UNKNOWN  # False for NaN
-    goes_on = said == belief.candidate and time_s - belief.heard_s <= settings.silent_s
+    goes_on = said == belief.candidate and time_s - belief.received_s <= settings.silent_s
     since_s = belief.since_s if goes_on else time_s
     if said == belief.terrain:
         shown = probability if said else math.nan
@@ -106,7 +106,7 @@ def hear(
     return Belief(belief.terrain, belief.probability, said, since_s, time_s)
 
 
-def approach(now: float, wanted: float, rate: float, dt_s: float) -> float:
+def approach(now: float, desired: float, rate: float, dt_s: float) -> float:
     """Return a target on its way: no further than ``rate dt`` from now; where there is none yet, the wanted.
 
     Examples
@@ -115,6 +115,6 @@ def approach(now: float, wanted: float, rate: float, dt_s: float) -> float:
     (0.102, 0.25)
     """
     if not math.isfinite(now):
-        return wanted
+        return desired
     step = rate * max(dt_s, 0.0)
-    return now + min(max(wanted - now, -step), step)
+    return now + min(max(desired - now, -step), step)

@@ -170,16 +170,16 @@ def check_settings(settings: TractionSettings) -> TractionSettings:
     --------
     >>> check_settings(SETTINGS._replace(lead_s=-0.1))
     Traceback (most recent call last):
-    terrain.errors.ConfigError: traction: lead_s is -0.1, a number from zero up is wanted
+    terrain.errors.ConfigError: traction: lead_s is -0.1, a number from zero up is required
     """
     for name, value in settings._asdict().items():
-        least, wanted = (
+        least, desired = (
             (1e-6, "above zero")
             if name in ("launch_mps", "droop_time_s", "charge_time_s")
             else (0.0, "from zero up")
         )
         if isinstance(value, bool) or not isinstance(value, int | float) or not least <= value < math.inf:
-            raise ConfigError(f"traction: {name} is {value!r}, a number {wanted} is wanted")
+            raise ConfigError(f"traction: {name} is {value!r}, a number {desired} is required")
     return TractionSettings(*(float(value) for value in settings))
 
 
@@ -270,17 +270,17 @@ def traction_step(
     """
     n = wheel_radps.size
     told, after, said = np.empty(n), state.copy(), np.empty(6)
-    wanted, along = 0.0, 0.0
+    desired, along = 0.0, 0.0
     for i in range(n):
-        wanted = max(wanted, abs(wheel_radps[i]) * radius_m)
+        desired = max(desired, abs(wheel_radps[i]) * radius_m)
         along += wheel_radps[i] * state[_PATTERN + i]
     was = state[_DRIVEN] if along >= 0.0 else 0.0  # the other way at once is a start from rest
     status = OK
     # what is known of the ground
     q, gain, slip, shared, std = math.inf, 0.0, -math.inf, 0.0, 0.0
     for i in range(n):
-        if wanted > 0.0:  # what a command to stop takes its directions from
-            after[_PATTERN + i] = wheel_radps[i] / wanted
+        if desired > 0.0:  # what a command to stop takes its directions from
+            after[_PATTERN + i] = wheel_radps[i] / desired
         sign = 1.0 if after[_PATTERN + i] >= 0.0 else -1.0
         speed = abs(after[_PATTERN + i]) * radius_m  # in shares of the fastest
         if not (
@@ -309,16 +309,16 @@ def traction_step(
     if not (0.0 < dt_s <= MAX_STEP_S):
         status = BAD_TIME
     if status == BAD_TIME:
-        driven = min(wanted, was + settings.fade_mps2 * _USUAL_STEP_S)
+        driven = min(desired, was + settings.fade_mps2 * _USUAL_STEP_S)
         after[_DRIVEN] = driven
         for i in range(n):
             told[i] = after[_PATTERN + i] * driven
         _say(said, driven, ground.traction_ratio, state[_BALANCE], math.nan, STEADY, BAD_TIME)
         return told, after, said
 
-    rising = wanted > was + 1e-9
-    falling = state[_WANTED] - wanted > _BRAKE_MPS2 * dt_s
-    after[_WANTED] = wanted
+    rising = desired > was + 1e-9
+    falling = state[_WANTED] - desired > _BRAKE_MPS2 * dt_s
+    after[_WANTED] = desired
     margin = max(settings.balance_margin_ratio, ground.margin_ratio)
     target = ground.traction_ratio
     if math.isfinite(state[_BALANCE]):
@@ -327,30 +327,30 @@ def traction_step(
     drive_state = STEADY
     if rising:
         drive_state = TRACTION
-    elif falling or (state[_BRAKING] > 0.0 and was > wanted):
+    elif falling or (state[_BRAKING] > 0.0 and was > desired):
         drive_state = BRAKING
 
     # drive
     braking_s = 0.0
     if status != OK:
-        driven = min(wanted, was + settings.fade_mps2 * dt_s)
+        driven = min(desired, was + settings.fade_mps2 * dt_s)
         after[_HELD] = 0.0
     elif rising:
         ahead = q + settings.lead_s * min(max(gain, 0.0), settings.lead_max_mps2)
         cap = max(ahead, settings.launch_mps) / (1.0 - min(target, _FLOOR_MAX))
-        driven = min(wanted, max(was, cap))
-        after[_HELD] = state[_HELD] + dt_s if driven < wanted else 0.0
+        driven = min(desired, max(was, cap))
+        after[_HELD] = state[_HELD] + dt_s if driven < desired else 0.0
     else:
-        driven = wanted
+        driven = desired
         after[_HELD] = 0.0
         if drive_state == BRAKING and ground.braking_mps2 > 0.0:
             braking_s = state[_BRAKING] + dt_s
             ahead = q - ground.braking_mps2 * min(braking_s, settings.brake_lead_s)
             charge = settings.charge_mps_per_mps2 * math.exp(-braking_s / settings.charge_time_s)
             ahead = ahead * (1.0 - ground.braking_ratio)
-            driven = max(wanted, min(was, ahead - charge * ground.braking_mps2))
-            if ahead <= max(wanted, _BRAKE_END_MPS):
-                driven, braking_s = wanted, 0.0
+            driven = max(desired, min(was, ahead - charge * ground.braking_mps2))
+            if ahead <= max(desired, _BRAKE_END_MPS):
+                driven, braking_s = desired, 0.0
     after[_BRAKING] = braking_s
     after[_BRAKED_FROM] = 0.0 if braking_s == 0.0 else max(state[_BRAKED_FROM], was)
     after[_DRIVEN] = driven
@@ -368,7 +368,7 @@ def traction_step(
             seen = state[_BALANCE] if math.isfinite(state[_BALANCE]) else shared
             after[_BALANCE] = seen + (shared - seen) * min(dt_s / _BALANCE_S, 1.0)
             floor = min(max(after[_BALANCE], 0.0) + margin, _FLOOR_MAX)
-            after[_FLOOR] = floor if driven >= wanted else max(after[_FLOOR], floor)
+            after[_FLOOR] = floor if driven >= desired else max(after[_FLOOR], floor)
 
     # one speed for all, and torques that are shared; beside the others', one that is not known is not 0
     mean = 0.0

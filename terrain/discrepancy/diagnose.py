@@ -86,7 +86,9 @@ def diagnose(
     if twice := [run_id for run_id, n in ids.items() if n > 1]:
         raise DataError(f"runs: {twice[0]!r} is the id of {ids[twice[0]]} runs; each needs its own")
     if len(runs) < MIN_RUNS:
-        raise DataError(f"runs: there are {len(runs)}, {MIN_RUNS} at the least are wanted, to hold some out")
+        raise DataError(
+            f"runs: there are {len(runs)}, {MIN_RUNS} at the least are required, to hold some out"
+        )
     return diagnose_signals([signals_of(run, simulation.robot) for run in runs], simulation, library)
 
 

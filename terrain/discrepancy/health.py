@@ -113,14 +113,14 @@ def _dead(signals: Sequence[Signals], info: Information) -> dict[int, str]:
             dead[_CURRENT] = False  # it is looked at only while the wheels are parallel
         for c in np.flatnonzero(dead):
             reasons[i] = f"its {CHANNELS[c]} is there in {share[i, c]:.0%} of its samples"
-        known = np.isfinite(run.rim_mps).all(axis=1)
+        known = np.isfinite(run.wheel_speed_mps).all(axis=1)
         if known.mean() < MIN_FINITE_SHARE:
             reasons[i] = f"its wheels are there in {known.mean():.0%} of its samples"
             continue
-        spread = run.rim_mps[known].std(axis=0)
+        spread = run.wheel_speed_mps[known].std(axis=0)
         if spread.min() < STILL_MPS and spread.max() > VARIES_MPS:
             reasons[i] = f"its wheel {int(np.argmin(spread)) + 1} never turns faster or slower, the others do"
-        elif np.abs(run.rim_mps[known]).max() < STILL_MPS:
+        elif np.abs(run.wheel_speed_mps[known]).max() < STILL_MPS:
             shown = info.rows[i].measured[:, _SPEEDS]
             if shown.size and np.nanmax(np.hypot(*np.nan_to_num(shown).T)) > MOVING_MPS:
                 reasons[i] = "its wheels stand, its camera moves"

@@ -124,7 +124,7 @@ def _parting(
     """Return the drive that parts all sets best; if none does, the one that does with a channel more."""
     logged = _logged(simulation.robot, info)
     names = list(dict.fromkeys(p for group in sets for effect in group for p in _parameters(effect)))
-    wanted = [
+    desired = [
         channel
         for group in sets
         for effect in group
@@ -136,7 +136,7 @@ def _parting(
     if info is not None:
         at = info.places(names)
         now = _parted(sets, names, info.a[:, at][:, :, at].sum(axis=0))
-    for channels in (logged, (*logged, *wanted)) if wanted else (logged,):
+    for channels in (logged, (*logged, *desired)) if desired else (logged,):
         drives = _drives(simulation, names, channels, info)
         found = [(_parted(sets, names, drive.a), drive) for drive in drives]
         found = [pair for pair in found if pair[0].collinearity < PARTED_INDEX]
@@ -145,7 +145,7 @@ def _parting(
         parted, drive = max(found, key=lambda pair: pair[0].power)
         index = f"{parted.collinearity:.2g}"
         if channels is not logged:
-            lacking = _listed(list(dict.fromkeys(wanted)))
+            lacking = _listed(list(dict.fromkeys(desired)))
             reason = f"{told} are one without {lacking}; with it logged, their collinearity index is {index}"
         elif info is None:
             reason = f"the collinearity index of {told} would be {index}"
@@ -248,7 +248,7 @@ def _drives(
 
 
 def _inputs(robot: Robot, name: str) -> tuple[Array, Array] | None:
-    """Return rim speeds and steering (n, wheels) of a scenario, or None if the robot cannot drive it."""
+    """Return wheel speeds and steering (n, wheels) of a scenario, or None if the robot cannot drive it."""
     speed_mps = 0.6 * robot.wheel_radius_m * (robot.motors.speed_max_radps if robot.motors else 0.0)
     try:
         scenario = make_scenario(name, robot, "ground", speed_mps=min(speed_mps, 1.0))
@@ -267,25 +267,31 @@ def _inputs(robot: Robot, name: str) -> tuple[Array, Array] | None:
             twist,
             np.zeros(3),
         )
-        rim_mps = wheel_radps * robot.wheel_radius_m
+        wheel_speed_mps = wheel_radps * robot.wheel_radius_m
     else:
         turn = 0.5 * robot.track_m * twist[:, 2]
-        rim_mps, steer_rad = (
+        wheel_speed_mps, steer_rad = (
             np.column_stack([twist[:, 0] - turn, twist[:, 0] + turn]),
             np.zeros((len(twist), 2)),
         )
     keep = math.exp(-1.0 / (RATE_HZ * FOLLOW_S))
     every = round(RATE_HZ / CLOCK_HZ)
-    rim_mps, steer_rad = (lfilter([1 - keep], [1, -keep], x, axis=0)[::every] for x in (rim_mps, steer_rad))
-    return rim_mps, steer_rad
+    wheel_speed_mps, steer_rad = (
+        lfilter([1 - keep], [1, -keep], x, axis=0)[::every] for x in (wheel_speed_mps, steer_rad)
+    )
+    return wheel_speed_mps, steer_rad
 
 
 def _signals(
-    simulation: Simulation, rim_mps: Array, steer_rad: Array, grade_deg: float, channels: Sequence[str]
+    simulation: Simulation,
+    wheel_speed_mps: Array,
+    steer_rad: Array,
+    grade_deg: float,
+    channels: Sequence[str],
 ) -> Signals:
     """Return a drive as a log without noise would have it; what was measured is not looked at, only where."""
-    level, vector = np.zeros(len(rim_mps)), simulation.vector
-    measured = np.full((len(rim_mps), len(CHANNELS)), np.nan)
+    level, vector = np.zeros(len(wheel_speed_mps)), simulation.vector
+    measured = np.full((len(wheel_speed_mps), len(CHANNELS)), np.nan)
     measured[:, [CHANNELS.index(name) for name in channels]] = 0.0
     if simulation.robot.drive == "swerve":
         parallel = np.abs(np.exp(1j * steer_rad).mean(axis=1)) > PARALLEL
@@ -293,13 +299,20 @@ def _signals(
     grade, roll = level, level
     if grade_deg:
         flat = move(
-            simulation.planar, vector, 1.0 / CLOCK_HZ, rim_mps, steer_rad, level, level, np.zeros((0, 3))
+            simulation.planar,
+            vector,
+            1.0 / CLOCK_HZ,
+            wheel_speed_mps,
+            steer_rad,
+            level,
+            level,
+            np.zeros((0, 3)),
         )
         yaw = np.cumsum(flat[:, TRUTH.index("yaw_rate_radps")]) / CLOCK_HZ
         steepness = math.tan(math.radians(grade_deg))
         ahead, left = steepness * np.cos(yaw), -steepness * np.sin(yaw)
         grade, roll = np.arctan(ahead / np.hypot(1.0, left)), np.arctan(left)
-    return Signals("", "", 1.0 / CLOCK_HZ, 0.0, rim_mps, steer_rad, grade, roll, measured)
+    return Signals("", "", 1.0 / CLOCK_HZ, 0.0, wheel_speed_mps, steer_rad, grade, roll, measured)
 
 
 def _noise(info: Information | None) -> Noise:

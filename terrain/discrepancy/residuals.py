@@ -30,7 +30,7 @@ INPUT_CUTOFFS = 2.4
 """Cut-off of what drives the simulation, over that of the common low-pass."""
 
 CALM_CUTOFF = 0.6
-"""Cut-off of the rim speeds that sensitivities are taken along, over that of the common low-pass: see
+"""Cut-off of the wheel speeds that sensitivities are taken along, over that of the common low-pass: see
 :func:`rows_of`."""
 
 SAME_CLOCK = 0.05
@@ -58,7 +58,7 @@ STEPS = {p.name: p.step for effect in LIBRARY for p in effect.parameters} | {
 """Over which change of a parameter its sensitivity is taken."""
 
 
-ONE_SIDED = ("steering_play_rad",)
+ONE_SIDED = ("steering_backlash_rad",)
 """Parameters that are not taken below 0: a play is not negative.  All others are taken to both sides:
 a delay to one side alone is half a step off, and then noise of the wheels looks like it."""
 
@@ -74,8 +74,8 @@ class LowPass(NamedTuple):
     cutoff_hz : of the window
     inputs_every : samples of the signals' clock a sample of the replay's; 0 where that clock is too slow for
         a window of its own in between
-    calm_hz : cut-off of the rim speeds that sensitivities are taken along, see :func:`rows_of`; infinite for
-        those of the prediction
+    calm_hz : cut-off of the wheel speeds that sensitivities are taken along, see :func:`rows_of`; infinite
+        for those of the prediction
     """
 
     taps: Array
@@ -126,8 +126,8 @@ INPUTS: tuple[str, ...] = (
     "force_ratio",
     "wheel_phase_rad",
 )
-"""Mean rim speed, right minus left (last minus first) rim speed, mean steering, tilt, traction over weight,
-and how far the wheels have turned: a column for each of them."""
+"""Mean wheel speed, right minus left (last minus first) wheel speed, mean steering, tilt,
+traction over weight, and how far the wheels have turned: a column for each of them."""
 
 
 def low_pass_of(signals: Sequence[Signals]) -> LowPass:
@@ -143,7 +143,7 @@ def low_pass_of(signals: Sequence[Signals]) -> LowPass:
     if 1 / fast.dt_s > (1 + SAME_CLOCK) * rate_hz:
         raise DataError(
             f"runs: {slow.run_id} is on a clock of {rate_hz:.3g} Hz, {fast.run_id} on one of "
-            f"{1 / fast.dt_s:.3g} Hz; clocks within {SAME_CLOCK:.0%} of each other are wanted"
+            f"{1 / fast.dt_s:.3g} Hz; clocks within {SAME_CLOCK:.0%} of each other are required"
         )
     cutoff_hz = min(CUTOFF_HZ, rate_hz / 5.0)
     near = 1 + SAME_CLOCK  # a logger of 49.9 Hz is one of 50
@@ -187,8 +187,8 @@ def rows_of(
     much of a mass.  Sensitivities are therefore taken along calmer wheels, as instruments: noise of a
     differentiated encoder grows with frequency, what a robot was told to do does not.
     """
-    dt, rim, steer, grade, roll, measured = _prepared(signals, low_pass)
-    n_rows = max((len(rim) - low_pass.taps.size) // low_pass.every + 1, 0)
+    dt, wheel_speed, steer, grade, roll, measured = _prepared(signals, low_pass)
+    n_rows = max((len(wheel_speed) - low_pass.taps.size) // low_pass.every + 1, 0)
     first = low_pass.taps.size // 2
     skip = math.ceil(SETTLE_S * low_pass.rate_hz)
     keep = slice(skip, max(n_rows - skip, skip))
@@ -206,13 +206,15 @@ def rows_of(
         rows: Array = holed(np.ascontiguousarray(values), known, low_pass.taps, low_pass.every)
         return rows[keep]
 
-    calm = _calm(rim, low_pass, dt)
-    true_rim, true_grade, true_roll = undone(planar, vector, dt, calm, grade, roll)
-    truth = move(planar, vector, dt, true_rim, steer, true_grade, true_roll, np.zeros((0, 3)))
+    calm = _calm(wheel_speed, low_pass, dt)
+    true_wheel_speed, true_grade, true_roll = undone(planar, vector, dt, calm, grade, roll)
+    truth = move(planar, vector, dt, true_wheel_speed, steer, true_grade, true_roll, np.zeros((0, 3)))
     points, sensed, spans = _points(vector, parameters)
     holes = np.zeros((0, 0), dtype=np.bool_) if whole else known
     window = holes, low_pass.taps, low_pass.every
-    now = _predictions(planar, points[:1], sensed[:1], dt, rim, steer, grade, roll, truth, *window)[0, keep]
+    now = _predictions(planar, points[:1], sensed[:1], dt, wheel_speed, steer, grade, roll, truth, *window)[
+        0, keep
+    ]
     told = _predictions(planar, points[1:], sensed[1:], dt, calm, steer, grade, roll, truth, *window)[:, keep]
     change = (told[::2] - told[1::2]) / spans[:, None, None]
     speed = calm.mean(axis=1)
@@ -231,13 +233,13 @@ def rows_of(
     )
 
 
-def _calm(rim: Array, low_pass: LowPass, dt: float) -> Array:
-    """Return rim speeds (n, wheels) behind the low-pass of the sensitivities, as long as they were."""
+def _calm(wheel_speed: Array, low_pass: LowPass, dt: float) -> Array:
+    """Return wheel speeds (n, wheels) behind the low-pass of the sensitivities, as long as they were."""
     if not math.isfinite(low_pass.calm_hz):
-        return rim
+        return wheel_speed
     taps = _window(low_pass.calm_hz, 1.0 / dt)
     half = taps.size // 2
-    return np.asarray(decimated(np.pad(rim, ((half, half), (0, 0)), mode="edge"), taps, 1))
+    return np.asarray(decimated(np.pad(wheel_speed, ((half, half), (0, 0)), mode="edge"), taps, 1))
 
 
 def _points(vector: Array, parameters: Sequence[str]) -> tuple[Array, Array, Array]:
@@ -264,7 +266,7 @@ def _predictions(
     points: Array,
     sensed: Array,
     dt: float,
-    rim_mps: Array,
+    wheel_speed_mps: Array,
     steer_rad: Array,
     grade_rad: Array,
     roll_rad: Array,
@@ -278,13 +280,13 @@ def _predictions(
     ``truth`` is what the body does at all points where sensors alone change; ``known`` says where something
     was measured, or is empty where that is everywhere.
     """
-    m = max((rim_mps.shape[0] - taps.size) // every + 1, 0)
+    m = max((wheel_speed_mps.shape[0] - taps.size) // every + 1, 0)
     out = np.empty((points.shape[0], m, 7))
     for i in range(points.shape[0]):
         if sensed[i]:
             shown = sense(planar, points[i], dt, truth)
         else:
-            shown = replay(planar, points[i], dt, rim_mps, steer_rad, grade_rad, roll_rad)
+            shown = replay(planar, points[i], dt, wheel_speed_mps, steer_rad, grade_rad, roll_rad)
         out[i] = holed(shown, known, taps, every) if known.shape[0] > 0 else decimated(shown, taps, every)
     return out
 
@@ -296,7 +298,9 @@ def _prepared(signals: Signals, low_pass: LowPass) -> tuple[float, Array, Array,
     window far above the low-pass: what is bent in the simulation, as friction about rest, turns noise of the
     wheels into something that does not average out.
     """
-    columns = np.column_stack([signals.rim_mps, signals.steer_rad, signals.grade_rad, signals.roll_rad])
+    columns = np.column_stack(
+        [signals.wheel_speed_mps, signals.steer_rad, signals.grade_rad, signals.roll_rad]
+    )
     measured = np.array(signals.measured)
     holes = ~np.isfinite(columns).all(axis=1)
     if holes.any():
@@ -313,11 +317,11 @@ def _prepared(signals: Signals, low_pass: LowPass) -> tuple[float, Array, Array,
         padded = np.pad(both, ((half, half), (0, 0)), mode="edge")
         both = decimated(padded, taps, every)
         columns, measured = both[:, : columns.shape[1]], both[:, columns.shape[1] :]
-    wheels = signals.rim_mps.shape[1]
-    rim, steer, tilt = np.split(columns, [wheels, 2 * wheels], axis=1)
+    wheels = signals.wheel_speed_mps.shape[1]
+    wheel_speed, steer, tilt = np.split(columns, [wheels, 2 * wheels], axis=1)
     return (
         signals.dt_s * max(every, 1),
-        np.ascontiguousarray(rim),
+        np.ascontiguousarray(wheel_speed),
         np.ascontiguousarray(steer),
         np.ascontiguousarray(tilt[:, 0]),
         np.ascontiguousarray(tilt[:, 1]),

@@ -83,8 +83,8 @@ class Problem(NamedTuple):
         self, vector: Array, names: Sequence[str] | None = None, noise: Noise | None = None
     ) -> Information:
         """Return what the runs say around a point."""
-        wanted = self.parameters if names is None else names
-        return information_at(self.signals, self.simulation, vector, wanted, self.low_pass, noise)
+        desired = self.parameters if names is None else names
+        return information_at(self.signals, self.simulation, vector, desired, self.low_pass, noise)
 
     def near(self, info: Information, vector: Array, names: Sequence[str]) -> Nearby:
         """Return what the runs say of a few parameters at another point, by the noise of an information."""

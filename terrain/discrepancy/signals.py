@@ -54,7 +54,7 @@ class Signals:
     run_id, terrain : of the run; the terrain is empty where it has no label or several
     dt_s : period of the clock
     start_s : first instant on the run's own clock
-    rim_mps : (n, wheels) rim speeds with the nominal radius; NaN where a logger was silent
+    wheel_speed_mps : (n, wheels) wheel speeds with the nominal radius; NaN where a logger was silent
     steer_rad : (n, wheels) steering angles, zeros taken off; 0 for a robot that has none
     grade_rad, roll_rad : (n,) measured tilt, uphill and left side up positive; 0 where none is measured
     measured : (n, len(CHANNELS)) what the simulation is held against; NaN where nothing was measured
@@ -64,14 +64,14 @@ class Signals:
     terrain: str
     dt_s: float
     start_s: float
-    rim_mps: Array
+    wheel_speed_mps: Array
     steer_rad: Array
     grade_rad: Array
     roll_rad: Array
     measured: Array
 
     def __post_init__(self) -> None:
-        for name in ("rim_mps", "steer_rad", "grade_rad", "roll_rad", "measured"):
+        for name in ("wheel_speed_mps", "steer_rad", "grade_rad", "roll_rad", "measured"):
             object.__setattr__(self, name, read_only(getattr(self, name)))
 
     def __len__(self) -> int:
@@ -99,7 +99,7 @@ def signals_of(run: RunLog, robot: Robot) -> Signals:
     if "wheels" not in run.streams:
         raise DataError(f"run {run.run_id}: it has no stream 'wheels', which drives the simulation")
     wheels = run.streams["wheels"]
-    rims = _rims(run, wheels, robot)
+    wheel_speeds = _wheel_speeds(run, wheels, robot)
     swerve = robot.drive == "swerve"
     if swerve and "steering" not in run.streams:
         raise DataError(f"run {run.run_id}: it has no stream 'steering', which drives the simulation")
@@ -112,7 +112,7 @@ def signals_of(run: RunLog, robot: Robot) -> Signals:
     if n < MIN_LENGTH_S * rate_hz:
         raise DataError(
             f"run {run.run_id}: its streams have {max(end_s - start_s, 0.0):.1f} s in common, "
-            f"{MIN_LENGTH_S:g} s at the least are wanted"
+            f"{MIN_LENGTH_S:g} s at the least are required"
         )
     time_s = start_s + np.arange(n) / rate_hz
     steer = np.zeros((n, len(robot.wheels)))
@@ -152,7 +152,7 @@ def signals_of(run: RunLog, robot: Robot) -> Signals:
     currents = [f"current_{wheel}_a" for wheel in robot.wheels]
     if set(currents) <= set(wheels.channels):
         each = [
-            _at(time_s, wheels.time_s, _signed(wheels.channel(name), rims[:, i]))
+            _at(time_s, wheels.time_s, _signed(wheels.channel(name), wheel_speeds[:, i]))
             for i, name in enumerate(currents)
         ]
         measured[:, CHANNELS.index(CURRENT)] = np.sum(each, axis=0)
@@ -164,14 +164,16 @@ def signals_of(run: RunLog, robot: Robot) -> Signals:
     if not np.isfinite(measured).any():
         raise DataError(
             f"run {run.run_id}: none of its channels is simulated; a gyro, currents of all wheels, a speed "
-            "over ground or an accelerometer with its tilt is wanted"
+            "over ground or an accelerometer with its tilt is required"
         )
     return Signals(
         run.run_id,
         run.terrains[0] if len(run.terrains) == 1 else "",
         1 / rate_hz,
         start_s,
-        np.column_stack([_at(time_s, wheels.time_s, rims[:, i]) for i in range(rims.shape[1])]),
+        np.column_stack(
+            [_at(time_s, wheels.time_s, wheel_speeds[:, i]) for i in range(wheel_speeds.shape[1])]
+        ),
         steer,
         grade,
         roll,
@@ -179,8 +181,8 @@ def signals_of(run: RunLog, robot: Robot) -> Signals:
     )
 
 
-def _rims(run: RunLog, wheels: Stream, robot: Robot) -> Array:
-    """Rim speeds (n, wheels), from rim speeds or from the motors' rates."""
+def _wheel_speeds(run: RunLog, wheels: Stream, robot: Robot) -> Array:
+    """Wheel speeds (n, wheels), from wheel speeds or from the motors' rates."""
     for pattern in ("motor_{}_radps", "speed_{}_mps"):
         names = [pattern.format(wheel) for wheel in robot.wheels]
         if set(names) <= set(wheels.channels):
@@ -192,7 +194,7 @@ def _rims(run: RunLog, wheels: Stream, robot: Robot) -> Array:
             return rates * (robot.wheel_radius_m / robot.motors.reduction_ratio)
     raise DataError(
         f"run {run.run_id}: its wheels have the channels {', '.join(wheels.channels)}; a speed of each of "
-        f"{', '.join(robot.wheels)} is wanted"
+        f"{', '.join(robot.wheels)} is required"
     )
 
 
@@ -205,16 +207,16 @@ def _without_jumps(seen: Stream, speed_mps: Array) -> Array:
     return np.where(jumps[:, None], np.nan, speed_mps)
 
 
-def _signed(current_a: Array, rim_mps: Array) -> Array:
+def _signed(current_a: Array, wheel_speed_mps: Array) -> Array:
     """Return currents (n,) with the sign of the wheel's turning, where the driver logs only their size.
 
     It does, if a wheel turns backward and its current is never below zero.  That a motor brakes cannot be
     told from such a log.
     """
-    backward = rim_mps < -BACKWARD_MPS
+    backward = wheel_speed_mps < -BACKWARD_MPS
     if backward.sum() < MIN_BACKWARD or np.nanmin(current_a) < 0:
         return current_a
-    return np.asarray(current_a * np.sign(rim_mps))
+    return np.asarray(current_a * np.sign(wheel_speed_mps))
 
 
 def _put(measured: Array, channel: str, time_s: Array, stream: Stream, name: str) -> None:

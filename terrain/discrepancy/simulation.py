@@ -41,7 +41,9 @@ class Simulation:
         vector_of(self.effects)
         for name, std in self.scatter.items():
             if name not in NUISANCES or not std >= 0:
-                raise ConfigError(f"scatter: {name} is {std!r}; a standard deviation of a nuisance is wanted")
+                raise ConfigError(
+                    f"scatter: {name} is {std!r}; a standard deviation of a nuisance is required"
+                )
         object.__setattr__(self, "effects", MappingProxyType(dict(self.effects)))
         object.__setattr__(self, "scatter", MappingProxyType(dict(self.scatter)))
         object.__setattr__(self, "grounds", MappingProxyType(dict(self.grounds)))

@@ -29,7 +29,7 @@ FELT_LOSS = 20.0
 log-likelihood."""
 
 
-def with_felt_tilt(
+def with_effective_tilt(
     simulation: Simulation, signals: Sequence[Signals], library: Sequence[Effect]
 ) -> Simulation:
     """Return the simulation with the share of the tilt that the robot feels on each labelled ground.
@@ -44,7 +44,7 @@ def with_felt_tilt(
     for terrain, ground in simulation.grounds.items():
         runs = [run for run in signals if run.terrain == terrain]
         if runs:
-            grounds[terrain] = ground._replace(felt_ratio=_felt(simulation, runs, ground, library))
+            grounds[terrain] = ground._replace(effective_ratio=_felt(simulation, runs, ground, library))
     return replace(simulation, grounds=grounds)
 
 
@@ -54,7 +54,7 @@ def _felt(
     names, low_pass = names_of(library), low_pass_of(runs)
     losses = []
     for share in SHARES:
-        tried = replace(simulation, grounds={runs[0].terrain: ground._replace(felt_ratio=share)})
+        tried = replace(simulation, grounds={runs[0].terrain: ground._replace(effective_ratio=share)})
         losses.append(_loss(information_at(runs, tried, simulation.vector, names, low_pass)))
     share, least = best_of(np.array(losses))
     return share if losses[-1] - least > FELT_LOSS else 1.0

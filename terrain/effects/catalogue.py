@@ -3,7 +3,7 @@
 Signals are those of :mod:`terrain.simulation.planar.model`: ``u`` the speed that the wheels would roll
 without slip, ``v`` the speed over ground, ``d`` a steering angle, ``w`` the yaw rate, ``F`` the traction, ``W
 = m g`` the nominal weight, ``f = F / W``, ``th`` the grade (uphill positive), ``ph`` the roll (left side up
-positive), ``B`` the track, ``dv`` right minus left rim speed and ``q = |dv| / (|dv| + 2 |u|)`` how tight a
+positive), ``B`` the track, ``dv`` right minus left wheel speed and ``q = |dv| / (|dv| + 2 |u|)`` how tight a
 turn is.
 """
 
@@ -94,7 +94,7 @@ LIBRARY: tuple[Effect, ...] = (
     Effect(
         "wheel_radius",
         _one("wheel_radius_ratio", -0.3, 0.3, 0.01),
-        "rim speed = (1 + e) r x wheel rate",
+        "wheel speed = (1 + e) r x wheel rate",
         _KINEMATICS,
         BOTH,
         (*_MOTION, HEADING),
@@ -104,7 +104,7 @@ LIBRARY: tuple[Effect, ...] = (
     Effect(
         "one_sided_radius",
         _one("one_sided_radius_ratio", -0.3, 0.3, 0.01),
-        "rim speeds of the right side x (1 + e/2), of the left x (1 - e/2)",
+        "wheel speeds of the right side x (1 + e/2), of the left x (1 - e/2)",
         _KINEMATICS,
         BOTH,
         (*_MOTION, HEADING),
@@ -123,8 +123,8 @@ LIBRARY: tuple[Effect, ...] = (
         for i in (1, 2, 3)
     ),
     Effect(
-        "steering_play",
-        _one("steering_play_rad", 0.0, 0.2, 0.003),
+        "steering_backlash",
+        _one("steering_backlash_rad", 0.0, 0.2, 0.003),
         "d follows the measured angle through a play of half width b",
         "play operator; Krasnosel'skii and Pokrovskii, Systems with Hysteresis, 1989",
         (SWERVE,),
@@ -422,9 +422,9 @@ def read_effect(text: str, drive: str) -> dict[str, float]:
         values = [float(part) for part in given.split(",")]
     except ValueError:
         values = []
-    wanted = ",".join(p.name for p in effect.parameters)
+    desired = ",".join(p.name for p in effect.parameters)
     if len(values) != len(effect.parameters):
-        raise ConfigError(f"--effect is {text!r}; {effect.name}=VALUE with {wanted} is wanted")
+        raise ConfigError(f"--effect is {text!r}; {effect.name}=VALUE with {desired} is required")
     for parameter, value in zip(effect.parameters, values, strict=True):
         if not parameter.low <= value <= parameter.high:
             raise ConfigError(
@@ -445,6 +445,8 @@ def vector_of(values: Mapping[str, float]) -> Array:
     vector = np.zeros(len(PARAMETERS))
     for name, value in values.items():
         if name not in INDEX or not math.isfinite(value):
-            raise ConfigError(f"effects: {name} is {value!r}; a finite number of a known parameter is wanted")
+            raise ConfigError(
+                f"effects: {name} is {value!r}; a finite number of a known parameter is required"
+            )
         vector[INDEX[name]] = value
     return vector

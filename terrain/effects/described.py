@@ -69,7 +69,7 @@ def checked_effects(place: str, values: Mapping[str, float], drive: str) -> dict
         low, high = known[name].low, known[name].high
         plain = isinstance(value, int | float | np.number) and not isinstance(value, bool)
         if not (plain and math.isfinite(value) and low <= value <= high):
-            raise ConfigError(f"{place}: {name} is {value!r}, a number from {low:g} to {high:g} is wanted")
+            raise ConfigError(f"{place}: {name} is {value!r}, a number from {low:g} to {high:g} is required")
     return {name: float(value) for name, value in values.items()}
 
 
@@ -100,10 +100,10 @@ def read_effects(place: str, described: Any, drive: str) -> tuple[dict[str, floa
     ({'camera_yaw_rad': 0.1}, array([[nan]]))
     """
     if not isinstance(described, dict) or "schema" not in described:
-        raise ConfigError(f"{place} is {described!r}, a mapping with schema and parameters is wanted")
+        raise ConfigError(f"{place} is {described!r}, a mapping with schema and parameters is required")
     schema = described["schema"]
     if isinstance(schema, bool) or not isinstance(schema, int) or schema < 1:
-        raise ConfigError(f"{place}: schema is {schema!r}, {SCHEMA} is wanted")
+        raise ConfigError(f"{place}: schema is {schema!r}, {SCHEMA} is required")
     if schema > SCHEMA:
         raise ConfigError(
             f"{place}: schema {schema} is newer than this version of terrain, which reads {SCHEMA}"
@@ -129,7 +129,7 @@ def _covariance(place: str, described: Any, names: list[str]) -> Array:
     for row, entries in zip(names, rows, strict=True):
         for column, entry in zip(names, entries, strict=True):
             if isinstance(entry, bool) or not isinstance(entry, int | float) or not math.isfinite(entry):
-                raise ConfigError(f"{place}: {row}, {column} is {entry!r}, a finite number is wanted")
+                raise ConfigError(f"{place}: {row}, {column} is {entry!r}, a finite number is required")
     return checked_covariance(place, np.array(rows, dtype=float).reshape(len(names), len(names)))
 
 
@@ -152,7 +152,7 @@ def checked_covariance(place: str, covariance: Array) -> Array:
         or covariance.shape[0] != covariance.shape[1]
         or not np.isfinite(covariance).all()
     ):
-        raise ConfigError(f"{place} has the shape {covariance.shape}; a square of finite numbers is wanted")
+        raise ConfigError(f"{place} has the shape {covariance.shape}; a square of finite numbers is required")
     variance = covariance.diagonal()
     if (variance < 0).any():
         raise ConfigError(f"{place} is not positive semi-definite: it has the variance {variance.min():g}")

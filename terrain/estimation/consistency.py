@@ -42,7 +42,7 @@ class Consistency(NamedTuple):
     low: float
     high: float
     share_outside: float
-    share_gated: float
+    gated_fraction: float
     verdict: str
 
 
@@ -77,8 +77,8 @@ def consistency_report(track: StateTrack, truth: Array | None = None) -> Consist
     for k, name in enumerate(track.sensors):
         used, gated = track.use[:, k] == USED, track.use[:, k] == GATED
         came = int(used.sum() + gated.sum())
-        share_gated = float(gated.sum() / came) if came else 0.0
-        sensors.append(_judge(name, track.nis[used, k], track.nis_dof[used, k], share_gated))
+        gated_fraction = float(gated.sum() / came) if came else 0.0
+        sensors.append(_judge(name, track.nis[used, k], track.nis_dof[used, k], gated_fraction))
     states = []
     if truth is not None:
         values = _fitting(truth, track, track.states)
@@ -216,12 +216,12 @@ def _draw(
                 z[n, i] = wrap(z[n, i])
 
 
-def _judge(name: str, squares: Array, dof: Array, share_gated: float) -> Consistency:
+def _judge(name: str, squares: Array, dof: Array, gated_fraction: float) -> Consistency:
     """Compare squares (n,), each of so many degrees of freedom, with chi-square."""
     if not squares.size:
         nan = float("nan")
         return Consistency(
-            name, 0, 0.0, nan, nan, nan, nan, share_gated, "overconfident" if share_gated else "unknown"
+            name, 0, 0.0, nan, nan, nan, nan, gated_fraction, "overconfident" if gated_fraction else "unknown"
         )
     dof = dof.astype(np.float64)
     n_independent = _independent(squares / dof)
@@ -229,11 +229,11 @@ def _judge(name: str, squares: Array, dof: Array, share_gated: float) -> Consist
     low, high = (float(chdtri(total, p)) / total for p in (1 - OUTSIDE / 2, OUTSIDE / 2))
     mean = float(squares.sum() / dof.sum())
     outside = (squares < chdtri(dof, 1 - OUTSIDE / 2)) | (squares > chdtri(dof, OUTSIDE / 2))
-    verdict = "overconfident" if mean > high or share_gated > MOST_GATED else "consistent"
-    if mean < low and share_gated <= MOST_GATED:
+    verdict = "overconfident" if mean > high or gated_fraction > MOST_GATED else "consistent"
+    if mean < low and gated_fraction <= MOST_GATED:
         verdict = "conservative"
     return Consistency(
-        name, squares.size, n_independent, mean, low, high, float(outside.mean()), share_gated, verdict
+        name, squares.size, n_independent, mean, low, high, float(outside.mean()), gated_fraction, verdict
     )
 
 

@@ -247,7 +247,7 @@ class FilterSettings:
     --------
     >>> FilterSettings(gate_probability=99.99)
     Traceback (most recent call last):
-    terrain.errors.ConfigError: gate_probability is 99.99, a number over 0 up to 1 is wanted
+    terrain.errors.ConfigError: gate_probability is 99.99, a number over 0 up to 1 is required
     """
 
     gate_probability: float = 0.9999
@@ -257,11 +257,11 @@ class FilterSettings:
     def __post_init__(self) -> None:
         if not 0 < self.gate_probability <= 1:
             raise ConfigError(
-                f"gate_probability is {self.gate_probability}, a number over 0 up to 1 is wanted"
+                f"gate_probability is {self.gate_probability}, a number over 0 up to 1 is required"
             )
         for name in ("reopen_after_s", "max_gap_s"):
             if not 0 < getattr(self, name) < math.inf:
-                raise ConfigError(f"{name} is {getattr(self, name)}, seconds above zero are wanted")
+                raise ConfigError(f"{name} is {getattr(self, name)}, seconds above zero are required")
 
 
 class FilterState(NamedTuple):
@@ -593,13 +593,13 @@ def _feed(
     n, k, d, m = len(stamps), len(model.sensors), len(model.states), len(model.rows)
     values = np.array(z, dtype=np.float64, order="C")
     variance = np.array(np.atleast_2d(r), dtype=np.float64, order="C")
-    for name, given, wanted in (
+    for name, given, desired in (
         ("time_s", stamps.shape, [(n,)]),
         ("z", values.shape, [(n, m)]),
         ("measurement_variance", variance.shape, [(n, m), (1, m)]),
     ):
-        if given not in wanted:
-            raise DataError(f"filter {model.name}: {name} has shape {given}, {wanted[0]} is needed")
+        if given not in desired:
+            raise DataError(f"filter {model.name}: {name} has shape {given}, {desired[0]} is needed")
     rows = n if keep else 0
     columns = _Columns(
         np.empty((rows, d)),

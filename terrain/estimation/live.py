@@ -50,7 +50,7 @@ from terrain.estimation.live_rows import (
 from terrain.estimation.measurements import CAMERA_ROWS, GNSS_LATENCY_S, GNSS_ROWS, WILD_FACTOR
 from terrain.estimation.resampling import GAP_PERIODS, MAX_AGE_PERIODS
 from terrain.estimation.swerve_filters import default_noise, make_filter
-from terrain.estimation.wheel_slip import STALE_AFTER_S, instant_slip, rim_scatter_mps
+from terrain.estimation.wheel_slip import STALE_AFTER_S, instant_slip, wheel_speed_scatter_mps
 from terrain.extension import Correction, corrected
 from terrain.logs.schema import WHEELS_CHANNELS
 from terrain.records import Array, Reading
@@ -79,7 +79,7 @@ class LiveEstimate(NamedTuple):
     rows : (18,) what was measured, in the order of ``ROWS_OF_DRIVE["swerve"]``; NaN where nothing was
     speed_x_mps, speed_y_mps, yaw_rate_radps, accel_x_mps2, accel_y_mps2 : of the states, by name
     motor_radps, current_a : (3,) as this sample of the wheels told them
-    rim_mps : (3,) speeds of the rims by it
+    wheel_speed_mps : (3,) speeds of the rims by it
     """
 
     time_s: float
@@ -97,7 +97,7 @@ class LiveEstimate(NamedTuple):
     accel_y_mps2: float
     motor_radps: Array
     current_a: Array
-    rim_mps: Array
+    wheel_speed_mps: Array
 
 
 class LiveEstimator:
@@ -129,7 +129,7 @@ class LiveEstimator:
     >>> estimator = LiveEstimator(load_robot("agrimaro"))
     >>> wheels = Reading(np.array([0.0]), np.array([[20.0, 20.0, 20.0, 1.0, 1.0, 1.0]]))
     >>> estimate, = estimator.step({"wheels": wheels})
-    >>> estimate.rim_mps, estimate.slip_stale
+    >>> estimate.wheel_speed_mps, estimate.slip_stale
     (array([0.4, 0.4, 0.4]), True)
     """
 
@@ -146,9 +146,9 @@ class LiveEstimator:
     ) -> None:
         for name, value in (("initial_yaw_rad", initial_yaw_rad or 0.0), ("gnss_latency_s", gnss_latency_s)):
             if not math.isfinite(value):
-                raise ConfigError(f"{name} is {value}, a finite number is wanted")
+                raise ConfigError(f"{name} is {value}, a finite number is required")
         if gnss_latency_s < 0:
-            raise ConfigError(f"gnss_latency_s is {gnss_latency_s:g}, a time from zero up is wanted")
+            raise ConfigError(f"gnss_latency_s is {gnss_latency_s:g}, a time from zero up is required")
         has_gnss = initial_yaw_rad is not None and "gnss" in channels
         self._measured, self._channels = robot, channels
         self._correction: Correction | None = None
@@ -204,7 +204,7 @@ class LiveEstimator:
             **{f"zero_{i}_rad": getattr(steering, f"zero_{i}_rad") for i in (1, 2, 3)},
         }
         self._motor_radps, self._z, self._gnss_variance = np.empty(3), np.empty(len(ROWS)), np.empty(4)
-        self._unheard = np.ones(3, dtype=np.bool_)
+        self._unmeasured = np.ones(3, dtype=np.bool_)
         before, turns, yaw = np.full((2, 16), np.nan), np.full((5, 3), np.nan), np.zeros(N_YAW)
         yaw[1] = np.nan
         self._row_memory = (
@@ -213,7 +213,7 @@ class LiveEstimator:
             *(self._n_queued, self._last_s, latency_s, np.array([params[name] for name in PARAMS])),
             *(_limits(robot), before, turns, np.full((len(ROWS), N_LINE), np.nan), yaw),
             *(np.full(N_GNSS, np.nan), np.full((2, 3), -np.inf), self._z, self._gnss_variance),
-            *(self._unheard, self._counts, self._wheel_counts),
+            *(self._unmeasured, self._counts, self._wheel_counts),
         )
         self._reduction_ratio, self._radius_m = motors.reduction_ratio, robot.wheel_radius_m
 
@@ -231,7 +231,7 @@ class LiveEstimator:
         at = np.array([_place(list(model.states), state) for state in states])
         self._slip = np.empty((2, len(robot.wheels)))
         self._places_m, self._at = np.array(robot.wheel_positions_m), at
-        self._rim_variance = rim_scatter_mps(robot) ** 2
+        self._wheel_speed_variance = wheel_speed_scatter_mps(robot) ** 2
         self._motion = [model.states.index(s) for s in LiveEstimate._fields[8:13]]
         self._variances = self._filter.cov.reshape(-1)[:: len(model.states) + 1]
 
@@ -355,10 +355,18 @@ class LiveEstimator:
         """Return ratio and standard deviation (2, wheels) of the slip: ``wheel_slip`` of one tick."""
         if math.isinf(age_s) or (age_s > STALE_AFTER_S and not self._in_state):
             return np.full_like(self._slip, np.nan)
-        resident, rim_mps = self._filter, self._z[:3] * self._radius_m
+        resident, wheel_speed_mps = self._filter, self._z[:3] * self._radius_m
         slip = np.empty_like(self._slip)
-        instant_slip(resident.mean, resident.cov, self._places_m, self._at, rim_mps, self._rim_variance, slip)
-        slip[:, self._unheard] = np.nan
+        instant_slip(
+            resident.mean,
+            resident.cov,
+            self._places_m,
+            self._at,
+            wheel_speed_mps,
+            self._wheel_speed_variance,
+            slip,
+        )
+        slip[:, self._unmeasured] = np.nan
         return slip
 
 

@@ -23,7 +23,7 @@ from terrain.estimation.measurements import (
     STANDING_SPEED_MPS,
 )
 from terrain.estimation.resampling import TICK_S
-from terrain.estimation.wheel_slip import UNHEARD_AFTER_S
+from terrain.estimation.wheel_slip import UNMEASURED_AFTER_S
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.kinematics.camera import QUATERNION_TOLERANCE
 from terrain.logs.schema import GNSS_CHANNELS, IMU_CHANNELS, STEERING_CHANNELS
@@ -353,24 +353,24 @@ def rows_at(
     lines: Array,
     yaw: Array,
     gnss_memory: Array,
-    heard_s: Array,
+    received_s: Array,
     z: Array,
     gnss_variance: Array,
-    unheard: Array,
+    unmeasured: Array,
     counts: Array,
     wheel_counts: Array,
 ) -> None:
     """Take from the queues what came by a tick of the wheels; write its rows z (18,) and variances (4,).
 
-    ``set_back`` says that the clock was: what is remembered of its other time is forgotten.  ``unheard`` (3,)
-    tells the wheels of which rate or angle was not measured for too long.
+    ``set_back`` says that the clock was: what is remembered of its other time is forgotten.  ``unmeasured``
+    (3,) tells the wheels of which rate or angle was not measured for too long.
     """
     if set_back:
         n_queued[:] = 0
         last_s[:] = -np.inf
         lines[:] = np.nan
         before[:] = np.nan
-        heard_s[:] = -np.inf
+        received_s[:] = -np.inf
     for stream in range(4):
         queue = (steering, imu, odometry, gnss)[stream]
         n, n_due = n_queued[stream], 0
@@ -420,9 +420,9 @@ def rows_at(
         gnss_variance[i] = np.nan if math.isnan(z[_POSITION + i]) else gnss_memory[2]
         gnss_variance[2 + i] = np.nan if math.isnan(z[_POSITION + 2 + i]) else GNSS_SPEED_STD_MPS**2
     for i in range(3):
-        unheard[i] = False
+        unmeasured[i] = False
         for k, row in enumerate((i, _STEER + i)):
             if not math.isnan(z[row]):
-                heard_s[k, i] = time_s
-            unheard[i] |= time_s - heard_s[k, i] > UNHEARD_AFTER_S
+                received_s[k, i] = time_s
+            unmeasured[i] |= time_s - received_s[k, i] > UNMEASURED_AFTER_S
     _refer_yaw(time_s, z, params, yaw)

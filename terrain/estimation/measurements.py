@@ -194,7 +194,7 @@ def measurement_table(
         raise DataError(f"run {run.run_id}: the stream 'wheels', which gives the clock, is empty")
     clock = wheels.time_s
     rates = wheels.values
-    if robot.drive == "swerve" and robot.motors is not None:  # the others' rows are rim speeds
+    if robot.drive == "swerve" and robot.motors is not None:  # the others' rows are wheel speeds
         rates = wheels.values / robot.motors.reduction_ratio
         wild = np.abs(rates) > WILD_FACTOR * robot.motors.speed_max_radps
         dropped["wheels: beyond the motors"] += int(wild.any(axis=1).sum())
@@ -233,8 +233,8 @@ def measurement_table(
     unknown = np.full(clock.size, np.nan)
     table = {row: z.get(row, unknown) for row in rows}
     if robot.drive == "swerve":
-        rim_mps = np.column_stack([table[row] for row in rows[:3]]) * robot.wheel_radius_m
-        _refer_yaw(table, clock, rim_mps, initial_yaw_rad, causal)
+        wheel_speed_mps = np.column_stack([table[row] for row in rows[:3]]) * robot.wheel_radius_m
+        _refer_yaw(table, clock, wheel_speed_mps, initial_yaw_rad, causal)
     return MeasurementTable(
         clock,
         rows,
@@ -246,13 +246,13 @@ def measurement_table(
 
 def _check(time_constant_s: float | None, ema_alpha: float | None, gnss_latency_s: float) -> None:
     if time_constant_s is not None and not 0 <= time_constant_s < np.inf:
-        raise ConfigError(f"time_constant_s is {time_constant_s:g}, a time from zero up is wanted")
+        raise ConfigError(f"time_constant_s is {time_constant_s:g}, a time from zero up is required")
     if ema_alpha is not None and not 0 <= ema_alpha < 1:
-        raise ConfigError(f"ema_alpha is {ema_alpha:g}, a share from 0 to below 1 is wanted")
+        raise ConfigError(f"ema_alpha is {ema_alpha:g}, a share from 0 to below 1 is required")
     if ema_alpha is not None and time_constant_s is not None:
         raise ConfigError("give time_constant_s or ema_alpha, not both: one of them smooths the camera")
     if not 0 <= gnss_latency_s < np.inf:
-        raise ConfigError(f"gnss_latency_s is {gnss_latency_s:g}, a time from zero up is wanted")
+        raise ConfigError(f"gnss_latency_s is {gnss_latency_s:g}, a time from zero up is required")
 
 
 def _wheel_channels(run: RunLog, robot: Robot) -> list[str]:
@@ -323,10 +323,10 @@ def _gnss_rows(gnss: Stream, causal: bool) -> tuple[dict[str, Array], dict[str, 
 
 
 def _refer_yaw(
-    table: dict[str, Array], clock: Array, rim_mps: Array, initial_yaw_rad: float, causal: bool
+    table: dict[str, Array], clock: Array, wheel_speed_mps: Array, initial_yaw_rad: float, causal: bool
 ) -> None:
     """Count the yaw rows of a table from the start, and keep the camera's on the turn that the IMU is on."""
-    moving = (np.abs(rim_mps) > STANDING_SPEED_MPS).any(axis=1) | (clock > clock[0] + STANDING_S)
+    moving = (np.abs(wheel_speed_mps) > STANDING_SPEED_MPS).any(axis=1) | (clock > clock[0] + STANDING_S)
     standing = ~np.logical_or.accumulate(moving)
     for row in ("imu_yaw_rad", "camera_yaw_rad"):
         known = np.isfinite(table[row])

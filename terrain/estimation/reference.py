@@ -47,8 +47,8 @@ def true_states(
     return out
 
 
-def rim_and_ground_speed(truth: Stream, robot: Robot) -> tuple[Array, Array]:
-    """Return the true rim speed and speed over ground along each wheel, both (n, wheels) in m/s.
+def wheel_and_ground_speed(truth: Stream, robot: Robot) -> tuple[Array, Array]:
+    """Return the true wheel speed and speed over ground along each wheel, both (n, wheels) in m/s.
 
     Parameters
     ----------
@@ -60,8 +60,8 @@ def rim_and_ground_speed(truth: Stream, robot: Robot) -> tuple[Array, Array]:
     turn = truth.channel("yaw_rate_radps")[:, None]
     along = truth.channel("speed_x_mps")[:, None] - turn * positions_m[:, 1]
     across = truth.channel("speed_y_mps")[:, None] + turn * positions_m[:, 0]
-    rim = _wheels(truth, robot, "wheel_{}_radps") * robot.wheel_radius_m
-    return rim, along * np.cos(steer) + across * np.sin(steer)
+    wheel_speed = _wheels(truth, robot, "wheel_{}_radps") * robot.wheel_radius_m
+    return wheel_speed, along * np.cos(steer) + across * np.sin(steer)
 
 
 def lagged_slip(truth: Stream, robot: Robot, time_constant_s: float) -> tuple[Array, Array]:
@@ -75,13 +75,13 @@ def lagged_slip(truth: Stream, robot: Robot, time_constant_s: float) -> tuple[Ar
     robot : gives the nominal radius and the wheels' places
     time_constant_s : of the low-pass on the filter's inputs
     """
-    rim, ground = (
+    wheel_speed, ground = (
         np.column_stack(
             [low_pass(truth.time_s, wheel, time_constant_s, LONGEST_STEP_S) for wheel in speeds.T]
         )
-        for speeds in rim_and_ground_speed(truth, robot)
+        for speeds in wheel_and_ground_speed(truth, robot)
     )
-    return slip_ratio(rim, ground), ground
+    return slip_ratio(wheel_speed, ground), ground
 
 
 def _wheels(truth: Stream, robot: Robot, pattern: str) -> Array:
@@ -98,9 +98,9 @@ def _true_state(truth: Stream, state: str, robot: Robot, initial_yaw_rad: float)
         offset = robot.sensors.gyro_bias_z_radps if robot.sensors else 0.0
         return np.asarray(truth.channel("gyro_bias_z_radps") - offset)
     if state.startswith("slip_speed_"):
-        rim, along = rim_and_ground_speed(truth, robot)
+        wheel_speed, along = wheel_and_ground_speed(truth, robot)
         wheel = state.split("_")[2]
         if wheel not in robot.wheels:
             raise DataError(f"state {state!r} is of a wheel that robot {robot.name} does not have")
-        return np.asarray((rim - along)[:, robot.wheels.index(wheel)])
+        return np.asarray((wheel_speed - along)[:, robot.wheels.index(wheel)])
     return None

@@ -218,7 +218,7 @@ _SAMPLE_STD = {
     "gnss_speed_mps": 0.03,
 }
 _SITE_STD_M = 100.0
-_RIM_STD_MPS = 0.007  # of a wheel's rim, mostly the ripple of the Hall steps
+_WHEEL_SPEED_STD_MPS = 0.007  # of a wheel's rim, mostly the ripple of the Hall steps
 _SLIP_STD_MPS = 0.15  # how far rim and ground differ, where both are measured and no state stands for it
 
 
@@ -268,8 +268,8 @@ def default_noise(name: str, robot: Robot, with_gnss: bool = False) -> Noise:
     (14,)
     """
     layout = _layout(name, robot)
-    rim_std_mps = _SLIP_STD_MPS if name == "vio12" else _RIM_STD_MPS
-    sample_std = _SAMPLE_STD | {"wheel_radps": rim_std_mps / robot.wheel_radius_m}
+    wheel_speed_std_mps = _SLIP_STD_MPS if name == "vio12" else _WHEEL_SPEED_STD_MPS
+    sample_std = _SAMPLE_STD | {"wheel_radps": wheel_speed_std_mps / robot.wheel_radius_m}
     for kind, std in _described_std(robot).items():
         sample_std[kind] = max(sample_std[kind], std)
     return Noise(
@@ -311,7 +311,7 @@ def thesis_noise(name: str, robot: Robot, sample_time_s: float = 0.02) -> Noise:
     """
     layout = _layout(name, robot)
     if not 0 < sample_time_s < math.inf:
-        raise ConfigError(f"sample_time_s is {sample_time_s}, seconds above zero are wanted")
+        raise ConfigError(f"sample_time_s is {sample_time_s}, seconds above zero are required")
     printed, r, q, p0 = _LAYOUTS["slip14"].states, _SLIP_R, _SLIP_Q, _SLIP_P0
     if layout.has_camera:
         printed, r, q, p0 = _LAYOUTS["vio12"].states, _VIO_R, _VIO_Q, _VIO_P0
@@ -338,7 +338,7 @@ def adaptive_noise(robot: Robot, factor: float) -> Noise:
         where the robot is no swerve robot, or the factor is not above zero.
     """
     if not 0 < factor < math.inf:
-        raise ConfigError(f"factor is {factor}, a number above zero is wanted")
+        raise ConfigError(f"factor is {factor}, a number above zero is required")
     plain = default_noise("encoder12", robot)
     scale = {"wheel_radps": factor, "accel_mps2": 1 / factor, "gyro_z_radps": 1 / factor}
     walk = plain.process_variance.diagonal().copy()

@@ -18,12 +18,12 @@ STALE_AFTER_S = 0.15
 """Age of the last speed over ground beyond which slip counts as stale: one and a half periods of GNSS, at 10
 Hz the slowest sensor of it, so that no sound one is called so; a 1 m/s^2 start gains 0.15 m/s unseen."""
 
-UNHEARD_AFTER_S = 0.5
+UNMEASURED_AFTER_S = 0.5
 """A wheel that has told neither rate nor angle for so long may turn and stand as it likes."""
 
 
 def wheel_slip(
-    track: StateTrack, table: MeasurementTable, robot: Robot, rim_std_mps: float | None = None
+    track: StateTrack, table: MeasurementTable, robot: Robot, wheel_speed_std_mps: float | None = None
 ) -> SlipTrack:
     """Return the slip of each wheel by what a filter believes; NaN unless it measured the speed over ground.
 
@@ -33,7 +33,8 @@ def wheel_slip(
         ``speed_y_mps`` and ``steer_<i>_rad`` where the robot can have them
     table : what the filter measured, on the same clock
     robot : places and radius of the wheels
-    rim_std_mps : standard deviation of a rim speed; by default that of the robot's file, unknown without
+    wheel_speed_std_mps : standard deviation of a wheel speed; by default that of the robot's file, unknown
+        without
 
     Raises
     ------
@@ -44,24 +45,24 @@ def wheel_slip(
     -----
     A filter with slip speeds l_i among its states (``slip_speed_<i>_mps``) gives
     ``s = l / max(|v + l|, |v|)`` from the state alone.  It goes on when the speed over ground is not measured
-    for a while, ``stale`` and with the growing uncertainty of its state.  For any other the rim speed is the
-    encoders' own, no filter's (thesis 7.2); its slip falls to 0 of itself as soon as only the wheels hold the
-    speed: NaN where stale.
+    for a while, ``stale`` and with the growing uncertainty of its state.  For any other the wheel speed is
+    the encoders' own, no filter's (thesis 7.2); its slip falls to 0 of itself as soon as only the wheels hold
+    the speed: NaN where stale.
 
-    ``slip_std`` is to first order ``sqrt(g P g')`` with the state's whole covariance, and the rim speed's
+    ``slip_std`` is to first order ``sqrt(g P g')`` with the state's whole covariance, and the wheel speed's
     variance added where that is not in the state.
     """
-    slip = _slip(track, table, robot, rim_std_mps)
+    slip = _slip(track, table, robot, wheel_speed_std_mps)
     unseen = np.isinf(track.reference_age_s)
     if not _has_slip_speed(track, robot):
         unseen = unseen | slip.stale
-    unknown = unseen[:, None] | _unheard(table, robot)
+    unknown = unseen[:, None] | _unmeasured(table, robot)
     ratio, std = (np.where(unknown, np.nan, v) for v in (slip.slip_ratio, slip.slip_std))
     return SlipTrack(slip.time_s, ratio, std, slip.wheels, slip.stale)
 
 
-def _unheard(table: MeasurementTable, robot: Robot) -> Array:
-    """Return where (n, wheels) a wheel's rate or angle was not measured for :data:`UNHEARD_AFTER_S`."""
+def _unmeasured(table: MeasurementTable, robot: Robot) -> Array:
+    """Return where (n, wheels) a wheel's rate or angle was not measured for :data:`UNMEASURED_AFTER_S`."""
     rows = {
         wheel: [f"wheel_{wheel}_radps", f"steer_{wheel}_rad"]
         if robot.drive == "swerve"
@@ -72,7 +73,7 @@ def _unheard(table: MeasurementTable, robot: Robot) -> Array:
     for names in rows.values():
         heard = np.isfinite(table.columns(names))
         last_s = np.maximum.accumulate(np.where(heard, table.time_s[:, None], -np.inf), axis=0)
-        columns.append((table.time_s[:, None] - last_s > UNHEARD_AFTER_S).any(axis=1))
+        columns.append((table.time_s[:, None] - last_s > UNMEASURED_AFTER_S).any(axis=1))
     return np.column_stack(columns)
 
 
@@ -93,7 +94,7 @@ def _slip(
     track: StateTrack,
     table: MeasurementTable,
     robot: Robot,
-    rim_std_mps: float | None,
+    wheel_speed_std_mps: float | None,
     from_encoders: bool = False,
 ) -> SlipTrack:
     """Slip and its standard deviation, measured over ground or not."""
@@ -105,15 +106,20 @@ def _slip(
         ground, d_ground = _ground_speed(track, robot, i)
         if in_state:
             slip_speed = _state(track, f"slip_speed_{wheel}_mps")
-            rim, d_rim, rim_variance = ground + slip_speed, d_ground.copy(), 0.0
-            d_rim[:, track.states.index(f"slip_speed_{wheel}_mps")] += 1.0
+            wheel_speed, d_wheel_speed, wheel_speed_variance = ground + slip_speed, d_ground.copy(), 0.0
+            d_wheel_speed[:, track.states.index(f"slip_speed_{wheel}_mps")] += 1.0
         else:
-            rim, d_rim = _rim_speed(table, robot, wheel), np.zeros_like(d_ground)
-            rim_variance = (rim_scatter_mps(robot) if rim_std_mps is None else rim_std_mps) ** 2
-        ratio[:, i] = slip_ratio(rim, ground)
-        by_rim, by_ground = _slopes(rim, ground)
-        gradient = by_rim[:, None] * d_rim + by_ground[:, None] * d_ground
-        variance = np.einsum("ni,nij,nj->n", gradient, track.cov, gradient) + by_rim**2 * rim_variance
+            wheel_speed, d_wheel_speed = _wheel_speed(table, robot, wheel), np.zeros_like(d_ground)
+            wheel_speed_variance = (
+                wheel_speed_scatter_mps(robot) if wheel_speed_std_mps is None else wheel_speed_std_mps
+            ) ** 2
+        ratio[:, i] = slip_ratio(wheel_speed, ground)
+        by_wheel_speed, by_ground = _slopes(wheel_speed, ground)
+        gradient = by_wheel_speed[:, None] * d_wheel_speed + by_ground[:, None] * d_ground
+        variance = (
+            np.einsum("ni,nij,nj->n", gradient, track.cov, gradient)
+            + by_wheel_speed**2 * wheel_speed_variance
+        )
         std[:, i] = np.sqrt(np.maximum(variance, 0.0))
     return SlipTrack(track.time_s, ratio, std, robot.wheels, track.reference_age_s > STALE_AFTER_S)
 
@@ -149,15 +155,15 @@ def _ground_speed(track: StateTrack, robot: Robot, wheel: int) -> tuple[Array, A
     return ahead * cos + left * sin, gradient
 
 
-def _slopes(rim: Array, ground: Array) -> tuple[Array, Array]:
-    """Return the derivatives of the slip ratio by the rim speed and by the speed over ground."""
-    traction = np.abs(rim) >= np.abs(ground)
-    fastest = np.where(traction, rim, ground)
+def _slopes(wheel_speed: Array, ground: Array) -> tuple[Array, Array]:
+    """Return the derivatives of the slip ratio by the wheel speed and by the speed over ground."""
+    traction = np.abs(wheel_speed) >= np.abs(ground)
+    fastest = np.where(traction, wheel_speed, ground)
     fastest = np.where(np.abs(fastest) < MIN_SPEED_MPS, np.nan, fastest)
     sign = np.sign(fastest)
-    by_rim = np.where(traction, sign * ground / fastest**2, 1.0 / np.abs(fastest))
-    by_ground = np.where(traction, -1.0 / np.abs(fastest), -sign * rim / fastest**2)
-    return by_rim, by_ground
+    by_wheel_speed = np.where(traction, sign * ground / fastest**2, 1.0 / np.abs(fastest))
+    by_ground = np.where(traction, -1.0 / np.abs(fastest), -sign * wheel_speed / fastest**2)
+    return by_wheel_speed, by_ground
 
 
 @njit(
@@ -166,12 +172,18 @@ def _slopes(rim: Array, ground: Array) -> tuple[Array, Array]:
     error_model="numpy",
 )
 def instant_slip(
-    mean: Array, cov: Array, places_m: Array, at: Array, rim_mps: Array, rim_variance: float, slip: Array
+    mean: Array,
+    cov: Array,
+    places_m: Array,
+    at: Array,
+    wheel_speed_mps: Array,
+    wheel_speed_variance: float,
+    slip: Array,
 ) -> None:
     """Write ratio and standard deviation (2, wheels) of the slip of one instant: :func:`wheel_slip`, live.
 
     ``at`` says where in the state stand speed_x, speed_y, yaw rate, the steering angles and the slip speeds,
-    the latter -1 where the state has none and ``rim_mps`` (wheels,) holds.
+    the latter -1 where the state has none and ``wheel_speed_mps`` (wheels,) holds.
     """
     n = places_m.shape[0]
     states, slopes = np.empty(5, np.int64), np.empty(5)
@@ -184,34 +196,36 @@ def instant_slip(
         cos, sin = np.cos(mean[states[3]]), np.sin(mean[states[3]])
         ground = ahead * cos + left * sin
         in_state = states[4] >= 0
-        rim = ground + mean[states[4]] if in_state else rim_mps[i]
-        traction = abs(rim) >= abs(ground)
-        fastest = rim if traction else ground
+        wheel_speed = ground + mean[states[4]] if in_state else wheel_speed_mps[i]
+        traction = abs(wheel_speed) >= abs(ground)
+        fastest = wheel_speed if traction else ground
         slip[:, i] = np.nan
-        if not (abs(fastest) >= MIN_SPEED_MPS and np.isfinite(rim)):
+        if not (abs(fastest) >= MIN_SPEED_MPS and np.isfinite(wheel_speed)):
             continue
         size, sign = abs(fastest), np.sign(fastest)
-        by_rim = sign * ground / fastest**2 if traction else 1.0 / size
-        by_ground = -1.0 / size if traction else -sign * rim / fastest**2
-        along = by_rim + by_ground if in_state else by_ground  # the state's ground speed moves its rim too
+        by_wheel_speed = sign * ground / fastest**2 if traction else 1.0 / size
+        by_ground = -1.0 / size if traction else -sign * wheel_speed / fastest**2
+        along = (
+            by_wheel_speed + by_ground if in_state else by_ground
+        )  # the state's ground speed moves its rim too
         slopes[0], slopes[1], slopes[2] = along * cos, along * sin, along * (x * sin - y * cos)
-        slopes[3], slopes[4] = along * (left * cos - ahead * sin), by_rim
-        variance = 0.0 if in_state else by_rim**2 * rim_variance
+        slopes[3], slopes[4] = along * (left * cos - ahead * sin), by_wheel_speed
+        variance = 0.0 if in_state else by_wheel_speed**2 * wheel_speed_variance
         for j in range(4 + in_state):
             for k in range(4 + in_state):
                 variance += slopes[j] * cov[states[j], states[k]] * slopes[k]
-        slip[0, i] = min(max((rim - ground) / size, -1.0), 1.0)
+        slip[0, i] = min(max((wheel_speed - ground) / size, -1.0), 1.0)
         slip[1, i] = np.sqrt(max(variance, 0.0))
 
 
-def _rim_speed(table: MeasurementTable, robot: Robot, wheel: str) -> Array:
+def _wheel_speed(table: MeasurementTable, robot: Robot, wheel: str) -> Array:
     if robot.drive == "swerve":
         return table.columns([f"wheel_{wheel}_radps"])[:, 0] * robot.wheel_radius_m
     return table.columns([f"wheel_{wheel}_mps"])[:, 0]
 
 
-def rim_scatter_mps(robot: Robot) -> float:
-    """Return the scatter of a rim speed: the driver's noise and the ripple of Hall steps; NaN where unknown.
+def wheel_speed_scatter_mps(robot: Robot) -> float:
+    """Return the scatter of a wheel speed: the motor noise and the ripple of Hall steps; NaN where unknown.
 
     Each step of the wheel by ``2 pi / steps`` lifts what the driver's low-pass reports by that over its time
     constant, and until the next it falls again: a saw-tooth of standard deviation height / sqrt(12).

@@ -58,25 +58,25 @@ def number(place: str, entry: Any, unit: str, low: float | None = None) -> float
     """
     check_keys(place, entry, ["value", "unit", "source"], optional=("interval",))
     if entry["unit"] != unit:
-        raise ConfigError(f"{place} has the unit {entry['unit']!r}, {unit!r} is wanted")
+        raise ConfigError(f"{place} has the unit {entry['unit']!r}, {unit!r} is required")
     if not isinstance(entry["source"], str) or not entry["source"].strip():
         raise ConfigError(f"{place} has no source: say where the number is from, or 'assumed'")
     value = entry["value"]
     within = not isinstance(value, bool) and isinstance(value, int | float) and math.isfinite(value)
     if low is None and not (within and value > 0):
-        raise ConfigError(f"{place} is {value!r}, a number above zero is wanted")
+        raise ConfigError(f"{place} is {value!r}, a number above zero is required")
     if low is not None and not (within and value >= low):
-        raise ConfigError(f"{place} is {value!r}, a number{' from zero up' if low == 0 else ''} is wanted")
+        raise ConfigError(f"{place} is {value!r}, a number{' from zero up' if low == 0 else ''} is required")
     return float(value)
 
 
-def check_keys(place: str, entry: Any, wanted: list[str], optional: tuple[str, ...] = ()) -> None:
-    """Refuse a mapping that lacks a wanted key or has one that is not accepted; ``ConfigError``."""
+def check_keys(place: str, entry: Any, desired: list[str], optional: tuple[str, ...] = ()) -> None:
+    """Refuse a mapping that lacks a desired key or has one that is not accepted; ``ConfigError``."""
     if not isinstance(entry, dict):
-        raise ConfigError(f"{place} is {entry!r}, a mapping with {', '.join(wanted)} is wanted")
-    accepted = [*wanted, *optional]
+        raise ConfigError(f"{place} is {entry!r}, a mapping with {', '.join(desired)} is required")
+    accepted = [*desired, *optional]
     unknown = [str(key) for key in entry if key not in accepted]
-    missing = [key for key in wanted if key not in entry]
+    missing = [key for key in desired if key not in entry]
     if unknown:
         raise ConfigError(f"{place}: key {unknown[0]!r} is unknown (accepted: {', '.join(accepted)})")
     if missing:

@@ -91,8 +91,8 @@ def forward(positions_m: Array, radius_m: float, wheel_radps: Array, steer_rad: 
     wheel = _numbers("wheel_radps", wheel_radps, len(positions), missing=True)
     steer = _numbers("steer_rad", steer_rad, len(positions), missing=True)
     wheel, steer = _together(wheel_radps=wheel, steer_rad=steer)
-    rim = np.stack([np.cos(steer), np.sin(steer)], axis=-1) * (radius * wheel)[..., None]
-    seen = rim.reshape(*wheel.shape[:-1], -1)
+    wheel_speed = np.stack([np.cos(steer), np.sin(steer)], axis=-1) * (radius * wheel)[..., None]
+    seen = wheel_speed.reshape(*wheel.shape[:-1], -1)
     rows = _rows(positions)
     twist = seen @ np.linalg.pinv(rows).T
     return twist, np.linalg.norm(seen - twist @ rows.T, axis=-1)
@@ -268,12 +268,12 @@ def wheel_commands(
     array([0.4 , 0.78, 1.13, 1.43, 1.68, 1.86, 2.  , 2.  , 2.  ])
     """
     positions = _positions(positions_m)
-    wanted = np.atleast_2d(_numbers("twists", twists, 3))
-    if wanted.ndim != 2:
-        raise ConfigError(f"twists have shape {wanted.shape}, (n, 3) is wanted")
+    desired = np.atleast_2d(_numbers("twists", twists, 3))
+    if desired.ndim != 2:
+        raise ConfigError(f"twists have shape {desired.shape}, (n, 3) is required")
     steer = _numbers("steer_0", steer_0, len(positions))
     if steer.ndim != 1:
-        raise ConfigError(f"steer_0 has shape {steer.shape}, ({len(positions)},) is wanted")
+        raise ConfigError(f"steer_0 has shape {steer.shape}, ({len(positions)},) is required")
     limits = {
         "radius_m": radius_m,
         "speed_max_radps": speed_max_radps,
@@ -282,7 +282,7 @@ def wheel_commands(
         "far_rad": far_rad,
     }
     numbers = [_above_zero(name, value) for name, value in limits.items()]
-    return _commands(positions, *numbers, wanted, steer)  # type: ignore[no-any-return]
+    return _commands(positions, *numbers, desired, steer)  # type: ignore[no-any-return]
 
 
 @njit(types.UniTuple(_F8, 2)(_F8, _F8, _F8, _F8), cache=True)
@@ -401,17 +401,17 @@ def _numbers(name: str, given: Any, size: int | None = None, missing: bool = Fal
     except (TypeError, ValueError):
         raise ConfigError(f"{name} cannot be read as an array of numbers") from None
     if size is not None and array.shape[-1:] != (size,):
-        raise ConfigError(f"{name} has shape {array.shape}, (..., {size}) is wanted")
+        raise ConfigError(f"{name} has shape {array.shape}, (..., {size}) is required")
     bad = np.isinf(array) if missing else ~np.isfinite(array)
     if bad.any():
-        raise ConfigError(f"{name} holds {array[bad].flat[0]}, finite numbers are wanted")
+        raise ConfigError(f"{name} holds {array[bad].flat[0]}, finite numbers are required")
     return array
 
 
 def _positions(given: Any) -> Array:
     positions = _numbers("positions_m", given, 2)
     if positions.ndim != 2 or len(positions) < 2:
-        raise ConfigError(f"positions_m has shape {positions.shape}, (wheels, 2) with two wheels is wanted")
+        raise ConfigError(f"positions_m has shape {positions.shape}, (wheels, 2) with two wheels is required")
     if (positions == positions[0]).all():
         raise ConfigError("positions_m holds one place only: wheels in one place do not tell the yaw rate")
     return positions
@@ -420,7 +420,7 @@ def _positions(given: Any) -> Array:
 def _above_zero(name: str, given: Any) -> float:
     value = _numbers(name, given)
     if value.ndim or not value > 0:
-        raise ConfigError(f"{name} is {given!r}, a number above zero is wanted")
+        raise ConfigError(f"{name} is {given!r}, a number above zero is required")
     return float(value)
 
 

@@ -10,7 +10,7 @@ file                     columns                  becomes stream and channels
 \                        ``wx wy wz``             ``gyro_x_radps gyro_y_radps gyro_z_radps``
 \                        ``ax ay az``             ``accel_x_mps2 accel_y_mps2 accel_z_mps2``
 ``pro_N.csv``            ``time``                 ``wheels``, seconds
-\                        ``velL velR``            ``speed_left_mps speed_right_mps`` (rim speed)
+\                        ``velL velR``            ``speed_left_mps speed_right_mps`` (wheel speed)
 \                        ``curL curR``            ``current_left_a current_right_a``
 =======================  =======================  ===================================================
 

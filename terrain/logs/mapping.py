@@ -212,17 +212,17 @@ def _check_units(file: str, mapping: Mapping) -> None:
         for channel, column in stream.channels.items():
             place = f"{file}: stream {name}: channel {channel}"
             try:
-                wanted = unit_of(channel)
+                desired = unit_of(channel)
             except LogError as error:
                 raise ConfigError(f"{file}: stream {name}: {error}") from error
-            _si_word(place, column.unit, wanted)
+            _si_word(place, column.unit, desired)
 
 
-def _si_word(place: str, unit: str, wanted: str) -> None:
-    suitable = ", ".join(name for name, (word, _) in UNIT_SCALES.items() if word == wanted)
+def _si_word(place: str, unit: str, desired: str) -> None:
+    suitable = ", ".join(name for name, (word, _) in UNIT_SCALES.items() if word == desired)
     if unit not in UNIT_SCALES:
         raise ConfigError(f"{place}: unit {unit!r} is unknown (accepted here: {suitable})")
-    if UNIT_SCALES[unit][0] != wanted:
+    if UNIT_SCALES[unit][0] != desired:
         raise ConfigError(f"{place}: unit {unit!r} does not suit it (accepted here: {suitable})")
 
 

@@ -132,7 +132,7 @@ def _entry(place: str, mapping: Any, key: str, kind: type) -> Any:
         raise LogError(f"{place}: key {key!r} is missing")
     if not isinstance(mapping[key], kind):
         words = {str: "a text", int: "a whole number", dict: "an object", list: "a list"}
-        raise LogError(f"{place}: {key!r} is {mapping[key]!r}, {words[kind]} is wanted")
+        raise LogError(f"{place}: {key!r} is {mapping[key]!r}, {words[kind]} is required")
     return mapping[key]
 
 
@@ -165,13 +165,13 @@ def _labels(place: str, entries: list[Any]) -> tuple[Label, ...]:
 def _time(place: str, entry: dict[str, Any], key: str) -> float:
     value = entry.get(key)
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise LogError(f"{place}: {key} is {value!r}, seconds are wanted")
+        raise LogError(f"{place}: {key} is {value!r}, seconds are required")
     return float(value)
 
 
 def _counts(place: str, counts: Any) -> Mapping[str, int]:
     if not isinstance(counts, dict) or not all(type(n) is int and n >= 0 for n in counts.values()):
-        raise LogError(f"{place}: 'dropped' is {counts!r}, counts by kind are wanted")
+        raise LogError(f"{place}: 'dropped' is {counts!r}, counts by kind are required")
     return counts
 
 
@@ -194,6 +194,6 @@ def _read_parquet(path: Path, channels: list[str]) -> tuple[Array, Array]:
             )
         column = table.column(name)
         if not (pyarrow.types.is_floating(column.type) or pyarrow.types.is_integer(column.type)):
-            raise LogError(f"{place}: column {name!r} holds {column.type}, numbers are wanted")
+            raise LogError(f"{place}: column {name!r} holds {column.type}, numbers are required")
         columns.append(column.cast("float64", safe=False).to_numpy())
     return columns[0], np.column_stack(columns[1:])

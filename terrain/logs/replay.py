@@ -53,7 +53,7 @@ def replay(run: RunLog, rate_hz: float = 50.0) -> Iterator[Sample]:
     [[0.0], [0.01, 0.02], [0.03]]
     """
     if not 0 < rate_hz < np.inf:
-        raise ConfigError(f"rate_hz is {rate_hz:g}, a rate above zero is wanted")
+        raise ConfigError(f"rate_hz is {rate_hz:g}, a rate above zero is required")
     came = {name: _came(run.streams[name].time_s) for name in SENSORS if name in run.streams}
     came = {name: time_s for name, time_s in came.items() if time_s.size}
     if not came:
@@ -95,7 +95,7 @@ def _twists(run: RunLog, ticks: Array) -> Array:
     commands = run.streams.get("commands")
     if commands is None or not set(TWIST) <= set(commands.channels):
         return twists
-    wanted = np.column_stack([commands.channel(channel) for channel in TWIST])
+    desired = np.column_stack([commands.channel(channel) for channel in TWIST])
     last = np.searchsorted(commands.time_s, ticks + _SLACK_S, side="right") - 1
-    twists[last >= 0] = wanted[last[last >= 0]]
+    twists[last >= 0] = desired[last[last >= 0]]
     return twists

@@ -24,10 +24,11 @@ UNIT_SYMBOLS: dict[str, str] = {
     "nm": "Nm",
     "n": "N",
     "ratio": "1",
+    "code": "-",
     "k": "K",
     "kg": "kg",
 }
-"""Unit word at the end of a channel name, and how it is printed."""
+"""Unit word at the end of a channel name, and how it is printed; ``code`` is the number of a status."""
 
 UNIT_SCALES: dict[str, tuple[str, float]] = {
     "s": ("s", 1.0),

@@ -70,7 +70,7 @@ def six_positions_log(
     (['imu'], 1950)
     """
     if not 0 < hold_s < math.inf:
-        raise ConfigError(f"hold_s is {hold_s!r}, a time above zero is wanted")
+        raise ConfigError(f"hold_s is {hold_s!r}, a time above zero is required")
     sensors = robot.equipment.sensors
     rng = np.random.default_rng(seed)
     crooked = CROOKED_RAD * rng.standard_normal((len(POSITIONS), 2))

@@ -22,12 +22,12 @@ _RANGES: dict[str, tuple[float, float, str]] = {
     "payload_kg": _FROM_ZERO,
     "payload_m": _ANY,
     "grade_ratio": _SLOPE,
-    "swell_ratio": _SLOPE,
-    "swell_length_m": _ABOVE_ZERO,
+    "undulation_ratio": _SLOPE,
+    "undulation_length_m": _ABOVE_ZERO,
     "radius_factors": _ABOVE_ZERO,
     "roughness_factor": _FROM_ZERO,
     "field_length_m": _ABOVE_ZERO,
-    "leg_play_rad": _PLAY,
+    "leg_backlash_rad": _PLAY,
 }
 
 
@@ -39,11 +39,12 @@ class Conditions:
     ----------
     payload_kg, payload_m : load, and where it lies (x, y) from the empty robot's centre of mass, body axes
     grade_ratio : (2,) mean gradient of the ground along world x and y, uphill positive
-    swell_ratio, swell_length_m : a gradient along world x that comes and goes on the way; its wave length
+    undulation_ratio, undulation_length_m : a gradient along world x that comes and goes on the way; its wave
+    length
     radius_factors : (3,) true rolling radius of each wheel over the nominal one
     roughness_factor : roughness over that of the soil's description
     field_length_m : over which length the ground changes along the way
-    leg_play_rad : by how much the third leg swings to either side on its hinge (thesis, conclusions)
+    leg_backlash_rad : by how much the third leg swings to either side on its hinge (thesis, conclusions)
 
     Raises
     ------
@@ -55,20 +56,20 @@ class Conditions:
     payload_kg: float = 0.0
     payload_m: tuple[float, float] = (0.0, 0.0)
     grade_ratio: tuple[float, float] = (0.0, 0.0)
-    swell_ratio: float = 0.0
-    swell_length_m: float = 15.0
+    undulation_ratio: float = 0.0
+    undulation_length_m: float = 15.0
     radius_factors: tuple[float, float, float] = (1.0, 1.0, 1.0)
     roughness_factor: float = 1.0
     field_length_m: float = 0.5
-    leg_play_rad: float = 0.0
+    leg_backlash_rad: float = 0.0
 
     def __post_init__(self) -> None:
         for item in fields(self):
             value = getattr(self, item.name)
-            low, high, wanted = _RANGES[item.name]
+            low, high, desired = _RANGES[item.name]
             for number in value if isinstance(value, tuple) else (value,):
                 if not (math.isfinite(number) and low <= number <= high):
-                    raise ConfigError(f"conditions: {item.name} is {value!r}, {wanted} is wanted")
+                    raise ConfigError(f"conditions: {item.name} is {value!r}, {desired} is required")
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,8 +79,8 @@ class Spread:
     payload_max_kg: float
     payload_offset_m: float
     grade_std_ratio: float
-    swell_std_ratio: float
-    swell_length_m: float
+    undulation_std_ratio: float
+    undulation_length_m: float
     radius_std_ratio: float
     roughness_log_std_ratio: float
     field_length_m: float
@@ -116,13 +117,13 @@ def draw_conditions(
         payload_kg=nominal.payload_kg + float(rng.uniform(0.0, spread.payload_max_kg)),
         payload_m=(float(offset[0]), float(offset[1])),
         grade_ratio=(float(grade[0]), float(grade[1])),
-        swell_ratio=nominal.swell_ratio + float(normal(spread.swell_std_ratio, 1)[0]),
-        swell_length_m=spread.swell_length_m,
+        undulation_ratio=nominal.undulation_ratio + float(normal(spread.undulation_std_ratio, 1)[0]),
+        undulation_length_m=spread.undulation_length_m,
         radius_factors=(float(radius[0]), float(radius[1]), float(radius[2])),
         roughness_factor=nominal.roughness_factor
         * float(np.exp(normal(spread.roughness_log_std_ratio, 1)[0])),
         field_length_m=spread.field_length_m,
-        leg_play_rad=nominal.leg_play_rad,
+        leg_backlash_rad=nominal.leg_backlash_rad,
     )
 
 
@@ -150,7 +151,7 @@ class Faults:
             for start_s, end_s in getattr(self, name):
                 if not start_s < end_s:
                     raise ConfigError(
-                        f"faults: {name} has ({start_s!r}, {end_s!r}), start before end is wanted"
+                        f"faults: {name} has ({start_s!r}, {end_s!r}), start before end is required"
                     )
 
 

@@ -185,7 +185,7 @@ def make_scenario(
         raise ConfigError(f"scenario {name!r} is unknown: use one of {', '.join(SCENARIOS)}")
     grounds = (terrains,) if isinstance(terrains, str) else tuple(terrains or ())
     if not grounds or not all(isinstance(terrain, str) and terrain for terrain in grounds):
-        raise ConfigError(f"terrains are {terrains!r}: one name or several are wanted")
+        raise ConfigError(f"terrains are {terrains!r}: one name or several are required")
     if len(grounds) > 1 and name != "course":
         raise ConfigError(
             f"scenario {name!r} is driven on one terrain, {len(grounds)} are given: use 'course'"
@@ -194,14 +194,14 @@ def make_scenario(
     if not steered and name in _STEERED:
         raise ConfigError(f"scenario {name!r} is not for robot {robot.name} with the drive {robot.drive!r}")
     order = _Order(*_ability(robot, speed_mps), _generator(seed), _accel(name, accel_mps2), steered)
-    wanted_s = _duration(duration_s)
+    desired_s = _duration(duration_s)
     if name == "course":
-        time_s, twist, patches = _course(order, wanted_s, grounds)
+        time_s, twist, patches = _course(order, desired_s, grounds)
     else:
         default_s, drive, smooth = _DRIVES[name]
         if callable(default_s):
             default_s = default_s(order)
-        length_s = default_s if wanted_s is None else wanted_s
+        length_s = default_s if desired_s is None else desired_s
         time_s = _times(length_s)
         twist = _twists(drive(order, length_s), time_s, smooth)
         patches = (Patch(0.0, grounds[0]),)
@@ -388,23 +388,23 @@ def _stretch(order: _Order, direction: float, gentle_1pm: float) -> _Leg:
 
 
 def _course(
-    order: _Order, wanted_s: float | None, terrains: tuple[str, ...]
+    order: _Order, desired_s: float | None, terrains: tuple[str, ...]
 ) -> tuple[Array, Array, tuple[Patch, ...]]:
     """Lay patches and drive over them; a given duration lays as many as are reached in it."""
     ground, driver = order.rng.spawn(2)
     order = order._replace(rng=driver)
     rounds = _rounds(terrains, ground)
     laid, end_m = next(rounds)
-    if wanted_s is None:
+    if desired_s is None:
         slowest_mps = order.limit((0.4 * order.speed_mps, 0.0, 0.4 * order.speed_mps * 0.15))[0]
         length_s = 2 * STAND_S + 2 * order.speed_mps / ACCEL_MPS2 + SLIP_MARGIN * end_m / slowest_mps
     else:
-        length_s = wanted_s
+        length_s = desired_s
         _rest("course", length_s, STAND_S + 1.2 * order.speed_mps / 0.5, at_least_s=3.0)
     time_s = _times(length_s)
     twist = _twists(_fill(_course_legs(order), length_s)[0], time_s)
     reached_m = _distance_m(time_s, twist) / SLIP_MARGIN
-    if wanted_s is None:
+    if desired_s is None:
         n = int(np.searchsorted(reached_m, end_m)) + 1
         return time_s[:n], twist[:n], tuple(laid)
     while end_m < reached_m[-1]:
@@ -524,7 +524,7 @@ def _duration(duration_s: float | None) -> float | None:
         return None
     if not _is_number(duration_s) or not 1 / RATE_HZ <= duration_s <= LONGEST_S:
         raise ConfigError(
-            f"duration_s is {duration_s!r}, a time from {1 / RATE_HZ:g} to {LONGEST_S:g} s is wanted"
+            f"duration_s is {duration_s!r}, a time from {1 / RATE_HZ:g} to {LONGEST_S:g} s is required"
         )
     return float(duration_s)
 
@@ -545,7 +545,7 @@ def _ability(robot: Robot, speed_mps: float) -> tuple[float, Callable[[Any], Arr
 
 def _accel(name: str, accel_mps2: float) -> float:
     if not (_is_number(accel_mps2) or accel_mps2 == math.inf) or not accel_mps2 > 0:
-        raise ConfigError(f"accel_mps2 is {accel_mps2!r}, a number above zero is wanted, inf for steps")
+        raise ConfigError(f"accel_mps2 is {accel_mps2!r}, a number above zero is required, inf for steps")
     if accel_mps2 != ACCEL_MPS2 and name not in _RAMPED:
         raise ConfigError(
             f"accel_mps2 is {accel_mps2:g}: scenario {name!r} has ramps of its own, "
@@ -558,7 +558,7 @@ def _generator(seed: int | np.random.Generator) -> np.random.Generator:
     if isinstance(seed, np.random.Generator):
         return seed
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
-        raise ConfigError(f"seed is {seed!r}, a whole number from 0 up is wanted")
+        raise ConfigError(f"seed is {seed!r}, a whole number from 0 up is required")
     return np.random.default_rng(seed)
 
 

@@ -41,7 +41,7 @@ class Drive(NamedTuple):
     speed_mps: float
     duration_s: float = 30.0
     grade_ratio: float = 0.0
-    swell_ratio: float = 0.0
+    undulation_ratio: float = 0.0
 
 
 LEARNING_DRIVES: tuple[Drive, ...] = (
@@ -96,7 +96,7 @@ def learning_run(
     drawn, simulated = np.random.SeedSequence(key).spawn(2)
     rng = np.random.default_rng(drawn)
     soil = scattered(nominal, rng)
-    ground = Conditions(grade_ratio=(drive.grade_ratio, 0.0), swell_ratio=drive.swell_ratio)
+    ground = Conditions(grade_ratio=(drive.grade_ratio, 0.0), undulation_ratio=drive.undulation_ratio)
     return simulate(
         robot,
         scenario_of(drive, nominal.name),

@@ -416,10 +416,10 @@ def left_out_scores(runs: Sequence[RunBins]) -> dict[str, Array]:
         others = [other for number, other in enumerate(runs) if number != out]
         left = _Pooled([run])
         for law in LAW_PARAMETERS:
-            taught = fit_curve(law, others, whole[law])
+            trained = fit_curve(law, others, whole[law])
             scores[law].append(
                 left.log_likelihood(
-                    *left.curve(law, taught.parameters), left.variance(law, taught.parameters)
+                    *left.curve(law, trained.parameters), left.variance(law, trained.parameters)
                 )
             )
         rest = np.concatenate([other.traction_ratio for other in others])

@@ -123,7 +123,7 @@ class WheelPull:
     slip_ratio, slip_std : (n, wheels) of the contact, its sideways part included; NaN where unknown
     thrust_n : (n, wheels) what the ground gives along that slip, before any resistance
     load_npkg : (n, wheels) load over the robot's mass
-    speed_mps : (n, wheels) the larger of rim speed and speed over ground
+    speed_mps : (n, wheels) the larger of wheel speed and speed over ground
     pull_n : (n,) sum of the thrusts along the way
     way_mps : (n,) speed
     grade_mps2 : (n,) part of gravity against the way: uphill positive
@@ -296,13 +296,13 @@ def wheel_pull(
     ahead = track.state("speed_x_mps")[:, None] - turn * y_m
     left = track.state("speed_y_mps")[:, None] + turn * x_m
     along, across = ahead * np.cos(steer) + left * np.sin(steer), left * np.cos(steer) - ahead * np.sin(steer)
-    rim = rate * robot.wheel_radius_m
-    slipping = rim - along
-    fastest = np.maximum(np.abs(rim), np.abs(along))
+    wheel_speed = rate * robot.wheel_radius_m
+    slipping = wheel_speed - along
+    fastest = np.maximum(np.abs(wheel_speed), np.abs(along))
     contact = np.column_stack(
         [contact_slip(clock, slipping[:, i], fastest[:, i], body.relaxation_length_m) for i in range(3)]
     )
-    rolling = np.where(rim + along < 0.0, -1.0, 1.0)
+    rolling = np.where(wheel_speed + along < 0.0, -1.0, 1.0)
 
     change = _smooth(np.gradient(rate, clock, axis=0), clock)
     torque = wheel_torque(
@@ -432,7 +432,7 @@ def body_balance(pull: WheelPull, robot: Robot, where: Array) -> Balance:
     return Balance(mass_kg, mass_std_kg, rho, math.hypot(math.hypot(scatter, by_mass), TILT_STD_RAD))
 
 
-def pull_samples(pull: WheelPull, mass_kg: float, where: Array, rim_std_mps: float) -> Array:
+def pull_samples(pull: WheelPull, mass_kg: float, where: Array, wheel_speed_std_mps: float) -> Array:
     """Return (k, 5) slip, its std, thrust over load, its std and its lag: means of one wheel.
 
     Means over :data:`SAMPLE_S` are taken before samples are sorted by their slip: a single slip errs by the
@@ -445,7 +445,7 @@ def pull_samples(pull: WheelPull, mass_kg: float, where: Array, rim_std_mps: flo
     pull : of a run
     mass_kg : of the robot with what it carries
     where : (n,) on which ground
-    rim_std_mps : scatter of a single rim speed
+    wheel_speed_std_mps : scatter of a single wheel speed
     """
     rows = []
     believed = pull.believed
@@ -453,7 +453,7 @@ def pull_samples(pull: WheelPull, mass_kg: float, where: Array, rim_std_mps: flo
         for block in _blocks(pull.time_s, believed[:, i] & where, SAMPLE_S):
             load_n = float(pull.load_npkg[block, i].mean()) * mass_kg
             n, last = block.stop - block.start, block.stop - 1
-            slip_std = rim_std_mps / (pull.speed_mps[block, i].mean() * math.sqrt(n))
+            slip_std = wheel_speed_std_mps / (pull.speed_mps[block, i].mean() * math.sqrt(n))
             mean_std = float(np.mean(pull.slip_std[block, i]))
             rows.append(
                 (

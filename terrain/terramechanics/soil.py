@@ -181,7 +181,7 @@ def soil_from(file: str, described: Any) -> Soil:
     check_keys(file, described, ["name", "law"], optional=tuple(RANGES))
     name, law = described["name"], described["law"]
     if not isinstance(name, str) or not name:
-        raise ConfigError(f"{file}: name is {name!r}, a word is wanted")
+        raise ConfigError(f"{file}: name is {name!r}, a word is required")
     if not isinstance(law, str) or law not in LAWS:
         raise ConfigError(f"{file}: law {law!r} is unknown: use one of {', '.join(LAWS)}")
     sinks = law == "janosi" and any(key in described for key in SINKAGE)

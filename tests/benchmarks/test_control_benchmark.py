@@ -30,31 +30,31 @@ DT_S = 0.02
 def rows():
     """What three wheels do in a start: command, rate, ground speed, acceleration, slip, torque (n, 3)."""
     rng = np.random.default_rng(0)
-    wanted = np.minimum(np.arange(N_STEPS) * 0.1, 5.0)[:, None] * np.ones(3)
-    ground = 0.17 * wanted + 0.01 * rng.standard_normal((N_STEPS, 3))
+    desired = np.minimum(np.arange(N_STEPS) * 0.1, 5.0)[:, None] * np.ones(3)
+    ground = 0.17 * desired + 0.01 * rng.standard_normal((N_STEPS, 3))
     accel = 0.3 * rng.standard_normal((N_STEPS, 3))
-    slip = np.clip(1 - ground / np.maximum(0.2 * wanted, 0.05), -1, 1)
-    return wanted, wanted, ground, accel, slip, 10 + rng.standard_normal((N_STEPS, 3))
+    slip = np.clip(1 - ground / np.maximum(0.2 * desired, 0.05), -1, 1)
+    return desired, desired, ground, accel, slip, 10 + rng.standard_normal((N_STEPS, 3))
 
 
-def with_traction(wanted, rate, ground, accel, slip, torque):
+def with_traction(desired, rate, ground, accel, slip, torque):
     state, std, aim = initial_state(), np.full(3, 0.005), Ground(0.1)
-    for u, v, a, s, t in zip(wanted, ground, accel, slip, torque, strict=True):
+    for u, v, a, s, t in zip(desired, ground, accel, slip, torque, strict=True):
         told, state, _ = traction_step(SETTINGS, state, aim, 0.2, u, v, a, s, std, 0.0, t, DT_S)
     return told
 
 
-def with_thesis(wanted, rate, ground, accel, slip, torque):
+def with_thesis(desired, rate, ground, accel, slip, torque):
     settings, state, targets = thesis_settings(0.2, GAINS), new_state(), np.array([0.1, -0.15, 0.05])
-    for u, w, v, a in zip(wanted, rate, ground, accel, strict=True):
+    for u, w, v, a in zip(desired, rate, ground, accel, strict=True):
         added, _, _, _, state = thesis_step(settings, state, u, w, v, a, float(v[0]), targets, DT_S)
     return u + added
 
 
-def with_python(wanted, rate, ground, accel, slip, torque):
+def with_python(desired, rate, ground, accel, slip, torque):
     """(8.1) to (8.3) with a clamp, wheel by wheel, in the interpreter."""
     integral = [0.0] * 3
-    for us, vs, ss in zip(wanted.tolist(), ground.tolist(), slip.tolist(), strict=True):
+    for us, vs, ss in zip(desired.tolist(), ground.tolist(), slip.tolist(), strict=True):
         told = []
         for i in range(3):
             error = (0.05 - ss[i]) * max(us[i] * 0.2, abs(vs[i])) / 0.2

@@ -73,7 +73,7 @@ def test_a_file_that_is_one_line_is_not_extended(tmp_path):
     value, interval = {"gyro_scale_ratio": 0.01}, {"gyro_scale_ratio": (0.0, 0.02)}
     assert robot_from("a", yaml.safe_load(extended_yaml(path, value, np.eye(1), interval, "a"))).effects
     path.write_text(yaml.safe_dump(yaml.safe_load(path.read_text()), default_flow_style=True))
-    with pytest.raises(ConfigError, match="one section a line is wanted"):
+    with pytest.raises(ConfigError, match="one section a line is required"):
         extended_yaml(path, value, np.eye(1), interval, "a")
 
 
@@ -240,9 +240,9 @@ def test_a_correction_is_the_inverse_of_what_sensors_do(names):
     np.testing.assert_allclose(other.values, camera.values, atol=8 * ROBOT.camera.yaw_rate_std_radps)
     table, plain = measurement_table(back, robot), measurement_table(clean, ROBOT)
     worst = {"accel": 1e-9, "gyro": 1e-3, "imu_yaw": 0.01, "camera_speed": 0.01, "camera_yaw": 0.02}
-    for row, column, wanted in zip(table.rows, table.z.T, plain.z.T, strict=True):
+    for row, column, desired in zip(table.rows, table.z.T, plain.z.T, strict=True):
         allowed = next((limit for start, limit in worst.items() if row.startswith(start)), 1e-9)
-        np.testing.assert_allclose(column, wanted, atol=allowed, err_msg=row)
+        np.testing.assert_allclose(column, desired, atol=allowed, err_msg=row)
     per_a = robot.motors.torque_constant_nmpa / ROBOT.motors.torque_constant_nmpa
     current = per_a * back.streams["wheels"].values[:, 3:]
     np.testing.assert_allclose(current, clean.streams["wheels"].values[:, 3:], atol=0.15)
@@ -250,7 +250,7 @@ def test_a_correction_is_the_inverse_of_what_sensors_do(names):
 
 @pytest.mark.parametrize("block", [1, 7, 1000])
 def test_block_by_block_is_the_whole_run(block):
-    effects = EVERY | {"steering_play_rad": 0.05}
+    effects = EVERY | {"steering_backlash_rad": 0.05}
     run = run_of(effects=effects)
     robot = extended(**effects)
     whole = corrected_log(run, robot)
@@ -332,11 +332,11 @@ def test_live_is_live_on_the_corrected_log():
     raw, plain = LiveEstimator(robot, "vio15", channels), LiveEstimator(corrected(robot), "vio15", channels)
     unshifted = replace(robot, effects={n: v for n, v in effects.items() if n != "steering_delay_s"})
     raw_now = LiveEstimator(unshifted, "vio15", channels)
-    told, wanted = [], []
+    told, desired = [], []
     log = corrected_log(run, unshifted)
     for one, other in zip(replay(run, 50.0), replay(log, 50.0), strict=True):
         told += raw_now.step(one.readings)
-        wanted += plain.step(other.readings)
+        desired += plain.step(other.readings)
         assert all(np.isfinite(estimate.mean).all() for estimate in raw.step(one.readings))
-    np.testing.assert_allclose([t.mean for t in told], [w.mean for w in wanted], atol=1e-9)
-    np.testing.assert_allclose([t.slip_ratio for t in told], [w.slip_ratio for w in wanted], atol=1e-9)
+    np.testing.assert_allclose([t.mean for t in told], [w.mean for w in desired], atol=1e-9)
+    np.testing.assert_allclose([t.slip_ratio for t in told], [w.slip_ratio for w in desired], atol=1e-9)

@@ -32,7 +32,7 @@ def test_husky_is_the_makers_nominal_geometry():
         (lambda d: d["track_m"].update(value=math.inf), "track_m is inf"),
         (lambda d: d["track_m"].update(value="wide"), "track_m is 'wide'"),
         (lambda d: d["track_m"].update(value=True), "track_m is True"),
-        (lambda d: d["track_m"].update(unit="mm"), "track_m has the unit 'mm', 'm' is wanted"),
+        (lambda d: d["track_m"].update(unit="mm"), "track_m has the unit 'mm', 'm' is required"),
         (lambda d: d["track_m"].pop("source"), "track_m: key 'source' is missing"),
         (lambda d: d["track_m"].update(source=" "), "track_m has no source"),
         (lambda d: d.update(track_m=0.57), "track_m is 0.57, a mapping with value, unit, source"),

@@ -42,11 +42,11 @@ def make_track(mean, states, cov=None, age_s=0.0, dt_s=0.02):
     )
 
 
-def make_table(track, rim_mps, robot=ROBOT):
+def make_table(track, wheel_speed_mps, robot=ROBOT):
     """Return measurements of which only the wheels, and how they are steered, are known."""
     rows = ROWS_OF_DRIVE[robot.drive]
     z = np.full((track.time_s.size, len(rows)), np.nan)
-    z[:, : len(robot.wheels)] = rim_mps
+    z[:, : len(robot.wheels)] = wheel_speed_mps
     if robot.drive == "swerve":
         z[:, :3] /= robot.wheel_radius_m
         z[:, [row.startswith("steer") for row in rows]] = 0.0
@@ -58,36 +58,36 @@ def make_table(track, rim_mps, robot=ROBOT):
 speeds = st.floats(-5, 5, allow_subnormal=False)
 
 
-@given(rim=speeds, ground=speeds)
-def test_laws_of_the_slip_ratio(rim, ground):
-    slip = slip_ratio(rim, ground)
-    if max(abs(rim), abs(ground)) < 0.05:
+@given(wheel_speed=speeds, ground=speeds)
+def test_laws_of_the_slip_ratio(wheel_speed, ground):
+    slip = slip_ratio(wheel_speed, ground)
+    if max(abs(wheel_speed), abs(ground)) < 0.05:
         assert np.isnan(slip)
-        assert slip_ratio(rim, ground, stationary=0.0) == 0.0
+        assert slip_ratio(wheel_speed, ground, stationary=0.0) == 0.0
         return
     assert -1 <= slip <= 1
-    assert slip == slip_ratio(rim, ground, stationary=0.0)
-    assert slip == -slip_ratio(ground, rim)  # what drives the one brakes the other
-    assert slip == -slip_ratio(-rim, -ground)
-    assert slip * (rim - ground) >= 0
-    if rim > ground > 0:
-        assert slip == pytest.approx((rim - ground) / rim)  # (7.1)
-    if ground > rim > 0:
-        assert slip == pytest.approx((rim - ground) / ground)  # (7.2)
+    assert slip == slip_ratio(wheel_speed, ground, stationary=0.0)
+    assert slip == -slip_ratio(ground, wheel_speed)  # what drives the one brakes the other
+    assert slip == -slip_ratio(-wheel_speed, -ground)
+    assert slip * (wheel_speed - ground) >= 0
+    if wheel_speed > ground > 0:
+        assert slip == pytest.approx((wheel_speed - ground) / wheel_speed)  # (7.1)
+    if ground > wheel_speed > 0:
+        assert slip == pytest.approx((wheel_speed - ground) / ground)  # (7.2)
 
 
 def test_singular_points_of_the_slip_ratio():
     inf, nan = np.inf, np.nan
-    rim = np.array([0.0, 1.0, 0.0, 0.05, 0.0499, 1.0, nan, 0.0, inf, 0.0])
+    wheel_speed = np.array([0.0, 1.0, 0.0, 0.05, 0.0499, 1.0, nan, 0.0, inf, 0.0])
     ground = np.array([0.0, 0.0, 1.0, 0.0, 0.0499, -1.0, 1.0, nan, 1.0, 1e-320])
     expected = np.array([nan, 1.0, -1.0, 1.0, nan, 1.0, nan, nan, nan, nan])
-    np.testing.assert_array_equal(slip_ratio(rim, ground), expected)
+    np.testing.assert_array_equal(slip_ratio(wheel_speed, ground), expected)
     for_control = np.array([0.0, 1.0, -1.0, 1.0, 0.0, 1.0, nan, nan, nan, 0.0])
-    np.testing.assert_array_equal(slip_ratio(rim, ground, stationary=0.0), for_control)
+    np.testing.assert_array_equal(slip_ratio(wheel_speed, ground, stationary=0.0), for_control)
     assert slip_ratio(np.ones((4, 1)), np.zeros(3)).shape == (4, 3)
     for least in (0.0, -1.0, nan):
-        with pytest.raises(ConfigError, match="a speed above zero is wanted"):
-            slip_ratio(rim, ground, min_speed_mps=least)
+        with pytest.raises(ConfigError, match="a speed above zero is required"):
+            slip_ratio(wheel_speed, ground, min_speed_mps=least)
 
 
 def test_slip_angle_is_that_of_the_slide_to_the_left_whichever_way_the_wheel_rolls():
@@ -119,10 +119,10 @@ def test_sign_of_slip_is_that_along_the_wheel(steer, rolls, goes, traction):
     ground = 0.8 * rolls
     velocity = ground * np.array([np.cos(steer), np.sin(steer)])
     assert np.sign(velocity[0]) == goes
-    rim = ground / (1 - traction) if traction > 0 else ground * (1 + traction)
-    mean = [*velocity, 0.0, *[steer] * 3, *[rim - ground] * 3]
+    wheel_speed = ground / (1 - traction) if traction > 0 else ground * (1 + traction)
+    mean = [*velocity, 0.0, *[steer] * 3, *[wheel_speed - ground] * 3]
     track = make_track(mean, WITH_SLIP)
-    table = make_table(track, rim)
+    table = make_table(track, wheel_speed)
     slip = wheel_slip(track, table, ROBOT).slip_ratio
     np.testing.assert_allclose(slip, rolls * traction)
     np.testing.assert_allclose(slip * np.sign(ground), traction)
@@ -158,14 +158,14 @@ def test_uncertainty_of_slip_is_that_of_the_state(slip_speed, way, with_slip):
     root = 0.004 * rng.standard_normal((len(states), len(states)))
     cov = root @ root.T
     track = make_track(mean, states, cov)
-    rim_std = 0.01
+    wheel_speed_std = 0.01
     along = track_ground(mean)
-    rim = along + slip_speed * way
-    slip = wheel_slip(track, make_table(track, rim), ROBOT, rim_std_mps=rim_std)
+    wheel_speed = along + slip_speed * way
+    slip = wheel_slip(track, make_table(track, wheel_speed), ROBOT, wheel_speed_std_mps=wheel_speed_std)
     n = 40000
     drawn = make_track(rng.multivariate_normal(mean, cov, n), states)
-    rims = make_table(drawn, rim + rim_std * rng.standard_normal((n, 3)))
-    scatter = wheel_slip(drawn, rims, ROBOT)
+    wheel_speeds = make_table(drawn, wheel_speed + wheel_speed_std * rng.standard_normal((n, 3)))
+    scatter = wheel_slip(drawn, wheel_speeds, ROBOT)
     assert np.sign(slip.slip_ratio[0]).tolist() == [np.sign(slip_speed * way)] * 3
     # 0.5 % by chance, the rest is second order at 3 % of relative noise
     np.testing.assert_allclose(scatter.slip_ratio.std(axis=0), slip.slip_std[0], rtol=0.03)
@@ -180,12 +180,12 @@ def track_ground(mean):
 def test_uncertainty_of_the_rim_is_by_default_the_robots_own():
     track = make_track([0.8, *[0.0] * 5], WITHOUT)
     table = make_table(track, 1.0)
-    rim_std = wheel_slip(track, table, ROBOT).slip_std[0, 0] / 0.8
+    wheel_speed_std = wheel_slip(track, table, ROBOT).slip_std[0, 0] / 0.8
     # the ripple of Hall steps behind the low-pass, drawn step by step
     dt, step = 1e-4, 2 * np.pi / 900
     count = np.floor(np.arange(0, 4, dt) * 5.0 / step)
     seen = lfilter([1 - np.exp(-dt / 0.05)], [1, -np.exp(-dt / 0.05)], np.diff(count) * step / dt)
-    assert rim_std == pytest.approx(seen[5000:].std() * ROBOT.wheel_radius_m, rel=0.03)
+    assert wheel_speed_std == pytest.approx(seen[5000:].std() * ROBOT.wheel_radius_m, rel=0.03)
     nameless = replace(ROBOT, sensors=None)
     assert np.isnan(wheel_slip(track, table, nameless).slip_std).all()
     np.testing.assert_allclose(wheel_slip(track, table, nameless).slip_ratio, 0.2)
@@ -232,12 +232,16 @@ def test_sides_of_a_skid_steered_robot(speed_name):
     half = HUSKY.track_m / 2
     track = make_track([0.9, 0.5], (speed_name, "yaw_rate_radps"), np.diag([1e-4, 4e-4]))
     left, right = 0.9 - 0.5 * half, 0.9 + 0.5 * half
-    slip = wheel_slip(track, make_table(track, [left / 0.8, right * 0.9], HUSKY), HUSKY, rim_std_mps=0.01)
+    slip = wheel_slip(
+        track, make_table(track, [left / 0.8, right * 0.9], HUSKY), HUSKY, wheel_speed_std_mps=0.01
+    )
     np.testing.assert_allclose(slip.slip_ratio, [[0.2, -0.1]])
     assert slip.wheels == ("left", "right")
     ground_std = np.sqrt(1e-4 + half**2 * 4e-4)
-    rim = left / 0.8
-    np.testing.assert_allclose(slip.slip_std[0, 0], np.hypot(ground_std / rim, 0.01 * left / rim**2))
+    wheel_speed = left / 0.8
+    np.testing.assert_allclose(
+        slip.slip_std[0, 0], np.hypot(ground_std / wheel_speed, 0.01 * left / wheel_speed**2)
+    )
 
 
 def test_what_does_not_fit_is_refused():
@@ -266,9 +270,9 @@ def start_of_a_run(slip, camera_s=0.0):
     rng = np.random.default_rng(0)
     fine = np.arange(0, 4.0, 0.001)
     speed = np.clip(fine - 0.5, 0.0, 1.0)
-    rim = lagged(speed / (1 - slip), 0.05)
+    wheel_speed = lagged(speed / (1 - slip), 0.05)
     t = np.arange(200) / 50
-    motor = np.interp(t, fine, rim) / ROBOT.wheel_radius_m * ROBOT.motors.reduction_ratio
+    motor = np.interp(t, fine, wheel_speed) / ROBOT.wheel_radius_m * ROBOT.motors.reduction_ratio
     motor = motor + ROBOT.sensors.motor_std_radps * rng.standard_normal(motor.size)
     wheels = Stream(t, np.tile(motor[:, None], 3), [f"motor_{i}_radps" for i in (1, 2, 3)])
     t = np.arange(800) / 200
@@ -282,8 +286,8 @@ def start_of_a_run(slip, camera_s=0.0):
 def raw_slip(run, robot, **options):
     """Slip of wheel 1 by what the table holds: encoders against the camera."""
     table = measurement_table(run, robot, **options)
-    rim, ground = table.columns(["wheel_1_radps", "camera_speed_x_mps"]).T
-    return slip_ratio(rim * robot.wheel_radius_m, ground)
+    wheel_speed, ground = table.columns(["wheel_1_radps", "camera_speed_x_mps"]).T
+    return slip_ratio(wheel_speed * robot.wheel_radius_m, ground)
 
 
 @pytest.mark.parametrize("camera_s", [0.0, 0.02])
@@ -362,16 +366,22 @@ def test_slip_of_one_instant_is_that_of_the_track(states):
     n, d = 300, len(states)
     mean = rng.normal(0.0, 1.0, (n, d)) * rng.choice([0.0, 0.02, 1.0], (n, 1))
     root = rng.normal(0.0, 0.1, (d, d))
-    rim_mps = rng.normal(0.0, 1.0, (n, 3)) * rng.choice([0.0, 0.02, 1.0, np.nan], (n, 3))
+    wheel_speed_mps = rng.normal(0.0, 1.0, (n, 3)) * rng.choice([0.0, 0.02, 1.0, np.nan], (n, 3))
     track = make_track(mean, states, root @ root.T)
-    slip = wheel_slip(track, make_table(track, rim_mps), ROBOT, rim_std_mps=0.05)
+    slip = wheel_slip(track, make_table(track, wheel_speed_mps), ROBOT, wheel_speed_std_mps=0.05)
     at = np.array([states.index(s) if s in states else -1 for s in WITH_SLIP])
     found = np.empty((n, 2, 3))
     for k in range(n):
         instant_slip(
-            mean[k], root @ root.T, np.array(ROBOT.wheel_positions_m), at, rim_mps[k], 0.05**2, found[k]
+            mean[k],
+            root @ root.T,
+            np.array(ROBOT.wheel_positions_m),
+            at,
+            wheel_speed_mps[k],
+            0.05**2,
+            found[k],
         )
-    heard = np.maximum.accumulate(np.where(np.isfinite(rim_mps), track.time_s[:, None], -1.0))
+    heard = np.maximum.accumulate(np.where(np.isfinite(wheel_speed_mps), track.time_s[:, None], -1.0))
     found = np.where((track.time_s[:, None] - heard > 0.5)[:, None], np.nan, found)
     np.testing.assert_allclose(found[:, 0], slip.slip_ratio, rtol=0, atol=1e-14)
     np.testing.assert_allclose(found[:, 1], slip.slip_std, rtol=1e-9, atol=1e-14)

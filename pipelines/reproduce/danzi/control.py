@@ -27,12 +27,12 @@ GAIN = 0.5
 
 
 class Case(NamedTuple):
-    """A row of table 8.1: speed over ground and rim speed, then what is printed of the control."""
+    """A row of table 8.1: speed over ground and wheel speed, then what is printed of the control."""
 
     name: str
     braking: bool
     speed_mps: float
-    rim_mps: float
+    wheel_speed_mps: float
     slip: float
     desired: float
     error: float
@@ -121,7 +121,7 @@ def _iterated(case: Case, form: str, gain: float, n_steps: int) -> tuple[Array, 
     settings = thesis_settings(1.0, Gains(gain, 0.0, 0.0, limit=10.0), form)
     state, speed = new_state(1), np.array([case.speed_mps])
     accel = np.copysign(ACCEL_MPS2, -speed if case.braking else speed)
-    rate, errors, sent = np.array([case.rim_mps]), [], []
+    rate, errors, sent = np.array([case.wheel_speed_mps]), [], []
     for _ in range(n_steps):
         slip = (rate - speed) / np.maximum(np.abs(rate), np.abs(speed))
         added, desired, _, _, state = thesis_step(

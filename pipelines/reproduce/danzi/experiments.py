@@ -65,7 +65,7 @@ from terrain.slip import MIN_SPEED_MPS
 
 TRACKS_M = (0.7, 0.756, 1.1)
 """The ends of its adjustment, and the track of 7.2."""
-RIM_MPS = 1.0
+WHEEL_SPEED_MPS = 1.0
 """What the wheels of the scenario ``straight`` are told."""
 OFTEN = 1 / 3
 """Share of the runs from which on something happens frequently."""
@@ -335,7 +335,7 @@ def _adaptive_tuning(seed: int, quick: bool) -> Finding:
     drift = {factor: [abs(_drift_mps(f)) for f in row] for factor, row in found.items()}
     most = max(FACTORS)
     true, _ = over_runs([steady_mean(true_slip(f), f) for f in found[most]])
-    slip_speed_mps = true * RIM_MPS
+    slip_speed_mps = true * WHEEL_SPEED_MPS
     n_lost = sum(value > slip_speed_mps for value in drift[most])
     mean, spread = over_runs(error[best])
     drifted, drift_range = over_runs(drift[most])

@@ -230,7 +230,7 @@ def slip_on_terrains(seed: int, quick: bool) -> Finding:
         pictures.append(
             Picture(
                 f"A start at 1 m/s² and steady driving on {words} by the thesis' filter (thesis, figure "
-                f"7.{number}): rim speeds over the speed over ground, and the slip between them beside the "
+                f"7.{number}): wheel speeds over the speed over ground, and the slip between them beside the "
                 "true one.",
                 slip_figure(thesis[0]),
             )

@@ -36,7 +36,7 @@ from terrain.records import Array, RunLog, Stream
 from terrain.robots import Robot
 from terrain.simulation.planar.model import Ground, Planar, make_planar
 from terrain.simulation.planar.motion import move
-from terrain.simulation.planar.noise import RIM, Noise, load_noise, load_scatter, noise_psd
+from terrain.simulation.planar.noise import WHEEL_SPEED, Noise, load_noise, load_scatter, noise_psd
 from terrain.simulation.planar.run import Hills, simulate_planar
 from terrain.simulation.planar.sensors import SENSED_ONLY, sense
 
@@ -78,8 +78,8 @@ class Limits(NamedTuple):
         at = [self.names.index(p.name) for p in effect.parameters]
         along = np.eye(len(at))[0] if direction is None else direction
         size = float(along @ self.information[np.ix_(at, at)] @ along)
-        wanted = norm.isf(TEST_SIZE / 2 / self.library_size) + norm.ppf(POWER)
-        return float(wanted / math.sqrt(size)) if size > 0 else math.inf
+        desired = norm.isf(TEST_SIZE / 2 / self.library_size) + norm.ppf(POWER)
+        return float(desired / math.sqrt(size)) if size > 0 else math.inf
 
     @property
     def library_size(self) -> int:
@@ -125,7 +125,7 @@ def poor_drives(rng: np.random.Generator, n_runs: int, duration_s: float = DURAT
 
 def _mixed(rng: np.random.Generator, duration_s: float) -> Array:
     n = round(duration_s * STEP_HZ) + 1
-    wanted = np.zeros((n, 3))
+    desired = np.zeros((n, 3))
     k = round(1.5 * STEP_HZ)
     while k < n - round(3.0 * STEP_HZ):
         length = round(rng.uniform(2.0, 5.0) * STEP_HZ)
@@ -139,17 +139,17 @@ def _mixed(rng: np.random.Generator, duration_s: float) -> Array:
             speed, turn = 0.0, rng.choice([-1.0, 1.0]) * rng.uniform(0.3, 0.8)
         elif kind == "turn":
             turn = rng.choice([-1.0, 1.0]) * rng.uniform(0.1, 0.6)
-        wanted[k : k + length] = speed, 0.0, turn
+        desired[k : k + length] = speed, 0.0, turn
         k += length
-    wanted[n - round(3.0 * STEP_HZ) :] = 0.0
-    return _ramped(wanted)
+    desired[n - round(3.0 * STEP_HZ) :] = 0.0
+    return _ramped(desired)
 
 
-def _ramped(wanted: Array) -> Array:
+def _ramped(desired: Array) -> Array:
     """Return twists (n, 3) from rest that change by 1 m/s^2 and 1 rad/s^2 at the most."""
     limit = 1.0 / STEP_HZ
-    twist = np.zeros_like(wanted)
-    for axis, goals in enumerate(wanted.T.tolist()):  # numbers of Python's own: arrays of three are slow
+    twist = np.zeros_like(desired)
+    for axis, goals in enumerate(desired.T.tolist()):  # numbers of Python's own: arrays of three are slow
         value, values = 0.0, [0.0]
         for goal in goals[1:]:
             change = goal - value
@@ -216,40 +216,40 @@ def _gram(
     truth = Stream(truth.time_s[even], truth.values[even], truth.channels)
     rate_hz = truth.rate_hz
     wheels = robot.wheels
-    rim = np.column_stack([truth.channel(f"wheel_{w}_radps") for w in wheels]) * robot.wheel_radius_m
+    wheel_speed = np.column_stack([truth.channel(f"wheel_{w}_radps") for w in wheels]) * robot.wheel_radius_m
     steer = (
         np.column_stack([truth.channel(f"steer_{w}_rad") for w in wheels])
         if robot.drive == "swerve"
-        else np.zeros_like(rim)
+        else np.zeros_like(wheel_speed)
     )
     grade, roll = -truth.channel("pitch_rad"), truth.channel("roll_rad").copy()
-    rim, steer = np.ascontiguousarray(rim), np.ascontiguousarray(steer)
-    shown = np.ones((len(rim), len(CHANNELS)))
+    wheel_speed, steer = np.ascontiguousarray(wheel_speed), np.ascontiguousarray(steer)
+    shown = np.ones((len(wheel_speed), len(CHANNELS)))
     if robot.drive == "swerve":  # the sum of currents tells the traction where wheels point one way
         shown[np.abs(np.exp(1j * steer).mean(axis=1)) < 0.95, CHANNELS.index(CURRENT)] = 0.0
     channels = [GYRO, SPEED_X, SPEED_Y, ACCEL, CURRENT]
     if robot.drive != "swerve":
         channels.append(TURNING_CURRENT)
-    n = len(rim)
+    n = len(wheel_speed)
     frequency_hz = np.fft.rfftfreq(n, 1 / rate_hz)
     used = frequency_hz < 0.4 * STEP_HZ
     f = frequency_hz[used]
     both_sides = np.where(f > 0, 4.0, 2.0)
-    pace = float(np.abs(rim).mean(axis=1)[np.abs(rim).mean(axis=1) > 0.05].mean())
+    pace = float(np.abs(wheel_speed).mean(axis=1)[np.abs(wheel_speed).mean(axis=1) > 0.05].mean())
     density = {name: _density(noise, robot, planar, name, f, pace) for name in channels}
     waves = {name: np.empty((len(names), f.size), dtype=complex) for name in channels}
     steps = {p.name: p.step for effect in LIBRARY for p in effect.parameters}
-    plain = move(planar, vector_of({}), 1 / rate_hz, rim, steer, grade, roll, np.zeros((0, 3)))
+    plain = move(planar, vector_of({}), 1 / rate_hz, wheel_speed, steer, grade, roll, np.zeros((0, 3)))
     for j, name in enumerate(names):
         step = steps.get(name, 0.005)
         both = []
-        for sign in (1.0, 0.0) if name == "steering_play_rad" else (1.0, -1.0):
+        for sign in (1.0, 0.0) if name == "steering_backlash_rad" else (1.0, -1.0):
             p = vector_of({name: sign * step})
             if name in SENSED_ONLY:
                 both.append(sense(planar, p, 1 / rate_hz, plain))
             else:
-                both.append(_shown(planar, p, 1 / rate_hz, rim, steer, grade, roll))
-        span = step if name == "steering_play_rad" else 2 * step
+                both.append(_shown(planar, p, 1 / rate_hz, wheel_speed, steer, grade, roll))
+        span = step if name == "steering_backlash_rad" else 2 * step
         change = (both[0] - both[1]) / span * shown
         for channel in channels:
             waves[channel][j] = np.fft.rfft(change[:, CHANNELS.index(channel)])[used] / rate_hz
@@ -260,26 +260,28 @@ def _gram(
     return gram
 
 
-def _shown(planar: Planar, p: Array, dt: float, rim: Array, steer: Array, grade: Array, roll: Array) -> Array:
+def _shown(
+    planar: Planar, p: Array, dt: float, wheel_speed: Array, steer: Array, grade: Array, roll: Array
+) -> Array:
     """Return what a replay of measured wheels and tilt would predict, as far as linear in what differs."""
     lag = p[INDEX["encoder_lag_s"]]
-    rims = rim + lag * np.gradient(rim, dt, axis=0) if lag else rim
+    wheel_speeds = wheel_speed + lag * np.gradient(wheel_speed, dt, axis=0) if lag else wheel_speed
     tilt = grade - p[INDEX["pitch_offset_rad"]], roll - p[INDEX["roll_offset_rad"]]
-    truth = move(planar, p, dt, rims, steer, *tilt, np.zeros((0, 3)))
+    truth = move(planar, p, dt, wheel_speeds, steer, *tilt, np.zeros((0, 3)))
     return np.asarray(sense(planar, p, dt, truth))
 
 
 def _density(noise: Noise, robot: Robot, planar: Planar, channel: str, f: Array, pace: float) -> Array:
     """Return the one-sided spectrum of what parts measured from replayed: noise of channel and wheels."""
     own = noise_psd(noise, robot, planar, channel, f, pace)
-    rim = noise_psd(noise, robot, planar, RIM, f, pace)
+    wheel_speed = noise_psd(noise, robot, planar, WHEEL_SPEED, f, pace)
     lag_s = robot.sensors.encoder_time_constant_s if robot.sensors is not None else 0.0
-    rim = rim * (1.0 + (2 * math.pi * f * lag_s) ** 2)  # the lag is undone
+    wheel_speed = wheel_speed * (1.0 + (2 * math.pi * f * lag_s) ** 2)  # the lag is undone
     n = planar.n_wheels
-    mean, rate = rim / n, (2 * math.pi * f) ** 2
+    mean, rate = wheel_speed / n, (2 * math.pi * f) ** 2
     if channel == GYRO:
         turn = np.sum(planar.to_twist[2] ** 2) / 2 if robot.drive == "swerve" else 2.0 / planar.track_m**2
-        return own + rim * turn
+        return own + wheel_speed * turn
     if channel == SPEED_X:
         return own + mean
     if channel == ACCEL:

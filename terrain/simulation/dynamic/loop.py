@@ -74,7 +74,7 @@ def in_loop(
     ----------
     controller : called once an instant of the scenario
     delay_steps : from an instant to when its command is in force; taken as one where it is none
-    scenario, substeps : what is wanted, and how many steps pass from instant to instant
+    scenario, substeps : what is required, and how many steps pass from instant to instant
     drive, motion : over the same record, nothing driven yet; a motion that cannot be integrated ends in NaN
     sensors : of the motion, by stream
 
@@ -86,7 +86,7 @@ def in_loop(
     Raises
     ------
     DataError
-        if a command or its status is not what is wanted.
+        if a command or its status is not what is required.
     """
     decided = np.empty((len(scenario.time_s), 9))
     status: list[Mapping[str, float]] = []
@@ -122,7 +122,7 @@ def _numbers(command: Command, time_s: float) -> Array:
         if values.shape != (3,) or not np.isfinite(values).all():
             shown = " ".join(repr(given).split())
             raise DataError(
-                f"controller: {name} of its command at {time_s:g} s is {shown}, 3 finite numbers are wanted"
+                f"controller: {name} of its command at {time_s:g} s is {shown}, 3 finite numbers are required"
             )
         row[3 * i : 3 * i + 3] = values
     return row
@@ -140,6 +140,6 @@ def _status(command: Command, first: Mapping[str, float] | None, time_s: float) 
     if first is not None and status.keys() != first.keys():
         raise DataError(
             f"controller: status of its command at {time_s:g} s has {', '.join(status) or 'nothing'}, "
-            f"that of the first has {', '.join(first) or 'nothing'}: the same names are wanted"
+            f"that of the first has {', '.join(first) or 'nothing'}: the same names are required"
         )
     return status

@@ -155,7 +155,7 @@ def simulate(
     built = _built(robot, effects or {})
     plant = _plant(built, scenario, soils, conditions, ground)
     n_steps = len(scenario.time_s) * substeps
-    state = start_state(plant, plant.play_rad * start.uniform(-1.0, 1.0, 3))
+    state = start_state(plant, plant.backlash_rad * start.uniform(-1.0, 1.0, 3))
     settle(plant, state)
     noise = road.standard_normal((n_steps, 3))
     motion = Motion(np.empty((n_steps, record_width(plant))), 0)
@@ -219,7 +219,7 @@ def _delay_steps(delay_s: float) -> int:
         or not 0 <= delay_s <= MAX_COMMAND_DELAY_S
     ):
         raise ConfigError(
-            f"command_delay_s is {delay_s!r}, a time from 0 to {MAX_COMMAND_DELAY_S:g} s is wanted"
+            f"command_delay_s is {delay_s!r}, a time from 0 to {MAX_COMMAND_DELAY_S:g} s is required"
         )
     return round(delay_s / STEP_S)
 
@@ -296,9 +296,9 @@ def _plant(
         payload_m=conditions.payload_m,
         radius_factors=np.array(conditions.radius_factors),
         grade_ratio=conditions.grade_ratio,
-        swell_ratio=conditions.swell_ratio,
-        swell_length_m=conditions.swell_length_m,
-        leg_play_rad=conditions.leg_play_rad,
+        undulation_ratio=conditions.undulation_ratio,
+        undulation_length_m=conditions.undulation_length_m,
+        leg_backlash_rad=conditions.leg_backlash_rad,
         grounds=np.array(
             [
                 ground_array(soil, robot.wheel_radius_m, body.tyre_width_m, body.contact_length_m)

@@ -15,9 +15,9 @@ States are integrated with semi-implicit steps of :data:`STEP_S`.  What acts, in
   ratio and stays finite at rest; ``terrain.terramechanics`` turns deflection and load into thrust, side force
   and resistance.
 - **leg**: the third wheel's leg swings about a hinge on the line of the other two, within
-  :attr:`Plant.leg_play_rad`, to where the ground pushes its wheel; that turns the wheel's heading, which its
-  steering encoder below the hinge does not see (thesis, conclusions: play of the third leg's opening system).
-  What the swing moves the wheel's centre by, and its friction's own moment, are left out.
+  :attr:`Plant.leg_backlash_rad`, to where the ground pushes its wheel; that turns the wheel's heading, which
+  its steering encoder below the hinge does not see (thesis, conclusions: play of the third leg's opening
+  system). What the swing moves the wheel's centre by, and its friction's own moment, are left out.
 - **body**: ``m (dv/dt + w x v) = sum F - m g grad``, ``I dw/dt = sum (r_i - r_com) x F_i``.
 
 Resistance acts at the axle, against the rolling of the wheel; hence in steady motion the thrust balances it
@@ -26,8 +26,8 @@ and the slip follows from the ground, not from the speed.
 Effects of the robot (:mod:`terrain.effects.catalogue`) act where a real robot would have them:
 
 - **wheel_radius, one_sided_radius**: true radii of the wheels, of which the commands know nothing;
-- **steering_delay, steering_play, steering_offset_i**: between the encoder, which the steering motor obeys,
-  and the wheel: ``wheel(t) = play(encoder(t - T)) + d0``;
+- **steering_delay, steering_backlash, steering_offset_i**: between the encoder, which the steering motor
+  obeys, and the wheel: ``wheel(t) = play(encoder(t - T)) + d0``;
 - **force_slip, shear_slip**: a creep of the contact on top of the ground's own slip.  Its deflection follows
   ``du/dt = (w r - v) - max(|w r|, |v|) (u / sigma + c f)`` with ``f = 3 F_i / W``, so that it settles
   where slip is that of the ground plus ``c f``, and no equation has to be solved for a force;
@@ -197,7 +197,7 @@ class Plant(NamedTuple):
     contact_length_m: float
     ride_stiffness_npm: float
     ride_damping_nspm: float
-    load_share: Array
+    load_fraction: Array
     load_per_force_ratio: Array
     reduction_ratio: float
     torque_max_nm: float
@@ -211,18 +211,18 @@ class Plant(NamedTuple):
     report_time_constant_s: float
     steer_rate_max_radps: float
     steer_accel_max_radps2: float
-    play_rad: float
-    leg_play_rad: float
+    backlash_rad: float
+    leg_backlash_rad: float
     grade_ratio: Array
-    swell_ratio: float
-    swell_length_m: float
+    undulation_ratio: float
+    undulation_length_m: float
     grounds: Array
     roughness_m3: Array
     patch_start_m: Array
     field: Array
     linked: bool
     steer_offset_rad: Array
-    steer_play_rad: float
+    steer_backlash_rad: float
     steer_delay_steps: int
     hidden: bool
     weight_n: float
@@ -241,9 +241,9 @@ def make_plant(
     payload_m: tuple[float, float],
     radius_factors: Array,
     grade_ratio: tuple[float, float],
-    swell_ratio: float,
-    swell_length_m: float,
-    leg_play_rad: float,
+    undulation_ratio: float,
+    undulation_length_m: float,
+    leg_backlash_rad: float,
     grounds: Array,
     roughness_m3: Array,
     patch_start_m: Array,
@@ -258,8 +258,9 @@ def make_plant(
     payload_kg, payload_m : load on top and where it lies from the empty robot's centre of mass, body axes
     radius_factors : (3,) true rolling radius of each wheel over the nominal one
     grade_ratio : (2,) mean gradient of the ground along world x and y, uphill positive
-    swell_ratio, swell_length_m : amplitude of a gradient that changes along the way, and its wave length
-    leg_play_rad : half the play of the third leg's hinge
+    undulation_ratio, undulation_length_m : amplitude of a gradient that changes along the way, and its wave
+    length
+    leg_backlash_rad : half the play of the third leg's hinge
     grounds : (patches, GROUND_SIZE) of ``terrain.terramechanics``
     roughness_m3 : (patches,) ISO 8608 roughness
     patch_start_m : (patches,) path length at which each begins, the first at 0
@@ -279,11 +280,12 @@ def make_plant(
     # Rows: vertical force, moment about y (x arm), moment about x (y arm); columns: the three wheels.
     balance = np.vstack([np.ones(3), robot.wheel_positions_m.T])
     inverse = np.linalg.inv(balance)
-    load_share = inverse @ np.array([1.0, com_m[0], com_m[1]])
-    if load_share.min() <= 0.0:
+    load_fraction = inverse @ np.array([1.0, com_m[0], com_m[1]])
+    if load_fraction.min() <= 0.0:
         raise ConfigError(
             f"robot {robot.name}: a payload of {payload_kg:g} kg at ({payload_m[0]:g}, {payload_m[1]:g}) m "
-            f"from the centre of mass tips it over: wheel {int(load_share.argmin()) + 1} would carry nothing"
+            f"from the centre of mass tips it over: wheel {int(load_fraction.argmin()) + 1} would carry "
+            "nothing"
         )
     return Plant(
         wheels_m=np.array(robot.wheel_positions_m),
@@ -297,7 +299,7 @@ def make_plant(
         contact_length_m=body.contact_length_m,
         ride_stiffness_npm=body.tyre_stiffness_npm,
         ride_damping_nspm=body.tyre_damping_nspm,
-        load_share=load_share,
+        load_fraction=load_fraction,
         load_per_force_ratio=np.ascontiguousarray(-body.com_height_m * inverse[:, 1:]),
         reduction_ratio=motors.reduction_ratio,
         torque_max_nm=motors.torque_max_nm,
@@ -311,18 +313,18 @@ def make_plant(
         report_time_constant_s=sensors.encoder_time_constant_s,
         steer_rate_max_radps=steering.rate_max_radps,
         steer_accel_max_radps2=steering.accel_max_radps2,
-        play_rad=steering.dead_band_rad,
-        leg_play_rad=float(leg_play_rad),
+        backlash_rad=steering.dead_band_rad,
+        leg_backlash_rad=float(leg_backlash_rad),
         grade_ratio=np.array(grade_ratio, dtype=float),
-        swell_ratio=float(swell_ratio),
-        swell_length_m=float(swell_length_m),
+        undulation_ratio=float(undulation_ratio),
+        undulation_length_m=float(undulation_length_m),
         grounds=np.ascontiguousarray(grounds, dtype=float),
         roughness_m3=np.ascontiguousarray(roughness_m3, dtype=float),
         patch_start_m=np.ascontiguousarray(patch_start_m, dtype=float),
         field=np.ascontiguousarray(field, dtype=float),
         linked=any(effects[name] != 0.0 for name in _LINKAGE),
         steer_offset_rad=np.array([effects[f"steering_offset_{i}_rad"] for i in (1, 2, 3)]),
-        steer_play_rad=effects["steering_play_rad"],
+        steer_backlash_rad=effects["steering_backlash_rad"],
         steer_delay_steps=round(effects["steering_delay_s"] / STEP_S),
         hidden=any(effects[name] != 0.0 for name in _GROUND),
         weight_n=robot.mass_kg * GRAVITY_MPS2,
@@ -335,7 +337,7 @@ def make_plant(
     )
 
 
-_LINKAGE = (*(f"steering_offset_{i}_rad" for i in (1, 2, 3)), "steering_play_rad", "steering_delay_s")
+_LINKAGE = (*(f"steering_offset_{i}_rad" for i in (1, 2, 3)), "steering_backlash_rad", "steering_delay_s")
 _GROUND = (
     *("force_slip_ratio", "shear_slip_ratio", "slip_resistance_ratio", "rolling_resistance_ratio"),
     *("viscous_drag_nspm", "side_hill_slip_ratio"),
@@ -428,26 +430,26 @@ def advance(
             if plant.linked:
                 heading = _linkage(plant, tail, w[STEER], i)
                 row[N_RECORD + i] = w[STEER]
-            if i == 2 and plant.leg_play_rad > 0.0:
+            if i == 2 and plant.leg_backlash_rad > 0.0:
                 heading += state[LEG]
             cos_steer, sin_steer = math.cos(heading), math.sin(heading)
             along = cos_steer * speeds[i, 0] + sin_steer * speeds[i, 1]
             across = -sin_steer * speeds[i, 0] + cos_steer * speeds[i, 1]
-            rim = w[RATE] * plant.radius_m[i]
-            fastest = max(abs(rim), abs(along))
+            wheel_speed = w[RATE] * plant.radius_m[i]
+            fastest = max(abs(wheel_speed), abs(along))
             ahead_m = (plant.wheels_m[i, 0] * state[3] + plant.wheels_m[i, 1] * state[4]) / speed
             patch = _patch(plant, state[6] + (ahead_m if speed > 0.05 else 0.0))
             ride_n = _ride(
                 plant, w, i, patch, math.sqrt(along * along + across * across), road_noise[k, i], dt
             )
             normal_n = plant.mass_kg * (
-                g_normal * plant.load_share[i]
+                g_normal * plant.load_fraction[i]
                 + plant.load_per_force_ratio[i, 0] * (accel[0] + GRAVITY_MPS2 * grade_x / steepness)
                 + plant.load_per_force_ratio[i, 1] * (accel[1] + GRAVITY_MPS2 * grade_y / steepness)
             )
-            ride[i] = ride_n / (plant.mass_kg * plant.load_share[i])
+            ride[i] = ride_n / (plant.mass_kg * plant.load_fraction[i])
             normal_n = max(normal_n + ride_n, 0.0)
-            rate_x = rim - along - fastest / plant.relaxation_m * w[DEFLECTION_X]
+            rate_x = wheel_speed - along - fastest / plant.relaxation_m * w[DEFLECTION_X]
             rate_y = -across - fastest / plant.relaxation_m * w[DEFLECTION_Y]
             if plant.hidden:
                 rate_x -= tail[CREEP + i] * fastest / plant.relaxation_m * w[DEFLECTION_X]
@@ -487,9 +489,9 @@ def advance(
             w[DEFLECTION_X] = min(max(deflection, -limit), limit)
             w[DEFLECTION_Y] = min(max(w[DEFLECTION_Y] + dt * rate_y, -limit), limit)
             at = N_BODY_RECORD + i * len(WHEEL_RECORD)
-            row[at] = rim / plant.radius_m[i]  # of this instant, as the slip is
+            row[at] = wheel_speed / plant.radius_m[i]  # of this instant, as the slip is
             row[at + 1] = heading
-            row[at + 2] = (rim - along) / fastest if fastest >= 0.05 else np.nan
+            row[at + 2] = (wheel_speed - along) / fastest if fastest >= 0.05 else np.nan
             row[at + 3] = math.atan2(across, abs(along)) if math.hypot(along, across) >= 0.05 else np.nan
             row[at + 4] = normal_n
             row[at + 5] = thrust
@@ -514,15 +516,15 @@ def advance(
         state[2] += dt * state[5]
         state[6] += dt * math.sqrt(origin_x * origin_x + origin_y * origin_y)
         state[7], state[8] = accel[0], accel[1]
-        if plant.leg_play_rad > 0.0:
+        if plant.leg_backlash_rad > 0.0:
             state[LEG] = _swing(plant, state[LEG], leg_nm, dt)
 
 
 @njit(cache=True)
 def _grade(plant: Plant, state: Array, cos_yaw: float, sin_yaw: float) -> tuple[float, float]:
     """Gradient of the ground in body axes, uphill positive."""
-    swell = plant.swell_ratio * math.sin(2 * math.pi * state[6] / plant.swell_length_m)
-    world_x, world_y = plant.grade_ratio[0] + swell, plant.grade_ratio[1]
+    undulation = plant.undulation_ratio * math.sin(2 * math.pi * state[6] / plant.undulation_length_m)
+    world_x, world_y = plant.grade_ratio[0] + undulation, plant.grade_ratio[1]
     return cos_yaw * world_x + sin_yaw * world_y, -sin_yaw * world_x + cos_yaw * world_y
 
 
@@ -539,15 +541,15 @@ def _steer(plant: Plant, w: Array, command_rad: float, dt: float) -> None:
     """Steering motor to its command with bounded rate and acceleration; the wheel hangs on it with play."""
     error = command_rad - w[MOTOR]
     # the rate from which the motor can still stop in time
-    wanted = math.copysign(
+    desired = math.copysign(
         min(math.sqrt(2 * plant.steer_accel_max_radps2 * abs(error)), plant.steer_rate_max_radps), error
     )
     if abs(error) < 1e-4:
-        wanted = error / dt
+        desired = error / dt
     change = plant.steer_accel_max_radps2 * dt
-    w[MOTOR_RATE] += min(max(wanted - w[MOTOR_RATE], -change), change)
+    w[MOTOR_RATE] += min(max(desired - w[MOTOR_RATE], -change), change)
     w[MOTOR] += dt * w[MOTOR_RATE]
-    w[STEER] = min(max(w[STEER], w[MOTOR] - plant.play_rad), w[MOTOR] + plant.play_rad)
+    w[STEER] = min(max(w[STEER], w[MOTOR] - plant.backlash_rad), w[MOTOR] + plant.backlash_rad)
 
 
 @njit(cache=True)
@@ -558,7 +560,9 @@ def _linkage(plant: Plant, tail: Array, encoder_rad: float, i: int) -> float:
         place = LATE + 3 * (int(tail[STEPS]) % plant.steer_delay_steps) + i
         late, tail[place] = tail[place], encoder_rad
         tail[STEPS] += i == 2
-    tail[HEADING + i] = min(max(tail[HEADING + i], late - plant.steer_play_rad), late + plant.steer_play_rad)
+    tail[HEADING + i] = min(
+        max(tail[HEADING + i], late - plant.steer_backlash_rad), late + plant.steer_backlash_rad
+    )
     return float(tail[HEADING + i] + plant.steer_offset_rad[i])
 
 
@@ -584,7 +588,7 @@ def _swing(plant: Plant, leg_rad: float, moment_nm: float, dt: float) -> float:
     if abs(moment_nm) <= LEG_FRICTION_NM:
         return leg_rad
     turned_rad = leg_rad + math.copysign(LEG_RATE_RADPS * dt, moment_nm)
-    return min(max(turned_rad, -plant.leg_play_rad), plant.leg_play_rad)
+    return min(max(turned_rad, -plant.leg_backlash_rad), plant.leg_backlash_rad)
 
 
 @njit(cache=True)
@@ -592,9 +596,9 @@ def _drive(plant: Plant, w: Array, command_radps: float, load_nm: float, dt: flo
     """Speed loop, motor and wheel; then what the driver reports of it."""
     command = min(max(command_radps, -plant.speed_max_radps), plant.speed_max_radps)
     error = command - w[ESTIMATE]
-    wanted = plant.speed_gain * error + w[INTEGRAL]
-    torque = min(max(wanted, -plant.torque_max_nm), plant.torque_max_nm)
-    if torque == wanted or wanted * error < 0.0:
+    desired = plant.speed_gain * error + w[INTEGRAL]
+    torque = min(max(desired, -plant.torque_max_nm), plant.torque_max_nm)
+    if torque == desired or desired * error < 0.0:
         w[INTEGRAL] += dt * plant.speed_integral * error
     w[TORQUE] += (torque - w[TORQUE]) * min(dt / max(plant.torque_time_constant_s, dt), 1.0)
     friction = plant.friction_nm * math.tanh(w[RATE] / 0.1)
@@ -621,7 +625,7 @@ def _ride(plant: Plant, w: Array, i: int, patch: int, speed: float, noise: float
     )
     contact_rate = (w[ROAD] - w[CONTACT]) * min(2.0 * speed / plant.contact_length_m, 1.0 / dt)
     w[CONTACT] += dt * contact_rate
-    mass_kg = plant.mass_kg * plant.load_share[i]
+    mass_kg = plant.mass_kg * plant.load_fraction[i]
     force_n = plant.ride_stiffness_npm * (w[CONTACT] - w[RIDE]) + plant.ride_damping_nspm * (
         contact_rate - w[RIDE_RATE]
     )

@@ -69,8 +69,8 @@ class Ground(NamedTuple):
     thrust_ratio : traction over weight at slips evenly spaced from 0 to 1, which takes the place of
         ``slip_ratio``; without any the thrust curve is straight
     load_ratio : by how much the traction at a slip grows with a load, as a share of the load's own share
-    felt_ratio : share of the measured tilt that is a slope to drive up; the rest is a body that rides over
-        bumps
+    effective_ratio : share of the measured tilt that is a slope to drive up; the rest is a body that rides
+        over bumps
     """
 
     slip_ratio: float = 0.3
@@ -79,7 +79,7 @@ class Ground(NamedTuple):
     scrub_ratio: float = 0.2
     thrust_ratio: tuple[float, ...] = ()
     load_ratio: float = 0.0
-    felt_ratio: float = 1.0
+    effective_ratio: float = 1.0
 
 
 class Planar(NamedTuple):
@@ -106,7 +106,7 @@ class Planar(NamedTuple):
     rolling_ratio: float
     scrub_ratio: float
     load_ratio: float
-    felt_ratio: float
+    effective_ratio: float
     com_x_m: float
     com_y_m: float
     arm_ratio: Array
@@ -154,7 +154,7 @@ def make_planar(robot: Robot, ground: Ground) -> Planar:
         rolling_ratio=ground.rolling_ratio,
         scrub_ratio=ground.scrub_ratio if not swerve else 0.0,
         load_ratio=ground.load_ratio,
-        felt_ratio=ground.felt_ratio,
+        effective_ratio=ground.effective_ratio,
         com_x_m=float(com_m[0]),
         com_y_m=float(com_m[1]),
         arm_ratio=np.ascontiguousarray(arm_m / spread_m),

@@ -23,7 +23,7 @@ def move(
     planar: Planar,
     p: Array,
     dt: float,
-    rim_mps: Array,
+    wheel_speed_mps: Array,
     steer_rad: Array,
     grade_rad: Array,
     roll_rad: Array,
@@ -35,20 +35,20 @@ def move(
     ----------
     planar, p : the simulation, and its parameters in the order of ``effects.PARAMETERS``
     dt : step in s
-    rim_mps : (n, wheels) wheel rates times the nominal radius
+    wheel_speed_mps : (n, wheels) wheel rates times the nominal radius
     steer_rad : (n, wheels) angles as encoders without error show them; not looked at for a skid-steer robot
     grade_rad, roll_rad : (n,) true tilt
     disturbance : (n, 3) what the ground adds to speeds (shares of ``|u|``, along and across) and yaw rate
         (rad/s), or none: (0, 3)
     """
-    out = np.zeros((rim_mps.shape[0], 8))
+    out = np.zeros((wheel_speed_mps.shape[0], 8))
     if planar.n_wheels == SWERVE_WHEELS:
-        move_swerve(planar, p, dt, rim_mps, steer_rad, grade_rad, roll_rad, disturbance, out)
+        move_swerve(planar, p, dt, wheel_speed_mps, steer_rad, grade_rad, roll_rad, disturbance, out)
     else:
-        move_skid(planar, p, dt, rim_mps, grade_rad, disturbance, out)
+        move_skid(planar, p, dt, wheel_speed_mps, grade_rad, disturbance, out)
     for k in range(out.shape[0]):
         fast = math.sqrt(out[k, VX] * out[k, VX] + out[k, VY] * out[k, VY])
-        out[k, VY] -= p[_SIDE_HILL] * planar.felt_ratio * roll_rad[k] * fast
+        out[k, VY] -= p[_SIDE_HILL] * planar.effective_ratio * roll_rad[k] * fast
         if disturbance.shape[0] > 0:
             out[k, VY] += fast * disturbance[k, 1]
             out[k, W] += disturbance[k, 2]

@@ -26,7 +26,7 @@ from terrain.simulation.planar.model import SWERVE_WHEELS, Planar
 WHEELS_HZ, IMU_HZ, CAMERA_HZ = 50.0, 100.0, 50.0
 """Rates of the loggers."""
 
-RIM, GRADE, ROLL = "rim_mps", "grade_rad", "roll_rad"
+WHEEL_SPEED, GRADE, ROLL = "wheel_speed_mps", "grade_rad", "roll_rad"
 """What a replay is fed with, beside the channels that are compared."""
 
 
@@ -193,7 +193,8 @@ def noise_psd(
     ----------
     noise : of the runs
     robot, planar : whose
-    channel : one of ``effects.CHANNELS``, or ``rim_mps`` (of one wheel), ``grade_rad`` or ``roll_rad``
+    channel : one of ``effects.CHANNELS``, or ``wheel_speed_mps`` (of one wheel), ``grade_rad`` or
+        ``roll_rad``
     frequency_hz : from 0 to the logger's Nyquist frequency: 25 Hz, of the IMU's channels 50 Hz
     speed_mps : of the wheels
     encoder_lag_s : beside the lag that the robot's description knows
@@ -253,7 +254,7 @@ def noise_psd(
             return drawn + white
         pull = planar.mass_kg * planar.radius_m / planar.nm_per_a
         return drawn + white + pull**2 * folded(jerked)
-    if channel == RIM:
+    if channel == WHEEL_SPEED:
         step_m = 2.0 * math.pi * robot.wheel_radius_m / (sensors.hall_steps_ratio * motors.reduction_ratio)
         place = white_psd(f, math.hypot(noise.encoder_m * moving, step_m / math.sqrt(12.0)), WHEELS_HZ)
         blue = place * (2.0 * np.sin(math.pi * f / WHEELS_HZ) * WHEELS_HZ) ** 2

@@ -28,7 +28,7 @@ def replay(
     planar: Planar,
     p: Array,
     dt: float,
-    rim_mps: Array,
+    wheel_speed_mps: Array,
     steer_rad: Array,
     grade_rad: Array,
     roll_rad: Array,
@@ -38,28 +38,28 @@ def replay(
     Parameters
     ----------
     planar, p, dt : as :func:`move` takes them
-    rim_mps, steer_rad, grade_rad, roll_rad : (n, wheels), (n, wheels), (n,), (n,) as measured: the lag of the
-        encoders, the clock and the offsets of the tilt are undone here
+    wheel_speed_mps, steer_rad, grade_rad, roll_rad : (n, wheels), (n, wheels), (n,), (n,) as measured: the
+        lag of the encoders, the clock and the offsets of the tilt are undone here
     """
-    rim, grade, roll = undone(planar, p, dt, rim_mps, grade_rad, roll_rad)
-    truth = move(planar, p, dt, rim, steer_rad, grade, roll, np.zeros((0, 3)))
+    wheel_speed, grade, roll = undone(planar, p, dt, wheel_speed_mps, grade_rad, roll_rad)
+    truth = move(planar, p, dt, wheel_speed, steer_rad, grade, roll, np.zeros((0, 3)))
     shown: Array = sense(planar, p, dt, truth)
     return shown
 
 
 @njit(cache=True)
 def undone(
-    planar: Planar, p: Array, dt: float, rim_mps: Array, grade_rad: Array, roll_rad: Array
+    planar: Planar, p: Array, dt: float, wheel_speed_mps: Array, grade_rad: Array, roll_rad: Array
 ) -> tuple[Array, Array, Array]:
     """Return rims, grade and roll as they are, of what is measured of them; see :func:`replay`."""
-    rim, grade, roll = rim_mps, grade_rad - p[_PITCH_OFFSET], roll_rad - p[_ROLL_OFFSET]
+    wheel_speed, grade, roll = wheel_speed_mps, grade_rad - p[_PITCH_OFFSET], roll_rad - p[_ROLL_OFFSET]
     lag = planar.encoder_lag_s + p[_LAG]
     if lag != 0.0:
-        rim = rim_mps.copy()
-        for i in range(rim.shape[1]):
-            rim[:, i] += lag * slopes(rim_mps[:, i].copy(), dt)
+        wheel_speed = wheel_speed_mps.copy()
+        for i in range(wheel_speed.shape[1]):
+            wheel_speed[:, i] += lag * slopes(wheel_speed_mps[:, i].copy(), dt)
     late = (p[_CLOCK_OFFSET] + planar.imu_latency_s) / dt
     if late != 0.0 or p[_CLOCK_RATE] != 0.0:
         grade = delayed(grade, -late, -p[_CLOCK_RATE])
         roll = delayed(roll, -late, -p[_CLOCK_RATE])
-    return rim, grade, roll
+    return wheel_speed, grade, roll

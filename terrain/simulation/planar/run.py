@@ -63,7 +63,7 @@ DRIVE_S = 0.06
 """Each of the two lags in a row by which a wheel follows its command; assumed."""
 
 DRIVE_MPS2 = 4.0
-"""The most that a rim speeds up; assumed, 2 g of grip would be needed for more."""
+"""The most that a wheel speeds up; assumed, 2 g of grip would be needed for more."""
 
 STEER_S = 0.08
 """Lag by which steering follows its command; assumed."""
@@ -75,7 +75,7 @@ SPIKE_HZ, SPIKE_S = 5.0, 0.06
 """How often, and how long."""
 
 OUTSIDE: tuple[str, ...] = ("wheel_eccentricity_ratio", "stick_slip_a")
-"""Causes that no effect of the library describes: rim speed x (1 + e sin(wheel angle)), each wheel with its
+"""Causes that no effect of the library describes: wheel speed x (1 + e sin(wheel angle)), each wheel with its
 own phase, and spikes of the current at crawling speed."""
 
 _PURPOSES = ("scatter", "hills", "ground", "wheels", "steering", "imu", "camera", "outside", "lidar")
@@ -90,13 +90,13 @@ class Hills(NamedTuple):
     Parameters
     ----------
     grade_ratio : mean gradient along the start's heading and to its left, uphill positive
-    swell_ratio : standard deviation of what swells add to either
-    swell_length_m : about their wave length; three of them cross in drawn directions
+    undulation_ratio : standard deviation of what undulations add to either
+    undulation_length_m : about their wave length; three of them cross in drawn directions
     """
 
     grade_ratio: tuple[float, float] = (0.0, 0.0)
-    swell_ratio: float = 0.0
-    swell_length_m: float = 15.0
+    undulation_ratio: float = 0.0
+    undulation_length_m: float = 15.0
 
 
 class _Motion(NamedTuple):
@@ -110,7 +110,7 @@ class _Motion(NamedTuple):
     pose: Array
     grade_rad: Array
     roll_rad: Array
-    rim_mps: Array
+    wheel_speed_mps: Array
     rolled_mps: Array
     steer_rad: Array
     active: Array
@@ -180,9 +180,9 @@ def simulate_planar(
             if robot.drive == "swerve" and name == "effective_track_ratio":
                 continue
             p[INDEX[name]] += getattr(scatter, name) * rngs["scatter"].standard_normal()
-    commands, channels, wanted_mps, wanted_rad = _commands(robot, twist)
+    commands, channels, desired_mps, desired_rad = _commands(robot, twist)
     motion = _moved(
-        robot, planar, p, step_s, wanted_mps, wanted_rad, hills or Hills(), noise, outside or {}, rngs
+        robot, planar, p, step_s, desired_mps, desired_rad, hills or Hills(), noise, outside or {}, rngs
     )
     shown = sense(planar, p, step_s, motion.truth)
     streams = {
@@ -204,17 +204,17 @@ def simulate_planar(
 def _check(robot: Robot, twist: Array, outside: Mapping[str, float], step_s: float) -> None:
     robot.has("body", "motors", "camera", "sensors", *(["steering"] if robot.drive == "swerve" else []))
     if twist.ndim != 2 or twist.shape[1] != 3 or len(twist) < 2 or not np.isfinite(twist).all():
-        raise ConfigError(f"twist has shape {twist.shape}, (n, 3) finite numbers with two rows are wanted")
+        raise ConfigError(f"twist has shape {twist.shape}, (n, 3) finite numbers with two rows are required")
     if robot.drive != "swerve" and twist[:, 1].any():
         raise ConfigError(f"twist drives robot {robot.name} sideways, which needs steered wheels")
     for name, value in outside.items():
         if name not in OUTSIDE or not math.isfinite(value):
             raise ConfigError(
-                f"outside: {name} is {value!r}; finite numbers of {', '.join(OUTSIDE)} are wanted"
+                f"outside: {name} is {value!r}; finite numbers of {', '.join(OUTSIDE)} are required"
             )
     parts = STEP_S / step_s if step_s > 0 else 0.0
     if parts < 0.5 or abs(parts - round(parts)) > 1e-9:
-        raise ConfigError(f"step_s is {step_s:g}, {STEP_S:g} s or a whole part of it is wanted")
+        raise ConfigError(f"step_s is {step_s:g}, {STEP_S:g} s or a whole part of it is required")
 
 
 def _generators(seed: int | np.random.SeedSequence) -> dict[str, np.random.Generator]:
@@ -248,8 +248,13 @@ def _commands(robot: Robot, twist: Array) -> tuple[Array, tuple[str, ...], Array
         return values, (*names, *wheels, *steers), wheel_radps * radius_m, steer_rad
     turn = 0.5 * robot.track_m * twist[:, 2]
     limit = radius_m * robot.motors.speed_max_radps
-    rims = np.clip(np.column_stack([twist[:, 0] - turn, twist[:, 0] + turn]), -limit, limit)
-    return np.hstack([twist, rims / radius_m]), (*names, *wheels), rims, np.zeros((len(twist), 2))
+    wheel_speeds = np.clip(np.column_stack([twist[:, 0] - turn, twist[:, 0] + turn]), -limit, limit)
+    return (
+        np.hstack([twist, wheel_speeds / radius_m]),
+        (*names, *wheels),
+        wheel_speeds,
+        np.zeros((len(twist), 2)),
+    )
 
 
 def _moved(
@@ -257,8 +262,8 @@ def _moved(
     planar: Planar,
     p: Array,
     dt: float,
-    wanted_mps: Array,
-    wanted_rad: Array,
+    desired_mps: Array,
+    desired_rad: Array,
     hills: Hills,
     noise: Noise | None,
     outside: Mapping[str, float],
@@ -266,9 +271,9 @@ def _moved(
 ) -> _Motion:
     parts = round(1.0 / (COMMANDS_HZ * dt))
     rate_max = robot.steering.rate_max_radps if robot.steering is not None else 0.0
-    rim, steer = _drive(wanted_mps, wanted_rad, parts, dt, rate_max)
-    n = len(rim)
-    active = np.zeros(n) if noise is None else activity(np.abs(rim).mean(axis=1), noise)
+    wheel_speed, steer = _drive(desired_mps, desired_rad, parts, dt, rate_max)
+    n = len(wheel_speed)
+    active = np.zeros(n) if noise is None else activity(np.abs(wheel_speed).mean(axis=1), noise)
     disturbance = np.zeros((0, 3))
     if noise is not None:
         white = rngs["ground"].standard_normal((3, n))
@@ -277,11 +282,11 @@ def _moved(
             white, std, np.array([noise.along_s, noise.across_s, noise.yaw_s]), dt
         ).T.copy()
         disturbance[:, 2] *= active
-    rolled = rim
+    rolled = wheel_speed
     if eccentric := outside.get("wheel_eccentricity_ratio", 0.0):
-        phase = rngs["outside"].uniform(0.0, 2.0 * math.pi, rim.shape[1])
-        angle = np.cumsum(rim, axis=0) * dt / robot.wheel_radius_m
-        rolled = rim * (1.0 + eccentric * np.sin(angle + phase))
+        phase = rngs["outside"].uniform(0.0, 2.0 * math.pi, wheel_speed.shape[1])
+        angle = np.cumsum(wheel_speed, axis=0) * dt / robot.wheel_radius_m
+        rolled = wheel_speed * (1.0 + eccentric * np.sin(angle + phase))
     level = np.zeros(n)
     waves = _waves(hills, rngs["hills"])
     flat = move(planar, p, dt, rolled, steer, level, level, disturbance)
@@ -292,48 +297,48 @@ def _moved(
         pose = _pose(truth, dt)
     else:
         truth = flat
-    sides = np.full(rim.shape[1], 1.0 - 0.5 * p[INDEX["one_sided_radius_ratio"]])
+    sides = np.full(wheel_speed.shape[1], 1.0 - 0.5 * p[INDEX["one_sided_radius_ratio"]])
     sides[-1] = 1.0 + 0.5 * p[INDEX["one_sided_radius_ratio"]]
     rolled = rolled * (1.0 + p[INDEX["wheel_radius_ratio"]]) * sides
-    return _Motion(truth, pose, grade, roll, rim, rolled, steer, active)
+    return _Motion(truth, pose, grade, roll, wheel_speed, rolled, steer, active)
 
 
 def _waves(hills: Hills, rng: np.random.Generator) -> Array:
-    """Return (3, 4) of the swells: amplitude along their two axes' direction, wave numbers, phase."""
+    """Return (3, 4) of the undulations: amplitude along their two axes' direction, wave numbers, phase."""
     waves = np.zeros((0, 4))
-    if hills.swell_ratio:
+    if hills.undulation_ratio:
         direction = rng.uniform(0.0, math.pi, 3)
         phase = rng.uniform(0.0, 2.0 * math.pi, 3)
-        size = np.full(3, hills.swell_ratio * math.sqrt(4.0 / 3.0))
-        number = 2.0 * math.pi / (hills.swell_length_m * np.array([0.7, 1.0, 1.4]))
+        size = np.full(3, hills.undulation_ratio * math.sqrt(4.0 / 3.0))
+        number = 2.0 * math.pi / (hills.undulation_length_m * np.array([0.7, 1.0, 1.4]))
         waves = np.column_stack([size, number, direction, phase])
     return waves
 
 
 @njit(cache=True)
 def _drive(
-    wanted_mps: Array, wanted_rad: Array, parts: int, dt: float, rate_max: float
+    desired_mps: Array, desired_rad: Array, parts: int, dt: float, rate_max: float
 ) -> tuple[Array, Array]:
-    """Return rims and steering (m, wheels) that follow what is wanted (n, wheels), ``parts`` steps a row."""
-    n, wheels = wanted_mps.shape
+    """Return wheel speeds and steering (m, wheels) that follow desired (n, wheels), ``parts`` steps a row."""
+    n, wheels = desired_mps.shape
     m = (n - 1) * parts + 1
-    rim, steer = np.empty((m, wheels)), np.empty((m, wheels))
+    wheel_speed, steer = np.empty((m, wheels)), np.empty((m, wheels))
     quick, turn = 1.0 - math.exp(-dt / DRIVE_S), 1.0 - math.exp(-dt / STEER_S)
     fastest, furthest = DRIVE_MPS2 * dt, rate_max * dt
     for i in range(wheels):
-        first, second, angle = 0.0, 0.0, wanted_rad[0, i]
+        first, second, angle = 0.0, 0.0, desired_rad[0, i]
         for k in range(m):
             row = k // parts
             part = (k - row * parts) / parts
             after = min(row + 1, n - 1)
-            goal = wanted_mps[row, i] + part * (wanted_mps[after, i] - wanted_mps[row, i])
+            goal = desired_mps[row, i] + part * (desired_mps[after, i] - desired_mps[row, i])
             first += min(max(quick * (goal - first), -fastest), fastest)
             second += quick * (first - second)
-            rim[k, i] = second
-            aim = wanted_rad[row, i] + part * (wanted_rad[after, i] - wanted_rad[row, i])
+            wheel_speed[k, i] = second
+            aim = desired_rad[row, i] + part * (desired_rad[after, i] - desired_rad[row, i])
             angle += min(max(turn * (aim - angle), -furthest), furthest)
             steer[k, i] = angle
-    return rim, steer
+    return wheel_speed, steer
 
 
 @njit(cache=True)
@@ -415,7 +420,7 @@ def _wheels(
         drawn = coloured(white, size, np.full(wheels, noise.current_s), dt * every).T * active[:, None]
         parts = parts + drawn + sensors.current_std_a * rng.standard_normal((n, wheels))
     lag_s = sensors.encoder_time_constant_s + p[INDEX["encoder_lag_s"]]
-    rate = _counted(motion.rim_mps, every, dt, step_m, jitter, lag_s)
+    rate = _counted(motion.wheel_speed_mps, every, dt, step_m, jitter, lag_s)
     rate = np.where(np.abs(rate) > 1e-6, rate + told, 0.0)  # an encoder that counts nothing says zero
     channels = (*(f"speed_{wheel}_mps" for wheel in robot.wheels), *(f"current_{w}_a" for w in robot.wheels))
     if robot.drive == "swerve":
@@ -424,18 +429,20 @@ def _wheels(
 
 
 @njit(cache=True)
-def _counted(rim_mps: Array, every: int, dt: float, step_m: float, jitter_m: Array, lag_s: float) -> Array:
-    """Return rim speeds (n, wheels) as encoders count them: ways over a sample, its stamp in the middle.
+def _counted(
+    wheel_speed_mps: Array, every: int, dt: float, step_m: float, jitter_m: Array, lag_s: float
+) -> Array:
+    """Return wheel speeds (n, wheels) as encoders count them: ways over a sample, its stamp in the middle.
 
     Parameters
     ----------
-    rim_mps : (m, wheels)
+    wheel_speed_mps : (m, wheels)
     every, dt : steps a sample, and their length
     step_m : of the encoder at the rim; 0 does not quantise
     jitter_m : (n + 1, wheels) errors of the ways read
     lag_s : of the low-pass behind
     """
-    m, wheels = rim_mps.shape
+    m, wheels = wheel_speed_mps.shape
     n = (m - 1) // every + 1
     out = np.empty((n, wheels))
     ways = np.empty(m)
@@ -443,12 +450,12 @@ def _counted(rim_mps: Array, every: int, dt: float, step_m: float, jitter_m: Arr
     for i in range(wheels):
         ways[0] = 0.0
         for k in range(1, m):
-            ways[k] = ways[k - 1] + 0.5 * dt * (rim_mps[k - 1, i] + rim_mps[k, i])
+            ways[k] = ways[k - 1] + 0.5 * dt * (wheel_speed_mps[k - 1, i] + wheel_speed_mps[k, i])
         before = 0.0
         for k in range(n + 1):
             at = k * every - every // 2
             inside = min(max(at, 0), m - 1)
-            way = ways[inside] + (at - inside) * dt * rim_mps[inside, i] + jitter_m[k, i]
+            way = ways[inside] + (at - inside) * dt * wheel_speed_mps[inside, i] + jitter_m[k, i]
             if step_m > 0.0:
                 way = math.floor(way / step_m) * step_m
             if k > 0:
@@ -466,7 +473,7 @@ def _counted(rim_mps: Array, every: int, dt: float, step_m: float, jitter_m: Arr
 
 def _spikes(motion: _Motion, rows: Array, dt: float, size_a: float, rng: np.random.Generator) -> Array:
     """Return spikes (n,) of the sum of the currents while the wheels crawl."""
-    speed = motion.rim_mps.mean(axis=1)
+    speed = motion.wheel_speed_mps.mean(axis=1)
     crawls = (np.abs(speed) < CRAWL_MPS) & (np.abs(speed) > 0.02)
     starts = rng.random(len(speed)) < SPIKE_HZ * dt
     length = max(1, round(SPIKE_S / dt))
@@ -598,7 +605,7 @@ def _truth(robot: Robot, p: Array, dt: float, motion: _Motion) -> Stream:
     v_x, v_y, turn = (motion.truth[rows, column] for column in (VX, VY, W))
     accel_x = motion.truth[rows, AX] - GRAVITY_MPS2 * np.sin(motion.grade_rad[rows])
     accel_y = np.gradient(v_y, 1.0 / IMU_HZ) + turn * v_x
-    rim, steer = motion.rim_mps[rows], motion.steer_rad[rows]
+    wheel_speed, steer = motion.wheel_speed_mps[rows], motion.steer_rad[rows]
     x, y = robot.wheel_positions_m.T
     along = (v_x[:, None] - y * turn[:, None]) * np.cos(steer) + (v_y[:, None] + x * turn[:, None]) * np.sin(
         steer
@@ -606,7 +613,7 @@ def _truth(robot: Robot, p: Array, dt: float, motion: _Motion) -> Stream:
     columns = [
         motion.pose[rows],
         np.column_stack([motion.roll_rad[rows], -motion.grade_rad[rows], v_x, v_y, turn, accel_x, accel_y]),
-        rim / robot.wheel_radius_m,
+        wheel_speed / robot.wheel_radius_m,
         steer,
         slip_ratio(motion.rolled_mps[rows], along),
         np.full((n, 1), p[INDEX["gyro_bias_radps"]] + robot.sensors.gyro_bias_z_radps),

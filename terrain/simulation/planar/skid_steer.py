@@ -56,7 +56,13 @@ def direction(speed_mps: float) -> float:
 
 @njit(cache=True)
 def move_skid(
-    planar: Planar, p: Array, dt: float, rim_mps: Array, grade_rad: Array, disturbance: Array, out: Array
+    planar: Planar,
+    p: Array,
+    dt: float,
+    wheel_speed_mps: Array,
+    grade_rad: Array,
+    disturbance: Array,
+    out: Array,
 ) -> None:
     """Write motion, traction and currents; arguments are those of :func:`~.planar_motion.move`."""
     n = out.shape[0]
@@ -65,13 +71,13 @@ def move_skid(
     carried = weight * (1.0 + planar.load_ratio * p[_PAYLOAD])
     rolling = (planar.rolling_ratio + p[_ROLLING]) * (1.0 + p[_PAYLOAD]) * weight
     scrub = (planar.scrub_ratio + p[_SCRUB]) * weight
-    u, turn, tight, difference = _differed(planar, p, dt, rim_mps)
+    u, turn, tight, difference = _differed(planar, p, dt, wheel_speed_mps)
     speed, rest, ground = np.zeros(n), np.zeros(n), planar.soft_ratio
     target_before, force_ratio, slip = 0.0, 0.0, 0.0
     for k in range(n):
         v = speed[k - 1] + u[k] - u[k - 1] if k > 0 else u[0]  # without the lag of a step
         smooth = math.sqrt(v * v + STANDSTILL_MPS * STANDSTILL_MPS)
-        force = mass * GRAVITY_MPS2 * planar.felt_ratio * math.sin(grade_rad[k]) + rolling * v / smooth
+        force = mass * GRAVITY_MPS2 * planar.effective_ratio * math.sin(grade_rad[k]) + rolling * v / smooth
         force += p[_DRAG] * v + p[_SLIP_RESISTANCE] * abs(slip) * weight * v / smooth
         force += scrub * tight[k] * direction(u[k])
         rest[k] = force
@@ -104,14 +110,16 @@ def move_skid(
 
 
 @njit(cache=True)
-def _differed(planar: Planar, p: Array, dt: float, rim_mps: Array) -> tuple[Array, Array, Array, Array]:
+def _differed(
+    planar: Planar, p: Array, dt: float, wheel_speed_mps: Array
+) -> tuple[Array, Array, Array, Array]:
     """Return speed without slip, yaw rate, how tight the turn is and the difference of the sides (n,)."""
-    n = rim_mps.shape[0]
+    n = wheel_speed_mps.shape[0]
     u, turn, tight, difference = np.empty(n), np.empty(n), np.zeros(n), np.empty(n)
     scale = 1.0 + p[_RADIUS]
     right, left = 1.0 + 0.5 * p[_ONE_SIDED], 1.0 - 0.5 * p[_ONE_SIDED]
     for k in range(n):
-        v_l, v_r = rim_mps[k, 0] * scale * left, rim_mps[k, 1] * scale * right
+        v_l, v_r = wheel_speed_mps[k, 0] * scale * left, wheel_speed_mps[k, 1] * scale * right
         dv = v_r - v_l
         u[k] = 0.5 * (v_r + v_l)
         size = abs(dv) + 2.0 * abs(u[k])

@@ -40,7 +40,7 @@ SHORTEST_M, LIGHTEST_KG = 1e-3, 1e-3
 _RADIUS = INDEX["wheel_radius_ratio"]
 _ONE_SIDED = INDEX["one_sided_radius_ratio"]
 _OFFSET_1 = INDEX["steering_offset_1_rad"]
-_PLAY = INDEX["steering_play_rad"]
+_PLAY = INDEX["steering_backlash_rad"]
 _STEER_DELAY = INDEX["steering_delay_s"]
 _FORCE_SLIP = INDEX["force_slip_ratio"]
 _SHEAR_SLIP = INDEX["shear_slip_ratio"]
@@ -55,7 +55,7 @@ def move_swerve(
     planar: Planar,
     p: Array,
     dt: float,
-    rim_mps: Array,
+    wheel_speed_mps: Array,
     steer_rad: Array,
     grade_rad: Array,
     roll_rad: Array,
@@ -64,14 +64,14 @@ def move_swerve(
 ) -> None:
     """Write motion, traction and current; arguments are those of :func:`~.planar_motion.move`."""
     n = out.shape[0]
-    u, pace, mean_rim, heading = _rolled(planar, p, dt, rim_mps, steer_rad)
+    u, pace, mean_wheel_speed, heading = _rolled(planar, p, dt, wheel_speed_mps, steer_rad)
     weight = planar.mass_kg * GRAVITY_MPS2
     load = 1.0 + p[_PAYLOAD]
     pressed = load / (1.0 + planar.load_ratio * p[_PAYLOAD])
     mass = planar.mass_kg * load
     spin_kg = max(planar.yaw_inertia_kgm2 / planar.spread_m**2, LIGHTEST_KG) * load
     rolling = (planar.rolling_ratio + p[_ROLLING]) * (1.0 + p[_PAYLOAD]) * weight
-    gravity = GRAVITY_MPS2 * planar.felt_ratio
+    gravity = GRAVITY_MPS2 * planar.effective_ratio
     ground, sigma, damping = planar.soft_ratio, max(planar.relaxation_m, SHORTEST_M), DEFLECTION_DAMPING_S
     by_sigma, by_dt, by_spread = 1.0 / sigma, 1.0 / dt, 1.0 / planar.spread_m
     # the contact springs as much whatever it carries
@@ -140,10 +140,12 @@ def move_swerve(
         out[k, FORCE] = load * weight * f[0]
         out[k, SLIP] = (pressed * soft + load * more) * f[0]
         out[k, AMPS] = load * weight * (heading[0, k] * f[0] + heading[1, k] * f[1] + heading[2, k] * f[2])
-    spun = slopes(mean_rim, dt)
+    spun = slopes(mean_wheel_speed, dt)
     for k in range(n):
         torque = (out[k, AMPS] + planar.rotating_kg * spun[k]) * planar.radius_m
-        way = mean_rim[k] / math.sqrt(mean_rim[k] * mean_rim[k] + ROLLING_MPS * ROLLING_MPS)
+        way = mean_wheel_speed[k] / math.sqrt(
+            mean_wheel_speed[k] * mean_wheel_speed[k] + ROLLING_MPS * ROLLING_MPS
+        )
         out[k, AMPS] = (torque + planar.friction_nm * way) / planar.nm_per_a
 
 
@@ -176,17 +178,17 @@ def _decayed(half_trace: float, determinant: float, dt: float) -> tuple[float, f
 
 @njit(cache=True)
 def _rolled(
-    planar: Planar, p: Array, dt: float, rim_mps: Array, steer_rad: Array
+    planar: Planar, p: Array, dt: float, wheel_speed_mps: Array, steer_rad: Array
 ) -> tuple[Array, Array, Array, Array]:
     """Return the twist without slip, the rims' root mean square and mean, and what tractions pull.
 
     (3, n), (n,), (n,), and (3, n): what a traction in each direction of the twist pulls along the wheels.
     """
-    n = rim_mps.shape[0]
+    n = wheel_speed_mps.shape[0]
     scale = 1.0 + p[_RADIUS]
     right, left = 1.0 + 0.5 * p[_ONE_SIDED], 1.0 - 0.5 * p[_ONE_SIDED]
     u, heading, angle = np.zeros((3, n)), np.zeros((3, n)), np.empty((3, n))
-    pace, mean_rim = np.empty(n), np.empty(n)
+    pace, mean_wheel_speed = np.empty(n), np.empty(n)
     for i in range(3):
         angle[i] = steer_rad[:, i] + p[_OFFSET_1 + i]
         if p[_STEER_DELAY] != 0.0:
@@ -196,18 +198,18 @@ def _rolled(
     for k in range(n):
         square, total = 0.0, 0.0
         for i in range(3):
-            rim = rim_mps[k, i] * scale * (right if i == 2 else left)
-            square += rim * rim
-            total += rim
+            wheel_speed = wheel_speed_mps[k, i] * scale * (right if i == 2 else left)
+            square += wheel_speed * wheel_speed
+            total += wheel_speed
             cos, sin = math.cos(angle[i, k]), math.sin(angle[i, k])
             for j in range(3):
                 told = planar.to_twist[j, 2 * i] * cos + planar.to_twist[j, 2 * i + 1] * sin
-                u[j, k] += rim * told
+                u[j, k] += wheel_speed * told
             heading[0, k] += cos / 3.0
             heading[1, k] += sin / 3.0
             heading[2, k] += (planar.arm_ratio[i, 0] * sin - planar.arm_ratio[i, 1] * cos) / 3.0
         u[0, k] -= u[2, k] * planar.com_y_m
         u[1, k] += u[2, k] * planar.com_x_m
         u[2, k] *= planar.spread_m
-        pace[k], mean_rim[k] = math.sqrt(square / 3.0), total / 3.0
-    return u, pace, mean_rim, heading
+        pace[k], mean_wheel_speed[k] = math.sqrt(square / 3.0), total / 3.0
+    return u, pace, mean_wheel_speed, heading

@@ -86,7 +86,7 @@ def test_ours_starts_gently_whichever_way_it_is_told_to_go():
 
 def test_a_drive_that_is_held_to_its_way_keeps_its_heading():
     names = ("fixed", "fixed+track")
-    settings = replace(SHORT, controllers=names, duration_s=15.0, leg_play_rad=0.02)
+    settings = replace(SHORT, controllers=names, duration_s=15.0, leg_backlash_rad=0.02)
     free, held = (
         drive(ROBOT, TABLE, settings)["controllers"][name]["yaw_drift_rad"]["mean"] for name in names
     )

@@ -46,7 +46,7 @@ def test_the_day_is_the_same_whatever_is_driven_and_is_no_nominal_one():
     assert len({tuple(day.soils.items()) for day in days}) == 1
     assert days[0].soils["grass"] != load_soil("grass")
     assert days[0].conditions.grade_ratio == (0.0, 0.0)
-    assert days[0].conditions.swell_ratio == 0.0
+    assert days[0].conditions.undulation_ratio == 0.0
     assert situation(COURSE, ROBOT, COURSE, 5).conditions.grade_ratio != (0.0, 0.0)
 
 

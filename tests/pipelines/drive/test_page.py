@@ -19,9 +19,9 @@ from terrain.control.traction import BRAKING, STEADY, TRACTION
 from terrain.records import RunLog, Stream
 
 TABLE = load_slip_table()
-SAYS = ("why_ratio", "terrain_ratio", "probability_ratio", "target_ratio", "aimed_ratio",
+SAYS = ("status_code", "terrain_ratio", "probability_ratio", "target_ratio", "aimed_ratio",
         "balance_ratio", "slip_ratio", "slip_std_ratio", "stale_s", "drive_state_ratio", "driven_mps",
-        "wanted_mps")  # fmt: skip
+        "desired_mps")  # fmt: skip
 
 
 def figure(mean, half=0.1, n=4):
@@ -56,14 +56,14 @@ def a_run(name="oracle", blind=False, grounds=("grass",), wheel_radps=7.0, slip=
     }
     truth = Stream(time_s, np.tile(list(columns.values()), (200, 1)), tuple(columns))
     told = dict.fromkeys(SAYS, np.full(100, math.nan)) | {"driven_mps": np.full(100, 0.9)}
-    told |= {"wanted_mps": np.ones(100), "why_ratio": np.zeros(100), "terrain_ratio": np.full(100, -1.0)}
+    told |= {"desired_mps": np.ones(100), "status_code": np.zeros(100), "terrain_ratio": np.full(100, -1.0)}
     told["drive_state_ratio"] = np.full(100, float(STEADY))
     if not blind:
         told |= {
             key: np.full(100, 0.2) for key in ("target_ratio", "aimed_ratio", "balance_ratio", "slip_ratio")
         }
         told["drive_state_ratio"] = np.repeat([float(TRACTION), float(STEADY), float(BRAKING)], [50, 25, 25])
-        told["why_ratio"] = np.where(np.arange(100) == 50, 2.0, 0.0)
+        told["status_code"] = np.where(np.arange(100) == 50, 2.0, 0.0)
         told["terrain_ratio"] = np.repeat([-1.0, list(TABLE.targets).index("clay")], 50)
     control = Stream(time_s[::2], np.column_stack(list(told.values())), tuple(told))
     edges = np.linspace(0, 2, len(grounds) + 1)

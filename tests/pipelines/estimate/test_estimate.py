@@ -341,10 +341,10 @@ def test_process_noise_is_tuned_on_chosen_runs():
         estimate(runs, "vio15", tune_on=[runs[0].run_id])
 
 
-@pytest.mark.parametrize("teacher", [0, 1])
-def test_what_was_tuned_with_a_receiver_serves_runs_without_one_and_the_other_way_round(teacher):
+@pytest.mark.parametrize("training_run", [0, 1])
+def test_what_was_tuned_with_a_receiver_serves_runs_without_one_and_the_other_way_round(training_run):
     runs = [drive(duration_s=8.0, number=1, gnss=Gnss()), drive(duration_s=8.0, number=2)]
-    result = estimate(runs, "vio15", tuning="likelihood", tune_on=[runs[teacher].run_id])
+    result = estimate(runs, "vio15", tuning="likelihood", tune_on=[runs[training_run].run_id])
     assert all(row["finite"] and row["slip_observable"] for row in result["runs"])
     assert ["gnss_position" in row["nis"] for row in result["runs"]] == [True, False]
 

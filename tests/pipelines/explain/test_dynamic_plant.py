@@ -63,7 +63,7 @@ def test_a_run_drives_on_the_soil_of_its_label_and_elsewhere_on_a_ground_like_an
         ("moon", None),
     ]
     soil = planar_ground(AGRIMARO, load_soil("grass"))
-    assert simulation.grounds["grass"]._replace(felt_ratio=1.0) == soil
+    assert simulation.grounds["grass"]._replace(effective_ratio=1.0) == soil
     assert simulation.ground == Ground()
     assert simulation.planar_on("grass").slip_ratio == soil.slip_ratio
     assert simulation.planar_on("moon").slip_ratio == simulation.planar.slip_ratio == Ground().slip_ratio
@@ -75,7 +75,7 @@ def test_tilt_is_felt_where_it_is_a_slope_and_not_where_a_body_rides_over_bumps(
     for robot, felt in ((AGRIMARO, 0.0), (HUSKY, 1.0)):
         runs = runs_of(robot=robot, n=3, vary=robot is HUSKY)
         simulation, told = simulation_for(runs, robot, library_of(robot.drive))
-        assert simulation.grounds["grass"].felt_ratio == pytest.approx(felt, abs=0.05)
+        assert simulation.grounds["grass"].effective_ratio == pytest.approx(felt, abs=0.05)
         assert len(ground_notes(told)) == (felt < 0.95)
 
 

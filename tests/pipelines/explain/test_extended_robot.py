@@ -30,7 +30,7 @@ CASES = {
     "one side": ({"one_sided_radius_ratio": 0.06}, None, 2.0),
     "biases": ({"gyro_bias_radps": 0.03, "accel_bias_mps2": 0.5}, None, None),
     "steering": (
-        {"steering_offset_1_rad": 0.05, "steering_play_rad": 0.03, "steering_delay_s": 0.08},
+        {"steering_offset_1_rad": 0.05, "steering_backlash_rad": 0.03, "steering_delay_s": 0.08},
         *(None, None),
     ),
     "many": (
@@ -87,8 +87,8 @@ def test_what_is_written_holds_what_was_measured_and_the_true_rim_speeds():
     written = enriched(estimate_run(run, replace(ROBOT, effects=ASKED), "vio15"))
     assert written.streams["imu"] is run.streams["imu"]
     wheels = written.streams["wheels"]
-    rim = wheels.channel("motor_1_radps") / ROBOT.motors.reduction_ratio * ROBOT.wheel_radius_m * 1.04
-    np.testing.assert_allclose(wheels.channel("speed_1_mps"), rim)
+    wheel_speed = wheels.channel("motor_1_radps") / ROBOT.motors.reduction_ratio * ROBOT.wheel_radius_m * 1.04
+    np.testing.assert_allclose(wheels.channel("speed_1_mps"), wheel_speed)
 
 
 def test_files_pass_through_the_commands(tmp_path):

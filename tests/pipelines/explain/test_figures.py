@@ -88,8 +88,8 @@ def test_of_short_runs_a_spectrum_is_taken_over_short_segments():
 
 
 def test_intervals_hold_the_mean_of_nothing_as_often_as_they_say():
-    n_days, missed_runs, missed_bins = 60, [], []
-    for day in range(n_days):
+    n_seeds, missed_runs, missed_bins = 60, [], []
+    for day in range(n_seeds):
         residuals = [coloured(400, 1000 * day + i) for i in range(6)]
         mean, half = run_means(residuals, [np.ones(400)] * 6, np.array([1.0, -0.7]))
         missed_runs.extend(np.abs(mean) > half)

@@ -50,7 +50,7 @@ def sane(command, names=None):
         assert row.shape == (3,)
         assert np.isfinite(row).all()
     assert names is None or list(command.status) == names
-    return int(command.status["why_ratio"])
+    return int(command.status["status_code"])
 
 
 # What arrives
@@ -239,7 +239,7 @@ def test_where_nothing_slips_it_drives_what_the_plain_command_drives():
     """On asphalt, sped up by no more than it can follow."""
     run, _ = driven("told:asphalt", "straight", "asphalt", 200, duration_s=12.0, accel_mps2=0.5)
     control = run.streams["control"]
-    short = control.channel("wanted_mps") - control.channel("driven_mps")
+    short = control.channel("desired_mps") - control.channel("driven_mps")
     assert (short >= 0).all()
     assert short.max() < 0.15
     assert short[control.time_s > 4.0].max() == 0.0
@@ -251,7 +251,7 @@ def test_where_nothing_slips_it_drives_what_the_plain_command_drives():
 def test_a_lost_camera_is_borne_for_a_second_and_then_said(lost_s):
     run, _ = driven("told:grass", "straight", "grass", 200, faults=Faults((lost_s,)), duration_s=14.0)
     control = run.streams["control"]
-    time_s, why = control.time_s, control.channel("why_ratio")
+    time_s, why = control.time_s, control.channel("status_code")
     assert set(why[(time_s > 2.0) & (time_s < 5.0)]) == {OK}
     assert not (set(why[(time_s > 6.0) & (time_s < lost_s[1])]) - {STALE, UNCERTAIN})
     assert set(why[(time_s > 7.2) & (time_s < lost_s[1])]) <= {STALE}
@@ -270,18 +270,18 @@ def test_a_start_without_a_camera_fades_in_and_learns_nothing():
     control = run.streams["control"]
     time_s = control.time_s
     gone = (time_s > 4.0) & (time_s < 6.0)
-    assert set(control.channel("why_ratio")[gone]) <= {STALE, UNCERTAIN}
+    assert set(control.channel("status_code")[gone]) <= {STALE, UNCERTAIN}
     assert np.isnan(control.channel("balance_ratio")[time_s < 6.0]).all()
     assert control.channel("driven_mps")[gone] == pytest.approx(1.0)
-    assert set(control.channel("why_ratio")[time_s > 6.5]) == {OK}
+    assert set(control.channel("status_code")[time_s > 6.5]) == {OK}
 
 
 def test_a_camera_that_never_comes_leaves_the_plain_command():
     faults = Faults(camera_lost_s=((0.0, 20.0),))
     run, _ = driven("told:grass", "straight", "grass", 200, faults=faults, duration_s=6.0)
     control = run.streams["control"]
-    assert set(control.channel("why_ratio")) == {NO_SLIP}
-    assert control.channel("driven_mps") == pytest.approx(control.channel("wanted_mps"), abs=0.03)
+    assert set(control.channel("status_code")) == {NO_SLIP}
+    assert control.channel("driven_mps") == pytest.approx(control.channel("desired_mps"), abs=0.03)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -339,7 +339,7 @@ def test_backward_and_sideways_slip_is_seen_and_held_as_forward(scenario):
     error = control.channel("slip_ratio")[fast] - true[fast]
     assert fast.sum() > 500
     assert np.sqrt(np.mean(error**2)) < 0.05
-    assert set(control.channel("why_ratio")[control.time_s > 1.0]) <= {OK, UNCERTAIN}
+    assert set(control.channel("status_code")[control.time_s > 1.0]) <= {OK, UNCERTAIN}
     plain = course(
         "plain",
         scenario,

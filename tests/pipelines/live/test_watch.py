@@ -14,7 +14,7 @@ from pipelines.runs.simulate import simulate_run
 from terrain.control.slip_table import load_slip_table
 from terrain.errors import DataError
 from terrain.estimation.live import LiveEstimator
-from terrain.kinematics.rim import with_rim_speeds
+from terrain.kinematics.wheel_speed import with_wheel_speeds
 from terrain.logs.replay import replay
 from terrain.records import Reading, RunLog, Sample, Stream
 from terrain.robots import load_robot
@@ -50,7 +50,7 @@ def estimated(run):
     told = [estimate for sample in replay(run) for estimate in estimator.step(sample.readings)]
     time_s = [estimate.time_s for estimate in told]
     channels = ("speed_x_mps", "speed_y_mps", "yaw_rate_radps", "accel_x_mps2", "accel_y_mps2")
-    streams = dict(with_rim_speeds(run, ROBOT).streams)
+    streams = dict(with_wheel_speeds(run, ROBOT).streams)
     streams["estimator"] = Stream(time_s, [[getattr(e, name) for name in channels] for e in told], channels)
     slip = [estimate.slip_ratio for estimate in told]
     streams["slip"] = Stream(time_s, slip, tuple(f"slip_{i}_ratio" for i in (1, 2, 3)))

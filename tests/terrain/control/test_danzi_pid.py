@@ -67,8 +67,8 @@ def accel_of(case, speed):
 def test_the_printed_form_gives_table_8_1(case, speed, rate, slip, desired, error, sent):
     settings = thesis_settings(1.0, PROPORTIONAL, "printed")
     v, w = float(speed), float(rate)
-    added, wanted, drive_state, status, _ = step(settings, new_state(), w, v, accel_of(case, v))
-    assert [f"{value:+.3f}" for value in (wanted - added, wanted, added, w + added)] == [
+    added, signal, drive_state, status, _ = step(settings, new_state(), w, v, accel_of(case, v))
+    assert [f"{value:+.3f}" for value in (signal - added, signal, added, w + added)] == [
         slip,
         desired,
         error,
@@ -83,8 +83,8 @@ def iterated(form, gain, case, speed, rate, steps):
     settings = thesis_settings(1.0, PROPORTIONAL._replace(kp=gain), form)
     state, v, w, errors = new_state(), float(speed), float(rate), []
     for _ in range(steps):
-        added, wanted, _, _, state = step(settings, state, w, v, accel_of(case, v))
-        errors.append(wanted - (w - v) / max(abs(w), abs(v)))
+        added, desired, _, _, state = step(settings, state, w, v, accel_of(case, v))
+        errors.append(desired - (w - v) / max(abs(w), abs(v)))
         w += added
     return np.array(errors)
 
@@ -129,22 +129,22 @@ def plain(settings, state, command, wheel, speed, accel, chassis, targets, dt_s)
     limit = settings.power_threshold_wpkg
     kind = UNKNOWN if math.isnan(power) else TRACTION if power > limit else BRAKING if power < -limit else 2
     sign = way if normalised else np.sign(speed)
-    wanted = NAN if kind == UNKNOWN else sign * targets[kind]
-    error = wanted - slip
+    desired = NAN if kind == UNKNOWN else sign * targets[kind]
+    error = desired - slip
     untouched = PidState(pid.integral, NAN), way
     if not 0 < dt_s <= 0.5:
-        return 0.0, wanted, kind, BAD_TIME, untouched
+        return 0.0, desired, kind, BAD_TIME, untouched
     if math.isnan(error + chassis):
-        return 0.0, wanted, kind, NO_ERROR, untouched
+        return 0.0, desired, kind, NO_ERROR, untouched
     if chassis <= settings.chassis_speed_mps:
-        return 0.0, wanted, kind, STANDING, untouched
+        return 0.0, desired, kind, STANDING, untouched
     if normalised and abs(speed) >= low and np.sign(speed) != way:
-        return 0.0, wanted, kind, REVERSING, untouched
+        return 0.0, desired, kind, REVERSING, untouched
     if abs(speed) < low:
         added, pid, _ = pid_step(settings.gains, pid, 0.0, dt_s)
-        return added, wanted, kind, LOW_SPEED, (pid, way)
+        return added, desired, kind, LOW_SPEED, (pid, way)
     added, pid, status = pid_step(settings.gains, pid, error * (fastest / r if normalised else 1), dt_s)
-    return added, wanted, kind, status, (pid, way)
+    return added, desired, kind, status, (pid, way)
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -215,13 +215,13 @@ def test_at_rest_noise_turns_the_desired_slip_of_the_printed_form_only():
     for form in FORMS:
         settings = thesis_settings(0.2, PROPORTIONAL, form)
         *_, state = step(settings, new_state(), 5.0, 0.9, 0.0)
-        wanted = []
+        signals = []
         for _ in range(200):
             speed, command = 0.003 * rng.standard_normal(2)
             added, desired, _, status, state = step(settings, state, 0.0, speed, 0.0, command=command)
             assert (added, status) == (0.0, STANDING)
-            wanted.append(desired)
-        turned[form] = int((np.diff(wanted) != 0).sum())
+            signals.append(desired)
+        turned[form] = int((np.diff(signals) != 0).sum())
     assert turned["printed"] > 50
     assert turned["normalised"] == 0
 
@@ -263,7 +263,7 @@ def test_settings_that_cannot_be_are_refused_in_one_sentence(arguments, words):
     assert "\n" not in str(refused.value)
 
 
-def driven(settings, target, duration_s=60.0, rim_mps=1.0, delay_rows=50):
+def driven(settings, target, duration_s=60.0, wheel_speed_mps=1.0, delay_rows=50):
     """Return the speed over ground (n,) each millisecond: level grass, the truth fed back 50 ms late."""
     body, substeps = ROBOT.body, round(DT_S * 1000)
     geometry = ROBOT.wheel_radius_m, body.tyre_width_m, body.contact_length_m
@@ -273,9 +273,9 @@ def driven(settings, target, duration_s=60.0, rim_mps=1.0, delay_rows=50):
         payload_m=(0.0, 0.0),
         radius_factors=np.ones(3),
         grade_ratio=(0.0, 0.0),
-        swell_ratio=0.0,
-        swell_length_m=15.0,
-        leg_play_rad=0.0,
+        undulation_ratio=0.0,
+        undulation_length_m=15.0,
+        leg_backlash_rad=0.0,
         grounds=np.array([ground_array(load_soil("grass"), *geometry)]),
         roughness_m3=np.zeros(1),
         patch_start_m=np.zeros(1),
@@ -287,7 +287,7 @@ def driven(settings, target, duration_s=60.0, rim_mps=1.0, delay_rows=50):
     rate = record[:, N_BODY_RECORD + WHEEL_RECORD.index("wheel_radps") :: len(WHEEL_RECORD)]
     targets, still = np.array([target, -0.15, target]), np.zeros((1, 3))
     for k in range(n):
-        command, added = np.full(3, min(k * DT_S, 1.0) * rim_mps / ROBOT.wheel_radius_m), np.zeros(3)
+        command, added = np.full(3, min(k * DT_S, 1.0) * wheel_speed_mps / ROBOT.wheel_radius_m), np.zeros(3)
         seen = k * substeps - 1 - delay_rows
         if seen >= 0:
             v, a = np.full(3, speed[seen]), np.full(3, accel[seen])
@@ -306,7 +306,7 @@ def test_on_grass_a_target_under_the_balance_slip_stops_the_robot_and_one_over_i
     balance = equilibrium_slip(load_soil("grass"), load_n, 0.0, *geometry)
     assert balance == pytest.approx(0.126, abs=0.001)
     free_mps = 1.0 - balance
-    clamp_radps = 5.0  # a whole 1 m/s of rim speed either way
+    clamp_radps = 5.0  # a whole 1 m/s of wheel speed either way
     for form, gains in {
         "normalised": Gains(0.5, 0.5, 0.0, clamp_radps),
         "printed": Gains(1.0, 1.0, 0.0, clamp_radps),

@@ -24,7 +24,7 @@ STEP_S = 0.01
 RADIUS_M = ROBOT.wheel_radius_m
 
 
-def drive(radius_factors, duration_s=10.0, rim=1.0, **truth):
+def drive(radius_factors, duration_s=10.0, wheel_speed=1.0, **truth):
     """A log whose truth is what is given, as numbers or rows (n,); rims, of nominal wheels, of each or all.
 
     Slip is what is true of the wheels as they are, along each; it is no channel where it nowhere is defined.
@@ -33,8 +33,10 @@ def drive(radius_factors, duration_s=10.0, rim=1.0, **truth):
     body = ("speed_x_mps", "speed_y_mps", "yaw_rate_radps", "yaw_rad")
     wheel = ("steer_{}_rad", "torque_{}_nm", "traction_{}_n", "side_{}_n", "sinkage_{}_m")
     columns = dict.fromkeys(body, 0.0) | {name.format(i): 0.0 for name in wheel for i in (1, 2, 3)}
-    rims = rim if isinstance(rim, tuple) else (rim,) * 3
-    columns |= {f"wheel_{i}_radps": np.asarray(row) / RADIUS_M for i, row in enumerate(rims, 1)} | truth
+    wheel_speeds = wheel_speed if isinstance(wheel_speed, tuple) else (wheel_speed,) * 3
+    columns |= {
+        f"wheel_{i}_radps": np.asarray(row) / RADIUS_M for i, row in enumerate(wheel_speeds, 1)
+    } | truth
     x, y, turn = (columns[name] for name in body[:3])
     for i, (factor, (x_m, y_m)) in enumerate(zip(radius_factors, ROBOT.wheel_positions_m, strict=True), 1):
         steer, rate = columns[f"steer_{i}_rad"], columns[f"wheel_{i}_radps"]
@@ -55,7 +57,7 @@ def time_of(duration_s=10.0):
 
 def test_energy_is_what_motors_put_in_and_none_comes_back():
     torques = {"torque_1_nm": 3.0, "torque_2_nm": -2.0, "torque_3_nm": 1.0}
-    found = course(speed_x_mps=0.8, rim=(1.0, 1.0, -0.5), **torques)
+    found = course(speed_x_mps=0.8, wheel_speed=(1.0, 1.0, -0.5), **torques)
     power_w = 3.0 * 1.0 / RADIUS_M  # the second drags, the third is turned against its torque
     assert found.energy_j[-1] == pytest.approx(10.0 * power_w)
     assert found.distance_m[-1] == pytest.approx(8.0)
@@ -71,7 +73,7 @@ def test_backward_and_sideways_cost_what_forward_does():
     pull = {f"traction_{i}_n": 20.0 for i in (1, 2, 3)} | {f"torque_{i}_nm": 5.0 for i in (1, 2, 3)}
     push = {name: -value for name, value in pull.items()}
     forward = course(speed_x_mps=0.9, **pull)
-    backward = course(speed_x_mps=-0.9, rim=-1.0, **push)
+    backward = course(speed_x_mps=-0.9, wheel_speed=-1.0, **push)
     left = course(speed_y_mps=0.9, **pull, **crab)
     for found in (forward, backward, left):
         assert found.distance_m[-1] == pytest.approx(9.0)
@@ -81,7 +83,9 @@ def test_backward_and_sideways_cost_what_forward_does():
 
 
 def test_scrub_is_what_contacts_take_up_along_the_wheels_and_across():
-    found = course(speed_x_mps=1.0, speed_y_mps=0.1, traction_1_n=50.0, rim=(1.1, 1.0, 1.0), side_2_n=-30.0)
+    found = course(
+        speed_x_mps=1.0, speed_y_mps=0.1, traction_1_n=50.0, wheel_speed=(1.1, 1.0, 1.0), side_2_n=-30.0
+    )
     assert found.scrub_along_j[-1] == pytest.approx(10 * 50.0 * 0.1)
     assert found.scrub_j[-1] == pytest.approx(10 * (50.0 * 0.1 + 30.0 * 0.1))
 
@@ -90,7 +94,7 @@ def test_wheels_that_fight_by_their_radii_take_energy_and_give_none():
     """One wheel 2 % larger, all told 5 rad/s: it pushes, the others drag, nothing else resists."""
     forces = {"traction_1_n": 40.0, "traction_2_n": -20.0, "traction_3_n": -20.0}
     found = course((1.02, 1.0, 1.0), speed_x_mps=1.005, **forces)
-    assert found.rim_mps[0] == pytest.approx([1.02, 1.0, 1.0])
+    assert found.wheel_speed_mps[0] == pytest.approx([1.02, 1.0, 1.0])
     assert found.scrub_along_j[-1] == pytest.approx(10 * 40.0 * 0.02)
 
 
@@ -101,7 +105,7 @@ def test_a_turning_robot_moves_at_each_wheel_as_a_rigid_body_does():
         f"steer_{i}_rad": math.atan2(turn * x, -turn * y)
         for i, (x, y) in enumerate(ROBOT.wheel_positions_m, 1)
     }
-    found = course(yaw_rate_radps=turn, rim=tuple(at_wheel), side_1_n=9.0, traction_2_n=9.0, **heads)
+    found = course(yaw_rate_radps=turn, wheel_speed=tuple(at_wheel), side_1_n=9.0, traction_2_n=9.0, **heads)
     assert found.ground_mps[0] == pytest.approx(at_wheel)
     assert found.scrub_j[-1] == pytest.approx(0.0, abs=1e-9)
 
@@ -109,15 +113,15 @@ def test_a_turning_robot_moves_at_each_wheel_as_a_rigid_body_does():
 def test_the_peak_of_slip_is_the_robots_while_it_is_fast_enough_and_no_bump_of_a_sample():
     time_s = time_of()
     speed = np.where(time_s < 2, 0.1, 0.5)
-    rim = np.where(time_s < 2, 1.0, np.where(time_s < 4, 0.8, 0.5))
-    rim[700] = 5.0  # one sample
-    found = course(speed_x_mps=speed, rim=(rim, rim, np.full_like(rim, 0.5)))
+    wheel_speed = np.where(time_s < 2, 1.0, np.where(time_s < 4, 0.8, 0.5))
+    wheel_speed[700] = 5.0  # one sample
+    found = course(speed_x_mps=speed, wheel_speed=(wheel_speed, wheel_speed, np.full_like(wheel_speed, 0.5)))
     after = time_s > 3
     assert slip_peak(found, after & (time_s < 4)) == pytest.approx(2 / 3 * (1 - 0.5 / 0.8), abs=1e-3)
     assert slip_peak(found, time_s > 6.9) < 0.45
     assert slip_peak(found, (time_s > 4.5) & (time_s < 6.9)) == pytest.approx(0.0, abs=1e-3)
     assert math.isnan(slip_peak(found, time_s < 2))
-    assert math.isnan(slip_peak(course(speed_x_mps=0.0, rim=0.0)))
+    assert math.isnan(slip_peak(course(speed_x_mps=0.0, wheel_speed=0.0)))
 
 
 def test_a_wheel_is_locked_where_it_hardly_turns_or_turns_against_its_way():
@@ -125,10 +129,14 @@ def test_a_wheel_is_locked_where_it_hardly_turns_or_turns_against_its_way():
     early = time_s < 1.5
     found = course(
         speed_x_mps=-0.5,
-        rim=(np.where(early, -0.04, -0.5), np.where(time_s < 0.5, 0.5, -0.5), np.full_like(time_s, -0.06)),
+        wheel_speed=(
+            np.where(early, -0.04, -0.5),
+            np.where(time_s < 0.5, 0.5, -0.5),
+            np.full_like(time_s, -0.06),
+        ),
     )
     assert lock_s(found) == pytest.approx(1.5)
-    assert lock_s(course(speed_x_mps=0.09, rim=0.0)) == 0.0
+    assert lock_s(course(speed_x_mps=0.09, wheel_speed=0.0)) == 0.0
 
 
 def test_stuck_is_to_go_and_not_to_go_for_long_whatever_the_wheels_are_told():
@@ -136,13 +144,13 @@ def test_stuck_is_to_go_and_not_to_go_for_long_whatever_the_wheels_are_told():
     speed = np.full_like(time_s, 0.5)
     for start_s, length_s in ((2.0, 2.1), (6.0, 1.9), (10.0, 5.0), (17.0, 3.0)):
         speed[(time_s >= start_s) & (time_s < start_s + length_s)] = 0.0
-    wanted = np.where((time_s > 9) & (time_s < 16), 0.15, 1.0)  # nobody asks for much the third time
-    control = Stream(time_s[::2], wanted[::2, None], ("wanted_mps",))
+    desired = np.where((time_s > 9) & (time_s < 16), 0.15, 1.0)  # nobody asks for much the third time
+    control = Stream(time_s[::2], desired[::2, None], ("desired_mps",))
     assert immobilised(course(duration_s=20.0, speed_x_mps=speed), control) == 2
 
 
 def test_to_turn_on_the_spot_is_to_go_and_to_slide_back_is_not():
-    control = Stream(time_of(5.0), np.ones((500, 1)), ("wanted_mps",))
+    control = Stream(time_of(5.0), np.ones((500, 1)), ("desired_mps",))
     steer = {
         f"steer_{i}_rad": math.atan2(x_m, -y_m) for i, (x_m, y_m) in enumerate(ROBOT.wheel_positions_m, 1)
     }

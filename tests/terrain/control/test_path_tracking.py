@@ -104,29 +104,29 @@ def wandering(rng, n):
     return np.array(poses) + 0.002 * rng.standard_normal((n, 3)), ground
 
 
-def told_of(poses, ground, wanted, function=track_step):
+def told_of(poses, ground, desired, function=track_step):
     state, rows = initial_tracking(), []
     for pose, twist in zip(poses, ground, strict=True):
-        told, state, said = function(SETTINGS, state, wanted, pose[:2], pose[2], twist, 0.001, 0.0, DT_S)
+        told, state, said = function(SETTINGS, state, desired, pose[:2], pose[2], twist, 0.001, 0.0, DT_S)
         rows.append([*told, *said])
     return np.array(rows)
 
 
 def test_the_world_s_origin_does_not_matter_and_left_is_as_right():
-    wanted = np.array([0.7, 0.1, 0.12])
+    desired = np.array([0.7, 0.1, 0.12])
     poses, ground = wandering(np.random.default_rng(1), 200)
-    rows = told_of(poses, ground, wanted)
+    rows = told_of(poses, ground, desired)
     assert set(rows[:, 6]) <= {OK, CLAMPED}
-    assert np.abs(rows[:, :3] - wanted).max() > 0.01
-    np.testing.assert_allclose(told_of(poses, ground, wanted, track_step.py_func), rows, atol=1e-9)
+    assert np.abs(rows[:, :3] - desired).max() > 0.01
+    np.testing.assert_allclose(told_of(poses, ground, desired, track_step.py_func), rows, atol=1e-9)
     turn, shift = 2.5, np.array([100.0, -40.0])
     cos, sin = math.cos(turn), math.sin(turn)
     turned = np.column_stack(
         [poses[:, :2] @ [[cos, sin], [-sin, cos]] + shift, poses[:, 2] + turn + 4 * math.pi]
     )
-    np.testing.assert_allclose(told_of(turned, ground, wanted), rows, atol=1e-9)
+    np.testing.assert_allclose(told_of(turned, ground, desired), rows, atol=1e-9)
     mirror = np.array([1.0, -1.0, -1.0])
-    flipped = told_of(poses * mirror, ground * mirror, wanted * mirror)
+    flipped = told_of(poses * mirror, ground * mirror, desired * mirror)
     np.testing.assert_allclose(flipped[:, :3], rows[:, :3] * mirror, atol=1e-9)
 
 
@@ -177,7 +177,7 @@ def test_integers_are_taken_and_times_are_checked():
     assert check_tracking(ROBOT, SETTINGS._replace(heading_pm=3)) == SETTINGS
     assert isinstance(check_tracking(ROBOT, SETTINGS._replace(heading_pm=3)).heading_pm, float)
     for option in ({"delay_s": -0.1}, {"delay_s": 2.0}, {"dt_s": 0.0}, {"dt_s": math.nan}):
-        with pytest.raises(ConfigError, match="s is wanted"):
+        with pytest.raises(ConfigError, match="s is required"):
             check_tracking(ROBOT, **option)
 
 
@@ -294,11 +294,11 @@ class Tracker:
 def run_of(name, terrain, seed, settings, duration_s=None, grade=(0.0, 0.0), lost_s=(), scatter=True):
     """Drive a day's scattered robot on its scattered soil; return its pose (n, 3) and its run."""
     rng = np.random.default_rng([seed, 77])
-    conditions = Conditions(leg_play_rad=0.02)
+    conditions = Conditions(leg_backlash_rad=0.02)
     soil = load_soil(terrain)
     if scatter:
         drawn = draw_conditions(load_spread(), rng, conditions)
-        conditions, soil = dataclasses.replace(drawn, swell_ratio=0.0), scattered(soil, rng)
+        conditions, soil = dataclasses.replace(drawn, undulation_ratio=0.0), scattered(soil, rng)
     conditions = dataclasses.replace(conditions, grade_ratio=grade)
     run = simulate(
         ROBOT,

@@ -109,15 +109,15 @@ def test_a_fault_gives_nothing_freezes_the_integral_and_leaves_no_kick(error, dt
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"kp": -0.1}, "gain kp is -0.1, a finite number from zero up is wanted"),
+        ({"kp": -0.1}, "gain kp is -0.1, a finite number from zero up is required"),
         ({"ki": NAN}, "gain ki is nan"),
         ({"kd": math.inf}, "gain kd is inf"),
         ({"kp": "1"}, "gain kp is '1'"),
         ({"kp": True}, "gain kp is True"),
         ({"derivative_time_constant_s": -1}, "gain derivative_time_constant_s is -1"),
-        ({"limit": 0}, "gain limit is 0, a finite number above zero is wanted"),
+        ({"limit": 0}, "gain limit is 0, a finite number above zero is required"),
         ({"limit": math.inf}, "gain limit is inf"),
-        ({"integral_limit": 0.0}, "gain integral_limit is 0.0, a number above zero is wanted"),
+        ({"integral_limit": 0.0}, "gain integral_limit is 0.0, a number above zero is required"),
         ({"integral_limit": NAN}, "gain integral_limit is nan"),
     ],
 )

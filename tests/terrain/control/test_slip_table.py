@@ -205,7 +205,7 @@ CURVE = (*SAND, "curve")
     ("place", "value", "fault"),
     [
         (("schema",), 3, "schema 3 is newer than 2"),
-        (("schema",), "2", "schema is '2', 1 or 2 is wanted"),
+        (("schema",), "2", "schema is '2', 1 or 2 is required"),
         (("robot",), ..., "key 'robot' is missing"),
         (("robot",), "", "robot is '', the name of one"),
         (("robot",), "husky", "the table is for robot 'husky', not for 'agrimaro'"),

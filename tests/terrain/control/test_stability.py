@@ -55,13 +55,13 @@ def small_changes(gains, form, n_delayed, speed_mps, slip_ratio, slope_ratio, n_
         slip = slip_of(w, v)
         rate = speed_mps / body.relaxation_length_m * (slip - taken)
         thrust_n = slope_ratio * LOAD_N * (taken + DEFLECTION_DAMPING_S * rate)
-        wanted = motors.speed_gain_nmspr * (u - estimate) + integral
+        desired = motors.speed_gain_nmspr * (u - estimate) + integral
         return np.array(
             [
                 (torque - RADIUS_M * thrust_n) / body.wheel_inertia_kgm2,
                 thrust_n / (ROBOT.mass_kg / 3),
                 rate,
-                (wanted - torque) / motors.torque_time_constant_s,
+                (desired - torque) / motors.torque_time_constant_s,
                 motors.speed_integral_nmpr * (u - estimate),
                 (w - estimate) / motors.speed_estimate_time_constant_s,
                 (slip - seen) / sensors.encoder_time_constant_s,
@@ -101,7 +101,7 @@ def test_a_small_change_grows_or_dies_as_the_largest_eigenvalue_says(numbers, fo
     assert (late / early) ** (1 / 250) == pytest.approx(spectral_radius(matrix), rel=2e-3)
 
 
-def on_grass(settings, target, rim_mps, n_delayed, duration_s=14.0):
+def on_grass(settings, target, wheel_speed_mps, n_delayed, duration_s=14.0):
     """Slip at each sample; from 3 s on under control, at 5 s a kick. Truth behind the encoders' low-pass."""
     plant = make_plant(
         ROBOT,
@@ -109,9 +109,9 @@ def on_grass(settings, target, rim_mps, n_delayed, duration_s=14.0):
         payload_m=(0.0, 0.0),
         radius_factors=np.ones(3),
         grade_ratio=(0.0, 0.0),
-        swell_ratio=0.0,
-        swell_length_m=15.0,
-        leg_play_rad=0.0,
+        undulation_ratio=0.0,
+        undulation_length_m=15.0,
+        leg_backlash_rad=0.0,
         grounds=np.array([ground_array(load_soil("grass"), *GEOMETRY)]),
         roughness_m3=np.zeros(1),
         patch_start_m=np.zeros(1),
@@ -121,7 +121,7 @@ def on_grass(settings, target, rim_mps, n_delayed, duration_s=14.0):
     queue, found = [np.zeros(3)] * n_delayed, []
     rate, speed, share = np.zeros(3), 0.0, 0.001 / ROBOT.sensors.encoder_time_constant_s
     for k in range(round(duration_s / DT_S)):
-        command, added = np.full(3, min(k * DT_S, 1.0) * rim_mps / RADIUS_M), np.zeros(3)
+        command, added = np.full(3, min(k * DT_S, 1.0) * wheel_speed_mps / RADIUS_M), np.zeros(3)
         if k >= 150:
             added, *_, memory = thesis_step(
                 settings,
@@ -144,18 +144,20 @@ def on_grass(settings, target, rim_mps, n_delayed, duration_s=14.0):
     return np.array(found)
 
 
-@pytest.mark.parametrize(("form", "rim_mps"), [("printed", 0.1), ("printed", 0.5), ("normalised", 1.0)])
-def test_the_full_robot_on_grass_settles_under_the_critical_gain_and_swings_over_it(form, rim_mps):
+@pytest.mark.parametrize(
+    ("form", "wheel_speed_mps"), [("printed", 0.1), ("printed", 0.5), ("normalised", 1.0)]
+)
+def test_the_full_robot_on_grass_settles_under_the_critical_gain_and_swings_over_it(form, wheel_speed_mps):
     soil, aside = load_soil("grass"), 1e-4
     balance = equilibrium_slip(soil, LOAD_N, 0.0, *GEOMETRY)
     below, above = net_pull(soil, LOAD_N, np.array([balance - aside, balance + aside]), *GEOMETRY)
     slope = (above - below) / (2 * aside) / LOAD_N
-    gain = critical_gain(form, 3 * DT_S, rim_mps, balance, slope)
+    gain = critical_gain(form, 3 * DT_S, wheel_speed_mps, balance, slope)
     settled, swinging = (
         on_grass(
-            thesis_settings(RADIUS_M, Gains(factor * gain, 0.0, 0.0, 2 * rim_mps / RADIUS_M), form),
+            thesis_settings(RADIUS_M, Gains(factor * gain, 0.0, 0.0, 2 * wheel_speed_mps / RADIUS_M), form),
             balance,
-            rim_mps,
+            wheel_speed_mps,
             3,
         )[-100:]
         for factor in (0.85, 1.2)
@@ -207,10 +209,10 @@ def test_without_gains_nothing_turns_unstable():
         ),
         ({"gains": Gains(-1.0, 0.0, 0.0, 5.0)}, "^gain kp is -1"),
         ({"form": "new"}, "^form 'new' is unknown: use one of printed, normalised"),
-        ({"delay_s": math.nan}, "^delay_s is nan, 0 to 1 s is wanted"),
+        ({"delay_s": math.nan}, "^delay_s is nan, 0 to 1 s is required"),
         ({"delay_s": -0.1}, "^delay_s is -0.1"),
         ({"dt_s": 0.0}, "^dt_s is 0.0"),
-        ({"low_speed_mps": 2.0}, "^low_speed_mps is 2.0, above 0 and below 2 is wanted"),
+        ({"low_speed_mps": 2.0}, "^low_speed_mps is 2.0, above 0 and below 2 is required"),
         ({"robot": load_robot("husky")}, "^robot husky: its description has no section"),
     ],
 )

@@ -89,18 +89,18 @@ def test_whatever_is_believed_was_said_for_the_whole_dwell(said):
 finite = st.floats(-1.0, 1.0)
 
 
-@given(now=finite, wanted=finite, rate=st.floats(0.0, 1.0), dt_s=st.floats(-1.0, 1.0))
-def test_a_target_moves_at_its_rate_and_never_past_its_end(now, wanted, rate, dt_s):
-    there = approach(now, wanted, rate, dt_s)
+@given(now=finite, desired=finite, rate=st.floats(0.0, 1.0), dt_s=st.floats(-1.0, 1.0))
+def test_a_target_moves_at_its_rate_and_never_past_its_end(now, desired, rate, dt_s):
+    there = approach(now, desired, rate, dt_s)
     assert abs(there - now) <= rate * max(dt_s, 0.0) + 1e-12
-    assert min(now, wanted) - 1e-12 <= there <= max(now, wanted) + 1e-12
-    if there != pytest.approx(wanted, abs=1e-12):
+    assert min(now, desired) - 1e-12 <= there <= max(now, desired) + 1e-12
+    if there != pytest.approx(desired, abs=1e-12):
         assert abs(there - now) == pytest.approx(rate * max(dt_s, 0.0), abs=1e-12)
-    assert approach(NAN, wanted, rate, dt_s) == wanted
+    assert approach(NAN, desired, rate, dt_s) == desired
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "wanted"),
+    ("name", "value", "desired"),
     [
         ("probability_least", 1.01, "from 0 to 1"),
         ("probability_least", -0.1, "from 0 to 1"),
@@ -111,7 +111,7 @@ def test_a_target_moves_at_its_rate_and_never_past_its_end(now, wanted, rate, dt
         ("rate_ratio", True, "from zero up"),
     ],
 )
-def test_settings_that_cannot_be_are_refused_in_one_sentence(name, value, wanted):
+def test_settings_that_cannot_be_are_refused_in_one_sentence(name, value, desired):
     with pytest.raises(ConfigError) as refused:
         check_switching(SWITCHING._replace(**{name: value}))
-    assert str(refused.value) == f"switching: {name} is {value!r}, a number {wanted} is wanted"
+    assert str(refused.value) == f"switching: {name} is {value!r}, a number {desired} is required"

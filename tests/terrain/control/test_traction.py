@@ -83,8 +83,10 @@ def plain(using, m, aim, radius, wheel, ground, accel, slips, stds, stale, torqu
     largest = 0.0
     for i in range(3):
         if known[i]:
-            rim = abs(ground[i]) / max(1 - max(way[i] * slips[i], 0), 0.05)
-            largest = max(largest, stds[i] * rim / max(rim, 1.5 * using.launch_mps, m["from"]))
+            wheel_speed = abs(ground[i]) / max(1 - max(way[i] * slips[i], 0), 0.05)
+            largest = max(
+                largest, stds[i] * wheel_speed / max(wheel_speed, 1.5 * using.launch_mps, m["from"])
+            )
     sure = not largest > using.std_max_ratio
     fresh = stale <= using.stale_max_s
     status = NO_SLIP if not all(known) else STALE if not fresh else UNCERTAIN if not sure else OK
@@ -172,13 +174,13 @@ def test_any_drive_with_faults_is_that_of_the_plain_form(seed):
     )  # no step of a fade is a threshold's, to the digit
     aim = Ground(rng.uniform(0, 0.6), *(rng.choice([[0.0, 0.0, 0.0], [0.15, 3.0, 0.05]])))
     memory, state = remembered(), initial_state()
-    wanted, v, bits = rng.choice([-1, 1], 3) * rng.uniform(0.2, 5, 3), 0.0, rng.uniform(0, 0.1)
+    desired, v, bits = rng.choice([-1, 1], 3) * rng.uniform(0.2, 5, 3), 0.0, rng.uniform(0, 0.1)
     push = rng.uniform(0, 1)
     for k in range(120):
         if rng.random() < 0.03:  # a new command: stop, another speed, another turn
-            wanted = rng.choice([0.0, 0.3, 1.0, -1.0]) * rng.choice([-1, 1], 3) * rng.uniform(0.2, 5, 3)
+            desired = rng.choice([0.0, 0.3, 1.0, -1.0]) * rng.choice([-1, 1], 3) * rng.uniform(0.2, 5, 3)
         level = min(1, k / 40)
-        wheel = wanted * level
+        wheel = desired * level
         v += (min(max(memory["d"] - v, -0.06), 0.06 * push)) * rng.uniform(0, 1)
         rows = [np.sign(wheel) * v * np.abs(wheel) / max(np.abs(wheel).max(), 0.1), rng.normal(0, 0.4, 3)]
         rows = [rows[0] + bits * rng.standard_normal(3), rows[1], np.clip(rng.normal(0, 0.3, 3), -1, 1)]
@@ -230,10 +232,10 @@ def test_speed_never_falls_while_more_is_wanted_and_the_turning_centre_stays(
     for std in (0.0, 1.0):
         even = SETTINGS._replace(droop_radps_per_nm=0.0)
         told, after, said = steps(state, wheel, **inputs, std=std, using=even)
-        wanted = float(np.abs(wheel).max()) * RADIUS_M
-        assert min(was, wanted) <= said[0] <= wanted
+        desired = float(np.abs(wheel).max()) * RADIUS_M
+        assert min(was, desired) <= said[0] <= desired
         assert after[DRIVEN] == said[0]
-        share = said[0] / wanted
+        share = said[0] / desired
         assert told == pytest.approx(share * wheel, abs=1e-12)
         got, residual = forward(POSITIONS_M, RADIUS_M, told, steer)
         assert got == pytest.approx(share * np.array(twist), abs=1e-9)
@@ -247,7 +249,7 @@ def test_speed_never_falls_while_more_is_wanted_and_the_turning_centre_stays(
 
 
 def rolling(torque, n=2000, wheel=5.0, **changes):
-    """Steady at what is wanted, for long; (told, state)."""
+    """Steady at what is required, for long; (told, state)."""
     state = initial_state()
     for _ in range(n):
         told, state, said = steps(state, wheel, ground_mps=0.99, slip=0.01, torque=torque, **changes)
@@ -337,11 +339,11 @@ def test_the_floor_rises_where_a_robot_is_held_back_and_gains_no_speed_and_only_
     assert floors["stuck"] == pytest.approx(0.1 + SETTINGS.floor_rate_ratio * 1.6, abs=0.02)
 
 
-def driven_along(target, duration_s=30.0, wanted_mps=1.0, shear=0.1, limit=0.4, resistance=0.2):
+def driven_along(target, duration_s=30.0, desired_mps=1.0, shear=0.1, limit=0.4, resistance=0.2):
     """Speed over ground (n,) of a point on wheels: ``v' = g (limit (1 - exp(-s / shear)) - resistance)``."""
     state, v, speeds = initial_state(), 0.0, []
     for k in range(round(duration_s / DT_S)):
-        told = min(wanted_mps, k * DT_S)
+        told = min(desired_mps, k * DT_S)
         d = state[DRIVEN]
         if target is not None:
             slip = (d - v) / max(d, v) if max(d, v) > 0.05 else 0.0
@@ -415,7 +417,7 @@ def test_gentle_slowing_and_speeding_up_are_no_braking():
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "wanted"),
+    ("name", "value", "desired"),
     [
         ("lead_s", -0.1, "from zero up"),
         ("launch_mps", 0.0, "above zero"),
@@ -427,10 +429,10 @@ def test_gentle_slowing_and_speeding_up_are_no_braking():
         ("stale_max_s", None, "from zero up"),
     ],
 )
-def test_settings_that_cannot_be_are_refused_in_one_sentence(name, value, wanted):
+def test_settings_that_cannot_be_are_refused_in_one_sentence(name, value, desired):
     with pytest.raises(ConfigError) as refused:
         check_settings(SETTINGS._replace(**{name: value}))
-    assert str(refused.value) == f"traction: {name} is {value!r}, a number {wanted} is wanted"
+    assert str(refused.value) == f"traction: {name} is {value!r}, a number {desired} is required"
 
 
 def test_whole_numbers_are_settings():

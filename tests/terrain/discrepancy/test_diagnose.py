@@ -27,7 +27,7 @@ EFFECTS = {
         *("payload", "motor_drift", "scrub", "side_hill_slip"),
     ),
     "agrimaro": (
-        *("steering_offset_2", "steering_play", "encoder_lag", "camera_yaw", "gyro_scale", "accel_bias"),
+        *("steering_offset_2", "steering_backlash", "encoder_lag", "camera_yaw", "gyro_scale", "accel_bias"),
         *("force_slip", "viscous_drag"),
     ),
 }

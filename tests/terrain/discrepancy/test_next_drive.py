@@ -97,6 +97,6 @@ def test_nothing_is_told_where_there_is_nothing_to_part_or_nothing_parts_it():
     assert next_drive(HUSKY, (), ()) is None
     bare = replace(HUSKY, robot=replace(HUSKY.robot, motors=None))
     assert next_drive(bare, [("wheel_radius", "force_slip")], ()) is None
-    typical = next_drive(AGRIMARO, [("steering_play", "steering_delay")], ())
+    typical = next_drive(AGRIMARO, [("steering_backlash", "steering_delay")], ())
     assert isinstance(typical, NextDrive)
     assert "would be" in typical.reason

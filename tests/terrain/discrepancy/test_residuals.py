@@ -124,10 +124,10 @@ def test_measured_and_predicted_pass_the_same_window(looked_at):
     """A prediction that is fed back as what was measured leaves nothing, holes or none."""
     simulation, effects, signals = looked_at
     low_pass = low_pass_of([signals])
-    dt, rim, steer, grade, roll, _ = _prepared(signals, low_pass)
-    shown = replay(simulation.planar, vector_of(effects), dt, rim, steer, grade, roll)
+    dt, wheel_speed, steer, grade, roll, _ = _prepared(signals, low_pass)
+    shown = replay(simulation.planar, vector_of(effects), dt, wheel_speed, steer, grade, roll)
     own = low_pass._replace(inputs_every=0)
-    fed = {"rim_mps": rim, "steer_rad": steer, "grade_rad": grade, "roll_rad": roll}
+    fed = {"wheel_speed_mps": wheel_speed, "steer_rad": steer, "grade_rad": grade, "roll_rad": roll}
     same = replace(signals, dt_s=dt, measured=shown, **fed)
     rows = rows_of(same, simulation.planar, vector_of(effects), (), own)
     assert_array_equal(rows.measured, rows.predicted)
@@ -179,13 +179,13 @@ def test_decimation_is_a_convolution_and_holes_are_weighed_out():
 
 def test_a_hole_stays_unknown_and_nothing_else_is_lost(looked_at):
     simulation, effects, signals = looked_at
-    measured, rim = signals.measured.copy(), signals.rim_mps.copy()
+    measured, wheel_speed = signals.measured.copy(), signals.wheel_speed_mps.copy()
     time_s = signals.time_s
     c = CHANNELS.index(SPEED_X)
     measured[(time_s > 8.0) & (time_s < 11.0), c] = np.nan
-    rim[(time_s > 15.0) & (time_s < 16.0)] = np.nan
+    wheel_speed[(time_s > 15.0) & (time_s < 16.0)] = np.nan
     low_pass = low_pass_of([signals])
-    holes = replace(signals, measured=measured, rim_mps=rim)
+    holes = replace(signals, measured=measured, wheel_speed_mps=wheel_speed)
     point = vector_of(effects)
     rows = rows_of(holes, simulation.planar, point, ["payload_ratio"], low_pass)
     before = rows_of(signals, simulation.planar, point, ["payload_ratio"], low_pass)
@@ -202,8 +202,10 @@ def test_a_hole_stays_unknown_and_nothing_else_is_lost(looked_at):
 def fake(dt_s, run_id="a", n=400):
     """Return signals of a robot that rolls."""
     still = np.zeros(n)
-    rim = np.full((n, 2), 0.5)
-    return Signals(run_id, "", dt_s, 0.0, rim, np.zeros((n, 2)), still, still, np.zeros((n, len(CHANNELS))))
+    wheel_speed = np.full((n, 2), 0.5)
+    return Signals(
+        run_id, "", dt_s, 0.0, wheel_speed, np.zeros((n, 2)), still, still, np.zeros((n, len(CHANNELS)))
+    )
 
 
 def test_the_slowest_clock_sets_the_low_pass_whichever_run_has_it():

@@ -61,7 +61,7 @@ def test_streams_of_a_skid_steer_robot_come_to_one_clock(husky):
     wheels, imu, seen = (husky.streams[name] for name in ("wheels", "imu", "odometry"))
     assert (signals.run_id, signals.terrain, signals.dt_s, len(signals)) == ("run", "grass", 0.02, 1001)
     assert_allclose(signals.time_s, wheels.time_s)
-    assert_array_equal(signals.rim_mps, wheels.values[:, :2])
+    assert_array_equal(signals.wheel_speed_mps, wheels.values[:, :2])
     assert not signals.steer_rad.any()
     assert_allclose(signals.grade_rad, -imu.channel("pitch_rad")[::2], atol=1e-12)
     assert_allclose(signals.roll_rad, imu.channel("roll_rad")[::2], atol=1e-12)
@@ -96,7 +96,7 @@ def test_steering_loses_its_zeros_and_turns_and_rates_of_motors_become_rims(agri
         assert_allclose(signals.steer_rad[:, i], truth.channel(f"steer_{i + 1}_rad")[::2], atol=1e-9)
     wheels = agrimaro.streams["wheels"]
     per_motor = AGRIMARO.wheel_radius_m / AGRIMARO.motors.reduction_ratio
-    assert_allclose(signals.rim_mps, wheels.values[:, :3] * per_motor)
+    assert_allclose(signals.wheel_speed_mps, wheels.values[:, :3] * per_motor)
     steering = agrimaro.streams["steering"]
     turned = replace(steering, values=np.angle(np.exp(1j * (steering.values + 2 * np.pi))))
     assert_allclose(
@@ -148,9 +148,10 @@ def test_long_holes_stay_holes_and_short_ones_are_bridged(husky):
     assert_array_equal(known, expected)
     assert_allclose(channel(signals, SPEED_X)[known], seen.values[known, 0], atol=1e-3)
     assert_array_equal(
-        np.isfinite(signals.rim_mps[:, 0]), ~((signals.time_s > 12.0) & (signals.time_s < 13.0 - 1e-9))
+        np.isfinite(signals.wheel_speed_mps[:, 0]),
+        ~((signals.time_s > 12.0) & (signals.time_s < 13.0 - 1e-9)),
     )
-    assert np.isfinite(signals.rim_mps[:, 1]).all()
+    assert np.isfinite(signals.wheel_speed_mps[:, 1]).all()
     nothing = replace(imu, values=np.full_like(imu.values, np.nan))
     signals = signals_of(with_stream(husky, "imu", nothing), HUSKY)
     assert np.isnan(channel(signals, GYRO)).all()
@@ -188,7 +189,7 @@ def test_a_run_that_cannot_be_compared_is_refused_in_one_sentence(husky, agrimar
         (husky, AGRIMARO, "is of the robot 'husky', the simulation is of 'agrimaro'"),
         (with_stream(husky, "wheels", None), HUSKY, "no stream 'wheels'"),
         (with_stream(agrimaro, "steering", None), AGRIMARO, "no stream 'steering'"),
-        (one_side, HUSKY, "a speed of each of left, right is wanted"),
+        (one_side, HUSKY, "a speed of each of left, right is required"),
         (short, HUSKY, "have 3.0 s in common, 4 s at the least"),
         (apart, HUSKY, "have 0.0 s in common"),
         (replace(husky, streams={"wheels": speeds}), HUSKY, "none of its channels is simulated"),

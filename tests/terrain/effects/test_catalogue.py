@@ -138,14 +138,14 @@ def test_an_alias_is_the_effect():
     ("text", "drive", "message"),
     [
         ("gravity=1", "swerve", "effect 'gravity' is unknown: use one of wheel_radius,"),
-        ("steering_play=0.01", "skid_steer", "cannot befall a robot with the drive 'skid_steer'"),
-        ("payload", "swerve", "payload=VALUE with payload_ratio is wanted"),
-        ("payload=heavy", "swerve", "payload=VALUE with payload_ratio is wanted"),
-        ("payload=0.1,0.2", "swerve", "payload=VALUE with payload_ratio is wanted"),
-        ("lever_arm=0.1", "swerve", "lever_arm=VALUE with lever_x_m,lever_y_m is wanted"),
+        ("steering_backlash=0.01", "skid_steer", "cannot befall a robot with the drive 'skid_steer'"),
+        ("payload", "swerve", "payload=VALUE with payload_ratio is required"),
+        ("payload=heavy", "swerve", "payload=VALUE with payload_ratio is required"),
+        ("payload=0.1,0.2", "swerve", "payload=VALUE with payload_ratio is required"),
+        ("lever_arm=0.1", "swerve", "lever_arm=VALUE with lever_x_m,lever_y_m is required"),
         ("payload=1.6", "swerve", "payload_ratio is 1.6, -0.5 to 1.5 is accepted"),
         ("payload=nan", "swerve", "payload_ratio is nan, -0.5 to 1.5 is accepted"),
-        ("steering_play=-0.01", "swerve", "steering_play_rad is -0.01, 0 to 0.2 is accepted"),
+        ("steering_backlash=-0.01", "swerve", "steering_backlash_rad is -0.01, 0 to 0.2 is accepted"),
     ],
 )
 def test_an_effect_that_cannot_be_is_refused_in_one_sentence(text, drive, message):

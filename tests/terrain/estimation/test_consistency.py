@@ -77,7 +77,7 @@ def test_a_filter_that_leaves_out_what_does_not_fit_is_not_called_consistent():
     time_s, _, z = turned()
     z[np.random.default_rng(0).random(len(z)) < 0.05, 1] += 5.0
     (compass, gyro) = consistency_report(run_filter(TURNTABLE, NOISE, time_s, z)).sensors
-    assert gyro.share_gated == pytest.approx(0.05, abs=0.015)
+    assert gyro.gated_fraction == pytest.approx(0.05, abs=0.015)
     assert (compass.verdict, gyro.verdict) == ("consistent", "overconfident")
 
 

@@ -444,7 +444,7 @@ def test_what_does_not_fit_the_model_is_refused(noise, z, message):
 
 
 def test_settings_that_are_none_are_refused():
-    with pytest.raises(ConfigError, match="reopen_after_s is 0, seconds above zero are wanted"):
+    with pytest.raises(ConfigError, match="reopen_after_s is 0, seconds above zero are required"):
         FilterSettings(reopen_after_s=0)
 
 

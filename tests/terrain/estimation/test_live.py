@@ -17,7 +17,7 @@ from terrain.estimation.measurements import GNSS_ROWS, ROWS_OF_DRIVE, measuremen
 from terrain.estimation.swerve_filters import default_noise, make_filter
 from terrain.estimation.wheel_slip import wheel_slip
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
-from terrain.kinematics.rim import with_rim_speeds
+from terrain.kinematics.wheel_speed import with_wheel_speeds
 from terrain.logs.replay import replay
 from terrain.records import Reading, Stream
 from terrain.robots import load_robot
@@ -73,8 +73,8 @@ def batch(run, robot=ROBOT, name="vio15", yaw=None):
         variance = np.tile(noise.measurement_variance, (table.time_s.size, 1))
         variance[:, [model.rows.index(row) for row in GNSS_ROWS]] = table.gnss_variance
         noise = Noise(noise.process_variance, variance, noise.initial_variance)
-    wanted = FilterSettings(GATE_PROBABILITY, REOPEN_AFTER_S)
-    track = run_filter(model, noise, table.time_s, table.columns(model.rows), wanted)
+    desired = FilterSettings(GATE_PROBABILITY, REOPEN_AFTER_S)
+    track = run_filter(model, noise, table.time_s, table.columns(model.rows), desired)
     return table.at(track.time_s), track, wheel_slip(track, table.at(track.time_s), robot)
 
 
@@ -86,7 +86,7 @@ def assert_equal(run, robot=ROBOT, name="vio15", yaw=None):
     n_rows = len(ROWS_OF_DRIVE["swerve"]) - (yaw is None) * len(GNSS_ROWS)
     np.testing.assert_allclose(column(told, "rows")[:, :n_rows], table.z[:, :n_rows], rtol=0, atol=1e-12)
     std = np.column_stack([track.std(state) for state in track.states])
-    for what, wanted in {
+    for what, desired in {
         "mean": track.mean,
         "std": std,
         "slip_ratio": slip.slip_ratio,
@@ -96,7 +96,7 @@ def assert_equal(run, robot=ROBOT, name="vio15", yaw=None):
         "speed_x_mps": track.state("speed_x_mps"),
         "accel_y_mps2": track.state("accel_y_mps2"),
     }.items():
-        np.testing.assert_allclose(column(told, what), wanted, rtol=0, atol=1e-9, err_msg=what)
+        np.testing.assert_allclose(column(told, what), desired, rtol=0, atol=1e-9, err_msg=what)
     counted = {kind: n for kind, n in estimator.dropped.items() if "clock" not in kind and "time" not in kind}
     batch_counts = {**table.dropped, **track.dropped}
     batch_counts.pop("wheels: stamp does not increase", None)
@@ -122,8 +122,8 @@ def assert_equal(run, robot=ROBOT, name="vio15", yaw=None):
 def test_live_equals_batch(scenario, duration_s, robot, name, yaw):
     run = log(scenario, duration_s, gnss=yaw is not None)
     told = assert_equal(run, robot, name, yaw)
-    wheels = with_rim_speeds(run, robot).streams["wheels"]
-    for what, pattern in (("rim_mps", "speed_{}_mps"), ("current_a", "current_{}_a")):
+    wheels = with_wheel_speeds(run, robot).streams["wheels"]
+    for what, pattern in (("wheel_speed_mps", "speed_{}_mps"), ("current_a", "current_{}_a")):
         raw = np.column_stack([wheels.channel(pattern.format(i)) for i in (1, 2, 3)])
         np.testing.assert_array_equal(column(told, what), raw)
 
@@ -236,9 +236,9 @@ def test_a_clock_that_is_set_back_is_believed_when_the_next_stamp_follows():
     _, plain = live(run)
     known = {round(estimate.time_s, 6): estimate for estimate in plain}
     for estimate in told[-100:]:
-        wanted = known[round(estimate.time_s, 6)]
+        desired = known[round(estimate.time_s, 6)]
         assert not estimate.slip_stale
-        np.testing.assert_allclose(estimate.slip_ratio, wanted.slip_ratio, atol=0.01)
+        np.testing.assert_allclose(estimate.slip_ratio, desired.slip_ratio, atol=0.01)
 
 
 def test_wheels_alone_tell_the_rim_speeds_and_no_slip():

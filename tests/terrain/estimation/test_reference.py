@@ -5,7 +5,7 @@ import pytest
 
 from pipelines.runs.simulate import simulate_run
 from terrain.errors import DataError
-from terrain.estimation.reference import lagged_slip, rim_and_ground_speed, true_states
+from terrain.estimation.reference import lagged_slip, true_states, wheel_and_ground_speed
 from terrain.estimation.resampling import low_pass
 from terrain.records import RunLog, StateTrack, Stream
 from terrain.robots import load_robot
@@ -52,18 +52,20 @@ def test_truth_comes_behind_the_low_pass_that_the_filter_was_fed_through(run):
 
 def test_slip_speed_and_slip_ratio_are_two_ways_to_say_one_thing(run):
     truth = run.streams["truth"]
-    rim, ground = rim_and_ground_speed(truth, ROBOT)
+    wheel_speed, ground = wheel_and_ground_speed(truth, ROBOT)
     for i in range(3):
         slip = truth.channel(f"slip_{i + 1}_ratio")
-        fastest = np.maximum(np.abs(rim[:, i]), np.abs(ground[:, i]))
+        fastest = np.maximum(np.abs(wheel_speed[:, i]), np.abs(ground[:, i]))
         moving = np.isfinite(slip) & (fastest > 0.2)
-        np.testing.assert_allclose((rim - ground)[moving, i] / fastest[moving], slip[moving], atol=0.01)
+        np.testing.assert_allclose(
+            (wheel_speed - ground)[moving, i] / fastest[moving], slip[moving], atol=0.01
+        )
 
 
 def test_slip_behind_the_low_pass_is_the_slip_where_driving_is_steady(run):
     truth = run.streams["truth"]
     slip, ground = lagged_slip(truth, ROBOT, 0.05)
-    np.testing.assert_array_equal(lagged_slip(truth, ROBOT, 0.0)[1], rim_and_ground_speed(truth, ROBOT)[1])
+    np.testing.assert_array_equal(lagged_slip(truth, ROBOT, 0.0)[1], wheel_and_ground_speed(truth, ROBOT)[1])
     steady = (truth.time_s > 4.0) & (truth.time_s < 7.0)
     told = np.column_stack([truth.channel(f"slip_{i}_ratio") for i in (1, 2, 3)])
     assert np.abs(slip[steady].mean(axis=0) - told[steady].mean(axis=0)).max() < 0.002

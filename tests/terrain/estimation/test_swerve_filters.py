@@ -72,8 +72,8 @@ def raw_slip(model, track, z):
         steer, turn = track.state(f"steer_{i + 1}_rad"), track.state("yaw_rate_radps")
         along, across = track.state("speed_x_mps") - turn * y_m, track.state("speed_y_mps") + turn * x_m
         speed = along * np.cos(steer) + across * np.sin(steer)
-        rim = z[:, model.rows.index(f"wheel_{i + 1}_radps")] * ROBOT.wheel_radius_m
-        slips.append((rim - speed) / np.maximum(np.abs(rim), np.abs(speed)))
+        wheel_speed = z[:, model.rows.index(f"wheel_{i + 1}_radps")] * ROBOT.wheel_radius_m
+        slips.append((wheel_speed - speed) / np.maximum(np.abs(wheel_speed), np.abs(speed)))
     return np.column_stack(slips)
 
 
@@ -489,8 +489,8 @@ def test_wheels_at_right_angles_at_the_start_are_found():
         ),
         (lambda: default_noise("vio15", load_robot("husky")), "robot husky has the drive 'skid_steer'"),
         (lambda: make_filter("vio15", dataclasses.replace(ROBOT, camera=None)), "has no section 'camera'"),
-        (lambda: thesis_noise("vio12", ROBOT, 0.0), "sample_time_s is 0.0, seconds above zero are wanted"),
-        (lambda: adaptive_noise(ROBOT, -1.0), "factor is -1.0, a number above zero is wanted"),
+        (lambda: thesis_noise("vio12", ROBOT, 0.0), "sample_time_s is 0.0, seconds above zero are required"),
+        (lambda: adaptive_noise(ROBOT, -1.0), "factor is -1.0, a number above zero is required"),
     ],
 )
 def test_what_is_no_filter_is_refused(call, message):

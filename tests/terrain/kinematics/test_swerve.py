@@ -46,8 +46,8 @@ def test_forward_undoes_inverse_and_no_wheel_turns_more_than_a_quarter(twist, st
     assert np.abs(aim - steer).max() <= math.pi / 2 + 1e-12
     standing = wheel == 0
     np.testing.assert_array_equal(aim[standing], np.array(steer)[standing])
-    rim = RADIUS_M * wheel[:, None] * np.stack([np.cos(aim), np.sin(aim)], axis=-1)
-    np.testing.assert_allclose(rim, wheel_velocities(WHEELS_M, twist), atol=STANDING_MPS)
+    wheel_speed = RADIUS_M * wheel[:, None] * np.stack([np.cos(aim), np.sin(aim)], axis=-1)
+    np.testing.assert_allclose(wheel_speed, wheel_velocities(WHEELS_M, twist), atol=STANDING_MPS)
 
 
 def test_velocities_are_those_of_points_of_a_body_that_moves():
@@ -229,7 +229,7 @@ def test_commands_keep_every_limit_and_drive_waits_for_steering():
         (lambda: wheel_velocities([[0.5, 0.0]], [1, 0, 0]), r"positions_m has shape \(1, 2\)"),
         (lambda: wheel_velocities([[0.5, 0.0]] * 3, [1, 0, 0]), "positions_m holds one place only"),
         (lambda: wheel_velocities([[0, np.inf], [1, 0]], [1, 0, 0]), "positions_m holds inf, finite"),
-        (lambda: wheel_velocities(WHEELS_M, [1, 0]), r"twist has shape \(2,\), \(\.\.\., 3\) is wanted"),
+        (lambda: wheel_velocities(WHEELS_M, [1, 0]), r"twist has shape \(2,\), \(\.\.\., 3\) is required"),
         (lambda: wheel_velocities(WHEELS_M, [1, 0, np.nan]), "twist holds nan, finite numbers"),
         (lambda: wheel_velocities(WHEELS_M, ["left", 0, 0]), "twist cannot be read as an array of numbers"),
         (lambda: forward(WHEELS_M, 0.0, np.ones(3), np.ones(3)), "radius_m is 0.0, a number above zero"),
@@ -248,11 +248,11 @@ def test_commands_keep_every_limit_and_drive_waits_for_steering():
         (lambda: admissible_yaw_rate(WHEELS_M, 0.2, [1, 2], [1, 2, 3], 1), r"speed_x_mps \(2,\) and speed_y"),
         (
             lambda: wheel_commands(WHEELS_M, 0.2, 10, 2, 0.02, np.zeros((2, 5, 3)), np.zeros(3)),
-            r"twists have shape \(2, 5, 3\), \(n, 3\) is wanted",
+            r"twists have shape \(2, 5, 3\), \(n, 3\) is required",
         ),
         (
             lambda: wheel_commands(WHEELS_M, 0.2, 10, 2, 0.02, np.zeros((5, 3)), np.zeros((5, 3))),
-            r"steer_0 has shape \(5, 3\), \(3,\) is wanted",
+            r"steer_0 has shape \(5, 3\), \(3,\) is required",
         ),
         (lambda: wheel_commands(WHEELS_M, 0.2, 10, 2, 0, np.zeros((5, 3)), np.zeros(3)), "dt_s is 0,"),
     ],

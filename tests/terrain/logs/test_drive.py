@@ -326,9 +326,9 @@ def test_straight_on_the_wheels_run_a_little_ahead_of_the_ground(husky_runs):
     for run in husky_runs:
         left, right = run.streams["wheels"].values[N:].T
         speed = run.streams["lidar"].channel("speed_x_mps")[N:]
-        rim = (left + right) / 2
-        if np.abs(left - right).mean() < 0.15 and np.abs(rim).mean() > 0.3:
-            ratios.append(np.nanmean(speed) / rim.mean())
+        wheel_speed = (left + right) / 2
+        if np.abs(left - right).mean() < 0.15 and np.abs(wheel_speed).mean() > 0.3:
+            ratios.append(np.nanmean(speed) / wheel_speed.mean())
         start = run.streams["wheels"].values[[0, N - 1]].mean(axis=1)
         accelerations.append(
             (start[1] - start[0], run.streams["imu"].channel("accel_x_mps2")[:N].mean() * 1.95)

@@ -16,12 +16,12 @@ from terrain.simulation.conditions import Conditions, Faults, draw_conditions, l
         ({"payload_kg": -1.0}, "payload_kg is -1.0, a number from zero up"),
         ({"payload_m": (0.0, math.inf)}, r"payload_m is \(0.0, inf\), a finite number"),
         ({"grade_ratio": (0.0, 1.2)}, r"grade_ratio is \(0.0, 1.2\), a gradient from -1 to 1"),
-        ({"swell_ratio": -2.0}, "swell_ratio is -2.0"),
-        ({"swell_length_m": 0.0}, "swell_length_m is 0.0, a number above zero"),
+        ({"undulation_ratio": -2.0}, "undulation_ratio is -2.0"),
+        ({"undulation_length_m": 0.0}, "undulation_length_m is 0.0, a number above zero"),
         ({"radius_factors": (1.0, 0.0, 1.0)}, r"radius_factors is \(1.0, 0.0, 1.0\), a number above zero"),
         ({"roughness_factor": -0.1}, "roughness_factor is -0.1, a number from zero up"),
-        ({"leg_play_rad": -0.01}, "leg_play_rad is -0.01, an angle from 0 to 0.5 rad"),
-        ({"leg_play_rad": math.nan}, "leg_play_rad is nan"),
+        ({"leg_backlash_rad": -0.01}, "leg_backlash_rad is -0.01, an angle from 0 to 0.5 rad"),
+        ({"leg_backlash_rad": math.nan}, "leg_backlash_rad is nan"),
         ({"field_length_m": math.nan}, "field_length_m is nan"),
     ],
 )
@@ -43,7 +43,7 @@ def test_conditions_scatter_around_the_nominal_ones_as_the_spread_says():
         payload_kg=5.0,
         payload_m=(0.05, -0.02),
         grade_ratio=(0.05, 0.0),
-        swell_ratio=0.01,
+        undulation_ratio=0.01,
         radius_factors=(1.02, 1.0, 0.97),
         roughness_factor=2.0,
     )
@@ -53,7 +53,7 @@ def test_conditions_scatter_around_the_nominal_ones_as_the_spread_says():
     low, high = np.sqrt(chi2.ppf([1e-5, 1 - 1e-5], n - 1) / (n - 1))
     for name, centre, std in (
         ("grade_ratio", nominal.grade_ratio, spread.grade_std_ratio),
-        ("swell_ratio", 0.01, spread.swell_std_ratio),
+        ("undulation_ratio", 0.01, spread.undulation_std_ratio),
         ("radius_factors", nominal.radius_factors, spread.radius_std_ratio),
     ):
         values = np.array([getattr(one, name) for one in drawn])
@@ -74,7 +74,7 @@ def test_the_same_generator_draws_the_same_day_and_no_spread_draws_the_nominal_o
     spread = load_spread()
     one, again = (draw_conditions(spread, np.random.default_rng(7)) for _ in range(2))
     assert one == again != draw_conditions(spread, np.random.default_rng(8))
-    lengths = {"swell_length_m": 15.0, "field_length_m": 0.5}
+    lengths = {"undulation_length_m": 15.0, "field_length_m": 0.5}
     none = dataclasses.replace(
         spread,
         **{item.name: 0.0 for item in dataclasses.fields(spread) if item.name not in lengths},
@@ -85,6 +85,6 @@ def test_the_same_generator_draws_the_same_day_and_no_spread_draws_the_nominal_o
         payload_m=(0.1, 0.0),
         grade_ratio=(0.1, 0.0),
         radius_factors=(0.99, 1.0, 1.0),
-        leg_play_rad=0.02,
+        leg_backlash_rad=0.02,
     )
     assert draw_conditions(none, np.random.default_rng(0), nominal) == nominal

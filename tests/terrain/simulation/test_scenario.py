@@ -51,8 +51,8 @@ def test_every_scenario_can_be_driven_by_the_robot_and_is_at_rest_where_it_says(
             change[change[:, 0].argmax()] = 0.0
         assert np.hypot(change[:, 0], change[:, 1]).max() <= ACCEL_MPS2 * (1 + 1e-9)
         assert change[:, 2].max() <= YAW_ACCEL_RADPS2 * (1 + 1e-9)
-        rim_mps = np.linalg.norm(wheel_velocities(ROBOT.wheel_positions_m, drive.twist), axis=-1)
-        assert rim_mps.max() <= ROBOT.wheel_radius_m * ROBOT.motors.speed_max_radps * (1 + 1e-9)
+        wheel_speed_mps = np.linalg.norm(wheel_velocities(ROBOT.wheel_positions_m, drive.twist), axis=-1)
+        assert wheel_speed_mps.max() <= ROBOT.wheel_radius_m * ROBOT.motors.speed_max_radps * (1 + 1e-9)
 
 
 @pytest.mark.parametrize("name", [name for name in SCENARIOS if name not in ("crab", "course")])
@@ -311,14 +311,14 @@ def test_other_scenarios_are_driven_on_one_terrain(name):
     ("options", "message"),
     [
         ({"name": "zigzag"}, "scenario 'zigzag' is unknown: use one of stand, straight"),
-        ({"terrains": []}, r"terrains are \[\]: one name or several are wanted"),
+        ({"terrains": []}, r"terrains are \[\]: one name or several are required"),
         ({"terrains": ""}, "terrains are ''"),
         ({"terrains": ["grass", 3]}, r"terrains are \['grass', 3\]"),
         ({"duration_s": -1.0}, "duration_s is -1.0, a time from"),
         ({"duration_s": 0}, "duration_s is 0, a time from"),
         ({"duration_s": math.nan}, "duration_s is nan"),
         ({"duration_s": math.inf}, "duration_s is inf"),
-        ({"duration_s": 1e12}, "duration_s is 1000000000000.0, a time from 0.02 to 3600 s is wanted"),
+        ({"duration_s": 1e12}, "duration_s is 1000000000000.0, a time from 0.02 to 3600 s is required"),
         ({"duration_s": "long"}, "duration_s is 'long'"),
         ({"speed_mps": 2.1}, "speed_mps is 2.1: robot agrimaro drives above 0 and up to 2 m/s"),
         ({"speed_mps": 0.0}, "speed_mps is 0.0"),

@@ -386,8 +386,8 @@ def test_turning_on_an_even_slope_rolls_nothing_and_a_swell_pitches():
     )
     gyro = columns_of(imu_stream(turning, SILENT_IMU, rng())[0], "gyro_{}_radps", "xyz")[10:]
     np.testing.assert_allclose(gyro, [[0.0, 0.0, 0.5]] * len(gyro), atol=1e-6)  # 0.05 were it Euler's angles
-    swell = motion_of(10.0, grade_x_ratio=0.05 * np.sin(time_s), grade_y_ratio=0.03 * np.sin(2 * time_s))
-    imu, _ = imu_stream(swell, SILENT_IMU, rng())
+    undulation = motion_of(10.0, grade_x_ratio=0.05 * np.sin(time_s), grade_y_ratio=0.03 * np.sin(2 * time_s))
+    imu, _ = imu_stream(undulation, SILENT_IMU, rng())
     for axis, angle in (("x", "roll"), ("y", "pitch")):
         turned = np.cumsum(imu.channel(f"gyro_{axis}_radps")) / 100
         told = imu.channel(f"{angle}_rad")

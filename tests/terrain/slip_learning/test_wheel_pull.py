@@ -128,9 +128,9 @@ def test_hard_ground_is_swept_past_its_peak():
 
 def test_contact_slip_settles_at_the_slip_ratio_over_its_relaxation_length():
     time_s = np.arange(0.0, 3.0, 0.02)
-    rim, ground, length_m = 1.0, 0.8, 0.05
-    slip = contact_slip(time_s, np.full(150, rim - ground), np.full(150, rim), length_m)
-    np.testing.assert_allclose(slip, 0.2 * (1 - np.exp(-time_s * rim / length_m)), atol=1e-12)
+    wheel_speed, ground, length_m = 1.0, 0.8, 0.05
+    slip = contact_slip(time_s, np.full(150, wheel_speed - ground), np.full(150, wheel_speed), length_m)
+    np.testing.assert_allclose(slip, 0.2 * (1 - np.exp(-time_s * wheel_speed / length_m)), atol=1e-12)
     still = contact_slip(time_s, np.zeros(150), np.zeros(150), length_m)
     assert not still.any()
 

@@ -50,12 +50,12 @@ def scatter_of(entry):
         (lambda d: d.pop("law"), "key 'law' is missing"),
         (lambda d: d.update(law="pacejka"), "law 'pacejka' is unknown: use one of janosi, magic"),
         (lambda d: d.update(law=["janosi"]), "law ['janosi'] is unknown"),
-        (lambda d: d.update(name=7), "name is 7, a word is wanted"),
+        (lambda d: d.update(name=7), "name is 7, a word is required"),
         (lambda d: d.update(colour="red"), "key 'colour' is unknown"),
         (lambda d: d.update(law="magic"), "key 'cohesion_pa' is unknown (accepted: name, law,"),
         (lambda d: d.pop("shear_modulus_m"), "key 'shear_modulus_m' is missing"),
         (lambda d: d.pop("kc_npmn1"), "key 'kc_npmn1' is missing"),
-        (lambda d: d["kc_npmn1"].update(unit="npm"), "kc_npmn1 has the unit 'npm', 'npmn1' is wanted"),
+        (lambda d: d["kc_npmn1"].update(unit="npm"), "kc_npmn1 has the unit 'npm', 'npmn1' is required"),
         (lambda d: d["friction_angle_rad"].update(value=28.0), "friction_angle_rad is 28, at most 1.2"),
         (lambda d: d["shear_modulus_m"].update(value=0.0), "shear_modulus_m is 0.0, a number above zero"),
         (lambda d: d["cohesion_pa"].update(value=-1.0), "cohesion_pa is -1.0, a number from zero up"),
@@ -97,7 +97,7 @@ def test_an_unknown_soil_is_named(name):
 def test_a_file_that_is_no_mapping_is_refused(tmp_path):
     path = tmp_path / "list.yaml"
     path.write_text("- clay\n")
-    with pytest.raises(ConfigError, match=r"list\.yaml is \['clay'\], a mapping with name, law is wanted"):
+    with pytest.raises(ConfigError, match=r"list\.yaml is \['clay'\], a mapping with name, law is required"):
         load_soil(path)
 
 

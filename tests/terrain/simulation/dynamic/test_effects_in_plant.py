@@ -63,10 +63,10 @@ def slope(x, y):
 def rolling(run, robot):
     wheels = run.streams["wheels"]
     rates = np.column_stack([wheels.channel(f"motor_{i}_radps") for i in (1, 2, 3)])
-    rim = rates.mean(axis=1) / robot.motors.reduction_ratio * robot.wheel_radius_m
+    wheel_speed = rates.mean(axis=1) / robot.motors.reduction_ratio * robot.wheel_radius_m
     camera = run.streams["odometry"]
     seen = body_motion(camera, robot.camera).speed_mps[:, 0]
-    return slope(rim, np.interp(wheels.time_s, camera.time_s, seen))
+    return slope(wheel_speed, np.interp(wheels.time_s, camera.time_s, seen))
 
 
 def twist_error(component):
@@ -224,7 +224,7 @@ CASES = {
         )
         for i, component in ((1, 2), (2, 2), (3, 1))
     },
-    "steering_play": ((0.04,), "complex", "grass", LEVEL, play, 0.04, True),
+    "steering_backlash": ((0.04,), "complex", "grass", LEVEL, play, 0.04, True),
     "steering_delay": ((0.08,), "complex", "grass", LEVEL, steering_late, 0.08, True),
     "gyro_bias": ((0.03,), "straight", "grass", LEVEL, standing("gyro_z_radps"), 0.03, True),
     "gyro_scale": ((-0.05,), "spot_turn", "tiles", LEVEL, gyro_slope, -0.05, True),
@@ -272,16 +272,16 @@ def test_every_effect_is_tried():
 
 @pytest.mark.parametrize("name", CASES)
 def test_a_hidden_effect_shows_with_its_sign_and_size(name):
-    values, scenario, soil, grade, feature, wanted, can_be_corrected = CASES[name]
+    values, scenario, soil, grade, feature, desired, can_be_corrected = CASES[name]
     effects = parameters(name, values)
     clean, run = driven(scenario, soil, grade), driven(scenario, soil, grade, tuple(effects.items()))
-    wanted = change_of(name, clean, run, values) if wanted is None else wanted
+    desired = change_of(name, clean, run, values) if desired is None else desired
     change = feature(run, ROBOT) - feature(clean, ROBOT)
-    assert change == pytest.approx(wanted, rel=0.15)
+    assert change == pytest.approx(desired, rel=0.15)
     if can_be_corrected:
         robot = replace(ROBOT, effects=effects)
         left = feature(corrected_log(run, robot), corrected(robot)) - feature(clean, ROBOT)
-        assert abs(left) < 0.1 * abs(wanted)
+        assert abs(left) < 0.1 * abs(desired)
         assert not corrected(robot).effects
 
 
@@ -323,7 +323,7 @@ def test_the_fused_yaw_has_the_gyros_scale_and_bias():
 def test_absent_effects_leave_every_byte():
     none = dict.fromkeys((p.name for e in library_of("swerve") for p in e.parameters), 0.0)
     drive = make_scenario("complex", ROBOT, "grass", 30.0)
-    options = {"conditions": Conditions(leg_play_rad=0.02, grade_ratio=(0.03, 0.05)), "gnss": Gnss()}
+    options = {"conditions": Conditions(leg_backlash_rad=0.02, grade_ratio=(0.03, 0.05)), "gnss": Gnss()}
     one, other = (
         simulate(ROBOT, drive, {"grass": load_soil("grass")}, 0, effects=effects, **options)
         for effects in (None, none)

@@ -24,7 +24,7 @@ from terrain.terramechanics.traction import ground_array
 ROBOT = load_robot("agrimaro")
 SOILS = {name: load_soil(name) for name in soil_names()}
 STAND = Command(np.zeros(3), np.zeros(3), np.zeros(3), {})
-HILLY = Conditions(grade_ratio=(0.05, -0.03), swell_ratio=0.02, payload_kg=15.0, leg_play_rad=0.02)
+HILLY = Conditions(grade_ratio=(0.05, -0.03), undulation_ratio=0.02, payload_kg=15.0, leg_backlash_rad=0.02)
 
 
 class Listener:
@@ -142,9 +142,9 @@ def test_pieces_between_commands_are_the_drive_in_which_each_step_has_its_own(de
         payload_m=(0.1, 0.0),
         radius_factors=np.ones(3),
         grade_ratio=(0.03, 0.02),
-        swell_ratio=0.0,
-        swell_length_m=15.0,
-        leg_play_rad=0.02,
+        undulation_ratio=0.0,
+        undulation_length_m=15.0,
+        leg_backlash_rad=0.02,
         grounds=np.array([ground_array(soil, ROBOT.wheel_radius_m, 0.1, 0.12)]),
         roughness_m3=np.array([1e-4]),
         patch_start_m=np.zeros(1),
@@ -216,8 +216,10 @@ def test_the_same_controller_and_seed_give_the_same_log_and_no_status_no_stream(
 
 def test_a_leg_with_play_leads_the_robot_astray_and_its_encoder_knows_nothing():
     runs = [
-        run_of("starts", "grass", seed=1, duration_s=20.0, conditions=Conditions(leg_play_rad=play_rad))
-        for play_rad in (0.0, 0.03)
+        run_of(
+            "starts", "grass", seed=1, duration_s=20.0, conditions=Conditions(leg_backlash_rad=backlash_rad)
+        )
+        for backlash_rad in (0.0, 0.03)
     ]
     firm, loose = (run.streams["truth"] for run in runs)
     assert np.abs(firm.channel("steer_3_rad")).max() <= ROBOT.steering.dead_band_rad
@@ -232,7 +234,7 @@ def test_a_leg_with_play_leads_the_robot_astray_and_its_encoder_knows_nothing():
 @pytest.mark.parametrize("delay_s", [-0.01, 0.51, math.nan, math.inf, "soon", None, True])
 def test_a_delay_that_is_none_is_refused(delay_s):
     for controller in (None, kinematic):
-        with pytest.raises(ConfigError, match=r"command_delay_s is .*, a time from 0 to 0.5 s is wanted"):
+        with pytest.raises(ConfigError, match=r"command_delay_s is .*, a time from 0 to 0.5 s is required"):
             run_of("straight", "grass", controller, duration_s=4.0, command_delay_s=delay_s)
 
 

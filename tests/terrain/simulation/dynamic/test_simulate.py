@@ -21,7 +21,7 @@ HILLY = Conditions(
     payload_kg=15.0,
     payload_m=(0.1, -0.1),
     grade_ratio=(0.05, -0.03),
-    swell_ratio=0.02,
+    undulation_ratio=0.02,
     radius_factors=(1.01, 0.99, 1.0),
 )
 
@@ -108,11 +108,11 @@ def test_the_truth_agrees_with_itself():
     )
     along = np.cos(steer) * centre[:, 0] + np.sin(steer) * centre[:, 1]
     across = -np.sin(steer) * centre[:, 0] + np.cos(steer) * centre[:, 1]
-    rim = radius * wheels_of(truth, "wheel_{}_radps")
-    fastest = np.maximum(abs(rim), abs(along))
+    wheel_speed = radius * wheels_of(truth, "wheel_{}_radps")
+    fastest = np.maximum(abs(wheel_speed), abs(along))
     slip = wheels_of(truth, "slip_{}_ratio")
     known = fastest >= 0.051
-    np.testing.assert_allclose(slip[known], ((rim - along) / fastest)[known], atol=1e-9)
+    np.testing.assert_allclose(slip[known], ((wheel_speed - along) / fastest)[known], atol=1e-9)
     assert np.isnan(slip[fastest < 0.049]).all()
     angle = wheels_of(truth, "slip_angle_{}_rad")
     moving = np.hypot(along, across) > 0.051

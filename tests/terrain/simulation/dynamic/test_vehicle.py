@@ -51,16 +51,16 @@ STICKY = Soil(
 )
 
 
-def plant_of(*soils, roughness_m3=0.0, starts_m=(0.0,), play_rad=0.0, com_height_m=None, **changes):
+def plant_of(*soils, roughness_m3=0.0, starts_m=(0.0,), backlash_rad=0.0, com_height_m=None, **changes):
     """Return the plant of the robot on even ground without scatter; no play unless it is asked for."""
     given = {
         "payload_kg": 0.0,
         "payload_m": (0.0, 0.0),
         "radius_factors": np.ones(3),
         "grade_ratio": (0.0, 0.0),
-        "swell_ratio": 0.0,
-        "swell_length_m": 15.0,
-        "leg_play_rad": 0.0,
+        "undulation_ratio": 0.0,
+        "undulation_length_m": 15.0,
+        "leg_backlash_rad": 0.0,
         "field": np.ones((2, 3, 1)),
     }
     plant = make_plant(
@@ -75,7 +75,7 @@ def plant_of(*soils, roughness_m3=0.0, starts_m=(0.0,), play_rad=0.0, com_height
             com_height_m=com_height_m,
             load_per_force_ratio=plant.load_per_force_ratio * com_height_m / plant.com_height_m,
         )
-    return plant._replace(play_rad=play_rad)
+    return plant._replace(backlash_rad=backlash_rad)
 
 
 def drive(plant, wheel_radps, steer_rad=None, seed=None, settled=False):
@@ -126,27 +126,27 @@ def reference(plant, wheel_radps, steer_rad, substeps, noise, dt_s=STEP_S, steer
     rows = []
     for k in range(len(noise)):
         c, s = math.cos(yaw), math.sin(yaw)
-        swell = plant.swell_ratio * math.sin(2 * math.pi * path / plant.swell_length_m)
-        world = plant.grade_ratio + np.array([swell, 0.0])
+        undulation = plant.undulation_ratio * math.sin(2 * math.pi * path / plant.undulation_length_m)
+        world = plant.grade_ratio + np.array([undulation, 0.0])
         grade = np.array([[c, s], [-s, c]]) @ world
         normal_g = GRAVITY_MPS2 / math.sqrt(1 + grade @ grade)
 
         error = steer_rad[k // substeps] - motor
-        wanted = np.sign(error) * np.sqrt(2 * plant.steer_accel_max_radps2 * abs(error))
-        wanted = np.clip(wanted, -plant.steer_rate_max_radps, plant.steer_rate_max_radps)
-        wanted = np.where(abs(error) < 1e-4, error / dt_s, wanted)
+        desired = np.sign(error) * np.sqrt(2 * plant.steer_accel_max_radps2 * abs(error))
+        desired = np.clip(desired, -plant.steer_rate_max_radps, plant.steer_rate_max_radps)
+        desired = np.where(abs(error) < 1e-4, error / dt_s, desired)
         most = plant.steer_accel_max_radps2 * dt_s
-        motor_rate = motor_rate + np.clip(wanted - motor_rate, -most, most)
+        motor_rate = motor_rate + np.clip(desired - motor_rate, -most, most)
         motor = motor + dt_s * motor_rate
-        steer = np.clip(steer, motor - plant.play_rad, motor + plant.play_rad)
+        steer = np.clip(steer, motor - plant.backlash_rad, motor + plant.backlash_rad)
 
         heading = steer + np.array([0.0, 0.0, leg])
         ahead = np.array([np.cos(heading), np.sin(heading)])
         left = np.array([-ahead[1], ahead[0]])
         centre = np.array([v[0] - turn * y, v[1] + turn * x])
         along, across = (ahead * centre).sum(axis=0), (left * centre).sum(axis=0)
-        rim = rate * plant.radius_m
-        fastest = np.maximum(abs(rim), abs(along))
+        wheel_speed = rate * plant.radius_m
+        fastest = np.maximum(abs(wheel_speed), abs(along))
 
         speed = math.hypot(*v)
         reach = plant.wheels_m @ v / speed if speed > 0.05 else np.zeros(3)
@@ -163,17 +163,17 @@ def reference(plant, wheel_radps, steer_rad, substeps, noise, dt_s=STEP_S, steer
         ride_n = plant.ride_stiffness_npm * (contact - ride) + plant.ride_damping_nspm * (
             contact_rate - ride_rate
         )
-        ride_rate = ride_rate + dt_s * ride_n / (mass * plant.load_share)
+        ride_rate = ride_rate + dt_s * ride_n / (mass * plant.load_fraction)
         ride = ride + dt_s * ride_rate
 
         pushed = mass * (accel + normal_g * grade)  # what the ground gives along the body's axes
         arms = mass * normal_g * plant.com_m - height * pushed
         normal = np.maximum(np.linalg.solve(balance, [mass * normal_g, *arms]) + ride_n, 0.0)
 
-        def creep(rim, along=along, across=across, fastest=fastest, deflection=deflection):
-            return np.array([rim - along, -across]) - fastest / plant.relaxation_m * deflection
+        def creep(wheel_speed, along=along, across=across, fastest=fastest, deflection=deflection):
+            return np.array([wheel_speed - along, -across]) - fastest / plant.relaxation_m * deflection
 
-        slip = (deflection + DEFLECTION_DAMPING_S * creep(rim)) / plant.relaxation_m
+        slip = (deflection + DEFLECTION_DAMPING_S * creep(wheel_speed)) / plant.relaxation_m
         got = np.array(
             [
                 wheel_ground(plant.grounds[patch[i]], normal[i], np.clip(slip[0, i], -1, 1), slip[1, i])
@@ -194,7 +194,20 @@ def reference(plant, wheel_radps, steer_rad, substeps, noise, dt_s=STEP_S, steer
         torque = torque + (asked - torque) * dt_s / plant.torque_time_constant_s
         rest = torque - plant.friction_nm * np.tanh(rate / 0.1) - thrust * plant.radius_m
         rows.append(
-            [*v, yaw, turn, path, *rate, *heading, *normal, *(rim - along), *torque, *ride, *reported, *patch]
+            [
+                *v,
+                yaw,
+                turn,
+                path,
+                *rate,
+                *heading,
+                *normal,
+                *(wheel_speed - along),
+                *torque,
+                *ride,
+                *reported,
+                *patch,
+            ]
         )
         rate = rate + dt_s * rest / plant.wheel_inertia_kgm2
         estimate = estimate + (rate - estimate) * dt_s / plant.estimate_time_constant_s
@@ -210,7 +223,7 @@ def reference(plant, wheel_radps, steer_rad, substeps, noise, dt_s=STEP_S, steer
         leg_nm = -plant.wheels_m[2, 1] * force[0, 2]
         if abs(leg_nm) > LEG_FRICTION_NM:
             swung = leg + dt_s * LEG_RATE_RADPS * np.sign(leg_nm)
-            leg = float(np.clip(swung, -plant.leg_play_rad, plant.leg_play_rad))
+            leg = float(np.clip(swung, -plant.leg_backlash_rad, plant.leg_backlash_rad))
         accel = force.sum(axis=1) / mass - normal_g * grade
         v = v + dt_s * (accel + turn * np.array([v[1], -v[0]]))
         turn = turn + dt_s * moment / plant.yaw_inertia_kgm2
@@ -232,14 +245,14 @@ def test_a_drive_with_everything_in_it_is_that_of_the_plain_form():
         load_soil("grass"),
         roughness_m3=5e-4,
         starts_m=(0.0, 0.2, 0.6),
-        play_rad=0.02,
+        backlash_rad=0.02,
         payload_kg=25.0,
         payload_m=(0.1, -0.08),
         radius_factors=np.array([1.01, 0.99, 1.0]),
         grade_ratio=(0.04, -0.06),
-        swell_ratio=0.03,
-        swell_length_m=2.0,
-        leg_play_rad=0.03,
+        undulation_ratio=0.03,
+        undulation_length_m=2.0,
+        leg_backlash_rad=0.03,
         field=rng.uniform(0.8, 1.2, (2, 3, 9)),
     )
     wheel, steer = 6 * rng.random((75, 3)), np.cumsum(0.1 * rng.standard_normal((75, 3)), axis=0)
@@ -282,7 +295,11 @@ def test_a_drive_with_everything_in_it_is_that_of_the_plain_form():
 
 def test_a_drive_in_two_parts_is_one_drive():
     plant = plant_of(
-        load_soil("grass"), roughness_m3=1e-3, grade_ratio=(0.05, 0.02), play_rad=0.02, leg_play_rad=0.02
+        load_soil("grass"),
+        roughness_m3=1e-3,
+        grade_ratio=(0.05, 0.02),
+        backlash_rad=0.02,
+        leg_backlash_rad=0.02,
     )
     rng = np.random.default_rng(0)
     wheel, steer, noise = 5 * rng.random((20, 3)), 0.3 * rng.random((20, 3)), rng.standard_normal((400, 3))
@@ -307,8 +324,8 @@ def test_a_straight_start_is_that_of_the_equations_integrated_by_scipy():
 
     def change(t, state):
         v, rate, deflection, torque, integral, estimate = state
-        rim = rate * radius
-        creep = rim - v - max(abs(rim), abs(v)) / sigma * deflection
+        wheel_speed = rate * radius
+        creep = wheel_speed - v - max(abs(wheel_speed), abs(v)) / sigma * deflection
         thrust, _, resistance, _ = wheel_ground(
             ground, load_n, (deflection + DEFLECTION_DAMPING_S * creep) / sigma, 0.0
         )
@@ -408,7 +425,9 @@ def test_a_steady_start_lightens_the_front_wheel_by_m_a_h_over_the_wheelbase():
 
 
 def test_at_rest_on_the_level_nothing_at_all_happens():
-    motion = drive(plant_of(load_soil("grass"), roughness_m3=1e-3, play_rad=0.02), np.zeros((100, 3)), seed=0)
+    motion = drive(
+        plant_of(load_soil("grass"), roughness_m3=1e-3, backlash_rad=0.02), np.zeros((100, 3)), seed=0
+    )
     assert np.ptp(np.nan_to_num(motion.record), axis=0).max() == 0.0
     assert np.isnan(motion.wheel("slip_ratio")).all()
     assert np.isnan(motion.wheel("slip_angle_rad")).all()
@@ -423,7 +442,7 @@ def test_at_rest_on_the_level_nothing_at_all_happens():
 def test_at_rest_on_a_slope_of_5_degrees_it_stays(name, way_rad):
     tan = math.tan(math.radians(5.0))
     plant = plant_of(
-        load_soil(name), grade_ratio=(tan * math.cos(way_rad), tan * math.sin(way_rad)), play_rad=0.02
+        load_soil(name), grade_ratio=(tan * math.cos(way_rad), tan * math.sin(way_rad)), backlash_rad=0.02
     )
     motion = drive(plant, np.zeros((500, 3)), settled=True)
     moved_m = np.hypot(motion.body("position_x_m"), motion.body("position_y_m"))
@@ -445,7 +464,7 @@ def test_mirrored_commands_give_mirrored_motion():
     motions = []
     for sign, order in ((1.0, [0, 1, 2]), (-1.0, swap)):
         plant = plant_of(
-            load_soil("grass"), roughness_m3=1e-3, grade_ratio=(sign * 0.05, 0.03), play_rad=0.02
+            load_soil("grass"), roughness_m3=1e-3, grade_ratio=(sign * 0.05, 0.03), backlash_rad=0.02
         )
         record, state = np.empty((2000, N_RECORD)), start_state(plant, np.zeros(3))
         args = (np.ascontiguousarray(sign * a[:, order]) for a in (wheel, steer))
@@ -484,8 +503,8 @@ def test_mirrored_commands_give_mirrored_motion():
 )
 def test_where_nothing_slips_the_twist_is_the_one_told(twist):
     plant = plant_of(STICKY, com_height_m=0.0)
-    wanted = np.tile(twist, (300, 1)) * np.minimum(np.arange(300) / 75, 1.0)[:, None]
-    _, wheel, steer = wheel_commands(ROBOT.wheel_positions_m, 0.2, 10.0, 2.0, 0.02, wanted, np.zeros(3))
+    desired = np.tile(twist, (300, 1)) * np.minimum(np.arange(300) / 75, 1.0)[:, None]
+    _, wheel, steer = wheel_commands(ROBOT.wheel_positions_m, 0.2, 10.0, 2.0, 0.02, desired, np.zeros(3))
     motion = drive(plant, wheel, steer)
     reached = [motion.body(name)[-1] for name in ("speed_x_mps", "speed_y_mps", "yaw_rate_radps")]
     np.testing.assert_allclose(reached, twist, atol=5e-3)
@@ -514,10 +533,10 @@ def test_what_the_motors_give_is_what_is_stored_lifted_and_lost():
     assert given > lifted + friction + rolling
 
 
-@pytest.mark.parametrize("leg_play_rad", [0.0, 0.03])
-def test_what_the_motors_give_in_curves_is_lost_in_the_contacts_to_the_side_as_well(leg_play_rad):
+@pytest.mark.parametrize("leg_backlash_rad", [0.0, 0.03])
+def test_what_the_motors_give_in_curves_is_lost_in_the_contacts_to_the_side_as_well(leg_backlash_rad):
     soil = load_soil("grass")
-    plant = plant_of(soil, leg_play_rad=leg_play_rad)
+    plant = plant_of(soil, leg_backlash_rad=leg_backlash_rad)
     at = np.arange(400)[:, None]
     steer = np.clip(0.8 * np.sin(at / 60), -0.5, 0.5) * [-1.0, 1.0, 0.4]
     motion = drive(plant, ramp(8.0, 7.0), steer, settled=True)
@@ -545,25 +564,25 @@ def test_what_the_motors_give_in_curves_is_lost_in_the_contacts_to_the_side_as_w
 
 
 def test_the_third_leg_swings_to_where_its_wheel_is_pushed_and_no_further():
-    play_rad = 0.03
-    plant = plant_of(load_soil("grass"), leg_play_rad=play_rad)
-    wanted = np.interp(np.arange(3500) * STEP_S, [0.0, 0.5, 1.5, 2.5, 3.5], [0.0, 0.0, 5.0, 5.0, 0.0])
-    motion = smoothly(plant, wanted)
+    backlash_rad = 0.03
+    plant = plant_of(load_soil("grass"), leg_backlash_rad=backlash_rad)
+    desired = np.interp(np.arange(3500) * STEP_S, [0.0, 0.5, 1.5, 2.5, 3.5], [0.0, 0.0, 5.0, 5.0, 0.0])
+    motion = smoothly(plant, desired)
     leg, heading, t = motion.body("leg_rad"), motion.wheel("steer_rad"), motion.time_s
     assert np.abs(np.diff(leg)).max() <= LEG_RATE_RADPS * STEP_S * (1 + 1e-9)
     assert not leg[t < 0.5].any()
     # a start pushes the wheel, on the right, forward: the leg to the left
-    assert (leg[(t > 0.9) & (t < 1.5)] == play_rad).all()
-    assert (leg[(t > 2.9) & (t < 3.4)] == -play_rad).all()  # braking: the other way
-    crossing_s = (np.flatnonzero(leg == play_rad)[0] - np.flatnonzero(leg)[0] + 1) * STEP_S
-    assert crossing_s >= play_rad / LEG_RATE_RADPS - STEP_S
+    assert (leg[(t > 0.9) & (t < 1.5)] == backlash_rad).all()
+    assert (leg[(t > 2.9) & (t < 3.4)] == -backlash_rad).all()  # braking: the other way
+    crossing_s = (np.flatnonzero(leg == backlash_rad)[0] - np.flatnonzero(leg)[0] + 1) * STEP_S
+    assert crossing_s >= backlash_rad / LEG_RATE_RADPS - STEP_S
     np.testing.assert_array_equal(heading[:, 2], leg)  # nothing was steered
     assert not heading[:, :2].any()
 
 
 def test_a_leg_that_is_hardly_pushed_stays_where_it_is():
     slow = 0.5 * LEG_FRICTION_NM / 0.756 / 30.0  # half of what moves it, on a third of the mass
-    plant = plant_of(STICKY, leg_play_rad=0.03, com_height_m=0.0)
+    plant = plant_of(STICKY, leg_backlash_rad=0.03, com_height_m=0.0)
     motion = smoothly(plant, slow / 0.2 * np.arange(4000) * STEP_S)
     assert motion.body("speed_x_mps")[-1] == pytest.approx(4.0 * slow, rel=0.1)
     assert not motion.body("leg_rad").any()
@@ -624,7 +643,7 @@ def test_the_speed_loop_reaches_its_speed_and_does_not_wind_up():
 def test_steering_keeps_its_limits_overshoots_nothing_and_hangs_in_its_play():
     steer = np.tile([1.2, -0.7, 0.05], (100, 1))
     steer[60:] = 0.0
-    motion = drive(plant_of(load_soil("tiles"), play_rad=0.02), np.zeros((100, 3)), steer)
+    motion = drive(plant_of(load_soil("tiles"), backlash_rad=0.02), np.zeros((100, 3)), steer)
     angle = motion.wheel("steer_rad")
     assert np.abs(np.diff(angle, axis=0)).max() <= 2.0944 * STEP_S * (1 + 1e-9)
     assert np.abs(np.diff(angle[:1150, 0], n=2)).max() < 2.1 * STEP_S  # it picks the wheel up, no more
@@ -693,7 +712,7 @@ def test_a_larger_wheel_is_faster():
 
 def test_a_wheel_in_the_air_does_nothing_and_breaks_nothing():
     plant = plant_of(STICKY, payload_kg=60.0, payload_m=(0.0, 0.37))  # nearly over the line of wheels 1 and 2
-    assert plant.load_share[2] < 0.15
+    assert plant.load_fraction[2] < 0.15
     steer = np.tile([0.4, -0.4, 0.0], (150, 1))
     motion = drive(plant, ramp(3.0, 9.0) * [1.0, 1.0, 0.4], steer)
     normal = motion.wheel("normal_n")

@@ -75,13 +75,13 @@ def rich(robot, dt=DT, length_s=30.0):
     return np.column_stack([speed, 0.9 * speed, 1.1 * speed]), steer, grade, roll
 
 
-def told(robot, values, rim, steer=None, grade=None, roll=None, ground=FREE, dt=DT):
+def told(robot, values, wheel_speed, steer=None, grade=None, roll=None, ground=FREE, dt=DT):
     """Return channels (n,) by name."""
-    n = len(rim)
-    steer = np.zeros((n, rim.shape[1])) if steer is None else steer
+    n = len(wheel_speed)
+    steer = np.zeros((n, wheel_speed.shape[1])) if steer is None else steer
     grade = np.full(n, grade or 0.0) if np.ndim(grade) == 0 else grade
     roll = np.full(n, roll or 0.0) if np.ndim(roll) == 0 else roll
-    shown = replay(make_planar(robot, ground), vector_of(values), dt, rim, steer, grade, roll)
+    shown = replay(make_planar(robot, ground), vector_of(values), dt, wheel_speed, steer, grade, roll)
     return dict(zip(CHANNELS, shown.T, strict=True))
 
 
@@ -100,8 +100,8 @@ def test_the_wheels_of_a_twist_move_the_robot_by_that_twist(twist):
 @pytest.mark.parametrize("drive", ROBOTS)
 def test_an_effect_shows_most_where_the_library_says(drive):
     robot = still(ROBOTS[drive])
-    rim, steer, grade, roll = rich(robot)
-    inputs = (make_planar(robot, Ground()), DT, rim, steer, grade, roll)
+    wheel_speed, steer, grade, roll = rich(robot)
+    inputs = (make_planar(robot, Ground()), DT, wheel_speed, steer, grade, roll)
 
     def shown(values):
         return replay(inputs[0], vector_of(values), *inputs[1:])
@@ -158,18 +158,18 @@ def test_slip_follows_the_force_as_its_equation_says():
         np.testing.assert_allclose(free[SPEED_X], shown[SPEED_X])
 
 
-def a_contact_for_each_wheel(robot, ground, rim, steer, dt):
+def a_contact_for_each_wheel(robot, ground, wheel_speed, steer, dt):
     """Return speeds and yaw rate (n, 3) of the origin: each wheel slips by itself, by Euler's small steps."""
     wheels, body = robot.wheel_positions_m, robot.body
     com = np.array([body.com_x_m, body.com_y_m])
     arm, load_n = wheels - com, robot.mass_kg * GRAVITY_MPS2 / 3
     sigma, slip = body.relaxation_length_m, np.zeros((3, 2))
     v, w = np.zeros(2), 0.0
-    out = np.zeros((len(rim), 3))
-    for k in range(len(rim)):
+    out = np.zeros((len(wheel_speed), 3))
+    for k in range(len(wheel_speed)):
         heading = np.column_stack([np.cos(steer[k]), np.sin(steer[k])])
         over = v + w * np.column_stack([-arm[:, 1], arm[:, 0]])
-        rate = (rim[k][:, None] * heading - over - np.abs(rim[k])[:, None] * slip) / sigma
+        rate = (wheel_speed[k][:, None] * heading - over - np.abs(wheel_speed[k])[:, None] * slip) / sigma
         push = load_n / ground.slip_ratio * (slip + DEFLECTION_DAMPING_S * rate)
         along = (over * heading).sum(axis=1)
         resist = ground.rolling_ratio * load_n * along / np.hypot(along, ROLLING_MPS)
@@ -189,16 +189,16 @@ def test_three_wheels_that_slip_each_by_itself_move_as_one_twist_that_slips():
     t = dt * np.arange(n)
     ramp = np.clip(t, 0.0, 1.0)
     twist = np.column_stack([0.6 * ramp, 0.2 * ramp * np.sin(0.8 * t), 0.3 * ramp * np.sin(1.1 * t)])
-    rolled = [inverse(robot.wheel_positions_m, 1.0, wanted, np.zeros(3)) for wanted in twist]
-    rim, steer = (np.array(part) for part in zip(*rolled, strict=True))
-    rim, steer = np.ascontiguousarray(rim), np.unwrap(steer, axis=0)
-    each = a_contact_for_each_wheel(robot, ground, rim, steer, dt)
+    rolled = [inverse(robot.wheel_positions_m, 1.0, desired, np.zeros(3)) for desired in twist]
+    wheel_speed, steer = (np.array(part) for part in zip(*rolled, strict=True))
+    wheel_speed, steer = np.ascontiguousarray(wheel_speed), np.unwrap(steer, axis=0)
+    each = a_contact_for_each_wheel(robot, ground, wheel_speed, steer, dt)
     level = np.zeros(n)
     planar = make_planar(robot, ground)
-    one = move(planar, vector_of({}), dt, rim, steer, level, level, np.zeros((0, 3)))[:, :3]
+    one = move(planar, vector_of({}), dt, wheel_speed, steer, level, level, np.zeros((0, 3)))[:, :3]
     lost = np.abs(each - twist)[1000:].mean(axis=0)
     assert (np.abs(one - each)[1000:].mean(axis=0) < 0.1 * lost).all()
-    coarse = [np.ascontiguousarray(x[::40]) for x in (rim, steer, level)]
+    coarse = [np.ascontiguousarray(x[::40]) for x in (wheel_speed, steer, level)]
     coarse = move(planar, vector_of({}), 40 * dt, *coarse, coarse[-1], np.zeros((0, 3)))[:, :3]
     assert (np.abs(coarse - one[::40])[25:].mean(axis=0) < 0.01 * lost).all()
 
@@ -210,10 +210,10 @@ def test_a_bent_thrust_curve_slips_by_its_inverse_and_a_load_presses_as_much_as_
         n = len(robot.wheels)
         for grade in (0.0, 0.05):
             shown = told(still(robot), {}, at_rate([0.5] * n), grade=grade, ground=ground)[SPEED_X][-1]
-            wanted = 0.1 * shown / math.hypot(shown, ROLLING_MPS) + math.sin(grade)
+            desired = 0.1 * shown / math.hypot(shown, ROLLING_MPS) + math.sin(grade)
             if robot is HUSKY:
-                wanted = 0.1 * direction(shown) + math.sin(grade)
-            assert 1 - shown / 0.5 == pytest.approx(np.interp(wanted, 0.4 * share, s), rel=2e-3)
+                desired = 0.1 * direction(shown) + math.sin(grade)
+            assert 1 - shown / 0.5 == pytest.approx(np.interp(desired, 0.4 * share, s), rel=2e-3)
             loaded = told(
                 still(robot), {"payload_ratio": 0.5}, at_rate([0.5] * n), grade=grade, ground=ground
             )
@@ -221,10 +221,12 @@ def test_a_bent_thrust_curve_slips_by_its_inverse_and_a_load_presses_as_much_as_
 
 
 def test_a_tilt_that_is_not_felt_takes_no_traction_and_still_shows_in_the_accelerometer():
-    unfelt = Ground(felt_ratio=0.0)
+    unfelt = Ground(effective_ratio=0.0)
     for robot in ROBOTS.values():
-        rim = at_rate([0.5] * len(robot.wheels))
-        level, tilted = (told(still(robot), {}, rim, grade=g, roll=g, ground=unfelt) for g in (0.0, 0.1))
+        wheel_speed = at_rate([0.5] * len(robot.wheels))
+        level, tilted = (
+            told(still(robot), {}, wheel_speed, grade=g, roll=g, ground=unfelt) for g in (0.0, 0.1)
+        )
         for channel in (SPEED_X, SPEED_Y, CURRENT):
             np.testing.assert_allclose(tilted[channel], level[channel])
         assert tilted[ACCEL][-1] - level[ACCEL][-1] == pytest.approx(GRAVITY_MPS2 * math.sin(0.1))
@@ -241,8 +243,8 @@ def test_shear_slip_is_the_inverse_of_its_curve_and_starts_with_slope_one():
         assert math.isfinite(shear_slip(5.0, grip))
 
 
-def speeds(rim_mps, values, **options):
-    return told(still(HUSKY), values, at_rate(rim_mps), **options)
+def speeds(wheel_speed_mps, values, **options):
+    return told(still(HUSKY), values, at_rate(wheel_speed_mps), **options)
 
 
 def test_kinematic_effects_do_what_their_formulas_say():
@@ -273,28 +275,31 @@ def test_steering_effects_do_what_their_formulas_say():
     wheel, steer = inverse(
         robot.wheel_positions_m, robot.wheel_radius_m, np.array([0.6, 0.0, 0.2]), np.zeros(3)
     )
-    right, rim = told(robot, {}, at_rate(wheel * robot.wheel_radius_m), at_rate(steer)), at_rate(wheel * 0.2)
+    right, wheel_speed = (
+        told(robot, {}, at_rate(wheel * robot.wheel_radius_m), at_rate(steer)),
+        at_rate(wheel * 0.2),
+    )
     offsets = {f"steering_offset_{i}_rad": 0.03 * i for i in (1, 2, 3)}
-    put_off = told(robot, offsets, rim, at_rate(steer - 0.03 * np.arange(1, 4)))
+    put_off = told(robot, offsets, wheel_speed, at_rate(steer - 0.03 * np.arange(1, 4)))
     for channel in (GYRO, SPEED_X, SPEED_Y):
         np.testing.assert_allclose(put_off[channel], right[channel], atol=1e-9)
     swing = at_rate(steer) + 0.1 * np.sin(2 * TIME_S)[:, None]
-    late = told(robot, {"steering_delay_s": 0.1}, rim, swing)
-    moved = told(robot, {}, rim, np.vstack([np.repeat(swing[:1], 5, axis=0), swing[:-5]]))
+    late = told(robot, {"steering_delay_s": 0.1}, wheel_speed, swing)
+    moved = told(robot, {}, wheel_speed, np.vstack([np.repeat(swing[:1], 5, axis=0), swing[:-5]]))
     np.testing.assert_allclose(late[SPEED_Y], moved[SPEED_Y], atol=1e-12)
-    narrow = told(robot, {"steering_play_rad": 0.2}, rim, swing)  # wider than the swing
+    narrow = told(robot, {"steering_backlash_rad": 0.2}, wheel_speed, swing)  # wider than the swing
     np.testing.assert_allclose(narrow[SPEED_Y], right[SPEED_Y], atol=1e-9)
-    with_play = told(robot, {"steering_play_rad": 0.02}, rim, swing)[SPEED_Y]
-    assert 0.7 < np.ptp(with_play[N // 2 :]) / np.ptp(told(robot, {}, rim, swing)[SPEED_Y]) < 0.9
+    with_play = told(robot, {"steering_backlash_rad": 0.02}, wheel_speed, swing)[SPEED_Y]
+    assert 0.7 < np.ptp(with_play[N // 2 :]) / np.ptp(told(robot, {}, wheel_speed, swing)[SPEED_Y]) < 0.9
 
 
 def test_effects_of_sensors_do_what_their_formulas_say():
-    rim = skid(HUSKY, 0.5 + 0.2 * np.sin(1.5 * TIME_S), 0.4 * np.sin(1.1 * TIME_S))
+    wheel_speed = skid(HUSKY, 0.5 + 0.2 * np.sin(1.5 * TIME_S), 0.4 * np.sin(1.1 * TIME_S))
     robot = still(HUSKY)
-    plain = told(robot, {}, rim)
+    plain = told(robot, {}, wheel_speed)
 
     def change(**values):
-        return told(robot, values, rim)
+        return told(robot, values, wheel_speed)
 
     w, v = plain[GYRO], plain[SPEED_X]
     np.testing.assert_allclose(change(gyro_bias_radps=0.02)[GYRO], w + 0.02)
@@ -315,9 +320,9 @@ def test_effects_of_sensors_do_what_their_formulas_say():
     rated = change(clock_rate_ratio=0.01)[GYRO]
     np.testing.assert_allclose(rated[5:], CubicSpline(TIME_S, w)(0.99 * TIME_S)[5:], atol=1e-7)
     np.testing.assert_allclose(change(yaw_delay_s=0.04)[GYRO][2:], w[:-2], atol=1e-12)
-    lagged, lag_s = rim.copy(), 0.1
+    lagged, lag_s = wheel_speed.copy(), 0.1
     for k in range(1, N):  # T y' + y = x by the trapezoidal rule
-        push = 0.5 * DT * (rim[k - 1] + rim[k] - lagged[k - 1])
+        push = 0.5 * DT * (wheel_speed[k - 1] + wheel_speed[k] - lagged[k - 1])
         lagged[k] = (lag_s * lagged[k - 1] + push) / (lag_s + 0.5 * DT)
     undone = told(robot, {"encoder_lag_s": lag_s}, lagged)
     np.testing.assert_allclose(undone[SPEED_X][60:-1], v[60:-1], atol=1e-3)
@@ -390,9 +395,9 @@ def test_nothing_moves_and_nothing_pulls_where_wheels_stand(drive):
 
 def test_the_ground_disturbs_speeds_by_shares_and_the_yaw_rate_as_it_is():
     planar, p = make_planar(still(AGRIMARO), FREE), vector_of({})
-    rim, steer, level = at_rate([0.5] * 3), np.zeros((N, 3)), np.zeros(N)
+    wheel_speed, steer, level = at_rate([0.5] * 3), np.zeros((N, 3)), np.zeros(N)
     push = np.column_stack([np.full(N, 0.02), np.full(N, 0.03), np.full(N, 0.01)])
-    pushed = dict(zip(TRUTH, move(planar, p, DT, rim, steer, level, level, push).T, strict=True))
+    pushed = dict(zip(TRUTH, move(planar, p, DT, wheel_speed, steer, level, level, push).T, strict=True))
     assert pushed["speed_x_mps"][-1] == pytest.approx(0.5 * 0.98)
     assert pushed["speed_y_mps"][-1] == pytest.approx(0.5 * 0.98 * 0.03)
     assert pushed["yaw_rate_radps"][-1] == pytest.approx(0.01)
@@ -409,8 +414,8 @@ def test_a_delay_holds_its_ends_and_whole_samples_are_a_shift():
 
 def test_sensors_that_are_right_show_the_truth():
     planar, p = make_planar(still(HUSKY), Ground()), vector_of({})
-    rim, steer, grade, roll = rich(HUSKY)
-    truth = move(planar, p, DT, rim, steer, grade, roll, np.zeros((0, 3)))
+    wheel_speed, steer, grade, roll = rich(HUSKY)
+    truth = move(planar, p, DT, wheel_speed, steer, grade, roll, np.zeros((0, 3)))
     shown = sense(planar, p, DT, truth)
     for channel, name in (
         (GYRO, "yaw_rate_radps"),

@@ -18,7 +18,7 @@ from terrain.effects.catalogue import (
     vector_of,
 )
 from terrain.errors import ConfigError
-from terrain.estimation.reference import rim_and_ground_speed
+from terrain.estimation.reference import wheel_and_ground_speed
 from terrain.estimation.resampling import low_pass
 from terrain.kinematics.camera import CHANNELS as POSE_CHANNELS
 from terrain.kinematics.camera import body_motion
@@ -76,12 +76,12 @@ def logged(run, robot):
 def replayed(run, robot, values, ground):
     """Return what follows from the run's wheels, steering and tilt."""
     wheels, imu = run.streams["wheels"], run.streams["imu"]
-    rim = wheels.values[:, : len(robot.wheels)]
-    steer = np.zeros(rim.shape)
+    wheel_speed = wheels.values[:, : len(robot.wheels)]
+    steer = np.zeros(wheel_speed.shape)
     if robot.drive == "swerve":
-        rim = rim / robot.motors.reduction_ratio * robot.wheel_radius_m
+        wheel_speed = wheel_speed / robot.motors.reduction_ratio * robot.wheel_radius_m
         steer = np.unwrap(run.streams["steering"].values, axis=0)
-    given = rim, steer, -imu.channel("pitch_rad")[::2], imu.channel("roll_rad")[::2]
+    given = wheel_speed, steer, -imu.channel("pitch_rad")[::2], imu.channel("roll_rad")[::2]
     given = [np.array(each, order="C") for each in given]  # as in use, or the kernels are compiled anew
     return replay(make_planar(robot, ground), vector_of(values), 0.02, *given)
 
@@ -180,14 +180,14 @@ def test_commands_are_followed_and_truth_adds_up(robot):
     twist = steady(0.6, 20.0, 0.25)
     run = simulate_planar(robot, twist, 0, ground=Ground(slip_ratio=0.0))
     truth = run.streams["truth"]
-    for name, wanted in (("speed_x_mps", 0.6), ("speed_y_mps", 0.0), ("yaw_rate_radps", 0.25)):
-        assert truth.channel(name)[-1] == pytest.approx(wanted, abs=1e-3)
+    for name, desired in (("speed_x_mps", 0.6), ("speed_y_mps", 0.0), ("yaw_rate_radps", 0.25)):
+        assert truth.channel(name)[-1] == pytest.approx(desired, abs=1e-3)
     yaw = truth.channel("yaw_rad")
     np.testing.assert_allclose(np.gradient(yaw, 0.01), truth.channel("yaw_rate_radps"), atol=2e-3)
     radius = 0.6 / 0.25
     assert np.ptp(truth.channel("position_y_m")) == pytest.approx(2 * radius, rel=0.05)
-    rim, ground = rim_and_ground_speed(truth, robot)
-    np.testing.assert_allclose(rim[-1], ground[-1], atol=1e-3)
+    wheel_speed, ground = wheel_and_ground_speed(truth, robot)
+    np.testing.assert_allclose(wheel_speed[-1], ground[-1], atol=1e-3)
     slipping = simulate_planar(robot, steady(0.6, 20.0), 0, ground=Ground(slip_ratio=1.0, rolling_ratio=0.1))
     slips = [slipping.streams["truth"].channel(f"slip_{wheel}_ratio")[-1] for wheel in robot.wheels]
     assert slips == pytest.approx([0.1] * len(slips), abs=1e-3)
@@ -218,9 +218,11 @@ def test_tilt_follows_the_heading_and_gravity_the_tilt(robot):
     np.testing.assert_allclose(imu.channel("accel_x_mps2")[200:], up[200:], atol=0.01 * shift)
     side = turn * v + GRAVITY_MPS2 * np.sin(truth.channel("roll_rad"))
     np.testing.assert_allclose(imu.channel("accel_y_mps2")[200:], side[200:], atol=0.01 * shift)
-    swell = simulate_planar(robot, steady(0.8, 120.0), 4, hills=Hills(swell_ratio=0.05)).streams["truth"]
+    undulation = simulate_planar(robot, steady(0.8, 120.0), 4, hills=Hills(undulation_ratio=0.05)).streams[
+        "truth"
+    ]
     for name in ("roll_rad", "pitch_rad"):
-        tilt = swell.channel(name)
+        tilt = undulation.channel(name)
         assert tilt.min() < 0.0 < tilt.max()
         assert 0.01 < np.std(tilt) < 0.1
 
@@ -254,7 +256,7 @@ def noisy_signals(robot, run):
     signals = {name: (channels[500:, CHANNELS.index(name)], 50.0) for name in names}
     told = {GYRO: "gyro_z_radps", ACCEL: "accel_x_mps2", "roll_rad": "roll_rad", "grade_rad": "pitch_rad"}
     signals |= {name: (imu.channel(channel)[1000:], 100.0) for name, channel in told.items()}
-    return signals | {"rim_mps": (wheels.values[500:, 0] * to_rim, 50.0)}
+    return signals | {"wheel_speed_mps": (wheels.values[500:, 0] * to_rim, 50.0)}
 
 
 @pytest.mark.parametrize("robot", ROBOTS, ids=NAMES)

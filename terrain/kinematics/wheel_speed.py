@@ -1,4 +1,4 @@
-"""Rim speeds: how fast each wheel's tread runs, from what the motor's driver reports."""
+"""Wheel speeds: how fast each wheel's tread runs, from what the motor's driver reports."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from terrain.records import RunLog, Stream
 from terrain.robots import Robot
 
 
-def with_rim_speeds(run: RunLog, robot: Robot) -> RunLog:
-    """Return a run whose stream ``wheels`` has rim speeds (``speed_1_mps``) beside its motor rates.
+def with_wheel_speeds(run: RunLog, robot: Robot) -> RunLog:
+    """Return a run whose stream ``wheels`` has wheel speeds (``speed_1_mps``) beside its motor rates.
 
-    Rim speeds that are there already are made anew; a run without motor rates comes back as it is.
+    Wheel speeds that are there already are made anew; a run without motor rates comes back as it is.
 
     Parameters
     ----------
@@ -27,24 +27,24 @@ def with_rim_speeds(run: RunLog, robot: Robot) -> RunLog:
     --------
     >>> from terrain.robots import load_robot
     >>> rates = Stream(np.arange(2.0), np.full((2, 3), 50.0), [f"motor_{i}_radps" for i in (1, 2, 3)])
-    >>> run = with_rim_speeds(RunLog("a", "agrimaro", {"wheels": rates}), load_robot("agrimaro"))
+    >>> run = with_wheel_speeds(RunLog("a", "agrimaro", {"wheels": rates}), load_robot("agrimaro"))
     >>> run.streams["wheels"].channel("speed_1_mps")
     array([1., 1.])
     """
     wheels = run.streams.get("wheels")
     motors = [f"motor_{wheel}_radps" for wheel in robot.wheels]
-    rims = tuple(f"speed_{wheel}_mps" for wheel in robot.wheels)
+    wheel_speeds = tuple(f"speed_{wheel}_mps" for wheel in robot.wheels)
     if wheels is None or not set(motors) <= set(wheels.channels):
         return run
     robot.has("motors")
     assert robot.motors is not None
     rate = np.column_stack([wheels.channel(channel) for channel in motors])
-    rim = rate / robot.motors.reduction_ratio * robot.wheel_radius_m
+    wheel_speed = rate / robot.motors.reduction_ratio * robot.wheel_radius_m
     streams = dict(run.streams)
-    kept = [i for i, channel in enumerate(wheels.channels) if channel not in rims]
+    kept = [i for i, channel in enumerate(wheels.channels) if channel not in wheel_speeds]
     streams["wheels"] = Stream(
         wheels.time_s,
-        np.hstack([wheels.values[:, kept], rim]),
-        (*(wheels.channels[i] for i in kept), *rims),
+        np.hstack([wheels.values[:, kept], wheel_speed]),
+        (*(wheels.channels[i] for i in kept), *wheel_speeds),
     )
     return RunLog(run.run_id, run.robot, streams, run.labels, run.source, run.dropped)
