@@ -7,7 +7,7 @@ import inspect
 import typing
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import typer
 from pydantic.fields import FieldInfo
@@ -61,7 +61,11 @@ def _options(model: type[Settings]) -> list[inspect.Parameter]:
         shown = option_name(model, name)
         switch = field.annotation is bool and default
         names = f"{shown}/--no-{shown.removeprefix('--')}" if switch else shown
-        option = typer.Option(names, help=field.description)
+        option = (
+            typer.Option(names, help=field.description)
+            if shown.startswith("-")
+            else typer.Argument(metavar=shown, help=field.description)
+        )
         options.append(_parameter(name, default, Annotated[kind, option]))
         for number, alias in enumerate(written.aliases):
             hidden = typer.Option(alias, hidden=True)
@@ -85,8 +89,6 @@ def _shown_type(field: FieldInfo, separated: bool) -> Any:
     kind = field.annotation
     if separated:
         return str | None if field.get_default() is None else str
-    if typing.get_origin(kind) is Literal:
-        return str
     return list[str] if kind == tuple[str, ...] else kind
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from pipelines.cli.runs import app as runs_group
 from terrain.errors import ConfigError, TerrainError
 from terrain.logs.schema import SIGNAL_SETS
 
@@ -102,40 +103,8 @@ DRIVE_CONTROLLERS = ("plain", "ramp", "thesis", "fixed", "learned", "oracle")
 MAX_GRADE_DEG = 30.0
 
 
-@app.command("import")
-def import_command(
-    folder: Annotated[Path, typer.Argument(help="Folder to read.")],
-    out: Annotated[Path, typer.Option(help="Folder of the new run folders.")],
-    layout: FormatOption = Format.auto,
-    mapping: Mapping = None,
-    repair: Repair = False,
-    json_file: Json = None,
-) -> None:
-    """Turn logs of any readable layout into run folders."""
-    from pipelines.runs.import_logs import import_logs
-
-    result = import_logs(folder, out, layout=layout.value, mapping=mapping, repair=repair)
-    for sentence in result["skipped"]:
-        typer.echo(f"skipped: {sentence}")
-    counts = "".join(f", {n} {kind}" for kind, n in result["dropped"].items())
-    typer.echo(f"{result['n_runs']} runs written to {out}{counts}")
-    _write_json(json_file, result)
-
-
-@app.command("inspect")
-def inspect_command(
-    folder: Annotated[Path, typer.Argument(help="Folder to read.")],
-    layout: FormatOption = Format.auto,
-    mapping: Mapping = None,
-    repair: Repair = False,
-    json_file: Json = None,
-) -> None:
-    """Show rates, lengths, gaps, stuck channels, and whether two loggers keep one clock."""
-    from pipelines.runs.inspect_logs import inspect_logs, print_inspection
-
-    result = inspect_logs(folder, layout=layout.value, mapping=mapping, repair=repair)
-    print_inspection(result, _console())
-    _write_json(json_file, result)
+GROUPS: tuple[typer.Typer, ...] = (runs_group,)
+"""The files of commands, in the order of help; each has its own ``app``."""
 
 
 @app.command("crossval")
@@ -741,6 +710,10 @@ def _write_json(path: Path | None, result: dict[str, Any]) -> None:
         from terrain.files.atomic import atomic_write
 
         atomic_write(path, json.dumps(result, indent=2, allow_nan=False) + "\n")
+
+
+for group in GROUPS:
+    app.add_typer(group)
 
 
 def main() -> None:

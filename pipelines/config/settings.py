@@ -19,7 +19,8 @@ class OptionText(NamedTuple):
 
     Parameters
     ----------
-    option : its option, as ``--window``; ``--name-of-the-field`` by default; empty for a field without one
+    option : its option, as ``--window``; ``--name-of-the-field`` by default; without dashes an argument that
+        is given by its place, as ``FOLDER``; empty for a field without one
     aliases : options of earlier releases, accepted and not shown
     separated : whether several values are given in one text, by commas
     """

@@ -3,40 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
 from rich.box import SIMPLE
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Column, Table
 
 from pipelines.classify.splits import counted
-from pipelines.reporting import progress
+from pipelines.reporting.terminal import progress_bar as progress_bar
 from terrain.control.slip_table import DRIVE_STATES
 
 MAX_ROWS = 12
-
-
-@contextmanager
-def progress_bar() -> Iterator[progress.Progress]:
-    """Show one bar a task on stderr; give the function that moves them."""
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
-    bars = Progress(*columns, console=Console(stderr=True))
-    tasks: dict[str, TaskID] = {}
-
-    def show(task: str, done: int, total: int) -> None:
-        if not tasks:
-            bars.start()  # not before: data that are refused at once are one line on stderr
-        if task not in tasks:
-            tasks[task] = bars.add_task(task, total=total)
-        bars.update(tasks[task], completed=done, total=total)
-
-    try:
-        yield show
-    finally:
-        if tasks:
-            bars.stop()
 
 
 def percent(value: float | None) -> str:
