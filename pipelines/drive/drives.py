@@ -15,7 +15,8 @@ from terrain.errors import ConfigError
 from terrain.records import Label
 from terrain.robots import Robot
 from terrain.simulation.conditions import Conditions, Faults, draw_conditions, load_spread
-from terrain.simulation.scenario import RATE_HZ, SCENARIOS, Patch, Scenario, make_scenario
+from terrain.simulation.scenario.make import SCENARIOS, make_scenario
+from terrain.simulation.scenario.scenario import RATE_HZ, Patch, Scenario
 from terrain.terramechanics.soil import Soil, load_soil, scattered, soil_names
 
 COURSE = "course"

@@ -7,13 +7,13 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from terrain.simulation.run import simulate_run
 
 from features.windows import Layout, cut_windows, layout_of
 from pipelines.classify.crossval import CrossvalSettings
 from pipelines.classify.labelled import RUNS_A_TERRAIN, SCENARIO
 from pipelines.classify.splits import labelled
 from pipelines.reporting.progress import Progress, silent
-from pipelines.runs.simulate import simulate_run
 from terrain.errors import DataError, TerrainError
 from terrain.kinematics.wheel_speed import with_wheel_speeds
 from terrain.logs.schema import SIGNAL_SETS

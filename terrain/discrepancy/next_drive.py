@@ -42,7 +42,8 @@ from terrain.records import Array
 from terrain.robots import Robot
 from terrain.simulation.planar.model import TRUTH
 from terrain.simulation.planar.motion import move
-from terrain.simulation.scenario import RATE_HZ, SCENARIOS, make_scenario
+from terrain.simulation.scenario.make import SCENARIOS, make_scenario
+from terrain.simulation.scenario.scenario import RATE_HZ
 
 GRADES_DEG = (0.0, 6.0)
 """Level, and a slope that every robot here climbs."""

@@ -18,10 +18,10 @@ from terrain.discrepancy.signals import Signals
 from terrain.effects.catalogue import CHANNELS, INDEX, LIBRARY
 from terrain.errors import DataError
 from terrain.records import Array
+from terrain.simulation.planar.ideal_sensors import SENSED_ONLY, sense
 from terrain.simulation.planar.model import Planar
 from terrain.simulation.planar.motion import move
 from terrain.simulation.planar.replay import replay, undone
-from terrain.simulation.planar.sensors import SENSED_ONLY, sense
 
 CUTOFF_HZ = 2.5
 """Cut-off of the common low-pass at the full clock; what a wheeled robot is told changes within 2 Hz."""

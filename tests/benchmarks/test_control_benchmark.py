@@ -8,9 +8,9 @@ import time
 
 import numpy as np
 import pytest
+from terrain.simulation.run import simulate_run
 
 from pipelines.live.pilot import LivePilot, PilotSettings
-from pipelines.runs.simulate import simulate_run
 from terrain.control.danzi_pid import new_state, thesis_settings, thesis_step
 from terrain.control.pid import Gains
 from terrain.control.traction import SETTINGS, Ground, initial_state, traction_step

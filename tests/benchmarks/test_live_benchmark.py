@@ -3,8 +3,8 @@
 import time
 
 import pytest
+from terrain.simulation.run import simulate_run
 
-from pipelines.runs.simulate import simulate_run
 from terrain.estimation.live import LiveEstimator
 from terrain.logs.replay import replay
 from terrain.robots import load_robot

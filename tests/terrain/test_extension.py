@@ -19,7 +19,7 @@ from terrain.logs.replay import replay
 from terrain.records import RunLog, Stream
 from terrain.robots import load_robot, robot_from
 from terrain.simulation.dynamic.simulate import simulate
-from terrain.simulation.scenario import make_scenario
+from terrain.simulation.scenario.make import make_scenario
 from terrain.terramechanics.soil import load_soil
 
 ROBOT, HUSKY = load_robot("agrimaro"), load_robot("husky")

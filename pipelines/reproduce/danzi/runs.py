@@ -7,16 +7,16 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from terrain.simulation.run import simulate_run
 
 from pipelines.estimate.estimate import Estimate
 from pipelines.reporting.drawing import finished, new_figure, styled
-from pipelines.runs.simulate import simulate_run
 from terrain.estimation.reference import lagged_slip
 from terrain.estimation.slip_figures import slip_figures
 from terrain.records import Array, RunLog
 from terrain.robots import Robot
 from terrain.simulation.conditions import Faults
-from terrain.simulation.scenario import STAND_S
+from terrain.simulation.scenario.legs import STAND_S
 
 RUNS, FEW_RUNS = 5, 2
 """How many runs a figure is the mean of, and how many when it is only tried out."""

@@ -34,11 +34,13 @@ from terrain.effects.catalogue import (
 )
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import Robot
+from terrain.simulation.planar.hills import Hills
+from terrain.simulation.planar.ideal_sensors import SENSED_ONLY, sense
 from terrain.simulation.planar.model import Ground, Planar, make_planar
 from terrain.simulation.planar.motion import move
-from terrain.simulation.planar.noise import WHEEL_SPEED, Noise, load_noise, load_scatter, noise_psd
-from terrain.simulation.planar.run import Hills, simulate_planar
-from terrain.simulation.planar.sensors import SENSED_ONLY, sense
+from terrain.simulation.planar.noise import Noise, load_noise, load_scatter
+from terrain.simulation.planar.noise_spectra import WHEEL_SPEED, noise_psd
+from terrain.simulation.planar.run import simulate_planar
 
 TEST_SIZE = 0.02
 """Size of the test over the whole library, to which limits refer."""

@@ -15,9 +15,11 @@ import numpy as np
 from terrain.errors import DataError, LogError
 from terrain.logs.schema import unit_of
 from terrain.records import Array, Command, Sample
-from terrain.simulation.dynamic.vehicle import N_BODY_RECORD, WHEEL_RECORD, Plant, advance
-from terrain.simulation.scenario import Scenario
-from terrain.simulation.sensors import Motion, Sensor
+from terrain.simulation.dynamic.plant import Plant
+from terrain.simulation.dynamic.step import advance
+from terrain.simulation.scenario.scenario import Scenario
+from terrain.simulation.sensors.motion import N_BODY_RECORD, WHEEL_RECORD, Motion
+from terrain.simulation.sensors.sensor import Sensor
 
 _PATCHES = slice(N_BODY_RECORD + WHEEL_RECORD.index("patch_ratio"), None, len(WHEEL_RECORD))
 
@@ -27,7 +29,7 @@ class Drive:
 
     Parameters
     ----------
-    plant, state, road_noise, record : as :func:`terrain.simulation.dynamic.vehicle.advance` takes them, for
+    plant, state, road_noise, record : as :func:`terrain.simulation.dynamic.step.advance` takes them, for
     all steps
     """
 

@@ -18,29 +18,18 @@ from terrain.records import Array, Command, Label, RunLog, Sample, Stream
 from terrain.robots import Robot
 from terrain.simulation.conditions import NO_FAULTS, Conditions, Faults
 from terrain.simulation.dynamic.loop import Drive, in_loop
-from terrain.simulation.dynamic.vehicle import (
-    BODY_RECORD,
-    FIELD_STEP_M,
-    STEP_S,
-    Plant,
-    advance,
-    make_plant,
-    record_width,
-    settle,
-    start_state,
-)
-from terrain.simulation.scenario import Scenario
-from terrain.simulation.sensors import (
-    CameraSensor,
-    Gnss,
-    GnssSensor,
-    ImuSensor,
-    Motion,
-    Sensor,
-    SteeringSensor,
-    WheelSensor,
-    truth_stream,
-)
+from terrain.simulation.dynamic.plant import FIELD_STEP_M, Plant, make_plant, record_width
+from terrain.simulation.dynamic.states import start_state
+from terrain.simulation.dynamic.step import advance, settle
+from terrain.simulation.scenario.scenario import Scenario
+from terrain.simulation.sensors.camera import CameraSensor
+from terrain.simulation.sensors.gnss import Gnss, GnssSensor
+from terrain.simulation.sensors.imu import ImuSensor
+from terrain.simulation.sensors.motion import BODY_RECORD, STEP_S, Motion
+from terrain.simulation.sensors.sensor import Sensor
+from terrain.simulation.sensors.steering import SteeringSensor
+from terrain.simulation.sensors.truth import truth_stream
+from terrain.simulation.sensors.wheels import WheelSensor
 from terrain.terramechanics.soil import Soil
 from terrain.terramechanics.traction import ground_array
 
@@ -128,7 +117,7 @@ def simulate(
     Examples
     --------
     >>> from terrain.robots import load_robot
-    >>> from terrain.simulation.scenario import make_scenario
+    >>> from terrain.simulation.scenario.make import make_scenario
     >>> from terrain.terramechanics.soil import load_soil
     >>> robot = load_robot("agrimaro")
     >>> drive = make_scenario("straight", robot, ["grass"], 5.0)

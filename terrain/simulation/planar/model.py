@@ -20,10 +20,11 @@ says they did; whatever is wrong about it is a parameter of :mod:`terrain.effect
 Load transfer, roughness and, of a skid-steer robot, lateral slip beside that on a side hill are left out:
 what they do to a log is noise here.  Sources stand with the effects.
 
-Here is what all of it shares: the ground, the robot's numbers on it, and the columns of a motion.  What moves
-is in :mod:`~terrain.simulation.planar.motion`, :mod:`~terrain.simulation.planar.skid_steer` and
-:mod:`~terrain.simulation.planar.swerve`, what shows in :mod:`~terrain.simulation.planar.sensors`, and both
-together over a log in :mod:`~terrain.simulation.planar.replay`.
+This module holds what all of it shares: the terrain, the robot's numbers on it, and the columns of a motion.
+Motion is in :mod:`~terrain.simulation.planar.motion`, :mod:`~terrain.simulation.planar.skid_steer` and
+:mod:`~terrain.simulation.planar.swerve`, sensors without noise in
+:mod:`~terrain.simulation.planar.ideal_sensors`, and both together over a log in
+:mod:`~terrain.simulation.planar.replay`.
 """
 
 from __future__ import annotations

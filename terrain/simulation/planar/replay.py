@@ -11,9 +11,9 @@ from numba import njit
 
 from terrain.effects.catalogue import INDEX
 from terrain.records import Array
+from terrain.simulation.planar.ideal_sensors import sense
 from terrain.simulation.planar.model import Planar
 from terrain.simulation.planar.motion import move
-from terrain.simulation.planar.sensors import sense
 from terrain.simulation.planar.signals import delayed, slopes
 
 _CLOCK_OFFSET = INDEX["clock_offset_s"]

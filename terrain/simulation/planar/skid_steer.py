@@ -64,7 +64,7 @@ def move_skid(
     disturbance: Array,
     out: Array,
 ) -> None:
-    """Write motion, traction and currents; arguments are those of :func:`~.planar_motion.move`."""
+    """Write motion, traction and currents; arguments are those of ``planar.motion.move``."""
     n = out.shape[0]
     weight = planar.mass_kg * GRAVITY_MPS2
     mass = planar.mass_kg * (1.0 + p[_PAYLOAD])

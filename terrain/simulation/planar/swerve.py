@@ -62,7 +62,7 @@ def move_swerve(
     disturbance: Array,
     out: Array,
 ) -> None:
-    """Write motion, traction and current; arguments are those of :func:`~.planar_motion.move`."""
+    """Write motion, traction and current; arguments are those of ``planar.motion.move``."""
     n = out.shape[0]
     u, pace, mean_wheel_speed, heading = _rolled(planar, p, dt, wheel_speed_mps, steer_rad)
     weight = planar.mass_kg * GRAVITY_MPS2

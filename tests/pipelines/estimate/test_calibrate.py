@@ -15,7 +15,7 @@ from terrain.records import RunLog
 from terrain.robots import load_robot
 from terrain.simulation.bench import six_positions_log
 from terrain.simulation.dynamic.simulate import simulate
-from terrain.simulation.scenario import make_scenario
+from terrain.simulation.scenario.make import make_scenario
 from terrain.terramechanics.soil import load_soil
 
 NOMINAL = load_robot("agrimaro")

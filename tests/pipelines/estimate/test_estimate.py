@@ -5,16 +5,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from terrain.simulation.run import simulate_run
 
 from pipelines.estimate.estimate import FILTERS, enriched, estimate, estimate_run, summary
-from pipelines.runs.simulate import simulate_run
 from terrain.errors import ConfigError, DataError, LogError
 from terrain.logs.read import read_run
 from terrain.logs.schema import signal_set_of
 from terrain.records import RunLog, Stream
 from terrain.robots import load_robot
 from terrain.simulation.conditions import Faults
-from terrain.simulation.sensors import Gnss
+from terrain.simulation.sensors.gnss import Gnss
 
 ROBOT = load_robot("agrimaro")
 STEADY_CAMERA = Faults(by_chance=False)

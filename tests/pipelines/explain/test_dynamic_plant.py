@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from terrain.simulation.run import simulate_run
 
 from pipelines.explain.classifier import classifier_gain, compared
 from pipelines.explain.ground import ground_notes, simulation_for
-from pipelines.runs.simulate import simulate_run
 from terrain.discrepancy.diagnose import diagnose
 from terrain.effects.catalogue import library_of
 from terrain.records import Label

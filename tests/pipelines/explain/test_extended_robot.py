@@ -15,8 +15,8 @@ from terrain.errors import ConfigError
 from terrain.extension import write_extended
 from terrain.robots import load_robot
 from terrain.simulation.dynamic.simulate import simulate
-from terrain.simulation.scenario import make_scenario
-from terrain.simulation.sensors import Gnss
+from terrain.simulation.scenario.make import make_scenario
+from terrain.simulation.sensors.gnss import Gnss
 from terrain.terramechanics.soil import load_soil
 
 ROBOT = load_robot("agrimaro")

@@ -10,12 +10,12 @@ from functools import cache
 
 import numpy as np
 import pytest
+from terrain.simulation.run import simulate_run
 
 from pipelines.drive.controllers import drive_once, make_driver
 from pipelines.drive.drives import situation, start_times
 from pipelines.live.pilot import CONTROLLERS, LivePilot, PilotSettings
 from pipelines.live.watch import Told
-from pipelines.runs.simulate import simulate_run
 from terrain.control.drive_metrics import course_of, distance_after, final_speed, slip_peak
 from terrain.control.pid import Gains
 from terrain.control.slip_table import CurveEntry, load_slip_table

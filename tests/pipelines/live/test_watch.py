@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from terrain.simulation.run import simulate_run
 
 from features.windows import cut_windows
 from pipelines.classify.crossval import CrossvalSettings, samples_of
@@ -10,7 +11,6 @@ from pipelines.estimate.estimate import enriched, estimate_run
 from pipelines.live.pilot import LivePilot
 from pipelines.live.watch import Classifier, Nobody, Told
 from pipelines.models.model_files import TerrainModel
-from pipelines.runs.simulate import simulate_run
 from terrain.control.slip_table import load_slip_table
 from terrain.errors import DataError
 from terrain.estimation.live import LiveEstimator

@@ -2,14 +2,15 @@ import json
 
 import numpy as np
 import pytest
+from terrain.simulation.run import simulate_run
 
-from pipelines.runs.simulate import simulate_run, simulate_runs
+from pipelines.runs.simulate import simulate_runs
 from terrain.errors import ConfigError, LogError
 from terrain.files.resources import data_folder
 from terrain.logs.read import find_runs, read_run
 from terrain.robots import load_robot
 from terrain.simulation.conditions import Conditions, Faults
-from terrain.simulation.sensors import Gnss
+from terrain.simulation.sensors.gnss import Gnss
 from terrain.terramechanics.soil import soil_names
 
 ROBOT, HUSKY = load_robot("agrimaro"), load_robot("husky")

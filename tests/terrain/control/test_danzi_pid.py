@@ -18,15 +18,10 @@ from terrain.control.power_state import BRAKING, STEADY, TRACTION, UNKNOWN, powe
 from terrain.control.slip_table import DRIVE_STATES
 from terrain.errors import ConfigError
 from terrain.robots import load_robot
-from terrain.simulation.dynamic.vehicle import (
-    BODY_RECORD,
-    N_BODY_RECORD,
-    N_RECORD,
-    WHEEL_RECORD,
-    advance,
-    make_plant,
-    start_state,
-)
+from terrain.simulation.dynamic.plant import make_plant
+from terrain.simulation.dynamic.states import start_state
+from terrain.simulation.dynamic.step import advance
+from terrain.simulation.sensors.motion import BODY_RECORD, N_BODY_RECORD, N_RECORD, WHEEL_RECORD
 from terrain.terramechanics.soil import load_soil
 from terrain.terramechanics.traction import equilibrium_slip, ground_array
 

@@ -9,16 +9,11 @@ from terrain.control.pid import Gains, PidState, check_gains, pid_step
 from terrain.control.stability import DELAY_S, SLOPES, check_stable, loop_matrix, spectral_radius
 from terrain.errors import ConfigError
 from terrain.robots import load_robot
-from terrain.simulation.dynamic.vehicle import (
-    BODY_RECORD,
-    DEFLECTION_DAMPING_S,
-    N_BODY_RECORD,
-    N_RECORD,
-    WHEEL_RECORD,
-    advance,
-    make_plant,
-    start_state,
-)
+from terrain.simulation.contact import DEFLECTION_DAMPING_S
+from terrain.simulation.dynamic.plant import make_plant
+from terrain.simulation.dynamic.states import start_state
+from terrain.simulation.dynamic.step import advance
+from terrain.simulation.sensors.motion import BODY_RECORD, N_BODY_RECORD, N_RECORD, WHEEL_RECORD
 from terrain.terramechanics.soil import load_soil
 from terrain.terramechanics.traction import equilibrium_slip, ground_array, net_pull
 

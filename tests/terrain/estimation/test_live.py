@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from terrain.simulation.run import simulate_run
 
-from pipelines.runs.simulate import simulate_run
 from terrain.errors import ConfigError
 from terrain.estimation.ekf import GATE_PROBABILITY, REOPEN_AFTER_S, FilterSettings, Noise, run_filter
 from terrain.estimation.live import CHANNELS, LiveEstimator
@@ -22,7 +22,7 @@ from terrain.logs.replay import replay
 from terrain.records import Reading, Stream
 from terrain.robots import load_robot
 from terrain.simulation.conditions import Faults
-from terrain.simulation.sensors import Gnss
+from terrain.simulation.sensors.gnss import Gnss
 
 ROBOT = load_robot("agrimaro")
 ODD = replace(

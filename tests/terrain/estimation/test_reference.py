@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
+from terrain.simulation.run import simulate_run
 
-from pipelines.runs.simulate import simulate_run
 from terrain.errors import DataError
 from terrain.estimation.reference import lagged_slip, true_states, wheel_and_ground_speed
 from terrain.estimation.resampling import low_pass

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
+from terrain.simulation.run import simulate_run
 
 from pipelines.estimate.estimate import estimate_run
-from pipelines.runs.simulate import simulate_run
 from terrain.constants import GRAVITY_MPS2
 from terrain.errors import DataError
 from terrain.estimation.resampling import on_clock

@@ -14,10 +14,13 @@ from terrain.records import Command
 from terrain.robots import load_robot
 from terrain.simulation.conditions import Conditions, Faults
 from terrain.simulation.dynamic.loop import Drive
+from terrain.simulation.dynamic.plant import make_plant
 from terrain.simulation.dynamic.simulate import COMMAND_CHANNELS, simulate
-from terrain.simulation.dynamic.vehicle import N_RECORD, advance, make_plant, settle, start_state
-from terrain.simulation.scenario import make_scenario
-from terrain.simulation.sensors import Gnss
+from terrain.simulation.dynamic.states import start_state
+from terrain.simulation.dynamic.step import advance, settle
+from terrain.simulation.scenario.make import make_scenario
+from terrain.simulation.sensors.gnss import Gnss
+from terrain.simulation.sensors.motion import N_RECORD
 from terrain.terramechanics.soil import load_soil, soil_names
 from terrain.terramechanics.traction import ground_array
 

@@ -22,10 +22,10 @@ from terrain.effects.catalogue import (
 from terrain.kinematics.swerve import inverse
 from terrain.robots import load_robot
 from terrain.simulation.contact import DEFLECTION_DAMPING_S, shear_slip
+from terrain.simulation.planar.ideal_sensors import sense
 from terrain.simulation.planar.model import TRUTH, Ground, make_planar
 from terrain.simulation.planar.motion import move
 from terrain.simulation.planar.replay import replay
-from terrain.simulation.planar.sensors import sense
 from terrain.simulation.planar.signals import delayed
 from terrain.simulation.planar.skid_steer import ENDO_POWER, STANDSTILL_MPS, direction
 from terrain.simulation.planar.swerve import ROLLING_MPS

@@ -8,29 +8,24 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, poisson
 
+from terrain.constants import GRAVITY_MPS2
 from terrain.kinematics.camera import body_motion, odometry_stream
 from terrain.robots import load_robot
 from terrain.simulation.conditions import NO_FAULTS, Faults
-from terrain.simulation.dynamic.vehicle import (
+from terrain.simulation.sensors.camera import CameraSensor
+from terrain.simulation.sensors.gnss import Gnss, GnssSensor
+from terrain.simulation.sensors.imu import IMU_BANDWIDTH_HZ, TILT_NOISE_RAD, ImuSensor
+from terrain.simulation.sensors.motion import (
     BODY_RECORD,
-    GRAVITY_MPS2,
     N_BODY_RECORD,
     N_RECORD,
     STEP_S,
     WHEEL_RECORD,
-)
-from terrain.simulation.sensors import (
-    IMU_BANDWIDTH_HZ,
-    TILT_NOISE_RAD,
-    CameraSensor,
-    Gnss,
-    GnssSensor,
-    ImuSensor,
     Motion,
-    SteeringSensor,
-    WheelSensor,
-    truth_stream,
 )
+from terrain.simulation.sensors.steering import SteeringSensor
+from terrain.simulation.sensors.truth import truth_stream
+from terrain.simulation.sensors.wheels import WheelSensor
 
 ROBOT = load_robot("agrimaro")
 QUIET = Faults(by_chance=False)

@@ -4,34 +4,30 @@ import numpy as np
 import pytest
 from scipy.integrate import quad, solve_ivp
 
+from terrain.constants import GRAVITY_MPS2
 from terrain.errors import ConfigError
 from terrain.kinematics.swerve import wheel_commands
 from terrain.robots import load_robot
-from terrain.simulation.dynamic.vehicle import (
+from terrain.simulation.contact import DEFLECTION_DAMPING_S
+from terrain.simulation.dynamic.plant import FIELD_STEP_M, make_plant
+from terrain.simulation.dynamic.profile import ROUGHNESS_CUTOFF, ROUGHNESS_WAVENUMBER
+from terrain.simulation.dynamic.states import (
     BODY_STATES,
-    DEFLECTION_DAMPING_S,
     EFFECT_STATES,
-    FIELD_STEP_M,
-    GRAVITY_MPS2,
     LATE,
-    LEG_FRICTION_NM,
-    LEG_RATE_RADPS,
     N_BODY,
-    N_BODY_RECORD,
-    N_RECORD,
     N_WHEEL,
-    ROLLING_SPEED_MPS,
-    ROUGHNESS_CUTOFF,
-    ROUGHNESS_WAVENUMBER,
-    STEP_S,
-    WHEEL_RECORD,
     WHEEL_STATES,
-    advance,
-    make_plant,
-    settle,
     start_state,
 )
-from terrain.simulation.sensors import Motion
+from terrain.simulation.dynamic.step import (
+    LEG_FRICTION_NM,
+    LEG_RATE_RADPS,
+    ROLLING_SPEED_MPS,
+    advance,
+    settle,
+)
+from terrain.simulation.sensors.motion import N_BODY_RECORD, N_RECORD, STEP_S, WHEEL_RECORD, Motion
 from terrain.terramechanics.soil import Soil, load_soil
 from terrain.terramechanics.traction import equilibrium_slip, friction_limit, ground_array, wheel_ground
 

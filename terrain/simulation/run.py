@@ -1,0 +1,215 @@
+"""One simulated run by names: robot, terrain, scenario and number in, a run log out.
+
+This entry picks the plant by the robot's drive: swerve robots are simulated by the dynamic plant
+(:mod:`terrain.simulation.dynamic.simulate`), all others by the planar one
+(:mod:`terrain.simulation.planar.run`).
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Mapping
+
+import numpy as np
+
+from terrain.errors import ConfigError
+from terrain.records import Array, RunLog, Stream
+from terrain.robots import Robot
+from terrain.simulation.bench import POSITIONS, TURN_S, six_positions_log
+from terrain.simulation.conditions import Conditions, Faults, draw_conditions, load_spread
+from terrain.simulation.dynamic.simulate import simulate
+from terrain.simulation.planar.ground import planar_ground
+from terrain.simulation.planar.hills import Hills
+from terrain.simulation.planar.noise import load_noise, load_scatter
+from terrain.simulation.planar.run import simulate_planar
+from terrain.simulation.scenario.make import make_scenario
+from terrain.simulation.sensors.gnss import Gnss
+from terrain.simulation.slip_sweep import learning_run
+from terrain.terramechanics.soil import Soil, load_soil, scattered, soil_names
+
+COURSE = "course"
+"""Word for a way over all terrains instead of the name of one."""
+
+BENCH = "six_positions"
+"""Word for the IMU alone on a bench, in place of a scenario."""
+
+BENCH_TERRAIN = "bench"
+"""The terrain that goes with it."""
+
+SLIP = "slip"
+"""Word for drives that take the wheels through their slips, for ``terrain learn-slip``."""
+
+
+def simulate_run(
+    robot: Robot,
+    terrain: str,
+    scenario: str,
+    seed: int,
+    number: int = 1,
+    *,
+    duration_s: float | None = None,
+    vary: bool = False,
+    conditions: Conditions | None = None,
+    faults: Faults | None = None,
+    gnss: Gnss | None = None,
+    effects: Mapping[str, float] | None = None,
+) -> RunLog:
+    """Return one simulated run.
+
+    What is drawn depends on ``seed``, ``terrain``, ``scenario`` and ``number`` alone: a run is the same
+    whatever is simulated beside it.  A skid-steer robot goes to the planar simulation.
+
+    Parameters
+    ----------
+    robot : swerve robot with all sections, or skid-steer robot with all but steering
+    terrain : name of a soil or path of its YAML file, or ``course`` for all soils in one run
+    scenario : name of a scenario; ``course`` goes with the terrain ``course``, ``six_positions`` (the IMU
+        alone, for calibration) with ``bench``; ``slip`` takes the wheels through their slips on varied days
+    seed, number : which draw
+    duration_s : length; the scenario's own by default
+    vary : draw soil, slope, load, tyres and roughness for this run as ``data/soils`` and ``data/spread`` tell
+    conditions : nominal conditions
+    faults : what the sensors suffer on purpose
+    gnss : receiver on board, if any
+    effects : parameters of :mod:`terrain.effects.catalogue` that act
+
+    Raises
+    ------
+    ConfigError
+        if the terrain or scenario is unknown or they do not go together, or the robot cannot do it.
+    """
+    if effects and scenario in (BENCH, SLIP):
+        raise ConfigError(f"scenario {scenario!r} is simulated without effects: leave them out")
+    if scenario == BENCH:
+        return _bench(robot, terrain, seed, number, duration_s)
+    if scenario == SLIP:
+        return _through_slips(robot, terrain, seed, number, duration_s, conditions, faults, gnss)
+    if (terrain == COURSE) != (scenario == COURSE):
+        raise ConfigError("terrain 'course' and scenario 'course' go together: give both or neither")
+    soils = {soil.name: soil for soil in map(load_soil, soil_names() if terrain == COURSE else (terrain,))}
+    names = list(soils)
+    terrain = terrain if terrain == COURSE else names[0]
+    key = [seed, zlib.crc32(terrain.encode()), zlib.crc32(scenario.encode()), number]
+    drawn, driven, simulated = np.random.SeedSequence(key).spawn(3)
+    if vary:
+        rng = np.random.default_rng(drawn)
+        soils = {name: scattered(soil, rng) for name, soil in soils.items()}
+        conditions = draw_conditions(load_spread(), rng, conditions)
+    drive_seed = int(driven.generate_state(1)[0])
+    if robot.drive != "swerve" and terrain == COURSE:
+        raise ConfigError(f"robot {robot.name}: scenario {COURSE!r} is for swerve robots")
+    drive = make_scenario(scenario, robot, names, duration_s, seed=drive_seed)
+    if robot.drive != "swerve":
+        if gnss is not None:
+            raise ConfigError(f"robot {robot.name}: its simulation has no receiver, leave gnss out")
+        log = _planar_run(
+            robot,
+            soils[terrain],
+            drive.twist,
+            simulated,
+            run_id_of(terrain, scenario, number),
+            conditions or Conditions(),
+            vary,
+            effects or {},
+        )
+        return log if faults is None else _without_camera(log, faults)
+    return simulate(
+        robot,
+        drive,
+        soils,
+        simulated,
+        run_id=run_id_of(terrain, scenario, number),
+        conditions=conditions,
+        faults=Faults() if faults is None else faults,
+        gnss=gnss,
+        effects=effects,
+    )
+
+
+def _planar_run(
+    robot: Robot,
+    soil: Soil,
+    twist: Array,
+    seed: np.random.SeedSequence,
+    run_id: str,
+    conditions: Conditions,
+    vary: bool,
+    effects: Mapping[str, float],
+) -> RunLog:
+    """Return a run of the planar simulation; what its sensors scatter, they do on a nominal day too."""
+    scatter = load_scatter()
+    if not vary:
+        tyres_and_ground = ("wheel_radius", "one_sided_radius", "rolling_resistance", "force_slip")
+        fixed = [f"{name}_ratio" for name in (*tyres_and_ground, "effective_track")]
+        scatter = scatter._replace(**dict.fromkeys(fixed, 0.0))
+    load = conditions.payload_kg / robot.mass_kg
+    return simulate_planar(
+        robot,
+        twist,
+        seed,
+        ground=planar_ground(robot, soil),
+        effects={**effects, "payload_ratio": effects.get("payload_ratio", 0.0) + load},
+        scatter=scatter,
+        hills=Hills(conditions.grade_ratio, conditions.undulation_ratio, conditions.undulation_length_m),
+        noise=load_noise(),
+        run_id=run_id,
+        terrain=soil.name,
+    )
+
+
+def _without_camera(run: RunLog, faults: Faults) -> RunLog:
+    """Return the run without the camera's samples of the times in which it is lost."""
+    seen = run.streams["odometry"]
+    kept = np.ones(len(seen), dtype=bool)
+    for start_s, end_s in faults.camera_lost_s:
+        kept &= (seen.time_s < start_s) | (seen.time_s >= end_s)
+    left = Stream(seen.time_s[kept], seen.values[kept], seen.channels)
+    streams = {name: left if name == "odometry" else stream for name, stream in run.streams.items()}
+    if len(left) < 2:
+        del streams["odometry"]
+    return RunLog(run.run_id, run.robot, streams, run.labels, run.source)
+
+
+def _through_slips(
+    robot: Robot,
+    terrain: str,
+    seed: int,
+    number: int,
+    duration_s: float | None,
+    conditions: Conditions | None,
+    faults: Faults | None,
+    gnss: Gnss | None,
+) -> RunLog:
+    """Return one of the drives of :mod:`terrain.simulation.slip_sweep`, which draw all conditions."""
+    if terrain == COURSE:
+        raise ConfigError(f"scenario {SLIP!r} is driven on one terrain, not on 'course'")
+    if duration_s is not None or conditions not in (None, Conditions()) or gnss is not None:
+        raise ConfigError(f"scenario {SLIP!r} draws its own day: leave duration, grade, payload and gnss out")
+    if faults not in (None, Faults()):
+        raise ConfigError(f"scenario {SLIP!r} has no faults on purpose: leave the camera's loss out")
+    ground = load_soil(terrain).name
+    return learning_run(robot, terrain, seed, number, run_id=run_id_of(ground, SLIP, number))
+
+
+def _bench(robot: Robot, terrain: str, seed: int, number: int, duration_s: float | None) -> RunLog:
+    """Return the log of an IMU that is held still in six positions, for ``terrain calibrate``."""
+    if terrain != BENCH_TERRAIN:
+        raise ConfigError(
+            f"scenario {BENCH!r} is done on a bench: give the terrain {BENCH_TERRAIN!r}, not {terrain!r}"
+        )
+    hold_s = 5.0 if duration_s is None else duration_s / len(POSITIONS) - TURN_S
+    key = np.random.SeedSequence([seed, zlib.crc32(BENCH.encode()), number])
+    return six_positions_log(
+        robot, key, hold_s=hold_s, run_id=run_id_of(terrain, scenario=BENCH, number=number)
+    )
+
+
+def run_id_of(terrain: str, scenario: str, number: int) -> str:
+    """Return the name of a simulated run.
+
+    Examples
+    --------
+    >>> run_id_of("grass", "straight", 3), run_id_of("course", "course", 12)
+    ('grass_straight_03', 'course_12')
+    """
+    return f"{terrain}_{number:02d}" if terrain == scenario else f"{terrain}_{scenario}_{number:02d}"

@@ -1,0 +1,1 @@
+"""Sensors of simulated robots: errors, low-pass, latency, quantisation and loss."""

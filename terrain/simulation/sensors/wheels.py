@@ -1,0 +1,38 @@
+"""Wheel encoders and motor currents."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from terrain.logs.schema import WHEELS_CHANNELS
+from terrain.records import Array
+from terrain.robots import Robot
+from terrain.simulation.sensors.motion import (
+    Motion,
+)
+from terrain.simulation.sensors.sensor import Sensor
+
+
+class WheelSensor(Sensor):
+    """Motor rates behind the driver's low-pass on quantised Hall steps, and motor currents.
+
+    Of the robot's effects it knows motor_drift.
+    """
+
+    def __init__(self, motion: Motion, robot: Robot, rng: np.random.Generator) -> None:
+        motors, sensors = robot.equipment.motors, robot.equipment.sensors
+        super().__init__(motion, WHEELS_CHANNELS, *motion.at(sensors.wheels_rate_hz))
+        n = len(self.rows)
+        self._reduction = motors.reduction_ratio
+        self._per_amp_nm = motors.torque_constant_nmpa * motors.reduction_ratio * motors.efficiency_ratio
+        self._motor_noise = sensors.motor_std_radps * rng.standard_normal((n, 3))
+        self._current_noise = sensors.current_std_a * rng.standard_normal((n, 3))
+        self._warm = 1.0 + robot.effects.get("motor_drift_ratio", 0.0) * self.time_s[:, None] / 60.0
+        self._reported, self._torque = motion.wheel("reported_radps"), motion.wheel("torque_nm")
+
+    def _write(self, new: slice, rows: Array) -> None:
+        motor = self._reported[rows] * self._reduction
+        moving = np.abs(motor) > 1e-3  # a Hall sensor that sees no step says nothing but zero
+        self.values[new, :3] = motor + self._motor_noise[new] * moving
+        current = self._torque[rows] / self._per_amp_nm * self._warm[new]
+        self.values[new, 3:] = current + self._current_noise[new]
