@@ -12,22 +12,18 @@ import numpy as np
 
 from pipelines.reporting.progress import Progress, silent
 from terrain.errors import ConfigError, LogError
-from terrain.estimation.consistency import consistency_report, nees
-from terrain.estimation.ekf import (
-    GATE_PROBABILITY,
-    REOPEN_AFTER_S,
-    FilterModel,
-    FilterSettings,
-    Noise,
-    run_filter,
-)
-from terrain.estimation.heading import gnss_heading
-from terrain.estimation.innovations import Innovations, innovations
-from terrain.estimation.measurements import GNSS_ROWS, MeasurementTable, measurement_table
+from terrain.estimation.ekf.consistency import consistency_report, nees
+from terrain.estimation.ekf.filter import run_filter
+from terrain.estimation.ekf.innovations import Innovations, innovations
+from terrain.estimation.ekf.model import GATE_PROBABILITY, REOPEN_AFTER_S, FilterModel, FilterSettings, Noise
+from terrain.estimation.filters.skid import make_skid_filter, skid_noise
+from terrain.estimation.filters.swerve import make_filter
+from terrain.estimation.filters.swerve_noise import default_noise, thesis_noise
+from terrain.estimation.measurements.batch import measurement_table
+from terrain.estimation.measurements.heading import gnss_heading
+from terrain.estimation.measurements.table import GNSS_ROWS, MeasurementTable
 from terrain.estimation.reference import true_states
-from terrain.estimation.skid_filter import make_skid_filter, skid_noise
 from terrain.estimation.slip_figures import SlipFigures, slip_figures
-from terrain.estimation.swerve_filters import default_noise, make_filter, thesis_noise
 from terrain.estimation.wheel_slip import blind_slip, wheel_slip
 from terrain.extension import corrected, corrected_log
 from terrain.files.atomic import ensure_writable

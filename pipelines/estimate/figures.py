@@ -22,7 +22,7 @@ from pipelines.reporting.drawing import (
     shorten,
     styled,
 )
-from terrain.estimation.innovations import Innovations
+from terrain.estimation.ekf.innovations import Innovations
 from terrain.estimation.reference import lagged_slip
 from terrain.files.atomic import atomic_write
 from terrain.kinematics.swerve import forward

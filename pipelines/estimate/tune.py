@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from typing import Any
 
 from terrain.errors import DataError
-from terrain.estimation.ekf import FilterModel, Noise
-from terrain.estimation.measurements import measurement_table
-from terrain.estimation.tuning import NoiseGroup, tune_noise
+from terrain.estimation.ekf.model import FilterModel, Noise
+from terrain.estimation.filters.tuning import NoiseGroup, tune_noise
+from terrain.estimation.measurements.batch import measurement_table
 from terrain.records import RunLog
 from terrain.robots import Robot
 

@@ -52,7 +52,7 @@ from terrain.control.traction import (
     with_driver,
 )
 from terrain.errors import ConfigError
-from terrain.estimation.live import LiveEstimate, LiveEstimator
+from terrain.estimation.live.estimator import LiveEstimate, LiveEstimator
 from terrain.extension import corrected
 from terrain.kinematics.swerve import FAR_RAD, wheel_command_step
 from terrain.logs.schema import IMU_CHANNELS

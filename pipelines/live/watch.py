@@ -11,7 +11,7 @@ import numpy as np
 from features.stream import WindowStream
 from pipelines.models.model_files import TerrainModel
 from terrain.errors import DataError
-from terrain.estimation.live import LiveEstimate
+from terrain.estimation.live.estimator import LiveEstimate
 from terrain.logs.schema import IMU_CHANNELS
 from terrain.records import Array, Reading, Sample
 

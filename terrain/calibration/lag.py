@@ -28,7 +28,7 @@ from scipy.optimize import minimize_scalar
 from terrain.calibration.finding import Finding, half_width, untold
 from terrain.calibration.motion import MAX_GAP_S, at_times, origin_twist
 from terrain.calibration.standing import Stretch
-from terrain.estimation.resampling import low_pass
+from terrain.estimation.measurements.resampling import low_pass
 from terrain.kinematics.swerve import forward
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import Robot

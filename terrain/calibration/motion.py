@@ -6,7 +6,7 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 from terrain.calibration.standing import Stretch
-from terrain.estimation.cleaning import MIN_CONFIDENCE_RATIO
+from terrain.estimation.measurements.cleaning import MIN_CONFIDENCE_RATIO
 from terrain.kinematics.camera import CHANNELS, body_motion
 from terrain.records import Array, Stream
 from terrain.robots import Robot

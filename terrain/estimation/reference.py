@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from terrain.errors import DataError
-from terrain.estimation.resampling import low_pass
+from terrain.estimation.measurements.resampling import low_pass
 from terrain.records import Array, RunLog, StateTrack, Stream
 from terrain.robots import Robot
 from terrain.slip import slip_ratio

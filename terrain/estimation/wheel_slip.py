@@ -9,7 +9,7 @@ import numpy as np
 from numba import float64, int64, njit, void
 
 from terrain.errors import DataError
-from terrain.estimation.measurements import MeasurementTable
+from terrain.estimation.measurements.table import MeasurementTable
 from terrain.records import Array, SlipTrack, StateTrack
 from terrain.robots import Robot
 from terrain.slip import MIN_SPEED_MPS, slip_ratio

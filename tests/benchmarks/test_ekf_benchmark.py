@@ -11,8 +11,11 @@ import pytest
 from filterpy.kalman import ExtendedKalmanFilter
 from threadpoolctl import threadpool_limits
 
-from terrain.estimation.ekf import FilterSettings, filter_step, initial_state, run_filter
-from terrain.estimation.swerve_filters import default_noise, make_filter
+from terrain.estimation.ekf.filter import filter_step, run_filter
+from terrain.estimation.ekf.model import FilterSettings
+from terrain.estimation.ekf.state import initial_state
+from terrain.estimation.filters.swerve import make_filter
+from terrain.estimation.filters.swerve_noise import default_noise
 from terrain.robots import load_robot
 
 N_STEPS = 2000

@@ -5,7 +5,7 @@ import time
 import pytest
 from terrain.simulation.run import simulate_run
 
-from terrain.estimation.live import LiveEstimator
+from terrain.estimation.live.estimator import LiveEstimator
 from terrain.logs.replay import replay
 from terrain.robots import load_robot
 

@@ -10,8 +10,8 @@ import yaml
 
 from terrain.effects.described import parameters_of
 from terrain.errors import ConfigError
-from terrain.estimation.live import LiveEstimator
-from terrain.estimation.measurements import measurement_table
+from terrain.estimation.live.estimator import LiveEstimator
+from terrain.estimation.measurements.batch import measurement_table
 from terrain.extension import Correction, corrected, corrected_log, extended_yaml, moved, write_extended
 from terrain.files.resources import data_folder
 from terrain.kinematics.camera import body_motion

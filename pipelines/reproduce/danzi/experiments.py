@@ -54,9 +54,10 @@ from pipelines.reproduce.reproduce import (
     said,
     verdict_of,
 )
-from terrain.estimation.innovations import Innovations
+from terrain.estimation.ekf.innovations import Innovations
+from terrain.estimation.filters.swerve import make_filter
+from terrain.estimation.filters.swerve_noise import adaptive_noise, thesis_noise
 from terrain.estimation.slip_figures import STEADY_SPEED_MPS
-from terrain.estimation.swerve_filters import adaptive_noise, make_filter, thesis_noise
 from terrain.kinematics.camera import body_motion, odometry_stream, to_camera
 from terrain.kinematics.swerve import admissible_scale, admissible_yaw_rate, wheel_velocities
 from terrain.records import Array

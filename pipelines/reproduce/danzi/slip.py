@@ -30,10 +30,12 @@ from pipelines.reproduce.danzi.runs import (
     true_slip,
 )
 from pipelines.reproduce.reproduce import Finding, Picture, Row, holds, said, verdict_of
-from terrain.estimation.ekf import FilterSettings, run_filter
-from terrain.estimation.measurements import measurement_table
+from terrain.estimation.ekf.filter import run_filter
+from terrain.estimation.ekf.model import FilterSettings
+from terrain.estimation.filters.swerve import make_filter
+from terrain.estimation.filters.swerve_noise import thesis_noise
+from terrain.estimation.measurements.batch import measurement_table
 from terrain.estimation.slip_figures import STEADY_SPEED_MPS
-from terrain.estimation.swerve_filters import make_filter, thesis_noise
 from terrain.estimation.wheel_slip import wheel_slip
 from terrain.records import Array, RunLog
 from terrain.robots import Robot, load_robot

@@ -9,7 +9,7 @@ from rich.console import Console
 
 from pipelines.estimate.calibrate import calibrate, print_calibration
 from terrain.errors import ConfigError, DataError
-from terrain.estimation.measurements import measurement_table
+from terrain.estimation.measurements.batch import measurement_table
 from terrain.logs.write import write_run
 from terrain.records import RunLog
 from terrain.robots import load_robot

@@ -13,7 +13,7 @@ from pipelines.live.watch import Classifier, Nobody, Told
 from pipelines.models.model_files import TerrainModel
 from terrain.control.slip_table import load_slip_table
 from terrain.errors import DataError
-from terrain.estimation.live import LiveEstimator
+from terrain.estimation.live.estimator import LiveEstimator
 from terrain.kinematics.wheel_speed import with_wheel_speeds
 from terrain.logs.replay import replay
 from terrain.records import Reading, RunLog, Sample, Stream

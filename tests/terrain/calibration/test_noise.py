@@ -7,7 +7,7 @@ from scipy.signal import lfilter
 
 from terrain.calibration.noise import measurement_variances, sensor_noise
 from terrain.calibration.standing import standing
-from terrain.estimation.measurements import ROWS_OF_DRIVE
+from terrain.estimation.measurements.table import ROWS_OF_DRIVE
 from terrain.records import RunLog, Stream
 
 N_SEEDS = 20

@@ -20,7 +20,7 @@ from terrain.control.path_tracking import (
     track_step,
 )
 from terrain.errors import ConfigError
-from terrain.estimation.live import LiveEstimator
+from terrain.estimation.live.estimator import LiveEstimator
 from terrain.kinematics.swerve import FAR_RAD, wheel_command_step
 from terrain.records import Command
 from terrain.robots import load_robot

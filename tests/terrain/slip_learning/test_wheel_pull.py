@@ -5,7 +5,7 @@ from terrain.simulation.run import simulate_run
 from pipelines.estimate.estimate import estimate_run
 from terrain.constants import GRAVITY_MPS2
 from terrain.errors import DataError
-from terrain.estimation.resampling import on_clock
+from terrain.estimation.measurements.resampling import on_clock
 from terrain.records import Label, RunLog, Stream
 from terrain.robots import load_robot
 from terrain.simulation.conditions import Conditions

@@ -18,8 +18,8 @@ from terrain.effects.catalogue import (
     vector_of,
 )
 from terrain.errors import ConfigError
+from terrain.estimation.measurements.resampling import low_pass
 from terrain.estimation.reference import wheel_and_ground_speed
-from terrain.estimation.resampling import low_pass
 from terrain.kinematics.camera import CHANNELS as POSE_CHANNELS
 from terrain.kinematics.camera import body_motion
 from terrain.logs.schema import IMU_CHANNELS, STEERING_CHANNELS, WHEELS_CHANNELS

@@ -13,8 +13,9 @@ import numpy as np
 from numba import boolean, float64, int64, njit, types, void
 
 from terrain.constants import GRAVITY_MPS2
-from terrain.estimation.cleaning import BELIEVED_S, MIN_CONFIDENCE_RATIO, OFF_CLOCK_S
-from terrain.estimation.measurements import (
+from terrain.estimation.measurements.cleaning import BELIEVED_S, MIN_CONFIDENCE_RATIO, OFF_CLOCK_S
+from terrain.estimation.measurements.resampling import TICK_S
+from terrain.estimation.measurements.table import (
     GNSS_SPEED_STD_MPS,
     GNSS_STD_M,
     LATE_S,
@@ -22,7 +23,6 @@ from terrain.estimation.measurements import (
     STANDING_S,
     STANDING_SPEED_MPS,
 )
-from terrain.estimation.resampling import TICK_S
 from terrain.estimation.wheel_slip import UNMEASURED_AFTER_S
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.kinematics.camera import QUATERNION_TOLERANCE

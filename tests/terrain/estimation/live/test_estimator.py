@@ -10,11 +10,14 @@ from hypothesis import strategies as st
 from terrain.simulation.run import simulate_run
 
 from terrain.errors import ConfigError
-from terrain.estimation.ekf import GATE_PROBABILITY, REOPEN_AFTER_S, FilterSettings, Noise, run_filter
-from terrain.estimation.live import CHANNELS, LiveEstimator
-from terrain.estimation.live_rows import QUEUE
-from terrain.estimation.measurements import GNSS_ROWS, ROWS_OF_DRIVE, measurement_table
-from terrain.estimation.swerve_filters import default_noise, make_filter
+from terrain.estimation.ekf.filter import run_filter
+from terrain.estimation.ekf.model import GATE_PROBABILITY, REOPEN_AFTER_S, FilterSettings, Noise
+from terrain.estimation.filters.swerve import make_filter
+from terrain.estimation.filters.swerve_noise import default_noise
+from terrain.estimation.live.estimator import CHANNELS, LiveEstimator
+from terrain.estimation.live.rows import QUEUE
+from terrain.estimation.measurements.batch import measurement_table
+from terrain.estimation.measurements.table import GNSS_ROWS, ROWS_OF_DRIVE
 from terrain.estimation.wheel_slip import wheel_slip
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.kinematics.wheel_speed import with_wheel_speeds

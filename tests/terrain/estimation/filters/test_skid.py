@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from terrain.errors import ConfigError
-from terrain.estimation.ekf import run_filter
-from terrain.estimation.skid_filter import MIN_TURN_RADPS, make_skid_filter, skid_noise
+from terrain.estimation.ekf.filter import run_filter
+from terrain.estimation.filters.skid import MIN_TURN_RADPS, make_skid_filter, skid_noise
 from terrain.robots import load_robot
 
 HUSKY = load_robot("husky")

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from numba import njit
 
-from terrain.estimation.resampling import TICK_S
+from terrain.estimation.measurements.resampling import TICK_S
 from terrain.logs.samples import longest_rise
 from terrain.records import Array, RunLog, Stream
 

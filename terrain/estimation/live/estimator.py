@@ -1,9 +1,9 @@
 """Live estimation of a swerve robot's motion and slip, sample by sample.
 
-The chain of :func:`~terrain.estimation.measurements.measurement_table` with ``causal=True``,
-:func:`~terrain.estimation.ekf.run_filter` and :func:`~terrain.estimation.wheel_slip.wheel_slip`, with the
-same numbers, on memory of a fixed size.  Each sample of the wheels is a tick, told of as soon as it is there;
-nothing waits for a sensor that is late.
+The chain of :func:`~terrain.estimation.measurements.batch.measurement_table` with ``causal=True``,
+:func:`~terrain.estimation.ekf.filter.run_filter` and :func:`~terrain.estimation.wheel_slip.wheel_slip`, with
+the same numbers, on memory of a fixed size.  Each sample of the wheels is a tick, whose estimate is returned
+at once; nothing waits for a sensor that is late.
 
 What differs from the batch is what has to look ahead there:
 
@@ -24,16 +24,11 @@ from typing import NamedTuple
 import numpy as np
 
 from terrain.errors import ConfigError
-from terrain.estimation.cleaning import LEAPS
-from terrain.estimation.ekf import (
-    GATE_PROBABILITY,
-    REOPEN_AFTER_S,
-    FilterModel,
-    FilterSettings,
-    Noise,
-    ResidentFilter,
-)
-from terrain.estimation.live_rows import (
+from terrain.estimation.ekf.model import GATE_PROBABILITY, REOPEN_AFTER_S, FilterModel, FilterSettings, Noise
+from terrain.estimation.ekf.resident import ResidentFilter
+from terrain.estimation.filters.swerve import make_filter
+from terrain.estimation.filters.swerve_noise import default_noise
+from terrain.estimation.live.rows import (
     KINDS,
     LIMITS,
     N_GNSS,
@@ -47,9 +42,9 @@ from terrain.estimation.live_rows import (
     push,
     rows_at,
 )
-from terrain.estimation.measurements import CAMERA_ROWS, GNSS_LATENCY_S, GNSS_ROWS, WILD_FACTOR
-from terrain.estimation.resampling import GAP_PERIODS, MAX_AGE_PERIODS
-from terrain.estimation.swerve_filters import default_noise, make_filter
+from terrain.estimation.measurements.cleaning import LEAPS
+from terrain.estimation.measurements.resampling import GAP_PERIODS, MAX_AGE_PERIODS
+from terrain.estimation.measurements.table import CAMERA_ROWS, GNSS_LATENCY_S, GNSS_ROWS, WILD_FACTOR
 from terrain.estimation.wheel_slip import STALE_AFTER_S, instant_slip, wheel_speed_scatter_mps
 from terrain.extension import Correction, corrected
 from terrain.logs.schema import WHEELS_CHANNELS
@@ -107,7 +102,7 @@ class LiveEstimator:
     ----------
     robot : a swerve robot with motors, steering and sensors, and a camera for vio12 and vio15; effects of an
         extended one are taken off what arrives
-    filter_name : one of :data:`~terrain.estimation.swerve_filters.FILTERS`
+    filter_name : one of :data:`~terrain.estimation.filters.swerve.FILTERS`
     channels : names of the columns of each stream's readings, in their order; by default those of the schema.
         A stream that is not named is not read
     settings : when a measurement or a stamp is not believed

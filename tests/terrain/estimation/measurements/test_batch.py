@@ -9,13 +9,9 @@ from scipy.spatial.transform import Rotation
 
 from terrain.constants import GRAVITY_MPS2
 from terrain.errors import ConfigError, DataError
-from terrain.estimation.measurements import (
-    CAMERA_ROWS,
-    GNSS_ROWS,
-    ROWS_OF_DRIVE,
-    measurement_table,
-)
-from terrain.estimation.resampling import low_pass
+from terrain.estimation.measurements.batch import measurement_table
+from terrain.estimation.measurements.resampling import low_pass
+from terrain.estimation.measurements.table import CAMERA_ROWS, GNSS_ROWS, ROWS_OF_DRIVE
 from terrain.kinematics.camera import odometry_stream
 from terrain.records import RunLog, Stream
 from terrain.robots import load_robot

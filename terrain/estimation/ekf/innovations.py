@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from terrain.angles import wrapped
-from terrain.estimation.ekf import FilterModel, FilterSettings, Noise
+from terrain.estimation.ekf.model import FilterModel, FilterSettings, Noise
 from terrain.records import Array, StateTrack
 
 

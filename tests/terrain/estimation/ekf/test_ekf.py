@@ -7,18 +7,12 @@ from hypothesis import strategies as st
 from numba import njit
 
 from terrain.errors import ConfigError, DataError
-from terrain.estimation.consistency import sample_from_model
-from terrain.estimation.ekf import (
-    FilterModel,
-    FilterSettings,
-    Noise,
-    ResidentFilter,
-    filter_step,
-    initial_state,
-    log_likelihood,
-    run_filter,
-)
-from terrain.estimation.kernel import OBSERVE, PROPAGATE
+from terrain.estimation.ekf.consistency import sample_from_model
+from terrain.estimation.ekf.filter import filter_step, log_likelihood, run_filter
+from terrain.estimation.ekf.kernel import OBSERVE, PROPAGATE
+from terrain.estimation.ekf.model import FilterModel, FilterSettings, Noise
+from terrain.estimation.ekf.resident import ResidentFilter
+from terrain.estimation.ekf.state import initial_state
 from terrain.records import ABSENT, GATED, REOPENED, USED
 
 DT_S = 0.02

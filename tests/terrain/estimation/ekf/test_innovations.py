@@ -2,10 +2,12 @@
 
 import numpy as np
 
-from terrain.estimation.consistency import sample_from_model
-from terrain.estimation.ekf import FilterSettings, run_filter
-from terrain.estimation.innovations import innovations
-from terrain.estimation.swerve_filters import default_noise, make_filter
+from terrain.estimation.ekf.consistency import sample_from_model
+from terrain.estimation.ekf.filter import run_filter
+from terrain.estimation.ekf.innovations import innovations
+from terrain.estimation.ekf.model import FilterSettings
+from terrain.estimation.filters.swerve import make_filter
+from terrain.estimation.filters.swerve_noise import default_noise
 from terrain.robots import load_robot
 
 ROBOT = load_robot("agrimaro")

@@ -6,17 +6,13 @@ from numba import njit
 from scipy.stats import chi2
 
 from terrain.errors import ConfigError
-from terrain.estimation.consistency import nees, sample_from_model
-from terrain.estimation.ekf import FilterSettings, Noise, run_filter
-from terrain.estimation.kernel import OBSERVE, PROPAGATE
-from terrain.estimation.swerve_filters import (
-    FILTERS,
-    adaptive_noise,
-    default_noise,
-    make_filter,
-    thesis_noise,
-)
-from terrain.estimation.swerve_model import observe_slip_ratio, observe_without_slip, propagate
+from terrain.estimation.ekf.consistency import nees, sample_from_model
+from terrain.estimation.ekf.filter import run_filter
+from terrain.estimation.ekf.kernel import OBSERVE, PROPAGATE
+from terrain.estimation.ekf.model import FilterSettings, Noise
+from terrain.estimation.filters.swerve import FILTERS, make_filter
+from terrain.estimation.filters.swerve_model import observe_slip_ratio, observe_without_slip, propagate
+from terrain.estimation.filters.swerve_noise import adaptive_noise, default_noise, thesis_noise
 from terrain.robots import load_robot
 
 ROBOT = load_robot("agrimaro")

@@ -3,9 +3,10 @@ import pytest
 from numba import njit
 
 from terrain.errors import DataError
-from terrain.estimation.consistency import consistency_report, nees, sample_from_model
-from terrain.estimation.ekf import FilterModel, Noise, run_filter
-from terrain.estimation.kernel import OBSERVE, PROPAGATE
+from terrain.estimation.ekf.consistency import consistency_report, nees, sample_from_model
+from terrain.estimation.ekf.filter import run_filter
+from terrain.estimation.ekf.kernel import OBSERVE, PROPAGATE
+from terrain.estimation.ekf.model import FilterModel, Noise
 from terrain.records import StateTrack
 
 DT_S = 0.05

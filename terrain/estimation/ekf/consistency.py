@@ -17,8 +17,10 @@ from scipy.special import chdtri
 
 from terrain.angles import wrapped
 from terrain.errors import DataError
-from terrain.estimation.ekf import FilterModel, Noise, initial_state
-from terrain.estimation.kernel import OBSERVE, PROPAGATE, wrap
+from terrain.estimation.ekf.kernel import OBSERVE, PROPAGATE
+from terrain.estimation.ekf.model import FilterModel, Noise
+from terrain.estimation.ekf.state import initial_state
+from terrain.estimation.ekf.steps import wrap
 from terrain.records import GATED, USED, Array, StateTrack
 
 OUTSIDE = 0.05

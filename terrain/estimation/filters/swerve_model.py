@@ -1,6 +1,7 @@
-"""The equations of the swerve filters, as :mod:`terrain.estimation.swerve_filters` writes and sources them.
+"""The equations of the swerve filters, as :mod:`terrain.estimation.filters.swerve` writes and sources them.
 
-Compiled for :class:`~terrain.estimation.ekf.FilterModel`: each writes what is expected, and its Jacobian.
+Compiled for :class:`~terrain.estimation.ekf.model.FilterModel`: each writes the predicted values and their
+Jacobian.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ import math
 
 from numba import njit
 
-from terrain.estimation.kernel import OBSERVE, PROPAGATE
+from terrain.estimation.ekf.kernel import OBSERVE, PROPAGATE
 from terrain.records import Array
 
 LARGEST_SLIP_RATIO = 0.95

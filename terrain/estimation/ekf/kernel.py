@@ -13,6 +13,23 @@ from typing import Any
 import numpy as np
 from numba import boolean, float64, int64, njit, types, void
 
+from terrain.estimation.ekf.steps import (
+    LARGEST,
+    LONGEST_GAP_S,
+    WIDEST,
+    anchor,
+    blame,
+    bridge,
+    clear,
+    condition_on,
+    copy,
+    fast,
+    find_columns,
+    forget,
+    innovation,
+    predict,
+    wrap,
+)
 from terrain.records import ABSENT, GATED, REOPENED, USED, Array
 
 _VECTOR, _MATRIX, _FLAGS, _COUNTS = float64[::1], float64[:, ::1], boolean[::1], int64[::1]
@@ -23,12 +40,6 @@ PROPAGATE = void(_VECTOR, float64, _VECTOR, _VECTOR, _MATRIX)
 
 OBSERVE = void(_VECTOR, _VECTOR, _VECTOR, _MATRIX)
 """Signature of ``observe(x, params, z_hat, H)``."""
-
-LARGEST = 1e9
-"""No state or measurement of a ground robot in SI units comes near: what does is taken for garbage."""
-
-LONGEST_GAP_S = 3600.0
-"""After a longer gap a position is no less certain than after this one: that is nowhere already."""
 
 TIME, PENDING, AGE, LIKELIHOOD = range(4)
 """What is in the vector ``clock``: last stamp, stamp of a leap that is not believed yet, time since the speed
@@ -43,200 +54,9 @@ _GATED, _NOT_FINITE, _NUMERICAL = range(3)
 _N_PER_ROW, _N_PER_SENSOR = len(PER_ROW), len(PER_SENSOR)
 _SKIP, _START, _STEP, _LEAP = range(4)  # what the clock says of a row
 _UNSOUND = -1  # a use that nobody sees
-_WIDEST = LARGEST**4
-
-_fast = njit(cache=True, error_model="numpy", forceinline=True)
 
 
-@njit(cache=True)
-def wrap(angle_rad: float) -> float:
-    """Return the angle in (-pi, pi].
-
-    Examples
-    --------
-    >>> float(wrap(-np.pi)) == np.pi, round(float(wrap(7.0)), 4)
-    (True, 0.7168)
-    """
-    turned = np.pi - (np.pi - angle_rad) % (2 * np.pi)
-    return turned if turned > -np.pi else np.pi
-
-
-@_fast
-def _clear(m: Array) -> None:
-    for i in range(m.shape[0]):
-        for j in range(m.shape[1]):
-            m[i, j] = 0.0
-
-
-@_fast
-def _copy(p: Array, x: Array, p_to: Array, x_to: Array) -> None:
-    for i in range(x.size):
-        x_to[i] = x[i]
-        for j in range(x.size):
-            p_to[i, j] = p[i, j]
-
-
-@_fast
-def _find_columns(m: Array, i: int, cols: Array) -> int:
-    """Write the columns in which row i of m is not zero; return how many."""
-    n = 0
-    for j in range(m.shape[1]):
-        if m[i, j] != 0.0:
-            cols[i, n] = j
-            n += 1
-    return n
-
-
-@_fast
-def _predict(
-    propagate: Any,
-    params: Array,
-    x: Array,
-    p: Array,
-    q: Array,
-    dt: float,
-    x_next: Array,
-    f: Array,
-    fp: Array,
-    cols: Array,
-    n_cols: Array,
-) -> None:
-    """x_next = f(x, dt), and P <- F P F' + Q dt, symmetric to the last bit."""
-    d = x.size
-    _clear(f)
-    propagate(x, dt, params, x_next, f)
-    for i in range(d):
-        n_cols[i] = _find_columns(f, i, cols)
-        for k in range(d):
-            fp[i, k] = 0.0
-        for c in range(n_cols[i]):
-            j = cols[i, c]
-            weight = f[i, j]
-            for k in range(d):
-                fp[i, k] += weight * p[j, k]
-    for i in range(d):
-        for k in range(i + 1):
-            total = q[i, k] * dt
-            for c in range(n_cols[k]):
-                j = cols[k, c]
-                total += fp[i, j] * f[k, j]
-            p[i, k] = total
-            p[k, i] = total
-
-
-@_fast
-def _anchor(p: Array, p0: Array, chosen: Array) -> None:
-    """Put the covariance of the chosen states back to P0, or leave it where it is wider; uncorrelated."""
-    for i in range(p.shape[0]):
-        if chosen[i]:
-            variance = min(max(p[i, i], p0[i, i]), LARGEST**2)
-            for j in range(p.shape[0]):
-                p[i, j] = 0.0
-                p[j, i] = 0.0
-            p[i, i] = variance
-
-
-@_fast
-def _blame(h: Array, order: Array, starts: Array, k: int, uses: Array, chosen: Array) -> None:
-    """Mark the states that the rejection of sensor k is put down to.
-
-    Those that it alone observes; without any, those that no sensor used before it in this row observes;
-    without any, all that it observes.
-    """
-    for spared in range(3):
-        n_chosen = 0
-        for j in range(chosen.size):
-            chosen[j] = False
-            for c in range(starts[k], starts[k + 1]):
-                chosen[j] |= h[order[c], j] != 0.0
-            for other in range(starts.size - 1):
-                used = uses[other] == USED or uses[other] == REOPENED
-                if other != k and (spared == 0 or (spared == 1 and used)):
-                    for c in range(starts[other], starts[other + 1]):
-                        chosen[j] &= h[order[c], j] == 0.0
-            n_chosen += chosen[j]
-        if n_chosen > 0:
-            return
-
-
-@_fast
-def _forget(x: Array, p: Array, x0: Array, p0: Array, is_position: Array, chosen: Array) -> None:
-    """Go back to what nothing is known of, but for positions that are still of this world."""
-    for i in range(x.size):
-        chosen[i] = not is_position[i] or p[i, i] > LARGEST**2
-        if not is_position[i]:
-            x[i] = x0[i]
-    _anchor(p, p0, chosen)
-
-
-@_fast
-def _bridge(p: Array, kept: Array, is_position: Array) -> None:
-    """Take back all of a covariance that grew over a gap but that of the positions."""
-    for i in range(is_position.size):
-        for j in range(is_position.size):
-            if not (is_position[i] and is_position[j]):
-                p[i, j] = kept[i, j]
-
-
-@_fast
-def _innovation(
-    i: int, h: Array, cols: Array, n_cols: Array, nus: Array, dx: Array, p: Array, g: Array
-) -> tuple[float, float]:
-    """Write g = P h' of row i; return its innovation after what was conditioned on before, and h P h'."""
-    nu, spread = nus[i], 0.0
-    for j in range(dx.size):
-        g[j] = 0.0
-    for c in range(n_cols[i]):
-        column = cols[i, c]
-        weight = h[i, column]
-        nu -= weight * dx[column]
-        for j in range(dx.size):
-            g[j] += weight * p[column, j]
-    for c in range(n_cols[i]):
-        spread += h[i, cols[i, c]] * g[cols[i, c]]
-    return nu, spread
-
-
-@_fast
-def _condition_on(
-    nu: float,
-    spread: float,
-    r: float,
-    x: Array,
-    dx: Array,
-    p: Array,
-    g: Array,
-    gain: Array,
-    left: Array,
-    step: Array,
-) -> bool:
-    """Condition dx and P on one row; return False, and leave them, where that leads out of this world.
-
-    K = g / s with s = h P h' + R.  `left` is what the Joseph form has beyond P - K g', R K - (g - K h g):
-    nothing but rounding, which saves R where it is lost in s beside a large h P h'.
-    """
-    d = dx.size
-    per_s = 1.0 / (spread + r)
-    n_bad = 0
-    for i in range(d):
-        k = g[i] * per_s
-        rest = r * k - (g[i] - k * spread)
-        moved = dx[i] + k * nu
-        variance = (p[i, i] - k * g[i]) + rest * k
-        gain[i], left[i], step[i] = k, rest, moved
-        n_bad += not ((abs(x[i] + moved) <= LARGEST) & (variance > 0.0) & (variance <= _WIDEST))
-    if n_bad > 0:
-        return False
-    for i in range(d):
-        dx[i] = step[i]
-    for i in range(d):
-        k, rest = gain[i], left[i]
-        for j in range(d):
-            p[i, j] = (p[i, j] - k * g[j]) + rest * gain[j]
-    return True
-
-
-@_fast
+@fast
 def _read_stamp(time_s: float, clock: Array, max_gap_s: float, counts: Array) -> tuple[int, float]:
     """Say what the clock does, and move it."""
     dt = time_s - clock[TIME]
@@ -324,15 +144,15 @@ def run(
             uses[k], squares[k], dofs[k] = ABSENT, np.nan, 0
 
         if kind == _STEP:
-            _copy(p, x, p_before, x_before)
-            _predict(propagate, params, x, p, q, dt, x_next, f, fp, f_cols, n_f_cols)
+            copy(p, x, p_before, x_before)
+            predict(propagate, params, x, p, q, dt, x_next, f, fp, f_cols, n_f_cols)
             n_bad = 0
             for i in range(d):
-                n_bad += not ((abs(x_next[i]) <= LARGEST) & (p[i, i] > 0.0) & (p[i, i] <= _WIDEST))
+                n_bad += not ((abs(x_next[i]) <= LARGEST) & (p[i, i] > 0.0) & (p[i, i] <= WIDEST))
                 x[i] = x_next[i]
             if n_bad > 0:
-                _copy(p_before, x_before, p, x)
-                _forget(x, p, x0, p0, is_position, chosen)
+                copy(p_before, x_before, p, x)
+                forget(x, p, x0, p0, is_position, chosen)
                 counts[_LOST] += 1
             clock[AGE] += dt
             for k in range(n_sensors):
@@ -340,15 +160,15 @@ def run(
                     rejected_s[k] += dt
         elif kind == _LEAP:
             gap_s = min(abs(dt), LONGEST_GAP_S)
-            _anchor(p, p0, ~is_position)
-            _copy(p, x, p_before, x_before)
-            _predict(propagate, params, x, p, q, gap_s, x_next, f, fp, f_cols, n_f_cols)
-            _bridge(p, p_before, is_position)
+            anchor(p, p0, ~is_position)
+            copy(p, x, p_before, x_before)
+            predict(propagate, params, x, p, q, gap_s, x_next, f, fp, f_cols, n_f_cols)
+            bridge(p, p_before, is_position)
             clock[AGE] = clock[AGE] + dt if dt > 0.0 else np.inf  # set back: nobody knows how long ago
             rejected_s[:] = -1.0
 
         if taken[n]:
-            _clear(h)
+            clear(h)
             observe(x, params, z_hat, h)
             dx[:] = 0.0
             at = n if variances.shape[0] > 1 else 0
@@ -363,35 +183,35 @@ def run(
                         counts[_N_PER_ROW + _N_PER_SENSOR * k + _NOT_FINITE] += 1
                         continue
                     nus[i] = wrap(z - z_hat[i]) if is_angle_row[i] else z - z_hat[i]
-                    n_h_cols[i] = _find_columns(h, i, h_cols)
+                    n_h_cols[i] = find_columns(h, i, h_cols)
                     rows[n_rows] = i
                     n_rows += 1
                 if n_rows == 0:
                     continue
                 if n_rows > 1:  # one row alone is judged before anything changes
-                    _copy(p, dx, p_before, dx_before)
+                    copy(p, dx, p_before, dx_before)
                 use, threshold, square, likelihood = USED, thresholds[n_rows], np.nan, 0.0
                 for attempt in range(2):
                     total, likelihood, sound, definite = 0.0, 0.0, True, True
                     for c in range(n_rows):
                         i = rows[c]
                         r = variances[at, i]
-                        nu, spread = _innovation(i, h, h_cols, n_h_cols, nus, dx, p, g)
+                        nu, spread = innovation(i, h, h_cols, n_h_cols, nus, dx, p, g)
                         s = spread + r
                         definite &= s > 0.5 * r
                         total += nu * nu / s
                         likelihood -= 0.5 * (math.log(2.0 * math.pi * s) + nu * nu / s)
                         if definite and (c < n_rows - 1 or total <= threshold):
-                            sound &= _condition_on(nu, spread, r, x, dx, p, g, gain, left, step)
+                            sound &= condition_on(nu, spread, r, x, dx, p, g, gain, left, step)
                     if attempt == 0:
                         square = total
                     if total <= threshold and sound and definite:
                         break
                     if n_rows > 1 or attempt == 1:
-                        _copy(p_before, dx_before, p, dx)
+                        copy(p_before, dx_before, p, dx)
                     if not definite:  # rounding has made P no covariance: go on without its correlations
                         chosen[:] = True
-                        _anchor(p, p0, chosen)
+                        anchor(p, p0, chosen)
                     if total <= threshold or attempt == 1 or not definite:
                         use = _UNSOUND
                         break
@@ -400,12 +220,12 @@ def run(
                         use = GATED
                         break
                     use, threshold = REOPENED, np.inf
-                    _copy(p, dx, p_before, dx_before)
-                    _blame(h, order, starts, k, uses, chosen)
-                    _anchor(p, p0, chosen)
+                    copy(p, dx, p_before, dx_before)
+                    blame(h, order, starts, k, uses, chosen)
+                    anchor(p, p0, chosen)
                     worst = 0.0
                     for c in range(n_rows):
-                        nu, spread = _innovation(rows[c], h, h_cols, n_h_cols, nus, dx, p, g)
+                        nu, spread = innovation(rows[c], h, h_cols, n_h_cols, nus, dx, p, g)
                         worst = max(worst, nu * nu / (spread + variances[at, rows[c]]))
                     if worst > thresholds[1]:  # more than the initial variance explains
                         for j in range(d):

@@ -21,8 +21,8 @@ import numpy as np
 from numba import njit
 
 from terrain.errors import ConfigError
-from terrain.estimation.ekf import FilterModel, Noise
-from terrain.estimation.kernel import OBSERVE, PROPAGATE
+from terrain.estimation.ekf.kernel import OBSERVE, PROPAGATE
+from terrain.estimation.ekf.model import FilterModel, Noise
 from terrain.records import Array
 from terrain.robots import Robot
 

@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from terrain.estimation.measurements import GNSS_SPEED_STD_MPS, MeasurementTable
+from terrain.estimation.measurements.table import GNSS_SPEED_STD_MPS, MeasurementTable
 from terrain.kinematics.swerve import forward
 from terrain.records import Array
 from terrain.robots import Robot

@@ -1,0 +1,100 @@
+"""The filter step on memory that stays: for loops that cannot wait."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+from numba.core.types.function_type import CompileResultWAP
+
+from terrain.errors import DataError
+from terrain.estimation.ekf.kernel import AGE, OBSERVE, PENDING, PROPAGATE, TIME, run
+from terrain.estimation.ekf.model import DEFAULT_SETTINGS, FilterModel, FilterSettings, Noise
+from terrain.estimation.ekf.state import (
+    SLACK_S,
+    Columns,
+    dropped_counts,
+    gate_thresholds,
+    initial_state,
+    matrices_of,
+    memory_of,
+)
+from terrain.records import Array
+
+
+class ResidentFilter:
+    """A filter that keeps its memory, for loops that cannot wait: the numbers of :func:`filter_step`.
+
+    Parameters
+    ----------
+    model, noise, settings : as of :func:`run_filter`; the measurement variance is (m,)
+
+    Raises
+    ------
+    DataError
+        where the noise does not fit the model, or changes from sample to sample.
+
+    Notes
+    -----
+    ``mean`` and ``cov`` are the memory itself, which the next step writes over.  Most of what
+    :func:`filter_step` takes goes into copies and into finding the model's compiled functions anew.
+    """
+
+    def __init__(self, model: FilterModel, noise: Noise, settings: FilterSettings = DEFAULT_SETTINGS) -> None:
+        if noise.measurement_variance.ndim != 1:
+            raise DataError(f"filter {model.name}: measurement_variance must be (m,) for a step at a time")
+        p0, q = matrices_of(model, noise)
+        d, k, m = len(model.states), len(model.sensors), len(model.rows)
+        self._memory = memory_of(initial_state(model, noise))
+        self._columns = Columns(
+            np.empty((1, d)),
+            np.empty((1, d, d)),
+            np.empty((1, k)),
+            np.zeros((1, k), np.int8),
+            np.zeros((1, k), np.int8),
+            np.empty(1),
+            np.zeros(1, np.bool_),
+        )
+        self._sensors, self._max_gap_s = model.sensor_names, settings.max_gap_s + SLACK_S
+        self._noise_variance, self._variance = noise.measurement_variance, np.empty((1, m))
+        self._stamp, self._z = np.empty(1), np.empty((1, m))
+        # by their addresses, found once: a compiled function itself is looked up at each call, for 40 us
+        functions = zip((model.propagate, model.observe), (PROPAGATE, OBSERVE), strict=True)
+        self._arguments = (
+            *(CompileResultWAP(f.overloads[tuple(signature.args)]) for f, signature in functions),
+            *model._constants[2:],
+            *(p0, q, gate_thresholds(model, settings), self._variance),
+            *(settings.reopen_after_s - SLACK_S, self._max_gap_s),
+            *(self._stamp, self._z, *self._memory, *self._columns),
+        )
+        self.mean, self.cov, self.use = self._memory.x, self._memory.p, self._columns.use[0]
+
+    def step(self, time_s: float, z: Array, measurement_variance: Array | None = None) -> bool:
+        """Take in one sample; return False where its stamp did not advance, or leapt."""
+        self._stamp[0] = time_s
+        self._z[0] = z
+        self._variance[0] = self._noise_variance if measurement_variance is None else measurement_variance
+        run(*self._arguments)
+        return bool(self._columns.taken[0])
+
+    def follows(self, time_s: float) -> int:
+        """Return what a stamp would be: 1 taken, -1 taken as that of a clock set back, 0 not taken."""
+        seen_s, pending_s = float(self._memory.clock[TIME]), float(self._memory.clock[PENDING])
+        if not math.isfinite(time_s):
+            return 0
+        step_s = time_s - seen_s
+        if abs(step_s) > self._max_gap_s:
+            believed = 0.0 < time_s - pending_s <= self._max_gap_s
+            return (1 if step_s > 0.0 else -1) if believed else 0
+        return int(not step_s <= 0.0)
+
+    @property
+    def reference_age_s(self) -> float:
+        """Time since the speed over ground was last measured; infinite before the first."""
+        return float(self._memory.clock[AGE])
+
+    @property
+    def dropped(self) -> Mapping[str, int]:
+        """What was not taken so far, as counts by kind."""
+        return dropped_counts(self._sensors, self._memory.counts)

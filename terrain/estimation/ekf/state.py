@@ -1,0 +1,124 @@
+"""What a filter carries from one sample to the next, and the arrays that its kernel moves and writes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import chdtri
+
+from terrain.errors import DataError
+from terrain.estimation.ekf.kernel import PER_ROW, PER_SENSOR
+from terrain.estimation.ekf.model import FilterModel, FilterSettings, Noise
+from terrain.records import Array
+
+SLACK_S = 1e-9  # what sums of steps may be off by
+
+
+class FilterState(NamedTuple):
+    """All that a filter carries from one sample to the next; :func:`initial_state` makes the first.
+
+    ``mean`` to ``log_likelihood`` are what :class:`~terrain.records.StateTrack` holds of one instant; the
+    rest is the filter's own.  ``time_s`` is NaN before the first sample.
+    """
+
+    time_s: float
+    mean: Array
+    cov: Array
+    nis: Array
+    nis_dof: Array
+    use: Array
+    reference_age_s: float
+    log_likelihood: float
+    pending_time_s: float
+    rejected_s: Array
+    counts: Array
+    sensors: tuple[str, ...]
+
+    @property
+    def dropped(self) -> Mapping[str, int]:
+        """What was not taken so far, as counts by kind."""
+        return dropped_counts(self.sensors, self.counts)
+
+
+def initial_state(model: FilterModel, noise: Noise) -> FilterState:
+    """Return what a filter knows before the first sample."""
+    k = len(model.sensors)
+    return FilterState(
+        math.nan,
+        model.initial_mean,
+        _initial_variance(model, noise),
+        np.full(k, np.nan),
+        np.zeros(k, np.int8),
+        np.zeros(k, np.int8),
+        math.inf,
+        0.0,
+        math.nan,
+        np.full(k, -1.0),
+        np.zeros(len(PER_ROW) + k * len(PER_SENSOR), np.int64),
+        model.sensor_names,
+    )
+
+
+class Memory(NamedTuple):
+    """What the kernel moves from sample to sample."""
+
+    x: Array
+    p: Array
+    clock: Array
+    rejected_s: Array
+    counts: Array
+
+
+class Columns(NamedTuple):
+    """What the kernel writes of each sample."""
+
+    mean: Array
+    cov: Array
+    nis: Array
+    nis_dof: Array
+    use: Array
+    reference_age_s: Array
+    taken: Array
+
+
+def memory_of(state: FilterState) -> Memory:
+    """Return copies of what the kernel moves."""
+    clock = [state.time_s, state.pending_time_s, state.reference_age_s, state.log_likelihood]
+    moved = (state.mean, state.cov, clock, state.rejected_s, state.counts)
+    return Memory(*(np.array(part, order="C") for part in moved))
+
+
+def dropped_counts(sensors: tuple[str, ...], counts: Array) -> dict[str, int]:
+    """Return the counts that are not zero, by kind."""
+    kinds = (*PER_ROW, *(f"{sensor} {what}" for sensor in sensors for what in PER_SENSOR))
+    return {kind: count for kind, count in zip(kinds, counts.tolist(), strict=True) if count}
+
+
+def _initial_variance(model: FilterModel, noise: Noise) -> Array:
+    return np.diag(model.initial_std**2) if noise.initial_variance is None else noise.initial_variance
+
+
+@lru_cache(maxsize=16)
+def matrices_of(model: FilterModel, noise: Noise) -> tuple[Array, Array]:
+    """Return P0 and Q as the kernel wants them, once they are sure to fit the model."""
+    d, m = len(model.states), len(model.rows)
+    for name in ("process_variance", "initial_variance"):
+        matrix = getattr(noise, name)
+        if matrix is not None and len(matrix) != d:
+            raise DataError(f"filter {model.name}: {name} is for {len(matrix)} states, it has {d}")
+    if noise.measurement_variance.shape[-1] != m:
+        given = noise.measurement_variance.shape[-1]
+        raise DataError(f"filter {model.name}: measurement_variance is for {given} rows, it has {m}")
+    return _initial_variance(model, noise).copy(), noise.process_variance.copy()
+
+
+@lru_cache(maxsize=16)
+def gate_thresholds(model: FilterModel, settings: FilterSettings) -> Array:
+    """Return the largest squared innovation that is believed, by its number of rows."""
+    widest = max(len(rows) for _, rows in model.sensors)
+    found: Array = chdtri(np.arange(1.0, widest + 1), 1 - settings.gate_probability)
+    return np.append(np.inf, found)

@@ -1,0 +1,1 @@
+"""What the filters estimate, from what, and with what noise."""

@@ -1,0 +1,1 @@
+"""Estimation sample by sample, on memory of a fixed size."""
