@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 
 from terrain.constants import GRAVITY_MPS2
-from terrain.effects.catalogue import ACCEL, CURRENT, GYRO, HEADING, SPEED_X, SPEED_Y, TURNING_CURRENT
+from terrain.effects import ACCEL, CURRENT, GYRO, HEADING, SPEED_X, SPEED_Y, TURNING_CURRENT
 from terrain.errors import ConfigError
 from terrain.files.descriptions import number, read_yaml
 from terrain.files.resources import data_folder

@@ -20,15 +20,15 @@ from numba import njit
 
 from terrain.angles import wrapped
 from terrain.constants import GRAVITY_MPS2
-from terrain.effects.catalogue import (
+from terrain.effects import (
     CHANNELS,
     CURRENT,
     HEADING,
     INDEX,
-    NUISANCES,
     SPEED_X,
     SPEED_Y,
     TURNING_CURRENT,
+    nuisances_of,
     vector_of,
 )
 from terrain.errors import ConfigError
@@ -176,9 +176,7 @@ def simulate_planar(
     rngs = _generators(seed)
     p = vector_of({**robot.effects, **(effects or {})})
     if scatter is not None:
-        for name in NUISANCES:
-            if robot.drive == "swerve" and name == "effective_track_ratio":
-                continue
+        for name in nuisances_of(robot.drive):
             p[INDEX[name]] += getattr(scatter, name) * rngs["scatter"].standard_normal()
     commands, channels, desired_mps, desired_rad = _commands(robot, twist)
     motion = _moved(

@@ -9,7 +9,7 @@ from pipelines.explain.classifier import classifier_gain, compared
 from pipelines.explain.ground import ground_notes, simulation_for
 from pipelines.runs.simulate import simulate_run
 from terrain.discrepancy.diagnose import diagnose
-from terrain.effects.catalogue import library_of
+from terrain.effects import library_of
 from terrain.records import Label
 from terrain.robots import load_robot
 from terrain.simulation.planar.ground import planar_ground
