@@ -26,7 +26,7 @@ from typing import Annotated, Any, NamedTuple, get_args, get_type_hints
 
 import numpy as np
 
-from terrain.effects.described import read_effects
+from terrain.effects import read_effects
 from terrain.errors import ConfigError
 from terrain.files.descriptions import check_keys, number, read_yaml
 from terrain.files.resources import data_folder

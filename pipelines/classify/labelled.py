@@ -7,12 +7,12 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from terrain.simulation.run import simulate_run
 
 from pipelines.estimate.estimate import Estimate, enriched, estimate_run, summary
 from pipelines.reporting.progress import Progress, silent
 from terrain.records import RunLog
 from terrain.robots import Robot, load_robot
+from terrain.simulation.run import simulate_run
 from terrain.terramechanics.soil import soil_names
 
 ROBOT = "agrimaro"

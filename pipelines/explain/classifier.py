@@ -7,7 +7,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from terrain.simulation.run import simulate_run
 
 from features.windows import Layout, cut_windows, layout_of
 from pipelines.classify.crossval import CrossvalSettings
@@ -19,6 +18,7 @@ from terrain.kinematics.wheel_speed import with_wheel_speeds
 from terrain.logs.schema import SIGNAL_SETS
 from terrain.records import Array, RunLog, Windows
 from terrain.robots import Robot
+from terrain.simulation.run import simulate_run
 from terrain.terramechanics.soil import soil_names
 
 MIN_RUNS, MIN_TERRAINS = 4, 2

@@ -24,7 +24,7 @@ from terrain.discrepancy.search import Problem
 from terrain.discrepancy.signals import signals_of
 from terrain.discrepancy.simulation import Simulation
 from terrain.discrepancy.verdict import Diagnosis
-from terrain.effects.catalogue import Effect, effect_named, library_of
+from terrain.effects import Effect, effect_named, library_of
 from terrain.errors import ConfigError, DataError, TerrainError
 from terrain.extension import extended_yaml
 from terrain.files.atomic import atomic_write, ensure_writable
@@ -370,7 +370,9 @@ def _library(robot: Robot, names: Sequence[str] | None) -> tuple[Effect, ...]:
         raise ConfigError("--effects names none; leave it out for all of them")
     for effect in desired:
         if effect not in there:
-            raise ConfigError(f"effect {effect.name} cannot befall a robot with the drive {robot.drive!r}")
+            raise ConfigError(
+                f"effect {effect.name} does not apply to a robot with the drive {robot.drive!r}"
+            )
     return tuple(effect for effect in there if effect in desired)
 
 

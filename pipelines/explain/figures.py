@@ -27,7 +27,7 @@ from pipelines.reporting.drawing import (
 )
 from pipelines.reproduce.reproduce import said
 from terrain.discrepancy.noise import Noise
-from terrain.effects.catalogue import CHANNELS
+from terrain.effects import CHANNELS
 from terrain.records import Array
 
 CHANNEL_WORDS = {

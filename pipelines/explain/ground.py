@@ -8,7 +8,7 @@ from typing import Any
 from terrain.discrepancy.signals import signals_of
 from terrain.discrepancy.simulation import Simulation
 from terrain.discrepancy.tilt import with_effective_tilt
-from terrain.effects.catalogue import Effect
+from terrain.effects import Effect
 from terrain.errors import ConfigError
 from terrain.records import RunLog
 from terrain.robots import Robot

@@ -30,7 +30,7 @@ from pipelines.reporting.drawing import NOT_KNOWN, png_bytes, sentence, styled, 
 from pipelines.reporting.page import page
 from pipelines.reporting.progress import Progress, silent
 from pipelines.reproduce.reproduce import MAX_SVG_BYTES, said
-from terrain.effects.catalogue import BOUNDS, LIBRARY
+from terrain.effects import LIBRARY, PARAMETER
 from terrain.files.atomic import atomic_write
 
 if TYPE_CHECKING:
@@ -58,18 +58,6 @@ SI = {
 
 SMALL = {"rad": "mrad", "radps": "mrad/s", "s": "ms", "m": "mm"}
 """Units of a thousandth."""
-
-SHARES = (
-    *("wheel_radius_ratio", "one_sided_radius_ratio", "gyro_scale_ratio", "effective_track_ratio"),
-    *("payload_ratio", "motor_constant_ratio", "motor_drift_ratio", "clock_rate_ratio"),
-)
-"""Parameters that are read as a percentage."""
-
-MISTAKEN = (
-    *("wheel_radius_ratio", "one_sided_radius_ratio", "gyro_scale_ratio", "effective_track_ratio"),
-    *("motor_constant_ratio", "clock_rate_ratio", "lever_x_m", "lever_y_m"),
-)
-"""Parameters that say by how much something that is there is off."""
 
 CAPTIONS = {
     "stretch": "Left: what was measured, and what the simulation makes of the logged wheels, steering and "
@@ -233,7 +221,7 @@ def quantity(parameter: str, value: float | None) -> str:
     """
     if value is None or not math.isfinite(value):
         return NOT_KNOWN
-    if parameter in SHARES:
+    if parameter in PARAMETER and PARAMETER[parameter].as_percent:
         return f"{_two(100.0 * value)}{NBSP}%"
     unit = parameter.rpartition("_")[2]
     if unit in SMALL and abs(value) < 0.0995:
@@ -519,14 +507,14 @@ def limit_words(limit: Mapping[str, Any], missed: bool) -> str:
     >>> limit_words(limit | {"detection_limit": None}, True)
     'A steering offset 1 of any size would not have been seen.'
     """
-    name = words_of(limit["name"].rpartition("_")[0])
+    parameter = PARAMETER[limit["name"]]
+    name = parameter.label
     article = "An" if name[0] in "aeiou" and not name.startswith("one") else "A"
     if limit["detection_limit"] is None:
         return f"{article} {name} of any size would not have been seen."
-    off = "off by " if limit["name"] in MISTAKEN else ""
+    off = "off by " if parameter.is_error else ""
     under = f"{off}under {quantity(limit['name'], limit['detection_limit'])}"
-    low, high = BOUNDS[limit["name"]]
-    most = max(-low, high)
+    most = max(-parameter.low, parameter.high)
     if missed and limit["detection_limit"] >= most:
         under = f"of any size that is likely (up to {quantity(limit['name'], most)})"
     return f"{article} {name} {under} would not have been seen."

@@ -23,7 +23,7 @@ from terrain.discrepancy.trials.hidden_effects import (
     rich_drives,
 )
 from terrain.discrepancy.verdict import AMBIGUOUS, NOT_EXCITED, Diagnosis
-from terrain.effects.catalogue import Effect, effect_named, library_of
+from terrain.effects import Effect, effect_named, library_of, nuisances_of
 from terrain.errors import ConfigError, DataError
 from terrain.records import Array
 from terrain.robots import Robot, load_robot
@@ -134,9 +134,8 @@ class Trial:
 
 def simulation_of(robot: Robot) -> Simulation:
     """Return the simulation under test, which knows how much runs scatter by themselves."""
-    scatter = load_scatter()._asdict()
-    if robot.drive == "swerve":
-        scatter.pop("effective_track_ratio")
+    every = load_scatter()
+    scatter = {name: getattr(every, name) for name in nuisances_of(robot.drive)}
     return Simulation(robot, Ground(), robot.effects, scatter)
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from pipelines.reporting.progress import Progress, silent
-from terrain.effects.catalogue import read_effect
+from terrain.effects import read_effect
 from terrain.errors import ConfigError, LogError
 from terrain.files.atomic import ensure_writable
 from terrain.logs.write import run_folder, write_run

@@ -17,7 +17,7 @@ from scipy.interpolate import CubicSpline
 
 from terrain.discrepancy.information import Information
 from terrain.discrepancy.residuals import Rows
-from terrain.effects.catalogue import CHANNELS, GYRO, HEADING, SPEED_X
+from terrain.effects import CHANNELS, GYRO, HEADING, SPEED_X
 from terrain.errors import DataError
 from terrain.records import Array
 

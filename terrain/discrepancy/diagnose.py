@@ -38,7 +38,7 @@ from terrain.discrepancy.verdict import (
     RuledOut,
     Value,
 )
-from terrain.effects.catalogue import BOUNDS, CHANNELS, INDEX, Effect
+from terrain.effects import BOUNDS, CHANNELS, INDEX, Effect
 from terrain.errors import DataError
 from terrain.records import RunLog
 
@@ -74,7 +74,7 @@ def diagnose(
     ----------
     runs : of the simulation's robot, three at the least
     simulation : under test, with the effects that are built in already
-    library : effects that may be named; all that can befall the robot by default
+    library : effects that may be named; all that apply to the robot by default
 
     Raises
     ------

@@ -15,7 +15,7 @@ from terrain.discrepancy.selection import MIN_CLUSTERS
 from terrain.discrepancy.signals import signals_of
 from terrain.discrepancy.simulation import Simulation
 from terrain.discrepancy.verdict import Excluded
-from terrain.effects.catalogue import CHANNELS
+from terrain.effects import CHANNELS
 from terrain.errors import ConfigError, DataError
 from terrain.records import Array, RunLog
 

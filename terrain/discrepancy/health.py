@@ -17,7 +17,7 @@ from terrain.discrepancy.information import PRIOR_STD, Information
 from terrain.discrepancy.residuals import Rows
 from terrain.discrepancy.signals import Signals
 from terrain.discrepancy.verdict import Clock, Excluded
-from terrain.effects.catalogue import CHANNELS, CURRENT, GYRO, INDEX, SPEED_X, SPEED_Y
+from terrain.effects import CHANNELS, CURRENT, GYRO, INDEX, SPEED_X, SPEED_Y
 from terrain.records import Array
 
 CLOCK_S, CLOCK_SIGMAS, CLOCK_SCATTER_S = 0.12, 6.0, 0.01

@@ -21,7 +21,7 @@ from terrain.discrepancy.noise import ORDER, Noise, noise_of, whitened
 from terrain.discrepancy.residuals import LowPass, Rows, rows_of
 from terrain.discrepancy.signals import Signals
 from terrain.discrepancy.simulation import Simulation
-from terrain.effects.catalogue import BOUNDS, INDEX
+from terrain.effects import BOUNDS, INDEX
 from terrain.records import Array
 
 N_BLOCKS = 3

@@ -24,7 +24,7 @@ from terrain.discrepancy.selection import SEEN_SHARE, Z_EFFECT
 from terrain.discrepancy.signals import PARALLEL, Signals
 from terrain.discrepancy.simulation import Simulation
 from terrain.discrepancy.verdict import Limit, NextDrive
-from terrain.effects.catalogue import (
+from terrain.effects import (
     ACCEL,
     BOUNDS,
     CHANNELS,

@@ -13,7 +13,7 @@ from terrain.discrepancy.information import Information
 from terrain.discrepancy.noise import whitened
 from terrain.discrepancy.residuals import INPUTS, Rows
 from terrain.discrepancy.selection import weighed_variance, z_of, z_of_t
-from terrain.effects.catalogue import CHANNELS
+from terrain.effects import CHANNELS
 from terrain.records import Array
 
 Z_PROBE = 4.5

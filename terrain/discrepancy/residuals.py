@@ -15,10 +15,10 @@ from numba import njit
 
 from terrain.constants import GRAVITY_MPS2
 from terrain.discrepancy.signals import Signals
-from terrain.effects.catalogue import CHANNELS, INDEX, LIBRARY
+from terrain.effects import CHANNELS, INDEX, ONE_SIDED, SENSED_ONLY, STEPS
 from terrain.errors import DataError
 from terrain.records import Array
-from terrain.simulation.planar.ideal_sensors import SENSED_ONLY, sense
+from terrain.simulation.planar.ideal_sensors import sense
 from terrain.simulation.planar.model import Planar
 from terrain.simulation.planar.motion import move
 from terrain.simulation.planar.replay import replay, undone
@@ -50,17 +50,6 @@ MIN_KNOWN = 0.75
 
 SETTLE_S = 0.5
 """Start and end of a run left out, beside what the low-pass takes: the replay starts as if steady."""
-
-STEPS = {p.name: p.step for effect in LIBRARY for p in effect.parameters} | {
-    "pitch_offset_rad": 0.005,
-    "roll_offset_rad": 0.005,
-}
-"""Over which change of a parameter its sensitivity is taken."""
-
-
-ONE_SIDED = ("steering_backlash_rad",)
-"""Parameters that are not taken below 0: a play is not negative.  All others are taken to both sides:
-a delay to one side alone is half a step off, and then noise of the wheels looks like it."""
 
 
 class LowPass(NamedTuple):

@@ -24,7 +24,7 @@ from terrain.discrepancy.residuals import LowPass
 from terrain.discrepancy.selection import Evidence, evidence, fitted
 from terrain.discrepancy.signals import Signals
 from terrain.discrepancy.simulation import Simulation
-from terrain.effects.catalogue import INDEX, Effect
+from terrain.effects import INDEX, Effect
 from terrain.records import Array
 
 MAX_CAUSES = 6
@@ -141,7 +141,7 @@ def names_of(effects: Sequence[Effect]) -> tuple[str, ...]:
 
     Examples
     --------
-    >>> from terrain.effects.catalogue import effect_named
+    >>> from terrain.effects import effect_named
     >>> names_of([effect_named("lever_arm")])
     ('lever_x_m', 'lever_y_m')
     """

@@ -11,7 +11,7 @@ from scipy.stats import chi2, norm
 from scipy.stats import t as student
 
 from terrain.discrepancy.information import Information, rest_beside
-from terrain.effects.catalogue import BOUNDS, INDEX, Effect
+from terrain.effects import BOUNDS, INDEX, Effect
 from terrain.records import Array
 
 Z_EFFECT = 4.0

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 from terrain.angles import unwrapped
-from terrain.effects.catalogue import (
+from terrain.effects import (
     ACCEL,
     CHANNELS,
     CURRENT,

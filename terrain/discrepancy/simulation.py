@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
-from terrain.effects.catalogue import NUISANCES, Effect, library_of, vector_of
+from terrain.effects import NUISANCES, Effect, library_of, vector_of
 from terrain.errors import ConfigError
 from terrain.records import Array
 from terrain.robots import Robot
@@ -50,7 +50,7 @@ class Simulation:
 
     @property
     def library(self) -> tuple[Effect, ...]:
-        """Effects that can befall this robot."""
+        """Effects that apply to this robot."""
         return library_of(self.robot.drive)
 
     @property

@@ -17,7 +17,7 @@ from terrain.discrepancy.residuals import low_pass_of
 from terrain.discrepancy.search import names_of
 from terrain.discrepancy.signals import Signals
 from terrain.discrepancy.simulation import Simulation
-from terrain.effects.catalogue import Effect
+from terrain.effects import Effect
 from terrain.records import Array
 from terrain.simulation.planar.model import Ground
 

@@ -1,1 +1,92 @@
-"""Effects: named groups of parameters of the simulation that are 0 where the effect is absent."""
+"""Effects: named groups of parameters of the simulation that are 0 where the effect is absent.
+
+An entry of the catalogue holds all about an effect: bounds, formula, source, robots, channels, where a
+description has it, how it is taken off samples, and how it is shown.
+
+Examples
+--------
+>>> effect = effect_named("gyro_scale")
+>>> effect.formula, effect.parameters[0].inverse.formula
+('gyro = (1 + k) w', '(gyro - bias) / (1 + k) + bias; fused yaw / (1 + k)')
+"""
+
+from terrain.effects.catalogue import (
+    BOUNDS,
+    DEPRECATED,
+    LIBRARY,
+    NUISANCES,
+    ONE_SIDED,
+    PARAMETER,
+    SENSED_ONLY,
+    STEPS,
+    effect_named,
+    in_plant,
+    library_of,
+    nuisances_of,
+    parameters_of,
+    read_effect,
+)
+from terrain.effects.described import SCHEMA, checked_covariance, checked_effects, read_effects
+from terrain.effects.sensors import OTHER_LOGGER
+from terrain.effects.types import (
+    ACCEL,
+    BOTH,
+    CHANNELS,
+    CURRENT,
+    GYRO,
+    HEADING,
+    SKID,
+    SPEED_X,
+    SPEED_Y,
+    SWERVE,
+    TURNING_CURRENT,
+    Combine,
+    Effect,
+    Home,
+    Inverse,
+    Parameter,
+    PlantPart,
+)
+from terrain.effects.vector import INDEX, PARAMETERS, vector_of
+
+__all__ = [
+    "ACCEL",
+    "BOTH",
+    "BOUNDS",
+    "CHANNELS",
+    "CURRENT",
+    "DEPRECATED",
+    "GYRO",
+    "HEADING",
+    "INDEX",
+    "LIBRARY",
+    "NUISANCES",
+    "ONE_SIDED",
+    "OTHER_LOGGER",
+    "PARAMETER",
+    "PARAMETERS",
+    "SCHEMA",
+    "SENSED_ONLY",
+    "SKID",
+    "SPEED_X",
+    "SPEED_Y",
+    "STEPS",
+    "SWERVE",
+    "TURNING_CURRENT",
+    "Combine",
+    "Effect",
+    "Home",
+    "Inverse",
+    "Parameter",
+    "PlantPart",
+    "checked_covariance",
+    "checked_effects",
+    "effect_named",
+    "in_plant",
+    "library_of",
+    "nuisances_of",
+    "parameters_of",
+    "read_effect",
+    "read_effects",
+    "vector_of",
+]

@@ -1,7 +1,7 @@
-"""The section ``effects`` of a robot's description: what its simulation lacked by ``terrain explain``.
+"""The section ``effects`` of a robot's description: effects found by ``terrain explain``.
 
 Each parameter of :mod:`terrain.effects.catalogue` is a number with unit, source and interval like any other;
-the covariance has a row a parameter, and may be left out where nobody knows it::
+the covariance has a row a parameter, and may be left out where it is unknown::
 
     effects:
       schema: 1
@@ -11,7 +11,8 @@ the covariance has a row a parameter, and may be left out where nobody knows it:
         wheel_radius_ratio: {wheel_radius_ratio: 2.3e-06, camera_yaw_rad: 1.0e-08}
         camera_yaw_rad: {wheel_radius_ratio: 1.0e-08, camera_yaw_rad: 2.6e-07}
 
-A parameter that is not there is 0, and its effect absent.
+A parameter that is not there is 0, and its effect absent.  Former names of parameters are read as the present
+ones.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from terrain.effects.catalogue import BOTH, Parameter, library_of
+from terrain.effects.catalogue import DEPRECATED, PARAMETER, parameters_of
 from terrain.errors import ConfigError
 from terrain.files.descriptions import check_keys, number
 from terrain.records import Array, read_only
@@ -34,19 +35,8 @@ ROUNDING = 1e-5
 """A covariance is written with seven digits: correlations may miss symmetry and sign by as much."""
 
 
-def parameters_of(drive: str) -> dict[str, Parameter]:
-    """Return the parameters, by name, of all effects that can befall robots of a drive.
-
-    Examples
-    --------
-    >>> parameters_of("skid_steer")["effective_track_ratio"].high
-    4.0
-    """
-    return {parameter.name: parameter for effect in library_of(drive) for parameter in effect.parameters}
-
-
 def checked_effects(place: str, values: Mapping[str, float], drive: str) -> dict[str, float]:
-    """Return the values of effects by parameter, once they are known to be possible.
+    """Return the values of effects by parameter, checked.
 
     Parameters
     ----------
@@ -57,14 +47,14 @@ def checked_effects(place: str, values: Mapping[str, float], drive: str) -> dict
     Raises
     ------
     ConfigError
-        for a parameter that is unknown or of an effect that cannot befall the robot, or a value that is no
-        finite number within its bounds.
+        for a parameter that is unknown or of an effect that does not apply to the robot, or a value that is
+        no finite number within its bounds.
     """
     known = parameters_of(drive)
     for name, value in values.items():
         if name not in known:
-            if any(name in parameters_of(other) for other in BOTH):
-                raise ConfigError(f"{place}: {name} cannot befall a robot with the drive {drive!r}")
+            if name in PARAMETER:
+                raise ConfigError(f"{place}: {name} does not apply to a robot with the drive {drive!r}")
             raise ConfigError(f"{place}: {name} is no parameter of an effect (known: {', '.join(known)})")
         low, high = known[name].low, known[name].high
         plain = isinstance(value, int | float | np.number) and not isinstance(value, bool)
@@ -108,7 +98,7 @@ def read_effects(place: str, described: Any, drive: str) -> tuple[dict[str, floa
         raise ConfigError(
             f"{place}: schema {schema} is newer than this version of terrain, which reads {SCHEMA}"
         )
-    entries = {str(name): entry for name, entry in described.items() if name not in ("schema", "covariance")}
+    entries = _renamed(place, {k: v for k, v in described.items() if k not in ("schema", "covariance")})
     known = parameters_of(drive)
     checked_effects(place, dict.fromkeys((name for name in entries if name not in known), 0.0), drive)
     values = {
@@ -121,9 +111,24 @@ def read_effects(place: str, described: Any, drive: str) -> tuple[dict[str, floa
     return values, _covariance(f"{place}: covariance", described["covariance"], list(values))
 
 
+def _renamed(place: str, entries: dict[Any, Any]) -> dict[str, Any]:
+    """Return entries by the present names of their parameters."""
+    renamed: dict[str, Any] = {}
+    for given, entry in entries.items():
+        name = DEPRECATED.get(str(given), str(given))
+        if name in renamed:
+            raise ConfigError(f"{place}: {name} is given twice, once by its former name")
+        renamed[name] = entry
+    return renamed
+
+
 def _covariance(place: str, described: Any, names: list[str]) -> Array:
+    if isinstance(described, dict):
+        described = _renamed(place, described)
     check_keys(place, described, names)
     for name in names:
+        if isinstance(described[name], dict):
+            described[name] = _renamed(f"{place}: {name}", described[name])
         check_keys(f"{place}: {name}", described[name], names)
     rows = [[described[row][column] for column in names] for row in names]
     for row, entries in zip(names, rows, strict=True):

@@ -12,6 +12,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from terrain.effects import NUISANCES, PARAMETER, SENSED_ONLY
 from terrain.errors import ConfigError
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import Robot
@@ -139,8 +140,7 @@ def _planar_run(
     """Return a run of the planar simulation; what its sensors scatter, they do on a nominal day too."""
     scatter = load_scatter()
     if not vary:
-        tyres_and_ground = ("wheel_radius", "one_sided_radius", "rolling_resistance", "force_slip")
-        fixed = [f"{name}_ratio" for name in (*tyres_and_ground, "effective_track")]
+        fixed = (name for name in NUISANCES if name in PARAMETER and name not in SENSED_ONLY)
         scatter = scatter._replace(**dict.fromkeys(fixed, 0.0))
     load = conditions.payload_kg / robot.mass_kg
     return simulate_planar(

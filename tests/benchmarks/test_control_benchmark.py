@@ -8,7 +8,6 @@ import time
 
 import numpy as np
 import pytest
-from terrain.simulation.run import simulate_run
 
 from pipelines.live.pilot import LivePilot, PilotSettings
 from terrain.control.danzi_pid import new_state, thesis_settings, thesis_step
@@ -16,6 +15,7 @@ from terrain.control.pid import Gains
 from terrain.control.traction import SETTINGS, Ground, initial_state, traction_step
 from terrain.logs.replay import replay
 from terrain.robots import load_robot
+from terrain.simulation.run import simulate_run
 
 N_STEPS = 2000
 MOST_US = {"traction": 30.0, "thesis": 60.0}

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import yaml
 
-from terrain.effects.described import parameters_of
+from terrain.effects import parameters_of
 from terrain.errors import ConfigError
 from terrain.estimation.live.estimator import LiveEstimator
 from terrain.estimation.measurements.batch import measurement_table
-from terrain.extension import Correction, corrected, corrected_log, extended_yaml, moved, write_extended
+from terrain.extension import Correction, apply_homes, corrected, corrected_log, extended_yaml, write_extended
 from terrain.files.resources import data_folder
 from terrain.kinematics.camera import body_motion
 from terrain.logs.replay import replay
@@ -113,7 +113,7 @@ R, Y, F = VALUES
         ({"schema": 0}, "schema is 0"),
         ({"warp_ratio": entry(0.1)}, "warp_ratio is no parameter of an effect"),
         ({"pitch_offset_rad": entry(0.1, "rad")}, "pitch_offset_rad is no parameter"),
-        ({"yaw_delay_s": entry(0.1, "s")}, "yaw_delay_s cannot befall a robot with the drive 'swerve'"),
+        ({"yaw_delay_s": entry(0.1, "s")}, "yaw_delay_s does not apply to a robot with the drive 'swerve'"),
         ({R: entry(math.nan)}, f"{R} is nan"),
         ({R: entry(math.inf)}, f"{R} is inf"),
         ({R: entry(0.5)}, f"{R} is 0.5, a number from -0.3 to 0.3"),
@@ -148,7 +148,7 @@ def test_a_section_without_a_schema_is_refused(section):
         ({"gyro_scale_ratio": 0.1}, np.eye(2), {"gyro_scale_ratio": (0.0, 0.2)}, "shape"),
         ({"gyro_scale_ratio": 0.1}, np.eye(1), {"gyro_scale_ratio": (0.2, 0.3)}, "must hold it"),
         ({"gyro_scale_ratio": 0.1}, np.eye(1), {}, "must hold it"),
-        ({"yaw_delay_s": 0.1}, np.eye(1), {"yaw_delay_s": (0.0, 0.2)}, "cannot befall"),
+        ({"yaw_delay_s": 0.1}, np.eye(1), {"yaw_delay_s": (0.0, 0.2)}, "does not apply to"),
         ({"gyro_scale_ratio": 0.1}, -np.eye(1), {"gyro_scale_ratio": (0.0, 0.2)}, "variance"),
     ],
 )
@@ -202,7 +202,7 @@ def test_each_effect_goes_where_the_description_has_it():
 
 def test_the_covariance_of_what_stays_is_that_of_the_rest():
     robot = replace(ROBOT, effects=VALUES, effects_cov=COV)
-    np.testing.assert_array_equal(moved(robot).effects_cov, COV[1:, 1:])
+    np.testing.assert_array_equal(apply_homes(robot).effects_cov, COV[1:, 1:])
     np.testing.assert_array_equal(corrected(robot).effects_cov, COV[2:, 2:])
 
 

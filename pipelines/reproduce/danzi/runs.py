@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from terrain.simulation.run import simulate_run
 
 from pipelines.estimate.estimate import Estimate
 from pipelines.reporting.drawing import finished, new_figure, styled
@@ -16,6 +15,7 @@ from terrain.estimation.slip_figures import slip_figures
 from terrain.records import Array, RunLog
 from terrain.robots import Robot
 from terrain.simulation.conditions import Faults
+from terrain.simulation.run import simulate_run
 from terrain.simulation.scenario.legs import STAND_S
 
 RUNS, FEW_RUNS = 5, 2

@@ -17,25 +17,29 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import norm
 
-from terrain.effects.catalogue import (
+from terrain.effects import (
     ACCEL,
     CHANNELS,
     CURRENT,
     GYRO,
     INDEX,
     LIBRARY,
-    NUISANCES,
+    ONE_SIDED,
+    SENSED_ONLY,
     SPEED_X,
     SPEED_Y,
+    STEPS,
     TURNING_CURRENT,
     Effect,
     library_of,
+    nuisances_of,
+    parameters_of,
     vector_of,
 )
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import Robot
 from terrain.simulation.planar.hills import Hills
-from terrain.simulation.planar.ideal_sensors import SENSED_ONLY, sense
+from terrain.simulation.planar.ideal_sensors import sense
 from terrain.simulation.planar.model import Ground, Planar, make_planar
 from terrain.simulation.planar.motion import move
 from terrain.simulation.planar.noise import Noise, load_noise, load_scatter
@@ -192,12 +196,9 @@ def hidden_runs(
 def limits_of(robot: Robot, drives: Drives) -> Limits:
     """Return what drives could show of each effect, by the Cramer-Rao bound."""
     planar, noise, scatter = make_planar(robot, Ground()), load_noise(), load_scatter()
-    names = tuple(dict.fromkeys([p.name for effect in library_of(robot.drive) for p in effect.parameters]))
-    extra = tuple(name for name in NUISANCES if name not in names)
-    if robot.drive == "swerve":
-        extra = tuple(name for name in extra if name != "effective_track_ratio")
-    every = (*names, *extra)
-    free = [every.index(name) for name in NUISANCES if name in every]
+    names, nuisances = tuple(parameters_of(robot.drive)), nuisances_of(robot.drive)
+    every = tuple(dict.fromkeys((*names, *nuisances)))
+    free = [every.index(name) for name in nuisances]
     std = np.array([getattr(scatter, every[i]) for i in free])
     total = np.zeros((len(names), len(names)))
     for twist, hills in zip(drives.twists, drives.hills, strict=True):
@@ -240,18 +241,17 @@ def _gram(
     pace = float(np.abs(wheel_speed).mean(axis=1)[np.abs(wheel_speed).mean(axis=1) > 0.05].mean())
     density = {name: _density(noise, robot, planar, name, f, pace) for name in channels}
     waves = {name: np.empty((len(names), f.size), dtype=complex) for name in channels}
-    steps = {p.name: p.step for effect in LIBRARY for p in effect.parameters}
     plain = move(planar, vector_of({}), 1 / rate_hz, wheel_speed, steer, grade, roll, np.zeros((0, 3)))
     for j, name in enumerate(names):
-        step = steps.get(name, 0.005)
+        step = STEPS[name]
         both = []
-        for sign in (1.0, 0.0) if name == "steering_backlash_rad" else (1.0, -1.0):
+        for sign in (1.0, 0.0) if name in ONE_SIDED else (1.0, -1.0):
             p = vector_of({name: sign * step})
             if name in SENSED_ONLY:
                 both.append(sense(planar, p, 1 / rate_hz, plain))
             else:
                 both.append(_shown(planar, p, 1 / rate_hz, wheel_speed, steer, grade, roll))
-        span = step if name == "steering_backlash_rad" else 2 * step
+        span = step if name in ONE_SIDED else 2 * step
         change = (both[0] - both[1]) / span * shown
         for channel in channels:
             waves[channel][j] = np.fft.rfft(change[:, CHANNELS.index(channel)])[used] / rate_hz

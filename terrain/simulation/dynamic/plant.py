@@ -25,6 +25,7 @@ from typing import NamedTuple
 import numpy as np
 
 from terrain.constants import GRAVITY_MPS2
+from terrain.effects import PlantPart, in_plant, parameters_of
 from terrain.errors import ConfigError
 from terrain.records import Array
 from terrain.robots import Robot
@@ -123,7 +124,7 @@ def make_plant(
         if the load takes the centre of mass out of the triangle of the wheels.
     """
     body, motors, steering, _, sensors = robot.equipment
-    effects = dict.fromkeys(_LINKAGE + _GROUND + _OTHER, 0.0) | dict(robot.effects)
+    effects = dict.fromkeys(parameters_of(robot.drive), 0.0) | dict(robot.effects)
     mass_kg = robot.mass_kg * (1.0 + effects["payload_ratio"]) + payload_kg
     half = 0.5 * effects["one_sided_radius_ratio"]
     rolling = (1.0 + effects["wheel_radius_ratio"]) * np.array([1.0 - half, 1.0 - half, 1.0 + half])
@@ -173,11 +174,11 @@ def make_plant(
         roughness_m3=np.ascontiguousarray(roughness_m3, dtype=float),
         patch_start_m=np.ascontiguousarray(patch_start_m, dtype=float),
         field=np.ascontiguousarray(field, dtype=float),
-        linked=any(effects[name] != 0.0 for name in _LINKAGE),
+        linked=any(effects[name] != 0.0 for name in in_plant(PlantPart.LINKAGE)),
         steer_offset_rad=np.array([effects[f"steering_offset_{i}_rad"] for i in (1, 2, 3)]),
         steer_backlash_rad=effects["steering_backlash_rad"],
         steer_delay_steps=round(effects["steering_delay_s"] / STEP_S),
-        hidden=any(effects[name] != 0.0 for name in _GROUND),
+        hidden=any(effects[name] != 0.0 for name in in_plant(PlantPart.CONTACT)),
         weight_n=robot.mass_kg * GRAVITY_MPS2,
         force_slip_ratio=effects["force_slip_ratio"],
         shear_slip_ratio=effects["shear_slip_ratio"],
@@ -186,16 +187,6 @@ def make_plant(
         drag_nspm=effects["viscous_drag_nspm"],
         side_hill_ratio=effects["side_hill_slip_ratio"],
     )
-
-
-_LINKAGE = (*(f"steering_offset_{i}_rad" for i in (1, 2, 3)), "steering_backlash_rad", "steering_delay_s")
-
-_GROUND = (
-    *("force_slip_ratio", "shear_slip_ratio", "slip_resistance_ratio", "rolling_resistance_ratio"),
-    *("viscous_drag_nspm", "side_hill_slip_ratio"),
-)
-
-_OTHER = ("payload_ratio", "one_sided_radius_ratio", "wheel_radius_ratio")
 
 
 def record_width(plant: Plant) -> int:

@@ -10,9 +10,9 @@ from itertools import pairwise
 import numpy as np
 from scipy.signal import lfilter
 
-from terrain.effects.described import checked_effects
+from terrain.effects import OTHER_LOGGER, PlantPart, checked_effects, in_plant
 from terrain.errors import ConfigError
-from terrain.extension import OTHER_LOGGER, moved
+from terrain.extension import apply_homes
 from terrain.kinematics.swerve import wheel_commands
 from terrain.records import Array, Command, Label, RunLog, Sample, Stream
 from terrain.robots import Robot
@@ -109,7 +109,7 @@ def simulate(
         if the robot is no swerve robot, lacks a section, is tipped over by its load or has a number so far
         out of scale that its motion cannot be integrated, a sensor is faster than the simulation's steps, a
         terrain of the scenario has no soil, its twists do not come every so many whole steps, the delay is
-        not from 0 to 0.5 s, or an effect cannot befall the robot or is out of its bounds.
+        not from 0 to 0.5 s, or an effect does not apply to the robot or is out of its bounds.
     DataError
         if a command is not one finite number a wheel, or its status not numbers by names that end in a unit,
         the same names throughout.
@@ -185,20 +185,14 @@ def simulate(
     )
 
 
-_IN_DESCRIPTION = (
-    *("gyro_bias_radps", "accel_bias_mps2", "motor_constant_ratio", "encoder_lag_s"),
-    *("camera_latency_s", "lever_x_m", "lever_y_m"),
-)
-"""Effects that are no more than another number of the description; plant and sensors take the others."""
-
-
 def _built(robot: Robot, effects: Mapping[str, float]) -> Robot:
     """Return the robot that drives, which the one that is commanded is taken for."""
     if not robot.effects and not effects:
         return robot
     acting = checked_effects("effects", {**robot.effects, **effects}, robot.drive)
     n = len(acting)
-    return moved(replace(robot, effects=acting, effects_cov=np.full((n, n), np.nan)), _IN_DESCRIPTION)
+    extended = replace(robot, effects=acting, effects_cov=np.full((n, n), np.nan))
+    return apply_homes(extended, in_plant(PlantPart.DESCRIPTION))
 
 
 def _delay_steps(delay_s: float) -> int:

@@ -1,4 +1,4 @@
-"""What sensors without noise show of a motion: bias, scale, mounting, latency and their logger's clock."""
+"""Output of sensors without noise along a motion: bias, scale, mounting, latency and their logger's clock."""
 
 from __future__ import annotations
 
@@ -7,16 +7,10 @@ import math
 import numpy as np
 from numba import njit
 
-from terrain.effects.catalogue import INDEX
+from terrain.effects import INDEX
 from terrain.records import Array
 from terrain.simulation.planar.model import AMPS, AX, TURNING_AMPS, VX, VY, Planar, W
 from terrain.simulation.planar.signals import delayed
-
-SENSED_ONLY: tuple[str, ...] = (
-    *("gyro_bias_radps", "gyro_scale_ratio", "accel_bias_mps2", "camera_latency_s", "camera_yaw_rad"),
-    *("lever_x_m", "lever_y_m", "motor_constant_ratio", "motor_drift_ratio"),
-)
-"""Parameters that change what sensors show, and not what the body does."""
 
 _GYRO_BIAS = INDEX["gyro_bias_radps"]
 _GYRO_SCALE = INDEX["gyro_scale_ratio"]
@@ -33,7 +27,7 @@ _DRIFT = INDEX["motor_drift_ratio"]
 
 @njit(cache=True)
 def sense(planar: Planar, p: Array, dt: float, truth: Array) -> Array:
-    """Return the channels (n, len(CHANNELS)) that sensors without noise would show.
+    """Return the channels (n, len(CHANNELS)) that sensors without noise measure.
 
     Parameters
     ----------

@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 
 from terrain.constants import GRAVITY_MPS2
-from terrain.effects.catalogue import INDEX
+from terrain.effects import INDEX
 from terrain.records import Array
 from terrain.simulation.planar.model import AX, SWERVE_WHEELS, VX, VY, Planar, W
 from terrain.simulation.planar.signals import slopes

@@ -12,7 +12,7 @@ from collections.abc import Callable
 import numpy as np
 
 from terrain.constants import GRAVITY_MPS2
-from terrain.effects.catalogue import ACCEL, CURRENT, GYRO, HEADING, SPEED_X, SPEED_Y, TURNING_CURRENT
+from terrain.effects import ACCEL, CURRENT, GYRO, HEADING, SPEED_X, SPEED_Y, TURNING_CURRENT
 from terrain.errors import ConfigError
 from terrain.records import Array
 from terrain.robots import Robot

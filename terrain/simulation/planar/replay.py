@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from terrain.effects.catalogue import INDEX
+from terrain.effects import INDEX
 from terrain.records import Array
 from terrain.simulation.planar.ideal_sensors import sense
 from terrain.simulation.planar.model import Planar

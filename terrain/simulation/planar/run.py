@@ -17,9 +17,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from terrain.effects.catalogue import (
+from terrain.effects import (
     INDEX,
-    NUISANCES,
+    nuisances_of,
     vector_of,
 )
 from terrain.errors import ConfigError
@@ -116,9 +116,7 @@ def simulate_planar(
     rngs = _generators(seed)
     p = vector_of({**robot.effects, **(effects or {})})
     if scatter is not None:
-        for name in NUISANCES:
-            if robot.drive == "swerve" and name == "effective_track_ratio":
-                continue
+        for name in nuisances_of(robot.drive):
             p[INDEX[name]] += getattr(scatter, name) * rngs["scatter"].standard_normal()
     commands, channels, desired_mps, desired_rad = wheel_commands_of(robot, twist)
     motion = _moved(

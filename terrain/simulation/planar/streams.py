@@ -11,7 +11,7 @@ from numba import njit
 
 from terrain.angles import wrapped
 from terrain.constants import GRAVITY_MPS2
-from terrain.effects.catalogue import (
+from terrain.effects import (
     CHANNELS,
     CURRENT,
     HEADING,

@@ -21,7 +21,7 @@ import numpy as np
 from numba import njit
 
 from terrain.constants import GRAVITY_MPS2
-from terrain.effects.catalogue import INDEX
+from terrain.effects import INDEX
 from terrain.records import Array
 from terrain.simulation.contact import DEFLECTION_DAMPING_S, shear_softness, softness
 from terrain.simulation.planar.model import AMPS, FORCE, SLIP, VX, VY, Planar, W

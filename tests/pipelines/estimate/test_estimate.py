@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from terrain.simulation.run import simulate_run
 
 from pipelines.estimate.estimate import FILTERS, enriched, estimate, estimate_run, summary
 from terrain.errors import ConfigError, DataError, LogError
@@ -14,6 +13,7 @@ from terrain.logs.schema import signal_set_of
 from terrain.records import RunLog, Stream
 from terrain.robots import load_robot
 from terrain.simulation.conditions import Faults
+from terrain.simulation.run import simulate_run
 from terrain.simulation.sensors.gnss import Gnss
 
 ROBOT = load_robot("agrimaro")

@@ -4,16 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from terrain.simulation.run import simulate_run
 
 from pipelines.explain.classifier import classifier_gain, compared
 from pipelines.explain.ground import ground_notes, simulation_for
 from terrain.discrepancy.diagnose import diagnose
-from terrain.effects.catalogue import library_of
+from terrain.effects import library_of
 from terrain.records import Label
 from terrain.robots import load_robot
 from terrain.simulation.planar.ground import planar_ground
 from terrain.simulation.planar.model import Ground
+from terrain.simulation.run import simulate_run
 from terrain.terramechanics.soil import load_soil
 
 AGRIMARO, HUSKY = load_robot("agrimaro"), load_robot("husky")

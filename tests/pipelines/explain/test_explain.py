@@ -152,7 +152,7 @@ def test_few_runs_keep_none_unless_asked_and_the_same_seed_gives_the_same_page(t
 def test_a_users_mistake_is_one_sentence_and_nothing_is_written(refused, data, tmp_path):
     here = ("--data", data, "--robot", "husky", "--out", "out")
     refused("effect 'gravity' is unknown", *here, "--effects", "gravity")
-    refused("cannot befall a robot with the drive 'skid_steer'", *here, "--effects", "steering_backlash")
+    refused("does not apply to a robot with the drive 'skid_steer'", *here, "--effects", "steering_backlash")
     refused("--effects names none", *here, "--effects", ",")
     refused("no run is labelled 'sand' throughout; labels are field", *here, "--terrain", "sand")
     refused("--hold-out is 5 of 7 runs; the diagnosis wants 3", *here, "--hold-out", "5")

@@ -17,7 +17,7 @@ from pipelines.explain.figures import (
 )
 from pipelines.reporting.drawing import png_bytes
 from terrain.discrepancy.noise import Noise, noise_of
-from terrain.effects.catalogue import CHANNELS
+from terrain.effects import CHANNELS
 
 RATE_HZ = 6.25
 C = CHANNELS.index("speed_x_mps")

@@ -23,7 +23,7 @@ from pipelines.explain.trials import (
     run_trial,
     table_of,
 )
-from terrain.effects.catalogue import library_of
+from terrain.effects import library_of
 from terrain.errors import ConfigError, DataError
 
 PLAIN = Trial(

@@ -10,7 +10,6 @@ from functools import cache
 
 import numpy as np
 import pytest
-from terrain.simulation.run import simulate_run
 
 from pipelines.drive.controllers import drive_once, make_driver
 from pipelines.drive.drives import situation, start_times
@@ -25,6 +24,7 @@ from terrain.logs.replay import replay
 from terrain.records import Reading, Sample
 from terrain.robots import load_robot
 from terrain.simulation.conditions import Faults
+from terrain.simulation.run import simulate_run
 from terrain.slip_learning.slip_curve import LAW_PARAMETERS
 
 ROBOT, TABLE = load_robot("agrimaro"), load_slip_table()

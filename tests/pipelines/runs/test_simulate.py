@@ -2,7 +2,6 @@ import json
 
 import numpy as np
 import pytest
-from terrain.simulation.run import simulate_run
 
 from pipelines.runs.simulate import simulate_runs
 from terrain.errors import ConfigError, LogError
@@ -10,6 +9,7 @@ from terrain.files.resources import data_folder
 from terrain.logs.read import find_runs, read_run
 from terrain.robots import load_robot
 from terrain.simulation.conditions import Conditions, Faults
+from terrain.simulation.run import simulate_run
 from terrain.simulation.sensors.gnss import Gnss
 from terrain.terramechanics.soil import soil_names
 
@@ -119,7 +119,7 @@ def test_load_slope_and_a_lost_camera_reach_a_skid_steered_run():
         ({"robot_name": "husky", "terrain": "course", "scenario": "course"}, "'course' is for swerve"),
         ({"robot_name": "husky", "scenario": "slip"}, "robot husky"),
         ({"robot_name": "husky", "gnss": True}, "has no receiver"),
-        ({"robot_name": "husky", "effects": ["steering_backlash=0.1"]}, "cannot befall"),
+        ({"robot_name": "husky", "effects": ["steering_backlash=0.1"]}, "does not apply to"),
         ({"effects": ["wheel_radius=9"]}, "-0.3 to 0.3 is accepted"),
         ({"effects": ["wheel_radius=0.1", "encoder_scale=0.1"]}, "effect 'encoder_scale' is given twice"),
         ({"scenario": "slip", "effects": ["wheel_radius=0.1"]}, "without effects"),

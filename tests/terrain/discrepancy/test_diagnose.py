@@ -13,7 +13,7 @@ from terrain.discrepancy.search import Problem, search
 from terrain.discrepancy.signals import signals_of
 from terrain.discrepancy.trials.hidden_effects import confusable_class, hidden_runs, limits_of, rich_drives
 from terrain.discrepancy.verdict import AMBIGUOUS, EXPLAINED, NONE, UNEXPLAINED
-from terrain.effects.catalogue import GYRO, HEADING, effect_named
+from terrain.effects import GYRO, HEADING, effect_named
 from terrain.errors import DataError
 from terrain.records import Stream
 from terrain.robots import load_robot

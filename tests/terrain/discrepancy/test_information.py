@@ -21,7 +21,7 @@ from terrain.discrepancy.residuals import low_pass_of
 from terrain.discrepancy.selection import fitted
 from terrain.discrepancy.signals import signals_of
 from terrain.discrepancy.simulation import Simulation
-from terrain.effects.catalogue import BOUNDS, CHANNELS, INDEX, SPEED_X, vector_of
+from terrain.effects import BOUNDS, CHANNELS, INDEX, SPEED_X, vector_of
 from terrain.robots import load_robot
 from terrain.simulation.planar.hills import Hills
 from terrain.simulation.planar.noise import load_noise, load_scatter

@@ -8,8 +8,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from terrain.discrepancy.information import information_at
 from terrain.discrepancy.residuals import (
-    ONE_SIDED,
-    STEPS,
     _prepared,
     decimated,
     holed,
@@ -20,15 +18,17 @@ from terrain.discrepancy.residuals import (
 from terrain.discrepancy.selection import fitted
 from terrain.discrepancy.signals import Signals, signals_of
 from terrain.discrepancy.simulation import Simulation
-from terrain.effects.catalogue import (
+from terrain.effects import (
     ACCEL,
     CHANNELS,
     CURRENT,
     GYRO,
     HEADING,
     INDEX,
+    ONE_SIDED,
     SPEED_X,
     SPEED_Y,
+    STEPS,
     TURNING_CURRENT,
     vector_of,
 )

@@ -9,7 +9,7 @@ from terrain.discrepancy.search import Problem, names_of, search
 from terrain.discrepancy.selection import fitted
 from terrain.discrepancy.signals import signals_of
 from terrain.discrepancy.trials.hidden_effects import hidden_runs, rich_drives
-from terrain.effects.catalogue import INDEX, LIBRARY, effect_named
+from terrain.effects import INDEX, LIBRARY, effect_named
 from terrain.robots import load_robot
 
 HUSKY = load_robot("husky")

@@ -20,7 +20,7 @@ from terrain.discrepancy.selection import (
     z_of,
     z_of_t,
 )
-from terrain.effects.catalogue import INDEX, effect_named
+from terrain.effects import INDEX, effect_named
 
 PARAMETERS = ("payload_ratio", "gyro_bias_radps", "lever_x_m", "lever_y_m", "wheel_radius_ratio")
 N_RUNS, N_ROWS = 8, 120

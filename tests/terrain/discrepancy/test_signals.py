@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from terrain.discrepancy.signals import PARALLEL, signals_of
-from terrain.effects.catalogue import (
+from terrain.effects import (
     ACCEL,
     CHANNELS,
     CURRENT,

@@ -1,9 +1,16 @@
 """The catalogue of effects is consistent, and each shows where it says."""
 
+import ast
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from terrain.effects.catalogue import (
+import terrain
+from terrain.effects import (
     ACCEL,
     BOTH,
     CHANNELS,
@@ -13,10 +20,14 @@ from terrain.effects.catalogue import (
     INDEX,
     LIBRARY,
     NUISANCES,
+    PARAMETER,
     PARAMETERS,
     SPEED_X,
     SPEED_Y,
+    SWERVE,
+    TILT_OFFSETS,
     TURNING_CURRENT,
+    PlantPart,
     effect_named,
     library_of,
     read_effect,
@@ -25,6 +36,7 @@ from terrain.effects.catalogue import (
 from terrain.errors import ConfigError
 from terrain.robots import load_robot
 from terrain.simulation.planar.model import Ground, make_planar
+from terrain.simulation.planar.noise import load_scatter
 from terrain.simulation.planar.replay import replay
 
 ROBOTS = {"skid_steer": load_robot("husky"), "swerve": load_robot("agrimaro")}
@@ -93,8 +105,100 @@ def test_names_are_unique_and_the_neutral_value_lies_within_the_bounds():
             assert p.unit in ("ratio", "rad", "s", "m", "radps", "mps2", "nspm")
 
 
+@pytest.mark.parametrize("name", ["steering_play=0.01", "steering_backlash=0.01"])
+def test_a_former_name_is_accepted_on_the_command_line(name):
+    assert read_effect(name, "swerve") == {"steering_backlash_rad": 0.01}
+
+
+def test_homes_are_numbers_of_a_description():
+    robot = ROBOTS["swerve"]
+    for effect in LIBRARY:
+        for p in effect.parameters:
+            for home in p.homes:
+                part = getattr(robot, home.section) if home.section else robot
+                assert isinstance(getattr(part, home.field), float), p.name
+        if effect.plant is PlantPart.DESCRIPTION:
+            assert all(p.homes for p in effect.parameters)
+        assert (effect.plant is None) == (SWERVE not in effect.drives)
+
+
+def test_ranks_of_scatter_are_those_of_the_scatter_that_is_published():
+    assert tuple(name for name in NUISANCES if name in load_scatter()._fields) == NUISANCES
+    assert set(NUISANCES) == set(load_scatter()._fields)
+    ranks = [p.scatter_rank for p in (*PARAMETER.values(), *TILT_OFFSETS) if p.scatter_rank]
+    assert sorted(ranks) == list(range(1, len(NUISANCES) + 1))
+
+
+ADDED = """
+import importlib.util, json, sys, types
+from pathlib import Path
+
+place = Path(importlib.util.find_spec("terrain").origin).parent / "effects"
+package = types.ModuleType("terrain.effects")
+package.__path__ = [str(place)]
+sys.modules["terrain.effects"] = package
+from terrain.effects import ground
+from terrain.effects.types import BOTH, CURRENT, SWERVE, Combine, Effect, Home, Inverse, Parameter, PlantPart
+
+home = Home("motors", "efficiency_ratio", Combine.TIMES)
+new = Parameter("gear_wear_ratio", -0.1, 0.1, 0.001, (home,), one_sided=True, scatter_rank=10,
+                as_percent=True, is_error=True, deprecated=("worn_ratio",))
+ground.SIDEWAYS += (
+    Effect("gear_wear", (new,), "x", "y", (SWERVE,), (CURRENT,), "z", True, PlantPart.DESCRIPTION,
+           deprecated=("worn",)),
+)
+exec(compile((place / "__init__.py").read_text(), "effects", "exec"), package.__dict__)
+
+from dataclasses import replace
+import terrain.effects as effects
+from pipelines.explain.page import limit_words, quantity
+from terrain.discrepancy import residuals, search, information
+from terrain.discrepancy.simulation import Simulation
+from terrain.discrepancy.trials.hidden_effects import STEPS
+from terrain.extension import corrected
+from terrain.robots import load_robot, robot_from
+from terrain.simulation.dynamic.simulate import _built
+
+robot, name = load_robot("agrimaro"), "gear_wear_ratio"
+for table in (effects.BOUNDS, effects.STEPS, effects.NUISANCES, effects.SENSED_ONLY, effects.ONE_SIDED,
+              effects.INDEX, residuals.STEPS, residuals.SENSED_ONLY, residuals.ONE_SIDED, STEPS,
+              information.PRIOR_STD, effects.nuisances_of("swerve")):
+    assert name in table
+assert name not in effects.nuisances_of("skid_steer")
+assert effects.read_effect("worn=0.05", "swerve") == {name: 0.05}
+assert Simulation(robot, effects={name: 0.05}, scatter={name: 0.1}).library[-1].name == "gear_wear"
+entry = {"value": 0.05, "unit": "ratio", "source": "test"}
+assert effects.read_effects("here", {"schema": 1, "worn_ratio": entry}, "swerve")[0] == {name: 0.05}
+for extended in (corrected(replace(robot, effects={name: 0.05})), _built(robot, {name: 0.05})):
+    assert extended.motors.efficiency_ratio == robot.motors.efficiency_ratio * 1.05
+    assert not extended.effects
+assert quantity(name, 0.05) == "5\N{NO-BREAK SPACE}%"
+assert limit_words({"name": name, "detection_limit": 0.05}, False).startswith("A gear wear off by under 5")
+"""
+
+
+def test_an_entry_of_the_catalogue_is_all_that_the_rest_of_the_project_needs_of_an_effect():
+    """In a process of its own: the catalogue is read at import.  No kernel runs."""
+    subprocess.run([sys.executable, "-c", ADDED], check=True, env=os.environ | {"NUMBA_DISABLE_JIT": "1"})
+
+
+def test_no_other_module_lists_effects():
+    """Three names in one literal are a list; the trials' causes that no library has are no effects."""
+    names = {*PARAMETER, *(name for effect in LIBRARY for name in (effect.name, *effect.aliases))}
+    root = Path(terrain.__file__).parent.parent
+    for path in sorted(
+        p for room in ("terrain", "features", "pipelines") for p in (root / room).rglob("*.py")
+    ):
+        if path.parent.name == "effects":
+            continue
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            parts = node.keys if isinstance(node, ast.Dict) else getattr(node, "elts", ())
+            listed = {part.value for part in parts if isinstance(part, ast.Constant)} & names
+            assert len(listed) < 3, f"{path.relative_to(root)}:{node.lineno} lists {sorted(listed)}"
+
+
 @pytest.mark.parametrize("drive", ROBOTS)
-def test_an_effect_changes_the_replay_of_the_robots_that_it_can_befall_and_of_no_others(responses, drive):
+def test_an_effect_changes_the_replay_of_the_robots_that_it_applies_to_and_of_no_others(responses, drive):
     for effect in LIBRARY:
         response = responses[drive, effect.name]
         if effect in library_of(drive):
@@ -138,7 +242,7 @@ def test_an_alias_is_the_effect():
     ("text", "drive", "message"),
     [
         ("gravity=1", "swerve", "effect 'gravity' is unknown: use one of wheel_radius,"),
-        ("steering_backlash=0.01", "skid_steer", "cannot befall a robot with the drive 'skid_steer'"),
+        ("steering_backlash=0.01", "skid_steer", "does not apply to a robot with the drive 'skid_steer'"),
         ("payload", "swerve", "payload=VALUE with payload_ratio is required"),
         ("payload=heavy", "swerve", "payload=VALUE with payload_ratio is required"),
         ("payload=0.1,0.2", "swerve", "payload=VALUE with payload_ratio is required"),

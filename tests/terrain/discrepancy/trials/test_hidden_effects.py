@@ -18,7 +18,7 @@ from terrain.discrepancy.trials.hidden_effects import (
     poor_drives,
     rich_drives,
 )
-from terrain.effects.catalogue import effect_named, library_of
+from terrain.effects import effect_named, library_of
 from terrain.robots import load_robot
 
 HUSKY, AGRIMARO = load_robot("husky"), load_robot("agrimaro")

@@ -9,7 +9,7 @@ import pytest
 from scipy.optimize import minimize_scalar
 
 from terrain.constants import GRAVITY_MPS2
-from terrain.effects.catalogue import library_of
+from terrain.effects import library_of
 from terrain.errors import ConfigError
 from terrain.estimation.measurements.resampling import low_pass
 from terrain.extension import corrected, corrected_log
@@ -358,7 +358,7 @@ def test_only_the_other_logger_has_its_own_clock():
 @pytest.mark.parametrize(
     ("effects", "message"),
     [
-        ({"effective_track_ratio": 0.5}, "cannot befall a robot with the drive 'swerve'"),
+        ({"effective_track_ratio": 0.5}, "does not apply to a robot with the drive 'swerve'"),
         ({"warp_ratio": 0.1}, "warp_ratio is no parameter"),
         ({"gyro_scale_ratio": math.nan}, "gyro_scale_ratio is nan"),
         ({"gyro_scale_ratio": 0.5}, "a number from -0.3 to 0.3"),

@@ -6,7 +6,7 @@ import pytest
 from scipy.signal import welch
 
 from terrain.constants import GRAVITY_MPS2
-from terrain.effects.catalogue import (
+from terrain.effects import (
     ACCEL,
     CHANNELS,
     CURRENT,

@@ -1,0 +1,128 @@
+"""Effects of the ground, of turning and of side slopes: slip and resistance."""
+
+from __future__ import annotations
+
+from terrain.effects.types import (
+    BOTH,
+    CURRENT,
+    GYRO,
+    HEADING,
+    MOTION,
+    SKID,
+    SPEED_X,
+    SPEED_Y,
+    TURNING_CURRENT,
+    Combine,
+    Effect,
+    Home,
+    Parameter,
+    PlantPart,
+)
+
+SLIP_AND_RESISTANCE: tuple[Effect, ...] = (
+    Effect(
+        "effective_track",
+        (
+            Parameter(
+                "effective_track_ratio",
+                -0.5,
+                4.0,
+                0.02,
+                homes=(Home("", "track_m", Combine.TIMES),),
+                scatter_rank=9,
+                as_percent=True,
+                is_error=True,
+            ),
+        ),
+        "w = dv / (B (1 + e))",
+        "Mandow et al., Experimental kinematics for wheeled skid-steer mobile robots, IROS 2007",
+        (SKID,),
+        (GYRO, SPEED_Y, HEADING),
+        "turns in place and in arcs, and an absolute heading",
+        twins=(("gyro_scale", HEADING),),
+    ),
+    Effect(
+        "turning_slip",
+        (Parameter("turning_slip_ratio", -0.5, 0.9, 0.02),),
+        "dv loses D = k q dv, shared as u_r = D a/(a+b), u_l = -D b/(a+b), a = |v_r|^(1-n), b = |v_l|^(1-n), "
+        "n = 0.5",
+        "Endo et al., IROS 2007, as in Yamauchi et al., (27) written without its singular points; the size "
+        "of D is this project's",
+        (SKID,),
+        (*MOTION, HEADING),
+        "arcs of several radii and turns in place",
+    ),
+    Effect(
+        "force_slip",
+        (Parameter("force_slip_ratio", -0.3, 3.0, 0.02, scatter_rank=8),),
+        "v = u - |u| c f",
+        "linear part of any thrust curve; Wong, Theory of Ground Vehicles",
+        BOTH,
+        (SPEED_X, SPEED_Y),
+        "slopes and accelerations",
+        plant=PlantPart.CONTACT,
+    ),
+    Effect(
+        "shear_slip",
+        (Parameter("shear_slip_ratio", 0.0, 3.0, 0.02),),
+        "f = f_max (1 - K/(s l) (1 - exp(-s l/K))), with K/l = c f_max / 2 so that c is its slip per force "
+        "at the start",
+        "Janosi and Hanamoto 1961, as integrated along the contact (Yamauchi et al., (17), corrected)",
+        BOTH,
+        (SPEED_X, SPEED_Y),
+        "tractions over half of f_max, of both small and large size",
+        plant=PlantPart.CONTACT,
+    ),
+    Effect(
+        "slip_resistance",
+        (Parameter("slip_resistance_ratio", 0.0, 5.0, 0.05),),
+        "resistance grows by b |s| W",
+        "Lyasko, Slip sinkage effect in soil-vehicle mechanics, J. Terramechanics 2010: linear in slip",
+        BOTH,
+        (CURRENT, SPEED_X),
+        "a range of slip",
+        plant=PlantPart.CONTACT,
+    ),
+    Effect(
+        "rolling_resistance",
+        (Parameter("rolling_resistance_ratio", -0.05, 0.5, 0.005, scatter_rank=7),),
+        "resistance grows by c W",
+        "Wong, Theory of Ground Vehicles",
+        BOTH,
+        (CURRENT, SPEED_X),
+        "several speeds, both ways",
+        plant=PlantPart.CONTACT,
+    ),
+    Effect(
+        "viscous_drag",
+        (Parameter("viscous_drag_nspm", 0.0, 500.0, 3.0),),
+        "resistance grows by c v",
+        "viscous friction of bearings and gears",
+        BOTH,
+        (CURRENT, SPEED_X),
+        "three speeds",
+        plant=PlantPart.CONTACT,
+    ),
+)
+
+SIDEWAYS: tuple[Effect, ...] = (
+    Effect(
+        "scrub",
+        (Parameter("scrub_ratio", -0.2, 1.0, 0.005),),
+        "resistance to rolling and to turning grow by k q W",
+        "scrub of skidding wheels; the form in q as EKF practice has it",
+        (SKID,),
+        (CURRENT, TURNING_CURRENT, SPEED_X),
+        "turns",
+    ),
+    Effect(
+        "side_hill_slip",
+        (Parameter("side_hill_slip_ratio", 0.0, 5.0, 0.05),),
+        "v_y = -c ph |v|",
+        "Yamauchi et al., (2), with the sign that gravity sets",
+        BOTH,
+        (SPEED_Y,),
+        "both signs of roll",
+        plant=PlantPart.CONTACT,
+    ),
+)

@@ -1,0 +1,87 @@
+"""Effects of the load and of the motors: mass, torque constant and its drift."""
+
+from __future__ import annotations
+
+from terrain.effects.types import (
+    BOTH,
+    CURRENT,
+    SPEED_X,
+    TURNING_CURRENT,
+    Combine,
+    Effect,
+    Home,
+    Inverse,
+    Parameter,
+    PlantPart,
+)
+
+LOAD_AND_MOTORS: tuple[Effect, ...] = (
+    Effect(
+        "payload",
+        (
+            Parameter(
+                "payload_ratio",
+                -0.5,
+                1.5,
+                0.02,
+                homes=(
+                    Home("", "mass_kg", Combine.TIMES),
+                    Home("body", "yaw_inertia_kgm2", Combine.TIMES, optional=True),
+                ),
+                as_percent=True,
+            ),
+        ),
+        "mass m (1 + p)",
+        "Newton",
+        BOTH,
+        (CURRENT, SPEED_X),
+        "accelerations and slopes",
+        plant=PlantPart.BODY,
+        twins=(("motor_constant", SPEED_X),),
+    ),
+    Effect(
+        "motor_constant",
+        (
+            Parameter(
+                "motor_constant_ratio",
+                -0.5,
+                1.0,
+                0.01,
+                homes=(Home("motors", "torque_constant_nmpa", Combine.OVER),),
+                inverse=Inverse(("wheels",), "current / (1 + q) without the section"),
+                as_percent=True,
+                is_error=True,
+            ),
+        ),
+        "current (1 + q)",
+        "DC motor: current is torque over its constant",
+        BOTH,
+        (CURRENT, TURNING_CURRENT),
+        "accelerations and slopes",
+        sensed_only=True,
+        plant=PlantPart.DESCRIPTION,
+        twins=(("payload", SPEED_X),),
+    ),
+    Effect(
+        "motor_drift",
+        (
+            Parameter(
+                "motor_drift_ratio",
+                -0.5,
+                1.0,
+                0.01,
+                inverse=Inverse(
+                    ("wheels",), "current / (1 + q t / 60 s), from the first stamp of the wheels"
+                ),
+                as_percent=True,
+            ),
+        ),
+        "current (1 + q t / 60 s) from the start of a run",
+        "remanence of a magnet that warms; linear over a run",
+        BOTH,
+        (CURRENT, TURNING_CURRENT),
+        "long runs",
+        sensed_only=True,
+        plant=PlantPart.SENSORS,
+    ),
+)

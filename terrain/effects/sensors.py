@@ -1,0 +1,209 @@
+"""Effects of sensors and clocks: bias, scale, mounting, latency, lag."""
+
+from __future__ import annotations
+
+from terrain.effects.types import (
+    ACCEL,
+    BOTH,
+    CURRENT,
+    GYRO,
+    HEADING,
+    MOTION,
+    SPEED_X,
+    SPEED_Y,
+    TURNING_CURRENT,
+    Combine,
+    Effect,
+    Home,
+    Inverse,
+    Parameter,
+    PlantPart,
+)
+from terrain.effects.wheels import KINEMATICS
+
+OTHER_LOGGER = ("imu", "odometry", "gnss", "lidar")
+"""Streams that are not stamped by the logger of the wheels."""
+
+SENSORS: tuple[Effect, ...] = (
+    Effect(
+        "gyro_bias",
+        (
+            Parameter(
+                "gyro_bias_radps",
+                -0.2,
+                0.2,
+                0.001,
+                homes=(Home("sensors", "gyro_bias_z_radps", Combine.ADDED),),
+                inverse=Inverse(("imu",), "gyro - b without the section; fused yaw - b t always"),
+                scatter_rank=1,
+            ),
+        ),
+        "gyro = w + b",
+        "IEEE Std 952",
+        BOTH,
+        (GYRO,),
+        "standstill; several runs, since every power-on has a bias of its own",
+        sensed_only=True,
+        plant=PlantPart.DESCRIPTION,
+    ),
+    Effect(
+        "gyro_scale",
+        (
+            Parameter(
+                "gyro_scale_ratio",
+                -0.3,
+                0.3,
+                0.01,
+                inverse=Inverse(("imu",), "(gyro - bias) / (1 + k) + bias; fused yaw / (1 + k)"),
+                as_percent=True,
+                is_error=True,
+            ),
+        ),
+        "gyro = (1 + k) w",
+        "IEEE Std 952",
+        BOTH,
+        (GYRO,),
+        "turns, and an absolute heading on a skid-steer robot",
+        sensed_only=True,
+        plant=PlantPart.SENSORS,
+        twins=(("effective_track", HEADING),),
+    ),
+    Effect(
+        "accel_bias",
+        (
+            Parameter(
+                "accel_bias_mps2",
+                -2.0,
+                2.0,
+                0.02,
+                homes=(Home("sensors", "accel_bias_x_mps2", Combine.ADDED, scaled_by="accel_scale_x_ratio"),),
+                inverse=Inverse(("imu",), "accelerometer - b without the section"),
+                scatter_rank=2,
+            ),
+        ),
+        "accelerometer = a_x + g sin th + b",
+        "IEEE Std 1293",
+        BOTH,
+        (ACCEL,),
+        "several runs, since every power-on has a bias of its own",
+        sensed_only=True,
+        plant=PlantPart.DESCRIPTION,
+        aliases=("accelerometer_mounting_pitch",),
+    ),
+    Effect(
+        "camera_latency",
+        (
+            Parameter(
+                "camera_latency_s",
+                0.0,
+                0.5,
+                0.005,
+                homes=(Home("camera", "latency_s", Combine.ADDED),),
+            ),
+        ),
+        "camera(t) = what it sees at t - T",
+        "pure delay",
+        BOTH,
+        (SPEED_X, SPEED_Y, HEADING),
+        "accelerations at two frequencies",
+        sensed_only=True,
+        plant=PlantPart.DESCRIPTION,
+    ),
+    Effect(
+        "camera_yaw",
+        (
+            Parameter(
+                "camera_yaw_rad",
+                -0.3,
+                0.3,
+                0.005,
+                inverse=Inverse(("odometry", "lidar"), "R(a) of what the camera measured"),
+            ),
+        ),
+        "camera = R(-a) (v_x, v_y): mounted turned to the left by -a, v_y grows by a v",
+        KINEMATICS,
+        BOTH,
+        (SPEED_X, SPEED_Y),
+        "straight, on more than one side slope",
+        sensed_only=True,
+        plant=PlantPart.SENSORS,
+    ),
+    Effect(
+        "lever_arm",
+        tuple(
+            Parameter(
+                f"lever_{axis}_m",
+                -1.0,
+                1.0,
+                0.02,
+                homes=(Home("camera", f"lever_{axis}_m", Combine.ADDED),),
+                is_error=True,
+            )
+            for axis in ("x", "y")
+        ),
+        "v_x - l_y w, v_y + l_x w at the camera",
+        KINEMATICS,
+        BOTH,
+        (SPEED_X, SPEED_Y),
+        "turns to both sides",
+        sensed_only=True,
+        plant=PlantPart.DESCRIPTION,
+    ),
+    Effect(
+        "clock_offset",
+        (
+            Parameter(
+                "clock_offset_s",
+                0.0,
+                0.5,
+                0.005,
+                inverse=Inverse(OTHER_LOGGER, "stamp t' - T"),
+            ),
+        ),
+        "IMU and camera stamp t' = t + T; wheels, currents and steering t",
+        "two loggers without a common clock",
+        BOTH,
+        (*MOTION, HEADING),
+        "switching manoeuvres",
+        plant=PlantPart.SENSORS,
+    ),
+    Effect(
+        "clock_rate",
+        (
+            Parameter(
+                "clock_rate_ratio",
+                -0.02,
+                0.02,
+                0.0005,
+                inverse=Inverse(OTHER_LOGGER, "stamp t' / (1 + r), from the first stamp of the wheels"),
+                as_percent=True,
+                is_error=True,
+            ),
+        ),
+        "IMU and camera stamp t' = (1 + r) t",
+        "two loggers without a common clock",
+        BOTH,
+        (*MOTION, HEADING),
+        "switching manoeuvres from the start of a run to its end",
+        plant=PlantPart.SENSORS,
+    ),
+    Effect(
+        "encoder_lag",
+        (
+            Parameter(
+                "encoder_lag_s",
+                0.0,
+                0.5,
+                0.005,
+                homes=(Home("sensors", "encoder_time_constant_s", Combine.ADDED),),
+            ),
+        ),
+        "T d(measured)/dt + measured = wheel rate",
+        "first-order low-pass",
+        BOTH,
+        (*MOTION, CURRENT, TURNING_CURRENT, HEADING),
+        "accelerations",
+        plant=PlantPart.DESCRIPTION,
+    ),
+)
+"""They change what a log holds of a motion; most of them nothing else."""

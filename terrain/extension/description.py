@@ -1,0 +1,80 @@
+"""Effects that are no more than other numbers of a robot's description."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from terrain.effects import PARAMETER, Home
+from terrain.robots import Robot
+
+
+def apply_homes(robot: Robot, names: Collection[str] = tuple(PARAMETER)) -> Robot:
+    """Return a robot with those of its effects that have a home in its description applied there.
+
+    Parameters
+    ----------
+    robot : any; without effects it is returned as it is
+    names : parameters that are applied, as far as the robot has them and the section of their home
+
+    Examples
+    --------
+    >>> from terrain.robots import load_robot
+    >>> extended = replace(load_robot("agrimaro"), effects={"payload_ratio": 0.1, "camera_yaw_rad": 0.02})
+    >>> robot = apply_homes(extended)
+    >>> round(robot.mass_kg, 3), dict(robot.effects)
+    (99.0, {'camera_yaw_rad': 0.02})
+    """
+    applied = []
+    for name, value in robot.effects.items():
+        homes = PARAMETER[name].homes
+        if name in names and homes and all(home.optional or _has_section(robot, home) for home in homes):
+            for home in homes:
+                robot = _apply(robot, home, value)
+            applied.append(name)
+    return _without(robot, applied)
+
+
+def corrected(robot: Robot) -> Robot:
+    """Return the robot that filters take, together with a log that is :func:`corrected_log`.
+
+    Effects with a home in the description are applied there; of the others those are left that have no
+    inverse on samples.  A robot without effects is returned as it is, and so is one that was corrected.
+
+    Examples
+    --------
+    >>> from terrain.robots import load_robot
+    >>> robot = corrected(replace(load_robot("agrimaro"), effects={"wheel_radius_ratio": 0.05}))
+    >>> round(robot.wheel_radius_m, 3), dict(robot.effects)
+    (0.21, {})
+    """
+    return _without(apply_homes(robot), [name for name in robot.effects if PARAMETER[name].inverse])
+
+
+def _has_section(robot: Robot, home: Home) -> bool:
+    return not home.section or getattr(robot, home.section) is not None
+
+
+def _apply(robot: Robot, home: Home, value: float) -> Robot:
+    """Return a robot with one number of its description changed; the same robot if it lacks the section."""
+    if not _has_section(robot, home):
+        return robot
+    part: Any = getattr(robot, home.section) if home.section else robot
+    if home.scaled_by:
+        value *= getattr(part, home.scaled_by)
+    part = replace(part, **{home.field: home.combine.apply(getattr(part, home.field), value)})
+    changed: Robot = replace(robot, **{home.section: part}) if home.section else part
+    return changed
+
+
+def _without(robot: Robot, names: Collection[str]) -> Robot:
+    kept = [i for i, name in enumerate(robot.effects) if name not in names]
+    if len(kept) == len(robot.effects):
+        return robot
+    effects = list(robot.effects.items())
+    return replace(
+        robot, effects=dict(effects[i] for i in kept), effects_cov=robot.effects_cov[np.ix_(kept, kept)]
+    )

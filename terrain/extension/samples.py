@@ -1,0 +1,176 @@
+"""Taking effects off the samples of a log: the inverse that the entry of each effect states."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from terrain.angles import unwrapped, wrapped
+from terrain.effects import OTHER_LOGGER, parameters_of
+from terrain.extension.description import apply_homes
+from terrain.kinematics.camera import turned
+from terrain.records import Array, RunLog, Stream
+from terrain.robots import Robot
+
+
+def corrected_log(run: RunLog, robot: Robot) -> RunLog:
+    """Return a log as the robot would have written it without the effects that have an inverse on samples.
+
+    Parameters
+    ----------
+    run : a log of the robot, as measured
+    robot : with its effects; without any the log is returned as it is
+
+    Notes
+    -----
+    Commands, estimates and labels are left alone; of a simulated truth the wheels' rates become those of
+    wheels of one radius.
+    """
+    if not robot.effects:
+        return run
+    wheels = run.streams.get("wheels")
+    correction = Correction(robot, float(wheels.time_s[0]) if wheels is not None and len(wheels) else 0.0)
+    streams = {
+        name: Stream(*correction(name, stream.channels, stream.time_s, stream.values), stream.channels)
+        for name, stream in run.streams.items()
+    }
+    delay_s = robot.effects.get("yaw_delay_s", 0.0)
+    if delay_s and "wheels" in streams:
+        streams["wheels"] = _delay_turning(streams["wheels"], delay_s)
+    return replace(run, streams=streams)
+
+
+def _delay_turning(wheels: Stream, delay_s: float) -> Stream:
+    """Delay the difference of the sides' wheel speeds, and leave their mean."""
+    names = [f"speed_{side}_mps" for side in ("left", "right")]
+    if not set(names) <= set(wheels.channels):
+        return wheels
+    left, right = (wheels.channel(name) for name in names)
+    half = 0.5 * (right - left)
+    known = np.isfinite(half)
+    if not known.any():
+        return wheels
+    change = np.interp(wheels.time_s - delay_s, wheels.time_s[known], half[known]) - half
+    values = np.array(wheels.values)
+    values[:, wheels.channels.index(names[0])] -= change
+    values[:, wheels.channels.index(names[1])] += change
+    return Stream(wheels.time_s, values, wheels.channels)
+
+
+class Correction:
+    """Takes a robot's effects off samples, a run in one block or block by block.
+
+    The integral of the gyro as it is, bias and scale included, is assumed to be the fused yaw.
+
+    Parameters
+    ----------
+    robot : with its effects
+    start_s : first stamp of the wheels, from which drifts count
+    """
+
+    def __init__(self, robot: Robot, start_s: float) -> None:
+        self._start_s = start_s
+        self._p = dict.fromkeys(parameters_of(robot.drive), 0.0) | dict(robot.effects)
+        believed = apply_homes(robot)
+        left = believed.effects
+        self._gyro_bias = believed.sensors.gyro_bias_z_radps if believed.sensors else 0.0
+        self._gyro_rest, self._accel_rest = left.get("gyro_bias_radps", 0.0), left.get("accel_bias_mps2", 0.0)
+        self._current = 1.0 + left.get("motor_constant_ratio", 0.0)
+        half = 0.5 * self._p["one_sided_radius_ratio"]
+        swerve = robot.drive == "swerve"
+        self._side = {wheel: 1.0 + half if wheel in ("3", "right") else 1.0 - half for wheel in robot.wheels}
+        self._has_backlash = swerve and self._p["steering_backlash_rad"] > 0.0
+        self._follower, self._angle, self._yaw = np.full(3, np.nan), np.full(3, np.nan), (np.nan, np.nan)
+        self._steps: Mapping[str, Callable[[tuple[str, ...], Array, Array], None]] = {
+            "wheels": self._wheels,
+            "steering": self._steering,
+            "imu": self._imu,
+            "odometry": self._camera,
+            "lidar": self._camera,
+            "truth": self._wheels,
+        }
+
+    def __call__(
+        self, name: str, channels: tuple[str, ...], time_s: Array, values: Array
+    ) -> tuple[Array, Array]:
+        """Return stamps (k,) and values (k, c) of the samples that follow on those given before.
+
+        Parameters
+        ----------
+        name, channels : of the stream
+        time_s, values : (k,), (k, c) as measured
+        """
+        if name in self._steps:
+            values = np.array(values, dtype=float)
+            with np.errstate(invalid="ignore", over="ignore"):  # samples may be no finite numbers
+                self._steps[name](channels, np.asarray(time_s), values)
+        return self._stamps(name, time_s), values
+
+    def _stamps(self, name: str, time_s: Array) -> Array:
+        p = self._p
+        if name in OTHER_LOGGER and (p["clock_offset_s"] or p["clock_rate_ratio"]):
+            since_s = (time_s - self._start_s - p["clock_offset_s"]) / (1.0 + p["clock_rate_ratio"])
+            return np.asarray(self._start_s + since_s)
+        if name == "steering" and p.get("steering_delay_s"):
+            return np.asarray(time_s + p["steering_delay_s"])
+        return time_s
+
+    def _wheels(self, channels: tuple[str, ...], time_s: Array, values: Array) -> None:
+        warm = 1.0 + self._p["motor_drift_ratio"] * (time_s - self._start_s) / 60.0
+        wheel_speed = 1.0 + self._p["wheel_radius_ratio"]
+        for i, channel in enumerate(channels):
+            quantity, _, rest = channel.partition("_")
+            wheel = rest.rpartition("_")[0]
+            if quantity == "current":
+                values[:, i] /= self._current * warm
+            elif wheel in self._side and quantity in ("motor", "speed", "wheel"):
+                values[:, i] *= self._side[wheel] * (wheel_speed if quantity == "speed" else 1.0)
+
+    def _steering(self, channels: tuple[str, ...], time_s: Array, values: Array) -> None:
+        if not self._has_backlash:
+            return
+        half = self._p["steering_backlash_rad"]
+        for wheel in range(3):
+            if f"angle_{wheel + 1}_rad" not in channels:
+                continue
+            column = channels.index(f"angle_{wheel + 1}_rad")
+            angles = unwrapped(np.concatenate([[self._angle[wheel]], values[:, column]]))[1:]
+            follower = self._follower[wheel]
+            known = np.isfinite(angles)
+            for k in np.flatnonzero(known).tolist():
+                angle = float(angles[k])
+                follower = angle if math.isnan(follower) else min(max(follower, angle - half), angle + half)
+                self._angle[wheel] = angle
+                values[k, column] = follower
+            self._follower[wheel] = follower
+            values[known, column] = wrapped(values[known, column])
+
+    def _imu(self, channels: tuple[str, ...], time_s: Array, values: Array) -> None:
+        scale = 1.0 + self._p["gyro_scale_ratio"]
+        if "gyro_z_radps" in channels:
+            gyro = values[:, channels.index("gyro_z_radps")]
+            gyro -= self._gyro_rest
+            if scale != 1.0:
+                gyro -= self._gyro_bias
+                gyro /= scale
+                gyro += self._gyro_bias
+        if "accel_x_mps2" in channels:
+            values[:, channels.index("accel_x_mps2")] -= self._accel_rest
+        bias = self._p["gyro_bias_radps"]
+        if "yaw_rad" in channels and (scale != 1.0 or bias):
+            column = channels.index("yaw_rad")
+            first_rad, last_rad = self._yaw
+            yaw = unwrapped(np.concatenate([[last_rad], values[:, column]]))[1:]
+            known = np.isfinite(yaw)
+            if known.any():
+                first_rad = float(yaw[known][0]) if math.isnan(first_rad) else first_rad
+                self._yaw = first_rad, float(yaw[known][-1])
+            turned_rad = yaw[known] - first_rad - bias * (time_s[known] - self._start_s)
+            values[known, column] = wrapped(first_rad + turned_rad / scale)
+
+    def _camera(self, channels: tuple[str, ...], time_s: Array, values: Array) -> None:
+        if self._p["camera_yaw_rad"]:
+            turned(values, channels, -self._p["camera_yaw_rad"])
