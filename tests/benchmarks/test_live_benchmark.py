@@ -3,11 +3,11 @@
 import time
 
 import pytest
-from terrain.simulation.run import simulate_run
 
 from terrain.estimation.live.estimator import LiveEstimator
 from terrain.logs.replay import replay
 from terrain.robots import load_robot
+from terrain.simulation.run import simulate_run
 
 MOST_US = 150.0
 

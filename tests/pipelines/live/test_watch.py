@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from terrain.simulation.run import simulate_run
 
 from features.windows import cut_windows
 from pipelines.classify.crossval import CrossvalSettings, samples_of
@@ -18,6 +17,7 @@ from terrain.kinematics.wheel_speed import with_wheel_speeds
 from terrain.logs.replay import replay
 from terrain.records import Reading, RunLog, Sample, Stream
 from terrain.robots import load_robot
+from terrain.simulation.run import simulate_run
 
 ROBOT = load_robot("agrimaro")
 TERRAINS = ("grass", "tiles")

@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
-from terrain.simulation.run import simulate_run
 
 from terrain.errors import DataError
 from terrain.estimation.measurements.resampling import low_pass
 from terrain.estimation.reference import lagged_slip, true_states, wheel_and_ground_speed
 from terrain.records import RunLog, StateTrack, Stream
 from terrain.robots import load_robot
+from terrain.simulation.run import simulate_run
 
 ROBOT = load_robot("agrimaro")
 STATES = ("yaw_rad", "speed_x_mps", "steer_2_rad", "gyro_bias_radps", "slip_speed_3_mps", "effective_track_m")

@@ -1,6 +1,5 @@
 import numpy as np
 import pytest
-from terrain.simulation.run import simulate_run
 
 from pipelines.estimate.estimate import estimate_run
 from terrain.constants import GRAVITY_MPS2
@@ -10,6 +9,7 @@ from terrain.records import Label, RunLog, Stream
 from terrain.robots import load_robot
 from terrain.simulation.conditions import Conditions
 from terrain.simulation.dynamic.simulate import simulate
+from terrain.simulation.run import simulate_run
 from terrain.simulation.slip_sweep import Drive, SlipSweep, scenario_of
 from terrain.slip_learning.wheel_pull import (
     body_balance,

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from terrain.simulation.run import simulate_run
 
 from terrain.errors import ConfigError
 from terrain.estimation.ekf.filter import run_filter
@@ -25,6 +24,7 @@ from terrain.logs.replay import replay
 from terrain.records import Reading, Stream
 from terrain.robots import load_robot
 from terrain.simulation.conditions import Faults
+from terrain.simulation.run import simulate_run
 from terrain.simulation.sensors.gnss import Gnss
 
 ROBOT = load_robot("agrimaro")
