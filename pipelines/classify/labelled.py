@@ -8,8 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.estimate.estimate import Estimate, enriched, estimate_run, summary
 from pipelines.reporting.progress import Progress, silent
+from terrain.estimation.enriched import enriched
+from terrain.estimation.estimate import Estimate, estimate_run
+from terrain.estimation.summary import EstimateSummary, summarize
 from terrain.records import RunLog
 from terrain.robots import Robot, load_robot
 from terrain.simulation.run import simulate_run
@@ -54,7 +56,7 @@ def labelled_runs(
             run = simulate_run(robot, terrain, SCENARIO, seed, number, vary=True)
             estimate = estimate_run(run, robot, FILTER)
             runs.append(enriched(estimate))
-            found.append(summary(estimate))
+            found.append(summarize(estimate))
             progress("simulate and filter", len(runs), runs_a_terrain * len(terrains))
             if terrain == "grass" and number == 1:
                 example = estimate
@@ -62,14 +64,14 @@ def labelled_runs(
     return sorted(runs, key=lambda run: run.run_id), rows, example
 
 
-def _row(terrain: str, found: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    pairs = [(row["slip_mean"], row["slip_true_mean"]) for row in found if row["slip_true_mean"] is not None]
+def _row(terrain: str, found: Sequence[EstimateSummary]) -> dict[str, Any]:
+    pairs = [(row.slip_mean, row.slip_true_mean) for row in found if math.isfinite(row.slip_true_mean)]
     estimated, true = np.array(pairs).T if pairs else (np.array([math.nan]), np.array([math.nan]))
     values = {
         "slip_mean": float(estimated.mean()),
         "slip_true_mean": float(true.mean()),
         "slip_rmse": float(np.sqrt(np.mean((estimated - true) ** 2))),
-        "nees": float(np.mean([row["nees"] for row in found])),
+        "nees": float(np.mean([row.nees for row in found])),
     }
     known = {key: value if math.isfinite(value) else None for key, value in values.items()}
     return {"terrain": terrain, "n_runs": len(found), **known}

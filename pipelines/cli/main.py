@@ -248,22 +248,19 @@ def estimate_command(
 ) -> None:
     """Estimate motion and slip, and say how well."""
     from pipelines.estimate.estimate import estimate
-    from pipelines.reporting.screens import print_estimates, progress_bar
+    from pipelines.estimate.screen import print_estimates
+    from pipelines.estimate.settings import EstimateSettings
+    from pipelines.reporting.json_file import write_json
+    from pipelines.reporting.screens import progress_bar
 
+    given: dict[str, Any] = {"filter": filter_name.value, "tuning": tuning and tuning.value}
+    given |= {"out": out, "robot": robot, "tune_on": tune_on, "figures": figures}
+    settings = EstimateSettings(**given)
     runs, skipped = _load(data, layout, mapping, repair, align=False)
     with progress_bar() as progress:
-        result = estimate(
-            runs,
-            filter_name.value,
-            robot=robot,
-            tuning=tuning and tuning.value,
-            out=out,
-            figures=figures,
-            tune_on=None if tune_on is None else [name.strip() for name in tune_on.split(",")],
-            progress=progress,
-        )
-    print_estimates({**result, "skipped": skipped}, _console())
-    _write_json(json_file, {**result, "skipped": skipped})
+        result = estimate(runs, settings, skipped, progress)
+    print_estimates(result, _console())
+    write_json(json_file, result)
 
 
 @app.command("learn-slip")

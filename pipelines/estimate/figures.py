@@ -8,7 +8,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from pipelines.estimate.estimate import Estimate
 from pipelines.reporting.drawing import (
     BLUE,
     CLASS_COLOURS,
@@ -23,7 +22,8 @@ from pipelines.reporting.drawing import (
     styled,
 )
 from terrain.estimation.ekf.innovations import Innovations
-from terrain.estimation.reference import lagged_slip
+from terrain.estimation.estimate import Estimate
+from terrain.estimation.reference import lagged_slip_at
 from terrain.files.atomic import atomic_write
 from terrain.kinematics.swerve import forward
 from terrain.records import GATED, Array
@@ -139,7 +139,9 @@ def slip_figure(estimate: Estimate) -> Figure:
     """Draw the slip of each wheel with its uncertainty, and the two speeds that it is made of."""
     track, slip = estimate.track, estimate.slip
     shown = slip if estimate.observable else estimate.blind
-    true = _true_slip(estimate)
+    true = None
+    if "truth" in estimate.run.streams:
+        true = lagged_slip_at(estimate.run, estimate.robot, track.time_s)
     with styled():
         figure = new_figure(9.0, 6.6)
         above, below = figure.subplots(2, 1, sharex=True, height_ratios=[1, 2])
@@ -175,15 +177,6 @@ def slip_figure(estimate: Estimate) -> Figure:
         below.grid()
         words = "slip" if estimate.observable else "slip is not observed"
         return finished(figure, f"{shorten(estimate.run.run_id, 40)}: {words}, {estimate.name}")
-
-
-def _true_slip(estimate: Estimate) -> Array | None:
-    truth = estimate.run.streams.get("truth")
-    if truth is None:
-        return None
-    lag_s = estimate.robot.sensors.encoder_time_constant_s if estimate.robot.sensors else 0.0
-    slip, _ = lagged_slip(truth, estimate.robot, lag_s)
-    return np.column_stack([np.interp(estimate.track.time_s, truth.time_s, wheel) for wheel in slip.T])
 
 
 def _encoder_twist(estimate: Estimate) -> Array:

@@ -33,7 +33,7 @@ from terrain.records import Array, RunLog
 from terrain.robots import Robot, load_robot
 
 if TYPE_CHECKING:
-    from pipelines.estimate.estimate import Estimate
+    from terrain.estimation.estimate import Estimate
 
 HOLD_OUT_FROM, HOLD_OUT_EVERY = 6, 4
 """Runs from which on a gain is measured, and every how many of them is kept for it."""
@@ -249,7 +249,7 @@ def filter_gain(
     """
     from dataclasses import replace
 
-    from pipelines.estimate.estimate import estimate_run
+    from terrain.estimation.estimate import estimate_run
 
     name = FILTERS.get(robot.drive)
     known = [run for run in runs if "truth" in run.streams]
@@ -279,9 +279,9 @@ def filter_gain(
 
 def _errors(found: Estimate) -> tuple[float, ...]:
     """Return the errors of a run, in the order of :data:`ERRORS`."""
-    from pipelines.estimate.estimate import summary
+    from terrain.estimation.summary import summarize
 
-    told, track, truth = summary(found), found.track, found.run.streams["truth"]
+    summary, track, truth = summarize(found), found.track, found.run.streams["truth"]
     squares = dict.fromkeys(("speed", "yaw_rate"), np.zeros(len(track.time_s)))
     for state in track.states:
         kind = state.removesuffix("_mps").removesuffix("_radps").removesuffix("_x").removesuffix("_y")
@@ -289,10 +289,9 @@ def _errors(found: Estimate) -> tuple[float, ...]:
             true = truth.channel("speed_x_mps" if state == "speed_mps" else state)
             off = track.state(state) - np.interp(track.time_s, truth.time_s, true)
             squares[kind] = squares[kind] + off**2
-    slip, true_slip = told["slip_mean"], told["slip_true_mean"]
-    known = slip is not None and true_slip is not None and told["slip_observable"]
     rms = [math.sqrt(float(np.nanmean(square))) for square in squares.values()]
-    return (*rms, abs(slip - true_slip) if known else math.nan)
+    slip_error = abs(summary.slip_mean - summary.slip_true_mean)
+    return (*rms, slip_error if summary.slip_observable else math.nan)
 
 
 def extended_numbers(

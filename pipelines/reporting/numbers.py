@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 NOT_KNOWN = "\N{EN DASH}"
 """Shown where a figure is not known."""
 
@@ -35,10 +37,10 @@ def format_known(value: float | None, form: str, unknown: str = "-") -> str:
 
     Examples
     --------
-    >>> format_known(0.1234, "{:+.2f}"), format_known(None, "{:+.2f}")
-    ('+0.12', '-')
+    >>> format_known(0.1234, "{:+.2f}"), format_known(None, "{:+.2f}"), format_known(math.nan, "{:+.2f}")
+    ('+0.12', '-', '-')
     """
-    return unknown if value is None else form.format(value)
+    return unknown if value is None or math.isnan(value) else form.format(value)
 
 
 def percent(ratio: float, digits: int = 1) -> str:

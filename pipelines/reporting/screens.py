@@ -140,45 +140,6 @@ def _stretches(windows: list[dict[str, Any]]) -> Iterator[list[dict[str, Any]]]:
         yield rows
 
 
-def print_estimates(result: dict[str, Any], console: Console) -> None:
-    """Print slip, its truth where it is known, and how consistent the filter was, a run a line."""
-    table = Table(
-        Column("run", overflow="fold"),
-        *(Column(name, justify="right") for name in ("slip", "std", "true", "stale s", "NEES", "NIS cam.")),
-        *(Column(name, justify="right") for name in ("speed RMSE", "dropped", "gated")),
-        title=f"filter {result['filter']}, {result['tuning']} noise",
-    )
-    for row in result["runs"]:
-        table.add_row(
-            row["run_id"],
-            _figure(row["slip_mean"], "{:+.4f}") + ("" if row["slip_observable"] else " blind"),
-            _figure(row["slip_std"], "{:.4f}"),
-            _figure(row["slip_true_mean"], "{:+.4f}"),
-            f"{row['stale_s']:.1f}",
-            _figure(row["nees"], "{:.2f}"),
-            _figure(row["nis"].get("camera_speed"), "{:.2f}"),
-            _figure(row["speed_rmse_mps"], "{:.4f}"),
-            str(row["n_dropped"]),
-            str(row["n_gated"]),
-        )
-    console.print(table)
-    if result["tuned"]:
-        scales = ", ".join(
-            f"{name} {scale:.3g} ({result['tuned']['status'][name]})"
-            for name, scale in result["tuned"]["scales"].items()
-        )
-        console.print(f"process variances scaled on {', '.join(result['tuned']['runs'])}: {scales}")
-    if not all(row["slip_observable"] for row in result["runs"]):
-        console.print(
-            "blind: nothing measured the speed over ground, so the figure is the wheels against themselves, "
-            "and the slip in the tracks is NaN"
-        )
-    if result["out"]:
-        console.print(f"runs with state and slip written to {result['out']}", highlight=False)
-    for sentence in result.get("skipped", []):
-        console.print(sentence, highlight=False)
-
-
 def print_learned_slip(result: dict[str, Any], console: Console) -> None:
     """Print curve and targets a terrain, and why some are not learned."""
     right = ("runs", "slips seen", "peak", "90 %", *DRIVE_STATES, "effic.", "J/m")

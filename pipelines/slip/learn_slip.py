@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipelines.estimate.estimate import estimate_run
 from pipelines.reporting.progress import Progress, silent
 from pipelines.runs.datasets import data_digest
 from terrain.control.slip_table import (
@@ -23,6 +22,7 @@ from terrain.control.slip_table import (
     write_slip_table,
 )
 from terrain.errors import ConfigError, DataError
+from terrain.estimation.estimate import estimate_run
 from terrain.estimation.wheel_slip import wheel_speed_scatter_mps
 from terrain.extension import corrected, corrected_log
 from terrain.files.atomic import atomic_write, ensure_writable

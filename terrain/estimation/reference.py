@@ -11,6 +11,7 @@ import numpy as np
 
 from terrain.errors import DataError
 from terrain.estimation.measurements.resampling import low_pass
+from terrain.kinematics.true_slip import true_slip, wheel_and_ground_speed
 from terrain.records import Array, RunLog, StateTrack, Stream
 from terrain.robots import Robot
 from terrain.slip import slip_ratio
@@ -47,23 +48,6 @@ def true_states(
     return out
 
 
-def wheel_and_ground_speed(truth: Stream, robot: Robot) -> tuple[Array, Array]:
-    """Return the true wheel speed and speed over ground along each wheel, both (n, wheels) in m/s.
-
-    Parameters
-    ----------
-    truth : stream as ``terrain.simulation`` writes it
-    robot : gives the nominal radius and the wheels' places
-    """
-    steer = _wheels(truth, robot, "steer_{}_rad")
-    positions_m = robot.wheel_positions_m
-    turn = truth.channel("yaw_rate_radps")[:, None]
-    along = truth.channel("speed_x_mps")[:, None] - turn * positions_m[:, 1]
-    across = truth.channel("speed_y_mps")[:, None] + turn * positions_m[:, 0]
-    wheel_speed = _wheels(truth, robot, "wheel_{}_radps") * robot.wheel_radius_m
-    return wheel_speed, along * np.cos(steer) + across * np.sin(steer)
-
-
 def lagged_slip(truth: Stream, robot: Robot, time_constant_s: float) -> tuple[Array, Array]:
     """Return the true slip ratio and speed over ground of each wheel, both (n, wheels), behind a low-pass.
 
@@ -84,8 +68,20 @@ def lagged_slip(truth: Stream, robot: Robot, time_constant_s: float) -> tuple[Ar
     return slip_ratio(wheel_speed, ground), ground
 
 
-def _wheels(truth: Stream, robot: Robot, pattern: str) -> Array:
-    return np.column_stack([truth.channel(pattern.format(wheel)) for wheel in robot.wheels])
+def lagged_slip_at(run: RunLog, robot: Robot, time_s: Array) -> Array:
+    """Return :func:`lagged_slip` (n, wheels) of a run behind its encoders' low-pass, at some instants."""
+    truth = run.streams["truth"]
+    slip, _ = lagged_slip(truth, robot, robot.encoder_lag_s)
+    return np.column_stack([np.interp(time_s, truth.time_s, wheel) for wheel in slip.T])
+
+
+def true_slip_at(run: RunLog, robot: Robot, time_s: Array) -> Array:
+    """Return the true slip (n, wheels), positive in traction, from some instants on; NaN without a truth."""
+    truth = run.streams.get("truth")
+    if truth is None:
+        return np.full((len(time_s), len(robot.wheels)), np.nan)
+    at = np.clip(np.searchsorted(truth.time_s, time_s), 0, len(truth) - 1)
+    return true_slip(truth, robot)[at]
 
 
 def _true_state(truth: Stream, state: str, robot: Robot, initial_yaw_rad: float) -> Array | None:

@@ -12,7 +12,6 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
-from pipelines.estimate.estimate import THESIS_SAMPLE_TIME_S, Estimate, estimate_run, summary
 from pipelines.estimate.figures import motion_figure
 from pipelines.reporting.drawing import (
     BLUE,
@@ -55,9 +54,11 @@ from pipelines.reproduce.reproduce import (
     verdict_of,
 )
 from terrain.estimation.ekf.innovations import Innovations
+from terrain.estimation.estimate import THESIS_SAMPLE_TIME_S, Estimate, estimate_run
 from terrain.estimation.filters.swerve import make_filter
 from terrain.estimation.filters.swerve_noise import adaptive_noise, thesis_noise
 from terrain.estimation.slip_figures import STEADY_SPEED_MPS
+from terrain.estimation.summary import summarize
 from terrain.kinematics.camera import body_motion, odometry_stream, to_camera
 from terrain.kinematics.swerve import admissible_scale, admissible_yaw_rate, wheel_velocities
 from terrain.records import Array
@@ -525,7 +526,7 @@ def _innovations(seed: int, quick: bool) -> Finding:
             beside={INNOVATIONS[row]: value for row, value in over_r.items()},
         )
     )
-    nis, nis_range = over_runs([summary(one)["nis"]["camera_speed"] for one in found])
+    nis, nis_range = over_runs([summarize(one).nis["camera_speed"] for one in found])
     free = [estimate_run(run, robot, "vio15", tuning="physical") for run in runs]
     q_mps = float(np.sqrt(thesis_noise("vio12", robot).process_variance[3, 3] * THESIS_SAMPLE_TIME_S))
     rows.append(
@@ -542,7 +543,7 @@ def _innovations(seed: int, quick: bool) -> Finding:
             f"{said(q_mps)} m/s (one standard deviation) in each of {said(THESIS_SAMPLE_TIME_S)} s. The "
             "noise of vio15, in natural units, is meant for rough ground and cautious on tiles, but by far "
             "less.",
-            beside={"vio15": over_runs([summary(one)["nis"]["camera_speed"] for one in free])[0]},
+            beside={"vio15": over_runs([summarize(one).nis["camera_speed"] for one in free])[0]},
         )
     )
     return Finding(

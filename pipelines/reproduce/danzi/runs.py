@@ -8,9 +8,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from pipelines.estimate.estimate import Estimate
 from pipelines.reporting.drawing import finished, new_figure, styled
-from terrain.estimation.reference import lagged_slip
+from terrain.estimation.estimate import Estimate
+from terrain.estimation.reference import lagged_slip, lagged_slip_at
 from terrain.estimation.slip_figures import slip_figures
 from terrain.records import Array, RunLog
 from terrain.robots import Robot
@@ -60,8 +60,7 @@ def lagged_truth(run: RunLog, robot: Robot) -> Curve:
 
 def true_slip(found: Estimate) -> Array:
     """Return :func:`lagged_truth` (n, wheels) at the instants of a filter."""
-    time_s, slip, _ = lagged_truth(found.run, found.robot)
-    return np.column_stack([np.interp(found.track.time_s, time_s, wheel) for wheel in slip.T])
+    return lagged_slip_at(found.run, found.robot, found.track.time_s)
 
 
 def steady_mean(slip: Array, found: Estimate) -> float:

@@ -14,7 +14,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from pipelines.estimate.estimate import THESIS_EMA_ALPHA, THESIS_SAMPLE_TIME_S, Estimate, estimate_run
 from pipelines.estimate.figures import slip_figure
 from pipelines.reporting.drawing import BLUE, CLASS_COLOURS, FAINT_INK, GRID, INK, VERMILION
 from pipelines.reproduce.danzi.runs import (
@@ -32,6 +31,7 @@ from pipelines.reproduce.danzi.runs import (
 from pipelines.reproduce.reproduce import Finding, Picture, Row, holds, said, verdict_of
 from terrain.estimation.ekf.filter import run_filter
 from terrain.estimation.ekf.model import FilterSettings
+from terrain.estimation.estimate import THESIS_EMA_ALPHA, THESIS_SAMPLE_TIME_S, Estimate, estimate_run
 from terrain.estimation.filters.swerve import make_filter
 from terrain.estimation.filters.swerve_noise import thesis_noise
 from terrain.estimation.measurements.batch import measurement_table

@@ -1,4 +1,4 @@
-"""Whether a filter is as wrong as it says: squared innovations, and squared errors where the truth is known.
+"""Whether a filter's covariance fits its errors: squared innovations, and errors where the truth is known.
 
 NIS nu' S^-1 nu and NEES e' P^-1 e follow a chi-square law with as many degrees of freedom as nu and e have
 entries (Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, 5.4):
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from enum import StrEnum
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,17 +25,25 @@ from terrain.estimation.ekf.steps import wrap
 from terrain.records import GATED, USED, Array, StateTrack
 
 OUTSIDE = 0.05
-"""Share that bounds leave outside, half on each side."""
+"""Probability outside the bounds, half on each side."""
 
 MOST_GATED = 0.01
-"""A sensor of which more is left out does not have the noise that the filter believes: 0.01 % is expected."""
+"""A sensor of which a larger fraction is gated does not have the noise of the model: 0.01 % is expected."""
+
+
+class ConsistencyVerdict(StrEnum):
+    """How squared errors compare with their chi-square bounds; unknown where there are none."""
+
+    CONSISTENT = "consistent"
+    OVERCONFIDENT = "overconfident"
+    CONSERVATIVE = "conservative"
+    UNKNOWN = "unknown"
 
 
 class Consistency(NamedTuple):
-    """How one sensor, or one group of states, agrees with what the filter says of it.
+    """How the errors of one sensor, or of one group of states, agree with the covariance of the filter.
 
-    ``n_independent`` is how many of the n values count: those that follow closely repeat each other.
-    ``verdict`` is ``consistent``, ``overconfident``, ``conservative``, or ``unknown`` where there is nothing.
+    ``n_independent`` is the effective number of independent values among the n.
     """
 
     name: str
@@ -45,7 +54,7 @@ class Consistency(NamedTuple):
     high: float
     share_outside: float
     gated_fraction: float
-    verdict: str
+    verdict: ConsistencyVerdict
 
 
 class ConsistencyReport(NamedTuple):
@@ -223,7 +232,15 @@ def _judge(name: str, squares: Array, dof: Array, gated_fraction: float) -> Cons
     if not squares.size:
         nan = float("nan")
         return Consistency(
-            name, 0, 0.0, nan, nan, nan, nan, gated_fraction, "overconfident" if gated_fraction else "unknown"
+            name,
+            0,
+            0.0,
+            nan,
+            nan,
+            nan,
+            nan,
+            gated_fraction,
+            ConsistencyVerdict.OVERCONFIDENT if gated_fraction else ConsistencyVerdict.UNKNOWN,
         )
     dof = dof.astype(np.float64)
     n_independent = _independent(squares / dof)
@@ -231,9 +248,11 @@ def _judge(name: str, squares: Array, dof: Array, gated_fraction: float) -> Cons
     low, high = (float(chdtri(total, p)) / total for p in (1 - OUTSIDE / 2, OUTSIDE / 2))
     mean = float(squares.sum() / dof.sum())
     outside = (squares < chdtri(dof, 1 - OUTSIDE / 2)) | (squares > chdtri(dof, OUTSIDE / 2))
-    verdict = "overconfident" if mean > high or gated_fraction > MOST_GATED else "consistent"
-    if mean < low and gated_fraction <= MOST_GATED:
-        verdict = "conservative"
+    verdict = ConsistencyVerdict.CONSISTENT
+    if mean > high or gated_fraction > MOST_GATED:
+        verdict = ConsistencyVerdict.OVERCONFIDENT
+    elif mean < low:
+        verdict = ConsistencyVerdict.CONSERVATIVE
     return Consistency(
         name, squares.size, n_independent, mean, low, high, float(outside.mean()), gated_fraction, verdict
     )

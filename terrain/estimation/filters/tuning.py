@@ -1,14 +1,15 @@
 """Noise from data: the variances under which the logs are most likely.
 
 The log likelihood of a filter is the sum of log N(nu; 0, S) over its innovations (Sarkka, Bayesian Filtering
-and Smoothing, 2013, 12.3), so that noise can be fitted to runs whose truth nobody
-knows.  Gates are off meanwhile: else it would pay to leave out what does not fit.
+and Smoothing, 2013, 12.3), so that noise can be fitted to runs without a truth.  Gates are off meanwhile:
+otherwise it would pay to leave out what does not fit.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from enum import StrEnum
 from typing import NamedTuple
 
 import numpy as np
@@ -35,12 +36,20 @@ class NoiseGroup(NamedTuple):
     rows: tuple[str, ...] = ()
 
 
+class TuningStatus(StrEnum):
+    """What the runs say of a scale: determined, at the end of its range, or not determined."""
+
+    FOUND = "found"
+    AT_BOUND = "at bound"
+    NOT_EXCITED = "not excited"
+
+
 class TunedGroup(NamedTuple):
-    """What became of a group: the scale of its variances, and ``found``, ``at bound`` or ``not excited``."""
+    """The scale of a group's variances, and how well the runs determine it."""
 
     name: str
     scale: float
-    status: str
+    status: TuningStatus
 
 
 class TuningReport(NamedTuple):
@@ -117,9 +126,9 @@ def tune_noise(
         drops = [
             after - likelihood(best + shift) for shift in math.log(2) * np.eye(len(groups))[i] * [[1], [-1]]
         ]
-        status = "found" if min(drops) > CLEAR_DROP else "not excited"
+        status = TuningStatus.FOUND if min(drops) > CLEAR_DROP else TuningStatus.NOT_EXCITED
         if abs(best[i]) > widest - 1e-3:
-            status = "at bound"
+            status = TuningStatus.AT_BOUND
         report.append(TunedGroup(group.name, float(np.exp(best[i])), status))
     tuned = _scaled(model, noise, scaled, np.exp(best))
     return tuned, TuningReport(tuple(report), before, after, n_evaluations, bool(found.success))

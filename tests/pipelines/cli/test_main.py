@@ -337,10 +337,10 @@ def test_the_choices_of_the_command_line_are_those_that_there_are():
     """They are written twice, so that help need not load what offers them."""
     from pipelines.classify.splits import PROTOCOLS
     from pipelines.cli import main as cli
-    from pipelines.estimate.estimate import FILTERS, TUNINGS
     from pipelines.models.recipes import RECIPES
     from pipelines.reproduce.reproduce import PAPERS
     from pipelines.runs.datasets import LAYOUTS
+    from terrain.estimation.estimate import FILTERS, TUNINGS
 
     for choices, offered in (
         (cli.Format, LAYOUTS),

@@ -1,43 +1,38 @@
-"""Slip comes back from simulated logs, with an honest uncertainty, and says when it does not know."""
+"""``terrain estimate``: tracks, pictures and JSON of runs, and tuning on chosen ones."""
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from pipelines.estimate.estimate import FILTERS, enriched, estimate, estimate_run, summary
+from pipelines.estimate.estimate import estimate
+from pipelines.estimate.settings import EstimateSettings
+from pipelines.reporting.json_file import as_json
 from terrain.errors import ConfigError, DataError, LogError
+from terrain.estimation.estimate import estimate_run
+from terrain.estimation.filters.tuning import TuningStatus
 from terrain.logs.read import read_run
 from terrain.logs.schema import signal_set_of
-from terrain.records import RunLog, Stream
 from terrain.robots import load_robot
-from terrain.simulation.conditions import Faults
 from terrain.simulation.run import simulate_run
 from terrain.simulation.sensors.gnss import Gnss
 
 ROBOT = load_robot("agrimaro")
-STEADY_CAMERA = Faults(by_chance=False)
-LOST = Faults(camera_lost_s=((10.0, 13.0),), by_chance=False)
-KEYS = {
-    "run_id",
-    "filter",
-    "slip_mean",
-    "slip_std",
-    "slip_true_mean",
-    "slip_observable",
-    "stale_s",
-    "nis",
-    "nees",
-    "speed_rmse_mps",
-    "n_dropped",
-    "n_gated",
-    "finite",
-}
 
 
 def drive(scenario="straight", terrain="grass", seed=0, **options):
     return simulate_run(ROBOT, terrain, scenario, seed, **options)
+
+
+KEYS = {
+    *("run_id", "filter", "slip_mean", "slip_std", "slip_true_mean", "slip_observable", "slip_peak"),
+    *("steady_s", "stale_s", "nis", "nees", "consistency", "speed_rmse_mps", "n_dropped", "n_gated"),
+    *("dropped", "finite"),
+}
+
+
+def tuned_on(*names):
+    return EstimateSettings(filter="vio15", tuning="likelihood", tune_on=names)
 
 
 @pytest.fixture(scope="module")
@@ -45,258 +40,13 @@ def straight():
     return drive()
 
 
-@pytest.mark.parametrize("scenario", ["straight", "arc"])
-@pytest.mark.parametrize("seed", [0, 1, 2])
-def test_slip_of_12_5_percent_is_found_by_15_states_and_read_low_by_the_thesis_own(scenario, seed):
-    run = drive(scenario, seed=seed)
-    row = summary(estimate_run(run, ROBOT, "vio15"))
-    true = row["slip_true_mean"]
-    assert true == pytest.approx(0.125, abs=0.01)
-    assert row["slip_mean"] == pytest.approx(true, abs=0.002)
-    assert set(row) >= KEYS
-    assert json.loads(json.dumps(row)) == row
-
-    thesis = summary(estimate_run(run, ROBOT, "vio12"))
-    # 0.110 to 0.120 where 0.125 is true: wheel rows without slip pull the speed to that of the wheels
-    assert 0.110 / 0.125 <= thesis["slip_mean"] / true <= 0.120 / 0.125
-
-
-def test_encoders_alone_are_blind_and_the_track_says_so(straight):
-    for name in ("encoder12", "slip14"):
-        found = estimate_run(straight, ROBOT, name)
-        row = summary(found)
-        assert row["slip_true_mean"] == pytest.approx(0.125, abs=0.004)
-        assert row["slip_observable"] is False
-        assert np.isnan(found.slip.slip_ratio).all()
-    blind = summary(estimate_run(straight, ROBOT, "encoder12"))
-    assert blind["slip_mean"] == pytest.approx(0.0, abs=0.005)
-    assert blind["slip_std"] is None
-
-
-def test_gnss_lets_encoders_see():
-    run = drive("arc", gnss=Gnss(fix_length_s=1e6))
-    found = estimate_run(run, ROBOT, "vio15")
-    assert "gnss_position" in found.track.sensors
-    fix = found.track.nis[:, found.track.sensors.index("gnss_position")]
-    assert np.nanmean(fix) / 2 < 3.0
-    assert summary(found)["slip_mean"] == pytest.approx(summary(found)["slip_true_mean"], abs=0.002)
-    alone = RunLog(run.run_id, run.robot, {k: v for k, v in run.streams.items() if k != "odometry"})
-    assert summary(estimate_run(alone, ROBOT, "vio15"))["slip_observable"] is True
-
-
-def turned(run, angle_rad):
-    """The run as a receiver tells it whose east is turned."""
-    gnss = run.streams["gnss"]
-    values = gnss.values.copy()
-    turn = np.array([[np.cos(angle_rad), np.sin(angle_rad)], [-np.sin(angle_rad), np.cos(angle_rad)]])
-    for columns in ([0, 1], [2, 3]):
-        values[:, columns] = values[:, columns] @ turn
-    return replace(run, streams={**run.streams, "gnss": Stream(gnss.time_s, values, gnss.channels)})
-
-
-@pytest.mark.parametrize("angle_rad", [0.0, 1.5, -2.9])
-def test_the_heading_of_the_start_is_found_from_the_drive(angle_rad):
-    run = turned(drive("arc", gnss=Gnss()), angle_rad)
-    for name in ("vio15", "encoder12"):
-        found = estimate_run(run, ROBOT, name)
-        start = found.table.columns(["imu_yaw_rad"])[10, 0]
-        assert abs(np.angle(np.exp(1j * (start - angle_rad)))) < 0.03
-        assert summary(found)["slip_observable"]
-    assert summary(estimate_run(run, ROBOT, "vio15"))["slip_mean"] == pytest.approx(
-        summary(estimate_run(run, ROBOT, "vio15"))["slip_true_mean"], abs=0.002
-    )
-
-
-def test_a_receiver_that_never_moved_is_left_out_and_counted():
-    found = estimate_run(drive("stand", gnss=Gnss(), duration_s=5.0), ROBOT, "vio15")
-    assert found.table.dropped == {"gnss: heading not told by the drive": 50}
-    assert "gnss_position" not in found.track.sensors
-
-
-def test_slip_is_positive_in_traction_on_the_way_back_too():
-    run = drive("complex")
-    row = summary(estimate_run(run, ROBOT, "vio15"))
-    assert row["slip_true_mean"] > 0.1
-    assert row["slip_mean"] == pytest.approx(row["slip_true_mean"], abs=0.004)
-
-
-def test_a_camera_that_is_described_as_worse_is_believed_less():
-    worse = replace(ROBOT, camera=replace(ROBOT.camera, speed_std_mps=0.05))
-    run = simulate_run(worse, "grass", "straight", 0)
-    assert 0.2 < summary(estimate_run(run, worse, "vio15"))["nees"] < 2.0
-
-
-@pytest.mark.parametrize("seed", [0, 1, 2, 3])
-def test_a_camera_lost_for_3_s_leaves_slip_stale_and_less_sure_but_near(seed):
-    run = drive(seed=seed, faults=LOST)
-    found = estimate_run(run, ROBOT, "vio15")
-    time_s = found.slip.time_s
-    lost = (time_s > 10.2) & (time_s < 13.0)
-    assert found.slip.stale[lost].all()
-    assert not found.slip.stale[(time_s > 2.0) & (time_s < 10.0)].any()
-    truth = run.streams["truth"]
-    true = np.mean(
-        [np.interp(time_s, truth.time_s, truth.channel(f"slip_{i}_ratio")) for i in (1, 2, 3)], axis=0
-    )
-    assert found.slip.slip_ratio[lost].mean() == pytest.approx(true[lost].mean(), abs=0.01)
-    std = found.slip.slip_std.mean(axis=1)
-    assert std[lost][-1] > 2 * std[(time_s > 9.0) & (time_s < 10.0)].max()
-    assert (np.diff(std[lost][::25]) > 0).all()
-    assert summary(found)["stale_s"] == pytest.approx(2.85, abs=0.1)
-
-    thesis = estimate_run(run, ROBOT, "vio12")
-    assert np.isnan(thesis.slip.slip_ratio[lost]).all()  # it would fall silently to 0
-    assert abs(thesis.blind.slip_ratio[lost][-20:].mean()) < 0.02
-
-
-def test_on_the_full_simulator_errors_are_what_the_filter_says():
-    runs = [
-        drive(scenario, terrain, seed, vary=True, duration_s=25.0)
-        for terrain in ("grass", "tiles", "tilled_loam", "firm_soil_gravel", "clay")
-        for scenario in ("survey", "straight")
-        for seed in range(5)
-    ]
-    errors = np.array([summary(estimate_run(run, ROBOT, "vio15"))["nees"] for run in runs])
-    assert 0.5 <= np.mean(errors) <= 2.0
-    by_terrain = errors.reshape(5, -1).mean(axis=1)
-    assert (by_terrain > 0.3).all()
-    assert (by_terrain < [1.5, 1.5, 8.0, 1.5, 1.5]).all()  # on loam a wheel's slip swings with every bump
-
-
-def test_no_negative_slip_peak_in_a_start_once_time_constants_match():
-    for terrain in ("tiles", "grass", "firm_soil_gravel"):
-        found = estimate_run(drive(terrain=terrain, faults=STEADY_CAMERA), ROBOT, "vio15")
-        start = (found.track.time_s < 3.0) & (found.track.state("speed_x_mps") > 0.2)
-        assert found.slip.slip_ratio[start].mean(axis=1).min() > -0.02
-
-
-def test_peaks_of_a_start_stand_in_the_order_of_the_grounds():
-    peaks = [
-        np.mean(
-            [summary(estimate_run(drive(terrain=t, seed=s), ROBOT, "vio15"))["slip_peak"] for s in (0, 1)]
-        )
-        for t in ("tiles", "grass", "firm_soil_gravel")
-    ]
-    assert peaks[0] < peaks[1] < peaks[2]
-
-
-def spoilt(run, stream, change):
-    streams = dict(run.streams)
-    old = streams[stream]
-    time_s, values = change(old.time_s.copy(), old.values.copy())
-    streams[stream] = Stream(time_s, values, old.channels)
-    return replace(run, streams=streams)
-
-
-def with_nan(time_s, values):
-    values[300:340] = np.nan
-    return time_s, values
-
-
-def with_infinities(time_s, values):
-    values[300:310, 0] = np.inf
-    values[320:330, -1] = -np.inf
-    return time_s, values
-
-
-def with_spikes(time_s, values):
-    values[200::97] += 1e4
-    return time_s, values
-
-
-def frozen(time_s, values):
-    values[300:500] = values[300]
-    return time_s, values
-
-
-def repeated(time_s, values):
-    time_s[300:303] = time_s[299]
-    return time_s, values
-
-
-def backward(time_s, values):
-    time_s[300:320] -= 1.0
-    return time_s, values
-
-
-def an_hour_on(time_s, values):
-    time_s[500:] += 3600.0
-    return time_s, values
-
-
-def an_hour_back(time_s, values):
-    time_s[500:] -= 3600.0
-    return time_s, values
-
-
-def ended_early(time_s, values):
-    n = len(time_s) // 2
-    return time_s[:n], values[:n]
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        with_nan,
-        with_infinities,
-        with_spikes,
-        frozen,
-        repeated,
-        backward,
-        an_hour_on,
-        an_hour_back,
-        ended_early,
-    ],
-)
-@pytest.mark.parametrize("stream", ["wheels", "imu", "odometry", "steering"])
-def test_no_fault_of_a_sensor_makes_the_filter_lose_its_head(straight, stream, change):
-    for name in ("vio15", "vio12", "encoder12"):
-        found = estimate_run(spoilt(straight, stream, change), ROBOT, name)
-        row = summary(found)
-        assert row["finite"] is True
-        assert json.loads(json.dumps(row)) == row
-        touched = row["n_dropped"] + row["n_gated"]
-        assert touched > 0 or change is ended_early or (change is frozen and stream in ("wheels", "steering"))
-    if stream != "wheels" and change not in (ended_early, an_hour_on, an_hour_back):
-        found = estimate_run(spoilt(straight, stream, change), ROBOT, "vio15")
-        assert summary(found)["slip_mean"] == pytest.approx(0.125, abs=0.01)
-
-
-@pytest.mark.parametrize("missing", ["imu", "odometry", "steering", "commands", "truth"])
-def test_a_stream_that_is_missing_is_missed_and_no_more(straight, missing):
-    streams = {name: stream for name, stream in straight.streams.items() if name != missing}
-    found = estimate_run(replace(straight, streams=streams), ROBOT, "vio15")
-    row = summary(found)
-    assert row["finite"]
-    assert row["slip_observable"] is (missing not in ("odometry", "steering"))
-    if missing == "truth":
-        assert row["nees"] is None
-        assert row["slip_true_mean"] is None
-
-
-@pytest.mark.parametrize(("stream", "channel"), [("wheels", "motor_1_radps"), ("steering", "angle_1_rad")])
-def test_a_wheel_that_falls_silent_has_no_slip_to_tell(straight, stream, channel):
-    column = straight.streams[stream].channels.index(channel)
-
-    def silent(time_s, values):
-        values[time_s > 10.0, column] = np.nan
-        return time_s, values
-
-    slip = estimate_run(spoilt(straight, stream, silent), ROBOT, "vio15").slip
-    late = slip.time_s > 10.7
-    assert np.isnan(slip.slip_ratio[late, 0]).all()
-    assert np.isfinite(slip.slip_ratio[late, 1:]).all()
-    assert np.isfinite(slip.slip_ratio[(slip.time_s > 5.0) & (slip.time_s < 10.4)]).all()
-
-
 def test_a_skid_steer_robot_without_a_reference_has_no_slip_to_show(datasets_dir, tmp_path):
     from pipelines.runs.datasets import load_runs
 
     run = load_runs(datasets_dir / "vulpi")[0]
-    result = estimate([run], "skid", out=tmp_path / "out")
-    (row,) = result["runs"]
-    assert row["slip_observable"] is False
-    assert row["finite"]
+    (row,) = estimate([run], EstimateSettings(filter="skid", out=tmp_path / "out")).runs
+    assert row.slip_observable is False
+    assert row.finite
     written = read_run(tmp_path / "out" / run.run_id)
     assert np.isnan(written.streams["slip"].values).all()
     assert (tmp_path / "out" / "figures" / f"{run.run_id}_motion.png").stat().st_size > 10_000
@@ -306,9 +56,13 @@ def test_a_skid_steer_robot_without_a_reference_has_no_slip_to_show(datasets_dir
 
 def test_runs_are_written_with_their_tracks_and_pictures(straight, tmp_path):
     seen = []
-    result = estimate([straight], "vio15", out=tmp_path, progress=lambda *step: seen.append(step))
+    settings = EstimateSettings(filter="vio15", out=tmp_path)
+    result = estimate([straight], settings, progress=lambda *step: seen.append(step))
     assert seen == [("estimate vio15", 1, 1)]
-    assert set(result) == {"filter", "tuning", "tuned", "out", "runs"}
+    document = as_json(result)
+    assert set(document) == {"filter", "tuning", "tuned", "out", "runs", "skipped"}
+    assert set(document["runs"][0]) >= KEYS
+    assert json.loads(json.dumps(document)) == document
     run = read_run(tmp_path / straight.run_id)
     assert run.streams["slip"].channels == ("slip_1_ratio", "slip_2_ratio", "slip_3_ratio")
     assert run.streams["estimator"].channels[0] == "speed_x_mps"
@@ -325,39 +79,25 @@ def test_runs_are_written_with_their_tracks_and_pictures(straight, tmp_path):
         f"{straight.run_id}_slip.png",
     ]
     with pytest.raises(LogError, match="is there already"):
-        estimate([straight], "vio15", out=tmp_path)
+        estimate([straight], settings)
 
 
 def test_process_noise_is_tuned_on_chosen_runs():
     runs = [drive("survey", terrain, vary=True, duration_s=15.0) for terrain in ("tiles", "grass")]
-    result = estimate(runs, "vio15", tuning="likelihood", tune_on=[runs[0].run_id])
-    assert result["tuned"]["runs"] == [runs[0].run_id]
-    assert result["tuned"]["log_likelihood_after"] > result["tuned"]["log_likelihood_before"]
-    assert result["tuned"]["status"]["steer"] == "found"
-    assert all(row["finite"] and row["slip_observable"] for row in result["runs"])
+    result = estimate(runs, tuned_on(runs[0].run_id))
+    assert result.tuned.runs == (runs[0].run_id,)
+    assert result.tuned.log_likelihood_after > result.tuned.log_likelihood_before
+    assert result.tuned.status["steer"] is TuningStatus.FOUND
+    assert all(row.finite and row.slip_observable for row in result.runs)
     with pytest.raises(DataError, match="no run 'grass_7' to tune on"):
-        estimate(runs, "vio15", tuning="likelihood", tune_on=["grass_7"])
+        estimate(runs, tuned_on("grass_7"))
     with pytest.raises(ConfigError, match="go with the tuning 'likelihood', not 'physical'"):
-        estimate(runs, "vio15", tune_on=[runs[0].run_id])
+        estimate(runs, EstimateSettings(filter="vio15", tune_on=(runs[0].run_id,)))
 
 
 @pytest.mark.parametrize("training_run", [0, 1])
 def test_what_was_tuned_with_a_receiver_serves_runs_without_one_and_the_other_way_round(training_run):
     runs = [drive(duration_s=8.0, number=1, gnss=Gnss()), drive(duration_s=8.0, number=2)]
-    result = estimate(runs, "vio15", tuning="likelihood", tune_on=[runs[training_run].run_id])
-    assert all(row["finite"] and row["slip_observable"] for row in result["runs"])
-    assert ["gnss_position" in row["nis"] for row in result["runs"]] == [True, False]
-
-
-def test_what_is_asked_for_wrongly_is_refused_in_one_sentence(straight):
-    assert set(FILTERS) == {"encoder12", "slip14", "vio12", "vio15", "skid"}
-    with pytest.raises(ConfigError, match="'skid' is not for robot agrimaro"):
-        estimate_run(straight, ROBOT, "skid")
-    with pytest.raises(ConfigError, match="no tuning 'best'"):
-        estimate_run(straight, ROBOT, "vio15", tuning="best")
-
-
-def test_the_same_log_gives_the_same_tracks(straight):
-    one, two = (enriched(estimate_run(straight, ROBOT, "vio15")) for _ in range(2))
-    for name in one.streams:
-        np.testing.assert_array_equal(one.streams[name].values, two.streams[name].values)
+    result = estimate(runs, tuned_on(runs[training_run].run_id))
+    assert all(row.finite and row.slip_observable for row in result.runs)
+    assert ["gnss_position" in row.nis for row in result.runs] == [True, False]

@@ -8,10 +8,14 @@ import pytest
 import yaml
 
 from pipelines.estimate.calibrate import calibrate
-from pipelines.estimate.estimate import enriched, estimate, estimate_run, summary
+from pipelines.estimate.estimate import estimate
+from pipelines.estimate.settings import EstimateSettings
 from pipelines.live.pilot import LivePilot
 from pipelines.slip.learn_slip import run_parts
 from terrain.errors import ConfigError
+from terrain.estimation.enriched import enriched
+from terrain.estimation.estimate import estimate_run
+from terrain.estimation.summary import summarize
 from terrain.extension import write_extended
 from terrain.robots import load_robot
 from terrain.simulation.dynamic.simulate import simulate
@@ -53,7 +57,7 @@ def errors(found):
         [np.interp(track.time_s, truth.time_s, truth.channel(f"slip_{i}_ratio")) for i in (1, 2, 3)]
     )
     error = (found.slip.slip_ratio - true)[found.figures.steady]
-    return summary(found)["speed_rmse_mps"], float(np.sqrt(np.nanmean(error**2)))
+    return summarize(found).speed_rmse_mps, float(np.sqrt(np.nanmean(error**2)))
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -70,7 +74,7 @@ def test_the_filter_of_an_extended_robot_is_as_good_as_without_effects(name):
         assert before[0] > speed_gain * after[0]
     if slip_gain:
         assert before[1] > slip_gain * after[1]
-    assert summary(found)["nees"] < 2.0
+    assert summarize(found).nees < 2.0
     assert found.run is run
 
 
@@ -98,8 +102,9 @@ def test_files_pass_through_the_commands(tmp_path):
     robot = write_extended(out, "agrimaro", ASKED, 1e-6 * np.eye(len(names)), intervals, "a test")
     run = driven(tuple(ASKED.items()), None, "straight", 8.0)
     for tuning in ("physical", "likelihood"):
-        told = estimate([run], "vio15", robot=str(out), tuning=tuning, figures=False)["runs"][0]
-        assert told["speed_rmse_mps"] < 0.006
+        settings = EstimateSettings(filter="vio15", robot=str(out), tuning=tuning, figures=False)
+        (row,) = estimate([run], settings).runs
+        assert row.speed_rmse_mps < 0.006
     assert np.isfinite(run_parts(run, robot)[0].balance.mass_kg)
     assert LivePilot(robot)._robot.wheel_radius_m == pytest.approx(0.208)
     with pytest.raises(ConfigError, match="is extended by effects"):

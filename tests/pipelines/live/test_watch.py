@@ -6,12 +6,13 @@ import pytest
 from features.windows import cut_windows
 from pipelines.classify.crossval import CrossvalSettings, samples_of
 from pipelines.classify.train import model_info
-from pipelines.estimate.estimate import enriched, estimate_run
 from pipelines.live.pilot import LivePilot
 from pipelines.live.watch import Classifier, Nobody, Told
 from pipelines.models.model_files import TerrainModel
 from terrain.control.slip_table import load_slip_table
 from terrain.errors import DataError
+from terrain.estimation.enriched import enriched
+from terrain.estimation.estimate import estimate_run
 from terrain.estimation.live.estimator import LiveEstimator
 from terrain.kinematics.wheel_speed import with_wheel_speeds
 from terrain.logs.replay import replay

@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from pipelines.estimate.estimate import estimate_run
 from terrain.constants import GRAVITY_MPS2
 from terrain.errors import DataError
+from terrain.estimation.estimate import estimate_run
 from terrain.estimation.measurements.resampling import on_clock
 from terrain.records import Label, RunLog, Stream
 from terrain.robots import load_robot

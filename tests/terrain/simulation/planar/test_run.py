@@ -19,9 +19,9 @@ from terrain.effects import (
 )
 from terrain.errors import ConfigError
 from terrain.estimation.measurements.resampling import low_pass
-from terrain.estimation.reference import wheel_and_ground_speed
 from terrain.kinematics.camera import CHANNELS as POSE_CHANNELS
 from terrain.kinematics.camera import body_motion
+from terrain.kinematics.true_slip import wheel_and_ground_speed
 from terrain.logs.schema import IMU_CHANNELS, STEERING_CHANNELS, WHEELS_CHANNELS
 from terrain.robots import load_robot
 from terrain.simulation.planar.ground import planar_ground

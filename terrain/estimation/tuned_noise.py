@@ -1,30 +1,49 @@
-"""Process noise of a filter from runs, by likelihood: ``terrain estimate --tuning likelihood``."""
+"""Process noise of a filter from runs, by likelihood."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 from terrain.errors import DataError
 from terrain.estimation.ekf.model import FilterModel, Noise
-from terrain.estimation.filters.tuning import NoiseGroup, tune_noise
+from terrain.estimation.filters.tuning import NoiseGroup, TuningStatus, tune_noise
 from terrain.estimation.measurements.batch import measurement_table
 from terrain.records import RunLog
 from terrain.robots import Robot
 
 MAX_RUNS = 3
-"""So many runs teach unless they are named: the likelihood of each is asked for a hundred times."""
+"""Number of runs to tune on unless they are named: the likelihood of each is evaluated a hundred times."""
 
 MAX_EVALUATIONS = 200
 
 GROUPS = ("speed", "yaw_rate", "accel", "steer", "slip", "effective_track", "gyro_bias")
 """States are tuned together whose names begin alike.
 
-Measurement noise stays: behind the common low-pass an error outlives a sample, and a likelihood that takes
-each for new would drive the variances of the sensors to nothing."""
+Measurement noise stays: behind the common low-pass an error lasts longer than a sample, and a likelihood that
+takes each for independent would drive the variances of the sensors to zero."""
 
 
-def chosen_runs(runs: Sequence[RunLog], names: Sequence[str] | None) -> list[RunLog]:
+@dataclass(frozen=True, slots=True)
+class TunedNoise:
+    """Result of a tuning.
+
+    Parameters
+    ----------
+    runs : ids of the runs tuned on
+    log_likelihood_before, log_likelihood_after : summed over them
+    scales : of the variances, by group
+    status : of each scale, by group
+    """
+
+    runs: tuple[str, ...]
+    log_likelihood_before: float
+    log_likelihood_after: float
+    scales: Mapping[str, float]
+    status: Mapping[str, TuningStatus]
+
+
+def tuning_runs(runs: Sequence[RunLog], names: Sequence[str] | None) -> list[RunLog]:
     """Return the runs named, or the first few.
 
     Raises
@@ -43,20 +62,15 @@ def chosen_runs(runs: Sequence[RunLog], names: Sequence[str] | None) -> list[Run
 
 def tuned_noise(
     model: FilterModel, noise: Noise, runs: Sequence[RunLog], robot: Robot
-) -> tuple[Noise, dict[str, Any]]:
+) -> tuple[Noise, TunedNoise]:
     """Return noise under which the runs are most likely, and what became of each group.
 
     Parameters
     ----------
     model : the filter
     noise : where to start
-    runs : to tune on
-    robot : whose runs they are
-
-    Returns
-    -------
-    Noise, dict that JSON can hold
-        ``runs, log_likelihood_before, log_likelihood_after, scales`` (of variances) and ``status`` by group.
+    runs : to tune on, without the effects of an extended robot
+    robot : whose runs they are, without its effects
     """
     tables = []
     for run in runs:
@@ -68,10 +82,10 @@ def tuned_noise(
     found, report = tune_noise(
         model, tables, noise, [group for group in grouped if group.states], MAX_EVALUATIONS
     )
-    return found, {
-        "runs": [run.run_id for run in runs],
-        "log_likelihood_before": report.log_likelihood_before,
-        "log_likelihood_after": report.log_likelihood_after,
-        "scales": {group.name: group.scale for group in report.groups},
-        "status": {group.name: group.status for group in report.groups},
-    }
+    return found, TunedNoise(
+        runs=tuple(run.run_id for run in runs),
+        log_likelihood_before=report.log_likelihood_before,
+        log_likelihood_after=report.log_likelihood_after,
+        scales={group.name: group.scale for group in report.groups},
+        status={group.name: group.status for group in report.groups},
+    )

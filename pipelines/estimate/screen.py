@@ -1,0 +1,56 @@
+"""What ``terrain estimate`` prints."""
+
+from __future__ import annotations
+
+from rich.console import Console
+from rich.table import Column, Table
+
+from pipelines.estimate.results import EstimateResult
+from pipelines.reporting.numbers import format_known
+from terrain.estimation.summary import EstimateSummary
+from terrain.estimation.tuned_noise import TunedNoise
+
+_RIGHT = ("slip", "std", "true", "stale s", "NEES", "NIS cam.", "speed RMSE", "dropped", "gated")
+
+
+def print_estimates(result: EstimateResult, console: Console) -> None:
+    """Print slip, its truth where it is known, and how consistent the filter was, a run a line."""
+    table = Table(
+        Column("run", overflow="fold"),
+        *(Column(name, justify="right") for name in _RIGHT),
+        title=f"filter {result.filter}, {result.tuning} noise",
+    )
+    for row in result.runs:
+        table.add_row(*_cells(row))
+    console.print(table)
+    if result.tuned is not None:
+        console.print(_tuning_words(result.tuned))
+    if not all(row.slip_observable for row in result.runs):
+        console.print(
+            "blind: nothing measured the speed over ground, so the figure is the wheels against themselves, "
+            "and the slip in the tracks is NaN"
+        )
+    if result.out is not None:
+        console.print(f"runs with state and slip written to {result.out}", highlight=False)
+    for sentence in result.skipped:
+        console.print(sentence, highlight=False)
+
+
+def _cells(row: EstimateSummary) -> tuple[str, ...]:
+    return (
+        row.run_id,
+        format_known(row.slip_mean, "{:+.4f}") + ("" if row.slip_observable else " blind"),
+        format_known(row.slip_std, "{:.4f}"),
+        format_known(row.slip_true_mean, "{:+.4f}"),
+        f"{row.stale_s:.1f}",
+        format_known(row.nees, "{:.2f}"),
+        format_known(row.nis.get("camera_speed"), "{:.2f}"),
+        format_known(row.speed_rmse_mps, "{:.4f}"),
+        str(row.n_dropped),
+        str(row.n_gated),
+    )
+
+
+def _tuning_words(tuned: TunedNoise) -> str:
+    scales = ", ".join(f"{name} {scale:.3g} ({tuned.status[name]})" for name, scale in tuned.scales.items())
+    return f"process variances scaled on {', '.join(tuned.runs)}: {scales}"

@@ -1,0 +1,27 @@
+"""Settings of ``terrain estimate``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from pipelines.config.settings import Settings, setting
+
+Filter = Literal["encoder12", "slip14", "vio12", "vio15", "skid"]
+"""Filters; the numbers are those of their states."""
+
+Tuning = Literal["physical", "thesis", "likelihood"]
+"""Sources of a filter's noise."""
+
+
+class EstimateSettings(Settings):
+    """Which filter, with what noise, and what is written."""
+
+    filter: Filter = setting(..., "Which filter.")
+    out: Path | None = setting(None, "Folder of new run folders with state and slip, and of pictures.")
+    robot: str | None = setting(None, "Robot or its YAML file, in place of the one that a run names.")
+    tuning: Tuning | None = setting(None, "Noise; the thesis' own for vio12, else physical.")
+    tune_on: tuple[str, ...] | None = setting(
+        None, "Runs, by commas, for the tuning 'likelihood'; the first three.", separated=True
+    )
+    figures: bool = setting(True, "Draw pictures into OUT/figures.")

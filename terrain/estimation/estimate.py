@@ -1,0 +1,206 @@
+"""A filter run over a whole log: measurements, states, slip, and the truth where a log has one."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from terrain.errors import ConfigError
+from terrain.estimation.ekf.filter import run_filter
+from terrain.estimation.ekf.innovations import Innovations, innovations
+from terrain.estimation.ekf.model import GATE_PROBABILITY, REOPEN_AFTER_S, FilterModel, FilterSettings, Noise
+from terrain.estimation.filters.skid import make_skid_filter, skid_noise
+from terrain.estimation.filters.swerve import make_filter
+from terrain.estimation.filters.swerve_noise import default_noise, thesis_noise
+from terrain.estimation.measurements.batch import measurement_table
+from terrain.estimation.measurements.heading import gnss_heading
+from terrain.estimation.measurements.table import GNSS_ROWS, MeasurementTable
+from terrain.estimation.reference import true_states
+from terrain.estimation.slip_figures import SlipFigures, slip_figures
+from terrain.estimation.wheel_slip import blind_slip, wheel_slip
+from terrain.extension import corrected, corrected_log
+from terrain.records import Array, RunLog, SlipTrack, StateTrack
+from terrain.robots import Robot
+
+FILTERS = ("encoder12", "slip14", "vio12", "vio15", "skid")
+"""Names of the filters; the numbers are those of their states."""
+
+TUNINGS = ("physical", "thesis", "likelihood")
+"""Noise in natural units; the thesis' own (6.13), (6.14), with its smoothing and without gates; process noise
+fitted to chosen runs."""
+
+OWN_TUNING: Mapping[str, str] = {"vio12": "thesis"}
+"""Tuning unless another is chosen: vio12 is the thesis' own filter, all others are physical."""
+
+THESIS_SAMPLE_TIME_S = 0.02
+"""Q of the thesis is per step; the sample time, which it does not print, is that of the wheels stream."""
+
+THESIS_EMA_ALPHA = 0.2
+"""Thesis (7.8): smoothing of the camera."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Estimate:
+    """All that is known of one run after filtering it.
+
+    Parameters
+    ----------
+    run : the log, as measured
+    robot : whose log it is, as the filter models it: without the effects of an extended one
+    name : of the filter
+    model : the filter
+    noise : of its process and its measurements
+    table : its measurements, of the log without the robot's effects
+    track : its states
+    slip : NaN where the speed over ground is not observed
+    blind : the slip by the encoders and the filter's own speed; of a filter without a reference of the speed
+        over ground that is no slip
+    figures : of ``slip``, or of ``blind`` where there is no other
+    truth : (n, d) true states, or None
+    """
+
+    run: RunLog
+    robot: Robot
+    name: str
+    model: FilterModel
+    noise: Noise
+    table: MeasurementTable
+    track: StateTrack
+    slip: SlipTrack
+    blind: SlipTrack
+    figures: SlipFigures
+    truth: Array | None
+
+    @property
+    def innovations(self) -> Innovations:
+        """Measurement minus prediction at each instant."""
+        return innovations(self.model, self.noise, self.track, self.table.columns(self.model.rows))
+
+    @property
+    def observable(self) -> bool:
+        """Whether the slip was observed at any time."""
+        return bool(np.isfinite(self.slip.slip_ratio).any())
+
+
+def estimate_run(
+    run: RunLog,
+    robot: Robot,
+    name: str,
+    *,
+    tuning: str | None = None,
+    noise: Noise | None = None,
+    initial_yaw_rad: float | None = None,
+) -> Estimate:
+    """Filter one run.
+
+    Parameters
+    ----------
+    run : log of the robot
+    robot : its description; the effects of an extended one are removed from the log before it is filtered
+    name : one of :data:`FILTERS`
+    tuning : one of :data:`TUNINGS`; the filter's own (:data:`OWN_TUNING`) by default
+    noise : that of a tuning on chosen runs, or any other, in place of the physical
+    initial_yaw_rad : heading at the start in the frame of the GNSS, east 0; found from the drive by default,
+        and where the drive does not determine it the GNSS is left out and counted
+
+    Raises
+    ------
+    ConfigError
+        if the filter does not fit the robot, or has no tuning of that name.
+    DataError
+        if the log has no wheels.
+    """
+    log, robot, tuning = corrected_log(run, robot), corrected(robot), tuning_of(name, tuning)
+    model, usual = model_and_noise(log, robot, name, tuning)
+    ema_alpha = THESIS_EMA_ALPHA if tuning == "thesis" and name == "vio12" else None
+    yaw_rad = initial_yaw_rad or 0.0
+    table = measurement_table(log, robot, ema_alpha=ema_alpha, initial_yaw_rad=yaw_rad)
+    if initial_yaw_rad is None and name != "skid" and set(GNSS_ROWS) & set(model.rows):
+        yaw_rad = gnss_heading(table, robot)
+        if math.isnan(yaw_rad):
+            found = estimate_run(_without_gnss(log), robot, name, tuning=tuning, initial_yaw_rad=0.0)
+            unused = {"gnss: heading not told by the drive": len(log.streams["gnss"])}
+            table = replace(found.table, dropped={**found.table.dropped, **unused})
+            return replace(found, run=_without_gnss(run), table=table)
+        table = measurement_table(log, robot, ema_alpha=ema_alpha, initial_yaw_rad=yaw_rad)
+    noise = _with_gnss_variance(noise or usual, model, table)
+    settings = FilterSettings(1.0 if tuning == "thesis" else GATE_PROBABILITY, REOPEN_AFTER_S)
+    track = run_filter(model, noise, table.time_s, table.columns(model.rows), settings)
+    table = table.at(track.time_s)
+    slip, blind = wheel_slip(track, table, robot), blind_slip(track, table, robot)
+    figures = slip_figures(
+        slip if np.isfinite(slip.slip_ratio).any() else blind,
+        _speed_mps(track),
+        track.time_s,
+        _rolling_direction(table, robot),
+    )
+    truth = true_states(log, track, robot, robot.encoder_lag_s, yaw_rad)
+    return Estimate(run, robot, name, model, noise, table, track, slip, blind, figures, truth)
+
+
+def model_and_noise(
+    run: RunLog, robot: Robot, name: str, tuning: str | None = None
+) -> tuple[FilterModel, Noise]:
+    """Return the filter for a run, and the noise that it starts from.
+
+    Raises
+    ------
+    ConfigError
+        as :func:`estimate_run` does.
+    """
+    if (name == "skid") != (robot.drive == "skid_steer"):
+        fits = "skid" if robot.drive == "skid_steer" else ", ".join(FILTERS[:-1])
+        raise ConfigError(
+            f"filter {name!r} is not for robot {robot.name}, whose drive is {robot.drive}: use {fits}"
+        )
+    robot, tuning = corrected(robot), tuning_of(name, tuning)
+    if name == "skid":
+        return make_skid_filter(robot), skid_noise(robot)
+    if tuning == "thesis":
+        return make_filter(name, robot), thesis_noise(name, robot, THESIS_SAMPLE_TIME_S)
+    gnss = "gnss" in run.streams and len(run.streams["gnss"]) > 0
+    return make_filter(name, robot, with_gnss=gnss), default_noise(name, robot, gnss)
+
+
+def tuning_of(name: str, tuning: str | None) -> str:
+    """Return the tuning of a filter: the one chosen, or its own.
+
+    Raises
+    ------
+    ConfigError
+        if there is no such tuning.
+    """
+    tuning = tuning or OWN_TUNING.get(name, "physical")
+    if tuning not in TUNINGS:
+        raise ConfigError(f"there is no tuning {tuning!r}; there are {', '.join(TUNINGS)}")
+    return tuning
+
+
+def _without_gnss(run: RunLog) -> RunLog:
+    return replace(run, streams={name: stream for name, stream in run.streams.items() if name != "gnss"})
+
+
+def _with_gnss_variance(noise: Noise, model: FilterModel, table: MeasurementTable) -> Noise:
+    """Give each position the variance of its own fix."""
+    places = [model.rows.index(row) for row in GNSS_ROWS if row in model.rows]
+    if not places:
+        return noise
+    variance = np.tile(noise.measurement_variance, (len(table.time_s), 1))
+    variance[:, places] = table.gnss_variance
+    return Noise(noise.process_variance, variance, noise.initial_variance)
+
+
+def _speed_mps(track: StateTrack) -> Array:
+    if "speed_mps" in track.states:
+        return track.state("speed_mps")
+    return np.hypot(track.state("speed_x_mps"), track.state("speed_y_mps"))
+
+
+def _rolling_direction(table: MeasurementTable, robot: Robot) -> Array:
+    """Return the direction (n, wheels) in which each wheel rolls: -1 backward, else 1."""
+    unit = "radps" if robot.drive == "swerve" else "mps"
+    rates = table.columns([f"wheel_{wheel}_{unit}" for wheel in robot.wheels])
+    return np.where(rates < 0.0, -1.0, 1.0)
