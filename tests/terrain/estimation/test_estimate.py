@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipelines.runs.simulate import simulate_run
 from terrain.errors import ConfigError
 from terrain.estimation.enriched import enriched
 from terrain.estimation.estimate import FILTERS, estimate_run
@@ -13,6 +12,7 @@ from terrain.estimation.summary import summarize
 from terrain.records import RunLog, Stream
 from terrain.robots import load_robot
 from terrain.simulation.conditions import Faults
+from terrain.simulation.run import simulate_run
 from terrain.simulation.sensors import Gnss
 
 ROBOT = load_robot("agrimaro")
