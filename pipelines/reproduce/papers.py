@@ -40,7 +40,8 @@ def assumed_numbers(descriptions: Iterable[tuple[str, str]]) -> tuple[AssumedNum
         AssumedNumber(f"{kind}/{name}.yaml", key, entry["value"], entry["unit"], str(entry["source"]))
         for kind, name in descriptions
         for key, entry in _entries(read_yaml(data_folder(kind) / f"{name}.yaml"))
-        if "value" in entry and any(mark in str(entry.get("source", "")) for mark in ("assumed", "identified"))
+        if "value" in entry
+        and any(mark in str(entry.get("source", "")) for mark in ("assumed", "identified"))
     )
 
 
