@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from pipelines.cli.reproduce import app as reproduce_group
 from pipelines.cli.runs import app as runs_group
 from terrain.errors import ConfigError, TerrainError
 from terrain.logs.schema import SIGNAL_SETS
@@ -63,12 +64,6 @@ class Tuning(StrEnum):
     likelihood = "likelihood"
 
 
-class Paper(StrEnum):
-    """Papers that can be reproduced."""
-
-    danzi = "danzi"
-
-
 class Recipe(StrEnum):
     """Recipes from windows to terrain."""
 
@@ -103,7 +98,7 @@ DRIVE_CONTROLLERS = ("plain", "ramp", "thesis", "fixed", "learned", "oracle")
 MAX_GRADE_DEG = 30.0
 
 
-GROUPS: tuple[typer.Typer, ...] = (runs_group,)
+GROUPS: tuple[typer.Typer, ...] = (runs_group, reproduce_group)
 """The files of commands, in the order of help; each has its own ``app``."""
 
 
@@ -521,23 +516,6 @@ def drive_command(
     print_drive(result, _console())
     if out is not None:
         typer.echo(f"page: {out / 'drive.html'}")
-    _write_json(json_file, result)
-
-
-@app.command("reproduce")
-def reproduce_command(
-    paper: Annotated[Paper, typer.Argument(help="Whose experiments to rerun in simulation.")],
-    out: Annotated[Path, typer.Option(help="Folder of the page.")] = Path("terrain-reproduce"),
-    seed: Annotated[int, typer.Option(min=0, help="Of all runs.")] = 0,
-    json_file: Json = None,
-) -> None:
-    """Rerun a paper's experiments in simulation, its figures beside ours."""
-    from pipelines.reporting.screens import progress_bar
-    from pipelines.reproduce.reproduce import print_reproduction, reproduce
-
-    with progress_bar() as progress:
-        result = reproduce(paper.value, out, seed, progress)
-    print_reproduction(result, _console())
     _write_json(json_file, result)
 
 

@@ -14,7 +14,9 @@ import numpy as np
 
 from terrain.files.atomic import atomic_write
 
-DEPRECATED_KEYS: dict[str, str] = {}
+DEPRECATED_KEYS: dict[str, str] = {
+    "simulated": "ours",
+}
 """New key: the key of earlier releases, which is written beside it for one more release."""
 
 

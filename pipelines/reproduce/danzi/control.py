@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipelines.reproduce.reproduce import Finding, Row, holds
+from pipelines.reproduce.results import Finding, Row, Verdict, holds
 from terrain.control.danzi_pid import new_state, thesis_settings, thesis_step
 from terrain.control.pid import Gains
 from terrain.records import Array
@@ -66,7 +66,7 @@ def traction_control(seed: int, quick: bool) -> Finding:
                 where="table 8.1",
                 printed=f"{case.sent_radps:+.3f} rad/s",
                 printed_interval=(case.sent_radps, case.sent_radps),
-                ours=float(sent[0]),
+                simulated=float(sent[0]),
                 unit="rad/s",
                 verdict=holds(same),
                 why="Slip, desired slip, error and rate are compared to the three digits printed.",
@@ -94,10 +94,10 @@ def _iterated_rows() -> list[Row]:
             what=f"Share of the slip error that is left after {N_STEPS} steps of the four braking cases",
             where="(8.3), table 8.1",
             printed="converges to the target",
-            ours=left,
+            simulated=left,
             spread=(float(min(swinging)), float(max(swinging))),
             unit="ratio",
-            verdict="corrected" if left > 0.99 else "as printed",
+            verdict=Verdict.CORRECTED if left > 0.99 else Verdict.AS_PRINTED,
             why="A slip error, a ratio, is added as rad/s. At 0.5 m/s and a radius of 1 m that changes the "
             "slip by twice the error: it changes its sign in each step, for ever. The next row has the right "
             "form.",
@@ -106,10 +106,10 @@ def _iterated_rows() -> list[Row]:
             what=f"Share of the error that a step leaves in all eight cases, normalised, gain {GAIN:g}",
             where="(8.3), table 8.1",
             printed="the output is added as it is",
-            ours=float(ours.mean()),
+            simulated=float(ours.mean()),
             spread=(float(ours.min()), float(ours.max())),
             unit="ratio",
-            verdict="corrected" if ours.max() < 0.6 else "differs",
+            verdict=Verdict.CORRECTED if ours.max() < 0.6 else Verdict.DIFFERS,
             why="K e max(|ω r|, |v|)/r is a rate, and does the same at any speed and radius.",
             beside={"braking": float(braking.max()), "traction, most": float(traction.max())},
         ),

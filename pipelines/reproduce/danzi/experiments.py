@@ -24,6 +24,7 @@ from pipelines.reporting.drawing import (
     new_figure,
     styled,
 )
+from pipelines.reporting.numbers import format_number
 from pipelines.reproduce.danzi.control import traction_control
 from pipelines.reproduce.danzi.runs import (
     START_S,
@@ -43,14 +44,14 @@ from pipelines.reproduce.danzi.slip import (
     slip_on_terrains,
     transient_dip,
 )
-from pipelines.reproduce.reproduce import (
+from pipelines.reproduce.results import (
     Experiment,
     Finding,
     Picture,
     Row,
+    Verdict,
     equation_verdict,
     holds,
-    said,
     verdict_of,
 )
 from terrain.estimation.ekf.innovations import Innovations
@@ -112,7 +113,7 @@ def _admissible_twists(seed: int, quick: bool) -> Finding:
                 where="2.3.2",
                 printed="100 % of what the motors allow",
                 printed_interval=(1.0, 1.0),
-                ours=slowest,
+                simulated=slowest,
                 unit="of the motors' speed",
                 verdict=verdict_of(slowest, (1.0, 1.0)),
                 why="Without a yaw rate all wheels go at the speed of the body.",
@@ -123,7 +124,7 @@ def _admissible_twists(seed: int, quick: bool) -> Finding:
                 where="2.3.2, figure 2.8",
                 printed="falls in proportion as the track grows",
                 printed_interval=(narrow_m / wide_m, narrow_m / wide_m),
-                ours=spot[wide_m] / spot[narrow_m],
+                simulated=spot[wide_m] / spot[narrow_m],
                 unit="ratio",
                 verdict=verdict_of(spot[wide_m] / spot[narrow_m], (narrow_m / wide_m, narrow_m / wide_m)),
                 why="The third wheel is the farthest from the centre and saturates first: the "
@@ -137,9 +138,9 @@ def _admissible_twists(seed: int, quick: bool) -> Finding:
                 where="(2.6) to (2.9)",
                 printed="no wheel beyond 1",
                 printed_interval=(0.0, 1.0),
-                ours=fastest,
+                simulated=fastest,
                 unit="of the motors' speed",
-                verdict="differs" if fastest <= 1.0 else "corrected",
+                verdict=Verdict.DIFFERS if fastest <= 1.0 else Verdict.CORRECTED,
                 why="Each wheel has its own place: y' + x_i g' for y' - x_i g', of opposite sign for "
                 "wheels 1 and 2, and x' + t g' for x' - t g' at the third. As printed, left and right "
                 "turns change places.",
@@ -199,7 +200,7 @@ def _blind_filters(seed: int, quick: bool) -> Finding:
                 where="4.6",
                 printed="zero, systematically",
                 printed_interval=(-NO_SLIP_RATIO, NO_SLIP_RATIO),
-                ours=blind,
+                simulated=blind,
                 spread=blind_range,
                 unit="ratio",
                 verdict=verdict_of(blind, (-NO_SLIP_RATIO, NO_SLIP_RATIO)),
@@ -211,7 +212,7 @@ def _blind_filters(seed: int, quick: bool) -> Finding:
                 what="Slip on grass by the 14 states, which hold a slip ratio for each wheel",
                 where="4.5",
                 printed="large errors, and instability",
-                ours=states,
+                simulated=states,
                 spread=states_range,
                 unit="ratio",
                 verdict=holds(not true_range[0] <= states <= true_range[1]),
@@ -225,9 +226,9 @@ def _blind_filters(seed: int, quick: bool) -> Finding:
                 where="4.5.1, (4.28)",
                 printed="not asked; the nonlinearity of 1/(1 - s) is blamed",
                 printed_interval=(attainable, attainable),
-                ours=rank,
+                simulated=rank,
                 unit="states",
-                verdict="corrected" if rank < attainable else "differs",
+                verdict=Verdict.CORRECTED if rank < attainable else Verdict.DIFFERS,
                 why="The fault is observability: no row measures the speed over ground, and no other "
                 f"filter on the same rows can do better. {attainable} are all but the position; rank of "
                 "the local observability matrix at 0.875 m/s with a slip of 0.125.",
@@ -347,7 +348,7 @@ def _adaptive_tuning(seed: int, quick: bool) -> Finding:
                 what="Error of the slip over the last 10 s, whatever its sign, with the best of four factors",
                 where="4.6.1",
                 printed="no factor gives the real slip",
-                ours=mean,
+                simulated=mean,
                 spread=spread,
                 unit="ratio",
                 verdict=holds(mean > NO_SLIP_RATIO),
@@ -359,12 +360,12 @@ def _adaptive_tuning(seed: int, quick: bool) -> Finding:
                 what=f"Drift of the speed from 10 s to {length_s:g} s, factor {most:g}",
                 where="4.6.1",
                 printed="diverged frequently",
-                ours=drifted,
+                simulated=drifted,
                 spread=drift_range,
                 unit="m/s",
                 verdict=holds(n_lost >= OFTEN * len(runs)),
                 why=f"{n_lost} of {len(runs)} runs drift by more than the slip speed that is looked for, "
-                f"{said(slip_speed_mps)} m/s. Speed over ground has to be measured.",
+                f"{format_number(slip_speed_mps)} m/s. Speed over ground has to be measured.",
                 beside={f"factor {f:g}": over_runs(drift[f])[0] for f in FACTORS[:-1]},
             ),
         ],
@@ -428,7 +429,7 @@ def _camera_frames(seed: int, quick: bool) -> Finding:
                 printed=f"(5.6) gives roll {printed_roll:.0f}, pitch {printed_pitch:.0f}, yaw "
                 f"{printed_yaw:.0f} deg",
                 printed_interval=(printed_yaw, printed_yaw),
-                ours=got_deg,
+                simulated=got_deg,
                 unit="deg",
                 verdict=equation_verdict(got_deg, yaw_deg, printed_yaw),
                 why="An orientation changes its axes on both sides: q_align⁻¹ ⊗ q_sensor ⊗ q_align; (5.6) "
@@ -440,7 +441,7 @@ def _camera_frames(seed: int, quick: bool) -> Finding:
                 where="5.2.3, (5.5)",
                 printed=f"{reversed_mps:.0f} m/s with the q_align of (5.5)",
                 printed_interval=(reversed_mps, reversed_mps),
-                ours=float(ours.speed_mps[1, 0]),
+                simulated=float(ours.speed_mps[1, 0]),
                 unit="m/s",
                 verdict=equation_verdict(float(ours.speed_mps[1, 0]), 1.0, reversed_mps),
                 why="The printed q_align is that of the camera's inner IMU. The pose stream has x right, y "
@@ -455,19 +456,19 @@ def _dead_band(seed: int, quick: bool) -> Finding:
     half_rad = load_robot(ROBOT).equipment.steering.dead_band_rad
     variance = (2 * half_rad) ** 2 / 12
     printed = 1.35e-4
-    agrees = verdict_of(variance, (printed, printed)) == "as printed"
+    agrees = verdict_of(variance, (printed, printed)) is Verdict.AS_PRINTED
     return Finding(
         [
             Row(
                 what="Variance of the steering within its dead band",
                 where="(6.8)",
-                printed=said(printed),
+                printed=format_number(printed),
                 printed_interval=(printed, printed),
-                ours=variance,
+                simulated=variance,
                 unit="rad²",
-                verdict="as printed" if agrees else "corrected",
-                why=f"0.042²/12 is {said(variance)}. It makes no difference: P_0 rounds to 1.5·10⁻⁴ either "
-                "way.",
+                verdict=Verdict.AS_PRINTED if agrees else Verdict.CORRECTED,
+                why=f"0.042²/12 is {format_number(variance)}. It makes no difference: P_0 rounds to 1.5·10⁻⁴ "
+                "with both.",
             )
         ]
     )
@@ -502,9 +503,9 @@ def _innovations(seed: int, quick: bool) -> Finding:
             Row(
                 what=f"Variance of the innovations of {INNOVATIONS[row]}",
                 where=f"6.2, figure 6.{2 * number}",
-                printed=said(printed),
+                printed=format_number(printed),
                 printed_interval=(printed, printed),
-                ours=mean,
+                simulated=mean,
                 spread=spread,
                 unit="(rad/s)²" if row.endswith("radps") else "(m/s)²",
                 verdict=verdict_of(mean, agreeing),
@@ -519,7 +520,7 @@ def _innovations(seed: int, quick: bool) -> Finding:
             where="6.2",
             printed="below 1: conservative",
             printed_interval=(0.0, 1.0),
-            ours=largest,
+            simulated=largest,
             unit="ratio",
             verdict=verdict_of(largest, (0.0, 1.0)),
             why="But what an innovation should have is R and the variance of the state together: next row.",
@@ -535,14 +536,14 @@ def _innovations(seed: int, quick: bool) -> Finding:
             "honest",
             where="6.1.1, (6.14)",
             printed="not given; R is said to saturate the index",
-            ours=nis,
+            simulated=nis,
             spread=nis_range,
             unit="ratio",
-            verdict="corrected" if nis < 1 / FAR_OFF else "differs",
+            verdict=Verdict.CORRECTED if nis < 1 / FAR_OFF else Verdict.DIFFERS,
             why="It is Q that does: it is printed a step and without a rate, and lets the speed move by "
-            f"{said(q_mps)} m/s (one standard deviation) in each of {said(THESIS_SAMPLE_TIME_S)} s. The "
-            "noise of vio15, in natural units, is meant for rough ground and cautious on tiles, but by far "
-            "less.",
+            f"{format_number(q_mps)} m/s (one standard deviation) in each of "
+            f"{format_number(THESIS_SAMPLE_TIME_S)} s. The noise of vio15, in natural units, is "
+            "meant for rough ground and cautious on tiles, but by far less.",
             beside={"vio15": over_runs([summarize(one).nis["camera_speed"] for one in free])[0]},
         )
     )

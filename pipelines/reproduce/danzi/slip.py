@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 
 from pipelines.estimate.figures import slip_figure
 from pipelines.reporting.drawing import BLUE, CLASS_COLOURS, FAINT_INK, GRID, INK, VERMILION
+from pipelines.reporting.numbers import format_number
 from pipelines.reproduce.danzi.runs import (
     START_S,
     Curve,
@@ -28,7 +29,7 @@ from pipelines.reproduce.danzi.runs import (
     steady_mean,
     true_slip,
 )
-from pipelines.reproduce.reproduce import Finding, Picture, Row, holds, said, verdict_of
+from pipelines.reproduce.results import Finding, Picture, Row, Verdict, holds, verdict_of
 from terrain.estimation.ekf.filter import run_filter
 from terrain.estimation.ekf.model import FilterSettings
 from terrain.estimation.estimate import THESIS_EMA_ALPHA, THESIS_SAMPLE_TIME_S, Estimate, estimate_run
@@ -62,30 +63,32 @@ def transient_dip(seed: int, quick: bool) -> Finding:
     robot = load_robot(ROBOT)
     runs = seeded_runs(robot, "tiles", "straight", seed, quick, duration_s=6.0)
     lag_s = robot.equipment.sensors.encoder_time_constant_s
-    ways: dict[str, dict[str, float]] = {
+    forms: dict[str, dict[str, float]] = {
         "as they come": {"time_constant_s": 0.0},
         "printed": {"ema_alpha": THESIS_EMA_ALPHA},
         "matched": {"time_constant_s": lag_s},
     }
-    curves = {way: [_slip_with(run, robot, **smoothing) for run in runs] for way, smoothing in ways.items()}
+    curves = {
+        form: [_slip_with(run, robot, **smoothing) for run in runs] for form, smoothing in forms.items()
+    }
     curves["truth"] = [lagged_truth(run, robot) for run in runs]
-    dip = {way: over_runs([_start(curve, np.min) for curve in row]) for way, row in curves.items()}
+    dip = {form: over_runs([_start(curve, np.min) for curve in row]) for form, row in curves.items()}
     early = {
-        way: over_runs([_start(curve, np.min, MIN_SPEED_MPS) for curve in row])[0]
-        for way, row in curves.items()
+        form: over_runs([_start(curve, np.min, MIN_SPEED_MPS) for curve in row])[0]
+        for form, row in curves.items()
     }
 
-    def row(way: str, what: str, printed: str, verdict: str, why: str) -> Row:
+    def row(form: str, what: str, printed: str, verdict: Verdict, why: str) -> Row:
         return Row(
             what=f"Smallest slip in a start at 1 m/s², {what}",
             where="7.2.2",
             printed=printed,
-            ours=dip[way][0],
-            spread=dip[way][1],
+            simulated=dip[form][0],
+            spread=dip[form][1],
             unit="ratio",
             verdict=verdict,
             why=why,
-            beside={"true": dip["truth"][0], "from 0.05 m/s on": early[way]},
+            beside={"true": dip["truth"][0], "from 0.05 m/s on": early[form]},
         )
 
     return Finding(
@@ -102,7 +105,7 @@ def transient_dip(seed: int, quick: bool) -> Finding:
                 "printed",
                 f"camera smoothed with alpha = {THESIS_EMA_ALPHA:g}",
                 "gone",
-                "as printed" if dip["printed"][0] >= GONE_RATIO else "corrected",
+                Verdict.AS_PRINTED if dip["printed"][0] >= GONE_RATIO else Verdict.CORRECTED,
                 "z = alpha z + (1 - alpha) z_raw with alpha = 0.2 is no heavy smoothing, but a delay of a "
                 "quarter of a sample: 5 ms at the 50 Hz assumed. The dip stays.",
             ),
@@ -121,7 +124,7 @@ def transient_dip(seed: int, quick: bool) -> Finding:
                 "printed remedy, and with one time constant for encoders and camera. Left of the dotted "
                 "line the robot is slower than 0.2 m/s, and the slip is a small difference over a small "
                 "number.",
-                _dip_figure({way: row[0] for way, row in curves.items()}),
+                _dip_figure({form: row[0] for form, row in curves.items()}),
             )
         ],
     )
@@ -161,9 +164,9 @@ def _dip_figure(curves: Mapping[str, Curve]) -> Figure:
         "truth": ("true", INK),
     }
     lines = []
-    for way, (time_s, slip, _) in curves.items():
+    for form, (time_s, slip, _) in curves.items():
         shown = (time_s > START_S[0]) & (time_s < START_S[1])
-        label, colour = looks[way]
+        label, colour = looks[form]
         lines.append((time_s[shown], slip[shown].mean(axis=1), colour, label))
     time_s, _, speed_mps = curves["truth"]
     fast_s = float(time_s[np.argmax(speed_mps > STEADY_SPEED_MPS)])
@@ -198,9 +201,9 @@ def slip_on_terrains(seed: int, quick: bool) -> Finding:
             Row(
                 what=f"Steady slip on {words}, by the thesis' filter",
                 where=where,
-                printed=f"{said(printed[0])} to {said(printed[1])}",
+                printed=f"{format_number(printed[0])} to {format_number(printed[1])}",
                 printed_interval=printed,
-                ours=steady,
+                simulated=steady,
                 spread=steady_range,
                 unit="ratio",
                 verdict=_unless_fitted(verdict_of(steady, printed), terrain),
@@ -213,9 +216,9 @@ def slip_on_terrains(seed: int, quick: bool) -> Finding:
             Row(
                 what=f"Peak of the slip in the start on {words}, from 0.2 m/s on, by the thesis' filter",
                 where=where,
-                printed=said(PEAK_SLIP[terrain]),
+                printed=format_number(PEAK_SLIP[terrain]),
                 printed_interval=at,
-                ours=peak,
+                simulated=peak,
                 spread=peak_range,
                 unit="ratio",
                 verdict=_unless_fitted(verdict_of(peak, at, peak_range), terrain),
@@ -244,7 +247,7 @@ def slip_on_terrains(seed: int, quick: bool) -> Finding:
             where="7.2.3",
             printed="0.16, 0.339, 0.475",
             printed_interval=(1.0, 1.0),
-            ours=in_order,
+            simulated=in_order,
             unit="(share of the runs)",
             verdict=verdict_of(in_order, (1.0, 1.0)),
             why="Gravel has the least traction to spare in a start, tiles the most. Grass and gravel have "
@@ -289,12 +292,14 @@ def known_bias(seed: int, quick: bool) -> Finding:
                 what=f"Steady slip on grass, {words}, by the thesis' filter",
                 where="6.1, 7.2.3",
                 printed="the true value, in steady driving",
-                ours=slip,
+                simulated=slip,
                 spread=spread,
                 unit="ratio",
-                verdict="as printed" if verdict_of(slip, (low, high)) == "as printed" else "corrected",
+                verdict=Verdict.AS_PRINTED
+                if verdict_of(slip, (low, high)) is Verdict.AS_PRINTED
+                else Verdict.CORRECTED,
                 why=f"{100 * short:.0f} % low: wheel rows that know no slip pull the speed towards that of "
-                "the rims. A slip speed of each wheel among the states (vio15) frees them.",
+                "the wheels. A slip speed of each wheel among the states (vio15) frees them.",
                 beside={"true": over_runs(true)[0], "vio15": better},
             )
         )
@@ -319,11 +324,11 @@ def camera_lost(seed: int, quick: bool) -> Finding:
         return Row(
             what=f"Slip on grass at the end of {lost_s:g} s without the camera, {what}",
             where="6.1",
-            printed="not told",
-            ours=ours,
+            printed="not given",
+            simulated=ours,
             spread=spread,
             unit="ratio",
-            verdict="not printed",
+            verdict=Verdict.NOT_PRINTED,
             why=why,
             beside={"true": true} | beside,
         )
@@ -342,8 +347,8 @@ def camera_lost(seed: int, quick: bool) -> Finding:
                 "by vio15",
                 held,
                 held_range,
-                f"The slip speeds wander as far as the filter says they may, here by up to {said(worst)}; "
-                "the slip is marked stale.",
+                "The slip speeds wander as far as the filter's covariance allows, here by up to "
+                f"{format_number(worst)}; the slip is marked stale.",
                 **{"its own standard deviation": std},
             ),
         ],
@@ -381,5 +386,5 @@ def _lost_figure(thesis: Estimate, free: Estimate) -> Figure:
     )
 
 
-def _unless_fitted(verdict: str, terrain: str) -> str:
-    return "assumed" if verdict == "as printed" and terrain != "tiles" else verdict
+def _unless_fitted(verdict: Verdict, terrain: str) -> Verdict:
+    return Verdict.ASSUMED if verdict is Verdict.AS_PRINTED and terrain != "tiles" else verdict

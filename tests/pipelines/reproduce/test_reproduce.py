@@ -12,22 +12,14 @@ import pytest
 from matplotlib.figure import Figure
 from rich.console import Console
 
+from pipelines.reporting.json_file import as_json
 from pipelines.reproduce import reproduce as frame
 from pipelines.reproduce.danzi.experiments import EXPERIMENTS, straight_line_rank
 from pipelines.reproduce.danzi.slip import camera_lost, known_bias
-from pipelines.reproduce.reproduce import (
-    PAPERS,
-    VERDICTS,
-    Experiment,
-    Finding,
-    Paper,
-    Picture,
-    Row,
-    assumed_numbers,
-    print_reproduction,
-    reproduce,
-    verdict_of,
-)
+from pipelines.reproduce.papers import PAPERS, assumed_numbers
+from pipelines.reproduce.reproduce import reproduce
+from pipelines.reproduce.results import Experiment, Finding, Paper, Picture, Row, Verdict, verdict_of
+from pipelines.reproduce.screen import print_reproduction
 from terrain.errors import ConfigError
 from terrain.robots import load_robot
 
@@ -41,9 +33,9 @@ def row(**changes):
         "what": "depth of the moor",
         "where": "figure 3",
         "printed": "1 to 2",
-        "ours": 1.5,
+        "simulated": 1.5,
         "unit": "m",
-        "verdict": "as printed",
+        "verdict": Verdict.AS_PRINTED,
         "why": "It was measured.",
     }
     return Row(**(values | changes))
@@ -91,9 +83,15 @@ def folder(tmp_path_factory):
 def danzi(folder):
     """All experiments of the thesis, with few and short runs."""
     steps = []
-    result = reproduce("danzi", folder, SEED, lambda *step: steps.append(step), quick=True)
+    found = reproduce("danzi", folder, SEED, lambda *step: steps.append(step), quick=True)
     assert steps == [("reproduce danzi", n, len(EXPERIMENTS)) for n in range(1, len(EXPERIMENTS) + 1)]
-    return result
+    return found
+
+
+@pytest.fixture(scope="module")
+def document(danzi):
+    """The same as JSON has it."""
+    return as_json(danzi)
 
 
 @pytest.fixture
@@ -107,11 +105,11 @@ def moor(monkeypatch):
             printed="5 < 6",
             why="a & b",
             unit="<m>",
-            ours=seed + 0.5,
+            simulated=seed + 0.5,
             spread=(0.25, 9.0),
             beside={"<i>wet</i>": 1e-7},
         )
-        return Finding([hostile, row(verdict="differs")], [Picture("<b>peat</b>", Figure())])
+        return Finding([hostile, row(verdict=Verdict.DIFFERS)], [Picture("<b>peat</b>", Figure())])
 
     module = types.ModuleType("moor_experiments")
     module.EXPERIMENTS = (Experiment("Digging <deep>", dig),)
@@ -144,8 +142,7 @@ def test_a_number_agrees_inside_what_is_printed(ours, printed, spread, verdict):
         {"what": " "},
         {"why": ""},
         {"unit": ""},
-        {"verdict": "splendid"},
-        {"ours": math.nan},
+        {"simulated": math.nan},
         {"beside": {"true": math.inf}},
         {"spread": (2.0, 1.0)},
         {"printed_interval": (math.nan, 1.0)},
@@ -187,20 +184,20 @@ def test_a_page_is_self_contained_and_escapes(moor, tmp_path):
 
 
 def test_assumed_numbers_are_those_whose_sources_say_so():
-    names = {number["name"] for number in assumed_numbers([("robots", "agrimaro"), ("soils", "grass")])}
+    names = {number.name for number in assumed_numbers([("robots", "agrimaro"), ("soils", "grass")])}
     assert {"mass_kg", "wheel_radius_m", "sensors.wheels_rate_hz", "friction_angle_rad"} <= names
     assert not {"track_m", "steering.dead_band_rad", "camera.lever_x_m"} & names
 
 
-def test_every_experiment_gives_whole_rows_and_a_page(danzi, folder):
-    assert json.loads(json.dumps(danzi, allow_nan=False)) == danzi
-    assert {found["experiment"] for found in danzi["rows"]} == {one.title for one in EXPERIMENTS}
+def test_every_experiment_gives_whole_rows_and_a_page(danzi, document, folder):
+    assert json.loads(json.dumps(document, allow_nan=False)) == document
+    assert {found["experiment"] for found in document["rows"]} == {one.title for one in EXPERIMENTS}
     whole = set(Row.__dataclass_fields__) | {"experiment"}
-    assert all(set(found) == whole for found in danzi["rows"])
-    assert danzi["verdicts"].keys() == VERDICTS.keys()
-    assert sum(danzi["verdicts"].values()) == len(danzi["rows"])
+    assert all(set(found) == whole for found in document["rows"])
+    assert document["verdicts"].keys() == {verdict.value for verdict in Verdict}
+    assert sum(document["verdicts"].values()) == len(document["rows"])
     page = Page((folder / "danzi.html").read_text(encoding="utf-8"))
-    assert all(found["what"] in page.text and found["why"] in page.text for found in danzi["rows"])
+    assert all(found["what"] in page.text and found["why"] in page.text for found in document["rows"])
     assert page.text.count("Figure ") == len(page.fetched) == page.tags.count("img")
     assert PAPERS["danzi"].about in page.text
     assert "try it out" in page.text
@@ -212,57 +209,57 @@ def find(result, pattern):
     return [found for found in result["rows"] if re.search(pattern, found["what"])]
 
 
-def test_what_the_thesis_prints_wrongly_is_corrected(danzi):
-    (turn,) = find(danzi, "sharpest left turn")
-    (rank,) = find(danzi, "Independent states")
-    (yaw,) = find(danzi, "Yaw from the camera")
-    (ahead,) = find(danzi, "Forward speed from the camera")
-    (band,) = find(danzi, "dead band")
+def test_what_the_thesis_prints_wrongly_is_corrected(document):
+    (turn,) = find(document, "sharpest left turn")
+    (rank,) = find(document, "Independent states")
+    (yaw,) = find(document, "Yaw from the camera")
+    (ahead,) = find(document, "Forward speed from the camera")
+    (band,) = find(document, "dead band")
     assert {one["verdict"] for one in (turn, rank, yaw, ahead, band)} == {"corrected"}
-    assert rank["ours"] == 9
-    assert (round(yaw["ours"], 6), yaw["printed_interval"]) == (30.0, [-90.0, -90.0])
-    assert ahead["ours"] == pytest.approx(-ahead["printed_interval"][0])
-    assert band["ours"] == pytest.approx(0.021**2 / 3)
+    assert rank["simulated"] == 9
+    assert (round(yaw["simulated"], 6), yaw["printed_interval"]) == (30.0, [-90.0, -90.0])
+    assert ahead["simulated"] == pytest.approx(-ahead["printed_interval"][0])
+    assert band["simulated"] == pytest.approx(0.021**2 / 3)
 
 
-def test_slip_is_what_the_thesis_and_its_corrections_make_it(danzi):
-    (blind,) = find(danzi, "by the 12 states")
-    assert abs(blind["ours"]) < 0.01 < blind["beside"]["true slip"]
+def test_slip_is_what_the_thesis_and_its_corrections_make_it(document):
+    (blind,) = find(document, "by the 12 states")
+    assert abs(blind["simulated"]) < 0.01 < blind["beside"]["true slip"]
     for terrain in ("tiles", "grass", "firm soil gravel"):
-        (steady,) = find(danzi, f"Steady slip on {terrain}, by")
+        (steady,) = find(document, f"Steady slip on {terrain}, by")
         low, high = steady["printed_interval"]
         assert low <= steady["beside"]["true"] <= high
         assert steady["beside"]["vio15"] == pytest.approx(steady["beside"]["true"], abs=0.004)
         assert steady["verdict"] == ("as printed" if terrain == "tiles" else "assumed")
-    for biased in find(danzi, "straight on|arc"):
-        assert biased["ours"] < 0.96 * biased["beside"]["true"]
-    early, printed_remedy, matched = find(danzi, "Smallest slip")
-    assert early["ours"] < printed_remedy["ours"] < -0.1 < matched["ours"]
-    thesis, ours = find(danzi, "without the camera, by")
-    assert abs(thesis["ours"]) < 0.01
-    off = ours["ours"] - ours["beside"]["true"]
+    for biased in find(document, "straight on|arc"):
+        assert biased["simulated"] < 0.96 * biased["beside"]["true"]
+    early, printed_remedy, matched = find(document, "Smallest slip")
+    assert early["simulated"] < printed_remedy["simulated"] < -0.1 < matched["simulated"]
+    thesis, ours = find(document, "without the camera, by")
+    assert abs(thesis["simulated"]) < 0.01
+    off = ours["simulated"] - ours["beside"]["true"]
     assert abs(off) < 3 * ours["beside"]["its own standard deviation"]
 
 
-def test_table_8_1_comes_out_as_printed_and_its_iteration_corrected(danzi):
-    cases = find(danzi, "Rate sent to the wheel, case")
+def test_table_8_1_comes_out_as_printed_and_its_iteration_corrected(document):
+    cases = find(document, "Rate sent to the wheel, case")
     assert [case["verdict"] for case in cases] == ["as printed"] * 8
-    assert [round(case["ours"], 3) for case in cases] == [case["printed_interval"][0] for case in cases]
-    swinging, normalised = find(danzi, "Share of the")
+    assert [round(case["simulated"], 3) for case in cases] == [case["printed_interval"][0] for case in cases]
+    swinging, normalised = find(document, "Share of the")
     assert {swinging["verdict"], normalised["verdict"]} == {"corrected"}
-    assert swinging["ours"] == pytest.approx(1.0)
+    assert swinging["simulated"] == pytest.approx(1.0)
     assert normalised["spread"] == pytest.approx([0.5, 0.56], abs=0.005)
 
 
-def test_the_same_seed_gives_the_same_rows_and_another_others(danzi):
+def test_the_same_seed_gives_the_same_rows_and_another_others(document):
     for experiment, run in (("zero-slip wheel rows", known_bias), ("The camera lost", camera_lost)):
-        rows = [found for found in danzi["rows"] if experiment in found["experiment"]]
+        rows = [found for found in document["rows"] if experiment in found["experiment"]]
         assert rows
         again = run(SEED, True).rows
-        assert [found["ours"] for found in rows] == [found.ours for found in again]
+        assert [found["simulated"] for found in rows] == [found.simulated for found in again]
         assert [found["why"] for found in rows] == [found.why for found in again]
-    assert [found.ours for found in known_bias(SEED + 1, True).rows] != [
-        found["ours"] for found in danzi["rows"] if "zero-slip wheel rows" in found["experiment"]
+    assert [found.simulated for found in known_bias(SEED + 1, True).rows] != [
+        found["simulated"] for found in document["rows"] if "zero-slip wheel rows" in found["experiment"]
     ]
 
 

@@ -1,0 +1,54 @@
+"""The papers that can be reproduced, and which numbers of their simulation are assumed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from pipelines.reproduce.results import AssumedNumber, Paper
+from terrain.files.descriptions import read_yaml
+from terrain.files.resources import data_folder
+
+PAPERS: Mapping[str, Paper] = {
+    "danzi": Paper(
+        title="Danzi, AgriMaRo thesis",
+        about=(
+            "D. Danzi, Development of a terrain-aware omnidirectional robotic platform for enhanced mobility "
+            "in agricultural fields, Politecnico di Torino, 2025-2026"
+        ),
+        module="pipelines.reproduce.danzi.experiments",
+        descriptions=(
+            ("robots", "agrimaro"),
+            ("soils", "tiles"),
+            ("soils", "grass"),
+            ("soils", "firm_soil_gravel"),
+        ),
+    ),
+}
+"""Papers by the name that the command takes."""
+
+
+def assumed_numbers(descriptions: Iterable[tuple[str, str]]) -> tuple[AssumedNumber, ...]:
+    """Return every number of the descriptions that was assumed or fitted, by its own source.
+
+    Examples
+    --------
+    >>> assumed_numbers([("soils", "asphalt")])[-1].file
+    'soils/asphalt.yaml'
+    """
+    return tuple(
+        AssumedNumber(f"{kind}/{name}.yaml", key, entry["value"], entry["unit"], str(entry["source"]))
+        for kind, name in descriptions
+        for key, entry in _entries(read_yaml(data_folder(kind) / f"{name}.yaml"))
+        if "value" in entry
+        and any(mark in str(entry.get("source", "")) for mark in ("assumed", "identified"))
+    )
+
+
+def _entries(described: Any, place: str = "") -> Iterable[tuple[str, dict[str, Any]]]:
+    """Yield, by their dotted names, the mappings of a description that hold no further ones with a value."""
+    for key, value in described.items():
+        if isinstance(value, dict) and "value" in value:
+            yield f"{place}{key}", value
+        elif isinstance(value, dict):
+            yield from _entries(value, f"{place}{key}.")
