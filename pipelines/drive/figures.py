@@ -25,7 +25,7 @@ from pipelines.reporting.drawing import (
     shorten,
     styled,
 )
-from pipelines.reproduce.reproduce import said
+from pipelines.reporting.numbers import format_number as said
 from pipelines.slip.figures import GREEN, LARGEST_RATIO, LAW_NAMES
 from terrain.control.drive_metrics import PEAK_ABOVE_MPS, SMOOTH_S
 from terrain.control.slip_table import SlipTable

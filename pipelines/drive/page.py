@@ -18,8 +18,9 @@ from pipelines.drive.drives import COURSE
 from pipelines.drive.figures import Panel, bars_figure, run_figures, table_figure
 from pipelines.quickstart.report import versions
 from pipelines.reporting.drawing import NOT_KNOWN, png_bytes, svg_text
+from pipelines.reporting.numbers import format_number as said
 from pipelines.reporting.page import page
-from pipelines.reproduce.reproduce import MAX_SVG_BYTES, said
+from pipelines.reporting.pictures import MAX_SVG_BYTES
 from terrain.control.drive_metrics import PEAK_ABOVE_MPS
 from terrain.control.slip_table import SlipTable
 from terrain.files.atomic import atomic_write

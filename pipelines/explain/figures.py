@@ -25,7 +25,7 @@ from pipelines.reporting.drawing import (
     shorten,
     styled,
 )
-from pipelines.reproduce.reproduce import said
+from pipelines.reporting.numbers import format_number as said
 from terrain.discrepancy.noise import Noise
 from terrain.effects import CHANNELS
 from terrain.records import Array
