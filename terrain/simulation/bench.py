@@ -92,5 +92,5 @@ def six_positions_log(
     )
     yaw = np.arctan2(turned[:, 1, 0], turned[:, 0, 0])
     tilt = np.column_stack([roll, pitch])
-    imu, _ = imu_samples(sensors, time_s, force, rate, tilt, np.unwrap(yaw) - yaw[0], rng)
+    imu = imu_samples(sensors, time_s, force, rate, tilt, np.unwrap(yaw) - yaw[0], rng)
     return RunLog(run_id, robot.name, {"imu": imu}, source="simulated, six positions on a bench")

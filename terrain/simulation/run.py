@@ -25,6 +25,7 @@ from terrain.simulation.planar.noise import load_noise, load_scatter
 from terrain.simulation.planar.run import simulate_planar
 from terrain.simulation.scenario.make import make_scenario
 from terrain.simulation.sensors.gnss import Gnss
+from terrain.simulation.sensors.sensor import is_lost
 from terrain.simulation.slip_sweep import learning_run
 from terrain.terramechanics.soil import Soil, load_soil, scattered, soil_names
 
@@ -160,9 +161,7 @@ def _planar_run(
 def _without_camera(run: RunLog, faults: Faults) -> RunLog:
     """Return the run without the camera's samples of the times in which it is lost."""
     seen = run.streams["odometry"]
-    kept = np.ones(len(seen), dtype=bool)
-    for start_s, end_s in faults.camera_lost_s:
-        kept &= (seen.time_s < start_s) | (seen.time_s >= end_s)
+    kept = ~is_lost(seen.time_s, faults.camera_lost_s)
     left = Stream(seen.time_s[kept], seen.values[kept], seen.channels)
     streams = {name: left if name == "odometry" else stream for name, stream in run.streams.items()}
     if len(left) < 2:

@@ -98,7 +98,7 @@ def in_loop(
             break
         motion.grow(step + 1)
         for sensor in sensors.values():
-            sensor.hear()
+            sensor.update()
         arrived = ((name, sensor.arrived(time_s)) for name, sensor in sensors.items())
         readings = {name: reading for name, reading in arrived if reading is not None}
         one, two, three = motion.record[step, _PATCHES].tolist()

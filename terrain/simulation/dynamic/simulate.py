@@ -173,7 +173,7 @@ def simulate(
     motion.grow(n_steps)
     streams: dict[str, Stream] = {}
     for name, sensor in sensors.items():
-        sensor.hear()
+        sensor.update()
         streams[name] = sensor.stream()
     streams["commands"] = Stream(scenario.time_s, decided, COMMAND_CHANNELS)
     if status:

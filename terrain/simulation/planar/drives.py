@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -10,6 +11,7 @@ from numba import njit
 from terrain.kinematics.swerve import wheel_commands
 from terrain.records import Array
 from terrain.robots import Robot
+from terrain.simulation.sensors.truth import wheel_channels
 
 COMMANDS_HZ = 50.0
 """Rate of the twists, as scenarios have them."""
@@ -24,12 +26,26 @@ STEER_S = 0.08
 """Lag by which steering follows its command; assumed."""
 
 
-def wheel_commands_of(robot: Robot, twist: Array) -> tuple[Array, tuple[str, ...], Array, Array]:
-    """Return values and channels of the stream, and speeds of rims and steering angles (n, wheels) wanted."""
-    names = ("speed_x_mps", "speed_y_mps", "yaw_rate_radps")
+class WheelCommands(NamedTuple):
+    """Commands of a run.
+
+    Parameters
+    ----------
+    values, channels : (n, c) of the stream
+    speed_mps, steer_rad : (n, wheels) desired circumferential speeds and steering angles of the wheels
+    """
+
+    values: Array
+    channels: tuple[str, ...]
+    speed_mps: Array
+    steer_rad: Array
+
+
+def wheel_commands_of(robot: Robot, twist: Array) -> WheelCommands:
+    """Return the commands that follow from desired twists (n, 3) with the described geometry."""
+    names = ("speed_x_mps", "speed_y_mps", "yaw_rate_radps", *wheel_channels("wheel_radps", robot.wheels))
     radius_m = robot.wheel_radius_m
     assert robot.motors is not None
-    wheels = tuple(f"wheel_{wheel}_radps" for wheel in robot.wheels)
     if robot.drive == "swerve":
         assert robot.steering is not None
         admitted, wheel_radps, steer_rad = wheel_commands(
@@ -41,18 +57,13 @@ def wheel_commands_of(robot: Robot, twist: Array) -> tuple[Array, tuple[str, ...
             twist,
             np.zeros(3),
         )
-        steers = tuple(f"steer_{wheel}_rad" for wheel in robot.wheels)
         values = np.hstack([admitted, wheel_radps, steer_rad])
-        return values, (*names, *wheels, *steers), wheel_radps * radius_m, steer_rad
+        channels = (*names, *wheel_channels("steer_rad", robot.wheels))
+        return WheelCommands(values, channels, wheel_radps * radius_m, steer_rad)
     turn = 0.5 * robot.track_m * twist[:, 2]
     limit = radius_m * robot.motors.speed_max_radps
-    wheel_speeds = np.clip(np.column_stack([twist[:, 0] - turn, twist[:, 0] + turn]), -limit, limit)
-    return (
-        np.hstack([twist, wheel_speeds / radius_m]),
-        (*names, *wheels),
-        wheel_speeds,
-        np.zeros((len(twist), 2)),
-    )
+    speeds = np.clip(np.column_stack([twist[:, 0] - turn, twist[:, 0] + turn]), -limit, limit)
+    return WheelCommands(np.hstack([twist, speeds / radius_m]), names, speeds, np.zeros((len(twist), 2)))
 
 
 @njit(cache=True)

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,7 +26,7 @@ from terrain.effects import (
 from terrain.errors import ConfigError
 from terrain.records import Array, Label, RunLog, Stream
 from terrain.robots import Robot
-from terrain.simulation.planar.drives import COMMANDS_HZ, follow_commands, wheel_commands_of
+from terrain.simulation.planar.drives import COMMANDS_HZ, WheelCommands, follow_commands, wheel_commands_of
 from terrain.simulation.planar.hills import Hills, path_of, tilt_along, undulations
 from terrain.simulation.planar.ideal_sensors import sense
 from terrain.simulation.planar.model import Ground, Planar, make_planar
@@ -37,7 +38,9 @@ from terrain.simulation.planar.noise import (
     coloured,
 )
 from terrain.simulation.planar.streams import (
+    Generators,
     PlanarMotion,
+    PlanarRun,
     camera_stream,
     imu_stream,
     lidar_stream,
@@ -111,29 +114,29 @@ def simulate_planar(
     >>> run.streams["wheels"].values[-1, :2].round(3), run.streams["odometry"].values[-1].round(3)
     (array([0.5, 0.5]), array([0.443, 0.   ]))
     """
-    _check(robot, twist, outside or {}, step_s)
+    outside = outside or {}
+    _check(robot, twist, outside, step_s)
     planar = make_planar(robot, ground or Ground())
     rngs = _generators(seed)
     p = vector_of({**robot.effects, **(effects or {})})
     if scatter is not None:
         for name in nuisances_of(robot.drive):
             p[INDEX[name]] += getattr(scatter, name) * rngs["scatter"].standard_normal()
-    commands, channels, desired_mps, desired_rad = wheel_commands_of(robot, twist)
-    motion = _moved(
-        robot, planar, p, step_s, desired_mps, desired_rad, hills or Hills(), noise, outside or {}, rngs
-    )
-    shown = sense(planar, p, step_s, motion.truth)
+    commands = wheel_commands_of(robot, twist)
+    setup = PlanarSetup(robot, planar, p, step_s, noise, outside)
+    motion = _motion(setup, commands, hills or Hills(), rngs)
+    run = PlanarRun(robot, planar, p, step_s, motion, sense(planar, p, step_s, motion.truth), noise)
     streams = {
-        "wheels": wheels_stream(robot, p, step_s, motion, shown, noise, outside or {}, rngs),
-        "imu": imu_stream(robot, p, step_s, motion, shown, noise, rngs["imu"]),
-        "odometry": camera_stream(robot, planar, p, step_s, motion, shown, noise, rngs["camera"]),
-        "commands": Stream(np.arange(len(twist)) / COMMANDS_HZ, commands, channels),
-        "truth": planar_truth(robot, p, step_s, motion),
+        "wheels": wheels_stream(run, outside.get("stick_slip_a", 0.0), rngs),
+        "imu": imu_stream(run, rngs["imu"]),
+        "odometry": camera_stream(run, rngs["camera"]),
+        "commands": Stream(np.arange(len(twist)) / COMMANDS_HZ, commands.values, commands.channels),
+        "truth": planar_truth(run),
     }
     if robot.drive == "swerve":
-        streams["steering"] = steering_stream(robot, step_s, motion, noise, rngs["steering"])
+        streams["steering"] = steering_stream(run, rngs["steering"])
     if heading:
-        streams["lidar"] = lidar_stream(step_s, motion, shown, noise, rngs["lidar"])
+        streams["lidar"] = lidar_stream(run, rngs["lidar"])
     end_s = (len(twist) - 1) / COMMANDS_HZ
     labels = (Label(0.0, end_s, terrain),) if terrain else ()
     return RunLog(run_id, robot.name, streams, labels, source="simulated, planar")
@@ -164,47 +167,51 @@ def _generators(seed: int | np.random.SeedSequence) -> dict[str, np.random.Gener
     }
 
 
-def _moved(
-    robot: Robot,
-    planar: Planar,
-    p: Array,
-    dt: float,
-    desired_mps: Array,
-    desired_rad: Array,
-    hills: Hills,
-    noise: Noise | None,
-    outside: Mapping[str, float],
-    rngs: Mapping[str, np.random.Generator],
-) -> PlanarMotion:
+class PlanarSetup(NamedTuple):
+    """A run before it is driven: robot, its numbers on the terrain, effects, step and disturbances."""
+
+    robot: Robot
+    planar: Planar
+    p: Array
+    dt: float
+    noise: Noise | None
+    outside: Mapping[str, float]
+
+
+def _motion(setup: PlanarSetup, commands: WheelCommands, hills: Hills, rngs: Generators) -> PlanarMotion:
+    """Return the motion of a robot that follows its commands over hills."""
+    robot, planar, p, dt, noise, outside = setup
     parts = round(1.0 / (COMMANDS_HZ * dt))
     rate_max = robot.steering.rate_max_radps if robot.steering is not None else 0.0
-    wheel_speed, steer = follow_commands(desired_mps, desired_rad, parts, dt, rate_max)
+    wheel_speed, steer = follow_commands(commands.speed_mps, commands.steer_rad, parts, dt, rate_max)
     n = len(wheel_speed)
     active = np.zeros(n) if noise is None else activity(np.abs(wheel_speed).mean(axis=1), noise)
-    disturbance = np.zeros((0, 3))
-    if noise is not None:
-        white = rngs["ground"].standard_normal((3, n))
-        std = np.array([noise.along_ratio, noise.across_ratio, noise.yaw_radps])
-        disturbance = coloured(
-            white, std, np.array([noise.along_s, noise.across_s, noise.yaw_s]), dt
-        ).T.copy()
-        disturbance[:, 2] *= active
+    disturbance = _disturbance(noise, active, dt, rngs["ground"])
     rolled = wheel_speed
     if eccentric := outside.get("wheel_eccentricity_ratio", 0.0):
         phase = rngs["outside"].uniform(0.0, 2.0 * math.pi, wheel_speed.shape[1])
         angle = np.cumsum(wheel_speed, axis=0) * dt / robot.wheel_radius_m
         rolled = wheel_speed * (1.0 + eccentric * np.sin(angle + phase))
     level = np.zeros(n)
-    waves = undulations(hills, rngs["hills"])
-    flat = move(planar, p, dt, rolled, steer, level, level, disturbance)
-    pose = path_of(flat, dt)
-    grade, roll = tilt_along(pose, np.array(hills.grade_ratio), waves)
+    truth = move(planar, p, dt, rolled, steer, level, level, disturbance)
+    pose = path_of(truth, dt)
+    grade, roll = tilt_along(pose, np.array(hills.grade_ratio), undulations(hills, rngs["hills"]))
     if grade.any() or roll.any():
         truth = move(planar, p, dt, rolled, steer, grade, roll, disturbance)
         pose = path_of(truth, dt)
-    else:
-        truth = flat
     sides = np.full(wheel_speed.shape[1], 1.0 - 0.5 * p[INDEX["one_sided_radius_ratio"]])
     sides[-1] = 1.0 + 0.5 * p[INDEX["one_sided_radius_ratio"]]
     rolled = rolled * (1.0 + p[INDEX["wheel_radius_ratio"]]) * sides
     return PlanarMotion(truth, pose, grade, roll, wheel_speed, rolled, steer, active)
+
+
+def _disturbance(noise: Noise | None, active: Array, dt: float, rng: np.random.Generator) -> Array:
+    """Return the disturbance (n, 3) of the terrain as :func:`move` takes it, (0, 3) without noise."""
+    if noise is None:
+        return np.zeros((0, 3))
+    white = rng.standard_normal((3, len(active)))
+    std = np.array([noise.along_ratio, noise.across_ratio, noise.yaw_radps])
+    tau_s = np.array([noise.along_s, noise.across_s, noise.yaw_s])
+    disturbance: Array = coloured(white, std, tau_s, dt).T.copy()
+    disturbance[:, 2] *= active
+    return disturbance

@@ -1,4 +1,10 @@
-"""From a planar motion to the streams of a run log: what each logger writes."""
+"""The streams of a planar run: what each logger writes of the motion and of the ideal measurements.
+
+The measurement models are those of :mod:`terrain.simulation.sensors`.  The loggers of the planar simulation
+differ from those of the dynamic plant in three respects, so that a replay of the log can undo them exactly:
+latency and clock errors are interpolated delays on a fixed grid, the wheel encoders report the distance over
+a period, and the noise of a moving robot is coloured and grows with speed.
+"""
 
 from __future__ import annotations
 
@@ -9,46 +15,42 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from terrain.angles import wrapped
 from terrain.constants import GRAVITY_MPS2
-from terrain.effects import (
-    CHANNELS,
-    CURRENT,
-    HEADING,
-    INDEX,
-    SPEED_X,
-    TURNING_CURRENT,
-)
-from terrain.kinematics.camera import odometry_stream
+from terrain.effects import CHANNELS, CURRENT, HEADING, INDEX, SPEED_X, TURNING_CURRENT
+from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.logs.schema import IMU_CHANNELS, STEERING_CHANNELS, WHEELS_CHANNELS
 from terrain.records import Array, Stream
 from terrain.robots import Robot
 from terrain.simulation.planar.model import AX, VX, VY, Planar, W
-from terrain.simulation.planar.noise import (
-    CAMERA_HZ,
-    IMU_HZ,
-    WHEELS_HZ,
-    Noise,
-    coloured,
-    lag_weights,
-)
+from terrain.simulation.planar.noise import CAMERA_HZ, IMU_HZ, WHEELS_HZ, Noise, coloured, lag_weights
 from terrain.simulation.planar.signals import delayed
+from terrain.simulation.sensors.camera import N_ERRORS, camera_samples
+from terrain.simulation.sensors.imu import ImuErrors, described_calibration, imu_values
+from terrain.simulation.sensors.steering import described_zeros, encoder_angle
+from terrain.simulation.sensors.truth import BODY_TRUTH, GYRO_BIAS, wheel_channels
+from terrain.simulation.sensors.wheels import add_rate_noise
 from terrain.slip import slip_ratio
 
 CRAWL_MPS = 0.25
-"""Below this speed stick-slip spikes."""
+"""Speed below which stick-slip shows as spikes of the current."""
 
 SPIKE_HZ, SPIKE_S = 5.0, 0.06
-"""How often, and how long."""
+"""Mean rate of the spikes, and the length of each."""
+
+STANDSTILL_MPS = 1e-6
+"""Speed below which an encoder counts nothing: its low-pass ends there."""
 
 _SEEN_X = CHANNELS.index(SPEED_X)
 
+Generators = Mapping[str, np.random.Generator]
+"""A generator for each purpose."""
+
 
 class PlanarMotion(NamedTuple):
-    """What happened, every step.
+    """Motion at each step.
 
-    Rims and steering are as encoders without error show them, ``rolled_mps`` is how fast rims are with the
-    radii that the wheels have, and ``active`` how much of the noise of a moving robot there is.
+    Wheel speeds and steering are as encoders without error show them, ``rolled_mps`` is the circumferential
+    speed with the true radii, and ``active`` the factor on the noise of a moving robot.
     """
 
     truth: Array
@@ -61,92 +63,120 @@ class PlanarMotion(NamedTuple):
     active: Array
 
 
-def sample_rows(motion: PlanarMotion, rate_hz: float, dt: float) -> tuple[Array, Array]:
-    """Return steps and stamps (k,) of a logger."""
-    rows = np.arange(0, len(motion.truth), round(1.0 / (rate_hz * dt)))
-    return rows, np.arange(len(rows)) / rate_hz
+class PlanarRun(NamedTuple):
+    """A run before its loggers.
+
+    Parameters
+    ----------
+    robot : of the run
+    planar, p, dt : numbers of the robot on its terrain, parameters of effects, and step in s
+    motion : at each step
+    ideal : (n, len(CHANNELS)) measurements of sensors without noise
+    noise : of terrain and sensors, or None
+    """
+
+    robot: Robot
+    planar: Planar
+    p: Array
+    dt: float
+    motion: PlanarMotion
+    ideal: Array
+    noise: Noise | None
+
+    def samples(self, rate_hz: float) -> tuple[Array, Array]:
+        """Return steps and stamps (k,) of a logger."""
+        rows = np.arange(0, len(self.ideal), round(1.0 / (rate_hz * self.dt)))
+        return rows, np.arange(len(rows)) / rate_hz
+
+    def delayed(self, values: Array, latency_s: float) -> Array:
+        """Return a signal (n,) as the logger of IMU and camera stamps it, behind a latency."""
+        late = (self.p[INDEX["clock_offset_s"]] + latency_s) / self.dt
+        rate = self.p[INDEX["clock_rate_ratio"]]
+        return delayed(values, late, rate) if late != 0.0 or rate != 0.0 else values
 
 
-def wheels_stream(
-    robot: Robot,
-    p: Array,
-    dt: float,
-    motion: PlanarMotion,
-    shown: Array,
-    noise: Noise | None,
-    outside: Mapping[str, float],
-    rngs: Mapping[str, np.random.Generator],
-) -> Stream:
+def wheels_stream(run: PlanarRun, stick_slip_a: float, rngs: Generators) -> Stream:
     """Return the stream of wheel speeds and motor currents."""
+    robot, motion = run.robot, run.motion
+    assert robot.motors is not None
+    rows, time_s = run.samples(WHEELS_HZ)
+    current = run.ideal[rows, CHANNELS.index(CURRENT)]
+    turning = run.ideal[rows, CHANNELS.index(TURNING_CURRENT)]
+    if stick_slip_a:
+        current = current + _spikes(motion, rows, run.dt, stick_slip_a, rngs["outside"])
+    wheels = len(robot.wheels)
+    currents = np.column_stack([current - turning, current + turning]) / 2.0
+    if robot.drive == "swerve":
+        currents = np.repeat(current[:, None] / wheels, wheels, axis=1)
+    speed, currents = _measured(run, rows, currents, rngs["wheels"])
+    channels = (*wheel_channels("speed_mps", robot.wheels), *wheel_channels("current_a", robot.wheels))
+    if robot.drive == "swerve":
+        speed = speed / robot.wheel_radius_m * robot.motors.reduction_ratio
+        channels = WHEELS_CHANNELS
+    return Stream(time_s, np.hstack([speed, currents]), channels)
+
+
+def _measured(
+    run: PlanarRun, rows: Array, currents_a: Array, rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """Return measured wheel speeds and currents (n, wheels)."""
+    robot, motion, noise = run.robot, run.motion, run.noise
     motors, sensors = robot.motors, robot.sensors
     assert motors is not None
     assert sensors is not None
-    rng, wheels = rngs["wheels"], len(robot.wheels)
-    every = round(1.0 / (WHEELS_HZ * dt))
-    rows, time_s = sample_rows(motion, WHEELS_HZ, dt)
-    n = len(rows)
-    active = motion.active[rows]
-    step_m, jitter, told = 0.0, np.zeros((n + 1, wheels)), np.zeros((n, wheels))
-    current = shown[rows, CHANNELS.index(CURRENT)]
-    turning = shown[rows, CHANNELS.index(TURNING_CURRENT)]
-    if outside.get("stick_slip_a", 0.0):
-        current = current + _spikes(motion, rows, dt, outside["stick_slip_a"], rngs["outside"])
-    parts = np.column_stack([current - turning, current + turning]) / 2.0
-    if robot.drive == "swerve":
-        parts = np.repeat(current[:, None] / wheels, wheels, axis=1)
+    n, wheels = currents_a.shape
+    every = round(1.0 / (WHEELS_HZ * run.dt))
+    lag_s = sensors.encoder_time_constant_s + run.p[INDEX["encoder_lag_s"]]
+    step_m, jitter, white = 0.0, np.zeros((n + 1, wheels)), np.zeros((n, wheels))
     if noise is not None:
+        active = motion.active[rows]
         step_m = 2.0 * math.pi * robot.wheel_radius_m / (sensors.hall_steps_ratio * motors.reduction_ratio)
-        jitter = (
-            rng.standard_normal((n + 1, wheels)) * noise.encoder_m * np.append(active, active[-1])[:, None]
-        )
+        jitter = rng.standard_normal((n + 1, wheels)) * noise.encoder_m
+        jitter *= np.append(active, active[-1])[:, None]
         white_mps = sensors.motor_std_radps / motors.reduction_ratio * robot.wheel_radius_m
-        told = white_mps * rng.standard_normal((n, wheels))
-        size = np.full(wheels, noise.current_a(robot.drive) / math.sqrt(wheels))
-        white = rng.standard_normal((wheels, n))
-        drawn = coloured(white, size, np.full(wheels, noise.current_s), dt * every).T * active[:, None]
-        parts = parts + drawn + sensors.current_std_a * rng.standard_normal((n, wheels))
-    lag_s = sensors.encoder_time_constant_s + p[INDEX["encoder_lag_s"]]
-    rate = _counted(motion.wheel_speed_mps, every, dt, step_m, jitter, lag_s)
-    rate = np.where(np.abs(rate) > 1e-6, rate + told, 0.0)  # an encoder that counts nothing says zero
-    channels = (*(f"speed_{wheel}_mps" for wheel in robot.wheels), *(f"current_{w}_a" for w in robot.wheels))
-    if robot.drive == "swerve":
-        rate, channels = rate / robot.wheel_radius_m * motors.reduction_ratio, WHEELS_CHANNELS
-    return Stream(time_s, np.hstack([rate, parts]), channels)
+        white = white_mps * rng.standard_normal((n, wheels))
+        std_a = np.full(wheels, noise.current_a(robot.drive) / math.sqrt(wheels))
+        tau_s = np.full(wheels, noise.current_s)
+        drawn = coloured(rng.standard_normal((wheels, n)), std_a, tau_s, run.dt * every).T * active[:, None]
+        currents_a = currents_a + drawn + sensors.current_std_a * rng.standard_normal((n, wheels))
+    speed = encoder_speed(motion.wheel_speed_mps, every, run.dt, step_m, jitter, lag_s)
+    speed[np.abs(speed) <= STANDSTILL_MPS] = 0.0
+    return add_rate_noise(speed, white, STANDSTILL_MPS), currents_a
 
 
 @njit(cache=True)
-def _counted(
+def encoder_speed(
     wheel_speed_mps: Array, every: int, dt: float, step_m: float, jitter_m: Array, lag_s: float
 ) -> Array:
-    """Return wheel speeds (n, wheels) as encoders count them: ways over a sample, its stamp in the middle.
+    """Return the wheel speeds (n, wheels) that encoders count: distance over a period, stamped in its middle.
 
     Parameters
     ----------
     wheel_speed_mps : (m, wheels)
-    every, dt : steps a sample, and their length
-    step_m : of the encoder at the rim; 0 does not quantise
-    jitter_m : (n + 1, wheels) errors of the ways read
-    lag_s : of the low-pass behind
+    every, dt : steps a sample, and their length in s
+    step_m : of the encoder, at the circumference; 0 does not quantise
+    jitter_m : (n + 1, wheels) errors of the distances read
+    lag_s : of the low-pass behind the encoder
     """
     m, wheels = wheel_speed_mps.shape
     n = (m - 1) // every + 1
     out = np.empty((n, wheels))
-    ways = np.empty(m)
+    distance = np.empty(m)
     period = every * dt
     for i in range(wheels):
-        ways[0] = 0.0
+        distance[0] = 0.0
         for k in range(1, m):
-            ways[k] = ways[k - 1] + 0.5 * dt * (wheel_speed_mps[k - 1, i] + wheel_speed_mps[k, i])
+            distance[k] = distance[k - 1] + 0.5 * dt * (wheel_speed_mps[k - 1, i] + wheel_speed_mps[k, i])
         before = 0.0
         for k in range(n + 1):
             at = k * every - every // 2
             inside = min(max(at, 0), m - 1)
-            way = ways[inside] + (at - inside) * dt * wheel_speed_mps[inside, i] + jitter_m[k, i]
+            reading = distance[inside] + (at - inside) * dt * wheel_speed_mps[inside, i] + jitter_m[k, i]
             if step_m > 0.0:
-                way = math.floor(way / step_m) * step_m
+                reading = math.floor(reading / step_m) * step_m
             if k > 0:
-                out[k - 1, i] = (way - before) / period
-            before = way
+                out[k - 1, i] = (reading - before) / period
+            before = reading
         if lag_s > 0.0:
             now, earlier, keep = lag_weights(lag_s, period)
             last_in = last_out = out[0, i]
@@ -167,155 +197,140 @@ def _spikes(motion: PlanarMotion, rows: Array, dt: float, size_a: float, rng: np
     return np.asarray((size_a * np.sign(speed) * lasting)[rows])
 
 
-def steering_stream(
-    robot: Robot, dt: float, motion: PlanarMotion, noise: Noise | None, rng: np.random.Generator
-) -> Stream:
+def steering_stream(run: PlanarRun, rng: np.random.Generator) -> Stream:
     """Return the stream of steering angles."""
-    steering, sensors = robot.steering, robot.sensors
+    steering, sensors = run.robot.steering, run.robot.sensors
     assert steering is not None
     assert sensors is not None
-    rows, time_s = sample_rows(motion, WHEELS_HZ, dt)
-    angle = motion.steer_rad[rows] + [steering.zero_1_rad, steering.zero_2_rad, steering.zero_3_rad]
-    if noise is not None:
-        step = 2.0 * math.pi / sensors.steering_steps_ratio
-        angle = angle + sensors.steering_std_rad * rng.standard_normal(angle.shape)
-        angle = np.floor(angle / step) * step + step / 2.0
-    return Stream(time_s, wrapped(angle), STEERING_CHANNELS)
+    rows, time_s = run.samples(WHEELS_HZ)
+    steer, noise, step_rad = run.motion.steer_rad[rows], np.zeros(1), 0.0
+    if run.noise is not None:
+        noise = sensors.steering_std_rad * rng.standard_normal(steer.shape)
+        step_rad = 2.0 * math.pi / sensors.steering_steps_ratio
+    return Stream(time_s, encoder_angle(steer, described_zeros(steering), noise, step_rad), STEERING_CHANNELS)
 
 
-def _clocked(values: Array, p: Array, dt: float, late_s: float) -> Array:
-    """Return a signal (n,) as the IMU's and camera's logger stamps it, so much later than it was."""
-    late, rate = (p[INDEX["clock_offset_s"]] + late_s) / dt, p[INDEX["clock_rate_ratio"]]
-    return delayed(values, late, rate) if late != 0.0 or rate != 0.0 else values
-
-
-def imu_stream(
-    robot: Robot,
-    p: Array,
-    dt: float,
-    motion: PlanarMotion,
-    shown: Array,
-    noise: Noise | None,
-    rng: np.random.Generator,
-) -> Stream:
+def imu_stream(run: PlanarRun, rng: np.random.Generator) -> Stream:
     """Return the stream of the IMU."""
-    sensors = robot.sensors
+    motion, sensors = run.motion, run.robot.sensors
     assert sensors is not None
-    rows, time_s = sample_rows(motion, IMU_HZ, dt)
-    n, late_s = len(rows), sensors.imu_latency_s
-    cos = np.cos(motion.grade_rad)
-    turn, v_x, v_y = (motion.truth[:, column] for column in (W, VX, VY))
-    roll, pitch = (
-        _clocked(motion.roll_rad, p, dt, late_s)[rows],
-        -_clocked(motion.grade_rad, p, dt, late_s)[rows],
+    rows, time_s = run.samples(IMU_HZ)
+    latency_s = sensors.imu_latency_s
+    v_x, v_y, turn = (motion.truth[:, column] for column in (VX, VY, W))
+    level = np.cos(motion.grade_rad)
+    tilt = np.column_stack(
+        [run.delayed(angle, latency_s)[rows] for angle in (motion.roll_rad, -motion.grade_rad)]
     )
-    aside = np.gradient(v_y, dt) + turn * v_x + GRAVITY_MPS2 * np.sin(motion.roll_rad) * cos
-    values = np.empty((n, 9))
-    values[:, 0], values[:, 1] = np.gradient(roll, 1.0 / IMU_HZ), np.gradient(pitch, 1.0 / IMU_HZ)
-    for column, channel in ((2, "yaw_rate_radps"), (3, "accel_x_mps2")):  # with clock and latency already
-        values[:, column] = shown[rows, CHANNELS.index(channel)]
-    values[:, 4] = _clocked(aside, p, dt, late_s)[rows]
-    values[:, 5] = _clocked(GRAVITY_MPS2 * np.cos(motion.roll_rad) * cos, p, dt, late_s)[rows]
-    values[:, :3] += [sensors.gyro_bias_x_radps, sensors.gyro_bias_y_radps, sensors.gyro_bias_z_radps]
-    values[:, 3:6] *= [sensors.accel_scale_x_ratio, sensors.accel_scale_y_ratio, sensors.accel_scale_z_ratio]
-    values[:, 3:6] += [sensors.accel_bias_x_mps2, sensors.accel_bias_y_mps2, sensors.accel_bias_z_mps2]
-    values[:, 6], values[:, 7] = roll + p[INDEX["roll_offset_rad"]], pitch - p[INDEX["pitch_offset_rad"]]
-    if noise is not None:
-        active = _clocked(motion.active, p, dt, late_s)[rows]
-        std = np.repeat([noise.gyro_radps, noise.accel_mps2], 3)
-        tau = np.repeat([noise.gyro_s, noise.accel_s], 3)
-        shaking = coloured(rng.standard_normal((6, n)), std, tau, 1.0 / IMU_HZ)
-        white = np.repeat([sensors.gyro_std_radps, sensors.accel_std_mps2], 3)
-        values[:, :6] += shaking.T * active[:, None] + white * rng.standard_normal((n, 6))
-        values[:, 6:8] += noise.tilt_rad * rng.standard_normal((n, 2))
-    values[:, 8] = (np.cumsum(values[:, 2]) - values[0, 2]) / IMU_HZ
-    if noise is not None:
-        values[:, 8] += sensors.yaw_std_rad * rng.standard_normal(n)
-    values[:, 8] = wrapped(values[:, 8])
+    rate = np.empty((len(rows), 3))
+    rate[:, :2] = np.gradient(tilt, 1.0 / IMU_HZ, axis=0)
+    rate[:, 2] = run.ideal[rows, CHANNELS.index("yaw_rate_radps")]  # with clock and latency already
+    force = np.empty((len(rows), 3))
+    force[:, 0] = run.ideal[rows, CHANNELS.index("accel_x_mps2")]
+    sideways = np.gradient(v_y, run.dt) + turn * v_x + GRAVITY_MPS2 * np.sin(motion.roll_rad) * level
+    force[:, 1] = run.delayed(sideways, latency_s)[rows]
+    force[:, 2] = run.delayed(GRAVITY_MPS2 * np.cos(motion.roll_rad) * level, latency_s)[rows]
+    active = run.delayed(motion.active, latency_s)[rows]
+    yaw = (np.cumsum(rate[:, 2]) - rate[0, 2]) / IMU_HZ
+    values = imu_values(_imu_errors(run, active, rng), slice(None), force, rate, tilt, yaw)
     return Stream(time_s, values, IMU_CHANNELS)
 
 
-def camera_stream(
-    robot: Robot,
-    planar: Planar,
-    p: Array,
-    dt: float,
-    motion: PlanarMotion,
-    shown: Array,
-    noise: Noise | None,
-    rng: np.random.Generator,
-) -> Stream:
-    """Return the stream of the tracking camera: poses of a swerve robot, else body speeds."""
-    camera = robot.camera
-    assert camera is not None
-    rows, time_s = sample_rows(motion, CAMERA_HZ, dt)
-    n = len(rows)
-    seen = shown[rows, _SEEN_X : _SEEN_X + 2].copy()
-    late_s = planar.latency_s + p[INDEX["camera_latency_s"]]
+def _imu_errors(run: PlanarRun, active: Array, rng: np.random.Generator) -> ImuErrors:
+    """Return the errors of the IMU: those described, and vibration while the robot moves; ``active`` (n,)."""
+    sensors, noise, n = run.robot.sensors, run.noise, len(active)
+    assert sensors is not None
+    scale, accel_bias, gyro_bias = described_calibration(sensors)
+    inertial, tilt, yaw = np.zeros((n, 6)), np.zeros((n, 2)), np.zeros(n)
     if noise is not None:
-        active = _clocked(motion.active, p, dt, late_s)[rows]
+        std = np.repeat([noise.gyro_radps, noise.accel_mps2], 3)
+        tau = np.repeat([noise.gyro_s, noise.accel_s], 3)
+        vibration = coloured(rng.standard_normal((6, n)), std, tau, 1.0 / IMU_HZ)
+        white = np.repeat([sensors.gyro_std_radps, sensors.accel_std_mps2], 3)
+        inertial = vibration.T * active[:, None] + white * rng.standard_normal((n, 6))
+        tilt = noise.tilt_rad * rng.standard_normal((n, 2))
+        yaw = sensors.yaw_std_rad * rng.standard_normal(n)
+    yaw_rate = gyro_bias[2] + inertial[:, 2]  # the fused yaw sums the measured rate
+    return ImuErrors(
+        accel_scale_ratio=scale,
+        yaw_scale_ratio=1.0,
+        rate_bias_radps=np.tile(gyro_bias, (n, 1)),
+        rate_noise_radps=inertial[:, :3],
+        accel_bias_mps2=accel_bias,
+        accel_noise_mps2=inertial[:, 3:],
+        tilt_bias_rad=np.array([run.p[INDEX["roll_offset_rad"]], -run.p[INDEX["pitch_offset_rad"]]]),
+        tilt_noise_rad=tilt,
+        yaw_bias_rad=(np.cumsum(yaw_rate) - yaw_rate[0]) / IMU_HZ,
+        yaw_noise_rad=yaw,
+    )
+
+
+def camera_stream(run: PlanarRun, rng: np.random.Generator) -> Stream:
+    """Return the stream of the camera: poses of a swerve robot, else speeds in body axes."""
+    camera, noise = run.robot.camera, run.noise
+    assert camera is not None
+    rows, time_s = run.samples(CAMERA_HZ)
+    n = len(rows)
+    latency_s = run.planar.latency_s + run.p[INDEX["camera_latency_s"]]
+    seen = run.ideal[rows, _SEEN_X : _SEEN_X + 2].copy()
+    if noise is not None:
+        active = run.delayed(run.motion.active, latency_s)[rows]
         std, tau = np.full(2, noise.camera_mps), np.full(2, noise.camera_s)
         seen += coloured(rng.standard_normal((2, n)), std, tau, 1.0 / CAMERA_HZ).T * active[:, None]
         seen += camera.speed_std_mps * rng.standard_normal((n, 2))
-    if robot.drive != "swerve":
+    if run.robot.drive != "swerve":
         return Stream(time_s, seen, ("speed_x_mps", "speed_y_mps"))
-    turn = shown[:, CHANNELS.index(HEADING)]
-    yaw = ((np.cumsum(turn) - 0.5 * (turn + turn[0])) * dt)[rows]
-    rate = turn[rows]
-    place_noise = np.zeros((n, 2))
+    turn = run.ideal[:, CHANNELS.index(HEADING)]
+    yaw = ((np.cumsum(turn) - 0.5 * (turn + turn[0])) * run.dt)[rows]
+    rate, position_noise = turn[rows], np.zeros((n, 2))
     if noise is not None:
         yaw = yaw + camera.yaw_std_rad * rng.standard_normal(n)
         rate = rate + camera.yaw_rate_std_radps * rng.standard_normal(n)
-        place_noise = camera.position_std_m * rng.standard_normal((n, 2))
+        position_noise = camera.position_std_m * rng.standard_normal((n, 2))
     origin = seen + np.column_stack([camera.lever_y_m * rate, -camera.lever_x_m * rate])
     cos, sin = np.cos(yaw), np.sin(yaw)
-    ground = np.column_stack(
+    velocity = np.column_stack(
         [origin[:, 0] * cos - origin[:, 1] * sin, origin[:, 0] * sin + origin[:, 1] * cos]
     )
-    place = np.cumsum(ground, axis=0) / CAMERA_HZ
-    roll = _clocked(motion.roll_rad, p, dt, late_s)[rows]
-    pitch = -_clocked(motion.grade_rad, p, dt, late_s)[rows]
-    return odometry_stream(time_s, place + place_noise, yaw, roll, pitch, origin, rate, camera, 0.0)
+    position = np.cumsum(velocity, axis=0) / CAMERA_HZ + position_noise
+    roll, pitch = (run.delayed(a, latency_s)[rows] for a in (run.motion.roll_rad, -run.motion.grade_rad))
+    body = np.column_stack([origin, rate, roll, pitch, yaw])
+    lever_m = np.array([camera.lever_x_m, camera.lever_y_m, camera.lever_z_m])
+    values = np.empty((n, len(CAMERA_CHANNELS)))
+    camera_samples(position, body, np.zeros((n, N_ERRORS)), lever_m, 0.0, values)
+    return Stream(time_s, values, CAMERA_CHANNELS)
 
 
-def lidar_stream(
-    dt: float, motion: PlanarMotion, shown: Array, noise: Noise | None, rng: np.random.Generator
-) -> Stream:
-    """Rate of a heading that no gyro has told, from central differences of it."""
-    rows, time_s = sample_rows(motion, CAMERA_HZ, dt)
-    rate = shown[rows, CHANNELS.index(HEADING)]
-    if noise is not None:
-        rate = rate + np.gradient(noise.heading_rad * rng.standard_normal(len(rows)), 1.0 / CAMERA_HZ)
+def lidar_stream(run: PlanarRun, rng: np.random.Generator) -> Stream:
+    """Return the rate of a heading that does not depend on the gyro, from central differences."""
+    rows, time_s = run.samples(CAMERA_HZ)
+    rate = run.ideal[rows, CHANNELS.index(HEADING)]
+    if run.noise is not None:
+        heading = run.noise.heading_rad * rng.standard_normal(len(rows))
+        rate = rate + np.gradient(heading, 1.0 / CAMERA_HZ)
     return Stream(time_s, rate[:, None], ("yaw_rate_radps",))
 
 
-def planar_truth(robot: Robot, p: Array, dt: float, motion: PlanarMotion) -> Stream:
+def planar_truth(run: PlanarRun) -> Stream:
     """Return the stream of true quantities."""
+    robot, motion = run.robot, run.motion
     assert robot.sensors is not None
-    rows, time_s = sample_rows(motion, IMU_HZ, dt)
-    n = len(rows)
+    rows, time_s = run.samples(IMU_HZ)
     v_x, v_y, turn = (motion.truth[rows, column] for column in (VX, VY, W))
-    accel_x = motion.truth[rows, AX] - GRAVITY_MPS2 * np.sin(motion.grade_rad[rows])
+    grade = motion.grade_rad[rows]
+    accel_x = motion.truth[rows, AX] - GRAVITY_MPS2 * np.sin(grade)
     accel_y = np.gradient(v_y, 1.0 / IMU_HZ) + turn * v_x
-    wheel_speed, steer = motion.wheel_speed_mps[rows], motion.steer_rad[rows]
+    steer = motion.steer_rad[rows]
     x, y = robot.wheel_positions_m.T
-    along = (v_x[:, None] - y * turn[:, None]) * np.cos(steer) + (v_y[:, None] + x * turn[:, None]) * np.sin(
-        steer
-    )
+    along_x, along_y = v_x[:, None] - y * turn[:, None], v_y[:, None] + x * turn[:, None]
+    along = along_x * np.cos(steer) + along_y * np.sin(steer)
     columns = [
         motion.pose[rows],
-        np.column_stack([motion.roll_rad[rows], -motion.grade_rad[rows], v_x, v_y, turn, accel_x, accel_y]),
-        wheel_speed / robot.wheel_radius_m,
+        np.column_stack([motion.roll_rad[rows], -grade, v_x, v_y, turn, accel_x, accel_y]),
+        motion.wheel_speed_mps[rows] / robot.wheel_radius_m,
         steer,
         slip_ratio(motion.rolled_mps[rows], along),
-        np.full((n, 1), p[INDEX["gyro_bias_radps"]] + robot.sensors.gyro_bias_z_radps),
+        np.full((len(rows), 1), run.p[INDEX["gyro_bias_radps"]] + robot.sensors.gyro_bias_z_radps),
     ]
-    channels = (
-        *("position_x_m", "position_y_m", "yaw_rad", "roll_rad", "pitch_rad"),
-        *("speed_x_mps", "speed_y_mps", "yaw_rate_radps", "accel_x_mps2", "accel_y_mps2"),
-        *(f"wheel_{wheel}_radps" for wheel in robot.wheels),
-        *(f"steer_{wheel}_rad" for wheel in robot.wheels),
-        *(f"slip_{wheel}_ratio" for wheel in robot.wheels),
-        "gyro_bias_z_radps",
-    )
+    wheels = (wheel_channels(each, robot.wheels) for each in ("wheel_radps", "steer_rad", "slip_ratio"))
+    channels = (*BODY_TRUTH, *(name for each in wheels for name in each), GYRO_BIAS)
     return Stream(time_s, np.hstack(columns), channels)

@@ -14,7 +14,7 @@ from terrain.simulation.sensors.motion import (
     YAW,
     Motion,
 )
-from terrain.simulation.sensors.sensor import Sensor
+from terrain.simulation.sensors.sensor import Sensor, is_lost
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,9 +50,7 @@ class GnssSensor(Sensor):
         std = np.where(fixed, receiver.fix_std_m, receiver.float_std_m)
         position_noise = std[:, None] * rng.standard_normal((n, 2))
         noise = np.column_stack([position_noise, receiver.speed_std_mps * rng.standard_normal((n, 2))])
-        kept = np.ones(n, dtype=bool)
-        for start_s, end_s in faults.gnss_lost_s:
-            kept &= ~((time_s >= start_s) & (time_s < end_s))
+        kept = ~is_lost(time_s, faults.gnss_lost_s)
         super().__init__(motion, GNSS_CHANNELS, time_s[kept], rows[kept])
         self._noise, self._quality = noise[kept], np.column_stack([std, fixed])[kept]
 

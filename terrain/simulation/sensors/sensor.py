@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 
 import numpy as np
 from numba import njit
@@ -24,60 +25,74 @@ from terrain.simulation.sensors.motion import (
 
 
 class Sensor(ABC):
-    """One sensor of one run, and what it wrote so far.
+    """One sensor of one run, and the samples it has written so far.
 
     Parameters
     ----------
-    motion : what it is told of; rows may be missing yet
+    motion : the recorded motion; its last rows may not be written yet
     channels : of its stream
     time_s : (n,) when its samples arrive
-    rows : (n,) of the motion that they tell of, none later than the sample
+    rows : (n,) of the motion that the samples measure, none later than the sample
     """
 
     def __init__(self, motion: Motion, channels: tuple[str, ...], time_s: Array, rows: Array) -> None:
         self.motion, self.channels, self.time_s, self.rows = motion, channels, time_s, rows
         self.values = np.empty((len(time_s), len(channels)))
-        self._shown = (time_s.view(), self.values.view())
-        for array in self._shown:
+        self._logged = (time_s.view(), self.values.view())
+        for array in self._logged:
             array.flags.writeable = False
         self._n_written = self._n_given = 0
 
     def stamp(self, offset_s: float, rate_ratio: float) -> None:
         """Stamp by a clock of its own, ``t' = (1 + r) t + T``; samples arrive when they did."""
-        self._shown = ((1.0 + rate_ratio) * self.time_s + offset_s, self._shown[1])
-        self._shown[0].flags.writeable = False
+        self._logged = ((1.0 + rate_ratio) * self.time_s + offset_s, self._logged[1])
+        self._logged[0].flags.writeable = False
 
-    def hear(self) -> None:
-        """Write the samples that the motion's rows allow by now."""
-        told = self._follow()
-        new = slice(self._n_written, int(self.rows.searchsorted(told)))
+    def update(self) -> None:
+        """Write the samples of all rows of the motion that are written."""
+        end = self._filter()
+        new = slice(self._n_written, int(self.rows.searchsorted(end)))
         if new.start < new.stop:
             self._write(new, self.rows[new])
             self._n_written = new.stop
 
     def arrived(self, time_s: float) -> Reading | None:
-        """Return what arrived since this was last asked, up to and with ``time_s``; None if nothing did."""
+        """Return the samples that arrived since the last call, up to and with ``time_s``; None for none."""
         new = slice(self._n_given, int(self.time_s.searchsorted(time_s, side="right")))
         self._n_given = new.stop
-        return Reading(*(array[new] for array in self._shown)) if new.start < new.stop else None
+        return Reading(*(array[new] for array in self._logged)) if new.start < new.stop else None
 
     def stream(self) -> Stream:
-        """Return all that it wrote, once the motion is complete."""
-        return Stream(*self._shown, self.channels)
+        """Return all samples, once the motion is complete."""
+        return Stream(*self._logged, self.channels)
 
-    def _follow(self) -> int:
-        """Carry on what has a memory; return up to which row samples can be written."""
+    def _filter(self) -> int:
+        """Filter the new rows; return the number of rows that samples can be written of."""
         return self.motion.n_rows
 
     @abstractmethod
     def _write(self, new: slice, rows: Array) -> None:
-        """Write samples ``new`` of what the motion's ``rows`` tell."""
+        """Write the samples ``new``, which measure the motion's ``rows``."""
+
+
+def is_lost(time_s: Array, intervals_s: Sequence[tuple[float, float]]) -> Array:
+    """Return which samples (n,) fall in one of the intervals (start, end); the end is not in it.
+
+    Examples
+    --------
+    >>> is_lost(np.arange(4.0), [(1.0, 3.0)])
+    array([False,  True,  True, False])
+    """
+    lost = np.zeros(len(time_s), dtype=bool)
+    for start_s, end_s in intervals_s:
+        lost |= (time_s >= start_s) & (time_s < end_s)
+    return lost
 
 
 class LowPass:
-    """First-order low-passes of several quantities, started at rest at the first values they are given.
+    """First-order low-passes of several quantities, started at rest at the first values.
 
-    Called with values (n, c) at :data:`STEP_S`, they filter them in place and remember where they were.
+    Called with values (n, c) at :data:`STEP_S`, they filter them in place and keep their state.
     """
 
     def __init__(self, time_constants_s: list[float]) -> None:

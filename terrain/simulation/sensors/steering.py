@@ -9,7 +9,7 @@ import numpy as np
 from terrain.angles import wrapped
 from terrain.logs.schema import STEERING_CHANNELS
 from terrain.records import Array
-from terrain.robots import Robot
+from terrain.robots import Robot, Steering
 from terrain.simulation.sensors.motion import (
     N_RECORD,
     Motion,
@@ -17,17 +17,38 @@ from terrain.simulation.sensors.motion import (
 from terrain.simulation.sensors.sensor import Sensor
 
 
-class SteeringSensor(Sensor):
-    """Absolute encoders: whole steps a turn (Gray code errs by one at most), the zero not taken off.
+def encoder_angle(steer_rad: Array, zeros_rad: Array, noise_rad: Array | float, step_rad: float) -> Array:
+    """Return the angles (n, wheels) that absolute encoders report.
 
-    The third one sits below the hinge of its leg, and does not see it swing; none sees what the linkage to
-    its wheel does (:func:`terrain.simulation.dynamic.plant.record_width`).
+    Parameters
+    ----------
+    steer_rad : (n, wheels) angles of the steering
+    zeros_rad : (wheels,) angles that encoders report at 0
+    noise_rad : (n, wheels), or one number
+    step_rad : of the encoder; 0 does not quantise
+    """
+    angle = steer_rad + zeros_rad + noise_rad
+    if step_rad > 0.0:
+        angle = np.floor(angle / step_rad) * step_rad + step_rad / 2
+    return wrapped(angle)
+
+
+def described_zeros(steering: Steering) -> Array:
+    """Return the zeros (3,) of the encoders of a robot's description."""
+    return np.array([steering.zero_1_rad, steering.zero_2_rad, steering.zero_3_rad])
+
+
+class SteeringSensor(Sensor):
+    """Absolute encoders: whole steps a turn (Gray code errs by one at most), with their zero offset.
+
+    The third one sits below the hinge of its leg and does not measure its swing; none measures the linkage to
+    its wheel (:func:`terrain.simulation.dynamic.plant.record_width`).
     """
 
     def __init__(self, motion: Motion, robot: Robot, rng: np.random.Generator) -> None:
         steering, sensors = robot.equipment.steering, robot.equipment.sensors
         super().__init__(motion, STEERING_CHANNELS, *motion.at(sensors.steering_rate_hz))
-        self._zeros = np.array([steering.zero_1_rad, steering.zero_2_rad, steering.zero_3_rad])
+        self._zeros = described_zeros(steering)
         self._step_rad = 2 * math.pi / sensors.steering_steps_ratio
         self._noise = sensors.steering_std_rad * rng.standard_normal((len(self.rows), 3))
         self._steer, self._leg = motion.wheel("steer_rad"), motion.body("leg_rad")
@@ -38,6 +59,4 @@ class SteeringSensor(Sensor):
         else:
             steer = self._steer[rows]
             steer[:, 2] -= self._leg[rows]
-        angle = steer + self._zeros + self._noise[new]
-        angle = np.floor(angle / self._step_rad) * self._step_rad + self._step_rad / 2
-        self.values[new] = wrapped(angle)
+        self.values[new] = encoder_angle(steer, self._zeros, self._noise[new], self._step_rad)

@@ -12,11 +12,19 @@ from terrain.simulation.sensors.motion import (
 )
 from terrain.simulation.sensors.sensor import Sensor
 
+STANDSTILL_RADPS = 1e-3
+"""Motor rate below which the Hall sensors count no step."""
+
+
+def add_rate_noise(rate: Array, noise: Array, standstill: float) -> Array:
+    """Return measured rates: an encoder that counts no step, at rates up to ``standstill``, has no noise."""
+    return np.asarray(rate + noise * (np.abs(rate) > standstill))
+
 
 class WheelSensor(Sensor):
     """Motor rates behind the driver's low-pass on quantised Hall steps, and motor currents.
 
-    Of the robot's effects it knows motor_drift.
+    Of the robot's effects it applies motor_drift.
     """
 
     def __init__(self, motion: Motion, robot: Robot, rng: np.random.Generator) -> None:
@@ -32,7 +40,6 @@ class WheelSensor(Sensor):
 
     def _write(self, new: slice, rows: Array) -> None:
         motor = self._reported[rows] * self._reduction
-        moving = np.abs(motor) > 1e-3  # a Hall sensor that sees no step says nothing but zero
-        self.values[new, :3] = motor + self._motor_noise[new] * moving
+        self.values[new, :3] = add_rate_noise(motor, self._motor_noise[new], STANDSTILL_RADPS)
         current = self._torque[rows] / self._per_amp_nm * self._warm[new]
         self.values[new, 3:] = current + self._current_noise[new]

@@ -59,7 +59,7 @@ def motion_of(duration_s, **columns):
 
 
 def heard(sensor):
-    sensor.hear()
+    sensor.update()
     return sensor.stream()
 
 
@@ -163,7 +163,7 @@ def test_a_motion_in_blocks_gives_the_bytes_of_the_motion_in_one(cuts):
         for n_rows in (*cuts, 700):
             parts.grow(n_rows)
             for sensor in pairs[1]:
-                sensor.hear()
+                sensor.update()
         for one, other in zip(*pairs, strict=True):
             batch, blocks = heard(one), other.stream()
             assert len(batch) > 20
@@ -187,7 +187,7 @@ def test_no_sample_tells_of_what_comes_after_it_and_each_arrives_once():
         ]
         motion.grow(301)
         for sensor in sensors:
-            sensor.hear()
+            sensor.update()
         told.append([sensor.arrived(0.3) for sensor in sensors])
         assert all(sensor.arrived(0.3) is None for sensor in sensors)
         assert [reading.time_s[-1] for reading in told[-1]] == [0.3, 0.3, 0.3, 0.3]
