@@ -224,72 +224,6 @@ def predict_command(
     _write_json(json_file, result)
 
 
-@app.command("simulate")
-def simulate_command(
-    robot: Annotated[str, typer.Option(help="Robot by name, or its YAML file.")],
-    terrain: Annotated[
-        str, typer.Option(help="Name of a soil, 'all' for each in turn, 'course' or 'bench'.")
-    ],
-    scenario: Annotated[
-        str,
-        typer.Option(
-            help="stand, straight, arc, starts, climb, brake, circle, crab, spot_turn, complex, survey; "
-            "slip, for learn-slip; course on 'course', six_positions on 'bench'."
-        ),
-    ],
-    out: Annotated[Path, typer.Option(help="Folder of the new run folders.")],
-    runs: Annotated[int, typer.Option(min=1, help="Runs a terrain.")] = 1,
-    duration: Annotated[float | None, typer.Option(help="Length of a run in s.")] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of everything that is drawn.")] = 0,
-    vary: Annotated[
-        bool, typer.Option("--vary", help="Draw soil, slope, load and tyres anew for each run.")
-    ] = False,
-    grade: Annotated[
-        float, typer.Option(help="Slope along the start's heading in degrees, uphill > 0.")
-    ] = 0.0,
-    payload: Annotated[float, typer.Option(min=0.0, help="Load in kg.")] = 0.0,
-    camera_lost: Annotated[
-        list[str] | None, typer.Option(help="START:END in s without the camera; may be given again.")
-    ] = None,
-    gnss: Annotated[bool, typer.Option("--gnss", help="With an RTK receiver on board.")] = False,
-    effect: Annotated[
-        list[str] | None,
-        typer.Option(help="NAME=VALUE of an effect that acts, as wheel_radius=0.03; may be given again."),
-    ] = None,
-    json_file: Json = None,
-) -> None:
-    """Simulate runs: ordinary run folders, with the truth beside what the sensors say."""
-    import math
-
-    from pipelines.reporting.screens import progress_bar
-    from pipelines.runs.simulate import simulate_runs
-    from terrain.simulation.conditions import Conditions, Faults
-
-    if not abs(grade) <= MAX_GRADE_DEG:
-        raise ConfigError(
-            f"--grade is {grade:g}; {-MAX_GRADE_DEG:g} to {MAX_GRADE_DEG:g} degrees are accepted"
-        )
-    with progress_bar() as progress:
-        result = simulate_runs(
-            robot,
-            terrain,
-            scenario,
-            out,
-            runs=runs,
-            duration_s=duration,
-            seed=seed,
-            vary=vary,
-            conditions=Conditions(payload_kg=payload, grade_ratio=(math.tan(math.radians(grade)), 0.0)),
-            faults=Faults(camera_lost_s=tuple(_interval(text) for text in camera_lost or ())),
-            gnss=gnss,
-            effects=effect or (),
-            progress=progress,
-        )
-    runs_of = "run of" if result["n_runs"] == 1 else "runs, in all"
-    typer.echo(f"{result['n_runs']} {runs_of} {result['duration_s']:.0f} s, written to {out}")
-    _write_json(json_file, result)
-
-
 @app.command("estimate")
 def estimate_command(
     data: Data,
@@ -660,18 +594,6 @@ def _load(
     return load_runs(
         data, layout=layout.value, mapping=mapping, repair=repair, align=align, on_skip=skipped.append
     ), skipped
-
-
-def _interval(text: str) -> tuple[float, float]:
-    """Read ``START:END``."""
-    start, _, end = text.partition(":")
-    try:
-        interval = float(start), float(end)
-    except ValueError:
-        interval = 0.0, 0.0
-    if not 0.0 <= interval[0] < interval[1]:
-        raise ConfigError(f"--camera-lost is {text!r}; START:END in seconds is required, as in 10:13")
-    return interval
 
 
 def _radii(text: str | None) -> tuple[float, float, float] | None:

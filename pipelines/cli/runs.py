@@ -1,11 +1,11 @@
-"""Commands on runs themselves: import, inspect."""
+"""Commands on runs themselves: import, inspect, simulate."""
 
 from __future__ import annotations
 
 import typer
 
 from pipelines.cli.command import Json, command
-from pipelines.runs.settings import ImportSettings, InspectSettings
+from pipelines.runs.settings import ImportSettings, InspectSettings, SimulateSettings
 
 app = typer.Typer()
 
@@ -37,4 +37,18 @@ def inspect_command(settings: InspectSettings, json_file: Json = None) -> None:
         settings.data, layout=settings.layout, mapping=settings.mapping, repair=settings.repair
     )
     print_inspection(result, output_console())
+    write_json(json_file, result)
+
+
+@command(app, "simulate")
+def simulate_command(settings: SimulateSettings, json_file: Json = None) -> None:
+    """Simulate runs: ordinary run folders, with the truth beside the measurements."""
+    from pipelines.reporting.json_file import write_json
+    from pipelines.reporting.terminal import progress_bar
+    from pipelines.runs.simulate import simulate_runs
+
+    with progress_bar() as progress:
+        result = simulate_runs(settings, progress)
+    runs_of = "run of" if result.n_runs == 1 else "runs, in all"
+    typer.echo(f"{result.n_runs} {runs_of} {result.duration_s:.0f} s, written to {result.out}")
     write_json(json_file, result)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from pipelines.reporting.progress import Progress, silent
+from pipelines.runs.settings import SimulateSettings
 from terrain.effects import read_effect
 from terrain.errors import ConfigError, LogError
 from terrain.files.atomic import ensure_writable
@@ -21,55 +23,50 @@ EVERY = "all"
 """Given in place of a terrain: each soil in turn."""
 
 
-def simulate_runs(
-    robot_name: str,
-    terrain: str,
-    scenario: str,
-    out: Path,
-    *,
-    runs: int = 1,
-    duration_s: float | None = None,
-    seed: int = 0,
-    vary: bool = False,
-    conditions: Conditions | None = None,
-    faults: Faults | None = None,
-    gnss: bool = False,
-    effects: Sequence[str] = (),
-    progress: Progress = silent,
-) -> dict[str, Any]:
-    """Simulate runs and write them as run folders.
+@dataclass(frozen=True, slots=True)
+class SimulatedRuns:
+    """Run folders that were simulated.
 
     Parameters
     ----------
-    robot_name : name of a robot or path of its YAML file
-    terrain : name of a soil or path of its YAML file, ``all`` for each in turn, or ``course``
-    scenario : name of a scenario
-    out : folder of the new run folders
-    runs : runs a terrain
-    effects : what acts, each ``NAME=VALUE`` as :func:`terrain.effects.catalogue.read_effect` takes it
-    others : as :func:`simulate_run`
+    out : folder of the run folders
+    robot, scenario, seed : of the runs
+    effects : parameters of :mod:`terrain.effects.catalogue` that act
+    n_runs, run_ids : how many, and their names
+    duration_s : of all runs together
+    """
 
-    Returns
-    -------
-    dict that JSON can hold
-        ``out, robot, scenario, seed, effects, n_runs, run_ids, duration_s``
+    out: Path
+    robot: str
+    scenario: str
+    seed: int
+    effects: Mapping[str, float]
+    n_runs: int
+    run_ids: tuple[str, ...]
+    duration_s: float
+
+
+def simulate_runs(settings: SimulateSettings, progress: Progress = silent) -> SimulatedRuns:
+    """Simulate runs and write them as run folders.
 
     Raises
     ------
     ConfigError
-        if an option is not accepted.
+        if a setting is not accepted.
     LogError
-        if a run of that name is there already; nothing is written then.
+        if a run of that name exists already; nothing is written then.
     """
-    robot = load_robot(robot_name)
-    acting = _effects(effects, robot.drive)
+    scenario, out = settings.scenario, settings.out
+    robot = load_robot(settings.robot)
+    effects = _effects(settings.effect, robot.drive)
     ensure_writable(out)
-    terrains = soil_names() if terrain == EVERY else (terrain,)
-    jobs = [(name, number) for name in terrains for number in range(1, runs + 1)]
+    terrains = soil_names() if settings.terrain == EVERY else (settings.terrain,)
+    jobs = [(name, number) for name in terrains for number in range(1, settings.runs + 1)]
     for name, number in jobs:
-        ground = name if name in (COURSE, BENCH_TERRAIN) else load_soil(name).name
-        if (folder := run_folder(run_id_of(ground, scenario, number), out)).exists():
+        terrain = name if name in (COURSE, BENCH_TERRAIN) else load_soil(name).name
+        if (folder := run_folder(run_id_of(terrain, scenario, number), out)).exists():
             raise LogError(f"{folder}: is there already, and is left as it is; choose another --out")
+    gradient = math.tan(math.radians(settings.grade_deg))
     run_ids: list[str] = []
     total_s = 0.0
     for done, (name, number) in enumerate(jobs):
@@ -77,29 +74,22 @@ def simulate_runs(
             robot,
             name,
             scenario,
-            seed,
+            settings.seed,
             number,
-            duration_s=duration_s,
-            vary=vary,
-            conditions=conditions,
-            faults=faults,
-            gnss=Gnss() if gnss else None,
-            effects=acting,
+            duration_s=settings.duration_s,
+            vary=settings.vary,
+            conditions=Conditions(payload_kg=settings.payload_kg, grade_ratio=(gradient, 0.0)),
+            faults=Faults(camera_lost_s=settings.camera_lost_s),
+            gnss=Gnss() if settings.gnss else None,
+            effects=effects,
         )
         write_run(run, out)
         run_ids.append(run.run_id)
         total_s += run.streams["imu"].duration_s
         progress("simulate", done + 1, len(jobs))
-    return {
-        "out": str(out),
-        "robot": robot.name,
-        "scenario": scenario,
-        "seed": seed,
-        "effects": acting,
-        "n_runs": len(run_ids),
-        "run_ids": run_ids,
-        "duration_s": total_s,
-    }
+    return SimulatedRuns(
+        out, robot.name, scenario, settings.seed, effects, len(run_ids), tuple(run_ids), total_s
+    )
 
 
 def _effects(given: Sequence[str], drive: str) -> dict[str, float]:

@@ -3,7 +3,10 @@ import json
 import numpy as np
 import pytest
 
-from pipelines.runs.simulate import simulate_runs
+from pipelines.reporting.json_file import as_json
+from pipelines.reporting.progress import silent
+from pipelines.runs.settings import SimulateSettings
+from pipelines.runs.simulate import simulate_runs as simulate_with
 from terrain.errors import ConfigError, LogError
 from terrain.files.resources import data_folder
 from terrain.logs.read import find_runs, read_run
@@ -14,6 +17,11 @@ from terrain.simulation.sensors.gnss import Gnss
 from terrain.terramechanics.soil import soil_names
 
 ROBOT, HUSKY = load_robot("agrimaro"), load_robot("husky")
+
+
+def simulate_runs(robot, terrain, scenario, out, progress=silent, **options):
+    settings = SimulateSettings(robot=robot, terrain=terrain, scenario=scenario, out=out, **options)
+    return simulate_with(settings, progress)
 
 
 def read_soil(name):
@@ -33,16 +41,17 @@ def test_a_run_is_the_same_whatever_is_simulated_beside_it(tmp_path):
         "agrimaro", "grass", "straight", tmp_path / "alone", runs=1, duration_s=4.0, vary=True
     )
     beside = simulate_runs("agrimaro", "all", "straight", tmp_path / "all", runs=2, duration_s=4.0, vary=True)
-    assert alone["run_ids"] == ["grass_straight_01"]
-    assert beside["n_runs"] == 2 * len(soil_names()) == len(set(beside["run_ids"]))
+    assert alone.run_ids == ("grass_straight_01",)
+    assert beside.n_runs == 2 * len(soil_names()) == len(set(beside.run_ids))
     assert bytes_of(tmp_path / "alone" / "grass_straight_01") == bytes_of(
         tmp_path / "all" / "grass_straight_01"
     )
     run = simulate_run(ROBOT, "grass", "straight", 0, 2, duration_s=4.0, vary=True)
     assert values_of(run) == values_of(read_run(tmp_path / "all" / "grass_straight_02"))
     assert {read().terrains for read in find_runs(tmp_path / "all")} == {(name,) for name in soil_names()}
-    assert json.loads(json.dumps(beside)) == beside
-    assert beside["duration_s"] == pytest.approx(16 * 4.01, abs=0.01)
+    keys = ["out", "robot", "scenario", "seed", "effects", "n_runs", "run_ids", "duration_s"]
+    assert list(json.loads(json.dumps(as_json(beside)))) == keys
+    assert beside.duration_s == pytest.approx(16 * 4.01, abs=0.01)
 
 
 def test_runs_differ_by_number_seed_and_terrain_and_more_so_where_they_vary():
@@ -73,19 +82,19 @@ def test_options_reach_the_run():
 
 def test_a_course_goes_over_all_grounds(tmp_path):
     result = simulate_runs("agrimaro", "course", "course", tmp_path, duration_s=30.0)
-    assert result["run_ids"] == ["course_01"]
+    assert result.run_ids == ("course_01",)
     run = read_run(tmp_path / "course_01")
     assert len(run.terrains) >= 2
     assert set(run.terrains) <= set(soil_names())
 
 
 def test_a_skid_steered_robot_makes_runs_too(tmp_path):
-    given = {"scenario": "complex", "duration_s": 30.0, "vary": True, "effects": ["effective_track=0.6"]}
+    given = {"scenario": "complex", "duration_s": 30.0, "vary": True, "effect": ["effective_track=0.6"]}
     result = simulate_runs("husky", "all", out=tmp_path, **given)
-    assert result["effects"] == {"effective_track_ratio": 0.6}
-    assert result["n_runs"] == len(soil_names())
+    assert result.effects == {"effective_track_ratio": 0.6}
+    assert result.n_runs == len(soil_names())
     run = read_run(tmp_path / "grass_complex_01")
-    again = simulate_run(HUSKY, "grass", "complex", 0, duration_s=30.0, vary=True, effects=result["effects"])
+    again = simulate_run(HUSKY, "grass", "complex", 0, duration_s=30.0, vary=True, effects=result.effects)
     assert values_of(run) == values_of(again)
     assert run.terrains == ("grass",)
     speeds = run.streams["wheels"].values[:, :2]
@@ -115,15 +124,15 @@ def test_load_slope_and_a_lost_camera_reach_a_skid_steered_run():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"robot_name": "husky", "scenario": "crab"}, "scenario 'crab' is not for robot husky"),
-        ({"robot_name": "husky", "terrain": "course", "scenario": "course"}, "'course' is for swerve"),
-        ({"robot_name": "husky", "scenario": "slip"}, "robot husky"),
-        ({"robot_name": "husky", "gnss": True}, "has no receiver"),
-        ({"robot_name": "husky", "effects": ["steering_backlash=0.1"]}, "does not apply to"),
-        ({"effects": ["wheel_radius=9"]}, "-0.3 to 0.3 is accepted"),
-        ({"effects": ["wheel_radius=0.1", "encoder_scale=0.1"]}, "effect 'encoder_scale' is given twice"),
-        ({"scenario": "slip", "effects": ["wheel_radius=0.1"]}, "without effects"),
-        ({"robot_name": "nobody"}, "robot 'nobody' is unknown"),
+        ({"robot": "husky", "scenario": "crab"}, "scenario 'crab' is not for robot husky"),
+        ({"robot": "husky", "terrain": "course", "scenario": "course"}, "'course' is for swerve"),
+        ({"robot": "husky", "scenario": "slip"}, "robot husky"),
+        ({"robot": "husky", "gnss": True}, "has no receiver"),
+        ({"robot": "husky", "effect": ["steering_backlash=0.1"]}, "does not apply to"),
+        ({"effect": ["wheel_radius=9"]}, "-0.3 to 0.3 is accepted"),
+        ({"effect": ["wheel_radius=0.1", "encoder_scale=0.1"]}, "effect 'encoder_scale' is given twice"),
+        ({"scenario": "slip", "effect": ["wheel_radius=0.1"]}, "without effects"),
+        ({"robot": "nobody"}, "robot 'nobody' is unknown"),
         ({"terrain": "lava"}, "soil 'lava' is unknown"),
         ({"scenario": "dance"}, "scenario 'dance' is unknown"),
         ({"terrain": "course"}, "go together"),
@@ -131,14 +140,21 @@ def test_load_slope_and_a_lost_camera_reach_a_skid_steered_run():
         ({"terrain": "all", "scenario": "course"}, "go together"),
         ({"duration_s": 0.5}, "duration_s is 0.5, too short"),
         ({"duration_s": float("nan")}, "duration_s is nan"),
-        ({"conditions": Conditions(payload_kg=500.0, payload_m=(0.0, 0.7))}, "tips it over"),
+        ({"grade_deg": 31.0}, "--grade is 31"),
+        ({"camera_lost": ["9:4"]}, "START:END"),
     ],
 )
 def test_what_is_not_accepted_is_refused_and_nothing_is_written(tmp_path, options, message):
-    given = {"robot_name": "agrimaro", "terrain": "grass", "scenario": "straight", "out": tmp_path / "runs"}
+    given = {"robot": "agrimaro", "terrain": "grass", "scenario": "straight", "out": tmp_path / "runs"}
     with pytest.raises(ConfigError, match=message):
         simulate_runs(**given | options)
     assert not (tmp_path / "runs").exists()
+
+
+def test_a_load_that_tips_the_robot_over_is_refused():
+    heavy = Conditions(payload_kg=500.0, payload_m=(0.0, 0.7))
+    with pytest.raises(ConfigError, match="tips it over"):
+        simulate_run(ROBOT, "grass", "straight", 0, conditions=heavy)
 
 
 def test_a_run_that_is_there_is_left_alone_and_nothing_else_is_written(tmp_path):
@@ -152,14 +168,14 @@ def test_a_soil_of_ones_own_goes_by_its_name(tmp_path):
     own = tmp_path / "field 7.yaml"
     own.write_text(read_soil("grass").replace("name: grass", "name: orchard"))
     result = simulate_runs("agrimaro", str(own), "straight", tmp_path / "runs", duration_s=4.0)
-    assert result["run_ids"] == ["orchard_straight_01"]
+    assert result.run_ids == ("orchard_straight_01",)
     assert read_run(tmp_path / "runs" / "orchard_straight_01").terrains == ("orchard",)
     with pytest.raises(LogError, match="orchard_straight_01: is there already"):
         simulate_runs("agrimaro", str(own), "straight", tmp_path / "runs", duration_s=4.0)
 
 
 def test_progress_counts_the_runs(tmp_path):
-    told = []
+    steps = []
     simulate_runs(
         "agrimaro",
         "snow",
@@ -167,15 +183,18 @@ def test_progress_counts_the_runs(tmp_path):
         tmp_path,
         runs=2,
         duration_s=1.0,
-        progress=lambda *args: told.append(args),
+        progress=lambda *args: steps.append(args),
     )
-    assert told == [("simulate", 1, 2), ("simulate", 2, 2)]
+    assert steps == [("simulate", 1, 2), ("simulate", 2, 2)]
 
 
 def test_an_imu_on_a_bench_is_simulated_for_calibration(tmp_path):
     result = simulate_runs("agrimaro", "bench", "six_positions", tmp_path / "logs", runs=2)
-    assert result["run_ids"] == ["bench_six_positions_01", "bench_six_positions_02"]
-    one, two = (read_run(tmp_path / "logs" / run_id) for run_id in result["run_ids"])
+    assert result.run_ids == (
+        "bench_six_positions_01",
+        "bench_six_positions_02",
+    )
+    one, two = (read_run(tmp_path / "logs" / run_id) for run_id in result.run_ids)
     assert set(one.streams) == {"imu"}
     assert one.streams["imu"].values[0, 0] != two.streams["imu"].values[0, 0]
     with pytest.raises(ConfigError, match="give the terrain 'bench', not 'grass'"):
