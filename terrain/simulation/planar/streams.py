@@ -16,14 +16,7 @@ import numpy as np
 from numba import njit
 
 from terrain.constants import GRAVITY_MPS2
-from terrain.effects import (
-    CHANNELS,
-    CURRENT,
-    HEADING,
-    INDEX,
-    SPEED_X,
-    TURNING_CURRENT,
-)
+from terrain.effects import CHANNELS, CURRENT, HEADING, INDEX, SPEED_X, TURNING_CURRENT
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.logs.schema import IMU_CHANNELS, STEERING_CHANNELS, WHEELS_CHANNELS
 from terrain.records import Array, Stream
