@@ -48,7 +48,7 @@ LOAD_AND_MOTORS: tuple[Effect, ...] = (
                 1.0,
                 0.01,
                 homes=(Home("motors", "torque_constant_nmpa", Combine.OVER),),
-                inverse=Inverse(("wheels",), "current / (1 + q) without the section"),
+                inverse=Inverse(("wheels",), "current / (1 + q)", without_home=True),
                 as_percent=True,
                 is_error=True,
             ),

@@ -74,10 +74,12 @@ class Inverse(NamedTuple):
     ----------
     streams : whose samples or stamps change
     formula : corrected from measured, in the signals of :mod:`terrain.effects.catalogue`
+    without_home : samples change only where the description lacks the section of the parameter's home
     """
 
     streams: tuple[str, ...]
     formula: str
+    without_home: bool = False
 
 
 class Parameter(NamedTuple):
@@ -89,8 +91,7 @@ class Parameter(NamedTuple):
     low, high : bounds of the search
     step : a small change that is still visible, over which sensitivities are taken
     homes : where the description has it; all of them change together
-    inverse : how it is taken off samples, if it can be.  A parameter with homes is taken off samples where
-        the description lacks their section, and otherwise as far as no home covers it
+    inverse : how it is taken off samples, if it can be
     one_sided : sensitivities are taken towards the positive side only: a backlash is not negative.  All
         others are taken to both sides: a delay to one side alone is half a step off, and noise of the wheels
         looks like it

@@ -19,7 +19,6 @@ from terrain.effects.types import (
 )
 
 KINEMATICS = "kinematics of a planar robot"
-_WHEELS = ("wheels", "truth")
 
 
 def _steering_offset(wheel: int) -> Effect:
@@ -54,7 +53,7 @@ WHEELS_AND_STEERING: tuple[Effect, ...] = (
                 0.3,
                 0.01,
                 homes=(Home("", "wheel_radius_m", Combine.TIMES),),
-                inverse=Inverse(_WHEELS, "wheel speed in m/s x (1 + e), where a log has it"),
+                inverse=Inverse(("wheels",), "wheel speed in m/s x (1 + e), where a log has it"),
                 scatter_rank=5,
                 as_percent=True,
                 is_error=True,
@@ -76,7 +75,9 @@ WHEELS_AND_STEERING: tuple[Effect, ...] = (
                 -0.3,
                 0.3,
                 0.01,
-                inverse=Inverse(_WHEELS, "rates and speeds of the right side x (1 + e/2), left x (1 - e/2)"),
+                inverse=Inverse(
+                    ("wheels", "truth"), "rates and speeds of the right side x (1 + e/2), left x (1 - e/2)"
+                ),
                 scatter_rank=6,
                 as_percent=True,
                 is_error=True,

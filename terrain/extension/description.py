@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from terrain.effects import PARAMETER, Home
+from terrain.errors import ConfigError
 from terrain.robots import Robot
 
 
@@ -52,6 +53,28 @@ def corrected(robot: Robot) -> Robot:
     (0.21, {})
     """
     return _without(apply_homes(robot), [name for name in robot.effects if PARAMETER[name].inverse])
+
+
+def check_corrected(robot: Robot) -> None:
+    """Refuse a robot with effects that :func:`corrected` would apply or that samples would be corrected for.
+
+    Raises
+    ------
+    ConfigError
+        if there are any: a filter would take them for motion.
+
+    Examples
+    --------
+    >>> from terrain.robots import load_robot
+    >>> check_corrected(replace(load_robot("agrimaro"), effects={"camera_yaw_rad": 0.02}))
+    Traceback (most recent call last):
+    terrain.errors.ConfigError: robot agrimaro: camera_yaw_rad is not corrected, neither in it nor in its log
+    """
+    left = set(robot.effects) - set(corrected(robot).effects)
+    if left:
+        raise ConfigError(
+            f"robot {robot.name}: {', '.join(sorted(left))} is not corrected, neither in it nor in its log"
+        )
 
 
 def _has_section(robot: Robot, home: Home) -> bool:

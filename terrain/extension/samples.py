@@ -10,10 +10,27 @@ import numpy as np
 
 from terrain.angles import unwrapped, wrapped
 from terrain.effects import OTHER_LOGGER, parameters_of
-from terrain.extension.description import apply_homes
+from terrain.extension.description import apply_homes, corrected
 from terrain.kinematics.camera import turned
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import Robot
+
+
+def correct(run: RunLog, robot: Robot) -> tuple[RunLog, Robot]:
+    """Return a log and its robot without the effects that can be taken off them, as filters take both.
+
+    A robot without effects, or one that was corrected, is returned as it is, and so is its log.
+
+    Examples
+    --------
+    >>> from terrain.robots import load_robot
+    >>> robot = replace(load_robot("husky"), effects={"wheel_radius_ratio": 0.1})
+    >>> wheels = Stream([0.0, 0.1], [[1.0], [1.0]], ("speed_left_mps",))
+    >>> run, robot = correct(RunLog("a", "husky", {"wheels": wheels}), robot)
+    >>> run.streams["wheels"].values[:, 0], dict(robot.effects)
+    (array([1.1, 1.1]), {})
+    """
+    return corrected_log(run, robot), corrected(robot)
 
 
 def corrected_log(run: RunLog, robot: Robot) -> RunLog:
@@ -68,23 +85,24 @@ class Correction:
     Parameters
     ----------
     robot : with its effects
-    start_s : first stamp of the wheels, from which drifts count
+    start_s : first stamp of the wheels, from which drifts count; the first stamp that comes by default
     """
 
-    def __init__(self, robot: Robot, start_s: float) -> None:
+    def __init__(self, robot: Robot, start_s: float = math.nan) -> None:
         self._start_s = start_s
         self._p = dict.fromkeys(parameters_of(robot.drive), 0.0) | dict(robot.effects)
-        believed = apply_homes(robot)
-        left = believed.effects
-        self._gyro_bias = believed.sensors.gyro_bias_z_radps if believed.sensors else 0.0
-        self._gyro_rest, self._accel_rest = left.get("gyro_bias_radps", 0.0), left.get("accel_bias_mps2", 0.0)
-        self._current = 1.0 + left.get("motor_constant_ratio", 0.0)
+        applied = apply_homes(robot)
+        homeless = applied.effects
+        self._gyro_bias = applied.sensors.gyro_bias_z_radps if applied.sensors else 0.0
+        self._gyro_offset = homeless.get("gyro_bias_radps", 0.0)
+        self._accel_offset = homeless.get("accel_bias_mps2", 0.0)
+        self._current = 1.0 + homeless.get("motor_constant_ratio", 0.0)
         half = 0.5 * self._p["one_sided_radius_ratio"]
         swerve = robot.drive == "swerve"
         self._side = {wheel: 1.0 + half if wheel in ("3", "right") else 1.0 - half for wheel in robot.wheels}
         self._has_backlash = swerve and self._p["steering_backlash_rad"] > 0.0
         self._follower, self._angle, self._yaw = np.full(3, np.nan), np.full(3, np.nan), (np.nan, np.nan)
-        self._steps: Mapping[str, Callable[[tuple[str, ...], Array, Array], None]] = {
+        self._inverses: Mapping[str, Callable[[tuple[str, ...], Array, Array], None]] = {
             "wheels": self._wheels,
             "steering": self._steering,
             "imu": self._imu,
@@ -103,10 +121,15 @@ class Correction:
         name, channels : of the stream
         time_s, values : (k,), (k, c) as measured
         """
-        if name in self._steps:
+        if math.isnan(self._start_s):
+            finite = time_s[np.isfinite(time_s)]
+            if not finite.size:
+                return time_s, values
+            self._start_s = float(finite[0])
+        if name in self._inverses:
             values = np.array(values, dtype=float)
             with np.errstate(invalid="ignore", over="ignore"):  # samples may be no finite numbers
-                self._steps[name](channels, np.asarray(time_s), values)
+                self._inverses[name](channels, np.asarray(time_s), values)
         return self._stamps(name, time_s), values
 
     def _stamps(self, name: str, time_s: Array) -> Array:
@@ -114,7 +137,7 @@ class Correction:
         if name in OTHER_LOGGER and (p["clock_offset_s"] or p["clock_rate_ratio"]):
             since_s = (time_s - self._start_s - p["clock_offset_s"]) / (1.0 + p["clock_rate_ratio"])
             return np.asarray(self._start_s + since_s)
-        if name == "steering" and p.get("steering_delay_s"):
+        if name == "steering" and p.get("steering_delay_s"):  # which skid-steer robots do not have
             return np.asarray(time_s + p["steering_delay_s"])
         return time_s
 
@@ -152,13 +175,13 @@ class Correction:
         scale = 1.0 + self._p["gyro_scale_ratio"]
         if "gyro_z_radps" in channels:
             gyro = values[:, channels.index("gyro_z_radps")]
-            gyro -= self._gyro_rest
+            gyro -= self._gyro_offset
             if scale != 1.0:
                 gyro -= self._gyro_bias
                 gyro /= scale
                 gyro += self._gyro_bias
         if "accel_x_mps2" in channels:
-            values[:, channels.index("accel_x_mps2")] -= self._accel_rest
+            values[:, channels.index("accel_x_mps2")] -= self._accel_offset
         bias = self._p["gyro_bias_radps"]
         if "yaw_rad" in channels and (scale != 1.0 or bias):
             column = channels.index("yaw_rad")
