@@ -1,4 +1,4 @@
-"""Labelled runs from nothing: simulated on each terrain, filtered, with slip beside what was measured."""
+"""Labelled runs without data: simulated on each terrain, filtered, with slip beside the measurements."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from pipelines.classify.results import TerrainSlip
 from pipelines.estimate.estimate import Estimate, enriched, estimate_run, summary
 from pipelines.reporting.progress import Progress, silent
 from terrain.records import RunLog
@@ -26,7 +27,7 @@ def labelled_runs(
     runs_a_terrain: int = RUNS_A_TERRAIN,
     progress: Progress = silent,
     robot: Robot | None = None,
-) -> tuple[list[RunLog], list[dict[str, Any]], Estimate]:
+) -> tuple[list[RunLog], tuple[TerrainSlip, ...], Estimate]:
     """Simulate and filter runs on every terrain, with varied speed, slope, load, tyres and soil.
 
     Parameters
@@ -39,9 +40,8 @@ def labelled_runs(
     -------
     runs
         with the streams ``estimator`` and ``slip``, sorted by id
-    rows
-        one a terrain: ``terrain, n_runs, slip_mean, slip_true_mean, slip_rmse, nees``; of the runs' steady
-        slips, and None where the slip was nowhere steady
+    slips
+        steady slip of the runs of each terrain
     example
         the estimate of one run, to be drawn
     """
@@ -59,10 +59,10 @@ def labelled_runs(
             if terrain == "grass" and number == 1:
                 example = estimate
         rows.append(_row(terrain, found))
-    return sorted(runs, key=lambda run: run.run_id), rows, example
+    return sorted(runs, key=lambda run: run.run_id), tuple(rows), example
 
 
-def _row(terrain: str, found: Sequence[dict[str, Any]]) -> dict[str, Any]:
+def _row(terrain: str, found: Sequence[dict[str, Any]]) -> TerrainSlip:
     pairs = [(row["slip_mean"], row["slip_true_mean"]) for row in found if row["slip_true_mean"] is not None]
     estimated, true = np.array(pairs).T if pairs else (np.array([math.nan]), np.array([math.nan]))
     values = {
@@ -72,4 +72,4 @@ def _row(terrain: str, found: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "nees": float(np.mean([row["nees"] for row in found])),
     }
     known = {key: value if math.isfinite(value) else None for key, value in values.items()}
-    return {"terrain": terrain, "n_runs": len(found), **known}
+    return TerrainSlip(terrain, len(found), **known)

@@ -16,9 +16,9 @@ from scipy.stats import t as student
 
 from pipelines.drive.drives import COURSE
 from pipelines.drive.figures import Panel, bars_figure, run_figures, table_figure
-from pipelines.quickstart.report import versions
 from pipelines.reporting.drawing import NOT_KNOWN, png_bytes, svg_text
 from pipelines.reporting.page import page
+from pipelines.reporting.versions import versions
 from pipelines.reproduce.reproduce import MAX_SVG_BYTES, said
 from terrain.control.drive_metrics import PEAK_ABOVE_MPS
 from terrain.control.slip_table import SlipTable

@@ -25,10 +25,10 @@ from pipelines.explain.figures import (
     titled,
 )
 from pipelines.explain.ground import ground_words
-from pipelines.quickstart.report import versions
 from pipelines.reporting.drawing import NOT_KNOWN, png_bytes, sentence, styled, svg_text
 from pipelines.reporting.page import page
 from pipelines.reporting.progress import Progress, silent
+from pipelines.reporting.versions import versions
 from pipelines.reproduce.reproduce import MAX_SVG_BYTES, said
 from terrain.effects import LIBRARY, PARAMETER
 from terrain.files.atomic import atomic_write

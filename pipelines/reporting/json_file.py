@@ -14,7 +14,7 @@ import numpy as np
 
 from terrain.files.atomic import atomic_write
 
-DEPRECATED_KEYS: dict[str, str] = {}
+DEPRECATED_KEYS: dict[str, str] = {"training_runs": "taught_runs"}
 """New key: the key of earlier releases, which is written beside it for one more release."""
 
 

@@ -422,7 +422,7 @@ robot.  Another robot has others, and ours changes with them.</p>
 
 
 def _again(result: Result) -> str:
-    from pipelines.quickstart.report import versions
+    from pipelines.reporting.versions import versions
 
     packages = ", ".join(f"{name} {number}" for name, number in versions().items())
     return f"""<section><h2>To make this page again</h2><pre>{escape(result["command"])}</pre>
