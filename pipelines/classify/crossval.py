@@ -1,105 +1,37 @@
-"""``terrain crossval``: how well a recipe does on runs it has not seen."""
+"""``terrain crossval``: how well a recipe does on held-out runs."""
 
 from __future__ import annotations
 
-import os
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
 
 from sklearn.base import clone
 
 from features.extractor import FeatureExtractor
-from features.windows import WindowRule
 from pipelines.classify.evaluation import fit_folds, pool, summarise
-from pipelines.classify.extras import fold_accuracy, has_speed, learning_curve, slow_fast
+from pipelines.classify.extras import examples_of, fold_accuracy, has_speed, learning_curve, slow_fast
+from pipelines.classify.results import CrossvalReport, Extras, Figures
+from pipelines.classify.settings import CrossvalSettings
 from pipelines.classify.splits import (
     N_FOLDS,
-    PROTOCOLS,
-    PUBLISHED_WINDOW_S,
+    Fold,
     Samples,
     counted,
     folds_of,
     grouped_samples,
     published_samples,
 )
-from pipelines.models.recipes import WindowPipeline, feature_matrix, make_recipe
+from pipelines.models.recipes import WindowPipeline, feature_matrix
 from pipelines.reporting.progress import Progress, silent
 from terrain.classify.folds import single_run_classes
-from terrain.errors import ConfigError
-from terrain.logs.schema import SIGNAL_SETS
-from terrain.records import RunLog
-
-DEFAULT_WINDOW_S = 2.0
-DEFAULT_REPEATS = {"grouped": 5, "leave-one-run-out": 1, "published": 5}
-
-
-@dataclass(frozen=True, slots=True)
-class CrossvalSettings:
-    """What to evaluate and how.
-
-    ``window_s`` and ``repeats`` default to what the protocol asks for (2 s; 1.7 s under ``published``);
-    ``skip_short`` leaves out and counts runs shorter than a window instead of refusing them.
-    """
-
-    recipe: str = "svm"
-    protocol: str = "grouped"
-    window_s: float | None = None
-    stride_s: float | None = None
-    steady: bool = True
-    repeats: int | None = None
-    seed: int = 0
-    signal_sets: tuple[str, ...] = SIGNAL_SETS
-    extras: bool = True
-    n_jobs: int = 0
-    skip_short: bool = False
-
-    def __post_init__(self) -> None:
-        if self.protocol not in PROTOCOLS:
-            raise ConfigError(f"there is no protocol {self.protocol!r}; there are {', '.join(PROTOCOLS)}")
-        if self.repeats is not None and self.repeats < 1:
-            raise ConfigError(f"{self.repeats} repeats are none; at least 1 is needed")
-        if self.protocol == "published" and (self.stride_s is not None or not self.steady):
-            raise ConfigError(
-                "'published' sets its own strides and keeps all motion: stride and steady do not apply"
-            )
-        if self.protocol == "leave-one-run-out" and (self.repeats or 1) > 1:
-            raise ConfigError("'leave-one-run-out' leaves nothing to deal anew: it has one repeat")
-        for name in self.signal_sets:
-            if name not in SIGNAL_SETS:
-                raise ConfigError(f"unknown signal set {name!r}; there are {', '.join(SIGNAL_SETS)}")
-
-    @property
-    def rule(self) -> WindowRule:
-        """How windows are cut."""
-        default_s = PUBLISHED_WINDOW_S if self.protocol == "published" else DEFAULT_WINDOW_S
-        length_s = default_s if self.window_s is None else self.window_s
-        steady = WindowRule().steady if self.steady else None
-        return WindowRule(length_s, self.stride_s, steady)
-
-    def new_recipe(self) -> WindowPipeline:
-        """Return the recipe, unfitted."""
-        return make_recipe(self.recipe, self.signal_sets, gap=self.rule.overlap, seed=self.seed)
-
-    @property
-    def jobs(self) -> int:
-        """Processes at once: what was asked for, or one a core."""
-        return self.n_jobs if self.n_jobs > 0 else os.cpu_count() or 1
+from terrain.records import Array, RunLog
 
 
 def crossval(
     runs: Sequence[RunLog], settings: CrossvalSettings, progress: Progress = silent
-) -> dict[str, Any]:
-    """Cross-validate a recipe on labelled runs.
-
-    Returns
-    -------
-    dict that JSON can hold
-        ``protocol, recipe, window_s, n_windows, n_runs, accuracy, accuracy_ci, accuracy_spread,
-        balanced_accuracy, macro_f1, per_class, confusion, classes, folds, per_run, vote_accuracy, ece,
-        reliability, dropped, repaired, notes`` and, with extras under ``grouped``, ``speed_only_accuracy``,
-        ``slow_fast`` and ``learning_curve``.
+) -> CrossvalReport:
+    """Cross-validate a recipe on labelled runs; extras are computed under ``grouped`` only.
 
     Raises
     ------
@@ -108,52 +40,61 @@ def crossval(
     """
     samples = samples_of(runs, settings)
     windows = samples.cut.windows
-    y = windows.terrain.astype(str)
-    repeats = settings.repeats or DEFAULT_REPEATS[settings.protocol]
-    folds = folds_of(samples, settings.protocol, repeats, settings.seed)
+    folds = folds_of(samples, settings.protocol, settings.n_repeats, settings.seed)
     recipe = settings.new_recipe()
     progress("features", 0, 1)
     features = feature_matrix(recipe, windows)
     progress("features", 1, 1)
-    classifier = recipe[-1]
-    results = fit_folds(
-        classifier, features, y, samples.group, folds, settings.jobs, settings.protocol, progress
-    )
-    repaired = dict(sum((Counter(run.dropped) for run in runs), Counter()))
-    report = {
-        "protocol": settings.protocol,
-        "recipe": settings.recipe,
-        "window_s": settings.rule.length_s,
-        "stride_s": None if settings.protocol == "published" else settings.rule.step_s,
-        "steady": settings.rule.steady is not None and settings.protocol != "published",
-        "signal_sets": list(settings.signal_sets),
-        "seed": settings.seed,
-        **summarise(pool(results, y), samples, settings.seed),
-        "n_features": features.shape[1],
-        "dropped": dict(samples.cut.dropped),
-        "repaired": repaired,
-        "notes": notes(samples, settings, repaired),
-    }
+    examples = examples_of(features, samples)
+    results = fit_folds(recipe[-1], examples, folds, settings.jobs, settings.protocol, progress)
+    figures = summarise(pool(results, examples.terrain), samples, settings.seed)
+    extras = None
     if settings.extras and settings.protocol == "grouped":
         first = [fold for fold in folds if fold.repeat == 0]
-        report["speed_only_accuracy"] = None
-        if has_speed(windows):
-            speed = FeatureExtractor(("wheels",), ("wheels",)).fit_transform(windows)
-            report["speed_only_accuracy"] = fold_accuracy(
-                clone(classifier), speed, samples, first, settings.jobs, "speed only", progress
-            )
-        report["slow_fast"] = slow_fast(classifier, features, samples, settings.jobs, progress)
-        report["learning_curve"] = learning_curve(
-            classifier,
-            features,
-            samples,
-            first,
-            report["accuracy_per_repeat"][0],
-            settings.seed,
-            settings.jobs,
-            progress,
+        extras = _extras(recipe, features, samples, first, figures.accuracy_per_repeat[0], settings, progress)
+    repaired = dict(sum((Counter(run.dropped) for run in runs), Counter()))
+    published = settings.protocol == "published"
+    return CrossvalReport(
+        **{each.name: getattr(figures, each.name) for each in fields(Figures)},
+        protocol=settings.protocol,
+        recipe=settings.recipe,
+        window_s=settings.rule.length_s,
+        stride_s=None if published else settings.rule.step_s,
+        steady=settings.rule.steady is not None and not published,
+        signal_sets=settings.signal_sets,
+        seed=settings.seed,
+        n_features=features.shape[1],
+        dropped=dict(samples.cut.dropped),
+        repaired=repaired,
+        notes=tuple(notes(samples, settings, repaired)),
+        extras=extras,
+    )
+
+
+def _extras(
+    recipe: WindowPipeline,
+    features: Array,
+    samples: Samples,
+    folds: Sequence[Fold],
+    accuracy: float,
+    settings: CrossvalSettings,
+    progress: Progress,
+) -> Extras:
+    """Return the checks beside an ``accuracy`` that was found on ``folds``."""
+    classifier, windows, jobs = recipe[-1], samples.cut.windows, settings.jobs
+    speed_only = None
+    if has_speed(windows):
+        speed = FeatureExtractor(("wheels",), ("wheels",)).fit_transform(windows)
+        speed_only = fold_accuracy(
+            clone(classifier), examples_of(speed, samples), folds, jobs, "speed only", progress
         )
-    return report
+    return Extras(
+        speed_only,
+        slow_fast(classifier, features, samples, jobs, progress),
+        learning_curve(
+            classifier, examples_of(features, samples), folds, accuracy, settings.seed, jobs, progress
+        ),
+    )
 
 
 def samples_of(runs: Sequence[RunLog], settings: CrossvalSettings) -> Samples:
@@ -163,23 +104,23 @@ def samples_of(runs: Sequence[RunLog], settings: CrossvalSettings) -> Samples:
     return grouped_samples(runs, settings.rule, settings.signal_sets, skip_short=settings.skip_short)
 
 
-def notes(samples: Samples, settings: CrossvalSettings, repaired: dict[str, int]) -> list[str]:
+def notes(samples: Samples, settings: CrossvalSettings, repaired: Mapping[str, int]) -> list[str]:
     """Return in sentences what a reader of the figures must know."""
-    said = []
+    sentences = []
     windows = samples.cut.windows
     alone = single_run_classes(windows.terrain.astype(str), windows.run_id.astype(str))
     if alone and settings.protocol != "published":
-        said.append(
+        sentences.append(
             f"{', '.join(alone)}: one run only, cut into {N_FOLDS} contiguous blocks with a gap; "
-            "its figures are optimistic, the same run teaches and tests"
+            "its figures are optimistic, the same run trains and tests"
         )
     if settings.protocol == "published":
-        said.append(
+        sentences.append(
             "published protocol: parts of one run lie on both sides of the split; "
             "for comparison with papers only"
         )
     if samples.cut.dropped:
-        said.append(f"windows left out: {counted(samples.cut.dropped)}")
+        sentences.append(f"windows left out: {counted(samples.cut.dropped)}")
     if repaired:
-        said.append(f"dropped to repair the logs: {counted(repaired)}")
-    return said
+        sentences.append(f"dropped to repair the logs: {counted(repaired)}")
+    return sentences

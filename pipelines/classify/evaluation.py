@@ -1,15 +1,18 @@
-"""Fit a classifier on every fold and pool what it says of windows it has not seen."""
+"""Fit a classifier on every fold, and pool its predictions for windows that were held out."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from joblib import Parallel, delayed
 from sklearn.base import BaseEstimator, clone
 
-from pipelines.classify.metrics import (
+from pipelines.classify.results import Figures, FoldFigures
+from pipelines.classify.splits import Fold, Samples
+from pipelines.reporting.progress import Progress, silent
+from terrain.classify.metrics import (
     calibration,
     class_figures,
     per_run_figures,
@@ -17,9 +20,22 @@ from pipelines.classify.metrics import (
     runs_by_terrain,
     vote,
 )
-from pipelines.classify.splits import Fold, Samples
-from pipelines.reporting.progress import Progress, silent
 from terrain.records import Array
+
+
+class Examples(NamedTuple):
+    """What a classifier learns from.
+
+    Parameters
+    ----------
+    features : (n, f)
+    terrain : (n,) class of each row
+    group : (n,) what must not be split, the run of each row
+    """
+
+    features: Array
+    terrain: Array
+    group: Array
 
 
 class FoldResult(NamedTuple):
@@ -27,7 +43,7 @@ class FoldResult(NamedTuple):
 
     fold: Fold
     probability: Array
-    fit_info: dict[str, Any]
+    chosen: Mapping[str, Any]
 
 
 class HeldOut(NamedTuple):
@@ -39,21 +55,25 @@ class HeldOut(NamedTuple):
     results: list[FoldResult]
 
 
-def _fit_fold(
-    classifier: BaseEstimator, features: Array, y: Array, group: Array, classes: Array, fold: Fold
-) -> FoldResult:
-    fitted = clone(classifier).fit(features[fold.train], y[fold.train], groups=group[fold.train])
+def _fit_fold(classifier: BaseEstimator, examples: Examples, classes: Array, fold: Fold) -> FoldResult:
+    fitted = fit_on(classifier, examples, fold.train)
     probability = np.zeros((len(fold.test), len(classes)))
-    probability[:, np.searchsorted(classes, fitted.classes_)] = fitted.predict_proba(features[fold.test])
+    probability[:, np.searchsorted(classes, fitted.classes_)] = fitted.predict_proba(
+        examples.features[fold.test]
+    )
     best = getattr(fitted, "best_", None)
     return FoldResult(fold, probability, dict(best._asdict()) if best is not None else {})
 
 
+def fit_on(classifier: BaseEstimator, examples: Examples, rows: Array) -> Any:
+    """Return a clone of the classifier, fitted on some rows."""
+    features, terrain, group = examples
+    return clone(classifier).fit(features[rows], terrain[rows], groups=group[rows])
+
+
 def fit_folds(
     classifier: BaseEstimator,
-    features: Array,
-    y: Array,
-    group: Array,
+    examples: Examples,
     folds: Sequence[Fold],
     n_jobs: int,
     task: str,
@@ -64,14 +84,13 @@ def fit_folds(
     Parameters
     ----------
     classifier : estimator with ``fit(X, y, groups)`` and ``predict_proba``
-    features : (n, f)
-    y, group : (n,) class and group of each row
+    examples : rows that the folds number
     folds : train and test rows
     n_jobs : processes at once
-    task, progress : what to tell while it goes on
+    task, progress : name of the work, and what is called as it goes on
     """
-    classes = np.unique(y)
-    jobs = (delayed(_fit_fold)(classifier, features, y, group, classes, fold) for fold in folds)
+    classes = np.unique(examples.terrain)
+    jobs = (delayed(_fit_fold)(classifier, examples, classes, fold) for fold in folds)
     results = []
     progress(task, 0, len(folds))
     for result in Parallel(n_jobs=max(min(n_jobs, len(folds)), 1), return_as="generator")(jobs):
@@ -80,12 +99,12 @@ def fit_folds(
     return results
 
 
-def pool(results: Sequence[FoldResult], y: Array) -> HeldOut:
-    """Lay the held-out probabilities of all folds beside the windows they belong to."""
-    classes = np.unique(y)
+def pool(results: Sequence[FoldResult], terrain: Array) -> HeldOut:
+    """Lay the held-out probabilities of all folds beside the windows (n,) that they belong to."""
+    classes = np.unique(terrain)
     n_repeats = 1 + max(result.fold.repeat for result in results)
-    probability = np.full((n_repeats, len(y), len(classes)), np.nan)
-    fold_number = np.full((n_repeats, len(y)), -1)
+    probability = np.full((n_repeats, len(terrain), len(classes)), np.nan)
+    fold_number = np.full((n_repeats, len(terrain)), -1)
     for result in results:
         probability[result.fold.repeat, result.fold.test] = result.probability
         fold_number[result.fold.repeat, result.fold.test] = result.fold.number
@@ -93,61 +112,55 @@ def pool(results: Sequence[FoldResult], y: Array) -> HeldOut:
 
 
 def _segments(group: Array, fold_number: Array) -> Array:
-    """Return a number for each stretch that one fold tested of one group."""
+    """Return a number for each stretch of a group that was tested by one fold."""
     group_of = np.unique(group.astype(str), return_inverse=True)[1]
     return np.asarray(group_of * (fold_number.max() + 1) + fold_number)
 
 
-def summarise(held_out: HeldOut, samples: Samples, seed: int) -> dict[str, Any]:
-    """Return every figure of a cross-validation as a dict that JSON can hold.
-
-    Figures are means over the repeats, ``accuracy_spread`` the standard deviation over them (None with a
-    single repeat); ``confusion`` and ``per_class`` count all repeats together; ``accuracy_ci`` is the
-    bootstrap over runs within classes.
-    """
+def summarise(held_out: HeldOut, samples: Samples, seed: int) -> Figures:
+    """Return the figures of merit of a cross-validation; ``seed`` is that of the bootstrap over runs."""
     windows = samples.cut.windows
-    y, classes = windows.terrain.astype(str), held_out.classes
-    run_id = runs_by_terrain(windows.run_id.astype(str), y)
+    terrain, classes = windows.terrain.astype(str), held_out.classes
+    run_id = runs_by_terrain(windows.run_id.astype(str), terrain)
     predicted = classes[held_out.probability.argmax(axis=2)]
-    correct = predicted == y
+    correct = predicted == terrain
     voted = np.stack(
         [
             classes[vote(p, _segments(samples.group, number), windows.start_s, windows.length_s)]
             for p, number in zip(held_out.probability, held_out.fold_number, strict=True)
         ]
     )  # fmt: skip
-    repeats = [class_figures(y, p, classes) for p in predicted]
-    pooled = class_figures(np.tile(y, len(predicted)), predicted.ravel(), classes)
-    accuracies = np.array([repeat["accuracy"] for repeat in repeats])
+    repeats = [class_figures(terrain, p, classes) for p in predicted]
+    pooled = class_figures(np.tile(terrain, len(predicted)), predicted.ravel(), classes)
+    accuracies = np.array([repeat.accuracy for repeat in repeats])
     confidence = held_out.probability.max(axis=2)
-    n_windows, n_repeats = len(y), len(repeats)
     calibrated = [calibration(c, right) for c, right in zip(confidence, correct, strict=True)]
-    return {
-        "classes": [str(name) for name in classes],
-        "n_windows": n_windows,
-        "n_runs": len(np.unique(windows.run_id)),
-        "repeats": n_repeats,
-        "accuracy": float(accuracies.mean()),
-        "accuracy_spread": float(accuracies.std(ddof=1)) if n_repeats > 1 else None,
-        "accuracy_per_repeat": accuracies.tolist(),
-        "accuracy_ci": list(run_bootstrap(correct.mean(axis=0), run_id, y, np.random.default_rng(seed))),
-        "balanced_accuracy": float(np.mean([repeat["balanced_accuracy"] for repeat in repeats])),
-        "macro_f1": float(np.mean([repeat["macro_f1"] for repeat in repeats])),
-        "per_class": pooled["per_class"],
-        "confusion": pooled["confusion"],
-        "vote_accuracy": float(np.mean(voted == y)),
-        "ece": float(np.mean([figures["ece"] for figures in calibrated])),
-        "reliability": calibration(confidence.ravel(), correct.ravel())["reliability"],
-        "per_run": per_run_figures(correct, predicted[0], voted == y, run_id, y),
-        "folds": [
-            {
-                "repeat": result.fold.repeat,
-                "fold": result.fold.number,
-                "n_train": len(result.fold.train),
-                "n_test": len(result.fold.test),
-                "accuracy": float(correct[result.fold.repeat, result.fold.test].mean()),
-                "chosen": result.fit_info,
-            }
+    return Figures(
+        classes=tuple(str(name) for name in classes),
+        n_windows=len(terrain),
+        n_runs=len(np.unique(windows.run_id)),
+        repeats=len(repeats),
+        accuracy=float(accuracies.mean()),
+        accuracy_spread=float(accuracies.std(ddof=1)) if len(repeats) > 1 else None,
+        accuracy_per_repeat=tuple(accuracies.tolist()),
+        accuracy_ci=run_bootstrap(correct.mean(axis=0), run_id, terrain, np.random.default_rng(seed)),
+        balanced_accuracy=float(np.mean([repeat.balanced_accuracy for repeat in repeats])),
+        macro_f1=float(np.mean([repeat.macro_f1 for repeat in repeats])),
+        per_class=pooled.per_class,
+        confusion=pooled.confusion,
+        vote_accuracy=float(np.mean(voted == terrain)),
+        ece=float(np.mean([figures.ece for figures in calibrated])),
+        reliability=calibration(confidence.ravel(), correct.ravel()).reliability,
+        per_run=per_run_figures(correct, predicted[0], voted == terrain, run_id, terrain),
+        folds=tuple(
+            FoldFigures(
+                result.fold.repeat,
+                result.fold.number,
+                len(result.fold.train),
+                len(result.fold.test),
+                float(correct[result.fold.repeat, result.fold.test].mean()),
+                result.chosen,
+            )
             for result in held_out.results
-        ],
-    }
+        ),
+    )

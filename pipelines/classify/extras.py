@@ -1,16 +1,18 @@
-"""The honest extras beside the headline: speed alone, slow against fast, and how many runs are enough."""
+"""Checks beside the headline figure: speed alone, slow against fast, and how many runs are enough."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import least_squares
 from sklearn.base import BaseEstimator
 
 from features.windows import wheel_speeds
-from pipelines.classify.evaluation import fit_folds
+from pipelines.classify.evaluation import Examples, FoldResult, fit_folds
+from pipelines.classify.results import Applicability, ClassSpeeds, LearningCurve, SlowFast
 from pipelines.classify.splits import Fold, Samples
 from pipelines.reporting.progress import Progress, silent
 from terrain.logs.schema import signal_set_of
@@ -24,6 +26,8 @@ MOVING_MPS = 0.03
 
 CURVE_RUNS = (1, 2, 3, 5, 8, 12)
 CURVE_DRAWS = 2
+MIN_CURVE_POINTS = 4
+"""The law of the learning curve has three parameters."""
 ENOUGH_GAIN = 0.01
 """Enough runs: doubling them would gain less than this accuracy."""
 
@@ -61,26 +65,37 @@ def covered_s(start_s: Array, length_s: float) -> float:
     return float(np.minimum(np.diff(np.sort(start_s)), length_s).sum() + length_s)
 
 
-def slow_fast_split(samples: Samples) -> dict[str, Any]:
-    """Split the runs of each class at their median speed, taken over the run's time on that class.
+class SlowFastSplit(NamedTuple):
+    """Runs of each class on both sides of its median speed, as (run, class) pairs.
 
-    Returns
-    -------
-    dict
-        ``status`` (``applicable`` or ``not applicable``), ``classes`` with the speeds of both sides,
-        ``left_out`` with the reason for each class, and ``slow`` and ``fast`` (run, class) pairs.
+    ``classes`` has the speeds of the classes that are kept, ``left_out`` the reason for each of the others.
     """
+
+    slow: tuple[tuple[str, str], ...]
+    fast: tuple[tuple[str, str], ...]
+    classes: dict[str, ClassSpeeds]
+    left_out: dict[str, str]
+
+    @property
+    def status(self) -> Applicability:
+        """Whether enough classes are kept."""
+        enough = len(self.classes) >= MIN_CLASSES
+        return Applicability.APPLICABLE if enough else Applicability.NOT_APPLICABLE
+
+
+def slow_fast_split(samples: Samples) -> SlowFastSplit:
+    """Split the runs of each class at their median speed, taken over the run's time on that class."""
     windows = samples.cut.windows
     run_id, y = windows.run_id.astype(str), windows.terrain.astype(str)
     sides: dict[str, list[tuple[str, str]]] = {"slow": [], "fast": []}
-    kept: dict[str, dict[str, float]] = {}
+    kept: dict[str, ClassSpeeds] = {}
     left_out: dict[str, str] = {}
-    for terrain in np.unique(y):
+    for terrain in np.unique(y).tolist():
         speeds = run_speeds(windows[y == terrain])
         runs = [run for run in np.unique(run_id[y == terrain]) if np.isfinite(speeds[run])]
-        speed = np.array([speeds[run] for run in runs])
-        slow = [run for run in runs if speeds[run] <= np.median(speed)]
-        fast = [run for run in runs if speeds[run] > np.median(speed)]
+        median = np.median([speeds[run] for run in runs]) if runs else math.nan
+        slow = [run for run in runs if speeds[run] <= median]
+        fast = [run for run in runs if speeds[run] > median]
         reason = None
         for name, side in (("slow", slow), ("fast", fast)):
             time_s = sum(
@@ -91,90 +106,87 @@ def slow_fast_split(samples: Samples) -> dict[str, Any]:
             elif time_s < MIN_TIME_A_SIDE_S:
                 reason = reason or f"{name} runs: {time_s:.0f} s"
         if reason:
-            left_out[str(terrain)] = reason
+            left_out[terrain] = reason
             continue
-        kept[str(terrain)] = {
-            "slow_mps": float(np.median([speeds[run] for run in slow])),
-            "fast_mps": float(np.median([speeds[run] for run in fast])),
-        }
-        sides["slow"] += [(run, str(terrain)) for run in slow]
-        sides["fast"] += [(run, str(terrain)) for run in fast]
-    status = "applicable" if len(kept) >= MIN_CLASSES else "not applicable"
-    return {"status": status, "classes": kept, "left_out": left_out, **sides}
+        slow_mps, fast_mps = (float(np.median([speeds[run] for run in side])) for side in (slow, fast))
+        kept[terrain] = ClassSpeeds(slow_mps, fast_mps)
+        sides["slow"] += [(run, terrain) for run in slow]
+        sides["fast"] += [(run, terrain) for run in fast]
+    return SlowFastSplit(tuple(sides["slow"]), tuple(sides["fast"]), kept, left_out)
 
 
 def slow_fast(
     classifier: BaseEstimator, features: Array, samples: Samples, n_jobs: int, progress: Progress = silent
-) -> dict[str, Any]:
-    """Train on the slow runs of each class and test on the fast ones, and back.
+) -> SlowFast:
+    """Train on the slow runs of each class and test on the fast ones, and the reverse.
 
-    A run that is slow on one class and fast on another has no part in either.
+    A run that is slow on one class and fast on another is on neither side.
     """
     split = slow_fast_split(samples)
-    slow, fast = split.pop("slow"), split.pop("fast")
-    if split["status"] != "applicable":
-        return {**split, "slow_to_fast": None, "fast_to_slow": None}
-    windows = samples.cut.windows
-    run_id, y = windows.run_id.astype(str), windows.terrain.astype(str)
-    both = {run for run, _ in slow} & {run for run, _ in fast}
-    pairs = list(zip(run_id, y, strict=True))
+    status, classes, left_out = split.status, split.classes, split.left_out
+    if status is Applicability.NOT_APPLICABLE:
+        return SlowFast(status, classes, left_out)
+    examples = examples_of(features, samples)
+    run_id = samples.cut.windows.run_id.astype(str)
+    both = {run for run, _ in split.slow} & {run for run, _ in split.fast}
+    pairs = list(zip(run_id, examples.terrain, strict=True))
     rows_slow, rows_fast = (
         np.array([i for i, pair in enumerate(pairs) if pair in set(side) and pair[0] not in both])
-        for side in (slow, fast)
+        for side in (split.slow, split.fast)
     )
     folds = [Fold(0, 0, rows_slow, rows_fast), Fold(0, 1, rows_fast, rows_slow)]
-    results = fit_folds(classifier, features, y, samples.group, folds, n_jobs, "slow to fast", progress)
-    accuracy = [_accuracy([result], y) for result in results]
-    return {**split, "slow_to_fast": accuracy[0], "fast_to_slow": accuracy[1]}
+    results = fit_folds(classifier, examples, folds, n_jobs, "slow to fast", progress)
+    to_fast, to_slow = (_accuracy([result], examples.terrain) for result in results)
+    return SlowFast(status, classes, left_out, to_fast, to_slow)
 
 
-def _accuracy(results: Sequence[Any], y: Array) -> float:
-    classes = np.unique(y)
-    right = [classes[r.probability.argmax(axis=1)] == y[r.fold.test] for r in results]
+def examples_of(features: Array, samples: Samples) -> Examples:
+    """Return rows of features with the terrain and the group of their windows."""
+    return Examples(features, samples.cut.windows.terrain.astype(str), samples.group)
+
+
+def _accuracy(results: Sequence[FoldResult], terrain: Array) -> float:
+    classes = np.unique(terrain)
+    right = [classes[r.probability.argmax(axis=1)] == terrain[r.fold.test] for r in results]
     return float(np.concatenate(right).mean())
 
 
 def fold_accuracy(
     classifier: BaseEstimator,
-    features: Array,
-    samples: Samples,
+    examples: Examples,
     folds: Sequence[Fold],
     n_jobs: int,
     task: str,
     progress: Progress = silent,
 ) -> float:
     """Return the accuracy over the folds of one repeat."""
-    y = samples.cut.windows.terrain.astype(str)
-    return _accuracy(fit_folds(classifier, features, y, samples.group, folds, n_jobs, task, progress), y)
+    return _accuracy(fit_folds(classifier, examples, folds, n_jobs, task, progress), examples.terrain)
 
 
 def learning_curve(
     classifier: BaseEstimator,
-    features: Array,
-    samples: Samples,
+    examples: Examples,
     folds: Sequence[Fold],
     full_accuracy: float,
     seed: int,
     n_jobs: int,
     progress: Progress = silent,
-) -> dict[str, Any]:
+) -> LearningCurve:
     """Return the accuracy against the number of training runs of each class.
 
-    The test folds stay what they are; of the training runs of each class at most m are drawn.
+    The test folds stay the same; of the training runs of each class at most m are drawn.
 
     Parameters
     ----------
+    classifier : unfitted, with ``fit(X, y, groups)``
+    examples : rows that the folds number
     folds : the folds of one repeat
     full_accuracy : accuracy on these folds with all training runs
-
-    Returns
-    -------
-    dict
-        ``runs_per_class`` (mean over classes and folds, since a class may have fewer than were asked
-        for), ``accuracy``, ``accuracy_spread`` (over draws of runs; None for all runs), ``enough_runs``
-        (None when not reached) and ``statement``, from :func:`enough_runs`.
+    seed : of the draws
+    n_jobs : processes at once
+    progress : called as folds are done
     """
-    y, group = samples.cut.windows.terrain.astype(str), samples.group.astype(str)
+    y, group = examples.terrain, examples.group.astype(str)
     available = [_runs_per_class(y, group, fold.train) for fold in folds]
     sizes = [size for size in CURVE_RUNS if size < max(counts.max() for counts in available)]
     rng = np.random.default_rng((seed, len(CURVE_RUNS)))
@@ -184,7 +196,7 @@ def learning_curve(
         for draw in range(CURVE_DRAWS)
         for fold in folds
     ]
-    results = fit_folds(classifier, features, y, group, drawn, n_jobs, "learning curve", progress)
+    results = fit_folds(classifier, examples._replace(group=group), drawn, n_jobs, "learning curve", progress)
     runs, accuracy = [], []
     spread: list[float | None] = []
     for size in sizes:
@@ -198,12 +210,8 @@ def learning_curve(
     runs.append(float(np.mean([counts.mean() for counts in available])))
     accuracy.append(full_accuracy)
     spread.append(None)
-    return {
-        "runs_per_class": runs,
-        "accuracy": accuracy,
-        "accuracy_spread": spread,
-        **enough_runs(np.array(runs), np.array(accuracy)),
-    }
+    enough = enough_runs(np.array(runs), np.array(accuracy))
+    return LearningCurve(tuple(runs), tuple(accuracy), tuple(spread), enough.n_runs, enough.statement)
 
 
 def _runs_per_class(y: Array, group: Array, rows: Array) -> Array:
@@ -219,8 +227,15 @@ def _rows_of_drawn_runs(y: Array, group: Array, rows: Array, size: int, rng: np.
     return kept
 
 
-def enough_runs(runs_per_class: Array, accuracy: Array) -> dict[str, Any]:
-    """Return how many runs a class would be enough, from ``accuracy(m) = a - b m^-c``.
+class EnoughRuns(NamedTuple):
+    """How many runs of each class are enough; None where that was not reached or cannot be determined."""
+
+    n_runs: int | None
+    statement: str
+
+
+def enough_runs(runs_per_class: Array, accuracy: Array) -> EnoughRuns:
+    """Return how many runs of each class would be enough, by the law ``accuracy(m) = a - b m^-c``.
 
     Enough is the smallest whole m for which doubling gains less than :data:`ENOUGH_GAIN` by that law; it
     is not sought beyond ten times the largest m that was measured.
@@ -232,14 +247,11 @@ def enough_runs(runs_per_class: Array, accuracy: Array) -> dict[str, Any]:
     Examples
     --------
     >>> m = np.array([1.0, 2.0, 4.0, 8.0, 16.0])
-    >>> enough_runs(m, 0.9 - 0.3 / m)["enough_runs"]
+    >>> enough_runs(m, 0.9 - 0.3 / m).n_runs
     16
     """
-    if len(accuracy) < 4:
-        return {
-            "enough_runs": None,
-            "statement": f"{len(accuracy)} sizes are too few to tell how many runs are enough",
-        }
+    if len(accuracy) < MIN_CURVE_POINTS:
+        return EnoughRuns(None, f"{len(accuracy)} sizes are too few to estimate how many runs are enough")
     fit = least_squares(
         lambda p: p[0] - p[1] * runs_per_class ** -p[2] - accuracy,
         x0=[min(accuracy.max() + 0.02, 1.0), 0.3, 0.7],
@@ -252,19 +264,15 @@ def enough_runs(runs_per_class: Array, accuracy: Array) -> dict[str, Any]:
     slack = float(np.interp(largest, sizes, gain))
     found = sizes[gain < ENOUGH_GAIN]
     if not len(found):
-        return {
-            "enough_runs": None,
-            "statement": (
-                f"not enough yet: doubling the {largest:.1f} runs a class would still gain {slack:.1%}"
-            ),
-        }
+        return EnoughRuns(
+            None,
+            f"not enough yet: doubling the {largest:.1f} runs per class would still gain {slack:.1%}",
+        )
     enough = int(found[0])
     verdict = "enough" if enough <= largest else "not enough yet"
-    return {
-        "enough_runs": enough,
-        "statement": (
-            f"{verdict}: {enough} {'run' if enough == 1 else 'runs'} a class would be enough "
-            f"(doubling them gains under {ENOUGH_GAIN:.0%}); "
-            f"the data have {largest:.1f} on average, doubling which would gain {slack:.1%}"
-        ),
-    }
+    return EnoughRuns(
+        enough,
+        f"{verdict}: {enough} {'run' if enough == 1 else 'runs'} per class would be enough "
+        f"(doubling them gains under {ENOUGH_GAIN:.0%}); "
+        f"the data have {largest:.1f} on average, doubling which would gain {slack:.1%}",
+    )

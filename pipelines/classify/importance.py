@@ -1,4 +1,4 @@
-"""Permutation importance of whole channels, on windows that the classifier has not seen."""
+"""Permutation importance of whole channels, on windows that were held out."""
 
 from __future__ import annotations
 
@@ -6,8 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 from joblib import Parallel, delayed
-from sklearn.base import BaseEstimator, clone
+from sklearn.base import BaseEstimator
 
+from pipelines.classify.evaluation import Examples, fit_on
+from pipelines.classify.results import ChannelImportance
 from pipelines.classify.splits import Fold
 from pipelines.reporting.progress import Progress, silent
 from terrain.records import Array
@@ -32,34 +34,35 @@ def channel_of(feature: str) -> str:
 
 def channel_importance(
     classifier: BaseEstimator,
-    features: Array,
+    examples: Examples,
     names: Sequence[str],
-    y: Array,
-    group: Array,
     folds: Sequence[Fold],
     seed: int,
     n_jobs: int,
     progress: Progress = silent,
-) -> list[dict[str, float | str]]:
+) -> tuple[ChannelImportance, ...]:
     """Return by how much balanced accuracy drops when all features of a channel are shuffled together.
 
-    Single features are nearly useless to shuffle: their neighbours say the same.  Each fold's classifier
-    is judged on that fold's test windows; drops are means over folds and shuffles, largest first.
+    Shuffling a single feature hardly lowers it, since the features of a channel carry much the same
+    information.  Each fold's classifier is tested on that fold's test windows; drops are means over folds and
+    shuffles.
 
     Parameters
     ----------
     classifier : unfitted, with ``fit(X, y, groups)``
-    features, names : (n, f) and the name of each column
-    y, group : (n,) class and group of each row
+    examples : n rows of f features
+    names : (f,) name of each feature
     folds : the folds of one repeat
+    seed : of the permutations
+    n_jobs : processes at once
+    progress : called as folds are done
 
     Returns
     -------
-    list of dict
-        ``feature`` (stream and channel), ``drop`` and ``std`` (over folds).
+    one a channel, the largest drop first
     """
     channels = np.array([channel_of(name) for name in names])
-    jobs = (delayed(_fold_drops)(classifier, features, channels, y, group, fold, seed) for fold in folds)
+    jobs = (delayed(_fold_drops)(classifier, examples, channels, fold, seed) for fold in folds)
     drops = []
     progress("importance", 0, len(folds))
     for drop in Parallel(n_jobs=min(n_jobs, len(folds)), return_as="generator")(jobs):
@@ -68,17 +71,17 @@ def channel_importance(
     table = np.array(drops)
     unique = np.unique(channels)
     order = np.argsort(-table.mean(axis=0), kind="stable")
-    return [
-        {"feature": str(unique[i]), "drop": float(table[:, i].mean()), "std": float(table[:, i].std(ddof=1))}
+    return tuple(
+        ChannelImportance(str(unique[i]), float(table[:, i].mean()), float(table[:, i].std(ddof=1)))
         for i in order
-    ]
+    )
 
 
 def _fold_drops(
-    classifier: BaseEstimator, features: Array, channels: Array, y: Array, group: Array, fold: Fold, seed: int
+    classifier: BaseEstimator, examples: Examples, channels: Array, fold: Fold, seed: int
 ) -> list[float]:
-    fitted = clone(classifier).fit(features[fold.train], y[fold.train], groups=group[fold.train])
-    test, truth = features[fold.test], y[fold.test]
+    fitted = fit_on(classifier, examples, fold.train)
+    test, truth = examples.features[fold.test], examples.terrain[fold.test]
     present = np.isin(truth, fitted.classes_)
     test, truth = test[present], truth[present]
     baseline = _balanced_accuracy(truth, fitted.predict(test))

@@ -1,13 +1,13 @@
-"""Labelled runs from nothing: simulated on each terrain, filtered, with slip beside what was measured."""
+"""Labelled runs without data: simulated on each terrain, filtered, with slip beside the measurements."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
+from pipelines.classify.results import TerrainSlip
 from pipelines.reporting.progress import Progress, silent
 from terrain.estimation.enriched import enriched
 from terrain.estimation.estimate import Estimate, estimate_run
@@ -28,7 +28,7 @@ def labelled_runs(
     runs_a_terrain: int = RUNS_A_TERRAIN,
     progress: Progress = silent,
     robot: Robot | None = None,
-) -> tuple[list[RunLog], list[dict[str, Any]], Estimate]:
+) -> tuple[list[RunLog], tuple[TerrainSlip, ...], Estimate]:
     """Simulate and filter runs on every terrain, with varied speed, slope, load, tyres and soil.
 
     Parameters
@@ -41,9 +41,8 @@ def labelled_runs(
     -------
     runs
         with the streams ``estimator`` and ``slip``, sorted by id
-    rows
-        one a terrain: ``terrain, n_runs, slip_mean, slip_true_mean, slip_rmse, nees``; of the runs' steady
-        slips, and None where the slip was nowhere steady
+    slips
+        steady slip of the runs of each terrain
     example
         the estimate of one run, to be drawn
     """
@@ -61,10 +60,10 @@ def labelled_runs(
             if terrain == "grass" and number == 1:
                 example = estimate
         rows.append(_row(terrain, found))
-    return sorted(runs, key=lambda run: run.run_id), rows, example
+    return sorted(runs, key=lambda run: run.run_id), tuple(rows), example
 
 
-def _row(terrain: str, found: Sequence[EstimateSummary]) -> dict[str, Any]:
+def _row(terrain: str, found: Sequence[EstimateSummary]) -> TerrainSlip:
     pairs = [(row.slip_mean, row.slip_true_mean) for row in found if math.isfinite(row.slip_true_mean)]
     estimated, true = np.array(pairs).T if pairs else (np.array([math.nan]), np.array([math.nan]))
     values = {
@@ -74,4 +73,4 @@ def _row(terrain: str, found: Sequence[EstimateSummary]) -> dict[str, Any]:
         "nees": float(np.mean([row.nees for row in found])),
     }
     known = {key: value if math.isfinite(value) else None for key, value in values.items()}
-    return {"terrain": terrain, "n_runs": len(found), **known}
+    return TerrainSlip(terrain, len(found), **known)

@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from features.windows import cut_windows
+from pipelines.classify.results import Predictions, TargetSlipRow, WindowPrediction
 from pipelines.models.model_files import TerrainModel
 from pipelines.runs.datasets import data_digest
 from terrain.control.slip_table import DRIVE_STATES, SlipTable
 from terrain.errors import ConfigError
-from terrain.records import RunLog
+from terrain.records import RunLog, SlipTarget
 
 
 def predict(
     runs: Sequence[RunLog], model: TerrainModel, table: SlipTable, *, skip_short: bool = False
-) -> dict[str, Any]:
+) -> Predictions:
     """Predict every window that the model's own rule keeps.
 
     Parameters
@@ -28,20 +28,10 @@ def predict(
     table : target slips
     skip_short : leave out and count runs that are shorter than a window instead of refusing them
 
-    Returns
-    -------
-    dict that JSON can hold
-        ``windows``: ``run_id, start_s, terrain, probability, target_slip`` (by drive state), ``status`` and
-        ``slip_entry`` (the entry of the table, which is the fallback's where the terrain has none);
-        ``accuracy`` over windows whose label the model knows, None where there are none;
-        ``taught_runs`` names runs the model was taught, on which accuracy is memory and no measure of
-        skill; ``repaired`` counts what a repairing reader dropped;
-        ``unknown_labels`` counts windows by labels that the model never saw; ``dropped`` and ``table``.
-
     Raises
     ------
     DataError
-        if a run lacks a channel or has another rate than the model was taught.
+        if a run lacks a channel or has another rate than the model was trained on.
     ConfigError
         if the table is for another robot than a run is of.
     """
@@ -56,44 +46,43 @@ def predict(
     probability = model.recipe.predict_proba(windows) if len(windows) else np.zeros((0, len(classes)))
     best = probability.argmax(axis=1)
     predicted, label = classes[best], windows.terrain.astype(str)
-    targets = {terrain: table.lookup(terrain) for terrain in classes}
-    rows = [
-        {
-            "run_id": str(windows.run_id[i]),
-            "start_s": float(windows.start_s[i]),
-            "terrain": str(predicted[i]),
-            "probability": float(probability[i, best[i]]),
-            "target_slip": {state: targets[predicted[i]][state].slip_ratio for state in DRIVE_STATES},
-            "slip_entry": targets[predicted[i]]["traction"].terrain,
-            "status": {state: targets[predicted[i]][state].status for state in DRIVE_STATES},
-            "label": str(label[i]) or None,
-        }
+    targets = {terrain: table.lookup(terrain) for terrain in classes.tolist()}
+    rows = tuple(
+        WindowPrediction(
+            run_id=str(windows.run_id[i]),
+            start_s=float(windows.start_s[i]),
+            terrain=str(predicted[i]),
+            probability=float(probability[i, best[i]]),
+            target_slip={state: targets[predicted[i]][state].slip_ratio for state in DRIVE_STATES},
+            slip_entry=targets[predicted[i]]["traction"].terrain,
+            status={state: targets[predicted[i]][state].status for state in DRIVE_STATES},
+            label=str(label[i]) or None,
+        )
         for i in range(len(windows))
-    ]
+    )
     known = np.isin(label, classes)
-    strange, counts = np.unique(label[(label != "") & ~known], return_counts=True)
-    return {
-        "windows": rows,
-        "n_windows": len(rows),
-        "n_runs": len(runs),
-        "classes": [str(c) for c in classes],
-        "accuracy": float(np.mean(predicted[known] == label[known])) if known.any() else None,
-        "n_judged": int(known.sum()),
-        "taught_runs": [run.run_id for run in runs if data_digest([run]) in model.info["run_digests"]],
-        "repaired": dict(sum((Counter(run.dropped) for run in runs), Counter())),
-        "unknown_labels": {str(name): int(count) for name, count in zip(strange, counts, strict=True)},
-        "n_unknown_labels": int(counts.sum()),
-        "dropped": dict(cut.dropped),
-        "table_name": table.name,
-        "table": {terrain: _table_row(table, terrain) for terrain in classes},
-    }
+    unknown, counts = np.unique(label[(label != "") & ~known], return_counts=True)
+    return Predictions(
+        windows=rows,
+        n_windows=len(rows),
+        n_runs=len(runs),
+        classes=tuple(targets),
+        accuracy=float(np.mean(predicted[known] == label[known])) if known.any() else None,
+        n_judged=int(known.sum()),
+        training_runs=tuple(run.run_id for run in runs if data_digest([run]) in model.info["run_digests"]),
+        repaired=dict(sum((Counter(run.dropped) for run in runs), Counter())),
+        unknown_labels={str(name): int(count) for name, count in zip(unknown, counts, strict=True)},
+        n_unknown_labels=int(counts.sum()),
+        dropped=dict(cut.dropped),
+        table_name=table.name,
+        table={terrain: _table_row(found) for terrain, found in targets.items()},
+    )
 
 
-def _table_row(table: SlipTable, terrain: str) -> dict[str, Any]:
-    targets = table.lookup(terrain)
-    return {
+def _table_row(targets: Mapping[str, SlipTarget]) -> TargetSlipRow:
+    return TargetSlipRow(
         **{state: targets[state].slip_ratio for state in DRIVE_STATES},
-        "entry": targets["traction"].terrain,
-        "status": ", ".join(dict.fromkeys(targets[state].status for state in DRIVE_STATES)),
-        "source": "; ".join(dict.fromkeys(targets[state].source for state in DRIVE_STATES)),
-    }
+        entry=targets["traction"].terrain,
+        status=", ".join(dict.fromkeys(targets[state].status for state in DRIVE_STATES)),
+        source="; ".join(dict.fromkeys(targets[state].source for state in DRIVE_STATES)),
+    )

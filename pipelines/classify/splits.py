@@ -1,4 +1,4 @@
-"""The protocols of cross-validation: which windows teach and which test.
+"""The protocols of cross-validation: which windows train and which test.
 
 ``grouped`` is the headline: whole runs are held out.  ``leave-one-run-out`` holds out one run at a time.
 ``published`` deals 5 s partitions of runs at random into folds, as the papers do, so that a test
@@ -29,15 +29,13 @@ from terrain.errors import ConfigError, DataError
 from terrain.logs.schema import SIGNAL_SETS
 from terrain.records import Array, RunLog
 
-PROTOCOLS = ("grouped", "leave-one-run-out", "published")
 N_FOLDS = 5
 PARTITION_S = 5.0
 PUBLISHED_STRIDE_S = 0.1
-PUBLISHED_WINDOW_S = 1.7
 
 
 class Fold(NamedTuple):
-    """Rows that teach and rows that test; ``repeat`` numbers the fold assignment."""
+    """Rows that train and rows that test; ``repeat`` numbers the fold assignment."""
 
     repeat: int
     number: int

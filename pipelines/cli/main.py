@@ -10,10 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pipelines.cli.reproduce import app as reproduce_group
-from pipelines.cli.runs import app as runs_group
+from pipelines.cli import classify, quickstart, reproduce, runs
 from terrain.errors import ConfigError, TerrainError
-from terrain.logs.schema import SIGNAL_SETS
 
 if TYPE_CHECKING:
     from terrain.records import RunLog
@@ -38,14 +36,6 @@ class Format(StrEnum):
     drive = "drive"
 
 
-class Protocol(StrEnum):
-    """Protocols of cross-validation."""
-
-    grouped = "grouped"
-    leave_one_run_out = "leave-one-run-out"
-    published = "published"
-
-
 class FilterName(StrEnum):
     """Filters; the numbers are those of their states."""
 
@@ -64,12 +54,6 @@ class Tuning(StrEnum):
     likelihood = "likelihood"
 
 
-class Recipe(StrEnum):
-    """Recipes from windows to terrain."""
-
-    svm = "svm"
-
-
 Data = Annotated[Path, typer.Option("--data", help="Folder of runs in any readable layout.")]
 Json = Annotated[
     Path | None,
@@ -84,139 +68,13 @@ Align = Annotated[
     bool,
     typer.Option("--align", help="Bring the wheel stream onto the IMU's clock where both see the turns."),
 ]
-Window = Annotated[float | None, typer.Option(help="Window length in s (2; 1.7 under 'published').")]
-Stride = Annotated[float | None, typer.Option(help="From window to window in s; one length by default.")]
-Steady = Annotated[bool, typer.Option(help="Keep windows of steady motion only.")]
-Signals = Annotated[
-    str, typer.Option(help="Signal sets to use, by commas; leave one out to see what it is worth.")
-]
-Seed = Annotated[int, typer.Option(min=0, help="Deals runs into folds.")]
-Repeats = Annotated[int | None, typer.Option(min=1, help="Fold assignments (5).")]
 Jobs = Annotated[int, typer.Option(min=0, help="Processes at once; 0 for one a core.")]
-ALL_SIGNALS = ",".join(SIGNAL_SETS)
 DRIVE_CONTROLLERS = ("plain", "ramp", "thesis", "fixed", "learned", "oracle")
 MAX_GRADE_DEG = 30.0
 
 
-GROUPS: tuple[typer.Typer, ...] = (runs_group, reproduce_group)
-"""The files of commands, in the order of help; each has its own ``app``."""
-
-
-@app.command("crossval")
-def crossval_command(
-    data: Data,
-    recipe: Annotated[Recipe, typer.Option(help="What to evaluate.")] = Recipe.svm,
-    protocol: Annotated[
-        Protocol, typer.Option(help="Which windows teach and which test.")
-    ] = Protocol.grouped,
-    window: Window = None,
-    stride: Stride = None,
-    steady: Steady = True,
-    signals: Signals = ALL_SIGNALS,
-    repeats: Repeats = None,
-    seed: Seed = 0,
-    extras: Annotated[bool, typer.Option(help="Speed alone, slow against fast, learning curve.")] = True,
-    jobs: Jobs = 0,
-    layout: FormatOption = Format.auto,
-    mapping: Mapping = None,
-    repair: Repair = False,
-    align: Align = False,
-    json_file: Json = None,
-) -> None:
-    """Tell how well a recipe does on runs it has not seen."""
-    from pipelines.classify.crossval import CrossvalSettings, crossval
-    from pipelines.reporting.screens import print_crossval, progress_bar
-    from pipelines.runs.datasets import data_digest
-
-    settings = CrossvalSettings(
-        recipe=recipe.value,
-        protocol=protocol.value,
-        window_s=window,
-        stride_s=stride,
-        steady=steady,
-        repeats=repeats,
-        seed=seed,
-        signal_sets=_names(signals),
-        extras=extras,
-        n_jobs=jobs,
-        skip_short=repair,
-    )
-    runs, skipped = _load(data, layout, mapping, repair, align)
-    with progress_bar() as progress:
-        report = crossval(runs, settings, progress)
-    result = {"dataset": data.resolve().name, "data_digest": data_digest(runs), **report, "skipped": skipped}
-    print_crossval(result, _console())
-    _write_json(json_file, result)
-
-
-@app.command("train")
-def train_command(
-    data: Data,
-    name: Annotated[str, typer.Option(help="Name of the registered model.")],
-    recipe: Annotated[Recipe, typer.Option(help="What to train.")] = Recipe.svm,
-    window: Window = None,
-    stride: Stride = None,
-    steady: Steady = True,
-    signals: Signals = ALL_SIGNALS,
-    repeats: Repeats = None,
-    seed: Seed = 0,
-    jobs: Jobs = 0,
-    layout: FormatOption = Format.auto,
-    mapping: Mapping = None,
-    repair: Repair = False,
-    align: Align = False,
-    json_file: Json = None,
-) -> None:
-    """Evaluate on held-out runs, fit on all of them, track in MLflow and register."""
-    from pipelines.classify.crossval import CrossvalSettings
-    from pipelines.classify.train import train
-    from pipelines.reporting.screens import print_crossval, print_training, progress_bar
-
-    settings = CrossvalSettings(
-        recipe=recipe.value,
-        window_s=window,
-        stride_s=stride,
-        steady=steady,
-        repeats=repeats,
-        seed=seed,
-        signal_sets=_names(signals),
-        extras=False,
-        n_jobs=jobs,
-        skip_short=repair,
-    )
-    runs, skipped = _load(data, layout, mapping, repair, align)
-    with progress_bar() as progress:
-        result = {**train(runs, settings, name, data.resolve().name, progress), "skipped": skipped}
-    print_crossval({**result["crossval"], "dataset": result["dataset"], "skipped": skipped}, _console())
-    print_training(result, _console())
-    _write_json(json_file, result)
-
-
-@app.command("predict")
-def predict_command(
-    model: Annotated[str, typer.Option(help="models:/NAME@champion, models:/NAME/3, or a model folder.")],
-    data: Data,
-    table: Annotated[
-        Path | None, typer.Option(help="Table of target slips; the packaged one by default.")
-    ] = None,
-    layout: FormatOption = Format.auto,
-    mapping: Mapping = None,
-    repair: Repair = False,
-    align: Align = False,
-    json_file: Json = None,
-) -> None:
-    """Print terrain, probability and target slip."""
-    from pipelines.classify.predict import predict
-    from pipelines.models.tracking import load_model
-    from pipelines.reporting.screens import print_predictions
-    from terrain.control.slip_table import load_slip_table
-
-    slip_table = load_slip_table(table)
-    runs, skipped = _load(data, layout, mapping, repair, align)
-    predicted = predict(runs, load_model(model), slip_table, skip_short=repair)
-    result = {"model": model, "dataset": data.resolve().name, **predicted, "skipped": skipped}
-    print_predictions(result, _console())
-    _write_json(json_file, result)
+GROUPS = (runs.app, classify.app, reproduce.app, quickstart.app)
+"""Files of commands, in the order of help."""
 
 
 @app.command("estimate")
@@ -519,39 +377,6 @@ def drive_command(
     _write_json(json_file, result)
 
 
-@app.command("quickstart")
-def quickstart_command(
-    data: Annotated[
-        Path | None, typer.Option("--data", help="Folder of labelled runs; without, runs are simulated.")
-    ] = None,
-    out: Annotated[Path, typer.Option(help="Folder of the runs and the report.")] = Path("terrain-report"),
-    name: Annotated[str, typer.Option(help="Name of the registered model.")] = "quickstart",
-    seed: Seed = 0,
-    jobs: Jobs = 0,
-    json_file: Json = None,
-) -> None:
-    """Import or simulate runs, cross-validate, train, predict, and write a report."""
-    from pipelines.classify.crossval import CrossvalSettings
-    from pipelines.quickstart.quickstart import quickstart
-    from pipelines.reporting.screens import (
-        print_crossval,
-        print_predictions,
-        print_slip,
-        print_training,
-        progress_bar,
-    )
-
-    with progress_bar() as progress:
-        result = quickstart(data, out, CrossvalSettings(seed=seed, n_jobs=jobs), name, progress)
-    if result["slip"]:
-        print_slip(result["slip"], _console())
-    print_crossval(result["crossval"], _console())
-    print_training(result["train"], _console())
-    print_predictions(result["predict"], _console())
-    typer.echo(f"report: {result['report']}")
-    _write_json(json_file, result)
-
-
 def _console() -> Any:
     from rich.console import Console
 
@@ -582,13 +407,6 @@ def _radii(text: str | None) -> tuple[float, float, float] | None:
     if not all(0.5 <= ratio <= 2.0 for ratio in (one, two, three)):
         raise ConfigError(f"--radius is {text!r}; three ratios from 0.5 to 2 are required, as in 1,1.02,1")
     return one, two, three
-
-
-def _names(signals: str) -> tuple[str, ...]:
-    names = tuple(name.strip() for name in signals.split(",") if name.strip())
-    if not names:
-        raise ConfigError(f"no signal set is named; there are {ALL_SIGNALS}")
-    return names
 
 
 def _checked(path: Path | None) -> Path | None:

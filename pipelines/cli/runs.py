@@ -14,28 +14,24 @@ app = typer.Typer()
 def import_command(settings: ImportSettings, json_file: Json = None) -> None:
     """Turn logs of any readable layout into run folders."""
     from pipelines.reporting.json_file import write_json
+    from pipelines.reporting.terminal import output_console
     from pipelines.runs.import_logs import import_logs
+    from pipelines.runs.screen import print_import
 
-    result = import_logs(
-        settings.data, settings.out, layout=settings.layout, mapping=settings.mapping, repair=settings.repair
-    )
-    for sentence in result["skipped"]:
-        typer.echo(f"skipped: {sentence}")
-    counts = "".join(f", {n} {kind}" for kind, n in result["dropped"].items())
-    typer.echo(f"{result['n_runs']} runs written to {result['out']}{counts}")
+    result = import_logs(settings)
+    print_import(result, output_console())
     write_json(json_file, result)
 
 
 @command(app, "inspect")
 def inspect_command(settings: InspectSettings, json_file: Json = None) -> None:
-    """Show rates, lengths, gaps, stuck channels, and whether two loggers keep one clock."""
+    """Show rates, lengths, gaps, stuck channels, and whether two loggers share one clock."""
     from pipelines.reporting.json_file import write_json
     from pipelines.reporting.terminal import output_console
-    from pipelines.runs.inspect_logs import inspect_logs, print_inspection
+    from pipelines.runs.inspect_logs import inspect_logs
+    from pipelines.runs.screen import print_inspection
 
-    result = inspect_logs(
-        settings.data, layout=settings.layout, mapping=settings.mapping, repair=settings.repair
-    )
+    result = inspect_logs(settings)
     print_inspection(result, output_console())
     write_json(json_file, result)
 

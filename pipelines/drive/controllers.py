@@ -94,8 +94,9 @@ def taught_classifier(
     seed : of the runs; they are no drives of ``terrain drive``, whatever its seeds
     runs_a_terrain : how many; those of ``terrain quickstart`` by default
     """
-    from pipelines.classify.crossval import CrossvalSettings, samples_of
+    from pipelines.classify.crossval import samples_of
     from pipelines.classify.labelled import RUNS_A_TERRAIN, labelled_runs
+    from pipelines.classify.settings import CrossvalSettings
     from pipelines.classify.train import model_info
 
     runs, _, _ = labelled_runs(seed, runs_a_terrain or RUNS_A_TERRAIN, progress, robot)

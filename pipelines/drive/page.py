@@ -16,11 +16,11 @@ from scipy.stats import t as student
 
 from pipelines.drive.drives import COURSE
 from pipelines.drive.figures import Panel, bars_figure, run_figures, table_figure
-from pipelines.quickstart.report import versions
 from pipelines.reporting.drawing import NOT_KNOWN, png_bytes, svg_text
 from pipelines.reporting.numbers import format_number as said
 from pipelines.reporting.page import page
 from pipelines.reporting.pictures import MAX_SVG_BYTES
+from pipelines.reporting.versions import versions
 from terrain.control.drive_metrics import PEAK_ABOVE_MPS
 from terrain.control.slip_table import SlipTable
 from terrain.files.atomic import atomic_write

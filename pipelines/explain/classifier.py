@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from features.windows import Layout, cut_windows, layout_of
-from pipelines.classify.crossval import CrossvalSettings
 from pipelines.classify.labelled import RUNS_A_TERRAIN, SCENARIO
+from pipelines.classify.settings import CrossvalSettings
 from pipelines.classify.splits import labelled
 from pipelines.reporting.progress import Progress, silent
 from terrain.errors import DataError, TerrainError

@@ -25,12 +25,12 @@ from pipelines.explain.figures import (
     titled,
 )
 from pipelines.explain.ground import ground_words
-from pipelines.quickstart.report import versions
 from pipelines.reporting.drawing import NOT_KNOWN, png_bytes, sentence, styled, svg_text
 from pipelines.reporting.numbers import format_number as said
 from pipelines.reporting.page import page
 from pipelines.reporting.pictures import MAX_SVG_BYTES
 from pipelines.reporting.progress import Progress, silent
+from pipelines.reporting.versions import versions
 from terrain.effects import LIBRARY, PARAMETER
 from terrain.files.atomic import atomic_write
 

@@ -21,6 +21,7 @@ from urllib.parse import urlsplit
 
 from pipelines.models.model_files import TRUSTED_TYPES, TerrainModel, read_model, write_info
 from pipelines.models.recipes import WindowPipeline
+from pipelines.models.results import Registered
 from terrain.errors import ModelError, TerrainError
 from terrain.files.atomic import ensure_writable
 from terrain.records import Windows
@@ -33,16 +34,6 @@ EXPERIMENT = "terrain"
 CHAMPION = "champion"
 SERVER_TIMEOUT_S = 5.0
 REQUIREMENTS = ("terrain-slip", "scikit-learn", "numpy", "scipy", "numba", "skops")
-
-
-class Registered(NamedTuple):
-    """A model version that has been registered, and what became of the alias ``champion``."""
-
-    model_uri: str
-    version: str
-    run_id: str
-    alias_moved: bool
-    alias_reason: str
 
 
 class Standing(NamedTuple):

@@ -16,6 +16,7 @@ from terrain.files.atomic import atomic_write
 
 DEPRECATED_KEYS: dict[str, str] = {
     "simulated": "ours",
+    "training_runs": "taught_runs",
 }
 """New key: the key of earlier releases, which is written beside it for one more release."""
 

@@ -103,7 +103,7 @@ def runs():
 @pytest.fixture(scope="session")
 def settings():
     """Return a maker of settings for one process, one repeat and no extras unless asked for."""
-    from pipelines.classify.crossval import CrossvalSettings
+    from pipelines.classify.settings import CrossvalSettings
 
     def make(**options):
         return CrossvalSettings(**({"repeats": 1, "extras": False, "n_jobs": 1} | options))
@@ -112,18 +112,86 @@ def settings():
 
 
 @pytest.fixture(scope="session")
-def tracked(tmp_path_factory, runs, settings):
+def make_report():
+    """Return a maker of a report of two terrains and three runs; what is given replaces its fields."""
+    from pipelines.classify.results import (
+        Applicability,
+        ClassSpeeds,
+        CrossvalReport,
+        Extras,
+        LearningCurve,
+        SlowFast,
+    )
+    from terrain.classify.metrics import ClassFigures, ReliabilityBin, RunFigures
+
+    statement = "3 sizes are too few to estimate how many runs are enough"
+    curve = LearningCurve((1.0, 2.0, 3.5), (0.5, 0.6, 0.65), (0.02, 0.01, None), None, statement)
+    slow_fast = SlowFast(
+        Applicability.NOT_APPLICABLE,
+        {"GRASS": ClassSpeeds(0.2, 0.4)},
+        {"ICE": "48 s of slow runs"},
+        None,
+        None,
+    )
+
+    def make(**changed):
+        fields = {
+            "dataset": "moor",
+            "protocol": "grouped",
+            "recipe": "svm",
+            "window_s": 2.0,
+            "stride_s": 2.0,
+            "steady": True,
+            "signal_sets": ("imu", "wheels"),
+            "seed": 0,
+            "classes": ("GRASS", "ICE"),
+            "n_windows": 40,
+            "n_runs": 3,
+            "repeats": 4,
+            "accuracy": 0.81335,
+            "accuracy_spread": 0.01234,
+            "accuracy_per_repeat": (0.81335,) * 4,
+            "accuracy_ci": (0.7236, 0.9079),
+            "balanced_accuracy": 0.77139,
+            "macro_f1": 0.7844,
+            "vote_accuracy": 0.82131,
+            "ece": 0.10776,
+            "per_class": {
+                "GRASS": ClassFigures(0.61, 0.45, 0.52, 60), "ICE": ClassFigures(0.61, 0.95, 0.52, 100)
+            },
+            "confusion": ((27, 33), (5, 95)),
+            "reliability": (ReliabilityBin(0.6, 0.7, 80), ReliabilityBin(0.9, 0.85, 80)),
+            "per_run": (
+                RunFigures("<b>g1</b>", "GRASS", 10, 0.3, 0.3, None),
+                RunFigures("g2", "GRASS", 5, 0.75, 0.75, None),
+                RunFigures("i1", "ICE", 25, 0.95, 0.95, None),
+            ),
+            "folds": (),
+            "n_features": 12,
+            "dropped": {"not steady": 7},
+            "repaired": {},
+            "notes": ("ICE: one run only & optimistic",),
+            "extras": Extras(0.4115, slow_fast, curve),
+        }  # fmt: skip
+        return CrossvalReport(**(fields | changed))
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def tracked(tmp_path_factory, runs):
     """A folder in which a model ``drawn`` has been trained with the embedded tracking, and the result.
 
     Made once: a new tracking database costs seconds.  ``model/`` beside ``mlruns/`` is the model by itself.
     """
+    from pipelines.classify.settings import TrainSettings
     from pipelines.classify.train import train
 
     folder = tmp_path_factory.mktemp("tracked")
     before, named = Path.cwd(), os.environ.pop("MLFLOW_TRACKING_URI", None)
     os.chdir(folder)
     try:
-        result = train(runs, settings(), "drawn", "twelve runs")
+        result = train(runs, TrainSettings(name="drawn", repeats=1, n_jobs=1), "twelve runs")
         (model,) = Path("mlruns").rglob("model.skops")
         shutil.copytree(model.parent, "model")
     finally:

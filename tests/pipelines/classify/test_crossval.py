@@ -3,7 +3,9 @@ import json
 import numpy as np
 import pytest
 
-from pipelines.classify.crossval import CrossvalSettings, crossval
+from pipelines.classify.crossval import crossval
+from pipelines.classify.settings import CrossvalSettings
+from pipelines.reporting.json_file import as_json
 from pipelines.runs.datasets import load_runs
 from terrain.errors import ConfigError, DataError
 from terrain.records import RunLog, Stream
@@ -29,6 +31,14 @@ PROMISED = {
     "dropped",
     "repaired",
     "notes",
+    "stride_s",
+    "steady",
+    "signal_sets",
+    "seed",
+    "repeats",
+    "accuracy_per_repeat",
+    "reliability",
+    "n_features",
 }
 
 
@@ -38,22 +48,23 @@ def report(runs, settings):
 
 
 def test_the_report_has_what_is_promised_and_is_json(report, runs):
-    assert set(report) >= PROMISED
-    assert json.loads(json.dumps(report, allow_nan=False)) == report
-    assert (report["n_runs"], report["n_windows"], report["window_s"]) == (12, 144, 2.0)
-    assert (len(report["folds"]), len(report["per_run"]), report["repeats"]) == (10, 12, 2)
-    assert np.sum(report["confusion"]) == 2 * 144
-    low, high = report["accuracy_ci"]
-    assert 0.5 < low <= report["accuracy"] <= high <= 1.0  # terrains that differ are told apart
-    assert report["accuracy"] == pytest.approx(np.trace(report["confusion"]) / 288)
-    assert report["dropped"] == {}
+    document = as_json(report)
+    assert set(document) == PROMISED
+    assert json.loads(json.dumps(document, allow_nan=False)) == document
+    assert (report.n_runs, report.n_windows, report.window_s) == (12, 144, 2.0)
+    assert (len(report.folds), len(report.per_run), report.repeats) == (10, 12, 2)
+    assert np.sum(report.confusion) == 2 * 144
+    low, high = report.accuracy_ci
+    assert 0.5 < low <= report.accuracy <= high <= 1.0  # terrains that differ are told apart
+    assert report.accuracy == pytest.approx(np.trace(report.confusion) / 288)
+    assert report.dropped == {}
 
 
 def test_one_seed_gives_one_report_and_another_seed_another(report, runs, settings):
     assert crossval(runs, settings(repeats=2)) == report
     other = crossval(runs, settings(seed=1))
-    assert other["accuracy_per_repeat"][0] not in report["accuracy_per_repeat"]
-    assert other["per_run"] != report["per_run"]
+    assert other.accuracy_per_repeat[0] not in report.accuracy_per_repeat
+    assert other.per_run != report.per_run
 
 
 def test_where_labels_are_but_names_of_runs_grouped_says_chance_and_published_is_fooled(drive, settings):
@@ -71,13 +82,13 @@ def test_where_labels_are_but_names_of_runs_grouped_says_chance_and_published_is
             for i in range(8)
         ]  # fmt: skip
 
-    grouped = [crossval(mislabelled(seed), settings())["accuracy"] for seed in range(3)]
+    grouped = [crossval(mislabelled(seed), settings()).accuracy for seed in range(3)]
     published = crossval(mislabelled(0), settings(protocol="published"))
     # Eight tosses of a coin have a standard deviation of 0.18, the mean of three draws one of 0.10; that
     # a held-out run leaves more runs of the other name in training pulls below one half.
     assert np.mean(grouped) < 0.68
-    assert published["accuracy"] > 0.9
-    assert any("both sides of the split" in note for note in published["notes"])
+    assert published.accuracy > 0.9
+    assert any("both sides of the split" in note for note in published.notes)
 
 
 def test_gaps_and_missing_values_drop_the_windows_they_touch_and_are_counted(runs, settings):
@@ -89,17 +100,17 @@ def test_gaps_and_missing_values_drop_the_windows_they_touch_and_are_counted(run
     kept = np.r_[0:700, 720:1200]  # 14.0 to 14.4 s
     streams = {**victim.streams, "imu": Stream(imu.time_s[kept], values[kept], imu.channels)}
     report = crossval([RunLog(victim.run_id, "husky", streams, victim.labels), *runs[1:]], settings())
-    assert report["dropped"] == {"gap": 1, "not finite": 2}
-    assert report["n_windows"] == 144 - 3
-    assert "windows left out: 1 gap, 2 not finite" in report["notes"]
+    assert report.dropped == {"gap": 1, "not finite": 2}
+    assert report.n_windows == 144 - 3
+    assert "windows left out: 1 gap, 2 not finite" in report.notes
 
 
 def test_signal_sets_are_switched_off_by_name(runs, settings, report):
     def n_features(*names):
-        return crossval(runs, settings(signal_sets=names))["n_features"]
+        return crossval(runs, settings(signal_sets=names)).n_features
 
     imu, wheels = n_features("imu"), n_features("wheels", "currents")
-    assert 0 < wheels < imu < imu + wheels < report["n_features"]  # together they give features of both
+    assert 0 < wheels < imu < imu + wheels < report.n_features  # together they give features of both
     with pytest.raises(ConfigError, match="unknown signal set 'sonar'; there are imu, wheels"):
         n_features("sonar")
     with pytest.raises(DataError, match="no channel of the signal sets slip"):
@@ -113,17 +124,15 @@ def test_a_signal_set_carries_what_it_knows_and_no_more(drive_all, settings):
         for terrain, current_a in (("ASPHALT", 1.0), ("GRASS", 2.0), ("GRAVEL", 4.0))
         for run in drive_all((terrain,), 4, seed=int(current_a), current_a=current_a, **alike)
     ]
-    assert crossval(runs, settings(signal_sets=("currents",)))["accuracy"] > 0.95
-    assert crossval(runs, settings(signal_sets=("imu",)))["accuracy"] < 0.6
+    assert crossval(runs, settings(signal_sets=("currents",))).accuracy > 0.95
+    assert crossval(runs, settings(signal_sets=("imu",))).accuracy < 0.6
 
 
 def test_leave_one_run_out_and_single_runs(drive, drive_all, settings):
     runs = [*drive_all(("ASPHALT", "GRASS"), 3, duration_s=16.0), drive("GRAVEL_1", "GRAVEL", 3, 40.0)]
     report = crossval(runs, settings(protocol="leave-one-run-out"))
-    assert (len(report["folds"]), report["repeats"], report["accuracy_spread"]) == (6 + 5, 1, None)
-    assert any(
-        note.startswith("GRAVEL: one run only, cut into 5 contiguous blocks") for note in report["notes"]
-    )
+    assert (len(report.folds), report.repeats, report.accuracy_spread) == (6 + 5, 1, None)
+    assert any(note.startswith("GRAVEL: one run only, cut into 5 contiguous blocks") for note in report.notes)
 
 
 def test_extras_do_without_what_the_data_lack(drive, settings):
@@ -133,20 +142,20 @@ def test_extras_do_without_what_the_data_lack(drive, settings):
         run = drive(f"T{i}_1", "GRASS", i, 30.0, level=level, label=f"T{i}")
         runs.append(RunLog(run.run_id, "husky", {"imu": run.streams["imu"]}, run.labels))
     report = crossval(runs, settings(extras=True, steady=False))
-    json.dumps(report, allow_nan=False)
-    assert report["speed_only_accuracy"] is None
-    assert report["slow_fast"]["status"] == "not applicable"
-    assert set(report["slow_fast"]["left_out"]) == {f"T{i}" for i in range(5)}
-    assert report["learning_curve"]["enough_runs"] is None
-    assert report["learning_curve"]["accuracy"] == pytest.approx([report["accuracy"]])
+    json.dumps(as_json(report), allow_nan=False)
+    assert report.extras.speed_only_accuracy is None
+    assert report.extras.slow_fast.status == "not applicable"
+    assert set(report.extras.slow_fast.left_out) == {f"T{i}" for i in range(5)}
+    assert report.extras.learning_curve.enough_runs is None
+    assert report.extras.learning_curve.accuracy == pytest.approx([report.accuracy])
 
 
 def test_settings_that_make_no_sense_are_refused():
     with pytest.raises(
-        ConfigError, match="there is no protocol 'lucky'; there are grouped, leave-one-run-out, published"
+        ConfigError, match="--protocol is 'lucky': input should be 'grouped', 'leave-one-run-out' or"
     ):
         CrossvalSettings(protocol="lucky")
-    with pytest.raises(ConfigError, match="0 repeats are none"):
+    with pytest.raises(ConfigError, match="--repeats is 0: input should be greater than or equal to 1"):
         CrossvalSettings(repeats=0)
     with pytest.raises(ConfigError, match="window length_s is -1"):
         _ = CrossvalSettings(window_s=-1).rule
@@ -156,7 +165,7 @@ def test_settings_that_make_no_sense_are_refused():
 
 def test_vulpi_is_told_apart_on_runs_that_were_held_out(datasets_dir, settings):
     report = crossval(load_runs(datasets_dir / "vulpi"), settings())
-    assert report["accuracy"] > 0.90
-    assert report["ece"] < 0.08
-    assert report["n_runs"] == 18
-    assert any(note.startswith("DIRT_ROAD: one run only") for note in report["notes"])
+    assert report.accuracy > 0.90
+    assert report.ece < 0.08
+    assert report.n_runs == 18
+    assert any(note.startswith("DIRT_ROAD: one run only") for note in report.notes)

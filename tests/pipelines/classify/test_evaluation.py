@@ -3,7 +3,7 @@ import pytest
 from sklearn.model_selection import cross_val_predict, cross_validate
 
 from features.windows import WindowCut, WindowRule
-from pipelines.classify.evaluation import FoldResult, fit_folds, pool, summarise
+from pipelines.classify.evaluation import Examples, FoldResult, fit_folds, pool, summarise
 from pipelines.classify.splits import Fold, Samples, folds_of, grouped_samples
 from pipelines.models.recipes import WindowPipeline, feature_matrix, make_recipe
 from terrain.errors import ConfigError
@@ -23,7 +23,8 @@ def results(samples):
     recipe = make_recipe("svm", seed=3)
     features = feature_matrix(recipe, windows)
     folds = folds_of(samples, "grouped", 1, seed=3)
-    return fit_folds(recipe[-1], features, windows.terrain.astype(str), samples.group, folds, 1, "fit")
+    examples = Examples(features, windows.terrain.astype(str), samples.group)
+    return fit_folds(recipe[-1], examples, folds, 1, "fit")
 
 
 def test_scikit_learn_cross_validates_whole_recipes_to_the_same_answers(samples, results):
@@ -37,10 +38,10 @@ def test_scikit_learn_cross_validates_whole_recipes_to_the_same_answers(samples,
         make_recipe("svm", seed=3), windows, y, groups=windows.run_id, cv=folds[:2], return_estimator=True
     )
     report = summarise(ours, samples, seed=0)
-    assert found["test_score"].tolist() == pytest.approx([fold["accuracy"] for fold in report["folds"][:2]])
-    for estimator, fold in zip(found["estimator"], report["folds"][:2], strict=True):
+    assert found["test_score"].tolist() == pytest.approx([fold.accuracy for fold in report.folds[:2]])
+    for estimator, fold in zip(found["estimator"], report.folds[:2], strict=True):
         assert 0 < estimator[-1].n_inner_fits_ <= 20
-        assert estimator[-1].best_._asdict() == fold["chosen"]
+        assert estimator[-1].best_._asdict() == fold.chosen
 
 
 def test_the_recipe_gives_its_last_step_the_run_of_each_window(samples):
@@ -93,28 +94,28 @@ def test_figures_of_hand_made_predictions():
     folds = [Fold(r, k, none, rows[k * 4 : k * 4 + 4]) for r in range(2) for k in range(2)]
     samples, results = hand_made(runs, start_s, y, answers, folds)
     report = summarise(pool(results, np.array(y)), samples, seed=0)
-    assert report["accuracy_per_repeat"] == [7 / 8, 5 / 8]
-    assert report["accuracy"] == 0.75
-    assert report["accuracy_spread"] == pytest.approx(np.std([7 / 8, 5 / 8], ddof=1))
-    assert (report["n_windows"], report["n_runs"], report["repeats"]) == (8, 4, 2)
-    assert report["confusion"] == [[5, 3], [1, 7]]
-    assert report["per_class"]["ice"]["recall"] == 5 / 8
-    assert [fold["accuracy"] for fold in report["folds"]] == [0.75, 1.0, 0.5, 0.75]
+    assert report.accuracy_per_repeat == (7 / 8, 5 / 8)
+    assert report.accuracy == 0.75
+    assert report.accuracy_spread == pytest.approx(np.std([7 / 8, 5 / 8], ddof=1))
+    assert (report.n_windows, report.n_runs, report.repeats) == (8, 4, 2)
+    assert report.confusion == ((5, 3), (1, 7))
+    assert report.per_class["ice"].recall == 5 / 8
+    assert [fold.accuracy for fold in report.folds] == [0.75, 1.0, 0.5, 0.75]
     # All are equally sure: 0.8 said, 7/8 and 5/8 right; every window its own bin of mass one.
-    assert report["ece"] == pytest.approx(np.mean([(7 * 0.2 + 1 * 0.8) / 8, (5 * 0.2 + 3 * 0.8) / 8]))
+    assert report.ece == pytest.approx(np.mean([(7 * 0.2 + 1 * 0.8) / 8, (5 * 0.2 + 3 * 0.8) / 8]))
     # Votes are of one or two windows of equal weight: only 'd' could be outvoted, in the second repeat.
-    per_run = {row["run_id"]: row for row in report["per_run"]}
-    assert per_run["b"]["accuracy"] == 0.25
-    assert per_run["b"]["mistaken_for"] == "mud"
-    low, high = report["accuracy_ci"]
-    assert 0.25 <= low < report["accuracy"] < high <= 1.0
+    per_run = {row.run_id: row for row in report.per_run}
+    assert per_run["b"].accuracy == 0.25
+    assert per_run["b"].mistaken_for == "mud"
+    low, high = report.accuracy_ci
+    assert 0.25 <= low < report.accuracy < high <= 1.0
 
 
 def test_one_repeat_has_no_spread():
     folds = [Fold(0, 0, np.empty(0, dtype=int), np.arange(4))]
     y = ["ice", "ice", "mud", "mud"]
     samples, results = hand_made(list("abcd"), range(4), y, [y], folds)
-    assert summarise(pool(results, np.array(y)), samples, 0)["accuracy_spread"] is None
+    assert summarise(pool(results, np.array(y)), samples, 0).accuracy_spread is None
 
 
 def test_votes_never_mix_two_runs_whatever_their_names_and_folds():
@@ -126,7 +127,7 @@ def test_votes_never_mix_two_runs_whatever_their_names_and_folds():
         Fold(0, 2, np.empty(0, dtype=int), np.arange(3, 6)),
     ]
     samples, results = hand_made(runs, start_s, y, [y], folds)
-    assert summarise(pool(results, np.array(y)), samples, 0)["vote_accuracy"] == 1.0
+    assert summarise(pool(results, np.array(y)), samples, 0).vote_accuracy == 1.0
 
 
 def test_votes_do_not_reach_across_the_blocks_of_a_run():
@@ -137,4 +138,4 @@ def test_votes_do_not_reach_across_the_blocks_of_a_run():
     ]
     answers = ["mud", "mud", "mud", "ice", "ice", "ice", "mud"]
     samples, results = hand_made(["a"] * 6 + ["b"], range(7), y, [answers], folds)
-    assert summarise(pool(results, np.array(y)), samples, 0)["vote_accuracy"] == 4 / 7
+    assert summarise(pool(results, np.array(y)), samples, 0).vote_accuracy == 4 / 7

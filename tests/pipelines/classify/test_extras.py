@@ -6,7 +6,7 @@ import pytest
 from features.windows import WindowRule
 from pipelines.classify import extras
 from pipelines.classify.crossval import crossval
-from pipelines.classify.evaluation import fit_folds
+from pipelines.classify.evaluation import Examples, fit_folds
 from pipelines.classify.extras import (
     CURVE_DRAWS,
     enough_runs,
@@ -59,8 +59,8 @@ def test_each_class_is_split_at_its_own_median_speed(runs_at):
     split = slow_fast_split(
         grouped_samples([r for t, s in plan.items() for r in runs_at(t, s)], WindowRule())
     )
-    assert (split["status"], split["left_out"]) == ("applicable", {})
-    assert {run for run, _ in split["slow"]} == {
+    assert (split.status, split.left_out) == ("applicable", {})
+    assert {run for run, _ in split.slow} == {
         "ASPHALT_0",
         "ASPHALT_1",
         "GRASS_1",
@@ -69,7 +69,7 @@ def test_each_class_is_split_at_its_own_median_speed(runs_at):
         "GRAVEL_1",
         "GRAVEL_2",
     }
-    assert {run for run, _ in split["fast"]} == {
+    assert {run for run, _ in split.fast} == {
         "ASPHALT_2",
         "ASPHALT_3",
         "GRASS_0",
@@ -77,23 +77,23 @@ def test_each_class_is_split_at_its_own_median_speed(runs_at):
         "GRAVEL_3",
         "GRAVEL_4",
     }
-    assert split["classes"]["GRASS"]["slow_mps"] == pytest.approx(0.55, abs=0.02)
-    assert split["classes"]["GRASS"]["fast_mps"] == pytest.approx(0.95, abs=0.02)
+    assert split.classes["GRASS"].slow_mps == pytest.approx(0.55, abs=0.02)
+    assert split.classes["GRASS"].fast_mps == pytest.approx(0.95, abs=0.02)
 
 
 def test_a_class_with_too_little_on_a_side_is_left_out_and_named(runs_at):
     enough = [*runs_at("ASPHALT", SPEEDS), *runs_at("GRASS", SPEEDS)]
     three = runs_at("GRAVEL", (0.3, 0.4, 0.8), 64.0)
     split = slow_fast_split(grouped_samples(enough + three, WindowRule()))
-    assert split["left_out"] == {"GRAVEL": "fast runs: 1"}
-    assert set(split["classes"]) == {"ASPHALT", "GRASS"}
-    assert split["status"] == "not applicable"  # two classes remain, three are needed
-    assert not [run for run, _ in split["slow"] + split["fast"] if run.startswith("GRAVEL")]
+    assert split.left_out == {"GRAVEL": "fast runs: 1"}
+    assert set(split.classes) == {"ASPHALT", "GRASS"}
+    assert split.status == "not applicable"  # two classes remain, three are needed
+    assert not [run for run, _ in split.slow + split.fast if run.startswith("GRAVEL")]
     # 2 x 28 s a side are too short; windows that overlap cover no more of them, though they are more.
     short = runs_at("GRAVEL", SPEEDS, 28.0)
     for stride_s in (None, 0.5):
         split = slow_fast_split(grouped_samples(enough + short, WindowRule(2.0, stride_s)))
-        assert split["left_out"] == {"GRAVEL": "slow runs: 56 s"}
+        assert split.left_out == {"GRAVEL": "slow runs: 56 s"}
 
 
 def test_what_is_learned_slow_and_does_not_hold_fast_is_found_out(runs_at, settings):
@@ -115,10 +115,10 @@ def test_what_is_learned_slow_and_does_not_hold_fast_is_found_out(runs_at, setti
         samples = grouped_samples(runs, WindowRule())
         recipe = make_recipe("svm", ("imu",))
         accuracy[name] = slow_fast(recipe[-1], feature_matrix(recipe, samples.cut.windows), samples, 1)
-    assert accuracy["own"]["slow_to_fast"] > 0.9
-    assert accuracy["own"]["fast_to_slow"] > 0.9
-    assert accuracy["next"]["slow_to_fast"] < 0.1
-    assert accuracy["next"]["fast_to_slow"] < 0.1
+    assert accuracy["own"].slow_to_fast > 0.9
+    assert accuracy["own"].fast_to_slow > 0.9
+    assert accuracy["next"].slow_to_fast < 0.1
+    assert accuracy["next"].fast_to_slow < 0.1
 
 
 def test_speed_alone_is_right_just_where_terrains_were_driven_at_speeds_of_their_own(
@@ -139,7 +139,7 @@ def test_speed_alone_is_right_just_where_terrains_were_driven_at_speeds_of_their
             for k, t in enumerate(("ASPHALT", "GRASS", "GRAVEL"))
             for i in range(5)
         ]
-        accuracy.append(crossval(runs, settings(extras=True))["speed_only_accuracy"])
+        accuracy.append(crossval(runs, settings(extras=True)).extras.speed_only_accuracy)
     assert accuracy[0] > 0.95
     assert accuracy[1] < 0.55
 
@@ -152,12 +152,13 @@ def test_the_learning_curve_draws_that_many_runs_and_leaves_test_folds_alone(dri
     folds = folds_of(samples, "grouped", 1, 0)
     seen = []
 
-    def spy(classifier, features, y, group, drawn, *rest):
+    def spy(classifier, examples, drawn, *rest):
         seen.extend(drawn)
-        return fit_folds(classifier, features, y, group, drawn, *rest)
+        return fit_folds(classifier, examples, drawn, *rest)
 
     monkeypatch.setattr(extras, "fit_folds", spy)
-    curve = learning_curve(recipe[-1], feature_matrix(recipe, windows), samples, folds, 0.77, 0, 1)
+    examples = Examples(feature_matrix(recipe, windows), windows.terrain.astype(str), samples.group)
+    curve = learning_curve(recipe[-1], examples, folds, 0.77, 0, 1)
     assert len(seen) == 3 * CURVE_DRAWS * len(folds)  # 1, 2 and 3 of the 4 runs that each fold can teach
     for fold in seen:
         (original,) = [f for f in folds if np.array_equal(f.test, fold.test)]
@@ -173,10 +174,10 @@ def test_the_learning_curve_draws_that_many_runs_and_leaves_test_folds_alone(dri
         {tuple(f.train) for f in seen if f.number == 1 and f.repeat == draw} for draw in range(CURVE_DRAWS)
     ]
     assert draws[0] != draws[1]
-    assert curve["runs_per_class"] == pytest.approx([1.0, (2 + 2 + 1) / 3, (3 + 3 + 1) / 3, (4 + 4 + 1) / 3])
-    assert curve["accuracy"][-1] == 0.77
-    assert curve["accuracy_spread"][-1] is None
-    assert all(0 <= share <= 1 for share in curve["accuracy"])
+    assert curve.runs_per_class == pytest.approx([1.0, (2 + 2 + 1) / 3, (3 + 3 + 1) / 3, (4 + 4 + 1) / 3])
+    assert curve.accuracy[-1] == 0.77
+    assert curve.accuracy_spread[-1] is None
+    assert all(0 <= accuracy <= 1 for accuracy in curve.accuracy)
 
 
 @pytest.mark.parametrize(("scale", "power"), [(0.3, 1.0), (0.2, 0.6), (0.4, 1.5)])
@@ -185,25 +186,25 @@ def test_enough_runs_of_a_known_law(scale, power):
     found = enough_runs(m, 0.95 - scale * m**-power)
     # Doubling m gains scale m^-power (1 - 2^-power); solved for a gain of one per cent.
     law = (100 * scale * (1 - 2.0**-power)) ** (1 / power)
-    assert found["enough_runs"] == pytest.approx(law, abs=1.05)
-    assert found["statement"].startswith("enough:" if found["enough_runs"] <= 12 else "not enough yet:")
+    assert found.n_runs == pytest.approx(law, abs=1.05)
+    assert found.statement.startswith("enough:" if found.n_runs <= 12 else "not enough yet:")
 
 
 def test_a_curve_that_still_climbs_gives_no_number():
     m = np.array([1.0, 2.0, 3.0, 4.0])
     found = enough_runs(m, 0.1 + 0.1 * np.log2(m))
-    assert found["enough_runs"] is None
-    assert found["statement"].startswith("not enough yet: doubling the 4.0 runs a class would still gain")
+    assert found.n_runs is None
+    assert found.statement.startswith("not enough yet: doubling the 4.0 runs per class would still gain")
     assert (
-        enough_runs(m[:3], m[:3] / 4)["statement"] == "3 sizes are too few to tell how many runs are enough"
+        enough_runs(m[:3], m[:3] / 4).statement == "3 sizes are too few to estimate how many runs are enough"
     )
-    assert enough_runs(m, np.full(4, 0.8))["enough_runs"] == 1
+    assert enough_runs(m, np.full(4, 0.8)).n_runs == 1
 
 
 def test_a_run_slow_on_one_class_and_fast_on_another_is_on_no_side(runs_at, settings, monkeypatch):
     """Its windows would otherwise teach and test at once."""
     folds = []
-    monkeypatch.setattr(extras, "fit_folds", lambda *args: folds.extend(args[4]) or [])
+    monkeypatch.setattr(extras, "fit_folds", lambda *args: folds.extend(args[2]) or [])
     monkeypatch.setattr(extras, "_accuracy", lambda *_: 0.5)
     runs = [run for terrain in ("ASPHALT", "GRASS", "GRAVEL") for run in runs_at(terrain, SPEEDS)]
     slow_grass, fast_gravel = (next(r for r in runs if r.run_id == name) for name in ("GRASS_0", "GRAVEL_3"))
@@ -219,9 +220,9 @@ def test_a_run_slow_on_one_class_and_fast_on_another_is_on_no_side(runs_at, sett
     mixed = RunLog("mixed", "husky", joined, labels)
     samples = grouped_samples([r for r in runs if r not in (slow_grass, fast_gravel)] + [mixed], WindowRule())
     split = slow_fast_split(samples)
-    assert ("mixed", "GRASS") in split["slow"]
-    assert ("mixed", "GRAVEL") in split["fast"]
-    with contextlib.suppress(IndexError):
+    assert ("mixed", "GRASS") in split.slow
+    assert ("mixed", "GRAVEL") in split.fast
+    with contextlib.suppress(ValueError):
         slow_fast(None, None, samples, 1)
     assert len(folds) == 2
     run_id = samples.cut.windows.run_id
@@ -245,5 +246,5 @@ def test_runs_with_several_labels_can_be_learned_from_few(drive, settings):
         }
         runs.append(RunLog(f"r{number}", "husky", streams, ((0.0, 12.0, "GRASS"), (12.0, 24.0, "GRAVEL"))))
     report = crossval(runs, settings(repeats=1, extras=True))
-    assert report["learning_curve"]["runs_per_class"][0] == 1.0
-    assert {row["run_id"] for row in report["per_run"]} >= {"r0 (GRASS)", "r0 (GRAVEL)"}
+    assert report.extras.learning_curve.runs_per_class[0] == 1.0
+    assert {row.run_id for row in report.per_run} >= {"r0 (GRASS)", "r0 (GRAVEL)"}

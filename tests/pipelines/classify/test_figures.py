@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,51 +19,32 @@ from pipelines.classify.figures import (
     per_run_figure,
     reliability_figure,
 )
-from pipelines.reporting.drawing import NOT_KNOWN, png_bytes, svg_text
+from pipelines.classify.results import ChannelImportance
+from pipelines.reporting.drawing import png_bytes, svg_text
+from pipelines.reporting.numbers import NOT_KNOWN
+from terrain.classify.metrics import RunFigures
 
 
 def run(run_id, terrain, accuracy, n_windows=10, mistaken_for=None):
-    return {
-        "run_id": run_id,
-        "terrain": terrain,
-        "n_windows": n_windows,
-        "accuracy": accuracy,
-        "vote_accuracy": accuracy,
-        "mistaken_for": mistaken_for,
-    }
+    return RunFigures(run_id, terrain, n_windows, accuracy, accuracy, mistaken_for)
 
 
 @pytest.fixture
-def report():
-    return {
-        "dataset": "moor",
-        "protocol": "grouped",
-        "classes": ["GRASS", "ICE"],
-        "repeats": 4,
-        "confusion": [[30, 10], [6, 114]],
-        "ece": 0.0512,
-        "reliability": [
-            {"confidence": 0.6, "accuracy": 0.7, "n_windows": 80},
-            {"confidence": 0.9, "accuracy": 0.85, "n_windows": 80},
-        ],
-        "per_run": [
+def report(make_report):
+    return make_report(
+        confusion=((30, 10), (6, 114)),
+        ece=0.0512,
+        per_run=(
             run("g1", "GRASS", 0.25, 4, "ICE"),
             run("g2", "GRASS", 1.0, 6),
             run("i1", "ICE", 0.95, 30, "GRASS"),
-        ],
-        "learning_curve": {
-            "runs_per_class": [1.0, 2.0, 3.5],
-            "accuracy": [0.5, 0.6, 0.65],
-            "accuracy_spread": [0.02, 0.01, None],
-            "enough_runs": None,
-            "statement": "3 sizes are too few to tell how many runs are enough",
-        },
-    }
+        ),
+    )
 
 
 @pytest.fixture
 def importances():
-    return [{"feature": f"feature_{i}", "drop": 0.001 * i, "std": 0.0005} for i in range(-1, 24)]
+    return [ChannelImportance(f"feature_{i}", 0.001 * i, 0.0005) for i in range(-1, 24)]
 
 
 def texts(axes):
@@ -89,8 +71,8 @@ def test_confusion_has_true_rows_from_the_top_and_predicted_columns(report):
 
 
 def test_a_class_that_was_never_tested_has_dashes_and_no_zero(report):
-    report["confusion"] = [[0, 0], [6, 114]]
-    assert texts(confusion_figure(report).axes[0])[:2] == [NOT_KNOWN, NOT_KNOWN]
+    untested = replace(report, confusion=((0, 0), (6, 114)))
+    assert texts(confusion_figure(untested).axes[0])[:2] == [NOT_KNOWN, NOT_KNOWN]
 
 
 def test_reliability_draws_every_bin_and_names_the_error(report):
@@ -125,8 +107,8 @@ def test_the_class_mean_weighs_runs_by_their_windows(report):
 
 
 def test_a_long_name_of_the_data_does_not_push_the_title_out(report):
-    report["dataset"] = "a_data_set_with_a_name_that_does_not_end_so_soon"
-    for figure in all_figures(report).values():
+    named = report.named("a_data_set_with_a_name_that_does_not_end_so_soon", "")
+    for figure in all_figures(named).values():
         figure.draw_without_rendering()
         assert figure._suptitle.get_window_extent().x1 <= figure.bbox.width
 
@@ -139,12 +121,12 @@ def test_only_a_run_below_one_half_says_what_it_is_taken_for(report):
 
 @pytest.mark.parametrize("n_runs", [18, 51])
 def test_run_names_neither_overlap_nor_leave_the_figure(report, n_runs):
-    report["per_run"] = [
+    runs = [
         run(f"{name}_long_name_{i:02d}", name, i / n_runs, 100 + i, "ICE")
-        for name in report["classes"]
+        for name in report.classes
         for i in range(n_runs // 2 + 1)
     ]
-    figure = per_run_figure(report)
+    figure = per_run_figure(replace(report, per_run=runs))
     labels = figure.axes[0].get_yticklabels()
     assert overlap(figure, [*labels, *figure.axes[0].texts]) == []
     assert min(label.get_window_extent().x0 for label in labels) >= 0
@@ -152,26 +134,25 @@ def test_run_names_neither_overlap_nor_leave_the_figure(report, n_runs):
 
 
 def test_of_very_many_runs_the_worst_are_drawn_and_the_title_says_so(report):
-    report["per_run"] = [run(f"r{i}", "ICE", i / 300) for i in range(300)]
-    figure = per_run_figure(report)
+    figure = per_run_figure(replace(report, per_run=[run(f"r{i}", "ICE", i / 300) for i in range(300)]))
     widths = [patch.get_width() for bar in figure.axes[0].containers for patch in bar]
     assert widths == [i / 300 for i in range(MAX_RUNS)]
     assert f"the worst {MAX_RUNS} of 300" in figure.get_suptitle()
 
 
 def test_learning_curve_has_a_spread_where_there_is_one(report):
-    figure = learning_curve_figure(report)
+    figure = learning_curve_figure(report, report.extras.learning_curve)
     axes = figure.axes[0]
     np.testing.assert_allclose(axes.lines[0].get_xydata(), [[1.0, 0.5], [2.0, 0.6], [3.5, 0.65]])
     bars = next(c for c in axes.containers if isinstance(c, ErrorbarContainer))[2][0].get_segments()
     np.testing.assert_allclose([bar[:, 1] for bar in bars], [[0.48, 0.52], [0.59, 0.61]])
-    assert figure.get_supxlabel() == "3 sizes are too few to tell how many runs are enough."
+    assert figure.get_supxlabel() == "3 sizes are too few to estimate how many runs are enough."
 
 
 @pytest.mark.parametrize(("enough", "drawn"), [(5, True), (50, False)])
 def test_enough_runs_is_drawn_only_where_it_does_not_squeeze_the_curve(report, enough, drawn):
-    report["learning_curve"]["enough_runs"] = enough
-    axes = learning_curve_figure(report).axes[0]
+    curve = report.extras.learning_curve._replace(enough_runs=enough)
+    axes = learning_curve_figure(report, curve).axes[0]
     assert (f"enough by the fitted law: {enough}" in [line.get_label() for line in axes.lines]) == drawn
 
 
@@ -189,8 +170,7 @@ def test_only_figures_whose_data_are_there_are_drawn(report, importances):
     assert list(all_figures(report, importances)) == [
         "confusion", "per_run", "reliability", "learning_curve", "importance",
     ]  # fmt: skip
-    del report["learning_curve"]
-    assert list(all_figures(report)) == ["confusion", "per_run", "reliability"]
+    assert list(all_figures(replace(report, extras=None))) == ["confusion", "per_run", "reliability"]
 
 
 def test_same_report_gives_same_bytes_and_another_gives_others(report):
@@ -198,13 +178,13 @@ def test_same_report_gives_same_bytes_and_another_gives_others(report):
     assert png_bytes(once) == png_bytes(again)
     assert svg_text(once) == svg_text(again) == svg_text(once), "and drawing changes nothing"
     assert "<dc:date>" not in svg_text(once)
-    report["confusion"] = [[31, 9], [6, 114]]
-    assert svg_text(confusion_figure(report)) != svg_text(once)
+    other = replace(report, confusion=((31, 9), (6, 114)))
+    assert svg_text(confusion_figure(other)) != svg_text(once)
 
 
 def test_a_name_is_drawn_as_it_is_written(report):
-    report["per_run"][0]["run_id"] = r"$\frac{1}$"
-    assert png_bytes(per_run_figure(report))
+    runs = [each._replace(run_id=r"$\frac{1}$") for each in report.per_run]
+    assert png_bytes(per_run_figure(replace(report, per_run=runs)))
 
 
 def test_no_global_state_is_touched():
@@ -213,8 +193,9 @@ def test_no_global_state_is_touched():
         "settings = lambda: {k: v for k, v in matplotlib.rcParams.copy().items() if k != 'backend'}\n"
         "before = settings()\n"
         "from pipelines.reporting.drawing import svg_text\n"
-        "from pipelines.classify.figures import confusion_figure\n"
-        "svg_text(confusion_figure({'classes': ['a', 'b'], 'confusion': [[1, 0], [0, 1]]}))\n"
+        "from pipelines.classify.figures import importance_figure\n"
+        "from pipelines.classify.results import ChannelImportance\n"
+        "svg_text(importance_figure([ChannelImportance('imu.gyro_x', 0.2, 0.01)]))\n"
         "assert settings() == before, 'settings changed'\n"
         "assert 'matplotlib.pyplot' not in sys.modules, 'pyplot imported'\n"
     )

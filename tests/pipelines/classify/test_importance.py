@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from pipelines.classify.evaluation import Examples
 from pipelines.classify.importance import channel_importance, channel_of
 from pipelines.classify.splits import Fold
 from terrain.classify.folds import split_runs
@@ -21,12 +22,14 @@ def importance(hidden, seed=0):
     features = rng.standard_normal((len(y), len(NAMES)))
     if hidden is not None:
         columns = [i for i, name in enumerate(NAMES) if channel_of(name) == hidden]
-        told = 3.0 * (run % 3) + 0.3 * rng.standard_normal(len(y))
-        features[:, columns] = told[:, None] + 0.01 * features[:, columns]
+        signal = 3.0 * (run % 3) + 0.3 * rng.standard_normal(len(y))
+        features[:, columns] = signal[:, None] + 0.01 * features[:, columns]
     folds = [Fold(0, k, *rows) for k, rows in enumerate(split_runs(y, run, 4, np.random.default_rng(0)))]
-    rows = channel_importance(GroupedSVC(((10.0, 0.4, 100.0),)), features, NAMES, y, run, folds, seed, 1)
-    assert [row["drop"] for row in rows] == sorted((row["drop"] for row in rows), reverse=True)
-    return {row["feature"]: (row["drop"], row["std"]) for row in rows}
+    rows = channel_importance(
+        GroupedSVC(((10.0, 0.4, 100.0),)), Examples(features, y, run), NAMES, folds, seed, 1
+    )
+    assert [row.drop for row in rows] == sorted((row.drop for row in rows), reverse=True)
+    return {row.feature: (row.drop, row.std) for row in rows}
 
 
 @pytest.mark.parametrize("hidden", ["imu.accel_z", "imu.gyro_x", "wheels.current_left"])

@@ -2,11 +2,11 @@ import numpy as np
 import pytest
 
 from features.windows import WindowRule
+from pipelines.classify.settings import PUBLISHED_WINDOW_S
 from pipelines.classify.splits import (
     N_FOLDS,
     PARTITION_S,
     PUBLISHED_STRIDE_S,
-    PUBLISHED_WINDOW_S,
     folds_of,
     grouped_samples,
     published_samples,

@@ -7,9 +7,13 @@ import pytest
 
 from pipelines.classify.crossval import samples_of
 from pipelines.classify.predict import predict
+from pipelines.classify.settings import TrainSettings
 from pipelines.classify.train import model_info, train
 from pipelines.models.model_files import TerrainModel, read_model
+from pipelines.quickstart.settings import QuickstartSettings
+from pipelines.reporting.json_file import as_json, with_deprecated_keys
 from pipelines.runs.import_logs import import_logs
+from pipelines.runs.settings import ImportSettings
 from terrain.control.slip_table import DRIVE_STATES, SlipTable, load_slip_table
 from terrain.errors import ConfigError, DataError, TerrainError
 from terrain.logs.write import write_run
@@ -23,37 +27,41 @@ def model(tracked):
 
 def test_training_is_judged_on_held_out_runs_and_says_where_the_model_is(tracked):
     _, result = tracked
-    json.dumps(result, allow_nan=False)
-    assert (result["model_uri"], result["version"]) == ("models:/drawn/1", "1")
-    assert result["crossval"]["protocol"] == "grouped"
-    assert result["n_windows"] == 144
-    drops = [row["drop"] for row in result["importance"]]
+    document = as_json(result)
+    json.dumps(document, allow_nan=False)
+    assert (document["model_uri"], document["version"]) == ("models:/drawn/1", "1")
+    assert set(document) == {
+        *("model_uri", "version", "run_id", "alias_moved", "alias_reason", "dataset", "data_digest"),
+        *("commit", "n_windows", "chosen", "importance", "crossval"),
+    }
+    assert document["crossval"]["protocol"] == "grouped"
+    assert "dataset" not in document["crossval"]
+    assert result.n_windows == 144
+    drops = [row.drop for row in result.importance]
     assert drops == sorted(drops, reverse=True)
 
 
 def test_new_runs_of_known_terrain_are_predicted(model, drive_all):
     runs = drive_all(n_runs=2, seed=77)
     result = predict(runs, model, load_slip_table())
-    json.dumps(result, allow_nan=False)
-    assert result["n_windows"] == len(result["windows"]) == result["n_judged"] == 2 * 3 * 12
-    assert result["accuracy"] > 0.6  # chance is one third
-    right = [row["terrain"] == row["run_id"].rpartition("_")[0] for row in result["windows"]]
-    assert result["accuracy"] == pytest.approx(np.mean(right))
-    starts = [row["start_s"] for row in result["windows"] if row["run_id"] == "GRASS_1"]
+    document = with_deprecated_keys(as_json(result))
+    json.dumps(document, allow_nan=False)
+    assert document["taught_runs"] == document["training_runs"] == []
+    assert result.n_windows == len(result.windows) == result.n_judged == 2 * 3 * 12
+    assert result.accuracy > 0.6  # chance is one third
+    right = [row.terrain == row.run_id.rpartition("_")[0] for row in result.windows]
+    assert result.accuracy == pytest.approx(np.mean(right))
+    starts = [row.start_s for row in result.windows if row.run_id == "GRASS_1"]
     assert starts == pytest.approx(np.arange(0, 24, 2))
-    for row in result["windows"]:
-        assert 1 / 3 <= row["probability"] <= 1
-        assert set(row["target_slip"]) == set(DRIVE_STATES)
-    assert result["taught_runs"] == []
+    for row in result.windows:
+        assert 1 / 3 <= row.probability <= 1
+        assert set(row.target_slip) == set(DRIVE_STATES)
 
 
-def test_accuracy_on_the_very_runs_that_were_taught_is_called_memory(model, runs):
-    assert predict(runs, model, load_slip_table())["taught_runs"] == [run.run_id for run in runs]
-
-
-def test_one_taught_run_among_new_ones_is_named(model, runs, drive):
+def test_training_runs_among_new_ones_are_named(model, runs, drive):
+    assert predict(runs, model, load_slip_table()).training_runs == tuple(run.run_id for run in runs)
     result = predict([runs[0], drive("new", "GRASS", 8)], model, load_slip_table())
-    assert result["taught_runs"] == [runs[0].run_id]
+    assert result.training_runs == (runs[0].run_id,)
 
 
 @pytest.mark.parametrize(
@@ -72,7 +80,7 @@ def test_a_model_of_some_signals_needs_no_others(runs, drive, settings, options,
     model = TerrainModel(recipe, model_info(runs, chosen, windows, "drawn", "none"))
     new = drive("new", "GRASS", 8)
     bare = RunLog("new", "husky", {name: new.streams[name] for name in streams}, new.labels)
-    assert predict([bare], model, load_slip_table())["n_windows"] == 12
+    assert predict([bare], model, load_slip_table()).n_windows == 12
 
 
 def test_labels_the_model_never_saw_are_predicted_counted_and_not_judged(model, drive, drive_all):
@@ -83,19 +91,19 @@ def test_labels_the_model_never_saw_are_predicted_counted_and_not_judged(model, 
         drive("tar_1", "GRAVEL", 9, label="TAR", duration_s=10.0),
     ]
     both = predict(known + strange, model, load_slip_table())
-    assert both["unknown_labels"] == {"LAVA": 12, "TAR": 5}
-    assert both["n_unknown_labels"] == 17
-    assert (both["accuracy"], both["n_judged"]) == (alone["accuracy"], alone["n_judged"])
-    assert both["n_windows"] == alone["n_windows"] + 17
-    assert {row["terrain"] for row in both["windows"]} <= set(both["classes"])
+    assert both.unknown_labels == {"LAVA": 12, "TAR": 5}
+    assert both.n_unknown_labels == 17
+    assert (both.accuracy, both.n_judged) == (alone.accuracy, alone.n_judged)
+    assert both.n_windows == alone.n_windows + 17
+    assert {row.terrain for row in both.windows} <= set(both.classes)
     only = predict(strange, model, load_slip_table())
-    assert (only["accuracy"], only["n_judged"]) == (None, 0)
+    assert (only.accuracy, only.n_judged) == (None, 0)
 
 
 def test_runs_without_labels_have_no_accuracy(model, drive):
     result = predict([drive("r", "GRASS", 3, label=None)], model, load_slip_table())
-    assert (result["accuracy"], result["n_judged"], result["unknown_labels"]) == (None, 0, {})
-    assert {row["label"] for row in result["windows"]} == {None}
+    assert (result.accuracy, result.n_judged, result.unknown_labels) == (None, 0, {})
+    assert {row.label for row in result.windows} == {None}
 
 
 def test_a_terrain_without_an_entry_gets_the_named_fallback(model, drive_all):
@@ -104,18 +112,18 @@ def test_a_terrain_without_an_entry_gets_the_named_fallback(model, drive_all):
         "bare", "unknown", {"unknown": table.targets["unknown"], "ASPHALT": table.targets["ASPHALT"]}
     )
     result = predict(drive_all(n_runs=1, seed=5), model, bare)
-    entries = {(row["terrain"], row["slip_entry"]) for row in result["windows"]}
+    entries = {(row.terrain, row.slip_entry) for row in result.windows}
     assert entries == {("ASPHALT", "ASPHALT"), ("GRASS", "unknown"), ("GRAVEL", "unknown")}
-    for row in result["windows"]:
+    for row in result.windows:
         for state in DRIVE_STATES:
-            target = bare.targets[row["slip_entry"]][state]
-            assert (row["target_slip"][state], row["status"][state]) == (target.slip_ratio, target.status)
+            target = bare.targets[row.slip_entry][state]
+            assert (row.target_slip[state], row.status[state]) == (target.slip_ratio, target.status)
 
 
 def test_a_table_of_another_robot_is_refused(model, drive):
     run = drive("r", "GRASS", 3)
     table = load_slip_table()
-    assert predict([run], model, replace(table, robot=run.robot))["n_runs"] == 1
+    assert predict([run], model, replace(table, robot=run.robot)).n_runs == 1
     with pytest.raises(ConfigError, match="is for robot 'agrimaro', run r is of 'husky'"):
         predict([run], model, replace(table, robot="agrimaro"))
 
@@ -129,15 +137,15 @@ def test_windows_that_are_dropped_are_counted_and_the_others_do_not_change(model
     kept = np.r_[0:800, 830:1200]  # 16.0 to 16.6 s
     streams = {**run.streams, "imu": Stream(imu.time_s[kept], values[kept], imu.channels)}
     holed = predict([RunLog("r", "husky", streams, run.labels)], model, load_slip_table())
-    assert holed["dropped"] == {"gap": 1, "not finite": 1}
-    expected = [row for row in whole["windows"] if row["start_s"] not in (6.0, 16.0)]
-    assert len(holed["windows"]) == 10
-    for row, same in zip(holed["windows"], expected, strict=True):
-        assert (row["start_s"], row["terrain"]) == (same["start_s"], same["terrain"])
-        assert row["probability"] == pytest.approx(same["probability"], abs=1e-12)
+    assert holed.dropped == {"gap": 1, "not finite": 1}
+    expected = [row for row in whole.windows if row.start_s not in (6.0, 16.0)]
+    assert len(holed.windows) == 10
+    for row, same in zip(holed.windows, expected, strict=True):
+        assert (row.start_s, row.terrain) == (same.start_s, same.terrain)
+        assert row.probability == pytest.approx(same.probability, abs=1e-12)
     still = drive("still", "GRASS", 4, speed_mps=0.0)
     nothing = predict([still], model, load_slip_table())
-    assert (nothing["windows"], nothing["accuracy"], nothing["dropped"]) == ([], None, {"not moving": 12})
+    assert (nothing.windows, nothing.accuracy, nothing.dropped) == ((), None, {"not moving": 12})
 
 
 def test_runs_that_do_not_fit_the_model_are_named(model, drive):
@@ -155,28 +163,27 @@ def test_runs_that_do_not_fit_the_model_are_named(model, drive):
     with pytest.raises(DataError, match=r"run s lasts 1\.00 s, shorter than a window of 2 s"):
         predict([run, short], model, load_slip_table())
     skipped = predict([run, short], model, load_slip_table(), skip_short=True)
-    assert (skipped["n_windows"], skipped["dropped"]) == (12, {"run too short": 1})
+    assert (skipped.n_windows, skipped.dropped) == (12, {"run too short": 1})
 
 
 @pytest.mark.parametrize("name", ["", "a/b", "a:b", "a@b", "a b", "a.b"])
-def test_a_name_no_registry_takes_is_refused_before_any_work(name, settings, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_a_name_no_registry_takes_is_refused(name):
     with pytest.raises(ConfigError, match=f"model name '{name}'"):
-        train([], settings(), name, "none")
-    assert list(tmp_path.iterdir()) == []
+        TrainSettings(name=name)
 
 
-def test_training_is_judged_by_the_grouped_protocol_only(settings):
-    with pytest.raises(ConfigError, match="not by 'published'"):
-        train([], settings(protocol="published"), "m", "none")
+def test_training_is_evaluated_by_the_grouped_protocol_only():
+    assert TrainSettings(name="m").evaluation.protocol == "grouped"
+    with pytest.raises(ConfigError, match="there is no setting 'protocol'"):
+        TrainSettings(name="m", protocol="published")
 
 
-def test_a_tracking_folder_that_cannot_be_written_is_told_before_any_work(settings, tmp_path, monkeypatch):
+def test_a_tracking_folder_that_cannot_be_written_is_reported_before_any_work(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
     (tmp_path / "mlruns").write_text("in the way")
     with pytest.raises(TerrainError, match="mlruns: cannot be written"):
-        train([], settings(), "m", "none")
+        train([], TrainSettings(name="m"), "none")
     assert (tmp_path / "mlruns").read_text() == "in the way"
 
 
@@ -188,12 +195,13 @@ def test_quickstart_goes_all_the_way_to_a_report_in_one_file(
     monkeypatch.setattr("pipelines.classify.extras.CURVE_RUNS", (1,))
     for run in drive_all(n_runs=2, duration_s=16.0):
         write_run(run, tmp_path / "data")
-    out, told = tmp_path / "out", []
+    steps = []
 
     def progress(task, done, total):
-        told.append((task, done, total))
+        steps.append((task, done, total))
 
-    first = quickstart(tmp_path / "data", out, settings(extras=True), "quick", progress)
+    asked = QuickstartSettings(data=tmp_path / "data", out=tmp_path / "out", name="quick")
+    first = as_json(quickstart(asked, progress, settings(extras=True)))
     json.dumps(first, allow_nan=False)
     assert (first["imported"]["n_runs"], first["imported"]["reused"]) == (6, False)
     assert first["train"]["model_uri"] == "models:/quick/1"
@@ -202,7 +210,7 @@ def test_quickstart_goes_all_the_way_to_a_report_in_one_file(
     assert page.lstrip().lower().startswith("<!doctype html>")
     assert "http://" not in page.replace("http://www.w3.org", "")
     assert "<script" not in page
-    assert {task for task, _, _ in told} >= {
+    assert {task for task, _, _ in steps} >= {
         "write runs",
         "features",
         "grouped",
@@ -210,27 +218,28 @@ def test_quickstart_goes_all_the_way_to_a_report_in_one_file(
         "predict",
         "report",
     }
-    for task in {task for task, _, _ in told}:
-        done, total = [step[1:] for step in told if step[0] == task][-1]
+    for task in {task for task, _, _ in steps}:
+        done, total = [step[1:] for step in steps if step[0] == task][-1]
         assert done == total
 
 
-def test_quickstart_reuses_its_own_import_and_no_other(drive_all, drive, settings, tmp_path, monkeypatch):
+def test_quickstart_reuses_its_own_import_and_no_other(drive_all, drive, tmp_path, monkeypatch):
     from pipelines.quickstart import quickstart as module
 
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(module, "crossval", lambda *_: (_ for _ in ()).throw(DataError("as far as this")))
     for run in drive_all(n_runs=1, duration_s=4.0):
         write_run(run, tmp_path / "data")
+    asked = QuickstartSettings(data=tmp_path / "data", out=tmp_path / "out", name="quick")
     with pytest.raises(DataError, match="as far as this"):
-        module.quickstart(tmp_path / "data", tmp_path / "out", settings(), "quick")
+        module.quickstart(asked)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["data"]  # a refusal leaves nothing
-    import_logs(tmp_path / "data", tmp_path / "out" / "runs")
+    import_logs(ImportSettings(data=tmp_path / "data", out=tmp_path / "out" / "runs"))
     with pytest.raises(DataError, match="as far as this"):
-        module.quickstart(tmp_path / "data", tmp_path / "out", settings(), "quick")
+        module.quickstart(asked)
     imported = sorted(path.name for path in (tmp_path / "out" / "runs").iterdir())
     assert imported == ["ASPHALT_1", "GRASS_1", "GRAVEL_1"]
     write_run(drive("GRASS_2", "GRASS", 0, 4.0), tmp_path / "data")
     with pytest.raises(DataError, match=r"out/runs: holds other runs than .*data; choose another --out"):
-        module.quickstart(tmp_path / "data", tmp_path / "out", settings(), "quick")
+        module.quickstart(asked)
     assert sorted(path.name for path in (tmp_path / "out" / "runs").iterdir()) == imported

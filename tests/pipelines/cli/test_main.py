@@ -171,7 +171,7 @@ def test_a_model_that_cannot_be_trusted_is_one_sentence(refused, place, drive, t
     refused("table.yaml: is no YAML", *ask, tracked[0] / "model", "--table", place / "table.yaml")
 
 
-def test_an_output_that_cannot_be_written_is_told_before_the_work(refused, place, drive_all, monkeypatch):
+def test_an_output_that_cannot_be_written_is_reported_before_the_work(refused, place, drive_all, monkeypatch):
     data = keep(drive_all(n_runs=2, duration_s=4.0), place)
     (place / "file").write_text("in the way")
     (place / "mlruns").write_text("in the way")
@@ -291,8 +291,8 @@ def test_predict_prints_terrain_probability_and_target_slip(terrain, place, driv
     code, out, err = terrain(*words)
     assert (code, err) == (0, "")
     for words in (
-        "+0.31", "-0.32", "+0.07", "the fallback 'any' stands in", "nobody measured them",
-        "11 windows are labelled LAVA, which the model never saw", "windows left out: 1 not finite",
+        "+0.31", "-0.32", "+0.07", "the fallback 'any' is used", "are unestimated: not measured",
+        "11 windows are labelled LAVA, which the model was not trained on", "windows left out: 1 not finite",
     ):  # fmt: skip
         assert words in out
     result = json.loads((place / "p.json").read_text())
@@ -335,17 +335,19 @@ def test_the_command_itself_ends_with_code_2_and_one_line(tmp_path):
 
 def test_the_choices_of_the_command_line_are_those_that_there_are():
     """They are written twice, so that help need not load what offers them."""
-    from pipelines.classify.splits import PROTOCOLS
+    from typing import get_args
+
+    from pipelines.classify.settings import RECIPES as RECIPE_CHOICES
     from pipelines.cli import main as cli
     from pipelines.models.recipes import RECIPES
     from pipelines.reproduce.reproduce import PAPERS
     from pipelines.runs.datasets import LAYOUTS
+    from pipelines.runs.settings import Layout
     from terrain.estimation.estimate import FILTERS, TUNINGS
 
+    assert get_args(Layout) == LAYOUTS
+    assert RECIPE_CHOICES == RECIPES
     for choices, offered in (
-        (cli.Format, LAYOUTS),
-        (cli.Protocol, PROTOCOLS),
-        (cli.Recipe, RECIPES),
         (cli.FilterName, FILTERS),
         (cli.Tuning, TUNINGS),
         (cli.Paper, PAPERS),

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from features.windows import cut_windows
-from pipelines.classify.crossval import CrossvalSettings, samples_of
+from pipelines.classify.crossval import samples_of
+from pipelines.classify.settings import CrossvalSettings
 from pipelines.classify.train import model_info
 from pipelines.live.pilot import LivePilot
 from pipelines.live.watch import Classifier, Nobody, Told

@@ -42,27 +42,27 @@ def log(tracked, runs):
 
 
 def test_a_training_run_holds_what_is_needed_to_judge_and_repeat_it(in_tracked, mlflow, runs):
-    result = in_tracked
-    run = mlflow.get_run(result["run_id"])
+    result, model = in_tracked, in_tracked.registered
+    run = mlflow.get_run(model.run_id)
     assert run.data.params["window_s"] == "2.0"
     assert run.data.params["n_runs"] == "12"
-    assert run.data.params["chosen_C"] == str(result["chosen"]["C"])
-    report = result["crossval"]
+    assert run.data.params["chosen_C"] == str(result.chosen["C"])
+    report = result.crossval
     for metric in ("accuracy", "balanced_accuracy", "macro_f1", "vote_accuracy", "ece"):
-        assert run.data.metrics[metric] == pytest.approx(report[metric])
+        assert run.data.metrics[metric] == pytest.approx(getattr(report, metric))
     assert run.data.tags["data_digest"] == data_digest(runs)
     assert run.data.tags["seed"] == "0"
-    assert run.data.tags["commit"] == result["commit"]
+    assert run.data.tags["commit"] == result.commit
     client = mlflow.MlflowClient()
-    figures = {file.path for file in client.list_artifacts(result["run_id"], "figures")}
+    figures = {file.path for file in client.list_artifacts(model.run_id, "figures")}
     assert figures == {
         f"figures/{name}.png" for name in ("confusion", "reliability", "per_run", "importance")
     }
-    logged = mlflow.artifacts.load_text(f"runs:/{result['run_id']}/crossval.json")
-    assert json.loads(logged)["accuracy"] == report["accuracy"]
-    version = client.get_model_version("drawn", result["version"])
-    assert version.run_id == result["run_id"]
-    signature = mlflow.models.get_model_info(result["model_uri"]).signature
+    logged = mlflow.artifacts.load_text(f"runs:/{model.run_id}/crossval.json")
+    assert json.loads(logged)["accuracy"] == report.accuracy
+    version = client.get_model_version("drawn", model.version)
+    assert version.run_id == model.run_id
+    signature = mlflow.models.get_model_info(model.model_uri).signature
     assert {(spec.name, spec.shape) for spec in signature.inputs} == {
         ("imu", (-1, 6, 100)),
         ("wheels", (-1, 4, 20)),
@@ -70,9 +70,9 @@ def test_a_training_run_holds_what_is_needed_to_judge_and_repeat_it(in_tracked, 
 
 
 def test_the_pyfunc_flavour_says_what_the_recipe_says(in_tracked, mlflow, runs):
-    model = load_model(in_tracked["model_uri"])
+    model = load_model(in_tracked.registered.model_uri)
     windows = cut_windows(runs, model.rule).windows
-    served = mlflow.pyfunc.load_model(in_tracked["model_uri"]).predict(windows.values)
+    served = mlflow.pyfunc.load_model(in_tracked.registered.model_uri).predict(windows.values)
     np.testing.assert_array_equal(served, model.recipe.predict(windows))
 
 
@@ -80,7 +80,7 @@ def test_a_model_is_loaded_by_alias_version_run_and_folder(in_tracked, runs, tra
     uris = [
         "models:/drawn@champion",
         "models:/drawn/1",
-        f"runs:/{in_tracked['run_id']}/model",
+        f"runs:/{in_tracked.registered.run_id}/model",
         str(tracked[0] / "model"),
     ]
     models = [load_model(uri) for uri in uris]
@@ -102,7 +102,7 @@ def champion_of(name):
 
 
 def test_the_champion_moves_by_the_rule(in_tracked, log):
-    told = []
+    reasons = []
     for macro_f1, digest, champion in (
         (0.80, "aa", "1"),  # the first
         (0.80, "aa", "1"),  # no better
@@ -111,10 +111,10 @@ def test_the_champion_moves_by_the_rule(in_tracked, log):
         (0.20, "bb", "5"),  # worse, on new data
     ):
         registered = log("by_rule", macro_f1, digest)
-        told.append(registered.alias_reason)
+        reasons.append(registered.alias_reason)
         assert registered.alias_moved == (registered.version == champion)
         assert champion_of("by_rule") == [champion]
-    assert told == [
+    assert reasons == [
         "first version",
         "macro F1 0.8000 is not better than 0.8000 of version 1 on the same data",
         "macro F1 0.8500 is better than 0.8000 of version 1 on the same data",
@@ -122,7 +122,7 @@ def test_the_champion_moves_by_the_rule(in_tracked, log):
         "new data: the digest differs from that of version 3",
     ]
     assert load_model("models:/by_rule@champion").info["data_digest"] == "bb"
-    assert in_tracked["alias_reason"] == "first version"
+    assert in_tracked.registered.alias_reason == "first version"
 
 
 def test_the_server_that_is_named_is_the_one_that_is_used(tracked, log, tmp_path, monkeypatch):

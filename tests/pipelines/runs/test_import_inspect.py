@@ -5,9 +5,12 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from pipelines.reporting.json_file import as_json
 from pipelines.runs.datasets import data_digest, load_runs
 from pipelines.runs.import_logs import import_logs
-from pipelines.runs.inspect_logs import inspect_logs, print_inspection
+from pipelines.runs.inspect_logs import inspect_logs
+from pipelines.runs.screen import print_inspection
+from pipelines.runs.settings import ImportSettings, InspectSettings
 from terrain.errors import LogError, TerrainError
 from terrain.logs.write import write_run
 from terrain.records import RunLog
@@ -18,9 +21,11 @@ def tree(folder):
 
 
 def test_imported_runs_are_the_runs_that_were_read(borealtc_dir, tmp_path):
-    told = []
-    report = import_logs(borealtc_dir, tmp_path / "out", progress=told.append)
-    assert told == report["run_ids"] == ["ICE_01", "SNOW_01", "SNOW_02"]
+    steps = []
+    asked = ImportSettings(data=borealtc_dir, out=tmp_path / "out")
+    report = as_json(import_logs(asked, progress=lambda *step: steps.append(step)))
+    assert steps == [("write runs", n, 3) for n in (1, 2, 3)]
+    assert report["run_ids"] == ["ICE_01", "SNOW_01", "SNOW_02"]
     assert (report["labels"], report["dropped"], report["skipped"]) == ({"ICE": 1, "SNOW": 2}, {}, [])
     assert (
         report["digest"] == data_digest(load_runs(tmp_path / "out")) == data_digest(load_runs(borealtc_dir))
@@ -31,7 +36,7 @@ def test_imported_runs_are_the_runs_that_were_read(borealtc_dir, tmp_path):
 def test_nothing_is_written_when_one_run_cannot_be_read(borealtc_dir, tmp_path):
     (borealtc_dir / "SNOW" / "pro_02.csv").write_text("time\n")
     with pytest.raises(LogError, match=r"SNOW/pro_02\.csv: column 'velL' is missing"):
-        import_logs(borealtc_dir, tmp_path / "out")
+        import_logs(ImportSettings(data=borealtc_dir, out=tmp_path / "out"))
     assert not (tmp_path / "out").exists()
 
 
@@ -39,26 +44,26 @@ def test_nothing_that_is_there_is_touched(borealtc_dir, tmp_path, make_run):
     write_run(make_run("SNOW_02", seed=9), tmp_path / "out")
     before = tree(tmp_path)
     with pytest.raises(LogError, match="SNOW_02: is there already, and is left as it is"):
-        import_logs(borealtc_dir, tmp_path / "out")
+        import_logs(ImportSettings(data=borealtc_dir, out=tmp_path / "out"))
     assert tree(tmp_path) == before
 
 
-def test_a_place_that_cannot_be_written_is_told_in_one_sentence(borealtc_dir, tmp_path):
+def test_a_place_that_cannot_be_written_is_one_sentence(borealtc_dir, tmp_path):
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(TerrainError, match="cannot be written") as error:
-        import_logs(borealtc_dir, tmp_path / "file" / "out")
+        import_logs(ImportSettings(data=borealtc_dir, out=tmp_path / "file" / "out"))
     assert "\n" not in str(error.value)
 
 
 def test_repair_is_counted_and_the_counts_travel_with_the_runs(borealtc_dir, tmp_path, edit):
     edit(borealtc_dir / "SNOW" / "imu_01.csv", lambda lines: [*lines[:30], *lines[29:]])
     (borealtc_dir / "ICE" / "pro_01.csv").unlink()
-    report = import_logs(borealtc_dir, tmp_path / "out", repair=True)
-    assert report["run_ids"] == ["SNOW_01", "SNOW_02"]
-    assert report["dropped"] == {"rows with a bad time": 1}
-    assert report["skipped"] == ["run skipped: ICE/pro_01.csv: is missing"]
-    inspected = inspect_logs(tmp_path / "out")
-    assert [run["dropped"] for run in inspected["runs"]] == [{"rows with a bad time": 1}, {}]
+    report = import_logs(ImportSettings(data=borealtc_dir, out=tmp_path / "out", repair=True))
+    assert report.run_ids == ("SNOW_01", "SNOW_02")
+    assert report.dropped == {"rows with a bad time": 1}
+    assert report.skipped == ("run skipped: ICE/pro_01.csv: is missing",)
+    inspected = inspect_logs(InspectSettings(data=tmp_path / "out"))
+    assert [run.dropped for run in inspected.runs] == [{"rows with a bad time": 1}, {}]
 
 
 def test_inspect_shows_rates_gaps_stuck_channels_missing_values_and_the_clock(borealtc_dir, edit):
@@ -70,7 +75,7 @@ def test_inspect_shows_rates_gaps_stuck_channels_missing_values_and_the_clock(bo
         return [",".join(row) for row in rows[:60] + rows[70:]]
 
     edit(borealtc_dir / "SNOW" / "imu_01.csv", spoil)
-    report = inspect_logs(borealtc_dir)
+    report = as_json(inspect_logs(InspectSettings(data=borealtc_dir)))
     json.dumps(report, allow_nan=False)
     run = next(run for run in report["runs"] if run["run_id"] == "SNOW_01")
     imu = run["streams"]["imu"]
@@ -86,22 +91,22 @@ def test_inspect_shows_rates_gaps_stuck_channels_missing_values_and_the_clock(bo
 
 def test_inspect_prints_a_row_for_every_stream(datasets_dir, tmp_path, make_run):
     text = io.StringIO()
-    report = inspect_logs(datasets_dir / "vulpi")
+    report = inspect_logs(InspectSettings(data=datasets_dir / "vulpi"))
     print_inspection(report, Console(file=text, width=200))
     lines = text.getvalue().splitlines()
     assert sum("│ imu " in line for line in lines) == sum("│ wheels " in line for line in lines) == 18
     assert any("PLOUGHED_4" in line and "estimated: offset" in line and "rate -1." in line for line in lines)
-    assert report["digest"][:12] in text.getvalue()
+    assert report.digest[:12] in text.getvalue()
 
 
 def test_runs_without_wheels_or_with_a_foreign_robot_are_inspected_too(tmp_path, make_run):
     run = make_run()
     write_run(RunLog("A", "husky", {"imu": run.streams["imu"]}), tmp_path)
     write_run(RunLog("B", "somebody's own", run.streams), tmp_path)
-    report = inspect_logs(tmp_path)
-    assert [entry["clock"] for entry in report["runs"]] == [None, None]
-    assert report["runs"][0]["terrains"] == []
+    report = inspect_logs(InspectSettings(data=tmp_path))
+    assert [run.clock for run in report.runs] == [None, None]
+    assert report.runs[0].terrains == ()
     text = io.StringIO()
     print_inspection(report, Console(file=text, width=200))
     assert "no gyro, no speeds of a left and a right wheel, or an unknown robot" in text.getvalue()
-    assert np.isfinite(report["runs"][1]["streams"]["wheels"]["rate_hz"])
+    assert np.isfinite(report.runs[1].streams["wheels"].rate_hz)

@@ -6,6 +6,7 @@ import pytest
 
 from pipelines.runs.datasets import data_digest, load_runs
 from pipelines.runs.import_logs import import_logs
+from pipelines.runs.settings import ImportSettings
 from terrain.errors import LogError
 from terrain.logs.drive import FILE_NAME, STREAMS, WHEEL_RADIUS_M, body_twists, find_runs
 
@@ -263,9 +264,9 @@ def test_repair_skips_a_command_that_has_one_window_only(tmp_path, caplog):
 
 def test_import_writes_what_was_read(tmp_path):
     folder = write(tmp_path / "log", table())
-    found = import_logs(folder, tmp_path / "raw", layout="drive")
-    assert (found["n_runs"], found["labels"]) == (3, {})
-    assert data_digest(load_runs(tmp_path / "raw")) == found["digest"] == data_digest(load_runs(folder))
+    found = import_logs(ImportSettings(data=folder, out=tmp_path / "raw", layout="drive"))
+    assert (found.n_runs, found.labels) == (3, {})
+    assert data_digest(load_runs(tmp_path / "raw")) == found.digest == data_digest(load_runs(folder))
 
 
 @pytest.fixture(scope="module")

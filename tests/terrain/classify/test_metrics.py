@@ -2,8 +2,10 @@ import numpy as np
 import pytest
 from sklearn.metrics import accuracy_score, balanced_accuracy_score, f1_score
 
-from pipelines.classify.metrics import (
+from terrain.classify.metrics import (
     CALIBRATION_BINS,
+    ClassFigures,
+    RunFigures,
     calibration,
     class_figures,
     per_run_figures,
@@ -19,37 +21,37 @@ def test_class_figures_agree_with_counting_by_hand_and_with_scikit_learn():
     predicted = np.where(rng.random(500) < 0.6, y, rng.choice(classes, 500))
     figures = class_figures(y, predicted, classes)
     confusion = np.array([[np.sum((y == t) & (predicted == p)) for p in classes] for t in classes])
-    np.testing.assert_array_equal(figures["confusion"], confusion)
+    np.testing.assert_array_equal(figures.confusion, confusion)
     hits = np.diag(confusion)
     recall, precision = hits / confusion.sum(axis=1), hits / confusion.sum(axis=0)
     f1 = 2 * recall * precision / (recall + precision)
     for i, name in enumerate(classes):
-        row = figures["per_class"][name]
-        assert row["n_windows"] == np.sum(y == name)
-        assert (row["recall"], row["precision"], row["f1"]) == pytest.approx((recall[i], precision[i], f1[i]))
-    assert figures["accuracy"] == pytest.approx(accuracy_score(y, predicted))
-    assert figures["balanced_accuracy"] == pytest.approx(balanced_accuracy_score(y, predicted))
-    assert figures["macro_f1"] == pytest.approx(f1_score(y, predicted, average="macro"))
+        row = figures.per_class[name]
+        assert row.n_windows == np.sum(y == name)
+        assert (row.recall, row.precision, row.f1) == pytest.approx((recall[i], precision[i], f1[i]))
+    assert figures.accuracy == pytest.approx(accuracy_score(y, predicted))
+    assert figures.balanced_accuracy == pytest.approx(balanced_accuracy_score(y, predicted))
+    assert figures.macro_f1 == pytest.approx(f1_score(y, predicted, average="macro"))
 
 
 def test_a_class_without_windows_does_not_count_against_the_means():
     y = np.array(["ice", "ice", "mud", "mud"])
     figures = class_figures(y, np.array(["ice", "snow", "mud", "mud"]), np.array(["ice", "mud", "snow"]))
-    assert figures["balanced_accuracy"] == pytest.approx((0.5 + 1.0) / 2)
-    assert figures["macro_f1"] == pytest.approx((2 / 3 + 1.0) / 2)
-    assert figures["per_class"]["snow"] == {"precision": 0.0, "recall": 0.0, "f1": 0.0, "n_windows": 0}
+    assert figures.balanced_accuracy == pytest.approx((0.5 + 1.0) / 2)
+    assert figures.macro_f1 == pytest.approx((2 / 3 + 1.0) / 2)
+    assert figures.per_class["snow"] == ClassFigures(0.0, 0.0, 0.0, 0)
 
 
 def test_calibration_error_of_known_cases():
     # 15 bins of 100: in bin b the confidence is c_b and exactly c_b of 100 are right.
     confidence = np.repeat(np.arange(60, 90, 2) / 100, 100)
     right = np.concatenate([np.arange(100) < round(100 * c) for c in np.arange(60, 90, 2) / 100])
-    assert calibration(confidence, right)["ece"] == pytest.approx(0.0, abs=1e-12)
-    assert calibration(confidence, np.ones(1500, dtype=bool))["ece"] == pytest.approx(1 - confidence.mean())
+    assert calibration(confidence, right).ece == pytest.approx(0.0, abs=1e-12)
+    assert calibration(confidence, np.ones(1500, dtype=bool)).ece == pytest.approx(1 - confidence.mean())
     # Too bold in one half and too shy in the other: the signs must not cancel.
     half = np.repeat([0.6, 0.9], 750)
-    assert calibration(half, np.arange(1500) % 4 < 3)["ece"] == pytest.approx(0.15, abs=0.01)
-    assert calibration(half, np.arange(1500) % 4 < 3, n_bins=1)["ece"] == pytest.approx(0.0, abs=1e-9)
+    assert calibration(half, np.arange(1500) % 4 < 3).ece == pytest.approx(0.15, abs=0.01)
+    assert calibration(half, np.arange(1500) % 4 < 3, n_bins=1).ece == pytest.approx(0.0, abs=1e-9)
 
 
 def test_calibration_bins_are_of_equal_mass_whatever_the_order():
@@ -57,19 +59,19 @@ def test_calibration_bins_are_of_equal_mass_whatever_the_order():
     confidence = rng.beta(8, 1, 1003)  # crowded near 1: bins of equal width would be empty
     right = rng.random(1003) < confidence**2
     figures = calibration(confidence, right)
-    table = figures["reliability"]
-    counts = [row["n_windows"] for row in table]
+    table = figures.reliability
+    counts = [row.n_windows for row in table]
     assert len(table) == CALIBRATION_BINS
     assert sum(counts) == 1003
     assert max(counts) - min(counts) <= 1
-    assert np.all(np.diff([row["confidence"] for row in table]) > 0)
+    assert np.all(np.diff([row.confidence for row in table]) > 0)
     expected = (
-        sum(n * abs(row["accuracy"] - row["confidence"]) for n, row in zip(counts, table, strict=True)) / 1003
+        sum(n * abs(row.accuracy - row.confidence) for n, row in zip(counts, table, strict=True)) / 1003
     )
-    assert figures["ece"] == pytest.approx(expected)
+    assert figures.ece == pytest.approx(expected)
     shuffled = rng.permutation(1003)
     assert calibration(confidence[shuffled], right[shuffled]) == figures
-    assert [row["n_windows"] for row in calibration(confidence[:4], right[:4])["reliability"]] == [1] * 4
+    assert [row.n_windows for row in calibration(confidence[:4], right[:4]).reliability] == [1] * 4
 
 
 def ballots(*words):
@@ -162,12 +164,5 @@ def test_figures_of_a_run_are_means_over_repeats_and_name_the_usual_mistake():
     predicted = np.array(["ice", "mud", "mud", "snow", "mud", "mud"])
     correct = np.array([predicted == terrain, np.ones(6, dtype=bool)])
     first, second = per_run_figures(correct, predicted, correct[:1], run_id, terrain)
-    assert first == {
-        "run_id": "r1",
-        "terrain": "ice",
-        "n_windows": 4,
-        "accuracy": 0.625,
-        "vote_accuracy": 0.25,
-        "mistaken_for": "mud",
-    }
-    assert (second["accuracy"], second["mistaken_for"]) == (1.0, None)
+    assert first == RunFigures("r1", "ice", 4, 0.625, 0.25, "mud")
+    assert (second.accuracy, second.mistaken_for) == (1.0, None)

@@ -1,8 +1,8 @@
-"""Figures of merit from held-out predictions: plain arrays in, plain numbers out."""
+"""Figures of merit of held-out predictions: accuracy, calibration, votes, and an interval over runs."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 from sklearn.metrics import confusion_matrix, precision_recall_fscore_support
@@ -16,64 +16,106 @@ N_BOOTSTRAP = 2000
 TIME_TOLERANCE_S = 1e-6
 
 
-def class_figures(y: Array, predicted: Array, classes: Array) -> dict[str, Any]:
+class ClassFigures(NamedTuple):
+    """Precision, recall and F1 of one class, and how many windows were truly of it."""
+
+    precision: float
+    recall: float
+    f1: float
+    n_windows: int
+
+
+class Classification(NamedTuple):
+    """Figures of one set of predictions; rows of ``confusion`` are true classes, columns predicted ones."""
+
+    accuracy: float
+    balanced_accuracy: float
+    macro_f1: float
+    per_class: dict[str, ClassFigures]
+    confusion: tuple[tuple[int, ...], ...]
+
+
+class ReliabilityBin(NamedTuple):
+    """Mean confidence and accuracy of a bin of windows."""
+
+    confidence: float
+    accuracy: float
+    n_windows: int
+
+
+class Calibration(NamedTuple):
+    """Expected calibration error, and the bins that it is a mean over."""
+
+    ece: float
+    reliability: tuple[ReliabilityBin, ...]
+
+
+class RunFigures(NamedTuple):
+    """Accuracy of the windows of one run, and the class that wrong ones are predicted as most often."""
+
+    run_id: str
+    terrain: str
+    n_windows: int
+    accuracy: float
+    vote_accuracy: float
+    mistaken_for: str | None
+
+
+def class_figures(y: Array, predicted: Array, classes: Array) -> Classification:
     """Return accuracy, balanced accuracy, macro F1, per-class figures and the confusion matrix.
 
     Parameters
     ----------
     y, predicted : (n,) classes
-    classes : (k,) order of rows and columns; rows of ``confusion`` are the true classes
+    classes : (k,) order of rows and columns
 
     Examples
     --------
     >>> figures = class_figures(np.array(["a", "a", "b"]), np.array(["a", "b", "b"]), np.array(["a", "b"]))
-    >>> figures["confusion"], round(figures["balanced_accuracy"], 2)
-    ([[1, 1], [0, 1]], 0.75)
+    >>> figures.confusion, round(figures.balanced_accuracy, 2)
+    (((1, 1), (0, 1)), 0.75)
     """
     precision, recall, f1, support = precision_recall_fscore_support(
         y, predicted, labels=classes, zero_division=0.0
     )
     tested = support > 0
-    return {
-        "accuracy": float(np.mean(y == predicted)),
-        "balanced_accuracy": float(recall[tested].mean()),
-        "macro_f1": float(f1[tested].mean()),
-        "per_class": {
-            str(name): {
-                "precision": float(precision[i]),
-                "recall": float(recall[i]),
-                "f1": float(f1[i]),
-                "n_windows": int(support[i]),
-            }
+    return Classification(
+        accuracy=float(np.mean(y == predicted)),
+        balanced_accuracy=float(recall[tested].mean()),
+        macro_f1=float(f1[tested].mean()),
+        per_class={
+            str(name): ClassFigures(float(precision[i]), float(recall[i]), float(f1[i]), int(support[i]))
             for i, name in enumerate(classes)
         },
-        "confusion": confusion_matrix(y, predicted, labels=classes).tolist(),
-    }
+        confusion=tuple(map(tuple, confusion_matrix(y, predicted, labels=classes).tolist())),
+    )
 
 
-def calibration(confidence: Array, correct: Array, n_bins: int = CALIBRATION_BINS) -> dict[str, Any]:
+def calibration(confidence: Array, correct: Array, n_bins: int = CALIBRATION_BINS) -> Calibration:
     """Return the expected calibration error of the top label over bins of equal mass.
 
     ``ece = sum_b n_b / n |accuracy_b - confidence_b|`` with the windows sorted by confidence and cut into
     ``n_bins`` bins of equal count (Guo et al. 2017, eq. 3, equal mass instead of equal width).
 
+    Parameters
+    ----------
+    confidence : (n,) probability of the predicted class
+    correct : (n,) whether the prediction is right
+    n_bins : number of bins; fewer where there are fewer windows
+
     Examples
     --------
-    >>> calibration(np.full(100, 0.9), np.arange(100) < 60, 1)["ece"]
+    >>> calibration(np.full(100, 0.9), np.arange(100) < 60, 1).ece
     0.3
     """
     order = np.argsort(confidence, kind="stable")
-    bins = [part for part in np.array_split(order, n_bins) if len(part)]
-    table = [
-        {
-            "confidence": float(confidence[part].mean()),
-            "accuracy": float(correct[part].mean()),
-            "n_windows": len(part),
-        }
-        for part in bins
-    ]
-    ece = sum(row["n_windows"] * abs(row["accuracy"] - row["confidence"]) for row in table) / len(order)
-    return {"ece": round(float(ece), 12), "reliability": table}
+    bins = tuple(
+        ReliabilityBin(float(confidence[part].mean()), float(correct[part].mean()), len(part))
+        for part in np.array_split(order, n_bins)
+        if len(part)
+    )
+    ece = sum(each.n_windows * abs(each.accuracy - each.confidence) for each in bins) / len(order)
+    return Calibration(round(float(ece), 12), bins)
 
 
 def vote(
@@ -129,7 +171,7 @@ def run_bootstrap(
 
     Parameters
     ----------
-    correct : (n,) share of repeats in which each window was right
+    correct : (n,) fraction of the repeats in which each window was classified correctly
     run_id, terrain : (n,) run and class of each window
     rng : source of the draws
     """
@@ -150,26 +192,27 @@ def run_bootstrap(
 
 def per_run_figures(
     correct: Array, predicted: Array, voted_correct: Array, run_id: Array, terrain: Array
-) -> list[dict[str, Any]]:
-    """Return accuracy, voted accuracy and the most frequent wrong answer of each run.
+) -> tuple[RunFigures, ...]:
+    """Return the figures of each run, in the order of their ids.
 
     Parameters
     ----------
-    correct, voted_correct : (n,) or (repeats, n)
+    correct, voted_correct : (n,) or (repeats, n) whether the prediction and the vote are right
     predicted : (n,) predictions of one repeat
+    run_id, terrain : (n,) run and class of each window
     """
     figures = []
     for name in np.unique(run_id):
         rows = run_id == name
         wrong, counts = np.unique(predicted[rows & (predicted != terrain)], return_counts=True)
         figures.append(
-            {
-                "run_id": str(name),
-                "terrain": str(terrain[rows][0]),
-                "n_windows": int(rows.sum()),
-                "accuracy": float(np.mean(correct[..., rows])),
-                "vote_accuracy": float(np.mean(voted_correct[..., rows])),
-                "mistaken_for": str(wrong[counts.argmax()]) if len(wrong) else None,
-            }
+            RunFigures(
+                run_id=str(name),
+                terrain=str(terrain[rows][0]),
+                n_windows=int(rows.sum()),
+                accuracy=float(np.mean(correct[..., rows])),
+                vote_accuracy=float(np.mean(voted_correct[..., rows])),
+                mistaken_for=str(wrong[counts.argmax()]) if len(wrong) else None,
+            )
         )
-    return figures
+    return tuple(figures)

@@ -1,0 +1,130 @@
+"""What ``terrain crossval``, ``train`` and ``predict`` print."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from itertools import groupby
+
+from rich.console import Console
+from rich.table import Table
+
+from pipelines.classify.results import (
+    Applicability,
+    CrossvalReport,
+    Extras,
+    Predictions,
+    SlowFast,
+    Training,
+    WindowPrediction,
+)
+from pipelines.classify.splits import counted
+from pipelines.reporting.numbers import percent
+from pipelines.reporting.terminal import print_lines
+from terrain.control.slip_table import DRIVE_STATES
+
+MAX_ROWS = 12
+
+
+def print_crossval(report: CrossvalReport, console: Console) -> None:
+    """Print the headline, the classes, and the extras."""
+    low, high = report.accuracy_ci
+    spread = report.accuracy_spread
+    repeats = "" if spread is None else f", spread over {report.repeats} fold assignments {spread:.1%}"
+    console.print(
+        f"{report.dataset}, protocol {report.protocol}, recipe {report.recipe}: "
+        f"{report.n_windows} windows of {report.window_s:g} s from {report.n_runs} runs"
+    )
+    print_lines(
+        console,
+        (
+            f"accuracy {percent(report.accuracy)} (95 % over runs: {low:.1%} to {high:.1%}{repeats})",
+            f"balanced accuracy {percent(report.balanced_accuracy)}, macro F1 {report.macro_f1:.3f}, "
+            f"vote over 5 s {percent(report.vote_accuracy)}, calibration error {report.ece:.3f}",
+        ),
+    )
+    table = Table("terrain", "windows", "precision", "recall", "F1", title="per class, all repeats together")
+    for name, row in report.per_class.items():
+        table.add_row(name, str(row.n_windows), percent(row.precision), percent(row.recall), f"{row.f1:.3f}")
+    console.print(table)
+    if report.extras is not None:
+        print_lines(console, _extras_lines(report.extras))
+    print_lines(console, (f"note: {note}" for note in (*report.notes, *(report.skipped or ()))))
+
+
+def _extras_lines(extras: Extras) -> Iterator[str]:
+    speed = extras.speed_only_accuracy
+    yield (
+        f"from wheel speed alone: {'-' if speed is None else percent(speed)} "
+        "(what recognising the driving would give)"
+    )
+    yield _slow_fast_line(extras.slow_fast)
+    yield f"runs: {extras.learning_curve.statement}"
+
+
+def _slow_fast_line(result: SlowFast) -> str:
+    out = "".join(f"; {name} left out ({reason})" for name, reason in result.left_out.items())
+    if result.status is Applicability.NOT_APPLICABLE:
+        return f"trained slow, tested fast: not applicable{out}"
+    to_fast, to_slow = (
+        "-" if ratio is None else percent(ratio) for ratio in (result.slow_to_fast, result.fast_to_slow)
+    )
+    return f"trained slow, tested fast: {to_fast}; back: {to_slow} ({', '.join(result.classes)}{out})"
+
+
+def print_training(result: Training, console: Console) -> None:
+    """Print where the model is, and whether it is the champion."""
+    model = result.registered
+    verdict = "champion" if model.alias_moved else "not champion"
+    print_lines(
+        console,
+        [
+            f"model {model.model_uri} from {result.n_windows} windows: {verdict} ({model.alias_reason})",
+        ],
+    )
+
+
+def print_predictions(result: Predictions, console: Console) -> None:
+    """Print consecutive windows of one terrain as a row, with probability and target slip."""
+    table = Table(
+        "run", "from s", "windows", "terrain", "prob.", "traction", "braking", "steady", title="target slip"
+    )
+    stretches = [list(rows) for _, rows in groupby(result.windows, lambda row: (row.run_id, row.terrain))]
+    for rows in stretches[:MAX_ROWS]:
+        table.add_row(*_stretch_cells(rows))
+    console.print(table)
+    if len(stretches) > MAX_ROWS:
+        console.print(f"... and {len(stretches) - MAX_ROWS} stretches more; --json has every window")
+    without_entry = [row for row in result.windows if row.slip_entry != row.terrain]
+    if without_entry:
+        names = ", ".join(sorted({row.terrain for row in without_entry}))
+        entry = without_entry[0].slip_entry
+        console.print(f"no entry in the slip table for {names}: the fallback {entry!r} is used")
+    if any("unestimated" in row.status.values() for row in result.windows):
+        console.print(f"target slips from the table {result.table_name!r} are unestimated: not measured")
+    print_lines(console, _accuracy_lines(result))
+
+
+def _stretch_cells(rows: Sequence[WindowPrediction]) -> list[str]:
+    first = rows[0]
+    probability = sum(row.probability for row in rows) / len(rows)
+    slips = [f"{first.target_slip[state]:+.2f}" for state in DRIVE_STATES]
+    return [
+        first.run_id, f"{first.start_s:.1f}", str(len(rows)), first.terrain, f"{probability:.2f}", *slips
+    ]  # fmt: skip
+
+
+def _accuracy_lines(result: Predictions) -> Iterator[str]:
+    if result.accuracy is not None:
+        n_trained = len(result.training_runs)
+        caution = (
+            f"; the model was trained on {n_trained} of {result.n_runs} runs: no measure of its skill"
+            if n_trained
+            else ""
+        )
+        yield f"accuracy {percent(result.accuracy)} over {result.n_judged} labelled windows{caution}"
+    for name, count in result.unknown_labels.items():
+        yield f"{count} windows are labelled {name}, which the model was not trained on: not judged"
+    for text, counts in (("windows left out", result.dropped), ("repaired", result.repaired)):
+        if counts:
+            yield f"{text}: {counted(counts)}"
+    yield from result.skipped or ()

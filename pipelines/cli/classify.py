@@ -1,0 +1,69 @@
+"""Commands of terrain classification: crossval, train, predict."""
+
+from __future__ import annotations
+
+import typer
+
+from pipelines.classify.settings import CrossvalSettings, PredictSettings, TrainSettings
+from pipelines.cli.command import Json, command
+from pipelines.runs.settings import AlignedRunsSettings, load
+
+app = typer.Typer()
+
+
+@command(app, "crossval")
+def crossval_command(source: AlignedRunsSettings, settings: CrossvalSettings, json_file: Json = None) -> None:
+    """Evaluate a recipe on held-out runs."""
+    from dataclasses import replace
+
+    from pipelines.classify.crossval import crossval
+    from pipelines.classify.screen import print_crossval
+    from pipelines.reporting.json_file import write_json
+    from pipelines.reporting.terminal import output_console, progress_bar
+    from pipelines.runs.datasets import data_digest
+
+    runs, skipped = load(source)
+    with progress_bar() as progress:
+        report = crossval(runs, settings.with_(skip_short=source.repair), progress)
+    report = replace(report.named(source.dataset, data_digest(runs)), skipped=tuple(skipped))
+    print_crossval(report, output_console())
+    write_json(json_file, report)
+
+
+@command(app, "train")
+def train_command(source: AlignedRunsSettings, settings: TrainSettings, json_file: Json = None) -> None:
+    """Evaluate on held-out runs, fit on all of them, track in MLflow and register."""
+    from dataclasses import replace
+
+    from pipelines.classify.screen import print_crossval, print_training
+    from pipelines.classify.train import train
+    from pipelines.reporting.json_file import write_json
+    from pipelines.reporting.terminal import output_console, progress_bar
+
+    runs, skipped = load(source)
+    with progress_bar() as progress:
+        found = train(runs, settings.with_(skip_short=source.repair), source.dataset, progress)
+    result = replace(found, skipped=tuple(skipped))
+    print_crossval(replace(result.crossval, skipped=result.skipped), output_console())
+    print_training(result, output_console())
+    write_json(json_file, result)
+
+
+@command(app, "predict")
+def predict_command(source: AlignedRunsSettings, settings: PredictSettings, json_file: Json = None) -> None:
+    """Print terrain, probability and target slip."""
+    from dataclasses import replace
+
+    from pipelines.classify.predict import predict
+    from pipelines.classify.screen import print_predictions
+    from pipelines.models.tracking import load_model
+    from pipelines.reporting.json_file import write_json
+    from pipelines.reporting.terminal import output_console
+    from terrain.control.slip_table import load_slip_table
+
+    table = load_slip_table(settings.table)
+    runs, skipped = load(source)
+    predicted = predict(runs, load_model(settings.model), table, skip_short=source.repair)
+    result = replace(predicted, model=settings.model, dataset=source.dataset, skipped=tuple(skipped))
+    print_predictions(result, output_console())
+    write_json(json_file, result)

@@ -1,0 +1,40 @@
+"""What ``terrain quickstart`` prints."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from rich.console import Console
+from rich.table import Table
+
+from pipelines.classify.results import TerrainSlip
+from pipelines.classify.screen import print_crossval, print_predictions, print_training
+from pipelines.quickstart.results import QuickstartResult
+from pipelines.reporting.numbers import format_known
+from pipelines.reporting.terminal import number_columns, print_lines
+
+
+def print_quickstart(result: QuickstartResult, console: Console) -> None:
+    """Print slip, evaluation, training and predictions, and where the report is."""
+    if result.slip:
+        print_slip(result.slip, console)
+    print_crossval(result.crossval, console)
+    print_training(result.train, console)
+    print_predictions(result.predict, console)
+    print_lines(console, [f"report: {result.report}"])
+
+
+def print_slip(rows: Sequence[TerrainSlip], console: Console) -> None:
+    """Print estimated and true slip of each terrain."""
+    columns = number_columns("runs", "slip", "true slip", "RMSE", "NEES")
+    table = Table("terrain", *columns, title="steady slip of the simulated runs")
+    for row in rows:
+        table.add_row(
+            row.terrain,
+            str(row.n_runs),
+            format_known(row.slip_mean, "{:+.3f}"),
+            format_known(row.slip_true_mean, "{:+.3f}"),
+            format_known(row.slip_rmse, "{:.4f}"),
+            format_known(row.nees, "{:.2f}"),
+        )
+    console.print(table)

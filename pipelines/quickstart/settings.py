@@ -1,0 +1,27 @@
+"""Settings of ``terrain quickstart``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pipelines.classify.settings import CrossvalSettings, TrainSettings
+from pipelines.config.settings import Settings, setting
+
+
+class QuickstartSettings(Settings):
+    """Which runs are used, where the report goes, and under which name the model is registered."""
+
+    data: Path | None = setting(None, "Folder of labelled runs; without, runs are simulated.")
+    out: Path = setting(Path("terrain-report"), "Folder of the runs and the report.")
+    name: str = setting("quickstart", "Name of the registered model.")
+    seed: int = setting(0, "Deals runs into folds; of the simulation, too.", ge=0)
+    n_jobs: int = setting(0, "Processes at once; 0 for one a core.", "--jobs", ge=0)
+
+    @property
+    def evaluation(self) -> CrossvalSettings:
+        """How the recipe is evaluated: by the defaults of ``terrain crossval``."""
+        return CrossvalSettings(seed=self.seed, n_jobs=self.n_jobs)
+
+    def training(self, evaluation: CrossvalSettings) -> TrainSettings:
+        """Return how the recipe of an evaluation is trained."""
+        return TrainSettings(name=self.name, **evaluation.shared())

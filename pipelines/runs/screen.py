@@ -1,0 +1,68 @@
+"""What ``terrain import`` and ``terrain inspect`` print."""
+
+from __future__ import annotations
+
+import math
+
+from rich.console import Console
+from rich.table import Column, Table
+
+from pipelines.reporting.terminal import print_lines
+from pipelines.runs.results import Imported, Inspection
+from terrain.logs.clock import ClockEstimate
+
+COLUMNS = {
+    "run": "left",
+    "stream": "left",
+    "rate Hz": "right",
+    "length s": "right",
+    "gaps": "right",
+    "longest s": "right",
+    "missing": "right",
+    "stuck": "left",
+    "clock of the wheels against the IMU": "left",
+}
+
+
+def print_import(result: Imported, console: Console) -> None:
+    """Print what was skipped, how many runs were written, and what was dropped."""
+    print_lines(console, (f"skipped: {sentence}" for sentence in result.skipped))
+    counts = "".join(f", {n} {kind}" for kind, n in result.dropped.items())
+    print_lines(console, [f"{result.n_runs} runs written to {result.out}{counts}"])
+
+
+def print_inspection(result: Inspection, console: Console) -> None:
+    """Print a row per stream, the clock beside the wheels."""
+    columns = [Column(name, justify=side, overflow="fold") for name, side in COLUMNS.items()]  # type: ignore[arg-type]
+    table = Table(*columns, title=f"{result.n_runs} runs, digest {result.digest[:12]}")
+    for run in result.runs:
+        for name, stream in run.streams.items():
+            table.add_row(
+                run.run_id,
+                name,
+                f"{stream.rate_hz:.2f}",
+                f"{stream.duration_s:.2f}",
+                str(stream.n_gaps),
+                f"{stream.longest_gap_s:.2f}" if stream.n_gaps else "",
+                str(sum(channel.n_nonfinite for channel in stream.channels.values())),
+                ", ".join(stream.stuck),
+                _clock_text(run.clock) if name == "wheels" else "",
+            )
+    console.print(table)
+    for run in result.runs:
+        if run.dropped:
+            counts = ", ".join(f"{n} {kind}" for kind, n in run.dropped.items())
+            console.print(f"{run.run_id}: dropped {counts}")
+    for sentence in result.skipped:
+        console.print(sentence)
+
+
+def _clock_text(clock: ClockEstimate | None) -> str:
+    if clock is None:
+        return "no gyro, no speeds of a left and a right wheel, or an unknown robot"
+    if math.isnan(clock.offset_s):
+        return str(clock.status)
+    text = f"{clock.status}: offset {clock.offset_s:+.3f} ± {clock.offset_std_s:.3f} s"
+    if not math.isnan(clock.rate):
+        text += f", rate {100 * clock.rate:+.2f} ± {100 * clock.rate_std:.2f} %"
+    return text
