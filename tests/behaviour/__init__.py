@@ -1,0 +1,1 @@
+"""Whether the commands still compute what they did: cases, what they gave, and the comparison."""

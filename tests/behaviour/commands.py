@@ -1,0 +1,273 @@
+"""What is run: cases of command lines on small inputs that are simulated or computed, none of them measured.
+
+A case is run in an empty folder of its own, its steps one after another; a step may use what one before it
+wrote.  Every step that is expected to succeed also gets ``--json``.
+"""
+
+from __future__ import annotations
+
+import gzip
+import math
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+
+COMMANDS = (
+    *("import", "inspect", "simulate", "calibrate", "estimate", "crossval", "train", "predict"),
+    *("learn-slip", "drive", "explain", "explain-trials", "quickstart", "reproduce"),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One command line without the word ``terrain``, and the exit code that is expected."""
+
+    words: str
+    code: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """Command lines that belong together.
+
+    Parameters
+    ----------
+    name : of the case, and of the file with its result
+    steps : in order
+    make : returns files that lie there before, by path
+    helps : commands whose options are listed; an empty name is ``terrain --help``
+    """
+
+    name: str
+    steps: tuple[Step, ...] = ()
+    make: Callable[[], Mapping[str, bytes]] = field(default=dict)
+    helps: tuple[str, ...] = ()
+
+
+def steps(*lines: str | Step) -> tuple[Step, ...]:
+    """Return steps; a plain line is expected to succeed."""
+    return tuple(line if isinstance(line, Step) else Step(line) for line in lines)
+
+
+def refused(words: str) -> Step:
+    """Return a step that is a user's mistake."""
+    return Step(words, 2)
+
+
+def foreign_logs() -> dict[str, bytes]:
+    """Return logs in the layouts of BorealTC and DRIVE, in CSV files of one's own, and one with faults."""
+    files = {}
+    for terrain, size in (("ICE", 0.2), ("SNOW", 0.28)):
+        for number in (1, 2, 3):
+            imu, wheels = _imu_rows(size + 0.1 * number), _wheel_rows(size + 0.1 * number)
+            files[f"borealtc/{terrain}/imu_{number:02d}.csv"] = _csv("time,wx,wy,wz,ax,ay,az", imu)
+            files[f"borealtc/{terrain}/pro_{number:02d}.csv"] = _csv("time,curL,curR,velL,velR", wheels)
+            files[f"own/{terrain}/imu {number}.csv"] = _csv("stamp,wx,wy,yaw rate,ax,ay,az", _in_ms(imu))
+            files[f"own/{terrain}/wheels {number}.csv"] = _csv("t,cl,cr,vl,vr", wheels)
+    spoilt = _imu_rows(0.4)
+    spoilt[17][3] = math.nan
+    spoilt[60][0] = spoilt[59][0]
+    files["spoilt/ICE/imu_01.csv"] = _csv("time,wx,wy,wz,ax,ay,az", spoilt)
+    files["spoilt/ICE/pro_01.csv"] = _csv("time,curL,curR,velL,velR", _wheel_rows(0.4))
+    files["mapping.yaml"] = MAPPING.encode()
+    files["drive/samples.csv.gz"] = gzip.compress(_csv(DRIVE_COLUMNS, _drive_rows()), mtime=0)
+    return files
+
+
+MAPPING = """\
+robot: husky
+terrain: "{terrain}"
+streams:
+  imu:
+    file: "{terrain}/imu {run}.csv"
+    time: {column: stamp, unit: ms}
+    channels:
+      gyro_z_radps: {column: yaw rate, unit: deg/s, scale: -1}
+      accel_x_mps2: {column: ax, unit: m/s^2}
+  wheels:
+    file: "{terrain}/wheels {run}.csv"
+    time: {column: t, unit: s}
+    channels:
+      speed_left_mps: {column: vl, unit: km/h}
+      speed_right_mps: {column: vr, unit: km/h}
+"""
+
+DRIVE_COLUMNS = (
+    "step,window,steady,time,cmd_left,cmd_right,wheel_left,wheel_right,"
+    "icp_x,icp_y,icp_z,icp_roll,icp_pitch,icp_yaw,imu_yaw,imu_ax,imu_ay,imu_az"
+)
+
+
+def _wave(i: int, k: int) -> float:
+    return round(math.sin(0.37 * i * (k + 1) + k) + 0.3 * math.sin(1.91 * i + k * k), 6)
+
+
+def _imu_rows(size: float) -> list[list[float]]:
+    return [[i / 50, *(size * _wave(i, k) for k in range(5)), 9.81 + size * _wave(i, 5)] for i in range(800)]
+
+
+def _wheel_rows(size: float) -> list[list[float]]:
+    return [[i / 10, *(3 + size * _wave(i, k) for k in (6, 7, 8, 9))] for i in range(160)]
+
+
+def _in_ms(rows: list[list[float]]) -> list[list[float]]:
+    return [[1000 * row[0], *row[1:]] for row in rows]
+
+
+def _drive_rows() -> list[list[float]]:
+    """Return three commands of three windows: arcs at one speed, each with a pose every second sample."""
+    rows: list[list[float]] = []
+    for step, (speed, turn) in enumerate(((0.5, 0.0), (0.7, 0.4), (-0.4, -0.3))):
+        for window in range(3):
+            for sample in range(40):
+                passed = sample // 2 * 0.1
+                pose = [speed * passed, 0.5 * speed * turn * passed**2, 0, 0, 0, turn * passed]
+                wheels = [(speed - 0.3 * turn) / 0.165, (speed + 0.3 * turn) / 0.165]
+                shaken = [0.01 * _wave(sample + 40 * window, k) for k in range(4)]
+                imu = [turn + shaken[0], shaken[1], shaken[2], 9.81 + shaken[3]]
+                felt = [wheels[0] + shaken[0], wheels[1] + shaken[1], *pose, *imu]
+                rows.append([step, window, int(window > 0), 0.05 * sample, *wheels, *felt])
+    return rows
+
+
+def _csv(head: str, rows: Iterable[Iterable[float]]) -> bytes:
+    lines = [",".join("" if math.isnan(value) else f"{value:.9g}" for value in row) for row in rows]
+    return ("\n".join([head, *lines]) + "\n").encode()
+
+
+SLIPPING = "--robot agrimaro --terrain grass --scenario slip --runs 6"
+
+CASES: tuple[Case, ...] = (
+    Case("help", helps=("", *COMMANDS)),
+    Case(
+        "reading",
+        steps(
+            "simulate --robot agrimaro --terrain grass --scenario straight --duration 8 --gnss "
+            "--camera-lost 4:5 --payload 10 --grade 3 --out raw",
+            "inspect raw",
+            "import raw --out copy",
+            refused("import raw --out copy"),
+        ),
+    ),
+    Case(
+        "foreign_logs",
+        steps(
+            "import borealtc --out of_borealtc",
+            "inspect borealtc",
+            "import own --mapping mapping.yaml --out of_own",
+            "import drive --out of_drive",
+            refused("inspect spoilt"),
+            "import spoilt --repair --out of_spoilt",
+        ),
+        foreign_logs,
+    ),
+    Case("quickstart", steps("quickstart --data borealtc --out report --jobs 1"), foreign_logs),
+    Case(
+        "simulate",
+        steps(
+            "simulate --robot agrimaro --terrain all --scenario survey --duration 9 --vary --out all",
+            "simulate --robot agrimaro --terrain course --scenario course --vary --seed 1 --out course",
+            "simulate --robot husky --terrain tilled_loam --scenario spot_turn --duration 8 "
+            "--effect effective_track=0.3 --effect wheel_radius=0.02 --out husky",
+            "simulate --robot agrimaro --terrain clay --scenario arc --duration 12 "
+            "--effect camera_latency=0.1 --effect payload=0.3 --out arc",
+        ),
+    ),
+    Case(
+        "calibrate",
+        steps(
+            "simulate --robot agrimaro --terrain bench --scenario six_positions --out bench",
+            "calibrate --data bench --robot agrimaro --out bench.yaml",
+            "simulate --robot agrimaro --terrain tiles --scenario stand --out hard",
+            "simulate --robot agrimaro --terrain tiles --scenario starts --out hard",
+            "simulate --robot agrimaro --terrain tiles --scenario complex --out hard",
+            "calibrate --data hard --robot agrimaro --out hard.yaml",
+        ),
+    ),
+    Case(
+        "estimate_swerve",
+        steps(
+            "simulate --robot agrimaro --terrain grass --scenario straight --duration 8 --camera-lost 4:6 "
+            "--seed 5 --out raw",
+            "estimate --data raw --filter encoder12 --no-figures --out encoder12",
+            "estimate --data raw --filter slip14 --no-figures --out slip14",
+            "estimate --data raw --filter vio12 --no-figures --out vio12",
+            "estimate --data raw --filter vio15 --out vio15",
+            "estimate --data raw --filter vio15 --tuning likelihood --no-figures",
+        ),
+    ),
+    Case(
+        "estimate_skid",
+        steps(
+            "simulate --robot husky --terrain grass --scenario survey --duration 20 --runs 2 --out raw",
+            "estimate --data raw --filter skid --no-figures --out skid",
+        ),
+    ),
+    Case(
+        "learning",
+        steps(
+            "simulate --robot agrimaro --terrain all --scenario survey --duration 16 --runs 2 --vary "
+            "--out raw",
+            "estimate --data raw --filter vio15 --no-figures --out runs",
+            "crossval --data runs --repeats 2 --jobs 1",
+            "crossval --data runs --protocol leave-one-run-out --signals imu,currents --no-extras --jobs 1",
+            "crossval --data runs --protocol published --repeats 1 --no-extras --jobs 1",
+            "train --data runs --name field --repeats 1 --jobs 1",
+            "predict --model models:/field@champion --data runs",
+            "drive --scenario starts --terrain grass --controllers plain,learned --seeds 2 --jobs 1 "
+            "--model models:/field@champion",
+        ),
+    ),
+    Case(
+        "slip",
+        steps(
+            f"simulate {SLIPPING} --out pull",
+            "learn-slip --data pull --robot agrimaro --out table.yaml --figures figures",
+            "drive --scenario starts --terrain grass --table table.yaml --seeds 2 --jobs 1 --out page "
+            "--controllers plain,ramp,thesis,fixed,oracle,told:grass,target:0.3,oracle+track",
+        ),
+    ),
+    Case(
+        "drive",
+        steps(
+            "drive --scenario course --terrain course --controllers plain,fixed,told:clay --seeds 2 --jobs 1",
+            "drive --scenario slope --terrain dry_sand --controllers plain,oracle --seeds 2 --jobs 1",
+            "drive --scenario circle --terrain tiles --radius 1,1.02,1 --leg-play 0.02 "
+            "--controllers plain,oracle,oracle+track --seeds 2 --jobs 1",
+            "drive --scenario brake --terrain wet_floor --grade -5 --ramp 0.4 --seeds 2 "
+            "--controllers plain,ramp,oracle --seed 7 --jobs 1",
+        ),
+    ),
+    Case(
+        "explain_husky",
+        steps(
+            "simulate --robot husky --terrain grass --scenario survey --runs 4 --duration 30 "
+            "--effect effective_track=0.4 --out raw",
+            "explain --data raw --robot husky --out explained",
+        ),
+    ),
+    Case(
+        "explain_agrimaro",
+        steps(
+            "simulate --robot agrimaro --terrain grass --scenario survey --runs 6 --duration 30 "
+            "--effect wheel_radius=0.03 --out raw",
+            "explain --data raw --robot agrimaro --out explained",
+            "explain --data raw --robot agrimaro --model explained/extended.yaml --out again",
+        ),
+    ),
+    Case(
+        "explain_trials",
+        steps("explain-trials --n 2 --seed 3 --runs 4 --jobs 1"),
+    ),
+    Case("reproduce", steps("reproduce danzi --out page")),
+    Case(
+        "refusals",
+        steps(
+            refused("simulate --robot nobody --terrain grass --scenario straight --out out"),
+            refused("inspect nowhere"),
+            refused("crossval --data nowhere --signals imu"),
+            refused("drive --grade 50"),
+            refused("explain-trials --n 1 --rows nothing"),
+        ),
+    ),
+)
+"""All cases; the names are those of the files with the results."""

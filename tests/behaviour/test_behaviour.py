@@ -1,0 +1,141 @@
+"""What the commands compute is what is kept in ``expected``, and the comparison sees where it is not."""
+
+from __future__ import annotations
+
+import copy
+import os
+import shlex
+import sys
+from importlib.metadata import entry_points
+
+import pytest
+
+from . import compare
+from .commands import CASES, COMMANDS
+from .compare import differences
+from .record import keep_result, load_result, outline, run_case, statistics
+
+RESULT = {
+    "verdict": "as printed",
+    "robot": "husky",
+    "run_ids": ["grass_01", "grass_02"],
+    "reason": "the runs show nothing of it",
+    "seconds": 1.25,
+    "run_id": "36466bf127cd46e987d8765c6cb43779",
+    "value": 0.25,
+    "interval": [0.2, 0.3],
+    "beside": {"true slip": 0.1, "factor 1": 0.2},
+    "importance": [{"feature": "imu.gyro", "drop": 0.1}, {"feature": "imu.accel", "drop": 0.1}],
+    "stream": {"time_s": statistics([0.0, 0.1, 0.2])},
+    "page": outline("<section><h2>Verdict</h2></section><section><h2>Causes</h2><table></table></section>"),
+}
+
+
+def terrain_command():
+    """Return the first words of the command: ``$TERRAIN_COMMAND``, or the installed entry point."""
+    named = os.environ.get("TERRAIN_COMMAND")
+    if named:
+        return shlex.split(named)
+    (point,) = entry_points(group="console_scripts", name="terrain")
+    return [sys.executable, "-c", f"from {point.module} import {point.attr} as main; main()"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_a_case_gives_what_it_gave(case, tmp_path):
+    result = run_case(case, terrain_command(), tmp_path)
+    found = differences(load_result(case.name), result)
+    assert not found, f"{len(found)} differences\n" + "\n".join(found[:40])
+
+
+def test_every_command_has_a_case():
+    lines = [step.words for case in CASES for step in case.steps if step.code == 0]
+    assert {line.split()[0] for line in lines} == set(COMMANDS)
+    assert set(load_result("help")["help"]["terrain"]["commands"]) == set(COMMANDS)
+
+
+def changed(change):
+    result = copy.deepcopy(RESULT)
+    change(result)
+    return differences(RESULT, result)
+
+
+def test_the_same_has_no_difference():
+    assert changed(lambda result: None) == []
+
+
+@pytest.mark.parametrize(
+    ("change", "where"),
+    [
+        (lambda r: r.update(value=0.25 * (1 + 1e-8)), "/value"),
+        (lambda r: r.update(value="0.25"), "/value"),
+        (lambda r: r.update(value=None), "/value"),
+        (lambda r: r.update(value=float("nan")), "/value"),
+        (lambda r: r["interval"].append(0.4), "/interval"),
+        (lambda r: r["interval"].__setitem__(1, 0.31), "/interval/1"),
+        (lambda r: r.pop("value"), "/value"),
+        (lambda r: r.update(more=1), "/more"),
+        (lambda r: r.update(robot="agrimaro"), "/robot"),
+        (lambda r: r.update(verdict="differs"), "/verdict"),
+        (lambda r: r["run_ids"].reverse(), "/run_ids/0"),
+        (lambda r: r.update(reason=""), "/reason"),
+        (lambda r: r.pop("seconds"), "/seconds"),
+        (lambda r: r.update(run_id="field"), "/run_id"),
+        (lambda r: r["beside"].update({"true slip": 0.11}), "/beside/true slip"),
+        (lambda r: r["importance"][0].update(drop=0.2), "/importance/imu.gyro/drop"),
+        (lambda r: r.update(stream={"time_s": statistics([0.0, 0.11, 0.2])}), "/stream/time_s/sum"),
+        (lambda r: r.update(stream={"time_s": statistics([0.0, float("nan"), 0.2])}), "/stream/time_s/nan"),
+        (lambda r: r.update(page=outline("<section><h2>Verdict</h2><table></table></section>")), "/page/h2"),
+        (lambda r: r["page"].update(section=1), "/page/section"),
+        (lambda r: r["page"].update(h2=["Verdict", "What it is"]), "/page/h2/1"),
+    ],
+)
+def test_a_change_is_seen(change, where):
+    assert [line.partition(":")[0] for line in changed(change) if line.startswith(where)][:1] == [where]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda r: r.update(value=0.25 * (1 + 1e-10)),
+        lambda r: r.update(reason="nothing of it is in these runs"),
+        lambda r: r.update(seconds=7.0),
+        lambda r: r.update(run_id="0" * 32),
+        lambda r: r.update(beside={"the true slip": 0.1, "factor 1": 0.2}),
+        lambda r: r["importance"].reverse(),
+    ],
+)
+def test_words_and_times_may_change(change):
+    assert changed(change) == []
+
+
+def test_a_sum_that_cancels_is_as_sure_as_its_summands():
+    one = {**statistics([1e6, -1e6, 0.0]), "sum": 0.0}
+    assert differences(one, {**one, "sum": 1e-6}) == []
+    assert differences(one, {**one, "sum": 1.0}) == ["/sum: 0.0 was expected, it is 1.0"]
+
+
+def test_a_new_name_is_accepted_and_so_is_the_old_one(monkeypatch):
+    def rename(result):
+        result["model"] = result.pop("robot")
+        result["run_ids"] = ["meadow_01", "grass_02"]
+
+    assert len(changed(rename)) == 3
+    monkeypatch.setitem(compare.ALIASES, "robot", "model")
+    monkeypatch.setitem(compare.ALIASES_OF_VALUES, "grass_01", "meadow_01")
+    assert changed(rename) == []
+    assert changed(lambda result: None) == []
+    assert changed(lambda result: result.update(model="husky")) == [
+        "all: holds a key by its old and by its new name"
+    ]
+
+
+def test_a_result_is_kept_and_read_back(tmp_path):
+    assert keep_result("small", RESULT, tmp_path).suffix == ".json"
+    assert load_result("small", tmp_path) == RESULT
+    big = {"names": [f"run_{i}" for i in range(20_000)]}
+    kept = keep_result("big", big, tmp_path)
+    assert kept.suffix == ".gz"
+    assert load_result("big", tmp_path) == big
+    content = kept.read_bytes()
+    assert keep_result("big", big, tmp_path).read_bytes() == content
