@@ -28,23 +28,10 @@ from terrain.estimation.ekf.model import GATE_PROBABILITY, REOPEN_AFTER_S, Filte
 from terrain.estimation.ekf.resident import ResidentFilter
 from terrain.estimation.filters.swerve import make_filter
 from terrain.estimation.filters.swerve_noise import default_noise
-from terrain.estimation.live.rows import (
-    KINDS,
-    LIMITS,
-    N_GNSS,
-    N_LINE,
-    N_YAW,
-    PARAMS,
-    QUEUE,
-    ROWS,
-    STREAMS,
-    WHEEL_KINDS,
-    push,
-    rows_at,
-)
-from terrain.estimation.measurements.cleaning import LEAPS
-from terrain.estimation.measurements.resampling import GAP_PERIODS, MAX_AGE_PERIODS
-from terrain.estimation.measurements.table import CAMERA_ROWS, GNSS_LATENCY_S, GNSS_ROWS, WILD_FACTOR
+from terrain.estimation.live.rows import KINDS, QUEUE, WHEEL_KINDS, push, rows_at
+from terrain.estimation.measurements.samples import ROWS, STREAMS, limits_of_rows, params_of, row_memory
+from terrain.estimation.measurements.table import GNSS_LATENCY_S, GNSS_ROWS
+from terrain.estimation.measurements.yaw import yaw_memory
 from terrain.estimation.wheel_slip import STALE_AFTER_S, instant_slip, wheel_speed_scatter_mps
 from terrain.extension import Correction, corrected
 from terrain.logs.schema import WHEELS_CHANNELS
@@ -184,30 +171,20 @@ class LiveEstimator:
     def _prepare_rows(self, initial_yaw_rad: float, gnss_latency_s: float) -> None:
         """Lay out what :func:`rows_at` is given: first what is fixed, then its memory."""
         robot = self._robot
-        motors, steering, sensors, camera = robot.motors, robot.steering, robot.sensors, robot.camera
+        motors, sensors, camera = robot.motors, robot.sensors, robot.camera
         assert motors is not None
-        assert steering is not None
         assert sensors is not None
         latency_s = np.zeros(len(STREAMS))
         latency_s[1:] = sensors.imu_latency_s, camera.latency_s if camera else 0.0, gnss_latency_s
-        params = {
-            "reduction_ratio": motors.reduction_ratio,
-            "wildest_radps": WILD_FACTOR * motors.speed_max_radps,
-            "wheel_radius_m": robot.wheel_radius_m,
-            "initial_yaw_rad": initial_yaw_rad,
-            **{name: getattr(sensors, name) for name in PARAMS if hasattr(sensors, name)},
-            **{f"zero_{i}_rad": getattr(steering, f"zero_{i}_rad") for i in (1, 2, 3)},
-        }
         self._motor_radps, self._z, self._gnss_variance = np.empty(3), np.empty(len(ROWS)), np.empty(4)
         self._unmeasured = np.ones(3, dtype=np.bool_)
-        before, turns, yaw = np.full((2, 16), np.nan), np.full((5, 3), np.nan), np.zeros(N_YAW)
-        yaw[1] = np.nan
+        lines, turns, gnss = row_memory()
         self._row_memory = (
             self._motor_radps,
             *self._queues,
-            *(self._n_queued, self._last_s, latency_s, np.array([params[name] for name in PARAMS])),
-            *(_limits(robot), before, turns, np.full((len(ROWS), N_LINE), np.nan), yaw),
-            *(np.full(N_GNSS, np.nan), np.full((2, 3), -np.inf), self._z, self._gnss_variance),
+            *(self._n_queued, self._last_s, latency_s, params_of(robot, initial_yaw_rad), _limits(robot)),
+            *(np.full((2, 16), np.nan), turns, lines, yaw_memory(), gnss, np.full((2, 3), -np.inf)),
+            *(self._z, self._gnss_variance),
             *(self._unmeasured, self._counts, self._wheel_counts),
         )
         self._reduction_ratio, self._radius_m = motors.reduction_ratio, robot.wheel_radius_m
@@ -370,20 +347,16 @@ def _place(names: list[str], name: str) -> int:
 
 
 def _limits(robot: Robot) -> Array:
-    """Return the ``LIMITS`` (18, 6) of each row."""
+    """Return the limits (18, 6) of the rows, by the described periods."""
     sensors, camera = robot.sensors, robot.camera
     assert sensors is not None
-    tick_s, lag_s = 1.0 / sensors.wheels_rate_hz, sensors.encoder_time_constant_s
-    limits = np.empty((len(ROWS), len(LIMITS)))
-    for limit, row in zip(limits, ROWS, strict=True):
-        period_s, tau_s = 1.0 / sensors.imu_rate_hz, lag_s
-        if row in CAMERA_ROWS and camera is not None:
-            period_s, tau_s = 1.0 / camera.rate_hz, max(lag_s - camera.time_constant_s, 0.0)
-        elif row in GNSS_ROWS:
-            period_s = GNSS_PERIOD_S
-        elif row.startswith("steer"):
-            period_s = 1.0 / sensors.steering_rate_hz
-        age_s = MAX_AGE_PERIODS * max(period_s, tick_s)
-        once = period_s > MAX_AGE_PERIODS * tick_s
-        limit[:] = (tau_s, GAP_PERIODS * period_s, age_s, once, *LEAPS.get(row, (np.inf, np.inf)))
-    return limits
+    lag_s = dict.fromkeys(STREAMS, sensors.encoder_time_constant_s)
+    period_s = {
+        "imu": 1.0 / sensors.imu_rate_hz,
+        "steering": 1.0 / sensors.steering_rate_hz,
+        "gnss": GNSS_PERIOD_S,
+    }
+    if camera is not None:
+        lag_s["odometry"] = max(sensors.encoder_time_constant_s - camera.time_constant_s, 0.0)
+        period_s["odometry"] = 1.0 / camera.rate_hz
+    return limits_of_rows(lag_s, period_s, 1.0 / sensors.wheels_rate_hz)

@@ -1,47 +1,59 @@
-"""From the streams of a run log to the rows that a filter measures, on one clock and with one delay.
+"""The measurements of a whole run log: one clock, one delay.
 
 The clock is that of the wheels, whose rates come behind the driver's low-pass.  A ground speed that is ahead
 of them makes the slip of a start look negative (Danzi, AgriMaRo thesis, 7.2.2), so every other signal goes
 through a low-pass too, and its own lag and the filter's together are the encoders'.  In order:
 
-1. samples that cannot be true are left out and counted (``terrain.estimation.measurements.cleaning``);
-2. known latencies are taken off the stamps;
-3. calibration, gravity and the camera's axes are taken off, angles are unwrapped;
-4. a low-pass, at each sensor's own rate;
+1. samples that cannot be true are left out and counted (:mod:`~terrain.estimation.measurements.cleaning`);
+2. known latencies are subtracted from the stamps;
+3. calibration, gravity and the camera's axes are removed, angles are unwrapped
+   (:mod:`~terrain.estimation.measurements.samples`);
+4. leaps are left out, then a low-pass, at each sensor's own rate;
 5. at each tick the last sample at or before it, unless it is too old; the low-pass runs on to the tick with
    that sample as its input, which leaves no delay of the holding
-   (``terrain.estimation.measurements.resampling``).
+   (:mod:`~terrain.estimation.measurements.sample_hold`).
+
+Steps 3 to 5 are those of the live chain (:mod:`terrain.estimation.live.rows`), looped.  What looks ahead is
+the cleaning, the median periods and, unless ``causal``, latencies, the yaw at the start and the origin of
+positions.
 """
 
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 
 import numpy as np
+from numba import njit
 
-from terrain.angles import unwrapped, wrapped
-from terrain.constants import GRAVITY_MPS2
 from terrain.errors import ConfigError, DataError
-from terrain.estimation.measurements.cleaning import clean_stream, without_leaps
-from terrain.estimation.measurements.resampling import ema, on_clock
+from terrain.estimation.measurements.cleaning import clean_stream
+from terrain.estimation.measurements.resampling import ema, median_step_s
+from terrain.estimation.measurements.sample_hold import TICK_S
+from terrain.estimation.measurements.samples import (
+    LEAPT,
+    NO_ROTATION,
+    ROWS,
+    STREAMS,
+    limits_of_rows,
+    params_of,
+    row_memory,
+    rows_at_tick,
+    take_sample,
+    wheel_rates,
+)
 from terrain.estimation.measurements.table import (
     CAMERA_ROWS,
     GNSS_LATENCY_S,
     GNSS_ROWS,
-    GNSS_SPEED_STD_MPS,
-    GNSS_STD_M,
-    LATE_S,
     ROWS_OF_DRIVE,
-    STANDING_S,
-    STANDING_SPEED_MPS,
-    WILD_FACTOR,
     MeasurementTable,
 )
+from terrain.estimation.measurements.yaw import average_yaw, refer_yaw, yaw_memory
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
-from terrain.kinematics.camera import body_motion
 from terrain.logs.schema import GNSS_CHANNELS, IMU_CHANNELS
 from terrain.records import Array, RunLog, Stream
-from terrain.robots import Camera, Robot, Steering
+from terrain.robots import Robot
 
 
 def measurement_table(
@@ -79,91 +91,69 @@ def measurement_table(
 
     Notes
     -----
-    With latencies taken off, a row holds what the sensor said of that instant, which arrives only later.
+    With latencies subtracted, a row holds what the sensor measured at that instant, which arrives only later.
     ``causal``, it holds the last that had arrived, at most a latency and a period old: the low-pass runs on
     from the sample's own instant to the tick.
 
-    A yaw row is ``initial_yaw_rad`` on average while the robot stands at the start, or at its first sample;
-    ``causal``, the average is that of the ticks so far.  A camera that starts late takes the IMU's yaw of
-    that instant instead, and after a loss the turn nearest to it.  The origin of positions is the first with
-    a fix, or the first of all where no fix ever comes, or if ``causal``.
+    A yaw row is ``initial_yaw_rad`` on average while the robot is at rest at the start, or at its first
+    sample; ``causal``, the average is that of the ticks so far.  The origin of positions is the first with a
+    fix, or the first of all where no fix ever comes, or if ``causal``.
 
     A sensor slower than the clock gives each of its samples once, so that no filter counts it several times.
 
     A simulated camera or IMU without noise looks frozen where nothing changes: give it noise.
     """
     _check(time_constant_s, ema_alpha, gnss_latency_s)
-    if robot.drive == "swerve":
+    swerve = robot.drive == "swerve"
+    if swerve:
         robot.has("motors", "steering", "sensors", *(["camera"] if "odometry" in run.streams else []))
-    sensors, camera = robot.sensors, robot.camera
-    encoder_s = robot.encoder_lag_s
-    smooth_s = 0.0 if ema_alpha is not None else time_constant_s
-    lag_s = encoder_s if smooth_s is None else smooth_s
-    rows = ROWS_OF_DRIVE[robot.drive]
     dropped: Counter[str] = Counter()
-    z: dict[str, Array] = {}
-    variance: dict[str, Array] = {}
-
     wheels = clean_stream(run, "wheels", _wheel_channels(run, robot), dropped)
     if wheels is None:
         raise DataError(f"run {run.run_id}: the stream 'wheels', which gives the clock, is empty")
-    clock = wheels.time_s
-    rates = wheels.values
-    if robot.drive == "swerve" and robot.motors is not None:  # the others' rows are wheel speeds
-        rates = wheels.values / robot.motors.reduction_ratio
-        wild = np.abs(rates) > WILD_FACTOR * robot.motors.speed_max_radps
-        dropped["wheels: beyond the motors"] += int(wild.any(axis=1).sum())
-        rates = np.where(wild, np.nan, rates)
-    z |= dict(zip(rows, rates.T, strict=False))
-
-    def at_ticks(stream: Stream, time_s: Array, told: dict[str, Array], behind_s: float) -> dict[str, Array]:
-        return on_clock(clock, time_s, told, behind_s, stream.time_s if causal else time_s)
-
-    imu = clean_stream(run, "imu", IMU_CHANNELS, dropped, frozen=IMU_CHANNELS[:6])
-    if imu is not None:
-        time_s = imu.time_s - (sensors.imu_latency_s if sensors else 0.0)
-        told = without_leaps("imu", time_s, _imu_rows(imu, robot), dropped)
-        z |= at_ticks(imu, time_s, told, lag_s)
-
-    steering = clean_stream(run, "steering", [f"angle_{i}_rad" for i in robot.wheels], dropped)
-    if steering is not None and robot.steering is not None:
-        told = _steering_rows(steering, robot.steering)
-        told = without_leaps("steering", steering.time_s, told, dropped)
-        z |= at_ticks(steering, steering.time_s, told, lag_s)
-
-    odometry = clean_stream(run, "odometry", CAMERA_CHANNELS, dropped, frozen=CAMERA_CHANNELS[3:13])
-    if odometry is not None and camera is not None:
-        own_s = max(encoder_s - camera.time_constant_s, 0.0) if smooth_s is None else smooth_s
-        time_s = odometry.time_s - camera.latency_s
-        told = without_leaps("odometry", time_s, _camera_rows(odometry, camera, dropped), dropped)
-        taken = at_ticks(odometry, time_s, told, own_s)
-        z |= taken if ema_alpha is None else {row: ema(value, ema_alpha) for row, value in taken.items()}
-
-    gnss = clean_stream(run, "gnss", GNSS_CHANNELS, dropped)
-    if gnss is not None:
-        told, variance_of_told = _gnss_rows(gnss, causal)
-        z |= at_ticks(gnss, gnss.time_s - gnss_latency_s, told, lag_s)
-        variance |= at_ticks(gnss, gnss.time_s - gnss_latency_s, variance_of_told, 0.0)
-
-    unknown = np.full(clock.size, np.nan)
-    table = {row: z.get(row, unknown) for row in rows}
-    if robot.drive == "swerve":
-        wheel_speed_mps = np.column_stack([table[row] for row in rows[:3]]) * robot.wheel_radius_m
-        _refer_yaw(table, clock, wheel_speed_mps, initial_yaw_rad, causal)
-    return MeasurementTable(
+    streams = _clean_streams(run, robot, dropped)
+    latency_s = _latencies_s(robot, gnss_latency_s)
+    params = params_of(robot, initial_yaw_rad)
+    lines, turns, gnss = row_memory()
+    if "gnss" in streams and not causal:
+        gnss[:2] = _gnss_origin(streams["gnss"])
+    clock, n = np.array(wheels.time_s), len(wheels)
+    z, variance, counts = np.empty((n, len(ROWS))), np.empty((n, len(GNSS_ROWS))), np.zeros((5, 3), np.int64)
+    _fill_rows(
         clock,
-        rows,
-        np.column_stack(list(table.values())),
-        np.column_stack([variance.get(row, unknown) for row in GNSS_ROWS]),
-        {kind: n for kind, n in dropped.items() if n},
+        np.array(wheels.values) if swerve else np.full((n, 3), np.nan),
+        *_samples_of(streams, latency_s, causal),
+        params,
+        _limits(streams, robot, clock, 0.0 if ema_alpha is not None else time_constant_s),
+        lines,
+        turns,
+        gnss,
+        z,
+        variance,
+        counts,
     )
+    if ema_alpha is not None:
+        for row in CAMERA_ROWS:
+            z[:, ROWS.index(row)] = ema(z[:, ROWS.index(row)], ema_alpha)
+    if swerve:
+        _refer_yaw(clock, z, params, yaw_memory(), causal)
+    dropped["wheels: beyond the motors"] += int(counts[-1, 0])
+    for number, name in enumerate(STREAMS):
+        dropped[f"{name}: leap"] += int(counts[number, LEAPT])
+        dropped[f"{name}: no rotation"] += int(counts[number, NO_ROTATION])
+    rows = ROWS_OF_DRIVE[robot.drive]
+    columns = dict(zip(ROWS, z.T, strict=True))
+    if not swerve:  # their wheels report speeds
+        columns |= dict(zip(rows, wheels.values.T, strict=False))
+    table = np.column_stack([columns[row] for row in rows])
+    return MeasurementTable(clock, rows, table, variance, {kind: n for kind, n in dropped.items() if n})
 
 
 def _check(time_constant_s: float | None, ema_alpha: float | None, gnss_latency_s: float) -> None:
     if time_constant_s is not None and not 0 <= time_constant_s < np.inf:
         raise ConfigError(f"time_constant_s is {time_constant_s:g}, a time from zero up is required")
     if ema_alpha is not None and not 0 <= ema_alpha < 1:
-        raise ConfigError(f"ema_alpha is {ema_alpha:g}, a share from 0 to below 1 is required")
+        raise ConfigError(f"ema_alpha is {ema_alpha:g}, a number from 0 to below 1 is required")
     if ema_alpha is not None and time_constant_s is not None:
         raise ConfigError("give time_constant_s or ema_alpha, not both: one of them smooths the camera")
     if not 0 <= gnss_latency_s < np.inf:
@@ -184,78 +174,112 @@ def _wheel_channels(run: RunLog, robot: Robot) -> list[str]:
     return channels
 
 
-def _imu_rows(imu: Stream, robot: Robot) -> dict[str, Array]:
-    """Calibrated yaw rate, acceleration of the body without gravity, and yaw.
+def _clean_streams(run: RunLog, robot: Robot, dropped: Counter[str]) -> dict[str, Stream]:
+    """Return the streams that the robot's rows are measured by, cleaned."""
+    steering_channels = [f"angle_{wheel}_rad" for wheel in robot.wheels]
+    found = {
+        "imu": clean_stream(run, "imu", IMU_CHANNELS, dropped, frozen=IMU_CHANNELS[:6]),
+        "steering": clean_stream(run, "steering", steering_channels, dropped),
+        "odometry": clean_stream(run, "odometry", CAMERA_CHANNELS, dropped, frozen=CAMERA_CHANNELS[3:13]),
+        "gnss": clean_stream(run, "gnss", GNSS_CHANNELS, dropped),
+    }
+    has = {"steering": robot.steering is not None, "odometry": robot.camera is not None}
+    return {name: stream for name, stream in found.items() if stream is not None and has.get(name, True)}
 
-    A sample is ``scale * truth + bias``.  The specific force at rest is g times the world's vertical in body
-    axes, ``g (-sin pitch, sin roll cos pitch, cos roll cos pitch)``: with the nose up (pitch negative) it
-    points forward too, with the left side up (roll positive) to the left.
-    """
-    sensors = robot.sensors
-    rate = imu.channel("gyro_z_radps") - (sensors.gyro_bias_z_radps if sensors else 0.0)
-    if sensors is None or robot.drive != "swerve":
-        return {"gyro_z_radps": rate}
-    force_x = (imu.channel("accel_x_mps2") - sensors.accel_bias_x_mps2) / sensors.accel_scale_x_ratio
-    force_y = (imu.channel("accel_y_mps2") - sensors.accel_bias_y_mps2) / sensors.accel_scale_y_ratio
-    roll, pitch = imu.channel("roll_rad"), imu.channel("pitch_rad")
+
+def _latencies_s(robot: Robot, gnss_latency_s: float) -> dict[str, float]:
     return {
-        "accel_x_mps2": force_x + GRAVITY_MPS2 * np.sin(pitch),
-        "accel_y_mps2": force_y - GRAVITY_MPS2 * np.sin(roll) * np.cos(pitch),
-        "gyro_z_radps": rate,
-        "imu_yaw_rad": unwrapped(imu.channel("yaw_rad")),
+        "imu": robot.sensors.imu_latency_s if robot.sensors else 0.0,
+        "odometry": robot.camera.latency_s if robot.camera else 0.0,
+        "gnss": gnss_latency_s,
     }
 
 
-def _steering_rows(steering: Stream, described: Steering) -> dict[str, Array]:
-    """Steering angles without their zeros; the first one lies within half a turn."""
-    zeros_rad = (described.zero_1_rad, described.zero_2_rad, described.zero_3_rad)
-    angles = wrapped(steering.values - zeros_rad)
-    return {f"steer_{i + 1}_rad": unwrapped(angles[:, i]) for i in range(3)}
+def _samples_of(
+    streams: Mapping[str, Stream], latency_s: Mapping[str, float], causal: bool
+) -> tuple[tuple[Array, ...], tuple[Array, ...], tuple[Array, ...]]:
+    """Return when samples count as arrived, the instants of measurement, and the values, by stream."""
+    came_s, instant_s, values = [], [], []
+    for name, channels in STREAMS.items():
+        stream = streams.get(name)
+        stamps = np.array(stream.time_s) if stream is not None else np.empty(0)
+        instant_s.append(stamps - latency_s.get(name, 0.0))
+        came_s.append(stamps if causal else instant_s[-1])
+        values.append(np.array(stream.values) if stream is not None else np.empty((0, len(channels))))
+    return tuple(came_s), tuple(instant_s), tuple(values)
 
 
-def _camera_rows(odometry: Stream, camera: Camera, dropped: Counter[str]) -> dict[str, Array]:
-    seen = body_motion(odometry, camera)
-    lost = np.isfinite(odometry.values[:, 3:7]).all(axis=1) & np.isnan(seen.yaw_rad)
-    dropped["odometry: no rotation"] += int(lost.sum())
-    columns = (seen.speed_mps[:, 0], seen.speed_mps[:, 1], seen.yaw_rate_radps, seen.yaw_rad)
-    return dict(zip(CAMERA_ROWS, columns, strict=True))
+def _limits(
+    streams: Mapping[str, Stream], robot: Robot, clock: Array, time_constant_s: float | None
+) -> Array:
+    """Return the limits (18, 6) of the rows, by the median periods of the log."""
+    lag_s = dict.fromkeys(STREAMS, robot.encoder_lag_s if time_constant_s is None else time_constant_s)
+    if robot.camera is not None and time_constant_s is None:
+        lag_s["odometry"] = max(robot.encoder_lag_s - robot.camera.time_constant_s, 0.0)
+    period_s = {name: median_step_s(stream.time_s) for name, stream in streams.items()}
+    judged = ROWS if robot.drive == "swerve" else ("gyro_z_radps",)
+    return limits_of_rows(lag_s, period_s, median_step_s(clock), judged)
 
 
-def _gnss_rows(gnss: Stream, causal: bool) -> tuple[dict[str, Array], dict[str, Array]]:
-    """Positions from the first (fixed) one, speeds, and the variances of both; NaN together."""
-    values = np.array(gnss.values[:, :4])
-    values[np.isnan(values[:, :2]).any(axis=1), :2] = np.nan
-    fixed = gnss.channel("fix_ratio") >= 0.5
-    placed = np.isfinite(values[:, 0])
-    origin = placed & fixed if (placed & fixed).any() and not causal else placed
-    if origin.any():
-        values[:, :2] -= values[origin.argmax(), :2]
-    std = gnss.channel("std_position_m")
-    std = np.where(std > 0, std, np.where(fixed, GNSS_STD_M[True], GNSS_STD_M[False]))
-    variance = np.column_stack([std, std, *[np.full(std.size, GNSS_SPEED_STD_MPS)] * 2]) ** 2
-    variance[np.isnan(values)] = np.nan
-    return dict(zip(GNSS_ROWS, values.T, strict=True)), dict(zip(GNSS_ROWS, variance.T, strict=True))
+def _gnss_origin(gnss: Stream) -> Array:
+    """Return the first position with a fix, or the first where there is none; NaN without any."""
+    position = gnss.values[:, :2]
+    known = np.isfinite(position).all(axis=1)
+    fixed = known & (gnss.channel("fix_ratio") >= 0.5)
+    first = fixed if fixed.any() else known
+    return np.asarray(position[first.argmax()]) if first.any() else np.full(2, np.nan)
 
 
-def _refer_yaw(
-    table: dict[str, Array], clock: Array, wheel_speed_mps: Array, initial_yaw_rad: float, causal: bool
+@njit(cache=True, error_model="numpy")
+def _fill_rows(
+    clock: Array,
+    motor_radps: Array,
+    came_s: tuple[Array, ...],
+    instant_s: tuple[Array, ...],
+    samples: tuple[Array, ...],
+    params: Array,
+    limits: Array,
+    lines: Array,
+    turns: Array,
+    gnss: Array,
+    z: Array,
+    gnss_variance: Array,
+    counts: Array,
 ) -> None:
-    """Count the yaw rows of a table from the start, and keep the camera's on the turn that the IMU is on."""
-    moving = (np.abs(wheel_speed_mps) > STANDING_SPEED_MPS).any(axis=1) | (clock > clock[0] + STANDING_S)
-    standing = ~np.logical_or.accumulate(moving)
-    for row in ("imu_yaw_rad", "camera_yaw_rad"):
-        known = np.isfinite(table[row])
-        if known.any():
-            first = known & standing if (known & standing).any() else np.arange(clock.size) == known.argmax()
-            reference = table[row][first].mean()
-            if causal:
-                so_far = np.maximum(np.cumsum(first), 1)
-                reference = np.cumsum(np.where(first, table[row], 0.0)) / so_far
-            table[row] = table[row] - reference + initial_yaw_rad
-    imu, camera = table["imu_yaw_rad"], table["camera_yaw_rad"]
-    both = np.isfinite(imu) & np.isfinite(camera)
-    start = int(np.isfinite(camera).argmax())
-    if both[start] and clock[start] > clock[0] + LATE_S:
-        camera = camera + imu[start] - initial_yaw_rad
-    turns = np.round(np.where(both, imu - camera, 0.0) / (2 * np.pi))
-    table["camera_yaw_rad"] = camera + 2 * np.pi * turns
+    """Write the rows z (n, 18) and variances (n, 4) of each tick, and count what became of the samples."""
+    due = np.zeros(len(came_s), np.int64)
+    for n in range(clock.size + 1):
+        time_s = clock[n] + TICK_S if n < clock.size else np.inf  # what comes after the last tick is counted
+        for stream in range(len(came_s)):
+            k = due[stream]
+            while k < came_s[stream].size and came_s[stream][k] <= time_s:
+                fate = take_sample(
+                    stream,
+                    samples[stream][k],
+                    instant_s[stream][k],
+                    came_s[stream][k],
+                    params,
+                    turns,
+                    lines,
+                    limits,
+                    gnss,
+                )
+                counts[stream, fate] += 1
+                k += 1
+            due[stream] = k
+        if n < clock.size:
+            _, beyond = wheel_rates(motor_radps[n], params, z[n])
+            counts[-1, 0] += beyond
+            rows_at_tick(clock[n], lines, limits, gnss, z[n], gnss_variance[n])
+
+
+@njit(cache=True, error_model="numpy")
+def _refer_yaw(clock: Array, z: Array, params: Array, yaw: Array, causal: bool) -> None:
+    """Count the yaw rows from the start: from the averages of all ticks, or of those so far."""
+    if not causal:
+        for n in range(clock.size):
+            average_yaw(clock[n], z[n], params, yaw)
+    for n in range(clock.size):
+        if causal:
+            average_yaw(clock[n], z[n], params, yaw)
+        refer_yaw(clock[n], z[n], params, yaw)

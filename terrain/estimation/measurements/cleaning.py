@@ -6,9 +6,8 @@ from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
-from numba import njit
 
-from terrain.estimation.measurements.resampling import TICK_S
+from terrain.estimation.measurements.sample_hold import TICK_S
 from terrain.logs.samples import longest_rise
 from terrain.records import Array, RunLog, Stream
 
@@ -20,23 +19,6 @@ MIN_CONFIDENCE_RATIO = 0.34
 
 OFF_CLOCK_S = 1.0
 """A sample that is further from every tick is of no use to anyone: its clock leapt."""
-
-LEAPS: dict[str, tuple[float, float]] = {
-    "accel_x_mps2": (20.0, 1000.0),
-    "accel_y_mps2": (20.0, 1000.0),
-    "gyro_z_radps": (0.5, 20.0),
-    "imu_yaw_rad": (0.1, 4.0),
-    **dict.fromkeys((f"steer_{i}_rad" for i in (1, 2, 3)), (0.1, 5.0)),
-    "camera_speed_x_mps": (0.1, 5.0),
-    "camera_speed_y_mps": (0.1, 5.0),
-    "camera_yaw_rate_radps": (0.2, 20.0),
-    "camera_yaw_rad": (0.1, 4.0),
-}
-"""What a sensor's noise may do between two samples and, a second, what a robot may: half a g, two thirds of a
-turn, twice the fastest steering; an accelerometer on rough ground sees several g."""
-
-BELIEVED_S = 0.1
-"""A value that has leapt and stays is believed after this long: it is left to the filter's gate."""
 
 
 def clean_stream(
@@ -92,39 +74,3 @@ def _frozen(time_s: Array, values: Array) -> Array:
     last = np.append(first[1:], len(time_s)) - 1
     lasting = np.repeat(time_s[last] - time_s[first] >= FROZEN_S - TICK_S, last - first + 1)
     return np.asarray(same & lasting)
-
-
-def without_leaps(
-    stream: str, time_s: Array, signals: dict[str, Array], dropped: Counter[str]
-) -> dict[str, Array]:
-    """Take out what no robot does from one sample to the next, before a low-pass smears it over many.
-
-    A camera that finds its place again shows speeds of several m/s for some samples; a spike is one sample.
-    """
-    leaping = np.zeros(time_s.size, dtype=bool)
-    kept = dict(signals)
-    for row, (least, per_second) in LEAPS.items():
-        if row in signals:
-            leaps = _leaps(time_s, signals[row], least, per_second)
-            kept[row] = np.where(leaps, np.nan, signals[row])
-            leaping |= leaps
-    dropped[f"{stream}: leap"] += int(leaping.sum())
-    return kept
-
-
-@njit(cache=True)
-def _leaps(time_s: Array, value: Array, least: float, per_second: float) -> Array:
-    """Mark samples (n,) that are further from the last one kept than a robot gets, for at most BELIEVED_S."""
-    leaps = np.zeros(value.size, dtype=np.bool_)
-    last, last_s, since_s = np.nan, np.nan, np.nan
-    for k in range(value.size):
-        if np.isnan(value[k]):
-            continue
-        if abs(value[k] - last) > least + per_second * (time_s[k] - last_s):
-            if np.isnan(since_s):
-                since_s = time_s[k]
-            if time_s[k] - since_s < BELIEVED_S:
-                leaps[k] = True
-                continue
-        last, last_s, since_s = value[k], time_s[k], np.nan
-    return leaps

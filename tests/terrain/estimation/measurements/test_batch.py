@@ -573,7 +573,7 @@ def test_what_gives_no_clock_is_refused():
     [
         ({"time_constant_s": -0.1}, "time_constant_s is -0.1"),
         ({"time_constant_s": np.nan}, "time_constant_s is nan"),
-        ({"ema_alpha": 1.0}, "ema_alpha is 1, a share from 0 to below 1"),
+        ({"ema_alpha": 1.0}, "ema_alpha is 1, a number from 0 to below 1"),
         ({"ema_alpha": 0.2, "time_constant_s": 0.1}, "not both"),
         ({"gnss_latency_s": -1.0}, "gnss_latency_s is -1"),
     ],
