@@ -1,0 +1,228 @@
+"""The compiled chain, sample by sample, gives the numbers of its plain form: whole signals, one by one."""
+
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from terrain.angles import unwrapped, wrapped
+from terrain.constants import GRAVITY_MPS2
+from terrain.estimation.measurements.batch import measurement_table
+from terrain.estimation.measurements.cleaning import clean_stream
+from terrain.estimation.measurements.sample_hold import (
+    BELIEVED_S,
+    GAP_PERIODS,
+    LEAPS,
+    MAX_AGE_PERIODS,
+    TICK_S,
+)
+from terrain.estimation.measurements.table import (
+    CAMERA_ROWS,
+    GNSS_LATENCY_S,
+    GNSS_ROWS,
+    GNSS_SPEED_STD_MPS,
+    GNSS_STD_M,
+    LATE_S,
+    ROWS_OF_DRIVE,
+    STANDING_S,
+    STANDING_SPEED_MPS,
+    WILD_FACTOR,
+)
+from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
+from terrain.kinematics.camera import body_motion
+from terrain.logs.schema import GNSS_CHANNELS, IMU_CHANNELS
+from terrain.records import Stream
+from terrain.robots import load_robot
+from terrain.simulation.conditions import Faults
+from terrain.simulation.run import simulate_run
+from terrain.simulation.sensors.gnss import Gnss
+
+ROBOT = load_robot("agrimaro")
+ODD = replace(
+    ROBOT,
+    sensors=replace(
+        ROBOT.sensors,
+        gyro_bias_z_radps=0.01,
+        accel_bias_x_mps2=0.1,
+        accel_scale_y_ratio=0.97,
+        imu_latency_s=0.02,
+    ),
+    steering=replace(ROBOT.steering, zero_1_rad=3.0, zero_2_rad=-2.0, zero_3_rad=0.5),
+    camera=replace(ROBOT.camera, time_constant_s=0.02, lever_x_m=0.1, latency_s=0.03),
+)
+
+
+def plain_leaps(time_s, value, least, per_second):
+    """Mark samples that are further from the last one kept than a robot gets, for at most BELIEVED_S."""
+    leaps = np.zeros(value.size, dtype=bool)
+    last, last_s, since_s = np.nan, np.nan, np.nan
+    for k in np.flatnonzero(np.isfinite(value)):
+        if abs(value[k] - last) > least + per_second * (time_s[k] - last_s):
+            since_s = time_s[k] if np.isnan(since_s) else since_s
+            if time_s[k] - since_s < BELIEVED_S:
+                leaps[k] = True
+                continue
+        last, last_s, since_s = value[k], time_s[k], np.nan
+    return leaps
+
+
+def plain_low_pass(time_s, value, tau_s, gap_s):
+    out = np.array(value)
+    for k in range(1, value.size):
+        step_s = time_s[k] - time_s[k - 1]
+        if step_s <= gap_s and tau_s > 0:
+            lead = tau_s * (value[k] - value[k - 1]) / step_s
+            out[k] = value[k] - lead + np.exp(-step_s / tau_s) * (out[k - 1] - value[k - 1] + lead)
+    return out
+
+
+def plain_held(clock, time_s, period_s):
+    """Return which sample each tick takes: the last at or before it, or -1 where that is too old."""
+    tick_s = np.median(np.diff(clock))
+    held = np.searchsorted(time_s, clock + TICK_S, side="right") - 1
+    taken = held >= 0
+    age_s = clock[taken] - time_s[held[taken]]
+    taken[taken] = age_s <= MAX_AGE_PERIODS * max(period_s, tick_s) + TICK_S
+    if period_s > MAX_AGE_PERIODS * tick_s:
+        taken[1:] &= held[1:] != held[:-1]
+    return np.where(taken, held, -1)
+
+
+def plain_on_clock(clock, time_s, came_s, signal, tau_s):
+    known, period_s = np.isfinite(signal), np.median(np.diff(time_s))
+    held = plain_held(clock, came_s[known], period_s)
+    taken, out = held[held >= 0], np.full(clock.size, np.nan)
+    behind = plain_low_pass(time_s[known], signal[known], tau_s, GAP_PERIODS * period_s) - signal[known]
+    decay = np.exp((time_s[known][taken] - clock[held >= 0]) / tau_s) if tau_s > 0 else 1.0
+    out[held >= 0] = signal[known][taken] + behind[taken] * decay
+    return out
+
+
+def plain_imu(imu, robot):
+    sensors = robot.sensors
+    force_x = (imu.channel("accel_x_mps2") - sensors.accel_bias_x_mps2) / sensors.accel_scale_x_ratio
+    force_y = (imu.channel("accel_y_mps2") - sensors.accel_bias_y_mps2) / sensors.accel_scale_y_ratio
+    roll, pitch = imu.channel("roll_rad"), imu.channel("pitch_rad")
+    return {
+        "accel_x_mps2": force_x + GRAVITY_MPS2 * np.sin(pitch),
+        "accel_y_mps2": force_y - GRAVITY_MPS2 * np.sin(roll) * np.cos(pitch),
+        "gyro_z_radps": imu.channel("gyro_z_radps") - sensors.gyro_bias_z_radps,
+        "imu_yaw_rad": unwrapped(imu.channel("yaw_rad")),
+    }
+
+
+def plain_steering(steering, robot):
+    zeros_rad = [getattr(robot.steering, f"zero_{i}_rad") for i in (1, 2, 3)]
+    return {f"steer_{i + 1}_rad": unwrapped(a) for i, a in enumerate(wrapped(steering.values - zeros_rad).T)}
+
+
+def plain_camera(odometry, robot):
+    seen = body_motion(odometry, robot.camera)
+    return dict(zip(CAMERA_ROWS, (*seen.speed_mps.T, seen.yaw_rate_radps, seen.yaw_rad), strict=True))
+
+
+def plain_gnss(gnss, causal):
+    """Positions from the first (fixed) one, speeds, and the variances of both; NaN together."""
+    values = np.array(gnss.values[:, :4])
+    values[np.isnan(values[:, :2]).any(axis=1), :2] = np.nan
+    fixed, known = gnss.channel("fix_ratio") >= 0.5, np.isfinite(values[:, 0])
+    values[:, :2] -= values[(known & fixed if (known & fixed).any() and not causal else known).argmax(), :2]
+    std = gnss.channel("std_position_m")
+    std = np.where(std > 0, std, np.where(fixed, GNSS_STD_M[True], GNSS_STD_M[False]))
+    variance = np.column_stack([std, std, *[np.full(std.size, GNSS_SPEED_STD_MPS)] * 2]) ** 2
+    variance[np.isnan(values)] = np.nan
+    return dict(zip(GNSS_ROWS, values.T, strict=True)), dict(zip(GNSS_ROWS, variance.T, strict=True))
+
+
+def plain_yaw(table, clock, wheel_speed_mps, initial_yaw_rad, causal):
+    """Count the yaw rows from the start, and keep the camera's on the turn that the IMU is on."""
+    moving = (np.abs(wheel_speed_mps) > STANDING_SPEED_MPS).any(axis=1) | (clock > clock[0] + STANDING_S)
+    standing = ~np.logical_or.accumulate(moving)
+    for row in ("imu_yaw_rad", "camera_yaw_rad"):
+        known = np.isfinite(table[row])
+        first = known & standing if (known & standing).any() else np.arange(clock.size) == known.argmax()
+        mean = table[row][first].mean()
+        if causal:
+            mean = np.cumsum(np.where(first, table[row], 0.0)) / np.maximum(np.cumsum(first), 1)
+        table[row] = table[row] - mean + initial_yaw_rad
+    imu, camera = table["imu_yaw_rad"], table["camera_yaw_rad"]
+    both, start = np.isfinite(imu) & np.isfinite(camera), int(np.isfinite(camera).argmax())
+    if both[start] and clock[start] > clock[0] + LATE_S:
+        camera = camera + imu[start] - initial_yaw_rad
+    table["camera_yaw_rad"] = camera + 2 * np.pi * np.round(np.where(both, imu - camera, 0.0) / (2 * np.pi))
+
+
+def plain_table(run, robot, causal, initial_yaw_rad):
+    """Return rows (n, 18), variances (n, 4) and counts of leaps of a swerve robot's run."""
+    dropped, lag_s = Counter(), robot.sensors.encoder_time_constant_s
+    wheels = clean_stream(run, "wheels", [f"motor_{i}_radps" for i in (1, 2, 3)], dropped)
+    clock, rates = wheels.time_s, wheels.values / robot.motors.reduction_ratio
+    rates = np.where(np.abs(rates) > WILD_FACTOR * robot.motors.speed_max_radps, np.nan, rates)
+    rows = ROWS_OF_DRIVE["swerve"]
+    table, leaps = dict(zip(rows, rates.T, strict=False)), {}
+    camera_lag_s = max(lag_s - robot.camera.time_constant_s, 0.0)
+    gnss_variance = dict.fromkeys(GNSS_ROWS, np.full(clock.size, np.nan))
+    for name, channels, frozen, latency_s, tau_s in (
+        ("imu", IMU_CHANNELS, IMU_CHANNELS[:6], robot.sensors.imu_latency_s, lag_s),
+        ("steering", [f"angle_{i}_rad" for i in (1, 2, 3)], (), 0.0, lag_s),
+        ("odometry", CAMERA_CHANNELS, CAMERA_CHANNELS[3:13], robot.camera.latency_s, camera_lag_s),
+        ("gnss", GNSS_CHANNELS, (), GNSS_LATENCY_S, lag_s),
+    ):
+        stream = clean_stream(run, name, channels, dropped, frozen=frozen)
+        if stream is None:
+            continue
+        time_s = stream.time_s - latency_s
+        came_s = stream.time_s if causal else time_s
+        if name == "gnss":
+            signals, variance = plain_gnss(stream, causal)
+            gnss_variance = {
+                row: plain_on_clock(clock, time_s, came_s, v, 0.0) for row, v in variance.items()
+            }
+        else:
+            convert = {"imu": plain_imu, "steering": plain_steering, "odometry": plain_camera}[name]
+            signals = convert(stream, robot)
+        found = {row: plain_leaps(time_s, v, *LEAPS.get(row, (np.inf, np.inf))) for row, v in signals.items()}
+        leaps[name] = int(np.any(list(found.values()), axis=0).sum())
+        for row, signal in signals.items():
+            signal = np.where(found[row], np.nan, signal)
+            table[row] = plain_on_clock(clock, time_s, came_s, signal, tau_s)
+    table = {row: table.get(row, np.full(clock.size, np.nan)) for row in rows}
+    wheel_speed_mps = np.column_stack([table[row] for row in rows[:3]]) * robot.wheel_radius_m
+    plain_yaw(table, clock, wheel_speed_mps, initial_yaw_rad, causal)
+    return np.column_stack(list(table.values())), np.column_stack(list(gnss_variance.values())), leaps
+
+
+def with_faults(run, rng):
+    """Return the run with missing values, spikes, stuck sensors, and stamps that go back."""
+    streams = dict(run.streams)
+    for name in ("wheels", "imu", "odometry", "steering"):
+        time_s, values = streams[name].time_s.copy(), streams[name].values.copy()
+        n = len(time_s)
+        values[rng.integers(0, n, 20), rng.integers(0, values.shape[1], 20)] = np.nan
+        values[rng.integers(0, n, 5)] += 1e3
+        values[n // 3 : n // 3 + 40] = values[n // 3]
+        time_s[n // 2 : n // 2 + 5] -= 0.5
+        streams[name] = Stream(time_s, values, streams[name].channels)
+    return replace(run, streams=streams)
+
+
+def drive(kind):
+    if kind == "late and lost camera":
+        faults = Faults(camera_lost_s=((0.0, 1.5), (5.0, 7.0)), by_chance=False)
+        return simulate_run(ROBOT, "grass", "straight", 5, duration_s=10.0, faults=faults)
+    run = simulate_run(ROBOT, "clay", "arc", 4, duration_s=12.0, gnss=Gnss())
+    return with_faults(run, np.random.default_rng(0)) if kind == "faults" else run
+
+
+@pytest.mark.parametrize("robot", [ROBOT, ODD], ids=["plain robot", "odd robot"])
+@pytest.mark.parametrize("causal", [False, True])
+@pytest.mark.parametrize("kind", ["sound", "faults", "late and lost camera"])
+def test_the_chain_gives_the_numbers_of_its_plain_form(kind, causal, robot):
+    run = drive(kind)
+    table = measurement_table(run, robot, causal=causal, initial_yaw_rad=0.7)
+    z, gnss_variance, leaps = plain_table(run, robot, causal, 0.7)
+    np.testing.assert_allclose(table.z, z, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(table.gnss_variance, gnss_variance, rtol=1e-12)
+    assert {name: table.dropped.get(f"{name}: leap", 0) for name in leaps} == leaps
+    assert (sum(leaps.values()) > 0) == (kind == "faults")
