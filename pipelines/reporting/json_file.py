@@ -16,6 +16,9 @@ from terrain.files.atomic import atomic_write
 
 DEPRECATED_KEYS: dict[str, str] = {
     "simulated": "ours",
+    "terrain_matches": "grounds",
+    "residual_ratio": "share",
+    "effective_ratio": "felt_ratio",
 }
 """New key: the key of earlier releases, which is written beside it for one more release."""
 
