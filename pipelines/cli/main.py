@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pipelines.cli import classify, quickstart, reproduce, runs
+from pipelines.cli import classify, explain, quickstart, reproduce, runs
 from terrain.errors import ConfigError, TerrainError
 
 if TYPE_CHECKING:
@@ -73,7 +73,7 @@ DRIVE_CONTROLLERS = ("plain", "ramp", "thesis", "fixed", "learned", "oracle")
 MAX_GRADE_DEG = 30.0
 
 
-GROUPS = (runs.app, classify.app, reproduce.app, quickstart.app)
+GROUPS = (runs.app, classify.app, explain.app, reproduce.app, quickstart.app)
 """Files of commands, in the order of help."""
 
 
@@ -179,91 +179,6 @@ def calibrate_command(
         repair=repair,
     )
     print_calibration(result, _console())
-    _write_json(json_file, result)
-
-
-@app.command("explain")
-def explain_command(
-    data: Data,
-    robot: Annotated[str, typer.Option(help="Robot whose simulation is tested: name or YAML file.")],
-    out: Annotated[Path, typer.Option(help="Folder of the page, its pictures, and the extended robot.")],
-    model: Annotated[
-        str | None, typer.Option(help="Extended description of that robot, tested in its place.")
-    ] = None,
-    effects: Annotated[
-        str | None, typer.Option(help="Effects that may be named, by commas; all by default.")
-    ] = None,
-    terrain: Annotated[str | None, typer.Option(help="Look at runs of this label alone.")] = None,
-    hold_out: Annotated[
-        int | None,
-        typer.Option(min=0, help="Runs kept to measure the gain; a quarter of six or more by default."),
-    ] = None,
-    classifier: Annotated[
-        bool,
-        typer.Option(
-            "--classifier", help="Also teach a classifier in simulation, before and after; takes a minute."
-        ),
-    ] = False,
-    seed: Annotated[int, typer.Option(min=0, help="Of which runs are kept, and of the bootstrap.")] = 0,
-    layout: FormatOption = Format.auto,
-    mapping: Mapping = None,
-    repair: Repair = False,
-    align: Align = False,
-    json_file: Json = None,
-) -> None:
-    """Find what a robot's simulation gets wrong about runs, extend it, and measure what that is worth."""
-    from pipelines.explain.explain import explain
-    from pipelines.reporting.screens import print_explain, progress_bar
-
-    runs, skipped = _load(data, layout, mapping, repair, align)
-    with progress_bar() as progress:
-        result = explain(
-            runs,
-            robot,
-            out,
-            model=model,
-            effects=None
-            if effects is None
-            else [name.strip() for name in effects.split(",") if name.strip()],
-            terrain=terrain,
-            hold_out=hold_out,
-            seed=seed,
-            dataset=data.resolve().name,
-            classifier=classifier,
-            progress=progress,
-        )
-    print_explain({**result, "skipped": skipped}, _console())
-    _write_json(json_file, {**result, "skipped": skipped})
-
-
-@app.command("explain-trials")
-def explain_trials_command(
-    n: Annotated[
-        int,
-        typer.Option(
-            help="Trials of each row; row 'found' takes the effects in turn, 50 trials a round, and tells "
-            "something after 5 rounds."
-        ),
-    ] = 100,
-    seed: Annotated[int, typer.Option(min=0, help="Of all that is drawn.")] = 0,
-    rows: Annotated[
-        str | None,
-        typer.Option(help="By commas: none, strong, ladder, found, two, outside, poor; all by default."),
-    ] = None,
-    runs: Annotated[int, typer.Option(help="Runs of each trial.")] = 8,
-    jobs: Jobs = 0,
-    json_file: Json = None,
-) -> None:
-    """Hide effects in simulated runs, have them looked for blindly, and count how often that is right."""
-    import os
-
-    from pipelines.explain.trials import ROWS, explain_trials
-    from pipelines.reporting.screens import print_explain_trials, progress_bar
-
-    chosen = ROWS if rows is None else tuple(name.strip() for name in rows.split(",") if name.strip())
-    with progress_bar() as progress:
-        result = explain_trials(n, seed, chosen, runs, jobs or os.cpu_count() or 1, progress)
-    print_explain_trials(result, _console())
     _write_json(json_file, result)
 
 

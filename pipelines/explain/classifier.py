@@ -1,10 +1,9 @@
-"""What an extension is worth to a classifier that is taught in simulation and asked about measured runs."""
+"""What an extension gains for a classifier that is trained in simulation and tested on measured runs."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -12,7 +11,9 @@ from features.windows import Layout, cut_windows, layout_of
 from pipelines.classify.labelled import RUNS_A_TERRAIN, SCENARIO
 from pipelines.classify.settings import CrossvalSettings
 from pipelines.classify.splits import labelled
+from pipelines.explain.results import Change, Comparison
 from pipelines.reporting.progress import Progress, silent
+from terrain.discrepancy.selection import bootstrap_counts
 from terrain.errors import DataError, TerrainError
 from terrain.kinematics.wheel_speed import with_wheel_speeds
 from terrain.logs.schema import SIGNAL_SETS
@@ -22,7 +23,7 @@ from terrain.simulation.run import simulate_run
 from terrain.terramechanics.soil import soil_names
 
 MIN_RUNS, MIN_TERRAINS = 4, 2
-"""Fewer held-out runs on fewer known terrains tell no accuracy."""
+"""Least numbers of held-out runs and known terrains for an accuracy."""
 
 N_BOOTSTRAP = 2000
 
@@ -35,38 +36,35 @@ def classifier_gain(
     seed: int,
     runs_a_terrain: int = RUNS_A_TERRAIN,
     progress: Progress = silent,
-) -> dict[str, Any]:
-    """Return the accuracy on held-out runs of a recipe taught on runs simulated without and with effects.
+) -> Comparison:
+    """Return the accuracy on held-out runs of a recipe trained on runs simulated without and with effects.
 
-    Both are taught on the same drives of varied days, with the same seeds, and asked about the same windows.
-    The interval is that of the difference, by bootstrap over runs.
+    Both are trained on the same varied drives with the same seeds, and tested on the same windows.  The
+    interval is that of the difference, by bootstrap over runs.
 
     Parameters
     ----------
-    held_out : measured runs; those count that are labelled with one soil of the package
+    held_out : measured runs; those that are labelled with one soil of the package are used
     robot : of the runs
-    before, after : effects that act in the simulation
+    before, after : effects in the simulation
     seed : of simulation, inner folds and bootstrap
     runs_a_terrain : simulated on each
-
-    Returns
-    -------
-    dict that JSON can hold
-        ``name, reason, n_runs, terrains, errors``; ``errors`` is empty where ``reason`` says why.
     """
     settings = CrossvalSettings(seed=seed)
     known = [run for run in held_out if len(run.terrains) == 1 and run.terrains[0] in soil_names()]
-    terrains = sorted({run.terrains[0] for run in known})
-    found: dict[str, Any] = {"name": settings.recipe, "n_runs": len(known), "terrains": terrains}
-    found["errors"] = {}
+    terrains = tuple(sorted({run.terrains[0] for run in known}))
+    unknown = Comparison(settings.recipe, None, len(known), {}, terrains)
     if len(terrains) < MIN_TERRAINS:
-        told = f"the held-out runs are on {len(terrains)} known terrain{'s' * (len(terrains) != 1)}, "
-        return found | {"reason": f"{told}{MIN_TERRAINS} at the least are required"}
+        plural = "s" * (len(terrains) != 1)
+        return unknown._replace(
+            reason=f"the held-out runs are on {len(terrains)} known terrain{plural}, at least {MIN_TERRAINS} "
+            "are required"
+        )
     if len(known) < MIN_RUNS:
-        return found | {"reason": f"{len(known)} runs are held out, {MIN_RUNS} at the least are required"}
+        return unknown._replace(reason=f"{len(known)} runs are held out, at least {MIN_RUNS} are required")
     bare = replace(robot, effects={}, effects_cov=np.empty((0, 0)))
     try:
-        right = []
+        correct = []
         for step, effects in enumerate((before, after)):
             trained = [
                 with_wheel_speeds(
@@ -76,24 +74,25 @@ def classifier_gain(
                 for terrain in terrains
                 for number in range(1, runs_a_terrain + 1)
             ]
-            right.append(_right(trained, [with_wheel_speeds(run, bare) for run in known], settings))
+            tested = [with_wheel_speeds(run, bare) for run in known]
+            correct.append(_correct_windows(trained, tested, settings))
             progress("classifier", step + 1, 2)
     except TerrainError as error:
-        return found | {"reason": str(error)}
-    (first, run_id), (second, _) = right
-    return found | {"reason": None, "errors": {"accuracy": compared(first, second, run_id, seed)}}
+        return unknown._replace(reason=str(error))
+    (first, run_id), (second, _) = correct
+    return unknown._replace(errors={"accuracy": accuracy_change(first, second, run_id, seed)})
 
 
-def _right(
+def _correct_windows(
     trained: Sequence[RunLog], known: Sequence[RunLog], settings: CrossvalSettings
 ) -> tuple[Array, Array]:
-    """Return which windows (n,) of the known runs are told right, and the runs (n,) that they are of."""
+    """Return which windows (n,) of the known runs are classified correctly, and their runs (n,)."""
     layout = _shared_layout(trained, known, settings)
-    lessons, exam = (_windows(runs, settings, layout) for runs in (trained, known))
+    train, test = (_windows(runs, settings, layout) for runs in (trained, known))
     recipe = settings.new_recipe()
-    recipe.fit(lessons, lessons.terrain.astype(str))
-    said = np.asarray(recipe.predict(exam)).astype(str)
-    return said == exam.terrain.astype(str), exam.run_id.astype(str)
+    recipe.fit(train, train.terrain.astype(str))
+    predicted = np.asarray(recipe.predict(test)).astype(str)
+    return predicted == test.terrain.astype(str), test.run_id.astype(str)
 
 
 def _shared_layout(trained: Sequence[RunLog], known: Sequence[RunLog], settings: CrossvalSettings) -> Layout:
@@ -113,23 +112,25 @@ def _windows(runs: Sequence[RunLog], settings: CrossvalSettings, layout: Layout)
     return labelled(cut_windows(runs, settings.rule, layout=layout, skip_short=True)).windows
 
 
-def compared(before: Array, after: Array, run_id: Array, seed: int) -> dict[str, Any]:
-    """Return accuracies ``before`` and ``after`` and the 95 % interval of their difference, ``change_ci``.
+def accuracy_change(before: Array, after: Array, run_id: Array, seed: int) -> Change:
+    """Return accuracies before and after, and the 95 % interval of their difference.
+
+    Parameters
+    ----------
+    before, after : (n,) whether each window is classified correctly
+    run_id : (n,) run of each window
+    seed : of the bootstrap over runs
 
     Examples
     --------
-    >>> found = compared(np.array([0, 0, 1, 1]), np.array([1, 1, 1, 1]), np.array(["a", "a", "b", "b"]), 0)
-    >>> found["before"], found["after"], found["change_ci"]
-    (0.5, 1.0, [0.0, 1.0])
+    >>> before, after = np.array([0, 0, 1, 1]), np.array([1, 1, 1, 1])
+    >>> accuracy_change(before, after, np.array(["a", "a", "b", "b"]), 0)
+    Change(before=0.5, after=1.0, change_ci=(0.0, 1.0))
     """
     runs, of = np.unique(run_id, return_inverse=True)
     n = len(runs)
     windows = np.bincount(of, minlength=n)
     change = np.bincount(of, weights=after.astype(float) - before.astype(float), minlength=n)
-    weights = np.random.default_rng(seed).multinomial(n, np.full(n, 1 / n), N_BOOTSTRAP)
-    low, high = np.quantile((weights @ change) / (weights @ windows), [0.025, 0.975])
-    return {
-        "before": float(before.mean()),
-        "after": float(after.mean()),
-        "change_ci": [float(low), float(high)],
-    }
+    counts = bootstrap_counts(n, N_BOOTSTRAP, seed)
+    low, high = np.quantile((counts @ change) / (counts @ windows), [0.025, 0.975])
+    return Change(float(before.mean()), float(after.mean()), (float(low), float(high)))

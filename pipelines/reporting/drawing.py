@@ -96,11 +96,11 @@ def sentence(text: str) -> str:
     return f"{text[:1].upper()}{text[1:]}{'' if text.endswith('.') else '.'}"
 
 
-def png_bytes(figure: Figure) -> bytes:
+def png_bytes(figure: Figure, dpi: int = PNG_DPI) -> bytes:
     """Return a figure as PNG: the same bytes for the same figure, with no date and no version inside."""
     with styled():
         file = io.BytesIO()
-        figure.savefig(file, format="png", dpi=PNG_DPI, metadata={"Software": None})
+        figure.savefig(file, format="png", dpi=dpi, metadata={"Software": None})
     return file.getvalue()
 
 

@@ -17,6 +17,9 @@ from terrain.files.atomic import atomic_write
 DEPRECATED_KEYS: dict[str, str] = {
     "simulated": "ours",
     "training_runs": "taught_runs",
+    "terrain_matches": "grounds",
+    "residual_ratio": "share",
+    "effective_ratio": "felt_ratio",
 }
 """New key: the key of earlier releases, which is written beside it for one more release."""
 

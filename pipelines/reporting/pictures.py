@@ -30,15 +30,25 @@ class Image(NamedTuple):
 
 def svg_or_png(figure: Figure, alt: str, caption: str = "", max_svg_bytes: int = MAX_SVG_BYTES) -> Image:
     """Return a figure as SVG, or as PNG where that is larger than ``max_svg_bytes``."""
-    content, kind = svg_text(figure).encode(), "svg+xml"
-    if len(content) > max_svg_bytes:
-        content, kind = png_bytes(figure), "png"
-    return Image(_data_uri(content, kind), alt, caption)
+    svg = svg_text(figure)
+    if len(svg.encode()) > max_svg_bytes:
+        return png_image(png_bytes(figure), alt, caption)
+    return svg_image(svg, alt, caption)
+
+
+def svg_image(svg: str, alt: str, caption: str = "") -> Image:
+    """Return a picture that is drawn as SVG already."""
+    return Image(_data_uri(svg.encode(), "svg+xml"), alt, caption)
+
+
+def png_image(content: bytes, alt: str, caption: str = "") -> Image:
+    """Return a picture that is drawn as PNG already."""
+    return Image(_data_uri(content, "png"), alt, caption)
 
 
 def png(figure: Figure, alt: str, caption: str = "") -> Image:
     """Return a figure as PNG."""
-    return Image(_data_uri(png_bytes(figure), "png"), alt, caption)
+    return png_image(png_bytes(figure), alt, caption)
 
 
 def _data_uri(content: bytes, kind: str) -> str:

@@ -25,11 +25,6 @@ from terrain.discrepancy.selection import SEEN_SHARE, Z_EFFECT, fitted, gain_int
 from terrain.discrepancy.signals import Signals, signals_of
 from terrain.discrepancy.simulation import Simulation
 from terrain.discrepancy.verdict import (
-    AMBIGUOUS,
-    EXPLAINED,
-    NONE,
-    NOT_EXCITED,
-    UNEXPLAINED,
     Cause,
     Diagnosis,
     Leftover,
@@ -37,6 +32,7 @@ from terrain.discrepancy.verdict import (
     Residual,
     RuledOut,
     Value,
+    Verdict,
 )
 from terrain.effects import BOUNDS, CHANNELS, INDEX, Effect
 from terrain.errors import DataError
@@ -86,9 +82,7 @@ def diagnose(
     if twice := [run_id for run_id, n in ids.items() if n > 1]:
         raise DataError(f"runs: {twice[0]!r} is the id of {ids[twice[0]]} runs; each needs its own")
     if len(runs) < MIN_RUNS:
-        raise DataError(
-            f"runs: there are {len(runs)}, {MIN_RUNS} at the least are required, to hold some out"
-        )
+        raise DataError(f"runs: there are {len(runs)}, at least {MIN_RUNS} are required, to hold some out")
     return diagnose_signals([signals_of(run, simulation.robot) for run in runs], simulation, library)
 
 
@@ -126,13 +120,13 @@ def diagnose_signals(
     at = [found.names.index(name) for name in parameters]
     grown = np.array([found.tried[effect.name].inflation for effect in named for _ in effect.parameters])
     if sets:
-        verdict = AMBIGUOUS
+        verdict = Verdict.AMBIGUOUS
     elif causes:
-        verdict = EXPLAINED
+        verdict = Verdict.EXPLAINED
     elif leftovers:
-        verdict = UNEXPLAINED
+        verdict = Verdict.UNEXPLAINED
     else:
-        verdict = NOT_EXCITED if len(missed) > BLIND_SHARE * len(limits) else NONE
+        verdict = Verdict.NOT_EXCITED if len(missed) > BLIND_SHARE * len(limits) else Verdict.NONE
     after = _after(problem, found, named)
     return Diagnosis(
         robot=simulation.robot.name,

@@ -11,10 +11,10 @@ from terrain.discrepancy.health import unfit_runs
 from terrain.discrepancy.information import N_BLOCKS, Information, information_at
 from terrain.discrepancy.residuals import low_pass_of, measured_channels
 from terrain.discrepancy.search import names_of
-from terrain.discrepancy.selection import MIN_CLUSTERS
+from terrain.discrepancy.selection import MIN_CLUSTERS, bootstrap_counts
 from terrain.discrepancy.signals import signals_of
 from terrain.discrepancy.simulation import Simulation
-from terrain.discrepancy.verdict import Excluded
+from terrain.discrepancy.verdict import Excluded, finite
 from terrain.effects import CHANNELS
 from terrain.errors import ConfigError, DataError
 from terrain.records import Array, RunLog
@@ -26,7 +26,7 @@ MIN_JUDGED = 3
 
 
 class Reduction(NamedTuple):
-    """Share of a square that an extension takes away, and its 95 % interval by bootstrap over clusters.
+    """Ratio of the square that an extension removes, and its 95 % interval by bootstrap over clusters.
 
     Examples
     --------
@@ -34,7 +34,7 @@ class Reduction(NamedTuple):
     (False, True)
     """
 
-    share: float
+    ratio: float
     low: float
     high: float
 
@@ -93,7 +93,7 @@ class Gain(NamedTuple):
             **_reduction_json(self.reduction),
             "channels": {
                 name: {
-                    key: _number(getattr(found, key))
+                    key: finite(getattr(found, key))
                     for key in ("rms_before", "rms_after", "white_before", "white_after")
                 }
                 | _reduction_json(found.reduction)
@@ -140,9 +140,7 @@ def gain(simulation: Simulation, extended: Simulation, runs: Sequence[RunLog], s
         after = information_at(signals, extended, extended.vector, names, low_pass)
     before = information_at(signals, simulation, simulation.vector, (), low_pass, after.noise)
     by_run = len(signals) >= MIN_CLUSTERS
-    rng = np.random.default_rng(seed)
-    n = len(signals) * (1 if by_run else N_BLOCKS)
-    weights = rng.multinomial(n, np.full(n, 1 / n), N_BOOTSTRAP)
+    weights = bootstrap_counts(len(signals) * (1 if by_run else N_BLOCKS), N_BOOTSTRAP, seed)
     channels = {}
     for name in measured_channels(after.rows):
         c = CHANNELS.index(name)
@@ -206,21 +204,17 @@ def _rms(squares: Array) -> float:
 def _reduction(before: Array, after: Array, weights: Array) -> Reduction:
     drawn, left = weights @ before, weights @ after
     with np.errstate(divide="ignore", invalid="ignore"):
-        shares = 1.0 - left / drawn
-        share = 1.0 - after.sum() / before.sum()
-    if not np.isfinite(shares).any():
+        ratios = 1.0 - left / drawn
+        ratio = 1.0 - after.sum() / before.sum()
+    if not np.isfinite(ratios).any():
         return Reduction(float("nan"), float("nan"), float("nan"))
-    low, high = np.nanquantile(shares, [0.025, 0.975])
-    return Reduction(float(share), float(low), float(high))
+    low, high = np.nanquantile(ratios, [0.025, 0.975])
+    return Reduction(float(ratio), float(low), float(high))
 
 
 def _reduction_json(found: Reduction) -> dict[str, Any]:
     return {
-        "reduction": _number(found.share),
-        "ci": [_number(found.low), _number(found.high)],
+        "reduction": finite(found.ratio),
+        "ci": [finite(found.low), finite(found.high)],
         "refused": found.refused,
     }
-
-
-def _number(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None

@@ -177,10 +177,14 @@ def _left_out_loss(info: Information, at: list[int]) -> Array:
     return loss
 
 
+def bootstrap_counts(n: int, n_draws: int, seed: int) -> Array:
+    """Return how often each of ``n`` clusters is drawn in each bootstrap sample (n_draws, n)."""
+    counts: Array = np.random.default_rng(seed).multinomial(n, np.full(n, 1 / n), n_draws)
+    return counts
+
+
 def gain_interval(gain: Array, seed: int = 0) -> tuple[float, float]:
     """Return the 95 % interval of the summed gain, by bootstrap over runs."""
-    weights = np.random.default_rng(seed).multinomial(
-        len(gain), np.full(len(gain), 1 / len(gain)), N_BOOTSTRAP
-    )
+    weights = bootstrap_counts(len(gain), N_BOOTSTRAP, seed)
     low, high = np.quantile(weights @ gain, [0.025, 0.975])
     return float(low), float(high)

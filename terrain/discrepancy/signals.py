@@ -1,8 +1,9 @@
-"""From streams to signals on one clock: what drives the simulation, and what it is held against."""
+"""From streams to signals on one clock: the inputs of the simulation, and what it is compared with."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,7 +33,7 @@ MAX_GAP_PERIODS = 3.5
 """Longest hole of a stream that is bridged by a straight line, in its own periods."""
 
 MIN_LENGTH_S = 4.0
-"""A shorter run has no stretch left once filters have settled."""
+"""Of a shorter run nothing is left once filters have settled."""
 
 JUMP_S, JUMP_MPS, JUMP_SIGMAS = 0.05, 0.1, 8.0
 """A speed of the camera is no speed but a jump of its map, if it is off the median of so long before and
@@ -42,7 +43,8 @@ BACKWARD_MPS, MIN_BACKWARD = 0.02, 5
 """A wheel turns backward that is so fast on so many samples."""
 
 PARALLEL = 0.95
-"""Mean of the wheels' unit vectors from which on the sum of currents tells traction: within 18 degrees."""
+"""Least norm of the mean of the wheels' unit vectors at which the sum of currents measures traction: wheels
+within 18 degrees of each other."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,7 +59,7 @@ class Signals:
     wheel_speed_mps : (n, wheels) wheel speeds with the nominal radius; NaN where a logger was silent
     steer_rad : (n, wheels) steering angles, zeros taken off; 0 for a robot that has none
     grade_rad, roll_rad : (n,) measured tilt, uphill and left side up positive; 0 where none is measured
-    measured : (n, len(CHANNELS)) what the simulation is held against; NaN where nothing was measured
+    measured : (n, len(CHANNELS)) what the simulation is compared with; NaN where nothing was measured
     """
 
     run_id: str
@@ -84,7 +86,7 @@ class Signals:
 
 
 def signals_of(run: RunLog, robot: Robot) -> Signals:
-    """Return what a run says, on one clock.
+    """Return the signals of a run, resampled to one clock.
 
     Raises
     ------
@@ -98,43 +100,88 @@ def signals_of(run: RunLog, robot: Robot) -> Signals:
         )
     if "wheels" not in run.streams:
         raise DataError(f"run {run.run_id}: it has no stream 'wheels', which drives the simulation")
-    wheels = run.streams["wheels"]
-    wheel_speeds = _wheel_speeds(run, wheels, robot)
     swerve = robot.drive == "swerve"
     if swerve and "steering" not in run.streams:
         raise DataError(f"run {run.run_id}: it has no stream 'steering', which drives the simulation")
-    used = ["wheels", *(["steering"] if swerve else [])]
-    others = [name for name in ("imu", "odometry", "lidar") if name in run.streams]
-    start_s = max(float(run.streams[name].time_s[0]) for name in (*used, *others))
-    end_s = min(float(run.streams[name].time_s[-1]) for name in (*used, *others))
-    rate_hz = min(MAX_RATE_HZ, wheels.rate_hz)
+    wheels = run.streams["wheels"]
+    wheel_speeds = _wheel_speeds(run, wheels, robot)
+    time_s, dt_s = _clock(run, ("wheels", "steering") if swerve else ("wheels",))
+    steer = _steering(run, robot, time_s) if swerve else np.zeros((time_s.size, len(robot.wheels)))
+    grade, roll = _tilt(run, time_s)
+    measured = np.full((time_s.size, len(CHANNELS)), np.nan)
+    _put_imu(measured, run, time_s)
+    _put_motion(measured, run, robot, time_s)
+    _put_currents(measured, wheels, wheel_speeds, steer, robot, time_s)
+    if not np.isfinite(measured).any():
+        raise DataError(
+            f"run {run.run_id}: none of its channels is simulated; a gyro, currents of all wheels, a speed "
+            "over ground or an accelerometer with its tilt is required"
+        )
+    columns = [_at(time_s, wheels.time_s, wheel_speeds[:, i]) for i in range(wheel_speeds.shape[1])]
+    return Signals(
+        run_id=run.run_id,
+        terrain=run.terrains[0] if len(run.terrains) == 1 else "",
+        dt_s=dt_s,
+        start_s=float(time_s[0]),
+        wheel_speed_mps=np.column_stack(columns),
+        steer_rad=steer,
+        grade_rad=grade,
+        roll_rad=roll,
+        measured=measured,
+    )
+
+
+def _clock(run: RunLog, inputs: Sequence[str]) -> tuple[Array, float]:
+    """Return the instants (n,) that all streams have in common, and their period."""
+    used = [*inputs, *(name for name in ("imu", "odometry", "lidar") if name in run.streams)]
+    start_s = max(float(run.streams[name].time_s[0]) for name in used)
+    end_s = min(float(run.streams[name].time_s[-1]) for name in used)
+    rate_hz = min(MAX_RATE_HZ, run.streams["wheels"].rate_hz)
     n = math.floor((end_s - start_s) * rate_hz + 1e-6) + 1 if end_s > start_s else 0
     if n < MIN_LENGTH_S * rate_hz:
         raise DataError(
             f"run {run.run_id}: its streams have {max(end_s - start_s, 0.0):.1f} s in common, "
-            f"{MIN_LENGTH_S:g} s at the least are required"
+            f"at least {MIN_LENGTH_S:g} s are required"
         )
-    time_s = start_s + np.arange(n) / rate_hz
-    steer = np.zeros((n, len(robot.wheels)))
-    if swerve:
-        robot.has("steering")
-        assert robot.steering is not None
-        stream = run.streams["steering"]
-        for i in range(3):
-            raw = unwrapped(stream.channel(f"angle_{i + 1}_rad"))
-            zero = getattr(robot.steering, f"zero_{i + 1}_rad")
-            turn = 2 * math.pi * np.round((raw[np.isfinite(raw)][:1].sum() - zero) / (2 * math.pi))
-            steer[:, i] = _at(time_s, stream.time_s, raw - zero - turn)
-    grade = roll = np.zeros(n)
-    measured = np.full((n, len(CHANNELS)), np.nan)
+    return start_s + np.arange(n) / rate_hz, 1 / rate_hz
+
+
+def _steering(run: RunLog, robot: Robot, time_s: Array) -> Array:
+    """Return the steering angles (n, wheels) of a swerve robot, zeros and whole turns subtracted."""
+    robot.has("steering")
+    assert robot.steering is not None
+    stream = run.streams["steering"]
+    steer = np.zeros((time_s.size, len(robot.wheels)))
+    for i in range(3):
+        raw = unwrapped(stream.channel(f"angle_{i + 1}_rad"))
+        zero = getattr(robot.steering, f"zero_{i + 1}_rad")
+        turn = 2 * math.pi * np.round((raw[np.isfinite(raw)][:1].sum() - zero) / (2 * math.pi))
+        steer[:, i] = _at(time_s, stream.time_s, raw - zero - turn)
+    return steer
+
+
+def _has_tilt(run: RunLog) -> bool:
+    return "imu" in run.streams and {"roll_rad", "pitch_rad"} <= set(run.streams["imu"].channels)
+
+
+def _tilt(run: RunLog, time_s: Array) -> tuple[Array, Array]:
+    """Return grade and roll (n,), 0 where none is measured."""
+    if not _has_tilt(run):
+        return np.zeros(time_s.size), np.zeros(time_s.size)
+    imu = run.streams["imu"]
+    grade = -_at(time_s, imu.time_s, imu.channel("pitch_rad"))
+    return grade, _at(time_s, imu.time_s, imu.channel("roll_rad"))
+
+
+def _put_imu(measured: Array, run: RunLog, time_s: Array) -> None:
     if (imu := run.streams.get("imu")) is not None:
-        tilted = {"roll_rad", "pitch_rad"} <= set(imu.channels)
-        if tilted:
-            grade = -_at(time_s, imu.time_s, imu.channel("pitch_rad"))
-            roll = _at(time_s, imu.time_s, imu.channel("roll_rad"))
         _put(measured, GYRO, time_s, imu, "gyro_z_radps")
-        if tilted:
+        if _has_tilt(run):
             _put(measured, ACCEL, time_s, imu, "accel_x_mps2")
+
+
+def _put_motion(measured: Array, run: RunLog, robot: Robot, time_s: Array) -> None:
+    """Put in speeds over ground and the heading rate, from a camera's poses, its speeds, or a lidar."""
     if (seen := run.streams.get("odometry")) is not None:
         if set(POSE_CHANNELS) <= set(seen.channels):
             robot.has("camera")
@@ -149,36 +196,25 @@ def signals_of(run: RunLog, robot: Robot) -> Signals:
         _put(measured, SPEED_X, time_s, lidar, "speed_x_mps")
         _put(measured, SPEED_Y, time_s, lidar, "speed_y_mps")
         _put(measured, HEADING, time_s, lidar, "yaw_rate_radps")
+
+
+def _put_currents(
+    measured: Array, wheels: Stream, wheel_speeds: Array, steer: Array, robot: Robot, time_s: Array
+) -> None:
+    """Put in the sum of the motor currents, and of a skid-steer robot their difference."""
     currents = [f"current_{wheel}_a" for wheel in robot.wheels]
-    if set(currents) <= set(wheels.channels):
-        each = [
-            _at(time_s, wheels.time_s, _signed(wheels.channel(name), wheel_speeds[:, i]))
-            for i, name in enumerate(currents)
-        ]
-        measured[:, CHANNELS.index(CURRENT)] = np.sum(each, axis=0)
-        if swerve:
-            parallel = np.abs(np.exp(1j * steer).mean(axis=1)) > PARALLEL
-            measured[~parallel, CHANNELS.index(CURRENT)] = np.nan
-        else:
-            measured[:, CHANNELS.index(TURNING_CURRENT)] = each[1] - each[0]
-    if not np.isfinite(measured).any():
-        raise DataError(
-            f"run {run.run_id}: none of its channels is simulated; a gyro, currents of all wheels, a speed "
-            "over ground or an accelerometer with its tilt is required"
-        )
-    return Signals(
-        run.run_id,
-        run.terrains[0] if len(run.terrains) == 1 else "",
-        1 / rate_hz,
-        start_s,
-        np.column_stack(
-            [_at(time_s, wheels.time_s, wheel_speeds[:, i]) for i in range(wheel_speeds.shape[1])]
-        ),
-        steer,
-        grade,
-        roll,
-        measured,
-    )
+    if not set(currents) <= set(wheels.channels):
+        return
+    each = [
+        _at(time_s, wheels.time_s, _signed(wheels.channel(name), wheel_speeds[:, i]))
+        for i, name in enumerate(currents)
+    ]
+    measured[:, CHANNELS.index(CURRENT)] = np.sum(each, axis=0)
+    if robot.drive == "swerve":
+        parallel = np.abs(np.exp(1j * steer).mean(axis=1)) > PARALLEL
+        measured[~parallel, CHANNELS.index(CURRENT)] = np.nan
+    else:
+        measured[:, CHANNELS.index(TURNING_CURRENT)] = each[1] - each[0]
 
 
 def _wheel_speeds(run: RunLog, wheels: Stream, robot: Robot) -> Array:
@@ -208,10 +244,10 @@ def _without_jumps(seen: Stream, speed_mps: Array) -> Array:
 
 
 def _signed(current_a: Array, wheel_speed_mps: Array) -> Array:
-    """Return currents (n,) with the sign of the wheel's turning, where the driver logs only their size.
+    """Return currents (n,) with the sign of the wheel speed, where the motor driver logs magnitudes only.
 
-    It does, if a wheel turns backward and its current is never below zero.  That a motor brakes cannot be
-    told from such a log.
+    That is so if a wheel turns backward and its current is never negative.  Braking cannot be seen in such a
+    log.
     """
     backward = wheel_speed_mps < -BACKWARD_MPS
     if backward.sum() < MIN_BACKWARD or np.nanmin(current_a) < 0:
@@ -229,9 +265,9 @@ def _at(time_s: Array, stamps_s: Array, values: Array) -> Array:
     known = np.isfinite(values)
     if known.sum() < 2:
         return np.full(time_s.size, np.nan)
-    stamps, told = stamps_s[known], values[known]
+    stamps, samples = stamps_s[known], values[known]
     period_s = float(np.median(np.diff(stamps_s)))
-    at = np.interp(time_s, stamps, told)
+    at = np.interp(time_s, stamps, samples)
     after = np.searchsorted(stamps, time_s, side="left").clip(1, stamps.size - 1)
     hole = (stamps[after] - stamps[after - 1]) > MAX_GAP_PERIODS * period_s
     inside = (time_s > stamps[after - 1]) & (time_s < stamps[after])

@@ -3,19 +3,26 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from enum import StrEnum
 from typing import Any, NamedTuple
 
 from terrain.records import Array
 
-NONE, EXPLAINED, AMBIGUOUS, UNEXPLAINED, NOT_EXCITED = (
-    "none",
-    "explained",
-    "ambiguous",
-    "unexplained",
-    "not_excited",
-)
-VERDICTS = (NONE, EXPLAINED, AMBIGUOUS, UNEXPLAINED, NOT_EXCITED)
+
+class Verdict(StrEnum):
+    """Outcome of a diagnosis.
+
+    ``REFUSED`` is never the verdict of a :class:`Diagnosis`: blind trials use it for a diagnosis that ended
+    in a ``DataError``.
+    """
+
+    NONE = "none"
+    EXPLAINED = "explained"
+    AMBIGUOUS = "ambiguous"
+    UNEXPLAINED = "unexplained"
+    NOT_EXCITED = "not_excited"
+    REFUSED = "refused"
 
 
 class Value(NamedTuple):
@@ -59,13 +66,13 @@ class Leftover(NamedTuple):
     ----------
     channel, input : names
     z : evidence, in standard deviations
-    share : of the channel's whitened residual that follows it
+    ratio : part of the channel's whitened squared residual that depends on it
     """
 
     channel: str
     input: str
     z: float
-    share: float
+    ratio: float
 
 
 class Limit(NamedTuple):
@@ -139,7 +146,7 @@ class Diagnosis:
     Parameters
     ----------
     robot : name
-    verdict : one of :data:`VERDICTS`; ``explained`` where a cause is named, also when something else is left
+    verdict : ``explained`` where a cause is named, also when something else is left
     causes : named beyond doubt
     parameters, cov : names (k,) of their parameters, and the covariance (k, k) of the values
     ambiguous_sets : effects of which one is there, and these runs do not tell which; the best fit first
@@ -155,7 +162,7 @@ class Diagnosis:
     """
 
     robot: str
-    verdict: str
+    verdict: Verdict
     causes: tuple[Cause, ...]
     parameters: tuple[str, ...]
     cov: Array
@@ -171,7 +178,6 @@ class Diagnosis:
     residual_before: dict[str, Residual]
     residual_after: dict[str, Residual]
     n_runs: int
-    notes: tuple[str, ...] = field(default=())
 
     @property
     def values(self) -> dict[str, float]:
@@ -181,23 +187,23 @@ class Diagnosis:
     def as_json(self) -> dict[str, Any]:
         """Return the answer as JSON has it; what is not known is null."""
         limits = [
-            {"name": x.name, "detection_limit": _number(x.value), "unit": x.unit, "needs": x.needs}
+            {"name": x.name, "detection_limit": finite(x.value), "unit": x.unit, "needs": x.needs}
             for x in self.limits
         ]
         missed = {x.name for x in self.not_excited}
         return {
             "robot": self.robot,
-            "verdict": self.verdict,
+            "verdict": self.verdict.value,
             "causes": [
                 {
                     "name": cause.name,
                     "aliases": list(cause.aliases),
                     "parameters": [_value(value) for value in cause.values],
-                    "held_out_gain": _number(cause.gain),
-                    "gain_ci": [_number(cause.gain_low), _number(cause.gain_high)],
+                    "held_out_gain": finite(cause.gain),
+                    "gain_ci": [finite(cause.gain_low), finite(cause.gain_high)],
                     "channels": list(cause.channels),
-                    "z": _number(cause.z),
-                    "dispersion": _number(cause.dispersion),
+                    "z": finite(cause.z),
+                    "dispersion": finite(cause.dispersion),
                 }
                 for cause in self.causes
             ],
@@ -207,7 +213,7 @@ class Diagnosis:
                 name: [_value(value) for value in values] for name, values in self.ambiguous_values.items()
             },
             "unexplained": [
-                {"channel": x.channel, "input": x.input, "z": _number(x.z), "share": _number(x.share)}
+                {"channel": x.channel, "input": x.input, "z": finite(x.z), "residual_ratio": finite(x.ratio)}
                 for x in self.unexplained
             ],
             "not_excited": [limit for limit in limits if limit["name"] in missed],
@@ -216,36 +222,36 @@ class Diagnosis:
                 {
                     "name": x.name,
                     "reason": x.reason,
-                    "z": _number(x.z),
+                    "z": finite(x.z),
                     "parameters": [_value(value) for value in x.values],
                 }
                 for x in self.ruled_out
             ],
             "excluded_runs": [x._asdict() for x in self.excluded_runs],
             "clocks": [
-                {"run_id": x.run_id, "offset_s": _number(x.offset_s), "std_s": _number(x.std_s)}
+                {"run_id": x.run_id, "offset_s": finite(x.offset_s), "std_s": finite(x.std_s)}
                 for x in self.clocks
             ],
             "next_drive": None if self.next_drive is None else self.next_drive._asdict(),
             "residual_before": {name: _residual(x) for name, x in self.residual_before.items()},
             "residual_after": {name: _residual(x) for name, x in self.residual_after.items()},
             "n_runs": self.n_runs,
-            "notes": list(self.notes),
         }
 
 
 def _value(value: Value) -> dict[str, Any]:
     return {
         "name": value.name,
-        "value": _number(value.value),
+        "value": finite(value.value),
         "unit": value.unit,
-        "ci": [_number(value.low), _number(value.high)],
+        "ci": [finite(value.low), finite(value.high)],
     }
 
 
 def _residual(residual: Residual) -> dict[str, Any]:
-    return {name: _number(value) for name, value in residual._asdict().items()}
+    return {name: finite(value) for name, value in residual._asdict().items()}
 
 
-def _number(value: float) -> float | None:
+def finite(value: float) -> float | None:
+    """Return a number as JSON can hold it: None where it is not finite."""
     return float(value) if math.isfinite(value) else None

@@ -1,168 +1,148 @@
-"""Blind trials' other side: hides effects in simulated runs, and says how small they could be and be seen.
+"""What a blind trial hides in simulated runs, drawn at random around the effects' detection limits.
 
-Nothing here is known to the diagnosis: it gets run logs without truth and without source.  The *limit* of an
-effect is the amplitude that a test at the size corrected for the library would find nine times in ten, by the
-Cramer-Rao bound of the very drives, with everything that scatters from run to run left free: from
-sensitivities of the true motion and from spectra of the noise as it is put in, not from anything that the
-diagnosis computes.
+The diagnosis gets run logs without truth and without source, and knows nothing of this module.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import norm
 
-from terrain.effects import (
-    ACCEL,
-    CHANNELS,
-    CURRENT,
-    GYRO,
-    INDEX,
-    LIBRARY,
-    ONE_SIDED,
-    SENSED_ONLY,
-    SPEED_X,
-    SPEED_Y,
-    STEPS,
-    TURNING_CURRENT,
-    Effect,
-    library_of,
-    nuisances_of,
-    parameters_of,
-    vector_of,
-)
-from terrain.records import Array, RunLog, Stream
+from terrain.discrepancy.trials.drives import Drives
+from terrain.discrepancy.trials.limits import Limits, confusable_class
+from terrain.discrepancy.trials.rows import Row
+from terrain.effects import Effect, effect_named, library_of
+from terrain.records import RunLog
 from terrain.robots import Robot
-from terrain.simulation.planar.hills import Hills
-from terrain.simulation.planar.ideal_sensors import sense
-from terrain.simulation.planar.model import Ground, Planar, make_planar
-from terrain.simulation.planar.motion import move
-from terrain.simulation.planar.noise import Noise, load_noise, load_scatter
-from terrain.simulation.planar.noise_spectra import WHEEL_SPEED, noise_psd
+from terrain.simulation.planar.noise import load_noise, load_scatter
 from terrain.simulation.planar.run import simulate_planar
 
-TEST_SIZE = 0.02
-"""Size of the test over the whole library, to which limits refer."""
+ROBOTS = ("agrimaro", "husky")
+"""Trials take them in turn."""
 
-POWER = 0.9
+STRONG = 3.0
+"""Amplitude over the detection limit, of an effect that has to be named."""
 
-CONFUSABLE = 0.99
-"""Two effects whose sensitivities correlate more than that, nuisances taken out, are of one class: a
-collinearity index of 10."""
+LADDER = (0.1, 10.0)
+"""Range of amplitudes over the limit, in row ``ladder``."""
 
-DURATION_S = 60.0
+FOUND_LADDER = (0.5, 6.5)
+"""Range of amplitudes over the limit, in row ``found``."""
 
-STEP_HZ = 50.0
+OUTSIDE = ("wheel_eccentricity", "motor_drift", "stick_slip", "clock_rate")
+"""Hidden in row ``outside``: two effects that no library has, and two whose entry is taken out."""
+
+ECCENTRICITY_RATIO, STICK_SLIP_A = (0.01, 0.04), (5.0, 20.0)
+"""Ranges of the amplitudes of what no library has: a wheel's centre 2 to 8 mm off, spikes of a few ampere."""
+
+ENTRY_TAKEN_OUT = (3.0, 10.0)
+"""Range over the limit, of those whose entry is taken out."""
 
 
-class Drives(NamedTuple):
-    """What is driven in a trial: twists and hills of each run."""
-
-    twists: tuple[Array, ...]
-    hills: tuple[Hills, ...]
-
-
-class Limits(NamedTuple):
-    """What the drives of a trial could show.
+class Case(NamedTuple):
+    """One trial to be done.
 
     Parameters
     ----------
-    names : parameters (k,)
-    information : (k, k) of all runs, nuisances free
+    row, number : kind of the trial, and its number
+    robot : name
+    n_runs : in the trial
+    seed : of all trials
     """
 
-    names: tuple[str, ...]
-    information: Array
-
-    def of(self, effect: Effect, direction: Array | None = None) -> float:
-        """Return the smallest amplitude that would be seen, along a direction (p,) or the first parameter."""
-        at = [self.names.index(p.name) for p in effect.parameters]
-        along = np.eye(len(at))[0] if direction is None else direction
-        size = float(along @ self.information[np.ix_(at, at)] @ along)
-        desired = norm.isf(TEST_SIZE / 2 / self.library_size) + norm.ppf(POWER)
-        return float(desired / math.sqrt(size)) if size > 0 else math.inf
-
-    @property
-    def library_size(self) -> int:
-        """How many effects are tested."""
-        return sum(all(p.name in self.names for p in effect.parameters) for effect in LIBRARY)
-
-    def alike(self, one: Effect, other: Effect) -> bool:
-        """Return whether two effects are of one confusable class."""
-        i, j = ([self.names.index(p.name) for p in effect.parameters] for effect in (one, other))
-        own, its = self.information[np.ix_(i, i)], self.information[np.ix_(j, j)]
-        cross = self.information[np.ix_(i, j)]
-        if min(np.diag(own).min(), np.diag(its).min()) <= 0:
-            return True
-        # the largest cosine between a change of the one and a change of the other
-        shared = np.linalg.solve(own, cross) @ np.linalg.solve(its, cross.T)
-        return math.sqrt(max(float(np.linalg.eigvals(shared).real.max()), 0.0)) > CONFUSABLE
+    row: Row
+    number: int
+    robot: str
+    n_runs: int
+    seed: int
 
 
-def rich_drives(rng: np.random.Generator, n_runs: int, duration_s: float = DURATION_S) -> Drives:
-    """Return drives that excite all: steps of speed and turn, stops, reversals, spot turns, hills."""
-    return Drives(
-        tuple(_mixed(rng, duration_s) for _ in range(n_runs)),
-        tuple(
-            Hills((rng.normal(0.0, 0.04), rng.normal(0.0, 0.04)), abs(rng.normal(0.0, 0.03)))
-            for _ in range(n_runs)
-        ),
-    )
+class Hidden(NamedTuple):
+    """What is hidden in the runs of a trial.
+
+    Parameters
+    ----------
+    effects : values by parameter, of effects of the catalogue
+    causes : names of the effects that the diagnosis may and should name
+    over_limit : amplitude over the detection limit; 0 where nothing of the catalogue is hidden
+    outside : name of what is hidden and not in the library; empty for none
+    library : effects that the diagnosis may name
+    outside_values : values by parameter, of what no library has
+    """
+
+    effects: dict[str, float]
+    causes: tuple[str, ...]
+    over_limit: float
+    outside: str
+    library: tuple[Effect, ...]
+    outside_values: dict[str, float]
 
 
-def poor_drives(rng: np.random.Generator, n_runs: int, duration_s: float = DURATION_S) -> Drives:
-    """Return drives that excite next to nothing: one speed, level ground, hardly any steering."""
-    n = round(duration_s * STEP_HZ) + 1
-    time_s = np.arange(n) / STEP_HZ
-    twists = []
-    for _ in range(n_runs):
-        twist = np.zeros((n, 3))
-        twist[:, 0] = np.clip(0.5 * (time_s - 0.5), 0.0, rng.uniform(0.65, 0.75))
-        phase = rng.uniform(0.0, 2 * math.pi)
-        twist[:, 2] = 0.01 * np.sin(2 * math.pi * time_s / 20.0 + phase) * (time_s > 5.0)
-        twists.append(twist)
-    return Drives(tuple(twists), tuple(Hills() for _ in range(n_runs)))
+def cases_of(row: Row, n: int, seed: int, n_runs: int) -> list[Case]:
+    """Return ``n`` cases of a row, the robots in turn."""
+    return [Case(row, i, ROBOTS[i % len(ROBOTS)], n_runs, seed) for i in range(n)]
 
 
-def _mixed(rng: np.random.Generator, duration_s: float) -> Array:
-    n = round(duration_s * STEP_HZ) + 1
-    desired = np.zeros((n, 3))
-    k = round(1.5 * STEP_HZ)
-    while k < n - round(3.0 * STEP_HZ):
-        length = round(rng.uniform(2.0, 5.0) * STEP_HZ)
-        kind = rng.choice(["ahead", "stop", "back", "spot", "turn"], p=[0.4, 0.1, 0.15, 0.1, 0.25])
-        speed, turn = rng.uniform(0.3, 1.0), 0.0
-        if kind == "stop":
-            speed = 0.0
-        elif kind == "back":
-            speed, turn = -rng.uniform(0.3, 0.8), rng.uniform(-0.4, 0.4) * rng.integers(2)
-        elif kind == "spot":
-            speed, turn = 0.0, rng.choice([-1.0, 1.0]) * rng.uniform(0.3, 0.8)
-        elif kind == "turn":
-            turn = rng.choice([-1.0, 1.0]) * rng.uniform(0.1, 0.6)
-        desired[k : k + length] = speed, 0.0, turn
-        k += length
-    desired[n - round(3.0 * STEP_HZ) :] = 0.0
-    return _ramped(desired)
+def draw_hidden(case: Case, robot: Robot, limits: Limits | None, rng: np.random.Generator) -> Hidden:
+    """Draw what a trial hides.
+
+    Parameters
+    ----------
+    limits : of the trial's drives; None where nothing is to be hidden
+    """
+    library = library_of(robot.drive)
+    if limits is None:
+        return Hidden({}, (), 0.0, "", library, {})
+    if case.row is Row.OUTSIDE:
+        return _draw_outside(case, limits, library, rng)
+    if case.row is Row.FOUND:
+        effect = library[(case.number // len(ROBOTS)) % len(library)]
+        over = float(math.exp(rng.uniform(*np.log(FOUND_LADDER))))
+        return Hidden(_values(effect, limits, over, rng), (effect.name,), over, "", library, {})
+    effect = library[int(rng.integers(len(library)))]
+    over = float(math.exp(rng.uniform(*np.log(LADDER)))) if case.row is Row.LADDER else STRONG
+    values = _values(effect, limits, over, rng)
+    if case.row is not Row.TWO:
+        return Hidden(values, (effect.name,), over, "", library, {})
+    others = [o for o in library if o.name not in confusable_class(limits, effect, robot.drive)]
+    others = [o for o in others if o.name not in [name for name, _ in effect.twins]]
+    other = others[int(rng.integers(len(others)))]
+    values |= _values(other, limits, over, rng)
+    return Hidden(values, (effect.name, other.name), over, "", library, {})
 
 
-def _ramped(desired: Array) -> Array:
-    """Return twists (n, 3) from rest that change by 1 m/s^2 and 1 rad/s^2 at the most."""
-    limit = 1.0 / STEP_HZ
-    twist = np.zeros_like(desired)
-    for axis, goals in enumerate(desired.T.tolist()):  # numbers of Python's own: arrays of three are slow
-        value, values = 0.0, [0.0]
-        for goal in goals[1:]:
-            change = goal - value
-            value += limit if change > limit else -limit if change < -limit else change
-            values.append(value)
-        twist[:, axis] = values
-    return twist
+def _draw_outside(
+    case: Case, limits: Limits, library: tuple[Effect, ...], rng: np.random.Generator
+) -> Hidden:
+    """Draw an effect that the library does not have: its entry is taken out, or there never was one."""
+    kind = OUTSIDE[(case.number // len(ROBOTS)) % len(OUTSIDE)]
+    if kind in [effect.name for effect in library]:
+        effect = effect_named(kind)
+        over = float(rng.uniform(*ENTRY_TAKEN_OUT))
+        rest = tuple(other for other in library if other is not effect)
+        return Hidden(_values(effect, limits, over, rng), (), over, kind, rest, {})
+    extra = {}
+    if kind == "wheel_eccentricity":
+        extra = {"wheel_eccentricity_ratio": float(rng.uniform(*ECCENTRICITY_RATIO))}
+    elif kind == "stick_slip":
+        extra = {"stick_slip_a": float(rng.uniform(*STICK_SLIP_A))}
+    return Hidden({}, (), 0.0, kind, library, extra)
+
+
+def _values(effect: Effect, limits: Limits, over: float, rng: np.random.Generator) -> dict[str, float]:
+    """Return values of an effect, of an amplitude over its limit, in a random direction within its bounds."""
+    low = np.array([p.low for p in effect.parameters])
+    high = np.array([p.high for p in effect.parameters])
+    direction = rng.standard_normal(len(effect.parameters))
+    direction /= np.linalg.norm(direction)
+    direction = np.where((low == 0.0) & (direction < 0), -direction, direction)
+    amplitude = over * limits.of(effect, direction)
+    values = np.clip(amplitude * direction, 0.9 * low, 0.9 * high)
+    return {p.name: float(value) for p, value in zip(effect.parameters, values, strict=True)}
 
 
 def hidden_runs(
@@ -172,7 +152,7 @@ def hidden_runs(
     effects: Mapping[str, float],
     outside: Mapping[str, float] | None = None,
 ) -> tuple[RunLog, ...]:
-    """Return the logs of drives with effects hidden in all of them; truth and source are kept back."""
+    """Return the logs of drives with effects hidden in all of them; truth and source are removed."""
     scatter, noise = load_scatter(), load_noise()
     runs = []
     for i, (twist, hills) in enumerate(zip(drives.twists, drives.hills, strict=True)):
@@ -191,108 +171,3 @@ def hidden_runs(
         shown = {name: stream for name, stream in run.streams.items() if name not in ("truth", "commands")}
         runs.append(replace(run, streams=shown, source=""))
     return tuple(runs)
-
-
-def limits_of(robot: Robot, drives: Drives) -> Limits:
-    """Return what drives could show of each effect, by the Cramer-Rao bound."""
-    planar, noise, scatter = make_planar(robot, Ground()), load_noise(), load_scatter()
-    names, nuisances = tuple(parameters_of(robot.drive)), nuisances_of(robot.drive)
-    every = tuple(dict.fromkeys((*names, *nuisances)))
-    free = [every.index(name) for name in nuisances]
-    std = np.array([getattr(scatter, every[i]) for i in free])
-    total = np.zeros((len(names), len(names)))
-    for twist, hills in zip(drives.twists, drives.hills, strict=True):
-        gram = _gram(robot, planar, noise, twist, hills, every)
-        inner = np.linalg.inv(gram[np.ix_(free, free)] + np.diag(1.0 / std**2))
-        left = gram - gram[:, free] @ inner @ gram[free]
-        total += left[: len(names), : len(names)]
-    return Limits(names, total)
-
-
-def _gram(
-    robot: Robot, planar: Planar, noise: Noise, twist: Array, hills: Hills, names: Sequence[str]
-) -> Array:
-    """Return the information (k, k) of one run, nothing free."""
-    run = simulate_planar(robot, twist, 0, hills=hills)
-    truth = run.streams["truth"]
-    even = slice(0, len(truth) // 100 * 100, 2)  # a length that its Fourier transform is quick with
-    truth = Stream(truth.time_s[even], truth.values[even], truth.channels)
-    rate_hz = truth.rate_hz
-    wheels = robot.wheels
-    wheel_speed = np.column_stack([truth.channel(f"wheel_{w}_radps") for w in wheels]) * robot.wheel_radius_m
-    steer = (
-        np.column_stack([truth.channel(f"steer_{w}_rad") for w in wheels])
-        if robot.drive == "swerve"
-        else np.zeros_like(wheel_speed)
-    )
-    grade, roll = -truth.channel("pitch_rad"), truth.channel("roll_rad").copy()
-    wheel_speed, steer = np.ascontiguousarray(wheel_speed), np.ascontiguousarray(steer)
-    shown = np.ones((len(wheel_speed), len(CHANNELS)))
-    if robot.drive == "swerve":  # the sum of currents tells the traction where wheels point one way
-        shown[np.abs(np.exp(1j * steer).mean(axis=1)) < 0.95, CHANNELS.index(CURRENT)] = 0.0
-    channels = [GYRO, SPEED_X, SPEED_Y, ACCEL, CURRENT]
-    if robot.drive != "swerve":
-        channels.append(TURNING_CURRENT)
-    n = len(wheel_speed)
-    frequency_hz = np.fft.rfftfreq(n, 1 / rate_hz)
-    used = frequency_hz < 0.4 * STEP_HZ
-    f = frequency_hz[used]
-    both_sides = np.where(f > 0, 4.0, 2.0)
-    pace = float(np.abs(wheel_speed).mean(axis=1)[np.abs(wheel_speed).mean(axis=1) > 0.05].mean())
-    density = {name: _density(noise, robot, planar, name, f, pace) for name in channels}
-    waves = {name: np.empty((len(names), f.size), dtype=complex) for name in channels}
-    plain = move(planar, vector_of({}), 1 / rate_hz, wheel_speed, steer, grade, roll, np.zeros((0, 3)))
-    for j, name in enumerate(names):
-        step = STEPS[name]
-        both = []
-        for sign in (1.0, 0.0) if name in ONE_SIDED else (1.0, -1.0):
-            p = vector_of({name: sign * step})
-            if name in SENSED_ONLY:
-                both.append(sense(planar, p, 1 / rate_hz, plain))
-            else:
-                both.append(_shown(planar, p, 1 / rate_hz, wheel_speed, steer, grade, roll))
-        span = step if name in ONE_SIDED else 2 * step
-        change = (both[0] - both[1]) / span * shown
-        for channel in channels:
-            waves[channel][j] = np.fft.rfft(change[:, CHANNELS.index(channel)])[used] / rate_hz
-    gram = np.zeros((len(names), len(names)))
-    for channel in channels:
-        weighed = waves[channel] * (both_sides / density[channel] * rate_hz / n)
-        gram += np.real(weighed @ waves[channel].conj().T)
-    return gram
-
-
-def _shown(
-    planar: Planar, p: Array, dt: float, wheel_speed: Array, steer: Array, grade: Array, roll: Array
-) -> Array:
-    """Return what a replay of measured wheels and tilt would predict, as far as linear in what differs."""
-    lag = p[INDEX["encoder_lag_s"]]
-    wheel_speeds = wheel_speed + lag * np.gradient(wheel_speed, dt, axis=0) if lag else wheel_speed
-    tilt = grade - p[INDEX["pitch_offset_rad"]], roll - p[INDEX["roll_offset_rad"]]
-    truth = move(planar, p, dt, wheel_speeds, steer, *tilt, np.zeros((0, 3)))
-    return np.asarray(sense(planar, p, dt, truth))
-
-
-def _density(noise: Noise, robot: Robot, planar: Planar, channel: str, f: Array, pace: float) -> Array:
-    """Return the one-sided spectrum of what parts measured from replayed: noise of channel and wheels."""
-    own = noise_psd(noise, robot, planar, channel, f, pace)
-    wheel_speed = noise_psd(noise, robot, planar, WHEEL_SPEED, f, pace)
-    lag_s = robot.sensors.encoder_time_constant_s if robot.sensors is not None else 0.0
-    wheel_speed = wheel_speed * (1.0 + (2 * math.pi * f * lag_s) ** 2)  # the lag is undone
-    n = planar.n_wheels
-    mean, rate = wheel_speed / n, (2 * math.pi * f) ** 2
-    if channel == GYRO:
-        turn = np.sum(planar.to_twist[2] ** 2) / 2 if robot.drive == "swerve" else 2.0 / planar.track_m**2
-        return own + wheel_speed * turn
-    if channel == SPEED_X:
-        return own + mean
-    if channel == ACCEL:
-        return own + mean * rate
-    if channel == CURRENT:
-        return own + mean * rate * (planar.mass_kg * planar.radius_m / planar.nm_per_a) ** 2
-    return own
-
-
-def confusable_class(limits: Limits, effect: Effect, drive: str) -> set[str]:
-    """Return the names of all effects that no log of these drives tells from one, and its own."""
-    return {other.name for other in library_of(drive) if other is effect or limits.alike(effect, other)}

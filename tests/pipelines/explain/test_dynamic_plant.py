@@ -1,13 +1,14 @@
-"""`terrain explain` on logs of the dynamic simulator, a richer model than the one held against them."""
+"""`terrain explain` on logs of the dynamic simulator, a richer model than the one under test."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from pipelines.explain.classifier import classifier_gain, compared
-from pipelines.explain.ground import ground_notes, simulation_for
+from pipelines.explain.classifier import accuracy_change, classifier_gain
+from pipelines.explain.wording import terrain_notes
 from terrain.discrepancy.diagnose import diagnose
+from terrain.discrepancy.terrain_match import simulation_for
 from terrain.effects import library_of
 from terrain.records import Label
 from terrain.robots import load_robot
@@ -30,7 +31,7 @@ def explained(runs):
 
 
 @pytest.mark.parametrize("terrain", ["grass", "firm_soil_gravel"])
-def test_of_a_plain_days_logs_nothing_is_named(terrain):
+def test_without_a_hidden_effect_nothing_is_named(terrain):
     found = explained(runs_of(terrain=terrain))
     assert (found.causes, found.ambiguous_sets, found.excluded_runs) == ((), (), ())
 
@@ -52,16 +53,12 @@ def test_what_was_hidden_in_the_plant_is_named_and_nothing_else(parameter, value
     assert found.ambiguous_sets == ()
 
 
-def test_a_run_drives_on_the_soil_of_its_label_and_elsewhere_on_a_ground_like_any():
+def test_a_run_is_simulated_on_the_soil_of_its_label_or_the_default_terrain():
     runs = runs_of(n=2, duration_s=10.0)
     unknown = [replace(run, run_id=f"u{i}", labels=(Label(0.0, 5.0, "moon"),)) for i, run in enumerate(runs)]
     several = replace(runs[0], run_id="s", labels=(Label(0.0, 5.0, "grass"), Label(5.0, 9.0, "snow")))
-    simulation, told = simulation_for([*runs, *unknown, several], AGRIMARO, LIBRARY)
-    assert [(each["terrain"], each["soil"]) for each in told] == [
-        ("", None),
-        ("grass", "grass"),
-        ("moon", None),
-    ]
+    simulation, matches = simulation_for([*runs, *unknown, several], AGRIMARO, LIBRARY)
+    assert [match[:2] for match in matches] == [("", None), ("grass", "grass"), ("moon", None)]
     soil = planar_ground(AGRIMARO, load_soil("grass"))
     assert simulation.grounds["grass"]._replace(effective_ratio=1.0) == soil
     assert simulation.ground == Ground()
@@ -71,38 +68,38 @@ def test_a_run_drives_on_the_soil_of_its_label_and_elsewhere_on_a_ground_like_an
     assert simulation_for(unknown, bare, LIBRARY)[0].grounds == {}
 
 
-def test_tilt_is_felt_where_it_is_a_slope_and_not_where_a_body_rides_over_bumps():
-    for robot, felt in ((AGRIMARO, 0.0), (HUSKY, 1.0)):
+def test_tilt_acts_as_a_slope_but_not_where_a_body_rides_over_bumps():
+    for robot, effective in ((AGRIMARO, 0.0), (HUSKY, 1.0)):
         runs = runs_of(robot=robot, n=3, vary=robot is HUSKY)
-        simulation, told = simulation_for(runs, robot, library_of(robot.drive))
-        assert simulation.grounds["grass"].effective_ratio == pytest.approx(felt, abs=0.05)
-        assert len(ground_notes(told)) == (felt < 0.95)
+        simulation, matches = simulation_for(runs, robot, library_of(robot.drive))
+        assert simulation.grounds["grass"].effective_ratio == pytest.approx(effective, abs=0.05)
+        assert len(terrain_notes(matches)) == (effective < 0.95)
 
 
-def test_a_classifier_gains_where_what_was_built_in_matters_and_says_why_where_it_cannot_be_judged():
+def test_a_classifier_gains_where_the_extension_matters_and_gives_a_reason_where_it_cannot_be_compared():
     effects = {"slip_resistance_ratio": 3.0}
-    grounds = ("asphalt", "snow", "tiles")
-    held = [run for g in grounds for run in runs_of(effects, terrain=g, n=4, seed=9, vary=True)]
+    terrains = ("asphalt", "snow", "tiles")
+    held = [run for name in terrains for run in runs_of(effects, terrain=name, n=4, seed=9, vary=True)]
     found = classifier_gain(held, AGRIMARO, {}, effects, 0, runs_a_terrain=5)
-    assert (found["reason"], found["n_runs"], found["terrains"]) == (None, 12, sorted(grounds))
-    accuracy = found["errors"]["accuracy"]
-    assert 0.0 < accuracy["change_ci"][0] < accuracy["after"] - accuracy["before"] < accuracy["change_ci"][1]
-    same = classifier_gain(held, AGRIMARO, {}, {}, 0, runs_a_terrain=2)["errors"]["accuracy"]
-    assert (same["before"], same["change_ci"]) == (same["after"], [0.0, 0.0])
+    assert (found.reason, found.n_runs, found.terrains) == (None, 12, terrains)
+    accuracy = found.errors["accuracy"]
+    assert 0.0 < accuracy.change_ci[0] < accuracy.after - accuracy.before < accuracy.change_ci[1]
+    same = classifier_gain(held, AGRIMARO, {}, {}, 0, runs_a_terrain=2).errors["accuracy"]
+    assert (same.before, same.change_ci) == (same.after, (0.0, 0.0))
     for few, reason in ((held[:3], "1 known terrain,"), (held[3:6], "3 runs are held out")):
-        told = classifier_gain(few, AGRIMARO, {}, effects, 0)
-        assert told["errors"] == {}
-        assert reason in told["reason"]
+        refused = classifier_gain(few, AGRIMARO, {}, effects, 0)
+        assert refused.errors == {}
+        assert reason in refused.reason
     slow = [replace(run, streams={"imu": run.streams["imu"]}) for run in held]
-    assert "wheel" in classifier_gain(slow, AGRIMARO, {}, effects, 0, runs_a_terrain=2)["reason"]
+    assert "wheel" in classifier_gain(slow, AGRIMARO, {}, effects, 0, runs_a_terrain=2).reason
 
 
 def test_the_interval_of_an_accuracy_is_over_runs():
     rng = np.random.default_rng(0)
     run_id = np.repeat([f"r{i}" for i in range(20)], 10)
     before = rng.random(200) < 0.6
-    each = np.repeat(rng.random(20) < 0.5, 10)  # whole runs are put right
-    change = compared(before, before | each, run_id, 0)["change_ci"]
+    each = np.repeat(rng.random(20) < 0.5, 10)  # whole runs become correct
+    change = accuracy_change(before, before | each, run_id, 0).change_ci
     gained = (before | each).mean() - before.mean()
     assert change[0] < gained < change[1]
     spread = np.array([(each & ~before)[run_id == name].mean() for name in np.unique(run_id)]).std()

@@ -6,13 +6,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipelines.explain.trials import simulation_of
 from terrain.discrepancy.diagnose import MIN_RUNS, _unsteady, diagnose
 from terrain.discrepancy.residuals import low_pass_of
 from terrain.discrepancy.search import Problem, search
 from terrain.discrepancy.signals import signals_of
-from terrain.discrepancy.trials.hidden_effects import confusable_class, hidden_runs, limits_of, rich_drives
-from terrain.discrepancy.verdict import AMBIGUOUS, EXPLAINED, NONE, UNEXPLAINED
+from terrain.discrepancy.trials.drives import rich_drives
+from terrain.discrepancy.trials.hidden_effects import hidden_runs
+from terrain.discrepancy.trials.limits import confusable_class, limits_of
+from terrain.discrepancy.trials.trial import simulation_of
+from terrain.discrepancy.verdict import Verdict
 from terrain.effects import GYRO, HEADING, effect_named
 from terrain.errors import DataError
 from terrain.records import Stream
@@ -70,7 +72,7 @@ def named(found):
 def test_where_nothing_is_hidden_nothing_is_named(worlds):
     for name, world in worlds.items():
         found = diagnose(world.runs({}), world.simulation)
-        assert (found.verdict, found.robot, found.n_runs) == (NONE, name, 6)
+        assert (found.verdict, found.robot, found.n_runs) == (Verdict.NONE, name, 6)
         assert (found.causes, found.ambiguous_sets, found.unexplained, found.excluded_runs) == (
             (),
             (),
@@ -83,7 +85,7 @@ def test_where_nothing_is_hidden_nothing_is_named(worlds):
         # what is apart is noise, and what scatters from run to run: biases of the gyro
         apart = {channel: told.systematic for channel, told in found.residual_before.items()}
         assert all(share < 0.4 for channel, share in apart.items() if channel != GYRO), apart
-        assert json.loads(json.dumps(found.as_json(), allow_nan=False))["verdict"] == NONE
+        assert json.loads(json.dumps(found.as_json(), allow_nan=False))["verdict"] == Verdict.NONE
 
 
 @pytest.mark.parametrize(("robot", "name"), [(robot, name) for robot in EFFECTS for name in EFFECTS[robot]])
@@ -94,7 +96,7 @@ def test_a_hidden_effect_is_named_with_its_value_and_nothing_beside_it(worlds, r
     sets = [set(names) for names in found.ambiguous_sets]
     assert named(found) == [name] or (named(found) == [] and sets and name in sets[0] <= world.twins(name))
     if found.causes:
-        assert found.verdict == EXPLAINED
+        assert found.verdict == Verdict.EXPLAINED
         for value in found.causes[0].values:
             std = (value.high - value.low) / (2 * 2.13)
             assert abs(value.value - hidden[value.name]) < 4 * std, value
@@ -120,7 +122,7 @@ def test_what_is_built_in_is_not_found_again_and_what_is_half_built_in_is_found_
     world = worlds["husky"]
     hidden = world.hidden("effective_track", over=8.0)
     runs = world.runs(hidden)
-    assert diagnose(runs, world.simulation.with_effects(hidden)).verdict == NONE
+    assert diagnose(runs, world.simulation.with_effects(hidden)).verdict == Verdict.NONE
     half = {name: 0.5 * value for name, value in hidden.items()}
     (cause,) = diagnose(runs, world.simulation.with_effects(half)).causes
     assert cause.name == "effective_track"
@@ -130,7 +132,7 @@ def test_what_is_built_in_is_not_found_again_and_what_is_half_built_in_is_found_
 def test_what_no_library_has_gets_no_name(worlds):
     for world in worlds.values():
         found = diagnose(world.runs({}, {"wheel_eccentricity_ratio": 0.03}), world.simulation)
-        assert found.verdict == UNEXPLAINED
+        assert found.verdict == Verdict.UNEXPLAINED
         assert named(found) == []
         assert any("wheel" in left.input for left in found.unexplained)
 
@@ -140,7 +142,7 @@ def test_an_effect_whose_entry_is_taken_out_gets_no_other_name(worlds):
     library = [effect for effect in world.simulation.library if effect.name != "motor_drift"]
     found = diagnose(world.runs(world.hidden("motor_drift", over=8.0)), world.simulation, library)
     assert named(found) == []
-    assert found.verdict == UNEXPLAINED
+    assert found.verdict == Verdict.UNEXPLAINED
     assert any(left.channel == "current_a" and "time" in left.input for left in found.unexplained)
 
 
@@ -153,7 +155,7 @@ def test_exact_twins_are_a_set_and_the_channel_that_parts_them_is_told(worlds):
         speeds = Stream(wheels.time_s, wheels.values[:, :2], wheels.channels[:2])
         runs.append(replace(run, streams={"wheels": speeds, "imu": run.streams["imu"]}))
     found = diagnose(runs, world.simulation)
-    assert found.verdict == AMBIGUOUS
+    assert found.verdict == Verdict.AMBIGUOUS
     assert named(found) == []
     assert {"gyro_scale", "effective_track"} <= set(found.ambiguous_sets[0])
     told = {value.name: value.value for values in found.ambiguous_values.values() for value in values}
@@ -191,7 +193,7 @@ def test_runs_that_cannot_be_diagnosed_are_refused_in_one_sentence(worlds):
     world = worlds["husky"]
     runs = world.runs({})
     for given, message in (
-        (runs[: MIN_RUNS - 1], "there are 2, 3 at the least"),
+        (runs[: MIN_RUNS - 1], "there are 2, at least 3"),
         ([*runs, runs[0]], "'run_01' is the id of 2 runs"),
         ([*runs, replace(worlds["agrimaro"].runs({})[0], run_id="x")], "run x is of the robot 'agrimaro'"),
     ):

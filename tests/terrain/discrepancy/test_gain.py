@@ -65,7 +65,7 @@ def test_without_scatter_the_gain_is_that_of_the_whitened_squares(longer):
         for key in ("white_before", "white_after")
     )
     # channels have all the same rows here
-    assert found.reduction.share == pytest.approx(1.0 - after / before, rel=1e-9)
+    assert found.reduction.ratio == pytest.approx(1.0 - after / before, rel=1e-9)
 
 
 def test_few_runs_are_cut_into_thirds_and_the_same_seed_gives_the_same_gain(longer):

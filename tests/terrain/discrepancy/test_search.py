@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 
-from pipelines.explain.trials import simulation_of
 from terrain.discrepancy.residuals import low_pass_of
 from terrain.discrepancy.search import Problem, names_of, search
 from terrain.discrepancy.selection import fitted
 from terrain.discrepancy.signals import signals_of
-from terrain.discrepancy.trials.hidden_effects import hidden_runs, rich_drives
+from terrain.discrepancy.trials.drives import rich_drives
+from terrain.discrepancy.trials.hidden_effects import hidden_runs
+from terrain.discrepancy.trials.trial import simulation_of
 from terrain.effects import INDEX, LIBRARY, effect_named
 from terrain.robots import load_robot
 

@@ -191,7 +191,7 @@ def test_a_run_that_cannot_be_compared_is_refused_in_one_sentence(husky, agrimar
         (with_stream(husky, "wheels", None), HUSKY, "no stream 'wheels'"),
         (with_stream(agrimaro, "steering", None), AGRIMARO, "no stream 'steering'"),
         (one_side, HUSKY, "a speed of each of left, right is required"),
-        (short, HUSKY, "have 3.0 s in common, 4 s at the least"),
+        (short, HUSKY, "have 3.0 s in common, at least 4 s"),
         (apart, HUSKY, "have 0.0 s in common"),
         (replace(husky, streams={"wheels": speeds}), HUSKY, "none of its channels is simulated"),
     ):

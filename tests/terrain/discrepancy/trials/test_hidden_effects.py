@@ -6,18 +6,12 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from pipelines.explain.trials import simulation_of
 from terrain.discrepancy.diagnose import POWER_Z, diagnose
 from terrain.discrepancy.selection import Z_EFFECT
-from terrain.discrepancy.trials.hidden_effects import (
-    POWER,
-    TEST_SIZE,
-    confusable_class,
-    hidden_runs,
-    limits_of,
-    poor_drives,
-    rich_drives,
-)
+from terrain.discrepancy.trials.drives import poor_drives, rich_drives
+from terrain.discrepancy.trials.hidden_effects import hidden_runs
+from terrain.discrepancy.trials.limits import POWER, TEST_SIZE, confusable_class, limits_of
+from terrain.discrepancy.trials.trial import simulation_of
 from terrain.effects import effect_named, library_of
 from terrain.robots import load_robot
 

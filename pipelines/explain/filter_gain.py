@@ -1,0 +1,69 @@
+"""What an extension gains for the robot's filter, against the truth of runs that have one."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from pipelines.explain.results import Change, Comparison
+from terrain.discrepancy.selection import bootstrap_counts
+from terrain.discrepancy.simulation import Simulation
+from terrain.errors import TerrainError
+from terrain.estimation.estimate import Estimate, estimate_run
+from terrain.estimation.summary import summarize
+from terrain.records import RunLog
+from terrain.robots import Robot
+
+FILTERS = {"swerve": "vio12", "skid_steer": "skid"}
+"""By kind of drive, the filter whose errors are compared."""
+
+ERRORS = ("speed_mps", "yaw_rate_radps", "slip_ratio")
+"""Errors that are compared: root mean squares of speed and yaw rate, and the error of the mean slip."""
+
+N_BOOTSTRAP = 2000
+
+
+def filter_gain(runs: Sequence[RunLog], robot: Robot, extended: Simulation, seed: int) -> Comparison | None:
+    """Return the errors of the robot's filter before and after, on runs with a truth; None without any.
+
+    Errors are means over runs; the interval is that of the difference, by bootstrap over runs.
+    """
+    name = FILTERS.get(robot.drive)
+    known = [run for run in runs if "truth" in run.streams]
+    if name is None or not known:
+        return None
+    better = replace(robot, effects=dict(extended.effects), effects_cov=np.empty((0, 0)))
+    rows: list[list[tuple[float, ...]]] = []
+    try:
+        for run in known:
+            rows.append([_errors(estimate_run(run, one, name)) for one in (robot, better)])
+    except TerrainError as error:
+        return Comparison(name, str(error), len(known), {})
+    table = np.array(rows)  # (runs, 2, errors)
+    counts = bootstrap_counts(len(rows), N_BOOTSTRAP, seed)
+    errors = {}
+    for k, key in enumerate(ERRORS):
+        both = table[:, :, k]
+        if np.isfinite(both).all():
+            low, high = np.quantile(counts @ (both[:, 1] - both[:, 0]) / len(rows), [0.025, 0.975])
+            interval = (float(low), float(high)) if len(rows) > 1 else None
+            errors[key] = Change(float(both[:, 0].mean()), float(both[:, 1].mean()), interval)
+    return Comparison(name, None, len(rows), errors)
+
+
+def _errors(found: Estimate) -> tuple[float, ...]:
+    """Return the errors of a run, in the order of :data:`ERRORS`."""
+    summary, track, truth = summarize(found), found.track, found.run.streams["truth"]
+    squares = dict.fromkeys(("speed", "yaw_rate"), np.zeros(len(track.time_s)))
+    for state in track.states:
+        kind = state.removesuffix("_mps").removesuffix("_radps").removesuffix("_x").removesuffix("_y")
+        if kind in squares:
+            true = truth.channel("speed_x_mps" if state == "speed_mps" else state)
+            error = track.state(state) - np.interp(track.time_s, truth.time_s, true)
+            squares[kind] = squares[kind] + error**2
+    rms = [math.sqrt(float(np.nanmean(square))) for square in squares.values()]
+    slip_error = abs(summary.slip_mean - summary.slip_true_mean)
+    return (*rms, slip_error if summary.slip_observable else math.nan)

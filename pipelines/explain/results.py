@@ -1,0 +1,201 @@
+"""Results of ``terrain explain`` and ``terrain explain-trials``, for screens, figures and pages."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from pipelines.explain.wording import terrain_notes
+from terrain.discrepancy.gain import Gain
+from terrain.discrepancy.noise import Noise
+from terrain.discrepancy.residuals import LowPass
+from terrain.discrepancy.simulation import Simulation
+from terrain.discrepancy.terrain_match import TerrainMatch
+from terrain.discrepancy.trials.scoring import Score
+from terrain.discrepancy.trials.trial import Trial
+from terrain.discrepancy.verdict import Diagnosis
+from terrain.records import RunLog
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DiagnosedRuns:
+    """Runs with their diagnosis: what figures are drawn from.
+
+    Parameters
+    ----------
+    diagnosis : of the runs used
+    simulation, extended : before and after; ``extended`` is None where no cause was named
+    terrains : on which the runs of each label were simulated
+    used, held_out : runs behind the diagnosis, and those held out of it
+    noise, low_pass : of the runs behind the diagnosis
+    """
+
+    diagnosis: Diagnosis
+    simulation: Simulation
+    extended: Simulation | None
+    terrains: tuple[TerrainMatch, ...]
+    used: tuple[RunLog, ...]
+    held_out: tuple[RunLog, ...]
+    noise: Noise
+    low_pass: LowPass
+
+
+class Change(NamedTuple):
+    """A figure before and after an extension, and the 95 % interval of its change (None for one run)."""
+
+    before: float
+    after: float
+    change_ci: tuple[float, float] | None
+
+
+class Comparison(NamedTuple):
+    """What an extension changes for a filter or a classifier on held-out runs.
+
+    Parameters
+    ----------
+    name : of the filter or the recipe
+    reason : why there are no errors; None where there are
+    n_runs : that were compared
+    errors : by figure
+    terrains : of the runs; None where they do not matter
+    """
+
+    name: str
+    reason: str | None
+    n_runs: int
+    errors: Mapping[str, Change]
+    terrains: tuple[str, ...] | None = None
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the comparison as JSON has it."""
+        shown = self._asdict()
+        if self.terrains is None:
+            del shown["terrains"]
+        return shown
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HeldOutGain:
+    """What an extension gains on held-out runs.
+
+    Parameters
+    ----------
+    gain : None where it was not measured
+    reason : why it was not
+    comparisons : by ``filter`` and ``classifier``; None for one that does not apply
+    """
+
+    gain: Gain | None
+    reason: str | None = None
+    comparisons: Mapping[str, Comparison | None] = field(default_factory=dict)
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the gain as JSON has it."""
+        if self.gain is None:
+            return {"measured": False, "reason": self.reason, **self.comparisons}
+        return {"measured": True, **self.gain.as_json(), **self.comparisons}
+
+
+class ExtendedDescription(NamedTuple):
+    """The extended description of the robot: its file, and the values of all its effects by parameter."""
+
+    file: Path
+    effects: Mapping[str, float]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Explanation:
+    """Result of ``terrain explain``.
+
+    Parameters
+    ----------
+    data, data_digest : name of the data set, and digest of its runs
+    description, model : of the robot as it was tested; ``model`` where that is an extended one
+    terrain : label of the runs that were used; None for all
+    diagnosis : of the runs
+    built_in : values by parameter of the effects that the simulation had before
+    terrains : on which the runs of each label were simulated
+    effects : names of those that may be named
+    seed : of the choice of held-out runs and of the bootstrap
+    used, held_out : ids of the runs behind the diagnosis, and of those held out of it
+    gain : on the runs held out
+    extended : None where no cause was named
+    page : file
+    skipped : a sentence for each run that could not be read
+    """
+
+    data: str
+    data_digest: str
+    description: str
+    model: str | None
+    terrain: str | None
+    diagnosis: Diagnosis
+    built_in: Mapping[str, float]
+    terrains: tuple[TerrainMatch, ...]
+    effects: tuple[str, ...]
+    seed: int
+    used: tuple[str, ...]
+    held_out: tuple[str, ...]
+    gain: HeldOutGain
+    extended: ExtendedDescription | None
+    page: Path
+    skipped: tuple[str, ...] = ()
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a reader has to know of the terrains, in sentences."""
+        return terrain_notes(self.terrains)
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the explanation as JSON has it."""
+        return {
+            "data": self.data,
+            "data_digest": self.data_digest,
+            **self.diagnosis.as_json(),
+            "built_in": self.built_in,
+            "terrain_matches": self.terrains,
+            "notes": self.notes,
+            "effects": self.effects,
+            "seed": self.seed,
+            "used": self.used,
+            "held_out": self.held_out,
+            "gain": self.gain,
+            "extended": self.extended,
+            "description": self.description,
+            "model": self.model,
+            "terrain": self.terrain,
+            "page": self.page,
+            "skipped": self.skipped,
+        }
+
+
+class Seconds(NamedTuple):
+    """Duration of a diagnosis."""
+
+    median: float
+    worst: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrialsResult:
+    """Result of ``terrain explain-trials``.
+
+    Parameters
+    ----------
+    n, seed, rows, runs : as in the settings
+    table : scores by name
+    found_from : by robot and effect, the amplitude over the detection limit from which nine in ten are found
+    seconds : that a diagnosis took
+    trials : every single one
+    """
+
+    n: int
+    seed: int
+    rows: tuple[str, ...]
+    runs: int
+    table: Mapping[str, Score]
+    found_from: Mapping[str, Mapping[str, float]]
+    seconds: Seconds
+    trials: tuple[Trial, ...]

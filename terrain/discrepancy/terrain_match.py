@@ -1,0 +1,67 @@
+"""The simulation that measured runs are compared with, on the terrain that each run's label names."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from terrain.discrepancy.signals import signals_of
+from terrain.discrepancy.simulation import Simulation
+from terrain.discrepancy.tilt import with_effective_tilt
+from terrain.effects import Effect
+from terrain.errors import ConfigError
+from terrain.records import RunLog
+from terrain.robots import Robot
+from terrain.simulation.planar.ground import planar_ground
+from terrain.simulation.planar.model import Ground
+from terrain.simulation.planar.noise import load_scatter
+from terrain.terramechanics.soil import extra_soil_names, load_soil, soil_names
+
+
+class TerrainMatch(NamedTuple):
+    """The terrain on which runs of a label are simulated.
+
+    Parameters
+    ----------
+    terrain : label of the runs; empty for runs without a label or with several
+    soil : its soil of the package; None for the default terrain
+    effective_ratio : part of the measured tilt that acts as a slope, from 0 to 1; None on the default terrain
+    """
+
+    terrain: str
+    soil: str | None
+    effective_ratio: float | None
+
+
+def simulation_for(
+    runs: Sequence[RunLog], robot: Robot, library: Sequence[Effect]
+) -> tuple[Simulation, tuple[TerrainMatch, ...]]:
+    """Return the simulation of runs, and the terrain that each of their labels is simulated on.
+
+    A label that is the name of a soil of the package is simulated on that soil, all others on the default
+    terrain.
+    """
+    labels = sorted({run.terrains[0] if len(run.terrains) == 1 else "" for run in runs})
+    grounds = {label: ground for label in labels if (ground := _ground(robot, label)) is not None}
+    simulation = Simulation(robot, Ground(), robot.effects, load_scatter()._asdict(), grounds)
+    if grounds:
+        signals = [signals_of(run, robot) for run in runs]
+        simulation = with_effective_tilt(simulation, signals, library)
+    matches = []
+    for label in labels:
+        ground = simulation.grounds.get(label)
+        known = ground is not None
+        matches.append(
+            TerrainMatch(label, label if known else None, ground.effective_ratio if ground else None)
+        )
+    return simulation, tuple(matches)
+
+
+def _ground(robot: Robot, label: str) -> Ground | None:
+    """Return the soil of a label for the planar simulation; None where there is none that can be driven."""
+    if robot.body is None or label not in (*soil_names(), *extra_soil_names()):
+        return None
+    try:
+        return planar_ground(robot, load_soil(label))
+    except ConfigError:  # the robot would get stuck on it
+        return None

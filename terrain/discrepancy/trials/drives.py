@@ -1,0 +1,85 @@
+"""What is driven in blind trials: motion that excites every effect, and motion that excites hardly any."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from terrain.records import Array
+from terrain.simulation.planar.hills import Hills
+
+DURATION_S = 60.0
+"""Length of a run."""
+
+STEP_HZ = 50.0
+"""Rate of the commanded twists."""
+
+
+class Drives(NamedTuple):
+    """What is driven in a trial: twists and hills of each run."""
+
+    twists: tuple[Array, ...]
+    hills: tuple[Hills, ...]
+
+
+def rich_drives(rng: np.random.Generator, n_runs: int, duration_s: float = DURATION_S) -> Drives:
+    """Return drives that excite all: steps of speed and turn, stops, reversals, spot turns, hills."""
+    return Drives(
+        tuple(_mixed(rng, duration_s) for _ in range(n_runs)),
+        tuple(
+            Hills((rng.normal(0.0, 0.04), rng.normal(0.0, 0.04)), abs(rng.normal(0.0, 0.03)))
+            for _ in range(n_runs)
+        ),
+    )
+
+
+def poor_drives(rng: np.random.Generator, n_runs: int, duration_s: float = DURATION_S) -> Drives:
+    """Return drives that excite next to nothing: one speed, level ground, hardly any steering."""
+    n = round(duration_s * STEP_HZ) + 1
+    time_s = np.arange(n) / STEP_HZ
+    twists = []
+    for _ in range(n_runs):
+        twist = np.zeros((n, 3))
+        twist[:, 0] = np.clip(0.5 * (time_s - 0.5), 0.0, rng.uniform(0.65, 0.75))
+        phase = rng.uniform(0.0, 2 * math.pi)
+        twist[:, 2] = 0.01 * np.sin(2 * math.pi * time_s / 20.0 + phase) * (time_s > 5.0)
+        twists.append(twist)
+    return Drives(tuple(twists), tuple(Hills() for _ in range(n_runs)))
+
+
+def _mixed(rng: np.random.Generator, duration_s: float) -> Array:
+    n = round(duration_s * STEP_HZ) + 1
+    desired = np.zeros((n, 3))
+    k = round(1.5 * STEP_HZ)
+    while k < n - round(3.0 * STEP_HZ):
+        length = round(rng.uniform(2.0, 5.0) * STEP_HZ)
+        kind = rng.choice(["ahead", "stop", "back", "spot", "turn"], p=[0.4, 0.1, 0.15, 0.1, 0.25])
+        speed, turn = rng.uniform(0.3, 1.0), 0.0
+        if kind == "stop":
+            speed = 0.0
+        elif kind == "back":
+            speed, turn = -rng.uniform(0.3, 0.8), rng.uniform(-0.4, 0.4) * rng.integers(2)
+        elif kind == "spot":
+            speed, turn = 0.0, rng.choice([-1.0, 1.0]) * rng.uniform(0.3, 0.8)
+        elif kind == "turn":
+            turn = rng.choice([-1.0, 1.0]) * rng.uniform(0.1, 0.6)
+        desired[k : k + length] = speed, 0.0, turn
+        k += length
+    desired[n - round(3.0 * STEP_HZ) :] = 0.0
+    return _ramped(desired)
+
+
+def _ramped(desired: Array) -> Array:
+    """Return twists (n, 3) from rest that change by 1 m/s^2 and 1 rad/s^2 at the most."""
+    limit = 1.0 / STEP_HZ
+    twist = np.zeros_like(desired)
+    for axis, goals in enumerate(desired.T.tolist()):  # numbers of Python's own: arrays of three are slow
+        value, values = 0.0, [0.0]
+        for goal in goals[1:]:
+            change = goal - value
+            value += limit if change > limit else -limit if change < -limit else change
+            values.append(value)
+        twist[:, axis] = values
+    return twist

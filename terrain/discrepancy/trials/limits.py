@@ -1,0 +1,196 @@
+"""How small an effect could be and still be seen: detection limits by the Cramer-Rao bound of the drives.
+
+The *limit* of an effect is the amplitude that a test at the size corrected for the library would find nine
+times in ten, with everything that varies from run to run left free.  It comes from sensitivities of the true
+motion and from spectra of the simulated noise, not from anything that the diagnosis computes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.stats import norm
+
+from terrain.discrepancy.trials.drives import STEP_HZ, Drives
+from terrain.effects import (
+    ACCEL,
+    CHANNELS,
+    CURRENT,
+    GYRO,
+    INDEX,
+    LIBRARY,
+    ONE_SIDED,
+    SENSED_ONLY,
+    SPEED_X,
+    SPEED_Y,
+    STEPS,
+    TURNING_CURRENT,
+    Effect,
+    library_of,
+    nuisances_of,
+    parameters_of,
+    vector_of,
+)
+from terrain.records import Array, Stream
+from terrain.robots import Robot
+from terrain.simulation.planar.hills import Hills
+from terrain.simulation.planar.ideal_sensors import sense
+from terrain.simulation.planar.model import Ground, Planar, make_planar
+from terrain.simulation.planar.motion import move
+from terrain.simulation.planar.noise import Noise, load_noise, load_scatter
+from terrain.simulation.planar.noise_spectra import WHEEL_SPEED, noise_psd
+from terrain.simulation.planar.run import simulate_planar
+
+TEST_SIZE = 0.02
+"""Size of the test over the whole library, to which limits refer."""
+
+POWER = 0.9
+
+CONFUSABLE = 0.99
+"""Two effects whose sensitivities correlate more than that, nuisances taken out, are of one class: a
+collinearity index of 10."""
+
+
+class Limits(NamedTuple):
+    """What the drives of a trial could show.
+
+    Parameters
+    ----------
+    names : parameters (k,)
+    information : (k, k) of all runs, nuisances free
+    """
+
+    names: tuple[str, ...]
+    information: Array
+
+    def of(self, effect: Effect, direction: Array | None = None) -> float:
+        """Return the smallest amplitude that would be seen, along a direction (p,) or the first parameter."""
+        at = [self.names.index(p.name) for p in effect.parameters]
+        along = np.eye(len(at))[0] if direction is None else direction
+        size = float(along @ self.information[np.ix_(at, at)] @ along)
+        desired = norm.isf(TEST_SIZE / 2 / self.library_size) + norm.ppf(POWER)
+        return float(desired / math.sqrt(size)) if size > 0 else math.inf
+
+    @property
+    def library_size(self) -> int:
+        """How many effects are tested."""
+        return sum(all(p.name in self.names for p in effect.parameters) for effect in LIBRARY)
+
+    def alike(self, one: Effect, other: Effect) -> bool:
+        """Return whether two effects are of one confusable class."""
+        i, j = ([self.names.index(p.name) for p in effect.parameters] for effect in (one, other))
+        own, its = self.information[np.ix_(i, i)], self.information[np.ix_(j, j)]
+        cross = self.information[np.ix_(i, j)]
+        if min(np.diag(own).min(), np.diag(its).min()) <= 0:
+            return True
+        # the largest cosine between a change of the one and a change of the other
+        shared = np.linalg.solve(own, cross) @ np.linalg.solve(its, cross.T)
+        return math.sqrt(max(float(np.linalg.eigvals(shared).real.max()), 0.0)) > CONFUSABLE
+
+
+def limits_of(robot: Robot, drives: Drives) -> Limits:
+    """Return what drives could show of each effect, by the Cramer-Rao bound."""
+    planar, noise, scatter = make_planar(robot, Ground()), load_noise(), load_scatter()
+    names, nuisances = tuple(parameters_of(robot.drive)), nuisances_of(robot.drive)
+    every = tuple(dict.fromkeys((*names, *nuisances)))
+    free = [every.index(name) for name in nuisances]
+    std = np.array([getattr(scatter, every[i]) for i in free])
+    total = np.zeros((len(names), len(names)))
+    for twist, hills in zip(drives.twists, drives.hills, strict=True):
+        gram = _gram(robot, planar, noise, twist, hills, every)
+        inner = np.linalg.inv(gram[np.ix_(free, free)] + np.diag(1.0 / std**2))
+        left = gram - gram[:, free] @ inner @ gram[free]
+        total += left[: len(names), : len(names)]
+    return Limits(names, total)
+
+
+def _gram(
+    robot: Robot, planar: Planar, noise: Noise, twist: Array, hills: Hills, names: Sequence[str]
+) -> Array:
+    """Return the information (k, k) of one run, nothing free."""
+    run = simulate_planar(robot, twist, 0, hills=hills)
+    truth = run.streams["truth"]
+    even = slice(0, len(truth) // 100 * 100, 2)  # a length that its Fourier transform is quick with
+    truth = Stream(truth.time_s[even], truth.values[even], truth.channels)
+    rate_hz = truth.rate_hz
+    wheels = robot.wheels
+    wheel_speed = np.column_stack([truth.channel(f"wheel_{w}_radps") for w in wheels]) * robot.wheel_radius_m
+    steer = (
+        np.column_stack([truth.channel(f"steer_{w}_rad") for w in wheels])
+        if robot.drive == "swerve"
+        else np.zeros_like(wheel_speed)
+    )
+    grade, roll = -truth.channel("pitch_rad"), truth.channel("roll_rad").copy()
+    wheel_speed, steer = np.ascontiguousarray(wheel_speed), np.ascontiguousarray(steer)
+    shown = np.ones((len(wheel_speed), len(CHANNELS)))
+    if robot.drive == "swerve":  # the sum of currents tells the traction where wheels point one way
+        shown[np.abs(np.exp(1j * steer).mean(axis=1)) < 0.95, CHANNELS.index(CURRENT)] = 0.0
+    channels = [GYRO, SPEED_X, SPEED_Y, ACCEL, CURRENT]
+    if robot.drive != "swerve":
+        channels.append(TURNING_CURRENT)
+    n = len(wheel_speed)
+    frequency_hz = np.fft.rfftfreq(n, 1 / rate_hz)
+    used = frequency_hz < 0.4 * STEP_HZ
+    f = frequency_hz[used]
+    both_sides = np.where(f > 0, 4.0, 2.0)
+    pace = float(np.abs(wheel_speed).mean(axis=1)[np.abs(wheel_speed).mean(axis=1) > 0.05].mean())
+    density = {name: _density(noise, robot, planar, name, f, pace) for name in channels}
+    waves = {name: np.empty((len(names), f.size), dtype=complex) for name in channels}
+    plain = move(planar, vector_of({}), 1 / rate_hz, wheel_speed, steer, grade, roll, np.zeros((0, 3)))
+    for j, name in enumerate(names):
+        step = STEPS[name]
+        both = []
+        for sign in (1.0, 0.0) if name in ONE_SIDED else (1.0, -1.0):
+            p = vector_of({name: sign * step})
+            if name in SENSED_ONLY:
+                both.append(sense(planar, p, 1 / rate_hz, plain))
+            else:
+                both.append(_shown(planar, p, 1 / rate_hz, wheel_speed, steer, grade, roll))
+        span = step if name in ONE_SIDED else 2 * step
+        change = (both[0] - both[1]) / span * shown
+        for channel in channels:
+            waves[channel][j] = np.fft.rfft(change[:, CHANNELS.index(channel)])[used] / rate_hz
+    gram = np.zeros((len(names), len(names)))
+    for channel in channels:
+        weighed = waves[channel] * (both_sides / density[channel] * rate_hz / n)
+        gram += np.real(weighed @ waves[channel].conj().T)
+    return gram
+
+
+def _shown(
+    planar: Planar, p: Array, dt: float, wheel_speed: Array, steer: Array, grade: Array, roll: Array
+) -> Array:
+    """Return what a replay of measured wheels and tilt would predict, as far as linear in what differs."""
+    lag = p[INDEX["encoder_lag_s"]]
+    wheel_speeds = wheel_speed + lag * np.gradient(wheel_speed, dt, axis=0) if lag else wheel_speed
+    tilt = grade - p[INDEX["pitch_offset_rad"]], roll - p[INDEX["roll_offset_rad"]]
+    truth = move(planar, p, dt, wheel_speeds, steer, *tilt, np.zeros((0, 3)))
+    return np.asarray(sense(planar, p, dt, truth))
+
+
+def _density(noise: Noise, robot: Robot, planar: Planar, channel: str, f: Array, pace: float) -> Array:
+    """Return the one-sided spectrum of what parts measured from replayed: noise of channel and wheels."""
+    own = noise_psd(noise, robot, planar, channel, f, pace)
+    wheel_speed = noise_psd(noise, robot, planar, WHEEL_SPEED, f, pace)
+    lag_s = robot.sensors.encoder_time_constant_s if robot.sensors is not None else 0.0
+    wheel_speed = wheel_speed * (1.0 + (2 * math.pi * f * lag_s) ** 2)  # the lag is undone
+    n = planar.n_wheels
+    mean, rate = wheel_speed / n, (2 * math.pi * f) ** 2
+    if channel == GYRO:
+        turn = np.sum(planar.to_twist[2] ** 2) / 2 if robot.drive == "swerve" else 2.0 / planar.track_m**2
+        return own + wheel_speed * turn
+    if channel == SPEED_X:
+        return own + mean
+    if channel == ACCEL:
+        return own + mean * rate
+    if channel == CURRENT:
+        return own + mean * rate * (planar.mass_kg * planar.radius_m / planar.nm_per_a) ** 2
+    return own
+
+
+def confusable_class(limits: Limits, effect: Effect, drive: str) -> set[str]:
+    """Return the names of all effects that no log of these drives tells from one, and its own."""
+    return {other.name for other in library_of(drive) if other is effect or limits.alike(effect, other)}

@@ -1,0 +1,37 @@
+"""One blind trial: what it depends on, and what it counts when the diagnosis refuses the runs."""
+
+from dataclasses import replace
+
+from terrain.discrepancy.trials.hidden_effects import cases_of
+from terrain.discrepancy.trials.rows import Row
+from terrain.discrepancy.trials.scoring import table_of
+from terrain.discrepancy.trials.trial import run_trial
+from terrain.discrepancy.verdict import Verdict
+from terrain.effects import library_of
+from terrain.errors import DataError
+
+
+def test_cases_take_the_robots_in_turn_and_row_found_every_effect():
+    cases = cases_of(Row.FOUND, 50, 7, 8)
+    assert [case.robot for case in cases[:4]] == ["agrimaro", "husky"] * 2
+    for robot, drive in (("agrimaro", "swerve"), ("husky", "skid_steer")):
+        library = library_of(drive)
+        own = [case for case in cases if case.robot == robot]
+        assert {case.number // 2 % len(library) for case in own} == set(range(len(library)))
+
+
+def test_a_trial_depends_on_its_seed_and_number_alone():
+    cases = cases_of(Row.STRONG, 4, 3, 3)
+    one, other = run_trial(cases[1]), run_trial(cases[1])
+    assert replace(one, seconds=0.0) == replace(other, seconds=0.0)
+    assert run_trial(cases[3]).hidden != one.hidden
+
+
+def test_runs_that_the_diagnosis_refuses_count_as_a_false_alarm_and_stop_nothing(monkeypatch):
+    def refuse(*_):
+        raise DataError("runs: only 2 of 8 are fit to be compared")
+
+    monkeypatch.setattr("terrain.discrepancy.trials.trial.diagnose", refuse)
+    found = run_trial(cases_of(Row.NONE, 1, 0, 3)[0])
+    assert (found.verdict, found.named, found.right) == (Verdict.REFUSED, (), True)
+    assert table_of([found])["none: false alarms"].hits == 1
