@@ -11,10 +11,10 @@ from pipelines.reporting.progress import Progress, silent
 from terrain.errors import ConfigError, LogError
 from terrain.estimation.ekf.model import Noise
 from terrain.estimation.enriched import enriched
-from terrain.estimation.estimate import Estimate, estimate_run, model_and_noise, tuning_of
+from terrain.estimation.estimate import Estimate, beside, filter_run, model_and_noise, tuning_of
 from terrain.estimation.summary import summarize
 from terrain.estimation.tuned_noise import TunedNoise, tuned_noise, tuning_runs
-from terrain.extension import corrected, corrected_log
+from terrain.extension import correct, corrected, corrected_log
 from terrain.files.atomic import ensure_writable
 from terrain.logs.write import run_folder, write_run
 from terrain.records import RunLog
@@ -52,11 +52,11 @@ def estimate(
     process_noise, tuned = _tuned(runs, settings) if tuning == "likelihood" else (None, None)
     rows = []
     for done, run in enumerate(runs):
-        robot, noise = load_robot(settings.robot or run.robot), None
+        (log, robot), noise = correct(run, load_robot(settings.robot or run.robot)), None
         if process_noise is not None:  # not every run has the sensors of the runs tuned on
-            _, own = model_and_noise(run, robot, settings.filter, tuning)
+            _, own = model_and_noise(log, robot, settings.filter, tuning)
             noise = Noise(process_noise.process_variance, own.measurement_variance, own.initial_variance)
-        found = estimate_run(run, robot, settings.filter, tuning=tuning, noise=noise)
+        found = beside(run, filter_run(log, robot, settings.filter, tuning=tuning, noise=noise))
         rows.append(summarize(found))
         if settings.out is not None:
             _write(found, settings.out, settings.figures)
@@ -74,8 +74,8 @@ def _refuse_existing(runs: Sequence[RunLog], out: Path) -> None:
 def _tuned(runs: Sequence[RunLog], settings: EstimateSettings) -> tuple[Noise, TunedNoise]:
     chosen = tuning_runs(runs, settings.tune_on)
     robot: Robot = load_robot(settings.robot or chosen[0].robot)
-    logs = [corrected_log(run, robot) for run in chosen]
-    return tuned_noise(*model_and_noise(logs[0], robot, settings.filter), logs, corrected(robot))
+    logs, robot = [corrected_log(run, robot) for run in chosen], corrected(robot)
+    return tuned_noise(*model_and_noise(logs[0], robot, settings.filter), logs, robot)
 
 
 def _write(found: Estimate, out: Path, figures: bool) -> None:

@@ -53,7 +53,7 @@ from terrain.control.traction import (
 )
 from terrain.errors import ConfigError
 from terrain.estimation.live.estimator import LiveEstimate, LiveEstimator
-from terrain.extension import corrected
+from terrain.extension import correct_live
 from terrain.kinematics.swerve import FAR_RAD, wheel_command_step
 from terrain.logs.schema import IMU_CHANNELS
 from terrain.records import Array, Command, Sample
@@ -175,7 +175,7 @@ class LivePilot:
             )
         if settings.controller == "thesis":
             check_stable(robot, settings.gains, settings.form, settings.delay_s)
-        measured, robot = robot, corrected(robot)
+        robot, correction = correct_live(robot)
         self._robot, self._table, self._settings = robot, table, settings
         self._watch = Nobody() if watch is None else watch
         self._terrains = {terrain: index for index, terrain in enumerate(table.targets)}
@@ -191,7 +191,7 @@ class LivePilot:
             robot.equipment.steering.rate_max_radps,
         )
         self._blind = settings.controller in ("plain", "ramp")
-        self._estimator = None if self._blind else LiveEstimator(measured)
+        self._estimator = None if self._blind else LiveEstimator(robot, correction=correction)
         if self._estimator is not None:
             if settings.track:
                 self._tracking = check_tracking(robot, settings.tracking, settings.delay_s)

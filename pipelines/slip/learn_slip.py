@@ -22,9 +22,9 @@ from terrain.control.slip_table import (
     write_slip_table,
 )
 from terrain.errors import ConfigError, DataError
-from terrain.estimation.estimate import estimate_run
+from terrain.estimation.estimate import filter_run
 from terrain.estimation.wheel_slip import wheel_speed_scatter_mps
-from terrain.extension import corrected, corrected_log
+from terrain.extension import correct
 from terrain.files.atomic import atomic_write, ensure_writable
 from terrain.records import RunLog, SlipTarget
 from terrain.robots import Robot, load_robot
@@ -204,8 +204,8 @@ def run_parts(run: RunLog, robot: Robot) -> list[RunPart]:
         raise DataError(
             f"run {run.run_id} is of robot {run.robot!r}: a table is learned for one, {robot.name!r}"
         )
-    run, robot = corrected_log(run, robot), corrected(robot)
-    found = estimate_run(run, robot, FILTER)
+    run, robot = correct(run, robot)
+    found = filter_run(run, robot, FILTER)
     pull = wheel_pull(run, robot, found.track, found.table, found.slip)
     parts = []
     for terrain in run.terrains:

@@ -21,7 +21,7 @@ from terrain.estimation.measurements.table import GNSS_ROWS, MeasurementTable
 from terrain.estimation.reference import true_states
 from terrain.estimation.slip_figures import SlipFigures, slip_figures
 from terrain.estimation.wheel_slip import blind_slip, wheel_slip
-from terrain.extension import corrected, corrected_log
+from terrain.extension import check_corrected, correct
 from terrain.records import Array, RunLog, SlipTrack, StateTrack
 from terrain.robots import Robot
 
@@ -94,12 +94,52 @@ def estimate_run(
     noise: Noise | None = None,
     initial_yaw_rad: float | None = None,
 ) -> Estimate:
-    """Filter one run.
+    """Correct one run for the effects of its robot, and filter it.
 
     Parameters
     ----------
-    run : log of the robot
-    robot : its description; the effects of an extended one are removed from the log before it is filtered
+    run : log of the robot, as measured
+    robot : its description
+    name, tuning, noise, initial_yaw_rad : as :func:`filter_run` takes them
+
+    Returns
+    -------
+    Estimate
+        of the corrected robot, beside the run as measured
+
+    Raises
+    ------
+    ConfigError
+        if the filter does not fit the robot, or has no tuning of that name.
+    DataError
+        if the log has no wheels.
+    """
+    found = filter_run(
+        *correct(run, robot), name, tuning=tuning, noise=noise, initial_yaw_rad=initial_yaw_rad
+    )
+    return beside(run, found)
+
+
+def beside(run: RunLog, found: Estimate) -> Estimate:
+    """Return the estimate of a corrected run beside the run as measured, less the GNSS that was left out."""
+    left_out = "gnss" in run.streams and "gnss" not in found.run.streams
+    return replace(found, run=_without_gnss(run) if left_out else run)
+
+
+def filter_run(
+    run: RunLog,
+    robot: Robot,
+    name: str,
+    *,
+    tuning: str | None = None,
+    noise: Noise | None = None,
+    initial_yaw_rad: float | None = None,
+) -> Estimate:
+    """Filter one run that is corrected.
+
+    Parameters
+    ----------
+    run, robot : as :func:`terrain.extension.correct` returns them
     name : one of :data:`FILTERS`
     tuning : one of :data:`TUNINGS`; the filter's own (:data:`OWN_TUNING`) by default
     noise : that of a tuning on chosen runs, or any other, in place of the physical
@@ -109,23 +149,23 @@ def estimate_run(
     Raises
     ------
     ConfigError
-        if the filter does not fit the robot, or has no tuning of that name.
+        if the filter does not fit the robot, or has no tuning of that name, or the robot is not corrected.
     DataError
         if the log has no wheels.
     """
-    log, robot, tuning = corrected_log(run, robot), corrected(robot), tuning_of(name, tuning)
-    model, usual = model_and_noise(log, robot, name, tuning)
+    tuning = tuning_of(name, tuning)
+    model, usual = model_and_noise(run, robot, name, tuning)
     ema_alpha = THESIS_EMA_ALPHA if tuning == "thesis" and name == "vio12" else None
     yaw_rad = initial_yaw_rad or 0.0
-    table = measurement_table(log, robot, ema_alpha=ema_alpha, initial_yaw_rad=yaw_rad)
+    table = measurement_table(run, robot, ema_alpha=ema_alpha, initial_yaw_rad=yaw_rad)
     if initial_yaw_rad is None and name != "skid" and set(GNSS_ROWS) & set(model.rows):
         yaw_rad = gnss_heading(table, robot)
         if math.isnan(yaw_rad):
-            found = estimate_run(_without_gnss(log), robot, name, tuning=tuning, initial_yaw_rad=0.0)
-            unused = {"gnss: heading not told by the drive": len(log.streams["gnss"])}
+            found = filter_run(_without_gnss(run), robot, name, tuning=tuning, initial_yaw_rad=0.0)
+            unused = {"gnss: heading not told by the drive": len(run.streams["gnss"])}
             table = replace(found.table, dropped={**found.table.dropped, **unused})
-            return replace(found, run=_without_gnss(run), table=table)
-        table = measurement_table(log, robot, ema_alpha=ema_alpha, initial_yaw_rad=yaw_rad)
+            return replace(found, table=table)
+        table = measurement_table(run, robot, ema_alpha=ema_alpha, initial_yaw_rad=yaw_rad)
     noise = _with_gnss_variance(noise or usual, model, table)
     settings = FilterSettings(1.0 if tuning == "thesis" else GATE_PROBABILITY, REOPEN_AFTER_S)
     track = run_filter(model, noise, table.time_s, table.columns(model.rows), settings)
@@ -137,26 +177,27 @@ def estimate_run(
         track.time_s,
         _rolling_direction(table, robot),
     )
-    truth = true_states(log, track, robot, robot.encoder_lag_s, yaw_rad)
+    truth = true_states(run, track, robot, robot.encoder_lag_s, yaw_rad)
     return Estimate(run, robot, name, model, noise, table, track, slip, blind, figures, truth)
 
 
 def model_and_noise(
     run: RunLog, robot: Robot, name: str, tuning: str | None = None
 ) -> tuple[FilterModel, Noise]:
-    """Return the filter for a run, and the noise that it starts from.
+    """Return the filter for a corrected run, and the noise that it starts from.
 
     Raises
     ------
     ConfigError
-        as :func:`estimate_run` does.
+        as :func:`filter_run` does.
     """
+    check_corrected(robot)
     if (name == "skid") != (robot.drive == "skid_steer"):
         fits = "skid" if robot.drive == "skid_steer" else ", ".join(FILTERS[:-1])
         raise ConfigError(
             f"filter {name!r} is not for robot {robot.name}, whose drive is {robot.drive}: use {fits}"
         )
-    robot, tuning = corrected(robot), tuning_of(name, tuning)
+    tuning = tuning_of(name, tuning)
     if name == "skid":
         return make_skid_filter(robot), skid_noise(robot)
     if tuning == "thesis":

@@ -6,13 +6,13 @@ and of turning, which filters do not model.  Whoever reads a run and its robot c
 
     run, robot = correct(run, robot)
 
-and filters take what is corrected.  A live chain corrects its robot, and gives its estimator a
-:class:`Correction` for the samples that come.  Where a description lacks the section of a home, samples are
+and filters take what is corrected.  A live chain gives its estimator the robot and the
+:class:`Correction` of :func:`correct_live`.  Where a description lacks the section of a home, samples are
 corrected instead if the effect has an inverse.
 """
 
 from terrain.extension.description import apply_homes, check_corrected, corrected
-from terrain.extension.samples import Correction, correct, corrected_log
+from terrain.extension.samples import Correction, correct, correct_live, corrected_log
 from terrain.extension.writing import extended_yaml, write_extended
 
 __all__ = [
@@ -20,6 +20,7 @@ __all__ = [
     "apply_homes",
     "check_corrected",
     "correct",
+    "correct_live",
     "corrected",
     "corrected_log",
     "extended_yaml",

@@ -33,6 +33,18 @@ def correct(run: RunLog, robot: Robot) -> tuple[RunLog, Robot]:
     return corrected_log(run, robot), corrected(robot)
 
 
+def correct_live(robot: Robot) -> tuple[Robot, Correction | None]:
+    """Return a robot as live filters take it, and what corrects the samples that come; None without effects.
+
+    Examples
+    --------
+    >>> from terrain.robots import load_robot
+    >>> correct_live(load_robot("husky"))[1] is None
+    True
+    """
+    return corrected(robot), Correction(robot) if robot.effects else None
+
+
 def corrected_log(run: RunLog, robot: Robot) -> RunLog:
     """Return a log as the robot would have written it without the effects that have an inverse on samples.
 

@@ -33,7 +33,7 @@ from terrain.estimation.measurements.samples import ROWS, STREAMS, limits_of_row
 from terrain.estimation.measurements.table import GNSS_LATENCY_S, GNSS_ROWS
 from terrain.estimation.measurements.yaw import yaw_memory
 from terrain.estimation.wheel_slip import STALE_AFTER_S, instant_slip, wheel_speed_scatter_mps
-from terrain.extension import Correction, corrected
+from terrain.extension import Correction, check_corrected
 from terrain.logs.schema import WHEELS_CHANNELS
 from terrain.records import Array, Reading
 from terrain.robots import Robot
@@ -87,8 +87,7 @@ class LiveEstimator:
 
     Parameters
     ----------
-    robot : a swerve robot with motors, steering and sensors, and a camera for vio12 and vio15; effects of an
-        extended one are taken off what arrives
+    robot : a swerve robot with motors, steering and sensors, and a camera for vio12 and vio15, corrected
     filter_name : one of :data:`~terrain.estimation.filters.swerve.FILTERS`
     channels : names of the columns of each stream's readings, in their order; by default those of the schema.
         A stream that is not named is not read
@@ -96,12 +95,14 @@ class LiveEstimator:
     noise : in place of the physical
     initial_yaw_rad : heading of the start in the world; without it the GNSS is not used
     gnss_latency_s : age of a position when it arrives
+    correction : takes the effects of an extended robot off what arrives, see
+        :func:`terrain.extension.correct_live`
 
     Raises
     ------
     ConfigError
-        if the filter does not fit the robot, a section of its description is missing, the wheels' channels
-        are not among those named, or a number is out of its range.
+        if the filter does not fit the robot, the robot is not corrected, a section of its description is
+        missing, the wheels' channels are not among those named, or a number is out of its range.
     DataError
         if the noise does not fit the filter.
 
@@ -125,6 +126,7 @@ class LiveEstimator:
         noise: Noise | None = None,
         initial_yaw_rad: float | None = None,
         gnss_latency_s: float = GNSS_LATENCY_S,
+        correction: Correction | None = None,
     ) -> None:
         for name, value in (("initial_yaw_rad", initial_yaw_rad or 0.0), ("gnss_latency_s", gnss_latency_s)):
             if not math.isfinite(value):
@@ -132,9 +134,8 @@ class LiveEstimator:
         if gnss_latency_s < 0:
             raise ConfigError(f"gnss_latency_s is {gnss_latency_s:g}, a time from zero up is required")
         has_gnss = initial_yaw_rad is not None and "gnss" in channels
-        self._measured, self._channels = robot, channels
-        self._correction: Correction | None = None
-        robot = corrected(robot)
+        check_corrected(robot)
+        self._channels, self._correction = channels, correction
         self._model = make_filter(filter_name, robot, with_gnss=has_gnss)
         robot.has("motors", "steering", "sensors")
         noise = default_noise(filter_name, robot, has_gnss) if noise is None else noise
@@ -272,19 +273,13 @@ class LiveEstimator:
             self._unreadable[name] = self._unreadable.get(name, 0) + 1
             return None
         if time_s.ndim == 1 and values.shape == (time_s.size, self._n_columns[name]):
-            return self._corrected(name, time_s, values) if self._measured.effects else (time_s, values)
+            if self._correction is not None:
+                return self._correction(name, self._channels[name], time_s, values)
+            return time_s, values
         self._unreadable[name] = self._unreadable.get(name, 0) + max(time_s.size, 1)
         if name == "wheels" and time_s.ndim == 1:
             return time_s, np.full((time_s.size, self._n_columns[name]), np.nan)
         return None
-
-    def _corrected(self, name: str, time_s: Array, values: Array) -> tuple[Array, Array]:
-        """Return samples without the robot's effects; drifts count from the first stamp that ever comes."""
-        if self._correction is None and np.isfinite(time_s).any():
-            self._correction = Correction(self._measured, float(time_s[np.isfinite(time_s)][0]))
-        if self._correction is None:
-            return time_s, values
-        return self._correction(name, self._channels[name], time_s, values)
 
     def _tick(self, time_s: float, wheels: Array) -> LiveEstimate | None:
         follows = self._filter.follows(time_s)

@@ -1,15 +1,28 @@
 """Extended robots: a correction takes off a robot and a log just what its effects put on."""
 
+import ast
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+import terrain
 from terrain.effects import parameters_of
+from terrain.errors import ConfigError
+from terrain.estimation.estimate import filter_run
 from terrain.estimation.live.estimator import LiveEstimator
 from terrain.estimation.measurements.batch import measurement_table
-from terrain.extension import Correction, apply_homes, corrected, corrected_log
+from terrain.extension import (
+    Correction,
+    apply_homes,
+    check_corrected,
+    correct,
+    correct_live,
+    corrected,
+    corrected_log,
+)
 from terrain.kinematics.camera import body_motion
 from terrain.logs.replay import replay
 from terrain.records import RunLog, Stream
@@ -242,13 +255,54 @@ def test_a_turned_camera_tells_of_the_same_robot():
     np.testing.assert_allclose(wrong.yaw_rate_radps, seen.yaw_rate_radps, atol=1e-9)
 
 
+EDGES = {
+    "terrain/estimation/estimate.py",
+    "pipelines/estimate/estimate.py",
+    "pipelines/slip/learn_slip.py",
+    "pipelines/live/pilot.py",
+}
+"""Where a run as measured meets the robot as described."""
+
+
+def test_corrections_are_applied_at_the_edge_and_filters_refuse_what_is_not_corrected():
+    root, appliers = (
+        Path(terrain.__file__).parent.parent,
+        {"correct", "correct_live", "corrected", "corrected_log"},
+    )
+    found = set()
+    for path in (
+        path for room in ("terrain", "pipelines", "features") for path in (root / room).rglob("*.py")
+    ):
+        called = {
+            node.func.id
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)
+        }
+        if path.parent.name != "extension" and called & appliers:
+            found.add(path.relative_to(root).as_posix())
+    assert found == EDGES
+    robot, run = extended(camera_yaw_rad=0.1), run_of("straight", 5.0)
+    for refused in (lambda: filter_run(run, robot, "vio15"), lambda: LiveEstimator(robot)):
+        with pytest.raises(ConfigError, match="camera_yaw_rad is not corrected"):
+            refused()
+    check_corrected(extended(force_slip_ratio=0.1))  # which filters do not model
+    once = correct(run, robot)
+    assert correct(*once) == once
+    assert correct_live(once[1]) == (once[1], None)
+
+
+def live_estimator(robot, channels):
+    believed, correction = correct_live(robot)
+    return LiveEstimator(believed, "vio15", channels, correction=correction)
+
+
 def test_live_is_live_on_the_corrected_log():
     effects = {name: EVERY[name] for name in EVERY if not name.startswith("clock")}
     run, robot = run_of("straight", 12.0, effects), extended(**effects)
     channels = {name: run.streams[name].channels for name in ("wheels", "steering", "imu", "odometry")}
-    raw, plain = LiveEstimator(robot, "vio15", channels), LiveEstimator(corrected(robot), "vio15", channels)
+    raw, plain = live_estimator(robot, channels), LiveEstimator(corrected(robot), "vio15", channels)
     unshifted = replace(robot, effects={n: v for n, v in effects.items() if n != "steering_delay_s"})
-    raw_now = LiveEstimator(unshifted, "vio15", channels)
+    raw_now = live_estimator(unshifted, channels)
     told, desired = [], []
     log = corrected_log(run, unshifted)
     for one, other in zip(replay(run, 50.0), replay(log, 50.0), strict=True):
