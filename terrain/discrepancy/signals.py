@@ -100,10 +100,9 @@ def signals_of(run: RunLog, robot: Robot) -> Signals:
         raise DataError(f"run {run.run_id}: it has no stream 'wheels', which drives the simulation")
     wheels = run.streams["wheels"]
     wheel_speeds = _wheel_speeds(run, wheels, robot)
-    swerve = robot.drive == "swerve"
-    if swerve and "steering" not in run.streams:
+    if robot.steered and "steering" not in run.streams:
         raise DataError(f"run {run.run_id}: it has no stream 'steering', which drives the simulation")
-    used = ["wheels", *(["steering"] if swerve else [])]
+    used = ["wheels", *(["steering"] if robot.steered else [])]
     others = [name for name in ("imu", "odometry", "lidar") if name in run.streams]
     start_s = max(float(run.streams[name].time_s[0]) for name in (*used, *others))
     end_s = min(float(run.streams[name].time_s[-1]) for name in (*used, *others))
@@ -116,13 +115,10 @@ def signals_of(run: RunLog, robot: Robot) -> Signals:
         )
     time_s = start_s + np.arange(n) / rate_hz
     steer = np.zeros((n, len(robot.wheels)))
-    if swerve:
-        robot.has("steering")
-        assert robot.steering is not None
+    if robot.steered:
         stream = run.streams["steering"]
-        for i in range(3):
-            raw = unwrapped(stream.channel(f"angle_{i + 1}_rad"))
-            zero = getattr(robot.steering, f"zero_{i + 1}_rad")
+        for i, zero in enumerate(robot.steering_zeros_rad):
+            raw = unwrapped(stream.channel(f"angle_{robot.wheels[i]}_rad"))
             turn = 2 * math.pi * np.round((raw[np.isfinite(raw)][:1].sum() - zero) / (2 * math.pi))
             steer[:, i] = _at(time_s, stream.time_s, raw - zero - turn)
     grade = roll = np.zeros(n)
@@ -137,8 +133,6 @@ def signals_of(run: RunLog, robot: Robot) -> Signals:
             _put(measured, ACCEL, time_s, imu, "accel_x_mps2")
     if (seen := run.streams.get("odometry")) is not None:
         if set(POSE_CHANNELS) <= set(seen.channels):
-            robot.has("camera")
-            assert robot.camera is not None
             speed = _without_jumps(seen, body_motion(seen, robot.camera).speed_mps)
             measured[:, CHANNELS.index(SPEED_X)] = _at(time_s, seen.time_s, speed[:, 0])
             measured[:, CHANNELS.index(SPEED_Y)] = _at(time_s, seen.time_s, speed[:, 1])
@@ -156,10 +150,9 @@ def signals_of(run: RunLog, robot: Robot) -> Signals:
             for i, name in enumerate(currents)
         ]
         measured[:, CHANNELS.index(CURRENT)] = np.sum(each, axis=0)
-        if swerve:
-            parallel = np.abs(np.exp(1j * steer).mean(axis=1)) > PARALLEL
-            measured[~parallel, CHANNELS.index(CURRENT)] = np.nan
-        else:
+        parallel = np.abs(np.exp(1j * steer).mean(axis=1)) > PARALLEL
+        measured[~parallel, CHANNELS.index(CURRENT)] = np.nan
+        if robot.skids:
             measured[:, CHANNELS.index(TURNING_CURRENT)] = each[1] - each[0]
     if not np.isfinite(measured).any():
         raise DataError(
@@ -189,8 +182,6 @@ def _wheel_speeds(run: RunLog, wheels: Stream, robot: Robot) -> Array:
             rates = np.column_stack([wheels.channel(name) for name in names])
             if pattern.startswith("speed"):
                 return rates
-            robot.has("motors")
-            assert robot.motors is not None
             return rates * (robot.wheel_radius_m / robot.motors.reduction_ratio)
     raise DataError(
         f"run {run.run_id}: its wheels have the channels {', '.join(wheels.channels)}; a speed of each of "

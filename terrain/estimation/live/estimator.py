@@ -49,7 +49,7 @@ from terrain.estimation.wheel_slip import STALE_AFTER_S, instant_slip, wheel_spe
 from terrain.extension import Correction, corrected
 from terrain.logs.schema import WHEELS_CHANNELS
 from terrain.records import Array, Reading
-from terrain.robots import Robot
+from terrain.robots import Robot, as_swerve
 
 GNSS_PERIOD_S = 0.1
 """Between two positions; no robot's description tells it."""
@@ -149,7 +149,8 @@ class LiveEstimator:
         self._correction: Correction | None = None
         robot = corrected(robot)
         self._model = make_filter(filter_name, robot, with_gnss=has_gnss)
-        robot.has("motors", "steering", "sensors")
+        robot = as_swerve(robot, "robot {name} has the drive {drive!r}: the live estimator is for 'swerve'")
+        robot.require("motors", "steering", "sensors")
         noise = default_noise(filter_name, robot, has_gnss) if noise is None else noise
         self._filter = ResidentFilter(self._model, noise, settings)
         self._robot = robot
@@ -165,7 +166,7 @@ class LiveEstimator:
         if lacking:
             raise ConfigError(f"channels of 'wheels' are {known}: {lacking[0]!r} must be among them")
         read = [name for name in STREAMS if name in channels and (name != "gnss" or has_gnss)]
-        if self._robot.camera is None and "odometry" in read:
+        if "odometry" in read and not self._robot.describes("camera"):
             read.remove("odometry")
         self._n_columns = {name: len(channels[name]) for name in ("wheels", *read)}
         self._motor_columns = np.array([known.index(channel) for channel in WHEELS_CHANNELS[:3]])
@@ -184,12 +185,9 @@ class LiveEstimator:
     def _prepare_rows(self, initial_yaw_rad: float, gnss_latency_s: float) -> None:
         """Lay out what :func:`rows_at` is given: first what is fixed, then its memory."""
         robot = self._robot
-        motors, steering, sensors, camera = robot.motors, robot.steering, robot.sensors, robot.camera
-        assert motors is not None
-        assert steering is not None
-        assert sensors is not None
+        motors, steering, sensors = robot.motors, robot.steering, robot.sensors
         latency_s = np.zeros(len(STREAMS))
-        latency_s[1:] = sensors.imu_latency_s, camera.latency_s if camera else 0.0, gnss_latency_s
+        latency_s[1:] = sensors.imu_latency_s, robot.completed.camera.latency_s, gnss_latency_s
         params = {
             "reduction_ratio": motors.reduction_ratio,
             "wildest_radps": WILD_FACTOR * motors.speed_max_radps,
@@ -243,7 +241,6 @@ class LiveEstimator:
     @property
     def lag_s(self) -> float:
         """How old what is told is: every row is behind the low-pass that the encoders' rates come through."""
-        assert self._robot.sensors is not None
         return self._robot.sensors.encoder_time_constant_s
 
     @property
@@ -371,13 +368,13 @@ def _place(names: list[str], name: str) -> int:
 
 def _limits(robot: Robot) -> Array:
     """Return the ``LIMITS`` (18, 6) of each row."""
-    sensors, camera = robot.sensors, robot.camera
-    assert sensors is not None
+    sensors = robot.sensors
     tick_s, lag_s = 1.0 / sensors.wheels_rate_hz, sensors.encoder_time_constant_s
     limits = np.empty((len(ROWS), len(LIMITS)))
     for limit, row in zip(limits, ROWS, strict=True):
         period_s, tau_s = 1.0 / sensors.imu_rate_hz, lag_s
-        if row in CAMERA_ROWS and camera is not None:
+        if row in CAMERA_ROWS and robot.describes("camera"):
+            camera = robot.camera
             period_s, tau_s = 1.0 / camera.rate_hz, max(lag_s - camera.time_constant_s, 0.0)
         elif row in GNSS_ROWS:
             period_s = GNSS_PERIOD_S

@@ -41,7 +41,7 @@ from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.kinematics.camera import body_motion
 from terrain.logs.schema import GNSS_CHANNELS, IMU_CHANNELS
 from terrain.records import Array, RunLog, Stream
-from terrain.robots import Camera, Robot, Steering
+from terrain.robots import Camera, Robot, Sensors
 
 
 def measurement_table(
@@ -93,9 +93,9 @@ def measurement_table(
     A simulated camera or IMU without noise looks frozen where nothing changes: give it noise.
     """
     _check(time_constant_s, ema_alpha, gnss_latency_s)
-    if robot.drive == "swerve":
-        robot.has("motors", "steering", "sensors", *(["camera"] if "odometry" in run.streams else []))
-    sensors, camera = robot.sensors, robot.camera
+    if robot.steered:
+        robot.require("motors", "steering", "sensors", *(["camera"] if "odometry" in run.streams else []))
+    sensors = robot.completed.sensors
     encoder_s = robot.encoder_lag_s
     smooth_s = 0.0 if ema_alpha is not None else time_constant_s
     lag_s = encoder_s if smooth_s is None else smooth_s
@@ -109,7 +109,7 @@ def measurement_table(
         raise DataError(f"run {run.run_id}: the stream 'wheels', which gives the clock, is empty")
     clock = wheels.time_s
     rates = wheels.values
-    if robot.drive == "swerve" and robot.motors is not None:  # the others' rows are wheel speeds
+    if robot.steered:  # the others' rows are wheel speeds
         rates = wheels.values / robot.motors.reduction_ratio
         wild = np.abs(rates) > WILD_FACTOR * robot.motors.speed_max_radps
         dropped["wheels: beyond the motors"] += int(wild.any(axis=1).sum())
@@ -121,18 +121,20 @@ def measurement_table(
 
     imu = clean_stream(run, "imu", IMU_CHANNELS, dropped, frozen=IMU_CHANNELS[:6])
     if imu is not None:
-        time_s = imu.time_s - (sensors.imu_latency_s if sensors else 0.0)
-        told = without_leaps("imu", time_s, _imu_rows(imu, robot), dropped)
+        time_s = imu.time_s - sensors.imu_latency_s
+        told = {row: values for row, values in _imu_rows(imu, sensors).items() if row in rows}
+        told = without_leaps("imu", time_s, told, dropped)
         z |= at_ticks(imu, time_s, told, lag_s)
 
     steering = clean_stream(run, "steering", [f"angle_{i}_rad" for i in robot.wheels], dropped)
-    if steering is not None and robot.steering is not None:
-        told = _steering_rows(steering, robot.steering)
+    if steering is not None and robot.describes("steering"):
+        told = _steering_rows(steering, robot)
         told = without_leaps("steering", steering.time_s, told, dropped)
         z |= at_ticks(steering, steering.time_s, told, lag_s)
 
     odometry = clean_stream(run, "odometry", CAMERA_CHANNELS, dropped, frozen=CAMERA_CHANNELS[3:13])
-    if odometry is not None and camera is not None:
+    if odometry is not None and robot.describes("camera"):
+        camera = robot.camera
         own_s = max(encoder_s - camera.time_constant_s, 0.0) if smooth_s is None else smooth_s
         time_s = odometry.time_s - camera.latency_s
         told = without_leaps("odometry", time_s, _camera_rows(odometry, camera, dropped), dropped)
@@ -147,8 +149,8 @@ def measurement_table(
 
     unknown = np.full(clock.size, np.nan)
     table = {row: z.get(row, unknown) for row in rows}
-    if robot.drive == "swerve":
-        wheel_speed_mps = np.column_stack([table[row] for row in rows[:3]]) * robot.wheel_radius_m
+    if robot.steered:
+        wheel_speed_mps = robot.wheel_speeds_mps(np.column_stack([table[row] for row in robot.wheel_rows]))
         _refer_yaw(table, clock, wheel_speed_mps, initial_yaw_rad, causal)
     return MeasurementTable(
         clock,
@@ -171,8 +173,7 @@ def _check(time_constant_s: float | None, ema_alpha: float | None, gnss_latency_
 
 
 def _wheel_channels(run: RunLog, robot: Robot) -> list[str]:
-    pattern = "motor_{}_radps" if robot.drive == "swerve" else "speed_{}_mps"
-    channels = [pattern.format(wheel) for wheel in robot.wheels]
+    channels = list(robot.rate_channels)
     if "wheels" not in run.streams:
         raise DataError(f"run {run.run_id}: there is no stream 'wheels', which gives the clock")
     lacking = [channel for channel in channels if channel not in run.streams["wheels"].channels]
@@ -184,33 +185,28 @@ def _wheel_channels(run: RunLog, robot: Robot) -> list[str]:
     return channels
 
 
-def _imu_rows(imu: Stream, robot: Robot) -> dict[str, Array]:
+def _imu_rows(imu: Stream, sensors: Sensors) -> dict[str, Array]:
     """Calibrated yaw rate, acceleration of the body without gravity, and yaw.
 
     A sample is ``scale * truth + bias``.  The specific force at rest is g times the world's vertical in body
     axes, ``g (-sin pitch, sin roll cos pitch, cos roll cos pitch)``: with the nose up (pitch negative) it
     points forward too, with the left side up (roll positive) to the left.
     """
-    sensors = robot.sensors
-    rate = imu.channel("gyro_z_radps") - (sensors.gyro_bias_z_radps if sensors else 0.0)
-    if sensors is None or robot.drive != "swerve":
-        return {"gyro_z_radps": rate}
     force_x = (imu.channel("accel_x_mps2") - sensors.accel_bias_x_mps2) / sensors.accel_scale_x_ratio
     force_y = (imu.channel("accel_y_mps2") - sensors.accel_bias_y_mps2) / sensors.accel_scale_y_ratio
     roll, pitch = imu.channel("roll_rad"), imu.channel("pitch_rad")
     return {
         "accel_x_mps2": force_x + GRAVITY_MPS2 * np.sin(pitch),
         "accel_y_mps2": force_y - GRAVITY_MPS2 * np.sin(roll) * np.cos(pitch),
-        "gyro_z_radps": rate,
+        "gyro_z_radps": imu.channel("gyro_z_radps") - sensors.gyro_bias_z_radps,
         "imu_yaw_rad": unwrapped(imu.channel("yaw_rad")),
     }
 
 
-def _steering_rows(steering: Stream, described: Steering) -> dict[str, Array]:
+def _steering_rows(steering: Stream, robot: Robot) -> dict[str, Array]:
     """Steering angles without their zeros; the first one lies within half a turn."""
-    zeros_rad = (described.zero_1_rad, described.zero_2_rad, described.zero_3_rad)
-    angles = wrapped(steering.values - zeros_rad)
-    return {f"steer_{i + 1}_rad": unwrapped(angles[:, i]) for i in range(3)}
+    angles = wrapped(steering.values - robot.steering_zeros_rad)
+    return {row: unwrapped(angles[:, i]) for i, row in enumerate(robot.steer_rows)}
 
 
 def _camera_rows(odometry: Stream, camera: Camera, dropped: Counter[str]) -> dict[str, Array]:
