@@ -126,7 +126,7 @@ def test_a_correction_changes_the_streams_that_the_catalogue_names_and_no_others
             or not np.array_equal(before.values, back.streams[stream].values)
         }
         named = set(p.inverse.streams) if p.inverse else set()
-        applied = all(not home.section or getattr(robot, home.section) for home in p.homes)
+        applied = all(not home.section or robot.describes(home.section) for home in p.homes)
         if p.inverse and p.inverse.without_home and applied:
             named = set()
         assert changed == named, name
