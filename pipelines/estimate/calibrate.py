@@ -21,7 +21,7 @@ from terrain.calibration.wheels import SLIP_RATIO, reduction_ratio, steering_zer
 from terrain.errors import ConfigError, DataError
 from terrain.files.atomic import atomic_write, ensure_writable
 from terrain.records import RunLog
-from terrain.robots import Robot, read_description, robot_from
+from terrain.robots import Robot, SwerveRobot, read_description, robot_from
 from terrain.terramechanics.soil import load_soil, soil_names
 
 if TYPE_CHECKING:
@@ -70,11 +70,11 @@ def calibrate(
     """
     file, described = read_description(robot_name)
     robot = robot_from(file, described)
-    if robot.drive != "swerve":
+    if not isinstance(robot, SwerveRobot):
         raise DataError(
             f"robot {robot.name}: drive {robot.drive!r} is not calibrated from logs, only 'swerve' is"
         )
-    robot.has("body", "motors", "steering", "camera", "sensors")
+    robot.require(*robot.sections)
     if robot.effects:  # what is calibrated would hold them a second time
         raise ConfigError(
             f"robot {robot.name}: {file} is extended by effects; calibrate the description without them, "

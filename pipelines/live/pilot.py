@@ -57,7 +57,7 @@ from terrain.extension import correct_live
 from terrain.kinematics.swerve import FAR_RAD, wheel_command_step
 from terrain.logs.schema import IMU_CHANNELS
 from terrain.records import Array, Command, Sample
-from terrain.robots import Robot
+from terrain.robots import Robot, as_swerve
 from terrain.slip import MIN_SPEED_MPS
 
 CONTROLLERS = ("plain", "ramp", "thesis", "traction")
@@ -159,8 +159,7 @@ class LivePilot:
             raise ConfigError(
                 f"controller {settings.controller!r} is unknown: use one of {', '.join(CONTROLLERS)}"
             )
-        if robot.drive != "swerve":
-            raise ConfigError(f"robot {robot.name}: drive {robot.drive!r} has no pilot, only 'swerve' has")
+        robot = as_swerve(robot, "robot {name}: drive {drive!r} has no pilot, only 'swerve' has")
         if not (math.isfinite(settings.ramp_mps2) and settings.ramp_mps2 > 0):
             raise ConfigError(f"ramp_mps2 is {settings.ramp_mps2!r}, a number above zero is required")
         table = load_slip_table() if table is None else table

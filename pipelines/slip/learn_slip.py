@@ -27,7 +27,7 @@ from terrain.estimation.wheel_slip import wheel_speed_scatter_mps
 from terrain.extension import correct
 from terrain.files.atomic import atomic_write, ensure_writable
 from terrain.records import RunLog, SlipTarget
-from terrain.robots import Robot, load_robot
+from terrain.robots import Robot, as_swerve, load_robot
 from terrain.slip_learning.slip_curve import (
     LAW_PARAMETERS,
     N_BOOTSTRAP,
@@ -115,12 +115,9 @@ def learn_slip(
     from pipelines.models.tracking import code_commit, ensure_tracking, log_learning
     from pipelines.slip.figures import curve_figures
 
-    robot = load_robot(robot_name)
-    if robot.drive != "swerve":
-        raise ConfigError(
-            f"robot {robot.name} has the drive {robot.drive!r}: slip curves are learned for 'swerve' alone"
-        )
-    _ = robot.equipment
+    refusal = "robot {name} has the drive {drive!r}: slip curves are learned for 'swerve' alone"
+    robot = as_swerve(load_robot(robot_name), refusal)
+    robot.require(*robot.sections)
     if out.is_dir():
         raise ConfigError(f"{out}: is a folder; --out names the file of the table")
     ensure_writable(out.parent)

@@ -31,9 +31,9 @@ def seen_motion(stretch: Stretch, robot: Robot) -> Stream | None:
     None where the camera saw nothing.
     """
     odometry = stretch.of("odometry", CHANNELS)
-    camera = robot.camera
-    if odometry is None or camera is None:
+    if odometry is None or not robot.describes("camera"):
         return None
+    camera = robot.camera
     seen = body_motion(odometry, camera)
     values = np.column_stack([seen.speed_mps, seen.yaw_rate_radps, seen.yaw_rad])
     sure = np.isfinite(values).all(axis=1) & (odometry.channel("confidence_ratio") >= MIN_CONFIDENCE_RATIO)

@@ -37,7 +37,7 @@ from terrain.effects import (
     effect_named,
 )
 from terrain.errors import ConfigError
-from terrain.kinematics.swerve import wheel_commands
+from terrain.kinematics.wheel_motion import wheel_motion
 from terrain.records import Array
 from terrain.robots import Robot
 from terrain.simulation.planar.model import TRUTH
@@ -222,9 +222,10 @@ def _logged(robot: Robot, info: Information | None) -> tuple[str, ...]:
     if info is not None:
         return measured_channels(info.rows)
     own = [GYRO, ACCEL]
-    own += [SPEED_X, SPEED_Y] if robot.camera is not None else []
-    own += [CURRENT, TURNING_CURRENT] if robot.motors is not None else []
-    return tuple(name for name in own if name != TURNING_CURRENT or robot.drive != "swerve")
+    own += [SPEED_X, SPEED_Y] if robot.describes("camera") else []
+    own += [CURRENT] if robot.describes("motors") else []
+    own += [TURNING_CURRENT] if robot.describes("motors") and robot.skids else []
+    return tuple(own)
 
 
 def _drives(
@@ -234,8 +235,9 @@ def _drives(
     told, signals = [], []
     for name in SCENARIOS:
         inputs = _inputs(simulation.robot, name)
-        for grade_deg in GRADES_DEG if inputs is not None else ():
-            assert inputs is not None
+        if inputs is None:
+            continue
+        for grade_deg in GRADES_DEG:
             told.append((name, grade_deg))
             signals.append(_signals(simulation, *inputs, grade_deg, channels))
     if not signals:
@@ -250,35 +252,19 @@ def _drives(
 
 def _inputs(robot: Robot, name: str) -> tuple[Array, Array] | None:
     """Return wheel speeds and steering (n, wheels) of a scenario, or None if the robot cannot drive it."""
-    speed_mps = 0.6 * robot.wheel_radius_m * (robot.motors.speed_max_radps if robot.motors else 0.0)
+    if not robot.describes("motors"):
+        return None
+    speed_mps = 0.6 * robot.wheel_radius_m * robot.motors.speed_max_radps
     try:
         scenario = make_scenario(name, robot, "ground", speed_mps=min(speed_mps, 1.0))
     except ConfigError:
         return None
-    assert robot.motors is not None
-    twist = scenario.twist[: round(LONGEST_S * RATE_HZ)]
-    if robot.drive == "swerve":
-        assert robot.steering is not None
-        _, wheel_radps, steer_rad = wheel_commands(
-            robot.wheel_positions_m,
-            robot.wheel_radius_m,
-            robot.motors.speed_max_radps,
-            robot.steering.rate_max_radps,
-            1.0 / RATE_HZ,
-            twist,
-            np.zeros(3),
-        )
-        wheel_speed_mps = wheel_radps * robot.wheel_radius_m
-    else:
-        turn = 0.5 * robot.track_m * twist[:, 2]
-        wheel_speed_mps, steer_rad = (
-            np.column_stack([twist[:, 0] - turn, twist[:, 0] + turn]),
-            np.zeros((len(twist), 2)),
-        )
+    motion = wheel_motion(robot, scenario.twist[: round(LONGEST_S * RATE_HZ)], 1.0 / RATE_HZ)
     keep = math.exp(-1.0 / (RATE_HZ * FOLLOW_S))
     every = round(RATE_HZ / CLOCK_HZ)
     wheel_speed_mps, steer_rad = (
-        lfilter([1 - keep], [1, -keep], x, axis=0)[::every] for x in (wheel_speed_mps, steer_rad)
+        lfilter([1 - keep], [1, -keep], x, axis=0)[::every]
+        for x in (motion.wheel_speed_mps, motion.steer_rad)
     )
     return wheel_speed_mps, steer_rad
 
@@ -294,9 +280,8 @@ def _signals(
     level, vector = np.zeros(len(wheel_speed_mps)), simulation.vector
     measured = np.full((len(wheel_speed_mps), len(CHANNELS)), np.nan)
     measured[:, [CHANNELS.index(name) for name in channels]] = 0.0
-    if simulation.robot.drive == "swerve":
-        parallel = np.abs(np.exp(1j * steer_rad).mean(axis=1)) > PARALLEL
-        measured[~parallel, CHANNELS.index(CURRENT)] = np.nan
+    parallel = np.abs(np.exp(1j * steer_rad).mean(axis=1)) > PARALLEL
+    measured[~parallel, CHANNELS.index(CURRENT)] = np.nan
     grade, roll = level, level
     if grade_deg:
         flat = move(

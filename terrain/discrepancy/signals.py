@@ -100,13 +100,12 @@ def signals_of(run: RunLog, robot: Robot) -> Signals:
         )
     if "wheels" not in run.streams:
         raise DataError(f"run {run.run_id}: it has no stream 'wheels', which drives the simulation")
-    swerve = robot.drive == "swerve"
-    if swerve and "steering" not in run.streams:
+    if robot.steered and "steering" not in run.streams:
         raise DataError(f"run {run.run_id}: it has no stream 'steering', which drives the simulation")
     wheels = run.streams["wheels"]
     wheel_speeds = _wheel_speeds(run, wheels, robot)
-    time_s, dt_s = _clock(run, ("wheels", "steering") if swerve else ("wheels",))
-    steer = _steering(run, robot, time_s) if swerve else np.zeros((time_s.size, len(robot.wheels)))
+    time_s, dt_s = _clock(run, ("wheels", "steering") if robot.steered else ("wheels",))
+    steer = _steering(run, robot, time_s) if robot.steered else np.zeros((time_s.size, len(robot.wheels)))
     grade, roll = _tilt(run, time_s)
     measured = np.full((time_s.size, len(CHANNELS)), np.nan)
     _put_imu(measured, run, time_s)
@@ -148,13 +147,10 @@ def _clock(run: RunLog, inputs: Sequence[str]) -> tuple[Array, float]:
 
 def _steering(run: RunLog, robot: Robot, time_s: Array) -> Array:
     """Return the steering angles (n, wheels) of a swerve robot, zeros and whole turns subtracted."""
-    robot.has("steering")
-    assert robot.steering is not None
     stream = run.streams["steering"]
     steer = np.zeros((time_s.size, len(robot.wheels)))
-    for i in range(3):
-        raw = unwrapped(stream.channel(f"angle_{i + 1}_rad"))
-        zero = getattr(robot.steering, f"zero_{i + 1}_rad")
+    for i, zero in enumerate(robot.steering_zeros_rad):
+        raw = unwrapped(stream.channel(f"angle_{robot.wheels[i]}_rad"))
         turn = 2 * math.pi * np.round((raw[np.isfinite(raw)][:1].sum() - zero) / (2 * math.pi))
         steer[:, i] = _at(time_s, stream.time_s, raw - zero - turn)
     return steer
@@ -184,8 +180,6 @@ def _put_motion(measured: Array, run: RunLog, robot: Robot, time_s: Array) -> No
     """Put in speeds over ground and the heading rate, from a camera's poses, its speeds, or a lidar."""
     if (seen := run.streams.get("odometry")) is not None:
         if set(POSE_CHANNELS) <= set(seen.channels):
-            robot.has("camera")
-            assert robot.camera is not None
             speed = _without_jumps(seen, body_motion(seen, robot.camera).speed_mps)
             measured[:, CHANNELS.index(SPEED_X)] = _at(time_s, seen.time_s, speed[:, 0])
             measured[:, CHANNELS.index(SPEED_Y)] = _at(time_s, seen.time_s, speed[:, 1])
@@ -210,10 +204,9 @@ def _put_currents(
         for i, name in enumerate(currents)
     ]
     measured[:, CHANNELS.index(CURRENT)] = np.sum(each, axis=0)
-    if robot.drive == "swerve":
-        parallel = np.abs(np.exp(1j * steer).mean(axis=1)) > PARALLEL
-        measured[~parallel, CHANNELS.index(CURRENT)] = np.nan
-    else:
+    parallel = np.abs(np.exp(1j * steer).mean(axis=1)) > PARALLEL
+    measured[~parallel, CHANNELS.index(CURRENT)] = np.nan
+    if robot.skids:
         measured[:, CHANNELS.index(TURNING_CURRENT)] = each[1] - each[0]
 
 
@@ -225,8 +218,6 @@ def _wheel_speeds(run: RunLog, wheels: Stream, robot: Robot) -> Array:
             rates = np.column_stack([wheels.channel(name) for name in names])
             if pattern.startswith("speed"):
                 return rates
-            robot.has("motors")
-            assert robot.motors is not None
             return rates * (robot.wheel_radius_m / robot.motors.reduction_ratio)
     raise DataError(
         f"run {run.run_id}: its wheels have the channels {', '.join(wheels.channels)}; a speed of each of "

@@ -28,6 +28,9 @@ from terrain.robots import Robot
 FILTERS = ("encoder12", "slip14", "vio12", "vio15", "skid")
 """Names of the filters; the numbers are those of their states."""
 
+FILTERS_OF_DRIVE = {"swerve": FILTERS[:-1], "skid_steer": FILTERS[-1:]}
+"""Filters of each drive."""
+
 TUNINGS = ("physical", "thesis", "likelihood")
 """Noise in natural units; the thesis' own (6.13), (6.14), with its smoothing and without gates; process noise
 fitted to chosen runs."""
@@ -192,8 +195,9 @@ def model_and_noise(
         as :func:`filter_run` does.
     """
     check_corrected(robot)
-    if (name == "skid") != (robot.drive == "skid_steer"):
-        fits = "skid" if robot.drive == "skid_steer" else ", ".join(FILTERS[:-1])
+    suitable = FILTERS_OF_DRIVE[robot.drive]
+    if name in FILTERS and name not in suitable:
+        fits = ", ".join(suitable)
         raise ConfigError(
             f"filter {name!r} is not for robot {robot.name}, whose drive is {robot.drive}: use {fits}"
         )
@@ -242,6 +246,5 @@ def _speed_mps(track: StateTrack) -> Array:
 
 def _rolling_direction(table: MeasurementTable, robot: Robot) -> Array:
     """Return the direction (n, wheels) in which each wheel rolls: -1 backward, else 1."""
-    unit = "radps" if robot.drive == "swerve" else "mps"
-    rates = table.columns([f"wheel_{wheel}_{unit}" for wheel in robot.wheels])
+    rates = table.columns(list(robot.wheel_rows))
     return np.where(rates < 0.0, -1.0, 1.0)

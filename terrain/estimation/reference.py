@@ -91,7 +91,7 @@ def _true_state(truth: Stream, state: str, robot: Robot, initial_yaw_rad: float)
     if state in truth.channels:
         return truth.channel(state)
     if state == "gyro_bias_radps" and "gyro_bias_z_radps" in truth.channels:
-        offset = robot.sensors.gyro_bias_z_radps if robot.sensors else 0.0
+        offset = robot.completed.sensors.gyro_bias_z_radps
         return np.asarray(truth.channel("gyro_bias_z_radps") - offset)
     if state.startswith("slip_speed_"):
         wheel_speed, along = wheel_and_ground_speed(truth, robot)

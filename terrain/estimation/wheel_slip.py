@@ -63,14 +63,9 @@ def wheel_slip(
 
 def _unmeasured(table: MeasurementTable, robot: Robot) -> Array:
     """Return where (n, wheels) a wheel's rate or angle was not measured for :data:`UNMEASURED_AFTER_S`."""
-    rows = {
-        wheel: [f"wheel_{wheel}_radps", f"steer_{wheel}_rad"]
-        if robot.drive == "swerve"
-        else [f"wheel_{wheel}_mps"]
-        for wheel in robot.wheels
-    }
     columns = []
-    for names in rows.values():
+    for i, row in enumerate(robot.wheel_rows):
+        names = [row, *robot.steer_rows[i : i + 1]]
         heard = np.isfinite(table.columns(names))
         last_s = np.maximum.accumulate(np.where(heard, table.time_s[:, None], -np.inf), axis=0)
         columns.append((table.time_s[:, None] - last_s > UNMEASURED_AFTER_S).any(axis=1))
@@ -109,7 +104,7 @@ def _slip(
             wheel_speed, d_wheel_speed, wheel_speed_variance = ground + slip_speed, d_ground.copy(), 0.0
             d_wheel_speed[:, track.states.index(f"slip_speed_{wheel}_mps")] += 1.0
         else:
-            wheel_speed, d_wheel_speed = _wheel_speed(table, robot, wheel), np.zeros_like(d_ground)
+            wheel_speed, d_wheel_speed = _wheel_speed(table, robot, i), np.zeros_like(d_ground)
             wheel_speed_variance = (
                 wheel_speed_scatter_mps(robot) if wheel_speed_std_mps is None else wheel_speed_std_mps
             ) ** 2
@@ -137,7 +132,7 @@ def _ground_speed(track: StateTrack, robot: Robot, wheel: int) -> tuple[Array, A
     steer_name = f"steer_{robot.wheels[wheel]}_rad"
     zero = np.zeros(track.time_s.size)
     across, steer = zero, zero  # what a robot without steered wheels cannot have
-    if robot.drive == "swerve":
+    if robot.steered:
         across, steer = _state(track, "speed_y_mps"), _state(track, steer_name)
     turn = _state(track, "yaw_rate_radps")
     ahead, left = _state(track, speed_name) - turn * y, across + turn * x
@@ -218,10 +213,8 @@ def instant_slip(
         slip[1, i] = np.sqrt(max(variance, 0.0))
 
 
-def _wheel_speed(table: MeasurementTable, robot: Robot, wheel: str) -> Array:
-    if robot.drive == "swerve":
-        return table.columns([f"wheel_{wheel}_radps"])[:, 0] * robot.wheel_radius_m
-    return table.columns([f"wheel_{wheel}_mps"])[:, 0]
+def _wheel_speed(table: MeasurementTable, robot: Robot, wheel: int) -> Array:
+    return robot.wheel_speeds_mps(table.columns([robot.wheel_rows[wheel]])[:, 0])
 
 
 def wheel_speed_scatter_mps(robot: Robot) -> float:
@@ -230,9 +223,9 @@ def wheel_speed_scatter_mps(robot: Robot) -> float:
     Each step of the wheel by ``2 pi / steps`` lifts what the driver's low-pass reports by that over its time
     constant, and until the next it falls again: a saw-tooth of standard deviation height / sqrt(12).
     """
-    sensors, motors = robot.sensors, robot.motors
-    if sensors is None or motors is None:
+    if not robot.describes("sensors", "motors"):
         return float("nan")
+    sensors, motors = robot.sensors, robot.motors
     noise = sensors.motor_std_radps / motors.reduction_ratio
     step_rad = 2 * np.pi / (sensors.hall_steps_ratio * motors.reduction_ratio)
     lag_s = sensors.encoder_time_constant_s

@@ -78,18 +78,18 @@ def check_corrected(robot: Robot) -> None:
 
 
 def _has_section(robot: Robot, home: Home) -> bool:
-    return not home.section or getattr(robot, home.section) is not None
+    return not home.section or robot.describes(home.section)
 
 
 def _apply(robot: Robot, home: Home, value: float) -> Robot:
     """Return a robot with one number of its description changed; the same robot if it lacks the section."""
     if not _has_section(robot, home):
         return robot
-    part: Any = getattr(robot, home.section) if home.section else robot
+    part: Any = robot.parts[home.section] if home.section else robot
     if home.scaled_by:
         value *= getattr(part, home.scaled_by)
     part = replace(part, **{home.field: home.combine.apply(getattr(part, home.field), value)})
-    changed: Robot = replace(robot, **{home.section: part}) if home.section else part
+    changed: Robot = robot.with_parts(**{home.section: part}) if home.section else part
     return changed
 
 

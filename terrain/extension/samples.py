@@ -105,14 +105,13 @@ class Correction:
         self._p = dict.fromkeys(parameters_of(robot.drive), 0.0) | dict(robot.effects)
         applied = apply_homes(robot)
         homeless = applied.effects
-        self._gyro_bias = applied.sensors.gyro_bias_z_radps if applied.sensors else 0.0
+        self._gyro_bias = applied.completed.sensors.gyro_bias_z_radps
         self._gyro_offset = homeless.get("gyro_bias_radps", 0.0)
         self._accel_offset = homeless.get("accel_bias_mps2", 0.0)
         self._current = 1.0 + homeless.get("motor_constant_ratio", 0.0)
         half = 0.5 * self._p["one_sided_radius_ratio"]
-        swerve = robot.drive == "swerve"
         self._side = {wheel: 1.0 + half if wheel in ("3", "right") else 1.0 - half for wheel in robot.wheels}
-        self._has_backlash = swerve and self._p["steering_backlash_rad"] > 0.0
+        self._has_backlash = self._p.get("steering_backlash_rad", 0.0) > 0.0
         self._follower, self._angle, self._yaw = np.full(3, np.nan), np.full(3, np.nan), (np.nan, np.nan)
         self._inverses: Mapping[str, Callable[[tuple[str, ...], Array, Array], None]] = {
             "wheels": self._wheels,

@@ -36,8 +36,6 @@ def with_wheel_speeds(run: RunLog, robot: Robot) -> RunLog:
     wheel_speeds = tuple(f"speed_{wheel}_mps" for wheel in robot.wheels)
     if wheels is None or not set(motors) <= set(wheels.channels):
         return run
-    robot.has("motors")
-    assert robot.motors is not None
     rate = np.column_stack([wheels.channel(channel) for channel in motors])
     wheel_speed = rate / robot.motors.reduction_ratio * robot.wheel_radius_m
     streams = dict(run.streams)

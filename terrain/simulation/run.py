@@ -98,10 +98,10 @@ def simulate_run(
         soils = {name: scattered(soil, rng) for name, soil in soils.items()}
         conditions = draw_conditions(load_spread(), rng, conditions)
     drive_seed = int(driven.generate_state(1)[0])
-    if robot.drive != "swerve" and terrain == COURSE:
+    if not robot.steered and terrain == COURSE:
         raise ConfigError(f"robot {robot.name}: scenario {COURSE!r} is for swerve robots")
     drive = make_scenario(scenario, robot, names, duration_s, seed=drive_seed)
-    if robot.drive != "swerve":
+    if not robot.steered:
         if gnss is not None:
             raise ConfigError(f"robot {robot.name}: its simulation has no receiver, leave gnss out")
         log = _planar_run(

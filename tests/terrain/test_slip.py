@@ -187,7 +187,7 @@ def test_uncertainty_of_the_rim_is_by_default_the_robots_own():
     count = np.floor(np.arange(0, 4, dt) * 5.0 / step)
     seen = lfilter([1 - np.exp(-dt / 0.05)], [1, -np.exp(-dt / 0.05)], np.diff(count) * step / dt)
     assert wheel_speed_std == pytest.approx(seen[5000:].std() * ROBOT.wheel_radius_m, rel=0.03)
-    nameless = replace(ROBOT, sensors=None)
+    nameless = ROBOT.without("sensors")
     assert np.isnan(wheel_slip(track, table, nameless).slip_std).all()
     np.testing.assert_allclose(wheel_slip(track, table, nameless).slip_ratio, 0.2)
 
@@ -293,7 +293,7 @@ def raw_slip(run, robot, **options):
 
 @pytest.mark.parametrize("camera_s", [0.0, 0.02])
 def test_a_start_has_no_false_braking_once_the_delays_match(camera_s):
-    robot = replace(ROBOT, camera=replace(ROBOT.camera, time_constant_s=camera_s))
+    robot = ROBOT.with_parts(camera=replace(ROBOT.camera, time_constant_s=camera_s))
     run = start_of_a_run(0.125, camera_s)
     apart, matched = raw_slip(run, robot, time_constant_s=0.0), raw_slip(run, robot)
     assert np.nanmin(apart) < -0.05

@@ -118,18 +118,14 @@ def _gram(
     rate_hz = truth.rate_hz
     wheels = robot.wheels
     wheel_speed = np.column_stack([truth.channel(f"wheel_{w}_radps") for w in wheels]) * robot.wheel_radius_m
-    steer = (
-        np.column_stack([truth.channel(f"steer_{w}_rad") for w in wheels])
-        if robot.drive == "swerve"
-        else np.zeros_like(wheel_speed)
-    )
+    steer = np.column_stack([truth.channel(f"steer_{w}_rad") for w in wheels])
     grade, roll = -truth.channel("pitch_rad"), truth.channel("roll_rad").copy()
     wheel_speed, steer = np.ascontiguousarray(wheel_speed), np.ascontiguousarray(steer)
     shown = np.ones((len(wheel_speed), len(CHANNELS)))
-    if robot.drive == "swerve":  # the sum of currents tells the traction where wheels point one way
-        shown[np.abs(np.exp(1j * steer).mean(axis=1)) < 0.95, CHANNELS.index(CURRENT)] = 0.0
+    # the sum of currents tells the traction where wheels point one way
+    shown[np.abs(np.exp(1j * steer).mean(axis=1)) < 0.95, CHANNELS.index(CURRENT)] = 0.0
     channels = [GYRO, SPEED_X, SPEED_Y, ACCEL, CURRENT]
-    if robot.drive != "swerve":
+    if robot.skids:
         channels.append(TURNING_CURRENT)
     n = len(wheel_speed)
     frequency_hz = np.fft.rfftfreq(n, 1 / rate_hz)
@@ -175,12 +171,12 @@ def _density(noise: Noise, robot: Robot, planar: Planar, channel: str, f: Array,
     """Return the one-sided spectrum of what parts measured from replayed: noise of channel and wheels."""
     own = noise_psd(noise, robot, planar, channel, f, pace)
     wheel_speed = noise_psd(noise, robot, planar, WHEEL_SPEED, f, pace)
-    lag_s = robot.sensors.encoder_time_constant_s if robot.sensors is not None else 0.0
+    lag_s = robot.completed.sensors.encoder_time_constant_s
     wheel_speed = wheel_speed * (1.0 + (2 * math.pi * f * lag_s) ** 2)  # the lag is undone
     n = planar.n_wheels
     mean, rate = wheel_speed / n, (2 * math.pi * f) ** 2
     if channel == GYRO:
-        turn = np.sum(planar.to_twist[2] ** 2) / 2 if robot.drive == "swerve" else 2.0 / planar.track_m**2
+        turn = 2.0 / planar.track_m**2 if robot.skids else np.sum(planar.to_twist[2] ** 2) / 2
         return own + wheel_speed * turn
     if channel == SPEED_X:
         return own + mean

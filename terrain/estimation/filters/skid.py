@@ -20,11 +20,10 @@ import math
 import numpy as np
 from numba import njit
 
-from terrain.errors import ConfigError
 from terrain.estimation.ekf.kernel import OBSERVE, PROPAGATE
 from terrain.estimation.ekf.model import FilterModel, Noise
 from terrain.records import Array
-from terrain.robots import Robot
+from terrain.robots import Robot, as_skid_steer
 
 MIN_TURN_RADPS = 0.1
 """Slower turns tell nothing on the track: the product w B would take the noise of w for turning."""
@@ -76,10 +75,7 @@ def make_skid_filter(robot: Robot) -> FilterModel:
     >>> make_skid_filter(load_robot("husky")).references
     ()
     """
-    if robot.drive != "skid_steer":
-        raise ConfigError(
-            f"robot {robot.name} has the drive {robot.drive!r}: this filter is for 'skid_steer'"
-        )
+    as_skid_steer(robot, "robot {name} has the drive {drive!r}: this filter is for 'skid_steer'")
     mean = np.zeros(len(_STATES))
     mean[_TRACK] = robot.track_m
     return FilterModel(

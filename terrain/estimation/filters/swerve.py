@@ -60,7 +60,7 @@ from terrain.estimation.filters.swerve_model import (
 )
 from terrain.estimation.measurements.table import CAMERA_ROWS, GNSS_ROWS
 from terrain.records import Array
-from terrain.robots import Robot
+from terrain.robots import Robot, as_swerve
 
 _WHEELS = ("1", "2", "3")
 _FADING_PER_S = 3.0  # of the acceleration of vio15: a third of a second, shorter than a start and a stop
@@ -142,8 +142,7 @@ def make_filter(
     (15, 14, ('camera_speed',))
     """
     layout = layout_of(name, robot)
-    camera = robot.camera if layout.has_camera else None
-    lever_m = (camera.lever_x_m, camera.lever_y_m) if camera else (0.0, 0.0)
+    lever_m = (robot.camera.lever_x_m, robot.camera.lever_y_m) if layout.has_camera else (0.0, 0.0)
     rows = rows_of(name, with_gnss)
     sensors = tuple((sensor, group) for sensor, group in _SENSORS.items() if group[0] in rows)
     has = (float(layout.has_camera), float(with_gnss))
@@ -168,10 +167,9 @@ def layout_of(name: str, robot: Robot) -> Layout:
     """Return the layout of a filter that fits the robot."""
     if name not in LAYOUTS:
         raise ConfigError(f"filter {name!r} is unknown: use one of {', '.join(FILTERS)}")
-    if robot.drive != "swerve":
-        raise ConfigError(f"robot {robot.name} has the drive {robot.drive!r}: filter {name} is for 'swerve'")
+    as_swerve(robot, f"robot {{name}} has the drive {{drive!r}}: filter {name} is for 'swerve'")
     if LAYOUTS[name].has_camera:
-        robot.has("camera")
+        robot.require("camera")
     return LAYOUTS[name]
 
 

@@ -43,15 +43,16 @@ _SLIP_STD_MPS = 0.15  # how far rim and ground differ, where both are measured a
 
 def _described_std(robot: Robot) -> dict[str, float]:
     """Return what the sensors scatter by as described; of n samples a tick, by 1 / sqrt(n) of it."""
-    sensors, camera = robot.sensors, robot.camera
     found = {}
-    if sensors is not None:
+    if robot.describes("sensors"):
+        sensors = robot.sensors
         imu = math.sqrt(sensors.wheels_rate_hz / max(sensors.imu_rate_hz, sensors.wheels_rate_hz))
         found["accel_mps2"] = sensors.accel_std_mps2 * imu
         found["gyro_z_radps"] = sensors.gyro_std_radps * imu
         found["imu_yaw_rad"] = sensors.yaw_std_rad * imu
         found["steer_rad"] = sensors.steering_std_rad
-    if sensors is not None and camera is not None:
+    if robot.describes("sensors", "camera"):
+        sensors, camera = robot.sensors, robot.camera
         seen = math.sqrt(sensors.wheels_rate_hz / max(camera.rate_hz, sensors.wheels_rate_hz))
         found["camera_speed_mps"] = camera.speed_std_mps * seen
         found["camera_yaw_rate_radps"] = camera.yaw_rate_std_radps * seen

@@ -36,7 +36,7 @@ from terrain.estimation.wheel_slip import STALE_AFTER_S, instant_slip, wheel_spe
 from terrain.extension import Correction, check_corrected
 from terrain.logs.schema import WHEELS_CHANNELS
 from terrain.records import Array, Reading
-from terrain.robots import Robot
+from terrain.robots import Robot, as_swerve
 
 GNSS_PERIOD_S = 0.1
 """Between two positions; no robot's description tells it."""
@@ -137,7 +137,8 @@ class LiveEstimator:
         check_corrected(robot)
         self._channels, self._correction = channels, correction
         self._model = make_filter(filter_name, robot, with_gnss=has_gnss)
-        robot.has("motors", "steering", "sensors")
+        robot = as_swerve(robot, "robot {name} has the drive {drive!r}: the live estimator is for 'swerve'")
+        robot.require("motors", "steering", "sensors")
         noise = default_noise(filter_name, robot, has_gnss) if noise is None else noise
         self._filter = ResidentFilter(self._model, noise, settings)
         self._robot = robot
@@ -153,7 +154,7 @@ class LiveEstimator:
         if lacking:
             raise ConfigError(f"channels of 'wheels' are {known}: {lacking[0]!r} must be among them")
         read = [name for name in STREAMS if name in channels and (name != "gnss" or has_gnss)]
-        if self._robot.camera is None and "odometry" in read:
+        if "odometry" in read and not self._robot.describes("camera"):
             read.remove("odometry")
         self._n_columns = {name: len(channels[name]) for name in ("wheels", *read)}
         self._motor_columns = np.array([known.index(channel) for channel in WHEELS_CHANNELS[:3]])
@@ -172,11 +173,9 @@ class LiveEstimator:
     def _prepare_rows(self, initial_yaw_rad: float, gnss_latency_s: float) -> None:
         """Lay out what :func:`rows_at` is given: first what is fixed, then its memory."""
         robot = self._robot
-        motors, sensors, camera = robot.motors, robot.sensors, robot.camera
-        assert motors is not None
-        assert sensors is not None
+        motors, sensors = robot.motors, robot.sensors
         latency_s = np.zeros(len(STREAMS))
-        latency_s[1:] = sensors.imu_latency_s, camera.latency_s if camera else 0.0, gnss_latency_s
+        latency_s[1:] = sensors.imu_latency_s, robot.completed.camera.latency_s, gnss_latency_s
         self._motor_radps, self._z, self._gnss_variance = np.empty(3), np.empty(len(ROWS)), np.empty(4)
         self._unmeasured = np.ones(3, dtype=np.bool_)
         lines, turns, gnss = row_memory()
@@ -221,7 +220,6 @@ class LiveEstimator:
     @property
     def lag_s(self) -> float:
         """How old what is told is: every row is behind the low-pass that the encoders' rates come through."""
-        assert self._robot.sensors is not None
         return self._robot.sensors.encoder_time_constant_s
 
     @property
@@ -343,15 +341,14 @@ def _place(names: list[str], name: str) -> int:
 
 def _limits(robot: Robot) -> Array:
     """Return the limits (18, 6) of the rows, by the described periods."""
-    sensors, camera = robot.sensors, robot.camera
-    assert sensors is not None
+    sensors = robot.sensors
     lag_s = dict.fromkeys(STREAMS, sensors.encoder_time_constant_s)
     period_s = {
         "imu": 1.0 / sensors.imu_rate_hz,
         "steering": 1.0 / sensors.steering_rate_hz,
         "gnss": GNSS_PERIOD_S,
     }
-    if camera is not None:
-        lag_s["odometry"] = max(sensors.encoder_time_constant_s - camera.time_constant_s, 0.0)
-        period_s["odometry"] = 1.0 / camera.rate_hz
+    if robot.describes("camera"):
+        lag_s["odometry"] = max(sensors.encoder_time_constant_s - robot.camera.time_constant_s, 0.0)
+        period_s["odometry"] = 1.0 / robot.camera.rate_hz
     return limits_of_rows(lag_s, period_s, 1.0 / sensors.wheels_rate_hz)

@@ -104,9 +104,8 @@ def measurement_table(
     A simulated camera or IMU without noise looks frozen where nothing changes: give it noise.
     """
     _check(time_constant_s, ema_alpha, gnss_latency_s)
-    swerve = robot.drive == "swerve"
-    if swerve:
-        robot.has("motors", "steering", "sensors", *(["camera"] if "odometry" in run.streams else []))
+    if robot.steered:
+        robot.require("motors", "steering", "sensors", *(["camera"] if "odometry" in run.streams else []))
     dropped: Counter[str] = Counter()
     wheels = clean_stream(run, "wheels", _wheel_channels(run, robot), dropped)
     if wheels is None:
@@ -121,7 +120,7 @@ def measurement_table(
     z, variance, counts = np.empty((n, len(ROWS))), np.empty((n, len(GNSS_ROWS))), np.zeros((5, 3), np.int64)
     _fill_rows(
         clock,
-        np.array(wheels.values) if swerve else np.full((n, 3), np.nan),
+        np.array(wheels.values) if robot.steered else np.full((n, 3), np.nan),
         *_samples_of(streams, latency_s, causal),
         params,
         _limits(streams, robot, clock, 0.0 if ema_alpha is not None else time_constant_s),
@@ -135,7 +134,7 @@ def measurement_table(
     if ema_alpha is not None:
         for row in CAMERA_ROWS:
             z[:, ROWS.index(row)] = ema(z[:, ROWS.index(row)], ema_alpha)
-    if swerve:
+    if robot.steered:
         _refer_yaw(clock, z, params, yaw_memory(), causal)
     dropped["wheels: beyond the motors"] += int(counts[-1, 0])
     for number, name in enumerate(STREAMS):
@@ -143,7 +142,7 @@ def measurement_table(
         dropped[f"{name}: no rotation"] += int(counts[number, NO_ROTATION])
     rows = ROWS_OF_DRIVE[robot.drive]
     columns = dict(zip(ROWS, z.T, strict=True))
-    if not swerve:  # their wheels report speeds
+    if not robot.steered:  # their wheels report speeds
         columns |= dict(zip(rows, wheels.values.T, strict=False))
     table = np.column_stack([columns[row] for row in rows])
     return MeasurementTable(clock, rows, table, variance, {kind: n for kind, n in dropped.items() if n})
@@ -161,8 +160,7 @@ def _check(time_constant_s: float | None, ema_alpha: float | None, gnss_latency_
 
 
 def _wheel_channels(run: RunLog, robot: Robot) -> list[str]:
-    pattern = "motor_{}_radps" if robot.drive == "swerve" else "speed_{}_mps"
-    channels = [pattern.format(wheel) for wheel in robot.wheels]
+    channels = list(robot.rate_channels)
     if "wheels" not in run.streams:
         raise DataError(f"run {run.run_id}: there is no stream 'wheels', which gives the clock")
     lacking = [channel for channel in channels if channel not in run.streams["wheels"].channels]
@@ -183,14 +181,14 @@ def _clean_streams(run: RunLog, robot: Robot, dropped: Counter[str]) -> dict[str
         "odometry": clean_stream(run, "odometry", CAMERA_CHANNELS, dropped, frozen=CAMERA_CHANNELS[3:13]),
         "gnss": clean_stream(run, "gnss", GNSS_CHANNELS, dropped),
     }
-    has = {"steering": robot.steering is not None, "odometry": robot.camera is not None}
+    has = {"steering": robot.describes("steering"), "odometry": robot.describes("camera")}
     return {name: stream for name, stream in found.items() if stream is not None and has.get(name, True)}
 
 
 def _latencies_s(robot: Robot, gnss_latency_s: float) -> dict[str, float]:
     return {
-        "imu": robot.sensors.imu_latency_s if robot.sensors else 0.0,
-        "odometry": robot.camera.latency_s if robot.camera else 0.0,
+        "imu": robot.completed.sensors.imu_latency_s,
+        "odometry": robot.completed.camera.latency_s,
         "gnss": gnss_latency_s,
     }
 
@@ -214,10 +212,10 @@ def _limits(
 ) -> Array:
     """Return the limits (18, 6) of the rows, by the median periods of the log."""
     lag_s = dict.fromkeys(STREAMS, robot.encoder_lag_s if time_constant_s is None else time_constant_s)
-    if robot.camera is not None and time_constant_s is None:
+    if robot.describes("camera") and time_constant_s is None:
         lag_s["odometry"] = max(robot.encoder_lag_s - robot.camera.time_constant_s, 0.0)
     period_s = {name: median_step_s(stream.time_s) for name, stream in streams.items()}
-    judged = ROWS if robot.drive == "swerve" else ("gyro_z_radps",)
+    judged = ROWS if robot.steered else ("gyro_z_radps",)
     return limits_of_rows(lag_s, period_s, median_step_s(clock), judged)
 
 

@@ -46,13 +46,12 @@ def gnss_heading(table: MeasurementTable, robot: Robot) -> float:
 
 def _speed_over_ground(table: MeasurementTable, robot: Robot) -> Array:
     """Return the speed (n,) of the origin in body axes, forward + 1j left: the camera's, or the wheels'."""
-    camera = robot.camera
-    rates = table.columns([f"wheel_{wheel}_radps" for wheel in robot.wheels])
-    steer = table.columns([f"steer_{wheel}_rad" for wheel in robot.wheels])
+    rates, steer = table.columns(list(robot.wheel_rows)), table.columns(list(robot.steer_rows))
     twist, _ = forward(robot.wheel_positions_m, robot.wheel_radius_m, rates, steer)
     speed = twist[:, 0] + 1j * twist[:, 1]
-    if camera is None:
+    if not robot.describes("camera"):
         return np.asarray(speed)
+    camera = robot.camera
     x, y, turn = table.columns(["camera_speed_x_mps", "camera_speed_y_mps", "camera_yaw_rate_radps"]).T
     by_camera = (x + turn * camera.lever_y_m) + 1j * (y - turn * camera.lever_x_m)
     return np.where(np.isfinite(by_camera), by_camera, speed)

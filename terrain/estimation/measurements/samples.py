@@ -73,16 +73,13 @@ _inline = njit(cache=True, error_model="numpy")
 
 def params_of(robot: Robot, initial_yaw_rad: float) -> Array:
     """Return the parameters (12,) of a robot, neutral ones for what it does not have."""
-    motors, sensors, steering = robot.motors, robot.sensors, robot.steering
+    motors, sensors = robot.completed.motors, robot.completed.sensors
+    zeros = {f"zero_{i}_rad": zero for i, zero in enumerate(robot.steering_zeros_rad.tolist(), 1)}
     values: dict[str, float] = dict.fromkeys(PARAMS, 0.0)
-    values |= {"reduction_ratio": 1.0, "fastest_radps": math.inf}
-    values |= {"accel_scale_x_ratio": 1.0, "accel_scale_y_ratio": 1.0}
     values |= {"wheel_radius_m": robot.wheel_radius_m, "initial_yaw_rad": initial_yaw_rad}
-    if motors is not None:
-        values["reduction_ratio"] = motors.reduction_ratio
-        values["fastest_radps"] = WILD_FACTOR * motors.speed_max_radps
-    for part in (sensors, steering):
-        values |= {name: getattr(part, name) for name in PARAMS if hasattr(part, name)}
+    values["reduction_ratio"] = motors.reduction_ratio
+    values["fastest_radps"] = WILD_FACTOR * motors.speed_max_radps
+    values |= {name: getattr(sensors, name) for name in PARAMS if hasattr(sensors, name)} | zeros
     return np.array([values[name] for name in PARAMS])
 
 

@@ -15,7 +15,7 @@ from terrain.errors import ConfigError
 from terrain.extension import apply_homes
 from terrain.kinematics.swerve import wheel_commands
 from terrain.records import Array, Command, Label, RunLog, Sample, Stream
-from terrain.robots import Robot
+from terrain.robots import Robot, as_swerve
 from terrain.simulation.conditions import NO_FAULTS, Conditions, Faults
 from terrain.simulation.dynamic.loop import Drive, in_loop
 from terrain.simulation.dynamic.plant import FIELD_STEP_M, Plant, make_plant, record_width
@@ -125,8 +125,7 @@ def simulate(
     >>> sorted(run.streams), run.terrains
     (['commands', 'imu', 'odometry', 'steering', 'truth', 'wheels'], ('grass',))
     """
-    if robot.drive != "swerve":
-        raise ConfigError(f"robot {robot.name}: drive {robot.drive!r} is not simulated, only 'swerve' is")
+    robot = as_swerve(robot, "robot {name}: drive {drive!r} is not simulated, only 'swerve' is")
     conditions = Conditions() if conditions is None else conditions
     substeps = round(1 / (scenario.rate_hz * STEP_S))
     if abs(substeps * scenario.rate_hz * STEP_S - 1.0) > 1e-9:

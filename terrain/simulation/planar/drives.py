@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
-from terrain.kinematics.swerve import wheel_commands
-from terrain.records import Array
+from terrain.kinematics.wheel_motion import WheelMotion
+from terrain.records import Array, Stream
 from terrain.robots import Robot
 from terrain.simulation.sensors.truth import wheel_channels
 
@@ -26,44 +25,15 @@ STEER_S = 0.08
 """Lag by which steering follows its command; assumed."""
 
 
-class WheelCommands(NamedTuple):
-    """Commands of a run.
-
-    Parameters
-    ----------
-    values, channels : (n, c) of the stream
-    speed_mps, steer_rad : (n, wheels) desired circumferential speeds and steering angles of the wheels
-    """
-
-    values: Array
-    channels: tuple[str, ...]
-    speed_mps: Array
-    steer_rad: Array
-
-
-def wheel_commands_of(robot: Robot, twist: Array) -> WheelCommands:
-    """Return the commands that follow from desired twists (n, 3) with the described geometry."""
-    names = ("speed_x_mps", "speed_y_mps", "yaw_rate_radps", *wheel_channels("wheel_radps", robot.wheels))
-    radius_m = robot.wheel_radius_m
-    assert robot.motors is not None
-    if robot.drive == "swerve":
-        assert robot.steering is not None
-        admitted, wheel_radps, steer_rad = wheel_commands(
-            robot.wheel_positions_m,
-            radius_m,
-            robot.motors.speed_max_radps,
-            robot.steering.rate_max_radps,
-            1.0 / COMMANDS_HZ,
-            twist,
-            np.zeros(3),
-        )
-        values = np.hstack([admitted, wheel_radps, steer_rad])
-        channels = (*names, *wheel_channels("steer_rad", robot.wheels))
-        return WheelCommands(values, channels, wheel_radps * radius_m, steer_rad)
-    turn = 0.5 * robot.track_m * twist[:, 2]
-    limit = radius_m * robot.motors.speed_max_radps
-    speeds = np.clip(np.column_stack([twist[:, 0] - turn, twist[:, 0] + turn]), -limit, limit)
-    return WheelCommands(np.hstack([twist, speeds / radius_m]), names, speeds, np.zeros((len(twist), 2)))
+def commands_stream(robot: Robot, desired: WheelMotion) -> Stream:
+    """Return the stream of commands."""
+    channels = (
+        *("speed_x_mps", "speed_y_mps", "yaw_rate_radps"),
+        *wheel_channels("wheel_radps", robot.wheels),
+        *robot.steer_rows,
+    )
+    columns = [desired.twist, desired.wheel_radps, desired.steer_rad[:, : len(robot.steer_rows)]]
+    return Stream(np.arange(len(desired.twist)) / COMMANDS_HZ, np.hstack(columns), channels)
 
 
 @njit(cache=True)

@@ -21,8 +21,6 @@ _SLIPS = np.linspace(0.0, 1.0, 101)
 _MORE = 1.01
 """Load for which growth with load is taken."""
 
-_TYRES = {"swerve": 3, "skid_steer": 4}
-
 
 def planar_ground(robot: Robot, soil: Soil) -> Ground:
     """Return what a soil is to a robot that carries its weight on all tyres alike.
@@ -48,10 +46,8 @@ def planar_ground(robot: Robot, soil: Soil) -> Ground:
     >>> [round(number, 3) for number in ground[:4]], round(ground.load_ratio, 2)
     ([1.569, 0.347, 0.08, 0.139], 0.76)
     """
-    robot.has("body")
-    assert robot.body is not None
     wheel = robot.wheel_radius_m, robot.body.tyre_width_m, robot.body.contact_length_m
-    normal_n = robot.mass_kg * GRAVITY_MPS2 / _TYRES[robot.drive]
+    normal_n = robot.mass_kg * GRAVITY_MPS2 / robot.n_tyres
     slip = equilibrium_slip(soil, normal_n, 0.0, *wheel)
     if math.isnan(slip):
         raise ConfigError(f"robot {robot.name}: it gets stuck on terrain {soil.name!r}")

@@ -52,7 +52,7 @@ currents of motors as described, and slip; traction and slip are those along x."
 VX, VY, W, AX, FORCE, AMPS, TURNING_AMPS, SLIP = range(len(TRUTH))
 """Their columns."""
 
-SKID_WHEELS, SWERVE_WHEELS = 2, 3
+SWERVE_WHEELS = 3
 
 IMU_LAG_S = 0.003
 """Lag of a swerve robot's IMU behind its latency: bandwidths of 47 and 62.5 Hz (Bosch BNO055 data sheet)."""
@@ -121,46 +121,44 @@ def make_planar(robot: Robot, ground: Ground) -> Planar:
     What a description leaves out does not act: without motors a traction of 1 N counts as 1 A, without a
     camera the speed is that of the body's origin, without delay.
     """
-    swerve = robot.drive == "swerve"
     x, y = robot.wheel_positions_m.T
     rows = np.zeros((2 * len(x), 3))
     rows[0::2, 0], rows[0::2, 2] = 1.0, -y
     rows[1::2, 1], rows[1::2, 2] = 1.0, x
-    motors, camera, body = robot.motors, robot.camera, robot.body
+    complete = robot.completed
+    motors, camera, body, sensors = complete.motors, complete.camera, complete.body, complete.sensors
     n_motors = len(robot.wheels)
-    com_m = robot.wheel_positions_m.mean(axis=0) if body is None else np.array([body.com_x_m, body.com_y_m])
+    com_m = np.array([body.com_x_m, body.com_y_m])
     arm_m = robot.wheel_positions_m - com_m
     spread_m = float(np.sqrt((arm_m**2).sum(axis=1).mean()))
     return Planar(
-        n_wheels=SWERVE_WHEELS if swerve else SKID_WHEELS,
+        n_wheels=len(robot.wheels),
         to_twist=np.ascontiguousarray(np.linalg.pinv(rows)),
         track_m=robot.track_m,
         radius_m=robot.wheel_radius_m,
         mass_kg=robot.mass_kg,
-        rotating_kg=0.0 if body is None else n_motors * body.wheel_inertia_kgm2 / robot.wheel_radius_m**2,
-        yaw_inertia_kgm2=0.0 if body is None else body.yaw_inertia_kgm2,
-        nm_per_a=robot.wheel_radius_m
-        if motors is None
-        else motors.torque_constant_nmpa * motors.reduction_ratio * motors.efficiency_ratio,
-        friction_nm=0.0 if motors is None else n_motors * motors.friction_nm,
-        lever_x_m=0.0 if camera is None else camera.lever_x_m,
-        lever_y_m=0.0 if camera is None else camera.lever_y_m,
-        latency_s=0.0 if camera is None else camera.latency_s + camera.time_constant_s,
-        imu_latency_s=0.0 if robot.sensors is None else robot.sensors.imu_latency_s,
-        imu_lag_s=IMU_LAG_S if swerve else 0.0,
-        encoder_lag_s=0.0 if robot.sensors is None else robot.sensors.encoder_time_constant_s,
+        rotating_kg=n_motors * body.wheel_inertia_kgm2 / robot.wheel_radius_m**2,
+        yaw_inertia_kgm2=body.yaw_inertia_kgm2,
+        nm_per_a=motors.torque_constant_nmpa * motors.reduction_ratio * motors.efficiency_ratio,
+        friction_nm=n_motors * motors.friction_nm,
+        lever_x_m=camera.lever_x_m,
+        lever_y_m=camera.lever_y_m,
+        latency_s=camera.latency_s + camera.time_constant_s,
+        imu_latency_s=sensors.imu_latency_s,
+        imu_lag_s=IMU_LAG_S if robot.steered else 0.0,
+        encoder_lag_s=sensors.encoder_time_constant_s,
         slip_ratio=ground.slip_ratio,
         soft_ratio=_slip_per_traction(ground),
         grip_ratio=ground.grip_ratio,
         rolling_ratio=ground.rolling_ratio,
-        scrub_ratio=ground.scrub_ratio if not swerve else 0.0,
+        scrub_ratio=ground.scrub_ratio if robot.skids else 0.0,
         load_ratio=ground.load_ratio,
         effective_ratio=ground.effective_ratio,
         com_x_m=float(com_m[0]),
         com_y_m=float(com_m[1]),
         arm_ratio=np.ascontiguousarray(arm_m / spread_m),
         spread_m=spread_m,
-        relaxation_m=0.0 if body is None else body.relaxation_length_m,
+        relaxation_m=body.relaxation_length_m,
     )
 
 

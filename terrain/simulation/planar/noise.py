@@ -15,6 +15,7 @@ from numba import njit
 from terrain.files.descriptions import number, read_yaml
 from terrain.files.resources import data_folder
 from terrain.records import Array
+from terrain.robots import Robot
 
 WHEELS_HZ, IMU_HZ, CAMERA_HZ = 50.0, 100.0, 50.0
 """Rates of the loggers."""
@@ -61,9 +62,9 @@ class Noise(NamedTuple):
     heading_rad: float
     moving_mps: float
 
-    def current_a(self, drive: str) -> float:
-        """Return the noise of the sum of the currents of robots of a drive."""
-        return self.current_swerve_a if drive == "swerve" else self.current_skid_a
+    def current_a(self, robot: Robot) -> float:
+        """Return the noise of the sum of a robot's currents."""
+        return self.current_skid_a if robot.skids else self.current_swerve_a
 
 
 def load_scatter() -> Scatter:

@@ -87,11 +87,7 @@ def noise_psd(
     ConfigError
         for another channel, or a robot without motors, camera or sensors.
     """
-    robot.has("motors", "camera", "sensors")
     motors, camera, sensors = robot.motors, robot.camera, robot.sensors
-    assert motors is not None
-    assert camera is not None
-    assert sensors is not None
     f = np.asarray(frequency_hz, dtype=np.float64)
     moving = float(activity(speed_mps, noise))
     speed = abs(speed_mps)
@@ -131,7 +127,7 @@ def noise_psd(
         shaking = ground(noise.accel_mps2 * moving, noise.accel_s, IMU_HZ)
         return shaking + jerked(f) + white_psd(f, sensors.accel_std_mps2, IMU_HZ)
     if channel in (CURRENT, TURNING_CURRENT):
-        drawn = ground(noise.current_a(robot.drive) * moving, noise.current_s, WHEELS_HZ)
+        drawn = ground(noise.current_a(robot) * moving, noise.current_s, WHEELS_HZ)
         white = white_psd(f, sensors.current_std_a * math.sqrt(len(robot.wheels)), WHEELS_HZ)
         if channel == TURNING_CURRENT:
             return drawn + white

@@ -24,9 +24,10 @@ from terrain.effects import (
     vector_of,
 )
 from terrain.errors import ConfigError
-from terrain.records import Array, Label, RunLog, Stream
+from terrain.kinematics.wheel_motion import WheelMotion, wheel_motion
+from terrain.records import Array, Label, RunLog
 from terrain.robots import Robot
-from terrain.simulation.planar.drives import COMMANDS_HZ, WheelCommands, follow_commands, wheel_commands_of
+from terrain.simulation.planar.drives import COMMANDS_HZ, commands_stream, follow_commands
 from terrain.simulation.planar.hills import Hills, path_of, tilt_along, undulations
 from terrain.simulation.planar.ideal_sensors import sense
 from terrain.simulation.planar.model import Ground, Planar, make_planar
@@ -122,18 +123,18 @@ def simulate_planar(
     if scatter is not None:
         for name in nuisances_of(robot.drive):
             p[INDEX[name]] += getattr(scatter, name) * rngs["scatter"].standard_normal()
-    commands = wheel_commands_of(robot, twist)
+    desired = wheel_motion(robot, twist, 1.0 / COMMANDS_HZ)
     setup = PlanarSetup(robot, planar, p, step_s, noise, outside)
-    motion = _motion(setup, commands, hills or Hills(), rngs)
+    motion = _motion(setup, desired, hills or Hills(), rngs)
     run = PlanarRun(robot, planar, p, step_s, motion, sense(planar, p, step_s, motion.truth), noise)
     streams = {
         "wheels": wheels_stream(run, outside.get("stick_slip_a", 0.0), rngs),
         "imu": imu_stream(run, rngs["imu"]),
         "odometry": camera_stream(run, rngs["camera"]),
-        "commands": Stream(np.arange(len(twist)) / COMMANDS_HZ, commands.values, commands.channels),
+        "commands": commands_stream(robot, desired),
         "truth": planar_truth(run),
     }
-    if robot.drive == "swerve":
+    if robot.steered:
         streams["steering"] = steering_stream(run, rngs["steering"])
     if heading:
         streams["lidar"] = lidar_stream(run, rngs["lidar"])
@@ -143,10 +144,10 @@ def simulate_planar(
 
 
 def _check(robot: Robot, twist: Array, outside: Mapping[str, float], step_s: float) -> None:
-    robot.has("body", "motors", "camera", "sensors", *(["steering"] if robot.drive == "swerve" else []))
+    robot.require(*robot.sections)
     if twist.ndim != 2 or twist.shape[1] != 3 or len(twist) < 2 or not np.isfinite(twist).all():
         raise ConfigError(f"twist has shape {twist.shape}, (n, 3) finite numbers with two rows are required")
-    if robot.drive != "swerve" and twist[:, 1].any():
+    if not robot.steered and twist[:, 1].any():
         raise ConfigError(f"twist drives robot {robot.name} sideways, which needs steered wheels")
     for name, value in outside.items():
         if name not in OUTSIDE or not math.isfinite(value):
@@ -178,12 +179,12 @@ class PlanarSetup(NamedTuple):
     outside: Mapping[str, float]
 
 
-def _motion(setup: PlanarSetup, commands: WheelCommands, hills: Hills, rngs: Generators) -> PlanarMotion:
+def _motion(setup: PlanarSetup, desired: WheelMotion, hills: Hills, rngs: Generators) -> PlanarMotion:
     """Return the motion of a robot that follows its commands over hills."""
     robot, planar, p, dt, noise, outside = setup
     parts = round(1.0 / (COMMANDS_HZ * dt))
-    rate_max = robot.steering.rate_max_radps if robot.steering is not None else 0.0
-    wheel_speed, steer = follow_commands(commands.speed_mps, commands.steer_rad, parts, dt, rate_max)
+    rate_max = robot.steering_rate_max_radps
+    wheel_speed, steer = follow_commands(desired.wheel_speed_mps, desired.steer_rad, parts, dt, rate_max)
     n = len(wheel_speed)
     active = np.zeros(n) if noise is None else activity(np.abs(wheel_speed).mean(axis=1), noise)
     disturbance = _disturbance(noise, active, dt, rngs["ground"])

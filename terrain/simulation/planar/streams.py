@@ -18,7 +18,7 @@ from numba import njit
 from terrain.constants import GRAVITY_MPS2
 from terrain.effects import CHANNELS, CURRENT, HEADING, INDEX, SPEED_X, TURNING_CURRENT
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
-from terrain.logs.schema import IMU_CHANNELS, STEERING_CHANNELS, WHEELS_CHANNELS
+from terrain.logs.schema import IMU_CHANNELS, STEERING_CHANNELS
 from terrain.records import Array, Stream
 from terrain.robots import Robot
 from terrain.simulation.planar.model import AX, VX, VY, Planar, W
@@ -26,7 +26,7 @@ from terrain.simulation.planar.noise import CAMERA_HZ, IMU_HZ, WHEELS_HZ, Noise,
 from terrain.simulation.planar.signals import delayed
 from terrain.simulation.sensors.camera import N_ERRORS, camera_samples
 from terrain.simulation.sensors.imu import ImuErrors, described_calibration, imu_values
-from terrain.simulation.sensors.steering import described_zeros, encoder_angle
+from terrain.simulation.sensors.steering import encoder_angle
 from terrain.simulation.sensors.truth import BODY_TRUTH, GYRO_BIAS, wheel_channels
 from terrain.simulation.sensors.wheels import add_rate_noise
 from terrain.slip import slip_ratio
@@ -98,22 +98,19 @@ class PlanarRun(NamedTuple):
 def wheels_stream(run: PlanarRun, stick_slip_a: float, rngs: Generators) -> Stream:
     """Return the stream of wheel speeds and motor currents."""
     robot, motion = run.robot, run.motion
-    assert robot.motors is not None
     rows, time_s = run.samples(WHEELS_HZ)
     current = run.ideal[rows, CHANNELS.index(CURRENT)]
     turning = run.ideal[rows, CHANNELS.index(TURNING_CURRENT)]
     if stick_slip_a:
         current = current + _spikes(motion, rows, run.dt, stick_slip_a, rngs["outside"])
     wheels = len(robot.wheels)
-    currents = np.column_stack([current - turning, current + turning]) / 2.0
-    if robot.drive == "swerve":
+    if robot.skids:
+        currents = np.column_stack([current - turning, current + turning]) / 2.0
+    else:
         currents = np.repeat(current[:, None] / wheels, wheels, axis=1)
     speed, currents = _measured(run, rows, currents, rngs["wheels"])
-    channels = (*wheel_channels("speed_mps", robot.wheels), *wheel_channels("current_a", robot.wheels))
-    if robot.drive == "swerve":
-        speed = speed / robot.wheel_radius_m * robot.motors.reduction_ratio
-        channels = WHEELS_CHANNELS
-    return Stream(time_s, np.hstack([speed, currents]), channels)
+    channels = (*robot.rate_channels, *wheel_channels("current_a", robot.wheels))
+    return Stream(time_s, np.hstack([robot.logged_rates(speed), currents]), channels)
 
 
 def _measured(
@@ -122,8 +119,6 @@ def _measured(
     """Return measured wheel speeds and currents (n, wheels)."""
     robot, motion, noise = run.robot, run.motion, run.noise
     motors, sensors = robot.motors, robot.sensors
-    assert motors is not None
-    assert sensors is not None
     n, wheels = currents_a.shape
     every = round(1.0 / (WHEELS_HZ * run.dt))
     lag_s = sensors.encoder_time_constant_s + run.p[INDEX["encoder_lag_s"]]
@@ -135,7 +130,7 @@ def _measured(
         jitter *= np.append(active, active[-1])[:, None]
         white_mps = sensors.motor_std_radps / motors.reduction_ratio * robot.wheel_radius_m
         white = white_mps * rng.standard_normal((n, wheels))
-        std_a = np.full(wheels, noise.current_a(robot.drive) / math.sqrt(wheels))
+        std_a = np.full(wheels, noise.current_a(robot) / math.sqrt(wheels))
         tau_s = np.full(wheels, noise.current_s)
         drawn = coloured(rng.standard_normal((wheels, n)), std_a, tau_s, run.dt * every).T * active[:, None]
         currents_a = currents_a + drawn + sensors.current_std_a * rng.standard_normal((n, wheels))
@@ -199,21 +194,19 @@ def _spikes(motion: PlanarMotion, rows: Array, dt: float, size_a: float, rng: np
 
 def steering_stream(run: PlanarRun, rng: np.random.Generator) -> Stream:
     """Return the stream of steering angles."""
-    steering, sensors = run.robot.steering, run.robot.sensors
-    assert steering is not None
-    assert sensors is not None
+    sensors = run.robot.sensors
     rows, time_s = run.samples(WHEELS_HZ)
     steer, noise, step_rad = run.motion.steer_rad[rows], np.zeros(1), 0.0
     if run.noise is not None:
         noise = sensors.steering_std_rad * rng.standard_normal(steer.shape)
         step_rad = 2.0 * math.pi / sensors.steering_steps_ratio
-    return Stream(time_s, encoder_angle(steer, described_zeros(steering), noise, step_rad), STEERING_CHANNELS)
+    angle = encoder_angle(steer, run.robot.steering_zeros_rad, noise, step_rad)
+    return Stream(time_s, angle, STEERING_CHANNELS)
 
 
 def imu_stream(run: PlanarRun, rng: np.random.Generator) -> Stream:
     """Return the stream of the IMU."""
     motion, sensors = run.motion, run.robot.sensors
-    assert sensors is not None
     rows, time_s = run.samples(IMU_HZ)
     latency_s = sensors.imu_latency_s
     v_x, v_y, turn = (motion.truth[:, column] for column in (VX, VY, W))
@@ -238,7 +231,6 @@ def imu_stream(run: PlanarRun, rng: np.random.Generator) -> Stream:
 def _imu_errors(run: PlanarRun, active: Array, rng: np.random.Generator) -> ImuErrors:
     """Return the errors of the IMU: those described, and vibration while the robot moves; ``active`` (n,)."""
     sensors, noise, n = run.robot.sensors, run.noise, len(active)
-    assert sensors is not None
     scale, accel_bias, gyro_bias = described_calibration(sensors)
     inertial, tilt, yaw = np.zeros((n, 6)), np.zeros((n, 2)), np.zeros(n)
     if noise is not None:
@@ -267,7 +259,6 @@ def _imu_errors(run: PlanarRun, active: Array, rng: np.random.Generator) -> ImuE
 def camera_stream(run: PlanarRun, rng: np.random.Generator) -> Stream:
     """Return the stream of the camera: poses of a swerve robot, else speeds in body axes."""
     camera, noise = run.robot.camera, run.noise
-    assert camera is not None
     rows, time_s = run.samples(CAMERA_HZ)
     n = len(rows)
     latency_s = run.planar.latency_s + run.p[INDEX["camera_latency_s"]]
@@ -277,7 +268,7 @@ def camera_stream(run: PlanarRun, rng: np.random.Generator) -> Stream:
         std, tau = np.full(2, noise.camera_mps), np.full(2, noise.camera_s)
         seen += coloured(rng.standard_normal((2, n)), std, tau, 1.0 / CAMERA_HZ).T * active[:, None]
         seen += camera.speed_std_mps * rng.standard_normal((n, 2))
-    if run.robot.drive != "swerve":
+    if not run.robot.steered:
         return Stream(time_s, seen, ("speed_x_mps", "speed_y_mps"))
     turn = run.ideal[:, CHANNELS.index(HEADING)]
     yaw = ((np.cumsum(turn) - 0.5 * (turn + turn[0])) * run.dt)[rows]
@@ -313,7 +304,6 @@ def lidar_stream(run: PlanarRun, rng: np.random.Generator) -> Stream:
 def planar_truth(run: PlanarRun) -> Stream:
     """Return the stream of true quantities."""
     robot, motion = run.robot, run.motion
-    assert robot.sensors is not None
     rows, time_s = run.samples(IMU_HZ)
     v_x, v_y, turn = (motion.truth[rows, column] for column in (VX, VY, W))
     grade = motion.grade_rad[rows]

@@ -94,7 +94,7 @@ def make_scenario(
         raise ConfigError(
             f"scenario {name!r} is driven on one terrain, {len(grounds)} are given: use 'course'"
         )
-    steered = robot.drive == "swerve"
+    steered = robot.steered
     if not steered and name in _STEERED:
         raise ConfigError(f"scenario {name!r} is not for robot {robot.name} with the drive {robot.drive!r}")
     request = DriveRequest(
@@ -124,8 +124,6 @@ def _checked_duration(duration_s: float | None) -> float | None:
 
 def _ability(robot: Robot, speed_mps: float) -> tuple[float, Callable[[Any], Array]]:
     """Return the speed, checked, and what shortens a twist to what the robot can."""
-    robot.has("motors")
-    assert robot.motors is not None
     positions_m, radius_m = robot.wheel_positions_m, robot.wheel_radius_m
     speed_max_radps = robot.motors.speed_max_radps
     if not _is_number(speed_mps) or not 0 < speed_mps <= radius_m * speed_max_radps:

@@ -19,8 +19,7 @@ from terrain.simulation.scenario.make import make_scenario
 from terrain.terramechanics.soil import load_soil
 
 NOMINAL = load_robot("agrimaro")
-HIDDEN = replace(
-    NOMINAL,
+HIDDEN = NOMINAL.with_parts(
     steering=replace(NOMINAL.steering, zero_1_rad=0.03, zero_2_rad=-0.02, zero_3_rad=0.015),
     motors=replace(NOMINAL.motors, reduction_ratio=9.4),
     camera=replace(NOMINAL.camera, time_constant_s=0.02),

@@ -18,7 +18,7 @@ def lags(runs, robot):
 @pytest.fixture(scope="module")
 def zeroed(nominal, hidden):
     """The description with steering and motors calibrated before."""
-    return replace(nominal, steering=hidden.steering, motors=hidden.motors)
+    return nominal.with_parts(steering=hidden.steering, motors=hidden.motors)
 
 
 def test_time_constants_come_back(drive, zeroed, coverage):
@@ -55,7 +55,7 @@ def test_a_delay_passes_for_a_lag(drive, zeroed):
 
 
 def test_a_camera_as_fast_as_the_accelerometer_has_a_lag_of_about_zero(drive, hidden, zeroed):
-    fast = replace(hidden, camera=replace(hidden.camera, time_constant_s=0.0))
+    fast = hidden.with_parts(camera=replace(hidden.camera, time_constant_s=0.0))
     found = lags([drive("starts", seed, robot=fast) for seed in (1, 2)], zeroed)["camera.time_constant_s"]
     assert found.low == 0.0
     assert found.high < 0.004

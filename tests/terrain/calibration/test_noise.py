@@ -31,7 +31,8 @@ def test_noise_comes_back(drive, nominal, coverage):
 
 
 def test_noise_is_told_from_what_moves_slowly_and_from_jumps(drive, nominal):
-    run = drive("stand", 1, robot=replace(nominal, sensors=replace(nominal.sensors, gyro_bias_z_radps=0.02)))
+    biased = nominal.with_parts(sensors=replace(nominal.sensors, gyro_bias_z_radps=0.02))
+    run = drive("stand", 1, robot=biased)
     plain = noise_of([run], nominal)
     assert plain["sensors.yaw_std_rad"].value == pytest.approx(nominal.sensors.yaw_std_rad, rel=0.05)
     odometry = run.streams["odometry"]
@@ -69,7 +70,7 @@ def test_the_interval_of_coloured_noise_is_wider(nominal):
 
 
 def test_noise_below_the_encoders_step_is_not_told(drive, nominal):
-    fine = replace(nominal, sensors=replace(nominal.sensors, steering_std_rad=0.0004))
+    fine = nominal.with_parts(sensors=replace(nominal.sensors, steering_std_rad=0.0004))
     finding = noise_of([drive("stand", 1, robot=fine)], nominal)["sensors.steering_std_rad"]
     assert not finding.told
     assert "step" in finding.note or finding.note == "no noise at rest"

@@ -77,8 +77,7 @@ def test_wheels_that_turn_slowly_do_not_stand(drive, nominal):
 @pytest.mark.parametrize("n_runs", [1, 4])
 def test_gyro_biases_come_back(n_runs, drive, nominal, hidden, coverage):
     # One power-on leans on the described scatter, so that has to be the true one.
-    described = replace(
-        nominal,
+    described = nominal.with_parts(
         sensors=replace(nominal.sensors, gyro_bias_std_radps=hidden.sensors.gyro_bias_std_radps)
         if n_runs == 1
         else nominal.sensors,
@@ -95,7 +94,7 @@ def test_gyro_biases_come_back(n_runs, drive, nominal, hidden, coverage):
 
 
 def test_coloured_noise_widens_the_interval(nominal):
-    still = replace(nominal, sensors=replace(nominal.sensors, gyro_bias_std_radps=0.0))
+    still = nominal.with_parts(sensors=replace(nominal.sensors, gyro_bias_std_radps=0.0))
     rng = np.random.default_rng(0)
     inside, naive = [], []
     for _ in range(30):

@@ -73,7 +73,7 @@ def test_load_and_tyres_of_the_day_do_not_matter(drive, nominal, truth):
 @pytest.mark.parametrize("zeros", [(2.5, -1.2, 3.13), (-3.1, 0.0, 1.6)])
 def test_zeros_may_lie_anywhere_on_the_turn(zeros, drive, nominal, hidden):
     names = ("zero_1_rad", "zero_2_rad", "zero_3_rad")
-    robot = replace(hidden, steering=replace(hidden.steering, **dict(zip(names, zeros, strict=True))))
+    robot = hidden.with_parts(steering=replace(hidden.steering, **dict(zip(names, zeros, strict=True))))
     found = zeros_of([drive("complex", 4, robot=robot)], nominal)
     np.testing.assert_allclose(np.angle(np.exp(1j * (found - zeros))), 0.0, atol=0.0015)
     assert (np.abs(found) <= np.pi).all()

@@ -96,7 +96,7 @@ def test_what_was_not_shown_is_asked_for_and_its_limit_is_told():
 
 def test_nothing_is_told_where_there_is_nothing_to_part_or_nothing_parts_it():
     assert next_drive(HUSKY, (), ()) is None
-    bare = replace(HUSKY, robot=replace(HUSKY.robot, motors=None))
+    bare = replace(HUSKY, robot=HUSKY.robot.without("motors"))
     assert next_drive(bare, [("wheel_radius", "force_slip")], ()) is None
     typical = next_drive(AGRIMARO, [("steering_backlash", "steering_delay")], ())
     assert isinstance(typical, NextDrive)

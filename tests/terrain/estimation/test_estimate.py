@@ -103,7 +103,7 @@ def test_slip_is_positive_in_traction_on_the_way_back_too():
 
 
 def test_a_camera_that_is_described_as_worse_is_believed_less():
-    worse = replace(ROBOT, camera=replace(ROBOT.camera, speed_std_mps=0.05))
+    worse = ROBOT.with_parts(camera=replace(ROBOT.camera, speed_std_mps=0.05))
     run = simulate_run(worse, "grass", "straight", 0)
     assert 0.2 < summarize(estimate_run(run, worse, "vio15")).nees < 2.0
 

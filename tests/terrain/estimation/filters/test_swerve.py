@@ -484,7 +484,7 @@ def test_wheels_at_right_angles_at_the_start_are_found():
             "filter 'vio16' is unknown: use one of encoder12, slip14, vio12, vio15",
         ),
         (lambda: default_noise("vio15", load_robot("husky")), "robot husky has the drive 'skid_steer'"),
-        (lambda: make_filter("vio15", dataclasses.replace(ROBOT, camera=None)), "has no section 'camera'"),
+        (lambda: make_filter("vio15", ROBOT.without("camera")), "has no section 'camera'"),
         (lambda: thesis_noise("vio12", ROBOT, 0.0), "sample_time_s is 0.0, seconds above zero are required"),
         (lambda: adaptive_noise(ROBOT, -1.0), "factor is -1.0, a number above zero is required"),
     ],

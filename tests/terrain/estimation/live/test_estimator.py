@@ -28,8 +28,7 @@ from terrain.simulation.run import simulate_run
 from terrain.simulation.sensors.gnss import Gnss
 
 ROBOT = load_robot("agrimaro")
-ODD = replace(
-    ROBOT,
+ODD = ROBOT.with_parts(
     sensors=replace(
         ROBOT.sensors,
         gyro_bias_z_radps=0.01,
@@ -42,7 +41,7 @@ ODD = replace(
     steering=replace(ROBOT.steering, zero_1_rad=3.0, zero_2_rad=-2.0, zero_3_rad=0.5),
     camera=replace(ROBOT.camera, time_constant_s=0.08, lever_x_m=0.1, latency_s=0.03),
 )
-IDEAL = replace(ROBOT, sensors=replace(ROBOT.sensors, encoder_time_constant_s=0.0))
+IDEAL = ROBOT.with_parts(sensors=replace(ROBOT.sensors, encoder_time_constant_s=0.0))
 MIDDLE_S = 8.0
 
 

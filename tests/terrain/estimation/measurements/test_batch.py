@@ -26,8 +26,7 @@ NOISE = 1e-4
 def bare(robot=ROBOT, *, camera=None, sensors=None, steering=None):
     """Return the robot with ideal sensors but for what is said."""
     ideal = {"latency_s": 0.0, "time_constant_s": 0.0}
-    return replace(
-        robot,
+    return robot.with_parts(
         camera=replace(robot.camera, **ideal | (camera or {})),
         sensors=replace(
             robot.sensors, **{"encoder_time_constant_s": 0.0, "imu_latency_s": 0.0} | (sensors or {})
@@ -585,8 +584,8 @@ def test_options_that_cannot_be_are_refused(options, said):
 
 def test_a_robot_has_to_describe_the_sensors_it_is_asked_of():
     with pytest.raises(ConfigError, match="no section 'camera'"):
-        measurement_table(RUN, replace(ROBOT, camera=None))
-    blind = replace(ROBOT, camera=None)
+        measurement_table(RUN, ROBOT.without("camera"))
+    blind = ROBOT.without("camera")
     assert measurement_table(without(RUN, "odometry"), blind).time_s.size == 300
 
 

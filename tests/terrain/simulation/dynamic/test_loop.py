@@ -279,9 +279,10 @@ def test_a_status_without_a_unit_is_refused():
     ],
 )
 def test_a_robot_whose_motion_blows_up_is_refused_and_its_controller_sees_none_of_it(section, changes):
-    if section is not None:
-        changes = {section: dataclasses.replace(getattr(ROBOT, section), **changes)}
-    robot = dataclasses.replace(ROBOT, **changes)
+    if section is None:
+        robot = dataclasses.replace(ROBOT, **changes)
+    else:
+        robot = ROBOT.with_parts(**{section: dataclasses.replace(getattr(ROBOT, section), **changes)})
     listener = Listener(lambda sample: kinematic(sample)._replace(status={"gain_ratio": 1.0}))
     drive = make_scenario("arc", ROBOT, "grass", 5.0)
     with pytest.raises(ConfigError, match="its motion cannot be integrated"):

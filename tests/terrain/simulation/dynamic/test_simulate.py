@@ -28,7 +28,7 @@ HILLY = Conditions(
 
 
 def with_part(section, **changes):
-    return dataclasses.replace(ROBOT, **{section: dataclasses.replace(getattr(ROBOT, section), **changes)})
+    return ROBOT.with_parts(**{section: dataclasses.replace(getattr(ROBOT, section), **changes)})
 
 
 def run_of(scenario, terrain, seed=0, duration_s=None, **options):
@@ -291,7 +291,7 @@ def test_a_course_is_labelled_ground_by_ground():
     ("changed", "message"),
     [
         ({"robot": load_robot("husky")}, "robot husky: drive 'skid_steer' is not simulated"),
-        ({"robot": dataclasses.replace(ROBOT, camera=None)}, "robot agrimaro: .* no section 'camera'"),
+        ({"robot": ROBOT.without("camera")}, "robot agrimaro: .* no section 'camera'"),
         ({"soils": {"tiles": SOILS["tiles"]}}, "scenario straight: terrain 'grass' has no soil"),
         (
             {"conditions": Conditions(payload_kg=300.0, payload_m=(0.6, 0.0))},

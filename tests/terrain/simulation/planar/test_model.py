@@ -51,7 +51,7 @@ TWISTS = {
 def still(robot):
     """Return the robot with a camera over its origin that tells at once."""
     camera = {"lever_x_m": 0.0, "lever_y_m": 0.0, "latency_s": 0.0, "time_constant_s": 0.0}
-    return replace(robot, camera=replace(robot.camera, **camera))
+    return robot.with_parts(camera=replace(robot.camera, **camera))
 
 
 def at_rate(value, n=N):
@@ -184,7 +184,7 @@ def a_contact_for_each_wheel(robot, ground, wheel_speed, steer, dt):
 
 def test_three_wheels_that_slip_each_by_itself_move_as_one_twist_that_slips():
     robot, dt, n = still(AGRIMARO), 1e-3, 12000
-    robot = replace(robot, sensors=replace(robot.sensors, encoder_time_constant_s=0.0, imu_latency_s=0.0))
+    robot = robot.with_parts(sensors=replace(robot.sensors, encoder_time_constant_s=0.0, imu_latency_s=0.0))
     ground = Ground(slip_ratio=1.2, rolling_ratio=0.08)
     t = dt * np.arange(n)
     ramp = np.clip(t, 0.0, 1.0)

@@ -54,7 +54,7 @@ def steady(speed_mps, length_s, turn_radps=0.0):
 
 def quick(robot):
     """Return the robot with encoders and an IMU that tell at once."""
-    return replace(robot, sensors=replace(robot.sensors, encoder_time_constant_s=0.0, imu_latency_s=0.0))
+    return robot.with_parts(sensors=replace(robot.sensors, encoder_time_constant_s=0.0, imu_latency_s=0.0))
 
 
 def logged(run, robot):
@@ -266,7 +266,7 @@ def test_noise_of_every_channel_has_the_density_that_is_said(robot):
     speed, ground = 0.6, Ground()
     # coarse steps of an encoder beat with its samples at a steady speed, and are no noise
     fine = replace(robot.sensors, hall_steps_ratio=20 * robot.sensors.hall_steps_ratio)
-    robot, twist = replace(robot, sensors=fine), steady(speed, 1500.0)
+    robot, twist = robot.with_parts(sensors=fine), steady(speed, 1500.0)
     noisy, quiet = (
         noisy_signals(robot, simulate_planar(robot, twist, 7, noise=noise, ground=ground, heading=True))
         for noise in (NOISE, None)
@@ -336,8 +336,8 @@ def test_on_a_soil_the_robot_slips_as_the_soil_has_it():
 @pytest.mark.parametrize(
     ("robot", "options", "message"),
     [
-        (replace(HUSKY, camera=None), {}, "no section 'camera'"),
-        (replace(AGRIMARO, steering=None), {}, "no section 'steering'"),
+        (HUSKY.without("camera"), {}, "no section 'camera'"),
+        (AGRIMARO.without("steering"), {}, "no section 'steering'"),
         (HUSKY, {"twist": np.zeros((5, 2))}, r"twist has shape \(5, 2\)"),
         (HUSKY, {"twist": np.full((5, 3), np.nan)}, "finite numbers"),
         (HUSKY, {"twist": np.ones((5, 3))}, "sideways, which needs steered wheels"),

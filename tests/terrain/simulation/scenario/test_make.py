@@ -1,5 +1,4 @@
 import math
-from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -324,7 +323,7 @@ def test_other_scenarios_are_driven_on_one_terrain(name):
         ({"seed": None}, "seed is None"),
         ({"robot": HUSKY, "name": "crab"}, "scenario 'crab' is not for robot husky"),
         ({"robot": HUSKY, "name": "course"}, "scenario 'course' is not for robot husky"),
-        ({"robot": replace(HUSKY, motors=None)}, "no section 'motors'"),
+        ({"robot": HUSKY.without("motors")}, "no section 'motors'"),
     ],
 )
 def test_what_cannot_be_driven_is_refused_in_one_sentence(options, message):

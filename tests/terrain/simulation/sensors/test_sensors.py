@@ -33,7 +33,7 @@ G = GRAVITY_MPS2
 
 
 def with_changes(section, **changes):
-    return dataclasses.replace(ROBOT, **{section: dataclasses.replace(getattr(ROBOT, section), **changes)})
+    return ROBOT.with_parts(**{section: dataclasses.replace(getattr(ROBOT, section), **changes)})
 
 
 def silenced(section):
@@ -140,8 +140,7 @@ def wild_motion(n=700):
 
 @pytest.mark.parametrize("cuts", [range(1, 700), range(1, 700, 20), [1, 2, 3, 250, 251, 699]])
 def test_a_motion_in_blocks_gives_the_bytes_of_the_motion_in_one(cuts):
-    odd = dataclasses.replace(
-        with_changes("sensors", imu_rate_hz=128.0, imu_latency_s=0.0, wheels_rate_hz=30.0),
+    odd = with_changes("sensors", imu_rate_hz=128.0, imu_latency_s=0.0, wheels_rate_hz=30.0).with_parts(
         camera=dataclasses.replace(
             ROBOT.camera, dropout_rate_hz=3.0, dropout_length_s=0.02, jump_rate_hz=4.0
         ),
@@ -418,9 +417,7 @@ def circle(duration_s, radius_m=2.0, speed_mps=0.8, lateral_mps=0.1):
 
 def test_what_the_camera_tells_in_its_own_frames_is_the_motion():
     motion = circle(12.0)
-    robot = dataclasses.replace(
-        SILENT_CAMERA, camera=dataclasses.replace(SILENT_CAMERA.camera, time_constant_s=0.0)
-    )
+    robot = SILENT_CAMERA.with_parts(camera=dataclasses.replace(SILENT_CAMERA.camera, time_constant_s=0.0))
     camera = robot.camera
     back = body_motion(camera_stream(motion, robot, rng(), QUIET), camera)
     told = np.maximum(np.round((back.time_s - camera.latency_s) / STEP_S).astype(int), 0)
@@ -436,7 +433,7 @@ def test_what_the_camera_tells_in_its_own_frames_is_the_motion():
 def test_the_camera_tells_what_its_stream_without_noise_says():
     camera = dataclasses.replace(SILENT_CAMERA.camera, time_constant_s=0.0, lever_z_m=0.3)
     motion = Motion(wild_motion())
-    told = camera_stream(motion, dataclasses.replace(SILENT_CAMERA, camera=camera), rng(), QUIET)
+    told = camera_stream(motion, SILENT_CAMERA.with_parts(camera=camera), rng(), QUIET)
     _, rows = motion.at(camera.rate_hz, camera.latency_s)
     seen = odometry_stream(
         told.time_s,
@@ -476,7 +473,7 @@ def test_a_lost_camera_is_missing_for_exactly_that_long_and_else_the_same():
 
 def test_dropouts_and_jumps_come_by_chance_at_their_rates():
     rates = {"dropout_rate_hz": 0.2, "dropout_length_s": 0.25, "jump_rate_hz": 0.3, "jump_std_m": 0.2}
-    robot = dataclasses.replace(SILENT_CAMERA, camera=dataclasses.replace(SILENT_CAMERA.camera, **rates))
+    robot = SILENT_CAMERA.with_parts(camera=dataclasses.replace(SILENT_CAMERA.camera, **rates))
     motion = motion_of(50.0)
     dropouts, lengths, jumps = 0, [], []
     for seed in range(12):
@@ -485,7 +482,7 @@ def test_dropouts_and_jumps_come_by_chance_at_their_rates():
         dropouts += (gap > 1e-6).sum()
         lengths += gap[gap > 1e-6].tolist()
         no_loss = dataclasses.replace(robot.camera, dropout_rate_hz=0.0)
-        whole = camera_stream(motion, dataclasses.replace(robot, camera=no_loss), rng(seed), NO_FAULTS)
+        whole = camera_stream(motion, robot.with_parts(camera=no_loss), rng(seed), NO_FAULTS)
         assert len(whole) == 10_000
         steps = np.diff(columns_of(whole, "position_{}_m", "xyz"), axis=0)
         jumped = steps[np.abs(steps).max(axis=1) > 1e-9]

@@ -1,0 +1,81 @@
+"""From desired twists to commands for the wheels, by the kind of drive."""
+
+from __future__ import annotations
+
+from functools import singledispatch
+from typing import NamedTuple
+
+import numpy as np
+
+from terrain.errors import ConfigError
+from terrain.kinematics.swerve import wheel_commands
+from terrain.records import Array
+from terrain.robots import Robot, SkidSteerRobot, SwerveRobot
+
+
+class WheelMotion(NamedTuple):
+    """Commands for the wheels of a robot.
+
+    Parameters
+    ----------
+    twist : (n, 3) of the body, shortened where a wheel would saturate
+    wheel_speed_mps : (n, wheels) wheel circumferential speeds
+    wheel_radps : (n, wheels) the same as rates of the wheels
+    steer_rad : (n, wheels) steering angles; 0 without steering
+    """
+
+    twist: Array
+    wheel_speed_mps: Array
+    wheel_radps: Array
+    steer_rad: Array
+
+
+@singledispatch
+def wheel_motion(robot: Robot, twist: Array, dt_s: float) -> WheelMotion:
+    """Return the commands with which a robot drives desired twists, its steering straight at the start.
+
+    Parameters
+    ----------
+    robot : with motors, and steering where it has any
+    twist : (n, 3) desired ``(speed_x_mps, speed_y_mps, yaw_rate_radps)``
+    dt_s : time from one twist to the next
+
+    Raises
+    ------
+    ConfigError
+        if the description lacks a section.
+
+    Notes
+    -----
+    A swerve robot: :func:`terrain.kinematics.swerve.wheel_commands`.  A skid-steer robot of track B:
+    ``v_left = v - w B / 2``, ``v_right = v + w B / 2``, each within what its motor can do.
+
+    Examples
+    --------
+    >>> from terrain.robots import load_robot
+    >>> wheel_motion(load_robot("husky"), np.array([[0.5, 0.0, 1.0]]), 0.02).wheel_speed_mps
+    array([[0.2146, 0.7854]])
+    """
+    raise ConfigError(f"robot {robot.name}: no kinematics are known for the drive {robot.drive!r}")
+
+
+@wheel_motion.register
+def _(robot: SwerveRobot, twist: Array, dt_s: float) -> WheelMotion:
+    admitted, wheel_radps, steer_rad = wheel_commands(
+        robot.wheel_positions_m,
+        robot.wheel_radius_m,
+        robot.motors.speed_max_radps,
+        robot.steering.rate_max_radps,
+        dt_s,
+        twist,
+        np.zeros(len(robot.wheels)),
+    )
+    return WheelMotion(admitted, wheel_radps * robot.wheel_radius_m, wheel_radps, steer_rad)
+
+
+@wheel_motion.register
+def _(robot: SkidSteerRobot, twist: Array, dt_s: float) -> WheelMotion:
+    turn = 0.5 * robot.track_m * twist[:, 2]
+    limit = robot.wheel_radius_m * robot.motors.speed_max_radps
+    speeds = np.clip(np.column_stack([twist[:, 0] - turn, twist[:, 0] + turn]), -limit, limit)
+    return WheelMotion(twist, speeds, speeds / robot.wheel_radius_m, np.zeros_like(speeds))

@@ -1,0 +1,26 @@
+"""Robots: one type a drive, the sections of their descriptions, and the reader of those."""
+
+from terrain.robots.parts import Body, Camera, Equipment, Motors, Part, Sensors, Steering
+from terrain.robots.reader import description_file, load_robot, read_description, robot_from
+from terrain.robots.robot import Robot
+from terrain.robots.skid_steer import SkidSteerRobot, as_skid_steer
+from terrain.robots.swerve import SwerveRobot, as_swerve
+
+__all__ = [
+    "Body",
+    "Camera",
+    "Equipment",
+    "Motors",
+    "Part",
+    "Robot",
+    "Sensors",
+    "SkidSteerRobot",
+    "Steering",
+    "SwerveRobot",
+    "as_skid_steer",
+    "as_swerve",
+    "description_file",
+    "load_robot",
+    "read_description",
+    "robot_from",
+]

@@ -1,0 +1,132 @@
+"""Reader of robots' descriptions.
+
+Each number of a description carries its unit and its source, ``source: assumed`` where there is none, and,
+where it was calibrated, its 95 % interval::
+
+    name: agrimaro
+    drive: swerve
+    wheel_radius_m: {value: 0.2, unit: m, source: assumed}
+    sensors:
+      gyro_bias_z_radps: {value: 0.0021, unit: radps, source: "terrain calibrate", interval: [0.0019, 0.0023]}
+
+Geometry and mass are required of every robot; the sections ``body``, ``motors``, ``steering``, ``camera`` and
+``sensors`` by what simulates a robot or filters its log.  The section ``effects`` of an extended robot
+(:mod:`terrain.effects`) says what else acts; :mod:`terrain.extension` makes use of it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, get_type_hints
+
+from terrain.effects import read_effects
+from terrain.errors import ConfigError
+from terrain.files.descriptions import check_keys, number, read_yaml
+from terrain.files.resources import data_folder
+from terrain.robots.parts import KIND_OF_SECTION
+from terrain.robots.robot import Robot
+from terrain.robots.skid_steer import SkidSteerRobot
+from terrain.robots.swerve import SwerveRobot
+
+KIND_OF_DRIVE: dict[str, type[Robot]] = {kind.drive: kind for kind in (SkidSteerRobot, SwerveRobot)}
+"""The type of each drive."""
+
+NUMBERS = ("wheel_radius_m", "track_m", "wheelbase_m", "mass_kg")
+"""Numbers that every description has."""
+
+
+def load_robot(name_or_path: str | Path) -> Robot:
+    """Return a robot of the package, by name, or the one that a YAML file describes.
+
+    Parameters
+    ----------
+    name_or_path : ``agrimaro``, ``husky``, or the path of a file that ends in ``.yaml`` or ``.yml``
+
+    Raises
+    ------
+    ConfigError
+        if there is no such robot, a key is unknown or missing, a unit is not the field's own, a source is
+        missing, a number is out of its range, or the geometry is impossible.
+
+    Examples
+    --------
+    >>> load_robot("husky").track_m
+    0.5708
+    """
+    file, described = read_description(name_or_path)
+    return robot_from(file, described)
+
+
+def read_description(name_or_path: str | Path) -> tuple[str, Any]:
+    """Return the file name and the YAML content of a robot's description, unchecked.
+
+    Raises
+    ------
+    ConfigError
+        if there is no such robot, or the file is no YAML.
+    """
+    path = description_file(name_or_path)
+    return path.name, read_yaml(path)
+
+
+def description_file(name_or_path: str | Path) -> Path:
+    """Return the file of a robot's description: the path itself, or that of a robot of the package.
+
+    Raises
+    ------
+    ConfigError
+        if there is no robot of that name.
+    """
+    path = Path(name_or_path)
+    if path.suffix not in (".yaml", ".yml"):
+        path = data_folder("robots") / f"{name_or_path}.yaml"
+        if path.parent != data_folder("robots") or not path.is_file():
+            known = ", ".join(sorted(file.stem for file in data_folder("robots").glob("*.yaml")))
+            raise ConfigError(f"robot {str(name_or_path)!r} is unknown: give one of {known}, or a .yaml file")
+    return path
+
+
+def robot_from(file: str, described: Any) -> Robot:
+    """Return the robot of a description's content; ``file`` is what messages call it.
+
+    Raises
+    ------
+    ConfigError
+        as :func:`load_robot` does.
+    """
+    check_keys(file, described, ["name", "drive", *NUMBERS], optional=(*KIND_OF_SECTION, "effects"))
+    name, drive = described["name"], described["drive"]
+    if not isinstance(name, str) or not name:
+        raise ConfigError(f"{file}: name is {name!r}, a word is required")
+    if drive not in KIND_OF_DRIVE:
+        raise ConfigError(f"{file}: drive {drive!r} is unknown: use one of {', '.join(KIND_OF_DRIVE)}")
+    wheel_radius_m, track_m, wheelbase_m, mass_kg = (
+        number(f"{file}: {key}", described[key], _unit(key)) for key in NUMBERS
+    )
+    parts = {
+        section: _part(f"{file}: {section}", kind, described[section])
+        for section, kind in KIND_OF_SECTION.items()
+        if described.get(section) is not None
+    }
+    robot = KIND_OF_DRIVE[drive](name, wheel_radius_m, track_m, wheelbase_m, mass_kg, parts)
+    if "effects" in described:
+        effects, cov = read_effects(f"{file}: effects", described["effects"], drive)
+        robot = replace(robot, effects=effects, effects_cov=cov)
+    robot.check_geometry(file)
+    return robot
+
+
+def _part(place: str, kind: Any, described: Any) -> Any:
+    hints = get_type_hints(kind, include_extras=True)
+    check_keys(place, described, list(hints))
+    return kind(
+        **{
+            key: number(f"{place}: {key}", described[key], _unit(key), *getattr(hint, "__metadata__", ()))
+            for key, hint in hints.items()
+        }
+    )
+
+
+def _unit(key: str) -> str:
+    return key.rpartition("_")[2]
