@@ -1,4 +1,4 @@
-"""The rules of the house: who imports whom, what a wheel carries, what README promises."""
+"""What a wheel carries, what README promises, and that help loads nothing heavy."""
 
 from __future__ import annotations
 
@@ -7,28 +7,12 @@ import os
 import re
 import subprocess
 import sys
-import tomllib
 from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 HEAVY = ("numpy", "pandas", "sklearn", "scipy", "numba", "mlflow", "torch", "matplotlib", "pyarrow")
-
-
-def test_imports_follow_the_arrows():
-    done = subprocess.run(
-        [sys.executable, "-c", "from importlinter.cli import lint_imports_command as c; c()", "--no-cache"],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
-    kept = re.search(r"Contracts: (\d+) kept, 0 broken", done.stdout)
-    contracts = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
-    assert kept, done.stdout
-    assert int(kept[1]) == len(contracts)
 
 
 def test_help_loads_nothing_heavy():
