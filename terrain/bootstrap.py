@@ -34,7 +34,7 @@ def bootstrap_rows(n: int, n_draws: int, rng: np.random.Generator) -> Array:
 
 
 def percentile_interval(draws: Array, level: float = LEVEL) -> tuple[float, float]:
-    """Return the interval of the given probability of a statistic's bootstrap draws (n_draws,); NaN is skipped.
+    """Return the interval of a given probability from bootstrap draws (n_draws,); NaN is skipped.
 
     Examples
     --------
