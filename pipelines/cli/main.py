@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pipelines.cli import classify, explain, quickstart, reproduce, runs
+from pipelines.cli import classify, estimate, explain, quickstart, reproduce, runs
 from terrain.errors import ConfigError, TerrainError
 
 if TYPE_CHECKING:
@@ -36,24 +36,6 @@ class Format(StrEnum):
     drive = "drive"
 
 
-class FilterName(StrEnum):
-    """Filters; the numbers are those of their states."""
-
-    encoder12 = "encoder12"
-    slip14 = "slip14"
-    vio12 = "vio12"
-    vio15 = "vio15"
-    skid = "skid"
-
-
-class Tuning(StrEnum):
-    """Where a filter's noise comes from."""
-
-    physical = "physical"
-    thesis = "thesis"
-    likelihood = "likelihood"
-
-
 Data = Annotated[Path, typer.Option("--data", help="Folder of runs in any readable layout.")]
 Json = Annotated[
     Path | None,
@@ -73,47 +55,8 @@ DRIVE_CONTROLLERS = ("plain", "ramp", "thesis", "fixed", "learned", "oracle")
 MAX_GRADE_DEG = 30.0
 
 
-GROUPS = (runs.app, classify.app, explain.app, reproduce.app, quickstart.app)
+GROUPS = (runs.app, estimate.app, classify.app, explain.app, reproduce.app, quickstart.app)
 """Files of commands, in the order of help."""
-
-
-@app.command("estimate")
-def estimate_command(
-    data: Data,
-    filter_name: Annotated[FilterName, typer.Option("--filter", help="Which filter.")],
-    out: Annotated[
-        Path | None, typer.Option(help="Folder of new run folders with state and slip, and of pictures.")
-    ] = None,
-    robot: Annotated[
-        str | None, typer.Option(help="Robot or its YAML file, in place of the one that a run names.")
-    ] = None,
-    tuning: Annotated[
-        Tuning | None, typer.Option(help="Noise; the thesis' own for vio12, else physical.")
-    ] = None,
-    tune_on: Annotated[
-        str | None, typer.Option(help="Runs, by commas, that teach the tuning 'likelihood'; the first three.")
-    ] = None,
-    figures: Annotated[bool, typer.Option(help="Draw pictures into OUT/figures.")] = True,
-    layout: FormatOption = Format.auto,
-    mapping: Mapping = None,
-    repair: Repair = False,
-    json_file: Json = None,
-) -> None:
-    """Estimate motion and slip, and say how well."""
-    from pipelines.estimate.estimate import estimate
-    from pipelines.estimate.screen import print_estimates
-    from pipelines.estimate.settings import EstimateSettings
-    from pipelines.reporting.json_file import write_json
-    from pipelines.reporting.screens import progress_bar
-
-    given: dict[str, Any] = {"filter": filter_name.value, "tuning": tuning and tuning.value}
-    given |= {"out": out, "robot": robot, "tune_on": tune_on, "figures": figures}
-    settings = EstimateSettings(**given)
-    runs, skipped = _load(data, layout, mapping, repair, align=False)
-    with progress_bar() as progress:
-        result = estimate(runs, settings, skipped, progress)
-    print_estimates(result, _console())
-    write_json(json_file, result)
 
 
 @app.command("learn-slip")

@@ -49,10 +49,12 @@ def tuning_runs(runs: Sequence[RunLog], names: Sequence[str] | None) -> list[Run
     Raises
     ------
     DataError
-        if there is no run of a name.
+        if none is named, or there is no run of a name.
     """
     if names is None:
         return list(runs[:MAX_RUNS])
+    if not names:
+        raise DataError("no run to tune on is named")
     known = {run.run_id: run for run in runs}
     for name in names:
         if name not in known:
