@@ -2,20 +2,28 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from numba.extending import register_jitable
 
 from terrain.records import Array
 
 
-def wrapped(angle_rad: Array) -> Array:
-    """Return angles (any shape) in (-pi, pi].
+def wrapped(angle_rad: float | Array) -> Any:
+    """Return an angle, or angles of any shape, in (-pi, pi]; one that lies there is returned as it is.
+
+    Compiled code may call it too.
 
     Examples
     --------
-    >>> wrapped(np.array([-np.pi, 4.0])).round(3)
-    array([ 3.142, -2.283])
+    >>> wrapped(np.array([-np.pi, 0.5, 4.0])).round(3)
+    array([ 3.142,  0.5  , -2.283])
     """
-    return np.asarray(np.pi - np.mod(np.pi - angle_rad, 2 * np.pi))
+    return angle_rad - 2 * np.pi * np.ceil((angle_rad - np.pi) / (2 * np.pi))
+
+
+register_jitable(wrapped)
 
 
 def unwrapped(angle_rad: Array) -> Array:

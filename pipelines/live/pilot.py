@@ -56,6 +56,7 @@ from terrain.estimation.live.estimator import LiveEstimate, LiveEstimator
 from terrain.extension import correct_live
 from terrain.kinematics.swerve import FAR_RAD, wheel_command_step
 from terrain.logs.schema import IMU_CHANNELS
+from terrain.kinematics.wheel_velocity import in_wheel_frame, point_velocity
 from terrain.records import Array, Command, Sample
 from terrain.robots import Robot, as_swerve
 from terrain.slip import MIN_SPEED_MPS
@@ -342,8 +343,8 @@ class LivePilot:
             steer = seen.mean[self._steer_states]
             cos, sin = np.cos(steer), np.sin(steer)
             x, y = self._positions_m.T
-            speed = (seen.speed_x_mps - seen.yaw_rate_radps * y) * cos
-            speed = speed + (seen.speed_y_mps + seen.yaw_rate_radps * x) * sin
+            forward, left = point_velocity(seen.speed_x_mps, seen.speed_y_mps, seen.yaw_rate_radps, x, y)
+            speed, _ = in_wheel_frame(forward, left, cos, sin)
             gain = seen.accel_x_mps2 * cos + seen.accel_y_mps2 * sin
             fastest = np.maximum(np.abs(seen.wheel_speed_mps), np.abs(speed))
             # a wheel stands by the filter's rate, which is not quite the reported one

@@ -8,6 +8,7 @@ from scipy.ndimage import median_filter
 from terrain.calibration.standing import Stretch
 from terrain.estimation.measurements.cleaning import MIN_CONFIDENCE_RATIO
 from terrain.kinematics.camera import CHANNELS, body_motion
+from terrain.kinematics.wheel_velocity import point_velocity
 from terrain.records import Array, Stream
 from terrain.robots import Robot
 
@@ -50,9 +51,10 @@ def origin_twist(stretch: Stretch, robot: Robot) -> Stream | None:
     seen = seen_motion(stretch, robot)
     if seen is None:
         return None
-    camera = robot.equipment.camera
-    turn = seen.values[:, 2:3] * [-camera.lever_y_m, camera.lever_x_m]
-    return Stream(seen.time_s, np.hstack([seen.values[:, :2] - turn, seen.values[:, 2:3]]), TWIST)
+    camera = robot.camera
+    turn = seen.values[:, 2]
+    origin = point_velocity(*seen.values[:, :2].T, turn, -camera.lever_x_m, -camera.lever_y_m)
+    return Stream(seen.time_s, np.column_stack([*origin, turn]), TWIST)
 
 
 def at_times(stream: Stream, time_s: Array) -> Array:

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.signal import lfilter
 
+from terrain.kinematics.wheel_velocity import wheel_frame_velocities
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import Robot
 
@@ -82,15 +83,10 @@ def course_of(
     truth = run.streams["truth"]
     wheels = robot.wheels
     step_s = float(np.median(np.diff(truth.time_s)))
-    along, across = truth.channel("speed_x_mps"), truth.channel("speed_y_mps")
-    turn = truth.channel("yaw_rate_radps")
-    rate, ground, sideways = np.empty((3, len(truth), len(wheels)))
-    for i, (wheel, (x, y)) in enumerate(zip(wheels, robot.wheel_positions_m.tolist(), strict=True)):
-        steer = truth.channel(f"steer_{wheel}_rad")
-        cos, sin = np.cos(steer), np.sin(steer)
-        ahead, left = along - turn * y, across + turn * x
-        rate[:, i] = truth.channel(f"wheel_{wheel}_radps")
-        ground[:, i], sideways[:, i] = ahead * cos + left * sin, left * cos - ahead * sin
+    twist = (truth.channel(name) for name in ("speed_x_mps", "speed_y_mps", "yaw_rate_radps"))
+    rate = np.column_stack([truth.channel(f"wheel_{wheel}_radps") for wheel in wheels])
+    steer = np.column_stack([truth.channel(f"steer_{wheel}_rad") for wheel in wheels])
+    ground, sideways = wheel_frame_velocities(*twist, robot.wheel_positions_m, steer)
     torque = np.column_stack([truth.channel(f"torque_{wheel}_nm") for wheel in wheels])
     power_w = np.maximum(torque * rate, 0.0).sum(axis=1)
     wheel_speed = rate * robot.wheel_radius_m * np.asarray(radius_factors)

@@ -40,6 +40,7 @@ from scipy.linalg import expm
 from terrain.control.pid import LONGEST_STEP_S, Gains, PidState, pid_step
 from terrain.control.stability import DELAY_S, SAMPLE_TIME_S, spectral_radius
 from terrain.errors import ConfigError
+from terrain.angles import wrapped
 from terrain.records import Array
 from terrain.robots import Robot
 
@@ -190,11 +191,6 @@ def initial_tracking() -> Array:
     return np.zeros(STATE_SIZE)
 
 
-@njit(types.float64(types.float64), cache=True)
-def _wrapped(angle_rad: float) -> float:
-    return angle_rad - 2.0 * math.pi * float(np.rint(angle_rad / (2.0 * math.pi)))
-
-
 @njit(
     types.Tuple((_F8[::1], _F8[::1], _F8[::1]))(_SETTINGS, _F8[::1], _ROW, _ROW, _F8, _ROW, _F8, _F8, _F8),
     cache=True,
@@ -275,7 +271,7 @@ def track_step(
         cos, sin = math.cos(middle), math.sin(middle)
         due_x = state[_LAST] + dt_s * (cos * ground_twist[0] - sin * ground_twist[1])
         due_y = state[_LAST + 1] + dt_s * (sin * ground_twist[0] + cos * ground_twist[1])
-        leap = _wrapped(yaw_rad - state[_LAST + 2] - dt_s * ground_twist[2])
+        leap = wrapped(yaw_rad - state[_LAST + 2] - dt_s * ground_twist[2])
         if abs(leap) > _LEAP_RAD or math.hypot(x - due_x, y - due_y) > _LEAP_M:
             cos, sin = math.cos(leap), math.sin(leap)
             off_x, off_y = after[_POSE] - due_x, after[_POSE + 1] - due_y
@@ -316,7 +312,7 @@ def track_step(
         ahead_s = (
             (cos * off_x + sin * off_y) * late_x
             + (cos * off_y - sin * off_x) * late_y
-            + arm * arm * _wrapped(yaw_rad - after[_POSE + 2]) * late_turn
+            + arm * arm * wrapped(yaw_rad - after[_POSE + 2]) * late_turn
         ) / late2
         ahead_s = min(max(ahead_s, -_BACK * dt_s), _AHEAD * dt_s)
         middle = after[_POSE + 2] + 0.5 * ahead_s * late_turn
@@ -329,7 +325,7 @@ def track_step(
     cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
     off_x, off_y = x - after[_POSE], y - after[_POSE + 1]
     error = np.array([cos * off_x + sin * off_y, cos * off_y - sin * off_x, 0.0])
-    error[2] = arm * _wrapped(yaw_rad - after[_POSE + 2])
+    error[2] = arm * wrapped(yaw_rad - after[_POSE + 2])
     way = np.array([told[0] / size, told[1] / size, arm * told[2] / size])
     error -= way * (error[0] * way[0] + error[1] * way[1] + error[2] * way[2])
     correction = np.empty(3)

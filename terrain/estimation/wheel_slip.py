@@ -10,6 +10,7 @@ from numba import float64, int64, njit, void
 
 from terrain.errors import DataError
 from terrain.estimation.measurements.table import MeasurementTable
+from terrain.kinematics.wheel_velocity import in_wheel_frame, point_velocity
 from terrain.records import Array, SlipTrack, StateTrack
 from terrain.robots import Robot
 from terrain.slip import MIN_SPEED_MPS, slip_ratio
@@ -135,19 +136,20 @@ def _ground_speed(track: StateTrack, robot: Robot, wheel: int) -> tuple[Array, A
     if robot.steered:
         across, steer = _state(track, "speed_y_mps"), _state(track, steer_name)
     turn = _state(track, "yaw_rate_radps")
-    ahead, left = _state(track, speed_name) - turn * y, across + turn * x
+    ahead, left = point_velocity(_state(track, speed_name), across, turn, x, y)
     cos, sin = np.cos(steer), np.sin(steer)
+    along, sideways = in_wheel_frame(ahead, left, cos, sin)
     slopes = {
         speed_name: cos,
         "speed_y_mps": sin,
         "yaw_rate_radps": x * sin - y * cos,
-        steer_name: left * cos - ahead * sin,
+        steer_name: sideways,
     }
     gradient = np.zeros((track.time_s.size, len(track.states)))
     for name, slope in slopes.items():
         if name in track.states:
             gradient[:, track.states.index(name)] = slope
-    return ahead * cos + left * sin, gradient
+    return along, gradient
 
 
 def _slopes(wheel_speed: Array, ground: Array) -> tuple[Array, Array]:
@@ -187,9 +189,9 @@ def instant_slip(
         states[3], states[4] = at[3 + i], at[3 + n + i]
         x, y = places_m[i, 0], places_m[i, 1]
         turn = mean[at[2]]
-        ahead, left = mean[at[0]] - turn * y, mean[at[1]] + turn * x
+        ahead, left = point_velocity(mean[at[0]], mean[at[1]], turn, x, y)
         cos, sin = np.cos(mean[states[3]]), np.sin(mean[states[3]])
-        ground = ahead * cos + left * sin
+        ground, sideways = in_wheel_frame(ahead, left, cos, sin)
         in_state = states[4] >= 0
         wheel_speed = ground + mean[states[4]] if in_state else wheel_speed_mps[i]
         traction = abs(wheel_speed) >= abs(ground)
@@ -204,7 +206,7 @@ def instant_slip(
             by_wheel_speed + by_ground if in_state else by_ground
         )  # the state's ground speed moves its rim too
         slopes[0], slopes[1], slopes[2] = along * cos, along * sin, along * (x * sin - y * cos)
-        slopes[3], slopes[4] = along * (left * cos - ahead * sin), by_wheel_speed
+        slopes[3], slopes[4] = along * sideways, by_wheel_speed
         variance = 0.0 if in_state else by_wheel_speed**2 * wheel_speed_variance
         for j in range(4 + in_state):
             for k in range(4 + in_state):

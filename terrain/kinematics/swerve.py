@@ -29,6 +29,7 @@ import numpy as np
 from numba import njit, types
 
 from terrain.errors import ConfigError
+from terrain.kinematics.wheel_velocity import point_velocity, velocity_matrix
 from terrain.records import Array
 
 STANDING_MPS = 1e-6
@@ -93,7 +94,7 @@ def forward(positions_m: Array, radius_m: float, wheel_radps: Array, steer_rad: 
     wheel, steer = _together(wheel_radps=wheel, steer_rad=steer)
     wheel_speed = np.stack([np.cos(steer), np.sin(steer)], axis=-1) * (radius * wheel)[..., None]
     seen = wheel_speed.reshape(*wheel.shape[:-1], -1)
-    rows = _rows(positions)
+    rows = velocity_matrix(positions)
     twist = seen @ np.linalg.pinv(rows).T
     return twist, np.linalg.norm(seen - twist @ rows.T, axis=-1)
 
@@ -340,8 +341,8 @@ def wheel_command_step(
     along, across = np.empty(wheels), np.empty(wheels)
     fastest = limit = radius_m * speed_max_radps
     for i in range(wheels):
-        along[i] = twist[0] - positions_m[i, 1] * twist[2]
-        across[i] = twist[1] + positions_m[i, 0] * twist[2]
+        x_m, y_m = positions_m[i]
+        along[i], across[i] = point_velocity(twist[0], twist[1], twist[2], x_m, y_m)
         fastest = max(fastest, math.hypot(along[i], across[i]))
     scale = limit / fastest
     admitted, speed, steer = np.empty(3), np.empty(wheels), np.empty(wheels)
@@ -382,15 +383,8 @@ def _commands(
     return admitted, speed, steer
 
 
-def _rows(positions: Array) -> Array:
-    """Return H (2 wheels, 3) of (2.3), its columns in the order of a twist here."""
-    x, y = positions.T
-    one, none = np.ones_like(x), np.zeros_like(x)
-    return np.stack([np.stack([one, none, -y], -1), np.stack([none, one, x], -1)], 1).reshape(-1, 3)
-
-
 def _velocities(positions: Array, twist: Array) -> Array:
-    flat = twist @ _rows(positions).T
+    flat = twist @ velocity_matrix(positions).T
     return np.asarray(flat.reshape(*flat.shape[:-1], len(positions), 2))
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from terrain.kinematics.wheel_velocity import wheel_frame_velocities
 from terrain.records import Array, Stream
 from terrain.robots import Robot
 
@@ -17,12 +18,9 @@ def wheel_and_ground_speed(truth: Stream, robot: Robot) -> tuple[Array, Array]:
     robot : gives the nominal radius and the positions of the wheels
     """
     steer = _of_wheels(truth, robot, "steer_{}_rad")
-    positions_m = robot.wheel_positions_m
-    turn = truth.channel("yaw_rate_radps")[:, None]
-    along = truth.channel("speed_x_mps")[:, None] - turn * positions_m[:, 1]
-    across = truth.channel("speed_y_mps")[:, None] + turn * positions_m[:, 0]
-    wheel_speed = _of_wheels(truth, robot, "wheel_{}_radps") * robot.wheel_radius_m
-    return wheel_speed, along * np.cos(steer) + across * np.sin(steer)
+    twist = (truth.channel(name) for name in ("speed_x_mps", "speed_y_mps", "yaw_rate_radps"))
+    along, _ = wheel_frame_velocities(*twist, robot.wheel_positions_m, steer)
+    return _of_wheels(truth, robot, "wheel_{}_radps") * robot.wheel_radius_m, along
 
 
 def true_slip(truth: Stream, robot: Robot) -> Array:

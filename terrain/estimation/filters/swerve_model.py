@@ -11,6 +11,7 @@ import math
 from numba import njit
 
 from terrain.estimation.ekf.kernel import OBSERVE, PROPAGATE
+from terrain.kinematics.wheel_velocity import in_wheel_frame, point_velocity
 from terrain.records import Array
 
 LARGEST_SLIP_RATIO = 0.95
@@ -55,11 +56,12 @@ def _observe_wheel(
     """(4.20): the wheel's own speed along it, times a scale."""
     place_x, place_y = params[_WHEELS + 2 * wheel], params[_WHEELS + 2 * wheel + 1]
     cos, sin = math.cos(x[steer]), math.sin(x[steer])
-    along, across = x[_VX] - x[_W] * place_y, x[_VY] + x[_W] * place_x
-    z_hat[wheel] = scale * (along * cos + across * sin)
+    forward, left = point_velocity(x[_VX], x[_VY], x[_W], place_x, place_y)
+    along, across = in_wheel_frame(forward, left, cos, sin)
+    z_hat[wheel] = scale * along
     h[wheel, _VX], h[wheel, _VY] = scale * cos, scale * sin
     h[wheel, _W] = scale * (place_x * sin - place_y * cos)
-    h[wheel, steer] = scale * (across * cos - along * sin)
+    h[wheel, steer] = scale * across
 
 
 @njit(cache=True)
@@ -82,12 +84,10 @@ def _observe_body(x: Array, params: Array, steer: int, bias: int, z_hat: Array, 
         _observe_direct(z_hat, h, 7 + i, x, steer + i)
     row = 10
     if params[_HAS_CAMERA] > 0.0:
-        _observe_direct(z_hat, h, row, x, _VX)
-        z_hat[row] -= x[_W] * params[_CAMERA_Y]
-        h[row, _W] = -params[_CAMERA_Y]
-        _observe_direct(z_hat, h, row + 1, x, _VY)
-        z_hat[row + 1] += x[_W] * params[_CAMERA_X]
-        h[row + 1, _W] = params[_CAMERA_X]
+        camera_x, camera_y = params[_CAMERA_X], params[_CAMERA_Y]
+        z_hat[row], z_hat[row + 1] = point_velocity(x[_VX], x[_VY], x[_W], camera_x, camera_y)
+        h[row, _VX], h[row, _W] = 1.0, -camera_y
+        h[row + 1, _VY], h[row + 1, _W] = 1.0, camera_x
         _observe_direct(z_hat, h, row + 2, x, _W)
         _observe_direct(z_hat, h, row + 3, x, _YAW)
         row += 4
@@ -103,8 +103,8 @@ def _observe_gnss(x: Array, antenna_x: float, antenna_y: float, row: int, z_hat:
     z_hat[row], z_hat[row + 1] = x[_X] + east, x[_Y] + north
     h[row, _X], h[row, _YAW] = 1.0, -north
     h[row + 1, _Y], h[row + 1, _YAW] = 1.0, east
-    along, across = x[_VX] - x[_W] * antenna_y, x[_VY] + x[_W] * antenna_x
-    speed_east, speed_north = along * cos - across * sin, along * sin + across * cos
+    forward, left = point_velocity(x[_VX], x[_VY], x[_W], antenna_x, antenna_y)
+    speed_east, speed_north = forward * cos - left * sin, forward * sin + left * cos
     z_hat[row + 2], z_hat[row + 3] = speed_east, speed_north
     h[row + 2, _VX], h[row + 2, _VY], h[row + 2, _W], h[row + 2, _YAW] = cos, -sin, -north, -speed_north
     h[row + 3, _VX], h[row + 3, _VY], h[row + 3, _W], h[row + 3, _YAW] = sin, cos, east, speed_east

@@ -9,6 +9,7 @@ import numpy as np
 
 from terrain.estimation.measurements.table import GNSS_SPEED_STD_MPS, MeasurementTable
 from terrain.kinematics.swerve import forward
+from terrain.kinematics.wheel_velocity import point_velocity
 from terrain.records import Array
 from terrain.robots import Robot
 
@@ -53,5 +54,6 @@ def _speed_over_ground(table: MeasurementTable, robot: Robot) -> Array:
         return np.asarray(speed)
     camera = robot.camera
     x, y, turn = table.columns(["camera_speed_x_mps", "camera_speed_y_mps", "camera_yaw_rate_radps"]).T
-    by_camera = (x + turn * camera.lever_y_m) + 1j * (y - turn * camera.lever_x_m)
+    origin_x, origin_y = point_velocity(x, y, turn, -camera.lever_x_m, -camera.lever_y_m)
+    by_camera = origin_x + 1j * origin_y
     return np.where(np.isfinite(by_camera), by_camera, speed)

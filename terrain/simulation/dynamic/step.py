@@ -32,6 +32,7 @@ import numpy as np
 from numba import njit
 
 from terrain.constants import GRAVITY_MPS2
+from terrain.kinematics.wheel_velocity import point_velocity
 from terrain.records import Array
 from terrain.simulation.contact import DEFLECTION_DAMPING_S, shear_slip
 from terrain.simulation.dynamic.actuators import drive_wheel, linkage_heading, steer_wheel
@@ -123,8 +124,8 @@ def advance(
         force_x, force_y, moment, leg_nm = 0.0, 0.0, 0.0, 0.0
         # speeds of the wheel centres, and which way the body goes
         for i in range(3):
-            speeds[i, 0] = state[3] - state[5] * (plant.wheels_m[i, 1] - plant.com_m[1])
-            speeds[i, 1] = state[4] + state[5] * (plant.wheels_m[i, 0] - plant.com_m[0])
+            x_m, y_m = plant.wheels_m[i, 0] - plant.com_m[0], plant.wheels_m[i, 1] - plant.com_m[1]
+            speeds[i, 0], speeds[i, 1] = point_velocity(state[3], state[4], state[5], x_m, y_m)
         speed = math.sqrt(state[3] * state[3] + state[4] * state[4]) + 1e-9
         for i in range(3):
             w = state[N_BODY + i * N_WHEEL : N_BODY + (i + 1) * N_WHEEL]
@@ -212,8 +213,9 @@ def advance(
         state[3] = vx + dt * (accel[0] + turn * vy)
         state[4] = vy + dt * (accel[1] - turn * vx)
         state[5] = turn + dt * accel[2]
-        origin_x = state[3] + state[5] * plant.com_m[1]
-        origin_y = state[4] - state[5] * plant.com_m[0]
+        origin_x, origin_y = point_velocity(
+            state[3], state[4], state[5], -plant.com_m[0], -plant.com_m[1]
+        )
         state[0] += dt * (cos_yaw * origin_x - sin_yaw * origin_y)
         state[1] += dt * (sin_yaw * origin_x + cos_yaw * origin_y)
         state[2] += dt * state[5]
@@ -258,8 +260,7 @@ def _record_body(
     one, two, three = N_BODY, N_BODY + N_WHEEL, N_BODY + 2 * N_WHEEL
     turn = state[5]
     row[0], row[1], row[2] = state[0], state[1], state[2]
-    row[3] = state[3] + turn * plant.com_m[1]
-    row[4] = state[4] - turn * plant.com_m[0]
+    row[3], row[4] = point_velocity(state[3], state[4], turn, -plant.com_m[0], -plant.com_m[1])
     row[5] = turn
     row[6] = accel[0] + accel[2] * plant.com_m[1] + turn * turn * plant.com_m[0]
     row[7] = accel[1] - accel[2] * plant.com_m[0] + turn * turn * plant.com_m[1]

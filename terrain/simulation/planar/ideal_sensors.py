@@ -8,6 +8,7 @@ import numpy as np
 from numba import njit
 
 from terrain.effects import INDEX
+from terrain.kinematics.wheel_velocity import point_velocity
 from terrain.records import Array
 from terrain.simulation.planar.model import AMPS, AX, TURNING_AMPS, VX, VY, Planar, W
 from terrain.simulation.planar.signals import delayed
@@ -40,7 +41,7 @@ def sense(planar: Planar, p: Array, dt: float, truth: Array) -> Array:
     cos, sin = math.cos(p[_CAMERA_YAW]), math.sin(p[_CAMERA_YAW])
     for k in range(n):
         w = truth[k, W]
-        v_x, v_y = truth[k, VX] - lever_y * w, truth[k, VY] + lever_x * w
+        v_x, v_y = point_velocity(truth[k, VX], truth[k, VY], w, lever_x, lever_y)
         out[k, 0] = (1.0 + p[_GYRO_SCALE]) * w + p[_GYRO_BIAS]
         out[k, 1] = cos * v_x - sin * v_y
         out[k, 2] = sin * v_x + cos * v_y

@@ -33,6 +33,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from terrain.kinematics.wheel_velocity import velocity_matrix
 from terrain.records import Array
 from terrain.robots import Robot
 
@@ -121,10 +122,6 @@ def make_planar(robot: Robot, ground: Ground) -> Planar:
     What a description leaves out does not act: without motors a traction of 1 N counts as 1 A, without a
     camera the speed is that of the body's origin, without delay.
     """
-    x, y = robot.wheel_positions_m.T
-    rows = np.zeros((2 * len(x), 3))
-    rows[0::2, 0], rows[0::2, 2] = 1.0, -y
-    rows[1::2, 1], rows[1::2, 2] = 1.0, x
     complete = robot.completed
     motors, camera, body, sensors = complete.motors, complete.camera, complete.body, complete.sensors
     n_motors = len(robot.wheels)
@@ -133,7 +130,7 @@ def make_planar(robot: Robot, ground: Ground) -> Planar:
     spread_m = float(np.sqrt((arm_m**2).sum(axis=1).mean()))
     return Planar(
         n_wheels=len(robot.wheels),
-        to_twist=np.ascontiguousarray(np.linalg.pinv(rows)),
+        to_twist=np.ascontiguousarray(np.linalg.pinv(velocity_matrix(robot.wheel_positions_m))),
         track_m=robot.track_m,
         radius_m=robot.wheel_radius_m,
         mass_kg=robot.mass_kg,

@@ -19,6 +19,7 @@ from terrain.constants import GRAVITY_MPS2
 from terrain.effects import CHANNELS, CURRENT, HEADING, INDEX, SPEED_X, TURNING_CURRENT
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.logs.schema import IMU_CHANNELS, STEERING_CHANNELS
+from terrain.kinematics.wheel_velocity import point_velocity, wheel_frame_velocities
 from terrain.records import Array, Stream
 from terrain.robots import Robot
 from terrain.simulation.planar.model import AX, VX, VY, Planar, W
@@ -277,7 +278,7 @@ def camera_stream(run: PlanarRun, rng: np.random.Generator) -> Stream:
         yaw = yaw + camera.yaw_std_rad * rng.standard_normal(n)
         rate = rate + camera.yaw_rate_std_radps * rng.standard_normal(n)
         position_noise = camera.position_std_m * rng.standard_normal((n, 2))
-    origin = seen + np.column_stack([camera.lever_y_m * rate, -camera.lever_x_m * rate])
+    origin = np.column_stack(point_velocity(*seen.T, rate, -camera.lever_x_m, -camera.lever_y_m))
     cos, sin = np.cos(yaw), np.sin(yaw)
     velocity = np.column_stack(
         [origin[:, 0] * cos - origin[:, 1] * sin, origin[:, 0] * sin + origin[:, 1] * cos]
@@ -310,9 +311,7 @@ def planar_truth(run: PlanarRun) -> Stream:
     accel_x = motion.truth[rows, AX] - GRAVITY_MPS2 * np.sin(grade)
     accel_y = np.gradient(v_y, 1.0 / IMU_HZ) + turn * v_x
     steer = motion.steer_rad[rows]
-    x, y = robot.wheel_positions_m.T
-    along_x, along_y = v_x[:, None] - y * turn[:, None], v_y[:, None] + x * turn[:, None]
-    along = along_x * np.cos(steer) + along_y * np.sin(steer)
+    along, _ = wheel_frame_velocities(v_x, v_y, turn, robot.wheel_positions_m, steer)
     columns = [
         motion.pose[rows],
         np.column_stack([motion.roll_rad[rows], -grade, v_x, v_y, turn, accel_x, accel_y]),

@@ -8,6 +8,7 @@ import numpy as np
 from numba import njit
 
 from terrain.kinematics.camera import CHANNELS, to_camera, turned
+from terrain.kinematics.wheel_velocity import point_velocity
 from terrain.records import Array
 from terrain.robots import Robot
 from terrain.simulation.conditions import Faults
@@ -118,7 +119,7 @@ def camera_samples(
         z = sy * cp * cr - cy * sp * sr
         place = _rotated(w_0, 0.0, 0.0, z_0, position_m[i, 0], position_m[i, 1], 0.0)
         lever = _rotated(w, x, y, z, lever_m[0], lever_m[1], lever_m[2])
-        ahead, left = motion[i, 0] - turn * lever_m[1], motion[i, 1] + turn * lever_m[0]
+        ahead, left = point_velocity(motion[i, 0], motion[i, 1], turn, lever_m[0], lever_m[1])
         velocity = _rotated(w, x, y, z, ahead, left, 0.0)
         row = values[i]
         row[0] = -(place[1] + lever[1] - lever_m[1])
