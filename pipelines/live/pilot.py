@@ -55,8 +55,8 @@ from terrain.errors import ConfigError
 from terrain.estimation.live.estimator import LiveEstimate, LiveEstimator
 from terrain.extension import correct_live
 from terrain.kinematics.swerve import FAR_RAD, wheel_command_step
-from terrain.logs.schema import IMU_CHANNELS
 from terrain.kinematics.wheel_velocity import in_wheel_frame, point_velocity
+from terrain.logs.schema import IMU_CHANNELS
 from terrain.records import Array, Command, Sample
 from terrain.robots import Robot, as_swerve
 from terrain.slip import MIN_SPEED_MPS

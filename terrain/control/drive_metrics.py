@@ -83,7 +83,8 @@ def course_of(
     truth = run.streams["truth"]
     wheels = robot.wheels
     step_s = float(np.median(np.diff(truth.time_s)))
-    twist = (truth.channel(name) for name in ("speed_x_mps", "speed_y_mps", "yaw_rate_radps"))
+    twist = [truth.channel(name) for name in ("speed_x_mps", "speed_y_mps", "yaw_rate_radps")]
+    along, across, _ = twist
     rate = np.column_stack([truth.channel(f"wheel_{wheel}_radps") for wheel in wheels])
     steer = np.column_stack([truth.channel(f"steer_{wheel}_rad") for wheel in wheels])
     ground, sideways = wheel_frame_velocities(*twist, robot.wheel_positions_m, steer)

@@ -37,10 +37,10 @@ import numpy as np
 from numba import njit, types
 from scipy.linalg import expm
 
+from terrain.angles import wrapped
 from terrain.control.pid import LONGEST_STEP_S, Gains, PidState, pid_step
 from terrain.control.stability import DELAY_S, SAMPLE_TIME_S, spectral_radius
 from terrain.errors import ConfigError
-from terrain.angles import wrapped
 from terrain.records import Array
 from terrain.robots import Robot
 

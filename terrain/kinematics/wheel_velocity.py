@@ -1,7 +1,7 @@
 """Velocity of a point of a rigid body that moves in a plane, and of a wheel along and across its heading.
 
-With the body's velocity ``(v_x, v_y)`` at its origin, its yaw rate w, and a wheel at ``(x, y)`` steered by d, all
-in body axes::
+With the body's velocity ``(v_x, v_y)`` at its origin, its yaw rate w, and a wheel at ``(x, y)`` steered by d,
+all in body axes::
 
     velocity of the point    a = v_x - w y,  l = v_y + w x
     along the wheel          a cos d + l sin d

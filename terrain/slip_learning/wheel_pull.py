@@ -348,7 +348,7 @@ def wheel_pull(
     balanced = (
         moving
         & fresh
-        & (np.abs(turn[:, 0]) < MAX_YAW_RATE_RADPS)
+        & (np.abs(track.state("yaw_rate_radps")) < MAX_YAW_RATE_RADPS)
         & straight.all(axis=1)
         & sound["current known"].all(axis=1)
         & attitude

@@ -213,9 +213,7 @@ def advance(
         state[3] = vx + dt * (accel[0] + turn * vy)
         state[4] = vy + dt * (accel[1] - turn * vx)
         state[5] = turn + dt * accel[2]
-        origin_x, origin_y = point_velocity(
-            state[3], state[4], state[5], -plant.com_m[0], -plant.com_m[1]
-        )
+        origin_x, origin_y = point_velocity(state[3], state[4], state[5], -plant.com_m[0], -plant.com_m[1])
         state[0] += dt * (cos_yaw * origin_x - sin_yaw * origin_y)
         state[1] += dt * (sin_yaw * origin_x + cos_yaw * origin_y)
         state[2] += dt * state[5]

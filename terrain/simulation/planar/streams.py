@@ -18,8 +18,8 @@ from numba import njit
 from terrain.constants import GRAVITY_MPS2
 from terrain.effects import CHANNELS, CURRENT, HEADING, INDEX, SPEED_X, TURNING_CURRENT
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
-from terrain.logs.schema import IMU_CHANNELS, STEERING_CHANNELS
 from terrain.kinematics.wheel_velocity import point_velocity, wheel_frame_velocities
+from terrain.logs.schema import IMU_CHANNELS, STEERING_CHANNELS
 from terrain.records import Array, Stream
 from terrain.robots import Robot
 from terrain.simulation.planar.model import AX, VX, VY, Planar, W
