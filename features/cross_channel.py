@@ -19,13 +19,13 @@ MIN_SPEED_MPS = 0.05
 """Division by speed stops here: below it a wheel reading is mostly quantisation."""
 
 MIN_WHEEL_DIFFERENCE_MPS = 0.03
-"""A smaller wheel difference (rms) is no turn; the yaw rate per wheel difference is NaN then."""
+"""A smaller wheel difference (rms) does not count as a turn; the yaw rate per wheel difference is NaN."""
 
 _LOG_FLOOR = 1e-4
 
 
 class Feature(NamedTuple):
-    """Name and unit of a feature, and the signal sets it is made of."""
+    """Name and unit of a feature, and the signal sets it is computed from."""
 
     name: str
     unit: str
@@ -33,7 +33,7 @@ class Feature(NamedTuple):
 
     @property
     def label(self) -> str:
-        """Name with its unit, as it stands in tables and plots."""
+        """Name with its unit, as in tables and plots."""
         return f"{self.name} [{self.unit}]"
 
 
@@ -117,7 +117,7 @@ def correlation_features(values: Array, channels: Sequence[str], stream: str) ->
 def speed_features(
     values: Mapping[str, Array], channels: Mapping[str, Sequence[str]]
 ) -> tuple[list[Feature], Array]:
-    """Return what currents, vibration and yaw rate are per wheel speed.
+    """Return currents, vibration and yaw rate per wheel speed.
 
     ``current_per_speed = mean(I) / v``, ``log_drive_effort = log10 mean |sum I v_wheel|``,
     ``log_std_per_speed = log10(std / v)`` of each IMU channel, and the turning-slip measure

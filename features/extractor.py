@@ -1,8 +1,8 @@
 """Windows to named feature vectors, as a scikit-learn transformer.
 
-Every feature knows the signal sets it is made of, and vanishes when one of them is switched off, so that
-switching a set off shows what it is worth.  What depends on the length of the window or on the rate of a
-stream (bands, lags) is relative to that stream's own rate.
+Every feature names the signal sets that it is computed from, and is left out when one of them is switched
+off, so that the value of a set can be measured by switching it off.  What depends on the length of the
+window or on the rate of a stream (bands, lags) is relative to that stream's own rate.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ LEFT_OUT = {
     "wheels": LEVEL_STATISTICS,
     "driving": LEVEL_STATISTICS,
 }
-"""Statistics that are made only when asked for.  Where an IMU channel sits is its mounting, its bias and the
-tilt of the ground on that day; the level of a speed, measured or estimated, is how the robot was driven.
-Neither is terrain.  ``driving``: speeds and yaw rates among the estimator's states.
+"""Statistics that are computed only on request.  The mean of an IMU channel depends on mounting, bias and
+slope, the level of a speed, measured or estimated, on how the robot was driven; neither is a property of the
+terrain.  ``driving``: speeds and yaw rates among the estimator's states.
 """
 
 
@@ -42,9 +42,9 @@ class FeatureExtractor(TransformerMixin, BaseEstimator):
 
     Parameters
     ----------
-    signal_sets : names out of :data:`~terrain.logs.schema.SIGNAL_SETS`; a feature is made only when all
+    signal_sets : names out of :data:`~terrain.logs.schema.SIGNAL_SETS`; a feature is computed only when all
         sets it needs are named
-    level_sets : sets of which the statistics in :data:`LEFT_OUT` are made as well
+    level_sets : sets of which the statistics in :data:`LEFT_OUT` are computed as well
 
     Attributes
     ----------
@@ -101,7 +101,7 @@ class FeatureExtractor(TransformerMixin, BaseEstimator):
         """Return the features (n_windows, n_features); NaN where a feature is not defined.
 
         Besides windows, plain arrays by stream ``(n_windows, n_channels, n_samples)`` are taken, with the
-        channels and rates of ``fit``; this is how a model server hands them over.
+        channels and rates of ``fit``; this is the form in which a model server passes them.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""Statistics of a slip track over a window; slip may be NaN where it is undefined, and stays unknown then."""
+"""Statistics of a slip track over a window; slip is NaN where it is undefined, and so are they."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import numpy as np
 
 from terrain.records import Array
 
-MIN_DEFINED_SHARE = 0.5
-"""With less of the window defined, its slip is not known: NaN."""
+MIN_DEFINED_FRACTION = 0.5
+"""With a smaller fraction of the window defined, its slip statistics are NaN."""
 
 SLIP_STATISTICS: tuple[str, ...] = ("mean", "std", "min", "max", "mean_abs", "median")
 
@@ -30,7 +30,7 @@ def slip_statistics(slip_ratio: Array) -> Array:
     """
     slip_ratio = np.where(np.isfinite(slip_ratio), slip_ratio, np.nan)
     out = np.full((*slip_ratio.shape[:2], len(SLIP_STATISTICS)), np.nan)
-    known = (~np.isnan(slip_ratio)).mean(axis=2) >= MIN_DEFINED_SHARE
+    known = (~np.isnan(slip_ratio)).mean(axis=2) >= MIN_DEFINED_FRACTION
     if known.any():
         samples = slip_ratio[known]
         out[known] = np.stack(

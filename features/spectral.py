@@ -1,8 +1,8 @@
 """Band powers and spectral moments of one channel over one window, relative to the stream's own rate.
 
 The window is centred and tapered (Hann); ``P(f)`` is its one-sided periodogram without the line at 0 Hz.
-Bands part the range from the first line to Nyquist evenly, so that they mean the same share of what the
-sensor could see at every rate.
+Bands divide the range from the first line to Nyquist evenly, so that at every rate a band covers the same
+fraction of the range that the sensor resolves.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from terrain.records import Array
 MAX_BANDS = 20
 MIN_BINS_PER_BAND = 2
 MIN_SAMPLES = 48
-"""A spectrum of fewer samples has too few lines to be more than the autocorrelation already says."""
+"""A spectrum of fewer samples has too few lines to add anything to the autocorrelation."""
 
 ROLLOFF = 0.85
 _FLOOR = 1e-10  # squared SI unit per Hz, under a logarithm: the noise density of a good sensor
@@ -33,12 +33,12 @@ MOMENTS: tuple[tuple[str, str], ...] = (
     ("flatness", "1"),
     ("rolloff", "Hz"),
     ("peak", "Hz"),
-    ("peak_share", "1"),
+    ("peak_ratio", "1"),
 )
 
 
 def n_bands(n_samples: int) -> int:
-    """Return into how many bands a window of ``n_samples`` is parted.
+    """Return the number of bands of a window of ``n_samples``.
 
     Examples
     --------
@@ -125,10 +125,10 @@ def _describe(power: Array, log_power: Array, edges: Array, resolution_hz: float
             rolloff = n_lines
             for k in range(n_lines):
                 d = k + 1 - centroid
-                share = p[k] / total
-                m2 += share * d * d
-                m3 += share * d * d * d
-                m4 += share * d * d * d * d
+                weight = p[k] / total
+                m2 += weight * d * d
+                m3 += weight * d * d * d
+                m4 += weight * d * d * d * d
                 sum_so_far += p[k]
                 if rolloff == n_lines and sum_so_far >= ROLLOFF * total:
                     rolloff = k + 1

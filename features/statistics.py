@@ -39,11 +39,11 @@ STATISTICS: tuple[tuple[str, str], ...] = (
     ("autocorrelation_4", "1"),
     ("autocorrelation_8", "1"),
 )
-"""Name and unit of each column; ``x`` stands for the unit of the channel."""
+"""Name and unit of each column; ``x`` is the unit of the channel."""
 
 _LAGS = (1, 2, 4, 8)
 _FLAT = 1e-9  # a standard deviation under this is rounding, not a signal
-_FLOOR = 1e-4  # SI unit, under a logarithm: the resolution of a good sensor, so that silence is no outlier
+_FLOOR = 1e-4  # SI unit, under a logarithm: the resolution of a good sensor; a constant signal is no outlier
 
 
 @njit(cache=True)
@@ -120,7 +120,7 @@ def _statistics(values: Array, in_order: Array, rate_hz: float, out: Array) -> N
 def channel_statistics(values: Array, rate_hz: float) -> Array:
     """Return the statistics of every channel in every window.
 
-    A flat channel (standard deviation 0) has shape statistics of 0: it neither leans nor peaks.
+    A flat channel (standard deviation 0) has shape statistics of 0.
 
     Parameters
     ----------

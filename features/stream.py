@@ -1,11 +1,11 @@
 """The windows of :mod:`features.windows`, cut sample by sample while the robot drives.
 
-:func:`~features.windows.cut_at` cuts here as well, on short buffers, so that a classifier sees live what it
-would have seen in the log.  The window ``k`` starts at ``s = start + k step``; it is cut as soon as every
+:func:`~features.windows.cut_at` cuts here as well, on short buffers, so that a classifier gets live what it
+would have got from the log.  The window ``k`` starts at ``s = start + k step``; it is cut as soon as every
 stream reaches its end, which is the moment from which a log would hold it too.
 
 A live chain does not stop for a bad sample: what cannot be used is dropped, counted and named, and a
-stream that falls silent costs windows and no memory.
+stream that stops costs windows and no memory.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from terrain.errors import ConfigError
 from terrain.records import Array, Stream, Windows
 
 PATIENCE_S = 5.0
-"""A stream that lies further behind the others has fallen silent: longer than a logger flushes its buffer,
+"""A stream that lags further behind the others has stopped: longer than a logger takes to write its buffer,
 shorter than an operator waits."""
 
 BUFFER_MARGIN = 4
@@ -71,7 +71,7 @@ class WindowStream:
     one never comes back, windows that a log would not hold at all are counted as ``gap``.
 
     A stamp that is further ahead than ``patience_s``, like the first one of a stream, is held back until
-    the next sample confirms it, so that one wild stamp costs one sample and not the rest of the drive.  A
+    the next sample confirms it, so that one wrong stamp costs one sample and not the rest of the run.  A
     clock that starts again from an earlier time needs a new ``WindowStream``.
 
     Parameters
@@ -79,7 +79,7 @@ class WindowStream:
     rule : how to cut
     layout : streams, channels (in the order in which their values are pushed) and rates
     run_id : run of the windows
-    patience_s : how far the others run ahead before a stream counts as silent and the windows that wait
+    patience_s : how far the others are ahead before a stream counts as stopped and the windows that wait
         for it are dropped
 
     Attributes
@@ -140,7 +140,7 @@ class WindowStream:
 
     @property
     def silent_streams(self) -> tuple[str, ...]:
-        """Streams that lie further behind the others than ``patience_s``, or have not begun by then."""
+        """Streams that lag behind the others by more than ``patience_s``, or have not begun by then."""
         begun = [b.last_s for b in self._buffers.values() if b.end]
         if not begun:
             return ()
@@ -188,7 +188,7 @@ class WindowStream:
     def _push_doubtful(
         self, stream: str, buffer: _Buffer, time_s: float, values: Sequence[float] | Array
     ) -> list[Windows]:
-        """Judge the first sample of a stream, one with a wild stamp, and the one after such a sample."""
+        """Accept, hold back or drop a first sample, one that jumps ahead, and the one after it."""
         suspect = buffer.suspect
         if not math.isfinite(time_s):
             self.dropped_samples[stream, "time not finite"] += 1
@@ -279,7 +279,7 @@ class WindowStream:
         ]
 
     def _make_room(self, stream: str) -> None:
-        """Forget what no window will ask for, and the oldest samples where that is not enough."""
+        """Remove what no window needs any more, and the oldest samples where that is not enough."""
         buffer = self._buffers[stream]
         if math.isnan(self._start_s):
             needed_from_s = max(b.last_s for b in self._buffers.values() if b.end) - self.patience_s

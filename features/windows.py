@@ -1,8 +1,8 @@
 """Windows of equal length over streams of different rates.
 
 A window of length ``L`` that starts at ``t0`` holds, of each stream, the first ``floor(L rate)`` samples
-at or after ``t0``.  Nothing is interpolated: each stream keeps its own rate, and what a window holds is
-what the sensor said.  :func:`cut_at` is the one place where samples are cut; whole logs, the papers'
+at or after ``t0``.  Nothing is interpolated: each stream keeps its own rate, and a window holds the samples
+as they were measured.  :func:`cut_at` is the one place where samples are cut; whole logs, the papers'
 partitions and the sample-by-sample form of :mod:`features.stream` all go through it.
 """
 
@@ -30,14 +30,14 @@ NAN_TOLERANT_STREAMS = ("slip",)
 
 SPAN_TOLERANCE = 0.1
 """A window whose samples span this much more or less time than they should, and one period, was not sampled
-at the rate it is read with: a slow or a hasty stretch of a logger, or a live stream set to another rate."""
+at the rate it is read with: a slow or a fast stretch of a logger, or a live stream set to another rate."""
 
 DROP_REASONS = ("gap", "wrong rate", "not finite", "not moving", "not steady")
 
 
 @dataclass(frozen=True, slots=True)
 class SteadyMotion:
-    """When a window counts as steady motion (thesis 8.1 asks for it and gives no numbers: both assumed).
+    """When a window counts as steady motion (thesis 8.1 requires it without numbers: both are assumed).
 
     Parameters
     ----------
@@ -233,13 +233,13 @@ def cut_at(
 def _mark_unsteady(
     values: Mapping[str, Array], rule: WindowRule, steady: SteadyMotion, layout: Layout, reason: Array
 ) -> None:
-    judged = reason == ""
-    speeds = np.ascontiguousarray(wheel_speeds(values, layout.channels)[judged])
+    candidate = reason == ""
+    speeds = np.ascontiguousarray(wheel_speeds(values, layout.channels)[candidate])
     half = speeds.shape[2] // 2
     before, after = speeds[:, :, :half].mean(axis=2), speeds[:, :, -half:].mean(axis=2)
     moving = np.abs(speeds).mean(axis=2).max(axis=1) >= steady.min_speed_mps
     even = np.abs(after - before).max(axis=1) <= steady.max_accel_mps2 * rule.length_s / 2
-    reason[judged] = np.where(moving, np.where(even, "", "not steady"), "not moving")
+    reason[candidate] = np.where(moving, np.where(even, "", "not steady"), "not moving")
 
 
 def wheel_speeds(values: Mapping[str, Array], channels: Mapping[str, tuple[str, ...]]) -> Array:
@@ -281,7 +281,7 @@ def regular_starts(start_s: float, end_s: float, length_s: float, step_s: float)
 
 
 def span_of(run: RunLog, layout: Layout) -> tuple[float, float]:
-    """Return from when to when all streams of ``layout`` run; the last sample's own period included."""
+    """Return first and last time at which all streams run, the period of the last sample included."""
     streams = [(run.streams[name], layout.rate_hz[name]) for name in layout.channels]
     return (
         float(max(stream.time_s[0] for stream, _ in streams)),
@@ -339,13 +339,7 @@ def cut_windows(
             f"window stride_s is {rule.step_s:g}; at least the shortest sample period, {fastest_s:g} s, "
             "is needed"
         )
-    parts: dict[str, list[Array]] = {
-        name: [np.empty((0, len(channels), layout.n_samples(name, rule.length_s)))]
-        for name, channels in layout.channels.items()
-    }
-    starts: list[Array] = [np.empty(0)]
-    ids: list[Array] = [np.empty(0, dtype=object)]
-    terrains: list[Array] = [np.empty(0, dtype=object)]
+    parts = [_no_windows(rule, layout)]
     dropped: Counter[str] = Counter()
     for run in runs:
         begin_s, end_s = span_of(run, layout)
@@ -361,21 +355,46 @@ def cut_windows(
             at = regular_starts(begin_s, end_s, rule.length_s, rule.step_s)
         else:
             at = np.asarray(starts_s.get(run.run_id, ()), dtype=float)
-        values, reason = cut_at(run.streams, at, rule, layout)
-        kept = reason == ""
-        dropped.update(str(r) for r in reason[~kept] if r != "incomplete")
-        for name, array in values.items():
-            parts[name].append(array[kept])
-        starts.append(at[kept])
-        ids.append(np.full(int(kept.sum()), run.run_id, dtype=object))
-        terrains.append(label_windows(run, at[kept], rule.length_s))
+        cut = _cut_run(run, at, rule, layout)
+        parts.append(cut.windows)
+        dropped.update(cut.dropped)
+    return WindowCut(_concatenated(parts), dict(dropped))
+
+
+def _no_windows(rule: WindowRule, layout: Layout) -> Windows:
+    values = {
+        name: np.empty((0, len(channels), layout.n_samples(name, rule.length_s)))
+        for name, channels in layout.channels.items()
+    }
+    nothing = np.empty(0, dtype=object)
+    return Windows(values, layout.channels, layout.rate_hz, rule.length_s, np.empty(0), nothing, nothing)
+
+
+def _cut_run(run: RunLog, starts_s: Array, rule: WindowRule, layout: Layout) -> WindowCut:
+    values, reason = cut_at(run.streams, starts_s, rule, layout)
+    kept = reason == ""
+    starts_kept_s = starts_s[kept]
     windows = Windows(
-        {name: np.concatenate(arrays) for name, arrays in parts.items()},
+        {name: array[kept] for name, array in values.items()},
         layout.channels,
         layout.rate_hz,
         rule.length_s,
-        np.concatenate(starts),
-        np.concatenate(ids),
-        np.concatenate(terrains),
+        starts_kept_s,
+        np.full(len(starts_kept_s), run.run_id, dtype=object),
+        label_windows(run, starts_kept_s, rule.length_s),
     )
-    return WindowCut(windows, dict(dropped))
+    return WindowCut(windows, Counter(str(r) for r in reason[~kept] if r != "incomplete"))
+
+
+def _concatenated(parts: Sequence[Windows]) -> Windows:
+    """Return the windows of all parts, which share channels, rates and length."""
+    first = parts[0]
+    return Windows(
+        {name: np.concatenate([part.values[name] for part in parts]) for name in first.values},
+        first.channels,
+        first.rate_hz,
+        first.length_s,
+        np.concatenate([part.start_s for part in parts]),
+        np.concatenate([part.run_id for part in parts]),
+        np.concatenate([part.terrain for part in parts]),
+    )

@@ -19,7 +19,7 @@ Array = NDArray[Any]
 
 
 def read_only(array: Any, dtype: Any = np.float64) -> Array:
-    """Return ``array`` as a C-contiguous array that nobody can write to (copied only when writable).
+    """Return ``array`` as a read-only C-contiguous array (copied only when writable).
 
     Examples
     --------
@@ -43,7 +43,7 @@ class Label(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stream:
-    """What one logger wrote: ``values[i]`` was sampled at ``time_s[i]``.
+    """Samples of one logger: ``values[i]`` was sampled at ``time_s[i]``.
 
     Parameters
     ----------
@@ -98,8 +98,8 @@ class RunLog:
     streams : by name: ``imu``, ``wheels``, ``steering``, ``odometry``, ``commands``, ``slip``,
         ``estimator``, ``truth``
     labels : terrain intervals; one for the whole run in the simple case, none when unlabelled
-    source : where the log comes from, in words
-    dropped : what a repairing reader took away, as counts by kind; empty after a strict read
+    source : where the log comes from, as text
+    dropped : what a repairing reader removed, as counts by kind; empty after a strict read
     """
 
     run_id: str
@@ -143,9 +143,9 @@ class Sample(NamedTuple):
     Parameters
     ----------
     time_s : of the step
-    twist : (3,) wanted ``(speed_x_mps, speed_y_mps, yaw_rate_radps)``
-    readings : by stream, what arrived since the step before; a stream that was silent is missing
-    terrain : the ground under the wheels where somebody knows it, as a simulation does; else empty
+    twist : (3,) desired ``(speed_x_mps, speed_y_mps, yaw_rate_radps)``
+    readings : by stream, what arrived since the previous step; a stream without new samples is missing
+    terrain : true terrain under the wheels where it is known, as in a simulation; else empty
     """
 
     time_s: float
@@ -155,13 +155,13 @@ class Sample(NamedTuple):
 
 
 class Command(NamedTuple):
-    """What a controller tells the wheels.
+    """What a controller commands the wheels to do.
 
     Parameters
     ----------
     wheel_radps, steer_rad : (wheels,)
-    twist : (3,) what of the wanted twist is driven
-    status : numbers that say why, by name ending in a unit; always the same names
+    twist : (3,) the part of the desired twist that is driven
+    status : figures of the decision, by name ending in a unit; always the same names
     """
 
     wheel_radps: Array
@@ -171,12 +171,12 @@ class Command(NamedTuple):
 
 
 ABSENT, USED, GATED, REOPENED = 0, 1, 2, 3
-"""What became of a sensor's measurement at one step of a filter (:attr:`StateTrack.use`)."""
+"""How a filter used a sensor's measurement at one step (:attr:`StateTrack.use`)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StateTrack:
-    """What a filter believes over time, and how well its measurements agreed with it.
+    """State estimate of a filter over time, and how consistent its measurements were with it.
 
     Parameters
     ----------
@@ -190,7 +190,7 @@ class StateTrack:
     sensors : name of each of the k sensors
     reference_age_s : (n,) time since a sensor of speed over ground was last used; infinite before the first
     log_likelihood : of all measurements that were used
-    dropped : what the filter did not take, as counts by kind
+    dropped : measurements that the filter did not accept, as counts by kind
     """
 
     time_s: Array
@@ -323,8 +323,8 @@ class Windows:
 class SlipTarget(NamedTuple):
     """Slip ratio to aim for on a terrain in a drive state.
 
-    ``status`` is ``unestimated`` (a number somebody assumed), ``estimated`` (learned from
-    ``n_runs`` runs) or ``invalid``.  ``slip_std`` is NaN where nobody measured it.
+    ``status`` is ``unestimated`` (an assumed number), ``estimated`` (learned from ``n_runs`` runs) or
+    ``invalid``.  ``slip_std`` is NaN where it was not estimated.
     """
 
     terrain: str

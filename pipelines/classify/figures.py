@@ -207,7 +207,7 @@ def _draw_class(
     for row, run in zip(rows, drawn, strict=True):
         _in_margin(axes, row, f"{run.n_windows}", va="center")
         if run.accuracy < MISTAKEN_BELOW and run.mistaken_for is not None:
-            taken = f"taken for {shorten(run.mistaken_for, 30)}"
+            taken = f"mistaken for {shorten(run.mistaken_for, 30)}"
             axes.text(run.accuracy + 0.012, row, taken, va="center", fontsize=7.5, bbox=BARE)
 
 

@@ -109,7 +109,7 @@ class CrossvalReport(Figures):
     """A cross-validation: its figures, how they were obtained, and what a reader has to know of them.
 
     ``extras`` is None where they were not asked for, ``dataset``, ``data_digest`` and ``skipped`` where the
-    caller did not say.
+    caller did not give them.
     """
 
     protocol: str

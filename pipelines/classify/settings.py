@@ -63,7 +63,7 @@ class RecipeSettings(Settings):
         return self.n_jobs if self.n_jobs > 0 else os.cpu_count() or 1
 
     def shared(self) -> dict[str, Any]:
-        """Return the fields that evaluation and training share, by name."""
+        """Return the fields that evaluation and training have in common, by name."""
         return {name: getattr(self, name) for name in RecipeSettings.model_fields}
 
     def new_recipe(self) -> WindowPipeline:

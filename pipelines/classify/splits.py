@@ -2,7 +2,7 @@
 
 ``grouped`` is the headline: whole runs are held out.  ``leave-one-run-out`` holds out one run at a time.
 ``published`` deals 5 s partitions of runs at random into folds, as the papers do, so that a test
-partition nearly always has its own run in training; it is there to compare with papers, no more.
+partition nearly always has its own run in training; it serves to compare with papers only.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Fold(NamedTuple):
 
 
 class Samples(NamedTuple):
-    """Windows with what protocols need to know of them.
+    """Windows, and what protocols need besides.
 
     ``group`` is what must not be split: the run, or the partition under ``published``.
     """
@@ -68,7 +68,7 @@ def grouped_samples(
 
 
 def counted(counts: Mapping[str, int]) -> str:
-    """Return counts by kind in words.
+    """Return counts by kind as text.
 
     Examples
     --------
@@ -84,7 +84,7 @@ def labelled(cut: WindowCut) -> WindowCut:
     if not len(known):
         raise DataError(f"not one window is left: {counted(cut.dropped) or 'no run is long enough'}")
     if not known.any():
-        raise DataError("no window has a terrain label: nothing can be learned or judged")
+        raise DataError("no window has a terrain label: nothing can be trained or tested")
     if known.all():
         return cut
     return WindowCut(cut.windows[known], {**cut.dropped, "no single label": int((~known).sum())})
@@ -144,8 +144,7 @@ def _partitions(run: RunLog, layout: Layout) -> tuple[Array, Array]:
 def folds_of(samples: Samples, protocol: str, repeats: int, seed: int) -> list[Fold]:
     """Return the folds of a protocol, repeat by repeat.
 
-    Each repeat deals anew from ``(seed, repeat)``; ``leave-one-run-out`` leaves nothing to deal and has
-    one repeat.
+    Each repeat deals anew from ``(seed, repeat)``; ``leave-one-run-out`` has a single fold assignment.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""From a settings model to the options of a command: a command's file only says what is called with it."""
+"""From a settings model to the options of a command; the file of a command only calls what does the work."""
 
 from __future__ import annotations
 

@@ -43,7 +43,7 @@ def setting(
     Parameters
     ----------
     default : its only default; ``...`` where it has to be given
-    text : what help says of it
+    text : its help
     option, aliases, separated : as :class:`OptionText`
     bounds : of a number, as pydantic names them: ``ge``, ``gt``, ``le``, ``lt``
     """

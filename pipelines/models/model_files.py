@@ -1,7 +1,7 @@
 """A fitted recipe on disk: ``model.skops``, and ``terrain_model.json`` with its checksum beside it.
 
 Models are loaded by skops with the fixed list of types below and nothing else, so that a file cannot bring
-code of its own; the checksum tells a damaged file from a whole one.
+code of its own; the checksum distinguishes a damaged file from an intact one.
 """
 
 from __future__ import annotations
@@ -48,11 +48,11 @@ _LOADER_ERRORS = (
     OSError,
     EOFError,
 )
-"""What skops lets through when a file is damaged, or made by somebody else."""
+"""Errors that skops passes on when a file is damaged or not its own."""
 
 
 class TerrainModel(NamedTuple):
-    """A fitted recipe and what is known of it.
+    """A fitted recipe, and how its training windows were cut.
 
     ``info`` holds ``version, sha256, recipe, classes, window_s, stride_s, steady, channels, rate_hz, seed,
     data_digest, run_digests`` and the version of the package.
@@ -63,7 +63,7 @@ class TerrainModel(NamedTuple):
 
     @property
     def layout(self) -> Layout:
-        """Channels and rates that a log must bring."""
+        """Channels and rates that a log must have."""
         channels = {stream: tuple(names) for stream, names in self.info["channels"].items()}
         return Layout(channels, self.info["rate_hz"])
 

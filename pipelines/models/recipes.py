@@ -18,10 +18,10 @@ RECIPES = ("svm",)
 
 
 class WindowPipeline(Pipeline):  # type: ignore[misc]
-    """A scikit-learn pipeline over windows that tells its last step which run each window is from.
+    """A scikit-learn pipeline over windows that passes the run of each window to its last step.
 
     The last step makes its inner folds of whole runs; ``cross_validate(recipe, windows, terrain,
-    groups=windows.run_id)`` therefore needs no further word.  ``classifier__groups`` overrides the run.
+    groups=windows.run_id)`` therefore needs no further argument.  ``classifier__groups`` overrides the run.
     """
 
     def fit(self, X: Windows, y: Any = None, **params: Any) -> WindowPipeline:
@@ -68,9 +68,9 @@ def make_recipe(
 
 
 def feature_matrix(recipe: WindowPipeline, windows: Windows) -> Array:
-    """Return what the steps before the last one make of the windows.
+    """Return the output of the steps before the last one.
 
-    These steps learn nothing but the channels and rates that all windows share, so their output for a
-    window does not depend on the other windows, and one computation serves all folds.
+    These steps learn nothing but the channels and rates that all windows have in common, so their output for
+    a window does not depend on the other windows, and one computation serves all folds.
     """
     return np.asarray(recipe[:-1].fit_transform(windows))

@@ -37,7 +37,7 @@ REQUIREMENTS = ("terrain-slip", "scikit-learn", "numpy", "scipy", "numba", "skop
 
 
 class Standing(NamedTuple):
-    """What the choice of the champion looks at."""
+    """What the choice of the champion depends on."""
 
     version: str
     data_digest: str
@@ -73,9 +73,9 @@ def code_commit() -> str:
     """
     file = Path(__file__).resolve()
 
-    def git(*words: str) -> str:
+    def git(*arguments: str) -> str:
         done = subprocess.run(
-            ["git", *words], cwd=file.parent, capture_output=True, text=True, check=True, timeout=10
+            ["git", *arguments], cwd=file.parent, capture_output=True, text=True, check=True, timeout=10
         )
         return done.stdout.strip()
 
@@ -130,11 +130,11 @@ def _connect(mlflow: Any, *, create: bool) -> None:
     uri = f"sqlite:///{folder / 'mlflow.db'}"
     mlflow.set_tracking_uri(uri)
     mlflow.set_registry_uri(uri)
-    os.environ.pop("MLFLOW_TRACKING_URI", None)  # MLflow sets it itself; it is the user's word, not ours
+    os.environ.pop("MLFLOW_TRACKING_URI", None)  # MLflow sets it itself; only the user may set it
 
 
 def _failures(mlflow: Any) -> tuple[type[Exception], ...]:
-    """Return what MLflow raises when a server, a database or a folder does not do its part."""
+    """Return what MLflow raises when a server, a database or a folder fails."""
     from sqlalchemy.exc import SQLAlchemyError
 
     return (mlflow.exceptions.MlflowException, SQLAlchemyError, OSError)
@@ -157,7 +157,7 @@ def log_training(
     name : name of the registered model
     recipe : fitted recipe
     windows : the windows it was fitted on, for the signature
-    info : what ``terrain_model.json`` shall say; ``data_digest`` is compared with the champion's
+    info : content of ``terrain_model.json``; ``data_digest`` is compared with the champion's
     params, metrics : as MLflow holds them; ``macro_f1`` must be among the metrics
     documents : JSON documents by file name
     figures : figures by name, logged as PNG
@@ -246,7 +246,7 @@ def _log_model(
         write_info(Path(path), dict(info))
 
     flavor = SimpleNamespace(save_model=save_model, __name__="mlflow.sklearn")
-    with redirect_stderr(io.StringIO()):  # it prints what is reported by the caller anyway
+    with redirect_stderr(io.StringIO()):  # the caller reports what it prints
         return Model.log(
             artifact_path=None,
             name="model",
@@ -305,10 +305,8 @@ def load_model(uri: str) -> TerrainModel:
         ensure_tracking()
     with _quiet() as mlflow:
         _connect(mlflow, create=False)
-        failures: tuple[type[Exception], ...] = (
-            *_failures(mlflow),
-            ImportError,
-        )  # some storages want a package
+        # some storages need a package of their own
+        failures: tuple[type[Exception], ...] = (*_failures(mlflow), ImportError)
         try:
             folder = mlflow.artifacts.download_artifacts(uri)
         except failures as error:

@@ -55,8 +55,8 @@ CAPTIONS = {
         "two standard deviations."
     ),
     "importance": (
-        "A long bar is an input that the model needs; related inputs share their weight, so that each "
-        "alone looks small."
+        "A long bar is an input that the model needs; the importance of related inputs is divided "
+        "among them, so that each alone looks small."
     ),
 }
 
@@ -70,7 +70,7 @@ class Mark(NamedTuple):
 
 
 class Headline(NamedTuple):
-    """The accuracy in words, beside what it must beat; ``alone`` are the terrains with a single run."""
+    """Text of the accuracy, values that it must exceed, and the terrains ``alone`` with a single run."""
 
     text: str
     alone: tuple[str, ...]

@@ -14,7 +14,7 @@ from pipelines.runs.results import Imported
 class KeptRuns:
     """Where the runs lie, and whether they were there from an earlier call.
 
-    ``imported`` says what was found when they were read from a folder of the user.
+    ``imported`` is the result of reading them, where they come from a folder of the user.
     """
 
     out: Path

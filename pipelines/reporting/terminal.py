@@ -1,4 +1,4 @@
-"""The terminal: progress bars on stderr, results on stdout, and what the tables of all screens share."""
+"""The terminal: progress bars on stderr, results on stdout, and parts of tables that all screens use."""
 
 from __future__ import annotations
 

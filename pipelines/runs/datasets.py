@@ -41,10 +41,10 @@ def load_runs(
     folder : a run folder, a folder of run folders, a folder in the BorealTC or the DRIVE layout, or the
         folder that the files of ``mapping`` are found under
     layout : one of ``LAYOUTS``; ``auto`` looks
-    mapping : YAML file that says how to read CSV files (``terrain.logs.mapping``)
+    mapping : YAML file that describes how to read CSV files (``terrain.logs.mapping``)
     repair : drop and count what a strict read refuses, and skip runs that cannot be read at all
     align : bring the wheel stream onto the clock of the IMU where the two clocks can be compared
-    on_skip : told in one sentence of each run that is skipped when repairing; logs a warning by default
+    on_skip : called with a sentence for each run that is skipped when repairing; logs a warning by default
 
     Raises
     ------

@@ -21,7 +21,7 @@ class ReadSettings(Settings):
     """How files are read."""
 
     layout: Layout = setting("auto", "Layout of the folder.", option="--format")
-    mapping: Path | None = setting(None, "YAML file that says how to read CSV files.")
+    mapping: Path | None = setting(None, "YAML file that describes how to read CSV files.")
     repair: bool = setting(False, "Drop and count what a strict read refuses.")
 
 

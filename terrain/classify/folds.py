@@ -2,8 +2,8 @@
 
 Runs are dealt at random, class by class, each to the fold that so far holds the fewest runs of that class
 and, among those, the fewest windows.  (scikit-learn's ``StratifiedGroupKFold`` sorts groups by size before
-dealing; with runs of unequal length nearly every seed gives the same folds, and a spread over seeds says
-nothing.)  A class that has a single run cannot be held out whole and be learned as well: its run is
+dealing; with runs of unequal length nearly every seed gives the same folds, and a spread over seeds is
+meaningless.)  A class that has a single run cannot be both held out whole and trained on: its run is
 cut into contiguous blocks, and training windows beside a test block are left out.
 """
 

@@ -1,14 +1,13 @@
 """RBF support vector machine that chooses and calibrates itself on folds which keep runs whole.
 
-Windows of one run resemble each other more than they resemble the same terrain on another day.  Hyper-
-parameters chosen, or probabilities calibrated, on folds that split runs are therefore too optimistic;
+Windows of one run resemble each other more than they resemble windows of the same terrain in another run.
+Hyper-parameters chosen, or probabilities calibrated, on folds that split runs are therefore too optimistic;
 here the inner folds are made of whole groups wherever a class has more than one.
 
 Steps of ``fit``: scale and select on each inner training part, fit every candidate there, keep the
 candidate with the best accuracy on the held-out parts; its held-out decision values d give the
 temperature T of ``p = softmax(d / T)`` that makes them most likely (Guo et al. 2017, section 4.2), which
-sets how sure the classifier may be and never changes what it says; scale, select and fit once more on
-everything.
+sets the confidence and never changes the predicted class; scale, select and fit once more on everything.
 """
 
 from __future__ import annotations
@@ -35,22 +34,21 @@ from terrain.errors import DataError
 from terrain.records import Array
 
 CLIP_STD = 5.0
-"""Scaled features are clipped here, so that one faulty sample cannot carry a window off all known ground."""
+"""Scaled features are clipped here, so that one faulty sample cannot move a window far from all others."""
 
 LOG_TEMPERATURE_BOUNDS = (-4.0, 4.0)
 """Decision values lie within about +-k for k classes: beyond these bounds probabilities are 0, 1 or flat."""
 
-
 MAX_INNER_ROWS = 4000
-"""Choices are made on at most so many rows, thinned evenly: overlapping windows repeat themselves, and the
-cost of an SVM grows with the square of their number.  The last fit takes them all."""
+"""Hyper-parameters are chosen on at most so many rows, thinned evenly: overlapping windows repeat each other,
+and the cost of an SVM grows with the square of their number.  The last fit uses all rows."""
 
 
 class Candidate(NamedTuple):
     """One choice of hyper-parameters.
 
     ``gamma`` is relative to 1 / number of selected features, so that it means the same distance whatever
-    the number; ``percentile`` is the share of features kept by an F test.
+    the number; ``percentile`` is the percentage of the features that an F test keeps.
     """
 
     C: float
@@ -179,7 +177,7 @@ class GroupedSVC(ClassifierMixin, BaseEstimator):
     def decision_function(self, X: Array) -> Array:
         """Return one decision value a class (n, k), of which the largest wins.
 
-        As in all of scikit-learn, two classes share one value (n,), positive for the second.
+        As in all of scikit-learn, two classes have one value (n,), positive for the second.
         """
         decisions = self._decisions(X)
         return decisions[:, 1] if len(self.classes_) == 2 else decisions
@@ -199,7 +197,7 @@ class GroupedSVC(ClassifierMixin, BaseEstimator):
         return np.asarray(self.classes_[best])
 
     def __sklearn_tags__(self) -> Any:
-        """Tell scikit-learn that NaN is accepted."""
+        """Declare that NaN is accepted."""
         tags = super().__sklearn_tags__()
         tags.input_tags.allow_nan = True
         return tags

@@ -43,20 +43,20 @@ def test_spectrum_agrees_with_scipy_and_its_definitions(seed, n_samples, rate_hz
     edges = np.linspace(0, f.size, n_bands(n_samples) + 1).round().astype(int)
     expected = [p[:, :, a:b].mean(axis=2) for a, b in pairwise(edges)]
     np.testing.assert_allclose(10.0**bands, np.stack(expected, axis=2) + FLOOR, rtol=1e-9)
-    share = p / p.sum(axis=2, keepdims=True)
-    centroid = np.sum(share * f, axis=2)
+    weight = p / p.sum(axis=2, keepdims=True)
+    centroid = np.sum(weight * f, axis=2)
     away = f - centroid[:, :, None]
-    spread = np.sqrt(np.sum(share * away**2, axis=2))
+    spread = np.sqrt(np.sum(weight * away**2, axis=2))
     for name, values_of in {
         "centroid": centroid,
         "spread": spread,
-        "spectral_skewness": np.sum(share * away**3, axis=2) / spread**3,
-        "spectral_kurtosis": np.sum(share * away**4, axis=2) / spread**4,
-        "entropy": -np.sum(share * np.log(share), axis=2) / np.log(f.size),
+        "spectral_skewness": np.sum(weight * away**3, axis=2) / spread**3,
+        "spectral_kurtosis": np.sum(weight * away**4, axis=2) / spread**4,
+        "entropy": -np.sum(weight * np.log(weight), axis=2) / np.log(f.size),
         "flatness": np.exp(np.log(p).mean(axis=2)) / p.mean(axis=2),
-        "rolloff": f[np.argmax(np.cumsum(share, axis=2) >= 0.85, axis=2)],
+        "rolloff": f[np.argmax(np.cumsum(weight, axis=2) >= 0.85, axis=2)],
         "peak": f[p.argmax(axis=2)],
-        "peak_share": share.max(axis=2),
+        "peak_ratio": weight.max(axis=2),
     }.items():
         np.testing.assert_allclose(moments[name], values_of, rtol=1e-5, atol=1e-7, err_msg=name)
 
@@ -75,18 +75,18 @@ def test_total_power_is_the_variance_of_the_tapered_signal(n_samples, rate_hz):
 @given(
     rate_hz=st.sampled_from([25.0, 50.0, 100.0, 187.0]),
     n_samples=st.sampled_from([50, 100, 200, 201]),
-    share_of_nyquist=st.floats(0.1, 0.9),
+    fraction_of_nyquist=st.floats(0.1, 0.9),
     amplitude=st.floats(0.01, 30.0),
 )
-def test_a_tone_lands_in_its_band(rate_hz, n_samples, share_of_nyquist, amplitude):
-    tone_hz = share_of_nyquist * rate_hz / 2
+def test_a_tone_lands_in_its_band(rate_hz, n_samples, fraction_of_nyquist, amplitude):
+    tone_hz = fraction_of_nyquist * rate_hz / 2
     time_s = np.arange(n_samples) / rate_hz
     bands, moments = table(amplitude * np.sin(2 * np.pi * tone_hz * time_s)[None, None], rate_hz)
     resolution_hz = rate_hz / n_samples
     assert abs(moments["peak"][0, 0] - tone_hz) <= 0.51 * resolution_hz
     assert abs(moments["centroid"][0, 0] - tone_hz) < resolution_hz
     assert moments["spread"][0, 0] < 2 * resolution_hz
-    band = share_of_nyquist * bands.shape[2]
+    band = fraction_of_nyquist * bands.shape[2]
     assert abs(int(bands[0, 0].argmax()) + 0.5 - band) <= 0.5 + bands.shape[2] / (n_samples / 2)
     power = 10.0 ** moments["log_power"][0, 0]
     assert power == pytest.approx(amplitude**2 / 2, rel=0.05)

@@ -122,9 +122,9 @@ def test_bad_stamps_cost_one_sample_each_and_nothing_else():
     batch = cut_windows([RunLog("a", "husky", STREAMS)], RULE)
     events = merged(STREAMS)
     bad = [np.nan, np.inf, -np.inf, -1.0, 5.0, 1e300, 1e9]
-    for i, time_s in enumerate(bad):  # the last two come one after the other: a wild stamp confirms no other
+    for i, time_s in enumerate(bad):  # the last two come one after the other: a wrong stamp confirms no other
         events.insert(len(events) // 2 + 7 * min(i, 5), ("imu", time_s, (9.0, 9.0)))
-    events.insert(0, ("imu", 1e9, (9.0, 9.0)))  # nor does a wild first stamp
+    events.insert(0, ("imu", 1e9, (9.0, 9.0)))  # nor does a wrong first stamp
     stream, found = streamed(events, RULE, LAYOUT)
     assert_same(batch.windows, found)
     assert stream.dropped_samples == {

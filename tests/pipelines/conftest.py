@@ -42,7 +42,7 @@ def driven_run(
     current_a=None,
     label=...,
 ):
-    """Return a run driven straight on at one speed over a terrain that shakes the robot in its own way.
+    """Return a run driven straight on at one speed over a terrain with vibrations of its own.
 
     ``level``, ``smoothness`` and ``current_a`` replace what the terrain does; ``label`` what it is called.
     """
@@ -51,7 +51,7 @@ def driven_run(
     smoothness = SMOOTHNESS[terrain] if smoothness is None else smoothness
     current_a = CURRENT_A[terrain] if current_a is None else current_a
     n_imu, n_wheels = round(duration_s * IMU_RATE_HZ), round(duration_s * WHEEL_RATE_HZ)
-    level *= np.exp(0.08 * rng.standard_normal())  # no two days are the same
+    level *= np.exp(0.08 * rng.standard_normal())  # no two runs are the same
     shaking = level * coloured_noise(rng, n_imu, len(IMU), smoothness) * [0.1, 0.1, 0.05, 1.0, 1.0, 1.0]
     imu = shaking + rng.normal(0, 0.05, len(IMU)) + [0, 0, 0, 0, 0, 9.81]
     speed = speed_mps + 0.01 * rng.standard_normal((n_wheels, 2))
@@ -96,7 +96,7 @@ def drive_all():
 
 @pytest.fixture(scope="session")
 def runs():
-    """Twelve runs of three terrains that are easy to tell apart."""
+    """Twelve runs of three terrains that are easy to distinguish."""
     return driven_runs()
 
 

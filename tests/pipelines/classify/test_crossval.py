@@ -55,7 +55,7 @@ def test_the_report_has_what_is_promised_and_is_json(report, runs):
     assert (len(report.folds), len(report.per_run), report.repeats) == (10, 12, 2)
     assert np.sum(report.confusion) == 2 * 144
     low, high = report.accuracy_ci
-    assert 0.5 < low <= report.accuracy <= high <= 1.0  # terrains that differ are told apart
+    assert 0.5 < low <= report.accuracy <= high <= 1.0  # terrains that differ are distinguished
     assert report.accuracy == pytest.approx(np.trace(report.confusion) / 288)
     assert report.dropped == {}
 
@@ -67,9 +67,9 @@ def test_one_seed_gives_one_report_and_another_seed_another(report, runs, settin
     assert other.per_run != report.per_run
 
 
-def test_where_labels_are_but_names_of_runs_grouped_says_chance_and_published_is_fooled(drive, settings):
+def test_where_labels_only_identify_runs_grouped_gives_chance_and_published_does_not(drive, settings):
     def mislabelled(seed):
-        """Eight runs, each with a vibration of its own; what they are called says nothing of it."""
+        """Eight runs, each with a vibration of its own; their labels do not depend on it."""
         rng = np.random.default_rng(seed)
         names = rng.permutation(["ICE"] * 4 + ["MUD"] * 4)
         levels, colours = (
@@ -117,7 +117,7 @@ def test_signal_sets_are_switched_off_by_name(runs, settings, report):
         n_features("slip")
 
 
-def test_a_signal_set_carries_what_it_knows_and_no_more(drive_all, settings):
+def test_a_signal_set_carries_its_own_information_only(drive_all, settings):
     alike = {"level": 0.8, "smoothness": 0.4}  # only the currents differ from terrain to terrain
     runs = [
         run
@@ -163,7 +163,7 @@ def test_settings_that_make_no_sense_are_refused():
     assert CrossvalSettings().rule.length_s == 2.0
 
 
-def test_vulpi_is_told_apart_on_runs_that_were_held_out(datasets_dir, settings):
+def test_terrains_of_vulpi_are_classified_on_held_out_runs(datasets_dir, settings):
     report = crossval(load_runs(datasets_dir / "vulpi"), settings())
     assert report.accuracy > 0.90
     assert report.ece < 0.08

@@ -31,13 +31,13 @@ def test_scikit_learn_cross_validates_whole_recipes_to_the_same_answers(samples,
     windows = samples.cut.windows
     y = windows.terrain.astype(str)
     folds = [(result.fold.train, result.fold.test) for result in results]
-    ours = pool(results, y)
-    theirs = cross_val_predict(make_recipe("svm", seed=3), windows, y, cv=folds, method="predict_proba")
-    np.testing.assert_allclose(ours.probability[0], theirs, atol=1e-9)
+    pooled = pool(results, y)
+    expected = cross_val_predict(make_recipe("svm", seed=3), windows, y, cv=folds, method="predict_proba")
+    np.testing.assert_allclose(pooled.probability[0], expected, atol=1e-9)
     found = cross_validate(
         make_recipe("svm", seed=3), windows, y, groups=windows.run_id, cv=folds[:2], return_estimator=True
     )
-    report = summarise(ours, samples, seed=0)
+    report = summarise(pooled, samples, seed=0)
     assert found["test_score"].tolist() == pytest.approx([fold.accuracy for fold in report.folds[:2]])
     for estimator, fold in zip(found["estimator"], report.folds[:2], strict=True):
         assert 0 < estimator[-1].n_inner_fits_ <= 20
@@ -61,7 +61,7 @@ def test_the_recipe_gives_its_last_step_the_run_of_each_window(samples):
 
 
 def hand_made(run_ids, start_s, y, answers, folds, classes=("ice", "mud")):
-    """Return samples and results in which ``answers`` (repeats, n) says what was predicted, at 0.8."""
+    """Return samples and results in which ``answers`` (repeats, n) are predicted, at 0.8."""
     n = len(y)
     windows = Windows(
         {"imu": np.zeros((n, 1, 4))},
@@ -101,7 +101,7 @@ def test_figures_of_hand_made_predictions():
     assert report.confusion == ((5, 3), (1, 7))
     assert report.per_class["ice"].recall == 5 / 8
     assert [fold.accuracy for fold in report.folds] == [0.75, 1.0, 0.5, 0.75]
-    # All are equally sure: 0.8 said, 7/8 and 5/8 right; every window its own bin of mass one.
+    # All are equally confident: 0.8 stated, 7/8 and 5/8 right; every window its own bin of mass one.
     assert report.ece == pytest.approx(np.mean([(7 * 0.2 + 1 * 0.8) / 8, (5 * 0.2 + 3 * 0.8) / 8]))
     # Votes are of one or two windows of equal weight: only 'd' could be outvoted, in the second repeat.
     per_run = {row.run_id: row for row in report.per_run}

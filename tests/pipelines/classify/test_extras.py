@@ -41,7 +41,7 @@ def test_the_speed_of_a_run_is_that_of_its_faster_wheel_where_it_moves(drive):
     wheels = run.streams["wheels"]
     values = wheels.values.copy()
     values[:, 0], values[:, 1] = 0.2, -0.6  # turning: the right wheel is faster, backwards
-    values[:240, :2] = [0.02, -0.01]  # it creeps, or stands, for 24 of 40 s
+    values[:240, :2] = [0.02, -0.01]  # it creeps, or rests, for 24 of 40 s
     moved = RunLog(
         "r", "husky", {**run.streams, "wheels": Stream(wheels.time_s, values, wheels.channels)}, run.labels
     )
@@ -96,7 +96,7 @@ def test_a_class_with_too_little_on_a_side_is_left_out_and_named(runs_at):
         assert split.left_out == {"GRAVEL": "slow runs: 56 s"}
 
 
-def test_what_is_learned_slow_and_does_not_hold_fast_is_found_out(runs_at, settings):
+def test_what_is_learned_slow_and_does_not_apply_fast_is_detected(runs_at, settings):
     """The vibration of a fast run is that of the next terrain driven slowly; in the control it is its own."""
     levels = {"ASPHALT": 0.3, "GRASS": 0.8, "GRAVEL": 2.0}
     following = dict(zip(levels, [*list(levels.values())[1:], levels["ASPHALT"]], strict=True))
@@ -159,7 +159,7 @@ def test_the_learning_curve_draws_that_many_runs_and_leaves_test_folds_alone(dri
     monkeypatch.setattr(extras, "fit_folds", spy)
     examples = Examples(feature_matrix(recipe, windows), windows.terrain.astype(str), samples.group)
     curve = learning_curve(recipe[-1], examples, folds, 0.77, 0, 1)
-    assert len(seen) == 3 * CURVE_DRAWS * len(folds)  # 1, 2 and 3 of the 4 runs that each fold can teach
+    assert len(seen) == 3 * CURVE_DRAWS * len(folds)  # 1, 2 and 3 of the 4 training runs of each fold
     for fold in seen:
         (original,) = [f for f in folds if np.array_equal(f.test, fold.test)]
         assert set(fold.train) <= set(original.train)
@@ -202,7 +202,7 @@ def test_a_curve_that_still_climbs_gives_no_number():
 
 
 def test_a_run_slow_on_one_class_and_fast_on_another_is_on_no_side(runs_at, settings, monkeypatch):
-    """Its windows would otherwise teach and test at once."""
+    """Its windows would otherwise train and test at once."""
     folds = []
     monkeypatch.setattr(extras, "fit_folds", lambda *args: folds.extend(args[2]) or [])
     monkeypatch.setattr(extras, "_accuracy", lambda *_: 0.5)

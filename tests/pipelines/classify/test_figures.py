@@ -1,4 +1,4 @@
-"""What is drawn is what the report says; the same report gives the same bytes."""
+"""Figures show the numbers of the report; the same report gives the same bytes."""
 
 import subprocess
 import sys
@@ -58,7 +58,7 @@ def overlap(figure, texts):
     return [(a, b) for i, (a, left) in enumerate(boxes) for b, right in boxes[:i] if left.overlaps(right)]
 
 
-def test_a_confusion_cell_holds_share_and_windows_per_repeat(report):
+def test_a_confusion_cell_holds_percentage_and_windows_per_repeat(report):
     assert texts(confusion_figure(report).axes[0]) == ["75%\n(7.5)", "25%\n(2.5)", "5%\n(1.5)", "95%\n(28.5)"]
 
 
@@ -113,9 +113,9 @@ def test_a_long_name_of_the_data_does_not_push_the_title_out(report):
         assert figure._suptitle.get_window_extent().x1 <= figure.bbox.width
 
 
-def test_only_a_run_below_one_half_says_what_it_is_taken_for(report):
-    assert [text for text in texts(per_run_figure(report).axes[0]) if "taken for" in text] == [
-        "taken for ICE"
+def test_only_a_run_below_one_half_shows_what_it_is_mistaken_for(report):
+    assert [text for text in texts(per_run_figure(report).axes[0]) if "mistaken for" in text] == [
+        "mistaken for ICE"
     ]
 
 

@@ -15,7 +15,7 @@ NAMES = [
 
 
 def importance(hidden, seed=0):
-    """Return drops by channel; only the features of channel ``hidden`` know the terrain, all the same."""
+    """Return drops by channel; only the features of channel ``hidden`` depend on the terrain, all alike."""
     rng = np.random.default_rng(4)
     run = np.repeat(np.arange(12), 30)
     y = np.array(["ice", "mud", "snow"])[run % 3]
@@ -33,7 +33,7 @@ def importance(hidden, seed=0):
 
 
 @pytest.mark.parametrize("hidden", ["imu.accel_z", "imu.gyro_x", "wheels.current_left"])
-def test_the_channel_that_knows_the_terrain_is_named(hidden):
+def test_the_channel_that_depends_on_the_terrain_is_named(hidden):
     """Its features repeat each other: shuffled one by one, none would be missed."""
     drops = importance(hidden)
     assert next(iter(drops)) == hidden
@@ -41,7 +41,7 @@ def test_the_channel_that_knows_the_terrain_is_named(hidden):
     assert all(abs(drop) < 0.1 for channel, (drop, _) in drops.items() if channel != hidden)
 
 
-def test_where_no_channel_knows_it_none_is_named():
+def test_where_no_channel_depends_on_it_none_is_named():
     assert all(abs(drop) < 0.1 for drop, _ in importance(None).values())
 
 

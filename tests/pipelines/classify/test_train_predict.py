@@ -25,7 +25,7 @@ def model(tracked):
     return read_model(tracked[0] / "model")
 
 
-def test_training_is_judged_on_held_out_runs_and_says_where_the_model_is(tracked):
+def test_training_is_evaluated_on_held_out_runs_and_names_the_model(tracked):
     _, result = tracked
     document = as_json(result)
     json.dumps(document, allow_nan=False)
@@ -83,7 +83,7 @@ def test_a_model_of_some_signals_needs_no_others(runs, drive, settings, options,
     assert predict([bare], model, load_slip_table()).n_windows == 12
 
 
-def test_labels_the_model_never_saw_are_predicted_counted_and_not_judged(model, drive, drive_all):
+def test_labels_that_were_not_trained_are_predicted_counted_and_not_judged(model, drive, drive_all):
     known = drive_all(n_runs=1, seed=5)
     alone = predict(known, model, load_slip_table())
     strange = [

@@ -17,13 +17,13 @@ from terrain.errors import ModelError
 
 
 def put(folder, content, **changed):
-    """Put other bytes in place of the model, with a checksum that says they are right."""
+    """Put other bytes in place of the model, with a checksum that fits them."""
     info = json.loads((folder / INFO_FILE).read_text()) | changed
     (folder / MODEL_FILE).write_bytes(content)
     write_info(folder, {key: value for key, value in info.items() if key not in ("version", "sha256")})
 
 
-def test_what_is_saved_says_the_same_to_the_last_bit(model_dir, runs):
+def test_a_saved_model_predicts_the_same_to_the_last_bit(model_dir, runs):
     model = read_model(model_dir)
     windows = cut_windows(runs, model.rule).windows
     live = make_recipe("svm").fit(windows, windows.terrain.astype(str))
@@ -55,7 +55,7 @@ def test_damage_that_the_checksum_covers_up_ends_in_one_sentence(model_dir):
             read_model(model_dir)
         except ModelError as error:
             refusals.append(str(error))
-    assert len(refusals) > 50  # bytes that say nothing may change unseen; nothing else is ever raised
+    assert len(refusals) > 50  # bytes that carry nothing may change unseen; nothing else is ever raised
     assert not [sentence for sentence in refusals if "\n" in sentence]
 
 

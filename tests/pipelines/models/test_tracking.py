@@ -69,7 +69,7 @@ def test_a_training_run_holds_what_is_needed_to_judge_and_repeat_it(in_tracked, 
     }
 
 
-def test_the_pyfunc_flavour_says_what_the_recipe_says(in_tracked, mlflow, runs):
+def test_the_pyfunc_flavour_predicts_as_the_recipe(in_tracked, mlflow, runs):
     model = load_model(in_tracked.registered.model_uri)
     windows = cut_windows(runs, model.rule).windows
     served = mlflow.pyfunc.load_model(in_tracked.registered.model_uri).predict(windows.values)
@@ -142,9 +142,9 @@ def test_the_server_that_is_named_is_the_one_that_is_used(tracked, log, tmp_path
 @pytest.mark.parametrize(
     "uri",
     [
-        "models:/nobody@champion",
+        "models:/missing@champion",
         "models:/drawn/99",
-        "models:/drawn@nobody",
+        "models:/drawn@missing",
         "models:/",
         "runs:/0123/model",
     ],

@@ -37,7 +37,7 @@ def test_two_runs_with_one_id_are_refused(tmp_path, make_run):
 
 
 @pytest.mark.parametrize("layout", ["auto", "runs", "borealtc"])
-def test_a_folder_without_runs_says_what_is_accepted(tmp_path, layout):
+def test_a_folder_without_runs_names_what_is_accepted(tmp_path, layout):
     with pytest.raises(LogError, match=r"holds no run; accepted are run folders \(run.json\), the BorealTC"):
         load_runs(tmp_path, layout=layout)
     with pytest.raises(LogError, match="nowhere: does not exist; accepted are"):
@@ -56,15 +56,15 @@ def test_options_that_do_not_go_together_are_refused(borealtc_dir, tmp_path):
         load_runs(borealtc_dir, layout="runs", mapping=tmp_path / "map.yaml")
 
 
-def test_repair_skips_what_cannot_be_read_and_says_so(borealtc_dir, caplog):
+def test_repair_skips_and_reports_what_cannot_be_read(borealtc_dir, caplog):
     (borealtc_dir / "SNOW" / "pro_01.csv").unlink()
     (borealtc_dir / "ICE" / "imu_01.csv").write_text("")
     with pytest.raises(LogError):
         load_runs(borealtc_dir)
-    told = []
-    runs = load_runs(borealtc_dir, repair=True, on_skip=told.append)
+    skipped = []
+    runs = load_runs(borealtc_dir, repair=True, on_skip=skipped.append)
     assert [run.run_id for run in runs] == ["SNOW_02"]
-    assert told == [
+    assert skipped == [
         "run skipped: ICE/imu_01.csv: is empty (a header and at least 2 rows are needed)",
         "run skipped: SNOW/pro_01.csv: is missing",
     ]
@@ -74,10 +74,10 @@ def test_repair_skips_what_cannot_be_read_and_says_so(borealtc_dir, caplog):
     with pytest.raises(
         LogError, match=r"not one run could be read, the first for this: ICE/imu_01\.csv: is empty"
     ):
-        load_runs(borealtc_dir, repair=True, on_skip=told.append)
+        load_runs(borealtc_dir, repair=True, on_skip=skipped.append)
 
 
-def test_align_moves_the_wheels_of_runs_that_tell_their_clocks(datasets_dir, tmp_path):
+def test_align_moves_the_wheels_of_runs_whose_clocks_can_be_compared(datasets_dir, tmp_path):
     for name in ("imu_04.csv", "pro_04.csv"):
         (tmp_path / "ASPHALT").mkdir(exist_ok=True)
         shutil.copy(datasets_dir / "borealtc" / "ASPHALT" / name, tmp_path / "ASPHALT")

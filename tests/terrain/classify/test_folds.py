@@ -66,8 +66,8 @@ def test_different_seeds_give_different_folds_though_runs_are_of_unequal_length(
         of_run = np.array([fold[groups == run][0] for run in runs])
         together[seed] = of_run[:, None] == of_run
     assert len({t.tobytes() for t in together}) == 40
-    share = together.mean(axis=0)[np.triu_indices(len(runs), 1)]
-    assert share.max() < 0.6  # no two runs always meet
+    together_ratio = together.mean(axis=0)[np.triu_indices(len(runs), 1)]
+    assert together_ratio.max() < 0.6  # no two runs always meet
     np.testing.assert_array_equal(
         fold_numbers(y, groups, 5, np.random.default_rng(7)),
         fold_numbers(y, groups, 5, np.random.default_rng(7)),

@@ -74,26 +74,26 @@ def test_calibration_bins_are_of_equal_mass_whatever_the_order():
     assert [row.n_windows for row in calibration(confidence[:4], right[:4]).reliability] == [1] * 4
 
 
-def ballots(*words):
-    """Return probabilities of three classes in which ``a``, ``b`` or ``c`` gets what the number says."""
-    probability = np.array([[(1 - share) / 2] * 3 for _, share in words])
-    for row, (name, share) in zip(probability, words, strict=True):
-        row["abc".index(name)] = share
+def ballots(*votes):
+    """Return probabilities of three classes in which ``a``, ``b`` or ``c`` gets that probability."""
+    probability = np.array([[(1 - p) / 2] * 3 for _, p in votes])
+    for row, (name, p) in zip(probability, votes, strict=True):
+        row["abc".index(name)] = p
     return probability
 
 
 def test_a_vote_counts_the_windows_of_the_last_five_seconds():
-    words = [("a", 0.9), ("b", 0.5), ("b", 0.5), ("b", 0.5), ("a", 0.9), ("a", 0.9), ("a", 0.9)]
-    voted = vote(ballots(*words), np.zeros(7), np.arange(7.0), 1.0)
+    votes = [("a", 0.9), ("b", 0.5), ("b", 0.5), ("b", 0.5), ("a", 0.9), ("a", 0.9), ("a", 0.9)]
+    voted = vote(ballots(*votes), np.zeros(7), np.arange(7.0), 1.0)
     # At the end of window 4 the last 5 s hold a b b b a; of window 5: b b b a a; of window 6: b b a a a.
     assert "".join("abc"[i] for i in voted) == "aabbbba"
-    # Windows of 2 s: only two lie wholly within 5 s; with one each the surer one wins, either way round.
+    # Windows of 2 s: only two lie wholly within 5 s; of one each the more probable wins, in either order.
     pairs = [("a", 0.9), ("b", 0.5), ("a", 0.6), ("c", 0.8)]
     assert vote(ballots(*pairs), np.zeros(4), 2.0 * np.arange(4), 2.0).tolist() == [0, 0, 0, 2]
     # A pause of the log does not stretch the five seconds, and a window longer than that votes alone.
     late = np.array([0.0, 1.0, 2.0, 30.0])
     assert vote(ballots(("a", 0.9), ("a", 0.9), ("a", 0.9), ("b", 0.5)), np.zeros(4), late, 1.0)[-1] == 1
-    assert vote(ballots(*words), np.zeros(7), np.arange(7.0), 6.0).tolist() == [0, 1, 1, 1, 0, 0, 0]
+    assert vote(ballots(*votes), np.zeros(7), np.arange(7.0), 6.0).tolist() == [0, 1, 1, 1, 0, 0, 0]
 
 
 def test_votes_agree_with_a_slow_count_and_never_cross_segments():

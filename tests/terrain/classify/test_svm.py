@@ -38,7 +38,7 @@ def test_contract_of_scikit_learn(estimator, check):
 
 
 @pytest.mark.parametrize("terrains", [["ice", "snow"], ["ice", "sand", "snow"]])
-def test_probabilities_sum_to_one_and_agree_with_the_answer(terrains):
+def test_probabilities_sum_to_one_and_agree_with_the_prediction(terrains):
     X, y, runs = draw_runs()
     kept = np.isin(y, terrains)
     model = GroupedSVC().fit(X[kept], y[kept], groups=runs[kept])
@@ -65,7 +65,7 @@ def test_the_choice_is_the_best_held_out_candidate_and_costs_few_fits():
 
 
 class SpyOnPreparation:
-    """Stands in for the scaling and selection, and writes down which runs it sees (in column 0)."""
+    """Replaces the scaling and selection, and records which runs it is fitted on (in column 0)."""
 
     def __init__(self, make, seen):
         self.pipeline, self.seen = make, seen
@@ -84,7 +84,7 @@ def test_inner_folds_never_split_a_run(monkeypatch):
     X, y, runs = draw_runs(n_runs=5)
     X[:, 0] = runs
     seen, original = [], svm._preparation
-    monkeypatch.setattr(svm, "_preparation", lambda share: SpyOnPreparation(original(share), seen))
+    monkeypatch.setattr(svm, "_preparation", lambda percentile: SpyOnPreparation(original(percentile), seen))
     GroupedSVC().fit(X, y, groups=runs)
     *inner, (final, held_out_at_the_end) = seen
     assert len(inner) == 3 * len({candidate.percentile for candidate in CANDIDATES})
@@ -96,7 +96,7 @@ def test_inner_folds_never_split_a_run(monkeypatch):
     assert not held_out_at_the_end
 
 
-def test_labels_that_belong_to_runs_alone_give_scores_of_chance():
+def test_labels_that_only_identify_runs_give_scores_of_chance():
     scores, split = [], []
     for seed in range(6):
         rng = np.random.default_rng(seed)
@@ -111,7 +111,7 @@ def test_labels_that_belong_to_runs_alone_give_scores_of_chance():
     assert np.mean(split) > 0.95  # the test can fail: folds that split runs look perfect
 
 
-def test_probabilities_are_as_sure_as_they_are_right():
+def test_confidence_agrees_with_accuracy():
     rng = np.random.default_rng(0)
 
     def draw(n):
@@ -122,14 +122,16 @@ def test_probabilities_are_as_sure_as_they_are_right():
     new, truth = draw(6000)
     model = GroupedSVC(((1.0, 0.2, 100.0), (10.0, 0.4, 100.0))).fit(X, y)
     probability = model.predict_proba(new)
-    sure, right = probability.max(axis=1), model.predict(new) == truth
-    parts = np.array_split(np.argsort(sure), 15)
-    ece = sum(len(part) / len(sure) * abs(sure[part].mean() - right[part].mean()) for part in parts)
+    confidence, right = probability.max(axis=1), model.predict(new) == truth
+    parts = np.array_split(np.argsort(confidence), 15)
+    ece = sum(
+        len(part) / len(confidence) * abs(confidence[part].mean() - right[part].mean()) for part in parts
+    )
     assert ece < 0.06  # of which 0.02 is the chance of 400 samples a bin
     posterior = expit(1.2 * new[:, 0] - 0.72)
     assert np.mean(np.abs(posterior - probability[:, 1])) < 0.1
     uncalibrated = svm.softmax(model._decisions(new) / 0.2, axis=1).max(axis=1)
-    assert abs(uncalibrated.mean() - right.mean()) > 3 * abs(sure.mean() - right.mean())
+    assert abs(uncalibrated.mean() - right.mean()) > 3 * abs(confidence.mean() - right.mean())
 
 
 def test_fit_is_deterministic_and_clone_learns_the_same():
@@ -140,7 +142,7 @@ def test_fit_is_deterministic_and_clone_learns_the_same():
         np.testing.assert_array_equal(model.predict_proba(X), models[0].predict_proba(X))
 
 
-def test_features_that_are_missing_constant_or_wild_do_no_harm():
+def test_features_that_are_missing_constant_or_extreme_do_no_harm():
     X, y, runs = draw_runs()
     new, truth, _ = draw_runs(seed=1)
     clean = np.mean(GroupedSVC().fit(X, y, groups=runs).predict(new) == truth)
@@ -175,7 +177,7 @@ def test_what_cannot_be_learned_is_refused():
 
 
 def test_inner_folds_leave_out_what_shares_samples_with_a_test_block(monkeypatch):
-    """The only run of a class is cut into inner blocks: windows that overlap one must not teach."""
+    """The only run of a class is cut into inner blocks: windows that overlap one must not train."""
     splits = []
 
     def spy(*args):
