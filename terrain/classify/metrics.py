@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from sklearn.metrics import confusion_matrix, precision_recall_fscore_support
 
+from terrain.bootstrap import bootstrap_rows, percentile_interval
 from terrain.records import Array
 
 CALIBRATION_BINS = 15
@@ -183,11 +184,10 @@ def run_bootstrap(
     n_hits, n_windows = np.zeros(N_BOOTSTRAP), np.zeros(N_BOOTSTRAP)
     for name in np.unique(terrain):
         members = np.flatnonzero(class_of == name)
-        drawn = members[rng.integers(len(members), size=(N_BOOTSTRAP, len(members)))]
+        drawn = members[bootstrap_rows(len(members), N_BOOTSTRAP, rng)]
         n_hits += hits[drawn].sum(axis=1)
         n_windows += sizes[drawn].sum(axis=1)
-    low, high = np.quantile(n_hits / n_windows, [(1 - INTERVAL) / 2, (1 + INTERVAL) / 2])
-    return float(low), float(high)
+    return percentile_interval(n_hits / n_windows, INTERVAL)
 
 
 def per_run_figures(
