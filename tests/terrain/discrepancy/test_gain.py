@@ -35,7 +35,7 @@ def simulation(effects=None, scatter=True):
     return Simulation(HUSKY, effects=effects or {}, scatter=load_scatter()._asdict() if scatter else {})
 
 
-def test_the_true_extension_leaves_noise_and_what_scatters(longer):
+def test_the_true_extension_leaves_noise_and_scatter(longer):
     found = gain(simulation(), simulation(LONGER), longer)
     ahead = found.channels["speed_x_mps"]
     assert not found.refused
