@@ -1,4 +1,4 @@
-"""Attribution: hide an effect, and it is named; hide none, and none is; what no log distinguishes is not claimed."""
+"""Attribution: a hidden effect is named, none where none is hidden, and what no log distinguishes is ambiguous."""
 
 import json
 from dataclasses import replace

@@ -22,8 +22,8 @@ def twist(duration_s=30.0):
 
 
 def runs(n, effects):
-    day = {"effects": effects, "scatter": load_scatter(), "noise": load_noise()}
-    return [simulate_planar(HUSKY, twist(), i, run_id=f"r{i}", **day) for i in range(n)]
+    options = {"effects": effects, "scatter": load_scatter(), "noise": load_noise()}
+    return [simulate_planar(HUSKY, twist(), i, run_id=f"r{i}", **options) for i in range(n)]
 
 
 @pytest.fixture(scope="module")

@@ -29,7 +29,7 @@ ODD = 2
 """Which of the runs has the fault."""
 
 
-def drive(robot=HUSKY, seed=0, name="survey", duration_s=40.0, **told) -> RunLog:
+def drive(robot=HUSKY, seed=0, name="survey", duration_s=40.0, **options) -> RunLog:
     twist = make_scenario(name, robot, "grass", duration_s, 0.6, seed=seed).twist
     return simulate_planar(
         robot,
@@ -40,7 +40,7 @@ def drive(robot=HUSKY, seed=0, name="survey", duration_s=40.0, **told) -> RunLog
         hills=Hills((0.04, 0.02), 0.03),
         run_id=f"run_{seed}",
         terrain="grass",
-        **told,
+        **options,
     )
 
 

@@ -165,17 +165,17 @@ def test_decimation_is_a_convolution_and_holes_are_left_out():
     known = np.ones((200, 2), dtype=bool)
     known[50:52, 0] = False
     known[100:140, 1] = False
-    told = decimate_known(np.where(known, values, np.nan), known, taps, 4)
-    for row in range(len(told)):
+    decimated = decimate_known(np.where(known, values, np.nan), known, taps, 4)
+    for row in range(len(decimated)):
         window = slice(4 * row, 4 * row + 21)
         for c in range(2):
             weight = taps * known[window, c]
             if weight.sum() >= 0.75:
                 mean = np.sum(weight * np.nan_to_num(values[window, c])) / weight.sum()
-                assert told[row, c] == pytest.approx(mean)
+                assert decimated[row, c] == pytest.approx(mean)
             else:
-                assert np.isnan(told[row, c])
-    assert np.isnan(told).sum(axis=0).tolist() == [0, 12]
+                assert np.isnan(decimated[row, c])
+    assert np.isnan(decimated).sum(axis=0).tolist() == [0, 12]
 
 
 def test_a_hole_stays_unknown_and_nothing_else_is_lost(looked_at):

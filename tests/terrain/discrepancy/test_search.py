@@ -54,8 +54,8 @@ def test_three_causes_are_found_with_their_values_by_relinearisation(three):
 def test_every_effect_has_evidence_and_only_causes_are_significant(three):
     asked, found = three
     assert set(found.tried) == {effect.name for effect in asked.library}
-    standing = {name for name, told in found.tried.items() if told.significant}
-    assert standing == {cause.name for cause in found.causes}
+    significant = {name for name, each in found.tried.items() if each.significant}
+    assert significant == {cause.name for cause in found.causes}
 
 
 def test_changes_are_counted_from_the_simulation_that_was_given(three):
@@ -65,8 +65,8 @@ def test_changes_are_counted_from_the_simulation_that_was_given(three):
     assert {cause.name for cause in again.causes} == {cause.name for cause in found.causes}
     std = np.sqrt(np.diag(found.cov))
     for name, value, own in zip(found.names, found.change, std, strict=True):
-        told = again.change[again.names.index(name)]
-        assert told + half[name] == pytest.approx(value, abs=own)
+        change = again.change[again.names.index(name)]
+        assert change + half[name] == pytest.approx(value, abs=own)
     at_fit = fit_change(again.info, again.names)[0]
     np.testing.assert_allclose(at_fit, again.change)
 

@@ -70,7 +70,7 @@ def true(payload=0.0, lever=0.0):
 
 def test_evidence_is_the_fit_over_its_noise():
     z = np.array([evidence(problem(true(10.0), seed), (), PAYLOAD).z for seed in range(60)])
-    # a t statistic of ten or so, told as a normal number, is less: its variance is not known for sure
+    # a t statistic of ten or so, as a normal number, is less: its variance is uncertain
     dof = TRUST_DOF + N_RUNS - 1
     assert np.median(z) == pytest.approx(z_of_t(10.0, dof), rel=0.1)
     found = evidence(problem(true(10.0)), (), PAYLOAD)

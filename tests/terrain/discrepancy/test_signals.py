@@ -26,12 +26,12 @@ from terrain.simulation.planar.run import simulate_planar
 HUSKY, AGRIMARO = load_robot("husky"), load_robot("agrimaro")
 
 
-def drive(robot, **told):
+def drive(robot, **options):
     t = np.arange(1001) / 50
     twist = np.column_stack([0.4 * np.sin(0.8 * t), np.zeros_like(t), 0.3 * np.sin(1.1 * t)])
     if robot is AGRIMARO:
         twist[:, 1] = 0.2 * np.sin(0.5 * t)
-    return simulate_planar(robot, twist, 1, hills=Hills((0.05, 0.0), 0.02), terrain="grass", **told)
+    return simulate_planar(robot, twist, 1, hills=Hills((0.05, 0.0), 0.02), terrain="grass", **options)
 
 
 @pytest.fixture(scope="module")
@@ -125,10 +125,10 @@ def test_current_magnitudes_get_the_sign_of_their_wheel_and_signed_ones_stay():
     at = [wheels.channels.index(f"current_{side}_a") for side in ("left", "right")]
     values[:, at] = np.abs(values[:, at])
     sizes = with_stream(run, "wheels", Stream(wheels.time_s, values, wheels.channels))
-    signed, told = signals_of(run, HUSKY), signals_of(sizes, HUSKY)
+    signed, restored = signals_of(run, HUSKY), signals_of(sizes, HUSKY)
     steady = signed.time_s > 2.0
-    assert_allclose(channel(told, TURNING_CURRENT)[steady], channel(signed, TURNING_CURRENT)[steady])
-    assert channel(told, TURNING_CURRENT)[steady].mean() > 1.0
+    assert_allclose(channel(restored, TURNING_CURRENT)[steady], channel(signed, TURNING_CURRENT)[steady])
+    assert channel(restored, TURNING_CURRENT)[steady].mean() > 1.0
     braked = np.array(values)
     braked[500, at[0]] = -0.1  # one sample below zero: the driver logs signs
     logged = signals_of(with_stream(run, "wheels", Stream(wheels.time_s, braked, wheels.channels)), HUSKY)
