@@ -13,7 +13,7 @@ from pipelines.classify.settings import CrossvalSettings
 from pipelines.classify.splits import labelled
 from pipelines.explain.results import Change, Comparison
 from pipelines.reporting.progress import Progress, silent
-from terrain.discrepancy.selection import bootstrap_counts
+from terrain.bootstrap import bootstrap_counts, percentile_interval
 from terrain.errors import DataError, TerrainError
 from terrain.kinematics.wheel_speed import with_wheel_speeds
 from terrain.logs.schema import SIGNAL_SETS
@@ -132,5 +132,5 @@ def accuracy_change(before: Array, after: Array, run_id: Array, seed: int) -> Ch
     windows = np.bincount(of, minlength=n)
     change = np.bincount(of, weights=after.astype(float) - before.astype(float), minlength=n)
     counts = bootstrap_counts(n, N_BOOTSTRAP, seed)
-    low, high = np.quantile((counts @ change) / (counts @ windows), [0.025, 0.975])
-    return Change(float(before.mean()), float(after.mean()), (float(low), float(high)))
+    interval = percentile_interval((counts @ change) / (counts @ windows))
+    return Change(float(before.mean()), float(after.mean()), interval)

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from pipelines.explain.results import Change, Comparison
-from terrain.discrepancy.selection import bootstrap_counts
+from terrain.bootstrap import bootstrap_counts, percentile_interval
 from terrain.discrepancy.simulation import Simulation
 from terrain.errors import TerrainError
 from terrain.estimation.estimate import Estimate, estimate_run
@@ -48,8 +48,8 @@ def filter_gain(runs: Sequence[RunLog], robot: Robot, extended: Simulation, seed
     for k, key in enumerate(ERRORS):
         both = table[:, :, k]
         if np.isfinite(both).all():
-            low, high = np.quantile(counts @ (both[:, 1] - both[:, 0]) / len(rows), [0.025, 0.975])
-            interval = (float(low), float(high)) if len(rows) > 1 else None
+            changes = counts @ (both[:, 1] - both[:, 0]) / len(rows)
+            interval = percentile_interval(changes) if len(rows) > 1 else None
             errors[key] = Change(float(both[:, 0].mean()), float(both[:, 1].mean()), interval)
     return Comparison(name, None, len(rows), errors)
 

@@ -7,11 +7,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from terrain.bootstrap import bootstrap_counts, percentile_interval
 from terrain.discrepancy.health import unfit_runs
 from terrain.discrepancy.information import N_BLOCKS, Information, information_at
 from terrain.discrepancy.residuals import low_pass_of, measured_channels
 from terrain.discrepancy.search import names_of
-from terrain.discrepancy.selection import MIN_CLUSTERS, bootstrap_counts
+from terrain.discrepancy.selection import MIN_CLUSTERS
 from terrain.discrepancy.signals import signals_of
 from terrain.discrepancy.simulation import Simulation
 from terrain.discrepancy.verdict import Excluded, finite
@@ -208,8 +209,7 @@ def _reduction(before: Array, after: Array, weights: Array) -> Reduction:
         ratio = 1.0 - after.sum() / before.sum()
     if not np.isfinite(ratios).any():
         return Reduction(float("nan"), float("nan"), float("nan"))
-    low, high = np.nanquantile(ratios, [0.025, 0.975])
-    return Reduction(float(ratio), float(low), float(high))
+    return Reduction(float(ratio), *percentile_interval(ratios))
 
 
 def _reduction_json(found: Reduction) -> dict[str, Any]:

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.stats import chi2, norm
 from scipy.stats import t as student
 
+from terrain.bootstrap import bootstrap_counts, percentile_interval
 from terrain.discrepancy.information import Information, partial_information
 from terrain.effects import BOUNDS, INDEX, Effect
 from terrain.records import Array
@@ -178,14 +179,6 @@ def _held_out_loss(info: Information, at: list[int]) -> Array:
     return loss
 
 
-def bootstrap_counts(n: int, n_draws: int, seed: int) -> Array:
-    """Return how often each of ``n`` clusters is drawn in each bootstrap sample (n_draws, n)."""
-    counts: Array = np.random.default_rng(seed).multinomial(n, np.full(n, 1 / n), n_draws)
-    return counts
-
-
 def gain_interval(gain: Array, seed: int = 0) -> tuple[float, float]:
     """Return the 95 % interval of the summed gain, by bootstrap over runs."""
-    weights = bootstrap_counts(len(gain), N_BOOTSTRAP, seed)
-    low, high = np.quantile(weights @ gain, [0.025, 0.975])
-    return float(low), float(high)
+    return percentile_interval(bootstrap_counts(len(gain), N_BOOTSTRAP, seed) @ gain)

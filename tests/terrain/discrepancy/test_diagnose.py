@@ -1,4 +1,4 @@
-"""Attribution: a hidden effect is named, none where none is hidden, and what no log distinguishes is ambiguous."""
+"""Attribution: a hidden effect is named, and what no log distinguishes is ambiguous."""
 
 import json
 from dataclasses import replace
