@@ -1,1 +1,1 @@
-"""What a simulation gets wrong about measured runs: shown, named, built in, and the gain measured."""
+"""What a simulation gets wrong about measured runs: found, named, built in, and the gain measured."""

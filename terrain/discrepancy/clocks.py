@@ -1,8 +1,8 @@
-"""How far the logger of IMU and camera is behind that of the wheels, run by run.
+"""Delay of the logger of IMU and camera behind that of the wheels, run by run.
 
-Each of its channels is held against what the wheels let expect, shifted.  The search is bounded, because a
-free one locks on to mirror images of the manoeuvres; gain and constant are free, because they may be wrong.
-Two clocks whose rates differ do so alike in all runs: one rate is shared.
+Each of its channels is compared with the shifted prediction from the wheel speeds.  The search is bounded,
+because a free one locks on to mirror images of the manoeuvres; gain and offset are free, because they may be
+wrong.  The rate between the two clocks is common to all runs.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ MIN_LAG_S, MAX_LAG_S = -0.5, 2.0
 looks like."""
 
 FAR_LAG_S = 10.0
-"""So far a clock is looked for only to say that it is out of reach, in runs of twice that."""
+"""Bound of a second search that only finds that a clock is out of reach, in runs of twice that length."""
 
 LAG_STEP_S = 0.1
 """Of the coarse search: what a robot does takes longer."""
@@ -46,35 +46,35 @@ FINE_S = 0.02
 """Grid on which what is expected is laid out; straight lines between."""
 
 CLOCKED = (GYRO, SPEED_X, HEADING)
-"""Channels that tell a clock: of the accelerometer the tilt is on its own clock, and what a skid-steer robot
-does sideways is in none of its wheels."""
+"""Channels that measure the clock: the tilt of the accelerometer is on its own clock, and the lateral motion
+of a skid-steer robot is in none of its wheels."""
 
 MIN_EXCITATION = 0.02
-"""Standard deviation (rad/s, m/s) of what is expected, below which a channel tells no clock."""
+"""Standard deviation (rad/s, m/s) of the prediction, below which a channel measures no clock."""
 
 MIN_CORRELATION = 0.7
-"""At the best shift; below, channel and wheels do not tell the same story."""
+"""Least correlation at the best shift."""
 
 RIVAL_MARGIN, RIVAL_FLOOR = 0.15, 0.02
-"""A shift elsewhere that leaves so much more of the variance, as a share and at all, is no rival."""
+"""A peak elsewhere is no rival if it leaves so much more of the variance, relative and absolute."""
 
 SAME_PEAK_S = 0.5
 """Two shifts closer than this are of one peak."""
 
 MAX_STD_S = 0.1
-"""A clock that is less sure tells nothing."""
+"""Largest standard deviation of a clock that is used."""
 
 MEMORY_S = 2.0
-"""Over which what is left is taken to remember itself."""
+"""Assumed correlation time of the residual."""
 
 MAX_STEPS, CONVERGED_S = 12, 0.003
 """Of least squares."""
 
-EVENT_S, EVENT_SHARE = 3.0, 0.7
-"""A clock that rests to such a share on so short a time rests on one event and all that was odd about it."""
+EVENT_S, EVENT_RATIO = 3.0, 0.7
+"""A clock is not used if that ratio of its information comes from so short a time: from one event."""
 
 FURTHEST = 1.5
-"""A rate so far out of the bounds is none."""
+"""A rate is refused that is so many times out of the bounds."""
 
 MIN_ROWS = 30
 
@@ -84,8 +84,8 @@ class Shift(NamedTuple):
 
     Parameters
     ----------
-    lag_s, std_s : (runs, len(CLOCKED)) at the middle of each run; NaN where a channel does not tell
-    rate : that all runs share
+    lag_s, std_s : (runs, len(CLOCKED)) at the middle of each run; NaN where a channel measures none
+    rate : common to all runs
     lost : (runs,) whether nothing fits within the search, and something well out of it
     """
 
@@ -126,18 +126,18 @@ def shifts_of(info: Information) -> Shift:
     """
     n = len(info.rows)
     pairs = {(i, c): pair for i, run in enumerate(info.rows) for c, pair in _pairs(run).items()}
-    searched, tables = _searched(pairs, RATES)
-    fits = _fitted(pairs, tables, searched)
+    searched, tables = _search_rates(pairs, RATES)
+    fits = _fit_lags(pairs, tables, searched)
     rate = _shared_rate(fits)
     if abs(rate - searched) > RATE_STEP:
-        _, tables = _searched(pairs, (rate,))
-        fits = _fitted(pairs, tables, rate)
+        _, tables = _search_rates(pairs, (rate,))
+        fits = _fit_lags(pairs, tables, rate)
         rate = _shared_rate(fits)
     lag_s, std_s = np.full((2, n, len(CLOCKED)), np.nan)
     for at, free in fits.items():
         fit: _Fit | None = free
         if abs(free.rate - rate) * 0.5 * pairs[at].time_s[-1] > LAG_STEP_S:
-            fit = _refined(pairs[at], float(LAGS_S[np.argmax(tables[at])]), rate, rate_stays=True)
+            fit = _refine_lag(pairs[at], float(LAGS_S[np.argmax(tables[at])]), rate, rate_stays=True)
         if fit is not None:
             follow = fit.cov[0, 1] / fit.cov[1, 1]  # of the lag, as the rate goes to that of all
             std = math.sqrt(max(fit.cov[0, 0] - follow * fit.cov[0, 1], 1e-12))
@@ -156,7 +156,7 @@ def shifts_of(info: Information) -> Shift:
 
 
 def offsets_of(shift: Shift) -> tuple[Array, Array]:
-    """Return the clock (runs,) of each run and its standard deviation, NaN where no channel tells.
+    """Return the clock (runs,) of each run and its standard deviation, NaN where no channel measures it.
 
     It is the least lag of its channels and of those that agree with it: any of them may be late by itself.
     """
@@ -176,25 +176,25 @@ def offsets_of(shift: Shift) -> tuple[Array, Array]:
 
 def _pairs(run: Rows) -> dict[int, _Pair]:
     """Return the channels that are measured and of which something is expected, by their place in CLOCKED."""
-    told = {}
+    compared = {}
     for c, name in enumerate(CLOCKED):
         measured, expected = (values[:, CHANNELS.index(name)] for values in (run.measured, run.predicted))
         known = np.isfinite(measured)
         if 2 * known.sum() > max(known.size, MIN_ROWS) and np.std(expected[known]) > MIN_EXCITATION:
-            told[c] = measured, expected
-    if not told:
+            compared[c] = measured, expected
+    if not compared:
         return {}
     fine_s = np.arange(run.time_s[0], run.time_s[-1], FINE_S)
-    curve = CubicSpline(run.time_s, np.column_stack([expected for _, expected in told.values()]))
+    curve = CubicSpline(run.time_s, np.column_stack([expected for _, expected in compared.values()]))
     values, slopes = np.asarray(curve(fine_s)).T.copy(), np.asarray(curve(fine_s, 1)).T.copy()
     time_s = run.time_s - run.time_s[0]
     return {
         c: _Pair(time_s, np.ascontiguousarray(measured), values[k], slopes[k])
-        for k, (c, (measured, _)) in enumerate(told.items())
+        for k, (c, (measured, _)) in enumerate(compared.items())
     }
 
 
-def _searched(pairs: _Pairs, rates: Sequence[float]) -> tuple[float, dict[tuple[int, int], Array]]:
+def _search_rates(pairs: _Pairs, rates: Sequence[float]) -> tuple[float, dict[tuple[int, int], Array]]:
     """Return the rate that fits all best, and under it the correlations (lags,) of each."""
     rate, least = 0.0, np.inf
     best: dict[tuple[int, int], Array] = {}
@@ -209,25 +209,27 @@ def _searched(pairs: _Pairs, rates: Sequence[float]) -> tuple[float, dict[tuple[
     return rate, best
 
 
-def _fitted(pairs: _Pairs, tables: dict[tuple[int, int], Array], rate: float) -> dict[tuple[int, int], _Fit]:
+def _fit_lags(
+    pairs: _Pairs, tables: dict[tuple[int, int], Array], rate: float
+) -> dict[tuple[int, int], _Fit]:
     """Return the fits from the best lags, of the channels that have one best."""
     fits = {}
     for at, column in tables.items():
         best = int(np.argmax(column))
-        if column[best] > MIN_CORRELATION and not _rivalled(column, best):
-            fit = _refined(pairs[at], float(LAGS_S[best]), rate)
+        if column[best] > MIN_CORRELATION and not _has_rival(column, best):
+            fit = _refine_lag(pairs[at], float(LAGS_S[best]), rate)
             if fit is not None:
                 fits[at] = fit
     return fits
 
 
 def _shared_rate(fits: dict[tuple[int, int], _Fit]) -> float:
-    """Return the median rate, each weighed by what it is sure of."""
+    """Return the median of the rates, weighted by their information."""
     if not fits:
         return 0.0
-    told = sorted((fit.rate, 1.0 / float(fit.cov[1, 1])) for fit in fits.values())
-    total = np.cumsum([weight for _, weight in told])
-    return told[int(np.searchsorted(total, 0.5 * total[-1]))][0]
+    rates = sorted((fit.rate, 1.0 / float(fit.cov[1, 1])) for fit in fits.values())
+    total = np.cumsum([weight for _, weight in rates])
+    return rates[int(np.searchsorted(total, 0.5 * total[-1]))][0]
 
 
 def _correlations(pair: _Pair, lags_s: Array, rate: float) -> Array:
@@ -240,7 +242,7 @@ def correlations(
 ) -> Array:
     """Return the correlation (lags,) of a signal with one on a fine grid, shifted; 0 where few samples meet.
 
-    The signal at ``t`` is held against what is expected at ``t - lag - rate (t - middle)``.
+    The signal at ``t`` is compared with the prediction at ``t - lag - rate (t - middle)``.
     """
     out = np.zeros(lags_s.size)
     known = np.isfinite(measured)
@@ -277,7 +279,7 @@ def _fits_further(pair: _Pair, best: float) -> bool:
     return beyond > MIN_CORRELATION and beyond > best + 0.15
 
 
-def _rivalled(column: Array, best: int) -> bool:
+def _has_rival(column: Array, best: int) -> bool:
     """Whether a peak elsewhere explains nearly as much."""
     left = 1.0 - np.clip(column, 0.0, 1.0) ** 2
     rises = np.diff(column) >= 0
@@ -286,8 +288,8 @@ def _rivalled(column: Array, best: int) -> bool:
     return bool((left[elsewhere] < (1 + RIVAL_MARGIN) * left[best] + RIVAL_FLOOR).any())
 
 
-def _refined(pair: _Pair, lag_s: float, rate: float, rate_stays: bool = False) -> _Fit | None:
-    """Return lag and rate, or the lag alone, by least squares from a start, or None if they run away.
+def _refine_lag(pair: _Pair, lag_s: float, rate: float, rate_stays: bool = False) -> _Fit | None:
+    """Return lag and rate, or the lag alone, by least squares from a start, or None if they diverge.
 
     Gain and constant are fitted beside them.  The covariance is ``(J'J)^-1 J'R J (J'J)^-1`` with the
     autocovariance ``R`` of what is left, tapered.
@@ -299,9 +301,9 @@ def _refined(pair: _Pair, lag_s: float, rate: float, rate_stays: bool = False) -
         use = np.isfinite(pair.measured) & (at_s > 0.0) & (at_s < fine_s[-1])
         if use.sum() < MIN_ROWS:
             return None
-        value, shown = np.interp(at_s[use], fine_s, pair.expected), pair.measured[use]
+        value, seen = np.interp(at_s[use], fine_s, pair.expected), pair.measured[use]
         level = value - value.mean()
-        gain = float(level @ shown) / max(float(level @ level), 1e-12)
+        gain = float(level @ seen) / max(float(level @ level), 1e-12)
         late = -gain * np.interp(at_s[use], fine_s, pair.slope)
         j = np.array([late, late * centred_s[use], value, np.ones(value.size)])
         if rate_stays:
@@ -313,7 +315,7 @@ def _refined(pair: _Pair, lag_s: float, rate: float, rate_stays: bool = False) -
         gram = j @ j.T
         if not np.linalg.det(gram) > 1e-9:
             return None
-        off = shown - gain * value
+        off = seen - gain * value
         step = np.linalg.solve(gram, j @ off)
         left = off - step @ j
         by_s, faster = float(step[0] / size[0]), 0.0 if rate_stays else float(step[1] / size[1])
@@ -326,7 +328,7 @@ def _refined(pair: _Pair, lag_s: float, rate: float, rate_stays: bool = False) -
         return None
     power = late * late
     rows = math.ceil(EVENT_S / float(pair.time_s[1] - pair.time_s[0]))
-    if np.convolve(power, np.ones(min(rows, power.size))).max() > EVENT_SHARE * power.sum():
+    if np.convolve(power, np.ones(min(rows, power.size))).max() > EVENT_RATIO * power.sum():
         return None
     scores = j * left
     spread = scores @ scores.T

@@ -2,8 +2,8 @@
 
 The order is that in which each step was seen to be needed: the health of the logs and gross regimes first,
 one low-pass for everything, whitening, then causes by held-out gain and a statistic clustered by run, a refit
-where sensitivities have changed, a swap test against all that could take a cause's place, constancy, and
-questions without a name for what is left.
+where sensitivities have changed, a swap test against all effects that could replace a cause, constancy, and
+probes of the remaining residual.
 """
 
 from __future__ import annotations
@@ -16,21 +16,21 @@ import numpy as np
 
 from terrain.discrepancy.clocks import shifts_of
 from terrain.discrepancy.health import clocks_of, unfit_runs
-from terrain.discrepancy.information import Information, counted_from, moved, rest_beside
+from terrain.discrepancy.information import Information, move_point, partial_information, recentre
 from terrain.discrepancy.next_drive import next_drive
-from terrain.discrepancy.probes import Answer, ask, drift_of
+from terrain.discrepancy.probes import ProbeResult, parameter_drifts, probe_residuals
 from terrain.discrepancy.residuals import low_pass_of, measured_channels
 from terrain.discrepancy.search import Found, Problem, names_of, search
-from terrain.discrepancy.selection import SEEN_SHARE, Z_EFFECT, fitted, gain_interval
+from terrain.discrepancy.selection import EXCITED_RATIO, Z_EFFECT, fit_change, gain_interval
 from terrain.discrepancy.signals import Signals, signals_of
 from terrain.discrepancy.simulation import Simulation
 from terrain.discrepancy.verdict import (
     Cause,
     Diagnosis,
-    Leftover,
     Limit,
     Residual,
     RuledOut,
+    Unexplained,
     Value,
     Verdict,
 )
@@ -39,23 +39,24 @@ from terrain.errors import DataError
 from terrain.records import RunLog
 
 MIN_RUNS = 3
-"""Fewer runs, and there is nothing left to judge a fit by."""
+"""Least number of runs: with fewer none is left to validate a fit."""
 
 POWER_Z = 1.28
-"""Beyond the threshold, so that nine in ten are seen."""
+"""Added to the threshold, so that nine in ten are detected."""
 
-BLIND_SHARE = 0.05
-"""Where so large a share of the library is not excited, finding nothing is no answer."""
+BLIND_RATIO = 0.05
+"""Ratio of the library that may be not excited before the verdict ``none`` becomes ``not_excited``."""
 
-DRIFT_SHARE, PROBE_SHARE = 0.05, 0.15
-"""A cause whose drift, or a nameless input in its channel, tells that share of what it tells is not it."""
+DRIFT_RATIO, PROBE_RATIO = 0.05, 0.15
+"""A cause is withdrawn if the evidence of its drift, or of a probe in its channel, exceeds that ratio of its
+own."""
 
-CALMER, CALMER_Z, CALMER_SHARE = 0.5, 3.0, 0.3
-"""A cause whose value differs by that many standard deviations and by that share of it, where sensitivities
-are taken along inputs of that share of the cut-off, is not it."""
+SLOW_CUTOFF_RATIO, SLOW_Z, SLOW_RATIO = 0.5, 3.0, 0.3
+"""A cause is withdrawn if its value differs by so many standard deviations and by that ratio, where
+sensitivities are computed along instruments of that ratio of the cut-off."""
 
 ENTANGLED = 0.97
-"""Two causes whose fitted values correlate more are one answer with two names: a collinearity index of 6."""
+"""Correlation of fitted values above which two causes are ambiguous: a collinearity index of 6."""
 
 INTERVAL_T = 2.13
 """Half a 95 % interval in standard deviations: t with the 15 degrees that eight runs and the noise give."""
@@ -76,7 +77,7 @@ def diagnose(
     ------
     DataError
         if runs are of another robot, too few, of one id, or too short, or have no channel in common with the
-        simulation, or if hardly any fits the others.
+        simulation, or if too few are consistent with each other.
     """
     ids = Counter(run.run_id for run in runs)
     if twice := [run_id for run_id, n in ids.items() if n > 1]:
@@ -107,14 +108,16 @@ def diagnose_signals(
         shift = shifts_of(start)
     found = search(problem, start)
     at_fit = found.info
-    answers = ask(at_fit, found.names, found.change)
-    drifts = drift_of(at_fit, found.names, found.change)
-    leftovers = _leftovers(at_fit, answers)
-    withdrawn = _withdrawn(found, drifts, answers) | _unsteady(problem, found)
-    named, sets = _sorted_out(found, [cause for cause in found.causes if cause.name not in withdrawn])
-    leftovers = _with_drifts(leftovers, found, withdrawn, drifts)
+    results = probe_residuals(at_fit, found.names, found.change)
+    drifts = parameter_drifts(at_fit, found.names, found.change)
+    unexplained = _unexplained_channels(at_fit, results)
+    withdrawn = _reasons_to_withdraw(found, drifts, results) | _frequency_dependent(problem, found)
+    named, sets = _named_and_ambiguous(
+        found, [cause for cause in found.causes if cause.name not in withdrawn]
+    )
+    unexplained = _with_drifts(unexplained, found, withdrawn, drifts)
     limits = tuple(_limits(found, problem.library))
-    missed = tuple(limit for limit in limits if limit.value > SEEN_SHARE * _bound(limit.name))
+    missed = tuple(limit for limit in limits if limit.value > EXCITED_RATIO * _bound(limit.name))
     causes = tuple(_cause(found, effect) for effect in named)
     parameters = names_of(named)
     at = [found.names.index(name) for name in parameters]
@@ -123,11 +126,11 @@ def diagnose_signals(
         verdict = Verdict.AMBIGUOUS
     elif causes:
         verdict = Verdict.EXPLAINED
-    elif leftovers:
+    elif unexplained:
         verdict = Verdict.UNEXPLAINED
     else:
-        verdict = Verdict.NOT_EXCITED if len(missed) > BLIND_SHARE * len(limits) else Verdict.NONE
-    after = _after(problem, found, named)
+        verdict = Verdict.NOT_EXCITED if len(missed) > BLIND_RATIO * len(limits) else Verdict.NONE
+    after = _information_after(problem, found, named)
     return Diagnosis(
         robot=simulation.robot.name,
         verdict=verdict,
@@ -136,7 +139,7 @@ def diagnose_signals(
         cov=found.cov[np.ix_(at, at)] * np.sqrt(np.outer(grown, grown)),
         ambiguous_sets=tuple(sets),
         ambiguous_values=_rival_values(found, sets),
-        unexplained=leftovers,
+        unexplained=unexplained,
         limits=limits,
         not_excited=missed,
         ruled_out=tuple(_ruled_out(found, named, sets, withdrawn, problem.library)),
@@ -149,77 +152,93 @@ def diagnose_signals(
     )
 
 
-def _leftovers(info: Information, answers: dict[tuple[str, str], Answer]) -> tuple[Leftover, ...]:
-    """Return the clearest input of every channel that follows one."""
-    best: dict[str, Leftover] = {}
+def _unexplained_channels(
+    info: Information, results: dict[tuple[str, str], ProbeResult]
+) -> tuple[Unexplained, ...]:
+    """Return the most significant input of every channel that depends on one."""
+    best: dict[str, Unexplained] = {}
     size = {c: sum(float((r[:, i] ** 2).sum()) for r in info.white_residual) for i, c in enumerate(CHANNELS)}
-    for (channel, name), answer in answers.items():
-        if answer.stands and (channel not in best or answer.z > best[channel].z):
-            best[channel] = Leftover(channel, name, answer.z, min(answer.gain / size[channel], 1.0))
+    for (channel, name), answer in results.items():
+        if answer.significant and (channel not in best or answer.z > best[channel].z):
+            best[channel] = Unexplained(channel, name, answer.z, min(answer.gain / size[channel], 1.0))
     return tuple(sorted(best.values(), key=lambda left: -left.z))
 
 
-def _withdrawn(
-    found: Found, drifts: dict[str, Answer], answers: dict[tuple[str, str], Answer]
+def _reasons_to_withdraw(
+    found: Found, drifts: dict[str, ProbeResult], results: dict[tuple[str, str], ProbeResult]
 ) -> dict[str, str]:
-    """Return the causes that fit and are still not it, by name, and why."""
+    """Return, by name, why causes that fit are withdrawn all the same."""
     why = {}
     for cause in found.causes:
         own = found.tried[cause.name]
-        if not own.stands:
+        if not own.significant:
             continue
-        told = own.z**2
+        evidence = own.z**2
         drift = _drift(drifts, cause)
         main = _channels(found, cause)
-        beside = {at: answer for at, answer in answers.items() if at[0] in main and answer.stands}
+        beside = {at: answer for at, answer in results.items() if at[0] in main and answer.significant}
         most = max(beside, key=lambda at: beside[at].gain, default=None)
-        if drift.stands and drift.gain > DRIFT_SHARE * told:
-            why[cause.name] = f"it helps, but changes from the start of runs to their end (z {drift.z:.1f})"
-        elif most is not None and beside[most].gain > PROBE_SHARE * told:
-            why[cause.name] = f"it helps, but {most[0]} follows {most[1]} beside it (z {beside[most].z:.1f})"
+        if drift.significant and drift.gain > DRIFT_RATIO * evidence:
+            why[cause.name] = (
+                f"it reduces the residual, but changes from the start of runs to their end (z {drift.z:.1f})"
+            )
+        elif most is not None and beside[most].gain > PROBE_RATIO * evidence:
+            why[cause.name] = (
+                f"it reduces the residual, but {most[0]} depends on {most[1]} beside it "
+                f"(z {beside[most].z:.1f})"
+            )
     return why
 
 
-def _unsteady(problem: Problem, found: Found) -> dict[str, str]:
-    """Return the causes whose values are others where quick motion is not looked at, by name, and why.
+def _frequency_dependent(problem: Problem, found: Found) -> dict[str, str]:
+    """Return, by name, why causes are withdrawn whose values differ when quick motion is filtered out.
 
-    Both are estimates of one thing, so they agree but for what the calmer one knows less (Hausman,
-    Econometrica 1978): where they do not, the cause stands for noise of the wheels that drive the simulation.
+    Both estimate the same quantity, so they agree up to the larger variance of the slower one (Hausman,
+    Econometrica 1978); where they do not, the cause fits noise of the wheel speeds.
     """
     if not found.causes:
         return {}
-    calmer = problem._replace(low_pass=problem.low_pass._replace(calm_hz=CALMER * problem.low_pass.calm_hz))
-    there = moved(found.info.vector, found.names, found.change)
-    info = calmer.at(there, found.names, found.info.noise)
-    value, cov = fitted(counted_from(info, problem.simulation.vector), found.names)
+    slower = problem._replace(
+        low_pass=problem.low_pass._replace(
+            instrument_cutoff_hz=SLOW_CUTOFF_RATIO * problem.low_pass.instrument_cutoff_hz
+        )
+    )
+    there = move_point(found.info.vector, found.names, found.change)
+    info = slower.at(there, found.names, found.info.noise)
+    value, cov = fit_change(recentre(info, problem.simulation.vector), found.names)
     why = {}
     for cause in found.causes:
         at = [found.names.index(p.name) for p in cause.parameters]
         size = found.change[at]
         var = np.maximum(np.diag(cov - found.cov)[at], 0.0) * found.tried[cause.name].inflation
         apart = np.abs(value[at] - size)
-        if (apart > np.maximum(CALMER_Z * np.sqrt(var), CALMER_SHARE * np.abs(size))).any():
-            why[cause.name] = "it helps, but has another value in slow motion alone: noise of the wheels"
+        if (apart > np.maximum(SLOW_Z * np.sqrt(var), SLOW_RATIO * np.abs(size))).any():
+            why[cause.name] = (
+                "it reduces the residual, but has another value in slow motion: "
+                "it fits noise of the wheel speeds"
+            )
     return why
 
 
-def _drift(drifts: dict[str, Answer], cause: Effect) -> Answer:
+def _drift(drifts: dict[str, ProbeResult], cause: Effect) -> ProbeResult:
     return max((drifts[p.name] for p in cause.parameters), key=lambda answer: answer.z)
 
 
-def _sorted_out(found: Found, causes: Sequence[Effect]) -> tuple[list[Effect], list[tuple[str, ...]]]:
-    """Return the causes that are named, and the sets of which one is there."""
+def _named_and_ambiguous(
+    found: Found, causes: Sequence[Effect]
+) -> tuple[list[Effect], list[tuple[str, ...]]]:
+    """Return the causes that are named, and the ambiguous sets."""
     named: list[Effect] = []
     sets: list[tuple[str, ...]] = []
     for cause in causes:
-        if not found.tried[cause.name].stands:
+        if not found.tried[cause.name].significant:
             continue
         if found.rivals[cause.name]:
             sets.append((cause.name, *_rival_names(found, cause)))
         else:
             named.append(cause)
     for one, other in combinations(causes, 2):
-        if (one in named or other in named) and _entangled(found, one, other):
+        if (one in named or other in named) and _correlated(found, one, other):
             sets = [names for names in sets if names[0] not in (one.name, other.name)]
             members = (one.name, *_rival_names(found, one), other.name, *_rival_names(found, other))
             sets.append(tuple(dict.fromkeys(members)))
@@ -231,8 +250,8 @@ def _rival_names(found: Found, cause: Effect) -> list[str]:
     return [rival.effect.name for rival in found.rivals[cause.name]]
 
 
-def _entangled(found: Found, one: Effect, other: Effect) -> bool:
-    """Return whether two causes that were fitted together can hardly be told apart by these runs."""
+def _correlated(found: Found, one: Effect, other: Effect) -> bool:
+    """Return whether the fitted values of two causes are too correlated to distinguish them."""
     i, j = ([found.names.index(p.name) for p in effect.parameters] for effect in (one, other))
     scale = np.sqrt(np.diag(found.cov))
     correlation = found.cov / np.outer(scale, scale)
@@ -240,17 +259,20 @@ def _entangled(found: Found, one: Effect, other: Effect) -> bool:
 
 
 def _with_drifts(
-    leftovers: tuple[Leftover, ...], found: Found, withdrawn: Mapping[str, str], drifts: dict[str, Answer]
-) -> tuple[Leftover, ...]:
-    """Add the channels of causes that were withdrawn since they drift to what is not explained."""
-    channels = {left.channel for left in leftovers}
+    unexplained: tuple[Unexplained, ...],
+    found: Found,
+    withdrawn: Mapping[str, str],
+    drifts: dict[str, ProbeResult],
+) -> tuple[Unexplained, ...]:
+    """Add the channels of causes that were withdrawn because of a drift to the unexplained ones."""
+    channels = {left.channel for left in unexplained}
     more = []
     for cause in found.causes:
         channel, drift = _channels(found, cause)[0], _drift(drifts, cause)
-        if cause.name in withdrawn and drift.stands and channel not in channels:
-            more.append(Leftover(channel, "time", drift.z, 0.0))
+        if cause.name in withdrawn and drift.significant and channel not in channels:
+            more.append(Unexplained(channel, "time", drift.z, 0.0))
             channels.add(channel)
-    return (*leftovers, *more)
+    return (*unexplained, *more)
 
 
 def _channels(found: Found, cause: Effect) -> tuple[str, ...]:
@@ -316,7 +338,7 @@ def _limits(found: Found, library: Sequence[Effect]) -> list[Limit]:
         base = info.places(others)
         for parameter in effect.parameters:
             own = info.places([parameter.name])
-            free = float(rest_beside(a, base, own)[1][0, 0])
+            free = float(partial_information(a, base, own)[1][0, 0])
             known = free > 1e-9 * max(a[own[0], own[0]], 1e-12)
             value = (Z_EFFECT + POWER_Z) / float(np.sqrt(free)) if known else np.inf
             limits.append(Limit(parameter.name, value, parameter.unit, effect.needs))
@@ -335,28 +357,28 @@ def _ruled_out(
     withdrawn: Mapping[str, str],
     library: Sequence[Effect],
 ) -> list[RuledOut]:
-    told = {effect.name for effect in named} | {name for names in sets for name in names}
+    answered = {effect.name for effect in named} | {name for names in sets for name in names}
     out = []
     for effect in library:
-        if effect.name in told:
+        if effect.name in answered:
             continue
         own = found.tried[effect.name]
         values: tuple[Value, ...] = ()
         if effect in found.causes:
-            reason = withdrawn.get(effect.name, "it does not stand beside the others that were found")
+            reason = withdrawn.get(effect.name, "it is not significant beside the other causes")
             values = _values(found, effect)
         elif not own.inside:
-            reason = "the value that would fit is out of its bounds"
+            reason = "the fitted value is out of its bounds"
         elif own.z <= Z_EFFECT:
-            reason = "the runs show nothing of it beside what was found"
+            reason = "it is not significant beside what was found"
         else:
-            reason = "it does not help on runs that were left out, or differs from run to run"
+            reason = "it does not reduce the residual of runs left out, or differs from run to run"
         out.append(RuledOut(effect.name, reason, own.z, values))
     return out
 
 
-def _after(problem: Problem, found: Found, named: Sequence[Effect]) -> Information:
-    """Return what the runs say around the simulation with the named causes built in."""
+def _information_after(problem: Problem, found: Found, named: Sequence[Effect]) -> Information:
+    """Return the information around the simulation with the named causes built in."""
     vector = problem.simulation.vector.copy()
     for name, value in zip(found.names, found.change, strict=True):
         if name in names_of(named):
@@ -372,6 +394,6 @@ def _residuals(info: Information, start: Information) -> dict[str, Residual]:
         left = np.concatenate([run.residual[:, c] for run in info.rows])
         rms = float(np.sqrt(np.nanmean(left**2)))
         noise = float(start.noise.std[c])
-        share = max(1.0 - (noise / rms) ** 2, 0.0) if rms > 0 else 0.0
-        out[channel] = Residual(rms, noise, share)
+        systematic = max(1.0 - (noise / rms) ** 2, 0.0) if rms > 0 else 0.0
+        out[channel] = Residual(rms, noise, systematic)
     return out

@@ -1,4 +1,4 @@
-"""What an extension is worth, on runs that had no say in it."""
+"""What an extension gains on held-out runs."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from terrain.records import Array, RunLog
 N_BOOTSTRAP = 2000
 
 MIN_JUDGED = 3
-"""Runs among which one can be seen not to belong."""
+"""Least number of runs among which an unfit one can be found."""
 
 
 class Reduction(NamedTuple):
@@ -63,15 +63,15 @@ class ChannelGain(NamedTuple):
 
 
 class Gain(NamedTuple):
-    """What an extension is worth.
+    """What an extension gains.
 
     Parameters
     ----------
     run_ids : of the runs on which it was measured
-    excluded : those that were given and do not belong
+    excluded : runs that were given and are unfit
     clusters : ``runs``, or ``thirds of runs`` where runs are few
     channels : by name
-    reduction : of the whitened square of all channels, with what scatters from run to run taken out
+    reduction : of the whitened square of all channels, with variations from run to run marginalised
     """
 
     run_ids: tuple[str, ...]
@@ -104,15 +104,15 @@ class Gain(NamedTuple):
 
 
 def gain(simulation: Simulation, extended: Simulation, runs: Sequence[RunLog], seed: int = 0) -> Gain:
-    """Return what an extension takes off the residual of runs that were not used to find it.
+    """Return by how much an extension reduces the residual of runs that were not used to find it.
 
-    One low-pass and one whitening filter serve before and after: that of the noise which the whole library,
-    let go around the extension, leaves.
+    One low-pass and one whitening filter serve before and after: fitted to the residual that
+    remains with the whole library freed around the extension.
 
     Parameters
     ----------
     simulation, extended : before and after
-    runs : that had no say in the extension
+    runs : held out of the diagnosis
     seed : of the bootstrap
 
     Raises
@@ -120,7 +120,7 @@ def gain(simulation: Simulation, extended: Simulation, runs: Sequence[RunLog], s
     ConfigError
         if the two are of different robots.
     DataError
-        if there is no run, or none that belongs.
+        if there is no run, or none is fit.
     """
     if simulation.robot.name != extended.robot.name:
         raise ConfigError(
@@ -180,7 +180,7 @@ def _squares(residuals: Sequence[Array], by_run: bool) -> Array:
 def _costs(info: Information, by_run: bool) -> Array:
     """Return what each cluster (n,) adds to minus twice the log-likelihood, its own scatter integrated out.
 
-    Thirds of a run are given a scatter each, since shares of one that is common to them need not be positive.
+    Each third of a run has a scatter of its own, since parts of a common one need not be positive.
     """
     prior = np.diag(1.0 / info.nuisance_std**2)
     costs = []

@@ -1,8 +1,8 @@
-"""Runs that do not belong, before any cause is looked for.
+"""Unfit runs, which are excluded before causes are searched.
 
-A run is unfit for what it has alone: a channel that is dead or stands still, a clock of its own, wheels that
-turn under a body that stays, or another robot and ground than it is said to be of.  What all runs share is
-no fault of a run: it is what the diagnosis looks for.
+A run is unfit for a fault of its own: a channel that is missing or frozen, a clock offset of its own, wheels
+that turn under a body at rest, or another robot or terrain than its log states.  What all runs have in common
+is no fault of a run: it is what the diagnosis searches.
 """
 
 from __future__ import annotations
@@ -29,26 +29,26 @@ STUCK_S, STUCK_STRETCH_S = 2.0, 1.0
 clock is not known, in stretches over all that a clock may be off."""
 
 STUCK_MPS, STUCK_RADPS = 0.15, 0.2
-"""What has to be expected of a body before it can be said to stay."""
+"""Least predicted motion for which a body can be found at rest."""
 
-STUCK_SHARE = 0.05
-"""Share of what is expected, below which a body stays; no slip of the library goes below 0.1."""
+STUCK_RATIO = 0.05
+"""Ratio of the predicted motion below which a body is at rest; no slip of the library goes below 0.1."""
 
 STUCK_FLOOR_MPS, STUCK_FLOOR_RADPS = 0.015, 0.02
-"""What a camera and a gyro show of a body that stays."""
+"""What a camera and a gyro measure of a body at rest."""
 
 STILL_MPS, VARIES_MPS, MOVING_MPS = 0.002, 0.05, 0.2
-"""Spread of a rim's speed that never changes, of one that does, and a speed at which no wheels stand."""
+"""Spread of a wheel speed that never changes, of one that does, and a speed at which no wheel rests."""
 
-MIN_FINITE_SHARE, USUAL_FINITE_SHARE = 0.3, 0.7
+MIN_FINITE_RATIO, USUAL_FINITE_RATIO = 0.3, 0.7
 """A channel is dead in a run that has some of it but less than the first, the others over the second."""
 
-FROZEN_S, CLIPPED_S, CLIPPED_SHARE = 2.0, 1.0, 0.03
-"""A channel is frozen that stands still for the first at a time, and clipped that is at its end for the
-second in all and the third of a run, while something else is expected."""
+FROZEN_S, CLIPPED_S, CLIPPED_RATIO = 2.0, 1.0, 0.03
+"""A channel is frozen if it is constant for the first at a time, and clipped if it is at its extreme for the
+second in all and the third of a run, while the prediction varies."""
 
 MARGIN_S = 0.6
-"""What is expected may come so much earlier or later."""
+"""Tolerance of the time at which a predicted change arrives."""
 
 FROZEN_RANGE, CLIPPED_SPREAD = 0.5, 0.1
 """Of what is expected meanwhile: range and spread over its spread in the run."""
@@ -57,10 +57,10 @@ FAR_END = 0.5
 """The end of a range is so far out at the least, over the largest size: idle currents rest at the other."""
 
 MIN_OTHERS = 3
-"""A run is judged by so many others of its terrain: of three runs two may be wrong."""
+"""Least number of other runs of its terrain that a run is compared with: of three runs two may be wrong."""
 
-UNLIKE_RATIO, UNLIKE_SHARE = 12.0, 0.2
-"""A run is unlike the others if a simulation in common with them costs it so many times what one in common
+UNLIKE_RATIO, UNLIKE_NOISE_RATIO = 12.0, 0.2
+"""A run is an outlier if a simulation in common with the others costs it so many times what one in common
 costs them among themselves, and so many variances of the noise a row.  Of 15 000 simulated runs without a
 fault, whatever was hidden in all runs of a set, one passed both."""
 
@@ -71,12 +71,12 @@ _CURRENT = CHANNELS.index(CURRENT)
 def unfit_runs(
     signals: Sequence[Signals], info: Information, shift: Shift | None = None
 ) -> tuple[Excluded, ...]:
-    """Return the runs that do not belong, each with the first reason that is found.
+    """Return the unfit runs, each with the first reason that is found.
 
     Parameters
     ----------
     signals : of all runs
-    info : what they say around the simulation as it is given, in the same order
+    info : of these runs around the simulation as it is given, in the same order
     shift : of these runs, where it is known already
 
     Raises
@@ -105,17 +105,17 @@ def clocks_of(info: Information, shift: Shift | None = None) -> tuple[Clock, ...
 def _dead(signals: Sequence[Signals], info: Information) -> dict[int, str]:
     """Return runs with a wheel or a channel of which hardly anything is there."""
     reasons: dict[int, str] = {}
-    share = np.array([np.isfinite(run.measured).mean(axis=0) for run in signals])
-    usual = np.median(share, axis=0)
+    known_ratio = np.array([np.isfinite(run.measured).mean(axis=0) for run in signals])
+    usual = np.median(known_ratio, axis=0)
     for i, run in enumerate(signals):
-        dead = (share[i] > 0) & (share[i] < MIN_FINITE_SHARE) & (usual > USUAL_FINITE_SHARE)
+        dead = (known_ratio[i] > 0) & (known_ratio[i] < MIN_FINITE_RATIO) & (usual > USUAL_FINITE_RATIO)
         if run.steer_rad.any():
-            dead[_CURRENT] = False  # it is looked at only while the wheels are parallel
+            dead[_CURRENT] = False  # it is compared only while the wheels are parallel
         for c in np.flatnonzero(dead):
-            reasons[i] = f"its {CHANNELS[c]} is there in {share[i, c]:.0%} of its samples"
+            reasons[i] = f"its {CHANNELS[c]} is known in {known_ratio[i, c]:.0%} of its samples"
         known = np.isfinite(run.wheel_speed_mps).all(axis=1)
-        if known.mean() < MIN_FINITE_SHARE:
-            reasons[i] = f"its wheels are there in {known.mean():.0%} of its samples"
+        if known.mean() < MIN_FINITE_RATIO:
+            reasons[i] = f"its wheel speeds are known in {known.mean():.0%} of its samples"
             continue
         spread = run.wheel_speed_mps[known].std(axis=0)
         if spread.min() < STILL_MPS and spread.max() > VARIES_MPS:
@@ -123,12 +123,12 @@ def _dead(signals: Sequence[Signals], info: Information) -> dict[int, str]:
         elif np.abs(run.wheel_speed_mps[known]).max() < STILL_MPS:
             shown = info.rows[i].measured[:, _SPEEDS]
             if shown.size and np.nanmax(np.hypot(*np.nan_to_num(shown).T)) > MOVING_MPS:
-                reasons[i] = "its wheels stand, its camera moves"
+                reasons[i] = "its wheels are at rest, its camera moves"
     return reasons
 
 
 def _late(info: Information, shift: Shift) -> dict[int, str]:
-    """Return runs whose clock is not that of the others: all channels that tell one are off, and alike."""
+    """Return runs with a clock of their own: all channels that measure it are off, and by the same lag."""
     offset_s = offsets_of(shift)[0] + info.vector[INDEX["clock_offset_s"]]
     reasons: dict[int, str] = {}
     for i in range(len(offset_s)):
@@ -158,20 +158,20 @@ def _behind(offset_s: float) -> str:
 
 
 def _stuck(info: Information, shift: Shift) -> dict[int, str]:
-    """Return runs in which wheels turn and the body stays, far longer than in the others."""
+    """Return runs in which wheels turn and the body is at rest, far longer than in the others."""
     reasons: dict[int, str] = {}
     if len(info.rows) < 2:
         return reasons
-    stays_s = np.array([_stays_s(run, shift.lag_s[i], shift.rate) for i, run in enumerate(info.rows)])
+    stays_s = np.array([_standstill_s(run, shift.lag_s[i], shift.rate) for i, run in enumerate(info.rows)])
     for i, time_s in enumerate(stays_s):
         usual_s = float(np.median(np.delete(stays_s, i)))
         if time_s > STUCK_S + 3.0 * usual_s:
-            reasons[i] = f"it is stuck for {time_s:.1f} s in all: its wheels turn, its body stays"
+            reasons[i] = f"it is stuck for {time_s:.1f} s in all: its wheels turn, its body is at rest"
     return reasons
 
 
-def _stays_s(run: Rows, lag_s: Array, rate: float) -> float:
-    """Return for how long, in stretches that count, a body stays that is expected to move."""
+def _standstill_s(run: Rows, lag_s: Array, rate: float) -> float:
+    """Return for how long, in stretches of a least length, a body is at rest that is predicted to move."""
     known = np.isfinite(lag_s)
     usual_s = float(np.median(lag_s[known])) if known.any() else 0.0
     centred_s = run.time_s - 0.5 * (run.time_s[0] + run.time_s[-1])
@@ -184,14 +184,14 @@ def _stays_s(run: Rows, lag_s: Array, rate: float) -> float:
         return run.measured[:, c], np.interp(at_s, run.time_s, run.predicted[:, c])
 
     gyro, turn = pair(GYRO)
-    calm = np.isfinite(gyro) & (np.abs(turn) < 0.1 * STUCK_RADPS)
-    bias = float(np.median(gyro[calm])) if calm.sum() >= 10 else np.nan
-    turns = np.abs(gyro - bias) > STUCK_SHARE * np.abs(turn) + STUCK_FLOOR_RADPS
+    straight = np.isfinite(gyro) & (np.abs(turn) < 0.1 * STUCK_RADPS)
+    bias = float(np.median(gyro[straight])) if straight.sum() >= 10 else np.nan
+    turns = np.abs(gyro - bias) > STUCK_RATIO * np.abs(turn) + STUCK_FLOOR_RADPS
     (x, along), (y, across) = pair(SPEED_X), pair(SPEED_Y)
     expected = np.hypot(along, across)
     seen = np.hypot(x, np.where(np.isfinite(y), y, 0.0))
     if np.isfinite(seen).any():
-        stays = (expected > STUCK_MPS) & (seen < STUCK_SHARE * expected + STUCK_FLOOR_MPS) & ~turns
+        stays = (expected > STUCK_MPS) & (seen < STUCK_RATIO * expected + STUCK_FLOOR_MPS) & ~turns
     else:
         stays = (np.abs(turn) > STUCK_RADPS) & np.isfinite(gyro - bias) & ~turns
     row_s = float(np.median(np.diff(run.time_s)))
@@ -206,7 +206,7 @@ def _stretches(where: Array) -> list[tuple[int, int]]:
 
 
 def _frozen(signals: Sequence[Signals], info: Information) -> dict[int, str]:
-    """Return runs with a channel that stands still, or at the end of its range, against what is expected."""
+    """Return runs with a channel that is constant, or clipped, while the prediction varies."""
     reasons: dict[int, str] = {}
     for i, (run, rows) in enumerate(zip(signals, info.rows, strict=True)):
         for c in np.flatnonzero(np.isfinite(run.measured).any(axis=0)):
@@ -219,13 +219,13 @@ def _frozen(signals: Sequence[Signals], info: Information) -> dict[int, str]:
                 inside = (rows.time_s > start_s + MARGIN_S) & (rows.time_s < end_s - MARGIN_S)
                 if end_s - start_s > FROZEN_S and np.ptp(expected[inside]) > FROZEN_RANGE * spread:
                     reasons[i] = (
-                        f"its {CHANNELS[c]} stands still for {end_s - start_s:.1f} s while it should change"
+                        f"its {CHANNELS[c]} is frozen for {end_s - start_s:.1f} s while it should change"
                     )
             for end in (np.nanmax(values), np.nanmin(values)):
                 there = np.flatnonzero(values == end)
-                if len(there) < max(CLIPPED_S / run.dt_s, CLIPPED_SHARE * len(values)):
+                if len(there) < max(CLIPPED_S / run.dt_s, CLIPPED_RATIO * len(values)):
                     continue
-                if abs(end) < FAR_END * np.nanmax(np.abs(values)):  # what rests is no end of a range
+                if abs(end) < FAR_END * np.nanmax(np.abs(values)):  # a value at rest is no end of a range
                     continue
                 if np.std(np.interp(there * run.dt_s, rows.time_s, expected)) > CLIPPED_SPREAD * spread:
                     reasons[i] = (
@@ -235,23 +235,23 @@ def _frozen(signals: Sequence[Signals], info: Information) -> dict[int, str]:
 
 
 def _unlike(info: Information, among: Sequence[int]) -> dict[int, str]:
-    """Return runs that no simulation in common with those of the same terrain fits, or none at all."""
+    """Return runs that no simulation in common with those of the same terrain fits."""
     reasons: dict[int, str] = {}
     for terrain in dict.fromkeys(info.rows[i].terrain for i in among):
         left = [i for i in among if info.rows[i].terrain == terrain]
         most = (len(left) - 1) // MIN_OTHERS
-        while most > 0 and (odd := _oddest(info, left)) is not None:
+        while most > 0 and (odd := _least_alike(info, left)) is not None:
             reasons[odd[0]] = odd[1]
             left.remove(odd[0])
             most -= 1
     return reasons
 
 
-def _oddest(info: Information, left: Sequence[int]) -> tuple[int, str] | None:
-    """Return the run that fits the others worst, if it is one of another kind, and why."""
-    ratio, share = oddness(info, left)
+def _least_alike(info: Information, left: Sequence[int]) -> tuple[int, str] | None:
+    """Return the run that is least consistent with the others, and why, if it is an outlier."""
+    ratio, noise_ratio = common_fit_cost(info, left)
     worst = int(np.argmax(ratio))
-    if ratio[worst] > UNLIKE_RATIO and share[worst] > UNLIKE_SHARE:
+    if ratio[worst] > UNLIKE_RATIO and noise_ratio[worst] > UNLIKE_NOISE_RATIO:
         return left[worst], (
             f"it is unlike the other runs: in common with them it fits {ratio[worst]:.0f} times worse than "
             "they do among themselves"
@@ -259,7 +259,7 @@ def _oddest(info: Information, left: Sequence[int]) -> tuple[int, str] | None:
     return None
 
 
-def oddness(info: Information, left: Sequence[int]) -> tuple[Array, Array]:
+def common_fit_cost(info: Information, left: Sequence[int]) -> tuple[Array, Array]:
     """Return what a simulation in common costs each run, over what it costs the others, and in noise a row.
 
     The cost is that in minus twice the log-likelihood, over a fit of each run by itself.

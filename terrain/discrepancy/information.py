@@ -1,8 +1,8 @@
-"""What runs say of the simulation's parameters: a quadratic form a run, what scatters by itself taken out.
+"""Information of runs on the simulation's parameters: a quadratic form a run, its own scatter marginalised.
 
 With whitened residual ``r``, sensitivities ``J`` and, of each run, deviations ``b ~ N(0, D)`` of the
-parameters that scatter (sensitivities ``N``), minus twice the log-likelihood of a change ``x`` is, up to a
-constant,
+parameters that vary from run to run (sensitivities ``N``), minus twice the log-likelihood of a change ``x``
+is, up to a constant,
 
     c - 2 g'x + x'A x,   A = J'V J,  g = J'V r,  V = I - N (N'N + D^-1)^-1 N'
 
@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from terrain.discrepancy.noise import ORDER, Noise, noise_of, whitened
+from terrain.discrepancy.noise import ORDER, Noise, noise_of, whiten
 from terrain.discrepancy.residuals import LowPass, Rows, rows_of
 from terrain.discrepancy.signals import Signals
 from terrain.discrepancy.simulation import Simulation
@@ -28,11 +28,11 @@ N_BLOCKS = 3
 """Time blocks of a run; they serve as clusters where runs are few."""
 
 PRIOR_STD = {name: 0.5 * max(abs(low), high) for name, (low, high) in BOUNDS.items()}
-"""How wide a parameter is let go when the whole library is fitted to see what noise is left."""
+"""Prior of a parameter while the whole library is freed to estimate the noise."""
 
 
 class Information(NamedTuple):
-    """What runs say, around one point of the parameters.
+    """Information of runs around one point of the parameters.
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ class Information(NamedTuple):
     rows, noise : from which they come
     white_residual, white_change : of each run (rows, channels) and (k, rows, channels), 0 where nothing was
         measured
-    nuisances : (q,) indices into ``parameters`` of what scatters from run to run
+    nuisances : (q,) indices into ``parameters`` of those that vary from run to run
     nuisance_std : (q,)
     shift : of each run (q, k + 1): deviation of its nuisances per unit of each parameter's change (negative),
         and that which its residual shows
@@ -67,7 +67,7 @@ class Information(NamedTuple):
     inner: tuple[Array, ...]
 
     def places(self, names: Sequence[str]) -> list[int]:
-        """Return where parameters stand in the matrices."""
+        """Return the positions of parameters in the matrices."""
         return [self.parameters.index(name) for name in names]
 
 
@@ -79,7 +79,7 @@ def information_at(
     low_pass: LowPass,
     noise: Noise | None = None,
 ) -> Information:
-    """Return what runs say around a point; the noise is that which the whole library leaves, unless given."""
+    """Return the information of runs around a point; the noise is estimated unless it is given."""
     planar = {terrain: simulation.planar_on(terrain) for terrain in {run.terrain for run in signals}}
     scattered = [name for name in simulation.scatter if simulation.scatter[name] > 0]
     names = tuple(dict.fromkeys([*parameters, *scattered]))
@@ -90,13 +90,13 @@ def information_at(
         speeds = [run.pace_mps for run in rows]
         noise = noise_of([run.residual for run in rows], speeds, 0)
         for _ in range(2):
-            loose = _summed(names, vector, rows, noise, nuisances, std)
-            left, n_fitted = _left_of_all(loose)
+            loose = _sum_forms(names, vector, rows, noise, nuisances, std)
+            left, n_fitted = _library_residuals(loose)
             noise = noise_of(left, speeds, n_fitted)
-    return _summed(names, vector, rows, noise, nuisances, std)
+    return _sum_forms(names, vector, rows, noise, nuisances, std)
 
 
-def _summed(
+def _sum_forms(
     names: tuple[str, ...],
     vector: Array,
     rows: tuple[Rows, ...],
@@ -109,7 +109,7 @@ def _summed(
     a_blocks, g_blocks = np.empty((n, N_BLOCKS, k, k)), np.empty((n, N_BLOCKS, k))
     white_r, white_j, shifts, inners = [], [], [], []
     for i, run in enumerate(rows):
-        residual, change = _whitened(noise, run)
+        residual, change = _whiten_run(noise, run)
         both = np.concatenate([change, residual[None]]).transpose(1, 0, 2)
         edges = [len(both) * b // N_BLOCKS for b in range(N_BLOCKS + 1)]
         parts = [both[edges[b] : edges[b + 1]].transpose(1, 0, 2).reshape(k + 1, -1) for b in range(N_BLOCKS)]
@@ -145,7 +145,7 @@ def _summed(
     )
 
 
-def _whitened(noise: Noise, run: Rows) -> tuple[Array, Array]:
+def _whiten_run(noise: Noise, run: Rows) -> tuple[Array, Array]:
     """Return residual (m, c) and sensitivities (k, m, c) whitened, both 0 where the residual is not known."""
     residual = run.residual
     known = np.isfinite(residual)
@@ -156,14 +156,14 @@ def _whitened(noise: Noise, run: Rows) -> tuple[Array, Array]:
         valid[lag:] &= known[:-lag] | ~used
         valid[:lag] &= ~used
     both = np.concatenate([residual[None], run.sensitivity]) / noise.size(run.pace_mps)
-    white = whitened(noise.filters, both)
+    white = whiten(noise.filters, both)
     white *= valid
     return white[0], white[1:]
 
 
-def _left_of_all(info: Information) -> tuple[list[Array], float]:
-    """Return what the whole library, let go, and each run's deviations leave; and how much they fitted."""
-    total, bound = info.a.sum(axis=0), _let_go(info)
+def _library_residuals(info: Information) -> tuple[list[Array], float]:
+    """Return the residuals with the whole library freed, and the effective number of fitted parameters."""
+    total, bound = info.a.sum(axis=0), _freed_information(info)
     x = np.linalg.solve(bound, info.g.sum(axis=0))
     left = []
     for run, shift in zip(info.rows, info.shift, strict=True):
@@ -176,14 +176,14 @@ def _left_of_all(info: Information) -> tuple[list[Array], float]:
     return left, n_fitted
 
 
-def _let_go(info: Information) -> Array:
-    """Return the information (k, k) of all runs where every parameter is let go as far as it may be."""
+def _freed_information(info: Information) -> Array:
+    """Return the information (k, k) of all runs with every parameter freed up to its prior."""
     prior = np.array([PRIOR_STD.get(name, 1e-6) for name in info.parameters])
     return np.asarray(info.a.sum(axis=0) + np.diag(1.0 / prior**2))
 
 
-def counted_from(info: Information, base: Array) -> Information:
-    """Return the same with changes counted from another point, to which the form is carried on straight."""
+def recentre(info: Information, base: Array) -> Information:
+    """Return the same with changes counted from another point, extrapolated linearly."""
     away = np.array([info.vector[INDEX[name]] - base[INDEX[name]] for name in info.parameters])
     return info._replace(
         vector=base,
@@ -193,8 +193,8 @@ def counted_from(info: Information, base: Array) -> Information:
     )
 
 
-def rest_beside(a: Array, base: Sequence[int], own: Sequence[int]) -> tuple[Array, Array]:
-    """Return what an information matrix says of parameters beside others that are fitted with them.
+def partial_information(a: Array, base: Sequence[int], own: Sequence[int]) -> tuple[Array, Array]:
+    """Return the information on parameters while others are fitted with them.
 
     Parameters
     ----------
@@ -236,12 +236,12 @@ def loss_of(info: Information, names: Sequence[str]) -> float:
 
 
 class Nearby(NamedTuple):
-    """What runs say of a few parameters at another point, by the noise and the scatter of an information.
+    """Information on a few parameters at another point, with the noise and scatter of an information.
 
     Parameters
     ----------
     vector : the point
-    a, g : (k, k) and (k,) of the quadratic form of the parameters asked for, all runs together
+    a, g : (k, k) and (k,) of the quadratic form of these parameters, all runs together
     white_residual : of each run (rows, channels)
     """
 
@@ -259,13 +259,13 @@ def nearby(
     parameters: Sequence[str],
     low_pass: LowPass,
 ) -> Nearby:
-    """Return what the runs of an information say at another point; much quicker than anew."""
+    """Return the information of the same runs at another point; much faster than computing it anew."""
     planar = {terrain: simulation.planar_on(terrain) for terrain in {run.terrain for run in signals}}
     k, white = len(parameters), []
     a, g = np.zeros((k, k)), np.zeros(k)
     for run, its_change, inner in zip(signals, info.white_change, info.inner, strict=True):
         rows = rows_of(run, planar[run.terrain], vector, parameters, low_pass)
-        residual, change = _whitened(info.noise, rows)
+        residual, change = _whiten_run(info.noise, rows)
         nuisances = its_change[info.nuisances].reshape(len(info.nuisances), -1)
         both = np.concatenate([change, residual[None]]).reshape(k + 1, -1)
         along = nuisances @ both.T
@@ -276,7 +276,7 @@ def nearby(
 
 
 def misfit_of(info: Information, white_residual: Sequence[Array]) -> float:
-    """Return what the whole library could still take from residuals (rows, channels) at another point.
+    """Return by how much the whole library could still reduce residuals (rows, channels) at another point.
 
     Parameters
     ----------
@@ -285,7 +285,7 @@ def misfit_of(info: Information, white_residual: Sequence[Array]) -> float:
 
     Notes
     -----
-    Up to a constant it is minus twice the log-likelihood there, as far as sensitivities can tell.  The sum of
+    Up to a constant it is minus twice the log-likelihood there, as far as the problem is linear.  The sum of
     squares itself will not do: the noise of the wheels is in the prediction, and a cause that makes it larger
     or smaller, as a mass does, would be judged by it.
     """
@@ -293,10 +293,10 @@ def misfit_of(info: Information, white_residual: Sequence[Array]) -> float:
     for residual, change, shift in zip(white_residual, info.white_change, info.shift, strict=True):
         flat = change.reshape(len(change), -1) @ residual.ravel()
         score += flat - shift[:, : len(flat)].T @ flat[info.nuisances]
-    return float(score @ np.linalg.solve(_let_go(info), score))
+    return float(score @ np.linalg.solve(_freed_information(info), score))
 
 
-def moved(point: Array, names: Sequence[str], change: Array) -> Array:
+def move_point(point: Array, names: Sequence[str], change: Array) -> Array:
     """Return the point that lies a change of the parameters named away, kept in the bounds of the library."""
     vector = point.copy()
     for name, value in zip(names, change, strict=True):

@@ -1,10 +1,11 @@
-"""What to drive next: the scenario that parts best what the runs did not, or shows what they did not show.
+"""The next drive: the scenario that best distinguishes what the runs could not, or excites what they did not.
 
 Every scenario of ``terrain simulate`` that the robot can drive is driven without noise, on the level and
-uphill, and the sensitivities of the effects in question are whitened like those of the runs, with what
-scatters by itself taken out.  Two effects are told apart by their collinearity index ``1 / sqrt(1 - r)``,
+uphill, and the sensitivities of the effects in question are whitened like those of the runs, with
+variations from run to run marginalised.  Two effects are compared by their collinearity index
+``1 / sqrt(1 - r)``,
 ``r`` the largest correlation of a change by the one with a change by the other: 1 is orthogonal, above 10
-they cannot be told apart (Brun et al., Water Resources Research 2001, of two normalised columns).
+they cannot be distinguished (Brun et al., Water Resources Research 2001, of two normalised columns).
 """
 
 from __future__ import annotations
@@ -17,10 +18,10 @@ from typing import NamedTuple
 import numpy as np
 from scipy.signal import lfilter
 
-from terrain.discrepancy.information import Information, correlation, information_at, rest_beside
+from terrain.discrepancy.information import Information, correlation, information_at, partial_information
 from terrain.discrepancy.noise import ORDER, Noise
 from terrain.discrepancy.residuals import low_pass_of, measured_channels
-from terrain.discrepancy.selection import SEEN_SHARE, Z_EFFECT
+from terrain.discrepancy.selection import EXCITED_RATIO, Z_EFFECT
 from terrain.discrepancy.signals import PARALLEL, Signals
 from terrain.discrepancy.simulation import Simulation
 from terrain.discrepancy.verdict import Limit, NextDrive
@@ -49,7 +50,7 @@ GRADES_DEG = (0.0, 6.0)
 """Level, and a slope that every robot here climbs."""
 
 LONGEST_S = 40.0
-"""Of a scenario that would last longer: what it is good for shows by then."""
+"""Longest part of a scenario that is simulated."""
 
 CLOCK_HZ = RATE_HZ / 2
 """Of the replay: half the rate of the commands is five times what they hold."""
@@ -57,17 +58,17 @@ CLOCK_HZ = RATE_HZ / 2
 FOLLOW_S = 0.1
 """Lag of wheels and steering behind their commands; assumed."""
 
-PARTED_INDEX = 10.0
-"""Collinearity index over which two effects are not told apart, whatever the amplitude."""
+SEPARABLE_INDEX = 10.0
+"""Collinearity index above which two effects are not distinguished, whatever the amplitude."""
 
 EXACT_INDEX = 100.0
-"""Over it two effects count as one."""
+"""Above it two effects count as one."""
 
-WORTH_A_DRIVE = 1.5
-"""So much has to be won, as a ratio, for a drive to be told."""
+MIN_IMPROVEMENT_RATIO = 1.5
+"""Least improvement by a drive that is suggested."""
 
 Z_SHOWN = Z_EFFECT + 1.28
-"""Evidence that nine drives in ten exceed the threshold with."""
+"""Expected evidence with which nine drives in ten exceed the threshold."""
 
 TYPICAL_STD = {
     GYRO: 0.01,
@@ -78,19 +79,19 @@ TYPICAL_STD = {
     TURNING_CURRENT: 1.0,
     HEADING: 0.02,
 }
-"""Noise of channels of which the runs tell none; assumed, white."""
+"""Noise of channels that the runs do not have; assumed, white."""
 
 
 class _Drive(NamedTuple):
-    """A scenario, and what it would say (k, k) of the parameters."""
+    """A scenario, and its information (k, k) on the parameters."""
 
     scenario: str
     grade_deg: float
     a: Array
 
 
-class _Parted(NamedTuple):
-    """Worst collinearity index of any pair, and sigmas of one at its bounds that the other cannot take."""
+class _Separation(NamedTuple):
+    """Worst collinearity index of any pair, and sigmas of one at its bounds that the other cannot explain."""
 
     collinearity: float
     power: float
@@ -102,27 +103,27 @@ def next_drive(
     missed: Sequence[Limit],
     info: Information | None = None,
 ) -> NextDrive | None:
-    """Return what to drive next, None where nothing is to be parted or no scenario helps.
+    """Return the next drive, None where nothing is to be distinguished or no scenario helps.
 
     Parameters
     ----------
     simulation : with what is built in so far
-    sets : effects of which one is there, and the runs do not tell which
-    missed : what the runs could not have shown; asked for only where nothing is to be parted
-    info : what the runs say; without it channels and noise are typical ones, and nothing is compared
+    sets : effects of which one is present, and which the runs cannot distinguish
+    missed : what the runs did not excite; used only where nothing is to be distinguished
+    info : of the runs; without it channels and noise are typical ones, and nothing is compared
 
-    Where a set cannot be parted by any drive with the channels that are logged, but could be with one more,
-    the reason names it.
+    Where a set cannot be distinguished by any drive with the channels that are logged, but could be with one
+    more, the reason names it.
     """
     if sets:
-        return _parting(simulation, sets, info)
-    return _showing(simulation, missed, info) if missed else None
+        return _separating_drive(simulation, sets, info)
+    return _exciting_drive(simulation, missed, info) if missed else None
 
 
-def _parting(
+def _separating_drive(
     simulation: Simulation, sets: Sequence[tuple[str, ...]], info: Information | None
 ) -> NextDrive | None:
-    """Return the drive that parts all sets best; if none does, the one that does with a channel more."""
+    """Return the drive that best distinguishes all sets, with more channels if none does."""
     logged = _logged(simulation.robot, info)
     names = list(dict.fromkeys(p for group in sets for effect in group for p in _parameters(effect)))
     desired = [
@@ -132,37 +133,43 @@ def _parting(
         for twin, channel in effect_named(effect).twins
         if twin in group and channel not in logged
     ]
-    told = " and ".join(dict.fromkeys(_listed(group) for group in sets))
-    now = _Parted(np.inf, 0.0)
+    groups = " and ".join(dict.fromkeys(_listed(group) for group in sets))
+    now = _Separation(np.inf, 0.0)
     if info is not None:
         at = info.places(names)
-        now = _parted(sets, names, info.a[:, at][:, :, at].sum(axis=0))
+        now = _separation(sets, names, info.a[:, at][:, :, at].sum(axis=0))
     for channels in (logged, (*logged, *desired)) if desired else (logged,):
         drives = _drives(simulation, names, channels, info)
-        found = [(_parted(sets, names, drive.a), drive) for drive in drives]
-        found = [pair for pair in found if pair[0].collinearity < PARTED_INDEX]
+        found = [(_separation(sets, names, drive.a), drive) for drive in drives]
+        found = [pair for pair in found if pair[0].collinearity < SEPARABLE_INDEX]
         if not found:
             continue
-        parted, drive = max(found, key=lambda pair: pair[0].power)
-        index = f"{parted.collinearity:.2g}"
+        separation, drive = max(found, key=lambda pair: pair[0].power)
+        index = f"{separation.collinearity:.2g}"
         if channels is not logged:
             lacking = _listed(list(dict.fromkeys(desired)))
-            reason = f"{told} are one without {lacking}; with it logged, their collinearity index is {index}"
+            reason = (
+                f"{groups} are one without {lacking}; with it logged, their collinearity index is {index}"
+            )
         elif info is None:
-            reason = f"the collinearity index of {told} would be {index}"
-        elif now.collinearity > WORTH_A_DRIVE * parted.collinearity:
-            reason = f"the collinearity index of {told} falls from {_told(now.collinearity)} to {index}"
+            reason = f"the collinearity index of {groups} would be {index}"
+        elif now.collinearity > MIN_IMPROVEMENT_RATIO * separation.collinearity:
+            reason = (
+                f"the collinearity index of {groups} falls from {_index_text(now.collinearity)} to {index}"
+            )
         else:
-            times = parted.power / max(now.power / math.sqrt(len(info.a)), 1e-9)
-            if times < WORTH_A_DRIVE:
+            times = separation.power / max(now.power / math.sqrt(len(info.a)), 1e-9)
+            if times < MIN_IMPROVEMENT_RATIO:
                 return None
-            reason = f"it parts {told} by {times:.2g} times as many sigmas as one of the runs"
+            reason = f"it separates {groups} by {times:.2g} times as many sigmas as one of the runs"
         return NextDrive(drive.scenario, drive.grade_deg, reason)
     return None
 
 
-def _showing(simulation: Simulation, missed: Sequence[Limit], info: Information | None) -> NextDrive | None:
-    """Return the drive that shows the most of what was not shown."""
+def _exciting_drive(
+    simulation: Simulation, missed: Sequence[Limit], info: Information | None
+) -> NextDrive | None:
+    """Return the drive that excites most of what the runs did not excite."""
     names = [limit.name for limit in missed]
     before = np.array([limit.value for limit in missed])
     bound = np.array([max(abs(value) for value in BOUNDS[name]) for name in names])
@@ -170,24 +177,24 @@ def _showing(simulation: Simulation, missed: Sequence[Limit], info: Information 
     for drive in _drives(simulation, names, _logged(simulation.robot, info), info):
         with np.errstate(divide="ignore"):
             limit = Z_SHOWN / np.sqrt(np.maximum(np.diag(drive.a), 0.0))
-        shown = (limit < SEEN_SHARE * bound) & (WORTH_A_DRIVE * limit < before)
+        excited = (limit < EXCITED_RATIO * bound) & (MIN_IMPROVEMENT_RATIO * limit < before)
         # as many as possible; the size of the limits decides between equals
-        score = shown.sum() + float(np.mean(1.0 / (1.0 + np.minimum(limit / bound, 1e6))))
-        if shown.any() and (best is None or score > best[0]):
-            best = score, drive, np.where(shown, limit, np.inf)
+        score = excited.sum() + float(np.mean(1.0 / (1.0 + np.minimum(limit / bound, 1e6))))
+        if excited.any() and (best is None or score > best[0]):
+            best = score, drive, np.where(excited, limit, np.inf)
     if best is None:
         return None
     _, drive, limit = best
     k = int(np.argmin(limit / bound))
     others = int(np.isfinite(limit).sum()) - 1
-    beside = f", and {others} more that the runs do not show" if others else ""
+    beside = f", and {others} more that the runs do not excite" if others else ""
     was = f"from {before[k]:.2g}" if math.isfinite(before[k]) else "from infinite"
     reason = f"the detection limit of {names[k]} falls {was} to {limit[k]:.2g} {missed[k].unit}{beside}"
     return NextDrive(drive.scenario, drive.grade_deg, reason)
 
 
-def _parted(sets: Sequence[tuple[str, ...]], names: Sequence[str], a: Array) -> _Parted:
-    """Return how well an information matrix (k, k) of parameters parts the worst pair of any set."""
+def _separation(sets: Sequence[tuple[str, ...]], names: Sequence[str], a: Array) -> _Separation:
+    """Return how well an information matrix (k, k) of parameters separates the worst pair of any set."""
     index, power = 1.0, np.inf
     for group in sets:
         for pair in combinations(group, 2):
@@ -195,12 +202,12 @@ def _parted(sets: Sequence[tuple[str, ...]], names: Sequence[str], a: Array) -> 
             r = correlation(a, one, other)
             index = max(index, math.inf if r >= 1.0 else 1.0 / math.sqrt(1.0 - r))
             power = min(power, _free(a, names, one, other), _free(a, names, other, one))
-    return _Parted(index, power)
+    return _Separation(index, power)
 
 
 def _free(a: Array, names: Sequence[str], one: list[int], other: list[int]) -> float:
-    """Return the evidence, in sigmas, of the one at its bounds that the other cannot take."""
-    free = rest_beside(a, other, one)[1]
+    """Return the evidence, in sigmas, of the one at its bounds that the other cannot explain."""
+    free = partial_information(a, other, one)[1]
     size = np.array([max(abs(value) for value in BOUNDS[names[k]]) for k in one])
     return math.sqrt(max(float(np.linalg.eigvalsh(free * np.outer(size, size))[0]), 0.0))
 
@@ -213,12 +220,12 @@ def _listed(names: Sequence[str]) -> str:
     return ", ".join(names[:-1]) + " and " + names[-1] if len(names) > 1 else names[0]
 
 
-def _told(index: float) -> str:
+def _index_text(index: float) -> str:
     return f"{index:.2g}" if index < EXACT_INDEX else f"over {EXACT_INDEX:g}"
 
 
 def _logged(robot: Robot, info: Information | None) -> tuple[str, ...]:
-    """Return the channels of the runs, or those that the robot's description lets expect."""
+    """Return the channels of the runs, or those expected from the robot's description."""
     if info is not None:
         return measured_channels(info.rows)
     own = [GYRO, ACCEL]
@@ -231,22 +238,23 @@ def _logged(robot: Robot, info: Information | None) -> tuple[str, ...]:
 def _drives(
     simulation: Simulation, names: Sequence[str], channels: Sequence[str], info: Information | None
 ) -> list[_Drive]:
-    """Return what each scenario on each grade would say of parameters in channels."""
-    told, signals = [], []
+    """Return the information of each scenario on each grade on parameters, from channels."""
+    driven, signals = [], []
     for name in SCENARIOS:
         inputs = _inputs(simulation.robot, name)
         if inputs is None:
             continue
         for grade_deg in GRADES_DEG:
-            told.append((name, grade_deg))
+            driven.append((name, grade_deg))
             signals.append(_signals(simulation, *inputs, grade_deg, channels))
     if not signals:
         return []
     vector = simulation.vector if info is None else info.vector
-    said = information_at(signals, simulation, vector, names, low_pass_of(signals), _noise(info))
-    at = said.places(names)
+    info_of_drives = information_at(signals, simulation, vector, names, low_pass_of(signals), _noise(info))
+    at = info_of_drives.places(names)
     return [
-        _Drive(name, grade_deg, a[np.ix_(at, at)]) for (name, grade_deg), a in zip(told, said.a, strict=True)
+        _Drive(name, grade_deg, a[np.ix_(at, at)])
+        for (name, grade_deg), a in zip(driven, info_of_drives.a, strict=True)
     ]
 
 
@@ -276,7 +284,7 @@ def _signals(
     grade_deg: float,
     channels: Sequence[str],
 ) -> Signals:
-    """Return a drive as a log without noise would have it; what was measured is not looked at, only where."""
+    """Return the signals of a drive without noise; of its measurements only the pattern of holes is used."""
     level, vector = np.zeros(len(wheel_speed_mps)), simulation.vector
     measured = np.full((len(wheel_speed_mps), len(CHANNELS)), np.nan)
     measured[:, [CHANNELS.index(name) for name in channels]] = 0.0
@@ -302,7 +310,7 @@ def _signals(
 
 
 def _noise(info: Information | None) -> Noise:
-    """Return the noise of the runs, and what is typical where they tell none."""
+    """Return the noise of the runs, and a typical one for channels that they do not have."""
     std = np.array([TYPICAL_STD[name] for name in CHANNELS])
     growth, filters = np.zeros((len(CHANNELS), 3)), np.zeros((len(CHANNELS), ORDER + 1))
     growth[:, 0], filters[:, 0] = std**2, 1.0

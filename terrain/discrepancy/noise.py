@@ -1,4 +1,4 @@
-"""What is left when everything known is taken out grows with speed and is coloured: both are taken off it.
+"""Noise of the residuals: it grows with speed and is coloured; whitening removes both.
 
 A channel's noise is ``s(v) x_k`` with ``s(v)^2 = a_0 + a_1 v + a_2 v^2`` of the wheels' speed ``v``, and
 ``x`` an autoregression: a robot shakes as it moves, and what shakes it lasts longer than a row.
@@ -16,17 +16,17 @@ from scipy.optimize import nnls
 from terrain.records import Array
 
 FLOOR = 0.2
-"""Least share of the mean square that noise at rest is taken to have: what a robot does as it starts is
-simulated less well than its noise there would ask for."""
+"""Least ratio of the mean square that is attributed to noise at rest: starts of a robot are simulated less
+well than the noise at rest suggests."""
 
 ORDER = 6
 """Of the autoregression: about a second at the rate of the rows."""
 
 ORDERS = (ORDER, 3, 1)
-"""What is tried: a channel with many holes has few stretches that fill a long one."""
+"""Orders that are tried: a channel with many holes has few stretches that fill a long one."""
 
-WHOLE_SHARE = 0.7
-"""Share of the rows of the shortest that an order has to keep."""
+WHOLE_RATIO = 0.7
+"""Ratio of the rows of the shortest order that a longer one has to keep."""
 
 
 class Noise(NamedTuple):
@@ -61,7 +61,7 @@ def noise_of(residuals: Sequence[Array], speeds_mps: Sequence[Array], n_fitted: 
     ----------
     residuals : of each run, NaN where nothing was measured
     speeds_mps : (m,) of the wheels, of each run
-    n_fitted : numbers that were fitted to these residuals, in all channels together: they made them smaller
+    n_fitted : number of parameters that were fitted to these residuals and made them smaller
     """
     n_channels = residuals[0].shape[1]
     filters, stds = np.full((n_channels, ORDER + 1), np.nan), np.full(n_channels, np.nan)
@@ -77,8 +77,8 @@ def noise_of(residuals: Sequence[Array], speeds_mps: Sequence[Array], n_fitted: 
         scaled = [
             r[:, c] / np.sqrt(_powers(v) @ growth[c]) for r, v in zip(residuals, speeds_mps, strict=True)
         ]
-        tables = {order: _lagged(scaled, order) for order in ORDERS}
-        enough = [order for order in ORDERS if len(tables[order]) >= WHOLE_SHARE * len(tables[ORDERS[-1]])]
+        tables = {order: _lag_table(scaled, order) for order in ORDERS}
+        enough = [order for order in ORDERS if len(tables[order]) >= WHOLE_RATIO * len(tables[ORDERS[-1]])]
         table, order = tables[enough[0]], enough[0]
         if len(table) < 10 * ORDER:
             continue
@@ -106,7 +106,7 @@ def _growth(square: Array, powers: Array) -> Array:
     return fitted
 
 
-def _lagged(signals: Sequence[Array], order: int) -> Array:
+def _lag_table(signals: Sequence[Array], order: int) -> Array:
     """Return rows ``x_k, x_(k-1), ... x_(k-order)`` of all signals, as far as they are known."""
     rows = [
         np.lib.stride_tricks.sliding_window_view(x, order + 1)[:, ::-1] for x in signals if len(x) > order
@@ -116,7 +116,7 @@ def _lagged(signals: Sequence[Array], order: int) -> Array:
 
 
 @njit(cache=True)
-def whitened(filters: Array, x: Array) -> Array:
+def whiten(filters: Array, x: Array) -> Array:
     """Return signals (k, m, c) behind the whitening filters (c, order + 1); 0 where that meets a NaN.
 
     The rows before the filter is filled are 0 too.

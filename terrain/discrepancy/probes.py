@@ -1,4 +1,4 @@
-"""Questions without a name: whether what is left follows an input, its square or rate, or a wheel's turn."""
+"""Probes: whether the residual depends on an input, its square or rate, or the angle of a wheel."""
 
 from __future__ import annotations
 
@@ -10,25 +10,25 @@ import numpy as np
 from scipy.stats import chi2
 
 from terrain.discrepancy.information import Information
-from terrain.discrepancy.noise import whitened
+from terrain.discrepancy.noise import whiten
 from terrain.discrepancy.residuals import INPUTS, Rows
-from terrain.discrepancy.selection import weighed_variance, z_of, z_of_t
+from terrain.discrepancy.selection import pooled_variance, z_of, z_of_t
 from terrain.effects import CHANNELS
 from terrain.records import Array
 
 Z_PROBE = 4.5
-"""Evidence that a probe needs: 7e-6, of some two hundred that are asked."""
+"""Evidence that a probe needs: 7e-6, of some two hundred."""
 
 CRAWL_MPS = 0.2
-"""Speed below which a robot crawls."""
+"""Scale of speed of the probe of crawling."""
 
 STANDSTILL_MPS = 0.05
 
 HARMONICS = (1, 2)
-"""Of a wheel's turn: an eccentric wheel, an oval one."""
+"""Of a wheel's angle: an eccentric wheel, an oval one."""
 
 
-class Answer(NamedTuple):
+class ProbeResult(NamedTuple):
     """Evidence of one probe.
 
     Parameters
@@ -41,18 +41,18 @@ class Answer(NamedTuple):
     gain: float
 
     @property
-    def stands(self) -> bool:
-        """Whether something is there."""
+    def significant(self) -> bool:
+        """Whether the residual depends on the input."""
         return self.z > Z_PROBE
 
 
 def probe_inputs(rows: Rows, rate_hz: float) -> dict[str, Array]:
-    """Return the inputs (m,) that residuals are held against, by name."""
+    """Return the inputs (m,) that residuals are compared with, by name."""
     speed, turn, steer, grade, roll, force = (rows.inputs[:, i] for i in range(6))
     accel = np.gradient(speed) * rate_hz if len(speed) > 1 else np.zeros_like(speed)
     tau = rows.time_s / 60.0 - 0.5
-    way = np.tanh(speed / STANDSTILL_MPS)
-    crawl = np.exp(-((speed / CRAWL_MPS) ** 2)) * np.abs(way)
+    direction = np.tanh(speed / STANDSTILL_MPS)
+    crawl = np.exp(-((speed / CRAWL_MPS) ** 2)) * np.abs(direction)
     return {
         "constant": np.ones_like(speed),
         "time": tau,
@@ -60,9 +60,9 @@ def probe_inputs(rows: Rows, rate_hz: float) -> dict[str, Array]:
         "speed": speed,
         "|speed|": np.abs(speed),
         "speed |speed|": speed * np.abs(speed),
-        "direction": way,
+        "direction": direction,
         "crawling": crawl,
-        "crawling direction": crawl * way,
+        "crawling direction": crawl * direction,
         "turn": turn,
         "|turn|": np.abs(turn),
         "turn |turn|": turn * np.abs(turn),
@@ -85,16 +85,19 @@ def probe_inputs(rows: Rows, rate_hz: float) -> dict[str, Array]:
     }
 
 
-def ask(info: Information, names: Sequence[str], change: Array) -> dict[tuple[str, str], Answer]:
-    """Return the answer of every probe, by channel and input.
+def probe_residuals(
+    info: Information, names: Sequence[str], change: Array
+) -> dict[tuple[str, str], ProbeResult]:
+    """Return the result of every probe, by channel and input.
 
     Parameters
     ----------
-    info : what the runs say at the fit; changes counted from wherever
-    names, change : parameters that were selected, and their fitted change: a probe has to tell more than they
+    info : of the runs at the fit; changes counted from any point
+    names, change : parameters that were selected, and their fitted change, beside which a probe has to be
+        significant
     """
     rate_hz = 1 / float(np.median(np.diff(info.rows[0].time_s)))
-    answers: dict[tuple[str, str], Answer] = {}
+    results: dict[tuple[str, str], ProbeResult] = {}
     inputs = [probe_inputs(run, rate_hz) for run in info.rows]
     for c, channel in enumerate(CHANNELS):
         if not any(residual[:, c].any() for residual in info.white_residual):
@@ -102,8 +105,8 @@ def ask(info: Information, names: Sequence[str], change: Array) -> dict[tuple[st
         columns = []
         for run, given, residual in zip(info.rows, inputs, info.white_residual, strict=True):
             columns.append(_white(info, run, c, np.array(list(given.values())), residual))
-        for name, answer in zip(inputs[0], _answers(info, names, change, c, columns), strict=True):
-            answers[channel, name] = answer
+        for name, result in zip(inputs[0], _probe_results(info, names, change, c, columns), strict=True):
+            results[channel, name] = result
         n_wheels = info.rows[0].inputs.shape[1] - len(INPUTS) + 1
         for wheel in range(n_wheels):
             for harmonic in HARMONICS:
@@ -113,12 +116,12 @@ def ask(info: Information, names: Sequence[str], change: Array) -> dict[tuple[st
                     pair = run.inputs[:, 0] * np.array([np.cos(phase), np.sin(phase)])
                     pairs.append(_white(info, run, c, pair, residual))
                 name = f"wheel {wheel + 1} turn" + ("" if harmonic == 1 else f" x{harmonic}")
-                answers[channel, name] = _turning(info, c, pairs)
-    return answers
+                results[channel, name] = _wheel_turn_probe(info, c, pairs)
+    return results
 
 
-def drift_of(info: Information, names: Sequence[str], change: Array) -> dict[str, Answer]:
-    """Return, of each selected parameter, whether it changes from the start of runs to their end."""
+def parameter_drifts(info: Information, names: Sequence[str], change: Array) -> dict[str, ProbeResult]:
+    """Return, by selected parameter, the evidence that it changes from the start of runs to their end."""
     if not names:
         return {}
     columns = [
@@ -126,20 +129,20 @@ def drift_of(info: Information, names: Sequence[str], change: Array) -> dict[str
         for run, white in zip(info.rows, info.white_change, strict=True)
     ]
     flat = [column.reshape(len(names), -1) for column in columns]
-    return dict(zip(names, _answers(info, names, change, None, flat), strict=True))
+    return dict(zip(names, _probe_results(info, names, change, None, flat), strict=True))
 
 
 def _white(info: Information, run: Rows, c: int, columns: Array, residual: Array) -> Array:
     """Whiten columns (q, m) as channel c, 0 where its residual is not known."""
     scaled = columns / info.noise.size(run.pace_mps)[:, c]
-    white = whitened(info.noise.filters[c : c + 1], np.ascontiguousarray(scaled[:, :, None]))[:, :, 0]
+    white = whiten(info.noise.filters[c : c + 1], np.ascontiguousarray(scaled[:, :, None]))[:, :, 0]
     return np.asarray(white * (residual[:, c] != 0.0))
 
 
-def _answers(
+def _probe_results(
     info: Information, names: Sequence[str], change: Array, c: int | None, columns: list[Array]
-) -> list[Answer]:
-    """Return the answers of columns (q, m) a run, in channel c or, where it is None, flat in all of them."""
+) -> list[ProbeResult]:
+    """Return the results of columns (q, m) a run, in channel c, or in all channels where it is None."""
     at = info.places(names)
     n_runs, q = len(columns), columns[0].shape[0]
     own, cross, score = np.empty((n_runs, q)), np.empty((n_runs, q, len(at))), np.empty((n_runs, q))
@@ -157,7 +160,9 @@ def _answers(
     if at:
         follow = np.linalg.lstsq(a.sum(axis=0), cross.sum(axis=0).T, rcond=1e-10)[0]
     free = own.sum(axis=0) - (cross.sum(axis=0) * follow.T).sum(axis=1)
-    share = own - 2 * np.einsum("rqs,sq->rq", cross, follow) + np.einsum("sq,rst,tq->rq", follow, a, follow)
+    size_of_run = (
+        own - 2 * np.einsum("rqs,sq->rq", cross, follow) + np.einsum("sq,rst,tq->rq", follow, a, follow)
+    )
     part = score - np.einsum("rs,sq->rq", g, follow)
     total = part.sum(axis=0)
     enough = free > 1e-6 * np.maximum(own.sum(axis=0), 1e-12)
@@ -166,17 +171,17 @@ def _answers(
     answers = []
     for k in range(q):
         if not enough[k]:
-            answers.append(Answer(0.0, 0.0))
+            answers.append(ProbeResult(0.0, 0.0))
             continue
-        part_k = part[:, k] - share[:, k] * size[k]
-        dispersion, dof = weighed_variance(part_k, np.clip(share[:, k] / free[k], 0.0, 0.9), free[k])
+        part_k = part[:, k] - size_of_run[:, k] * size[k]
+        dispersion, dof = pooled_variance(part_k, np.clip(size_of_run[:, k] / free[k], 0.0, 0.9), free[k])
         z = z_of_t(abs(total[k]) / np.sqrt(free[k] * dispersion), dof)
-        answers.append(Answer(z, float(total[k] ** 2 / free[k])))
+        answers.append(ProbeResult(z, float(total[k] ** 2 / free[k])))
     return answers
 
 
-def _turning(info: Information, c: int, pairs: list[Array]) -> Answer:
-    """Return the answer of a wave that starts anywhere in each run: two columns a run, each run its own."""
+def _wheel_turn_probe(info: Information, c: int, pairs: list[Array]) -> ProbeResult:
+    """Return the result of a wave with a phase of its own in each run: two columns a run."""
     statistic, each = 0.0, []
     for i, x in enumerate(pairs):
         j, r = info.white_change[i][:, :, c], info.white_residual[i][:, c]
@@ -187,7 +192,9 @@ def _turning(info: Information, c: int, pairs: list[Array]) -> Answer:
             each.append(float(score @ np.linalg.solve(own, score)))
             statistic += each[-1]
     if not each:
-        return Answer(0.0, 0.0)
+        return ProbeResult(0.0, 0.0)
     z = z_of(float(chi2.logsf(statistic, 2 * len(each))))
-    shown = float(np.median(each)) > 2 * math.log(2.0) * 1.5  # the median of chi^2 with 2 degrees is 2 log 2
-    return Answer(z if shown else 0.0, statistic - 2 * len(each))
+    in_most_runs = (
+        float(np.median(each)) > 2 * math.log(2.0) * 1.5
+    )  # the median of chi^2 with 2 degrees is 2 log 2
+    return ProbeResult(z if in_most_runs else 0.0, statistic - 2 * len(each))

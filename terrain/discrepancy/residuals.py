@@ -1,7 +1,7 @@
-"""Measured against simulated, and what each parameter of the simulation would change, behind one low-pass.
+"""Measured against simulated, and the sensitivity to each parameter of the simulation, low-pass filtered.
 
-Measurement, prediction and sensitivities pass the **same** low-pass: an encoder that is differentiated has
-its errors in what the prediction is made from, and without it they look like latency or mass.
+Measurement, prediction and sensitivities pass the **same** low-pass: the prediction contains
+the noise of a differentiated encoder, which otherwise looks like latency or mass.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ from terrain.simulation.planar.motion import move
 from terrain.simulation.planar.replay import replay, undone
 
 CUTOFF_HZ = 2.5
-"""Cut-off of the common low-pass at the full clock; what a wheeled robot is told changes within 2 Hz."""
+"""Cut-off of the common low-pass at the full clock; commands of a wheeled robot change within 2 Hz."""
 
 INPUT_CUTOFFS = 2.4
-"""Cut-off of what drives the simulation, over that of the common low-pass."""
+"""Cut-off of the inputs of the simulation, over that of the common low-pass."""
 
-CALM_CUTOFF = 0.6
-"""Cut-off of the wheel speeds that sensitivities are taken along, over that of the common low-pass: see
-:func:`rows_of`."""
+INSTRUMENT_CUTOFF_RATIO = 0.6
+"""Cut-off of the wheel speeds that serve as instruments of the sensitivities, over that of the common
+low-pass: see :func:`rows_of`."""
 
 SAME_CLOCK = 0.05
-"""Share by which the runs' clocks may differ: one window serves all of them."""
+"""Ratio by which the runs' clocks may differ: one window serves all of them."""
 
 CLOCKS_PER_CUTOFF = 10.0
 """Rate of the replay's clock over the cut-off of the common low-pass."""
@@ -46,14 +46,14 @@ TAPS_PER_CUTOFF = 2.4
 """Half length of the low-pass times its cut-off."""
 
 MIN_KNOWN = 0.75
-"""Share of the low-pass's weight that has to be known for a row, where a channel has holes."""
+"""Ratio of the low-pass's weight that has to be known for a row, where a channel has holes."""
 
 SETTLE_S = 0.5
-"""Start and end of a run left out, beside what the low-pass takes: the replay starts as if steady."""
+"""Start and end of a run left out, beside those of the low-pass: the replay starts in steady motion."""
 
 
 class LowPass(NamedTuple):
-    """A symmetric window, and what is written of what passes it.
+    """A symmetric window, and the rate of its output.
 
     Parameters
     ----------
@@ -63,8 +63,8 @@ class LowPass(NamedTuple):
     cutoff_hz : of the window
     inputs_every : samples of the signals' clock a sample of the replay's; 0 where that clock is too slow for
         a window of its own in between
-    calm_hz : cut-off of the wheel speeds that sensitivities are taken along, see :func:`rows_of`; infinite
-        for those of the prediction
+    instrument_cutoff_hz : cut-off of the wheel speeds that serve as instruments of the sensitivities, see
+        :func:`rows_of`; infinite for those of the prediction
     """
 
     taps: Array
@@ -72,19 +72,19 @@ class LowPass(NamedTuple):
     rate_hz: float
     cutoff_hz: float
     inputs_every: int
-    calm_hz: float
+    instrument_cutoff_hz: float
 
 
 class Rows(NamedTuple):
-    """A run behind the low-pass: what is compared, row by row.
+    """A low-pass filtered run, row by row.
 
     Parameters
     ----------
     run_id, terrain : of the run
     time_s : (m,) from the start of the run
     measured, predicted : (m, channels)
-    sensitivity : (parameters, m, channels) change of the prediction per change of each parameter asked for
-    inputs : (m, len(INPUTS) - 1 + wheels) what drives the simulation, for looking where a residual comes from
+    sensitivity : (parameters, m, channels) change of the prediction per change of each parameter
+    inputs : (m, len(INPUTS) - 1 + wheels) inputs of the simulation, for probes of the residual
     """
 
     run_id: str
@@ -102,7 +102,7 @@ class Rows(NamedTuple):
 
     @property
     def pace_mps(self) -> Array:
-        """How fast (m,) the wheels turn, straight ahead or against each other."""
+        """Speed (m,) of the wheels, straight ahead or against each other."""
         return np.maximum(np.abs(self.inputs[:, 0]), 0.5 * np.abs(self.inputs[:, 1]))
 
 
@@ -145,7 +145,7 @@ def low_pass_of(signals: Sequence[Signals]) -> LowPass:
         clock_hz / every,
         cutoff_hz,
         inputs_every,
-        CALM_CUTOFF * cutoff_hz,
+        INSTRUMENT_CUTOFF_RATIO * cutoff_hz,
     )
 
 
@@ -159,7 +159,7 @@ def _window(cutoff_hz: float, rate_hz: float) -> Array:
 def rows_of(
     signals: Signals, planar: Planar, vector: Array, parameters: Sequence[str], low_pass: LowPass
 ) -> Rows:
-    """Return a run behind the low-pass, and the sensitivities of the parameters named.
+    """Return a low-pass filtered run, and the sensitivities to the parameters named.
 
     Parameters
     ----------
@@ -170,13 +170,14 @@ def rows_of(
 
     Notes
     -----
-    The prediction holds the noise of the wheels that drive it, and so does the residual, turned about.  A
-    sensitivity along the same wheels holds it too, and where a robot hardly changes its motion, that is most
-    of it: residual and sensitivity agree by their noise, and an acceleration that never was looks like too
-    much of a mass.  Sensitivities are therefore taken along calmer wheels, as instruments: noise of a
-    differentiated encoder grows with frequency, what a robot was told to do does not.
+    The prediction contains the noise of its input, the wheel speeds, and so does the residual, with the
+    opposite sign.  A sensitivity along the same wheel speeds contains it too, and where a robot hardly
+    changes its motion the noise is most of it: residual and sensitivity are correlated by their noise, and
+    a spurious acceleration looks like an error of the mass.  Sensitivities are therefore computed along
+    low-pass filtered wheel speeds, as instruments: the noise of a differentiated encoder grows with
+    frequency, the commands do not.
     """
-    dt, wheel_speed, steer, grade, roll, measured = _prepared(signals, low_pass)
+    dt, wheel_speed, steer, grade, roll, measured = _prepare_inputs(signals, low_pass)
     n_rows = max((len(wheel_speed) - low_pass.taps.size) // low_pass.every + 1, 0)
     first = low_pass.taps.size // 2
     skip = math.ceil(SETTLE_S * low_pass.rate_hz)
@@ -186,30 +187,34 @@ def rows_of(
     whole = bool(known[:, known.any(axis=0)].all())
 
     def plain(values: Array) -> Array:
-        rows: Array = decimated(np.ascontiguousarray(values), low_pass.taps, low_pass.every)
+        rows: Array = decimate(np.ascontiguousarray(values), low_pass.taps, low_pass.every)
         return rows[keep]
 
     def smooth(values: Array) -> Array:
         if whole:
             return plain(values)
-        rows: Array = holed(np.ascontiguousarray(values), known, low_pass.taps, low_pass.every)
+        rows: Array = decimate_known(np.ascontiguousarray(values), known, low_pass.taps, low_pass.every)
         return rows[keep]
 
-    calm = _calm(wheel_speed, low_pass, dt)
-    true_wheel_speed, true_grade, true_roll = undone(planar, vector, dt, calm, grade, roll)
+    instruments = _instruments(wheel_speed, low_pass, dt)
+    true_wheel_speed, true_grade, true_roll = undone(planar, vector, dt, instruments, grade, roll)
     truth = move(planar, vector, dt, true_wheel_speed, steer, true_grade, true_roll, np.zeros((0, 3)))
-    points, sensed, spans = _points(vector, parameters)
+    points, sensed, spans = _evaluation_points(vector, parameters)
     holes = np.zeros((0, 0), dtype=np.bool_) if whole else known
     window = holes, low_pass.taps, low_pass.every
     now = _predictions(planar, points[:1], sensed[:1], dt, wheel_speed, steer, grade, roll, truth, *window)[
         0, keep
     ]
-    told = _predictions(planar, points[1:], sensed[1:], dt, calm, steer, grade, roll, truth, *window)[:, keep]
-    change = (told[::2] - told[1::2]) / spans[:, None, None]
-    speed = calm.mean(axis=1)
+    both = _predictions(planar, points[1:], sensed[1:], dt, instruments, steer, grade, roll, truth, *window)[
+        :, keep
+    ]
+    change = (both[::2] - both[1::2]) / spans[:, None, None]
+    speed = instruments.mean(axis=1)
     force = truth[:, 4] / (GRAVITY_MPS2 * planar.mass_kg)
-    inputs = np.column_stack([speed, calm[:, -1] - calm[:, 0], steer.mean(axis=1), grade, roll, force])
-    phase = np.cumsum(calm, axis=0) * (dt / planar.radius_m)
+    inputs = np.column_stack(
+        [speed, instruments[:, -1] - instruments[:, 0], steer.mean(axis=1), grade, roll, force]
+    )
+    phase = np.cumsum(instruments, axis=0) * (dt / planar.radius_m)
     at = first + low_pass.every * np.arange(n_rows)[keep]
     return Rows(
         signals.run_id,
@@ -222,19 +227,19 @@ def rows_of(
     )
 
 
-def _calm(wheel_speed: Array, low_pass: LowPass, dt: float) -> Array:
-    """Return wheel speeds (n, wheels) behind the low-pass of the sensitivities, as long as they were."""
-    if not math.isfinite(low_pass.calm_hz):
+def _instruments(wheel_speed: Array, low_pass: LowPass, dt: float) -> Array:
+    """Return wheel speeds (n, wheels) low-pass filtered as instruments, of the same length."""
+    if not math.isfinite(low_pass.instrument_cutoff_hz):
         return wheel_speed
-    taps = _window(low_pass.calm_hz, 1.0 / dt)
+    taps = _window(low_pass.instrument_cutoff_hz, 1.0 / dt)
     half = taps.size // 2
-    return np.asarray(decimated(np.pad(wheel_speed, ((half, half), (0, 0)), mode="edge"), taps, 1))
+    return np.asarray(decimate(np.pad(wheel_speed, ((half, half), (0, 0)), mode="edge"), taps, 1))
 
 
-def _points(vector: Array, parameters: Sequence[str]) -> tuple[Array, Array, Array]:
-    """Return the points at which the simulation is asked: here, and ahead and back in each parameter.
+def _evaluation_points(vector: Array, parameters: Sequence[str]) -> tuple[Array, Array, Array]:
+    """Return the points at which the simulation is evaluated: here, and ahead and back in each parameter.
 
-    The second are those at which sensors alone change; the third how far ahead and back lie apart.
+    Further returned are the points at which only sensors change, and the distances from ahead to back.
     """
     points = np.tile(vector, (1 + 2 * len(parameters), 1))
     sensed = np.zeros(len(points), dtype=np.bool_)
@@ -264,10 +269,10 @@ def _predictions(
     taps: Array,
     every: int,
 ) -> Array:
-    """Return what the simulation predicts at each point, behind the low-pass: (points, rows, channels).
+    """Return the low-pass filtered prediction of the simulation at each point (points, rows, channels).
 
-    ``truth`` is what the body does at all points where sensors alone change; ``known`` says where something
-    was measured, or is empty where that is everywhere.
+    ``truth`` is the motion of the body at all points where only sensors change; ``known`` states where
+    channels were measured, or is empty where that is everywhere.
     """
     m = max((wheel_speed_mps.shape[0] - taps.size) // every + 1, 0)
     out = np.empty((points.shape[0], m, 7))
@@ -276,16 +281,17 @@ def _predictions(
             shown = sense(planar, points[i], dt, truth)
         else:
             shown = replay(planar, points[i], dt, wheel_speed_mps, steer_rad, grade_rad, roll_rad)
-        out[i] = holed(shown, known, taps, every) if known.shape[0] > 0 else decimated(shown, taps, every)
+        out[i] = (
+            decimate_known(shown, known, taps, every) if known.shape[0] > 0 else decimate(shown, taps, every)
+        )
     return out
 
 
-def _prepared(signals: Signals, low_pass: LowPass) -> tuple[float, Array, Array, Array, Array, Array]:
-    """Return the clock's period, rims, steering, grade, roll and what is measured, as the low-pass wants.
+def _prepare_inputs(signals: Signals, low_pass: LowPass) -> tuple[float, Array, Array, Array, Array, Array]:
+    """Return the clock's period, wheel speeds, steering, grade, roll and measurements without holes.
 
-    Holes of what drives the simulation are bridged, and what is measured there is dropped.  Both pass a
-    window far above the low-pass: what is bent in the simulation, as friction about rest, turns noise of the
-    wheels into something that does not average out.
+    Holes of the inputs are bridged, and measurements there are dropped.  Both pass a window far above the
+    low-pass: nonlinearities of the simulation, as friction about rest, turn noise of the wheels into a bias.
     """
     columns = np.column_stack(
         [signals.wheel_speed_mps, signals.steer_rad, signals.grade_rad, signals.roll_rad]
@@ -304,7 +310,7 @@ def _prepared(signals: Signals, low_pass: LowPass) -> tuple[float, Array, Array,
         both = np.column_stack([columns, measured])
         half = taps.size // 2
         padded = np.pad(both, ((half, half), (0, 0)), mode="edge")
-        both = decimated(padded, taps, every)
+        both = decimate(padded, taps, every)
         columns, measured = both[:, : columns.shape[1]], both[:, columns.shape[1] :]
     wheels = signals.wheel_speed_mps.shape[1]
     wheel_speed, steer, tilt = np.split(columns, [wheels, 2 * wheels], axis=1)
@@ -319,8 +325,8 @@ def _prepared(signals: Signals, low_pass: LowPass) -> tuple[float, Array, Array,
 
 
 @njit(cache=True)
-def decimated(values: Array, taps: Array, every: int) -> Array:
-    """Return columns (m, c) of ``values`` (n, c) behind a window, every so many samples; a NaN spreads."""
+def decimate(values: Array, taps: Array, every: int) -> Array:
+    """Return columns (m, c) of ``values`` (n, c) filtered by a window and decimated; a NaN spreads."""
     n, c = values.shape
     m = max((n - taps.size) // every + 1, 0)
     out = np.zeros((m, c))
@@ -333,7 +339,7 @@ def decimated(values: Array, taps: Array, every: int) -> Array:
 
 
 @njit(cache=True)
-def holed(values: Array, known: Array, taps: Array, every: int) -> Array:
+def decimate_known(values: Array, known: Array, taps: Array, every: int) -> Array:
     """Return the same of columns with holes: the window's mean over what is known (n, c) of each.
 
     The same samples have to be left out of whatever is compared.  Where less than :data:`MIN_KNOWN` of the

@@ -11,59 +11,58 @@ from terrain.discrepancy.information import (
     Information,
     Nearby,
     correlation,
-    counted_from,
     information_at,
     loss_of,
     misfit_of,
-    moved,
+    move_point,
     nearby,
-    rest_beside,
+    partial_information,
+    recentre,
 )
 from terrain.discrepancy.noise import Noise
 from terrain.discrepancy.residuals import LowPass
-from terrain.discrepancy.selection import Evidence, evidence, fitted
+from terrain.discrepancy.selection import Evidence, evidence, fit_change
 from terrain.discrepancy.signals import Signals
 from terrain.discrepancy.simulation import Simulation
 from terrain.effects import INDEX, Effect
 from terrain.records import Array
 
 MAX_CAUSES = 6
-"""More are not looked for: by then the simulation is of another robot."""
+"""Most causes of a diagnosis: with more the simulation is of another robot."""
 
 MAX_STEPS = 12
-"""How often something is added or tried in vain."""
+"""Most steps of the search, successful or not."""
 
 MUCH_GAIN, CLOSE_GAIN, MAX_FITTED = 200.0, 0.3, 6
-"""Gain from which on the first few are fitted in earnest: those with that share of the first one's, so
-many at most."""
+"""Gain above which the best candidates are compared by nonlinear fits: those with that ratio of the best
+one's gain, so many at most."""
 
 RIVAL_LOSS = 8.0
-"""Two causes whose best fits differ by less in minus twice the log-likelihood are not told apart: the wrong
-one of two is that much ahead with a chance of 0.3 % at most, whatever the size of the effect."""
+"""Two causes whose best fits differ by less in minus twice the log-likelihood are not distinguished: the
+wrong one of two is that much ahead with a chance of 0.3 % at most, whatever the size of the effect."""
 
 TWIN, TWIN_LOSS = 0.985, 20.0
-"""The same of two whose sensitivities correlate more, a collinearity index of 8: all that parts them is a
-small share of what they explain, and as much the simulation's own fault as theirs."""
+"""The same of two whose sensitivities correlate more, a collinearity index of 8: what distinguishes them is a
+small part of what they explain, and may as well be an error of the simulation."""
 
 PARAMETER_LOSS = 4.0
 """What a fit has to gain by each of its parameters before it counts as better than one with fewer."""
 
-RIVAL_LINEAR, RIVAL_SHARE = 80.0, 0.5
-"""Worse than that, or than that share of what the cause gains, before sensitivities are taken anew, and a
-rival is not tried: it gains less by it."""
+RIVAL_LINEAR, RIVAL_RATIO = 80.0, 0.5
+"""Loss, and ratio of the gain of the cause, above which a rival is not refitted nonlinearly."""
 
 Z_PAIR = 4.6
-"""Evidence that each of two effects needs beside the other, where neither stands alone: 4e-6, 300 pairs."""
+"""Evidence that each of two effects needs beside the other, if neither is significant alone: 4e-6."""
 
 ALIKE = 0.99
 """Two effects whose sensitivities correlate more are not taken for a pair."""
 
 MAX_REFITS, SETTLED = 8, 0.3
-"""How often sensitivities of what is selected are taken anew, until a fit moves by less than that share of
-its standard deviation."""
+"""Most relinearisations of the selected causes, and the ratio of its standard deviation below which a step
+ends them."""
 
 RIVAL_REFITS = 3
-"""How often those of a rival are taken anew."""
+"""Most relinearisations of a rival."""
 
 
 class Problem(NamedTuple):
@@ -82,12 +81,12 @@ class Problem(NamedTuple):
     def at(
         self, vector: Array, names: Sequence[str] | None = None, noise: Noise | None = None
     ) -> Information:
-        """Return what the runs say around a point."""
+        """Return the information of the runs around a point."""
         desired = self.parameters if names is None else names
         return information_at(self.signals, self.simulation, vector, desired, self.low_pass, noise)
 
     def near(self, info: Information, vector: Array, names: Sequence[str]) -> Nearby:
-        """Return what the runs say of a few parameters at another point, by the noise of an information."""
+        """Return the information on a few parameters at another point, with the noise of an information."""
         return nearby(info, self.signals, self.simulation, vector, names, self.low_pass)
 
 
@@ -98,7 +97,7 @@ class Rival(NamedTuple):
     ----------
     effect : that
     behind : by how much it fits worse, as minus twice a log-likelihood
-    change, std : (p,) of its parameters, by a fit of its own; a value may stand at its bound
+    change, std : (p,) of its parameters, by a fit of its own; a value may be at its bound
     """
 
     effect: Effect
@@ -121,7 +120,7 @@ class Found(NamedTuple):
     Parameters
     ----------
     causes : effects selected, in the order in which they came
-    info : what the runs say there, changes counted from the simulation that was given
+    info : of the runs there, changes counted from the simulation that was given
     change : (k,) of the parameters ``names``, and its covariance
     rivals : by cause, the effects that fit as well in its place
     tried : last evidence of every effect
@@ -149,32 +148,34 @@ def names_of(effects: Sequence[Effect]) -> tuple[str, ...]:
 
 
 def search(problem: Problem, start: Information) -> Found:
-    """Return the causes that the runs ask for.
+    """Return the causes that explain the runs.
 
     Parameters
     ----------
     problem : of what
-    start : what the runs say around the simulation as it is given
+    start : information of the runs around the simulation as it is given
     """
     base = start.vector
     info = start
     causes: list[Effect] = []
-    barred: set[str] = set()  # came beside the causes that there are, and did not stay
-    seen = {_set_of([])}  # what was held for the causes; none of it twice, or the search goes in circles
+    barred: set[str] = set()  # added to the current causes, and dropped again
+    seen = {
+        _set_of([])
+    }  # sets of causes that were reached; none of them twice, or the search goes in circles
     for _ in range(MAX_STEPS):
         new = _next(problem, info, base, causes, barred)
         if not new or len(causes) + len(new) > MAX_CAUSES:
             break
-        more, at = _standing(problem, info, base, [*causes, *new], seen)
+        more, at = _refit_significant(problem, info, base, [*causes, *new], seen)
         if at is not info:
-            more, at = _swapped(problem, at, base, more)
+            more, at = _swap_for_better(problem, at, base, more)
         if _set_of(more) not in seen:
             seen.add(_set_of(more))
             barred = set()
             causes, info = more, at
         barred |= {effect.name for effect in new if effect not in causes}
     names = names_of(causes)
-    change, cov = fitted(info, names)
+    change, cov = fit_change(info, names)
     rivals = _rivals(problem, info, start, causes)
     tried = {
         effect.name: evidence(info, [n for n in names if n not in names_of([effect])], effect)
@@ -186,37 +187,37 @@ def search(problem: Problem, start: Information) -> Found:
 def _next(
     problem: Problem, info: Information, base: Array, causes: Sequence[Effect], barred: set[str]
 ) -> list[Effect]:
-    """Return the effect that helps most on runs left out, or a pair where none does alone; else nothing.
+    """Return the effect with the largest gain on runs left out, or a pair where none is significant alone.
 
-    Where much is wrong, what a straight line promises is far off: then the first few are fitted in earnest.
+    Where much is wrong the linear gain is inaccurate: then the best few are compared by nonlinear fits.
     """
     left = [effect for effect in problem.library if effect not in causes and effect.name not in barred]
     found = [(evidence(info, names_of(causes), effect), effect) for effect in left]
-    standing = [(float(each.gain.sum()), effect) for each, effect in found if each.stands]
-    if not standing:
+    candidates = [(float(each.gain.sum()), effect) for each, effect in found if each.significant]
+    if not candidates:
         return _pair(info, causes, left)
-    standing.sort(key=lambda pair: -pair[0])
-    best = standing[0][0]
-    close = [effect for gain, effect in standing[:MAX_FITTED] if gain > CLOSE_GAIN * best]
+    candidates.sort(key=lambda pair: -pair[0])
+    best = candidates[0][0]
+    close = [effect for gain, effect in candidates[:MAX_FITTED] if gain > CLOSE_GAIN * best]
     if best < MUCH_GAIN or len(close) == 1:
-        return [standing[0][1]]
+        return [candidates[0][1]]
     return [min(close, key=lambda effect: _refit(problem, info, base, names_of([*causes, effect])).loss)]
 
 
-def _standing(
+def _refit_significant(
     problem: Problem,
     info: Information,
     base: Array,
     causes: list[Effect],
     seen: Set[frozenset[str]] = frozenset(),
 ) -> tuple[list[Effect], Information]:
-    """Refit causes, and drop the weakest until all stand beside the others.
+    """Refit causes, and drop the weakest until all are significant beside the others.
 
-    Where that leads to causes that were seen, they are not fitted again: the information is the one given.
+    A set that was reached before is not fitted again: the information is the one given.
     """
     at = info
     while _set_of(causes) not in seen:
-        at = _refitted(problem, at, base, causes)
+        at = _relinearize(problem, at, base, causes)
         weak = _weakest(at, causes) if causes else None
         if weak is None:
             return causes, at
@@ -228,15 +229,15 @@ def _set_of(causes: Sequence[Effect]) -> frozenset[str]:
     return frozenset(cause.name for cause in causes)
 
 
-def _swapped(
+def _swap_for_better(
     problem: Problem, info: Information, base: Array, causes: list[Effect]
 ) -> tuple[list[Effect], Information]:
-    """Swap a cause for an effect that fits better in its place, as long as there is one."""
+    """Replace a cause by an effect that fits better, as long as there is one."""
     for _ in range(MAX_CAUSES):
         better = _better(info, causes, problem.library)
         if better is None:
             break
-        swapped, at = _standing(problem, info, base, better)
+        swapped, at = _refit_significant(problem, info, base, better)
         if len(swapped) < len(causes):
             break
         causes, info = swapped, at
@@ -244,14 +245,14 @@ def _swapped(
 
 
 def _pair(info: Information, causes: Sequence[Effect], library: Sequence[Effect]) -> list[Effect]:
-    """Return two effects that stand beside each other and the causes, where neither stands alone.
+    """Return two effects that are significant beside each other and the causes, where neither is alone.
 
-    Two that pull the other way, as an offset and a rate of a clock, hide each other.
+    Two of opposite sign, as an offset and a rate of a clock, hide each other.
     """
     left = [effect for effect in library if len(effect.parameters) == 1]
     base, own = info.places(names_of(causes)), info.places(names_of(left))
     a, g = info.a.sum(axis=0), info.g.sum(axis=0)
-    follow, a_free = rest_beside(a, base, own)
+    follow, a_free = partial_information(a, base, own)
     g_free = g[own] - g[base] @ follow
     size = np.maximum(np.diag(a_free), 1e-12)
     z, rho = g_free / np.sqrt(size), a_free / np.sqrt(np.outer(size, size))
@@ -267,7 +268,7 @@ def _pair(info: Information, causes: Sequence[Effect], library: Sequence[Effect]
         found = [
             evidence(info, (*names_of(causes), *names_of([other])), one) for one, other in (pair, pair[::-1])
         ]
-        if all(one.stands and one.z > Z_PAIR for one in found):
+        if all(one.significant and one.z > Z_PAIR for one in found):
             return pair
     return []
 
@@ -275,10 +276,10 @@ def _pair(info: Information, causes: Sequence[Effect], library: Sequence[Effect]
 def _steps(
     problem: Problem, info: Information, base: Array, names: Sequence[str], n_most: int
 ) -> Iterator[Nearby]:
-    """Yield what the runs say at the points to which a nonlinear fit of parameters goes, until it settles."""
-    change, _ = fitted(info, names)
+    """Yield the information at the points of a nonlinear fit of parameters, until it converges."""
+    change, _ = fit_change(info, names)
     for _ in range(n_most):
-        point = problem.near(info, moved(base, names, change), names)
+        point = problem.near(info, move_point(base, names, change), names)
         yield point
         cov = np.linalg.pinv(point.a, hermitian=True)
         now = point.vector[[INDEX[name] for name in names]] - base[[INDEX[name] for name in names]]
@@ -287,33 +288,33 @@ def _steps(
             break
 
 
-def _refitted(problem: Problem, info: Information, base: Array, causes: Sequence[Effect]) -> Information:
-    """Fit, and take everything anew where the fit has gone."""
+def _relinearize(problem: Problem, info: Information, base: Array, causes: Sequence[Effect]) -> Information:
+    """Fit, and return the information around the fitted point."""
     point = base
     for near in _steps(problem, info, base, names_of(causes), MAX_REFITS):
         point = near.vector
-    return counted_from(problem.at(point), base)
+    return recentre(problem.at(point), base)
 
 
 def _weakest(info: Information, causes: Sequence[Effect]) -> int | None:
-    """Return which cause no longer stands beside the others, the weakest of them."""
+    """Return the least significant cause, None if all are significant beside the others."""
     z = []
     for cause in causes:
         others = names_of([other for other in causes if other is not cause])
         found = evidence(info, others, cause)
-        z.append(np.inf if found.stands else found.z)
+        z.append(np.inf if found.significant else found.z)
     weakest = int(np.argmin(z))
     return weakest if np.isfinite(z[weakest]) else None
 
 
 def _better(info: Information, causes: Sequence[Effect], library: Sequence[Effect]) -> list[Effect] | None:
-    """Return the causes with one swapped for an effect that fits better in its place, if there is one."""
+    """Return the causes with one replaced by an effect that fits better, if there is one."""
     now = _penalised(info, causes)
     best: tuple[float, list[Effect]] = (now - RIVAL_LOSS, [])
     for i, cause in enumerate(causes):
         others = [other for other in causes if other is not cause]
         for effect in library:
-            if effect in causes or not evidence(info, names_of(others), effect).stands:
+            if effect in causes or not evidence(info, names_of(others), effect).significant:
                 continue
             swapped = [*causes[:i], effect, *causes[i + 1 :]]
             loss = _penalised(info, swapped)
@@ -332,8 +333,8 @@ def _rivals(
 ) -> dict[str, tuple[Rival, ...]]:
     """Return by cause all effects that, refitted in its place, fit as well as it does, the best first.
 
-    It is judged by the noise that the causes leave and by that of the simulation as it is given: a cause that
-    takes something for noise is ahead by the one alone.
+    It is compared by the noise that the causes leave and by that of the simulation as it is given: a cause
+    that absorbs noise is ahead by only one of them.
     """
     base, judges = start.vector, (info, start)
     own: list[float] = []  # losses of the causes by both judges, where anything comes near
@@ -354,11 +355,11 @@ def _rivals(
 
 
 def _near(problem: Problem, info: Information, cause: Effect, others: Sequence[Effect]) -> list[Effect]:
-    """Return the effects that come near a cause beside the others, as far as sensitivities tell."""
+    """Return the effects that come near a cause beside the others, by linear fits."""
     causes = [*others, cause]
     now = loss_of(info, names_of(causes))
     gain = loss_of(info, names_of(others)) - now
-    most = min(RIVAL_LINEAR, RIVAL_LOSS + RIVAL_SHARE * gain)
+    most = min(RIVAL_LINEAR, RIVAL_LOSS + RIVAL_RATIO * gain)
     return [
         effect
         for effect in problem.library
@@ -369,9 +370,9 @@ def _near(problem: Problem, info: Information, cause: Effect, others: Sequence[E
 
 
 def _allowed(info: Information, others: Sequence[Effect], cause: Effect, rival: Effect) -> float:
-    """Return by how much a rival may fit worse than a cause and still be one."""
+    """Return by how much a rival may fit worse than a cause and still be a rival."""
     base, own, its = (info.places(names_of(effects)) for effects in (others, [cause], [rival]))
-    free = rest_beside(info.a.sum(axis=0), base, [*own, *its])[1]
+    free = partial_information(info.a.sum(axis=0), base, [*own, *its])[1]
     alike = correlation(free, range(len(own)), range(len(own), len(own) + len(its)))
     return TWIN_LOSS if alike > TWIN else RIVAL_LOSS
 

@@ -1,4 +1,4 @@
-"""Which effects the runs ask for: one after the other, judged on runs left out and clustered by run."""
+"""Selection of effects: evidence and gain on runs left out, clustered by run."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from scipy.stats import chi2, norm
 from scipy.stats import t as student
 
 from terrain.bootstrap import bootstrap_counts, percentile_interval
-from terrain.discrepancy.information import Information, rest_beside
+from terrain.discrepancy.information import Information, partial_information
 from terrain.effects import BOUNDS, INDEX, Effect
 from terrain.records import Array
 
 Z_EFFECT = 4.0
 """Evidence an effect needs, as a standard normal number: 6e-5, times a library of 26."""
 
-SEEN_SHARE = 0.1
-"""An effect whose detection limit is over this share of what it may be counts as not excited."""
+EXCITED_RATIO = 0.1
+"""An effect counts as not excited if its detection limit exceeds this ratio of its bound."""
 
 TRUST_DOF = 8.0
-"""How many clusters' worth the noise that whitening found counts, beside the scatter between clusters."""
+"""Degrees of freedom of the noise found by whitening, beside those of the scatter between clusters."""
 
 MIN_CLUSTERS = 6
 """With fewer runs, their time blocks are the clusters."""
@@ -31,7 +31,7 @@ N_BOOTSTRAP = 1000
 
 
 class Evidence(NamedTuple):
-    """What speaks for an effect beside those selected.
+    """Evidence of an effect beside those selected.
 
     Parameters
     ----------
@@ -52,17 +52,17 @@ class Evidence(NamedTuple):
     inside: bool
 
     @property
-    def stands(self) -> bool:
-        """Whether all that is asked for is there."""
+    def significant(self) -> bool:
+        """Whether the effect is within its bounds, above the threshold, and gains on runs left out."""
         return self.inside and self.z > Z_EFFECT and gain_interval(self.gain)[0] > 0
 
     @property
     def inflation(self) -> float:
-        """By how much the variance of its values is larger than the noise alone tells; 1 at the least."""
+        """By how much the variance of its values is larger than by the noise alone; 1 at the least."""
         return max(self.dispersion, 1.0)
 
 
-def fitted(info: Information, names: Sequence[str]) -> tuple[Array, Array]:
+def fit_change(info: Information, names: Sequence[str]) -> tuple[Array, Array]:
     """Return the change (k,) of parameters that fits all runs best, and its covariance by the noise."""
     at = info.places(names)
     a = info.a[:, at][:, :, at].sum(axis=0)
@@ -71,7 +71,7 @@ def fitted(info: Information, names: Sequence[str]) -> tuple[Array, Array]:
 
 
 def evidence(info: Information, selected: Sequence[str], effect: Effect) -> Evidence:
-    """Return what speaks for an effect beside the parameters selected."""
+    """Return the evidence of an effect beside the parameters selected."""
     own = [p.name for p in effect.parameters]
     base, new = info.places([name for name in selected if name not in own]), info.places(own)
     both = base + new
@@ -81,7 +81,7 @@ def evidence(info: Information, selected: Sequence[str], effect: Effect) -> Evid
     if not np.diag(total)[n:].min() > 1e-12:
         return Evidence(effect.name, np.zeros(len(own)), 0.0, 0.0, np.zeros(len(a)), False)
     # direction in which the new ones change while the selected ones follow
-    follow, free = rest_beside(total, range(n), range(n, len(both)))
+    follow, free = partial_information(total, range(n), range(n, len(both)))
     own_score = score[n:] - follow.T @ score[:n]
     if not np.linalg.eigvalsh(free)[0] > 1e-9 * np.diag(total)[n:].min():
         free = free + 1e-9 * np.diag(np.diag(total)[n:])
@@ -106,8 +106,9 @@ def _dispersion(
 ) -> tuple[float, float]:
     """Return the variance of a change along itself over that from the noise, and its degrees of freedom.
 
-    The scatter between clusters (runs; time blocks where runs are few) says one thing with as many degrees as
-    there are clusters that tell, the noise says 1 with :data:`TRUST_DOF`; both are weighed by them.
+    The scatter between clusters (runs; time blocks where runs are few) gives one estimate, with as many
+    degrees of freedom as there are informative clusters; the noise gives 1 with :data:`TRUST_DOF`.  Both are
+    weighted by their degrees of freedom.
     """
     runs = len(info.a) >= MIN_CLUSTERS
     a = info.a if runs else info.a_blocks.reshape(-1, *info.a.shape[1:])
@@ -122,22 +123,22 @@ def _dispersion(
         total, score = a.sum(axis=0), g.sum(axis=0)
         x[:n] = np.linalg.lstsq(total[:n, :n], score[:n] - total[:n, n:] @ change, rcond=1e-10)[0]
     part = (g - a @ x) @ direction
-    share = np.clip(np.einsum("i,kij,j->k", direction, a, direction) / size, 0.0, 0.9)
-    return weighed_variance(part, share, size)
+    fraction = np.clip(np.einsum("i,kij,j->k", direction, a, direction) / size, 0.0, 0.9)
+    return pooled_variance(part, fraction, size)
 
 
-def weighed_variance(part: Array, share: Array, size: float) -> tuple[float, float]:
+def pooled_variance(part: Array, fraction: Array, size: float) -> tuple[float, float]:
     """Return a variance over that from the noise, and its degrees of freedom.
 
     Parameters
     ----------
     part : (clusters,) what is left of each cluster's score at the fit
-    share : (clusters,) of the information that comes from each; they sum up to 1
+    fraction : (clusters,) of the information that comes from each; they sum up to 1
     size : information in all, which is the variance of the score by the noise
     """
     m = len(part)
-    variance = float(((part / (1.0 - share)) ** 2).sum()) * (m - 1) / m / size
-    dof = max(min(1.0 / (float((share**2).sum()) + 1e-12), m) - 1.0, 1.0)
+    variance = float(((part / (1.0 - fraction)) ** 2).sum()) * (m - 1) / m / size
+    dof = max(min(1.0 / (float((fraction**2).sum()) + 1e-12), m) - 1.0, 1.0)
     both = TRUST_DOF + dof * variance
     # Satterthwaite: where clusters scatter far more than the noise allows, only their degrees count
     return both / (TRUST_DOF + dof), both**2 / (TRUST_DOF + dof * variance**2)
@@ -163,14 +164,14 @@ def z_of(log_p: float) -> float:
 
 def held_out_gain(info: Information, base: list[int], both: list[int]) -> Array:
     """Return the fall (runs,) of each run's loss when it is left out, of ``both`` over ``base``."""
-    return _left_out_loss(info, base) - _left_out_loss(info, both)
+    return _held_out_loss(info, base) - _held_out_loss(info, both)
 
 
-def _left_out_loss(info: Information, at: list[int]) -> Array:
+def _held_out_loss(info: Information, at: list[int]) -> Array:
     if not at:
         return np.zeros(len(info.a))
     a, g = info.a[:, at][:, :, at], info.g[:, at]
-    # in units of what each parameter is known by; one that the other runs know nothing of stays where it is
+    # in standard deviations of each parameter; one without information in the other runs keeps its value
     unit = np.sqrt(np.maximum(np.einsum("kii->i", a), 1e-30))
     rest = (a.sum(axis=0) - a) / np.outer(unit, unit) + 1e-9 * np.eye(len(at))
     x = np.linalg.solve(rest, ((g.sum(axis=0) - g) / unit)[:, :, None])[:, :, 0] / unit

@@ -36,11 +36,11 @@ MIN_LENGTH_S = 4.0
 """Of a shorter run nothing is left once filters have settled."""
 
 JUMP_S, JUMP_MPS, JUMP_SIGMAS = 0.05, 0.1, 8.0
-"""A speed of the camera is no speed but a jump of its map, if it is off the median of so long before and
-after by the second, and by so many times what its speeds are usually off."""
+"""A camera speed is a jump of its map if it differs from the median over the first before and after by the
+second, and by so many times the usual deviation."""
 
 BACKWARD_MPS, MIN_BACKWARD = 0.02, 5
-"""A wheel turns backward that is so fast on so many samples."""
+"""A wheel turns backward if it is faster than that on at least so many samples."""
 
 PARALLEL = 0.95
 """Least norm of the mean of the wheels' unit vectors at which the sum of currents measures traction: wheels
@@ -91,7 +91,7 @@ def signals_of(run: RunLog, robot: Robot) -> Signals:
     Raises
     ------
     DataError
-        if the run is of another robot or lacks what drives the simulation, if none of its channels is
+        if the run is of another robot or lacks inputs of the simulation, if none of its channels is
         simulated, or if it is too short.
     """
     if run.robot != robot.name:
@@ -116,7 +116,7 @@ def signals_of(run: RunLog, robot: Robot) -> Signals:
             f"run {run.run_id}: none of its channels is simulated; a gyro, currents of all wheels, a speed "
             "over ground or an accelerometer with its tilt is required"
         )
-    columns = [_at(time_s, wheels.time_s, wheel_speeds[:, i]) for i in range(wheel_speeds.shape[1])]
+    columns = [_resample(time_s, wheels.time_s, wheel_speeds[:, i]) for i in range(wheel_speeds.shape[1])]
     return Signals(
         run_id=run.run_id,
         terrain=run.terrains[0] if len(run.terrains) == 1 else "",
@@ -152,7 +152,7 @@ def _steering(run: RunLog, robot: Robot, time_s: Array) -> Array:
     for i, zero in enumerate(robot.steering_zeros_rad):
         raw = unwrapped(stream.channel(f"angle_{robot.wheels[i]}_rad"))
         turn = 2 * math.pi * np.round((raw[np.isfinite(raw)][:1].sum() - zero) / (2 * math.pi))
-        steer[:, i] = _at(time_s, stream.time_s, raw - zero - turn)
+        steer[:, i] = _resample(time_s, stream.time_s, raw - zero - turn)
     return steer
 
 
@@ -165,8 +165,8 @@ def _tilt(run: RunLog, time_s: Array) -> tuple[Array, Array]:
     if not _has_tilt(run):
         return np.zeros(time_s.size), np.zeros(time_s.size)
     imu = run.streams["imu"]
-    grade = -_at(time_s, imu.time_s, imu.channel("pitch_rad"))
-    return grade, _at(time_s, imu.time_s, imu.channel("roll_rad"))
+    grade = -_resample(time_s, imu.time_s, imu.channel("pitch_rad"))
+    return grade, _resample(time_s, imu.time_s, imu.channel("roll_rad"))
 
 
 def _put_imu(measured: Array, run: RunLog, time_s: Array) -> None:
@@ -181,8 +181,8 @@ def _put_motion(measured: Array, run: RunLog, robot: Robot, time_s: Array) -> No
     if (seen := run.streams.get("odometry")) is not None:
         if set(POSE_CHANNELS) <= set(seen.channels):
             speed = _without_jumps(seen, body_motion(seen, robot.camera).speed_mps)
-            measured[:, CHANNELS.index(SPEED_X)] = _at(time_s, seen.time_s, speed[:, 0])
-            measured[:, CHANNELS.index(SPEED_Y)] = _at(time_s, seen.time_s, speed[:, 1])
+            measured[:, CHANNELS.index(SPEED_X)] = _resample(time_s, seen.time_s, speed[:, 0])
+            measured[:, CHANNELS.index(SPEED_Y)] = _resample(time_s, seen.time_s, speed[:, 1])
         else:
             _put(measured, SPEED_X, time_s, seen, "speed_x_mps")
             _put(measured, SPEED_Y, time_s, seen, "speed_y_mps")
@@ -200,7 +200,7 @@ def _put_currents(
     if not set(currents) <= set(wheels.channels):
         return
     each = [
-        _at(time_s, wheels.time_s, _signed(wheels.channel(name), wheel_speeds[:, i]))
+        _resample(time_s, wheels.time_s, _signed(wheels.channel(name), wheel_speeds[:, i]))
         for i, name in enumerate(currents)
     ]
     measured[:, CHANNELS.index(CURRENT)] = np.sum(each, axis=0)
@@ -226,7 +226,7 @@ def _wheel_speeds(run: RunLog, wheels: Stream, robot: Robot) -> Array:
 
 
 def _without_jumps(seen: Stream, speed_mps: Array) -> Array:
-    """Return speeds (n, 2) with those missing at which the camera found its place anew."""
+    """Return speeds (n, 2) with NaN where the camera relocalised."""
     width = 2 * round(JUMP_S * seen.rate_hz) + 1
     off = np.abs(speed_mps - median_filter(speed_mps, (width, 1), mode="nearest"))
     usual = 1.48 * np.nanmedian(off, axis=0) if len(off) else np.zeros(2)
@@ -248,10 +248,10 @@ def _signed(current_a: Array, wheel_speed_mps: Array) -> Array:
 
 def _put(measured: Array, channel: str, time_s: Array, stream: Stream, name: str) -> None:
     if name in stream.channels:
-        measured[:, CHANNELS.index(channel)] = _at(time_s, stream.time_s, stream.channel(name))
+        measured[:, CHANNELS.index(channel)] = _resample(time_s, stream.time_s, stream.channel(name))
 
 
-def _at(time_s: Array, stamps_s: Array, values: Array) -> Array:
+def _resample(time_s: Array, stamps_s: Array, values: Array) -> Array:
     """Return a signal on the clock by straight lines between its samples; NaN in its holes."""
     known = np.isfinite(values)
     if known.sum() < 2:

@@ -1,4 +1,4 @@
-"""The simulation under test: a robot, its ground, the effects built in, and what scatters by itself."""
+"""The simulation under test: a robot, its terrain, the effects built in, and scatter from run to run."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from terrain.simulation.planar.model import Ground, Planar, make_planar
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Simulation:
-    """What :func:`terrain.discrepancy.diagnose.diagnose` holds against measured runs.
+    """What :func:`terrain.discrepancy.diagnose.diagnose` compares measured runs with.
 
     Parameters
     ----------
     robot : of the runs
-    ground : on which it is taken to drive
-    grounds : by the label of a run, where that is another one
+    ground : default terrain
+    grounds : terrains by the label of a run
     effects : parameters of the effects that are built in already; those not named are 0
     scatter : standard deviation from run to run of parameters in :data:`NUISANCES`; those not named are 0
 
     Raises
     ------
     ConfigError
-        for a parameter that is unknown, or a scatter of something that is no nuisance.
+        for a parameter that is unknown, or a scatter of a parameter that is no nuisance.
     """
 
     robot: Robot
@@ -55,11 +55,11 @@ class Simulation:
 
     @property
     def planar(self) -> Planar:
-        """Numbers for the kernels, on the ground that no label tells."""
+        """Numbers for the kernels, on the default terrain."""
         return make_planar(self.robot, self.ground)
 
     def planar_on(self, terrain: str) -> Planar:
-        """Return the numbers for the kernels on the ground of a label."""
+        """Return the numbers for the kernels on the terrain of a label."""
         return make_planar(self.robot, self.grounds.get(terrain, self.ground))
 
     @property
@@ -68,6 +68,6 @@ class Simulation:
         return vector_of(self.effects)
 
     def with_effects(self, values: Mapping[str, float]) -> Simulation:
-        """Return the same with more effects built in; what is there already grows by what is given."""
+        """Return the same with effects added to those that are built in already."""
         grown = {name: self.effects.get(name, 0.0) + value for name, value in values.items()}
         return replace(self, effects={**self.effects, **grown})

@@ -1,8 +1,8 @@
-"""How much of the measured tilt is a slope to drive up, and how much a body that rides over bumps.
+"""Which part of the measured tilt is a slope, and which part a body that rides over bumps.
 
-A tilt that is no slope takes no traction, yet it looks like one to a simulation that is fed with it: then
-mass, resistance and slip are all off.  Which it is, the runs of a ground tell: with no more than a share of
-the tilt felt as a slope, and everything in the library let go, they fit best.
+A tilt that is no slope takes no traction; simulated as a slope it biases mass, resistance and slip.  The part
+that acts as a slope is estimated for each terrain: the runs fit best with it, all parameters of the library
+freed.
 """
 
 from __future__ import annotations
@@ -21,55 +21,57 @@ from terrain.effects import Effect
 from terrain.records import Array
 from terrain.simulation.planar.model import Ground
 
-SHARES = (0.0, 0.5, 1.0)
-"""That are tried; the best lies on the parabola through their losses."""
+RATIOS = (0.0, 0.5, 1.0)
+"""Effective ratios that are tried; the best lies on the parabola through their losses."""
 
-FELT_LOSS = 20.0
-"""A tilt counts as felt throughout, unless a smaller share fits better by that in minus twice the
+TILT_LOSS = 20.0
+"""All of the tilt counts as a slope, unless a smaller part fits better by that in minus twice the
 log-likelihood."""
 
 
 def with_effective_tilt(
     simulation: Simulation, signals: Sequence[Signals], library: Sequence[Effect]
 ) -> Simulation:
-    """Return the simulation with the share of the tilt that the robot feels on each labelled ground.
+    """Return the simulation with the effective ratio of the tilt on each labelled terrain.
 
     Parameters
     ----------
-    simulation : with grounds by label; that of runs without one stays as it is
+    simulation : with terrains by label; that of runs without one stays as it is
     signals : of runs
-    library : effects that are let go meanwhile
+    library : effects that are freed meanwhile
     """
     grounds = dict(simulation.grounds)
     for terrain, ground in simulation.grounds.items():
         runs = [run for run in signals if run.terrain == terrain]
         if runs:
-            grounds[terrain] = ground._replace(effective_ratio=_felt(simulation, runs, ground, library))
+            grounds[terrain] = ground._replace(
+                effective_ratio=_best_effective_ratio(simulation, runs, ground, library)
+            )
     return replace(simulation, grounds=grounds)
 
 
-def _felt(
+def _best_effective_ratio(
     simulation: Simulation, runs: Sequence[Signals], ground: Ground, library: Sequence[Effect]
 ) -> float:
     names, low_pass = names_of(library), low_pass_of(runs)
     losses = []
-    for share in SHARES:
-        tried = replace(simulation, grounds={runs[0].terrain: ground._replace(effective_ratio=share)})
+    for ratio in RATIOS:
+        tried = replace(simulation, grounds={runs[0].terrain: ground._replace(effective_ratio=ratio)})
         losses.append(_loss(information_at(runs, tried, simulation.vector, names, low_pass)))
-    share, least = best_of(np.array(losses))
-    return share if losses[-1] - least > FELT_LOSS else 1.0
+    ratio, least = best_ratio(np.array(losses))
+    return ratio if losses[-1] - least > TILT_LOSS else 1.0
 
 
-def best_of(losses: Array) -> tuple[float, float]:
-    """Return the share, 0 to 1, and the loss at the bottom of the parabola through the losses of SHARES.
+def best_ratio(losses: Array) -> tuple[float, float]:
+    """Return the ratio, 0 to 1, and the loss at the minimum of the parabola through the losses of RATIOS.
 
     Examples
     --------
-    >>> best_of(np.array([1.0, 0.0, 1.0]))[0], best_of(np.array([0.0, 2.0, 8.0]))[0]
+    >>> best_ratio(np.array([1.0, 0.0, 1.0]))[0], best_ratio(np.array([0.0, 2.0, 8.0]))[0]
     (0.5, 0.0)
     """
-    a, b, c = np.polyfit(SHARES, losses, 2)
-    bottom = min(max(-b / (2.0 * a), 0.0), 1.0) if a > 0.0 else float(SHARES[int(np.argmin(losses))])
+    a, b, c = np.polyfit(RATIOS, losses, 2)
+    bottom = min(max(-b / (2.0 * a), 0.0), 1.0) if a > 0.0 else float(RATIOS[int(np.argmin(losses))])
     return round(float(bottom), 3), float(a * bottom**2 + b * bottom + c)
 
 

@@ -1,4 +1,4 @@
-"""The answer: what the simulation gets wrong, how sure that is, and what could not have been seen."""
+"""The diagnosis: what the simulation gets wrong, with which evidence, and what could not be detected."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Cause(NamedTuple):
     ----------
     name, aliases : of the effect
     values : its parameters, over what the simulation has of them already
-    gain, gain_low, gain_high : share of the whitened residual's square that it takes from runs left out of
+    gain, gain_low, gain_high : ratio of the whitened squared residual that it removes from runs left out of
         its fit, and its 95 % interval by bootstrap over runs
     channels : where it shows, the clearest first
     z, dispersion : its evidence, see :class:`terrain.discrepancy.selection.Evidence`
@@ -59,8 +59,8 @@ class Cause(NamedTuple):
     dispersion: float
 
 
-class Leftover(NamedTuple):
-    """A channel whose residual follows an input, and no effect that says why.
+class Unexplained(NamedTuple):
+    """A channel whose residual depends on an input, without an effect that explains it.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ class Leftover(NamedTuple):
 
 
 class Limit(NamedTuple):
-    """The smallest value of an effect that these runs would have shown nine times in ten."""
+    """The smallest value of an effect that these runs would have revealed nine times in ten."""
 
     name: str
     value: float
@@ -90,9 +90,9 @@ class RuledOut(NamedTuple):
     Parameters
     ----------
     name : of the effect
-    reason : in words
+    reason : a sentence
     z : its evidence
-    values : those that fit, of an effect that was withdrawn although it helps
+    values : fitted ones, of an effect that was withdrawn although it reduces the residual
     """
 
     name: str
@@ -102,14 +102,14 @@ class RuledOut(NamedTuple):
 
 
 class Excluded(NamedTuple):
-    """A run that does not belong, and why."""
+    """A run that is excluded as unfit, and why."""
 
     run_id: str
     reason: str
 
 
 class Clock(NamedTuple):
-    """By how much the IMU's and the camera's logger is behind the wheels' in a run, and how sure that is."""
+    """Delay of the IMU's and the camera's logger behind the wheels' in a run, and its standard deviation."""
 
     run_id: str
     offset_s: float
@@ -122,8 +122,8 @@ class Residual(NamedTuple):
     Parameters
     ----------
     rms : of measured minus simulated
-    noise : of what is left when everything in the library is let go
-    systematic : share of the square that is not noise, from 0 to 1
+    noise : of what is left when all parameters of the library are freed
+    systematic : part of the square that is not noise, from 0 to 1
     """
 
     rms: float
@@ -132,7 +132,7 @@ class Residual(NamedTuple):
 
 
 class NextDrive(NamedTuple):
-    """What to drive next: a scenario of ``terrain simulate``, and how far it parts what is not parted."""
+    """The next drive: a scenario of ``terrain simulate``, and what it would distinguish or reveal."""
 
     scenario: str
     grade_deg: float
@@ -146,17 +146,17 @@ class Diagnosis:
     Parameters
     ----------
     robot : name
-    verdict : ``explained`` where a cause is named, also when something else is left
-    causes : named beyond doubt
+    verdict : ``explained`` where a cause is named, also when something else is left unexplained
+    causes : named
     parameters, cov : names (k,) of their parameters, and the covariance (k, k) of the values
-    ambiguous_sets : effects of which one is there, and these runs do not tell which; the best fit first
+    ambiguous_sets : effects of which one is present, and which these runs cannot distinguish; best fit first
     ambiguous_values : fitted values of each of them, by the effect's name
-    unexplained : channels that follow an input without a name for it
+    unexplained : channels that depend on an input without a known cause
     limits : detection limit of every effect
     not_excited : those whose limit is beyond what an effect may be
     ruled_out : effects that are not the answer
     excluded_runs, clocks : by run
-    next_drive : None where nothing is to be parted
+    next_drive : None where nothing is to be distinguished
     residual_before, residual_after : by channel, with the simulation given and with the causes built in
     n_runs : that were compared
     """
@@ -168,7 +168,7 @@ class Diagnosis:
     cov: Array
     ambiguous_sets: tuple[tuple[str, ...], ...]
     ambiguous_values: dict[str, tuple[Value, ...]]
-    unexplained: tuple[Leftover, ...]
+    unexplained: tuple[Unexplained, ...]
     limits: tuple[Limit, ...]
     not_excited: tuple[Limit, ...]
     ruled_out: tuple[RuledOut, ...]

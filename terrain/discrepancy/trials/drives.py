@@ -18,16 +18,16 @@ STEP_HZ = 50.0
 
 
 class Drives(NamedTuple):
-    """What is driven in a trial: twists and hills of each run."""
+    """Drives of a trial: twists and hills of each run."""
 
     twists: tuple[Array, ...]
     hills: tuple[Hills, ...]
 
 
 def rich_drives(rng: np.random.Generator, n_runs: int, duration_s: float = DURATION_S) -> Drives:
-    """Return drives that excite all: steps of speed and turn, stops, reversals, spot turns, hills."""
+    """Return drives that excite all effects: steps of speed and turn, stops, reversals, spot turns, hills."""
     return Drives(
-        tuple(_mixed(rng, duration_s) for _ in range(n_runs)),
+        tuple(_mixed_drive(rng, duration_s) for _ in range(n_runs)),
         tuple(
             Hills((rng.normal(0.0, 0.04), rng.normal(0.0, 0.04)), abs(rng.normal(0.0, 0.03)))
             for _ in range(n_runs)
@@ -36,7 +36,7 @@ def rich_drives(rng: np.random.Generator, n_runs: int, duration_s: float = DURAT
 
 
 def poor_drives(rng: np.random.Generator, n_runs: int, duration_s: float = DURATION_S) -> Drives:
-    """Return drives that excite next to nothing: one speed, level ground, hardly any steering."""
+    """Return drives that excite hardly any effect: one speed, level terrain, little steering."""
     n = round(duration_s * STEP_HZ) + 1
     time_s = np.arange(n) / STEP_HZ
     twists = []
@@ -49,7 +49,7 @@ def poor_drives(rng: np.random.Generator, n_runs: int, duration_s: float = DURAT
     return Drives(tuple(twists), tuple(Hills() for _ in range(n_runs)))
 
 
-def _mixed(rng: np.random.Generator, duration_s: float) -> Array:
+def _mixed_drive(rng: np.random.Generator, duration_s: float) -> Array:
     n = round(duration_s * STEP_HZ) + 1
     desired = np.zeros((n, 3))
     k = round(1.5 * STEP_HZ)
@@ -68,11 +68,11 @@ def _mixed(rng: np.random.Generator, duration_s: float) -> Array:
         desired[k : k + length] = speed, 0.0, turn
         k += length
     desired[n - round(3.0 * STEP_HZ) :] = 0.0
-    return _ramped(desired)
+    return _limit_rate(desired)
 
 
-def _ramped(desired: Array) -> Array:
-    """Return twists (n, 3) from rest that change by 1 m/s^2 and 1 rad/s^2 at the most."""
+def _limit_rate(desired: Array) -> Array:
+    """Return twists (n, 3) from rest that change by at most 1 m/s^2 and 1 rad/s^2."""
     limit = 1.0 / STEP_HZ
     twist = np.zeros_like(desired)
     for axis, goals in enumerate(desired.T.tolist()):  # numbers of Python's own: arrays of three are slow

@@ -48,6 +48,7 @@ TEST_SIZE = 0.02
 """Size of the test over the whole library, to which limits refer."""
 
 POWER = 0.9
+"""Rate at which an effect at its limit is detected."""
 
 CONFUSABLE = 0.99
 """Two effects whose sensitivities correlate more than that, nuisances taken out, are of one class: a
@@ -55,7 +56,7 @@ collinearity index of 10."""
 
 
 class Limits(NamedTuple):
-    """What the drives of a trial could show.
+    """Information of the drives of a trial.
 
     Parameters
     ----------
@@ -67,7 +68,7 @@ class Limits(NamedTuple):
     information: Array
 
     def of(self, effect: Effect, direction: Array | None = None) -> float:
-        """Return the smallest amplitude that would be seen, along a direction (p,) or the first parameter."""
+        """Return the smallest detectable amplitude, along a direction (p,) or the first parameter."""
         at = [self.names.index(p.name) for p in effect.parameters]
         along = np.eye(len(at))[0] if direction is None else direction
         size = float(along @ self.information[np.ix_(at, at)] @ along)
@@ -92,7 +93,7 @@ class Limits(NamedTuple):
 
 
 def limits_of(robot: Robot, drives: Drives) -> Limits:
-    """Return what drives could show of each effect, by the Cramer-Rao bound."""
+    """Return the information of drives on each effect, by the Cramer-Rao bound."""
     planar, noise, scatter = make_planar(robot, Ground()), load_noise(), load_scatter()
     names, nuisances = tuple(parameters_of(robot.drive)), nuisances_of(robot.drive)
     every = tuple(dict.fromkeys((*names, *nuisances)))
@@ -121,9 +122,9 @@ def _gram(
     steer = np.column_stack([truth.channel(f"steer_{w}_rad") for w in wheels])
     grade, roll = -truth.channel("pitch_rad"), truth.channel("roll_rad").copy()
     wheel_speed, steer = np.ascontiguousarray(wheel_speed), np.ascontiguousarray(steer)
-    shown = np.ones((len(wheel_speed), len(CHANNELS)))
-    # the sum of currents tells the traction where wheels point one way
-    shown[np.abs(np.exp(1j * steer).mean(axis=1)) < 0.95, CHANNELS.index(CURRENT)] = 0.0
+    measured = np.ones((len(wheel_speed), len(CHANNELS)))
+    # the sum of currents measures traction only where wheels are parallel
+    measured[np.abs(np.exp(1j * steer).mean(axis=1)) < 0.95, CHANNELS.index(CURRENT)] = 0.0
     channels = [GYRO, SPEED_X, SPEED_Y, ACCEL, CURRENT]
     if robot.skids:
         channels.append(TURNING_CURRENT)
@@ -144,9 +145,9 @@ def _gram(
             if name in SENSED_ONLY:
                 both.append(sense(planar, p, 1 / rate_hz, plain))
             else:
-                both.append(_shown(planar, p, 1 / rate_hz, wheel_speed, steer, grade, roll))
+                both.append(_predict(planar, p, 1 / rate_hz, wheel_speed, steer, grade, roll))
         span = step if name in ONE_SIDED else 2 * step
-        change = (both[0] - both[1]) / span * shown
+        change = (both[0] - both[1]) / span * measured
         for channel in channels:
             waves[channel][j] = np.fft.rfft(change[:, CHANNELS.index(channel)])[used] / rate_hz
     gram = np.zeros((len(names), len(names)))
@@ -156,10 +157,10 @@ def _gram(
     return gram
 
 
-def _shown(
+def _predict(
     planar: Planar, p: Array, dt: float, wheel_speed: Array, steer: Array, grade: Array, roll: Array
 ) -> Array:
-    """Return what a replay of measured wheels and tilt would predict, as far as linear in what differs."""
+    """Return the prediction of a replay of measured wheels and tilt, linear in lag and offsets."""
     lag = p[INDEX["encoder_lag_s"]]
     wheel_speeds = wheel_speed + lag * np.gradient(wheel_speed, dt, axis=0) if lag else wheel_speed
     tilt = grade - p[INDEX["pitch_offset_rad"]], roll - p[INDEX["roll_offset_rad"]]
@@ -168,7 +169,7 @@ def _shown(
 
 
 def _density(noise: Noise, robot: Robot, planar: Planar, channel: str, f: Array, pace: float) -> Array:
-    """Return the one-sided spectrum of what parts measured from replayed: noise of channel and wheels."""
+    """Return the one-sided spectrum of measured minus replayed: noise of channel and wheels."""
     own = noise_psd(noise, robot, planar, channel, f, pace)
     wheel_speed = noise_psd(noise, robot, planar, WHEEL_SPEED, f, pace)
     lag_s = robot.completed.sensors.encoder_time_constant_s
@@ -188,5 +189,5 @@ def _density(noise: Noise, robot: Robot, planar: Planar, channel: str, f: Array,
 
 
 def confusable_class(limits: Limits, effect: Effect, drive: str) -> set[str]:
-    """Return the names of all effects that no log of these drives tells from one, and its own."""
+    """Return the name of an effect, and of all that no log of these drives distinguishes from it."""
     return {other.name for other in library_of(drive) if other is effect or limits.alike(effect, other)}

@@ -125,7 +125,7 @@ def run_trial(case: Case) -> Trial:
 
 
 def _classes(limits: Limits, causes: tuple[str, ...], robot: Robot) -> dict[str, tuple[str, ...]]:
-    """Return, by cause, the effects that no log of these drives tells apart from it."""
+    """Return, by cause, the effects that no log of these drives distinguishes from it."""
     classes = {}
     for cause in causes:
         effect = effect_named(cause)

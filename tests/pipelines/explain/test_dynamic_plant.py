@@ -46,7 +46,7 @@ def test_without_a_hidden_effect_nothing_is_named(terrain):
         ("payload_ratio", 0.3),
     ],
 )
-def test_what_was_hidden_in_the_plant_is_named_and_nothing_else(parameter, value):
+def test_an_effect_hidden_in_the_plant_is_named_and_nothing_else(parameter, value):
     found = explained(runs_of({parameter: value}))
     assert list(found.values) == [parameter]
     assert found.values[parameter] == pytest.approx(value, rel=0.15)

@@ -86,7 +86,7 @@ def test_a_position_that_drifts_with_the_gyro_comes_back():
     assert after < 0.005 < 0.05 < before
 
 
-def test_what_is_written_holds_what_was_measured_and_the_true_rim_speeds():
+def test_the_written_run_holds_the_measurements_and_the_true_wheel_speeds():
     run = driven(tuple(ASKED.items()))
     written = enriched(estimate_run(run, replace(ROBOT, effects=ASKED), "vio15"))
     assert written.streams["imu"] is run.streams["imu"]

@@ -21,11 +21,11 @@ from terrain.discrepancy.verdict import (
     Clock,
     Diagnosis,
     Excluded,
-    Leftover,
     Limit,
     NextDrive,
     Residual,
     RuledOut,
+    Unexplained,
     Value,
     Verdict,
 )
@@ -173,8 +173,8 @@ def test_unexplained_channels_effects_not_excited_and_excluded_runs_are_shown():
     result = a_result(
         verdict=Verdict.UNEXPLAINED,
         unexplained=(
-            Leftover("current_a", "wheel 1 turn", 12.34, 0.2),
-            Leftover("speed_x_mps", "time", np.inf, 0),
+            Unexplained("current_a", "wheel 1 turn", 12.34, 0.2),
+            Unexplained("speed_x_mps", "time", np.inf, 0),
         ),
         not_excited=LIMITS[1:],
         excluded_runs=(Excluded("r<9>", "its gyro stands still"),),

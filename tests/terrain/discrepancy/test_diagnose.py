@@ -1,4 +1,4 @@
-"""Attribution: hide an effect, and it is named; hide none, and none is; what no log tells is not claimed."""
+"""Attribution: a hidden effect is named, and what no log distinguishes is ambiguous."""
 
 import json
 from dataclasses import replace
@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from terrain.discrepancy.diagnose import MIN_RUNS, _unsteady, diagnose
+from terrain.discrepancy.diagnose import MIN_RUNS, _frequency_dependent, diagnose
 from terrain.discrepancy.residuals import low_pass_of
 from terrain.discrepancy.search import Problem, search
 from terrain.discrepancy.signals import signals_of
@@ -83,8 +83,8 @@ def test_where_nothing_is_hidden_nothing_is_named(worlds):
         assert len(found.ruled_out) == len(world.simulation.library)
         assert all(abs(clock.offset_s) < 0.02 for clock in found.clocks)
         # what is apart is noise, and what scatters from run to run: biases of the gyro
-        apart = {channel: told.systematic for channel, told in found.residual_before.items()}
-        assert all(share < 0.4 for channel, share in apart.items() if channel != GYRO), apart
+        apart = {channel: residual.systematic for channel, residual in found.residual_before.items()}
+        assert all(ratio < 0.4 for channel, ratio in apart.items() if channel != GYRO), apart
         assert json.loads(json.dumps(found.as_json(), allow_nan=False))["verdict"] == Verdict.NONE
 
 
@@ -118,7 +118,7 @@ def test_of_two_hidden_effects_both_are_named(worlds, robot, names):
     assert set(found.parameters) == set(hidden) == set(found.values)
 
 
-def test_what_is_built_in_is_not_found_again_and_what_is_half_built_in_is_found_by_half(worlds):
+def test_a_built_in_effect_is_not_found_again_and_half_of_one_is_found_by_half(worlds):
     world = worlds["husky"]
     hidden = world.hidden("effective_track", over=8.0)
     runs = world.runs(hidden)
@@ -129,7 +129,7 @@ def test_what_is_built_in_is_not_found_again_and_what_is_half_built_in_is_found_
     assert cause.values[0].low < half["effective_track_ratio"] < cause.values[0].high
 
 
-def test_what_no_library_has_gets_no_name(worlds):
+def test_an_effect_of_no_library_is_unexplained(worlds):
     for world in worlds.values():
         found = diagnose(world.runs({}, {"wheel_eccentricity_ratio": 0.03}), world.simulation)
         assert found.verdict == Verdict.UNEXPLAINED
@@ -137,7 +137,7 @@ def test_what_no_library_has_gets_no_name(worlds):
         assert any("wheel" in left.input for left in found.unexplained)
 
 
-def test_an_effect_whose_entry_is_taken_out_gets_no_other_name(worlds):
+def test_an_effect_without_its_entry_is_unexplained(worlds):
     world = worlds["husky"]
     library = [effect for effect in world.simulation.library if effect.name != "motor_drift"]
     found = diagnose(world.runs(world.hidden("motor_drift", over=8.0)), world.simulation, library)
@@ -146,7 +146,7 @@ def test_an_effect_whose_entry_is_taken_out_gets_no_other_name(worlds):
     assert any(left.channel == "current_a" and "time" in left.input for left in found.unexplained)
 
 
-def test_exact_twins_are_a_set_and_the_channel_that_parts_them_is_told(worlds):
+def test_exact_twins_are_ambiguous_and_the_channel_that_distinguishes_them_is_named(worlds):
     """Without camera, heading and currents a gyro's scale and an effective track are one and the same."""
     world = worlds["husky"]
     runs = []
@@ -158,14 +158,14 @@ def test_exact_twins_are_a_set_and_the_channel_that_parts_them_is_told(worlds):
     assert found.verdict == Verdict.AMBIGUOUS
     assert named(found) == []
     assert {"gyro_scale", "effective_track"} <= set(found.ambiguous_sets[0])
-    told = {value.name: value.value for values in found.ambiguous_values.values() for value in values}
-    assert told["gyro_scale_ratio"] == pytest.approx(0.1, abs=0.01)
-    assert 1 / (1 + told["effective_track_ratio"]) == pytest.approx(1.1, abs=0.02)
+    values = {value.name: value.value for each in found.ambiguous_values.values() for value in each}
+    assert values["gyro_scale_ratio"] == pytest.approx(0.1, abs=0.01)
+    assert 1 / (1 + values["effective_track_ratio"]) == pytest.approx(1.1, abs=0.02)
     assert found.next_drive is not None
     assert HEADING in found.next_drive.reason
 
 
-def test_a_run_that_does_not_belong_is_left_out_and_the_rest_is_diagnosed(worlds):
+def test_an_unfit_run_is_excluded_and_the_rest_is_diagnosed(worlds):
     world = worlds["husky"]
     runs = list(world.runs(world.hidden("payload")))
     imu = runs[2].streams["imu"]
@@ -203,12 +203,12 @@ def test_runs_that_cannot_be_diagnosed_are_refused_in_one_sentence(worlds):
         assert "\n" not in str(error.value)
 
 
-def test_a_cause_that_is_another_in_slow_motion_is_withdrawn(worlds):
+def test_a_cause_with_another_value_in_slow_motion_is_withdrawn(worlds):
     world = worlds["husky"]
     signals = tuple(signals_of(run, world.robot) for run in world.runs(world.hidden("camera_yaw")))
     asked = Problem(signals, world.simulation, low_pass_of(signals), world.simulation.library)
     found = search(asked, asked.at(world.simulation.vector))
     assert [cause.name for cause in found.causes] == ["camera_yaw"]
-    assert _unsteady(asked, found) == {}
+    assert _frequency_dependent(asked, found) == {}
     # as if quick motion had asked for twice of it
-    assert list(_unsteady(asked, found._replace(change=2 * found.change))) == ["camera_yaw"]
+    assert list(_frequency_dependent(asked, found._replace(change=2 * found.change))) == ["camera_yaw"]

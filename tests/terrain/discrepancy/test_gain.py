@@ -22,8 +22,8 @@ def twist(duration_s=30.0):
 
 
 def runs(n, effects):
-    day = {"effects": effects, "scatter": load_scatter(), "noise": load_noise()}
-    return [simulate_planar(HUSKY, twist(), i, run_id=f"r{i}", **day) for i in range(n)]
+    options = {"effects": effects, "scatter": load_scatter(), "noise": load_noise()}
+    return [simulate_planar(HUSKY, twist(), i, run_id=f"r{i}", **options) for i in range(n)]
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +35,7 @@ def simulation(effects=None, scatter=True):
     return Simulation(HUSKY, effects=effects or {}, scatter=load_scatter()._asdict() if scatter else {})
 
 
-def test_the_true_extension_leaves_noise_and_what_scatters(longer):
+def test_the_true_extension_leaves_noise_and_scatter(longer):
     found = gain(simulation(), simulation(LONGER), longer)
     ahead = found.channels["speed_x_mps"]
     assert not found.refused

@@ -29,7 +29,7 @@ ODD = 2
 """Which of the runs has the fault."""
 
 
-def drive(robot=HUSKY, seed=0, name="survey", duration_s=40.0, **told) -> RunLog:
+def drive(robot=HUSKY, seed=0, name="survey", duration_s=40.0, **options) -> RunLog:
     twist = make_scenario(name, robot, "grass", duration_s, 0.6, seed=seed).twist
     return simulate_planar(
         robot,
@@ -40,7 +40,7 @@ def drive(robot=HUSKY, seed=0, name="survey", duration_s=40.0, **told) -> RunLog
         hills=Hills((0.04, 0.02), 0.03),
         run_id=f"run_{seed}",
         terrain="grass",
-        **told,
+        **options,
     )
 
 
@@ -91,14 +91,14 @@ def sound() -> list[RunLog]:
         (AGRIMARO, {"clock_offset_s": 0.5, "steering_offset_1_rad": 0.2}),
     ],
 )
-def test_what_all_runs_have_makes_none_unfit(robot, effects):
+def test_an_effect_common_to_all_runs_makes_none_unfit(robot, effects):
     names = ["survey", "complex", "survey", "starts", "spot_turn"]
     for first in (10, 20):
         runs = [drive(robot, first + i, name, effects=effects) for i, name in enumerate(names)]
         assert excluded(runs) == ()
 
 
-def test_a_clock_of_its_own_is_told_to_the_hundredth(sound):
+def test_a_clock_offset_of_one_run_is_found_to_a_hundredth_of_a_second(sound):
     runs = [late(run, 0.84 if i == ODD else 0.02) for i, run in enumerate(sound)]
     signals, info = looked_at(runs)
     assert unfit_runs(signals, info) == (
@@ -112,7 +112,7 @@ def test_a_clock_of_its_own_is_told_to_the_hundredth(sound):
     assert all(0 < clock.std_s < 0.01 for clock in clocks)
 
 
-def test_a_clock_needs_something_to_go_by_and_an_offset_of_all_is_no_fault(sound):
+def test_a_clock_requires_excitation_and_a_common_offset_is_no_fault(sound):
     runs = [late(run, 0.3) for run in [*sound[:3], drive(seed=7, name="stand")]]
     signals, info = looked_at(runs)
     assert unfit_runs(signals, info) == ()
@@ -122,7 +122,7 @@ def test_a_clock_needs_something_to_go_by_and_an_offset_of_all_is_no_fault(sound
     assert np.isnan(clocks_of(info)[3].std_s)
 
 
-def test_clocks_out_of_reach_are_refused_of_most_runs_and_exclude_one(sound):
+def test_clocks_out_of_the_search_exclude_a_run_and_are_refused_for_most_runs(sound):
     one = excluded([late(run, 5.0) if i == ODD else run for i, run in enumerate(sound)])
     assert [run.run_id for run in one] == [f"run_{ODD}"]
     assert "not -0.5 to 2 s behind" in one[0].reason
@@ -160,9 +160,9 @@ def dead_wheel(run: RunLog) -> RunLog:
     ("fault", "reason"),
     [
         (stuck, "it is stuck"),
-        (gyro(lambda t, w: np.where(t < 15, w, w[t < 15][-1])), "yaw_rate_radps stands still"),
+        (gyro(lambda t, w: np.where(t < 15, w, w[t < 15][-1])), "yaw_rate_radps is frozen"),
         (gyro(lambda t, w: np.clip(w, *np.quantile(w, [0.1, 0.9]))), "yaw_rate_radps is clipped"),
-        (gyro(lambda t, w: np.where(t < 6, w, np.nan)), "yaw_rate_radps is there in 1"),
+        (gyro(lambda t, w: np.where(t < 6, w, np.nan)), "yaw_rate_radps is known in 1"),
         (gyro(lambda t, w: -w), "it is unlike the other runs"),
         (dead_wheel, "its wheel 1 never turns faster or slower"),
         (
@@ -171,13 +171,13 @@ def dead_wheel(run: RunLog) -> RunLog:
         ),
     ],
 )
-def test_a_fault_of_one_run_is_found_and_no_other_run_goes(sound, fault, reason):
+def test_a_fault_of_one_run_excludes_that_run_only(sound, fault, reason):
     found = excluded([fault(run) if i == ODD else run for i, run in enumerate(sound)])
     assert [run.run_id for run in found] == [f"run_{ODD}"]
     assert reason in found[0].reason
 
 
-def test_a_run_alone_is_not_judged_by_others_and_clocks_that_are_known_are_not_sought_again(sound):
+def test_a_single_run_is_not_compared_and_known_clocks_are_reused(sound):
     signals, info = looked_at(sound[:1])
     assert unfit_runs(signals, info) == ()
     signals, info = looked_at([late(run, 0.84 if i == ODD else 0.02) for i, run in enumerate(sound)])
@@ -186,7 +186,7 @@ def test_a_run_alone_is_not_judged_by_others_and_clocks_that_are_known_are_not_s
     assert clocks_of(info, shift) == clocks_of(info)
 
 
-def test_of_three_runs_none_is_unlike_and_a_terrain_of_its_own_is_not_judged(sound):
+def test_of_three_runs_none_is_an_outlier_and_a_single_terrain_is_not_compared(sound):
     sand = drive(seed=ODD, ground=Ground(1.2, 0.35, 0.15, 0.3))
     assert excluded([sound[0], sound[1], sand]) == ()
     labelled = replace(sand, labels=(sand.labels[0]._replace(terrain="sand"),))

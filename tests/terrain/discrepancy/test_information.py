@@ -9,16 +9,16 @@ from numpy.testing import assert_allclose
 from terrain.discrepancy.information import (
     N_BLOCKS,
     correlation,
-    counted_from,
     information_at,
     loss_of,
     misfit_of,
-    moved,
+    move_point,
     nearby,
-    rest_beside,
+    partial_information,
+    recentre,
 )
 from terrain.discrepancy.residuals import low_pass_of
-from terrain.discrepancy.selection import fitted
+from terrain.discrepancy.selection import fit_change
 from terrain.discrepancy.signals import signals_of
 from terrain.discrepancy.simulation import Simulation
 from terrain.effects import BOUNDS, CHANNELS, INDEX, SPEED_X, vector_of
@@ -95,7 +95,7 @@ def test_the_form_is_generalised_least_squares_with_scatter_written_out(info):
         assert info.c[i] == pytest.approx(c)
         total_a, total_g = total_a + a, total_g + g
     at = [info.parameters.index(name) for name in NAMES]
-    change, cov = fitted(info, NAMES)
+    change, cov = fit_change(info, NAMES)
     expected = np.linalg.solve(total_a[np.ix_(at, at)], total_g[at])
     std = np.sqrt(np.diag(cov))
     assert_allclose(change / std, expected / std, atol=1e-5)
@@ -106,12 +106,12 @@ def test_the_form_is_generalised_least_squares_with_scatter_written_out(info):
     assert abs(off) < 4 * std[1]
 
 
-def test_what_scatters_is_a_parameter_too_and_its_scatter_widens_what_is_known_of_it(info, signals):
+def test_a_nuisance_is_a_parameter_too_and_its_scatter_widens_its_variance(info, signals):
     assert info.parameters[: len(NAMES)] == NAMES
     assert set(np.array(info.parameters)[info.nuisances]) == set(SCATTER._fields)
     firm = information_at(signals, Simulation(HUSKY), info.vector, NAMES, low_pass_of(signals), info.noise)
     name = ["rolling_resistance_ratio"]  # which scatters
-    wide, narrow = fitted(info, name)[1][0, 0], fitted(firm, name)[1][0, 0]
+    wide, narrow = fit_change(info, name)[1][0, 0], fit_change(firm, name)[1][0, 0]
     # the mean over runs cannot be better known than its scatter lets
     assert wide > SCATTER.rolling_resistance_ratio**2 / len(signals) > narrow
     assert firm.nuisances.size == 0
@@ -129,13 +129,13 @@ def test_changes_counted_from_another_point_end_at_the_same_values(signals, info
     there = vector_of({"camera_yaw_rad": 0.02, "payload_ratio": 0.05})
     low_pass = low_pass_of(signals)
     moved_info = information_at(signals, SIMULATION, there, NAMES, low_pass, info.noise)
-    here = counted_from(moved_info, base)
+    here = recentre(moved_info, base)
     names = list(NAMES[:2])
-    change, _ = fitted(moved_info, names)
-    again, cov = fitted(here, names)
+    change, _ = fit_change(moved_info, names)
+    again, cov = fit_change(here, names)
     assert_allclose(again, change + [there[INDEX[name]] for name in names], atol=1e-9)
     # the simulation is all but straight in these two: sensitivities taken elsewhere give the same answer
-    direct, _ = fitted(info, names)
+    direct, _ = fit_change(info, names)
     assert (np.abs(again - direct) < np.sqrt(np.diag(cov))).all()
     assert_allclose(here.vector, base)
     # and with the same likelihood there
@@ -149,30 +149,30 @@ def test_nearby_is_the_same_form_at_another_point_by_the_same_noise(signals, inf
     scale = np.sqrt(here.a.diagonal())
     assert_allclose(here.a / np.outer(scale, scale), info.a[:, at][:, :, at].sum(0) / np.outer(scale, scale))
     assert_allclose(here.g / scale, info.g[:, at].sum(0) / scale, atol=1e-9)
-    there = moved(info.vector, names, np.array([0.05, 0.02, 0.02]))
+    there = move_point(info.vector, names, np.array([0.05, 0.02, 0.02]))
     direct = information_at(signals, SIMULATION, there, names, low_pass, info.noise)
     near = nearby(info, signals, SIMULATION, there, names, low_pass)
     at = direct.places(names)
     assert_allclose(near.a, direct.a[:, at][:, :, at].sum(0), rtol=0.02, atol=0.01 * near.a.max())
-    for white, told in zip(near.white_residual, direct.white_residual, strict=True):
-        assert_allclose(white, told)
+    for white, expected in zip(near.white_residual, direct.white_residual, strict=True):
+        assert_allclose(white, expected)
 
 
 def test_two_points_differ_in_misfit_as_their_likelihoods_do(signals, info):
     low_pass, names = low_pass_of(signals), ["camera_yaw_rad", "payload_ratio"]
-    change, _ = fitted(info, names)
+    change, _ = fit_change(info, names)
     before = misfit_of(info, info.white_residual)
-    point = nearby(info, signals, SIMULATION, moved(info.vector, names, change), names, low_pass)
+    point = nearby(info, signals, SIMULATION, move_point(info.vector, names, change), names, low_pass)
     after = misfit_of(info, point.white_residual)
     assert before - after == pytest.approx(-loss_of(info, names), rel=0.02)
 
 
-def test_the_noise_of_wheels_does_not_part_two_scales_of_one_current(signals, info):
+def test_noise_of_the_wheels_does_not_separate_two_scales_of_one_current(signals, info):
     """By sums of squares the mass, which enlarges that noise, would be ahead or behind by far more."""
     low_pass = low_pass_of(signals)
     ahead = {}
     for name, change in (("payload_ratio", 0.05), ("camera_yaw_rad", 0.0)):
-        there = moved(info.vector, [name], np.array([change]))
+        there = move_point(info.vector, [name], np.array([change]))
         point = nearby(info, signals, SIMULATION, there, [name], low_pass)
         squares = sum(float((white**2).sum()) for white in point.white_residual)
         ahead[name] = squares, misfit_of(info, point.white_residual)
@@ -192,14 +192,14 @@ def test_correlation_is_the_largest_of_any_change_by_the_one_and_the_other():
     cosine = a[0, 2] / np.sqrt(a[0, 0] * a[2, 2])
     assert correlation(a, [0], [2]) == pytest.approx(abs(cosine))
     assert correlation(np.diag([1.0, 0.0]), [0], [1]) == 1.0
-    follow, free = rest_beside(a, [0, 1], [2, 3])
+    follow, free = partial_information(a, [0, 1], [2, 3])
     assert free[1, 1] == pytest.approx(0.0, abs=1e-9 * a[3, 3])
     assert_allclose(follow[:, 1], [1.0, 1.0])
     assert_allclose(np.linalg.inv(free[:1, :1]), np.linalg.inv(a[:3, :3])[2:, 2:])
 
 
-def test_a_point_that_is_moved_to_keeps_within_bounds(info):
-    point = moved(
+def test_a_moved_point_stays_within_bounds(info):
+    point = move_point(
         info.vector, ["payload_ratio", "camera_latency_s", "pitch_offset_rad"], np.array([9.0, -0.1, 0.3])
     )
     assert point[INDEX["payload_ratio"]] == BOUNDS["payload_ratio"][1]

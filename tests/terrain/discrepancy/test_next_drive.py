@@ -1,4 +1,4 @@
-"""The drive that is told parts what it says, when it is driven."""
+"""The suggested drive separates the effects that it names, when it is driven."""
 
 import re
 from dataclasses import replace
@@ -32,7 +32,7 @@ def drive(simulation: Simulation, name: str, grade_deg: float = 0.0, seed: int =
     return simulate_planar(simulation.robot, twist, seed, hills=hills, noise=load_noise(), run_id=f"{seed}")
 
 
-def said(simulation: Simulation, runs: list[RunLog], names: list[str]) -> Information:
+def information_of(simulation: Simulation, runs: list[RunLog], names: list[str]) -> Information:
     signals = [signals_of(run, simulation.robot) for run in runs]
     return information_at(signals, simulation, simulation.vector, names, low_pass_of(signals))
 
@@ -52,17 +52,21 @@ def collinearity(info: Information, names: list[str]) -> float:
         (AGRIMARO, ("steering_offset_1", "gyro_bias"), ["steering_offset_1_rad", "gyro_bias_radps"]),
     ],
 )
-def test_the_drive_that_is_told_has_the_index_that_is_told(simulation, group, names):
-    before = said(simulation, [drive(simulation, "straight", seed=seed) for seed in range(3)], names)
-    told = next_drive(simulation, [group], (), before)
-    assert told is not None
-    index = re.search(r"falls from (over )?([\d.]+) to ([\d.]+)$", told.reason)
+def test_the_suggested_drive_has_the_stated_collinearity_index(simulation, group, names):
+    before = information_of(
+        simulation, [drive(simulation, "straight", seed=seed) for seed in range(3)], names
+    )
+    suggested = next_drive(simulation, [group], (), before)
+    assert suggested is not None
+    index = re.search(r"falls from (over )?([\d.]+) to ([\d.]+)$", suggested.reason)
     assert index is not None
     over, was, comes = index[1], float(index[2]), float(index[3])
     now = collinearity(before, names)
     assert now >= was if over else was == pytest.approx(now, rel=0.05)
     assert comes < 0.5 * was
-    driven = said(simulation, [drive(simulation, told.scenario, told.grade_deg, seed=9)], names)
+    driven = information_of(
+        simulation, [drive(simulation, suggested.scenario, suggested.grade_deg, seed=9)], names
+    )
     assert collinearity(driven, names) < max(1.5 * comes, 0.5 * was)
 
 
@@ -70,31 +74,31 @@ def test_twins_need_a_sensor_and_the_reason_names_it():
     runs = [drive(HUSKY, "complex", seed=seed) for seed in range(3)]
     blind = [replace(run, streams={k: s for k, s in run.streams.items() if k != "odometry"}) for run in runs]
     names = ["gyro_scale_ratio", "effective_track_ratio"]
-    told = next_drive(
+    suggested = next_drive(
         replace(HUSKY, scatter={}),
         [("effective_track", "gyro_scale")],
         (),
-        said(replace(HUSKY, scatter={}), blind, names),
+        information_of(replace(HUSKY, scatter={}), blind, names),
     )
-    assert told is not None
-    assert "one without heading_rate_radps" in told.reason
+    assert suggested is not None
+    assert "one without heading_rate_radps" in suggested.reason
 
 
-def test_what_was_not_shown_is_asked_for_and_its_limit_is_told():
+def test_an_effect_that_was_not_excited_gets_a_drive_with_its_limit():
     names = ["side_hill_slip_ratio", "camera_yaw_rad"]
-    before = said(AGRIMARO, [drive(AGRIMARO, "straight", seed=seed) for seed in range(3)], names)
+    before = information_of(AGRIMARO, [drive(AGRIMARO, "straight", seed=seed) for seed in range(3)], names)
     missed = [Limit("side_hill_slip_ratio", np.inf, "ratio", "both signs of roll")]
-    told = next_drive(AGRIMARO, (), missed, before)
-    assert told is not None
-    assert told.grade_deg > 0  # there is no roll on the level
-    limit = re.search(r"from infinite to ([\d.]+) ratio", told.reason)
+    suggested = next_drive(AGRIMARO, (), missed, before)
+    assert suggested is not None
+    assert suggested.grade_deg > 0  # there is no roll on the level
+    limit = re.search(r"from infinite to ([\d.]+) ratio", suggested.reason)
     assert limit is not None
-    info = said(AGRIMARO, [drive(AGRIMARO, told.scenario, told.grade_deg)], names)
+    info = information_of(AGRIMARO, [drive(AGRIMARO, suggested.scenario, suggested.grade_deg)], names)
     at = info.places(names[:1])[0]
     assert 5.48 / np.sqrt(info.a[0, at, at]) == pytest.approx(float(limit[1]), rel=0.6)
 
 
-def test_nothing_is_told_where_there_is_nothing_to_part_or_nothing_parts_it():
+def test_no_drive_is_suggested_without_need_or_without_effect():
     assert next_drive(HUSKY, (), ()) is None
     bare = replace(HUSKY, robot=HUSKY.robot.without("motors"))
     assert next_drive(bare, [("wheel_radius", "force_slip")], ()) is None

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from terrain.discrepancy.noise import ORDER, noise_of, whitened
+from terrain.discrepancy.noise import ORDER, noise_of, whiten
 
 GROWTH = np.array([[0.2, 0.0, 0.8], [1e-4, 3e-4, 0.0]])
 """Coefficients of the variance in 1, v and v^2, of two channels."""
@@ -40,7 +40,7 @@ def test_coloured_noise_that_grows_with_speed_comes_out_white():
     )
     white = np.concatenate(
         [
-            whitened(noise.filters, (r / noise.size(v))[None])[0, ORDER:]
+            whiten(noise.filters, (r / noise.size(v))[None])[0, ORDER:]
             for r, v in zip(residuals, speeds, strict=True)
         ]
     )
@@ -68,7 +68,7 @@ def test_the_filter_is_a_convolution_and_stops_where_something_is_unknown():
     x = rng.standard_normal((3, 50, 2))
     x[1, 20, 0] = np.nan
     filters = rng.standard_normal((2, ORDER + 1))
-    out = whitened(filters, x)
+    out = whiten(filters, x)
     for j in range(3):
         for c in range(2):
             expected = np.convolve(x[j, :, c], filters[c])[:50]

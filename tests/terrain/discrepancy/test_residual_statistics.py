@@ -30,7 +30,7 @@ def test_the_spectrum_of_coloured_noise_is_that_of_the_filter_that_whitens_it():
     assert held == pytest.approx(1.0, rel=0.05)
 
 
-def test_a_hole_parts_a_spectrum_and_the_shortest_stretches_have_none():
+def test_a_hole_splits_a_spectrum_and_the_shortest_stretches_have_none():
     whole = coloured(2000, 1)
     holed = np.concatenate([whole[:1000], [np.nan], whole[1000:]])
     np.testing.assert_allclose(
@@ -48,7 +48,7 @@ def test_of_short_runs_a_spectrum_is_taken_over_short_segments():
     assert frequency[0] == pytest.approx(RATE_HZ / 64)
 
 
-def test_intervals_hold_the_mean_of_nothing_as_often_as_they_say():
+def test_intervals_of_zero_mean_noise_have_their_nominal_coverage():
     n_seeds, missed_runs, missed_bins = 60, [], []
     for seed in range(n_seeds):
         residuals = [coloured(400, 1000 * seed + i) for i in range(6)]
@@ -74,7 +74,7 @@ def test_the_mean_of_a_short_run_scatters_no_more_than_the_noise_itself():
     assert half[0] < 1.96 / np.sqrt(1 - kept**2)
 
 
-def test_bins_want_rows_and_intervals_want_runs():
+def test_bins_require_rows_and_intervals_require_runs():
     x = np.linspace(0, 1, 200)
     centres, means, halves = binned_means([x, x], [np.ones(200), np.full(200, np.nan)])
     assert len(centres) == 6

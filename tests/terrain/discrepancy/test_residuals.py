@@ -8,14 +8,14 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from terrain.discrepancy.information import information_at
 from terrain.discrepancy.residuals import (
-    _prepared,
-    decimated,
-    holed,
+    _prepare_inputs,
+    decimate,
+    decimate_known,
     low_pass_of,
     measured_channels,
     rows_of,
 )
-from terrain.discrepancy.selection import fitted
+from terrain.discrepancy.selection import fit_change
 from terrain.discrepancy.signals import Signals, signals_of
 from terrain.discrepancy.simulation import Simulation
 from terrain.effects import (
@@ -86,7 +86,7 @@ def looked_at(request):
     return Simulation(robot), effects, signals_of(drive(robot, effects), robot)
 
 
-def test_with_the_right_effects_hardly_anything_is_left_and_without_them_much(looked_at):
+def test_the_right_effects_leave_a_small_residual_and_none_a_large_one(looked_at):
     simulation, effects, signals = looked_at
     low_pass = low_pass_of([signals])
     noise = np.array([NOISE[channel] for channel in CHANNELS])
@@ -105,7 +105,7 @@ def test_with_the_right_effects_hardly_anything_is_left_and_without_them_much(lo
 def test_sensitivities_are_differences_of_full_replays(looked_at):
     """Two routes: effects of sensors alone reuse the motion, and here all is replayed."""
     simulation, effects, signals = looked_at
-    low_pass, point = low_pass_of([signals])._replace(calm_hz=np.inf), vector_of(effects)
+    low_pass, point = low_pass_of([signals])._replace(instrument_cutoff_hz=np.inf), vector_of(effects)
     names = [p.name for effect in simulation.library for p in effect.parameters]
     rows = rows_of(
         signals, simulation.planar, point, [*names, "pitch_offset_rad", "roll_offset_rad"], low_pass
@@ -125,7 +125,7 @@ def test_measured_and_predicted_pass_the_same_window(looked_at):
     """A prediction that is fed back as what was measured leaves nothing, holes or none."""
     simulation, effects, signals = looked_at
     low_pass = low_pass_of([signals])
-    dt, wheel_speed, steer, grade, roll, _ = _prepared(signals, low_pass)
+    dt, wheel_speed, steer, grade, roll, _ = _prepare_inputs(signals, low_pass)
     shown = replay(simulation.planar, vector_of(effects), dt, wheel_speed, steer, grade, roll)
     own = low_pass._replace(inputs_every=0)
     fed = {"wheel_speed_mps": wheel_speed, "steer_rad": steer, "grade_rad": grade, "roll_rad": roll}
@@ -156,26 +156,26 @@ def test_the_window_passes_what_is_slow_and_stops_what_rows_cannot_hold():
     assert max(gain(f) for f in stopped) < 0.01
 
 
-def test_decimation_is_a_convolution_and_holes_are_weighed_out():
+def test_decimation_is_a_convolution_and_holes_are_left_out():
     rng = np.random.default_rng(0)
     values, taps = rng.standard_normal((200, 2)), np.hamming(21) / np.hamming(21).sum()
     expected = np.column_stack([np.convolve(column, taps, mode="valid")[::4] for column in values.T])
-    assert_allclose(decimated(values, taps, 4), expected)
-    assert_allclose(holed(values, np.ones((200, 2), dtype=bool), taps, 4), expected)
+    assert_allclose(decimate(values, taps, 4), expected)
+    assert_allclose(decimate_known(values, np.ones((200, 2), dtype=bool), taps, 4), expected)
     known = np.ones((200, 2), dtype=bool)
     known[50:52, 0] = False
     known[100:140, 1] = False
-    told = holed(np.where(known, values, np.nan), known, taps, 4)
-    for row in range(len(told)):
+    decimated = decimate_known(np.where(known, values, np.nan), known, taps, 4)
+    for row in range(len(decimated)):
         window = slice(4 * row, 4 * row + 21)
         for c in range(2):
             weight = taps * known[window, c]
             if weight.sum() >= 0.75:
                 mean = np.sum(weight * np.nan_to_num(values[window, c])) / weight.sum()
-                assert told[row, c] == pytest.approx(mean)
+                assert decimated[row, c] == pytest.approx(mean)
             else:
-                assert np.isnan(told[row, c])
-    assert np.isnan(told).sum(axis=0).tolist() == [0, 12]
+                assert np.isnan(decimated[row, c])
+    assert np.isnan(decimated).sum(axis=0).tolist() == [0, 12]
 
 
 def test_a_hole_stays_unknown_and_nothing_else_is_lost(looked_at):
@@ -220,7 +220,7 @@ def test_the_slowest_clock_sets_the_low_pass_whichever_run_has_it():
         low_pass_of([fast, fake(0.1, "b")])
 
 
-def test_noise_of_the_wheels_is_not_taken_for_a_mass_or_a_motor():
+def test_noise_of_the_wheels_is_not_attributed_to_a_mass_or_a_motor():
     """At one speed the wheels' acceleration is all noise, in the residual and in what a mass would change."""
     robot = ROBOTS["agrimaro"]
     time_s = np.arange(2001) / 50
@@ -230,12 +230,12 @@ def test_noise_of_the_wheels_is_not_taken_for_a_mass_or_a_motor():
     signals, simulation = [signals_of(run, robot) for run in runs], Simulation(robot)
     low_pass = low_pass_of(signals)
     off = {}
-    for calm_hz in (low_pass.calm_hz, np.inf):
-        same = low_pass._replace(calm_hz=calm_hz)
+    for instrument_cutoff_hz in (low_pass.instrument_cutoff_hz, np.inf):
+        same = low_pass._replace(instrument_cutoff_hz=instrument_cutoff_hz)
         names = ["motor_constant_ratio", "rolling_resistance_ratio", "accel_bias_mps2"]
         info = information_at(signals, simulation, simulation.vector, names, same)
-        change, cov = fitted(info, names)
-        off[calm_hz] = change[0], change[0] / np.sqrt(cov[0, 0])
+        change, cov = fit_change(info, names)
+        off[instrument_cutoff_hz] = change[0], change[0] / np.sqrt(cov[0, 0])
     assert off[np.inf][1] < -4.0
-    assert abs(off[low_pass.calm_hz][0]) < 0.5 * abs(off[np.inf][0])
-    assert abs(off[low_pass.calm_hz][1]) < 3.0
+    assert abs(off[low_pass.instrument_cutoff_hz][0]) < 0.5 * abs(off[np.inf][0])
+    assert abs(off[low_pass.instrument_cutoff_hz][1]) < 3.0

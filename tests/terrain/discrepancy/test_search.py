@@ -5,7 +5,7 @@ import pytest
 
 from terrain.discrepancy.residuals import low_pass_of
 from terrain.discrepancy.search import Problem, names_of, search
-from terrain.discrepancy.selection import fitted
+from terrain.discrepancy.selection import fit_change
 from terrain.discrepancy.signals import signals_of
 from terrain.discrepancy.trials.drives import rich_drives
 from terrain.discrepancy.trials.hidden_effects import hidden_runs
@@ -36,7 +36,7 @@ def three():
     return asked, searched(asked)
 
 
-def test_three_causes_are_found_with_their_values_by_refits_where_the_fit_has_gone(three):
+def test_three_causes_are_found_with_their_values_by_relinearisation(three):
     _, found = three
     assert {cause.name for cause in found.causes} == {"camera_latency", "payload", "camera_yaw"}
     assert set(found.names) == set(HIDDEN)
@@ -51,11 +51,11 @@ def test_three_causes_are_found_with_their_values_by_refits_where_the_fit_has_go
     assert found.rivals == {cause.name: () for cause in found.causes}
 
 
-def test_evidence_is_told_of_every_effect_and_only_the_causes_stand(three):
+def test_every_effect_has_evidence_and_only_causes_are_significant(three):
     asked, found = three
     assert set(found.tried) == {effect.name for effect in asked.library}
-    standing = {name for name, told in found.tried.items() if told.stands}
-    assert standing == {cause.name for cause in found.causes}
+    significant = {name for name, each in found.tried.items() if each.significant}
+    assert significant == {cause.name for cause in found.causes}
 
 
 def test_changes_are_counted_from_the_simulation_that_was_given(three):
@@ -65,13 +65,13 @@ def test_changes_are_counted_from_the_simulation_that_was_given(three):
     assert {cause.name for cause in again.causes} == {cause.name for cause in found.causes}
     std = np.sqrt(np.diag(found.cov))
     for name, value, own in zip(found.names, found.change, std, strict=True):
-        told = again.change[again.names.index(name)]
-        assert told + half[name] == pytest.approx(value, abs=own)
-    at_fit = fitted(again.info, again.names)[0]
+        change = again.change[again.names.index(name)]
+        assert change + half[name] == pytest.approx(value, abs=own)
+    at_fit = fit_change(again.info, again.names)[0]
     np.testing.assert_allclose(at_fit, again.change)
 
 
-def test_causes_that_were_held_once_are_not_held_again(three, monkeypatch):
+def test_a_set_of_causes_is_not_reached_twice(three, monkeypatch):
     """One comes, drives another out and goes itself: what is left was there before, and so it would go on."""
     asked, found = three
     first, second, third = (effect_named(name) for name in ("payload", "camera_yaw", "gyro_bias"))
@@ -89,7 +89,7 @@ def test_causes_that_were_held_once_are_not_held_again(three, monkeypatch):
         left = [each for each in (first, second, third) if each not in causes and each.name not in barred]
         return left[:1]
 
-    monkeypatch.setattr("terrain.discrepancy.search._refitted", refitted)
+    monkeypatch.setattr("terrain.discrepancy.search._relinearize", refitted)
     monkeypatch.setattr("terrain.discrepancy.search._weakest", weakest)
     monkeypatch.setattr("terrain.discrepancy.search._next", following)
     monkeypatch.setattr("terrain.discrepancy.search._better", lambda *_: None)
@@ -103,7 +103,7 @@ def test_causes_that_were_held_once_are_not_held_again(three, monkeypatch):
     ]
 
 
-def test_without_its_entry_in_the_library_a_cause_that_nothing_resembles_is_left():
+def test_without_its_entry_in_the_library_a_distinct_cause_stays_unexplained():
     names = ["camera_latency", "gyro_bias", "accel_bias", "scrub"]
     found = searched(problem({"camera_yaw_rad": 0.05}, names))
     assert found.causes == ()

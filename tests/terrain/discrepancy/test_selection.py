@@ -13,10 +13,10 @@ from terrain.discrepancy.selection import (
     N_BOOTSTRAP,
     TRUST_DOF,
     evidence,
-    fitted,
+    fit_change,
     gain_interval,
     held_out_gain,
-    weighed_variance,
+    pooled_variance,
     z_of,
     z_of_t,
 )
@@ -70,16 +70,16 @@ def true(payload=0.0, lever=0.0):
 
 def test_evidence_is_the_fit_over_its_noise():
     z = np.array([evidence(problem(true(10.0), seed), (), PAYLOAD).z for seed in range(60)])
-    # a t statistic of ten or so, told as a normal number, is less: its variance is not known for sure
+    # a t statistic of ten or so, as a normal number, is less: its variance is uncertain
     dof = TRUST_DOF + N_RUNS - 1
     assert np.median(z) == pytest.approx(z_of_t(10.0, dof), rel=0.1)
     found = evidence(problem(true(10.0)), (), PAYLOAD)
-    assert found.stands
+    assert found.significant
     assert abs(found.change[0] - 10 * STD) < 4 * STD
-    assert_allclose(found.change, fitted(problem(true(10.0)), ["payload_ratio"])[0])
+    assert_allclose(found.change, fit_change(problem(true(10.0)), ["payload_ratio"])[0])
 
 
-def test_where_nothing_is_hidden_evidence_is_as_rare_as_it_says():
+def test_without_a_hidden_effect_evidence_has_its_nominal_rate():
     z = np.array([evidence(problem(true(), seed), ("gyro_bias_radps",), PAYLOAD).z for seed in range(300)])
     for limit in (1.0, 2.0, 3.0):
         expected = 2 * norm.sf(limit)
@@ -90,10 +90,10 @@ def test_where_nothing_is_hidden_evidence_is_as_rare_as_it_says():
 def test_of_several_parameters_evidence_is_that_of_all_together():
     z = np.array([evidence(problem(true(), seed), (), LEVER).z for seed in range(200)])
     assert (z > 2.0).mean() < 0.0455 + 3 * np.sqrt(0.0455 / 200)
-    assert evidence(problem(true(lever=12.0)), (), LEVER).stands
+    assert evidence(problem(true(lever=12.0)), (), LEVER).significant
 
 
-def test_what_differs_from_run_to_run_tells_less():
+def test_differences_from_run_to_run_reduce_evidence():
     same, other = (problem(true(40.0), scatter=scatter) for scatter in (0.0, 100 * STD))
     assert evidence(same, (), PAYLOAD).dispersion == pytest.approx(1.0, abs=0.6)
     found = evidence(other, (), PAYLOAD)
@@ -102,7 +102,7 @@ def test_what_differs_from_run_to_run_tells_less():
     assert found.z < 0.3 * evidence(same, (), PAYLOAD).z
 
 
-def test_a_cause_that_is_selected_takes_away_what_another_could_tell():
+def test_a_selected_cause_reduces_the_evidence_of_a_similar_effect():
     info = problem(true(30.0), alike=0.98)
     radius = effect_named("wheel_radius")
     assert evidence(info, (), radius).z > 6.0
@@ -110,15 +110,15 @@ def test_a_cause_that_is_selected_takes_away_what_another_could_tell():
     assert evidence(info, ("wheel_radius_ratio",), PAYLOAD).z > 3.0
 
 
-def test_out_of_bounds_or_without_any_information_nothing_stands():
+def test_out_of_bounds_or_without_information_nothing_is_significant():
     high = PAYLOAD.parameters[0].high
     far = problem([1.2 * high, 0.0, 0.0, 0.0, 0.0])
     found = evidence(far, (), PAYLOAD)
-    assert (found.inside, found.stands) == (False, False)
+    assert (found.inside, found.significant) == (False, False)
     blind = problem(true())
     blind.a[:, 0] = blind.a[:, :, 0] = blind.g[:, 0] = 0.0
     found = evidence(blind, (), PAYLOAD)
-    assert (found.z, found.stands) == (0.0, False)
+    assert (found.z, found.significant) == (0.0, False)
 
 
 @pytest.mark.parametrize("n_runs", [3, N_RUNS])
@@ -138,24 +138,24 @@ def test_held_out_gain_is_that_of_fits_without_each_run(n_runs):
     assert_allclose(held_out_gain(info, [], both), plain, rtol=1e-5, atol=1e-6)
 
 
-def test_a_variance_is_weighed_from_noise_and_clusters():
+def test_a_variance_is_pooled_from_noise_and_clusters():
     share = np.full(12, 1 / 12)
     size = 50.0
     fits = (1 - share) * np.sqrt(size / 12) * np.sqrt(12 / 11)  # clusters that scatter as the noise lets them
-    variance, dof = weighed_variance(fits, share, size)
+    variance, dof = pooled_variance(fits, share, size)
     assert variance == pytest.approx(1.0)
     assert dof == pytest.approx(TRUST_DOF + 11)
-    none, _ = weighed_variance(np.zeros(12), share, size)
+    none, _ = pooled_variance(np.zeros(12), share, size)
     assert none == pytest.approx(TRUST_DOF / (TRUST_DOF + 11))  # noise alone is believed so far
-    wild, dof = weighed_variance(1000 * fits, share, size)
+    wild, dof = pooled_variance(1000 * fits, share, size)
     assert wild == pytest.approx(1e6 * 11 / (TRUST_DOF + 11), rel=1e-3)
     assert dof == pytest.approx(11, rel=1e-3)
     one_tells = np.array([0.9, *np.full(11, 0.1 / 11)])
-    _, dof = weighed_variance(1000 * (1 - one_tells) * np.sqrt(size / 12), one_tells, size)
+    _, dof = pooled_variance(1000 * (1 - one_tells) * np.sqrt(size / 12), one_tells, size)
     assert dof < 1.5
 
 
-def test_numbers_of_evidence_are_as_improbable_as_what_they_stand_for():
+def test_z_scores_are_as_improbable_as_the_statistics_they_represent():
     for t, dof in ((2.0, 5.0), (8.0, 15.0)):
         assert 2 * norm.sf(z_of_t(t, dof)) == pytest.approx(2 * student.sf(t, dof))
     assert z_of(np.log(2 * norm.sf(3.0))) == pytest.approx(3.0)
@@ -164,7 +164,7 @@ def test_numbers_of_evidence_are_as_improbable_as_what_they_stand_for():
     assert z_of(-1e4) > z_of(-601.0)
 
 
-def test_the_interval_of_a_gain_holds_its_spread_over_runs():
+def test_the_interval_of_a_gain_covers_its_spread_over_runs():
     rng = np.random.default_rng(0)
     gain = 10.0 + 4.0 * rng.standard_normal(20)
     low, high = gain_interval(gain)
@@ -175,4 +175,4 @@ def test_the_interval_of_a_gain_holds_its_spread_over_runs():
 
 
 def test_with_few_runs_thirds_of_them_are_the_clusters():
-    assert evidence(problem(true(10.0), n_runs=3), (), PAYLOAD).stands
+    assert evidence(problem(true(10.0), n_runs=3), (), PAYLOAD).significant

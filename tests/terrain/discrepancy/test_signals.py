@@ -26,12 +26,12 @@ from terrain.simulation.planar.run import simulate_planar
 HUSKY, AGRIMARO = load_robot("husky"), load_robot("agrimaro")
 
 
-def drive(robot, **told):
+def drive(robot, **options):
     t = np.arange(1001) / 50
     twist = np.column_stack([0.4 * np.sin(0.8 * t), np.zeros_like(t), 0.3 * np.sin(1.1 * t)])
     if robot is AGRIMARO:
         twist[:, 1] = 0.2 * np.sin(0.5 * t)
-    return simulate_planar(robot, twist, 1, hills=Hills((0.05, 0.0), 0.02), terrain="grass", **told)
+    return simulate_planar(robot, twist, 1, hills=Hills((0.05, 0.0), 0.02), terrain="grass", **options)
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +78,7 @@ def test_streams_of_a_skid_steer_robot_come_to_one_clock(husky):
         signals.measured[0, 0] = 1.0
 
 
-def test_a_tracking_camera_shows_the_speed_of_its_own_point_in_body_axes(agrimaro):
+def test_a_tracking_camera_measures_the_speed_of_its_own_point_in_body_axes(agrimaro):
     signals, truth, camera = signals_of(agrimaro, AGRIMARO), agrimaro.streams["truth"], AGRIMARO.camera
     late_s = signals.time_s - camera.latency_s - camera.time_constant_s
     x, y, turn = (
@@ -91,7 +91,7 @@ def test_a_tracking_camera_shows_the_speed_of_its_own_point_in_body_axes(agrimar
     assert np.isnan(channel(signals, HEADING)).all()
 
 
-def test_steering_loses_its_zeros_and_turns_and_rates_of_motors_become_rims(agrimaro):
+def test_steering_zeros_and_turns_are_subtracted_and_motor_rates_become_wheel_speeds(agrimaro):
     signals, truth = signals_of(agrimaro, AGRIMARO), agrimaro.streams["truth"]
     for i in range(3):
         assert_allclose(signals.steer_rad[:, i], truth.channel(f"steer_{i + 1}_rad")[::2], atol=1e-9)
@@ -115,7 +115,7 @@ def test_the_sum_of_currents_counts_only_while_the_wheels_are_parallel(agrimaro)
     assert np.isnan(channel(signals, TURNING_CURRENT)).all()
 
 
-def test_currents_that_are_sizes_get_the_sign_of_their_wheel_and_others_stay():
+def test_current_magnitudes_get_the_sign_of_their_wheel_and_signed_ones_stay():
     # on the spot: the sides turn against each other, and both motors drive
     t = np.arange(1001) / 50
     twist = np.column_stack([np.zeros_like(t), np.zeros_like(t), 0.8 * np.minimum(t, 1.0)])
@@ -125,10 +125,10 @@ def test_currents_that_are_sizes_get_the_sign_of_their_wheel_and_others_stay():
     at = [wheels.channels.index(f"current_{side}_a") for side in ("left", "right")]
     values[:, at] = np.abs(values[:, at])
     sizes = with_stream(run, "wheels", Stream(wheels.time_s, values, wheels.channels))
-    signed, told = signals_of(run, HUSKY), signals_of(sizes, HUSKY)
+    signed, restored = signals_of(run, HUSKY), signals_of(sizes, HUSKY)
     steady = signed.time_s > 2.0
-    assert_allclose(channel(told, TURNING_CURRENT)[steady], channel(signed, TURNING_CURRENT)[steady])
-    assert channel(told, TURNING_CURRENT)[steady].mean() > 1.0
+    assert_allclose(channel(restored, TURNING_CURRENT)[steady], channel(signed, TURNING_CURRENT)[steady])
+    assert channel(restored, TURNING_CURRENT)[steady].mean() > 1.0
     braked = np.array(values)
     braked[500, at[0]] = -0.1  # one sample below zero: the driver logs signs
     logged = signals_of(with_stream(run, "wheels", Stream(wheels.time_s, braked, wheels.channels)), HUSKY)
@@ -165,7 +165,7 @@ def test_the_clock_is_that_of_slow_wheels_and_runs_as_long_as_all_streams(husky)
     assert (signals.dt_s, signals.start_s, len(signals)) == pytest.approx((0.1, 3.0, 120))
 
 
-def test_without_tilt_the_accelerometer_tells_nothing_and_with_two_labels_no_terrain_is_named(husky):
+def test_without_tilt_the_accelerometer_is_not_used_and_with_two_labels_no_terrain_is_named(husky):
     imu = husky.streams["imu"]
     gyro = Stream(imu.time_s, imu.values[:, 2:4], imu.channels[2:4])
     run = replace(

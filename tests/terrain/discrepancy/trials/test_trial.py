@@ -27,7 +27,7 @@ def test_a_trial_depends_on_its_seed_and_number_alone():
     assert run_trial(cases[3]).hidden != one.hidden
 
 
-def test_runs_that_the_diagnosis_refuses_count_as_a_false_alarm_and_stop_nothing(monkeypatch):
+def test_refused_runs_count_as_a_false_alarm(monkeypatch):
     def refuse(*_):
         raise DataError("runs: only 2 of 8 are fit to be compared")
 
