@@ -11,24 +11,24 @@ One step, for each wheel with radius r, rate w and ground speed v along it:
 
 Two forms:
 
-- ``printed``: the direction is sgn(v), and the output of the PID on e, a ratio, is added as rad/s.  What that
-  makes of an error depends on radius and speed: by (8.4) a correction changes the slip r / max(|w r|, |v|)
-  times as much.  The four braking rows of table 8.1 (r = 1 m, 0.5 m/s: twice), iterated at K_P = 1, throw the
-  error from one side to the other for ever.
-- ``normalised``: the PID is given ``e max(|w r|, |v|) / r`` in rad/s, by which K_P = 0.5 leaves half of an
-  error in braking and, in the cases of table 8.1, 0.50 to 0.56 of it in traction, at any speed and radius.
-  sgn(v) flips on noise at rest: the direction is that of the command, which changes when the command goes
-  beyond the low speed the other way.  The integral starts anew then, and while the wheel still rolls the old
-  way it is left alone: a braking target with the sign of the new way would hold up the reversal.
+- ``printed``: the direction is sgn(v), and the output of the PID on e, a ratio, is added as rad/s.  The loop
+  gain then depends on radius and speed: by (8.4) a correction changes the slip r / max(|w r|, |v|) times as
+  much.  In the four braking rows of table 8.1 (r = 1 m, 0.5 m/s: twice), iterated at K_P = 1, the error
+  oscillates without decay.
+- ``normalised``: the input of the PID is ``e max(|w r|, |v|) / r`` in rad/s, by which K_P = 0.5 leaves 0.5 of
+  an error in braking and, in the cases of table 8.1, 0.50 to 0.56 of it in traction, at any speed and radius.
+  At rest sgn(v) changes with noise: the direction is that of the command instead, which changes when the
+  command exceeds the low speed in the other direction.  The integral is reset then, and nothing is corrected
+  while the wheel still rolls in the old direction: a braking target with the sign of the new direction would
+  delay the reversal.
 
-The thesis prints neither clamp nor anti-windup, nor what an integral does while its output is not used: here
-it stands.
+The thesis specifies neither clamp nor anti-windup, nor the integral while its output is not used: here it is
+kept.
 
-A target that is not the slip at which the ground's thrust balances the resistance (0.126 on grass) cannot be
-held at a constant speed.  With an integral either form then slows the robot towards a standstill or drives it
-as far beyond its command as the clamp allows: in a minute at K_P = K_I = 0.5, normalised, from 0.87 m/s to
-0.10 with a target of 0.05, and to 1.75 with 0.2 and a clamp of 5 rad/s.  It is here as what better
-controllers are measured against.
+A target that is not the slip at which the thrust balances the resistance (0.126 on grass) cannot be held at a
+constant speed.  With an integral either form then slows the robot towards a standstill or drives it as far
+beyond its command as the clamp allows: in a minute at K_P = K_I = 0.5, normalised, from 0.87 m/s to 0.10 with
+a target of 0.05, and to 1.75 with 0.2 and a clamp of 5 rad/s.  It is a baseline for other controllers.
 """
 
 from __future__ import annotations
@@ -40,16 +40,16 @@ import numpy as np
 from numba import njit, types
 
 from terrain.control.pid import (
-    BAD_TIME,
     GAINS,
     LONGEST_STEP_S,
-    NO_ERROR,
     Gains,
     PidState,
+    PidStatus,
     check_gains,
     pid_step,
 )
-from terrain.control.power_state import POWER_THRESHOLD_WPKG, UNKNOWN, power_state
+from terrain.control.power_state import POWER_THRESHOLD_WPKG, DriveState, power_state
+from terrain.control.status import StatusCode
 from terrain.errors import ConfigError
 from terrain.records import Array
 
@@ -59,13 +59,25 @@ LOW_SPEED_MPS = 0.05
 FORMS = ("printed", "normalised")
 PRINTED, NORMALISED = range(2)
 
-LOW_SPEED, STANDING, REVERSING = 4, 5, 6
-"""Statuses beside those of :mod:`terrain.control.pid`: the error counts as 0; the robot stands, nothing is
-added; the wheel rolls against its command or has had none yet, nothing is added."""
+
+class ThesisStatus(StatusCode):
+    """Result of a step of a wheel: those of its PID, and three in which its error is not used.
+
+    ``LOW_SPEED``: the error counts as 0.  ``STANDING``, ``REVERSING``: nothing is added, as the robot is at
+    rest, or as the wheel rolls against its command or has had none yet.
+    """
+
+    OK = PidStatus.OK
+    CLAMPED = PidStatus.CLAMPED
+    BAD_TIME = PidStatus.BAD_TIME
+    NO_ERROR = PidStatus.NO_ERROR
+    LOW_SPEED = 4
+    STANDING = 5
+    REVERSING = 6
 
 
 class ThesisSettings(NamedTuple):
-    """What the controller is set to; :func:`thesis_settings` checks it.
+    """Settings; :func:`thesis_settings` checks them.
 
     Parameters
     ----------
@@ -135,7 +147,7 @@ def thesis_settings(
 
 
 def new_state(wheels: int = 3) -> Array:
-    """Return the state (3, wheels) of a controller that has seen nothing."""
+    """Return the state (3, wheels) before the first step."""
     return np.array([np.zeros(wheels), np.full(wheels, np.nan), np.zeros(wheels)])
 
 
@@ -158,7 +170,7 @@ def conditioned_slip(wheel_speed_mps: float, speed_mps: float, low_speed_mps: fl
 @njit(_F8(types.int64, _F8, _ROW), cache=True)
 def desired_slip(drive_state: int, direction: float, target_ratio: Array) -> float:
     """Return (8.7)-(8.9): the target of the state (traction, braking, steady) times the direction, or NaN."""
-    return math.nan if drive_state == UNKNOWN else direction * target_ratio[drive_state]
+    return math.nan if drive_state == DriveState.UNKNOWN.value else direction * target_ratio[drive_state]
 
 
 @njit(
@@ -178,12 +190,12 @@ def thesis_step(
     target_ratio: Array,
     dt_s: float,
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """Return what is added to the wheels' commands, and why; compiled, callable from compiled code.
+    """Return the correction of the wheels' commands, and why; compiled, callable from compiled code.
 
     Parameters
     ----------
     settings, state : of :func:`thesis_settings`; of :func:`new_state` or the step before (left as it is)
-    command_radps, wheel_radps : (wheels,) wanted by the kinematics, and measured
+    command_radps, wheel_radps : (wheels,) commanded by the kinematics, and measured
     speed_mps, accel_mps2 : (wheels,) of the wheel's centre over ground, along the wheel
     chassis_speed_mps : magnitude of the robot's velocity
     target_ratio : (3,) slip in traction, braking, steady motion, as ``slip_table`` signs it
@@ -193,9 +205,8 @@ def thesis_step(
     -------
     correction_radps : (wheels,) to add to the commands; 0 by every status but ok, clamped and low speed
     desired_ratio : (wheels,) signed along the wheel; NaN where the drive state or the target is unknown
-    drive_state : (wheels,) of :mod:`terrain.control.power_state`
-    status : (wheels,) of :mod:`terrain.control.pid`, or :data:`LOW_SPEED`, :data:`STANDING`,
-        :data:`REVERSING`
+    drive_state : (wheels,) numbers of :class:`terrain.control.power_state.DriveState`
+    status : (wheels,) numbers of :class:`ThesisStatus`
     state : next
 
     Examples
@@ -231,13 +242,13 @@ def thesis_step(
         )
         error = desired[i] - slip
         if not 0.0 < dt_s <= LONGEST_STEP_S:
-            status[i] = BAD_TIME
+            status[i] = ThesisStatus.BAD_TIME.value
         elif not math.isfinite(error) or math.isnan(chassis_speed_mps):
-            status[i] = NO_ERROR
+            status[i] = ThesisStatus.NO_ERROR.value
         elif chassis_speed_mps <= settings.chassis_speed_mps:
-            status[i] = STANDING
+            status[i] = ThesisStatus.STANDING.value
         elif normalised and abs(speed) >= low and speed * direction[i] <= 0.0:
-            status[i] = REVERSING
+            status[i] = ThesisStatus.REVERSING.value
         else:
             slow = abs(speed) < low
             if slow:
@@ -248,5 +259,5 @@ def thesis_step(
             correction[i], after, status[i] = pid_step(settings.gains, before, error, dt_s)
             integral[i], memory[i] = after.integral, after.error
             if slow:
-                status[i] = LOW_SPEED
+                status[i] = ThesisStatus.LOW_SPEED.value
     return correction, desired, drive_state, status, later

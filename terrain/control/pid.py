@@ -1,14 +1,14 @@
-"""PID controller as one pure step: gains, state and error in, output, next state and a status out.
+"""PID controller as one pure step: from gains, state and error to output, next state and a status.
 
 (8.2) of Danzi, AgriMaRo thesis, in steps of dt::
 
     I' = I + K_I e dt                         d = (x' - x) / dt,  x' = x + (1 - exp(-dt / tau)) (e - x)
     u = clip(K_P e + I' + K_D d, -limit, limit)
 
-The thesis prints neither anti-windup nor a clamp nor a filter on the derivative.  Here the integral is
-conditional: it stands while the sum is beyond the limit and the error would drive it further.  The derivative
-is that of the error behind a low-pass of time constant tau; there is none at the first error, nor at the
-first after a gap.
+The thesis specifies neither anti-windup nor a clamp nor a filter on the derivative.  Here integration is
+conditional: the integral is kept while the sum is beyond the limit and the error would drive it further.  The
+derivative is that of the low-pass filtered error (time constant tau); it is zero at the first error and at
+the first after a gap.
 """
 
 from __future__ import annotations
@@ -18,27 +18,31 @@ from typing import NamedTuple
 
 from numba import njit, types
 
+from terrain.control.status import StatusCode
 from terrain.errors import ConfigError
 
 LONGEST_STEP_S = 0.5
-"""After a longer silence the last error tells nothing of this one."""
+"""After a longer step the previous error carries no information on the present one."""
 
-OK, CLAMPED, BAD_TIME, NO_ERROR = range(4)
-"""What a step did: went, went against the limit, or had no time step or no error to go by."""
 
-STATUSES = ("ok", "clamped", "bad time", "no error")
-"""Names of the statuses by their code."""
+class PidStatus(StatusCode):
+    """Result of a step: computed, computed and clamped to the limit, or no valid time step or error."""
+
+    OK = 0
+    CLAMPED = 1
+    BAD_TIME = 2
+    NO_ERROR = 3
 
 
 class Gains(NamedTuple):
-    """What a controller is set to; output and limits have one unit.
+    """Gains and limits of a controller; output and limits have the same unit.
 
     Parameters
     ----------
-    kp, ki, kd : output by error, by error and second, by error a second
-    limit : largest output either way
-    integral_limit : largest integral either way; infinite where the limit does
-    derivative_time_constant_s : of the low-pass on the error whose derivative counts; 0 for none
+    kp, ki, kd : output per error, per error and second, per rate of error
+    limit : largest magnitude of the output
+    integral_limit : largest magnitude of the integral; infinite where ``limit`` is sufficient
+    derivative_time_constant_s : of the low-pass on the error before it is differentiated; 0 for none
     """
 
     kp: float
@@ -50,7 +54,7 @@ class Gains(NamedTuple):
 
 
 class PidState(NamedTuple):
-    """What a controller remembers: its integral, in units of the output, and the smoothed error or NaN."""
+    """State of a controller: its integral, in units of the output, and the filtered error or NaN."""
 
     integral: float = 0.0
     error: float = math.nan
@@ -58,7 +62,7 @@ class PidState(NamedTuple):
 
 GAINS = types.NamedUniTuple(types.float64, len(Gains._fields), Gains)
 PID_STATE = types.NamedUniTuple(types.float64, len(PidState._fields), PidState)
-"""The two as compiled signatures name them; their numbers have to be floats."""
+"""Numba types of the two for compiled signatures; their numbers have to be floats."""
 
 
 def check_gains(gains: Gains) -> Gains:
@@ -109,7 +113,7 @@ def pid_step(gains: Gains, state: PidState, error: float, dt_s: float) -> tuple[
     output : within the limit; 0 where there is no error (NaN or infinite) or the time step is not above 0 and
         up to :data:`LONGEST_STEP_S`
     state : then with its integral as it was, and without a memory of the error
-    status : :data:`OK`, :data:`CLAMPED`, :data:`BAD_TIME` or :data:`NO_ERROR`
+    status : number of a :class:`PidStatus`
 
     Examples
     --------
@@ -122,9 +126,9 @@ def pid_step(gains: Gains, state: PidState, error: float, dt_s: float) -> tuple[
     (0.0, PidState(integral=0.2, error=nan), 3)
     """
     if not 0.0 < dt_s <= LONGEST_STEP_S:
-        return 0.0, PidState(state.integral, math.nan), BAD_TIME
+        return 0.0, PidState(state.integral, math.nan), PidStatus.BAD_TIME.value
     if not math.isfinite(error):
-        return 0.0, PidState(state.integral, math.nan), NO_ERROR
+        return 0.0, PidState(state.integral, math.nan), PidStatus.NO_ERROR.value
     smooth, rate = error, 0.0
     if not math.isnan(state.error):
         tau_s = gains.derivative_time_constant_s
@@ -137,4 +141,5 @@ def pid_step(gains: Gains, state: PidState, error: float, dt_s: float) -> tuple[
         integral = state.integral
     desired = without + integral
     output = min(max(desired, -gains.limit), gains.limit)
-    return output, PidState(integral, smooth), OK if output == desired else CLAMPED
+    status = PidStatus.OK.value if output == desired else PidStatus.CLAMPED.value
+    return output, PidState(integral, smooth), status

@@ -1,8 +1,8 @@
-"""Whether a wheel is in traction, braking or rolling steadily, by the power that moves its share of the body.
+"""Drive state of a wheel (traction, braking or steady) from the power per mass that accelerates the body.
 
-(8.6) of Danzi, AgriMaRo thesis: ``Power_state = a v`` with acceleration and speed along the wheel, which is
-W for each kg and has no need of a sign of its own: with and against the motion are positive and negative
-whichever way the wheel rolls.
+(8.6) of Danzi, AgriMaRo thesis: ``Power_state = a v`` with acceleration a and speed v along the wheel, in
+W/kg.  The product is positive while the wheel speeds up and negative while it slows down, in either direction
+of rolling.
 """
 
 from __future__ import annotations
@@ -11,21 +11,30 @@ import math
 
 from numba import njit, types
 
-TRACTION, BRAKING, STEADY = range(3)
-"""Places of the states in ``slip_table.DRIVE_STATES``."""
+from terrain.control.status import StatusCode
 
-UNKNOWN = -1
-"""State of a wheel whose speed or acceleration is not known."""
+
+class DriveState(StatusCode):
+    """Drive state of a wheel or of the robot; from 0 on, its place in ``slip_table.DRIVE_STATES``.
+
+    ``UNKNOWN`` is that of a wheel whose speed or acceleration is not known.
+    """
+
+    UNKNOWN = -1
+    TRACTION = 0
+    BRAKING = 1
+    STEADY = 2
+
 
 POWER_THRESHOLD_WPKG = 0.1
-"""Assumed, the thesis prints none: 0.1 m/s^2 at 1 m/s, which is what counts as a steady speed elsewhere
-(``terrain.estimation.slip_figures.STEADY_CHANGE_MPS``), and over five times what an accelerometer's bias
-makes of it."""
+"""Assumed, as the thesis specifies none: 0.1 m/s^2 at 1 m/s, the threshold of a steady speed elsewhere
+(``terrain.estimation.slip_figures.STEADY_CHANGE_MPS``), and more than five times the effect of an
+accelerometer's bias."""
 
 
 @njit(types.int64(types.float64, types.float64, types.float64), cache=True)
 def power_state(accel_mps2: float, speed_mps: float, threshold_wpkg: float) -> int:
-    """Return :data:`TRACTION`, :data:`BRAKING`, :data:`STEADY` (at the threshold too), or :data:`UNKNOWN`.
+    """Return the number of the :class:`DriveState` of a wheel; at the threshold it is steady.
 
     Examples
     --------
@@ -34,7 +43,7 @@ def power_state(accel_mps2: float, speed_mps: float, threshold_wpkg: float) -> i
     """
     power_wpkg = accel_mps2 * speed_mps
     if math.isnan(power_wpkg):
-        return UNKNOWN
+        return DriveState.UNKNOWN.value
     if power_wpkg > threshold_wpkg:
-        return TRACTION
-    return BRAKING if power_wpkg < -threshold_wpkg else STEADY
+        return DriveState.TRACTION.value
+    return DriveState.BRAKING.value if power_wpkg < -threshold_wpkg else DriveState.STEADY.value

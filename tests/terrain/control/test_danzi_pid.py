@@ -6,15 +6,13 @@ import pytest
 from terrain.constants import GRAVITY_MPS2
 from terrain.control.danzi_pid import (
     FORMS,
-    LOW_SPEED,
-    REVERSING,
-    STANDING,
+    ThesisStatus,
     new_state,
     thesis_settings,
     thesis_step,
 )
-from terrain.control.pid import BAD_TIME, CLAMPED, NO_ERROR, OK, Gains, PidState, pid_step
-from terrain.control.power_state import BRAKING, STEADY, TRACTION, UNKNOWN, power_state
+from terrain.control.pid import Gains, PidState, pid_step
+from terrain.control.power_state import DriveState, power_state
 from terrain.control.slip_table import DRIVE_STATES
 from terrain.errors import ConfigError
 from terrain.robots import load_robot
@@ -70,7 +68,7 @@ def test_the_printed_form_gives_table_8_1(case, speed, rate, slip, desired, erro
         sent,
     ]
     assert DRIVE_STATES[drive_state] == ("traction" if case[1] in "AB" else "braking")
-    assert status == OK
+    assert status == ThesisStatus.OK
 
 
 def iterated(form, gain, case, speed, rate, steps):
@@ -103,7 +101,7 @@ def test_iterated_the_printed_form_oscillates_in_braking_and_the_normalised_one_
 
 @pytest.mark.parametrize("radius_m", [0.1, 0.4])
 @pytest.mark.parametrize("speed", [0.1, 1.0, -2.0])
-def test_the_normalised_form_takes_the_same_share_of_an_error_at_any_speed_and_radius(speed, radius_m):
+def test_the_normalised_form_removes_the_same_fraction_of_an_error_at_any_speed_and_radius(speed, radius_m):
     settings = thesis_settings(radius_m, PROPORTIONAL._replace(kp=0.5, limit=1e3))
     rate = 0.8 * speed / radius_m  # braking: a slip of 0.2, 0.05 too much
     added, *_ = step(settings, new_state(), rate, speed, -3 * speed / speed**2)
@@ -111,50 +109,54 @@ def test_the_normalised_form_takes_the_same_share_of_an_error_at_any_speed_and_r
 
 
 def plain(settings, state, command, wheel, speed, accel, chassis, targets, dt_s):
-    """The step for one wheel in plain words; ``state`` is (PidState, direction)."""
-    pid, way = state
+    """The step for one wheel without compiled code; ``state`` is (PidState, direction)."""
+    pid, direction = state
     r, low = settings.wheel_radius_m, settings.low_speed_mps
     normalised = FORMS[settings.form] == "normalised"
-    told = 0 if abs(command * r) <= low or math.isnan(command) else math.copysign(1, command)
-    if told and told != way:
-        way, pid = told, PidState(0.0 if normalised else pid.integral, pid.error)
+    commanded = 0 if abs(command * r) <= low or math.isnan(command) else math.copysign(1, command)
+    if commanded and commanded != direction:
+        direction, pid = commanded, PidState(0.0 if normalised else pid.integral, pid.error)
     fastest = NAN if math.isnan(wheel + speed) else max(abs(wheel * r), abs(speed))
     slip = 0.0 if fastest < low else (wheel * r - speed) / fastest if fastest else NAN
     power = accel * speed
     limit = settings.power_threshold_wpkg
-    kind = UNKNOWN if math.isnan(power) else TRACTION if power > limit else BRAKING if power < -limit else 2
-    sign = way if normalised else np.sign(speed)
-    desired = NAN if kind == UNKNOWN else sign * targets[kind]
+    kind = DriveState.STEADY
+    if math.isnan(power):
+        kind = DriveState.UNKNOWN
+    elif abs(power) > limit:
+        kind = DriveState.TRACTION if power > 0 else DriveState.BRAKING
+    sign = direction if normalised else np.sign(speed)
+    desired = NAN if kind == DriveState.UNKNOWN else sign * targets[kind]
     error = desired - slip
-    untouched = PidState(pid.integral, NAN), way
+    untouched = PidState(pid.integral, NAN), direction
     if not 0 < dt_s <= 0.5:
-        return 0.0, desired, kind, BAD_TIME, untouched
+        return 0.0, desired, kind, ThesisStatus.BAD_TIME, untouched
     if math.isnan(error + chassis):
-        return 0.0, desired, kind, NO_ERROR, untouched
+        return 0.0, desired, kind, ThesisStatus.NO_ERROR, untouched
     if chassis <= settings.chassis_speed_mps:
-        return 0.0, desired, kind, STANDING, untouched
-    if normalised and abs(speed) >= low and np.sign(speed) != way:
-        return 0.0, desired, kind, REVERSING, untouched
+        return 0.0, desired, kind, ThesisStatus.STANDING, untouched
+    if normalised and abs(speed) >= low and np.sign(speed) != direction:
+        return 0.0, desired, kind, ThesisStatus.REVERSING, untouched
     if abs(speed) < low:
         added, pid, _ = pid_step(settings.gains, pid, 0.0, dt_s)
-        return added, desired, kind, LOW_SPEED, (pid, way)
+        return added, desired, kind, ThesisStatus.LOW_SPEED, (pid, direction)
     added, pid, status = pid_step(settings.gains, pid, error * (fastest / r if normalised else 1), dt_s)
-    return added, desired, kind, status, (pid, way)
+    return added, desired, kind, status, (pid, direction)
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_any_drive_with_faults_is_that_of_the_plain_form_and_of_its_mirror(form):
+def test_any_drive_with_faults_equals_the_reference_and_its_mirror_image(form):
     rng = np.random.default_rng(1)
     settings = thesis_settings(0.2, Gains(0.6, 2.0, 0.01, 1.5, 1.2, 0.05), form)
     state, mirrored = new_state(), new_state()
     oracle = [(PidState(), 0.0)] * 3
     seen = set()
     for k in range(3000):
-        way = math.sin(k / 60)
-        speed = way + 0.05 * rng.standard_normal(3)
-        wheels = np.array([way / 0.2 + 0.3 * rng.standard_normal(3) for _ in range(2)])
+        direction = math.sin(k / 60)
+        speed = direction + 0.05 * rng.standard_normal(3)
+        wheels = np.array([direction / 0.2 + 0.3 * rng.standard_normal(3) for _ in range(2)])
         accel = rng.standard_normal(3)
-        chassis, dt_s, targets = abs(way), DT_S, TARGETS.copy()
+        chassis, dt_s, targets = abs(direction), DT_S, TARGETS.copy()
         if k % 7 == 0:
             speed[rng.integers(3)] = rng.choice([NAN, 0.0])
             wheels[rng.integers(2), rng.integers(3)] = rng.choice([NAN, 0.0])
@@ -177,24 +179,32 @@ def test_any_drive_with_faults_is_that_of_the_plain_form_and_of_its_mirror(form)
         assert all(np.array_equal(*pair) for pair in zip(found[2:], other[2:], strict=True))
         state = after
         seen |= {int(code) for code in found[3]}
-    reached = {OK, CLAMPED, BAD_TIME, NO_ERROR, LOW_SPEED, STANDING, REVERSING}
-    assert seen == reached - ({REVERSING} if form == "printed" else set())
+    reached = {
+        ThesisStatus.OK,
+        ThesisStatus.CLAMPED,
+        ThesisStatus.BAD_TIME,
+        ThesisStatus.NO_ERROR,
+        ThesisStatus.LOW_SPEED,
+        ThesisStatus.STANDING,
+        ThesisStatus.REVERSING,
+    }
+    assert seen == reached - ({ThesisStatus.REVERSING} if form == "printed" else set())
 
 
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize(
     ("changes", "expected"),
     [
-        ({"rate": NAN}, NO_ERROR),
-        ({"speed": NAN, "chassis": 1.0}, NO_ERROR),
-        ({"accel": NAN}, NO_ERROR),
-        ({"chassis": NAN}, NO_ERROR),
-        ({"targets": np.full(3, NAN)}, NO_ERROR),
-        ({"dt_s": 0.51}, BAD_TIME),
-        ({"chassis": 0.05}, STANDING),
+        ({"rate": NAN}, ThesisStatus.NO_ERROR),
+        ({"speed": NAN, "chassis": 1.0}, ThesisStatus.NO_ERROR),
+        ({"accel": NAN}, ThesisStatus.NO_ERROR),
+        ({"chassis": NAN}, ThesisStatus.NO_ERROR),
+        ({"targets": np.full(3, NAN)}, ThesisStatus.NO_ERROR),
+        ({"dt_s": 0.51}, ThesisStatus.BAD_TIME),
+        ({"chassis": 0.05}, ThesisStatus.STANDING),
     ],
 )
-def test_without_what_it_needs_it_adds_nothing_and_its_integral_stands(form, changes, expected):
+def test_without_valid_inputs_nothing_is_added_and_the_integral_is_kept(form, changes, expected):
     settings = thesis_settings(0.2, Gains(0.5, 5.0, 0.1, 5.0), form)
     drive = {"rate": 5.0, "speed": 0.7, "accel": 0.0, "command": 5.0}
     *_, state = step(settings, new_state(), **drive)
@@ -204,7 +214,7 @@ def test_without_what_it_needs_it_adds_nothing_and_its_integral_stands(form, cha
     assert np.array_equal(after[[0, 2]], state[[0, 2]])
 
 
-def test_at_rest_noise_turns_the_desired_slip_of_the_printed_form_only():
+def test_at_rest_noise_changes_the_sign_of_the_desired_slip_of_the_printed_form_only():
     rng = np.random.default_rng(2)
     turned = {}
     for form in FORMS:
@@ -214,30 +224,38 @@ def test_at_rest_noise_turns_the_desired_slip_of_the_printed_form_only():
         for _ in range(200):
             speed, command = 0.003 * rng.standard_normal(2)
             added, desired, _, status, state = step(settings, state, 0.0, speed, 0.0, command=command)
-            assert (added, status) == (0.0, STANDING)
+            assert (added, status) == (0.0, ThesisStatus.STANDING)
             signals.append(desired)
         turned[form] = int((np.diff(signals) != 0).sum())
     assert turned["printed"] > 50
     assert turned["normalised"] == 0
 
 
-def test_a_wheel_that_still_rolls_against_its_command_is_left_alone_and_starts_anew():
+def test_a_wheel_that_rolls_against_its_command_is_not_corrected_and_its_integral_is_reset():
     settings = thesis_settings(0.2, Gains(0.5, 5.0, 0.0, 5.0))
     state = new_state()
     for _ in range(20):
         *_, state = step(settings, state, 5.0, 0.7, 0.0)
     assert state[0, 0] < 0
     added, _, _, status, state = step(settings, state, 2.0, 0.5, -1.0, command=-5.0)
-    assert (added, status, state[0, 0], state[2, 0]) == (0.0, REVERSING, 0.0, -1.0)
+    assert (added, status, state[0, 0], state[2, 0]) == (0.0, ThesisStatus.REVERSING, 0.0, -1.0)
     added, desired, _, status, state = step(settings, state, -5.0, -0.7, 0.0, command=-5.0)
-    assert (desired, status) == (-0.05, OK)
+    assert (desired, status) == (-0.05, ThesisStatus.OK)
     assert added > 0  # turns back more slowly
 
 
 def test_power_at_the_threshold_is_steady():
     states = [power_state(accel, 0.5, 0.1) for accel in (0.2, 0.2000001, -0.2, -0.2000001, NAN)]
-    assert states == [STEADY, TRACTION, STEADY, BRAKING, UNKNOWN]
-    assert [DRIVE_STATES[state] for state in (TRACTION, BRAKING, STEADY)] == list(DRIVE_STATES)
+    assert states == [
+        DriveState.STEADY,
+        DriveState.TRACTION,
+        DriveState.STEADY,
+        DriveState.BRAKING,
+        DriveState.UNKNOWN,
+    ]
+    assert [
+        DRIVE_STATES[state] for state in (DriveState.TRACTION, DriveState.BRAKING, DriveState.STEADY)
+    ] == list(DRIVE_STATES)
 
 
 @pytest.mark.parametrize(
@@ -251,7 +269,7 @@ def test_power_at_the_threshold_is_steady():
         ({"gains": Gains(1.0, 0.0, 0.0, 0.0)}, "gain limit is 0.0"),
     ],
 )
-def test_settings_that_cannot_be_are_refused_in_one_sentence(arguments, words):
+def test_invalid_settings_are_refused_in_one_sentence(arguments, words):
     with pytest.raises(ConfigError) as refused:
         thesis_settings(**{"wheel_radius_m": 0.2, "gains": PROPORTIONAL} | arguments)
     assert str(refused.value).startswith(words)
@@ -294,14 +312,14 @@ def driven(settings, target, duration_s=60.0, wheel_speed_mps=1.0, delay_rows=50
     return speed
 
 
-def test_on_grass_a_target_under_the_balance_slip_stops_the_robot_and_one_over_it_runs_away():
+def test_on_grass_a_target_below_the_balance_slip_stops_the_robot_and_one_above_it_runs_away():
     body = ROBOT.body
     load_n = ROBOT.mass_kg / 3 * GRAVITY_MPS2
     geometry = ROBOT.wheel_radius_m, body.tyre_width_m, body.contact_length_m
     balance = equilibrium_slip(load_soil("grass"), load_n, 0.0, *geometry)
     assert balance == pytest.approx(0.126, abs=0.001)
     free_mps = 1.0 - balance
-    clamp_radps = 5.0  # a whole 1 m/s of wheel speed either way
+    clamp_radps = 5.0  # a whole 1 m/s of wheel speed in either direction
     for form, gains in {
         "normalised": Gains(0.5, 0.5, 0.0, clamp_radps),
         "printed": Gains(1.0, 1.0, 0.0, clamp_radps),

@@ -7,14 +7,10 @@ from hypothesis import strategies as st
 from scipy.signal import lfilter
 
 from terrain.control.pid import (
-    BAD_TIME,
-    CLAMPED,
     LONGEST_STEP_S,
-    NO_ERROR,
-    OK,
-    STATUSES,
     Gains,
     PidState,
+    PidStatus,
     check_gains,
     pid_step,
 )
@@ -61,10 +57,10 @@ def test_output_and_integral_keep_their_limits_and_do_not_wind_up(errors, number
     integral = 0.0
     for error, (output, state, status) in zip(errors, outputs(gains, errors), strict=True):
         assert abs(output) <= gains.limit
-        assert status in (OK, CLAMPED)
-        assert status == OK or abs(output) == gains.limit
+        assert status in (PidStatus.OK, PidStatus.CLAMPED)
+        assert status == PidStatus.OK or abs(output) == gains.limit
         assert abs(state.integral) <= gains.integral_limit
-        if status == CLAMPED and output * error > 0:
+        if status == PidStatus.CLAMPED and output * error > 0:
             assert abs(state.integral) <= abs(integral)
         integral = state.integral
 
@@ -72,28 +68,28 @@ def test_output_and_integral_keep_their_limits_and_do_not_wind_up(errors, number
 def test_after_a_long_stop_against_the_limit_it_comes_back_at_once():
     gains = check_gains(Gains(1.0, 2.0, 0.0, 1.0))
     found = outputs(gains, [5.0] * 1000 + [-0.1])
-    assert [status for *_, status in found[-2:]] == [CLAMPED, OK]
+    assert [status for *_, status in found[-2:]] == [PidStatus.CLAMPED, PidStatus.OK]
     assert found[-1][0] < 0.0  # an integral that had gone on would hold it at 1 for a minute and a half
 
 
 def test_an_integral_beyond_a_limit_that_was_lowered_comes_down():
     gains = check_gains(Gains(1.0, 2.0, 0.0, 1.0))
     output, state, status = pid_step(gains, PidState(5.0), -0.1, DT_S)
-    assert (output, status) == (1.0, CLAMPED)
+    assert (output, status) == (1.0, PidStatus.CLAMPED)
     assert state.integral == pytest.approx(5.0 - 2.0 * 0.1 * DT_S)
 
 
 @pytest.mark.parametrize(
     ("error", "dt_s", "status"),
     [
-        (NAN, DT_S, NO_ERROR),
-        (math.inf, DT_S, NO_ERROR),
-        (-math.inf, DT_S, NO_ERROR),
-        (1.0, 0.0, BAD_TIME),
-        (1.0, -0.02, BAD_TIME),
-        (1.0, NAN, BAD_TIME),
-        (1.0, np.nextafter(LONGEST_STEP_S, 1.0), BAD_TIME),
-        (NAN, NAN, BAD_TIME),
+        (NAN, DT_S, PidStatus.NO_ERROR),
+        (math.inf, DT_S, PidStatus.NO_ERROR),
+        (-math.inf, DT_S, PidStatus.NO_ERROR),
+        (1.0, 0.0, PidStatus.BAD_TIME),
+        (1.0, -0.02, PidStatus.BAD_TIME),
+        (1.0, NAN, PidStatus.BAD_TIME),
+        (1.0, np.nextafter(LONGEST_STEP_S, 1.0), PidStatus.BAD_TIME),
+        (NAN, NAN, PidStatus.BAD_TIME),
     ],
 )
 def test_a_fault_gives_nothing_freezes_the_integral_and_leaves_no_kick(error, dt_s, status):
@@ -101,7 +97,7 @@ def test_a_fault_gives_nothing_freezes_the_integral_and_leaves_no_kick(error, dt
     _, before, _ = outputs(gains, [0.3, 0.4, 0.5])[-1]
     output, after, found = pid_step(gains, before, error, dt_s)
     assert (output, after.integral, found) == (0.0, before.integral, status)
-    assert STATUSES[found] in ("bad time", "no error")
+    assert PidStatus(found).label in ("bad time", "no error")
     resumed, _, _ = pid_step(gains, after, 50.0, DT_S)
     assert resumed == pytest.approx(50.0 + before.integral + 50.0 * DT_S)  # no derivative over the gap
 

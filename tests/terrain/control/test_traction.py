@@ -6,25 +6,21 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from terrain.control import traction
+from terrain.control.power_state import DriveState
 from terrain.control.slip_table import DRIVE_STATES
 from terrain.control.traction import (
-    BAD_TIME,
-    BRAKING,
-    NO_SLIP,
-    OK,
-    SETTINGS,
-    STALE,
     STATE_SIZE,
-    STATUS_NAMES,
-    STEADY,
-    TRACTION,
-    UNCERTAIN,
-    Ground,
-    check_settings,
-    forget_ground,
+    TractionStatus,
+    forget_terrain,
     initial_state,
     traction_step,
-    with_driver,
+)
+from terrain.control.traction_settings import (
+    SETTINGS,
+    TractionTarget,
+    WheelMeasurements,
+    check_settings,
+    with_motor_driver,
 )
 from terrain.errors import ConfigError
 from terrain.kinematics.swerve import forward, inverse
@@ -36,9 +32,9 @@ DT_S = 0.02
 NAN, INF = math.nan, math.inf
 BAD_TIMES = (NAN, 0.0, -0.02, 0.6, INF, -INF)
 DRIVEN, WANTED, BALANCE, FLOOR = 0, 1, 5, 6
-GROUND = Ground(0.1)
-SLICK = Ground(0.1, 0.15, 3.0)
-"""Ground on which braking is controlled."""
+TARGET = TractionTarget(0.1)
+SLICK = TractionTarget(0.1, 0.15, 3.0)
+"""Terrain on which braking is controlled."""
 
 
 def steps(
@@ -52,20 +48,20 @@ def steps(
     stale_s=0.0,
     torque=0.0,
     dt_s=DT_S,
-    aim=GROUND,
+    aim=TARGET,
     using=SETTINGS,
 ):
-    """One step, each row given whole or as one number for all wheels; (told, next state, said)."""
+    """One step, each row given whole or as one number for all wheels; (command, next state, report)."""
     rows = [np.array(np.broadcast_to(row, 3), float) for row in (wheel, ground_mps, accel, slip, std, torque)]
-    given = [*rows[:5], stale_s, rows[5]]
     before = state.copy()
-    told, after, said = traction_step(using, state, Ground(*map(float, aim)), RADIUS_M, *given, dt_s)
+    target, wheels = TractionTarget(*map(float, aim)), WheelMeasurements(*rows[1:])
+    command, after, report = traction_step(using, state, target, RADIUS_M, rows[0], wheels, stale_s, dt_s)
     assert np.array_equal(state, before, equal_nan=True)
-    return told, after, said
+    return command, after, report
 
 
 def plain(using, m, aim, radius, wheel, ground, accel, slips, stds, stale, torque, dt):
-    """The step of the module's docstring, wheel by wheel, on a dict; (told, driven, target, status)."""
+    """The step of the module's docstring, wheel by wheel, on a dict; (command, driven, target, status)."""
     u = [w * radius for w in wheel]
     w = max(abs(x) for x in u)
     if sum(x * s for x, s in zip(u, m["share"], strict=True)) < 0:
@@ -87,9 +83,11 @@ def plain(using, m, aim, radius, wheel, ground, accel, slips, stds, stale, torqu
             largest = max(
                 largest, stds[i] * wheel_speed / max(wheel_speed, 1.5 * using.launch_mps, m["from"])
             )
-    sure = not largest > using.std_max_ratio
+    certain = not largest > using.std_max_ratio
     fresh = stale <= using.stale_max_s
-    status = NO_SLIP if not all(known) else STALE if not fresh else UNCERTAIN if not sure else OK
+    checks = {TractionStatus.NO_SLIP: all(known), TractionStatus.STALE: fresh}
+    checks |= {TractionStatus.UNCERTAIN: certain}
+    status = next((status for status, passed in checks.items() if not passed), TractionStatus.OK)
     target = aim.traction_ratio
     if not math.isnan(m["balance"]):
         over = max(using.balance_margin_ratio, aim.margin_ratio)
@@ -98,11 +96,11 @@ def plain(using, m, aim, radius, wheel, ground, accel, slips, stds, stale, torqu
     d = m["d"]
     if not 0 < dt <= 0.5:
         m["d"] = min(w, d + using.fade_mps2 * 0.02)
-        return [m["d"] * s / radius for s in m["share"]], m["d"], aim.traction_ratio, BAD_TIME
+        return [m["d"] * s / radius for s in m["share"]], m["d"], aim.traction_ratio, TractionStatus.BAD_TIME
     rising, sharply = w > d + 1e-9, m["w"] - w > 0.5 * dt
     braking = not rising and (sharply or (m["braking_s"] > 0 and d > w))
     m["w"], braking_s = w, 0.0
-    if status != OK:
+    if status != TractionStatus.OK:
         new, m["held_s"] = min(w, d + using.fade_mps2 * dt), 0.0
     elif rising:
         led = q + using.lead_s * min(max(a, 0.0), using.lead_max_mps2)
@@ -118,21 +116,22 @@ def plain(using, m, aim, radius, wheel, ground, accel, slips, stds, stale, torqu
                 new, braking_s = max(w, min(d, least - spent)), t
     m["from"] = max(m["from"], d) if braking_s > 0 else 0.0
     m["d"], m["braking_s"] = new, braking_s
-    if status == OK:
+    if status == TractionStatus.OK:
         learn(using, m, q, way, slips, w, target, dt, aim.margin_ratio)
     seen = [way[i] * torque[i] for i in range(3)]
     if new <= 0.1 or not all(map(math.isfinite, seen)):
         seen = [0.0] * 3
     keep = math.exp(-dt / using.droop_time_s)
     m["torque"] = [keep * t + (1 - keep) * s for t, s in zip(m["torque"], seen, strict=True)]
-    told = []
+    command = []
     mean_slip = sum(way[i] * slips[i] for i in range(3) if known[i]) / 3
     grip = min(max(2 - abs(mean_slip) / traction._GRIP, 0), 1)
     for i in range(3):
         give = using.droop_radps_per_nm * (m["torque"][i] - sum(m["torque"]) / 3)
         most = grip * using.droop_max_ratio * share[i] * new / radius
-        told.append(way[i] * (share[i] * new / radius - (min(max(give, -most), most) if status == OK else 0)))
-    return told, new, target, status
+        droop = min(max(give, -most), most) if status == TractionStatus.OK else 0
+        command.append(way[i] * (share[i] * new / radius - droop))
+    return command, new, target, status
 
 
 def learn(using, m, q, way, slips, w, target, dt, margin):
@@ -166,13 +165,13 @@ def in_order(m):
 
 @given(st.integers(0, 2**32 - 1))
 @settings(max_examples=40)
-def test_any_drive_with_faults_is_that_of_the_plain_form(seed):
+def test_any_drive_with_faults_equals_the_reference_implementation(seed):
     rng = np.random.default_rng(seed)
     changes = {"launch_mps": float(rng.choice([0.01, 0.22])), "droop_time_s": 0.2, "fade_mps2": 1.07}
-    using = with_driver(
+    using = with_motor_driver(
         SETTINGS._replace(**changes), ROBOT
     )  # no step of a fade is a threshold's, to the digit
-    aim = Ground(rng.uniform(0, 0.6), *(rng.choice([[0.0, 0.0, 0.0], [0.15, 3.0, 0.05]])))
+    aim = TractionTarget(rng.uniform(0, 0.6), *(rng.choice([[0.0, 0.0, 0.0], [0.15, 3.0, 0.05]])))
     memory, state = remembered(), initial_state()
     desired, v, bits = rng.choice([-1, 1], 3) * rng.uniform(0.2, 5, 3), 0.0, rng.uniform(0, 0.1)
     push = rng.uniform(0, 1)
@@ -191,13 +190,15 @@ def test_any_drive_with_faults_is_that_of_the_plain_form(seed):
             stale_s = rng.choice([NAN, INF, 3.01, 2.9])
         if rng.random() < 0.05:
             dt_s = rng.choice(BAD_TIMES)
+        wheels = WheelMeasurements(*rows)
+        command, state, report = traction_step(using, state, aim, RADIUS_M, wheel, wheels, stale_s, dt_s)
         given = (*rows[:4], stale_s, rows[4], dt_s)
-        told, state, said = traction_step(using, state, aim, RADIUS_M, wheel, *given)
         expected, driven, target, status = plain(using, memory, aim, RADIUS_M, wheel, *given)
-        assert told == pytest.approx(expected, abs=1e-12), k
-        assert [said[0], said[1], said[5]] == pytest.approx([driven, target, status], abs=1e-12), k
+        assert command == pytest.approx(expected, abs=1e-12), k
+        decided = [report.driven_mps, report.target_ratio, report.status]
+        assert decided == pytest.approx([driven, target, status], abs=1e-12), k
         assert state == pytest.approx(in_order(memory), nan_ok=True, abs=1e-12), k
-        assert np.isfinite(told).all()
+        assert np.isfinite(command).all()
 
 
 @given(
@@ -211,10 +212,11 @@ def test_the_cap_is_the_normalised_p_controller_of_slip_on_the_chassis(driven, s
     state[[DRIVEN, WANTED]] = driven
     using = SETTINGS._replace(launch_mps=1e-6)
     wheel = (driven + more) / RADIUS_M
-    told, _, said = steps(state, wheel, ground_mps=driven * (1 - slip), slip=slip, aim=(target,), using=using)
+    ground_mps = driven * (1 - slip)
+    command, _, report = steps(state, wheel, ground_mps=ground_mps, slip=slip, aim=(target,), using=using)
     corrected = driven + (target - slip) * driven / (1 - target)
-    assert said[0] == pytest.approx(min(driven + more, max(driven, corrected)), rel=1e-9)
-    assert told == pytest.approx(np.full(3, said[0] / RADIUS_M))
+    assert report.driven_mps == pytest.approx(min(driven + more, max(driven, corrected)), rel=1e-9)
+    assert command == pytest.approx(np.full(3, report.driven_mps / RADIUS_M))
 
 
 twists = st.tuples(*[st.floats(-1.0, 1.0)] * 3).filter(lambda twist: max(map(abs, twist)) > 0.05)
@@ -222,7 +224,7 @@ numbers = st.floats(-2.0, 2.0)
 
 
 @given(twist=twists, was=st.floats(0, 2), way=numbers, accel=numbers, slip=st.floats(-1, 1), torque=numbers)
-def test_speed_never_falls_while_more_is_wanted_and_the_turning_centre_stays(
+def test_speed_never_falls_while_more_is_desired_and_the_turning_centre_stays(
     twist, was, way, accel, slip, torque
 ):
     wheel, steer = inverse(POSITIONS_M, RADIUS_M, np.array(twist), np.zeros(3))
@@ -231,110 +233,115 @@ def test_speed_never_falls_while_more_is_wanted_and_the_turning_centre_stays(
     inputs = {"ground_mps": way * np.sign(wheel), "accel": accel, "slip": slip, "torque": torque * wheel}
     for std in (0.0, 1.0):
         even = SETTINGS._replace(droop_radps_per_nm=0.0)
-        told, after, said = steps(state, wheel, **inputs, std=std, using=even)
+        command, after, report = steps(state, wheel, **inputs, std=std, using=even)
         desired = float(np.abs(wheel).max()) * RADIUS_M
-        assert min(was, desired) <= said[0] <= desired
-        assert after[DRIVEN] == said[0]
-        share = said[0] / desired
-        assert told == pytest.approx(share * wheel, abs=1e-12)
-        got, residual = forward(POSITIONS_M, RADIUS_M, told, steer)
+        assert min(was, desired) <= report.driven_mps <= desired
+        assert after[DRIVEN] == report.driven_mps
+        share = report.driven_mps / desired
+        assert command == pytest.approx(share * wheel, abs=1e-12)
+        got, residual = forward(POSITIONS_M, RADIUS_M, command, steer)
         assert got == pytest.approx(share * np.array(twist), abs=1e-9)
         assert residual < 1e-9
         # backward is forward in a mirror
         turned = {name: -np.asarray(row) for name, row in inputs.items()}
-        back, after_back, said_back = steps(state, -wheel, **turned, std=std, using=even)
-        assert np.array_equal(back, -told)
-        assert np.array_equal(said_back, said, equal_nan=True)
+        back, after_back, report_back = steps(state, -wheel, **turned, std=std, using=even)
+        assert np.array_equal(back, -command)
+        assert np.array_equal(report_back, report, equal_nan=True)
         assert np.array_equal(after_back[:-3], after[:-3], equal_nan=True)
 
 
 def rolling(torque, n=2000, wheel=5.0, **changes):
-    """Steady at what is required, for long; (told, state)."""
+    """Steady at what is required, for long; (command, state)."""
     state = initial_state()
     for _ in range(n):
-        told, state, said = steps(state, wheel, ground_mps=0.99, slip=0.01, torque=torque, **changes)
-    assert said[0] == 1.0
-    return told, state
+        command, state, report = steps(state, wheel, ground_mps=0.99, slip=0.01, torque=torque, **changes)
+    assert report.driven_mps == 1.0
+    return command, state
 
 
-def test_wheels_give_way_to_torque_over_the_mean_and_to_nothing_else():
+def test_wheel_speed_droops_with_torque_above_the_mean_only():
     assert np.array_equal(rolling(7.0)[0], np.full(3, 5.0))
     torque = np.array([12.0, 3.0, -6.0])
-    told, _ = rolling(torque)
-    assert told - 5.0 == pytest.approx(SETTINGS.droop_radps_per_nm * (torque.mean() - torque), rel=1e-6)
-    assert told.sum() == pytest.approx(15.0)
-    told, _ = rolling(10 * torque)  # 10 % of its speed at most
-    assert told == pytest.approx([4.5, 5.0 + 0.0, 5.5])
-    told, _ = rolling(torque, wheel=5.0, std=1.0)
-    assert np.array_equal(told, np.full(3, 5.0))
+    command, _ = rolling(torque)
+    assert command - 5.0 == pytest.approx(SETTINGS.droop_radps_per_nm * (torque.mean() - torque), rel=1e-6)
+    assert command.sum() == pytest.approx(15.0)
+    command, _ = rolling(10 * torque)  # 10 % of its speed at most
+    assert command == pytest.approx([4.5, 5.0 + 0.0, 5.5])
+    command, _ = rolling(torque, wheel=5.0, std=1.0)
+    assert np.array_equal(command, np.full(3, 5.0))
 
 
-def test_a_torque_that_is_not_known_is_not_taken_for_none():
+def test_an_unknown_torque_does_not_count_as_zero():
     steady, state = rolling(np.array([10.0, 10.0, 10.0]))
     for _ in range(100):
-        told, state, _ = steps(state, 5.0, ground_mps=0.99, slip=0.01, torque=[NAN, 10.0, 10.0])
-    assert np.array_equal(told, steady)
+        command, state, _ = steps(state, 5.0, ground_mps=0.99, slip=0.01, torque=[NAN, 10.0, 10.0])
+    assert np.array_equal(command, steady)
 
 
 FAULTS = [
-    *[({name: value}, NO_SLIP) for name in ("ground_mps", "accel", "slip", "std") for value in (NAN, INF)],
-    ({"ground_mps": [0.9, NAN, 0.9]}, NO_SLIP),
-    ({"std": 0.03}, UNCERTAIN),
-    *[({"stale_s": value}, STALE) for value in (3.01, INF, NAN)],
-    *[({"dt_s": value}, BAD_TIME) for value in BAD_TIMES],
+    *[
+        ({name: value}, TractionStatus.NO_SLIP)
+        for name in ("ground_mps", "accel", "slip", "std")
+        for value in (NAN, INF)
+    ],
+    ({"ground_mps": [0.9, NAN, 0.9]}, TractionStatus.NO_SLIP),
+    ({"std": 0.03}, TractionStatus.UNCERTAIN),
+    *[({"stale_s": value}, TractionStatus.STALE) for value in (3.01, INF, NAN)],
+    *[({"dt_s": value}, TractionStatus.BAD_TIME) for value in BAD_TIMES],
 ]
 
 
 @pytest.mark.parametrize(("fault", "status"), FAULTS)
-def test_without_what_it_needs_it_fades_to_what_is_wanted_and_learns_nothing(fault, status):
+def test_without_valid_inputs_it_fades_to_the_desired_speed_and_learns_nothing(fault, status):
     _, state = rolling(torque=0.0)
     state[[DRIVEN, FLOOR, BALANCE]] = 0.3, 0.2, 0.1
     before = state.copy()
     sound = {"ground_mps": 0.25, "slip": 0.1, "torque": NAN}
-    _, _, said = steps(state, 5.0, **sound)
-    assert (said[0], said[5]) == (pytest.approx(0.25 / 0.8), OK)
+    _, _, report = steps(state, 5.0, **sound)
+    assert (report.driven_mps, report.status) == (pytest.approx(0.25 / 0.8), TractionStatus.OK)
     rise = SETTINGS.fade_mps2 * DT_S
     for k in range(100):
-        told, state, said = steps(state, 5.0, **sound | fault)
-        assert STATUS_NAMES[int(said[5])] == STATUS_NAMES[status]
-        assert said[0] == pytest.approx(min(1.0, 0.3 + (k + 1) * rise))
-        assert told == pytest.approx(np.full(3, said[0] / RADIUS_M))
+        command, state, report = steps(state, 5.0, **sound | fault)
+        assert TractionStatus(report.status) is status
+        assert report.driven_mps == pytest.approx(min(1.0, 0.3 + (k + 1) * rise))
+        assert command == pytest.approx(np.full(3, report.driven_mps / RADIUS_M))
         assert np.array_equal(state[[BALANCE, FLOOR]], before[[BALANCE, FLOOR]])
-    told, _, said = steps(state, 0.0, **sound | fault)  # and stops at once
-    assert not told.any()
-    assert said[0] == 0.0
+    command, _, report = steps(state, 0.0, **sound | fault)  # and stops at once
+    assert not command.any()
+    assert report.driven_mps == 0.0
 
 
-def test_balance_is_measured_where_motion_is_steady_and_gives_the_target_its_floor():
+def test_balance_is_measured_in_steady_motion_and_sets_the_floor_of_the_target():
     state = initial_state()
     speeds = np.concatenate([np.arange(0, 1, 0.02), np.full(150, 1.0)])
     seen = []
     for k, speed in enumerate(speeds):
         slip = 0.4 if speed < 1 else 0.15 + 0.05 * math.exp(-(k - 50) / 10)
         gone = speed * (1 - slip)
-        _, state, said = steps(state, speed / RADIUS_M, ground_mps=gone, slip=slip, aim=(0.9,))
-        seen.append(said[2])
+        _, state, report = steps(state, speed / RADIUS_M, ground_mps=gone, slip=slip, aim=(0.9,))
+        seen.append(report.balance_ratio)
     assert np.isnan(seen[:80]).all()
     assert seen[-1] == pytest.approx(0.15, abs=1e-3)
     assert state[FLOOR] == pytest.approx(0.15 + SETTINGS.balance_margin_ratio, abs=1e-3)
-    assert steps(state, 5.0, ground_mps=0.85, slip=0.15, aim=(0.05,))[2][1] == state[FLOOR]
-    working = steps(state, 5.0, ground_mps=0.85, slip=0.15, aim=Ground(0.9, margin_ratio=0.05))[2][1]
+    assert steps(state, 5.0, ground_mps=0.85, slip=0.15, aim=(0.05,))[2].target_ratio == state[FLOOR]
+    aim = TractionTarget(0.9, margin_ratio=0.05)
+    working = steps(state, 5.0, ground_mps=0.85, slip=0.15, aim=aim)[2].target_ratio
     assert working == pytest.approx(0.2, abs=1e-3)  # no more than the balance and what the work takes
-    forgotten = forget_ground(state)
+    forgotten = forget_terrain(state)
     assert (math.isnan(forgotten[BALANCE]), forgotten[FLOOR]) == (True, 0.0)
     rest = [i for i in range(STATE_SIZE) if i not in (BALANCE, FLOOR)]
     assert np.array_equal(forgotten[rest], state[rest])
 
 
-def test_the_floor_rises_where_a_robot_is_held_back_and_gains_no_speed_and_only_there():
+def test_the_floor_rises_only_where_a_limited_robot_gains_no_speed():
     floors = {}
     for name, gain_mps2 in {"stuck": 0.0, "gaining": 0.6}.items():
         state, v = initial_state(), 0.3
         for _ in range(100):
             v += gain_mps2 * DT_S
-            _, state, said = steps(state, 20.0, ground_mps=v, slip=0.1, aim=(0.1,))
+            _, state, report = steps(state, 20.0, ground_mps=v, slip=0.1, aim=(0.1,))
         floors[name] = state[FLOOR]
-        assert said[0] < 4.0
+        assert report.driven_mps < 4.0
     assert floors["gaining"] == 0.0
     assert floors["stuck"] == pytest.approx(0.1 + SETTINGS.floor_rate_ratio * 1.6, abs=0.02)
 
@@ -343,21 +350,21 @@ def driven_along(target, duration_s=30.0, desired_mps=1.0, shear=0.1, limit=0.4,
     """Speed over ground (n,) of a point on wheels: ``v' = g (limit (1 - exp(-s / shear)) - resistance)``."""
     state, v, speeds = initial_state(), 0.0, []
     for k in range(round(duration_s / DT_S)):
-        told = min(desired_mps, k * DT_S)
+        command = min(desired_mps, k * DT_S)
         d = state[DRIVEN]
         if target is not None:
             slip = (d - v) / max(d, v) if max(d, v) > 0.05 else 0.0
-            _, state, said = steps(state, told / RADIUS_M, ground_mps=v, slip=slip, aim=(target,))
-            told = said[0]
+            _, state, report = steps(state, command / RADIUS_M, ground_mps=v, slip=slip, aim=(target,))
+            command = report.driven_mps
         for _ in range(40):
-            slip = (told - v) / max(told, v) if max(told, v) > 1e-6 else 0.0
+            slip = (command - v) / max(command, v) if max(command, v) > 1e-6 else 0.0
             thrust = math.copysign(limit * (1 - math.exp(-abs(slip) / shear)), slip)
             v = max(0.0, v + 9.81 * (thrust - resistance * min(v / 0.02, 1.0)) * DT_S / 40)
         speeds.append(v)
     return np.array(speeds)
 
 
-def test_no_target_however_low_or_high_costs_the_robot_its_speed():
+def test_no_target_reduces_the_steady_speed():
     free = driven_along(None)
     balance = 0.1 * math.log(2)
     assert free[-1] == pytest.approx(1 - balance, rel=1e-3)
@@ -368,56 +375,56 @@ def test_no_target_however_low_or_high_costs_the_robot_its_speed():
 
 
 def braked(aim, wheel, v, slowing=3.0, using=SETTINGS):
-    """Told (n, 3), driven and state after a command to stand, on ground that slows so much."""
+    """Told (n, 3), driven and state after a command to stop, on ground that slows so much."""
     state = initial_state()
     ways = np.sign(wheel)
     _, state, _ = steps(state, wheel, ground_mps=v * ways, aim=aim, using=using)
     state[DRIVEN] = v
     rows = []
     while len(rows) < 100:
-        told, state, said = steps(state, 0.0, ground_mps=v * ways, aim=aim, using=using)
-        rows.append([*told, said[0], said[4], v])
+        command, state, report = steps(state, 0.0, ground_mps=v * ways, aim=aim, using=using)
+        rows.append([*command, report.driven_mps, report.drive_state, v])
         v = max(v - slowing * DT_S, 0.0)
     return np.array(rows), state
 
 
-def test_braking_on_slick_ground_keeps_the_directions_and_its_slip_and_ends():
+def test_braking_on_slick_terrain_keeps_the_directions_and_its_slip_and_ends():
     wheel = np.array([5.0, -5.0, 4.0])
-    loose, _ = braked(Ground(0.1), wheel, 1.0)
+    loose, _ = braked(TractionTarget(0.1), wheel, 1.0)
     assert not loose[:, :4].any()
-    using = with_driver(SETTINGS, ROBOT)
+    using = with_motor_driver(SETTINGS, ROBOT)
     held, state = braked(SLICK, wheel, 1.0, using=using)
-    told, driven, state_said, v = held[:, :3], held[:, 3], held[:, 4], held[:, 5]
+    command, driven, drive_state, v = held[:, :3], held[:, 3], held[:, 4], held[:, 5]
     busy = driven > 0
     assert 5 < busy.sum() < 20
-    assert told[busy] == pytest.approx(driven[busy, None] / 1.0 * wheel)
+    assert command[busy] == pytest.approx(driven[busy, None] / 1.0 * wheel)
     assert (np.diff(driven) <= 1e-12).all()
-    assert set(state_said[busy]) == {BRAKING}
+    assert set(drive_state[busy]) == {DriveState.BRAKING}
     # the slip asked for, at the speed that the lead makes of the one seen
     time_s = np.arange(1, 101) * DT_S
     charge = using.charge_mps_per_mps2 * 3.0 * np.exp(-time_s / using.charge_time_s)
     expected = (v - 3.0 * np.minimum(time_s, using.brake_lead_s)) * (1 - 0.15) - charge
     assert driven[busy] == pytest.approx(expected[busy])
-    assert (expected + charge)[busy].min() > 0.1  # slower, the wheels are told to stand
+    assert (expected + charge)[busy].min() > 0.1  # slower, the wheels are commanded to stop
     assert not held[~busy][:, :4].any()
     assert state[DRIVEN] == 0.0
 
 
-def test_gentle_slowing_and_speeding_up_are_no_braking():
+def test_gentle_deceleration_and_acceleration_are_not_braking():
     state = initial_state()
-    said = []
+    states = []
     for speed in [*np.full(5, 1.0), *np.arange(1.0, 0.9, -0.008), *np.full(5, 1.1)]:
         _, state, row = steps(state, speed / RADIUS_M, ground_mps=0.95, aim=SLICK)
-        said.append(row[4])
-    assert said[0] == TRACTION
-    assert BRAKING not in said
-    assert said[6] == STEADY
-    names = {TRACTION: "traction", BRAKING: "braking", STEADY: "steady"}
+        states.append(row.drive_state)
+    assert states[0] == DriveState.TRACTION
+    assert DriveState.BRAKING not in states
+    assert states[6] == DriveState.STEADY
+    names = {DriveState.TRACTION: "traction", DriveState.BRAKING: "braking", DriveState.STEADY: "steady"}
     assert tuple(names[code] for code in range(3)) == DRIVE_STATES
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "desired"),
+    ("name", "value", "accepted"),
     [
         ("lead_s", -0.1, "from zero up"),
         ("launch_mps", 0.0, "above zero"),
@@ -429,12 +436,12 @@ def test_gentle_slowing_and_speeding_up_are_no_braking():
         ("stale_max_s", None, "from zero up"),
     ],
 )
-def test_settings_that_cannot_be_are_refused_in_one_sentence(name, value, desired):
+def test_invalid_settings_are_refused_in_one_sentence(name, value, accepted):
     with pytest.raises(ConfigError) as refused:
         check_settings(SETTINGS._replace(**{name: value}))
-    assert str(refused.value) == f"traction: {name} is {value!r}, a number {desired} is required"
+    assert str(refused.value) == f"traction: {name} is {value!r}, a number {accepted} is required"
 
 
-def test_whole_numbers_are_settings():
+def test_integers_are_accepted_as_settings():
     using = check_settings(SETTINGS._replace(lead_s=0, stale_max_s=3))
-    assert steps(initial_state(), 5.0, using=using)[2][5] == OK
+    assert steps(initial_state(), 5.0, using=using)[2].status == TractionStatus.OK
