@@ -1,8 +1,8 @@
-"""What a drive cost and how well it went, from the truth of its log.
+"""Metrics of a simulated drive, from the truth in its log.
 
-Energy is what the wheels' motors put in, ``max(T w, 0)`` summed over wheels: a driver that is dragged gives
-nothing back.  It is compared at equal distance, since at equal time a controller that gets further looks
-thrifty.
+Energy is the mechanical work of the wheels' motors, ``max(T w, 0)`` summed over wheels: the motor drivers do
+not recover energy.  Controllers are compared at equal distance, as at equal time the consumption of one that
+travels less far is lower.
 """
 
 from __future__ import annotations
@@ -19,37 +19,39 @@ from terrain.records import Array, RunLog, Stream
 from terrain.robots import Robot
 
 PEAK_ABOVE_MPS = 0.2
-"""Slip counts while the robot is faster: slower, the ratio is one of two small speeds."""
+"""Slip is evaluated above this speed: below it is the ratio of two small speeds."""
 
 SMOOTH_S = 0.05
-"""Slip is behind the low-pass that its estimate is behind: a bump is no start."""
+"""Time constant of the low-pass on slip, the one of its estimate: it removes the slip of single bumps."""
 
-LOCKED_SHARE, LOCKED_ABOVE_MPS = 0.1, 0.1
-"""A wheel is locked where its rim does less than this share of its way over ground, above this speed."""
+LOCKED_RATIO, LOCKED_ABOVE_MPS = 0.1, 0.1
+"""A wheel is locked where its circumferential speed is below this fraction of its speed over ground, above
+this speed over ground."""
 
-STOOD_MPS = 0.02
-"""A robot that goes slower than this stands."""
+STANDING_MPS = 0.02
+"""A robot that is slower than this stands."""
 
-STUCK_MPS, STUCK_S, WANTED_MPS = 0.03, 2.0, 0.2
-"""A robot that is to go faster than the last, and is slower than the first for so long, is stuck."""
+STUCK_MPS, STUCK_S, STUCK_COMMAND_MPS = 0.03, 2.0, 0.2
+"""A robot is immobilised where it is slower than the first for this time while a speed above the last is
+desired."""
 
 FINAL_S = 20.0
-"""The final speed is the mean over so long, or the last third of the run: ground differs along the way."""
+"""The final speed is the mean over this time, or over the last third of a shorter run."""
 
 
-class Course(NamedTuple):
+class DriveHistory(NamedTuple):
     """The truth of a drive, evenly spaced.
 
     Parameters
     ----------
-    time_s, speed_mps, velocity_mps : (n,), (n,), (n, 2); speed over ground whichever way, velocity in body
-        axes
-    progress_mps : (n,) along what is required; negative where the robot slides back
-    distance_m, energy_j, scrub_j, scrub_along_j : (n,) summed up; scrub is what the contacts take up, and the
-        part of it along the wheels
-    wheel_speed_mps, ground_mps, slip_ratio : (n, wheels) along each wheel; slip positive in traction
-        whichever way, behind the low-pass, NaN at rest
-    sinkage_m : (n,) the deepest wheel's
+    time_s, speed_mps, velocity_mps : (n,), (n,), (n, 2); magnitude of the velocity over ground, and the
+        velocity in body axes
+    progress_mps : (n,) speed along the desired direction; negative where the robot slides back
+    distance_m, energy_j, scrub_j, scrub_along_j : (n,) cumulated; scrub is the energy dissipated in the
+        contacts, and the part of it along the wheels
+    wheel_speed_mps, ground_mps, slip_ratio : (n, wheels) circumferential speed, speed over ground along each
+        wheel, and slip, low-pass filtered, positive in traction in both directions; NaN at rest
+    sinkage_m : (n,) of the deepest wheel
     yaw_rad : (n,)
     """
 
@@ -68,17 +70,17 @@ class Course(NamedTuple):
     yaw_rad: Array
 
 
-def course_of(
+def drive_history(
     run: RunLog, robot: Robot, radius_factors: tuple[float, float, float] = (1.0, 1.0, 1.0)
-) -> Course:
-    """Return what happened in a simulated run.
+) -> DriveHistory:
+    """Return the history of a simulated run.
 
     Parameters
     ----------
     run : with its truth
-    robot : the one that drove
+    robot : the one that was simulated
     radius_factors : true radius of each wheel over the nominal one (``Conditions``); without them, wheels
-        that fight each other by their radii seem to win energy from the ground
+        of different radii appear to gain energy from the ground
     """
     truth = run.streams["truth"]
     wheels = robot.wheels
@@ -99,12 +101,12 @@ def course_of(
     progress = _progress(truth.time_s, np.column_stack([along, across]), run.streams.get("commands"))
     signed = np.full(wheel_speed.shape, math.nan)
     for i, wheel in enumerate(wheels):
-        if f"slip_{wheel}_ratio" in truth.channels:  # a slip that no instant has is no channel
+        if f"slip_{wheel}_ratio" in truth.channels:  # a slip that is never defined has no channel
             signed[:, i] = truth.channel(f"slip_{wheel}_ratio")
     slip = _smooth(np.nan_to_num(signed * np.sign(ground)), step_s)
     slip[np.isnan(signed)] = np.nan
     sinkage = np.column_stack([truth.channel(f"sinkage_{wheel}_m") for wheel in wheels])
-    return Course(
+    return DriveHistory(
         truth.time_s,
         speed,
         np.column_stack([along, across]),
@@ -122,10 +124,10 @@ def course_of(
 
 
 def _progress(time_s: Array, velocity: Array, commands: Stream | None) -> Array:
-    """Return the speed (n,) along what is required, or was last: to slide back down a slope is no way made.
+    """Return the speed (n,) along the last desired direction: sliding down a slope backwards is negative.
 
-    Where no translation was wanted yet, as in a turn on the spot, or nobody says what is, it is the speed
-    whichever way.
+    Before any translation is desired, as in a turn on the spot, or without commands, it is the speed over
+    ground.
     """
     if commands is None:
         return np.asarray(np.linalg.norm(velocity, axis=1))
@@ -133,8 +135,8 @@ def _progress(time_s: Array, velocity: Array, commands: Stream | None) -> Array:
     size = np.linalg.norm(desired, axis=1)
     last = np.maximum.accumulate(np.where(size > 0.0, np.arange(size.size), -1))
     at = last[np.clip(np.searchsorted(commands.time_s, time_s, side="right") - 1, 0, size.size - 1)]
-    way = desired[at] / np.maximum(size[at], 1e-9)[:, None]
-    along = np.where(at < 0, np.linalg.norm(velocity, axis=1), np.einsum("ij,ij->i", velocity, way))
+    direction = desired[at] / np.maximum(size[at], 1e-9)[:, None]
+    along = np.where(at < 0, np.linalg.norm(velocity, axis=1), np.einsum("ij,ij->i", velocity, direction))
     return np.asarray(along)
 
 
@@ -143,93 +145,95 @@ def _smooth(values: Array, step_s: float) -> Array:
     return np.asarray(lfilter([1.0 - keep], [1.0, -keep], values, axis=0))
 
 
-def slip_peak(course: Course, within: Array | None = None) -> float:
+def slip_peak(history: DriveHistory, within: Array | None = None) -> float:
     """Return the largest slip of the robot, the mean over its wheels, above :data:`PEAK_ABOVE_MPS`; or NaN.
 
     Parameters
     ----------
-    course : of the drive
-    within : (n,) where to look; everywhere by default
+    history : of the drive
+    within : (n,) samples to evaluate; all by default
     """
-    looked = course.speed_mps > PEAK_ABOVE_MPS
-    looked &= np.isfinite(course.slip_ratio).any(axis=1)
+    used = history.speed_mps > PEAK_ABOVE_MPS
+    used &= np.isfinite(history.slip_ratio).any(axis=1)
     if within is not None:
-        looked &= within
-    return float(np.nanmean(course.slip_ratio[looked], axis=1).max()) if looked.any() else math.nan
+        used &= within
+    return float(np.nanmean(history.slip_ratio[used], axis=1).max()) if used.any() else math.nan
 
 
-def energy_to(course: Course, distance_m: float, start_s: float = 0.0) -> float:
-    """Return the energy in J of the first metres after an instant; NaN where the robot did not get so far."""
-    first = int(np.searchsorted(course.time_s, start_s))
-    way = course.distance_m - course.distance_m[first]
-    if way[-1] < distance_m:
+def energy_over(history: DriveHistory, distance_m: float, start_s: float = 0.0) -> float:
+    """Return the energy in J over a distance from a time on; NaN where the robot did not travel so far."""
+    first = int(np.searchsorted(history.time_s, start_s))
+    travelled = history.distance_m - history.distance_m[first]
+    if travelled[-1] < distance_m:
         return math.nan
-    return float(np.interp(distance_m, way[first:], course.energy_j[first:]) - course.energy_j[first])
+    return float(np.interp(distance_m, travelled[first:], history.energy_j[first:]) - history.energy_j[first])
 
 
-def distance_after(course: Course, start_s: float, length_s: float) -> float:
-    """Return how far in m the robot got from an instant on, in so long."""
-    first, last = np.searchsorted(course.time_s, [start_s, start_s + length_s])
-    return float(course.distance_m[min(last, len(course.distance_m) - 1)] - course.distance_m[first])
+def distance_within(history: DriveHistory, start_s: float, length_s: float) -> float:
+    """Return the distance in m travelled within ``length_s`` from a time on."""
+    first, last = np.searchsorted(history.time_s, [start_s, start_s + length_s])
+    return float(history.distance_m[min(last, len(history.distance_m) - 1)] - history.distance_m[first])
 
 
-def lock_s(course: Course, start_s: float = 0.0, end_s: float = math.inf) -> float:
-    """Return for how long in s, of a stretch, the wheel that was locked longest was."""
-    within = (course.time_s >= start_s) & (course.time_s <= end_s)
-    step_s = course.time_s[1] - course.time_s[0]
-    moving = np.abs(course.ground_mps) > LOCKED_ABOVE_MPS
+def lock_s(history: DriveHistory, start_s: float = 0.0, end_s: float = math.inf) -> float:
+    """Return the time in s, between two times, for which the wheel that was locked longest was locked."""
+    within = (history.time_s >= start_s) & (history.time_s <= end_s)
+    step_s = history.time_s[1] - history.time_s[0]
+    moving = np.abs(history.ground_mps) > LOCKED_ABOVE_MPS
     locked = moving & (
-        course.wheel_speed_mps * np.sign(course.ground_mps) < LOCKED_SHARE * np.abs(course.ground_mps)
+        history.wheel_speed_mps * np.sign(history.ground_mps) < LOCKED_RATIO * np.abs(history.ground_mps)
     )
     return float(locked[within].sum(axis=0).max() * step_s)
 
 
-def immobilised(course: Course, control: Stream) -> int:
-    """Return how often the robot was stuck: to go, and not going, for :data:`STUCK_S`.
+def immobilised(history: DriveHistory, control: Stream) -> int:
+    """Return how often the robot was stuck: no motion for :data:`STUCK_S` although one is desired.
 
-    It is to go by the pilot's ``desired_mps``, and not by what wheels are told: a controller that stops the
-    robot is no excuse.  It goes where a wheel makes way in the direction that it turns: one that turns on the
-    spot is not stuck, one that slides back down a slope is.
+    The desired speed is the pilot's ``desired_mps`` and not the wheels' command: a robot that its controller
+    stops counts as stuck.  It moves where a wheel moves over ground in the direction of its rotation: a robot
+    that turns on the spot is not stuck, one that slides back down a slope is.
     """
-    desired = np.interp(course.time_s, control.time_s, control.channel("desired_mps"))
-    going_mps = (course.ground_mps * np.sign(course.wheel_speed_mps)).max(axis=1)
-    stuck = (desired > WANTED_MPS) & (going_mps < STUCK_MPS)
+    desired = np.interp(history.time_s, control.time_s, control.channel("desired_mps"))
+    moving_mps = (history.ground_mps * np.sign(history.wheel_speed_mps)).max(axis=1)
+    stuck = (desired > STUCK_COMMAND_MPS) & (moving_mps < STUCK_MPS)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], stuck, [False]]).astype(int)))
-    step_s = course.time_s[1] - course.time_s[0]
+    step_s = history.time_s[1] - history.time_s[0]
     return int(((edges[1::2] - edges[::2]) * step_s >= STUCK_S).sum())
 
 
-def final_speed(course: Course) -> float:
+def final_speed(history: DriveHistory) -> float:
     """Return the mean speed in m/s at the end of a drive."""
-    length_s = min(FINAL_S, course.time_s[-1] / 3)
-    return float(course.progress_mps[course.time_s > course.time_s[-1] - length_s].mean())
+    length_s = min(FINAL_S, history.time_s[-1] / 3)
+    return float(history.progress_mps[history.time_s > history.time_s[-1] - length_s].mean())
 
 
-def standing_from(course: Course, start_s: float) -> float:
-    """Return when the robot first stood, or turned round, after an instant at which it drove; NaN if never.
+def standstill_time(history: DriveHistory, start_s: float) -> float:
+    """Return the first time in s, from one on, at which the robot stood or reversed; NaN if never.
 
-    A robot that is braked hard may swing back: what counts is the first standstill.
+    A robot that is braked hard may roll back: the first standstill counts.
     """
-    first = int(np.searchsorted(course.time_s, start_s - 1e-9))
-    way = course.velocity_mps[first] / max(course.speed_mps[first], 1e-9)
-    stood = np.flatnonzero(course.velocity_mps[first:] @ way < STOOD_MPS)
-    return float(course.time_s[first + stood[0]]) if stood.size else math.nan
+    first = int(np.searchsorted(history.time_s, start_s - 1e-9))
+    direction = history.velocity_mps[first] / max(history.speed_mps[first], 1e-9)
+    stood = np.flatnonzero(history.velocity_mps[first:] @ direction < STANDING_MPS)
+    return float(history.time_s[first + stood[0]]) if stood.size else math.nan
 
 
-def stop_distance(course: Course, start_s: float) -> float:
-    """Return how far in m the robot went from an instant on until it stood; NaN where it did not."""
-    end_s = standing_from(course, start_s)
-    return distance_after(course, start_s, end_s - start_s) if math.isfinite(end_s) else math.nan
+def stopping_distance(history: DriveHistory, start_s: float) -> float:
+    """Return the distance in m from a time on until the robot stood; NaN where it did not."""
+    end_s = standstill_time(history, start_s)
+    return distance_within(history, start_s, end_s - start_s) if math.isfinite(end_s) else math.nan
 
 
-def adapt_times(control: Stream, changes: Sequence[tuple[float, float]], close: float = 0.02) -> list[float]:
-    """Return how long after each change of ground the target came close to the new ground's own.
+def adaptation_times(
+    control: Stream, changes: Sequence[tuple[float, float]], close: float = 0.02
+) -> list[float]:
+    """Return the time from each change of terrain until the target was close to the new terrain's.
 
     Parameters
     ----------
     control : the pilot's status
-    changes : instant of each change, and the target of the new ground
-    close : how near counts
+    changes : time of each change, and the target of the new terrain
+    close : largest difference that counts as close
 
     Returns
     -------
@@ -244,7 +248,7 @@ def adapt_times(control: Stream, changes: Sequence[tuple[float, float]], close: 
     return found
 
 
-def roughness(commands: Stream) -> float:
-    """Return the rms change of the wheels' commands in rad/s^2: smooth is small."""
+def command_change(commands: Stream) -> float:
+    """Return the rms rate of change of the wheels' commands in rad/s^2."""
     wheels = np.column_stack([commands.channel(f"wheel_{i}_radps") for i in (1, 2, 3)])
     return float(np.sqrt(np.mean((np.diff(wheels, axis=0) / np.diff(commands.time_s)[:, None]) ** 2)))

@@ -1,9 +1,9 @@
-"""Whether gains of a slip controller are stable on a robot: its sampled loop, linearised, at its limits.
+"""Stability of a slip controller on a robot: its sampled loop, linearised, over the range of operation.
 
 Small changes about steady rolling of one wheel that carries a third of the robot, with rate w, ground speed
-v, ``V = max(w r, v)``, slip s, share k of it that the contact has taken up over its relaxation length,
-torque T, the driver's PI (q its integral, e its estimate of w, g its gains) and y, the slip as a controller
-sees it::
+v, ``V = max(w r, v)``, slip s, the slip k that the contact has built up over its relaxation length, torque T,
+the PI loop of the motor driver (q its integral, e its estimate of w, g its gains) and y, the estimated slip
+that the controller uses::
 
     s = (r (1 - s_0) w - v) / V  (traction)   or   (r w - (1 + s_0) v) / V  (braking)
     k' = (s - k) V / sigma                    thrust F = c (k + damping k')
@@ -12,20 +12,20 @@ sees it::
 
 The controller gives its output u once in a sample time, after a delay (whole samples, rounded up), and
 between samples u is held; so the loop is a matrix from one sample to the next, and it is stable where all
-eigenvalues are inside the unit circle.  One is always 1 and is taken out: w, v and u can shift together
-without a change of slip, which no controller of slip can see.  It is how a target beside the balance slip
-makes a robot drift, and no oscillation.
+eigenvalues are inside the unit circle.  One eigenvalue is always 1 and is removed: w, v and u can shift
+together without a change of slip, which is not observable in slip.  This mode is the drift of a robot whose
+target is not the balance slip, and no oscillation.
 
-The limits: V from the low speed of the controller to the motors' own, traction and braking, and ground whose
-thrust rises with slip from hardly at all (a wheel that slides) to twice as steeply as on tiles.  By the
-first equation one rad/s changes the slip by r / V: the printed form's gain is K_P r / V and is largest at the
+The range: V from the low speed of the controller to the largest of the motors, traction and braking, and
+slopes of the thrust over slip from almost zero (a wheel that slides) to twice that of tiles.  By the first
+equation one rad/s changes the slip by r / V: the printed form's gain is K_P r / V and is largest at the
 lowest speed; the normalised form's is K_P.  For AgriMaRo with a delay of 0.05 s and K_P alone, the printed
 form is unstable from K_P = 0.38 rad/s on (at 0.05 m/s; at 0.5 m/s from 3.8, at 2 m/s from 15), the normalised
 one from 1.53 at any speed.
 
 The body's friction with the ground, the limits of torque and output, and the falling branch beyond the peak
-of a thrust curve are not in it.  Encoders and speed over ground are taken to be behind the same low-pass, as
-they have to be for slip to mean anything (thesis 7.2.2).
+of a thrust curve are not modelled.  Encoders and speed over ground are assumed to have the same low-pass,
+as the slip ratio requires (thesis 7.2.2).
 """
 
 from __future__ import annotations
@@ -47,24 +47,24 @@ from terrain.simulation.contact import DEFLECTION_DAMPING_S
 from terrain.simulation.sensors.motion import STEP_S
 
 SAMPLE_TIME_S = 0.02
-"""Of the commands, assumed: the thesis prints none."""
+"""Sample time of the commands, assumed: the thesis specifies none."""
 
 DELAY_S = 0.05
-"""From the instant that a measurement describes to the command made of it; assumed."""
+"""From the time of a measurement to the command computed from it; assumed."""
 
 LONGEST_DELAY_S = 1.0
 
 N_SPEEDS = 24
 SLIPS = (-0.2, 0.2)
-"""Braking has the full gain, traction 1 - s of it."""
+"""Braking has the full gain, traction 1 - s times as much."""
 
 SLOPES = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
 """Rise of the thrust with slip, in loads: turf at its balance slip has 0.6, tiles have 15."""
 
 LARGEST_FACTOR = 1e3
-"""Gains that can be raised so much have no margin worth a number."""
+"""A larger gain margin is given as infinite."""
 
-(RATE, SPEED, CONTACT, TORQUE, INTEGRAL, ESTIMATE, SEEN, COMMAND) = range(8)
+(RATE, SPEED, CONTACT, TORQUE, INTEGRAL, ESTIMATE, MEASURED_SLIP, COMMAND) = range(8)
 _HALVINGS, _TAYLOR_ORDER = 12, 8
 # All at once by a series, and squared: scipy's expm, matrix by matrix, takes seconds where cores are busy.
 
@@ -72,13 +72,13 @@ _PID, _ERROR, _DELAYED = 7, 8, 9  # places after the plant's seven states
 
 
 class Stability(NamedTuple):
-    """How stable a loop is, and where it is least so.
+    """Largest eigenvalue of a loop, and where it occurs.
 
     Parameters
     ----------
     radius_ratio : largest magnitude of an eigenvalue; stable below 1
-    speed_mps, slip_ratio, slope_ratio : where that is
-    gain_margin_ratio : factor on all gains from which on the loop is unstable somewhere; infinite for none
+    speed_mps, slip_ratio, slope_ratio : where it occurs
+    gain_margin_ratio : factor on all gains at which the loop becomes unstable somewhere; infinite for none
     """
 
     radius_ratio: float
@@ -107,16 +107,16 @@ def check_stable(
     dt_s: float = SAMPLE_TIME_S,
     low_speed_mps: float = LOW_SPEED_MPS,
 ) -> Stability:
-    """Return how stable the loop is at the robot's limits.
+    """Return the stability of the loop over the robot's range of operation.
 
     Parameters
     ----------
     robot : with its sections
-    gains : of :class:`terrain.control.pid.Gains`; the limits play no part
+    gains : of :class:`terrain.control.pid.Gains`; the limits are not used
     form : ``printed`` or ``normalised``, see :mod:`terrain.control.danzi_pid`
     delay_s : from measurement to command, beside the encoders' low-pass
     dt_s : sample time
-    low_speed_mps : below which the controller does nothing
+    low_speed_mps : below which the controller is inactive
 
     Raises
     ------
@@ -133,7 +133,7 @@ def check_stable(
     >>> check_stable(robot, Gains(1.0, 0.0, 0.0, limit=5.0), "printed")
     Traceback (most recent call last):
     terrain.errors.ConfigError: robot agrimaro: slip control (printed, kp 1, ki 0, kd 0) with a delay of
-    0.05 s is unstable from 0.05 to 0.131 m/s; of all its gains 0.38 times as much is stable
+    0.05 s is unstable from 0.05 to 0.131 m/s; it is stable up to 0.38 times these gains
     """
     gains = check_gains(gains)
     points = _points(robot, delay_s, dt_s, low_speed_mps)
@@ -144,7 +144,7 @@ def check_stable(
         for given in (gains._replace(kp=0.0, ki=0.0, kd=0.0), gains)
     )
 
-    def radii(factor: float) -> Array:  # with all gains times as large: each enters the matrix but once
+    def radii(factor: float) -> Array:  # with all gains scaled: the matrix is linear in them
         return np.asarray(np.abs(np.linalg.eigvals(without + factor * (loops - without))).max(axis=1))
 
     found = radii(1.0)
@@ -154,7 +154,7 @@ def check_stable(
         raise ConfigError(
             f"robot {robot.name}: slip control ({form}, kp {gains.kp:g}, ki {gains.ki:g}, kd {gains.kd:g}) "
             f"with a delay of {delay_s:g} s is unstable from {min(speeds):.3g} to {max(speeds):.3g} m/s; "
-            f"of all its gains {margin:.2g} times as much is stable"
+            f"it is stable up to {margin:.2g} times these gains"
         )
     worst = points[int(found.argmax())]
     return Stability(float(found.max()), *worst[:3], margin)
@@ -176,7 +176,7 @@ def loop_matrix(
     Parameters
     ----------
     robot, gains, form, delay_s, dt_s : as :func:`check_stable` takes them
-    speed_mps : V, the larger of rim and ground speed
+    speed_mps : V, the larger of wheel circumferential speed and ground speed
     slip_ratio : s_0
     slope_ratio : c in loads
 
@@ -191,7 +191,7 @@ def loop_matrix(
 
 
 def plant_matrix(robot: Robot, speed_mps: float, slip_ratio: float, slope_ratio: float) -> Array:
-    """Return how fast (8, 8) the plant's states and the command change by each of them; the last row is 0.
+    """Return the system matrix (8, 8) of the plant's states and the command; the last row is 0.
 
     In the order of ``w, v, k, T, q, e, y, u`` of the module's equations.
     """
@@ -203,10 +203,10 @@ def plant_matrix(robot: Robot, speed_mps: float, slip_ratio: float, slope_ratio:
         if slip_ratio > 0
         else radius_m * one[RATE] - (1 + slip_ratio) * one[SPEED]
     ) / speed_mps
-    taken_up = (slip - one[CONTACT]) * speed_mps / body.relaxation_length_m
-    thrust = slope_ratio * third_kg * GRAVITY_MPS2 * (one[CONTACT] + DEFLECTION_DAMPING_S * taken_up)
-    lacking = one[COMMAND] - one[ESTIMATE]
-    desired = motors.speed_gain_nmspr * lacking + one[INTEGRAL]
+    build_up = (slip - one[CONTACT]) * speed_mps / body.relaxation_length_m
+    thrust = slope_ratio * third_kg * GRAVITY_MPS2 * (one[CONTACT] + DEFLECTION_DAMPING_S * build_up)
+    speed_error = one[COMMAND] - one[ESTIMATE]
+    desired = motors.speed_gain_nmspr * speed_error + one[INTEGRAL]
     # no lag is shorter than the simulator's step, as there
     torque_s, estimate_s, encoder_s = (
         max(lag_s, STEP_S)
@@ -219,11 +219,11 @@ def plant_matrix(robot: Robot, speed_mps: float, slip_ratio: float, slope_ratio:
     change = np.zeros((8, 8))
     change[RATE] = (one[TORQUE] - radius_m * thrust) / body.wheel_inertia_kgm2
     change[SPEED] = thrust / third_kg
-    change[CONTACT] = taken_up
+    change[CONTACT] = build_up
     change[TORQUE] = (desired - one[TORQUE]) / torque_s
-    change[INTEGRAL] = motors.speed_integral_nmpr * lacking
+    change[INTEGRAL] = motors.speed_integral_nmpr * speed_error
     change[ESTIMATE] = (one[RATE] - one[ESTIMATE]) / estimate_s
-    change[SEEN] = (slip - one[SEEN]) / encoder_s
+    change[MEASURED_SLIP] = (slip - one[MEASURED_SLIP]) / encoder_s
     return change
 
 
@@ -239,7 +239,7 @@ def spectral_radius(matrix: Array) -> float:
 
 
 def _points(robot: Robot, delay_s: float, dt_s: float, low_speed_mps: float) -> list[_Point]:
-    """Return the plant at all limits of the robot; ``ConfigError`` where there are none."""
+    """Return the plant over the range of operation; ``ConfigError`` where the range is empty."""
     _n_delayed(delay_s, dt_s)
     fastest_mps = robot.wheel_radius_m * robot.equipment.motors.speed_max_radps
     if not 0 < low_speed_mps < fastest_mps:
@@ -273,13 +273,13 @@ def _n_delayed(delay_s: float, dt_s: float) -> int:
 
 
 def _closed(robot: Robot, gains: Gains, form: str, n_delayed: int, dt_s: float, point: _Point) -> Array:
-    """Return the loop of ``pid_step``, its output held back by some samples, and the plant."""
+    """Return the loop of ``pid_step`` and the plant, with a delay of some samples."""
     if form not in FORMS:
         raise ConfigError(f"form {form!r} is unknown: use one of {', '.join(FORMS)}")
     radius_m, slip = robot.wheel_radius_m, point.slip_ratio
     size = _DELAYED + n_delayed
     one, loop = np.eye(size), np.zeros((size, size))
-    error = -one[SEEN] * (point.speed_mps / radius_m if form == "normalised" else 1.0)
+    error = -one[MEASURED_SLIP] * (point.speed_mps / radius_m if form == "normalised" else 1.0)
     tau_s = gains.derivative_time_constant_s
     change = (error - one[_ERROR]) * (-math.expm1(-dt_s / tau_s) if tau_s > 0 else 1.0)
     loop[:_PID, :_PID] = point.keep
@@ -295,13 +295,13 @@ def _closed(robot: Robot, gains: Gains, form: str, n_delayed: int, dt_s: float, 
     together[[RATE, ESTIMATE, _PID]] = 1.0
     together[_DELAYED:] = 1.0
     together[SPEED] = radius_m * (1 - slip) if slip > 0 else radius_m / (1 + slip)
-    # What is left of the loop on the directions across one that it maps to itself: its other eigenvalues.
+    # The loop on the complement of the direction that it maps to itself: its other eigenvalues.
     across = np.linalg.svd(together[None])[2][1:]
     return np.asarray(across @ loop @ across.T)
 
 
 def _gain_margin(radii: Callable[[float], Array]) -> float:
-    """Return the factor on all gains at which the loop turns unstable; it is stable at no gain."""
+    """Return the factor on all gains at which the loop becomes unstable; it is stable without gain."""
     if radii(LARGEST_FACTOR).max() < 1.0:
         return math.inf
     low, high = 1 / LARGEST_FACTOR, LARGEST_FACTOR

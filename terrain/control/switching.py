@@ -1,9 +1,9 @@
-"""Switching targets without harm: when a class is believed, and how fast a target may move.
+"""Switching of targets: when a classification is accepted, and how fast a target may change.
 
-A classifier speaks once a window and is wrong at times; a target that followed each word would jump with it.
-Here a class is believed when it was said with enough probability, window after window, for a dwell; doubt
-that lasts as long is believed too, as "unknown", and the table's fallback stands in.  Whatever is believed,
-the target moves to its new value at a bounded rate.
+A classifier gives one output per window, and some are wrong; a target that followed each output would jump.
+Here a class is accepted when it was classified with sufficient probability, window after window, for a dwell
+time.  Outputs of low probability for as long are accepted as "unknown", for which the table's fallback is
+used.  The target then moves to its new value at a bounded rate.
 """
 
 from __future__ import annotations
@@ -14,19 +14,19 @@ from typing import NamedTuple
 from terrain.errors import ConfigError
 
 UNKNOWN = ""
-"""What is believed of ground that nobody knows."""
+"""Name of a terrain that is not known."""
 
 
 class SwitchSettings(NamedTuple):
-    """When a class is believed, and how fast a target moves.
+    """When a class is accepted, and how fast a target moves.
 
     Parameters
     ----------
-    probability_least : of a window's class, for it to count; less is doubt.  With the eight classes of the
-        simulated runs, 0.5 is where the calibrated classifier is right more often than not
-    dwell_s : from the first window of a class to the last, all alike; windows come every 2 s, so two of them
-    silent_s : no word for so long, as while the robot stands, and the row of words starts anew
-    rate_ratio : change of the target a second: a start takes some seconds
+    probability_least : of a window's class, for it to count; below it the window counts as unknown.  With the
+        eight classes of the simulated runs the calibrated classifier is right more often than not above 0.5
+    dwell_s : time over which all windows have to agree; windows come every 2 s, so two of them
+    silent_s : after a gap of this length between outputs, as while the robot stands, the dwell starts again
+    rate_ratio : change of the target per second: a start takes some seconds
     """
 
     probability_least: float = 0.5
@@ -38,14 +38,15 @@ class SwitchSettings(NamedTuple):
 SWITCHING = SwitchSettings()
 
 
-class Belief(NamedTuple):
-    """What is believed of the ground, and what may be believed next.
+class TerrainBelief(NamedTuple):
+    """The accepted terrain, and the candidate that may replace it.
 
     Parameters
     ----------
-    terrain : believed; :data:`UNKNOWN` at first
-    probability : with which it was said last; NaN before
-    candidate, since_s, received_s : what was said last, since when without interruption, and when last
+    terrain : accepted; :data:`UNKNOWN` at first
+    probability : with which it was classified last; NaN before
+    candidate, since_s, received_s : class of the last output, since when without interruption, and the time
+        of the last output
     """
 
     terrain: str = UNKNOWN
@@ -55,11 +56,11 @@ class Belief(NamedTuple):
     received_s: float = math.nan
 
 
-NOTHING = Belief()
+NO_BELIEF = TerrainBelief()
 
 
 def check_switching(settings: SwitchSettings) -> None:
-    """Refuse settings that are none.
+    """Refuse invalid settings.
 
     Raises
     ------
@@ -73,41 +74,45 @@ def check_switching(settings: SwitchSettings) -> None:
     terrain.errors.ConfigError: switching: probability_least is 1.5, a number from 0 to 1 is required
     """
     for name, value in settings._asdict().items():
-        most, desired = (1.0, "from 0 to 1") if name == "probability_least" else (math.inf, "from zero up")
+        most, accepted = (1.0, "from 0 to 1") if name == "probability_least" else (math.inf, "from zero up")
         number = isinstance(value, int | float) and not isinstance(value, bool)
         if not (number and math.isfinite(value) and 0.0 <= value <= most):
-            raise ConfigError(f"switching: {name} is {value!r}, a number {desired} is required")
+            raise ConfigError(f"switching: {name} is {value!r}, a number {accepted} is required")
 
 
-def hear(
-    belief: Belief, time_s: float, terrain: str, probability: float, settings: SwitchSettings = SWITCHING
-) -> Belief:
-    """Return what is believed after one word of a classifier.
+def update(
+    belief: TerrainBelief,
+    time_s: float,
+    terrain: str,
+    probability: float,
+    settings: SwitchSettings = SWITCHING,
+) -> TerrainBelief:
+    """Return the belief after one output of a classifier.
 
-    A probability that is NaN or too low, like an empty terrain, is doubt, whatever class goes with it.  A
-    word that is not later than the last is not heard.
+    A probability that is NaN or too low, like an empty terrain, counts as unknown for any class.  An output
+    that is not later than the last is ignored.
 
     Examples
     --------
-    >>> belief = hear(NOTHING, 2.0, "grass", 0.9)
-    >>> belief.terrain, hear(belief, 4.0, "grass", 0.8).terrain
+    >>> belief = update(NO_BELIEF, 2.0, "grass", 0.9)
+    >>> belief.terrain, update(belief, 4.0, "grass", 0.8).terrain
     ('', 'grass')
     """
     if not math.isfinite(time_s) or time_s <= belief.received_s:
         return belief
-    said = terrain if probability >= settings.probability_least else UNKNOWN  # False for NaN
-    goes_on = said == belief.candidate and time_s - belief.received_s <= settings.silent_s
-    since_s = belief.since_s if goes_on else time_s
-    if said == belief.terrain:
-        shown = probability if said else math.nan
-        return Belief(belief.terrain, shown, said, since_s, time_s)
+    candidate = terrain if probability >= settings.probability_least else UNKNOWN  # False for NaN
+    continues = candidate == belief.candidate and time_s - belief.received_s <= settings.silent_s
+    since_s = belief.since_s if continues else time_s
+    known_probability = probability if candidate else math.nan
+    if candidate == belief.terrain:
+        return TerrainBelief(belief.terrain, known_probability, candidate, since_s, time_s)
     if time_s - since_s >= settings.dwell_s - 1e-9:
-        return Belief(said, probability if said else math.nan, said, since_s, time_s)
-    return Belief(belief.terrain, belief.probability, said, since_s, time_s)
+        return TerrainBelief(candidate, known_probability, candidate, since_s, time_s)
+    return TerrainBelief(belief.terrain, belief.probability, candidate, since_s, time_s)
 
 
 def approach(now: float, desired: float, rate: float, dt_s: float) -> float:
-    """Return a target on its way: no further than ``rate dt`` from now; where there is none yet, the wanted.
+    """Return a target that approaches the desired one by at most ``rate dt``; the desired one at first.
 
     Examples
     --------

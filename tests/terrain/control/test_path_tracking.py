@@ -1,4 +1,4 @@
-"""Drift correction: laws of the step, an ideal robot that is late, and the whole robot with its play."""
+"""Drift correction: laws of the step, an ideal robot that is late, and the whole robot with its backlash."""
 
 import dataclasses
 import math
@@ -6,19 +6,8 @@ import math
 import numpy as np
 import pytest
 
-from terrain.control.path_tracking import (
-    BAD_TIME,
-    CLAMPED,
-    NO_POSE,
-    OK,
-    SETTINGS,
-    STALE,
-    STANDING,
-    UNCERTAIN,
-    check_tracking,
-    initial_tracking,
-    track_step,
-)
+from terrain.control.path_tracking import PoseEstimate, TrackStatus, initial_tracking, track_step
+from terrain.control.tracking_settings import SETTINGS, check_tracking
 from terrain.errors import ConfigError
 from terrain.estimation.live.estimator import LiveEstimator
 from terrain.kinematics.swerve import FAR_RAD, wheel_command_step
@@ -53,41 +42,45 @@ def moved(pose, twist, dt_s=DT_S):
     )
 
 
+def estimate_of(pose, std=0.001, stale_s=0.0):
+    return PoseEstimate(*map(float, pose), std, stale_s)
+
+
 def step(state, twist, pose, ground=None, std=0.001, stale_s=0.0, dt_s=DT_S, settings=SETTINGS):
     ground = twist if ground is None else ground
-    return track_step(settings, state, twist, pose[:2], pose[2], ground, std, stale_s, dt_s)
+    return track_step(settings, state, twist, estimate_of(pose, std, stale_s), ground, dt_s)
 
 
 def drive(twist, pose, n, disturbance=(0.0, 0.0, 0.0), speed=1.0, settings=SETTINGS):
-    """Let an ideal robot do what it is told, slower and disturbed; rows of said and told, state and pose."""
+    """Drive an ideal robot, slower and disturbed; (rows of report and command, state, pose)."""
     state, pose, rows, ground = initial_tracking(), np.array(pose), [], np.zeros(3)
     for _ in range(n):
-        told, state, said = step(state, twist, pose, ground, settings=settings)
-        ground = speed * told + np.array(disturbance)
+        command, state, report = step(state, twist, pose, ground, settings=settings)
+        ground = speed * command + np.array(disturbance)
         pose = moved(pose, ground)
-        rows.append([*said, *told])
+        rows.append([*report, *command])
     return np.array(rows), state, pose
 
 
 @TWIST
 @pytest.mark.parametrize("speed", [1.0, 0.4])
-def test_who_follows_at_his_own_speed_is_left_alone(twist, speed):
+def test_a_robot_that_follows_at_its_own_speed_is_not_corrected(twist, speed):
     rows, _, _ = drive(twist, [3.0, -2.0, 9.0], 600, speed=speed)
     # at a step from rest the reference waits a moment for what is seen late, on an arc micrometres beside it
     np.testing.assert_allclose(rows[:, 4:], np.tile(twist, (600, 1)), atol=5e-5)
-    assert (rows[:, 3] == OK).all()
+    assert (rows[:, 3] == TrackStatus.OK).all()
 
 
 @TWIST
-def test_a_steady_disturbance_is_taken_out_and_nothing_is_added_along_the_way(twist):
+def test_a_constant_disturbance_is_removed_and_nothing_is_added_along_the_path(twist):
     size = np.linalg.norm(ARM * twist)
-    way = ARM * twist / size
+    along = ARM * twist / size
     disturbance = 0.03 * size * np.array([0.7, 0.5, -0.4])
-    disturbance -= way * (way @ disturbance)
+    disturbance -= along * (along @ disturbance)
     n = round(40.0 / size / DT_S)
     rows, _, _ = drive(twist, [0.0, 0.0, 0.3], n, disturbance / ARM)
     added = (rows[:, 4:] - twist) * ARM
-    assert np.abs(added @ way).max() < 1e-9
+    assert np.abs(added @ along).max() < 1e-9
     last = rows[-n // 10 :]
     assert np.abs(last[:, 0]).max() < 0.004
     assert np.abs(last[:, 1]).max() < 0.012
@@ -96,7 +89,7 @@ def test_a_steady_disturbance_is_taken_out_and_nothing_is_added_along_the_way(tw
 
 
 def wandering(rng, n):
-    """Return pose and ground twist of a robot that is told a constant twist and does something near it."""
+    """Return pose and ground twist of a robot that follows a constant twist approximately."""
     ground = np.array([0.7, 0.1, 0.1]) + 0.05 * rng.standard_normal((n, 3))
     poses = [rng.standard_normal(3)]
     for twist in ground[:-1]:
@@ -104,45 +97,45 @@ def wandering(rng, n):
     return np.array(poses) + 0.002 * rng.standard_normal((n, 3)), ground
 
 
-def told_of(poses, ground, desired, function=track_step):
+def tracked(poses, ground, desired, function=track_step):
     state, rows = initial_tracking(), []
     for pose, twist in zip(poses, ground, strict=True):
-        told, state, said = function(SETTINGS, state, desired, pose[:2], pose[2], twist, 0.001, 0.0, DT_S)
-        rows.append([*told, *said])
+        command, state, report = function(SETTINGS, state, desired, estimate_of(pose), twist, DT_S)
+        rows.append([*command, *report])
     return np.array(rows)
 
 
-def test_the_world_s_origin_does_not_matter_and_left_is_as_right():
+def test_corrections_do_not_depend_on_the_origin_and_are_mirror_symmetric():
     desired = np.array([0.7, 0.1, 0.12])
     poses, ground = wandering(np.random.default_rng(1), 200)
-    rows = told_of(poses, ground, desired)
-    assert set(rows[:, 6]) <= {OK, CLAMPED}
+    rows = tracked(poses, ground, desired)
+    assert set(rows[:, 6]) <= {TrackStatus.OK, TrackStatus.CLAMPED}
     assert np.abs(rows[:, :3] - desired).max() > 0.01
-    np.testing.assert_allclose(told_of(poses, ground, desired, track_step.py_func), rows, atol=1e-9)
+    np.testing.assert_allclose(tracked(poses, ground, desired, track_step.py_func), rows, atol=1e-9)
     turn, shift = 2.5, np.array([100.0, -40.0])
     cos, sin = math.cos(turn), math.sin(turn)
     turned = np.column_stack(
         [poses[:, :2] @ [[cos, sin], [-sin, cos]] + shift, poses[:, 2] + turn + 4 * math.pi]
     )
-    np.testing.assert_allclose(told_of(turned, ground, desired), rows, atol=1e-9)
+    np.testing.assert_allclose(tracked(turned, ground, desired), rows, atol=1e-9)
     mirror = np.array([1.0, -1.0, -1.0])
-    flipped = told_of(poses * mirror, ground * mirror, desired * mirror)
+    flipped = tracked(poses * mirror, ground * mirror, desired * mirror)
     np.testing.assert_allclose(flipped[:, :3], rows[:, :3] * mirror, atol=1e-9)
 
 
 def late(speed_mps, k, delay=3, lag_s=0.08, seen_s=0.05):
-    """Return the heading error, early and in the end, of a robot that turns a while after it is told."""
+    """Return the heading error, early and in the end, of a robot that turns some time after its command."""
     settings = SETTINGS._replace(heading_pm=k, heading_fastest_ps=2 * k, heading_integral_pm2=0.0)
     twist, state, seen = np.array([speed_mps, 0.0, 0.0]), initial_tracking(), np.zeros(3)
     _, state, _ = step(state, twist, seen, settings=settings)
     pose, turn, coming, errors = np.array([0.0, 0.0, 1e-4]), 0.0, [0.0] * delay, []
     for _ in range(400):
         seen = seen + (pose - seen) * (DT_S / seen_s)
-        told, state, said = step(state, twist, seen, settings=settings)
-        coming.append(told[2])
+        command, state, report = step(state, twist, seen, settings=settings)
+        coming.append(command[2])
         turn += (coming.pop(0) - turn) * (DT_S / lag_s)
         pose = moved(pose, np.array([speed_mps, 0.0, turn]))
-        errors.append(abs(said[0]))
+        errors.append(abs(report.heading_error_rad))
     return max(errors[:40]), max(errors[-40:])
 
 
@@ -154,7 +147,7 @@ def accepted(**changes):
     return True
 
 
-def test_what_the_linear_check_refuses_swings_and_what_it_accepts_does_not():
+def test_gains_that_the_linear_check_refuses_oscillate_and_accepted_ones_decay():
     assert accepted()
     assert not accepted(heading_pm=12.0, heading_fastest_ps=24.0)
     assert not accepted(cross_pm=12.0, cross_fastest_ps=24.0)
@@ -168,12 +161,12 @@ def test_what_the_linear_check_refuses_swings_and_what_it_accepts_does_not():
 
 @pytest.mark.parametrize("name", [*SETTINGS._fields])
 @pytest.mark.parametrize("value", [-0.1, math.nan, math.inf, True, "1"])
-def test_settings_that_are_none_are_refused(name, value):
+def test_invalid_settings_are_refused(name, value):
     with pytest.raises(ConfigError, match=f"path tracking: {name} is "):
         check_tracking(ROBOT, SETTINGS._replace(**{name: value}))
 
 
-def test_integers_are_taken_and_times_are_checked():
+def test_integers_are_accepted_and_times_are_checked():
     assert check_tracking(ROBOT, SETTINGS._replace(heading_pm=3)) == SETTINGS
     assert isinstance(check_tracking(ROBOT, SETTINGS._replace(heading_pm=3)).heading_pm, float)
     for option in ({"delay_s": -0.1}, {"delay_s": 2.0}, {"dt_s": 0.0}, {"dt_s": math.nan}):
@@ -184,68 +177,68 @@ def test_integers_are_taken_and_times_are_checked():
 @pytest.mark.parametrize(
     ("status", "fault"),
     [
-        (NO_POSE, {"pose": np.array([math.nan, 0.0, 0.0])}),
-        (NO_POSE, {"pose": np.array([1.0, 0.0, math.inf])}),
-        (NO_POSE, {"ground": np.array([1.0, math.nan, 0.0])}),
-        (UNCERTAIN, {"std": 0.2}),
-        (UNCERTAIN, {"std": math.nan}),
-        (STALE, {"stale_s": 3.1}),
-        (STALE, {"stale_s": math.inf}),
-        (BAD_TIME, {"dt_s": 0.0}),
-        (BAD_TIME, {"dt_s": -0.02}),
-        (BAD_TIME, {"dt_s": 0.6}),
-        (BAD_TIME, {"dt_s": math.nan}),
+        (TrackStatus.NO_POSE, {"pose": np.array([math.nan, 0.0, 0.0])}),
+        (TrackStatus.NO_POSE, {"pose": np.array([1.0, 0.0, math.inf])}),
+        (TrackStatus.NO_POSE, {"ground": np.array([1.0, math.nan, 0.0])}),
+        (TrackStatus.UNCERTAIN, {"std": 0.2}),
+        (TrackStatus.UNCERTAIN, {"std": math.nan}),
+        (TrackStatus.STALE, {"stale_s": 3.1}),
+        (TrackStatus.STALE, {"stale_s": math.inf}),
+        (TrackStatus.BAD_TIME, {"dt_s": 0.0}),
+        (TrackStatus.BAD_TIME, {"dt_s": -0.02}),
+        (TrackStatus.BAD_TIME, {"dt_s": 0.6}),
+        (TrackStatus.BAD_TIME, {"dt_s": math.nan}),
     ],
 )
-def test_without_a_pose_nothing_is_corrected_and_nothing_is_learned(status, fault):
+def test_without_a_valid_pose_nothing_is_corrected_and_the_state_is_kept(status, fault):
     twist = np.array(TWISTS["forward"])
     rows, state, pose = drive(twist, np.zeros(3), 200, (0.0, 0.02, 0.02))
     assert rows[-1, 2] > 0.02
     given = {"pose": pose, **fault}
-    told, after, said = step(state, twist, given.pop("pose"), **given)
-    np.testing.assert_array_equal(told, twist)
-    assert said[3] == status
-    assert math.isnan(said[0])
+    command, after, report = step(state, twist, given.pop("pose"), **given)
+    np.testing.assert_array_equal(command, twist)
+    assert report.status == status
+    assert math.isnan(report.heading_error_rad)
     np.testing.assert_array_equal(after[:12], state[:12])  # reference and integrals
-    again, _, said = step(after, twist, pose)
-    assert said[3] == OK  # a moment later all is as it was
+    again, _, report = step(after, twist, pose)
+    assert report.status == TrackStatus.OK  # a step later the correction is as before
     np.testing.assert_allclose(again, rows[-1, 4:], atol=0.01)
-    if status != BAD_TIME:
+    if status != TrackStatus.BAD_TIME:
         for _ in range(30):
             _, after, _ = step(after, twist, pose, std=1.0)
-        _, after, said = step(after, twist, pose + 5.0)  # blind for long: the way begins here
-        np.testing.assert_allclose(said[:3], 0.0, atol=1e-12)
+        _, after, report = step(after, twist, pose + 5.0)  # blind for long: the path starts here
+        np.testing.assert_allclose(report[:3], 0.0, atol=1e-12)
 
 
-def test_a_pose_that_leaps_is_relocalisation_and_kicks_nobody():
+def test_a_pose_that_jumps_is_relocalisation_and_gives_no_correction():
     twist = np.array(TWISTS["forward"])
     rows, state, pose = drive(twist, np.zeros(3), 200, (0.0, 0.01, 0.01))
-    calm, *_ = step(state, twist, pose)
-    for leap in ([0.05, -0.3, 0.0], [0.0, 0.0, 0.3], [0.4, 0.3, -2.5]):
-        told, after, said = step(state, twist, pose + np.array(leap), rows[-1, 4:])
-        np.testing.assert_allclose(told, calm, atol=2e-3)
-        assert said[3] == OK
-        back, _, _ = step(after, twist, moved(pose, calm))
-        np.testing.assert_allclose(back, calm, atol=4e-3)
+    settled, *_ = step(state, twist, pose)
+    for jump in ([0.05, -0.3, 0.0], [0.0, 0.0, 0.3], [0.4, 0.3, -2.5]):
+        command, after, report = step(state, twist, pose + np.array(jump), rows[-1, 4:])
+        np.testing.assert_allclose(command, settled, atol=2e-3)
+        assert report.status == TrackStatus.OK
+        back, _, _ = step(after, twist, moved(pose, settled))
+        np.testing.assert_allclose(back, settled, atol=4e-3)
 
 
-def test_a_stop_begins_anew_and_a_turn_of_the_way_keeps_the_heading():
+def test_a_stop_resets_the_reference_and_a_turn_of_the_path_keeps_the_heading():
     forward, left = np.array([0.8, 0.0, 0.0]), np.array([0.0, 0.8, 0.0])
     _, state, pose = drive(forward, np.zeros(3), 100, (0.0, 0.03, 0.03))
-    told, stood, said = step(state, np.zeros(3), pose)
-    np.testing.assert_array_equal(told, np.zeros(3))
-    assert said[3] == STANDING
+    command, stood, report = step(state, np.zeros(3), pose)
+    np.testing.assert_array_equal(command, np.zeros(3))
+    assert report.status == TrackStatus.STANDING
     assert not stood[9:12].any()
-    _, _, said = step(stood, forward, pose)
-    np.testing.assert_allclose(said[:3], 0.0, atol=1e-12)
-    heading = step(state, forward, pose)[2][0]
-    _, turned, said = step(state, left, pose)
-    assert said[0] == pytest.approx(heading, abs=1e-3)
-    assert said[1] == pytest.approx(0.0, abs=1e-12)
+    _, _, report = step(stood, forward, pose)
+    np.testing.assert_allclose(report[:3], 0.0, atol=1e-12)
+    heading = step(state, forward, pose)[2].heading_error_rad
+    _, turned, report = step(state, left, pose)
+    assert report.heading_error_rad == pytest.approx(heading, abs=1e-3)
+    assert report.cross_track_m == pytest.approx(0.0, abs=1e-12)
     assert abs(heading) > 1e-3
-    # still rolling ahead: that is not beside the way, as the wheels are being turned
-    _, _, said = step(turned, left, moved(pose, forward), forward)
-    assert said[1] == pytest.approx(0.0, abs=1e-12)
+    # still rolling ahead: no cross-track error, as the wheels are being turned
+    _, _, report = step(turned, left, moved(pose, forward), forward)
+    assert report.cross_track_m == pytest.approx(0.0, abs=1e-12)
 
 
 def test_corrections_stay_small_and_the_integral_does_not_wind_up():
@@ -253,7 +246,7 @@ def test_corrections_stay_small_and_the_integral_does_not_wind_up():
     rows, state, _ = drive(twist, np.zeros(3), 500, (0.0, -0.6, -0.6))
     limit = math.hypot(SETTINGS.heading_max_rad, SETTINGS.cross_max_rad)
     assert rows[:, 2].max() <= limit + 1e-12
-    assert (rows[-100:, 3] == CLAMPED).all()
+    assert (rows[-100:, 3] == TrackStatus.CLAMPED).all()
     assert np.abs(state[9:12]).max() <= limit
 
 
@@ -292,7 +285,7 @@ class Tracker:
 
 
 def run_of(name, terrain, seed, settings, duration_s=None, grade=(0.0, 0.0), lost_s=(), scatter=True):
-    """Drive a day's scattered robot on its scattered soil; return its pose (n, 3) and its run."""
+    """Drive a robot with drawn properties on a drawn soil; return its pose (n, 3) and its run."""
     rng = np.random.default_rng([seed, 77])
     conditions = Conditions(leg_backlash_rad=0.02)
     soil = load_soil(terrain)
@@ -315,11 +308,11 @@ def run_of(name, terrain, seed, settings, duration_s=None, grade=(0.0, 0.0), los
 
 
 def drift(pose):
-    """Return yaw and place beside the way at 20 m (or the end), and the rms of the heading after 2 m."""
-    way_m = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(pose[:, :2], axis=0).T))])
-    end = min(int(np.searchsorted(way_m, 20.0)), len(pose) - 1)
+    """Return yaw and the cross-track error at 20 m (or the end), and the rms of the heading after 2 m."""
+    distance_m = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(pose[:, :2], axis=0).T))])
+    end = min(int(np.searchsorted(distance_m, 20.0)), len(pose) - 1)
     heading = pose[: end + 1, 2] - pose[0, 2]
-    rms = math.sqrt(np.mean(heading[way_m[: end + 1] > 2.0] ** 2))
+    rms = math.sqrt(np.mean(heading[distance_m[: end + 1] > 2.0] ** 2))
     return abs(heading[-1]), abs(pose[end, 1] - pose[0, 1]), rms
 
 
@@ -330,13 +323,13 @@ def drifts(terrain, settings, seeds=range(3), **options):
 
 
 @pytest.mark.parametrize("terrain", ["tiles", "grass", "dry_sand"])
-def test_of_the_drift_by_play_less_than_a_tenth_is_left(terrain):
+def test_less_than_a_tenth_of_the_drift_by_backlash_remains(terrain):
     plain, tracked = drifts(terrain, None), drifts(terrain, SETTINGS)
     assert plain[0] > 0.08
     assert (tracked < 0.1 * plain).all()
 
 
-def test_a_side_slope_and_a_lost_camera_keep_the_robot_on_its_way():
+def test_tracking_holds_on_a_side_slope_and_without_a_camera():
     slope = (0.0, math.tan(math.radians(5.0)))
     plain, tracked = (
         drifts("grass", None, [0, 1], grade=slope),
@@ -353,13 +346,13 @@ def test_the_steering_is_trimmed_and_does_not_chatter():
     steer = run.streams["commands"].values[:, 6:]
     assert np.abs(steer).max() < 0.1
     travel_rad = np.abs(np.diff(steer, axis=0)).sum(axis=0)
-    assert travel_rad.max() < 0.4  # ten times across the play of 0.042 in 21 m
+    assert travel_rad.max() < 0.4  # ten times across the backlash of 0.042 in 21 m
     assert np.abs(np.diff(steer, axis=0)).max() < 0.02
 
 
 @pytest.mark.parametrize("name", ["complex", "crab", "arc", "spot_turn"])
-def test_every_kind_of_drive_comes_nearer_to_its_own_path(name):
-    """Distance of the origin to the path of the wanted twists, wherever on it, and the heading at the end."""
+def test_tracking_reduces_the_distance_to_the_path_in_every_scenario(name):
+    """Distance of the origin to the path of the desired twists, and the heading at the end."""
     drive = make_scenario(name, ROBOT, "tiles")
     path = [np.zeros(3)]
     for twist in drive.twist:

@@ -87,7 +87,7 @@ def small_changes(gains, form, n_delayed, speed_mps, slip_ratio, slope_ratio, n_
         ((2.0, 2.0, 0.05, 0.05), "printed", 1, (0.1, 0.2, 3.0)),
     ],
 )
-def test_a_small_change_grows_or_dies_as_the_largest_eigenvalue_says(numbers, form, n_delayed, where):
+def test_a_small_change_grows_or_decays_by_the_largest_eigenvalue(numbers, form, n_delayed, where):
     kp, ki, kd, tau_s = numbers
     gains = check_gains(Gains(kp, ki, kd, MOST_RADPS, derivative_time_constant_s=tau_s))
     matrix = loop_matrix(ROBOT, gains, form, n_delayed * DT_S, *where)
@@ -142,7 +142,9 @@ def on_grass(settings, target, wheel_speed_mps, n_delayed, duration_s=14.0):
 @pytest.mark.parametrize(
     ("form", "wheel_speed_mps"), [("printed", 0.1), ("printed", 0.5), ("normalised", 1.0)]
 )
-def test_the_full_robot_on_grass_settles_under_the_critical_gain_and_swings_over_it(form, wheel_speed_mps):
+def test_the_full_robot_on_grass_settles_below_the_critical_gain_and_oscillates_above_it(
+    form, wheel_speed_mps
+):
     soil, aside = load_soil("grass"), 1e-4
     balance = equilibrium_slip(soil, LOAD_N, 0.0, *GEOMETRY)
     below, above = net_pull(soil, LOAD_N, np.array([balance - aside, balance + aside]), *GEOMETRY)
@@ -188,7 +190,7 @@ def test_margins_shrink_with_gain_delay_and_sample_time():
     assert margin(form="printed", low_speed_mps=0.1) == pytest.approx(2 * margin(form="printed"), rel=0.02)
 
 
-def test_without_gains_nothing_turns_unstable():
+def test_the_loop_is_stable_without_gains():
     found = check_stable(ROBOT, Gains(0.0, 0.0, 0.0, 1.0))
     assert found.radius_ratio < 1
     assert found.gain_margin_ratio == math.inf
