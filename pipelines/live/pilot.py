@@ -1,97 +1,100 @@
-"""The whole chain from samples to wheel commands: estimate, recognise, look up, correct.
+"""The whole chain from samples to wheel commands; :meth:`LivePilot.step` runs when a sample arrives.
 
-One :meth:`LivePilot.step` takes what the sensors wrote since the last one and returns what the wheels are
-told, with its reasons.  It imports neither a tracking library nor a web server; the simulator and the
-service on the robot call the same object.
+::
+
+    sample -> motion -> terrain -> target slip -> path tracking -> kinematics -> wheel speeds
+
+Neither a tracking library nor a web server is imported; the simulator and the service on the robot call the
+same object.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from pipelines.live.watch import Nobody, Watch, readable
+from pipelines.live.terrain_source import NoTerrain, TerrainSource, readable
 from terrain.constants import GRAVITY_MPS2
-from terrain.control.danzi_pid import new_state, thesis_settings, thesis_step
 from terrain.control.path_tracking import (
-    NO_POSE,
-    TrackSettings,
-    check_tracking,
+    PoseEstimate,
+    TrackReport,
+    TrackStatus,
     initial_tracking,
     track_step,
 )
-from terrain.control.path_tracking import SETTINGS as TRACKING
 from terrain.control.pid import Gains
 from terrain.control.slick import braking_by_slip
 from terrain.control.slip_table import SlipTable, load_slip_table
 from terrain.control.stability import check_stable
 from terrain.control.switching import (
-    NOTHING,
+    NO_BELIEF,
     SWITCHING,
-    Belief,
     SwitchSettings,
+    TerrainBelief,
     approach,
     check_switching,
-    hear,
+    update,
 )
-from terrain.control.traction import (
-    BAD_TIME,
-    MAX_STEP_S,
-    NO_SLIP,
-    OK,
-    SETTINGS,
-    STEADY,
-    Ground,
-    TractionSettings,
-    check_settings,
-    forget_ground,
-    initial_state,
-    traction_step,
-    with_driver,
+from terrain.control.tracking_settings import SETTINGS as TRACKING
+from terrain.control.tracking_settings import TrackSettings, check_tracking
+from terrain.control.traction_settings import SETTINGS, TractionSettings, TractionTarget
+from terrain.control.wheel_controllers import (
+    PERIOD_S,
+    UNOBSERVED,
+    RampController,
+    ThesisController,
+    TractionController,
+    WheelController,
+    WheelObserver,
+    WheelRequest,
+    estimate_age,
+    step_or_period,
 )
 from terrain.errors import ConfigError
 from terrain.estimation.live.estimator import LiveEstimate, LiveEstimator
 from terrain.extension import correct_live
 from terrain.kinematics.swerve import FAR_RAD, wheel_command_step
-from terrain.kinematics.wheel_velocity import in_wheel_frame, point_velocity
 from terrain.logs.schema import IMU_CHANNELS
 from terrain.records import Array, Command, Sample
-from terrain.robots import Robot, as_swerve
+from terrain.robots import Robot, SwerveRobot, as_swerve
 from terrain.slip import MIN_SPEED_MPS
 
 CONTROLLERS = ("plain", "ramp", "thesis", "traction")
-"""As the kinematics commands; with a bounded rise of speed; the thesis' PID on each wheel; ours."""
+"""Commands of the kinematics; with a bounded rise of speed; the thesis' PID on each wheel; the controller of
+:mod:`terrain.control.traction`."""
+
+OPEN_LOOP = ("plain", "ramp")
+"""Controllers that use no measurement."""
 
 THESIS_GAINS = Gains(0.5, 0.5, 0.0, limit=2.0)
-"""The thesis prints none; these are stable threefold on the simulated robot (``check_stable``)."""
+"""The thesis specifies none; these have a gain margin of 3 on the simulated robot (``check_stable``)."""
 
 MARGIN_MAX_RATIO = 0.06
-"""A table says by its targets of traction and of steady motion how much slip over the balance gives the pull
-that is worked with; up to this much is added to the balance that is measured.  More is a table that aims for
-a peak."""
-
-PERIOD_S = 0.02
-"""Of the loop; what is counted with where the clock gives no sense."""
+"""The difference of a table's targets in traction and in steady motion is the slip above the balance that
+gives the working pull; up to this much is added to the measured balance.  A larger difference is that of a
+table that aims for a peak."""
 
 _ROLL, _PITCH = IMU_CHANNELS.index("roll_rad"), IMU_CHANNELS.index("pitch_rad")
+_NOT_ESTIMATED = UNOBSERVED._replace(stale_s=math.nan)
+_NOT_TRACKED = TrackReport(math.nan, math.nan, 0.0, TrackStatus.NO_POSE)
 
 
 @dataclass(frozen=True, slots=True)
 class PilotSettings:
-    """How a pilot drives.
+    """Controller of a pilot and its settings.
 
     Parameters
     ----------
     controller : one of :data:`CONTROLLERS`
-    ramp_mps2 : rise of the speed of the fastest wheel, of ``ramp``
+    ramp_mps2 : largest rise of the speed of the fastest wheel, of ``ramp``
     traction, switching : of ``traction``
     gains, form : of ``thesis``
-    delay_s : from a sample to the wheel; what gains have to be stable with
-    track : hold heading and place to what the wanted twists add up to; not with ``plain`` and ``ramp``, which
-        know neither
-    tracking : of that
+    delay_s : from a sample to the wheel; the loops have to be stable with it
+    track : with path tracking; not with ``plain`` and ``ramp``, which estimate no pose
+    tracking : its settings
     """
 
     controller: str = "traction"
@@ -105,46 +108,78 @@ class PilotSettings:
     tracking: TrackSettings = TRACKING
 
 
+class PilotStatus(NamedTuple):
+    """Status of a step; its fields are the channels of the stream ``control``.
+
+    Parameters
+    ----------
+    status_code : :class:`terrain.control.traction.TractionStatus`
+    terrain_code : place of the current terrain in :attr:`LivePilot.terrains`; -1 where it is unknown
+    probability_ratio : of the current terrain
+    target_ratio, aimed_ratio : target slip, and the target with its floor
+    balance_ratio : slip of steady motion
+    slip_ratio, slip_std_ratio : largest slip of a wheel, and largest standard deviation
+    stale_s : time since the speed over ground was measured last
+    drive_state_code : :class:`terrain.control.power_state.DriveState`
+    driven_mps, desired_mps : commanded and desired speed of the fastest wheel
+    heading_error_rad, cross_track_m : of path tracking
+    track_status_code : :class:`terrain.control.path_tracking.TrackStatus`
+    """
+
+    status_code: float
+    terrain_code: float
+    probability_ratio: float
+    target_ratio: float
+    aimed_ratio: float
+    balance_ratio: float
+    slip_ratio: float
+    slip_std_ratio: float
+    stale_s: float
+    drive_state_code: float
+    driven_mps: float
+    desired_mps: float
+    heading_error_rad: float
+    cross_track_m: float
+    track_status_code: float
+
+
 @dataclass(slots=True)
 class _Memory:
-    """All that a pilot carries from step to step."""
+    """State of a pilot between two steps."""
 
-    steer: Array
-    traction: Array
-    thesis: Array
+    steer_rad: Array
     tracking: Array
     time_s: float = math.nan
-    driven_mps: float = 0.0
-    wheel: Array = field(default_factory=lambda: np.zeros(3))
-    belief: Belief = NOTHING
+    belief: TerrainBelief = NO_BELIEF
     target_ratio: float = math.nan
     estimate: LiveEstimate | None = None
     tilt_rad: tuple[float, float] = (0.0, 0.0)
 
 
 class LivePilot:
-    """Drive a robot through its wanted twists.
+    """Drive a robot along its desired twists.
 
     Parameters
     ----------
     robot : a swerve robot with all sections
     table : target slips
-    watch : who says what the ground is; nobody by default
-    settings : how to drive
-    steer_rad : (3,) where the steering was told to be last
+    source : of the current terrain; without one it stays unknown
+    settings : controller and its settings
+    steer_rad : (3,) last command of the steering
 
     Raises
     ------
     ConfigError
-        if the controller is unknown, a setting is none, the table is another robot's, or the gains make the
-        loop unstable at the robot's limits.
+        if the controller is unknown, a setting is not accepted, the table is another robot's, or the gains
+        make the loop unstable in the robot's range of operation.
 
     Examples
     --------
+    >>> from terrain.control.traction import TractionStatus
     >>> from terrain.robots import load_robot
     >>> pilot = LivePilot(load_robot("agrimaro"), load_slip_table())
     >>> command = pilot.step(Sample(0.0, np.array([0.5, 0.0, 0.0]), {}))  # nothing is known yet
-    >>> command.wheel_radps, command.status["status_code"] == NO_SLIP
+    >>> command.wheel_radps, command.status["status_code"] == TractionStatus.NO_SLIP
     (array([0.1, 0.1, 0.1]), True)
     """
 
@@ -152,133 +187,93 @@ class LivePilot:
         self,
         robot: Robot,
         table: SlipTable | None = None,
-        watch: Watch | None = None,
+        source: TerrainSource | None = None,
         settings: PilotSettings = PilotSettings(),
         steer_rad: Array | None = None,
     ) -> None:
-        if settings.controller not in CONTROLLERS:
-            raise ConfigError(
-                f"controller {settings.controller!r} is unknown: use one of {', '.join(CONTROLLERS)}"
-            )
-        robot = as_swerve(robot, "robot {name}: drive {drive!r} has no pilot, only 'swerve' has")
-        if not (math.isfinite(settings.ramp_mps2) and settings.ramp_mps2 > 0):
-            raise ConfigError(f"ramp_mps2 is {settings.ramp_mps2!r}, a number above zero is required")
         table = load_slip_table() if table is None else table
-        if table.robot and table.robot != robot.name:
-            raise ConfigError(
-                f"slip table {table.name}: is of the robot {table.robot!r}, not of {robot.name!r}"
-            )
-        check_switching(settings.switching)
-        if settings.track and settings.controller in ("plain", "ramp"):
-            raise ConfigError(
-                f"controller {settings.controller!r} knows no place: it cannot be held to a way"
-            )
-        if settings.controller == "thesis":
-            check_stable(robot, settings.gains, settings.form, settings.delay_s)
-        robot, correction = correct_live(robot)
-        self._robot, self._table, self._settings = robot, table, settings
-        self._watch = Nobody() if watch is None else watch
+        robot, correction = correct_live(check_pilot(robot, table, settings))
+        self._table, self._settings, self._radius_m = table, settings, robot.wheel_radius_m
+        self._source = NoTerrain() if source is None else source
         self._terrains = {terrain: index for index, terrain in enumerate(table.targets)}
         self._braking = {name: braking_by_slip(curve) for name, curve in table.curves.items()}
-        self._traction = with_driver(check_settings(settings.traction), robot)
-        self._thesis = thesis_settings(robot.wheel_radius_m, settings.gains, settings.form)
-        motors = robot.equipment.motors
-        self._per_amp_nm = motors.torque_constant_nmpa * motors.reduction_ratio * motors.efficiency_ratio
         self._positions_m = np.array(robot.wheel_positions_m)
         self._limits = (
             robot.wheel_radius_m,
-            motors.speed_max_radps,
+            robot.equipment.motors.speed_max_radps,
             robot.equipment.steering.rate_max_radps,
         )
-        self._blind = settings.controller in ("plain", "ramp")
-        self._estimator = None if self._blind else LiveEstimator(robot, correction=correction)
-        if self._estimator is not None:
+        self._controller = _wheel_controller(robot, settings)
+        self._estimator: LiveEstimator | None = None
+        if settings.controller not in OPEN_LOOP:
+            self._estimator = LiveEstimator(robot, correction=correction)
+            states = self._estimator.states
+            self._observer = WheelObserver(robot, [states.index(f"steer_{i}_rad") for i in robot.wheels])
             if settings.track:
                 self._tracking = check_tracking(robot, settings.tracking, settings.delay_s)
             pose = ("position_x_m", "position_y_m", "yaw_rad")
-            self._place_states = [self._estimator.states.index(state) for state in pose]
-            self._steer_states = [self._estimator.states.index(f"steer_{i}_rad") for i in robot.wheels]
+            self._pose_states = [states.index(state) for state in pose]
         steer = np.zeros(3) if steer_rad is None else np.array(steer_rad, dtype=np.float64)
-        self._now = _Memory(steer, initial_state(), new_state(), initial_tracking())
+        self._now = _Memory(steer, initial_tracking())
 
     @property
     def terrains(self) -> tuple[str, ...]:
-        """Entries of the table, by the number that the status ``terrain_ratio`` gives; -1 is unknown."""
+        """Entries of the table, in the order of the status ``terrain_code``."""
         return tuple(self._terrains)
 
     def step(self, sample: Sample) -> Command:
-        """Take what arrived, and return what the wheels are told; nothing that arrives makes it raise.
+        """Return the wheels' commands for a sample; whatever arrives, it does not raise.
 
-        The ``status`` holds ``status_code`` (:data:`terrain.control.traction.STATUS_NAMES`),
-        ``terrain_ratio`` and ``probability_ratio`` of the ground believed, ``target_ratio``, ``aimed_ratio``
-        (the target with its floor), ``balance_ratio``, ``slip_ratio``, ``slip_std_ratio``, ``stale_s``,
-        ``drive_state_ratio`` (place in ``slip_table.DRIVE_STATES``; -1 for not known), ``driven_mps`` and
-        ``desired_mps``; and, with ``track``, ``off_heading_rad`` and ``cross_track_m`` of the reference, and
-        ``track_ratio`` (:data:`terrain.control.path_tracking.STATUS_NAMES`).
+        Parameters
+        ----------
+        sample : readings since the step before, and the desired twist
+
+        Returns
+        -------
+        Command
+            its ``status`` has the fields of :class:`PilotStatus`
         """
-        now, robot = self._now, self._robot
-        dt_s = sample.time_s - now.time_s
+        now = self._now
         first = math.isnan(now.time_s) and math.isfinite(sample.time_s)
-        sound = first or 0.0 < dt_s <= MAX_STEP_S
+        dt_s = PERIOD_S if first else sample.time_s - now.time_s
         if math.isfinite(sample.time_s):
             now.time_s = sample.time_s
-        known_dt_s = dt_s if sound and not first else PERIOD_S
-        twist = np.asarray(sample.twist, dtype=np.float64)
-        if twist.shape != (3,) or not np.isfinite(twist).all():
-            twist = np.zeros(3)
-        self._perceive(sample)
-        target = self._target(known_dt_s)
-        twist, off = self._hold(twist, sample.time_s, dt_s if not first else PERIOD_S)
-        admitted, wheel, steer = wheel_command_step(
-            self._positions_m, *self._limits, known_dt_s, FAR_RAD, twist, now.steer
+        self._estimate(sample)
+        target = self._target(step_or_period(dt_s))
+        twist, tracked = self._track(_finite_twist(sample.twist), sample.time_s, dt_s)
+        admitted, wheel_radps, now.steer_rad = wheel_command_step(
+            self._positions_m, *self._limits, step_or_period(dt_s), FAR_RAD, twist, now.steer_rad
         )
-        now.steer = steer
-        desired_mps = float(np.abs(wheel).max()) * robot.wheel_radius_m
-        if self._blind:
-            told, said = self._ramp(wheel, desired_mps, known_dt_s)
-        else:
-            told, said = self._correct(sample.time_s, wheel, target, dt_s if not first else PERIOD_S)
-        status = {
-            "status_code": said[5],
-            "terrain_ratio": float(self._terrains.get(now.belief.terrain, -1)),
-            "probability_ratio": now.belief.probability,
-            "target_ratio": now.target_ratio,
-            "aimed_ratio": said[1],
-            "balance_ratio": said[2],
-            "slip_ratio": said[3],
-            "slip_std_ratio": said[6],
-            "stale_s": said[7],
-            "drive_state_ratio": said[4],
-            "driven_mps": said[0],
-            "desired_mps": desired_mps,
-            "off_heading_rad": off[0],
-            "cross_track_m": off[1],
-            "track_ratio": off[2],
-        }
-        scale = said[0] / desired_mps if desired_mps > 0.0 else 0.0
-        return Command(told, steer, admitted * scale, status)
-
-    def _hold(self, twist: Array, time_s: float, dt_s: float) -> tuple[Array, tuple[float, float, float]]:
-        """Return the twist that holds the way, and how far off it the robot is, and why nothing is held."""
-        now, seen = self._now, self._now.estimate
-        if not self._settings.track or self._estimator is None or seen is None:
-            return twist, (math.nan, math.nan, float(NO_POSE))
-        place, yaw = self._place_states[:2], self._place_states[2]
-        held, now.tracking, said = track_step(
-            self._tracking,
-            now.tracking,
-            twist,
-            seen.mean[place],
-            seen.mean[yaw],
-            np.array([seen.speed_x_mps, seen.speed_y_mps, seen.yaw_rate_radps]),
-            seen.std[yaw],
-            seen.reference_age_s + max(time_s - seen.time_s, 0.0),
-            dt_s,
+        desired_mps = float(np.abs(wheel_radps).max()) * self._radius_m
+        observed = (
+            _NOT_ESTIMATED if self._estimator is None else self._observer.observe(now.estimate, sample.time_s)
         )
-        return held, (float(said[0]), float(said[1]), float(said[3]))
+        entry = self._table.lookup(now.belief.terrain)
+        command_radps, done = self._controller.step(
+            WheelRequest(wheel_radps, desired_mps, target, entry, observed, dt_s)
+        )
+        status = PilotStatus(
+            float(done.status),
+            float(self._terrains.get(now.belief.terrain, -1)),
+            now.belief.probability,
+            now.target_ratio,
+            done.aimed_ratio,
+            done.balance_ratio,
+            done.slip_ratio,
+            float(observed.wheels.slip_std.max()),
+            observed.stale_s,
+            float(done.drive_state),
+            done.driven_mps,
+            desired_mps,
+            tracked.heading_error_rad,
+            tracked.cross_track_m,
+            float(tracked.status),
+        )
+        scale = done.driven_mps / desired_mps if desired_mps > 0.0 else 0.0
+        return Command(command_radps, now.steer_rad, admitted * scale, status._asdict())
 
-    def _perceive(self, sample: Sample) -> None:
-        """Estimate, and hear what the ground is."""
+    def _estimate(self, sample: Sample) -> None:
+        """Update the motion, the tilt, and the current terrain."""
         if self._estimator is None:
             return
         now = self._now
@@ -290,19 +285,21 @@ class LivePilot:
             roll, pitch = float(imu.values[-1, _ROLL]), float(imu.values[-1, _PITCH])
             if math.isfinite(roll) and math.isfinite(pitch):
                 now.tilt_rad = roll, pitch
-        believed = now.belief.terrain
-        for word in self._watch.hear(sample, estimates):
-            if self._watch.sure:
-                now.belief = Belief(word.terrain, word.probability, word.terrain, word.time_s, word.time_s)
-            else:
-                now.belief = hear(
-                    now.belief, word.time_s, word.terrain, word.probability, self._settings.switching
+        before = now.belief.terrain
+        for found in self._source.update(sample, estimates):
+            if self._source.certain:
+                now.belief = TerrainBelief(
+                    found.terrain, found.probability, found.terrain, found.time_s, found.time_s
                 )
-        if now.belief.terrain != believed:
-            now.traction = forget_ground(now.traction)
+            else:
+                now.belief = update(
+                    now.belief, found.time_s, found.terrain, found.probability, self._settings.switching
+                )
+        if now.belief.terrain != before:
+            self._controller.forget_terrain()
 
-    def _target(self, dt_s: float) -> Ground:
-        """Return what is aimed for, on its way from what was aimed for on the ground before."""
+    def _target(self, dt_s: float) -> TractionTarget:
+        """Return the slips to aim for; the target moves to that of the terrain at a bounded rate."""
         now = self._now
         entry = self._table.lookup(now.belief.terrain)
         now.target_ratio = approach(
@@ -311,89 +308,71 @@ class LivePilot:
         braking = self._braking.get(entry["traction"].terrain)
         margin = min(entry["traction"].slip_ratio - entry["steady"].slip_ratio, MARGIN_MAX_RATIO)
         if braking is None:
-            return Ground(now.target_ratio, margin_ratio=margin)
-        roll, pitch = now.tilt_rad
-        way = now.estimate
-        speed_mps = math.hypot(way.speed_x_mps, way.speed_y_mps) if way is not None else 0.0
-        uphill_mps2 = 0.0
-        if way is not None and speed_mps > MIN_SPEED_MPS:
-            along, across = way.speed_x_mps / speed_mps, way.speed_y_mps / speed_mps
-            uphill_mps2 = GRAVITY_MPS2 * (-math.sin(pitch) * along + math.sin(roll) * across)
-        mps2 = max(braking.mps2 + uphill_mps2, 0.0)
-        return Ground(now.target_ratio, braking.slip_ratio, mps2, margin)
+            return TractionTarget(now.target_ratio, margin_ratio=margin)
+        mps2 = max(braking.mps2 + _uphill_mps2(now.estimate, *now.tilt_rad), 0.0)
+        return TractionTarget(now.target_ratio, braking.slip_ratio, mps2, margin)
 
-    def _ramp(self, wheel: Array, desired_mps: float, dt_s: float) -> tuple[Array, tuple[float, ...]]:
-        now = self._now
-        rise = self._settings.ramp_mps2 * dt_s if self._settings.controller == "ramp" else math.inf
-        before_mps = now.driven_mps if float(wheel @ now.wheel) >= 0.0 else 0.0
-        now.wheel, now.driven_mps = wheel, min(desired_mps, before_mps + rise)
-        nan = math.nan
-        told = wheel * (now.driven_mps / desired_mps) if desired_mps > 0.0 else wheel
-        return told, (now.driven_mps, nan, nan, nan, float(STEADY), float(OK), nan, nan)
+    def _track(self, twist: Array, time_s: float, dt_s: float) -> tuple[Array, TrackReport]:
+        """Return the twist that keeps the path, and how far the robot is from it."""
+        now, seen = self._now, self._now.estimate
+        if not self._settings.track or seen is None:
+            return twist, _NOT_TRACKED
+        x, y, yaw = self._pose_states
+        mean = seen.mean
+        pose = PoseEstimate(
+            float(mean[x]), float(mean[y]), float(mean[yaw]), float(seen.std[yaw]), estimate_age(seen, time_s)
+        )
+        ground_twist = np.array([seen.speed_x_mps, seen.speed_y_mps, seen.yaw_rate_radps])
+        twist, now.tracking, report = track_step(
+            self._tracking, now.tracking, twist, pose, ground_twist, dt_s
+        )
+        return twist, report
 
-    def _correct(
-        self, time_s: float, wheel: Array, ground: Ground, dt_s: float
-    ) -> tuple[Array, tuple[float, ...]]:
-        now, robot = self._now, self._robot
-        seen = now.estimate
-        speed, gain, slip, std, torque = np.full((5, 3), math.nan)
-        stale_s = math.inf
-        if seen is not None:
-            stale_s = seen.reference_age_s + max(time_s - seen.time_s, 0.0)
-            steer = seen.mean[self._steer_states]
-            cos, sin = np.cos(steer), np.sin(steer)
-            x, y = self._positions_m.T
-            forward, left = point_velocity(seen.speed_x_mps, seen.speed_y_mps, seen.yaw_rate_radps, x, y)
-            speed, _ = in_wheel_frame(forward, left, cos, sin)
-            gain = seen.accel_x_mps2 * cos + seen.accel_y_mps2 * sin
-            fastest = np.maximum(np.abs(seen.wheel_speed_mps), np.abs(speed))
-            # a wheel stands by the filter's rate, which is not quite the reported one
-            standing = fastest < np.where(np.isnan(seen.slip_ratio), 2.0, 1.0) * MIN_SPEED_MPS
-            slip = np.where(standing & ~math.isinf(stale_s), 0.0, seen.slip_ratio)
-            std = np.where(standing, 0.0, seen.slip_std)
-            torque = seen.current_a * self._per_amp_nm
-        if self._settings.controller == "thesis":
-            return self._thesis_correct(wheel, speed, gain, slip, std, stale_s, dt_s)
-        told, now.traction, said = traction_step(
-            self._traction,
-            now.traction,
-            ground,
-            robot.wheel_radius_m,
-            wheel,
-            speed,
-            gain,
-            slip,
-            std,
-            stale_s,
-            torque,
-            dt_s,
-        )
-        return told, (*said.tolist(), float(std.max()), stale_s)
 
-    def _thesis_correct(
-        self, wheel: Array, speed: Array, gain: Array, slip: Array, std: Array, stale_s: float, dt_s: float
-    ) -> tuple[Array, tuple[float, ...]]:
-        now, settings = self._now, self._settings
-        entry = self._table.lookup(now.belief.terrain)
-        targets = np.array([entry[state].slip_ratio for state in ("traction", "braking", "steady")])
-        seen = now.estimate
-        if seen is None or stale_s > settings.traction.stale_max_s:
-            speed = np.full(3, math.nan)
-        rate = np.full(3, math.nan) if seen is None else seen.wheel_speed_mps / self._robot.wheel_radius_m
-        chassis_mps = math.nan if seen is None else math.hypot(seen.speed_x_mps, seen.speed_y_mps)
-        added, desired, drive, _, now.thesis = thesis_step(
-            self._thesis, now.thesis, wheel, rate, speed, gain, chassis_mps, targets, dt_s
+def check_pilot(robot: Robot, table: SlipTable, settings: PilotSettings) -> SwerveRobot:
+    """Return a robot that can be driven.
+
+    Raises
+    ------
+    ConfigError
+        as :class:`LivePilot` does, apart from the settings of traction and tracking.
+    """
+    if settings.controller not in CONTROLLERS:
+        raise ConfigError(
+            f"controller {settings.controller!r} is unknown: use one of {', '.join(CONTROLLERS)}"
         )
-        why = BAD_TIME if not 0.0 < dt_s <= MAX_STEP_S else OK if np.isfinite(desired).all() else NO_SLIP
-        driven_mps = float(np.abs(wheel + added).max()) * self._robot.wheel_radius_m
-        aimed, largest = (float(np.where(wheel < 0.0, -s, s).max()) for s in (desired, slip))
-        return wheel + added, (
-            driven_mps,
-            aimed,
-            math.nan,
-            largest,
-            float(drive[0]),
-            float(why),
-            float(std.max()),
-            stale_s,
-        )
+    swerve = as_swerve(robot, "robot {name}: drive {drive!r} has no pilot, only 'swerve' has")
+    if not (math.isfinite(settings.ramp_mps2) and settings.ramp_mps2 > 0):
+        raise ConfigError(f"ramp_mps2 is {settings.ramp_mps2!r}, a number above zero is required")
+    if table.robot and table.robot != robot.name:
+        raise ConfigError(f"slip table {table.name}: is of the robot {table.robot!r}, not of {robot.name!r}")
+    check_switching(settings.switching)
+    if settings.track and settings.controller in OPEN_LOOP:
+        raise ConfigError(f"controller {settings.controller!r} estimates no pose: it has no path tracking")
+    if settings.controller == "thesis":
+        check_stable(swerve, settings.gains, settings.form, settings.delay_s)
+    return swerve
+
+
+def _wheel_controller(robot: SwerveRobot, settings: PilotSettings) -> WheelController:
+    traction = TractionController(robot, settings.traction)  # checks the settings for every controller
+    if settings.controller == "traction":
+        return traction
+    if settings.controller == "thesis":
+        return ThesisController(robot, settings.gains, settings.form, settings.traction.stale_max_s)
+    return RampController(settings.ramp_mps2 if settings.controller == "ramp" else math.inf)
+
+
+def _finite_twist(twist: Array) -> Array:
+    """Return a desired twist (3,); zeros where it is none."""
+    twist = np.asarray(twist, dtype=np.float64)
+    return twist if twist.shape == (3,) and np.isfinite(twist).all() else np.zeros(3)
+
+
+def _uphill_mps2(estimate: LiveEstimate | None, roll_rad: float, pitch_rad: float) -> float:
+    """Return the deceleration by gravity along the motion: positive uphill, 0 at rest."""
+    speed_mps = 0.0 if estimate is None else math.hypot(estimate.speed_x_mps, estimate.speed_y_mps)
+    if estimate is None or not speed_mps > MIN_SPEED_MPS:
+        return 0.0
+    along, across = estimate.speed_x_mps / speed_mps, estimate.speed_y_mps / speed_mps
+    return GRAVITY_MPS2 * (-math.sin(pitch_rad) * along + math.sin(roll_rad) * across)

@@ -197,10 +197,10 @@ def _observe(
 @njit(cache=True)
 def _aimed_slip(state: Array, target_ratio: float, margin_ratio: float) -> float:
     """Return s*: no more than the balance and its margin, no less than the floor."""
-    aimed = target_ratio
+    aimed = float(target_ratio)
     if math.isfinite(state[_BALANCE]):
         aimed = min(aimed, max(state[_BALANCE], 0.0) + margin_ratio)
-    return max(aimed, state[_FLOOR])
+    return max(aimed, float(state[_FLOOR]))
 
 
 @njit(cache=True)

@@ -1,4 +1,4 @@
-"""What a classifier is shown live is what it was taught on, and nothing it is shown stops the robot."""
+"""Live windows of a classifier equal those of its training, and no input stops the loop."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from pipelines.classify.crossval import samples_of
 from pipelines.classify.settings import CrossvalSettings
 from pipelines.classify.train import model_info
 from pipelines.live.pilot import LivePilot
-from pipelines.live.watch import Classifier, Nobody, Told
+from pipelines.live.terrain_source import Classifier, KnownTerrain, NoTerrain
 from pipelines.models.model_files import TerrainModel
 from terrain.control.slip_table import load_slip_table
 from terrain.errors import DataError
@@ -27,7 +27,7 @@ TERRAINS = ("grass", "tiles")
 
 @pytest.fixture(scope="module")
 def model():
-    """Taught on two short runs of each of two grounds."""
+    """Trained on two short runs of each of two terrains."""
     runs = [
         enriched(
             estimate_run(simulate_run(ROBOT, terrain, "survey", 5, number, duration_s=25.0), ROBOT, "vio15")
@@ -49,19 +49,19 @@ def log():
 def estimated(run):
     """The run with the streams that ``enriched`` adds, of the estimator on the robot."""
     estimator = LiveEstimator(ROBOT)
-    told = [estimate for sample in replay(run) for estimate in estimator.step(sample.readings)]
-    time_s = [estimate.time_s for estimate in told]
+    estimates = [estimate for sample in replay(run) for estimate in estimator.step(sample.readings)]
+    time_s = [estimate.time_s for estimate in estimates]
     channels = ("speed_x_mps", "speed_y_mps", "yaw_rate_radps", "accel_x_mps2", "accel_y_mps2")
     streams = dict(with_wheel_speeds(run, ROBOT).streams)
-    streams["estimator"] = Stream(time_s, [[getattr(e, name) for name in channels] for e in told], channels)
-    slip = [estimate.slip_ratio for estimate in told]
+    streams["estimator"] = Stream(time_s, [[getattr(e, name) for name in channels] for e in estimates], channels)
+    slip = [estimate.slip_ratio for estimate in estimates]
     streams["slip"] = Stream(time_s, slip, tuple(f"slip_{i}_ratio" for i in (1, 2, 3)))
     return RunLog(run.run_id, run.robot, streams, run.labels)
 
 
 def live(classifier, run, change=lambda sample: sample):
-    """What a classifier says of a run told again, and the windows that it was shown."""
-    estimator, shown, words = LiveEstimator(ROBOT), [], []
+    """The outputs of a classifier for a replayed run, and its windows."""
+    estimator, shown, found = LiveEstimator(ROBOT), [], []
     push = classifier._stream.push
 
     def keep(*sample):
@@ -71,31 +71,31 @@ def live(classifier, run, change=lambda sample: sample):
 
     classifier._stream.push = keep
     for sample in map(change, replay(run)):
-        words += classifier.hear(sample, estimator.step(sample.readings))
-    return words, shown
+        found += classifier.update(sample, estimator.step(sample.readings))
+    return found, shown
 
 
-def test_live_windows_are_those_of_the_enriched_log_and_so_is_what_is_said(model, log):
-    words, shown = live(Classifier(model), log)
+def test_live_windows_and_outputs_equal_those_of_the_enriched_log(model, log):
+    found, shown = live(Classifier(model), log)
     batch = cut_windows([estimated(log)], model.rule, layout=model.layout).windows
-    assert len(shown) == len(batch) == len(words) > 5
+    assert len(shown) == len(batch) == len(found) > 5
     for k, window in enumerate(shown):
         assert window.start_s[0] == batch.start_s[k]
         for stream, values in batch.values.items():
             np.testing.assert_array_equal(window.values[stream][0], values[k], err_msg=stream)
     probability = model.recipe.predict_proba(batch)
     classes = model.recipe.classes_
-    assert [word.terrain for word in words] == [classes[best] for best in probability.argmax(axis=1)]
-    assert [word.probability for word in words] == pytest.approx(probability.max(axis=1), abs=1e-12)
+    assert [one.terrain for one in found] == [classes[best] for best in probability.argmax(axis=1)]
+    assert [one.probability for one in found] == pytest.approx(probability.max(axis=1), abs=1e-12)
     ends_s = batch.start_s + model.rule.length_s
-    late_s = np.array([word.time_s for word in words]) - ends_s
+    late_s = np.array([one.time_s for one in found]) - ends_s
     assert (np.abs(late_s) < 0.05).all()
 
 
-def test_a_pilot_comes_to_believe_it(model, log):
-    driver = LivePilot(ROBOT, load_slip_table(), Classifier(model))
-    believed = [driver.step(sample).status["terrain_ratio"] for sample in replay(log)]
-    assert driver.terrains[int(believed[-1])] == "grass"
+def test_a_pilot_accepts_the_classification(model, log):
+    pilot = LivePilot(ROBOT, load_slip_table(), Classifier(model))
+    believed = [pilot.step(sample).status["terrain_code"] for sample in replay(log)]
+    assert pilot.terrains[int(believed[-1])] == "grass"
     assert set(believed) == {-1.0, believed[-1]}
 
 
@@ -115,22 +115,22 @@ WIDTHS = {"wheels": 6, "imu": 9}
         lambda width: Reading(None, None),
     ],
 )
-def test_readings_that_are_none_cost_windows_and_no_more(model, log, make):
+def test_invalid_readings_cost_windows_and_no_more(model, log, make):
     def spoil(sample):
         if not 9.0 <= sample.time_s < 9.1:
             return sample
         return sample._replace(readings={name: make(width) for name, width in WIDTHS.items()})
 
-    words, _ = live(Classifier(model), log, spoil)
+    found, _ = live(Classifier(model), log, spoil)
     whole, _ = live(Classifier(model), log)
-    assert [word[:2] for word in words[-3:]] == [word[:2] for word in whole[-3:]]
-    assert [word.probability for word in words[-3:]] == pytest.approx(
-        [word.probability for word in whole[-3:]], abs=0.01
+    assert [one[:2] for one in found[-3:]] == [one[:2] for one in whole[-3:]]
+    assert [one.probability for one in found[-3:]] == pytest.approx(
+        [one.probability for one in whole[-3:]], abs=0.01
     )
-    assert len(whole) - 2 <= len(words) <= len(whole)
+    assert len(whole) - 2 <= len(found) <= len(whole)
 
 
-def test_a_window_that_the_model_refuses_is_counted_and_no_error(model, log):
+def test_a_window_that_the_model_refuses_is_counted_and_raises_nothing(model, log):
     class Refusing:
         classes_ = model.recipe.classes_
         asked = 0
@@ -142,15 +142,15 @@ def test_a_window_that_the_model_refuses_is_counted_and_no_error(model, log):
             return model.recipe.predict_proba(windows)
 
     classifier = Classifier(model._replace(recipe=Refusing()))
-    words, shown = live(classifier, log)
+    found, shown = live(classifier, log)
     assert classifier.failed == {"Input X contains NaN.": (len(shown) + 1) // 2}
-    assert len(words) == len(shown) // 2
+    assert len(found) == len(shown) // 2
 
 
 @pytest.mark.parametrize(
     ("stream", "channel"), [("imu", "accel_q_mps2"), ("gnss", "speed_x_mps"), ("estimator", "speed_z_mps")]
 )
-def test_a_model_that_wants_what_is_not_made_live_is_refused(model, stream, channel):
+def test_a_model_that_requires_a_missing_channel_is_refused(model, stream, channel):
     channels = dict(model.info["channels"])
     channels[stream] = [*channels.get(stream, []), channel]
     rates = {**model.info["rate_hz"], stream: 50.0}
@@ -158,18 +158,19 @@ def test_a_model_that_wants_what_is_not_made_live_is_refused(model, stream, chan
     with pytest.raises(DataError) as refused:
         Classifier(wanting)
     assert (
-        str(refused.value) == f"the model wants {channel!r} of the stream {stream!r}, which is not made live"
+        str(refused.value)
+        == f"the model requires {channel!r} of the stream {stream!r}, which is not computed live"
     )
 
 
-def test_who_is_told_says_each_change_once_and_who_is_nobody_nothing():
-    told = Told(lambda ground: {"clay": "grass"}.get(ground, ground))
-    grounds = ["", "clay", "clay", "", "clay", "snow", "snow", ""]
-    samples = [Sample(float(k), np.zeros(3), {}, ground) for k, ground in enumerate(grounds)]
-    said = [word for sample in samples for word in told.hear(sample, [])]
-    assert [(word.time_s, word.terrain, word.probability) for word in said] == [
+def test_a_known_terrain_is_given_once_a_change_and_no_terrain_never():
+    known = KnownTerrain(lambda terrain: {"clay": "grass"}.get(terrain, terrain))
+    terrains = ["", "clay", "clay", "", "clay", "snow", "snow", ""]
+    samples = [Sample(float(k), np.zeros(3), {}, terrain) for k, terrain in enumerate(terrains)]
+    found = [one for sample in samples for one in known.update(sample, [])]
+    assert [(one.time_s, one.terrain, one.probability) for one in found] == [
         (1.0, "grass", 1.0),
         (5.0, "snow", 1.0),
     ]
-    assert not any(Nobody().hear(sample, []) for sample in samples)
-    assert (told.sure, Nobody.sure, Classifier.sure) == (True, False, False)
+    assert not any(NoTerrain().update(sample, []) for sample in samples)
+    assert (known.certain, NoTerrain.certain, Classifier.certain) == (True, False, False)

@@ -1,4 +1,4 @@
-"""Who says what ground it is: a classifier on live windows, somebody who knows, or nobody."""
+"""Sources of the current terrain: a classifier on live windows, a known terrain, or none."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from terrain.logs.schema import IMU_CHANNELS
 from terrain.records import Array, Reading, Sample
 
 
-class Word(NamedTuple):
-    """What was said of the ground, and with which probability; an empty terrain is doubt."""
+class TerrainEstimate(NamedTuple):
+    """Terrain at a time, and its probability; an empty terrain is unknown."""
 
     time_s: float
     terrain: str
@@ -34,49 +34,49 @@ def readable(reading: Reading | None, n_columns: int) -> Reading | None:
     return Reading(time_s, values) if fits else None
 
 
-class Watch(Protocol):
-    """Says what the ground is, now and then; ``sure``: each word is believed at once."""
+class TerrainSource(Protocol):
+    """Gives the terrain from time to time; ``certain``: each output is accepted at once."""
 
-    sure: bool
+    certain: bool
 
-    def hear(self, sample: Sample, estimates: Sequence[LiveEstimate]) -> list[Word]:
-        """Take what arrived and what was made of it; return what is to be said, mostly nothing."""
+    def update(self, sample: Sample, estimates: Sequence[LiveEstimate]) -> list[TerrainEstimate]:
+        """Take a sample and the estimates made from it; return the terrains found, in most steps none."""
         ...
 
 
-class Nobody:
-    """Says nothing: the table's fallback stands in for every ground."""
+class NoTerrain:
+    """No source: the terrain stays unknown, and the table's fallback is used."""
 
-    sure = False
+    certain = False
 
-    def hear(self, sample: Sample, estimates: Sequence[LiveEstimate]) -> list[Word]:
+    def update(self, sample: Sample, estimates: Sequence[LiveEstimate]) -> list[TerrainEstimate]:
         """Return nothing."""
         return []
 
 
-class Told:
-    """Says what somebody knows who is never in doubt, at once and at every change.
+class KnownTerrain:
+    """The true terrain of the samples, at every change of it.
 
     Parameters
     ----------
-    name_of : from the true ground to what is said of it, to be wrong on purpose
+    name_of : from the true terrain to the one that is given, to be wrong on purpose
     """
 
-    sure = True
+    certain = True
 
     def __init__(self, name_of: Callable[[str], str] = str) -> None:
         self._name_of = name_of
-        self._said = ""
+        self._last = ""
 
-    def hear(self, sample: Sample, estimates: Sequence[LiveEstimate]) -> list[Word]:
-        """Return the ground of the sample where it is another than before."""
-        if not sample.terrain or sample.terrain == self._said:
+    def update(self, sample: Sample, estimates: Sequence[LiveEstimate]) -> list[TerrainEstimate]:
+        """Return the terrain of the sample where it has changed."""
+        if not sample.terrain or sample.terrain == self._last:
             return []
-        self._said = sample.terrain
-        return [Word(sample.time_s, self._name_of(sample.terrain), 1.0)]
+        self._last = sample.terrain
+        return [TerrainEstimate(sample.time_s, self._name_of(sample.terrain), 1.0)]
 
 
-_MADE: dict[str, Callable[[LiveEstimate], Array]] = {
+_COMPUTED: dict[str, Callable[[LiveEstimate], Array]] = {
     "wheels": lambda estimate: np.concatenate(
         [estimate.motor_radps, estimate.current_a, estimate.wheel_speed_mps]
     ),
@@ -102,10 +102,10 @@ _COLUMNS: dict[str, tuple[str, ...]] = {
 
 
 class Classifier:
-    """Says what a model makes of each live window, cut as the model was taught.
+    """The output of a model for each live window, cut as the windows of its training.
 
-    Windows are made of what ``pipelines.estimate.estimate.enriched`` writes into a log, live: wheel speeds
-    beside motor rates, the estimator's states, slip, and the IMU.
+    Windows hold the channels that ``pipelines.estimate.estimate.enriched`` adds to a log, computed live:
+    wheel speeds beside motor rates, the estimator's states, slip, and the IMU.
 
     Parameters
     ----------
@@ -113,15 +113,15 @@ class Classifier:
 
     Attributes
     ----------
-    failed : windows that the model refused, by why
+    failed : number of windows that the model refused, by error message
 
     Raises
     ------
     DataError
-        if the model wants a stream or a channel that is not made live.
+        if the model requires a stream or a channel that is not computed live.
     """
 
-    sure = False
+    certain = False
 
     def __init__(self, model: TerrainModel) -> None:
         layout = model.layout
@@ -129,7 +129,7 @@ class Classifier:
             lacking = sorted(set(channels) - set(_COLUMNS.get(stream, ())))
             if lacking:
                 raise DataError(
-                    f"the model wants {lacking[0]!r} of the stream {stream!r}, which is not made live"
+                    f"the model requires {lacking[0]!r} of the stream {stream!r}, which is not computed live"
                 )
         self._recipe: Any = model.recipe
         self._classes = [str(name) for name in model.recipe.classes_]
@@ -140,25 +140,25 @@ class Classifier:
         }
         self.failed: Counter[str] = Counter()
 
-    def hear(self, sample: Sample, estimates: Sequence[LiveEstimate]) -> list[Word]:
-        """Return a word for each window that is complete by now."""
+    def update(self, sample: Sample, estimates: Sequence[LiveEstimate]) -> list[TerrainEstimate]:
+        """Return the terrain of each window that is complete by now."""
         windows = []
         imu = readable(sample.readings.get("imu"), len(IMU_CHANNELS))
         if imu is not None and "imu" in self._columns:
             for time_s, values in zip(imu.time_s.tolist(), imu.values[:, self._columns["imu"]], strict=True):
                 windows += self._stream.push("imu", time_s, values)
         for estimate in estimates:
-            for stream, made in _MADE.items():
+            for stream, compute in _COMPUTED.items():
                 if stream in self._columns:
-                    values = made(estimate)[self._columns[stream]]
+                    values = compute(estimate)[self._columns[stream]]
                     windows += self._stream.push(stream, estimate.time_s, values)
-        words = []
+        found: list[TerrainEstimate] = []
         for window in windows:
             try:
                 probability = self._recipe.predict_proba(window)[0]
-            except (ValueError, DataError) as error:  # a window of broken samples must not stop the robot
+            except (ValueError, DataError) as error:  # a window of broken samples must not stop the loop
                 self.failed[str(error)] += 1
                 continue
             best = int(probability.argmax())
-            words.append(Word(sample.time_s, self._classes[best], float(probability[best])))
-        return words
+            found.append(TerrainEstimate(sample.time_s, self._classes[best], float(probability[best])))
+        return found
