@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pipelines.cli import classify, estimate, explain, quickstart, reproduce, runs
+from pipelines.cli import classify, drive, estimate, explain, quickstart, reproduce, runs
 from terrain.errors import ConfigError, TerrainError
 
 if TYPE_CHECKING:
@@ -51,11 +51,10 @@ Align = Annotated[
     typer.Option("--align", help="Bring the wheel stream onto the IMU's clock where both see the turns."),
 ]
 Jobs = Annotated[int, typer.Option(min=0, help="Processes at once; 0 for one a core.")]
-DRIVE_CONTROLLERS = ("plain", "ramp", "thesis", "fixed", "learned", "oracle")
 MAX_GRADE_DEG = 30.0
 
 
-GROUPS = (runs.app, estimate.app, classify.app, explain.app, reproduce.app, quickstart.app)
+GROUPS = (runs.app, estimate.app, classify.app, drive.app, explain.app, reproduce.app, quickstart.app)
 """Files of commands, in the order of help."""
 
 
@@ -125,116 +124,6 @@ def calibrate_command(
     _write_json(json_file, result)
 
 
-@app.command("drive")
-def drive_command(
-    robot: Annotated[str, typer.Option(help="Robot by name, or its YAML file.")] = "agrimaro",
-    scenario: Annotated[
-        str,
-        typer.Option(
-            help="starts, straight, slope (the steepest; else level), brake, circle, crab; course and mixed "
-            "on the terrain 'course'; or any of simulate."
-        ),
-    ] = "starts",
-    terrain: Annotated[
-        str, typer.Option(help="Name of a soil, its YAML file, or 'course' for all.")
-    ] = "grass",
-    controllers: Annotated[
-        str,
-        typer.Option(
-            help="By commas: plain, ramp, thesis, fixed, learned, oracle, told:NAME (always told that "
-            "ground), target:SLIP; ours also as NAME+track, held to its way."
-        ),
-    ] = ",".join(DRIVE_CONTROLLERS),
-    table: Annotated[
-        Path | None, typer.Option(help="Table of target slips; the packaged one by default.")
-    ] = None,
-    model: Annotated[
-        str | None,
-        typer.Option(help="Classifier of 'learned': models:/NAME@champion or a folder; taught anew without."),
-    ] = None,
-    seeds: Annotated[int, typer.Option(min=1, help="Days: draws of load, soil, tyres and noise.")] = 20,
-    seed: Annotated[int, typer.Option(min=0, help="The first of them.")] = 0,
-    delay: Annotated[float, typer.Option(help="From a sample to the wheel in s.")] = 0.05,
-    ramp: Annotated[
-        float | None,
-        typer.Option(help="Rise of speed of 'ramp' in m/s^2; without, as fast as gets as far as ours."),
-    ] = None,
-    duration: Annotated[float | None, typer.Option(help="Length of a drive in s.")] = None,
-    speed: Annotated[float, typer.Option(help="Cruising speed in m/s.")] = 1.0,
-    accel: Annotated[float, typer.Option(help="Rise of the wanted speed in m/s^2; inf for a step.")] = 1.0,
-    grade: Annotated[float, typer.Option(help="Slope in degrees, uphill > 0.")] = 0.0,
-    radius: Annotated[
-        str | None,
-        typer.Option(help="True radius of each wheel over the believed one, as in 1,1.02,1; drawn without."),
-    ] = None,
-    leg_backlash: Annotated[float, typer.Option(help="Play of the third leg in rad.")] = 0.0,
-    plant: Annotated[
-        str | None, typer.Option(help="Robot as it really is, where it is not what --robot believes.")
-    ] = None,
-    out: Annotated[Path | None, typer.Option(help="Folder of the page with its pictures.")] = None,
-    jobs: Jobs = 0,
-    json_file: Json = None,
-) -> None:
-    """Drive controllers side by side in the closed loop, and compare what it costs."""
-    import os
-
-    from pipelines.drive.controllers import taught_classifier
-    from pipelines.drive.drive import DriveSettings, drive, example_runs
-    from pipelines.reporting.screens import print_drive, progress_bar
-    from terrain.control.slip_table import load_slip_table
-    from terrain.robots import load_robot
-
-    if not abs(grade) <= MAX_GRADE_DEG:
-        raise ConfigError(
-            f"--grade is {grade:g}; {-MAX_GRADE_DEG:g} to {MAX_GRADE_DEG:g} degrees are accepted"
-        )
-    described = load_robot(robot)
-    slip_table = load_slip_table(table, described.name)
-    settings = DriveSettings(
-        scenario=scenario,
-        terrain=terrain,
-        controllers=tuple(name.strip() for name in controllers.split(",") if name.strip()),
-        seeds=seeds,
-        first_seed=seed,
-        delay_s=delay,
-        ramp_mps2=ramp,
-        duration_s=duration,
-        speed_mps=speed,
-        accel_mps2=accel,
-        grade_deg=grade,
-        radius_factors=_radii(radius),
-        leg_backlash_rad=leg_backlash,
-        plant=None if plant is None else load_robot(plant),
-    )
-    settings.check(described, slip_table)
-    needs_model = any(name.partition("+")[0] == "learned" for name in settings.controllers)
-    if model is not None and not needs_model:
-        raise ConfigError("--model is the classifier of 'learned', which is not among the controllers")
-    if out is not None:
-        from terrain.files.atomic import ensure_writable
-
-        ensure_writable(out)
-    with progress_bar() as progress:
-        classifier = None
-        if needs_model:
-            if model is None:
-                classifier = taught_classifier(described, seed, progress)
-            else:
-                from pipelines.models.tracking import load_model
-
-                classifier = load_model(model)
-        result = drive(described, slip_table, settings, classifier, progress, jobs or os.cpu_count() or 1)
-        if out is not None:
-            from pipelines.drive.page import write_drive_page
-
-            examples = example_runs(described, slip_table, settings, result["ramp_mps2"], classifier)
-            write_drive_page(out, result, examples, slip_table)
-    print_drive(result, _console())
-    if out is not None:
-        typer.echo(f"page: {out / 'drive.html'}")
-    _write_json(json_file, result)
-
-
 def _console() -> Any:
     from rich.console import Console
 
@@ -252,19 +141,6 @@ def _load(
     return load_runs(
         data, layout=layout.value, mapping=mapping, repair=repair, align=align, on_skip=skipped.append
     ), skipped
-
-
-def _radii(text: str | None) -> tuple[float, float, float] | None:
-    """Read ``A,B,C``."""
-    if text is None:
-        return None
-    try:
-        one, two, three = (float(part) for part in text.split(","))
-    except ValueError:
-        one = two = three = 0.0
-    if not all(0.5 <= ratio <= 2.0 for ratio in (one, two, three)):
-        raise ConfigError(f"--radius is {text!r}; three ratios from 0.5 to 2 are required, as in 1,1.02,1")
-    return one, two, three
 
 
 def _checked(path: Path | None) -> Path | None:

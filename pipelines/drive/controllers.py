@@ -1,77 +1,117 @@
-"""Who drives in ``terrain drive``: from a controller's name to a pilot with its table and its watch."""
+"""Controllers of ``terrain drive``: from a name to a pilot with its table and its terrain source."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from enum import Enum
 
-from pipelines.drive.drives import Situation
+from pipelines.drive.controller_names import BASELINES, CONTROLLERS, TRACK
 from pipelines.live.pilot import LivePilot, PilotSettings
-from pipelines.live.watch import Classifier, Nobody, Told, Watch
+from pipelines.live.terrain_source import Classifier, KnownTerrain, NoTerrain, TerrainSource
 from pipelines.models.model_files import TerrainModel
 from pipelines.reporting.progress import Progress, silent
+from terrain.control.situations import Situation
 from terrain.control.slip_table import SlipTable
 from terrain.errors import ConfigError
 from terrain.records import RunLog, SlipTarget
 from terrain.robots import Robot
 from terrain.simulation.dynamic.simulate import simulate
 
-CONTROLLERS = ("plain", "ramp", "thesis", "fixed", "learned", "oracle")
-"""Commands as they are; with a bounded rise; the thesis' PID on the table's fallback; ours on the fallback,
-on what a classifier says, on the true ground.  Also ``told:NAME``, ours and always told that ground, and
-``target:0.2``, ours with that target; and each of ours with ``+track``: held to its way."""
+DEFAULT_RAMP_MPS2 = PilotSettings().ramp_mps2
+
+
+class Source(Enum):
+    """Where a controller has the current terrain from."""
+
+    NONE = "none"
+    CLASSIFIER = "classifier"
+    TRUTH = "truth"
+    KNOWN = "known"
 
 
 @dataclass(frozen=True, slots=True)
-class Driver:
-    """What a controller's name stands for.
+class Controller:
+    """What the name of a controller stands for.
 
     Parameters
     ----------
     name : as given
-    pilot : how it drives
-    table : targets that it looks up
-    says : ``nobody``, ``classifier``, ``truth``, or the name of the ground that it is told
+    pilot : its settings
+    table : its targets
+    source : of the current terrain
+    known_terrain : given to the pilot on every terrain, where the source is ``KNOWN``
     """
 
     name: str
     pilot: PilotSettings
     table: SlipTable
-    says: str = "nobody"
+    source: Source = Source.NONE
+    known_terrain: str = ""
+
+    @property
+    def adapts(self) -> bool:
+        """Whether its target follows the terrain."""
+        return self.source in (Source.CLASSIFIER, Source.TRUTH)
 
 
-def make_driver(name: str, table: SlipTable, delay_s: float, ramp_mps2: float = 0.5) -> Driver:
-    """Return a driver by name.
+@dataclass(frozen=True, slots=True, eq=False)
+class DriveInputs:
+    """Robots and models of a comparison.
+
+    Parameters
+    ----------
+    robot : as the controllers assume it
+    table : target slips
+    model : classifier of ``classified``
+    plant : the simulated robot, where it is another one
+    """
+
+    robot: Robot
+    table: SlipTable
+    model: TerrainModel | None = None
+    plant: Robot | None = None
+
+    @property
+    def simulated(self) -> Robot:
+        """The robot that is simulated."""
+        return self.plant or self.robot
+
+
+def make_controller(
+    name: str, table: SlipTable, delay_s: float, ramp_mps2: float = DEFAULT_RAMP_MPS2
+) -> Controller:
+    """Return a controller by name.
 
     Raises
     ------
     ConfigError
-        if there is none of that name, or its ground or target is none.
+        if there is none of that name, or its terrain or target is none.
     """
-    bare, track, rest = name.partition("+track")
+    bare, track, rest = name.partition(TRACK)
     if track and not rest:
-        driver = make_driver(bare, table, delay_s, ramp_mps2)
-        return replace(driver, name=name, pilot=replace(driver.pilot, track=True))
-    kind, _, what = name.partition(":")
-    ours = PilotSettings(delay_s=delay_s)
-    if name in ("plain", "ramp", "thesis"):
-        return Driver(name, replace(ours, controller=name, ramp_mps2=ramp_mps2), table)
-    if name in ("fixed", "learned", "oracle"):
-        says = {"fixed": "nobody", "learned": "classifier", "oracle": "truth"}[name]
-        return Driver(name, ours, table, says)
-    if kind == "told" and what:
-        if what not in table.targets:
-            raise ConfigError(f"controller {name!r}: the table {table.name} has no entry {what!r}")
-        return Driver(name, ours, table, what)
+        controller = make_controller(bare, table, delay_s, ramp_mps2)
+        return replace(controller, name=name, pilot=replace(controller.pilot, track=True))
+    kind, _, given = name.partition(":")
+    traction = PilotSettings(delay_s=delay_s)
+    if name in BASELINES:
+        return Controller(name, replace(traction, controller=name, ramp_mps2=ramp_mps2), table)
+    sources = {"fallback": Source.NONE, "classified": Source.CLASSIFIER, "true_terrain": Source.TRUTH}
+    if name in sources:
+        return Controller(name, traction, table, sources[name])
+    if kind == "known" and given:
+        if given not in table.targets:
+            raise ConfigError(f"controller {name!r}: the table {table.name} has no entry {given!r}")
+        return Controller(name, traction, table, Source.KNOWN, given)
     if kind == "target":
-        return Driver(name, ours, _only(table, name, what))
+        return Controller(name, traction, _single_target(table, name, given))
     raise ConfigError(
-        f"controller {name!r} is unknown: use {', '.join(CONTROLLERS)}, told:NAME, target:SLIP; +track"
+        f"controller {name!r} is unknown: use {', '.join(CONTROLLERS)}, known:NAME, target:SLIP; {TRACK}"
     )
 
 
-def _only(table: SlipTable, name: str, slip: str) -> SlipTable:
-    """Return a table whose fallback has one target, and nothing else."""
+def _single_target(table: SlipTable, name: str, slip: str) -> SlipTable:
+    """Return a table whose only entry is its fallback, with one target."""
     try:
         ratio = float(slip)
     except ValueError:
@@ -83,16 +123,17 @@ def _only(table: SlipTable, name: str, slip: str) -> SlipTable:
     return replace(table, targets={table.fallback: entry}, curves={}, reasons={})
 
 
-def taught_classifier(
+def train_classifier(
     robot: Robot, seed: int, progress: Progress = silent, runs_a_terrain: int | None = None
 ) -> TerrainModel:
-    """Return a classifier that was taught on simulated labelled runs of a robot.
+    """Return a classifier that was trained on simulated labelled runs of a robot.
 
     Parameters
     ----------
     robot : swerve robot
-    seed : of the runs; they are no drives of ``terrain drive``, whatever its seeds
-    runs_a_terrain : how many; those of ``terrain quickstart`` by default
+    seed : of the runs; they differ from the drives of ``terrain drive`` at any seed
+    progress : of the runs and the training
+    runs_a_terrain : number of runs; that of ``terrain quickstart`` by default
     """
     from pipelines.classify.crossval import samples_of
     from pipelines.classify.labelled import RUNS_A_TERRAIN, labelled_runs
@@ -103,49 +144,44 @@ def taught_classifier(
     settings = CrossvalSettings(seed=seed)
     windows = samples_of(runs, settings).cut.windows
     recipe = settings.new_recipe()
-    progress("teach", 0, 1)
+    progress("train", 0, 1)
     recipe.fit(windows, windows.terrain.astype(str))
-    progress("teach", 1, 1)
+    progress("train", 1, 1)
     return TerrainModel(recipe, model_info(runs, settings, windows, "simulated", ""))
 
 
 def drive_once(
-    robot: Robot,
-    driver: Driver,
-    where: Situation,
-    delay_s: float,
-    model: TerrainModel | None = None,
-    run_id: str = "drive",
-    plant: Robot | None = None,
+    inputs: DriveInputs, controller: Controller, situation: Situation, run_id: str = "drive"
 ) -> RunLog:
     """Return the log of one drive, the pilot's status in its stream ``control``.
 
     Raises
     ------
     ConfigError
-        if the driver needs a classifier and there is none.
+        if the controller needs a classifier and there is none.
     """
-    pilot = LivePilot(robot, driver.table, _watch(driver, model), driver.pilot)
+    source = _terrain_source(controller, inputs.model)
+    pilot = LivePilot(inputs.robot, controller.table, source, controller.pilot)
     return simulate(
-        plant or robot,
-        where.scenario,
-        where.soils,
-        where.seed,
+        inputs.simulated,
+        situation.scenario,
+        situation.soils,
+        situation.seed,
         run_id=run_id,
-        conditions=where.conditions,
-        faults=where.faults,
+        conditions=situation.conditions,
+        faults=situation.faults,
         controller=pilot.step,
-        command_delay_s=delay_s,
+        command_delay_s=controller.pilot.delay_s,
     )
 
 
-def _watch(driver: Driver, model: TerrainModel | None) -> Watch:
-    if driver.says == "nobody":
-        return Nobody()
-    if driver.says == "truth":
-        return Told()
-    if driver.says != "classifier":
-        return Told(lambda _: driver.says)
+def _terrain_source(controller: Controller, model: TerrainModel | None) -> TerrainSource:
+    if controller.source is Source.NONE:
+        return NoTerrain()
+    if controller.source is Source.TRUTH:
+        return KnownTerrain()
+    if controller.source is Source.KNOWN:
+        return KnownTerrain(lambda _: controller.known_terrain)
     if model is None:
-        raise ConfigError("controller 'learned' needs a classifier: give a model")
+        raise ConfigError("controller 'classified' needs a classifier: give a model")
     return Classifier(model)

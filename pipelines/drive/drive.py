@@ -1,428 +1,264 @@
-"""``terrain drive``: controllers side by side in the closed loop, on the same ground, days and noise."""
+"""``terrain drive``: controllers side by side in the closed loop, in the same situations."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import t as student
 
-from pipelines.drive.controllers import CONTROLLERS, Driver, drive_once, make_driver
-from pipelines.drive.drives import (
-    SLOPE,
-    Situation,
-    brake_time,
-    changes_of,
-    desired_until,
-    situation,
-    start_times,
+from pipelines.drive.controller_names import TRACK
+from pipelines.drive.controllers import (
+    DEFAULT_RAMP_MPS2,
+    Controller,
+    DriveInputs,
+    Source,
+    drive_once,
+    make_controller,
+    train_classifier,
 )
-from pipelines.live.pilot import LivePilot, PilotSettings
-from pipelines.models.model_files import TerrainModel
+from pipelines.drive.results import DriveResult
+from pipelines.drive.settings import DriveSettings
+from pipelines.live.pilot import LivePilot
 from pipelines.reporting.progress import Progress, silent
-from terrain.control.drive_metrics import (
-    Course,
-    adapt_times,
-    course_of,
-    distance_after,
-    energy_to,
-    final_speed,
-    immobilised,
-    lock_s,
-    roughness,
-    slip_peak,
-    standing_from,
-    stop_distance,
+from terrain.control.comparison import mean_interval
+from terrain.control.drive_evaluation import (
+    START_TIME_S,
+    EnergyCurve,
+    energy_at_equal_distance,
+    energy_curve,
+    evaluate_drive,
 )
-from terrain.control.slip_table import SlipTable
+from terrain.control.drive_metrics import drive_history
+from terrain.control.situations import SLOPE, STARTS, Situation, SituationOptions, make_situation
+from terrain.control.slip_table import load_slip_table
 from terrain.errors import ConfigError
 from terrain.records import RunLog
-from terrain.robots import Robot
+from terrain.robots import load_robot
 
-FIRST_M = 4.0
-"""Way of a start over which energy is compared."""
+STEEPEST_DEG, SLOPE_STEPS = 25.0, 9
+"""Range of the search for the steepest grade, and its bisections: to a tenth of a degree."""
 
-AFTER_S = 5.0
-"""Time of a start after which distance is."""
+CLIMBING_MPS = 0.05
+"""A robot that is faster than this in the last second climbs."""
 
-TARGET_CHANGE = 0.02
-"""Targets that differ by less count as one."""
+LEAST_RAMP_MPS2, MOST_RAMP_MPS2, RAMP_STEPS = 0.1, 10.0, 7
+"""Range of the search for the matching ramp (up to twice the desired rise, where that is finite), and its
+bisections."""
 
-STEEPEST_DEG = 25.0
-SLOPE_STEPS = 8
-
-KEYS = (
-    "energy_j_per_m",
-    "distance_m",
-    "mean_speed_mps",
-    "final_speed_mps",
-    "slip_peak",
-    "lock_s",
-    "scrub_j",
-    "immobilised",
-    "adapt_s",
-)
-"""What each controller is judged by, everywhere; the others are of some scenarios."""
+REFERENCES = ("true_terrain", "classified", "fallback")
+"""Controllers whose distance the ramp matches: the first of them that is driven."""
 
 
-@dataclass(frozen=True, slots=True)
-class DriveSettings:
-    """What is driven.
+class Drive(NamedTuple):
+    """Metrics of one drive by name, and its energy over distance."""
 
-    Parameters
-    ----------
-    scenario, terrain : as :func:`pipelines.drive.drives.situation`
-    controllers : of :data:`CONTROLLERS`
-    seeds : how many days, from ``first_seed`` on
-    first_seed : the first of them
-    delay_s : from a sample to the wheel
-    ramp_mps2 : of the fixed ramp; without, as fast as gets as far as the best of ours
-    duration_s, speed_mps, accel_mps2, grade_deg, radius_factors : of the scenario
-    leg_backlash_rad : play of the third leg
-    plant : the robot as it is, where that is not what the controllers believe
+    metrics: dict[str, float]
+    energy: EnergyCurve
+
+
+def load_inputs(settings: DriveSettings) -> DriveInputs:
+    """Return robots and table, without a classifier.
+
+    Raises
+    ------
+    TerrainError
+        if one cannot be read, or the table is another robot's.
     """
-
-    scenario: str = "starts"
-    terrain: str = "grass"
-    controllers: tuple[str, ...] = CONTROLLERS
-    seeds: int = 20
-    first_seed: int = 0
-    delay_s: float = 0.05
-    ramp_mps2: float | None = None
-    duration_s: float | None = None
-    speed_mps: float = 1.0
-    accel_mps2: float = 1.0
-    grade_deg: float = 0.0
-    radius_factors: tuple[float, float, float] | None = None
-    leg_backlash_rad: float = 0.0
-    plant: Robot | None = None
-
-    def check(self, robot: Robot, table: SlipTable) -> None:
-        """Refuse what cannot be driven, before anything is.
-
-        Raises
-        ------
-        ConfigError
-            if a controller, a number, the scenario or the terrain is not accepted.
-        """
-        if not self.controllers:
-            raise ConfigError("no controller is named")
-        repeated = {name for name in self.controllers if self.controllers.count(name) > 1}
-        if repeated:
-            raise ConfigError(f"controllers name {min(repeated)!r} twice")
-        if self.seeds < 1:
-            raise ConfigError(f"seeds is {self.seeds}, at least 1 is required")
-        if not 0.0 <= self.delay_s <= 0.5:
-            raise ConfigError(f"delay_s is {self.delay_s!r}, 0 to 0.5 s are accepted")
-        if self.scenario == SLOPE and self.grade_deg:
-            raise ConfigError("scenario 'slope' looks for the steepest grade itself: leave the grade out")
-        ramp_mps2 = PilotSettings().ramp_mps2 if self.ramp_mps2 is None else self.ramp_mps2
-        for name in self.controllers:
-            driver = make_driver(name, table, self.delay_s, ramp_mps2)
-            LivePilot(robot, driver.table, None, driver.pilot)
-        self.situation(robot, self.first_seed)
-
-    def situation(self, robot: Robot, seed: int, grade_deg: float | None = None) -> Situation:
-        """Return what is driven on the day of a seed."""
-        return situation(
-            self.scenario,
-            self.plant or robot,
-            self.terrain,
-            seed,
-            duration_s=self.duration_s,
-            speed_mps=self.speed_mps,
-            accel_mps2=self.accel_mps2,
-            grade_deg=self.grade_deg if grade_deg is None else grade_deg,
-            radius_factors=self.radius_factors,
-            leg_backlash_rad=self.leg_backlash_rad,
-        )
+    robot = load_robot(settings.robot)
+    plant = None if settings.plant is None else load_robot(settings.plant)
+    return DriveInputs(robot, load_slip_table(settings.table, robot.name), plant=plant)
 
 
-def judge(run: RunLog, course: Course, robot: Robot, where: Situation, driver: Driver) -> dict[str, float]:
-    """Return what a drive is judged by, but energy at equal distance; NaN where it has none of it.
+def with_classifier(settings: DriveSettings, inputs: DriveInputs, progress: Progress = silent) -> DriveInputs:
+    """Return the inputs with the classifier of the settings, or a newly trained one, where one is needed."""
+    if not settings.needs_model:
+        return inputs
+    if settings.model is None:
+        return replace(inputs, model=train_classifier(inputs.robot, settings.first_seed, progress))
+    from pipelines.models.tracking import load_model
 
-    ``robot`` is the one that drove, whatever its controller believed, ``course`` what it did.
-    """
-    commands, control = run.streams["commands"], run.streams["control"]
-    starts = start_times(where.scenario)
-    row = {
-        "distance_m": float(course.distance_m[-1]),
-        "mean_speed_mps": float(course.progress_mps.mean()),
-        "final_speed_mps": final_speed(course),
-        "slip_peak": slip_peak(course),
-        "lock_s": lock_s(course),
-        "scrub_j": float(course.scrub_j[-1]),
-        "scrub_along_j": float(course.scrub_along_j[-1]),
-        "immobilised": float(immobilised(course, control)),
-        "adapt_s": math.nan,
-        "adapted_ratio": math.nan,
-        "slip_error_ratio": _slip_error(run),
-        "sinkage_m": float(course.sinkage_m.mean()),
-        "command_mps2": roughness(commands) * robot.wheel_radius_m,
-        "yaw_drift_rad": float(abs(course.yaw_rad[-1] - course.yaw_rad[0])),
-    }
-    changes = _changes(run, driver)
-    if changes and driver.says in ("classifier", "truth"):
-        times = np.array(adapt_times(control, changes))
-        row["adapted_ratio"] = float(np.isfinite(times).mean())
-        row["adapt_s"] = float(np.nanmean(times)) if np.isfinite(times).any() else math.nan
-    if where.scenario.name == "starts":
-        row |= _starts(course, starts)
-    if where.scenario.name == "brake":
-        told_s = brake_time(where.scenario)
-        row["stop_m"] = stop_distance(course, told_s)
-        row["lock_s"] = lock_s(course, told_s, standing_from(course, told_s))
-    return row
+    return replace(inputs, model=load_model(settings.model))
 
 
-def _changes(run: RunLog, driver: Driver) -> list[tuple[float, float]]:
-    """Return when the ground asked for another target, and which; one that stays asks for nothing."""
-    found, before = [], math.nan
-    for time_s, ground in [(0.0, run.labels[0].terrain), *changes_of(run.labels)] if run.labels else []:
-        desired = driver.table.lookup(ground)["traction"].slip_ratio
-        if abs(desired - before) > TARGET_CHANGE:
-            found.append((time_s, desired))
-        before = desired
-    return found
-
-
-def _slip_error(run: RunLog) -> float:
-    """Return how far slip was from what was aimed for while speed was held back; NaN without an aim."""
-    control = run.streams["control"]
-    if "aimed_ratio" not in control.channels or "slip_ratio" not in control.channels:
-        return math.nan
-    held = control.channel("driven_mps") < control.channel("desired_mps") - 1e-6
-    error = np.abs(control.channel("slip_ratio") - control.channel("aimed_ratio"))[held]
-    return float(np.nanmean(error)) if np.isfinite(error).any() else math.nan
-
-
-def _starts(course: Course, starts: Sequence[float]) -> dict[str, float]:
-    """Judge the first start, before which nothing is known but the class, and the mean of those after it."""
-    rows = []
-    for start_s in starts:
-        within = (course.time_s >= start_s) & (course.time_s < start_s + 7.0)
-        rows.append(
-            {
-                "slip_peak": slip_peak(course, within),
-                f"distance_{AFTER_S:g}s_m": distance_after(course, start_s, AFTER_S),
-                f"energy_{FIRST_M:g}m_j": energy_to(course, FIRST_M, start_s),
-            }
-        )
-    first, later = rows[0], rows[1:]
-    return {
-        **{f"first_{key}": value for key, value in first.items()},
-        **{key: float(np.mean([row[key] for row in later])) for key in first},
-    }
-
-
-def drive(
-    robot: Robot,
-    table: SlipTable,
-    settings: DriveSettings,
-    model: TerrainModel | None = None,
-    progress: Progress = silent,
-    n_jobs: int = 2,
-) -> dict[str, Any]:
-    """Drive all controllers through the same days, and judge them.
-
-    Parameters
-    ----------
-    robot : swerve robot
-    table : targets
-    settings : what is driven
-    model : classifier, for ``learned``
-    progress : told of each drive
-    n_jobs : processes
-
-    Returns
-    -------
-    dict that JSON can hold
-        ``scenario, terrain, robot, table, seeds, delay_s, ramp_mps2`` and ``controllers``: by name, each of
-        :data:`KEYS` and more with its ``mean``, ``ci`` (95 %, Student's law over seeds) and ``n``; ``rows``,
-        the same a day, None where a day has none.
+def check_drive(settings: DriveSettings, inputs: DriveInputs) -> None:
+    """Refuse what cannot be driven.
 
     Raises
     ------
     ConfigError
-        if an option is not accepted.
+        if a controller does not exist on the robot or the table, or the situation does not.
     """
-    settings.check(robot, table)
-    ramp = settings.ramp_mps2
-    named = [name for name in settings.controllers if name != "ramp"]
-    drivers = {name: make_driver(name, table, settings.delay_s) for name in named}
-    if model is None and any(driver.says == "classifier" for driver in drivers.values()):
-        raise ConfigError("controller 'learned' needs a classifier: give a model")
-    seeds = range(settings.first_seed, settings.first_seed + settings.seeds)
-    n = len(seeds) * len(settings.controllers)
-    rows = _drive_all(robot, list(drivers.values()), settings, seeds, model, n_jobs, progress, (0, n))
-    if "ramp" in settings.controllers:
-        if ramp is None:
-            ramp = _matching_ramp(robot, table, settings, rows, n_jobs)
-        driver = make_driver("ramp", table, settings.delay_s, ramp)
-        done = len(seeds) * len(drivers)
-        rows |= _drive_all(robot, [driver], settings, seeds, model, n_jobs, progress, (done, n))
-    _share_distance(rows)
+    for controller in _controllers(settings, inputs, settings.controllers):
+        LivePilot(inputs.robot, controller.table, None, controller.pilot)
+    _situation(settings, inputs, settings.first_seed)
+
+
+def drive(settings: DriveSettings, inputs: DriveInputs, progress: Progress = silent) -> DriveResult:
+    """Drive all controllers at the same seeds, and evaluate them.
+
+    Parameters
+    ----------
+    settings : what is driven
+    inputs : robots, table, and the classifier where a controller needs one
+    progress : of the drives
+
+    Raises
+    ------
+    ConfigError
+        if a setting is not accepted.
+    """
+    check_drive(settings, inputs)
+    names = settings.controllers
+    controllers = _controllers(settings, inputs, [name for name in names if name != "ramp"])
+    if inputs.model is None and any(one.source is Source.CLASSIFIER for one in controllers):
+        raise ConfigError("controller 'classified' needs a classifier: give a model")
+    count = _counter(progress, settings.seeds * len(names))
+    drives = _drive_all(settings, inputs, controllers, count)
+    ramp_mps2 = None
+    if "ramp" in names:
+        ramp_mps2 = settings.ramp_mps2
+        if ramp_mps2 is None:
+            ramp_mps2 = _matching_ramp(settings, inputs, drives)
+        drives |= _drive_all(settings, inputs, _controllers(settings, inputs, ["ramp"], ramp_mps2), count)
+    for at_one_seed in zip(*drives.values(), strict=True):
+        energies = energy_at_equal_distance([one.energy for one in at_one_seed])
+        for one, energy in zip(at_one_seed, energies, strict=True):
+            one.metrics["energy_j_per_m"] = energy
+    rows = {name: tuple(one.metrics for one in drives[name]) for name in names}
+    return DriveResult(
+        scenario=settings.scenario,
+        terrain=settings.terrain,
+        robot=inputs.robot.name,
+        table=inputs.table.name,
+        seeds=tuple(_seeds(settings)),
+        delay_s=settings.delay_s,
+        grade_deg=settings.grade_deg,
+        ramp_mps2=ramp_mps2,
+        controllers={
+            name: {key: mean_interval([row[key] for row in rows[name]]) for key in rows[name][0]}
+            for name in names
+        },
+        rows=rows,
+    )
+
+
+def example_runs(settings: DriveSettings, inputs: DriveInputs, ramp_mps2: float | None) -> dict[str, RunLog]:
+    """Return the drive of each controller at the first seed."""
+    situation = _situation(settings, inputs, settings.first_seed)
     return {
-        "scenario": settings.scenario,
-        "terrain": settings.terrain,
-        "robot": robot.name,
-        "table": table.name,
-        "seeds": list(seeds),
-        "delay_s": settings.delay_s,
-        "grade_deg": settings.grade_deg,
-        "ramp_mps2": ramp if "ramp" in settings.controllers else None,
-        "controllers": {
-            name: {
-                key: _figure([row[key] for row in rows[name]]) for key in rows[name][0] if key != "_energy"
-            }
-            for name in settings.controllers
-        },
-        "rows": {
-            name: [
-                {key: _known(value) for key, value in row.items() if key != "_energy"} for row in rows[name]
-            ]
-            for name in settings.controllers
-        },
+        one.name: drive_once(inputs, one, situation, one.name)
+        for one in _controllers(settings, inputs, settings.controllers, ramp_mps2)
     }
 
 
-def _known(value: float) -> float | None:
-    return value if math.isfinite(value) else None
+def _seeds(settings: DriveSettings) -> range:
+    return range(settings.first_seed, settings.first_seed + settings.seeds)
+
+
+def _situation(
+    settings: DriveSettings, inputs: DriveInputs, seed: int, grade_deg: float | None = None
+) -> Situation:
+    options = SituationOptions(
+        duration_s=settings.duration_s,
+        speed_mps=settings.speed_mps,
+        accel_mps2=settings.accel_mps2,
+        grade_deg=settings.grade_deg if grade_deg is None else grade_deg,
+        radius_factors=settings.radius_factors,
+        leg_backlash_rad=settings.leg_backlash_rad,
+    )
+    return make_situation(settings.scenario, inputs.simulated, settings.terrain, seed, options)
+
+
+def _controllers(
+    settings: DriveSettings, inputs: DriveInputs, names: Sequence[str], ramp_mps2: float | None = None
+) -> list[Controller]:
+    ramp_mps2 = settings.ramp_mps2 if ramp_mps2 is None else ramp_mps2
+    ramp_mps2 = DEFAULT_RAMP_MPS2 if ramp_mps2 is None else ramp_mps2
+    return [make_controller(name, inputs.table, settings.delay_s, ramp_mps2) for name in names]
+
+
+def _counter(progress: Progress, total: int) -> Callable[[], None]:
+    """Return a function that reports one drive more."""
+    done = 0
+
+    def count() -> None:
+        nonlocal done
+        done += 1
+        progress("drive", done, total)
+
+    return count
 
 
 def _drive_all(
-    robot: Robot,
-    drivers: Sequence[Driver],
     settings: DriveSettings,
-    seeds: Sequence[int],
-    model: TerrainModel | None,
-    n_jobs: int,
-    progress: Progress,
-    count: tuple[int, int],
-) -> dict[str, list[dict[str, Any]]]:
+    inputs: DriveInputs,
+    controllers: Sequence[Controller],
+    count: Callable[[], None],
+) -> dict[str, list[Drive]]:
+    """Return the drives of each controller, one a seed, in as many processes as the settings say."""
     from joblib import Parallel, delayed
 
-    jobs = [(driver, seed) for seed in seeds for driver in drivers]
-    rows: dict[str, list[dict[str, Any]]] = {driver.name: [] for driver in drivers}
-    pool = Parallel(n_jobs=max(min(n_jobs, len(jobs)), 1), return_as="generator")
+    jobs = [(controller, seed) for seed in _seeds(settings) for controller in controllers]
+    drives: dict[str, list[Drive]] = {controller.name: [] for controller in controllers}
+    pool = Parallel(n_jobs=max(min(settings.n_jobs, len(jobs)), 1), return_as="generator")
+    without_model = replace(inputs, model=None)  # which is large to send to another process
     work = pool(
-        delayed(_job)(robot, driver, settings, seed, model if driver.says == "classifier" else None)
-        for driver, seed in jobs
-    )
-    for done, ((driver, _), row) in enumerate(zip(jobs, work, strict=True)):
-        rows[driver.name].append(row)
-        progress("drive", count[0] + done + 1, count[1])
-    return rows
-
-
-def _job(
-    robot: Robot,
-    driver: Driver,
-    settings: DriveSettings,
-    seed: int,
-    model: TerrainModel | None,
-) -> dict[str, Any]:
-    where = settings.situation(robot, seed)
-    run = drive_once(robot, driver, where, settings.delay_s, model, plant=settings.plant)
-    plant = settings.plant or robot
-    course = course_of(run, plant, where.conditions.radius_factors)
-    row: dict[str, Any] = judge(run, course, plant, where, driver)
-    if settings.scenario == SLOPE:
-        row["steepest_deg"] = steepest(robot, driver, settings, seed, model)
-    driven = course.time_s <= desired_until(where.scenario)  # a coast after the last stop costs nothing
-    row["_energy"] = (np.maximum.accumulate(course.distance_m[driven]), course.energy_j[driven])
-    return row
-
-
-def steepest(
-    robot: Robot, driver: Driver, settings: DriveSettings, seed: int, model: TerrainModel | None = None
-) -> float:
-    """Return the steepest grade in degrees that a driver climbs, by bisection to a tenth of a degree."""
-    low, high = -STEEPEST_DEG, STEEPEST_DEG
-    for _ in range(SLOPE_STEPS + 1):
-        middle = (low + high) / 2
-        run = drive_once(
-            robot,
-            driver,
-            settings.situation(robot, seed, middle),
-            settings.delay_s,
-            model,
-            plant=settings.plant,
+        delayed(_drive_one)(
+            settings, inputs if controller.source is Source.CLASSIFIER else without_model, controller, seed
         )
-        truth = run.streams["truth"]
+        for controller, seed in jobs
+    )
+    for (controller, _), one in zip(jobs, work, strict=True):
+        drives[controller.name].append(one)
+        count()
+    return drives
+
+
+def _drive_one(settings: DriveSettings, inputs: DriveInputs, controller: Controller, seed: int) -> Drive:
+    situation = _situation(settings, inputs, seed)
+    run = drive_once(inputs, controller, situation)
+    history = drive_history(run, inputs.simulated, situation.conditions.radius_factors)
+    adapting_to = controller.table if controller.adapts else None
+    metrics = evaluate_drive(run, history, inputs.simulated, situation, adapting_to)
+    if settings.scenario == SLOPE:
+        metrics["steepest_deg"] = steepest(settings, inputs, controller, seed)
+    return Drive(metrics, energy_curve(history, situation.scenario))
+
+
+def steepest(settings: DriveSettings, inputs: DriveInputs, controller: Controller, seed: int) -> float:
+    """Return the steepest grade in degrees that a controller climbs, by bisection."""
+    low, high = -STEEPEST_DEG, STEEPEST_DEG
+    for _ in range(SLOPE_STEPS):
+        middle = (low + high) / 2
+        truth = drive_once(inputs, controller, _situation(settings, inputs, seed, middle)).streams["truth"]
         last = truth.time_s > truth.time_s[-1] - 1.0
-        low, high = (middle, high) if truth.channel("speed_x_mps")[last].mean() > 0.05 else (low, middle)
+        climbs = truth.channel("speed_x_mps")[last].mean() > CLIMBING_MPS
+        low, high = (middle, high) if climbs else (low, middle)
     return low
 
 
 def _matching_ramp(
-    robot: Robot,
-    table: SlipTable,
-    settings: DriveSettings,
-    rows: Mapping[str, Sequence[Mapping[str, Any]]],
-    n_jobs: int,
+    settings: DriveSettings, inputs: DriveInputs, drives: Mapping[str, Sequence[Drive]]
 ) -> float:
-    """Return the ramp that gets as far as the first of ours among the controllers, on the same days."""
-    kinds = ("oracle", "learned", "fixed")
-    ours = [name for kind in kinds for name in rows if name in (kind, f"{kind}+track")]
-    others = [name for name in rows if name.startswith(("told:", "target:"))]
-    if not ours + others:
-        return PilotSettings().ramp_mps2
-    key = f"distance_{AFTER_S:g}s_m" if settings.scenario == "starts" else "distance_m"
-    desired = np.mean([row[key] for row in rows[(ours + others)[0]]])
-    seeds = range(settings.first_seed, settings.first_seed + settings.seeds)
-    low, high = 0.1, 2.0 * settings.accel_mps2 if math.isfinite(settings.accel_mps2) else 10.0
-    for _ in range(7):
+    """Return the ramp that travels as far as the first reference among the controllers, at the same seeds."""
+    references = [name for kind in REFERENCES for name in drives if name in (kind, f"{kind}{TRACK}")]
+    references += [name for name in drives if name.startswith(("known:", "target:"))]
+    if not references:
+        return DEFAULT_RAMP_MPS2
+    key = f"distance_{START_TIME_S:g}s_m" if settings.scenario == STARTS else "distance_m"
+
+    def distance_m(found: Sequence[Drive]) -> float:
+        return float(np.mean([one.metrics[key] for one in found]))
+
+    desired_m = distance_m(drives[references[0]])
+    low = LEAST_RAMP_MPS2
+    high = 2.0 * settings.accel_mps2 if math.isfinite(settings.accel_mps2) else MOST_RAMP_MPS2
+    for _ in range(RAMP_STEPS):
         middle = math.sqrt(low * high)
-        driver = make_driver("ramp", table, settings.delay_s, middle)
-        got = _drive_all(robot, [driver], settings, seeds, None, n_jobs, silent, (0, 1))
-        short = np.mean([row[key] for row in got["ramp"]]) < desired
+        ramp = _controllers(settings, inputs, ["ramp"], middle)
+        short = distance_m(_drive_all(settings, inputs, ramp, lambda: None)["ramp"]) < desired_m
         low, high = (middle, high) if short else (low, middle)
     return math.sqrt(low * high)
-
-
-def _share_distance(rows: Mapping[str, list[dict[str, Any]]]) -> None:
-    """Add ``energy_j_per_m``, over the way that all made that day who made half of the longest.
-
-    It depends on who else is driven, as the way does; one who made less than half has none that day.
-    """
-    for day in zip(*rows.values(), strict=True):
-        ways = [float(row["_energy"][0][-1]) for row in day]
-        shared = min(way for way in ways if way >= max(ways) / 2)
-        for row, way in zip(day, ways, strict=True):
-            distance, energy = row["_energy"]
-            row["energy_j_per_m"] = (
-                float(np.interp(shared, distance, energy) / shared) if way >= shared > 0.0 else math.nan
-            )
-
-
-def example_runs(
-    robot: Robot,
-    table: SlipTable,
-    settings: DriveSettings,
-    ramp_mps2: float | None = None,
-    model: TerrainModel | None = None,
-) -> dict[str, RunLog]:
-    """Return each controller's drive on the first day, to be looked at."""
-    where = settings.situation(robot, settings.first_seed)
-    ramp = PilotSettings().ramp_mps2 if ramp_mps2 is None else ramp_mps2
-    drivers = [make_driver(name, table, settings.delay_s, ramp) for name in settings.controllers]
-    return {
-        driver.name: drive_once(robot, driver, where, settings.delay_s, model, driver.name, settings.plant)
-        for driver in drivers
-    }
-
-
-def _figure(values: Sequence[float]) -> dict[str, Any]:
-    """Return mean and 95 % interval of a figure over days; None where no day has it."""
-    known = np.array([value for value in values if math.isfinite(value)])
-    if not known.size:
-        return {"mean": None, "ci": None, "n": 0}
-    mean = float(known.mean())
-    if known.size == 1:
-        return {"mean": mean, "ci": None, "n": 1}
-    half = float(student.ppf(0.975, known.size - 1) * known.std(ddof=1) / math.sqrt(known.size))
-    return {"mean": mean, "ci": [mean - half, mean + half], "n": int(known.size)}

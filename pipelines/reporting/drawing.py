@@ -29,6 +29,13 @@ BARE = {"facecolor": "white", "edgecolor": "none", "pad": 0.7}
 """Behind a text that would else be crossed by lines of the grid."""
 CLASS_COLOURS = (BLUE, "#e69f00", "#009e73", "#cc79a7", "#56b4e9", VERMILION, "#8c8c8c")
 """Okabe and Ito (2008), without black and yellow, and grey: told apart by colour-blind readers, too."""
+_, ORANGE, GREEN, PINK, SKY, _, GREY = CLASS_COLOURS
+
+LAW_NAMES = {"janosi": "Janosi and Hanamoto", "magic": "Magic Formula"}
+"""Of the laws of thrust over slip."""
+
+LARGEST_THRUST_RATIO = 1.3
+"""Thrust over load up to which curves are drawn."""
 
 STYLE = {
     "font.family": ["DejaVu Sans"],

@@ -63,33 +63,3 @@ def print_learned_slip(result: dict[str, Any], console: Console) -> None:
 
 def _figure(value: float | None, form: str) -> str:
     return "-" if value is None else form.format(value)
-
-
-def print_drive(result: dict[str, Any], console: Console) -> None:
-    """Print what each controller's drives cost, with their 95 % intervals over days."""
-    ramp = result["ramp_mps2"]
-    console.print(
-        f"{result['robot']}, {result['scenario']} on {result['terrain']}, "
-        f"days: {len(result['seeds'])}, table "
-        f"{result['table']}, delay {result['delay_s']:g} s"
-        + (f", ramp {ramp:.2f} m/s^2" if ramp is not None else ""),
-        highlight=False,
-    )
-    controllers = result["controllers"]
-    table = Table(title="mean over days, with its 95 % interval")
-    table.add_column("", no_wrap=True)
-    for name in controllers:
-        table.add_column(name, overflow="fold")
-    for key in next(iter(controllers.values())):
-        figures = [controllers[name][key] for name in controllers]
-        if all(figure["mean"] is None for figure in figures):
-            continue
-        table.add_row(key, *(_with_interval(figure) for figure in figures))
-    console.print(table)
-
-
-def _with_interval(figure: dict[str, Any]) -> str:
-    if figure["mean"] is None:
-        return "-"
-    half = f" ± {(figure['ci'][1] - figure['ci'][0]) / 2:.2g}" if figure["ci"] else ""
-    return f"{figure['mean']:.4g}{half}"

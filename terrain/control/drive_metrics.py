@@ -103,7 +103,7 @@ def drive_history(
     for i, wheel in enumerate(wheels):
         if f"slip_{wheel}_ratio" in truth.channels:  # a slip that is never defined has no channel
             signed[:, i] = truth.channel(f"slip_{wheel}_ratio")
-    slip = _smooth(np.nan_to_num(signed * np.sign(ground)), step_s)
+    slip = low_passed_slip(traction_slip(signed, rate), step_s)
     slip[np.isnan(signed)] = np.nan
     sinkage = np.column_stack([truth.channel(f"sinkage_{wheel}_m") for wheel in wheels])
     return DriveHistory(
@@ -140,9 +140,25 @@ def _progress(time_s: Array, velocity: Array, commands: Stream | None) -> Array:
     return np.asarray(along)
 
 
-def _smooth(values: Array, step_s: float) -> Array:
+def traction_slip(slip_ratio: Array, wheel_radps: Array) -> Array:
+    """Return slip that is positive in traction in both directions, from slip signed along the wheel.
+
+    The sign is that of the speed over ground: the sign of the wheel's rate, but opposite where the magnitude
+    of slip is above 1, as the wheel then turns against the motion; a locked wheel only brakes.
+
+    Examples
+    --------
+    >>> traction_slip(np.array([0.2, -0.2, -1.1, 1.0]), np.array([5.0, -5.0, -1.0, 0.0]))
+    array([ 0.2,  0.2, -1.1, -1. ])
+    """
+    direction = np.where(np.abs(slip_ratio) > 1.0, -np.sign(wheel_radps), np.sign(wheel_radps))
+    return np.asarray(slip_ratio * np.where(wheel_radps == 0.0, -np.sign(slip_ratio), direction))
+
+
+def low_passed_slip(slip_ratio: Array, step_s: float) -> Array:
+    """Return slip (n, wheels) behind the low-pass of its estimate; NaN counts as 0."""
     keep = math.exp(-step_s / SMOOTH_S)
-    return np.asarray(lfilter([1.0 - keep], [1.0, -keep], values, axis=0))
+    return np.asarray(lfilter([1.0 - keep], [1.0, -keep], np.nan_to_num(slip_ratio), axis=0))
 
 
 def slip_peak(history: DriveHistory, within: Array | None = None) -> float:

@@ -30,7 +30,7 @@ from terrain.control.traction_settings import (
     check_settings,
     with_motor_driver,
 )
-from terrain.estimation.live import LiveEstimate
+from terrain.estimation.live.estimator import LiveEstimate
 from terrain.records import Array, SlipTarget
 from terrain.robots import Robot
 from terrain.slip import MIN_SPEED_MPS

@@ -11,12 +11,12 @@ from functools import cache
 import numpy as np
 import pytest
 
-from pipelines.drive.controllers import drive_once, make_controller
-from pipelines.drive.drives import situation, start_times
+from pipelines.drive.controllers import DriveInputs, drive_once, make_controller
 from pipelines.live.pilot import CONTROLLERS, LivePilot, PilotSettings
 from pipelines.live.terrain_source import KnownTerrain
 from terrain.control.drive_metrics import distance_within, drive_history, final_speed, slip_peak
 from terrain.control.pid import Gains
+from terrain.control.situations import SituationOptions, make_situation, start_times
 from terrain.control.slip_table import CurveEntry, load_slip_table
 from terrain.control.traction import TractionStatus
 from terrain.control.traction_settings import SETTINGS
@@ -225,10 +225,10 @@ def test_a_known_terrain_moves_the_target_at_its_rate():
 @cache
 def driven(name, scenario, terrain, seed, faults=None, **options):
     """A drive of that controller and its situation."""
-    where = situation(scenario, ROBOT, terrain, seed, **options)
+    where = make_situation(scenario, ROBOT, terrain, seed, SituationOptions(**options))
     if faults is not None:
         where = where._replace(faults=faults)
-    return drive_once(ROBOT, make_controller(name, TABLE, DELAY_S), where, DELAY_S), where
+    return drive_once(DriveInputs(ROBOT, TABLE), make_controller(name, TABLE, DELAY_S), where), where
 
 
 def history(name, scenario, terrain, seed, **options):
@@ -254,7 +254,9 @@ def test_a_lost_camera_is_bridged_for_a_second_and_then_reported(lost_s):
     control = run.streams["control"]
     time_s, why = control.time_s, control.channel("status_code")
     assert set(why[(time_s > 2.0) & (time_s < 5.0)]) == {TractionStatus.OK}
-    assert not (set(why[(time_s > 6.0) & (time_s < lost_s[1])]) - {TractionStatus.STALE, TractionStatus.UNCERTAIN})
+    assert not (
+        set(why[(time_s > 6.0) & (time_s < lost_s[1])]) - {TractionStatus.STALE, TractionStatus.UNCERTAIN}
+    )
     assert set(why[(time_s > 7.2) & (time_s < lost_s[1])]) <= {TractionStatus.STALE}
     assert set(why[time_s > lost_s[1] + 0.5]) == {TractionStatus.OK}
     lost = (time_s > lost_s[0]) & (time_s < lost_s[1])
@@ -288,7 +290,7 @@ def test_without_any_camera_the_plain_command_is_driven():
 @pytest.mark.parametrize("seed", SEEDS)
 def test_a_start_on_grass_slips_less_and_travels_nearly_as_far(seed):
     plain, limited = (history(name, "starts", "grass", seed) for name in ("plain", "known:grass"))
-    starts = start_times(situation("starts", ROBOT, "grass", seed).scenario)
+    starts = start_times(make_situation("starts", ROBOT, "grass", seed).scenario)
     for start_s in starts[1:]:
         within = (plain.time_s >= start_s) & (plain.time_s < start_s + 7)
         assert slip_peak(plain, within) > 1.5 * slip_peak(limited, within)
@@ -340,7 +342,10 @@ def test_backward_and_sideways_slip_is_estimated_and_limited_as_forward(scenario
     error = control.channel("slip_ratio")[fast] - true[fast]
     assert fast.sum() > 500
     assert np.sqrt(np.mean(error**2)) < 0.05
-    assert set(control.channel("status_code")[control.time_s > 1.0]) <= {TractionStatus.OK, TractionStatus.UNCERTAIN}
+    assert set(control.channel("status_code")[control.time_s > 1.0]) <= {
+        TractionStatus.OK,
+        TractionStatus.UNCERTAIN,
+    }
     plain = history(
         "plain",
         scenario,

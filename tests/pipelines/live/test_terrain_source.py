@@ -53,7 +53,9 @@ def estimated(run):
     time_s = [estimate.time_s for estimate in estimates]
     channels = ("speed_x_mps", "speed_y_mps", "yaw_rate_radps", "accel_x_mps2", "accel_y_mps2")
     streams = dict(with_wheel_speeds(run, ROBOT).streams)
-    streams["estimator"] = Stream(time_s, [[getattr(e, name) for name in channels] for e in estimates], channels)
+    streams["estimator"] = Stream(
+        time_s, [[getattr(e, name) for name in channels] for e in estimates], channels
+    )
     slip = [estimate.slip_ratio for estimate in estimates]
     streams["slip"] = Stream(time_s, slip, tuple(f"slip_{i}_ratio" for i in (1, 2, 3)))
     return RunLog(run.run_id, run.robot, streams, run.labels)

@@ -199,7 +199,10 @@ def test_the_loop_is_stable_without_gains():
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ({"gains": Gains(2.0, 0.0, 0.0, 5.0)}, r"unstable from 0\.05 to 2 m/s; it is stable up to 0\.76 times"),
+        (
+            {"gains": Gains(2.0, 0.0, 0.0, 5.0)},
+            r"unstable from 0\.05 to 2 m/s; it is stable up to 0\.76 times",
+        ),
         (
             {"form": "printed"},
             r"^robot agrimaro: slip control \(printed, kp 1, .* unstable from 0\.05 to 0\.1",

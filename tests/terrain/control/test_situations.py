@@ -4,17 +4,18 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from pipelines.drive.drives import (
+from terrain.control.situations import (
+    CAMERA_LOST_S,
     COURSE,
-    DRIVES,
-    LOSS_S,
     MIXED,
     N_STARTS,
+    SITUATIONS,
     STARTS_HOLD_S,
+    SituationOptions,
     brake_time,
-    changes_of,
-    situation,
+    make_situation,
     start_times,
+    terrain_changes,
 )
 from terrain.errors import ConfigError
 from terrain.records import Label
@@ -24,13 +25,17 @@ from terrain.terramechanics.soil import load_soil
 ROBOT = load_robot("agrimaro")
 
 
-def ground_of(name):
+def situation(name, robot, terrain, seed, **options):
+    return make_situation(name, robot, terrain, seed, SituationOptions(**options))
+
+
+def terrain_of(name):
     return COURSE if name in (COURSE, MIXED) else "grass"
 
 
-@pytest.mark.parametrize("name", DRIVES)
-def test_a_seed_is_a_day_and_nothing_else_is_drawn(name):
-    one, again, other = (situation(name, ROBOT, ground_of(name), seed) for seed in (3, 3, 4))
+@pytest.mark.parametrize("name", SITUATIONS)
+def test_all_that_is_drawn_depends_on_the_seed(name):
+    one, again, other = (situation(name, ROBOT, terrain_of(name), seed) for seed in (3, 3, 4))
     assert one.conditions == again.conditions != other.conditions
     assert np.array_equal(one.scenario.twist, again.scenario.twist)
     assert one.scenario.patches == again.scenario.patches
@@ -40,17 +45,17 @@ def test_a_seed_is_a_day_and_nothing_else_is_drawn(name):
     assert one.scenario.name == {"slope": "climb"}.get(name, name)
 
 
-def test_the_day_is_the_same_whatever_is_driven_and_is_no_nominal_one():
-    days = [situation(name, ROBOT, "grass", 5) for name in DRIVES if ground_of(name) == "grass"]
-    assert len({day.conditions for day in days}) == 1
-    assert len({tuple(day.soils.items()) for day in days}) == 1
-    assert days[0].soils["grass"] != load_soil("grass")
-    assert days[0].conditions.grade_ratio == (0.0, 0.0)
-    assert days[0].conditions.undulation_ratio == 0.0
+def test_conditions_of_a_seed_are_the_same_in_all_scenarios_and_not_nominal():
+    drawn = [situation(name, ROBOT, "grass", 5) for name in SITUATIONS if terrain_of(name) == "grass"]
+    assert len({one.conditions for one in drawn}) == 1
+    assert len({tuple(one.soils.items()) for one in drawn}) == 1
+    assert drawn[0].soils["grass"] != load_soil("grass")
+    assert drawn[0].conditions.grade_ratio == (0.0, 0.0)
+    assert drawn[0].conditions.undulation_ratio == 0.0
     assert situation(COURSE, ROBOT, COURSE, 5).conditions.grade_ratio != (0.0, 0.0)
 
 
-def test_slopes_and_radii_are_what_is_asked_for():
+def test_slopes_and_radii_are_the_chosen_ones():
     asked = situation("slope", ROBOT, "grass", 5, grade_deg=10.0, radius_factors=(1.02, 1.0, 1.0)).conditions
     drawn = situation("slope", ROBOT, "grass", 5).conditions
     assert asked.grade_ratio == (pytest.approx(math.tan(math.radians(10))), 0.0)
@@ -59,7 +64,7 @@ def test_slopes_and_radii_are_what_is_asked_for():
 
 
 @pytest.mark.parametrize(("speed_mps", "accel_mps2"), [(1.0, 1.0), (2.0, 0.05), (1.5, math.inf)])
-def test_starts_come_from_rest_and_go_on_for_as_long_as_is_judged(speed_mps, accel_mps2):
+def test_starts_begin_at_rest_and_last_as_long_as_is_evaluated(speed_mps, accel_mps2):
     scenario = situation("starts", ROBOT, "grass", 0, speed_mps=speed_mps, accel_mps2=accel_mps2).scenario
     time_s, speed = scenario.time_s, scenario.twist[:, 0]
     starts = start_times(scenario)
@@ -75,14 +80,14 @@ def test_starts_come_from_rest_and_go_on_for_as_long_as_is_judged(speed_mps, acc
         assert np.abs(np.diff(speed)).max() == pytest.approx(accel_mps2 / scenario.rate_hz)
 
 
-def test_a_braking_begins_where_the_command_first_says_stand():
+def test_a_braking_begins_where_standstill_is_first_desired():
     scenario = situation("brake", ROBOT, "grass", 0).scenario
     at = int(np.searchsorted(scenario.time_s, brake_time(scenario)))
     assert scenario.twist[at - 1, 0] == 1.0
     assert not scenario.twist[at:].any()
 
 
-def test_mixed_changes_ground_all_along_and_loses_its_camera():
+def test_mixed_changes_terrain_throughout_and_loses_its_camera():
     mixed = situation(MIXED, ROBOT, COURSE, 1)
     patches = mixed.scenario.patches
     lengths = np.diff([patch.start_m for patch in patches])
@@ -91,14 +96,14 @@ def test_mixed_changes_ground_all_along_and_loses_its_camera():
     assert patches[-1].start_m > mixed.scenario.distance_m[-1] - 9.0
     assert all(a.terrain != b.terrain for a, b in pairwise(patches))
     assert {patch.terrain for patch in patches} <= set(mixed.soils)
-    assert mixed.faults.camera_lost_s == (LOSS_S,)
-    assert mixed.scenario.time_s[-1] > LOSS_S[1]
+    assert mixed.faults.camera_lost_s == (CAMERA_LOST_S,)
+    assert mixed.scenario.time_s[-1] > CAMERA_LOST_S[1]
 
 
-def test_changes_are_where_another_ground_begins():
+def test_changes_are_where_another_terrain_begins():
     labels = (Label(0, 4, "a"), Label(4.5, 6, "a"), Label(7, 9, "b"), Label(9, 11, "a"))
-    assert changes_of(labels) == [(7.0, "b"), (9.0, "a")]
-    assert changes_of(labels[:2]) == changes_of(()) == []
+    assert terrain_changes(labels) == [(7.0, "b"), (9.0, "a")]
+    assert terrain_changes(labels[:2]) == terrain_changes(()) == []
 
 
 @pytest.mark.parametrize(
@@ -118,7 +123,7 @@ def test_changes_are_where_another_ground_begins():
         ("circle", "tiles", {"radius_factors": (0.0, 1.0, 1.0)}, "conditions: radius_factors is"),
     ],
 )
-def test_what_cannot_be_driven_is_refused_in_one_sentence(name, terrain, options, words):
+def test_invalid_situations_are_refused_in_one_sentence(name, terrain, options, words):
     with pytest.raises(ConfigError) as refused:
         situation(name, ROBOT, terrain, 0, **options)
     assert str(refused.value).startswith(words)

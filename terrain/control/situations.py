@@ -1,0 +1,195 @@
+"""Situations to compare controllers in: scenario, soils, conditions and faults, drawn by a seed."""
+
+from __future__ import annotations
+
+import math
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from terrain.errors import ConfigError
+from terrain.records import Label
+from terrain.robots import Robot
+from terrain.simulation.conditions import Conditions, Faults, draw_conditions, load_spread
+from terrain.simulation.scenario.make import SCENARIOS, make_scenario
+from terrain.simulation.scenario.scenario import RATE_HZ, Patch, Scenario
+from terrain.terramechanics.soil import Soil, load_soil, scattered, soil_names
+
+COURSE = "course"
+"""Terrain of scenarios that cross all soils in one drive."""
+
+STARTS, BRAKE, SLOPE, MIXED = "starts", "brake", "slope", "mixed"
+
+STARTS_HOLD_S, STARTS_REST_S, N_STARTS = 6.0, 1.5, 3
+"""Of ``starts``: long enough to evaluate 5 s of each, and to learn the slip of steady motion."""
+
+MIXED_S, CAMERA_LOST_S = 90.0, (28.0, 31.0)
+"""Default length of ``mixed``, and the interval in it without the camera."""
+
+SITUATIONS = (STARTS, "straight", COURSE, SLOPE, BRAKE, "circle", "crab", MIXED)
+"""Scenarios made for comparisons; those of ``terrain simulate`` are accepted, too."""
+
+
+class Situation(NamedTuple):
+    """All that a simulated drive needs beside a robot and a controller."""
+
+    scenario: Scenario
+    soils: Mapping[str, Soil]
+    conditions: Conditions
+    faults: Faults
+    seed: np.random.SeedSequence
+
+
+@dataclass(frozen=True, slots=True)
+class SituationOptions:
+    """What is chosen of a situation.
+
+    Parameters
+    ----------
+    duration_s, speed_mps, accel_mps2 : of the scenario
+    grade_deg : uphill along the initial heading
+    radius_factors : true radius of each wheel over the nominal one; drawn by default
+    leg_backlash_rad : of the third leg
+    """
+
+    duration_s: float | None = None
+    speed_mps: float = 1.0
+    accel_mps2: float = 1.0
+    grade_deg: float = 0.0
+    radius_factors: tuple[float, float, float] | None = None
+    leg_backlash_rad: float = 0.0
+
+
+def make_situation(
+    name: str, robot: Robot, terrain: str, seed: int, options: SituationOptions = SituationOptions()
+) -> Situation:
+    """Return a situation; what is drawn depends on the seed and the terrain alone.
+
+    Load, soil, tyres, roughness and noise are drawn.  ``course`` and ``mixed`` have slopes and undulations as
+    fields have (``data/spread``); all others have the chosen grade.
+
+    Parameters
+    ----------
+    name : one of :data:`SITUATIONS`, or of the scenarios of ``terrain simulate``
+    robot : swerve robot
+    terrain : soil, or ``course`` for all of them
+    seed : of all that is drawn
+    options : what is not drawn
+
+    Raises
+    ------
+    ConfigError
+        if scenario or terrain are unknown or do not go together, or an option is out of range.
+    """
+    known = (*SITUATIONS, *(scenario for scenario in SCENARIOS if scenario not in SITUATIONS))
+    if name not in known:
+        raise ConfigError(f"scenario {name!r} is unknown: use one of {', '.join(known)}")
+    over_all = terrain == COURSE
+    if over_all != (name in (COURSE, MIXED)):
+        raise ConfigError(
+            f"scenario {name!r} does not go with terrain {terrain!r}: 'course' is for 'course' and 'mixed'"
+        )
+    soils = {soil.name: soil for soil in map(load_soil, soil_names() if over_all else (terrain,))}
+    drawn_for = terrain if over_all else next(iter(soils))  # the soil's name, wherever its file lies
+    key = [seed, zlib.crc32(drawn_for.encode())]
+    drawn, driven, simulated = np.random.SeedSequence(key).spawn(3)
+    rng = np.random.default_rng(drawn)
+    soils = {name: scattered(soil, rng) for name, soil in soils.items()}
+    conditions = _chosen(draw_conditions(load_spread(), rng), options, level=not over_all)
+    scenario = _scenario(name, robot, list(soils), driven, options)
+    faults = Faults(camera_lost_s=(CAMERA_LOST_S,)) if name == MIXED else Faults()
+    return Situation(scenario, soils, conditions, faults, simulated)
+
+
+def _chosen(conditions: Conditions, options: SituationOptions, level: bool) -> Conditions:
+    """Return the drawn conditions with those that are chosen."""
+    if level:
+        conditions = replace(conditions, grade_ratio=(0.0, 0.0), undulation_ratio=0.0)
+    if options.leg_backlash_rad:
+        conditions = replace(conditions, leg_backlash_rad=options.leg_backlash_rad)
+    if options.grade_deg:
+        grade_ratio = math.tan(math.radians(options.grade_deg))
+        conditions = replace(conditions, grade_ratio=(grade_ratio, 0.0))
+    if options.radius_factors is not None:
+        conditions = replace(conditions, radius_factors=options.radius_factors)
+    return conditions
+
+
+def _scenario(
+    name: str, robot: Robot, soils: list[str], drawn: np.random.SeedSequence, options: SituationOptions
+) -> Scenario:
+    seed = int(drawn.generate_state(1)[0])
+    duration_s, speed_mps = options.duration_s, options.speed_mps
+    changes = {"accel_mps2": options.accel_mps2} if options.accel_mps2 != 1.0 else {}
+    if name == STARTS:
+        if duration_s is not None:
+            raise ConfigError(f"scenario 'starts' is as long as its {N_STARTS} starts: leave duration_s out")
+        return _starts(robot, soils[0], speed_mps, options.accel_mps2)
+    if name == MIXED:
+        length_s = MIXED_S if duration_s is None else duration_s
+        whole = make_scenario("complex", robot, soils[0], length_s, speed_mps, seed, **changes)
+        return replace(whole, name=MIXED, patches=_patches(soils, whole, np.random.default_rng(drawn)))
+    made = "climb" if name == SLOPE else name
+    return make_scenario(made, robot, soils, duration_s, speed_mps, seed, **changes)
+
+
+def _starts(robot: Robot, terrain: str, speed_mps: float, accel_mps2: float) -> Scenario:
+    """Stand, start, hold the speed, stop, several times: as ``terrain simulate`` has it, but longer."""
+    enough_s = 60.0 + 4.0 * speed_mps / accel_mps2 if accel_mps2 > 0 else None
+    checked = make_scenario(STARTS, robot, terrain, enough_s, speed_mps, accel_mps2=accel_mps2)
+    ramp_s = speed_mps / accel_mps2
+    knots_s, speeds = [0.0, 1.0], [0.0, 0.0]
+    for _ in range(N_STARTS):
+        for length_s, speed in (
+            (ramp_s, speed_mps),
+            (STARTS_HOLD_S, speed_mps),
+            (ramp_s, 0.0),
+            (STARTS_REST_S, 0.0),
+        ):
+            knots_s.append(knots_s[-1] + length_s)
+            speeds.append(speed)
+    time_s = np.arange(round(knots_s[-1] * RATE_HZ) + 1) / RATE_HZ
+    twist = np.zeros((time_s.size, 3))
+    twist[:, 0] = np.interp(time_s, knots_s, speeds)
+    return replace(checked, time_s=time_s, twist=twist)
+
+
+def _patches(names: list[str], scenario: Scenario, rng: np.random.Generator) -> tuple[Patch, ...]:
+    """Return patches of 5 to 9 m in drawn order, no two alike in a row."""
+    patches: list[Patch] = []
+    start_m, end_m = 0.0, float(scenario.distance_m[-1])
+    while start_m < end_m:
+        others = [name for name in names if not patches or name != patches[-1].terrain]
+        patches.append(Patch(start_m, others[int(rng.integers(len(others)))]))
+        start_m += float(rng.uniform(5.0, 9.0))
+    return tuple(patches)
+
+
+def start_times(scenario: Scenario) -> list[float]:
+    """Return the times at which motion is desired after a rest."""
+    desired = np.abs(scenario.twist).max(axis=1) > 0
+    return [float(time_s) for time_s in scenario.time_s[:-1][np.diff(desired.astype(int)) == 1]]
+
+
+def desired_until(scenario: Scenario) -> float:
+    """Return the last time at which motion is desired; 0 where none is."""
+    desired = np.flatnonzero(np.abs(scenario.twist).max(axis=1) > 0)
+    return float(scenario.time_s[desired[-1]]) if desired.size else 0.0
+
+
+def brake_time(scenario: Scenario) -> float:
+    """Return the time from which on standstill is desired, to the end."""
+    return float(scenario.time_s[scenario.time_s > desired_until(scenario)][0])
+
+
+def terrain_changes(labels: Sequence[Label]) -> list[tuple[float, str]]:
+    """Return the time at which each new terrain begins, and its name, of a run's labels."""
+    return [
+        (after.start_s, after.terrain)
+        for before, after in pairwise(labels)
+        if after.terrain != before.terrain
+    ]
