@@ -51,7 +51,6 @@ Align = Annotated[
     typer.Option("--align", help="Bring the wheel stream onto the IMU's clock where both see the turns."),
 ]
 Jobs = Annotated[int, typer.Option(min=0, help="Processes at once; 0 for one a core.")]
-DRIVE_CONTROLLERS = ("plain", "ramp", "thesis", "fixed", "learned", "oracle")
 MAX_GRADE_DEG = 30.0
 
 
@@ -142,19 +141,6 @@ def _load(
     return load_runs(
         data, layout=layout.value, mapping=mapping, repair=repair, align=align, on_skip=skipped.append
     ), skipped
-
-
-def _radii(text: str | None) -> tuple[float, float, float] | None:
-    """Read ``A,B,C``."""
-    if text is None:
-        return None
-    try:
-        one, two, three = (float(part) for part in text.split(","))
-    except ValueError:
-        one = two = three = 0.0
-    if not all(0.5 <= ratio <= 2.0 for ratio in (one, two, three)):
-        raise ConfigError(f"--radius is {text!r}; three ratios from 0.5 to 2 are required, as in 1,1.02,1")
-    return one, two, three
 
 
 def _checked(path: Path | None) -> Path | None:

@@ -59,7 +59,7 @@ from terrain.extension import correct_live
 from terrain.kinematics.swerve import FAR_RAD, wheel_command_step
 from terrain.logs.schema import IMU_CHANNELS
 from terrain.records import Array, Command, Sample
-from terrain.robots import Robot, as_swerve
+from terrain.robots import Robot, SwerveRobot, as_swerve
 from terrain.slip import MIN_SPEED_MPS
 
 CONTROLLERS = ("plain", "ramp", "thesis", "traction")
@@ -192,8 +192,7 @@ class LivePilot:
         steer_rad: Array | None = None,
     ) -> None:
         table = load_slip_table() if table is None else table
-        check_pilot(robot, table, settings)
-        robot, correction = correct_live(robot)
+        robot, correction = correct_live(check_pilot(robot, table, settings))
         self._table, self._settings, self._radius_m = table, settings, robot.wheel_radius_m
         self._source = NoTerrain() if source is None else source
         self._terrains = {terrain: index for index, terrain in enumerate(table.targets)}
@@ -330,8 +329,8 @@ class LivePilot:
         return twist, report
 
 
-def check_pilot(robot: Robot, table: SlipTable, settings: PilotSettings) -> None:
-    """Refuse what cannot be driven.
+def check_pilot(robot: Robot, table: SlipTable, settings: PilotSettings) -> SwerveRobot:
+    """Return a robot that can be driven.
 
     Raises
     ------
@@ -342,7 +341,7 @@ def check_pilot(robot: Robot, table: SlipTable, settings: PilotSettings) -> None
         raise ConfigError(
             f"controller {settings.controller!r} is unknown: use one of {', '.join(CONTROLLERS)}"
         )
-    as_swerve(robot, "robot {name}: drive {drive!r} has no pilot, only 'swerve' has")
+    swerve = as_swerve(robot, "robot {name}: drive {drive!r} has no pilot, only 'swerve' has")
     if not (math.isfinite(settings.ramp_mps2) and settings.ramp_mps2 > 0):
         raise ConfigError(f"ramp_mps2 is {settings.ramp_mps2!r}, a number above zero is required")
     if table.robot and table.robot != robot.name:
@@ -351,10 +350,11 @@ def check_pilot(robot: Robot, table: SlipTable, settings: PilotSettings) -> None
     if settings.track and settings.controller in OPEN_LOOP:
         raise ConfigError(f"controller {settings.controller!r} estimates no pose: it has no path tracking")
     if settings.controller == "thesis":
-        check_stable(robot, settings.gains, settings.form, settings.delay_s)
+        check_stable(swerve, settings.gains, settings.form, settings.delay_s)
+    return swerve
 
 
-def _wheel_controller(robot: Robot, settings: PilotSettings) -> WheelController:
+def _wheel_controller(robot: SwerveRobot, settings: PilotSettings) -> WheelController:
     traction = TractionController(robot, settings.traction)  # checks the settings for every controller
     if settings.controller == "traction":
         return traction

@@ -12,7 +12,8 @@ import pytest
 from pipelines.live.pilot import LivePilot, PilotSettings
 from terrain.control.danzi_pid import new_state, thesis_settings, thesis_step
 from terrain.control.pid import Gains
-from terrain.control.traction import SETTINGS, Ground, initial_state, traction_step
+from terrain.control.traction import initial_state, traction_step
+from terrain.control.traction_settings import SETTINGS, TractionTarget, WheelMeasurements
 from terrain.logs.replay import replay
 from terrain.robots import load_robot
 from terrain.simulation.run import simulate_run
@@ -28,7 +29,7 @@ DT_S = 0.02
 
 
 def rows():
-    """What three wheels do in a start: command, rate, ground speed, acceleration, slip, torque (n, 3)."""
+    """Three wheels in a start: command, rate, ground speed, acceleration, slip, torque (n, 3)."""
     rng = np.random.default_rng(0)
     desired = np.minimum(np.arange(N_STEPS) * 0.1, 5.0)[:, None] * np.ones(3)
     ground = 0.17 * desired + 0.01 * rng.standard_normal((N_STEPS, 3))
@@ -38,10 +39,11 @@ def rows():
 
 
 def with_traction(desired, rate, ground, accel, slip, torque):
-    state, std, aim = initial_state(), np.full(3, 0.005), Ground(0.1)
+    state, std, aim = initial_state(), np.full(3, 0.005), TractionTarget(0.1)
     for u, v, a, s, t in zip(desired, ground, accel, slip, torque, strict=True):
-        told, state, _ = traction_step(SETTINGS, state, aim, 0.2, u, v, a, s, std, 0.0, t, DT_S)
-    return told
+        wheels = WheelMeasurements(v, a, s, std, t)
+        command, state, _ = traction_step(SETTINGS, state, aim, 0.2, u, wheels, 0.0, DT_S)
+    return command
 
 
 def with_thesis(desired, rate, ground, accel, slip, torque):
@@ -55,12 +57,12 @@ def with_python(desired, rate, ground, accel, slip, torque):
     """(8.1) to (8.3) with a clamp, wheel by wheel, in the interpreter."""
     integral = [0.0] * 3
     for us, vs, ss in zip(desired.tolist(), ground.tolist(), slip.tolist(), strict=True):
-        told = []
+        command = []
         for i in range(3):
             error = (0.05 - ss[i]) * max(us[i] * 0.2, abs(vs[i])) / 0.2
             integral[i] = min(max(integral[i] + GAINS.ki * error * DT_S, -GAINS.limit), GAINS.limit)
-            told.append(us[i] + min(max(GAINS.kp * error + integral[i], -GAINS.limit), GAINS.limit))
-    return np.array(told)
+            command.append(us[i] + min(max(GAINS.kp * error + integral[i], -GAINS.limit), GAINS.limit))
+    return np.array(command)
 
 
 @pytest.mark.benchmark(group=f"{N_STEPS} control steps of three wheels", timer=time.process_time)

@@ -59,7 +59,7 @@ def test_one_controller_alone_is_driven():
 
 
 def test_controllers_have_their_earlier_names_on_the_command_line_and_in_json():
-    settings = SHORT.with_(controllers="oracle+track,told:clay,fixed", seeds=1, duration_s=1.5)
+    settings = SHORT.with_(controllers="oracle+track,told:clay,fixed", seeds=1, duration_s=3.0)
     assert settings.controllers == ("true_terrain+track", "known:clay", "fallback")
     document = as_json(drive(settings, INPUTS))
     for key in ("controllers", "rows"):
