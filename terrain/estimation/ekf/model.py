@@ -68,11 +68,20 @@ class FilterModel:
     angle_rows: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        place = f"filter {self.name}"
         if not len(self.initial_mean):
             object.__setattr__(self, "initial_mean", np.zeros(len(self.states)))
         for name in ("params", "initial_std", "initial_mean"):
             object.__setattr__(self, name, read_only(getattr(self, name)))
+        self._check_initial()
+        self._check_names()
+        for what, signature in (("propagate", PROPAGATE), ("observe", OBSERVE)):
+            if tuple(signature.args) not in getattr(getattr(self, what), "signatures", ()):
+                raise ConfigError(
+                    f"filter {self.name}: {what} must be compiled as @njit({what.upper()}, cache=True)"
+                )
+
+    def _check_initial(self) -> None:
+        place = f"filter {self.name}"
         for name in ("initial_std", "initial_mean"):
             shape = getattr(self, name).shape
             if shape != (len(self.states),):
@@ -81,6 +90,10 @@ class FilterModel:
             raise ConfigError(
                 f"{place}: initial_std {self.initial_std.tolist()} must be above zero and finite"
             )
+
+    def _check_names(self) -> None:
+        """Refuse a name without a unit, one that is given twice, and one that refers to nothing."""
+        place = f"filter {self.name}"
         for name in (*self.states, *self.rows):
             try:
                 unit_of(name)
@@ -100,9 +113,6 @@ class FilterModel:
         ):
             for unknown in (name for name in names if name not in known):
                 raise ConfigError(f"{place}: {what} name {unknown!r}, which is none of {', '.join(known)}")
-        for what, signature in (("propagate", PROPAGATE), ("observe", OBSERVE)):
-            if tuple(signature.args) not in getattr(getattr(self, what), "signatures", ()):
-                raise ConfigError(f"{place}: {what} must be compiled as @njit({what.upper()}, cache=True)")
 
     @property
     def sensor_names(self) -> tuple[str, ...]:

@@ -22,6 +22,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -32,6 +33,7 @@ from terrain.estimation.measurements.resampling import ema, median_step_s
 from terrain.estimation.measurements.sample_hold import TICK_S
 from terrain.estimation.measurements.samples import (
     LEAPT,
+    N_FATES,
     NO_ROTATION,
     ROWS,
     STREAMS,
@@ -54,6 +56,14 @@ from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.logs.schema import GNSS_CHANNELS, IMU_CHANNELS
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import Robot
+
+
+class _Samples(NamedTuple):
+    """Samples by stream, in the order of :data:`STREAMS`: arrival, instant of measurement, values."""
+
+    came_s: tuple[Array, ...]
+    instant_s: tuple[Array, ...]
+    values: tuple[Array, ...]
 
 
 def measurement_table(
@@ -111,41 +121,42 @@ def measurement_table(
     if wheels is None:
         raise DataError(f"run {run.run_id}: the stream 'wheels', which gives the clock, is empty")
     streams = _clean_streams(run, robot, dropped)
-    latency_s = _latencies_s(robot, gnss_latency_s)
+    clock = np.array(wheels.time_s)
+    limits = _limits(streams, robot, clock, 0.0 if ema_alpha is not None else time_constant_s)
+    samples = _samples_of(streams, _latencies_s(robot, gnss_latency_s), causal)
+    motor_radps = np.array(wheels.values) if robot.steered else np.full((clock.size, 3), np.nan)
     params = params_of(robot, initial_yaw_rad)
-    lines, turns, gnss = row_memory()
-    if "gnss" in streams and not causal:
-        gnss[:2] = _gnss_origin(streams["gnss"])
-    clock, n = np.array(wheels.time_s), len(wheels)
-    z, variance, counts = np.empty((n, len(ROWS))), np.empty((n, len(GNSS_ROWS))), np.zeros((5, 3), np.int64)
-    _fill_rows(
-        clock,
-        np.array(wheels.values) if robot.steered else np.full((n, 3), np.nan),
-        *_samples_of(streams, latency_s, causal),
-        params,
-        _limits(streams, robot, clock, 0.0 if ema_alpha is not None else time_constant_s),
-        lines,
-        turns,
-        gnss,
-        z,
-        variance,
-        counts,
-    )
+    origin_m = _gnss_origin(streams["gnss"]) if "gnss" in streams and not causal else np.full(2, np.nan)
+    z, variance, counts = _rows(clock, motor_radps, samples, params, limits, origin_m)
+    dropped += counts  # a Counter, so that zeros fall out
     if ema_alpha is not None:
         for row in CAMERA_ROWS:
             z[:, ROWS.index(row)] = ema(z[:, ROWS.index(row)], ema_alpha)
     if robot.steered:
         _refer_yaw(clock, z, params, yaw_memory(), causal)
-    dropped["wheels: beyond the motors"] += int(counts[-1, 0])
-    for number, name in enumerate(STREAMS):
-        dropped[f"{name}: leap"] += int(counts[number, LEAPT])
-        dropped[f"{name}: no rotation"] += int(counts[number, NO_ROTATION])
     rows = ROWS_OF_DRIVE[robot.drive]
     columns = dict(zip(ROWS, z.T, strict=True))
     if not robot.steered:  # their wheels report speeds
         columns |= dict(zip(rows, wheels.values.T, strict=False))
     table = np.column_stack([columns[row] for row in rows])
-    return MeasurementTable(clock, rows, table, variance, {kind: n for kind, n in dropped.items() if n})
+    return MeasurementTable(clock, rows, table, variance, dropped)
+
+
+def _rows(
+    clock: Array, motor_radps: Array, samples: _Samples, params: Array, limits: Array, origin_m: Array
+) -> tuple[Array, Array, Counter[str]]:
+    """Return the rows (n, 18), the variances (n, 4) of the GNSS rows, and what was left out."""
+    n = clock.size
+    z, variance = np.empty((n, len(ROWS))), np.empty((n, len(GNSS_ROWS)))
+    counts = np.zeros((len(STREAMS) + 1, N_FATES), np.int64)  # the last row is of the wheels
+    lines, turns, gnss = row_memory()
+    gnss[:2] = origin_m
+    _fill_rows(clock, motor_radps, *samples, params, limits, lines, turns, gnss, z, variance, counts)
+    dropped = Counter({"wheels: beyond the motors": int(counts[-1, 0])})
+    for number, name in enumerate(STREAMS):
+        dropped[f"{name}: leap"] = int(counts[number, LEAPT])
+        dropped[f"{name}: no rotation"] = int(counts[number, NO_ROTATION])
+    return z, variance, dropped
 
 
 def _check(time_constant_s: float | None, ema_alpha: float | None, gnss_latency_s: float) -> None:
@@ -193,10 +204,7 @@ def _latencies_s(robot: Robot, gnss_latency_s: float) -> dict[str, float]:
     }
 
 
-def _samples_of(
-    streams: Mapping[str, Stream], latency_s: Mapping[str, float], causal: bool
-) -> tuple[tuple[Array, ...], tuple[Array, ...], tuple[Array, ...]]:
-    """Return when samples count as arrived, the instants of measurement, and the values, by stream."""
+def _samples_of(streams: Mapping[str, Stream], latency_s: Mapping[str, float], causal: bool) -> _Samples:
     came_s, instant_s, values = [], [], []
     for name, channels in STREAMS.items():
         stream = streams.get(name)
@@ -204,7 +212,7 @@ def _samples_of(
         instant_s.append(stamps - latency_s.get(name, 0.0))
         came_s.append(stamps if causal else instant_s[-1])
         values.append(np.array(stream.values) if stream is not None else np.empty((0, len(channels))))
-    return tuple(came_s), tuple(instant_s), tuple(values)
+    return _Samples(tuple(came_s), tuple(instant_s), tuple(values))
 
 
 def _limits(

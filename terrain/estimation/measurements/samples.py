@@ -57,7 +57,8 @@ PARAMS = (
 )
 """Parameters of the robot that the kernels use, in the order of ``params``."""
 
-TAKEN, LEAPT, NO_ROTATION = range(3)
+N_FATES = 3
+TAKEN, LEAPT, NO_ROTATION = range(N_FATES)
 """What became of a sample."""
 
 N_TURNS, N_GNSS = 5, 3
