@@ -354,7 +354,7 @@ def check_pilot(robot: Robot, table: SlipTable, settings: PilotSettings) -> Swer
     return swerve
 
 
-def _wheel_controller(robot: SwerveRobot, settings: PilotSettings) -> WheelController:
+def _wheel_controller(robot: Robot, settings: PilotSettings) -> WheelController:
     traction = TractionController(robot, settings.traction)  # checks the settings for every controller
     if settings.controller == "traction":
         return traction

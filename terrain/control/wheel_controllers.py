@@ -31,6 +31,7 @@ from terrain.control.traction_settings import (
     with_motor_driver,
 )
 from terrain.estimation.live.estimator import LiveEstimate
+from terrain.kinematics.wheel_velocity import in_wheel_frame, point_velocity
 from terrain.records import Array, SlipTarget
 from terrain.robots import Robot
 from terrain.slip import MIN_SPEED_MPS
@@ -137,8 +138,10 @@ class WheelObserver:
         stale_s = estimate_age(estimate, time_s)
         steer = estimate.mean[self._steer_states]
         cos, sin = np.cos(steer), np.sin(steer)
-        speed = (estimate.speed_x_mps - estimate.yaw_rate_radps * self._y_m) * cos
-        speed = speed + (estimate.speed_y_mps + estimate.yaw_rate_radps * self._x_m) * sin
+        forward, left = point_velocity(
+            estimate.speed_x_mps, estimate.speed_y_mps, estimate.yaw_rate_radps, self._x_m, self._y_m
+        )
+        speed, _ = in_wheel_frame(forward, left, cos, sin)
         accel = estimate.accel_x_mps2 * cos + estimate.accel_y_mps2 * sin
         fastest = np.maximum(np.abs(estimate.wheel_speed_mps), np.abs(speed))
         # a wheel stands by the filter's rate, which differs a little from the measured one

@@ -106,7 +106,7 @@ def test_files_pass_through_the_commands(tmp_path):
         (row,) = estimate([run], settings).runs
         assert row.speed_rmse_mps < 0.006
     assert np.isfinite(run_parts(run, robot)[0].balance.mass_kg)
-    assert LivePilot(robot)._robot.wheel_radius_m == pytest.approx(0.208)
+    assert LivePilot(robot)._radius_m == pytest.approx(0.208)
     with pytest.raises(ConfigError, match="is extended by effects"):
         calibrate(tmp_path, out)
     content = yaml.safe_load(out.read_text())
