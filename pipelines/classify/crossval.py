@@ -17,12 +17,12 @@ from pipelines.classify.splits import (
     N_FOLDS,
     Fold,
     Samples,
-    counted,
     folds_of,
     grouped_samples,
     published_samples,
 )
 from pipelines.models.recipes import WindowPipeline, feature_matrix
+from pipelines.reporting.numbers import format_counts
 from pipelines.reporting.progress import Progress, silent
 from terrain.classify.folds import single_run_classes
 from terrain.records import Array, RunLog
@@ -120,7 +120,7 @@ def notes(samples: Samples, settings: CrossvalSettings, repaired: Mapping[str, i
             "for comparison with papers only"
         )
     if samples.cut.dropped:
-        sentences.append(f"windows left out: {counted(samples.cut.dropped)}")
+        sentences.append(f"windows left out: {format_counts(samples.cut.dropped)}")
     if repaired:
-        sentences.append(f"dropped to repair the logs: {counted(repaired)}")
+        sentences.append(f"dropped to repair the logs: {format_counts(repaired)}")
     return sentences

@@ -12,7 +12,7 @@ from sklearn.base import BaseEstimator
 
 from features.windows import wheel_speeds
 from pipelines.classify.evaluation import Examples, FoldResult, fit_folds
-from pipelines.classify.results import Applicability, ClassSpeeds, LearningCurve, SlowFast
+from pipelines.classify.results import MIN_CLASSES, Applicability, ClassSpeeds, LearningCurve, SlowFast
 from pipelines.classify.splits import Fold, Samples
 from pipelines.reporting.progress import Progress, silent
 from terrain.logs.schema import signal_set_of
@@ -20,7 +20,6 @@ from terrain.records import Array, Windows
 
 MIN_RUNS_A_SIDE = 2
 MIN_TIME_A_SIDE_S = 60.0
-MIN_CLASSES = 3
 MOVING_MPS = 0.03
 """The faster wheel moves above this; it is the steady-motion rule's own threshold."""
 

@@ -69,7 +69,7 @@ def predict(
         classes=tuple(targets),
         accuracy=float(np.mean(predicted[known] == label[known])) if known.any() else None,
         n_judged=int(known.sum()),
-        training_runs=tuple(run.run_id for run in runs if data_digest([run]) in model.info["run_digests"]),
+        training_runs=tuple(run.run_id for run in runs if data_digest([run]) in model.info.run_digests),
         repaired=dict(sum((Counter(run.dropped) for run in runs), Counter())),
         unknown_labels={str(name): int(count) for name, count in zip(unknown, counts, strict=True)},
         n_unknown_labels=int(counts.sum()),

@@ -29,6 +29,10 @@ class Applicability(StrEnum):
     NOT_APPLICABLE = "not applicable"
 
 
+MIN_CLASSES = 3
+"""Slow and fast runs are compared where at least so many classes have enough of both."""
+
+
 class ClassSpeeds(NamedTuple):
     """Median speeds of the slow and of the fast runs of a class."""
 

@@ -17,8 +17,7 @@ from pipelines.classify.results import (
     Training,
     WindowPrediction,
 )
-from pipelines.classify.splits import counted
-from pipelines.reporting.numbers import percent
+from pipelines.reporting.numbers import format_counts, percent
 from pipelines.reporting.terminal import print_lines
 from terrain.control.slip_table import DRIVE_STATES
 
@@ -126,5 +125,5 @@ def _accuracy_lines(result: Predictions) -> Iterator[str]:
         yield f"{count} windows are labelled {name}, which the model was not trained on: not judged"
     for text, counts in (("windows left out", result.dropped), ("repaired", result.repaired)):
         if counts:
-            yield f"{text}: {counted(counts)}"
+            yield f"{text}: {format_counts(counts)}"
     yield from result.skipped or ()

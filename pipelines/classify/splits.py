@@ -7,7 +7,7 @@ partition nearly always has its own run in training; it serves to compare with p
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -24,6 +24,7 @@ from features.windows import (
     regular_starts,
     span_of,
 )
+from pipelines.reporting.numbers import format_counts
 from terrain.classify.folds import block_groups, single_run_classes, split_runs
 from terrain.errors import ConfigError, DataError
 from terrain.logs.schema import SIGNAL_SETS
@@ -67,22 +68,11 @@ def grouped_samples(
     return Samples(cut, cut.windows.run_id, rule.overlap)
 
 
-def counted(counts: Mapping[str, int]) -> str:
-    """Return counts by kind as text.
-
-    Examples
-    --------
-    >>> counted({"not moving": 1, "gap": 2})
-    '2 gap, 1 not moving'
-    """
-    return ", ".join(f"{n} {kind}" for kind, n in sorted(counts.items()))
-
-
 def labelled(cut: WindowCut) -> WindowCut:
     """Keep the windows that lie under one label; the others are counted as ``no single label``."""
     known = cut.windows.terrain != ""
     if not len(known):
-        raise DataError(f"not one window is left: {counted(cut.dropped) or 'no run is long enough'}")
+        raise DataError(f"not one window is left: {format_counts(cut.dropped) or 'no run is long enough'}")
     if not known.any():
         raise DataError("no window has a terrain label: nothing can be trained or tested")
     if known.all():

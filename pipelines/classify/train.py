@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -14,6 +13,7 @@ from pipelines.classify.importance import channel_importance
 from pipelines.classify.results import CrossvalReport, Training
 from pipelines.classify.settings import RecipeSettings, TrainSettings
 from pipelines.classify.splits import folds_of
+from pipelines.models.results import ModelInfo
 from pipelines.reporting.json_file import as_json
 from pipelines.reporting.progress import Progress, silent
 from pipelines.runs.datasets import data_digest
@@ -82,8 +82,8 @@ def train(
     return Training(
         registered=registered,
         dataset=dataset,
-        data_digest=info["data_digest"],
-        commit=info["commit"],
+        data_digest=info.data_digest,
+        commit=info.commit,
         n_windows=len(windows),
         chosen=chosen,
         importance=importance,
@@ -120,22 +120,22 @@ def _params(
 
 def model_info(
     runs: Sequence[RunLog], settings: RecipeSettings, windows: Windows, dataset: str, commit: str
-) -> dict[str, Any]:
-    """Return how the training windows were cut, as a new log must be, and where they came from."""
+) -> ModelInfo:
+    """Return how the training windows were cut, as those of a new log must be, and where they came from."""
     rule = settings.rule
-    return {
-        "recipe": settings.recipe,
-        "classes": [str(c) for c in np.unique(windows.terrain.astype(str))],
-        "window_s": rule.length_s,
-        "stride_s": rule.stride_s,
-        "steady": dataclasses.asdict(rule.steady) if rule.steady is not None else None,
-        "signal_sets": list(settings.signal_sets),
-        "channels": {stream: list(names) for stream, names in windows.channels.items()},
-        "rate_hz": dict(windows.rate_hz),
-        "seed": settings.seed,
-        "data_digest": data_digest(runs),
-        "run_digests": [data_digest([run]) for run in runs],
-        "dataset": dataset,
-        "commit": commit,
-        "package_version": __version__,
-    }
+    return ModelInfo(
+        classes=tuple(np.unique(windows.terrain.astype(str)).tolist()),
+        window_s=rule.length_s,
+        stride_s=rule.stride_s,
+        steady=rule.steady,
+        channels={stream: tuple(names) for stream, names in windows.channels.items()},
+        rate_hz=dict(windows.rate_hz),
+        run_digests=tuple(data_digest([run]) for run in runs),
+        recipe=settings.recipe,
+        signal_sets=settings.signal_sets,
+        seed=settings.seed,
+        data_digest=data_digest(runs),
+        dataset=dataset,
+        commit=commit,
+        package_version=__version__,
+    )

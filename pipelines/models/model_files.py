@@ -10,10 +10,12 @@ import hashlib
 import json
 import zipfile
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-from features.windows import Layout, SteadyMotion, WindowRule
+from features.windows import Layout, WindowRule
 from pipelines.models.recipes import WindowPipeline
+from pipelines.models.results import ModelInfo
+from pipelines.reporting.json_file import as_json
 from terrain.errors import ConfigError, DataError, ModelError
 from terrain.files.atomic import atomic_write
 
@@ -52,32 +54,26 @@ _LOADER_ERRORS = (
 
 
 class TerrainModel(NamedTuple):
-    """A fitted recipe, and how its training windows were cut.
-
-    ``info`` holds ``version, sha256, recipe, classes, window_s, stride_s, steady, channels, rate_hz, seed,
-    data_digest, run_digests`` and the version of the package.
-    """
+    """A fitted recipe, and how its training windows were cut."""
 
     recipe: WindowPipeline
-    info: dict[str, Any]
+    info: ModelInfo
 
     @property
     def layout(self) -> Layout:
         """Channels and rates that a log must have."""
-        channels = {stream: tuple(names) for stream, names in self.info["channels"].items()}
-        return Layout(channels, self.info["rate_hz"])
+        return self.info.layout
 
     @property
     def rule(self) -> WindowRule:
         """How windows must be cut for this model."""
-        steady = SteadyMotion(**self.info["steady"]) if self.info["steady"] is not None else None
-        return WindowRule(self.info["window_s"], self.info["stride_s"], steady)
+        return self.info.rule
 
 
-def write_info(folder: Path, info: dict[str, Any]) -> None:
+def write_info(folder: Path, info: ModelInfo) -> None:
     """Write ``terrain_model.json`` beside a ``model.skops``, with the checksum of the latter."""
     sha256 = hashlib.sha256((folder / MODEL_FILE).read_bytes()).hexdigest()
-    content = {"version": INFO_VERSION, "sha256": sha256, **info}
+    content = {"version": INFO_VERSION, "sha256": sha256, **as_json(info)}
     atomic_write(folder / INFO_FILE, json.dumps(content, indent=2, sort_keys=True) + "\n")
 
 
@@ -93,9 +89,9 @@ def read_model(folder: Path) -> TerrainModel:
     if not file.is_file() or not info_file.is_file():
         raise ModelError(f"{folder}: holds no model of this package ({MODEL_FILE} and {INFO_FILE})")
     try:
-        info = json.loads(info_file.read_text(encoding="utf-8"))
-        version, expected = info["version"], info["sha256"]
-        missing = INFO_KEYS - set(info)
+        document = json.loads(info_file.read_text(encoding="utf-8"))
+        version, expected = document.pop("version"), document.pop("sha256")
+        missing = INFO_KEYS - set(document)
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ModelError(f"{info_file}: is damaged ({error})") from error
     if version != INFO_VERSION or missing:
@@ -104,8 +100,8 @@ def read_model(folder: Path) -> TerrainModel:
     found = hashlib.sha256(content).hexdigest()
     if found != expected:
         raise ModelError(f"{file}: is damaged (SHA-256 {found[:12]}..., {str(expected)[:12]}... expected)")
-    model = TerrainModel(_load(file, content), info)
     try:
+        model = TerrainModel(_load(file, content), ModelInfo.from_json(document))
         for stream in model.layout.channels:
             model.layout.n_samples(stream, model.rule.length_s)
     except (TypeError, KeyError, AttributeError, ConfigError, DataError) as error:

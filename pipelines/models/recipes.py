@@ -17,7 +17,7 @@ from terrain.records import Array, Windows
 RECIPES = ("svm",)
 
 
-class WindowPipeline(Pipeline):  # type: ignore[misc]
+class WindowPipeline(Pipeline):
     """A scikit-learn pipeline over windows that passes the run of each window to its last step.
 
     The last step makes its inner folds of whole runs; ``cross_validate(recipe, windows, terrain,

@@ -1,8 +1,12 @@
-"""What registering a model gives."""
+"""What is known of a trained model, and what registering it gives."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Self
+
+from features.windows import Layout, SteadyMotion, WindowRule
 
 
 class Registered(NamedTuple):
@@ -13,3 +17,56 @@ class Registered(NamedTuple):
     run_id: str
     alias_moved: bool
     alias_reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class ModelInfo:
+    """How the training windows of a model were cut, as those of a new log must be, and where they came from.
+
+    Parameters
+    ----------
+    classes : in the order of the probabilities
+    window_s, stride_s, steady : the rule of the windows
+    channels, rate_hz : by stream, which a log must have
+    run_digests : of each training run
+    recipe, signal_sets, seed : what was trained
+    data_digest, dataset : of the training runs
+    commit, package_version : of the code
+    """
+
+    classes: tuple[str, ...]
+    window_s: float
+    stride_s: float | None
+    steady: SteadyMotion | None
+    channels: Mapping[str, tuple[str, ...]]
+    rate_hz: Mapping[str, float]
+    run_digests: tuple[str, ...]
+    recipe: str = ""
+    signal_sets: tuple[str, ...] = ()
+    seed: int = 0
+    data_digest: str = ""
+    dataset: str = ""
+    commit: str = ""
+    package_version: str = ""
+
+    @classmethod
+    def from_json(cls, document: Mapping[str, Any]) -> Self:
+        """Return the record of a JSON document; ``TypeError`` where a key is unknown or missing."""
+        steady = document.get("steady")
+        changed: dict[str, Any] = {
+            "steady": None if steady is None else SteadyMotion(**steady),
+            "channels": {stream: tuple(names) for stream, names in document["channels"].items()},
+        }
+        for name in ("classes", "run_digests", "signal_sets"):
+            changed[name] = tuple(document.get(name, ()))
+        return cls(**{**document, **changed})
+
+    @property
+    def layout(self) -> Layout:
+        """Channels and rates that a log must have."""
+        return Layout(self.channels, self.rate_hz)
+
+    @property
+    def rule(self) -> WindowRule:
+        """How windows must be cut."""
+        return WindowRule(self.window_s, self.stride_s, self.steady)

@@ -21,7 +21,7 @@ from urllib.parse import urlsplit
 
 from pipelines.models.model_files import TRUSTED_TYPES, TerrainModel, read_model, write_info
 from pipelines.models.recipes import WindowPipeline
-from pipelines.models.results import Registered
+from pipelines.models.results import ModelInfo, Registered
 from terrain.errors import ModelError, TerrainError
 from terrain.files.atomic import ensure_writable
 from terrain.records import Windows
@@ -144,7 +144,7 @@ def log_training(
     name: str,
     recipe: WindowPipeline,
     windows: Windows,
-    info: Mapping[str, Any],
+    info: ModelInfo,
     params: Mapping[str, Any],
     metrics: Mapping[str, float],
     documents: Mapping[str, Any],
@@ -172,7 +172,7 @@ def log_training(
         try:
             mlflow.set_experiment(EXPERIMENT)
             with mlflow.start_run(run_name=name) as run:
-                tags = {key: info[key] for key in ("data_digest", "commit", "seed")}
+                tags = {key: getattr(info, key) for key in ("data_digest", "commit", "seed")}
                 _log(mlflow, params, metrics, tags, documents, figures)
                 logged = _log_model(mlflow, name, recipe, windows, info)
             return _promote(
@@ -236,14 +236,12 @@ def _log(
         mlflow.log_figure(figure, f"figures/{name}.png")
 
 
-def _log_model(
-    mlflow: Any, name: str, recipe: WindowPipeline, windows: Windows, info: Mapping[str, Any]
-) -> Any:
+def _log_model(mlflow: Any, name: str, recipe: WindowPipeline, windows: Windows, info: ModelInfo) -> Any:
     from mlflow.models import Model
 
     def save_model(path: str, mlflow_model: Any, **options: Any) -> None:
         mlflow.sklearn.save_model(recipe, path, mlflow_model=mlflow_model, **options)
-        write_info(Path(path), dict(info))
+        write_info(Path(path), info)
 
     flavor = SimpleNamespace(save_model=save_model, __name__="mlflow.sklearn")
     with redirect_stderr(io.StringIO()):  # the caller reports what it prints
@@ -273,10 +271,10 @@ def _signature(recipe: WindowPipeline, windows: Windows) -> Any:
 
 
 def _promote(
-    mlflow: Any, name: str, number: str, run_id: str, info: Mapping[str, Any], metrics: Mapping[str, float]
+    mlflow: Any, name: str, number: str, run_id: str, info: ModelInfo, metrics: Mapping[str, float]
 ) -> Registered:
     client = mlflow.MlflowClient()
-    candidate = Standing(number, info["data_digest"], float(metrics["macro_f1"]))
+    candidate = Standing(number, info.data_digest, float(metrics["macro_f1"]))
     client.set_model_version_tag(name, number, "data_digest", candidate.data_digest)
     client.set_model_version_tag(name, number, "macro_f1", repr(candidate.macro_f1))
     champion = None

@@ -8,10 +8,16 @@ from typing import NamedTuple
 
 from matplotlib.figure import Figure
 
-from pipelines.classify.extras import MIN_CLASSES
-from pipelines.classify.results import Applicability, CrossvalReport, Predictions, SlowFast, WindowPrediction
+from pipelines.classify.results import (
+    MIN_CLASSES,
+    Applicability,
+    CrossvalReport,
+    Predictions,
+    SlowFast,
+    WindowPrediction,
+)
 from pipelines.quickstart.results import QuickstartResult
-from pipelines.reporting.numbers import NOT_KNOWN, percent
+from pipelines.reporting.numbers import NOT_KNOWN, format_counts, percent
 from pipelines.reporting.pictures import Image, svg_or_png
 from pipelines.reporting.templates import render
 from pipelines.reporting.versions import versions
@@ -319,14 +325,13 @@ def _target_rows(predictions: Predictions) -> tuple[TargetRow, ...]:
 
 def _provenance(result: QuickstartResult) -> tuple[Pair, ...]:
     report = result.crossval
-    dropped = ", ".join(f"{n} {reason}" for reason, n in report.dropped.items())
     return (
         Pair("data digest", result.data_digest, code=True),
         Pair("commit", result.commit, code=True),
         Pair("seed", str(result.seed)),
         Pair("protocol", f"{report.protocol}, {_plural(report.repeats, 'repeat')}"),
         Pair("recipe", report.recipe),
-        Pair("windows", f"{report.window_s:g} s; left out: {dropped or 'none'}"),
+        Pair("windows", f"{report.window_s:g} s; left out: {format_counts(report.dropped) or 'none'}"),
         Pair("signal sets", ", ".join(report.signal_sets)),
         Pair("features", str(report.n_features)),
         Pair("made", result.created),

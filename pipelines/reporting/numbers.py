@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 NOT_KNOWN = "\N{EN DASH}"
 """Shown where a figure is not known."""
@@ -52,6 +53,17 @@ def percent(ratio: float, digits: int = 1) -> str:
     ('81.3%', '100%')
     """
     return f"{ratio:.{digits}%}"
+
+
+def format_counts(counts: Mapping[str, int]) -> str:
+    """Return counts by kind, sorted by kind.
+
+    Examples
+    --------
+    >>> format_counts({"not moving": 1, "gap": 2})
+    '2 gap, 1 not moving'
+    """
+    return ", ".join(f"{n} {kind}" for kind, n in sorted(counts.items()))
 
 
 def shorten(text: str, width: int) -> str:

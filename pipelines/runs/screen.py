@@ -7,6 +7,7 @@ import math
 from rich.console import Console
 from rich.table import Column, Table
 
+from pipelines.reporting.numbers import format_counts
 from pipelines.reporting.terminal import print_lines
 from pipelines.runs.results import Imported, Inspection
 from terrain.logs.clock import ClockEstimate
@@ -27,7 +28,7 @@ COLUMNS = {
 def print_import(result: Imported, console: Console) -> None:
     """Print what was skipped, how many runs were written, and what was dropped."""
     print_lines(console, (f"skipped: {sentence}" for sentence in result.skipped))
-    counts = "".join(f", {n} {kind}" for kind, n in result.dropped.items())
+    counts = f", {format_counts(result.dropped)}" if result.dropped else ""
     print_lines(console, [f"{result.n_runs} runs written to {result.out}{counts}"])
 
 
@@ -51,8 +52,7 @@ def print_inspection(result: Inspection, console: Console) -> None:
     console.print(table)
     for run in result.runs:
         if run.dropped:
-            counts = ", ".join(f"{n} {kind}" for kind, n in run.dropped.items())
-            console.print(f"{run.run_id}: dropped {counts}")
+            console.print(f"{run.run_id}: dropped {format_counts(run.dropped)}")
     for sentence in result.skipped:
         console.print(sentence)
 

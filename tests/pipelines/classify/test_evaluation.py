@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from sklearn.model_selection import cross_val_predict, cross_validate
+from sklearn.model_selection import StratifiedGroupKFold, cross_val_predict, cross_validate
 
 from features.windows import WindowCut, WindowRule
 from pipelines.classify.evaluation import Examples, FoldResult, fit_folds, pool, summarise
@@ -42,6 +42,12 @@ def test_scikit_learn_cross_validates_whole_recipes_to_the_same_answers(samples,
     for estimator, fold in zip(found["estimator"], report.folds[:2], strict=True):
         assert 0 < estimator[-1].n_inner_fits_ <= 20
         assert estimator[-1].best_._asdict() == fold.chosen
+    several = windows[windows.terrain != "GRAVEL"]
+    folds_of_runs = StratifiedGroupKFold(2, shuffle=True, random_state=0)
+    found = cross_validate(
+        make_recipe("svm"), several, several.terrain.astype(str), groups=several.run_id, cv=folds_of_runs
+    )
+    assert np.all(found["test_score"] > 0.6)
 
 
 def test_the_recipe_gives_its_last_step_the_run_of_each_window(samples):

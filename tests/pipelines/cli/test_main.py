@@ -9,7 +9,7 @@ from sklearn.linear_model import LogisticRegression
 from skops import io as skops_io
 
 from pipelines.cli import main as cli
-from pipelines.models.model_files import INFO_FILE, MODEL_FILE, write_info
+from pipelines.models.model_files import MODEL_FILE, read_model, write_info
 from terrain.logs.write import write_run
 from terrain.records import RunLog, Stream
 
@@ -164,8 +164,7 @@ def test_a_model_that_cannot_be_trusted_is_one_sentence(refused, place, drive, t
     (model / MODEL_FILE).write_bytes(content)
     refused("model.skops: is damaged (SHA-256", *ask, model)
     (model / MODEL_FILE).write_bytes(skops_io.dumps(LogisticRegression().fit([[0.0], [1.0]], [0, 1])))
-    info = json.loads((model / INFO_FILE).read_text())
-    write_info(model, {key: value for key, value in info.items() if key not in ("version", "sha256")})
+    write_info(model, read_model(tracked[0] / "model").info)
     refused("holds a LogisticRegression, not a recipe of this package", *ask, model)
     (place / "table.yaml").write_text("name: [")
     refused("table.yaml: is no YAML", *ask, tracked[0] / "model", "--table", place / "table.yaml")

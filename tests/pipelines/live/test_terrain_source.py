@@ -1,5 +1,7 @@
 """Live windows of a classifier equal those of its training, and no input stops the loop."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -153,10 +155,10 @@ def test_a_window_that_the_model_refuses_is_counted_and_raises_nothing(model, lo
     ("stream", "channel"), [("imu", "accel_q_mps2"), ("gnss", "speed_x_mps"), ("estimator", "speed_z_mps")]
 )
 def test_a_model_that_requires_a_missing_channel_is_refused(model, stream, channel):
-    channels = dict(model.info["channels"])
-    channels[stream] = [*channels.get(stream, []), channel]
-    rates = {**model.info["rate_hz"], stream: 50.0}
-    wanting = model._replace(info={**model.info, "channels": channels, "rate_hz": rates})
+    channels = dict(model.info.channels)
+    channels[stream] = (*channels.get(stream, ()), channel)
+    rates = {**model.info.rate_hz, stream: 50.0}
+    wanting = model._replace(info=replace(model.info, channels=channels, rate_hz=rates))
     with pytest.raises(DataError) as refused:
         Classifier(wanting)
     assert (

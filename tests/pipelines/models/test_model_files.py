@@ -13,6 +13,7 @@ from skops import io as skops_io
 from features.windows import SteadyMotion, WindowRule, cut_windows
 from pipelines.models.model_files import INFO_FILE, MODEL_FILE, TRUSTED_TYPES, read_model, write_info
 from pipelines.models.recipes import WindowPipeline, make_recipe
+from pipelines.models.results import ModelInfo
 from terrain.errors import ModelError
 
 
@@ -20,7 +21,7 @@ def put(folder, content, **changed):
     """Put other bytes in place of the model, with a checksum that fits them."""
     info = json.loads((folder / INFO_FILE).read_text()) | changed
     (folder / MODEL_FILE).write_bytes(content)
-    write_info(folder, {key: value for key, value in info.items() if key not in ("version", "sha256")})
+    write_info(folder, ModelInfo.from_json({k: v for k, v in info.items() if k not in ("version", "sha256")}))
 
 
 def test_a_saved_model_predicts_the_same_to_the_last_bit(model_dir, runs):
@@ -28,7 +29,7 @@ def test_a_saved_model_predicts_the_same_to_the_last_bit(model_dir, runs):
     windows = cut_windows(runs, model.rule).windows
     live = make_recipe("svm").fit(windows, windows.terrain.astype(str))
     assert np.array_equal(model.recipe.predict_proba(windows), live.predict_proba(windows))
-    assert model.recipe.classes_.tolist() == model.info["classes"] == ["ASPHALT", "GRASS", "GRAVEL"]
+    assert model.recipe.classes_.tolist() == list(model.info.classes) == ["ASPHALT", "GRASS", "GRAVEL"]
     assert model.rule == WindowRule(2.0, None, SteadyMotion())
     assert set(skops_io.get_untrusted_types(file=model_dir / MODEL_FILE)) <= set(TRUSTED_TYPES)
 

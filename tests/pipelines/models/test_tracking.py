@@ -2,6 +2,7 @@ import json
 import shutil
 import sqlite3
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -30,11 +31,10 @@ def log(tracked, runs):
     """Return a function that logs the trained model once more, under a name, with a macro F1 and a digest."""
     model = read_model(tracked[0] / "model")
     windows = cut_windows(runs[:1], model.rule).windows
-    info = {key: value for key, value in model.info.items() if key not in ("version", "sha256")}
 
     def again(name, macro_f1, digest="aa"):
         return log_training(
-            name, model.recipe, windows, info | {"data_digest": digest}, {"recipe": "svm"},
+            name, model.recipe, windows, replace(model.info, data_digest=digest), {"recipe": "svm"},
             {"macro_f1": macro_f1}, {}, {},
         )  # fmt: skip
 
@@ -121,7 +121,7 @@ def test_the_champion_moves_by_the_rule(in_tracked, log):
         "macro F1 0.8400 is not better than 0.8500 of version 3 on the same data",
         "new data: the digest differs from that of version 3",
     ]
-    assert load_model("models:/by_rule@champion").info["data_digest"] == "bb"
+    assert load_model("models:/by_rule@champion").info.data_digest == "bb"
     assert in_tracked.registered.alias_reason == "first version"
 
 
@@ -131,7 +131,7 @@ def test_the_server_that_is_named_is_the_one_that_is_used(tracked, log, tmp_path
     monkeypatch.chdir(tmp_path / "work")
     monkeypatch.setenv("MLFLOW_TRACKING_URI", f"sqlite:///{tmp_path / 'other.db'}")
     log("elsewhere", 0.5)
-    assert load_model("models:/elsewhere@champion").info["data_digest"] == "aa"
+    assert load_model("models:/elsewhere@champion").info.data_digest == "aa"
     assert list((tmp_path / "work").iterdir()) == []  # no ./mlruns beside the server that was named
     monkeypatch.delenv("MLFLOW_TRACKING_URI")
     monkeypatch.chdir(tracked[0])
