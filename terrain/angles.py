@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 from numba.extending import register_jitable
@@ -10,7 +10,15 @@ from numba.extending import register_jitable
 from terrain.records import Array
 
 
-def wrapped(angle_rad: float | Array) -> Any:
+@overload
+def wrapped(angle_rad: float) -> float: ...
+
+
+@overload
+def wrapped(angle_rad: Array) -> Array: ...
+
+
+def wrapped(angle_rad: Any) -> Any:
     """Return an angle, or angles of any shape, in (-pi, pi]; one that lies there is returned as it is.
 
     Compiled code may call it too.

@@ -8,7 +8,7 @@ from scipy.ndimage import median_filter
 from terrain.calibration.standing import Stretch
 from terrain.estimation.measurements.cleaning import MIN_CONFIDENCE_RATIO
 from terrain.kinematics.camera import CHANNELS, body_motion
-from terrain.kinematics.wheel_velocity import point_velocity
+from terrain.kinematics.wheel_velocity import TWIST, point_velocity
 from terrain.records import Array, Stream
 from terrain.robots import Robot
 
@@ -22,7 +22,6 @@ MAX_GAP_S = 0.1
 """Over a longer gap nothing is interpolated."""
 
 SEEN = ("camera_speed_x_mps", "camera_speed_y_mps", "camera_yaw_rate_radps", "camera_yaw_rad")
-TWIST = ("speed_x_mps", "speed_y_mps", "yaw_rate_radps")
 
 
 def seen_motion(stretch: Stretch, robot: Robot) -> Stream | None:
@@ -52,9 +51,9 @@ def origin_twist(stretch: Stretch, robot: Robot) -> Stream | None:
     if seen is None:
         return None
     camera = robot.camera
-    turn = seen.values[:, 2]
-    origin = point_velocity(*seen.values[:, :2].T, turn, -camera.lever_x_m, -camera.lever_y_m)
-    return Stream(seen.time_s, np.column_stack([*origin, turn]), TWIST)
+    x_mps, y_mps, turn_radps = seen.values[:, :3].T
+    origin = point_velocity(x_mps, y_mps, turn_radps, -camera.lever_x_m, -camera.lever_y_m)
+    return Stream(seen.time_s, np.column_stack([*origin, turn_radps]), TWIST)
 
 
 def at_times(stream: Stream, time_s: Array) -> Array:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.signal import lfilter
 
-from terrain.kinematics.wheel_velocity import wheel_frame_velocities
+from terrain.kinematics.wheel_velocity import TWIST, wheel_frame_velocities
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import Robot
 
@@ -85,11 +85,10 @@ def drive_history(
     truth = run.streams["truth"]
     wheels = robot.wheels
     step_s = float(np.median(np.diff(truth.time_s)))
-    twist = [truth.channel(name) for name in ("speed_x_mps", "speed_y_mps", "yaw_rate_radps")]
-    along, across, _ = twist
+    twist = np.column_stack([truth.channel(name) for name in TWIST])
     rate = np.column_stack([truth.channel(f"wheel_{wheel}_radps") for wheel in wheels])
     steer = np.column_stack([truth.channel(f"steer_{wheel}_rad") for wheel in wheels])
-    ground, sideways = wheel_frame_velocities(*twist, robot.wheel_positions_m, steer)
+    ground, sideways = wheel_frame_velocities(twist, robot.wheel_positions_m, steer)
     torque = np.column_stack([truth.channel(f"torque_{wheel}_nm") for wheel in wheels])
     power_w = np.maximum(torque * rate, 0.0).sum(axis=1)
     wheel_speed = rate * robot.wheel_radius_m * np.asarray(radius_factors)
@@ -97,8 +96,9 @@ def drive_history(
     side = np.column_stack([truth.channel(f"side_{wheel}_n") for wheel in wheels])
     along_w = (traction * (wheel_speed - ground)).sum(axis=1)
     lost_w = along_w - (side * sideways).sum(axis=1)
-    speed = np.hypot(along, across)
-    progress = _progress(truth.time_s, np.column_stack([along, across]), run.streams.get("commands"))
+    velocity = twist[:, :2]
+    speed = np.hypot(velocity[:, 0], velocity[:, 1])
+    progress = _progress(truth.time_s, velocity, run.streams.get("commands"))
     signed = np.full(wheel_speed.shape, math.nan)
     for i, wheel in enumerate(wheels):
         if f"slip_{wheel}_ratio" in truth.channels:  # a slip that is never defined has no channel
@@ -109,7 +109,7 @@ def drive_history(
     return DriveHistory(
         truth.time_s,
         speed,
-        np.column_stack([along, across]),
+        velocity,
         progress,
         np.cumsum(progress) * step_s,
         np.cumsum(power_w) * step_s,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from terrain.kinematics.wheel_velocity import wheel_frame_velocities
+from terrain.kinematics.wheel_velocity import TWIST, wheel_frame_velocities
 from terrain.records import Array, Stream
 from terrain.robots import Robot
 
@@ -18,8 +18,8 @@ def wheel_and_ground_speed(truth: Stream, robot: Robot) -> tuple[Array, Array]:
     robot : gives the nominal radius and the positions of the wheels
     """
     steer = _of_wheels(truth, robot, "steer_{}_rad")
-    twist = (truth.channel(name) for name in ("speed_x_mps", "speed_y_mps", "yaw_rate_radps"))
-    along, _ = wheel_frame_velocities(*twist, robot.wheel_positions_m, steer)
+    twist = np.column_stack([truth.channel(name) for name in TWIST])
+    along, _ = wheel_frame_velocities(twist, robot.wheel_positions_m, steer)
     return _of_wheels(truth, robot, "wheel_{}_radps") * robot.wheel_radius_m, along
 
 

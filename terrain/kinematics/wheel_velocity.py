@@ -21,6 +21,9 @@ from numba.extending import register_jitable
 
 from terrain.records import Array
 
+TWIST = ("speed_x_mps", "speed_y_mps", "yaw_rate_radps")
+"""Columns of a twist, as channels and states have them."""
+
 
 def point_velocity(
     speed_x_mps: float | Array,
@@ -57,29 +60,21 @@ for function in (point_velocity, in_wheel_frame):
     register_jitable(function)
 
 
-def wheel_frame_velocities(
-    speed_x_mps: Array, speed_y_mps: Array, yaw_rate_radps: Array, positions_m: Array, steer_rad: Array
-) -> tuple[Array, Array]:
+def wheel_frame_velocities(twist: Array, positions_m: Array, steer_rad: Array) -> tuple[Array, Array]:
     """Return the velocities (n, wheels) of the wheel centres along each wheel and across it.
 
     Parameters
     ----------
-    speed_x_mps, speed_y_mps, yaw_rate_radps : (n,) of the body
+    twist : (n, 3) of the body
     positions_m : (wheels, 2)
     steer_rad : (n, wheels)
 
     Examples
     --------
-    >>> along, across = wheel_frame_velocities(
-    ...     np.array([1.0]), np.array([0.0]), np.array([0.2]), np.array([[0.5, 0.0]]), np.array([[0.0]])
-    ... )
-    >>> along, across
+    >>> wheel_frame_velocities(np.array([[1.0, 0.0, 0.2]]), np.array([[0.5, 0.0]]), np.array([[0.0]]))
     (array([[1.]]), array([[0.1]]))
     """
-    x_m, y_m = positions_m.T
-    forward, left = point_velocity(
-        speed_x_mps[:, None], speed_y_mps[:, None], yaw_rate_radps[:, None], x_m, y_m
-    )
+    forward, left = point_velocity(twist[:, 0:1], twist[:, 1:2], twist[:, 2:3], *positions_m.T)
     return in_wheel_frame(forward, left, np.cos(steer_rad), np.sin(steer_rad))
 
 

@@ -39,7 +39,7 @@ from terrain.constants import GRAVITY_MPS2
 from terrain.errors import DataError
 from terrain.estimation.measurements.resampling import on_clock
 from terrain.estimation.measurements.table import MeasurementTable
-from terrain.kinematics.wheel_velocity import wheel_frame_velocities
+from terrain.kinematics.wheel_velocity import TWIST, wheel_frame_velocities
 from terrain.records import Array, Label, RunLog, SlipTrack, StateTrack, read_only
 from terrain.robots import Robot
 
@@ -293,8 +293,8 @@ def wheel_pull(
 
     steer = np.column_stack([track.state(f"steer_{wheel}_rad") for wheel in robot.wheels])
     rate = table.columns([f"wheel_{wheel}_radps" for wheel in robot.wheels])
-    twist = (track.state(name) for name in ("speed_x_mps", "speed_y_mps", "yaw_rate_radps"))
-    along, across = wheel_frame_velocities(*twist, robot.wheel_positions_m, steer)
+    twist = np.column_stack([track.state(name) for name in TWIST])
+    along, across = wheel_frame_velocities(twist, robot.wheel_positions_m, steer)
     wheel_speed = rate * robot.wheel_radius_m
     slipping = wheel_speed - along
     fastest = np.maximum(np.abs(wheel_speed), np.abs(along))
@@ -348,7 +348,7 @@ def wheel_pull(
     balanced = (
         moving
         & fresh
-        & (np.abs(track.state("yaw_rate_radps")) < MAX_YAW_RATE_RADPS)
+        & (np.abs(twist[:, 2]) < MAX_YAW_RATE_RADPS)
         & straight.all(axis=1)
         & sound["current known"].all(axis=1)
         & attitude

@@ -21,7 +21,6 @@ from terrain.errors import DataError
 from terrain.estimation.ekf.kernel import OBSERVE, PROPAGATE
 from terrain.estimation.ekf.model import FilterModel, Noise
 from terrain.estimation.ekf.state import initial_state
-from terrain.estimation.ekf.steps import wrap
 from terrain.records import GATED, USED, Array, StateTrack
 
 OUTSIDE = 0.05
@@ -217,14 +216,14 @@ def _draw(
             for i in range(d):
                 x[i] = x_next[i] + walk[n, i]
                 if is_angle_state[i]:
-                    x[i] = wrap(x[i])
+                    x[i] = wrapped(x[i])
         truth[n] = x
         h[:] = 0.0
         observe(x, params, z_hat, h)
         for i in range(m):
             z[n, i] += z_hat[i]
             if is_angle_row[i]:
-                z[n, i] = wrap(z[n, i])
+                z[n, i] = wrapped(z[n, i])
 
 
 def _judge(name: str, squares: Array, dof: Array, gated_fraction: float) -> Consistency:

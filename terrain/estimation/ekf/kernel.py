@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numba import boolean, float64, int64, njit, types, void
 
+from terrain.angles import wrapped
 from terrain.estimation.ekf.steps import (
     LARGEST,
     LONGEST_GAP_S,
@@ -28,7 +29,6 @@ from terrain.estimation.ekf.steps import (
     forget,
     innovation,
     predict,
-    wrap,
 )
 from terrain.records import ABSENT, GATED, REOPENED, USED, Array
 
@@ -182,7 +182,7 @@ def run(
                     if not (abs(z) <= LARGEST and variances[at, i] > 0.0 and variances[at, i] < np.inf):
                         counts[_N_PER_ROW + _N_PER_SENSOR * k + _NOT_FINITE] += 1
                         continue
-                    nus[i] = wrap(z - z_hat[i]) if is_angle_row[i] else z - z_hat[i]
+                    nus[i] = wrapped(z - z_hat[i]) if is_angle_row[i] else z - z_hat[i]
                     n_h_cols[i] = find_columns(h, i, h_cols)
                     rows[n_rows] = i
                     n_rows += 1
@@ -246,7 +246,7 @@ def run(
             for i in range(d):
                 x[i] += dx[i]
                 if is_angle_state[i]:
-                    x[i] = wrap(x[i])
+                    x[i] = wrapped(x[i])
                 for j in range(i):
                     p[j, i] = p[i, j]
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 from numba import njit
 
 from terrain.records import REOPENED, USED, Array
@@ -17,19 +16,6 @@ LONGEST_GAP_S = 3600.0
 WIDEST = LARGEST**4
 
 fast = njit(cache=True, error_model="numpy", forceinline=True)
-
-
-@njit(cache=True)
-def wrap(angle_rad: float) -> float:
-    """Return the angle in (-pi, pi].
-
-    Examples
-    --------
-    >>> float(wrap(-np.pi)) == np.pi, round(float(wrap(7.0)), 4)
-    (True, 0.7168)
-    """
-    turned = np.pi - (np.pi - angle_rad) % (2 * np.pi)
-    return turned if turned > -np.pi else np.pi
 
 
 @fast

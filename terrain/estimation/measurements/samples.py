@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numba import njit
 
+from terrain.angles import wrapped
 from terrain.constants import GRAVITY_MPS2
 from terrain.estimation.measurements.sample_hold import LEAPS, N_LINE, NO_LEAP, at_tick, limits_of, take
 from terrain.estimation.measurements.table import (
@@ -112,11 +113,6 @@ def row_memory() -> tuple[Array, Array, Array]:
 
 
 @_inline
-def _wrap(angle_rad: float) -> float:
-    return np.pi - (np.pi - angle_rad) % (2 * np.pi)
-
-
-@_inline
 def _unwrap(angle_rad: float, memory: Array) -> float:
     """Return the angle without jumps of a turn; ``memory`` holds the last one and the turns so far."""
     if math.isnan(angle_rad):
@@ -140,7 +136,7 @@ def take_steering(
     """Steering angles without their zeros; the first one lies within half a turn."""
     leapt = False
     for i in range(3):
-        angle = _wrap(sample[i] - params[_ZERO + i])
+        angle = wrapped(sample[i] - params[_ZERO + i])
         leapt |= take(STEER + i, _unwrap(angle, turns[i]), came_s, came_s, lines, limits)
     return bool(leapt)
 

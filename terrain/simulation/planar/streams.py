@@ -278,7 +278,9 @@ def camera_stream(run: PlanarRun, rng: np.random.Generator) -> Stream:
         yaw = yaw + camera.yaw_std_rad * rng.standard_normal(n)
         rate = rate + camera.yaw_rate_std_radps * rng.standard_normal(n)
         position_noise = camera.position_std_m * rng.standard_normal((n, 2))
-    origin = np.column_stack(point_velocity(*seen.T, rate, -camera.lever_x_m, -camera.lever_y_m))
+    origin = np.column_stack(
+        point_velocity(seen[:, 0], seen[:, 1], rate, -camera.lever_x_m, -camera.lever_y_m)
+    )
     cos, sin = np.cos(yaw), np.sin(yaw)
     velocity = np.column_stack(
         [origin[:, 0] * cos - origin[:, 1] * sin, origin[:, 0] * sin + origin[:, 1] * cos]
@@ -311,7 +313,7 @@ def planar_truth(run: PlanarRun) -> Stream:
     accel_x = motion.truth[rows, AX] - GRAVITY_MPS2 * np.sin(grade)
     accel_y = np.gradient(v_y, 1.0 / IMU_HZ) + turn * v_x
     steer = motion.steer_rad[rows]
-    along, _ = wheel_frame_velocities(v_x, v_y, turn, robot.wheel_positions_m, steer)
+    along, _ = wheel_frame_velocities(np.column_stack([v_x, v_y, turn]), robot.wheel_positions_m, steer)
     columns = [
         motion.pose[rows],
         np.column_stack([motion.roll_rad[rows], -grade, v_x, v_y, turn, accel_x, accel_y]),
