@@ -195,7 +195,7 @@ def sample_from_model(
     ),
     cache=True,
 )
-def _draw(
+def _draw(  # noqa: PLR0913 - a kernel takes its arrays one by one
     propagate: Any,
     observe: Any,
     params: Array,

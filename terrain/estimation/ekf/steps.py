@@ -61,7 +61,7 @@ def find_columns(m: Array, i: int, cols: Array) -> int:
 
 
 @fast
-def predict(
+def predict(  # noqa: PLR0913 - a kernel takes its arrays one by one
     propagate: Any,
     params: Array,
     x: Array,
@@ -171,7 +171,7 @@ def innovation(
 
 
 @fast
-def condition_on(
+def condition_on(  # noqa: PLR0913 - a kernel takes its arrays one by one
     nu: float,
     spread: float,
     r: float,

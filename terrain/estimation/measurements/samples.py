@@ -221,7 +221,7 @@ def take_gnss(
 
 
 @_inline
-def take_sample(
+def take_sample(  # noqa: PLR0913 - a kernel takes its arrays one by one
     stream: int,
     sample: Array,
     instant_s: float,
