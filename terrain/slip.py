@@ -68,6 +68,21 @@ def slip_ratio(
     return np.clip(slip, -1.0, 1.0)
 
 
+def traction_slip(slip_ratio: Array, wheel_radps: Array) -> Array:
+    """Return slip that is positive in traction in both directions, from slip signed along the wheel.
+
+    The sign is that of the speed over ground: the sign of the wheel's rate, but opposite where the magnitude
+    of slip is above 1, as the wheel then turns against the motion; a locked wheel only brakes.
+
+    Examples
+    --------
+    >>> traction_slip(np.array([0.2, -0.2, -1.1, 1.0]), np.array([5.0, -5.0, -1.0, 0.0]))
+    array([ 0.2,  0.2, -1.1, -1. ])
+    """
+    direction = np.where(np.abs(slip_ratio) > 1.0, -np.sign(wheel_radps), np.sign(wheel_radps))
+    return np.asarray(slip_ratio * np.where(wheel_radps == 0.0, -np.sign(slip_ratio), direction))
+
+
 def slip_angle(forward_mps: Any, left_mps: Any, min_speed_mps: float = MIN_SPEED_MPS) -> Array:
     """Return the angle in rad from a wheel's plane to where its centre goes; positive to the wheel's left.
 

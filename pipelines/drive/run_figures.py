@@ -23,10 +23,11 @@ from pipelines.reporting.drawing import (
     styled,
 )
 from pipelines.reporting.numbers import shorten
-from terrain.control.drive_metrics import PEAK_ABOVE_MPS, low_passed_slip, traction_slip
+from terrain.control.drive_metrics import PEAK_ABOVE_MPS, low_passed_slip
 from terrain.control.power_state import DriveState
 from terrain.control.slip_table import SlipTable
 from terrain.control.traction import TractionStatus
+from terrain.kinematics.true_slip import true_slip
 from terrain.records import Array, RunLog
 
 MAX_POINTS = 2500
@@ -70,9 +71,7 @@ def drive_curves(run: RunLog) -> DriveCurves:
     step_s = float(np.median(np.diff(truth.time_s)))
     speed = np.hypot(truth.channel("speed_x_mps"), truth.channel("speed_y_mps"))
     wheels = [name.split("_")[1] for name in truth.channels if name.startswith("wheel_")]
-    slips = np.column_stack([truth.channel(f"slip_{wheel}_ratio") for wheel in wheels])
-    rates = np.column_stack([truth.channel(f"wheel_{wheel}_radps") for wheel in wheels])
-    slips = low_passed_slip(np.clip(traction_slip(slips, rates), -1.0, 1.0), step_s)
+    slips = low_passed_slip(np.clip(true_slip(truth, wheels), -1.0, 1.0), step_s)
     slips[speed < PEAK_ABOVE_MPS] = np.nan
     channels = {name: control.channel(name) for name in control.channels}
     aimed = channels["aimed_ratio"]

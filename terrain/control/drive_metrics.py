@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.signal import lfilter
 
+from terrain.kinematics.true_slip import true_slip
 from terrain.kinematics.wheel_velocity import TWIST, wheel_frame_velocities
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import Robot
@@ -99,12 +100,9 @@ def drive_history(
     velocity = twist[:, :2]
     speed = np.hypot(velocity[:, 0], velocity[:, 1])
     progress = _progress(truth.time_s, velocity, run.streams.get("commands"))
-    signed = np.full(wheel_speed.shape, math.nan)
-    for i, wheel in enumerate(wheels):
-        if f"slip_{wheel}_ratio" in truth.channels:  # a slip that is never defined has no channel
-            signed[:, i] = truth.channel(f"slip_{wheel}_ratio")
-    slip = low_passed_slip(traction_slip(signed, rate), step_s)
-    slip[np.isnan(signed)] = np.nan
+    true = true_slip(truth, wheels)
+    slip = low_passed_slip(true, step_s)
+    slip[np.isnan(true)] = np.nan
     sinkage = np.column_stack([truth.channel(f"sinkage_{wheel}_m") for wheel in wheels])
     return DriveHistory(
         truth.time_s,
@@ -138,21 +136,6 @@ def _progress(time_s: Array, velocity: Array, commands: Stream | None) -> Array:
     direction = desired[at] / np.maximum(size[at], 1e-9)[:, None]
     along = np.where(at < 0, np.linalg.norm(velocity, axis=1), np.einsum("ij,ij->i", velocity, direction))
     return np.asarray(along)
-
-
-def traction_slip(slip_ratio: Array, wheel_radps: Array) -> Array:
-    """Return slip that is positive in traction in both directions, from slip signed along the wheel.
-
-    The sign is that of the speed over ground: the sign of the wheel's rate, but opposite where the magnitude
-    of slip is above 1, as the wheel then turns against the motion; a locked wheel only brakes.
-
-    Examples
-    --------
-    >>> traction_slip(np.array([0.2, -0.2, -1.1, 1.0]), np.array([5.0, -5.0, -1.0, 0.0]))
-    array([ 0.2,  0.2, -1.1, -1. ])
-    """
-    direction = np.where(np.abs(slip_ratio) > 1.0, -np.sign(wheel_radps), np.sign(wheel_radps))
-    return np.asarray(slip_ratio * np.where(wheel_radps == 0.0, -np.sign(slip_ratio), direction))
 
 
 def low_passed_slip(slip_ratio: Array, step_s: float) -> Array:

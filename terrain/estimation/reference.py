@@ -81,7 +81,7 @@ def true_slip_at(run: RunLog, robot: Robot, time_s: Array) -> Array:
     if truth is None:
         return np.full((len(time_s), len(robot.wheels)), np.nan)
     at = np.clip(np.searchsorted(truth.time_s, time_s), 0, len(truth) - 1)
-    return true_slip(truth, robot)[at]
+    return true_slip(truth, robot.wheels)[at]
 
 
 def _true_state(truth: Stream, state: str, robot: Robot, initial_yaw_rad: float) -> Array | None:

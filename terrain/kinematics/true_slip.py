@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from terrain.kinematics.wheel_velocity import TWIST, wheel_frame_velocities
 from terrain.records import Array, Stream
 from terrain.robots import Robot
+from terrain.slip import traction_slip
 
 
 def wheel_and_ground_speed(truth: Stream, robot: Robot) -> tuple[Array, Array]:
@@ -23,25 +26,23 @@ def wheel_and_ground_speed(truth: Stream, robot: Robot) -> tuple[Array, Array]:
     return _of_wheels(truth, robot, "wheel_{}_radps") * robot.wheel_radius_m, along
 
 
-def true_slip(truth: Stream, robot: Robot) -> Array:
-    """Return the slip ratio (n, wheels) that the simulation recorded, positive in traction.
+def true_slip(truth: Stream, wheels: Sequence[str]) -> Array:
+    """Return the slip ratio (n, wheels) that a simulation recorded, positive in traction.
 
-    The recorded one is positive along the wheel's own x axis (:mod:`terrain.slip`); here its sign is that of
-    traction in either direction of rolling, ``s * sign(v)`` with the speed over ground v along the wheel.  It
-    is that of the wheels' true radii, up to 2 where a wheel turns against its direction of travel, and NaN
-    where wheel and robot are at rest.
+    The recorded one is signed along the wheel's own x axis; here its sign is that of traction in both
+    directions (:func:`terrain.slip.traction_slip`).  It is that of the wheels' true radii, up to 2 where a
+    wheel turns against the motion, and NaN where wheel and robot are at rest.
 
     Parameters
     ----------
-    truth : stream as ``terrain.simulation`` writes it; the slip of a wheel that has no channel is NaN
-    robot : gives the wheels and their positions
+    truth : stream as ``terrain.simulation`` writes it; a slip that is never defined has no channel
+    wheels : their names
     """
-    recorded = np.full((len(truth), len(robot.wheels)), np.nan)
-    for i, wheel in enumerate(robot.wheels):
-        if f"slip_{wheel}_ratio" in truth.channels:  # a slip that is NaN throughout is not written
+    recorded = np.full((len(truth), len(wheels)), np.nan)
+    for i, wheel in enumerate(wheels):
+        if f"slip_{wheel}_ratio" in truth.channels:
             recorded[:, i] = truth.channel(f"slip_{wheel}_ratio")
-    _, ground = wheel_and_ground_speed(truth, robot)
-    return recorded * np.where(ground < 0.0, -1.0, 1.0)
+    return traction_slip(recorded, np.column_stack([truth.channel(f"wheel_{w}_radps") for w in wheels]))
 
 
 def _of_wheels(truth: Stream, robot: Robot, pattern: str) -> Array:
