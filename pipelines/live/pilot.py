@@ -192,25 +192,25 @@ class LivePilot:
         steer_rad: Array | None = None,
     ) -> None:
         table = load_slip_table() if table is None else table
-        robot, correction = correct_live(check_pilot(robot, table, settings))
-        self._table, self._settings, self._radius_m = table, settings, robot.wheel_radius_m
+        driven, correction = correct_live(check_pilot(robot, table, settings))
+        self._table, self._settings, self._radius_m = table, settings, driven.wheel_radius_m
         self._source = NoTerrain() if source is None else source
         self._terrains = {terrain: index for index, terrain in enumerate(table.targets)}
         self._braking = {name: braking_by_slip(curve) for name, curve in table.curves.items()}
-        self._positions_m = np.array(robot.wheel_positions_m)
+        self._positions_m = np.array(driven.wheel_positions_m)
         self._limits = (
-            robot.wheel_radius_m,
-            robot.equipment.motors.speed_max_radps,
-            robot.equipment.steering.rate_max_radps,
+            driven.wheel_radius_m,
+            driven.equipment.motors.speed_max_radps,
+            driven.equipment.steering.rate_max_radps,
         )
-        self._controller = _wheel_controller(robot, settings)
+        self._controller = _wheel_controller(driven, settings)
         self._estimator: LiveEstimator | None = None
         if settings.controller not in OPEN_LOOP:
-            self._estimator = LiveEstimator(robot, correction=correction)
+            self._estimator = LiveEstimator(driven, correction=correction)
             states = self._estimator.states
-            self._observer = WheelObserver(robot, [states.index(f"steer_{i}_rad") for i in robot.wheels])
+            self._observer = WheelObserver(driven, [states.index(f"steer_{i}_rad") for i in driven.wheels])
             if settings.track:
-                self._tracking = check_tracking(robot, settings.tracking, settings.delay_s)
+                self._tracking = check_tracking(driven, settings.tracking, settings.delay_s)
             pose = ("position_x_m", "position_y_m", "yaw_rad")
             self._pose_states = [states.index(state) for state in pose]
         steer = np.zeros(3) if steer_rad is None else np.array(steer_rad, dtype=np.float64)

@@ -166,8 +166,3 @@ class Effect(NamedTuple):
     aliases: tuple[str, ...] = ()
     twins: tuple[tuple[str, str], ...] = ()
     deprecated: tuple[str, ...] = ()
-
-    @property
-    def label(self) -> str:
-        """Words of the name, as pages write it."""
-        return self.name.replace("_", " ")

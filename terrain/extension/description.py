@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -12,8 +12,11 @@ from terrain.effects import PARAMETER, Home
 from terrain.errors import ConfigError
 from terrain.robots import Robot
 
+AnyRobot = TypeVar("AnyRobot", bound=Robot)
+"""What is corrected keeps its drive."""
 
-def apply_homes(robot: Robot, names: Collection[str] = tuple(PARAMETER)) -> Robot:
+
+def apply_homes(robot: AnyRobot, names: Collection[str] = tuple(PARAMETER)) -> AnyRobot:
     """Return a robot with those of its effects that have a home in its description applied there.
 
     Parameters
@@ -39,7 +42,7 @@ def apply_homes(robot: Robot, names: Collection[str] = tuple(PARAMETER)) -> Robo
     return _without(robot, applied)
 
 
-def corrected(robot: Robot) -> Robot:
+def corrected(robot: AnyRobot) -> AnyRobot:
     """Return the robot that filters take, together with a log that is :func:`corrected_log`.
 
     Effects with a home in the description are applied there; of the others those are left that have no
@@ -81,7 +84,7 @@ def _has_section(robot: Robot, home: Home) -> bool:
     return not home.section or robot.describes(home.section)
 
 
-def _apply(robot: Robot, home: Home, value: float) -> Robot:
+def _apply(robot: AnyRobot, home: Home, value: float) -> AnyRobot:
     """Return a robot with one number of its description changed; the same robot if it lacks the section."""
     if not _has_section(robot, home):
         return robot
@@ -89,11 +92,11 @@ def _apply(robot: Robot, home: Home, value: float) -> Robot:
     if home.scaled_by:
         value *= getattr(part, home.scaled_by)
     part = replace(part, **{home.field: home.combine.apply(getattr(part, home.field), value)})
-    changed: Robot = robot.with_parts(**{home.section: part}) if home.section else part
+    changed: AnyRobot = robot.with_parts(**{home.section: part}) if home.section else part
     return changed
 
 
-def _without(robot: Robot, names: Collection[str]) -> Robot:
+def _without(robot: AnyRobot, names: Collection[str]) -> AnyRobot:
     kept = [i for i, name in enumerate(robot.effects) if name not in names]
     if len(kept) == len(robot.effects):
         return robot

@@ -10,13 +10,13 @@ import numpy as np
 
 from terrain.angles import unwrapped, wrapped
 from terrain.effects import OTHER_LOGGER, parameters_of
-from terrain.extension.description import apply_homes, corrected
+from terrain.extension.description import AnyRobot, apply_homes, corrected
 from terrain.kinematics.camera import turned
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import Robot
 
 
-def correct(run: RunLog, robot: Robot) -> tuple[RunLog, Robot]:
+def correct(run: RunLog, robot: AnyRobot) -> tuple[RunLog, AnyRobot]:
     """Return a log and its robot without the effects that can be taken off them, as filters take both.
 
     A robot without effects, or one that was corrected, is returned as it is, and so is its log.
@@ -33,7 +33,7 @@ def correct(run: RunLog, robot: Robot) -> tuple[RunLog, Robot]:
     return corrected_log(run, robot), corrected(robot)
 
 
-def correct_live(robot: Robot) -> tuple[Robot, Correction | None]:
+def correct_live(robot: AnyRobot) -> tuple[AnyRobot, Correction | None]:
     """Return a robot as live filters take it, and what corrects the samples that come; None without effects.
 
     Examples

@@ -151,17 +151,17 @@ exec(compile((place / "__init__.py").read_text(), "effects", "exec"), package.__
 
 from dataclasses import replace
 import terrain.effects as effects
-from pipelines.explain.page import limit_words, quantity
+from pipelines.explain.wording import limit_text, quantity
 from terrain.discrepancy import residuals, search, information
 from terrain.discrepancy.simulation import Simulation
-from terrain.discrepancy.trials.hidden_effects import STEPS
+from terrain.discrepancy.verdict import Limit
 from terrain.extension import corrected
 from terrain.robots import load_robot, robot_from
 from terrain.simulation.dynamic.simulate import _built
 
 robot, name = load_robot("agrimaro"), "gear_wear_ratio"
 for table in (effects.BOUNDS, effects.STEPS, effects.NUISANCES, effects.SENSED_ONLY, effects.ONE_SIDED,
-              effects.INDEX, residuals.STEPS, residuals.SENSED_ONLY, residuals.ONE_SIDED, STEPS,
+              effects.INDEX, residuals.STEPS, residuals.SENSED_ONLY, residuals.ONE_SIDED,
               information.PRIOR_STD, effects.nuisances_of("swerve")):
     assert name in table
 assert name not in effects.nuisances_of("skid_steer")
@@ -173,7 +173,7 @@ for extended in (corrected(replace(robot, effects={name: 0.05})), _built(robot, 
     assert extended.motors.efficiency_ratio == robot.motors.efficiency_ratio * 1.05
     assert not extended.effects
 assert quantity(name, 0.05) == "5\N{NO-BREAK SPACE}%"
-assert limit_words({"name": name, "detection_limit": 0.05}, False).startswith("A gear wear off by under 5")
+assert limit_text(Limit(name, 0.05, "ratio", "z"), False).startswith("A gear wear off by under 5")
 """
 
 
