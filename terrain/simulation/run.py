@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 
@@ -42,6 +43,15 @@ SLIP = "slip"
 """Word for drives that take the wheels through their slips, for ``terrain learn-slip``."""
 
 
+class Setup(NamedTuple):
+    """Conditions, faults of the sensors, receiver and effects of a run."""
+
+    conditions: Conditions
+    faults: Faults
+    gnss: Gnss | None
+    effects: Mapping[str, float]
+
+
 def simulate_run(
     robot: Robot,
     terrain: str,
@@ -59,33 +69,36 @@ def simulate_run(
     """Return one simulated run.
 
     What is drawn depends on ``seed``, ``terrain``, ``scenario`` and ``number`` alone: a run is the same
-    whatever is simulated beside it.  A skid-steer robot goes to the planar simulation.
+    whatever is simulated beside it.
 
     Parameters
     ----------
     robot : swerve robot with all sections, or skid-steer robot with all but steering
     terrain : name of a soil or path of its YAML file, or ``course`` for all soils in one run
     scenario : name of a scenario; ``course`` goes with the terrain ``course``, ``six_positions`` (the IMU
-        alone, for calibration) with ``bench``; ``slip`` takes the wheels through their slips on varied days
-    seed, number : which draw
+    alone,
+        for calibration) with ``bench``; ``slip`` sweeps the slip of the wheels under varied conditions
+    seed, number : of what is drawn
     duration_s : length; the scenario's own by default
-    vary : draw soil, slope, load, tyres and roughness for this run as ``data/soils`` and ``data/spread`` tell
+    vary : draw soil, slope, load, tyres and roughness for this run by ``data/soils`` and ``data/spread``
     conditions : nominal conditions
-    faults : what the sensors suffer on purpose
+    faults : faults of the sensors
     gnss : receiver on board, if any
     effects : parameters of :mod:`terrain.effects.catalogue` that act
 
     Raises
     ------
     ConfigError
-        if the terrain or scenario is unknown or they do not go together, or the robot cannot do it.
+        if the terrain or scenario is unknown or they do not go together, or the robot cannot drive it.
     """
     if effects and scenario in (BENCH, SLIP):
         raise ConfigError(f"scenario {scenario!r} is simulated without effects: leave them out")
     if scenario == BENCH:
         return _bench(robot, terrain, seed, number, duration_s)
     if scenario == SLIP:
-        return _through_slips(robot, terrain, seed, number, duration_s, conditions, faults, gnss)
+        _check_slip(terrain, duration_s, conditions, faults, gnss)
+        run_id = run_id_of(load_soil(terrain).name, SLIP, number)
+        return learning_run(robot, terrain, seed, number, run_id=run_id)
     if (terrain == COURSE) != (scenario == COURSE):
         raise ConfigError("terrain 'course' and scenario 'course' go together: give both or neither")
     soils = {soil.name: soil for soil in map(load_soil, soil_names() if terrain == COURSE else (terrain,))}
@@ -97,35 +110,15 @@ def simulate_run(
         rng = np.random.default_rng(drawn)
         soils = {name: scattered(soil, rng) for name, soil in soils.items()}
         conditions = draw_conditions(load_spread(), rng, conditions)
-    drive_seed = int(driven.generate_state(1)[0])
-    if not robot.steered and terrain == COURSE:
+    run_id, planar = run_id_of(terrain, scenario, number), not robot.steered
+    if planar and terrain == COURSE:
         raise ConfigError(f"robot {robot.name}: scenario {COURSE!r} is for swerve robots")
+    drive_seed = int(driven.generate_state(1)[0])
     drive = make_scenario(scenario, robot, names, duration_s, seed=drive_seed)
-    if not robot.steered:
-        if gnss is not None:
-            raise ConfigError(f"robot {robot.name}: its simulation has no receiver, leave gnss out")
-        log = _planar_run(
-            robot,
-            soils[terrain],
-            drive.twist,
-            simulated,
-            run_id_of(terrain, scenario, number),
-            conditions or Conditions(),
-            vary,
-            effects or {},
-        )
-        return log if faults is None else _without_camera(log, faults)
-    return simulate(
-        robot,
-        drive,
-        soils,
-        simulated,
-        run_id=run_id_of(terrain, scenario, number),
-        conditions=conditions,
-        faults=Faults() if faults is None else faults,
-        gnss=gnss,
-        effects=effects,
-    )
+    setup = Setup(conditions or Conditions(), faults or Faults(), gnss, effects or {})
+    if planar:
+        return _planar_run(robot, soils[terrain], drive.twist, simulated, run_id, setup, vary)
+    return simulate(robot, drive, soils, simulated, run_id=run_id, **setup._asdict())
 
 
 def _planar_run(
@@ -134,17 +127,19 @@ def _planar_run(
     twist: Array,
     seed: np.random.SeedSequence,
     run_id: str,
-    conditions: Conditions,
+    setup: Setup,
     vary: bool,
-    effects: Mapping[str, float],
 ) -> RunLog:
-    """Return a run of the planar simulation; what its sensors scatter, they do on a nominal day too."""
+    """Return a run of the planar simulation; the scatter of its sensors does not depend on ``vary``."""
+    conditions, faults, gnss, effects = setup
+    if gnss is not None:
+        raise ConfigError(f"robot {robot.name}: its simulation has no receiver, leave gnss out")
     scatter = load_scatter()
     if not vary:
         fixed = (name for name in NUISANCES if name in PARAMETER and name not in SENSED_ONLY)
         scatter = scatter._replace(**dict.fromkeys(fixed, 0.0))
     load = conditions.payload_kg / robot.mass_kg
-    return simulate_planar(
+    run = simulate_planar(
         robot,
         twist,
         seed,
@@ -156,10 +151,13 @@ def _planar_run(
         run_id=run_id,
         terrain=soil.name,
     )
+    return _without_camera(run, faults)
 
 
 def _without_camera(run: RunLog, faults: Faults) -> RunLog:
-    """Return the run without the camera's samples of the times in which it is lost."""
+    """Return the run without the samples of the lost camera."""
+    if not faults.camera_lost_s:
+        return run
     seen = run.streams["odometry"]
     kept = ~is_lost(seen.time_s, faults.camera_lost_s)
     left = Stream(seen.time_s[kept], seen.values[kept], seen.channels)
@@ -169,25 +167,22 @@ def _without_camera(run: RunLog, faults: Faults) -> RunLog:
     return RunLog(run.run_id, run.robot, streams, run.labels, run.source)
 
 
-def _through_slips(
-    robot: Robot,
+def _check_slip(
     terrain: str,
-    seed: int,
-    number: int,
     duration_s: float | None,
     conditions: Conditions | None,
     faults: Faults | None,
     gnss: Gnss | None,
-) -> RunLog:
-    """Return one of the drives of :mod:`terrain.simulation.slip_sweep`, which draw all conditions."""
+) -> None:
+    """Refuse options of the drives of :mod:`terrain.simulation.slip_sweep`, which draw all conditions."""
     if terrain == COURSE:
         raise ConfigError(f"scenario {SLIP!r} is driven on one terrain, not on 'course'")
     if duration_s is not None or conditions not in (None, Conditions()) or gnss is not None:
-        raise ConfigError(f"scenario {SLIP!r} draws its own day: leave duration, grade, payload and gnss out")
+        raise ConfigError(
+            f"scenario {SLIP!r} draws its conditions: leave duration, grade, payload and gnss out"
+        )
     if faults not in (None, Faults()):
         raise ConfigError(f"scenario {SLIP!r} has no faults on purpose: leave the camera's loss out")
-    ground = load_soil(terrain).name
-    return learning_run(robot, terrain, seed, number, run_id=run_id_of(ground, SLIP, number))
 
 
 def _bench(robot: Robot, terrain: str, seed: int, number: int, duration_s: float | None) -> RunLog:

@@ -29,10 +29,9 @@ from terrain.effects import PlantPart, in_plant, parameters_of
 from terrain.errors import ConfigError
 from terrain.records import Array
 from terrain.robots import Robot
+from terrain.simulation.conditions import Conditions
+from terrain.simulation.dynamic.profile import TerrainProfile
 from terrain.simulation.sensors.motion import N_RECORD, STEP_S
-
-FIELD_STEP_M = 0.1
-"""Grid on which the ground varies along the way."""
 
 
 class Plant(NamedTuple):
@@ -86,37 +85,15 @@ class Plant(NamedTuple):
     side_hill_ratio: float
 
 
-def make_plant(
-    robot: Robot,
-    *,
-    payload_kg: float,
-    payload_m: tuple[float, float],
-    radius_factors: Array,
-    grade_ratio: tuple[float, float],
-    undulation_ratio: float,
-    undulation_length_m: float,
-    leg_backlash_rad: float,
-    grounds: Array,
-    roughness_m3: Array,
-    patch_start_m: Array,
-    field: Array,
-) -> Plant:
-    """Return the plant of a robot with its load on its ground.
+def make_plant(robot: Robot, conditions: Conditions, profile: TerrainProfile) -> Plant:
+    """Return the plant of a robot with its load on its terrain.
 
     Parameters
     ----------
-    robot : with sections body, motors, steering and sensors; of its effects those act that are listed above,
-        and a payload
-    payload_kg, payload_m : load on top and where it lies from the empty robot's centre of mass, body axes
-    radius_factors : (3,) true rolling radius of each wheel over the nominal one
-    grade_ratio : (2,) mean gradient of the ground along world x and y, uphill positive
-    undulation_ratio, undulation_length_m : amplitude of a gradient that changes along the way, and its wave
-    length
-    leg_backlash_rad : half the play of the third leg's hinge
-    grounds : (patches, GROUND_SIZE) of ``terrain.terramechanics``
-    roughness_m3 : (patches,) ISO 8608 roughness
-    patch_start_m : (patches,) path length at which each begins, the first at 0
-    field : (2, 3, cells) factors along the way on thrust and on resistance, for each wheel
+    robot : with sections body, motors, steering and sensors; of its effects those listed above act, and a
+    payload
+    conditions : load, slope, tyres and the play of the third leg
+    profile : the terrain
 
     Raises
     ------
@@ -125,34 +102,26 @@ def make_plant(
     """
     body, motors, steering, _, sensors = robot.equipment
     effects = dict.fromkeys(parameters_of(robot.drive), 0.0) | dict(robot.effects)
-    mass_kg = robot.mass_kg * (1.0 + effects["payload_ratio"]) + payload_kg
+    mass_kg = robot.mass_kg * (1.0 + effects["payload_ratio"]) + conditions.payload_kg
     half = 0.5 * effects["one_sided_radius_ratio"]
     rolling = (1.0 + effects["wheel_radius_ratio"]) * np.array([1.0 - half, 1.0 - half, 1.0 + half])
-    com_m = np.array([body.com_x_m, body.com_y_m]) + payload_kg / mass_kg * np.asarray(payload_m)
-    # Rows: vertical force, moment about y (x arm), moment about x (y arm); columns: the three wheels.
-    balance = np.vstack([np.ones(3), robot.wheel_positions_m.T])
-    inverse = np.linalg.inv(balance)
-    load_fraction = inverse @ np.array([1.0, com_m[0], com_m[1]])
-    if load_fraction.min() <= 0.0:
-        raise ConfigError(
-            f"robot {robot.name}: a payload of {payload_kg:g} kg at ({payload_m[0]:g}, {payload_m[1]:g}) m "
-            f"from the centre of mass tips it over: wheel {int(load_fraction.argmin()) + 1} would carry "
-            "nothing"
-        )
+    offset_m = conditions.payload_kg / mass_kg * np.asarray(conditions.payload_m)
+    com_m = np.array([body.com_x_m, body.com_y_m]) + offset_m
+    load_fraction, load_per_moment = _load_shares(robot, conditions, com_m)
     return Plant(
         wheels_m=np.array(robot.wheel_positions_m),
         com_m=com_m,
         com_height_m=body.com_height_m,
         mass_kg=mass_kg,
         yaw_inertia_kgm2=body.yaw_inertia_kgm2 * mass_kg / robot.mass_kg,
-        radius_m=robot.wheel_radius_m * np.asarray(radius_factors, dtype=float) * rolling,
+        radius_m=robot.wheel_radius_m * np.array(conditions.radius_factors) * rolling,
         wheel_inertia_kgm2=body.wheel_inertia_kgm2,
         relaxation_m=body.relaxation_length_m,
         contact_length_m=body.contact_length_m,
         ride_stiffness_npm=body.tyre_stiffness_npm,
         ride_damping_nspm=body.tyre_damping_nspm,
         load_fraction=load_fraction,
-        load_per_force_ratio=np.ascontiguousarray(-body.com_height_m * inverse[:, 1:]),
+        load_per_force_ratio=np.ascontiguousarray(-body.com_height_m * load_per_moment),
         reduction_ratio=motors.reduction_ratio,
         torque_max_nm=motors.torque_max_nm,
         speed_max_radps=motors.speed_max_radps,
@@ -166,14 +135,14 @@ def make_plant(
         steer_rate_max_radps=steering.rate_max_radps,
         steer_accel_max_radps2=steering.accel_max_radps2,
         backlash_rad=steering.dead_band_rad,
-        leg_backlash_rad=float(leg_backlash_rad),
-        grade_ratio=np.array(grade_ratio, dtype=float),
-        undulation_ratio=float(undulation_ratio),
-        undulation_length_m=float(undulation_length_m),
-        grounds=np.ascontiguousarray(grounds, dtype=float),
-        roughness_m3=np.ascontiguousarray(roughness_m3, dtype=float),
-        patch_start_m=np.ascontiguousarray(patch_start_m, dtype=float),
-        field=np.ascontiguousarray(field, dtype=float),
+        leg_backlash_rad=float(conditions.leg_backlash_rad),
+        grade_ratio=np.array(conditions.grade_ratio, dtype=float),
+        undulation_ratio=float(conditions.undulation_ratio),
+        undulation_length_m=float(conditions.undulation_length_m),
+        grounds=np.ascontiguousarray(profile.grounds, dtype=float),
+        roughness_m3=np.ascontiguousarray(profile.roughness_m3, dtype=float),
+        patch_start_m=np.ascontiguousarray(profile.start_m, dtype=float),
+        field=np.ascontiguousarray(profile.field, dtype=float),
         linked=any(effects[name] != 0.0 for name in in_plant(PlantPart.LINKAGE)),
         steer_offset_rad=np.array([effects[f"steering_offset_{i}_rad"] for i in (1, 2, 3)]),
         steer_backlash_rad=effects["steering_backlash_rad"],
@@ -187,6 +156,21 @@ def make_plant(
         drag_nspm=effects["viscous_drag_nspm"],
         side_hill_ratio=effects["side_hill_slip_ratio"],
     )
+
+
+def _load_shares(robot: Robot, conditions: Conditions, com_m: Array) -> tuple[Array, Array]:
+    """Return the load (3,) of each wheel over the weight, and per moment about the two body axes (3, 2)."""
+    # Rows: vertical force, moment about y (x arm), moment about x (y arm); columns: the three wheels.
+    inverse = np.linalg.inv(np.vstack([np.ones(3), robot.wheel_positions_m.T]))
+    load_fraction = inverse @ np.array([1.0, com_m[0], com_m[1]])
+    if load_fraction.min() <= 0.0:
+        x_m, y_m = conditions.payload_m
+        raise ConfigError(
+            f"robot {robot.name}: a payload of {conditions.payload_kg:g} kg at ({x_m:g}, {y_m:g}) m "
+            f"from the centre of mass tips it over: wheel {int(load_fraction.argmin()) + 1} would carry "
+            "nothing"
+        )
+    return load_fraction, inverse[:, 1:]
 
 
 def record_width(plant: Plant) -> int:

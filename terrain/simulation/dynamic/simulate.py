@@ -1,14 +1,24 @@
-"""One simulated run: a robot, a scenario and its ground in, an ordinary run log with its truth out."""
+"""One run of the dynamic plant: robot, scenario and soils in, an ordinary run log with its truth out.
+
+Examples
+--------
+>>> from terrain.robots import load_robot
+>>> from terrain.simulation.scenario.make import make_scenario
+>>> from terrain.terramechanics.soil import load_soil
+>>> robot = load_robot("agrimaro")
+>>> drive = make_scenario("straight", robot, ["grass"], 5.0)
+>>> run = simulate(robot, drive, {"grass": load_soil("grass")}, seed=0)
+>>> sorted(run.streams), run.terrains
+(['commands', 'imu', 'odometry', 'steering', 'truth', 'wheels'], ('grass',))
+"""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
-from scipy.signal import lfilter
 
 from terrain.effects import OTHER_LOGGER, PlantPart, checked_effects, in_plant
 from terrain.errors import ConfigError
@@ -18,7 +28,8 @@ from terrain.records import Array, Command, Label, RunLog, Sample, Stream
 from terrain.robots import Robot, as_swerve
 from terrain.simulation.conditions import NO_FAULTS, Conditions, Faults
 from terrain.simulation.dynamic.loop import Drive, in_loop
-from terrain.simulation.dynamic.plant import FIELD_STEP_M, Plant, make_plant, record_width
+from terrain.simulation.dynamic.plant import make_plant, record_width
+from terrain.simulation.dynamic.profile import draw_profile
 from terrain.simulation.dynamic.states import start_state
 from terrain.simulation.dynamic.step import advance, settle
 from terrain.simulation.scenario.scenario import Scenario
@@ -31,13 +42,9 @@ from terrain.simulation.sensors.steering import SteeringSensor
 from terrain.simulation.sensors.truth import truth_stream
 from terrain.simulation.sensors.wheels import WheelSensor
 from terrain.terramechanics.soil import Soil
-from terrain.terramechanics.traction import ground_array
 
 MIN_LABEL_S = 0.5
 """A shorter stay on one ground gets no label."""
-
-MAX_FIELD_CELLS = 5 * 10**6
-"""Cells of ground up to where the fastest wheel can come; a day at 2 m/s takes 3.5 million."""
 
 MAX_WHEEL_SPEEDS = 100.0
 """No wheel turns so many times as fast as its motor can: then the steps are too long for the robot, as with a
@@ -45,6 +52,8 @@ load of 1000 t on 90 kg."""
 
 MAX_COMMAND_DELAY_S = 0.5
 """Longest way of a command to the wheels; what comes later is no control."""
+
+_PURPOSES = ("terrain", "road", "start", "wheels", "steering", "imu", "camera", "gnss")
 
 _SENSOR_RATES = ("wheels_rate_hz", "steering_rate_hz", "imu_rate_hz")
 
@@ -74,34 +83,32 @@ def simulate(
 ) -> RunLog:
     """Drive a scenario and return what the loggers wrote, with the truth beside it.
 
-    Without a controller the wheels are told what the wanted twists ask of them.  With one the loop is
-    closed: at each instant of the scenario it is given what has arrived since the one before, just as it will
-    stand in the log, and what it answers is what the wheels are told.
+    Without a controller the wheels are commanded to follow the desired twists.  With one the loop is closed:
+    at each instant of the scenario it gets the samples that arrived since the instant before, as the log has
+    them, and its output is the command.
 
     Parameters
     ----------
     robot : swerve robot with all sections
-    scenario : what is driven, and on which ground
+    scenario : twists and terrains
     soils : by the terrain names of the scenario
-    seed : of everything that is drawn; the same seed gives the same log, and a sequence is left as it is
+    seed : of everything that is drawn; the same seed gives the same log, and a sequence is not advanced
     run_id : name of the run
-    conditions : load, slope, tyres, roughness; a level, nominal day by default
-    faults : what the sensors suffer on purpose
+    conditions : load, slope, tyres, roughness; level and nominal by default
+    faults : faults of the sensors
     gnss : receiver on board, if any
-    controller : called once an instant of the scenario; without a command yet, wheels are told to stand and
-        the steering to stay at 0
-    command_delay_s : from that instant to when the wheels are told, in whole steps; the step that starts at
-        the instant always runs with the command before
+    controller : called once an instant of the scenario; before its first command is in force, the wheels are
+        commanded to stand and the steering to stay at 0
+    command_delay_s : from that instant to when the command is in force, in whole steps, one at least
     effects : parameters of :mod:`terrain.effects.catalogue` that act on this robot and its sensors, beside
-        those of its own description or in place of them; the commands know of none, and no log says so
+        those of its description or in place of them; the commands and the log do not contain them
 
     Returns
     -------
     RunLog
-        streams wheels, steering, imu, odometry, commands, truth, gnss where there is a receiver, and control,
-        the status of the controller's commands, where there is any; commands are those decided at each
-        instant.  What was lost throughout is no stream.  A label for each stretch in which all wheels are on
-        one ground.
+        streams wheels, steering, imu, odometry, commands as decided at each instant, truth, gnss where there
+        is a receiver, and control, the status of the controller's commands, where there is any; none that was
+        lost throughout.  A label for each stretch in which all wheels are on one terrain.
 
     Raises
     ------
@@ -113,79 +120,93 @@ def simulate(
     DataError
         if a command is not one finite number a wheel, or its status not numbers by names that end in a unit,
         the same names throughout.
-
-    Examples
-    --------
-    >>> from terrain.robots import load_robot
-    >>> from terrain.simulation.scenario.make import make_scenario
-    >>> from terrain.terramechanics.soil import load_soil
-    >>> robot = load_robot("agrimaro")
-    >>> drive = make_scenario("straight", robot, ["grass"], 5.0)
-    >>> run = simulate(robot, drive, {"grass": load_soil("grass")}, seed=0)
-    >>> sorted(run.streams), run.terrains
-    (['commands', 'imu', 'odometry', 'steering', 'truth', 'wheels'], ('grass',))
     """
     robot = as_swerve(robot, "robot {name}: drive {drive!r} is not simulated, only 'swerve' is")
-    conditions = Conditions() if conditions is None else conditions
+    conditions = conditions or Conditions()
+    substeps, delay_steps = _substeps(robot, scenario), _delay_steps(command_delay_s)
+    rngs = _generators(seed)
+    built = _built(robot, effects or {})
+    plant = make_plant(built, conditions, draw_profile(built, scenario, soils, conditions, rngs["terrain"]))
+    n_steps = len(scenario.time_s) * substeps
+    state = start_state(plant, plant.backlash_rad * rngs["start"].uniform(-1.0, 1.0, 3))
+    settle(plant, state)
+    road_noise = rngs["road"].standard_normal((n_steps, 3))
+    motion = Motion(np.empty((n_steps, record_width(plant))), 0)
+    sensors = _sensors(motion, built, faults, gnss, rngs)
+    status: dict[str, Array] = {}
+    if controller is None:
+        admitted, wheel_radps, steer_rad = _commands(robot, scenario)
+        advance(plant, state, wheel_radps, steer_rad, substeps, road_noise, motion.record)
+        decided = np.hstack([admitted, wheel_radps, steer_rad])
+    else:
+        drive = Drive(plant, state, road_noise, motion.record)
+        decided, status = in_loop(controller, delay_steps, scenario, substeps, drive, motion, sensors)
+    _check_motion(motion, robot)
+    motion.grow(n_steps)
+    streams = _streams(sensors, motion)
+    streams["commands"] = Stream(scenario.time_s, decided, COMMAND_CHANNELS)
+    if status:
+        streams["control"] = Stream(scenario.time_s, np.column_stack(list(status.values())), tuple(status))
+    return RunLog(run_id, robot.name, streams, _labels(motion, scenario), f"simulated, {scenario.name}")
+
+
+def _substeps(robot: Robot, scenario: Scenario) -> int:
+    """Return the steps from twist to twist, once robot and scenario are checked."""
     substeps = round(1 / (scenario.rate_hz * STEP_S))
     if abs(substeps * scenario.rate_hz * STEP_S - 1.0) > 1e-9:
         raise ConfigError(
             f"scenario {scenario.name}: rate_hz is {scenario.rate_hz:g}, it must divide {1 / STEP_S:g}"
         )
     _check_rates(robot)
-    delay_steps = _delay_steps(command_delay_s)
-    sequence = seed if isinstance(seed, np.random.SeedSequence) else np.random.SeedSequence(seed)
-    # One generator a purpose: a sensor more or less changes nothing about the others.
-    ground, road, start, wheels, steering, imu, camera, receiver = (
-        np.random.default_rng(np.random.SeedSequence(sequence.entropy, spawn_key=(*sequence.spawn_key, i)))
-        for i in range(8)
-    )
-    built = _built(robot, effects or {})
-    plant = _plant(built, scenario, soils, conditions, ground)
-    n_steps = len(scenario.time_s) * substeps
-    state = start_state(plant, plant.backlash_rad * start.uniform(-1.0, 1.0, 3))
-    settle(plant, state)
-    noise = road.standard_normal((n_steps, 3))
-    motion = Motion(np.empty((n_steps, record_width(plant))), 0)
-    imu_sensor = ImuSensor(motion, built, imu)
+    return substeps
+
+
+def _generators(seed: int | np.random.SeedSequence) -> dict[str, np.random.Generator]:
+    """Return a generator for each purpose: one sensor more or less does not change the others."""
+    root = seed if isinstance(seed, np.random.SeedSequence) else np.random.SeedSequence(seed)
+    return {
+        purpose: np.random.default_rng(np.random.SeedSequence(root.entropy, spawn_key=(*root.spawn_key, i)))
+        for i, purpose in enumerate(_PURPOSES)
+    }
+
+
+def _sensors(
+    motion: Motion,
+    robot: Robot,
+    faults: Faults,
+    gnss: Gnss | None,
+    rngs: Mapping[str, np.random.Generator],
+) -> dict[str, Sensor]:
+    """Return the sensors on board, by stream."""
     sensors: dict[str, Sensor] = {
-        "wheels": WheelSensor(motion, built, wheels),
-        "steering": SteeringSensor(motion, built, steering),
-        "imu": imu_sensor,
-        "odometry": CameraSensor(motion, built, camera, faults),
+        "wheels": WheelSensor(motion, robot, rngs["wheels"]),
+        "steering": SteeringSensor(motion, robot, rngs["steering"]),
+        "imu": ImuSensor(motion, robot, rngs["imu"]),
+        "odometry": CameraSensor(motion, robot, rngs["camera"], faults),
     }
     if gnss is not None:
-        sensors["gnss"] = GnssSensor(motion, gnss, receiver, faults)
-    offset_s, rate = (built.effects.get(name, 0.0) for name in ("clock_offset_s", "clock_rate_ratio"))
+        sensors["gnss"] = GnssSensor(motion, gnss, rngs["gnss"], faults)
+    offset_s, rate = (robot.effects.get(name, 0.0) for name in ("clock_offset_s", "clock_rate_ratio"))
     if offset_s or rate:
         for name in sensors.keys() & set(OTHER_LOGGER):
             sensors[name].stamp(offset_s, rate)
-    status: dict[str, Array] = {}
-    if controller is None:
-        admitted, wheel_radps, steer_rad = _commands(robot, scenario)
-        advance(plant, state, wheel_radps, steer_rad, substeps, noise, motion.record)
-        decided = np.hstack([admitted, wheel_radps, steer_rad])
-    else:
-        drive = Drive(plant, state, noise, motion.record)
-        decided, status = in_loop(controller, delay_steps, scenario, substeps, drive, motion, sensors)
-    _check_motion(motion, robot)
-    motion.grow(n_steps)
+    return sensors
+
+
+def _streams(sensors: Mapping[str, Sensor], motion: Motion) -> dict[str, Stream]:
+    """Return the streams of sensors and truth; those without samples are left out."""
     streams: dict[str, Stream] = {}
     for name, sensor in sensors.items():
         sensor.update()
         streams[name] = sensor.stream()
-    streams["commands"] = Stream(scenario.time_s, decided, COMMAND_CHANNELS)
-    if status:
-        streams["control"] = Stream(scenario.time_s, np.column_stack(list(status.values())), tuple(status))
-    streams["truth"] = truth_stream(motion, imu_sensor.yaw_bias_radps, imu_sensor.time_s)
-    streams = {name: stream for name, stream in streams.items() if len(stream) > 1}
-    return RunLog(
-        run_id, robot.name, streams, _labels(motion, scenario), source=f"simulated, {scenario.name}"
-    )
+    imu = sensors["imu"]
+    assert isinstance(imu, ImuSensor)
+    streams["truth"] = truth_stream(motion, imu.yaw_bias_radps, imu.time_s)
+    return {name: stream for name, stream in streams.items() if len(stream) > 1}
 
 
 def _built(robot: Robot, effects: Mapping[str, float]) -> Robot:
-    """Return the robot that drives, which the one that is commanded is taken for."""
+    """Return the robot with all its effects, of which the commanded one lacks some."""
     if not robot.effects and not effects:
         return robot
     acting = checked_effects("effects", {**robot.effects, **effects}, robot.drive)
@@ -240,56 +261,6 @@ def _commands(robot: Robot, scenario: Scenario) -> tuple[Array, Array, Array]:
         1 / scenario.rate_hz,
         scenario.twist,
         np.zeros(3),
-    )
-
-
-def _plant(
-    robot: Robot,
-    scenario: Scenario,
-    soils: Mapping[str, Soil],
-    conditions: Conditions,
-    rng: np.random.Generator,
-) -> Plant:
-    body, motors = robot.equipment.body, robot.equipment.motors
-    for patch in scenario.patches:
-        if patch.terrain not in soils:
-            raise ConfigError(f"scenario {scenario.name}: terrain {patch.terrain!r} has no soil")
-    on = [soils[patch.terrain] for patch in scenario.patches]
-    starts_m = np.array([patch.start_m for patch in scenario.patches])
-    farthest_m = 2.0 * robot.wheel_radius_m * motors.speed_max_radps * scenario.time_s[-1]
-    n_cells = math.ceil(farthest_m / FIELD_STEP_M) + 1
-    if n_cells > MAX_FIELD_CELLS:
-        raise ConfigError(
-            f"robot {robot.name}: its wheels can come {farthest_m / 2e3:g} km far in this run, "
-            f"{MAX_FIELD_CELLS * FIELD_STEP_M / 2e3:g} km of ground are simulated at most"
-        )
-    keep = math.exp(-FIELD_STEP_M / conditions.field_length_m)
-    white = rng.standard_normal((2, 3, n_cells))
-    white[:, :, 1:] *= math.sqrt(1.0 - keep**2)
-    unit = lfilter([1.0], [1.0, -keep], white, axis=2)
-    patch_of_cell = np.searchsorted(starts_m, np.arange(n_cells) * FIELD_STEP_M, side="right") - 1
-    spread = np.array([[soil.thrust_field_ratio, soil.resistance_field_ratio] for soil in on])[
-        patch_of_cell
-    ].T
-    field = np.exp(spread[:, None, :] * unit - 0.5 * spread[:, None, :] ** 2)
-    return make_plant(
-        robot,
-        payload_kg=conditions.payload_kg,
-        payload_m=conditions.payload_m,
-        radius_factors=np.array(conditions.radius_factors),
-        grade_ratio=conditions.grade_ratio,
-        undulation_ratio=conditions.undulation_ratio,
-        undulation_length_m=conditions.undulation_length_m,
-        leg_backlash_rad=conditions.leg_backlash_rad,
-        grounds=np.array(
-            [
-                ground_array(soil, robot.wheel_radius_m, body.tyre_width_m, body.contact_length_m)
-                for soil in on
-            ]
-        ),
-        roughness_m3=np.array([soil.roughness_m3 * conditions.roughness_factor for soil in on]),
-        patch_start_m=starts_m,
-        field=field,
     )
 
 

@@ -41,7 +41,7 @@ BODY_STATES = (
 """Position is that of the body's origin; speeds and accelerations (dv/dt + w x v, of the step before) are
 those of its centre of mass in body axes; the third leg is at 0 in the middle of its play."""
 
-SPEED_X, YAW_RATE, PATH, LEG = 3, 5, 6, 9
+YAW, SPEED_X, SPEED_Y, YAW_RATE, PATH, ACCEL_X, ACCEL_Y, LEG = range(2, 10)
 
 N_BODY = len(BODY_STATES)
 

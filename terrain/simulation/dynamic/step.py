@@ -36,9 +36,12 @@ from terrain.kinematics.wheel_velocity import point_velocity
 from terrain.records import Array
 from terrain.simulation.contact import DEFLECTION_DAMPING_S, shear_slip
 from terrain.simulation.dynamic.actuators import drive_wheel, linkage_heading, steer_wheel
-from terrain.simulation.dynamic.plant import FIELD_STEP_M, Plant, record_width
-from terrain.simulation.dynamic.profile import patch_index, ride_over, terrain_gradient
+from terrain.simulation.dynamic.plant import Plant, record_width
+from terrain.simulation.dynamic.profile import FIELD_STEP_M
+from terrain.simulation.dynamic.ride import patch_index, ride_over, terrain_gradient
 from terrain.simulation.dynamic.states import (
+    ACCEL_X,
+    ACCEL_Y,
     CREEP,
     DEFLECTION_X,
     DEFLECTION_Y,
@@ -50,8 +53,10 @@ from terrain.simulation.dynamic.states import (
     REPORTED,
     RIDE,
     SPEED_X,
+    SPEED_Y,
     STEER,
     TORQUE,
+    YAW,
     YAW_RATE,
 )
 from terrain.simulation.sensors.motion import N_BODY_RECORD, N_RECORD, STEP_S, WHEEL_RECORD
@@ -108,15 +113,20 @@ def advance(
     road_noise : (n * substeps, 3) standard normal numbers, the roughness under each wheel
     record : (n * substeps, record_width) is written: :data:`BODY_RECORD`, then :data:`WHEEL_RECORD` a wheel,
         then the encoders' angles where a linkage hides the wheels
+
+    Notes
+    -----
+    The step of a wheel is not a function of its own: reference counts of the plant's arrays, which each call
+    that takes them costs, would double the time of a run.
     """
     dt = STEP_S
     tail = state[N_BODY + 3 * N_WHEEL :]
-    accel = np.array([state[7], state[8], 0.0])  # of the last step; the third is dw/dt
+    accel = np.array([state[ACCEL_X], state[ACCEL_Y], 0.0])  # of the last step; the third is dw/dt
     speeds = np.zeros((3, 2))
     ride = np.zeros(3)  # vertical acceleration of each corner
     for k in range(wheel_radps.shape[0] * substeps):
         command = k // substeps
-        cos_yaw, sin_yaw = math.cos(state[2]), math.sin(state[2])
+        cos_yaw, sin_yaw = math.cos(state[YAW]), math.sin(state[YAW])
         grade_x, grade_y = terrain_gradient(plant, state, cos_yaw, sin_yaw)
         steepness = math.sqrt(1.0 + grade_x * grade_x + grade_y * grade_y)
         g_normal = GRAVITY_MPS2 / steepness
@@ -125,8 +135,10 @@ def advance(
         # speeds of the wheel centres, and which way the body goes
         for i in range(3):
             x_m, y_m = plant.wheels_m[i, 0] - plant.com_m[0], plant.wheels_m[i, 1] - plant.com_m[1]
-            speeds[i, 0], speeds[i, 1] = point_velocity(state[3], state[4], state[5], x_m, y_m)
-        speed = math.sqrt(state[3] * state[3] + state[4] * state[4]) + 1e-9
+            speeds[i, 0], speeds[i, 1] = point_velocity(
+                state[SPEED_X], state[SPEED_Y], state[YAW_RATE], x_m, y_m
+            )
+        speed = math.sqrt(state[SPEED_X] * state[SPEED_X] + state[SPEED_Y] * state[SPEED_Y]) + 1e-9
         for i in range(3):
             w = state[N_BODY + i * N_WHEEL : N_BODY + (i + 1) * N_WHEEL]
             steer_wheel(plant, w, steer_rad[command, i], dt)
@@ -141,8 +153,8 @@ def advance(
             across = -sin_steer * speeds[i, 0] + cos_steer * speeds[i, 1]
             wheel_speed = w[RATE] * plant.radius_m[i]
             fastest = max(abs(wheel_speed), abs(along))
-            ahead_m = (plant.wheels_m[i, 0] * state[3] + plant.wheels_m[i, 1] * state[4]) / speed
-            patch = patch_index(plant, state[6] + (ahead_m if speed > 0.05 else 0.0))
+            ahead_m = (plant.wheels_m[i, 0] * state[SPEED_X] + plant.wheels_m[i, 1] * state[SPEED_Y]) / speed
+            patch = patch_index(plant, state[PATH] + (ahead_m if speed > 0.05 else 0.0))
             ride_n = ride_over(
                 plant, w, i, patch, math.sqrt(along * along + across * across), road_noise[k, i], dt
             )
@@ -163,7 +175,7 @@ def advance(
             thrust, side, resistance, sinkage = wheel_ground(
                 plant.grounds[patch], normal_n, min(max(slip_x, -1.0), 1.0), slip_y
             )
-            cell = min(max(int(state[6] / FIELD_STEP_M), 0), plant.field.shape[2] - 1)  # a NaN is no place
+            cell = min(max(int(state[PATH] / FIELD_STEP_M), 0), plant.field.shape[2] - 1)  # a NaN is no place
             thrust *= plant.field[0, i, cell]
             side *= plant.field[0, i, cell]
             resistance *= plant.field[1, i, cell]
@@ -208,19 +220,26 @@ def advance(
         accel[1] = force_y / plant.mass_kg - GRAVITY_MPS2 * grade_y / steepness
         accel[2] = moment / plant.yaw_inertia_kgm2
         _record_body(plant, state, accel, ride, grade_x, grade_y, row)
-        turn = state[5]
-        vx, vy = state[3], state[4]
-        state[3] = vx + dt * (accel[0] + turn * vy)
-        state[4] = vy + dt * (accel[1] - turn * vx)
-        state[5] = turn + dt * accel[2]
-        origin_x, origin_y = point_velocity(state[3], state[4], state[5], -plant.com_m[0], -plant.com_m[1])
-        state[0] += dt * (cos_yaw * origin_x - sin_yaw * origin_y)
-        state[1] += dt * (sin_yaw * origin_x + cos_yaw * origin_y)
-        state[2] += dt * state[5]
-        state[6] += dt * math.sqrt(origin_x * origin_x + origin_y * origin_y)
-        state[7], state[8] = accel[0], accel[1]
+        _advance_body(state, accel, plant.com_m[0], plant.com_m[1], cos_yaw, sin_yaw)
         if plant.leg_backlash_rad > 0.0:
             state[LEG] = _swing(plant, state[LEG], leg_nm, dt)
+
+
+@njit(cache=True)
+def _advance_body(
+    state: Array, accel: Array, com_x_m: float, com_y_m: float, cos_yaw: float, sin_yaw: float
+) -> None:
+    """Step the body with the acceleration (3,) of its centre of mass and of its yaw."""
+    dt, turn, vx, vy = STEP_S, state[YAW_RATE], state[SPEED_X], state[SPEED_Y]
+    state[SPEED_X] = vx + dt * (accel[0] + turn * vy)
+    state[SPEED_Y] = vy + dt * (accel[1] - turn * vx)
+    state[YAW_RATE] = turn + dt * accel[2]
+    origin_x, origin_y = point_velocity(state[SPEED_X], state[SPEED_Y], state[YAW_RATE], -com_x_m, -com_y_m)
+    state[0] += dt * (cos_yaw * origin_x - sin_yaw * origin_y)
+    state[1] += dt * (sin_yaw * origin_x + cos_yaw * origin_y)
+    state[YAW] += dt * state[YAW_RATE]
+    state[PATH] += dt * math.sqrt(origin_x * origin_x + origin_y * origin_y)
+    state[ACCEL_X], state[ACCEL_Y] = accel[0], accel[1]
 
 
 @njit(cache=True)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
@@ -69,81 +70,128 @@ def noise_psd(
 ) -> Array:
     """Return the one-sided density of the noise in a channel of a log at a steady speed, unit^2/Hz.
 
-    Noise of the ground counts in each channel in which it shows.  Noise of the wheels shows in a log of
-    the wheels alone, and comes into every channel of a replay that is fed with it: that is the caller's.
+    Noise of the terrain counts in each channel in which it shows.  Noise of the wheels shows in a log of the
+    wheels alone; a replay that takes a log of the wheels carries it into every channel, which the caller
+    adds.
 
     Parameters
     ----------
     noise : of the runs
-    robot, planar : whose
+    robot, planar : of the runs
     channel : one of ``effects.CHANNELS``, or ``wheel_speed_mps`` (of one wheel), ``grade_rad`` or
-        ``roll_rad``
+    ``roll_rad``
     frequency_hz : from 0 to the logger's Nyquist frequency: 25 Hz, of the IMU's channels 50 Hz
     speed_mps : of the wheels
-    encoder_lag_s : beside the lag that the robot's description knows
+    encoder_lag_s : beside the lag of the robot's description
 
     Raises
     ------
     ConfigError
         for another channel, or a robot without motors, camera or sensors.
     """
-    motors, camera, sensors = robot.motors, robot.camera, robot.sensors
     f = np.asarray(frequency_hz, dtype=np.float64)
-    moving = float(activity(speed_mps, noise))
-    speed = abs(speed_mps)
+    model = _Spectra(noise, robot, planar, abs(speed_mps), float(activity(speed_mps, noise)), encoder_lag_s)
+    densities: dict[str, Callable[[Array], Array]] = {
+        GYRO: model.yaw_rate,
+        SPEED_X: model.speed_ahead,
+        SPEED_Y: model.speed_sideways,
+        ACCEL: model.accel,
+        CURRENT: model.current,
+        TURNING_CURRENT: model.turning_current,
+        WHEEL_SPEED: model.wheel_speed,
+        HEADING: model.heading_rate,
+        GRADE: model.tilt,
+        ROLL: model.tilt,
+    }
+    if channel not in densities:
+        raise ConfigError(f"noise of channel {channel!r} is not known")
+    return densities[channel](f)
 
-    def ground(std: float, tau_s: float, rate_hz: float) -> Array:
-        return coloured_psd(f, std, tau_s, rate_hz)
 
-    def along(at_hz: Array) -> Array:
-        lag = speed * planar.slip_ratio / GRAVITY_MPS2
-        told = coloured_psd(at_hz, noise.along_ratio * speed, noise.along_s, IMU_HZ)
-        if planar.n_wheels != SWERVE_WHEELS:
-            return told * lag_gain(at_hz, lag, IMU_HZ)
-        w = 2.0 * math.pi * at_hz  # a contact that gives swings
-        sprung = w**2 * planar.relaxation_m * planar.slip_ratio / GRAVITY_MPS2
-        return np.asarray(told / ((1.0 - sprung) ** 2 + (w * lag) ** 2))
+def _folded(density: Callable[[Array], Array], f: Array) -> Array:
+    """Return the density of every second sample of a signal at the IMU's rate."""
+    return density(f) + density(IMU_HZ / 2.0 - f)
 
-    def jerked(at_hz: Array) -> Array:  # by differences as the simulation takes them, at the IMU's rate
-        angle = 2.0 * math.pi * at_hz / IMU_HZ
-        return along(at_hz) * ((8.0 * np.sin(angle) - np.sin(2.0 * angle)) / 6.0 * IMU_HZ) ** 2
 
-    def folded(density: Callable[[Array], Array]) -> Array:  # of every second sample
-        return density(f) + density(IMU_HZ / 2.0 - f)
+class _Spectra(NamedTuple):
+    """Densities of the noise of one robot at a steady speed, each from frequencies (n,) to (n,).
 
-    if channel == GYRO:
-        turning = ground(noise.yaw_radps * moving, noise.yaw_s, IMU_HZ)
-        shaking = ground(noise.gyro_radps * moving, noise.gyro_s, IMU_HZ)
-        return turning + shaking + white_psd(f, sensors.gyro_std_radps, IMU_HZ)
-    if channel in (SPEED_X, SPEED_Y):
-        seen = ground(noise.camera_mps * moving, noise.camera_s, CAMERA_HZ)
-        seen += white_psd(f, camera.speed_std_mps, CAMERA_HZ)
-        turning = ground(noise.yaw_radps * moving, noise.yaw_s, CAMERA_HZ)
-        if channel == SPEED_X:
-            return seen + folded(along) + turning * planar.lever_y_m**2
-        aside = ground(noise.across_ratio * speed, noise.across_s, CAMERA_HZ)
-        return seen + aside + turning * planar.lever_x_m**2
-    if channel == ACCEL:
-        shaking = ground(noise.accel_mps2 * moving, noise.accel_s, IMU_HZ)
-        return shaking + jerked(f) + white_psd(f, sensors.accel_std_mps2, IMU_HZ)
-    if channel in (CURRENT, TURNING_CURRENT):
-        drawn = ground(noise.current_a(robot) * moving, noise.current_s, WHEELS_HZ)
-        white = white_psd(f, sensors.current_std_a * math.sqrt(len(robot.wheels)), WHEELS_HZ)
-        if channel == TURNING_CURRENT:
-            return drawn + white
-        pull = planar.mass_kg * planar.radius_m / planar.nm_per_a
-        return drawn + white + pull**2 * folded(jerked)
-    if channel == WHEEL_SPEED:
+    ``moving`` is the activity of the noise at that speed, 0 to 1.
+    """
+
+    noise: Noise
+    robot: Robot
+    planar: Planar
+    speed_mps: float
+    moving: float
+    encoder_lag_s: float
+
+    def yaw_rate(self, f: Array) -> Array:
+        sensors, noise = self.robot.sensors, self.noise
+        vibration = coloured_psd(f, noise.gyro_radps * self.moving, noise.gyro_s, IMU_HZ)
+        return self._turning(f, IMU_HZ) + vibration + white_psd(f, sensors.gyro_std_radps, IMU_HZ)
+
+    def speed_ahead(self, f: Array) -> Array:
+        turning = self._turning(f, CAMERA_HZ) * self.planar.lever_y_m**2
+        return self._seen(f) + _folded(self._along, f) + turning
+
+    def speed_sideways(self, f: Array) -> Array:
+        noise = self.noise
+        sideways = coloured_psd(f, noise.across_ratio * self.speed_mps, noise.across_s, CAMERA_HZ)
+        return self._seen(f) + sideways + self._turning(f, CAMERA_HZ) * self.planar.lever_x_m**2
+
+    def accel(self, f: Array) -> Array:
+        sensors, noise = self.robot.sensors, self.noise
+        vibration = coloured_psd(f, noise.accel_mps2 * self.moving, noise.accel_s, IMU_HZ)
+        return vibration + self._along_rate(f) + white_psd(f, sensors.accel_std_mps2, IMU_HZ)
+
+    def current(self, f: Array) -> Array:
+        planar = self.planar
+        amps_per_accel = planar.mass_kg * planar.radius_m / planar.nm_per_a
+        return self.turning_current(f) + amps_per_accel**2 * _folded(self._along_rate, f)
+
+    def turning_current(self, f: Array) -> Array:
+        robot, noise = self.robot, self.noise
+        drawn = coloured_psd(f, noise.current_a(robot) * self.moving, noise.current_s, WHEELS_HZ)
+        return drawn + white_psd(f, robot.sensors.current_std_a * math.sqrt(len(robot.wheels)), WHEELS_HZ)
+
+    def wheel_speed(self, f: Array) -> Array:
+        robot, motors, sensors = self.robot, self.robot.motors, self.robot.sensors
         step_m = 2.0 * math.pi * robot.wheel_radius_m / (sensors.hall_steps_ratio * motors.reduction_ratio)
-        place = white_psd(f, math.hypot(noise.encoder_m * moving, step_m / math.sqrt(12.0)), WHEELS_HZ)
-        blue = place * (2.0 * np.sin(math.pi * f / WHEELS_HZ) * WHEELS_HZ) ** 2
-        blue = blue * lag_gain(f, sensors.encoder_time_constant_s + encoder_lag_s, WHEELS_HZ)
+        std_m = math.hypot(self.noise.encoder_m * self.moving, step_m / math.sqrt(12.0))
+        rate = white_psd(f, std_m, WHEELS_HZ) * (2.0 * np.sin(math.pi * f / WHEELS_HZ) * WHEELS_HZ) ** 2
+        rate = rate * lag_gain(f, sensors.encoder_time_constant_s + self.encoder_lag_s, WHEELS_HZ)
         white_mps = sensors.motor_std_radps / motors.reduction_ratio * robot.wheel_radius_m
-        return np.asarray(blue + white_psd(f, white_mps, WHEELS_HZ))
-    if channel == HEADING:
-        angle = white_psd(f, noise.heading_rad, CAMERA_HZ)
-        told = angle * (np.sin(2.0 * math.pi * f / CAMERA_HZ) * CAMERA_HZ) ** 2
-        return told + ground(noise.yaw_radps * moving, noise.yaw_s, CAMERA_HZ)
-    if channel in (GRADE, ROLL):
-        return white_psd(f, noise.tilt_rad, IMU_HZ)
-    raise ConfigError(f"noise of channel {channel!r} is not known")
+        return np.asarray(rate + white_psd(f, white_mps, WHEELS_HZ))
+
+    def heading_rate(self, f: Array) -> Array:
+        angle = white_psd(f, self.noise.heading_rad, CAMERA_HZ)
+        rate = angle * (np.sin(2.0 * math.pi * f / CAMERA_HZ) * CAMERA_HZ) ** 2
+        return np.asarray(rate + self._turning(f, CAMERA_HZ))
+
+    def tilt(self, f: Array) -> Array:
+        return white_psd(f, self.noise.tilt_rad, IMU_HZ)
+
+    def _turning(self, f: Array, rate_hz: float) -> Array:
+        return coloured_psd(f, self.noise.yaw_radps * self.moving, self.noise.yaw_s, rate_hz)
+
+    def _seen(self, f: Array) -> Array:
+        camera, noise = self.robot.camera, self.noise
+        vibration = coloured_psd(f, noise.camera_mps * self.moving, noise.camera_s, CAMERA_HZ)
+        return vibration + white_psd(f, camera.speed_std_mps, CAMERA_HZ)
+
+    def _along(self, f: Array) -> Array:
+        """Return the density of the speed ahead, at the IMU's rate."""
+        noise, planar = self.noise, self.planar
+        lag = self.speed_mps * planar.slip_ratio / GRAVITY_MPS2
+        terrain = coloured_psd(f, noise.along_ratio * self.speed_mps, noise.along_s, IMU_HZ)
+        if planar.n_wheels != SWERVE_WHEELS:
+            return terrain * lag_gain(f, lag, IMU_HZ)
+        w = 2.0 * math.pi * f  # a contact with a relaxation length swings
+        sprung = w**2 * planar.relaxation_m * planar.slip_ratio / GRAVITY_MPS2
+        return np.asarray(terrain / ((1.0 - sprung) ** 2 + (w * lag) ** 2))
+
+    def _along_rate(self, f: Array) -> Array:
+        """Return the density of its rate by differences as the simulation takes them, at the IMU's rate."""
+        angle = 2.0 * math.pi * f / IMU_HZ
+        return self._along(f) * ((8.0 * np.sin(angle) - np.sin(2.0 * angle)) / 6.0 * IMU_HZ) ** 2

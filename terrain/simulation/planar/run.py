@@ -138,8 +138,7 @@ def simulate_planar(
         streams["steering"] = steering_stream(run, rngs["steering"])
     if heading:
         streams["lidar"] = lidar_stream(run, rngs["lidar"])
-    end_s = (len(twist) - 1) / COMMANDS_HZ
-    labels = (Label(0.0, end_s, terrain),) if terrain else ()
+    labels = (Label(0.0, (len(twist) - 1) / COMMANDS_HZ, terrain),) if terrain else ()
     return RunLog(run_id, robot.name, streams, labels, source="simulated, planar")
 
 

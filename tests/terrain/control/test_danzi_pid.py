@@ -16,12 +16,14 @@ from terrain.control.power_state import DriveState, power_state
 from terrain.control.slip_table import DRIVE_STATES
 from terrain.errors import ConfigError
 from terrain.robots import load_robot
+from terrain.simulation.conditions import Conditions
 from terrain.simulation.dynamic.plant import make_plant
+from terrain.simulation.dynamic.profile import uniform_profile
 from terrain.simulation.dynamic.states import start_state
 from terrain.simulation.dynamic.step import advance
 from terrain.simulation.sensors.motion import BODY_RECORD, N_BODY_RECORD, N_RECORD, WHEEL_RECORD
 from terrain.terramechanics.soil import load_soil
-from terrain.terramechanics.traction import equilibrium_slip, ground_array
+from terrain.terramechanics.traction import equilibrium_slip
 
 ROBOT = load_robot("agrimaro")
 DT_S = 0.02
@@ -278,22 +280,8 @@ def test_invalid_settings_are_refused_in_one_sentence(arguments, words):
 
 def driven(settings, target, duration_s=60.0, wheel_speed_mps=1.0, delay_rows=50):
     """Return the speed over ground (n,) each millisecond: level grass, the truth fed back 50 ms late."""
-    body, substeps = ROBOT.body, round(DT_S * 1000)
-    geometry = ROBOT.wheel_radius_m, body.tyre_width_m, body.contact_length_m
-    plant = make_plant(
-        ROBOT,
-        payload_kg=0.0,
-        payload_m=(0.0, 0.0),
-        radius_factors=np.ones(3),
-        grade_ratio=(0.0, 0.0),
-        undulation_ratio=0.0,
-        undulation_length_m=15.0,
-        leg_backlash_rad=0.0,
-        grounds=np.array([ground_array(load_soil("grass"), *geometry)]),
-        roughness_m3=np.zeros(1),
-        patch_start_m=np.zeros(1),
-        field=np.ones((2, 3, 1)),
-    )
+    substeps = round(DT_S * 1000)
+    plant = make_plant(ROBOT, Conditions(), uniform_profile(ROBOT, load_soil("grass")))
     state, memory, n = start_state(plant, np.zeros(3)), new_state(), round(duration_s / DT_S)
     record = np.zeros((n * substeps, N_RECORD))
     speed, accel = (record[:, BODY_RECORD.index(name)] for name in ("speed_x_mps", "accel_x_mps2"))

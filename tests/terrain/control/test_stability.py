@@ -9,13 +9,15 @@ from terrain.control.pid import Gains, PidState, check_gains, pid_step
 from terrain.control.stability import DELAY_S, SLOPES, check_stable, loop_matrix, spectral_radius
 from terrain.errors import ConfigError
 from terrain.robots import load_robot
+from terrain.simulation.conditions import Conditions
 from terrain.simulation.contact import DEFLECTION_DAMPING_S
 from terrain.simulation.dynamic.plant import make_plant
+from terrain.simulation.dynamic.profile import uniform_profile
 from terrain.simulation.dynamic.states import start_state
 from terrain.simulation.dynamic.step import advance
 from terrain.simulation.sensors.motion import BODY_RECORD, N_BODY_RECORD, N_RECORD, WHEEL_RECORD
 from terrain.terramechanics.soil import load_soil
-from terrain.terramechanics.traction import equilibrium_slip, ground_array, net_pull
+from terrain.terramechanics.traction import equilibrium_slip, net_pull
 
 ROBOT = load_robot("agrimaro")
 DT_S = 0.02
@@ -98,20 +100,7 @@ def test_a_small_change_grows_or_decays_by_the_largest_eigenvalue(numbers, form,
 
 def on_grass(settings, target, wheel_speed_mps, n_delayed, duration_s=14.0):
     """Slip at each sample; from 3 s on under control, at 5 s a kick. Truth behind the encoders' low-pass."""
-    plant = make_plant(
-        ROBOT,
-        payload_kg=0.0,
-        payload_m=(0.0, 0.0),
-        radius_factors=np.ones(3),
-        grade_ratio=(0.0, 0.0),
-        undulation_ratio=0.0,
-        undulation_length_m=15.0,
-        leg_backlash_rad=0.0,
-        grounds=np.array([ground_array(load_soil("grass"), *GEOMETRY)]),
-        roughness_m3=np.zeros(1),
-        patch_start_m=np.zeros(1),
-        field=np.ones((2, 3, 1)),
-    )
+    plant = make_plant(ROBOT, Conditions(), uniform_profile(ROBOT, load_soil("grass")))
     state, memory, record = start_state(plant, np.zeros(3)), new_state(), np.zeros((20, N_RECORD))
     queue, found = [np.zeros(3)] * n_delayed, []
     rate, speed, share = np.zeros(3), 0.0, 0.001 / ROBOT.sensors.encoder_time_constant_s

@@ -15,6 +15,7 @@ from terrain.robots import load_robot
 from terrain.simulation.conditions import Conditions, Faults
 from terrain.simulation.dynamic.loop import Drive
 from terrain.simulation.dynamic.plant import make_plant
+from terrain.simulation.dynamic.profile import uniform_profile
 from terrain.simulation.dynamic.simulate import COMMAND_CHANNELS, simulate
 from terrain.simulation.dynamic.states import start_state
 from terrain.simulation.dynamic.step import advance, settle
@@ -22,7 +23,6 @@ from terrain.simulation.scenario.make import make_scenario
 from terrain.simulation.sensors.gnss import Gnss
 from terrain.simulation.sensors.motion import N_RECORD
 from terrain.terramechanics.soil import load_soil, soil_names
-from terrain.terramechanics.traction import ground_array
 
 ROBOT = load_robot("agrimaro")
 SOILS = {name: load_soil(name) for name in soil_names()}
@@ -139,20 +139,10 @@ def test_commands_played_back_give_the_motion_of_the_run_they_are_from():
 def test_pieces_between_commands_are_the_drive_in_which_each_step_has_its_own(delay):
     rng = np.random.default_rng(delay)
     soil = SOILS["clay"]
-    plant = make_plant(
-        ROBOT,
-        payload_kg=10.0,
-        payload_m=(0.1, 0.0),
-        radius_factors=np.ones(3),
-        grade_ratio=(0.03, 0.02),
-        undulation_ratio=0.0,
-        undulation_length_m=15.0,
-        leg_backlash_rad=0.02,
-        grounds=np.array([ground_array(soil, ROBOT.wheel_radius_m, 0.1, 0.12)]),
-        roughness_m3=np.array([1e-4]),
-        patch_start_m=np.zeros(1),
-        field=np.ones((2, 3, 1)),
+    conditions = Conditions(
+        payload_kg=10.0, payload_m=(0.1, 0.0), grade_ratio=(0.03, 0.02), leg_backlash_rad=0.02
     )
+    plant = make_plant(ROBOT, conditions, uniform_profile(ROBOT, soil, roughness_m3=1e-4))
     n, substeps = 60, 20
     wheel, steer = 4 * rng.random((n, 3)), 0.3 * rng.standard_normal((n, 3))
     noise = rng.standard_normal((n * substeps, 3))

@@ -309,7 +309,7 @@ def test_a_course_is_labelled_ground_by_ground():
             {"robot": with_part("sensors", imu_rate_hz=1e9)},
             "sensors: imu_rate_hz is 1e[+]09, at most 1000",
         ),
-        ({"robot": with_part("motors", speed_max_radps=1e6)}, "km of ground are simulated at most"),
+        ({"robot": with_part("motors", speed_max_radps=1e6)}, "km of terrain are simulated at most"),
     ],
 )
 def test_what_cannot_be_simulated_is_refused_in_one_sentence(changed, message):

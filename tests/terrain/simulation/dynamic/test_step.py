@@ -8,9 +8,11 @@ from terrain.constants import GRAVITY_MPS2
 from terrain.errors import ConfigError
 from terrain.kinematics.swerve import wheel_commands
 from terrain.robots import load_robot
+from terrain.simulation.conditions import Conditions
 from terrain.simulation.contact import DEFLECTION_DAMPING_S
-from terrain.simulation.dynamic.plant import FIELD_STEP_M, make_plant
-from terrain.simulation.dynamic.profile import ROUGHNESS_CUTOFF, ROUGHNESS_WAVENUMBER
+from terrain.simulation.dynamic.plant import make_plant
+from terrain.simulation.dynamic.profile import FIELD_STEP_M, uniform_profile
+from terrain.simulation.dynamic.ride import ROUGHNESS_CUTOFF, ROUGHNESS_WAVENUMBER
 from terrain.simulation.dynamic.states import (
     BODY_STATES,
     EFFECT_STATES,
@@ -29,7 +31,7 @@ from terrain.simulation.dynamic.step import (
 )
 from terrain.simulation.sensors.motion import N_BODY_RECORD, N_RECORD, STEP_S, WHEEL_RECORD, Motion
 from terrain.terramechanics.soil import Soil, load_soil
-from terrain.terramechanics.traction import equilibrium_slip, friction_limit, ground_array, wheel_ground
+from terrain.terramechanics.traction import equilibrium_slip, friction_limit, wheel_ground
 
 ROBOT = load_robot("agrimaro")
 GEOMETRY = ROBOT.wheel_radius_m, ROBOT.body.tyre_width_m, ROBOT.body.contact_length_m
@@ -49,23 +51,9 @@ STICKY = Soil(
 
 def plant_of(*soils, roughness_m3=0.0, starts_m=(0.0,), backlash_rad=0.0, com_height_m=None, **changes):
     """Return the plant of the robot on even ground without scatter; no play unless it is asked for."""
-    given = {
-        "payload_kg": 0.0,
-        "payload_m": (0.0, 0.0),
-        "radius_factors": np.ones(3),
-        "grade_ratio": (0.0, 0.0),
-        "undulation_ratio": 0.0,
-        "undulation_length_m": 15.0,
-        "leg_backlash_rad": 0.0,
-        "field": np.ones((2, 3, 1)),
-    }
-    plant = make_plant(
-        ROBOT,
-        grounds=np.array([ground_array(soil, *GEOMETRY) for soil in soils]),
-        roughness_m3=np.full(len(soils), roughness_m3),
-        patch_start_m=np.array(starts_m),
-        **given | changes,
-    )
+    field = changes.pop("field", np.ones((2, 3, 1)))
+    profile = uniform_profile(ROBOT, *soils, roughness_m3=roughness_m3, start_m=starts_m)
+    plant = make_plant(ROBOT, Conditions(**changes), profile._replace(field=field))
     if com_height_m is not None:
         plant = plant._replace(
             com_height_m=com_height_m,
@@ -702,7 +690,7 @@ def test_vibration_is_that_of_the_spectrum_of_the_road(speed_mps):
 
 
 def test_a_larger_wheel_is_faster():
-    motion = drive(plant_of(STICKY, radius_factors=np.full(3, 1.02)), ramp(4.0))
+    motion = drive(plant_of(STICKY, radius_factors=(1.02,) * 3), ramp(4.0))
     assert motion.body("speed_x_mps")[-1] == pytest.approx(1.02, abs=1e-3)
 
 
