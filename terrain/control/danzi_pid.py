@@ -214,16 +214,14 @@ def thesis_step(
     Case 1A of table 8.1, forward in traction with too much slip, on three wheels of a radius of 1 m:
 
     >>> printed = thesis_settings(1.0, Gains(1.0, 0.0, 0.0, limit=1.0), "printed")
-    >>> rate, speed = np.full(3, 0.7), np.full(3, 0.6)
-    >>> targets = np.array([0.1, -0.15, 0.05])
+    >>> rate, speed, targets = np.full(3, 0.7), np.full(3, 0.6), np.array([0.1, -0.15, 0.05])
     >>> added, *_ = thesis_step(printed, new_state(), rate, rate, speed, np.ones(3), 0.6, targets, 0.02)
     >>> added.round(3)
     array([-0.043, -0.043, -0.043])
     """
     wheels = wheel_radps.size
-    correction, desired = np.zeros(wheels), np.empty(wheels)
+    correction, desired, later = np.zeros(wheels), np.empty(wheels), np.empty((3, wheels))
     drive_state, status = np.empty(wheels, np.int64), np.empty(wheels, np.int64)
-    later = np.empty((3, wheels))
     integral, memory, direction = later[0], later[1], later[2]
     radius, low = settings.wheel_radius_m, settings.low_speed_mps
     normalised = settings.form == NORMALISED

@@ -30,6 +30,7 @@ ALIASES: dict[str, str] = {
 
 ALIASES_OF_VALUES: dict[str, str] = {
     "--leg-play": "--leg-backlash",
+    "The first day, run by run": "The first seed, run by run",
     "fixed": "fallback",
     "learned": "classified",
     "oracle": "true_terrain",

@@ -183,7 +183,7 @@ def test_it_needs_neither_tracking_nor_a_web_server():
 
 
 @pytest.mark.parametrize(
-    ("robot", "table", "settings", "words"),
+    ("robot", "table", "settings", "message"),
     [
         ("agrimaro", {}, {"controller": "best"}, "controller 'best' is unknown: use one of plain, ramp"),
         ("husky", {}, {}, "robot husky: drive 'skid_steer' has no pilot, only 'swerve' has"),
@@ -199,10 +199,10 @@ def test_it_needs_neither_tracking_nor_a_web_server():
         ("agrimaro", {}, {"controller": "thesis", "gains": Gains(-1.0, 0.0, 0.0, 2.0)}, "gain kp is -1.0"),
     ],
 )
-def test_invalid_settings_are_refused_in_one_sentence(robot, table, settings, words):
+def test_invalid_settings_are_refused_in_one_sentence(robot, table, settings, message):
     with pytest.raises(ConfigError) as refused:
         LivePilot(load_robot(robot), replace(TABLE, **table), settings=PilotSettings(**settings))
-    assert str(refused.value).startswith(words)
+    assert str(refused.value).startswith(message)
     assert "\n" not in str(refused.value)
 
 

@@ -98,9 +98,9 @@ def test_live_windows_and_outputs_equal_those_of_the_enriched_log(model, log):
 
 def test_a_pilot_accepts_the_classification(model, log):
     pilot = LivePilot(ROBOT, load_slip_table(), Classifier(model))
-    believed = [pilot.step(sample).status["terrain_code"] for sample in replay(log)]
-    assert pilot.terrains[int(believed[-1])] == "grass"
-    assert set(believed) == {-1.0, believed[-1]}
+    accepted = [pilot.step(sample).status["terrain_code"] for sample in replay(log)]
+    assert pilot.terrains[int(accepted[-1])] == "grass"
+    assert set(accepted) == {-1.0, accepted[-1]}
 
 
 WIDTHS = {"wheels": 6, "imu": 9}

@@ -261,7 +261,7 @@ def test_power_at_the_threshold_is_steady():
 
 
 @pytest.mark.parametrize(
-    ("arguments", "words"),
+    ("arguments", "message"),
     [
         ({"form": "new"}, "form 'new' is unknown: use one of printed, normalised"),
         ({"wheel_radius_m": 0.0}, "wheel_radius_m is 0.0"),
@@ -271,10 +271,10 @@ def test_power_at_the_threshold_is_steady():
         ({"gains": Gains(1.0, 0.0, 0.0, 0.0)}, "gain limit is 0.0"),
     ],
 )
-def test_invalid_settings_are_refused_in_one_sentence(arguments, words):
+def test_invalid_settings_are_refused_in_one_sentence(arguments, message):
     with pytest.raises(ConfigError) as refused:
         thesis_settings(**{"wheel_radius_m": 0.2, "gains": PROPORTIONAL} | arguments)
-    assert str(refused.value).startswith(words)
+    assert str(refused.value).startswith(message)
     assert "\n" not in str(refused.value)
 
 

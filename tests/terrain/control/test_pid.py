@@ -103,7 +103,7 @@ def test_a_fault_gives_nothing_freezes_the_integral_and_leaves_no_kick(error, dt
 
 
 @pytest.mark.parametrize(
-    ("change", "words"),
+    ("change", "message"),
     [
         ({"kp": -0.1}, "gain kp is -0.1, a finite number from zero up is required"),
         ({"ki": NAN}, "gain ki is nan"),
@@ -117,8 +117,8 @@ def test_a_fault_gives_nothing_freezes_the_integral_and_leaves_no_kick(error, dt
         ({"integral_limit": NAN}, "gain integral_limit is nan"),
     ],
 )
-def test_gains_that_cannot_be_are_refused_in_one_sentence(change, words):
+def test_invalid_gains_are_refused_in_one_sentence(change, message):
     with pytest.raises(ConfigError) as refused:
         check_gains(Gains(1.0, 0.0, 0.0, 1.0)._replace(**change))
-    assert str(refused.value).startswith(words)
+    assert str(refused.value).startswith(message)
     assert "\n" not in str(refused.value)

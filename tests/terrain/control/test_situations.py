@@ -107,7 +107,7 @@ def test_changes_are_where_another_terrain_begins():
 
 
 @pytest.mark.parametrize(
-    ("name", "terrain", "options", "words"),
+    ("name", "terrain", "options", "message"),
     [
         ("race", "grass", {}, "scenario 'race' is unknown: use one of starts, straight"),
         ("starts", COURSE, {}, "scenario 'starts' does not go with terrain 'course'"),
@@ -123,8 +123,8 @@ def test_changes_are_where_another_terrain_begins():
         ("circle", "tiles", {"radius_factors": (0.0, 1.0, 1.0)}, "conditions: radius_factors is"),
     ],
 )
-def test_invalid_situations_are_refused_in_one_sentence(name, terrain, options, words):
+def test_invalid_situations_are_refused_in_one_sentence(name, terrain, options, message):
     with pytest.raises(ConfigError) as refused:
         situation(name, ROBOT, terrain, 0, **options)
-    assert str(refused.value).startswith(words)
+    assert str(refused.value).startswith(message)
     assert "\n" not in str(refused.value)

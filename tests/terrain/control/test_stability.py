@@ -186,7 +186,7 @@ def test_the_loop_is_stable_without_gains():
 
 
 @pytest.mark.parametrize(
-    ("arguments", "words"),
+    ("arguments", "message"),
     [
         (
             {"gains": Gains(2.0, 0.0, 0.0, 5.0)},
@@ -205,7 +205,7 @@ def test_the_loop_is_stable_without_gains():
         ({"robot": load_robot("husky")}, "^robot husky: its description has no section"),
     ],
 )
-def test_an_unstable_loop_or_bad_input_is_refused_in_one_sentence(arguments, words):
-    with pytest.raises(ConfigError, match=words) as refused:
+def test_an_unstable_loop_or_bad_input_is_refused_in_one_sentence(arguments, message):
+    with pytest.raises(ConfigError, match=message) as refused:
         check_stable(**{"robot": ROBOT, "gains": Gains(1.0, 0.0, 0.0, 5.0)} | arguments)
     assert "\n" not in str(refused.value)

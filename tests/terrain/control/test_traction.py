@@ -31,7 +31,7 @@ POSITIONS_M, RADIUS_M = ROBOT.wheel_positions_m, ROBOT.wheel_radius_m
 DT_S = 0.02
 NAN, INF = math.nan, math.inf
 BAD_TIMES = (NAN, 0.0, -0.02, 0.6, INF, -INF)
-DRIVEN, WANTED, BALANCE, FLOOR = 0, 1, 5, 6
+DRIVEN, DESIRED, BALANCE, FLOOR = 0, 1, 5, 6
 TARGET = TractionTarget(0.1)
 SLICK = TractionTarget(0.1, 0.15, 3.0)
 """Terrain on which braking is controlled."""
@@ -68,18 +68,18 @@ def plain(using, m, aim, radius, wheel, ground, accel, slips, stds, stale, torqu
         m["d"] = 0.0
     if w > 0:
         m["share"] = [x / w for x in u]
-    way = [-1.0 if share < 0 else 1.0 for share in m["share"]]
+    direction = [-1.0 if share < 0 else 1.0 for share in m["share"]]
     share = [abs(s) for s in m["share"]]
     known = [all(map(math.isfinite, row)) for row in zip(ground, accel, slips, stds, strict=True)]
     near = [i for i in range(3) if known[i] and share[i] >= 0.3]
     q, a = 0.0, 0.0
     if near:
-        i = min(near, key=lambda i: way[i] * ground[i] / share[i])
-        q, a = way[i] * ground[i] / share[i], way[i] * accel[i] / share[i]
+        i = min(near, key=lambda i: direction[i] * ground[i] / share[i])
+        q, a = direction[i] * ground[i] / share[i], direction[i] * accel[i] / share[i]
     largest = 0.0
     for i in range(3):
         if known[i]:
-            wheel_speed = abs(ground[i]) / max(1 - max(way[i] * slips[i], 0), 0.05)
+            wheel_speed = abs(ground[i]) / max(1 - max(direction[i] * slips[i], 0), 0.05)
             largest = max(
                 largest, stds[i] * wheel_speed / max(wheel_speed, 1.5 * using.launch_mps, m["from"])
             )
@@ -117,24 +117,24 @@ def plain(using, m, aim, radius, wheel, ground, accel, slips, stds, stale, torqu
     m["from"] = max(m["from"], d) if braking_s > 0 else 0.0
     m["d"], m["braking_s"] = new, braking_s
     if status == TractionStatus.OK:
-        learn(using, m, q, way, slips, w, target, dt, aim.margin_ratio)
-    seen = [way[i] * torque[i] for i in range(3)]
+        learn(using, m, q, direction, slips, w, target, dt, aim.margin_ratio)
+    seen = [direction[i] * torque[i] for i in range(3)]
     if new <= 0.1 or not all(map(math.isfinite, seen)):
         seen = [0.0] * 3
     keep = math.exp(-dt / using.droop_time_s)
     m["torque"] = [keep * t + (1 - keep) * s for t, s in zip(m["torque"], seen, strict=True)]
     command = []
-    mean_slip = sum(way[i] * slips[i] for i in range(3) if known[i]) / 3
+    mean_slip = sum(direction[i] * slips[i] for i in range(3) if known[i]) / 3
     grip = min(max(2 - abs(mean_slip) / traction._GRIP, 0), 1)
     for i in range(3):
         give = using.droop_radps_per_nm * (m["torque"][i] - sum(m["torque"]) / 3)
         most = grip * using.droop_max_ratio * share[i] * new / radius
         droop = min(max(give, -most), most) if status == TractionStatus.OK else 0
-        command.append(way[i] * (share[i] * new / radius - droop))
+        command.append(direction[i] * (share[i] * new / radius - droop))
     return command, new, target, status
 
 
-def learn(using, m, q, way, slips, w, target, dt, margin):
+def learn(using, m, q, direction, slips, w, target, dt, margin):
     """What steady motion balances, and whether a robot that is held back gains speed."""
     m["slow"] += (q - m["slow"]) * min(dt / traction._SLOW_S, 1)
     gained = (q - m["slow"]) / traction._SLOW_S
@@ -144,7 +144,7 @@ def learn(using, m, q, way, slips, w, target, dt, margin):
         m["reference"], m["constant_s"] = m["d"], 0.0
     m["constant_s"] += dt
     if m["constant_s"] > traction._CONSTANT_S and abs(gained) < traction._STEADY_MPS2 and q > 0.1:
-        slip = sum(way[i] * slips[i] for i in range(3)) / 3
+        slip = sum(direction[i] * slips[i] for i in range(3)) / 3
         if math.isnan(m["balance"]):
             m["balance"] = slip
         m["balance"] += (slip - m["balance"]) * min(dt / traction._BALANCE_S, 1)
@@ -209,7 +209,7 @@ def test_any_drive_with_faults_equals_the_reference_implementation(seed):
 )
 def test_the_cap_is_the_normalised_p_controller_of_slip_on_the_chassis(driven, slip, target, more):
     state = initial_state()
-    state[[DRIVEN, WANTED]] = driven
+    state[[DRIVEN, DESIRED]] = driven
     using = SETTINGS._replace(launch_mps=1e-6)
     wheel = (driven + more) / RADIUS_M
     ground_mps = driven * (1 - slip)
@@ -223,14 +223,21 @@ twists = st.tuples(*[st.floats(-1.0, 1.0)] * 3).filter(lambda twist: max(map(abs
 numbers = st.floats(-2.0, 2.0)
 
 
-@given(twist=twists, was=st.floats(0, 2), way=numbers, accel=numbers, slip=st.floats(-1, 1), torque=numbers)
+@given(
+    twist=twists, was=st.floats(0, 2), direction=numbers, accel=numbers, slip=st.floats(-1, 1), torque=numbers
+)
 def test_speed_never_falls_while_more_is_desired_and_the_turning_centre_stays(
-    twist, was, way, accel, slip, torque
+    twist, was, direction, accel, slip, torque
 ):
     wheel, steer = inverse(POSITIONS_M, RADIUS_M, np.array(twist), np.zeros(3))
     state = initial_state()
-    state[[DRIVEN, WANTED]] = was
-    inputs = {"ground_mps": way * np.sign(wheel), "accel": accel, "slip": slip, "torque": torque * wheel}
+    state[[DRIVEN, DESIRED]] = was
+    inputs = {
+        "ground_mps": direction * np.sign(wheel),
+        "accel": accel,
+        "slip": slip,
+        "torque": torque * wheel,
+    }
     for std in (0.0, 1.0):
         even = SETTINGS._replace(droop_radps_per_nm=0.0)
         command, after, report = steps(state, wheel, **inputs, std=std, using=even)
@@ -375,14 +382,14 @@ def test_no_target_reduces_the_steady_speed():
 
 
 def braked(aim, wheel, v, slowing=3.0, using=SETTINGS):
-    """Told (n, 3), driven and state after a command to stop, on ground that slows so much."""
+    """Commands (n, 3), speed and state after a command to stop, at a given deceleration."""
     state = initial_state()
-    ways = np.sign(wheel)
-    _, state, _ = steps(state, wheel, ground_mps=v * ways, aim=aim, using=using)
+    directions = np.sign(wheel)
+    _, state, _ = steps(state, wheel, ground_mps=v * directions, aim=aim, using=using)
     state[DRIVEN] = v
     rows = []
     while len(rows) < 100:
-        command, state, report = steps(state, 0.0, ground_mps=v * ways, aim=aim, using=using)
+        command, state, report = steps(state, 0.0, ground_mps=v * directions, aim=aim, using=using)
         rows.append([*command, report.driven_mps, report.drive_state, v])
         v = max(v - slowing * DT_S, 0.0)
     return np.array(rows), state
