@@ -243,17 +243,3 @@ class Predictions:
         found = {each.name: getattr(self, each.name) for each in fields(self)}
         unknown = [name for name in ("model", "dataset", "skipped") if found[name] is None]
         return {name: value for name, value in found.items() if name not in unknown}
-
-
-class TerrainSlip(NamedTuple):
-    """Steady slip of the simulated runs of a terrain: mean estimate, mean truth, RMSE, and mean NEES.
-
-    None where the slip was nowhere steady.
-    """
-
-    terrain: str
-    n_runs: int
-    slip_mean: float | None
-    slip_true_mean: float | None
-    slip_rmse: float | None
-    nees: float | None

@@ -136,9 +136,9 @@ def train_classifier(
     runs_a_terrain : number of runs; that of ``terrain quickstart`` by default
     """
     from pipelines.classify.crossval import samples_of
-    from pipelines.classify.labelled import RUNS_A_TERRAIN, labelled_runs
     from pipelines.classify.settings import CrossvalSettings
     from pipelines.classify.train import model_info
+    from pipelines.estimate.labelled import RUNS_A_TERRAIN, labelled_runs
 
     runs, _, _ = labelled_runs(seed, runs_a_terrain or RUNS_A_TERRAIN, progress, robot)
     settings = CrossvalSettings(seed=seed)

@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 
 from features.windows import Layout, cut_windows, layout_of
-from pipelines.classify.labelled import RUNS_A_TERRAIN, SCENARIO
 from pipelines.classify.settings import CrossvalSettings
 from pipelines.classify.splits import labelled
-from pipelines.explain.results import Change, Comparison
+from pipelines.estimate.labelled import RUNS_A_TERRAIN, SCENARIO
 from pipelines.reporting.progress import Progress, silent
 from terrain.bootstrap import bootstrap_counts, percentile_interval
+from terrain.discrepancy.filter_gain import Change, Comparison
 from terrain.errors import DataError, TerrainError
 from terrain.kinematics.wheel_speed import with_wheel_speeds
 from terrain.logs.schema import SIGNAL_SETS

@@ -9,20 +9,14 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.explain.classifier import classifier_gain
-from pipelines.explain.filter_gain import filter_gain
 from pipelines.explain.page import PAGE_FILE, write_explain_page
-from pipelines.explain.results import (
-    Comparison,
-    DiagnosedRuns,
-    Explanation,
-    ExtendedDescription,
-    HeldOutGain,
-)
+from pipelines.explain.results import DiagnosedRuns, Explanation, ExtendedDescription, HeldOutGain
 from pipelines.explain.settings import ExplainSettings
 from pipelines.reporting.progress import Progress, silent
 from pipelines.runs.datasets import data_digest
 from terrain.discrepancy.diagnose import diagnose
 from terrain.discrepancy.extend import extend, extended_effects
+from terrain.discrepancy.filter_gain import Comparison, filter_gain
 from terrain.discrepancy.gain import gain
 from terrain.discrepancy.hold_out import HOLD_OUT_FROM, split_runs
 from terrain.discrepancy.residuals import low_pass_of

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from pipelines.explain.wording import terrain_notes
+from terrain.discrepancy.filter_gain import Comparison
 from terrain.discrepancy.gain import Gain
 from terrain.discrepancy.noise import Noise
 from terrain.discrepancy.residuals import LowPass
@@ -40,40 +41,6 @@ class DiagnosedRuns:
     held_out: tuple[RunLog, ...]
     noise: Noise
     low_pass: LowPass
-
-
-class Change(NamedTuple):
-    """A figure before and after an extension, and the 95 % interval of its change (None for one run)."""
-
-    before: float
-    after: float
-    change_ci: tuple[float, float] | None
-
-
-class Comparison(NamedTuple):
-    """What an extension changes for a filter or a classifier on held-out runs.
-
-    Parameters
-    ----------
-    name : of the filter or the recipe
-    reason : why there are no errors; None where there are
-    n_runs : that were compared
-    errors : by figure
-    terrains : of the runs; None where they do not matter
-    """
-
-    name: str
-    reason: str | None
-    n_runs: int
-    errors: Mapping[str, Change]
-    terrains: tuple[str, ...] | None = None
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the comparison as JSON has it."""
-        shown = self._asdict()
-        if self.terrains is None:
-            del shown["terrains"]
-        return shown
 
 
 @dataclass(frozen=True, slots=True, eq=False)

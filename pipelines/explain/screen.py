@@ -6,10 +6,11 @@ from collections.abc import Iterator
 
 from rich.console import Console
 
-from pipelines.explain.results import Comparison, Explanation, TrialsResult
+from pipelines.explain.results import Explanation, TrialsResult
 from pipelines.explain.wording import effect_label, gain_text, quantity, verdict_text
 from pipelines.reporting.numbers import format_known, percent
 from pipelines.reporting.terminal import compact_table, number_columns, print_lines, text_column
+from terrain.discrepancy.filter_gain import Comparison
 from terrain.discrepancy.trials.rows import Row
 from terrain.discrepancy.trials.scoring import FOUND_TRIALS
 from terrain.discrepancy.verdict import Cause, Diagnosis

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from pipelines.explain.results import Comparison, Explanation
+from pipelines.explain.results import Explanation
 from pipelines.explain.wording import (
     CHANNEL_WORDS,
     channel_label,
@@ -26,6 +26,7 @@ from pipelines.explain.wording import (
 from pipelines.reporting.numbers import NBSP, NOT_KNOWN, sentence
 from pipelines.reporting.pictures import Image
 from pipelines.reporting.versions import versions
+from terrain.discrepancy.filter_gain import Comparison
 from terrain.discrepancy.gain import ChannelGain, Gain
 from terrain.discrepancy.verdict import Cause, Clock, Diagnosis, Limit, RuledOut
 from terrain.effects import LIBRARY

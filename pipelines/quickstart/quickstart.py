@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from pipelines.classify.crossval import crossval
-from pipelines.classify.results import TerrainSlip
 from pipelines.classify.settings import CrossvalSettings
+from pipelines.estimate.labelled import TerrainSlip
 from pipelines.quickstart.results import KeptRuns, QuickstartResult
 from pipelines.quickstart.settings import QuickstartSettings
 from pipelines.reporting.progress import Progress, silent
@@ -47,7 +47,7 @@ def quickstart(
     Parameters
     ----------
     settings : where runs are read, and where runs (``out/runs``) and report (``out/report.html``) go; without
-        data, runs are simulated and filtered (:mod:`pipelines.classify.labelled`)
+        data, runs are simulated and filtered (:mod:`pipelines.estimate.labelled`)
     progress : called as the work goes on
     evaluation : how the recipe is evaluated; ``settings.evaluation`` by default
     runs_a_terrain : simulated runs of each terrain
@@ -100,8 +100,8 @@ def quickstart(
 
 
 def _simulated(seed: int, runs_a_terrain: int | None, progress: Progress) -> _Source:
-    from pipelines.classify.labelled import RUNS_A_TERRAIN, labelled_runs
     from pipelines.estimate.figures import motion_figure, slip_figure
+    from pipelines.estimate.labelled import RUNS_A_TERRAIN, labelled_runs
 
     runs, slip, example = labelled_runs(seed, runs_a_terrain or RUNS_A_TERRAIN, progress)
     return _Source(runs, slip, {"slip": slip_figure(example), "motion": motion_figure(example)})
@@ -113,7 +113,7 @@ def _commands(
     """Return what to type for the same, step by step."""
     data, steps = settings.data, []
     if data is None:
-        from pipelines.classify.labelled import FILTER, ROBOT, RUNS_A_TERRAIN, SCENARIO
+        from pipelines.estimate.labelled import FILTER, ROBOT, RUNS_A_TERRAIN, SCENARIO
 
         data = settings.out / "runs"
         steps = [

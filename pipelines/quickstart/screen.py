@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from rich.console import Console
 from rich.table import Table
 
-from pipelines.classify.results import TerrainSlip
 from pipelines.classify.screen import print_crossval, print_predictions, print_training
+from pipelines.estimate.labelled import TerrainSlip
 from pipelines.quickstart.results import QuickstartResult
 from pipelines.reporting.numbers import format_known
 from pipelines.reporting.terminal import number_columns, print_lines

@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 
 from pipelines.explain.page import explain_page, figure_view
-from pipelines.explain.results import Change, Comparison, Explanation, HeldOutGain
+from pipelines.explain.results import Explanation, HeldOutGain
 from pipelines.explain.view import RunPicture
 from pipelines.explain.wording import limit_text, quantity, verdict_text
 from pipelines.reporting.json_file import as_json
 from pipelines.reporting.numbers import NOT_KNOWN
 from pipelines.reporting.pictures import png_image
+from terrain.discrepancy.filter_gain import Change, Comparison
 from terrain.discrepancy.gain import ChannelGain, Gain, Reduction
 from terrain.discrepancy.verdict import (
     Cause,

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipelines.explain.results import Change, Comparison
 from terrain.bootstrap import bootstrap_counts, percentile_interval
 from terrain.discrepancy.simulation import Simulation
 from terrain.errors import TerrainError
@@ -24,6 +24,40 @@ ERRORS = ("speed_mps", "yaw_rate_radps", "slip_ratio")
 """Errors that are compared: root mean squares of speed and yaw rate, and the error of the mean slip."""
 
 N_BOOTSTRAP = 2000
+
+
+class Change(NamedTuple):
+    """A figure before and after an extension, and the 95 % interval of its change (None for one run)."""
+
+    before: float
+    after: float
+    change_ci: tuple[float, float] | None
+
+
+class Comparison(NamedTuple):
+    """What an extension changes for a filter or a classifier on held-out runs.
+
+    Parameters
+    ----------
+    name : of the filter or the recipe
+    reason : why there are no errors; None where there are
+    n_runs : that were compared
+    errors : by figure
+    terrains : of the runs; None where they do not matter
+    """
+
+    name: str
+    reason: str | None
+    n_runs: int
+    errors: Mapping[str, Change]
+    terrains: tuple[str, ...] | None = None
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the comparison as JSON has it."""
+        shown = self._asdict()
+        if self.terrains is None:
+            del shown["terrains"]
+        return shown
 
 
 def filter_gain(runs: Sequence[RunLog], robot: Robot, extended: Simulation, seed: int) -> Comparison | None:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
-from pipelines.classify.results import TerrainSlip
 from pipelines.reporting.progress import Progress, silent
 from terrain.estimation.enriched import enriched
 from terrain.estimation.estimate import Estimate, estimate_run
@@ -21,6 +21,20 @@ ROBOT = "agrimaro"
 SCENARIO = "survey"
 FILTER = "vio15"
 RUNS_A_TERRAIN = 6
+
+
+class TerrainSlip(NamedTuple):
+    """Steady slip of the simulated runs of a terrain: mean estimate, mean truth, RMSE, and mean NEES.
+
+    None where the slip was nowhere steady.
+    """
+
+    terrain: str
+    n_runs: int
+    slip_mean: float | None
+    slip_true_mean: float | None
+    slip_rmse: float | None
+    nees: float | None
 
 
 def labelled_runs(

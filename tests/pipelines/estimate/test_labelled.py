@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from pipelines.classify.crossval import crossval
-from pipelines.classify.labelled import labelled_runs
 from pipelines.classify.settings import CrossvalSettings
+from pipelines.estimate.labelled import labelled_runs
 from pipelines.quickstart.quickstart import quickstart
 from pipelines.quickstart.settings import QuickstartSettings
 from pipelines.reporting.json_file import as_json
