@@ -5,17 +5,14 @@ With wheel i at ``(x_i, y_i)``, steered by ``d_i`` and turning at ``w_i``, radiu
     velocity of its centre    p_i' = (v_x - y_i g', v_y + x_i g')                        (2.2)
     rolling without slip      p_i' = r w_i (cos d_i, sin d_i)                            (2.1)
     all wheels                S(d) w = H V, V = H^+ S(d) w                               (2.3), (2.4)
-    the other way             d_i = atan2(p_iy', p_ix') + k pi, w_i = (-1)^k |p_i'| / r  (2.5)
-    no motor saturates        |p_i'| <= r w_max                                          (2.6)-(2.10)
+    wheels for a twist        d_i = atan2(p_iy', p_ix') + k pi, w_i = (-1)^k |p_i'| / r  (2.5)
 
 A twist is an array ``(..., 3)`` ordered ``(speed_x_mps, speed_y_mps, yaw_rate_radps)`` everywhere here; the
 source puts the yaw rate first, and the columns of its H are reordered accordingly.
 
 Source: Danzi, AgriMaRo thesis, 2.3.  Corrected: one table of wheel positions, ``robot.wheel_positions_m``
 (its 7.2), because (2.3) numbers the wheels of the x axis the other way round; rows of H are
-``[-y_i 1 0; x_i 0 1]``; S is block-diagonal, 6 x 3; (2.6)-(2.9) have ``y' + x_i g'`` and ``x' - y_i g'`` with
-each wheel's own position.  The admissible region is convex, but no polyhedron: each wheel bounds it by a
-cylinder.
+``[-y_i 1 0; x_i 0 1]``; S is block-diagonal, 6 x 3.  Limits: :mod:`terrain.kinematics.swerve_limits`.
 
 Functions check what they are given; :func:`wheel_command_step` alone trusts it.
 """
@@ -23,17 +20,17 @@ Functions check what they are given; :func:`wheel_command_step` alone trusts it.
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 from numba import njit, types
 
 from terrain.errors import ConfigError
+from terrain.kinematics.arguments import above_zero, broadcast, finite_numbers, wheel_positions
 from terrain.kinematics.wheel_velocity import point_velocity, velocity_matrix
 from terrain.records import Array
 
 STANDING_MPS = 1e-6
-"""A wheel slower than this stands: below, its direction is rounding, and nobody's wish."""
+"""A wheel slower than this is at rest: below, its direction is rounding, no command."""
 
 FAR_RAD = 0.35
 """A wheel steered further than this from where it should be holds back the drive of all (20 degrees)."""
@@ -59,7 +56,7 @@ def wheel_velocities(positions_m: Array, twist: Array) -> Array:
            [ 1.  ,  0.1 ],
            [ 1.15,  0.  ]])
     """
-    return _velocities(_positions(positions_m), _numbers("twist", twist, 3))
+    return _velocities(wheel_positions(positions_m), finite_numbers("twist", twist, 3))
 
 
 def forward(positions_m: Array, radius_m: float, wheel_radps: Array, steer_rad: Array) -> tuple[Array, Array]:
@@ -87,11 +84,11 @@ def forward(positions_m: Array, radius_m: float, wheel_radps: Array, steer_rad: 
     >>> twist.round(3), residual_mps.round(3)
     (array([0.995, 0.   , 0.2  ]), np.float64(0.0))
     """
-    positions = _positions(positions_m)
-    radius = _above_zero("radius_m", radius_m)
-    wheel = _numbers("wheel_radps", wheel_radps, len(positions), missing=True)
-    steer = _numbers("steer_rad", steer_rad, len(positions), missing=True)
-    wheel, steer = _together(wheel_radps=wheel, steer_rad=steer)
+    positions = wheel_positions(positions_m)
+    radius = above_zero("radius_m", radius_m)
+    wheel = finite_numbers("wheel_radps", wheel_radps, len(positions), missing=True)
+    steer = finite_numbers("steer_rad", steer_rad, len(positions), missing=True)
+    wheel, steer = broadcast(wheel_radps=wheel, steer_rad=steer)
     wheel_speed = np.stack([np.cos(steer), np.sin(steer)], axis=-1) * (radius * wheel)[..., None]
     seen = wheel_speed.reshape(*wheel.shape[:-1], -1)
     rows = velocity_matrix(positions)
@@ -127,103 +124,14 @@ def inverse(positions_m: Array, radius_m: float, twist: Array, steer_now_rad: Ar
     >>> inverse([[-0.5, 0.0], [0.5, 0.0]], 0.2, [-1.0, 0.0, 0.0], [0.0, 7.0])
     (array([-5., -5.]), array([0.        , 6.28318531]))
     """
-    positions = _positions(positions_m)
-    radius = _above_zero("radius_m", radius_m)
-    velocity = _velocities(positions, _numbers("twist", twist, 3))
-    now = _numbers("steer_now_rad", steer_now_rad, len(positions))
-    along, across, now = _together(twist=velocity[..., 0], _=velocity[..., 1], steer_now_rad=now)
+    positions = wheel_positions(positions_m)
+    radius = above_zero("radius_m", radius_m)
+    velocity = _velocities(positions, finite_numbers("twist", twist, 3))
+    now = finite_numbers("steer_now_rad", steer_now_rad, len(positions))
+    along, across, now = broadcast(twist=velocity[..., 0], _=velocity[..., 1], steer_now_rad=now)
     wheel, steer = np.empty(now.shape), np.empty(now.shape)
     _aim_all(along.ravel(), across.ravel(), radius, now.ravel(), wheel.reshape(-1), steer.reshape(-1))
     return wheel, steer
-
-
-def admissible_scale(positions_m: Array, radius_m: float, twist: Array, speed_max_radps: float) -> Array:
-    """Return the largest k (...), at most 1, with which ``k * twist`` saturates no wheel, (2.10).
-
-    Raises
-    ------
-    ConfigError
-        as :func:`inverse` does, and for a limit that is not above zero.
-
-    Examples
-    --------
-    >>> admissible_scale([[-0.5, 0.0], [0.5, 0.0]], 0.2, [[4.0, 0.0, 0.0], [1.0, 0.0, 0.0]], 10.0)
-    array([0.5, 1. ])
-    """
-    limit_mps = _above_zero("radius_m", radius_m) * _above_zero("speed_max_radps", speed_max_radps)
-    velocity = wheel_velocities(positions_m, twist)
-    fastest_mps = np.hypot(velocity[..., 0], velocity[..., 1]).max(axis=-1)
-    return np.asarray(limit_mps / np.maximum(fastest_mps, limit_mps))
-
-
-def scaled(positions_m: Array, radius_m: float, twist: Array, speed_max_radps: float) -> Array:
-    """Return the twist (..., 3) in its own direction, shortened until no wheel saturates.
-
-    The direction is kept, so the centre of rotation and the path are: the robot is slower on the same curve.
-
-    Raises
-    ------
-    ConfigError
-        as :func:`admissible_scale` does.
-
-    Examples
-    --------
-    >>> scaled([[-0.5, 0.0], [0.5, 0.0]], 0.2, [2.4, 0.0, 3.6], 10.0)
-    array([1.6, 0. , 2.4])
-    """
-    scale = admissible_scale(positions_m, radius_m, twist, speed_max_radps)
-    return np.asarray(np.asarray(twist, dtype=np.float64) * scale[..., None])
-
-
-def admissible_yaw_rate(
-    positions_m: Array, radius_m: float, speed_x_mps: Array, speed_y_mps: Array, speed_max_radps: float
-) -> tuple[Array, Array]:
-    """Return the lowest and the highest yaw rate (...) that saturate no wheel at a given translation.
-
-    The boundary of the admissible region: with v_max = r w_max, (2.6) corrected asks of every wheel
-    ``(x_i^2 + y_i^2) g'^2 + 2 (x_i v_y - y_i v_x) g' + v_x^2 + v_y^2 - v_max^2 <= 0``, an interval of g'.
-    Figure 2.8 and its dimensionless twist (2.11) come of positions in half wheelbases, radius and limit 1.
-
-    Parameters
-    ----------
-    positions_m : (wheels, 2)
-    radius_m : of the wheels
-    speed_x_mps, speed_y_mps : (...) broadcast against each other
-    speed_max_radps : limit of the wheels
-
-    Returns
-    -------
-    low_radps, high_radps : (...); NaN where no yaw rate is admissible
-
-    Raises
-    ------
-    ConfigError
-        for shapes that do not fit, values that are not finite, a radius or limit that is not above zero.
-
-    Examples
-    --------
-    >>> xi = 1.5  # track over half the wheelbase
-    >>> admissible_yaw_rate([[-1, 0], [1, 0], [0, -xi]], 1.0, [0.0, 0.7], 0.0, 1.0)
-    (array([-0.66666667, -0.71414284]), array([0.66666667, 0.2       ]))
-    """
-    positions = _positions(positions_m)
-    limit_mps = _above_zero("radius_m", radius_m) * _above_zero("speed_max_radps", speed_max_radps)
-    x_mps, y_mps = _together(
-        speed_x_mps=_numbers("speed_x_mps", speed_x_mps), speed_y_mps=_numbers("speed_y_mps", speed_y_mps)
-    )
-    x, y = positions.T
-    square = x * x + y * y
-    across = x * y_mps[..., None] - y * x_mps[..., None]
-    away = x * x_mps[..., None] + y * y_mps[..., None]
-    # across^2 + away^2 = square * speed^2 turns the discriminant into one that cancels nothing
-    inside = square * limit_mps**2 - away**2
-    # a wheel at the origin does not feel the yaw rate: it bounds the translation alone
-    free = np.where(np.hypot(x_mps, y_mps) <= limit_mps, np.inf, np.nan)[..., None]
-    root = np.sqrt(np.where(inside >= 0, inside, np.nan))
-    pivot = np.where(square > 0, square, 1.0)
-    low = np.where(square > 0, (-across - root) / pivot, -free).max(axis=-1)
-    high = np.where(square > 0, (-across + root) / pivot, free).min(axis=-1)
-    return np.where(low <= high, low, np.nan), np.where(low <= high, high, np.nan)
 
 
 def wheel_commands(
@@ -236,7 +144,7 @@ def wheel_commands(
     steer_0: Array,
     far_rad: float = FAR_RAD,
 ) -> tuple[Array, Array, Array]:
-    """Return what the wheels are told, step by step, to drive a row of twists.
+    """Return the commands of the wheels, step by step, to drive a sequence of twists.
 
     Parameters
     ----------
@@ -268,11 +176,11 @@ def wheel_commands(
     >>> wheel[:, 0].round(2)
     array([0.4 , 0.78, 1.13, 1.43, 1.68, 1.86, 2.  , 2.  , 2.  ])
     """
-    positions = _positions(positions_m)
-    desired = np.atleast_2d(_numbers("twists", twists, 3))
+    positions = wheel_positions(positions_m)
+    desired = np.atleast_2d(finite_numbers("twists", twists, 3))
     if desired.ndim != 2:
         raise ConfigError(f"twists have shape {desired.shape}, (n, 3) is required")
-    steer = _numbers("steer_0", steer_0, len(positions))
+    steer = finite_numbers("steer_0", steer_0, len(positions))
     if steer.ndim != 1:
         raise ConfigError(f"steer_0 has shape {steer.shape}, ({len(positions)},) is required")
     limits = {
@@ -282,7 +190,7 @@ def wheel_commands(
         "dt_s": dt_s,
         "far_rad": far_rad,
     }
-    numbers = [_above_zero(name, value) for name, value in limits.items()]
+    numbers = [above_zero(name, value) for name, value in limits.items()]
     return _commands(positions, *numbers, desired, steer)  # type: ignore[no-any-return]
 
 
@@ -317,20 +225,20 @@ def wheel_command_step(
     twist: Array,
     steer_rad: Array,
 ) -> tuple[Array, Array, Array]:
-    """Return what the wheels are told for one twist; compiled, callable from compiled code, checks nothing.
+    """Return the commands of the wheels for one twist; compiled, callable from compiled code, checks nothing.
 
-    The twist is shortened to the admissible region, each wheel aims (:func:`inverse`) from where its steering
-    was told to be last, and the steering moves there no faster than it can.  While it is on its way, the
-    wheels' rolling directions contradict each other: as long as one wheel is further than ``far_rad`` from
-    its aim, the speeds of all are multiplied by ``max(0, cos(error))`` of the worst one, so that none scrubs.
-    This drive law is ours: the thesis says only that steering takes its time.
+    The twist is shortened to the admissible region, each wheel aims (:func:`inverse`) from its last
+    steering command, and the steering moves there no faster than it can. While it moves, the wheels'
+    rolling directions contradict each other: as long as one wheel is further than ``far_rad`` from its aim,
+    the speeds of all are multiplied by ``max(0, cos(error))`` of the worst one, so that none scrubs. The
+    thesis gives no such law; it says only that steering takes time.
 
     Parameters
     ----------
     positions_m : (wheels, 2)
     radius_m, speed_max_radps, rate_max_radps, dt_s, far_rad : as in :func:`wheel_commands`
     twist : (3,)
-    steer_rad : (wheels,) the steering told last
+    steer_rad : (wheels,) the last steering command
 
     Returns
     -------
@@ -386,41 +294,3 @@ def _commands(
 def _velocities(positions: Array, twist: Array) -> Array:
     flat = twist @ velocity_matrix(positions).T
     return np.asarray(flat.reshape(*flat.shape[:-1], len(positions), 2))
-
-
-def _numbers(name: str, given: Any, size: int | None = None, missing: bool = False) -> Array:
-    """Return ``given`` as an array of finite floats with ``size`` columns; NaN too where samples may miss."""
-    try:
-        array = np.asarray(given, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise ConfigError(f"{name} cannot be read as an array of numbers") from None
-    if size is not None and array.shape[-1:] != (size,):
-        raise ConfigError(f"{name} has shape {array.shape}, (..., {size}) is required")
-    bad = np.isinf(array) if missing else ~np.isfinite(array)
-    if bad.any():
-        raise ConfigError(f"{name} holds {array[bad].flat[0]}, finite numbers are required")
-    return array
-
-
-def _positions(given: Any) -> Array:
-    positions = _numbers("positions_m", given, 2)
-    if positions.ndim != 2 or len(positions) < 2:
-        raise ConfigError(f"positions_m has shape {positions.shape}, (wheels, 2) with two wheels is required")
-    if (positions == positions[0]).all():
-        raise ConfigError("positions_m holds one place only: wheels in one place do not tell the yaw rate")
-    return positions
-
-
-def _above_zero(name: str, given: Any) -> float:
-    value = _numbers(name, given)
-    if value.ndim or not value > 0:
-        raise ConfigError(f"{name} is {given!r}, a number above zero is required")
-    return float(value)
-
-
-def _together(**arrays: Array) -> list[Array]:
-    try:
-        return list(np.broadcast_arrays(*arrays.values()))
-    except ValueError:
-        names = " and ".join(f"{name} {array.shape}" for name, array in arrays.items() if name != "_")
-        raise ConfigError(f"shapes do not fit together: {names}") from None

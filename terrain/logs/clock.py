@@ -23,11 +23,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.ndimage import binary_erosion, gaussian_filter1d, maximum_filter
+from scipy.ndimage import maximum_filter
 from scipy.optimize import least_squares
 
-from terrain.errors import DataError
-from terrain.records import Array, RunLog, Stream
+from terrain.logs.yaw_rates import YawRatePair, correlation_of, gyro_at, imu_time_s, low_passed_pair
+from terrain.records import Array, RunLog
 
 MAX_OFFSET_S = 2.0
 """The loggers of a run are started together; the published runs that tell it differ by up to 1.7 s."""
@@ -53,32 +53,14 @@ RIVAL_MARGIN = 0.15
 RATE_KNOWN = 0.01
 """With a larger standard deviation the rate is not told apart from that of any stated sampling rate."""
 
-MIN_SAMPLES = 30
-"""Fewer samples of the slower stream tell no correlation from chance."""
-
 RIVAL_FLOOR = 0.05
 """Share of the variance by which a rival must be worse even when the best peak explains nearly everything."""
-
-EDGE_SIGMAS = 3.0
-"""So close to an end or a gap, in widths of the low-pass, it has too little to average: not used."""
 
 SAME_PEAK_SIGMAS = 4.0
 """Two peaks of the grid that lie closer than this many widths of the low-pass are one."""
 
-MIN_SIGMA_S = 0.1
-"""Width of the low-pass under fast streams: no robot turns faster, and a finer search only takes longer."""
-
 MAX_SEARCH_SAMPLES = 1500
 """The coarse search looks at this many instants of a long run; least squares at all of them."""
-
-MAX_GAP_SAMPLES = 3.0
-"""Across a longer gap, in widths of the low-pass, nothing is interpolated."""
-
-MAX_GAP_SHARE = 20.0
-"""A stream that lasts this many times as long as its samples do is mostly gap, and is not compared."""
-
-MIN_GYRO_STEPS = 8
-"""Grid of the smooth gyro, in steps a period of the slower stream: fine enough for straight lines between."""
 
 STATUSES = ("estimated", "offset only", "not excited", "ambiguous", "at bound")
 
@@ -106,19 +88,6 @@ class ClockEstimate(NamedTuple):
     correlation: float
     status: str
     reference_s: float
-
-
-class _Pair(NamedTuple):
-    """Both signals, low-passed alike: the wheels on their own times, the gyro on a fine even grid."""
-
-    time_s: Array
-    wheels_radps: Array
-    sigma_s: float
-    gyro_start_s: float
-    gyro_step_s: float
-    gyro_radps: Array
-    gyro_slope: Array
-    gyro_valid: Array
 
 
 class _Peak(NamedTuple):
@@ -180,7 +149,7 @@ def estimate_clock(
     >>> found.status, round(found.offset_s, 2), abs(found.rate) < 1e-3
     ('estimated', 0.3, True)
     """
-    pair = _low_passed_pair(run, track_m)
+    pair = low_passed_pair(run, track_m)
     reference_s = float(run.streams["wheels"].time_s[0])
     if pair is None:
         return _no_estimate("not excited", reference_s)
@@ -232,82 +201,8 @@ def _no_estimate(status: str, reference_s: float, correlation: float = np.nan) -
     return ClockEstimate(np.nan, np.nan, np.nan, np.nan, np.nan, correlation, status, reference_s)
 
 
-def _low_passed_pair(run: RunLog, track_m: float) -> _Pair | None:
-    try:
-        wheels, imu = run.streams["wheels"], run.streams["imu"]
-        left_mps, right_mps = wheels.channel("speed_left_mps"), wheels.channel("speed_right_mps")
-        gyro_radps = imu.channel("gyro_z_radps")
-    except KeyError as error:
-        raise DataError(f"{run.run_id}: clocks cannot be compared without {error.args[0]}") from error
-    if any(len(stream) * MAX_GAP_SHARE * _period_s(stream) < stream.duration_s for stream in (wheels, imu)):
-        return None
-    slow_s = max(_period_s(wheels), _period_s(imu), MIN_SIGMA_S)
-    n_steps = int(np.ceil(slow_s / _period_s(wheels)))
-    wheels_s, wheels_radps, wheels_valid = _low_pass(
-        wheels.time_s, (right_mps - left_mps) / track_m, slow_s, n_steps
-    )
-    kept = np.flatnonzero(wheels_valid)[::n_steps]
-    n_steps = max(int(np.ceil(slow_s / _period_s(imu))), MIN_GYRO_STEPS)
-    gyro_s, gyro_radps, gyro_valid = _low_pass(imu.time_s, gyro_radps, slow_s, n_steps)
-    if kept.size < MIN_SAMPLES or gyro_valid.sum() < MIN_SAMPLES:
-        return None
-    return _Pair(
-        wheels_s[kept],
-        wheels_radps[kept],
-        slow_s,
-        float(gyro_s[0]),
-        slow_s / n_steps,
-        gyro_radps,
-        np.gradient(gyro_radps, slow_s / n_steps),
-        gyro_valid,
-    )
-
-
-def _period_s(stream: Stream) -> float:
-    return float(np.median(np.diff(stream.time_s)))
-
-
-def _low_pass(time_s: Array, values: Array, sigma_s: float, n_steps: int) -> tuple[Array, Array, Array]:
-    """Return an even grid of ``n_steps`` a sigma, the smooth values on it, and where samples support them."""
-    finite = np.isfinite(values)
-    step_s = sigma_s / n_steps
-    grid_s = np.arange(time_s[0], time_s[-1] + 1e-6 * step_s, step_s)
-    if finite.sum() < MIN_SAMPLES:
-        return grid_s, np.zeros(grid_s.size), np.zeros(grid_s.size, dtype=bool)
-    time_s, values = time_s[finite], values[finite]
-    after = np.clip(np.searchsorted(time_s, grid_s), 1, time_s.size - 1)
-    near = time_s[after] - time_s[after - 1] <= MAX_GAP_SAMPLES * sigma_s
-    inside = (grid_s >= time_s[0] - step_s) & (grid_s <= time_s[-1] + step_s)
-    supported = binary_erosion(near & inside, iterations=int(EDGE_SIGMAS * n_steps))
-    return grid_s, gaussian_filter1d(np.interp(grid_s, time_s, values), n_steps, mode="nearest"), supported
-
-
-def _imu_time_s(pair: _Pair, centre_s: float, shift_s: float, rate: float) -> Array:
-    return pair.time_s + shift_s + rate * (pair.time_s - centre_s)
-
-
-def _gyro_at(pair: _Pair, imu_s: Array, grid: Array) -> tuple[Array, Array]:
-    """Return what is on the grid of the gyro at some times of the IMU, and where there is anything."""
-    place = (imu_s - pair.gyro_start_s) / pair.gyro_step_s
-    before = np.clip(place.astype(np.intp), 0, grid.size - 2)
-    part = place - before
-    there = (part >= 0.0) & (part <= 1.0) & pair.gyro_valid[before] & pair.gyro_valid[before + 1]
-    return grid[before] * (1.0 - part) + grid[before + 1] * part, there
-
-
-def _correlation(pair: _Pair, imu_s: Array) -> float:
-    """Return the correlation of gyro and wheels, NaN where less than half of the run overlaps."""
-    gyro, there = _gyro_at(pair, imu_s, pair.gyro_radps)
-    if there.sum() < max(MIN_SAMPLES, 0.5 * there.size):
-        return np.nan
-    gyro = gyro[there] - np.mean(gyro[there])
-    wheels = pair.wheels_radps[there] - np.mean(pair.wheels_radps[there])
-    power = float(np.sqrt((gyro @ gyro) * (wheels @ wheels)))
-    return float(gyro @ wheels) / power if power > 0.0 else np.nan
-
-
 def _search(
-    pair: _Pair, centre_s: float, lever_s: float, max_offset_s: float, max_rate: float
+    pair: YawRatePair, centre_s: float, lever_s: float, max_offset_s: float, max_rate: float
 ) -> _Search | None:
     """Return the best correlations on a grid of shift and rate, None where nothing correlates."""
     every = -(-pair.time_s.size // MAX_SEARCH_SAMPLES)
@@ -322,7 +217,7 @@ def _search(
     for row, shift_s in enumerate(shifts_s):
         for column, rate in enumerate(rates):
             if abs(shift_s - rate * lever_s) <= max_offset_s * (1.0 + 1e-9):
-                found[row, column] = _correlation(pair, _imu_time_s(pair, centre_s, shift_s, rate))
+                found[row, column] = correlation_of(pair, imu_time_s(pair, centre_s, shift_s, rate))
     high = np.where(np.isnan(found), -1.0, found)
     row, column = (int(i) for i in np.unravel_index(np.argmax(high), high.shape))
     if high[row, column] <= 0.0:
@@ -340,7 +235,7 @@ def _search(
     return _Search(best, peak(np.where(tops, high, -1.0)), peak(np.where(np.isnan(found), -1.0, -found)))
 
 
-def _moved_s(pair: _Pair, centre_s: float, one: _Fit, other: _Fit) -> float:
+def _moved_s(pair: YawRatePair, centre_s: float, one: _Fit, other: _Fit) -> float:
     """Return the most that any sample moves between two fits."""
     reach_s = float(np.max(np.abs(pair.time_s - centre_s)))
     return abs(one.shift_s - other.shift_s) + abs(one.rate - other.rate) * reach_s
@@ -351,19 +246,19 @@ def _nearly_as_good(rival: _Fit, best: _Fit) -> bool:
     return rival_unexplained < (1.0 + RIVAL_MARGIN) * unexplained + RIVAL_FLOOR
 
 
-def _refine(pair: _Pair, centre_s: float, peak: _Peak, max_rate: float) -> _Fit:
+def _refine(pair: YawRatePair, centre_s: float, peak: _Peak, max_rate: float) -> _Fit:
     """Return the least-squares fit near a peak of the grid; without a rate when ``max_rate`` is 0."""
-    _, there = _gyro_at(pair, _imu_time_s(pair, centre_s, peak.shift_s, peak.rate), pair.gyro_radps)
+    _, there = gyro_at(pair, imu_time_s(pair, centre_s, peak.shift_s, peak.rate), pair.gyro_radps)
     wheels = pair.wheels_radps[there]
     from_centre_s = pair.time_s[there] - centre_s
     n_params = 4 if max_rate > 0.0 else 3
 
     def gyro_and_slope(params: Array) -> tuple[Array, Array]:
         rate = params[3] if n_params == 4 else 0.0
-        imu_s = _imu_time_s(pair, centre_s, params[0], rate)
+        imu_s = imu_time_s(pair, centre_s, params[0], rate)
         return (
-            _gyro_at(pair, imu_s, pair.gyro_radps)[0][there],
-            _gyro_at(pair, imu_s, pair.gyro_slope)[0][there],
+            gyro_at(pair, imu_s, pair.gyro_radps)[0][there],
+            gyro_at(pair, imu_s, pair.gyro_slope)[0][there],
         )
 
     def residual(params: Array) -> Array:

@@ -61,7 +61,8 @@ from terrain.estimation.filters.swerve_noise import adaptive_noise, thesis_noise
 from terrain.estimation.slip_figures import STEADY_SPEED_MPS
 from terrain.estimation.summary import summarize
 from terrain.kinematics.camera import body_motion, odometry_stream, to_camera
-from terrain.kinematics.swerve import admissible_scale, admissible_yaw_rate, wheel_velocities
+from terrain.kinematics.swerve import wheel_velocities
+from terrain.kinematics.swerve_limits import admissible_scale, admissible_yaw_rate
 from terrain.records import Array
 from terrain.robots import Robot, load_robot
 from terrain.slip import MIN_SPEED_MPS

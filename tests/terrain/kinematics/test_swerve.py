@@ -10,15 +10,13 @@ from terrain.errors import ConfigError
 from terrain.kinematics.swerve import (
     FAR_RAD,
     STANDING_MPS,
-    admissible_scale,
-    admissible_yaw_rate,
     forward,
     inverse,
-    scaled,
     wheel_command_step,
     wheel_commands,
     wheel_velocities,
 )
+from terrain.kinematics.swerve_limits import admissible_scale, admissible_yaw_rate, scaled
 from terrain.robots import load_robot
 
 ROBOT = load_robot("agrimaro")
