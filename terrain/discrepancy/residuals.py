@@ -255,7 +255,7 @@ def _evaluation_points(vector: Array, parameters: Sequence[str]) -> tuple[Array,
 
 
 @njit(cache=True)
-def _predictions(  # noqa: PLR0913 - a compiled kernel takes arrays, no records
+def _predictions(
     planar: Planar,
     points: Array,
     sensed: Array,
