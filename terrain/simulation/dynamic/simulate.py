@@ -28,7 +28,7 @@ from terrain.records import Array, Command, Label, RunLog, Sample, Stream
 from terrain.robots import Robot, as_swerve
 from terrain.simulation.conditions import NO_FAULTS, Conditions, Faults
 from terrain.simulation.dynamic.loop import Drive, in_loop
-from terrain.simulation.dynamic.plant import make_plant, record_width
+from terrain.simulation.dynamic.plant import Plant, make_plant, record_width
 from terrain.simulation.dynamic.profile import draw_profile
 from terrain.simulation.dynamic.states import start_state
 from terrain.simulation.dynamic.step import advance, settle
@@ -67,7 +67,7 @@ COMMAND_CHANNELS = (
 """The admitted twist of the body, and what it asks of the wheels."""
 
 
-def simulate(
+def simulate(  # noqa: PLR0913 - options of an entry, all by keyword and with defaults
     robot: Robot,
     scenario: Scenario,
     soils: Mapping[str, Soil],
@@ -122,11 +122,10 @@ def simulate(
         the same names throughout.
     """
     robot = as_swerve(robot, "robot {name}: drive {drive!r} is not simulated, only 'swerve' is")
-    conditions = conditions or Conditions()
     substeps, delay_steps = _substeps(robot, scenario), _delay_steps(command_delay_s)
     rngs = _generators(seed)
     built = _built(robot, effects or {})
-    plant = make_plant(built, conditions, draw_profile(built, scenario, soils, conditions, rngs["terrain"]))
+    plant = _plant(built, scenario, soils, conditions or Conditions(), rngs["terrain"])
     n_steps = len(scenario.time_s) * substeps
     state = start_state(plant, plant.backlash_rad * rngs["start"].uniform(-1.0, 1.0, 3))
     settle(plant, state)
@@ -143,10 +142,10 @@ def simulate(
         decided, status = in_loop(controller, delay_steps, scenario, substeps, drive, motion, sensors)
     _check_motion(motion, robot)
     motion.grow(n_steps)
-    streams = _streams(sensors, motion)
-    streams["commands"] = Stream(scenario.time_s, decided, COMMAND_CHANNELS)
+    streams = _streams(sensors) | {"commands": Stream(scenario.time_s, decided, COMMAND_CHANNELS)}
     if status:
         streams["control"] = Stream(scenario.time_s, np.column_stack(list(status.values())), tuple(status))
+    streams["truth"] = _truth(motion, sensors["imu"])
     return RunLog(run_id, robot.name, streams, _labels(motion, scenario), f"simulated, {scenario.name}")
 
 
@@ -193,16 +192,17 @@ def _sensors(
     return sensors
 
 
-def _streams(sensors: Mapping[str, Sensor], motion: Motion) -> dict[str, Stream]:
-    """Return the streams of sensors and truth; those without samples are left out."""
-    streams: dict[str, Stream] = {}
-    for name, sensor in sensors.items():
+def _streams(sensors: Mapping[str, Sensor]) -> dict[str, Stream]:
+    """Return the streams of the sensors; those without samples are left out."""
+    for sensor in sensors.values():
         sensor.update()
-        streams[name] = sensor.stream()
-    imu = sensors["imu"]
-    assert isinstance(imu, ImuSensor)
-    streams["truth"] = truth_stream(motion, imu.yaw_bias_radps, imu.time_s)
+    streams = {name: sensor.stream() for name, sensor in sensors.items()}
     return {name: stream for name, stream in streams.items() if len(stream) > 1}
+
+
+def _truth(motion: Motion, imu: Sensor) -> Stream:
+    assert isinstance(imu, ImuSensor)
+    return truth_stream(motion, imu.yaw_bias_radps, imu.time_s)
 
 
 def _built(robot: Robot, effects: Mapping[str, float]) -> Robot:
@@ -262,6 +262,16 @@ def _commands(robot: Robot, scenario: Scenario) -> tuple[Array, Array, Array]:
         scenario.twist,
         np.zeros(3),
     )
+
+
+def _plant(
+    robot: Robot,
+    scenario: Scenario,
+    soils: Mapping[str, Soil],
+    conditions: Conditions,
+    rng: np.random.Generator,
+) -> Plant:
+    return make_plant(robot, conditions, draw_profile(robot, scenario, soils, conditions, rng))
 
 
 def _labels(motion: Motion, scenario: Scenario) -> tuple[Label, ...]:

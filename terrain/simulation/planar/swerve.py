@@ -51,7 +51,7 @@ _PAYLOAD = INDEX["payload_ratio"]
 
 
 @njit(cache=True)
-def move_swerve(
+def move_swerve(  # noqa: PLR0913 - a kernel
     planar: Planar,
     p: Array,
     dt: float,

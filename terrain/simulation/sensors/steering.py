@@ -30,7 +30,7 @@ def encoder_angle(steer_rad: Array, zeros_rad: Array, noise_rad: Array | float, 
     angle = steer_rad + zeros_rad + noise_rad
     if step_rad > 0.0:
         angle = np.floor(angle / step_rad) * step_rad + step_rad / 2
-    return wrapped(angle)
+    return np.asarray(wrapped(angle))
 
 
 def described_zeros(steering: Steering) -> Array:

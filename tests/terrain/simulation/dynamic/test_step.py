@@ -232,7 +232,7 @@ def test_a_drive_with_everything_in_it_is_that_of_the_plain_form():
         backlash_rad=0.02,
         payload_kg=25.0,
         payload_m=(0.1, -0.08),
-        radius_factors=np.array([1.01, 0.99, 1.0]),
+        radius_factors=(1.01, 0.99, 1.0),
         grade_ratio=(0.04, -0.06),
         undulation_ratio=0.03,
         undulation_length_m=2.0,
