@@ -52,7 +52,7 @@ class Setup(NamedTuple):
     effects: Mapping[str, float]
 
 
-def simulate_run(  # noqa: PLR0913 - options of an entry, all by keyword and with defaults
+def simulate_run(
     robot: Robot,
     terrain: str,
     scenario: str,

@@ -67,7 +67,7 @@ COMMAND_CHANNELS = (
 """The admitted twist of the body, and what it asks of the wheels."""
 
 
-def simulate(  # noqa: PLR0913 - options of an entry, all by keyword and with defaults
+def simulate(
     robot: Robot,
     scenario: Scenario,
     soils: Mapping[str, Soil],

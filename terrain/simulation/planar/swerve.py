@@ -51,7 +51,7 @@ _PAYLOAD = INDEX["payload_ratio"]
 
 
 @njit(cache=True)
-def move_swerve(  # noqa: PLR0913 - a kernel
+def move_swerve(
     planar: Planar,
     p: Array,
     dt: float,
