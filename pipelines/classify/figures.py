@@ -212,16 +212,8 @@ def _draw_class(
 
 
 def _in_margin(axes: Axes, row: float, text: str, va: str) -> None:
-    axes.text(
-        1.07,
-        row,
-        text,
-        transform=axes.get_yaxis_transform(),
-        ha="right",
-        va=va,
-        fontsize=7.5,
-        color=FAINT_INK,
-    )
+    place = axes.get_yaxis_transform()
+    axes.text(1.07, row, text, transform=place, ha="right", va=va, fontsize=7.5, color=FAINT_INK)
 
 
 def learning_curve_figure(report: CrossvalReport, curve: LearningCurve) -> Figure:

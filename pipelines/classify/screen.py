@@ -74,12 +74,8 @@ def print_training(result: Training, console: Console) -> None:
     """Print where the model is, and whether it is the champion."""
     model = result.registered
     verdict = "champion" if model.alias_moved else "not champion"
-    print_lines(
-        console,
-        [
-            f"model {model.model_uri} from {result.n_windows} windows: {verdict} ({model.alias_reason})",
-        ],
-    )
+    line = f"model {model.model_uri} from {result.n_windows} windows: {verdict} ({model.alias_reason})"
+    print_lines(console, [line])
 
 
 def print_predictions(result: Predictions, console: Console) -> None:

@@ -1,11 +1,11 @@
-"""Commands of state estimation: estimate."""
+"""Commands of state estimation: estimate, calibrate."""
 
 from __future__ import annotations
 
 import typer
 
 from pipelines.cli.command import Json, command
-from pipelines.estimate.settings import EstimateSettings
+from pipelines.estimate.settings import CalibrateSettings, EstimateSettings
 from pipelines.runs.settings import RunsSettings, load
 
 app = typer.Typer()
@@ -23,4 +23,24 @@ def estimate_command(source: RunsSettings, settings: EstimateSettings, json_file
     with progress_bar() as progress:
         result = estimate(runs, settings, skipped, progress)
     print_estimates(result, output_console())
+    write_json(json_file, result)
+
+
+@command(app, "calibrate")
+def calibrate_command(source: RunsSettings, settings: CalibrateSettings, json_file: Json = None) -> None:
+    """Find zeros, ratio, biases, noise and time constants of a robot from its logs."""
+    from pipelines.estimate.calibrate import calibrate, print_calibration
+    from pipelines.reporting.json_file import write_json
+    from pipelines.reporting.terminal import output_console
+
+    result = calibrate(
+        source.data,
+        settings.robot,
+        settings.out,
+        hard=settings.hard,
+        layout=source.layout,
+        mapping=source.mapping,
+        repair=source.repair,
+    )
+    print_calibration(result, output_console())
     write_json(json_file, result)

@@ -46,13 +46,6 @@ Json = Annotated[
 FormatOption = Annotated[Format, typer.Option("--format", help="Layout of the folder.")]
 Mapping = Annotated[Path | None, typer.Option(help="YAML file that says how to read CSV files.")]
 Repair = Annotated[bool, typer.Option("--repair", help="Drop and count what a strict read refuses.")]
-Align = Annotated[
-    bool,
-    typer.Option("--align", help="Bring the wheel stream onto the IMU's clock where both see the turns."),
-]
-Jobs = Annotated[int, typer.Option(min=0, help="Processes at once; 0 for one a core.")]
-MAX_GRADE_DEG = 30.0
-
 
 GROUPS = (runs.app, estimate.app, classify.app, drive.app, explain.app, reproduce.app, quickstart.app)
 """Files of commands, in the order of help."""
@@ -92,36 +85,6 @@ def learn_slip_command(
     print_learned_slip({**result, "skipped": skipped}, _console())
     named = {key: value for key, value in result.items() if key != "tracking_run_id"}  # drawn by MLflow anew
     _write_json(json_file, {**named, "skipped": skipped})
-
-
-@app.command("calibrate")
-def calibrate_command(
-    data: Data,
-    robot: Annotated[str, typer.Option(help="Robot by name, or its YAML file, to start from.")],
-    out: Annotated[Path | None, typer.Option(help="New YAML file with what was found.")] = None,
-    hard: Annotated[
-        str | None,
-        typer.Option(help="Labels of hard ground, by commas; those that slip next to nothing by default."),
-    ] = None,
-    layout: FormatOption = Format.auto,
-    mapping: Mapping = None,
-    repair: Repair = False,
-    json_file: Json = None,
-) -> None:
-    """Find zeros, ratio, biases, noise and time constants of a robot from its logs."""
-    from pipelines.estimate.calibrate import calibrate, print_calibration
-
-    result = calibrate(
-        data,
-        robot,
-        out,
-        hard=None if hard is None else [name.strip() for name in hard.split(",")],
-        layout=layout.value,
-        mapping=mapping,
-        repair=repair,
-    )
-    print_calibration(result, _console())
-    _write_json(json_file, result)
 
 
 def _console() -> Any:

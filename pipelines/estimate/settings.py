@@ -1,4 +1,4 @@
-"""Settings of ``terrain estimate``."""
+"""Settings of ``terrain estimate`` and ``terrain calibrate``."""
 
 from __future__ import annotations
 
@@ -25,3 +25,15 @@ class EstimateSettings(Settings):
         None, "Runs, by commas, for the tuning 'likelihood'; the first three.", separated=True
     )
     figures: bool = setting(True, "Draw pictures into OUT/figures.")
+
+
+class CalibrateSettings(Settings):
+    """From which description a calibration starts, and what is written."""
+
+    robot: str = setting(..., "Robot by name, or its YAML file, to start from.")
+    out: Path | None = setting(None, "New YAML file with the estimated parameters.")
+    hard: tuple[str, ...] | None = setting(
+        None,
+        "Labels of hard ground, by commas; those that slip next to nothing by default.",
+        separated=True,
+    )
