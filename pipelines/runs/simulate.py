@@ -1,4 +1,4 @@
-"""``terrain simulate``: seeded run folders of a simulated robot, the truth beside what its sensors say."""
+"""``terrain simulate``: seeded run folders of a simulated robot, the truth beside the measurements."""
 
 from __future__ import annotations
 

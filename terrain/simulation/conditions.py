@@ -33,17 +33,17 @@ _RANGES: dict[str, tuple[float, float, str]] = {
 
 @dataclass(frozen=True, slots=True)
 class Conditions:
-    """Conditions of one run; the defaults are a level, nominal day.
+    """Conditions of one run; the defaults are level and nominal.
 
     Parameters
     ----------
     payload_kg, payload_m : load, and where it lies (x, y) from the empty robot's centre of mass, body axes
     grade_ratio : (2,) mean gradient of the ground along world x and y, uphill positive
-    undulation_ratio, undulation_length_m : a gradient along world x that comes and goes on the way; its wave
+    undulation_ratio, undulation_length_m : a gradient along world x that changes along the path; its wave
     length
     radius_factors : (3,) true rolling radius of each wheel over the nominal one
     roughness_factor : roughness over that of the soil's description
-    field_length_m : over which length the ground changes along the way
+    field_length_m : over which length the terrain changes along the path
     leg_backlash_rad : by how much the third leg swings to either side on its hinge (thesis, conclusions)
 
     Raises

@@ -31,7 +31,7 @@ from terrain.simulation.slip_sweep import learning_run
 from terrain.terramechanics.soil import Soil, load_soil, scattered, soil_names
 
 COURSE = "course"
-"""Word for a way over all terrains instead of the name of one."""
+"""A path over all terrains, in place of the name of one."""
 
 BENCH = "six_positions"
 """Word for the IMU alone on a bench, in place of a scenario."""

@@ -1,6 +1,6 @@
 """Drives in simulation that take the wheels through their slips, for learning the curve of a terrain.
 
-Each tells a part: *starts* at several accelerations, down to a step of the command in which the wheels spin
+Each covers a part: *starts* at several accelerations, down to a step of the command in which the wheels spin
 and the robot gathers speed through the whole curve; *climbs* over ground that rises and falls, slowly;
 *sweeps* in which one wheel of the long side turns ever faster than the robot drives and the others hold it
 back, which shows the curve on ground so hard that no start would, with no load moved and at leisure.
@@ -133,9 +133,9 @@ def scenario_of(drive: Drive, terrain: str) -> Scenario:
 class SlipSweep:
     """A controller that drives straight ahead and sends one wheel after the other through its slips.
 
-    The wheels in turn are those in line with the way: their pull against each other turns the robot little.
-    The command is ``w = v / (r (1 - s))`` with a slip s that rises to :data:`SWEEP_SLIP` and falls again; the
-    robot is held by its other wheels, so that the slip is nearly as commanded.
+    The wheels in turn are those in line with the direction of motion: their pull against each other turns the
+    robot little. The command is ``w = v / (r (1 - s))`` with a slip s that rises to :data:`SWEEP_SLIP` and
+    falls again; the robot is held by its other wheels, so that the slip is nearly as commanded.
     """
 
     def __init__(self, robot: Robot) -> None:

@@ -6,7 +6,7 @@ Locomotion, 1956; Wong, Theory of Ground Vehicles, chapter 2)::
     p(z) = (kc / b + kphi) z^n                          pressure at the depth z
     k = kc + b kphi                                     of one metre of a wheel's width: b p(z) = k z^n
     z0 = (3 N / ((3 - n) k sqrt(2 r)))^(2 / (2 n + 1))  sinkage of a rigid wheel
-    Rc = k z0^(n + 1) / (n + 1)                         work of pressing a rut of depth z0, a metre of way
+    Rc = k z0^(n + 1) / (n + 1)                         work of pressing a rut of depth z0, a metre travelled
 
 z0 takes the rim for a parabola and (z0 - x^2 / 2r)^n to first order in x^2: at that depth the soil carries N
 within 9 % for n up to 1.3, beside an error of the order of z0 / 4r.
@@ -73,7 +73,7 @@ def slip_sinkage_factor(slip_ratio: float, exponent: float) -> float:
 
 @njit(cache=True)
 def compaction_resistance(sinkage_m: float, modulus: float, exponent: float) -> float:
-    """Return the force in N that presses a rut of that depth: the work of p(z) b, a metre of way.
+    """Return the force in N that presses a rut of that depth: the work of p(z) b, a metre travelled.
 
     Parameters
     ----------

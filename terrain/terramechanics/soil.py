@@ -71,7 +71,7 @@ class Scatter(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Soil:
-    """One kind of ground; numbers that its law does not have, or that nobody gave, are NaN.
+    """One kind of ground; numbers that its law does not have, or that are not given, are NaN.
 
     Parameters
     ----------

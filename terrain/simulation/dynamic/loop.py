@@ -1,7 +1,7 @@
-"""The closed loop: a controller that hears what the sensors have written so far, and tells the wheels.
+"""The closed loop: a controller gets what the sensors have written so far, and commands the wheels.
 
 At instant ``t_k`` of the scenario the step that starts there has run with the command in force, so a sample
-stamped ``t_k`` of a sensor without latency is there; what the controller answers is in force from the step
+stamped ``t_k`` of a sensor without latency is there; the command of the controller is in force from the step
 that starts a delay later, one step at the least.
 """
 

@@ -51,7 +51,7 @@ MAX_WHEEL_SPEEDS = 100.0
 load of 1000 t on 90 kg."""
 
 MAX_COMMAND_DELAY_S = 0.5
-"""Longest way of a command to the wheels; what comes later is no control."""
+"""Longest delay of a command to the wheels; a later one is no control."""
 
 _PURPOSES = ("terrain", "road", "start", "wheels", "steering", "imu", "camera", "gnss")
 

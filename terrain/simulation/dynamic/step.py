@@ -64,7 +64,7 @@ from terrain.terramechanics import traction
 from terrain.terramechanics.traction import wheel_ground
 
 ROLLING_SPEED_MPS = 0.02
-"""Speed over which a resistance takes its full size: it opposes rolling and pushes nobody at rest."""
+"""Speed over which a resistance takes its full size: it opposes rolling and does not push a robot at rest."""
 
 LEG_RATE_RADPS = 0.5
 """How fast the third leg swings through its play; assumed, it crosses one degree in 35 ms."""
@@ -80,9 +80,9 @@ STIFFEST = -0.9
 def settle(plant: Plant, state: Array) -> None:
     """Let a robot that was put on a slope come to rest; ``state`` is changed in place.
 
-    Its wheels are told to stand; contacts and motors take up the load, which on the level changes nothing.
-    For four of five seconds the speeds are taken away ten times a second, so that it does not swing; where it
-    stands afterwards is the origin.  Ground too steep to stand on lets it slide.
+    Its wheels are commanded to stand; contacts and motors take up the load, which on the level changes
+    nothing. For four of five seconds the speeds are taken away ten times a second, so that it does not swing;
+    where it rests afterwards is the origin.  Terrain too steep to stand on lets it slide.
     """
     stand, record = np.zeros((1, 3)), np.empty((100, record_width(plant)))
     for tenth in range(50):
@@ -132,7 +132,7 @@ def advance(
         g_normal = GRAVITY_MPS2 / steepness
         row = record[k]
         force_x, force_y, moment, leg_nm = 0.0, 0.0, 0.0, 0.0
-        # speeds of the wheel centres, and which way the body goes
+        # speeds of the wheel centres, and the direction of motion
         for i in range(3):
             x_m, y_m = plant.wheels_m[i, 0] - plant.com_m[0], plant.wheels_m[i, 1] - plant.com_m[1]
             speeds[i, 0], speeds[i, 1] = point_velocity(

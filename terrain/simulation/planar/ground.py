@@ -1,4 +1,4 @@
-"""A soil as the planar simulation knows it: thrust curve, its end, growth with load, and resistances."""
+"""A soil in the planar simulation: thrust curve, its end, growth with load, and resistances."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from terrain.terramechanics.soil import Soil
 from terrain.terramechanics.traction import equilibrium_slip, ground_array, wheel_ground
 
 SCRUB_SHARE = 0.4
-"""Resistance to turning over the ground's grip; assumed: wheels of a side skid sideways on half their way."""
+"""Resistance to turning over the ground's grip; assumed: wheels of a side skid sideways over half the
+distance."""
 
 _SLIPS = np.linspace(0.0, 1.0, 101)
 

@@ -1,7 +1,8 @@
 """The planar simulation: from wheels, steering and tilt to motion, currents and what sensors show of them.
 
 One body for all wheeled robots, fed either with what a simulated drive does to the wheels or with what a log
-says they did; whatever is wrong about it is a parameter of :mod:`terrain.effects.catalogue`, 0 where absent.
+records of them; whatever is wrong about it is a parameter of :mod:`terrain.effects.catalogue`, 0 where
+absent.
 
 - **kinematics** without slip: of a swerve robot the least-squares twist of its wheels' velocities, of a
   skid-steer robot ``u = (v_r + v_l)/2``, ``w = (v_r - v_l)/B``;
@@ -60,7 +61,7 @@ IMU_LAG_S = 0.003
 
 
 class Ground(NamedTuple):
-    """A ground as the planar simulation knows it.
+    """A terrain in the planar simulation.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""From what a log says of wheels, steering and tilt to what its other sensors should show.
+"""From logged wheels, steering and tilt to what the other sensors of the log should show.
 
 Lags, clocks and offsets that stand between the inputs and their records are undone first; from there on a
 replay is the motion and the sensors of a simulated run.
@@ -33,7 +33,7 @@ def replay(
     grade_rad: Array,
     roll_rad: Array,
 ) -> Array:
-    """Return the channels (n, len(CHANNELS)) that follow from what a log says of wheels, steering and tilt.
+    """Return the channels (n, len(CHANNELS)) that follow from logged wheels, steering and tilt.
 
     Parameters
     ----------

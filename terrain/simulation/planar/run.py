@@ -81,7 +81,7 @@ def simulate_planar(
     Parameters
     ----------
     robot : with body, motors, camera and sensors; a swerve robot with steering
-    twist : (n, 3) wanted ``(speed_x_mps, speed_y_mps, yaw_rate_radps)`` at 50 Hz, from rest
+    twist : (n, 3) desired ``(speed_x_mps, speed_y_mps, yaw_rate_radps)`` at 50 Hz, from rest
     seed : of everything that is drawn; the same gives the same bytes, and a sequence is left as it is
     ground : a firm one by default
     effects : parameters of :mod:`terrain.effects.catalogue`, beside or in place of the description's own
@@ -89,7 +89,7 @@ def simulate_planar(
     hills : level by default
     noise : of ground and sensors; by default there is none, and encoders do not quantise
     outside : amplitudes of :data:`OUTSIDE`
-    heading : add the stream lidar, with the rate of a heading that no gyro has told
+    heading : add the stream lidar, with the rate of a heading that does not depend on the gyro
     run_id, terrain : of the run; without a terrain it has no label
     step_s : from step to step; a half, a third... of it changes little
 

@@ -20,13 +20,14 @@ from terrain.simulation.planar.model import AMPS, FORCE, SLIP, TURNING_AMPS, VX,
 from terrain.simulation.planar.signals import delayed, slopes
 
 STANDSTILL_MPS = 0.05
-"""Speed over which a resistance takes its full size: it opposes motion and pushes nobody at rest."""
+"""Speed over which a resistance takes its full size: it opposes motion and does not push a robot at rest."""
 
 ENDO_POWER = 0.5
 """Exponent n of the turning slip; assumed, Endo et al. fitted one to each ground."""
 
 MAX_SLIP = 0.9
-"""Slip that forces take at the most, either way; assumed: a straight thrust curve has no end of its own."""
+"""Slip that forces take at the most, of either sign; assumed: a straight thrust curve has no end of its
+own."""
 
 _RADIUS = INDEX["wheel_radius_ratio"]
 _ONE_SIDED = INDEX["one_sided_radius_ratio"]
@@ -44,7 +45,7 @@ _SCRUB = INDEX["scrub_ratio"]
 
 @njit(cache=True)
 def direction(speed_mps: float) -> float:
-    """Return which way something moves, -1 to 1, and 0 at rest.
+    """Return the direction of a motion, -1 to 1, and 0 at rest.
 
     Examples
     --------

@@ -29,7 +29,7 @@ from terrain.simulation.planar.signals import delayed, play, slopes
 
 ROLLING_MPS = 0.02
 """Speed over which a resistance takes its full size, as in the dynamic simulation: it opposes motion and
-pushes nobody at rest."""
+does not push a robot at rest."""
 
 STIFFEST, STIFFEST_GROUND = 0.1, 1e-6
 """Slip per traction that an effect leaves of the ground's own at the least, and that of the stiffest."""

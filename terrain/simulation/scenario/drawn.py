@@ -29,7 +29,7 @@ PATCH_M = (6.0, 12.0)
 """Length of a terrain patch of ``course``."""
 
 SLIP_MARGIN = 1.25
-"""A slipping robot gets less far than it is told: ``course`` drives this much further than its patches are
+"""A slipping robot gets less far than commanded: ``course`` drives this much further than its patches are
 long, so that with 20 % of slip the last one is crossed as well."""
 
 

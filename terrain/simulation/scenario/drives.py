@@ -31,7 +31,7 @@ CIRCLE_M = 1.5
 """Radius of ``circle``."""
 
 CIRCLE_MPS = 0.5
-"""Speed of ``circle``, unless a lower one is asked for."""
+"""Speed of ``circle``, unless a lower one is given."""
 
 BRAKE_S = 4.0
 """Of ``brake``: how long the speed is held before the stop, and the rest after it."""
@@ -136,7 +136,7 @@ _ON_THE_SPOT: tuple[tuple[float, float, float, float], ...] = (
 )
 
 _CRAB: tuple[tuple[float, float, float, float], ...] = (
-    # as above; the steering stands through each reversal and turns at the start after each rest
+    # as above; the steering does not move through each reversal and turns at the start after each rest
     (-0.6, 0.0, 0.0, 3.0),
     (0.6, 0.0, 0.0, 3.0),
     (0.0, 0.0, 0.0, 1.0),

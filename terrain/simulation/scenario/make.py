@@ -27,7 +27,7 @@ _STEERED = ("crab", "course")
 """Those that only steered wheels drive, or only the simulation of a robot that has them."""
 
 SCENARIOS: tuple[str, ...] = (*DRIVES, "course")
-"""Names that :func:`make_scenario` knows."""
+"""Names that :func:`make_scenario` accepts."""
 
 
 def make_scenario(
@@ -41,18 +41,16 @@ def make_scenario(
 ) -> Scenario:
     """Return a scenario by name; all start at rest, all but ``straight``, ``climb`` and ``course`` end there.
 
-    ============= ===================================================================================
-    stand         standing still, for calibration
-    straight      1 s of rest, 1 m/s^2 up to the speed, held to the end
-    climb         the same for 15 s, for a slope
-    brake         1 s of rest, 1 m/s^2 up to the speed, held for 4 s, and told to stand at once; 4 s of rest
-    circle        a full turn and more to the left on a radius of 1.5 m, at 0.5 m/s at most
-    crab          backward, forward, to both sides and along both diagonals, each way and back again; smooth
-    arc           the same with 0.3 rad/s, and down to rest
-    starts        from rest at 1 m/s^2 to the speed, 3 s, and down at 1 m/s^2, again and again
-    spot_turn     in place to the left, to the right, at 0.6 rad/s, several times
-    complex       forward, curves to both sides, backward with curves, sideways, diagonally; smooth
-    survey        labelled runs: stretches of 4 to 6 s, straight and in gentle arcs, now and then a stop, a
+    ============= =================================================================================== stand
+    standing still, for calibration straight      1 s of rest, 1 m/s^2 up to the speed, held to the end climb
+    the same for 15 s, for a slope brake         1 s of rest, 1 m/s^2 up to the speed, held for 4 s, and a
+    command to stop at once; 4 s of rest circle        a full turn and more to the left on a radius of 1.5 m,
+    at 0.5 m/s at most crab          backward, forward, to both sides and along both diagonals, forth and back
+    each; smooth arc           the same with 0.3 rad/s, and down to rest starts        from rest at 1 m/s^2 to
+    the speed, 3 s, and down at 1 m/s^2, again and again spot_turn     in place to the left, to the right, at
+    0.6 rad/s, several times complex       forward, curves to both sides, backward with curves, sideways,
+    diagonally; smooth survey        labelled runs: stretches of 4 to 6 s, straight and in gentle arcs, now
+    and then a stop, a
                   stretch backward or a turn on the spot; drawn
     course        over patches of 6 to 12 m of every terrain in turn, in drawn request, at changing speed
     ============= ===================================================================================

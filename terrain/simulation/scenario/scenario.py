@@ -30,7 +30,7 @@ class Scenario:
     name : of the drive
     rate_hz : of the twists
     time_s : (n,) from 0 to the duration, both included, at that rate
-    twist : (n, 3) wanted ``(speed_x_mps, speed_y_mps, yaw_rate_radps)``, no wheel beyond the robot's limit
+    twist : (n, 3) desired ``(speed_x_mps, speed_y_mps, yaw_rate_radps)``, no wheel beyond the robot's limit
     patches : terrains in order; the first starts at 0, the last has no end
     """
 

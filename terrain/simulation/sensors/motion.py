@@ -107,6 +107,6 @@ class Motion:
         return self.record[:, N_BODY_RECORD + WHEEL_RECORD.index(name) :: len(WHEEL_RECORD)][:, :3]
 
     def at(self, rate_hz: float, latency_s: float = 0.0) -> tuple[Array, Array]:
-        """Stamps (k,) of a sensor of that rate, and the rows (k,) it tells of."""
+        """Stamps (k,) of a sensor of that rate, and the rows (k,) it measures."""
         time_s = np.arange(math.floor(len(self.record) * STEP_S * rate_hz + 1e-6)) / rate_hz
         return time_s, np.maximum(np.round((time_s - latency_s) / STEP_S).astype(int), 0)
