@@ -39,8 +39,7 @@ from terrain.simulation.run import simulate_run
 from terrain.simulation.sensors.gnss import Gnss
 
 ROBOT = load_robot("agrimaro")
-ODD = replace(
-    ROBOT,
+ODD = ROBOT.with_parts(
     sensors=replace(
         ROBOT.sensors,
         gyro_bias_z_radps=0.01,
