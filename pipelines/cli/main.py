@@ -109,7 +109,9 @@ def calibrate_command(
     json_file: Json = None,
 ) -> None:
     """Find zeros, ratio, biases, noise and time constants of a robot from its logs."""
-    from pipelines.estimate.calibrate import calibrate, print_calibration
+    from pipelines.estimate.calibrate import calibrate
+    from pipelines.estimate.calibration_screen import print_calibration
+    from pipelines.reporting.json_file import write_json
 
     result = calibrate(
         data,
@@ -121,7 +123,7 @@ def calibrate_command(
         repair=repair,
     )
     print_calibration(result, _console())
-    _write_json(json_file, result)
+    write_json(json_file, result)
 
 
 def _console() -> Any:
