@@ -6,10 +6,11 @@ import copy
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import yaml
 
+from pipelines.estimate.calibration_results import CalibrationResult, FindingRow
 from pipelines.runs.datasets import load_runs
 from terrain.calibration.finding import Finding
 from terrain.calibration.lag import starts_and_stops, time_constants
@@ -24,9 +25,6 @@ from terrain.records import RunLog
 from terrain.robots import Robot, SwerveRobot, read_description, robot_from
 from terrain.terramechanics.soil import load_soil, soil_names
 
-if TYPE_CHECKING:
-    from rich.console import Console
-
 MAX_NAMED_RUNS = 4
 """A source names that many runs, and counts more."""
 
@@ -40,7 +38,7 @@ def calibrate(
     layout: str = "auto",
     mapping: str | Path | None = None,
     repair: bool = False,
-) -> dict[str, Any]:
+) -> CalibrationResult:
     """Calibrate a robot's description from its runs, and write it.
 
     Parameters
@@ -52,11 +50,7 @@ def calibrate(
 
     Returns
     -------
-    dict that JSON can hold
-        ``robot``, ``out``, ``hard``, ``run_ids``; ``findings``, for each number ``parameter``, ``unit``,
-        ``described`` (before), ``value``, ``low``, ``high`` (95 %), ``n``, ``counted``, ``runs``, ``note``
-        (what is assumed, or why there is no value); ``measurement_variances`` of the calibrated robot by
-        the filters' rows
+    CalibrationResult
 
     Raises
     ------
@@ -94,14 +88,14 @@ def calibrate(
         raise DataError(f"{data}: nothing of robot {robot.name} can be calibrated from this: {reasons}")
     name = file if out is None else out.name
     calibrated = described_with(described, findings)
-    result = {
-        "robot": robot.name,
-        "out": None if out is None else str(out),
-        "hard": list(grounds),
-        "run_ids": [run.run_id for run in runs],
-        "findings": [_finding_dict(finding, described) for finding in findings],
-        "measurement_variances": measurement_variances(robot_from(name, calibrated)),
-    }
+    result = CalibrationResult(
+        robot=robot.name,
+        out=None if out is None else str(out),
+        hard=grounds,
+        run_ids=tuple(run.run_id for run in runs),
+        findings=tuple(_row(finding, described) for finding in findings),
+        measurement_variances=measurement_variances(robot_from(name, calibrated)),
+    )
     if out is not None:
         head = f"# Calibrated from {len(runs)} runs; what they could not tell is as it was in {file}.\n"
         atomic_write(out, head + _yaml_text(calibrated))
@@ -164,35 +158,6 @@ def described_with(described: Any, findings: Sequence[Finding]) -> Any:
     return found
 
 
-def print_calibration(result: dict[str, Any], console: Console) -> None:
-    """Print what :func:`calibrate` returns: what was found, then what was not and why."""
-    from rich.table import Table
-
-    told = [finding for finding in result["findings"] if finding["value"] is not None]
-    table = Table(title=f"{result['robot']}: {len(told)} numbers from {len(result['run_ids'])} runs")
-    for heading, right in (("number", False), ("was", True), ("is", True), ("95 % from", True), ("to", True)):
-        table.add_column(heading, justify="right" if right else "left")
-    table.add_column("of")
-    for finding in told:
-        figures = (finding["described"], finding["value"], finding["low"], finding["high"])
-        runs = len(finding["runs"])
-        table.add_row(
-            finding["parameter"],
-            *("" if figure is None else f"{figure:.4g}" for figure in figures),
-            f"{finding['n']} {finding['counted']}, {runs} run{'s' * (runs > 1)}",
-        )
-    console.print(table)
-    for title, chosen in (("not told", False), ("assumed", True)):
-        notes: dict[str, list[str]] = {}
-        for finding in result["findings"]:
-            if finding["note"] and (finding["value"] is not None) == chosen:
-                notes.setdefault(finding["note"], []).append(finding["parameter"])
-        for note, parameters in notes.items():
-            console.print(f"{title}: {', '.join(parameters)}: {note}", highlight=False)
-    if result["out"] is not None:
-        console.print(f"written to {result['out']}", highlight=False)
-
-
 def _new_file(out: Path) -> Path:
     if out.suffix not in (".yaml", ".yml"):
         raise ConfigError(f"{out}: a robot's description is a .yaml file")
@@ -202,20 +167,25 @@ def _new_file(out: Path) -> Path:
     return out
 
 
-def _finding_dict(finding: Finding, described: Any) -> dict[str, Any]:
+def _row(finding: Finding, described: Any) -> FindingRow:
     section, _, name = finding.parameter.partition(".")
     entry = described.get(section, {}).get(name)
-    numbers = {key: getattr(finding, key) for key in ("value", "low", "high")}
-    return {
-        "parameter": finding.parameter,
-        "unit": entry["unit"] if entry else "s",
-        "described": float(entry["value"]) if entry else None,
-        **{key: float(number) if math.isfinite(number) else None for key, number in numbers.items()},
-        "n": finding.n,
-        "counted": finding.counted,
-        "runs": list(finding.runs),
-        "note": finding.note,
-    }
+    value, low, high = (
+        float(number) if math.isfinite(number) else None
+        for number in (finding.value, finding.low, finding.high)
+    )
+    return FindingRow(
+        finding.parameter,
+        entry["unit"] if entry else "s",
+        float(entry["value"]) if entry else None,
+        value,
+        low,
+        high,
+        finding.n,
+        finding.counted,
+        tuple(finding.runs),
+        finding.note,
+    )
 
 
 def _yaml_text(described: Any) -> str:

@@ -37,6 +37,12 @@ ALIASES_OF_VALUES: dict[str, str] = {
     "oracle+track": "true_terrain+track",
     "told:grass": "known:grass",
     "told:clay": "known:clay",
+    "What it follows": "What it depends on",
+    "Gain, on runs that had no say in it": "Gain on held-out runs",
+    "What would not have been seen": "What would not have been detected",
+    "Not told apart": "Not distinguished",
+    "Without a name": "Unexplained",
+    "The paper's figure beside ours": "The paper's figure beside the simulation's",
     "steering_play": "steering_backlash",
     "steering_play_rad": "steering_backlash_rad",
 }

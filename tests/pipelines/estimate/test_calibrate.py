@@ -7,7 +7,9 @@ import pytest
 import yaml
 from rich.console import Console
 
-from pipelines.estimate.calibrate import calibrate, print_calibration
+from pipelines.estimate.calibrate import calibrate
+from pipelines.estimate.calibration_screen import print_calibration
+from pipelines.reporting.json_file import as_json
 from terrain.errors import ConfigError, DataError
 from terrain.estimation.measurements.batch import measurement_table
 from terrain.logs.write import write_run
@@ -70,19 +72,19 @@ def data(tmp_path):
 
 def test_the_hidden_truth_lies_in_the_intervals(calibrated):
     _, _, result = calibrated
-    told = [finding for finding in result["findings"] if finding["value"] is not None]
+    told = [finding for finding in result.findings if finding.value is not None]
     inside = []
     for finding in told:
-        section, _, name = finding["parameter"].partition(".")
+        section, _, name = finding.parameter.partition(".")
         if name:
             true = getattr(getattr(HIDDEN, section), name)
-            inside.append(finding["low"] <= true <= finding["high"])
-            assert finding["low"] <= finding["value"] <= finding["high"]
-            assert finding["n"] > 0
-            assert finding["runs"]
+            inside.append(finding.low <= true <= finding.high)
+            assert finding.low <= finding.value <= finding.high
+            assert finding.n > 0
+            assert finding.runs
     assert len(inside) == 24
     assert np.mean(inside) >= 0.9
-    assert json.loads(json.dumps(result, allow_nan=False)) == result
+    assert json.loads(json.dumps(as_json(result), allow_nan=False)) == as_json(result)
 
 
 def test_the_file_is_a_description_that_people_can_read(calibrated):
@@ -92,7 +94,7 @@ def test_the_file_is_a_description_that_people_can_read(calibrated):
     described, before = yaml.safe_load(text), yaml.safe_load(_source_of_agrimaro())
     assert robot.name == "agrimaro"
     assert text.startswith("# Calibrated from 8 runs;")
-    told = {finding["parameter"]: finding for finding in result["findings"] if finding["value"] is not None}
+    told = {finding.parameter: finding for finding in result.findings if finding.value is not None}
     for section, entries in described.items():
         if not isinstance(entries, dict) or "value" in entries:
             assert entries == before[section]
@@ -103,10 +105,10 @@ def test_the_file_is_a_description_that_people_can_read(calibrated):
             if finding is None:
                 assert entry == before[section][name]
                 continue
-            assert entry["source"].startswith(f"terrain calibrate, {len(finding['runs'])} run")
-            width = finding["high"] - finding["low"]
-            assert entry["value"] == pytest.approx(finding["value"], abs=0.01 * width)
-            assert entry["interval"] == pytest.approx([finding["low"], finding["high"]], abs=0.01 * width)
+            assert entry["source"].startswith(f"terrain calibrate, {len(finding.runs)} run")
+            width = finding.high - finding.low
+            assert entry["value"] == pytest.approx(finding.value, abs=0.01 * width)
+            assert entry["interval"] == pytest.approx([finding.low, finding.high], abs=0.01 * width)
     assert described["sensors"]["accel_scale_x_ratio"]["source"] == "terrain calibrate, 1 run: bench"
     assert described["sensors"]["motor_std_radps"] == before["sensors"]["motor_std_radps"]  # a Hall sensor
 
@@ -140,10 +142,10 @@ def test_what_filters_are_given_is_right_afterwards(calibrated):
 def test_a_calibrated_file_can_be_calibrated_again(calibrated, tmp_path):
     runs, out, first = calibrated
     second = calibrate(runs, str(out), tmp_path / "again.yaml")
-    for one, other in zip(first["findings"], second["findings"], strict=True):
-        if one["value"] is not None:
-            half = (one["high"] - one["low"]) / 2
-            assert other["value"] == pytest.approx(one["value"], abs=half)
+    for one, other in zip(first.findings, second.findings, strict=True):
+        if one.value is not None:
+            half = (one.high - one.low) / 2
+            assert other.value == pytest.approx(one.value, abs=half)
 
 
 def test_what_is_printed(calibrated):
@@ -159,12 +161,12 @@ def test_what_is_printed(calibrated):
 
 def test_standing_alone_tells_what_it_can(data):
     result = calibrate(data(driven("stand", 1)), "agrimaro")
-    found = {finding["parameter"]: finding for finding in result["findings"]}
-    assert result["out"] is None
-    assert found["sensors.gyro_bias_z_radps"]["value"] is not None
-    assert "like a tilt" in found["sensors.accel_bias_x_mps2"]["note"]
-    assert "never move" in found["steering.zero_1_rad"]["note"]
-    assert "never move" in found["camera.time_constant_s"]["note"]
+    found = {finding.parameter: finding for finding in result.findings}
+    assert result.out is None
+    assert found["sensors.gyro_bias_z_radps"].value is not None
+    assert "like a tilt" in found["sensors.accel_bias_x_mps2"].note
+    assert "never move" in found["steering.zero_1_rad"].note
+    assert "never move" in found["camera.time_constant_s"].note
 
 
 def test_runs_that_tell_nothing(data, tmp_path):
@@ -182,9 +184,9 @@ def test_a_log_without_a_camera(data):
     blind = {name: stream for name, stream in run.streams.items() if name != "odometry"}
     still = {name: stream for name, stream in stand.streams.items() if name != "odometry"}
     folder = data(RunLog("a", run.robot, blind, run.labels), RunLog("b", run.robot, still, stand.labels))
-    found = {finding["parameter"]: finding for finding in calibrate(folder, "agrimaro")["findings"]}
+    found = {finding.parameter: finding for finding in calibrate(folder, "agrimaro").findings}
     for parameter in ("steering.zero_2_rad", "motors.reduction_ratio", "camera.time_constant_s"):
-        assert found[parameter]["note"] == "no run has a camera (stream 'odometry')"
+        assert found[parameter].note == "no run has a camera (stream 'odometry')"
 
 
 def test_what_is_refused(data, tmp_path):
