@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from enum import StrEnum
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -320,6 +321,14 @@ class Windows:
         )
 
 
+class TargetStatus(StrEnum):
+    """Origin of a target slip: assumed, learned from runs, or learned and contradictory."""
+
+    UNESTIMATED = "unestimated"
+    ESTIMATED = "estimated"
+    INVALID = "invalid"
+
+
 class SlipTarget(NamedTuple):
     """Slip ratio to aim for on a terrain in a drive state.
 
@@ -332,5 +341,5 @@ class SlipTarget(NamedTuple):
     slip_ratio: float
     slip_std: float
     n_runs: int
-    status: str
+    status: TargetStatus
     source: str

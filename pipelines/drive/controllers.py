@@ -14,7 +14,7 @@ from pipelines.reporting.progress import Progress, silent
 from terrain.control.situations import Situation
 from terrain.control.slip_table import SlipTable
 from terrain.errors import ConfigError
-from terrain.records import RunLog, SlipTarget
+from terrain.records import RunLog, SlipTarget, TargetStatus
 from terrain.robots import Robot
 from terrain.simulation.dynamic.simulate import simulate
 
@@ -119,7 +119,8 @@ def _single_target(table: SlipTable, name: str, slip: str) -> SlipTable:
     if not 0.0 <= ratio < 1.0:
         raise ConfigError(f"controller {name!r}: a slip from 0 to below 1 is required")
     entry = dict(table.targets[table.fallback])
-    entry["traction"] = SlipTarget(table.fallback, "traction", ratio, math.nan, 0, "unestimated", "given")
+    assumed = TargetStatus.UNESTIMATED
+    entry["traction"] = SlipTarget(table.fallback, "traction", ratio, math.nan, 0, assumed, "given")
     return replace(table, targets={table.fallback: entry}, curves={}, reasons={})
 
 

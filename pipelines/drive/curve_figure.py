@@ -23,7 +23,7 @@ from pipelines.reporting.drawing import (
 from pipelines.reporting.numbers import shorten
 from terrain.control.slip_table import SlipTable
 from terrain.records import Array
-from terrain.slip_learning.slip_curve import LAW_PARAMETERS, traction_ratio
+from terrain.slip_learning.laws import LAW_PARAMETERS, traction_ratio
 
 COLUMNS = 3
 

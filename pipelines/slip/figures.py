@@ -1,10 +1,9 @@
-"""Pictures of learned slip curves: what runs showed, the law through it, its peak and the targets."""
+"""Figures of learned slip curves: bins of the runs, the fitted law, its peak and the targets."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -12,27 +11,24 @@ from matplotlib.figure import Figure
 
 from pipelines.reporting.drawing import (
     BLUE,
-    CLASS_COLOURS,
     FAINT_INK,
+    GREEN,
     INK,
+    LARGEST_THRUST_RATIO,
+    LAW_NAMES,
     VERMILION,
     finished,
     new_figure,
-    shorten,
     styled,
 )
-from terrain.slip_learning.slip_curve import traction_ratio
+from pipelines.reporting.numbers import shorten
+from terrain.slip_learning.learn import LearnedTerrain
+from terrain.slip_learning.peak import PeakStatus
 
-if TYPE_CHECKING:
-    from pipelines.slip.learn_slip import Learned
-
-LAW_NAMES = {"janosi": "Janosi and Hanamoto", "magic": "Magic Formula"}
-GREEN = CLASS_COLOURS[2]
 SHEET_COLUMNS = 2
-LARGEST_RATIO = 1.3
 
 
-def curve_figures(learned: Sequence[Learned], robot: str) -> dict[str, Figure]:
+def curve_figures(learned: Sequence[LearnedTerrain], robot: str) -> dict[str, Figure]:
     """Return a figure a terrain, by its name, and ``all_terrains`` with all of them on a sheet."""
     figures = {entry.terrain: curve_figure(entry, robot) for entry in learned}
     if learned:
@@ -40,7 +36,7 @@ def curve_figures(learned: Sequence[Learned], robot: str) -> dict[str, Figure]:
     return figures
 
 
-def curve_figure(entry: Learned, robot: str) -> Figure:
+def curve_figure(entry: LearnedTerrain, robot: str) -> Figure:
     """Draw one terrain: bins of each run, the law with its 90 % band, peak, resistance and targets."""
     with styled():
         figure = new_figure(8.4, 4.8)
@@ -52,7 +48,7 @@ def curve_figure(entry: Learned, robot: str) -> Figure:
         return finished(figure, f"{shorten(entry.terrain, 40)}, {robot}: {_headline(entry)}")
 
 
-def sheet(learned: Sequence[Learned], robot: str) -> Figure:
+def sheet(learned: Sequence[LearnedTerrain], robot: str) -> Figure:
     """Draw all terrains beside each other, with the same slip axis."""
     n_rows = math.ceil(len(learned) / SHEET_COLUMNS)
     with styled():
@@ -79,10 +75,10 @@ def sheet(learned: Sequence[Learned], robot: str) -> Figure:
         return finished(figure, f"slip curves of {robot}")
 
 
-def draw_curve(axes: Axes, entry: Learned) -> None:
-    """Draw what runs showed on one terrain, and what was learned of it."""
-    for number, part in enumerate(entry.parts):
-        bins = part.bins
+def draw_curve(axes: Axes, entry: LearnedTerrain) -> None:
+    """Draw bins of the runs on one terrain, and its curve."""
+    for number, run in enumerate(entry.runs):
+        bins = run.bins
         axes.errorbar(
             bins.slip_ratio,
             bins.traction_ratio,
@@ -95,34 +91,32 @@ def draw_curve(axes: Axes, entry: Learned) -> None:
             alpha=0.55,
             label=None if number else "bins of each run, ± 1 std",
         )
-    shown = [value for part in entry.parts for value in part.bins.traction_ratio]
+    shown = [value for run in entry.runs for value in run.bins.traction_ratio]
     if entry.curve is not None:
         _draw_law(axes, entry)
-        shown += [entry.curve.resistance_ratio, float(entry.curve.band[:, 2].max())]
-    low, high = min([0.0, *shown]), min(max([0.1, *shown]), LARGEST_RATIO)
+        shown += [entry.curve.resistance_ratio, float(entry.curve.band.high_ratio.max())]
+    low, high = min([0.0, *shown]), min(max([0.1, *shown]), LARGEST_THRUST_RATIO)
     axes.set_ylim(low - 0.08 * (high - low), high + 0.12 * (high - low))
     axes.set_xlim(-0.03, 1.0)
     axes.grid()
 
 
-def _draw_law(axes: Axes, entry: Learned) -> None:
+def _draw_law(axes: Axes, entry: LearnedTerrain) -> None:
     curve = entry.curve
     assert curve is not None
-    slips = curve.band[:, 0]
-    axes.fill_between(
-        slips, curve.band[:, 1], curve.band[:, 2], color=BLUE, alpha=0.2, lw=0, label="90 % over runs"
-    )
+    slips, low, high = curve.band
+    axes.fill_between(slips, low, high, color=BLUE, alpha=0.2, lw=0, label="90 % over runs")
     axes.plot(
         slips,
-        traction_ratio(curve.law, curve.parameters, slips),
+        curve.thrust_ratio(slips),
         color=BLUE,
         lw=1.6,
-        label="law, in the slips seen",
+        label="law, within the observed slips",
     )
     beyond = np.linspace(curve.slip_range[1], 1.0, 50)
     axes.plot(
         beyond,
-        traction_ratio(curve.law, curve.parameters, beyond),
+        curve.thrust_ratio(beyond),
         color=BLUE,
         lw=0.9,
         ls=":",
@@ -133,18 +127,18 @@ def _draw_law(axes: Axes, entry: Learned) -> None:
     peak = curve.peak.slip_ratio
     axes.plot(
         [peak],
-        traction_ratio(curve.law, curve.parameters, np.array([peak])),
+        curve.thrust_ratio(np.array([peak])),
         "^",
         color=VERMILION,
         ms=7,
-        label="peak of the net pull, or 95 % of it",
+        label="peak of net traction, or 95 % of it",
     )
     if entry.targets is not None:
         for state, marker in (("traction", "D"), ("steady", "s")):
-            slip = getattr(entry.targets, state).slip_ratio
+            slip = entry.targets.of(state).slip_ratio
             axes.plot(
                 [slip],
-                traction_ratio(curve.law, curve.parameters, np.array([slip])),
+                curve.thrust_ratio(np.array([slip])),
                 marker,
                 color=GREEN,
                 ms=5.5,
@@ -152,14 +146,14 @@ def _draw_law(axes: Axes, entry: Learned) -> None:
             )
 
 
-def _headline(entry: Learned) -> str:
+def _headline(entry: LearnedTerrain) -> str:
     if entry.curve is None:
         return f"{entry.status}, {entry.reason}"
     curve = entry.curve
     low, high = curve.peak_interval
-    words = "peak" if curve.peak.status == "peak" else "no peak, 95 %"
+    kind = "peak" if curve.peak.status is PeakStatus.PEAK else "no peak, 95 %"
     tail = f", {entry.reason}" if entry.reason else ""
     return (
-        f"{LAW_NAMES[curve.law]}, {words} at {curve.peak.slip_ratio:.3f} ({low:.3f} to {high:.3f}), "
+        f"{LAW_NAMES[curve.law]}, {kind} at {curve.peak.slip_ratio:.3f} ({low:.3f} to {high:.3f}), "
         f"{curve.n_runs} runs{tail}"
     )

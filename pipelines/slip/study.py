@@ -1,16 +1,17 @@
-"""How often the interval of a learned peak holds the true one, and how near it is: many simulated terrains.
+"""Coverage of the interval of a learned peak and error of the peak, over many simulated terrains.
 
 A case is one terrain with the runs of :data:`terrain.simulation.slip_sweep.LEARNING_DRIVES`.  The truth is
-the described soil's own net pull under a third of the unladen robot, asked by the same definition over the
-slips that the case has seen.
+the peak of the described soil's own net traction under a third of the robot's weight, by the same definition
+over the slips that the case observes.
 
     python -m pipelines.slip.study --cases 100 --seed 0
 """
 
 from __future__ import annotations
 
-import json
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -19,47 +20,101 @@ import typer
 from scipy.special import betaincinv
 
 from pipelines.reporting.progress import Progress, silent
-from pipelines.slip.learn_slip import learn_terrain, run_parts
 from terrain.constants import GRAVITY_MPS2
+from terrain.records import TargetStatus
 from terrain.robots import Robot, load_robot
 from terrain.simulation.slip_sweep import LEARNING_DRIVES, Drive, learning_runs
-from terrain.slip_learning.slip_curve import N_BOOTSTRAP, Peak, net_peak
+from terrain.slip_learning.curve import N_BOOTSTRAP
+from terrain.slip_learning.learn import learn_terrain, terrain_runs
+from terrain.slip_learning.peak import Peak, PeakStatus, net_peak
 from terrain.terramechanics.soil import load_soil, soil_names
 from terrain.terramechanics.traction import net_pull
 
 WELL_COVERED_SLIP = 0.5
-"""Slips seen up to here and beyond cover a curve well: the peaks of hard ground are at 0.2 to 0.35."""
+"""Slips observed up to here and beyond cover a curve well: the peaks of hard terrain are at 0.2 to 0.35."""
 
 
 class Case(NamedTuple):
-    """One terrain learned: what was said, and what is true."""
+    """The estimated and the true peak of one learned terrain."""
 
     terrain: str
     seed: int
-    status: str
     law: str
     peak_slip: float
     interval: tuple[float, float]
-    peak_status: str
+    peak_status: PeakStatus
     slip_range: tuple[float, float]
     true_slip: float
-    true_status: str
+    true_status: PeakStatus
 
     @property
     def inside(self) -> bool:
-        """Whether the interval holds the true peak."""
+        """Whether the interval contains the true peak."""
         return self.interval[0] <= self.true_slip <= self.interval[1]
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the fields, and whether the interval contains the truth."""
+        return self._asdict() | {"status": TargetStatus.ESTIMATED, "inside": self.inside}
+
+
+class Coverage(NamedTuple):
+    """Coverage and error over cases.
+
+    Parameters
+    ----------
+    n : cases
+    coverage, coverage_ci : ratio of intervals that contain the true peak, and its exact 95 % interval
+    error_mean, error_median_abs, error_max_abs : of the peak slip
+    within_003 : ratio of cases with an error of at most 0.03
+    width_median : of the intervals
+    well_covered : cases with slips up to :data:`WELL_COVERED_SLIP` and beyond
+    status_right : cases with the true status of the peak
+    """
+
+    n: int
+    coverage: float
+    coverage_ci: tuple[float, float] | None
+    error_mean: float
+    error_median_abs: float
+    error_max_abs: float
+    within_003: float
+    width_median: float
+    well_covered: int
+    status_right: int
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the fields; a ratio within 0.03 by that name."""
+        return {name.replace("within_003", "within_0.03"): value for name, value in self._asdict().items()}
+
+
+@dataclass(frozen=True, slots=True)
+class StudyResult:
+    """Coverage over all learned cases and by terrain; the keys of ``--json``, those of ``all`` at the top."""
+
+    n_cases: int
+    n_learned: int
+    all: Coverage
+    terrains: Mapping[str, Coverage]
+    cases: tuple[Case, ...]
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the fields, with those of ``all`` in its place."""
+        document: dict[str, Any] = {}
+        for each in fields(self):
+            value = getattr(self, each.name)
+            document |= value.as_json() if isinstance(value, Coverage) else {each.name: value}
+        return document
 
 
 def true_peak(robot: Robot, terrain: str, slip_range: tuple[float, float]) -> Peak:
-    """Return the peak of the described soil's net pull within the slips seen, under a third of the robot.
+    """Return the peak of a described soil's net traction within a range of slips, under a third of the robot.
 
     Examples
     --------
     >>> true_peak(load_robot("agrimaro"), "snow", (0.0, 0.6))
-    Peak(slip_ratio=0.3115, status='peak')
+    Peak(slip_ratio=0.3115, status=<PeakStatus.PEAK: 'peak'>)
     """
-    soil, body = load_soil(terrain), robot.equipment.body
+    soil, body = load_soil(terrain), robot.body
     geometry = robot.wheel_radius_m, body.tyre_width_m, body.contact_length_m
     load_n = robot.mass_kg * GRAVITY_MPS2 / len(robot.wheels)
     return net_peak(lambda slips: net_pull(soil, load_n, slips, *geometry), *slip_range)
@@ -71,26 +126,26 @@ def run_case(
     seed: int,
     drives: tuple[Drive, ...] = LEARNING_DRIVES,
     n_bootstrap: int = N_BOOTSTRAP,
-) -> Case:
-    """Simulate and learn one terrain."""
-    parts = [part for run in learning_runs(robot, terrain, seed, drives) for part in run_parts(run, robot)]
-    learned = learn_terrain(terrain, parts, seed, n_bootstrap)
-    if learned.curve is None:
-        nothing = (np.nan, np.nan)
-        return Case(terrain, seed, learned.status, "", np.nan, nothing, "", nothing, np.nan, "")
+) -> Case | None:
+    """Simulate and learn one terrain; None where its targets are not learned."""
+    measured = [
+        each for run in learning_runs(robot, terrain, seed, drives) for each in terrain_runs(run, robot)
+    ]
+    learned = learn_terrain(terrain, measured, seed, n_bootstrap)
     curve = learned.curve
+    if curve is None or learned.status is not TargetStatus.ESTIMATED:
+        return None
     true = true_peak(robot, terrain, curve.slip_range)
     return Case(
-        terrain,
-        seed,
-        learned.status,
-        curve.law,
-        curve.peak.slip_ratio,
-        curve.peak_interval,
-        curve.peak.status,
-        curve.slip_range,
-        true.slip_ratio,
-        true.status,
+        terrain=terrain,
+        seed=seed,
+        law=curve.law,
+        peak_slip=curve.peak.slip_ratio,
+        interval=curve.peak_interval,
+        peak_status=curve.peak.status,
+        slip_range=curve.slip_range,
+        true_slip=true.slip_ratio,
+        true_status=true.status,
     )
 
 
@@ -100,7 +155,7 @@ def study(
     terrains: Sequence[str] = soil_names(),
     n_bootstrap: int = N_BOOTSTRAP,
     progress: Progress = silent,
-) -> list[Case]:
+) -> list[Case | None]:
     """Return a case a seed, over the terrains in turn."""
     cases = []
     for done, seed in enumerate(seeds, start=1):
@@ -110,7 +165,7 @@ def study(
 
 
 def clopper_pearson(hits: int, n: int, level: float = 0.95) -> tuple[float, float]:
-    """Return the exact interval of a share by ``hits`` of ``n``.
+    """Return the exact interval of a probability by ``hits`` of ``n``.
 
     Examples
     --------
@@ -124,38 +179,38 @@ def clopper_pearson(hits: int, n: int, level: float = 0.95) -> tuple[float, floa
     return low, high
 
 
-def summary(cases: Sequence[Case]) -> dict[str, Any]:
+def summary(cases: Sequence[Case | None]) -> StudyResult:
     """Return coverage and error, of all and by terrain; cases that were not learned are counted apart."""
-    learned = [case for case in cases if case.status == "estimated"]
-    return {
-        "n_cases": len(cases),
-        "n_learned": len(learned),
-        **_figures(learned),
-        "terrains": {
-            terrain: _figures([case for case in learned if case.terrain == terrain])
+    learned = [case for case in cases if case is not None]
+    return StudyResult(
+        n_cases=len(cases),
+        n_learned=len(learned),
+        all=_coverage(learned),
+        terrains={
+            terrain: _coverage([case for case in learned if case.terrain == terrain])
             for terrain in sorted({case.terrain for case in learned})
         },
-        "cases": [{**case._asdict(), "inside": case.inside} for case in learned],
-    }
+        cases=tuple(learned),
+    )
 
 
-def _figures(cases: Sequence[Case]) -> dict[str, Any]:
-    hits = sum(case.inside for case in cases)
+def _coverage(cases: Sequence[Case]) -> Coverage:
+    n, hits = len(cases), sum(case.inside for case in cases)
+    if not n:
+        return Coverage(0, math.nan, None, math.nan, math.nan, math.nan, math.nan, math.nan, 0, 0)
     error = np.array([case.peak_slip - case.true_slip for case in cases])
-    return {
-        "n": len(cases),
-        "coverage": hits / len(cases) if cases else None,
-        "coverage_ci": list(clopper_pearson(hits, len(cases))) if cases else None,
-        "error_mean": float(error.mean()) if cases else None,
-        "error_median_abs": float(np.median(np.abs(error))) if cases else None,
-        "error_max_abs": float(np.abs(error).max()) if cases else None,
-        "within_0.03": float(np.mean(np.abs(error) <= 0.03)) if cases else None,
-        "width_median": float(np.median([case.interval[1] - case.interval[0] for case in cases]))
-        if cases
-        else None,
-        "well_covered": sum(case.slip_range[1] >= WELL_COVERED_SLIP for case in cases),
-        "status_right": sum(case.peak_status == case.true_status for case in cases),
-    }
+    return Coverage(
+        n=n,
+        coverage=hits / n,
+        coverage_ci=clopper_pearson(hits, n),
+        error_mean=float(error.mean()),
+        error_median_abs=float(np.median(np.abs(error))),
+        error_max_abs=float(np.abs(error).max()),
+        within_003=float(np.mean(np.abs(error) <= 0.03)),
+        width_median=float(np.median([case.interval[1] - case.interval[0] for case in cases])),
+        well_covered=sum(case.slip_range[1] >= WELL_COVERED_SLIP for case in cases),
+        status_right=sum(case.peak_status is case.true_status for case in cases),
+    )
 
 
 def main(
@@ -165,22 +220,22 @@ def main(
     json_file: Annotated[Path | None, typer.Option("--json")] = None,
 ) -> None:
     """Print coverage of the peak's interval over seeded cases."""
-    from pipelines.reporting.screens import progress_bar
+    from pipelines.reporting.json_file import write_json
+    from pipelines.reporting.terminal import progress_bar
 
     with progress_bar() as progress:
         result = summary(study(load_robot(robot), range(seed, seed + cases), progress=progress))
-    for name, row in [("all", result), *result["terrains"].items()]:
-        low, high = row["coverage_ci"]
+    for name, row in [("all", result.all), *result.terrains.items()]:
+        low, high = row.coverage_ci or (math.nan, math.nan)
         typer.echo(
-            f"{name:18s} n {row['n']:3d}  coverage {row['coverage']:.3f} ({low:.3f} to {high:.3f})  "
-            f"error mean {row['error_mean']:+.4f} median {row['error_median_abs']:.4f} "
-            f"max {row['error_max_abs']:.4f}  within 0.03 {row['within_0.03']:.2f}  "
-            f"width {row['width_median']:.3f}  well covered {row['well_covered']}  "
-            f"status right {row['status_right']}"
+            f"{name:18s} n {row.n:3d}  coverage {row.coverage:.3f} ({low:.3f} to {high:.3f})  "
+            f"error mean {row.error_mean:+.4f} median {row.error_median_abs:.4f} "
+            f"max {row.error_max_abs:.4f}  within 0.03 {row.within_003:.2f}  "
+            f"width {row.width_median:.3f}  well covered {row.well_covered}  "
+            f"status right {row.status_right}"
         )
-    typer.echo(f"not learned: {result['n_cases'] - result['n_learned']} of {result['n_cases']}")
-    if json_file is not None:
-        json_file.write_text(json.dumps(result, indent=2) + "\n")
+    typer.echo(f"not learned: {result.n_cases - result.n_learned} of {result.n_cases}")
+    write_json(json_file, result)
 
 
 if __name__ == "__main__":

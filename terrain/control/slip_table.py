@@ -1,9 +1,8 @@
 """Target slip by terrain and drive state, from a YAML table in which every number has its source.
 
-Two forms are read.  That of ``data/target_slip/default.yaml`` has numbers that somebody wrote; one with runs
-behind it (``n_runs`` and ``slip_std``) is ``estimated``, one without ``unestimated``, whoever wrote it.
-``terrain learn-slip`` writes the other, ``schema: 2``: for one robot, each number with its status, and beside
-the numbers the curve that they are from.
+Two forms are read.  That of ``data/target_slip/default.yaml`` is written by hand; a number with runs behind
+it (``n_runs`` and ``slip_std``) is ``estimated``, one without ``unestimated``.  ``terrain learn-slip`` writes
+the other, ``schema: 2``: for one robot, each number with its status, and the curve that the numbers are from.
 """
 
 from __future__ import annotations
@@ -11,9 +10,10 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
+from enum import StrEnum
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, TypeVar
 
 import yaml
 
@@ -21,8 +21,9 @@ from terrain.errors import ConfigError
 from terrain.files.atomic import atomic_write
 from terrain.files.descriptions import check_keys, read_yaml
 from terrain.files.resources import data_folder
-from terrain.records import SlipTarget
-from terrain.slip_learning.slip_curve import LAW_BOUNDS, LAW_PARAMETERS
+from terrain.records import SlipTarget, TargetStatus
+from terrain.slip_learning.laws import LAW_BOUNDS, LAW_PARAMETERS
+from terrain.slip_learning.peak import PeakStatus
 
 DRIVE_STATES = ("traction", "braking", "steady")
 
@@ -32,40 +33,39 @@ SIGN = {"traction": 1, "braking": -1, "steady": 1}
 SCHEMA = 2
 """Newest form that is read, and the one that is written."""
 
-STATUSES = ("unestimated", "estimated", "invalid")
-PEAK_STATUSES = ("peak", "no_peak")
+_Status = TypeVar("_Status", bound=StrEnum)
 
 _NUMBER_KEYS = {"slip_ratio", "source", "slip_std", "n_runs"}
 _HEADER = """\
-# Slip to aim for on each terrain, positive in traction (s = (w r - v) / max(|w r|, |v|)).
-# Written by terrain learn-slip.  estimated: learned from n_runs runs; unestimated: too little was driven, the
-# number is assumed; invalid: what was learned contradicts itself, the fallback stands in.
+# Target slip on each terrain, positive in traction (s = (w r - v) / max(|w r|, |v|)).
+# Written by terrain learn-slip.  estimated: learned from n_runs runs; unestimated: the runs do not suffice,
+# the number is assumed; invalid: what was learned contradicts itself, the fallback is used instead.
 """
 
 
 @dataclass(frozen=True, slots=True)
 class CurveEntry:
-    """What a table holds of a learned curve; numbers as they stand in the file, None where nobody knows.
+    """What a table holds of a learned curve; numbers as in the file, None where not known.
 
     Parameters
     ----------
-    law, parameters : by :data:`terrain.slip_learning.slip_curve.LAW_PARAMETERS`
-    peak_slip_ratio, peak_interval_ratio, peak_status : of the net pull
-        (:mod:`terrain.slip_learning.slip_curve`); the interval holds it with 90 %
-    slip_range_ratio : slips that were seen
+    law, parameters : by :data:`terrain.slip_learning.laws.LAW_PARAMETERS`
+    peak_slip_ratio, peak_interval_ratio, peak_status : of net traction (:mod:`terrain.slip_learning.peak`);
+        the interval contains it with 90 %
+    slip_range_ratio : slips that were observed
     resistance_ratio, resistance_std : over load
-    balance_slip_ratio : where thrust is resistance
-    peak_based_slip_ratio, working_slip_ratio : what the target of traction is the lesser of
+    balance_slip_ratio : where thrust equals resistance
+    peak_based_slip_ratio, working_slip_ratio : of which the target of traction is the lesser
     traction_efficiency_ratio : tractive efficiency there
-    traction_energy_jpm, braking_energy_jpm, steady_energy_jpm : of the unladen robot a metre at each target
-    n_runs : behind it
+    traction_energy_jpm, braking_energy_jpm, steady_energy_jpm : a metre, at each target, without payload
+    n_runs : the curve is fitted to
     """
 
     law: str
     parameters: Mapping[str, float]
     peak_slip_ratio: float
     peak_interval_ratio: tuple[float, float]
-    peak_status: str
+    peak_status: PeakStatus
     slip_range_ratio: tuple[float, float]
     resistance_ratio: float
     resistance_std: float
@@ -86,9 +86,9 @@ class SlipTable:
     Parameters
     ----------
     name : name of the table
-    fallback : the entry that stands in for a terrain without a valid one
+    fallback : the entry used for a terrain without a valid one
     targets : by terrain, then by drive state
-    robot : whose slips they are; empty where the table is for none in particular
+    robot : that the slips are for; empty where the table is for any robot
     curves : by terrain, where one was learned
     reasons : by terrain, why its numbers are not learned or not used
     """
@@ -105,9 +105,9 @@ class SlipTable:
             object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
 
     def lookup(self, terrain: str) -> Mapping[str, SlipTarget]:
-        """Return the targets for a terrain, or those of the fallback; each says whose entry it is.
+        """Return the targets for a terrain, or those of the fallback; each names the entry that it is from.
 
-        An entry with an ``invalid`` number is no entry.
+        The fallback is also used for an entry with an ``invalid`` number.
 
         Examples
         --------
@@ -116,7 +116,7 @@ class SlipTable:
         ('ICE', 'unknown')
         """
         entry = self.targets.get(terrain)
-        if entry is None or any(target.status == "invalid" for target in entry.values()):
+        if entry is None or any(target.status is TargetStatus.INVALID for target in entry.values()):
             return self.targets[self.fallback]
         return entry
 
@@ -139,11 +139,39 @@ def load_slip_table(path: str | Path | None = None, robot: str | None = None) ->
     """
     file = data_folder("target_slip") / "default.yaml" if path is None else Path(path)
     content = read_yaml(file)
+    schema = _schema(file, content)
+    of_robot = _check_frame(file, content, schema)
+    if robot is not None and of_robot and of_robot != robot:
+        raise ConfigError(f"{file}: the table is for robot {of_robot!r}, not for {robot!r}")
+    fallback = content["fallback"]
+    targets, curves, reasons = {}, {}, {}
+    for key, entry in content["terrains"].items():
+        terrain = str(key)
+        targets[terrain] = _targets(file, terrain, entry, schema)
+        if "curve" in entry:
+            curves[terrain] = _curve(f"{file}: {terrain}, curve", entry["curve"])
+        if "reason" in entry:
+            if not isinstance(entry["reason"], str):
+                raise ConfigError(f"{file}: {terrain}: reason is {entry['reason']!r}, a text is required")
+            reasons[terrain] = entry["reason"]
+    if any(target.status is TargetStatus.INVALID for target in targets[fallback].values()):
+        raise ConfigError(
+            f"{file}: the fallback {fallback!r} is invalid: it could not be used for any terrain"
+        )
+    return SlipTable(str(content["name"]), fallback, targets, of_robot, curves, reasons)
+
+
+def _schema(file: Path, content: Any) -> int:
     schema = content.get("schema", 1) if isinstance(content, dict) else 1
     if isinstance(schema, bool) or not isinstance(schema, int) or schema < 1:
         raise ConfigError(f"{file}: schema is {schema!r}, 1 or {SCHEMA} is required")
     if schema > SCHEMA:
         raise ConfigError(f"{file}: schema {schema} is newer than {SCHEMA}, the newest that is read here")
+    return schema
+
+
+def _check_frame(file: Path, content: Any, schema: int) -> str:
+    """Check all of a file but its terrains; return the robot that it is for, or an empty name."""
     keys = ["name", "fallback", "terrains"]
     if schema == 1 and not (isinstance(content, dict) and set(content) - {"schema"} == set(keys)):
         raise ConfigError(f"{file}: a slip table holds just the keys name, fallback and terrains")
@@ -152,32 +180,25 @@ def load_slip_table(path: str | Path | None = None, robot: str | None = None) ->
     terrains, fallback = content["terrains"], content["fallback"]
     if not isinstance(terrains, dict) or not isinstance(fallback, str) or fallback not in terrains:
         raise ConfigError(f"{file}: the fallback {fallback!r} is no entry of terrains")
-    of_robot = content.get("robot", "")
-    if schema > 1 and not (isinstance(of_robot, str) and of_robot):
-        raise ConfigError(f"{file}: robot is {of_robot!r}, the name of one is required")
-    if robot is not None and of_robot and of_robot != robot:
-        raise ConfigError(f"{file}: the table is for robot {of_robot!r}, not for {robot!r}")
-    targets, curves, reasons = {}, {}, {}
-    for key, entry in terrains.items():
-        terrain = str(key)
-        extra = {"curve", "reason"} if schema > 1 else set()
-        if not isinstance(entry, dict) or not set(DRIVE_STATES) <= set(entry) <= set(DRIVE_STATES) | extra:
-            raise ConfigError(f"{file}: {terrain} needs just the drive states {', '.join(DRIVE_STATES)}")
-        targets[terrain] = {
-            state: _target(file, terrain, state, entry[state], schema) for state in DRIVE_STATES
-        }
-        _check_order(file, terrain, targets[terrain])
-        if "curve" in entry:
-            curves[terrain] = _curve(f"{file}: {terrain}, curve", entry["curve"])
-        if "reason" in entry:
-            if not isinstance(entry["reason"], str):
-                raise ConfigError(f"{file}: {terrain}: reason is {entry['reason']!r}, a text is required")
-            reasons[terrain] = entry["reason"]
-    if any(target.status == "invalid" for target in targets[fallback].values()):
+    robot = content.get("robot", "")
+    if schema > 1 and not (isinstance(robot, str) and robot):
+        raise ConfigError(f"{file}: robot is {robot!r}, the name of one is required")
+    return str(robot)
+
+
+def _targets(file: Path, terrain: str, entry: Any, schema: int) -> dict[str, SlipTarget]:
+    """Return the targets of a terrain by drive state."""
+    extra = {"curve", "reason"} if schema > 1 else set()
+    if not isinstance(entry, dict) or not set(DRIVE_STATES) <= set(entry) <= set(DRIVE_STATES) | extra:
+        raise ConfigError(f"{file}: {terrain} needs just the drive states {', '.join(DRIVE_STATES)}")
+    targets = {state: _target(file, terrain, state, entry[state], schema) for state in DRIVE_STATES}
+    steady, traction = targets["steady"].slip_ratio, targets["traction"].slip_ratio
+    if steady > traction:
         raise ConfigError(
-            f"{file}: the fallback {fallback!r} is invalid: nothing could stand in for anything"
+            f"{file}: {terrain}: steady slip {steady:g} is over that of traction, {traction:g}; "
+            "targets must rise"
         )
-    return SlipTable(str(content["name"]), fallback, targets, of_robot, curves, reasons)
+    return targets
 
 
 def write_slip_table(table: SlipTable, path: str | Path) -> None:
@@ -228,7 +249,7 @@ def _number(target: SlipTarget) -> dict[str, Any]:
         "slip_ratio": float(target.slip_ratio),
         **known,
         **runs,
-        "status": target.status,
+        "status": TargetStatus(target.status).value,
         "source": target.source,
     }
 
@@ -236,6 +257,8 @@ def _number(target: SlipTarget) -> dict[str, Any]:
 def _plain(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {key: float(number) for key, number in value.items()}
+    if isinstance(value, StrEnum):
+        return value.value
     return [float(number) for number in value] if isinstance(value, tuple) else value
 
 
@@ -258,24 +281,15 @@ def _target(file: Path, terrain: str, state: str, number: Any, schema: int) -> S
         raise ConfigError(f"{where}: slip_std is {std!r}; it must be a number of at least 0")
     if isinstance(n_runs, bool) or not isinstance(n_runs, int) or n_runs < 0:
         raise ConfigError(f"{where}: n_runs is {n_runs!r}; it must be a whole number of at least 0")
-    status = number.get("status", "estimated" if n_runs else "unestimated")
-    if status not in STATUSES:
-        raise ConfigError(f"{where}: status is {status!r}; it must be one of {', '.join(STATUSES)}")
-    if (schema == 1 or status == "estimated") and (std is None) != (n_runs == 0):
+    status = _one_of(
+        TargetStatus, where, "status", number.get("status", "estimated" if n_runs else "unestimated")
+    )
+    if (schema == 1 or status is TargetStatus.ESTIMATED) and (std is None) != (n_runs == 0):
         raise ConfigError(f"{where}: slip_std and n_runs go together")
-    if status == "estimated" and n_runs == 0:
+    if status is TargetStatus.ESTIMATED and n_runs == 0:
         raise ConfigError(f"{where}: status is 'estimated', and no runs are behind it")
     slip_std = math.nan if std is None else float(std)
     return SlipTarget(terrain, state, float(slip), slip_std, n_runs, status, number["source"])
-
-
-def _check_order(file: Path, terrain: str, targets: Mapping[str, SlipTarget]) -> None:
-    steady, traction = targets["steady"].slip_ratio, targets["traction"].slip_ratio
-    if steady > traction:
-        raise ConfigError(
-            f"{file}: {terrain}: steady slip {steady:g} is over that of traction, {traction:g}; "
-            "targets must rise"
-        )
 
 
 def _curve(where: str, content: Any) -> CurveEntry:
@@ -284,41 +298,48 @@ def _curve(where: str, content: Any) -> CurveEntry:
     law, n_runs = content["law"], content["n_runs"]
     if not isinstance(law, str) or law not in LAW_PARAMETERS:
         raise ConfigError(f"{where}: law is {law!r}; it must be one of {', '.join(LAW_PARAMETERS)}")
-    if content["peak_status"] not in PEAK_STATUSES:
-        raise ConfigError(
-            f"{where}: peak_status is {content['peak_status']!r}; "
-            f"it must be one of {', '.join(PEAK_STATUSES)}"
-        )
+    status = _one_of(PeakStatus, where, "peak_status", content["peak_status"])
     if isinstance(n_runs, bool) or not isinstance(n_runs, int) or n_runs < 1:
         raise ConfigError(f"{where}: n_runs is {n_runs!r}; it must be a whole number of at least 1")
-    parameters = content["parameters"]
-    check_keys(f"{where}: parameters", parameters, list(LAW_PARAMETERS[law]))
-    values: dict[str, Any] = {"law": law, "peak_status": content["peak_status"], "n_runs": n_runs}
-    values["parameters"] = {name: _finite(f"{where}: {name}", value) for name, value in parameters.items()}
-    for name, least, most in zip(LAW_PARAMETERS[law], *LAW_BOUNDS[law], strict=True):
-        if not least <= values["parameters"][name] <= most:
-            raise ConfigError(
-                f"{where}: {name} is {values['parameters'][name]:g}; {least:g} to {most:g} are accepted"
-            )
-    values["working_slip_ratio"] = None
+    values: dict[str, Any] = {"working_slip_ratio": None, "law": law, "peak_status": status, "n_runs": n_runs}
+    values["parameters"] = _parameters(where, law, content["parameters"])
     for name in names:
-        if (name in values and name != "working_slip_ratio") or name not in content:
-            continue
-        value = content[name]
-        if name in ("peak_interval_ratio", "slip_range_ratio"):
-            if not isinstance(value, list) or len(value) != 2:
-                raise ConfigError(f"{where}: {name} is {value!r}; two numbers are required")
-            low, high = (_finite(f"{where}: {name}", edge) for edge in value)
-            if not -1 <= low <= high <= 1:
-                raise ConfigError(
-                    f"{where}: {name} is {value!r}; two rising numbers within [-1, 1] are required"
-                )
-            values[name] = (low, high)
-            continue
-        values[name] = _finite(f"{where}: {name}", value)
-        if "slip_ratio" in name and abs(values[name]) > 1:
-            raise ConfigError(f"{where}: {name} is {value!r}; it must be within [-1, 1]")
+        if name in content and name not in ("law", "peak_status", "n_runs", "parameters"):
+            read = _interval if name in ("peak_interval_ratio", "slip_range_ratio") else _ratio
+            values[name] = read(where, name, content[name])
     return CurveEntry(**values)
+
+
+def _parameters(where: str, law: str, content: Any) -> dict[str, float]:
+    check_keys(f"{where}: parameters", content, list(LAW_PARAMETERS[law]))
+    values = {name: _finite(f"{where}: {name}", value) for name, value in content.items()}
+    for name, least, most in zip(LAW_PARAMETERS[law], *LAW_BOUNDS[law], strict=True):
+        if not least <= values[name] <= most:
+            raise ConfigError(f"{where}: {name} is {values[name]:g}; {least:g} to {most:g} are accepted")
+    return values
+
+
+def _interval(where: str, name: str, value: Any) -> tuple[float, float]:
+    if not isinstance(value, list) or len(value) != 2:
+        raise ConfigError(f"{where}: {name} is {value!r}; two numbers are required")
+    low, high = (_finite(f"{where}: {name}", edge) for edge in value)
+    if not -1 <= low <= high <= 1:
+        raise ConfigError(f"{where}: {name} is {value!r}; two rising numbers within [-1, 1] are required")
+    return low, high
+
+
+def _ratio(where: str, name: str, value: Any) -> float:
+    """Return a number, of a slip one within [-1, 1]."""
+    number = _finite(f"{where}: {name}", value)
+    if "slip_ratio" in name and abs(number) > 1:
+        raise ConfigError(f"{where}: {name} is {value!r}; it must be within [-1, 1]")
+    return number
+
+
+def _one_of(kind: type[_Status], where: str, name: str, value: Any) -> _Status:
+    if value not in list(kind):
+        raise ConfigError(f"{where}: {name} is {value!r}; it must be one of {', '.join(kind)}")
+    return kind(value)
 
 
 def _finite(where: str, value: Any) -> float:

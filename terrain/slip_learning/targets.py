@@ -1,4 +1,4 @@
-"""Which slip to aim for, from what a terrain's curve tells: traction, braking and steady motion.
+"""Target slips of a terrain from its slip curve, for traction, braking and steady motion.
 
 With thrust f(s) and resistance rho over load, weight W, wheel radius r and bearing friction T_f::
 
@@ -17,22 +17,23 @@ import numpy as np
 
 from terrain.constants import GRAVITY_MPS2
 from terrain.robots import Robot
-from terrain.slip_learning.slip_curve import SYSTEMATIC_SLIP_STD, SlipCurve, traction_ratio
+from terrain.slip_learning.curve import SlipCurve
+from terrain.slip_learning.peak import SYSTEMATIC_SLIP_STD, PeakStatus
 
-PEAK_SHARE = 0.9
-"""Traction keeps below the peak: behind it more slip gives less pull and a wheel runs away, and the thrust at
-nine tenths of the peak's slip is within a hundredth of it."""
+PEAK_SLIP_RATIO = 0.9
+"""Target of traction over the peak slip: beyond the peak more slip gives less traction and a wheel spins up,
+and the thrust at nine tenths of the peak slip is within a hundredth of it."""
 
 MIN_ABOVE_BALANCE_SLIP = 0.03
-"""Traction has to differ from steady motion by more than slip is measured to, or it would not drive off."""
+"""Traction has to differ from steady motion by more than the error of the slip, or no robot would start."""
 
 BRAKING_CAP_SLIP = 0.3
-"""Where thrust rises for ever, a wheel is not braked further: it would gain little, lose its side force with
-the slip, and plough instead of roll."""
+"""Where thrust rises monotonically, a wheel is not braked further: it would gain little, lose its side force
+with the slip, and plough instead of roll."""
 
 
 class TargetSlip(NamedTuple):
-    """A slip to aim for, and one standard deviation of what is known of it."""
+    """A target slip, its standard deviation, and what it is derived from."""
 
     slip_ratio: float
     slip_std: float
@@ -40,10 +41,10 @@ class TargetSlip(NamedTuple):
 
 
 class Targets(NamedTuple):
-    """Targets of a terrain, and what stands behind that of traction.
+    """Targets of a terrain, and the two slips of which that of traction is the lesser.
 
-    ``peak_based_slip_ratio`` is :data:`PEAK_SHARE` of the peak, ``working_slip_ratio`` the slip that gives
-    the working pull; the lesser of the two is aimed for.
+    ``peak_based_slip_ratio`` is :data:`PEAK_SLIP_RATIO` of the peak slip, ``working_slip_ratio`` the slip
+    with the net traction of a start.
     """
 
     traction: TargetSlip
@@ -52,48 +53,64 @@ class Targets(NamedTuple):
     peak_based_slip_ratio: float
     working_slip_ratio: float
 
+    def of(self, drive_state: str) -> TargetSlip:
+        """Return the target of ``traction``, ``braking`` or ``steady``."""
+        return {"traction": self.traction, "braking": self.braking, "steady": self.steady}[drive_state]
+
 
 def targets_of(curve: SlipCurve) -> Targets:
-    """Return the targets of a terrain: braking <= 0 <= steady <= traction.
-
-    Traction is near the peak but not beyond what the work asks for: slip over that buys nothing and costs
-    energy.  It is never under :data:`MIN_ABOVE_BALANCE_SLIP` over the steady one.
-    """
+    """Return the targets of a terrain: braking <= 0 <= steady <= traction."""
     n = f"{curve.n_runs} runs, {curve.law}"
-    steady = max(curve.balance_slip_ratio, 0.0)
-    peak, peak_std = curve.peak.slip_ratio, curve.peak_std
-    by_peak, working = PEAK_SHARE * peak, curve.working_slip_ratio
-    traction, std, why = by_peak, PEAK_SHARE * peak_std, f"{PEAK_SHARE:g} of the peak"
-    if curve.peak.status == "no_peak":
-        why = f"{PEAK_SHARE:g} of the slip at 95 % of the largest pull seen"
-    if working < by_peak:
-        traction, std, why = working, curve.working_std, "working pull"
-    if traction < steady + MIN_ABOVE_BALANCE_SLIP:
-        traction, std, why = steady + MIN_ABOVE_BALANCE_SLIP, curve.balance_std, "just above balance"
-    braking, braking_std, how = peak, peak_std, "the peak mirrored"
-    if curve.peak.status == "no_peak":
-        braking, how = min(peak, BRAKING_CAP_SLIP), "95 % of the largest pull seen, mirrored"
-        if peak > BRAKING_CAP_SLIP:
-            braking_std, how = SYSTEMATIC_SLIP_STD, "capped: thrust rises on"
+    steady = TargetSlip(
+        max(curve.balance_slip_ratio, 0.0), curve.balance_std, f"balance with the resistance; {n}"
+    )
+    traction, braking = _traction(curve, steady.slip_ratio), _braking(curve)
     return Targets(
-        TargetSlip(traction, std, f"{why}; {n}"),
-        TargetSlip(-braking, braking_std, f"{how}; {n}"),
-        TargetSlip(steady, curve.balance_std, f"balance of the resistance; {n}"),
-        by_peak,
-        working,
+        traction._replace(source=f"{traction.source}; {n}"),
+        braking._replace(source=f"{braking.source}; {n}"),
+        steady,
+        PEAK_SLIP_RATIO * curve.peak.slip_ratio,
+        curve.working_slip_ratio,
     )
 
 
+def _traction(curve: SlipCurve, steady_slip_ratio: float) -> TargetSlip:
+    """Return the target near the peak, but not beyond what a start requires: more slip only costs energy.
+
+    It is at least :data:`MIN_ABOVE_BALANCE_SLIP` above the steady one.
+    """
+    by_peak = PEAK_SLIP_RATIO * curve.peak.slip_ratio
+    of = (
+        "the peak slip"
+        if curve.peak.status is PeakStatus.PEAK
+        else "the slip at 95 % of the largest traction"
+    )
+    target = TargetSlip(by_peak, PEAK_SLIP_RATIO * curve.peak_std, f"{PEAK_SLIP_RATIO:g} of {of}")
+    if curve.working_slip_ratio < by_peak:
+        target = TargetSlip(curve.working_slip_ratio, curve.working_std, "net traction of a start")
+    least = steady_slip_ratio + MIN_ABOVE_BALANCE_SLIP
+    return TargetSlip(least, curve.balance_std, "just above balance") if target.slip_ratio < least else target
+
+
+def _braking(curve: SlipCurve) -> TargetSlip:
+    """Return the peak slip mirrored; where there is no peak, at most :data:`BRAKING_CAP_SLIP`."""
+    slip, std = curve.peak.slip_ratio, curve.peak_std
+    if curve.peak.status is PeakStatus.PEAK:
+        return TargetSlip(-slip, std, "the peak slip mirrored")
+    if slip > BRAKING_CAP_SLIP:
+        return TargetSlip(-BRAKING_CAP_SLIP, SYSTEMATIC_SLIP_STD, "capped: thrust rises monotonically")
+    return TargetSlip(-slip, std, "the slip at 95 % of the largest traction, mirrored")
+
+
 def tractive_efficiency(curve: SlipCurve, slip_ratio: float) -> float:
-    """Return the share of a wheel's work that becomes net pull times way; NaN without thrust."""
-    thrust = float(traction_ratio(curve.law, curve.parameters, np.array([slip_ratio]))[0])
+    """Return the work of net traction over that of a wheel; NaN without thrust."""
+    thrust = float(curve.thrust_ratio(np.array([slip_ratio]))[0])
     return (thrust - curve.resistance_ratio) / thrust * (1.0 - slip_ratio) if thrust > 0 else math.nan
 
 
 def energy_jpm(curve: SlipCurve, slip_ratio: float, robot: Robot) -> float:
-    """Return the energy in J a metre that the wheels of the unladen robot take; negative where they give."""
-    motors = robot.equipment.motors
-    thrust = float(traction_ratio(curve.law, curve.parameters, np.array([slip_ratio]))[0])
+    """Return the energy in J a metre at the wheels of the robot without payload; negative in recuperation."""
+    thrust = float(curve.thrust_ratio(np.array([slip_ratio]))[0])
     turns = 1.0 / (1.0 - slip_ratio) if slip_ratio >= 0 else 1.0 + slip_ratio
-    friction_n = len(robot.wheels) * motors.friction_nm / robot.wheel_radius_m
+    friction_n = len(robot.wheels) * robot.motors.friction_nm / robot.wheel_radius_m
     return (thrust * robot.mass_kg * GRAVITY_MPS2 + friction_n) * turns

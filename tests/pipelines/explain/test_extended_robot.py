@@ -11,7 +11,6 @@ from pipelines.estimate.calibrate import calibrate
 from pipelines.estimate.estimate import estimate
 from pipelines.estimate.settings import EstimateSettings
 from pipelines.live.pilot import LivePilot
-from pipelines.slip.learn_slip import run_parts
 from terrain.errors import ConfigError
 from terrain.estimation.enriched import enriched
 from terrain.estimation.estimate import estimate_run
@@ -21,6 +20,7 @@ from terrain.robots import load_robot
 from terrain.simulation.dynamic.simulate import simulate
 from terrain.simulation.scenario.make import make_scenario
 from terrain.simulation.sensors.gnss import Gnss
+from terrain.slip_learning.learn import terrain_runs
 from terrain.terramechanics.soil import load_soil
 
 ROBOT = load_robot("agrimaro")
@@ -105,7 +105,7 @@ def test_files_pass_through_the_commands(tmp_path):
         settings = EstimateSettings(filter="vio15", robot=str(out), tuning=tuning, figures=False)
         (row,) = estimate([run], settings).runs
         assert row.speed_rmse_mps < 0.006
-    assert np.isfinite(run_parts(run, robot)[0].balance.mass_kg)
+    assert np.isfinite(terrain_runs(run, robot)[0].balance.mass_kg)
     assert LivePilot(robot)._radius_m == pytest.approx(0.208)
     with pytest.raises(ConfigError, match="is extended by effects"):
         calibrate(tmp_path, out)

@@ -26,7 +26,7 @@ from terrain.records import Reading, Sample
 from terrain.robots import load_robot
 from terrain.simulation.conditions import Faults
 from terrain.simulation.run import simulate_run
-from terrain.slip_learning.slip_curve import LAW_PARAMETERS
+from terrain.slip_learning.laws import LAW_PARAMETERS
 
 ROBOT, TABLE = load_robot("agrimaro"), load_slip_table()
 DT_S, DELAY_S = 0.02, 0.05

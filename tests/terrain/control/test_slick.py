@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 
 from terrain.constants import GRAVITY_MPS2
-from terrain.control.slick import LOCKED_RATIO, SHARE, SLICK_RATIO, braking_by_slip
+from terrain.control.slick import DECELERATION_RATIO, LOCKED_RATIO, SLICK_RATIO, braking_by_slip
 from terrain.control.slip_table import CurveEntry
-from terrain.slip_learning.slip_curve import LAW_PARAMETERS, traction_ratio
+from terrain.slip_learning.laws import LAW_PARAMETERS, traction_ratio
 
 
 def curve(law, *parameters, resistance=0.02):
@@ -18,7 +18,7 @@ def test_slick_ground_whose_thrust_falls_is_braked_at_its_peak():
     b, c, d = 25.0, 1.5, 0.3
     braking = braking_by_slip(curve("magic", b, c, d, 0.0))
     assert braking.slip_ratio == pytest.approx(np.tan(np.pi / 2 / c) / b, abs=0.002)
-    assert braking.mps2 == pytest.approx(SHARE * (d + 0.02) * GRAVITY_MPS2, rel=1e-3)
+    assert braking.mps2 == pytest.approx(DECELERATION_RATIO * (d + 0.02) * GRAVITY_MPS2, rel=1e-3)
 
 
 @pytest.mark.parametrize(

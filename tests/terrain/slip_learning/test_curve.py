@@ -4,28 +4,22 @@ import numpy as np
 import pytest
 
 from terrain.robots import load_robot
-from terrain.slip_learning.slip_curve import (
-    BIN_EDGES,
-    WORKING_PULL_RATIO,
-    RunBins,
-    chosen_law,
+from terrain.slip_learning.curve import (
+    WORKING_TRACTION_RATIO,
+    Resistances,
     contradiction,
-    expanded_interval,
-    fit_curve,
+    insufficiency,
     learn_curve,
-    left_out_scores,
-    net_peak,
-    run_bins,
-    slip_at,
-    slip_range,
-    too_little,
-    traction_ratio,
     weighted_resistance,
 )
+from terrain.slip_learning.fit import chosen_law, fit_curve, left_out_scores
+from terrain.slip_learning.laws import slip_at, traction_ratio
+from terrain.slip_learning.peak import expanded_interval, net_peak
+from terrain.slip_learning.samples import BIN_EDGES, RunBins, TractionSamples, run_bins, slip_range
 from terrain.slip_learning.targets import (
     BRAKING_CAP_SLIP,
     MIN_ABOVE_BALANCE_SLIP,
-    PEAK_SHARE,
+    PEAK_SLIP_RATIO,
     energy_jpm,
     targets_of,
     tractive_efficiency,
@@ -48,11 +42,11 @@ def drawn_runs(law, theta, rng, n=6, noise=0.01, run_std=0.1, offset_std=0.003, 
     return runs
 
 
-def rho_of(n, value=0.1):
-    return np.column_stack([np.full(n, value), np.full(n, 0.01)])
+def resistances_of(n, value=0.1):
+    return Resistances(np.full(n, value), np.full(n, 0.01))
 
 
-def test_laws_are_those_of_the_simulated_ground():
+def test_laws_are_those_of_the_simulated_terrain():
     slips = np.array([-0.3, -1e-5, 0.0, 1e-5, 0.02, 0.2, 0.9])
     np.testing.assert_allclose(
         traction_ratio(*SAND, slips), [janosi_force(s, 0.6, 1.0, 0.16) for s in slips], rtol=1e-9, atol=1e-15
@@ -63,7 +57,7 @@ def test_laws_are_those_of_the_simulated_ground():
 
 
 @pytest.mark.parametrize(("law", "theta"), [SAND, SNOW])
-def test_the_law_behind_runs_is_chosen_and_its_numbers_come_back(law, theta):
+def test_true_law_is_chosen_and_its_parameters_are_recovered(law, theta):
     runs = drawn_runs(law, theta, np.random.default_rng(3))
     assert chosen_law(left_out_scores(runs)) == law
     fit = fit_curve(law, runs)
@@ -74,18 +68,17 @@ def test_the_law_behind_runs_is_chosen_and_its_numbers_come_back(law, theta):
     assert 0.5 < fit.misfit < 1.5
 
 
-def test_a_run_with_many_samples_counts_once():
+def test_a_run_with_many_samples_does_not_dominate():
     rng = np.random.default_rng(0)
     few, many = (
         run_bins(
             "r",
-            np.column_stack(
-                [
-                    rng.uniform(0.2, 0.3, n),
-                    np.full(n, 0.01),
-                    0.3 + 0.02 * rng.standard_normal(n),
-                    np.full((n, 2), 0.01),
-                ]
+            TractionSamples(
+                rng.uniform(0.2, 0.3, n),
+                np.full(n, 0.01),
+                0.3 + 0.02 * rng.standard_normal(n),
+                np.full(n, 0.01),
+                np.full(n, 0.01),
             ),
         )
         for n in (40, 40_000)
@@ -94,7 +87,7 @@ def test_a_run_with_many_samples_counts_once():
     assert (many.traction_std > 0.3 * few.traction_std).all()
 
 
-def test_steep_law_does_not_excuse_its_own_residuals():
+def test_slip_errors_do_not_bias_a_steep_law():
     """Slips that are off by more than the curve's rise must not make the curve steeper and higher."""
     rng = np.random.default_rng(5)
     runs = drawn_runs("magic", (10.0, 1.9, 0.8, 0.97), rng, offset_std=0.006)
@@ -104,18 +97,18 @@ def test_steep_law_does_not_excuse_its_own_residuals():
 
 
 @pytest.mark.parametrize(("law", "theta"), [SAND, SNOW])
-def test_interval_holds_the_true_peak_of_drawn_terrains(law, theta):
+def test_interval_contains_the_true_peak_of_drawn_terrains(law, theta):
     rho, hits, n = 0.1 if law == "janosi" else 0.04, 0, 8
     for seed in range(n):
         rng = np.random.default_rng(100 + seed)
         runs = drawn_runs(law, theta, rng)
-        curve = learn_curve(runs, rho_of(len(runs), rho), rng, n_bootstrap=40)
+        curve = learn_curve(runs, resistances_of(len(runs), rho), rng, n_bootstrap=40)
         true = net_peak(lambda s: traction_ratio(law, theta, s) - rho, *curve.slip_range)
         hits += curve.peak_interval[0] <= true.slip_ratio <= curve.peak_interval[1]
     assert hits >= 5  # of 8 at 90 %: fewer one time in two hundred
 
 
-def test_peak_and_no_peak_are_told_apart_and_stay_in_range():
+def test_peak_and_no_peak_are_distinguished_and_stay_in_range():
     hump = net_peak(lambda s: -((s - 0.3) ** 2), 0.0, 0.8)
     assert hump == (0.3, "peak")
     assert net_peak(lambda s: -((s - 0.79) ** 2) + 1, 0.0, 0.8).status == "no_peak"
@@ -123,7 +116,7 @@ def test_peak_and_no_peak_are_told_apart_and_stay_in_range():
     net = traction_ratio(*SAND, np.array([rising.slip_ratio, 0.7])) - 0.1
     assert rising.status == "no_peak"
     assert net[0] / net[1] == pytest.approx(0.95, abs=1e-3)
-    assert net_peak(lambda s: s - 2.0, 0.0, 0.5) == (0.5, "no_peak")  # never pulls
+    assert net_peak(lambda s: s - 2.0, 0.0, 0.5) == (0.5, "no_peak")  # no net traction
 
 
 def test_slip_at_inverts_the_law():
@@ -134,32 +127,32 @@ def test_slip_at_inverts_the_law():
     assert slip_at(*SNOW, -0.1) == 0.0
 
 
-def test_coverage_is_asked_for_before_anything_is_believed():
+def test_runs_that_do_not_suffice_for_a_curve_are_refused():
     rng = np.random.default_rng(0)
-    assert "2 runs" in too_little(drawn_runs(*SAND, rng, n=2))
-    assert "of range is needed" in too_little(drawn_runs(*SAND, rng, reach=0.08))
+    assert "2 runs" in insufficiency(drawn_runs(*SAND, rng, n=2))
+    assert "a range of" in insufficiency(drawn_runs(*SAND, rng, reach=0.08))
     runs = drawn_runs(*SAND, rng, n=4)
-    assert too_little(runs) is None
+    assert insufficiency(runs) is None
     empty = RunBins("empty", *np.zeros((4, 0)))
-    assert too_little([empty, empty, *runs[:2]]) is not None
+    assert insufficiency([empty, empty, *runs[:2]]) is not None
     assert all(math.isnan(edge) for edge in slip_range([empty, empty]))
     with pytest.raises(ValueError, match="are needed"):
-        learn_curve(runs[:2], rho_of(2), rng)
+        learn_curve(runs[:2], resistances_of(2), rng)
 
 
 @pytest.mark.parametrize(
-    ("theta", "rho", "words"),
+    ("theta", "rho", "text"),
     [
         (SAND[1], -0.1, "negative"),
         ((0.01, 0.16), 0.001, "does not rise"),
         (SAND[1], 0.9, "more thrust than the resistance"),
     ],
 )
-def test_a_curve_that_contradicts_itself_is_told(theta, rho, words):
+def test_a_curve_that_contradicts_itself_is_reported(theta, rho, text):
     rng = np.random.default_rng(1)
     runs = drawn_runs("janosi", theta, rng, noise=0.004)
-    curve = learn_curve(runs, rho_of(len(runs), rho), rng, n_bootstrap=5)
-    assert words in contradiction(curve)
+    curve = learn_curve(runs, resistances_of(len(runs), rho), rng, n_bootstrap=5)
+    assert text in contradiction(curve)
 
 
 def test_points_without_a_curve_are_invalid():
@@ -168,7 +161,7 @@ def test_points_without_a_curve_are_invalid():
         RunBins(f"r{i}", s, np.full(12, 0.003), rng.normal(0.3, 0.1, 12), np.full(12, 0.01))
         for i, s in enumerate(np.tile(np.linspace(0.02, 0.6, 12), (5, 1)))
     ]
-    curve = learn_curve(runs, rho_of(5), rng, n_bootstrap=5)
+    curve = learn_curve(runs, resistances_of(5), rng, n_bootstrap=5)
     assert contradiction(curve) is not None
 
 
@@ -179,26 +172,26 @@ def test_interval_of_few_runs_is_wider_than_its_percentiles():
     assert expanded_interval(np.full(50, 0.3), 5, 0.3) == pytest.approx((0.2918, 0.3082), abs=1e-3)
 
 
-def test_resistance_weighs_runs_by_what_they_know():
-    mean, std = weighted_resistance(np.array([[0.1, 0.01], [0.3, 1.0], [np.nan, np.nan]]))
+def test_resistance_is_weighted_by_the_accuracy_of_each_run():
+    mean, std = weighted_resistance(Resistances(np.array([0.1, 0.3, np.nan]), np.array([0.01, 1.0, np.nan])))
     assert mean == pytest.approx(0.1, abs=1e-3)
     assert std >= 0.0099
-    assert all(math.isnan(value) for value in weighted_resistance(np.full((3, 2), np.nan)))
+    assert all(math.isnan(value) for value in weighted_resistance(Resistances(*np.full((2, 3), np.nan))))
 
 
 @pytest.mark.parametrize(("law", "theta", "rho"), [(*SAND, 0.2), (*SNOW, 0.04)])
-def test_targets_rise_and_do_what_they_are_for(law, theta, rho):
+def test_targets_rise_and_have_the_traction_they_are_chosen_for(law, theta, rho):
     rng = np.random.default_rng(4)
     runs = drawn_runs(law, theta, rng, noise=0.003, run_std=0.02)
-    curve = learn_curve(runs, rho_of(len(runs), rho), rng, n_bootstrap=20)
+    curve = learn_curve(runs, resistances_of(len(runs), rho), rng, n_bootstrap=20)
     targets, robot = targets_of(curve), load_robot("agrimaro")
     steady, traction = targets.steady.slip_ratio, targets.traction.slip_ratio
     assert -BRAKING_CAP_SLIP <= targets.braking.slip_ratio < 0 <= steady < traction or law == "magic"
     f = traction_ratio(curve.law, curve.parameters, np.array([steady, traction]))
     assert f[0] == pytest.approx(curve.resistance_ratio, abs=1e-3)
     assert traction >= steady + MIN_ABOVE_BALANCE_SLIP - 1e-9
-    assert traction <= max(PEAK_SHARE * curve.peak.slip_ratio, steady + MIN_ABOVE_BALANCE_SLIP) + 1e-9
-    assert f[1] - curve.resistance_ratio >= WORKING_PULL_RATIO - 0.001
+    assert traction <= max(PEAK_SLIP_RATIO * curve.peak.slip_ratio, steady + MIN_ABOVE_BALANCE_SLIP) + 1e-9
+    assert f[1] - curve.resistance_ratio >= WORKING_TRACTION_RATIO - 0.001
     assert 0 < tractive_efficiency(curve, traction) < 1
     assert tractive_efficiency(curve, steady) == pytest.approx(0.0, abs=1e-3)
     energies = [energy_jpm(curve, s, robot) for s in (-0.2, steady, traction, curve.peak.slip_ratio)]

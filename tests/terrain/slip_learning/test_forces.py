@@ -11,14 +11,10 @@ from terrain.simulation.conditions import Conditions
 from terrain.simulation.dynamic.simulate import simulate
 from terrain.simulation.run import simulate_run
 from terrain.simulation.slip_sweep import Drive, SlipSweep, scenario_of
-from terrain.slip_learning.wheel_pull import (
-    body_balance,
-    contact_slip,
-    ground_thrust,
-    pull_samples,
-    wheel_loads,
-    wheel_pull,
-)
+from terrain.slip_learning.balance import body_balance
+from terrain.slip_learning.contacts import contact_slip
+from terrain.slip_learning.forces import ground_thrust, wheel_forces, wheel_loads
+from terrain.slip_learning.samples import traction_samples
 from terrain.terramechanics.soil import load_soil
 from terrain.terramechanics.traction import net_pull
 
@@ -34,19 +30,19 @@ def driven(terrain, drive, seed=0, controller=None, **conditions):
         conditions=Conditions(**conditions),
         controller=controller,
     )
-    return run, pull_of(run)
+    return run, forces_of(run)
 
 
-def pull_of(run):
+def forces_of(run):
     found = estimate_run(run, ROBOT, "vio15")
-    return wheel_pull(run, ROBOT, found.track, found.table, found.slip)
+    return wheel_forces(run, ROBOT, found.track, found.table, found.slip)
 
 
-def true_wheels(run, pull, pattern):
+def true_wheels(run, forces, pattern):
     truth = run.streams["truth"]
     rows = {str(i): truth.channel(pattern.format(i)) for i in (1, 2, 3)}
     lag_s = ROBOT.equipment.sensors.encoder_time_constant_s
-    return np.column_stack(list(on_clock(pull.time_s, truth.time_s, rows, lag_s).values()))
+    return np.column_stack(list(on_clock(forces.time_s, truth.time_s, rows, lag_s).values()))
 
 
 @pytest.fixture(scope="module")
@@ -54,62 +50,62 @@ def starts():
     return driven("grass", Drive("starts", 1.5, 1.2), roughness_factor=0.1)
 
 
-def test_thrust_load_and_slip_of_a_run_are_those_that_happened(starts):
-    run, pull = starts
+def test_thrust_load_and_slip_of_a_run_are_near_the_truth(starts):
+    run, forces = starts
     for found, pattern, tolerance in (
-        (pull.thrust_n, "traction_{}_n", 3.0),  # 1 % of the load; current noise alone is half of it
-        (pull.load_npkg * ROBOT.mass_kg, "normal_{}_n", 15.0),
-        (pull.slip_ratio, "slip_{}_ratio", 0.03),  # of the contact, 5 cm of way behind in a start
+        (forces.thrust_n, "traction_{}_n", 3.0),  # 1 % of the load; current noise alone is half of it
+        (forces.load_npkg * ROBOT.mass_kg, "normal_{}_n", 15.0),
+        (forces.slip_ratio, "slip_{}_ratio", 0.03),  # of the contact, 5 cm behind in a start
     ):
-        error = (found - true_wheels(run, pull, pattern))[pull.believed]
+        error = (found - true_wheels(run, forces, pattern))[forces.valid]
         assert len(error) > 1000
         assert abs(np.mean(error)) < tolerance / 3
         assert np.std(error) < 2 * tolerance
 
 
 def test_samples_lie_on_the_curve_of_the_soil(starts):
-    run, pull = starts
-    samples = pull_samples(pull, ROBOT.mass_kg, pull.on(run.labels, "grass"), 0.008)
+    run, forces = starts
+    samples = traction_samples(forces, ROBOT.mass_kg, forces.on_terrain(run.labels, "grass"), 0.008)
     body = ROBOT.equipment.body
     load_n = ROBOT.mass_kg * GRAVITY_MPS2 / 3
     geometry = ROBOT.wheel_radius_m, body.tyre_width_m, body.contact_length_m
     soil = load_soil("grass")
-    net = net_pull(soil, load_n, np.append(samples[:, 0], 0.0), *geometry) / load_n
+    net = net_pull(soil, load_n, np.append(samples.slip_ratio, 0.0), *geometry) / load_n
     true = net[:-1] - net[-1]
-    assert samples[:, 0].max() > 0.35
-    assert np.median(np.abs(samples[:, 2] / true - 1)[samples[:, 0] > 0.1]) < 0.05
+    assert samples.slip_ratio.max() > 0.35
+    assert np.median(np.abs(samples.traction_ratio / true - 1)[samples.slip_ratio > 0.1]) < 0.05
 
 
-def test_balance_finds_mass_and_resistance_of_a_laden_robot():
-    run, pull = driven("asphalt", Drive("starts", 1.5, 1.2), payload_kg=20.0)
-    found = body_balance(pull, ROBOT, pull.on(run.labels, "asphalt"))
+def test_balance_finds_mass_and_resistance_with_a_payload():
+    run, forces = driven("asphalt", Drive("starts", 1.5, 1.2), payload_kg=20.0)
+    found = body_balance(forces, ROBOT, forces.on_terrain(run.labels, "asphalt"))
     assert abs(found.mass_kg - 110.0) < 3 * found.mass_std_kg < 15.0
     assert abs(found.resistance_ratio - 0.015) < 2 * found.resistance_std
-    nowhere = body_balance(pull, ROBOT, np.zeros(len(pull.time_s), dtype=bool))
+    nowhere = body_balance(forces, ROBOT, np.zeros(len(forces.time_s), dtype=bool))
     assert np.isnan(nowhere.resistance_ratio)
     assert nowhere.mass_kg == ROBOT.mass_kg
 
 
-def test_a_robot_that_hardly_gets_on_is_not_weighed_by_it():
-    """On a steep slope of sand it digs in: a fifth of its mass would be found, and surely."""
+def test_mass_is_not_estimated_from_a_robot_that_hardly_moves():
+    """On a steep slope of sand it digs in: a fifth of its mass would be found, with a small error."""
     grade = Conditions(grade_ratio=(0.08, 0.0))
     run = simulate_run(ROBOT, "dry_sand", "starts", 2001, 5, vary=True, conditions=grade)
-    pull = pull_of(run)
-    found = body_balance(pull, ROBOT, pull.on(run.labels, "dry_sand"))
+    forces = forces_of(run)
+    found = body_balance(forces, ROBOT, forces.on_terrain(run.labels, "dry_sand"))
     assert abs(found.mass_kg - ROBOT.mass_kg) < 45.0
     assert found.resistance_ratio < 0.5
 
 
-def test_backing_counts_as_traction_and_a_slope_as_load():
+def test_reversing_counts_as_traction_and_a_slope_shifts_load():
     ahead = scenario_of(Drive("starts", 1.5, 1.0, 10.0), "grass")
     twist = -ahead.twist
     backward = type(ahead)("back", ahead.rate_hz, ahead.time_s, twist, ahead.patches)
     run = simulate(ROBOT, backward, {"grass": load_soil("grass")}, 0)
-    pull = pull_of(run)
-    good = pull.believed & (true_wheels(run, pull, "slip_{}_ratio") < -0.05)
+    forces = forces_of(run)
+    good = forces.valid & (true_wheels(run, forces, "slip_{}_ratio") < -0.05)
     assert good.sum() > 100
-    assert (pull.slip_ratio[good] > 0).all()
-    assert np.mean(pull.thrust_n[good] > 0) > 0.99
+    assert (forces.slip_ratio[good] > 0).all()
+    assert np.mean(forces.thrust_n[good] > 0) > 0.99
     climbing = wheel_loads(ROBOT, np.array([[1.0, 0.0, 9.7], [0.0, 1.0, 9.7]]))
     np.testing.assert_allclose(climbing.sum(axis=1), 9.7)
     assert climbing[0, 0] > climbing[0, 1]
@@ -118,12 +114,12 @@ def test_backing_counts_as_traction_and_a_slope_as_load():
     )  # the third wheel stands to the right: speeding up to the left loads it
 
 
-def test_hard_ground_is_swept_past_its_peak():
-    run, pull = driven("tiles", Drive("sweep", 1.0, 0.8, 20.0), controller=SlipSweep(ROBOT))
-    samples = pull_samples(pull, ROBOT.mass_kg, pull.on(run.labels, "tiles"), 0.008)
-    assert samples[:, 0].max() > 0.5
-    beyond = samples[:, 0] > 0.15
-    np.testing.assert_allclose(np.median(samples[beyond, 2]), 0.78, atol=0.03)
+def test_sweep_on_hard_terrain_passes_its_peak():
+    run, forces = driven("tiles", Drive("sweep", 1.0, 0.8, 20.0), controller=SlipSweep(ROBOT))
+    samples = traction_samples(forces, ROBOT.mass_kg, forces.on_terrain(run.labels, "tiles"), 0.008)
+    assert samples.slip_ratio.max() > 0.5
+    beyond = samples.slip_ratio > 0.15
+    np.testing.assert_allclose(np.median(samples.traction_ratio[beyond]), 0.78, atol=0.03)
 
 
 def test_contact_slip_settles_at_the_slip_ratio_over_its_relaxation_length():
@@ -141,14 +137,14 @@ def test_thrust_is_torque_less_friction_and_inertia():
     assert ground_thrust(-torque, -5.0, -3.0, 0.5, 0.15, 0.2) == pytest.approx(-100.0)
 
 
-def test_ground_beside_a_boundary_is_left_out_but_not_at_the_ends(starts):
-    _, pull = starts
-    end_s = pull.time_s[-1]
+def test_samples_after_a_change_of_terrain_are_left_out_but_not_at_the_ends(starts):
+    _, forces = starts
+    end_s = forces.time_s[-1]
     labels = (Label(0.0, 10.0, "grass"), Label(10.0, end_s + 1, "clay"))
-    grass, clay = pull.on(labels, "grass"), pull.on(labels, "clay")
+    grass, clay = forces.on_terrain(labels, "grass"), forces.on_terrain(labels, "clay")
     assert grass[0]
     assert clay[-1]
-    assert not (clay & (pull.time_s < 10.3 - 1e-9)).any()
+    assert not (clay & (forces.time_s < 10.3 - 1e-9)).any()
 
 
 @pytest.mark.parametrize(
@@ -158,17 +154,19 @@ def test_a_log_without_current_or_attitude_is_named(starts, stream, channel):
     run, _ = starts
     found = estimate_run(run, ROBOT, "vio15")
     streams = dict(run.streams)
-    told = streams.pop(stream)
+    removed = streams.pop(stream)
     if channel is not None:
-        kept = [i for i, name in enumerate(told.channels) if name != channel]
-        streams[stream] = Stream(told.time_s, told.values[:, kept], tuple(told.channels[i] for i in kept))
+        kept = [i for i, name in enumerate(removed.channels) if name != channel]
+        streams[stream] = Stream(
+            removed.time_s, removed.values[:, kept], tuple(removed.channels[i] for i in kept)
+        )
     bare = RunLog("bare", run.robot, streams, run.labels)
     with pytest.raises(DataError, match=f"run bare: stream '{stream}' has no channel '{channel or ''}"):
-        wheel_pull(bare, ROBOT, found.track, found.table, found.slip)
+        wheel_forces(bare, ROBOT, found.track, found.table, found.slip)
 
 
-def test_a_filter_without_slip_speeds_does_not_do(starts):
+def test_a_filter_without_slip_speeds_is_refused(starts):
     run, _ = starts
     found = estimate_run(run, ROBOT, "vio12")
     with pytest.raises(DataError, match="has no slip speeds"):
-        wheel_pull(run, ROBOT, found.track, found.table, found.slip)
+        wheel_forces(run, ROBOT, found.track, found.table, found.slip)

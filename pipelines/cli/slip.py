@@ -1,0 +1,26 @@
+"""The command learn-slip."""
+
+from __future__ import annotations
+
+import typer
+
+from pipelines.cli.command import Json, command
+from pipelines.runs.settings import load
+from pipelines.slip.settings import LearnSlipSettings
+
+app = typer.Typer()
+
+
+@command(app, "learn-slip")
+def learn_slip_command(settings: LearnSlipSettings, json_file: Json = None) -> None:
+    """Learn slip curves of labelled runs, and the target slip on each terrain."""
+    from pipelines.reporting.json_file import write_json
+    from pipelines.reporting.terminal import output_console, progress_bar
+    from pipelines.slip.learn_slip import learn_slip
+    from pipelines.slip.screen import print_learned_slip
+
+    runs, skipped = load(settings)
+    with progress_bar() as progress:
+        result = learn_slip(runs, settings, skipped, progress)
+    print_learned_slip(result, output_console())
+    write_json(json_file, result)

@@ -1,0 +1,17 @@
+"""Settings of ``terrain learn-slip``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pipelines.config.settings import setting
+from pipelines.runs.settings import RunsSettings
+
+
+class LearnSlipSettings(RunsSettings):
+    """Labelled runs of one robot, and what is written."""
+
+    robot: str = setting(..., "Swerve robot by name, or its YAML file.")
+    out: Path = setting(..., "YAML file of the table of target slips.")
+    figures: Path | None = setting(None, "Folder of a page and its pictures; MLflow gets them anyway.")
+    seed: int = setting(0, "Of the bootstrap.", ge=0)

@@ -1,0 +1,112 @@
+"""The table of target slips of the terrains that were learned."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from statistics import median_low
+
+from terrain.control.slip_table import DRIVE_STATES, SIGN, CurveEntry, SlipTable, load_slip_table
+from terrain.records import SlipTarget, TargetStatus
+from terrain.robots import Robot
+from terrain.slip_learning.curve import SlipCurve
+from terrain.slip_learning.laws import LAW_PARAMETERS
+from terrain.slip_learning.learn import LearnedTerrain
+from terrain.slip_learning.targets import Targets, energy_jpm, tractive_efficiency
+
+FALLBACK = "unknown"
+DIGITS = 4
+"""Of slips and ratios of forces in the table: a hundredth of their standard deviation."""
+
+
+def learned_table(learned: Sequence[LearnedTerrain], robot: Robot, name: str) -> SlipTable:
+    """Return the table: learned numbers, assumed ones where nothing was learned, and the fallback.
+
+    The fallback is for a terrain without an entry: of each drive state the lower median of the estimated
+    terrains' numbers, and the packaged table's own without any.  The least of them would not do: on soft
+    terrain the slip for tiles would not overcome the resistance.
+
+    Parameters
+    ----------
+    learned : of each terrain
+    robot : that drove
+    name : of the table
+    """
+    default = load_slip_table()
+    targets: dict[str, Mapping[str, SlipTarget]] = {}
+    curves, reasons = {}, {}
+    for entry in learned:
+        if entry.curve is not None and entry.targets is not None:
+            targets[entry.terrain] = _estimated(entry.terrain, entry.targets, entry.curve.n_runs)
+            curves[entry.terrain] = curve_entry(entry.curve, entry.targets, robot)
+        else:
+            targets[entry.terrain] = _assumed(entry, default)
+            reasons[entry.terrain] = entry.reason
+    reasons.setdefault(FALLBACK, "used for a terrain without an entry")
+    targets.setdefault(FALLBACK, _fallback(targets, default))
+    return SlipTable(name, FALLBACK, targets, robot.name, curves, reasons)
+
+
+def _estimated(terrain: str, targets: Targets, n_runs: int) -> dict[str, SlipTarget]:
+    found = {}
+    for state in DRIVE_STATES:
+        slip, std, source = targets.of(state)
+        numbers = round(slip, DIGITS), round(std, DIGITS), n_runs
+        found[state] = SlipTarget(terrain, state, *numbers, TargetStatus.ESTIMATED, source)
+    return found
+
+
+def _assumed(entry: LearnedTerrain, default: SlipTable) -> dict[str, SlipTarget]:
+    found = {}
+    for state, assumed in default.lookup(entry.terrain).items():
+        source = f"table {default.name}, {assumed.terrain}: {assumed.source}"
+        numbers = assumed.slip_ratio, math.nan, 0
+        found[state] = SlipTarget(entry.terrain, state, *numbers, entry.status, source)
+    return found
+
+
+def _fallback(targets: Mapping[str, Mapping[str, SlipTarget]], default: SlipTable) -> dict[str, SlipTarget]:
+    estimated = [
+        by_state for by_state in targets.values() if by_state["traction"].status is TargetStatus.ESTIMATED
+    ]
+    chosen = {}
+    for state in DRIVE_STATES:
+        if estimated:
+            slip = SIGN[state] * median_low(abs(by_state[state].slip_ratio) for by_state in estimated)
+            source = "lower median of the terrains estimated here"
+        else:
+            slip = default.targets[default.fallback][state].slip_ratio
+            source = f"table {default.name}, its fallback"
+        chosen[state] = SlipTarget(FALLBACK, state, slip, math.nan, 0, TargetStatus.UNESTIMATED, source)
+    return chosen
+
+
+def curve_entry(curve: SlipCurve, targets: Targets, robot: Robot) -> CurveEntry:
+    """Return what the table holds of a curve, rounded."""
+    energy = {
+        state: round(energy_jpm(curve, targets.of(state).slip_ratio, robot), 1) for state in DRIVE_STATES
+    }
+    named = zip(LAW_PARAMETERS[curve.law], curve.parameters, strict=True)
+    working = targets.working_slip_ratio
+    return CurveEntry(
+        law=curve.law,
+        parameters={name: round(value, DIGITS + 1) for name, value in named},
+        peak_slip_ratio=round(curve.peak.slip_ratio, DIGITS),
+        peak_interval_ratio=_rounded(curve.peak_interval),
+        peak_status=curve.peak.status,
+        slip_range_ratio=_rounded(curve.slip_range),
+        resistance_ratio=round(curve.resistance_ratio, DIGITS),
+        resistance_std=round(curve.resistance_std, DIGITS),
+        balance_slip_ratio=round(curve.balance_slip_ratio, DIGITS),
+        peak_based_slip_ratio=round(targets.peak_based_slip_ratio, DIGITS),
+        working_slip_ratio=None if math.isnan(working) else round(working, DIGITS),
+        traction_efficiency_ratio=round(tractive_efficiency(curve, targets.traction.slip_ratio), 3),
+        traction_energy_jpm=energy["traction"],
+        braking_energy_jpm=energy["braking"],
+        steady_energy_jpm=energy["steady"],
+        n_runs=curve.n_runs,
+    )
+
+
+def _rounded(pair: tuple[float, float]) -> tuple[float, float]:
+    return round(pair[0], DIGITS), round(pair[1], DIGITS)

@@ -1,0 +1,139 @@
+"""What is learned of a terrain: measurements of each run, the slip curve and the target slips."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from terrain.errors import DataError
+from terrain.estimation.estimate import filter_run
+from terrain.estimation.wheel_slip import wheel_speed_scatter_mps
+from terrain.extension import correct
+from terrain.records import RunLog, TargetStatus
+from terrain.robots import Robot
+from terrain.slip_learning.balance import Balance, body_balance
+from terrain.slip_learning.curve import (
+    N_BOOTSTRAP,
+    Resistances,
+    SlipCurve,
+    contradiction,
+    insufficiency,
+    learn_curve,
+)
+from terrain.slip_learning.forces import wheel_forces
+from terrain.slip_learning.samples import RunBins, run_bins, slip_range, traction_samples
+from terrain.slip_learning.targets import Targets, targets_of
+
+FILTER = "vio15"
+"""Filter whose state holds the slip speed of each wheel."""
+
+
+class TerrainRun(NamedTuple):
+    """Measurements of one run on one terrain.
+
+    Parameters
+    ----------
+    run_id, terrain : of the run
+    bins : mean slip and thrust over load
+    balance : mass and resistance
+    left_out : number of samples that do not meet each condition of :class:`WheelForces`
+    n_samples : behind the bins
+    """
+
+    run_id: str
+    terrain: str
+    bins: RunBins
+    balance: Balance
+    left_out: Mapping[str, int]
+    n_samples: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LearnedTerrain:
+    """What was learned of one terrain.
+
+    Parameters
+    ----------
+    terrain : its name
+    runs : on it
+    status : whether the targets are learned
+    reason : why ``curve`` or ``targets`` are None; empty otherwise
+    curve : None where the runs do not suffice for one
+    targets : None without a curve, or where the curve contradicts itself
+    """
+
+    terrain: str
+    runs: tuple[TerrainRun, ...]
+    status: TargetStatus
+    reason: str = ""
+    curve: SlipCurve | None = None
+    targets: Targets | None = None
+
+    @property
+    def runs_with_bins(self) -> tuple[TerrainRun, ...]:
+        """Runs with at least one bin of slip."""
+        return tuple(run for run in self.runs if len(run.bins.slip_ratio))
+
+    @property
+    def slip_range(self) -> tuple[float, float]:
+        """Smallest and largest slip that two runs or more reach; NaN where no two runs have bins."""
+        return slip_range([run.bins for run in self.runs_with_bins])
+
+
+def terrain_runs(run: RunLog, robot: Robot) -> list[TerrainRun]:
+    """Return the measurements of a run on each terrain that it is labelled with.
+
+    Raises
+    ------
+    DataError
+        if it is another robot's, or lacks currents or attitude.
+    """
+    if run.robot != robot.name:
+        raise DataError(
+            f"run {run.run_id} is of robot {run.robot!r}: a table is learned for one, {robot.name!r}"
+        )
+    run, robot = correct(run, robot)
+    found = filter_run(run, robot, FILTER)
+    forces = wheel_forces(run, robot, found.track, found.table, found.slip)
+    speed_std_mps = wheel_speed_scatter_mps(robot)
+    measured = []
+    for terrain in run.terrains:
+        where = forces.on_terrain(run.labels, terrain)
+        balance = body_balance(forces, robot, where)
+        samples = traction_samples(forces, balance.mass_kg, where, speed_std_mps)
+        left_out = {name: int((~met[where]).sum()) for name, met in forces.conditions.items()}
+        bins, n = run_bins(run.run_id, samples), len(samples.slip_ratio)
+        measured.append(TerrainRun(run.run_id, terrain, bins, balance, left_out, n))
+    return measured
+
+
+def learn_terrain(
+    terrain: str, runs: Sequence[TerrainRun], seed: int, n_bootstrap: int = N_BOOTSTRAP
+) -> LearnedTerrain:
+    """Return what runs show of one terrain; a curve is fitted only where they suffice for one.
+
+    Parameters
+    ----------
+    terrain : its name
+    runs : on it
+    seed : of the bootstrap
+    n_bootstrap : how many draws of runs
+    """
+    with_bins = [run for run in runs if len(run.bins.slip_ratio)]
+    bins = [run.bins for run in with_bins]
+    resistances = Resistances(
+        np.array([run.balance.resistance_ratio for run in with_bins]),
+        np.array([run.balance.resistance_std for run in with_bins]),
+    )
+    why = insufficiency(bins)
+    if why is None and not resistances.known.any():
+        why = "no run has straight driving of sufficient length for an estimate of the resistance"
+    if why is not None:
+        return LearnedTerrain(terrain, tuple(runs), TargetStatus.UNESTIMATED, why)
+    curve = learn_curve(bins, resistances, np.random.default_rng(seed), n_bootstrap)
+    if (why := contradiction(curve)) is not None:
+        return LearnedTerrain(terrain, tuple(runs), TargetStatus.INVALID, why, curve)
+    return LearnedTerrain(terrain, tuple(runs), TargetStatus.ESTIMATED, "", curve, targets_of(curve))
