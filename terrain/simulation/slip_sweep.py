@@ -1,9 +1,9 @@
-"""Drives in simulation that take the wheels through their slips, for learning the curve of a terrain.
+"""Simulated drives that take the wheels through a range of slips, for learning the curve of a terrain.
 
 Each covers a part: *starts* at several accelerations, down to a step of the command in which the wheels spin
-and the robot gathers speed through the whole curve; *climbs* over ground that rises and falls, slowly;
+and the robot accelerates through the whole curve; *climbs* over terrain that rises and falls, slowly;
 *sweeps* in which one wheel of the long side turns ever faster than the robot drives and the others hold it
-back, which shows the curve on ground so hard that no start would, with no load moved and at leisure.
+back: they show the curve on terrain so hard that no start would, without load transfer and slowly.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from terrain.simulation.scenario.scenario import RATE_HZ, Patch, Scenario
 from terrain.terramechanics.soil import load_soil, scattered
 
 SWEEP_SLIP = 0.75
-"""Farthest slip that a wheel is sent to."""
+"""Largest slip of the swept wheel."""
 
 SWEEP_S = 6.0
-"""From no slip to the farthest and back."""
+"""From no slip to the largest and back."""
 
 SWEEP_SPEED_MPS = 0.8
 """Of a sweep: the swept wheel stays within its motor's speed up to a slip of 0.6."""
@@ -34,7 +34,7 @@ STEADY_S = 3.0
 
 
 class Drive(NamedTuple):
-    """Kind of a drive (``starts``, ``climb``, ``sweep``), acceleration, speed and the ground's gradient."""
+    """Kind of a drive (``starts``, ``climb``, ``sweep``), acceleration, speed and the terrain's gradient."""
 
     kind: str
     accel_mps2: float
@@ -54,20 +54,20 @@ LEARNING_DRIVES: tuple[Drive, ...] = (
     Drive("starts", 40.0, 1.8),
     Drive("climb", 2.0, 1.2, 30.0, 0.1, 0.08),
 )
-"""Eight runs that between them see slips from 0 to over 0.5 on every soil."""
+"""Eight runs that together cover slips from 0 to over 0.5 on every soil."""
 
 
 def learning_runs(
     robot: Robot, terrain: str, seed: int, drives: tuple[Drive, ...] = LEARNING_DRIVES
 ) -> list[RunLog]:
-    """Return one run a drive, with soil, load, slope, tyres and roughness drawn anew for each.
+    """Return one run a drive, with soil, load, slope, tyres and roughness drawn for each.
 
     Parameters
     ----------
     robot : swerve robot with all sections
     terrain : name of a soil or path of its YAML file
     seed : of everything that is drawn
-    drives : what is driven
+    drives : one a run
     """
     return [learning_run(robot, terrain, seed, number, drive) for number, drive in enumerate(drives, start=1)]
 
@@ -86,7 +86,7 @@ def learning_run(
     ----------
     robot, terrain, seed : as for :func:`learning_runs`
     number : from 1 on
-    drive : by default that of :data:`LEARNING_DRIVES` whose turn it is, again and again
+    drive : by default those of :data:`LEARNING_DRIVES` in turn
     run_id : named after terrain, drive and number by default
     """
     if drive is None:
@@ -109,7 +109,7 @@ def learning_run(
 
 
 def scenario_of(drive: Drive, terrain: str) -> Scenario:
-    """Return what is driven: straight ahead from rest, once or, of ``starts``, again and again.
+    """Return the scenario: straight ahead from rest, once, or repeatedly for ``starts``.
 
     Examples
     --------
@@ -131,11 +131,11 @@ def scenario_of(drive: Drive, terrain: str) -> Scenario:
 
 
 class SlipSweep:
-    """A controller that drives straight ahead and sends one wheel after the other through its slips.
+    """A controller that drives straight ahead and takes one wheel after the other through a range of slips.
 
     The wheels in turn are those in line with the direction of motion: their pull against each other turns the
     robot little. The command is ``w = v / (r (1 - s))`` with a slip s that rises to :data:`SWEEP_SLIP` and
-    falls again; the robot is held by its other wheels, so that the slip is nearly as commanded.
+    falls again; the other wheels hold the robot, so that the slip is nearly as commanded.
     """
 
     def __init__(self, robot: Robot) -> None:
