@@ -9,7 +9,7 @@ specific force f = a + g up (the reading of an ideal accelerometer)::
 
 The torque constant kt, the reduction n and the efficiency eta are those of the robot's description.  The
 efficiency is taken as one factor between current and torque, driving and driven alike, as in
-:mod:`terrain.simulation.sensors`; a reduction that is driven by its wheel has it the other way round, so that
+:mod:`terrain.simulation.sensors`; with a reduction that is driven by its wheel it is reversed, so that
 braking forces of a real robot come out too small by about its square.
 
 Slips have passed the encoders' low-pass filter, the current has not: everything goes through the same filter.
@@ -79,7 +79,7 @@ RATE_SMOOTHING_S = 0.06
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WheelForces:
-    """Thrust, load and slip of each wheel over a run; positive in traction whichever way a wheel rolls.
+    """Thrust, load and slip of each wheel over a run; positive in traction, forward or in reverse.
 
     Parameters
     ----------

@@ -11,8 +11,7 @@ resistance over load rho.  Its peak slip is
 
 Its 90 % interval is from a bootstrap over whole runs, so that it contains what differs from run to run,
 whether or not a factor describes it; percentiles are taken further out as a few runs demand (expanded
-percentile interval; Hesterberg, What teachers should know about the bootstrap, American Statistician 69,
-2015).
+percentile interval; Hesterberg, American Statistician 69 (4), 371-386, 2015).
 """
 
 from __future__ import annotations
@@ -119,7 +118,7 @@ def peak_interval(
 def _shape_std(thrust_ratio: Callable[[Array], Array], peak: Peak, high_slip: float) -> float:
     """Return how far a tilt of the curve by :data:`SHAPE_STD_RATIO` moves a peak or the slip at 95 %.
 
-    Near a peak ``f = f_0 (1 - a (s - s_0)^2)``, with a by what f has lost a third of the way back; the tilt
+    Near a peak ``f = f_0 (1 - a (s - s_0)^2)``, with a by the thrust at two thirds of s_0; the tilt
     is over the peak's slip.  Without a peak, the tilt over the observed slips raises f here against f there.
     """
     slip = peak.slip_ratio

@@ -13,7 +13,7 @@ def curve(law, *parameters, resistance=0.02):
     return CurveEntry(law, named, *numbers, 5)
 
 
-def test_slick_ground_whose_thrust_falls_is_braked_at_its_peak():
+def test_slick_terrain_with_falling_thrust_is_braked_at_its_peak():
     """D sin(C atan(B s)) without curvature has its peak D where C atan(B s) is a right angle."""
     b, c, d = 25.0, 1.5, 0.3
     braking = braking_by_slip(curve("magic", b, c, d, 0.0))

@@ -240,11 +240,11 @@ CURVE = (*SAND, "curve")
         ((*CURVE, "extra"), 1, "key 'extra' is unknown"),
     ],
 )
-def test_a_learned_table_that_is_not_accepted_is_told_in_one_sentence(tmp_path, place, value, fault):
+def test_a_learned_table_that_is_not_accepted_is_refused_in_one_sentence(tmp_path, place, value, fault):
     path = write(tmp_path, learned_with(place, value))
-    with pytest.raises(ConfigError, match=rf"table\.yaml.*{fault}") as told:
+    with pytest.raises(ConfigError, match=rf"table\.yaml.*{fault}") as refusal:
         load_slip_table(path, robot="agrimaro")
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(refusal.value)
 
 
 def test_a_key_given_twice_is_refused(tmp_path):
@@ -253,7 +253,7 @@ def test_a_key_given_twice_is_refused(tmp_path):
         load_slip_table(write(tmp_path, text))
 
 
-def test_an_old_table_is_nobodys_and_must_rise_too(tmp_path):
+def test_a_table_of_schema_1_is_for_any_robot_and_must_rise_too(tmp_path):
     assert load_slip_table(write(tmp_path, table_with()), robot="agrimaro").robot == ""
     falling = table_with(slip_ratio=0.1)
     falling["terrains"]["SNOW"]["steady"]["slip_ratio"] = 0.2
