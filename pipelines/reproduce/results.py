@@ -1,4 +1,4 @@
-"""What a reproduced paper gives: rows of comparison, figures, and the verdict on each row."""
+"""Results of a reproduced paper: rows of comparison, figures, and the verdict on each row."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SAME = 1e-9
-"""Relative difference that is rounding."""
+"""Relative difference up to which two numbers are equal but for rounding."""
 
 
 class Verdict(StrEnum):
-    """What can come of a comparison."""
+    """Result of a comparison."""
 
     AS_PRINTED = "as printed"
     DIFFERS = "differs"
@@ -28,10 +28,10 @@ class Verdict(StrEnum):
 
 MEANINGS: Mapping[Verdict, str] = {
     Verdict.AS_PRINTED: "the simulation agrees with what the paper prints",
-    Verdict.DIFFERS: "the simulation does not agree; the row states what is known of the reason",
-    Verdict.CORRECTED: "the paper prints an error, which the row names; the result here is the right form",
-    Verdict.ASSUMED: "the simulation agrees, but rests on numbers that were fitted to this very figure: no "
-    "independent check",
+    Verdict.DIFFERS: "the simulation does not agree; the row states the reason as far as it is known",
+    Verdict.CORRECTED: "the paper prints an error, which the row names; the result here is by the right form",
+    Verdict.ASSUMED: "the simulation agrees, but depends on parameters that were fitted to this figure: "
+    "not an independent check",
     Verdict.NOT_PRINTED: "the paper has no figure for it",
 }
 
@@ -58,16 +58,16 @@ class Row:
 
     Parameters
     ----------
-    what : was measured
+    what : the quantity
     where : section, equation or figure of the paper
-    printed : the paper's figure, or its claim in other words
+    printed : the paper's figure, or its claim in words
     simulated : the number, over several runs their mean
     unit : of all numbers of the row
     verdict : on the comparison
-    why : a sentence
+    why : a sentence that explains the verdict
     printed_interval : (low, high) of the paper's figure where it is one number (twice) or an interval
     spread : (low, high) of the simulation over the runs, where there were several
-    beside : what else was measured with it, by name
+    beside : related numbers, by name
 
     Raises
     ------
@@ -99,28 +99,28 @@ class Row:
 
 
 class Picture(NamedTuple):
-    """A figure with what to see in it."""
+    """A figure and its caption."""
 
     caption: str
     figure: Figure
 
 
 class Finding(NamedTuple):
-    """What an experiment gave."""
+    """Rows and figures of an experiment."""
 
     rows: Sequence[Row]
     pictures: Sequence[Picture] = ()
 
 
 class Experiment(NamedTuple):
-    """``run(seed, quick)`` does the work; ``quick`` takes fewer and shorter runs and changes nothing else."""
+    """An experiment; ``run(seed, quick)`` returns its finding, ``quick`` makes runs fewer and shorter."""
 
     title: str
     run: Callable[[int, bool], Finding]
 
 
 class AssumedNumber(NamedTuple):
-    """A number of a description that is neither the paper's nor measured."""
+    """A number of a description that is neither printed in the paper nor measured."""
 
     file: str
     name: str
@@ -144,7 +144,7 @@ class ExperimentRow(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Reproduction:
-    """What ``terrain reproduce`` found; its fields are the keys of ``--json``.
+    """Result of ``terrain reproduce``; its fields are the keys of ``--json``.
 
     Parameters
     ----------
@@ -183,8 +183,8 @@ def verdict_of(
 
     Notes
     -----
-    An interval has to hold the mean.  One printed number comes of one run: it agrees if it lies within the
-    spread of the simulated runs.  Without a spread the two have to be equal.
+    A printed interval has to contain the mean.  A single printed number is of one run: it agrees if it lies
+    within the spread of the simulated runs.  Without a spread the two have to be equal.
 
     Examples
     --------
@@ -202,7 +202,7 @@ def verdict_of(
 
 
 def holds(claim: bool) -> Verdict:
-    """Return the verdict on a claim that is no number.
+    """Return the verdict on a claim without a number.
 
     Examples
     --------
@@ -213,9 +213,9 @@ def holds(claim: bool) -> Verdict:
 
 
 def equation_verdict(simulated: float, right: float, printed: float) -> Verdict:
-    """Return the verdict on an equation whose right result is known.
+    """Return the verdict on an equation whose correct result is known.
 
-    ``corrected`` where the simulation alone gives the right result.
+    It is ``corrected`` where only the simulation gives the correct result.
 
     Examples
     --------

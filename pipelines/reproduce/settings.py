@@ -8,7 +8,7 @@ from pipelines.config.settings import Settings, setting
 
 
 class ReproduceSettings(Settings):
-    """Where the page goes, and what is drawn."""
+    """Folder of the page, and the seed of all runs."""
 
     out: Path = setting(Path("terrain-reproduce"), "Folder of the page.")
-    seed: int = setting(0, "Of all runs.", ge=0)
+    seed: int = setting(0, "Seed of all runs.", ge=0)

@@ -1,31 +1,55 @@
-"""What experiments of papers share: seeded runs, the truth beside a filter, means over runs, line figures."""
+"""What the experiments of a paper share: seeded runs, the true slip, means over runs, line figures."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from pipelines.reporting.drawing import finished, new_figure, styled
-from terrain.estimation.estimate import Estimate
+from terrain.estimation.estimate import Estimate, estimate_run
 from terrain.estimation.reference import lagged_slip, lagged_slip_at
-from terrain.estimation.slip_figures import slip_figures
+from terrain.estimation.slip_figures import STEADY_SPEED_MPS, slip_figures
 from terrain.records import Array, RunLog
 from terrain.robots import Robot
 from terrain.simulation.conditions import Faults
 from terrain.simulation.run import simulate_run
 from terrain.simulation.scenario.legs import STAND_S
 
+ROBOT = "agrimaro"
 RUNS, FEW_RUNS = 5, 2
-"""How many runs a figure is the mean of, and how many when it is only tried out."""
-
+"""Number of runs that a figure is averaged over, and the number with ``quick``."""
 START_S = (STAND_S, STAND_S + 2.0)
-"""The 1 m/s^2 start of the scenario ``straight``, and a second to settle."""
+"""The start of the scenario ``straight`` at 1 m/s^2, and one second to settle."""
+NO_SLIP_RATIO = 0.01
+"""Slip that the thesis measures on tiles and regards as zero (7.2.3)."""
 
-Curve = tuple[Array, Array, Array]
-"""Times (n,), slip (n, wheels) and the speed ahead (n,) in m/s."""
+
+class Curve(NamedTuple):
+    """Times (n,) in s, slip ratio (n, wheels) and forward speed (n,) in m/s."""
+
+    time_s: Array
+    slip_ratio: Array
+    speed_mps: Array
+
+
+class Line(NamedTuple):
+    """A line of a figure: times (n,) in s, values (n,), colour and label."""
+
+    time_s: Array
+    values: Array
+    colour: str
+    label: str
+
+
+class OverRuns(NamedTuple):
+    """Mean of a number over several runs, and its range (lowest, highest)."""
+
+    mean: float
+    spread: tuple[float, float]
 
 
 def seeded_runs(
@@ -37,7 +61,7 @@ def seeded_runs(
     duration_s: float | None = None,
     faults: Faults | None = None,
 ) -> list[RunLog]:
-    """Return runs that differ in what is drawn; arguments as for ``simulate_run``."""
+    """Return runs that differ in their random draws; arguments as for ``simulate_run``."""
     numbers = range(1, 1 + (FEW_RUNS if quick else RUNS))
     return [
         simulate_run(robot, terrain, scenario, seed, number, duration_s=duration_s, faults=faults)
@@ -45,61 +69,79 @@ def seeded_runs(
     ]
 
 
-def curve_of(found: Estimate) -> Curve:
-    """Return the slip that a filter found."""
-    return found.track.time_s, found.slip.slip_ratio, found.track.state("speed_x_mps")
+def estimate_with_both_filters(runs: Sequence[RunLog], robot: Robot) -> tuple[list[Estimate], list[Estimate]]:
+    """Return the estimates of the thesis' filter with its own noise, and of vio15 with physical noise."""
+    return (
+        [estimate_run(run, robot, "vio12", tuning="thesis") for run in runs],
+        [estimate_run(run, robot, "vio15", tuning="physical") for run in runs],
+    )
+
+
+def curve_of(estimate: Estimate) -> Curve:
+    """Return the slip that a filter estimated."""
+    return Curve(estimate.track.time_s, estimate.slip.slip_ratio, estimate.track.state("speed_x_mps"))
 
 
 def lagged_truth(run: RunLog, robot: Robot) -> Curve:
-    """Return the true slip behind the encoders' low-pass: the best that can be estimated."""
+    """Return the true slip after the low-pass filter of the encoders: the best that can be estimated."""
     truth = run.streams["truth"]
     lag_s = robot.equipment.sensors.encoder_time_constant_s
-    slip, ground = lagged_slip(truth, robot, lag_s)
-    return truth.time_s, slip, ground.mean(axis=1)
+    slip, ground_speed = lagged_slip(truth, robot, lag_s)
+    return Curve(truth.time_s, slip, ground_speed.mean(axis=1))
 
 
-def true_slip(found: Estimate) -> Array:
-    """Return :func:`lagged_truth` (n, wheels) at the instants of a filter."""
-    return lagged_slip_at(found.run, found.robot, found.track.time_s)
+def true_slip(estimate: Estimate) -> Array:
+    """Return :func:`lagged_truth` (n, wheels) at the sample times of a filter."""
+    return lagged_slip_at(estimate.run, estimate.robot, estimate.track.time_s)
 
 
-def steady_mean(slip: Array, found: Estimate) -> float:
-    """Return the mean over wheels of a slip (n, wheels) while the robot, in truth, drove steadily."""
-    truth = found.run.streams["truth"]
-    steady = slip_figures(found.blind, truth.channel("speed_x_mps"), truth.time_s).steady
+def steady_mean(slip: Array, estimate: Estimate) -> float:
+    """Return the mean over the wheels of a slip (n, wheels) while the true speed is steady."""
+    truth = estimate.run.streams["truth"]
+    steady = slip_figures(estimate.blind, truth.channel("speed_x_mps"), truth.time_s).steady
     return float(np.nanmean(slip[steady]))
 
 
-def mean_between(slip: Array, found: Estimate, start_s: float, end_s: float) -> float:
-    """Return the mean over wheels of a slip (n, wheels) from one time to another."""
-    return float(np.nanmean(slip[(found.track.time_s >= start_s) & (found.track.time_s < end_s)]))
+def mean_between(slip: Array, estimate: Estimate, start_s: float, end_s: float) -> float:
+    """Return the mean over the wheels of a slip (n, wheels) between two times."""
+    time_s = estimate.track.time_s
+    return float(np.nanmean(slip[(time_s >= start_s) & (time_s < end_s)]))
 
 
-def over_runs(values: Sequence[float]) -> tuple[float, tuple[float, float]]:
+def extreme_in_start(
+    curve: Curve, extreme: Callable[[Array], float], above_mps: float = STEADY_SPEED_MPS
+) -> float:
+    """Return the smallest or largest slip during the start, at speeds above ``above_mps``."""
+    chosen = (curve.time_s > START_S[0]) & (curve.time_s < START_S[1]) & (curve.speed_mps > above_mps)
+    values = curve.slip_ratio[chosen]
+    return float(extreme(values[np.isfinite(values)]))
+
+
+def over_runs(values: Sequence[float]) -> OverRuns:
     """Return the mean over runs and their range.
 
     Examples
     --------
     >>> over_runs([1.0, 2.0, 6.0])
-    (3.0, (1.0, 6.0))
+    OverRuns(mean=3.0, spread=(1.0, 6.0))
     """
-    return float(np.mean(values)), (float(np.min(values)), float(np.max(values)))
+    return OverRuns(float(np.mean(values)), (float(np.min(values)), float(np.max(values))))
 
 
 def lines_figure(
     title: str,
     y_label: str,
-    lines: Sequence[tuple[Array, Array, str, str]],
-    below: Callable[[Axes], object] | None = None,
+    lines: Sequence[Line],
+    draw_background: Callable[[Axes], object] | None = None,
 ) -> Figure:
-    """Draw lines over time, each (times, values, colour, label), on what ``below`` draws first."""
+    """Draw lines over time, on top of what ``draw_background`` draws."""
     with styled():
         figure = new_figure(8.4, 3.8)
         axes = figure.add_subplot()
-        if below is not None:
-            below(axes)
-        for time_s, values, colour, label in lines:
-            axes.plot(time_s, values, color=colour, lw=1.2, label=label)
+        if draw_background is not None:
+            draw_background(axes)
+        for line in lines:
+            axes.plot(line.time_s, line.values, color=line.colour, lw=1.2, label=line.label)
         axes.set(xlabel="time [s]", ylabel=y_label)
         add_legend(axes)
         return finished(figure, title)

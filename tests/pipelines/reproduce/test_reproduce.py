@@ -1,4 +1,4 @@
-"""Rows are whole and judged fairly, the page stands alone, and the experiments come out as they should."""
+"""Rows are complete, verdicts correct, the page self-contained; experiments give the known results."""
 
 import io
 import json
@@ -14,8 +14,10 @@ from rich.console import Console
 
 from pipelines.reporting.json_file import as_json
 from pipelines.reproduce import reproduce as frame
-from pipelines.reproduce.danzi.experiments import EXPERIMENTS, straight_line_rank
-from pipelines.reproduce.danzi.slip import camera_lost, known_bias
+from pipelines.reproduce.danzi.camera_lost import camera_lost
+from pipelines.reproduce.danzi.experiments import EXPERIMENTS
+from pipelines.reproduce.danzi.observability import straight_line_rank
+from pipelines.reproduce.danzi.slip_bias import slip_bias
 from pipelines.reproduce.papers import PAPERS, assumed_numbers
 from pipelines.reproduce.reproduce import reproduce
 from pipelines.reproduce.results import Experiment, Finding, Paper, Picture, Row, Verdict, verdict_of
@@ -90,7 +92,7 @@ def danzi(folder):
 
 @pytest.fixture(scope="module")
 def document(danzi):
-    """The same as JSON has it."""
+    """The same as JSON."""
     return as_json(danzi)
 
 
@@ -119,21 +121,21 @@ def moor(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("ours", "printed", "spread", "verdict"),
+    ("simulated", "printed", "spread", "verdict"),
     [
         (1.0, (1.0, 2.0), None, "as printed"),
         (2.0, (1.0, 2.0), None, "as printed"),
         (2.1, (1.0, 2.0), None, "differs"),
-        (2.1, (1.0, 2.0), (1.5, 2.7), "differs"),  # an interval is asked for the mean
-        (2.1, (1.6, 1.6), (1.5, 2.7), "as printed"),  # one printed number might have been one of our runs
+        (2.1, (1.0, 2.0), (1.5, 2.7), "differs"),  # an interval is compared with the mean
+        (2.1, (1.6, 1.6), (1.5, 2.7), "as printed"),  # one printed number is of one run
         (2.1, (1.4, 1.4), (1.5, 2.7), "differs"),
         (0.1 + 0.2, (0.3, 0.3), None, "as printed"),
         (-0.3, (-0.5, -0.1), None, "as printed"),
         (0.0, (0.0, 0.0), None, "as printed"),
     ],
 )
-def test_a_number_agrees_inside_what_is_printed(ours, printed, spread, verdict):
-    assert verdict_of(ours, printed, spread) == verdict
+def test_a_number_agrees_inside_what_is_printed(simulated, printed, spread, verdict):
+    assert verdict_of(simulated, printed, spread) == verdict
 
 
 @pytest.mark.parametrize(
@@ -148,7 +150,7 @@ def test_a_number_agrees_inside_what_is_printed(ours, printed, spread, verdict):
         {"printed_interval": (math.nan, 1.0)},
     ],
 )
-def test_a_row_that_says_nothing_is_refused(fault):
+def test_an_incomplete_row_is_refused(fault):
     with pytest.raises(ValueError, match=r"^row "):
         row(**fault)
 
@@ -183,13 +185,13 @@ def test_a_page_is_self_contained_and_escapes(moor, tmp_path):
     assert "1 differs" in shown
 
 
-def test_assumed_numbers_are_those_whose_sources_say_so():
+def test_assumed_numbers_are_those_with_an_assumed_source():
     names = {number.name for number in assumed_numbers([("robots", "agrimaro"), ("soils", "grass")])}
     assert {"mass_kg", "wheel_radius_m", "sensors.wheels_rate_hz", "friction_angle_rad"} <= names
     assert not {"track_m", "steering.dead_band_rad", "camera.lever_x_m"} & names
 
 
-def test_every_experiment_gives_whole_rows_and_a_page(danzi, document, folder):
+def test_every_experiment_gives_complete_rows_and_a_page(danzi, document, folder):
     assert json.loads(json.dumps(document, allow_nan=False)) == document
     assert {found["experiment"] for found in document["rows"]} == {one.title for one in EXPERIMENTS}
     whole = set(Row.__dataclass_fields__) | {"experiment"}
@@ -209,7 +211,7 @@ def find(result, pattern):
     return [found for found in result["rows"] if re.search(pattern, found["what"])]
 
 
-def test_what_the_thesis_prints_wrongly_is_corrected(document):
+def test_errors_of_the_thesis_are_corrected(document):
     (turn,) = find(document, "sharpest left turn")
     (rank,) = find(document, "Independent states")
     (yaw,) = find(document, "Yaw from the camera")
@@ -222,7 +224,7 @@ def test_what_the_thesis_prints_wrongly_is_corrected(document):
     assert band["simulated"] == pytest.approx(0.021**2 / 3)
 
 
-def test_slip_is_what_the_thesis_and_its_corrections_make_it(document):
+def test_slip_agrees_with_the_thesis_and_with_its_corrections(document):
     (blind,) = find(document, "by the 12 states")
     assert abs(blind["simulated"]) < 0.01 < blind["beside"]["true slip"]
     for terrain in ("tiles", "grass", "firm soil gravel"):
@@ -235,36 +237,36 @@ def test_slip_is_what_the_thesis_and_its_corrections_make_it(document):
         assert biased["simulated"] < 0.96 * biased["beside"]["true"]
     early, printed_remedy, matched = find(document, "Smallest slip")
     assert early["simulated"] < printed_remedy["simulated"] < -0.1 < matched["simulated"]
-    thesis, ours = find(document, "without the camera, by")
+    thesis, vio15 = find(document, "without the camera, by")
     assert abs(thesis["simulated"]) < 0.01
-    off = ours["simulated"] - ours["beside"]["true"]
-    assert abs(off) < 3 * ours["beside"]["its own standard deviation"]
+    off = vio15["simulated"] - vio15["beside"]["true"]
+    assert abs(off) < 3 * vio15["beside"]["standard deviation by the filter"]
 
 
-def test_table_8_1_comes_out_as_printed_and_its_iteration_corrected(document):
+def test_table_8_1_is_reproduced_and_its_iteration_corrected(document):
     cases = find(document, "Rate sent to the wheel, case")
     assert [case["verdict"] for case in cases] == ["as printed"] * 8
     assert [round(case["simulated"], 3) for case in cases] == [case["printed_interval"][0] for case in cases]
-    swinging, normalised = find(document, "Share of the")
-    assert {swinging["verdict"], normalised["verdict"]} == {"corrected"}
-    assert swinging["simulated"] == pytest.approx(1.0)
+    oscillating, normalised = find(document, "Fraction of the")
+    assert {oscillating["verdict"], normalised["verdict"]} == {"corrected"}
+    assert oscillating["simulated"] == pytest.approx(1.0)
     assert normalised["spread"] == pytest.approx([0.5, 0.56], abs=0.005)
 
 
 def test_the_same_seed_gives_the_same_rows_and_another_others(document):
-    for experiment, run in (("zero-slip wheel rows", known_bias), ("The camera lost", camera_lost)):
+    for experiment, run in (("zero-slip wheel rows", slip_bias), ("Loss of the camera", camera_lost)):
         rows = [found for found in document["rows"] if experiment in found["experiment"]]
         assert rows
         again = run(SEED, True).rows
         assert [found["simulated"] for found in rows] == [found.simulated for found in again]
         assert [found["why"] for found in rows] == [found.why for found in again]
-    assert [found.simulated for found in known_bias(SEED + 1, True).rows] != [
+    assert [found.simulated for found in slip_bias(SEED + 1, True).rows] != [
         found["simulated"] for found in document["rows"] if "zero-slip wheel rows" in found["experiment"]
     ]
 
 
 @pytest.mark.parametrize(
-    ("name", "as_printed", "known"),
+    ("name", "as_printed", "expected"),
     [
         ("slip14", True, (9, 12)),
         ("slip14", False, (10, 12)),
@@ -272,5 +274,5 @@ def test_the_same_seed_gives_the_same_rows_and_another_others(document):
         ("vio15", False, (13, 13)),
     ],
 )
-def test_only_a_speed_over_ground_makes_all_states_known(name, as_printed, known):
-    assert straight_line_rank(name, load_robot("agrimaro"), as_printed) == known
+def test_all_states_are_observable_only_with_a_speed_over_ground(name, as_printed, expected):
+    assert straight_line_rank(name, load_robot("agrimaro"), as_printed) == expected
