@@ -115,26 +115,13 @@ def body_motion(odometry: Stream, camera: Camera) -> BodyMotion:
 
 
 def odometry_stream(
-    time_s: Array,
-    position_m: Array,
-    yaw_rad: Array,
-    roll_rad: Array,
-    pitch_rad: Array,
-    velocity_mps: Array,
-    yaw_rate_radps: Array,
-    camera: Camera,
-    yaw_0: float,
-    confidence: Array | float = 1.0,
+    body: BodyMotion, camera: Camera, yaw_0: float, confidence: Array | float = 1.0
 ) -> Stream:
     """Return the pose stream, without noise, of a camera on a body that moves in a plane.
 
     Parameters
     ----------
-    time_s : (n,) stamps
-    position_m : (n, 2) of the body's origin
-    yaw_rad, roll_rad, pitch_rad : (n,)
-    velocity_mps : (n, 2) of the body's origin in body axes
-    yaw_rate_radps : (n,) about the body's z axis; rates of roll and pitch are left out
+    body : motion of the body's origin; rates of roll and pitch are left out
     camera : where it sits on the body
     yaw_0 : heading at power-on in rad, which happens with the body level at position (0, 0)
     confidence : (n,) or one number
@@ -143,12 +130,15 @@ def odometry_stream(
     -----
     The inverse of :func:`body_motion`.  Nothing is differentiated, so that any of the arrays may hold noise.
     """
-    rotation = Rotation.from_euler("ZYX", np.column_stack([yaw_rad - yaw_0, pitch_rad, roll_rad]))
+    n = len(body.time_s)
+    rotation = Rotation.from_euler(
+        "ZYX", np.column_stack([body.yaw_rad - yaw_0, body.pitch_rad, body.roll_rad])
+    )
     lever_m = np.array([camera.lever_x_m, camera.lever_y_m, camera.lever_z_m])
-    ground = np.column_stack([position_m, np.zeros(len(time_s))])
+    ground = np.column_stack([body.position_m, np.zeros(n)])
     place = Rotation.from_euler("Z", -yaw_0).apply(ground) + rotation.apply(lever_m) - lever_m
-    rate = np.column_stack([np.zeros((len(time_s), 2)), yaw_rate_radps])
-    velocity = np.column_stack([velocity_mps, np.zeros(len(time_s))]) + np.cross(rate, lever_m)
+    rate = np.column_stack([np.zeros((n, 2)), body.yaw_rate_radps])
+    velocity = np.column_stack([body.speed_mps, np.zeros(n)]) + np.cross(rate, lever_m)
     quaternion = rotation.as_quat()
     values = [
         to_camera(place),
@@ -156,7 +146,7 @@ def odometry_stream(
         quaternion[:, 3],
         to_camera(rotation.apply(velocity)),
         to_camera(rate),
-        np.broadcast_to(confidence, len(time_s)),
+        np.broadcast_to(confidence, n),
     ]
     return Stream(time_s, np.column_stack(values), CHANNELS)
 

@@ -99,8 +99,7 @@ def read_run(class_folder: Path, number: str, *, repair: bool = False) -> RunLog
             list(columns),
             row_of=partial(data_row, path),
             columns=list(columns.values()),
-            repair=repair,
-            dropped=dropped,
+            repairs=dropped if repair else None,
         )
     run_id = f"{class_folder.name}_{number}"
     refuse_apart(run_id, streams)

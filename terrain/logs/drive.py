@@ -244,8 +244,7 @@ def _run(windows: _Windows, start: int, end: int, *, repair: bool = False) -> Ru
             TWIST_CHANNELS if is_lidar else list(STREAMS[name]),
             row_of=int,  # times are made here: no row is at fault
             columns=columns,
-            repair=repair,
-            dropped=dropped,
+            repairs=dropped if repair else None,
             unknown_is_a_value=is_lidar,
         )
     return RunLog(

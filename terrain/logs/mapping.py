@@ -164,8 +164,7 @@ def read_run(folder: Path, mapping: Mapping, words: dict[str, str], *, repair: b
             path,
             [stream.time.column, *(column.column for column in columns)],
             delimiter=stream.delimiter,
-            repair=repair,
-            dropped=dropped,
+            repairs=dropped if repair else None,
         )
         scale, offset, factor = np.array([(c.scale, c.offset, UNIT_SCALES[c.unit][1]) for c in columns]).T
         streams[name] = checked_stream(
@@ -175,8 +174,7 @@ def read_run(folder: Path, mapping: Mapping, words: dict[str, str], *, repair: b
             list(stream.channels),
             row_of=partial(data_row, path, delimiter=stream.delimiter),
             columns=[column.column for column in columns],
-            repair=repair,
-            dropped=dropped,
+            repairs=dropped if repair else None,
         )
     run_id = (mapping.run_id or "_".join(f"{{{word}}}" for word in words)).format(**words)
     refuse_apart(run_id, streams)

@@ -91,8 +91,7 @@ def read_run(folder: str | Path, *, repair: bool = False) -> RunLog:
             values,
             channels,
             row_of=lambda index: index + 1,
-            repair=repair,
-            dropped=dropped,
+            repairs=dropped if repair else None,
             unknown_is_a_value=name in ("slip", "truth"),
         )
     if not streams:

@@ -72,8 +72,7 @@ def checked_stream(
     *,
     row_of: Callable[[int], int],
     columns: Sequence[str] = (),
-    repair: bool = False,
-    dropped: Counter[str] | None = None,
+    repairs: Counter[str] | None = None,
     unknown_is_a_value: bool = False,
 ) -> Stream:
     """Return the stream that the arrays hold, or say what is wrong with them.
@@ -86,8 +85,7 @@ def checked_stream(
     channels : c names
     row_of : row number in the file of a sample, for the message
     columns : c names of the columns in the file, for the message, where they are not the channels
-    repair : drop and count what would otherwise be refused
-    dropped : counts by kind, added to when repairing
+    repairs : counts by kind of what is dropped instead of refused; None refuses
     unknown_is_a_value : a channel may hold nothing but NaN, as slip does that nobody could observe
 
     Raises
@@ -103,14 +101,13 @@ def checked_stream(
     Traceback (most recent call last):
     terrain.errors.LogError: a.csv: time goes back at row 4 (0.1 s after 0.2 s)
     """
-    counts: Counter[str] = Counter() if dropped is None else dropped
     values = np.where(np.isfinite(values), values, np.nan)
-    if repair:
+    if repairs is not None:
         kept = np.flatnonzero(np.isfinite(time_s))
         if np.any(np.diff(time_s[kept]) <= 0.0):
             kept = kept[longest_rise(time_s[kept])]
         if kept.size < time_s.size:
-            counts[BAD_TIME] += time_s.size - kept.size
+            repairs[BAD_TIME] += time_s.size - kept.size
             time_s, values = time_s[kept], values[kept]
     else:
         _refuse_bad_time(name, time_s, row_of)
@@ -121,11 +118,11 @@ def checked_stream(
         for channel, column in zip(channels, values.T, strict=True)
         if not np.isfinite(column).any() and not unknown_is_a_value
     ]
-    if dead and not repair:
+    if dead and repairs is None:
         column = f" (column {columns[list(channels).index(dead[0])]})" if columns else ""
         raise LogError(f"{name}: channel {dead[0]}{column} has nothing finite in its {time_s.size} rows")
-    if dead:
-        counts[DEAD_CHANNEL] += len(dead)
+    if dead and repairs is not None:
+        repairs[DEAD_CHANNEL] += len(dead)
     return Stream(time_s, values, tuple(channels))
 
 

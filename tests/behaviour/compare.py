@@ -25,6 +25,17 @@ ALIASES: dict[str, str] = {
     "oracle+track": "true_terrain+track",
     "told:grass": "known:grass",
     "told:clay": "known:clay",
+    **{
+        f"run_{old}.{kind}": f"run_{new}.{kind}"
+        for old, new in {
+            "fixed": "fallback",
+            "learned": "classified",
+            "oracle": "true_terrain",
+            "oracle_track": "true_terrain_track",
+            "told_grass": "known_grass",
+        }.items()
+        for kind in ("png", "svg")
+    },
 }
 """Old key of JSON, old name of a file, stream or channel: the new one.  At any depth."""
 

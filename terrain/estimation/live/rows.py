@@ -188,7 +188,7 @@ def rows_at(
                 counts[stream, refused] += 1
                 continue
             instant_s = came_s - latency_s[stream]
-            fate = take_sample(stream, sample, instant_s, came_s, params, turns, lines, limits, gnss_memory)
+            fate = take_sample(stream, sample, (instant_s, came_s), params, turns, lines, limits, gnss_memory)
             counts[stream, _LEAP] += fate == LEAPT
             counts[stream, _NO_ROTATION] += fate == NO_ROTATION
         while n > n_due and queue[n - 1, _STAMP_COLUMN] > time_s + OFF_CLOCK_S:

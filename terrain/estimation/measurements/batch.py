@@ -262,8 +262,7 @@ def _fill_rows(
                 fate = take_sample(
                     stream,
                     samples[stream][k],
-                    instant_s[stream][k],
-                    came_s[stream][k],
+                    (instant_s[stream][k], came_s[stream][k]),
                     params,
                     turns,
                     lines,

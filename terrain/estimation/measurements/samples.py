@@ -220,15 +220,18 @@ def take_gnss(
 def take_sample(
     stream: int,
     sample: Array,
-    instant_s: float,
-    came_s: float,
+    stamps_s: tuple[float, float],
     params: Array,
     turns: Array,
     lines: Array,
     limits: Array,
     gnss: Array,
 ) -> int:
-    """Take a sample of any stream; return :data:`TAKEN`, :data:`LEAPT` or :data:`NO_ROTATION`."""
+    """Take a sample of any stream; return :data:`TAKEN`, :data:`LEAPT` or :data:`NO_ROTATION`.
+
+    ``stamps_s`` are the instant of the measurement and that of its arrival.
+    """
+    instant_s, came_s = stamps_s
     if stream == ODOMETRY:
         fate: int = take_odometry(sample, instant_s, came_s, turns, lines, limits)
         return fate

@@ -51,7 +51,8 @@ TRUTH: tuple[str, ...] = (
 """What the body does, before any sensor: speeds of the body's origin, specific force along x, traction,
 currents of motors as described, and slip; traction and slip are those along x."""
 
-VX, VY, W, AX, FORCE, AMPS, TURNING_AMPS, SLIP = range(len(TRUTH))
+N_TRUTH = len(TRUTH)
+VX, VY, W, AX, FORCE, AMPS, TURNING_AMPS, SLIP = range(N_TRUTH)
 """Their columns."""
 
 SWERVE_WHEELS = 3

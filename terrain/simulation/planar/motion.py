@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 from numba import njit
 
 from terrain.constants import GRAVITY_MPS2
@@ -41,11 +40,10 @@ def move(
     disturbance : (n, 3) what the ground adds to speeds (shares of ``|u|``, along and across) and yaw rate
         (rad/s), or none: (0, 3)
     """
-    out = np.zeros((wheel_speed_mps.shape[0], 8))
     if planar.n_wheels == SWERVE_WHEELS:
-        move_swerve(planar, p, dt, wheel_speed_mps, steer_rad, grade_rad, roll_rad, disturbance, out)
+        out = move_swerve(planar, p, dt, wheel_speed_mps, steer_rad, grade_rad, roll_rad, disturbance)
     else:
-        move_skid(planar, p, dt, wheel_speed_mps, grade_rad, disturbance, out)
+        out = move_skid(planar, p, dt, wheel_speed_mps, grade_rad, disturbance)
     for k in range(out.shape[0]):
         fast = math.sqrt(out[k, VX] * out[k, VX] + out[k, VY] * out[k, VY])
         out[k, VY] -= p[_SIDE_HILL] * planar.effective_ratio * roll_rad[k] * fast

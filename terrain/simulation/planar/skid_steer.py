@@ -16,7 +16,7 @@ from terrain.constants import GRAVITY_MPS2
 from terrain.effects import INDEX
 from terrain.records import Array
 from terrain.simulation.contact import shear_softness, softness
-from terrain.simulation.planar.model import AMPS, FORCE, SLIP, TURNING_AMPS, VX, Planar, W
+from terrain.simulation.planar.model import AMPS, FORCE, N_TRUTH, SLIP, TURNING_AMPS, VX, Planar, W
 from terrain.simulation.planar.signals import delayed, slopes
 
 STANDSTILL_MPS = 0.05
@@ -63,10 +63,10 @@ def move_skid(
     wheel_speed_mps: Array,
     grade_rad: Array,
     disturbance: Array,
-    out: Array,
-) -> None:
-    """Write motion, traction and currents; arguments are those of ``planar.motion.move``."""
-    n = out.shape[0]
+) -> Array:
+    """Return motion, traction and currents; arguments are those of ``planar.motion.move``."""
+    n = wheel_speed_mps.shape[0]
+    out = np.zeros((n, N_TRUTH))
     weight = planar.mass_kg * GRAVITY_MPS2
     mass = planar.mass_kg * (1.0 + p[_PAYLOAD])
     carried = weight * (1.0 + planar.load_ratio * p[_PAYLOAD])
@@ -108,6 +108,7 @@ def move_skid(
         moment = planar.yaw_inertia_kgm2 * (1.0 + p[_PAYLOAD]) * spin[k]
         force = 2.0 * moment / planar.track_m + scrub * tight[k] * direction(difference[k])
         out[k, TURNING_AMPS] = force * planar.radius_m / planar.nm_per_a
+    return out
 
 
 @njit(cache=True)

@@ -24,7 +24,7 @@ from terrain.constants import GRAVITY_MPS2
 from terrain.effects import INDEX
 from terrain.records import Array
 from terrain.simulation.contact import DEFLECTION_DAMPING_S, shear_softness, softness
-from terrain.simulation.planar.model import AMPS, FORCE, SLIP, VX, VY, Planar, W
+from terrain.simulation.planar.model import AMPS, FORCE, N_TRUTH, SLIP, VX, VY, Planar, W
 from terrain.simulation.planar.signals import delayed, play, slopes
 
 ROLLING_MPS = 0.02
@@ -60,10 +60,10 @@ def move_swerve(
     grade_rad: Array,
     roll_rad: Array,
     disturbance: Array,
-    out: Array,
-) -> None:
-    """Write motion, traction and current; arguments are those of ``planar.motion.move``."""
-    n = out.shape[0]
+) -> Array:
+    """Return motion, traction and current; arguments are those of ``planar.motion.move``."""
+    n = wheel_speed_mps.shape[0]
+    out = np.zeros((n, N_TRUTH))
     u, pace, mean_wheel_speed, heading = _rolled(planar, p, dt, wheel_speed_mps, steer_rad)
     weight = planar.mass_kg * GRAVITY_MPS2
     load = 1.0 + p[_PAYLOAD]
@@ -147,6 +147,7 @@ def move_swerve(
             mean_wheel_speed[k] * mean_wheel_speed[k] + ROLLING_MPS * ROLLING_MPS
         )
         out[k, AMPS] = (torque + planar.friction_nm * way) / planar.nm_per_a
+    return out
 
 
 @njit(cache=True)
