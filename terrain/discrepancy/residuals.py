@@ -255,7 +255,7 @@ def _evaluation_points(vector: Array, parameters: Sequence[str]) -> tuple[Array,
 
 
 @njit(cache=True)
-def _predictions(
+def _predictions(  # noqa: PLR0913 - a kernel takes its arrays one by one
     planar: Planar,
     points: Array,
     sensed: Array,

@@ -115,13 +115,23 @@ def body_motion(odometry: Stream, camera: Camera) -> BodyMotion:
 
 
 def odometry_stream(
-    body: BodyMotion, camera: Camera, yaw_0: float, confidence: Array | float = 1.0
+    time_s: Array,
+    position_m: Array,
+    attitude_rad: Array,
+    twist: Array,
+    camera: Camera,
+    yaw_0: float,
+    confidence: Array | float = 1.0,
 ) -> Stream:
     """Return the pose stream, without noise, of a camera on a body that moves in a plane.
 
     Parameters
     ----------
-    body : motion of the body's origin; rates of roll and pitch are left out
+    time_s : (n,) stamps
+    position_m : (n, 2) of the body's origin
+    attitude_rad : (n, 3) roll, pitch and yaw
+    twist : (n, 3) velocity of the body's origin in body axes in m/s, and yaw rate in rad/s; rates of roll and
+        pitch are left out
     camera : where it sits on the body
     yaw_0 : heading at power-on in rad, which happens with the body level at position (0, 0)
     confidence : (n,) or one number
@@ -130,15 +140,13 @@ def odometry_stream(
     -----
     The inverse of :func:`body_motion`.  Nothing is differentiated, so that any of the arrays may hold noise.
     """
-    n = len(body.time_s)
-    rotation = Rotation.from_euler(
-        "ZYX", np.column_stack([body.yaw_rad - yaw_0, body.pitch_rad, body.roll_rad])
-    )
+    n = len(time_s)
+    rotation = Rotation.from_euler("ZYX", attitude_rad[:, ::-1] - [yaw_0, 0.0, 0.0])
     lever_m = np.array([camera.lever_x_m, camera.lever_y_m, camera.lever_z_m])
-    ground = np.column_stack([body.position_m, np.zeros(n)])
+    ground = np.column_stack([position_m, np.zeros(n)])
     place = Rotation.from_euler("Z", -yaw_0).apply(ground) + rotation.apply(lever_m) - lever_m
-    rate = np.column_stack([np.zeros((n, 2)), body.yaw_rate_radps])
-    velocity = np.column_stack([body.speed_mps, np.zeros(n)]) + np.cross(rate, lever_m)
+    rate = np.column_stack([np.zeros((n, 2)), twist[:, 2]])
+    velocity = np.column_stack([twist[:, :2], np.zeros(n)]) + np.cross(rate, lever_m)
     quaternion = rotation.as_quat()
     values = [
         to_camera(place),

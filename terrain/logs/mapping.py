@@ -164,7 +164,8 @@ def read_run(folder: Path, mapping: Mapping, words: dict[str, str], *, repair: b
             path,
             [stream.time.column, *(column.column for column in columns)],
             delimiter=stream.delimiter,
-            repairs=dropped if repair else None,
+            repair=repair,
+            dropped=dropped,
         )
         scale, offset, factor = np.array([(c.scale, c.offset, UNIT_SCALES[c.unit][1]) for c in columns]).T
         streams[name] = checked_stream(

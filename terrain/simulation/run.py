@@ -52,7 +52,7 @@ class Setup(NamedTuple):
     effects: Mapping[str, float]
 
 
-def simulate_run(
+def simulate_run(  # noqa: PLR0913 - an entry whose options have defaults
     robot: Robot,
     terrain: str,
     scenario: str,

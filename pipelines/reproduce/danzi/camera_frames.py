@@ -23,7 +23,12 @@ def camera_frames(seed: int, quick: bool) -> Finding:
     nothing, yaw_rad = np.zeros(2), np.radians([0.0, YAW_DEG])
     speed = np.array([[SPEED_MPS, 0.0], [SPEED_MPS, 0.0]])
     stream = odometry_stream(
-        np.array([0.0, 1.0]), np.zeros((2, 2)), yaw_rad, nothing, nothing, speed, nothing, camera, yaw_0=0.0
+        np.array([0.0, 1.0]),
+        np.zeros((2, 2)),
+        np.column_stack([nothing, nothing, yaw_rad]),
+        np.column_stack([speed, nothing]),
+        camera,
+        yaw_0=0.0,
     )
     motion = body_motion(stream, camera)
     return Finding([_yaw(motion, stream), _forward_speed(motion)])

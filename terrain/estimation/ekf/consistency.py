@@ -13,7 +13,7 @@ from enum import StrEnum
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import boolean, float64, njit, types, void
+from numba import boolean, float64, njit, types
 from scipy.special import chdtri
 
 from terrain.angles import wrapped
@@ -161,36 +161,23 @@ def sample_from_model(
     values, vectors = np.linalg.eigh(noise.process_variance * dt_s)
     walk = rng.standard_normal((n, d)) @ (vectors * np.sqrt(np.maximum(values, 0.0))).T
     z = rng.standard_normal((n, m)) * np.sqrt(noise.measurement_variance)
-    truth = np.empty((n, d))
-    is_angle_state, is_angle_row = (
-        np.array([name in angles for name in names], dtype=np.bool_)
-        for names, angles in ((model.states, model.angle_states), (model.rows, model.angle_rows))
+    is_angle = (
+        np.array([name in model.angle_states for name in model.states], dtype=np.bool_),
+        np.array([name in model.angle_rows for name in model.rows], dtype=np.bool_),
     )
-    _draw(
-        model.propagate,
-        model.observe,
-        model.params.copy(),
-        is_angle_state,
-        is_angle_row,
-        dt_s,
-        x,
-        walk,
-        truth,
-        z,
-    )
+    truth = _draw(model.propagate, model.observe, model.params.copy(), is_angle, dt_s, x, walk, z)
     return np.arange(n) * dt_s, truth, z
 
 
 @njit(
-    void(
+    float64[:, ::1](
         types.FunctionType(PROPAGATE),
         types.FunctionType(OBSERVE),
         float64[::1],
-        boolean[::1],
-        boolean[::1],
+        types.UniTuple(boolean[::1], 2),
         float64,
         float64[::1],
-        *(float64[:, ::1],) * 3,
+        *(float64[:, ::1],) * 2,
     ),
     cache=True,
 )
@@ -198,16 +185,16 @@ def _draw(
     propagate: Any,
     observe: Any,
     params: Array,
-    is_angle_state: Array,
-    is_angle_row: Array,
+    is_angle: tuple[Array, Array],
     dt: float,
     x: Array,
     walk: Array,
-    truth: Array,
     z: Array,
-) -> None:
-    """Fill the truth, and add what is expected to the noise in z."""
+) -> Array:
+    """Return the truth, and add what is expected to the noise in z; ``is_angle`` of states and of rows."""
     d, m = x.size, z.shape[1]
+    is_angle_state, is_angle_row = is_angle
+    truth = np.empty((z.shape[0], d))
     x_next, z_hat, f, h = np.zeros(d), np.zeros(m), np.zeros((d, d)), np.zeros((m, d))
     for n in range(truth.shape[0]):
         if n > 0:
@@ -224,6 +211,7 @@ def _draw(
             z[n, i] += z_hat[i]
             if is_angle_row[i]:
                 z[n, i] = wrapped(z[n, i])
+    return truth
 
 
 def _judge(name: str, squares: Array, dof: Array, gated_fraction: float) -> Consistency:

@@ -89,7 +89,7 @@ def _read_stamp(time_s: float, clock: Array, max_gap_s: float, counts: Array) ->
     cache=True,
     error_model="numpy",
 )
-def run(
+def run(  # noqa: C901, PLR0913 - one loop: cut into functions a step takes 6.7 us in place of 3.7
     propagate: Any,
     observe: Any,
     params: Array,

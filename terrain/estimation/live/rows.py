@@ -139,7 +139,7 @@ def _refused(stream: int, stamped: Array, before: Array) -> int:
     cache=True,
     error_model="numpy",
 )
-def rows_at(
+def rows_at(  # noqa: PLR0913 - a kernel keeps its memory in arrays of its caller
     time_s: float,
     set_back: bool,
     motor_radps: Array,

@@ -67,7 +67,7 @@ COMMAND_CHANNELS = (
 """The admitted twist of the body, and what it asks of the wheels."""
 
 
-def simulate(
+def simulate(  # noqa: PLR0913 - an entry whose options have defaults
     robot: Robot,
     scenario: Scenario,
     soils: Mapping[str, Soil],

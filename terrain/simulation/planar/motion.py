@@ -41,7 +41,7 @@ def move(
         (rad/s), or none: (0, 3)
     """
     if planar.n_wheels == SWERVE_WHEELS:
-        out = move_swerve(planar, p, dt, wheel_speed_mps, steer_rad, grade_rad, roll_rad, disturbance)
+        out: Array = move_swerve(planar, p, dt, wheel_speed_mps, steer_rad, grade_rad, roll_rad, disturbance)
     else:
         out = move_skid(planar, p, dt, wheel_speed_mps, grade_rad, disturbance)
     for k in range(out.shape[0]):

@@ -26,6 +26,12 @@ def drive(speed_x, speed_y, yaw_rate, *, yaw_0=0.0, roll=0.0, pitch=0.0, n=1001,
     return time, position, yaw, np.broadcast_to(roll, n), np.broadcast_to(pitch, n), speed, rate
 
 
+def pose_stream(time, position, yaw, roll, pitch, speed, rate, camera, yaw_0):
+    """The stream of a drive."""
+    attitude, twist = np.column_stack([roll, pitch, yaw]), np.column_stack([speed, rate])
+    return odometry_stream(time, position, attitude, twist, camera, yaw_0)
+
+
 def turn(vectors, yaw):
     cos, sin = np.cos(yaw), np.sin(yaw)
     return np.stack(
@@ -55,7 +61,7 @@ def test_a_stream_gives_back_the_motion_it_was_made_of(seed, yaw_0, tilt, lever_
     roll, pitch = tilt * rng.standard_normal((2, n)).clip(-2, 2)
     position, speed = rng.standard_normal((n, 2)).cumsum(axis=0), rng.standard_normal((n, 2))
     rate = rng.standard_normal(n)
-    stream = odometry_stream(
+    stream = pose_stream(
         np.arange(n) / 200, position, yaw, roll, pitch, speed, rate, camera, float(rng.uniform(-4, 4))
     )
     seen = body_motion(stream, camera)
@@ -89,7 +95,7 @@ def test_renaming_axes_is_the_quaternion_product_of_the_thesis_and_its_matrices(
 def test_a_yaw_of_30_degrees_is_one():
     # turned left about the camera's own y axis, which points up
     sensor = Rotation.from_euler("Y", 30, degrees=True)
-    stream = odometry_stream(*drive(0.0, 0.0, 0.0, n=2), CAMERA, 0.0)
+    stream = pose_stream(*drive(0.0, 0.0, 0.0, n=2), CAMERA, 0.0)
     x, y, z, w = sensor.as_quat()
     quaternions = {
         f"quaternion_{axis}_ratio": [start, value]
@@ -104,17 +110,17 @@ def test_a_yaw_of_30_degrees_is_one():
 
 
 def test_signs_of_what_the_camera_says():
-    nose_up = body_motion(odometry_stream(*drive(1.0, 0.0, 0.0, pitch=-0.1), CAMERA, 0.0), CAMERA)
+    nose_up = body_motion(pose_stream(*drive(1.0, 0.0, 0.0, pitch=-0.1), CAMERA, 0.0), CAMERA)
     np.testing.assert_allclose(nose_up.pitch_rad, -0.1)
     np.testing.assert_allclose(nose_up.speed_mps, np.broadcast_to([1.0, 0.0], (1001, 2)), atol=1e-12)
     for heading in np.radians([0.0, 30.0, 90.0, -135.0, 180.0]):
-        stream = odometry_stream(*drive(0.7, 0.2, 0.0, yaw_0=heading), CAMERA, 0.0)
+        stream = pose_stream(*drive(0.7, 0.2, 0.0, yaw_0=heading), CAMERA, 0.0)
         seen = body_motion(stream, CAMERA)
         np.testing.assert_allclose(seen.speed_mps, np.broadcast_to([0.7, 0.2], (1001, 2)), atol=1e-12)
         np.testing.assert_allclose(seen.position_m[-1], [3.5, 1.0], atol=1e-9)
-    ahead = odometry_stream(*drive(0.7, 0.0, 0.0), CAMERA, 0.0)
+    ahead = pose_stream(*drive(0.7, 0.0, 0.0), CAMERA, 0.0)
     np.testing.assert_allclose(ahead.channel("velocity_z_mps"), -0.7)  # z points backward
-    left = odometry_stream(*drive(0.0, 0.0, 0.5), CAMERA, 0.0)
+    left = pose_stream(*drive(0.0, 0.0, 0.5), CAMERA, 0.0)
     np.testing.assert_allclose(left.channel("rate_y_radps"), 0.5)  # y points up
     seen = body_motion(left, CAMERA)
     np.testing.assert_allclose(seen.yaw_rate_radps, 0.5)
@@ -124,7 +130,7 @@ def test_signs_of_what_the_camera_says():
 
 
 def test_a_turn_on_the_spot_moves_the_camera_and_not_the_robot():
-    stream = odometry_stream(*drive(0.0, 0.0, 2.0, yaw_0=1.0), CAMERA, 0.3)
+    stream = pose_stream(*drive(0.0, 0.0, 2.0, yaw_0=1.0), CAMERA, 0.3)
     seen = body_motion(stream, CAMERA)
     moved = np.linalg.norm(stream.values[:, [0, 2]] - stream.values[0, [0, 2]], axis=1)
     assert moved.max() > 1.4  # twice the lever arm
@@ -136,7 +142,7 @@ def test_a_turn_on_the_spot_moves_the_camera_and_not_the_robot():
 def test_position_is_the_integral_of_speed():
     time = np.arange(1001) * 0.005
     plain = drive(1 + 0.3 * np.sin(time), 0.2 * np.cos(time), np.sin(2 * time), yaw_0=0.4)
-    seen = body_motion(odometry_stream(*plain, CAMERA, 0.4), CAMERA)
+    seen = body_motion(pose_stream(*plain, CAMERA, 0.4), CAMERA)
     origin = seen.speed_mps - seen.yaw_rate_radps[:, None] * np.array([-LEVER_M[1], LEVER_M[0]])
     ground = turn(origin, seen.yaw_rad)
     walked = np.cumsum((ground[1:] + ground[:-1]) / 2 * 0.005, axis=0)
@@ -148,7 +154,7 @@ def test_position_is_the_integral_of_speed():
 )
 def test_what_is_no_rotation_is_unknown(quaternion):
     plain = drive(1.0, 0.0, 0.5, yaw_0=0.3)
-    good = odometry_stream(*plain, CAMERA, 0.0)
+    good = pose_stream(*plain, CAMERA, 0.0)
     rows = np.isin(np.arange(1001), [0, 1, 500])
     bad = with_channels(
         good,
@@ -169,7 +175,7 @@ def test_what_is_no_rotation_is_unknown(quaternion):
 
 
 def test_a_stream_without_one_good_sample_is_unknown_throughout():
-    stream = odometry_stream(*drive(1.0, 0.0, 0.0, n=5), CAMERA, 0.0)
+    stream = pose_stream(*drive(1.0, 0.0, 0.0, n=5), CAMERA, 0.0)
     lost = with_channels(stream, quaternion_w_ratio=np.nan)
     assert np.isnan(body_motion(lost, CAMERA).position_m).all()
     empty = Stream([], np.zeros((0, len(stream.channels))), stream.channels)

@@ -48,7 +48,7 @@ def test_a_dead_channel_is_refused_and_stays_nan_on_repair():
     with pytest.raises(LogError, match="channel accel_x_mps2 has nothing finite in its 3 rows"):
         stream_of([0, 1, 2], values)
     dropped = Counter()
-    repaired = stream_of([0, 1, 2], values, repair=True, dropped=dropped)
+    repaired = stream_of([0, 1, 2], values, repairs=dropped)
     assert repaired.channels == tuple(CHANNELS)
     assert np.isnan(repaired.channel("accel_x_mps2")).all()
     assert dropped == {"channels with nothing finite": 1}
@@ -64,6 +64,6 @@ def test_one_bad_time_costs_one_row_on_repair(spike_s):
     time_s = np.arange(10.0)
     time_s[6] = spike_s
     dropped = Counter()
-    stream = stream_of(time_s, repair=True, dropped=dropped)
+    stream = stream_of(time_s, repairs=dropped)
     assert stream.time_s.tolist() == [0, 1, 2, 3, 4, 5, 7, 8, 9]
     assert dropped == {BAD_TIME: 1}

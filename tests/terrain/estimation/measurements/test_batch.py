@@ -65,7 +65,7 @@ def turning_run(duration_s=6.0, *, yaw_0=0.0, rate=0.4, speed=0.5, roll=0.0, pit
     position = speed / rate * np.column_stack([np.sin(yaw) - np.sin(yaw_0), np.cos(yaw_0) - np.cos(yaw)])
     plain = noisy([*position.T, yaw, roll, pitch, speed, 0.0, rate]).T
     streams["odometry"] = odometry_stream(
-        t, plain[:2].T, plain[2], plain[3], plain[4], plain[5:7].T, plain[7], ROBOT.camera, yaw_0
+        t, plain[:2].T, plain[[3, 4, 2]].T, plain[5:8].T, ROBOT.camera, yaw_0
     )
     t = clock(10.0)
     yaw = yaw_0 + rate * t

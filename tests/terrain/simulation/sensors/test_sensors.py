@@ -438,10 +438,8 @@ def test_the_camera_tells_what_its_stream_without_noise_says():
     seen = odometry_stream(
         told.time_s,
         motion.record[rows, :2],
-        motion.body("yaw_rad")[rows],
-        *motion.tilt_rad[rows].T,
-        motion.record[rows, 3:5],
-        motion.body("yaw_rate_radps")[rows],
+        np.column_stack([motion.tilt_rad[rows], motion.body("yaw_rad")[rows]]),
+        np.column_stack([motion.record[rows, 3:5], motion.body("yaw_rate_radps")[rows]]),
         camera,
         yaw_0=motion.body("yaw_rad")[0],
     )
