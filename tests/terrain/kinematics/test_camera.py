@@ -103,7 +103,7 @@ def test_a_yaw_of_30_degrees_is_one():
     np.testing.assert_allclose(printed, [0.0, -60.0, -90.0], atol=1e-6)  # what (5.6) gives as printed
 
 
-def test_signs_of_what_the_camera_says():
+def test_signs_of_camera_motion():
     nose_up = body_motion(odometry_stream(*drive(1.0, 0.0, 0.0, pitch=-0.1), CAMERA, 0.0), CAMERA)
     np.testing.assert_allclose(nose_up.pitch_rad, -0.1)
     np.testing.assert_allclose(nose_up.speed_mps, np.broadcast_to([1.0, 0.0], (1001, 2)), atol=1e-12)
@@ -146,7 +146,7 @@ def test_position_is_the_integral_of_speed():
 @pytest.mark.parametrize(
     "quaternion", [(0, 0, 0, 0), (0, 0, 0, np.nan), (0.5, 0.5, 0.5, 0.9), (np.inf, 0, 0, 0)]
 )
-def test_what_is_no_rotation_is_unknown(quaternion):
+def test_poses_without_a_valid_quaternion_are_nan(quaternion):
     plain = drive(1.0, 0.0, 0.5, yaw_0=0.3)
     good = odometry_stream(*plain, CAMERA, 0.0)
     rows = np.isin(np.arange(1001), [0, 1, 500])
