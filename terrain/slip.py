@@ -36,7 +36,7 @@ def slip_ratio(
 
     Parameters
     ----------
-    wheel_speed_mps, ground_speed_mps : circumferential speed of a wheel, and speed of its centre along it; they broadcast
+    wheel_speed_mps, ground_speed_mps : of a wheel's circumference, and its centre along it; they broadcast
     min_speed_mps : with both slower the wheel is stationary
     stationary : slip of a stationary wheel: NaN in analysis, where it has none; 0 for a controller (7.2.1)
 
@@ -47,7 +47,7 @@ def slip_ratio(
 
     Notes
     -----
-    (7.7), clipped: a wheel that turns against its travel would come out at up to 2.  Where one speed is unknown
+    (7.7), clipped: a wheel that turns against its travel would have up to 2.  Where one speed is unknown
     the slip is NaN, stationary or not.
 
     Examples
