@@ -9,8 +9,8 @@ AgriMaRo thesis, (7.3) to (7.7))::
 (7.1) and (7.2), the two regimes of the SAE, are this for v > 0 only; the larger absolute value is safe
 everywhere.  The sign of s is that of the slip speed **along the wheel's own x axis**: positive in traction
 and negative in braking where the wheel rolls forward, and the reverse where it rolls backward, be it that the
-robot backs or that its steering stands beyond 90 degrees.  ``s * sign(v)`` is positive in traction whichever
-way it rolls.
+robot backs or that its steering stands beyond 90 degrees.  ``s * sign(v)`` is positive in traction for both
+rolling directions.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from terrain.errors import ConfigError
 from terrain.records import Array
 
 MIN_SPEED_MPS = 0.05
-"""With rim and ground both slower the slip is noise over noise (thesis 7.2.1)."""
+"""With wheel speed and ground speed both lower the slip is noise over noise (thesis 7.2.1)."""
 
 
 def slip_ratio(
@@ -36,7 +36,7 @@ def slip_ratio(
 
     Parameters
     ----------
-    wheel_speed_mps, ground_speed_mps : of a wheel's rim and of its centre along it; they broadcast
+    wheel_speed_mps, ground_speed_mps : of a wheel's circumference, and its centre along it; they broadcast
     min_speed_mps : with both slower the wheel is stationary
     stationary : slip of a stationary wheel: NaN in analysis, where it has none; 0 for a controller (7.2.1)
 
@@ -47,7 +47,7 @@ def slip_ratio(
 
     Notes
     -----
-    (7.7), clipped: a wheel that turns against its way would come out at up to 2.  Where one speed is unknown
+    (7.7), clipped: a wheel that turns against its travel would have up to 2.  Where one speed is unknown
     the slip is NaN, stationary or not.
 
     Examples
@@ -93,7 +93,7 @@ def slip_angle(forward_mps: Any, left_mps: Any, min_speed_mps: float = MIN_SPEED
 
     Notes
     -----
-    ``atan2(v_y, |v_x|)``: within a quarter turn; the ground's side force opposes it whichever way it rolls.
+    ``atan2(v_y, |v_x|)``: within a quarter turn; the side force opposes it for both rolling directions.
 
     Examples
     --------

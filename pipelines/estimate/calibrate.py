@@ -83,7 +83,7 @@ def calibrate(
             )
     grounds = hard_grounds() if hard is None else tuple(hard)
     findings = find(runs, described, robot, grounds)
-    if not any(finding.told for finding in findings):
+    if not any(finding.determined for finding in findings):
         reasons = "; ".join(dict.fromkeys(finding.note for finding in findings))
         raise DataError(f"{data}: nothing of robot {robot.name} can be calibrated from this: {reasons}")
     name = file if out is None else out.name
@@ -144,7 +144,7 @@ def described_with(described: Any, findings: Sequence[Finding]) -> Any:
     found = copy.deepcopy(described)
     for finding in findings:
         section, _, name = finding.parameter.partition(".")
-        if not finding.told or name not in found.get(section, {}):
+        if not finding.determined or name not in found.get(section, {}):
             continue
         half = (finding.high - finding.low) / 2
         digits = 2 - math.floor(math.log10(half)) if half > 0 else 12

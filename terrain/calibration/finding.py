@@ -1,4 +1,4 @@
-"""What logs tell of one number of a robot's description, and what they cannot tell."""
+"""Calibration results: the value of one parameter of a robot's description, or why it is undetermined."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ CONFIDENCE = 0.95
 
 
 class Finding(NamedTuple):
-    """One number as the logs have it; ``value`` is NaN where they cannot tell, and ``note`` says why.
+    """One parameter estimated from logs; ``value`` is NaN where it is undetermined, and ``note`` says why.
 
     Parameters
     ----------
@@ -24,7 +24,7 @@ class Finding(NamedTuple):
     value, low, high : the number and its 95 % interval
     n, counted : how many of what it rests on (12, ``"stretches"``)
     runs : ids of the runs used
-    note : what is assumed; or why nothing can be told
+    note : what is assumed; or why the value is undetermined
     """
 
     parameter: str
@@ -37,12 +37,12 @@ class Finding(NamedTuple):
     note: str = ""
 
     @property
-    def told(self) -> bool:
-        """Whether there is a value."""
+    def determined(self) -> bool:
+        """Whether the logs determine the value."""
         return math.isfinite(self.value)
 
 
-def untold(parameters: Sequence[str], reason: str) -> list[Finding]:
+def undetermined(parameters: Sequence[str], reason: str) -> list[Finding]:
     """Return a finding without a value for each parameter."""
     return [Finding(name, math.nan, math.nan, math.nan, 0, "", (), reason) for name in parameters]
 
@@ -81,7 +81,7 @@ def biases(
     counted: str,
     runs: tuple[str, ...],
 ) -> list[Finding]:
-    """Return what biases in single power-ons tell of those to come, and of how much these differ.
+    """Predict the biases of future power-ons, and their scatter, from those of single power-ons.
 
     Parameters
     ----------
@@ -92,7 +92,7 @@ def biases(
 
     Notes
     -----
-    However well a bias is known in one power-on, it tells of the next only as much as the scatter lets it.
+    However well a bias is known in one power-on, the scatter limits how well it predicts the next one.
     The axes share one scatter, as the description has it: k power-ons give 3 (k - 1) degrees of freedom.
     """
     k = len(found)
@@ -105,14 +105,14 @@ def biases(
     else:
         between = float(((found - mean) ** 2).sum() / (3 * (k - 1)))
         half = np.broadcast_to(half_width(math.sqrt(between / k), 3 * (k - 1)), 3)
-    told = [
+    found_biases = [
         Finding(
             name, float(mean[i]), float(mean[i] - half[i]), float(mean[i] + half[i]), n, counted, runs, note
         )
         for i, name in enumerate(parameters)
     ]
     if k < MIN_POWER_ONS:
-        return told + untold(
+        return found_biases + undetermined(
             [std_parameter], f"{k} power-ons: {MIN_POWER_ONS} at least show how much they differ"
         )
     # What a single power-on's own error adds to the scatter is taken off.
@@ -120,7 +120,7 @@ def biases(
         math.sqrt(max(edge**2 - float(variance.mean()), 0.0))
         for edge in sorted((*std_interval(between, 3 * (k - 1)), math.sqrt(between)))
     )
-    return [*told, Finding(std_parameter, std, low, high, k, "power-ons", runs, note)]
+    return [*found_biases, Finding(std_parameter, std, low, high, k, "power-ons", runs, note)]
 
 
 MIN_POWER_ONS = 3

@@ -25,7 +25,7 @@ import numpy as np
 from scipy.integrate import cumulative_trapezoid
 from scipy.optimize import minimize_scalar
 
-from terrain.calibration.finding import Finding, half_width, untold
+from terrain.calibration.finding import Finding, half_width, undetermined
 from terrain.calibration.motion import MAX_GAP_S, at_times, origin_twist
 from terrain.calibration.standing import Stretch
 from terrain.estimation.measurements.resampling import low_pass
@@ -104,13 +104,13 @@ def time_constants(events: Sequence[Event]) -> list[Finding]:
     """
     names = [ENCODER, CAMERA, DIFFERENCE]
     if len(events) < MIN_EVENTS:
-        return untold(
+        return undetermined(
             names, f"{len(events)} straight starts and stops on hard ground: {MIN_EVENTS} are needed"
         )
     encoder_s, encoder_parts = _lag([_signal(event, event.wheels) for event in events], slips=True)
     camera_s, camera_parts = _lag([_signal(event, event.camera) for event in events], slips=False)
     if max(encoder_s, camera_s) > 0.95 * MAX_LAG_S:
-        return untold(
+        return undetermined(
             names, f"speeds lag by more than {MAX_LAG_S:g} s: bring the loggers' clocks together first"
         )
     runs = tuple(dict.fromkeys(event.run_id for event in events))
@@ -128,7 +128,7 @@ def time_constants(events: Sequence[Event]) -> list[Finding]:
     return found
 
 
-TOTAL = "a total lag: a pure delay cannot be told from a low-pass"
+TOTAL = "a total lag: a pure delay is indistinguishable from a low-pass"
 
 
 class _Signal(NamedTuple):
@@ -168,10 +168,10 @@ def _within(stretch: Stretch, robot: Robot) -> list[Event]:
         grid_s = np.arange(start_s, end_s, GRID_S)
         accel = at_times(imu, grid_s) @ along
         viewed = (seen.time_s >= grid_s[0]) & (seen.time_s <= grid_s[-1])
-        told = (time_s >= grid_s[0]) & (time_s <= grid_s[-1])
+        covered = (time_s >= grid_s[0]) & (time_s <= grid_s[-1])
         gaps = np.diff(seen.time_s[viewed], prepend=grid_s[0], append=grid_s[-1])
         if np.isfinite(accel).all() and gaps.max() <= MAX_GAP_S:
-            of_wheels = (time_s[told], wheel_speed[told, :2] @ along)
+            of_wheels = (time_s[covered], wheel_speed[covered, :2] @ along)
             of_camera = (seen.time_s[viewed], seen.values[viewed, :2] @ along)
             found.append(Event(stretch.run.run_id, grid_s, accel, of_wheels, of_camera))
     return found

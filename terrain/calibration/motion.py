@@ -36,10 +36,12 @@ def seen_motion(stretch: Stretch, robot: Robot) -> Stream | None:
     camera = robot.camera
     seen = body_motion(odometry, camera)
     values = np.column_stack([seen.speed_mps, seen.yaw_rate_radps, seen.yaw_rad])
-    sure = np.isfinite(values).all(axis=1) & (odometry.channel("confidence_ratio") >= MIN_CONFIDENCE_RATIO)
-    if not sure.any():
+    confident = np.isfinite(values).all(axis=1) & (
+        odometry.channel("confidence_ratio") >= MIN_CONFIDENCE_RATIO
+    )
+    if not confident.any():
         return None
-    time_s, values = seen.time_s[sure] - camera.latency_s, values[sure]
+    time_s, values = seen.time_s[confident] - camera.latency_s, values[confident]
     width = 2 * round(JUMP_S * odometry.rate_hz / 2) + 1
     kept = (np.abs(values - median_filter(values, size=(width, 1), mode="nearest")) <= JUMP).all(axis=1)
     return Stream(time_s[kept], values[kept], SEEN) if kept.any() else None

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from terrain.angles import unwrapped
-from terrain.calibration.finding import Finding, std_interval, untold
+from terrain.calibration.finding import Finding, std_interval, undetermined
 from terrain.calibration.motion import seen_motion
 from terrain.calibration.standing import ACCEL, GYRO, NO_STANDING, Stretch, batches
 from terrain.records import Array, Stream
@@ -52,7 +52,7 @@ def sensor_noise(stretches: Sequence[Stretch], robot: Robot) -> list[Finding]:
         for parameter, stream in _signals(stretch, robot).items():
             signals.setdefault(parameter, []).append((stretch.run.run_id, stream))
     if not stretches:
-        return untold(_PARAMETERS, NO_STANDING)
+        return undetermined(_PARAMETERS, NO_STANDING)
     return [_noise(parameter, signals.get(parameter, []), robot) for parameter in _PARAMETERS]
 
 
@@ -140,10 +140,10 @@ def _noise(parameter: str, signals: Sequence[tuple[str, Stream]], robot: Robot) 
     described = getattr(getattr(robot.equipment, section), name)
     residuals = [_about_a_line(batch) for _, stream in signals for batch in batches(stream)]
     if not residuals:
-        return untold([parameter], "no standing stretch has this signal")[0]
+        return undetermined([parameter], "no standing stretch has this signal")[0]
     squares = float(sum((part**2).sum() for part in residuals))
     if squares < sum(part.size for part in residuals) * (NO_NOISE_SHARE * described) ** 2:
-        return untold([parameter], "no noise at rest")[0]
+        return undetermined([parameter], "no noise at rest")[0]
     correlation = np.array([_correlation(residuals, lag) for lag in range(1, LAGS + 1)])
     # A line takes two samples' worth of white noise with it, and more of coloured noise.
     taken = 2 * max(1 + 2 * correlation.sum(), 1.0)
@@ -156,7 +156,7 @@ def _noise(parameter: str, signals: Sequence[tuple[str, Stream]], robot: Robot) 
         step = 2 * math.pi / robot.equipment.sensors.steering_steps_ratio
         step_variance = step**2 / 12
         if variance - step_variance < (MIN_NOISE_STEPS * step) ** 2:
-            return untold([parameter], f"the noise hides below the encoder's step of {step:.2g} rad")[0]
+            return undetermined([parameter], f"the noise hides below the encoder's step of {step:.2g} rad")[0]
     value, low, high = (math.sqrt(max(x - step_variance, 0.0)) for x in (variance, low**2, high**2))
     n = sum(len(stream) for _, stream in signals)
     runs = tuple(dict.fromkeys(run_id for run_id, _ in signals))

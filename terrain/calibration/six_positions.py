@@ -1,6 +1,6 @@
 """Accelerometer in six positions: bias and scale of each axis (Danzi, AgriMaRo thesis, 3.3.3).
 
-Held still, whichever way up, it measures gravity and nothing else.  With ``a = k f + b`` an axis, the means
+Held still, in any orientation, it measures gravity only.  With ``a = k f + b`` an axis, the means
 of the stretches fulfil::
 
     |(a - b) / k| = g
@@ -15,7 +15,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from terrain.calibration.finding import Finding, biases, half_width, untold
+from terrain.calibration.finding import Finding, biases, half_width, undetermined
 from terrain.calibration.standing import ACCEL, Stretch, batches
 from terrain.constants import GRAVITY_MPS2
 from terrain.errors import DataError
@@ -118,7 +118,7 @@ def accelerometer(stretches: Sequence[Stretch], robot: Robot) -> list[Finding]:
         except DataError:
             continue
     if not fits:
-        return untold([*bias_names, *scale_names, std_name], LEVEL_ONLY)
+        return undetermined([*bias_names, *scale_names, std_name], LEVEL_ONLY)
     runs = tuple(fits)
     n = sum(len(of_run[run_id]) for run_id in runs)
     bias, scale, cov = (np.array(part) for part in zip(*fits.values(), strict=True))

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from terrain.calibration.finding import Finding, biases, untold
+from terrain.calibration.finding import Finding, biases, undetermined
 from terrain.logs.schema import IMU_CHANNELS
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import Robot
@@ -28,8 +28,8 @@ MAX_BIAS_RADPS = 0.06
 sheet)."""
 
 STANDING_MPS = 0.01
-"""Rim speed of a standing wheel: a single step of its Hall sensor shows as more behind the driver's
-low-pass."""
+"""Largest circumferential speed of a standing wheel: a single step of its Hall sensor reads as more after
+the low-pass of the motor driver."""
 
 BATCH_S = 1.0
 """Means over batches of this length are as good as independent."""
@@ -123,7 +123,7 @@ def gyro_bias(stretches: Sequence[Stretch], robot: Robot) -> list[Finding]:
         if stream := stretch.of("imu", GYRO):
             of_run.setdefault(stretch.run.run_id, []).append(stream)
     if not of_run:
-        return untold([*names, "sensors.gyro_bias_std_radps"], NO_STANDING)
+        return undetermined([*names, "sensors.gyro_bias_std_radps"], NO_STANDING)
     parts = [
         np.array([batch.mean(axis=0) for stream in streams for batch in batches(stream)])
         for streams in of_run.values()

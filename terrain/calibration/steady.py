@@ -67,7 +67,7 @@ def steady_stretches(run: RunLog, robot: Robot, hard: Sequence[str]) -> list[Ste
     -----
     A wheel rolls along its centre's travel when its motor turns forward, and against it otherwise: the full
     turn is known, and not only half of it.  Consecutive stretches with the wheels steered alike are one,
-    because the play of the steering is where it was.
+    because the steering backlash is unchanged.
     """
     found: list[Steady] = []
     for label in run.labels:

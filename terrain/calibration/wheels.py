@@ -30,7 +30,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from terrain.calibration.finding import Finding, half_width, untold
+from terrain.calibration.finding import Finding, half_width, undetermined
 from terrain.calibration.steady import Steady, direction_of
 from terrain.records import Array
 from terrain.robots import Robot
@@ -61,7 +61,7 @@ def steering_zeros(stretches: Sequence[Steady], robot: Robot) -> list[Finding]:
     -----
     Least squares with Huber's weights on the equations of this module's head.  The interval is that of
     their scatter and of half a step, to which an encoder may be off everywhere.  Zeros known no better than
-    the play are not told.
+    the backlash are undetermined.
     """
     names = [f"steering.zero_{i}_rad" for i in robot.wheels]
     off = np.array([stretch.off_rad for stretch in stretches]).reshape(-1, 3)
@@ -86,7 +86,9 @@ def steering_zeros(stretches: Sequence[Steady], robot: Robot) -> list[Finding]:
                     for name, z, h in zip(names, zero, half, strict=True)
                 ]
     driven = " and ".join(dict.fromkeys(map(direction_of, stretches))) or "nowhere"
-    return untold(names, f"{len(stretches)} steady stretches, driven {driven}, cannot tell: {WANTED}")
+    return undetermined(
+        names, f"{len(stretches)} steady stretches, driven {driven}, undetermined: {REQUIRED_MOTION}"
+    )
 
 
 def reduction_ratio(stretches: Sequence[Steady], robot: Robot) -> Finding:
@@ -107,7 +109,7 @@ def reduction_ratio(stretches: Sequence[Steady], robot: Robot) -> Finding:
     name = "motors.reduction_ratio"
     runs = tuple(dict.fromkeys(stretch.run_id for stretch in stretches))
     if not runs:
-        return untold([name], f"there is no steady stretch: {WANTED}")[0]
+        return undetermined([name], f"there is no steady stretch: {REQUIRED_MOTION}")[0]
     single = np.array(
         [
             np.average(
@@ -126,7 +128,7 @@ def reduction_ratio(stretches: Sequence[Steady], robot: Robot) -> Finding:
 
 ZEROS = "tyres and motors taken for alike, the camera for square to the body"
 RATIO = "with the described wheel radius: only ratio over radius is to be seen; slip 0 to 0.2 %"
-WANTED = "drive straight forward, backward and to both sides on hard ground, with the camera"
+REQUIRED_MOTION = "drive straight forward, backward and to both sides on hard ground, with the camera"
 
 
 def _balance(stretch: Steady, slip_rad: Array, robot: Robot) -> tuple[Array, Array]:

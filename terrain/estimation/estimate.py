@@ -165,7 +165,7 @@ def filter_run(
         yaw_rad = gnss_heading(table, robot)
         if math.isnan(yaw_rad):
             found = filter_run(_without_gnss(run), robot, name, tuning=tuning, initial_yaw_rad=0.0)
-            unused = {"gnss: heading not told by the drive": len(run.streams["gnss"])}
+            unused = {"gnss: heading not observable in this run": len(run.streams["gnss"])}
             table = replace(found.table, dropped={**found.table.dropped, **unused})
             return replace(found, table=table)
         table = measurement_table(run, robot, ema_alpha=ema_alpha, initial_yaw_rad=yaw_rad)

@@ -55,7 +55,7 @@ def slip_figures(
     slip : of a filter; stale samples count as long as they are no NaN
     speed_mps, time_s : (k,) speed of the robot, on any clock
     rolling : (n, wheels) -1 where a wheel rolls backward, else 1: means are of slip positive in traction
-        then, so that ways ahead and back do not cancel; without, slip counts as it is
+        then, so that driving forward and backward does not cancel; without, slip counts as it is
 
     Notes
     -----
@@ -73,16 +73,16 @@ def slip_figures(
     moving = speed > STEADY_SPEED_MPS
     steady = moving & started & (change < STEADY_CHANGE_MPS)
     ratio = slip.slip_ratio if rolling is None else slip.slip_ratio * rolling
-    calm, wild = ratio[steady], np.abs(ratio[moving & ~steady])
-    wheel_peak = np.array([_of_known(np.max, wheel) for wheel in wild.T])
+    steady_slip, transient_slip = ratio[steady], np.abs(ratio[moving & ~steady])
+    wheel_peak = np.array([_of_known(np.max, wheel) for wheel in transient_slip.T])
     return SlipFigures(
         steady=read_only(steady, np.bool_),
         steady_s=float(np.diff(slip.time_s, append=slip.time_s[-1:])[steady].sum()),
-        steady_mean=_of_known(np.mean, calm),
-        steady_std=_of_known(np.std, calm),
+        steady_mean=_of_known(np.mean, steady_slip),
+        steady_std=_of_known(np.std, steady_slip),
         peak=_of_known(np.max, wheel_peak),
-        wheel_mean=read_only([_of_known(np.mean, wheel) for wheel in calm.T]),
-        wheel_std=read_only([_of_known(np.std, wheel) for wheel in calm.T]),
+        wheel_mean=read_only([_of_known(np.mean, wheel) for wheel in steady_slip.T]),
+        wheel_std=read_only([_of_known(np.std, wheel) for wheel in steady_slip.T]),
         wheel_peak=read_only(wheel_peak),
     )
 

@@ -24,7 +24,7 @@ class EstimateSummary:
     Parameters
     ----------
     run_id, filter : which run and which filter
-    slip_mean, slip_std : in steady motion, positive in traction whichever way a wheel rolls; of a filter
+    slip_mean, slip_std : in steady motion, positive in traction for both rolling directions; of a filter
         without a reference of the speed over ground it is the blind figure, and ``slip_observable`` is false
     slip_true_mean : the true slip at the same instants
     slip_observable : whether the speed over ground was measured

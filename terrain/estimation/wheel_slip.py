@@ -20,7 +20,7 @@ STALE_AFTER_S = 0.15
 Hz the slowest sensor of it, so that no sound one is called so; a 1 m/s^2 start gains 0.15 m/s unseen."""
 
 UNMEASURED_AFTER_S = 0.5
-"""A wheel that has told neither rate nor angle for so long may turn and stand as it likes."""
+"""After this time without a rate or an angle, the motion of a wheel is unknown."""
 
 
 def wheel_slip(
@@ -67,8 +67,8 @@ def _unmeasured(table: MeasurementTable, robot: Robot) -> Array:
     columns = []
     for i, row in enumerate(robot.wheel_rows):
         names = [row, *robot.steer_rows[i : i + 1]]
-        heard = np.isfinite(table.columns(names))
-        last_s = np.maximum.accumulate(np.where(heard, table.time_s[:, None], -np.inf), axis=0)
+        measured = np.isfinite(table.columns(names))
+        last_s = np.maximum.accumulate(np.where(measured, table.time_s[:, None], -np.inf), axis=0)
         columns.append((table.time_s[:, None] - last_s > UNMEASURED_AFTER_S).any(axis=1))
     return np.column_stack(columns)
 
@@ -204,7 +204,7 @@ def instant_slip(
         by_ground = -1.0 / size if traction else -sign * wheel_speed / fastest**2
         along = (
             by_wheel_speed + by_ground if in_state else by_ground
-        )  # the state's ground speed moves its rim too
+        )  # the wheel speed follows from the state's ground speed too
         slopes[0], slopes[1], slopes[2] = along * cos, along * sin, along * (x * sin - y * cos)
         slopes[3], slopes[4] = along * sideways, by_wheel_speed
         variance = 0.0 if in_state else by_wheel_speed**2 * wheel_speed_variance
@@ -222,8 +222,8 @@ def _wheel_speed(table: MeasurementTable, robot: Robot, wheel: int) -> Array:
 def wheel_speed_scatter_mps(robot: Robot) -> float:
     """Return the scatter of a wheel speed: the motor noise and the ripple of Hall steps; NaN where unknown.
 
-    Each step of the wheel by ``2 pi / steps`` lifts what the driver's low-pass reports by that over its time
-    constant, and until the next it falls again: a saw-tooth of standard deviation height / sqrt(12).
+    Each step of the wheel by ``2 pi / steps`` raises the low-passed rate of the motor driver by that over its
+    time constant, and until the next it falls again: a saw-tooth of standard deviation height / sqrt(12).
     """
     if not robot.describes("sensors", "motors"):
         return float("nan")

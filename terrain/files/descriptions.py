@@ -1,4 +1,4 @@
-"""YAML that describes things: every number with its unit and its source, no key that nobody asked for."""
+"""YAML that describes things: every number with its unit and its source, no unknown key."""
 
 from __future__ import annotations
 

@@ -65,7 +65,7 @@ class BodyMotion:
 
 
 def body_motion(odometry: Stream, camera: Camera) -> BodyMotion:
-    """Return the motion of the robot that a pose stream tells of.
+    """Return the motion of the robot from a pose stream.
 
     Parameters
     ----------

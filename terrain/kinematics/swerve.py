@@ -11,7 +11,7 @@ A twist is an array ``(..., 3)`` ordered ``(speed_x_mps, speed_y_mps, yaw_rate_r
 source puts the yaw rate first, and the columns of its H are reordered accordingly.
 
 Source: Danzi, AgriMaRo thesis, 2.3.  Corrected: one table of wheel positions, ``robot.wheel_positions_m``
-(its 7.2), because (2.3) numbers the wheels of the x axis the other way round; rows of H are
+(its 7.2), because (2.3) numbers the wheels of the x axis in the opposite order; rows of H are
 ``[-y_i 1 0; x_i 0 1]``; S is block-diagonal, 6 x 3.  Limits: :mod:`terrain.kinematics.swerve_limits`.
 
 Functions check what they are given; :func:`wheel_command_step` alone trusts it.

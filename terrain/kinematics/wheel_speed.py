@@ -1,4 +1,4 @@
-"""Wheel speeds: how fast each wheel's tread runs, from what the motor's driver reports."""
+"""Wheel circumferential speeds, from the rates that the motor driver reports."""
 
 from __future__ import annotations
 

@@ -8,8 +8,8 @@ The gyro and the wheels both see the robot turn, each on its own clock::
 with ``t_ref`` the first wheel sample.  Both signals pass the same Gaussian low-pass, as wide as a period of
 the slower stream and 0.1 s at least.  A coarse grid over (offset, rate) finds the highest correlation, least
 squares refines it.
-The search is bounded: the gain is positive (a skid-steer robot turns less than its wheels say, never the
-other way), offset and rate lie within a range; so a periodic manoeuvre cannot lock it on to a mirror image.
+The search is bounded: the gain is positive (a skid-steer robot turns less than its wheels indicate, never
+more), offset and rate lie within a range; so a periodic manoeuvre cannot lock it on to a mirror image.
 
 Standard deviations are those of least squares under residuals as correlated as they are found to be; in
 simulated runs of a minute they are right within a fifth, in runs of 15 s about a third too small.
@@ -51,7 +51,7 @@ RIVAL_MARGIN = 0.15
 """A second peak is a rival when it leaves at most this much more of the variance unexplained."""
 
 RATE_KNOWN = 0.01
-"""With a larger standard deviation the rate is not told apart from that of any stated sampling rate."""
+"""With a larger standard deviation the rate is indistinguishable from that of any stated sampling rate."""
 
 RIVAL_FLOOR = 0.05
 """Share of the variance by which a rival must be worse even when the best peak explains nearly everything."""
@@ -108,7 +108,7 @@ class _Search(NamedTuple):
 class _Fit(NamedTuple):
     """What least squares found; ``cov`` (4, 4) is of shift, gain, bias and rate.
 
-    The shift is told at the centre of the turning.
+    The shift refers to the centre of the turning.
     """
 
     shift_s: float
@@ -157,7 +157,7 @@ def estimate_clock(
     if np.sqrt(np.mean(turning)) < MIN_YAW_RATE_STD_RADPS:
         return _no_estimate("not excited", reference_s)
     turning[turning < MIN_YAW_RATE_STD_RADPS**2] = 0.0
-    # Shift and rate hardly trade against each other when the shift is told at the centre of the turning.
+    # Shift and rate hardly trade against each other when the shift refers to the centre of the turning.
     centre_s = float(np.average(pair.time_s, weights=turning))
     lever_s = centre_s - reference_s
 

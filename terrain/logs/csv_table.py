@@ -46,7 +46,7 @@ def read_columns(
     Parameters
     ----------
     path : file whose first line is a header
-    columns : names in the header, in the order wanted
+    columns : names in the header, in the required order
     delimiter : one character
     repair : turn cells that are no number into NaN, leave out rows of the wrong length, and count both
     dropped : counts by kind, added to when repairing

@@ -21,7 +21,7 @@ Little of the file is documented.  What is assumed here was held against the oth
 - *Windows* follow on one another, and so do commands.  The one after a change of speed begins a sample
   late (wheel speeds, which are new every second sample, repeat across that edge in 15 % of the cases, and
   in 50 % elsewhere); into the last one of five begins with the sample before it, which is read once.
-  Within a window the clock is the nominal one; at its edge it is sure to one sample.
+  Within a window the clock is the nominal one; at its edge it is accurate to one sample.
 - *Runs* begin where ``steady`` falls to 0.  ``step`` of such a window may still be the one before (62 of
   201), so that the windows after it number the run.
 - ``imu_yaw`` is the rate of ``icp_yaw`` (slope 1.00, offset 2 mrad/s).  The accelerometer is turned by half
@@ -142,8 +142,8 @@ def body_twists(pose: Array, period_s: float) -> Array:
     the sum being over the angles as published, with their jumps of a full turn.
 
     NaN where poses are too few or too much to one side for a slope (:data:`MAX_GAIN_PER_S`), as within
-    about 0.3 s of a window's edge.  The first pose of a window is not used, since nobody knows how old
-    it is; nor are poses that come out of a queue, as after an outage (:data:`OUTAGE_S`, :data:`QUEUE`).
+    about 0.3 s of a window's edge.  The first pose of a window is not used, since its age is
+    unknown; nor are poses that come out of a queue, as after an outage (:data:`OUTAGE_S`, :data:`QUEUE`).
     On the published file 65 % of the samples have a twist.  Poses scatter about their parabola by 19 mm
     forward, 5 mm sideways and 3 mrad, hence the twist by 0.05 m/s, 0.012 m/s and 0.007 rad/s.
 
@@ -188,8 +188,8 @@ def body_twists(pose: Array, period_s: float) -> Array:
     # of the parabola: (n, k, power, channel of the pose)
     curve = inverse @ np.swapaxes(view(weighted, width, axis=1) @ powers, -1, -2)
     with np.errstate(invalid="ignore"):
-        sure = np.sqrt(inverse[..., 1, 1]) / (half * period_s) <= MAX_GAIN_PER_S
-    slope = np.where(sure[..., None], curve[..., 1, :] / (half * period_s), np.nan)
+        certain = np.sqrt(inverse[..., 1, 1]) / (half * period_s) <= MAX_GAIN_PER_S
+    slope = np.where(certain[..., None], curve[..., 1, :] / (half * period_s), np.nan)
     heading = curve[..., 0, 2] - frame_yaw[:, None]
     cos, sin = np.cos(heading), np.sin(heading)
     return np.stack(
@@ -203,7 +203,7 @@ def body_twists(pose: Array, period_s: float) -> Array:
 
 
 def _dated(pose: Array, period_s: float) -> Array:
-    """Return (n, k) true where a pose is new and was not held up on its way."""
+    """Return (n, k) true where a pose is new and was not delayed in a queue."""
     new = np.zeros(pose.shape[:2], dtype=bool)
     new[:, 1:] = (np.diff(pose, axis=1) != 0.0).any(axis=-1)
     new &= np.isfinite(pose).all(axis=-1)

@@ -1,4 +1,4 @@
-"""Reader of any CSV files, told by a small YAML mapping where things are.
+"""Reader of any CSV files, whose layout a small YAML mapping describes.
 
 ::
 
@@ -125,10 +125,10 @@ def find_runs(folder: Path, mapping: Mapping) -> list[Callable[..., RunLog]]:
     found: dict[str, dict[str, str]] = {}
     for stream in mapping.streams.values():
         pattern = _pattern(stream.file)
-        wild = "".join(
+        pattern_text = "".join(
             "*" if part.startswith("{") else glob.escape(part) for part in re.split(r"(\{\w+\})", stream.file)
         )
-        for path in folder.glob(wild):
+        for path in folder.glob(pattern_text):
             match = pattern.fullmatch(path.relative_to(folder).as_posix())
             if match:
                 found[repr(sorted(match.groupdict().items()))] = match.groupdict()

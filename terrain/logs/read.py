@@ -138,7 +138,7 @@ def _entry(place: str, mapping: Any, key: str, kind: type) -> Any:
 def _channels(place: str, channels: dict[str, Any]) -> list[str]:
     for channel, unit in channels.items():
         if unit_of(channel) != unit:
-            raise LogError(f"{place}: channel {channel!r} is said to be in {unit!r}, its name says otherwise")
+            raise LogError(f"{place}: channel {channel!r} is declared in {unit!r}, its name states otherwise")
     if not channels:
         raise LogError(f"{place}: has no channel")
     return list(channels)

@@ -1,4 +1,4 @@
-"""A log told again as it came: step by step, what each sensor had sent since the step before."""
+"""Replay of a log: step by step, the samples of each sensor since the previous step."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ SENSORS: tuple[str, ...] = ("wheels", "steering", "imu", "odometry", "gnss")
 """Streams that a robot's sensors write; the others are commands, truth and what was made of them."""
 
 TWIST: tuple[str, ...] = ("speed_x_mps", "speed_y_mps", "yaw_rate_radps")
-"""Channels of the wanted motion in the stream ``commands``."""
+"""Channels of the desired motion in the stream ``commands``."""
 
 _SLACK_S = 1e-9  # stamps that differ by less are the same instant, written by two clocks' arithmetic
 
@@ -31,7 +31,7 @@ def replay(run: RunLog, rate_hz: float = 50.0) -> Iterator[Sample]:
     ------
     Sample
         with the readings stamped after the step before and up to this one, in the order of the log, and all
-        channels of it; the last twist wanted by then, zeros where the log has none; the label there
+        channels of it; the last twist desired by then, zeros where the log has none; the label there
 
     Raises
     ------
@@ -90,7 +90,7 @@ def _came(time_s: Array) -> Array:
 
 
 def _twists(run: RunLog, ticks: Array) -> Array:
-    """Return the twist (n, 3) wanted at each tick."""
+    """Return the twist (n, 3) desired at each tick."""
     twists = np.zeros((ticks.size, 3))
     commands = run.streams.get("commands")
     if commands is None or not set(TWIST) <= set(commands.channels):

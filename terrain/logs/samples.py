@@ -86,7 +86,7 @@ def checked_stream(
     row_of : row number in the file of a sample, for the message
     columns : c names of the columns in the file, for the message, where they are not the channels
     repairs : counts by kind of what is dropped instead of refused; None refuses
-    unknown_is_a_value : a channel may hold nothing but NaN, as slip does that nobody could observe
+    unknown_is_a_value : a channel may hold nothing but NaN, as unobservable slip does
 
     Raises
     ------

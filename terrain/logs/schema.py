@@ -63,7 +63,7 @@ WHEELS_CHANNELS: tuple[str, ...] = (
     *(f"motor_{i}_radps" for i in (1, 2, 3)),
     *(f"current_{i}_a" for i in (1, 2, 3)),
 )
-"""Channels of the drivers of a swerve robot: motor rates and motor currents."""
+"""Channels of the motor drivers of a swerve robot: motor rates and motor currents."""
 
 STEERING_CHANNELS: tuple[str, ...] = tuple(f"angle_{i}_rad" for i in (1, 2, 3))
 """Channels of its steering encoders."""

@@ -1,6 +1,6 @@
 """The contact of wheel and ground: slip over traction of a ground and of a shear curve, and its damping.
 
-Both planar motions slip by these laws, and the dynamic simulation shares what is said here of shear and
+Both planar motions slip by these laws, and the dynamic simulation shares their shear and
 damping: an effect is the same number in all of them.
 """
 

@@ -8,8 +8,8 @@ Locomotion, 1956; Wong, Theory of Ground Vehicles, chapter 2)::
     z0 = (3 N / ((3 - n) k sqrt(2 r)))^(2 / (2 n + 1))  sinkage of a rigid wheel
     Rc = k z0^(n + 1) / (n + 1)                         work of pressing a rut of depth z0, a metre travelled
 
-z0 takes the rim for a parabola and (z0 - x^2 / 2r)^n to first order in x^2: at that depth the soil carries N
-within 9 % for n up to 1.3, beside an error of the order of z0 / 4r.
+z0 takes the wheel's circumference for a parabola and (z0 - x^2 / 2r)^n to first order in x^2: at that
+depth the soil carries N within 9 % for n up to 1.3, beside an error of the order of z0 / 4r.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ def grade_resistance(weight_n: float, grade_rad: float) -> float:
 def contact_length(sinkage_m: float, wheel_radius_m: float, tyre_contact_m: float) -> float:
     """Return over which length in m the wheel shears: its arc in the ground, at least the tyre's own contact.
 
-    The arc runs from where the rim enters to its lowest point, r acos(1 - z / r).
+    The arc runs from where the wheel enters the soil to its lowest point, r acos(1 - z / r).
 
     Examples
     --------

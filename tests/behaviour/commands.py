@@ -124,8 +124,8 @@ def _drive_rows() -> list[list[float]]:
                 wheels = [(speed - 0.3 * turn) / 0.165, (speed + 0.3 * turn) / 0.165]
                 shaken = [0.01 * _wave(sample + 40 * window, k) for k in range(4)]
                 imu = [turn + shaken[0], shaken[1], shaken[2], 9.81 + shaken[3]]
-                felt = [wheels[0] + shaken[0], wheels[1] + shaken[1], *pose, *imu]
-                rows.append([step, window, int(window > 0), 0.05 * sample, *wheels, *felt])
+                measured = [wheels[0] + shaken[0], wheels[1] + shaken[1], *pose, *imu]
+                rows.append([step, window, int(window > 0), 0.05 * sample, *wheels, *measured])
     return rows
 
 

@@ -62,7 +62,7 @@ ALIASES_OF_VALUES: dict[str, str] = {
 IGNORED: dict[str, str] = {
     "seconds": "time that computing took",
     "elapsed_s": "time that computing took",
-    "created": "time of the day",
+    "created": "time of writing",
     "commit": "state of the code",
     "data_digest": "the last bit of one sample changes it; the samples are compared themselves",
     "digest": "the last bit of one sample changes it; the samples are compared themselves",
@@ -103,7 +103,7 @@ def differences(expected: Any, actual: Any, path: str = "", key: str = "") -> li
     ----------
     expected, actual : what JSON can hold
     path : where in the whole, for the lines
-    key : the last key on the way there, which says what a string is
+    key : the last key of that path, which decides what a string is
     """
     if key in IGNORED:
         return []
@@ -198,7 +198,7 @@ def _of_lists(expected: Sequence[Any], actual: Sequence[Any], path: str, key: st
 
 
 def _of_statistics(expected: Mapping[str, Any], actual: Mapping[str, Any], path: str) -> list[str]:
-    size = math.sqrt(expected["n"] * expected["sum_sq"])  # a sum of what cancels is as sure as its summands
+    size = math.sqrt(expected["n"] * expected["sum_sq"])  # a sum that cancels is as accurate as its summands
     found = []
     for name in sorted(STATISTICS):
         close = name == "sum" and abs(expected[name] - actual[name]) <= TOLERANCE * size

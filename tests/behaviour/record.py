@@ -195,8 +195,8 @@ def _run(words: Sequence[str], folder: Path) -> subprocess.CompletedProcess[str]
 
 def _run_step(step: Step, i: int, terrain: Sequence[str], folder: Path) -> dict[str, Any]:
     file = folder / f"step_{i:02d}.json"
-    wanted = [] if step.code else ["--json", file.name]
-    done = _run([*terrain, *step.words.split(), *wanted], folder)
+    options = [] if step.code else ["--json", file.name]
+    done = _run([*terrain, *step.words.split(), *options], folder)
     result: dict[str, Any] = {"line": step.words, "code": done.returncode}
     if done.returncode != step.code:
         result["stderr"] = done.stderr[-2000:]

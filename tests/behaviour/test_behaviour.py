@@ -42,7 +42,7 @@ def terrain_command():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
-def test_a_case_gives_what_it_gave(case, tmp_path):
+def test_a_case_reproduces_its_recorded_result(case, tmp_path):
     result = run_case(case, terrain_command(), tmp_path)
     found = differences(load_result(case.name), result)
     assert not found, f"{len(found)} differences\n" + "\n".join(found[:40])
@@ -90,7 +90,7 @@ def test_the_same_has_no_difference():
         (lambda r: r["page"].update(h2=["Verdict", "What it is"]), "/page/h2/1"),
     ],
 )
-def test_a_change_is_seen(change, where):
+def test_each_change_is_detected(change, where):
     assert [line.partition(":")[0] for line in changed(change) if line.startswith(where)][:1] == [where]
 
 
@@ -109,7 +109,7 @@ def test_words_and_times_may_change(change):
     assert changed(change) == []
 
 
-def test_a_sum_that_cancels_is_as_sure_as_its_summands():
+def test_a_sum_that_cancels_is_as_accurate_as_its_summands():
     one = {**statistics([1e6, -1e6, 0.0]), "sum": 0.0}
     assert differences(one, {**one, "sum": 1e-6}) == []
     assert differences(one, {**one, "sum": 1.0}) == ["/sum: 0.0 was expected, it is 1.0"]

@@ -57,13 +57,13 @@ def report(benchmark, n_windows, n_features):
         benchmark.extra_info["ms_per_window"] = 1e3 * benchmark.stats.stats.median / n_windows
 
 
-def test_ours_all_at_once(benchmark, compared):
+def test_transform_of_all_windows_at_once(benchmark, compared):
     windows, benchmark.group = compared
     table = benchmark(warmed_up(windows).transform, windows)
     report(benchmark, *table.shape)
 
 
-def test_ours_one_by_one(benchmark, compared):
+def test_transform_of_windows_one_by_one(benchmark, compared):
     windows, benchmark.group = compared
     extractor = warmed_up(windows)
     rows = benchmark(lambda: [extractor.transform(windows[i]) for i in range(len(windows))])

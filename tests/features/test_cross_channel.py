@@ -16,7 +16,7 @@ def by_name(imu, wheels, wheel_channels=WHEELS):
     return dict(zip([feature.name for feature in features], table.T, strict=True))
 
 
-def test_what_a_filter_estimates_is_no_imu_and_no_wheel():
+def test_speed_features_exclude_estimated_signals():
     values = {"imu": np.ones((2, 6, 50)), "estimator": np.ones((2, 2, 50))}
     channels = {"imu": IMU, "estimator": ("speed_x_mps", "accel_x_mps2")}
     assert speed_features(values, channels)[0] == []  # an estimated speed is none of the wheels'
@@ -64,7 +64,7 @@ def test_without_a_turn_there_is_no_turning_slip():
     assert "turning.yaw_per_wheel_difference" not in one_sided
 
 
-def test_per_speed_features_do_what_their_names_say():
+def test_per_speed_features_match_their_definitions():
     rng = np.random.default_rng(0)
     imu, wheels = rng.standard_normal((5, 6, 200)), rng.uniform(0.3, 0.6, (5, 4, 13))
     slow, fast = by_name(imu, wheels), by_name(imu, wheels * [[2.0], [2.0], [1.0], [1.0]])

@@ -75,7 +75,7 @@ def test_a_set_switched_off_takes_away_exactly_the_features_it_is_part_of(off):
     np.testing.assert_array_equal(part.transform(windows), whole.transform(windows)[:, kept])
 
 
-def test_levels_that_are_no_terrain_are_left_out_unless_asked_for():
+def test_levels_that_are_no_terrain_are_left_out_by_default():
     windows = draw_windows()
 
     def levels(extractor):
@@ -192,7 +192,7 @@ def test_it_is_a_scikit_learn_transformer():
     np.testing.assert_array_equal(again.fit_transform(windows), fitted.transform(windows))
 
 
-def test_what_it_learned_is_stored_without_pickle():
+def test_a_trained_model_is_stored_without_pickle():
     windows = draw_windows()
     extractor = FeatureExtractor().fit(windows)
     stored = io.dumps(extractor)

@@ -104,7 +104,7 @@ def test_crossings_per_second_of_a_tone_are_twice_its_frequency_at_every_rate():
 
 
 @pytest.mark.parametrize("level", [0.0, 9.81, -1e3])
-def test_a_flat_channel_has_no_shape(level):
+def test_a_constant_channel_has_no_shape_features(level):
     found = table(np.full((1, 1, 50), level))
     for name in NAMES:
         expected = {"log_std": -4.0, "rms": abs(level), "mean_abs": abs(level)}.get(

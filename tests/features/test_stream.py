@@ -118,7 +118,7 @@ def test_streams_may_arrive_out_of_order_among_themselves():
     assert_same(batch.windows, streamed(lagging, RULE, LAYOUT)[1])
 
 
-def test_bad_stamps_cost_one_sample_each_and_nothing_else():
+def test_each_bad_stamp_costs_only_its_sample():
     batch = cut_windows([RunLog("a", "husky", STREAMS)], RULE)
     events = merged(STREAMS)
     bad = [np.nan, np.inf, -np.inf, -1.0, 5.0, 1e300, 1e9]

@@ -224,5 +224,5 @@ def test_short_runs_can_be_skipped_and_are_counted():
     assert nothing.values["imu"].shape == (0, 1, 100)
 
 
-def test_rates_near_a_whole_number_do_not_lose_a_sample():
+def test_rates_near_an_integer_do_not_lose_a_sample():
     assert Layout({"imu": ("accel_z_mps2",)}, {"imu": 99.9999}).n_samples("imu", 2.0) == 200

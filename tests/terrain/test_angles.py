@@ -31,5 +31,5 @@ def test_whole_turns_do_not_matter(angle, turns):
     assert wrapped(np.array([angle]))[0] == once
 
 
-def test_unknown_stays_unknown():
+def test_nan_propagates():
     assert math.isnan(wrapped(math.nan))

@@ -91,7 +91,7 @@ def test_singular_points_of_the_slip_ratio():
             slip_ratio(wheel_speed, ground, min_speed_mps=least)
 
 
-def test_slip_angle_is_that_of_the_slide_to_the_left_whichever_way_the_wheel_rolls():
+def test_slip_angle_is_positive_to_the_left_for_both_rolling_directions():
     np.testing.assert_allclose(
         slip_angle([1.0, -1.0, 1.0], [0.2, 0.2, -0.2]), np.arctan(0.2) * np.array([1, 1, -1])
     )
@@ -131,7 +131,7 @@ def test_sign_of_slip_is_that_along_the_wheel(steer, rolls, goes, traction):
     np.testing.assert_allclose(encoders, slip)
 
 
-def test_each_wheel_has_its_own_way_in_a_turn():
+def test_each_wheel_slips_along_its_own_path_in_a_turn():
     turn = 0.6
     mean = np.zeros(9)
     mean[:3] = 0.5, 0.1, turn
@@ -149,25 +149,25 @@ def test_each_wheel_has_its_own_way_in_a_turn():
 
 
 @pytest.mark.parametrize("slip_speed", [0.12, -0.15])  # traction, braking
-@pytest.mark.parametrize("way", [1.0, -1.0])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
 @pytest.mark.parametrize("with_slip", [True, False])
-def test_uncertainty_of_slip_is_that_of_the_state(slip_speed, way, with_slip):
+def test_uncertainty_of_slip_is_that_of_the_state(slip_speed, sign, with_slip):
     """First order against a Monte Carlo of the states, correlations and all."""
     rng = np.random.default_rng(5)
     states = WITH_SLIP if with_slip else WITHOUT
-    mean = np.array([0.7 * way, 0.15, 0.3, 0.4, -0.3, 0.2, *[slip_speed * way] * 3])[: len(states)]
+    mean = np.array([0.7 * sign, 0.15, 0.3, 0.4, -0.3, 0.2, *[slip_speed * sign] * 3])[: len(states)]
     root = 0.004 * rng.standard_normal((len(states), len(states)))
     cov = root @ root.T
     track = make_track(mean, states, cov)
     wheel_speed_std = 0.01
     along = track_ground(mean)
-    wheel_speed = along + slip_speed * way
+    wheel_speed = along + slip_speed * sign
     slip = wheel_slip(track, make_table(track, wheel_speed), ROBOT, wheel_speed_std_mps=wheel_speed_std)
     n = 40000
     drawn = make_track(rng.multivariate_normal(mean, cov, n), states)
     wheel_speeds = make_table(drawn, wheel_speed + wheel_speed_std * rng.standard_normal((n, 3)))
     scatter = wheel_slip(drawn, wheel_speeds, ROBOT)
-    assert np.sign(slip.slip_ratio[0]).tolist() == [np.sign(slip_speed * way)] * 3
+    assert np.sign(slip.slip_ratio[0]).tolist() == [np.sign(slip_speed * sign)] * 3
     # 0.5 % by chance, the rest is second order at 3 % of relative noise
     np.testing.assert_allclose(scatter.slip_ratio.std(axis=0), slip.slip_std[0], rtol=0.03)
 
@@ -178,7 +178,7 @@ def track_ground(mean):
     return (mean[0] - mean[2] * y) * np.cos(steer) + (mean[1] + mean[2] * x) * np.sin(steer)
 
 
-def test_uncertainty_of_the_rim_is_by_default_the_robots_own():
+def test_wheel_speed_uncertainty_is_by_default_the_robots_own():
     track = make_track([0.8, *[0.0] * 5], WITHOUT)
     table = make_table(track, 1.0)
     wheel_speed_std = wheel_slip(track, table, ROBOT).slip_std[0, 0] / 0.8
@@ -245,7 +245,7 @@ def test_sides_of_a_skid_steered_robot(speed_name):
     )
 
 
-def test_what_does_not_fit_is_refused():
+def test_tracks_and_tables_that_do_not_match_are_refused():
     track = make_track(np.zeros((3, 9)), WITH_SLIP)
     with pytest.raises(DataError, match="are not on one clock"):
         wheel_slip(track, make_table(make_track(np.zeros((4, 9)), WITH_SLIP), 1.0), ROBOT)
@@ -267,7 +267,7 @@ def lagged(speed, tau, dt=0.001):
 
 
 def start_of_a_run(slip, camera_s=0.0):
-    """Return a 1 m/s^2 start to 1 m/s: encoders behind 50 ms, a camera behind what is said."""
+    """Return a 1 m/s^2 start to 1 m/s: encoders behind 50 ms, a camera behind by ``camera_s``."""
     rng = np.random.default_rng(0)
     fine = np.arange(0, 4.0, 0.001)
     speed = np.clip(fine - 0.5, 0.0, 1.0)
@@ -341,7 +341,7 @@ def test_figures_of_a_run_come_from_its_steady_and_its_transient_parts():
     assert coarse.steady_mean == pytest.approx(figures.steady_mean, abs=0.002)
 
 
-def test_figures_that_nothing_gives_are_unknown():
+def test_figures_without_steady_or_moving_samples_are_nan():
     slip, speed, time = drive(np.full((600, 3), 0.1))
     standing = slip_figures(slip, np.zeros(600), time)
     short = slip_figures(
@@ -384,8 +384,8 @@ def test_slip_of_one_instant_is_that_of_the_track(states):
             0.05**2,
             found[k],
         )
-    heard = np.maximum.accumulate(np.where(np.isfinite(wheel_speed_mps), track.time_s[:, None], -1.0))
-    found = np.where((track.time_s[:, None] - heard > 0.5)[:, None], np.nan, found)
+    measured_s = np.maximum.accumulate(np.where(np.isfinite(wheel_speed_mps), track.time_s[:, None], -1.0))
+    found = np.where((track.time_s[:, None] - measured_s > 0.5)[:, None], np.nan, found)
     np.testing.assert_allclose(found[:, 0], slip.slip_ratio, rtol=0, atol=1e-14)
     np.testing.assert_allclose(found[:, 1], slip.slip_std, rtol=1e-9, atol=1e-14)
     assert np.isfinite(found).any()

@@ -114,9 +114,9 @@ def run_filter(
     -------
     StateTrack
         ``time_s`` increases strictly.  Left out and counted in ``dropped`` are rows whose stamp does not
-        advance; the first row after a leap of more than ``max_gap_s`` either way, which is believed when the
-        next stamp follows it (so that one bad stamp costs one row); and, of a clock that was set back, the
-        rows up to the time that the track had reached: the filter takes them in, the track cannot hold them.
+        advance; the first row after a jump of more than ``max_gap_s`` forward or back, which is accepted when
+        the next stamp follows it (so that one bad stamp costs one row); and, of a clock that was set back,
+        the rows up to the time that the track had reached: the filter uses them, the track omits them.
 
     Raises
     ------

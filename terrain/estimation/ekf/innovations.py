@@ -1,4 +1,4 @@
-"""What each measurement said beyond its prediction, to look at: a filter keeps only the squares."""
+"""The innovations of each measurement, for inspection: a filter keeps only their squares."""
 
 from __future__ import annotations
 

@@ -53,7 +53,7 @@ _NOT_ADVANCED, _JUMPED, _LOST = range(3)
 _GATED, _NOT_FINITE, _NUMERICAL = range(3)
 _N_PER_ROW, _N_PER_SENSOR = len(PER_ROW), len(PER_SENSOR)
 _SKIP, _START, _STEP, _LEAP = range(4)  # what the clock says of a row
-_UNSOUND = -1  # a use that nobody sees
+_UNSOUND = -1  # a use that is never reported
 
 
 @fast
@@ -164,7 +164,7 @@ def run(  # noqa: C901, PLR0913 - one loop: cut into functions a step takes 6.7 
             copy(p, x, p_before, x_before)
             predict(propagate, params, x, p, q, gap_s, x_next, f, fp, f_cols, n_f_cols)
             bridge(p, p_before, is_position)
-            clock[AGE] = clock[AGE] + dt if dt > 0.0 else np.inf  # set back: nobody knows how long ago
+            clock[AGE] = clock[AGE] + dt if dt > 0.0 else np.inf  # set back: the age is unknown
             rejected_s[:] = -1.0
 
         if taken[n]:

@@ -104,7 +104,7 @@ def _initial_variance(model: FilterModel, noise: Noise) -> Array:
 
 @lru_cache(maxsize=16)
 def matrices_of(model: FilterModel, noise: Noise) -> tuple[Array, Array]:
-    """Return P0 and Q as the kernel wants them, once they are sure to fit the model."""
+    """Return P0 and Q in the layout of the kernel, checked against the model."""
     d, m = len(model.states), len(model.rows)
     for name in ("process_variance", "initial_variance"):
         matrix = getattr(noise, name)

@@ -6,8 +6,8 @@ Wheels of a side turn together at v_left, v_right; v is the speed, w the yaw rat
 
 A skid-steer robot turns by sliding, so that B is not the distance of its wheels but 1.5 to 2 times that
 (Mandow et al., Experimental kinematics for wheeled skid-steer mobile robots, IROS 2007); it is a state, and
-known as well as the robot has turned.  The gyro's bias b is told from turning by the wheels, at the latest
-when they stand.
+known as well as the robot has turned.  The gyro's bias b is distinguished from turning by the wheels, at the
+latest when they stand.
 
 What is missing is the slip that both sides share: v is the speed of the wheels.  The filter has no reference
 of the speed over ground, ``reference_age_s`` of its track is infinite, and so slip is unknown, not zero.

@@ -37,8 +37,8 @@ _SAMPLE_STD = {
     "gnss_position_m": 0.02,
     "gnss_speed_mps": 0.03,
 }
-_WHEEL_SPEED_STD_MPS = 0.007  # of a wheel's rim, mostly the ripple of the Hall steps
-_SLIP_STD_MPS = 0.15  # how far rim and ground differ, where both are measured and no state stands for it
+_WHEEL_SPEED_STD_MPS = 0.007  # circumferential speed of a wheel, mostly the ripple of the Hall steps
+_SLIP_STD_MPS = 0.15  # wheel speed minus ground speed, where both are measured and slip is no state
 
 
 def _described_std(robot: Robot) -> dict[str, float]:
@@ -139,8 +139,8 @@ def adaptive_noise(robot: Robot, factor: float) -> Noise:
 
     The variance of the wheels is multiplied by the factor, that of accelerometer and gyro divided by it, and
     the walk of the yaw rate multiplied.  No factor will do: as long as the wheels hold the speed, it is
-    theirs and slip reads zero; where they let go of it, it is the integral of the accelerometer's
-    bias too.  The speed over ground has to be measured.
+    theirs and slip reads zero; where they do not, it includes the integral of the accelerometer's
+    bias.  The speed over ground has to be measured.
 
     Raises
     ------

@@ -21,7 +21,7 @@ from terrain.estimation.ekf.model import FilterModel, Noise
 from terrain.records import Array
 
 WIDEST_SCALE = 1e4
-"""No variance is scaled by more than this, either way."""
+"""No variance is scaled up or down by more than this."""
 
 CLEAR_DROP = 2.0
 """A scale twice or half as large has to cost this much log likelihood, as an error of two standard deviations

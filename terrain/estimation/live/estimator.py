@@ -45,7 +45,7 @@ SETTINGS = FilterSettings(GATE_PROBABILITY, REOPEN_AFTER_S)
 """Those of the batch."""
 
 CHANNELS: Mapping[str, tuple[str, ...]] = {"wheels": WHEELS_CHANNELS, **STREAMS}
-"""Channels of each stream unless others are told."""
+"""Default channels of each stream."""
 
 
 class LiveEstimate(NamedTuple):
@@ -60,8 +60,8 @@ class LiveEstimate(NamedTuple):
     reference_age_s : time since it was; infinite before the first time
     rows : (18,) what was measured, in the order of ``ROWS_OF_DRIVE["swerve"]``; NaN where nothing was
     speed_x_mps, speed_y_mps, yaw_rate_radps, accel_x_mps2, accel_y_mps2 : of the states, by name
-    motor_radps, current_a : (3,) as this sample of the wheels told them
-    wheel_speed_mps : (3,) speeds of the rims by it
+    motor_radps, current_a : (3,) of this sample of the wheels
+    wheel_speed_mps : (3,) circumferential speeds of that sample
     """
 
     time_s: float
@@ -219,7 +219,7 @@ class LiveEstimator:
 
     @property
     def lag_s(self) -> float:
-        """How old what is told is: every row is behind the low-pass that the encoders' rates come through."""
+        """Delay of every estimate: each row follows the low-pass of the encoders' rates."""
         return self._robot.sensors.encoder_time_constant_s
 
     @property
@@ -246,7 +246,7 @@ class LiveEstimator:
         -------
         list of LiveEstimate
             in order of time, unless the clock of the wheels was set back.  A stamp that leaps by more than
-            ``settings.max_gap_s`` is believed, and told of, when the next one follows it.
+            ``settings.max_gap_s`` is accepted, and reported, when the next one follows it.
         """
         for name, stream, columns, fixed in self._inputs:
             reading = readings.get(name)

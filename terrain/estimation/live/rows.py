@@ -45,7 +45,7 @@ WHEEL_KINDS = ("not finite", "beyond the motors")
 QUEUE = 1024
 """Samples of a stream that wait for the wheels; five seconds of a camera."""
 
-_STAMP, _OFF_CLOCK, _NOT_FINITE, _FROZEN, _UNSURE, _NO_ROTATION, _LEAP, _WAITED = range(len(KINDS))
+_STAMP, _OFF_CLOCK, _NOT_FINITE, _FROZEN, _LOW_CONFIDENCE, _NO_ROTATION, _LEAP, _WAITED = range(len(KINDS))
 _STAMP_COLUMN, _FINITE_COLUMN, _FIRST_COLUMN = 0, 1, 2  # of a queue
 
 _V, _M, _I, _IM = float64[::1], float64[:, ::1], int64[::1], int64[:, ::1]
@@ -127,7 +127,7 @@ def _refused(stream: int, stamped: Array, before: Array) -> int:
     if stream == ODOMETRY and complete and _repeats(stamped, 3, 13, before[1]):
         return _FROZEN
     if stream == ODOMETRY and stamped[_FIRST_COLUMN + 13] < MIN_CONFIDENCE_RATIO:
-        return _UNSURE
+        return _LOW_CONFIDENCE
     return -1
 
 

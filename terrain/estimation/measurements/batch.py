@@ -1,8 +1,8 @@
 """The measurements of a whole run log: one clock, one delay.
 
-The clock is that of the wheels, whose rates come behind the driver's low-pass.  A ground speed that is ahead
-of them makes the slip of a start look negative (Danzi, AgriMaRo thesis, 7.2.2), so every other signal goes
-through a low-pass too, and its own lag and the filter's together are the encoders'.  In order:
+The clock is that of the wheels, whose rates pass the low-pass of the motor driver.  A ground speed that
+is ahead of them makes the slip of a start look negative (Danzi, AgriMaRo thesis, 7.2.2), so every other
+signal goes through a low-pass too, and its own lag and the filter's together are the encoders'.  In order:
 
 1. samples that cannot be true are left out and counted (:mod:`~terrain.estimation.measurements.cleaning`);
 2. known latencies are subtracted from the stamps;

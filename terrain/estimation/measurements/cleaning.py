@@ -54,9 +54,9 @@ def clean_stream(
         kept[finite] = ~_frozen(time_s[finite], values[finite][:, noisy])
         dropped[f"{name}: frozen"] += int((~kept).sum())
     if "confidence_ratio" in present:
-        unsure = kept & (values[:, channels.index("confidence_ratio")] < MIN_CONFIDENCE_RATIO)
-        dropped[f"{name}: low confidence"] += int(unsure.sum())
-        kept &= ~unsure
+        low_confidence = kept & (values[:, channels.index("confidence_ratio")] < MIN_CONFIDENCE_RATIO)
+        dropped[f"{name}: low confidence"] += int(low_confidence.sum())
+        kept &= ~low_confidence
     return Stream(time_s[kept], values[kept], tuple(channels)) if kept.any() else None
 
 

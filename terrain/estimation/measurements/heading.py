@@ -36,13 +36,13 @@ def gnss_heading(table: MeasurementTable, robot: Robot) -> float:
     """
     yaw = table.columns(["camera_yaw_rad", "imu_yaw_rad"])
     yaw_rad = np.where(np.isfinite(yaw[:, 0]), yaw[:, 0], yaw[:, 1])
-    told = table.columns(["gnss_speed_x_mps", "gnss_speed_y_mps"]) @ np.array([1.0, 1.0j])
+    gnss_speed = table.columns(["gnss_speed_x_mps", "gnss_speed_y_mps"]) @ np.array([1.0, 1.0j])
     seen = _speed_over_ground(table, robot) * np.exp(1j * yaw_rad)
-    good = np.isfinite(told) & np.isfinite(seen) & (np.abs(seen) > MIN_SPEED_MPS)
+    good = np.isfinite(gnss_speed) & np.isfinite(seen) & (np.abs(seen) > MIN_SPEED_MPS)
     weight = float(np.sum(np.abs(seen[good]) ** 2))
     if weight == 0.0 or GNSS_SPEED_STD_MPS / math.sqrt(weight) > MAX_STD_RAD:
         return math.nan
-    return cmath.phase(complex(np.sum(told[good] * np.conj(seen[good]))))
+    return cmath.phase(complex(np.sum(gnss_speed[good] * np.conj(seen[good]))))
 
 
 def _speed_over_ground(table: MeasurementTable, robot: Robot) -> Array:

@@ -19,8 +19,8 @@ from terrain.estimation.measurements.sample_hold import LEAPS, N_LINE, NO_LEAP, 
 from terrain.estimation.measurements.table import (
     GNSS_SPEED_STD_MPS,
     GNSS_STD_M,
+    MAX_RATE_FACTOR,
     ROWS_OF_DRIVE,
-    WILD_FACTOR,
 )
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.kinematics.camera import QUATERNION_TOLERANCE
@@ -80,7 +80,7 @@ def params_of(robot: Robot, initial_yaw_rad: float) -> Array:
     values: dict[str, float] = dict.fromkeys(PARAMS, 0.0)
     values |= {"wheel_radius_m": robot.wheel_radius_m, "initial_yaw_rad": initial_yaw_rad}
     values["reduction_ratio"] = motors.reduction_ratio
-    values["fastest_radps"] = WILD_FACTOR * motors.speed_max_radps
+    values["fastest_radps"] = MAX_RATE_FACTOR * motors.speed_max_radps
     values |= {name: getattr(sensors, name) for name in PARAMS if hasattr(sensors, name)} | zeros
     return np.array([values[name] for name in PARAMS])
 

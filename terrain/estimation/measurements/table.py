@@ -11,8 +11,8 @@ import numpy as np
 from terrain.errors import DataError
 from terrain.records import Array, read_only
 
-WILD_FACTOR = 2.0
-"""No wheel turns so many times faster than its motor can drive it."""
+MAX_RATE_FACTOR = 2.0
+"""Wheel rates above this multiple of the motor's maximum are discarded."""
 
 LATE_S = 0.5
 """A camera whose first sample comes later than this after the clock's may have missed a turn."""
@@ -21,7 +21,7 @@ STANDING_S = 1.0
 """Longest stretch, before the wheels turn, over which the heading at the start is averaged."""
 
 STANDING_SPEED_MPS = 0.05
-"""Rim speed under which a wheel counts as standing (thesis 7.2.1)."""
+"""Wheel circumferential speed below which a wheel counts as standing (thesis 7.2.1)."""
 
 GNSS_LATENCY_S = 0.1
 """Age of a position when it arrives; assumed, as in the simulated receiver."""

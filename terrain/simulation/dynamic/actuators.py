@@ -57,7 +57,7 @@ def linkage_heading(plant: Plant, tail: Array, encoder_rad: float, i: int) -> fl
 
 @njit(cache=True)
 def drive_wheel(plant: Plant, w: Array, command_radps: float, load_nm: float, dt: float) -> None:
-    """Speed loop, motor and wheel; then what the driver reports of it."""
+    """Speed loop, motor and wheel; then the rate that the motor driver reports."""
     command = min(max(command_radps, -plant.speed_max_radps), plant.speed_max_radps)
     error = command - w[ESTIMATE]
     desired = plant.speed_gain * error + w[INTEGRAL]

@@ -92,7 +92,7 @@ def make_plant(robot: Robot, conditions: Conditions, profile: TerrainProfile) ->
     ----------
     robot : with sections body, motors, steering and sensors; of its effects those listed above act, and a
     payload
-    conditions : load, slope, tyres and the play of the third leg
+    conditions : load, slope, tyres and the backlash of the third leg
     profile : the terrain
 
     Raises

@@ -21,7 +21,7 @@ FIELD_STEP_M = 0.1
 """Grid of the variation of the terrain along the path."""
 
 MAX_FIELD_CELLS = 5 * 10**6
-"""Cells of terrain up to the farthest point that the fastest wheel can reach; a day at 2 m/s takes 3.5
+"""Cells of terrain up to the farthest point that the fastest wheel can reach; 24 h at 2 m/s take 3.5
 million."""
 
 

@@ -5,10 +5,10 @@ States are integrated with semi-implicit steps of :data:`STEP_S`.  What acts, in
 - **load**: three contacts carry a rigid body, so their normal forces follow from balance alone:
   ``sum N = m g cos``, and the moments of gravity and inertia about the two body axes; tyres as springs over
   a rough ground add their own (:func:`_ride`).
-- **steering**: a rate-limited, acceleration-limited motor turns the wheel through a play of half width
+- **steering**: a rate-limited, acceleration-limited motor turns the wheel through a backlash of half width
   ``dead_band``.
-- **speed loop** of each driver: PI on its own estimate of the wheel's rate, torque limit with anti-windup,
-  torque lag; the current follows the torque.
+- **speed loop** of each motor driver: PI on its own estimate of the wheel's rate, torque limit with
+  anti-windup, torque lag; the current follows the torque.
 - **contact**: longitudinal and lateral deflections of the contact (Pacejka, Tyre and Vehicle Dynamics, 7.2.1,
   single contact point) with the larger absolute speed as in the SAE slip,
   ``du/dt = (w r - v_long) - max(|w r|, |v_long|) u / sigma``, so that ``u / sigma`` settles at the slip
@@ -16,7 +16,7 @@ States are integrated with semi-implicit steps of :data:`STEP_S`.  What acts, in
   and resistance.
 - **leg**: the third wheel's leg swings about a hinge on the line of the other two, within
   :attr:`Plant.leg_backlash_rad`, to where the ground pushes its wheel; that turns the wheel's heading, which
-  its steering encoder below the hinge does not see (thesis, conclusions: play of the third leg's opening
+  its steering encoder below the hinge does not see (thesis, conclusions: backlash of the third leg's opening
   system). What the swing moves the wheel's centre by, and its friction's own moment, are left out.
 - **body**: ``m (dv/dt + w x v) = sum F - m g grad``, ``I dw/dt = sum (r_i - r_com) x F_i``.
 

@@ -51,7 +51,7 @@ def replay(
 def undone(
     planar: Planar, p: Array, dt: float, wheel_speed_mps: Array, grade_rad: Array, roll_rad: Array
 ) -> tuple[Array, Array, Array]:
-    """Return rims, grade and roll as they are, of what is measured of them; see :func:`replay`."""
+    """Return true wheel speeds, grade and roll from the measured ones; see :func:`replay`."""
     wheel_speed, grade, roll = wheel_speed_mps, grade_rad - p[_PITCH_OFFSET], roll_rad - p[_ROLL_OFFSET]
     lag = planar.encoder_lag_s + p[_LAG]
     if lag != 0.0:

@@ -1,6 +1,6 @@
 """One run of the planar simulation: desired twists in, an ordinary run log with its truth out.
 
-Twists become the wheel speeds and steering angles that a driver would command with the described geometry
+Twists become the wheel speeds and steering angles that a controller would command with the described geometry
 (:mod:`~terrain.simulation.planar.drives`); the motors follow them with a lag and bounded rates;
 :func:`~terrain.simulation.planar.motion.move` gives the motion on hilly terrain,
 :func:`~terrain.simulation.planar.ideal_sensors.sense` the measurements of sensors without noise; loggers add

@@ -143,10 +143,10 @@ def move_swerve(
     spun = slopes(mean_wheel_speed, dt)
     for k in range(n):
         torque = (out[k, AMPS] + planar.rotating_kg * spun[k]) * planar.radius_m
-        way = mean_wheel_speed[k] / math.sqrt(
+        direction = mean_wheel_speed[k] / math.sqrt(
             mean_wheel_speed[k] * mean_wheel_speed[k] + ROLLING_MPS * ROLLING_MPS
         )
-        out[k, AMPS] = (torque + planar.friction_nm * way) / planar.nm_per_a
+        out[k, AMPS] = (torque + planar.friction_nm * direction) / planar.nm_per_a
     return out
 
 
@@ -181,7 +181,7 @@ def _decayed(half_trace: float, determinant: float, dt: float) -> tuple[float, f
 def _rolled(
     planar: Planar, p: Array, dt: float, wheel_speed_mps: Array, steer_rad: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Return the twist without slip, the rims' root mean square and mean, and what tractions pull.
+    """Return the twist without slip, the wheel speeds' root mean square and mean, and the pull of tractions.
 
     (3, n), (n,), (n,), and (3, n): what a traction in each direction of the twist pulls along the wheels.
     """
@@ -204,8 +204,8 @@ def _rolled(
             total += wheel_speed
             cos, sin = math.cos(angle[i, k]), math.sin(angle[i, k])
             for j in range(3):
-                told = planar.to_twist[j, 2 * i] * cos + planar.to_twist[j, 2 * i + 1] * sin
-                u[j, k] += wheel_speed * told
+                gain = planar.to_twist[j, 2 * i] * cos + planar.to_twist[j, 2 * i + 1] * sin
+                u[j, k] += wheel_speed * gain
             heading[0, k] += cos / 3.0
             heading[1, k] += sin / 3.0
             heading[2, k] += (planar.arm_ratio[i, 0] * sin - planar.arm_ratio[i, 1] * cos) / 3.0

@@ -78,9 +78,9 @@ def course(
     request: DriveRequest, desired_s: float | None, terrains: tuple[str, ...]
 ) -> tuple[Array, Array, tuple[Patch, ...]]:
     """Lay patches and drive over them; a given duration lays as many as are reached in it."""
-    ground, driver = request.rng.spawn(2)
-    request = request._replace(rng=driver)
-    rounds = _rounds(terrains, ground)
+    patch_rng, motion_rng = request.rng.spawn(2)
+    request = request._replace(rng=motion_rng)
+    rounds = _rounds(terrains, patch_rng)
     laid, end_m = next(rounds)
     if desired_s is None:
         slowest_mps = request.limit((0.4 * request.speed_mps, 0.0, 0.4 * request.speed_mps * 0.15))[0]

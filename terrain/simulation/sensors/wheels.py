@@ -22,7 +22,7 @@ def add_rate_noise(rate: Array, noise: Array, standstill: float) -> Array:
 
 
 class WheelSensor(Sensor):
-    """Motor rates behind the driver's low-pass on quantised Hall steps, and motor currents.
+    """Motor rates after the motor driver's low-pass on quantised Hall steps, and motor currents.
 
     Of the robot's effects it applies motor_drift.
     """

@@ -79,7 +79,7 @@ def coverage(truth):
         held = {}
         for findings in calibrations:
             for finding in findings:
-                if finding.told and "." in finding.parameter:
+                if finding.determined and "." in finding.parameter:
                     held.setdefault(finding.parameter, []).append(
                         finding.low <= truth(finding.parameter) <= finding.high
                     )

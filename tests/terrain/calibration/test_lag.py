@@ -73,5 +73,5 @@ def test_holes_and_curves_are_left_out(drive, zeroed):
     assert starts_and_stops(drive("arc", 4), zeroed, HARD) == []
     assert starts_and_stops(drive("starts", 4, terrain="grass"), zeroed, HARD) == []
     few = time_constants(whole[:4])
-    assert not any(finding.told for finding in few)
+    assert not any(finding.determined for finding in few)
     assert few[0].note == "4 straight starts and stops on hard ground: 5 are needed"

@@ -24,13 +24,13 @@ def test_noise_comes_back(drive, nominal, coverage):
     assert len(held) == 8
     assert min(held.values()) >= 0.8
     for finding in found[0].values():  # and narrow: 5 % of each
-        assert not finding.told or finding.high - finding.low < 0.1 * finding.value
+        assert not finding.determined or finding.high - finding.low < 0.1 * finding.value
     motor = found[0]["sensors.motor_std_radps"]
-    assert not motor.told
+    assert not motor.determined
     assert motor.note == "no noise at rest"  # a Hall sensor that sees no step
 
 
-def test_noise_is_told_from_what_moves_slowly_and_from_jumps(drive, nominal):
+def test_noise_is_separated_from_slow_drift_and_from_jumps(drive, nominal):
     biased = nominal.with_parts(sensors=replace(nominal.sensors, gyro_bias_z_radps=0.02))
     run = drive("stand", 1, robot=biased)
     plain = noise_of([run], nominal)
@@ -42,7 +42,7 @@ def test_noise_is_told_from_what_moves_slowly_and_from_jumps(drive, nominal):
         "r", run.robot, {**run.streams, "odometry": Stream(odometry.time_s, values, odometry.channels)}
     )
     for name, finding in noise_of([jumped], nominal).items():
-        if finding.told:
+        if finding.determined:
             assert finding.value == pytest.approx(plain[name].value, rel=0.01)
 
 
@@ -69,20 +69,20 @@ def test_the_interval_of_coloured_noise_is_wider(nominal):
     assert imu[0.6][1] > 1.3 * imu[0.0][1]
 
 
-def test_noise_below_the_encoders_step_is_not_told(drive, nominal):
+def test_noise_below_the_encoder_step_is_undetermined(drive, nominal):
     fine = nominal.with_parts(sensors=replace(nominal.sensors, steering_std_rad=0.0004))
     finding = noise_of([drive("stand", 1, robot=fine)], nominal)["sensors.steering_std_rad"]
-    assert not finding.told
+    assert not finding.determined
     assert "step" in finding.note or finding.note == "no noise at rest"
 
 
-def test_a_log_without_a_sensor_says_so(drive, nominal):
+def test_a_missing_sensor_has_undetermined_noise(drive, nominal):
     run = drive("stand", 1)
     bare = RunLog("r", run.robot, {name: run.streams[name] for name in ("imu", "wheels")})
     found = noise_of([bare], nominal)
-    assert found["sensors.gyro_std_radps"].told
+    assert found["sensors.gyro_std_radps"].determined
     assert found["camera.speed_std_mps"].note == "no standing stretch has this signal"
-    assert not any(finding.told for finding in sensor_noise([], nominal))
+    assert not any(finding.determined for finding in sensor_noise([], nominal))
 
 
 def test_variances_of_the_filters_rows(nominal):

@@ -57,7 +57,7 @@ def test_square_positions_have_a_closed_form():
 def test_level_standing_alone_is_not_enough(drive, nominal, hidden):
     findings = calibrated([drive("stand", 1)], nominal)
     assert len(findings) == 7
-    assert not any(finding.told for finding in findings)
+    assert not any(finding.determined for finding in findings)
     assert all("like a tilt" in finding.note for finding in findings)
     up = GRAVITY_MPS2 * np.vstack([np.eye(3), -np.eye(3)])
     with pytest.raises(DataError, match="axis y was not turned both up and down"):
@@ -70,7 +70,7 @@ def test_the_bench_is_a_power_on_like_any_other(nominal, hidden):
     assert log.streams["imu"].values.tobytes() == again.streams["imu"].values.tobytes()
     held = standing(log, nominal)
     assert len(held) == 6
-    assert gyro_bias(held, nominal)[0].told
+    assert gyro_bias(held, nominal)[0].determined
     imu = log.streams["imu"]
     roll, pitch = (imu.channel(name) for name in ("roll_rad", "pitch_rad"))
     vertical = np.column_stack([-np.sin(pitch), np.sin(roll) * np.cos(pitch), np.cos(roll) * np.cos(pitch)])

@@ -30,7 +30,7 @@ def noise_run(nominal, rng, smoothness, bias_radps=0.0, duration_s=20.0):
     return RunLog("noise", nominal.name, {"imu": Stream(np.arange(n) / 100, values, channels)})
 
 
-def test_stretches_are_where_nothing_moves(drive, nominal):
+def test_standing_stretches_contain_no_motion(drive, nominal):
     (whole,) = standing(drive("stand", 1), nominal)
     assert whole.start_s < 1.0
     assert whole.end_s > 19.0
@@ -106,10 +106,10 @@ def test_coloured_noise_widens_the_interval(nominal):
     assert np.mean(naive) < 0.6  # what independent samples would have had
 
 
-def test_without_standing_nothing_is_told(nominal):
+def test_without_a_standing_stretch_no_bias_is_determined(nominal):
     findings = gyro_bias([], nominal)
     assert len(findings) == 4
-    assert not any(finding.told for finding in findings)
+    assert not any(finding.determined for finding in findings)
     assert {finding.note for finding in findings} == {
         "no run has a standing stretch of 5 s: let the robot stand, switched on"
     }

@@ -57,7 +57,7 @@ def test_forward_and_backward_driving_agree_on_a_side_slope(drive, nominal, trut
         assert finding.high - finding.low < 0.003
 
 
-def test_load_and_tyres_of_the_day_do_not_matter(drive, nominal, truth):
+def test_steering_zeros_do_not_depend_on_load_and_tyres(drive, nominal, truth):
     runs = [
         drive("complex", 1, conditions=Conditions(radius_factors=(1.006, 0.996, 1.0))),
         drive("complex", 2, conditions=Conditions(payload_kg=25.0, payload_m=(0.1, 0.1))),
@@ -87,15 +87,15 @@ def test_only_the_ratio_over_the_radius_is_seen(drive, nominal):
     assert twice == pytest.approx(2 * one)
 
 
-def test_driving_one_way_tells_no_zero_but_the_ratio(drive, nominal):
+def test_forward_driving_alone_determines_the_ratio_but_no_zero(drive, nominal):
     stretches = stretches_of([drive("starts", seed) for seed in range(4)], nominal)
     assert {direction_of(stretch) for stretch in stretches} == {"forward"}
     for finding in steering_zeros(stretches, nominal):
-        assert not finding.told
+        assert not finding.determined
         assert (
-            "driven forward, cannot tell: drive straight forward, backward and to both sides" in finding.note
+            "driven forward, undetermined: drive straight forward, backward and to both sides" in finding.note
         )
-    assert reduction_ratio(stretches, nominal).told
+    assert reduction_ratio(stretches, nominal).determined
 
 
 def test_stretches_are_steady_straight_and_on_hard_ground(drive, nominal, hidden):
@@ -108,7 +108,7 @@ def test_stretches_are_steady_straight_and_on_hard_ground(drive, nominal, hidden
     assert steady_stretches(drive("complex", 5, terrain="grass"), nominal, HARD) == []
 
 
-def test_the_reason_why_there_is_none(drive, nominal):
+def test_missing_steady_stretches_are_explained(drive, nominal):
     run = drive("straight", 1)
     blind = RunLog("r", run.robot, {k: v for k, v in run.streams.items() if k != "odometry"}, run.labels)
     assert why_none([blind], nominal, HARD) == "no run has a camera (stream 'odometry')"
@@ -116,4 +116,4 @@ def test_the_reason_why_there_is_none(drive, nominal):
     assert why_none([soft], nominal, HARD) == "no run is labelled with hard ground (tiles, asphalt)"
     assert "never move" in why_none([drive("stand", 1)], nominal, HARD)
     assert "no straight driving" in why_none([drive("arc", 1)], nominal, HARD)
-    assert not reduction_ratio([], nominal).told
+    assert not reduction_ratio([], nominal).determined

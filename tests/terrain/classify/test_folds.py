@@ -91,7 +91,7 @@ def test_classes_and_runs_may_be_numbers():
         assert set(y[train]) == set(y[test]) == {3, 8}
 
 
-def test_what_cannot_be_split_is_refused():
+def test_too_few_classes_or_runs_for_folds_are_refused():
     rng = np.random.default_rng(0)
     with pytest.raises(DataError, match="all windows are 'ice': a classifier needs at least two classes"):
         next(split_runs(np.array(["ice"] * 4), np.array(list("aabb")), 2, rng))

@@ -164,7 +164,7 @@ def test_a_class_with_a_single_run_is_learned_all_the_same():
     assert np.mean(model.predict(X[y == "sand"]) == "sand") > 0.5
 
 
-def test_what_cannot_be_learned_is_refused():
+def test_too_few_classes_or_windows_are_refused():
     X, y, runs = draw_runs()
     with pytest.raises(DataError, match="all windows are 'ice': a classifier needs at least two classes"):
         GroupedSVC().fit(X[y == "ice"], y[y == "ice"])

@@ -25,7 +25,7 @@ RADIUS_M = ROBOT.wheel_radius_m
 
 
 def drive(radius_factors, duration_s=10.0, wheel_speed=1.0, **truth):
-    """A log whose truth is what is given, as numbers or rows (n,); rims, of nominal wheels, of each or all.
+    """A log whose truth is given as numbers or rows (n,); wheel speeds, of nominal wheels, of each or all.
 
     Slip is what is true of the wheels as they are, along each; it is no channel where it nowhere is defined.
     """

@@ -366,5 +366,5 @@ def test_tracking_reduces_the_distance_to_the_path_in_every_scenario(name):
     (plain, _), (tracked, heading) = off
     assert tracked < 0.045
     assert tracked < plain
-    # a turn on the spot ends where speed loops bring it, in both; they lag by 0.1 s of 0.6 rad/s each way
+    # a turn on the spot ends where speed loops bring it, in both; they lag by 0.1 s of 0.6 rad/s
     assert heading < (0.12 if name == "spot_turn" else 0.03)

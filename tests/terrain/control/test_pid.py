@@ -39,7 +39,7 @@ def test_within_its_limits_it_is_the_linear_filter(tau_s):
     assert [output for output, *_ in outputs(gains, error)] == pytest.approx(expected, abs=1e-10)
 
 
-def test_a_constant_disturbance_is_taken_out_by_the_integral():
+def test_the_integral_removes_a_constant_disturbance():
     gains, state, level = check_gains(Gains(2.0, 4.0, 0.0, 10.0)), PidState(), 0.0
     for _ in range(2000):
         output, state, _ = pid_step(gains, state, 1.0 - level, DT_S)

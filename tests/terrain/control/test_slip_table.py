@@ -337,7 +337,7 @@ def tables(draw):
 
 @settings(max_examples=60, deadline=None)
 @given(table=tables())
-def test_what_is_written_is_read(tmp_path_factory, table):
+def test_a_written_file_is_read_back_unchanged(tmp_path_factory, table):
     path = tmp_path_factory.getbasetemp() / "written.yaml"
     write_slip_table(table, path)
     found = load_slip_table(path, robot=table.robot)

@@ -1,4 +1,4 @@
-"""A gain is what an extension takes off runs that had no say in it; none is claimed that is not there."""
+"""The gain of an extension is the reduction of the residual on held-out runs; noise alone gives none."""
 
 import numpy as np
 import pytest
@@ -76,7 +76,7 @@ def test_few_runs_are_cut_into_thirds_and_the_same_seed_gives_the_same_gain(long
     assert few.as_json()["ci"] != gain(simulation(), simulation(LONGER), longer[:2], seed=4).as_json()["ci"]
 
 
-def test_what_cannot_be_measured_is_refused(longer):
+def test_a_gain_without_held_out_runs_or_of_another_robot_is_refused(longer):
     with pytest.raises(DataError, match="no run that was not used"):
         gain(simulation(), simulation(LONGER), [])
     with pytest.raises(ConfigError, match="'agrimaro', not of 'husky'"):

@@ -54,7 +54,7 @@ def test_coloured_noise_that_grows_with_speed_comes_out_white():
             assert abs(correlation) < 4 / np.sqrt(len(white)), (c, lag)
 
 
-def test_what_was_fitted_has_made_residuals_smaller():
+def test_fitted_effects_reduce_the_residuals():
     """A hundred numbers take a hundred degrees of freedom away, shared by the two channels."""
     speeds, residuals = runs(2, 300)
     plain, fitted = (noise_of(residuals, speeds, n) for n in (0, 100))

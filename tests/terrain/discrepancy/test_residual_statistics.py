@@ -39,7 +39,7 @@ def test_a_hole_splits_a_spectrum_and_the_shortest_stretches_have_none():
     assert np.isnan(spectrum([whole[:7]], RATE_HZ)[1]).all()
 
 
-def test_of_short_runs_a_spectrum_is_taken_over_short_segments():
+def test_spectra_of_short_runs_use_short_segments():
     white = np.random.default_rng(3).standard_normal(40 * 300)
     frequency, power = spectrum([*np.split(white, 300), np.full(5, np.nan)], RATE_HZ)
     np.testing.assert_allclose(frequency, np.fft.rfftfreq(32, 1 / RATE_HZ)[1:])

@@ -147,8 +147,8 @@ def test_a_variance_is_pooled_from_noise_and_clusters():
     assert dof == pytest.approx(TRUST_DOF + 11)
     none, _ = pooled_variance(np.zeros(12), share, size)
     assert none == pytest.approx(TRUST_DOF / (TRUST_DOF + 11))  # noise alone is believed so far
-    wild, dof = pooled_variance(1000 * fits, share, size)
-    assert wild == pytest.approx(1e6 * 11 / (TRUST_DOF + 11), rel=1e-3)
+    large, dof = pooled_variance(1000 * fits, share, size)
+    assert large == pytest.approx(1e6 * 11 / (TRUST_DOF + 11), rel=1e-3)
     assert dof == pytest.approx(11, rel=1e-3)
     one_tells = np.array([0.9, *np.full(11, 0.1 / 11)])
     _, dof = pooled_variance(1000 * (1 - one_tells) * np.sqrt(size / 12), one_tells, size)

@@ -57,7 +57,7 @@ def kept(stream, rows):
     return Stream(stream.time_s[rows], stream.values[rows], stream.channels)
 
 
-def test_streams_of_a_skid_steer_robot_come_to_one_clock(husky):
+def test_streams_of_a_skid_steer_robot_are_resampled_to_one_clock(husky):
     signals = signals_of(husky, HUSKY)
     wheels, imu, seen = (husky.streams[name] for name in ("wheels", "imu", "odometry"))
     assert (signals.run_id, signals.terrain, signals.dt_s, len(signals)) == ("run", "grass", 0.02, 1001)
@@ -130,7 +130,7 @@ def test_current_magnitudes_get_the_sign_of_their_wheel_and_signed_ones_stay():
     assert_allclose(channel(restored, TURNING_CURRENT)[steady], channel(signed, TURNING_CURRENT)[steady])
     assert channel(restored, TURNING_CURRENT)[steady].mean() > 1.0
     braked = np.array(values)
-    braked[500, at[0]] = -0.1  # one sample below zero: the driver logs signs
+    braked[500, at[0]] = -0.1  # one sample below zero: the motor driver logs signs
     logged = signals_of(with_stream(run, "wheels", Stream(wheels.time_s, braked, wheels.channels)), HUSKY)
     assert abs(channel(logged, TURNING_CURRENT)[steady].mean()) < 0.1
 

@@ -58,7 +58,7 @@ DT = 0.02
 
 
 def rich_drive(drive):
-    """Return rims, steering, grade and roll of a drive that shows every effect."""
+    """Return wheel speeds, steering, grade and roll of a drive that shows every effect."""
     t = DT * np.arange(1500)
     speed, turn = 0.5 * np.sin(0.9 * t) + 0.35 * np.sin(0.31 * t), 0.5 * np.sin(0.53 * t + 1.0)
     grade, roll = 0.08 * np.sin(0.23 * t), 0.06 * np.cos(0.29 * t)
@@ -216,7 +216,7 @@ def test_an_effect_shows_in_the_channels_that_it_names_and_in_no_others(response
         assert clear <= set(effect.channels) <= noticeable, effect.name
 
 
-def test_twins_are_twins_of_each_other_and_part_where_they_say(responses):
+def test_twins_are_mutual_and_differ_in_their_distinguishing_channel(responses):
     for effect in LIBRARY:
         for name, channel in effect.twins:
             twin = effect_named(name)

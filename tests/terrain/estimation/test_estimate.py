@@ -43,7 +43,7 @@ def test_slip_of_12_5_percent_is_found_by_15_states_and_read_low_by_the_thesis_o
     assert 0.110 / 0.125 <= thesis.slip_mean / true <= 0.120 / 0.125
 
 
-def test_encoders_alone_are_blind_and_the_track_says_so(straight):
+def test_encoders_alone_cannot_observe_slip_and_the_track_reports_it(straight):
     for name in ("encoder12", "slip14"):
         found = estimate_run(straight, ROBOT, name)
         row = summarize(found)
@@ -55,7 +55,7 @@ def test_encoders_alone_are_blind_and_the_track_says_so(straight):
     assert np.isnan(blind.slip_std)
 
 
-def test_gnss_lets_encoders_see():
+def test_gnss_makes_slip_observable_with_encoders():
     run = drive("arc", gnss=Gnss(fix_length_s=1e6))
     found = estimate_run(run, ROBOT, "vio15")
     assert "gnss_position" in found.track.sensors
@@ -91,25 +91,25 @@ def test_the_heading_of_the_start_is_found_from_the_drive(angle_rad):
 
 def test_a_receiver_that_never_moved_is_left_out_and_counted():
     found = estimate_run(drive("stand", gnss=Gnss(), duration_s=5.0), ROBOT, "vio15")
-    assert found.table.dropped == {"gnss: heading not told by the drive": 50}
+    assert found.table.dropped == {"gnss: heading not observable in this run": 50}
     assert "gnss_position" not in found.track.sensors
 
 
-def test_slip_is_positive_in_traction_on_the_way_back_too():
+def test_slip_is_positive_in_traction_for_both_rolling_directions():
     run = drive("complex")
     row = summarize(estimate_run(run, ROBOT, "vio15"))
     assert row.slip_true_mean > 0.1
     assert row.slip_mean == pytest.approx(row.slip_true_mean, abs=0.004)
 
 
-def test_a_camera_that_is_described_as_worse_is_believed_less():
+def test_the_filter_is_consistent_with_a_noisier_camera():
     worse = ROBOT.with_parts(camera=replace(ROBOT.camera, speed_std_mps=0.05))
     run = simulate_run(worse, "grass", "straight", 0)
     assert 0.2 < summarize(estimate_run(run, worse, "vio15")).nees < 2.0
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2, 3])
-def test_a_camera_lost_for_3_s_leaves_slip_stale_and_less_sure_but_near(seed):
+def test_a_camera_outage_of_3_s_makes_slip_stale_and_less_certain_but_close(seed):
     run = drive(seed=seed, faults=LOST)
     found = estimate_run(run, ROBOT, "vio15")
     time_s = found.slip.time_s
@@ -229,7 +229,7 @@ def ended_early(time_s, values):
     ],
 )
 @pytest.mark.parametrize("stream", ["wheels", "imu", "odometry", "steering"])
-def test_no_fault_of_a_sensor_makes_the_filter_lose_its_head(straight, stream, change):
+def test_the_filter_recovers_from_every_sensor_fault(straight, stream, change):
     for name in ("vio15", "vio12", "encoder12"):
         found = estimate_run(spoilt(straight, stream, change), ROBOT, name)
         row = summarize(found)
@@ -242,7 +242,7 @@ def test_no_fault_of_a_sensor_makes_the_filter_lose_its_head(straight, stream, c
 
 
 @pytest.mark.parametrize("missing", ["imu", "odometry", "steering", "commands", "truth"])
-def test_a_stream_that_is_missing_is_missed_and_no_more(straight, missing):
+def test_estimates_without_one_stream_stay_finite(straight, missing):
     streams = {name: stream for name, stream in straight.streams.items() if name != missing}
     found = estimate_run(replace(straight, streams=streams), ROBOT, "vio15")
     row = summarize(found)
@@ -254,7 +254,7 @@ def test_a_stream_that_is_missing_is_missed_and_no_more(straight, missing):
 
 
 @pytest.mark.parametrize(("stream", "channel"), [("wheels", "motor_1_radps"), ("steering", "angle_1_rad")])
-def test_a_wheel_that_falls_silent_has_no_slip_to_tell(straight, stream, channel):
+def test_a_wheel_without_samples_has_no_slip(straight, stream, channel):
     column = straight.streams[stream].channels.index(channel)
 
     def silent(time_s, values):
@@ -268,7 +268,7 @@ def test_a_wheel_that_falls_silent_has_no_slip_to_tell(straight, stream, channel
     assert np.isfinite(slip.slip_ratio[(slip.time_s > 5.0) & (slip.time_s < 10.4)]).all()
 
 
-def test_what_is_asked_for_wrongly_is_refused_in_one_sentence(straight):
+def test_unknown_filters_and_tunings_are_refused_in_one_sentence(straight):
     assert set(FILTERS) == {"encoder12", "slip14", "vio12", "vio15", "skid"}
     with pytest.raises(ConfigError, match="'skid' is not for robot agrimaro"):
         estimate_run(straight, ROBOT, "skid")

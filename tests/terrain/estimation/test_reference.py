@@ -1,4 +1,4 @@
-"""The truth of a simulated run is told in the states of each filter."""
+"""The truth of a simulated run, expressed in the states of each filter."""
 
 import numpy as np
 import pytest
@@ -37,7 +37,7 @@ def empty_track(states, time_s):
     )
 
 
-def test_truth_comes_behind_the_low_pass_that_the_filter_was_fed_through(run):
+def test_truth_passes_the_low_pass_of_the_filter_inputs(run):
     time_s = np.arange(0.5, 9.0, 0.02)
     truth = run.streams["truth"]
     found = true_states(run, empty_track(STATES, time_s), ROBOT, 0.05)
@@ -48,10 +48,10 @@ def test_truth_comes_behind_the_low_pass_that_the_filter_was_fed_through(run):
     lag_s = (plain - found)[rising, 1].mean() / np.gradient(plain[rising, 1], time_s[rising]).mean()
     assert lag_s == pytest.approx(0.05, abs=0.01)
     assert found[0, 0] == pytest.approx(0.0, abs=0.02)
-    assert np.isnan(found[:, 5]).all()  # nobody knows an effective track
+    assert np.isnan(found[:, 5]).all()  # there is no true effective track
 
 
-def test_slip_speed_and_slip_ratio_are_two_ways_to_say_one_thing(run):
+def test_slip_speed_and_slip_ratio_of_the_truth_agree(run):
     truth = run.streams["truth"]
     wheel_speed, ground = wheel_and_ground_speed(truth, ROBOT)
     for i in range(3):
@@ -68,13 +68,13 @@ def test_slip_behind_the_low_pass_is_the_slip_where_driving_is_steady(run):
     slip, ground = lagged_slip(truth, ROBOT, 0.05)
     np.testing.assert_array_equal(lagged_slip(truth, ROBOT, 0.0)[1], wheel_and_ground_speed(truth, ROBOT)[1])
     steady = (truth.time_s > 4.0) & (truth.time_s < 7.0)
-    told = np.column_stack([truth.channel(f"slip_{i}_ratio") for i in (1, 2, 3)])
-    assert np.abs(slip[steady].mean(axis=0) - told[steady].mean(axis=0)).max() < 0.002
+    true_slip = np.column_stack([truth.channel(f"slip_{i}_ratio") for i in (1, 2, 3)])
+    assert np.abs(slip[steady].mean(axis=0) - true_slip[steady].mean(axis=0)).max() < 0.002
     assert np.isnan(slip[truth.time_s < 0.9]).all()  # it stands
     assert (ground[steady] > 0.5).all()
 
 
-def test_no_truth_is_none_and_a_wheel_too_many_is_said(run):
+def test_a_run_without_truth_gives_none_and_an_extra_wheel_is_refused(run):
     streams = {name: stream for name, stream in run.streams.items() if name != "truth"}
     track = empty_track(("speed_x_mps",), np.arange(0.0, 1.0, 0.1))
     assert true_states(RunLog("a", "agrimaro", streams), track, ROBOT, 0.05) is None

@@ -59,7 +59,7 @@ def test_no_effects_change_nothing():
         np.testing.assert_allclose(stream.values, run.streams[name].values, rtol=0, atol=1e-12)
 
 
-def test_each_effect_goes_where_the_description_has_it():
+def test_corrections_change_the_parameter_of_each_effect():
     robot = corrected(extended(**EVERY))
     e = EVERY
     assert robot.wheel_radius_m == pytest.approx(0.2 * (1 + e["wheel_radius_ratio"]))
@@ -97,7 +97,7 @@ def test_the_covariance_of_what_stays_is_that_of_the_rest():
     np.testing.assert_array_equal(corrected(robot).effects_cov, COV[2:, 2:])
 
 
-def test_what_is_corrected_once_is_not_corrected_twice():
+def test_corrections_are_applied_once():
     run = run_of(effects=EVERY)
     once = corrected_log(run, extended(**EVERY))
     assert corrected(extended(**EVERY)).effects
@@ -229,10 +229,10 @@ def test_a_skid_steer_robot_without_sections_is_corrected_in_its_samples():
         "clock_offset_s": 0.3,
         "yaw_delay_s": 0.1,
     }
-    told = [left / 1.1 / 0.97, right / 1.1 / 1.03, np.full(time_s.size, 1.2), np.full(time_s.size, 2.4)]
+    measured = [left / 1.1 / 0.97, right / 1.1 / 1.03, np.full(time_s.size, 1.2), np.full(time_s.size, 2.4)]
     gyro = 1.05 * turn + 0.02
     streams = {
-        "wheels": Stream(time_s, np.column_stack(told), channels),
+        "wheels": Stream(time_s, np.column_stack(measured), channels),
         "imu": Stream(time_s + 0.3, gyro[:, None], ("gyro_z_radps",)),
     }
     back = corrected_log(RunLog("a", "husky", streams), replace(BARE, effects=effects))
@@ -245,7 +245,7 @@ def test_a_skid_steer_robot_without_sections_is_corrected_in_its_samples():
     np.testing.assert_allclose(wheels[:, 1] - wheels[:, 0], late, atol=1e-12)
 
 
-def test_a_turned_camera_tells_of_the_same_robot():
+def test_motion_does_not_depend_on_the_mounting_of_the_camera():
     effects = {"camera_yaw_rad": 0.3}
     clean, run = run_of(), run_of(effects=effects)
     seen, wrong = (body_motion(log.streams["odometry"], ROBOT.camera) for log in (clean, run))
@@ -303,11 +303,11 @@ def test_live_is_live_on_the_corrected_log():
     raw, plain = live_estimator(robot, channels), LiveEstimator(corrected(robot), "vio15", channels)
     unshifted = replace(robot, effects={n: v for n, v in effects.items() if n != "steering_delay_s"})
     raw_now = live_estimator(unshifted, channels)
-    told, desired = [], []
+    found, desired = [], []
     log = corrected_log(run, unshifted)
     for one, other in zip(replay(run, 50.0), replay(log, 50.0), strict=True):
-        told += raw_now.step(one.readings)
+        found += raw_now.step(one.readings)
         desired += plain.step(other.readings)
         assert all(np.isfinite(estimate.mean).all() for estimate in raw.step(one.readings))
-    np.testing.assert_allclose([t.mean for t in told], [w.mean for w in desired], atol=1e-9)
-    np.testing.assert_allclose([t.slip_ratio for t in told], [w.slip_ratio for w in desired], atol=1e-9)
+    np.testing.assert_allclose([t.mean for t in found], [w.mean for w in desired], atol=1e-9)
+    np.testing.assert_allclose([t.slip_ratio for t in found], [w.slip_ratio for w in desired], atol=1e-9)

@@ -132,9 +132,9 @@ def test_a_section_without_a_schema_is_refused(section):
         ({"gyro_scale_ratio": 0.1}, -np.eye(1), {"gyro_scale_ratio": (0.0, 0.2)}, "variance"),
     ],
 )
-def test_what_cannot_be_read_is_not_written(tmp_path, values, cov, intervals, message):
+def test_invalid_values_are_not_written(tmp_path, values, cov, intervals, message):
     with pytest.raises(ConfigError, match=message):
-        write_extended(tmp_path / "mine.yaml", "agrimaro", values, cov, intervals, "nobody")
+        write_extended(tmp_path / "mine.yaml", "agrimaro", values, cov, intervals, "a test")
     assert not list(tmp_path.iterdir())
 
 

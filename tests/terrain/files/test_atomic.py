@@ -11,11 +11,11 @@ def test_an_existing_file_is_replaced_whole(tmp_path):
     assert [path.name for path in (tmp_path / "a").iterdir()] == ["report.json"]
 
 
-def test_an_unwritable_place_is_told_in_one_sentence_and_left_clean(tmp_path):
+def test_an_unwritable_path_is_refused_in_one_sentence_and_left_clean(tmp_path):
     (tmp_path / "report.json").mkdir()  # a folder where the file should go: also root cannot write it
     with pytest.raises(TerrainError, match=r"report\.json: cannot be written"):
         atomic_write(tmp_path / "report.json", "new")
-    (tmp_path / "file").write_text("in the way")
+    (tmp_path / "file").write_text("not a folder")
     with pytest.raises(TerrainError, match="cannot be written"):
         atomic_write(tmp_path / "file" / "report.json", "new")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "report.json"]

@@ -152,7 +152,7 @@ def test_position_is_the_integral_of_speed():
 @pytest.mark.parametrize(
     "quaternion", [(0, 0, 0, 0), (0, 0, 0, np.nan), (0.5, 0.5, 0.5, 0.9), (np.inf, 0, 0, 0)]
 )
-def test_what_is_no_rotation_is_unknown(quaternion):
+def test_poses_without_a_valid_quaternion_are_nan(quaternion):
     plain = drive(1.0, 0.0, 0.5, yaw_0=0.3)
     good = pose_stream(*plain, CAMERA, 0.0)
     rows = np.isin(np.arange(1001), [0, 1, 500])

@@ -164,12 +164,12 @@ def plain_step(twist, steer, rate_max_radps, dt_s, far_rad):
     """The step in the words of its docstring: the oracle of the compiled one."""
     admitted = scaled(WHEELS_M, RADIUS_M, twist, SPEED_MAX_RADPS)
     wheel, aim = inverse(WHEELS_M, RADIUS_M, admitted, steer)
-    told = steer + np.clip(aim - steer, -rate_max_radps * dt_s, rate_max_radps * dt_s)
-    worst = np.abs(aim - told).max()
-    return admitted, wheel * (max(0.0, math.cos(worst)) if worst > far_rad else 1.0), told
+    commanded = steer + np.clip(aim - steer, -rate_max_radps * dt_s, rate_max_radps * dt_s)
+    worst = np.abs(aim - commanded).max()
+    return admitted, wheel * (max(0.0, math.cos(worst)) if worst > far_rad else 1.0), commanded
 
 
-def wild_twists(n, rng):
+def random_twists(n, rng):
     twists = np.repeat(rng.normal(0, 1.5, (n // 20, 3)), 20, axis=0)
     twists[rng.random(n) < 0.1] = 0.0
     return twists
@@ -177,17 +177,17 @@ def wild_twists(n, rng):
 
 def test_compiled_commands_equal_the_plain_form_and_live_equals_batch():
     rng = np.random.default_rng(11)
-    twists, start = wild_twists(1000, rng), rng.normal(0, 4, 3)
+    twists, start = random_twists(1000, rng), rng.normal(0, 4, 3)
     batch = wheel_commands(WHEELS_M, RADIUS_M, SPEED_MAX_RADPS, RATE_MAX_RADPS, 0.02, twists, start)
-    live, oracle, steer, told = [], [], start, start
+    live, oracle, steer, commanded = [], [], start, start
     for twist in twists:
         step = wheel_command_step(
             WHEELS_M, RADIUS_M, SPEED_MAX_RADPS, RATE_MAX_RADPS, 0.02, FAR_RAD, twist, steer
         )
         live.append(step)
         steer = step[2]
-        oracle.append(plain_step(twist, told, RATE_MAX_RADPS, 0.02, FAR_RAD))
-        told = oracle[-1][2]
+        oracle.append(plain_step(twist, commanded, RATE_MAX_RADPS, 0.02, FAR_RAD))
+        commanded = oracle[-1][2]
     for together, one_by_one, plain in zip(
         batch, zip(*live, strict=True), zip(*oracle, strict=True), strict=True
     ):
@@ -197,7 +197,7 @@ def test_compiled_commands_equal_the_plain_form_and_live_equals_batch():
 
 def test_commands_keep_every_limit_and_drive_waits_for_steering():
     rng = np.random.default_rng(5)
-    twists, start = wild_twists(2000, rng), np.zeros(3)
+    twists, start = random_twists(2000, rng), np.zeros(3)
     admitted, wheel, steer = wheel_commands(
         WHEELS_M, RADIUS_M, SPEED_MAX_RADPS, RATE_MAX_RADPS, 0.02, twists, start
     )
@@ -255,7 +255,7 @@ def test_commands_keep_every_limit_and_drive_waits_for_steering():
         (lambda: wheel_commands(WHEELS_M, 0.2, 10, 2, 0, np.zeros((5, 3)), np.zeros(3)), "dt_s is 0,"),
     ],
 )
-def test_what_is_no_robot_or_no_motion_is_refused_in_one_sentence(call, message):
+def test_invalid_robots_and_motions_are_refused_in_one_sentence(call, message):
     with pytest.raises(ConfigError, match=message) as error:
         call()
     assert "\n" not in str(error.value)

@@ -87,7 +87,7 @@ def test_a_periodic_manoeuvre_never_locks_on_to_an_image(period_s, sign):
     assert align(run, found) is run
 
 
-def test_a_slow_periodic_manoeuvre_is_no_riddle_within_the_bounds():
+def test_a_slow_periodic_manoeuvre_is_unambiguous_within_the_bounds():
     found = estimate_clock(
         run_of(0.2 * np.sin(IMU_TIME_S / 2), 0.35 * np.sin((WHEEL_TIME_S + 0.3) / 2)), track_m=TRACK_M
     )
@@ -124,7 +124,7 @@ def test_unrelated_turning_is_not_matched():
         assert estimate_clock(mixed, track_m=TRACK_M).status == "not excited"
 
 
-def test_one_turn_alone_tells_the_offset_and_not_the_rate():
+def test_one_turn_determines_the_clock_offset_but_not_its_rate():
     rate = 0.01
     run = hidden_clock(7, 0.4, rate, turning=lambda time_s: np.exp(-(((time_s - 20.0) / 2.0) ** 2)))
     found = estimate_clock(run, track_m=TRACK_M)

@@ -68,7 +68,7 @@ def test_the_noise_of_a_twist_is_that_of_the_pose_times_its_gain():
     # six or seven poses 0.1 s apart: 1 / sqrt(sum t^2) is 1.9 to 2.4; the mean of the first five headings,
     # and the turn by the heading's own noise, add little
     assert np.all((middle.std(axis=0) > 1.7 * noise) & (middle.std(axis=0) < 2.7 * noise))
-    # where a slope is not sure, none is given
+    # where a slope is uncertain, none is given
     seen = np.isfinite(found).all(axis=(0, 2))
     assert seen.sum() > 25
     assert found[:, seen].std(axis=0).max() < 4.5 * noise
@@ -322,7 +322,7 @@ def test_the_lidar_agrees_with_the_gyro_and_the_wheels(husky_runs):
     assert np.std(lidar[seen] - ahead[seen]) < 0.05 < np.std(lidar[seen] - gyro[seen])
 
 
-def test_straight_on_the_wheels_run_a_little_ahead_of_the_ground(husky_runs):
+def test_wheels_run_faster_than_the_ground_in_straight_driving(husky_runs):
     ratios, accelerations = [], []
     for run in husky_runs:
         left, right = run.streams["wheels"].values[N:].T

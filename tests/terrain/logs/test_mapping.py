@@ -43,7 +43,7 @@ def test_units_scale_and_offset_become_si(tmp_path, save):
     (tmp_path / "drive.csv").write_text("stamp;yaw;v\n1000;90;36\n1500;-90;72\n2000;;0\n")
     mapping = {
         "robot": "husky",
-        "run_id": "field day",
+        "run_id": "field trial",
         "terrain": "GRASS",
         "streams": {
             "imu": {
@@ -58,7 +58,7 @@ def test_units_scale_and_offset_become_si(tmp_path, save):
         },
     }
     (run,) = load_runs(tmp_path, mapping=save(mapping))
-    assert (run.run_id, run.terrains) == ("field day", ("GRASS",))
+    assert (run.run_id, run.terrains) == ("field trial", ("GRASS",))
     assert run.streams["imu"].time_s.tolist() == [1.0, 1.5, 2.0]
     np.testing.assert_allclose(run.streams["imu"].channel("gyro_z_radps"), [-np.pi / 2, np.pi / 2, np.nan])
     np.testing.assert_allclose(run.streams["imu"].channel("speed_left_mps"), [10.0, 30.0, -10.0])
@@ -66,8 +66,8 @@ def test_units_scale_and_offset_become_si(tmp_path, save):
 
 def deep(path, value):
     def change(mapping):
-        *way, last = path
-        for key in way:
+        *parents, last = path
+        for key in parents:
             mapping = mapping[key]
         mapping[last] = value
 

@@ -22,7 +22,7 @@ VALUES = npst.arrays(
 @given(
     TIMES, VALUES, st.text(max_size=8), st.dictionaries(st.text(max_size=5), st.integers(0, 9), max_size=2)
 )
-def test_what_is_written_is_read_back(time_s, values, words, dropped):
+def test_a_written_log_is_read_back_unchanged(time_s, values, words, dropped):
     values[0] = 1.0
     stream = Stream(time_s, values[: len(time_s)], ("gyro_z_radps", "accel_x_mps2"))
     run = RunLog("A_1", words, {"imu": stream}, (Label(0.1, 0.3, words),), words, dropped)
@@ -101,7 +101,7 @@ def test_unfinished_writes_are_no_runs(tmp_path, make_run):
          "is not the name of a file in the run folder"),
         (lambda d: d["streams"]["imu"].update(file="gps.parquet"), "SNOW_01/gps.parquet: is missing"),
         (lambda d: d["streams"]["imu"]["channels"].update(gyro_z_radps="deg"),
-         "'gyro_z_radps' is said to be in 'deg'"),
+         "'gyro_z_radps' is declared in 'deg'"),
         (lambda d: d["streams"]["imu"]["channels"].update(gyro_z_dps="dps"), "does not end in a known unit"),
         (lambda d: d["streams"]["imu"]["channels"].update(gyro_w_radps="radps"),
          "column 'gyro_w_radps' is missing"),

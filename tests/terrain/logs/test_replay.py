@@ -21,7 +21,7 @@ def commands(time_s, twist):
     return (time_s, twist, ("speed_x_mps", "speed_y_mps", "yaw_rate_radps"))
 
 
-def test_every_sample_comes_once_in_order_and_not_before_its_stamp():
+def test_every_sample_arrives_once_in_order_and_not_before_its_stamp():
     rng = np.random.default_rng(0)
     wheels, fast = np.arange(100) / 50.0 + 0.003, np.cumsum(rng.uniform(0.001, 0.02, 300)) - 0.1
     run = run_of(wheels=imu(wheels), imu=imu(fast), truth=imu(fast))
@@ -40,7 +40,7 @@ def test_every_sample_comes_once_in_order_and_not_before_its_stamp():
     assert sum("wheels" in s.readings for s in samples) == 100  # one a step, on their own clock
 
 
-def test_stamps_out_of_order_come_with_the_next_in_order():
+def test_samples_out_of_order_are_delivered_with_the_next_in_order():
     time_s = np.array([0.0, 0.02, 50.0, 0.04, 0.01, np.nan, 0.06, 0.08, -3.0])
     samples = list(replay(run_of(imu=imu(time_s))))
     came = {int(v): s.time_s for s in samples for v in s.readings["imu"].values[:, 0]}
@@ -49,7 +49,7 @@ def test_stamps_out_of_order_come_with_the_next_in_order():
     )
 
 
-def test_the_twist_is_the_last_one_wanted_and_the_terrain_the_label():
+def test_the_twist_is_the_last_command_and_the_terrain_is_the_label():
     run = run_of(imu=imu(np.arange(6) / 50.0), commands=commands([0.02, 0.07], [[1, 2, 3], [4, 5, 6]]))
     samples = list(replay(run))
     np.testing.assert_array_equal([s.twist[0] for s in samples], [0, 1, 1, 1, 4, 4])
@@ -57,7 +57,7 @@ def test_the_twist_is_the_last_one_wanted_and_the_terrain_the_label():
     assert not any(s.twist.any() for s in replay(run_of(imu=imu([0.0, 0.1]))))
 
 
-def test_what_cannot_be_replayed_is_said():
+def test_logs_and_rates_that_cannot_be_replayed_are_refused():
     with pytest.raises(ConfigError, match="rate_hz is 0"):
         replay(run_of(imu=imu([0.0])), 0.0)
     with pytest.raises(DataError, match="no sensor to replay"):

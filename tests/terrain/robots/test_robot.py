@@ -17,7 +17,7 @@ def test_the_drive_of_a_description_is_the_type_of_the_robot():
 
 
 @pytest.mark.parametrize("robot", [AGRIMARO, HUSKY], ids=lambda robot: robot.name)
-def test_every_drive_answers_what_its_users_ask(robot):
+def test_every_drive_type_provides_the_robot_interface(robot):
     n = len(robot.wheels)
     assert robot.wheel_positions_m.shape == (n, 2)
     assert len(robot.rate_channels) == len(robot.wheel_rows) == len(robot.steering_zeros_rad) == n

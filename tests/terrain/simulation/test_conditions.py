@@ -25,7 +25,7 @@ from terrain.simulation.conditions import Conditions, Faults, draw_conditions, l
         ({"field_length_m": math.nan}, "field_length_m is nan"),
     ],
 )
-def test_what_no_day_is_like_is_refused(changed, message):
+def test_impossible_conditions_are_refused(changed, message):
     with pytest.raises(ConfigError, match=message):
         Conditions(**changed)
 
@@ -70,7 +70,7 @@ def test_conditions_scatter_around_the_nominal_ones_as_the_spread_says():
     assert len(set(drawn)) == n
 
 
-def test_the_same_generator_draws_the_same_day_and_no_spread_draws_the_nominal_one():
+def test_conditions_repeat_with_the_generator_and_are_nominal_without_spread():
     spread = load_spread()
     one, again = (draw_conditions(spread, np.random.default_rng(7)) for _ in range(2))
     assert one == again != draw_conditions(spread, np.random.default_rng(8))

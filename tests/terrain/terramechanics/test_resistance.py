@@ -38,7 +38,7 @@ def test_the_ground_carries_the_wheel_at_its_sinkage(n, normal_n):
     kc, kphi = 5e3, 1.5e6
     modulus = kc + WIDTH_M * kphi
     sinkage_m = rigid_wheel_sinkage(normal_n, RADIUS_M, modulus, n)
-    # What the formula leaves out, in closed form: (1 - u^2)^n is not 1 - n u^2, and a rim is no parabola.
+    # What the formula leaves out, in closed form: (1 - u^2)^n is not 1 - n u^2, and a circle is no parabola.
     first_order = 0.5 * beta(0.5, n + 1) / (1 - n / 3)
     assert abs(first_order - 1) < 0.09
     carried = carried_n(sinkage_m, kc, kphi, n)
@@ -89,7 +89,7 @@ def test_the_arc_takes_over_from_the_tyre_and_ends_at_the_axle():
     lengths = np.array([contact_length(z, RADIUS_M, 0.12) for z in depths])
     assert (np.diff(lengths) >= 0).all()
     assert lengths[0] == 0.12
-    # chord of the arc: from the lowest point of the rim to where it enters
+    # chord of the arc: from the lowest point of the wheel to where it enters
     arc = lengths[(lengths > 0.12) & (depths < RADIUS_M)]
     chord = np.sqrt(2 * RADIUS_M * depths[(lengths > 0.12) & (depths < RADIUS_M)])
     np.testing.assert_allclose(2 * RADIUS_M * np.sin(arc / RADIUS_M / 2), chord)

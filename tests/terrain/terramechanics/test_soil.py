@@ -106,18 +106,18 @@ def test_scatter_has_the_spread_and_the_bounds_that_the_description_states(name)
     soil = load_soil(name)
     rng = np.random.default_rng(5)
     draws = [scattered(soil, rng) for _ in range(2000)]
-    told = {entry.parameter: entry.run_ratio for entry in soil.scatter}
+    run_ratio = {entry.parameter: entry.run_ratio for entry in soil.scatter}
     for key in RANGES:
         values = np.array([getattr(draw, key) for draw in draws])
         nominal = getattr(soil, key)
-        if key not in told:
+        if key not in run_ratio:
             np.testing.assert_array_equal(values, nominal)
             continue
         if key == "friction_angle_rad":
             values, nominal = np.tan(values), math.tan(nominal)
         if nominal == 0:
             continue
-        sigma = math.sqrt(math.log1p(told[key] ** 2))
+        sigma = math.sqrt(math.log1p(run_ratio[key] ** 2))
         log = np.log(values / nominal)
         assert np.abs(log).max() <= 2 * sigma * (1 + 1e-12)
         # A normal cut at two sigma (with its tails left on the cut) keeps 0.96 of its standard deviation.

@@ -155,7 +155,7 @@ def test_the_compiled_wheel_is_the_plain_one_and_stays_on_the_friction_circle(
     slip_sinkage=st.floats(0.0, 5.0),
 )
 @example(name="dry_sand", normal_n=5e-324, slip_x=5e-324, slip_y=-5e-324, slip_sinkage=5.0)
-def test_nothing_finite_makes_nan(name, normal_n, slip_x, slip_y, slip_sinkage):
+def test_finite_inputs_give_finite_forces(name, normal_n, slip_x, slip_y, slip_sinkage):
     soil = replace(load_soil(name), slip_sinkage_ratio=slip_sinkage)
     assert np.isfinite(wheel_ground(ground_array(soil, *GEOMETRY), normal_n, slip_x, slip_y)).all()
 

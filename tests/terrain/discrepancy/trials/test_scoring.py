@@ -55,7 +55,7 @@ def test_a_rate_has_the_interval_of_clopper_and_pearson(k, n):
     assert found[2:] == pytest.approx((k / n, expected.low, expected.high))
 
 
-def test_a_rate_of_nothing_is_not_known():
+def test_a_rate_of_no_trials_is_nan():
     found = rate_of([])
     assert (found.hits, found.of, found.low, found.high) == (0, 0, 0.0, 1.0)
     assert math.isnan(found.rate)
@@ -86,7 +86,7 @@ def test_the_table_counts_outcomes_by_row():
     left = trial(
         "outside", "", outside=OUTSIDE[2], verdict=Verdict.UNEXPLAINED, unexplained=(("current_a", "time"),)
     )
-    unsure = trial("poor", named=(), verdict=Verdict.AMBIGUOUS, sets=(("payload", "motor_constant"),))
+    ambiguous = trial("poor", named=(), verdict=Verdict.AMBIGUOUS, sets=(("payload", "motor_constant"),))
     both = trial("two", "payload", causes=("payload", "scrub"), named=("scrub", "payload"))
     table = table_of(
         [
@@ -99,7 +99,7 @@ def test_the_table_counts_outcomes_by_row():
             *[trial("ladder")] * 2,
             eccentric,
             left,
-            unsure,
+            ambiguous,
             both,
             replace(both, named=("payload",)),
         ]

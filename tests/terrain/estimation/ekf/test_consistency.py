@@ -82,7 +82,7 @@ def test_a_filter_that_leaves_out_what_does_not_fit_is_not_called_consistent():
     assert (compass.verdict, gyro.verdict) == ("consistent", "overconfident")
 
 
-def test_what_gave_nothing_is_unknown():
+def test_a_sensor_without_measurements_has_an_unknown_verdict():
     time_s, truth, z = turned(n=200)
     z[:, 0] = np.nan
     truth[:, 2] = np.nan
@@ -109,7 +109,7 @@ def test_nees_is_the_squared_error_over_its_covariance_with_angles_wrapped():
         nees(track, truth, ["yaw_rad"])
 
 
-def test_what_is_drawn_has_the_moments_it_was_drawn_with():
+def test_drawn_samples_have_the_requested_moments():
     walk = np.array([[1e-4, 0.0, 0.0], [0.0, 0.04, -0.01], [0.0, -0.01, 0.01]])  # correlated
     noise = Noise(walk, SAMPLE, np.array([1e-2, 0.04, 0.09]))
     starts, steps, errors = [], [], []

@@ -205,7 +205,7 @@ def spoilt(seed=0):
     return time_s, z
 
 
-def test_a_log_sample_by_sample_gives_what_it_gives_at_once_bit_for_bit():
+def test_sample_by_sample_equals_batch_bit_for_bit():
     time_s, z = spoilt()
     r = np.tile(CARRIAGE_NOISE.measurement_variance, (time_s.size, 1))
     r[::3, 0] *= 4
@@ -281,7 +281,7 @@ def test_a_clock_that_was_set_back_goes_on_live():
     assert len(track.time_s) == 200
 
 
-def test_two_wild_stamps_one_after_the_other_cost_two_rows():
+def test_two_consecutive_outlier_stamps_cost_two_rows():
     time_s, _, z = ridden()
     time_s[200], time_s[201] = 1e5, 1.5e5
     track = run_filter(CARRIAGE, CARRIAGE_NOISE, time_s, z)
@@ -353,7 +353,7 @@ garbage = st.one_of(
     repeats=st.integers(1, 80),
     gate=st.sampled_from([0.9999, 1.0]),
 )
-def test_no_garbage_makes_the_answer_anything_but_finite(rows, repeats, gate):
+def test_estimates_stay_finite_for_arbitrary_measurements(rows, repeats, gate):
     z = np.repeat([row for row, _ in rows], repeats, axis=0)
     time_s = np.repeat([dt for _, dt in rows], repeats)
     with np.errstate(all="ignore"):
@@ -396,7 +396,7 @@ def test_a_log_may_be_empty_or_end_at_once():
         ({"measurement_variance": np.ones((1, 2, 2))}, r"measurement_variance has shape \(1, 2, 2\)"),
     ],
 )
-def test_noise_that_is_none_is_refused(given, message):
+def test_invalid_noise_is_refused(given, message):
     fine = {"process_variance": np.zeros(2), "measurement_variance": np.ones(2)}
     with pytest.raises(ConfigError, match=message):
         Noise(**(fine | given))
@@ -418,7 +418,7 @@ def test_noise_that_is_none_is_refused(given, message):
         ({"propagate": print}, r"propagate must be compiled as @njit\(PROPAGATE, cache=True\)"),
     ],
 )
-def test_models_that_are_none_are_refused(changes, message):
+def test_invalid_models_are_refused(changes, message):
     with pytest.raises(ConfigError, match=message):
         carriage(**changes)
 
@@ -432,12 +432,12 @@ def test_models_that_are_none_are_refused(changes, message):
         (Noise(np.ones(2), np.ones((4, 2))), np.zeros((3, 2)), r"measurement_variance has shape \(4, 2\)"),
     ],
 )
-def test_what_does_not_fit_the_model_is_refused(noise, z, message):
+def test_noise_and_measurements_of_another_size_are_refused(noise, z, message):
     with pytest.raises(DataError, match=message):
         run_filter(CARRIAGE, noise, np.arange(3.0), z)
 
 
-def test_settings_that_are_none_are_refused():
+def test_invalid_settings_are_refused():
     with pytest.raises(ConfigError, match="reopen_after_s is 0, seconds above zero are required"):
         FilterSettings(reopen_after_s=0)
 
@@ -462,16 +462,16 @@ def test_a_resident_filter_takes_the_same_steps_to_the_last_bit(steps, seed):
         assert taken == (follows != 0)
         assert taken == (state.time_s == time_s and before_s != time_s)
         assert not taken or (follows < 0) == (time_s < before_s)
-        for ours, theirs in (
+        for found, expected in (
             (resident.mean, state.mean),
             (resident.cov, state.cov),
             (resident.use, state.use),
             (resident.reference_age_s, state.reference_age_s),
         ):
-            np.testing.assert_array_equal(ours, theirs)
+            np.testing.assert_array_equal(found, expected)
         assert resident.dropped == state.dropped
 
 
-def test_a_resident_filter_wants_one_variance_a_row():
+def test_a_resident_filter_requires_one_variance_per_row():
     with pytest.raises(DataError, match="must be \\(m,\\)"):
         ResidentFilter(flight(), Noise(np.ones(5), np.ones((3, 5))))

@@ -41,7 +41,7 @@ def test_the_first_sensor_of_a_step_has_the_square_that_the_filter_kept():
     np.testing.assert_allclose((value / std)[1:] ** 2, track.nis[1:, 0], rtol=1e-6, atol=1e-9)
 
 
-def test_what_was_not_measured_has_none():
+def test_missing_measurements_have_no_innovation():
     _, _, found = filtered()
     value, std = found.row("camera_speed_x_mps")
     assert np.isnan(value[200:250]).all()
@@ -49,7 +49,7 @@ def test_what_was_not_measured_has_none():
     assert np.isfinite(value[251:]).all()
 
 
-def test_nothing_is_predicted_over_a_gap_and_so_nothing_is_an_innovation_after_it():
+def test_the_first_row_after_a_gap_has_no_innovation():
     model, noise = make_filter("vio15", ROBOT), default_noise("vio15", ROBOT)
     time_s, _, z = sample_from_model(model, noise, 400, 0.02, np.random.default_rng(1))
     time_s = np.where(np.arange(400) < 200, time_s, time_s + 6.0)

@@ -12,7 +12,7 @@ RATE_HZ = 20.0
 
 
 def drive(turn_radps, track_m=1.03, bias_radps=0.004, seed=0, speed_mps=0.7):
-    """Wheels and gyro of a robot that turns as it is told; yaw is its truth."""
+    """Wheels and gyro of a robot that turns as commanded; yaw is its truth."""
     n = len(turn_radps)
     rng = np.random.default_rng(seed)
     speed = speed_mps * np.minimum(np.arange(n) / RATE_HZ / 2, 1)

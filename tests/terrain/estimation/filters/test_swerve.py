@@ -132,7 +132,7 @@ def test_the_noise_of_the_thesis_is_that_of_its_tables_per_second():
 
 
 @pytest.mark.parametrize("yaw_rate_radps", [0.0, 0.3])
-def test_who_sees_the_slip_and_who_is_blind_to_it(yaw_rate_radps):
+def test_slip_is_observable_only_with_a_speed_over_ground(yaw_rate_radps):
     """Thesis 4.6, 6.1: slip reads 0 without a speed over ground, and low with wheel rows that know none."""
     found = {}
     for name, noise in (("encoder12", default_noise), ("vio12", thesis_noise), ("vio15", default_noise)):
@@ -211,7 +211,7 @@ def as_printed(name):
     return dataclasses.replace(make_filter(name, ROBOT), observe=printed[name])
 
 
-def test_what_driving_straight_leaves_unobserved():
+def test_observable_rank_in_straight_driving():
     """Positions are measured by GNSS only; of the other 12 states of slip14 as printed 9 are left."""
     straight = {"speed_x_mps": 1.0} | {f"slip_{i}_ratio": SLIP for i in (1, 2, 3)}
     straight = {
@@ -320,7 +320,7 @@ SAMPLE = {
 }
 
 
-def calm_noise(model):
+def low_noise(model):
     def variances(stds, names):
         return np.array(
             [next(std for kind, std in stds.items() if name.startswith(kind)) ** 2 for name in names]
@@ -348,9 +348,9 @@ def test_vio15_is_consistent_on_what_its_own_equations_draw():
 def test_gnss_is_another_reference():
     """Without a camera: position, heading of the world and slip come from the antenna alone."""
     model = make_filter("vio15", ROBOT, with_gnss=True, antenna_m=(0.2, -0.3))
-    calm = calm_noise(model)
-    start = np.maximum(calm.initial_variance.diagonal(), model.initial_std**2)
-    noise = Noise(calm.process_variance, calm.measurement_variance, start)
+    low = low_noise(model)
+    start = np.maximum(low.initial_variance.diagonal(), model.initial_std**2)
+    noise = Noise(low.process_variance, low.measurement_variance, start)
     time_s, truth, z = sample_from_model(model, noise, 2001, DT_S, np.random.default_rng(0))
     z[:, [row.startswith(("camera", "imu_yaw")) for row in model.rows]] = np.nan
     z[np.arange(2001) % 5 > 0, 14:] = np.nan  # 10 Hz
@@ -405,7 +405,7 @@ def test_a_broken_sensor_is_counted_by_its_name_and_costs_little(sensor, fault):
         ("wheel_1_radps", 30.0),
     ],
 )
-def test_what_a_sensor_made_up_for_four_seconds_is_gone_three_seconds_later(row, value):
+def test_the_filter_recovers_within_3_s_of_a_4_s_sensor_fault(row, value):
     model = make_filter("vio15", ROBOT)
     time_s, z, along = drive(model)
     z[400:600, model.rows.index(row)] = value
@@ -489,6 +489,6 @@ def test_wheels_at_right_angles_at_the_start_are_found():
         (lambda: adaptive_noise(ROBOT, -1.0), "factor is -1.0, a number above zero is required"),
     ],
 )
-def test_what_is_no_filter_is_refused(call, message):
+def test_invalid_filters_are_refused(call, message):
     with pytest.raises(ConfigError, match=message):
         call()

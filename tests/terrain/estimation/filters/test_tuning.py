@@ -68,7 +68,7 @@ def test_variances_that_are_off_by_four_to_thirty_come_back():
     assert [entry.verdict for entry in consistency_report(track).sensors].count("consistent") >= 10
 
 
-def test_what_the_runs_say_nothing_on_is_called_so():
+def test_a_group_without_measurements_is_reported_as_not_excited():
     """Camera rows are missing throughout."""
     truth = true_noise()
     runs = tables(truth, n_runs=1, n=200)
@@ -79,7 +79,7 @@ def test_what_the_runs_say_nothing_on_is_called_so():
     np.testing.assert_array_equal(tuned.measurement_variance, truth.measurement_variance)
 
 
-def test_the_search_stops_where_it_is_told_to():
+def test_the_search_stops_at_its_evaluation_limit():
     truth = true_noise()
     _, report = tune_noise(MODEL, tables(truth, 1, 100), scaled(truth, OFF_BY), GROUPS, max_evaluations=12)
     assert not report.converged
@@ -96,7 +96,7 @@ def test_the_search_stops_where_it_is_told_to():
         ([], "there is no group to tune"),
     ],
 )
-def test_groups_that_are_none_are_refused(groups, message):
+def test_invalid_groups_are_refused(groups, message):
     with pytest.raises(ConfigError, match=message):
         tune_noise(MODEL, [(np.zeros(1), np.zeros((1, 14)))], true_noise(), groups)
 

@@ -61,11 +61,13 @@ def log(scenario="straight", duration_s=16.0, gnss=False, lost=(), seed=3):
 def live(run, robot=ROBOT, name="vio15", yaw=None, rate_hz=50.0):
     channels = {stream: run.streams[stream].channels for stream in CHANNELS if stream in run.streams}
     estimator = LiveEstimator(robot, name, channels, initial_yaw_rad=yaw)
-    return estimator, [told for sample in replay(run, rate_hz) for told in estimator.step(sample.readings)]
+    return estimator, [
+        estimate for sample in replay(run, rate_hz) for estimate in estimator.step(sample.readings)
+    ]
 
 
-def column(told, name):
-    return np.array([getattr(estimate, name) for estimate in told], dtype=float)
+def column(estimates, name):
+    return np.array([getattr(estimate, name) for estimate in estimates], dtype=float)
 
 
 def batch(run, robot=ROBOT, name="vio15", yaw=None):
@@ -82,11 +84,11 @@ def batch(run, robot=ROBOT, name="vio15", yaw=None):
 
 def assert_equal(run, robot=ROBOT, name="vio15", yaw=None):
     """Compare everything at every tick; return the live side."""
-    estimator, told = live(run, robot, name, yaw)
+    estimator, estimates = live(run, robot, name, yaw)
     table, track, slip = batch(run, robot, name, yaw)
-    np.testing.assert_array_equal(column(told, "time_s"), table.time_s)
+    np.testing.assert_array_equal(column(estimates, "time_s"), table.time_s)
     n_rows = len(ROWS_OF_DRIVE["swerve"]) - (yaw is None) * len(GNSS_ROWS)
-    np.testing.assert_allclose(column(told, "rows")[:, :n_rows], table.z[:, :n_rows], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(column(estimates, "rows")[:, :n_rows], table.z[:, :n_rows], rtol=0, atol=1e-12)
     std = np.column_stack([track.std(state) for state in track.states])
     for what, desired in {
         "mean": track.mean,
@@ -98,13 +100,13 @@ def assert_equal(run, robot=ROBOT, name="vio15", yaw=None):
         "speed_x_mps": track.state("speed_x_mps"),
         "accel_y_mps2": track.state("accel_y_mps2"),
     }.items():
-        np.testing.assert_allclose(column(told, what), desired, rtol=0, atol=1e-9, err_msg=what)
+        np.testing.assert_allclose(column(estimates, what), desired, rtol=0, atol=1e-9, err_msg=what)
     counted = {kind: n for kind, n in estimator.dropped.items() if "clock" not in kind and "time" not in kind}
     batch_counts = {**table.dropped, **track.dropped}
     batch_counts.pop("wheels: stamp does not increase", None)
     batch_counts.pop("clock jump", None)
     assert counted == batch_counts
-    return told
+    return estimates
 
 
 @pytest.mark.parametrize(
@@ -123,11 +125,11 @@ def assert_equal(run, robot=ROBOT, name="vio15", yaw=None):
 )
 def test_live_equals_batch(scenario, duration_s, robot, name, yaw):
     run = log(scenario, duration_s, gnss=yaw is not None)
-    told = assert_equal(run, robot, name, yaw)
+    estimates = assert_equal(run, robot, name, yaw)
     wheels = with_wheel_speeds(run, robot).streams["wheels"]
     for what, pattern in (("wheel_speed_mps", "speed_{}_mps"), ("current_a", "current_{}_a")):
         raw = np.column_stack([wheels.channel(pattern.format(i)) for i in (1, 2, 3)])
-        np.testing.assert_array_equal(column(told, what), raw)
+        np.testing.assert_array_equal(column(estimates, what), raw)
 
 
 def test_how_samples_are_bundled_does_not_matter():
@@ -141,13 +143,13 @@ def test_how_samples_are_bundled_does_not_matter():
 
 
 def test_a_lost_camera_makes_slip_stale_and_its_uncertainty_grow():
-    told = assert_equal(log(duration_s=20.0, lost=((8.0, 11.0),)))
-    time_s, stale = column(told, "time_s"), column(told, "slip_stale").astype(bool)
+    estimates = assert_equal(log(duration_s=20.0, lost=((8.0, 11.0),)))
+    time_s, stale = column(estimates, "time_s"), column(estimates, "slip_stale").astype(bool)
     lost = (time_s > 8.3) & (time_s < 11.0)
     assert stale[lost].all()
     assert not stale[(time_s > 3.0) & (time_s < 8.0)].any()
     assert not stale[time_s > 11.1].any()
-    std = column(told, "slip_std")[lost][::25].mean(axis=1)  # every half a second
+    std = column(estimates, "slip_std")[lost][::25].mean(axis=1)  # every half a second
     assert (np.diff(std) > 0).all()
     assert std[-1] > 2.5 * std[0]
 
@@ -211,12 +213,12 @@ def test_faults_cost_live_what_they_cost_the_batch(stream, fault):
     assert_equal(edited(log(), stream, FAULTS[fault]))
 
 
-def test_a_wild_value_costs_live_a_moment_only():
-    """The batch takes an IMU that repeats a wild value for 60 ms for a leap, live for frozen."""
+def test_an_outlier_disturbs_the_live_estimate_only_briefly():
+    """An IMU repeats an outlier for 60 ms: the batch counts it as a leap, live as frozen."""
     run = edited(log(), "imu", put(50.0, n=6))
-    _, told = live(run)
+    _, estimates = live(run)
     _, _, slip = batch(run)
-    apart = np.abs(column(told, "slip_ratio") - slip.slip_ratio)
+    apart = np.abs(column(estimates, "slip_ratio") - slip.slip_ratio)
     time_s = slip.time_s
     assert np.nanmax(apart[time_s < MIDDLE_S]) < 1e-9
     assert np.nanmax(apart[time_s > MIDDLE_S + 1.0]) < 2e-4
@@ -225,46 +227,46 @@ def test_a_wild_value_costs_live_a_moment_only():
 
 def test_a_clock_that_is_set_back_is_believed_when_the_next_stamp_follows():
     run = log()
-    estimator, told = LiveEstimator(ROBOT), []
+    estimator, estimates = LiveEstimator(ROBOT), []
     for sample in replay(run):
         back_s = 100.0 * (sample.time_s < MIDDLE_S)
         readings = {
             name: Reading(reading.time_s + back_s, reading.values)
             for name, reading in sample.readings.items()
         }
-        told += estimator.step(readings)
-    assert len(told) == len(run.streams["wheels"]) - 1
+        estimates += estimator.step(readings)
+    assert len(estimates) == len(run.streams["wheels"]) - 1
     assert estimator.dropped["clock jump"] == 1
     _, plain = live(run)
     known = {round(estimate.time_s, 6): estimate for estimate in plain}
-    for estimate in told[-100:]:
+    for estimate in estimates[-100:]:
         desired = known[round(estimate.time_s, 6)]
         assert not estimate.slip_stale
         np.testing.assert_allclose(estimate.slip_ratio, desired.slip_ratio, atol=0.01)
 
 
-def test_wheels_alone_tell_the_rim_speeds_and_no_slip():
+def test_wheels_alone_give_wheel_speeds_and_no_slip():
     estimator = LiveEstimator(ROBOT)
-    told = [t for s in replay(log()) for t in estimator.step(_only("wheels", s))]
-    assert np.isnan(column(told, "slip_ratio")).all()
-    assert column(told, "slip_stale").all()
-    assert np.isinf(column(told, "reference_age_s")).all()
-    assert np.isfinite(column(told, "mean")).all()
+    estimates = [e for s in replay(log()) for e in estimator.step(_only("wheels", s))]
+    assert np.isnan(column(estimates, "slip_ratio")).all()
+    assert column(estimates, "slip_stale").all()
+    assert np.isinf(column(estimates, "reference_age_s")).all()
+    assert np.isfinite(column(estimates, "mean")).all()
     assert estimator.lag_s == ROBOT.sensors.encoder_time_constant_s
 
 
-def test_a_wheel_that_is_not_heard_of_has_no_slip():
+def test_a_wheel_without_measurements_has_no_slip():
     def mute(time_s, values):
         values[time_s > MIDDLE_S, 1] = np.nan
         return time_s, values
 
-    told = assert_equal(edited(log(), "wheels", mute))
-    late = column(told, "slip_ratio")[column(told, "time_s") > MIDDLE_S + 0.6]
+    estimates = assert_equal(edited(log(), "wheels", mute))
+    late = column(estimates, "slip_ratio")[column(estimates, "time_s") > MIDDLE_S + 0.6]
     assert np.isnan(late[:, 1]).all()
     assert np.isfinite(late[:100, [0, 2]]).any()
 
 
-def test_what_waits_for_the_wheels_is_bounded():
+def test_the_queue_of_samples_ahead_of_the_wheels_is_bounded():
     estimator = LiveEstimator(ROBOT)
     rng = np.random.default_rng(0)
     for k in range(40):
@@ -302,7 +304,7 @@ def garbage(draw):
 
 @settings(deadline=None, max_examples=40)
 @given(garbage(), st.sampled_from([None, 0.3]))
-def test_nothing_that_comes_raises_or_makes_a_state_infinite(steps, yaw):
+def test_arbitrary_readings_neither_raise_nor_make_a_state_infinite(steps, yaw):
     estimator = LiveEstimator(ROBOT, initial_yaw_rad=yaw)
     sound = list(replay(log()))[200:260]
     for sample in sound:
@@ -312,9 +314,9 @@ def test_nothing_that_comes_raises_or_makes_a_state_infinite(steps, yaw):
             name: Reading(reading.time_s + sound[-1].time_s, reading.values)
             for name, reading in readings.items()
         }
-        told = estimator.step(shifted)
-        assert len(told) <= (readings["wheels"].time_s.size if "wheels" in readings else 0)
-        for estimate in told:
+        estimates = estimator.step(shifted)
+        assert len(estimates) <= (readings["wheels"].time_s.size if "wheels" in readings else 0)
+        for estimate in estimates:
             assert np.isfinite(estimate.mean).all()
             assert (np.isfinite(estimate.std) & (estimate.std > 0)).all()
             assert not (np.abs(estimate.slip_ratio) > 1.0).any()
@@ -346,7 +348,7 @@ def _wheels(time_s):
     ],
 )
 @pytest.mark.parametrize("stream", ["wheels", "imu"])
-def test_what_is_no_reading_is_counted(stream, reading):
+def test_unreadable_readings_are_counted(stream, reading):
     estimator = LiveEstimator(ROBOT)
     estimator.step({stream: reading})
     assert (reading is None) or estimator.dropped[f"{stream}: unreadable"] >= 1
@@ -367,11 +369,11 @@ def test_columns_go_by_name():
     _, other = live(turned)
     np.testing.assert_array_equal(column(other, "slip_ratio"), column(plain, "slip_ratio"))
     few = LiveEstimator(ROBOT, channels={"wheels": CHANNELS["wheels"][:3]})
-    (told,) = few.step({"wheels": Reading(np.array([0.0]), np.ones((1, 3)))})
-    assert np.isnan(told.current_a).all()
+    (estimate,) = few.step({"wheels": Reading(np.array([0.0]), np.ones((1, 3)))})
+    assert np.isnan(estimate.current_a).all()
 
 
-def test_what_is_asked_wrongly_is_said():
+def test_invalid_options_are_refused():
     with pytest.raises(ConfigError, match="'motor_1_radps' must be among them"):
         LiveEstimator(ROBOT, channels={"wheels": ("current_1_a",)})
     with pytest.raises(ConfigError, match="gnss_latency_s is -1"):

@@ -24,7 +24,7 @@ NOISE = 1e-4
 
 
 def bare(robot=ROBOT, *, camera=None, sensors=None, steering=None):
-    """Return the robot with ideal sensors but for what is said."""
+    """Return the robot with ideal sensors except for the given values."""
     ideal = {"latency_s": 0.0, "time_constant_s": 0.0}
     return robot.with_parts(
         camera=replace(robot.camera, **ideal | (camera or {})),
@@ -119,7 +119,7 @@ def test_ideal_sensors_give_the_motion():
     np.testing.assert_array_equal(table.time_s, RUN.streams["wheels"].time_s)
     t = table.time_s
     lever = np.array([ROBOT.camera.lever_x_m, ROBOT.camera.lever_y_m])
-    told = {
+    expected = {
         **{f"wheel_{i}_radps": 0.5 / 0.2 for i in (1, 2, 3)},
         "accel_x_mps2": 0.0,
         "accel_y_mps2": 0.2,
@@ -133,7 +133,7 @@ def test_ideal_sensors_give_the_motion():
         "camera_yaw_rate_radps": 0.4,
         "camera_yaw_rad": 0.4 * t,
     }
-    for name, value in told.items():
+    for name, value in expected.items():
         within = 8 * NOISE * (GRAVITY_MPS2 if "accel" in name else 1)  # tilt moves gravity
         np.testing.assert_allclose(rows_of(table, name)[:, 0], value, atol=within, err_msg=name)
     fresh = np.arange(t.size) % 5 == 0  # a sensor slower than the clock gives each sample once
@@ -170,7 +170,7 @@ def test_a_robot_at_rest_on_a_slope_does_not_accelerate(roll, pitch):
     assert np.abs(accel).max() < 6 * NOISE * GRAVITY_MPS2
 
 
-def test_what_a_robots_file_says_of_its_sensors_is_taken_off():
+def test_described_sensor_errors_are_subtracted():
     robot = bare(
         sensors={
             "gyro_bias_z_radps": GYRO_BIAS,
@@ -370,14 +370,14 @@ def test_samples_that_are_no_numbers_are_left_out_and_counted():
     assert np.isnan(rows_of(table, *CAMERA_ROWS)[lost]).all()
 
 
-def test_a_quaternion_that_is_none_is_left_out_and_counted():
+def test_an_invalid_quaternion_is_left_out_and_counted():
     run = change(RUN, "odometry", set_rows(lambda t: t >= 4.0, 0.0, "quaternion_w_ratio"))
     table = measurement_table(run, bare())
     assert table.dropped == {"odometry: no rotation": 400}
     assert np.isnan(rows_of(table, *CAMERA_ROWS)[table.time_s > 4.03]).all()
 
 
-def test_an_unsure_camera_is_not_heard():
+def test_camera_samples_of_low_confidence_are_dropped():
     run = change(RUN, "odometry", set_rows(lambda t: (t >= 2) & (t < 3), 1 / 3, "confidence_ratio"))
     table = measurement_table(run, bare())
     assert table.dropped == {"odometry: low confidence": 200}
@@ -402,7 +402,7 @@ def test_a_sensor_that_repeats_itself_is_frozen(stream):
     assert np.isnan(rows_of(table, *rows)[frozen]).all()
     assert np.isfinite(rows_of(table, *rows)[~frozen & (table.time_s < 2.0)]).all()
     shorter = measurement_table(change(RUN, stream, freeze(2.0, 2.2)), bare())
-    assert shorter.dropped == {}  # a few equal samples may be a slow driver
+    assert shorter.dropped == {}  # a few equal samples may be a slow motor driver
 
     stopped = change(RUN, "wheels", set_rows(lambda t: t > 1, 0.0))
     stopped = change(stopped, "steering", set_rows(lambda t: t > 1, 0.1))
@@ -511,7 +511,7 @@ def test_a_camera_that_was_lost_through_a_turn_comes_back_on_the_right_one():
     np.testing.assert_allclose(rows_of(table, "camera_yaw_rad")[seen, 0], table.time_s[seen], atol=0.03)
 
 
-def test_gnss_without_a_fix_is_worth_less_and_late():
+def test_gnss_without_a_fix_has_a_larger_variance_and_is_late():
     def float_first(time_s, values, channels):
         values[time_s < 1.0, channels.index("fix_ratio")] = 0.0
         values[time_s > 4.0, channels.index("std_position_m")] = 0.1
@@ -555,10 +555,10 @@ def test_a_skid_steered_robot_has_sides_and_a_gyro():
     with_gnss = measurement_table(husky_run(gnss=True), HUSKY, gnss_latency_s=0.0)
     np.testing.assert_allclose(with_gnss.z[::2, 3], with_gnss.time_s[::2])
     assert np.isnan(with_gnss.z[:, 5:]).all()  # no speed in this stream
-    np.testing.assert_allclose(with_gnss.gnss_variance[::2, 0], 0.25)  # nobody said that it had a fix
+    np.testing.assert_allclose(with_gnss.gnss_variance[::2, 0], 0.25)  # no fix was reported
 
 
-def test_what_gives_no_clock_is_refused():
+def test_logs_without_a_clock_are_refused():
     with pytest.raises(DataError, match="run run: there is no stream 'wheels', which gives the clock"):
         measurement_table(without(RUN, "wheels"), ROBOT)
     with pytest.raises(DataError, match="the stream 'wheels', which gives the clock, is empty"):
@@ -568,7 +568,7 @@ def test_what_gives_no_clock_is_refused():
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "message"),
     [
         ({"time_constant_s": -0.1}, "time_constant_s is -0.1"),
         ({"time_constant_s": np.nan}, "time_constant_s is nan"),
@@ -577,8 +577,8 @@ def test_what_gives_no_clock_is_refused():
         ({"gnss_latency_s": -1.0}, "gnss_latency_s is -1"),
     ],
 )
-def test_options_that_cannot_be_are_refused(options, said):
-    with pytest.raises(ConfigError, match=said):
+def test_invalid_options_are_refused(options, message):
+    with pytest.raises(ConfigError, match=message):
         measurement_table(RUN, ROBOT, **options)
 
 
@@ -589,7 +589,7 @@ def test_a_robot_has_to_describe_the_sensors_it_is_asked_of():
     assert measurement_table(without(RUN, "odometry"), blind).time_s.size == 300
 
 
-def test_a_causal_table_knows_nothing_of_what_comes_later():
+def test_a_causal_table_does_not_depend_on_later_samples():
     robot = bare(
         sensors={"imu_latency_s": 0.005, "encoder_time_constant_s": 0.05}, camera={"latency_s": 0.006}
     )

@@ -24,10 +24,10 @@ from terrain.estimation.measurements.table import (
     GNSS_SPEED_STD_MPS,
     GNSS_STD_M,
     LATE_S,
+    MAX_RATE_FACTOR,
     ROWS_OF_DRIVE,
     STANDING_S,
     STANDING_SPEED_MPS,
-    WILD_FACTOR,
 )
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.kinematics.camera import body_motion
@@ -157,7 +157,7 @@ def plain_table(run, robot, causal, initial_yaw_rad):
     dropped, lag_s = Counter(), robot.sensors.encoder_time_constant_s
     wheels = clean_stream(run, "wheels", [f"motor_{i}_radps" for i in (1, 2, 3)], dropped)
     clock, rates = wheels.time_s, wheels.values / robot.motors.reduction_ratio
-    rates = np.where(np.abs(rates) > WILD_FACTOR * robot.motors.speed_max_radps, np.nan, rates)
+    rates = np.where(np.abs(rates) > MAX_RATE_FACTOR * robot.motors.speed_max_radps, np.nan, rates)
     rows = ROWS_OF_DRIVE["swerve"]
     table, leaps = dict(zip(rows, rates.T, strict=False)), {}
     camera_lag_s = max(lag_s - robot.camera.time_constant_s, 0.0)

@@ -92,7 +92,7 @@ def twist_error(component):
 
 
 def asked(radii=(1.0, 1.0, 1.0), steer=(0.0, 0.0, 0.0), component=2):
-    """Change of the twist of wheels that are told to go straight on at 1 m/s."""
+    """Change of the twist of wheels that are commanded straight ahead at 1 m/s."""
     rate = np.array(radii) / ROBOT.wheel_radius_m
     return float(forward(ROBOT.wheel_positions_m, ROBOT.wheel_radius_m, rate, np.array(steer))[0][component])
 
@@ -159,9 +159,9 @@ def gyro_late(run, robot):
 def encoder_late(run, robot):
     wheels = run.streams["wheels"]
     true = truth(run, "wheel_1_radps", wheels.time_s)
-    told = wheels.channel("motor_1_radps") / robot.motors.reduction_ratio
+    reported = wheels.channel("motor_1_radps") / robot.motors.reduction_ratio
     best = minimize_scalar(
-        lambda lag_s: np.sum((low_pass(wheels.time_s, true, lag_s, 1.0) - told) ** 2), (0.01, 0.1)
+        lambda lag_s: np.sum((low_pass(wheels.time_s, true, lag_s, 1.0) - reported) ** 2), (0.01, 0.1)
     )
     return float(best.x) - robot.sensors.encoder_time_constant_s
 
@@ -295,7 +295,7 @@ def test_both_arms_of_a_lever_show():
 @pytest.mark.parametrize(
     "slip", [{"force_slip_ratio": 3.0}, {"shear_slip_ratio": 3.0}, {"force_slip_ratio": -0.3}]
 )
-def test_creep_of_any_size_stays_calm(slip):
+def test_creep_of_any_magnitude_does_not_oscillate(slip):
     run = driven("straight", "asphalt", LEVEL, tuple(slip.items()))
     clean = driven("straight", "asphalt", LEVEL)
     rate, plain = (

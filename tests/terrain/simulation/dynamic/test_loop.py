@@ -40,13 +40,13 @@ class Listener:
         self.samples.append(sample)
         return self.controller(sample)
 
-    def heard(self, stream):
+    def received(self, stream):
         given = [sample.readings[stream] for sample in self.samples if stream in sample.readings]
         return np.concatenate([r.time_s for r in given]), np.vstack([r.values for r in given])
 
 
 def kinematic(sample):
-    """Tell the wheels what the wanted twist asks of them, steering ahead."""
+    """Command the wheel speeds of the desired twist, with the steering straight ahead."""
     wheel = np.full(3, sample.twist[0] / 0.2) + sample.twist[2] * np.array([0.0, 0.0, 0.756 / 0.2])
     steer = np.array([-1.0, 1.0, 0.0]) * math.atan2(0.5075 * sample.twist[2], max(sample.twist[0], 0.1))
     return Command(wheel, steer, sample.twist, {})
@@ -83,7 +83,7 @@ def wheels_of(stream, pattern):
         ("course", ["tiles", "snow", "grass"], {"duration_s": 25.0}),
     ],
 )
-def test_what_a_controller_is_given_is_what_stands_in_the_log(scenario, terrain, options, tmp_path):
+def test_the_readings_of_a_controller_equal_the_log(scenario, terrain, options, tmp_path):
     listener = Listener(kinematic)
     run = run_of(scenario, terrain, listener, 3, **options)
     drive = make_scenario(scenario, ROBOT, terrain, options.get("duration_s"))
@@ -94,8 +94,10 @@ def test_what_a_controller_is_given_is_what_stands_in_the_log(scenario, terrain,
     assert set().union(*(sample.readings for sample in listener.samples)) == sensed
     for name in sensed:
         stream = run.streams[name]
-        time_s, values = listener.heard(name)
-        n = np.searchsorted(stream.time_s, ticks_s[-1], side="right")  # after the last tick nobody listens
+        time_s, values = listener.received(name)
+        n = np.searchsorted(
+            stream.time_s, ticks_s[-1], side="right"
+        )  # after the last tick no controller runs
         assert time_s.tobytes() == stream.time_s[:n].tobytes()
         assert values.tobytes() == stream.values[:n].tobytes()
         for before_s, sample in zip([-1.0, *ticks_s[:-1]], listener.samples, strict=True):
@@ -155,15 +157,15 @@ def test_pieces_between_commands_are_the_drive_in_which_each_step_has_its_own(de
         assert drive.until(k * substeps + 1)
         drive.command(k * substeps + delay, wheel[k], steer[k])
     assert drive.until(n * substeps)
-    told = (np.arange(n * substeps) - delay) // substeps
-    held_wheel, held_steer = (np.where(told[:, None] >= 0, rows[told], 0.0) for rows in (wheel, steer))
+    tick = (np.arange(n * substeps) - delay) // substeps
+    held_wheel, held_steer = (np.where(tick[:, None] >= 0, rows[tick], 0.0) for rows in (wheel, steer))
     advance(plant, other, held_wheel, held_steer, 1, noise, whole)
     assert one.tobytes() == other.tobytes()
     assert pieces.tobytes() == whole.tobytes()
 
 
 @pytest.mark.parametrize("delay_s", [0, 0.01, 0.05, np.float64(0.123), 0.5])
-def test_wheels_stand_until_the_first_command_has_come(delay_s):
+def test_wheels_stand_until_the_first_command_arrives(delay_s):
     def at_once(sample):
         return STAND._replace(wheel_radps=np.full(3, 3.0), steer_rad=np.full(3, 0.2))
 
@@ -177,7 +179,7 @@ def test_wheels_stand_until_the_first_command_has_come(delay_s):
 
 
 def test_a_loop_over_the_camera_drives_at_the_speed_that_slip_takes_away():
-    """On grass an eighth of the rim's speed is lost; an integral of the speed's error brings it back."""
+    """On grass an eighth of the wheel speed is lost; an integral of the speed's error brings it back."""
     gain = {"ratio": 1.0}
 
     def controller(sample):
@@ -207,7 +209,7 @@ def test_the_same_controller_and_seed_give_the_same_log_and_no_status_no_stream(
     assert one.streams["commands"].channels == COMMAND_CHANNELS
 
 
-def test_a_leg_with_play_leads_the_robot_astray_and_its_encoder_knows_nothing():
+def test_leg_backlash_deflects_the_robot_unseen_by_the_steering_encoder():
     runs = [
         run_of(
             "starts", "grass", seed=1, duration_s=20.0, conditions=Conditions(leg_backlash_rad=backlash_rad)
@@ -225,7 +227,7 @@ def test_a_leg_with_play_leads_the_robot_astray_and_its_encoder_knows_nothing():
 
 
 @pytest.mark.parametrize("delay_s", [-0.01, 0.51, math.nan, math.inf, "soon", None, True])
-def test_a_delay_that_is_none_is_refused(delay_s):
+def test_an_invalid_delay_is_refused(delay_s):
     for controller in (None, kinematic):
         with pytest.raises(ConfigError, match=r"command_delay_s is .*, a time from 0 to 0.5 s is required"):
             run_of("straight", "grass", controller, duration_s=4.0, command_delay_s=delay_s)
@@ -245,7 +247,7 @@ def test_a_delay_that_is_none_is_refused(delay_s):
         ({"status": None}, "status of its command at 1.02 s"),
     ],
 )
-def test_a_command_that_is_none_is_refused_with_its_time(changed, message):
+def test_an_invalid_command_is_refused_with_its_time(changed, message):
     def controller(sample):
         command = STAND._replace(status={"gain_ratio": math.nan})
         return command._replace(**changed) if sample.time_s > 1.01 else command

@@ -120,8 +120,8 @@ def test_the_truth_agrees_with_itself():
     np.testing.assert_allclose(angle[moving], np.arctan2(across, abs(along))[moving], atol=1e-9)
     # central differences over 20 ms: within what the acceleration changes in that time
     accel = np.gradient(v, t, axis=0) + turn[:, None] * np.column_stack([-v[:, 1], v[:, 0]])
-    told = np.column_stack([truth.channel("accel_x_mps2"), truth.channel("accel_y_mps2")])
-    assert np.sqrt(((accel - told) ** 2).mean()) < 0.05 * told.std()
+    true_accel = np.column_stack([truth.channel("accel_x_mps2"), truth.channel("accel_y_mps2")])
+    assert np.sqrt(((accel - true_accel) ** 2).mean()) < 0.05 * true_accel.std()
     c, s = np.cos(yaw), np.sin(yaw)
     world = np.column_stack([c * v[:, 0] - s * v[:, 1], s * v[:, 0] + c * v[:, 1]])
     moved = np.cumsum(0.5 * (world[1:] + world[:-1]) * np.diff(t)[:, None], axis=0)
@@ -132,7 +132,7 @@ def test_the_truth_agrees_with_itself():
     assert wheels_of(truth, "normal_{}_n").sum(axis=1).mean() == pytest.approx(mass_n, rel=0.01)
 
 
-def test_sensors_tell_of_the_truth_beside_them():
+def test_sensor_streams_agree_with_the_truth():
     run = run_of("complex", "tiles", 1)
     truth, wheels, steering, imu = (run.streams[name] for name in ("truth", "wheels", "steering", "imu"))
     for i in (1, 2, 3):
@@ -153,15 +153,15 @@ def test_sensors_tell_of_the_truth_beside_them():
     np.testing.assert_array_equal(commands.values[:, :3], make_scenario("complex", ROBOT, "tiles").twist)
 
 
-@pytest.mark.parametrize("way", ["camera", "gnss"])
-def test_a_fault_or_a_sensor_more_changes_no_other_stream(way):
+@pytest.mark.parametrize("added", ["camera", "gnss"])
+def test_an_added_fault_or_sensor_changes_no_other_stream(added):
     options = {
         "camera": {"faults": Faults(camera_lost_s=((1.0, 3.0),), by_chance=False)},
         "gnss": {"gnss": Gnss(), "faults": Faults(gnss_lost_s=((2.0, 3.0),))},
-    }[way]
+    }[added]
     plain, changed = (run_of("straight", "grass", 5, 6.0, **given) for given in ({}, options))
-    assert ("gnss" in changed.streams) == (way == "gnss")
-    assert (len(plain.streams["odometry"]) > len(changed.streams["odometry"])) == (way == "camera")
+    assert ("gnss" in changed.streams) == (added == "gnss")
+    assert (len(plain.streams["odometry"]) > len(changed.streams["odometry"])) == (added == "camera")
     for name in ("wheels", "steering", "imu", "commands", "truth"):
         np.testing.assert_array_equal(plain.streams[name].values, changed.streams[name].values)
 
@@ -207,7 +207,7 @@ def test_a_run_reads_back_as_it_was_written(tmp_path):
         assert ("odometry" in run.streams) == (run.run_id != "blind")
 
 
-def test_labels_cover_just_what_all_wheels_stand_on():
+def test_labels_cover_stretches_with_all_wheels_on_one_terrain():
     time_s = np.arange(601) / 50
     twist = np.column_stack([np.minimum(time_s, 1.0), np.zeros((601, 2))])
     patches = ((0.0, "tiles"), (3.0, "grass"), (6.0, "snow"))
@@ -239,7 +239,7 @@ def test_a_ground_that_is_crossed_in_a_moment_gets_no_label():
     assert simulate(ROBOT, drive, SOILS, 1).terrains == ("tiles", "snow")
 
 
-def test_the_ground_varies_along_the_way_as_soil_and_conditions_say(monkeypatch):
+def test_terrain_varies_along_the_path_as_soil_and_conditions_state(monkeypatch):
     plants = []
 
     def noted(plant, state, wheel, steer, substeps, noise, record):
@@ -312,7 +312,7 @@ def test_a_course_is_labelled_ground_by_ground():
         ({"robot": with_part("motors", speed_max_radps=1e6)}, "km of terrain are simulated at most"),
     ],
 )
-def test_what_cannot_be_simulated_is_refused_in_one_sentence(changed, message):
+def test_invalid_simulations_are_refused_in_one_sentence(changed, message):
     given = {
         "robot": ROBOT,
         "scenario": make_scenario("straight", ROBOT, "grass", 4.0),

@@ -267,9 +267,9 @@ def test_a_drive_with_everything_in_it_is_that_of_the_plain_form():
     np.testing.assert_allclose(motion.wheel("reported_radps")[:-1], plain["reported"][1:], rtol=0, atol=1e-7)
     # acceleration at the origin is what its speed does
     turn, along, across = (motion.body(name) for name in ("yaw_rate_radps", "speed_x_mps", "speed_y_mps"))
-    told = [motion.body(name)[:-1] for name in ("accel_x_mps2", "accel_y_mps2")]
-    np.testing.assert_allclose(told[0], np.diff(along) / STEP_S - (turn * across)[:-1], rtol=0, atol=1e-9)
-    np.testing.assert_allclose(told[1], np.diff(across) / STEP_S + (turn * along)[:-1], rtol=0, atol=1e-9)
+    recorded = [motion.body(name)[:-1] for name in ("accel_x_mps2", "accel_y_mps2")]
+    np.testing.assert_allclose(recorded[0], np.diff(along) / STEP_S - (turn * across)[:-1], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(recorded[1], np.diff(across) / STEP_S + (turn * along)[:-1], rtol=0, atol=1e-9)
     # roll and pitch of the plane through the corners
     roll = (plain["ride"][:, :2].mean(axis=1) - plain["ride"][:, 2]) / 0.756
     np.testing.assert_allclose(motion.body("ride_roll_rad"), roll, rtol=0, atol=1e-9)
@@ -422,11 +422,13 @@ def test_at_rest_on_the_level_nothing_at_all_happens():
 
 
 @pytest.mark.parametrize("name", ["tiles", "grass", "snow", "dry_sand"])
-@pytest.mark.parametrize("way_rad", [0.0, 1.5, 2.4, 4.0])
-def test_at_rest_on_a_slope_of_5_degrees_it_stays(name, way_rad):
+@pytest.mark.parametrize("uphill_rad", [0.0, 1.5, 2.4, 4.0])
+def test_a_robot_at_rest_on_a_slope_of_5_degrees_does_not_move(name, uphill_rad):
     tan = math.tan(math.radians(5.0))
     plant = plant_of(
-        load_soil(name), grade_ratio=(tan * math.cos(way_rad), tan * math.sin(way_rad)), backlash_rad=0.02
+        load_soil(name),
+        grade_ratio=(tan * math.cos(uphill_rad), tan * math.sin(uphill_rad)),
+        backlash_rad=0.02,
     )
     motion = drive(plant, np.zeros((500, 3)), settled=True)
     moved_m = np.hypot(motion.body("position_x_m"), motion.body("position_y_m"))
@@ -485,7 +487,7 @@ def test_mirrored_commands_give_mirrored_motion():
     "twist",
     [(0.8, 0.0, 0.0), (-0.6, 0.0, 0.3), (0.0, 0.5, 0.0), (0.4, -0.3, -0.2), (0.0, 0.0, 0.6), (0.5, 0.2, 0.5)],
 )
-def test_where_nothing_slips_the_twist_is_the_one_told(twist):
+def test_without_slip_the_twist_is_the_commanded_one(twist):
     plant = plant_of(STICKY, com_height_m=0.0)
     desired = np.tile(twist, (300, 1)) * np.minimum(np.arange(300) / 75, 1.0)[:, None]
     _, wheel, steer = wheel_commands(ROBOT.wheel_positions_m, 0.2, 10.0, 2.0, 0.02, desired, np.zeros(3))
@@ -495,7 +497,7 @@ def test_where_nothing_slips_the_twist_is_the_one_told(twist):
     np.testing.assert_allclose(motion.wheel("slip_ratio")[-1], 0.0, atol=6e-3)
 
 
-def test_what_the_motors_give_is_what_is_stored_lifted_and_lost():
+def test_motor_work_equals_kinetic_potential_and_dissipated_energy():
     soil, grade = load_soil("grass"), 0.05
     plant = plant_of(soil, grade_ratio=(grade, 0.0))
     motion = drive(plant, np.vstack([ramp(4.0), ramp(2.0, -3.0), ramp(2.0)]), settled=True)
@@ -518,7 +520,7 @@ def test_what_the_motors_give_is_what_is_stored_lifted_and_lost():
 
 
 @pytest.mark.parametrize("leg_backlash_rad", [0.0, 0.03])
-def test_what_the_motors_give_in_curves_is_lost_in_the_contacts_to_the_side_as_well(leg_backlash_rad):
+def test_motor_work_in_curves_is_dissipated_by_lateral_slip_too(leg_backlash_rad):
     soil = load_soil("grass")
     plant = plant_of(soil, leg_backlash_rad=leg_backlash_rad)
     at = np.arange(400)[:, None]
@@ -557,7 +559,7 @@ def test_the_third_leg_swings_to_where_its_wheel_is_pushed_and_no_further():
     assert not leg[t < 0.5].any()
     # a start pushes the wheel, on the right, forward: the leg to the left
     assert (leg[(t > 0.9) & (t < 1.5)] == backlash_rad).all()
-    assert (leg[(t > 2.9) & (t < 3.4)] == -backlash_rad).all()  # braking: the other way
+    assert (leg[(t > 2.9) & (t < 3.4)] == -backlash_rad).all()  # braking: the opposite side
     crossing_s = (np.flatnonzero(leg == backlash_rad)[0] - np.flatnonzero(leg)[0] + 1) * STEP_S
     assert crossing_s >= backlash_rad / LEG_RATE_RADPS - STEP_S
     np.testing.assert_array_equal(heading[:, 2], leg)  # nothing was steered
@@ -617,7 +619,7 @@ def test_the_speed_loop_reaches_its_speed_and_does_not_wind_up():
     assert 59.0 < torque.max() <= 60.0
     assert rate.max() < 12.0
     np.testing.assert_allclose(rate[-1], 10.0, atol=0.02)
-    # too weak for the hill it rolls back for two seconds; told to go that way, it does so at once
+    # too weak for the hill it rolls back for two seconds; commanded backward, it follows at once
     weak = plant_of(STICKY, grade_ratio=(0.05, 0.0))._replace(torque_max_nm=2.0)
     torque = drive(weak, np.vstack([np.full((100, 3), 5.0), np.full((20, 3), -9.0)])).wheel("torque_nm")
     np.testing.assert_allclose(torque[500:2000], 2.0, rtol=1e-6)
@@ -631,7 +633,7 @@ def test_steering_keeps_its_limits_overshoots_nothing_and_hangs_in_its_play():
     angle = motion.wheel("steer_rad")
     assert np.abs(np.diff(angle, axis=0)).max() <= 2.0944 * STEP_S * (1 + 1e-9)
     assert np.abs(np.diff(angle[:1150, 0], n=2)).max() < 2.1 * STEP_S  # it picks the wheel up, no more
-    # it stops short by the play on either way
+    # it stops short by the backlash in both directions
     np.testing.assert_allclose(angle[1199], [1.18, -0.68, 0.03], atol=1.5e-3)
     np.testing.assert_allclose(angle[-1], [0.02, -0.02, 0.02], atol=1.5e-3)
     assert (angle.max(axis=0) <= [1.1815, 0.0, 0.0315]).all()
@@ -640,7 +642,7 @@ def test_steering_keeps_its_limits_overshoots_nothing_and_hangs_in_its_play():
     assert np.flatnonzero(angle[:, 0] > 1.17)[0] * STEP_S == pytest.approx(fastest_s, abs=0.005)
 
 
-def test_each_wheel_changes_ground_where_it_stands():
+def test_each_wheel_changes_terrain_at_its_own_position():
     plant = plant_of(load_soil("tiles"), load_soil("grass"), starts_m=(0.0, 2.0))
     motion = drive(plant, ramp(5.0))
     patch, path = motion.wheel("patch_ratio"), motion.body("path_m")
@@ -650,7 +652,7 @@ def test_each_wheel_changes_ground_where_it_stands():
     assert motion.wheel("slip_ratio")[-1].mean() > 0.1 > motion.wheel("slip_ratio")[2000].mean()
 
 
-def test_hall_steps_show_at_a_crawl_and_tell_the_rate_in_the_mean():
+def test_hall_steps_show_at_low_speed_and_give_the_rate_in_the_mean():
     crawl = drive(plant_of(load_soil("tiles")), ramp(10.0, 0.05))
     reported, rate = crawl.wheel("reported_radps")[5000:], crawl.wheel("wheel_radps")[5000:]
     steps = np.diff(reported, axis=0).max(axis=0)
@@ -694,7 +696,7 @@ def test_a_larger_wheel_is_faster():
     assert motion.body("speed_x_mps")[-1] == pytest.approx(1.02, abs=1e-3)
 
 
-def test_a_wheel_in_the_air_does_nothing_and_breaks_nothing():
+def test_an_unloaded_wheel_exerts_no_force():
     plant = plant_of(STICKY, payload_kg=60.0, payload_m=(0.0, 0.37))  # nearly over the line of wheels 1 and 2
     assert plant.load_fraction[2] < 0.15
     steer = np.tile([0.4, -0.4, 0.0], (150, 1))

@@ -64,7 +64,7 @@ def skid(robot, speed, turn):
 
 
 def rich(robot, dt=DT, length_s=30.0):
-    """Return rims, steering, grade and roll of a drive that shows most effects."""
+    """Return wheel speeds, steering, grade and roll of a drive that shows most effects."""
     t = dt * np.arange(round(length_s / dt))
     speed = 0.5 * np.sin(0.9 * t) + 0.35 * np.sin(0.31 * t)
     turn = 0.5 * np.sin(0.53 * t + 1.0)
@@ -75,7 +75,7 @@ def rich(robot, dt=DT, length_s=30.0):
     return np.column_stack([speed, 0.9 * speed, 1.1 * speed]), steer, grade, roll
 
 
-def told(robot, values, wheel_speed, steer=None, grade=None, roll=None, ground=FREE, dt=DT):
+def replayed(robot, values, wheel_speed, steer=None, grade=None, roll=None, ground=FREE, dt=DT):
     """Return channels (n,) by name."""
     n = len(wheel_speed)
     steer = np.zeros((n, wheel_speed.shape[1])) if steer is None else steer
@@ -89,11 +89,11 @@ def told(robot, values, wheel_speed, steer=None, grade=None, roll=None, ground=F
 def test_the_wheels_of_a_twist_move_the_robot_by_that_twist(twist):
     robot = still(AGRIMARO)
     wheel, steer = inverse(robot.wheel_positions_m, robot.wheel_radius_m, np.array(twist), np.zeros(3))
-    shown = told(robot, {}, at_rate(wheel * robot.wheel_radius_m), at_rate(steer))
+    shown = replayed(robot, {}, at_rate(wheel * robot.wheel_radius_m), at_rate(steer))
     for channel, value in zip((SPEED_X, SPEED_Y, GYRO), twist, strict=True):
         np.testing.assert_allclose(shown[channel], value, atol=1e-7)  # no contact is quite rigid
     if not twist[1]:
-        shown = told(still(HUSKY), {}, at_rate(skid(HUSKY, twist[0], twist[2])[0]))
+        shown = replayed(still(HUSKY), {}, at_rate(skid(HUSKY, twist[0], twist[2])[0]))
         np.testing.assert_allclose([shown[SPEED_X][-1], shown[GYRO][-1]], [twist[0], twist[2]], atol=1e-12)
 
 
@@ -116,13 +116,13 @@ def test_an_effect_shows_most_where_the_library_says(drive):
         alike = {GYRO: HEADING, CURRENT: TURNING_CURRENT, SPEED_X: SPEED_Y}
         if effect.name == "clock_rate" or any(p.unit == "s" for p in effect.parameters):
             alike[GYRO] = ACCEL
-        told_of = np.isin(CHANNELS, [*effect.channels, *(alike.get(c, c) for c in effect.channels)])
+        described = np.isin(CHANNELS, [*effect.channels, *(alike.get(c, c) for c in effect.channels)])
         if effect not in library_of(drive):
             assert (change == 0).all(), effect.name
             continue
-        assert change[told_of].max() > 1e-3, effect.name
+        assert change[described].max() > 1e-3, effect.name
         # through force and slip some of everything is everywhere
-        assert (change[~told_of] <= 0.8 * change[told_of].max() + 1e-9).all(), (effect.name, change)
+        assert (change[~described] <= 0.8 * change[described].max() + 1e-9).all(), (effect.name, change)
 
 
 @pytest.mark.parametrize("drive", ROBOTS)
@@ -139,7 +139,7 @@ def test_the_answer_hardly_depends_on_the_step(drive, values):
         assert off <= 0.02 * np.std(fine[:, c]) + 1e-12, channel
 
 
-def test_slip_follows_the_force_as_its_equation_says():
+def test_slip_follows_its_equation_of_force():
     """v = u - |u| c f with f = (m v' + m g sin th + R) / (m g), integrated by Euler in small steps."""
     ground = Ground(slip_ratio=0.6, rolling_ratio=0.0)
     dt, n = 1e-3, 12000
@@ -150,11 +150,11 @@ def test_slip_follows_the_force_as_its_equation_says():
     for k in range(n - 1):
         accel = ((u[k] - v[k]) / (abs(u[k]) * 0.6) - math.sin(grade[k])) * GRAVITY_MPS2
         v[k + 1] = v[k] + dt * accel
-    shown = told(still(HUSKY), {}, np.column_stack([u, u]), grade=grade, ground=ground, dt=dt)
+    shown = replayed(still(HUSKY), {}, np.column_stack([u, u]), grade=grade, ground=ground, dt=dt)
     np.testing.assert_allclose(shown[SPEED_X][500:], v[500:], atol=1e-4)
     # the same compliance as an effect, or shared
     for c in ({"force_slip_ratio": 0.6}, {"force_slip_ratio": 0.6, "shear_slip_ratio": 0.0}):
-        free = told(still(HUSKY), c, np.column_stack([u, u]), grade=grade, ground=FREE, dt=dt)
+        free = replayed(still(HUSKY), c, np.column_stack([u, u]), grade=grade, ground=FREE, dt=dt)
         np.testing.assert_allclose(free[SPEED_X], shown[SPEED_X])
 
 
@@ -209,23 +209,23 @@ def test_a_bent_thrust_curve_slips_by_its_inverse_and_a_load_presses_as_much_as_
     for robot in ROBOTS.values():
         n = len(robot.wheels)
         for grade in (0.0, 0.05):
-            shown = told(still(robot), {}, at_rate([0.5] * n), grade=grade, ground=ground)[SPEED_X][-1]
+            shown = replayed(still(robot), {}, at_rate([0.5] * n), grade=grade, ground=ground)[SPEED_X][-1]
             desired = 0.1 * shown / math.hypot(shown, ROLLING_MPS) + math.sin(grade)
             if robot is HUSKY:
                 desired = 0.1 * direction(shown) + math.sin(grade)
             assert 1 - shown / 0.5 == pytest.approx(np.interp(desired, 0.4 * share, s), rel=2e-3)
-            loaded = told(
+            loaded = replayed(
                 still(robot), {"payload_ratio": 0.5}, at_rate([0.5] * n), grade=grade, ground=ground
             )
             assert loaded[SPEED_X][-1] == pytest.approx(shown, rel=1e-6)
 
 
-def test_a_tilt_that_is_not_felt_takes_no_traction_and_still_shows_in_the_accelerometer():
-    unfelt = Ground(effective_ratio=0.0)
+def test_a_tilt_of_effective_ratio_0_takes_no_traction_but_shows_in_the_accelerometer():
+    without_tilt = Ground(effective_ratio=0.0)
     for robot in ROBOTS.values():
         wheel_speed = at_rate([0.5] * len(robot.wheels))
         level, tilted = (
-            told(still(robot), {}, wheel_speed, grade=g, roll=g, ground=unfelt) for g in (0.0, 0.1)
+            replayed(still(robot), {}, wheel_speed, grade=g, roll=g, ground=without_tilt) for g in (0.0, 0.1)
         )
         for channel in (SPEED_X, SPEED_Y, CURRENT):
             np.testing.assert_allclose(tilted[channel], level[channel])
@@ -244,10 +244,10 @@ def test_shear_slip_is_the_inverse_of_its_curve_and_starts_with_slope_one():
 
 
 def speeds(wheel_speed_mps, values, **options):
-    return told(still(HUSKY), values, at_rate(wheel_speed_mps), **options)
+    return replayed(still(HUSKY), values, at_rate(wheel_speed_mps), **options)
 
 
-def test_kinematic_effects_do_what_their_formulas_say():
+def test_kinematic_effects_match_their_formulas():
     b = HUSKY.track_m
     assert speeds([0.5, 0.5], {"wheel_radius_ratio": 0.1})[SPEED_X][-1] == pytest.approx(0.55)
     one_sided = speeds([0.5, 0.5], {"one_sided_radius_ratio": 0.1})
@@ -267,39 +267,41 @@ def test_kinematic_effects_do_what_their_formulas_say():
     for roll in (0.1, -0.1):
         for speed in (0.5, -0.5):
             aside = speeds([speed, speed], {"side_hill_slip_ratio": 0.4}, roll=roll)[SPEED_Y][-1]
-            assert aside == pytest.approx(-0.4 * roll * 0.5)  # downhill, whichever way it drives
+            assert aside == pytest.approx(-0.4 * roll * 0.5)  # downhill, in both driving directions
 
 
-def test_steering_effects_do_what_their_formulas_say():
+def test_steering_effects_match_their_formulas():
     robot = still(AGRIMARO)
     wheel, steer = inverse(
         robot.wheel_positions_m, robot.wheel_radius_m, np.array([0.6, 0.0, 0.2]), np.zeros(3)
     )
     right, wheel_speed = (
-        told(robot, {}, at_rate(wheel * robot.wheel_radius_m), at_rate(steer)),
+        replayed(robot, {}, at_rate(wheel * robot.wheel_radius_m), at_rate(steer)),
         at_rate(wheel * 0.2),
     )
     offsets = {f"steering_offset_{i}_rad": 0.03 * i for i in (1, 2, 3)}
-    put_off = told(robot, offsets, wheel_speed, at_rate(steer - 0.03 * np.arange(1, 4)))
+    put_off = replayed(robot, offsets, wheel_speed, at_rate(steer - 0.03 * np.arange(1, 4)))
     for channel in (GYRO, SPEED_X, SPEED_Y):
         np.testing.assert_allclose(put_off[channel], right[channel], atol=1e-9)
     swing = at_rate(steer) + 0.1 * np.sin(2 * TIME_S)[:, None]
-    late = told(robot, {"steering_delay_s": 0.1}, wheel_speed, swing)
-    moved = told(robot, {}, wheel_speed, np.vstack([np.repeat(swing[:1], 5, axis=0), swing[:-5]]))
+    late = replayed(robot, {"steering_delay_s": 0.1}, wheel_speed, swing)
+    moved = replayed(robot, {}, wheel_speed, np.vstack([np.repeat(swing[:1], 5, axis=0), swing[:-5]]))
     np.testing.assert_allclose(late[SPEED_Y], moved[SPEED_Y], atol=1e-12)
-    narrow = told(robot, {"steering_backlash_rad": 0.2}, wheel_speed, swing)  # wider than the swing
+    narrow = replayed(robot, {"steering_backlash_rad": 0.2}, wheel_speed, swing)  # wider than the swing
     np.testing.assert_allclose(narrow[SPEED_Y], right[SPEED_Y], atol=1e-9)
-    with_play = told(robot, {"steering_backlash_rad": 0.02}, wheel_speed, swing)[SPEED_Y]
-    assert 0.7 < np.ptp(with_play[N // 2 :]) / np.ptp(told(robot, {}, wheel_speed, swing)[SPEED_Y]) < 0.9
+    with_backlash = replayed(robot, {"steering_backlash_rad": 0.02}, wheel_speed, swing)[SPEED_Y]
+    assert (
+        0.7 < np.ptp(with_backlash[N // 2 :]) / np.ptp(replayed(robot, {}, wheel_speed, swing)[SPEED_Y]) < 0.9
+    )
 
 
-def test_effects_of_sensors_do_what_their_formulas_say():
+def test_sensor_effects_match_their_formulas():
     wheel_speed = skid(HUSKY, 0.5 + 0.2 * np.sin(1.5 * TIME_S), 0.4 * np.sin(1.1 * TIME_S))
     robot = still(HUSKY)
-    plain = told(robot, {}, wheel_speed)
+    plain = replayed(robot, {}, wheel_speed)
 
     def change(**values):
-        return told(robot, values, wheel_speed)
+        return replayed(robot, values, wheel_speed)
 
     w, v = plain[GYRO], plain[SPEED_X]
     np.testing.assert_allclose(change(gyro_bias_radps=0.02)[GYRO], w + 0.02)
@@ -324,7 +326,7 @@ def test_effects_of_sensors_do_what_their_formulas_say():
     for k in range(1, N):  # T y' + y = x by the trapezoidal rule
         push = 0.5 * DT * (wheel_speed[k - 1] + wheel_speed[k] - lagged[k - 1])
         lagged[k] = (lag_s * lagged[k - 1] + push) / (lag_s + 0.5 * DT)
-    undone = told(robot, {"encoder_lag_s": lag_s}, lagged)
+    undone = replayed(robot, {"encoder_lag_s": lag_s}, lagged)
     np.testing.assert_allclose(undone[SPEED_X][60:-1], v[60:-1], atol=1e-3)
 
 
@@ -342,26 +344,28 @@ def test_forces_and_currents_balance(robot):
     friction_n = len(robot.wheels) * robot.motors.friction_nm / robot.wheel_radius_m * direction(speed)
 
     def steady(**values):
-        """Return pull, both speeds over the rim's, and the accelerometer, of a robot that climbs steadily."""
-        shown = told(still(robot), values, at_rate([speed] * len(robot.wheels)), grade=grade, ground=ground)
+        """Return pull, both speeds over the wheel speed, and the accelerometer, of a steady climb."""
+        shown = replayed(
+            still(robot), values, at_rate([speed] * len(robot.wheels)), grade=grade, ground=ground
+        )
         pull_n = shown[CURRENT][-1] * planar.nm_per_a / planar.radius_m - friction_n
         return pull_n, shown[SPEED_X][-1] / speed, shown[ACCEL][-1]
 
     pull, share, accel = steady()
-    way = direction(share * speed)
-    assert pull == pytest.approx(weight * (math.sin(grade) + 0.06 * way))
+    sign = direction(share * speed)
+    assert pull == pytest.approx(weight * (math.sin(grade) + 0.06 * sign))
     assert share == pytest.approx(1 - 0.3 * pull / weight)
     assert accel == pytest.approx(GRAVITY_MPS2 * math.sin(grade))
-    near = {"rel": 1e-4}  # the direction at the standstill's scale feels a slower drive
+    near = {"rel": 1e-4}  # the direction at the standstill's scale applies to a slower drive
     assert steady(payload_ratio=0.2)[0] == pytest.approx(1.2 * pull, **near)
     assert steady(motor_constant_ratio=0.1)[0] == pytest.approx(1.1 * pull + 0.1 * friction_n)
     drift = 0.1 * TIME_S[-1] / 60
     assert steady(motor_drift_ratio=0.1)[0] == pytest.approx(pull + drift * (pull + friction_n))
-    assert steady(rolling_resistance_ratio=0.02)[0] == pytest.approx(pull + 0.02 * way * weight, **near)
+    assert steady(rolling_resistance_ratio=0.02)[0] == pytest.approx(pull + 0.02 * sign * weight, **near)
     more, slower, _ = steady(viscous_drag_nspm=50.0)
     assert more == pytest.approx(pull + 50.0 * slower * speed, **near)
     more, slower, _ = steady(slip_resistance_ratio=0.5)
-    assert more == pytest.approx(pull + 0.5 * weight * (1 - slower) * way, **near)
+    assert more == pytest.approx(pull + 0.5 * weight * (1 - slower) * sign, **near)
     assert steady(force_slip_ratio=0.2)[1] == pytest.approx(1 - 0.5 * pull / weight, **near)
     bent = 0.2 * shear_slip(pull / weight, ground.grip_ratio)
     assert steady(shear_slip_ratio=0.2)[1] == pytest.approx(1 - 0.3 * pull / weight - bent, **near)
@@ -372,23 +376,23 @@ def test_turning_takes_current_of_the_difference_of_the_sides():
     planar = make_planar(HUSKY, ground)
     n_per_a = planar.nm_per_a / planar.radius_m
     weight = HUSKY.mass_kg * GRAVITY_MPS2
-    for way in (1.0, -1.0):
-        spot = told(HUSKY, {"scrub_ratio": 0.1}, at_rate([-0.3 * way, 0.3 * way]), ground=ground)
-        assert spot[TURNING_CURRENT][-1] * n_per_a == pytest.approx(0.3 * weight * direction(0.6 * way))
+    for sign in (1.0, -1.0):
+        spot = replayed(HUSKY, {"scrub_ratio": 0.1}, at_rate([-0.3 * sign, 0.3 * sign]), ground=ground)
+        assert spot[TURNING_CURRENT][-1] * n_per_a == pytest.approx(0.3 * weight * direction(0.6 * sign))
         assert spot[CURRENT][-1] == pytest.approx(0.0, abs=1e-9)
     spin = 0.4 / TIME_S[-1]
-    speeding = told(HUSKY, {}, skid(HUSKY, np.full(N, 0.6), spin * TIME_S))
+    speeding = replayed(HUSKY, {}, skid(HUSKY, np.full(N, 0.6), spin * TIME_S))
     moment = planar.yaw_inertia_kgm2 * spin
     assert speeding[TURNING_CURRENT][N // 2] * n_per_a == pytest.approx(2 * moment / HUSKY.track_m)
 
 
 @pytest.mark.parametrize("drive", ROBOTS)
-def test_nothing_moves_and_nothing_pulls_where_wheels_stand(drive):
+def test_standing_wheels_give_no_motion_and_no_current(drive):
     robot = ROBOTS[drive]
-    shown = told(robot, {}, at_rate([0.0] * len(robot.wheels)), ground=Ground())
+    shown = replayed(robot, {}, at_rate([0.0] * len(robot.wheels)), ground=Ground())
     for channel in CHANNELS:
         np.testing.assert_allclose(shown[channel], 0.0, atol=1e-12)
-    on_a_slope = told(robot, {}, at_rate([0.0] * len(robot.wheels)), grade=0.1, ground=Ground())
+    on_a_slope = replayed(robot, {}, at_rate([0.0] * len(robot.wheels)), grade=0.1, ground=Ground())
     np.testing.assert_allclose(on_a_slope[SPEED_X], 0.0, atol=1e-12)
     assert on_a_slope[CURRENT][-1] > 0.0  # motors hold it
 

@@ -101,7 +101,7 @@ EFFECTS = [
 
 @pytest.mark.parametrize("values", EFFECTS, ids=lambda values: "+".join(values) or "none")
 @pytest.mark.parametrize("robot", ROBOTS, ids=NAMES)
-def test_a_replay_with_the_same_effects_tells_what_the_log_tells(robot, values):
+def test_a_replay_with_the_same_effects_reproduces_the_log(robot, values):
     ground = Ground()
     run = simulate_planar(
         robot, drive(robot), 3, ground=ground, effects=values, hills=HILLS, heading=robot is not AGRIMARO
@@ -253,16 +253,21 @@ def density(values, rate_hz):
 
 def noisy_signals(robot, run):
     wheels, imu, channels = run.streams["wheels"], run.streams["imu"], logged(run, robot)
-    to_rim = robot.wheel_radius_m / robot.motors.reduction_ratio if robot.drive == "swerve" else 1.0
+    to_wheel_speed = robot.wheel_radius_m / robot.motors.reduction_ratio if robot.drive == "swerve" else 1.0
     names = [SPEED_X, SPEED_Y, CURRENT, HEADING, *([] if robot.drive == "swerve" else [TURNING_CURRENT])]
     signals = {name: (channels[500:, CHANNELS.index(name)], 50.0) for name in names}
-    told = {GYRO: "gyro_z_radps", ACCEL: "accel_x_mps2", "roll_rad": "roll_rad", "grade_rad": "pitch_rad"}
-    signals |= {name: (imu.channel(channel)[1000:], 100.0) for name, channel in told.items()}
-    return signals | {"wheel_speed_mps": (wheels.values[500:, 0] * to_rim, 50.0)}
+    channel_of = {
+        GYRO: "gyro_z_radps",
+        ACCEL: "accel_x_mps2",
+        "roll_rad": "roll_rad",
+        "grade_rad": "pitch_rad",
+    }
+    signals |= {name: (imu.channel(channel)[1000:], 100.0) for name, channel in channel_of.items()}
+    return signals | {"wheel_speed_mps": (wheels.values[500:, 0] * to_wheel_speed, 50.0)}
 
 
 @pytest.mark.parametrize("robot", ROBOTS, ids=NAMES)
-def test_noise_of_every_channel_has_the_density_that_is_said(robot):
+def test_noise_of_every_channel_has_the_stated_density(robot):
     speed, ground = 0.6, Ground()
     # coarse steps of an encoder beat with its samples at a steady speed, and are no noise
     fine = replace(robot.sensors, hall_steps_ratio=20 * robot.sensors.hall_steps_ratio)
@@ -279,7 +284,7 @@ def test_noise_of_every_channel_has_the_density_that_is_said(robot):
             assert measured[band].sum() == pytest.approx(expected[band].sum(), rel=0.15), (name, low)
 
 
-def test_encoders_lag_as_described_and_stand_still_in_silence():
+def test_encoders_lag_as_described_and_read_zero_at_rest():
     lag_s = AGRIMARO.sensors.encoder_time_constant_s
     twist = drive(AGRIMARO)
     slow, at_once = (
@@ -292,7 +297,7 @@ def test_encoders_lag_as_described_and_stand_still_in_silence():
 
 
 @pytest.mark.parametrize("robot", ROBOTS, ids=NAMES)
-def test_eccentric_wheels_ripple_with_their_turns_and_encoders_do_not_see_it(robot):
+def test_eccentric_wheels_ripple_once_a_turn_unseen_by_the_encoders(robot):
     run, plain = (
         simulate_planar(robot, steady(0.5, 60.0), 1, outside=outside)
         for outside in ({"wheel_eccentricity_ratio": 0.05}, {})
@@ -348,7 +353,7 @@ def test_on_a_soil_the_robot_slips_as_the_soil_has_it():
         (HUSKY, {"step_s": 0.0}, "step_s is 0,"),
     ],
 )
-def test_what_cannot_be_is_refused_in_one_sentence(robot, options, message):
+def test_impossible_inputs_are_refused_in_one_sentence(robot, options, message):
     with pytest.raises(ConfigError, match=message) as error:
         simulate_planar(robot, **{"twist": np.zeros((5, 3)), "seed": 0} | options)
     assert "\n" not in str(error.value)

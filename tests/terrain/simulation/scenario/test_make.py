@@ -29,7 +29,7 @@ def resting(scenario):
 
 @pytest.mark.parametrize("speed_mps", [0.3, 1.0, 2.0])
 @pytest.mark.parametrize("name", SCENARIOS)
-def test_every_scenario_can_be_driven_by_the_robot_and_is_at_rest_where_it_says(name, speed_mps):
+def test_every_scenario_is_feasible_and_rests_where_stated(name, speed_mps):
     for seed in range(5 if name in DRAWN else 1):
         drive = make(name, speed_mps=speed_mps, seed=seed)
         assert drive.time_s[0] == 0
@@ -63,7 +63,7 @@ def test_a_robot_without_steering_drives_all_but_what_takes_it_sideways(name):
 
 
 @pytest.mark.parametrize("name", SCENARIOS)
-def test_wheels_follow_but_for_the_moment_in_which_they_are_steered(name):
+def test_wheels_follow_their_commands_except_during_steering(name):
     drive = make(name, seed=2)
     geometry = ROBOT.wheel_positions_m, ROBOT.wheel_radius_m
     admitted, wheel, steer = wheel_commands(
@@ -138,12 +138,12 @@ def test_starts_are_repeated():
     assert (np.diff(np.flatnonzero(np.diff(resting(drive).astype(int)) > 0)) >= 5 * drive.rate_hz).all()
 
 
-def test_spot_turns_go_round_both_ways_and_nowhere_else():
+def test_spot_turns_rotate_in_both_directions_without_translation():
     drive = make("spot_turn")
     assert (drive.twist[:, :2] == 0).all()
     yaw = drive.twist[:, 2]
     assert (yaw.max(), yaw.min(), yaw.sum()) == pytest.approx((0.6, -0.6, 0.0), abs=1e-9)
-    assert len(np.flatnonzero(np.diff(np.sign(yaw)))) == 12  # three turns each way
+    assert len(np.flatnonzero(np.diff(np.sign(yaw)))) == 12  # three turns in each direction
     assert drive.distance_m[-1] == 0
 
 
@@ -166,7 +166,7 @@ def test_complex_holds_every_kind_of_motion():
 
 
 @pytest.mark.parametrize("speed_mps", [0.3, 0.5, 1.0])
-def test_brake_holds_its_speed_and_is_told_to_stand_at_once(speed_mps):
+def test_brake_holds_its_speed_and_then_commands_zero_at_once(speed_mps):
     drive = make("brake", speed_mps=speed_mps)
     x = drive.twist[:, 0]
     assert (drive.twist[:, 1:] == 0).all()
@@ -187,15 +187,15 @@ def test_a_circle_comes_round_to_where_it_began(speed_mps, driven_mps):
     assert np.abs(place[yaw > 2 * math.pi]).min() < 0.02
 
 
-def test_crab_goes_every_way_without_turning_and_starts_backward():
+def test_crab_drives_in_every_direction_without_turning_and_starts_backward():
     drive = make("crab")
     x, y, yaw = drive.twist.T
     assert (yaw == 0).all()
     assert x[~resting(drive)][0] < 0
     held = (np.diff(drive.twist, axis=0, append=0) == 0).all(axis=1) & ~resting(drive)
-    way = np.round(np.degrees(np.arctan2(y, x)[held])) % 360
+    heading_deg = np.round(np.degrees(np.arctan2(y, x)[held])) % 360
     for degrees in range(0, 360, 45):
-        assert (way == degrees).sum() >= 1.5 * drive.rate_hz
+        assert (heading_deg == degrees).sum() >= 1.5 * drive.rate_hz
 
 
 @pytest.mark.parametrize("name", ["straight", "climb", "starts"])
@@ -270,7 +270,7 @@ def test_a_course_is_driven_over_every_terrain_in_a_drawn_order():
         assert lengths_m.min() >= PATCH_M[0]
         assert lengths_m.max() <= PATCH_M[1] + 0.02
         crossing = np.searchsorted(drive.distance_m, starts_m[1:])
-        assert (drive.twist[crossing, 0] > 0).all()  # changes are under way
+        assert (drive.twist[crossing, 0] > 0).all()  # terrain changes while it drives
         speeds = drive.twist[drive.time_s > 4.0, 0]
         assert speeds.min() >= 0.4
         assert speeds.max() <= 1.2
@@ -326,7 +326,7 @@ def test_other_scenarios_are_driven_on_one_terrain(name):
         ({"robot": HUSKY.without("motors")}, "no section 'motors'"),
     ],
 )
-def test_what_cannot_be_driven_is_refused_in_one_sentence(options, message):
+def test_infeasible_drives_are_refused_in_one_sentence(options, message):
     given = {"name": "survey", "robot": ROBOT, "terrains": "grass"} | options
     with pytest.raises(ConfigError, match=message) as error:
         make_scenario(**given)
@@ -343,7 +343,7 @@ def test_too_short_a_time_is_refused_and_the_message_says_what_is_long_enough(na
         make(name, duration_s=enough_s - 0.12)
 
 
-def test_a_scenario_of_ones_own_is_checked():
+def test_a_custom_scenario_is_validated():
     time_s = np.arange(3) / 50
     assert not Scenario("mine", 50.0, time_s, np.zeros((3, 3)), ((0.0, "ice"),)).twist.flags.writeable
     with pytest.raises(ValueError, match=r"twist has shape \(3, 2\)"):

@@ -58,30 +58,30 @@ def motion_of(duration_s, **columns):
     return Motion(record)
 
 
-def heard(sensor):
+def stream_of(sensor):
     sensor.update()
     return sensor.stream()
 
 
 def wheels_stream(*given):
-    return heard(WheelSensor(*given))
+    return stream_of(WheelSensor(*given))
 
 
 def steering_stream(*given):
-    return heard(SteeringSensor(*given))
+    return stream_of(SteeringSensor(*given))
 
 
 def imu_stream(*given):
     sensor = ImuSensor(*given)
-    return heard(sensor), sensor.yaw_bias_radps
+    return stream_of(sensor), sensor.yaw_bias_radps
 
 
 def camera_stream(*given):
-    return heard(CameraSensor(*given))
+    return stream_of(CameraSensor(*given))
 
 
 def gnss_stream(*given):
-    return heard(GnssSensor(*given))
+    return stream_of(GnssSensor(*given))
 
 
 def clock(duration_s):
@@ -130,7 +130,7 @@ def test_every_logger_keeps_its_own_rate_and_begins_at_0():
         np.testing.assert_allclose(stream.time_s, np.arange(n) / rate_hz, rtol=0, atol=1e-12)
 
 
-def wild_motion(n=700):
+def random_motion(n=700):
     """A motion in which nothing stands still."""
     draw = rng(11)
     record = 0.05 * draw.standard_normal((n, N_RECORD)).cumsum(axis=0)
@@ -146,7 +146,7 @@ def test_a_motion_in_blocks_gives_the_bytes_of_the_motion_in_one(cuts):
         ),
     )
     faults = Faults(camera_lost_s=((0.1, 0.2),), gnss_lost_s=((0.3, 0.4),))
-    whole, parts = Motion(wild_motion()), Motion(wild_motion(), 0)
+    whole, parts = Motion(random_motion()), Motion(random_motion(), 0)
     for robot in (ROBOT, odd):
         pairs = [
             [
@@ -164,17 +164,17 @@ def test_a_motion_in_blocks_gives_the_bytes_of_the_motion_in_one(cuts):
             for sensor in pairs[1]:
                 sensor.update()
         for one, other in zip(*pairs, strict=True):
-            batch, blocks = heard(one), other.stream()
+            batch, blocks = stream_of(one), other.stream()
             assert len(batch) > 20
             assert np.isfinite(batch.values).all()
             assert batch.time_s.tobytes() == blocks.time_s.tobytes()
             assert batch.values.tobytes() == blocks.values.tobytes(), type(one).__name__
 
 
-def test_no_sample_tells_of_what_comes_after_it_and_each_arrives_once():
-    record, later = wild_motion(), wild_motion()
+def test_no_sample_depends_on_later_motion_and_each_arrives_once():
+    record, later = random_motion(), random_motion()
     later[301:] += 1.0
-    told = []
+    arrived = []
     for rows in (record, later):
         motion = Motion(rows, 0)
         robot = with_changes("sensors", imu_latency_s=0.0)
@@ -187,12 +187,12 @@ def test_no_sample_tells_of_what_comes_after_it_and_each_arrives_once():
         motion.grow(301)
         for sensor in sensors:
             sensor.update()
-        told.append([sensor.arrived(0.3) for sensor in sensors])
+        arrived.append([sensor.arrived(0.3) for sensor in sensors])
         assert all(sensor.arrived(0.3) is None for sensor in sensors)
-        assert [reading.time_s[-1] for reading in told[-1]] == [0.3, 0.3, 0.3, 0.3]
-        assert [len(reading.time_s) for reading in told[-1]] == [16, 16, 31, 61]
-        assert not any(array.flags.writeable for reading in told[-1] for array in reading)
-    for one, other in zip(*told, strict=True):
+        assert [reading.time_s[-1] for reading in arrived[-1]] == [0.3, 0.3, 0.3, 0.3]
+        assert [len(reading.time_s) for reading in arrived[-1]] == [16, 16, 31, 61]
+        assert not any(array.flags.writeable for reading in arrived[-1] for array in reading)
+    for one, other in zip(*arrived, strict=True):
         assert one.values.tobytes() == other.values.tobytes()
 
 
@@ -241,16 +241,16 @@ def test_biases_stay_for_a_run_and_differ_between_runs():
         accel_bias_y_mps2=-0.3,
         accel_scale_z_ratio=1.02,
     )
-    motion, gyro, accel, tilt, told = motion_of(2.0), [], [], [], []
+    motion, gyro, accel, tilt, biases = motion_of(2.0), [], [], [], []
     for seed in range(150):
         imu, bias = imu_stream(motion, calibrated, rng(seed))
         assert np.ptp(bias) == 0.0
-        told.append(bias[0])
+        biases.append(bias[0])
         gyro.append(columns_of(imu, "gyro_{}_radps", "xyz").mean(axis=0))
         accel.append(columns_of(imu, "accel_{}_mps2", "xyz").mean(axis=0))
         tilt.append(columns_of(imu, "{}_rad", ["roll", "pitch"]).mean(axis=0))
     within = 1 / math.sqrt(200)
-    assert np.abs(np.array(gyro)[:, 2] - told).max() < 4.5 * sensors.gyro_std_radps * within
+    assert np.abs(np.array(gyro)[:, 2] - biases).max() < 4.5 * sensors.gyro_std_radps * within
     assert_std(
         gyro, math.hypot(sensors.gyro_bias_std_radps, sensors.gyro_std_radps * within), [0.0, 0.0, 0.01]
     )
@@ -333,11 +333,11 @@ def test_steering_is_seen_in_whole_steps_with_its_zero_and_wrapped():
 def test_the_third_encoder_does_not_see_its_leg_swing():
     leg = np.linspace(-0.03, 0.03, 1000)
     swung = np.column_stack([np.full(1000, 0.2), np.full(1000, -0.1), 0.3 + leg])
-    told = [
+    readings = [
         steering_stream(motion_of(1.0, steer_rad=steer, leg_rad=swing), ROBOT, rng(1)).values
         for steer, swing in ((swung, leg), (np.array([[0.2, -0.1, 0.3]]), 0.0))
     ]
-    np.testing.assert_allclose(told[0], told[1], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(readings[0], readings[1], rtol=0, atol=1e-12)
 
 
 def test_current_times_its_constants_is_the_torque():
@@ -368,7 +368,7 @@ def test_at_rest_on_a_slope_the_imu_reads_gravity(grade_x, grade_y):
     assert np.sign([-pitch, roll]).tolist() == np.sign([grade_x, grade_y]).tolist()
 
 
-def test_turning_on_an_even_slope_rolls_nothing_and_a_swell_pitches():
+def test_the_gyro_follows_the_tilt_on_an_even_slope_and_on_undulation():
     time_s = clock(10.0)
     yaw = 0.5 * time_s
     turning = motion_of(
@@ -384,9 +384,9 @@ def test_turning_on_an_even_slope_rolls_nothing_and_a_swell_pitches():
     imu, _ = imu_stream(undulation, SILENT_IMU, rng())
     for axis, angle in (("x", "roll"), ("y", "pitch")):
         turned = np.cumsum(imu.channel(f"gyro_{axis}_radps")) / 100
-        told = imu.channel(f"{angle}_rad")
-        assert np.abs(turned - (told - told[0])).max() < 8 * TILT_NOISE_RAD
-        assert np.ptp(told) > 0.05
+        tilt = imu.channel(f"{angle}_rad")
+        assert np.abs(turned - (tilt - tilt[0])).max() < 8 * TILT_NOISE_RAD
+        assert np.ptp(tilt) > 0.05
 
 
 def test_the_ride_shakes_the_imu_where_it_sits():
@@ -415,39 +415,39 @@ def circle(duration_s, radius_m=2.0, speed_mps=0.8, lateral_mps=0.1):
     )
 
 
-def test_what_the_camera_tells_in_its_own_frames_is_the_motion():
+def test_body_motion_from_camera_poses_is_the_true_motion():
     motion = circle(12.0)
     robot = SILENT_CAMERA.with_parts(camera=dataclasses.replace(SILENT_CAMERA.camera, time_constant_s=0.0))
     camera = robot.camera
     back = body_motion(camera_stream(motion, robot, rng(), QUIET), camera)
-    told = np.maximum(np.round((back.time_s - camera.latency_s) / STEP_S).astype(int), 0)
+    rows = np.maximum(np.round((back.time_s - camera.latency_s) / STEP_S).astype(int), 0)
     np.testing.assert_allclose(back.yaw_rate_radps, 0.4, atol=1e-9)
     # at the camera: v + w x r
     at_camera = [0.8 - 0.4 * camera.lever_y_m, 0.1 + 0.4 * camera.lever_x_m]
-    np.testing.assert_allclose(back.speed_mps, [at_camera] * len(told), atol=1e-9)
-    np.testing.assert_allclose(back.yaw_rad, motion.body("yaw_rad")[told], atol=1e-9)
-    position = np.column_stack([motion.body("position_x_m"), motion.body("position_y_m")])[told]
+    np.testing.assert_allclose(back.speed_mps, [at_camera] * len(rows), atol=1e-9)
+    np.testing.assert_allclose(back.yaw_rad, motion.body("yaw_rad")[rows], atol=1e-9)
+    position = np.column_stack([motion.body("position_x_m"), motion.body("position_y_m")])[rows]
     np.testing.assert_allclose(back.position_m, position, atol=1e-9)
 
 
-def test_the_camera_tells_what_its_stream_without_noise_says():
+def test_the_camera_without_noise_gives_the_ideal_odometry_stream():
     camera = dataclasses.replace(SILENT_CAMERA.camera, time_constant_s=0.0, lever_z_m=0.3)
-    motion = Motion(wild_motion())
-    told = camera_stream(motion, SILENT_CAMERA.with_parts(camera=camera), rng(), QUIET)
+    motion = Motion(random_motion())
+    found = camera_stream(motion, SILENT_CAMERA.with_parts(camera=camera), rng(), QUIET)
     _, rows = motion.at(camera.rate_hz, camera.latency_s)
     seen = odometry_stream(
-        told.time_s,
+        found.time_s,
         motion.record[rows, :2],
         np.column_stack([motion.tilt_rad[rows], motion.body("yaw_rad")[rows]]),
         np.column_stack([motion.record[rows, 3:5], motion.body("yaw_rate_radps")[rows]]),
         camera,
         yaw_0=motion.body("yaw_rad")[0],
     )
-    assert told.channels == seen.channels
-    np.testing.assert_allclose(told.values, seen.values, rtol=0, atol=1e-12)
+    assert found.channels == seen.channels
+    np.testing.assert_allclose(found.values, seen.values, rtol=0, atol=1e-12)
 
 
-def test_the_camera_tells_the_slope_it_is_on():
+def test_the_camera_measures_the_slope():
     motion = motion_of(1.0, speed_x_mps=1.0, grade_x_ratio=0.1, grade_y_ratio=-0.05)
     back = body_motion(camera_stream(motion, SILENT_CAMERA, rng(), QUIET), ROBOT.camera)
     turned = Rotation.from_euler("ZYX", [0.0, back.pitch_rad[-1], back.roll_rad[-1]]).as_matrix()
@@ -499,7 +499,7 @@ def test_dropouts_and_jumps_come_by_chance_at_their_rates():
     assert len(camera_stream(motion, robot, rng(1), QUIET)) == 10_000
 
 
-def test_gnss_tells_where_the_robot_was_and_how_well_it_knows():
+def test_gnss_reports_delayed_positions_with_their_accuracy():
     motion = circle(60.0)
     receiver = Gnss(fix_length_s=3.0, float_length_s=1.0)
     seen = [gnss_stream(motion, receiver, rng(seed), QUIET) for seed in range(10)]
