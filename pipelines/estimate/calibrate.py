@@ -1,4 +1,4 @@
-"""``terrain calibrate``: what run logs tell of a robot's description, written as a new description."""
+"""``terrain calibrate``: numbers of a robot's description from run logs, written as a new description."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ def hard_grounds() -> tuple[str, ...]:
 
 
 def find(runs: Sequence[RunLog], described: Any, robot: Robot, hard: Sequence[str]) -> list[Finding]:
-    """Return what runs tell of each number that logs can tell of, and why they do not of the others."""
+    """Return a finding for each number that logs can determine, with the reason where these do not."""
     resting = [stretch for run in runs for stretch in standing(run, robot)]
     held = [stretch for run in runs for stretch in standing(run, robot, MIN_POSITION_S)]
     findings = [*gyro_bias(resting, robot), *accelerometer(held, robot), *sensor_noise(resting, robot)]
@@ -130,7 +130,7 @@ def find(runs: Sequence[RunLog], described: Any, robot: Robot, hard: Sequence[st
     findings += (
         driven if steady else [finding._replace(note=why_none(runs, robot, hard)) for finding in driven]
     )
-    # Starts are told from turns by where the wheels point: with the zeros that have just been found.
+    # Starts are distinguished from turns by the steering angles, with the zeros that have just been found.
     better = robot_from(robot.name, described_with(described, findings))
     events = [event for run in runs for event in starts_and_stops(run, better, hard)]
     lags = time_constants(events)

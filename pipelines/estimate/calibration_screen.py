@@ -14,12 +14,12 @@ def print_calibration(result: CalibrationResult, console: Console) -> None:
     """Print a calibration: what was found, then what was not and why."""
     from rich.table import Table
 
-    told = [finding for finding in result.findings if finding.value is not None]
-    table = Table(title=f"{result.robot}: {len(told)} numbers from {len(result.run_ids)} runs")
+    found = [finding for finding in result.findings if finding.value is not None]
+    table = Table(title=f"{result.robot}: {len(found)} numbers from {len(result.run_ids)} runs")
     for heading, right in (("number", False), ("was", True), ("is", True), ("95 % from", True), ("to", True)):
         table.add_column(heading, justify="right" if right else "left")
     table.add_column("of")
-    for finding in told:
+    for finding in found:
         figures = (finding.described, finding.value, finding.low, finding.high)
         runs = len(finding.runs)
         table.add_row(
@@ -28,7 +28,7 @@ def print_calibration(result: CalibrationResult, console: Console) -> None:
             f"{finding.n} {finding.counted}, {runs} run{'s' * (runs > 1)}",
         )
     console.print(table)
-    for title, chosen in (("not told", False), ("assumed", True)):
+    for title, chosen in (("not determined", False), ("assumed", True)):
         notes: dict[str, list[str]] = {}
         for finding in result.findings:
             if finding.note and (finding.value is not None) == chosen:

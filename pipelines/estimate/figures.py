@@ -67,7 +67,7 @@ def motion_figure(estimate: Estimate) -> Figure:
 def _swerve_motion(estimate: Estimate) -> Figure:
     track, table = estimate.track, estimate.table
     seen = estimate.name in ("vio12", "vio15")
-    twist, told = _encoder_twist(estimate), estimate.innovations
+    twist, innovations = _encoder_twist(estimate), estimate.innovations
     with styled():
         figure = new_figure(11.0, 7.6)
         panels = figure.subplots(3, 2, sharex=True, width_ratios=[3, 2])
@@ -86,7 +86,7 @@ def _swerve_motion(estimate: Estimate) -> Figure:
                 _line(left, track.time_s, true, INK, "truth, behind the same low-pass", lw=0.8, ls="--")
             left.set_ylabel(label)
             left.grid()
-            _innovation(right, estimate, told, row if seen else "gyro_z_radps")
+            _innovation(right, estimate, innovations, row if seen else "gyro_z_radps")
         panels[0, 0].legend(ncols=3, fontsize=7.5, frameon=False, loc="lower left", bbox_to_anchor=(0, 1))
         for axes in panels[-1]:
             axes.set_xlabel("time [s]")
@@ -118,9 +118,9 @@ def _skid_motion(estimate: Estimate) -> Figure:
         return finished(figure, f"{shorten(estimate.run.run_id, 40)}: motion without a speed reference")
 
 
-def _innovation(axes: Axes, estimate: Estimate, told: Innovations, row: str) -> None:
+def _innovation(axes: Axes, estimate: Estimate, innovations: Innovations, row: str) -> None:
     track = estimate.track
-    value, std = told.row(row)
+    value, std = innovations.row(row)
     sensor = next(k for k, (_, rows) in enumerate(estimate.model.sensors) if row in rows)
     gated = track.use[:, sensor] == GATED
     axes.fill_between(track.time_s, -2 * std, 2 * std, color=GRID, lw=0, label="± 2 std expected")
@@ -153,7 +153,7 @@ def slip_figure(estimate: Estimate) -> Figure:
                 estimate.table.time_s,
                 wheel_speed[:, i] * estimate.robot.wheel_radius_m,
                 CLASS_COLOURS[i],
-                f"rim of wheel {wheel}",
+                f"circumference, wheel {wheel}",
                 lw=0.7,
             )
         above.set_ylabel("speed [m/s]")

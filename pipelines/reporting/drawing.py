@@ -1,4 +1,4 @@
-"""How pictures are drawn: one style, one way to lay out, the same bytes for the same figure.
+"""How pictures are drawn: one style, one layout, the same bytes for the same figure.
 
 Figures are made with the object-oriented interface and an own style, so that nothing global is changed and
 a user's matplotlib settings do not show.
@@ -28,7 +28,7 @@ VERMILION = "#d55e00"
 BARE = {"facecolor": "white", "edgecolor": "none", "pad": 0.7}
 """Behind a text that would else be crossed by lines of the grid."""
 CLASS_COLOURS = (BLUE, "#e69f00", "#009e73", "#cc79a7", "#56b4e9", VERMILION, "#8c8c8c")
-"""Okabe and Ito (2008), without black and yellow, and grey: told apart by colour-blind readers, too."""
+"""Okabe and Ito (2008), without black and yellow, and grey: distinguishable for colour-blind readers, too."""
 _, ORANGE, GREEN, PINK, SKY, _, GREY = CLASS_COLOURS
 
 LAW_NAMES = {"janosi": "Janosi and Hanamoto", "magic": "Magic Formula"}

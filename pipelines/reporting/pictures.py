@@ -19,7 +19,7 @@ class Image(NamedTuple):
     Parameters
     ----------
     source : data URI
-    alt : what is said of it where it cannot be seen
+    alt : text in its place where it cannot be seen
     caption : below it, or empty
     """
 

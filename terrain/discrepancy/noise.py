@@ -45,7 +45,7 @@ class Noise(NamedTuple):
     std: Array
 
     def size(self, speed_mps: Array) -> Array:
-        """Return ``s`` (m, channels) at speeds (m,) of the wheels, either way."""
+        """Return ``s`` (m, channels) at speeds (m,) of the wheels, forward or backward."""
         return np.asarray(np.sqrt(_powers(speed_mps) @ self.growth.T))
 
 

@@ -90,7 +90,7 @@ SLIP_AND_RESISTANCE: tuple[Effect, ...] = (
         "Wong, Theory of Ground Vehicles",
         BOTH,
         (CURRENT, SPEED_X),
-        "several speeds, both ways",
+        "several speeds, forward and backward",
         plant=PlantPart.CONTACT,
     ),
     Effect(

@@ -34,7 +34,7 @@ class Body:
 
 @dataclass(frozen=True, slots=True)
 class Motors:
-    """Motors behind a reduction, and the speed loop of their drivers; torques and gains at the wheel."""
+    """Motors behind a reduction, and the speed loop of the motor drivers; torques and gains at the wheel."""
 
     reduction_ratio: float
     torque_constant_nmpa: float

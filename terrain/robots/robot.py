@@ -122,7 +122,7 @@ class Robot(ABC):
 
     @property
     def motors(self) -> Motors:
-        """Motors and the speed loop of their drivers."""
+        """Motors and the speed loop of their motor drivers."""
         return self._part(Motors)
 
     @property

@@ -181,15 +181,13 @@ def test_training_is_evaluated_by_the_grouped_protocol_only():
 def test_a_tracking_folder_that_cannot_be_written_is_reported_before_any_work(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
-    (tmp_path / "mlruns").write_text("in the way")
+    (tmp_path / "mlruns").write_text("an obstacle")
     with pytest.raises(TerrainError, match="mlruns: cannot be written"):
         train([], TrainSettings(name="m"), "none")
-    assert (tmp_path / "mlruns").read_text() == "in the way"
+    assert (tmp_path / "mlruns").read_text() == "an obstacle"
 
 
-def test_quickstart_goes_all_the_way_to_a_report_in_one_file(
-    in_tracked, drive_all, settings, tmp_path, monkeypatch
-):
+def test_quickstart_ends_in_a_report_in_one_file(in_tracked, drive_all, settings, tmp_path, monkeypatch):
     from pipelines.quickstart.quickstart import quickstart
 
     monkeypatch.setattr("pipelines.classify.extras.CURVE_RUNS", (1,))

@@ -172,8 +172,8 @@ def test_a_model_that_cannot_be_trusted_is_one_sentence(refused, place, drive, t
 
 def test_an_output_that_cannot_be_written_is_reported_before_the_work(refused, place, drive_all, monkeypatch):
     data = keep(drive_all(n_runs=2, duration_s=4.0), place)
-    (place / "file").write_text("in the way")
-    (place / "mlruns").write_text("in the way")
+    (place / "file").write_text("an obstacle")
+    (place / "mlruns").write_text("an obstacle")
     monkeypatch.setattr("pipelines.classify.crossval.fit_folds", lambda *_: pytest.fail("the work was begun"))
     cannot = "cannot be written"
     refused(cannot, "import", data, "--out", place / "file" / "out")

@@ -72,9 +72,9 @@ def data(tmp_path):
 
 def test_the_hidden_truth_lies_in_the_intervals(calibrated):
     _, _, result = calibrated
-    told = [finding for finding in result.findings if finding.value is not None]
+    found = [finding for finding in result.findings if finding.value is not None]
     inside = []
-    for finding in told:
+    for finding in found:
         section, _, name = finding.parameter.partition(".")
         if name:
             true = getattr(getattr(HIDDEN, section), name)
@@ -94,14 +94,14 @@ def test_the_file_is_a_description_that_people_can_read(calibrated):
     described, before = yaml.safe_load(text), yaml.safe_load(_source_of_agrimaro())
     assert robot.name == "agrimaro"
     assert text.startswith("# Calibrated from 8 runs;")
-    told = {finding.parameter: finding for finding in result.findings if finding.value is not None}
+    found = {finding.parameter: finding for finding in result.findings if finding.value is not None}
     for section, entries in described.items():
         if not isinstance(entries, dict) or "value" in entries:
             assert entries == before[section]
             continue
         for name, entry in entries.items():
             assert f"  {name}: {{value: " in text  # one line a number
-            finding = told.get(f"{section}.{name}")
+            finding = found.get(f"{section}.{name}")
             if finding is None:
                 assert entry == before[section][name]
                 continue
@@ -154,7 +154,7 @@ def test_what_is_printed(calibrated):
     print_calibration(result, Console(file=screen, width=200))
     text = screen.getvalue()
     assert "agrimaro: 25 numbers from 8 runs" in text
-    assert "not told: sensors.motor_std_radps: no noise at rest" in text
+    assert "not determined: sensors.motor_std_radps: no noise at rest" in text
     assert "only ratio over radius is to be seen" in text
     assert text.rstrip().endswith(f"written to {out}")
 

@@ -96,7 +96,7 @@ def test_process_noise_is_tuned_on_chosen_runs():
 
 
 @pytest.mark.parametrize("training_run", [0, 1])
-def test_what_was_tuned_with_a_receiver_serves_runs_without_one_and_the_other_way_round(training_run):
+def test_noise_tuned_with_a_receiver_serves_runs_without_one_and_the_reverse(training_run):
     runs = [drive(duration_s=8.0, number=1, gnss=Gnss()), drive(duration_s=8.0, number=2)]
     result = estimate(runs, tuned_on(runs[training_run].run_id))
     assert all(row.finite and row.slip_observable for row in result.runs)

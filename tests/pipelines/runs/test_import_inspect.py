@@ -49,7 +49,7 @@ def test_nothing_that_is_there_is_touched(borealtc_dir, tmp_path, make_run):
 
 
 def test_a_place_that_cannot_be_written_is_one_sentence(borealtc_dir, tmp_path):
-    (tmp_path / "file").write_text("in the way")
+    (tmp_path / "file").write_text("an obstacle")
     with pytest.raises(TerrainError, match="cannot be written") as error:
         import_logs(ImportSettings(data=borealtc_dir, out=tmp_path / "file" / "out"))
     assert "\n" not in str(error.value)

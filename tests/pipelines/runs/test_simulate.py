@@ -132,7 +132,7 @@ def test_load_slope_and_a_lost_camera_reach_a_skid_steered_run():
         ({"effect": ["wheel_radius=9"]}, "-0.3 to 0.3 is accepted"),
         ({"effect": ["wheel_radius=0.1", "encoder_scale=0.1"]}, "effect 'encoder_scale' is given twice"),
         ({"scenario": "slip", "effect": ["wheel_radius=0.1"]}, "without effects"),
-        ({"robot": "nobody"}, "robot 'nobody' is unknown"),
+        ({"robot": "ghost"}, "robot 'ghost' is unknown"),
         ({"terrain": "lava"}, "soil 'lava' is unknown"),
         ({"scenario": "dance"}, "scenario 'dance' is unknown"),
         ({"terrain": "course"}, "go together"),
