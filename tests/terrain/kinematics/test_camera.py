@@ -109,7 +109,7 @@ def test_a_yaw_of_30_degrees_is_one():
     np.testing.assert_allclose(printed, [0.0, -60.0, -90.0], atol=1e-6)  # what (5.6) gives as printed
 
 
-def test_signs_of_what_the_camera_says():
+def test_signs_of_camera_motion():
     nose_up = body_motion(pose_stream(*drive(1.0, 0.0, 0.0, pitch=-0.1), CAMERA, 0.0), CAMERA)
     np.testing.assert_allclose(nose_up.pitch_rad, -0.1)
     np.testing.assert_allclose(nose_up.speed_mps, np.broadcast_to([1.0, 0.0], (1001, 2)), atol=1e-12)
