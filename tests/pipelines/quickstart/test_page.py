@@ -12,10 +12,10 @@ from pipelines.classify.results import (
     Applicability,
     Predictions,
     TargetSlipRow,
-    TerrainSlip,
     Training,
     WindowPrediction,
 )
+from pipelines.estimate.labelled import TerrainSlip
 from pipelines.models.results import Registered
 from pipelines.quickstart.page import CAPTIONS, html_report
 from pipelines.quickstart.results import KeptRuns, QuickstartResult
