@@ -140,6 +140,7 @@ def estimate_clock(
 
     Examples
     --------
+    >>> from terrain.records import Stream
     >>> time_s = np.arange(0.0, 60.0, 0.02)
     >>> yaw_rate = 0.4 * np.sin(time_s + 0.02 * time_s**2)
     >>> gyro = Stream(time_s + 0.3, yaw_rate[:, None], ("gyro_z_radps",))

@@ -258,7 +258,7 @@ def test_motion_does_not_depend_on_the_mounting_of_the_camera():
 EDGES = {
     "terrain/estimation/estimate.py",
     "pipelines/estimate/estimate.py",
-    "pipelines/slip/learn_slip.py",
+    "terrain/slip_learning/learn.py",
     "pipelines/live/pilot.py",
 }
 """Where a run as measured meets the robot as described."""
