@@ -93,6 +93,12 @@ TOLERANCE = 1e-9
 TINY = 1e-12
 """Absolute: what should be 0 and is rounding."""
 
+LOOSE: dict[str, dict[str, float]] = {"estimate_swerve": {"/steps/05/json": 2e-3}}
+"""By case, the paths that are compared by a relative tolerance of their own.  In ``estimate_swerve`` step 5 is the
+tuning ``likelihood``: its search stops where the likelihood is flat, so that rounding of 1e-13 in the
+measurements
+moves the scale of the gyro's bias by 1e-3, and figures of the run by 1e-6."""
+
 _RANDOM_ID = re.compile(r"[0-9a-f]{32}|[0-9a-f]{40}|[0-9a-f]{64}")
 
 
@@ -115,6 +121,23 @@ def differences(expected: Any, actual: Any, path: str = "", key: str = "") -> li
         return _of_lists(expected, actual, path, key)
     same = _same_leaf(expected, actual, key)
     return [] if same else [f"{path or 'all'}: {_short(expected)} was expected, it is {_short(actual)}"]
+
+
+def settled(
+    expected: Any, actual: Any, loose: Mapping[str, float], path: str = "", tolerance: float = 0.0
+) -> Any:
+    """Return the actual result with numbers of loosely compared paths replaced where they are within tolerance."""
+    tolerance = next((width for place, width in loose.items() if path.startswith(place)), tolerance)
+    if isinstance(expected, Mapping) and isinstance(actual, Mapping):
+        return {
+            name: settled(expected.get(name), value, loose, f"{path}/{name}", tolerance)
+            for name, value in actual.items()
+        }
+    if isinstance(expected, list) and isinstance(actual, list) and len(expected) == len(actual):
+        pairs = enumerate(zip(expected, actual, strict=True))
+        return [settled(one, other, loose, f"{path}/{i:02d}", tolerance) for i, (one, other) in pairs]
+    numbers = isinstance(expected, float) and isinstance(actual, float)
+    return expected if numbers and math.isclose(expected, actual, rel_tol=tolerance) else actual
 
 
 def is_prose(text: str, key: str = "") -> bool:
