@@ -29,9 +29,8 @@ def as_json(value: Any) -> Any:
 
     Parameters
     ----------
-    value : a record (dataclass or named tuple), a mapping, a sequence, an array, an enum, a path, a number or
-    a
-        text; a record with a method ``as_json`` decides itself what it shows
+    value : a record (dataclass or named tuple), a mapping, a sequence, an array, an enum, a path, a number
+        or a text; a record with a method ``as_json`` decides itself what it shows
 
     Examples
     --------

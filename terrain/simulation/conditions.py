@@ -40,7 +40,7 @@ class Conditions:
     payload_kg, payload_m : load, and where it lies (x, y) from the empty robot's centre of mass, body axes
     grade_ratio : (2,) mean gradient of the ground along world x and y, uphill positive
     undulation_ratio, undulation_length_m : a gradient along world x that changes along the path; its wave
-    length
+        length
     radius_factors : (3,) true rolling radius of each wheel over the nominal one
     roughness_factor : roughness over that of the soil's description
     field_length_m : over which length the terrain changes along the path

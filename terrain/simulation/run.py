@@ -76,8 +76,7 @@ def simulate_run(  # noqa: PLR0913 - an entry whose options have defaults
     robot : swerve robot with all sections, or skid-steer robot with all but steering
     terrain : name of a soil or path of its YAML file, or ``course`` for all soils in one run
     scenario : name of a scenario; ``course`` goes with the terrain ``course``, ``six_positions`` (the IMU
-    alone,
-        for calibration) with ``bench``; ``slip`` sweeps the slip of the wheels under varied conditions
+        alone, for calibration) with ``bench``; ``slip`` sweeps the slip of the wheels under varied conditions
     seed, number : of what is drawn
     duration_s : length; the scenario's own by default
     vary : draw soil, slope, load, tyres and roughness for this run by ``data/soils`` and ``data/spread``

@@ -94,10 +94,10 @@ TINY = 1e-12
 """Absolute: what should be 0 and is rounding."""
 
 LOOSE: dict[str, dict[str, float]] = {"estimate_swerve": {"/steps/05/json": 2e-3}}
-"""By case, the paths that are compared by a relative tolerance of their own.  In ``estimate_swerve`` step 5 is the
-tuning ``likelihood``: its search stops where the likelihood is flat, so that rounding of 1e-13 in the
-measurements
-moves the scale of the gyro's bias by 1e-3, and figures of the run by 1e-6."""
+"""By case, the paths that are compared by a relative tolerance of their own.
+
+In ``estimate_swerve`` step 5 is the tuning ``likelihood``: its search stops where the likelihood is flat, so
+that rounding of 1e-13 in the measurements moves the scale of the gyro's bias by 1e-3, and figures by 1e-6."""
 
 _RANDOM_ID = re.compile(r"[0-9a-f]{32}|[0-9a-f]{40}|[0-9a-f]{64}")
 
@@ -126,7 +126,7 @@ def differences(expected: Any, actual: Any, path: str = "", key: str = "") -> li
 def settled(
     expected: Any, actual: Any, loose: Mapping[str, float], path: str = "", tolerance: float = 0.0
 ) -> Any:
-    """Return the actual result with numbers of loosely compared paths replaced where they are within tolerance."""
+    """Return the actual result, with numbers of loosely compared paths replaced where they are close."""
     tolerance = next((width for place, width in loose.items() if path.startswith(place)), tolerance)
     if isinstance(expected, Mapping) and isinstance(actual, Mapping):
         return {

@@ -91,7 +91,7 @@ def make_plant(robot: Robot, conditions: Conditions, profile: TerrainProfile) ->
     Parameters
     ----------
     robot : with sections body, motors, steering and sensors; of its effects those listed above act, and a
-    payload
+        payload
     conditions : load, slope, tyres and the backlash of the third leg
     profile : the terrain
 
