@@ -126,3 +126,25 @@ def test_the_mapping_in_readme_is_accepted(tmp_path):
     assert run.terrains == ("ICE",)
     assert run.streams["imu"].values[:, 0] == pytest.approx([-1.5708, -3.1416], abs=1e-4)
     assert run.streams["wheels"].values[0] == pytest.approx([1.0, 2.0])
+
+
+def test_links_between_pages_lead_somewhere():
+    pages = [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")]
+    links = [
+        (page, link)
+        for page in pages
+        for link in re.findall(r"\]\(([^)#:]+\.\w+)\)", page.read_text(encoding="utf-8"))
+    ]
+    assert len(links) > 8
+    assert [(page.name, link) for page, link in links if not (page.parent / link).exists()] == []
+
+
+def test_files_that_pages_name_are_there():
+    pages = [ROOT / "CONTRIBUTING.md", *(ROOT / "docs").glob("*.md")]
+    named = {
+        (page.name, path)
+        for page in pages
+        for path in re.findall(r"`((?:terrain|pipelines|features|tests|data)/[\w/.]+)`", page.read_text())
+    }
+    assert len(named) > 30
+    assert sorted(each for each in named if not (ROOT / each[1]).exists()) == []

@@ -64,6 +64,6 @@ def test_former_keys_are_written_beside_the_new_ones_at_any_depth(monkeypatch, t
     write_json(None, {"new": 1})
 
 
-def test_what_json_cannot_hold_is_a_fault_of_ours():
+def test_a_value_that_json_cannot_hold_is_an_error():
     with pytest.raises(TypeError):
         as_json(object())
