@@ -18,9 +18,9 @@ from pipelines.reporting.drawing import (
     finished,
     new_figure,
     png_bytes,
-    shorten,
     styled,
 )
+from pipelines.reporting.numbers import shorten
 from terrain.estimation.ekf.innovations import Innovations
 from terrain.estimation.estimate import Estimate
 from terrain.estimation.reference import lagged_slip_at

@@ -16,7 +16,6 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-NOT_KNOWN = "\N{EN DASH}"
 PNG_DPI = 160
 TITLE_LETTERS_AN_INCH = 11
 
@@ -65,42 +64,6 @@ STYLE = {
 }
 """Names of runs are drawn as they are: a dollar sign in one starts no formula.  Without hinting a text is
 as wide in one resolution as in another, so that a layout made for one fits the other."""
-
-
-def percent(share: float, digits: int = 1) -> str:
-    """Return a share as a percentage.
-
-    Examples
-    --------
-    >>> percent(0.8134), percent(1.0, 0)
-    ('81.3%', '100%')
-    """
-    return f"{share:.{digits}%}"
-
-
-def shorten(text: str, width: int) -> str:
-    """Cut the middle out of a text that is too long; both ends of an id tell something.
-
-    Examples
-    --------
-    >>> shorten("2024-05-01_field_north_run_17", 16)
-    '2024-05…h_run_17'
-    """
-    if len(text) <= width:
-        return text
-    tail = width // 2
-    return f"{text[: width - tail - 1]}…{text[-tail:]}"
-
-
-def sentence(text: str) -> str:
-    """Write a remark as a sentence.
-
-    Examples
-    --------
-    >>> sentence("not enough yet")
-    'Not enough yet.'
-    """
-    return f"{text[:1].upper()}{text[1:]}{'' if text.endswith('.') else '.'}"
 
 
 def png_bytes(figure: Figure, dpi: int = PNG_DPI) -> bytes:
