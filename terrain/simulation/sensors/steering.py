@@ -9,11 +9,8 @@ import numpy as np
 from terrain.angles import wrapped
 from terrain.logs.schema import STEERING_CHANNELS
 from terrain.records import Array
-from terrain.robots import Robot, Steering
-from terrain.simulation.sensors.motion import (
-    N_RECORD,
-    Motion,
-)
+from terrain.robots import Robot
+from terrain.simulation.sensors.motion import N_RECORD, Motion
 from terrain.simulation.sensors.sensor import Sensor
 
 
@@ -33,11 +30,6 @@ def encoder_angle(steer_rad: Array, zeros_rad: Array, noise_rad: Array | float, 
     return np.asarray(wrapped(angle))
 
 
-def described_zeros(steering: Steering) -> Array:
-    """Return the zeros (3,) of the encoders of a robot's description."""
-    return np.array([steering.zero_1_rad, steering.zero_2_rad, steering.zero_3_rad])
-
-
 class SteeringSensor(Sensor):
     """Absolute encoders: whole steps a turn (Gray code errs by one at most), with their zero offset.
 
@@ -46,9 +38,9 @@ class SteeringSensor(Sensor):
     """
 
     def __init__(self, motion: Motion, robot: Robot, rng: np.random.Generator) -> None:
-        steering, sensors = robot.equipment.steering, robot.equipment.sensors
+        sensors = robot.sensors
         super().__init__(motion, STEERING_CHANNELS, *motion.at(sensors.steering_rate_hz))
-        self._zeros = described_zeros(steering)
+        self._zeros = robot.steering_zeros_rad
         self._step_rad = 2 * math.pi / sensors.steering_steps_ratio
         self._noise = sensors.steering_std_rad * rng.standard_normal((len(self.rows), 3))
         self._steer, self._leg = motion.wheel("steer_rad"), motion.body("leg_rad")
