@@ -204,7 +204,7 @@ def _frequency_dependent(problem: Problem, found: Found) -> dict[str, str]:
         )
     )
     there = move_point(found.info.vector, found.names, found.change)
-    info = slower.at(there, found.names, found.info.noise)
+    info = slower.at(there, found.names, found.info.statistics)
     value, cov = fit_change(recentre(info, problem.simulation.vector), found.names)
     why = {}
     for cause in found.causes:
@@ -383,7 +383,7 @@ def _information_after(problem: Problem, found: Found, named: Sequence[Effect]) 
     for name, value in zip(found.names, found.change, strict=True):
         if name in names_of(named):
             vector[INDEX[name]] += value
-    return problem.at(vector, (), found.info.noise)
+    return problem.at(vector, (), found.info.statistics)
 
 
 def _residuals(info: Information, start: Information) -> dict[str, Residual]:

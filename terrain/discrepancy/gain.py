@@ -139,7 +139,7 @@ def gain(simulation: Simulation, extended: Simulation, runs: Sequence[RunLog], s
         if not signals:
             raise DataError(f"gain: none of {len(runs)} runs is fit to be compared ({excluded[0].reason})")
         after = information_at(signals, extended, extended.vector, names, low_pass)
-    before = information_at(signals, simulation, simulation.vector, (), low_pass, after.noise)
+    before = information_at(signals, simulation, simulation.vector, (), low_pass, after.statistics)
     by_run = len(signals) >= MIN_CLUSTERS
     weights = bootstrap_counts(len(signals) * (1 if by_run else N_BLOCKS), N_BOOTSTRAP, seed)
     channels = {}

@@ -12,23 +12,40 @@ moved far.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from terrain.discrepancy.noise import ORDER, Noise, noise_of, whiten
+from terrain.discrepancy.noise import ORDER, ORDERS, WHITE, Noise, noise_of, whiten
 from terrain.discrepancy.residuals import LowPass, Rows, rows_of
+from terrain.discrepancy.scatter import scatter_of
 from terrain.discrepancy.signals import Signals
 from terrain.discrepancy.simulation import Simulation
-from terrain.effects import BOUNDS, INDEX
+from terrain.effects import BOUNDS, CHANNELS, INDEX
 from terrain.records import Array
 
 N_BLOCKS = 3
 """Time blocks of a run; they serve as clusters where runs are few."""
 
+N_PROBES = 4
+"""Of the inputs that are taken out before the noise is estimated, for each channel."""
+
 PRIOR_STD = {name: 0.5 * max(abs(low), high) for name, (low, high) in BOUNDS.items()}
 """Prior of a parameter while the whole library is freed to estimate the noise."""
+
+
+class Statistics(NamedTuple):
+    """What differs between measurement and simulation at random.
+
+    Parameters
+    ----------
+    noise : of each channel
+    scatter : standard deviation from run to run, by parameter
+    """
+
+    noise: Noise
+    scatter: Mapping[str, float]
 
 
 class Information(NamedTuple):
@@ -48,6 +65,8 @@ class Information(NamedTuple):
     shift : of each run (q, k + 1): deviation of its nuisances per unit of each parameter's change (negative),
         and that which its residual shows
     inner : of each run (q, q): covariance of its nuisances given the parameters
+    origin, origin_loss : the point where sensitivities were taken, and the sum of ``c`` there; they stay when
+        changes are counted from another point
     """
 
     parameters: tuple[str, ...]
@@ -65,10 +84,18 @@ class Information(NamedTuple):
     nuisance_std: Array
     shift: tuple[Array, ...]
     inner: tuple[Array, ...]
+    origin: Array
+    origin_loss: float
 
     def places(self, names: Sequence[str]) -> list[int]:
         """Return the positions of parameters in the matrices."""
         return [self.parameters.index(name) for name in names]
+
+    @property
+    def statistics(self) -> Statistics:
+        """Noise and scatter that were estimated or given."""
+        names = [self.parameters[i] for i in self.nuisances]
+        return Statistics(self.noise, dict(zip(names, self.nuisance_std.tolist(), strict=True)))
 
 
 def information_at(
@@ -77,23 +104,53 @@ def information_at(
     vector: Array,
     parameters: Sequence[str],
     low_pass: LowPass,
-    noise: Noise | None = None,
+    statistics: Statistics | None = None,
 ) -> Information:
-    """Return the information of runs around a point; the noise is estimated unless it is given."""
+    """Return the information of runs around a point; noise and scatter are estimated unless given."""
     planar = {terrain: simulation.planar_on(terrain) for terrain in {run.terrain for run in signals}}
     scattered = [name for name in simulation.scatter if simulation.scatter[name] > 0]
     names = tuple(dict.fromkeys([*parameters, *scattered]))
     rows = tuple(rows_of(run, planar[run.terrain], vector, names, low_pass) for run in signals)
     nuisances = np.array([names.index(name) for name in scattered], dtype=int)
-    std = np.array([simulation.scatter[name] for name in scattered])
-    if noise is None:
-        speeds = [run.pace_mps for run in rows]
-        noise = noise_of([run.residual for run in rows], speeds, 0)
-        for _ in range(2):
-            loose = _sum_forms(names, vector, rows, noise, nuisances, std)
-            left, n_fitted = _library_residuals(loose)
-            noise = noise_of(left, speeds, n_fitted)
+    if statistics is None:
+        assumed_std = np.array([simulation.scatter[name] for name in scattered])
+        noise, std = _noise_and_scatter(names, vector, rows, nuisances, assumed_std)
+    else:
+        noise, std = statistics.noise, np.array([statistics.scatter[name] for name in scattered])
     return _sum_forms(names, vector, rows, noise, nuisances, std)
+
+
+def _noise_and_scatter(
+    names: tuple[str, ...], vector: Array, rows: tuple[Rows, ...], nuisances: Array, assumed_std: Array
+) -> tuple[Noise, Array]:
+    """Return noise and scatter from run to run, by what the whole library and a few probes leave.
+
+    The first fits weigh all frequencies alike: see :data:`terrain.discrepancy.noise.WHITE`.
+    """
+    speeds = [run.pace_mps for run in rows]
+    row_s = float(np.median(np.diff(rows[0].time_s)))
+    noise, std = noise_of([run.residual for run in rows], speeds, row_s, orders=WHITE), assumed_std
+    for orders in (WHITE, ORDERS, ORDERS):
+        loose = _sum_forms(names, vector, rows, noise, nuisances, std)
+        if std.size:
+            std = _scatter(loose, assumed_std)
+            loose = _sum_forms(names, vector, rows, noise, nuisances, std)
+        left, n_fitted = _library_residuals(loose)
+        noise = noise_of(left, speeds, row_s, n_fitted, orders)
+    plain = noise_of(_without_probes(loose, left), speeds, row_s, n_fitted + len(CHANNELS) * N_PROBES, ORDERS)
+    return noise._replace(std=plain.std), std
+
+
+def _scatter(info: Information, assumed_std: Array) -> Array:
+    """Return the scatter (q,) of nuisances about what the whole library explains of all runs alike."""
+    x = np.linalg.solve(_freed_information(info), info.g.sum(axis=0))
+    gram, score = [], []
+    for residual, change in zip(info.white_residual, info.white_change, strict=True):
+        own = change[info.nuisances].reshape(info.nuisances.size, -1)
+        left = residual.ravel() - x @ change.reshape(len(x), -1)
+        gram.append(own @ own.T)
+        score.append(own @ left)
+    return scatter_of(np.array(gram), np.array(score), assumed_std)
 
 
 def _sum_forms(
@@ -142,6 +199,8 @@ def _sum_forms(
         std,
         tuple(shifts),
         tuple(inners),
+        vector,
+        float(c.sum()),
     )
 
 
@@ -162,7 +221,7 @@ def _whiten_run(noise: Noise, run: Rows) -> tuple[Array, Array]:
 
 
 def _library_residuals(info: Information) -> tuple[list[Array], float]:
-    """Return the residuals with the whole library freed, and the effective number of fitted parameters."""
+    """Return the residuals with the whole library and probes freed, and how many parameters were fitted."""
     total, bound = info.a.sum(axis=0), _freed_information(info)
     x = np.linalg.solve(bound, info.g.sum(axis=0))
     left = []
@@ -174,6 +233,28 @@ def _library_residuals(info: Information) -> tuple[list[Array], float]:
     for inner in info.inner:
         n_fitted += info.nuisances.size - float((np.diag(inner) / info.nuisance_std**2).sum())
     return left, n_fitted
+
+
+def _without_probes(info: Information, left: Sequence[Array]) -> list[Array]:
+    """Return residuals (rows, channels) without what a few probes explain in all runs alike.
+
+    A constant, the speed, the turn and their product: what the library does not have is no noise.
+    """
+    probes = []
+    for run in info.rows:
+        speed, turn = run.inputs[:, 0], run.inputs[:, 1]
+        probes.append(np.column_stack([np.ones_like(speed), speed, turn, speed * turn]))
+    sizes = [info.noise.size(run.pace_mps) for run in info.rows]
+    out = [residual.copy() for residual in left]
+    every, size, value = np.concatenate(probes), np.concatenate(sizes), np.concatenate(left)
+    for c in range(value.shape[1]):
+        known = np.isfinite(value[:, c] / size[:, c])
+        if known.sum() > 10 * N_PROBES:
+            weighted = every[known] / size[known, c : c + 1]
+            fit = np.linalg.lstsq(weighted, value[known, c] / size[known, c], rcond=1e-10)[0]
+            for residual, columns in zip(out, probes, strict=True):
+                residual[:, c] -= columns @ fit
+    return out
 
 
 def _freed_information(info: Information) -> Array:
@@ -241,13 +322,14 @@ class Nearby(NamedTuple):
     Parameters
     ----------
     vector : the point
-    a, g : (k, k) and (k,) of the quadratic form of these parameters, all runs together
+    a, g, c : (k, k), (k,) and the constant of the quadratic form of these parameters, all runs together
     white_residual : of each run (rows, channels)
     """
 
     vector: Array
     a: Array
     g: Array
+    c: float
     white_residual: tuple[Array, ...]
 
 
@@ -262,17 +344,16 @@ def nearby(
     """Return the information of the same runs at another point; much faster than computing it anew."""
     planar = {terrain: simulation.planar_on(terrain) for terrain in {run.terrain for run in signals}}
     k, white = len(parameters), []
-    a, g = np.zeros((k, k)), np.zeros(k)
+    total = np.zeros((k + 1, k + 1))
     for run, its_change, inner in zip(signals, info.white_change, info.inner, strict=True):
         rows = rows_of(run, planar[run.terrain], vector, parameters, low_pass)
         residual, change = _whiten_run(info.noise, rows)
         nuisances = its_change[info.nuisances].reshape(len(info.nuisances), -1)
         both = np.concatenate([change, residual[None]]).reshape(k + 1, -1)
         along = nuisances @ both.T
-        gram = both @ both.T - along.T @ inner @ along
-        a, g = a + gram[:k, :k], g + gram[:k, k]
+        total += both @ both.T - along.T @ inner @ along
         white.append(residual)
-    return Nearby(vector, a, g, tuple(white))
+    return Nearby(vector, total[:k, :k], total[:k, k], float(total[k, k]), tuple(white))
 
 
 def misfit_of(info: Information, white_residual: Sequence[Array]) -> float:

@@ -18,7 +18,13 @@ from typing import NamedTuple
 import numpy as np
 from scipy.signal import lfilter
 
-from terrain.discrepancy.information import Information, correlation, information_at, partial_information
+from terrain.discrepancy.information import (
+    Information,
+    Statistics,
+    correlation,
+    information_at,
+    partial_information,
+)
 from terrain.discrepancy.noise import ORDER, Noise
 from terrain.discrepancy.residuals import low_pass_of, measured_channels
 from terrain.discrepancy.selection import EXCITED_RATIO, Z_EFFECT
@@ -250,7 +256,9 @@ def _drives(
     if not signals:
         return []
     vector = simulation.vector if info is None else info.vector
-    info_of_drives = information_at(signals, simulation, vector, names, low_pass_of(signals), _noise(info))
+    info_of_drives = information_at(
+        signals, simulation, vector, names, low_pass_of(signals), _statistics(simulation, info)
+    )
     at = info_of_drives.places(names)
     return [
         _Drive(name, grade_deg, a[np.ix_(at, at)])
@@ -309,8 +317,8 @@ def _signals(
     return Signals("", "", 1.0 / CLOCK_HZ, 0.0, wheel_speed_mps, steer_rad, grade, roll, measured)
 
 
-def _noise(info: Information | None) -> Noise:
-    """Return the noise of the runs, and a typical one for channels that they do not have."""
+def _statistics(simulation: Simulation, info: Information | None) -> Statistics:
+    """Return noise and scatter of the runs, and a typical noise of channels that they do not have."""
     std = np.array([TYPICAL_STD[name] for name in CHANNELS])
     growth, filters = np.zeros((len(CHANNELS), 3)), np.zeros((len(CHANNELS), ORDER + 1))
     growth[:, 0], filters[:, 0] = std**2, 1.0
@@ -318,4 +326,5 @@ def _noise(info: Information | None) -> Noise:
         known = np.isfinite(info.noise.filters).all(axis=1)
         growth[known], filters[known] = info.noise.growth[known], info.noise.filters[known]
         std[known] = info.noise.std[known]
-    return Noise(growth, filters, std)
+    scatter = simulation.scatter if info is None else info.statistics.scatter
+    return Statistics(Noise(growth, filters, std), scatter)

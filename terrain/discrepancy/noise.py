@@ -25,8 +25,21 @@ ORDER = 6
 ORDERS = (ORDER, 3, 1)
 """Orders that are tried: a channel with many holes has few stretches that fill a long one."""
 
+WHITE = (0,)
+"""The order of noise without memory, with which a fit starts: a memory that is fitted to a residual full of
+levels would weigh levels down to nothing, and they would never be fitted."""
+
+LONGEST_MEMORY_S = 1.0
+"""Correlation time of the noise at the most: ground and vibration forget themselves within a second or a
+metre, and what lasts longer is a level that wants a cause."""
+
 WHOLE_RATIO = 0.7
 """Ratio of the rows of the shortest order that a longer one has to keep."""
+
+
+SHRINKS = np.linspace(1.0, 0.0, 51)
+"""Factors by which the poles of an autoregression are drawn in, from none, until its memory is short
+enough."""
 
 
 class Noise(NamedTuple):
@@ -54,14 +67,22 @@ def _powers(speed_mps: Array) -> Array:
     return np.column_stack([np.ones_like(v), v, v * v])
 
 
-def noise_of(residuals: Sequence[Array], speeds_mps: Sequence[Array], n_fitted: float) -> Noise:
+def noise_of(
+    residuals: Sequence[Array],
+    speeds_mps: Sequence[Array],
+    row_s: float,
+    n_fitted: float = 0.0,
+    orders: Sequence[int] = ORDERS,
+) -> Noise:
     """Return the noise of residuals (m, channels) of several runs, fitted by least squares over all of them.
 
     Parameters
     ----------
     residuals : of each run, NaN where nothing was measured
     speeds_mps : (m,) of the wheels, of each run
+    row_s : from row to row
     n_fitted : number of parameters that were fitted to these residuals and made them smaller
+    orders : of the autoregression that are tried, from the longest; :data:`WHITE` for none
     """
     n_channels = residuals[0].shape[1]
     filters, stds = np.full((n_channels, ORDER + 1), np.nan), np.full(n_channels, np.nan)
@@ -77,15 +98,13 @@ def noise_of(residuals: Sequence[Array], speeds_mps: Sequence[Array], n_fitted: 
         scaled = [
             r[:, c] / np.sqrt(_powers(v) @ growth[c]) for r, v in zip(residuals, speeds_mps, strict=True)
         ]
-        tables = {order: _lag_table(scaled, order) for order in ORDERS}
-        enough = [order for order in ORDERS if len(tables[order]) >= WHOLE_RATIO * len(tables[ORDERS[-1]])]
+        tables = {order: _lag_table(scaled, order) for order in orders}
+        enough = [order for order in orders if len(tables[order]) >= WHOLE_RATIO * len(tables[orders[-1]])]
         table, order = tables[enough[0]], enough[0]
         if len(table) < 10 * ORDER:
             continue
         grow = 1.0 / max(1.0 - n_fitted / n_rows - order / len(table), 0.2)
-        gram = table[:, 1:].T @ table[:, 1:]
-        gram += 1e-9 * np.trace(gram) / order * np.eye(order)
-        weights = np.linalg.solve(gram, table[:, 1:].T @ table[:, 0])
+        weights = _autoregression(table, row_s)
         left = table[:, 0] - table[:, 1:] @ weights
         scale = np.sqrt(np.mean(left**2) * grow)
         if not scale > 0:
@@ -93,6 +112,29 @@ def noise_of(residuals: Sequence[Array], speeds_mps: Sequence[Array], n_fitted: 
         filters[c] = np.concatenate([[1.0], -weights, np.zeros(ORDER - order)]) / scale
         stds[c] = np.sqrt(np.mean(square[seen]) * grow)
     return Noise(growth, filters, stds)
+
+
+def _autoregression(table: Array, row_s: float) -> Array:
+    """Return the weights (order,) of an autoregression whose memory is :data:`LONGEST_MEMORY_S` at the most.
+
+    The density at zero frequency, ``s^2 row / (1 - sum w)^2`` with the variance ``s^2`` of what drives it,
+    is at most that of noise with an exponential correlation of that time, ``2 tau`` times its variance.
+    Where it is larger, weights are multiplied by ``g^lag``, which draws all poles in by ``g``.
+    """
+    order = table.shape[1] - 1
+    if not order:
+        return np.empty(0)
+    gram = table[:, 1:].T @ table[:, 1:]
+    gram += 1e-9 * np.trace(gram) / order * np.eye(order)
+    weights = np.asarray(np.linalg.solve(gram, table[:, 1:].T @ table[:, 0]))
+    most = 2.0 * LONGEST_MEMORY_S / row_s * float(np.mean(table[:, 0] ** 2))
+    lags = np.arange(1, order + 1)
+    for shrink in SHRINKS:
+        drawn_in = weights * shrink**lags
+        power = float(np.mean((table[:, 0] - table[:, 1:] @ drawn_in) ** 2))
+        if power <= most * (1.0 - drawn_in.sum()) ** 2 and drawn_in.sum() < 1.0:
+            return np.asarray(drawn_in)
+    return np.zeros(order)
 
 
 def _growth(square: Array, powers: Array) -> Array:

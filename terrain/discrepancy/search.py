@@ -10,6 +10,7 @@ import numpy as np
 from terrain.discrepancy.information import (
     Information,
     Nearby,
+    Statistics,
     correlation,
     information_at,
     loss_of,
@@ -19,7 +20,6 @@ from terrain.discrepancy.information import (
     partial_information,
     recentre,
 )
-from terrain.discrepancy.noise import Noise
 from terrain.discrepancy.residuals import LowPass
 from terrain.discrepancy.selection import Evidence, evidence, fit_change
 from terrain.discrepancy.signals import Signals
@@ -57,7 +57,11 @@ Z_PAIR = 4.6
 ALIKE = 0.99
 """Two effects whose sensitivities correlate more are not taken for a pair."""
 
-MAX_REFITS, SETTLED = 8, 0.3
+MAX_HALVINGS, RISE = 4, 0.005
+"""How often a step is halved that raises the whitened square by more than that ratio of it; a mass or a lag
+raises it by less, with the noise of the wheels that is in the prediction."""
+
+MAX_REFITS, SETTLED = 12, 0.3
 """Most relinearisations of the selected causes, and the ratio of its standard deviation below which a step
 ends them."""
 
@@ -79,11 +83,11 @@ class Problem(NamedTuple):
         return tuple(p.name for effect in self.library for p in effect.parameters)
 
     def at(
-        self, vector: Array, names: Sequence[str] | None = None, noise: Noise | None = None
+        self, vector: Array, names: Sequence[str] | None = None, statistics: Statistics | None = None
     ) -> Information:
-        """Return the information of the runs around a point."""
+        """Return the information of the runs around a point; see :func:`information_at`."""
         desired = self.parameters if names is None else names
-        return information_at(self.signals, self.simulation, vector, desired, self.low_pass, noise)
+        return information_at(self.signals, self.simulation, vector, desired, self.low_pass, statistics)
 
     def near(self, info: Information, vector: Array, names: Sequence[str]) -> Nearby:
         """Return the information on a few parameters at another point, with the noise of an information."""
@@ -276,21 +280,32 @@ def _pair(info: Information, causes: Sequence[Effect], library: Sequence[Effect]
 def _steps(
     problem: Problem, info: Information, base: Array, names: Sequence[str], n_most: int
 ) -> Iterator[Nearby]:
-    """Yield the information at the points of a nonlinear fit of parameters, until it converges."""
+    """Yield the information at the points of a nonlinear fit of parameters, until it converges.
+
+    A step that raises the whitened square is halved, and given up after :data:`MAX_HALVINGS`.
+    """
+    at = [INDEX[name] for name in names]
+    others = np.delete(info.origin - base, at)
+    here, loss = info.origin[at] - base[at], np.inf if others.any() else info.origin_loss
     change, _ = fit_change(info, names)
     for _ in range(n_most):
         point = problem.near(info, move_point(base, names, change), names)
+        for _ in range(MAX_HALVINGS):
+            if point.c <= (1.0 + RISE) * loss:
+                break
+            change = 0.5 * (here + change)
+            point = problem.near(info, move_point(base, names, change), names)
         yield point
         cov = np.linalg.pinv(point.a, hermitian=True)
-        now = point.vector[[INDEX[name] for name in names]] - base[[INDEX[name] for name in names]]
-        before, change = change, now + cov @ point.g
-        if (np.abs(change - before) < SETTLED * np.sqrt(np.maximum(np.diag(cov), 1e-30))).all():
-            break
+        here, loss = point.vector[at] - base[at], point.c
+        change = here + cov @ point.g
+        if (np.abs(change - here) < SETTLED * np.sqrt(np.maximum(np.diag(cov), 1e-30))).all():
+            return
 
 
 def _relinearize(problem: Problem, info: Information, base: Array, causes: Sequence[Effect]) -> Information:
     """Fit, and return the information around the fitted point."""
-    point = base
+    point = info.origin if causes else base
     for near in _steps(problem, info, base, names_of(causes), MAX_REFITS):
         point = near.vector
     return recentre(problem.at(point), base)

@@ -109,7 +109,7 @@ def test_the_form_is_generalised_least_squares_with_scatter_written_out(info):
 def test_a_nuisance_is_a_parameter_too_and_its_scatter_widens_its_variance(info, signals):
     assert info.parameters[: len(NAMES)] == NAMES
     assert set(np.array(info.parameters)[info.nuisances]) == set(SCATTER._fields)
-    firm = information_at(signals, Simulation(HUSKY), info.vector, NAMES, low_pass_of(signals), info.noise)
+    firm = information_at(signals, Simulation(HUSKY), info.vector, NAMES, low_pass_of(signals), info.statistics)
     name = ["rolling_resistance_ratio"]  # which scatters
     wide, narrow = fit_change(info, name)[1][0, 0], fit_change(firm, name)[1][0, 0]
     # the mean over runs cannot be better known than its scatter lets
@@ -128,7 +128,7 @@ def test_changes_counted_from_another_point_end_at_the_same_values(signals, info
     base = info.vector
     there = vector_of({"camera_yaw_rad": 0.02, "payload_ratio": 0.05})
     low_pass = low_pass_of(signals)
-    moved_info = information_at(signals, SIMULATION, there, NAMES, low_pass, info.noise)
+    moved_info = information_at(signals, SIMULATION, there, NAMES, low_pass, info.statistics)
     here = recentre(moved_info, base)
     names = list(NAMES[:2])
     change, _ = fit_change(moved_info, names)
@@ -150,7 +150,7 @@ def test_nearby_is_the_same_form_at_another_point_by_the_same_noise(signals, inf
     assert_allclose(here.a / np.outer(scale, scale), info.a[:, at][:, :, at].sum(0) / np.outer(scale, scale))
     assert_allclose(here.g / scale, info.g[:, at].sum(0) / scale, atol=1e-9)
     there = move_point(info.vector, names, np.array([0.05, 0.02, 0.02]))
-    direct = information_at(signals, SIMULATION, there, names, low_pass, info.noise)
+    direct = information_at(signals, SIMULATION, there, names, low_pass, info.statistics)
     near = nearby(info, signals, SIMULATION, there, names, low_pass)
     at = direct.places(names)
     assert_allclose(near.a, direct.a[:, at][:, :, at].sum(0), rtol=0.02, atol=0.01 * near.a.max())

@@ -30,7 +30,7 @@ def runs(n_runs, n_rows, seed=0):
 
 def test_coloured_noise_that_grows_with_speed_comes_out_white():
     speeds, residuals = runs(8, 1500)
-    noise = noise_of(residuals, speeds, 0)
+    noise = noise_of(residuals, speeds, 0.2, 0)
     at = np.array([0.1, 0.4, 0.8])
     expected = np.sqrt(np.column_stack([at**0, at, at**2]) @ GROWTH.T)
     assert_allclose(noise.size(at), expected, rtol=0.12)
@@ -57,7 +57,7 @@ def test_coloured_noise_that_grows_with_speed_comes_out_white():
 def test_fitted_effects_reduce_the_residuals():
     """A hundred numbers take a hundred degrees of freedom away, shared by the two channels."""
     speeds, residuals = runs(2, 300)
-    plain, fitted = (noise_of(residuals, speeds, n) for n in (0, 100))
+    plain, fitted = (noise_of(residuals, speeds, 0.2, n) for n in (0, 100))
     grown = np.sqrt(1 / (1 - 100 / (2 * 2 * 300)))
     assert_allclose(fitted.std / plain.std, grown, rtol=0.005)
     assert_allclose(plain.filters[:, 0] / fitted.filters[:, 0], grown, rtol=0.005)
@@ -84,10 +84,10 @@ def test_a_channel_that_is_hardly_measured_or_never_differs_has_no_filter():
         np.column_stack([r[:, 0], np.where(np.arange(300) < 12, r[:, 1], np.nan), 0 * r[:, 0]])
         for r in residuals
     ]
-    noise = noise_of(gone, speeds, 0)
+    noise = noise_of(gone, speeds, 0.2, 0)
     assert np.isfinite(noise.filters).all(axis=1).tolist() == [True, False, False]
     assert np.isfinite(noise.std).tolist() == [True, False, False]
     holes = [r.copy() for r in residuals]
     for r in holes:
         r[100:140] = np.nan
-    assert_allclose(noise_of(holes, speeds, 0).std, noise_of(residuals, speeds, 0).std, rtol=0.15)
+    assert_allclose(noise_of(holes, speeds, 0.2, 0).std, noise_of(residuals, speeds, 0.2, 0).std, rtol=0.15)

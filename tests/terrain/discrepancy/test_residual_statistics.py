@@ -19,7 +19,7 @@ def coloured(n, seed, keep=0.7):
 def test_the_spectrum_of_coloured_noise_is_that_of_the_filter_that_whitens_it():
     """Two routes: averaged periodograms, and the fitted autoregression; both hold the variance."""
     residuals = [coloured(4000, seed) for seed in range(8)]
-    noise = noise_of([r[:, None] for r in residuals], [np.ones(4000)] * 8, 0)
+    noise = noise_of([r[:, None] for r in residuals], [np.ones(4000)] * 8, 0.2, 0)
     frequency, power = spectrum(residuals, RATE_HZ)
     fitted = noise.size(np.ones(1))[0, 0] ** 2 * noise_spectrum(noise.filters[0], frequency, RATE_HZ)
     inner = slice(1, -1)
