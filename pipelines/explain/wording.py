@@ -29,6 +29,8 @@ SI = {
     "mps2": "m/s²",
     "m": "m",
     "s": "s",
+    "s2": "s²",
+    "a": "A",
     "nspm": "N s/m",
 }
 """How pages write the last word of a parameter's name."""

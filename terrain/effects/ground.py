@@ -53,6 +53,18 @@ SLIP_AND_RESISTANCE: tuple[Effect, ...] = (
         "arcs of several radii and turns in place",
     ),
     Effect(
+        "turn_drag",
+        # measured: 0.02 to 0.1 s^2 (Warthog on asphalt and sand), 0.6 to 0.9 s^2 (Husky)
+        (Parameter("turn_drag_s2", -0.1, 3.0, 0.005),),
+        "u / (1 + c w^2) in place of u, about u (1 - c w^2), and that itself for c < 0; w as simulated, with "
+        "the effective track",
+        "second-order loss of speed in turns, as in the logs of Baril et al., DRIVE, ICRA 2024; the bounded "
+        "form is this project's",
+        (SKID,),
+        (SPEED_X,),
+        "arcs of several yaw rates",
+    ),
+    Effect(
         "force_slip",
         (Parameter("force_slip_ratio", -0.3, 3.0, 0.02, scatter_rank=8),),
         "v = u - |u| c f",
@@ -106,6 +118,28 @@ SLIP_AND_RESISTANCE: tuple[Effect, ...] = (
 )
 
 SIDEWAYS: tuple[Effect, ...] = (
+    Effect(
+        "turn_side_slip",
+        # measured: 0.11 to 0.19 s (Husky; Warthog on asphalt, gravel and sand), DRIVE, as turn_drag
+        (Parameter("turn_side_slip_s", -0.5, 0.5, 0.005),),
+        "v_y = -c v_x w: to the outside of a turn",
+        "m (dv_y/dt + w v_x) = -K v_y with c = m/K; the centre of rotation lies c v_x ahead: Mandow et al., "
+        "Experimental kinematics for wheeled skid-steer mobile robots, IROS 2007",
+        (SKID,),
+        (SPEED_Y,),
+        "arcs of several speeds, to both sides",
+    ),
+    Effect(
+        "side_slip_build_up",
+        # with the friction of turn_side_slip its time constant would be c, 0.2 s at the most where measured
+        (Parameter("side_slip_build_up_s", 0.0, 1.0, 0.01, one_sided=True),),
+        "T dv_y/dt + v_y = -c v_x w",
+        "first-order lag of the lateral motion: the inertia in m (dv_y/dt + w v_x) = -K v_y",
+        (SKID,),
+        (SPEED_Y,),
+        "steps of the yaw rate while driving",
+        modifies="turn_side_slip",
+    ),
     Effect(
         "scrub",
         (Parameter("scrub_ratio", -0.2, 1.0, 0.005),),

@@ -84,4 +84,24 @@ LOAD_AND_MOTORS: tuple[Effect, ...] = (
         sensed_only=True,
         plant=PlantPart.SENSORS,
     ),
+    Effect(
+        "current_offset",
+        (
+            # zero of a Hall sensor: up to 2 % of a range of 50 to 200 A
+            Parameter(
+                "current_offset_a",
+                -4.0,
+                4.0,
+                0.05,
+                inverse=Inverse(("wheels",), "current of each motor - b"),
+            ),
+        ),
+        "current of each motor + b: n b in the sum of n motors, nothing in the difference of the sides",
+        "zero error of a current sensor",
+        BOTH,
+        (CURRENT,),
+        "standstill, and driving forward and backward",
+        sensed_only=True,
+        plant=PlantPart.SENSORS,
+    ),
 )

@@ -28,10 +28,11 @@ SENSORS: tuple[Effect, ...] = (
     Effect(
         "gyro_bias",
         (
+            # 3 deg/s, the zero error of MEMS gyros as data sheets have it (Bosch BMI055: 1 deg/s)
             Parameter(
                 "gyro_bias_radps",
-                -0.2,
-                0.2,
+                -0.05,
+                0.05,
                 0.001,
                 homes=(Home("sensors", "gyro_bias_z_radps", Combine.ADDED),),
                 inverse=Inverse(("imu",), "gyro - b where the description has no home; fused yaw - b t"),
@@ -49,10 +50,11 @@ SENSORS: tuple[Effect, ...] = (
     Effect(
         "gyro_scale",
         (
+            # data sheets of MEMS gyros have 1 to 4 %; a part that is off by more than 15 % is broken
             Parameter(
                 "gyro_scale_ratio",
-                -0.3,
-                0.3,
+                -0.15,
+                0.15,
                 0.01,
                 inverse=Inverse(("imu",), "(gyro - bias) / (1 + k) + bias; fused yaw / (1 + k)"),
                 as_percent=True,
@@ -89,6 +91,25 @@ SENSORS: tuple[Effect, ...] = (
         sensed_only=True,
         plant=PlantPart.DESCRIPTION,
         aliases=("accelerometer_mounting_pitch",),
+    ),
+    Effect(
+        "imu_latency",
+        (
+            Parameter(
+                "imu_latency_s",
+                0.0,
+                0.5,
+                0.005,
+                homes=(Home("sensors", "imu_latency_s", Combine.ADDED),),
+                inverse=Inverse(("imu",), "stamp t - T", without_home=True),
+            ),
+        ),
+        "gyro, accelerometer and tilt(t) = what they measure at t - T",
+        "pure delay; the samples of one IMU arrive together",
+        BOTH,
+        (GYRO, ACCEL),
+        "steps of the yaw rate, and a camera that is not late",
+        plant=PlantPart.DESCRIPTION,
     ),
     Effect(
         "camera_latency",
@@ -154,13 +175,13 @@ SENSORS: tuple[Effect, ...] = (
         (
             Parameter(
                 "clock_offset_s",
-                0.0,
+                -0.5,
                 0.5,
                 0.005,
                 inverse=Inverse(OTHER_LOGGER, "stamp t' - T"),
             ),
         ),
-        "IMU and camera stamp t' = t + T; wheels, currents and steering t",
+        "IMU and camera stamp t' = t + T; wheels, currents and steering t: for T < 0 these are the late ones",
         "two loggers without a common clock",
         BOTH,
         (*MOTION, HEADING),

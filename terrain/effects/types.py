@@ -152,6 +152,7 @@ class Effect(NamedTuple):
     aliases : other names of the same effect, which no log distinguishes from it
     twins : names of effects that look the same, and the channel that a log needs to distinguish them
     deprecated : former names, accepted on the command line
+    modifies : name of the effect without which it does nothing; empty for an effect that acts by itself
     """
 
     name: str
@@ -166,3 +167,4 @@ class Effect(NamedTuple):
     aliases: tuple[str, ...] = ()
     twins: tuple[tuple[str, str], ...] = ()
     deprecated: tuple[str, ...] = ()
+    modifies: str = ""

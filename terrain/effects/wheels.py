@@ -43,6 +43,36 @@ def _steering_offset(wheel: int) -> Effect:
     )
 
 
+def _wheel_scale(wheel: int) -> Effect:
+    """Return the scale of one encoder.
+
+    All three together span wheel_radius and one_sided_radius, so that of the five three logs
+    determine three; one alone looks like neither.
+    """
+    name = f"wheel_scale_{wheel}"
+    return Effect(
+        name,
+        (
+            # an encoder that loses counts, or a tyre of another wear: a fifth is more than either
+            Parameter(
+                f"{name}_ratio",
+                -0.2,
+                0.2,
+                0.01,
+                inverse=Inverse(("wheels",), f"rate and speed of wheel {wheel} x (1 + e)"),
+                as_percent=True,
+                is_error=True,
+            ),
+        ),
+        f"wheel speed {wheel} = (1 + e) x measured",
+        KINEMATICS,
+        (SWERVE,),
+        (*MOTION, HEADING),
+        "straight drives in several directions",
+        plant=PlantPart.SENSORS,
+    )
+
+
 WHEELS_AND_STEERING: tuple[Effect, ...] = (
     Effect(
         "wheel_radius",
@@ -70,11 +100,12 @@ WHEELS_AND_STEERING: tuple[Effect, ...] = (
     Effect(
         "one_sided_radius",
         (
+            # pressure and wear of tyres differ by a few percent from side to side
             Parameter(
                 "one_sided_radius_ratio",
-                -0.3,
-                0.3,
-                0.01,
+                -0.1,
+                0.1,
+                0.008,
                 inverse=Inverse(
                     ("wheels", "truth"), "rates and speeds of the right side x (1 + e/2), left x (1 - e/2)"
                 ),
@@ -90,6 +121,7 @@ WHEELS_AND_STEERING: tuple[Effect, ...] = (
         "fast and straight",
         plant=PlantPart.BODY,
     ),
+    *(_wheel_scale(wheel) for wheel in (1, 2, 3)),
     *(_steering_offset(wheel) for wheel in (1, 2, 3)),
     Effect(
         "steering_backlash",

@@ -108,9 +108,11 @@ class Correction:
         self._gyro_bias = applied.completed.sensors.gyro_bias_z_radps
         self._gyro_offset = homeless.get("gyro_bias_radps", 0.0)
         self._accel_offset = homeless.get("accel_bias_mps2", 0.0)
+        self._imu_late_s = homeless.get("imu_latency_s", 0.0)
         self._current = 1.0 + homeless.get("motor_constant_ratio", 0.0)
         half = 0.5 * self._p["one_sided_radius_ratio"]
         self._side = {wheel: 1.0 + half if wheel in ("3", "right") else 1.0 - half for wheel in robot.wheels}
+        self._scale = {wheel: 1.0 + self._p.get(f"wheel_scale_{wheel}_ratio", 0.0) for wheel in robot.wheels}
         self._has_backlash = self._p.get("steering_backlash_rad", 0.0) > 0.0
         self._follower, self._angle, self._yaw = np.full(3, np.nan), np.full(3, np.nan), (np.nan, np.nan)
         self._inverses: Mapping[str, Callable[[tuple[str, ...], Array, Array], None]] = {
@@ -119,7 +121,7 @@ class Correction:
             "imu": self._imu,
             "odometry": self._camera,
             "lidar": self._camera,
-            "truth": self._wheels,
+            "truth": self._true_wheels,
         }
 
     def __call__(
@@ -145,6 +147,8 @@ class Correction:
 
     def _stamps(self, name: str, time_s: Array) -> Array:
         p = self._p
+        if name == "imu" and self._imu_late_s:
+            time_s = time_s - self._imu_late_s
         if name in OTHER_LOGGER and (p["clock_offset_s"] or p["clock_rate_ratio"]):
             since_s = (time_s - self._start_s - p["clock_offset_s"]) / (1.0 + p["clock_rate_ratio"])
             return np.asarray(self._start_s + since_s)
@@ -159,9 +163,18 @@ class Correction:
             quantity, _, rest = channel.partition("_")
             wheel = rest.rpartition("_")[0]
             if quantity == "current":
+                values[:, i] -= self._p["current_offset_a"]
                 values[:, i] /= self._current * warm
-            elif wheel in self._side and quantity in ("motor", "speed", "wheel"):
-                values[:, i] *= self._side[wheel] * (wheel_speed if quantity == "speed" else 1.0)
+            elif wheel in self._side and quantity in ("motor", "speed"):
+                metres = wheel_speed if quantity == "speed" else 1.0
+                values[:, i] *= self._side[wheel] * self._scale[wheel] * metres
+
+    def _true_wheels(self, channels: tuple[str, ...], time_s: Array, values: Array) -> None:
+        for i, channel in enumerate(channels):
+            quantity, _, rest = channel.partition("_")
+            wheel = rest.rpartition("_")[0]
+            if quantity == "wheel" and wheel in self._side:
+                values[:, i] *= self._side[wheel]
 
     def _steering(self, channels: tuple[str, ...], time_s: Array, values: Array) -> None:
         if not self._has_backlash:

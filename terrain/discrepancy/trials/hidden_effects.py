@@ -99,16 +99,17 @@ def draw_hidden(case: Case, robot: Robot, limits: Limits | None, rng: np.random.
         return Hidden({}, (), 0.0, "", library, {})
     if case.row is Row.OUTSIDE:
         return _draw_outside(case, limits, library, rng)
+    acting = [effect for effect in library if not effect.modifies]  # the others do nothing alone
     if case.row is Row.FOUND:
-        effect = library[(case.number // len(ROBOTS)) % len(library)]
+        effect = acting[(case.number // len(ROBOTS)) % len(acting)]
         over = float(math.exp(rng.uniform(*np.log(FOUND_LADDER))))
         return Hidden(_values(effect, limits, over, rng), (effect.name,), over, "", library, {})
-    effect = library[int(rng.integers(len(library)))]
+    effect = acting[int(rng.integers(len(acting)))]
     over = float(math.exp(rng.uniform(*np.log(LADDER)))) if case.row is Row.LADDER else STRONG
     values = _values(effect, limits, over, rng)
     if case.row is not Row.TWO:
         return Hidden(values, (effect.name,), over, "", library, {})
-    others = [o for o in library if o.name not in confusable_class(limits, effect, robot.drive)]
+    others = [o for o in acting if o.name not in confusable_class(limits, effect, robot.drive)]
     others = [o for o in others if o.name not in [name for name, _ in effect.twins]]
     other = others[int(rng.integers(len(others)))]
     values |= _values(other, limits, over, rng)

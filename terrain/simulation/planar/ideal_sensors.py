@@ -17,6 +17,7 @@ _GYRO_BIAS = INDEX["gyro_bias_radps"]
 _GYRO_SCALE = INDEX["gyro_scale_ratio"]
 _ACCEL_BIAS = INDEX["accel_bias_mps2"]
 _LATENCY = INDEX["camera_latency_s"]
+_IMU_LATENCY = INDEX["imu_latency_s"]
 _CAMERA_YAW = INDEX["camera_yaw_rad"]
 _LEVER_X = INDEX["lever_x_m"]
 _LEVER_Y = INDEX["lever_y_m"]
@@ -24,6 +25,7 @@ _CLOCK_OFFSET = INDEX["clock_offset_s"]
 _CLOCK_RATE = INDEX["clock_rate_ratio"]
 _MOTOR = INDEX["motor_constant_ratio"]
 _DRIFT = INDEX["motor_drift_ratio"]
+_CURRENT_OFFSET = INDEX["current_offset_a"]
 
 
 @njit(cache=True)
@@ -47,11 +49,12 @@ def sense(planar: Planar, p: Array, dt: float, truth: Array) -> Array:
         out[k, 2] = sin * v_x + cos * v_y
         out[k, 3] = truth[k, AX] + p[_ACCEL_BIAS]
         warm = (1.0 + p[_MOTOR]) * (1.0 + p[_DRIFT] * k * dt / 60.0)
-        out[k, 4] = truth[k, AMPS] * warm
+        out[k, 4] = truth[k, AMPS] * warm + planar.n_wheels * p[_CURRENT_OFFSET]
         out[k, 5] = truth[k, TURNING_AMPS] * warm
         out[k, 6] = w
     offset, rate = p[_CLOCK_OFFSET] / dt, p[_CLOCK_RATE]
-    camera, imu = (planar.latency_s + p[_LATENCY]) / dt, (planar.imu_latency_s + planar.imu_lag_s) / dt
+    camera = (planar.latency_s + p[_LATENCY]) / dt
+    imu = (planar.imu_latency_s + p[_IMU_LATENCY] + planar.imu_lag_s) / dt
     for c in (0, 1, 2, 3, 6):
         late = offset + (imu if c in (0, 3) else camera)
         if late != 0.0 or rate != 0.0:

@@ -16,10 +16,12 @@ absent.
 - **currents**: their sum is ``F r`` along the wheels' mean heading and the motors' friction over the torque
   that an ampere gives at the wheel; of a skid-steer robot also the difference of the sides, from yaw inertia
   and scrub;
+- **turning** of a skid-steer robot: its wheels' yaw rate and speed are reduced by turning slip and turn drag,
+  and it slips sideways by ``T dv_y/dt + v_y = -c v w``;
 - **sensors**: gyro, accelerometer and camera with bias, scale, mounting, latency and their logger's clock.
 
-Load transfer, roughness and, of a skid-steer robot, lateral slip beside that on a side hill are left out:
-what they do to a log is noise here.  Sources stand with the effects.
+Load transfer and roughness are left out: what they do to a log is noise here.  Sources stand with the
+effects.
 
 This module holds what all of it shares: the terrain, the robot's numbers on it, and the columns of a motion.
 Motion is in :mod:`~terrain.simulation.planar.motion`, :mod:`~terrain.simulation.planar.skid_steer` and

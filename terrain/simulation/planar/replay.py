@@ -18,6 +18,7 @@ from terrain.simulation.planar.signals import delayed, slopes
 
 _CLOCK_OFFSET = INDEX["clock_offset_s"]
 _CLOCK_RATE = INDEX["clock_rate_ratio"]
+_IMU_LATENCY = INDEX["imu_latency_s"]
 _LAG = INDEX["encoder_lag_s"]
 _PITCH_OFFSET = INDEX["pitch_offset_rad"]
 _ROLL_OFFSET = INDEX["roll_offset_rad"]
@@ -58,7 +59,7 @@ def undone(
         wheel_speed = wheel_speed_mps.copy()
         for i in range(wheel_speed.shape[1]):
             wheel_speed[:, i] += lag * slopes(wheel_speed_mps[:, i].copy(), dt)
-    late = (p[_CLOCK_OFFSET] + planar.imu_latency_s) / dt
+    late = (p[_CLOCK_OFFSET] + planar.imu_latency_s + p[_IMU_LATENCY]) / dt
     if late != 0.0 or p[_CLOCK_RATE] != 0.0:
         grade = delayed(grade, -late, -p[_CLOCK_RATE])
         roll = delayed(roll, -late, -p[_CLOCK_RATE])

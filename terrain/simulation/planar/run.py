@@ -43,6 +43,7 @@ from terrain.simulation.planar.streams import (
     PlanarMotion,
     PlanarRun,
     camera_stream,
+    encoder_scales,
     imu_stream,
     lidar_stream,
     planar_truth,
@@ -201,7 +202,7 @@ def _motion(setup: PlanarSetup, desired: WheelMotion, hills: Hills, rngs: Genera
         pose = path_of(truth, dt)
     sides = np.full(wheel_speed.shape[1], 1.0 - 0.5 * p[INDEX["one_sided_radius_ratio"]])
     sides[-1] = 1.0 + 0.5 * p[INDEX["one_sided_radius_ratio"]]
-    rolled = rolled * (1.0 + p[INDEX["wheel_radius_ratio"]]) * sides
+    rolled = rolled * (1.0 + p[INDEX["wheel_radius_ratio"]]) * sides * encoder_scales(robot, p)
     return PlanarMotion(truth, pose, grade, roll, wheel_speed, rolled, steer, active)
 
 

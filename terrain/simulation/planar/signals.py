@@ -84,6 +84,28 @@ def _between(values: Array, at: float) -> float:
 
 
 @njit(cache=True)
+def lagged(values: Array, tau_s: float, dt: float) -> Array:
+    """Return a signal (n,) behind a first-order lag, exact for what runs straight from sample to sample.
+
+    It starts at rest at its first value; without a time constant it is returned as it is.
+
+    Examples
+    --------
+    >>> lagged(np.array([0.0, 1.0, 2.0, 3.0]), 1e-3, 1.0).round(3)
+    array([0.   , 0.999, 1.999, 2.999])
+    """
+    if tau_s <= 0.0:
+        return values
+    out = np.empty(values.size)
+    keep = math.exp(-dt / tau_s)
+    out[0] = values[0]
+    for k in range(1, values.size):
+        lead = tau_s * (values[k] - values[k - 1]) / dt
+        out[k] = values[k] - lead + keep * (out[k - 1] - values[k - 1] + lead)
+    return out
+
+
+@njit(cache=True)
 def play(angle: Array, half: float) -> None:
     """Let an angle follow itself through a play of half width ``half``, from the middle; in place."""
     follower = angle[0]

@@ -2,7 +2,10 @@
 
 With ``f = (m dv/dt + F) / (m g)`` and ``F`` what slope and resistances ask for, ``v = u - |u| c f`` is a
 low-pass of ``u - |u| c F / (m g)`` with the time constant ``|u| c / g``, stepped exactly for what runs
-straight from sample to sample.  Turning slip takes of the difference of the sides by how tight the turn is.
+straight from sample to sample.  Turning slip takes of the difference of the sides by how tight the turn is,
+turn drag of the mean by the yaw rate.  With friction against lateral motion, ``m (dv_y/dt + w v) = -K v_y``,
+the robot slips to the outside of a turn: ``T dv_y/dt + v_y = -c v w``, ``c = T = m/K``; the two are
+parameters of their own.
 """
 
 from __future__ import annotations
@@ -16,8 +19,8 @@ from terrain.constants import GRAVITY_MPS2
 from terrain.effects import INDEX
 from terrain.records import Array
 from terrain.simulation.contact import shear_softness, softness
-from terrain.simulation.planar.model import AMPS, FORCE, N_TRUTH, SLIP, TURNING_AMPS, VX, Planar, W
-from terrain.simulation.planar.signals import delayed, slopes
+from terrain.simulation.planar.model import AMPS, FORCE, N_TRUTH, SLIP, TURNING_AMPS, VX, VY, Planar, W
+from terrain.simulation.planar.signals import delayed, lagged, slopes
 
 STANDSTILL_MPS = 0.05
 """Speed over which a resistance takes its full size: it opposes motion and does not push a robot at rest."""
@@ -34,6 +37,9 @@ _ONE_SIDED = INDEX["one_sided_radius_ratio"]
 _YAW_DELAY = INDEX["yaw_delay_s"]
 _TRACK = INDEX["effective_track_ratio"]
 _TURN_SLIP = INDEX["turning_slip_ratio"]
+_TURN_DRAG = INDEX["turn_drag_s2"]
+_SIDE_SLIP = INDEX["turn_side_slip_s"]
+_BUILD_UP = INDEX["side_slip_build_up_s"]
 _FORCE_SLIP = INDEX["force_slip_ratio"]
 _SHEAR_SLIP = INDEX["shear_slip_ratio"]
 _SLIP_RESISTANCE = INDEX["slip_resistance_ratio"]
@@ -108,6 +114,8 @@ def move_skid(
         moment = planar.yaw_inertia_kgm2 * (1.0 + p[_PAYLOAD]) * spin[k]
         force = 2.0 * moment / planar.track_m + scrub * tight[k] * direction(difference[k])
         out[k, TURNING_AMPS] = force * planar.radius_m / planar.nm_per_a
+    if p[_SIDE_SLIP] != 0.0:
+        out[:, VY] = lagged(-p[_SIDE_SLIP] * speed * turn, p[_BUILD_UP], dt)
     return out
 
 
@@ -134,4 +142,8 @@ def _differed(
         turn[k] = (dv - lost) / (planar.track_m * (1.0 + p[_TRACK]))
     if p[_YAW_DELAY] != 0.0:
         turn = delayed(turn, p[_YAW_DELAY] / dt, 0.0)
+    if p[_TURN_DRAG] != 0.0:
+        for k in range(n):
+            drag = p[_TURN_DRAG] * turn[k] * turn[k]
+            u[k] *= 1.0 / (1.0 + drag) if drag > 0.0 else 1.0 - drag  # never turns the motion about
     return u, turn, tight, difference

@@ -140,6 +140,12 @@ def _measured(
     return add_rate_noise(speed, white, STANDSTILL_MPS), currents_a
 
 
+def encoder_scales(robot: Robot, p: Array) -> Array:
+    """Return true over measured wheel rates (wheels,): encoders may lose counts."""
+    names = [f"wheel_scale_{wheel}_ratio" for wheel in robot.wheels]
+    return np.array([1.0 + p[INDEX[name]] if name in INDEX else 1.0 for name in names])
+
+
 @njit(cache=True)
 def encoder_speed(
     wheel_speed_mps: Array, every: int, dt: float, step_m: float, jitter_m: Array, lag_s: float
@@ -209,7 +215,7 @@ def imu_stream(run: PlanarRun, rng: np.random.Generator) -> Stream:
     """Return the stream of the IMU."""
     motion, sensors = run.motion, run.robot.sensors
     rows, time_s = run.samples(IMU_HZ)
-    latency_s = sensors.imu_latency_s
+    latency_s = sensors.imu_latency_s + run.p[INDEX["imu_latency_s"]]
     v_x, v_y, turn = (motion.truth[:, column] for column in (VX, VY, W))
     level = np.cos(motion.grade_rad)
     tilt = np.column_stack(
@@ -317,7 +323,7 @@ def planar_truth(run: PlanarRun) -> Stream:
     columns = [
         motion.pose[rows],
         np.column_stack([motion.roll_rad[rows], -grade, v_x, v_y, turn, accel_x, accel_y]),
-        motion.wheel_speed_mps[rows] / robot.wheel_radius_m,
+        motion.wheel_speed_mps[rows] * encoder_scales(robot, run.p) / robot.wheel_radius_m,
         steer,
         slip_ratio(motion.rolled_mps[rows], along),
         np.full((len(rows), 1), run.p[INDEX["gyro_bias_radps"]] + robot.sensors.gyro_bias_z_radps),

@@ -39,6 +39,7 @@ SHORTEST_M, LIGHTEST_KG = 1e-3, 1e-3
 
 _RADIUS = INDEX["wheel_radius_ratio"]
 _ONE_SIDED = INDEX["one_sided_radius_ratio"]
+_SCALE_1 = INDEX["wheel_scale_1_ratio"]
 _OFFSET_1 = INDEX["steering_offset_1_rad"]
 _PLAY = INDEX["steering_backlash_rad"]
 _STEER_DELAY = INDEX["steering_delay_s"]
@@ -199,7 +200,9 @@ def _rolled(
     for k in range(n):
         square, total = 0.0, 0.0
         for i in range(3):
-            wheel_speed = wheel_speed_mps[k, i] * scale * (right if i == 2 else left)
+            wheel_speed = (
+                wheel_speed_mps[k, i] * scale * (right if i == 2 else left) * (1.0 + p[_SCALE_1 + i])
+            )
             square += wheel_speed * wheel_speed
             total += wheel_speed
             cos, sin = math.cos(angle[i, k]), math.sin(angle[i, k])

@@ -79,9 +79,15 @@ def responses():
         neutral = replay(planar, vector_of({}), DT, *inputs)
         for effect in LIBRARY:
             power = np.zeros(len(CHANNELS))
+            carrier = (
+                {p.name: 0.5 * p.high for p in effect_named(effect.modifies).parameters}
+                if effect.modifies
+                else {}
+            )
+            without = replay(planar, vector_of(carrier), DT, *inputs) if carrier else neutral
             for p in effect.parameters:
-                shown = replay(planar, vector_of({p.name: p.step}), DT, *inputs)
-                power += (((shown - neutral) / noise)[50:-50] ** 2).mean(axis=0)
+                shown = replay(planar, vector_of(carrier | {p.name: p.step}), DT, *inputs)
+                power += (((shown - without) / noise)[50:-50] ** 2).mean(axis=0)
             found[drive, effect.name] = np.sqrt(power)
     return found
 
@@ -102,7 +108,7 @@ def test_names_are_unique_and_the_neutral_value_lies_within_the_bounds():
         for p in effect.parameters:
             assert p.low <= 0.0 < p.high
             assert 0.0 < p.step < 0.1 * p.high
-            assert p.unit in ("ratio", "rad", "s", "m", "radps", "mps2", "nspm")
+            assert p.unit in ("ratio", "rad", "s", "s2", "m", "a", "radps", "mps2", "nspm")
 
 
 @pytest.mark.parametrize("name", ["steering_play=0.01", "steering_backlash=0.01"])

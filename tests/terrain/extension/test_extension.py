@@ -71,6 +71,7 @@ def test_corrections_change_the_parameter_of_each_effect():
     assert robot.sensors.gyro_bias_z_radps == e["gyro_bias_radps"]
     assert robot.sensors.accel_bias_x_mps2 == e["accel_bias_mps2"]
     assert robot.encoder_lag_s == robot.sensors.encoder_time_constant_s == 0.05 + e["encoder_lag_s"]
+    assert robot.sensors.imu_latency_s == pytest.approx(0.005 + e["imu_latency_s"])
     assert robot.camera.latency_s == pytest.approx(0.006 + e["camera_latency_s"])
     assert robot.camera.lever_x_m == pytest.approx(0.6685 + e["lever_x_m"])
     assert robot.camera.lever_y_m == pytest.approx(-0.26875 + e["lever_y_m"])
@@ -150,8 +151,10 @@ SENSED = {
     "gyro_scale_ratio": -0.1,
     "gyro_bias_radps": 0.02,
     "accel_bias_mps2": 0.3,
-    "clock_offset_s": 0.1,
+    "clock_offset_s": -0.1,
     "clock_rate_ratio": 0.003,
+    "current_offset_a": 0.8,
+    "wheel_scale_2_ratio": -0.04,
     "motor_drift_ratio": 0.3,
     "motor_constant_ratio": 0.1,
 }
@@ -170,6 +173,7 @@ def test_a_correction_is_the_inverse_of_what_sensors_do(names):
     np.testing.assert_allclose(other.values, camera.values, atol=8 * ROBOT.camera.yaw_rate_std_radps)
     table, plain = measurement_table(back, robot), measurement_table(clean, ROBOT)
     worst = {"accel": 1e-9, "gyro": 1e-3, "imu_yaw": 0.01, "camera_speed": 0.01, "camera_yaw": 0.02}
+    worst |= {"wheel": 4e-3} if "wheel_scale_2_ratio" in effects else {}
     for row, column, desired in zip(table.rows, table.z.T, plain.z.T, strict=True):
         allowed = next((limit for start, limit in worst.items() if row.startswith(start)), 1e-9)
         np.testing.assert_allclose(column, desired, atol=allowed, err_msg=row)
@@ -226,10 +230,12 @@ def test_a_skid_steer_robot_without_sections_is_corrected_in_its_samples():
         "gyro_bias_radps": 0.02,
         "gyro_scale_ratio": 0.05,
         "motor_constant_ratio": 0.2,
-        "clock_offset_s": 0.3,
+        "clock_offset_s": 0.1,
+        "imu_latency_s": 0.2,
+        "current_offset_a": 0.4,
         "yaw_delay_s": 0.1,
     }
-    measured = [left / 1.1 / 0.97, right / 1.1 / 1.03, np.full(time_s.size, 1.2), np.full(time_s.size, 2.4)]
+    measured = [left / 1.1 / 0.97, right / 1.1 / 1.03, np.full(time_s.size, 1.6), np.full(time_s.size, 2.8)]
     gyro = 1.05 * turn + 0.02
     streams = {
         "wheels": Stream(time_s, np.column_stack(measured), channels),

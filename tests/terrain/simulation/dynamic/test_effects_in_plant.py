@@ -156,6 +156,30 @@ def gyro_late(run, robot):
     return -slope(np.gradient(true, imu.time_s), imu.channel("gyro_z_radps") - true)
 
 
+def imu_late(run, robot):
+    imu = run.streams["imu"]
+    true = truth(run, "yaw_rate_radps", imu.time_s - robot.sensors.imu_latency_s)
+    return -slope(np.gradient(true, imu.time_s), imu.channel("gyro_z_radps") - true)
+
+
+def standing_current(run, robot):
+    wheels = run.streams["wheels"]
+    stands = wheels.time_s < 0.9
+    return float(sum(wheels.channel(f"current_{i}_a")[stands].mean() for i in (1, 2, 3)))
+
+
+def counted(i):
+    """Measured over true rate of a wheel."""
+
+    def feature(run, robot):
+        wheels, late = steady(run, "wheels")
+        true = truth(run, f"wheel_{i}_radps", wheels.time_s[late])
+        measured = wheels.channel(f"motor_{i}_radps")[late] / robot.motors.reduction_ratio
+        return slope(true, measured) if np.ptp(true) > 1.0 else float(measured.mean() / true.mean())
+
+    return feature
+
+
 def encoder_late(run, robot):
     wheels = run.streams["wheels"]
     true = truth(run, "wheel_1_radps", wheels.time_s)
@@ -218,6 +242,10 @@ CASES = {
         *(asked(radii=(1 - E / 2, 1 - E / 2, 1 + E / 2)), True),
     ),
     **{
+        f"wheel_scale_{i}": ((0.05,), "straight", "tiles", LEVEL, counted(i), -0.05 / 1.05, True)
+        for i in (1, 2, 3)
+    },
+    **{
         f"steering_offset_{i}": (
             *((0.04,), "straight", "tiles", LEVEL, twist_error(component)),
             *(asked(steer=0.04 * (np.arange(3) == i - 1), component=component), True),
@@ -229,6 +257,7 @@ CASES = {
     "gyro_bias": ((0.03,), "straight", "grass", LEVEL, standing("gyro_z_radps"), 0.03, True),
     "gyro_scale": ((-0.05,), "spot_turn", "tiles", LEVEL, gyro_slope, -0.05, True),
     "accel_bias": ((0.3,), "straight", "grass", LEVEL, standing("accel_x_mps2"), 0.3, True),
+    "imu_latency": ((0.06,), "complex", "grass", LEVEL, imu_late, 0.06, True),
     "camera_latency": ((0.06,), "starts", "grass", LEVEL, camera_late, 0.06, True),
     "camera_yaw": ((0.05,), "straight", "tiles", LEVEL, sideways, 0.05, True),
     "lever_arm": ((0.1, -0.07), "spot_turn", "tiles", LEVEL, lever(0), 0.1, True),
@@ -242,6 +271,7 @@ CASES = {
     "viscous_drag": ((40.0,), "straight", "tiles", LEVEL, traction, 40.0 / WEIGHT_N, False),
     "payload": ((0.3,), "straight", "tiles", UPHILL, traction, None, False),
     "motor_constant": ((0.2,), "straight", "tiles", UPHILL, current, None, True),
+    "current_offset": ((0.4,), "straight", "tiles", LEVEL, standing_current, 3 * 0.4, True),
     "motor_drift": ((0.5,), "straight", "tiles", UPHILL, warming, None, True),
     "side_hill_slip": ((0.3,), "straight", "tiles", ACROSS, sideways, -0.3 * math.atan(0.15), False),
 }
@@ -361,7 +391,7 @@ def test_only_the_other_logger_has_its_own_clock():
         ({"effective_track_ratio": 0.5}, "does not apply to a robot with the drive 'swerve'"),
         ({"warp_ratio": 0.1}, "warp_ratio is no parameter"),
         ({"gyro_scale_ratio": math.nan}, "gyro_scale_ratio is nan"),
-        ({"gyro_scale_ratio": 0.5}, "a number from -0.3 to 0.3"),
+        ({"gyro_scale_ratio": 0.5}, "a number from -0.15 to 0.15"),
     ],
 )
 def test_an_effect_that_cannot_be_is_refused(effects, message):

@@ -16,6 +16,7 @@ from terrain.effects import (
     SPEED_X,
     SPEED_Y,
     TURNING_CURRENT,
+    effect_named,
     library_of,
     vector_of,
 )
@@ -26,7 +27,7 @@ from terrain.simulation.planar.ideal_sensors import sense
 from terrain.simulation.planar.model import TRUTH, Ground, make_planar
 from terrain.simulation.planar.motion import move
 from terrain.simulation.planar.replay import replay
-from terrain.simulation.planar.signals import delayed
+from terrain.simulation.planar.signals import delayed, lagged
 from terrain.simulation.planar.skid_steer import ENDO_POWER, STANDSTILL_MPS, direction
 from terrain.simulation.planar.swerve import ROLLING_MPS
 
@@ -106,11 +107,11 @@ def test_an_effect_shows_most_where_the_library_says(drive):
     def shown(values):
         return replay(inputs[0], vector_of(values), *inputs[1:])
 
-    neutral = shown({})
-    size = neutral.std(axis=0) + 1e-9
+    size = shown({}).std(axis=0) + 1e-9
     for effect in LIBRARY:
+        carrier = {p.name: 0.25 for p in effect_named(effect.modifies).parameters} if effect.modifies else {}
         values = {p.name: 10 * p.step for p in effect.parameters}
-        change = np.sqrt(((shown(values) - neutral) ** 2).mean(axis=0)) / size
+        change = np.sqrt(((shown(carrier | values) - shown(carrier)) ** 2).mean(axis=0)) / size
         # yaw rate and heading, both currents and both speeds stand for each other; what shifts a speed in
         # time shifts its slope, and most where friction turns about
         alike = {GYRO: HEADING, CURRENT: TURNING_CURRENT, SPEED_X: SPEED_Y}
@@ -270,6 +271,84 @@ def test_kinematic_effects_match_their_formulas():
             assert aside == pytest.approx(-0.4 * roll * 0.5)  # downhill, in both driving directions
 
 
+def test_a_turning_robot_slips_to_the_outside_of_the_turn_and_slows_down():
+    for speed in (0.5, -0.5):
+        for turn in (0.8, -0.8):
+            wheels = skid(HUSKY, speed, turn)
+            aside = speeds(wheels, {"turn_side_slip_s": 0.15})
+            assert aside[SPEED_Y][-1] == pytest.approx(-0.15 * speed * turn)
+            # the centripetal acceleration w v_x points to the inside, the slip to the outside
+            assert np.sign(aside[SPEED_Y][-1]) == -np.sign(turn * speed)
+            np.testing.assert_array_equal(aside[GYRO], speeds(wheels, {})[GYRO])
+            slow = speeds(wheels, {"turn_drag_s2": 0.7})
+            assert slow[SPEED_X][-1] == pytest.approx(speed / (1 + 0.7 * turn**2))
+            assert speeds(wheels, {"turn_drag_s2": -0.1})[SPEED_X][-1] == pytest.approx(
+                speed * (1 + 0.1 * turn**2)
+            )
+    # the yaw rate is that of the robot: with three times the track it turns a third
+    wide = {"effective_track_ratio": 2.0, "turn_drag_s2": 0.9, "turn_side_slip_s": 0.2}
+    shown = speeds(skid(HUSKY, 0.5, 0.9), wide)
+    slow = 0.5 / (1 + 0.9 * 0.3**2)
+    assert shown[SPEED_X][-1] == pytest.approx(slow)
+    assert shown[SPEED_Y][-1] == pytest.approx(-0.2 * slow * 0.3)
+    # no drag turns the motion about
+    assert (speeds(skid(HUSKY, 0.5, 4.0), {"turn_drag_s2": 3.0})[SPEED_X] > 0).all()
+
+
+def test_side_slip_builds_up_as_inertia_against_friction():
+    """m (dv_y/dt + w v) = -K v_y with m/K = 0.2 s, by Euler's small steps; one value for both parameters."""
+    dt, tau = 1e-3, 0.2
+    t = dt * np.arange(6000)
+    turn, speed = 0.6 * np.sin(2.0 * t), 0.5 + 0.2 * np.sin(1.3 * t)
+    v_y = np.zeros(t.size)
+    for k in range(t.size - 1):
+        v_y[k + 1] = v_y[k] + dt * (-turn[k] * speed[k] - v_y[k] / tau)
+    both = {"turn_side_slip_s": tau, "side_slip_build_up_s": tau}
+    shown = replayed(still(HUSKY), both, skid(HUSKY, speed, turn), dt=dt)
+    np.testing.assert_allclose(shown[SPEED_Y], v_y, atol=2e-4)
+    at_once = replayed(still(HUSKY), {"turn_side_slip_s": tau}, skid(HUSKY, speed, turn), dt=dt)
+    assert np.abs(at_once[SPEED_Y] - v_y).max() > 0.01
+    alone = replayed(still(HUSKY), {"side_slip_build_up_s": tau}, skid(HUSKY, speed, turn), dt=dt)
+    assert not alone[SPEED_Y].any()
+
+
+def test_a_lag_is_exact_for_a_ramp_and_nothing_without_a_time_constant():
+    ramp = 0.3 * DT * np.arange(N)
+    exact = 0.3 * (TIME_S - 0.25 * (1.0 - np.exp(-TIME_S / 0.25)))
+    np.testing.assert_allclose(lagged(ramp, 0.25, DT), exact, atol=1e-12)
+    np.testing.assert_array_equal(lagged(ramp, 0.0, DT), ramp)
+    np.testing.assert_allclose(lagged(ramp, 1e-6, DT), ramp, atol=1e-6)
+
+
+def test_the_scale_of_an_encoder_is_that_of_its_wheel():
+    robot = still(AGRIMARO)
+    twist = np.array([0.5, 0.1, 0.2])
+    wheel, steer = inverse(robot.wheel_positions_m, robot.wheel_radius_m, twist, np.zeros(3))
+    rolled = wheel * robot.wheel_radius_m
+    for i in range(3):
+        lost = rolled.copy()
+        lost[i] /= 1.05
+        shown = replayed(robot, {f"wheel_scale_{i + 1}_ratio": 0.05}, at_rate(lost), at_rate(steer))
+        for channel, value in zip((SPEED_X, SPEED_Y, GYRO), twist, strict=True):
+            np.testing.assert_allclose(shown[channel], value, atol=1e-7)
+    values = dict.fromkeys((f"wheel_scale_{i}_ratio" for i in (1, 2, 3)), 0.05)
+    every = replayed(robot, values, at_rate(rolled), at_rate(steer))
+    radius = replayed(robot, {"wheel_radius_ratio": 0.05}, at_rate(rolled), at_rate(steer))
+    np.testing.assert_allclose(every[SPEED_X], radius[SPEED_X], rtol=1e-12)
+    sides = values | {"wheel_scale_1_ratio": -0.03, "wheel_scale_2_ratio": -0.03, "wheel_scale_3_ratio": 0.03}
+    every = replayed(robot, sides, at_rate(rolled), at_rate(steer))
+    one_sided = replayed(robot, {"one_sided_radius_ratio": 0.06}, at_rate(rolled), at_rate(steer))
+    np.testing.assert_allclose(every[GYRO], one_sided[GYRO], rtol=1e-12)
+
+
+@pytest.mark.parametrize("robot", ROBOTS.values(), ids=ROBOTS)
+def test_each_motor_has_the_offset_of_its_current(robot):
+    wheel_speed = at_rate([0.5] * len(robot.wheels))
+    plain, shown = (replayed(robot, values, wheel_speed) for values in ({}, {"current_offset_a": 0.5}))
+    np.testing.assert_allclose(shown[CURRENT], plain[CURRENT] + 0.5 * len(robot.wheels))
+    np.testing.assert_array_equal(shown[TURNING_CURRENT], plain[TURNING_CURRENT])
+
+
 def test_steering_effects_match_their_formulas():
     robot = still(AGRIMARO)
     wheel, steer = inverse(
@@ -316,6 +395,17 @@ def test_sensor_effects_match_their_formulas():
     late = change(camera_latency_s=0.1)
     np.testing.assert_allclose(late[SPEED_X][5:], v[:-5], atol=1e-12)
     np.testing.assert_allclose(late[GYRO], w)
+    np.testing.assert_array_equal(late[ACCEL], plain[ACCEL])
+    imu = change(imu_latency_s=0.06)
+    for channel in (GYRO, ACCEL):
+        np.testing.assert_allclose(imu[channel][3:], plain[channel][:-3], atol=1e-12)
+    np.testing.assert_allclose(imu[SPEED_X], v, atol=1e-12)
+    np.testing.assert_allclose(imu[HEADING], w)
+    early = change(clock_offset_s=-0.06)  # wheels whose logger is late: all else is ahead of them
+    for channel in (GYRO, SPEED_X, ACCEL, HEADING):
+        np.testing.assert_allclose(early[channel][:-3], plain[channel][3:], atol=1e-12)
+        np.testing.assert_array_equal(early[channel][-3:], plain[channel][-1])
+    np.testing.assert_array_equal(early[CURRENT], plain[CURRENT])
     offset = change(clock_offset_s=0.06)
     np.testing.assert_allclose(offset[GYRO][3:], w[:-3], atol=1e-12)
     np.testing.assert_allclose(offset[CURRENT], plain[CURRENT])

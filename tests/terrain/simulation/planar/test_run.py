@@ -88,10 +88,18 @@ def replayed(run, robot, values, ground):
     return replay(make_planar(robot, ground), vector_of(values), 0.02, *given)
 
 
+OWN = {
+    "skid_steer": [{"turn_side_slip_s": 0.15, "side_slip_build_up_s": 0.2, "turn_drag_s2": 0.9}],
+    "swerve": [{"wheel_scale_2_ratio": 0.05}],
+}
+"""Effects that robots of one drive alone have."""
+
 EFFECTS = [
     {},
     {"wheel_radius_ratio": 0.05, "force_slip_ratio": 0.3, "payload_ratio": 0.2},
     {"clock_offset_s": 0.07, "camera_latency_s": 0.05},
+    {"clock_offset_s": -0.26},
+    {"imu_latency_s": 0.16, "current_offset_a": 0.7},
     {"clock_rate_ratio": 0.002},
     {"encoder_lag_s": 0.12},
     {"pitch_offset_rad": 0.03, "roll_offset_rad": -0.02, "side_hill_slip_ratio": 1.0},
@@ -99,8 +107,11 @@ EFFECTS = [
 ]
 
 
-@pytest.mark.parametrize("values", EFFECTS, ids=lambda values: "+".join(values) or "none")
-@pytest.mark.parametrize("robot", ROBOTS, ids=NAMES)
+@pytest.mark.parametrize(
+    ("robot", "values"),
+    [(robot, values) for robot in ROBOTS for values in (*EFFECTS, *OWN[robot.drive])],
+    ids=lambda each: getattr(each, "name", None) or "+".join(each) or "none",
+)
 def test_a_replay_with_the_same_effects_reproduces_the_log(robot, values):
     ground = Ground()
     run = simulate_planar(
