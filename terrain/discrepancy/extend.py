@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from terrain.discrepancy.diagnose import INTERVAL_T
+from terrain.discrepancy.answers import INTERVAL_T
 from terrain.discrepancy.residuals import LowPass, Rows, rows_of
 from terrain.discrepancy.signals import signals_of
 from terrain.discrepancy.simulation import Simulation

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -27,6 +28,9 @@ STANDSTILL_MPS = 0.05
 HARMONICS = (1, 2)
 """Of a wheel's angle: an eccentric wheel, an oval one."""
 
+PLACEBOS = (0.63, 1.37, 1.63)
+"""Multiples of a wheel's angle that nothing on a wheel repeats with."""
+
 
 class ProbeResult(NamedTuple):
     """Evidence of one probe.
@@ -35,10 +39,12 @@ class ProbeResult(NamedTuple):
     ----------
     z : as of :class:`terrain.discrepancy.selection.Evidence`
     gain : fall of minus twice the log-likelihood, were it built in
+    alike : by selected parameter, the correlation of what the input and the parameter change in the channel
     """
 
     z: float
     gain: float
+    alike: Mapping[str, float] = MappingProxyType({})
 
     @property
     def significant(self) -> bool:
@@ -109,15 +115,23 @@ def probe_residuals(
             results[channel, name] = result
         n_wheels = info.rows[0].inputs.shape[1] - len(INPUTS) + 1
         for wheel in range(n_wheels):
+            false = [_wave_statistics(info, c, _waves(info, c, wheel, times)) for times in PLACEBOS]
+            placebo = float(np.mean(np.concatenate(false))) / 2.0 if false[0].size else 1.0
             for harmonic in HARMONICS:
-                pairs = []
-                for run, residual in zip(info.rows, info.white_residual, strict=True):
-                    phase = harmonic * run.inputs[:, len(INPUTS) - 1 + wheel]
-                    pair = run.inputs[:, 0] * np.array([np.cos(phase), np.sin(phase)])
-                    pairs.append(_white(info, run, c, pair, residual))
                 name = f"wheel {wheel + 1} turn" + ("" if harmonic == 1 else f" x{harmonic}")
-                results[channel, name] = _wheel_turn_probe(info, c, pairs)
+                waves = _waves(info, c, wheel, harmonic)
+                results[channel, name] = _wheel_turn_probe(info, c, waves, placebo)
     return results
+
+
+def _waves(info: Information, c: int, wheel: int, times: float) -> list[Array]:
+    """Return cosine and sine (2, rows) of a multiple of a wheel's angle in each run, whitened as channel c."""
+    pairs = []
+    for run, residual in zip(info.rows, info.white_residual, strict=True):
+        phase = times * run.inputs[:, len(INPUTS) - 1 + wheel]
+        pair = run.inputs[:, 0] * np.array([np.cos(phase), np.sin(phase)])
+        pairs.append(_white(info, run, c, pair, residual))
+    return pairs
 
 
 def parameter_drifts(info: Information, names: Sequence[str], change: Array) -> dict[str, ProbeResult]:
@@ -146,12 +160,14 @@ def _probe_results(
     at = info.places(names)
     n_runs, q = len(columns), columns[0].shape[0]
     own, cross, score = np.empty((n_runs, q)), np.empty((n_runs, q, len(at))), np.empty((n_runs, q))
+    power = np.zeros(len(at))
     for i, x in enumerate(columns):
         white, residual = info.white_change[i], info.white_residual[i]
         j = white.reshape(len(white), -1) if c is None else white[:, :, c]
         r = residual.ravel() if c is None else residual[:, c]
         xn = x @ j[info.nuisances].T
         own[i] = (x * x).sum(axis=1) - np.einsum("qi,ij,qj->q", xn, info.inner[i], xn)
+        power += (j[at] ** 2).sum(axis=1)
         cross[i] = x @ j[at].T - xn @ info.shift[i][:, at]
         score[i] = x @ r - xn @ info.shift[i][:, -1]
     a = info.a[:, at][:, :, at]
@@ -168,6 +184,8 @@ def _probe_results(
     enough = free > 1e-6 * np.maximum(own.sum(axis=0), 1e-12)
     free = np.where(enough, free, np.inf)
     size = total / free
+    both = np.sqrt(np.maximum(np.outer(own.sum(axis=0), power), 1e-30))
+    alike = np.abs(cross.sum(axis=0)) / both
     answers = []
     for k in range(q):
         if not enough[k]:
@@ -176,13 +194,29 @@ def _probe_results(
         part_k = part[:, k] - size_of_run[:, k] * size[k]
         dispersion, dof = pooled_variance(part_k, np.clip(size_of_run[:, k] / free[k], 0.0, 0.9), free[k])
         z = z_of_t(abs(total[k]) / np.sqrt(free[k] * dispersion), dof)
-        answers.append(ProbeResult(z, float(total[k] ** 2 / free[k])))
+        known = dict(zip(names, alike[k].tolist(), strict=True))
+        answers.append(ProbeResult(z, float(total[k] ** 2 / free[k]), known))
     return answers
 
 
-def _wheel_turn_probe(info: Information, c: int, pairs: list[Array]) -> ProbeResult:
-    """Return the result of a wave with a phase of its own in each run: two columns a run."""
-    statistic, each = 0.0, []
+def _wheel_turn_probe(info: Information, c: int, pairs: list[Array], placebo: float) -> ProbeResult:
+    """Return the result of a wave with a phase of its own in each run: two columns a run.
+
+    ``placebo`` is the mean square of waves that no wheel makes: what they explain is no turn of a wheel.
+    """
+    each = _wave_statistics(info, c, pairs)
+    if not each.size:
+        return ProbeResult(0.0, 0.0)
+    each = each / max(placebo, 1.0)
+    z = z_of(float(chi2.logsf(each.sum(), 2 * each.size)))
+    # the median of chi^2 with 2 degrees is 2 log 2
+    in_most_runs = float(np.median(each)) > 2 * math.log(2.0) * 1.5
+    return ProbeResult(z if in_most_runs else 0.0, float(each.sum()) - 2 * each.size)
+
+
+def _wave_statistics(info: Information, c: int, pairs: list[Array]) -> Array:
+    """Return what two columns explain of the residual of each run (runs,), as chi^2 with 2 degrees."""
+    each = []
     for i, x in enumerate(pairs):
         j, r = info.white_change[i][:, :, c], info.white_residual[i][:, c]
         xn = x @ j[info.nuisances].T
@@ -190,11 +224,4 @@ def _wheel_turn_probe(info: Information, c: int, pairs: list[Array]) -> ProbeRes
         score = x @ r - xn @ info.shift[i][:, -1]
         if np.linalg.eigvalsh(own)[0] > 1e-6:
             each.append(float(score @ np.linalg.solve(own, score)))
-            statistic += each[-1]
-    if not each:
-        return ProbeResult(0.0, 0.0)
-    z = z_of(float(chi2.logsf(statistic, 2 * len(each))))
-    in_most_runs = (
-        float(np.median(each)) > 2 * math.log(2.0) * 1.5
-    )  # the median of chi^2 with 2 degrees is 2 log 2
-    return ProbeResult(z if in_most_runs else 0.0, statistic - 2 * len(each))
+    return np.array(each)

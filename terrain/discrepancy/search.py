@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence, Set
+from collections.abc import Iterator, Mapping, Sequence, Set
 from typing import NamedTuple
 
 import numpy as np
@@ -53,6 +53,10 @@ RIVAL_LINEAR, RIVAL_RATIO = 80.0, 0.5
 
 Z_PAIR = 4.6
 """Evidence that each of two effects needs beside the other, if neither is significant alone: 4e-6."""
+
+SHARED = 0.5
+"""Least correlation of what a cause and its rival change: one that shares less with it explains something
+else, and is no rival, however little worse it fits."""
 
 ALIKE = 0.99
 """Two effects whose sensitivities correlate more are not taken for a pair."""
@@ -126,8 +130,9 @@ class Found(NamedTuple):
     causes : effects selected, in the order in which they came
     info : of the runs there, changes counted from the simulation that was given
     change : (k,) of the parameters ``names``, and its covariance
-    rivals : by cause, the effects that fit as well in its place
+    rivals : by cause, the effects that fit as well in its place, once :func:`with_rivals` has looked
     tried : last evidence of every effect
+    assumed_scatter : from run to run, by parameter, as the simulation was given it
     """
 
     causes: tuple[Effect, ...]
@@ -137,6 +142,7 @@ class Found(NamedTuple):
     cov: Array
     rivals: dict[str, tuple[Rival, ...]]
     tried: dict[str, Evidence]
+    assumed_scatter: Mapping[str, float]
 
 
 def names_of(effects: Sequence[Effect]) -> tuple[str, ...]:
@@ -178,14 +184,32 @@ def search(problem: Problem, start: Information) -> Found:
             barred = set()
             causes, info = more, at
         barred |= {effect.name for effect in new if effect not in causes}
+    return _found(problem, info, causes)
+
+
+def refit(problem: Problem, start: Information, found: Found, causes: Sequence[Effect]) -> Found:
+    """Return some of the causes that were found, fitted without the others; no other is searched.
+
+    Those that are no longer significant are dropped.
+    """
+    kept, info = _refit_significant(problem, found.info, start.vector, list(causes))
+    return _found(problem, info, kept)
+
+
+def _found(problem: Problem, info: Information, causes: Sequence[Effect]) -> Found:
+    """Return what there is to say about causes at their fit, rivals left out."""
     names = names_of(causes)
     change, cov = fit_change(info, names)
-    rivals = _rivals(problem, info, start, causes)
     tried = {
         effect.name: evidence(info, [n for n in names if n not in names_of([effect])], effect)
         for effect in problem.library
     }
-    return Found(tuple(causes), info, names, change, cov, rivals, tried)
+    return Found(tuple(causes), info, names, change, cov, {}, tried, problem.simulation.scatter)
+
+
+def with_rivals(problem: Problem, start: Information, found: Found) -> Found:
+    """Return the same with the effects that fit as well in the place of a cause."""
+    return found._replace(rivals=_rivals(problem, found.info, start, found.causes))
 
 
 def _next(
@@ -380,16 +404,21 @@ def _near(problem: Problem, info: Information, cause: Effect, others: Sequence[E
         for effect in problem.library
         if effect not in causes
         and loss_of(info, names_of([*others, effect])) - now < most
+        and _alike(info, others, cause, effect) > SHARED
         and evidence(info, names_of(others), effect).inside
     ]
 
 
 def _allowed(info: Information, others: Sequence[Effect], cause: Effect, rival: Effect) -> float:
     """Return by how much a rival may fit worse than a cause and still be a rival."""
+    return TWIN_LOSS if _alike(info, others, cause, rival) > TWIN else RIVAL_LOSS
+
+
+def _alike(info: Information, others: Sequence[Effect], cause: Effect, rival: Effect) -> float:
+    """Return the correlation of what a cause and another effect change beside the others."""
     base, own, its = (info.places(names_of(effects)) for effects in (others, [cause], [rival]))
     free = partial_information(info.a.sum(axis=0), base, [*own, *its])[1]
-    alike = correlation(free, range(len(own)), range(len(own), len(own) + len(its)))
-    return TWIN_LOSS if alike > TWIN else RIVAL_LOSS
+    return correlation(free, range(len(own)), range(len(own), len(own) + len(its)))
 
 
 def _refit(problem: Problem, info: Information, base: Array, names: Sequence[str]) -> _Refit:

@@ -21,6 +21,7 @@ class Verdict(StrEnum):
     EXPLAINED = "explained"
     AMBIGUOUS = "ambiguous"
     UNEXPLAINED = "unexplained"
+    VARIES = "varies"
     NOT_EXCITED = "not_excited"
     REFUSED = "refused"
 
@@ -46,6 +47,7 @@ class Cause(NamedTuple):
         its fit, and its 95 % interval by bootstrap over runs
     channels : where it shows, the clearest first
     z, dispersion : its evidence, see :class:`terrain.discrepancy.selection.Evidence`
+    caveat : what the values depend on, in words; empty where they are the same throughout
     """
 
     name: str
@@ -57,6 +59,39 @@ class Cause(NamedTuple):
     channels: tuple[str, ...]
     z: float
     dispersion: float
+    caveat: str = ""
+
+
+class RunGroup(NamedTuple):
+    """Runs in which a parameter has one value, and the standard deviation of that."""
+
+    value: float
+    std: float
+    run_ids: tuple[str, ...]
+
+
+class Varying(NamedTuple):
+    """An effect whose size differs from run to run.
+
+    Parameters
+    ----------
+    name, parameter, unit : of the effect
+    rivals : effects that explain the differences as well
+    mean, scatter : of the values over runs
+    z : evidence of the difference, as a standard normal number
+    groups : two groups of runs, the smaller value first; empty where values are spread
+    channel : where it shows most
+    """
+
+    name: str
+    parameter: str
+    unit: str
+    rivals: tuple[str, ...]
+    mean: float
+    scatter: float
+    z: float
+    groups: tuple[RunGroup, ...]
+    channel: str
 
 
 class Unexplained(NamedTuple):
@@ -146,7 +181,8 @@ class Diagnosis:
     Parameters
     ----------
     robot : name
-    verdict : ``explained`` where a cause is named, also when something else is left unexplained
+    verdict : ``explained`` where a cause is named, also when something else is left unexplained; ``varies``
+        where what was found has no value that all runs share
     causes : named
     parameters, cov : names (k,) of their parameters, and the covariance (k, k) of the values
     ambiguous_sets : effects of which one is present, and which these runs cannot distinguish; best fit first
@@ -159,6 +195,7 @@ class Diagnosis:
     next_drive : None where nothing is to be distinguished
     residual_before, residual_after : by channel, with the simulation given and with the causes built in
     n_runs : that were compared
+    varying : effects whose size differs from run to run
     """
 
     robot: str
@@ -178,6 +215,7 @@ class Diagnosis:
     residual_before: dict[str, Residual]
     residual_after: dict[str, Residual]
     n_runs: int
+    varying: tuple[Varying, ...] = ()
 
     @property
     def values(self) -> dict[str, float]:
@@ -204,6 +242,7 @@ class Diagnosis:
                     "channels": list(cause.channels),
                     "z": finite(cause.z),
                     "dispersion": finite(cause.dispersion),
+                    "caveat": cause.caveat,
                 }
                 for cause in self.causes
             ],
@@ -216,6 +255,7 @@ class Diagnosis:
                 {"channel": x.channel, "input": x.input, "z": finite(x.z), "residual_ratio": finite(x.ratio)}
                 for x in self.unexplained
             ],
+            "varying": [_varying(each) for each in self.varying],
             "not_excited": [limit for limit in limits if limit["name"] in missed],
             "detection_limits": limits,
             "ruled_out": [
@@ -246,6 +286,15 @@ def _value(value: Value) -> dict[str, Any]:
         "unit": value.unit,
         "ci": [finite(value.low), finite(value.high)],
     }
+
+
+def _varying(each: Varying) -> dict[str, Any]:
+    groups = [
+        {"value": finite(group.value), "std": finite(group.std), "runs": list(group.run_ids)}
+        for group in each.groups
+    ]
+    plain = each._asdict() | {"rivals": list(each.rivals), "groups": groups}
+    return plain | {key: finite(plain[key]) for key in ("mean", "scatter", "z")}
 
 
 def _residual(residual: Residual) -> dict[str, Any]:
