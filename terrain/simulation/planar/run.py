@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import fields, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -80,7 +81,8 @@ def simulate_planar(  # noqa: PLR0913 - an entry whose options have defaults
 
     Parameters
     ----------
-    robot : with body, motors, camera and sensors; a swerve robot with steering
+    robot : a swerve robot with all its sections; of a skid-steer robot those that are missing do not act
+        (:func:`~terrain.simulation.planar.model.make_planar`), and without motors there are no currents
     twist : (n, 3) desired ``(speed_x_mps, speed_y_mps, yaw_rate_radps)`` at 50 Hz, from rest
     seed : of everything that is drawn; the same gives the same bytes, and a sequence is left as it is
     ground : a firm one by default
@@ -102,7 +104,7 @@ def simulate_planar(  # noqa: PLR0913 - an entry whose options have defaults
     Raises
     ------
     ConfigError
-        if the robot lacks a section, or a parameter or an outside cause is unknown or not finite.
+        if a swerve robot lacks a section, or a parameter or an outside cause is unknown or not finite.
 
     Examples
     --------
@@ -117,6 +119,8 @@ def simulate_planar(  # noqa: PLR0913 - an entry whose options have defaults
     """
     outside = outside or {}
     _check(robot, twist, outside, step_s)
+    currents = robot.describes("motors")
+    robot = with_silent_parts(robot)
     planar = make_planar(robot, ground or Ground())
     rngs = _generators(seed)
     p = vector_of({**robot.effects, **(effects or {})})
@@ -128,7 +132,7 @@ def simulate_planar(  # noqa: PLR0913 - an entry whose options have defaults
     motion = _motion(setup, desired, hills or Hills(), rngs)
     run = PlanarRun(robot, planar, p, step_s, motion, sense(planar, p, step_s, motion.truth), noise)
     streams = {
-        "wheels": wheels_stream(run, outside.get("stick_slip_a", 0.0), rngs),
+        "wheels": wheels_stream(run, outside.get("stick_slip_a", 0.0), rngs, currents),
         "imu": imu_stream(run, rngs["imu"]),
         "odometry": camera_stream(run, rngs["camera"]),
         "commands": commands_stream(robot, desired),
@@ -143,7 +147,8 @@ def simulate_planar(  # noqa: PLR0913 - an entry whose options have defaults
 
 
 def _check(robot: Robot, twist: Array, outside: Mapping[str, float], step_s: float) -> None:
-    robot.require(*robot.sections)
+    if robot.steered:
+        robot.require(*robot.sections)
     if twist.ndim != 2 or twist.shape[1] != 3 or len(twist) < 2 or not np.isfinite(twist).all():
         raise ConfigError(f"twist has shape {twist.shape}, (n, 3) finite numbers with two rows are required")
     if not robot.steered and twist[:, 1].any():
@@ -156,6 +161,23 @@ def _check(robot: Robot, twist: Array, outside: Mapping[str, float], step_s: flo
     parts = STEP_S / step_s if step_s > 0 else 0.0
     if parts < 0.5 or abs(parts - round(parts)) > 1e-9:
         raise ConfigError(f"step_s is {step_s:g}, {STEP_S:g} s or a whole part of it is required")
+
+
+def with_silent_parts(robot: Robot) -> Robot:
+    """Return the robot with parts that neither act nor are noisy for the sections that it lacks.
+
+    Examples
+    --------
+    >>> from terrain.robots import load_robot
+    >>> with_silent_parts(load_robot("warthog")).sensors.gyro_std_radps
+    0.0
+    """
+    silent = {
+        name: replace(part, **{f.name: 0.0 for f in fields(part) if math.isnan(getattr(part, f.name))})
+        for name, part in robot.completed.parts.items()
+        if name not in robot.parts
+    }
+    return robot.with_parts(**silent)
 
 
 def _generators(seed: int | np.random.SeedSequence) -> dict[str, np.random.Generator]:
