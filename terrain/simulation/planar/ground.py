@@ -18,8 +18,8 @@ SCRUB_SHARE = 0.4
 distance."""
 
 WIDTH_RATIO, CONTACT_RATIO = 0.6, 0.6
-"""Width of a tyre, and length of its contact on firm ground, over the radius of the wheel, where a description
-has no section ``body``; assumed: the described robots have 0.5 to 0.7, and 0.6."""
+"""Width of a tyre, and length of its contact on firm ground, over the wheel's radius, where a description has
+no section ``body``; assumed: the described robots have 0.5 to 0.7, and 0.6."""
 
 _SLIPS = np.linspace(0.0, 1.0, 101)
 

@@ -27,7 +27,7 @@ from terrain.effects import (
 from terrain.errors import ConfigError
 from terrain.kinematics.wheel_motion import WheelMotion, wheel_motion
 from terrain.records import Array, Label, RunLog
-from terrain.robots import Robot
+from terrain.robots import Part, Robot
 from terrain.simulation.planar.drives import COMMANDS_HZ, commands_stream, follow_commands
 from terrain.simulation.planar.hills import Hills, path_of, tilt_along, undulations
 from terrain.simulation.planar.ideal_sensors import sense
@@ -172,11 +172,11 @@ def with_silent_parts(robot: Robot) -> Robot:
     >>> with_silent_parts(load_robot("warthog")).sensors.gyro_std_radps
     0.0
     """
-    silent = {
-        name: replace(part, **{f.name: 0.0 for f in fields(part) if math.isnan(getattr(part, f.name))})
-        for name, part in robot.completed.parts.items()
-        if name not in robot.parts
-    }
+    silent: dict[str, Part] = {}
+    for name, part in robot.completed.parts.items():
+        if name not in robot.parts:
+            unknown = [item.name for item in fields(part) if math.isnan(getattr(part, item.name))]
+            silent[name] = replace(part, **dict.fromkeys(unknown, 0.0))  # type: ignore[arg-type]
     return robot.with_parts(**silent)
 
 
