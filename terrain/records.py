@@ -101,6 +101,8 @@ class RunLog:
     labels : terrain intervals; one for the whole run in the simple case, none when unlabelled
     source : where the log comes from, as text
     dropped : what a repairing reader removed, as counts by kind; empty after a strict read
+    session : outing that the run is part of, by name: runs of one session share what changes from one to the
+        next, as the weather, the ground and how the sensors were mounted; empty where unknown
     """
 
     run_id: str
@@ -109,6 +111,7 @@ class RunLog:
     labels: tuple[Label, ...] = ()
     source: str = ""
     dropped: Mapping[str, int] = field(default_factory=dict)
+    session: str = ""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "streams", MappingProxyType(dict(self.streams)))

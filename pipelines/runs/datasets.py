@@ -5,21 +5,30 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
+import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from terrain.errors import ConfigError, LogError
 from terrain.records import Array, RunLog
 
+if TYPE_CHECKING:
+    from terrain.logs.drive import DriveRobot
+    from terrain.robots import Robot
+
 LAYOUTS = ("auto", "runs", "borealtc", "csv", "drive")
 """``runs``: run folders as this package writes them; ``csv``: any CSV, by a mapping file; ``drive``: the
-file ``samples.csv.gz`` of the Husky log of DRIVE."""
+files ``samples.csv.gz`` of DRIVE, one a session."""
+
+DRIVE_ROBOT = "husky"
+"""Robot of a log of DRIVE where none is named: that of the log that was published with the paper."""
 
 ACCEPTED = (
     "accepted are run folders (run.json), the BorealTC layout (<CLASS>/imu_N.csv and pro_N.csv), "
-    "the DRIVE layout (samples.csv.gz), and any CSV with a mapping file"
+    "the DRIVE layout (samples.csv.gz, or folders of sessions with one each), and any CSV with a mapping file"
 )
 
 _log = logging.getLogger(__name__)
@@ -32,24 +41,27 @@ def load_runs(
     mapping: str | Path | None = None,
     repair: bool = False,
     align: bool = False,
+    robot: str | Path | None = None,
     on_skip: Callable[[str], None] = _log.warning,
 ) -> list[RunLog]:
     """Return the runs that lie under a folder, sorted by their id.
 
     Parameters
     ----------
-    folder : a run folder, a folder of run folders, a folder in the BorealTC or the DRIVE layout, or the
-        folder that the files of ``mapping`` are found under
+    folder : a run folder, a folder of run folders, a folder in the BorealTC or the DRIVE layout (a session,
+        or folders of sessions), or the folder that the files of ``mapping`` are found under
     layout : one of ``LAYOUTS``; ``auto`` looks
     mapping : YAML file that describes how to read CSV files (``terrain.logs.mapping``)
     repair : drop and count what a strict read refuses, and skip runs that cannot be read at all
     align : bring the wheel stream onto the clock of the IMU where the two clocks can be compared
+    robot : the robot of logs that do not name theirs, those of DRIVE, by name or its YAML file;
+        :data:`DRIVE_ROBOT` by default
     on_skip : called with a sentence for each run that is skipped when repairing; logs a warning by default
 
     Raises
     ------
     LogError
-        if nothing readable is there, a run cannot be read, or two runs have one id.
+        if nothing readable is there, a run cannot be read, two runs have one id, or layouts are mixed.
     ConfigError
         if the layout is unknown, the mapping is not accepted, or a robot is unknown (to align, or to turn
         motor rates into wheel speeds).
@@ -57,10 +69,11 @@ def load_runs(
         if a run that is to be aligned has no gyro or no wheel speeds.
     """
     folder = Path(folder)
+    described = _described(robot)
     runs = []
     skipped: list[str] = []
     places: dict[str, list[str]] = {}
-    for read in _readers(folder, layout, mapping):
+    for read in _readers(folder, layout, mapping, described):
         try:
             run = read(repair=repair)
         except LogError as error:
@@ -76,15 +89,15 @@ def load_runs(
     for run_id, found in places.items():
         if len(found) > 1:
             raise LogError(f"{folder}: {len(found)} runs have the id {run_id!r} ({' and '.join(found)})")
-    runs = sorted(map(_with_wheel_speeds, runs), key=lambda run: run.run_id)
-    return [_aligned(run) for run in runs] if align else runs
+    runs = sorted((_with_wheel_speeds(run, described) for run in runs), key=lambda run: run.run_id)
+    return [_aligned(run, described) for run in runs] if align else runs
 
 
 def data_digest(runs: Sequence[RunLog]) -> str:
     """Return a SHA-256 over the content of the runs, in hexadecimal.
 
-    It covers ids, robots, labels, channels, times and values, and neither order nor source nor layout on
-    disk: a data set read from CSV and from the run folders it was imported into has one digest.
+    It covers ids, robots, sessions, labels, channels, times and values, and neither order nor source nor
+    layout on disk: a data set read from CSV and from the run folders it was imported into has one digest.
 
     Examples
     --------
@@ -98,6 +111,7 @@ def data_digest(runs: Sequence[RunLog]) -> str:
             "run_id": run.run_id,
             "robot": run.robot,
             "labels": [list(label) for label in run.labels],
+            **({"session": run.session} if run.session else {}),
             "streams": {
                 name: [len(run.streams[name]), [run.streams[name].channels[i] for i in order]]
                 for name, order in orders.items()
@@ -121,7 +135,17 @@ def _place(read: Callable[..., RunLog], run: RunLog) -> str:
     return str(first) if isinstance(first, Path) and (first / "run.json").is_file() else run.source
 
 
-def _readers(folder: Path, layout: str, mapping: str | Path | None) -> list[Callable[..., RunLog]]:
+def _described(robot: str | Path | None) -> Robot | None:
+    if robot is None:
+        return None
+    from terrain.robots import load_robot
+
+    return load_robot(robot)
+
+
+def _readers(
+    folder: Path, layout: str, mapping: str | Path | None, robot: Robot | None
+) -> list[Callable[..., RunLog]]:
     if layout not in LAYOUTS:
         raise ConfigError(f"layout {layout!r} is unknown: choose one of {', '.join(LAYOUTS)}")
     if not folder.is_dir():
@@ -135,21 +159,33 @@ def _readers(folder: Path, layout: str, mapping: str | Path | None) -> list[Call
         from terrain.logs import mapping as by_mapping
 
         return by_mapping.find_runs(folder, by_mapping.load_mapping(mapping))
-    if layout in ("auto", "runs"):
-        from terrain.logs import read
+    from terrain.logs import borealtc, drive, read
 
-        readers = read.find_runs(folder)
-        if readers or layout == "runs":
-            return _some(readers, folder)
-    if layout in ("auto", "borealtc"):
-        from terrain.logs import borealtc
+    found: dict[str, list[Any]] = {
+        "runs": read.find_runs(folder) if layout in ("auto", "runs") else [],
+        "borealtc": borealtc.find_runs(folder) if layout in ("auto", "borealtc") else [],
+        "drive": drive.find_sessions(folder) if layout in ("auto", "drive") else [],
+    }
+    names = [name for name, readers in found.items() if readers]
+    if len(names) > 1:
+        raise LogError(f"{folder}: mixes the layouts {' and '.join(names)}; choose one with --format")
+    if names == ["drive"]:
+        return drive.find_runs(folder, _drive_robot(robot))
+    return _some([reader for readers in found.values() for reader in readers], folder)
 
-        readers = borealtc.find_runs(folder)
-        if readers or layout == "borealtc":
-            return _some(readers, folder)
-    from terrain.logs import drive
 
-    return _some(drive.find_runs(folder), folder)
+def _drive_robot(robot: Robot | None) -> DriveRobot:
+    """Return what the reader of DRIVE takes of a robot."""
+    from terrain.logs.drive import DriveRobot
+    from terrain.robots import as_skid_steer, load_robot
+
+    robot = as_skid_steer(
+        load_robot(DRIVE_ROBOT) if robot is None else robot,
+        "robot {name}: drive {drive!r} does not fit logs of DRIVE, which have a left and a right "
+        "wheel speed, as 'skid_steer' has",
+    )
+    fastest = robot.motors.speed_max_radps if robot.describes("motors") else math.inf
+    return DriveRobot(robot.name, robot.wheel_radius_m, fastest)
 
 
 def _some(readers: list[Callable[..., RunLog]], folder: Path) -> list[Callable[..., RunLog]]:
@@ -158,20 +194,31 @@ def _some(readers: list[Callable[..., RunLog]], folder: Path) -> list[Callable[.
     return readers
 
 
-def _with_wheel_speeds(run: RunLog) -> RunLog:
+def _with_wheel_speeds(run: RunLog, robot: Robot | None) -> RunLog:
     """Add wheel speeds where a log has motor rates, so that windows know how fast the robot drove."""
     wheels = run.streams.get("wheels")
     if wheels is None or not any(channel.startswith("motor_") for channel in wheels.channels):
         return run
     from terrain.kinematics.wheel_speed import with_wheel_speeds
+
+    return with_wheel_speeds(run, robot_of(run, robot))
+
+
+def robot_of(run: RunLog, robot: Robot | None) -> Robot:
+    """Return the robot of a run: ``robot``, where it has the name that the run states, else the package's.
+
+    Raises
+    ------
+    ConfigError
+        if the package has no robot of the name.
+    """
     from terrain.robots import load_robot
 
-    return with_wheel_speeds(run, load_robot(run.robot))
+    return robot if robot is not None and robot.name == run.robot else load_robot(run.robot)
 
 
-def _aligned(run: RunLog) -> RunLog:
+def _aligned(run: RunLog, robot: Robot | None) -> RunLog:
     from terrain.logs.align import align
     from terrain.logs.clock import estimate_clock
-    from terrain.robots import load_robot
 
-    return align(run, estimate_clock(run, track_m=load_robot(run.robot).track_m))
+    return align(run, estimate_clock(run, track_m=robot_of(run, robot).track_m))

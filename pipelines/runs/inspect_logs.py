@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from pipelines.runs.datasets import data_digest
+from pipelines.runs.datasets import data_digest, robot_of
 from pipelines.runs.results import InspectedRun, Inspection
 from pipelines.runs.settings import RunsSettings, load
 from terrain.errors import ConfigError, DataError
 from terrain.logs.clock import estimate_clock
 from terrain.logs.quality import stream_quality
 from terrain.records import RunLog
-from terrain.robots import load_robot
+from terrain.robots import Robot, load_robot
 
 
 def inspect_logs(settings: RunsSettings) -> Inspection:
@@ -21,12 +21,15 @@ def inspect_logs(settings: RunsSettings) -> Inspection:
         if a run cannot be read.
     """
     runs, skipped = load(settings)
-    return Inspection(len(runs), data_digest(runs), tuple(skipped), tuple(_inspected(run) for run in runs))
+    given = getattr(settings, "robot", None)
+    robot = None if given is None else load_robot(given)
+    inspected = tuple(_inspected(run, robot) for run in runs)
+    return Inspection(len(runs), data_digest(runs), tuple(skipped), inspected)
 
 
-def _inspected(run: RunLog) -> InspectedRun:
+def _inspected(run: RunLog, robot: Robot | None) -> InspectedRun:
     try:
-        clock = estimate_clock(run, track_m=load_robot(run.robot).track_m)
+        clock = estimate_clock(run, track_m=robot_of(run, robot).track_m)
     except (ConfigError, DataError):
         clock = None
     streams = {name: stream_quality(stream) for name, stream in run.streams.items()}

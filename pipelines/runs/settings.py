@@ -14,7 +14,10 @@ if TYPE_CHECKING:
 
 Layout = Literal["auto", "runs", "borealtc", "csv", "drive"]
 """``auto``: found out; ``runs``: run folders as this package writes them; ``csv``: any CSV, by a mapping
-file; ``drive``: the file ``samples.csv.gz`` of the Husky log of DRIVE."""
+file; ``drive``: the files ``samples.csv.gz`` of DRIVE, one a session."""
+
+
+ROBOT_TEXT = "Robot of logs that do not name theirs (DRIVE), by name or its YAML file; the husky by default."
 
 
 class ReadSettings(Settings):
@@ -39,6 +42,7 @@ class RunsSettings(ReadSettings):
 class AlignedRunsSettings(RunsSettings):
     """The runs of a command that can also bring their two loggers onto one clock."""
 
+    robot: str | None = setting(None, ROBOT_TEXT)
     align: bool = setting(False, "Bring the wheel stream onto the IMU's clock where both see the turns.")
 
 
@@ -46,6 +50,7 @@ class InspectSettings(RunsSettings):
     """What is inspected."""
 
     data: Path = setting(..., "Folder to read.", option="FOLDER")
+    robot: str | None = setting(None, ROBOT_TEXT)
 
 
 class ImportSettings(InspectSettings):
@@ -61,8 +66,13 @@ class LoadedRuns(NamedTuple):
     skipped: list[str]
 
 
-def load(settings: RunsSettings) -> LoadedRuns:
+def load(settings: RunsSettings, robot: str | None = None) -> LoadedRuns:
     """Return the runs, sorted by their id.
+
+    Parameters
+    ----------
+    settings : which runs, and how they are read
+    robot : of logs that do not name theirs; that of the settings by default, where they have one
 
     Raises
     ------
@@ -78,6 +88,7 @@ def load(settings: RunsSettings) -> LoadedRuns:
         mapping=settings.mapping,
         repair=settings.repair,
         align=isinstance(settings, AlignedRunsSettings) and settings.align,
+        robot=getattr(settings, "robot", None) if robot is None else robot,
         on_skip=skipped.append,
     )
     return LoadedRuns(runs, skipped)

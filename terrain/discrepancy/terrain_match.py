@@ -59,7 +59,7 @@ def simulation_for(
 
 def _ground(robot: Robot, label: str) -> Ground | None:
     """Return the soil of a label for the planar simulation; None where there is none that can be driven."""
-    if not robot.describes("body") or label not in (*soil_names(), *extra_soil_names()):
+    if label not in (*soil_names(), *extra_soil_names()):
         return None
     try:
         return planar_ground(robot, load_soil(label))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from terrain.estimation.estimate import Estimate
@@ -28,7 +30,7 @@ def enriched(estimate: Estimate) -> RunLog:
     streams["estimator"] = Stream(track.time_s, values, channels)
     streams["slip"] = estimate.slip.as_stream()
     streams["state"] = _state_stream(estimate)
-    return RunLog(run.run_id, run.robot, streams, run.labels, run.source, run.dropped)
+    return replace(run, streams=streams)
 
 
 def _state_stream(estimate: Estimate) -> Stream:

@@ -11,13 +11,17 @@ and filters take what is corrected.  A live chain gives its estimator the robot 
 corrected instead if the effect has an inverse.
 """
 
+from terrain.extension.basis import Basis, Origin, basis_of
 from terrain.extension.description import apply_homes, check_corrected, corrected
 from terrain.extension.samples import Correction, correct, correct_live, corrected_log
 from terrain.extension.writing import extended_yaml, write_extended
 
 __all__ = [
+    "Basis",
     "Correction",
+    "Origin",
     "apply_homes",
+    "basis_of",
     "check_corrected",
     "correct",
     "correct_live",

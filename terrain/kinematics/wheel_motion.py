@@ -36,14 +36,14 @@ def wheel_motion(robot: Robot, twist: Array, dt_s: float) -> WheelMotion:
 
     Parameters
     ----------
-    robot : with motors, and steering where it has any
+    robot : a swerve robot with motors and steering; a skid-steer robot without motors has no fastest speed
     twist : (n, 3) desired ``(speed_x_mps, speed_y_mps, yaw_rate_radps)``
     dt_s : time from one twist to the next
 
     Raises
     ------
     ConfigError
-        if the description lacks a section.
+        if the description of a swerve robot lacks a section.
 
     Notes
     -----
@@ -76,6 +76,6 @@ def _(robot: SwerveRobot, twist: Array, dt_s: float) -> WheelMotion:
 @wheel_motion.register
 def _(robot: SkidSteerRobot, twist: Array, dt_s: float) -> WheelMotion:
     turn = 0.5 * robot.track_m * twist[:, 2]
-    limit = robot.wheel_radius_m * robot.motors.speed_max_radps
+    limit = robot.wheel_radius_m * robot.completed.motors.speed_max_radps
     speeds = np.clip(np.column_stack([twist[:, 0] - turn, twist[:, 0] + turn]), -limit, limit)
     return WheelMotion(twist, speeds, speeds / robot.wheel_radius_m, np.zeros_like(speeds))

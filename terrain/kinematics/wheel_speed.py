@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from terrain.records import RunLog, Stream
@@ -45,4 +47,4 @@ def with_wheel_speeds(run: RunLog, robot: Robot) -> RunLog:
         np.hstack([wheels.values[:, kept], wheel_speed]),
         (*(wheels.channels[i] for i in kept), *wheel_speeds),
     )
-    return RunLog(run.run_id, run.robot, streams, run.labels, run.source, run.dropped)
+    return replace(run, streams=streams)

@@ -1,38 +1,50 @@
-r"""Reader of the Husky log of DRIVE: random wheel commands in, lidar pose out.
+r"""Reader of the logs of DRIVE: random wheel commands in, lidar pose out.
 
-``samples.csv.gz`` holds windows of 40 samples at 20 Hz (Baril et al., DRIVE: Data-driven Robot Input Vector
-Exploration, ICRA 2024; repository norlab-ulaval/DRIVE, ``calib_data/test_husky``).  Three windows belong to
-a command, one while the robot changes its speed (``steady`` 0) and two after (``steady`` 1): they become a
-run ``step_000``, ``step_001``, ...  Terrain is not published, so no run has a label.
+A session is a folder with ``samples.csv.gz``, windows of 40 samples at 20 Hz (Baril et al., DRIVE:
+Data-driven Robot Input Vector Exploration, ICRA 2024; repositories norlab-ulaval/DRIVE, ``calib_data``, and
+norlab-ulaval/doughnut_calib).  Three windows belong to a command, one while the
+robot changes its speed (``steady`` 0) and two after (``steady`` 1): they become a run ``step_000``,
+``step_001``, ...  The file does not name its robot, which has to be given.
+
+Folders of sessions are read as one data set: runs are ``asphalt_1_step_000``, ..., and name their session.  A
+session's folder that is named ``<terrain>_<number>`` labels its runs; other runs have no label.
 
 ============  ==========================================  ===============================================
 stream        channels                                    from
 ============  ==========================================  ===============================================
 ``wheels``    ``speed_left_mps speed_right_mps``          ``wheel_left wheel_right`` (rad/s) times the
-                                                          maker's wheel radius, 0.165 m
+                                                          nominal wheel radius
 ``imu``       ``gyro_z_radps``                            ``imu_yaw``, a rate and no angle
 \             ``accel_x_mps2 accel_y_mps2 accel_z_mps2``  ``-imu_ax -imu_ay imu_az``, specific force
-``lidar``     ``speed_x_mps speed_y_mps yaw_rate_radps``  ``icp_x icp_y icp_yaw``, see :func:`body_twists`
+``lidar``     ``speed_x_mps speed_y_mps yaw_rate_radps``  ``icp_x icp_y icp_yaw``, see
+                                                          :func:`~terrain.logs.lidar_twist.body_twists`
 ``commands``  ``wheel_left_radps wheel_right_radps``      ``cmd_left cmd_right`` as published
 ============  ==========================================  ===============================================
 
-Little of the file is documented.  What is assumed here was held against the other columns:
+Little of the files is documented.  What is assumed here was compared with the other columns, first of the
+Husky's log, then of six sessions of a Warthog and one of a Marmotte:
 
 - *Windows* follow on one another, and so do commands.  The one after a change of speed begins a sample
-  late (wheel speeds, which are new every second sample, repeat across that edge in 15 % of the cases, and
-  in 50 % elsewhere); into the last one of five begins with the sample before it, which is read once.
+  late (wheel speeds, which are new every second sample of the Husky's, repeat across that edge in 15 % of the
+  cases, and in 50 % elsewhere; every fifth of the Warthog's, in 60 % and 80 %); into the last one of five
+  begins with the sample before it, which is read once.
   Within a window the clock is the nominal one; at its edge it is accurate to one sample.
 - *Runs* begin where ``steady`` falls to 0.  ``step`` of such a window may still be the one before (62 of
   201), so that the windows after it number the run.
-- ``imu_yaw`` is the rate of ``icp_yaw`` (slope 1.00, offset 2 mrad/s).  The accelerometer is turned by half
-  a turn about z: speeding up and turning left both read negative, and the tilt of the lidar pose agrees.
+- ``imu_yaw`` is the rate of ``icp_yaw`` (of the Husky slope 1.00, offset 2 mrad/s); on a few sessions its
+  sign is turned.  Signs and axes are documented nowhere and are read as those of the Husky, whose
+  accelerometer is turned by half a turn about z: speeding up and turning left both read negative, and the
+  tilt of the lidar pose agrees.  On other robots they may differ.
 - ``icp_yaw`` is a difference of two wrapped angles, and the position of a window is turned by the mean of
   the first five of them, not by the first: ``icp_x`` points along the mean heading of the first 0.25 s.
   Where the heading wraps within these (11 windows) that mean is no direction that the robot ever had.
-- *Late*: the lidar lags the gyro by 0.16 s; after that their yaw rates agree to 0.03 rad/s rms.  The wheel
-  speeds lag the gyro by 0.26 s while speeds change.  Both are held from one message to the next, about
-  0.1 s.  Times are as logged; nothing is shifted.
-- ``cmd_*`` are no wheel speeds: below its limits the robot drives 1.8 times as fast forward and turns its
+- *Late*: the Husky's lidar lags the gyro by 0.16 s; after that their yaw rates agree to 0.03 rad/s rms.  Its
+  wheel speeds lag the gyro by 0.26 s while speeds change.  The Warthog's lidar lags by 0.4 to 0.7 s, its
+  wheels by 0.05 s.  Times are as logged; nothing is shifted, but poses that took longer than usual.
+- *Held*: values are held from one message to the next.  A wheel speed that is usually held for over
+  :data:`MAX_HELD_S` is read as a measurement at the sample where it is new, and as a straight line to the
+  next one: held, the Warthog's wheels (4 Hz) would lag by 0.1 s more, in steps.
+- ``cmd_*`` are no wheel speeds: below its limits the Husky drives 1.8 times as fast forward and turns its
   wheels 0.8 times as fast against each other.  Commands go up to 14.7 rad/s, steady wheels to 6.1 rad/s.
 - ``steady``, ``icp_z``, ``icp_roll`` and ``icp_pitch`` are left out: the first says which window of a
   command it is, the others are relative to each window's own start.
@@ -40,28 +52,30 @@ Little of the file is documented.  What is assumed here was held against the oth
 
 from __future__ import annotations
 
+import math
+import re
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from terrain.errors import LogError
 from terrain.logs.csv_table import data_row, read_columns, short_name
+from terrain.logs.lidar_twist import CHANNELS as TWIST_CHANNELS
+from terrain.logs.lidar_twist import N_FRAME, body_twists
 from terrain.logs.samples import checked_stream
-from terrain.records import Array, RunLog
+from terrain.records import Array, Label, RunLog
 
 FILE_NAME = "samples.csv.gz"
 
-WHEEL_RADIUS_M = 0.165
-"""Nominal radius of a Husky A200 wheel, as the maker has it."""
-
 STREAMS: dict[str, dict[str, tuple[str, float]]] = {
     "wheels": {
-        "speed_left_mps": ("wheel_left", WHEEL_RADIUS_M),
-        "speed_right_mps": ("wheel_right", WHEEL_RADIUS_M),
+        "speed_left_mps": ("wheel_left", 1.0),
+        "speed_right_mps": ("wheel_right", 1.0),
     },
     "imu": {
         "gyro_z_radps": ("imu_yaw", 1.0),
@@ -74,148 +88,142 @@ STREAMS: dict[str, dict[str, tuple[str, float]]] = {
         "wheel_right_radps": ("cmd_right", 1.0),
     },
 }
-"""Column and factor of each channel that is read as it stands."""
+"""Column and factor of each channel that is read as it stands; those of the wheels are times the radius."""
 
-TWIST_CHANNELS: tuple[str, ...] = ("speed_x_mps", "speed_y_mps", "yaw_rate_radps")
-"""Channels of the stream ``lidar``."""
+MAX_HELD_S = 0.1
+"""A wheel speed that is usually held for longer is read as straight lines.  Held for 0.1 s it lags by 0.025 s
+on samples at 20 Hz, half a sample; held for 0.25 s by 0.1 s."""
 
-HALF_WIDTH_S = 0.3
-"""Poses to either side that a speed is fitted to: about six."""
-
-OUTAGE_S = 0.2
-"""A pose that was waited for so long (two scans) is stale when it comes, and so are those right behind."""
-
-QUEUE = 3
-"""So many new poses in as many samples come out of a queue, since a scan takes two samples."""
-
-MAX_GAIN_PER_S = 4.0
-"""Largest standard deviation of a speed for each unit of the pose's; 2.3 in the middle of a window."""
+MAX_OVERSPEED = 1.5
+"""Wheels that turn so many times as fast as the robot's own ever do are those of another robot; downhill, or
+with a measurement's noise, they turn 1.1 times as fast."""
 
 _KEYS = ("step", "window", "steady", "time")
 _POSE = ("icp_x", "icp_y", "icp_yaw")
-_N_FRAME = 5  # samples whose mean heading the authors turned the positions of a window by
 _MAX_OVERLAP = 5  # samples; 3 is the most that is there
+_SESSION_NAME = re.compile(r"(.+)_\d+")
+
+
+class DriveRobot(NamedTuple):
+    """What a reader has to know of the robot that a log does not name.
+
+    Parameters
+    ----------
+    name : as run logs have it
+    wheel_radius_m : nominal
+    wheel_rate_max_radps : fastest that its wheels turn; infinite where unknown
+    """
+
+    name: str
+    wheel_radius_m: float
+    wheel_rate_max_radps: float = math.inf
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Windows:
-    """The whole file: n windows of k samples."""
+    """A whole session: n windows of k samples."""
 
     name: str
+    robot: str
+    session: str  # empty where it has no name
+    terrain: str  # empty where unknown
     step: Array  # (n,)
     steady: Array  # (n,)
     time_s: Array  # (k,) within a window
     values: dict[str, Array]  # by stream (n, k, channels)
+    held: tuple[int, ...]  # usual samples from one new value of a wheel to the next; 1 where not to be undone
 
 
-def find_runs(folder: Path) -> list[Callable[..., RunLog]]:
-    """Return one reader per command of the file ``samples.csv.gz`` in ``folder``; call it with ``repair=``.
+def find_sessions(folder: Path) -> list[Path]:
+    """Return the folders of the sessions: ``folder`` itself, or, if any in it has a log, all those in it.
 
-    The list is empty when there is no such file.  The file is read at once, for all of them.
+    Hidden folders are passed over.
 
     Raises
     ------
     LogError
-        if the file is broken or lacks a column, holds a cell that is no number, or windows that are not
-        all sampled alike.
+        if there is a log in ``folder`` and in a folder in it.
     """
-    path = folder / FILE_NAME
-    if not path.is_file():
-        return []
-    windows = _read_windows(path)
-    starts = np.flatnonzero(windows.steady == 0)
-    if starts.size == 0 or starts[0] != 0:
-        raise LogError(f"{windows.name}: the first window has steady 1; a command begins with steady 0")
-    ends = [*starts[1:].tolist(), len(windows.steady)]
-    return [partial(_run, windows, start, end) for start, end in zip(starts.tolist(), ends, strict=True)]
+    inside = sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.startswith("."))
+    logged = [path for path in inside if (path / FILE_NAME).is_file()]
+    if not (folder / FILE_NAME).is_file():
+        return inside if logged else []
+    if logged:
+        raise LogError(
+            f"{folder}: holds {FILE_NAME} itself and in {logged[0].name}; give the folder of one session, or "
+            "one that holds the folders of sessions only"
+        )
+    return [folder]
 
 
-def body_twists(pose: Array, period_s: float) -> Array:
-    r"""Return speeds forward and to the left and yaw rate from poses that are held between two scans.
+def find_runs(folder: Path, robot: DriveRobot) -> list[Callable[..., RunLog]]:
+    """Return one reader per command of the sessions in ``folder``; call it with ``repair=``.
 
-    A parabola is fitted to the poses within :data:`HALF_WIDTH_S` of each sample, each pose counted once,
-    when it is new.  Its slope is turned into the body's axes by its heading,
-
-    .. math:: v = R(-\psi)\,\dot p, \qquad
-              \psi = \texttt{yaw} - \tfrac15 \textstyle\sum_{i<5} \texttt{yaw}_i ,
-
-    the sum being over the angles as published, with their jumps of a full turn.
-
-    NaN where poses are too few or too much to one side for a slope (:data:`MAX_GAIN_PER_S`), as within
-    about 0.3 s of a window's edge.  The first pose of a window is not used, since its age is
-    unknown; nor are poses that come out of a queue, as after an outage (:data:`OUTAGE_S`, :data:`QUEUE`).
-    On the published file 65 % of the samples have a twist.  Poses scatter about their parabola by 19 mm
-    forward, 5 mm sideways and 3 mrad, hence the twist by 0.05 m/s, 0.012 m/s and 0.007 rad/s.
+    The list is empty when there is none.  The files are read at once, for all runs.  A folder beside sessions
+    that has no log has a reader too: it raises :class:`LogError`.
 
     Parameters
     ----------
-    pose : (n, k, 3) ``icp_x``, ``icp_y`` and ``icp_yaw`` of n windows, as published; NaN where missing
-    period_s : time from sample to sample
+    folder : of a session, with the file ``samples.csv.gz``, or of folders of sessions
+    robot : that drove them
 
-    Returns
-    -------
-    (n, k, 3) of the point that the pose is of, with the channels :data:`TWIST_CHANNELS`
+    Raises
+    ------
+    LogError
+        if a file is broken or lacks a column, holds a cell that is no number, windows that are not
+        all sampled alike, or wheels that turn faster than the robot's can.
+    """
+    readers: list[Callable[..., RunLog]] = []
+    for path in find_sessions(folder):
+        if not (path / FILE_NAME).is_file():
+            readers.append(partial(_refuse, path))
+            continue
+        numbered = _SESSION_NAME.fullmatch(path.resolve().name)
+        session = path.resolve().name if numbered or path != folder else ""
+        windows = _read_windows(path / FILE_NAME, robot, session, numbered[1] if numbered else "")
+        starts = np.flatnonzero(windows.steady == 0)
+        if starts.size == 0 or starts[0] != 0:
+            raise LogError(f"{windows.name}: the first window has steady 1; a command begins with steady 0")
+        ends = [*starts[1:].tolist(), len(windows.steady)]
+        readers += [
+            partial(_run, windows, start, end) for start, end in zip(starts.tolist(), ends, strict=True)
+        ]
+    return readers
+
+
+def _refuse(folder: Path, *, repair: bool = False) -> RunLog:
+    raise LogError(f"{folder}: has no {FILE_NAME}, which the other sessions beside it have")
+
+
+def between_updates(values: Array, time_s: Array, held: int) -> Array:
+    """Return a held signal as straight lines between the samples where it is new.
+
+    A value that stays for longer than usual was measured again and found the same: it is held until the usual
+    time before the next one.
+
+    Parameters
+    ----------
+    values : (n,) as held
+    time_s : (n,)
+    held : usual number of samples from one new value to the next
 
     Examples
     --------
-    Half a metre a second, straight on:
-
-    >>> pose = np.zeros((1, 40, 3))
-    >>> pose[0, :, 0] = 0.5 * 0.1 * (np.arange(40) // 2)
-    >>> body_twists(pose, 0.05)[0, 20].round(6).tolist()
-    [0.5, 0.0, 0.0]
+    >>> between_updates(np.array([0.0, 0.0, 0.0, 0.0, 4.0, 4.0, 8.0]), np.arange(7.0), 2).tolist()
+    [0.0, 0.0, 0.0, 2.0, 4.0, 6.0, 8.0]
     """
-    n, k, _ = pose.shape
-    frame_yaw = pose[:, :_N_FRAME, 2].mean(axis=1)
-    dated = _dated(pose, period_s)
-    turned = pose.copy()
-    known = np.isfinite(pose[..., 2])
-    for window in range(n):
-        turned[window, known[window], 2] = np.unwrap(pose[window, known[window], 2])
-    half = round(HALF_WIDTH_S / period_s)
-    lag = np.arange(-half, half + 1) / half
-    powers = lag[:, None] ** np.arange(3)
-    padding = [(0, 0), (half, half)]
-    weight = np.pad(dated, padding).astype(np.float64)
-    weighted = np.pad(np.where(dated[..., None], turned, 0.0), [*padding, (0, 0)])
-    view = np.lib.stride_tricks.sliding_window_view
-    width = 2 * half + 1
-    products = (powers[:, :, None] * powers[:, None, :]).reshape(width, 9)
-    normal = (view(weight, width, axis=1) @ products).reshape(n, k, 3, 3)
-    seen = normal[..., 0, 0] >= 3.0
-    inverse = np.full_like(normal, np.nan)
-    inverse[seen] = np.linalg.inv(normal[seen])
-    # of the parabola: (n, k, power, channel of the pose)
-    curve = inverse @ np.swapaxes(view(weighted, width, axis=1) @ powers, -1, -2)
-    with np.errstate(invalid="ignore"):
-        certain = np.sqrt(inverse[..., 1, 1]) / (half * period_s) <= MAX_GAIN_PER_S
-    slope = np.where(certain[..., None], curve[..., 1, :] / (half * period_s), np.nan)
-    heading = curve[..., 0, 2] - frame_yaw[:, None]
-    cos, sin = np.cos(heading), np.sin(heading)
-    return np.stack(
-        [
-            cos * slope[..., 0] + sin * slope[..., 1],
-            cos * slope[..., 1] - sin * slope[..., 0],
-            slope[..., 2],
-        ],
-        axis=-1,
-    )
+    new = np.flatnonzero(np.diff(values, prepend=np.nan) != 0.0)
+    stayed = new[1:][np.diff(new) > held] - held
+    known = np.sort(np.concatenate([new, stayed]))
+    return np.asarray(np.interp(time_s, time_s[known], values[known]))
 
 
-def _dated(pose: Array, period_s: float) -> Array:
-    """Return (n, k) true where a pose is new and was not delayed in a queue."""
-    new = np.zeros(pose.shape[:2], dtype=bool)
-    new[:, 1:] = (np.diff(pose, axis=1) != 0.0).any(axis=-1)
-    new &= np.isfinite(pose).all(axis=-1)
-    window, sample = np.nonzero(new)
-    first = np.diff(window, prepend=-1) != 0
-    waited = np.where(first, sample, np.diff(sample, prepend=0))
-    heads = first | (waited > 1)  # of rows of poses that came sample by sample
-    row = np.cumsum(heads) - 1
-    queued = (waited[heads] >= round(OUTAGE_S / period_s)) | (np.bincount(row) >= QUEUE)
-    dated = np.zeros_like(new)
-    dated[window, sample] = ~queued[row]
-    return dated
+def _usual_hold(values: Array, period_s: float) -> int:
+    """Return the median samples from one new value (n, k) to the next; 1 where that is short or unknown."""
+    window, sample = np.nonzero(np.diff(values, axis=1) != 0.0)
+    waits = np.diff(sample)[np.diff(window) == 0]
+    usual = int(np.median(waits)) if waits.size else 1
+    return usual if usual * period_s > MAX_HELD_S * (1.0 + 1e-6) else 1
 
 
 def _run(windows: _Windows, start: int, end: int, *, repair: bool = False) -> RunLog:
@@ -231,24 +239,39 @@ def _run(windows: _Windows, start: int, end: int, *, repair: bool = False) -> Ru
             f"{windows.name}: the windows of one command have the steps {', '.join(map(str, steps))}"
         )
     kept, time_s = _on_one_clock(windows, start, end)
-    run_id = f"step_{steps[0]:03d}"
+    run_id = "_".join([*filter(None, [windows.session]), f"step_{steps[0]:03d}"])
     dropped: Counter[str] = Counter()
     streams = {}
-    for name, values in windows.values.items():
+    for name, logged in windows.values.items():
         is_lidar = name == "lidar"
+        values = logged[start:end][kept]
+        if name == "wheels":
+            values = np.column_stack(
+                [
+                    between_updates(v, time_s, n) if n > 1 else v
+                    for v, n in zip(values.T, windows.held, strict=True)
+                ]
+            )
         columns = () if is_lidar else [column for column, _ in STREAMS[name].values()]
         streams[name] = checked_stream(
             f"{windows.name}, {run_id}",
             time_s,
-            values[start:end][kept],
+            values,
             TWIST_CHANNELS if is_lidar else list(STREAMS[name]),
             row_of=int,  # times are made here: no row is at fault
             columns=columns,
             repairs=dropped if repair else None,
             unknown_is_a_value=is_lidar,
         )
+    until_s = float(time_s[-1] + windows.time_s[1] - windows.time_s[0])
     return RunLog(
-        run_id, "husky", streams, source=f"{windows.name}, step {steps[0]}, DRIVE layout", dropped=dropped
+        run_id,
+        windows.robot,
+        streams,
+        (Label(0.0, until_s, windows.terrain),) if windows.terrain else (),
+        source=f"{windows.name}, step {steps[0]}, DRIVE layout",
+        dropped=dropped,
+        session=windows.session,
     )
 
 
@@ -271,7 +294,7 @@ def _on_one_clock(windows: _Windows, start: int, end: int) -> tuple[Array, Array
     return kept, (at_s[:, None] + time_s - time_s[0])[kept]
 
 
-def _read_windows(path: Path) -> _Windows:
+def _read_windows(path: Path, robot: DriveRobot, session: str, terrain: str) -> _Windows:
     sources = {name: list(columns.values()) for name, columns in STREAMS.items()}
     read = [*_KEYS, *_POSE, *(column for pairs in sources.values() for column, _ in pairs)]
     table = read_columns(path, read)
@@ -284,9 +307,22 @@ def _read_windows(path: Path) -> _Windows:
         name: np.stack([columns[column] * factor for column, factor in pairs], axis=-1)
         for name, pairs in sources.items()
     }
+    held = tuple(_usual_hold(wheel, period_s) for wheel in np.moveaxis(values["wheels"], -1, 0))
+    _refuse_other_robot(short_name(path), values["wheels"], robot)
+    values["wheels"] *= robot.wheel_radius_m
     values["lidar"] = body_twists(np.stack([columns[name] for name in _POSE], axis=-1), period_s)
     step, steady = (keys[:, 0, i].astype(np.int64) for i in (0, 2))
-    return _Windows(short_name(path), step, steady, np.arange(k) * period_s, values)
+    time_s = np.arange(k) * period_s
+    return _Windows(short_name(path), robot.name, session, terrain, step, steady, time_s, values, held)
+
+
+def _refuse_other_robot(name: str, wheel_radps: Array, robot: DriveRobot) -> None:
+    fastest = float(np.nanmax(np.abs(wheel_radps), initial=0.0))
+    if fastest > MAX_OVERSPEED * robot.wheel_rate_max_radps:
+        raise LogError(
+            f"{name}: its wheels turn at up to {fastest:.1f} rad/s, those of robot {robot.name} at up to "
+            f"{robot.wheel_rate_max_radps:.1f} rad/s: name the robot that drove it (--robot)"
+        )
 
 
 def _checked_keys(path: Path, keys: Array) -> Array:
@@ -304,8 +340,8 @@ def _checked_keys(path: Path, keys: Array) -> Array:
     k = int(sizes[0])
     for i in np.flatnonzero(sizes != k):
         raise LogError(f"{name}: {windows[i]} has {sizes[i]} samples, the first one has {k}")
-    if k <= _N_FRAME:
-        raise LogError(f"{name}: windows have {k} samples, more than {_N_FRAME} are needed")
+    if k <= N_FRAME:
+        raise LogError(f"{name}: windows have {k} samples, more than {N_FRAME} are needed")
     keys = keys.reshape(-1, k, len(_KEYS))
     time_s = keys[0, :, 3]
     period_s = (time_s[-1] - time_s[0]) / (k - 1)

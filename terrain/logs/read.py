@@ -13,6 +13,7 @@ One folder per run holds ``run.json`` and one Parquet file per stream::
       "schema_version": 1,
       "run_id": "SNOW_07",
       "robot": "husky",
+      "session": "monday",
       "source": "where the log comes from, in words",
       "labels": [{"start_s": 0.0, "end_s": 54.92, "terrain": "SNOW"}],
       "streams": {
@@ -23,7 +24,8 @@ One folder per run holds ``run.json`` and one Parquet file per stream::
 
 Times are seconds on the clock of the run and strictly increase.  A label holds from ``start_s`` to just
 before ``end_s``; labels do not overlap.  Each channel is named with its SI unit word, which is written
-beside it too.  ``dropped`` (may be left out) counts what a repairing reader took away before.
+beside it too.  ``dropped`` (may be left out) counts what a repairing reader took away before; ``session``
+(may be left out) names the outing that the run is part of.
 """
 
 from __future__ import annotations
@@ -105,6 +107,7 @@ def read_run(folder: str | Path, *, repair: bool = False) -> RunLog:
         _labels(place, _entry(place, head, "labels", list)),
         source=_entry(place, head, "source", str),
         dropped=dropped,
+        session=_entry(place, {"session": ""} | head, "session", str),
     )
 
 

@@ -59,6 +59,7 @@ def write_run(run: RunLog, folder: str | Path, *, replace: bool = False) -> Path
         "schema_version": SCHEMA_VERSION,
         "run_id": run.run_id,
         "robot": run.robot,
+        **({"session": run.session} if run.session else {}),
         "source": run.source,
         "labels": [label._asdict() for label in run.labels],
         "streams": {

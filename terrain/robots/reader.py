@@ -16,6 +16,7 @@ Geometry and mass are required of every robot; the sections ``body``, ``motors``
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_type_hints
@@ -109,12 +110,24 @@ def robot_from(file: str, described: Any) -> Robot:
         for section, kind in KIND_OF_SECTION.items()
         if described.get(section) is not None
     }
-    robot = KIND_OF_DRIVE[drive](name, wheel_radius_m, track_m, wheelbase_m, mass_kg, parts)
+    kind = KIND_OF_DRIVE[drive]
+    assumed = frozenset(_assumed(described))
+    robot = kind(name, wheel_radius_m, track_m, wheelbase_m, mass_kg, parts, assumed=assumed)
     if "effects" in described:
         effects, cov = read_effects(f"{file}: effects", described["effects"], drive)
         robot = replace(robot, effects=effects, effects_cov=cov)
     robot.check_geometry(file)
     return robot
+
+
+def _assumed(described: dict[str, Any]) -> Iterator[str]:
+    """Yield the names of the numbers of a checked description whose source begins with "assumed"."""
+    sections = {"": {key: described[key] for key in NUMBERS}}
+    sections |= {f"{name}.": described[name] for name in KIND_OF_SECTION if described.get(name) is not None}
+    for prefix, entries in sections.items():
+        for key, entry in entries.items():
+            if entry["source"].strip().lower().startswith("assumed"):
+                yield f"{prefix}{key}"
 
 
 def _part(place: str, kind: Any, described: Any) -> Any:

@@ -36,6 +36,7 @@ class Robot(ABC):
     parts : sections of the description by name
     effects : parameters of :mod:`terrain.effects.catalogue` that are not 0, by name
     effects_cov : (n, n) covariance of the effects in their order; NaN where unknown
+    assumed : numbers whose source begins with "assumed", as ``track_m`` and ``camera.lever_x_m``
     """
 
     name: str
@@ -46,6 +47,7 @@ class Robot(ABC):
     parts: Mapping[str, Part] = field(default_factory=dict, hash=False)
     effects: Mapping[str, float] = field(default_factory=dict, hash=False)
     effects_cov: Array = field(default_factory=lambda: np.empty((0, 0)), compare=False)
+    assumed: frozenset[str] = frozenset()
 
     drive: ClassVar[str]
     """The kind of drive, as descriptions name it."""

@@ -17,6 +17,10 @@ SCRUB_SHARE = 0.4
 """Resistance to turning over the ground's grip; assumed: wheels of a side skid sideways over half the
 distance."""
 
+WIDTH_RATIO, CONTACT_RATIO = 0.6, 0.6
+"""Width of a tyre, and length of its contact on firm ground, over the wheel's radius, where a description has
+no section ``body``; assumed: the described robots have 0.5 to 0.7, and 0.6."""
+
 _SLIPS = np.linspace(0.0, 1.0, 101)
 
 _MORE = 1.01
@@ -31,13 +35,13 @@ def planar_ground(robot: Robot, soil: Soil) -> Ground:
 
     Parameters
     ----------
-    robot : with a body
+    robot : a tyre that it does not describe has :data:`WIDTH_RATIO` and :data:`CONTACT_RATIO`
     soil : the ground
 
     Raises
     ------
     ConfigError
-        if the robot has no body, or is stuck on that soil.
+        if the robot is stuck on that soil.
 
     Examples
     --------
@@ -47,7 +51,10 @@ def planar_ground(robot: Robot, soil: Soil) -> Ground:
     >>> [round(number, 3) for number in ground[:4]], round(ground.load_ratio, 2)
     ([1.569, 0.347, 0.08, 0.139], 0.76)
     """
-    wheel = robot.wheel_radius_m, robot.body.tyre_width_m, robot.body.contact_length_m
+    width_m, contact_m = WIDTH_RATIO * robot.wheel_radius_m, CONTACT_RATIO * robot.wheel_radius_m
+    if robot.describes("body"):
+        width_m, contact_m = robot.body.tyre_width_m, robot.body.contact_length_m
+    wheel = robot.wheel_radius_m, width_m, contact_m
     normal_n = robot.mass_kg * GRAVITY_MPS2 / robot.n_tyres
     slip = equilibrium_slip(soil, normal_n, 0.0, *wheel)
     if math.isnan(slip):

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import fields, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -26,7 +27,7 @@ from terrain.effects import (
 from terrain.errors import ConfigError
 from terrain.kinematics.wheel_motion import WheelMotion, wheel_motion
 from terrain.records import Array, Label, RunLog
-from terrain.robots import Robot
+from terrain.robots import Part, Robot
 from terrain.simulation.planar.drives import COMMANDS_HZ, commands_stream, follow_commands
 from terrain.simulation.planar.hills import Hills, path_of, tilt_along, undulations
 from terrain.simulation.planar.ideal_sensors import sense
@@ -81,7 +82,8 @@ def simulate_planar(  # noqa: PLR0913 - an entry whose options have defaults
 
     Parameters
     ----------
-    robot : with body, motors, camera and sensors; a swerve robot with steering
+    robot : a swerve robot with all its sections; of a skid-steer robot those that are missing do not act
+        (:func:`~terrain.simulation.planar.model.make_planar`), and without motors there are no currents
     twist : (n, 3) desired ``(speed_x_mps, speed_y_mps, yaw_rate_radps)`` at 50 Hz, from rest
     seed : of everything that is drawn; the same gives the same bytes, and a sequence is left as it is
     ground : a firm one by default
@@ -103,7 +105,7 @@ def simulate_planar(  # noqa: PLR0913 - an entry whose options have defaults
     Raises
     ------
     ConfigError
-        if the robot lacks a section, or a parameter or an outside cause is unknown or not finite.
+        if a swerve robot lacks a section, or a parameter or an outside cause is unknown or not finite.
 
     Examples
     --------
@@ -118,6 +120,8 @@ def simulate_planar(  # noqa: PLR0913 - an entry whose options have defaults
     """
     outside = outside or {}
     _check(robot, twist, outside, step_s)
+    currents = robot.describes("motors")
+    robot = with_silent_parts(robot)
     planar = make_planar(robot, ground or Ground())
     rngs = _generators(seed)
     p = vector_of({**robot.effects, **(effects or {})})
@@ -129,7 +133,7 @@ def simulate_planar(  # noqa: PLR0913 - an entry whose options have defaults
     motion = _motion(setup, desired, hills or Hills(), rngs)
     run = PlanarRun(robot, planar, p, step_s, motion, sense(planar, p, step_s, motion.truth), noise)
     streams = {
-        "wheels": wheels_stream(run, outside.get("stick_slip_a", 0.0), rngs),
+        "wheels": wheels_stream(run, outside.get("stick_slip_a", 0.0), rngs, currents),
         "imu": imu_stream(run, rngs["imu"]),
         "odometry": camera_stream(run, rngs["camera"]),
         "commands": commands_stream(robot, desired),
@@ -144,7 +148,8 @@ def simulate_planar(  # noqa: PLR0913 - an entry whose options have defaults
 
 
 def _check(robot: Robot, twist: Array, outside: Mapping[str, float], step_s: float) -> None:
-    robot.require(*robot.sections)
+    if robot.steered:
+        robot.require(*robot.sections)
     if twist.ndim != 2 or twist.shape[1] != 3 or len(twist) < 2 or not np.isfinite(twist).all():
         raise ConfigError(f"twist has shape {twist.shape}, (n, 3) finite numbers with two rows are required")
     if not robot.steered and twist[:, 1].any():
@@ -157,6 +162,23 @@ def _check(robot: Robot, twist: Array, outside: Mapping[str, float], step_s: flo
     parts = STEP_S / step_s if step_s > 0 else 0.0
     if parts < 0.5 or abs(parts - round(parts)) > 1e-9:
         raise ConfigError(f"step_s is {step_s:g}, {STEP_S:g} s or a whole part of it is required")
+
+
+def with_silent_parts(robot: Robot) -> Robot:
+    """Return the robot with parts that neither act nor are noisy for the sections that it lacks.
+
+    Examples
+    --------
+    >>> from terrain.robots import load_robot
+    >>> with_silent_parts(load_robot("warthog")).sensors.gyro_std_radps
+    0.0
+    """
+    silent: dict[str, Part] = {}
+    for name, part in robot.completed.parts.items():
+        if name not in robot.parts:
+            unknown = [item.name for item in fields(part) if math.isnan(getattr(part, item.name))]
+            silent[name] = replace(part, **dict.fromkeys(unknown, 0.0))  # type: ignore[arg-type]
+    return robot.with_parts(**silent)
 
 
 def _generators(seed: int | np.random.SeedSequence) -> dict[str, np.random.Generator]:

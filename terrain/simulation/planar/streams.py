@@ -96,8 +96,8 @@ class PlanarRun(NamedTuple):
         return delayed(values, late, rate) if late != 0.0 or rate != 0.0 else values
 
 
-def wheels_stream(run: PlanarRun, stick_slip_a: float, rngs: Generators) -> Stream:
-    """Return the stream of wheel speeds and motor currents."""
+def wheels_stream(run: PlanarRun, stick_slip_a: float, rngs: Generators, logs_currents: bool) -> Stream:
+    """Return the stream of wheel speeds and, where they are logged, motor currents."""
     robot, motion = run.robot, run.motion
     rows, time_s = run.samples(WHEELS_HZ)
     current = run.ideal[rows, CHANNELS.index(CURRENT)]
@@ -110,6 +110,8 @@ def wheels_stream(run: PlanarRun, stick_slip_a: float, rngs: Generators) -> Stre
     else:
         currents = np.repeat(current[:, None] / wheels, wheels, axis=1)
     speed, currents = _measured(run, rows, currents, rngs["wheels"])
+    if not logs_currents:
+        return Stream(time_s, robot.logged_rates(speed), robot.rate_channels)
     channels = (*robot.rate_channels, *wheel_channels("current_a", robot.wheels))
     return Stream(time_s, np.hstack([robot.logged_rates(speed), currents]), channels)
 
@@ -126,7 +128,9 @@ def _measured(
     step_m, jitter, white = 0.0, np.zeros((n + 1, wheels)), np.zeros((n, wheels))
     if noise is not None:
         active = motion.active[rows]
-        step_m = 2.0 * math.pi * robot.wheel_radius_m / (sensors.hall_steps_ratio * motors.reduction_ratio)
+        if sensors.hall_steps_ratio > 0.0:
+            turns = sensors.hall_steps_ratio * motors.reduction_ratio
+            step_m = 2.0 * math.pi * robot.wheel_radius_m / turns
         jitter = rng.standard_normal((n + 1, wheels)) * noise.encoder_m
         jitter *= np.append(active, active[-1])[:, None]
         white_mps = sensors.motor_std_radps / motors.reduction_ratio * robot.wheel_radius_m

@@ -61,7 +61,7 @@ def make_scenario(
     Parameters
     ----------
     name : one of :data:`SCENARIOS`
-    robot : with motors; no twist saturates its wheels
+    robot : no twist saturates its wheels; without motors, which swerve robots need, they have no limit
     terrains : of the ground, one unless the scenario is ``course``; the names are not looked up
     duration_s : what the scenario is made for by default; taken to a whole number of samples
     speed_mps : cruising speed; ``survey`` and ``course`` draw from 0.4 to 1.2 times it, backward and sideways
@@ -123,12 +123,15 @@ def _checked_duration(duration_s: float | None) -> float | None:
 def _ability(robot: Robot, speed_mps: float) -> tuple[float, Callable[[Any], Array]]:
     """Return the speed, checked, and what shortens a twist to what the robot can."""
     positions_m, radius_m = robot.wheel_positions_m, robot.wheel_radius_m
-    speed_max_radps = robot.motors.speed_max_radps
+    motors = robot.motors if robot.steered else robot.completed.motors
+    speed_max_radps = motors.speed_max_radps
     if not _is_number(speed_mps) or not 0 < speed_mps <= radius_m * speed_max_radps:
         raise ConfigError(
             f"speed_mps is {speed_mps!r}: robot {robot.name} drives above 0 and up to "
             f"{radius_m * speed_max_radps:g} m/s"
         )
+    if math.isinf(speed_max_radps):
+        return float(speed_mps), lambda twist: np.asarray(twist, dtype=np.float64)
     return float(speed_mps), lambda twist: scaled(positions_m, radius_m, twist, speed_max_radps)
 
 

@@ -64,8 +64,7 @@ def test_a_run_is_simulated_on_the_soil_of_its_label_or_the_default_terrain():
     assert simulation.ground == Ground()
     assert simulation.planar_on("grass").slip_ratio == soil.slip_ratio
     assert simulation.planar_on("moon").slip_ratio == simulation.planar.slip_ratio == Ground().slip_ratio
-    bare = AGRIMARO.without("body")  # without a tyre there is no soil
-    assert simulation_for(unknown, bare, LIBRARY)[0].grounds == {}
+    assert simulation_for(unknown, AGRIMARO, LIBRARY)[0].grounds == {}
 
 
 def test_tilt_acts_as_a_slope_but_not_where_a_body_rides_over_bumps():

@@ -26,5 +26,11 @@ def test_no_wheel_turns_faster_than_its_motor_can(robot):
 
 
 def test_a_robot_without_motors_is_named():
-    with pytest.raises(ConfigError, match=r"robot husky: .* no section 'motors'"):
-        wheel_motion(HUSKY.without("motors"), np.zeros((2, 3)), 0.02)
+    with pytest.raises(ConfigError, match=r"robot agrimaro: .* no section 'motors'"):
+        wheel_motion(AGRIMARO.without("motors"), np.zeros((2, 3)), 0.02)
+
+
+def test_a_skid_steer_robot_without_motors_has_no_fastest_speed():
+    motion = wheel_motion(HUSKY.without("motors"), np.array([[50.0, 0.0, 9.0]]), 0.02)
+    turn_mps = 9.0 * HUSKY.track_m / 2
+    np.testing.assert_allclose(motion.wheel_speed_mps, [[50.0 - turn_mps, 50.0 + turn_mps]])

@@ -352,7 +352,7 @@ def test_on_a_soil_the_robot_slips_as_the_soil_has_it():
 @pytest.mark.parametrize(
     ("robot", "options", "message"),
     [
-        (HUSKY.without("camera"), {}, "no section 'camera'"),
+        (AGRIMARO.without("camera"), {}, "no section 'camera'"),
         (AGRIMARO.without("steering"), {}, "no section 'steering'"),
         (HUSKY, {"twist": np.zeros((5, 2))}, r"twist has shape \(5, 2\)"),
         (HUSKY, {"twist": np.full((5, 3), np.nan)}, "finite numbers"),

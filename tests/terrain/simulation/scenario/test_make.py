@@ -323,7 +323,7 @@ def test_other_scenarios_are_driven_on_one_terrain(name):
         ({"seed": None}, "seed is None"),
         ({"robot": HUSKY, "name": "crab"}, "scenario 'crab' is not for robot husky"),
         ({"robot": HUSKY, "name": "course"}, "scenario 'course' is not for robot husky"),
-        ({"robot": HUSKY.without("motors")}, "no section 'motors'"),
+        ({"robot": ROBOT.without("motors")}, "no section 'motors'"),
     ],
 )
 def test_infeasible_drives_are_refused_in_one_sentence(options, message):

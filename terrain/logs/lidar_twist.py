@@ -1,0 +1,133 @@
+r"""Speeds of a body from the poses that a lidar registration published, held from one to the next."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from terrain.records import Array
+
+CHANNELS: tuple[str, ...] = ("speed_x_mps", "speed_y_mps", "yaw_rate_radps")
+"""What :func:`body_twists` returns."""
+
+HALF_WIDTH_SCANS = 3
+"""Poses to either side that a speed is fitted to: about six, enough for a parabola and its noise."""
+
+OUTAGE_SCANS = 2
+"""A pose that took so many usual waits is stale when it comes, and so are those right behind."""
+
+QUEUE = 3
+"""So many new poses in as many samples come out of a queue, since a registration takes longer than that."""
+
+MAX_GAIN_PER_S = 4.0
+"""Largest standard deviation of a speed for each unit of the pose's; 2.3 in the middle of a window of 40
+samples with a pose in every second one."""
+
+N_FRAME = 5
+"""Samples whose mean heading the authors of DRIVE turned the positions of a window by."""
+
+
+def body_twists(pose: Array, period_s: float) -> Array:
+    r"""Return speeds forward and to the left and yaw rate from poses that are held between two scans.
+
+    A pose is of the time at which its registration began, when the one before came out: one that took longer
+    than the usual wait (the median of all) is that much older, and is dated so.  (On sand, where a Warthog's
+    waits are uneven, that takes the error of the yaw rate against the gyro from 0.44 to 0.24 rad/s.)
+    What the robot drove from one dated pose to the next, as an arc, is summed in its own axes,
+
+    .. math:: \Delta s = \frac{\Delta\psi / 2}{\sin(\Delta\psi / 2)} R(-\bar\psi)\,\Delta p, \qquad
+              \psi = \texttt{yaw} - \tfrac15 \textstyle\sum_{i<5} \texttt{yaw}_i ,
+
+    with the mean heading :math:`\bar\psi` of the two, so that a steady twist is a straight line in time,
+    however tight the turn; the sum over the first five is of the angles as published, with their jumps of a
+    full turn.  A parabola is fitted to the sums within :data:`HALF_WIDTH_SCANS` usual waits of each sample,
+    and its slope is the twist.
+
+    NaN where poses are too few or too much to one side for a slope (:data:`MAX_GAIN_PER_S`), as within
+    three waits of a window's edge.  The first pose of a window is not used, since its age is
+    unknown; nor are poses that come out of a queue or after an outage (:data:`OUTAGE_SCANS`, :data:`QUEUE`).
+
+    Parameters
+    ----------
+    pose : (n, k, 3) x, y and yaw of n windows, as published; NaN where missing
+    period_s : time from sample to sample
+
+    Returns
+    -------
+    (n, k, 3) of the point that the pose is of, with the channels :data:`CHANNELS`
+
+    Examples
+    --------
+    Half a metre a second, straight on:
+
+    >>> pose = np.zeros((1, 40, 3))
+    >>> pose[0, :, 0] = 0.5 * 0.1 * (np.arange(40) // 2)
+    >>> body_twists(pose, 0.05)[0, 20].round(6).tolist()
+    [0.5, 0.0, 0.0]
+    """
+    n, k, _ = pose.shape
+    new = _new(pose)
+    scan = _usual_wait(new)
+    weight, driven = np.zeros((n, k)), np.zeros((n, k, 3))
+    frame_yaw = pose[:, :N_FRAME, 2].mean(axis=1)
+    for window in range(n):
+        arrival = np.flatnonzero(new[window])
+        at, usable = _dated(arrival, k, scan)
+        came = pose[window, arrival]
+        came[:, 2] = np.unwrap(came[:, 2])
+        weight[window, at[usable]] = 1.0
+        driven[window, at[usable]] = _driven(came[usable], frame_yaw[window])
+    half = HALF_WIDTH_SCANS * scan
+    powers = (np.arange(-half, half + 1) / half)[:, None] ** np.arange(3)
+    padding = [(0, 0), (half, half)]
+    view = np.lib.stride_tricks.sliding_window_view
+    width = 2 * half + 1
+    products = (powers[:, :, None] * powers[:, None, :]).reshape(width, 9)
+    normal = (view(np.pad(weight, padding), width, axis=1) @ products).reshape(n, k, 3, 3)
+    seen = normal[..., 0, 0] >= 3.0
+    inverse = np.full_like(normal, np.nan)
+    inverse[seen] = np.linalg.inv(normal[seen])
+    sums = np.swapaxes(view(np.pad(driven, [*padding, (0, 0)]), width, axis=1) @ powers, -1, -2)
+    slope = (inverse @ sums)[..., 1, :] / (half * period_s)
+    with np.errstate(invalid="ignore"):
+        certain = np.sqrt(inverse[..., 1, 1]) / (half * period_s) <= MAX_GAIN_PER_S
+    return np.where(certain[..., None], slope, np.nan)
+
+
+def _new(pose: Array) -> Array:
+    """Return (n, k) true where a pose is not the one before."""
+    new = np.zeros(pose.shape[:2], dtype=bool)
+    new[:, 1:] = (np.diff(pose, axis=1) != 0.0).any(axis=-1)
+    return new & np.isfinite(pose).all(axis=-1)
+
+
+def _usual_wait(new: Array) -> int:
+    """Return the median number of samples from one new value (n, k) to the next."""
+    window, sample = np.nonzero(new)
+    waits = np.diff(sample)[np.diff(window) == 0]
+    return max(int(np.median(waits)), 1) if waits.size else 1
+
+
+def _dated(arrival: Array, k: int, scan: int) -> tuple[Array, Array]:
+    """Return the samples that poses are dated at, by those of k at which they came, and which are usable."""
+    if not arrival.size:
+        return arrival, arrival.astype(bool)
+    waited = np.diff(arrival, prepend=0)
+    heads = np.concatenate([[True], waited[1:] > 1])  # of rows of poses that came sample by sample
+    row = np.cumsum(heads) - 1
+    queued = (waited[heads] >= OUTAGE_SCANS * scan) | (np.bincount(row) >= QUEUE)
+    at = np.concatenate([arrival[:1], arrival[:-1] + scan])
+    usable = ~queued[row] & (at < k)
+    usable[0] &= arrival[0] <= scan  # what came before the window is not known
+    return at, usable
+
+
+def _driven(pose: Array, frame_yaw: float) -> Array:
+    """Return distance forward, to the left, and yaw (m, 3), each from the first of the poses (m, 3)."""
+    turned = np.diff(pose[:, 2])
+    heading = pose[:-1, 2] + turned / 2 - frame_yaw
+    cos, sin = np.cos(heading), np.sin(heading)
+    chord = np.diff(pose[:, :2], axis=0) / np.sinc(turned / (2 * np.pi))[:, None]
+    along = np.column_stack(
+        [cos * chord[:, 0] + sin * chord[:, 1], cos * chord[:, 1] - sin * chord[:, 0], turned]
+    )
+    return np.concatenate([np.zeros((min(len(pose), 1), 3)), np.cumsum(along, axis=0)])

@@ -1,0 +1,105 @@
+"""A robot of which geometry and mass are all that is known: simulated, explained and filtered."""
+
+import numpy as np
+import pytest
+
+from pipelines.estimate.estimate import estimate
+from pipelines.estimate.settings import EstimateSettings
+from pipelines.explain.explain import diagnose_runs
+from pipelines.runs.datasets import load_runs
+from pipelines.runs.settings import SimulateSettings
+from pipelines.runs.simulate import simulate_runs
+from terrain.discrepancy.signals import signals_of
+from terrain.effects import CHANNELS, effect_named, vector_of
+from terrain.robots import load_robot
+from terrain.simulation.planar.model import Ground, make_planar
+from terrain.simulation.planar.replay import replay
+from terrain.simulation.planar.run import simulate_planar
+
+TEXT = """name: mule
+drive: skid_steer
+wheel_radius_m: {value: 0.3, unit: m, source: me}
+track_m: {value: 1.08, unit: m, source: me}
+wheelbase_m: {value: 0.9, unit: m, source: assumed}
+mass_kg: {value: 280.0, unit: kg, source: me}
+"""
+
+
+@pytest.fixture(scope="module")
+def robot_file(tmp_path_factory):
+    path = tmp_path_factory.mktemp("robot") / "mule.yaml"
+    path.write_text(TEXT)
+    return path
+
+
+@pytest.fixture(scope="module")
+def wide_runs(robot_file, tmp_path_factory):
+    """Runs of a robot that turns as if its track were 40 % wider."""
+    out = tmp_path_factory.mktemp("runs")
+    simulate_runs(
+        SimulateSettings(
+            robot=str(robot_file),
+            terrain="asphalt",
+            scenario="complex",
+            out=out,
+            runs=6,
+            duration_s=40.0,
+            effect=("effective_track=0.4",),
+        )
+    )
+    return load_runs(out)
+
+
+def test_a_simulated_run_has_no_currents_and_turns_as_its_geometry_says(robot_file):
+    robot = load_robot(robot_file)
+    twist = np.zeros((501, 3))
+    twist[50:, 0], twist[50:, 2] = 0.6, 0.4
+    run = simulate_planar(robot, twist, 0, ground=Ground(slip_ratio=1e-9, rolling_ratio=0.0, scrub_ratio=0.0))
+    assert run.streams["wheels"].channels == ("speed_left_mps", "speed_right_mps")
+    left, right = run.streams["wheels"].values[-1]
+    assert right - left == pytest.approx(0.4 * 1.08, abs=1e-6)
+    assert run.streams["imu"].channel("gyro_z_radps")[-1] == pytest.approx(0.4, abs=1e-6)
+    np.testing.assert_allclose(run.streams["odometry"].values[-1], [0.6, 0.0], atol=1e-6)
+    assert all(np.isfinite(run.streams[name].values).all() for name in ("wheels", "imu", "odometry"))
+
+
+@pytest.mark.parametrize("terrain", ["asphalt", "grass", "dry_sand"])
+def test_every_kind_of_soil_can_be_driven(robot_file, tmp_path, terrain):
+    settings = SimulateSettings(
+        robot=str(robot_file), terrain=terrain, scenario="straight", out=tmp_path, duration_s=6.0, vary=True
+    )
+    assert simulate_runs(settings).n_runs == 1
+    (run,) = load_runs(tmp_path)
+    speed_mps = run.streams["truth"].channel("speed_x_mps")[-1]
+    rolled_mps = run.streams["wheels"].values[-1].mean()
+    assert rolled_mps == pytest.approx(1.0, abs=0.05)
+    assert 0.5 < speed_mps < 1.03
+
+
+def test_the_log_replayed_is_what_was_measured(robot_file, wide_runs):
+    """Two routes: the simulation that wrote the log, and its replay from the wheel speeds logged."""
+    robot = load_robot(robot_file)
+    signals = signals_of(wide_runs[0], robot)
+    p = vector_of({"effective_track_ratio": 0.4})
+    seen = replay(
+        make_planar(robot, Ground()), p, signals.dt_s, signals.wheel_speed_mps, signals.steer_rad,
+        signals.grade_rad, signals.roll_rad,
+    )  # fmt: skip
+    column = CHANNELS.index("yaw_rate_radps")
+    error = (signals.measured - seen)[50:-50, column]
+    assert np.std(error) < 0.03 < np.nanstd(signals.measured[:, column])
+
+
+def test_runs_are_explained_without_an_assumption_about_what_is_not_described(robot_file, wide_runs):
+    robot = load_robot(robot_file)
+    library = [effect_named("effective_track"), effect_named("lever_arm")]
+    found = diagnose_runs(wide_runs, robot, library, None, 0).diagnosis
+    assert [cause.name for cause in found.causes] == ["effective_track"]
+    (value,) = found.causes[0].values
+    assert value.value == pytest.approx(0.4, abs=0.05)
+
+
+def test_runs_are_filtered(robot_file, wide_runs):
+    settings = EstimateSettings(filter="skid", robot=str(robot_file), figures=False)
+    found = estimate(wide_runs, settings)
+    assert len(found.runs) == len(wide_runs)
