@@ -22,6 +22,7 @@ def with_late_streams(runs: Sequence[RunLog], names: Collection[str], late_s: fl
 
     Examples
     --------
+    >>> from terrain.records import Stream
     >>> run = RunLog("a", "husky", {"imu": Stream([0.0, 1.0], [[0.0], [1.0]], ("gyro_z_radps",))})
     >>> with_late_streams([run], ("imu",), 0.25)[0].streams["imu"].time_s
     array([0.25, 1.25])

@@ -111,8 +111,9 @@ class Limits(NamedTuple):
         i, j = ([self.names.index(p.name) for p in effect.parameters] for effect in (one, other))
         own, its = self.information[np.ix_(i, i)], self.information[np.ix_(j, j)]
         cross = self.information[np.ix_(i, j)]
-        if min(np.diag(own).min(), np.diag(its).min()) <= 0:
-            return True
+        unseen = [bool(np.diag(each).min() <= 0) for each in (own, its)]
+        if any(unseen):
+            return all(unseen)
         # the largest cosine between a change of the one and a change of the other
         shared = np.linalg.solve(own, cross) @ np.linalg.solve(its, cross.T)
         return math.sqrt(max(float(np.linalg.eigvals(shared).real.max()), 0.0)) > CONFUSABLE

@@ -64,10 +64,12 @@ class Draw(NamedTuple):
         """Return drives that excite all effects."""
         return rich_drives(self.rng, self.case.n_runs)
 
-    def strong(self, limits: Limits, without: Sequence[str] = ()) -> Hidden:
-        """Draw an effect in :data:`CLEAR` that these drives excite: its amplitude is within its bounds."""
+    def strong(
+        self, limits: Limits, over_limit: tuple[float, float] = CLEAR, without: Sequence[str] = ()
+    ) -> Hidden:
+        """Draw an effect that these drives excite: its amplitude is within its bounds."""
         library = library_of(self.robot.drive)
-        over = float(math.exp(self.rng.uniform(*np.log(CLEAR))))
+        over = float(math.exp(self.rng.uniform(*np.log(over_limit))))
         fit = [e for e in library if e.name not in without and e.parameters[0].name in limits.names]
         for i in self.rng.permutation(len(fit)):
             values = values_of(fit[i], limits, over, self.rng)

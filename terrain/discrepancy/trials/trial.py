@@ -12,12 +12,12 @@ import numpy as np
 from terrain.discrepancy.diagnose import diagnose
 from terrain.discrepancy.simulation import Simulation
 from terrain.discrepancy.trials.hidden_effects import Case
-from terrain.discrepancy.trials.limits import Limits, confusable_class
+from terrain.discrepancy.trials.limits import confusable_class
 from terrain.discrepancy.trials.rows import Row
 from terrain.discrepancy.trials.stage import Stage
 from terrain.discrepancy.trials.stages import CLOCK, stage_of
 from terrain.discrepancy.verdict import Diagnosis, Verdict
-from terrain.effects import LIBRARY, effect_named, nuisances_of
+from terrain.effects import HEADING, LIBRARY, effect_named, nuisances_of
 from terrain.errors import DataError
 from terrain.robots import Robot, load_robot
 from terrain.simulation.planar.model import Ground
@@ -137,7 +137,7 @@ def run_trial(case: Case) -> Trial:
 def _trial(
     case: Case, robot: Robot, stage: Stage, answer: Diagnosis | None, refusal: str, seconds: float
 ) -> Trial:
-    hidden, limits = stage.hidden, stage.limits
+    hidden = stage.hidden
     return Trial(
         row=case.row,
         number=case.number,
@@ -147,7 +147,7 @@ def _trial(
         causes=hidden.causes,
         outside=hidden.outside,
         over_limit=hidden.over_limit,
-        classes={} if limits is None else _classes(limits, hidden.causes, robot),
+        classes=_classes(stage, robot),
         seconds=seconds,
         variant=stage.variant,
         accepted=stage.accepted,
@@ -196,13 +196,16 @@ def _answered(answer: Diagnosis | None) -> dict[str, Any]:
     }
 
 
-def _classes(limits: Limits, causes: tuple[str, ...], robot: Robot) -> dict[str, tuple[str, ...]]:
+def _classes(stage: Stage, robot: Robot) -> dict[str, tuple[str, ...]]:
     """Return, by cause, the effects that no log of these drives distinguishes from it."""
+    if stage.limits is None:
+        return {}
+    has_heading = any("lidar" in run.streams for run in stage.runs)
     classes = {}
-    for cause in causes:
+    for cause in stage.hidden.causes:
         if cause not in [effect.name for effect in LIBRARY]:
             continue
         effect = effect_named(cause)
-        twins = confusable_class(limits, effect, robot.drive) | {name for name, _ in effect.twins}
-        classes[cause] = tuple(sorted(twins))
+        twins = {name for name, channel in effect.twins if not (has_heading and channel == HEADING)}
+        classes[cause] = tuple(sorted(twins | confusable_class(stage.limits, effect, robot.drive)))
     return classes

@@ -278,6 +278,16 @@ def test_what_is_free_costs_the_information_that_the_inverse_has_not():
     )
 
 
+def test_what_the_logs_do_not_show_is_no_twin_of_what_they_show():
+    """Logs of the DRIVE layout have no currents and no tilt."""
+    limits = stage(Row.SHORT, 0).limits
+    track, motor, accel = (effect_named(n) for n in ("effective_track", "motor_constant", "accel_bias"))
+    assert math.isinf(limits.of(motor))
+    assert not limits.alike(track, motor)
+    assert limits.alike(motor, accel)
+    assert not limits.alike(track, effect_named("gyro_scale"))  # the lidar has a heading of its own
+
+
 def test_short_rows_are_of_the_skid_steer_robot_whatever_is_asked_for():
     for row in (Row.SHORT, Row.KNOWN):
         assert cases_of(row, 2, 5, 8) == [Case(row, n, "husky", SHORT_RUNS, 5) for n in range(2)]
