@@ -1,4 +1,4 @@
-"""What is driven in blind trials: motion that excites every effect, and motion that excites hardly any."""
+"""What is driven in blind trials: motion that excites every effect, hardly any, or one command a run."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from terrain.records import Array
+from terrain.robots import Robot
 from terrain.simulation.planar.hills import Hills
 
 DURATION_S = 60.0
@@ -16,12 +17,23 @@ DURATION_S = 60.0
 STEP_HZ = 50.0
 """Rate of the commanded twists."""
 
+COMMAND_S, LEAD_S, HOLD_S = 6.0, 2.0, 0.3
+"""Length of a run that is one command, of the drive before its log begins, and for how long the command
+before holds in it."""
+
+COMMAND_MPS2 = 2.0
+"""The most by which the wheels of a side speed up in such a run, so that a command is reached in its lead."""
+
+COMMAND_GRADE_RATIO = 0.01
+"""Standard deviation of the slope under such runs, which have no measured tilt: a yard."""
+
 
 class Drives(NamedTuple):
-    """Drives of a trial: twists and hills of each run."""
+    """Drives of a trial: twists and hills of each run, and for how long is driven before the log begins."""
 
     twists: tuple[Array, ...]
     hills: tuple[Hills, ...]
+    lead_s: float = 0.0
 
 
 def rich_drives(rng: np.random.Generator, n_runs: int, duration_s: float = DURATION_S) -> Drives:
@@ -49,6 +61,24 @@ def poor_drives(rng: np.random.Generator, n_runs: int, duration_s: float = DURAT
     return Drives(tuple(twists), tuple(Hills() for _ in range(n_runs)))
 
 
+def command_drives(rng: np.random.Generator, robot: Robot, n_runs: int) -> Drives:
+    """Return drives of one command a run, as DRIVE has them: the wheel speeds of each side are drawn.
+
+    A run begins at the command before, which its lead reaches from rest.
+    """
+    n = round((LEAD_S + COMMAND_S) * STEP_HZ) + 1
+    fastest_mps = robot.motors.speed_max_radps * robot.wheel_radius_m
+    twists = []
+    for _ in range(n_runs):
+        desired = np.zeros((n, 2))
+        for first in (1, round((LEAD_S + HOLD_S) * STEP_HZ)):
+            desired[first:] = rng.uniform(-fastest_mps, fastest_mps, 2)
+        left, right = _limit_rate(desired, COMMAND_MPS2).T
+        twists.append(np.column_stack([(left + right) / 2, np.zeros(n), (right - left) / robot.track_m]))
+    hills = tuple(Hills(tuple(rng.normal(0.0, COMMAND_GRADE_RATIO, 2).tolist())) for _ in range(n_runs))
+    return Drives(tuple(twists), hills, LEAD_S)
+
+
 def _mixed_drive(rng: np.random.Generator, duration_s: float) -> Array:
     n = round(duration_s * STEP_HZ) + 1
     desired = np.zeros((n, 3))
@@ -71,15 +101,15 @@ def _mixed_drive(rng: np.random.Generator, duration_s: float) -> Array:
     return _limit_rate(desired)
 
 
-def _limit_rate(desired: Array) -> Array:
-    """Return twists (n, 3) from rest that change by at most 1 m/s^2 and 1 rad/s^2."""
-    limit = 1.0 / STEP_HZ
-    twist = np.zeros_like(desired)
+def _limit_rate(desired: Array, most: float = 1.0) -> Array:
+    """Return columns (n, k) from rest that change by at most so much in a second: m/s^2, rad/s^2."""
+    limit = most / STEP_HZ
+    limited = np.zeros_like(desired)
     for axis, goals in enumerate(desired.T.tolist()):  # numbers of Python's own: arrays of three are slow
         value, values = 0.0, [0.0]
         for goal in goals[1:]:
             change = goal - value
             value += limit if change > limit else -limit if change < -limit else change
             values.append(value)
-        twist[:, axis] = values
-    return twist
+        limited[:, axis] = values
+    return limited

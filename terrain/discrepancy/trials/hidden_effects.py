@@ -6,26 +6,32 @@ The diagnosis gets run logs without truth and without source, and knows nothing 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
-from terrain.discrepancy.trials.drives import Drives
+from terrain.discrepancy.trials.drives import STEP_HZ, Drives
 from terrain.discrepancy.trials.limits import Limits, confusable_class
 from terrain.discrepancy.trials.rows import Row
-from terrain.effects import Effect, effect_named, library_of
-from terrain.records import RunLog
+from terrain.effects import BOUNDS, Effect, effect_named, library_of
+from terrain.records import RunLog, Stream
 from terrain.robots import Robot
-from terrain.simulation.planar.noise import load_noise, load_scatter
+from terrain.simulation.planar.noise import Scatter, load_noise, load_scatter
 from terrain.simulation.planar.run import simulate_planar
 
 ROBOTS = ("agrimaro", "husky")
 """Trials take them in turn."""
 
+SHORT_RUNS = 80
+"""Number of runs where a run is one command of 6 s."""
+
 STRONG = 3.0
 """Amplitude over the detection limit, of an effect that has to be named."""
+
+CLIP_RATIO = 0.9
+"""Ratio of the bounds of an effect, beyond which none is hidden."""
 
 LADDER = (0.1, 10.0)
 """Range of amplitudes over the limit, in row ``ladder``."""
@@ -83,8 +89,14 @@ class Hidden(NamedTuple):
 
 
 def cases_of(row: Row, n: int, seed: int, n_runs: int) -> list[Case]:
-    """Return ``n`` cases of a row, the robots in turn."""
-    return [Case(row, i, ROBOTS[i % len(ROBOTS)], n_runs, seed) for i in range(n)]
+    """Return ``n`` cases of a row, the robots in turn where a row has both.
+
+    The rows of 6 s a run have :data:`SHORT_RUNS` of the skid-steer robot whatever is asked for.
+    """
+    if row in (Row.SHORT, Row.KNOWN):
+        return [Case(row, i, ROBOTS[1], SHORT_RUNS, seed) for i in range(n)]
+    robots = ROBOTS[:1] if row is Row.DYNAMIC else ROBOTS
+    return [Case(row, i, robots[i % len(robots)], n_runs, seed) for i in range(n)]
 
 
 def draw_hidden(case: Case, robot: Robot, limits: Limits | None, rng: np.random.Generator) -> Hidden:
@@ -103,16 +115,16 @@ def draw_hidden(case: Case, robot: Robot, limits: Limits | None, rng: np.random.
     if case.row is Row.FOUND:
         effect = acting[(case.number // len(ROBOTS)) % len(acting)]
         over = float(math.exp(rng.uniform(*np.log(FOUND_LADDER))))
-        return Hidden(_values(effect, limits, over, rng), (effect.name,), over, "", library, {})
+        return Hidden(values_of(effect, limits, over, rng), (effect.name,), over, "", library, {})
     effect = acting[int(rng.integers(len(acting)))]
     over = float(math.exp(rng.uniform(*np.log(LADDER)))) if case.row is Row.LADDER else STRONG
-    values = _values(effect, limits, over, rng)
+    values = values_of(effect, limits, over, rng)
     if case.row is not Row.TWO:
         return Hidden(values, (effect.name,), over, "", library, {})
     others = [o for o in acting if o.name not in confusable_class(limits, effect, robot.drive)]
     others = [o for o in others if o.name not in [name for name, _ in effect.twins]]
     other = others[int(rng.integers(len(others)))]
-    values |= _values(other, limits, over, rng)
+    values |= values_of(other, limits, over, rng)
     return Hidden(values, (effect.name, other.name), over, "", library, {})
 
 
@@ -125,7 +137,7 @@ def _draw_outside(
         effect = effect_named(kind)
         over = float(rng.uniform(*ENTRY_TAKEN_OUT))
         rest = tuple(other for other in library if other is not effect)
-        return Hidden(_values(effect, limits, over, rng), (), over, kind, rest, {})
+        return Hidden(values_of(effect, limits, over, rng), (), over, kind, rest, {})
     extra = {}
     if kind == "wheel_eccentricity":
         extra = {"wheel_eccentricity_ratio": float(rng.uniform(*ECCENTRICITY_RATIO))}
@@ -134,7 +146,7 @@ def _draw_outside(
     return Hidden({}, (), 0.0, kind, library, extra)
 
 
-def _values(effect: Effect, limits: Limits, over: float, rng: np.random.Generator) -> dict[str, float]:
+def values_of(effect: Effect, limits: Limits, over: float, rng: np.random.Generator) -> dict[str, float]:
     """Return values of an effect, of an amplitude over its limit, in a random direction within its bounds."""
     low = np.array([p.low for p in effect.parameters])
     high = np.array([p.high for p in effect.parameters])
@@ -142,33 +154,72 @@ def _values(effect: Effect, limits: Limits, over: float, rng: np.random.Generato
     direction /= np.linalg.norm(direction)
     direction = np.where((low == 0.0) & (direction < 0), -direction, direction)
     amplitude = over * limits.of(effect, direction)
-    values = np.clip(amplitude * direction, 0.9 * low, 0.9 * high)
+    values = np.clip(amplitude * direction, CLIP_RATIO * low, CLIP_RATIO * high)
     return {p.name: float(value) for p, value in zip(effect.parameters, values, strict=True)}
+
+
+def is_clipped(values: Mapping[str, float]) -> bool:
+    """Return whether :func:`values_of` clipped a value.
+
+    Examples
+    --------
+    >>> is_clipped({"gyro_scale_ratio": 0.27}), is_clipped({"gyro_scale_ratio": 0.26})
+    (True, False)
+    """
+    return any(
+        value != 0.0 and value in [CLIP_RATIO * bound for bound in BOUNDS[name]]
+        for name, value in values.items()
+    )
 
 
 def hidden_runs(
     robot: Robot,
     drives: Drives,
     seed: np.random.SeedSequence,
-    effects: Mapping[str, float],
+    effects: Mapping[str, float] | Sequence[Mapping[str, float]],
     outside: Mapping[str, float] | None = None,
+    *,
+    scatter: Scatter | None = None,
+    heading: bool = False,
 ) -> tuple[RunLog, ...]:
-    """Return the logs of drives with effects hidden in all of them; truth and source are removed."""
-    scatter, noise = load_scatter(), load_noise()
+    """Return the logs of drives with effects hidden in all of them; truth and source are removed.
+
+    Parameters
+    ----------
+    effects : values by parameter, of all runs or of each one
+    outside : amplitudes of what no library has
+    scatter : of the runs; that of the package by default
+    heading : log a heading that does not depend on the gyro, too
+    """
+    scatter, noise = scatter or load_scatter(), load_noise()
+    each = [effects] * len(drives.twists) if isinstance(effects, Mapping) else effects
     runs = []
-    for i, (twist, hills) in enumerate(zip(drives.twists, drives.hills, strict=True)):
+    for i, (twist, hills, own) in enumerate(zip(drives.twists, drives.hills, each, strict=True)):
         run = simulate_planar(
             robot,
             twist,
             np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, i)),
-            effects=effects,
+            effects=own,
             scatter=scatter,
             noise=noise,
             hills=hills,
             outside=outside,
+            heading=heading,
             run_id=f"run_{i + 1:02d}",
             terrain="ground",
         )
         shown = {name: stream for name, stream in run.streams.items() if name not in ("truth", "commands")}
-        runs.append(replace(run, streams=shown, source=""))
+        runs.append(_after(replace(run, streams=shown, source=""), drives.lead_s))
     return tuple(runs)
+
+
+def _after(run: RunLog, lead_s: float) -> RunLog:
+    """Return a run from a time on, which becomes the 0 of its clock."""
+    if lead_s == 0.0:
+        return run
+    streams = {}
+    for name, stream in run.streams.items():
+        kept = stream.time_s >= lead_s - 0.5 / (2.0 * STEP_HZ)
+        streams[name] = Stream(stream.time_s[kept] - lead_s, stream.values[kept], stream.channels)
+    labels = tuple(label._replace(end_s=label.end_s - lead_s) for label in run.labels)
+    return replace(run, streams=streams, labels=labels)

@@ -20,6 +20,7 @@ from terrain.effects import (
     CHANNELS,
     CURRENT,
     GYRO,
+    HEADING,
     INDEX,
     LIBRARY,
     ONE_SIDED,
@@ -34,13 +35,12 @@ from terrain.effects import (
     parameters_of,
     vector_of,
 )
-from terrain.records import Array, Stream
+from terrain.records import Array, RunLog, Stream
 from terrain.robots import Robot
-from terrain.simulation.planar.hills import Hills
 from terrain.simulation.planar.ideal_sensors import sense
 from terrain.simulation.planar.model import Ground, Planar, make_planar
 from terrain.simulation.planar.motion import move
-from terrain.simulation.planar.noise import Noise, load_noise, load_scatter
+from terrain.simulation.planar.noise import Noise, Scatter, load_noise, load_scatter
 from terrain.simulation.planar.noise_spectra import WHEEL_SPEED, noise_psd
 from terrain.simulation.planar.run import simulate_planar
 
@@ -53,6 +53,23 @@ POWER = 0.9
 CONFUSABLE = 0.99
 """Two effects whose sensitivities correlate more than that, nuisances taken out, are of one class: a
 collinearity index of 10."""
+
+
+class Sensing(NamedTuple):
+    """What the logs of a trial hold, all that the planar simulation measures by default.
+
+    Parameters
+    ----------
+    channels : that are logged; without any those of the planar simulation
+    cutoff_hz : above which the log holds nothing
+    tilt : whether a tilt is logged; without one the simulation takes the ground as level
+    scatter : of the runs; that of the package by default
+    """
+
+    channels: tuple[str, ...] = ()
+    cutoff_hz: float = 0.4 * STEP_HZ
+    scatter: Scatter | None = None
+    tilt: bool = True
 
 
 class Limits(NamedTuple):
@@ -80,28 +97,52 @@ class Limits(NamedTuple):
         """How many effects are tested."""
         return sum(all(p.name in self.names for p in effect.parameters) for effect in LIBRARY)
 
+    def free(self, *names: str) -> Limits:
+        """Return the information on all other parameters while some are not known."""
+        out = [self.names.index(name) for name in names]
+        left = [i for i in range(len(self.names)) if i not in out]
+        cross = self.information[np.ix_(left, out)]
+        inner = self.information[np.ix_(out, out)]
+        rest = self.information[np.ix_(left, left)] - cross @ np.linalg.solve(inner, cross.T)
+        return Limits(tuple(self.names[i] for i in left), rest)
+
     def alike(self, one: Effect, other: Effect) -> bool:
         """Return whether two effects are of one confusable class."""
         i, j = ([self.names.index(p.name) for p in effect.parameters] for effect in (one, other))
         own, its = self.information[np.ix_(i, i)], self.information[np.ix_(j, j)]
         cross = self.information[np.ix_(i, j)]
-        if min(np.diag(own).min(), np.diag(its).min()) <= 0:
-            return True
+        unseen = [bool(np.diag(each).min() <= 0) for each in (own, its)]
+        if any(unseen):
+            return all(unseen)
         # the largest cosine between a change of the one and a change of the other
         shared = np.linalg.solve(own, cross) @ np.linalg.solve(its, cross.T)
         return math.sqrt(max(float(np.linalg.eigvals(shared).real.max()), 0.0)) > CONFUSABLE
 
 
-def limits_of(robot: Robot, drives: Drives) -> Limits:
-    """Return the information of drives on each effect, by the Cramer-Rao bound."""
-    planar, noise, scatter = make_planar(robot, Ground()), load_noise(), load_scatter()
+def limits_of(robot: Robot, drives: Drives, sensing: Sensing | None = None) -> Limits:
+    """Return the information of drives on each effect, by the Cramer-Rao bound.
+
+    Examples
+    --------
+    >>> from terrain.discrepancy.trials.drives import rich_drives
+    >>> from terrain.effects import effect_named
+    >>> from terrain.robots import load_robot
+    >>> drives = rich_drives(np.random.default_rng(0), 3, 20.0)
+    >>> limits_of(load_robot("husky"), drives).of(effect_named("wheel_radius")) < 0.03
+    True
+    """
+    sensing = sensing or Sensing()
+    planar, noise, scatter = make_planar(robot, Ground()), load_noise(), sensing.scatter or load_scatter()
     names, nuisances = tuple(parameters_of(robot.drive)), nuisances_of(robot.drive)
     every = tuple(dict.fromkeys((*names, *nuisances)))
     free = [every.index(name) for name in nuisances]
     std = np.array([getattr(scatter, every[i]) for i in free])
     total = np.zeros((len(names), len(names)))
+    lead = round(drives.lead_s * STEP_HZ)
     for twist, hills in zip(drives.twists, drives.hills, strict=True):
-        gram = _gram(robot, planar, noise, twist, hills, every)
+        gram = _gram(
+            robot, planar, noise, simulate_planar(robot, twist, 0, hills=hills), every, sensing, lead
+        )
         inner = np.linalg.inv(gram[np.ix_(free, free)] + np.diag(1.0 / std**2))
         left = gram - gram[:, free] @ inner @ gram[free]
         total += left[: len(names), : len(names)]
@@ -109,28 +150,35 @@ def limits_of(robot: Robot, drives: Drives) -> Limits:
 
 
 def _gram(
-    robot: Robot, planar: Planar, noise: Noise, twist: Array, hills: Hills, names: Sequence[str]
+    robot: Robot,
+    planar: Planar,
+    noise: Noise,
+    run: RunLog,
+    names: Sequence[str],
+    sensing: Sensing,
+    lead: int,
 ) -> Array:
-    """Return the information (k, k) of one run, nothing free."""
-    run = simulate_planar(robot, twist, 0, hills=hills)
+    """Return the information (k, k) of one run from a step on, nothing free."""
     truth = run.streams["truth"]
-    even = slice(0, len(truth) // 100 * 100, 2)  # a length that its Fourier transform is quick with
+    even = slice(2 * lead, len(truth) // 100 * 100, 2)  # a length that its Fourier transform is quick with
     truth = Stream(truth.time_s[even], truth.values[even], truth.channels)
     rate_hz = truth.rate_hz
     wheels = robot.wheels
     wheel_speed = np.column_stack([truth.channel(f"wheel_{w}_radps") for w in wheels]) * robot.wheel_radius_m
     steer = np.column_stack([truth.channel(f"steer_{w}_rad") for w in wheels])
-    grade, roll = -truth.channel("pitch_rad"), truth.channel("roll_rad").copy()
+    grade, roll = (
+        sensing.tilt * sign * truth.channel(f"{axis}_rad") for axis, sign in (("pitch", -1.0), ("roll", 1.0))
+    )
     wheel_speed, steer = np.ascontiguousarray(wheel_speed), np.ascontiguousarray(steer)
     measured = np.ones((len(wheel_speed), len(CHANNELS)))
     # the sum of currents measures traction only where wheels are parallel
     measured[np.abs(np.exp(1j * steer).mean(axis=1)) < 0.95, CHANNELS.index(CURRENT)] = 0.0
-    channels = [GYRO, SPEED_X, SPEED_Y, ACCEL, CURRENT]
-    if robot.skids:
-        channels.append(TURNING_CURRENT)
+    channels = sensing.channels or (GYRO, SPEED_X, SPEED_Y, ACCEL, CURRENT)
+    if robot.skids and not sensing.channels:
+        channels = (*channels, TURNING_CURRENT)
     n = len(wheel_speed)
     frequency_hz = np.fft.rfftfreq(n, 1 / rate_hz)
-    used = frequency_hz < 0.4 * STEP_HZ
+    used = frequency_hz < sensing.cutoff_hz
     f = frequency_hz[used]
     both_sides = np.where(f > 0, 4.0, 2.0)
     pace = float(np.abs(wheel_speed).mean(axis=1)[np.abs(wheel_speed).mean(axis=1) > 0.05].mean())
@@ -176,7 +224,7 @@ def _density(noise: Noise, robot: Robot, planar: Planar, channel: str, f: Array,
     wheel_speed = wheel_speed * (1.0 + (2 * math.pi * f * lag_s) ** 2)  # the lag is undone
     n = planar.n_wheels
     mean, rate = wheel_speed / n, (2 * math.pi * f) ** 2
-    if channel == GYRO:
+    if channel in (GYRO, HEADING):
         turn = 2.0 / planar.track_m**2 if robot.skids else np.sum(planar.to_twist[2] ** 2) / 2
         return own + wheel_speed * turn
     if channel == SPEED_X:

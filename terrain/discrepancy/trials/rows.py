@@ -11,6 +11,14 @@ class Row(StrEnum):
     ``NONE``: nothing.  ``STRONG``: one effect of 3 times its detection limit.  ``LADDER``: one effect of 0.1
     to 10 times its limit.  ``FOUND``: each effect in turn, around its limit.  ``TWO``: two effects.
     ``OUTSIDE``: something that is not in the library.  ``POOR``: one effect, with drives that excite little.
+
+    What measured runs have besides, see :mod:`terrain.discrepancy.trials.stage`.  ``GROSS``: one effect of 20
+    to 100 times its limit.  ``SHORT``: one effect in 80 runs of 6 s.  ``LATE``: a logger is late, beside one
+    effect.  ``SCATTERED``: an effect that differs from run to run.  ``STALLED``: runs whose body is at rest,
+    beside one effect.  ``HALF``: an effect in half of the runs.  ``SENSOR_LATE``: one sensor is late.
+    ``FAULT``: a sign, a unit or an order written into the log.  ``DYNAMIC``: runs of the dynamic simulation,
+    half of the trials with nothing hidden.  ``KNOWN``: a skid-steer robot of which the effective track is far
+    off, in 80 runs of 6 s.
     """
 
     NONE = "none"
@@ -20,3 +28,13 @@ class Row(StrEnum):
     TWO = "two"
     OUTSIDE = "outside"
     POOR = "poor"
+    GROSS = "gross"
+    SHORT = "short"
+    LATE = "late"
+    SCATTERED = "scattered"
+    STALLED = "stalled"
+    HALF = "half"
+    SENSOR_LATE = "sensor_late"
+    FAULT = "fault"
+    DYNAMIC = "dynamic"
+    KNOWN = "known"

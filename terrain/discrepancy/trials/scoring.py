@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import beta
 
 from terrain.discrepancy.trials.hidden_effects import OUTSIDE, ROBOTS
+from terrain.discrepancy.trials.measured_scores import is_covered, measured_scores, states_something
+from terrain.discrepancy.trials.rate import Rate, rate_of
 from terrain.discrepancy.trials.rows import Row
 from terrain.discrepancy.trials.trial import Trial
 from terrain.discrepancy.verdict import Verdict
@@ -18,23 +19,6 @@ from terrain.records import Array
 
 FOUND_TRIALS = 5
 """Least number of trials of an effect, from which the amplitude at which it is found is fitted."""
-
-
-class Rate(NamedTuple):
-    """A rate, and its 95 % interval by Clopper and Pearson (Biometrika 1934).
-
-    Parameters
-    ----------
-    hits, of : counts
-    rate : NaN where nothing was counted
-    low, high : ends of the interval
-    """
-
-    hits: int
-    of: int
-    rate: float
-    low: float
-    high: float
 
 
 class Score(NamedTuple):
@@ -56,33 +40,16 @@ class Score(NamedTuple):
     met: bool
 
 
-def rate_of(outcomes: Iterable[bool]) -> Rate:
-    """Return the rate of outcomes that are true.
-
-    Examples
-    --------
-    >>> [round(x, 4) for x in rate_of([False] * 300)[2:]]
-    [0.0, 0.0, 0.0122]
-    """
-    counted = [bool(outcome) for outcome in outcomes]
-    n, k = len(counted), sum(counted)
-    if n == 0:
-        return Rate(0, 0, math.nan, 0.0, 1.0)
-    low = float(beta.ppf(0.025, k, n - k + 1)) if k > 0 else 0.0
-    high = float(beta.ppf(0.975, k + 1, n - k)) if k < n else 1.0
-    return Rate(k, n, k / n, low, high)
-
-
 def table_of(trials: Sequence[Trial]) -> dict[str, Score]:
     """Return the scores of all rows that were tried, by name."""
     rows = {row: [t for t in trials if t.row == row] for row in Row}
-    return {name: Score(*rate, bar, met) for name, rate, bar, met in _scores(trials, rows) if rate.of}
+    scores = (*_scores(trials, rows), *measured_scores(rows))
+    return {name: Score(*rate, bar, met) for name, rate, bar, met in scores if rate.of}
 
 
 def _scores(trials: Sequence[Trial], rows: dict[Row, list[Trial]]) -> Iterator[tuple[str, Rate, str, bool]]:
     """Yield name, rate, bar, and whether it is met."""
-    quiet = (Verdict.NONE, Verdict.NOT_EXCITED)
-    alarms = rate_of(t.verdict not in quiet for t in rows[Row.NONE])
+    alarms = rate_of(states_something(t) for t in rows[Row.NONE])
     yield "none: false alarms", alarms, "at most 2 %", alarms.rate <= 0.02
     named = rate_of(all(t.found(c) for c in t.causes) for t in rows[Row.STRONG])
     yield "strong: named", named, "at least 95 %", named.rate >= 0.95
@@ -90,7 +57,7 @@ def _scores(trials: Sequence[Trial], rows: dict[Row, list[Trial]]) -> Iterator[t
         wrong = rate_of(t.wrong for t in rows[row])
         yield f"{row.value}: wrongly named", wrong, "at most 1 %", wrong.rate <= 0.01
     covered = rate_of(
-        _covered(t)
+        is_covered(t)
         for t in [*rows[Row.LADDER], *rows[Row.FOUND], *rows[Row.STRONG]]
         if t.over_limit >= 1.0 and t.causes[0] in t.named
     )
@@ -115,12 +82,9 @@ def _outside_scores(trials: Sequence[Trial]) -> Iterator[tuple[str, Rate, str, b
     for kind in OUTSIDE:
         some = [t for t in trials if t.outside == kind]
         yield f"outside, {kind}: misnamed", rate_of(bool(t.named) for t in some), "", True
-        yield f"outside, {kind}: unexplained", rate_of(bool(t.unexplained) for t in some), "", True
-
-
-def _covered(trial: Trial) -> bool:
-    """Return whether every hidden value lies within the interval that was given for it."""
-    return all(trial.intervals[p][1] <= value <= trial.intervals[p][2] for p, value in trial.hidden.items())
+        left = rate_of(bool(t.unexplained) for t in some)
+        bar = "at least 60 %" if kind == "stick_slip" else ""
+        yield f"outside, {kind}: unexplained", left, bar, not bar or left.rate >= 0.6
 
 
 def found_from(trials: Sequence[Trial]) -> dict[str, dict[str, float]]:

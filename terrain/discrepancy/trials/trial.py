@@ -5,21 +5,33 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from terrain.discrepancy.diagnose import diagnose
 from terrain.discrepancy.simulation import Simulation
-from terrain.discrepancy.trials.drives import poor_drives, rich_drives
-from terrain.discrepancy.trials.hidden_effects import Case, draw_hidden, hidden_runs
-from terrain.discrepancy.trials.limits import Limits, confusable_class, limits_of
+from terrain.discrepancy.trials.hidden_effects import Case
+from terrain.discrepancy.trials.limits import confusable_class
 from terrain.discrepancy.trials.rows import Row
+from terrain.discrepancy.trials.stage import Stage
+from terrain.discrepancy.trials.stages import CLOCK, stage_of
 from terrain.discrepancy.verdict import Diagnosis, Verdict
-from terrain.effects import effect_named, nuisances_of
+from terrain.effects import HEADING, LIBRARY, effect_named, nuisances_of
 from terrain.errors import DataError
 from terrain.robots import Robot, load_robot
 from terrain.simulation.planar.model import Ground
 from terrain.simulation.planar.noise import load_scatter
+
+CLOCK_STATED_S = 0.04
+"""Largest error of the delay between two loggers that is stated: two samples of the wheels' logger."""
+
+
+class Varying(NamedTuple):
+    """An effect that differs from run to run, as it was answered: its name, and the runs of each value."""
+
+    name: str
+    groups: tuple[tuple[float, tuple[str, ...]], ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,7 +40,7 @@ class Trial:
 
     Parameters
     ----------
-    row, number, robot, n_runs : of the case
+    row, number, robot, n_runs : of the case; ``n_runs`` that were made
     hidden : values by parameter
     causes : names of the effects hidden
     outside : name of what is hidden and not in the library
@@ -36,9 +48,16 @@ class Trial:
     classes : by cause, the effects of its confusable class
     verdict : ``REFUSED`` where the diagnosis did not accept the runs, as too few seemed to be fit
     named, sets, unexplained : the answer
-    intervals : by parameter named: value, lower and upper end of its 95 % interval
+    intervals : by parameter named, alone or in a set: value, lower and upper end of its 95 % interval
     gain_low : lower end of the smallest held-out gain of a cause
     seconds : duration of the diagnosis
+    variant, accepted, clipped, late_s, stalled, present, fault : as a
+        :class:`~terrain.discrepancy.trials.stage.Stage` has them
+    clock_s : median delay of IMU and camera that the answer states; NaN where it states none
+    excluded : ids of the runs that were excluded
+    varying : effects that differ from run to run
+    statements : what the answer states of faults of the logs
+    refusal : why the runs were refused
     """
 
     row: Row
@@ -57,10 +76,27 @@ class Trial:
     intervals: dict[str, tuple[float, float, float]]
     gain_low: float
     seconds: float
+    variant: str = ""
+    accepted: tuple[str, ...] = ()
+    clipped: bool = False
+    late_s: float = math.nan
+    stalled: tuple[str, ...] = ()
+    present: tuple[str, ...] = ()
+    fault: str = ""
+    clock_s: float = math.nan
+    excluded: tuple[str, ...] = ()
+    varying: tuple[Varying, ...] = ()
+    statements: tuple[str, ...] = ()
+    refusal: str = ""
 
     def found(self, cause: str) -> bool:
-        """Return whether a hidden effect is named, alone or in a set with none but its confusable class."""
+        """Return whether a hidden effect is named, alone or in a set with none but its confusable class.
+
+        A late logger is found by the delay that is stated, too.
+        """
         twins = {cause, *self.classes.get(cause, ())}
+        if cause == CLOCK and abs(self.clock_s - self.late_s) <= CLOCK_STATED_S:
+            return True
         return cause in self.named or any(cause in names and set(names) <= twins for names in self.sets)
 
     @property
@@ -71,8 +107,8 @@ class Trial:
     @property
     def wrong(self) -> bool:
         """Whether something is named, alone or in a set, that is not hidden."""
-        false = [name for name in self.named if name not in self.causes]
-        return bool(false) or any(not set(names) & set(self.causes) for names in self.sets)
+        fine = {*self.causes, *self.accepted}
+        return bool(set(self.named) - fine) or any(not set(names) & fine for names in self.sets)
 
 
 def simulation_of(robot: Robot) -> Simulation:
@@ -87,48 +123,89 @@ def run_trial(case: Case) -> Trial:
     robot = load_robot(case.robot)
     key = [case.seed, case.number, list(Row).index(case.row), case.n_runs]
     drawn, noise = np.random.SeedSequence(key).spawn(2)
-    rng = np.random.default_rng(drawn)
-    rich = rich_drives(rng, case.n_runs)
-    drives = poor_drives(rng, case.n_runs) if case.row is Row.POOR else rich
-    limits = None if case.row is Row.NONE else limits_of(robot, rich)
-    hidden = draw_hidden(case, robot, limits, rng)
-    runs = hidden_runs(robot, drives, noise, hidden.effects, hidden.outside_values)
-    answer: Diagnosis | None
+    stage = stage_of(case, robot, np.random.default_rng(drawn), noise)
+    answer: Diagnosis | None = None
+    refusal = ""
     start_s = time.perf_counter()
     try:
-        answer = diagnose(runs, simulation_of(robot), hidden.library)
-    except DataError:
-        answer = None
-    seconds = time.perf_counter() - start_s
-    causes = () if answer is None else answer.causes
-    left = () if answer is None else answer.unexplained
+        answer = diagnose(stage.runs, stage.simulation or simulation_of(robot), stage.hidden.library)
+    except DataError as error:
+        refusal = str(error)
+    return _trial(case, robot, stage, answer, refusal, time.perf_counter() - start_s)
+
+
+def _trial(
+    case: Case, robot: Robot, stage: Stage, answer: Diagnosis | None, refusal: str, seconds: float
+) -> Trial:
+    hidden = stage.hidden
     return Trial(
         row=case.row,
         number=case.number,
         robot=case.robot,
-        n_runs=case.n_runs,
+        n_runs=len(stage.runs),
         hidden=hidden.effects | hidden.outside_values,
         causes=hidden.causes,
         outside=hidden.outside,
         over_limit=hidden.over_limit,
-        classes={} if limits is None else _classes(limits, hidden.causes, robot),
-        verdict=Verdict.REFUSED if answer is None else answer.verdict,
-        named=tuple(cause.name for cause in causes),
-        sets=() if answer is None else answer.ambiguous_sets,
-        unexplained=tuple((each.channel, each.input) for each in left),
-        intervals={
-            value.name: (value.value, value.low, value.high) for cause in causes for value in cause.values
-        },
-        gain_low=min((cause.gain_low for cause in causes), default=math.nan),
+        classes=_classes(stage, robot),
         seconds=seconds,
+        variant=stage.variant,
+        accepted=stage.accepted,
+        clipped=stage.clipped,
+        late_s=stage.late_s,
+        stalled=stage.stalled,
+        present=stage.present,
+        fault=stage.fault,
+        refusal=refusal,
+        **_answered(answer),
     )
 
 
-def _classes(limits: Limits, causes: tuple[str, ...], robot: Robot) -> dict[str, tuple[str, ...]]:
+def _answered(answer: Diagnosis | None) -> dict[str, Any]:
+    """Return the fields of a trial that are the answer; what a diagnosis does not have is empty."""
+    if answer is None:
+        none = dict.fromkeys(("named", "sets", "unexplained"), ())
+        return {**none, "verdict": Verdict.REFUSED, "intervals": {}, "gain_low": math.nan}
+    causes = answer.causes
+    in_sets = [
+        value
+        for names in answer.ambiguous_sets
+        for n in names
+        for value in answer.ambiguous_values.get(n, ())
+    ]
+    values = [*in_sets, *(value for cause in causes for value in cause.values)]
+    offset_s = np.array([clock.offset_s for clock in answer.clocks])
+    known_s = offset_s[np.isfinite(offset_s)]
+    return {
+        "verdict": answer.verdict,
+        "named": tuple(cause.name for cause in causes),
+        "sets": answer.ambiguous_sets,
+        "unexplained": tuple((each.channel, each.input) for each in answer.unexplained),
+        "intervals": {value.name: (value.value, value.low, value.high) for value in values},
+        "gain_low": min((cause.gain_low for cause in causes), default=math.nan),
+        "clock_s": float(np.median(known_s)) if known_s.size else math.nan,
+        "excluded": tuple(run.run_id for run in answer.excluded_runs),
+        "varying": tuple(
+            Varying(each.name, tuple((float(value), tuple(ids)) for value, ids in each.groups))
+            for each in getattr(answer, "varying", ())
+        ),
+        "statements": tuple(
+            " ".join((str(each.kind), str(each.channel), str(each.sentence)))
+            for each in getattr(answer, "faults", ())
+        ),
+    }
+
+
+def _classes(stage: Stage, robot: Robot) -> dict[str, tuple[str, ...]]:
     """Return, by cause, the effects that no log of these drives distinguishes from it."""
+    if stage.limits is None:
+        return {}
+    has_heading = any("lidar" in run.streams for run in stage.runs)
     classes = {}
-    for cause in causes:
+    for cause in stage.hidden.causes:
+        if cause not in [effect.name for effect in LIBRARY]:
+            continue
         effect = effect_named(cause)
-        twins = confusable_class(limits, effect, robot.drive) | {name for name, _ in effect.twins}
-        classes[cause] = tuple(sorted(twins))
+        twins = {name for name, channel in effect.twins if not (has_heading and channel == HEADING)}
+        classes[cause] = tuple(sorted(twins | confusable_class(stage.limits, effect, robot.drive)))
     return classes
