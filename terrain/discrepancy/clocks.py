@@ -21,9 +21,9 @@ from terrain.effects import CHANNELS, GYRO, HEADING, SPEED_X
 from terrain.errors import DataError
 from terrain.records import Array
 
-MIN_LAG_S, MAX_LAG_S = -0.5, 2.0
-"""Loggers of a run are started together, the wheels' first; the other sign is what an encoder's low-pass
-looks like."""
+MIN_LAG_S, MAX_LAG_S = -1.0, 2.0
+"""Loggers of a run are started together, the wheels' first.  The other sign is that of wheels that are late:
+they are averaged, sent a few times a second, held, and queued, which adds up to less than a second."""
 
 FAR_LAG_S = 10.0
 """Bound of a second search that only finds that a clock is out of reach, in runs of twice that length."""

@@ -177,7 +177,7 @@ def rows_of(
     low-pass filtered wheel speeds, as instruments: the noise of a differentiated encoder grows with
     frequency, the commands do not.
     """
-    dt, wheel_speed, steer, grade, roll, measured = _prepare_inputs(signals, low_pass)
+    dt, wheel_speed, steer, grade, roll, measured = prepare_inputs(signals, low_pass)
     n_rows = max((len(wheel_speed) - low_pass.taps.size) // low_pass.every + 1, 0)
     first = low_pass.taps.size // 2
     skip = math.ceil(SETTLE_S * low_pass.rate_hz)
@@ -287,7 +287,7 @@ def _predictions(  # noqa: PLR0913 - a kernel takes its arrays one by one
     return out
 
 
-def _prepare_inputs(signals: Signals, low_pass: LowPass) -> tuple[float, Array, Array, Array, Array, Array]:
+def prepare_inputs(signals: Signals, low_pass: LowPass) -> tuple[float, Array, Array, Array, Array, Array]:
     """Return the clock's period, wheel speeds, steering, grade, roll and measurements without holes.
 
     Holes of the inputs are bridged, and measurements there are dropped.  Both pass a window far above the

@@ -125,7 +125,7 @@ def test_a_clock_requires_excitation_and_a_common_offset_is_no_fault(sound):
 def test_clocks_out_of_the_search_exclude_a_run_and_are_refused_for_most_runs(sound):
     one = excluded([late(run, 5.0) if i == ODD else run for i, run in enumerate(sound)])
     assert [run.run_id for run in one] == [f"run_{ODD}"]
-    assert "not -0.5 to 2 s behind" in one[0].reason
+    assert "not -1 to 2 s behind" in one[0].reason
     with pytest.raises(DataError, match="unsynchronised clocks beyond the search in 6 of 6"):
         excluded([late(run, 5.0) for run in sound])
 

@@ -8,11 +8,11 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from terrain.discrepancy.information import information_at
 from terrain.discrepancy.residuals import (
-    _prepare_inputs,
     decimate,
     decimate_known,
     low_pass_of,
     measured_channels,
+    prepare_inputs,
     rows_of,
 )
 from terrain.discrepancy.selection import fit_change
@@ -125,7 +125,7 @@ def test_measured_and_predicted_pass_the_same_window(looked_at):
     """A prediction that is fed back as what was measured leaves nothing, holes or none."""
     simulation, effects, signals = looked_at
     low_pass = low_pass_of([signals])
-    dt, wheel_speed, steer, grade, roll, _ = _prepare_inputs(signals, low_pass)
+    dt, wheel_speed, steer, grade, roll, _ = prepare_inputs(signals, low_pass)
     shown = replay(simulation.planar, vector_of(effects), dt, wheel_speed, steer, grade, roll)
     own = low_pass._replace(inputs_every=0)
     fed = {"wheel_speed_mps": wheel_speed, "steer_rad": steer, "grade_rad": grade, "roll_rad": roll}
