@@ -16,11 +16,11 @@ from scipy.stats import chi2
 from terrain.discrepancy.information import N_BLOCKS, Information
 from terrain.records import Array
 
-VARIES_RATIO = 0.5
-"""A value that differs by more than that ratio of itself, from the least to the greatest of its groups, is no
-value: a drift that has nothing to do with the cause, seen as one, differs by 4/3 from first to last third."""
+VARIES_RATIO = 0.25
+"""A value whose groups are further apart than that ratio of it, root mean square by their information, is no
+value: a cause that grows from nothing along a run, seen as a constant one, has 0.54 between its thirds."""
 
-CAVEAT_RATIO = 0.1
+CAVEAT_RATIO = 0.05
 """A value that differs by more than that ratio is given with what it depends on."""
 
 CERTAIN_P = 1e-5
@@ -45,8 +45,9 @@ class Constancy(NamedTuple):
     ----------
     thirds : of the time of each run, the first first
     halves : of the runs, in the order given
-    ratio : largest difference between groups of one kind, over the size of the value
-    split : ``time`` or ``runs``, where that largest difference is
+    ratio : root mean square difference of groups of one kind from their mean, each with the weight of its
+        information, over the size of the value
+    split : ``time`` or ``runs``, where that is largest
     certain : whether differences are beyond the noise
     """
 
@@ -127,7 +128,7 @@ def _groups(
 
 
 def _difference(groups: Sequence[Group]) -> tuple[float, bool]:
-    """Return the largest difference between groups, and whether it is beyond the noise."""
+    """Return how far groups are apart, weighted by their information, and whether it is beyond the noise."""
     if len(groups) < 2:
         return 0.0, False
     values, std = np.array([g.values for g in groups]), np.array([g.std for g in groups])
@@ -139,7 +140,8 @@ def _difference(groups: Sequence[Group]) -> tuple[float, bool]:
     mean = (weight * values).sum(axis=0) / weight.sum(axis=0)
     statistic = float((weight * (values - mean) ** 2).sum(axis=0).max())
     certain = float(chi2.sf(statistic, len(groups) - 1)) < CERTAIN_P
-    return float(np.ptp(values, axis=0).max()), certain
+    apart = np.sqrt((weight * (values - mean) ** 2).sum(axis=0) / weight.sum(axis=0))
+    return float(apart.max()), certain
 
 
 def _main(groups: Sequence[Group]) -> int:

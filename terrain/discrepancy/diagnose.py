@@ -24,7 +24,8 @@ from terrain.discrepancy.answers import (
 )
 from terrain.discrepancy.clocks import shifts_of
 from terrain.discrepancy.health import clocks_of, unfit_runs
-from terrain.discrepancy.information import Information
+from terrain.discrepancy.information import Information, move_point
+from terrain.discrepancy.latencies import latencies_of, starting_values
 from terrain.discrepancy.next_drive import next_drive
 from terrain.discrepancy.probes import probe_residuals
 from terrain.discrepancy.residuals import low_pass_of
@@ -84,9 +85,10 @@ def diagnose_signals(
     effects = simulation.library if library is None else tuple(library)
     low_pass = low_pass_of(signals)
     problem = Problem(tuple(signals), simulation, low_pass, effects)
-    start = problem.at(simulation.vector)
-    shift = shifts_of(start)
-    excluded = unfit_runs(problem.signals, start, shift)
+    seeds = _seeds(problem)
+    aligned = _at_seeds(problem, seeds)
+    shift = shifts_of(aligned)
+    excluded = unfit_runs(problem.signals, aligned, shift)
     if excluded:
         gone = {run.run_id for run in excluded}
         kept = tuple(run for run in problem.signals if run.run_id not in gone)
@@ -94,9 +96,11 @@ def diagnose_signals(
             reasons = "; ".join(f"{run.run_id}: {run.reason}" for run in excluded[:3])
             raise DataError(f"runs: only {len(kept)} of {len(signals)} are fit to be compared ({reasons})")
         problem = problem._replace(signals=kept)
-        start = problem.at(simulation.vector)
-        shift = shifts_of(start)
-    found, withdrawn = _search_and_withdraw(problem, start)
+        seeds = _seeds(problem)
+        aligned = _at_seeds(problem, seeds)
+        shift = shifts_of(aligned)
+    start = problem.at(simulation.vector) if seeds else aligned
+    found, withdrawn = _search_and_withdraw(problem, start, seeds)
     varying = varying_effects(found, problem.library)
     found, withdrawn = _without_varying(problem, start, found, withdrawn, varying)
     found = with_rivals(problem, start, found)
@@ -130,7 +134,7 @@ def diagnose_signals(
         not_excited=missed,
         ruled_out=tuple(ruled_out_of(found, named, sets, withdrawn, problem.library)),
         excluded_runs=excluded,
-        clocks=clocks_of(start, shift),
+        clocks=clocks_of(aligned, shift),
         next_drive=next_drive(simulation, sets, missed, found.info),
         residual_before=residuals_of(start, start),
         residual_after=residuals_of(after, start),
@@ -139,13 +143,26 @@ def diagnose_signals(
     )
 
 
-def _search_and_withdraw(problem: Problem, start: Information) -> tuple[Found, dict[str, RuledOut]]:
+def _seeds(problem: Problem) -> dict[str, float]:
+    """Return lags of sensors that are so large that a search has to start from them."""
+    found = starting_values(latencies_of(problem.signals, problem.simulation))
+    return {name: value for name, value in found.items() if name in problem.parameters}
+
+
+def _at_seeds(problem: Problem, seeds: Mapping[str, float]) -> Information:
+    vector = problem.simulation.vector
+    return problem.at(move_point(vector, tuple(seeds), np.array(list(seeds.values()))))
+
+
+def _search_and_withdraw(
+    problem: Problem, start: Information, seeds: Mapping[str, float]
+) -> tuple[Found, dict[str, RuledOut]]:
     """Return the causes that may be named, and those that were withdrawn, by name.
 
     One is withdrawn at a time, the one that gains least, and the others are fitted anew: a wrong cause
     distorts the others, and their reasons go with it.
     """
-    found = search(problem, start)
+    found = search(problem, start, seeds)
     withdrawn: dict[str, RuledOut] = {}
     for _ in range(MAX_WITHDRAWN):
         probes = probe_residuals(found.info, found.names, found.change)

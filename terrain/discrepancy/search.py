@@ -27,8 +27,9 @@ from terrain.discrepancy.simulation import Simulation
 from terrain.effects import INDEX, Effect
 from terrain.records import Array
 
-MAX_CAUSES = 6
-"""Most causes of a diagnosis: with more the simulation is of another robot."""
+MAX_CAUSES = 8
+"""Most causes of a diagnosis: with more the simulation is of another robot.  Lags of two sensors, track, side
+slip, drag, and a wrong lever arm are six."""
 
 MAX_STEPS = 12
 """Most steps of the search, successful or not."""
@@ -157,21 +158,35 @@ def names_of(effects: Sequence[Effect]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(p.name for effect in effects for p in effect.parameters))
 
 
-def search(problem: Problem, start: Information) -> Found:
+def search(problem: Problem, start: Information, seeds: Mapping[str, float] | None = None) -> Found:
     """Return the causes that explain the runs.
 
     Parameters
     ----------
     problem : of what
     start : information of the runs around the simulation as it is given
+    seeds : parameters whose values are so large that sensitivities without them would mislead, as lags of
+        sensors: other causes are first searched with them built in, then all are fitted together
     """
     base = start.vector
-    info = start
     causes: list[Effect] = []
+    info = start
+    if seeds:
+        there = move_point(base, tuple(seeds), np.array(list(seeds.values())))
+        first, info = _grow(problem, problem.at(there), there, [])
+        seeded = [each for each in problem.library if set(names_of([each])) & set(seeds)]
+        causes = [*seeded, *(cause for cause in first if cause not in seeded)]
+        causes, info = _refit_significant(problem, recentre(info, base), base, causes)
+    causes, info = _grow(problem, info, base, causes)
+    return _found(problem, info, causes)
+
+
+def _grow(
+    problem: Problem, info: Information, base: Array, causes: list[Effect]
+) -> tuple[list[Effect], Information]:
+    """Add effects, refit, drop and swap, until none is significant that is not there."""
     barred: set[str] = set()  # added to the current causes, and dropped again
-    seen = {
-        _set_of([])
-    }  # sets of causes that were reached; none of them twice, or the search goes in circles
+    seen = {_set_of(causes)}  # sets that were reached; none twice, or the search goes in circles
     for _ in range(MAX_STEPS):
         new = _next(problem, info, base, causes, barred)
         if not new or len(causes) + len(new) > MAX_CAUSES:
@@ -184,7 +199,7 @@ def search(problem: Problem, start: Information) -> Found:
             barred = set()
             causes, info = more, at
         barred |= {effect.name for effect in new if effect not in causes}
-    return _found(problem, info, causes)
+    return causes, info
 
 
 def refit(problem: Problem, start: Information, found: Found, causes: Sequence[Effect]) -> Found:

@@ -21,11 +21,11 @@ NEAR_BOUND = 0.02
 WORSE_RATIO = 1.1
 """A cause is withdrawn that makes the square of a channel larger by more than that."""
 
-PROBE_RATIO, PROBE_ALIKE = 0.15, 0.3
+PROBE_RATIO, PROBE_ALIKE = 0.5, 0.3
 """A cause is withdrawn if a nameless input of its channel gains that ratio of its own gain beside it, and
 looks like it: a correlation below the second says that the two are different matters."""
 
-SLOW_CUTOFF_RATIO, SLOW_Z, SLOW_RATIO = 0.5, 3.0, 0.3
+SLOW_CUTOFF_RATIO, SLOW_Z, SLOW_RATIO = 0.5, 3.0, 0.5
 """A cause is withdrawn if its value differs by so many standard deviations and by that ratio, where
 sensitivities are computed along instruments of that ratio of the cut-off."""
 
