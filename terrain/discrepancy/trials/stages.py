@@ -112,7 +112,8 @@ def _gross(draw: Draw) -> Stage:
     drives = draw.rich()
     limits = limits_of(draw.robot, drives)
     library = library_of(draw.robot.drive)
-    effect = library[int(draw.rng.integers(len(library)))]
+    seen = [effect for effect in library if math.isfinite(limits.of(effect))]
+    effect = seen[int(draw.rng.integers(len(seen)))]
     over = float(math.exp(draw.rng.uniform(*np.log(GROSS))))
     values = values_of(effect, limits, over, draw.rng)
     hidden = Hidden(values, (effect.name,), over, "", library, {})

@@ -16,6 +16,7 @@ from terrain.discrepancy.trials.limits import confusable_class
 from terrain.discrepancy.trials.rows import Row
 from terrain.discrepancy.trials.stage import Stage
 from terrain.discrepancy.trials.stages import CLOCK, stage_of
+from terrain.discrepancy.trials.written_faults import Statement
 from terrain.discrepancy.verdict import Diagnosis, Verdict
 from terrain.effects import HEADING, LIBRARY, effect_named, nuisances_of
 from terrain.errors import DataError
@@ -86,7 +87,7 @@ class Trial:
     clock_s: float = math.nan
     excluded: tuple[str, ...] = ()
     varying: tuple[Varying, ...] = ()
-    statements: tuple[str, ...] = ()
+    statements: tuple[Statement, ...] = ()
     refusal: str = ""
 
     def found(self, cause: str) -> bool:
@@ -189,11 +190,14 @@ def _answered(answer: Diagnosis | None) -> dict[str, Any]:
             Varying(each.name, tuple((float(value), tuple(ids)) for value, ids in each.groups))
             for each in getattr(answer, "varying", ())
         ),
-        "statements": tuple(
-            " ".join((str(each.kind), str(each.channel), str(each.sentence)))
-            for each in getattr(answer, "faults", ())
-        ),
+        "statements": tuple(_statement(each) for each in getattr(answer, "faults", ())),
     }
+
+
+def _statement(fault: Any) -> Statement:
+    """Return what is stated of a fault; the column is what has it where no channel does."""
+    channel = getattr(fault, "channel", None) or getattr(fault, "column", "")
+    return Statement(str(fault.kind), str(channel), str(fault.sentence))
 
 
 def _classes(stage: Stage, robot: Robot) -> dict[str, tuple[str, ...]]:

@@ -14,6 +14,14 @@ from terrain.records import RunLog, Stream
 from terrain.robots import Robot
 
 
+class Statement(NamedTuple):
+    """What an answer states of a fault of the logs: its kind, the channel or column, and the sentence."""
+
+    kind: str
+    channel: str
+    sentence: str
+
+
 class WrittenFault(NamedTuple):
     """A fault of a log.
 
@@ -23,8 +31,9 @@ class WrittenFault(NamedTuple):
     drives : of robots whose logs show it
     stream : that has it
     write : gives the stream with the fault, of a robot
-    channel, words : a sentence that states the fault has one of each, in lower case
-    without : words of sentences that state another one
+    channel : the channel that is stated has one of these words, in lower case
+    words : the kind or the sentence has one of these
+    without : words of another channel
     """
 
     name: str
@@ -35,20 +44,22 @@ class WrittenFault(NamedTuple):
     words: tuple[str, ...]
     without: tuple[str, ...] = ()
 
-    def stated_in(self, sentences: Iterable[str]) -> bool:
-        """Return whether a sentence states this fault.
+    def stated_in(self, statements: Iterable[Statement]) -> bool:
+        """Return whether one states this fault.
 
         Examples
         --------
-        >>> fault_named("gyro_deg").stated_in(["the gyro is logged in deg/s"])
+        >>> fault_named("gyro_deg").stated_in([Statement("unit", "gyro", "the gyro is in deg/s")])
         True
         """
-        return any(
-            any(word in text for word in self.words)
-            and any(word in text for word in self.channel)
-            and not any(word in text for word in self.without)
-            for text in map(str.lower, sentences)
-        )
+        for statement in statements:
+            channel, text = statement.channel.lower(), f"{statement.kind} {statement.sentence}".lower()
+            own = any(word in channel for word in self.channel) and not any(
+                w in channel for w in self.without
+            )
+            if own and any(word in text for word in self.words):
+                return True
+        return False
 
 
 def _scaled(part: str, factor: float) -> Callable[[Stream, Robot], Stream]:
@@ -81,21 +92,25 @@ _GYRO = ("gyro", "yaw")
 _SKID, _SWERVE, _BOTH = ("skid_steer",), ("swerve",), ("skid_steer", "swerve")
 
 FAULTS: tuple[WrittenFault, ...] = (
-    WrittenFault("gyro_sign", _BOTH, "imu", _scaled("gyro_z_", -1.0), _GYRO, ("sign", "turned", "invert")),
+    WrittenFault("gyro_sign", _BOTH, "imu", _scaled("gyro_z_", -1.0), _GYRO, ("sign", "invert")),
     WrittenFault("gyro_deg", _BOTH, "imu", _scaled("gyro_", 180.0 / math.pi), _GYRO, ("deg",)),
     WrittenFault("wheels_kmh", _SKID, "wheels", _scaled("speed_", 3.6), ("wheel",), ("km/h",)),
-    WrittenFault("camera_kmh", _SKID, "odometry", _scaled("speed_", 3.6), ("camera", "speed"), ("km/h",)),
+    WrittenFault(
+        "camera_kmh", _SKID, "odometry", _scaled("speed_", 3.6), ("camera", "ground", "speed_x"), ("km/h",)
+    ),
     WrittenFault(
         "wheels_rpm", _SWERVE, "wheels", _scaled("motor_", 30.0 / math.pi), ("wheel", "motor"), ("rpm",)
     ),
-    WrittenFault("swapped_currents", _SKID, "wheels", _swapped("current_{}_a"), ("current",), ("swap",)),
+    WrittenFault(
+        "swapped_currents", _SKID, "wheels", _swapped("current_{}_a"), ("current",), ("swap", "exchange")
+    ),
     WrittenFault(
         "swapped_wheels",
         _BOTH,
         "wheels",
         _swapped("speed_{}_mps", "motor_{}_radps"),
-        ("wheel", "speed", "motor"),
-        ("swap",),
+        ("wheel", "motor"),
+        ("swap", "exchange"),
         ("current",),
     ),
 )

@@ -11,6 +11,7 @@ from terrain.discrepancy.trials.measured_scores import is_right, states_somethin
 from terrain.discrepancy.trials.rows import Row
 from terrain.discrepancy.trials.scoring import table_of
 from terrain.discrepancy.trials.trial import CLOCK_STATED_S, Trial, Varying, run_trial
+from terrain.discrepancy.trials.written_faults import Statement
 from terrain.discrepancy.verdict import Clock, Value, Verdict
 
 RIGHT = Trial(
@@ -116,8 +117,8 @@ def test_an_effect_of_half_of_the_runs_has_to_be_named_as_one_that_varies():
 
 def test_a_fault_has_to_be_stated_in_words():
     fault = replace(SILENT, row=Row.FAULT, hidden={}, causes=(), fault="gyro_deg", variant="gyro_deg")
-    stated = replace(fault, statements=("unit gyro the gyro is in deg/s",))
-    other = replace(fault, statements=("sign gyro the gyro has the opposite sign",))
+    stated = replace(fault, statements=(Statement("unit", "gyro", "the gyro is in deg/s"),))
+    other = replace(fault, statements=(Statement("sign", "gyro", "its sign is turned"),))
     named = replace(fault, named=("effective_track",))
     assert [is_right(t) for t in (stated, other, fault, named)] == [True, False, False, False]
     table = counted([stated, other, named])
@@ -130,7 +131,7 @@ def test_the_dynamic_simulation_with_nothing_hidden_asks_for_silence():
     quiet = replace(SILENT, row=Row.DYNAMIC, hidden={}, causes=())
     loud = [
         replace(quiet, verdict=Verdict.UNEXPLAINED),
-        replace(quiet, statements=("stuck gyro it is frozen",)),
+        replace(quiet, statements=(Statement("stuck", "gyro", "it is frozen"),)),
         replace(quiet, varying=(Varying("payload", ()),)),
         replace(quiet, verdict=Verdict.REFUSED),
     ]
@@ -177,7 +178,10 @@ def test_a_trial_takes_what_the_diagnosis_answers(monkeypatch):
         unexplained=(),
         clocks=(Clock("a", -0.2, 0.01), Clock("b", math.nan, math.nan), Clock("c", -0.3, 0.01)),
         excluded_runs=(SimpleNamespace(run_id="b"),),
-        faults=(SimpleNamespace(kind="unit", channel="gyro", sentence="it is in deg/s"),),
+        faults=(
+            SimpleNamespace(kind="unit", channel="gyro", sentence="it is in deg/s"),
+            SimpleNamespace(kind="sign", column="heading rate", sentence="it is turned"),
+        ),
         varying=(SimpleNamespace(name="payload", groups=((0.1, ("a",)), (0.2, ("c",)))),),
     )
     case = cases_of(Row.FAULT, 1, 0, 3)[0]
@@ -185,7 +189,10 @@ def test_a_trial_takes_what_the_diagnosis_answers(monkeypatch):
     found = run_trial(case)
     assert found.clock_s == pytest.approx(-0.25)
     assert found.excluded == ("b",)
-    assert found.statements == ("unit gyro it is in deg/s",)
+    assert found.statements == (
+        ("unit", "gyro", "it is in deg/s"),
+        ("sign", "heading rate", "it is turned"),
+    )
     assert found.varying == (Varying("payload", ((0.1, ("a",)), (0.2, ("c",)))),)
     assert found.intervals == {"motor_constant_ratio": (0.1, 0.0, 0.2)}
     for name in ("faults", "varying"):
