@@ -117,6 +117,8 @@ def traces_of(runs: Sequence[RunLog], robot: Robot) -> Traces:
             continue
         new, hold_s = _new_samples(time_s, rates)
         any_new = new.any(axis=1)
+        if not any_new.any():
+            continue
         grid_s = np.arange(time_s[0], time_s[-1] + 2.0 * STEP_S, STEP_S)
         area.append(np.column_stack([_integral(grid_s, commands.time_s, each) for each in orders.T]))
         place = (time_s[any_new] - grid_s[0]) / STEP_S

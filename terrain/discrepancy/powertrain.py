@@ -84,6 +84,20 @@ STARTS: tuple[tuple[float, ...], ...] = (
 LIMIT_STARTS = (0.3, 0.5, 0.7, 0.9)
 
 
+WORDS = {
+    "delay_s": "the wheels answer {} s late",
+    "time_constant_s": "they settle with a time constant of {} s",
+    "slew_radps2": "they speed up and slow down by at most {} rad/s²",
+    "deadband_radps": "commands below {} rad/s do not move them",
+    "gain_ratio": "they turn {} times as fast as commanded",
+    "difference_gain_ratio": "they turn {} times as fast against each other as commanded",
+    "common_limit_radps": "the mean of both sides is at most {} rad/s",
+    "difference_limit_radps": "half the difference of the sides is at most {} rad/s",
+    "wheel_limit_radps": "no wheel turns faster than {} rad/s",
+}
+"""What each part does, with a place for its value."""
+
+
 class PartStatus(Enum):
     """Whether a part of the powertrain is there."""
 
@@ -149,6 +163,17 @@ class Powertrain(NamedTuple):
         return vector
 
     @property
+    def sentences(self) -> tuple[str, ...]:
+        """What was found, a sentence each, with its interval; one where nothing was."""
+        if not self.found:
+            return ("The wheels turn as they are commanded, as far as the runs show it.",)
+        parts = ((WORDS[p.name].format(f"{p.value:.3g}"), f"{p.low:.3g} to {p.high:.3g}") for p in self.found)
+        stated = [f"{words[0].upper()}{words[1:]} ({interval})." for words, interval in parts]
+        if self.is_scaled:
+            stated.append("The commands are no wheel speeds: they are scaled before the wheels get them.")
+        return tuple(stated)
+
+    @property
     def is_scaled(self) -> bool:
         """Whether commands are no wheel speeds: a gain is not 1."""
         gains = [part for part in self.found if "gain" in part.name]
@@ -172,20 +197,11 @@ def powertrain_of(runs: Sequence[RunLog], robot: Robot, seed: int = 0) -> Powert
     traces = traces_of(runs, robot)
     n_runs = len(traces.start_radps)
     two_sides = traces.measured.shape[1] == 2
-    one_gain = (DIFFERENCE_GAIN, COMMON_LIMIT, DIFFERENCE_LIMIT)
-    candidates = [i for i in range(len(NAMES)) if two_sides or i not in one_gain]
+    of_two_sides = (DIFFERENCE_GAIN, COMMON_LIMIT, DIFFERENCE_LIMIT)
+    candidates = [i for i in range(len(NAMES)) if two_sides or i not in of_two_sides]
     fold_of = np.random.default_rng(seed).permutation(n_runs) % FOLDS
     kept, vector = _add_parts(traces, candidates, fold_of, seed)
-    error = _left_out(traces, kept, vector, fold_of)
-    gains: dict[int, float] = {}
-    for i in list(kept):  # a later part may have taken over what an earlier one did
-        rest = [j for j in kept if j != i]
-        without = _fit(traces, rest, _without(vector, i), np.ones(n_runs))
-        left = _left_out(traces, rest, without, fold_of)
-        if _low_gain(left, error, seed) > 0.0:
-            gains[i] = float(1.0 - error.sum() / left.sum())
-        else:
-            kept, vector, error = rest, without, left
+    kept, vector, error, gains = _drop_parts(traces, kept, vector, fold_of, seed)
     vector = _fit(traces, kept, vector, np.ones(n_runs), both_sides=True)
     intervals = _intervals(traces, kept, vector, seed)
     parts = []
@@ -279,12 +295,37 @@ def _add_parts(
             return kept, vector
 
 
+def _drop_parts(
+    traces: Traces, kept: list[int], vector: Array, fold_of: Array, seed: int
+) -> tuple[list[int], Array, Array, dict[int, float]]:
+    """Return the parts without those that a later one made needless, and what each removes beside the others.
+
+    Further returned are all values and the squared error of each run (runs,) that is left out.
+    """
+    every = np.ones(len(fold_of))
+    while True:
+        error = _left_out(traces, kept, vector, fold_of)
+        gains, needless = {}, {}
+        for i in kept:
+            rest = [j for j in kept if j != i]
+            without = _fit(traces, rest, _without(vector, i), every)
+            left = _left_out(traces, rest, without, fold_of)
+            gains[i] = float(1.0 - error.sum() / left.sum())
+            if _low_gain(left, error, seed) <= 0.0:
+                needless[i] = rest, without
+        if not needless:
+            return kept, vector, error, gains
+        kept, vector = needless[min(needless, key=lambda i: gains[i])]
+
+
 def _started(traces: Traces, vector: Array, i: int) -> Array:
     """Return the values with a part added, at the best of those that its fit may start from."""
     top = float(np.abs(traces.measured).max())
     starts = STARTS[i] or tuple(ratio * top for ratio in LIMIT_STARTS)
-    points = np.tile(vector, (len(starts), 1))
-    points[:, i] = np.clip(starts, LOW[i], HIGH[i])
+    shorter = vector.copy()
+    shorter[TIME_CONSTANT] *= 0.5  # a slew limit takes over much of what a time constant did without it
+    points = np.repeat([vector, shorter], len(starts), axis=0)
+    points[:, i] = np.clip(np.tile(starts, 2), LOW[i], HIGH[i])
     return np.asarray(min(points, key=lambda p: float(squared_errors(traces, p).sum())))
 
 

@@ -1,6 +1,7 @@
 """What is hidden between commanded and measured wheel speeds comes back, and nothing else."""
 
 import math
+import re
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ import pytest
 from terrain.discrepancy.command_response import ABSENT, NAMES, STEP_S, follow
 from terrain.discrepancy.powertrain import PartStatus, powertrain_of
 from terrain.errors import DataError
+from terrain.logs.drive import find_runs
 from terrain.records import RunLog, Stream
 from terrain.robots import load_robot
 
@@ -144,3 +146,29 @@ def test_runs_without_commands_are_refused_in_one_sentence():
     bare = [RunLog(run.run_id, "husky", {"wheels": run.streams["wheels"]}) for run in runs[:2]]
     with pytest.raises(DataError, match=r"runs: 4 have commanded and measured wheel speeds; at least 5"):
         powertrain_of([*bare, *runs[2:]], HUSKY)
+
+
+def test_the_answer_is_stated_in_sentences():
+    found = powertrain_of(commanded_runs({"delay_s": 0.2, "time_constant_s": 0.3}, n=10), HUSKY)
+    late, slow = found.sentences
+    assert re.fullmatch(r"The wheels answer 0\.\d+ s late \(0\.\d+ to 0\.\d+\)\.", late)
+    assert slow.startswith("They settle with a time constant of 0.")
+    assert found.vector[0] == found.found[0].value
+    nothing = powertrain_of(commanded_runs({}, n=10), HUSKY)
+    assert len(nothing.sentences) == 1
+    assert "as they are commanded" in nothing.sentences[0]
+
+
+def test_the_commands_of_the_measured_husky_are_no_wheel_speeds(measured):
+    """Its log: 1.8 times as fast forward, 0.8 times in turning, at most 6.1 rad/s (terrain.logs.drive)."""
+    runs = [read(repair=True) for read in find_runs(measured("drive_husky"))[::3]]
+    found = powertrain_of(runs, HUSKY)
+    values = {part.name: part for part in found.found}
+    assert values["gain_ratio"].value == pytest.approx(1.8, abs=0.1)
+    assert values["difference_gain_ratio"].value == pytest.approx(0.8, abs=0.1)
+    assert values["wheel_limit_radps"].value == pytest.approx(6.1, abs=0.15)
+    assert values["delay_s"].low > 0.2
+    assert found.is_scaled
+    assert found.sentences[-1].startswith("The commands are no wheel speeds")
+    assert found.hold_s == pytest.approx(0.1)
+    assert found.rms_after_radps < 0.2 * found.rms_before_radps
