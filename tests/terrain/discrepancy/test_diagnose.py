@@ -26,11 +26,11 @@ OVER = 4.0
 EFFECTS = {
     "husky": (
         *("wheel_radius", "one_sided_radius", "effective_track", "camera_latency", "lever_arm", "clock_rate"),
-        *("payload", "motor_drift", "scrub", "side_hill_slip"),
+        *("payload", "motor_drift", "scrub", "side_hill_slip", "turn_side_slip", "turn_drag", "imu_latency"),
     ),
     "agrimaro": (
         *("steering_offset_2", "steering_backlash", "encoder_lag", "camera_yaw", "gyro_scale", "accel_bias"),
-        *("force_slip", "viscous_drag"),
+        *("force_slip", "viscous_drag", "wheel_scale_2", "current_offset"),
     ),
 }
 """Of wheels, steering, sensors, clocks, masses, motors and the ground; some of each robot."""

@@ -1,0 +1,174 @@
+"""What is hidden between commanded and measured wheel speeds comes back, and nothing else."""
+
+import math
+import re
+
+import numpy as np
+import pytest
+
+from terrain.discrepancy.command_response import ABSENT, NAMES, STEP_S, follow
+from terrain.discrepancy.powertrain import PartStatus, powertrain_of
+from terrain.errors import DataError
+from terrain.logs.drive import find_runs
+from terrain.records import RunLog, Stream
+from terrain.robots import load_robot
+
+HUSKY, AGRIMARO = load_robot("husky"), load_robot("agrimaro")
+NOISE_RADPS = 0.05
+FINE_S, PERIOD_S = 0.005, 0.05
+
+
+def plain_response(commands, fine_n, start, values):
+    """Speeds (runs, fine_n, wheels) by small steps, of commands (runs, m, wheels) held from 20 Hz."""
+    p = dict(zip(NAMES, ABSENT, strict=True)) | values
+    out = np.empty((len(commands), fine_n, commands.shape[2]))
+    y = np.array(start, dtype=float)
+    quick = -math.expm1(-FINE_S / p["time_constant_s"]) if p["time_constant_s"] else 1.0
+    for k in range(fine_n):
+        row = math.floor((k * FINE_S - p["delay_s"]) / PERIOD_S - 1e-9)  # a command acts after its stamp
+        if row >= 0:
+            x = commands[:, min(row, commands.shape[1] - 1)]
+            if x.shape[1] == 2:
+                common, half = p["gain_ratio"] * x.mean(axis=1), x[:, 1] - x[:, 0]
+                common = np.clip(common, -p["common_limit_radps"], p["common_limit_radps"])
+                half = 0.5 * p["difference_gain_ratio"] * half
+                half = np.clip(half, -p["difference_limit_radps"], p["difference_limit_radps"])
+                x = np.column_stack([common - half, common + half])
+            else:
+                x = p["gain_ratio"] * x
+            size = np.abs(x)
+            x = np.sign(x) * np.maximum(np.minimum(size, 2 * (size - p["deadband_radps"])), 0)
+            x = np.clip(x, -p["wheel_limit_radps"], p["wheel_limit_radps"])
+            y = y + np.clip(quick * (x - y), -p["slew_radps2"] * FINE_S, p["slew_radps2"] * FINE_S)
+        out[:, k] = y
+    return out
+
+
+def commanded_runs(values, n=40, seed=0, robot=HUSKY, hold=1, sizes=6.0):
+    """Runs of one step of the commands each, at 20 Hz; wheel speeds are new every ``hold`` samples."""
+    rng = np.random.default_rng(seed)
+    time_s, wheels = PERIOD_S * np.arange(120), robot.wheels
+    before, after = rng.uniform(-sizes, sizes, (2, n, 1, len(wheels)))
+    commands = np.where(time_s[:, None] < 1.0, before, after)
+    n_fine = round(len(time_s) * PERIOD_S / FINE_S)
+    start = plain_response(np.tile(before, (1, 200, 1)), n_fine, np.zeros((n, len(wheels))), values)[:, -1]
+    rates = plain_response(commands, n_fine, start, values)[:, :: round(PERIOD_S / FINE_S)]
+    rates = rates + NOISE_RADPS * rng.standard_normal(rates.shape)
+    rates = rates[:, (np.arange(len(time_s)) // hold) * hold]
+    names = tuple(f"wheel_{wheel}_radps" for wheel in wheels)
+    return [
+        RunLog(
+            f"run_{i}",
+            robot.name,
+            {
+                "wheels": Stream(
+                    time_s, robot.logged_rates(rates[i] * robot.wheel_radius_m), robot.rate_channels
+                ),
+                "commands": Stream(time_s, commands[i], names),
+            },
+        )
+        for i in range(n)
+    ]
+
+
+HIDDEN = {
+    "nothing": ({}, {}),
+    "delay": ({"delay_s": 0.23}, {}),
+    "lag": ({"time_constant_s": 0.3}, {}),
+    "late, slow and limited": ({"delay_s": 0.12, "time_constant_s": 0.2, "slew_radps2": 8.0}, {}),
+    "deadband": ({"deadband_radps": 0.9, "delay_s": 0.1}, {"sizes": 3.0}),
+    "two gains": (
+        {"gain_ratio": 1.6, "difference_gain_ratio": 0.8, "delay_s": 0.2, "common_limit_radps": 5.0},
+        {},
+    ),
+    "saturated": ({"wheel_limit_radps": 4.0, "time_constant_s": 0.15}, {}),
+    "held": ({"delay_s": 0.2, "time_constant_s": 0.25}, {"hold": 2}),
+    "held long": ({"delay_s": 0.2, "slew_radps2": 6.0}, {"hold": 5, "n": 80}),
+    "swerve": ({"delay_s": 0.15, "gain_ratio": 0.9}, {"robot": AGRIMARO}),
+}
+
+
+@pytest.mark.parametrize("case", HIDDEN)
+def test_what_is_hidden_comes_back_and_nothing_else(case):
+    hidden, options = HIDDEN[case]
+    found = powertrain_of(commanded_runs(hidden, **options), options.get("robot", HUSKY))
+    assert {part.name for part in found.found} == set(hidden)
+    for part in found.found:
+        room = 0.0 if part.unit == "s" else 0.01 * part.value  # so much of limits is left to the grid
+        assert part.low - room <= hidden[part.name] <= part.high + room, part
+        coarse = part.name == "delay_s" and not {"time_constant_s", "slew_radps2"} & set(hidden)
+        assert part.value == pytest.approx(hidden[part.name], rel=0.05, abs=PERIOD_S * coarse)
+        assert part.gain_ratio > 0.0
+    assert found.rms_after_radps < 1.3 * NOISE_RADPS
+    assert (found.rms_before_radps > 3 * found.rms_after_radps) == bool(hidden)
+    assert found.hold_s == pytest.approx(0.05 * options.get("hold", 1))
+    assert found.is_scaled == (case == "two gains")
+
+
+def test_the_kernel_is_the_equations():
+    rng = np.random.default_rng(3)
+    commands = rng.uniform(-6.0, 6.0, (6, 2)).repeat(20, axis=0)
+    values = dict(zip(NAMES, (0.13, 0.2, 12.0, 0.8, 1.3, 0.7, 4.0, 2.0, 5.0), strict=True))
+    fine = round(PERIOD_S / FINE_S)
+    area = np.vstack([np.zeros((1, 2)), np.cumsum(commands.repeat(fine, axis=0) * FINE_S, axis=0)])[:-1]
+    start, p = np.array([0.5, -0.5]), np.array(list(values.values()))
+    expected = plain_response(commands[None], len(area), start[None], values)[0]
+    np.testing.assert_allclose(follow(area, start, p, FINE_S), expected, atol=1e-9)
+    every = round(STEP_S / FINE_S)
+    coarse = follow(np.ascontiguousarray(area[::every]), start, p, STEP_S)
+    assert np.abs(coarse - expected[::every]).max() < 0.15
+
+
+def test_what_the_commands_do_not_show_is_not_excited():
+    straight = commanded_runs({"delay_s": 0.2}, n=20)
+    held = []
+    for run in straight:  # the commands of the right side to both, and never a change of them
+        commands = np.tile(run.streams["commands"].values[-1, 1:], (len(run.streams["commands"]), 2))
+        rates = commands + NOISE_RADPS * np.random.default_rng(len(held)).standard_normal(commands.shape)
+        streams = {
+            "wheels": Stream(run.streams["wheels"].time_s, rates * HUSKY.wheel_radius_m, HUSKY.rate_channels),
+            "commands": Stream(run.streams["wheels"].time_s, commands, run.streams["commands"].channels),
+        }
+        held.append(RunLog(run.run_id, "husky", streams))
+    status = {part.name: part.status for part in powertrain_of(held, HUSKY).parts}
+    for name in ("delay_s", "time_constant_s", "slew_radps2", "difference_gain_ratio"):
+        assert status[name] is PartStatus.NOT_EXCITED, name
+    assert status["gain_ratio"] is PartStatus.NOT_NEEDED
+
+
+def test_the_same_seed_gives_the_same_answer():
+    runs = commanded_runs({"delay_s": 0.2, "time_constant_s": 0.3}, n=10)
+    assert repr(powertrain_of(runs, HUSKY, 5)) == repr(powertrain_of(runs, HUSKY, 5))
+
+
+def test_runs_without_commands_are_refused_in_one_sentence():
+    runs = commanded_runs({}, n=6)
+    bare = [RunLog(run.run_id, "husky", {"wheels": run.streams["wheels"]}) for run in runs[:2]]
+    with pytest.raises(DataError, match=r"runs: 4 have commanded and measured wheel speeds; at least 5"):
+        powertrain_of([*bare, *runs[2:]], HUSKY)
+
+
+def test_the_answer_is_stated_in_sentences():
+    found = powertrain_of(commanded_runs({"delay_s": 0.2, "time_constant_s": 0.3}, n=10), HUSKY)
+    late, slow = found.sentences
+    assert re.fullmatch(r"The wheels answer 0\.\d+ s late \(0\.\d+ to 0\.\d+\)\.", late)
+    assert slow.startswith("They settle with a time constant of 0.")
+    assert found.vector[0] == found.found[0].value
+    nothing = powertrain_of(commanded_runs({}, n=10), HUSKY)
+    assert len(nothing.sentences) == 1
+    assert "as they are commanded" in nothing.sentences[0]
+
+
+def test_the_commands_of_the_measured_husky_are_no_wheel_speeds(measured):
+    """Its log: 1.8 times as fast forward, 0.8 times in turning, at most 6.1 rad/s (terrain.logs.drive)."""
+    runs = [read(repair=True) for read in find_runs(measured("drive_husky"))[::3]]
+    found = powertrain_of(runs, HUSKY)
+    values = {part.name: part for part in found.found}
+    assert values["gain_ratio"].value == pytest.approx(1.8, abs=0.1)
+    assert values["difference_gain_ratio"].value == pytest.approx(0.8, abs=0.1)
+    assert values["wheel_limit_radps"].value == pytest.approx(6.1, abs=0.15)
+    assert values["delay_s"].low > 0.2
+    assert found.is_scaled
+    assert found.sentences[-1].startswith("The commands are no wheel speeds")
+    assert found.hold_s == pytest.approx(0.1)
+    assert found.rms_after_radps < 0.2 * found.rms_before_radps
