@@ -9,6 +9,10 @@ class TerrainError(Exception):
     """Base of every error that input, options or files can cause."""
 
 
+class OutsideRegionWarning(UserWarning):
+    """A drive leaves the region that a robot's effects were validated in: it is extrapolated."""
+
+
 class LogError(TerrainError):
     """A run log cannot be read as it stands: the message names file, row and value."""
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import sys
+import warnings
+from typing import Any
 
 import typer
 
 from pipelines.cli import classify, drive, estimate, explain, quickstart, reproduce, runs, slip
-from terrain.errors import TerrainError
+from terrain.errors import OutsideRegionWarning, TerrainError
 
 app = typer.Typer(
     name="terrain",
@@ -28,8 +30,23 @@ for group in GROUPS:
     app.add_typer(group)
 
 
+class _Notes:
+    """Shows warnings of drives outside a robot's region in a sentence, the first of a command."""
+
+    def __init__(self) -> None:
+        self._usual, self._shown = warnings.showwarning, False
+
+    def __call__(self, message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:
+        if not issubclass(category, OutsideRegionWarning):
+            self._usual(message, category, *place, **more)
+        elif not self._shown:
+            self._shown = True
+            typer.echo(f"note: {message}", err=True)
+
+
 def main() -> None:
     """Run the command line: a user's mistake is one sentence and exit code 2, a fault keeps its traceback."""
+    warnings.showwarning = _Notes()
     try:
         app()
     except TerrainError as error:

@@ -26,7 +26,7 @@ from terrain.discrepancy.terrain_match import simulation_for
 from terrain.discrepancy.verdict import NextDrive
 from terrain.effects import Effect, effect_named, library_of
 from terrain.errors import ConfigError, DataError
-from terrain.extension import extended_yaml
+from terrain.extension import extended_yaml, region_of
 from terrain.files.atomic import atomic_write, ensure_writable
 from terrain.kinematics.wheel_speed import with_wheel_speeds
 from terrain.records import RunLog
@@ -71,7 +71,9 @@ def explain(runs: Sequence[RunLog], settings: ExplainSettings, progress: Progres
     if diagnosed.extended is not None:
         effects = extended_effects(robot, diagnosed.diagnosis)
         source = f"terrain explain, {diagnosed.diagnosis.n_runs} runs of {settings.dataset or 'a data set'}"
-        text = extended_yaml(description, *effects, source)
+        excluded = {run.run_id for run in diagnosed.diagnosis.excluded_runs}
+        region = region_of([run for run in diagnosed.used if run.run_id not in excluded], robot)
+        text = extended_yaml(description, *effects, source, region)
         extended = ExtendedDescription(out / EXTENDED_FILE, effects.values)
     result = Explanation(
         data=settings.dataset,

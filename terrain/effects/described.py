@@ -31,6 +31,9 @@ from terrain.records import Array, read_only
 SCHEMA = 1
 """Version of the section that is read and written."""
 
+NOT_EFFECTS = ("schema", "covariance", "region")
+"""Keys of the section that name no parameter; the region is read by :mod:`terrain.robots.region`."""
+
 ROUNDING = 1e-5
 """A covariance is written with seven digits: correlations may miss symmetry and sign by as much."""
 
@@ -98,7 +101,7 @@ def read_effects(place: str, described: Any, drive: str) -> tuple[dict[str, floa
         raise ConfigError(
             f"{place}: schema {schema} is newer than this version of terrain, which reads {SCHEMA}"
         )
-    entries = _renamed(place, {k: v for k, v in described.items() if k not in ("schema", "covariance")})
+    entries = _renamed(place, {k: v for k, v in described.items() if k not in NOT_EFFECTS})
     known = parameters_of(drive)
     checked_effects(place, dict.fromkeys((name for name in entries if name not in known), 0.0), drive)
     values = {

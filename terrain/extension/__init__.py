@@ -13,6 +13,7 @@ corrected instead if the effect has an inverse.
 
 from terrain.extension.basis import Basis, Origin, basis_of
 from terrain.extension.description import apply_homes, check_corrected, corrected
+from terrain.extension.region import RegionMonitor, region_of, warn_outside
 from terrain.extension.samples import Correction, correct, correct_live, corrected_log
 from terrain.extension.writing import extended_yaml, write_extended
 
@@ -20,6 +21,7 @@ __all__ = [
     "Basis",
     "Correction",
     "Origin",
+    "RegionMonitor",
     "apply_homes",
     "basis_of",
     "check_corrected",
@@ -28,5 +30,7 @@ __all__ = [
     "corrected",
     "corrected_log",
     "extended_yaml",
+    "region_of",
+    "warn_outside",
     "write_extended",
 ]

@@ -81,8 +81,8 @@ def basis_of(robot: Robot, parameter: str, value: float = 0.0) -> tuple[Basis, .
         origin = Origin.ASSUMED if name in robot.assumed else Origin.SOURCED
         if home.section and not robot.describes(home.section):
             origin = Origin.LEFT_OUT
-        numbers = (_number(each, home.section, home.field) for each in (before, after))
-        found.append(Basis(home.section, home.field, *numbers, origin))
+        described, extended = (_number(each, home.section, home.field) for each in (before, after))
+        found.append(Basis(home.section, home.field, described, extended, origin))
     return tuple(found)
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from terrain.angles import unwrapped, wrapped
 from terrain.effects import OTHER_LOGGER, parameters_of
 from terrain.extension.description import AnyRobot, apply_homes, corrected
+from terrain.extension.region import warn_outside
 from terrain.kinematics.camera import turned
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import Robot
@@ -21,6 +22,11 @@ def correct(run: RunLog, robot: AnyRobot) -> tuple[RunLog, AnyRobot]:
 
     A robot without effects, or one that was corrected, is returned as it is, and so is its log.
 
+    Warns
+    -----
+    OutsideRegionWarning
+        if the run leaves the region that the robot's effects were validated in.
+
     Examples
     --------
     >>> from terrain.robots import load_robot
@@ -30,6 +36,7 @@ def correct(run: RunLog, robot: AnyRobot) -> tuple[RunLog, AnyRobot]:
     >>> run.streams["wheels"].values[:, 0], dict(robot.effects)
     (array([1.1, 1.1]), {})
     """
+    warn_outside(run, robot)
     return corrected_log(run, robot), corrected(robot)
 
 

@@ -15,7 +15,7 @@ from terrain.errors import ConfigError
 from terrain.files.atomic import atomic_write
 from terrain.files.descriptions import read_yaml
 from terrain.records import Array
-from terrain.robots import Robot, description_file, robot_from
+from terrain.robots import Region, Robot, description_file, robot_from
 
 DIGITS = 7
 """Significant digits that a file has of each number."""
@@ -27,6 +27,7 @@ def extended_yaml(
     covariance: Array,
     intervals: Mapping[str, tuple[float, float]],
     source: str,
+    region: Region | None = None,
 ) -> str:
     """Return the description of a robot with a section ``effects``, as YAML.
 
@@ -39,6 +40,7 @@ def extended_yaml(
     covariance : (n, n) of the values in their order
     intervals : 95 % of each value, by parameter
     source : of the numbers, in words
+    region : of driving, that they were validated in
 
     Raises
     ------
@@ -67,6 +69,7 @@ def extended_yaml(
             f"effects: covariance has the shape {cov.shape}, {(len(names), len(names))} is required"
         )
     lines = _section_lines(values, parameters_of(robot.drive), cov, intervals, source)
+    lines += [] if region is None else _region_lines(region)
     text = _without_effects(path.read_text(encoding="utf-8")) + "\n".join(lines) + "\n"
     try:
         content = yaml.safe_load(text)
@@ -86,6 +89,7 @@ def write_extended(
     covariance: Array,
     intervals: Mapping[str, tuple[float, float]],
     source: str,
+    region: Region | None = None,
 ) -> Robot:
     """Write the description of :func:`extended_yaml` to a file, and return the robot.
 
@@ -99,7 +103,7 @@ def write_extended(
         raise ConfigError(f"{out}: a robot's description is a .yaml file")
     if out.exists():
         raise ConfigError(f"{out}: is there already, and is left as it is; choose another name")
-    text = extended_yaml(robot_name, values, covariance, intervals, source)
+    text = extended_yaml(robot_name, values, covariance, intervals, source, region)
     atomic_write(out, text)
     return robot_from(out.name, yaml.safe_load(text))
 
@@ -132,6 +136,17 @@ def _section_lines(
     lines = ["effects:", *(f"  {name}: {_flow(entry)}" for name, entry in section.items())]
     lines += ["  covariance:" if rows else "  covariance: {}"]
     return lines + [f"    {name}: {_flow(row)}" for name, row in rows.items()]
+
+
+def _region_lines(region: Region) -> list[str]:
+    """Return the lines of the region; a range that was not measured has none."""
+    ranges = {name: value for name, value in region._asdict().items() if value is not None}
+    ranges["terrains"] = list(region.terrains)
+    entries = {
+        name: value if name == "terrains" else [_rounded(edge) for edge in value]
+        for name, value in ranges.items()
+    }
+    return ["  region:", *(f"    {name}: {_flow(entry)}" for name, entry in entries.items())]
 
 
 def _without_effects(text: str) -> str:

@@ -2,6 +2,7 @@
 
 from terrain.robots.parts import Body, Camera, Equipment, Motors, Part, Sensors, Steering
 from terrain.robots.reader import description_file, load_robot, read_description, robot_from
+from terrain.robots.region import Region
 from terrain.robots.robot import Robot
 from terrain.robots.skid_steer import SkidSteerRobot, as_skid_steer
 from terrain.robots.swerve import SwerveRobot, as_swerve
@@ -12,6 +13,7 @@ __all__ = [
     "Equipment",
     "Motors",
     "Part",
+    "Region",
     "Robot",
     "Sensors",
     "SkidSteerRobot",

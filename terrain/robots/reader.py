@@ -26,6 +26,7 @@ from terrain.errors import ConfigError
 from terrain.files.descriptions import check_keys, number, read_yaml
 from terrain.files.resources import data_folder
 from terrain.robots.parts import KIND_OF_SECTION
+from terrain.robots.region import read_region
 from terrain.robots.robot import Robot
 from terrain.robots.skid_steer import SkidSteerRobot
 from terrain.robots.swerve import SwerveRobot
@@ -115,7 +116,9 @@ def robot_from(file: str, described: Any) -> Robot:
     robot = kind(name, wheel_radius_m, track_m, wheelbase_m, mass_kg, parts, assumed=assumed)
     if "effects" in described:
         effects, cov = read_effects(f"{file}: effects", described["effects"], drive)
-        robot = replace(robot, effects=effects, effects_cov=cov)
+        stated = described["effects"].get("region")
+        region = None if stated is None else read_region(f"{file}: effects: region", stated)
+        robot = replace(robot, effects=effects, effects_cov=cov, region=region)
     robot.check_geometry(file)
     return robot
 

@@ -14,6 +14,7 @@ import numpy as np
 from terrain.errors import ConfigError
 from terrain.records import Array, read_only
 from terrain.robots.parts import KIND_OF_SECTION, Body, Camera, Equipment, Motors, Part, Sensors, Steering
+from terrain.robots.region import Region
 
 P = TypeVar("P", bound=Part)
 
@@ -36,6 +37,7 @@ class Robot(ABC):
     parts : sections of the description by name
     effects : parameters of :mod:`terrain.effects.catalogue` that are not 0, by name
     effects_cov : (n, n) covariance of the effects in their order; NaN where unknown
+    region : of driving, that the effects were validated in; None where none is stated
     assumed : numbers whose source begins with "assumed", as ``track_m`` and ``camera.lever_x_m``
     """
 
@@ -47,6 +49,7 @@ class Robot(ABC):
     parts: Mapping[str, Part] = field(default_factory=dict, hash=False)
     effects: Mapping[str, float] = field(default_factory=dict, hash=False)
     effects_cov: Array = field(default_factory=lambda: np.empty((0, 0)), compare=False)
+    region: Region | None = None
     assumed: frozenset[str] = frozenset()
 
     drive: ClassVar[str]

@@ -15,6 +15,7 @@ import numpy as np
 
 from terrain.effects import NUISANCES, PARAMETER, SENSED_ONLY
 from terrain.errors import ConfigError
+from terrain.extension import warn_outside
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import Robot
 from terrain.simulation.bench import POSITIONS, TURN_S, six_positions_log
@@ -89,6 +90,11 @@ def simulate_run(  # noqa: PLR0913 - an entry whose options have defaults
     ------
     ConfigError
         if the terrain or scenario is unknown or they do not go together, or the robot cannot drive it.
+
+    Warns
+    -----
+    OutsideRegionWarning
+        if the run leaves the region that the robot's effects were validated in.
     """
     if effects and scenario in (BENCH, SLIP):
         raise ConfigError(f"scenario {scenario!r} is simulated without effects: leave them out")
@@ -116,8 +122,11 @@ def simulate_run(  # noqa: PLR0913 - an entry whose options have defaults
     drive = make_scenario(scenario, robot, names, duration_s, seed=drive_seed)
     setup = Setup(conditions or Conditions(), faults or Faults(), gnss, effects or {})
     if planar:
-        return _planar_run(robot, soils[terrain], drive.twist, simulated, run_id, setup, vary)
-    return simulate(robot, drive, soils, simulated, run_id=run_id, **setup._asdict())
+        run = _planar_run(robot, soils[terrain], drive.twist, simulated, run_id, setup, vary)
+    else:
+        run = simulate(robot, drive, soils, simulated, run_id=run_id, **setup._asdict())
+    warn_outside(run, robot)
+    return run
 
 
 def _planar_run(

@@ -33,7 +33,7 @@ from terrain.estimation.measurements.samples import ROWS, STREAMS, limits_of_row
 from terrain.estimation.measurements.table import GNSS_LATENCY_S, GNSS_ROWS
 from terrain.estimation.measurements.yaw import yaw_memory
 from terrain.estimation.wheel_slip import STALE_AFTER_S, instant_slip, wheel_speed_scatter_mps
-from terrain.extension import Correction, check_corrected
+from terrain.extension import Correction, RegionMonitor, check_corrected
 from terrain.logs.schema import WHEELS_CHANNELS
 from terrain.records import Array, Reading
 from terrain.robots import Robot, as_swerve
@@ -141,7 +141,7 @@ class LiveEstimator:
         robot.require("motors", "steering", "sensors")
         noise = default_noise(filter_name, robot, has_gnss) if noise is None else noise
         self._filter = ResidentFilter(self._model, noise, settings)
-        self._robot = robot
+        self._robot, self._region = robot, RegionMonitor(robot)
         self._unreadable: dict[str, int] = {}
         self._connect(channels, has_gnss)
         self._prepare_rows(initial_yaw_rad or 0.0, gnss_latency_s)
@@ -297,6 +297,9 @@ class LiveEstimator:
         v_x, v_y, turn, a_x, a_y = self._motion
         current_a = wheels[self._current_columns]
         current_a[self._current_columns < 0] = np.nan
+        wheel_speed_mps = motor_radps / self._reduction_ratio * self._radius_m
+        if self._region.compares:
+            self._region.step(time_s, float(wheel_speed_mps.mean()), mean.item(turn))
         return LiveEstimate(
             time_s,
             mean,
@@ -313,7 +316,7 @@ class LiveEstimator:
             mean.item(a_y),
             motor_radps,
             current_a,
-            motor_radps / self._reduction_ratio * self._radius_m,
+            wheel_speed_mps,
         )
 
     def _slip_at(self, age_s: float) -> Array:

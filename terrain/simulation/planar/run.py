@@ -83,18 +83,16 @@ def simulate_planar(  # noqa: PLR0913 - an entry whose options have defaults
     Parameters
     ----------
     robot : a swerve robot with all its sections; of a skid-steer robot those that are missing do not act
-        (:func:`~terrain.simulation.planar.model.make_planar`), and without motors there are no currents
+        (:func:`~terrain.simulation.planar.model.make_planar`); without motors there are no currents
     twist : (n, 3) desired ``(speed_x_mps, speed_y_mps, yaw_rate_radps)`` at 50 Hz, from rest
     seed : of everything that is drawn; the same gives the same bytes, and a sequence is left as it is
     ground : a firm one by default
     effects : parameters of :mod:`terrain.effects.catalogue`, beside or in place of the description's own
     scatter : of this run's own parameters; by default they do not
-    hills : level by default
-    noise : of ground and sensors; by default there is none, and encoders do not quantise
+    hills, noise : level and without noise by default; then encoders do not quantise
     outside : amplitudes of :data:`OUTSIDE`
     heading : add the stream lidar, with the rate of a heading that does not depend on the gyro
-    run_id, terrain : of the run; without a terrain it has no label
-    step_s : from step to step; a half, a third... of it changes little
+    run_id, terrain, step_s : of the run, from step to step; without a terrain it has no label
 
     Returns
     -------
@@ -120,8 +118,7 @@ def simulate_planar(  # noqa: PLR0913 - an entry whose options have defaults
     """
     outside = outside or {}
     _check(robot, twist, outside, step_s)
-    currents = robot.describes("motors")
-    robot = with_silent_parts(robot)
+    currents, robot = robot.describes("motors"), with_silent_parts(robot)
     planar = make_planar(robot, ground or Ground())
     rngs = _generators(seed)
     p = vector_of({**robot.effects, **(effects or {})})
