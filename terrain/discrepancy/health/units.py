@@ -138,7 +138,10 @@ def _middle(logs: Array) -> Array:
 
 
 def _options(logs: Array, robot: Robot) -> list[Changes]:
-    """Return the readings: nothing, one column in another unit, or two."""
+    """Return the readings: nothing, one column in another unit, or two that are measured.
+
+    Wheels and what they turn in one other unit would hide each other: then a body that slips looks like it.
+    """
     known = np.array([np.isfinite(column).any() for column in logs.T])
     units = {column: list(sizes.values()) for column, sizes in UNITS.items()}
     units[Column.WHEELS].append(robot.wheel_radius_m)  # rates of wheels in the place of speeds
@@ -149,7 +152,8 @@ def _options(logs: Array, robot: Robot) -> list[Changes]:
         for size in sizes
         for factor in (size, 1.0 / size)
     ]
-    pairs = [pair for pair in combinations(single, 2) if pair[0].column is not pair[1].column]
+    measured = [change for change in single if not change.of_wheels]
+    pairs = [pair for pair in combinations(measured, 2) if pair[0].column is not pair[1].column]
     return [(), *((change,) for change in single), *pairs]
 
 
