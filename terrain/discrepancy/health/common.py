@@ -35,11 +35,14 @@ FLOOR = {G: 0.02, H: 0.02, X: 0.015}
 STRAIGHT_RADPS, MIN_STRAIGHT = 0.02, 10
 """Of rows in which no turn is predicted, and so many at the least, the median of the gyro is its bias."""
 
-SIGMAS, FEW_RUNS, LEAST_OFF = 5.0, 8.0, 0.15
+SIGMAS, FEW_RUNS, LEAST_OFF = 4.5, 8.0, 0.15
 """A run is of another robot or terrain if its gain is off by so many times the scatter of the runs and its
 own error, times one plus the second over their number, since few runs measure their scatter badly: of normal
-gains one set of 1000 has such a run.  It is off by the third, too, in the logarithm: radii of one robot
-differ by less."""
+gains at most one set of 500 has such a run.  It is off by the third, too, in the logarithm: radii of one
+robot differ by less."""
+
+MIN_COMPARED = 6
+"""Of fewer runs with a gain, one in a hundred sets has such a run."""
 
 INNER, INNER_SIGMAS = 2 / 3, 0.967
 """Scatter comes from that ratio of the runs, the nearest to the median, and what it is of a normal law: the
@@ -175,15 +178,14 @@ def _outliers(responses: Sequence[Response], c: int, name: str) -> dict[int, str
             rows = np.isfinite(run.measured[:, c]).sum()
             error[i] = math.sqrt((1.0 / correlation**2 - 1.0) / max(rows * min(run.period_s, 1.0), 1.0))
     known = np.isfinite(logs)
-    most = (int(known.sum()) - 1) // round(1 / MAX_ODD_RATIO)
-    if most < 1:
+    if known.sum() < MIN_COMPARED:
         return {}
     off = logs - np.median(logs[known])
     inner = float(np.quantile(np.abs(off[known]), INNER, method="higher"))
     scatter = max(inner / INNER_SIGMAS, MIN_SCATTER)
     sigmas = SIGMAS * (1.0 + FEW_RUNS / known.sum())
     far = np.abs(off) > np.maximum(sigmas * np.hypot(scatter, error), LEAST_OFF)
-    if far.sum() > most:
+    if far.sum() > MAX_ODD_RATIO * known.sum():
         return {}
     return {
         int(i): f"it is unlike the other runs: its {name} is {math.exp(off[i]):.2f} times what they "
