@@ -9,33 +9,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 
-from terrain.discrepancy.clocks import CLOCKED, MAX_LAG_S, MIN_LAG_S, Shift, offsets_of, shifts_of
+from terrain.discrepancy.clocks import MAX_LAG_S, MIN_LAG_S, Shift, offsets_of, shifts_of
+from terrain.discrepancy.health.common import STRETCH_S, odd_runs, stalled_runs, stretches
+from terrain.discrepancy.health.response import responses_of
 from terrain.discrepancy.information import PRIOR_STD, Information
-from terrain.discrepancy.residuals import Rows
+from terrain.discrepancy.latencies import Latencies
 from terrain.discrepancy.signals import Signals
 from terrain.discrepancy.verdict import Clock, Excluded
-from terrain.effects import CHANNELS, CURRENT, GYRO, INDEX, SPEED_X, SPEED_Y
+from terrain.effects import CHANNELS, CURRENT, INDEX, SPEED_X, SPEED_Y
 from terrain.records import Array
 
 CLOCK_S, CLOCK_SIGMAS, CLOCK_SCATTER_S = 0.12, 6.0, 0.01
 """A clock is a run's own if it is off by the first, and by so many times its error and the scatter of the
 others, which is the third at the least."""
-
-STUCK_S, STUCK_STRETCH_S = 2.0, 1.0
-"""A run is stuck that is for the first in all, counted in stretches of the second at the least; where its
-clock is not known, in stretches over all that a clock may be off."""
-
-STUCK_MPS, STUCK_RADPS = 0.15, 0.2
-"""Least predicted motion for which a body can be found at rest."""
-
-STUCK_RATIO = 0.05
-"""Ratio of the predicted motion below which a body is at rest; no slip of the library goes below 0.1."""
-
-STUCK_FLOOR_MPS, STUCK_FLOOR_RADPS = 0.015, 0.02
-"""What a camera and a gyro measure of a body at rest."""
 
 STILL_MPS, VARIES_MPS, MOVING_MPS = 0.002, 0.05, 0.2
 """Spread of a wheel speed that never changes, of one that does, and a speed at which no wheel rests."""
@@ -69,7 +59,10 @@ _CURRENT = CHANNELS.index(CURRENT)
 
 
 def unfit_runs(
-    signals: Sequence[Signals], info: Information, shift: Shift | None = None
+    signals: Sequence[Signals],
+    info: Information,
+    shift: Shift | None = None,
+    latencies: Latencies | None = None,
 ) -> tuple[Excluded, ...]:
     """Return the unfit runs, each with the first reason that is found.
 
@@ -78,6 +71,7 @@ def unfit_runs(
     signals : of all runs
     info : of these runs around the simulation as it is given, in the same order
     shift : of these runs, where it is known already
+    latencies : of these runs, where they are known; short runs measure them only together
 
     Raises
     ------
@@ -85,10 +79,14 @@ def unfit_runs(
         if most runs' clocks are further apart than is searched.
     """
     shift = shifts_of(info) if shift is None else shift
+    responses = responses_of(info.rows, latencies, shift)
+    has_clock = [bool(np.isfinite(lag_s).any()) for lag_s in shift.lag_s]
+    stalled = stalled_runs(responses, has_clock, MAX_LAG_S + MARGIN_S - STRETCH_S)
     reasons: dict[int, str] = {}
-    for found in (_dead(signals, info), _late(info, shift), _stuck(info, shift), _frozen(signals, info)):
+    for found in (_dead(signals, info), _late(info, shift), stalled, _frozen(signals, info)):
         reasons = found | reasons
-    reasons |= _unlike(info, [i for i in range(len(signals)) if i not in reasons])
+    for odd in (partial(odd_runs, responses), partial(_unlike, info)):
+        reasons |= odd([i for i in range(len(signals)) if i not in reasons])
     return tuple(Excluded(signals[i].run_id, reasons[i]) for i in sorted(reasons))
 
 
@@ -157,54 +155,6 @@ def _behind(offset_s: float) -> str:
     return f"{abs(offset_s):.2f} s {'behind' if offset_s >= 0 else 'ahead of'}"
 
 
-def _stuck(info: Information, shift: Shift) -> dict[int, str]:
-    """Return runs in which wheels turn and the body is at rest, far longer than in the others."""
-    reasons: dict[int, str] = {}
-    if len(info.rows) < 2:
-        return reasons
-    stays_s = np.array([_standstill_s(run, shift.lag_s[i], shift.rate) for i, run in enumerate(info.rows)])
-    for i, time_s in enumerate(stays_s):
-        usual_s = float(np.median(np.delete(stays_s, i)))
-        if time_s > STUCK_S + 3.0 * usual_s:
-            reasons[i] = f"it is stuck for {time_s:.1f} s in all: its wheels turn, its body is at rest"
-    return reasons
-
-
-def _standstill_s(run: Rows, lag_s: Array, rate: float) -> float:
-    """Return for how long, in stretches of a least length, a body is at rest that is predicted to move."""
-    known = np.isfinite(lag_s)
-    usual_s = float(np.median(lag_s[known])) if known.any() else 0.0
-    centred_s = run.time_s - 0.5 * (run.time_s[0] + run.time_s[-1])
-
-    def pair(name: str) -> tuple[Array, Array]:
-        c = CHANNELS.index(name)
-        own = CLOCKED.index(name) if name in CLOCKED else CLOCKED.index(SPEED_X)
-        late_s = lag_s[own] if known[own] else usual_s
-        at_s = run.time_s - late_s - rate * centred_s
-        return run.measured[:, c], np.interp(at_s, run.time_s, run.predicted[:, c])
-
-    gyro, turn = pair(GYRO)
-    straight = np.isfinite(gyro) & (np.abs(turn) < 0.1 * STUCK_RADPS)
-    bias = float(np.median(gyro[straight])) if straight.sum() >= 10 else np.nan
-    turns = np.abs(gyro - bias) > STUCK_RATIO * np.abs(turn) + STUCK_FLOOR_RADPS
-    (x, along), (y, across) = pair(SPEED_X), pair(SPEED_Y)
-    expected = np.hypot(along, across)
-    seen = np.hypot(x, np.where(np.isfinite(y), y, 0.0))
-    if np.isfinite(seen).any():
-        stays = (expected > STUCK_MPS) & (seen < STUCK_RATIO * expected + STUCK_FLOOR_MPS) & ~turns
-    else:
-        stays = (np.abs(turn) > STUCK_RADPS) & np.isfinite(gyro - bias) & ~turns
-    row_s = float(np.median(np.diff(run.time_s)))
-    least_s = STUCK_STRETCH_S if known.any() else MAX_LAG_S + MARGIN_S
-    return row_s * sum(b - a for a, b in _stretches(stays) if (b - a) * row_s >= least_s)
-
-
-def _stretches(where: Array) -> list[tuple[int, int]]:
-    """Return starts and ends, not included, of the stretches in which something holds."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], where, [False]]).astype(np.int8)))
-    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
-
-
 def _frozen(signals: Sequence[Signals], info: Information) -> dict[int, str]:
     """Return runs with a channel that is constant, or clipped, while the prediction varies."""
     reasons: dict[int, str] = {}
@@ -214,7 +164,7 @@ def _frozen(signals: Sequence[Signals], info: Information) -> dict[int, str]:
             spread = float(np.std(expected))
             if not spread > 0:
                 continue
-            for a, b in _stretches(values[1:] == values[:-1]):
+            for a, b in stretches(values[1:] == values[:-1]):
                 start_s, end_s = a * run.dt_s, b * run.dt_s
                 inside = (rows.time_s > start_s + MARGIN_S) & (rows.time_s < end_s - MARGIN_S)
                 if end_s - start_s > FROZEN_S and np.ptp(expected[inside]) > FROZEN_RANGE * spread:

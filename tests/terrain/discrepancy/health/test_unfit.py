@@ -159,7 +159,7 @@ def dead_wheel(run: RunLog) -> RunLog:
 @pytest.mark.parametrize(
     ("fault", "reason"),
     [
-        (stuck, "it is stuck"),
+        (stuck, "it is stalled"),
         (gyro(lambda t, w: np.where(t < 15, w, w[t < 15][-1])), "yaw_rate_radps is frozen"),
         (gyro(lambda t, w: np.clip(w, *np.quantile(w, [0.1, 0.9]))), "yaw_rate_radps is clipped"),
         (gyro(lambda t, w: np.where(t < 6, w, np.nan)), "yaw_rate_radps is known in 1"),

@@ -1,0 +1,239 @@
+"""Signs, units and exchanged columns are named with their repair, and what effects do is none of them."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from pipelines.runs.datasets import load_runs
+from terrain.discrepancy.health import Column, Fault, FaultKind, faults_of, repaired
+from terrain.discrepancy.latencies import latencies_of
+from terrain.discrepancy.residuals import low_pass_of, rows_of
+from terrain.discrepancy.signals import Signals, signals_of
+from terrain.discrepancy.trials.drives import rich_drives
+from terrain.discrepancy.trials.hidden_effects import hidden_runs
+from terrain.discrepancy.trials.trial import simulation_of
+from terrain.records import Array, RunLog, Stream
+from terrain.robots import load_robot
+
+DEG, RPM, KMH = 57.29577951, 9.54929659, 3.6
+SIGN, UNIT, SWAPPED = FaultKind.SIGN, FaultKind.UNIT, FaultKind.SWAPPED
+TRACK = {"effective_track_ratio": 1.5}
+"""A robot that turns 2.5 times less than its simulation."""
+
+Edit = Callable[[RunLog], RunLog]
+
+
+@cache
+def sound(name: str = "husky", track: bool = False, seed: int = 3) -> tuple[RunLog, ...]:
+    effects = TRACK if track else {}
+    drives = rich_drives(np.random.default_rng(seed), 8, 40.0)
+    return hidden_runs(load_robot(name), drives, np.random.SeedSequence(seed), effects)
+
+
+def on_one_clock(runs: Sequence[RunLog]) -> list[Signals]:
+    return [signals_of(run, load_robot(run.robot)) for run in runs]
+
+
+def faults(signals: Sequence[Signals], name: str = "husky") -> tuple[Fault, ...]:
+    simulation, low_pass = simulation_of(load_robot(name)), low_pass_of(signals)
+    planar = simulation.planar_on("")
+    rows = [rows_of(run, planar, simulation.vector, (), low_pass) for run in signals]
+    return faults_of(signals, rows, simulation, low_pass)
+
+
+def edit(stream: str, start: str | Sequence[str], change: Callable[[Array], Array]) -> Edit:
+    """Return what changes the columns of a stream whose names begin so."""
+
+    def edited(run: RunLog) -> RunLog:
+        was = run.streams[stream]
+        at = [i for i, name in enumerate(was.channels) if name.startswith(tuple(start))]
+        values = was.values.copy()
+        values[:, at] = change(values[:, at])
+        return replace(run, streams={**run.streams, stream: replace(was, values=values)})
+
+    return edited
+
+
+def times(factor: float) -> Callable[[Array], Array]:
+    return lambda values: values * factor
+
+
+def exchanged(values: Array) -> Array:
+    return values[:, ::-1]
+
+
+GYRO, ACCEL = ("gyro_z",), ("accel_x",)
+SPEED, WHEELS, CURRENTS = ("speed_x", "speed_y"), ("speed_", "motor_"), ("current_",)
+WRITTEN = {
+    "the gyro's sign": (edit("imu", GYRO, times(-1)), SIGN, Column.GYRO, -1),
+    "gyro in deg/s": (edit("imu", GYRO, times(DEG)), UNIT, Column.GYRO, 1 / DEG),
+    "gyro in rad/s, read as deg/s": (edit("imu", GYRO, times(1 / DEG)), UNIT, Column.GYRO, DEG),
+    "gyro in rpm": (edit("imu", GYRO, times(RPM)), UNIT, Column.GYRO, 1 / RPM),
+    "speed in km/h": (edit("odometry", SPEED, times(KMH)), UNIT, Column.SPEED, 1 / KMH),
+    "the speed's sign": (edit("odometry", SPEED, times(-1)), SIGN, Column.SPEED, -1),
+    "x and y of the speed": (edit("odometry", SPEED, exchanged), SWAPPED, Column.SPEED, 1),
+    "accelerometer in g": (edit("imu", ACCEL, times(1 / 9.80665)), UNIT, Column.ACCEL, 9.80665),
+    "the accelerometer's sign": (edit("imu", ACCEL, times(-1)), SIGN, Column.ACCEL, -1),
+    "wheels in km/h": (edit("wheels", WHEELS, times(KMH)), UNIT, Column.WHEELS, 1 / KMH),
+    "wheels in rpm": (edit("wheels", WHEELS, times(RPM)), UNIT, Column.WHEELS, 1 / RPM),
+    "the wheels' sign": (edit("wheels", WHEELS, times(-1)), SIGN, Column.WHEELS, -1),
+    "the left wheels' sign": (edit("wheels", ("speed_left",), times(-1)), SIGN, Column.WHEELS, -1),
+    "left and right wheels": (edit("wheels", WHEELS, exchanged), SWAPPED, Column.WHEELS, 1),
+    "left and right currents": (edit("wheels", CURRENTS, exchanged), SWAPPED, Column.CURRENTS, 1),
+    "the currents' sign": (edit("wheels", CURRENTS, times(-1)), SIGN, Column.CURRENTS, -1),
+    "currents in mA": (edit("wheels", CURRENTS, times(1e3)), UNIT, Column.CURRENTS, 1e-3),
+}
+
+
+@pytest.mark.parametrize("track", [False, True])
+@pytest.mark.parametrize("written", WRITTEN)
+def test_a_fault_of_all_runs_is_named_and_its_repair_gives_the_log_back(written, track):
+    write, kind, column, factor = WRITTEN[written]
+    was = sound(track=track)
+    signals = on_one_clock([write(run) for run in was])
+    (fault,) = faults(signals)
+    assert (fault.kind, fault.column) == (kind, column)
+    assert fault.run_ids == tuple(run.run_id for run in was)
+    assert fault.factor == pytest.approx(factor, rel=1e-4)
+    assert "in all 8 runs" in fault.sentence
+    assert fault.sentence.endswith(fault.repair)
+    assert "mapping file" in fault.repair
+    for run, truth in zip(repaired(signals, [fault]), on_one_clock(was), strict=True):
+        assert_allclose(run.measured, truth.measured, rtol=1e-4, atol=1e-9)
+        assert_allclose(run.wheel_speed_mps, truth.wheel_speed_mps, rtol=1e-4, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "written",
+    ["the gyro's sign", "gyro in deg/s", "speed in km/h", "left and right wheels", "wheels in km/h"],
+)
+def test_a_fault_of_one_run_is_named_by_the_run(written):
+    write, kind, column, _ = WRITTEN[written]
+    runs = [write(run) if i == 2 else run for i, run in enumerate(sound())]
+    (fault,) = faults(on_one_clock(runs))
+    assert (fault.kind, fault.column, fault.run_ids) == (kind, column, ("run_03",))
+    assert "in 1 of 8 runs (run_03)" in fault.sentence
+
+
+@pytest.mark.parametrize(
+    "written", ["the gyro's sign", "gyro in deg/s", "wheels in km/h", "accelerometer in g"]
+)
+def test_a_swerve_robot_has_the_same_faults(written):
+    write, kind, column, _ = WRITTEN[written]
+    (fault,) = faults(on_one_clock([write(run) for run in sound("agrimaro")]), "agrimaro")
+    assert (fault.kind, fault.column, len(fault.run_ids)) == (kind, column, 8)
+
+
+def test_a_session_is_named_also_where_a_run_of_it_drives_straight():
+    write = WRITTEN["the gyro's sign"][0]
+    runs = [
+        replace(write(run), run_id=f"gravel_{i}") if i < 5 else replace(run, run_id=f"sand_{i}")
+        for i, run in enumerate(sound())
+    ]
+    (fault,) = faults(on_one_clock(runs))
+    assert "in all 5 runs of gravel" in fault.sentence
+
+
+def with_heading(run: RunLog) -> RunLog:
+    """Replace the camera by a lidar that measures a heading, too."""
+    imu, seen = run.streams["imu"], run.streams["odometry"]
+    yaw_rate = np.interp(seen.time_s, imu.time_s, imu.channel("gyro_z_radps"))
+    values = np.column_stack([seen.values, yaw_rate])
+    lidar = Stream(seen.time_s, values, (*seen.channels, "yaw_rate_radps"))
+    streams = {name: stream for name, stream in run.streams.items() if name != "odometry"}
+    return replace(run, streams={**streams, "lidar": lidar})
+
+
+def test_a_heading_says_whether_the_gyro_or_the_wheels_are_turned():
+    runs = [with_heading(run) for run in sound(track=True)]
+    (gyro,) = faults(on_one_clock([WRITTEN["the gyro's sign"][0](run) for run in runs]))
+    assert gyro.column is Column.GYRO
+    assert "the heading rate with -1.00" in gyro.sentence
+    (wheels,) = faults(on_one_clock([WRITTEN["left and right wheels"][0](run) for run in runs]))
+    assert (wheels.kind, wheels.column) == (SWAPPED, Column.WHEELS)
+    (both,) = faults(on_one_clock([edit("lidar", ("yaw",), times(DEG))(run) for run in runs]))
+    assert (both.kind, both.column) == (UNIT, Column.HEADING)
+
+
+def test_with_a_gyro_alone_both_readings_are_named():
+    def alone(run: RunLog) -> RunLog:
+        wheels = run.streams["wheels"]
+        speeds = replace(wheels, values=wheels.values[:, :2], channels=wheels.channels[:2])
+        return replace(run, streams={"imu": run.streams["imu"], "wheels": speeds})
+
+    write = WRITTEN["the gyro's sign"][0]
+    signals = [
+        replace(run, grade_rad=0 * run.grade_rad) for run in on_one_clock(map(alone, map(write, sound())))
+    ]
+    (fault,) = faults([_only_gyro(run) for run in signals])
+    assert fault.column is Column.GYRO
+    assert "cannot distinguish" in fault.sentence
+    assert "left and right are exchanged" in fault.sentence
+
+
+def _only_gyro(run: Signals) -> Signals:
+    measured = run.measured.copy()
+    measured[:, 1:] = np.nan
+    return replace(run, measured=measured)
+
+
+@pytest.mark.parametrize(
+    ("name", "effects"),
+    [
+        ("husky", {"effective_track_ratio": 3.5}),
+        ("husky", {"effective_track_ratio": -0.45, "gyro_scale_ratio": 0.25}),
+        ("husky", {"turning_slip_ratio": 0.8, "wheel_radius_ratio": -0.25}),
+        ("husky", {"lever_x_m": -0.9, "one_sided_radius_ratio": 0.2, "motor_constant_ratio": 0.9}),
+        ("husky", {"force_slip_ratio": 2.7, "rolling_resistance_ratio": 0.4}),
+        ("agrimaro", {"gyro_scale_ratio": 0.27, "wheel_radius_ratio": -0.27}),
+        ("agrimaro", {"camera_yaw_rad": 0.27, "steering_offset_1_rad": 0.27, "payload_ratio": 1.4}),
+        ("agrimaro", {"encoder_lag_s": 0.45, "clock_offset_s": 0.45}),
+    ],
+)
+def test_what_effects_do_is_no_fault(name, effects):
+    robot = load_robot(name)
+    drives = rich_drives(np.random.default_rng(5), 8, 40.0)
+    runs = hidden_runs(robot, drives, np.random.SeedSequence(5), effects)
+    assert faults(on_one_clock(runs), name) == ()
+
+
+def test_faults_of_two_columns_are_both_named():
+    write = [WRITTEN[name][0] for name in ("gyro in deg/s", "the gyro's sign", "left and right currents")]
+    runs = list(sound(track=True))
+    for step in write:
+        runs = [step(run) for run in runs]
+    signals = on_one_clock(runs)
+    found = faults(signals)
+    assert {(fault.kind, fault.column) for fault in found} == {
+        (SIGN, Column.GYRO),
+        (UNIT, Column.GYRO),
+        (SWAPPED, Column.CURRENTS),
+    }
+    truth = on_one_clock(sound(track=True))
+    for run, true in zip(repaired(signals, found), truth, strict=True):
+        assert_allclose(run.measured, true.measured, rtol=1e-4, atol=1e-9)
+
+
+def test_a_reading_that_is_not_clear_leaves_the_channel_out():
+    (fault,) = faults(on_one_clock([WRITTEN["gyro in deg/s"][0](run) for run in sound()]))
+    signals = on_one_clock(sound())
+    left = repaired(signals, [replace(fault, factor=float("nan"))])
+    assert all(np.isnan(run.measured[:, 0]).all() for run in left)
+    assert_allclose(left[0].measured[:, 1:], signals[0].measured[:, 1:])
+
+
+@pytest.mark.parametrize("folder", ["drive_husky", "borealtc", "vulpi"])
+def test_measured_huskies_have_no_fault(measured, folder):
+    assert faults(on_one_clock(load_runs(measured(folder)))) == ()
+
+
+def test_the_gyro_of_the_measured_marmotte_is_turned(measured):
+    runs = load_runs(measured("drive_marmotte"))
+    (fault,) = faults(on_one_clock(runs))
+    assert (fault.kind, fault.column, len(fault.run_ids)) == (SIGN, Column.GYRO, len(runs))
+    assert "the heading rate with -0.9" in fault.sentence
+    assert latencies_of(repaired(on_one_clock(runs), [fault]), simulation_of(load_robot("husky"))).channels
