@@ -9,7 +9,7 @@ import numpy as np
 from pipelines.explain.results import Seconds, TrialsResult
 from pipelines.explain.settings import TrialsSettings
 from pipelines.reporting.progress import Progress, silent
-from terrain.discrepancy.diagnose import MIN_RUNS
+from terrain.discrepancy.preparation import MIN_RUNS
 from terrain.discrepancy.trials.hidden_effects import Case, cases_of
 from terrain.discrepancy.trials.rows import Row
 from terrain.discrepancy.trials.scoring import found_from, table_of

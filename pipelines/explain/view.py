@@ -28,7 +28,8 @@ from pipelines.reporting.pictures import Image
 from pipelines.reporting.versions import versions
 from terrain.discrepancy.filter_gain import Comparison
 from terrain.discrepancy.gain import ChannelGain, Gain
-from terrain.discrepancy.verdict import Cause, Clock, Diagnosis, Limit, RuledOut
+from terrain.discrepancy.health.runs import Clock
+from terrain.discrepancy.verdict import Cause, Diagnosis, Limit, RuledOut
 from terrain.effects import LIBRARY
 
 COMPARISON_TITLES = {"filter": "Error of the filter {name}", "classifier": "Classifier {name}"}

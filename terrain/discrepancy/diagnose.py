@@ -22,13 +22,11 @@ from terrain.discrepancy.answers import (
     ruled_out_of,
     values_of,
 )
-from terrain.discrepancy.clocks import shifts_of
-from terrain.discrepancy.health import clocks_of, unfit_runs
-from terrain.discrepancy.information import Information, move_point
-from terrain.discrepancy.latencies import latencies_of, starting_values
+from terrain.discrepancy.health import clocks_of
+from terrain.discrepancy.information import Information
 from terrain.discrepancy.next_drive import next_drive
+from terrain.discrepancy.preparation import MIN_RUNS, prepare
 from terrain.discrepancy.probes import probe_residuals
-from terrain.discrepancy.residuals import low_pass_of
 from terrain.discrepancy.search import Found, Problem, names_of, refit, search, with_rivals
 from terrain.discrepancy.selection import EXCITED_RATIO
 from terrain.discrepancy.signals import Signals, signals_of
@@ -39,9 +37,6 @@ from terrain.discrepancy.withdrawal import raw_gain, reasons_to_withdraw
 from terrain.effects import BOUNDS, CHANNELS, INDEX, Effect, effect_named
 from terrain.errors import DataError
 from terrain.records import RunLog
-
-MIN_RUNS = 3
-"""Least number of runs: with fewer none is left to validate a fit."""
 
 BLIND_RATIO = 0.05
 """Ratio of the library that may be not excited before the verdict ``none`` becomes ``not_excited``."""
@@ -83,24 +78,10 @@ def diagnose_signals(
 ) -> Diagnosis:
     """Return the diagnosis of runs that are on one clock already; see :func:`diagnose`."""
     effects = simulation.library if library is None else tuple(library)
-    low_pass = low_pass_of(signals)
-    problem = Problem(tuple(signals), simulation, low_pass, effects)
-    seeds = _seeds(problem)
-    aligned = _at_seeds(problem, seeds)
-    shift = shifts_of(aligned)
-    excluded = unfit_runs(problem.signals, aligned, shift)
-    if excluded:
-        gone = {run.run_id for run in excluded}
-        kept = tuple(run for run in problem.signals if run.run_id not in gone)
-        if len(kept) < MIN_RUNS:
-            reasons = "; ".join(f"{run.run_id}: {run.reason}" for run in excluded[:3])
-            raise DataError(f"runs: only {len(kept)} of {len(signals)} are fit to be compared ({reasons})")
-        problem = problem._replace(signals=kept)
-        seeds = _seeds(problem)
-        aligned = _at_seeds(problem, seeds)
-        shift = shifts_of(aligned)
-    start = problem.at(simulation.vector) if seeds else aligned
-    found, withdrawn = _search_and_withdraw(problem, start, seeds)
+    prepared = prepare(signals, simulation, effects)
+    problem = prepared.problem
+    start = problem.at(simulation.vector) if prepared.seeds else prepared.aligned
+    found, withdrawn = _search_and_withdraw(problem, start, prepared.seeds)
     varying = varying_effects(found, problem.library)
     found, withdrawn = _without_varying(problem, start, found, withdrawn, varying)
     found = with_rivals(problem, start, found)
@@ -133,25 +114,15 @@ def diagnose_signals(
         limits=limits,
         not_excited=missed,
         ruled_out=tuple(ruled_out_of(found, named, sets, withdrawn, problem.library)),
-        excluded_runs=excluded,
-        clocks=clocks_of(aligned, shift),
+        excluded_runs=prepared.excluded,
+        clocks=clocks_of(prepared.aligned, prepared.shift),
         next_drive=next_drive(simulation, sets, missed, found.info),
         residual_before=residuals_of(start, start),
         residual_after=residuals_of(after, start),
         n_runs=len(problem.signals),
         varying=varying,
+        faults=prepared.faults,
     )
-
-
-def _seeds(problem: Problem) -> dict[str, float]:
-    """Return lags of sensors that are so large that a search has to start from them."""
-    found = starting_values(latencies_of(problem.signals, problem.simulation))
-    return {name: value for name, value in found.items() if name in problem.parameters}
-
-
-def _at_seeds(problem: Problem, seeds: Mapping[str, float]) -> Information:
-    vector = problem.simulation.vector
-    return problem.at(move_point(vector, tuple(seeds), np.array(list(seeds.values()))))
 
 
 def _search_and_withdraw(

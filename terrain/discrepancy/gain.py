@@ -9,13 +9,14 @@ import numpy as np
 
 from terrain.bootstrap import bootstrap_counts, percentile_interval
 from terrain.discrepancy.health import unfit_runs
+from terrain.discrepancy.health.runs import Excluded
 from terrain.discrepancy.information import N_BLOCKS, Information, information_at
 from terrain.discrepancy.residuals import low_pass_of, measured_channels
 from terrain.discrepancy.search import names_of
 from terrain.discrepancy.selection import MIN_CLUSTERS
 from terrain.discrepancy.signals import signals_of
 from terrain.discrepancy.simulation import Simulation
-from terrain.discrepancy.verdict import Excluded, finite
+from terrain.discrepancy.verdict import finite
 from terrain.effects import CHANNELS
 from terrain.errors import ConfigError, DataError
 from terrain.records import Array, RunLog

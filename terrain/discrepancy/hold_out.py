@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from terrain.discrepancy.diagnose import MIN_RUNS
+from terrain.discrepancy.preparation import MIN_RUNS
 from terrain.errors import DataError
 from terrain.records import RunLog
 

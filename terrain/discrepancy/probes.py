@@ -125,7 +125,7 @@ def probe_residuals(
 
 
 def _waves(info: Information, c: int, wheel: int, times: float) -> list[Array]:
-    """Return cosine and sine (2, rows) of a multiple of a wheel's angle in each run, whitened as channel c."""
+    """Return cosine and sine (2, rows) of a multiple of a wheel's angle, whitened as channel c."""
     pairs = []
     for run, residual in zip(info.rows, info.white_residual, strict=True):
         phase = times * run.inputs[:, len(INPUTS) - 1 + wheel]

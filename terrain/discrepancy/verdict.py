@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, NamedTuple
 
+from terrain.discrepancy.health.faults import Fault
+from terrain.discrepancy.health.runs import Clock, Excluded
 from terrain.records import Array
 
 
@@ -136,21 +138,6 @@ class RuledOut(NamedTuple):
     values: tuple[Value, ...] = ()
 
 
-class Excluded(NamedTuple):
-    """A run that is excluded as unfit, and why."""
-
-    run_id: str
-    reason: str
-
-
-class Clock(NamedTuple):
-    """Delay of the IMU's and the camera's logger behind the wheels' in a run, and its standard deviation."""
-
-    run_id: str
-    offset_s: float
-    std_s: float
-
-
 class Residual(NamedTuple):
     """How far measured and simulated are apart in one channel, behind the common low-pass.
 
@@ -196,6 +183,7 @@ class Diagnosis:
     residual_before, residual_after : by channel, with the simulation given and with the causes built in
     n_runs : that were compared
     varying : effects whose size differs from run to run
+    faults : of channels, which were repaired before anything was compared
     """
 
     robot: str
@@ -216,6 +204,7 @@ class Diagnosis:
     residual_after: dict[str, Residual]
     n_runs: int
     varying: tuple[Varying, ...] = ()
+    faults: tuple[Fault, ...] = ()
 
     @property
     def values(self) -> dict[str, float]:
@@ -255,6 +244,7 @@ class Diagnosis:
                 {"channel": x.channel, "input": x.input, "z": finite(x.z), "residual_ratio": finite(x.ratio)}
                 for x in self.unexplained
             ],
+            "faults": [_fault(each) for each in self.faults],
             "varying": [_varying(each) for each in self.varying],
             "not_excited": [limit for limit in limits if limit["name"] in missed],
             "detection_limits": limits,
@@ -285,6 +275,17 @@ def _value(value: Value) -> dict[str, Any]:
         "value": finite(value.value),
         "unit": value.unit,
         "ci": [finite(value.low), finite(value.high)],
+    }
+
+
+def _fault(fault: Fault) -> dict[str, Any]:
+    return {
+        "kind": fault.kind.value,
+        "column": fault.column.value,
+        "runs": list(fault.run_ids),
+        "factor": finite(fault.factor),
+        "sentence": fault.sentence,
+        "repair": fault.repair,
     }
 
 

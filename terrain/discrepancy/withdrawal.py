@@ -1,4 +1,4 @@
-"""Why causes that reduce the residual are withdrawn all the same: one reason a rule, each with its numbers."""
+"""Why causes that reduce the residual are withdrawn all the same: a reason a rule, with its numbers."""
 
 from __future__ import annotations
 

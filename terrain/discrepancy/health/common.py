@@ -176,7 +176,9 @@ def _outliers(responses: Sequence[Response], c: int, name: str) -> dict[int, str
         if math.isfinite(gain) and gain > 0 and correlation > FOLLOWS:
             logs[i] = math.log(gain)
             rows = np.isfinite(run.measured[:, c]).sum()
-            error[i] = math.sqrt((1.0 / correlation**2 - 1.0) / max(rows * min(run.period_s, 1.0), 1.0))
+            error[i] = math.sqrt(
+                max(1.0 / correlation**2 - 1.0, 0.0) / max(rows * min(run.period_s, 1.0), 1.0)
+            )
     known = np.isfinite(logs)
     if known.sum() < MIN_COMPARED:
         return {}

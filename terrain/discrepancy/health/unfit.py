@@ -16,10 +16,10 @@ import numpy as np
 from terrain.discrepancy.clocks import MAX_LAG_S, MIN_LAG_S, Shift, offsets_of, shifts_of
 from terrain.discrepancy.health.common import STRETCH_S, odd_runs, stalled_runs, stretches
 from terrain.discrepancy.health.response import responses_of
+from terrain.discrepancy.health.runs import Clock, Excluded
 from terrain.discrepancy.information import PRIOR_STD, Information
 from terrain.discrepancy.latencies import Latencies
 from terrain.discrepancy.signals import Signals
-from terrain.discrepancy.verdict import Clock, Excluded
 from terrain.effects import CHANNELS, CURRENT, INDEX, SPEED_X, SPEED_Y
 from terrain.records import Array
 

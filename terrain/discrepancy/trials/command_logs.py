@@ -11,7 +11,7 @@ import numpy as np
 
 from terrain.discrepancy.trials.limits import Sensing
 from terrain.effects import GYRO, HEADING, SPEED_X, SPEED_Y
-from terrain.logs.drive import TWIST_CHANNELS
+from terrain.logs.lidar_twist import CHANNELS as TWIST_CHANNELS
 from terrain.records import Array, RunLog, Stream
 from terrain.simulation.planar.noise import Scatter
 

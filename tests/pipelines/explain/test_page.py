@@ -17,11 +17,10 @@ from pipelines.reporting.numbers import NOT_KNOWN
 from pipelines.reporting.pictures import png_image
 from terrain.discrepancy.filter_gain import Change, Comparison
 from terrain.discrepancy.gain import ChannelGain, Gain, Reduction
+from terrain.discrepancy.health.runs import Clock, Excluded
 from terrain.discrepancy.verdict import (
     Cause,
-    Clock,
     Diagnosis,
-    Excluded,
     Limit,
     NextDrive,
     Residual,

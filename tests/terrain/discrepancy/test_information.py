@@ -109,7 +109,9 @@ def test_the_form_is_generalised_least_squares_with_scatter_written_out(info):
 def test_a_nuisance_is_a_parameter_too_and_its_scatter_widens_its_variance(info, signals):
     assert info.parameters[: len(NAMES)] == NAMES
     assert set(np.array(info.parameters)[info.nuisances]) == set(SCATTER._fields)
-    firm = information_at(signals, Simulation(HUSKY), info.vector, NAMES, low_pass_of(signals), info.statistics)
+    firm = information_at(
+        signals, Simulation(HUSKY), info.vector, NAMES, low_pass_of(signals), info.statistics
+    )
     name = ["rolling_resistance_ratio"]  # which scatters
     wide, narrow = fit_change(info, name)[1][0, 0], fit_change(firm, name)[1][0, 0]
     # the mean over runs cannot be better known than its scatter lets

@@ -6,13 +6,14 @@ from types import SimpleNamespace
 
 import pytest
 
+from terrain.discrepancy.health.runs import Clock
 from terrain.discrepancy.trials.hidden_effects import cases_of
 from terrain.discrepancy.trials.measured_scores import is_right, states_something, wrong_names
 from terrain.discrepancy.trials.rows import Row
 from terrain.discrepancy.trials.scoring import table_of
 from terrain.discrepancy.trials.trial import CLOCK_STATED_S, Trial, Varying, run_trial
 from terrain.discrepancy.trials.written_faults import Statement
-from terrain.discrepancy.verdict import Clock, Value, Verdict
+from terrain.discrepancy.verdict import Value, Verdict
 
 RIGHT = Trial(
     row=Row.SHORT,
