@@ -95,6 +95,7 @@ SENSORS: tuple[Effect, ...] = (
     Effect(
         "imu_latency",
         (
+            # as much of it and of camera_latency is a clock_offset: logs determine two of the three
             Parameter(
                 "imu_latency_s",
                 0.0,

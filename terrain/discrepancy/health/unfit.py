@@ -49,6 +49,9 @@ FAR_END = 0.5
 MIN_OTHERS = 3
 """Least number of other runs of its terrain that a run is compared with: of three runs two may be wrong."""
 
+UNKNOWN_RATIO = 1e-6
+"""Information over that of the prior, below which a parameter is not counted: fitting it costs nothing."""
+
 UNLIKE_RATIO, UNLIKE_NOISE_RATIO = 12.0, 0.2
 """A run is an outlier if a simulation in common with the others costs it so many times what one in common
 costs them among themselves, and so many variances of the noise a row.  Of 15 000 simulated runs without a
@@ -216,7 +219,8 @@ def common_fit_cost(info: Information, left: Sequence[int]) -> tuple[Array, Arra
     """
     prior = np.diag(1.0 / np.array([PRIOR_STD.get(name, 1e-6) for name in info.parameters]) ** 2)
     a, g, c = info.a[left], info.g[left], info.c[left]
-    n, k = len(left), len(prior)
+    n = len(left)
+    k = int((a.sum(axis=0).diagonal() > UNKNOWN_RATIO * prior.diagonal()).sum())
 
     def loss(a: Array, g: Array) -> Array:
         x = np.linalg.solve(a + prior, g[..., None])[..., 0]
