@@ -7,8 +7,7 @@ traction, ``W = m g`` the nominal weight, ``f = F / W``, ``th`` the grade (uphil
 ``q = |dv| / (|dv| + 2 |u|)`` how tight a turn is.
 
 To add an effect, write its entry into the module of its kind, and its formula into the kernels of
-:mod:`terrain.simulation.planar`.  Everything else reads the entry.  Then delete the compiled kernels
-(``__pycache__/*.nb*``): the places of the parameters are compiled into them, and the cache does not notice.
+:mod:`terrain.simulation.planar`.  Everything else reads the entry.
 """
 
 from __future__ import annotations
