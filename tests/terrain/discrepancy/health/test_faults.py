@@ -218,6 +218,18 @@ def test_faults_of_two_columns_are_both_named():
         assert_allclose(run.measured, true.measured, rtol=1e-4, atol=1e-9)
 
 
+@pytest.mark.parametrize(
+    ("stream", "start", "offset", "column"),
+    [("imu", "gyro_z", 0.9, Column.GYRO), ("imu", "accel_x", -9.8, Column.ACCEL)],
+)
+def test_an_offset_that_no_bias_has_is_named_and_subtracted(stream, start, offset, column):
+    was = sound(track=True)
+    (fault,) = faults(on_one_clock([edit(stream, (start,), lambda v: v + offset)(run) for run in was]))
+    assert (fault.kind, fault.column) == (FaultKind.OFFSET, column)
+    assert fault.change.offset == pytest.approx(-offset, abs=0.1)
+    assert "in all 8 runs" in fault.sentence
+
+
 def test_a_reading_that_is_not_clear_leaves_the_channel_out():
     (fault,) = faults(on_one_clock([WRITTEN["gyro in deg/s"][0](run) for run in sound()]))
     signals = on_one_clock(sound())
