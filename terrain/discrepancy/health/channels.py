@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from terrain.discrepancy.clocks import Shift
 from terrain.discrepancy.health.faults import Change, Fault, repaired
+from terrain.discrepancy.health.offsets import offset_faults
 from terrain.discrepancy.health.response import Response, responses_of
 from terrain.discrepancy.health.signs import (
     Reading,
@@ -34,7 +35,7 @@ def faults_of(
     shift: Shift | None = None,
     latencies: Latencies | None = None,
 ) -> tuple[Fault, ...]:
-    """Return the faults of channels, in the order in which they are to be repaired.
+    """Return the faults of channels, in the order in which they are to be repaired: signs, units, offsets.
 
     The simulation may be wrong: a fault is what no effect of the catalogue does.
 
@@ -57,7 +58,11 @@ def faults_of(
         now = _with_rows(runs, now, fault, simulation, low_pass)
         runs = repaired(runs, [fault])
         responses = responses_of(now, latencies, shift)
-    return (*found, *unit_faults(responses, simulation.robot))
+    units = unit_faults(responses, simulation.robot)
+    for fault in units:
+        now = _with_rows(runs, now, fault, simulation, low_pass)
+        runs = repaired(runs, [fault])
+    return (*found, *units, *offset_faults(responses_of(now, latencies, shift)))
 
 
 def _turned(
@@ -116,6 +121,6 @@ def _with_rows(
         if each.run_id not in ids
         else _simulated(fault.change.applied(run), simulation, low_pass)
         if fault.change.of_wheels
-        else each._replace(measured=fault.change.measured(each.measured))
+        else each._replace(measured=fault.measured(each.measured))
         for run, each in zip(runs, rows, strict=True)
     )

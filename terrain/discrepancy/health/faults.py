@@ -21,6 +21,7 @@ class FaultKind(StrEnum):
     SIGN = "sign"
     UNIT = "unit"
     SWAPPED = "swapped"
+    OFFSET = "offset"
 
 
 class Column(StrEnum):
@@ -66,12 +67,14 @@ class Change(NamedTuple):
     kind, column : what is changed, and how
     factor : by which samples are multiplied; 1 for columns that are exchanged
     wheel : which wheel alone; -1 for all
+    offset : that is added
     """
 
     kind: FaultKind
     column: Column
     factor: float = 1.0
     wheel: int = -1
+    offset: float = 0.0
 
     @property
     def of_wheels(self) -> bool:
@@ -86,6 +89,9 @@ class Change(NamedTuple):
                 changed[:, [X, Y]] = values[:, [Y, X]]
             elif self.column in (Column.CURRENTS, Column.SIDES):
                 changed[:, T] = -values[:, T]
+        elif self.kind is FaultKind.OFFSET:
+            c = CHANNELS_OF[self.column][0]
+            changed[:, c] = values[:, c] + self.offset
         else:
             for c in CHANNELS_OF[self.column]:
                 changed[:, c] = values[:, c] * self.factor
@@ -105,12 +111,6 @@ class Change(NamedTuple):
             wheel_speed *= self.factor
         return replace(run, measured=measured, wheel_speed_mps=wheel_speed)
 
-    def without(self, run: Signals) -> Signals:
-        """Return a run without the channels that the fault is in."""
-        measured = run.measured.copy()
-        measured[:, list(CHANNELS_OF[self.column])] = np.nan
-        return replace(run, measured=measured)
-
 
 @dataclass(frozen=True, slots=True)
 class Fault:
@@ -121,8 +121,8 @@ class Fault:
     kind : what is wrong
     column : with what
     run_ids : of the runs that have it
-    factor : by which its samples are to be multiplied; NaN where it is left out, since readings of it cannot
-        be distinguished
+    factor : by which its samples are to be multiplied, 1 for an exchange and an offset; NaN where it is left
+        out, since readings of it cannot be distinguished
     sentence : what is wrong, how that is seen, and what to do
     repair : what to do alone
     change : that makes the log right
@@ -136,15 +136,28 @@ class Fault:
     repair: str
     change: Change
 
+    def measured(self, values: Array) -> Array:
+        """Return measured channels (n, channels) without the fault, NaN in those that are left out."""
+        if not np.isnan(self.factor):
+            return self.change.measured(values)
+        left = values.copy()
+        left[:, list(CHANNELS_OF[self.column])] = np.nan
+        return left
+
 
 def repaired(signals: Sequence[Signals], faults: Sequence[Fault]) -> tuple[Signals, ...]:
     """Return runs without faults, in the same order: changed, or left out where it is not clear how."""
     fixed = list(signals)
     for fault in faults:
         ids = set(fault.run_ids)
-        step = fault.change.without if np.isnan(fault.factor) else fault.change.applied
-        fixed = [step(run) if run.run_id in ids else run for run in fixed]
+        fixed = [_without(fault, run) if run.run_id in ids else run for run in fixed]
     return tuple(fixed)
+
+
+def _without(fault: Fault, run: Signals) -> Signals:
+    if np.isnan(fault.factor):
+        return replace(run, measured=fault.measured(run.measured))
+    return fault.change.applied(run)
 
 
 def session_of(run_id: str) -> str:

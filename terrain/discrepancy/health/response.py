@@ -87,7 +87,7 @@ def responses_of(
         predicted = run.predicted.copy()
         centred_s = run.time_s - run.time_s.mean() if run.time_s.size else run.time_s
         rate = 0.0 if shift is None else shift.rate
-        for c, name in CLOCK_OF.items():
+        for c, name in CLOCK_OF.items() if run.time_s.size else ():
             late_s = known.get(name, common.get(name, usual_s)) + rate * centred_s
             predicted[:, c] = np.interp(run.time_s - late_s, run.time_s, run.predicted[:, c])
         period_s = float(np.median(np.diff(run.time_s))) if run.time_s.size > 1 else 0.0

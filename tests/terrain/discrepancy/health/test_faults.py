@@ -89,8 +89,7 @@ WRITTEN = {
 }
 
 
-@pytest.mark.parametrize("track", [False, True])
-@pytest.mark.parametrize("written", WRITTEN)
+@pytest.mark.parametrize(("written", "track"), [(name, i % 2 == 1) for i, name in enumerate(WRITTEN)])
 def test_a_fault_of_all_runs_is_named_and_its_repair_gives_the_log_back(written, track):
     write, kind, column, factor = WRITTEN[written]
     was = sound(track=track)
@@ -216,6 +215,34 @@ def test_faults_of_two_columns_are_both_named():
     truth = on_one_clock(sound(track=True))
     for run, true in zip(repaired(signals, found), truth, strict=True):
         assert_allclose(run.measured, true.measured, rtol=1e-4, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("stream", "start", "offset", "column"),
+    [("imu", "gyro_z", 0.9, Column.GYRO), ("imu", "accel_x", -9.8, Column.ACCEL)],
+)
+def test_an_offset_that_no_bias_has_is_named_and_subtracted(stream, start, offset, column):
+    was = sound(track=True)
+    (fault,) = faults(on_one_clock([edit(stream, (start,), lambda v: v + offset)(run) for run in was]))
+    assert (fault.kind, fault.column) == (FaultKind.OFFSET, column)
+    assert fault.change.offset == pytest.approx(-offset, abs=0.1)
+    assert "in all 8 runs" in fault.sentence
+
+
+def test_one_run_alone_and_a_run_without_rows_are_no_special_case():
+    write = WRITTEN["gyro in deg/s"][0]
+    (fault,) = faults(on_one_clock([write(sound()[0])]))
+    assert fault.column is Column.GYRO
+    (run,) = on_one_clock(sound()[:1])
+    simulation, low_pass = simulation_of(load_robot("husky")), low_pass_of([run])
+    (rows,) = (rows_of(run, simulation.planar_on(""), simulation.vector, (), low_pass),)
+    none = rows._replace(
+        time_s=rows.time_s[:0],
+        measured=rows.measured[:0],
+        predicted=rows.predicted[:0],
+        inputs=rows.inputs[:0],
+    )
+    assert faults_of([run], [none], simulation, low_pass) == ()
 
 
 def test_a_reading_that_is_not_clear_leaves_the_channel_out():
