@@ -68,7 +68,8 @@ class Constancy(NamedTuple):
         if not self.certain or self.ratio <= CAVEAT_RATIO:
             return ""
         groups = self.thirds if self.split == "time" else self.halves
-        shown = ", ".join(f"{group.values[_main(groups)]:.3g} in the {group.name}" for group in groups)
+        told = [(group.values[_main(groups)], group.name) for group in groups]
+        shown = ", ".join(f"{value:.3g} in the {name}" for value, name in told if math.isfinite(value))
         return f"its value depends on {'time' if self.split == 'time' else 'the run'}: {shown}"
 
 
@@ -128,22 +129,25 @@ def _groups(
 
 
 def _difference(groups: Sequence[Group]) -> tuple[float, bool]:
-    """Return how far groups are apart, weighted by their information, and whether it is beyond the noise."""
+    """Return how far groups are apart, weighted by their information, and whether it is beyond the noise.
+
+    A group counts for the parameters that it shows; a parameter that is apart by noise counts only where none
+    is apart beyond it.
+    """
     if len(groups) < 2:
         return 0.0, False
     values, std = np.array([g.values for g in groups]), np.array([g.std for g in groups])
-    known = np.isfinite(values).all(axis=0) & (std > 0).all(axis=0)
-    if not known.any():
-        return 0.0, False
-    values, std = values[:, known], std[:, known]
-    weight = 1.0 / std**2
-    mean = (weight * values).sum(axis=0) / weight.sum(axis=0)
-    statistic = float((weight * (values - mean) ** 2).sum(axis=0).max())
-    certain = float(chi2.sf(statistic, len(groups) - 1)) < CERTAIN_P
-    apart = np.sqrt((weight * (values - mean) ** 2).sum(axis=0) / weight.sum(axis=0))
-    return float(apart.max()), certain
+    known = np.isfinite(values) & (std > 0)
+    known &= known.sum(axis=0) > 1
+    weight = np.where(known, 1.0 / np.where(known, std, 1.0) ** 2, 0.0)
+    total = np.maximum(weight.sum(axis=0), 1e-30)
+    values = np.where(known, values, 0.0)
+    statistic = (weight * (values - (weight * values).sum(axis=0) / total) ** 2).sum(axis=0)
+    certain = chi2.sf(statistic, np.maximum(known.sum(axis=0) - 1, 1)) < CERTAIN_P
+    apart = np.sqrt(statistic / total)
+    return float(apart[certain].max() if certain.any() else apart.max()), bool(certain.any())
 
 
 def _main(groups: Sequence[Group]) -> int:
     """Return the parameter that is largest over all groups."""
-    return int(np.argmax(np.nanmax(np.abs([group.values for group in groups]), axis=0)))
+    return int(np.argmax(np.nan_to_num([np.abs(group.values) for group in groups]).max(axis=0)))

@@ -134,18 +134,6 @@ def _waves(info: Information, c: int, wheel: int, times: float) -> list[Array]:
     return pairs
 
 
-def parameter_drifts(info: Information, names: Sequence[str], change: Array) -> dict[str, ProbeResult]:
-    """Return, by selected parameter, the evidence that it changes from the start of runs to their end."""
-    if not names:
-        return {}
-    columns = [
-        white[info.places(names)] * (run.time_s / 60.0 - 0.5)[None, :, None]
-        for run, white in zip(info.rows, info.white_change, strict=True)
-    ]
-    flat = [column.reshape(len(names), -1) for column in columns]
-    return dict(zip(names, _probe_results(info, names, change, None, flat), strict=True))
-
-
 def _white(info: Information, run: Rows, c: int, columns: Array, residual: Array) -> Array:
     """Whiten columns (q, m) as channel c, 0 where its residual is not known."""
     scaled = columns / info.noise.size(run.pace_mps)[:, c]
@@ -154,17 +142,16 @@ def _white(info: Information, run: Rows, c: int, columns: Array, residual: Array
 
 
 def _probe_results(
-    info: Information, names: Sequence[str], change: Array, c: int | None, columns: list[Array]
+    info: Information, names: Sequence[str], change: Array, c: int, columns: list[Array]
 ) -> list[ProbeResult]:
-    """Return the results of columns (q, m) a run, in channel c, or in all channels where it is None."""
+    """Return the results of columns (q, m) a run, in channel c."""
     at = info.places(names)
     n_runs, q = len(columns), columns[0].shape[0]
     own, cross, score = np.empty((n_runs, q)), np.empty((n_runs, q, len(at))), np.empty((n_runs, q))
     power = np.zeros(len(at))
     for i, x in enumerate(columns):
         white, residual = info.white_change[i], info.white_residual[i]
-        j = white.reshape(len(white), -1) if c is None else white[:, :, c]
-        r = residual.ravel() if c is None else residual[:, c]
+        j, r = white[:, :, c], residual[:, c]
         xn = x @ j[info.nuisances].T
         own[i] = (x * x).sum(axis=1) - np.einsum("qi,ij,qj->q", xn, info.inner[i], xn)
         power += (j[at] ** 2).sum(axis=1)

@@ -144,18 +144,23 @@ def _scattered(
         dof += max(int(use.sum()) - 1, 0)
     noise = (TRUST_DOF + inside) / (TRUST_DOF + dof)
     precision = np.where(seen, 1.0 / (noise / np.where(seen, total, 1.0) + assumed_std**2), 0.0)
-    mean = float((precision * value).sum() / precision.sum())
-    square = precision * (value - mean) ** 2
-    # one run that is far out is no variation from run to run
-    square = np.minimum(square, 9.0 * max(float(np.median(square[seen])), 1.0))
+    square = _squares(value, precision)
+    # one run that is far out is no variation from run to run: the others have to differ as well
+    rest = np.where(np.arange(len(square)) == np.argmax(square), 0.0, precision)
     n = int(seen.sum())
-    z = z_of(float(fisher.logsf(square.sum() / (n - 1), n - 1, TRUST_DOF + dof)))
+    z = z_of(float(fisher.logsf(_squares(value, rest).sum() / (n - 2), n - 2, TRUST_DOF + dof)))
     beyond = float(square.sum()) - (n - 1)
     spread = float(precision.sum() - (precision**2).sum() / precision.sum())
     scatter = math.sqrt(max(beyond / spread, 0.0) + assumed_std**2)
     low, high = BOUNDS[effect.parameters[0].name]
     gain = float(square.sum()) if scatter < high - low else 0.0
     return _RunValues(effect, value + given, precision, gain, scatter, z, channel)
+
+
+def _squares(value: Array, precision: Array) -> Array:
+    """Return the squares (runs,) of values about their mean, in variances, those far out limited."""
+    square = precision * (value - (precision * value).sum() / precision.sum()) ** 2
+    return np.asarray(np.minimum(square, 9.0 * max(float(np.median(square[precision > 0])), 1.0)))
 
 
 def _two_groups(best: _RunValues, run_ids: Sequence[str]) -> tuple[RunGroup, ...]:

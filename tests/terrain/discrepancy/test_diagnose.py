@@ -6,10 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from terrain.discrepancy.diagnose import MIN_RUNS, _frequency_dependent, diagnose
-from terrain.discrepancy.residuals import low_pass_of
-from terrain.discrepancy.search import Problem, search
-from terrain.discrepancy.signals import signals_of
+from terrain.discrepancy.diagnose import diagnose
+from terrain.discrepancy.preparation import MIN_RUNS
 from terrain.discrepancy.trials.drives import rich_drives
 from terrain.discrepancy.trials.hidden_effects import hidden_runs
 from terrain.discrepancy.trials.limits import confusable_class, limits_of
@@ -201,14 +199,3 @@ def test_runs_that_cannot_be_diagnosed_are_refused_in_one_sentence(worlds):
             diagnose(given, world.simulation)
         assert message in str(error.value)
         assert "\n" not in str(error.value)
-
-
-def test_a_cause_with_another_value_in_slow_motion_is_withdrawn(worlds):
-    world = worlds["husky"]
-    signals = tuple(signals_of(run, world.robot) for run in world.runs(world.hidden("camera_yaw")))
-    asked = Problem(signals, world.simulation, low_pass_of(signals), world.simulation.library)
-    found = search(asked, asked.at(world.simulation.vector))
-    assert [cause.name for cause in found.causes] == ["camera_yaw"]
-    assert _frequency_dependent(asked, found) == {}
-    # as if quick motion had asked for twice of it
-    assert list(_frequency_dependent(asked, found._replace(change=2 * found.change))) == ["camera_yaw"]

@@ -4,13 +4,15 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from terrain.discrepancy.noise import ORDER, noise_of, whiten
+from terrain.discrepancy.noise import LONGEST_MEMORY_S, ORDER, WHITE, noise_of, whiten
 
 GROWTH = np.array([[0.2, 0.0, 0.8], [1e-4, 3e-4, 0.0]])
 """Coefficients of the variance in 1, v and v^2, of two channels."""
 
 KEEP = np.array([0.8, 0.3])
 """Of each channel's noise, from row to row."""
+
+ROW_S = 0.2
 
 
 def runs(n_runs, n_rows, seed=0):
@@ -91,3 +93,77 @@ def test_a_channel_that_is_hardly_measured_or_never_differs_has_no_filter():
     for r in holes:
         r[100:140] = np.nan
     assert_allclose(noise_of(holes, speeds, 0.2, 0).std, noise_of(residuals, speeds, 0.2, 0).std, rtol=0.15)
+
+
+def autoregression(residuals, order=ORDER):
+    """Return the filter (order + 1,) of one-column residuals by plain least squares, white of size one."""
+    table = np.concatenate([np.lib.stride_tricks.sliding_window_view(r[:, 0], order + 1) for r in residuals])
+    weights, left, *_ = np.linalg.lstsq(table[:, -2::-1], table[:, -1], rcond=None)
+    return np.concatenate([[1.0], -weights]) / np.sqrt(left[0] / len(table))
+
+
+def at_zero_frequency(filters):
+    """Return the gain of a filter that whitens noise of size one over that of the longest memory."""
+    return abs(filters.sum()) / np.sqrt(ROW_S / (2 * LONGEST_MEMORY_S))
+
+
+def coloured(keep, n_runs=8, n_rows=400):
+    """Return noise of size one of runs that move at 1 m/s."""
+    rng = np.random.default_rng(5)
+    out = []
+    for _ in range(n_runs):
+        x = rng.standard_normal((n_rows, 1))
+        for k in range(1, n_rows):
+            x[k] = keep * x[k - 1] + np.sqrt(1 - keep**2) * x[k]
+        out.append(x)
+    return out, [np.ones(n_rows)] * n_runs
+
+
+def test_memory_within_the_bound_is_that_of_least_squares_and_a_longer_one_is_drawn_in_to_it():
+    short, speeds = coloured(0.6)
+    noise = noise_of(short, speeds, ROW_S, 0, (1,))
+    size = noise.size(np.ones(1))[0, 0]
+    plain = autoregression([x / size for x in short], 1)
+    assert_allclose(noise.filters[0, :2] / noise.filters[0, 0], plain / plain[0], rtol=1e-6)
+    assert at_zero_frequency(plain) > 1.3
+    long, speeds = coloured(0.98)
+    noise = noise_of(long, speeds, ROW_S, 0)
+    plain = autoregression([x / noise.size(np.ones(1))[0, 0] for x in long])
+    assert at_zero_frequency(plain) < 0.7
+    assert 0.98 < at_zero_frequency(noise.filters[0]) < 1.3
+
+
+def test_steps_that_last_do_not_take_the_gain_at_zero_frequency_away():
+    """A robot that turns less than is said leaves a residual of one level a command."""
+    rng = np.random.default_rng(6)
+    levels = [
+        np.repeat(rng.choice([-1.0, 1.0], 2), 100)[:, None] + 0.02 * rng.standard_normal((200, 1))
+        for _ in range(8)
+    ]
+    noise = noise_of(levels, [np.ones(200)] * 8, ROW_S)
+    assert at_zero_frequency(autoregression(levels)) < 0.3
+    assert at_zero_frequency(noise.filters[0]) > 0.98
+
+
+def test_a_level_is_not_swallowed():
+    """Weights that start white find a level of 1 in 40 runs of 8 s, and those behind it ten times clearer."""
+    rng = np.random.default_rng(7)
+    levels = [1.0 + 0.1 * rng.standard_normal((40, 1)) for _ in range(40)]
+    speeds = [np.ones(40)] * 40
+
+    def mean_and_z(noise):
+        ones = np.ones((40, 1)) / noise.size(speeds[0])
+        white = [whiten(noise.filters, np.stack([ones, r / noise.size(speeds[0])])) for r in levels]
+        power = sum((both[0, ORDER:] ** 2).sum() for both in white)
+        cross = sum((both[0, ORDER:] * both[1, ORDER:]).sum() for both in white)
+        return cross / power, cross / np.sqrt(power)
+
+    mean, z = mean_and_z(noise_of(levels, speeds, ROW_S, orders=WHITE))
+    assert z == pytest.approx(np.sqrt(40 * (40 - ORDER)), rel=0.02)
+    left = noise_of([r - mean for r in levels], speeds, ROW_S, 1)
+    mean, z = mean_and_z(left)
+    assert mean == pytest.approx(1.0, abs=4 * 0.1 / np.sqrt(40 * (40 - ORDER)))
+    assert z > 300
+    # colour that is fitted to the level itself at once leaves a tenth of it, by the bound, but never nothing
+    _, z = mean_and_z(noise_of(levels, speeds, ROW_S))
+    assert z > 10

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from terrain.discrepancy.diagnose import POWER_Z, diagnose
+from terrain.discrepancy.answers import POWER_Z
+from terrain.discrepancy.diagnose import diagnose
 from terrain.discrepancy.selection import Z_EFFECT
 from terrain.discrepancy.trials.drives import poor_drives, rich_drives
 from terrain.discrepancy.trials.hidden_effects import hidden_runs

@@ -1,0 +1,152 @@
+"""Whether a value is one number, on linear problems whose parameters change as is known."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from terrain.discrepancy.constancy import CAVEAT_RATIO, VARIES_RATIO, constancy_of
+from terrain.discrepancy.information import N_BLOCKS
+
+NAMES = ("payload_ratio", "gyro_bias_radps")
+N_RUNS, N_ROWS, SIZE = 8, 120, 0.2
+
+
+def problem(value, excited=None, seed=0, n_runs=N_RUNS, noise=1.0):
+    """Return runs in the form of an Information; the second parameter is 0.1 throughout.
+
+    Parameters
+    ----------
+    value : of the first parameter, by run (from 0) and time (rows,) from 0 to 1
+    excited : factor (rows,) of its sensitivity by time
+    """
+    rng = np.random.default_rng(seed)
+    at = (np.arange(N_ROWS) + 0.5) / N_ROWS
+    a_blocks, g_blocks = np.empty((n_runs, N_BLOCKS, 2, 2)), np.empty((n_runs, N_BLOCKS, 2))
+    for i in range(n_runs):
+        j = 30.0 * rng.standard_normal((2, N_ROWS))
+        j[1] += 0.2 * j[0]
+        j[0] *= 1.0 if excited is None else excited(at)
+        r = value(i, at) * j[0] + 0.1 * j[1] + noise * rng.standard_normal(N_ROWS)
+        for b, rows in enumerate(np.array_split(np.arange(N_ROWS), N_BLOCKS)):
+            a_blocks[i, b], g_blocks[i, b] = j[:, rows] @ j[:, rows].T, j[:, rows] @ r[rows]
+    return SimpleNamespace(
+        a=a_blocks.sum(axis=1),
+        g=g_blocks.sum(axis=1),
+        a_blocks=a_blocks,
+        g_blocks=g_blocks,
+        places=lambda names: [NAMES.index(name) for name in names],
+    )
+
+
+def constancy(info, own=NAMES[:1], inflation=1.0):
+    change = np.linalg.solve(info.a.sum(axis=0), info.g.sum(axis=0))
+    return constancy_of(info, NAMES, own, change, inflation)
+
+
+def values(groups):
+    return np.array([group.values[0] for group in groups])
+
+
+def constant(i, at):
+    return SIZE
+
+
+def from_nothing(i, at):
+    return 2 * SIZE * at
+
+
+def test_a_constant_value_is_one_number_within_its_own_error():
+    for seed in range(20):
+        found = constancy(problem(constant, seed=seed))
+        assert not found.certain
+        assert not found.varies
+        assert found.caveat == ""
+        for groups, n in ((found.thirds, 3), (found.halves, 2)):
+            std = np.array([group.std[0] for group in groups])
+            assert (np.abs(values(groups) - SIZE) < 4.5 * std).all()
+            assert_allclose(std, np.sqrt(n / (N_RUNS * N_ROWS)) / 30.0, rtol=0.25)
+
+
+def test_a_value_that_grows_from_nothing_along_a_run_is_none():
+    found = constancy(problem(from_nothing))
+    assert_allclose(values(found.thirds), np.array([1, 3, 5]) / 3 * SIZE, atol=0.02)
+    # 2/3 to either side of the mean in two of three
+    assert found.ratio == pytest.approx(np.sqrt(2 / 3) * 2 / 3, rel=0.1)
+    assert found.ratio > VARIES_RATIO
+    assert (found.certain, found.varies, found.split) == (True, True, "time")
+    assert found.caveat.startswith("its value depends on time: 0.0")
+    # the other one stays what it is
+    assert not constancy(problem(from_nothing), NAMES[1:]).varies
+
+
+def test_a_value_of_other_runs_is_none_and_of_few_runs_is_not_told():
+    halves = constancy(problem(lambda i, at: SIZE * (0.5 if i < N_RUNS / 2 else 1.5)))
+    assert (halves.varies, halves.split) == (True, "runs")
+    assert_allclose(values(halves.halves), [0.5 * SIZE, 1.5 * SIZE], atol=0.02)
+    assert "depends on the run: " in halves.caveat
+    few = constancy(problem(lambda i, at: SIZE * (0.5 if i < 2 else 1.5), n_runs=4))
+    assert (few.halves, few.varies) == ((), False)
+
+
+def test_a_value_that_differs_by_less_is_named_with_what_it_depends_on():
+    found = constancy(problem(lambda i, at: SIZE * (0.85 + 0.3 * at), noise=0.2), inflation=0.04)
+    assert CAVEAT_RATIO < found.ratio < VARIES_RATIO
+    assert (found.certain, found.varies) == (True, False)
+    assert found.caveat != ""
+    # the same difference within the noise is none
+    assert constancy(problem(lambda i, at: SIZE * (0.85 + 0.3 * at)), inflation=9.0).caveat == ""
+
+
+def test_a_third_that_shows_nothing_does_not_count():
+    """Robots stand first: a value that is the same in the rest is constant, one that is not is none."""
+
+    def stands_first(at):
+        return np.where(at < 1 / 3, 0.0, 1.0)
+
+    one = constancy(problem(constant, stands_first))
+    assert np.isnan(values(one.thirds)).tolist() == [True, False, False]
+    assert not one.certain
+    other = constancy(problem(lambda i, at: SIZE * (0.5 + (at > 2 / 3)), stands_first))
+    assert (other.varies, other.split) == (True, "time")
+    assert not np.isfinite(other.thirds[0].std).any()
+    assert "nan" not in other.caveat
+
+
+def test_a_third_that_shows_little_weighs_little():
+    """The start of a run, hardly excited, has another value: that is no size of the whole."""
+    found = constancy(
+        problem(
+            lambda i, at: np.where(at < 1 / 3, 0.0, SIZE),
+            lambda at: np.where(at < 1 / 3, 0.1, 1.0),
+            noise=0.3,
+        )
+    )
+    assert found.certain
+    assert found.ratio < 0.5 * VARIES_RATIO
+
+
+def test_of_two_parameters_the_one_that_is_apart_by_noise_is_no_size():
+    """One differs by a hundredth, beyond doubt; the other is hardly shown in thirds."""
+    found = constancy(
+        hardly_shown(problem(lambda i, at: SIZE * (0.99 + 0.02 * at), noise=0.01), change=0.1), NAMES, 1e-4
+    )
+    assert found.certain
+    assert found.ratio < CAVEAT_RATIO
+
+
+def hardly_shown(info, change):
+    """Return the same with a second parameter whose thirds are apart by half of it, at two deviations."""
+    for b, away in enumerate((-1.0, 0.0, 1.0)):
+        info.a_blocks[:, b, 1, :] = info.a_blocks[:, b, :, 1] = 0.0
+        info.a_blocks[:, b, 1, 1] = 1e-4 * (2 / (0.5 * change)) ** 2 / N_RUNS
+        info.g_blocks[:, b, 1] = info.a_blocks[:, b, 1, 1] * change * (1 + 0.5 * away)
+        info.g_blocks[:, b, 0] = info.a_blocks[:, b, 0, 0] * SIZE * (1 + 0.01 * away)
+    return SimpleNamespace(
+        a=info.a_blocks.sum(axis=1),
+        g=info.g_blocks.sum(axis=1),
+        a_blocks=info.a_blocks,
+        g_blocks=info.g_blocks,
+        places=info.places,
+    )

@@ -1,0 +1,81 @@
+"""Effects that differ from run to run: in two groups, at random, in one run alone, or not at all."""
+
+import numpy as np
+import pytest
+
+from terrain.discrepancy.diagnose import diagnose
+from terrain.discrepancy.residuals import low_pass_of
+from terrain.discrepancy.search import Problem, search
+from terrain.discrepancy.signals import signals_of
+from terrain.discrepancy.trials.drives import rich_drives
+from terrain.discrepancy.trials.hidden_effects import hidden_runs
+from terrain.discrepancy.trials.trial import simulation_of
+from terrain.discrepancy.varying import run_scatter, varying_effects
+from terrain.discrepancy.verdict import Verdict
+from terrain.effects import effect_named
+from terrain.robots import load_robot
+
+HUSKY = load_robot("husky")
+SIMULATION = simulation_of(HUSKY)
+RADIUS = "wheel_radius_ratio"
+LIBRARY = tuple(
+    effect_named(name)
+    for name in ("wheel_radius", "effective_track", "payload", "gyro_scale", "camera_yaw", "accel_bias")
+)
+N_RUNS = 8
+
+
+def runs(values, seed=1):
+    """Return runs of 30 s, each with a radius of its own."""
+    drives = rich_drives(np.random.default_rng(seed), N_RUNS, 30.0)
+    return hidden_runs(HUSKY, drives, np.random.SeedSequence(seed), [{RADIUS: float(x)} for x in values])
+
+
+def searched(logs):
+    signals = tuple(signals_of(run, HUSKY) for run in logs)
+    asked = Problem(signals, SIMULATION, low_pass_of(signals), LIBRARY)
+    return search(asked, asked.at(SIMULATION.vector))
+
+
+ODD = np.arange(N_RUNS) % 2
+
+
+@pytest.fixture(scope="module")
+def half():
+    return runs(0.06 * ODD)
+
+
+def test_half_of_the_runs_are_a_group_and_each_group_has_its_value(half):
+    (found,) = varying_effects(searched(half), LIBRARY)
+    assert (found.name, found.rivals, found.channel) == ("wheel_radius", (), "speed_x_mps")
+    assert found.mean == pytest.approx(0.03, abs=0.005)
+    assert found.scatter == pytest.approx(0.03 * np.sqrt(8 / 7), rel=0.3)
+    one, other = found.groups
+    assert one.run_ids == tuple(run.run_id for run in half[::2])
+    assert other.run_ids == tuple(run.run_id for run in half[1::2])
+    assert abs(one.value) < 4 * one.std < 0.01
+    assert abs(other.value - 0.06) < 4 * other.std < 0.01
+
+
+def test_that_is_the_answer_and_no_value_of_all_runs_is_named(half):
+    found = diagnose(half, SIMULATION, LIBRARY)
+    assert found.verdict == Verdict.VARIES
+    assert (found.causes, found.ambiguous_sets) == ((), ())
+    assert [each.name for each in found.varying] == ["wheel_radius"]
+
+
+def test_a_spread_that_is_even_has_no_groups():
+    values = np.linspace(-0.03, 0.09, N_RUNS)
+    searched_one = searched(runs(values))
+    (found,) = varying_effects(searched_one, LIBRARY)
+    assert (found.name, found.groups) == ("wheel_radius", ())
+    assert found.scatter == pytest.approx(np.std(values, ddof=1), rel=0.3)
+    assert run_scatter(searched_one, effect_named("wheel_radius")) == found.scatter
+    assert run_scatter(searched_one, effect_named("camera_yaw")) < 0.01
+
+
+@pytest.mark.parametrize(
+    "values", [np.zeros(N_RUNS), np.full(N_RUNS, 0.06), 0.06 * (np.arange(N_RUNS) == 3)]
+)
+def test_runs_that_are_alike_and_one_rogue_do_not_vary(values):
+    assert varying_effects(searched(runs(values)), LIBRARY) == ()
