@@ -25,6 +25,7 @@ from terrain.discrepancy.answers import (
 from terrain.discrepancy.health import clocks_of
 from terrain.discrepancy.information import Information
 from terrain.discrepancy.next_drive import next_drive
+from terrain.discrepancy.pooled import pooled
 from terrain.discrepancy.preparation import MIN_RUNS, prepare
 from terrain.discrepancy.probes import probe_residuals
 from terrain.discrepancy.search import Found, Problem, names_of, refit, search, with_rivals
@@ -84,7 +85,7 @@ def diagnose_signals(
     found, withdrawn = _search_and_withdraw(problem, start, prepared.seeds)
     varying = varying_effects(found, problem.library)
     found, withdrawn = _without_varying(problem, start, found, withdrawn, varying)
-    found = with_rivals(problem, start, found)
+    found = pooled(problem, with_rivals(problem, start, found))
     unexplained = _unexplained_channels(found, withdrawn, varying)
     named, sets = _named_and_ambiguous(found, found.causes)
     limits = tuple(limits_of(found, problem.library))

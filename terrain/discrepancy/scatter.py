@@ -18,9 +18,8 @@ import numpy as np
 
 from terrain.records import Array
 
-PRIOR_RUNS = 4.0
-"""What was assumed counts as so many runs: that is how many a laboratory has seen of its robot, at the
-least."""
+PRIOR_RUNS = 2.0
+"""What was assumed counts as so many runs: enough that three runs do not deny it."""
 
 TAIL_DOF = 4.0
 """Degrees of freedom of deviations from run to run: few enough for a run in twenty that is far out."""
