@@ -16,9 +16,13 @@ from scipy.stats import chi2
 from terrain.discrepancy.information import N_BLOCKS, Information
 from terrain.records import Array
 
-VARIES_RATIO = 0.25
+VARIES_RATIO = 0.5
 """A value whose groups are further apart than that ratio of it, root mean square by their information, is no
-value: a cause that grows from nothing along a run, seen as a constant one, has 0.54 between its thirds."""
+value."""
+
+GROWS_RATIO, GROWTH = 0.25, 2.0
+"""Nor is one that is apart by the first and grows along runs by the second: a cause that starts from nothing,
+as warmth and the rate of a clock do, has 0.54 between its thirds, and grows five times."""
 
 CAVEAT_RATIO = 0.05
 """A value that differs by more than that ratio is given with what it depends on."""
@@ -60,7 +64,15 @@ class Constancy(NamedTuple):
     @property
     def varies(self) -> bool:
         """Whether the value differs so much that it is none."""
-        return self.certain and self.ratio > VARIES_RATIO
+        least = GROWS_RATIO if self.split == "time" and self._grows else VARIES_RATIO
+        return self.certain and self.ratio > least
+
+    @property
+    def _grows(self) -> bool:
+        """Whether the value has one sign and grows from the first third to the last."""
+        first, middle, last = (float(group.values[_main(self.thirds)]) for group in self.thirds)
+        sign = 1.0 if last > 0 else -1.0
+        return sign * last > GROWTH * abs(first) and sign * last > sign * middle > sign * first
 
     @property
     def caveat(self) -> str:

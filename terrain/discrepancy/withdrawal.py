@@ -25,8 +25,8 @@ PROBE_RATIO, PROBE_ALIKE = 0.5, 0.3
 """A cause is withdrawn if a nameless input of its channel gains that ratio of its own gain beside it, and
 looks like it: a correlation below the second says that the two are different matters."""
 
-SLOW_CUTOFF_RATIO, SLOW_Z, SLOW_RATIO = 0.5, 3.0, 0.5
-"""A cause is withdrawn if its value differs by so many standard deviations and by that ratio, where
+SLOW_CUTOFF_RATIO, SLOW_Z, SLOW_RATIO = 0.5, 3.0, 0.3
+"""A cause is withdrawn if its value is smaller by so many standard deviations and by that ratio, where
 sensitivities are computed along instruments of that ratio of the cut-off."""
 
 
@@ -187,15 +187,16 @@ def _slow_values(problem: Problem, found: Found) -> Array:
 
 
 def _frequency_dependent(found: Found, cause: Effect, slow: Array) -> str:
-    """Return whether a cause has another value when quick motion is filtered out of the instruments.
+    """Return whether a cause is smaller when quick motion is filtered out of the instruments.
 
     Both estimate the same quantity, so they agree up to the larger variance of the slower one (Hausman,
-    Econometrica 1978); where they do not, the cause fits noise of the wheel speeds.
+    Econometrica 1978); where the slower one is smaller, the cause fits noise of the wheel speeds, which goes
+    with it.
     """
     at = [found.names.index(p.name) for p in cause.parameters]
     size = found.change[at]
     var = np.maximum(slow[at, 1] - np.diag(found.cov)[at], 0.0) * found.tried[cause.name].inflation
-    apart = np.abs(slow[at, 0] - size)
+    apart = (size - slow[at, 0]) * np.sign(size)
     if (apart > np.maximum(SLOW_Z * np.sqrt(var), SLOW_RATIO * np.linalg.norm(size))).any():
-        return "has another value in slow motion: it fits noise of the wheel speeds"
+        return "has a smaller value in slow motion: it fits noise of the wheel speeds"
     return ""
