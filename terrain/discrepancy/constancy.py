@@ -14,6 +14,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from terrain.discrepancy.information import N_BLOCKS, Information
+from terrain.effects import INDEX
 from terrain.records import Array
 
 VARIES_RATIO = 0.5
@@ -32,6 +33,11 @@ CERTAIN_P = 1e-5
 
 MIN_HALF_RUNS = 3
 """Least number of runs in half of them."""
+
+
+THIRDS = ("first third", "second third", "last third")
+
+HALVES = ("first half of the runs", "second half")
 
 
 class Group(NamedTuple):
@@ -97,67 +103,97 @@ def constancy_of(
     own : those of one effect
     inflation : of the variances over those from the noise
     """
-    at, mine = info.places(names), [list(names).index(name) for name in own]
-    by_time = [
-        (info.a_blocks[:, b][:, at][:, :, at].sum(axis=0), info.g_blocks[:, b][:, at].sum(axis=0))
-        for b in range(N_BLOCKS)
-    ]
-    half = len(info.a) // 2
-    by_run = []
+    n, half = len(info.rows), len(info.rows) // 2
+    by_time = np.tile(np.arange(N_BLOCKS), (n, 1))
+    by_run = np.repeat((np.arange(n) >= half).astype(int)[:, None], N_BLOCKS, axis=1)
+    thirds = _fit_groups(info, names, own, by_time, inflation)
+    split = {"time": thirds}
     if half >= MIN_HALF_RUNS:
-        for part in (slice(0, half), slice(half, None)):
-            by_run.append((info.a[part][:, at][:, :, at].sum(axis=0), info.g[part][:, at].sum(axis=0)))
-    thirds = _groups(("first third", "second third", "last third"), by_time, mine, change, inflation)
-    halves = _groups(("first half of the runs", "second half"), by_run, mine, change, inflation)
-    size = float(np.linalg.norm(change[mine]))
-    found = [(_difference(groups), split) for groups, split in ((thirds, "time"), (halves, "runs"))]
-    certain = [(ratio, split) for (ratio, sure), split in found if sure]
-    ratio, split = max(certain, default=(max(ratio for (ratio, _), _ in found), "time"))
-    return Constancy(thirds, halves, ratio / size if size > 0 else math.inf, split, bool(certain))
+        split["runs"] = _fit_groups(info, names, own, by_run, inflation)
+    found = {kind: _difference(*fit) for kind, fit in split.items()}
+    size = float(np.linalg.norm(change[[list(names).index(name) for name in own]]))
+    certain = {kind: ratio for kind, (ratio, sure) in found.items() if sure}
+    kind = max(certain, key=lambda each: certain[each]) if certain else "time"
+    labels = {"time": THIRDS, "runs": HALVES}
+    groups = {
+        each: tuple(
+            Group(label, *pair)
+            for label, pair in zip(labels[each], zip(*_by_group(*fit), strict=True), strict=True)
+        )
+        for each, fit in split.items()
+    }
+    ratio = found[kind][0] / size if size > 0 else math.inf
+    return Constancy(groups["time"], groups.get("runs", ()), ratio, kind, bool(certain))
 
 
-def _groups(
-    labels: Sequence[str],
-    forms: Sequence[tuple[Array, Array]],
-    mine: list[int],
-    change: Array,
-    inflation: float,
-) -> tuple[Group, ...]:
-    """Return the values in each group, all that is fitted free; NaN where a group shows nothing of them.
+def _fit_groups(
+    info: Information, names: Sequence[str], own: Sequence[str], group_of: Array, inflation: float
+) -> tuple[Array, Array]:
+    """Fit parameters in each group of the data, with all others and what varies from run to run in common.
 
-    Other parameters are held near their common fit by the information of all groups together.
+    Parameters
+    ----------
+    group_of : (runs, N_BLOCKS) the group of each third of each run
+
+    Returns
+    -------
+    values : (groups, p); NaN where a group shows nothing
+    cov : (groups, p, groups, p)
     """
-    total = sum((a for a, _ in forms), np.zeros((len(change), len(change))))
-    others = np.array([i not in mine for i in range(len(change))])
-    hold = np.where(others, np.diag(total), 0.0)
-    groups = []
-    for label, (a, g) in zip(labels, forms, strict=False):
-        cov = np.linalg.pinv(a + np.diag(hold), hermitian=True)
-        values = (cov @ (g + hold * change))[mine]
-        std = np.sqrt(np.maximum(np.diag(cov)[mine], 0.0) * inflation)
-        shown = np.diag(a)[mine] > 1e-9 * np.diag(total)[mine]
-        groups.append(Group(label, np.where(shown, values, np.nan), np.where(shown, std, np.nan)))
-    return tuple(groups)
+    mine, others = info.places(own), info.places([name for name in names if name not in own])
+    n_groups, p = int(group_of.max()) + 1, len(mine)
+    q, k = info.nuisances.size, n_groups * p + len(others)
+    total, score = np.zeros((k, k)), np.zeros(k)
+    away = np.array([info.origin[INDEX[n]] - info.vector[INDEX[n]] for n in info.parameters])
+    for i, (residual, change) in enumerate(zip(info.white_residual, info.white_change, strict=True)):
+        rows = len(residual)
+        columns = np.zeros((q + k + 1, *residual.shape))
+        columns[:q], columns[q + n_groups * p : -1] = change[info.nuisances], change[others]
+        columns[-1] = residual + np.tensordot(away, change, axes=1)
+        for b in range(N_BLOCKS):
+            part, at = slice(rows * b // N_BLOCKS, rows * (b + 1) // N_BLOCKS), q + group_of[i, b] * p
+            columns[at : at + p, part] = change[mine, part]
+        flat = columns.reshape(len(columns), -1)
+        gram = flat @ flat.T
+        free = gram[q:, q:] - gram[q:, :q] @ info.inner[i] @ gram[:q, q:]
+        total, score = total + free[:-1, :-1], score + free[:-1, -1]
+    cov = np.linalg.pinv(total, hermitian=True, rcond=1e-12)
+    shown = (np.diag(total) > 1e-9 * np.diag(total)[: n_groups * p].max())[: n_groups * p]
+    values = np.where(shown, (cov @ score)[: n_groups * p], np.nan).reshape(n_groups, p)
+    return values, inflation * cov[: n_groups * p, : n_groups * p].reshape(n_groups, p, n_groups, p)
 
 
-def _difference(groups: Sequence[Group]) -> tuple[float, bool]:
+def _by_group(values: Array, cov: Array) -> tuple[Array, Array]:
+    """Return values (groups, p) and their standard deviations."""
+    variance = np.einsum("gpgp->gp", cov)
+    return values, np.where(np.isfinite(values), np.sqrt(np.maximum(variance, 0.0)), np.nan)
+
+
+def _difference(values: Array, cov: Array) -> tuple[float, bool]:
     """Return how far groups are apart, weighted by their information, and whether it is beyond the noise.
 
     A group counts for the parameters that it shows; a parameter that is apart by noise counts only where none
     is apart beyond it.
     """
-    if len(groups) < 2:
+    sizes, certain = [], []
+    for p in range(values.shape[1]):
+        known = np.flatnonzero(np.isfinite(values[:, p]))
+        if known.size < 2:
+            continue
+        value, own = values[known, p], cov[known, p][:, known, p]
+        precision = np.linalg.pinv(own, hermitian=True)
+        ones = np.ones(known.size)
+        off = value - (ones @ precision @ value) / (ones @ precision @ ones)
+        statistic = float(off @ precision @ off)
+        certain.append(float(chi2.sf(statistic, known.size - 1)) < CERTAIN_P)
+        weight = 1.0 / np.maximum(np.diag(own), 1e-30)
+        sizes.append(
+            math.sqrt(float(np.average((value - np.average(value, weights=weight)) ** 2, weights=weight)))
+        )
+    if not sizes:
         return 0.0, False
-    values, std = np.array([g.values for g in groups]), np.array([g.std for g in groups])
-    known = np.isfinite(values) & (std > 0)
-    known &= known.sum(axis=0) > 1
-    weight = np.where(known, 1.0 / np.where(known, std, 1.0) ** 2, 0.0)
-    total = np.maximum(weight.sum(axis=0), 1e-30)
-    values = np.where(known, values, 0.0)
-    statistic = (weight * (values - (weight * values).sum(axis=0) / total) ** 2).sum(axis=0)
-    certain = chi2.sf(statistic, np.maximum(known.sum(axis=0) - 1, 1)) < CERTAIN_P
-    apart = np.sqrt(statistic / total)
-    return float(apart[certain].max() if certain.any() else apart.max()), bool(certain.any())
+    sure = [size for size, yes in zip(sizes, certain, strict=True) if yes]
+    return max(sure or sizes), bool(sure)
 
 
 def _main(groups: Sequence[Group]) -> int:

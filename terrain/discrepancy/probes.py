@@ -171,8 +171,9 @@ def _probe_results(
     enough = free > 1e-6 * np.maximum(own.sum(axis=0), 1e-12)
     free = np.where(enough, free, np.inf)
     size = total / free
-    both = np.sqrt(np.maximum(np.outer(own.sum(axis=0), power), 1e-30))
-    alike = np.abs(cross.sum(axis=0)) / both
+    both = np.sqrt(np.outer(own.sum(axis=0), power))
+    alike = np.divide(np.abs(cross.sum(axis=0)), both, out=np.zeros_like(both), where=both > 1e-9)
+    alike = np.minimum(alike, 1.0)
     answers = []
     for k in range(q):
         if not enough[k]:

@@ -141,19 +141,28 @@ def _worse(found: Found, cause: Effect) -> str:
 
 
 def channel_effects(found: Found, cause: Effect) -> dict[str, ChannelEffect]:
-    """Return what a cause does to each channel that was measured."""
+    """Return what a cause does to each channel that was measured.
+
+    What varies from run to run is taken out of each run as its residual shows it, but not the cause's own
+    variation, which would take its place.
+    """
     info = found.info
     own = [p.name for p in cause.parameters]
     every, others = info.places(found.names), info.places([n for n in found.names if n not in own])
     fits = [_fits(info, places) for places in (others, every)]
     squares = np.zeros((2, 2, len(CHANNELS)))
-    moved = np.array([info.vector[INDEX[name]] for name in info.parameters])
-    origin = np.array([info.origin[INDEX[name]] for name in info.parameters])
+    away = np.array([info.vector[INDEX[n]] - info.origin[INDEX[n]] for n in info.parameters])
+    kept = ~np.isin(info.nuisances, info.places(own))
+    free, precision = info.nuisances[kept], np.diag(1.0 / info.nuisance_std[kept] ** 2)
     for i, (residual, change) in enumerate(zip(info.white_residual, info.white_change, strict=True)):
-        plain = residual + np.tensordot(origin - moved, change, axes=1)  # back at where changes are 0
+        scatter = change[free].reshape(free.size, -1)
+        inner = np.linalg.inv(scatter @ scatter.T + precision)
         for m, (places, (common, held_out)) in enumerate(zip((others, every), fits, strict=True)):
             for kind, x in enumerate((common, held_out[i])):
-                left = plain - np.tensordot(x, change[places], axes=1) * (residual != 0.0)
+                moved = away.copy()
+                moved[places] += x
+                left = residual - np.tensordot(moved, change, axes=1)
+                left -= np.tensordot(inner @ (scatter @ left.ravel()), change[free], axes=1)
                 squares[m, kind] += (left**2).sum(axis=0)
     return {
         CHANNELS[c]: ChannelEffect(squares[0, 0, c], squares[1, 0, c], squares[0, 1, c] - squares[1, 1, c])
