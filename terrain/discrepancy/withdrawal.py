@@ -141,19 +141,24 @@ def _worse(found: Found, cause: Effect) -> str:
 
 
 def channel_effects(found: Found, cause: Effect) -> dict[str, ChannelEffect]:
-    """Return what a cause does to each channel that was measured."""
+    """Return what a cause does to each channel that was measured, by what runs do not vary by themselves.
+
+    A robot whose track scatters turns by chance as if a right radius were wrong.
+    """
     info = found.info
     own = [p.name for p in cause.parameters]
     every, others = info.places(found.names), info.places([n for n in found.names if n not in own])
     fits = [_fits(info, places) for places in (others, every)]
     squares = np.zeros((2, 2, len(CHANNELS)))
-    moved = np.array([info.vector[INDEX[name]] for name in info.parameters])
-    origin = np.array([info.origin[INDEX[name]] for name in info.parameters])
+    away = np.array([info.origin[INDEX[name]] - info.vector[INDEX[name]] for name in info.parameters])
     for i, (residual, change) in enumerate(zip(info.white_residual, info.white_change, strict=True)):
-        plain = residual + np.tensordot(origin - moved, change, axes=1)  # back at where changes are 0
         for m, (places, (common, held_out)) in enumerate(zip((others, every), fits, strict=True)):
             for kind, x in enumerate((common, held_out[i])):
-                left = plain - np.tensordot(x, change[places], axes=1) * (residual != 0.0)
+                move = -away
+                move[places] += x
+                own_deviation = info.shift[i][:, -1] - info.shift[i][:, :-1] @ move
+                move[info.nuisances] += own_deviation
+                left = residual - np.tensordot(move, change, axes=1) * (residual != 0.0)
                 squares[m, kind] += (left**2).sum(axis=0)
     return {
         CHANNELS[c]: ChannelEffect(squares[0, 0, c], squares[1, 0, c], squares[0, 1, c] - squares[1, 1, c])
