@@ -86,8 +86,8 @@ class Constancy(NamedTuple):
         if not self.certain or self.ratio <= CAVEAT_RATIO:
             return ""
         groups = self.thirds if self.split == "time" else self.halves
-        told = [(group.values[_main(groups)], group.name) for group in groups]
-        shown = ", ".join(f"{value:.3g} in the {name}" for value, name in told if math.isfinite(value))
+        named = [(group.values[_main(groups)], group.name) for group in groups]
+        shown = ", ".join(f"{value:.3g} in the {name}" for value, name in named if math.isfinite(value))
         return f"its value depends on {'time' if self.split == 'time' else 'the run'}: {shown}"
 
 

@@ -176,8 +176,10 @@ def _sum_forms(
         shift = inner @ gram[nuisances]
         taken = gram - gram[:, nuisances] @ shift
         a[i], g[i], c[i] = taken[:k, :k], taken[:k, k], taken[k, k]
+        prior = shift.T @ (shift / std[:, None] ** 2) / N_BLOCKS
         for b in range(N_BLOCKS):
-            part = grams[b] - shift.T @ grams[b][nuisances]
+            follow = shift.T @ grams[b][nuisances]
+            part = grams[b] - follow - follow.T + follow[:, nuisances] @ shift + prior
             a_blocks[i, b], g_blocks[i, b] = part[:k, :k], part[:k, k]
         white_r.append(residual)
         white_j.append(change)

@@ -1,15 +1,17 @@
 """Scatter from run to run of the parameters that vary by themselves, estimated from the runs.
 
-Of each run ``i`` the whitened residual, with what all runs have in common taken out, is ``N_i b_i + e_i``
-with ``b_i ~ N(0, D)``.  The variances in ``D`` are those of greatest likelihood, by expectation and
-maximisation (Laird and Ware, Biometrics 1982, without the terms of the common effects): with ``G = N'N`` and
-``s = N'r``,
+Of each run ``i`` the whitened residual, with what all runs have in common taken out, is ``N_i (m + b_i) +
+e_i`` with ``b_i ~ N(0, D)``.  The variances in ``D`` are those of greatest likelihood, by expectation and
+maximisation (Laird and Ware, Biometrics 1982): with ``G = N'N`` and ``s = N'r``,
 
-    V = (G + D^-1)^-1,   b = V s,   D <- mean of u b^2 + V over runs,   u = (n + 1)/(n + b^2 / D).
+    V = (G + D^-1)^-1,   b = V (s - G m),   u = (n + 1)/(n + b^2 / D),
+    D <- mean of u b^2 + V over runs,   m <- m + mean of b weighted by u.
 
-The weight ``u`` is that of deviations with Student's distribution of ``n`` degrees (Lange et al., JASA 1989):
-one run of another robot is no scatter.  Variances that were assumed count as some runs more, and are the
-least: a few runs that happen to be alike do not show that a robot never varies.
+The mean ``m`` is there since what was taken out is a fit to all runs: one run of another robot moves it, and
+all others deviate from it alike.  The weight ``u`` is that of deviations with Student's distribution of ``n``
+degrees (Lange et al., JASA 1989): one run of another robot is no scatter.  Variances that were assumed count
+as some runs more, and are the least: a few runs that happen to be alike do not show that a robot never
+varies.
 """
 
 from __future__ import annotations
@@ -48,11 +50,12 @@ def scatter_of(gram: Array, score: Array, assumed_std: Array) -> Array:
     True
     """
     assumed = assumed_std**2
-    variance = assumed.copy()
+    variance, mean = assumed.copy(), np.zeros(len(assumed))
     for _ in range(EM_STEPS):
         inner = np.linalg.inv(gram + np.diag(1.0 / variance))
-        own = np.einsum("iqp,ip->iq", inner, score)
+        own = np.einsum("iqp,ip->iq", inner, score - gram @ mean)
         weight = (TAIL_DOF + 1.0) / (TAIL_DOF + own**2 / variance)
+        mean = mean + (weight * own).sum(axis=0) / weight.sum(axis=0)
         square = weight / NORMAL_RATIO * own**2 + np.einsum("iqq->iq", inner)
         variance = (PRIOR_RUNS * assumed + square.sum(axis=0)) / (PRIOR_RUNS + len(gram))
         variance = np.maximum(variance, assumed)

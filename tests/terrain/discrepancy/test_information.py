@@ -21,6 +21,8 @@ from terrain.discrepancy.residuals import low_pass_of
 from terrain.discrepancy.selection import fit_change
 from terrain.discrepancy.signals import signals_of
 from terrain.discrepancy.simulation import Simulation
+from terrain.discrepancy.trials.drives import rich_drives
+from terrain.discrepancy.trials.hidden_effects import hidden_runs
 from terrain.effects import BOUNDS, CHANNELS, INDEX, SPEED_X, vector_of
 from terrain.robots import load_robot
 from terrain.simulation.planar.hills import Hills
@@ -208,3 +210,19 @@ def test_a_moved_point_stays_within_bounds(info):
     assert point[INDEX["camera_latency_s"]] == 0.0
     assert point[INDEX["pitch_offset_rad"]] == 0.3
     assert not info.vector.any()
+
+
+def test_what_runs_vary_by_does_not_leak_between_their_thirds():
+    """A camera's yaw and a gyro's bias of each run are not told as a side slip that comes and goes."""
+    off = []
+    hidden = {"turn_side_slip_s": 0.035}
+    for seed in range(11, 15):
+        drives = rich_drives(np.random.default_rng(3), 6, 40.0)
+        runs = hidden_runs(HUSKY, drives, np.random.SeedSequence(seed), hidden)
+        signals = [signals_of(run, HUSKY) for run in runs]
+        there = vector_of(hidden)
+        info = information_at(signals, SIMULATION, there, list(hidden), low_pass_of(signals))
+        a, g = info.a_blocks[:, :, 0, 0].sum(axis=0), info.g_blocks[:, :, 0].sum(axis=0)
+        off.append(g / np.sqrt(a))
+    assert np.abs(off).max() < 4.0
+    assert np.std(off) < 1.6

@@ -74,8 +74,6 @@ def test_a_spread_that_is_even_has_no_groups():
     assert run_scatter(searched_one, effect_named("camera_yaw")) < 0.01
 
 
-@pytest.mark.parametrize(
-    "values", [np.zeros(N_RUNS), np.full(N_RUNS, 0.06), 0.06 * (np.arange(N_RUNS) == 3)]
-)
+@pytest.mark.parametrize("values", [np.zeros(N_RUNS), np.full(N_RUNS, 0.06), 0.06 * (np.arange(N_RUNS) == 3)])
 def test_runs_that_are_alike_and_one_rogue_do_not_vary(values):
     assert varying_effects(searched(runs(values)), LIBRARY) == ()
