@@ -123,9 +123,18 @@ def draw_hidden(case: Case, robot: Robot, limits: Limits | None, rng: np.random.
         return Hidden(values, (effect.name,), over, "", library, {})
     others = [o for o in acting if o.name not in confusable_class(limits, effect, robot.drive)]
     others = [o for o in others if o.name not in [name for name, _ in effect.twins]]
+    others = [o for o in others if not _is_another_pair(limits, (effect, o), acting)]
     other = others[int(rng.integers(len(others)))]
     values |= values_of(other, limits, over, rng)
     return Hidden(values, (effect.name, other.name), over, "", library, {})
+
+
+def _is_another_pair(limits: Limits, pair: tuple[Effect, Effect], library: Sequence[Effect]) -> bool:
+    """Return whether a third effect can take the place of one of two: no log distinguishes them then."""
+    rest = [
+        other for other in library if other not in pair and not any(limits.alike(one, other) for one in pair)
+    ]
+    return any(limits.spanned(pair, third) for third in rest)
 
 
 def _draw_outside(

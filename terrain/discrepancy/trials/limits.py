@@ -118,6 +118,20 @@ class Limits(NamedTuple):
         shared = np.linalg.solve(own, cross) @ np.linalg.solve(its, cross.T)
         return math.sqrt(max(float(np.linalg.eigvals(shared).real.max()), 0.0)) > CONFUSABLE
 
+    def spanned(self, pair: tuple[Effect, Effect], other: Effect) -> bool:
+        """Return whether two effects together look like another, which then takes the place of one of them.
+
+        Equal latencies of IMU and camera are a clock offset: logs determine two of the three.
+        """
+        i = [self.names.index(p.name) for effect in pair for p in effect.parameters]
+        j = [self.names.index(p.name) for p in other.parameters]
+        own, its = self.information[np.ix_(i, i)], self.information[np.ix_(j, j)]
+        if np.diag(its).min() <= 0 or np.diag(own).min() <= 0:
+            return False
+        shared = self.information[np.ix_(j, i)] @ np.linalg.pinv(own, hermitian=True, rcond=1e-9)
+        shared = np.linalg.solve(its, shared @ self.information[np.ix_(i, j)])
+        return math.sqrt(max(float(np.linalg.eigvals(shared).real.max()), 0.0)) > CONFUSABLE
+
 
 def limits_of(robot: Robot, drives: Drives, sensing: Sensing | None = None) -> Limits:
     """Return the information of drives on each effect, by the Cramer-Rao bound.
