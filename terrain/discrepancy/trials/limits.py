@@ -128,8 +128,9 @@ class Limits(NamedTuple):
         own, its = self.information[np.ix_(i, i)], self.information[np.ix_(j, j)]
         if np.diag(its).min() <= 0 or np.diag(own).min() <= 0:
             return False
-        shared = self.information[np.ix_(j, i)] @ np.linalg.pinv(own, hermitian=True, rcond=1e-9)
-        shared = np.linalg.solve(its, shared @ self.information[np.ix_(i, j)])
+        inverse = np.linalg.pinv(own, hermitian=True, rcond=1e-9)
+        cross = self.information[np.ix_(i, j)]
+        shared = np.linalg.solve(its, cross.T @ inverse @ cross)
         return math.sqrt(max(float(np.linalg.eigvals(shared).real.max()), 0.0)) > CONFUSABLE
 
 

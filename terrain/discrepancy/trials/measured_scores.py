@@ -52,7 +52,7 @@ def is_right(trial: Trial) -> bool:
     if trial.row is Row.FAULT:
         return fault_named(trial.fault).stated_in(trial.statements)
     if trial.row is Row.HALF:
-        return trial.causes[0] in [each.name for each in trial.varying] and not wrong_names(trial)
+        return varies(trial, trial.causes[0]) and not wrong_names(trial)
     if not trial.causes:
         return not states_something(trial)
     right = trial.right and not wrong_names(trial)
@@ -61,7 +61,17 @@ def is_right(trial: Trial) -> bool:
 
 def wrong_names(trial: Trial) -> set[str]:
     """Return what is named alone, or as varying, and is not hidden."""
-    return {*trial.named, *(each.name for each in trial.varying)} - {*trial.causes, *trial.accepted}
+    varying = {each.name for each in trial.varying if not {*each.rivals} & {*trial.causes}}
+    return {*trial.named, *varying} - {*trial.causes, *trial.accepted}
+
+
+def varies(trial: Trial, cause: str) -> bool:
+    """Return whether an effect differs from run to run, alone or with none but its confusable class."""
+    twins = {cause, *trial.classes.get(cause, ())}
+    return any(
+        each.name == cause or (cause in each.rivals and {each.name, *each.rivals} <= twins)
+        for each in trial.varying
+    )
 
 
 def states_something(trial: Trial) -> bool:
@@ -81,7 +91,7 @@ def is_covered(trial: Trial) -> bool:
 def groups_are_right(trial: Trial) -> bool:
     """Return whether the runs with the effect are a group of their own."""
     return any(
-        each.name in trial.causes and set(ids) == set(trial.present)
+        {each.name, *each.rivals} & set(trial.causes) and set(ids) == set(trial.present)
         for each in trial.varying
         for _, ids in each.groups
     )
@@ -115,7 +125,7 @@ def _stalled(trials: Sequence[Trial]) -> Iterator[Scored]:
 
 
 def _half(trials: Sequence[Trial]) -> Iterator[Scored]:
-    groups = rate_of(groups_are_right(t) for t in trials if t.causes[0] in [each.name for each in t.varying])
+    groups = rate_of(groups_are_right(t) for t in trials if varies(t, t.causes[0]))
     yield "half: groups of runs are right", groups, "", True
 
 

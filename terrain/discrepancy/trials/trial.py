@@ -29,10 +29,18 @@ CLOCK_STATED_S = 0.04
 
 
 class Varying(NamedTuple):
-    """An effect that differs from run to run, as it was answered: its name, and the runs of each value."""
+    """An effect that differs from run to run, as it was answered.
+
+    Parameters
+    ----------
+    name : of the effect
+    groups : value and run ids of each group
+    rivals : effects that explain the differences as well
+    """
 
     name: str
     groups: tuple[tuple[float, tuple[str, ...]], ...]
+    rivals: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,17 +195,13 @@ def _answered(answer: Diagnosis | None) -> dict[str, Any]:
         "clock_s": float(np.median(known_s)) if known_s.size else math.nan,
         "excluded": tuple(run.run_id for run in answer.excluded_runs),
         "varying": tuple(
-            Varying(each.name, tuple((float(value), tuple(ids)) for value, ids in each.groups))
-            for each in getattr(answer, "varying", ())
+            Varying(each.name, tuple((group.value, group.run_ids) for group in each.groups), each.rivals)
+            for each in answer.varying
         ),
-        "statements": tuple(_statement(each) for each in getattr(answer, "faults", ())),
+        "statements": tuple(
+            Statement(fault.kind.value, fault.column.value, fault.sentence) for fault in answer.faults
+        ),
     }
-
-
-def _statement(fault: Any) -> Statement:
-    """Return what is stated of a fault; the column is what has it where no channel does."""
-    channel = getattr(fault, "channel", None) or getattr(fault, "column", "")
-    return Statement(str(fault.kind), str(channel), str(fault.sentence))
 
 
 def _classes(stage: Stage, robot: Robot) -> dict[str, tuple[str, ...]]:

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from terrain.discrepancy.health import Column, FaultKind
 from terrain.discrepancy.health.runs import Clock
 from terrain.discrepancy.trials.hidden_effects import cases_of
 from terrain.discrepancy.trials.measured_scores import is_right, states_something, wrong_names
@@ -13,7 +14,7 @@ from terrain.discrepancy.trials.rows import Row
 from terrain.discrepancy.trials.scoring import table_of
 from terrain.discrepancy.trials.trial import CLOCK_STATED_S, Trial, Varying, run_trial
 from terrain.discrepancy.trials.written_faults import Statement
-from terrain.discrepancy.verdict import Value, Verdict
+from terrain.discrepancy.verdict import RunGroup, Value, Verdict
 
 RIGHT = Trial(
     row=Row.SHORT,
@@ -111,6 +112,10 @@ def test_an_effect_of_half_of_the_runs_has_to_be_named_as_one_that_varies():
     varies = replace(half, named=(), varying=(Varying("payload", groups),))
     mixed = replace(varies, varying=(Varying("payload", ((0.2, ("a", "c")), (0.0, ("b", "d")))),))
     other = replace(half, named=(), varying=(Varying("scrub", groups),))
+    rival = replace(half, named=(), varying=(Varying("scrub", groups, ("payload",)),))
+    twins = replace(rival, classes={"payload": ("scrub",)})
+    assert [is_right(t) for t in (rival, twins)] == [False, True]
+    assert not wrong_names(rival)
     assert [is_right(t) for t in (varies, mixed, half, other)] == [True, True, False, False]
     assert [bool(wrong_names(t)) for t in (varies, mixed, half, other)] == [False, False, False, True]
     assert counted([varies, mixed, half])["half: groups of runs are right"][:2] == (1, 2)
@@ -180,10 +185,16 @@ def test_a_trial_takes_what_the_diagnosis_answers(monkeypatch):
         clocks=(Clock("a", -0.2, 0.01), Clock("b", math.nan, math.nan), Clock("c", -0.3, 0.01)),
         excluded_runs=(SimpleNamespace(run_id="b"),),
         faults=(
-            SimpleNamespace(kind="unit", channel="gyro", sentence="it is in deg/s"),
-            SimpleNamespace(kind="sign", column="heading rate", sentence="it is turned"),
+            SimpleNamespace(kind=FaultKind.UNIT, column=Column.GYRO, sentence="it is in deg/s"),
+            SimpleNamespace(kind=FaultKind.SIGN, column=Column.HEADING, sentence="it is turned"),
         ),
-        varying=(SimpleNamespace(name="payload", groups=((0.1, ("a",)), (0.2, ("c",)))),),
+        varying=(
+            SimpleNamespace(
+                name="payload",
+                groups=(RunGroup(0.1, 0.01, ("a",)), RunGroup(0.2, 0.01, ("c",))),
+                rivals=("motor_constant",),
+            ),
+        ),
     )
     case = cases_of(Row.FAULT, 1, 0, 3)[0]
     monkeypatch.setattr("terrain.discrepancy.trials.trial.diagnose", lambda *_: answer)
@@ -194,9 +205,5 @@ def test_a_trial_takes_what_the_diagnosis_answers(monkeypatch):
         ("unit", "gyro", "it is in deg/s"),
         ("sign", "heading rate", "it is turned"),
     )
-    assert found.varying == (Varying("payload", ((0.1, ("a",)), (0.2, ("c",)))),)
+    assert found.varying == (Varying("payload", ((0.1, ("a",)), (0.2, ("c",))), ("motor_constant",)),)
     assert found.intervals == {"motor_constant_ratio": (0.1, 0.0, 0.2)}
-    for name in ("faults", "varying"):
-        delattr(answer, name)
-    bare = run_trial(case)
-    assert (bare.statements, bare.varying) == ((), ())
