@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from terrain.discrepancy.residuals import low_pass_of
-from terrain.discrepancy.search import Problem, names_of, search
+from terrain.discrepancy.search import Problem, names_of, search, with_rivals
 from terrain.discrepancy.selection import fit_change
 from terrain.discrepancy.signals import signals_of
 from terrain.discrepancy.trials.drives import rich_drives
@@ -37,7 +37,7 @@ def three():
 
 
 def test_three_causes_are_found_with_their_values_by_relinearisation(three):
-    _, found = three
+    asked, found = three
     assert {cause.name for cause in found.causes} == {"camera_latency", "payload", "camera_yaw"}
     assert set(found.names) == set(HIDDEN)
     std = np.sqrt(np.diag(found.cov))
@@ -48,7 +48,9 @@ def test_three_causes_are_found_with_their_values_by_relinearisation(three):
         abs(found.change[found.names.index("camera_latency_s")])
         > 20 * std[found.names.index("camera_latency_s")]
     )
-    assert found.rivals == {cause.name: () for cause in found.causes}
+    assert found.rivals == {}
+    start = asked.at(asked.simulation.vector)
+    assert with_rivals(asked, start, found).rivals == {cause.name: () for cause in found.causes}
 
 
 def test_every_effect_has_evidence_and_only_causes_are_significant(three):
