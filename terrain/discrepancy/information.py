@@ -350,7 +350,7 @@ def nearby(
     for run, its_change, inner in zip(signals, info.white_change, info.inner, strict=True):
         rows = rows_of(run, planar[run.terrain], vector, parameters, low_pass)
         residual, change = _whiten_run(info.noise, rows)
-        nuisances = its_change[info.nuisances].reshape(len(info.nuisances), -1)
+        nuisances = its_change[info.nuisances].reshape(len(info.nuisances), residual.size)
         both = np.concatenate([change, residual[None]]).reshape(k + 1, -1)
         along = nuisances @ both.T
         total += both @ both.T - along.T @ inner @ along

@@ -162,6 +162,20 @@ def test_nearby_is_the_same_form_at_another_point_by_the_same_noise(signals, inf
         assert_allclose(white, expected)
 
 
+def test_a_simulation_of_which_nothing_scatters_is_fitted_too(signals, info):
+    firm = information_at(
+        signals,
+        Simulation(HUSKY),
+        info.vector,
+        NAMES,
+        low_pass_of(signals),
+        info.statistics._replace(scatter={}),
+    )
+    here = nearby(firm, signals, Simulation(HUSKY), info.vector, list(NAMES), low_pass_of(signals))
+    scale = np.sqrt(here.a.diagonal())
+    assert_allclose(here.a / np.outer(scale, scale), firm.a.sum(0) / np.outer(scale, scale), atol=1e-9)
+
+
 def test_two_points_differ_in_misfit_as_their_likelihoods_do(signals, info):
     low_pass, names = low_pass_of(signals), ["camera_yaw_rad", "payload_ratio"]
     change, _ = fit_change(info, names)

@@ -9,7 +9,7 @@ import pytest
 from terrain.discrepancy.command_response import ABSENT, NAMES, STEP_S, follow
 from terrain.discrepancy.powertrain import PartStatus, powertrain_of
 from terrain.errors import DataError
-from terrain.logs.drive import find_runs
+from terrain.logs.drive import DriveRobot, find_runs
 from terrain.records import RunLog, Stream
 from terrain.robots import load_robot
 
@@ -161,7 +161,8 @@ def test_the_answer_is_stated_in_sentences():
 
 def test_the_commands_of_the_measured_husky_are_no_wheel_speeds(measured):
     """Its log: 1.8 times as fast forward, 0.8 times in turning, at most 6.1 rad/s (terrain.logs.drive)."""
-    runs = [read(repair=True) for read in find_runs(measured("drive_husky"))[::3]]
+    robot = DriveRobot("husky", HUSKY.wheel_radius_m)
+    runs = [read(repair=True) for read in find_runs(measured("drive_husky"), robot)[::3]]
     found = powertrain_of(runs, HUSKY)
     values = {part.name: part for part in found.found}
     assert values["gain_ratio"].value == pytest.approx(1.8, abs=0.1)

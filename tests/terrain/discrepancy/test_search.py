@@ -1,16 +1,20 @@
 """The search on runs in which it is known what is there."""
 
+from itertools import pairwise
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
+from terrain.discrepancy.information import Nearby, move_point
 from terrain.discrepancy.residuals import low_pass_of
-from terrain.discrepancy.search import Problem, names_of, search
+from terrain.discrepancy.search import RISE, Problem, _steps, names_of, search, with_rivals
 from terrain.discrepancy.selection import fit_change
 from terrain.discrepancy.signals import signals_of
 from terrain.discrepancy.trials.drives import rich_drives
 from terrain.discrepancy.trials.hidden_effects import hidden_runs
 from terrain.discrepancy.trials.trial import simulation_of
-from terrain.effects import INDEX, LIBRARY, effect_named
+from terrain.effects import BOUNDS, INDEX, LIBRARY, effect_named
 from terrain.robots import load_robot
 
 HUSKY = load_robot("husky")
@@ -37,7 +41,7 @@ def three():
 
 
 def test_three_causes_are_found_with_their_values_by_relinearisation(three):
-    _, found = three
+    asked, found = three
     assert {cause.name for cause in found.causes} == {"camera_latency", "payload", "camera_yaw"}
     assert set(found.names) == set(HIDDEN)
     std = np.sqrt(np.diag(found.cov))
@@ -48,7 +52,9 @@ def test_three_causes_are_found_with_their_values_by_relinearisation(three):
         abs(found.change[found.names.index("camera_latency_s")])
         > 20 * std[found.names.index("camera_latency_s")]
     )
-    assert found.rivals == {cause.name: () for cause in found.causes}
+    assert found.rivals == {}
+    start = asked.at(asked.simulation.vector)
+    assert with_rivals(asked, start, found).rivals == {cause.name: () for cause in found.causes}
 
 
 def test_every_effect_has_evidence_and_only_causes_are_significant(three):
@@ -126,3 +132,75 @@ def test_names_come_once_and_in_order():
     assert names_of([lever, payload, lever]) == ("lever_x_m", "lever_y_m", "payload_ratio")
     assert set(names_of(LIBRARY)) <= set(INDEX)
     assert names_of([]) == ()
+
+
+LATE_AND_WIDE = {"camera_latency_s": 0.25, "effective_track_ratio": 1.5}
+
+
+@pytest.mark.parametrize("seeds", [{}, {"camera_latency_s": 0.2}])
+def test_a_large_lag_and_a_track_that_is_far_off_are_found_together(seeds):
+    asked = problem(
+        LATE_AND_WIDE, ("camera_latency", "effective_track", "camera_yaw", "lever_arm", "gyro_scale")
+    )
+    found = search(asked, asked.at(asked.simulation.vector), seeds)
+    assert {cause.name for cause in found.causes} == {"camera_latency", "effective_track"}
+    grown = [found.tried[name.removesuffix("_s").removesuffix("_ratio")].inflation for name in found.names]
+    std = np.sqrt(np.diag(found.cov) * grown)
+    for name, value, own in zip(found.names, found.change, std, strict=True):
+        assert abs(value - LATE_AND_WIDE[name]) < 4 * own, name
+
+
+def test_a_seed_that_is_wrong_is_dropped():
+    asked = problem({"camera_yaw_rad": 0.03}, ("camera_latency", "camera_yaw", "gyro_scale"))
+    found = search(asked, asked.at(asked.simulation.vector), {"camera_latency_s": 0.2})
+    assert [cause.name for cause in found.causes] == ["camera_yaw"]
+
+
+class Bent:
+    """One parameter in place of a problem: its residual saturates, and Gauss and Newton overshoot."""
+
+    TRUE, WIDTH, WEIGHT = 0.0, 0.02, 1e4
+
+    def near(self, info, vector, names):
+        x = (vector[INDEX[names[0]]] - self.TRUE) / self.WIDTH
+        slope, residual = 1 / (1 + x**2) / self.WIDTH, -np.arctan(x)
+        a, g = np.array([[slope**2]]), np.array([slope * residual])
+        return Nearby(vector, self.WEIGHT * a, self.WEIGHT * g, self.WEIGHT * residual**2, ())
+
+    def start(self, at):
+        """Return the information at a point, changes counted from 0."""
+        vector = move_point(np.zeros(len(INDEX)), ["camera_yaw_rad"], np.array([at]))
+        here = self.near(None, vector, ["camera_yaw_rad"])
+        return SimpleNamespace(
+            a=here.a[None],
+            g=(here.g + here.a @ [at])[None],
+            origin=vector,
+            origin_loss=here.c,
+            places=lambda names: [0],
+        )
+
+
+def test_a_step_that_raises_the_square_is_halved(monkeypatch):
+    bent, names = Bent(), ["camera_yaw_rad"]
+    info, base = bent.start(0.05), np.zeros(len(INDEX))
+    points = list(_steps(bent, info, base, names, 12))
+    losses = [info.origin_loss, *(point.c for point in points)]
+    assert all(after <= (1 + RISE) * before for before, after in pairwise(losses))
+    assert points[-1].vector[INDEX["camera_yaw_rad"]] == pytest.approx(0.0, abs=1e-4)
+    # without that guard it goes from bound to bound
+    monkeypatch.setattr("terrain.discrepancy.search.MAX_HALVINGS", 0)
+    wild = list(_steps(bent, info, base, names, 12))
+    assert abs(wild[-1].vector[INDEX["camera_yaw_rad"]]) == BOUNDS["camera_yaw_rad"][1]
+
+
+def test_what_changes_other_channels_is_no_rival(monkeypatch):
+    """A camera's yaw and a payload explain as much, each in channels of its own."""
+    library = ("camera_yaw", "payload", "gyro_scale")
+    asked = problem({"camera_yaw_rad": 0.01, "payload_ratio": 0.25}, library)
+    start = asked.at(asked.simulation.vector)
+    found = search(asked, start)
+    assert {cause.name for cause in found.causes} == {"camera_yaw", "payload"}
+    alone = found._replace(causes=(effect_named("payload"),))  # as if the yaw had been withdrawn
+    assert with_rivals(asked, start, alone).rivals == {"payload": ()}
+    monkeypatch.setattr("terrain.discrepancy.search.SHARED", -1.0)
+    assert "camera_yaw" in [each.effect.name for each in with_rivals(asked, start, alone).rivals["payload"]]

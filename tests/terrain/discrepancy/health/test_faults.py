@@ -16,6 +16,7 @@ from terrain.discrepancy.signals import Signals, signals_of
 from terrain.discrepancy.trials.drives import rich_drives
 from terrain.discrepancy.trials.hidden_effects import hidden_runs
 from terrain.discrepancy.trials.trial import simulation_of
+from terrain.logs.drive import DriveRobot, find_runs
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import load_robot
 
@@ -259,7 +260,8 @@ def test_measured_huskies_have_no_fault(measured, folder):
 
 
 def test_the_gyro_of_the_measured_marmotte_is_turned(measured):
-    runs = load_runs(measured("drive_marmotte"))
+    robot = DriveRobot("husky", load_robot("husky").wheel_radius_m)  # a sign asks for no size
+    runs = [read(repair=True) for read in find_runs(measured("drive_marmotte"), robot)]
     (fault,) = faults(on_one_clock(runs))
     assert (fault.kind, fault.column, len(fault.run_ids)) == (SIGN, Column.GYRO, len(runs))
     assert "the heading rate with -0.9" in fault.sentence

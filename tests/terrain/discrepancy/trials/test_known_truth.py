@@ -1,0 +1,47 @@
+"""A robot of known truth in short runs, and one of which nothing is wrong."""
+
+import numpy as np
+import pytest
+
+from terrain.discrepancy.diagnose import diagnose
+from terrain.discrepancy.trials.command_logs import as_command_log
+from terrain.discrepancy.trials.drives import command_drives
+from terrain.discrepancy.trials.hidden_effects import SHORT_RUNS, Case, hidden_runs
+from terrain.discrepancy.trials.known_truth import KNOWN, TRACK_ERROR, value_is_right
+from terrain.discrepancy.trials.rows import Row
+from terrain.discrepancy.trials.scattered_values import TRACK, TRACK_RATIO
+from terrain.discrepancy.trials.trial import run_trial, simulation_of
+from terrain.discrepancy.verdict import Verdict
+from terrain.robots import load_robot
+
+HUSKY = load_robot("husky")
+
+
+@pytest.mark.parametrize(
+    "number",
+    [
+        pytest.param(i, id=known.name, marks=[pytest.mark.slow] * (i in (1, 2)))
+        for i, known in enumerate(KNOWN)
+    ],
+)
+def test_a_track_that_is_two_and_a_half_times_as_wide_is_named_in_short_runs(number):
+    known = KNOWN[number]
+    trial = run_trial(Case(Row.KNOWN, number, "husky", SHORT_RUNS, 0))
+    assert TRACK in trial.named
+    assert trial.right
+    assert value_is_right(trial.intervals)
+    _, low, high = trial.intervals[TRACK_RATIO]
+    if not known.scatters:  # the mean of runs that scatter is no constant to be met
+        assert low < TRACK_ERROR < high
+    assert set(trial.stalled) <= set(trial.excluded)
+    assert len(trial.excluded) <= len(trial.stalled) + 1
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_short_runs_in_which_nothing_is_hidden_have_no_cause(seed):
+    drives = command_drives(np.random.default_rng(seed), HUSKY, SHORT_RUNS)
+    runs = hidden_runs(HUSKY, drives, np.random.SeedSequence(seed), {}, heading=True)
+    found = diagnose(tuple(map(as_command_log, runs)), simulation_of(HUSKY))
+    assert found.verdict in (Verdict.NONE, Verdict.NOT_EXCITED)
+    assert (found.causes, found.ambiguous_sets, found.varying, found.faults) == ((), (), (), ())
+    assert len(found.excluded_runs) <= 3  # a command may leave a wheel as fast as the one before
