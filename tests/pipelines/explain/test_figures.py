@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from pipelines.explain.shown import ShownRun, example_stretch
 
 from pipelines.explain.figures import dependence_figure, run_figure, spectra_figure, systematic_figure
-from pipelines.explain.shown import ShownRun, example_stretch
 from pipelines.reporting.drawing import png_bytes
 from terrain.discrepancy.noise import Noise
 from terrain.discrepancy.verdict import Residual
