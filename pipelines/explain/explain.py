@@ -188,7 +188,7 @@ def held_out_gain(
                 diagnosed.held_out, robot, simulation.effects, extended.effects, seed, progress=progress
             )
     judged = compare_runs(simulation, extended, fit, diagnosed.low_pass, held_out=True)
-    nameless = nameless_gain(diagnosed.compared, judged, _noise_of(diagnosed.diagnosis))
+    nameless = nameless_gain(diagnosed.compared, judged, _noise_of(diagnosed.diagnosis), seed)
     progress("gain", 1, 1)
     return HeldOutGain(found, reason, comparisons, nameless, judged)
 

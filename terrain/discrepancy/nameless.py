@@ -16,8 +16,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from terrain.bootstrap import bootstrap_counts, percentile_interval
 from terrain.discrepancy.channel_words import CHANNEL_WORDS
 from terrain.discrepancy.compared import ComparedRun, channels_of
+from terrain.discrepancy.gain import N_BOOTSTRAP
+from terrain.discrepancy.information import N_BLOCKS
+from terrain.discrepancy.selection import MIN_CLUSTERS
 from terrain.discrepancy.verdict import finite
 from terrain.effects import CHANNELS
 from terrain.records import Array
@@ -33,8 +37,8 @@ LEAST_RANGE = 1e-6
 """Spread of a column that counts as constant."""
 
 LITTLE_LEFT = 0.05
-"""Part of the square which a learner may remove beyond the named causes before something is left to find:
-its twenty-odd columns follow differences between runs as well."""
+"""Part of the square that a learner has to remove beyond the named causes, at the lower end of its interval,
+before something is left to find: less would not change what the simulation is good for."""
 
 
 class Learned(NamedTuple):
@@ -45,12 +49,15 @@ class Learned(NamedTuple):
     rms_before, rms_after : root mean square before, and behind the learner, in the channel's unit
     ratio : part of the square that the learner removes; below 0 where it adds to it
     named_ratio : part that the named causes remove; NaN where none was named
+    left_low : lower end of the 95 % interval, by bootstrap over runs or thirds of runs, of what the learner
+        removes beyond the named causes
     """
 
     rms_before: float
     rms_after: float
     ratio: float
     named_ratio: float
+    left_low: float
 
 
 class Nameless(NamedTuple):
@@ -83,14 +90,10 @@ class Nameless(NamedTuple):
         left = self.ratio - named
         learner = f"{100.0 * max(self.ratio, 0.0):.0f} %"
         channels = [
-            CHANNEL_WORDS[name][0]
-            for name, each in self.channels.items()
-            if each.ratio - (each.named_ratio if math.isfinite(each.named_ratio) else 0.0) > LITTLE_LEFT
+            CHANNEL_WORDS[name][0] for name, each in self.channels.items() if each.left_low > LITTLE_LEFT
         ]
         if channels:
-            judged = f"a cause without a name is left in {_listed(channels)}"
-        elif left > LITTLE_LEFT:
-            judged = "a cause without a name is left"
+            judged = f"more is left to find in {_listed(channels)}"
         elif left < -LITTLE_LEFT:
             judged = "it finds less than the names state"
         else:
@@ -114,6 +117,7 @@ class Nameless(NamedTuple):
                     "rms_after": finite(each.rms_after),
                     "reduction": finite(each.ratio),
                     "named_reduction": finite(each.named_ratio),
+                    "left_to_find_from": finite(each.left_low),
                 }
                 for name, each in self.channels.items()
             },
@@ -121,7 +125,10 @@ class Nameless(NamedTuple):
 
 
 def nameless_gain(
-    used: Sequence[ComparedRun], held_out: Sequence[ComparedRun], noise: Mapping[str, float]
+    used: Sequence[ComparedRun],
+    held_out: Sequence[ComparedRun],
+    noise: Mapping[str, float],
+    seed: int = 0,
 ) -> Nameless | None:
     """Return what a nameless learner reaches on runs held out; None where there are none.
 
@@ -130,6 +137,7 @@ def nameless_gain(
     used : runs that it is fitted to
     held_out : on which it and the named causes are judged, behind the same low-pass
     noise : by channel, over which the squares of channels are added
+    seed : of the bootstrap
     """
     if not used or not held_out:
         return None
@@ -151,7 +159,10 @@ def nameless_gain(
             named = np.concatenate([run.residual(True)[:, c] for run in held_out])[known]
         squares = np.array([float(x @ x) for x in (before[known], after, named)])
         rms = np.sqrt(squares / known.sum())
-        channels[name] = Learned(float(rms[0]), float(rms[1]), *_ratios(squares))
+        rival = named if extended else before[known]
+        of_run = np.repeat(np.arange(len(held_out)), [len(run.time_s) for run in held_out])[known]
+        left_low = _left_low(before[known] ** 2, rival**2 - after**2, of_run, seed)
+        channels[name] = Learned(float(rms[0]), float(rms[1]), *_ratios(squares), left_low)
         if noise.get(name, math.nan) > 0:
             total += squares / noise[name] ** 2
     return Nameless(len(held_out), channels, *_ratios(total))
@@ -159,6 +170,17 @@ def nameless_gain(
 
 def _listed(words: Sequence[str]) -> str:
     return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
+
+
+def _left_low(before: Array, more: Array, of_run: Array, seed: int) -> float:
+    """Return the lower end of the interval of what is removed more (n,), over the square before (n,)."""
+    runs = [np.flatnonzero(of_run == run) for run in np.unique(of_run)]
+    parts = runs if len(runs) >= MIN_CLUSTERS else [p for run in runs for p in np.array_split(run, N_BLOCKS)]
+    weights = bootstrap_counts(len(parts), N_BOOTSTRAP, seed)
+    sums = np.array([[more[part].sum(), before[part].sum()] for part in parts])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        ratios = (weights @ sums[:, 0]) / (weights @ sums[:, 1])
+    return float(percentile_interval(ratios)[0]) if np.isfinite(ratios).any() else math.nan
 
 
 def _ratios(squares: Array) -> tuple[float, float]:

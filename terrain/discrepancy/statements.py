@@ -10,7 +10,7 @@ from terrain.discrepancy.channel_words import CHANNEL_WORDS, off_by
 from terrain.discrepancy.compared import ComparedRun, channels_of, rms_of
 from terrain.discrepancy.gain import Gain
 from terrain.discrepancy.response_slopes import Slope, slopes_of
-from terrain.discrepancy.robot_terms import in_robot_terms
+from terrain.discrepancy.robot_terms import UNITS, in_robot_terms
 from terrain.discrepancy.verdict import Diagnosis, RuledOut, finite
 from terrain.effects import PARAMETER, effect_named
 from terrain.robots import Robot
@@ -91,9 +91,9 @@ def statements_of(
 
 def _worded(of: Statement, diagnosis: Diagnosis, robot: Robot) -> Statement:
     name, unit = CHANNEL_WORDS[of.channel]
-    parts = [off_by(of.channel, of.slope), _repair(of, diagnosis, robot, unit), _rivals(of, diagnosis, robot)]
-    parts += [_varies(of, diagnosis), _remainder(of, diagnosis, robot, unit)]
-    parts = [part for part in parts if part]
+    repair = _repair(of, diagnosis, robot, unit)
+    parts = [off_by(of.channel, of.slope), repair, _rivals(of, diagnosis, robot), _varies(of, diagnosis)]
+    parts = [part for part in (*parts, _remainder(of, diagnosis, robot, bool(repair))) if part]
     if not parts:
         return of._replace(
             text=f"{name}: measured and simulated agree to {_size(of.rms_before)} {unit} rms {of.where}."
@@ -110,13 +110,18 @@ def _repair(of: Statement, diagnosis: Diagnosis, robot: Robot, unit: str) -> str
     if not math.isfinite(of.rms_after):
         return ""
     change = of.rms_after - of.rms_before
+    changed = abs(change) >= CHANGED * of.rms_before
     by_name = {cause.name: cause for cause in diagnosis.causes}
-    causes = [in_robot_terms(name, by_name[name].values, robot) for name in of.causes]
-    if not causes and abs(change) < CHANGED * of.rms_before:
-        return ""
+    names = of.causes
+    if not changed:  # it is worth a word in the channel that a cause shows in most
+        names = tuple(name for name in names if by_name[name].channels[0] == of.channel)
+    elif not names:  # it shows more clearly in other channels
+        names = tuple(name for name in by_name if of.channel in effect_named(name).channels)
+    causes = [in_robot_terms(name, by_name[name].values, robot) for name in names]
+    if not changed:
+        words = f"with {_listed(causes)} its error stays at {_size(of.rms_after)} {unit} {of.where}"
+        return words if causes else ""
     words = _listed(causes) if causes else "what is named for other channels"
-    if abs(change) < CHANGED * of.rms_before:
-        return f"with {words} its error stays at {_size(of.rms_after)} {unit} {of.where}"
     verb, sizes = "falls" if change < 0 else "rises", f"{_size(of.rms_before)} to {_size(of.rms_after)}"
     return f"with {words} its error {verb} from {sizes} {unit} {of.where}"
 
@@ -139,27 +144,37 @@ def _varies(of: Statement, diagnosis: Diagnosis) -> str:
     texts = []
     for each in diagnosis.varying:
         if each.channel == of.channel:
-            words = PARAMETER[each.parameter].label
-            size = f"{100.0 * each.scatter:.2g} %" if PARAMETER[each.parameter].as_percent else ""
-            size = size or f"{each.scatter:.2g} {each.unit}".removesuffix(" ratio")
-            texts.append(f"the {words} behind it differs from run to run by {size}")
+            parameter = PARAMETER[each.parameter]
+            size = f"{100.0 * each.scatter:.2g} %" if parameter.as_percent else f"{each.scatter:.2g}"
+            unit = "" if parameter.unit == "ratio" else f" {UNITS.get(parameter.unit, parameter.unit)}"
+            texts.append(f"the {parameter.label} differs from run to run by {size}{unit}")
     return "; ".join(texts)
 
 
-def _remainder(of: Statement, diagnosis: Diagnosis, robot: Robot, unit: str) -> str:
+def _remainder(of: Statement, diagnosis: Diagnosis, robot: Robot, repaired: bool) -> str:
     """Return what the named causes do not explain, and what it depends on."""
-    rest = of.rms_after if math.isfinite(of.rms_after) else of.rms_before
+    unit = CHANNEL_WORDS[of.channel][1]
+    rest = f"{_size(of.rms_after if math.isfinite(of.rms_after) else of.rms_before)} {unit}"
     withdrawn = {each.name: each for each in diagnosis.ruled_out if each.values}
     texts = []
     for left in diagnosis.unexplained:
         if left.channel != of.channel:
             continue
+        if left.input == "constant" and not repaired and math.isfinite(of.slope.level):
+            continue  # that is the level already stated
         effect = withdrawn.get(left.input)
-        if effect is None:
-            how = f"depend on {left.input}" if left.input != "constant" else "are a constant offset"
+        if effect is not None:
+            words = in_robot_terms(effect.name, effect.values, robot)
+            how = ("look", "looks"), f"like {words}, a cause that was withdrawn"
+        elif left.input == "constant":
+            how = ("are", "is"), "a constant offset"
         else:
-            how = f"look like {in_robot_terms(effect.name, effect.values, robot)}, a cause that was withdrawn"
-        texts.append(f"{_size(rest)} {unit} remain, which {how}")
+            how = ("depend", "depends"), f"on {left.input}"
+        (many, one), what = how
+        if repaired:
+            texts.append(f"{rest} rms remain, which {many} {what}")
+        else:
+            texts.append(f"measured and simulated are {rest} rms apart, which {one} {what}")
     return "; ".join(texts)
 
 

@@ -11,7 +11,7 @@ from pipelines.cli import main as cli
 from pipelines.explain import page as explain_page
 from pipelines.explain.explain import EXTENDED_FILE
 from pipelines.explain.page import PAGE_FILE
-from terrain.discrepancy.diagnose import INTERVAL_T
+from terrain.discrepancy.answers import INTERVAL_T
 from terrain.logs.write import write_run
 from terrain.records import RunLog
 from terrain.robots import load_robot

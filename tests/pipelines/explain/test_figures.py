@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from pipelines.explain.shown import ShownRun, example_stretch
 
 from pipelines.explain.figures import dependence_figure, run_figure, spectra_figure, systematic_figure
 from pipelines.reporting.drawing import png_bytes
+from terrain.discrepancy.compared import ComparedRun, example_stretch
 from terrain.discrepancy.noise import Noise
 from terrain.discrepancy.verdict import Residual
 from terrain.effects import CHANNELS
@@ -33,8 +33,8 @@ def a_run(name="r", off=0.0, seed=0, n=300, held_out=False, after=True):
     fixed = before.copy()
     fixed[:, C] = off
     time_s = np.arange(n) / RATE_HZ
-    inputs = {"speed [m/s]": np.sin(time_s), "roll [rad]": np.zeros(n), "time [s]": time_s}
-    return ShownRun(
+    inputs = {"speed_mps": np.sin(time_s), "roll_rad": np.zeros(n), "time_s": time_s}
+    return ComparedRun(
         name, "grass", held_out, time_s, np.ones(n), measured, before, fixed if after else None, inputs
     )
 

@@ -4,7 +4,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from terrain.discrepancy.diagnose import INTERVAL_T
+from terrain.discrepancy.answers import INTERVAL_T
 from terrain.discrepancy.extend import extend, extended_effects
 from terrain.discrepancy.simulation import Simulation
 from terrain.discrepancy.verdict import Cause, Diagnosis, Value, Verdict
