@@ -15,6 +15,9 @@ from terrain.records import Array
 CLEAR_STDS = 3.0
 """A factor or a level is stated where it is off by so many standard deviations over runs."""
 
+OUTLIER_STDS = 3.0
+"""Distance of a run from the others, in their standard deviations, beyond which it is far out."""
+
 LEAST_OFF = 0.03
 """Least ratio by which a factor is off: below it a sentence has nothing to state."""
 
@@ -113,8 +116,13 @@ def _slope(pairs: Sequence[tuple[Array, Array]]) -> Slope:
 
 
 def _std_of_mean(off: Array, weight: Array) -> float:
-    """Return the standard deviation of a weighted mean by how far runs (n,) are from it."""
+    """Return the standard deviation of a weighted mean by how far runs (n,) are from it.
+
+    A run that is far out, as a stalled one, hardly moves a median, and counts as one at the edge.
+    """
     known = np.isfinite(off) & (weight > 0.0)
     if known.sum() < 2:
         return math.inf
+    edge = OUTLIER_STDS * 1.48 * float(np.median(np.abs(off[known])))
+    off = np.clip(off, -edge, edge)
     return float(np.sqrt(((weight * off)[known] ** 2).sum()) / weight[known].sum())

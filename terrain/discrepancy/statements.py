@@ -118,10 +118,11 @@ def _repair(of: Statement, diagnosis: Diagnosis, robot: Robot, unit: str) -> str
     elif not names:  # it shows more clearly in other channels
         names = tuple(name for name in by_name if of.channel in effect_named(name).channels)
     causes = [in_robot_terms(name, by_name[name].values, robot) for name in names]
-    if not changed:
-        words = f"with {_listed(causes)} its error stays at {_size(of.rms_after)} {unit} {of.where}"
-        return words if causes else ""
+    if not (changed or causes):
+        return ""
     words = _listed(causes) if causes else "what is named for other channels"
+    if not changed:
+        return f"with {words} its error stays at {_size(of.rms_after)} {unit} {of.where}"
     verb, sizes = "falls" if change < 0 else "rises", f"{_size(of.rms_before)} to {_size(of.rms_after)}"
     return f"with {words} its error {verb} from {sizes} {unit} {of.where}"
 
