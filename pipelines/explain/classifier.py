@@ -12,8 +12,7 @@ from pipelines.classify.settings import CrossvalSettings
 from pipelines.classify.splits import labelled
 from pipelines.estimate.labelled import RUNS_A_TERRAIN, SCENARIO
 from pipelines.reporting.progress import Progress, silent
-from terrain.bootstrap import bootstrap_counts, percentile_interval
-from terrain.discrepancy.filter_gain import Change, Comparison
+from terrain.discrepancy.filter_gain import Comparison, accuracy_change
 from terrain.errors import DataError, TerrainError
 from terrain.kinematics.wheel_speed import with_wheel_speeds
 from terrain.logs.schema import SIGNAL_SETS
@@ -24,8 +23,6 @@ from terrain.terramechanics.soil import soil_names
 
 MIN_RUNS, MIN_TERRAINS = 4, 2
 """Least numbers of held-out runs and known terrains for an accuracy."""
-
-N_BOOTSTRAP = 2000
 
 
 def classifier_gain(
@@ -110,27 +107,3 @@ def _shared_layout(trained: Sequence[RunLog], known: Sequence[RunLog], settings:
 
 def _windows(runs: Sequence[RunLog], settings: CrossvalSettings, layout: Layout) -> Windows:
     return labelled(cut_windows(runs, settings.rule, layout=layout, skip_short=True)).windows
-
-
-def accuracy_change(before: Array, after: Array, run_id: Array, seed: int) -> Change:
-    """Return accuracies before and after, and the 95 % interval of their difference.
-
-    Parameters
-    ----------
-    before, after : (n,) whether each window is classified correctly
-    run_id : (n,) run of each window
-    seed : of the bootstrap over runs
-
-    Examples
-    --------
-    >>> before, after = np.array([0, 0, 1, 1]), np.array([1, 1, 1, 1])
-    >>> accuracy_change(before, after, np.array(["a", "a", "b", "b"]), 0)
-    Change(before=0.5, after=1.0, change_ci=(0.0, 1.0))
-    """
-    runs, of = np.unique(run_id, return_inverse=True)
-    n = len(runs)
-    windows = np.bincount(of, minlength=n)
-    change = np.bincount(of, weights=after.astype(float) - before.astype(float), minlength=n)
-    counts = bootstrap_counts(n, N_BOOTSTRAP, seed)
-    interval = percentile_interval((counts @ change) / (counts @ windows))
-    return Change(float(before.mean()), float(after.mean()), interval)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,16 +14,22 @@ from pipelines.explain.results import DiagnosedRuns, Explanation, ExtendedDescri
 from pipelines.explain.settings import ExplainSettings
 from pipelines.reporting.progress import Progress, silent
 from pipelines.runs.datasets import data_digest
+from terrain.discrepancy.compared import compare_runs, without_levels
 from terrain.discrepancy.diagnose import diagnose
 from terrain.discrepancy.extend import extend, extended_effects
 from terrain.discrepancy.filter_gain import Comparison, filter_gain
-from terrain.discrepancy.gain import gain
-from terrain.discrepancy.hold_out import HOLD_OUT_FROM, split_runs
+from terrain.discrepancy.gain import fit_to_judge, gain_of_signals
+from terrain.discrepancy.health import repaired
+from terrain.discrepancy.hold_out import HOLD_OUT_FROM, repair_held_out, split_runs
+from terrain.discrepancy.nameless import nameless_gain
+from terrain.discrepancy.parts import part_values
 from terrain.discrepancy.residuals import low_pass_of
+from terrain.discrepancy.robot_terms import in_robot_terms
 from terrain.discrepancy.search import Problem
-from terrain.discrepancy.signals import signals_of
-from terrain.discrepancy.terrain_match import simulation_for
-from terrain.discrepancy.verdict import NextDrive
+from terrain.discrepancy.signals import Signals, signals_of
+from terrain.discrepancy.statements import statements_of, terrains_apart
+from terrain.discrepancy.terrain_match import TerrainMatch, check_robots, runs_of_terrain, simulation_for
+from terrain.discrepancy.verdict import Diagnosis, NextDrive
 from terrain.effects import Effect, effect_named, library_of
 from terrain.errors import ConfigError, DataError
 from terrain.extension import extended_yaml, region_of
@@ -33,6 +39,10 @@ from terrain.records import RunLog
 from terrain.robots import Robot, load_robot
 
 EXTENDED_FILE, NEXT_FILE = "extended.yaml", "next_drive.yaml"
+
+DEFAULT_SOIL, NEXT_RUNS = "grass", 8
+"""Of the command that simulates the next drive: a soil that every robot drives on, and as many runs as the
+blind trials have."""
 
 
 def explain(runs: Sequence[RunLog], settings: ExplainSettings, progress: Progress = silent) -> Explanation:
@@ -61,18 +71,18 @@ def explain(runs: Sequence[RunLog], settings: ExplainSettings, progress: Progres
             f"{out / EXTENDED_FILE}: is there already and is not overwritten; choose another --out"
         )
     ensure_writable(out)
-    chosen = _of_terrain(runs, settings.terrain)
-    _check_robots(chosen, robot)
+    chosen = runs_of_terrain(runs, settings.terrain)
+    check_robots(chosen, robot)
     diagnosed = diagnose_runs(chosen, robot, library, settings.hold_out, seed)
     progress("diagnose", 1, 1)
     gained = held_out_gain(diagnosed, robot, seed, settings.classifier, progress)
     description = settings.model or settings.robot
     extended, text = None, ""
+    diagnosis = diagnosed.diagnosis
     if diagnosed.extended is not None:
-        effects = extended_effects(robot, diagnosed.diagnosis)
-        source = f"terrain explain, {diagnosed.diagnosis.n_runs} runs of {settings.dataset or 'a data set'}"
-        excluded = {run.run_id for run in diagnosed.diagnosis.excluded_runs}
-        region = region_of([run for run in diagnosed.used if run.run_id not in excluded], robot)
+        effects = extended_effects(robot, diagnosis)
+        source = f"terrain explain, {diagnosis.n_runs} runs of {settings.dataset or 'a data set'}"
+        region = region_of(diagnosed.fit, robot)
         text = extended_yaml(description, *effects, source, region)
         extended = ExtendedDescription(out / EXTENDED_FILE, effects.values)
     result = Explanation(
@@ -81,7 +91,7 @@ def explain(runs: Sequence[RunLog], settings: ExplainSettings, progress: Progres
         description=description,
         model=settings.model,
         terrain=settings.terrain,
-        diagnosis=diagnosed.diagnosis,
+        diagnosis=diagnosis,
         built_in=dict(diagnosed.simulation.effects),
         terrains=diagnosed.terrains,
         effects=tuple(effect.name for effect in library),
@@ -91,11 +101,15 @@ def explain(runs: Sequence[RunLog], settings: ExplainSettings, progress: Progres
         gain=gained,
         extended=extended,
         page=out / PAGE_FILE,
+        statements=statements_of(diagnosis, robot, diagnosed.compared, gained.gain),
+        terms={cause.name: in_robot_terms(cause.name, cause.values, robot) for cause in diagnosis.causes},
+        next_command=next_command(diagnosis, description, diagnosed.terrains),
+        terrains_apart=terrains_apart(diagnosis, diagnosed.compared),
     )
-    write_explain_page(out, diagnosed, result, progress)
+    write_explain_page(out, diagnosed, result, settings.max_pictures, progress)
     if extended is not None:
         atomic_write(extended.file, text)
-    _write_next_drive(out, diagnosed.diagnosis.next_drive)
+    _write_next_drive(out, diagnosis.next_drive)
     return result
 
 
@@ -109,12 +123,33 @@ def diagnose_runs(
     diagnosis = diagnose(used, simulation, library)
     extended = extend(simulation, diagnosis) if diagnosis.causes else None
     excluded = {run.run_id for run in diagnosis.excluded_runs}
-    signals = tuple(signals_of(run, robot) for run in used if run.run_id not in excluded)
+    fit = tuple(run for run in used if run.run_id not in excluded)
+    signals = repaired([signals_of(run, robot) for run in fit], diagnosis.faults)
     low_pass = low_pass_of(signals)
-    noise = Problem(signals, simulation, low_pass, tuple(library)).at(simulation.vector).noise
-    return DiagnosedRuns(
-        diagnosis, simulation, extended, terrains, tuple(used), tuple(held_out), noise, low_pass
+    compared = compare_runs(simulation, extended, signals, low_pass)
+    last = extended or simulation
+    info = Problem(signals, simulation, low_pass, tuple(library)).at(last.vector)
+    held_signals = repair_held_out(
+        [signals_of(run, robot) for run in held_out], diagnosis.faults, last, low_pass, _noise_of(diagnosis)
     )
+    return DiagnosedRuns(
+        diagnosis,
+        simulation,
+        extended,
+        terrains,
+        fit,
+        tuple(used),
+        tuple(held_out),
+        compared,
+        held_signals,
+        without_levels(info.noise, compared),
+        low_pass,
+        part_values(info, diagnosis.causes),
+    )
+
+
+def _noise_of(diagnosis: Diagnosis) -> dict[str, float]:
+    return {channel: residual.noise for channel, residual in diagnosis.residual_before.items()}
 
 
 def held_out_gain(
@@ -126,27 +161,47 @@ def held_out_gain(
     ----------
     classifier : whether a classifier trained in simulation is compared, too
     """
-    simulation, extended, runs = diagnosed.simulation, diagnosed.extended, diagnosed.held_out
-    if extended is None:
-        return HeldOutGain(None, "no cause was named, so that nothing was built in")
-    if not runs:
-        return HeldOutGain(
-            None,
-            f"no run was held out ({len(diagnosed.used)} runs; {HOLD_OUT_FROM} or more, or --hold-out, "
-            "hold some out)",
-        )
+    simulation, extended, runs = diagnosed.simulation, diagnosed.extended, diagnosed.held_signals
     found, reason = None, None
+    comparisons: dict[str, Comparison | None] = {}
+    fit: Sequence[Signals] = ()
     try:
-        found = gain(simulation, extended, runs, seed)
+        if not runs:
+            reason = (
+                f"no run was held out ({len(diagnosed.used)} runs; {HOLD_OUT_FROM} or more, or --hold-out, "
+                "hold some out)"
+            )
+        elif extended is None:
+            reason = "no cause was named, so that nothing was built in"
+            fit = fit_to_judge(simulation, runs)[0]
+        else:
+            found = gain_of_signals(simulation, extended, runs, seed)
+            fit = [run for run in runs if run.run_id in found.run_ids]
     except DataError as error:
-        reason = str(error)
-    comparisons: dict[str, Comparison | None] = {"filter": filter_gain(runs, robot, extended, seed)}
-    if classifier:
-        comparisons["classifier"] = classifier_gain(
-            runs, robot, simulation.effects, extended.effects, seed, progress=progress
-        )
+        reason = reason or str(error)
+    if extended is not None and runs:
+        # a filter is given the logs as they are: with a fault in them its error is that of the fault
+        faulty = bool(diagnosed.diagnosis.faults)
+        comparisons["filter"] = None if faulty else filter_gain(diagnosed.held_out, robot, extended, seed)
+        if classifier:
+            comparisons["classifier"] = classifier_gain(
+                diagnosed.held_out, robot, simulation.effects, extended.effects, seed, progress=progress
+            )
+    judged = compare_runs(simulation, extended, fit, diagnosed.low_pass, held_out=True)
+    nameless = nameless_gain(diagnosed.compared, judged, _noise_of(diagnosed.diagnosis), seed)
     progress("gain", 1, 1)
-    return HeldOutGain(found, reason, comparisons)
+    return HeldOutGain(found, reason, comparisons, nameless, judged)
+
+
+def next_command(diagnosis: Diagnosis, description: str, terrains: Sequence[TerrainMatch]) -> str | None:
+    """Return the command that simulates the next drive; None where none is suggested."""
+    coming = diagnosis.next_drive
+    if coming is None:
+        return None
+    soil = next((match.soil for match in terrains if match.soil), DEFAULT_SOIL)
+    grade = f" --grade {coming.grade_deg:g}" if coming.grade_deg else ""
+    words = f"--robot {shlex.quote(description)} --terrain {soil} --scenario {coming.scenario}{grade}"
+    return f"terrain simulate {words} --runs {NEXT_RUNS} --out next_drive"
 
 
 def _robot(robot_name: str, model: str | None) -> Robot:
@@ -175,29 +230,6 @@ def _library(robot: Robot, names: Sequence[str] | None) -> tuple[Effect, ...]:
                 f"effect {effect.name} does not apply to a robot with the drive {robot.drive!r}"
             )
     return tuple(effect for effect in applicable if effect in chosen)
-
-
-def _of_terrain(runs: Sequence[RunLog], terrain: str | None) -> list[RunLog]:
-    if not runs:
-        raise DataError("there is no run to explain")
-    if terrain is None:
-        return list(runs)
-    chosen = [run for run in runs if run.terrains == (terrain,)]
-    if not chosen:
-        labels = sorted({name for run in runs for name in run.terrains})
-        raise DataError(
-            f"no run is labelled {terrain!r} throughout; labels are {', '.join(labels) if labels else 'none'}"
-        )
-    return chosen
-
-
-def _check_robots(runs: Sequence[RunLog], robot: Robot) -> None:
-    others = Counter(run.robot for run in runs if run.robot != robot.name)
-    if others:
-        (name, n), *_ = others.most_common(1)
-        raise DataError(
-            f"{n} of {len(runs)} runs are of the robot {name!r}; the simulation is of {robot.name!r}"
-        )
 
 
 def _write_next_drive(out: Path, next_drive: NextDrive | None) -> None:

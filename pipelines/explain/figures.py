@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -11,8 +12,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
-from pipelines.explain.shown import ShownRun, channels_of
-from pipelines.explain.wording import CHANNEL_WORDS
 from pipelines.reporting.drawing import (
     BLUE,
     FAINT_INK,
@@ -24,10 +23,13 @@ from pipelines.reporting.drawing import (
     styled,
 )
 from pipelines.reporting.numbers import format_number
+from pipelines.reporting.quantities import quantity
+from terrain.discrepancy.channel_words import CHANNEL_WORDS, INPUT_LABELS
+from terrain.discrepancy.compared import MIN_SPREAD, ComparedRun, channels_of, spread_of, strongest_input
 from terrain.discrepancy.noise import Noise
+from terrain.discrepancy.parts import PartValues
 from terrain.discrepancy.residual_statistics import (
     binned_means,
-    input_range,
     noise_spectrum,
     run_means,
     spectrum,
@@ -37,16 +39,17 @@ from terrain.effects import CHANNELS
 from terrain.records import Array
 
 BAND_STDS = 2.0
-"""Half width of the noise band in standard deviations."""
-
-MIN_SPREAD = 0.01
-"""Range of an input in its own unit, below which no dependence can be seen."""
+"""Half width of the noise band in standard deviations.  The band is about 0: an offset lies outside of it."""
 
 COLUMNS = 3
+
+MANY_RUNS = 24
+"""Runs up to which each has a place on an axis; of more the distribution of their means is drawn."""
+
 BEFORE, AFTER = "simulated", "with the causes built in"
 
 
-def run_figure(run: ShownRun, noise: Noise, title: str) -> Figure:
+def run_figure(run: ComparedRun, noise: Noise, title: str) -> Figure:
     """Draw each channel measured and simulated on the left, and what is between them on the right."""
     names = channels_of([run])
     bands = BAND_STDS * noise.size(run.pace_mps)
@@ -130,7 +133,7 @@ def systematic_figure(
         return finished(figure, "Systematic part of the squared residual; grey: noise")
 
 
-def spectra_figure(runs: Sequence[ShownRun], noise: Noise, cutoff_hz: float) -> Figure:
+def spectra_figure(runs: Sequence[ComparedRun], noise: Noise, cutoff_hz: float) -> Figure:
     """Draw the spectrum of each channel's residual before and after, and that of the noise."""
     names = channels_of(runs)
     rate_hz = 1.0 / float(np.median(np.diff(runs[0].time_s)))
@@ -170,25 +173,67 @@ def spectra_figure(runs: Sequence[ShownRun], noise: Noise, cutoff_hz: float) -> 
         return finished(figure, "Spectrum of measured minus simulated, mean over runs")
 
 
-def dependence_figure(runs: Sequence[ShownRun], noise: Noise) -> Figure:
+def strongest_figure(runs: Sequence[ComparedRun]) -> Figure:
+    """Draw the mean residual of each channel, before and after, over the input on which it depends most."""
+    names = channels_of(runs)
+    n_rows = math.ceil(len(names) / COLUMNS)
+    with styled():
+        figure = new_figure(10.0, 0.9 + 2.2 * n_rows)
+        grid = figure.subplots(n_rows, COLUMNS, squeeze=False)
+        for axes, name in itertools.zip_longest(grid.ravel(), names):
+            if name is None:
+                axes.set_axis_off()
+                continue
+            words, unit = CHANNEL_WORDS[name]
+            key = strongest_input(runs, name)
+            _means(axes, runs, name, key)
+            axes.axhline(0.0, color=FAINT_INK, lw=0.7)
+            axes.set_title(f"{words} [{unit}]", loc="left", fontsize=8.5)
+            axes.set_xlabel(INPUT_LABELS[key])
+            axes.grid(axis="y")
+        _legend(figure, grid.ravel()[: len(names)])
+        return finished(figure, "Measured minus simulated, over the input on which it depends most")
+
+
+def parts_figure(parts: Sequence[PartValues]) -> Figure:
+    """Draw the value of each cause in thirds of the time and in halves of the runs."""
+    columns = min(COLUMNS, len(parts))
+    n_rows = math.ceil(len(parts) / columns)
+    with styled():
+        figure = new_figure(10.0, 0.8 + 1.6 * n_rows)
+        grid = figure.subplots(n_rows, columns, squeeze=False)
+        for axes, each in itertools.zip_longest(grid.ravel(), parts):
+            if each is None:
+                axes.set_axis_off()
+                continue
+            at = np.arange(len(each.parts))[::-1]
+            axes.axvspan(each.value.low, each.value.high, color=GRID, lw=0, label="all runs, 95 %")
+            values, half = (
+                np.array([getattr(part, key) for part in each.parts]) for key in ("value", "half")
+            )
+            axes.errorbar(values, at, xerr=np.nan_to_num(half), fmt="o", color=BLUE, ms=3.5, elinewidth=1.2)
+            axes.set_yticks(at, [part.name for part in each.parts])
+            axes.xaxis.set_major_locator(MaxNLocator(5))
+            axes.set_ylim(-0.6, len(at) - 0.4)
+            axes.set_title(
+                f"{each.value.name}: {quantity(each.value.name, each.value.value)}", loc="left", fontsize=8.5
+            )
+        _legend(figure, grid.ravel()[: len(parts)])
+        return finished(figure, "Values of the causes by thirds of the time and halves of the runs")
+
+
+def dependence_figure(runs: Sequence[ComparedRun], noise: Noise) -> Figure:
     """Draw the mean residual of each channel over each input, time and run."""
     names = channels_of(runs)
-    inputs = [name for name in runs[0].inputs if _spread(runs, name) > MIN_SPREAD]
+    inputs = [name for name in runs[0].inputs if spread_of(runs, name) > MIN_SPREAD]
     with styled():
         figure = new_figure(10.0, 1.15 + 1.2 * len(names))
         grid = figure.subplots(len(names), len(inputs) + 1, sharey="row", sharex="col", squeeze=False)
         for row, name in enumerate(names):
-            c = CHANNELS.index(name)
             words, unit = CHANNEL_WORDS[name]
-            for after, colour, kind in ((False, VERMILION, BEFORE), (True, BLUE, AFTER)):
-                if after and runs[0].after is None:
-                    continue
-                residuals = [run.residual(after)[:, c] for run in runs]
-                for axes, key in zip(grid[row], inputs, strict=False):
-                    _points(axes, *binned_means([run.inputs[key] for run in runs], residuals), colour, kind)
-                sizes = [noise.size(run.pace_mps)[:, c] for run in runs]
-                means = run_means(residuals, sizes, noise.filters[c])
-                _points(grid[row, -1], np.arange(1.0, len(runs) + 1), *means, colour, kind, joined=False)
+            for axes, key in zip(grid[row], inputs, strict=False):
+                _means(axes, runs, name, key)
+            _run_axis(grid[row, -1], runs, noise, name)
             for axes in grid[row]:
                 axes.axhline(0.0, color=FAINT_INK, lw=0.7)
                 axes.yaxis.set_major_locator(MaxNLocator(3))
@@ -196,21 +241,38 @@ def dependence_figure(runs: Sequence[ShownRun], noise: Noise) -> Figure:
                 axes.tick_params(labelsize=7)
                 axes.grid(axis="y")
             grid[row, 0].set_title(f"{words} [{unit}]", loc="left", fontsize=8.5)
-        for axes, key in zip(grid[-1], [*inputs, "run"], strict=True):
+        last = "run" if len(runs) <= MANY_RUNS else "number of runs"
+        for axes, key in zip(grid[-1], [*(INPUT_LABELS[name] for name in inputs), last], strict=True):
             axes.set_xlabel(key, fontsize=8)
-        grid[-1, -1].set_xlim(0.3, len(runs) + 0.7)
         grid[-1, -1].xaxis.set_major_locator(MaxNLocator(3, integer=True))
         _legend(figure, grid.ravel())
         return finished(figure, "What the residual depends on: its mean and the 95 % interval of it, by bins")
 
 
-def _spread(runs: Sequence[ShownRun], key: str) -> float:
-    values = np.concatenate([run.inputs[key] for run in runs])
-    known = values[np.isfinite(values)]
-    if not known.size:
-        return 0.0
-    low, high = input_range(known)
-    return high - low
+def _kinds(runs: Sequence[ComparedRun]) -> list[tuple[bool, str, str]]:
+    """Return before and, where anything was built in, after: with its colour and label."""
+    return [(False, VERMILION, BEFORE), *([(True, BLUE, AFTER)] if runs[0].after is not None else [])]
+
+
+def _means(axes: Axes, runs: Sequence[ComparedRun], channel: str, key: str) -> None:
+    c = CHANNELS.index(channel)
+    for after, colour, kind in _kinds(runs):
+        residuals = [run.residual(after)[:, c] for run in runs]
+        _points(axes, *binned_means([run.inputs[key] for run in runs], residuals), colour, kind)
+
+
+def _run_axis(axes: Axes, runs: Sequence[ComparedRun], noise: Noise, channel: str) -> None:
+    """Draw the mean of each run, or of many runs how their means are distributed."""
+    c = CHANNELS.index(channel)
+    for after, colour, kind in _kinds(runs):
+        residuals = [run.residual(after)[:, c] for run in runs]
+        sizes = [noise.size(run.pace_mps)[:, c] for run in runs]
+        means, halves = run_means(residuals, sizes, noise.filters[c])
+        if len(runs) <= MANY_RUNS:
+            _points(axes, np.arange(1.0, len(runs) + 1), means, halves, colour, kind, joined=False)
+            continue
+        known = means[np.isfinite(means)]
+        axes.hist(known, bins=20, orientation="horizontal", histtype="step", color=colour, lw=1.1, label=kind)
 
 
 def _points(

@@ -8,11 +8,17 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from pipelines.explain.wording import terrain_notes
+from terrain.discrepancy.compared import ComparedRun
 from terrain.discrepancy.filter_gain import Comparison
 from terrain.discrepancy.gain import Gain
+from terrain.discrepancy.nameless import Nameless
 from terrain.discrepancy.noise import Noise
+from terrain.discrepancy.parts import PartValues
 from terrain.discrepancy.residuals import LowPass
+from terrain.discrepancy.response_slopes import Slope
+from terrain.discrepancy.signals import Signals
 from terrain.discrepancy.simulation import Simulation
+from terrain.discrepancy.statements import Statement
 from terrain.discrepancy.terrain_match import TerrainMatch
 from terrain.discrepancy.trials.scoring import Score
 from terrain.discrepancy.trials.trial import Trial
@@ -29,18 +35,25 @@ class DiagnosedRuns:
     diagnosis : of the runs used
     simulation, extended : before and after; ``extended`` is None where no cause was named
     terrains : on which the runs of each label were simulated
-    used, held_out : runs behind the diagnosis, and those held out of it
-    noise, low_pass : of the runs behind the diagnosis
+    fit, used, held_out : runs behind the diagnosis, these and those excluded from it, and those held out
+    compared : fit runs beside the simulation
+    held_signals : of the runs held out, faults repaired
+    noise, low_pass : of the fit runs
+    parts : values of the causes in parts of the data
     """
 
     diagnosis: Diagnosis
     simulation: Simulation
     extended: Simulation | None
     terrains: tuple[TerrainMatch, ...]
+    fit: tuple[RunLog, ...]
     used: tuple[RunLog, ...]
     held_out: tuple[RunLog, ...]
+    compared: tuple[ComparedRun, ...]
+    held_signals: tuple[Signals, ...]
     noise: Noise
     low_pass: LowPass
+    parts: tuple[PartValues, ...]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,17 +65,22 @@ class HeldOutGain:
     gain : None where it was not measured
     reason : why it was not
     comparisons : by ``filter`` and ``classifier``; None for one that does not apply
+    nameless : what a nameless learner reaches on the same runs; None where none is held out
+    judged : held-out runs that are fit, beside the simulation
     """
 
     gain: Gain | None
     reason: str | None = None
     comparisons: Mapping[str, Comparison | None] = field(default_factory=dict)
+    nameless: Nameless | None = None
+    judged: tuple[ComparedRun, ...] = ()
 
     def as_json(self) -> dict[str, Any]:
         """Return the gain as JSON has it."""
+        nameless = {} if self.nameless is None else {"nameless": self.nameless.as_json()}
         if self.gain is None:
-            return {"measured": False, "reason": self.reason, **self.comparisons}
-        return {"measured": True, **self.gain.as_json(), **self.comparisons}
+            return {"measured": False, "reason": self.reason, **self.comparisons, **nameless}
+        return {"measured": True, **self.gain.as_json(), **self.comparisons, **nameless}
 
 
 class ExtendedDescription(NamedTuple):
@@ -90,6 +108,10 @@ class Explanation:
     gain : on the runs held out
     extended : None where no cause was named
     page : file
+    statements : a sentence a channel
+    terms : by cause, its value in quantities that the builder of the robot knows
+    next_command : that simulates the next drive; None where none is suggested
+    terrains_apart : measured over simulated by label, where labels clearly differ
     skipped : a sentence for each run that could not be read
     """
 
@@ -108,12 +130,16 @@ class Explanation:
     gain: HeldOutGain
     extended: ExtendedDescription | None
     page: Path
+    statements: tuple[Statement, ...] = ()
+    terms: Mapping[str, str] = field(default_factory=dict)
+    next_command: str | None = None
+    terrains_apart: Mapping[str, Slope] = field(default_factory=dict)
     skipped: tuple[str, ...] = ()
 
     @property
     def notes(self) -> tuple[str, ...]:
         """What a reader has to know of the terrains, in sentences."""
-        return terrain_notes(self.terrains)
+        return terrain_notes(self.terrains, self.terrains_apart)
 
     def as_json(self) -> dict[str, Any]:
         """Return the explanation as JSON has it."""
@@ -124,6 +150,9 @@ class Explanation:
             "built_in": self.built_in,
             "terrain_matches": self.terrains,
             "notes": self.notes,
+            "statements": [statement.as_json() for statement in self.statements],
+            "terms": self.terms,
+            "next_command": self.next_command,
             "effects": self.effects,
             "seed": self.seed,
             "used": self.used,

@@ -6,28 +6,40 @@ from collections.abc import Iterator
 
 from rich.console import Console
 
-from pipelines.explain.results import Explanation, TrialsResult
-from pipelines.explain.wording import effect_label, gain_text, quantity, verdict_text
+from pipelines.explain.results import Explanation, HeldOutGain, TrialsResult
+from pipelines.explain.wording import (
+    caveat_text,
+    effect_label,
+    gain_text,
+    unexplained_text,
+    varying_text,
+    verdict_text,
+)
 from pipelines.reporting.numbers import format_known, percent
+from pipelines.reporting.quantities import quantity
 from pipelines.reporting.terminal import compact_table, number_columns, print_lines, text_column
+from terrain.discrepancy.channel_words import CHANNEL_WORDS
 from terrain.discrepancy.filter_gain import Comparison
+from terrain.discrepancy.statements import split_ruled_out
 from terrain.discrepancy.trials.rows import Row
 from terrain.discrepancy.trials.scoring import FOUND_TRIALS
 from terrain.discrepancy.verdict import Cause, Diagnosis
 
 
 def print_explain(result: Explanation, console: Console) -> None:
-    """Print what the simulation lacks, with which evidence, the gain, and what could not be detected."""
+    """Print faults, a sentence a channel, the verdict, causes, gains, and what was withdrawn or is left."""
     diagnosis = result.diagnosis
-    print_lines(
-        console,
-        (f"{diagnosis.robot}, {diagnosis.n_runs} runs: {diagnosis.verdict.value}", verdict_text(diagnosis)),
-    )
+    print_lines(console, (f"{diagnosis.robot}, {diagnosis.n_runs} runs: {diagnosis.verdict.value}",))
+    print_lines(console, (f"fault: {fault.sentence}" for fault in diagnosis.faults))
+    print_lines(console, (f"- {statement.text}" for statement in result.statements))
+    print_lines(console, (verdict_text(diagnosis),))
     if diagnosis.causes:
         _print_causes(diagnosis.causes, console)
+    _print_gain(result.gain, console)
     print_lines(console, _diagnosis_lines(diagnosis))
     print_lines(console, result.notes)
-    print_lines(console, _gain_lines(result))
+    if result.next_command is not None:
+        print_lines(console, (f"what to drive next: {result.next_command}",))
     print_lines(console, result.skipped)
     if result.extended is not None:
         print_lines(console, (f"extended description: {result.extended.file}",))
@@ -49,15 +61,41 @@ def _print_causes(causes: tuple[Cause, ...], console: Console) -> None:
     console.print(table)
 
 
+def _print_gain(found: HeldOutGain, console: Console) -> None:
+    gain, nameless = found.gain, found.nameless
+    if gain is None:
+        print_lines(console, (f"gain on held-out runs not measured: {found.reason}",))
+    else:
+        columns = number_columns("rms before", "after", "square less by", "95 %", "nameless learner")
+        table = compact_table(text_column("channel"), *columns)
+        for name, each in gain.channels.items():
+            label, unit = CHANNEL_WORDS[name]
+            learned = None if nameless is None else nameless.channels.get(name)
+            table.add_row(
+                label,
+                f"{each.rms_before:.3g} {unit}",
+                f"{each.rms_after:.3g}",
+                percent(each.reduction.ratio),
+                f"{each.reduction.low:.1%} to {each.reduction.high:.1%}",
+                "" if learned is None else percent(learned.ratio),
+            )
+        console.print(table)
+        print_lines(console, (gain_text(gain),))
+    if nameless is not None:
+        print_lines(console, (nameless.sentence,))
+    trained = found.comparisons.get("classifier")
+    if trained is not None:
+        text = _accuracy_text(trained)
+        print_lines(console, (f"classifier trained in simulation, on measured runs: {text}",))
+
+
 def _diagnosis_lines(diagnosis: Diagnosis) -> Iterator[str]:
-    for left in diagnosis.unexplained:
-        yield f"unexplained: {left.channel} depends on {left.input}"
-    if diagnosis.not_excited:
-        names = ", ".join(limit.name for limit in diagnosis.not_excited)
-        yield f"the driving would not have shown: {names}"
+    varying = {each.name for each in diagnosis.varying}
     for cause in diagnosis.causes:
         if cause.aliases:
             yield f"no log distinguishes {cause.name} from {', '.join(cause.aliases)}"
+        if cause.caveat and cause.name not in varying:
+            yield f"{effect_label(cause.name)}: {caveat_text(cause.caveat)}"
     for effects in diagnosis.ambiguous_sets:
         values = ", ".join(
             f"{name} {quantity(each.name, each.value)}"
@@ -65,22 +103,18 @@ def _diagnosis_lines(diagnosis: Diagnosis) -> Iterator[str]:
             for each in diagnosis.ambiguous_values.get(name, ())
         )
         yield f"one of: {values}"
-    if diagnosis.next_drive is not None:
-        drive = ", ".join(f"{key} {value}" for key, value in diagnosis.next_drive._asdict().items())
-        yield f"what to drive next: {drive}"
+    for effect in split_ruled_out(diagnosis)[0]:
+        values = ", ".join(quantity(each.name, each.value) for each in effect.values)
+        yield f"withdrawn: {effect_label(effect.name)} {values}: {effect.reason}"
+    for each in diagnosis.varying:
+        yield varying_text(each)
+    for left in diagnosis.unexplained:
+        yield f"unexplained: {left.channel} {unexplained_text(left, diagnosis)}"
+    if diagnosis.not_excited:
+        names = ", ".join(limit.name for limit in diagnosis.not_excited)
+        yield f"the driving would not have shown: {names}"
     for run in diagnosis.excluded_runs:
         yield f"excluded: {run.run_id}: {run.reason}"
-
-
-def _gain_lines(result: Explanation) -> Iterator[str]:
-    gain = result.gain
-    if gain.gain is None:
-        yield f"gain on held-out runs not measured: {gain.reason}"
-        return
-    yield gain_text(gain.gain)
-    trained = gain.comparisons.get("classifier")
-    if trained is not None:
-        yield f"classifier trained in simulation, on measured runs: {_accuracy_text(trained)}"
 
 
 def _accuracy_text(trained: Comparison) -> str:

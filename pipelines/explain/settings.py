@@ -28,7 +28,20 @@ class ExplainSettings(AlignedRunsSettings):
     classifier: bool = setting(
         False, "Also train a classifier in simulation, before and after; takes a minute."
     )
+    pictures: str = setting("12", "Most pictures of the page: a number, or 'all' for one of every run too.")
     seed: int = setting(0, "Of the choice of held-out runs, and of the bootstrap.", ge=0)
+
+    @field_validator("pictures")
+    @classmethod
+    def _check_pictures(cls, pictures: str) -> str:
+        if pictures != "all" and not pictures.isdecimal():
+            raise ValueError(f"--pictures is {pictures!r}; a number or 'all' is required")
+        return pictures
+
+    @property
+    def max_pictures(self) -> int | None:
+        """Most pictures; None for all."""
+        return None if self.pictures == "all" else int(self.pictures)
 
 
 class TrialsSettings(Settings):

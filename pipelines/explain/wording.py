@@ -3,43 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
-from pipelines.reporting.numbers import NBSP, NOT_KNOWN, format_number
+from pipelines.reporting.numbers import NBSP
+from pipelines.reporting.quantities import enumerated, percentage, percentage_interval, quantity
+from terrain.discrepancy.channel_words import CHANNEL_WORDS
 from terrain.discrepancy.gain import Gain
+from terrain.discrepancy.response_slopes import Slope
 from terrain.discrepancy.terrain_match import TerrainMatch
-from terrain.discrepancy.verdict import Diagnosis, Limit, Value
+from terrain.discrepancy.verdict import Diagnosis, Limit, Unexplained, Value, Varying
 from terrain.effects import PARAMETER
 
-CHANNEL_WORDS = {
-    "yaw_rate_radps": ("yaw rate, gyro", "rad/s"),
-    "speed_x_mps": ("speed ahead", "m/s"),
-    "speed_y_mps": ("speed to the left", "m/s"),
-    "accel_x_mps2": ("accelerometer ahead", "m/s²"),
-    "current_a": ("sum of the currents", "A"),
-    "turning_current_a": ("right minus left current", "A"),
-    "heading_rate_radps": ("heading rate, no gyro", "rad/s"),
-}
-"""What a channel is called, and its unit."""
-
-SI = {
-    "ratio": "",
-    "radps": "rad/s",
-    "rad": "rad",
-    "mps2": "m/s²",
-    "m": "m",
-    "s": "s",
-    "s2": "s²",
-    "a": "A",
-    "nspm": "N s/m",
-}
-"""How pages write the last word of a parameter's name."""
-
-SMALL = {"rad": "mrad", "radps": "mrad/s", "s": "ms", "m": "mm"}
-"""Units of a thousandth."""
-
-TINY = 1e-12
-"""Ends of an interval below this are shown as 0: rounding of two equal numbers."""
+SHOWN_RUNS = 5
+"""Names of runs that a sentence lists."""
 
 
 def effect_label(effect: str) -> str:
@@ -58,39 +34,6 @@ def channel_label(channel: str) -> str:
     return CHANNEL_WORDS[channel][0]
 
 
-def unit_label(unit: str) -> str:
-    """Return how a page writes a unit.
-
-    Examples
-    --------
-    >>> unit_label("radps"), unit_label("ratio")
-    ('rad/s', '')
-    """
-    return SI.get(unit, unit)
-
-
-def quantity(parameter: str, value: float) -> str:
-    r"""Return a value with its unit, two digits.
-
-    Examples
-    --------
-    >>> quantity("gyro_bias_radps", 0.0031), quantity("wheel_radius_ratio", 0.004)
-    ('3.1\xa0mrad/s', '0.4\xa0%')
-    >>> quantity("scrub_ratio", 0.02)
-    '0.02'
-    >>> quantity("lever_x_m", math.nan)
-    '–'
-    """
-    if not math.isfinite(value):
-        return NOT_KNOWN
-    if parameter in PARAMETER and PARAMETER[parameter].as_percent:
-        return f"{two_digits(100.0 * value)}{NBSP}%"
-    unit = parameter.rpartition("_")[2]
-    if unit in SMALL and abs(value) < 0.0995:
-        return f"{two_digits(1000.0 * value)}{NBSP}{SMALL[unit]}"
-    return f"{two_digits(value)}{NBSP}{SI.get(unit, unit)}".strip(NBSP)
-
-
 def value_with_interval(value: Value) -> str:
     r"""Return a value and its interval.
 
@@ -103,43 +46,44 @@ def value_with_interval(value: Value) -> str:
     return f"{quantity(value.name, value.value)} ({low} to {high})"
 
 
-def two_digits(value: float) -> str:
-    """Return a number with two digits."""
-    return format_number(float(f"{value:.2g}"))
-
-
-def number(value: float | None) -> str:
-    """Return a number with three digits, or a mark where it is not known."""
-    return NOT_KNOWN if value is None or not math.isfinite(value) else format_number(value)
-
-
-def percentage(ratio: float) -> str:
-    """Return a ratio as a percentage with two digits, or a mark where it is not known."""
-    return NOT_KNOWN if not math.isfinite(ratio) else f"{two_digits(100.0 * ratio)}{NBSP}%"
-
-
-def percentage_interval(low: float, high: float) -> str:
-    """Return an interval of ratios."""
-    return f"{percentage(low)} to {percentage(high)}"
-
-
-def interval(low: float, high: float) -> str:
-    """Return an interval of numbers, or a mark where it is not known."""
-    if not (math.isfinite(low) and math.isfinite(high)):
-        return NOT_KNOWN
-    low, high = (end if abs(end) > TINY else 0.0 for end in (low, high))
-    return f"{format_number(low)} to {format_number(high)}"
-
-
-def enumerated(names: Sequence[str], last: str = "and") -> str:
-    """Return names as a sentence lists them.
+def caveat_text(caveat: str) -> str:
+    r"""Return a caveat with units as pages write them.
 
     Examples
     --------
-    >>> enumerated(["a", "b", "c"]), enumerated(["a"])
-    ('a, b and c', 'a')
+    >>> caveat_text("it differs from run to run by 0.34 ratio")
+    'it differs from run to run by 0.34'
     """
-    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} {last} {names[-1]}"
+    return caveat.replace(" ratio", "").replace(" s2", f"{NBSP}s²")
+
+
+def varying_text(each: Varying) -> str:
+    """Return how an effect differs from run to run, in a sentence or two."""
+    mean, scatter = (quantity(each.parameter, value) for value in (each.mean, each.scatter))
+    text = (
+        f"The {effect_label(each.name)} differs from run to run: {mean} on average, with a standard "
+        f"deviation of {scatter}."
+    )
+    if each.groups:
+        parts = []
+        for group in each.groups:
+            n, shown = len(group.run_ids), ", ".join(group.run_ids[:SHOWN_RUNS])
+            more = ", ..." if n > SHOWN_RUNS else ""
+            runs = f"{n} run{'s' * (n != 1)} ({shown}{more})"
+            parts.append(f"{quantity(each.parameter, group.value)} in {runs}")
+        text += f" Two groups: {', and '.join(parts)}."
+    if each.rivals:
+        rivals = enumerated(list(map(effect_label, each.rivals)), "or")
+        text += f" These runs do not distinguish that from {rivals}."
+    return text
+
+
+def unexplained_text(left: Unexplained, diagnosis: Diagnosis) -> str:
+    """Return what a channel depends on: an input, or what resembles an effect that was withdrawn."""
+    withdrawn = {effect.name for effect in diagnosis.ruled_out if effect.values}
+    if left.input in withdrawn:
+        return f"resembles {effect_label(left.input)}, which was withdrawn"
+    return f"depends on {left.input}"
 
 
 def verdict_text(diagnosis: Diagnosis) -> str:
@@ -157,6 +101,9 @@ def verdict_text(diagnosis: Diagnosis) -> str:
         "distinguish them."
         for names in diagnosis.ambiguous_sets
     ]
+    if diagnosis.varying:
+        names = [effect_label(each.name) for each in diagnosis.varying]
+        sentences.append(f"The size of {enumerated(names)} differs from run to run.")
     if diagnosis.unexplained:
         channels = dict.fromkeys(channel_label(left.channel) for left in diagnosis.unexplained)
         also = " also" if sentences else ""
@@ -175,10 +122,9 @@ def gain_text(gain: Gain) -> str:
     """Return what an extension gains in a sentence."""
     n = len(gain.run_ids)
     runs = f"{n} held-out runs" if n != 1 else "one held-out run"
+    low_high = percentage_interval(gain.reduction.low, gain.reduction.high)
     ratio = percentage(gain.reduction.ratio)
-    reduction = (
-        f"{ratio} of the squared residual ({percentage_interval(gain.reduction.low, gain.reduction.high)})"
-    )
+    reduction = f"{ratio} of the squared residual after whitening ({low_high})"
     if gain.refused:
         return f"On {runs} no gain can be claimed: {reduction}, an interval that includes zero."
     return f"On {runs} the extension removes {reduction}."
@@ -212,15 +158,28 @@ def limit_text(limit: Limit, missed: bool) -> str:
     return f"{article} {name} {under} would not have been detected."
 
 
-def terrain_notes(matches: Sequence[TerrainMatch]) -> tuple[str, ...]:
-    """Return a sentence for each terrain on which only a part of the measured tilt acts as a slope."""
-    return tuple(
+def terrain_notes(matches: Sequence[TerrainMatch], apart: Mapping[str, Slope]) -> tuple[str, ...]:
+    """Return what a reader has to know of the terrains, in sentences.
+
+    Parameters
+    ----------
+    matches : on which the runs of each label were simulated
+    apart : measured over simulated by label, where labels clearly differ
+    """
+    notes = [
         f"On {match.terrain} runs fit best if {100.0 * match.effective_ratio:.0f} % of the measured tilt "
         "is a slope to drive up; the rest is attributed to a body that rides over bumps, which takes no "
         "traction."
         for match in matches
         if match.effective_ratio is not None and match.effective_ratio < 1.0
-    )
+    ]
+    if apart:
+        each = enumerated([f"{slope.ratio:.2f} on {label}" for label, slope in apart.items()])
+        notes.append(
+            f"Terrains differ: measured over simulated is {each}. Explain each by itself with "
+            f"{enumerated([f'--terrain {label}' for label in apart], 'or')}."
+        )
+    return tuple(notes)
 
 
 def terrain_text(matches: Sequence[TerrainMatch]) -> str:

@@ -7,12 +7,10 @@ from typing import NamedTuple
 import numpy as np
 
 from terrain.discrepancy.answers import INTERVAL_T
-from terrain.discrepancy.residuals import LowPass, Rows, rows_of
-from terrain.discrepancy.signals import signals_of
 from terrain.discrepancy.simulation import Simulation
 from terrain.discrepancy.verdict import Diagnosis
 from terrain.errors import ConfigError
-from terrain.records import Array, RunLog
+from terrain.records import Array
 from terrain.robots import Robot
 
 
@@ -82,15 +80,3 @@ def extended_effects(robot: Robot, diagnosis: Diagnosis) -> ExtendedEffects:
         for name, half in zip(names, halves, strict=True)
     }
     return ExtendedEffects(values, cov, intervals)
-
-
-def rows_before_after(
-    simulation: Simulation, extended: Simulation | None, run: RunLog, low_pass: LowPass
-) -> tuple[Rows, Rows | None]:
-    """Return a low-pass filtered run beside the simulation, and beside the extended one if any."""
-    signals = signals_of(run, simulation.robot)
-    planar = simulation.planar_on(signals.terrain)
-    before = rows_of(signals, planar, simulation.vector, (), low_pass)
-    if extended is None:
-        return before, None
-    return before, rows_of(signals, planar, extended.vector, (), low_pass)

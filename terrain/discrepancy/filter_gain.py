@@ -14,7 +14,7 @@ from terrain.discrepancy.simulation import Simulation
 from terrain.errors import TerrainError
 from terrain.estimation.estimate import Estimate, estimate_run
 from terrain.estimation.summary import summarize
-from terrain.records import RunLog
+from terrain.records import Array, RunLog
 from terrain.robots import Robot
 
 FILTERS = {"swerve": "vio12", "skid_steer": "skid"}
@@ -101,3 +101,27 @@ def _errors(found: Estimate) -> tuple[float, ...]:
     rms = [math.sqrt(float(np.nanmean(square))) for square in squares.values()]
     slip_error = abs(summary.slip_mean - summary.slip_true_mean)
     return (*rms, slip_error if summary.slip_observable else math.nan)
+
+
+def accuracy_change(before: Array, after: Array, run_id: Array, seed: int) -> Change:
+    """Return accuracies before and after, and the 95 % interval of their difference.
+
+    Parameters
+    ----------
+    before, after : (n,) whether each window is classified correctly
+    run_id : (n,) run of each window
+    seed : of the bootstrap over runs
+
+    Examples
+    --------
+    >>> before, after = np.array([0, 0, 1, 1]), np.array([1, 1, 1, 1])
+    >>> accuracy_change(before, after, np.array(["a", "a", "b", "b"]), 0)
+    Change(before=0.5, after=1.0, change_ci=(0.0, 1.0))
+    """
+    runs, of = np.unique(run_id, return_inverse=True)
+    n = len(runs)
+    windows = np.bincount(of, minlength=n)
+    change = np.bincount(of, weights=after.astype(float) - before.astype(float), minlength=n)
+    counts = bootstrap_counts(n, N_BOOTSTRAP, seed)
+    interval = percentile_interval((counts @ change) / (counts @ windows))
+    return Change(float(before.mean()), float(after.mean()), interval)

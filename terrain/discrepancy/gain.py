@@ -14,7 +14,7 @@ from terrain.discrepancy.information import N_BLOCKS, Information, information_a
 from terrain.discrepancy.residuals import low_pass_of, measured_channels
 from terrain.discrepancy.search import names_of
 from terrain.discrepancy.selection import MIN_CLUSTERS
-from terrain.discrepancy.signals import signals_of
+from terrain.discrepancy.signals import Signals, signals_of
 from terrain.discrepancy.simulation import Simulation
 from terrain.discrepancy.verdict import finite
 from terrain.effects import CHANNELS
@@ -127,19 +127,15 @@ def gain(simulation: Simulation, extended: Simulation, runs: Sequence[RunLog], s
         raise ConfigError(
             f"the extension is of the robot {extended.robot.name!r}, not of {simulation.robot.name!r}"
         )
-    if not runs:
-        raise DataError("gain: there is no run that was not used in the diagnosis")
-    signals = tuple(signals_of(run, simulation.robot) for run in runs)
+    return gain_of_signals(simulation, extended, [signals_of(run, simulation.robot) for run in runs], seed)
+
+
+def gain_of_signals(
+    simulation: Simulation, extended: Simulation, runs: Sequence[Signals], seed: int = 0
+) -> Gain:
+    """Return the same for runs that are on one clock already; see :func:`gain`."""
+    signals, excluded, after = fit_to_judge(extended, runs)
     low_pass = low_pass_of(signals)
-    names = names_of(extended.library)
-    after = information_at(signals, extended, extended.vector, names, low_pass)
-    excluded = unfit_runs(signals, after) if len(signals) >= MIN_JUDGED else ()
-    if excluded:
-        gone = {run.run_id for run in excluded}
-        signals = tuple(run for run in signals if run.run_id not in gone)
-        if not signals:
-            raise DataError(f"gain: none of {len(runs)} runs is fit to be compared ({excluded[0].reason})")
-        after = information_at(signals, extended, extended.vector, names, low_pass)
     before = information_at(signals, simulation, simulation.vector, (), low_pass, after.statistics)
     by_run = len(signals) >= MIN_CLUSTERS
     weights = bootstrap_counts(len(signals) * (1 if by_run else N_BLOCKS), N_BOOTSTRAP, seed)
@@ -166,6 +162,36 @@ def gain(simulation: Simulation, extended: Simulation, runs: Sequence[RunLog], s
         channels,
         _reduction(cost[0], cost[1], weights),
     )
+
+
+def fit_to_judge(
+    simulation: Simulation, runs: Sequence[Signals]
+) -> tuple[tuple[Signals, ...], tuple[Excluded, ...], Information]:
+    """Return the runs that are fit to be judged on, those that are not, and the information of the first.
+
+    Parameters
+    ----------
+    simulation : with the causes built in, if there are any
+    runs : that were not used in the diagnosis
+
+    Raises
+    ------
+    DataError
+        if there is no run, or none is fit.
+    """
+    signals = tuple(runs)
+    if not signals:
+        raise DataError("gain: there is no run that was not used in the diagnosis")
+    low_pass, names = low_pass_of(signals), names_of(simulation.library)
+    info = information_at(signals, simulation, simulation.vector, names, low_pass)
+    excluded = unfit_runs(signals, info) if len(signals) >= MIN_JUDGED else ()
+    if excluded:
+        gone = {run.run_id for run in excluded}
+        signals = tuple(run for run in signals if run.run_id not in gone)
+        if not signals:
+            raise DataError(f"gain: none of {len(runs)} runs is fit to be compared ({excluded[0].reason})")
+        info = information_at(signals, simulation, simulation.vector, names, low_pass)
+    return signals, tuple(excluded), info
 
 
 def _squares(residuals: Sequence[Array], by_run: bool) -> Array:

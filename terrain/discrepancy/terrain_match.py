@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -9,7 +10,7 @@ from terrain.discrepancy.signals import signals_of
 from terrain.discrepancy.simulation import Simulation
 from terrain.discrepancy.tilt import with_effective_tilt
 from terrain.effects import Effect
-from terrain.errors import ConfigError
+from terrain.errors import ConfigError, DataError
 from terrain.records import RunLog
 from terrain.robots import Robot
 from terrain.simulation.planar.ground import planar_ground
@@ -65,3 +66,40 @@ def _ground(robot: Robot, label: str) -> Ground | None:
         return planar_ground(robot, load_soil(label))
     except ConfigError:  # the robot would get stuck on it
         return None
+
+
+def runs_of_terrain(runs: Sequence[RunLog], terrain: str | None) -> list[RunLog]:
+    """Return the runs that are of one label throughout; all of them where none is asked for.
+
+    Raises
+    ------
+    DataError
+        if there is no such run.
+    """
+    if not runs:
+        raise DataError("there is no run to explain")
+    if terrain is None:
+        return list(runs)
+    chosen = [run for run in runs if run.terrains == (terrain,)]
+    if not chosen:
+        labels = sorted({name for run in runs for name in run.terrains})
+        raise DataError(
+            f"no run is labelled {terrain!r} throughout; labels are {', '.join(labels) if labels else 'none'}"
+        )
+    return chosen
+
+
+def check_robots(runs: Sequence[RunLog], robot: Robot) -> None:
+    """Make sure that all runs are of the robot.
+
+    Raises
+    ------
+    DataError
+        if some are of another.
+    """
+    others = Counter(run.robot for run in runs if run.robot != robot.name)
+    if others:
+        (name, n), *_ = others.most_common(1)
+        raise DataError(
+            f"{n} of {len(runs)} runs are of the robot {name!r}; the simulation is of {robot.name!r}"
+        )

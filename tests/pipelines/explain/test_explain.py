@@ -110,7 +110,16 @@ def test_the_hidden_cause_is_named_built_in_and_absent_when_tested_again(terrain
     assert re.findall(r'(?:src|href)="(?!data:)', page) == []
     pictures = {path.name for path in (tmp_path / "found" / "pictures").iterdir()}
     assert {"stretch.svg", "shares.png", "spectra.png", "dependence.png"} <= pictures
-    assert sum(name.startswith("run_") for name in pictures) == 7
+    assert len({name.rpartition(".")[0] for name in pictures}) == 12
+    (statement,) = [each for each in found["statements"] if each["channel"] == "speed_y_mps"]
+    assert statement["causes"] == ["camera_yaw"]
+    assert "with the camera turned 2.3° to the right its error falls from" in statement["text"]
+    assert statement["text"] in out
+    assert statement["rms_after"] < 0.5 * statement["rms_before"]
+    nameless = found["gain"]["nameless"]["channels"]["speed_y_mps"]
+    assert nameless["named_reduction"] == pytest.approx(
+        found["gain"]["channels"]["speed_y_mps"]["reduction"], abs=0.01
+    )
 
     extended = tmp_path / "found" / EXTENDED_FILE
     assert load_robot(extended).effects == pytest.approx({"camera_yaw_rad": value["value"]}, rel=1e-6)
@@ -135,8 +144,9 @@ def test_of_few_runs_none_is_held_out_by_default_and_the_same_seed_gives_the_sam
     for i in range(4):
         write_run(a_run(i), few)
     words = ("--data", few, "--robot", "husky", "--json", "j.json", "--effects", "camera_yaw")
-    code, out, err = terrain(*words, "--out", "none")
+    code, out, err = terrain(*words, "--out", "none", "--pictures", "all")
     assert code == 0, err
+    assert len(list((tmp_path / "none" / "pictures").glob("run_*"))) == 4
     assert "gain on held-out runs not measured: no run was held out" in out
     pages = []
     for out in ("a", "b"):
@@ -153,6 +163,7 @@ def test_a_users_mistake_is_one_sentence_and_nothing_is_written(refused, data, t
     refused("effect 'gravity' is unknown", *here, "--effects", "gravity")
     refused("does not apply to a robot with the drive 'skid_steer'", *here, "--effects", "steering_backlash")
     refused("--effects names none", *here, "--effects", ",")
+    refused("--pictures is 'few'; a number or 'all' is required", *here, "--pictures", "few")
     refused("no run is labelled 'sand' throughout; labels are field", *here, "--terrain", "sand")
     refused("--hold-out is 5 of 7 runs; the diagnosis requires at least 3", *here, "--hold-out", "5")
     refused("7 of 7 runs are of the robot 'husky'", *here[:2], "--robot", "agrimaro", "--out", "out")

@@ -2,12 +2,14 @@
 
 import json
 import re
+from dataclasses import replace
 from html import unescape
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from pipelines.explain.explain import next_command
 from pipelines.explain.page import explain_page, figure_view
 from pipelines.explain.results import Explanation, HeldOutGain
 from pipelines.explain.view import RunPicture
@@ -17,7 +19,11 @@ from pipelines.reporting.numbers import NOT_KNOWN
 from pipelines.reporting.pictures import png_image
 from terrain.discrepancy.filter_gain import Change, Comparison
 from terrain.discrepancy.gain import ChannelGain, Gain, Reduction
+from terrain.discrepancy.health.faults import Column, Fault, FaultKind
 from terrain.discrepancy.health.runs import Clock, Excluded
+from terrain.discrepancy.nameless import Learned, Nameless
+from terrain.discrepancy.response_slopes import Slope
+from terrain.discrepancy.statements import Statement
 from terrain.discrepancy.verdict import (
     Cause,
     Diagnosis,
@@ -25,8 +31,10 @@ from terrain.discrepancy.verdict import (
     NextDrive,
     Residual,
     RuledOut,
+    RunGroup,
     Unexplained,
     Value,
+    Varying,
     Verdict,
 )
 
@@ -111,13 +119,35 @@ def test_a_cause_is_shown_with_value_interval_gain_and_aliases():
     assert "Values are added to what the description has already" in text
 
 
-def test_figures_come_before_tables_and_nothing_is_fetched():
+def test_sentences_come_first_then_gains_then_withdrawn_then_pictures_and_nothing_is_fetched():
     runs = [
         RunPicture("first", "pictures/a.png", png_image(b"png", "first")),
         RunPicture("2 > 1", 'pictures/"b".png', None),
     ]
-    page = page_of(a_result(a_gain(), causes=(a_cause(),)), runs)
-    assert 0 < page.index("<img") < page.index("<table")
+    fault = Fault(FaultKind.SIGN, Column.GYRO, ("r3",), -1.0, "the gyro's sign is turned", "multiply", None)
+    withdrawn = RuledOut("clock_offset", "it changes", 9.0, (Value("clock_offset_s", 0.1, "s", 0.09, 0.11),))
+    statement = Statement(
+        "speed_x_mps", Slope(0.5, 0.1), (), 0.2, 0.1, "", "speed ahead: it drives too fast.", True
+    )
+    result = a_result(
+        a_gain(), causes=(a_cause(),), faults=(fault,), ruled_out=(withdrawn,), not_excited=LIMITS[1:]
+    )
+    page = page_of(replace(result, statements=(statement,)), runs)
+    marks = [
+        "The gyro&#39;s sign is turned.",
+        "<b>Speed ahead</b>: it drives too fast.",
+        "The simulation lacks",
+    ]
+    marks += [
+        "Gain on held-out runs",
+        "Withdrawn",
+        "0.1\xa0s (90\xa0ms to 0.11\xa0s)",
+        "<img",
+        "Not excited",
+        "Where these",
+    ]
+    places = [page.index(mark) for mark in marks]
+    assert places == sorted(places)
     assert re.findall(r'(?:src|href)="(?!data:)([^"]*)', page) == ["pictures/&#34;b&#34;.png"]
     assert "<script" not in page
     assert "<summary>first</summary>" in page
@@ -132,6 +162,10 @@ def test_a_gain_that_is_refused_is_not_claimed():
     assert "no gain to claim" in text
     worse = a_gain(refused=True, high=-0.05)
     assert "worse than before" in text_of(page_of(a_result(worse, causes=(a_cause(),))))
+    learned = Nameless(2, {"speed_x_mps": Learned(0.02, 0.01, 0.76, 0.75, -0.02)}, 0.76, 0.75)
+    text = text_of(page_of(a_result(replace(a_gain(), nameless=learned), causes=(a_cause(),))))
+    assert "speed ahead m/s 0.02 0.01 75 % 70 % to 80 % 76 %" in text.replace("\xa0", " ")
+    assert "a nameless learner 76 %: little is left to find." in text
     bare = text_of(page_of(a_result()))
     assert "The gain on held-out runs was not measured: nothing was built in." in bare
 
@@ -186,7 +220,7 @@ def test_unexplained_channels_effects_not_excited_and_excluded_runs_are_shown():
         "The residual is systematic, without a known cause, in sum of the currents and speed ahead." in text
     )
     assert "Of 3 parameters that may be wrong, 2 could not have been detected." in text
-    assert "sum of the currents wheel 1 turn 12.3 20 %" in text
+    assert "sum of the currents depends on wheel 1 turn 12.3 20 %" in text
     assert "A payload of any size would not have been detected." in text
     assert "A clock rate of any size that is likely (up to 2 %) would not have been detected." in text
     assert "A steering offset 1 under 3 mrad would not have been detected." in text
@@ -228,3 +262,27 @@ def test_json_holds_null_where_nothing_is_known():
     assert (shown["gain"]["measured"], shown["gain"]["ci"]) == (True, [0.4, 0.6])
     assert set(shown["gain"]["filter"]) == {"name", "reason", "n_runs", "errors"}
     assert as_json(a_result())["gain"] == {"measured": False, "reason": "nothing was built in"}
+
+
+def test_an_effect_that_differs_from_run_to_run_is_given_with_its_groups_and_rivals():
+    groups = RunGroup(0.0, 0.01, ("a", "b")), RunGroup(0.3, 0.01, tuple("cdefgh"))
+    each = Varying("payload", "payload_ratio", "ratio", ("scrub",), 0.1, 0.14, 9.0, groups, "current_a")
+    result = a_result(verdict=Verdict.VARIES, varying=(each,))
+    text = text_of(page_of(result)).replace("\xa0", " ")
+    assert "The size of payload differs from run to run." in text
+    assert "10 % on average, with a standard deviation of 14 %." in text
+    assert "Two groups: 0 % in 2 runs (a, b), and 30 % in 6 runs (c, d, e, f, g, ...)." in text
+    assert "These runs do not distinguish that from scrub." in text
+
+
+def test_the_next_drive_is_a_command_and_terrains_that_differ_are_named():
+    result = a_result(next_drive=NextDrive("climb", 6.0, "it parts them"))
+    assert next_command(result.diagnosis, "my robot.yaml", ()) == (
+        "terrain simulate --robot 'my robot.yaml' --terrain grass --scenario climb --grade 6 --runs 8 "
+        "--out next_drive"
+    )
+    apart = {"ice": Slope(0.4, 0.01), "snow": Slope(0.5, 0.01)}
+    text = text_of(page_of(replace(result, next_command="terrain simulate", terrains_apart=apart)))
+    assert "In simulation first: terrain simulate" in text
+    assert "measured over simulated is 0.40 on ice and 0.50 on snow." in text
+    assert "Explain each by itself with --terrain ice or --terrain snow." in text

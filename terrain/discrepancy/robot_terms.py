@@ -1,0 +1,212 @@
+"""The value of an effect in quantities that the builder of a robot knows: a track in m, a lag of the wheels.
+
+A value is added to what the description has already, and the description's number stands beside the sum:
+where that number is assumed, only the sum was measured.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+
+from terrain.discrepancy.verdict import Value
+from terrain.effects import PARAMETER, effect_named
+from terrain.extension import Basis, Origin, basis_of
+from terrain.robots import Robot
+
+EXAMPLE_RADPS, EXAMPLE_MPS = 0.5, 1.0
+"""The turn and the speed at which losses that grow with them are stated."""
+
+UNITS = {
+    "ratio": "",
+    "radps": "rad/s",
+    "mps2": "m/s²",
+    "s2": "s²",
+    "a": "A",
+    "nspm": "N s/m",
+    "nmpa": "N m/A",
+}
+"""How sentences write the last word of a name, where that is not the unit itself."""
+
+Total = Mapping[str, float]
+
+
+def in_robot_terms(effect: str, values: Sequence[Value], robot: Robot) -> str:
+    """Return what an effect with its values makes of the robot, as the object of "with".
+
+    Parameters
+    ----------
+    effect : name
+    values : found, over what the robot has of the effect already
+    robot : as it was tested
+
+    Examples
+    --------
+    >>> from terrain.robots import load_robot
+    >>> track = Value("effective_track_ratio", 1.5, "ratio", 1.47, 1.53)
+    >>> in_robot_terms("effective_track", [track], load_robot("husky"))
+    'an effective track of 1.43 m (described: 0.571 m)'
+    >>> late = Value("clock_offset_s", -0.27, "s", -0.28, -0.26)
+    >>> in_robot_terms("clock_offset", [late], load_robot("husky"))
+    'the wheels logged 0.27 s late'
+    """
+    total = {value.name: robot.effects.get(value.name, 0.0) + value.value for value in values}
+    written = TERMS.get(effect)
+    if written is not None:
+        return written(values, total, robot)
+    return " and ".join(_generic(value, total[value.name], robot) for value in values)
+
+
+def rounded(value: float, half: float) -> str:
+    """Return a number with the digits that half its interval leaves it, three where that is not known.
+
+    Examples
+    --------
+    >>> rounded(1.4271, 0.03), rounded(0.0961, 0.025), rounded(0.165, float("nan"))
+    ('1.43', '0.10', '0.165')
+    """
+    if not (math.isfinite(half) and half > 0.0):
+        return f"{value:.3g}"
+    return f"{value:.{min(max(-math.floor(math.log10(half)), 0), 5)}f}"
+
+
+def _half(value: Value) -> float:
+    return (value.high - value.low) / 2.0
+
+
+def described_as(basis: Basis) -> str:
+    """Return the number of the description beside which a value stands, and whether it is assumed.
+
+    Examples
+    --------
+    >>> from terrain.robots import load_robot
+    >>> described_as(basis_of(load_robot("husky"), "lever_x_m", -0.25)[0])
+    '(described: 0.35 m, assumed)'
+    """
+    if basis.origin is Origin.LEFT_OUT:
+        return "(not described)"
+    unit = basis.field.rpartition("_")[2]
+    number = f"{basis.described:.3g} {UNITS.get(unit, unit)}".strip()
+    return f"(described: {number}{', assumed' if basis.origin is Origin.ASSUMED else ''})"
+
+
+def _generic(value: Value, total: float, robot: Robot) -> str:
+    """Return a value by the number of the description that it changes, or as it is."""
+    parameter = PARAMETER[value.name]
+    bases = basis_of(robot, value.name, total)
+    if bases and bases[0].described and bases[0].origin is not Origin.LEFT_OUT:
+        basis = bases[0]
+        scale = abs((basis.extended - basis.described) / total) if total else 0.0
+        name, _, unit = basis.field.rpartition("_")
+        number = f"{rounded(basis.extended, scale * _half(value))} {UNITS.get(unit, unit)}".strip()
+        name = name.replace("_", " ").removesuffix(" x").removesuffix(" z")
+        return f"{_article(name)} {name} of {number} {described_as(basis)}"
+    if parameter.as_percent:
+        number = f"{rounded(100.0 * total, 100.0 * _half(value))} %"
+    else:
+        number = f"{rounded(total, _half(value))} {UNITS.get(parameter.unit, parameter.unit)}".strip()
+    return (
+        f"{_article(parameter.label)} {parameter.label} {'off by' if parameter.is_error else 'of'} {number}"
+    )
+
+
+def _article(name: str) -> str:
+    return "an" if name[0] in "aeiou" and not name.startswith("one") else "a"
+
+
+def _track(values: Sequence[Value], total: Total, robot: Robot) -> str:
+    (value,) = values
+    (basis,) = basis_of(robot, value.name, total[value.name])
+    number = rounded(basis.extended, basis.described * _half(value))
+    return f"an effective track of {number} m {described_as(basis)}"
+
+
+def _lever(values: Sequence[Value], total: Total, robot: Robot) -> str:
+    """Return where the measured point is: only the sum of the lever described and the one found is known."""
+    parts: list[str] = []
+    notes: list[str] = []
+    for value, (ahead, behind) in zip(values, (("ahead", "behind"), ("left", "right")), strict=True):
+        if parts and abs(value.value) <= _half(value):
+            continue
+        (basis,) = basis_of(robot, value.name, total[value.name])
+        side = ahead if basis.extended >= 0.0 else behind
+        parts.append(f"{rounded(abs(basis.extended), _half(value))} m {side}")
+        notes.append(described_as(basis))
+    joint = {"behind": " "}.get(parts[-1].rpartition(" ")[2], " of ")
+    return f"the measured point {' and '.join(parts)}{joint}the centre {notes[0]}"
+
+
+def _late(positive: str, negative: str) -> Callable[[Sequence[Value], Total, Robot], str]:
+    def write(values: Sequence[Value], total: Total, robot: Robot) -> str:
+        (value,) = values
+        homes = basis_of(robot, value.name, total[value.name])
+        late_s = homes[0].extended if homes else total[value.name]
+        return f"{positive if late_s > 0 else negative} {rounded(abs(late_s), _half(value))} s late"
+
+    return write
+
+
+def _camera_yaw(values: Sequence[Value], total: Total, robot: Robot) -> str:
+    (value,) = values
+    angle = total[value.name]
+    degrees = rounded(math.degrees(abs(angle)), math.degrees(_half(value)))
+    return f"the camera turned {degrees}° to the {'right' if angle > 0 else 'left'}"
+
+
+def _turn_drag(values: Sequence[Value], total: Total, robot: Robot) -> str:
+    (value,) = values
+    lost = total[value.name] * EXAMPLE_RADPS**2
+    percent = 100.0 * (lost / (1.0 + lost) if lost > 0 else lost)
+    change = "loses" if percent > 0 else "gains"
+    return f"a robot that {change} {abs(percent):.2g} % of its speed in a turn of {EXAMPLE_RADPS:g} rad/s"
+
+
+def _side_slip(values: Sequence[Value], total: Total, robot: Robot) -> str:
+    (value,) = values
+    slide = total[value.name] * EXAMPLE_MPS * EXAMPLE_RADPS
+    number = rounded(abs(slide), _half(value) * EXAMPLE_MPS * EXAMPLE_RADPS)
+    side = "outside" if slide > 0 else "inside"
+    return f"a slide of {number} m/s to the {side} at {EXAMPLE_MPS:g} m/s and {EXAMPLE_RADPS:g} rad/s"
+
+
+def _gyro_scale(values: Sequence[Value], total: Total, robot: Robot) -> str:
+    (value,) = values
+    error = total[value.name]
+    number = rounded(100.0 * abs(error), 100.0 * _half(value))
+    return f"a gyro that reads {number} % too {'much' if error > 0 else 'little'}"
+
+
+def _one_sided(values: Sequence[Value], total: Total, robot: Robot) -> str:
+    (value,) = values
+    error = total[value.name]
+    number = rounded(100.0 * abs(error), 100.0 * _half(value))
+    return f"wheels that are {number} % {'larger' if error > 0 else 'smaller'} on the right than on the left"
+
+
+TERMS: dict[str, Callable[[Sequence[Value], Total, Robot], str]] = {
+    "effective_track": _track,
+    "lever_arm": _lever,
+    "clock_offset": _late("the other sensors logged", "the wheels logged"),
+    "imu_latency": _late("the IMU", "the IMU"),
+    "camera_latency": _late("the camera or lidar", "the camera or lidar"),
+    "yaw_delay": _late("the robot turning", "the robot turning"),
+    "camera_yaw": _camera_yaw,
+    "turn_drag": _turn_drag,
+    "turn_side_slip": _side_slip,
+    "gyro_scale": _gyro_scale,
+    "one_sided_radius": _one_sided,
+}
+"""How the effects are worded whose numbers do not speak for themselves; the others by their home."""
+
+
+def short_terms(name: str, values: Sequence[Value], robot: Robot) -> str:
+    """Return the same without the description's numbers.
+
+    Examples
+    --------
+    >>> from terrain.robots import load_robot
+    >>> track = Value("effective_track_ratio", 1.5, "ratio", 1.47, 1.53)
+    >>> short_terms("effective_track", [track], load_robot("husky"))
+    'an effective track of 1.43 m'
+    """
+    return in_robot_terms(effect_named(name).name, values, robot).partition(" (")[0]

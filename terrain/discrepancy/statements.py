@@ -1,0 +1,222 @@
+"""One plain sentence a channel: what the simulation gets wrong there, what repairs it, and what remains."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+from terrain.discrepancy.channel_words import CHANNEL_WORDS, off_by
+from terrain.discrepancy.compared import ComparedRun, channels_of, rms_of
+from terrain.discrepancy.gain import Gain
+from terrain.discrepancy.response_slopes import Slope, slopes_of
+from terrain.discrepancy.robot_terms import UNITS, in_robot_terms
+from terrain.discrepancy.verdict import Diagnosis, RuledOut, finite
+from terrain.effects import PARAMETER, effect_named
+from terrain.robots import Robot
+
+CHANGED = 0.05
+"""Least ratio by which the residual of a channel changes for that to be stated."""
+
+APART_STDS = 4.0
+"""Terrains differ if their factors are so many standard deviations apart: the two furthest of several."""
+
+KEPT_ASIDE, COMPARED = "on runs kept aside", "on the runs compared"
+
+
+class Statement(NamedTuple):
+    """A channel in one sentence.
+
+    Parameters
+    ----------
+    channel : name
+    slope : measured over simulated, of the runs compared
+    causes : named ones that show in it
+    rms_before, rms_after : of measured minus simulated; the second NaN where nothing was built in
+    where : of which runs these are
+    text : the sentence
+    found : whether it states more than that the two agree
+    """
+
+    channel: str
+    slope: Slope
+    causes: tuple[str, ...]
+    rms_before: float
+    rms_after: float
+    where: str
+    text: str
+    found: bool
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the statement as JSON has it; what is not known is null."""
+        return {
+            "channel": self.channel,
+            "measured_over_simulated": finite(self.slope.ratio),
+            "measured_minus_simulated": finite(self.slope.level),
+            "causes": list(self.causes),
+            "rms_before": finite(self.rms_before),
+            "rms_after": finite(self.rms_after),
+            "runs": self.where,
+            "text": self.text,
+        }
+
+
+def statements_of(
+    diagnosis: Diagnosis, robot: Robot, used: Sequence[ComparedRun], gain: Gain | None
+) -> tuple[Statement, ...]:
+    """Return a sentence a channel, those that state something first.
+
+    Parameters
+    ----------
+    diagnosis : of the runs
+    robot : as it was tested
+    used : runs behind the diagnosis, beside the simulation
+    gain : on the runs held out; None where that was not measured
+    """
+    slopes = slopes_of(used)
+    extended = bool(used) and used[0].after is not None
+    found = []
+    for channel in channels_of(used):
+        if gain is not None and channel in gain.channels:
+            before, after = gain.channels[channel].rms_before, gain.channels[channel].rms_after
+            where = KEPT_ASIDE
+        else:
+            before, where = rms_of(used, channel, False), COMPARED
+            after = rms_of(used, channel, True) if extended else math.nan
+        causes = tuple(cause.name for cause in diagnosis.causes if channel in cause.channels)
+        statement = Statement(channel, slopes[channel], causes, before, after, where, "", False)
+        found.append(_worded(statement, diagnosis, robot))
+    return tuple(sorted(found, key=lambda each: not each.found))
+
+
+def _worded(of: Statement, diagnosis: Diagnosis, robot: Robot) -> Statement:
+    name, unit = CHANNEL_WORDS[of.channel]
+    repair = _repair(of, diagnosis, robot, unit)
+    parts = [off_by(of.channel, of.slope), repair, _rivals(of, diagnosis, robot), _varies(of, diagnosis)]
+    parts = [part for part in (*parts, _remainder(of, diagnosis, robot, bool(repair))) if part]
+    if not parts:
+        return of._replace(
+            text=f"{name}: measured and simulated agree to {_size(of.rms_before)} {unit} rms {of.where}."
+        )
+    return of._replace(text=f"{name}: {'; '.join(parts)}.", found=True)
+
+
+def _size(value: float) -> str:
+    return f"{value:.2g}"
+
+
+def _repair(of: Statement, diagnosis: Diagnosis, robot: Robot, unit: str) -> str:
+    """Return what the named causes make of the error."""
+    if not math.isfinite(of.rms_after):
+        return ""
+    change = of.rms_after - of.rms_before
+    changed = abs(change) >= CHANGED * of.rms_before
+    by_name = {cause.name: cause for cause in diagnosis.causes}
+    names = of.causes
+    if not changed:  # it is worth a word in the channel that a cause shows in most
+        names = tuple(name for name in names if by_name[name].channels[0] == of.channel)
+    elif not names:  # it shows more clearly in other channels
+        names = tuple(name for name in by_name if of.channel in effect_named(name).channels)
+    causes = [in_robot_terms(name, by_name[name].values, robot) for name in names]
+    if not (changed or causes):
+        return ""
+    words = _listed(causes) if causes else "what is named for other channels"
+    if not changed:
+        return f"with {words} its error stays at {_size(of.rms_after)} {unit} {of.where}"
+    verb, sizes = "falls" if change < 0 else "rises", f"{_size(of.rms_before)} to {_size(of.rms_after)}"
+    return f"with {words} its error {verb} from {sizes} {unit} {of.where}"
+
+
+def _rivals(of: Statement, diagnosis: Diagnosis, robot: Robot) -> str:
+    """Return the effects of which one explains the channel, where runs do not distinguish them."""
+    texts = []
+    for names in diagnosis.ambiguous_sets:
+        if of.channel not in effect_named(names[0]).channels[:1]:
+            continue
+        known = [name for name in names if name in diagnosis.ambiguous_values]
+        each = [in_robot_terms(name, diagnosis.ambiguous_values[name], robot) for name in known]
+        if each:
+            texts.append(f"{_listed(each, 'or')} explains it, and these runs do not distinguish which")
+    return "; ".join(texts)
+
+
+def _varies(of: Statement, diagnosis: Diagnosis) -> str:
+    """Return that the effect behind the channel differs from run to run."""
+    texts = []
+    for each in diagnosis.varying:
+        if each.channel == of.channel:
+            parameter = PARAMETER[each.parameter]
+            size = f"{100.0 * each.scatter:.2g} %" if parameter.as_percent else f"{each.scatter:.2g}"
+            unit = "" if parameter.unit == "ratio" else f" {UNITS.get(parameter.unit, parameter.unit)}"
+            texts.append(f"the {parameter.label} differs from run to run by {size}{unit}")
+    return "; ".join(texts)
+
+
+def _remainder(of: Statement, diagnosis: Diagnosis, robot: Robot, repaired: bool) -> str:
+    """Return what the named causes do not explain, and what it depends on."""
+    unit = CHANNEL_WORDS[of.channel][1]
+    rest = f"{_size(of.rms_after if math.isfinite(of.rms_after) else of.rms_before)} {unit}"
+    withdrawn = {each.name: each for each in diagnosis.ruled_out if each.values}
+    texts = []
+    for left in diagnosis.unexplained:
+        if left.channel != of.channel:
+            continue
+        if left.input == "constant" and not repaired and math.isfinite(of.slope.level):
+            continue  # that is the level already stated
+        effect = withdrawn.get(left.input)
+        if effect is not None:
+            words = in_robot_terms(effect.name, effect.values, robot)
+            how = ("look", "looks"), f"like {words}, a cause that was withdrawn"
+        elif left.input == "constant":
+            how = ("are", "is"), "a constant offset"
+        else:
+            how = ("depend", "depends"), f"on {left.input}"
+        (many, one), what = how
+        if repaired:
+            texts.append(f"{rest} rms remain, which {many} {what}")
+        else:
+            texts.append(f"measured and simulated are {rest} rms apart, which {one} {what}")
+    return "; ".join(texts)
+
+
+def _listed(words: Sequence[str], last: str = "and") -> str:
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} {last} {words[-1]}"
+
+
+def split_ruled_out(diagnosis: Diagnosis) -> tuple[list[RuledOut], list[RuledOut]]:
+    """Return causes that were withdrawn, and effects that runs would have shown.
+
+    What the runs did not excite is neither.
+    """
+    missed = {limit.name for limit in diagnosis.not_excited}
+    withdrawn = [effect for effect in diagnosis.ruled_out if effect.values]
+    seen = [
+        effect
+        for effect in diagnosis.ruled_out
+        if not effect.values and not {p.name for p in effect_named(effect.name).parameters} <= missed
+    ]
+    return withdrawn, seen
+
+
+def terrains_apart(diagnosis: Diagnosis, used: Sequence[ComparedRun]) -> Mapping[str, Slope]:
+    """Return measured over simulated by terrain where terrains clearly differ; empty where they do not.
+
+    They are compared in the channel of the effect that varies, or of a cause whose caveat is the run; with
+    runs of one label, or runs that are alike, nothing is compared.
+    """
+    channels = [each.channel for each in diagnosis.varying]
+    channels += [cause.channels[0] for cause in diagnosis.causes if "run" in cause.caveat and cause.channels]
+    labels = sorted({run.terrain for run in used if run.terrain})
+    if not channels or len(labels) < 2:
+        return {}
+    each = {label: [run for run in used if run.terrain == label] for label in labels}
+    for channel in dict.fromkeys(channels):
+        slopes = {label: slopes_of(runs).get(channel) for label, runs in each.items()}
+        known = {label: slope for label, slope in slopes.items() if slope and math.isfinite(slope.std)}
+        ordered = sorted(known.values(), key=lambda slope: slope.ratio)
+        if len(ordered) > 1:
+            low, high = ordered[0], ordered[-1]
+            apart = high.ratio - low.ratio
+            if apart > max(APART_STDS * math.hypot(low.std, high.std), CHANGED * abs(low.ratio)):
+                return known
+    return {}
