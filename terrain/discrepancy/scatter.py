@@ -29,6 +29,10 @@ TAIL_DOF = 4.0
 NORMAL_RATIO = 0.786
 """Mean of ``u z^2`` of normal deviations ``z``, by which estimates are divided to be right for them."""
 
+MORE_RATIO = 1.5
+"""An estimate counts from that ratio of what was assumed: eight runs determine it to a quarter, and what is within
+is no news."""
+
 EM_STEPS = 60
 """Enough for a scatter that is ten times what was assumed; one that runs hardly show stays as assumed."""
 
@@ -59,4 +63,5 @@ def scatter_of(gram: Array, score: Array, assumed_std: Array) -> Array:
         square = weight / NORMAL_RATIO * own**2 + np.einsum("iqq->iq", inner)
         variance = (PRIOR_RUNS * assumed + square.sum(axis=0)) / (PRIOR_RUNS + len(gram))
         variance = np.maximum(variance, assumed)
-    return np.asarray(np.sqrt(variance))
+    std = np.sqrt(variance)
+    return np.where(std > MORE_RATIO * assumed_std, std, assumed_std)
