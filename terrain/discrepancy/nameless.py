@@ -94,6 +94,8 @@ class Nameless(NamedTuple):
         ]
         if channels:
             judged = f"more is left to find in {_listed(channels)}"
+        elif left > LITTLE_LEFT:
+            judged = f"{self.n_runs} runs are too few to state more"
         elif left < -LITTLE_LEFT:
             judged = "it finds less than the names state"
         else:

@@ -226,7 +226,7 @@ def test_unexplained_channels_effects_not_excited_and_excluded_runs_are_shown():
     assert "A steering offset 1 under 3 mrad would not have been detected." in text
     assert "r<9> its gyro stands still" in text
     assert f"r3 12.3 ms 1 ms r4 {NOT_KNOWN} {NOT_KNOWN}" in text
-    assert "scrub the runs show nothing of it 0.4" in text
+    assert "scrub The runs show nothing of it. 0.4" in text
 
 
 def test_nothing_found_says_so():
