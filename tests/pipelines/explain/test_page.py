@@ -200,7 +200,7 @@ def test_an_ambiguous_set_is_shown_with_what_would_distinguish_it_and_what_to_dr
         "payload 20 % (10 % to 30 %) accelerations and slopes; speed ahead distinguishes it from motor "
         "constant" in text
     )
-    assert "scenario climb, grade deg 6.0 It parts them." in text
+    assert "Scenario climb, on a slope of 6° It parts them." in text
 
 
 def test_unexplained_channels_effects_not_excited_and_excluded_runs_are_shown():
