@@ -27,7 +27,7 @@ from terrain.discrepancy.residuals import low_pass_of
 from terrain.discrepancy.robot_terms import in_robot_terms
 from terrain.discrepancy.search import Problem
 from terrain.discrepancy.signals import Signals, signals_of
-from terrain.discrepancy.statements import statements_of, terrains_apart
+from terrain.discrepancy.statements import acting_causes, statements_of, terrains_apart
 from terrain.discrepancy.terrain_match import TerrainMatch, check_robots, runs_of_terrain, simulation_for
 from terrain.discrepancy.verdict import Diagnosis, NextDrive
 from terrain.effects import Effect, effect_named, library_of
@@ -101,7 +101,7 @@ def explain(runs: Sequence[RunLog], settings: ExplainSettings, progress: Progres
         gain=gained,
         extended=extended,
         page=out / PAGE_FILE,
-        statements=statements_of(diagnosis, robot, diagnosed.compared, gained.gain),
+        statements=statements_of(diagnosis, robot, diagnosed.compared, gained.gain, diagnosed.acting),
         terms={cause.name: in_robot_terms(cause.name, cause.values, robot) for cause in diagnosis.causes},
         next_command=next_command(diagnosis, description, diagnosed.terrains),
         terrains_apart=terrains_apart(diagnosis, diagnosed.compared),
@@ -145,6 +145,7 @@ def diagnose_runs(
         without_levels(info.noise, compared),
         low_pass,
         part_values(info, diagnosis.causes),
+        acting_causes(simulation, diagnosis, signals, compared),
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -40,6 +40,7 @@ class DiagnosedRuns:
     held_signals : of the runs held out, faults repaired
     noise, low_pass : of the fit runs
     parts : values of the causes in parts of the data
+    acting : by cause, the channels that it changes
     """
 
     diagnosis: Diagnosis
@@ -54,6 +55,7 @@ class DiagnosedRuns:
     noise: Noise
     low_pass: LowPass
     parts: tuple[PartValues, ...]
+    acting: Mapping[str, Sequence[str]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

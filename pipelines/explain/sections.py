@@ -164,7 +164,8 @@ def _next_drive(result: Explanation) -> NextDriveView | None:
     coming = result.diagnosis.next_drive
     if coming is None:
         return None
-    drive = f"scenario {coming.scenario}, grade deg {coming.grade_deg}"
+    slope = f", on a slope of {coming.grade_deg:g}°" if coming.grade_deg else ""
+    drive = f"Scenario {coming.scenario}{slope}"
     return NextDriveView(drive, sentence(coming.reason), result.next_command or "")
 
 

@@ -20,7 +20,6 @@ from terrain.bootstrap import bootstrap_counts, percentile_interval
 from terrain.discrepancy.channel_words import CHANNEL_WORDS
 from terrain.discrepancy.compared import ComparedRun, channels_of
 from terrain.discrepancy.gain import N_BOOTSTRAP
-from terrain.discrepancy.information import N_BLOCKS
 from terrain.discrepancy.selection import MIN_CLUSTERS
 from terrain.discrepancy.verdict import finite
 from terrain.effects import CHANNELS
@@ -49,8 +48,8 @@ class Learned(NamedTuple):
     rms_before, rms_after : root mean square before, and behind the learner, in the channel's unit
     ratio : part of the square that the learner removes; below 0 where it adds to it
     named_ratio : part that the named causes remove; NaN where none was named
-    left_low : lower end of the 95 % interval, by bootstrap over runs or thirds of runs, of what the learner
-        removes beyond the named causes
+    left_low : lower end of the 95 % interval, by bootstrap over runs, of what the learner removes beyond the
+        named causes; NaN where runs are too few: what one run has in common in itself is no cause
     """
 
     rms_before: float
@@ -94,6 +93,8 @@ class Nameless(NamedTuple):
         ]
         if channels:
             judged = f"more is left to find in {_listed(channels)}"
+        elif left > LITTLE_LEFT:
+            judged = f"{self.n_runs} runs are too few to state more"
         elif left < -LITTLE_LEFT:
             judged = "it finds less than the names state"
         else:
@@ -174,8 +175,9 @@ def _listed(words: Sequence[str]) -> str:
 
 def _left_low(before: Array, more: Array, of_run: Array, seed: int) -> float:
     """Return the lower end of the interval of what is removed more (n,), over the square before (n,)."""
-    runs = [np.flatnonzero(of_run == run) for run in np.unique(of_run)]
-    parts = runs if len(runs) >= MIN_CLUSTERS else [p for run in runs for p in np.array_split(run, N_BLOCKS)]
+    parts = [np.flatnonzero(of_run == run) for run in np.unique(of_run)]
+    if len(parts) < MIN_CLUSTERS:
+        return math.nan
     weights = bootstrap_counts(len(parts), N_BOOTSTRAP, seed)
     sums = np.array([[more[part].sum(), before[part].sum()] for part in parts])
     with np.errstate(invalid="ignore", divide="ignore"):

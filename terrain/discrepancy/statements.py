@@ -6,13 +6,19 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from terrain.discrepancy.channel_words import CHANNEL_WORDS, off_by
-from terrain.discrepancy.compared import ComparedRun, channels_of, rms_of
+from terrain.discrepancy.compared import ComparedRun, channels_of, compare_runs, rms_of
 from terrain.discrepancy.gain import Gain
+from terrain.discrepancy.residuals import low_pass_of
 from terrain.discrepancy.response_slopes import Slope, slopes_of
 from terrain.discrepancy.robot_terms import UNITS, in_robot_terms
+from terrain.discrepancy.signals import Signals
+from terrain.discrepancy.simulation import Simulation
 from terrain.discrepancy.verdict import Diagnosis, RuledOut, finite
-from terrain.effects import PARAMETER, effect_named
+from terrain.effects import CHANNELS, PARAMETER, effect_named
+from terrain.records import Array
 from terrain.robots import Robot
 
 CHANGED = 0.05
@@ -20,6 +26,10 @@ CHANGED = 0.05
 
 APART_STDS = 4.0
 """Terrains differ if their factors are so many standard deviations apart: the two furthest of several."""
+
+ACTS_RATIO = 0.25
+"""Least part of the change of a channel by all causes, root mean square, that one of them makes to be named
+with it."""
 
 KEPT_ASIDE, COMPARED = "on runs kept aside", "on the runs compared"
 
@@ -31,7 +41,7 @@ class Statement(NamedTuple):
     ----------
     channel : name
     slope : measured over simulated, of the runs compared
-    causes : named ones that show in it
+    causes : named ones that act on it
     rms_before, rms_after : of measured minus simulated; the second NaN where nothing was built in
     where : of which runs these are
     text : the sentence
@@ -62,7 +72,11 @@ class Statement(NamedTuple):
 
 
 def statements_of(
-    diagnosis: Diagnosis, robot: Robot, used: Sequence[ComparedRun], gain: Gain | None
+    diagnosis: Diagnosis,
+    robot: Robot,
+    used: Sequence[ComparedRun],
+    gain: Gain | None,
+    acting: Mapping[str, Sequence[str]] | None = None,
 ) -> tuple[Statement, ...]:
     """Return a sentence a channel, those that state something first.
 
@@ -72,6 +86,7 @@ def statements_of(
     robot : as it was tested
     used : runs behind the diagnosis, beside the simulation
     gain : on the runs held out; None where that was not measured
+    acting : by cause, the channels that it changes, see :func:`acting_causes`; where it shows by default
     """
     slopes = slopes_of(used)
     extended = bool(used) and used[0].after is not None
@@ -83,10 +98,50 @@ def statements_of(
         else:
             before, where = rms_of(used, channel, False), COMPARED
             after = rms_of(used, channel, True) if extended else math.nan
-        causes = tuple(cause.name for cause in diagnosis.causes if channel in cause.channels)
+        acts = {cause.name: cause.channels for cause in diagnosis.causes} if acting is None else acting
+        causes = tuple(cause.name for cause in diagnosis.causes if channel in acts[cause.name])
         statement = Statement(channel, slopes[channel], causes, before, after, where, "", False)
         found.append(_worded(statement, diagnosis, robot))
     return tuple(sorted(found, key=lambda each: not each.found))
+
+
+def acting_causes(
+    simulation: Simulation, diagnosis: Diagnosis, signals: Sequence[Signals], used: Sequence[ComparedRun]
+) -> dict[str, tuple[str, ...]]:
+    """Return the channels that each named cause changes: where the extension without it predicts otherwise.
+
+    Parameters
+    ----------
+    simulation : before
+    diagnosis : of the runs
+    signals, used : runs behind the diagnosis, and the same beside the simulation
+    """
+    acting = {}
+    low_pass = low_pass_of(signals)
+    for cause in diagnosis.causes:
+        own = {value.name for value in cause.values}
+        others = {name: value for name, value in diagnosis.values.items() if name not in own}
+        without = compare_runs(simulation, simulation.with_effects(others), signals, low_pass)
+        channels = []
+        for c, channel in enumerate(CHANNELS):
+            all_of_it = _square([(run.after, run.before, run.measured) for run in used], c)
+            part = _square(
+                [(run.after, rest.after, run.measured) for run, rest in zip(used, without, strict=True)], c
+            )
+            if part > (ACTS_RATIO**2) * all_of_it:
+                channels.append(channel)
+        acting[cause.name] = tuple(channels)
+    return acting
+
+
+def _square(pairs: Sequence[tuple[Array | None, Array | None, Array]], c: int) -> float:
+    """Return the sum of the squared differences of two predictions where the channel was measured."""
+    total = 0.0
+    for one, other, measured in pairs:
+        assert one is not None
+        assert other is not None
+        total += float(np.nansum(np.where(np.isfinite(measured[:, c]), one[:, c] - other[:, c], 0.0) ** 2))
+    return total
 
 
 def _worded(of: Statement, diagnosis: Diagnosis, robot: Robot) -> Statement:
@@ -113,10 +168,8 @@ def _repair(of: Statement, diagnosis: Diagnosis, robot: Robot, unit: str) -> str
     changed = abs(change) >= CHANGED * of.rms_before
     by_name = {cause.name: cause for cause in diagnosis.causes}
     names = of.causes
-    if not changed:  # it is worth a word in the channel that a cause shows in most
+    if not changed:  # that is worth stating where a cause shows most
         names = tuple(name for name in names if by_name[name].channels[0] == of.channel)
-    elif not names:  # it shows more clearly in other channels
-        names = tuple(name for name in by_name if of.channel in effect_named(name).channels)
     causes = [in_robot_terms(name, by_name[name].values, robot) for name in names]
     if not (changed or causes):
         return ""

@@ -200,7 +200,7 @@ def test_an_ambiguous_set_is_shown_with_what_would_distinguish_it_and_what_to_dr
         "payload 20 % (10 % to 30 %) accelerations and slopes; speed ahead distinguishes it from motor "
         "constant" in text
     )
-    assert "scenario climb, grade deg 6.0 It parts them." in text
+    assert "Scenario climb, on a slope of 6° It parts them." in text
 
 
 def test_unexplained_channels_effects_not_excited_and_excluded_runs_are_shown():
@@ -226,7 +226,7 @@ def test_unexplained_channels_effects_not_excited_and_excluded_runs_are_shown():
     assert "A steering offset 1 under 3 mrad would not have been detected." in text
     assert "r<9> its gyro stands still" in text
     assert f"r3 12.3 ms 1 ms r4 {NOT_KNOWN} {NOT_KNOWN}" in text
-    assert "scrub the runs show nothing of it 0.4" in text
+    assert "scrub The runs show nothing of it. 0.4" in text
 
 
 def test_nothing_found_says_so():

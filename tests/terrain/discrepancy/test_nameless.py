@@ -33,9 +33,9 @@ def a_run(seed, hidden=0.0, named=None, late=0, n=300):
     return ComparedRun(f"r{seed}", "", False, time_s, np.ones(n), measured, before, after, inputs)
 
 
-def learned(hidden, named, late=0, n_used=12):
+def learned(hidden, named, late=0, n_used=12, n_judged=8):
     used, judged = (
-        [a_run(s, hidden, named, late) for s in seeds] for seeds in (range(n_used), range(50, 56))
+        [a_run(s, hidden, named, late) for s in seeds] for seeds in (range(n_used), range(50, 50 + n_judged))
     )
     found = nameless_gain(used, judged, {CHANNEL: STD})
     return found, found.channels[CHANNEL]
@@ -62,6 +62,12 @@ def test_of_noise_it_learns_nothing():
     assert math.isnan(channel.named_ratio)
     assert found.sentence.startswith("Nothing was named")
     assert found.sentence.endswith("little is left to find.")
+
+
+def test_of_few_runs_no_more_is_stated_than_they_hold():
+    found, channel = learned(0.5, named=0.0, n_judged=2)
+    assert math.isnan(channel.left_low)
+    assert found.sentence.endswith("2 runs are too few to state more.")
 
 
 def test_without_runs_held_out_there_is_no_comparison_and_json_has_no_nan():

@@ -6,11 +6,14 @@ import numpy as np
 import pytest
 
 from terrain.discrepancy.channel_words import off_by
-from terrain.discrepancy.compared import ComparedRun
+from terrain.discrepancy.compared import ComparedRun, compare_runs
 from terrain.discrepancy.gain import ChannelGain, Gain, Reduction
+from terrain.discrepancy.residuals import low_pass_of
 from terrain.discrepancy.response_slopes import Slope, slope_through_zero, slopes_of
 from terrain.discrepancy.robot_terms import in_robot_terms
-from terrain.discrepancy.statements import split_ruled_out, statements_of, terrains_apart
+from terrain.discrepancy.signals import signals_of
+from terrain.discrepancy.simulation import Simulation
+from terrain.discrepancy.statements import acting_causes, split_ruled_out, statements_of, terrains_apart
 from terrain.discrepancy.verdict import (
     Cause,
     Diagnosis,
@@ -23,6 +26,7 @@ from terrain.discrepancy.verdict import (
 )
 from terrain.effects import CHANNELS
 from terrain.robots import load_robot
+from terrain.simulation.planar.run import simulate_planar
 
 HUSKY = load_robot("husky")
 YAW, CURRENT = "yaw_rate_radps", "current_a"
@@ -232,3 +236,16 @@ def test_what_could_not_have_been_seen_is_not_ruled_out():
     first, second = split_ruled_out(a_diagnosis(ruled_out=effects, not_excited=(missed,)))
     assert [effect.name for effect in first] == ["scrub"]
     assert [effect.name for effect in second] == ["gyro_bias"]
+
+
+def test_a_cause_acts_on_the_channels_that_it_changes():
+    time_s = np.arange(1000) / 50
+    twist = np.column_stack([0.5 * np.sin(0.6 * time_s), 0.0 * time_s, 0.5 * np.sin(0.9 * time_s)])
+    signals = [signals_of(simulate_planar(HUSKY, twist, 1, run_id="a"), HUSKY)]
+    yaw = Cause("camera_yaw", (), (Value("camera_yaw_rad", 0.1, "rad", 0.09, 0.11),), 0, 0, 0, (), 9.0, 1.0)
+    diagnosis, simulation = a_diagnosis(causes=(TRACK, yaw)), Simulation(HUSKY)
+    used = compare_runs(simulation, simulation.with_effects(diagnosis.values), signals, low_pass_of(signals))
+    acting = acting_causes(simulation, diagnosis, signals, used)
+    assert "yaw_rate_radps" in acting["effective_track"]
+    assert "speed_y_mps" in acting["camera_yaw"]
+    assert "yaw_rate_radps" not in acting["camera_yaw"]
