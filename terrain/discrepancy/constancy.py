@@ -99,7 +99,7 @@ def constancy_of(
     halves = _groups(("first half of the runs", "second half"), by_run, mine, change, inflation)
     size = float(np.linalg.norm(change[mine]))
     found = [(_difference(groups), split) for groups, split in ((thirds, "time"), (halves, "runs"))]
-    certain = [(ratio, split) for (ratio, sure), split in found if sure]
+    certain = [(ratio, split) for (ratio, beyond), split in found if beyond]
     ratio, split = max(certain, default=(max(ratio for (ratio, _), _ in found), "time"))
     return Constancy(thirds, halves, ratio / size if size > 0 else math.inf, split, bool(certain))
 

@@ -95,24 +95,24 @@ Changes = tuple[Change, ...]
 def unit_faults(responses: Sequence[Response], robot: Robot) -> tuple[Fault, ...]:
     """Return columns whose unit is not that of their name, in all runs or in some of them."""
     logs, fit = (np.array(each) for each in zip(*(_log_gains(run) for run in responses), strict=True))
-    told = [i for i in range(len(logs)) if np.isfinite(logs[i]).any()]
-    if not told:
+    known = [i for i in range(len(logs)) if np.isfinite(logs[i]).any()]
+    if not known:
         return ()
     options = _options(logs, robot)
     turn = SKID_TURN if robot.skids else SWERVE_TURN
-    own = {i: _best(logs[i], options, turn)[0] for i in told}
+    own = {i: _best(logs[i], options, turn)[0] for i in known}
     suggested = {changes for changes in own.values() if changes}
-    usual = [i for i in told if not own[i] and any(_shows(logs[i], changes) for changes in suggested)]
+    usual = [i for i in known if not own[i] and any(_shows(logs[i], changes) for changes in suggested)]
     if not suggested:
         return ()
-    if len(usual) < MIN_USUAL_RATIO * len(told):
-        best, rivals = _best(_middle(logs[[i for i in told if i not in usual]]), options, turn)
+    if len(usual) < MIN_USUAL_RATIO * len(known):
+        best, rivals = _best(_middle(logs[[i for i in known if i not in usual]]), options, turn)
         has = [i for i in range(len(logs)) if i not in usual]
         return tuple(_fault(best, change, rivals, has, responses, logs) for change in best)
     middle, scatter = _middle(logs[usual]), 1.48 * _middle(np.abs(logs[usual] - _middle(logs[usual])))
     near = np.clip(SCATTERS * np.where(np.isfinite(scatter), scatter, TIGHT), TIGHT, NEAR)
     of_runs: dict[Changes, list[int]] = {}
-    for i in (i for i in told if own[i]):
+    for i in (i for i in known if own[i]):
         off = np.where(fit[i] > CLEAR_FIT, logs[i], np.nan) - middle
         fitting = [changes for changes in options if changes and _agrees(off, changes, near)]
         if fitting:

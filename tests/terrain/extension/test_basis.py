@@ -37,7 +37,7 @@ def test_a_number_is_assumed_where_its_source_says_so_and_only_there(name):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_the_extended_number_is_the_one_that_filters_take(name):
-    """Two routes: the number that is said, and the description with the effect applied."""
+    """Two routes: the number that is stated, and the description with the effect applied."""
     robot = load_robot(name)
     for parameter in parameters_of(robot.drive):
         extended = apply_homes(replace(robot, effects={parameter: 0.1}))
