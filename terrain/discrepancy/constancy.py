@@ -112,7 +112,7 @@ def constancy_of(
         split["runs"] = _fit_groups(info, names, own, by_run, inflation)
     found = {kind: _difference(*fit) for kind, fit in split.items()}
     size = float(np.linalg.norm(change[[list(names).index(name) for name in own]]))
-    certain = {kind: ratio for kind, (ratio, sure) in found.items() if sure}
+    certain = {kind: ratio for kind, (ratio, beyond) in found.items() if beyond}
     kind = max(certain, key=lambda each: certain[each]) if certain else "time"
     labels = {"time": THIRDS, "runs": HALVES}
     groups = {
@@ -192,8 +192,8 @@ def _difference(values: Array, cov: Array) -> tuple[float, bool]:
         )
     if not sizes:
         return 0.0, False
-    sure = [size for size, yes in zip(sizes, certain, strict=True) if yes]
-    return max(sure or sizes), bool(sure)
+    clear = [size for size, yes in zip(sizes, certain, strict=True) if yes]
+    return max(clear or sizes), bool(clear)
 
 
 def _main(groups: Sequence[Group]) -> int:

@@ -81,7 +81,7 @@ def repair_held_out(
     for run in signals:
         for fault in faults:
             if math.isnan(fault.factor):
-                run = fault.change.without(run)
+                run = without(fault, run)
             else:
                 run = min(run, fault.change.applied(run), key=misfit)
         fixed.append(run)

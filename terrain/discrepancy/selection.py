@@ -98,7 +98,12 @@ def evidence(info: Information, selected: Sequence[str], effect: Effect) -> Evid
 
 def _one_degree(statistic: float, degrees: int) -> float:
     """Return the chi^2 of one degree that is as improbable as one of several."""
-    return statistic if degrees == 1 else z_of(float(chi2.logsf(statistic, degrees))) ** 2
+    if degrees == 1:
+        return statistic
+    log_p = float(chi2.logsf(statistic, degrees))
+    if math.isinf(log_p):  # it underflows; far out the density falls as the tail does
+        log_p = float(chi2.logpdf(statistic, degrees)) + math.log(2.0)
+    return z_of(log_p) ** 2
 
 
 def _dispersion(

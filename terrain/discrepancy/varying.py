@@ -34,7 +34,7 @@ MIN_GROUP = 2
 """Least number of runs in a group."""
 
 ALIKE_RATIO = 0.9
-"""An effect that explains so much of what the best one explains is not told apart from it."""
+"""An effect that explains so much of what the best one explains is not distinguished from it."""
 
 
 class _RunValues(NamedTuple):

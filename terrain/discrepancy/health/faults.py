@@ -150,11 +150,11 @@ def repaired(signals: Sequence[Signals], faults: Sequence[Fault]) -> tuple[Signa
     fixed = list(signals)
     for fault in faults:
         ids = set(fault.run_ids)
-        fixed = [_without(fault, run) if run.run_id in ids else run for run in fixed]
+        fixed = [without(fault, run) if run.run_id in ids else run for run in fixed]
     return tuple(fixed)
 
 
-def _without(fault: Fault, run: Signals) -> Signals:
+def without(fault: Fault, run: Signals) -> Signals:
     if np.isnan(fault.factor):
         return replace(run, measured=fault.measured(run.measured))
     return fault.change.applied(run)

@@ -172,7 +172,7 @@ def is_clipped(values: Mapping[str, float]) -> bool:
 
     Examples
     --------
-    >>> is_clipped({"gyro_scale_ratio": 0.27}), is_clipped({"gyro_scale_ratio": 0.26})
+    >>> is_clipped({"gyro_scale_ratio": 0.135}), is_clipped({"gyro_scale_ratio": 0.13})
     (True, False)
     """
     return any(

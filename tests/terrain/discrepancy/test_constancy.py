@@ -81,7 +81,7 @@ def test_a_value_that_grows_from_nothing_along_a_run_is_none():
     assert not constancy(problem(from_nothing), NAMES[1:]).varies
 
 
-def test_a_value_of_other_runs_is_none_and_of_few_runs_is_not_told():
+def test_a_value_of_other_runs_is_none_and_of_few_runs_is_not_given():
     halves = constancy(problem(lambda i, at: SIZE * (0.5 if i < N_RUNS / 2 else 1.5)))
     assert (halves.varies, halves.split) == (True, "runs")
     assert_allclose(values(halves.halves), [0.5 * SIZE, 1.5 * SIZE], atol=0.02)

@@ -227,7 +227,7 @@ def test_a_moved_point_stays_within_bounds(info):
 
 
 def test_what_runs_vary_by_does_not_leak_between_their_thirds():
-    """A camera's yaw and a gyro's bias of each run are not told as a side slip that comes and goes."""
+    """A camera's yaw and a gyro's bias of each run are not taken for a side slip that comes and goes."""
     off = []
     hidden = {"turn_side_slip_s": 0.035}
     for seed in range(11, 15):

@@ -134,7 +134,7 @@ def test_memory_within_the_bound_is_that_of_least_squares_and_a_longer_one_is_dr
 
 
 def test_steps_that_last_do_not_take_the_gain_at_zero_frequency_away():
-    """A robot that turns less than is said leaves a residual of one level a command."""
+    """A robot that turns less than it should leaves a residual of one level a command."""
     rng = np.random.default_rng(6)
     levels = [
         np.repeat(rng.choice([-1.0, 1.0], 2), 100)[:, None] + 0.02 * rng.standard_normal((200, 1))

@@ -189,8 +189,8 @@ def test_a_step_that_raises_the_square_is_halved(monkeypatch):
     assert points[-1].vector[INDEX["camera_yaw_rad"]] == pytest.approx(0.0, abs=1e-4)
     # without that guard it goes from bound to bound
     monkeypatch.setattr("terrain.discrepancy.search.MAX_HALVINGS", 0)
-    wild = list(_steps(bent, info, base, names, 12))
-    assert abs(wild[-1].vector[INDEX["camera_yaw_rad"]]) == BOUNDS["camera_yaw_rad"][1]
+    free = list(_steps(bent, info, base, names, 12))
+    assert abs(free[-1].vector[INDEX["camera_yaw_rad"]]) == BOUNDS["camera_yaw_rad"][1]
 
 
 def test_what_changes_other_channels_is_no_rival(monkeypatch):

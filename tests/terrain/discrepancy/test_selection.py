@@ -176,3 +176,10 @@ def test_the_interval_of_a_gain_covers_its_spread_over_runs():
 
 def test_with_few_runs_thirds_of_them_are_the_clusters():
     assert evidence(problem(true(10.0), n_runs=3), (), PAYLOAD).significant
+
+
+def test_evidence_of_two_parameters_stays_finite_however_clear_they_are():
+    """What is seen a hundred times over has a number too, and it grows with what is seen."""
+    z = [evidence(problem(true(lever=size)), (), LEVER).z for size in (30.0, 100.0, 300.0)]
+    assert np.isfinite(z).all()
+    assert z == sorted(z)
