@@ -18,6 +18,7 @@ from terrain.discrepancy.compared import compare_runs, without_levels
 from terrain.discrepancy.diagnose import diagnose
 from terrain.discrepancy.extend import extend, extended_effects
 from terrain.discrepancy.filter_gain import Comparison, filter_gain
+from terrain.discrepancy.fitting import Problem
 from terrain.discrepancy.gain import fit_to_judge, gain_of_signals
 from terrain.discrepancy.health import repaired
 from terrain.discrepancy.hold_out import HOLD_OUT_FROM, repair_held_out, split_runs
@@ -25,7 +26,6 @@ from terrain.discrepancy.nameless import nameless_gain
 from terrain.discrepancy.parts import part_values
 from terrain.discrepancy.residuals import low_pass_of
 from terrain.discrepancy.robot_terms import in_robot_terms
-from terrain.discrepancy.search import Problem
 from terrain.discrepancy.signals import Signals, signals_of
 from terrain.discrepancy.statements import acting_causes, statements_of, terrains_apart
 from terrain.discrepancy.terrain_match import TerrainMatch, check_robots, runs_of_terrain, simulation_for

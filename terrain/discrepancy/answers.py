@@ -7,9 +7,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from terrain.discrepancy.constancy import CAVEAT_RATIO, constancy_of
+from terrain.discrepancy.fitting import names_of
 from terrain.discrepancy.information import Information, partial_information
 from terrain.discrepancy.residuals import measured_channels
-from terrain.discrepancy.search import Found, names_of
+from terrain.discrepancy.search import Found
 from terrain.discrepancy.selection import Z_EFFECT, gain_interval
 from terrain.discrepancy.varying import run_scatter
 from terrain.discrepancy.verdict import Cause, Limit, Residual, RuledOut, Value

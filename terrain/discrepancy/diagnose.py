@@ -22,13 +22,14 @@ from terrain.discrepancy.answers import (
     ruled_out_of,
     values_of,
 )
+from terrain.discrepancy.fitting import Problem, names_of
 from terrain.discrepancy.health import clocks_of
 from terrain.discrepancy.information import Information
 from terrain.discrepancy.next_drive import next_drive
 from terrain.discrepancy.pooled import pooled
 from terrain.discrepancy.preparation import MIN_RUNS, prepare
 from terrain.discrepancy.probes import probe_residuals
-from terrain.discrepancy.search import Found, Problem, names_of, refit, search, with_rivals
+from terrain.discrepancy.search import Found, refit, search, with_rivals
 from terrain.discrepancy.selection import EXCITED_RATIO
 from terrain.discrepancy.signals import Signals, signals_of
 from terrain.discrepancy.simulation import Simulation

@@ -8,11 +8,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from terrain.bootstrap import bootstrap_counts, percentile_interval
+from terrain.discrepancy.fitting import names_of
 from terrain.discrepancy.health import unfit_runs
 from terrain.discrepancy.health.runs import Excluded
 from terrain.discrepancy.information import N_BLOCKS, Information, information_at
 from terrain.discrepancy.residuals import low_pass_of, measured_channels
-from terrain.discrepancy.search import names_of
 from terrain.discrepancy.selection import MIN_CLUSTERS
 from terrain.discrepancy.signals import Signals, signals_of
 from terrain.discrepancy.simulation import Simulation

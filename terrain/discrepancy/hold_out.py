@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from terrain.discrepancy.health import Fault
+from terrain.discrepancy.health.faults import Fault, without
 from terrain.discrepancy.preparation import MIN_RUNS
 from terrain.discrepancy.residuals import LowPass, rows_of
 from terrain.discrepancy.signals import Signals

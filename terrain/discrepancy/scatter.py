@@ -30,8 +30,8 @@ NORMAL_RATIO = 0.786
 """Mean of ``u z^2`` of normal deviations ``z``, by which estimates are divided to be right for them."""
 
 MORE_RATIO = 1.5
-"""An estimate counts from that ratio of what was assumed: eight runs determine it to a quarter, and what is within
-is no news."""
+"""An estimate counts from that ratio of what was assumed: eight runs determine it to a quarter, and
+what is within that is no news."""
 
 EM_STEPS = 60
 """Enough for a scatter that is ten times what was assumed; one that runs hardly show stays as assumed."""

@@ -2,29 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence, Set
+from collections.abc import Mapping, Sequence, Set
 from typing import NamedTuple
 
 import numpy as np
 
+from terrain.discrepancy.fitting import Problem, fit_again, names_of, penalised_loss, relinearize
 from terrain.discrepancy.information import (
     Information,
-    Nearby,
-    Statistics,
-    correlation,
-    information_at,
-    loss_of,
-    misfit_of,
     move_point,
-    nearby,
     partial_information,
     recentre,
 )
-from terrain.discrepancy.residuals import LowPass
+from terrain.discrepancy.rivals import RIVAL_LOSS, Rival, rivals_of
 from terrain.discrepancy.selection import Evidence, evidence, fit_change
-from terrain.discrepancy.signals import Signals
-from terrain.discrepancy.simulation import Simulation
-from terrain.effects import INDEX, Effect
+from terrain.effects import Effect
 from terrain.records import Array
 
 MAX_CAUSES = 8
@@ -38,89 +30,11 @@ MUCH_GAIN, CLOSE_GAIN, MAX_FITTED = 200.0, 0.3, 6
 """Gain above which the best candidates are compared by nonlinear fits: those with that ratio of the best
 one's gain, so many at most."""
 
-RIVAL_LOSS = 8.0
-"""Two causes whose best fits differ by less in minus twice the log-likelihood are not distinguished: the
-wrong one of two is that much ahead with a chance of 0.3 % at most, whatever the size of the effect."""
-
-TWIN, TWIN_LOSS = 0.985, 20.0
-"""The same of two whose sensitivities correlate more, a collinearity index of 8: what distinguishes them is a
-small part of what they explain, and may as well be an error of the simulation."""
-
-PARAMETER_LOSS = 4.0
-"""What a fit has to gain by each of its parameters before it counts as better than one with fewer."""
-
-RIVAL_LINEAR, RIVAL_RATIO = 80.0, 0.5
-"""Loss, and ratio of the gain of the cause, above which a rival is not refitted nonlinearly."""
-
 Z_PAIR = 4.6
 """Evidence that each of two effects needs beside the other, if neither is significant alone: 4e-6."""
 
-SHARED = 0.5
-"""Least correlation of what a cause and its rival change: one that shares less with it explains something
-else, and is no rival, however little worse it fits."""
-
 ALIKE = 0.99
 """Two effects whose sensitivities correlate more are not taken for a pair."""
-
-MAX_HALVINGS, RISE = 4, 0.005
-"""How often a step is halved that raises the whitened square by more than that ratio of it; a mass or a lag
-raises it by less, with the noise of the wheels that is in the prediction."""
-
-MAX_REFITS, SETTLED = 12, 0.3
-"""Most relinearisations of the selected causes, and the ratio of its standard deviation below which a step
-ends them."""
-
-RIVAL_REFITS = 3
-"""Most relinearisations of a rival."""
-
-
-class Problem(NamedTuple):
-    """Runs, the simulation, and the low-pass of all."""
-
-    signals: tuple[Signals, ...]
-    simulation: Simulation
-    low_pass: LowPass
-    library: tuple[Effect, ...]
-
-    @property
-    def parameters(self) -> tuple[str, ...]:
-        """Of the library."""
-        return tuple(p.name for effect in self.library for p in effect.parameters)
-
-    def at(
-        self, vector: Array, names: Sequence[str] | None = None, statistics: Statistics | None = None
-    ) -> Information:
-        """Return the information of the runs around a point; see :func:`information_at`."""
-        desired = self.parameters if names is None else names
-        return information_at(self.signals, self.simulation, vector, desired, self.low_pass, statistics)
-
-    def near(self, info: Information, vector: Array, names: Sequence[str]) -> Nearby:
-        """Return the information on a few parameters at another point, with the noise of an information."""
-        return nearby(info, self.signals, self.simulation, vector, names, self.low_pass)
-
-
-class Rival(NamedTuple):
-    """An effect that fits as well as a cause in its place.
-
-    Parameters
-    ----------
-    effect : that
-    behind : by how much it fits worse, as minus twice a log-likelihood
-    change, std : (p,) of its parameters, by a fit of its own; a value may be at its bound
-    """
-
-    effect: Effect
-    behind: float
-    change: Array
-    std: Array
-
-
-class _Refit(NamedTuple):
-    """How badly a nonlinear fit fits, as minus twice a log-likelihood (see misfit_of), and what it fits."""
-
-    loss: float
-    change: Array
-    std: Array
 
 
 class Found(NamedTuple):
@@ -144,18 +58,6 @@ class Found(NamedTuple):
     rivals: dict[str, tuple[Rival, ...]]
     tried: dict[str, Evidence]
     assumed_scatter: Mapping[str, float]
-
-
-def names_of(effects: Sequence[Effect]) -> tuple[str, ...]:
-    """Return the parameters of effects, each once.
-
-    Examples
-    --------
-    >>> from terrain.effects import effect_named
-    >>> names_of([effect_named("lever_arm")])
-    ('lever_x_m', 'lever_y_m')
-    """
-    return tuple(dict.fromkeys(p.name for effect in effects for p in effect.parameters))
 
 
 def search(problem: Problem, start: Information, seeds: Mapping[str, float] | None = None) -> Found:
@@ -224,7 +126,7 @@ def _found(problem: Problem, info: Information, causes: Sequence[Effect]) -> Fou
 
 def with_rivals(problem: Problem, start: Information, found: Found) -> Found:
     """Return the same with the effects that fit as well in the place of a cause."""
-    return found._replace(rivals=_rivals(problem, found.info, start, found.causes))
+    return found._replace(rivals=rivals_of(problem, found.info, start, found.causes))
 
 
 def _next(
@@ -244,7 +146,7 @@ def _next(
     close = [effect for gain, effect in candidates[:MAX_FITTED] if gain > CLOSE_GAIN * best]
     if best < MUCH_GAIN or len(close) == 1:
         return [candidates[0][1]]
-    return [min(close, key=lambda effect: _refit(problem, info, base, names_of([*causes, effect])).loss)]
+    return [min(close, key=lambda effect: fit_again(problem, info, base, names_of([*causes, effect])).loss)]
 
 
 def _refit_significant(
@@ -260,7 +162,7 @@ def _refit_significant(
     """
     at = info
     while _set_of(causes) not in seen:
-        at = _relinearize(problem, at, base, causes)
+        at = relinearize(problem, at, base, causes)
         weak = _weakest(at, causes) if causes else None
         if weak is None:
             return causes, at
@@ -316,40 +218,6 @@ def _pair(info: Information, causes: Sequence[Effect], library: Sequence[Effect]
     return []
 
 
-def _steps(
-    problem: Problem, info: Information, base: Array, names: Sequence[str], n_most: int
-) -> Iterator[Nearby]:
-    """Yield the information at the points of a nonlinear fit of parameters, until it converges.
-
-    A step that raises the whitened square is halved, and given up after :data:`MAX_HALVINGS`.
-    """
-    at = [INDEX[name] for name in names]
-    others = np.delete(info.origin - base, at)
-    here, loss = info.origin[at] - base[at], np.inf if others.any() else info.origin_loss
-    change, _ = fit_change(info, names)
-    for _ in range(n_most):
-        point = problem.near(info, move_point(base, names, change), names)
-        for _ in range(MAX_HALVINGS):
-            if point.c <= (1.0 + RISE) * loss:
-                break
-            change = 0.5 * (here + change)
-            point = problem.near(info, move_point(base, names, change), names)
-        yield point
-        cov = np.linalg.pinv(point.a, hermitian=True)
-        here, loss = point.vector[at] - base[at], point.c
-        change = here + cov @ point.g
-        if (np.abs(change - here) < SETTLED * np.sqrt(np.maximum(np.diag(cov), 1e-30))).all():
-            return
-
-
-def _relinearize(problem: Problem, info: Information, base: Array, causes: Sequence[Effect]) -> Information:
-    """Fit, and return the information around the fitted point."""
-    point = info.origin if causes else base
-    for near in _steps(problem, info, base, names_of(causes), MAX_REFITS):
-        point = near.vector
-    return recentre(problem.at(point), base)
-
-
 def _weakest(info: Information, causes: Sequence[Effect]) -> int | None:
     """Return the least significant cause, None if all are significant beside the others."""
     z = []
@@ -363,7 +231,7 @@ def _weakest(info: Information, causes: Sequence[Effect]) -> int | None:
 
 def _better(info: Information, causes: Sequence[Effect], library: Sequence[Effect]) -> list[Effect] | None:
     """Return the causes with one replaced by an effect that fits better, if there is one."""
-    now = _penalised(info, causes)
+    now = penalised_loss(info, causes)
     best: tuple[float, list[Effect]] = (now - RIVAL_LOSS, [])
     for i, cause in enumerate(causes):
         others = [other for other in causes if other is not cause]
@@ -371,80 +239,7 @@ def _better(info: Information, causes: Sequence[Effect], library: Sequence[Effec
             if effect in causes or not evidence(info, names_of(others), effect).significant:
                 continue
             swapped = [*causes[:i], effect, *causes[i + 1 :]]
-            loss = _penalised(info, swapped)
+            loss = penalised_loss(info, swapped)
             if loss < best[0]:
                 best = loss, swapped
     return best[1] or None
-
-
-def _penalised(info: Information, causes: Sequence[Effect]) -> float:
-    names = names_of(causes)
-    return loss_of(info, names) + PARAMETER_LOSS * len(names)
-
-
-def _rivals(
-    problem: Problem, info: Information, start: Information, causes: Sequence[Effect]
-) -> dict[str, tuple[Rival, ...]]:
-    """Return by cause all effects that, refitted in its place, fit as well as it does, the best first.
-
-    It is compared by the noise that the causes leave and by that of the simulation as it is given: a cause
-    that absorbs noise is ahead by only one of them.
-    """
-    base, judges = start.vector, (info, start)
-    own: list[float] = []  # losses of the causes by both judges, where anything comes near
-    rivals = {}
-    for cause in causes:
-        others = [other for other in causes if other is not cause]
-        found = []
-        for effect in _near(problem, info, cause, others):
-            own = own or [_refit(problem, judge, base, names_of(causes)).loss for judge in judges]
-            swapped = names_of([*others, effect])
-            here, there = (_refit(problem, judge, base, swapped) for judge in judges)
-            behind = min(here.loss - own[0], there.loss - own[1])
-            if behind < _allowed(info, others, cause, effect):
-                at = [swapped.index(p.name) for p in effect.parameters]
-                found.append(Rival(effect, behind, here.change[at], here.std[at]))
-        rivals[cause.name] = tuple(sorted(found, key=lambda rival: rival.behind))
-    return rivals
-
-
-def _near(problem: Problem, info: Information, cause: Effect, others: Sequence[Effect]) -> list[Effect]:
-    """Return the effects that come near a cause beside the others, by linear fits."""
-    causes = [*others, cause]
-    now = loss_of(info, names_of(causes))
-    gain = loss_of(info, names_of(others)) - now
-    most = min(RIVAL_LINEAR, RIVAL_LOSS + RIVAL_RATIO * gain)
-    return [
-        effect
-        for effect in problem.library
-        if effect not in causes
-        and loss_of(info, names_of([*others, effect])) - now < most
-        and _alike(info, others, cause, effect) > SHARED
-        and evidence(info, names_of(others), effect).inside
-    ]
-
-
-def _allowed(info: Information, others: Sequence[Effect], cause: Effect, rival: Effect) -> float:
-    """Return by how much a rival may fit worse than a cause and still be a rival."""
-    return TWIN_LOSS if _alike(info, others, cause, rival) > TWIN else RIVAL_LOSS
-
-
-def _alike(info: Information, others: Sequence[Effect], cause: Effect, rival: Effect) -> float:
-    """Return the correlation of what a cause and another effect change beside the others."""
-    base, own, its = (info.places(names_of(effects)) for effects in (others, [cause], [rival]))
-    free = partial_information(info.a.sum(axis=0), base, [*own, *its])[1]
-    return correlation(free, range(len(own)), range(len(own), len(own) + len(its)))
-
-
-def _refit(problem: Problem, info: Information, base: Array, names: Sequence[str]) -> _Refit:
-    """Return the best point of a nonlinear fit of parameters."""
-    best: tuple[float, Nearby] | None = None
-    for near in _steps(problem, info, base, names, RIVAL_REFITS):
-        misfit = misfit_of(info, near.white_residual)
-        if best is None or misfit < best[0]:
-            best = misfit, near
-    assert best is not None
-    misfit, near = best
-    at = [INDEX[name] for name in names]
-    std = np.sqrt(np.maximum(np.diag(np.linalg.pinv(near.a, hermitian=True)), 0.0))
-    return _Refit(misfit + PARAMETER_LOSS * len(names), near.vector[at] - base[at], std)

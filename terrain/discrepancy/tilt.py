@@ -12,9 +12,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from terrain.discrepancy.fitting import names_of
 from terrain.discrepancy.information import Information, information_at
 from terrain.discrepancy.residuals import low_pass_of
-from terrain.discrepancy.search import names_of
 from terrain.discrepancy.signals import Signals
 from terrain.discrepancy.simulation import Simulation
 from terrain.effects import Effect

@@ -8,9 +8,10 @@ from typing import NamedTuple
 import numpy as np
 
 from terrain.discrepancy.constancy import Constancy, constancy_of
+from terrain.discrepancy.fitting import Problem
 from terrain.discrepancy.information import Information, move_point, partial_information, recentre
 from terrain.discrepancy.probes import ProbeResult
-from terrain.discrepancy.search import Found, Problem
+from terrain.discrepancy.search import Found
 from terrain.discrepancy.selection import fit_change
 from terrain.effects import BOUNDS, CHANNELS, INDEX, Effect
 from terrain.records import Array

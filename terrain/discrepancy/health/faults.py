@@ -155,6 +155,7 @@ def repaired(signals: Sequence[Signals], faults: Sequence[Fault]) -> tuple[Signa
 
 
 def without(fault: Fault, run: Signals) -> Signals:
+    """Return a run without a fault, or without its channel where it is not clear how it should be."""
     if np.isnan(fault.factor):
         return replace(run, measured=fault.measured(run.measured))
     return fault.change.applied(run)

@@ -6,9 +6,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from terrain.discrepancy.fitting import RISE, Problem, names_of, steps_of
 from terrain.discrepancy.information import Nearby, move_point
 from terrain.discrepancy.residuals import low_pass_of
-from terrain.discrepancy.search import RISE, Problem, _steps, names_of, search, with_rivals
+from terrain.discrepancy.search import search, with_rivals
 from terrain.discrepancy.selection import fit_change
 from terrain.discrepancy.signals import signals_of
 from terrain.discrepancy.trials.drives import rich_drives
@@ -95,7 +96,7 @@ def test_a_set_of_causes_is_not_reached_twice(three, monkeypatch):
         left = [each for each in (first, second, third) if each not in causes and each.name not in barred]
         return left[:1]
 
-    monkeypatch.setattr("terrain.discrepancy.search._relinearize", refitted)
+    monkeypatch.setattr("terrain.discrepancy.search.relinearize", refitted)
     monkeypatch.setattr("terrain.discrepancy.search._weakest", weakest)
     monkeypatch.setattr("terrain.discrepancy.search._next", following)
     monkeypatch.setattr("terrain.discrepancy.search._better", lambda *_: None)
@@ -183,13 +184,13 @@ class Bent:
 def test_a_step_that_raises_the_square_is_halved(monkeypatch):
     bent, names = Bent(), ["camera_yaw_rad"]
     info, base = bent.start(0.05), np.zeros(len(INDEX))
-    points = list(_steps(bent, info, base, names, 12))
+    points = list(steps_of(bent, info, base, names, 12))
     losses = [info.origin_loss, *(point.c for point in points)]
     assert all(after <= (1 + RISE) * before for before, after in pairwise(losses))
     assert points[-1].vector[INDEX["camera_yaw_rad"]] == pytest.approx(0.0, abs=1e-4)
     # without that guard it goes from bound to bound
     monkeypatch.setattr("terrain.discrepancy.search.MAX_HALVINGS", 0)
-    free = list(_steps(bent, info, base, names, 12))
+    free = list(steps_of(bent, info, base, names, 12))
     assert abs(free[-1].vector[INDEX["camera_yaw_rad"]]) == BOUNDS["camera_yaw_rad"][1]
 
 

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from terrain.discrepancy.diagnose import diagnose
+from terrain.discrepancy.fitting import Problem
 from terrain.discrepancy.residuals import low_pass_of
-from terrain.discrepancy.search import Problem, search
+from terrain.discrepancy.search import search
 from terrain.discrepancy.signals import signals_of
 from terrain.discrepancy.trials.drives import rich_drives
 from terrain.discrepancy.trials.hidden_effects import hidden_runs

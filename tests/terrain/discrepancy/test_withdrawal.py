@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from terrain.discrepancy import withdrawal
+from terrain.discrepancy.fitting import Problem
 from terrain.discrepancy.probes import ProbeResult, probe_residuals
 from terrain.discrepancy.residuals import low_pass_of
-from terrain.discrepancy.search import Problem, _found, search
+from terrain.discrepancy.search import _found, search
 from terrain.discrepancy.signals import signals_of
 from terrain.discrepancy.trials.drives import rich_drives
 from terrain.discrepancy.trials.hidden_effects import hidden_runs
