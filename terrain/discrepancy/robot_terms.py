@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 
 from terrain.discrepancy.verdict import Value
-from terrain.effects import PARAMETER, effect_named
+from terrain.effects import PARAMETER, Wording, effect_named
 from terrain.extension import Basis, Origin, basis_of
 from terrain.robots import Robot
 
@@ -51,7 +51,7 @@ def in_robot_terms(effect: str, values: Sequence[Value], robot: Robot) -> str:
     'the wheels logged 0.27 s late'
     """
     total = {value.name: robot.effects.get(value.name, 0.0) + value.value for value in values}
-    written = TERMS.get(effect)
+    written = TERMS.get(effect_named(effect).wording)
     if written is not None:
         return written(values, total, robot)
     return " and ".join(_generic(value, total[value.name], robot) for value in values)
@@ -136,14 +136,12 @@ def _lever(values: Sequence[Value], total: Total, robot: Robot) -> str:
     return f"the measured point {' and '.join(parts)}{joint}the centre {notes[0]}"
 
 
-def _late(positive: str, negative: str) -> Callable[[Sequence[Value], Total, Robot], str]:
-    def write(values: Sequence[Value], total: Total, robot: Robot) -> str:
-        (value,) = values
-        homes = basis_of(robot, value.name, total[value.name])
-        late_s = homes[0].extended if homes else total[value.name]
-        return f"{positive if late_s > 0 else negative} {rounded(abs(late_s), _half(value))} s late"
-
-    return write
+def _late(values: Sequence[Value], total: Total, robot: Robot) -> str:
+    (value,) = values
+    homes = basis_of(robot, value.name, total[value.name])
+    late_s = homes[0].extended if homes else total[value.name]
+    who = effect_named(PARAMETER[value.name].label.replace(" ", "_")).late
+    return f"{who[0 if late_s > 0 else 1]} {rounded(abs(late_s), _half(value))} s late"
 
 
 def _camera_yaw(values: Sequence[Value], total: Total, robot: Robot) -> str:
@@ -183,18 +181,15 @@ def _one_sided(values: Sequence[Value], total: Total, robot: Robot) -> str:
     return f"wheels that are {number} % {'larger' if error > 0 else 'smaller'} on the right than on the left"
 
 
-TERMS: dict[str, Callable[[Sequence[Value], Total, Robot], str]] = {
-    "effective_track": _track,
-    "lever_arm": _lever,
-    "clock_offset": _late("the other sensors logged", "the wheels logged"),
-    "imu_latency": _late("the IMU", "the IMU"),
-    "camera_latency": _late("the camera or lidar", "the camera or lidar"),
-    "yaw_delay": _late("the robot turning", "the robot turning"),
-    "camera_yaw": _camera_yaw,
-    "turn_drag": _turn_drag,
-    "turn_side_slip": _side_slip,
-    "gyro_scale": _gyro_scale,
-    "one_sided_radius": _one_sided,
+TERMS: dict[Wording, Callable[[Sequence[Value], Total, Robot], str]] = {
+    Wording.TRACK: _track,
+    Wording.MEASURED_POINT: _lever,
+    Wording.LATE: _late,
+    Wording.CAMERA_YAW: _camera_yaw,
+    Wording.LOSS_IN_TURNS: _turn_drag,
+    Wording.SIDE_SLIP: _side_slip,
+    Wording.GYRO_SCALE: _gyro_scale,
+    Wording.SIDES: _one_sided,
 }
 """How the effects are worded whose numbers do not speak for themselves; the others by their home."""
 

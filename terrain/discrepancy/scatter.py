@@ -20,7 +20,7 @@ import numpy as np
 
 from terrain.records import Array
 
-PRIOR_RUNS = 2.0
+PRIOR_RUNS = 4.0
 """What was assumed counts as so many runs: enough that three runs do not deny it."""
 
 TAIL_DOF = 4.0

@@ -156,7 +156,7 @@ def channel_effects(found: Found, cause: Effect) -> dict[str, ChannelEffect]:
     kept = ~np.isin(info.nuisances, info.places(own))
     free, precision = info.nuisances[kept], np.diag(1.0 / info.nuisance_std[kept] ** 2)
     for i, (residual, change) in enumerate(zip(info.white_residual, info.white_change, strict=True)):
-        scatter = change[free].reshape(free.size, -1)
+        scatter = change[free].reshape(free.size, residual.size)
         inner = np.linalg.inv(scatter @ scatter.T + precision)
         for m, (places, (common, held_out)) in enumerate(zip((others, every), fits, strict=True)):
             for kind, x in enumerate((common, held_out[i])):

@@ -47,6 +47,7 @@ from terrain.effects.types import (
     Inverse,
     Parameter,
     PlantPart,
+    Wording,
 )
 from terrain.effects.vector import INDEX, PARAMETERS, vector_of
 
@@ -81,6 +82,7 @@ __all__ = [
     "Inverse",
     "Parameter",
     "PlantPart",
+    "Wording",
     "checked_covariance",
     "checked_effects",
     "effect_named",

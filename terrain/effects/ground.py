@@ -17,6 +17,7 @@ from terrain.effects.types import (
     Home,
     Parameter,
     PlantPart,
+    Wording,
 )
 
 SLIP_AND_RESISTANCE: tuple[Effect, ...] = (
@@ -40,6 +41,7 @@ SLIP_AND_RESISTANCE: tuple[Effect, ...] = (
         (GYRO, SPEED_Y, HEADING),
         "turns in place and in arcs, and an absolute heading",
         twins=(("gyro_scale", HEADING),),
+        wording=Wording.TRACK,
     ),
     Effect(
         "turning_slip",
@@ -63,6 +65,7 @@ SLIP_AND_RESISTANCE: tuple[Effect, ...] = (
         (SKID,),
         (SPEED_X,),
         "arcs of several yaw rates",
+        wording=Wording.LOSS_IN_TURNS,
     ),
     Effect(
         "force_slip",
@@ -128,6 +131,7 @@ SIDEWAYS: tuple[Effect, ...] = (
         (SKID,),
         (SPEED_Y,),
         "arcs of several speeds, to both sides",
+        wording=Wording.SIDE_SLIP,
     ),
     Effect(
         "side_slip_build_up",

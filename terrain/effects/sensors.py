@@ -18,6 +18,7 @@ from terrain.effects.types import (
     Inverse,
     Parameter,
     PlantPart,
+    Wording,
 )
 from terrain.effects.wheels import KINEMATICS
 
@@ -69,6 +70,7 @@ SENSORS: tuple[Effect, ...] = (
         sensed_only=True,
         plant=PlantPart.SENSORS,
         twins=(("effective_track", HEADING),),
+        wording=Wording.GYRO_SCALE,
     ),
     Effect(
         "accel_bias",
@@ -111,6 +113,8 @@ SENSORS: tuple[Effect, ...] = (
         (GYRO, ACCEL),
         "steps of the yaw rate, and a camera that is not late",
         plant=PlantPart.DESCRIPTION,
+        wording=Wording.LATE,
+        late=("the IMU", "the IMU"),
     ),
     Effect(
         "camera_latency",
@@ -130,6 +134,8 @@ SENSORS: tuple[Effect, ...] = (
         "accelerations at two frequencies",
         sensed_only=True,
         plant=PlantPart.DESCRIPTION,
+        wording=Wording.LATE,
+        late=("the camera or lidar", "the camera or lidar"),
     ),
     Effect(
         "camera_yaw",
@@ -149,6 +155,7 @@ SENSORS: tuple[Effect, ...] = (
         "straight, on more than one side slope",
         sensed_only=True,
         plant=PlantPart.SENSORS,
+        wording=Wording.CAMERA_YAW,
     ),
     Effect(
         "lever_arm",
@@ -170,6 +177,7 @@ SENSORS: tuple[Effect, ...] = (
         "turns to both sides",
         sensed_only=True,
         plant=PlantPart.DESCRIPTION,
+        wording=Wording.MEASURED_POINT,
     ),
     Effect(
         "clock_offset",
@@ -188,6 +196,8 @@ SENSORS: tuple[Effect, ...] = (
         (*MOTION, HEADING),
         "switching manoeuvres",
         plant=PlantPart.SENSORS,
+        wording=Wording.LATE,
+        late=("the other sensors logged", "the wheels logged"),
     ),
     Effect(
         "clock_rate",

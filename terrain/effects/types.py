@@ -135,6 +135,20 @@ class PlantPart(Enum):
     SENSORS = "samples and stamps"
 
 
+class Wording(Enum):
+    """What a sentence makes of the values of an effect."""
+
+    NUMBER = "the number of its home, or the values themselves"
+    TRACK = "an effective track in m"
+    MEASURED_POINT = "where the measured point is"
+    LATE = "who is late, in s"
+    CAMERA_YAW = "an angle of the camera in degrees"
+    LOSS_IN_TURNS = "the speed that a turn takes"
+    SIDE_SLIP = "the speed to the outside of a turn"
+    GYRO_SCALE = "by how much the gyro reads too much"
+    SIDES = "by how much the wheels of a side are larger"
+
+
 class Effect(NamedTuple):
     """An error that the simulation may have.
 
@@ -152,6 +166,8 @@ class Effect(NamedTuple):
     aliases : other names of the same effect, which no log distinguishes from it
     twins : names of effects that look the same, and the channel that a log needs to distinguish them
     deprecated : former names, accepted on the command line
+    wording : what sentences make of its values
+    late : who is late by a positive and by a negative value, of an effect that is worded so
     modifies : name of the effect without which it does nothing; empty for an effect that acts by itself
     """
 
@@ -167,4 +183,6 @@ class Effect(NamedTuple):
     aliases: tuple[str, ...] = ()
     twins: tuple[tuple[str, str], ...] = ()
     deprecated: tuple[str, ...] = ()
+    wording: Wording = Wording.NUMBER
+    late: tuple[str, str] = ("", "")
     modifies: str = ""

@@ -16,6 +16,7 @@ from terrain.effects.types import (
     Inverse,
     Parameter,
     PlantPart,
+    Wording,
 )
 
 KINEMATICS = "kinematics of a planar robot"
@@ -120,6 +121,7 @@ WHEELS_AND_STEERING: tuple[Effect, ...] = (
         (*MOTION, HEADING),
         "fast and straight",
         plant=PlantPart.BODY,
+        wording=Wording.SIDES,
     ),
     *(_wheel_scale(wheel) for wheel in (1, 2, 3)),
     *(_steering_offset(wheel) for wheel in (1, 2, 3)),
@@ -178,5 +180,7 @@ WHEELS_AND_STEERING: tuple[Effect, ...] = (
         (SKID,),
         (GYRO, SPEED_Y, HEADING),
         "steps of the yaw rate",
+        wording=Wording.LATE,
+        late=("the robot turning", "the robot turning"),
     ),
 )

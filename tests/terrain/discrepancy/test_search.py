@@ -189,7 +189,7 @@ def test_a_step_that_raises_the_square_is_halved(monkeypatch):
     assert all(after <= (1 + RISE) * before for before, after in pairwise(losses))
     assert points[-1].vector[INDEX["camera_yaw_rad"]] == pytest.approx(0.0, abs=1e-4)
     # without that guard it goes from bound to bound
-    monkeypatch.setattr("terrain.discrepancy.search.MAX_HALVINGS", 0)
+    monkeypatch.setattr("terrain.discrepancy.fitting.MAX_HALVINGS", 0)
     free = list(steps_of(bent, info, base, names, 12))
     assert abs(free[-1].vector[INDEX["camera_yaw_rad"]]) == BOUNDS["camera_yaw_rad"][1]
 
@@ -203,5 +203,5 @@ def test_what_changes_other_channels_is_no_rival(monkeypatch):
     assert {cause.name for cause in found.causes} == {"camera_yaw", "payload"}
     alone = found._replace(causes=(effect_named("payload"),))  # as if the yaw had been withdrawn
     assert with_rivals(asked, start, alone).rivals == {"payload": ()}
-    monkeypatch.setattr("terrain.discrepancy.search.SHARED", -1.0)
+    monkeypatch.setattr("terrain.discrepancy.rivals.SHARED", -1.0)
     assert "camera_yaw" in [each.effect.name for each in with_rivals(asked, start, alone).rivals["payload"]]

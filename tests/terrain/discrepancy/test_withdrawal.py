@@ -168,4 +168,4 @@ def test_what_a_cause_does_to_each_channel():
 def test_a_value_that_differs_in_slow_motion(yaw):
     asked, found = yaw
     # as if quick motion had asked for twice of it
-    assert "has another value in slow motion" in reason(asked, found._replace(change=2 * found.change))
+    assert "has a smaller value in slow motion" in reason(asked, found._replace(change=2 * found.change))
