@@ -66,9 +66,18 @@ class Problem(NamedTuple):
 
 
 class Refit(NamedTuple):
-    """How badly a nonlinear fit fits, as minus twice a log-likelihood (see misfit_of), and what it fits."""
+    """A nonlinear fit.
+
+    Parameters
+    ----------
+    loss : how badly it fits, as minus twice a log-likelihood; see
+        :func:`~terrain.discrepancy.information.misfit_of`
+    square : whitened square that it leaves
+    change, std : (k,) of its parameters
+    """
 
     loss: float
+    square: float
     change: Array
     std: Array
 
@@ -136,4 +145,4 @@ def fit_again(problem: Problem, info: Information, base: Array, names: Sequence[
     misfit, near = best
     at = [INDEX[name] for name in names]
     std = np.sqrt(np.maximum(np.diag(np.linalg.pinv(near.a, hermitian=True)), 0.0))
-    return Refit(misfit + PARAMETER_LOSS * len(names), near.vector[at] - base[at], std)
+    return Refit(misfit + PARAMETER_LOSS * len(names), near.c, near.vector[at] - base[at], std)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from terrain.discrepancy.fitting import Problem, fit_again, names_of
+from terrain.discrepancy.fitting import RISE, Problem, Refit, fit_again, names_of
 from terrain.discrepancy.information import Information, correlation, loss_of, partial_information
 from terrain.discrepancy.selection import evidence
 from terrain.effects import Effect
@@ -49,20 +49,22 @@ def rivals_of(
     """Return by cause all effects that, refitted in its place, fit as well as it does, the best first.
 
     It is compared by the noise that the causes leave and by that of the simulation as it is given: a cause
-    that absorbs noise is ahead by only one of them.
+    that absorbs noise is ahead by only one of them.  Where much is wrong, neither is a likelihood: a rival that
+    leaves a larger square than the noise of the wheels can make is none.
     """
     base, judges = start.vector, (info, start)
-    own: list[float] = []  # losses of the causes by both judges, where anything comes near
+    own: list[Refit] = []  # losses of the causes by both judges, where anything comes near
     rivals = {}
     for cause in causes:
         others = [other for other in causes if other is not cause]
         found = []
         for effect in _near(problem, info, cause, others):
-            own = own or [fit_again(problem, judge, base, names_of(causes)).loss for judge in judges]
+            own = own or [fit_again(problem, judge, base, names_of(causes)) for judge in judges]
             swapped = names_of([*others, effect])
             here, there = (fit_again(problem, judge, base, swapped) for judge in judges)
-            behind = min(here.loss - own[0], there.loss - own[1])
-            if behind < _allowed(info, others, cause, effect):
+            behind = min(here.loss - own[0].loss, there.loss - own[1].loss)
+            worse = here.square > (1.0 + RISE) * own[0].square + RIVAL_LOSS
+            if not worse and behind < _allowed(info, others, cause, effect):
                 at = [swapped.index(p.name) for p in effect.parameters]
                 found.append(Rival(effect, behind, here.change[at], here.std[at]))
         rivals[cause.name] = tuple(sorted(found, key=lambda rival: rival.behind))
