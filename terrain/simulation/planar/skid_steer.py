@@ -78,6 +78,7 @@ def move_skid(
     carried = weight * (1.0 + planar.load_ratio * p[_PAYLOAD])
     rolling = (planar.rolling_ratio + p[_ROLLING]) * (1.0 + p[_PAYLOAD]) * weight
     scrub = (planar.scrub_ratio + p[_SCRUB]) * weight
+    radius_m = planar.radius_m * (1.0 + p[_RADIUS])
     u, turn, tight, difference = _differed(planar, p, dt, wheel_speed_mps)
     speed, rest, ground = np.zeros(n), np.zeros(n), planar.soft_ratio
     target_before, force_ratio, slip = 0.0, 0.0, 0.0
@@ -109,11 +110,11 @@ def move_skid(
     accel, wheel, spin = slopes(speed, dt), slopes(u, dt), slopes(turn, dt)
     for k in range(n):
         out[k, FORCE] = mass * accel[k] + rest[k]
-        torque = (out[k, FORCE] + planar.rotating_kg * wheel[k]) * planar.radius_m
+        torque = (out[k, FORCE] + planar.rotating_kg * wheel[k]) * radius_m
         out[k, AMPS] = (torque + planar.friction_nm * direction(u[k])) / planar.nm_per_a
         moment = planar.yaw_inertia_kgm2 * (1.0 + p[_PAYLOAD]) * spin[k]
         force = 2.0 * moment / planar.track_m + scrub * tight[k] * direction(difference[k])
-        out[k, TURNING_AMPS] = force * planar.radius_m / planar.nm_per_a
+        out[k, TURNING_AMPS] = force * radius_m / planar.nm_per_a
     if p[_SIDE_SLIP] != 0.0:
         out[:, VY] = lagged(-p[_SIDE_SLIP] * speed * turn, p[_BUILD_UP], dt)
     return out

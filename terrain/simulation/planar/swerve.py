@@ -143,7 +143,7 @@ def move_swerve(
         out[k, AMPS] = load * weight * (heading[0, k] * f[0] + heading[1, k] * f[1] + heading[2, k] * f[2])
     spun = slopes(mean_wheel_speed, dt)
     for k in range(n):
-        torque = (out[k, AMPS] + planar.rotating_kg * spun[k]) * planar.radius_m
+        torque = (out[k, AMPS] + planar.rotating_kg * spun[k]) * planar.radius_m * (1.0 + p[_RADIUS])
         direction = mean_wheel_speed[k] / math.sqrt(
             mean_wheel_speed[k] * mean_wheel_speed[k] + ROLLING_MPS * ROLLING_MPS
         )
