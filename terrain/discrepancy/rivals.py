@@ -49,8 +49,8 @@ def rivals_of(
     """Return by cause all effects that, refitted in its place, fit as well as it does, the best first.
 
     It is compared by the noise that the causes leave and by that of the simulation as it is given: a cause
-    that absorbs noise is ahead by only one of them.  Where much is wrong, neither is a likelihood: a rival that
-    leaves a larger square than the noise of the wheels can make is none.
+    that absorbs noise is ahead by only one of them.  Where much is wrong, neither is a likelihood: a rival
+    that leaves a larger square than the noise of the wheels can make is none.
     """
     base, judges = start.vector, (info, start)
     own: list[Refit] = []  # losses of the causes by both judges, where anything comes near
