@@ -62,7 +62,7 @@ def varying_effects(found: Found, library: Sequence[Effect]) -> tuple[Varying, .
     if len(found.info.rows) < 2 * MIN_GROUP:
         return ()
     tried = [_run_values(found, effect) for effect in library if len(effect.parameters) == 1]
-    tried = [each for each in tried if each.z > Z_VARIES]
+    tried = [each for each in tried if each.z > Z_VARIES and _is_possible(each)]
     if not tried:
         return ()
     best = max(tried, key=lambda each: each.gain)
@@ -83,6 +83,13 @@ def varying_effects(found: Found, library: Sequence[Effect]) -> tuple[Varying, .
             best.channel,
         ),
     )
+
+
+def _is_possible(tried: _RunValues) -> bool:
+    """Return whether the values of most runs are what the parameter may be."""
+    low, high = BOUNDS[tried.effect.parameters[0].name]
+    mean = float(np.average(tried.value, weights=tried.weight))
+    return bool(low <= mean - tried.scatter and mean + tried.scatter <= high)
 
 
 def _run_values(found: Found, effect: Effect) -> _RunValues:
