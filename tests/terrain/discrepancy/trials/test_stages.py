@@ -93,6 +93,7 @@ def test_the_same_seed_gives_the_same_trial_and_nothing_of_the_truth_leaks(row):
     assert len({run.run_id for run in made.runs}) == len(made.runs)
 
 
+@pytest.mark.slow
 def test_gross_effects_are_20_to_100_times_their_limit_unless_that_is_beyond_the_bounds():
     clipped = []
     for number in range(12):
@@ -205,6 +206,7 @@ def test_stalled_runs_do_not_move_and_their_wheels_turn():
                 assert speed > 0.25 * driven
 
 
+@pytest.mark.slow
 def test_half_of_the_runs_have_the_effect_and_the_others_have_none():
     made = stage_hiding(Row.HALF, ("gyro_bias",))
     (bias,) = made.hidden.effects.values()
