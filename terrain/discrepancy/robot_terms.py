@@ -192,16 +192,3 @@ TERMS: dict[Wording, Callable[[Sequence[Value], Total, Robot], str]] = {
     Wording.SIDES: _one_sided,
 }
 """How the effects are worded whose numbers do not speak for themselves; the others by their home."""
-
-
-def short_terms(name: str, values: Sequence[Value], robot: Robot) -> str:
-    """Return the same without the description's numbers.
-
-    Examples
-    --------
-    >>> from terrain.robots import load_robot
-    >>> track = Value("effective_track_ratio", 1.5, "ratio", 1.47, 1.53)
-    >>> short_terms("effective_track", [track], load_robot("husky"))
-    'an effective track of 1.43 m'
-    """
-    return in_robot_terms(effect_named(name).name, values, robot).partition(" (")[0]

@@ -159,9 +159,7 @@ def _scattered(
     beyond = float(square.sum()) - (n - 1)
     spread = float(precision.sum() - (precision**2).sum() / precision.sum())
     scatter = math.sqrt(max(beyond / spread, 0.0) + assumed_std**2)
-    low, high = BOUNDS[effect.parameters[0].name]
-    gain = float(square.sum()) if scatter < high - low else 0.0
-    return _RunValues(effect, value + given, precision, gain, scatter, z, channel)
+    return _RunValues(effect, value + given, precision, float(square.sum()), scatter, z, channel)
 
 
 def _squares(value: Array, precision: Array) -> Array:
