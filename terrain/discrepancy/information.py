@@ -67,6 +67,7 @@ class Information(NamedTuple):
     inner : of each run (q, q): covariance of its nuisances given the parameters
     origin, origin_loss : the point where sensitivities were taken, and the sum of ``c`` there; they stay when
         changes are counted from another point
+    model_std : (k,) error of the simulation itself in units of each parameter, the same in all runs
     """
 
     parameters: tuple[str, ...]
@@ -86,6 +87,7 @@ class Information(NamedTuple):
     inner: tuple[Array, ...]
     origin: Array
     origin_loss: float
+    model_std: Array
 
     def places(self, names: Sequence[str]) -> list[int]:
         """Return the positions of parameters in the matrices."""
@@ -117,7 +119,8 @@ def information_at(
         noise, std = _noise_and_scatter(names, vector, rows, nuisances, assumed_std)
     else:
         noise, std = statistics.noise, np.array([statistics.scatter[name] for name in scattered])
-    return _sum_forms(names, vector, rows, noise, nuisances, std)
+    model_std = np.array([simulation.model_error.get(name, 0.0) for name in names])
+    return _sum_forms(names, vector, rows, noise, nuisances, std)._replace(model_std=model_std)
 
 
 def _noise_and_scatter(
@@ -203,6 +206,7 @@ def _sum_forms(
         tuple(inners),
         vector,
         float(c.sum()),
+        np.zeros(k),
     )
 
 

@@ -148,7 +148,8 @@ def _probe_results(
     at = info.places(names)
     n_runs, q = len(columns), columns[0].shape[0]
     own, cross, score = np.empty((n_runs, q)), np.empty((n_runs, q, len(at))), np.empty((n_runs, q))
-    power = np.zeros(len(at))
+    power, doubtful = np.zeros(len(at)), np.flatnonzero(info.model_std)
+    shown = np.zeros((q, len(doubtful)))
     for i, x in enumerate(columns):
         white, residual = info.white_change[i], info.white_residual[i]
         j, r = white[:, :, c], residual[:, c]
@@ -156,12 +157,15 @@ def _probe_results(
         own[i] = (x * x).sum(axis=1) - np.einsum("qi,ij,qj->q", xn, info.inner[i], xn)
         power += (j[at] ** 2).sum(axis=1)
         cross[i] = x @ j[at].T - xn @ info.shift[i][:, at]
+        shown += x @ j[doubtful].T - xn @ info.shift[i][:, doubtful]
         score[i] = x @ r - xn @ info.shift[i][:, -1]
     a = info.a[:, at][:, :, at]
     g = info.g[:, at] - a @ change  # at the fit
     follow = np.zeros((0, q))
     if at:
         follow = np.linalg.lstsq(a.sum(axis=0), cross.sum(axis=0).T, rcond=1e-10)[0]
+        shown -= follow.T @ info.a[:, at][:, :, doubtful].sum(axis=0)
+    of_model = ((shown * info.model_std[doubtful]) ** 2).max(axis=1, initial=0.0)
     free = own.sum(axis=0) - (cross.sum(axis=0) * follow.T).sum(axis=1)
     size_of_run = (
         own - 2 * np.einsum("rqs,sq->rq", cross, follow) + np.einsum("sq,rst,tq->rq", follow, a, follow)
@@ -181,7 +185,7 @@ def _probe_results(
             continue
         part_k = part[:, k] - size_of_run[:, k] * size[k]
         dispersion, dof = pooled_variance(part_k, np.clip(size_of_run[:, k] / free[k], 0.0, 0.9), free[k])
-        z = z_of_t(abs(total[k]) / np.sqrt(free[k] * dispersion), dof)
+        z = z_of_t(abs(total[k]) / np.sqrt(free[k] * dispersion + of_model[k]), dof)
         known = dict(zip(names, alike[k].tolist(), strict=True))
         answers.append(ProbeResult(z, float(total[k] ** 2 / free[k]), known))
     return answers

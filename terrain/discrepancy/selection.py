@@ -129,7 +129,9 @@ def _dispersion(
         x[:n] = np.linalg.lstsq(total[:n, :n], score[:n] - total[:n, n:] @ change, rcond=1e-10)[0]
     part = (g - a @ x) @ direction
     fraction = np.clip(np.einsum("i,kij,j->k", direction, a, direction) / size, 0.0, 0.9)
-    return pooled_variance(part, fraction, size)
+    variance, dof = pooled_variance(part, fraction, size)
+    of_model = (free @ change) * info.model_std[both[n:]]
+    return variance + float((of_model**2).sum()) / size, dof
 
 
 def pooled_variance(part: Array, fraction: Array, size: float) -> tuple[float, float]:

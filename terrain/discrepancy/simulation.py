@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
-from terrain.effects import NUISANCES, Effect, library_of, vector_of
+from terrain.effects import INDEX, NUISANCES, Effect, library_of, vector_of
 from terrain.errors import ConfigError
 from terrain.records import Array
 from terrain.robots import Robot
@@ -24,6 +24,8 @@ class Simulation:
     grounds : terrains by the label of a run
     effects : parameters of the effects that are built in already; those not named are 0
     scatter : standard deviation from run to run of parameters in :data:`NUISANCES`; those not named are 0
+    model_error : how large the simulation's own error is in units of parameters, the same in all runs; what
+        is no larger is not stated
 
     Raises
     ------
@@ -36,6 +38,7 @@ class Simulation:
     effects: Mapping[str, float] = field(default_factory=dict)
     scatter: Mapping[str, float] = field(default_factory=dict)
     grounds: Mapping[str, Ground] = field(default_factory=dict)
+    model_error: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         vector_of(self.effects)
@@ -44,6 +47,10 @@ class Simulation:
                 raise ConfigError(
                     f"scatter: {name} is {std!r}; a standard deviation of a nuisance is required"
                 )
+        for name, std in self.model_error.items():
+            if name not in INDEX or not std >= 0:
+                raise ConfigError(f"model_error: {name} is {std!r}; a size from 0 of a parameter is required")
+        object.__setattr__(self, "model_error", MappingProxyType(dict(self.model_error)))
         object.__setattr__(self, "effects", MappingProxyType(dict(self.effects)))
         object.__setattr__(self, "scatter", MappingProxyType(dict(self.scatter)))
         object.__setattr__(self, "grounds", MappingProxyType(dict(self.grounds)))

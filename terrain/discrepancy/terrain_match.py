@@ -4,18 +4,19 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 from terrain.discrepancy.signals import signals_of
 from terrain.discrepancy.simulation import Simulation
 from terrain.discrepancy.tilt import with_effective_tilt
-from terrain.effects import Effect
+from terrain.effects import Effect, parameters_of
 from terrain.errors import ConfigError, DataError
 from terrain.records import RunLog
 from terrain.robots import Robot
 from terrain.simulation.planar.ground import planar_ground
 from terrain.simulation.planar.model import Ground
-from terrain.simulation.planar.noise import load_scatter
+from terrain.simulation.planar.noise import load_model_error, load_scatter
 from terrain.terramechanics.soil import extra_soil_names, load_soil, soil_names
 
 
@@ -46,6 +47,9 @@ def simulation_for(
     grounds = {label: ground for label in labels if (ground := _ground(robot, label)) is not None}
     simulation = Simulation(robot, Ground(), robot.effects, load_scatter()._asdict(), grounds)
     if grounds:
+        own = set(parameters_of(robot.drive))
+        error = {name: std for name, std in load_model_error().items() if name in own}
+        simulation = replace(simulation, model_error=error)
         signals = [signals_of(run, robot) for run in runs]
         simulation = with_effective_tilt(simulation, signals, library)
     matches = []

@@ -89,6 +89,19 @@ def load_noise() -> Noise:
     return Noise(**_numbers("noise", Noise._fields))
 
 
+def load_model_error() -> dict[str, float]:
+    """Return how far the planar simulation on a soil of the package is off the dynamic plant, by parameter.
+
+    Each is the value that a parameter seems to have where nothing is hidden; see ``data/spread/planar.yaml``.
+
+    Examples
+    --------
+    >>> load_model_error()["motor_constant_ratio"]
+    0.025
+    """
+    return _numbers("model_error", tuple(read_yaml(data_folder("spread") / "planar.yaml")["model_error"]))
+
+
 def _numbers(part: str, names: tuple[str, ...]) -> dict[str, float]:
     described: Any = read_yaml(data_folder("spread") / "planar.yaml")[part]
     return {
