@@ -60,6 +60,8 @@ class Information(NamedTuple):
     rows, noise : from which they come
     white_residual, white_change : of each run (rows, channels) and (k, rows, channels), 0 where nothing was
         measured
+    grams : (runs, N_BLOCKS, k + 1, k + 1) products of whitened sensitivities and, last, of the residual at
+        ``origin``, in each third of each run; nothing is marginalised
     nuisances : (q,) indices into ``parameters`` of those that vary from run to run
     nuisance_std : (q,)
     shift : of each run (q, k + 1): deviation of its nuisances per unit of each parameter's change (negative),
@@ -80,6 +82,7 @@ class Information(NamedTuple):
     noise: Noise
     white_residual: tuple[Array, ...]
     white_change: tuple[Array, ...]
+    grams: Array
     nuisances: Array
     nuisance_std: Array
     shift: tuple[Array, ...]
@@ -144,13 +147,8 @@ def _noise_and_scatter(
 def _scatter(info: Information, assumed_std: Array) -> Array:
     """Return the scatter (q,) of nuisances about what the whole library explains of all runs alike."""
     x = np.linalg.solve(_freed_information(info), info.g.sum(axis=0))
-    gram, score = [], []
-    for residual, change in zip(info.white_residual, info.white_change, strict=True):
-        own = change[info.nuisances].reshape(info.nuisances.size, -1)
-        left = residual.ravel() - x @ change.reshape(len(x), -1)
-        gram.append(own @ own.T)
-        score.append(own @ left)
-    return scatter_of(np.array(gram), np.array(score), assumed_std)
+    along = info.grams.sum(axis=1)[:, info.nuisances]
+    return scatter_of(along[:, :, info.nuisances], along[:, :, -1] - along[:, :, :-1] @ x, assumed_std)
 
 
 def _sum_forms(
@@ -165,12 +163,10 @@ def _sum_forms(
     a, g, c = np.empty((n, k, k)), np.empty((n, k)), np.empty(n)
     a_blocks, g_blocks = np.empty((n, N_BLOCKS, k, k)), np.empty((n, N_BLOCKS, k))
     white_r, white_j, shifts, inners = [], [], [], []
+    every = np.empty((n, N_BLOCKS, k + 1, k + 1))
     for i, run in enumerate(rows):
         residual, change = _whiten_run(noise, run)
-        both = np.concatenate([change, residual[None]]).transpose(1, 0, 2)
-        edges = [len(both) * b // N_BLOCKS for b in range(N_BLOCKS + 1)]
-        parts = [both[edges[b] : edges[b + 1]].transpose(1, 0, 2).reshape(k + 1, -1) for b in range(N_BLOCKS)]
-        grams = np.array([part @ part.T for part in parts])
+        every[i] = grams = grams_of(residual, change)
         gram = grams.sum(axis=0)
         inner = np.linalg.inv(gram[np.ix_(nuisances, nuisances)] + np.diag(1.0 / std**2))
         shift = inner @ gram[nuisances]
@@ -197,6 +193,7 @@ def _sum_forms(
         noise,
         tuple(white_r),
         tuple(white_j),
+        every,
         nuisances,
         std,
         tuple(shifts),
@@ -204,6 +201,20 @@ def _sum_forms(
         vector,
         float(c.sum()),
     )
+
+
+def grams_of(residual: Array, change: Array) -> Array:
+    """Return the products (N_BLOCKS, k + 1, k + 1) of columns of a run in each third of its rows.
+
+    Parameters
+    ----------
+    residual : (rows, channels), the last column
+    change : (k, rows, channels)
+    """
+    columns = np.concatenate([change, residual[None]])
+    edges = [len(residual) * b // N_BLOCKS for b in range(N_BLOCKS + 1)]
+    parts = [columns[:, edges[b] : edges[b + 1]].reshape(len(columns), -1) for b in range(N_BLOCKS)]
+    return np.array([part @ part.T for part in parts])
 
 
 def _whiten_run(noise: Noise, run: Rows) -> tuple[Array, Array]:
