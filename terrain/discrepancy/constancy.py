@@ -145,16 +145,16 @@ def _fit_groups(
     q, k = info.nuisances.size, n_groups * p + len(others)
     total, score = np.zeros((k, k)), np.zeros(k)
     away = np.array([info.origin[INDEX[n]] - info.vector[INDEX[n]] for n in info.parameters])
-    for i, (residual, change) in enumerate(zip(info.white_residual, info.white_change, strict=True)):
-        rows = len(residual)
-        columns = np.zeros((q + k + 1, *residual.shape))
-        columns[:q], columns[q + n_groups * p : -1] = change[info.nuisances], change[others]
-        columns[-1] = residual + np.tensordot(away, change, axes=1)
+    for i, grams in enumerate(info.grams):
+        gram = np.zeros((q + k + 1, q + k + 1))
         for b in range(N_BLOCKS):
-            part, at = slice(rows * b // N_BLOCKS, rows * (b + 1) // N_BLOCKS), q + group_of[i, b] * p
-            columns[at : at + p, part] = change[mine, part]
-        flat = columns.reshape(len(columns), -1)
-        gram = flat @ flat.T
+            columns = np.zeros((len(away) + 1, q + k + 1))
+            at = q + group_of[i, b] * p
+            columns[info.nuisances, np.arange(q)] = 1.0
+            columns[mine, np.arange(at, at + p)] = 1.0
+            columns[others, np.arange(q + n_groups * p, q + k)] = 1.0
+            columns[:, -1] = *away, 1.0
+            gram += columns.T @ grams[b] @ columns
         free = gram[q:, q:] - gram[q:, :q] @ info.inner[i] @ gram[:q, q:]
         total, score = total + free[:-1, :-1], score + free[:-1, -1]
     cov = np.linalg.pinv(total, hermitian=True, rcond=1e-12)

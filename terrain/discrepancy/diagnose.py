@@ -84,7 +84,7 @@ def diagnose_signals(
     problem = prepared.problem
     start = problem.at(simulation.vector) if prepared.seeds else prepared.aligned
     found, withdrawn = _search_and_withdraw(problem, start, prepared.seeds)
-    varying = varying_effects(found, problem.library)
+    varying = varying_effects(problem, found)
     found, withdrawn = _without_varying(problem, start, found, withdrawn, varying)
     found = pooled(problem, with_rivals(problem, start, found))
     unexplained = _unexplained_channels(found, withdrawn, varying)

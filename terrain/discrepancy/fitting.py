@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from terrain.discrepancy.information import (
     Information,
-    Nearby,
     Statistics,
     information_at,
     loss_of,
-    misfit_of,
     move_point,
-    nearby,
     recentre,
 )
+from terrain.discrepancy.nearby import Nearby, misfit_of, nearby
 from terrain.discrepancy.residuals import LowPass
 from terrain.discrepancy.selection import fit_change
 from terrain.discrepancy.signals import Signals
@@ -54,11 +52,15 @@ class Problem(NamedTuple):
         return tuple(p.name for effect in self.library for p in effect.parameters)
 
     def at(
-        self, vector: Array, names: Sequence[str] | None = None, statistics: Statistics | None = None
+        self,
+        vector: Array,
+        names: Sequence[str] | None = None,
+        statistics: Statistics | None = None,
+        own: Mapping[str, Array] | None = None,
     ) -> Information:
         """Return the information of the runs around a point; see :func:`information_at`."""
         desired = self.parameters if names is None else names
-        return information_at(self.signals, self.simulation, vector, desired, self.low_pass, statistics)
+        return information_at(self.signals, self.simulation, vector, desired, self.low_pass, statistics, own)
 
     def near(self, info: Information, vector: Array, names: Sequence[str]) -> Nearby:
         """Return the information on a few parameters at another point, with the noise of an information."""
@@ -71,7 +73,7 @@ class Refit(NamedTuple):
     Parameters
     ----------
     loss : how badly it fits, as minus twice a log-likelihood; see
-        :func:`~terrain.discrepancy.information.misfit_of`
+        :func:`~terrain.discrepancy.nearby.misfit_of`
     square : whitened square that it leaves
     change, std : (k,) of its parameters
     """

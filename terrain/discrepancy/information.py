@@ -24,6 +24,7 @@ from terrain.discrepancy.signals import Signals
 from terrain.discrepancy.simulation import Simulation
 from terrain.effects import BOUNDS, CHANNELS, INDEX
 from terrain.records import Array
+from terrain.simulation.planar.model import Planar
 
 N_BLOCKS = 3
 """Time blocks of a run; they serve as clusters where runs are few."""
@@ -60,6 +61,8 @@ class Information(NamedTuple):
     rows, noise : from which they come
     white_residual, white_change : of each run (rows, channels) and (k, rows, channels), 0 where nothing was
         measured
+    grams : (runs, N_BLOCKS, k + 1, k + 1) products of whitened sensitivities and, last, of the residual at
+        ``origin``, in each third of each run; nothing is marginalised
     nuisances : (q,) indices into ``parameters`` of those that vary from run to run
     nuisance_std : (q,)
     shift : of each run (q, k + 1): deviation of its nuisances per unit of each parameter's change (negative),
@@ -81,6 +84,7 @@ class Information(NamedTuple):
     noise: Noise
     white_residual: tuple[Array, ...]
     white_change: tuple[Array, ...]
+    grams: Array
     nuisances: Array
     nuisance_std: Array
     shift: tuple[Array, ...]
@@ -107,12 +111,21 @@ def information_at(
     parameters: Sequence[str],
     low_pass: LowPass,
     statistics: Statistics | None = None,
+    own: Mapping[str, Array] | None = None,
 ) -> Information:
-    """Return the information of runs around a point; noise and scatter are estimated unless given."""
+    """Return the information of runs around a point; noise and scatter are estimated unless given.
+
+    With ``own`` values (runs,) of some of the parameters, sensitivities are those of each run at its own;
+    residuals are counted from the point all the same, linearly.
+    """
     planar = {terrain: simulation.planar_on(terrain) for terrain in {run.terrain for run in signals}}
     scattered = [name for name in simulation.scatter if simulation.scatter[name] > 0]
     names = tuple(dict.fromkeys([*parameters, *scattered]))
-    rows = tuple(rows_of(run, planar[run.terrain], vector, names, low_pass) for run in signals)
+    each = [{name: float(value[i]) for name, value in (own or {}).items()} for i in range(len(signals))]
+    rows = tuple(
+        _rows_at(run, planar[run.terrain], vector, names, low_pass, mine)
+        for run, mine in zip(signals, each, strict=True)
+    )
     nuisances = np.array([names.index(name) for name in scattered], dtype=int)
     if statistics is None:
         assumed_std = np.array([simulation.scatter[name] for name in scattered])
@@ -121,6 +134,23 @@ def information_at(
         noise, std = statistics.noise, np.array([statistics.scatter[name] for name in scattered])
     model_std = np.array([simulation.model_error.get(name, 0.0) for name in names])
     return _sum_forms(names, vector, rows, noise, nuisances, std)._replace(model_std=model_std)
+
+
+def _rows_at(
+    run: Signals,
+    planar: Planar,
+    vector: Array,
+    names: Sequence[str],
+    low_pass: LowPass,
+    own: Mapping[str, float],
+) -> Rows:
+    """Return a run with sensitivities at its own values, and its prediction extrapolated to the point."""
+    at = [INDEX[name] for name in own]
+    there = vector.copy()
+    there[at] = list(own.values())
+    rows = rows_of(run, planar, there, names, low_pass)
+    back = np.tensordot(vector[at] - there[at], rows.sensitivity[[names.index(name) for name in own]], axes=1)
+    return rows._replace(predicted=rows.predicted + back)
 
 
 def _noise_and_scatter(
@@ -146,14 +176,9 @@ def _noise_and_scatter(
 
 def _scatter(info: Information, assumed_std: Array) -> Array:
     """Return the scatter (q,) of nuisances about what the whole library explains of all runs alike."""
-    x = np.linalg.solve(_freed_information(info), info.g.sum(axis=0))
-    gram, score = [], []
-    for residual, change in zip(info.white_residual, info.white_change, strict=True):
-        own = change[info.nuisances].reshape(info.nuisances.size, -1)
-        left = residual.ravel() - x @ change.reshape(len(x), -1)
-        gram.append(own @ own.T)
-        score.append(own @ left)
-    return scatter_of(np.array(gram), np.array(score), assumed_std)
+    x = np.linalg.solve(freed_information(info), info.g.sum(axis=0))
+    along = info.grams.sum(axis=1)[:, info.nuisances]
+    return scatter_of(along[:, :, info.nuisances], along[:, :, -1] - along[:, :, :-1] @ x, assumed_std)
 
 
 def _sum_forms(
@@ -168,12 +193,10 @@ def _sum_forms(
     a, g, c = np.empty((n, k, k)), np.empty((n, k)), np.empty(n)
     a_blocks, g_blocks = np.empty((n, N_BLOCKS, k, k)), np.empty((n, N_BLOCKS, k))
     white_r, white_j, shifts, inners = [], [], [], []
+    every = np.empty((n, N_BLOCKS, k + 1, k + 1))
     for i, run in enumerate(rows):
-        residual, change = _whiten_run(noise, run)
-        both = np.concatenate([change, residual[None]]).transpose(1, 0, 2)
-        edges = [len(both) * b // N_BLOCKS for b in range(N_BLOCKS + 1)]
-        parts = [both[edges[b] : edges[b + 1]].transpose(1, 0, 2).reshape(k + 1, -1) for b in range(N_BLOCKS)]
-        grams = np.array([part @ part.T for part in parts])
+        residual, change = whiten_run(noise, run)
+        every[i] = grams = grams_of(residual, change)
         gram = grams.sum(axis=0)
         inner = np.linalg.inv(gram[np.ix_(nuisances, nuisances)] + np.diag(1.0 / std**2))
         shift = inner @ gram[nuisances]
@@ -200,6 +223,7 @@ def _sum_forms(
         noise,
         tuple(white_r),
         tuple(white_j),
+        every,
         nuisances,
         std,
         tuple(shifts),
@@ -210,7 +234,21 @@ def _sum_forms(
     )
 
 
-def _whiten_run(noise: Noise, run: Rows) -> tuple[Array, Array]:
+def grams_of(residual: Array, change: Array) -> Array:
+    """Return the products (N_BLOCKS, k + 1, k + 1) of columns of a run in each third of its rows.
+
+    Parameters
+    ----------
+    residual : (rows, channels), the last column
+    change : (k, rows, channels)
+    """
+    columns = np.concatenate([change, residual[None]])
+    edges = [len(residual) * b // N_BLOCKS for b in range(N_BLOCKS + 1)]
+    parts = [columns[:, edges[b] : edges[b + 1]].reshape(len(columns), -1) for b in range(N_BLOCKS)]
+    return np.array([part @ part.T for part in parts])
+
+
+def whiten_run(noise: Noise, run: Rows) -> tuple[Array, Array]:
     """Return residual (m, c) and sensitivities (k, m, c) whitened, both 0 where the residual is not known."""
     residual = run.residual
     known = np.isfinite(residual)
@@ -228,7 +266,7 @@ def _whiten_run(noise: Noise, run: Rows) -> tuple[Array, Array]:
 
 def _library_residuals(info: Information) -> tuple[list[Array], float]:
     """Return the residuals with the whole library and probes freed, and how many parameters were fitted."""
-    total, bound = info.a.sum(axis=0), _freed_information(info)
+    total, bound = info.a.sum(axis=0), freed_information(info)
     x = np.linalg.solve(bound, info.g.sum(axis=0))
     left = []
     for run, shift in zip(info.rows, info.shift, strict=True):
@@ -263,7 +301,7 @@ def _without_probes(info: Information, left: Sequence[Array]) -> list[Array]:
     return out
 
 
-def _freed_information(info: Information) -> Array:
+def freed_information(info: Information) -> Array:
     """Return the information (k, k) of all runs with every parameter freed up to its prior."""
     prior = np.array([PRIOR_STD.get(name, 1e-6) for name in info.parameters])
     return np.asarray(info.a.sum(axis=0) + np.diag(1.0 / prior**2))
@@ -320,67 +358,6 @@ def loss_of(info: Information, names: Sequence[str]) -> float:
     at = info.places(names)
     a, g = info.a[:, at][:, :, at].sum(axis=0), info.g[:, at].sum(axis=0)
     return -float(g @ np.linalg.lstsq(a, g, rcond=1e-10)[0]) if at else 0.0
-
-
-class Nearby(NamedTuple):
-    """Information on a few parameters at another point, with the noise and scatter of an information.
-
-    Parameters
-    ----------
-    vector : the point
-    a, g, c : (k, k), (k,) and the constant of the quadratic form of these parameters, all runs together
-    white_residual : of each run (rows, channels)
-    """
-
-    vector: Array
-    a: Array
-    g: Array
-    c: float
-    white_residual: tuple[Array, ...]
-
-
-def nearby(
-    info: Information,
-    signals: Sequence[Signals],
-    simulation: Simulation,
-    vector: Array,
-    parameters: Sequence[str],
-    low_pass: LowPass,
-) -> Nearby:
-    """Return the information of the same runs at another point; much faster than computing it anew."""
-    planar = {terrain: simulation.planar_on(terrain) for terrain in {run.terrain for run in signals}}
-    k, white = len(parameters), []
-    total = np.zeros((k + 1, k + 1))
-    for run, its_change, inner in zip(signals, info.white_change, info.inner, strict=True):
-        rows = rows_of(run, planar[run.terrain], vector, parameters, low_pass)
-        residual, change = _whiten_run(info.noise, rows)
-        nuisances = its_change[info.nuisances].reshape(len(info.nuisances), residual.size)
-        both = np.concatenate([change, residual[None]]).reshape(k + 1, -1)
-        along = nuisances @ both.T
-        total += both @ both.T - along.T @ inner @ along
-        white.append(residual)
-    return Nearby(vector, total[:k, :k], total[:k, k], float(total[k, k]), tuple(white))
-
-
-def misfit_of(info: Information, white_residual: Sequence[Array]) -> float:
-    """Return by how much the whole library could still reduce residuals (rows, channels) at another point.
-
-    Parameters
-    ----------
-    info : whose sensitivities and noise are the measure
-    white_residual : of each run, whitened by the noise of ``info``
-
-    Notes
-    -----
-    Up to a constant it is minus twice the log-likelihood there, as far as the problem is linear.  The sum of
-    squares itself will not do: the noise of the wheels is in the prediction, and a cause that makes it larger
-    or smaller, as a mass does, would be judged by it.
-    """
-    score = np.zeros(len(info.parameters))
-    for residual, change, shift in zip(white_residual, info.white_change, info.shift, strict=True):
-        flat = change.reshape(len(change), -1) @ residual.ravel()
-        score += flat - shift[:, : len(flat)].T @ flat[info.nuisances]
-    return float(score @ np.linalg.solve(_freed_information(info), score))
 
 
 def move_point(point: Array, names: Sequence[str], change: Array) -> Array:

@@ -1,22 +1,27 @@
 """Effects whose size differs from run to run: how much, and whether the runs fall into two groups.
 
-Of each run the value ``x_i`` of one parameter is fitted by itself, with what varies from run to run by itself
-marginalised.  The scatter of ``x_i`` between runs is compared with that between the thirds of each run (an
-analysis of variance): noise that lasts is in both.
+Runs are fitted with values of their own of one effect at a time, by a mixed model in which all else varies by
+no more than is assumed.  The answer is the effect with the greatest likelihood: what half of the wheels do is
+not the scatter of a track, though a scatter of the track that is estimated beside it would take most of it.
+
+Whether an effect varies is judged by the likelihood that is lost with one value for all runs.  The noise of a
+run's value is that between the thirds of each run, since noise that lasts is in both.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import f as fisher
 
-from terrain.discrepancy.information import N_BLOCKS
+from terrain.discrepancy.fitting import Problem
+from terrain.discrepancy.information import N_BLOCKS, PRIOR_STD, Information, recentre
+from terrain.discrepancy.mixed_model import MixedFit, fit_mixed
+from terrain.discrepancy.rivals import RIVAL_LINEAR, RIVAL_LOSS
 from terrain.discrepancy.search import Found
-from terrain.discrepancy.selection import TRUST_DOF, z_of
+from terrain.discrepancy.selection import TRUST_DOF, z_of_t
 from terrain.discrepancy.verdict import RunGroup, Varying
 from terrain.effects import BOUNDS, CHANNELS, INDEX, Effect
 from terrain.records import Array
@@ -33,116 +38,220 @@ TWO_GROUPS_RATIO = 0.15
 MIN_GROUP = 2
 """Least number of runs in a group."""
 
-ALIKE_RATIO = 0.9
-"""An effect that explains so much of what the best one explains is not distinguished from it."""
+OUT_STDS, OUT_SCATTERS, OUT_RATIO = 3.0, 0.5, 0.2
+"""A run's value is out of its bounds by so many standard deviations and scatters, and the ratio of the runs
+that may be: a rogue or two, and less than a group of eight runs."""
+
+LEAST_RATIO = 1e-4
+"""Least scatter of a parameter of which none is assumed, over the prior of its value."""
+
+NEAR_RATIO, N_STEPS = 0.2, 3
+"""Effects whose loss is behind by that ratio of the best one's gain are compared by nonlinear fits of so many
+steps: a run's own value may be far from where sensitivities were taken."""
+
+SCATTERS = np.concatenate([[0.0], np.geomspace(1e-3, 1.0, 40)])
+"""Scatters that are tried, over the range of the values."""
 
 
 class _RunValues(NamedTuple):
-    """Values (runs,) of a parameter by each run alone, and how far they scatter beyond the noise."""
+    """Values (runs,) of a parameter by each run alone, and how far they scatter beyond the noise.
 
-    effect: Effect
+    Parameters
+    ----------
+    value : over what the simulation has of it
+    weight : precision of each, 0 where a run shows nothing
+    """
+
+    name: str
     value: Array
     weight: Array
-    gain: float
     scatter: float
     z: float
-    channel: str
+
+
+class _Tried(NamedTuple):
+    """An effect of which each run has its own values, by parameter, and how well that fits.
+
+    Parameters
+    ----------
+    gain : fall of the loss from one value in all runs
+    """
+
+    effect: Effect
+    runs: tuple[_RunValues, ...]
+    loss: float
+    gain: float
+
+    @property
+    def clearest(self) -> _RunValues:
+        """The parameter that differs most clearly."""
+        return max(self.runs, key=lambda each: each.z)
 
 
 def run_scatter(found: Found, effect: Effect) -> float:
     """Return the scatter from run to run of the first parameter of an effect, noise taken off."""
-    return _run_values(found, effect).scatter
+    shared = found.change - _away(found.info, found.names)
+    fit = MixedFit(0.0, shared, found.info.nuisance_std)
+    return _values_by_run(found, effect.parameters[0].name, found.names, (), fit).scatter
 
 
-def varying_effects(found: Found, library: Sequence[Effect]) -> tuple[Varying, ...]:
+def varying_effects(problem: Problem, found: Found) -> tuple[Varying, ...]:
     """Return the effect whose size differs most clearly from run to run; none where runs are alike.
 
     Only one is returned: what one effect varies by looks like a variation of all that resemble it.
     """
-    if len(found.info.rows) < 2 * MIN_GROUP:
+    info = found.info
+    if len(info.rows) < 2 * MIN_GROUP:
         return ()
-    tried = [_run_values(found, effect) for effect in library if len(effect.parameters) == 1]
-    tried = [each for each in tried if each.z > Z_VARIES and _is_possible(each)]
+    tried = [_tried(found, effect) for effect in problem.library if _may_vary(found, effect)]
     if not tried:
         return ()
-    best = max(tried, key=lambda each: each.gain)
-    rivals = [each.effect.name for each in tried if each is not best and each.gain > ALIKE_RATIO * best.gain]
-    parameter = best.effect.parameters[0]
-    groups = _two_groups(best, [run.run_id for run in found.info.rows])
-    mean = float(np.average(best.value, weights=best.weight))
+    first = min(tried, key=lambda each: each.loss)
+    behind = max(RIVAL_LINEAR, NEAR_RATIO * first.gain)
+    near = [_refitted(problem, found, each) for each in tried if each.loss <= first.loss + behind]
+    near = [each for each in near if each.clearest.z > Z_VARIES and _is_possible(info, each.clearest)]
+    if not near:
+        return ()
+    best = min(near, key=lambda each: each.loss)
+    rivals = [e.effect.name for e in near if e is not best and e.loss < best.loss + RIVAL_LOSS]
+    runs = best.clearest
+    parameter = best.effect.parameters[best.runs.index(runs)]
     return (
         Varying(
             best.effect.name,
             parameter.name,
             parameter.unit,
             tuple(rivals),
-            mean,
-            best.scatter,
-            best.z,
-            groups,
-            best.channel,
+            float(np.average(runs.value, weights=runs.weight)),
+            runs.scatter,
+            runs.z,
+            _two_groups(runs, [run.run_id for run in info.rows]),
+            _clearest_channel(info, runs.name),
         ),
     )
 
 
-def _is_possible(tried: _RunValues) -> bool:
+def _is_possible(info: Information, runs: _RunValues) -> bool:
     """Return whether the values of most runs are what the parameter may be."""
-    low, high = BOUNDS[tried.effect.parameters[0].name]
-    mean = float(np.average(tried.value, weights=tried.weight))
-    return bool(low <= mean - tried.scatter and mean + tried.scatter <= high)
+    low, high = BOUNDS[runs.name]
+    seen = runs.weight > 0
+    value = info.vector[INDEX[runs.name]] + runs.value[seen]
+    margin = OUT_STDS / np.sqrt(runs.weight[seen]) + OUT_SCATTERS * runs.scatter
+    return bool(np.mean((value < low - margin) | (value > high + margin)) <= OUT_RATIO)
 
 
-def _run_values(found: Found, effect: Effect) -> _RunValues:
-    """Fit a parameter to each run, at the common fit of all."""
-    info, name = found.info, effect.parameters[0].name
-    place = info.places([name])[0]
-    own_nuisance = np.flatnonzero(info.nuisances == place)
-    kept = np.delete(info.nuisances, own_nuisance)
-    std = np.delete(info.nuisance_std, own_nuisance)
-    selected = info.places(found.names)
-    fit = found.change - np.array([info.origin[INDEX[n]] - info.vector[INDEX[n]] for n in found.names])
-    n = len(info.rows)
-    score, weight = np.empty((n, N_BLOCKS)), np.empty((n, N_BLOCKS))
-    power = np.zeros(len(CHANNELS))
-    for i, (residual, change) in enumerate(zip(info.white_residual, info.white_change, strict=True)):
-        left = residual - np.tensordot(fit, change[selected], axes=1) * (residual != 0.0)
-        columns = np.concatenate([change[kept], change[place][None], left[None]])
-        power += (change[place] ** 2).sum(axis=0)
-        edges = [columns.shape[1] * b // N_BLOCKS for b in range(N_BLOCKS + 1)]
-        parts = [columns[:, edges[b] : edges[b + 1]].reshape(len(columns), -1) for b in range(N_BLOCKS)]
-        grams = np.array([part @ part.T for part in parts])
-        q = len(kept)
-        gram = grams.sum(axis=0)
-        follow = np.linalg.solve(gram[:q, :q] + np.diag(1.0 / std**2), gram[:q, q:])
-        for b in range(N_BLOCKS):
-            cross = grams[b][:q, q:]
-            taken = (
-                grams[b][q:, q:] - follow.T @ cross - cross.T @ follow + follow.T @ grams[b][:q, :q] @ follow
-            )
-            weight[i, b], score[i, b] = taken[0, 0], taken[0, 1]
-    assumed = float(info.nuisance_std[own_nuisance[0]]) if own_nuisance.size else 0.0
-    given = float(found.change[found.names.index(name)]) if name in found.names else 0.0
-    return _scattered(effect, score, weight, _assumed_scatter(found, name, assumed), given, _clearest(power))
+def _may_vary(found: Found, effect: Effect) -> bool:
+    """Return whether an effect varies by itself, at the common fit of all runs."""
+    return any(each.z > Z_VARIES for each in _at_common_fit(found, effect))
 
 
-def _assumed_scatter(found: Found, name: str, estimated: float) -> float:
+def _at_common_fit(found: Found, effect: Effect) -> list[_RunValues]:
+    fit = MixedFit(0.0, found.change - _away(found.info, found.names), _least_std(found, ()))
+    return [_values_by_run(found, p.name, found.names, (), fit) for p in effect.parameters]
+
+
+def _tried(found: Found, effect: Effect, scatter: Sequence[float] = ()) -> _Tried:
+    """Fit runs with values of their own of an effect, all else as it is assumed.
+
+    Parameters
+    ----------
+    scatter : of its parameters, to start from; estimated at the common fit by default
+    """
+    info, own = found.info, tuple(p.name for p in effect.parameters)
+    names = (*found.names, *(name for name in own if name not in found.names))
+    least = _least_std(found, own)
+    free = np.arange(len(least)) >= len(least) - len(own)
+    start = least.copy()
+    start[free] = scatter or [each.scatter for each in _at_common_fit(found, effect)]
+    varies = [*info.nuisances[_kept(info, own)], *info.places(own)]
+    gram, shared = info.grams.sum(axis=1), info.places(names)
+    fit = fit_mixed(gram, shared, varies, least, start, free)
+    alike = fit_mixed(gram, shared, varies, least, least, np.zeros_like(free))
+    runs = tuple(_values_by_run(found, name, names, own, fit) for name in own)
+    return _Tried(effect, runs, fit.loss, alike.loss - fit.loss)
+
+
+def _refitted(problem: Problem, found: Found, tried: _Tried) -> _Tried:
+    """Return the same by a nonlinear fit: sensitivities of each run at its own values."""
+    base = found.info.vector
+    names = tuple(dict.fromkeys([*found.names, *(p.name for p in tried.effect.parameters)]))
+    for _ in range(N_STEPS):
+        own: Mapping[str, Array] = {
+            runs.name: np.clip(base[INDEX[runs.name]] + runs.value, *BOUNDS[runs.name]) for runs in tried.runs
+        }
+        there = problem.at(found.info.origin, names, found.info.statistics, own)
+        scatter = [runs.scatter for runs in tried.runs]
+        tried = _tried(found._replace(info=recentre(there, base)), tried.effect, scatter)
+    return tried
+
+
+def _kept(info: Information, own: Sequence[str]) -> Array:
+    """Return which of the nuisances are of no effect of their own."""
+    return ~np.isin(info.nuisances, info.places(own))
+
+
+def _least_std(found: Found, own: Sequence[str]) -> Array:
+    """Return the standard deviations assumed of nuisances, and those of an effect, last."""
+    info = found.info
+    names = [info.parameters[i] for i in info.nuisances[_kept(info, own)]]
+    return np.array([_assumed(found, name) or LEAST_RATIO * PRIOR_STD[name] for name in (*names, *own)])
+
+
+def _assumed(found: Found, name: str) -> float:
     """Return the scatter that is no news: what was assumed of the parameter, not what was estimated."""
-    return min(float(found.assumed_scatter.get(name, 0.0)), estimated) if estimated else 0.0
+    return float(found.assumed_scatter.get(name, 0.0))
 
 
-def _clearest(power: Array) -> str:
+def _away(info: Information, names: Sequence[str]) -> Array:
+    """Return where sensitivities were taken, over the point from which changes are counted."""
+    return np.array([info.origin[INDEX[name]] - info.vector[INDEX[name]] for name in names])
+
+
+def _values_by_run(
+    found: Found, name: str, names: Sequence[str], own: Sequence[str], fit: MixedFit
+) -> _RunValues:
+    """Return the values of a parameter by each run, with all that varies beside it marginalised.
+
+    Parameters
+    ----------
+    names : of the parameters whose shared values ``fit`` has
+    own : parameters that ``fit`` has deviations of beside the nuisances, last
+    """
+    info = found.info
+    varies = np.array([*info.nuisances[_kept(info, own)], *info.places(own)], dtype=int)
+    beside = varies != info.places([name])[0]
+    kept, q = varies[beside], int(beside.sum())
+    precision = np.diag(1.0 / fit.std[beside] ** 2)
+    columns = np.zeros((len(info.parameters) + 1, q + 2))  # what varies, the parameter, and the residual
+    columns[kept, np.arange(q)] = 1.0
+    columns[info.places([name])[0], q] = 1.0
+    columns[info.places(names), -1] = -fit.shared
+    columns[-1, -1] = 1.0
+    parts = columns.T @ info.grams @ columns
+    gram = parts.sum(axis=1)
+    follow = np.linalg.solve(gram[:, :q, :q] + precision, gram[:, :q, q:])
+    prior = follow.transpose(0, 2, 1) @ precision @ follow / N_BLOCKS
+    back = follow[:, None].transpose(0, 1, 3, 2)
+    along = back @ parts[:, :, :q, q:]
+    inner = back @ parts[:, :, :q, :q] @ follow[:, None]
+    taken = parts[:, :, q:, q:] - along - along.transpose(0, 1, 3, 2) + inner + prior[:, None]
+    mean = _away(info, [name])[0] + (fit.shared[list(names).index(name)] if name in names else 0.0)
+    return _between_runs(name, taken[:, :, 0, 1], taken[:, :, 0, 0], _assumed(found, name), float(mean))
+
+
+def _clearest_channel(info: Information, name: str) -> str:
+    place = info.places([name])[0]
+    power = sum((change[place] ** 2).sum(axis=0) for change in info.white_change)
     return CHANNELS[int(np.argmax(power))]
 
 
-def _scattered(
-    effect: Effect, score: Array, weight: Array, assumed_std: float, given: float, channel: str
-) -> _RunValues:
-    """Compare values between runs with those between thirds of each run."""
+def _between_runs(name: str, score: Array, weight: Array, assumed_std: float, mean: float) -> _RunValues:
+    """Compare values between runs with those between thirds of each run, all (runs, N_BLOCKS)."""
     total = weight.sum(axis=1)
     seen = total > 1e-6 * max(float(total.max()), 1e-30)
     if seen.sum() < 2 * MIN_GROUP or not total.max() > 0:
         nothing = np.zeros(len(total))
-        return _RunValues(effect, nothing, np.ones(len(total)), 0.0, 0.0, 0.0, channel)
+        return _RunValues(name, nothing, np.ones(len(total)), 0.0, 0.0)
     value = np.where(seen, score.sum(axis=1) / np.where(seen, total, 1.0), 0.0)
     inside, dof = 0.0, 0
     for i in np.flatnonzero(seen):
@@ -153,13 +262,26 @@ def _scattered(
     precision = np.where(seen, 1.0 / (noise / np.where(seen, total, 1.0) + assumed_std**2), 0.0)
     square = _squares(value, precision)
     # one run that is far out is no variation from run to run: the others have to differ as well
-    rest = np.where(np.arange(len(square)) == np.argmax(square), 0.0, precision)
-    n = int(seen.sum())
-    z = z_of(float(fisher.logsf(_squares(value, rest).sum() / (n - 2), n - 2, TRUST_DOF + dof)))
-    beyond = float(square.sum()) - (n - 1)
+    known = np.flatnonzero(seen)
+    likelihood = min(_likelihood_ratio(value[rest], precision[rest]) for rest in _left_out(known))
+    z = z_of_t(math.sqrt(max(likelihood, 0.0)), TRUST_DOF + dof)
+    square = _squares(value, precision)
+    beyond = float(square.sum()) - (len(known) - 1)
     spread = float(precision.sum() - (precision**2).sum() / precision.sum())
     scatter = math.sqrt(max(beyond / spread, 0.0) + assumed_std**2)
-    return _RunValues(effect, value + given, precision, float(square.sum()), scatter, z, channel)
+    return _RunValues(name, value + mean, precision, scatter, z)
+
+
+def _left_out(places: Array) -> list[Array]:
+    return [np.delete(places, i) for i in range(len(places))]
+
+
+def _likelihood_ratio(value: Array, precision: Array) -> float:
+    """Return the fall of minus twice the log-likelihood where values have a scatter of their own."""
+    variance = 1.0 / precision + (SCATTERS[:, None] * np.ptp(value)) ** 2
+    mean = (value / variance).sum(axis=1) / (1.0 / variance).sum(axis=1)
+    loss = (np.log(variance) + (value - mean[:, None]) ** 2 / variance).sum(axis=1)
+    return float(loss[0] - loss.min())
 
 
 def _squares(value: Array, precision: Array) -> Array:

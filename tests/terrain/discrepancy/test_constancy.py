@@ -7,6 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from terrain.discrepancy.constancy import CAVEAT_RATIO, VARIES_RATIO, constancy_of
+from terrain.discrepancy.information import grams_of
 from terrain.effects import PARAMETERS
 
 NAMES = ("payload_ratio", "gyro_bias_radps")
@@ -43,8 +44,7 @@ def problem(value, excited=None, seed=0, n_runs=N_RUNS, noise=1.0, second=1.0):
         vector=nowhere,
         nuisances=np.zeros(0, dtype=int),
         inner=[np.zeros((0, 0))] * n_runs,
-        white_residual=residuals,
-        white_change=changes,
+        grams=np.array([grams_of(r, j) for r, j in zip(residuals, changes, strict=True)]),
         places=lambda names: [NAMES.index(name) for name in names],
     )
 

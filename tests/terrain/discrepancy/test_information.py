@@ -11,12 +11,11 @@ from terrain.discrepancy.information import (
     correlation,
     information_at,
     loss_of,
-    misfit_of,
     move_point,
-    nearby,
     partial_information,
     recentre,
 )
+from terrain.discrepancy.nearby import misfit_of, nearby
 from terrain.discrepancy.residuals import low_pass_of
 from terrain.discrepancy.selection import fit_change
 from terrain.discrepancy.signals import signals_of

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from terrain.discrepancy.fitting import RISE, Problem, names_of, steps_of
-from terrain.discrepancy.information import Nearby, move_point
+from terrain.discrepancy.information import move_point
+from terrain.discrepancy.nearby import Nearby
 from terrain.discrepancy.residuals import low_pass_of
 from terrain.discrepancy.search import search, with_rivals
 from terrain.discrepancy.selection import fit_change
