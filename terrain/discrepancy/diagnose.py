@@ -22,6 +22,7 @@ from terrain.discrepancy.answers import (
     ruled_out_of,
     values_of,
 )
+from terrain.discrepancy.conditions import with_conditions
 from terrain.discrepancy.fitting import Problem, names_of
 from terrain.discrepancy.health import clocks_of
 from terrain.discrepancy.information import Information
@@ -81,8 +82,9 @@ def diagnose_signals(
     """Return the diagnosis of runs that are on one clock already; see :func:`diagnose`."""
     effects = simulation.library if library is None else tuple(library)
     prepared = prepare(signals, simulation, effects)
-    problem = prepared.problem
-    start = problem.at(simulation.vector) if prepared.seeds else prepared.aligned
+    problem = with_conditions(prepared.problem, prepared.aligned)
+    same = problem is prepared.problem and not prepared.seeds
+    start = prepared.aligned if same else problem.at(simulation.vector)
     found, withdrawn = _search_and_withdraw(problem, start, prepared.seeds)
     varying = varying_effects(problem, found)
     found, withdrawn = _without_varying(problem, start, found, withdrawn, varying)

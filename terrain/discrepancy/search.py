@@ -47,7 +47,7 @@ class Found(NamedTuple):
     change : (k,) of the parameters ``names``, and its covariance
     rivals : by cause, the effects that fit as well in its place, once :func:`with_rivals` has looked
     tried : last evidence of every effect
-    assumed_scatter : from run to run, by parameter, as the simulation was given it
+    assumed_scatter : from run to run, by parameter, that is no news
     """
 
     causes: tuple[Effect, ...]
@@ -121,7 +121,7 @@ def _found(problem: Problem, info: Information, causes: Sequence[Effect]) -> Fou
         effect.name: evidence(info, [n for n in names if n not in names_of([effect])], effect)
         for effect in problem.library
     }
-    return Found(tuple(causes), info, names, change, cov, {}, tried, problem.simulation.scatter)
+    return Found(tuple(causes), info, names, change, cov, {}, tried, problem.simulation.known_scatter)
 
 
 def with_rivals(problem: Problem, start: Information, found: Found) -> Found:

@@ -26,6 +26,8 @@ class Simulation:
     scatter : standard deviation from run to run of parameters in :data:`NUISANCES`; those not named are 0
     model_error : how large the simulation's own error is in units of parameters, the same in all runs; what
         is no larger is not stated
+    varied_error, varied_scatter : mean over runs and scatter of them that conditions may make which differ
+        from run to run, in units of parameters: see :mod:`terrain.discrepancy.conditions`
 
     Raises
     ------
@@ -39,6 +41,8 @@ class Simulation:
     scatter: Mapping[str, float] = field(default_factory=dict)
     grounds: Mapping[str, Ground] = field(default_factory=dict)
     model_error: Mapping[str, float] = field(default_factory=dict)
+    varied_error: Mapping[str, float] = field(default_factory=dict)
+    varied_scatter: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         vector_of(self.effects)
@@ -47,10 +51,12 @@ class Simulation:
                 raise ConfigError(
                     f"scatter: {name} is {std!r}; a standard deviation of a nuisance is required"
                 )
-        for name, std in self.model_error.items():
-            if name not in INDEX or not std >= 0:
-                raise ConfigError(f"model_error: {name} is {std!r}; a size from 0 of a parameter is required")
-        object.__setattr__(self, "model_error", MappingProxyType(dict(self.model_error)))
+        for kind in ("model_error", "varied_error", "varied_scatter"):
+            sizes = getattr(self, kind)
+            for name, size in sizes.items():
+                if name not in INDEX or not size >= 0:
+                    raise ConfigError(f"{kind}: {name} is {size!r}; a size from 0 of a parameter is required")
+            object.__setattr__(self, kind, MappingProxyType(dict(sizes)))
         object.__setattr__(self, "effects", MappingProxyType(dict(self.effects)))
         object.__setattr__(self, "scatter", MappingProxyType(dict(self.scatter)))
         object.__setattr__(self, "grounds", MappingProxyType(dict(self.grounds)))
@@ -68,6 +74,12 @@ class Simulation:
     def planar_on(self, terrain: str) -> Planar:
         """Return the numbers for the kernels on the terrain of a label."""
         return make_planar(self.robot, self.grounds.get(terrain, self.ground))
+
+    @property
+    def known_scatter(self) -> dict[str, float]:
+        """Scatter from run to run that is no news: what is assumed, or what conditions may make."""
+        both = {*self.scatter, *self.varied_scatter}
+        return {n: max(self.scatter.get(n, 0.0), self.varied_scatter.get(n, 0.0)) for n in both}
 
     @property
     def vector(self) -> Array:

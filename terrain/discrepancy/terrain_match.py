@@ -47,9 +47,7 @@ def simulation_for(
     grounds = {label: ground for label in labels if (ground := _ground(robot, label)) is not None}
     simulation = Simulation(robot, Ground(), robot.effects, load_scatter()._asdict(), grounds)
     if grounds:
-        own = set(parameters_of(robot.drive))
-        error = {name: std for name, std in load_model_error().items() if name in own}
-        simulation = replace(simulation, model_error=error)
+        simulation = with_model_error(simulation)
         signals = [signals_of(run, robot) for run in runs]
         simulation = with_effective_tilt(simulation, signals, library)
     matches = []
@@ -60,6 +58,15 @@ def simulation_for(
             TerrainMatch(label, label if known else None, ground.effective_ratio if ground else None)
         )
     return simulation, tuple(matches)
+
+
+def with_model_error(simulation: Simulation) -> Simulation:
+    """Return the simulation with its own error on the soils of the package."""
+    parameters = set(parameters_of(simulation.robot.drive))
+    common, varied, scatter = (
+        {name: size for name, size in sizes.items() if name in parameters} for sizes in load_model_error()
+    )
+    return replace(simulation, model_error=common, varied_error=varied, varied_scatter=scatter)
 
 
 def _ground(robot: Robot, label: str) -> Ground | None:

@@ -7,6 +7,7 @@ of it is again such a noise.
 from __future__ import annotations
 
 import math
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -89,21 +90,40 @@ def load_noise() -> Noise:
     return Noise(**_numbers("noise", Noise._fields))
 
 
-def load_model_error() -> dict[str, float]:
-    """Return how far the planar simulation on a soil of the package is off the dynamic plant, by parameter.
+class ModelError(NamedTuple):
+    """How far the planar simulation on a soil of the package is off the dynamic plant, by parameter.
 
-    Each is the value that a parameter seems to have where nothing is hidden; see ``data/spread/planar.yaml``.
+    Parameters
+    ----------
+    common : value that each parameter seems to have where nothing is hidden
+    varied : the same of the mean over runs whose conditions differ
+    scatter : of single runs whose conditions differ
+    """
+
+    common: dict[str, float]
+    varied: dict[str, float]
+    scatter: dict[str, float]
+
+
+def load_model_error() -> ModelError:
+    """Return the simulation's own error; ``data/spread/planar.yaml`` says how it was measured.
 
     Examples
     --------
-    >>> load_model_error()["motor_constant_ratio"]
-    0.025
+    >>> load_model_error().common["motor_constant_ratio"]
+    0.024
     """
-    return _numbers("model_error", tuple(read_yaml(data_folder("spread") / "planar.yaml")["model_error"]))
+    parts = ("model_error", "varied_error", "varied_scatter")
+    return ModelError(*(_numbers(part, tuple(_described()[part])) for part in parts))
+
+
+@cache
+def _described() -> Any:
+    return read_yaml(data_folder("spread") / "planar.yaml")
 
 
 def _numbers(part: str, names: tuple[str, ...]) -> dict[str, float]:
-    described: Any = read_yaml(data_folder("spread") / "planar.yaml")[part]
+    described = _described()[part]
     return {
         name: number(f"planar.yaml: {part}: {name}", described[name], name.rpartition("_")[2], 0.0)
         for name in names

@@ -26,7 +26,7 @@ PARAMETERS = ("payload_ratio", "gyro_bias_radps", "lever_x_m", "lever_y_m", "whe
 N_RUNS, N_ROWS = 8, 120
 
 
-def problem(true, seed=0, n_runs=N_RUNS, scatter=0.0, alike=0.0):
+def problem(true, seed=0, n_runs=N_RUNS, scatter=0.0, alike=0.0, model_std=0.0):
     """Return a linear problem with white noise of size one, in the form of an Information.
 
     Parameters
@@ -34,6 +34,7 @@ def problem(true, seed=0, n_runs=N_RUNS, scatter=0.0, alike=0.0):
     true : (k,) what is there
     scatter : standard deviation from run to run of the first parameter
     alike : correlation of the sensitivities of the first and the last parameter
+    model_std : the simulation's own error in units of the first parameter
     """
     rng = np.random.default_rng(seed)
     k = len(PARAMETERS)
@@ -54,6 +55,7 @@ def problem(true, seed=0, n_runs=N_RUNS, scatter=0.0, alike=0.0):
         g=g,
         a_blocks=a_blocks,
         g_blocks=g_blocks,
+        model_std=np.eye(k)[0] * model_std,
         places=lambda names: [PARAMETERS.index(name) for name in names],
     )
 
@@ -183,3 +185,17 @@ def test_evidence_of_two_parameters_stays_finite_however_clear_they_are():
     z = [evidence(problem(true(lever=size)), (), LEVER).z for size in (30.0, 100.0, 300.0)]
     assert np.isfinite(z).all()
     assert z == sorted(z)
+
+
+@pytest.mark.parametrize("ratio", [0.5, 2.0])
+def test_the_simulations_own_error_adds_to_the_variance_of_a_value(ratio):
+    payload, true = effect_named("payload"), (0.02, 0.0, 0.0, 0.0, 0.0)
+    plain = evidence(problem(true), (), payload)
+    std = float(np.sqrt(fit_change(problem(true), ["payload_ratio"])[1][0, 0]))
+    doubtful = evidence(problem(true, model_std=ratio * std), (), payload)
+    assert doubtful.change == pytest.approx(plain.change)
+    assert doubtful.dispersion == pytest.approx(plain.dispersion + ratio**2, rel=1e-6)
+    assert doubtful.z < plain.z
+    other = effect_named("wheel_radius")  # what payload may be off by does not touch an effect beside it
+    two = [evidence(problem(true, model_std=m), (), other) for m in (0.0, ratio * std)]
+    assert two[0].z == two[1].z
