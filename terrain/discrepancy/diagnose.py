@@ -87,6 +87,11 @@ def diagnose_signals(
     start = prepared.aligned if same else problem.at(simulation.vector)
     found, withdrawn = _search_and_withdraw(problem, start, prepared.seeds)
     varying = varying_effects(problem, found)
+    if _is_beside(problem, found, varying):
+        problem = problem._replace(varying={varying[0].parameter: varying[0].scatter})
+        start = problem.at(start.vector)
+        found, withdrawn = _search_and_withdraw(problem, start, prepared.seeds)
+        varying = varying_effects(problem, found)
     found, withdrawn = _without_varying(problem, start, found, withdrawn, varying)
     found = pooled(problem, with_rivals(problem, start, found))
     unexplained = _unexplained_channels(found, withdrawn, varying)
@@ -164,6 +169,18 @@ def _withdraw(
     withdrawn[cause.name] = RuledOut(cause.name, reason, evidence.z, values_of(found, cause))
     others = [other for other in found.causes if other is not cause and other.modifies != cause.name]
     return refit(problem, start, found, others)
+
+
+def _is_beside(problem: Problem, found: Found, varying: Sequence[Varying]) -> bool:
+    """Return whether causes were found beside an effect that varies, of which runs had one value.
+
+    What that value leaves may look like causes: they are searched again with a value of each run.
+    """
+    return any(
+        each.parameter not in problem.scatter and cause.name not in (each.name, *each.rivals)
+        for each in varying
+        for cause in found.causes
+    )
 
 
 def _without_varying(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -39,12 +40,23 @@ RIVAL_REFITS = 3
 
 
 class Problem(NamedTuple):
-    """Runs, the simulation, and the low-pass of all."""
+    """Runs, the simulation, and the low-pass of all.
+
+    Parameters
+    ----------
+    varying : standard deviation from run to run, by parameter, beside the scatter that the simulation has
+    """
 
     signals: tuple[Signals, ...]
     simulation: Simulation
     low_pass: LowPass
     library: tuple[Effect, ...]
+    varying: Mapping[str, float] = MappingProxyType({})
+
+    @property
+    def scatter(self) -> dict[str, float]:
+        """Standard deviation from run to run that is assumed, by parameter."""
+        return {**self.simulation.scatter, **self.varying}
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -60,7 +72,9 @@ class Problem(NamedTuple):
     ) -> Information:
         """Return the information of the runs around a point; see :func:`information_at`."""
         desired = self.parameters if names is None else names
-        return information_at(self.signals, self.simulation, vector, desired, self.low_pass, statistics, own)
+        return information_at(
+            self.signals, self.simulation, vector, desired, self.low_pass, statistics, own, self.scatter
+        )
 
     def near(self, info: Information, vector: Array, names: Sequence[str]) -> Nearby:
         """Return the information on a few parameters at another point, with the noise of an information."""

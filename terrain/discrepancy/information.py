@@ -112,14 +112,17 @@ def information_at(
     low_pass: LowPass,
     statistics: Statistics | None = None,
     own: Mapping[str, Array] | None = None,
+    scatter: Mapping[str, float] | None = None,
 ) -> Information:
     """Return the information of runs around a point; noise and scatter are estimated unless given.
 
-    With ``own`` values (runs,) of some of the parameters, sensitivities are those of each run at its own;
-    residuals are counted from the point all the same, linearly.
+    What is assumed of the scatter is that of the simulation by default.  With ``own`` values (runs,) of some
+    of the parameters, sensitivities are those of each run at its own; residuals are counted from the point
+    all the same, linearly.
     """
     planar = {terrain: simulation.planar_on(terrain) for terrain in {run.terrain for run in signals}}
-    scattered = [name for name in simulation.scatter if simulation.scatter[name] > 0]
+    assumed = simulation.scatter if scatter is None else scatter
+    scattered = [name for name in assumed if assumed[name] > 0]
     names = tuple(dict.fromkeys([*parameters, *scattered]))
     each = [{name: float(value[i]) for name, value in (own or {}).items()} for i in range(len(signals))]
     rows = tuple(
@@ -128,7 +131,7 @@ def information_at(
     )
     nuisances = np.array([names.index(name) for name in scattered], dtype=int)
     if statistics is None:
-        assumed_std = np.array([simulation.scatter[name] for name in scattered])
+        assumed_std = np.array([assumed[name] for name in scattered])
         noise, std = _noise_and_scatter(names, vector, rows, nuisances, assumed_std)
     else:
         noise, std = statistics.noise, np.array([statistics.scatter[name] for name in scattered])

@@ -28,7 +28,7 @@ N_STEPS = 4
 def pooled(problem: Problem, found: Found) -> Found:
     """Return what was found with the values that leave the least square over all runs."""
     scatter = dict(found.info.statistics.scatter)
-    assumed = problem.simulation.scatter
+    assumed = problem.scatter
     own = [n for n in found.names if n in scatter and scatter[n] > SCATTERS_RATIO * assumed[n]]
     if not own:
         return found

@@ -26,10 +26,10 @@ LIBRARY = tuple(
 N_RUNS = 8
 
 
-def runs(values, seed=1):
-    """Return runs of 30 s, each with a radius of its own."""
+def runs(values, seed=1, name=RADIUS, robot=HUSKY):
+    """Return runs of 30 s, each with a value of its own."""
     drives = rich_drives(np.random.default_rng(seed), N_RUNS, 30.0)
-    return hidden_runs(HUSKY, drives, np.random.SeedSequence(seed), [{RADIUS: float(x)} for x in values])
+    return hidden_runs(robot, drives, np.random.SeedSequence(seed), [{name: float(x)} for x in values])
 
 
 def searched(logs, library=LIBRARY, simulation=SIMULATION):
@@ -79,3 +79,42 @@ def test_a_spread_that_is_even_has_no_groups():
 @pytest.mark.parametrize("values", [np.zeros(N_RUNS), np.full(N_RUNS, 0.06), 0.06 * (np.arange(N_RUNS) == 3)])
 def test_runs_that_are_alike_and_one_rogue_do_not_vary(values):
     assert varying_effects(*searched(runs(values))) == ()
+
+
+def varying(name, value, library, robot=HUSKY):
+    """Return what is found to vary where a parameter has a value in half of the runs alone."""
+    logs = runs(value * ODD, name=name, robot=robot)
+    effects = tuple(effect_named(each) for each in library)
+    return varying_effects(*searched(logs, effects, simulation_of(robot)))
+
+
+def test_an_effect_that_is_absent_at_its_bound_may_vary():
+    (found,) = varying("encoder_lag_s", 0.03, ("encoder_lag", "clock_offset", "camera_latency"))
+    assert (found.name, found.rivals) == ("encoder_lag", ())
+    assert [group.value for group in found.groups] == pytest.approx([0.0, 0.03], abs=0.003)
+
+
+def test_an_effect_does_not_vary_by_what_it_may_not_be():
+    """An offset of one sign looks like an encoder that is early, which none is; of the other, late."""
+    (found,) = varying("clock_offset_s", 0.03, ("encoder_lag", "clock_offset"))
+    assert (found.name, found.rivals) == ("clock_offset", ())
+    assert varying("clock_offset_s", 0.03, ("encoder_lag",)) == ()
+    assert [each.name for each in varying("clock_offset_s", -0.03, ("encoder_lag",))] == ["encoder_lag"]
+
+
+def test_a_wheel_of_half_of_the_runs_is_no_scatter_of_the_wheels():
+    """What varies by itself would take most of it, were its scatter estimated first."""
+    names = ("wheel_scale_2", "one_sided_radius", "wheel_radius", "gyro_bias", "steering_offset_2")
+    (found,) = varying("wheel_scale_2_ratio", 0.05, names, load_robot("agrimaro"))
+    assert (found.name, found.rivals) == ("wheel_scale_2", ())
+
+
+def test_of_two_parameters_the_one_that_differs_is_stated():
+    (found,) = varying("lever_y_m", 0.06, ("lever_arm", "camera_yaw", "gyro_scale"))
+    assert (found.name, found.parameter) == ("lever_arm", "lever_y_m")
+    assert [group.value for group in found.groups] == pytest.approx([0.0, 0.06], abs=0.01)
+
+
+def test_a_value_far_from_where_sensitivities_are_taken_first_is_that_of_its_runs():
+    (found,) = varying("effective_track_ratio", 0.8, ("effective_track", "turning_slip"))
+    assert [group.value for group in found.groups] == pytest.approx([0.0, 0.8], rel=0.05, abs=0.04)

@@ -1,0 +1,47 @@
+"""Which effects fit as well in the place of a cause, by the losses and squares of their fits."""
+
+import numpy as np
+import pytest
+
+from terrain.discrepancy import rivals
+from terrain.discrepancy.fitting import RISE, Refit
+from terrain.discrepancy.rivals import RIVAL_LOSS, rivals_of
+from terrain.effects import effect_named
+
+CAUSE, OTHER = effect_named("payload"), effect_named("motor_constant")
+SQUARE = 1000.0
+
+
+class Judge:
+    """An information of which only the point is read."""
+
+    vector = np.zeros(1)
+
+
+@pytest.fixture
+def fitted(monkeypatch):
+    """Return a function that sets loss and square of the other effect's fit, and returns the rivals."""
+
+    def found(behind, square):
+        def fit(problem, judge, base, names):
+            own = names == (CAUSE.parameters[0].name,)
+            return Refit(0.0 if own else behind, SQUARE if own else square, np.array([0.1]), np.array([0.01]))
+
+        monkeypatch.setattr(rivals, "fit_again", fit)
+        monkeypatch.setattr(rivals, "_near", lambda *_: [OTHER])
+        monkeypatch.setattr(rivals, "_allowed", lambda *_: RIVAL_LOSS)
+        found = rivals_of(None, Judge(), Judge(), [CAUSE])
+        return [each.effect.name for each in found[CAUSE.name]]
+
+    return found
+
+
+def test_an_effect_that_is_little_behind_is_a_rival(fitted):
+    assert fitted(RIVAL_LOSS - 1.0, SQUARE) == [OTHER.name]
+    assert fitted(RIVAL_LOSS + 1.0, SQUARE) == []
+
+
+def test_an_effect_that_leaves_a_larger_square_is_no_rival(fitted):
+    most = (1.0 + RISE) * SQUARE + RIVAL_LOSS
+    assert fitted(-50.0, most - 1.0) == [OTHER.name]
+    assert fitted(-50.0, most + 1.0) == []
