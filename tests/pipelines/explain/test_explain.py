@@ -15,6 +15,7 @@ from terrain.discrepancy.answers import INTERVAL_T
 from terrain.logs.write import write_run
 from terrain.records import RunLog
 from terrain.robots import load_robot
+from terrain.simulation.planar.drives import COMMANDS_HZ, DRIVE_S
 from terrain.simulation.planar.noise import load_noise, load_scatter
 from terrain.simulation.planar.run import simulate_planar
 
@@ -121,6 +122,17 @@ def test_the_hidden_cause_is_named_built_in_and_absent_when_tested_again(terrain
         found["gain"]["channels"]["speed_y_mps"]["reduction"], abs=0.01
     )
 
+    powertrain = {part["name"]: part for part in found["powertrain"]["parts"]}
+    late = [powertrain[name] for name in ("delay_s", "time_constant_s")]
+    assert [part["status"] for part in late] == ["found", "found"]
+    assert sum(part["value"] for part in late) == pytest.approx(2 * DRIVE_S - 0.5 / COMMANDS_HZ, abs=0.015)
+    assert {name for name, part in powertrain.items() if part["status"] == "found"} == {
+        part["name"] for part in late
+    }
+    assert found["powertrain"]["reduction"][1] > 0.5
+    assert all(f"powertrain: {text}" in out for text in found["powertrain"]["sentences"])
+    assert all(f"<li>{text}</li>" in page for text in found["powertrain"]["sentences"])
+
     extended = tmp_path / "found" / EXTENDED_FILE
     assert load_robot(extended).effects == pytest.approx({"camera_yaw_rad": value["value"]}, rel=1e-6)
     undrawn()
@@ -148,6 +160,7 @@ def test_of_few_runs_none_is_held_out_by_default_and_the_same_seed_gives_the_sam
     assert code == 0, err
     assert len(list((tmp_path / "none" / "pictures").glob("run_*"))) == 4
     assert "gain on held-out runs not measured: no run was held out" in out
+    assert "powertrain: The wheel speeds are not compared with their commands: runs: 4 have" in out
     pages = []
     for out in ("a", "b"):
         code, _, err = terrain(*words, "--out", out, "--hold-out", "1", "--seed", "3")
