@@ -218,6 +218,24 @@ def test_runs_that_cannot_be_compared_are_one_sentence(refused, tmp_path):
     refused("there are 2, at least 3", "--data", two, "--robot", "husky", "--out", "out")
 
 
+def test_runs_of_another_robot_one_run_and_a_robot_at_rest_are_one_sentence(refused, tmp_path):
+    out = ("--out", "out")
+    for i in range(3):
+        write_run(a_run(i, load_robot("agrimaro"), {}), tmp_path / "agrimaro")
+    wrong = "3 of 3 runs are of the robot 'agrimaro'; the simulation is of 'husky'"
+    refused(wrong, "--data", tmp_path / "agrimaro", "--robot", "husky", *out)
+    write_run(a_run(0), tmp_path / "one")
+    refused("there are 1, at least 3", "--data", tmp_path / "one", "--robot", "husky", *out)
+    for i in range(3):
+        standing = np.zeros((400, 3))
+        run = simulate_planar(HUSKY, standing, i, noise=load_noise(), run_id=f"stand_{i}", terrain="field")
+        write_run(run, tmp_path / "rest")
+    refused(
+        "in all 3 the wheels are at rest; runs that drive are required",
+        *("--data", tmp_path / "rest", "--robot", "husky", *out),
+    )
+
+
 def test_an_extended_description_is_not_overwritten(refused, data, tmp_path):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / EXTENDED_FILE).write_text("mine")
