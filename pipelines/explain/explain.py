@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -23,12 +22,14 @@ from terrain.discrepancy.gain import fit_to_judge, gain_of_signals
 from terrain.discrepancy.health import repaired
 from terrain.discrepancy.hold_out import HOLD_OUT_FROM, repair_held_out, split_runs
 from terrain.discrepancy.nameless import nameless_gain
+from terrain.discrepancy.next_drive import next_command
 from terrain.discrepancy.parts import part_values
+from terrain.discrepancy.powertrain import powertrain_answer
 from terrain.discrepancy.residuals import low_pass_of
 from terrain.discrepancy.robot_terms import in_robot_terms
 from terrain.discrepancy.signals import Signals, signals_of
 from terrain.discrepancy.statements import acting_causes, statements_of, terrains_apart
-from terrain.discrepancy.terrain_match import TerrainMatch, check_robots, runs_of_terrain, simulation_for
+from terrain.discrepancy.terrain_match import check_robots, runs_of_terrain, simulation_for
 from terrain.discrepancy.verdict import Diagnosis, NextDrive
 from terrain.effects import Effect, effect_named, library_of
 from terrain.errors import ConfigError, DataError
@@ -39,10 +40,6 @@ from terrain.records import RunLog
 from terrain.robots import Robot, load_robot
 
 EXTENDED_FILE, NEXT_FILE = "extended.yaml", "next_drive.yaml"
-
-DEFAULT_SOIL, NEXT_RUNS = "grass", 8
-"""Of the command that simulates the next drive: a soil that every robot drives on, and as many runs as the
-blind trials have."""
 
 
 def explain(runs: Sequence[RunLog], settings: ExplainSettings, progress: Progress = silent) -> Explanation:
@@ -105,6 +102,7 @@ def explain(runs: Sequence[RunLog], settings: ExplainSettings, progress: Progres
         terms={cause.name: in_robot_terms(cause.name, cause.values, robot) for cause in diagnosis.causes},
         next_command=next_command(diagnosis, description, diagnosed.terrains),
         terrains_apart=terrains_apart(diagnosis, diagnosed.compared),
+        powertrain=powertrain_answer(chosen, robot, diagnosis.faults, seed),
     )
     write_explain_page(out, diagnosed, result, settings.max_pictures, progress)
     if extended is not None:
@@ -192,17 +190,6 @@ def held_out_gain(
     nameless = nameless_gain(diagnosed.compared, judged, _noise_of(diagnosed.diagnosis), seed)
     progress("gain", 1, 1)
     return HeldOutGain(found, reason, comparisons, nameless, judged)
-
-
-def next_command(diagnosis: Diagnosis, description: str, terrains: Sequence[TerrainMatch]) -> str | None:
-    """Return the command that simulates the next drive; None where none is suggested."""
-    coming = diagnosis.next_drive
-    if coming is None:
-        return None
-    soil = next((match.soil for match in terrains if match.soil), DEFAULT_SOIL)
-    grade = f" --grade {coming.grade_deg:g}" if coming.grade_deg else ""
-    words = f"--robot {shlex.quote(description)} --terrain {soil} --scenario {coming.scenario}{grade}"
-    return f"terrain simulate {words} --runs {NEXT_RUNS} --out next_drive"
 
 
 def _robot(robot_name: str, model: str | None) -> Robot:

@@ -14,6 +14,7 @@ from terrain.discrepancy.gain import Gain
 from terrain.discrepancy.nameless import Nameless
 from terrain.discrepancy.noise import Noise
 from terrain.discrepancy.parts import PartValues
+from terrain.discrepancy.powertrain_answer import PowertrainAnswer
 from terrain.discrepancy.residuals import LowPass
 from terrain.discrepancy.response_slopes import Slope
 from terrain.discrepancy.signals import Signals
@@ -115,6 +116,7 @@ class Explanation:
     next_command : that simulates the next drive; None where none is suggested
     terrains_apart : measured over simulated by label, where labels clearly differ
     skipped : a sentence for each run that could not be read
+    powertrain : from commanded to measured wheel speeds; None where no run logs both
     """
 
     data: str
@@ -137,6 +139,7 @@ class Explanation:
     next_command: str | None = None
     terrains_apart: Mapping[str, Slope] = field(default_factory=dict)
     skipped: tuple[str, ...] = ()
+    powertrain: PowertrainAnswer | None = None
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -166,6 +169,7 @@ class Explanation:
             "terrain": self.terrain,
             "page": self.page,
             "skipped": self.skipped,
+            "powertrain": self.powertrain,
         }
 
 

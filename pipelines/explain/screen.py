@@ -38,6 +38,8 @@ def print_explain(result: Explanation, console: Console) -> None:
     _print_gain(result.gain, console)
     print_lines(console, _diagnosis_lines(diagnosis))
     print_lines(console, result.notes)
+    if result.powertrain is not None:
+        print_lines(console, (f"powertrain: {text}" for text in result.powertrain.sentences))
     if result.next_command is not None:
         print_lines(console, (f"what to drive next: {result.next_command}",))
     print_lines(console, result.skipped)

@@ -92,6 +92,7 @@ def page_view(result: Explanation, figures: Sequence[FigureView], runs: Sequence
             )
             for left in diagnosis.unexplained
         ),
+        powertrain=() if result.powertrain is None else result.powertrain.sentences,
         next_drive=_next_drive(result),
         figures=tuple(figures),
         runs=tuple(runs),

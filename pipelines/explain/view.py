@@ -152,7 +152,7 @@ class PageView:
     Parameters
     ----------
     heading, lead : of the page
-    faults, statements : sentences, of channels
+    faults, statements, powertrain : sentences, of channels and of what is between commands and wheels
     verdict : and warnings
     gain : None where nothing is known of runs held out, for ``gain_reason``
     comparisons : of the filter and the classifier
@@ -176,6 +176,7 @@ class PageView:
     withdrawn: tuple[RuledOutView, ...]
     varying: tuple[str, ...]
     unexplained: tuple[UnexplainedView, ...]
+    powertrain: tuple[str, ...]
     next_drive: NextDriveView | None
     figures: tuple[FigureView, ...]
     runs: tuple[RunPicture, ...]

@@ -86,7 +86,8 @@ class Traces(NamedTuple):
         return int(self.new.sum())
 
 
-def _is_commanded(run: RunLog, robot: Robot) -> bool:
+def is_commanded(run: RunLog, robot: Robot) -> bool:
+    """Return whether a run logs the commanded and the measured speed of each wheel."""
     if not {"commands", "wheels"} <= run.streams.keys():
         return False
     commanded = {f"wheel_{wheel}_radps" for wheel in robot.wheels} <= set(run.streams["commands"].channels)
@@ -105,7 +106,7 @@ def traces_of(runs: Sequence[RunLog], robot: Robot) -> Traces:
     first, sample = [0], [0]
     per_radps = robot.logged_rates(np.full(len(robot.wheels), robot.wheel_radius_m))
     for run in runs:
-        if not _is_commanded(run, robot):
+        if not is_commanded(run, robot):
             continue
         commands, wheels = run.streams["commands"], run.streams["wheels"]
         rates = np.column_stack([wheels.channel(name) for name in robot.rate_channels]) / per_radps

@@ -11,6 +11,7 @@ they cannot be distinguished (Brun et al., Water Resources Research 2001, of two
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Sequence
 from itertools import combinations
 from typing import NamedTuple
@@ -30,7 +31,8 @@ from terrain.discrepancy.residuals import low_pass_of, measured_channels
 from terrain.discrepancy.selection import EXCITED_RATIO, Z_EFFECT
 from terrain.discrepancy.signals import PARALLEL, Signals
 from terrain.discrepancy.simulation import Simulation
-from terrain.discrepancy.verdict import Limit, NextDrive
+from terrain.discrepancy.terrain_match import TerrainMatch
+from terrain.discrepancy.verdict import Diagnosis, Limit, NextDrive
 from terrain.effects import (
     ACCEL,
     BOUNDS,
@@ -51,6 +53,10 @@ from terrain.simulation.planar.model import TRUTH
 from terrain.simulation.planar.motion import move
 from terrain.simulation.scenario.make import SCENARIOS, make_scenario
 from terrain.simulation.scenario.scenario import RATE_HZ
+
+DEFAULT_SOIL, NEXT_RUNS = "grass", 8
+"""Of the command that simulates the next drive: a soil that every robot drives on, and as many runs as the
+blind trials have."""
 
 GRADES_DEG = (0.0, 6.0)
 """Level, and a slope that every robot here climbs."""
@@ -328,3 +334,14 @@ def _statistics(simulation: Simulation, info: Information | None) -> Statistics:
         std[known] = info.noise.std[known]
     scatter = simulation.scatter if info is None else info.statistics.scatter
     return Statistics(Noise(growth, filters, std), scatter)
+
+
+def next_command(diagnosis: Diagnosis, description: str, terrains: Sequence[TerrainMatch]) -> str | None:
+    """Return the command that simulates the next drive; None where none is suggested."""
+    coming = diagnosis.next_drive
+    if coming is None:
+        return None
+    soil = next((match.soil for match in terrains if match.soil), DEFAULT_SOIL)
+    grade = f" --grade {coming.grade_deg:g}" if coming.grade_deg else ""
+    words = f"--robot {shlex.quote(description)} --terrain {soil} --scenario {coming.scenario}{grade}"
+    return f"terrain simulate {words} --runs {NEXT_RUNS} --out next_drive"

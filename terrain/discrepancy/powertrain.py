@@ -10,8 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from enum import Enum
-from typing import NamedTuple
+from itertools import pairwise
 
 import numpy as np
 
@@ -27,12 +26,16 @@ from terrain.discrepancy.command_response import (
     STEP_S,
     TIME_CONSTANT,
     Traces,
+    is_commanded,
     left_over,
     predict,
     settled,
     squared_errors,
     traces_of,
 )
+from terrain.discrepancy.health import Fault
+from terrain.discrepancy.powertrain_answer import Part, PartStatus, Powertrain, PowertrainAnswer
+from terrain.errors import DataError
 from terrain.records import Array, RunLog
 from terrain.robots import Robot
 
@@ -52,9 +55,6 @@ EXCITED_SIGMAS = 3.0
 GRID_ROOM_S = STEP_S / 2
 """What the grid leaves open of delay and time constant: no number of runs makes their intervals narrower."""
 
-SCALE_TOLERANCE = 0.1
-"""Gains further from 1 than that: the commands are no wheel speeds."""
-
 LOW = np.array([0.0, 0.0, 0.1, 0.0, 0.05, 0.05, 0.1, 0.1, 0.1])
 HIGH = np.array([1.0, 2.0, 500.0, 5.0, 5.0, 5.0, 200.0, 200.0, 200.0])
 """Bounds of the fit."""
@@ -66,7 +66,7 @@ USUAL = np.array([0.1, 0.1, 5.0, 0.3, 1.2, 1.2, 2.0, 1.0, 2.0])
 """A size of each part that robots have; what the runs would show of it says whether they excite it."""
 
 MAX_STEPS, MAX_DAMPING, TOLERANCE = 20, 1e4, 1e-4
-"""Of the Gauss-Newton fit; it ends where a step reduces the error by less than the tolerance."""
+"""Of the Gauss-Newton fit; it ends where a step reduces the error, or would, by less than the tolerance."""
 
 STARTS: tuple[tuple[float, ...], ...] = (
     (0.05, 0.15, 0.3, 0.5),
@@ -82,102 +82,6 @@ STARTS: tuple[tuple[float, ...], ...] = (
 """Where the fit of each part starts from; limits start from shares of the largest measured speed."""
 
 LIMIT_STARTS = (0.3, 0.5, 0.7, 0.9)
-
-
-WORDS = {
-    "delay_s": "the wheels answer {} s late",
-    "time_constant_s": "they settle with a time constant of {} s",
-    "slew_radps2": "they speed up and slow down by at most {} rad/s²",
-    "deadband_radps": "commands below {} rad/s do not move them",
-    "gain_ratio": "they turn {} times as fast as commanded",
-    "difference_gain_ratio": "they turn {} times as fast against each other as commanded",
-    "common_limit_radps": "the mean of both sides is at most {} rad/s",
-    "difference_limit_radps": "half the difference of the sides is at most {} rad/s",
-    "wheel_limit_radps": "no wheel turns faster than {} rad/s",
-}
-"""What each part does, with a place for its value."""
-
-
-class PartStatus(Enum):
-    """Whether a part of the powertrain is there."""
-
-    FOUND = "it reduces the error of runs left out"
-    NOT_NEEDED = "it does not reduce the error of runs left out"
-    NOT_EXCITED = "the commands would not show it"
-
-
-class Part(NamedTuple):
-    """One part of the powertrain.
-
-    Parameters
-    ----------
-    name : of :data:`NAMES`, ends in its unit
-    status : whether it is there
-    value, low, high : with its 95 % interval over runs; NaN where it was not found.  A delay of wheels that
-        then follow at once is known to a period of the logger at the best
-    gain_ratio : of the squared error of runs left out, that it removes beside the others; NaN where not found
-    """
-
-    name: str
-    status: PartStatus
-    value: float
-    low: float
-    high: float
-    gain_ratio: float
-
-    @property
-    def unit(self) -> str:
-        """Last word of the name."""
-        return self.name.rpartition("_")[2]
-
-
-class Powertrain(NamedTuple):
-    """From commanded to measured wheel speeds.
-
-    Parameters
-    ----------
-    parts : in the order of :data:`NAMES`; without those of two sides where a robot has not just two
-    rms_before_radps, rms_after_radps : measured minus commanded, and minus predicted of runs left out of the
-        fit
-    hold_s : period at which new wheel speeds are logged
-    n_runs : that have both
-    """
-
-    parts: tuple[Part, ...]
-    rms_before_radps: float
-    rms_after_radps: float
-    hold_s: float
-    n_runs: int
-
-    @property
-    def found(self) -> tuple[Part, ...]:
-        """Parts that are there."""
-        return tuple(part for part in self.parts if part.status is PartStatus.FOUND)
-
-    @property
-    def vector(self) -> Array:
-        """Values (len(NAMES),) as :func:`follow` takes them."""
-        vector = ABSENT.copy()
-        for part in self.found:
-            vector[NAMES.index(part.name)] = part.value
-        return vector
-
-    @property
-    def sentences(self) -> tuple[str, ...]:
-        """What was found, a sentence each, with its interval; one where nothing was."""
-        if not self.found:
-            return ("The wheels turn as they are commanded, as far as the runs show it.",)
-        parts = ((WORDS[p.name].format(f"{p.value:.3g}"), f"{p.low:.3g} to {p.high:.3g}") for p in self.found)
-        stated = [f"{words[0].upper()}{words[1:]} ({interval})." for words, interval in parts]
-        if self.is_scaled:
-            stated.append("The commands are no wheel speeds: they are scaled before the wheels get them.")
-        return tuple(stated)
-
-    @property
-    def is_scaled(self) -> bool:
-        """Whether commands are no wheel speeds: a gain is not 1."""
-        gains = [part for part in self.found if "gain" in part.name]
-        return any(abs(part.value - 1.0) > SCALE_TOLERANCE for part in gains)
 
 
 def powertrain_of(runs: Sequence[RunLog], robot: Robot, seed: int = 0) -> Powertrain:
@@ -215,9 +119,40 @@ def powertrain_of(runs: Sequence[RunLog], robot: Robot, seed: int = 0) -> Powert
         else:
             shown = PartStatus.NOT_NEEDED if _is_excited(traces, vector, i) else PartStatus.NOT_EXCITED
             parts.append(Part(NAMES[i], shown, math.nan, math.nan, math.nan, math.nan))
-    size = traces.n_values
-    before = math.sqrt(float(squared_errors(traces, ABSENT).sum()) / size)
-    return Powertrain(tuple(parts), before, math.sqrt(float(error.sum()) / size), traces.hold_s, n_runs)
+    size, raw = traces.n_values, squared_errors(traces, ABSENT)
+    before, after = (math.sqrt(float(each.sum()) / size) for each in (raw, error))
+    return Powertrain(tuple(parts), before, after, _reduction(raw, error, seed), traces.hold_s, n_runs)
+
+
+def powertrain_answer(
+    runs: Sequence[RunLog], robot: Robot, faults: Sequence[Fault], seed: int = 0
+) -> PowertrainAnswer | None:
+    """Return what is between commanded and measured wheel speeds; None where no run logs both.
+
+    Parameters
+    ----------
+    runs : of the robot
+    robot : names of its wheels, wheel radius and reduction
+    faults : of their logs; runs whose wheel speeds have one are left out
+    seed : of the folds and of the bootstrap
+    """
+    if not any(is_commanded(run, robot) for run in runs):
+        return None
+    faulty = {run_id for fault in faults if fault.change.of_wheels for run_id in fault.run_ids}
+    try:
+        return PowertrainAnswer(powertrain_of([run for run in runs if run.run_id not in faulty], robot, seed))
+    except DataError as error:
+        left_out = f" ({len(faulty)} have a fault of their wheel speeds)" if faulty else ""
+        return PowertrainAnswer(None, f"{error}{left_out}")
+
+
+def _reduction(before: Array, after: Array, seed: int) -> tuple[float, float, float]:
+    """Return by what the squared errors (runs,) are less, with its interval over runs; 0 of none at all."""
+    if not before.sum() > 0:
+        return 0.0, 0.0, 0.0
+    counts = bootstrap_counts(len(before), DRAWS, seed)
+    drawn = 1.0 - (counts @ after) / np.maximum(counts @ before, 1e-12)
+    return (1.0 - float(after.sum() / before.sum()), *percentile_interval(drawn))
 
 
 def _normal(traces: Traces, active: Sequence[int], p: Array, both_sides: bool = False) -> tuple[Array, Array]:
@@ -230,25 +165,39 @@ def _normal(traces: Traces, active: Sequence[int], p: Array, both_sides: bool = 
         near[i] = max(p[i] - STEPS[i], LOW[i]) if both_sides else p[i]
         back = predict(traces, near) if both_sides else here
         change[row] = (predict(traces, far) - back) / (far[i] - near[i]) * traces.new
-    products = np.einsum("anj,bnj->nab", change, change)
-    runs = traces.sample[:-1]
-    return np.add.reduceat(products, runs), np.add.reduceat(np.einsum("anj,nj->na", change, left), runs)
+    ends = list(pairwise(traces.sample.tolist()))
+    parts = [(change[:, i:j].reshape(len(active), -1), left[i:j].ravel()) for i, j in ends]
+    return np.array([d @ d.T for d, _ in parts]), np.array([d @ r for d, r in parts])
 
 
-def _fit(traces: Traces, active: Sequence[int], start: Array, used: Array, both_sides: bool = False) -> Array:
-    """Return the values that fit runs with weights ``used`` (runs,) best, by guarded Gauss-Newton steps."""
+def _fit(
+    traces: Traces,
+    active: Sequence[int],
+    start: Array,
+    used: Array,
+    both_sides: bool = False,
+    first: tuple[Array, Array] | None = None,
+) -> Array:
+    """Return the values that fit runs with weights ``used`` (runs,) best, by guarded Gauss-Newton steps.
+
+    ``first`` are the normal equations of the runs at the start, where they are known.
+    """
     p, damping = start.copy(), 1e-3
     if not active:
         return p
     at = list(active)
     best = float(used @ squared_errors(traces, p))
-    for _ in range(MAX_STEPS):
-        a, g = (np.tensordot(used, each, axes=1) for each in _normal(traces, at, p, both_sides))
+    for n in range(MAX_STEPS):
+        normal = first if first is not None and n == 0 else _normal(traces, at, p, both_sides)
+        a, g = (np.tensordot(used, each, axes=1) for each in normal)
         before = best
         while damping < MAX_DAMPING:
             scaled = a + damping * np.diag(np.diag(a)) + 1e-12 * np.eye(len(at))
+            step = np.linalg.solve(scaled, g)
+            if not step @ (2.0 * g - a @ step) > TOLERANCE * before:
+                return p
             trial = p.copy()
-            trial[at] = np.clip(p[at] + np.linalg.solve(scaled, g), LOW[at], HIGH[at])
+            trial[at] = np.clip(p[at] + step, LOW[at], HIGH[at])
             error = float(used @ squared_errors(traces, trial))
             if error < best:
                 p, best, damping = trial, error, damping / 5.0
@@ -263,10 +212,12 @@ def _fit(traces: Traces, active: Sequence[int], start: Array, used: Array, both_
 def _left_out(traces: Traces, active: Sequence[int], start: Array, fold_of: Array) -> Array:
     """Return the squared error of each run (runs,), of a fit that it is left out of."""
     error = np.empty(len(fold_of))
+    first = _normal(traces, active, start) if active else None
     for fold in range(FOLDS):
         out = fold_of == fold
         if out.any():
-            error[out] = squared_errors(traces, _fit(traces, active, start, (~out).astype(float)))[out]
+            p = _fit(traces, active, start, (~out).astype(float), first=first)
+            error[out] = squared_errors(traces, p)[out]
     return error
 
 

@@ -22,6 +22,9 @@ from terrain.errors import DataError
 MIN_RUNS = 3
 """Least number of runs: with fewer none is left to validate a fit."""
 
+REST_MPS = 0.02
+"""Fastest that a wheel turns, by its sensor's noise, in a run that does not drive."""
+
 
 class Prepared(NamedTuple):
     """Runs that are fit to be compared.
@@ -72,6 +75,9 @@ def prepare(signals: Sequence[Signals], simulation: Simulation, library: Sequenc
             raise DataError(f"runs: only {len(kept)} of {len(signals)} are fit to be compared ({reasons})")
         problem = problem._replace(signals=kept)
         seeds, aligned, shift = _aligned(problem, latencies_of(kept, simulation))
+    if not any(np.nanmax(np.abs(run.wheel_speed_mps), initial=0.0) > REST_MPS for run in problem.signals):
+        n = len(problem.signals)
+        raise DataError(f"runs: in all {n} the wheels are at rest; runs that drive are required")
     return Prepared(problem, faults, excluded, seeds, aligned, shift)
 
 

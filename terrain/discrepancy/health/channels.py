@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from terrain.discrepancy.clocks import Shift
 from terrain.discrepancy.health.faults import Change, Fault, repaired
@@ -80,9 +80,9 @@ def _turned(
         return None
     robot = simulation.robot
 
-    def tried(change: Change) -> Reading:
+    def tried(change: Change, places: Iterable[int]) -> Reading:
         after = list(responses)
-        for i in suspects:
+        for i in places:
             if change.of_wheels:
                 changed = _simulated(change.applied(runs[i]), simulation, low_pass)
             else:
@@ -91,11 +91,12 @@ def _turned(
             after[i] = responses_of([changed], latencies, own)[0]
         return reading_of(change, responses, after)
 
-    best = best_reading([tried(change) for change in candidate_changes(robot)])
-    if best is None:
+    found = best_reading([tried(change, suspects) for change in candidate_changes(robot)])
+    if found is None:
         return None
-    has = runs_with(best[0], [run.run_id for run in runs], responses)
-    return sign_fault(*best, has, responses, robot)
+    best = tried(found[0].change, range(len(runs)))
+    has = runs_with(best, [run.run_id for run in runs], responses)
+    return sign_fault(best, found[1], has, responses, robot)
 
 
 def _of_run(shift: Shift, i: int) -> Shift:

@@ -68,6 +68,7 @@ class Change(NamedTuple):
     factor : by which samples are multiplied; 1 for columns that are exchanged
     wheel : which wheel alone; -1 for all
     offset : that is added
+    pair : wheels that are exchanged
     """
 
     kind: FaultKind
@@ -75,6 +76,7 @@ class Change(NamedTuple):
     factor: float = 1.0
     wheel: int = -1
     offset: float = 0.0
+    pair: tuple[int, int] = (0, 1)
 
     @property
     def of_wheels(self) -> bool:
@@ -104,7 +106,7 @@ class Change(NamedTuple):
             return replace(run, measured=measured)
         wheel_speed = run.wheel_speed_mps.copy()
         if self.kind is FaultKind.SWAPPED:
-            wheel_speed = wheel_speed[:, ::-1]
+            wheel_speed[:, self.pair] = wheel_speed[:, self.pair[::-1]]
         elif self.wheel >= 0:
             wheel_speed[:, self.wheel] *= self.factor
         else:

@@ -8,6 +8,7 @@ zero; the likelihood that a reading gains is summed over the runs that it mends.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
@@ -61,12 +62,14 @@ class Reading(NamedTuple):
     correlation : (runs, channels) under it
     gain : (runs,) of twice the log-likelihood
     mends : (runs,) whether a channel follows the wheels that did not, and none is worse
+    suits : (runs,) whether the gain is as clear and none is worse; a channel may have followed before
     """
 
     change: Change
     correlation: Array
     gain: Array
     mends: Array
+    suits: Array
 
 
 def candidate_changes(robot: Robot) -> tuple[Change, ...]:
@@ -77,6 +80,9 @@ def candidate_changes(robot: Robot) -> tuple[Change, ...]:
     changes.append(Change(swapped, Column.SPEED))
     if robot.skids:
         changes += [Change(swapped, column) for column in (Column.CURRENTS, Column.WHEELS, Column.SIDES)]
+    else:
+        pairs = combinations(range(len(robot.wheels)), 2)
+        changes += [Change(swapped, Column.WHEELS, pair=pair) for pair in pairs]
     changes += [Change(sign, Column.WHEELS, -1.0, wheel) for wheel in (-1, *range(len(robot.wheels)))]
     return tuple(changes)
 
@@ -96,7 +102,8 @@ def reading_of(change: Change, before: Sequence[Response], after: Sequence[Respo
     turned = (old < TURNED) & (new > RIGHT)
     mended = (turned | ((new - old > RISE) & (new > CLEAR)))[:, keys].any(axis=1)
     worse = ((new < old - LOSS) & (old > RIGHT))[:, keys].any(axis=1)
-    return Reading(change, new, gain, mended & ~worse & (gain > GAIN))
+    suits = ~worse & (gain > GAIN)
+    return Reading(change, new, gain, mended & suits, suits)
 
 
 def best_reading(readings: Sequence[Reading]) -> tuple[Reading, list[Reading]] | None:
@@ -115,13 +122,13 @@ def best_reading(readings: Sequence[Reading]) -> tuple[Reading, list[Reading]] |
 
 
 def runs_with(reading: Reading, ids: Sequence[str], responses: Sequence[Response]) -> list[int]:
-    """Return the runs that have a fault: those that it mends, and of their sessions those that cannot say.
+    """Return the runs that have a fault: those that it suits, and of their sessions those that cannot say.
 
     A run that drives straight measures no sign of a gyro; it has that of the others.
     """
-    has = {i for i in range(len(ids)) if reading.mends[i]}
+    has = set(np.flatnonzero(reading.suits).tolist())
     old = np.array([fits(run)[0] for run in responses])
-    mended = sorted(has)
+    mended = np.flatnonzero(reading.mends)
     shift = np.median(np.abs(reading.correlation[mended] - old[mended]), axis=0)
     shows = [c for c in FOLLOWERS if shift[c] > RISE]
     for session in {session_of(ids[i]) for i in has}:
@@ -183,6 +190,9 @@ def _fault_words(change: Change, robot: Robot) -> tuple[str, str]:
         if change.column is Column.SPEED:
             names = "speed_x_mps and speed_y_mps"
             what = "the speeds forward and to the left are exchanged"
+        elif not robot.skids:
+            names = " and ".join(robot.rate_channels[i] for i in change.pair)
+            what = "wheel speeds of {} and {} are exchanged".format(*(robot.wheels[i] for i in change.pair))
         else:
             what = f"{change.column.value} of left and right are exchanged"
             names = {

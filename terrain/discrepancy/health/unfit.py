@@ -14,8 +14,15 @@ from functools import partial
 import numpy as np
 
 from terrain.discrepancy.clocks import MAX_LAG_S, MIN_LAG_S, Shift, offsets_of, shifts_of
-from terrain.discrepancy.health.common import STRETCH_S, odd_runs, stalled_runs, stretches
-from terrain.discrepancy.health.response import responses_of
+from terrain.discrepancy.health.common import (
+    FOLLOWS,
+    STRETCH_S,
+    common_gains,
+    odd_runs,
+    stalled_runs,
+    stretches,
+)
+from terrain.discrepancy.health.response import MOTION, Response, gains_of, responses_of
 from terrain.discrepancy.health.runs import Clock, Excluded
 from terrain.discrepancy.information import PRIOR_STD, Information
 from terrain.discrepancy.latencies import Latencies
@@ -29,6 +36,10 @@ others, which is the third at the least."""
 
 STILL_MPS, VARIES_MPS, MOVING_MPS = 0.002, 0.05, 0.2
 """Spread of a wheel speed that never changes, of one that does, and a speed at which no wheel rests."""
+
+OFF_RATIO = 1.5
+"""Of the gain of a run over that of the others, which one dead wheel of two makes 2 or 0: a wheel that never
+changes is dead only beyond that, or where the body does not follow the wheels at all."""
 
 MIN_FINITE_RATIO, USUAL_FINITE_RATIO = 0.3, 0.7
 """A channel is dead in a run that has some of it but less than the first, the others over the second."""
@@ -86,7 +97,7 @@ def unfit_runs(
     has_clock = [bool(np.isfinite(lag_s).any()) for lag_s in shift.lag_s]
     stalled = stalled_runs(responses, has_clock, MAX_LAG_S + MARGIN_S - STRETCH_S)
     reasons: dict[int, str] = {}
-    for found in (_dead(signals, info), _late(info, shift), stalled, _frozen(signals, info)):
+    for found in (_dead(signals, info, responses), _late(info, shift), stalled, _frozen(signals, info)):
         reasons = found | reasons
     for odd in (partial(odd_runs, responses), partial(_unlike, info)):
         reasons |= odd([i for i in range(len(signals)) if i not in reasons])
@@ -103,9 +114,10 @@ def clocks_of(info: Information, shift: Shift | None = None) -> tuple[Clock, ...
     )
 
 
-def _dead(signals: Sequence[Signals], info: Information) -> dict[int, str]:
+def _dead(signals: Sequence[Signals], info: Information, responses: Sequence[Response]) -> dict[int, str]:
     """Return runs with a wheel or a channel of which hardly anything is there."""
     reasons: dict[int, str] = {}
+    common = common_gains(responses)
     known_ratio = np.array([np.isfinite(run.measured).mean(axis=0) for run in signals])
     usual = np.median(known_ratio, axis=0)
     for i, run in enumerate(signals):
@@ -119,13 +131,25 @@ def _dead(signals: Sequence[Signals], info: Information) -> dict[int, str]:
             reasons[i] = f"its wheel speeds are known in {known.mean():.0%} of its samples"
             continue
         spread = run.wheel_speed_mps[known].std(axis=0)
-        if spread.min() < STILL_MPS and spread.max() > VARIES_MPS:
+        constant = spread.min() < STILL_MPS and spread.max() > VARIES_MPS
+        if constant and _disagrees(responses[i], common):
             reasons[i] = f"its wheel {int(np.argmin(spread)) + 1} never turns faster or slower, the others do"
         elif np.abs(run.wheel_speed_mps[known]).max() < STILL_MPS:
             shown = info.rows[i].measured[:, _SPEEDS]
             if shown.size and np.nanmax(np.hypot(*np.nan_to_num(shown).T)) > MOVING_MPS:
                 reasons[i] = "its wheels are at rest, its camera moves"
     return reasons
+
+
+def _disagrees(response: Response, common: Array) -> bool:
+    """Return whether the body does not move as the wheels make it move in the other runs.
+
+    A wheel that is driven at a steady speed beside others that change is no dead one: the body follows them.
+    """
+    gain, correlation = gains_of(response)
+    asked = [c for c in MOTION if correlation[c] != 0.0]
+    off = np.abs(np.log(np.abs(gain[asked] / common[asked])))  # NaN, which is not over, where none is known
+    return bool((correlation[asked] < FOLLOWS).any() or (off > math.log(OFF_RATIO)).any())
 
 
 def _late(info: Information, shift: Shift) -> dict[int, str]:

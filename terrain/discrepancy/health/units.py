@@ -158,11 +158,16 @@ def _options(logs: Array, robot: Robot) -> list[Changes]:
 
 
 def _repaired_logs(logs: Array, changes: Changes) -> Array:
-    """Return the logarithms of gains after changes: of measured channels up, of a larger prediction down."""
+    """Return the logarithms of gains after changes: of measured channels up, of a larger prediction down.
+
+    The currents are not in proportion to the wheel speeds: beside a motion their gain says nothing of these.
+    """
     after = logs.copy()
     for change in changes:
         if change.of_wheels:
             after[_MOTION] -= math.log(change.factor)
+            if np.isfinite(after[_MOTION]).any():
+                after[_PLACE[AMPS]] = np.nan
         else:
             for c in CHANNELS_OF[change.column]:
                 if c in _PLACE:

@@ -74,12 +74,16 @@ def _scaled(part: str, factor: float) -> Callable[[Stream, Robot], Stream]:
 
 
 def _swapped(*kinds: str) -> Callable[[Stream, Robot], Stream]:
-    """Return what puts the channels of the first two wheels in each other's place."""
+    """Return what puts the channels of the last two wheels in each other's place.
+
+    Of the catalogue's swerve robot the first two always turn alike, unless it drives sideways while it turns:
+    their exchange leaves a log as it was.
+    """
 
     def write(stream: Stream, robot: Robot) -> Stream:
         values = stream.values.copy()
         for kind in kinds:
-            pair = [kind.format(wheel) for wheel in robot.wheels[:2]]
+            pair = [kind.format(wheel) for wheel in robot.wheels[-2:]]
             if set(pair) <= set(stream.channels):
                 at = [stream.channels.index(name) for name in pair]
                 values[:, at] = values[:, at[::-1]]

@@ -15,6 +15,7 @@ from terrain.discrepancy.answers import INTERVAL_T
 from terrain.logs.write import write_run
 from terrain.records import RunLog
 from terrain.robots import load_robot
+from terrain.simulation.planar.drives import COMMANDS_HZ, DRIVE_S
 from terrain.simulation.planar.noise import load_noise, load_scatter
 from terrain.simulation.planar.run import simulate_planar
 
@@ -121,6 +122,17 @@ def test_the_hidden_cause_is_named_built_in_and_absent_when_tested_again(terrain
         found["gain"]["channels"]["speed_y_mps"]["reduction"], abs=0.01
     )
 
+    powertrain = {part["name"]: part for part in found["powertrain"]["parts"]}
+    late = [powertrain[name] for name in ("delay_s", "time_constant_s")]
+    assert [part["status"] for part in late] == ["found", "found"]
+    assert sum(part["value"] for part in late) == pytest.approx(2 * DRIVE_S - 0.5 / COMMANDS_HZ, abs=0.015)
+    assert {name for name, part in powertrain.items() if part["status"] == "found"} == {
+        part["name"] for part in late
+    }
+    assert found["powertrain"]["reduction"][1] > 0.5
+    assert all(f"powertrain: {text}" in out for text in found["powertrain"]["sentences"])
+    assert all(f"<li>{text}</li>" in page for text in found["powertrain"]["sentences"])
+
     extended = tmp_path / "found" / EXTENDED_FILE
     assert load_robot(extended).effects == pytest.approx({"camera_yaw_rad": value["value"]}, rel=1e-6)
     undrawn()
@@ -148,6 +160,7 @@ def test_of_few_runs_none_is_held_out_by_default_and_the_same_seed_gives_the_sam
     assert code == 0, err
     assert len(list((tmp_path / "none" / "pictures").glob("run_*"))) == 4
     assert "gain on held-out runs not measured: no run was held out" in out
+    assert "powertrain: The wheel speeds are not compared with their commands: runs: 4 have" in out
     pages = []
     for out in ("a", "b"):
         code, _, err = terrain(*words, "--out", out, "--hold-out", "1", "--seed", "3")
@@ -203,6 +216,24 @@ def test_runs_that_cannot_be_compared_are_one_sentence(refused, tmp_path):
     for i in range(2):
         write_run(a_run(i), two)
     refused("there are 2, at least 3", "--data", two, "--robot", "husky", "--out", "out")
+
+
+def test_runs_of_another_robot_one_run_and_a_robot_at_rest_are_one_sentence(refused, tmp_path):
+    out = ("--out", "out")
+    for i in range(3):
+        write_run(a_run(i, load_robot("agrimaro"), {}), tmp_path / "agrimaro")
+    wrong = "3 of 3 runs are of the robot 'agrimaro'; the simulation is of 'husky'"
+    refused(wrong, "--data", tmp_path / "agrimaro", "--robot", "husky", *out)
+    write_run(a_run(0), tmp_path / "one")
+    refused("there are 1, at least 3", "--data", tmp_path / "one", "--robot", "husky", *out)
+    for i in range(3):
+        standing = np.zeros((400, 3))
+        run = simulate_planar(HUSKY, standing, i, noise=load_noise(), run_id=f"stand_{i}", terrain="field")
+        write_run(run, tmp_path / "rest")
+    refused(
+        "in all 3 the wheels are at rest; runs that drive are required",
+        *("--data", tmp_path / "rest", "--robot", "husky", *out),
+    )
 
 
 def test_an_extended_description_is_not_overwritten(refused, data, tmp_path):

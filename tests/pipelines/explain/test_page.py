@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipelines.explain.explain import next_command
 from pipelines.explain.page import explain_page, figure_view
 from pipelines.explain.results import Explanation, HeldOutGain
 from pipelines.explain.view import RunPicture
@@ -22,6 +21,7 @@ from terrain.discrepancy.gain import ChannelGain, Gain, Reduction
 from terrain.discrepancy.health.faults import Column, Fault, FaultKind
 from terrain.discrepancy.health.runs import Clock, Excluded
 from terrain.discrepancy.nameless import Learned, Nameless
+from terrain.discrepancy.next_drive import next_command
 from terrain.discrepancy.response_slopes import Slope
 from terrain.discrepancy.statements import Statement
 from terrain.discrepancy.verdict import (
@@ -116,6 +116,7 @@ def test_a_cause_is_shown_with_value_interval_gain_and_aliases():
     assert "lever_x_m 0.1 m 0.09 to 0.11 40 % 30 % to 50 % speed to the left, speed ahead 9" in text
     assert "no log distinguishes it from: an alias" in text
     assert "On 2 held-out runs the extension removes 50 % of the squared residual" in text
+    assert "commanded" not in text  # no run logs commands
     assert "Values are added to what the description has already" in text
 
 

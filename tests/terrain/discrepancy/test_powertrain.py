@@ -7,7 +7,10 @@ import numpy as np
 import pytest
 
 from terrain.discrepancy.command_response import ABSENT, NAMES, STEP_S, follow
-from terrain.discrepancy.powertrain import PartStatus, powertrain_of
+from terrain.discrepancy.health import Column, Fault, FaultKind
+from terrain.discrepancy.health.faults import Change
+from terrain.discrepancy.powertrain import powertrain_answer, powertrain_of
+from terrain.discrepancy.powertrain_answer import PartStatus
 from terrain.errors import DataError
 from terrain.logs.drive import DriveRobot, find_runs
 from terrain.records import RunLog, Stream
@@ -130,10 +133,15 @@ def test_what_the_commands_do_not_show_is_not_excited():
             "commands": Stream(run.streams["wheels"].time_s, commands, run.streams["commands"].channels),
         }
         held.append(RunLog(run.run_id, "husky", streams))
-    status = {part.name: part.status for part in powertrain_of(held, HUSKY).parts}
+    found = powertrain_of(held, HUSKY)
+    status = {part.name: part.status for part in found.parts}
     for name in ("delay_s", "time_constant_s", "slew_radps2", "difference_gain_ratio"):
         assert status[name] is PartStatus.NOT_EXCITED, name
     assert status["gain_ratio"] is PartStatus.NOT_NEEDED
+    assert found.sentences[-1].startswith(
+        "The commands would not have shown a delay, a time constant, a slew"
+    )
+    assert " or " in found.sentences[-1]
 
 
 def test_the_same_seed_gives_the_same_answer():
@@ -150,13 +158,45 @@ def test_runs_without_commands_are_refused_in_one_sentence():
 
 def test_the_answer_is_stated_in_sentences():
     found = powertrain_of(commanded_runs({"delay_s": 0.2, "time_constant_s": 0.3}, n=10), HUSKY)
-    late, slow = found.sentences
+    late, slow, gained = found.sentences
     assert re.fullmatch(r"The wheels answer 0\.\d+ s late \(0\.\d+ to 0\.\d+\)\.", late)
     assert slow.startswith("They settle with a time constant of 0.")
     assert found.vector[0] == found.found[0].value
     nothing = powertrain_of(commanded_runs({}, n=10), HUSKY)
-    assert len(nothing.sentences) == 1
     assert "as they are commanded" in nothing.sentences[0]
+    assert nothing.reduction == (0.0, 0.0, 0.0)
+    ratio, low, high = found.reduction
+    assert 0.0 < low <= ratio <= high < 1.0
+    assert ratio == pytest.approx(1 - (found.rms_after_radps / found.rms_before_radps) ** 2)
+    off = f"off by {found.rms_after_radps:.3g} rad/s rms instead of {found.rms_before_radps:.3g}"
+    assert off in gained
+    assert f"less by {ratio:.1%} ({low:.1%} to {high:.1%})" in gained
+
+
+def test_an_answer_leaves_out_what_is_no_command_or_a_wheel_speed_with_a_fault():
+    runs = commanded_runs({"delay_s": 0.2, "time_constant_s": 0.3}, n=10)
+    bare = [RunLog(run.run_id, "husky", {"wheels": run.streams["wheels"]}) for run in runs]
+    assert powertrain_answer(bare, HUSKY, ()) is None
+    few = powertrain_answer([*bare[:7], *runs[7:]], HUSKY, ())
+    assert few.powertrain is None
+    assert few.sentences == (
+        "The wheel speeds are not compared with their commands: runs: 3 have commanded and measured wheel "
+        "speeds; at least 5 are required.",
+    )
+    in_kmh = [replaced(run, 3.6) if i < 3 else run for i, run in enumerate(runs)]
+    change = Change(FaultKind.UNIT, Column.WHEELS, 1 / 3.6)
+    fault = Fault(change.kind, change.column, ("run_0", "run_1", "run_2"), change.factor, "", "", change)
+    assert powertrain_answer(in_kmh, HUSKY, ()).powertrain.n_runs == len(runs)
+    assert repr(powertrain_answer(in_kmh, HUSKY, (fault,)).powertrain) == repr(powertrain_of(runs[3:], HUSKY))
+    gyro = Change(FaultKind.SIGN, Column.GYRO, -1.0)
+    turned = Fault(gyro.kind, gyro.column, fault.run_ids, -1.0, "", "", gyro)
+    assert repr(powertrain_answer(runs, HUSKY, (turned,)).powertrain) == repr(powertrain_of(runs, HUSKY))
+
+
+def replaced(run, factor):
+    wheels = run.streams["wheels"]
+    faster = Stream(wheels.time_s, factor * wheels.values, wheels.channels)
+    return RunLog(run.run_id, run.robot, {**run.streams, "wheels": faster})
 
 
 def test_the_commands_of_the_measured_husky_are_no_wheel_speeds(measured):
@@ -170,6 +210,6 @@ def test_the_commands_of_the_measured_husky_are_no_wheel_speeds(measured):
     assert values["wheel_limit_radps"].value == pytest.approx(6.1, abs=0.15)
     assert values["delay_s"].low > 0.2
     assert found.is_scaled
-    assert found.sentences[-1].startswith("The commands are no wheel speeds")
+    assert any(text.startswith("The commands are no wheel speeds") for text in found.sentences)
     assert found.hold_s == pytest.approx(0.1)
     assert found.rms_after_radps < 0.2 * found.rms_before_radps

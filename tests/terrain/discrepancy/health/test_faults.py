@@ -10,6 +10,8 @@ from numpy.testing import assert_allclose
 
 from pipelines.runs.datasets import load_runs
 from terrain.discrepancy.health import Column, Fault, FaultKind, faults_of, repaired
+from terrain.discrepancy.health.response import AMPS, A, G, X
+from terrain.discrepancy.health.units import KEYS, SWERVE_TURN, _best, _middle, _options
 from terrain.discrepancy.latencies import latencies_of
 from terrain.discrepancy.residuals import low_pass_of, rows_of
 from terrain.discrepancy.signals import Signals, signals_of
@@ -117,6 +119,41 @@ def test_a_fault_of_one_run_is_named_by_the_run(written):
     (fault,) = faults(on_one_clock(runs))
     assert (fault.kind, fault.column, fault.run_ids) == (kind, column, ("run_03",))
     assert "in 1 of 8 runs (run_03)" in fault.sentence
+
+
+@pytest.mark.parametrize("written", ["gyro in deg/s", "speed in km/h", "wheels in rpm"])
+def test_half_of_the_runs_in_another_unit_are_named(written):
+    write, kind, column, _ = WRITTEN[written]
+    half = (0, 1, 4, 5)  # run_04 drives straight: it could not show the unit of a gyro
+    (fault,) = faults(on_one_clock([write(run) if i in half else run for i, run in enumerate(sound())]))
+    assert (fault.kind, fault.column) == (kind, column)
+    assert fault.run_ids == tuple(sound()[i].run_id for i in half)
+    assert "in 4 of 8 runs (run_01, run_02, run_05, run_06)" in fault.sentence
+
+
+@pytest.mark.parametrize("of_one", [False, True])
+def test_two_wheels_of_a_swerve_robot_are_exchanged(of_one):
+    was = sound("agrimaro")
+    write = edit("wheels", ("motor_2", "motor_3"), exchanged)
+    runs = [write(run) if i == 2 or not of_one else run for i, run in enumerate(was)]
+    (fault,) = faults(on_one_clock(runs), "agrimaro")
+    assert (fault.kind, fault.column) == (SWAPPED, Column.WHEELS)
+    assert fault.run_ids == tuple(run.run_id for i, run in enumerate(was) if i == 2 or not of_one)
+    assert fault.sentence.startswith("wheel speeds of 2 and 3 are exchanged in")
+    assert "exchange motor_2_radps and motor_3_radps" in fault.repair
+    for run, truth in zip(repaired(on_one_clock(runs), [fault]), on_one_clock(was), strict=True):
+        assert_allclose(run.wheel_speed_mps, truth.wheel_speed_mps, atol=1e-9)
+
+
+def test_the_unit_of_wheels_is_not_judged_by_the_currents():
+    """In rpm these wheels predict accelerations that are none, and currents that no motor has."""
+    logs = np.full((8, len(KEYS)), np.nan)
+    logs[:, [KEYS.index(G), KEYS.index(X)]] = -2.25, -2.15
+    logs[5, KEYS.index(A)], logs[[2, 5, 6], KEYS.index(AMPS)] = -2.56, -2.28
+    robot = load_robot("agrimaro")
+    (change,), rivals = _best(_middle(logs), _options(logs, robot), SWERVE_TURN)
+    assert (change.column, change.factor) == (Column.WHEELS, pytest.approx(1 / RPM))
+    assert rivals == []
 
 
 @pytest.mark.parametrize(

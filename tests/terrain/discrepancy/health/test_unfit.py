@@ -16,7 +16,7 @@ from terrain.discrepancy.residuals import low_pass_of
 from terrain.discrepancy.signals import Signals, signals_of
 from terrain.discrepancy.simulation import Simulation
 from terrain.errors import DataError
-from terrain.records import Array, RunLog
+from terrain.records import Array, RunLog, Stream
 from terrain.robots import load_robot
 from terrain.simulation.planar.hills import Hills
 from terrain.simulation.planar.model import Ground
@@ -154,6 +154,33 @@ def dead_wheel(run: RunLog) -> RunLog:
         values[:, channels.index("speed_left_mps")] = 0.0
 
     return edited(run, "wheels", edit)
+
+
+def of_sides(left_mps: Array, right_mps: Array) -> RunLog:
+    """Return a run of which the speeds of left and right are given over time, without its start from rest."""
+    rate_radps = (right_mps - left_mps) / HUSKY.track_m
+    twist = np.column_stack([(left_mps + right_mps) / 2, np.zeros_like(left_mps), rate_radps])
+    run = simulate_planar(HUSKY, twist, ODD, scatter=load_scatter(), run_id=f"run_{ODD}", terrain="grass")
+    wheels = run.streams["wheels"]
+    late = wheels.time_s > 2.0
+    later = Stream(wheels.time_s[late], wheels.values[late], wheels.channels)
+    return replace(run, streams={**run.streams, "wheels": later})
+
+
+@pytest.mark.parametrize("left_mps", [0.0, 0.3])
+def test_a_wheel_at_a_steady_speed_is_not_dead_but_one_that_only_reads_so_is(sound, left_mps):
+    def reads_so(values: Array, time_s: Array, channels: list[str]) -> None:
+        values[:, channels.index("speed_left_mps")] = left_mps
+
+    time_s = np.arange(40 * 50 + 1) / 50
+    steady, right = np.full_like(time_s, left_mps), left_mps + 0.25 * np.sin(0.7 * time_s)
+    run = of_sides(steady, right)
+    assert np.std(run.streams["wheels"].channel("speed_left_mps")) < 0.002
+    others = [each for i, each in enumerate(sound) if i != ODD]
+    assert excluded([*others, run]) == ()
+    both = of_sides(left_mps + 0.25 * np.sin(0.8 * time_s), right)
+    ((name, reason),) = excluded([*others, edited(both, "wheels", reads_so)])
+    assert (name, reason) == (f"run_{ODD}", "its wheel 1 never turns faster or slower, the others do")
 
 
 @pytest.mark.parametrize(
