@@ -14,11 +14,19 @@ from terrain.discrepancy.information import Information
 from terrain.discrepancy.noise import whiten
 from terrain.discrepancy.residuals import INPUTS, Rows
 from terrain.discrepancy.selection import pooled_variance, z_of, z_of_t
-from terrain.effects import CHANNELS
+from terrain.effects import CHANNELS, INDEX
 from terrain.records import Array
 
 Z_PROBE = 4.5
 """Evidence that a probe needs: 7e-6, of some two hundred."""
+
+BLOCK_S = 5.0
+"""Length of the blocks of a run that count as independent: several times what the noise remembers."""
+
+RUN_RATIO = 2.0
+"""Runs are the clusters instead of their blocks where the variance between runs is larger by that ratio: what
+the residual depends on is then one more thing that differs from run to run (MacKinnon, Nielsen and Webb,
+Journal of Econometrics 2023)."""
 
 CRAWL_MPS = 0.2
 """Scale of speed of the probe of crawling."""
@@ -105,13 +113,14 @@ def probe_residuals(
     rate_hz = 1 / float(np.median(np.diff(info.rows[0].time_s)))
     results: dict[tuple[str, str], ProbeResult] = {}
     inputs = [probe_inputs(run, rate_hz) for run in info.rows]
+    blocks = _blocks_of(info, names, change)
     for c, channel in enumerate(CHANNELS):
         if not any(residual[:, c].any() for residual in info.white_residual):
             continue
         columns = []
         for run, given, residual in zip(info.rows, inputs, info.white_residual, strict=True):
             columns.append(_white(info, run, c, np.array(list(given.values())), residual))
-        for name, result in zip(inputs[0], _probe_results(info, names, change, c, columns), strict=True):
+        for name, result in zip(inputs[0], _probe_results(info, names, blocks, c, columns), strict=True):
             results[channel, name] = result
         n_wheels = info.rows[0].inputs.shape[1] - len(INPUTS) + 1
         for wheel in range(n_wheels):
@@ -141,40 +150,78 @@ def _white(info: Information, run: Rows, c: int, columns: Array, residual: Array
     return np.asarray(white * (residual[:, c] != 0.0))
 
 
+class _Blocks(NamedTuple):
+    """Blocks of all runs, and the information on the selected parameters in each of them.
+
+    Parameters
+    ----------
+    edges : of each run, (blocks + 1,) rows
+    first : (runs,) number of the first block of each run
+    at : places of the k selected parameters
+    change : (k,) from where the residuals are taken to their fitted values
+    a, g : (blocks, k, k) and (blocks, k) information, and score at the fit
+    """
+
+    edges: tuple[Array, ...]
+    first: Array
+    at: list[int]
+    change: Array
+    a: Array
+    g: Array
+
+
+def _blocks_of(info: Information, names: Sequence[str], change: Array) -> _Blocks:
+    at = info.places(names)
+    change = change - np.array([info.origin[INDEX[name]] - info.vector[INDEX[name]] for name in names])
+    edges, a, g = [], [], []
+    for i, run in enumerate(info.rows):
+        n_blocks = max(round(float(run.time_s[-1] - run.time_s[0]) / BLOCK_S), 1)
+        edges.append(np.linspace(0, len(run.time_s), n_blocks + 1).astype(int))
+        own, n = info.white_change[i][at], info.white_change[i][info.nuisances]
+        free = own - np.tensordot(info.shift[i][:, at].T, n, axes=1)
+        residual = info.white_residual[i] - np.tensordot(info.shift[i][:, -1], n, axes=1)
+        both = np.einsum("jmc,kmc->mjk", own, free), np.einsum("jmc,mc->mj", own, residual)
+        gram, score = (np.add.reduceat(each, edges[-1][:-1], axis=0) for each in both)
+        a.append((gram + gram.transpose(0, 2, 1)) / 2.0)
+        g.append(score - a[-1] @ change)
+    first = np.cumsum([0, *(len(each) - 1 for each in edges[:-1])])
+    return _Blocks(tuple(edges), first, at, change, np.concatenate(a), np.concatenate(g))
+
+
 def _probe_results(
-    info: Information, names: Sequence[str], change: Array, c: int, columns: list[Array]
+    info: Information, names: Sequence[str], blocks: _Blocks, c: int, columns: list[Array]
 ) -> list[ProbeResult]:
     """Return the results of columns (q, m) a run, in channel c."""
-    at = info.places(names)
-    n_runs, q = len(columns), columns[0].shape[0]
-    own, cross, score = np.empty((n_runs, q)), np.empty((n_runs, q, len(at))), np.empty((n_runs, q))
-    power, doubtful = np.zeros(len(at)), np.flatnonzero(info.model_std)
-    shown = np.zeros((q, len(doubtful)))
+    at, q = blocks.at, columns[0].shape[0]
+    sums: list[tuple[Array, ...]] = []
+    power = np.zeros(len(at))
     for i, x in enumerate(columns):
-        white, residual = info.white_change[i], info.white_residual[i]
-        j, r = white[:, :, c], residual[:, c]
-        xn = x @ j[info.nuisances].T
-        own[i] = (x * x).sum(axis=1) - np.einsum("qi,ij,qj->q", xn, info.inner[i], xn)
+        j, r = info.white_change[i][:, :, c], info.white_residual[i][:, c]
+        n, shift = j[info.nuisances], info.shift[i]
         power += (j[at] ** 2).sum(axis=1)
-        cross[i] = x @ j[at].T - xn @ info.shift[i][:, at]
-        shown += x @ j[doubtful].T - xn @ info.shift[i][:, doubtful]
-        score[i] = x @ r - xn @ info.shift[i][:, -1]
-    a = info.a[:, at][:, :, at]
-    g = info.g[:, at] - a @ change  # at the fit
+        each = (
+            x * (x - (x @ n.T) @ info.inner[i] @ n),
+            x[:, None] * (j[at] - shift[:, at].T @ n),
+            x * (r - shift[:, -1] @ n),
+        )
+        sums.append(tuple(np.add.reduceat(s, blocks.edges[i][:-1], axis=-1) for s in each))
+    own, cross, score = (
+        np.moveaxis(np.concatenate(parts, axis=-1), -1, 0) for parts in zip(*sums, strict=True)
+    )
     follow = np.zeros((0, q))
     if at:
-        follow = np.linalg.lstsq(a.sum(axis=0), cross.sum(axis=0).T, rcond=1e-10)[0]
-        shown -= follow.T @ info.a[:, at][:, :, doubtful].sum(axis=0)
-    of_model = ((shown * info.model_std[doubtful]) ** 2).max(axis=1, initial=0.0)
+        follow = np.linalg.lstsq(blocks.a.sum(axis=0), cross.sum(axis=0).T, rcond=1e-10)[0]
+    of_model = _of_model(info, at, c, columns, follow)
     free = own.sum(axis=0) - (cross.sum(axis=0) * follow.T).sum(axis=1)
-    size_of_run = (
-        own - 2 * np.einsum("rqs,sq->rq", cross, follow) + np.einsum("sq,rst,tq->rq", follow, a, follow)
+    sizes = (
+        own
+        - 2 * np.einsum("bqs,sq->bq", cross, follow)
+        + np.einsum("sq,bst,tq->bq", follow, blocks.a, follow)
     )
-    part = score - np.einsum("rs,sq->rq", g, follow)
+    part = score - cross @ blocks.change - np.einsum("bs,sq->bq", blocks.g, follow)
     total = part.sum(axis=0)
     enough = free > 1e-6 * np.maximum(own.sum(axis=0), 1e-12)
     free = np.where(enough, free, np.inf)
-    size = total / free
     both = np.sqrt(np.outer(own.sum(axis=0), power))
     alike = np.divide(np.abs(cross.sum(axis=0)), both, out=np.zeros_like(both), where=both > 1e-9)
     alike = np.minimum(alike, 1.0)
@@ -183,12 +230,45 @@ def _probe_results(
         if not enough[k]:
             answers.append(ProbeResult(0.0, 0.0))
             continue
-        part_k = part[:, k] - size_of_run[:, k] * size[k]
-        dispersion, dof = pooled_variance(part_k, np.clip(size_of_run[:, k] / free[k], 0.0, 0.9), free[k])
-        z = z_of_t(abs(total[k]) / np.sqrt(free[k] * dispersion + of_model[k]), dof)
+        left = part[:, k] - sizes[:, k] * total[k] / free[k]
+        z = _z(float(total[k]), float(free[k]), left, sizes[:, k], blocks.first, float(of_model[k]))
         known = dict(zip(names, alike[k].tolist(), strict=True))
         answers.append(ProbeResult(z, float(total[k] ** 2 / free[k]), known))
     return answers
+
+
+def _of_model(info: Information, at: list[int], c: int, columns: list[Array], follow: Array) -> Array:
+    """Return the variance (q,) of a probe's score by the simulation's own error.
+
+    Of errors in units of several parameters the largest counts: each was measured as if it were alone.
+    """
+    doubtful = np.flatnonzero(info.model_std)
+    shown = -follow.T @ info.a[:, at][:, :, doubtful].sum(axis=0)
+    for i, x in enumerate(columns):
+        j = info.white_change[i][:, :, c]
+        shown += x @ (j[doubtful] - info.shift[i][:, doubtful].T @ j[info.nuisances]).T
+    return np.asarray(((shown * info.model_std[doubtful]) ** 2).max(axis=1, initial=0.0))
+
+
+def _z(total: float, free: float, left: Array, sizes: Array, first: Array, of_model: float) -> float:
+    """Return the evidence of a score, whose variance is estimated between blocks, or between runs.
+
+    Parameters
+    ----------
+    total, free : score of all runs, and its information, which is its variance by the noise
+    left, sizes : (blocks,) what is left of each block's score at the fit, and its information
+    first : (runs,) number of the first block of each run
+    of_model : its variance by the simulation's own error
+    """
+    by_run, dof_by_run = _variance(np.add.reduceat(left, first), np.add.reduceat(sizes, first), free)
+    variance, dof = _variance(left, sizes, free)
+    if by_run > RUN_RATIO * variance:
+        variance, dof = by_run, dof_by_run
+    return z_of_t(abs(total) / math.sqrt(free * variance + of_model), dof)
+
+
+def _variance(left: Array, sizes: Array, free: float) -> tuple[float, float]:
+    return pooled_variance(left, np.clip(sizes / free, 0.0, 0.9), free)
 
 
 def _wheel_turn_probe(info: Information, c: int, pairs: list[Array], placebo: float) -> ProbeResult:
