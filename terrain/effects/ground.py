@@ -55,6 +55,19 @@ SLIP_AND_RESISTANCE: tuple[Effect, ...] = (
         "arcs of several radii and turns in place",
     ),
     Effect(
+        "track_narrowing",
+        # measured: 0.007 to 0.009 s^4/m^2 (Warthog on asphalt and gravel), which is mu = 0.75; none on sand
+        (Parameter("track_narrowing_s2pm2", 0.0, 1.0, 0.005),),
+        "w grows by x/(1 + x), x = c (u w)^2, u and w without it: lateral acceleration turns the robot more",
+        "Wong, Theory of Ground Vehicles, skid-steering at high speeds: the moment that resists turning falls "
+        "with (V^2 / (g R mu))^2; with an effective track B (1 + e), c is about e / ((1 + e) (g mu)^2); the "
+        "bounded form is this project's",
+        (SKID,),
+        (GYRO, SPEED_Y, HEADING),
+        "fast arcs, and turns in place",
+        wording=Wording.FAST_TURNS,
+    ),
+    Effect(
         "turn_drag",
         # measured: 0.02 to 0.1 s^2 (Warthog on asphalt and sand), 0.6 to 0.9 s^2 (Husky)
         (Parameter("turn_drag_s2", -0.1, 3.0, 0.005),),
