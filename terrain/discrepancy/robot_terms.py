@@ -13,9 +13,13 @@ from terrain.discrepancy.verdict import Value
 from terrain.effects import PARAMETER, Wording, effect_named
 from terrain.extension import Basis, Origin, basis_of
 from terrain.robots import Robot
+from terrain.simulation.planar.skid_steer import SLIDING_RADPS
 
-EXAMPLE_RADPS, EXAMPLE_MPS, EXAMPLE_MPS2 = 0.5, 1.0, 2.0
-"""The turn, the speed and the lateral acceleration at which losses that grow with them are stated."""
+EXAMPLE_RADPS, EXAMPLE_MPS = 0.5, 1.0
+"""The turn and the speed at which losses that grow with them are stated."""
+
+FAST_RADPS, FAST_MPS = 1.0, 2.0
+"""The same of what fast turns do."""
 
 UNITS = {
     "ratio": "",
@@ -50,6 +54,9 @@ def in_robot_terms(effect: str, values: Sequence[Value], robot: Robot) -> str:
     >>> late = Value("clock_offset_s", -0.27, "s", -0.28, -0.26)
     >>> in_robot_terms("clock_offset", [late], load_robot("husky"))
     'the wheels logged 0.27 s late'
+    >>> narrow = Value("track_narrowing_s2pm2", 0.04, "s2pm2", 0.03, 0.05)
+    >>> in_robot_terms("track_narrowing", [narrow], load_robot("warthog"))
+    'a track that acts 6.9 % narrower at 2 m/s and 1 rad/s'
     """
     total = {value.name: robot.effects.get(value.name, 0.0) + value.value for value in values}
     written = TERMS.get(effect_named(effect).wording)
@@ -190,12 +197,11 @@ def _turn_drag(values: Sequence[Value], total: Total, robot: Robot) -> str:
 
 def _fast_turns(values: Sequence[Value], total: Total, robot: Robot) -> str:
     (value,) = values
-    x = total[value.name] * EXAMPLE_MPS2**2
+    radps = FAST_RADPS
+    x = total[value.name] * (FAST_MPS * radps) ** 2 / (1.0 + (radps / SLIDING_RADPS) ** 2)
     gained = x / (1.0 + abs(x))
-    return (
-        f"a track that acts {100.0 * gained / (1.0 + gained):.2g} % narrower at {EXAMPLE_MPS2:g} m/s² of "
-        "lateral acceleration"
-    )
+    percent = 100.0 * gained / (1.0 + gained)
+    return f"a track that acts {percent:.2g} % narrower at {FAST_MPS:g} m/s and {radps:g} rad/s"
 
 
 def _side_slip(values: Sequence[Value], total: Total, robot: Robot) -> str:

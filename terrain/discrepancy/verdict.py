@@ -11,7 +11,6 @@ from terrain.discrepancy.health.faults import Fault
 from terrain.discrepancy.health.runs import Clock, Excluded
 from terrain.records import Array
 
-
 AGREE_P = 0.01
 """Probability below which sessions of one terrain do not agree: of some six values of a diagnosis, hardly
 any by chance."""

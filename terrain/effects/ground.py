@@ -56,12 +56,12 @@ SLIP_AND_RESISTANCE: tuple[Effect, ...] = (
     ),
     Effect(
         "track_narrowing",
-        # measured: 0.007 to 0.009 s^4/m^2 (Warthog on asphalt and gravel), which is mu = 0.75; none on sand
+        # measured: 0.03 to 0.045 s^2/m^2 (Warthog on asphalt and gravel, up to 3.5 m/s and 2.8 rad/s)
         (Parameter("track_narrowing_s2pm2", 0.0, 1.0, 0.005),),
-        "w grows by x/(1 + x), x = c (u w)^2, u and w without it: lateral acceleration turns the robot more",
-        "Wong, Theory of Ground Vehicles, skid-steering at high speeds: the moment that resists turning falls "
-        "with (V^2 / (g R mu))^2; with an effective track B (1 + e), c is about e / ((1 + e) (g mu)^2); the "
-        "bounded form is this project's",
+        "w grows by x/(1 + x), x = c (u w)^2 / (1 + (w / w0)^2), w0 = 1 rad/s, u and w without it",
+        "lateral acceleration moves the centre of rotation ahead by s0, about c' u (turn_side_slip), and the "
+        "moment that resists turning falls with (2 s0 / L)^2: Wong, Theory of Ground Vehicles, skid-steering "
+        "at high speeds; that it builds up with w, and the bounded form, are this project's",
         (SKID,),
         (GYRO, SPEED_Y, HEADING),
         "fast arcs, and turns in place",

@@ -3,9 +3,9 @@
 With ``f = (m dv/dt + F) / (m g)`` and ``F`` what slope and resistances ask for, ``v = u - |u| c f`` is a
 low-pass of ``u - |u| c F / (m g)`` with the time constant ``|u| c / g``, stepped exactly for what runs
 straight from sample to sample.  Turning slip takes of the difference of the sides by how tight the turn is,
-turn drag of the mean by the yaw rate; with the square of the lateral acceleration the track acts narrower.  With friction against lateral motion, ``m (dv_y/dt + w v) = -K v_y``,
-the robot slips to the outside of a turn: ``T dv_y/dt + v_y = -c v w``, ``c = T = m/K``; the two are
-parameters of their own.
+turn drag of the mean by the yaw rate; in fast arcs the track acts narrower.  With friction against lateral
+motion, ``m (dv_y/dt + w v) = -K v_y``, the robot slips to the outside of a turn:
+``T dv_y/dt + v_y = -c v w``, ``c = T = m/K``; the two are parameters of their own.
 """
 
 from __future__ import annotations
