@@ -120,7 +120,7 @@ def test_a_fault_of_one_run_is_named_by_the_run(written):
 
 
 def test_one_run_of_many_is_no_other_unit():
-    """A pose that is lost for one command of thirty reads three times too fast, and no logger was set anew."""
+    """A pose that is lost for one command of thirty reads three times too fast; its unit is the same."""
     write, *_ = WRITTEN["speed in km/h"]
     many = [replace(run, run_id=f"{run.run_id}_{seed}") for seed in (3, 4, 5) for run in sound(seed=seed)]
     for n_written, n_faults in ((1, 0), (3, 1)):
