@@ -29,7 +29,6 @@ from terrain.discrepancy.next_drive import next_drive
 from terrain.discrepancy.pooled import pooled
 from terrain.discrepancy.preparation import MIN_RUNS, prepare
 from terrain.discrepancy.probes import probe_residuals
-from terrain.discrepancy.residuals import measured_channels
 from terrain.discrepancy.search import Found, refit, search, with_rivals
 from terrain.discrepancy.selection import EXCITED_RATIO
 from terrain.discrepancy.sessions import values_by_session
@@ -37,7 +36,7 @@ from terrain.discrepancy.signals import Signals, signals_of
 from terrain.discrepancy.simulation import Simulation
 from terrain.discrepancy.varying import VARIES_RATIO, run_scatter, varying_effects
 from terrain.discrepancy.verdict import Cause, Diagnosis, RuledOut, Unexplained, Varying, Verdict
-from terrain.discrepancy.withdrawal import raw_gain, reasons_to_withdraw
+from terrain.discrepancy.withdrawal import raw_gain, reasons_to_withdraw, shown_beside
 from terrain.effects import BOUNDS, CHANNELS, INDEX, Effect, effect_named
 from terrain.errors import DataError
 from terrain.records import RunLog
@@ -197,10 +196,9 @@ def _unexplained_channels(
     for (channel, name), answer in results.items():
         if answer.significant and (channel not in best or answer.z > best[channel].z):
             best[channel] = Unexplained(channel, name, answer.z, min(answer.gain / size[channel], 1.0))
-    measured = measured_channels(info.rows)
     for each in withdrawn.values():
-        channel = next((c for c in effect_named(each.name).channels if c in measured), "")
-        if channel and channel not in best and not any(each.name in (v.name, *v.rivals) for v in varying):
+        channel = shown_beside(found, effect_named(each.name))
+        if channel not in best and not any(each.name in (v.name, *v.rivals) for v in varying):
             best[channel] = Unexplained(channel, each.name, each.z, 0.0)
     return tuple(sorted(best.values(), key=lambda left: -left.z))
 

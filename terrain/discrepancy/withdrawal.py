@@ -49,6 +49,22 @@ def shown_channels(found: Found, cause: Effect) -> tuple[str, ...]:
     return tuple(CHANNELS[i] for i in order if power[i] > 0.1 * power[order[0]])
 
 
+def shown_beside(found: Found, effect: Effect) -> str:
+    """Return the channel in which an effect shows most while the causes are fitted with it.
+
+    A wheel radius beside an effective track shows in the speed alone: the track takes what it does to the
+    yaw rate.
+    """
+    info = found.info
+    own = info.places([p.name for p in effect.parameters])
+    base = info.places([name for name in found.names if name not in {p.name for p in effect.parameters}])
+    follow, _ = partial_information(info.a.sum(axis=0), base, own)
+    power = np.zeros(len(CHANNELS))
+    for white in info.white_change:
+        power += ((white[own] - np.tensordot(follow.T, white[base], axes=1)) ** 2).sum(axis=(0, 1))
+    return CHANNELS[int(np.argmax(power))]
+
+
 def raw_gain(found: Found, cause: Effect) -> float:
     """Return by how much a cause reduces minus twice the log-likelihood, the others refitted.
 

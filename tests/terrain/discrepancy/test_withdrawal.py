@@ -22,6 +22,7 @@ from terrain.discrepancy.withdrawal import (
     constancies,
     raw_gain,
     reasons_to_withdraw,
+    shown_beside,
     shown_channels,
 )
 from terrain.effects import BOUNDS, CHANNELS, effect_named
@@ -182,3 +183,12 @@ def test_what_runs_deviate_by_themselves_is_not_free():
     effects = channel_effects(found, found.causes[0])
     gained = sum(each.without - each.with_cause for each in effects.values())
     assert gained == pytest.approx(2 * g @ x - x @ a @ x, rel=1e-6)
+
+
+def test_beside_a_track_a_wheel_radius_shows_in_the_speed():
+    asked = problem(runs({"effective_track_ratio": 0.5}), ("effective_track", "wheel_radius"))
+    found = searched(asked)
+    track, radius = asked.library
+    assert found.causes == (track,)
+    assert shown_beside(found, radius) == "speed_x_mps"
+    assert shown_beside(found, track) == "yaw_rate_radps"
