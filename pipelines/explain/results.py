@@ -19,7 +19,7 @@ from terrain.discrepancy.residuals import LowPass
 from terrain.discrepancy.response_slopes import Slope
 from terrain.discrepancy.signals import Signals
 from terrain.discrepancy.simulation import Simulation
-from terrain.discrepancy.statements import Statement
+from terrain.discrepancy.statements import Statement, session_notes
 from terrain.discrepancy.terrain_match import TerrainMatch
 from terrain.discrepancy.trials.scoring import Score
 from terrain.discrepancy.trials.trial import Trial
@@ -143,8 +143,8 @@ class Explanation:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What a reader has to know of the terrains, in sentences."""
-        return terrain_notes(self.terrains, self.terrains_apart)
+        """What a reader has to know of the terrains and sessions, in sentences."""
+        return terrain_notes(self.terrains, self.terrains_apart) + session_notes(self.diagnosis)
 
     def as_json(self) -> dict[str, Any]:
         """Return the explanation as JSON has it."""

@@ -20,7 +20,7 @@ from pipelines.reporting.quantities import quantity
 from pipelines.reporting.terminal import compact_table, number_columns, print_lines, text_column
 from terrain.discrepancy.channel_words import CHANNEL_WORDS
 from terrain.discrepancy.filter_gain import Comparison
-from terrain.discrepancy.statements import split_ruled_out
+from terrain.discrepancy.statements import SESSION_COLUMNS, session_rows, split_ruled_out
 from terrain.discrepancy.trials.rows import Row
 from terrain.discrepancy.trials.scoring import FOUND_TRIALS
 from terrain.discrepancy.verdict import Cause, Diagnosis
@@ -35,6 +35,11 @@ def print_explain(result: Explanation, console: Console) -> None:
     print_lines(console, (verdict_text(diagnosis),))
     if diagnosis.causes:
         _print_causes(diagnosis.causes, console)
+    if rows := session_rows(diagnosis):
+        table = compact_table(*map(text_column, SESSION_COLUMNS))
+        for row in rows:
+            table.add_row(*row)
+        console.print(table)
     _print_gain(result.gain, console)
     print_lines(console, _diagnosis_lines(diagnosis))
     print_lines(console, result.notes)

@@ -51,7 +51,7 @@ from terrain.discrepancy.filter_gain import Comparison
 from terrain.discrepancy.gain import ChannelGain
 from terrain.discrepancy.health.runs import Clock
 from terrain.discrepancy.nameless import Learned
-from terrain.discrepancy.statements import split_ruled_out
+from terrain.discrepancy.statements import session_rows, split_ruled_out
 from terrain.discrepancy.verdict import Cause, Diagnosis, Limit, RuledOut
 from terrain.effects import LIBRARY
 
@@ -94,6 +94,7 @@ def page_view(result: Explanation, figures: Sequence[FigureView], runs: Sequence
         ),
         powertrain=() if result.powertrain is None else result.powertrain.sentences,
         next_drive=_next_drive(result),
+        sessions=session_rows(diagnosis),
         figures=tuple(figures),
         runs=tuple(runs),
         ruled_out=tuple(map(_ruled_out, ruled_out)),

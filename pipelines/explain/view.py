@@ -157,6 +157,7 @@ class PageView:
     gain : None where nothing is known of runs held out, for ``gain_reason``
     comparisons : of the filter and the classifier
     causes, ambiguous, withdrawn, varying, unexplained, next_drive : sections
+    sessions : values of the causes by session, a row of ``SESSION_COLUMNS`` each
     figures, runs : pictures
     ruled_out : effects that runs would have shown
     missed, limits : detection limits of effects that the runs did not excite, and of all others
@@ -178,6 +179,7 @@ class PageView:
     unexplained: tuple[UnexplainedView, ...]
     powertrain: tuple[str, ...]
     next_drive: NextDriveView | None
+    sessions: tuple[tuple[str, ...], ...]
     figures: tuple[FigureView, ...]
     runs: tuple[RunPicture, ...]
     ruled_out: tuple[RuledOutView, ...]

@@ -32,11 +32,12 @@ from terrain.discrepancy.preparation import MIN_RUNS, prepare
 from terrain.discrepancy.probes import probe_residuals
 from terrain.discrepancy.search import Found, refit, search, with_rivals
 from terrain.discrepancy.selection import EXCITED_RATIO
+from terrain.discrepancy.sessions import values_by_session
 from terrain.discrepancy.signals import Signals, signals_of
 from terrain.discrepancy.simulation import Simulation
 from terrain.discrepancy.varying import VARIES_RATIO, run_scatter, varying_effects
 from terrain.discrepancy.verdict import Cause, Diagnosis, RuledOut, Unexplained, Varying, Verdict
-from terrain.discrepancy.withdrawal import raw_gain, reasons_to_withdraw
+from terrain.discrepancy.withdrawal import raw_gain, reasons_to_withdraw, shown_beside
 from terrain.effects import BOUNDS, CHANNELS, INDEX, Effect, effect_named
 from terrain.errors import DataError
 from terrain.records import RunLog
@@ -131,6 +132,7 @@ def diagnose_signals(
         n_runs=len(problem.signals),
         varying=varying,
         faults=prepared.faults,
+        by_session=values_by_session(found, problem.signals, named, simulation.robot),
     )
 
 
@@ -214,7 +216,7 @@ def _unexplained_channels(
         if answer.significant and (channel not in best or answer.z > best[channel].z):
             best[channel] = Unexplained(channel, name, answer.z, min(answer.gain / size[channel], 1.0))
     for each in withdrawn.values():
-        channel = effect_named(each.name).channels[0]
+        channel = shown_beside(found, effect_named(each.name))
         if channel not in best and not any(each.name in (v.name, *v.rivals) for v in varying):
             best[channel] = Unexplained(channel, each.name, each.z, 0.0)
     return tuple(sorted(best.values(), key=lambda left: -left.z))

@@ -13,15 +13,20 @@ from terrain.discrepancy.verdict import Value
 from terrain.effects import PARAMETER, Wording, effect_named
 from terrain.extension import Basis, Origin, basis_of
 from terrain.robots import Robot
+from terrain.simulation.planar.skid_steer import SLIDING_RADPS
 
 EXAMPLE_RADPS, EXAMPLE_MPS = 0.5, 1.0
 """The turn and the speed at which losses that grow with them are stated."""
+
+FAST_RADPS, FAST_MPS = 1.0, 2.0
+"""The same of what fast turns do."""
 
 UNITS = {
     "ratio": "",
     "radps": "rad/s",
     "mps2": "m/s²",
     "s2": "s²",
+    "s2pm2": "s²/m²",
     "a": "A",
     "nspm": "N s/m",
     "nmpa": "N m/A",
@@ -49,12 +54,43 @@ def in_robot_terms(effect: str, values: Sequence[Value], robot: Robot) -> str:
     >>> late = Value("clock_offset_s", -0.27, "s", -0.28, -0.26)
     >>> in_robot_terms("clock_offset", [late], load_robot("husky"))
     'the wheels logged 0.27 s late'
+    >>> narrow = Value("track_narrowing_s2pm2", 0.04, "s2pm2", 0.03, 0.05)
+    >>> in_robot_terms("track_narrowing", [narrow], load_robot("warthog"))
+    'a track that acts 6.9 % narrower at 2 m/s and 1 rad/s'
     """
     total = {value.name: robot.effects.get(value.name, 0.0) + value.value for value in values}
     written = TERMS.get(effect_named(effect).wording)
     if written is not None:
         return written(values, total, robot)
     return " and ".join(_generic(value, total[value.name], robot) for value in values)
+
+
+def value_in_robot_terms(parameter: str, value: float, low: float, high: float, robot: Robot) -> str:
+    """Return a value and its interval by the number of the description that it changes, or as they are.
+
+    Parameters
+    ----------
+    parameter : of an effect
+    value, low, high : over what the robot has of it already
+    robot : as it was tested
+
+    Examples
+    --------
+    >>> from terrain.robots import load_robot
+    >>> value_in_robot_terms("effective_track_ratio", 1.5, 1.47, 1.53, load_robot("husky"))
+    '1.43 m (1.41 to 1.44)'
+    >>> value_in_robot_terms("one_sided_radius_ratio", 0.025, 0.02, 0.03, load_robot("husky"))
+    '0.025 (0.020 to 0.030)'
+    """
+    given = robot.effects.get(parameter, 0.0)
+    numbers, unit = [given + each for each in (value, low, high)], PARAMETER[parameter].unit
+    bases = [basis_of(robot, parameter, number)[:1] for number in numbers]
+    if all(basis and basis[0].described and basis[0].origin is not Origin.LEFT_OUT for basis in bases):
+        numbers = [basis[0].extended for basis in bases]
+        unit = bases[0][0].field.rpartition("_")[2]
+    at, *ends = (rounded(number, 0.5 * abs(numbers[2] - numbers[1])) for number in numbers)
+    low_end, high_end = sorted(ends, key=float)
+    return f"{f'{at} {UNITS.get(unit, unit)}'.strip()} ({low_end} to {high_end})"
 
 
 def rounded(value: float, half: float) -> str:
@@ -159,6 +195,15 @@ def _turn_drag(values: Sequence[Value], total: Total, robot: Robot) -> str:
     return f"a robot that {change} {abs(percent):.2g} % of its speed in a turn of {EXAMPLE_RADPS:g} rad/s"
 
 
+def _fast_turns(values: Sequence[Value], total: Total, robot: Robot) -> str:
+    (value,) = values
+    radps = FAST_RADPS
+    x = total[value.name] * (FAST_MPS * radps) ** 2 / (1.0 + (radps / SLIDING_RADPS) ** 2)
+    gained = x / (1.0 + abs(x))
+    percent = 100.0 * gained / (1.0 + gained)
+    return f"a track that acts {percent:.2g} % narrower at {FAST_MPS:g} m/s and {radps:g} rad/s"
+
+
 def _side_slip(values: Sequence[Value], total: Total, robot: Robot) -> str:
     (value,) = values
     slide = total[value.name] * EXAMPLE_MPS * EXAMPLE_RADPS
@@ -186,6 +231,7 @@ TERMS: dict[Wording, Callable[[Sequence[Value], Total, Robot], str]] = {
     Wording.MEASURED_POINT: _lever,
     Wording.LATE: _late,
     Wording.CAMERA_YAW: _camera_yaw,
+    Wording.FAST_TURNS: _fast_turns,
     Wording.LOSS_IN_TURNS: _turn_drag,
     Wording.SIDE_SLIP: _side_slip,
     Wording.GYRO_SCALE: _gyro_scale,

@@ -60,6 +60,7 @@ class Signals:
     steer_rad : (n, wheels) steering angles, zeros taken off; 0 for a robot that has none
     grade_rad, roll_rad : (n,) measured tilt, uphill and left side up positive; 0 where none is measured
     measured : (n, len(CHANNELS)) what the simulation is compared with; NaN where nothing was measured
+    session : that the run is part of; empty where that is not known
     """
 
     run_id: str
@@ -71,6 +72,7 @@ class Signals:
     grade_rad: Array
     roll_rad: Array
     measured: Array
+    session: str = ""
 
     def __post_init__(self) -> None:
         for name in ("wheel_speed_mps", "steer_rad", "grade_rad", "roll_rad", "measured"):
@@ -127,6 +129,7 @@ def signals_of(run: RunLog, robot: Robot) -> Signals:
         grade_rad=grade,
         roll_rad=roll,
         measured=measured,
+        session=run.session,
     )
 
 

@@ -34,6 +34,9 @@ with it."""
 KEPT_ASIDE, COMPARED = "on runs kept aside", "on the runs compared"
 
 
+SESSION_COLUMNS = ("value", "terrain", "session", "runs", "95 % interval", "sessions of the terrain")
+
+
 class Statement(NamedTuple):
     """A channel in one sentence.
 
@@ -273,3 +276,29 @@ def terrains_apart(diagnosis: Diagnosis, used: Sequence[ComparedRun]) -> Mapping
             if apart > max(APART_STDS * math.hypot(low.std, high.std), CHANGED * abs(low.ratio)):
                 return known
     return {}
+
+
+def session_rows(diagnosis: Diagnosis) -> tuple[tuple[str, ...], ...]:
+    """Return the values of named causes by session, a row of :data:`SESSION_COLUMNS` each."""
+    rows = []
+    for each in diagnosis.by_session:
+        alike = "" if len(each.sessions) < 2 else "agree" if each.agree else "differ"
+        for i, own in enumerate(each.sessions):
+            heads = (PARAMETER[each.parameter].label, each.terrain) if i == 0 else ("", "")
+            rows.append((*heads, own.session, str(own.n_runs), own.text, "" if i else alike))
+    return tuple(rows)
+
+
+def session_notes(diagnosis: Diagnosis) -> tuple[str, ...]:
+    """Return a sentence for each value in which sessions of one terrain differ by more than their errors."""
+    notes = []
+    for each in diagnosis.by_session:
+        if not each.agree:
+            parameter = PARAMETER[each.parameter]
+            values = _listed([f"{own.text} in {own.session}" for own in each.sessions])
+            of = f" of {each.terrain}" if each.terrain else ""
+            notes.append(
+                f"Sessions{of} differ: the {parameter.label} is {values}, with the same causes in each; one "
+                "value for all of them is a mean."
+            )
+    return tuple(notes)

@@ -11,6 +11,10 @@ from terrain.discrepancy.health.faults import Fault
 from terrain.discrepancy.health.runs import Clock, Excluded
 from terrain.records import Array
 
+AGREE_P = 0.01
+"""Probability below which sessions of one terrain do not agree: of some six values of a diagnosis, hardly
+any by chance."""
+
 
 class Verdict(StrEnum):
     """Outcome of a diagnosis.
@@ -94,6 +98,49 @@ class Varying(NamedTuple):
     z: float
     groups: tuple[RunGroup, ...]
     channel: str
+
+
+class SessionValue(NamedTuple):
+    """A parameter fitted to the runs of one session, beside the same causes as in all sessions.
+
+    Parameters
+    ----------
+    session, n_runs : name, and runs that were compared
+    value, low, high, std : of the parameter, 95 % interval and standard deviation with the scatter of runs
+    text : value and interval in quantities of the robot's description
+    """
+
+    session: str
+    n_runs: int
+    value: float
+    low: float
+    high: float
+    std: float
+    text: str
+
+
+class BySession(NamedTuple):
+    """A parameter of a named cause by session, of the sessions of one terrain.
+
+    Parameters
+    ----------
+    parameter, unit, terrain : names
+    sessions : values
+    p : probability of such differences where sessions agree; NaN for one session
+    between_std : standard deviation between sessions beyond that of their values; NaN for one session
+    """
+
+    parameter: str
+    unit: str
+    terrain: str
+    sessions: tuple[SessionValue, ...]
+    p: float
+    between_std: float
+
+    @property
+    def agree(self) -> bool:
+        """Whether sessions may have one value; one session does."""
+        return not self.p < AGREE_P
 
 
 class Unexplained(NamedTuple):
@@ -184,6 +231,7 @@ class Diagnosis:
     n_runs : that were compared
     varying : effects whose size differs from run to run
     faults : of channels, which were repaired before anything was compared
+    by_session : values of the named causes by terrain and session; empty where runs are of one session
     """
 
     robot: str
@@ -205,6 +253,7 @@ class Diagnosis:
     n_runs: int
     varying: tuple[Varying, ...] = ()
     faults: tuple[Fault, ...] = ()
+    by_session: tuple[BySession, ...] = ()
 
     @property
     def values(self) -> dict[str, float]:
@@ -246,6 +295,7 @@ class Diagnosis:
             ],
             "faults": [_fault(each) for each in self.faults],
             "varying": [_varying(each) for each in self.varying],
+            "by_session": [_by_session(each) for each in self.by_session],
             "not_excited": [limit for limit in limits if limit["name"] in missed],
             "detection_limits": limits,
             "ruled_out": [
@@ -296,6 +346,27 @@ def _varying(each: Varying) -> dict[str, Any]:
     ]
     plain = each._asdict() | {"rivals": list(each.rivals), "groups": groups}
     return plain | {key: finite(plain[key]) for key in ("mean", "scatter", "z")}
+
+
+def _by_session(each: BySession) -> dict[str, Any]:
+    sessions = [
+        {
+            "session": own.session,
+            "runs": own.n_runs,
+            "value": finite(own.value),
+            "ci": [finite(own.low), finite(own.high)],
+            "text": own.text,
+        }
+        for own in each.sessions
+    ]
+    numbers = {"p": finite(each.p), "between_std": finite(each.between_std), "agree": each.agree}
+    return {
+        "name": each.parameter,
+        "unit": each.unit,
+        "terrain": each.terrain,
+        "sessions": sessions,
+        **numbers,
+    }
 
 
 def _residual(residual: Residual) -> dict[str, Any]:

@@ -49,6 +49,22 @@ def shown_channels(found: Found, cause: Effect) -> tuple[str, ...]:
     return tuple(CHANNELS[i] for i in order if power[i] > 0.1 * power[order[0]])
 
 
+def shown_beside(found: Found, effect: Effect) -> str:
+    """Return the channel in which an effect shows most while the causes are fitted with it.
+
+    A wheel radius beside an effective track shows in the speed alone: the track takes what it does to the
+    yaw rate.
+    """
+    info = found.info
+    own = info.places([p.name for p in effect.parameters])
+    base = info.places([name for name in found.names if name not in {p.name for p in effect.parameters}])
+    follow, _ = partial_information(info.a.sum(axis=0), base, own)
+    power = np.zeros(len(CHANNELS))
+    for white in info.white_change:
+        power += ((white[own] - np.tensordot(follow.T, white[base], axes=1)) ** 2).sum(axis=(0, 1))
+    return CHANNELS[int(np.argmax(power))]
+
+
 def raw_gain(found: Found, cause: Effect) -> float:
     """Return by how much a cause reduces minus twice the log-likelihood, the others refitted.
 
@@ -145,7 +161,8 @@ def channel_effects(found: Found, cause: Effect) -> dict[str, ChannelEffect]:
     """Return what a cause does to each channel that was measured.
 
     What varies from run to run is taken out of each run as its residual shows it, but not the cause's own
-    variation, which would take its place.
+    variation, which would take its place.  What that variation costs by its assumed size counts in the
+    channels where it shows: in runs of one motion each it would else be a cause of any kind for nothing.
     """
     info = found.info
     own = [p.name for p in cause.parameters]
@@ -158,13 +175,16 @@ def channel_effects(found: Found, cause: Effect) -> dict[str, ChannelEffect]:
     for i, (residual, change) in enumerate(zip(info.white_residual, info.white_change, strict=True)):
         scatter = change[free].reshape(free.size, residual.size)
         inner = np.linalg.inv(scatter @ scatter.T + precision)
+        shown = (change[free] ** 2).sum(axis=1)
+        cost = precision @ (shown / np.maximum(shown.sum(axis=1, keepdims=True), 1e-30))
         for m, (places, (common, held_out)) in enumerate(zip((others, every), fits, strict=True)):
             for kind, x in enumerate((common, held_out[i])):
                 moved = away.copy()
                 moved[places] += x
                 left = residual - np.tensordot(moved, change, axes=1)
-                left -= np.tensordot(inner @ (scatter @ left.ravel()), change[free], axes=1)
-                squares[m, kind] += (left**2).sum(axis=0)
+                own_change = inner @ (scatter @ left.ravel())
+                left -= np.tensordot(own_change, change[free], axes=1)
+                squares[m, kind] += (left**2).sum(axis=0) + own_change**2 @ cost
     return {
         CHANNELS[c]: ChannelEffect(squares[0, 0, c], squares[1, 0, c], squares[0, 1, c] - squares[1, 1, c])
         for c in range(len(CHANNELS))

@@ -55,6 +55,19 @@ SLIP_AND_RESISTANCE: tuple[Effect, ...] = (
         "arcs of several radii and turns in place",
     ),
     Effect(
+        "track_narrowing",
+        # measured: 0.03 to 0.045 s^2/m^2 (Warthog on asphalt and gravel, up to 3.5 m/s and 2.8 rad/s)
+        (Parameter("track_narrowing_s2pm2", 0.0, 1.0, 0.005),),
+        "w grows by x/(1 + x), x = c (u w)^2 / (1 + (w / w0)^2), w0 = 1 rad/s, u and w without it",
+        "lateral acceleration moves the centre of rotation ahead by s0, about c' u (turn_side_slip), and the "
+        "moment that resists turning falls with (2 s0 / L)^2: Wong, Theory of Ground Vehicles, skid-steering "
+        "at high speeds; that it builds up with w, and the bounded form, are this project's",
+        (SKID,),
+        (GYRO, SPEED_Y, HEADING),
+        "fast arcs, and turns in place",
+        wording=Wording.FAST_TURNS,
+    ),
+    Effect(
         "turn_drag",
         # measured: 0.02 to 0.1 s^2 (Warthog on asphalt and sand), 0.6 to 0.9 s^2 (Husky)
         (Parameter("turn_drag_s2", -0.1, 3.0, 0.005),),

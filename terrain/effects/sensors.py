@@ -119,10 +119,11 @@ SENSORS: tuple[Effect, ...] = (
     Effect(
         "camera_latency",
         (
+            # measured: 0.16 s (Husky) and 0.3 to 0.5 s (Warthog), poses of a lidar's scans, DRIVE
             Parameter(
                 "camera_latency_s",
                 0.0,
-                0.5,
+                1.0,
                 0.005,
                 homes=(Home("camera", "latency_s", Combine.ADDED),),
             ),

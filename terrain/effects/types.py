@@ -143,6 +143,7 @@ class Wording(Enum):
     MEASURED_POINT = "where the measured point is"
     LATE = "who is late, in s"
     CAMERA_YAW = "an angle of the camera in degrees"
+    FAST_TURNS = "by how much the track acts narrower in a fast turn"
     LOSS_IN_TURNS = "the speed that a turn takes"
     SIDE_SLIP = "the speed to the outside of a turn"
     GYRO_SCALE = "by how much the gyro reads too much"

@@ -54,6 +54,10 @@ MIN_SCATTER = 0.02
 MAX_ODD_RATIO = 1 / 3
 """More runs than that are no outliers: runs then differ in groups, which is for the diagnosis to say."""
 
+MIN_FAULTY_RATIO = 0.05
+"""A fault of a logger is in that ratio of the runs at the least: units and zeros are set once, and a run in a
+hundred that is off is one whose sensor failed, which is no reason to repair it."""
+
 ODD_CHANNELS = {G: "yaw rate", H: "heading rate", X: "speed"}
 """Channels by which runs are compared: gains of the others depend on what was driven."""
 

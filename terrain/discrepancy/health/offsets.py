@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from terrain.discrepancy.health.common import MIN_FAULTY_RATIO
 from terrain.discrepancy.health.faults import LOGGED, Change, Column, Fault, FaultKind, in_runs
 from terrain.discrepancy.health.response import LEAST, A, G, H, Response, X
 
@@ -31,7 +32,7 @@ def offset_faults(responses: Sequence[Response]) -> tuple[Fault, ...]:
     for column, (c, largest, unit) in LARGEST.items():
         offsets = np.array([_offset(run, c) for run in responses])
         has = np.flatnonzero(np.abs(offsets[:, 0]) > largest + SIGMAS * offsets[:, 1])
-        if not has.size:
+        if has.size < max(MIN_FAULTY_RATIO * np.isfinite(offsets[:, 0]).sum(), 1):
             continue
         offset = float(np.median(offsets[has, 0]))
         ids = tuple(every[i] for i in has)

@@ -14,6 +14,7 @@ from itertools import combinations
 import numpy as np
 
 from terrain.constants import GRAVITY_MPS2
+from terrain.discrepancy.health.common import MIN_FAULTY_RATIO
 from terrain.discrepancy.health.faults import CHANNELS_OF, LOGGED, Change, Column, Fault, FaultKind, in_runs
 from terrain.discrepancy.health.response import AMPS, A, G, H, Response, X, gains_of
 from terrain.records import Array
@@ -121,6 +122,7 @@ def unit_faults(responses: Sequence[Response], robot: Robot) -> tuple[Fault, ...
     return tuple(
         _fault(changes, change, (), has, responses, logs)
         for changes, has in of_runs.items()
+        if len(has) >= MIN_FAULTY_RATIO * len(informed)
         for change in changes
     )
 

@@ -17,7 +17,7 @@ absent.
   that an ampere gives at the wheel; of a skid-steer robot also the difference of the sides, from yaw inertia
   and scrub;
 - **turning** of a skid-steer robot: its wheels' yaw rate and speed are reduced by turning slip and turn drag,
-  and it slips sideways by ``T dv_y/dt + v_y = -c v w``;
+  lateral acceleration makes its track act narrower, and it slips sideways by ``T dv_y/dt + v_y = -c v w``;
 - **sensors**: gyro, accelerometer and camera with bias, scale, mounting, latency and their logger's clock.
 
 Load transfer and roughness are left out: what they do to a log is noise here.  Sources stand with the

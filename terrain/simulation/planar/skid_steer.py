@@ -3,9 +3,9 @@
 With ``f = (m dv/dt + F) / (m g)`` and ``F`` what slope and resistances ask for, ``v = u - |u| c f`` is a
 low-pass of ``u - |u| c F / (m g)`` with the time constant ``|u| c / g``, stepped exactly for what runs
 straight from sample to sample.  Turning slip takes of the difference of the sides by how tight the turn is,
-turn drag of the mean by the yaw rate.  With friction against lateral motion, ``m (dv_y/dt + w v) = -K v_y``,
-the robot slips to the outside of a turn: ``T dv_y/dt + v_y = -c v w``, ``c = T = m/K``; the two are
-parameters of their own.
+turn drag of the mean by the yaw rate; in fast arcs the track acts narrower.  With friction against lateral
+motion, ``m (dv_y/dt + w v) = -K v_y``, the robot slips to the outside of a turn:
+``T dv_y/dt + v_y = -c v w``, ``c = T = m/K``; the two are parameters of their own.
 """
 
 from __future__ import annotations
@@ -32,10 +32,15 @@ MAX_SLIP = 0.9
 """Slip that forces take at the most, of either sign; assumed: a straight thrust curve has no end of its
 own."""
 
+SLIDING_RADPS = 1.0
+"""Yaw rate from which the wheels mostly slide sideways, and below which they mostly deflect; of a Warthog on
+asphalt and gravel."""
+
 _RADIUS = INDEX["wheel_radius_ratio"]
 _ONE_SIDED = INDEX["one_sided_radius_ratio"]
 _YAW_DELAY = INDEX["yaw_delay_s"]
 _TRACK = INDEX["effective_track_ratio"]
+_NARROWING = INDEX["track_narrowing_s2pm2"]
 _TURN_SLIP = INDEX["turning_slip_ratio"]
 _TURN_DRAG = INDEX["turn_drag_s2"]
 _SIDE_SLIP = INDEX["turn_side_slip_s"]
@@ -141,6 +146,9 @@ def _differed(
             u[k] -= 0.5 * lost * (a - b) / (a + b)
         difference[k] = dv
         turn[k] = (dv - lost) / (planar.track_m * (1.0 + p[_TRACK]))
+        if p[_NARROWING] != 0.0:
+            x = p[_NARROWING] * (u[k] * turn[k]) ** 2 / (1.0 + (turn[k] / SLIDING_RADPS) ** 2)
+            turn[k] *= 1.0 + x / (1.0 + abs(x))
     if p[_YAW_DELAY] != 0.0:
         turn = delayed(turn, p[_YAW_DELAY] / dt, 0.0)
     if p[_TURN_DRAG] != 0.0:

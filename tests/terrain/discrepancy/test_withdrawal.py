@@ -22,6 +22,7 @@ from terrain.discrepancy.withdrawal import (
     constancies,
     raw_gain,
     reasons_to_withdraw,
+    shown_beside,
     shown_channels,
 )
 from terrain.effects import BOUNDS, CHANNELS, effect_named
@@ -169,3 +170,25 @@ def test_a_value_that_differs_in_slow_motion(yaw):
     asked, found = yaw
     # as if quick motion had asked for twice of it
     assert "has a smaller value in slow motion" in reason(asked, found._replace(change=2 * found.change))
+
+
+def test_what_runs_deviate_by_themselves_is_not_free():
+    """Gains of channels add up to that of the likelihood, in which a run's own deviation has its cost."""
+    loose = replace(STEADY, scatter={"effective_track_ratio": 0.05})
+    asked = problem(runs({"gyro_bias_radps": 0.02}), ("gyro_bias",), loose)
+    found = searched(asked)
+    assert [cause.name for cause in found.causes] == ["gyro_bias"]
+    info, at = found.info, found.info.places(found.names)
+    x, a, g = found.change, info.a[:, at][:, :, at].sum(axis=0), info.g[:, at].sum(axis=0)
+    effects = channel_effects(found, found.causes[0])
+    gained = sum(each.without - each.with_cause for each in effects.values())
+    assert gained == pytest.approx(2 * g @ x - x @ a @ x, rel=1e-6)
+
+
+def test_beside_a_track_a_wheel_radius_shows_in_the_speed():
+    asked = problem(runs({"effective_track_ratio": 0.5}), ("effective_track", "wheel_radius"))
+    found = searched(asked)
+    track, radius = asked.library
+    assert found.causes == (track,)
+    assert shown_beside(found, radius) == "speed_x_mps"
+    assert shown_beside(found, track) == "yaw_rate_radps"

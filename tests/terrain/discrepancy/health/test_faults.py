@@ -156,6 +156,15 @@ def test_the_unit_of_wheels_is_not_judged_by_the_currents():
     assert rivals == []
 
 
+def test_one_run_of_many_is_no_other_unit():
+    """A pose that is lost for one command of thirty reads three times too fast; its unit is the same."""
+    write, *_ = WRITTEN["speed in km/h"]
+    many = [replace(run, run_id=f"{run.run_id}_{seed}") for seed in (3, 4, 5) for run in sound(seed=seed)]
+    for n_written, n_faults in ((1, 0), (3, 1)):
+        runs = [write(run) if i < n_written else run for i, run in enumerate(many)]
+        assert len(faults(on_one_clock(runs))) == n_faults
+
+
 @pytest.mark.parametrize(
     "written", ["the gyro's sign", "gyro in deg/s", "wheels in km/h", "accelerometer in g"]
 )

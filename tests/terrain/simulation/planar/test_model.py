@@ -28,7 +28,7 @@ from terrain.simulation.planar.model import TRUTH, Ground, make_planar
 from terrain.simulation.planar.motion import move
 from terrain.simulation.planar.replay import replay
 from terrain.simulation.planar.signals import delayed, lagged
-from terrain.simulation.planar.skid_steer import ENDO_POWER, STANDSTILL_MPS, direction
+from terrain.simulation.planar.skid_steer import ENDO_POWER, SLIDING_RADPS, STANDSTILL_MPS, direction
 from terrain.simulation.planar.swerve import ROLLING_MPS
 
 HUSKY, AGRIMARO = load_robot("husky"), load_robot("agrimaro")
@@ -293,6 +293,23 @@ def test_a_turning_robot_slips_to_the_outside_of_the_turn_and_slows_down():
     assert shown[SPEED_Y][-1] == pytest.approx(-0.2 * slow * 0.3)
     # no drag turns the motion about
     assert (speeds(skid(HUSKY, 0.5, 4.0), {"turn_drag_s2": 3.0})[SPEED_X] > 0).all()
+
+
+def test_a_track_acts_narrower_in_fast_arcs_and_not_in_turns_in_place():
+    values = {"effective_track_ratio": 0.8, "track_narrowing_s2pm2": 0.05}
+    for speed, turn in ((2.0, 1.2), (-2.0, 1.2), (0.7, -2.0)):
+        w = turn / 1.8
+        x = 0.05 * speed**2 * w**2 / (1 + (w / SLIDING_RADPS) ** 2)
+        shown = speeds(skid(HUSKY, speed, turn), values)
+        assert shown[GYRO][-1] == pytest.approx(w * (1 + x / (1 + x)))
+        assert shown[SPEED_X][-1] == pytest.approx(speed)
+    # neither in place nor straight ahead does it change anything
+    for wheels in (skid(HUSKY, 0.0, 2.0), skid(HUSKY, 3.0, 0.0)):
+        alone = {"effective_track_ratio": 0.8}
+        np.testing.assert_allclose(speeds(wheels, values)[GYRO], speeds(wheels, alone)[GYRO])
+    # the track is halved at the most
+    most = speeds(skid(HUSKY, 9.0, 9.0), values)[GYRO][-1]
+    assert 5.0 < most < 10.0
 
 
 def test_side_slip_builds_up_as_inertia_against_friction():
