@@ -25,7 +25,7 @@ from terrain.discrepancy.answers import (
 from terrain.discrepancy.conditions import with_conditions
 from terrain.discrepancy.fitting import Problem, names_of
 from terrain.discrepancy.health import clocks_of
-from terrain.discrepancy.information import Information
+from terrain.discrepancy.information import Information, recentre
 from terrain.discrepancy.next_drive import next_drive
 from terrain.discrepancy.pooled import pooled
 from terrain.discrepancy.preparation import MIN_RUNS, prepare
@@ -86,13 +86,14 @@ def diagnose_signals(
     problem = with_conditions(prepared.problem, prepared.aligned)
     same = problem is prepared.problem and not prepared.seeds
     start = prepared.aligned if same else problem.at(simulation.vector)
-    found, withdrawn = _search_and_withdraw(problem, start, prepared.seeds)
+    found, withdrawn = _withdraw_wrong(problem, start, search(problem, start, prepared.seeds), {})
     varying = varying_effects(problem, found)
     if _is_beside(problem, found, varying):
         problem = problem._replace(varying={varying[0].parameter: varying[0].scatter})
-        start = problem.at(start.vector)
-        found, withdrawn = _search_and_withdraw(problem, start, prepared.seeds)
-        varying = varying_effects(problem, found)
+        info = recentre(problem.at(found.info.origin), start.vector)
+        again = list(dict.fromkeys([*found.causes, effect_named(varying[0].name)]))
+        found = refit(problem, start, found._replace(info=info), again)
+        found, withdrawn = _withdraw_wrong(problem, start, found, withdrawn)
     found, withdrawn = _without_varying(problem, start, found, withdrawn, varying)
     found = pooled(problem, with_rivals(problem, start, found))
     unexplained = _unexplained_channels(found, withdrawn, varying)
@@ -136,16 +137,14 @@ def diagnose_signals(
     )
 
 
-def _search_and_withdraw(
-    problem: Problem, start: Information, seeds: Mapping[str, float]
+def _withdraw_wrong(
+    problem: Problem, start: Information, found: Found, withdrawn: dict[str, RuledOut]
 ) -> tuple[Found, dict[str, RuledOut]]:
     """Return the causes that may be named, and those that were withdrawn, by name.
 
     One is withdrawn at a time, the one that gains least, and the others are fitted anew: a wrong cause
     distorts the others, and their reasons go with it.
     """
-    found = search(problem, start, seeds)
-    withdrawn: dict[str, RuledOut] = {}
     for _ in range(MAX_WITHDRAWN):
         probes = probe_residuals(found.info, found.names, found.change)
         reasons = reasons_to_withdraw(problem, found, probes)
@@ -176,7 +175,7 @@ def _withdraw(
 def _is_beside(problem: Problem, found: Found, varying: Sequence[Varying]) -> bool:
     """Return whether causes were found beside an effect that varies, of which runs had one value.
 
-    What that value leaves may look like causes: they are searched again with a value of each run.
+    What that value leaves may look like causes: they are fitted again with a value of each run.
     """
     return any(
         each.parameter not in problem.scatter and cause.name not in (each.name, *each.rivals)

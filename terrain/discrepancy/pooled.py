@@ -28,10 +28,12 @@ N_STEPS = 4
 def pooled(problem: Problem, found: Found) -> Found:
     """Return what was found with the values that leave the least square over all runs."""
     scatter = dict(found.info.statistics.scatter)
-    assumed = problem.scatter
+    assumed = problem.simulation.scatter
+    scatter = {name: std for name, std in scatter.items() if name in assumed}
     own = [n for n in found.names if n in scatter and scatter[n] > SCATTERS_RATIO * assumed[n]]
-    if not own:
+    if not own and not problem.varying:
         return found
+    problem = problem._replace(varying={})
     statistics = Statistics(found.info.noise, scatter | {name: assumed[name] for name in own})
     base = problem.simulation.vector
     point, change = found.info.origin, found.change

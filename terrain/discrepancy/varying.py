@@ -38,7 +38,7 @@ TWO_GROUPS_RATIO = 0.15
 MIN_GROUP = 2
 """Least number of runs in a group."""
 
-OUT_STDS, OUT_SCATTERS, OUT_RATIO = 3.0, 0.5, 0.2
+OUT_STDS, OUT_SCATTERS, OUT_RATIO = 3.0, 0.25, 0.2
 """A run's value is out of its bounds by so many standard deviations and scatters, and the ratio of the runs
 that may be: a rogue or two, and less than a group of eight runs."""
 
