@@ -17,7 +17,8 @@ from terrain.effects import BOUNDS, CHANNELS, INDEX, Effect
 from terrain.records import Array
 
 NEAR_BOUND = 0.02
-"""A value closer to a bound than that ratio of the range is no value: the search would have gone on."""
+"""A value closer to a bound than that ratio of the range, or of twice the bound where the other is further
+from 0, is no value: the search would have gone on."""
 
 WORSE_RATIO = 1.1
 """A cause is withdrawn that makes the square of a channel larger by more than that."""
@@ -118,8 +119,8 @@ def _at_bound(problem: Problem, found: Found, cause: Effect) -> str:
         low, high = BOUNDS[p.name]
         given = dict(problem.simulation.effects).get(p.name, 0.0)
         value = given + float(found.change[found.names.index(p.name)])
-        edge = NEAR_BOUND * (high - low)
-        if value > high - edge or (low < 0.0 and value < low + edge):
+        above, below = (NEAR_BOUND * min(high - low, 2.0 * abs(bound)) for bound in (high, low))
+        if value > high - above or (low < 0.0 and value < low + below):
             return f"{p.label} ends at the bound of what it may be ({value:.3g} {p.unit})"
     return ""
 
