@@ -1,6 +1,7 @@
 """Each rule by which a cause is withdrawn, alone, on runs in which it is known what is there."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -169,3 +170,15 @@ def test_a_value_that_differs_in_slow_motion(yaw):
     asked, found = yaw
     # as if quick motion had asked for twice of it
     assert "has a smaller value in slow motion" in reason(asked, found._replace(change=2 * found.change))
+
+
+@pytest.mark.parametrize(
+    ("value", "at_bound"), [(-0.045, False), (-0.0495, True), (0.45, False), (0.495, True)]
+)
+def test_a_bound_near_zero_has_an_edge_of_its_own(value, at_bound):
+    effect = effect_named("rolling_resistance")
+    names = tuple(p.name for p in effect.parameters)
+    assert BOUNDS[names[0]] == (-0.05, 0.5)
+    found = SimpleNamespace(names=names, change=np.array([value]))
+    asked = SimpleNamespace(simulation=SimpleNamespace(effects={}))
+    assert bool(withdrawal._at_bound(asked, found, effect)) == at_bound
