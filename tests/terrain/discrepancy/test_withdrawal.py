@@ -1,6 +1,7 @@
 """Each rule by which a cause is withdrawn, alone, on runs in which it is known what is there."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -192,3 +193,15 @@ def test_beside_a_track_a_wheel_radius_shows_in_the_speed():
     assert found.causes == (track,)
     assert shown_beside(found, radius) == "speed_x_mps"
     assert shown_beside(found, track) == "yaw_rate_radps"
+
+
+@pytest.mark.parametrize(
+    ("value", "at_bound"), [(-0.045, False), (-0.0495, True), (0.45, False), (0.495, True)]
+)
+def test_a_bound_near_zero_has_an_edge_of_its_own(value, at_bound):
+    effect = effect_named("rolling_resistance")
+    names = tuple(p.name for p in effect.parameters)
+    assert BOUNDS[names[0]] == (-0.05, 0.5)
+    found = SimpleNamespace(names=names, change=np.array([value]))
+    asked = SimpleNamespace(simulation=SimpleNamespace(effects={}))
+    assert bool(withdrawal._at_bound(asked, found, effect)) == at_bound
