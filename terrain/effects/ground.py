@@ -56,8 +56,9 @@ SLIP_AND_RESISTANCE: tuple[Effect, ...] = (
     ),
     Effect(
         "track_narrowing",
-        # measured: 0.03 to 0.045 s^2/m^2 (Warthog on asphalt and gravel, up to 3.5 m/s and 2.8 rad/s)
-        (Parameter("track_narrowing_s2pm2", 0.0, 1.0, 0.005),),
+        # measured: 0.03 to 0.045 s^2/m^2 (Warthog on asphalt and gravel, up to 3.5 m/s and 2.8 rad/s); it
+        # goes with 1/mu^2, and would be 2 at mu = 0.1
+        (Parameter("track_narrowing_s2pm2", 0.0, 2.0, 0.02),),
         "w grows by x/(1 + x), x = c (u w)^2 / (1 + (w / w0)^2), w0 = 1 rad/s, u and w without it",
         "lateral acceleration moves the centre of rotation ahead by s0, about c' u (turn_side_slip), and the "
         "moment that resists turning falls with (2 s0 / L)^2: Wong, Theory of Ground Vehicles, skid-steering "

@@ -108,7 +108,7 @@ def test_names_are_unique_and_the_neutral_value_lies_within_the_bounds():
         for p in effect.parameters:
             assert p.low <= 0.0 < p.high
             assert 0.0 < p.step < 0.1 * p.high
-            assert p.unit in ("ratio", "rad", "s", "s2", "m", "a", "radps", "mps2", "nspm")
+            assert p.unit in ("ratio", "rad", "s", "s2", "s2pm2", "m", "a", "radps", "mps2", "nspm")
 
 
 @pytest.mark.parametrize("name", ["steering_play=0.01", "steering_backlash=0.01"])
