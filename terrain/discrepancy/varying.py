@@ -258,7 +258,8 @@ def _between_runs(name: str, score: Array, weight: Array, assumed_std: float, me
         use = weight[i] > 0.05 * total[i]
         inside += float(((score[i] - weight[i] * value[i])[use] ** 2 / weight[i][use]).sum())
         dof += max(int(use.sum()) - 1, 0)
-    noise = (TRUST_DOF + inside) / (TRUST_DOF + dof)
+    # thirds of a run share its deviations, most of the variance of a short one: no less than by whitening
+    noise = max((TRUST_DOF + inside) / (TRUST_DOF + dof), 1.0)
     precision = np.where(seen, 1.0 / (noise / np.where(seen, total, 1.0) + assumed_std**2), 0.0)
     square = _squares(value, precision)
     # one run that is far out is no variation from run to run: the others have to differ as well
