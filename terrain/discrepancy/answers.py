@@ -60,7 +60,7 @@ def caveat_of(found: Found, effect: Effect) -> str:
     constant = constancy_of(found.info, found.names, names, found.change, found.tried[effect.name].inflation)
     caveats = [constant.caveat] if constant.caveat else []
     value = abs(float(found.change[found.names.index(names[0])]))
-    scatter = run_scatter(found, effect)
+    scatter = run_scatter(found, names[0])
     if len(names) == 1 and scatter > CAVEAT_RATIO * value:
         caveats.append(f"it differs from run to run by {scatter:.2g} {effect.parameters[0].unit}")
     return "; ".join(caveats)

@@ -37,6 +37,6 @@ def with_conditions(problem: Problem, info: Information) -> Problem:
     for effect in problem.library:
         name = effect.parameters[0].name
         if name in simulation.varied_error:
-            mean = min(MEAN_PER_SCATTER * run_scatter(found, effect), simulation.varied_error[name])
+            mean = min(MEAN_PER_SCATTER * run_scatter(found, name), simulation.varied_error[name])
             error[name] = math.hypot(error.get(name, 0.0), mean)
     return problem._replace(simulation=replace(simulation, model_error=error))

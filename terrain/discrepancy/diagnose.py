@@ -195,10 +195,11 @@ def _without_varying(
     for each in varying:
         for cause in found.causes:
             alike = cause.name in (each.name, *each.rivals)
-            value = found.change[found.names.index(cause.parameters[0].name)]
-            scatter = run_scatter(found, cause)
-            if alike and scatter > VARIES_RATIO * abs(value):
-                reason = f"its value differs from run to run, by {scatter:.3g} about {value:.3g}"
+            sizes = {p.name: abs(found.change[found.names.index(p.name)]) for p in cause.parameters}
+            name, value = max(sizes.items(), key=lambda item: item[1])
+            scatter = run_scatter(found, name)
+            if alike and scatter > VARIES_RATIO * value:
+                reason = f"its value differs from run to run, by {scatter:.3g} about a size of {value:.3g}"
                 found = _withdraw(problem, start, found, cause, reason, withdrawn)
     return found, withdrawn
 

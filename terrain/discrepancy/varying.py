@@ -29,6 +29,9 @@ from terrain.records import Array
 Z_VARIES = 4.5
 """Evidence of a difference between runs, as of a probe: of some thirty effects."""
 
+Z_NEAR = 3.0
+"""Evidence of an effect that may be what varies instead of one whose evidence is enough."""
+
 VARIES_RATIO = 0.5
 """A named value that scatters by more than that ratio of itself is no value of all runs."""
 
@@ -88,11 +91,11 @@ class _Tried(NamedTuple):
         return max(self.runs, key=lambda each: each.z)
 
 
-def run_scatter(found: Found, effect: Effect) -> float:
-    """Return the scatter from run to run of the first parameter of an effect, noise taken off."""
+def run_scatter(found: Found, name: str) -> float:
+    """Return the scatter from run to run of a parameter, noise taken off."""
     shared = found.change - _away(found.info, found.names)
     fit = MixedFit(0.0, shared, found.info.nuisance_std)
-    return _values_by_run(found, effect.parameters[0].name, found.names, (), fit).scatter
+    return _values_by_run(found, name, found.names, (), fit).scatter
 
 
 def varying_effects(problem: Problem, found: Found) -> tuple[Varying, ...]:
@@ -103,17 +106,24 @@ def varying_effects(problem: Problem, found: Found) -> tuple[Varying, ...]:
     info = found.info
     if len(info.rows) < 2 * MIN_GROUP:
         return ()
-    tried = [_tried(found, effect) for effect in problem.library if _may_vary(found, effect)]
-    if not tried:
+    clear = {effect.name: _clearness(found, effect) for effect in problem.library}
+    if not max(clear.values()) > Z_VARIES:
         return ()
+    tried = [_tried(found, effect) for effect in problem.library if clear[effect.name] > Z_NEAR]
     first = min(tried, key=lambda each: each.loss)
     behind = max(RIVAL_LINEAR, NEAR_RATIO * first.gain)
-    near = [_refitted(problem, found, each) for each in tried if each.loss <= first.loss + behind]
-    near = [each for each in near if each.clearest.z > Z_VARIES and _is_possible(info, each.clearest)]
+    refitted = [(_refitted(problem, found, each), each) for each in tried if each.loss <= first.loss + behind]
+    near = [pair for pair in refitted if _is_possible(info, pair[0].clearest)]
     if not near:
         return ()
-    best = min(near, key=lambda each: each.loss)
-    rivals = [e.effect.name for e in near if e is not best and e.loss < best.loss + RIVAL_LOSS]
+    best, linear = min(near, key=lambda pair: pair[0].loss)
+    # a mass makes more or less of the noise of the wheels, which a nonlinear fit counts: either may say so
+    alike = [
+        each for each, before in near if min(each.loss - best.loss, before.loss - linear.loss) < RIVAL_LOSS
+    ]
+    if not max(each.clearest.z for each in alike) > Z_VARIES:
+        return ()
+    rivals = [each.effect.name for each in alike if each is not best]
     runs = best.clearest
     parameter = best.effect.parameters[best.runs.index(runs)]
     return (
@@ -140,9 +150,9 @@ def _is_possible(info: Information, runs: _RunValues) -> bool:
     return bool(np.mean((value < low - margin) | (value > high + margin)) <= OUT_RATIO)
 
 
-def _may_vary(found: Found, effect: Effect) -> bool:
-    """Return whether an effect varies by itself, at the common fit of all runs."""
-    return any(each.z > Z_VARIES for each in _at_common_fit(found, effect))
+def _clearness(found: Found, effect: Effect) -> float:
+    """Return the evidence that an effect varies by itself, at the common fit of all runs."""
+    return max(each.z for each in _at_common_fit(found, effect))
 
 
 def _at_common_fit(found: Found, effect: Effect) -> list[_RunValues]:

@@ -72,8 +72,8 @@ def test_a_spread_that_is_even_has_no_groups():
     (found,) = varying_effects(asked, searched_one)
     assert (found.name, found.groups) == ("wheel_radius", ())
     assert found.scatter == pytest.approx(np.std(values, ddof=1), rel=0.3)
-    assert run_scatter(searched_one, effect_named("wheel_radius")) == pytest.approx(found.scatter, rel=0.02)
-    assert run_scatter(searched_one, effect_named("camera_yaw")) < 0.01
+    assert run_scatter(searched_one, RADIUS) == pytest.approx(found.scatter, rel=0.02)
+    assert run_scatter(searched_one, "camera_yaw_rad") < 0.01
 
 
 @pytest.mark.parametrize("values", [np.zeros(N_RUNS), np.full(N_RUNS, 0.06), 0.06 * (np.arange(N_RUNS) == 3)])
