@@ -34,6 +34,7 @@ INPUTS = load_inputs(SHORT)
 ROBOT, TABLE = INPUTS.robot, INPUTS.table
 
 
+@pytest.mark.slow
 def test_the_result_does_not_depend_on_the_number_of_processes():
     one, two = (drive(ALL.with_(duration_s=3.0, jobs=n), INPUTS) for n in (1, 2))
     assert json.dumps(as_json(one), allow_nan=False) == json.dumps(as_json(two), allow_nan=False)

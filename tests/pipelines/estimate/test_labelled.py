@@ -34,12 +34,14 @@ def test_every_terrain_is_driven_and_its_slip_is_near_the_truth(labelled):
     assert np.ptp(list(driven.values())) > 0.1
 
 
+@pytest.mark.slow
 def test_terrain_is_classified_on_held_out_runs_but_not_too_well_to_be_true(labelled):
     runs, _, _ = labelled
     report = crossval(runs, CrossvalSettings(repeats=1, extras=False, n_jobs=2))
     assert 2.5 / 8 < report.accuracy < 0.95
 
 
+@pytest.mark.slow
 def test_quickstart_needs_no_data(in_tracked, tmp_path):
     settings = CrossvalSettings(repeats=1, extras=False, n_jobs=1, signal_sets=("currents", "slip"))
     asked = QuickstartSettings(out=tmp_path / "out", name="from_nothing")

@@ -35,7 +35,7 @@ QUIET = (Verdict.NONE, Verdict.NOT_EXCITED)
 
 
 @pytest.mark.parametrize("vary", [False, True])
-@pytest.mark.parametrize("terrain", ["grass", "firm_soil_gravel"])
+@pytest.mark.parametrize("terrain", ["grass", pytest.param("firm_soil_gravel", marks=pytest.mark.slow)])
 def test_without_a_hidden_effect_nothing_is_stated(terrain, vary):
     found = explained(runs_of(terrain=terrain, vary=vary))
     assert found.verdict in QUIET
@@ -47,8 +47,8 @@ def test_without_a_hidden_effect_nothing_is_stated(terrain, vary):
     [
         ("wheel_radius_ratio", 0.05),
         ("camera_yaw_rad", 0.05),
-        ("camera_latency_s", 0.1),
-        ("gyro_scale_ratio", 0.1),
+        pytest.param("camera_latency_s", 0.1, marks=pytest.mark.slow),
+        pytest.param("gyro_scale_ratio", 0.1, marks=pytest.mark.slow),
         ("payload_ratio", 0.3),
     ],
 )
@@ -81,6 +81,7 @@ def test_tilt_acts_as_a_slope_but_not_where_a_body_rides_over_bumps():
         assert len(terrain_notes(matches, {})) == (effective < 0.95)
 
 
+@pytest.mark.slow
 def test_a_classifier_gains_where_the_extension_matters_and_gives_a_reason_where_it_cannot_be_compared():
     effects = {"slip_resistance_ratio": 3.0}
     terrains = ("asphalt", "snow", "tiles")

@@ -13,6 +13,7 @@ from terrain.discrepancy.trials.rows import Row
 from terrain.errors import ConfigError
 
 
+@pytest.mark.slow
 def test_a_few_blind_trials_come_out_right():
     """One on each robot of each kind that has to be right: more of them are for the command."""
     result = explain_trials(TrialsSettings(n=2, seed=1, rows="none,strong", runs=4, n_jobs=1))

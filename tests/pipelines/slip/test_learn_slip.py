@@ -222,6 +222,7 @@ def test_an_existing_table_is_replaced(runs, tmp_path, monkeypatch):
     assert not [file for file in tmp_path.iterdir() if file.name.startswith(".t")]
 
 
+@pytest.mark.slow
 def test_intervals_contain_the_true_peaks_of_two_terrains():
     """Eight cases at 90 %: fewer than five inside is one time in two hundred."""
     cases = [

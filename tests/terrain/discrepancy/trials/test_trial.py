@@ -2,6 +2,8 @@
 
 from dataclasses import replace
 
+import pytest
+
 from terrain.discrepancy.trials.hidden_effects import cases_of
 from terrain.discrepancy.trials.rows import Row
 from terrain.discrepancy.trials.scoring import table_of
@@ -20,6 +22,7 @@ def test_cases_take_the_robots_in_turn_and_row_found_every_effect():
         assert {case.number // 2 % len(library) for case in own} == set(range(len(library)))
 
 
+@pytest.mark.slow
 def test_a_trial_depends_on_its_seed_and_number_alone():
     cases = cases_of(Row.STRONG, 4, 3, 3)
     one, other = run_trial(cases[1]), run_trial(cases[1])
