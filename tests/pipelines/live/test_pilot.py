@@ -168,8 +168,8 @@ def test_memory_does_not_grow():
         gc.collect()  # free lists of the interpreter too
         held.append(tracemalloc.get_traced_memory()[0])
     tracemalloc.stop()
-    # bytes a step: less than an array takes, more than what numba's boxing leaves to its lists; what grows does
-    # so in every lap, a cache that fills in one of them does not
+    # bytes a step: less than an array takes, more than what numba's boxing leaves to its lists; what grows
+    # does so in every lap, a cache that fills in one of them does not
     assert min(np.diff(held)) < 50 * len(samples)
 
 
