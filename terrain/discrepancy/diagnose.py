@@ -29,7 +29,7 @@ from terrain.discrepancy.information import Information, recentre
 from terrain.discrepancy.next_drive import next_drive
 from terrain.discrepancy.pooled import pooled
 from terrain.discrepancy.preparation import MIN_RUNS, prepare
-from terrain.discrepancy.probes import probe_residuals
+from terrain.discrepancy.probes import TILT_INPUTS, ProbeResult, probe_residuals
 from terrain.discrepancy.search import Found, refit, search, with_rivals
 from terrain.discrepancy.selection import EXCITED_RATIO
 from terrain.discrepancy.sessions import values_by_session
@@ -96,7 +96,7 @@ def diagnose_signals(
         found, withdrawn = _withdraw_wrong(problem, start, found, withdrawn)
     found, withdrawn = _without_varying(problem, start, found, withdrawn, varying)
     found = pooled(problem, with_rivals(problem, start, found))
-    unexplained = _unexplained_channels(found, withdrawn, varying)
+    unexplained = _unexplained_channels(problem, found, withdrawn, varying)
     named, sets = _named_and_ambiguous(found, found.causes)
     limits = tuple(limits_of(found, problem.library))
     causes = tuple(cause_of(found, effect) for effect in named)
@@ -146,7 +146,7 @@ def _withdraw_wrong(
     distorts the others, and their reasons go with it.
     """
     for _ in range(MAX_WITHDRAWN):
-        probes = probe_residuals(found.info, found.names, found.change)
+        probes = _probes(problem, found)
         reasons = reasons_to_withdraw(problem, found, probes)
         if not reasons:
             break
@@ -204,12 +204,20 @@ def _without_varying(
     return found, withdrawn
 
 
+def _probes(problem: Problem, found: Found) -> dict[tuple[str, str], ProbeResult]:
+    """Return the probes of the residual, those of a tilt that is only in part a slope left out."""
+    results = probe_residuals(found.info, found.names, found.change)
+    if all(problem.simulation.tilt_is_slope(run.terrain) for run in problem.signals):
+        return results
+    return {at: each for at, each in results.items() if at[1] not in TILT_INPUTS}
+
+
 def _unexplained_channels(
-    found: Found, withdrawn: Mapping[str, RuledOut], varying: Sequence[Varying]
+    problem: Problem, found: Found, withdrawn: Mapping[str, RuledOut], varying: Sequence[Varying]
 ) -> tuple[Unexplained, ...]:
     """Return the most significant input of every channel that depends on one."""
     info = found.info
-    results = probe_residuals(info, found.names, found.change)
+    results = _probes(problem, found)
     best: dict[str, Unexplained] = {}
     size = {c: sum(float((r[:, i] ** 2).sum()) for r in info.white_residual) for i, c in enumerate(CHANNELS)}
     for (channel, name), answer in results.items():

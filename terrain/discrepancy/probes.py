@@ -40,6 +40,10 @@ PLACEBOS = (0.63, 1.37, 1.63)
 """Multiples of a wheel's angle that nothing on a wheel repeats with."""
 
 
+TILT_INPUTS = ("grade", "roll", "grade |speed|", "roll |speed|")
+"""Inputs that say nothing where only a part of the tilt is a slope: which part differs along a run."""
+
+
 class ProbeResult(NamedTuple):
     """Evidence of one probe.
 

@@ -75,6 +75,10 @@ class Simulation:
         """Return the numbers for the kernels on the terrain of a label."""
         return make_planar(self.robot, self.grounds.get(terrain, self.ground))
 
+    def tilt_is_slope(self, terrain: str) -> bool:
+        """Return whether all of the measured tilt on the terrain of a label counts as a slope."""
+        return self.grounds.get(terrain, self.ground).effective_ratio >= 1.0
+
     @property
     def known_scatter(self) -> dict[str, float]:
         """Scatter from run to run that is no news: what is assumed, or what conditions may make."""

@@ -78,6 +78,7 @@ def test_tilt_acts_as_a_slope_but_not_where_a_body_rides_over_bumps():
         runs = runs_of(robot=robot, n=3, vary=robot is HUSKY)
         simulation, matches = simulation_for(runs, robot, library_of(robot.drive))
         assert simulation.grounds["grass"].effective_ratio == pytest.approx(effective, abs=0.05)
+        assert simulation.tilt_is_slope("grass") == (simulation.grounds["grass"].effective_ratio == 1.0)
         assert len(terrain_notes(matches, {})) == (effective < 0.95)
 
 

@@ -2,10 +2,12 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+import terrain.discrepancy.diagnose as diagnose_module
 from terrain.discrepancy.diagnose import diagnose
 from terrain.discrepancy.preparation import MIN_RUNS
 from terrain.discrepancy.trials.drives import rich_drives
@@ -17,6 +19,7 @@ from terrain.effects import GYRO, HEADING, effect_named
 from terrain.errors import DataError
 from terrain.records import Stream
 from terrain.robots import load_robot
+from terrain.simulation.planar.model import Ground
 
 OVER = 4.0
 """Times the smallest amplitude that these drives could show."""
@@ -204,3 +207,15 @@ def test_runs_that_cannot_be_diagnosed_are_refused_in_one_sentence(worlds):
             diagnose(given, world.simulation)
         assert message in str(error.value)
         assert "\n" not in str(error.value)
+
+
+def test_inputs_of_a_tilt_that_is_no_slope_are_no_evidence(worlds, monkeypatch):
+    every = dict.fromkeys([("speed_x_mps", "grade"), ("speed_x_mps", "speed")])
+    monkeypatch.setattr(diagnose_module, "probe_residuals", lambda *_: every)
+    found = SimpleNamespace(info=None, names=(), change=None)
+    signals = (SimpleNamespace(terrain="grass"),)
+    for ratio, names in ((1.0, ["grade", "speed"]), (0.4, ["speed"])):
+        ground = Ground(effective_ratio=ratio)
+        simulation = replace(worlds["husky"].simulation, grounds={"grass": ground})
+        problem = SimpleNamespace(simulation=simulation, signals=signals)
+        assert [name for _, name in diagnose_module._probes(problem, found)] == names
