@@ -55,6 +55,11 @@ CONFUSABLE = 0.99
 collinearity index of 10."""
 
 
+UNSEEN = 1e-9
+"""Information in a parameter's unit below which drives show nothing of it: no bound of a parameter is near the
+standard deviation of that, 3e4."""
+
+
 class Sensing(NamedTuple):
     """What the logs of a trial hold, all that the planar simulation measures by default.
 
@@ -111,7 +116,7 @@ class Limits(NamedTuple):
         i, j = ([self.names.index(p.name) for p in effect.parameters] for effect in (one, other))
         own, its = self.information[np.ix_(i, i)], self.information[np.ix_(j, j)]
         cross = self.information[np.ix_(i, j)]
-        unseen = [bool(np.diag(each).min() <= 0) for each in (own, its)]
+        unseen = [bool(np.diag(each).min() <= UNSEEN) for each in (own, its)]
         if any(unseen):
             return all(unseen)
         # the largest cosine between a change of the one and a change of the other
@@ -126,7 +131,7 @@ class Limits(NamedTuple):
         i = [self.names.index(p.name) for effect in pair for p in effect.parameters]
         j = [self.names.index(p.name) for p in other.parameters]
         own, its = self.information[np.ix_(i, i)], self.information[np.ix_(j, j)]
-        if np.diag(its).min() <= 0 or np.diag(own).min() <= 0:
+        if min(np.diag(its).min(), np.diag(own).min()) <= UNSEEN:
             return False
         inverse = np.linalg.pinv(own, hermitian=True, rcond=1e-9)
         cross = self.information[np.ix_(i, j)]

@@ -1,9 +1,10 @@
 """Which effects a trial may hide together."""
 
 import numpy as np
+import pytest
 
 from terrain.discrepancy.trials.drives import rich_drives
-from terrain.discrepancy.trials.limits import limits_of
+from terrain.discrepancy.trials.limits import Limits, limits_of
 from terrain.effects import effect_named
 from terrain.robots import load_robot
 
@@ -16,3 +17,13 @@ def test_two_effects_that_a_third_can_stand_for_are_known():
     assert limits.spanned(pair, effect_named("clock_offset"))
     assert not limits.spanned(pair, effect_named("payload"))
     assert not limits.alike(pair[0], effect_named("clock_offset"))
+
+
+@pytest.mark.parametrize("least", [0.0, 1e-320, 1e-12])
+def test_an_effect_that_drives_hardly_show_is_like_none_that_they_show(least):
+    names = "payload_ratio", "turn_drag_s2", "scrub_ratio"
+    limits = Limits(names, np.diag([100.0, least, least]))
+    payload, drag, scrub = (effect_named(name) for name in ("payload", "turn_drag", "scrub"))
+    assert not limits.alike(payload, drag)
+    assert limits.alike(drag, scrub)
+    assert not limits.spanned((payload, drag), scrub)
