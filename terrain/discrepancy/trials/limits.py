@@ -56,8 +56,8 @@ collinearity index of 10."""
 
 
 UNSEEN = 1e-9
-"""Information in a parameter's unit below which drives show nothing of it: its standard deviation, 3e4, is far
-beyond every bound."""
+"""Information in a parameter's unit below which drives show nothing of it: its standard deviation, 3e4, is
+far beyond every bound."""
 
 
 class Sensing(NamedTuple):
