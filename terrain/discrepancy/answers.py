@@ -20,8 +20,8 @@ from terrain.effects import CHANNELS, Effect
 POWER_Z = 1.28
 """Added to the threshold, so that nine in ten are detected."""
 
-INTERVAL_T = 2.13
-"""Half a 95 % interval in standard deviations: t with the 15 degrees that eight runs and the noise give."""
+INTERVAL_T = 2.36
+"""Half a 95 % interval in standard deviations: t with the 7 degrees that eight runs give."""
 
 
 def values_of(found: Found, effect: Effect) -> tuple[Value, ...]:

@@ -51,6 +51,12 @@ MIN_KNOWN = 0.75
 SETTLE_S = 0.5
 """Start and end of a run left out, beside those of the low-pass: the replay starts in steady motion."""
 
+SHORT_S = 10.0
+"""A shorter run may have its one change of command at its start, which is kept if it is in steady motion."""
+
+STEADY_S, STEADY_MPS, STEADY_RAD = 0.25, 0.05, 0.02
+"""Steady motion: for so long no wheel's speed and no steering changes by more than that."""
+
 
 class LowPass(NamedTuple):
     """A symmetric window, and the rate of its output.
@@ -181,7 +187,9 @@ def rows_of(
     n_rows = max((len(wheel_speed) - low_pass.taps.size) // low_pass.every + 1, 0)
     first = low_pass.taps.size // 2
     skip = math.ceil(SETTLE_S * low_pass.rate_hz)
-    keep = slice(skip, max(n_rows - skip, skip))
+    is_short = len(wheel_speed) * dt < SHORT_S
+    start = 0 if is_short and _begins_steadily(wheel_speed, steer, dt) else skip
+    keep = slice(start, max(n_rows - skip, start))
 
     known = np.isfinite(measured)
     whole = bool(known[:, known.any(axis=0)].all())
@@ -224,6 +232,14 @@ def rows_of(
         now,
         change,
         np.column_stack([plain(inputs), phase[at]]),
+    )
+
+
+def _begins_steadily(wheel_speed: Array, steer: Array, dt: float) -> bool:
+    first = slice(0, math.ceil(STEADY_S / dt) + 1)
+    return bool(
+        np.ptp(wheel_speed[first], axis=0).max() <= STEADY_MPS
+        and np.ptp(steer[first], axis=0).max() <= STEADY_RAD
     )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from terrain.discrepancy.fitting import RISE, Problem, Refit, fit_again, names_of
+from terrain.discrepancy.fitting import Problem, Refit, fit_again, names_of
 from terrain.discrepancy.information import Information, correlation, loss_of, partial_information
 from terrain.discrepancy.selection import evidence
 from terrain.effects import Effect
@@ -15,12 +15,16 @@ RIVAL_LOSS = 8.0
 """Two causes whose best fits differ by less in minus twice the log-likelihood are not distinguished: the
 wrong one of two is that much ahead with a chance of 0.3 % at most, whatever the size of the effect."""
 
-TWIN, TWIN_LOSS = 0.985, 20.0
+TWIN, TWIN_LOSS = 0.99, 30.0
 """The same of two whose sensitivities correlate more, a collinearity index of 8: what distinguishes them is a
 small part of what they explain, and may as well be an error of the simulation."""
 
 RIVAL_LINEAR, RIVAL_RATIO = 80.0, 0.5
 """Loss, and ratio of the gain of the cause, above which a rival is not refitted nonlinearly."""
+
+RIVAL_RISE = 0.02
+"""Ratio by which a rival may leave a larger square than a cause: a mass that is too small predicts less of the
+wheels' noise, which is up to so much of what a slow drive leaves."""
 
 SHARED = 0.5
 """Least correlation of what a cause and its rival change: one that shares less with it explains something
@@ -63,7 +67,7 @@ def rivals_of(
             swapped = names_of([*others, effect])
             here, there = (fit_again(problem, judge, base, swapped) for judge in judges)
             behind = min(here.loss - own[0].loss, there.loss - own[1].loss)
-            worse = here.square > (1.0 + RISE) * own[0].square + RIVAL_LOSS
+            worse = here.square > (1.0 + RIVAL_RISE) * own[0].square + RIVAL_LOSS
             if not worse and behind < _allowed(info, others, cause, effect):
                 at = [swapped.index(p.name) for p in effect.parameters]
                 found.append(Rival(effect, behind, here.change[at], here.std[at]))

@@ -16,7 +16,7 @@ from terrain.discrepancy.information import (
 )
 from terrain.discrepancy.rivals import RIVAL_LOSS, Rival, rivals_of
 from terrain.discrepancy.selection import Evidence, evidence, fit_change
-from terrain.effects import Effect
+from terrain.effects import BOUNDS, INDEX, Effect
 from terrain.records import Array
 
 MAX_CAUSES = 8
@@ -138,7 +138,11 @@ def _next(
     """
     left = [effect for effect in problem.library if effect not in causes and effect.name not in barred]
     found = [(evidence(info, names_of(causes), effect), effect) for effect in left]
-    candidates = [(float(each.gain.sum()), effect) for each, effect in found if each.significant]
+    candidates = [
+        (float(each.gain.sum()), effect)
+        for each, effect in found
+        if each.significant or _is_inside_by_fit(problem, info, base, causes, effect, each)
+    ]
     if not candidates:
         return _pair(info, causes, left)
     candidates.sort(key=lambda pair: -pair[0])
@@ -147,6 +151,26 @@ def _next(
     if best < MUCH_GAIN or len(close) == 1:
         return [candidates[0][1]]
     return [min(close, key=lambda effect: fit_again(problem, info, base, names_of([*causes, effect])).loss)]
+
+
+def _is_inside_by_fit(
+    problem: Problem,
+    info: Information,
+    base: Array,
+    causes: Sequence[Effect],
+    effect: Effect,
+    found: Evidence,
+) -> bool:
+    """Return whether an effect that gains much is within its bounds by a nonlinear fit, if not by a linear one.
+
+    A robot that turns twice as fast as it should has half the track, which straight lines take for none.
+    """
+    if found.inside or not found._replace(inside=True).significant or found.gain.sum() < MUCH_GAIN:
+        return False
+    names = names_of([*causes, effect])
+    change = fit_again(problem, info, base, names).change
+    values = base[[INDEX[name] for name in names]] + change
+    return all(BOUNDS[name][0] < value < BOUNDS[name][1] for name, value in zip(names, values, strict=True))
 
 
 def _refit_significant(

@@ -218,17 +218,20 @@ def hidden_runs(
             terrain="ground",
         )
         shown = {name: stream for name, stream in run.streams.items() if name not in ("truth", "commands")}
-        runs.append(_after(replace(run, streams=shown, source=""), drives.lead_s))
+        rate = own.get("clock_rate_ratio", 0.0)
+        runs.append(_after(replace(run, streams=shown, source=""), drives.lead_s, rate))
     return tuple(runs)
 
 
-def _after(run: RunLog, lead_s: float) -> RunLog:
-    """Return a run from a time on, which becomes the 0 of its clock."""
+def _after(run: RunLog, lead_s: float, clock_rate_ratio: float) -> RunLog:
+    """Return a run from a time on, which becomes the 0 of its clocks: a clock that drifts has not begun to."""
     if lead_s == 0.0:
         return run
     streams = {}
     for name, stream in run.streams.items():
         kept = stream.time_s >= lead_s - 0.5 / (2.0 * STEP_HZ)
-        streams[name] = Stream(stream.time_s[kept] - lead_s, stream.values[kept], stream.channels)
+        ahead_s = 0.0 if name == "wheels" else clock_rate_ratio * lead_s
+        time_s = stream.time_s[kept] - lead_s - ahead_s
+        streams[name] = Stream(time_s, stream.values[kept], stream.channels)
     labels = tuple(label._replace(end_s=label.end_s - lead_s) for label in run.labels)
     return replace(run, streams=streams, labels=labels)

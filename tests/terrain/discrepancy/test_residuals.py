@@ -8,6 +8,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from terrain.discrepancy.information import information_at
 from terrain.discrepancy.residuals import (
+    SETTLE_S,
     decimate,
     decimate_known,
     low_pass_of,
@@ -239,3 +240,30 @@ def test_noise_of_the_wheels_is_not_attributed_to_a_mass_or_a_motor():
     assert off[np.inf][1] < -4.0
     assert abs(off[low_pass.instrument_cutoff_hz][0]) < 0.5 * abs(off[np.inf][0])
     assert abs(off[low_pass.instrument_cutoff_hz][1]) < 3.0
+
+
+@pytest.mark.parametrize(
+    ("seconds", "moving", "lost_s"),
+    [(6.0, False, 0.0), (6.0, True, SETTLE_S), (20.0, False, SETTLE_S)],
+    ids=["short and steady", "short and speeding up", "long"],
+)
+def test_the_start_of_a_short_run_is_kept_where_it_begins_in_steady_motion(seconds, moving, lost_s):
+    """Its one change of command is there."""
+    robot = ROBOTS["husky"]
+    simulation = Simulation(robot)
+    signals = signals_of(drive(robot, {}), robot)
+    n = round(seconds / signals.dt_s)
+    wheel_speed = np.full((n, len(robot.wheels)), 0.5)
+    wheel_speed[:, 0] += 0.3 * np.clip(signals.time_s[:n] / 0.3, 0.0, 1.0) * moving
+    cut = replace(
+        signals,
+        wheel_speed_mps=wheel_speed,
+        **{
+            name: getattr(signals, name)[:n] for name in ("steer_rad", "grade_rad", "roll_rad", "measured")
+        },
+    )
+    low_pass = low_pass_of([cut])
+    rows = rows_of(cut, simulation.planar, vector_of({}), (), low_pass)
+    clock_s = cut.dt_s * max(low_pass.inputs_every, 1)
+    centre_s = low_pass.taps.size // 2 * clock_s
+    assert rows.time_s[0] == pytest.approx(centre_s + lost_s, abs=1.0 / low_pass.rate_hz)

@@ -206,3 +206,13 @@ def test_what_changes_other_channels_is_no_rival(monkeypatch):
     assert with_rivals(asked, start, alone).rivals == {"payload": ()}
     monkeypatch.setattr("terrain.discrepancy.rivals.SHARED", -1.0)
     assert "camera_yaw" in [each.effect.name for each in with_rivals(asked, start, alone).rivals["payload"]]
+
+
+def test_a_track_of_half_is_found_though_straight_lines_take_it_for_less_than_none():
+    asked = problem({"effective_track_ratio": -0.45})
+    start = asked.at(asked.simulation.vector)
+    linear, _ = fit_change(start, ["effective_track_ratio"])
+    assert linear[0] < BOUNDS["effective_track_ratio"][0]
+    found = searched(asked)
+    assert [cause.name for cause in found.causes] == ["effective_track"]
+    assert found.change[0] == pytest.approx(-0.45, abs=0.02)

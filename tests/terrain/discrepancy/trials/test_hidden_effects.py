@@ -9,7 +9,7 @@ from scipy.stats import norm
 from terrain.discrepancy.answers import POWER_Z
 from terrain.discrepancy.diagnose import diagnose
 from terrain.discrepancy.selection import Z_EFFECT
-from terrain.discrepancy.trials.drives import poor_drives, rich_drives
+from terrain.discrepancy.trials.drives import LEAD_S, command_drives, poor_drives, rich_drives
 from terrain.discrepancy.trials.hidden_effects import hidden_runs
 from terrain.discrepancy.trials.limits import POWER, TEST_SIZE, confusable_class, limits_of
 from terrain.discrepancy.trials.trial import simulation_of
@@ -110,3 +110,20 @@ def test_the_same_seed_gives_the_same_bytes(world):
     again = rich_drives(np.random.default_rng(1), 6, 40.0)
     assert all((a == b).all() for a, b in zip(again.twists, drives.twists, strict=True))
     assert again.hills == drives.hills
+
+
+def test_a_clock_that_drifts_starts_with_the_log():
+    """Of a log that begins two seconds into a drive, the first stamps of both loggers agree."""
+    rate = 0.02
+    drives = command_drives(np.random.default_rng(0), HUSKY, 1)
+    (plain,), (drifting,) = (
+        hidden_runs(HUSKY, drives, np.random.SeedSequence(1), values)
+        for values in ({}, {"clock_rate_ratio": rate})
+    )
+    one, other = (run.streams["imu"].channel("gyro_z_radps") for run in (plain, drifting))
+    shown, late = plain.streams["imu"].time_s, drifting.streams["imu"].time_s
+    assert late[0] == pytest.approx(shown[0] - rate * LEAD_S, abs=0.02)
+    # an event is stamped as late as the clock has drifted since the log began
+    event = shown[np.abs(np.diff(one)).argmax()]
+    there = late[np.abs(np.diff(other)).argmax()]
+    assert there - event == pytest.approx(rate * event, abs=0.03)
