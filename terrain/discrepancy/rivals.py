@@ -23,8 +23,8 @@ RIVAL_LINEAR, RIVAL_RATIO = 80.0, 0.5
 """Loss, and ratio of the gain of the cause, above which a rival is not refitted nonlinearly."""
 
 RIVAL_RISE = 0.02
-"""Ratio by which a rival may leave a larger square than a cause: a mass that is too small predicts less of the
-wheels' noise, which is up to so much of what a slow drive leaves."""
+"""Ratio by which a rival may leave a larger square than a cause: a mass that is too small predicts less of
+the wheels' noise, which is up to so much of what a slow drive leaves."""
 
 SHARED = 0.5
 """Least correlation of what a cause and its rival change: one that shares less with it explains something

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Callable, Mapping, Sequence, Set
 from typing import NamedTuple
 
 import numpy as np
 
-from terrain.discrepancy.fitting import Problem, fit_again, names_of, penalised_loss, relinearize
+from terrain.discrepancy.fitting import Problem, Refit, fit_again, names_of, penalised_loss, relinearize
 from terrain.discrepancy.information import (
     Information,
     move_point,
@@ -89,8 +89,17 @@ def _grow(
     """Add effects, refit, drop and swap, until none is significant that is not there."""
     barred: set[str] = set()  # added to the current causes, and dropped again
     seen = {_set_of(causes)}  # sets that were reached; none twice, or the search goes in circles
+    fits: dict[tuple[frozenset[str], str], Refit] = {}  # none is made twice
+
+    def fit(effect: Effect) -> Refit:
+        key = _set_of(causes), effect.name
+        if key not in fits:
+            fits[key] = fit_again(problem, info, base, names_of([*causes, effect]))
+        return fits[key]
+
     for _ in range(MAX_STEPS):
-        new = _next(problem, info, base, causes, barred)
+        left = [each for each in problem.library if each not in causes and each.name not in barred]
+        new = _next(info, base, causes, left, fit)
         if not new or len(causes) + len(new) > MAX_CAUSES:
             break
         more, at = _refit_significant(problem, info, base, [*causes, *new], seen)
@@ -130,18 +139,21 @@ def with_rivals(problem: Problem, start: Information, found: Found) -> Found:
 
 
 def _next(
-    problem: Problem, info: Information, base: Array, causes: Sequence[Effect], barred: set[str]
+    info: Information,
+    base: Array,
+    causes: Sequence[Effect],
+    left: Sequence[Effect],
+    fit: Callable[[Effect], Refit],
 ) -> list[Effect]:
     """Return the effect with the largest gain on runs left out, or a pair where none is significant alone.
 
     Where much is wrong the linear gain is inaccurate: then the best few are compared by nonlinear fits.
     """
-    left = [effect for effect in problem.library if effect not in causes and effect.name not in barred]
     found = [(evidence(info, names_of(causes), effect), effect) for effect in left]
     candidates = [
         (float(each.gain.sum()), effect)
         for each, effect in found
-        if each.significant or _is_inside_by_fit(problem, info, base, causes, effect, each)
+        if each.significant or _is_inside_by_fit(base, causes, effect, each, fit)
     ]
     if not candidates:
         return _pair(info, causes, left)
@@ -150,26 +162,20 @@ def _next(
     close = [effect for gain, effect in candidates[:MAX_FITTED] if gain > CLOSE_GAIN * best]
     if best < MUCH_GAIN or len(close) == 1:
         return [candidates[0][1]]
-    return [min(close, key=lambda effect: fit_again(problem, info, base, names_of([*causes, effect])).loss)]
+    return [min(close, key=lambda effect: fit(effect).loss)]
 
 
 def _is_inside_by_fit(
-    problem: Problem,
-    info: Information,
-    base: Array,
-    causes: Sequence[Effect],
-    effect: Effect,
-    found: Evidence,
+    base: Array, causes: Sequence[Effect], effect: Effect, found: Evidence, fit: Callable[[Effect], Refit]
 ) -> bool:
-    """Return whether an effect that gains much is within its bounds by a nonlinear fit, if not by a linear one.
+    """Return whether an effect that gains much is within its bounds by a nonlinear fit alone.
 
     A robot that turns twice as fast as it should has half the track, which straight lines take for none.
     """
     if found.inside or not found._replace(inside=True).significant or found.gain.sum() < MUCH_GAIN:
         return False
     names = names_of([*causes, effect])
-    change = fit_again(problem, info, base, names).change
-    values = base[[INDEX[name] for name in names]] + change
+    values = base[[INDEX[name] for name in names]] + fit(effect).change
     return all(BOUNDS[name][0] < value < BOUNDS[name][1] for name, value in zip(names, values, strict=True))
 
 

@@ -224,7 +224,7 @@ def hidden_runs(
 
 
 def _after(run: RunLog, lead_s: float, clock_rate_ratio: float) -> RunLog:
-    """Return a run from a time on, which becomes the 0 of its clocks: a clock that drifts has not begun to."""
+    """Return a run from a time on, which becomes the 0 of its clocks: none has drifted there."""
     if lead_s == 0.0:
         return run
     streams = {}

@@ -258,9 +258,7 @@ def test_the_start_of_a_short_run_is_kept_where_it_begins_in_steady_motion(secon
     cut = replace(
         signals,
         wheel_speed_mps=wheel_speed,
-        **{
-            name: getattr(signals, name)[:n] for name in ("steer_rad", "grade_rad", "roll_rad", "measured")
-        },
+        **{name: getattr(signals, name)[:n] for name in ("steer_rad", "grade_rad", "roll_rad", "measured")},
     )
     low_pass = low_pass_of([cut])
     rows = rows_of(cut, simulation.planar, vector_of({}), (), low_pass)

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from terrain.discrepancy import rivals
-from terrain.discrepancy.fitting import RISE, Refit
-from terrain.discrepancy.rivals import RIVAL_LOSS, rivals_of
+from terrain.discrepancy.fitting import Refit
+from terrain.discrepancy.rivals import RIVAL_LOSS, RIVAL_RISE, rivals_of
 from terrain.effects import effect_named
 
 CAUSE, OTHER = effect_named("payload"), effect_named("motor_constant")
@@ -42,6 +42,6 @@ def test_an_effect_that_is_little_behind_is_a_rival(fitted):
 
 
 def test_an_effect_that_leaves_a_larger_square_is_no_rival(fitted):
-    most = (1.0 + RISE) * SQUARE + RIVAL_LOSS
+    most = (1.0 + RIVAL_RISE) * SQUARE + RIVAL_LOSS
     assert fitted(-50.0, most - 1.0) == [OTHER.name]
     assert fitted(-50.0, most + 1.0) == []

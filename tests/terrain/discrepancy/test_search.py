@@ -93,9 +93,8 @@ def test_a_set_of_causes_is_not_reached_twice(three, monkeypatch):
         others = [i for i, cause in enumerate(causes) if cause is not first]
         return others[0] if third in causes else None
 
-    def following(problem, info, base, causes, barred):
-        left = [each for each in (first, second, third) if each not in causes and each.name not in barred]
-        return left[:1]
+    def following(info, base, causes, left, fit):
+        return [each for each in (first, second, third) if each in left][:1]
 
     monkeypatch.setattr("terrain.discrepancy.search.relinearize", refitted)
     monkeypatch.setattr("terrain.discrepancy.search._weakest", weakest)
