@@ -16,7 +16,7 @@ from pipelines.explain.wording import (
     verdict_text,
 )
 from pipelines.reporting.numbers import format_known, percent
-from pipelines.reporting.quantities import quantity
+from pipelines.reporting.quantities import quantity, unit_label
 from pipelines.reporting.terminal import compact_table, number_columns, print_lines, text_column
 from terrain.discrepancy.channel_words import CHANNEL_WORDS
 from terrain.discrepancy.filter_gain import Comparison
@@ -60,7 +60,7 @@ def _print_causes(causes: tuple[Cause, ...], console: Console) -> None:
             first = place == 0
             table.add_row(
                 effect_label(cause.name) if first else "",
-                f"{each.value:.4g} {each.unit}",
+                f"{each.value:.4g} {unit_label(each.unit) or each.unit}",
                 f"{each.low:.4g} to {each.high:.4g}",
                 percent(cause.gain) if first else "",
                 f"{cause.z:.1f}" if first else "",

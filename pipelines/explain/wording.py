@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 
 from pipelines.reporting.numbers import NBSP
-from pipelines.reporting.quantities import enumerated, percentage, percentage_interval, quantity
+from pipelines.reporting.quantities import SI, enumerated, percentage, percentage_interval, quantity
 from terrain.discrepancy.channel_words import CHANNEL_WORDS
 from terrain.discrepancy.gain import Gain
 from terrain.discrepancy.response_slopes import Slope
@@ -54,7 +55,7 @@ def caveat_text(caveat: str) -> str:
     >>> caveat_text("it differs from run to run by 0.34 ratio")
     'it differs from run to run by 0.34'
     """
-    return caveat.replace(" ratio", "").replace(" s2", f"{NBSP}s²")
+    return re.sub(rf"(?<=\d) ({'|'.join(SI)})\b", lambda found: f"{NBSP}{SI[found[1]]}".rstrip(NBSP), caveat)
 
 
 def varying_text(each: Varying) -> str:
