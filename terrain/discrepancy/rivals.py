@@ -37,7 +37,7 @@ class Rival(NamedTuple):
     Parameters
     ----------
     effect : that
-    behind : by how much it fits worse, as minus twice a log-likelihood
+    behind : by how much it fits worse, as minus twice a log-likelihood, over the inflation of the cause
     change, std : (p,) of its parameters, by a fit of its own; a value may be at its bound
     """
 
@@ -53,21 +53,23 @@ def rivals_of(
     """Return by cause all effects that, refitted in its place, fit as well as it does, the best first.
 
     It is compared by the noise that the causes leave and by that of the simulation as it is given: a cause
-    that absorbs noise is ahead by only one of them.  Where much is wrong, neither is a likelihood: a rival
-    that leaves a larger square than the noise of the wheels can make is none.
+    that absorbs noise is ahead by only one of them.  Where runs disagree on a cause by more than the noise
+    allows, losses count that much less, as a quasi-likelihood has them.  Where much is wrong, neither is a
+    likelihood: a rival that leaves a larger square than the noise of the wheels can make is none.
     """
     base, judges = start.vector, (info, start)
     own: list[Refit] = []  # losses of the causes by both judges, where anything comes near
     rivals = {}
     for cause in causes:
         others = [other for other in causes if other is not cause]
+        inflation = evidence(info, names_of(others), cause).inflation
         found = []
-        for effect in _near(problem, info, cause, others):
+        for effect in _near(problem, info, cause, others, inflation):
             own = own or [fit_again(problem, judge, base, names_of(causes)) for judge in judges]
             swapped = names_of([*others, effect])
             here, there = (fit_again(problem, judge, base, swapped) for judge in judges)
-            behind = min(here.loss - own[0].loss, there.loss - own[1].loss)
-            worse = here.square > (1.0 + RIVAL_RISE) * own[0].square + RIVAL_LOSS
+            behind = min(here.loss - own[0].loss, there.loss - own[1].loss) / inflation
+            worse = here.square > (1.0 + RIVAL_RISE) * own[0].square + RIVAL_LOSS * inflation
             if not worse and behind < _allowed(info, others, cause, effect):
                 at = [swapped.index(p.name) for p in effect.parameters]
                 found.append(Rival(effect, behind, here.change[at], here.std[at]))
@@ -75,12 +77,14 @@ def rivals_of(
     return rivals
 
 
-def _near(problem: Problem, info: Information, cause: Effect, others: Sequence[Effect]) -> list[Effect]:
+def _near(
+    problem: Problem, info: Information, cause: Effect, others: Sequence[Effect], inflation: float
+) -> list[Effect]:
     """Return the effects that come near a cause beside the others, by linear fits."""
     causes = [*others, cause]
     now = loss_of(info, names_of(causes))
     gain = loss_of(info, names_of(others)) - now
-    most = min(RIVAL_LINEAR, RIVAL_LOSS + RIVAL_RATIO * gain)
+    most = min(RIVAL_LINEAR * inflation, RIVAL_LOSS * inflation + RIVAL_RATIO * gain)
     return [
         effect
         for effect in problem.library
