@@ -206,7 +206,7 @@ def _without_varying(
 
 def _probes(problem: Problem, found: Found) -> dict[tuple[str, str], ProbeResult]:
     """Return the probes of the residual, those of a tilt that is only in part a slope left out."""
-    results = probe_residuals(found.info, found.names, found.change)
+    results = probe_residuals(found.info, found.names, found.change, problem.simulation.probe_error)
     if all(problem.simulation.tilt_is_slope(run.terrain) for run in problem.signals):
         return results
     return {at: each for at, each in results.items() if at[1] not in TILT_INPUTS}

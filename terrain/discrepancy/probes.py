@@ -104,7 +104,10 @@ def probe_inputs(rows: Rows, rate_hz: float) -> dict[str, Array]:
 
 
 def probe_residuals(
-    info: Information, names: Sequence[str], change: Array
+    info: Information,
+    names: Sequence[str],
+    change: Array,
+    error: Mapping[tuple[str, str], float] = MappingProxyType({}),
 ) -> dict[tuple[str, str], ProbeResult]:
     """Return the result of every probe, by channel and input.
 
@@ -113,6 +116,8 @@ def probe_residuals(
     info : of the runs at the fit; changes counted from any point
     names, change : parameters that were selected, and their fitted change, beside which a probe has to be
         significant
+    error : how much a channel depends on an input by the simulation's own error, in the channel's unit for
+        one of the input; where it is not named, not at all
     """
     rate_hz = 1 / float(np.median(np.diff(info.rows[0].time_s)))
     results: dict[tuple[str, str], ProbeResult] = {}
@@ -124,7 +129,8 @@ def probe_residuals(
         columns = []
         for run, given, residual in zip(info.rows, inputs, info.white_residual, strict=True):
             columns.append(_white(info, run, c, np.array(list(given.values())), residual))
-        for name, result in zip(inputs[0], _probe_results(info, names, blocks, c, columns), strict=True):
+        own = np.array([error.get((channel, name), 0.0) for name in inputs[0]])
+        for name, result in zip(inputs[0], _probe_results(info, names, blocks, c, columns, own), strict=True):
             results[channel, name] = result
         n_wheels = info.rows[0].inputs.shape[1] - len(INPUTS) + 1
         for wheel in range(n_wheels):
@@ -193,9 +199,9 @@ def _blocks_of(info: Information, names: Sequence[str], change: Array) -> _Block
 
 
 def _probe_results(
-    info: Information, names: Sequence[str], blocks: _Blocks, c: int, columns: list[Array]
+    info: Information, names: Sequence[str], blocks: _Blocks, c: int, columns: list[Array], error: Array
 ) -> list[ProbeResult]:
-    """Return the results of columns (q, m) a run, in channel c."""
+    """Return the results of columns (q, m) a run, in channel c, where the simulation has an error (q,)."""
     at, q = blocks.at, columns[0].shape[0]
     sums: list[tuple[Array, ...]] = []
     power = np.zeros(len(at))
@@ -235,7 +241,8 @@ def _probe_results(
             answers.append(ProbeResult(0.0, 0.0))
             continue
         left = part[:, k] - sizes[:, k] * total[k] / free[k]
-        z = _z(float(total[k]), float(free[k]), left, sizes[:, k], blocks.first, float(of_model[k]))
+        by_model = float(of_model[k] + (free[k] * error[k]) ** 2)
+        z = _z(float(total[k]), float(free[k]), left, sizes[:, k], blocks.first, by_model)
         known = dict(zip(names, alike[k].tolist(), strict=True))
         answers.append(ProbeResult(z, float(total[k] ** 2 / free[k]), known))
     return answers

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
-from terrain.effects import INDEX, NUISANCES, Effect, library_of, vector_of
+from terrain.effects import CHANNELS, INDEX, NUISANCES, Effect, library_of, vector_of
 from terrain.errors import ConfigError
 from terrain.records import Array
 from terrain.robots import Robot
@@ -28,6 +28,7 @@ class Simulation:
         is no larger is not stated
     varied_error, varied_scatter : mean over runs and scatter of them that conditions may make which differ
         from run to run, in units of parameters: see :mod:`terrain.discrepancy.conditions`
+    probe_error : how much the residual of a channel depends on an input by the simulation's own error
 
     Raises
     ------
@@ -43,6 +44,7 @@ class Simulation:
     model_error: Mapping[str, float] = field(default_factory=dict)
     varied_error: Mapping[str, float] = field(default_factory=dict)
     varied_scatter: Mapping[str, float] = field(default_factory=dict)
+    probe_error: Mapping[tuple[str, str], float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         vector_of(self.effects)
@@ -57,6 +59,12 @@ class Simulation:
                 if name not in INDEX or not size >= 0:
                     raise ConfigError(f"{kind}: {name} is {size!r}; a size from 0 of a parameter is required")
             object.__setattr__(self, kind, MappingProxyType(dict(sizes)))
+        for (channel, name), size in self.probe_error.items():
+            if channel not in CHANNELS or not size >= 0:
+                raise ConfigError(
+                    f"probe_error: {name} in {channel} is {size!r}; a size from 0 in a channel is required"
+                )
+        object.__setattr__(self, "probe_error", MappingProxyType(dict(self.probe_error)))
         object.__setattr__(self, "effects", MappingProxyType(dict(self.effects)))
         object.__setattr__(self, "scatter", MappingProxyType(dict(self.scatter)))
         object.__setattr__(self, "grounds", MappingProxyType(dict(self.grounds)))

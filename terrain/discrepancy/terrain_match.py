@@ -63,10 +63,18 @@ def simulation_for(
 def with_model_error(simulation: Simulation) -> Simulation:
     """Return the simulation with its own error on the soils of the package."""
     parameters = set(parameters_of(simulation.robot.drive))
+    error = load_model_error()
     common, varied, scatter = (
-        {name: size for name, size in sizes.items() if name in parameters} for sizes in load_model_error()
+        {name: size for name, size in sizes.items() if name in parameters}
+        for sizes in (error.common, error.varied, error.scatter)
     )
-    return replace(simulation, model_error=common, varied_error=varied, varied_scatter=scatter)
+    return replace(
+        simulation,
+        model_error=common,
+        varied_error=varied,
+        varied_scatter=scatter,
+        probe_error=error.probes,
+    )
 
 
 def _ground(robot: Robot, label: str) -> Ground | None:

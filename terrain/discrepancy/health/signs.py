@@ -100,7 +100,8 @@ def reading_of(change: Change, before: Sequence[Response], after: Sequence[Respo
     gain = np.array([b[1].sum() - a[1].sum() for a, b in zip(was, now, strict=True)])
     keys = list(FOLLOWERS)
     turned = (old < TURNED) & (new > RIGHT)
-    mended = (turned | ((new - old > RISE) & (new > CLEAR)))[:, keys].any(axis=1)
+    asked = old != 0.0  # what a run does not show cannot be wrong in it
+    mended = (asked & (turned | ((new - old > RISE) & (new > CLEAR))))[:, keys].any(axis=1)
     worse = ((new < old - LOSS) & (old > RIGHT))[:, keys].any(axis=1)
     suits = ~worse & (gain > GAIN)
     return Reading(change, new, gain, mended & suits, suits)
@@ -171,10 +172,11 @@ def _evidence(change: Change, responses: Sequence[Response], shown: Sequence[int
     gains, old = (np.array(each) for each in zip(*(gains_of(run) for run in runs), strict=True))
     new = best.correlation[list(shown)]
     own = [c for c in FOLLOWERS if c in CHANNELS_OF[change.column] or change.of_wheels]
-    turned = [c for c in own if np.median(new[:, c] - old[:, c]) > RISE]
+    asked = (old != 0.0) & np.isfinite(gains)
+    turned = [c for c in own if asked[:, c].any() and np.median((new - old)[asked[:, c], c]) > RISE]
     words = []
     for c in turned:
-        on = (old[:, c] != 0.0) & np.isfinite(gains[:, c])
+        on = asked[:, c]
         text = f"the {WORDS[CHANNELS[c]]} follows the wheels with the factor {np.median(gains[on, c]):.2f}"
         both = on & np.isfinite(gains[:, H])
         if change.column is Column.GYRO and both.any():

@@ -98,11 +98,13 @@ class ModelError(NamedTuple):
     common : value that each parameter seems to have where nothing is hidden
     varied : the same of the mean over runs whose conditions differ
     scatter : of single runs whose conditions differ
+    probes : what the residual depends on, by channel and input
     """
 
     common: dict[str, float]
     varied: dict[str, float]
     scatter: dict[str, float]
+    probes: dict[tuple[str, str], float]
 
 
 def load_model_error() -> ModelError:
@@ -113,8 +115,16 @@ def load_model_error() -> ModelError:
     >>> load_model_error().common["motor_constant_ratio"]
     0.024
     """
-    parts = ("model_error", "varied_error", "varied_scatter")
-    return ModelError(*(_numbers(part, tuple(_described()[part])) for part in parts))
+    common, varied, scatter = (
+        _numbers(part, tuple(_described()[part]))
+        for part in ("model_error", "varied_error", "varied_scatter")
+    )
+    probes = {
+        (channel, name): float(size)
+        for channel, sizes in _described()["probe_error"].items()
+        for name, size in sizes.items()
+    }
+    return ModelError(common, varied, scatter, probes)
 
 
 @cache

@@ -42,6 +42,17 @@ def test_spikes_at_random_times_in_eight_runs_are_seen(plain):
     assert not any(result.significant for result in probed(plain).values())
 
 
+def test_what_the_simulation_is_known_to_get_wrong_by_is_no_news():
+    """Its error counts as a standard deviation of what the channel depends on, and in that channel alone."""
+    info = information_of_drives(stick_slip_a=5.0)
+    before = probed(info)
+    known = probe_residuals(info, (), np.zeros(0), {CRAWLING: 10.0})
+    assert before[CRAWLING].significant
+    assert known[CRAWLING].z < 1.0
+    assert known[CRAWLING].gain == before[CRAWLING].gain
+    assert {at for at in before if known[at] != before[at]} == {CRAWLING}
+
+
 def test_noise_is_as_significant_as_chance_has_it(plain):
     rng = np.random.default_rng(6)
     z = []

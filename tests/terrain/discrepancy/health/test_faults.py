@@ -10,7 +10,9 @@ from numpy.testing import assert_allclose
 
 from pipelines.runs.datasets import load_runs
 from terrain.discrepancy.health import Column, Fault, FaultKind, faults_of, repaired
+from terrain.discrepancy.health.faults import Change
 from terrain.discrepancy.health.response import AMPS, A, G, X
+from terrain.discrepancy.health.signs import reading_of
 from terrain.discrepancy.health.units import KEYS, SWERVE_TURN, _best, _middle, _options
 from terrain.discrepancy.latencies import latencies_of
 from terrain.discrepancy.residuals import low_pass_of, rows_of
@@ -18,6 +20,7 @@ from terrain.discrepancy.signals import Signals, signals_of
 from terrain.discrepancy.trials.drives import rich_drives
 from terrain.discrepancy.trials.hidden_effects import hidden_runs
 from terrain.discrepancy.trials.trial import simulation_of
+from terrain.effects import CHANNELS
 from terrain.logs.drive import DriveRobot, find_runs
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import load_robot
@@ -298,6 +301,21 @@ def test_a_reading_that_is_not_clear_leaves_the_channel_out():
     left = repaired(signals, [replace(fault, factor=float("nan"))])
     assert all(np.isnan(run.measured[:, 0]).all() for run in left)
     assert_allclose(left[0].measured[:, 1:], signals[0].measured[:, 1:])
+
+
+def test_a_reading_mends_no_channel_that_a_run_does_not_show(monkeypatch):
+    """Straight ahead a gyro says nothing; with a wheel turned the simulation turns, and its noise may fit."""
+    monkeypatch.setattr("terrain.discrepancy.health.signs.fits", lambda run: run)
+    change = Change(SIGN, Column.WHEELS, -1.0, 2)
+
+    def fitted(gyro, likelihood):
+        correlation = np.zeros(len(CHANNELS))
+        correlation[[G, X]] = gyro, 0.9
+        return correlation, np.array([likelihood])
+
+    after = [fitted(0.98, 100.0)]
+    unasked, asked = (reading_of(change, [fitted(gyro, 0.0)], after) for gyro in (0.0, 0.1))
+    assert (unasked.mends.tolist(), asked.mends.tolist()) == ([False], [True])
 
 
 @pytest.mark.parametrize("folder", ["drive_husky", "borealtc", "vulpi"])
