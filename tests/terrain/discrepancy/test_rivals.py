@@ -1,5 +1,7 @@
 """Which effects fit as well in the place of a cause, by the losses and squares of their fits."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -22,13 +24,14 @@ class Judge:
 def fitted(monkeypatch):
     """Return a function that sets loss and square of the other effect's fit, and returns the rivals."""
 
-    def found(behind, square):
+    def found(behind, square, inflation=1.0):
         def fit(problem, judge, base, names):
             own = names == (CAUSE.parameters[0].name,)
             return Refit(0.0 if own else behind, SQUARE if own else square, np.array([0.1]), np.array([0.01]))
 
         monkeypatch.setattr(rivals, "fit_again", fit)
         monkeypatch.setattr(rivals, "_near", lambda *_: [OTHER])
+        monkeypatch.setattr(rivals, "evidence", lambda *_: SimpleNamespace(inflation=inflation))
         monkeypatch.setattr(rivals, "_allowed", lambda *_: RIVAL_LOSS)
         found = rivals_of(None, Judge(), Judge(), [CAUSE])
         return [each.effect.name for each in found[CAUSE.name]]
@@ -45,3 +48,8 @@ def test_an_effect_that_leaves_a_larger_square_is_no_rival(fitted):
     most = (1.0 + RIVAL_RISE) * SQUARE + RIVAL_LOSS
     assert fitted(-50.0, most - 1.0) == [OTHER.name]
     assert fitted(-50.0, most + 1.0) == []
+
+
+def test_losses_count_less_where_runs_disagree_on_the_cause(fitted):
+    assert fitted(3.0 * RIVAL_LOSS, SQUARE) == []
+    assert fitted(3.0 * RIVAL_LOSS, SQUARE, inflation=4.0) == [OTHER.name]
