@@ -54,6 +54,8 @@ CONFUSABLE = 0.99
 """Two effects whose sensitivities correlate more than that, nuisances taken out, are of one class: a
 collinearity index of 10."""
 
+TURNING_MPS = 0.05
+"""Slower wheels do not count as turning."""
 
 UNSEEN = 1e-9
 """Information in a parameter's unit below which drives show nothing of it: its standard deviation, 3e4, is
@@ -201,7 +203,7 @@ def _gram(
     used = frequency_hz < sensing.cutoff_hz
     f = frequency_hz[used]
     both_sides = np.where(f > 0, 4.0, 2.0)
-    pace = float(np.abs(wheel_speed).mean(axis=1)[np.abs(wheel_speed).mean(axis=1) > 0.05].mean())
+    pace = _pace_mps(wheel_speed)
     density = {name: _density(noise, robot, planar, name, f, pace) for name in channels}
     waves = {name: np.empty((len(names), f.size), dtype=complex) for name in channels}
     plain = move(planar, vector_of({}), 1 / rate_hz, wheel_speed, steer, grade, roll, np.zeros((0, 3)))
@@ -223,6 +225,13 @@ def _gram(
         weighed = waves[channel] * (both_sides / density[channel] * rate_hz / n)
         gram += np.real(weighed @ waves[channel].conj().T)
     return gram
+
+
+def _pace_mps(wheel_speed: Array) -> float:
+    """Return the mean speed of the wheels while they turn; the least that counts if they do not."""
+    speed = np.abs(wheel_speed).mean(axis=1)
+    turning = speed[speed > TURNING_MPS]
+    return float(turning.mean()) if turning.size else TURNING_MPS
 
 
 def _predict(

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from terrain.discrepancy.trials.drives import rich_drives
+from terrain.discrepancy.trials.drives import command_drives, rich_drives
 from terrain.discrepancy.trials.limits import Limits, limits_of
 from terrain.effects import effect_named
 from terrain.robots import load_robot
@@ -27,3 +27,15 @@ def test_an_effect_that_drives_hardly_show_is_like_none_that_they_show(least):
     assert not limits.alike(payload, drag)
     assert limits.alike(drag, scrub)
     assert not limits.spanned((payload, drag), scrub)
+
+
+def test_a_run_that_stands_shows_little_and_spoils_nothing():
+    """One command of eighty may be next to none."""
+    husky = load_robot("husky")
+    drives = command_drives(np.random.default_rng(0), husky, 3)
+    standing = tuple(np.zeros_like(twist) if i == 1 else twist for i, twist in enumerate(drives.twists))
+    moved = limits_of(husky, drives._replace(twists=drives.twists[::2], hills=drives.hills[::2]))
+    limits = limits_of(husky, drives._replace(twists=standing))
+    assert np.isfinite(limits.information).all()
+    at = limits.names.index("wheel_radius_ratio")
+    assert limits.information[at, at] == pytest.approx(moved.information[at, at], rel=1e-3)
