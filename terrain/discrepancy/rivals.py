@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import numpy as np
+
 from terrain.discrepancy.fitting import Problem, Refit, fit_again, names_of
 from terrain.discrepancy.information import Information, correlation, loss_of, partial_information
 from terrain.discrepancy.selection import evidence
@@ -58,11 +60,12 @@ def rivals_of(
     likelihood: a rival that leaves a larger square than the noise of the wheels can make is none.
     """
     base, judges = start.vector, (info, start)
+    runs_alone = info._replace(model_std=np.zeros_like(info.model_std))  # in what all runs have they agree
     own: list[Refit] = []  # losses of the causes by both judges, where anything comes near
     rivals = {}
     for cause in causes:
         others = [other for other in causes if other is not cause]
-        inflation = evidence(info, names_of(others), cause).inflation
+        inflation = evidence(runs_alone, names_of(others), cause).inflation
         found = []
         for effect in _near(problem, info, cause, others, inflation):
             own = own or [fit_again(problem, judge, base, names_of(causes)) for judge in judges]

@@ -121,8 +121,8 @@ def load_model_error() -> ModelError:
     )
     probes = {
         (channel, name): float(size)
-        for channel, sizes in _described()["probe_error"].items()
-        for name, size in sizes.items()
+        for channel, entry in _described()["probe_error"].items()
+        for name, size in entry["sizes"].items()
     }
     return ModelError(common, varied, scatter, probes)
 

@@ -1,6 +1,7 @@
 """Which effects fit as well in the place of a cause, by the losses and squares of their fits."""
 
 from types import SimpleNamespace
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -14,10 +15,11 @@ CAUSE, OTHER = effect_named("payload"), effect_named("motor_constant")
 SQUARE = 1000.0
 
 
-class Judge:
+class Judge(NamedTuple):
     """An information of which only the point is read."""
 
-    vector = np.zeros(1)
+    vector: np.ndarray = np.zeros(1)
+    model_std: np.ndarray = np.zeros(1)
 
 
 @pytest.fixture
