@@ -8,11 +8,16 @@ TRACK = "+track"
 CONTROLLERS = ("plain", "ramp", "thesis", "fallback", "classified", "true_terrain")
 """Commands of the kinematics; with a bounded rise of speed; the thesis' PID of slip on each wheel; the
 traction controller with the target of the table's fallback, of the classified terrain, and of the true one.
-Also ``known:NAME`` and ``target:SLIP``, the traction controller with the target of that terrain, and with
-that target; and all but the first two with :data:`TRACK`."""
+Also :data:`THESIS_ADAPTING`; ``known:NAME`` and ``target:SLIP``, the traction controller with the target of
+that terrain, and with that target; and all but the first two with :data:`TRACK`."""
 
 BASELINES = ("plain", "ramp", "thesis")
-ADAPTING = ("classified", "true_terrain")
+THESIS_ADAPTING = ("thesis:classified", "thesis:true_terrain")
+"""The thesis' PID with the targets of the classified terrain, which is the chain of the thesis, and of the
+true one; ``thesis`` alone has those of the table's fallback."""
+
+USING_CLASSIFIER = ("classified", "thesis:classified")
+ADAPTING = ("classified", "true_terrain", *THESIS_ADAPTING)
 """Controllers whose target follows the terrain."""
 
 _EARLIER = {"fixed": "fallback", "learned": "classified", "oracle": "true_terrain", "told": "known"}

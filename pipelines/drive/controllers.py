@@ -6,8 +6,9 @@ import math
 from dataclasses import dataclass, replace
 from enum import Enum
 
-from pipelines.drive.controller_names import BASELINES, CONTROLLERS, TRACK
-from pipelines.live.pilot import LivePilot, PilotSettings
+from pipelines.drive.controller_names import BASELINES, CONTROLLERS, THESIS_ADAPTING, TRACK
+from pipelines.live.pilot import LivePilot
+from pipelines.live.pilot_settings import PilotSettings
 from pipelines.live.terrain_source import Classifier, KnownTerrain, NoTerrain, TerrainSource
 from pipelines.models.model_files import TerrainModel
 from pipelines.reporting.progress import Progress, silent
@@ -28,6 +29,9 @@ class Source(Enum):
     CLASSIFIER = "classifier"
     TRUTH = "truth"
     KNOWN = "known"
+
+
+_SOURCES = {"fallback": Source.NONE, "classified": Source.CLASSIFIER, "true_terrain": Source.TRUTH}
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +67,7 @@ class DriveInputs:
     ----------
     robot : as the controllers assume it
     table : target slips
-    model : classifier of ``classified``
+    model : classifier of ``classified`` and ``thesis:classified``
     plant : the simulated robot, where it is another one
     """
 
@@ -96,9 +100,10 @@ def make_controller(
     traction = PilotSettings(delay_s=delay_s)
     if name in BASELINES:
         return Controller(name, replace(traction, controller=name, ramp_mps2=ramp_mps2), table)
-    sources = {"fallback": Source.NONE, "classified": Source.CLASSIFIER, "true_terrain": Source.TRUTH}
-    if name in sources:
-        return Controller(name, traction, table, sources[name])
+    if name in _SOURCES:
+        return Controller(name, traction, table, _SOURCES[name])
+    if name in THESIS_ADAPTING:
+        return Controller(name, replace(traction, controller=kind), table, _SOURCES[given])
     if kind == "known" and given:
         if given not in table.targets:
             raise ConfigError(f"controller {name!r}: the table {table.name} has no entry {given!r}")
@@ -106,7 +111,8 @@ def make_controller(
     if kind == "target":
         return Controller(name, traction, _single_target(table, name, given))
     raise ConfigError(
-        f"controller {name!r} is unknown: use {', '.join(CONTROLLERS)}, known:NAME, target:SLIP; {TRACK}"
+        f"controller {name!r} is unknown: use {', '.join((*CONTROLLERS, *THESIS_ADAPTING))}, known:NAME, "
+        f"target:SLIP; {TRACK}"
     )
 
 
@@ -184,5 +190,5 @@ def _terrain_source(controller: Controller, model: TerrainModel | None) -> Terra
     if controller.source is Source.KNOWN:
         return KnownTerrain(lambda _: controller.known_terrain)
     if model is None:
-        raise ConfigError("controller 'classified' needs a classifier: give a model")
+        raise ConfigError(f"controller {controller.name!r} needs a classifier: give a model")
     return Classifier(model)

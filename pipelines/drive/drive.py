@@ -113,8 +113,9 @@ def drive(settings: DriveSettings, inputs: DriveInputs, progress: Progress = sil
     check_drive(settings, inputs)
     names = settings.controllers
     controllers = _controllers(settings, inputs, [name for name in names if name != "ramp"])
-    if inputs.model is None and any(one.source is Source.CLASSIFIER for one in controllers):
-        raise ConfigError("controller 'classified' needs a classifier: give a model")
+    for one in controllers:
+        if one.source is Source.CLASSIFIER and inputs.model is None:
+            raise ConfigError(f"controller {one.name!r} needs a classifier: give a model")
     count = _counter(progress, settings.seeds * len(names))
     drives = _drive_all(settings, inputs, controllers, count)
     ramp_mps2 = None

@@ -20,6 +20,10 @@ LABELS = {
     "immobilised": ("times stuck", ""),
     "adapt_s": ("time to the new terrain's target", "s"),
     "adapted_ratio": ("ratio of terrain changes followed", ""),
+    "believed_ratio": ("ratio of driving time with a known terrain", ""),
+    "n_accepted": ("outputs of the classifier accepted", ""),
+    "n_below_threshold": ("outputs below the threshold", ""),
+    "n_refused": ("windows the classifier refused", ""),
     "slip_error_ratio": ("slip error while the speed was limited", ""),
     "sinkage_m": ("sinkage of the deepest wheel", "m"),
     "command_mps2": ("change of the wheels' commands, rms", "m/s²"),
@@ -64,6 +68,9 @@ _CONTROLLERS = {
     "plain": "The wheel speeds of the kinematics; slip is not used.",
     "ramp": "As plain, with a speed that rises by no more than {ramp}.",
     "thesis": "The thesis' PID of slip on each wheel, with the target of the table's fallback.",
+    "thesis:classified": "The thesis' PID of slip on each wheel, with the targets of the terrain that a "
+    "classifier recognises while driving: the chain of the thesis.",
+    "thesis:true_terrain": "The thesis' PID of slip on each wheel, with the targets of the true terrain.",
     "fallback": "Traction control: one speed for all wheels, limited while it rises; the target is that of "
     "the table's fallback.",
     "classified": "Traction control with the target of the terrain that a classifier recognises while "

@@ -5,6 +5,7 @@ from __future__ import annotations
 from rich.console import Console
 from rich.table import Column, Table
 
+from pipelines.drive.belief import belief_notes
 from pipelines.drive.results import DriveResult
 from pipelines.reporting.terminal import print_lines, text_column
 from terrain.control.comparison import MeanInterval
@@ -27,6 +28,7 @@ def print_drive(result: DriveResult, console: Console) -> None:
         if any(value.mean is not None for value in values):
             table.add_row(key, *map(_with_interval, values))
     console.print(table)
+    print_lines(console, belief_notes(result))
 
 
 def _with_interval(value: MeanInterval) -> str:

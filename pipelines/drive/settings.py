@@ -7,7 +7,7 @@ from pathlib import Path
 from pydantic import field_validator, model_validator
 
 from pipelines.config.settings import Settings, setting
-from pipelines.drive.controller_names import CONTROLLERS, base_name, current_name
+from pipelines.drive.controller_names import CONTROLLERS, USING_CLASSIFIER, base_name, current_name
 from terrain.errors import ConfigError
 
 MAX_GRADE_DEG = 30.0
@@ -27,13 +27,15 @@ class DriveSettings(Settings):
     controllers: tuple[str, ...] = setting(
         CONTROLLERS,
         "By commas: plain, ramp, thesis; the traction controller on the target of fallback, classified, "
-        "true_terrain, known:NAME (of that terrain) or target:SLIP; NAME+track with path tracking.",
+        "true_terrain, known:NAME (of that terrain) or target:SLIP; the thesis' PID on the targets of "
+        "thesis:classified or thesis:true_terrain; NAME+track with path tracking.",
         separated=True,
     )
     table: Path | None = setting(None, "Table of target slips; the packaged one by default.")
     model: str | None = setting(
         None,
-        "Classifier of 'classified': models:/NAME@champion or a folder; one is trained by default.",
+        "Classifier of 'classified' and 'thesis:classified': models:/NAME@champion or a folder; one is "
+        "trained by default.",
     )
     seeds: int = setting(20, "Number of seeds: each draws load, soil, tyres and noise.", ge=1)
     first_seed: int = setting(0, "First seed.", option="--seed", ge=0)
@@ -108,13 +110,14 @@ class DriveSettings(Settings):
         if self.scenario == "slope" and self.grade_deg:
             raise ConfigError("scenario 'slope' searches for the steepest grade itself: leave the grade out")
         if self.model is not None and not self.needs_model:
-            raise ConfigError("--model is the classifier of 'classified', which is not among the controllers")
+            names = " and ".join(map(repr, USING_CLASSIFIER))
+            raise ConfigError(f"--model is the classifier of {names}, which are not among the controllers")
         return self
 
     @property
     def needs_model(self) -> bool:
         """Whether a controller uses a classifier."""
-        return any(base_name(name) == "classified" for name in self.controllers)
+        return any(base_name(name) in USING_CLASSIFIER for name in self.controllers)
 
     @property
     def n_jobs(self) -> int:

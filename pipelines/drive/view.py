@@ -11,7 +11,8 @@ from typing import NamedTuple
 from matplotlib.figure import Figure
 
 from pipelines.drive.bar_figure import Panel, bars_figure
-from pipelines.drive.controller_names import ADAPTING, BASELINES, base_name
+from pipelines.drive.belief import belief_notes, is_hardly_believed
+from pipelines.drive.controller_names import ADAPTING, BASELINES, THESIS_ADAPTING, base_name
 from pipelines.drive.curve_figure import table_figure
 from pipelines.drive.labels import (
     ABSOLUTE,
@@ -94,6 +95,7 @@ class DriveView:
     ----------
     heading, lead : on top of the page
     verdict : a sentence on the main comparison, or nothing
+    notes : a sentence on each controller whose classifier was hardly believed
     scenario : what is driven, or nothing
     controllers : a sentence on each
     differences : of pairs of controllers; None where there are none
@@ -108,6 +110,7 @@ class DriveView:
     heading: str
     lead: str
     verdict: str
+    notes: tuple[str, ...]
     scenario: str
     controllers: tuple[Named, ...]
     differences: Table | None
@@ -152,6 +155,7 @@ def drive_view(result: DriveResult, figures: Mapping[str, Figure]) -> DriveView:
         heading=f"{result.scenario} on {_terrain_name(result)}",
         lead=_lead(result),
         verdict=_verdict(result, pairs, metrics),
+        notes=belief_notes(result),
         scenario=SCENARIOS.get(result.scenario, ""),
         controllers=tuple(Named(name, controller_text(name, result.ramp_mps2)) for name in names),
         differences=_differences(result, pairs, metrics),
@@ -214,11 +218,12 @@ def _lead(result: DriveResult) -> str:
 
 
 def _pairs(names: Sequence[str]) -> list[tuple[str, str]]:
-    """Return the pairs to compare: all with plain, traction control with ramp and fallback."""
-    traction = [name for name in names if name not in BASELINES]
+    """Return the pairs to compare: all with plain, traction control with ramp and fallback, PID with PID."""
+    traction = [name for name in names if base_name(name) not in (*BASELINES, *THESIS_ADAPTING)]
     pairs = [(name, "plain") for name in names if name != "plain" and "plain" in names]
     pairs += [(name, "ramp") for name in traction if "ramp" in names]
     pairs += [(name, "fallback") for name in traction if name in ADAPTING and "fallback" in names]
+    pairs += [(name, "thesis") for name in names if name in THESIS_ADAPTING and "thesis" in names]
     if not pairs and len(names) > 1:
         pairs = [(name, names[0]) for name in names[1:]]
     return pairs
@@ -229,7 +234,8 @@ def _verdict(result: DriveResult, pairs: Sequence[tuple[str, str]], metrics: Seq
     if not pairs:
         return ""
     preferred = ("classified", "true_terrain", "fallback")
-    name, other = next((pair for one in preferred for pair in pairs if pair[0] == one), pairs[0])
+    credited = [pair for pair in pairs if not is_hardly_believed(result, pair[0])] or pairs
+    name, other = next((pair for one in preferred for pair in credited if pair[0] == one), credited[0])
     significant, alike = [], []
     for key in metrics:
         found = difference(result, name, other, key)

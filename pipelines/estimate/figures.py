@@ -24,6 +24,7 @@ from pipelines.reporting.numbers import shorten
 from terrain.estimation.ekf.innovations import Innovations
 from terrain.estimation.estimate import Estimate
 from terrain.estimation.reference import lagged_slip_at
+from terrain.estimation.stuck import stuck_intervals
 from terrain.files.atomic import atomic_write
 from terrain.kinematics.swerve import forward
 from terrain.records import GATED, Array
@@ -96,7 +97,9 @@ def _swerve_motion(estimate: Estimate) -> Figure:
 def _skid_motion(estimate: Estimate) -> Figure:
     track, table = estimate.track, estimate.table
     wheels = table.columns(["wheel_left_mps", "wheel_right_mps"])
-    track_m = estimate.robot.track_m
+    track_m, stuck = estimate.robot.track_m, np.zeros(track.time_s.size, dtype=bool)
+    for interval in stuck_intervals(track.time_s, np.asarray(estimate.motion)):
+        stuck |= (track.time_s >= interval.start_s) & (track.time_s <= interval.end_s)
     raw = {
         "speed_mps": (wheels.mean(axis=1), "mean of the wheels"),
         "yaw_rate_radps": (np.diff(wheels, axis=1)[:, 0] / track_m, f"wheels over {track_m:g} m"),
@@ -111,9 +114,10 @@ def _skid_motion(estimate: Estimate) -> Figure:
                 _line(axes, table.time_s, table.columns(["gyro_z_radps"])[:, 0], GREEN, "gyro", lw=0.6)
             _band(axes, track.time_s, track.state(state), track.std(state))
             _line(axes, track.time_s, track.state(state), BLUE, "skid filter, ± 2 std", lw=1.4)
+            _shade(axes, track.time_s, stuck, "stuck")
             axes.set_ylabel(label)
             axes.grid()
-            axes.legend(ncols=3, fontsize=7.5, frameon=False, loc="lower left", bbox_to_anchor=(0, 1))
+            axes.legend(ncols=4, fontsize=7.5, frameon=False, loc="lower left", bbox_to_anchor=(0, 1))
         axes.set_xlabel("time [s]")
         return finished(figure, f"{shorten(estimate.run.run_id, 40)}: motion without a speed reference")
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
 from rich.console import Console
 from rich.table import Column, Table
 
 from pipelines.estimate.results import EstimateResult
 from pipelines.reporting.numbers import format_known
+from terrain.estimation.stuck import StuckInterval
 from terrain.estimation.summary import EstimateSummary
 from terrain.estimation.tuned_noise import TunedNoise
 
@@ -25,6 +28,9 @@ def print_estimates(result: EstimateResult, console: Console) -> None:
     console.print(table)
     if result.tuned is not None:
         console.print(_tuning_words(result.tuned))
+    for row in result.runs:
+        if row.motion is not None and row.stuck is not None:
+            console.print(f"{row.run_id}: {_motion_words(row.motion, row.stuck)}", highlight=False)
     if not all(row.slip_observable for row in result.runs):
         console.print(
             "blind: nothing measured the speed over ground, so the figure is the wheels against themselves, "
@@ -49,6 +55,14 @@ def _cells(row: EstimateSummary) -> tuple[str, ...]:
         str(row.n_dropped),
         str(row.n_gated),
     )
+
+
+def _motion_words(motion: Mapping[str, float], stuck: Sequence[StuckInterval]) -> str:
+    """Return when a robot was stuck, and for how long nothing is known of its motion."""
+    times = ", ".join(f"{interval.start_s:.1f} to {interval.end_s:.1f} s" for interval in stuck)
+    found = f"stuck from {times}" if stuck else "not seen to be stuck"
+    known = f"moving for {motion['moving']:.1f} s, at rest for {motion['at_rest']:.1f} s"
+    return f"{found}; {known}, unknown for {motion['unknown']:.1f} s"
 
 
 def _tuning_words(tuned: TunedNoise) -> str:

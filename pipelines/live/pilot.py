@@ -12,12 +12,20 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
-from pipelines.live.terrain_source import NoTerrain, TerrainSource, readable
+from pipelines.live.pilot_settings import (
+    DEFAULT_SETTINGS,
+    OPEN_LOOP,
+    PilotSettings,
+    PilotStatus,
+    check_pilot,
+    wheel_controller,
+)
+from pipelines.live.terrain_source import NoTerrain, TerrainSource
 from terrain.constants import GRAVITY_MPS2
+from terrain.control.actuation import Actuation
 from terrain.control.path_tracking import (
     PoseEstimate,
     TrackReport,
@@ -25,52 +33,38 @@ from terrain.control.path_tracking import (
     initial_tracking,
     track_step,
 )
-from terrain.control.pid import Gains
 from terrain.control.slick import braking_by_slip
 from terrain.control.slip_table import SlipTable, load_slip_table
-from terrain.control.stability import check_stable
 from terrain.control.switching import (
     NO_BELIEF,
-    SWITCHING,
-    SwitchSettings,
+    OutputStatus,
     TerrainBelief,
     approach,
-    check_switching,
+    drive_on,
+    output_status,
     update,
 )
-from terrain.control.tracking_settings import SETTINGS as TRACKING
-from terrain.control.tracking_settings import TrackSettings, check_tracking
-from terrain.control.traction_settings import SETTINGS, TractionSettings, TractionTarget
+from terrain.control.tracking_settings import check_tracking
+from terrain.control.traction import TractionStatus
+from terrain.control.traction_settings import TractionTarget
 from terrain.control.wheel_controllers import (
     PERIOD_S,
     UNOBSERVED,
-    RampController,
-    ThesisController,
-    TractionController,
-    WheelController,
     WheelObserver,
     WheelRequest,
     estimate_age,
     step_or_period,
 )
-from terrain.errors import ConfigError
-from terrain.estimation.live.estimator import LiveEstimate, LiveEstimator
+from terrain.estimation.live.clocks import Clocks, numbers
+from terrain.estimation.live.estimate import LiveEstimate
+from terrain.estimation.live.estimator import LiveEstimator
+from terrain.estimation.live.health import SENSORS, SLIP_SENSORS, SOUND, Health
 from terrain.extension import correct_live
 from terrain.kinematics.swerve import FAR_RAD, wheel_command_step
-from terrain.logs.schema import IMU_CHANNELS
-from terrain.records import Array, Command, Sample
-from terrain.robots import Robot, SwerveRobot, as_swerve
+from terrain.logs.schema import IMU_CHANNELS, WHEELS_CHANNELS
+from terrain.records import Array, Command, Reading, Sample
+from terrain.robots import Robot
 from terrain.slip import MIN_SPEED_MPS
-
-CONTROLLERS = ("plain", "ramp", "thesis", "traction")
-"""Commands of the kinematics; with a bounded rise of speed; the thesis' PID on each wheel; the controller of
-:mod:`terrain.control.traction`."""
-
-OPEN_LOOP = ("plain", "ramp")
-"""Controllers that use no measurement."""
-
-THESIS_GAINS = Gains(0.5, 0.5, 0.0, limit=2.0)
-"""The thesis specifies none; these have a gain margin of 3 on the simulated robot (``check_stable``)."""
 
 MARGIN_MAX_RATIO = 0.06
 """The difference of a table's targets in traction and in steady motion is the slip above the balance that
@@ -78,69 +72,9 @@ gives the working pull; up to this much is added to the measured balance.  A lar
 table that aims for a peak."""
 
 _ROLL, _PITCH = IMU_CHANNELS.index("roll_rad"), IMU_CHANNELS.index("pitch_rad")
+_OF_SLIP = np.array([SENSORS.index(name) for name in SLIP_SENSORS])
 _NOT_ESTIMATED = UNOBSERVED._replace(stale_s=math.nan)
 _NOT_TRACKED = TrackReport(math.nan, math.nan, 0.0, TrackStatus.NO_POSE)
-
-
-@dataclass(frozen=True, slots=True)
-class PilotSettings:
-    """Controller of a pilot and its settings.
-
-    Parameters
-    ----------
-    controller : one of :data:`CONTROLLERS`
-    ramp_mps2 : largest rise of the speed of the fastest wheel, of ``ramp``
-    traction, switching : of ``traction``
-    gains, form : of ``thesis``
-    delay_s : from a sample to the wheel; the loops have to be stable with it
-    track : with path tracking; not with ``plain`` and ``ramp``, which estimate no pose
-    tracking : its settings
-    """
-
-    controller: str = "traction"
-    ramp_mps2: float = 0.5
-    traction: TractionSettings = SETTINGS
-    switching: SwitchSettings = SWITCHING
-    gains: Gains = THESIS_GAINS
-    form: str = "normalised"
-    delay_s: float = 0.05
-    track: bool = False
-    tracking: TrackSettings = TRACKING
-
-
-class PilotStatus(NamedTuple):
-    """Status of a step; its fields are the channels of the stream ``control``.
-
-    Parameters
-    ----------
-    status_code : :class:`terrain.control.traction.TractionStatus`
-    terrain_code : place of the current terrain in :attr:`LivePilot.terrains`; -1 where it is unknown
-    probability_ratio : of the current terrain
-    target_ratio, aimed_ratio : target slip, and the target with its floor
-    balance_ratio : slip of steady motion
-    slip_ratio, slip_std_ratio : largest slip of a wheel, and largest standard deviation
-    stale_s : time since the speed over ground was measured last
-    drive_state_code : :class:`terrain.control.power_state.DriveState`
-    driven_mps, desired_mps : commanded and desired speed of the fastest wheel
-    heading_error_rad, cross_track_m : of path tracking
-    track_status_code : :class:`terrain.control.path_tracking.TrackStatus`
-    """
-
-    status_code: float
-    terrain_code: float
-    probability_ratio: float
-    target_ratio: float
-    aimed_ratio: float
-    balance_ratio: float
-    slip_ratio: float
-    slip_std_ratio: float
-    stale_s: float
-    drive_state_code: float
-    driven_mps: float
-    desired_mps: float
-    heading_error_rad: float
-    cross_track_m: float
-    track_status_code: float
 
 
 @dataclass(slots=True)
@@ -151,6 +85,7 @@ class _Memory:
     tracking: Array
     time_s: float = math.nan
     belief: TerrainBelief = NO_BELIEF
+    output: OutputStatus = OutputStatus.NONE
     target_ratio: float = math.nan
     estimate: LiveEstimate | None = None
     tilt_rad: tuple[float, float] = (0.0, 0.0)
@@ -179,7 +114,7 @@ class LivePilot:
     >>> from terrain.robots import load_robot
     >>> pilot = LivePilot(load_robot("agrimaro"), load_slip_table())
     >>> command = pilot.step(Sample(0.0, np.array([0.5, 0.0, 0.0]), {}))  # nothing is known yet
-    >>> command.wheel_radps, command.status["status_code"] == TractionStatus.NO_SLIP
+    >>> command.wheel_radps, command.status["status_code"] == TractionStatus.UNSOUND
     (array([0.1, 0.1, 0.1]), True)
     """
 
@@ -188,7 +123,7 @@ class LivePilot:
         robot: Robot,
         table: SlipTable | None = None,
         source: TerrainSource | None = None,
-        settings: PilotSettings = PilotSettings(),
+        settings: PilotSettings = DEFAULT_SETTINGS,
         steer_rad: Array | None = None,
     ) -> None:
         table = load_slip_table() if table is None else table
@@ -203,7 +138,7 @@ class LivePilot:
             driven.equipment.motors.speed_max_radps,
             driven.equipment.steering.rate_max_radps,
         )
-        self._controller = _wheel_controller(driven, settings)
+        self._controller = wheel_controller(driven, settings)
         self._estimator: LiveEstimator | None = None
         if settings.controller not in OPEN_LOOP:
             self._estimator = LiveEstimator(driven, correction=correction)
@@ -213,6 +148,10 @@ class LivePilot:
                 self._tracking = check_tracking(driven, settings.tracking, settings.delay_s)
             pose = ("position_x_m", "position_y_m", "yaw_rad")
             self._pose_states = [states.index(state) for state in pose]
+            self._steer_states = [states.index(f"steer_{i}_rad") for i in driven.wheels]
+        self._clocks = Clocks()
+        self._actuation = Actuation(driven.wheel_radius_m / driven.equipment.motors.reduction_ratio)
+        self._health = np.zeros(len(SENSORS), dtype=np.int8)
         steer = np.zeros(3) if steer_rad is None else np.array(steer_rad, dtype=np.float64)
         self._now = _Memory(steer, initial_tracking())
 
@@ -220,6 +159,29 @@ class LivePilot:
     def terrains(self) -> tuple[str, ...]:
         """Entries of the table, in the order of the status ``terrain_code``."""
         return tuple(self._terrains)
+
+    @property
+    def estimate(self) -> LiveEstimate | None:
+        """Last estimate of the motion; None before the first, and of controllers that use none."""
+        return self._now.estimate
+
+    @property
+    def health(self) -> dict[str, str]:
+        """Health of each sensor at the last step, by name, as those of ``Health`` in small letters."""
+        return {
+            name: Health(status).name.lower()
+            for name, status in zip(SENSORS, self._health.tolist(), strict=True)
+        }
+
+    @property
+    def dropped(self) -> dict[str, int]:
+        """What was not taken so far, and how often a clock was set, as counts by stream and kind."""
+        return self._clocks.counts | ({} if self._estimator is None else self._estimator.dropped)
+
+    @property
+    def lateness_s(self) -> dict[str, float]:
+        """How late the last reading of each stream came."""
+        return self._clocks.lateness_s
 
     def step(self, sample: Sample) -> Command:
         """Return the wheels' commands for a sample; whatever arrives, it does not raise.
@@ -233,34 +195,50 @@ class LivePilot:
         Command
             its ``status`` has the fields of :class:`PilotStatus`
         """
-        now = self._now
-        first = math.isnan(now.time_s) and math.isfinite(sample.time_s)
-        dt_s = PERIOD_S if first else sample.time_s - now.time_s
-        if math.isfinite(sample.time_s):
-            now.time_s = sample.time_s
-        self._estimate(sample)
+        now, before_s = self._now, self._now.time_s
+        time_s, readings = self._clocks.step(
+            getattr(sample, "time_s", None), getattr(sample, "readings", None)
+        )
+        dt_s = PERIOD_S if math.isnan(before_s) else time_s - before_s
+        now.time_s = time_s
+        terrain = getattr(sample, "terrain", "")
+        desired = _finite_twist(getattr(sample, "twist", None))
+        if self._estimator is not None:
+            self._compare(time_s, dt_s, readings)
+        self._estimate(Sample(time_s, desired, readings, terrain if isinstance(terrain, str) else ""))
+        sensor, health = self._judge()
         target = self._target(step_or_period(dt_s))
-        twist, tracked = self._track(_finite_twist(sample.twist), sample.time_s, dt_s)
+        twist, tracked = self._track(desired, time_s, dt_s)
         admitted, wheel_radps, now.steer_rad = wheel_command_step(
             self._positions_m, *self._limits, step_or_period(dt_s), FAR_RAD, twist, now.steer_rad
         )
-        desired_mps = float(np.abs(wheel_radps).max()) * self._radius_m
-        observed = (
-            _NOT_ESTIMATED if self._estimator is None else self._observer.observe(now.estimate, sample.time_s)
+        desired_mps = max(map(abs, wheel_radps.tolist())) * self._radius_m
+        if not self._source.certain:
+            now.belief = drive_on(now.belief, desired_mps, step_or_period(dt_s), self._settings.switching)
+        observed = _NOT_ESTIMATED if self._estimator is None else self._observer.observe(now.estimate, time_s)
+        sound = health <= SOUND
+        request = WheelRequest(
+            wheel_radps,
+            desired_mps,
+            target,
+            self._table.lookup(now.belief.terrain),
+            observed if sound else UNOBSERVED,
+            dt_s,
         )
-        entry = self._table.lookup(now.belief.terrain)
-        command_radps, done = self._controller.step(
-            WheelRequest(wheel_radps, desired_mps, target, entry, observed, dt_s)
-        )
-        status = PilotStatus(
-            float(done.status),
+        command_radps, done = self._controller.step(request)
+        status = done.status
+        if not sound and status != TractionStatus.BAD_TIME:
+            status = TractionStatus.UNSOUND
+        self._actuation.commanded(command_radps * self._radius_m, now.steer_rad)
+        figures = PilotStatus(
+            float(status),
             float(self._terrains.get(now.belief.terrain, -1)),
             now.belief.probability,
             now.target_ratio,
             done.aimed_ratio,
             done.balance_ratio,
-            done.slip_ratio,
-            float(observed.wheels.slip_std.max()),
+            done.slip_ratio if sound else _largest_slip(observed.wheels.slip_ratio, wheel_radps),
+            _largest(observed.wheels.slip_std.tolist()),
             observed.stale_s,
             float(done.drive_state),
             done.driven_mps,
@@ -268,24 +246,26 @@ class LivePilot:
             tracked.heading_error_rad,
             tracked.cross_track_m,
             float(tracked.status),
+            float(sensor),
+            float(health),
+            float(now.output),
         )
         scale = done.driven_mps / desired_mps if desired_mps > 0.0 else 0.0
-        return Command(command_radps, now.steer_rad, admitted * scale, status._asdict())
+        return Command(command_radps, now.steer_rad, admitted * scale, figures._asdict())
 
     def _estimate(self, sample: Sample) -> None:
         """Update the motion, the tilt, and the current terrain."""
         if self._estimator is None:
             return
         now = self._now
-        estimates = self._estimator.step(sample.readings)
-        if estimates:
-            now.estimate = estimates[-1]
-        imu = readable(sample.readings.get("imu"), len(IMU_CHANNELS))
-        if imu is not None:
+        estimates = self._estimator.step(sample.readings, sample.time_s)
+        now.estimate = self._estimator.at(sample.time_s)
+        imu = sample.readings.get("imu")
+        if imu is not None and imu.values.shape[1] == len(IMU_CHANNELS) and len(imu.values):
             roll, pitch = float(imu.values[-1, _ROLL]), float(imu.values[-1, _PITCH])
             if math.isfinite(roll) and math.isfinite(pitch):
                 now.tilt_rad = roll, pitch
-        before = now.belief.terrain
+        before, n_refused, now.output = now.belief.terrain, self._source.n_refused, OutputStatus.NONE
         for found in self._source.update(sample, estimates):
             if self._source.certain:
                 now.belief = TerrainBelief(
@@ -295,8 +275,43 @@ class LivePilot:
                 now.belief = update(
                     now.belief, found.time_s, found.terrain, found.probability, self._settings.switching
                 )
+            now.output = output_status(found.terrain, found.probability, self._settings.switching)
+        if self._source.n_refused > n_refused:
+            now.output = OutputStatus.REFUSED
         if now.belief.terrain != before:
             self._controller.forget_terrain()
+
+    def _compare(self, time_s: float, dt_s: float, readings: dict[str, Reading]) -> None:
+        """Compare wheels and steering with their commands; take away rates that are not to be believed."""
+        wheels, seen = readings.get("wheels"), self._now.estimate
+        if wheels is not None and (
+            wheels.values.shape[1:] != (len(WHEELS_CHANNELS),) or not len(wheels.values)
+        ):
+            wheels = None
+        steer_rad = None if seen is None else seen.mean[self._steer_states]
+        self._actuation.measured(time_s, step_or_period(dt_s), wheels, steer_rad)
+        off = self._actuation.off[:3]
+        if wheels is not None and off.any():
+            values = wheels.values.copy()
+            values[:, np.flatnonzero(off)] = math.nan
+            readings["wheels"] = Reading(wheels.time_s, values)
+
+    def _judge(self) -> tuple[int, int]:
+        """Update the health of the sensors; return the place of the least sound, or -1, and its health."""
+        seen = self._now.estimate
+        if self._estimator is None:
+            return -1, Health.FRESH
+        if seen is None:
+            self._health[:] = Health.LOST
+            return 0, Health.LOST
+        self._health[:] = seen.health
+        if self._actuation.off.any():
+            for i in np.flatnonzero(self._actuation.off):
+                self._health[i] = max(self._health[i], Health.DISAGREES)
+        of_slip = self._health[_OF_SLIP]
+        worst = int(of_slip.argmax())
+        health = int(of_slip[worst])
+        return (int(_OF_SLIP[worst]), health) if health > SOUND else (-1, health)
 
     def _target(self, dt_s: float) -> TractionTarget:
         """Return the slips to aim for; the target moves to that of the terrain at a bounded rate."""
@@ -329,44 +344,22 @@ class LivePilot:
         return twist, report
 
 
-def check_pilot(robot: Robot, table: SlipTable, settings: PilotSettings) -> SwerveRobot:
-    """Return a robot that can be driven.
-
-    Raises
-    ------
-    ConfigError
-        as :class:`LivePilot` does, apart from the settings of traction and tracking.
-    """
-    if settings.controller not in CONTROLLERS:
-        raise ConfigError(
-            f"controller {settings.controller!r} is unknown: use one of {', '.join(CONTROLLERS)}"
-        )
-    swerve = as_swerve(robot, "robot {name}: drive {drive!r} has no pilot, only 'swerve' has")
-    if not (math.isfinite(settings.ramp_mps2) and settings.ramp_mps2 > 0):
-        raise ConfigError(f"ramp_mps2 is {settings.ramp_mps2!r}, a number above zero is required")
-    if table.robot and table.robot != robot.name:
-        raise ConfigError(f"slip table {table.name}: is of the robot {table.robot!r}, not of {robot.name!r}")
-    check_switching(settings.switching)
-    if settings.track and settings.controller in OPEN_LOOP:
-        raise ConfigError(f"controller {settings.controller!r} estimates no pose: it has no path tracking")
-    if settings.controller == "thesis":
-        check_stable(swerve, settings.gains, settings.form, settings.delay_s)
-    return swerve
-
-
-def _wheel_controller(robot: Robot, settings: PilotSettings) -> WheelController:
-    traction = TractionController(robot, settings.traction)  # checks the settings for every controller
-    if settings.controller == "traction":
-        return traction
-    if settings.controller == "thesis":
-        return ThesisController(robot, settings.gains, settings.form, settings.traction.stale_max_s)
-    return RampController(settings.ramp_mps2 if settings.controller == "ramp" else math.inf)
-
-
-def _finite_twist(twist: Array) -> Array:
+def _finite_twist(given: object) -> Array:
     """Return a desired twist (3,); zeros where it is none."""
-    twist = np.asarray(twist, dtype=np.float64)
-    return twist if twist.shape == (3,) and np.isfinite(twist).all() else np.zeros(3)
+    twist = numbers(given)
+    if twist is None or twist.shape != (3,) or not math.isfinite(sum(twist.tolist())):
+        return np.zeros(3)
+    return twist
+
+
+def _largest(values: list[float]) -> float:
+    """Return the largest of some values; NaN where one is."""
+    return math.nan if any(map(math.isnan, values)) else max(values)
+
+
+def _largest_slip(slip_ratio: Array, wheel_radps: Array) -> float:
+    """Return the largest slip of a wheel, positive in traction; NaN where it is not known."""
+    return float(np.where(wheel_radps < 0.0, -slip_ratio, slip_ratio).max())
 
 
 def _uphill_mps2(estimate: LiveEstimate | None, roll_rad: float, pitch_rad: float) -> float:

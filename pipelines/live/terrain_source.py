@@ -11,7 +11,7 @@ import numpy as np
 from features.stream import WindowStream
 from pipelines.models.model_files import TerrainModel
 from terrain.errors import DataError
-from terrain.estimation.live.estimator import LiveEstimate
+from terrain.estimation.live.estimate import LiveEstimate
 from terrain.logs.schema import IMU_CHANNELS
 from terrain.records import Array, Reading, Sample
 
@@ -35,9 +35,17 @@ def readable(reading: Reading | None, n_columns: int) -> Reading | None:
 
 
 class TerrainSource(Protocol):
-    """Gives the terrain from time to time; ``certain``: each output is accepted at once."""
+    """Gives the terrain from time to time.
+
+    ``certain``: each output is accepted at once, and holds until the next.
+    """
 
     certain: bool
+
+    @property
+    def n_refused(self) -> int:
+        """Number of windows without an output."""
+        ...
 
     def update(self, sample: Sample, estimates: Sequence[LiveEstimate]) -> list[TerrainEstimate]:
         """Take a sample and the estimates made from it; return the terrains found, in most steps none."""
@@ -48,6 +56,7 @@ class NoTerrain:
     """No source: the terrain stays unknown, and the table's fallback is used."""
 
     certain = False
+    n_refused = 0
 
     def update(self, sample: Sample, estimates: Sequence[LiveEstimate]) -> list[TerrainEstimate]:
         """Return nothing."""
@@ -63,6 +72,7 @@ class KnownTerrain:
     """
 
     certain = True
+    n_refused = 0
 
     def __init__(self, name_of: Callable[[str], str] = str) -> None:
         self._name_of = name_of
@@ -139,6 +149,11 @@ class Classifier:
             for stream, channels in layout.channels.items()
         }
         self.failed: Counter[str] = Counter()
+
+    @property
+    def n_refused(self) -> int:
+        """Number of windows that the model refused."""
+        return self.failed.total()
 
     def update(self, sample: Sample, estimates: Sequence[LiveEstimate]) -> list[TerrainEstimate]:
         """Return the terrain of each window that is complete by now."""

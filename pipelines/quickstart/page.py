@@ -16,6 +16,7 @@ from pipelines.classify.results import (
     SlowFast,
     WindowPrediction,
 )
+from pipelines.quickstart.consistency_view import ConsistencyTable, consistency_table
 from pipelines.quickstart.results import QuickstartResult
 from pipelines.reporting.numbers import NOT_KNOWN, format_counts, percent
 from pipelines.reporting.pictures import Image, svg_or_png
@@ -147,6 +148,7 @@ class View(NamedTuple):
     lead: str
     headline: Headline
     figures: tuple[tuple[Image, bool], ...]
+    consistency: ConsistencyTable | None
     terrains: tuple[TerrainRow, ...]
     weak: tuple[str, ...]
     most_frequent: float
@@ -169,6 +171,7 @@ def html_report(result: QuickstartResult, figures: Mapping[str, Figure]) -> str:
         lead=_lead(result),
         headline=_headline(report),
         figures=_images(figures),
+        consistency=consistency_table(result.consistency) if result.consistency else None,
         terrains=terrains,
         weak=tuple(row.terrain for row in terrains if row.weak),
         most_frequent=_most_frequent(report),

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from pipelines.classify.crossval import crossval
 from pipelines.classify.settings import CrossvalSettings
+from pipelines.estimate.consistency import TerrainConsistency
 from pipelines.estimate.labelled import TerrainSlip
 from pipelines.quickstart.results import KeptRuns, QuickstartResult
 from pipelines.quickstart.settings import QuickstartSettings
@@ -33,6 +34,7 @@ class _Source(NamedTuple):
 
     runs: list[RunLog]
     slip: tuple[TerrainSlip, ...] | None
+    consistency: tuple[TerrainConsistency, ...] | None
     figures: dict[str, Figure]
 
 
@@ -64,10 +66,10 @@ def quickstart(
     data, out = settings.data, settings.out
     ensure_writable(out)
     ensure_tracking()
-    runs, slip, figures = (
-        _simulated(evaluation.seed, runs_a_terrain, progress)
+    runs, slip, consistency, figures = (
+        _simulated(evaluation, runs_a_terrain, progress)
         if data is None
-        else _Source(load_runs(data), None, {})
+        else _Source(load_runs(data), None, None, {})
     )
     _refuse_other_runs(runs, data, out / "runs")
     dataset = SIMULATED if data is None else data.resolve().name
@@ -88,6 +90,7 @@ def quickstart(
         predict=predicted,
         imported=imported,
         slip=slip,
+        consistency=consistency,
         commands=_commands(settings, evaluation.seed, model_uri, runs_a_terrain),
         report=out / REPORT_FILE,
         created=datetime.now(UTC).isoformat(timespec="seconds"),
@@ -99,12 +102,18 @@ def quickstart(
     return result
 
 
-def _simulated(seed: int, runs_a_terrain: int | None, progress: Progress) -> _Source:
+def _simulated(evaluation: CrossvalSettings, runs_a_terrain: int | None, progress: Progress) -> _Source:
+    from pipelines.estimate.consistency import RUNS_A_SCENARIO, consistency_by_terrain
     from pipelines.estimate.figures import motion_figure, slip_figure
-    from pipelines.estimate.labelled import RUNS_A_TERRAIN, labelled_runs
+    from pipelines.estimate.labelled import ROBOT, RUNS_A_TERRAIN, labelled_runs
+    from terrain.robots import load_robot
 
+    seed, n_jobs = evaluation.seed, evaluation.n_jobs
     runs, slip, example = labelled_runs(seed, runs_a_terrain or RUNS_A_TERRAIN, progress)
-    return _Source(runs, slip, {"slip": slip_figure(example), "motion": motion_figure(example)})
+    n_runs = min(runs_a_terrain or RUNS_A_SCENARIO, RUNS_A_SCENARIO)
+    consistency = consistency_by_terrain(load_robot(ROBOT), seed, n_runs, progress=progress, n_jobs=n_jobs)
+    figures = {"slip": slip_figure(example), "motion": motion_figure(example)}
+    return _Source(runs, slip, consistency, figures)
 
 
 def _commands(

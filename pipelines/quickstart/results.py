@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from pipelines.classify.results import CrossvalReport, Predictions, Training
+from pipelines.estimate.consistency import TerrainConsistency
 from pipelines.estimate.labelled import TerrainSlip
 from pipelines.runs.results import Imported
 
@@ -38,6 +39,7 @@ class QuickstartResult:
     Parameters
     ----------
     slip : estimated and true slip by terrain; None where the runs are the user's
+    consistency : of the filter by terrain and group of states; None where the runs are the user's
     commands : what to type for the same, step by step
     report : file of the page
     created, elapsed_s : when the work was done, and how long it took
@@ -52,6 +54,7 @@ class QuickstartResult:
     predict: Predictions
     imported: KeptRuns
     slip: tuple[TerrainSlip, ...] | None
+    consistency: tuple[TerrainConsistency, ...] | None
     commands: tuple[str, ...]
     report: Path
     created: str

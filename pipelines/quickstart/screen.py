@@ -8,6 +8,7 @@ from rich.console import Console
 from rich.table import Table
 
 from pipelines.classify.screen import print_crossval, print_predictions, print_training
+from pipelines.estimate.consistency import print_consistency
 from pipelines.estimate.labelled import TerrainSlip
 from pipelines.quickstart.results import QuickstartResult
 from pipelines.reporting.numbers import format_known
@@ -18,6 +19,8 @@ def print_quickstart(result: QuickstartResult, console: Console) -> None:
     """Print slip, evaluation, training and predictions, and where the report is."""
     if result.slip:
         print_slip(result.slip, console)
+    if result.consistency:
+        print_consistency(result.consistency, console)
     print_crossval(result.crossval, console)
     print_training(result.train, console)
     print_predictions(result.predict, console)

@@ -31,7 +31,8 @@ from terrain.control.situations import (
     terrain_changes,
 )
 from terrain.control.slip_table import SlipTable
-from terrain.records import Array, RunLog
+from terrain.control.switching import DRIVING_MPS, OutputStatus
+from terrain.records import Array, RunLog, Stream
 from terrain.robots import Robot
 from terrain.simulation.scenario.scenario import Scenario
 
@@ -58,6 +59,11 @@ METRICS = (
 """Metrics that every drive has; others belong to some scenarios."""
 
 
+BELIEF = ("believed_ratio", "n_accepted", "n_below_threshold", "n_refused")
+"""Metrics of a controller that uses the terrain: ratio of the driving time with a known terrain, and outputs
+of its source by :class:`terrain.control.switching.OutputStatus`."""
+
+
 class EnergyCurve(NamedTuple):
     """Energy over distance of a drive: distance (n,), which never falls, and energy (n,)."""
 
@@ -79,7 +85,8 @@ def evaluate_drive(
     run, history : the drive's log, and the history of its truth
     robot : the one that was simulated, whatever its controller assumed
     situation : in which it was driven
-    adapting_to : targets of a controller that uses the terrain; without, no adaptation is evaluated
+    adapting_to : targets of a controller that uses the terrain; without, neither adaptation nor belief is
+        evaluated
     """
     commands, control = run.streams["commands"], run.streams["control"]
     scenario = situation.scenario
@@ -99,6 +106,7 @@ def evaluate_drive(
         "command_mps2": command_change(commands) * robot.wheel_radius_m,
         "yaw_drift_rad": float(abs(history.yaw_rad[-1] - history.yaw_rad[0])),
     }
+    row |= _belief(control) if adapting_to is not None else dict.fromkeys(BELIEF, math.nan)
     changes = [] if adapting_to is None else _target_changes(run, adapting_to)
     if changes:
         times = np.array(adaptation_times(control, changes))
@@ -111,6 +119,16 @@ def evaluate_drive(
         row["stop_m"] = stopping_distance(history, stop_s)
         row["lock_s"] = lock_s(history, stop_s, standstill_time(history, stop_s))
     return row
+
+
+def _belief(control: Stream) -> dict[str, float]:
+    """Return :data:`BELIEF`: ratio of driving time with a known terrain, and outputs by their status."""
+    driving = control.channel("desired_mps") >= DRIVING_MPS
+    known = control.channel("terrain_code")[driving] >= 0.0
+    output = control.channel("output_code")
+    counted = (OutputStatus.ACCEPTED, OutputStatus.BELOW_THRESHOLD, OutputStatus.REFUSED)
+    counts = (float((output == status).sum()) for status in counted)
+    return dict(zip(BELIEF, (float(known.mean()) if known.size else math.nan, *counts), strict=True))
 
 
 def _target_changes(run: RunLog, table: SlipTable) -> list[tuple[float, float]]:

@@ -3,7 +3,9 @@
 A classifier gives one output per window, and some are wrong; a target that followed each output would jump.
 Here a class is accepted when it was classified with sufficient probability, window after window, for a dwell
 time.  Outputs of low probability for as long are accepted as "unknown", for which the table's fallback is
-used.  The target then moves to its new value at a bounded rate.
+used.  A class that no output has confirmed for some time of driving becomes unknown, too: a classifier that
+fell silent, or that contradicts itself, says nothing of where the robot has come to since.  The target then
+moves to its new value at a bounded rate.
 """
 
 from __future__ import annotations
@@ -11,7 +13,12 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+from terrain.control.status import StatusCode
 from terrain.errors import ConfigError
+
+DRIVING_MPS = 0.03
+"""A robot whose fastest wheel is to turn at least so fast drives: windows are cut from this speed on
+(``features.windows.SteadyMotion``)."""
 
 UNKNOWN = ""
 """Name of a terrain that is not known."""
@@ -26,12 +33,16 @@ class SwitchSettings(NamedTuple):
         eight classes of the simulated runs the calibrated classifier is right more often than not above 0.5
     dwell_s : time over which all windows have to agree; windows come every 2 s, so two of them
     silent_s : after a gap of this length between outputs, as while the robot stands, the dwell starts again
+    unconfirmed_max_s : time of driving after which a class that no output has confirmed becomes unknown: five
+        windows.  Of the outputs on a simulated terrain 0.4 (tiles) to 1.0 (loam) are of its class, so that
+        five in a row are not by chance in 8 % of the cases at the worst
     rate_ratio : change of the target per second: a start takes some seconds
     """
 
     probability_least: float = 0.5
     dwell_s: float = 1.5
     silent_s: float = 10.0
+    unconfirmed_max_s: float = 10.0
     rate_ratio: float = 0.1
 
 
@@ -47,6 +58,7 @@ class TerrainBelief(NamedTuple):
     probability : with which it was classified last; NaN before
     candidate, since_s, received_s : class of the last output, since when without interruption, and the time
         of the last output
+    unconfirmed_s : time of driving since an output of the accepted class
     """
 
     terrain: str = UNKNOWN
@@ -54,9 +66,23 @@ class TerrainBelief(NamedTuple):
     candidate: str = UNKNOWN
     since_s: float = math.nan
     received_s: float = math.nan
+    unconfirmed_s: float = 0.0
 
 
 NO_BELIEF = TerrainBelief()
+
+
+class OutputStatus(StatusCode):
+    """The last output of a terrain source in a step, if there was one.
+
+    ``ACCEPTED``: it counts for its class.  ``BELOW_THRESHOLD``: its probability does not suffice, and it
+    counts as unknown.  ``REFUSED``: the classifier could not use the window.
+    """
+
+    NONE = 0
+    ACCEPTED = 1
+    BELOW_THRESHOLD = 2
+    REFUSED = 3
 
 
 def check_switching(settings: SwitchSettings) -> None:
@@ -100,7 +126,8 @@ def update(
     """
     if not math.isfinite(time_s) or time_s <= belief.received_s:
         return belief
-    candidate = terrain if probability >= settings.probability_least else UNKNOWN  # False for NaN
+    counts = output_status(terrain, probability, settings) is OutputStatus.ACCEPTED
+    candidate = terrain if counts else UNKNOWN
     continues = candidate == belief.candidate and time_s - belief.received_s <= settings.silent_s
     since_s = belief.since_s if continues else time_s
     known_probability = probability if candidate else math.nan
@@ -108,7 +135,48 @@ def update(
         return TerrainBelief(belief.terrain, known_probability, candidate, since_s, time_s)
     if time_s - since_s >= settings.dwell_s - 1e-9:
         return TerrainBelief(candidate, known_probability, candidate, since_s, time_s)
-    return TerrainBelief(belief.terrain, belief.probability, candidate, since_s, time_s)
+    return belief._replace(candidate=candidate, since_s=since_s, received_s=time_s)
+
+
+def output_status(terrain: str, probability: float, settings: SwitchSettings = SWITCHING) -> OutputStatus:
+    """Return whether an output counts for its class.
+
+    Examples
+    --------
+    >>> output_status("grass", 0.9).label, output_status("grass", 0.3).label
+    ('accepted', 'below threshold')
+    """
+    enough = terrain != UNKNOWN and probability >= settings.probability_least  # False for NaN
+    return OutputStatus.ACCEPTED if enough else OutputStatus.BELOW_THRESHOLD
+
+
+def drive_on(
+    belief: TerrainBelief, speed_mps: float, dt_s: float, settings: SwitchSettings = SWITCHING
+) -> TerrainBelief:
+    """Return the belief after a time without an output; unknown where it was not confirmed for too long.
+
+    Parameters
+    ----------
+    belief : before
+    speed_mps : desired circumferential speed of the fastest wheel; below :data:`DRIVING_MPS` no time counts,
+        as no windows come
+    dt_s : time; nothing counts where it is not above zero
+    settings : of ``unconfirmed_max_s``
+
+    Examples
+    --------
+    >>> grass = TerrainBelief("grass", 0.9, "grass", 0.0, 2.0)
+    >>> drive_on(grass, 1.0, 9.0).terrain, drive_on(grass, 1.0, 11.0).terrain
+    ('grass', '')
+    >>> drive_on(grass, 0.0, 11.0).terrain
+    'grass'
+    """
+    if belief.terrain == UNKNOWN or not (speed_mps >= DRIVING_MPS and dt_s > 0.0):
+        return belief
+    unconfirmed_s = belief.unconfirmed_s + dt_s
+    if unconfirmed_s > settings.unconfirmed_max_s:
+        return TerrainBelief(received_s=belief.received_s)
+    return belief._replace(unconfirmed_s=unconfirmed_s)
 
 
 def approach(now: float, desired: float, rate: float, dt_s: float) -> float:

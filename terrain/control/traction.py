@@ -59,13 +59,17 @@ MAX_STEP_S = 0.5
 
 
 class TractionStatus(StatusCode):
-    """Whether a correction is made, or why not: slip too uncertain, too old or unknown, or a bad clock."""
+    """Whether a correction is made, or why not.
+
+    Slip too uncertain, too old or unknown, a bad clock, or a sensor that is not to be believed.
+    """
 
     OK = 0
     UNCERTAIN = 1
     STALE = 2
     NO_SLIP = 3
     BAD_TIME = 4
+    UNSOUND = 5
 
 
 class TractionReport(NamedTuple):
@@ -112,6 +116,7 @@ _JUDGED = 1.5  # of the launch speed: slower, what is corrected is a speed, and 
 _GRIP = 0.03  # up to this slip wheels work against each other; ground that yields by twice as much lets them
 _SLOWEST_WHEEL_RATIO = 0.3  # of the fastest: a slower wheel, near the turning centre, is not used for q
 _BRAKE_END_MPS = 0.05  # slower than that, stopping is a matter of a wheel's turn
+_BRAKE_LONGEST, _BRAKE_SPARE_S = 1.3, 0.3  # of the time that the planned deceleration takes: then wheels lock
 _BRAKE_MPS2 = 0.5  # a command that falls faster than the resistances slow the robot is a braking
 
 (
@@ -239,7 +244,9 @@ def _driven_speed(
     else:
         driven = desired
         after[_HELD] = 0.0
-        if drive_state == DriveState.BRAKING.value and target.braking_mps2 > 0.0:
+        stops_in_s = state[_BRAKED_FROM] / max(target.braking_mps2, 1e-6)
+        overdue = state[_BRAKING] > _BRAKE_LONGEST * stops_in_s + _BRAKE_SPARE_S
+        if drive_state == DriveState.BRAKING.value and target.braking_mps2 > 0.0 and not overdue:
             braking_s = state[_BRAKING] + dt_s
             ahead = seen.ground_mps - target.braking_mps2 * min(braking_s, settings.brake_lead_s)
             charge = settings.charge_mps_per_mps2 * math.exp(-braking_s / settings.charge_time_s)

@@ -42,7 +42,7 @@ class TractionSettings(NamedTuple):
     droop_radps_per_nm: float = 0.02
     droop_max_ratio: float = 0.1
     droop_time_s: float = 1.5
-    std_max_ratio: float = 0.02
+    std_max_ratio: float = 0.025
     stale_max_s: float = 3.0
     brake_lead_s: float = 0.15
     charge_mps_per_mps2: float = 0.0

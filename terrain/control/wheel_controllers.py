@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from typing import NamedTuple, Protocol
 
 import numpy as np
+from numba import njit
 
 from terrain.control.danzi_pid import new_state, thesis_settings, thesis_step
 from terrain.control.pid import Gains
@@ -30,7 +31,7 @@ from terrain.control.traction_settings import (
     check_settings,
     with_motor_driver,
 )
-from terrain.estimation.live.estimator import LiveEstimate
+from terrain.estimation.live.estimate import LiveEstimate
 from terrain.kinematics.wheel_velocity import in_wheel_frame, point_velocity
 from terrain.records import Array, SlipTarget
 from terrain.robots import Robot
@@ -136,26 +137,55 @@ class WheelObserver:
         if estimate is None:
             return UNOBSERVED
         stale_s = estimate_age(estimate, time_s)
-        steer = estimate.mean[self._steer_states]
-        cos, sin = np.cos(steer), np.sin(steer)
-        forward, left = point_velocity(
-            estimate.speed_x_mps, estimate.speed_y_mps, estimate.yaw_rate_radps, self._x_m, self._y_m
+        motion = (estimate.speed_x_mps, estimate.speed_y_mps, estimate.yaw_rate_radps)
+        found = np.empty((5, 3))
+        _observe_wheels(
+            estimate.mean[self._steer_states],
+            motion,
+            (estimate.accel_x_mps2, estimate.accel_y_mps2),
+            self._x_m,
+            self._y_m,
+            estimate.wheel_speed_mps,
+            estimate.slip_ratio,
+            estimate.slip_std,
+            math.isinf(stale_s),
+            found,
         )
-        speed, _ = in_wheel_frame(forward, left, cos, sin)
-        accel = estimate.accel_x_mps2 * cos + estimate.accel_y_mps2 * sin
-        fastest = np.maximum(np.abs(estimate.wheel_speed_mps), np.abs(speed))
-        # a wheel stands by the filter's rate, which differs a little from the measured one
-        standing = fastest < np.where(np.isnan(estimate.slip_ratio), 2.0, 1.0) * MIN_SPEED_MPS
-        slip = np.where(standing & ~math.isinf(stale_s), 0.0, estimate.slip_ratio)
-        std = np.where(standing, 0.0, estimate.slip_std)
-        torque = estimate.current_a * self._torque_per_amp_nm
-        chassis_mps = math.hypot(estimate.speed_x_mps, estimate.speed_y_mps)
+        found[4] = estimate.current_a * self._torque_per_amp_nm
         return Observation(
-            WheelMeasurements(speed, accel, slip, std, torque),
+            WheelMeasurements(*found),
             estimate.wheel_speed_mps / self._radius_m,
-            chassis_mps,
+            math.hypot(motion[0], motion[1]),
             stale_s,
         )
+
+
+@njit(cache=True, error_model="numpy")
+def _observe_wheels(  # noqa: PLR0913 - a kernel takes its arrays one by one
+    steer_rad: Array,
+    motion: tuple[float, float, float],
+    accel_mps2: tuple[float, float],
+    x_m: Array,
+    y_m: Array,
+    wheel_speed_mps: Array,
+    slip_ratio: Array,
+    slip_std: Array,
+    never_seen: bool,
+    found: Array,
+) -> None:
+    """Write speed, acceleration, slip and its standard deviation (4, wheels) along each wheel."""
+    for i in range(steer_rad.size):
+        cos, sin = math.cos(steer_rad[i]), math.sin(steer_rad[i])
+        forward, left = point_velocity(motion[0], motion[1], motion[2], x_m[i], y_m[i])
+        speed, _ = in_wheel_frame(forward, left, cos, sin)
+        fastest = abs(speed)
+        if not abs(wheel_speed_mps[i]) <= fastest:  # NaN too
+            fastest = abs(wheel_speed_mps[i])
+        # a wheel stands by the filter's rate, which differs a little from the measured one
+        standing = fastest < (2.0 if math.isnan(slip_ratio[i]) else 1.0) * MIN_SPEED_MPS
+        found[0, i], found[1, i] = speed, accel_mps2[0] * cos + accel_mps2[1] * sin
+        found[2, i] = 0.0 if standing and not never_seen else slip_ratio[i]
+        found[3, i] = 0.0 if standing else slip_std[i]
 
 
 UNOBSERVED = Observation(

@@ -12,14 +12,16 @@ from terrain.errors import ConfigError
 from terrain.estimation.ekf.filter import run_filter
 from terrain.estimation.ekf.innovations import Innovations, innovations
 from terrain.estimation.ekf.model import GATE_PROBABILITY, REOPEN_AFTER_S, FilterModel, FilterSettings, Noise
-from terrain.estimation.filters.skid import make_skid_filter, skid_noise
+from terrain.estimation.filters.skid import make_skid_filter, skid_noise, within_bounds
 from terrain.estimation.filters.swerve import make_filter
-from terrain.estimation.filters.swerve_noise import default_noise, thesis_noise
+from terrain.estimation.filters.swerve_noise import default_noise, scheduled, thesis_noise
 from terrain.estimation.measurements.batch import measurement_table
 from terrain.estimation.measurements.heading import gnss_heading
+from terrain.estimation.measurements.skid_rows import WHEELS_AND_GYRO
 from terrain.estimation.measurements.table import GNSS_ROWS, MeasurementTable
 from terrain.estimation.reference import true_states
 from terrain.estimation.slip_figures import SlipFigures, slip_figures
+from terrain.estimation.stuck import motion_track
 from terrain.estimation.wheel_slip import blind_slip, wheel_slip
 from terrain.extension import check_corrected, correct
 from terrain.records import Array, RunLog, SlipTrack, StateTrack
@@ -80,7 +82,22 @@ class Estimate:
     @property
     def innovations(self) -> Innovations:
         """Measurement minus prediction at each instant."""
-        return innovations(self.model, self.noise, self.track, self.table.columns(self.model.rows))
+        inputs = np.nan_to_num(self.table.columns(self.model.inputs))
+        z = self.table.columns(self.model.rows)
+        return innovations(self.model, self.noise, self.track, z, inputs=inputs)
+
+    @property
+    def motion(self) -> Array | None:
+        """The :class:`~terrain.estimation.stuck.Motion` (n,) at each instant; None of robots that steer."""
+        if self.name != "skid":
+            return None
+        return motion_track(
+            self.track.time_s,
+            self.table.columns(WHEELS_AND_GYRO),
+            self.track.state("yaw_rate_radps"),
+            self.track.std("gyro_bias_radps"),
+            self.robot.track_m,
+        )
 
     @property
     def observable(self) -> bool:
@@ -169,9 +186,15 @@ def filter_run(
             table = replace(found.table, dropped={**found.table.dropped, **unused})
             return replace(found, table=table)
         table = measurement_table(run, robot, ema_alpha=ema_alpha, initial_yaw_rad=yaw_rad)
-    noise = _with_gnss_variance(noise or usual, model, table)
+    physical = noise is None and tuning == "physical"
+    noise, inputs = _with_gnss_variance(noise or usual, model, table), None
+    if physical:
+        noise, inputs = scheduled(model, noise, table)
     settings = FilterSettings(1.0 if tuning == "thesis" else GATE_PROBABILITY, REOPEN_AFTER_S)
-    track = run_filter(model, noise, table.time_s, table.columns(model.rows), settings)
+    track = run_filter(model, noise, table.time_s, table.columns(model.rows), settings, inputs)
+    if name == "skid":
+        track = replace(track, mean=within_bounds(track.mean, robot.track_m))
+    noise = noise.at(np.searchsorted(table.time_s, track.time_s))
     table = table.at(track.time_s)
     slip, blind = wheel_slip(track, table, robot), blind_slip(track, table, robot)
     figures = slip_figures(

@@ -8,6 +8,7 @@ would count 5 cm/s of known delay as an error.
 from __future__ import annotations
 
 import numpy as np
+from scipy.integrate import cumulative_trapezoid
 
 from terrain.errors import DataError
 from terrain.estimation.measurements.resampling import low_pass
@@ -93,6 +94,9 @@ def _true_state(truth: Stream, state: str, robot: Robot, initial_yaw_rad: float)
     if state == "gyro_bias_radps" and "gyro_bias_z_radps" in truth.channels:
         offset = robot.completed.sensors.gyro_bias_z_radps
         return np.asarray(truth.channel("gyro_bias_z_radps") - offset)
+    if state == "imu_yaw_offset_rad" and "gyro_bias_z_radps" in truth.channels:
+        bias = truth.channel("gyro_bias_z_radps") - robot.completed.sensors.gyro_bias_z_radps
+        return np.asarray(cumulative_trapezoid(bias, truth.time_s, initial=0.0))
     if state.startswith("slip_speed_"):
         wheel_speed, along = wheel_and_ground_speed(truth, robot)
         wheel = state.split("_")[2]

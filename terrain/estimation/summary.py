@@ -11,6 +11,7 @@ import numpy as np
 from terrain.estimation.ekf.consistency import consistency_report, nees
 from terrain.estimation.estimate import Estimate
 from terrain.estimation.reference import true_slip_at
+from terrain.estimation.stuck import StuckInterval, motion_seconds, stuck_intervals
 from terrain.records import GATED, USED, Array, StateTrack
 
 JUDGED_STATES = ("speed_x_mps", "speed_y_mps", "yaw_rate_radps", "slip_speed_")
@@ -37,6 +38,9 @@ class EstimateSummary:
     speed_rmse_mps : of the speed over ground
     n_dropped, n_gated, dropped : samples left out, measurements rejected by a gate, and counts by kind
     finite : whether all states and covariances are finite
+    motion : time that the robot was at rest, moving, stuck, and neither is known; None of a filter that does
+        not judge it
+    stuck : when it was stuck, None as ``motion``
     """
 
     run_id: str
@@ -56,6 +60,8 @@ class EstimateSummary:
     n_gated: int
     dropped: Mapping[str, int]
     finite: bool
+    motion: Mapping[str, float] | None
+    stuck: tuple[StuckInterval, ...] | None
 
 
 def summarize(estimate: Estimate) -> EstimateSummary:
@@ -63,6 +69,7 @@ def summarize(estimate: Estimate) -> EstimateSummary:
     track, slip, figures = estimate.track, estimate.slip, estimate.figures
     steps_s = np.diff(track.time_s, append=track.time_s[-1:])
     true_slip = true_slip_at(estimate.run, estimate.robot, track.time_s)
+    motion = estimate.motion
     n_refused = sum(n for kind, n in track.dropped.items() if not kind.endswith(" gated"))
     return EstimateSummary(
         run_id=estimate.run.run_id,
@@ -85,6 +92,8 @@ def summarize(estimate: Estimate) -> EstimateSummary:
         n_gated=int((track.use == GATED).sum()),
         dropped={**estimate.table.dropped, **track.dropped},
         finite=bool(np.isfinite(track.mean).all() and np.isfinite(track.cov).all()),
+        motion=None if motion is None else motion_seconds(track.time_s, motion),
+        stuck=None if motion is None else stuck_intervals(track.time_s, motion),
     )
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 
 COMMANDS = (
     *("import", "inspect", "simulate", "calibrate", "estimate", "crossval", "train", "predict"),
-    *("learn-slip", "drive", "explain", "explain-trials", "quickstart", "reproduce"),
+    *("learn-slip", "drive", "faults", "explain", "explain-trials", "quickstart", "reproduce"),
 )
 
 
@@ -170,6 +170,14 @@ CASES: tuple[Case, ...] = (
             "--effect effective_track=0.3 --effect wheel_radius=0.02 --out husky",
             "simulate --robot agrimaro --terrain clay --scenario arc --duration 12 "
             "--effect camera_latency=0.1 --effect payload=0.3 --out arc",
+        ),
+    ),
+    Case(
+        "faults",
+        steps(
+            "faults --faults loss_odometry,late_30ms_imu --situations steady --durations 3 --seed 3 --jobs 1 "
+            "--out page",
+            refused("faults --faults broken"),
         ),
     ),
     Case(

@@ -9,7 +9,8 @@ import time
 import numpy as np
 import pytest
 
-from pipelines.live.pilot import LivePilot, PilotSettings
+from pipelines.live.pilot import LivePilot
+from pipelines.live.pilot_settings import PilotSettings
 from terrain.control.danzi_pid import new_state, thesis_settings, thesis_step
 from terrain.control.pid import Gains
 from terrain.control.traction import initial_state, traction_step

@@ -279,9 +279,9 @@ def start_of_a_run(slip, camera_s=0.0):
     t = np.arange(800) / 200
     seen = np.interp(t - 0.006, fine, lagged(speed, camera_s) if camera_s else speed)
     seen = np.column_stack([seen, 0 * t]) + 0.001 * rng.standard_normal((t.size, 2))
-    zero = np.zeros(t.size)
+    zero, attitude = np.zeros(t.size), 1e-5 * rng.standard_normal((t.size, 3))
     pose = odometry_stream(
-        t, np.zeros((t.size, 2)), np.zeros((t.size, 3)), np.column_stack([seen, zero]), ROBOT.camera, 0.0
+        t, np.zeros((t.size, 2)), attitude, np.column_stack([seen, zero]), ROBOT.camera, 0.0
     )
     return RunLog("start", "agrimaro", {"wheels": wheels, "odometry": pose})
 

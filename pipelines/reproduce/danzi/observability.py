@@ -42,18 +42,18 @@ def straight_line_rank(name: str, robot: Robot, as_printed: bool = False) -> Obs
     """
     model = make_filter(name, robot)
     n = len(model.states)
-    x = np.zeros(n)
+    x, params = np.zeros(n), np.append(model.params, np.zeros(len(model.inputs)))
     x[model.states.index("speed_x_mps")] = SPEED_MPS
     x[[state.startswith("slip_") for state in model.states]] = SLIP_RATIO
     since_start, blocks = np.eye(n), []
     for _ in range(n):
         expected, h = np.zeros(len(model.rows)), np.zeros((len(model.rows), n))
-        model.observe(x, model.params.copy(), expected, h)
+        model.observe(x, params, expected, h)
         if as_printed:
             h[3:5] = _printed_acceleration_rows(model.states, x)
         blocks.append(h @ since_start)
         after, f = np.zeros(n), np.zeros((n, n))
-        model.propagate(x, THESIS_SAMPLE_TIME_S, model.params.copy(), after, f)
+        model.propagate(x, THESIS_SAMPLE_TIME_S, params, after, f)
         since_start, x = f @ since_start, after
     return ObservableStates(int(np.linalg.matrix_rank(np.vstack(blocks))), n - len(model.positions))
 

@@ -165,7 +165,8 @@ def sample_from_model(
         np.array([name in model.angle_states for name in model.states], dtype=np.bool_),
         np.array([name in model.angle_rows for name in model.rows], dtype=np.bool_),
     )
-    truth = _draw(model.propagate, model.observe, model.params.copy(), is_angle, dt_s, x, walk, z)
+    params = np.append(model.params, np.zeros(len(model.inputs)))
+    truth = _draw(model.propagate, model.observe, params, is_angle, dt_s, x, walk, z)
     return np.arange(n) * dt_s, truth, z
 
 

@@ -24,7 +24,15 @@ import numpy as np
 
 from terrain.errors import DataError
 from terrain.estimation.ekf.kernel import LIKELIHOOD, run
-from terrain.estimation.ekf.model import DEFAULT_SETTINGS, UNGATED, FilterModel, FilterSettings, Noise
+from terrain.estimation.ekf.model import (
+    DEFAULT_SETTINGS,
+    NOTHING_GIVEN,
+    UNGATED,
+    FilterModel,
+    FilterSettings,
+    Given,
+    Noise,
+)
 from terrain.estimation.ekf.state import (
     SLACK_S,
     Columns,
@@ -46,7 +54,7 @@ def filter_step(
     time_s: float,
     z: Array,
     settings: FilterSettings = DEFAULT_SETTINGS,
-    measurement_variance: Array | None = None,
+    given: Given = NOTHING_GIVEN,
 ) -> FilterState:
     """Return the state after one sample; sample by sample a log gives what it gives at once, bit for bit.
 
@@ -56,7 +64,7 @@ def filter_step(
     state : of the sample before, or :func:`initial_state`; it is not changed
     time_s : stamp of the sample; the first one starts the clock
     z : (m,) measurements, NaN where there is none
-    measurement_variance : (m,) of this sample; that of ``noise`` without
+    given : what is known of this sample beside its measurements
 
     Returns
     -------
@@ -69,11 +77,10 @@ def filter_step(
     DataError
         where z or the variance has the wrong length.
     """
-    r = noise.measurement_variance if measurement_variance is None else np.asarray(measurement_variance)
-    memory = memory_of(state)
-    columns = _feed(
-        model, noise, settings, np.array([time_s], dtype=np.float64), np.asarray(z)[None], r, memory
-    )
+    if given.measurement_variance is None:
+        given = given._replace(measurement_variance=noise.measurement_variance)
+    memory, stamp_s = memory_of(state), np.array([time_s], dtype=np.float64)
+    columns = _feed(model, noise, settings, stamp_s, np.asarray(z)[None], given, memory)
     for array in (*memory, *columns):
         array.flags.writeable = False
     seen_s, pending_s, age_s, likelihood = memory.clock.tolist()
@@ -99,6 +106,7 @@ def run_filter(
     time_s: Array,
     z: Array,
     settings: FilterSettings = DEFAULT_SETTINGS,
+    inputs: Array | None = None,
 ) -> StateTrack:
     """Filter a whole log.
 
@@ -109,6 +117,7 @@ def run_filter(
     time_s : (n,) stamps, at any spacing
     z : (n, m) measurements, NaN where there is none
     settings : gates and gaps
+    inputs : (n, k) of the step up to each sample; zeros without
 
     Returns
     -------
@@ -132,7 +141,8 @@ def run_filter(
     """
     stamps = np.array(time_s, dtype=np.float64)
     memory = memory_of(initial_state(model, noise))
-    columns = _feed(model, noise, settings, stamps, z, noise.measurement_variance, memory)
+    given = Given(noise.measurement_variance, noise.walk_variance, inputs)
+    columns = _feed(model, noise, settings, stamps, z, given, memory)
     reached = np.maximum.accumulate(np.where(columns.taken, stamps, -np.inf))
     shown = columns.taken & (stamps > np.append(-np.inf, reached[:-1])[: stamps.size])
     dropped = dropped_counts(model.sensor_names, memory.counts)
@@ -167,7 +177,8 @@ def log_likelihood(
     """Return the log likelihood of a log without keeping its track; everything is believed by default."""
     memory = memory_of(initial_state(model, noise))
     stamps = np.array(time_s, dtype=np.float64)
-    _feed(model, noise, settings, stamps, z, noise.measurement_variance, memory, keep=False)
+    given = Given(noise.measurement_variance, noise.walk_variance)
+    _feed(model, noise, settings, stamps, z, given, memory, keep=False)
     return float(memory.clock[LIKELIHOOD])
 
 
@@ -177,7 +188,7 @@ def _feed(
     settings: FilterSettings,
     stamps: Array,
     z: Array,
-    r: Array,
+    given: Given,
     memory: Memory,
     *,
     keep: bool = True,
@@ -186,14 +197,21 @@ def _feed(
     matrices = matrices_of(model, noise)
     n, k, d, m = len(stamps), len(model.sensors), len(model.states), len(model.rows)
     values = np.array(z, dtype=np.float64, order="C")
-    variance = np.array(np.atleast_2d(r), dtype=np.float64, order="C")
-    for name, given, desired in (
+    variance, walks, inputs = (
+        np.zeros((1, columns))
+        if array is None
+        else np.array(np.atleast_2d(array), dtype=np.float64, order="C")
+        for array, columns in zip(given, (m, d, len(model.inputs)), strict=True)
+    )
+    for name, shape, desired in (
         ("time_s", stamps.shape, [(n,)]),
         ("z", values.shape, [(n, m)]),
         ("measurement_variance", variance.shape, [(n, m), (1, m)]),
+        ("walk_variance", walks.shape, [(n, d), (1, d)]),
+        ("inputs", inputs.shape, [(n, len(model.inputs)), (1, len(model.inputs))]),
     ):
-        if given not in desired:
-            raise DataError(f"filter {model.name}: {name} has shape {given}, {desired[0]} is needed")
+        if shape not in desired:
+            raise DataError(f"filter {model.name}: {name} has shape {shape}, {desired[0]} is needed")
     rows = n if keep else 0
     columns = Columns(
         np.empty((rows, d)),
@@ -209,6 +227,8 @@ def _feed(
         *matrices,
         gate_thresholds(model, settings),
         variance,
+        walks,
+        inputs,
         settings.reopen_after_s - SLACK_S,
         settings.max_gap_s + SLACK_S,
         stamps,

@@ -45,6 +45,9 @@ TIME, PENDING, AGE, LIKELIHOOD = range(4)
 """What is in the vector ``clock``: last stamp, stamp of a leap that is not believed yet, time since the speed
 over ground was measured, log likelihood."""
 
+HELD_S = 2.0
+"""A sensor that the model holds is not reopened before this time."""
+
 PER_ROW = ("time did not advance", "clock jump", "state numerical")
 PER_SENSOR = ("gated", "not finite", "numerical")
 """What is counted: the former once, then the latter for each sensor."""
@@ -81,8 +84,8 @@ def _read_stamp(time_s: float, clock: Array, max_gap_s: float, counts: Array) ->
     void(
         types.FunctionType(PROPAGATE),
         types.FunctionType(OBSERVE),
-        *(_VECTOR, _COUNTS, _COUNTS, _FLAGS, _FLAGS, _FLAGS, _FLAGS, _VECTOR, _MATRIX, _MATRIX, _VECTOR),
-        *(_MATRIX, float64, float64, _VECTOR, _MATRIX),
+        *(_VECTOR, _COUNTS, _COUNTS, _FLAGS, _FLAGS, _FLAGS, _FLAGS, _FLAGS, _VECTOR),
+        *(_MATRIX, _MATRIX, _VECTOR, _MATRIX, _MATRIX, _MATRIX, float64, float64, _VECTOR, _MATRIX),
         *(_VECTOR, _MATRIX, _VECTOR, _VECTOR, _COUNTS),
         *(_MATRIX, float64[:, :, ::1], _MATRIX, _SMALL, _SMALL, _VECTOR, _FLAGS),
     ),
@@ -96,6 +99,7 @@ def run(  # noqa: C901, PLR0913 - one loop: cut into functions a step takes 6.7 
     order: Array,
     starts: Array,
     is_reference: Array,
+    is_held: Array,
     is_angle_row: Array,
     is_angle_state: Array,
     is_position: Array,
@@ -104,6 +108,8 @@ def run(  # noqa: C901, PLR0913 - one loop: cut into functions a step takes 6.7 
     q: Array,
     thresholds: Array,
     variances: Array,
+    walks: Array,
+    inputs: Array,
     reopen_after_s: float,
     max_gap_s: float,
     stamps: Array,
@@ -136,6 +142,7 @@ def run(  # noqa: C901, PLR0913 - one loop: cut into functions a step takes 6.7 
     g, gain, left, step = np.zeros(d), np.zeros(d), np.zeros(d), np.zeros(d)
     uses, squares, dofs = np.zeros(n_sensors, np.int64), np.zeros(n_sensors), np.zeros(n_sensors, np.int64)
     keep = mean.shape[0] > 0
+    first_input = params.size - inputs.shape[1]
 
     for n in range(stamps.size):
         kind, dt = _read_stamp(stamps[n], clock, max_gap_s, counts)
@@ -145,9 +152,14 @@ def run(  # noqa: C901, PLR0913 - one loop: cut into functions a step takes 6.7 
 
         if kind == _STEP:
             copy(p, x, p_before, x_before)
+            at = n if inputs.shape[0] > 1 else 0
+            for i in range(inputs.shape[1]):
+                params[first_input + i] = inputs[at, i]
             predict(propagate, params, x, p, q, dt, x_next, f, fp, f_cols, n_f_cols)
+            at = n if walks.shape[0] > 1 else 0
             n_bad = 0
             for i in range(d):
+                p[i, i] += walks[at, i] * dt
                 n_bad += not ((abs(x_next[i]) <= LARGEST) & (p[i, i] > 0.0) & (p[i, i] <= WIDEST))
                 x[i] = x_next[i]
             if n_bad > 0:
@@ -216,7 +228,7 @@ def run(  # noqa: C901, PLR0913 - one loop: cut into functions a step takes 6.7 
                         use = _UNSOUND
                         break
                     rejected_s[k] = max(rejected_s[k], 0.0)
-                    if rejected_s[k] < reopen_after_s:
+                    if rejected_s[k] < (max(reopen_after_s, HELD_S) if is_held[k] else reopen_after_s):
                         use = GATED
                         break
                     use, threshold = REOPENED, np.inf

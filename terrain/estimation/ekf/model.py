@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -38,10 +38,13 @@ class FilterModel:
         (m, d) that are not zero.  Both are compiled with signatures of
         :mod:`terrain.estimation.ekf.kernel`, as ``@njit(PROPAGATE, cache=True)``: with an explicit one numba
         finds them again on disk
-    params : what the two functions need of the robot
+    params : what the two functions need of the robot; the inputs of a sample stand behind them
+    inputs : names of what is known of each step beside the state; 0 where it is not given
     initial_std : (d,) how little is known of each state where nothing is known
     initial_mean : (d,) zeros without
     references : sensors of the speed over ground
+    held : sensors that are not reopened before two seconds: those that fail, rather than show the ground's
+        doing
     positions : states that a gap in the data leaves where they were, with a covariance that grew
     angle_states : states that are wrapped to (-pi, pi]
     angle_rows : rows whose innovation is
@@ -62,7 +65,9 @@ class FilterModel:
     params: Array
     initial_std: Array
     initial_mean: Array = field(default_factory=lambda: np.zeros(0))
+    inputs: tuple[str, ...] = ()
     references: tuple[str, ...] = ()
+    held: tuple[str, ...] = ()
     positions: tuple[str, ...] = ()
     angle_states: tuple[str, ...] = ()
     angle_rows: tuple[str, ...] = ()
@@ -107,6 +112,7 @@ class FilterModel:
             raise ConfigError(f"{place}: its sensors must hold every row once; they hold {grouped}")
         for what, names, known in (
             ("references", self.references, self.sensor_names),
+            ("held", self.held, self.sensor_names),
             ("positions", self.positions, self.states),
             ("angle_states", self.angle_states, self.states),
             ("angle_rows", self.angle_rows, self.rows),
@@ -126,6 +132,7 @@ class FilterModel:
         starts = np.cumsum([0, *(len(rows) for _, rows in self.sensors)])
         marks = (
             (self.sensor_names, self.references),
+            (self.sensor_names, self.held),
             (self.rows, self.angle_rows),
             (self.states, self.angle_states),
             (self.states, self.positions),
@@ -133,7 +140,7 @@ class FilterModel:
         return (
             self.propagate,
             self.observe,
-            self.params.copy(),
+            np.append(self.params, np.zeros(len(self.inputs))),
             np.array(order, dtype=np.int64),
             starts.astype(np.int64),
             *(np.array([name in chosen for name in names], dtype=np.bool_) for names, chosen in marks),
@@ -151,6 +158,8 @@ class Noise:
     measurement_variance : (m,) of each row, or (n, m) where it changes from sample to sample (of a sample
         whose variance is NaN, zero or negative, the row is not used); rows are independent
     initial_variance : (d,) or (d, d); what the model says without
+    walk_variance : (n, d), **per second**, of each sample beside the process variance: for states that change
+        faster at times
 
     Raises
     ------
@@ -167,6 +176,7 @@ class Noise:
     process_variance: Array
     measurement_variance: Array
     initial_variance: Array | None = None
+    walk_variance: Array | None = None
 
     def __post_init__(self) -> None:
         process = _covariance("process_variance", self.process_variance)
@@ -174,6 +184,11 @@ class Noise:
         if self.initial_variance is not None:
             initial = _covariance("initial_variance", self.initial_variance, definite=True)
             object.__setattr__(self, "initial_variance", initial)
+        if self.walk_variance is not None:
+            walk = read_only(self.walk_variance)
+            object.__setattr__(self, "walk_variance", walk)
+            if walk.ndim != 2 or not ((walk >= 0) & (walk < np.inf)).all():
+                raise ConfigError("walk_variance must be (n, d), finite and not below zero")
         r = read_only(self.measurement_variance)
         object.__setattr__(self, "measurement_variance", r)
         if r.ndim not in (1, 2):
@@ -182,6 +197,34 @@ class Noise:
             raise ConfigError("measurement_variance is a matrix: rows are taken as independent, give (m,)")
         if r.ndim == 1 and not ((r > 0) & np.isfinite(r)).all():
             raise ConfigError(f"measurement_variance {r.tolist()} must be above zero and finite")
+
+    def at(self, samples: Array) -> Noise:
+        """Return the noise of some samples (k,) by number, where it changes from sample to sample."""
+        r, walk = self.measurement_variance, self.walk_variance
+        return Noise(
+            self.process_variance,
+            r[samples] if r.ndim == 2 else r,
+            self.initial_variance,
+            None if walk is None else walk[samples],
+        )
+
+
+class Given(NamedTuple):
+    """What is known of a sample, or of each of n, beside its measurements; None where that is nothing.
+
+    Parameters
+    ----------
+    measurement_variance : (m,) in place of that of the noise
+    walk_variance : (d,) per second up to the sample, beside the process variance
+    inputs : (k,) of the step up to the sample
+    """
+
+    measurement_variance: Array | None = None
+    walk_variance: Array | None = None
+    inputs: Array | None = None
+
+
+NOTHING_GIVEN = Given()
 
 
 def _covariance(what: str, given: Any, *, definite: bool = False) -> Array:
@@ -213,7 +256,8 @@ class FilterSettings:
     reopen_after_s : a sensor that was rejected all this time is believed once.  First the variance of the
         states to blame goes back to the initial one, or to what explains the measurement where that is more.
         To blame are those that it alone observes; without any, those that no sensor used before it in the
-        row observes; else all that it does
+        row observes; else all that it does.  A sensor that the model
+        holds takes two seconds at least
     max_gap_s : over a longer step nothing is integrated; a log sampled slower than that needs another value
 
     Raises

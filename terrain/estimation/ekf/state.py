@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -61,6 +61,22 @@ def initial_state(model: FilterModel, noise: Noise) -> FilterState:
         np.zeros(len(PER_ROW) + k * len(PER_SENSOR), np.int64),
         model.sensor_names,
     )
+
+
+def in_one(arrays: Sequence[Array]) -> tuple[Array, list[Array]]:
+    """Return one buffer that holds copies of arrays of one type, and the arrays as views of it.
+
+    Examples
+    --------
+    >>> buffer, (one, two) = in_one([np.zeros(2), np.ones((2, 2))])
+    >>> two[0, 1] = 5.0
+    >>> buffer.tolist()
+    [0.0, 0.0, 1.0, 5.0, 1.0, 1.0]
+    """
+    buffer = np.concatenate([np.ravel(array) for array in arrays])
+    ends = np.cumsum([np.size(array) for array in arrays])
+    parts = np.split(buffer, ends[:-1])
+    return buffer, [part.reshape(np.shape(array)) for part, array in zip(parts, arrays, strict=True)]
 
 
 class Memory(NamedTuple):

@@ -57,13 +57,15 @@ from terrain.estimation.filters.swerve_model import (
     observe_slip_speed,
     observe_without_slip,
     propagate,
+    propagate_slip_speed,
 )
-from terrain.estimation.measurements.table import CAMERA_ROWS, GNSS_ROWS
+from terrain.estimation.measurements.table import CAMERA_ROWS, DERIVED_ROWS, GNSS_ROWS
 from terrain.records import Array
 from terrain.robots import Robot, as_swerve
 
 _WHEELS = ("1", "2", "3")
 _FADING_PER_S = 3.0  # of the acceleration of vio15: a third of a second, shorter than a start and a stop
+_BIAS_FADING_PER_S = (2e-4, 8e-4)  # of gyro and accelerometer: with their walks, as uncertain as at first
 _POSITION = ("position_x_m", "position_y_m")
 MOTION = (
     *(*_POSITION, "yaw_rad", "speed_x_mps", "speed_y_mps", "yaw_rate_radps"),
@@ -71,28 +73,41 @@ MOTION = (
 )
 _STEER = tuple(f"steer_{i}_rad" for i in _WHEELS)
 _BIAS = ("gyro_bias_radps",)
+_ACCEL_BIAS = ("accel_bias_x_mps2", "accel_bias_y_mps2")
 
 
 class Layout(NamedTuple):
-    """States and measurement function of a filter, and whether it needs a camera."""
+    """States of a filter, process and measurement, whether it needs a camera, and held sensors."""
 
     states: tuple[str, ...]
-    observe: Any
+    functions: tuple[Any, Any]
     has_camera: bool
+    held: tuple[str, ...] = ()
 
 
+GROWTH_INPUTS = tuple(f"wheel_{i}_growth_per_s" for i in _WHEELS)
+_SLIP_SPEED = tuple(f"slip_speed_{i}_mps" for i in _WHEELS)
+_HELD = ("camera_yaw_rate", "camera_yaw", "gyro", "camera_speed", "accel", "rest")
+
+_WITHOUT_SLIP = (propagate, observe_without_slip)
+_SLIP_RATIO = (propagate, observe_slip_ratio)
+_WITH_SLIP_SPEED = (propagate_slip_speed, observe_slip_speed)
 LAYOUTS = {
-    "encoder12": Layout((*MOTION, *_STEER, *_BIAS), observe_without_slip, False),
-    "slip14": Layout((*MOTION, *(f"slip_{i}_ratio" for i in _WHEELS), *_STEER), observe_slip_ratio, False),
-    "vio12": Layout((*MOTION, *_STEER, *_BIAS), observe_without_slip, True),
+    "encoder12": Layout((*MOTION, *_STEER, *_BIAS), _WITHOUT_SLIP, False),
+    "slip14": Layout((*MOTION, *(f"slip_{i}_ratio" for i in _WHEELS), *_STEER), _SLIP_RATIO, False),
+    "vio12": Layout((*MOTION, *_STEER, *_BIAS), _WITHOUT_SLIP, True),
     "vio15": Layout(
-        (*MOTION, *_STEER, *_BIAS, *(f"slip_speed_{i}_mps" for i in _WHEELS)), observe_slip_speed, True
+        (*MOTION, *_STEER, *_BIAS, *_SLIP_SPEED, "imu_yaw_offset_rad", *_ACCEL_BIAS),
+        _WITH_SLIP_SPEED,
+        True,
+        _HELD,
     ),
 }
 
 FILTERS = tuple(LAYOUTS)
 """Names of the filters."""
 
+REST_ROWS = DERIVED_ROWS[-3:]
 _ROWS = (
     *(f"wheel_{i}_radps" for i in _WHEELS),
     *("accel_x_mps2", "accel_y_mps2", "gyro_z_radps", "imu_yaw_rad"),
@@ -111,6 +126,7 @@ _SENSORS = {
     "accel": ("accel_x_mps2", "accel_y_mps2"),
     **{f"steer_{i}": (f"steer_{i}_rad",) for i in _WHEELS},
     **{f"wheel_{i}": (f"wheel_{i}_radps",) for i in _WHEELS},
+    "rest": REST_ROWS,
 }
 _REFERENCES = ("camera_speed", "gnss_speed")
 _ANGLES = ("yaw_rad", *_STEER, "imu_yaw_rad", "camera_yaw_rad")
@@ -139,24 +155,27 @@ def make_filter(
     >>> from terrain.robots import load_robot
     >>> model = make_filter("vio15", load_robot("agrimaro"))
     >>> len(model.states), len(model.rows), model.references
-    (15, 14, ('camera_speed',))
+    (18, 17, ('camera_speed',))
     """
     layout = layout_of(name, robot)
     lever_m = (robot.camera.lever_x_m, robot.camera.lever_y_m) if layout.has_camera else (0.0, 0.0)
     rows = rows_of(name, with_gnss)
     sensors = tuple((sensor, group) for sensor, group in _SENSORS.items() if group[0] in rows)
     has = (float(layout.has_camera), float(with_gnss))
+    fading = (_FADING_PER_S, *_BIAS_FADING_PER_S) if name == "vio15" else (0.0,) * 3
     places_m = (*robot.wheel_positions_m.ravel(), *lever_m, *antenna_m)
     return FilterModel(
         name=f"{name} with GNSS" if with_gnss else name,
         states=layout.states,
         rows=rows,
         sensors=sensors,
-        propagate=propagate,
-        observe=layout.observe,
-        params=np.array([robot.wheel_radius_m, *places_m, *has, _FADING_PER_S if name == "vio15" else 0.0]),
+        propagate=layout.functions[0],
+        observe=layout.functions[1],
+        inputs=GROWTH_INPUTS if name == "vio15" else (),
+        params=np.array([robot.wheel_radius_m, *places_m, *has, *fading]),
         initial_std=initial_std(name, with_gnss),
         references=tuple(sensor for sensor, _ in sensors if sensor in _REFERENCES),
+        held=tuple(sensor for sensor, _ in sensors if sensor in layout.held),
         positions=_POSITION,
         angle_states=tuple(state for state in layout.states if state in _ANGLES),
         angle_rows=tuple(row for row in rows if row in _ANGLES),
@@ -174,8 +193,9 @@ def layout_of(name: str, robot: Robot) -> Layout:
 
 
 def rows_of(name: str, with_gnss: bool) -> tuple[str, ...]:
-    """Return the rows in the order of (6.3)."""
-    return (*_ROWS, *CAMERA_ROWS * LAYOUTS[name].has_camera, *GNSS_ROWS * with_gnss)
+    """Return the rows in the order of (6.3), and rest."""
+    has_camera = LAYOUTS[name].has_camera
+    return (*_ROWS, *CAMERA_ROWS * has_camera, *REST_ROWS * (name == "vio15"), *GNSS_ROWS * with_gnss)
 
 
 # Standard deviations by name without axis and wheel: of what is known of a robot that was just switched on,
@@ -189,6 +209,8 @@ _INITIAL_STD = {
     "gyro_bias_radps": 0.01,
     "slip_ratio": 0.3,
     "slip_speed_mps": 0.2,
+    "imu_yaw_offset_rad": 0.01,
+    "accel_bias_mps2": 0.05,
 }
 _SITE_STD_M = 100.0
 

@@ -17,12 +17,15 @@ from terrain.records import Array
 LARGEST_SLIP_RATIO = 0.95
 """slip14's wheel row has a pole at 1: it is evaluated no nearer."""
 
-# Places in `params`: radius, places of the wheels, of camera and antenna, which of the latter there are, and
-# how fast an acceleration fades, in 1/s.
+# Places in `params`: radius, places of the wheels, of camera and antenna, which of the latter there are, how
+# fast acceleration, gyro bias and accelerometer biases fade, in 1/s, and
+# as inputs the growth of each wheel's speed, in 1/s.
 _RADIUS, _WHEELS, _CAMERA_X, _CAMERA_Y, _ANTENNA_X, _ANTENNA_Y = 0, 1, 7, 8, 9, 10
-_HAS_CAMERA, _HAS_GNSS, _FADING = 11, 12, 13
-# Places in the state that all filters share.
+_HAS_CAMERA, _HAS_GNSS, _FADING, _BIAS_FADING, _ACCEL_BIAS_FADING = range(11, 16)
+_GROWTH = 16
+# Places in the state that all filters share, and those of vio15.
 _X, _Y, _YAW, _VX, _VY, _W, _AX, _AY = range(8)
+_STEER, _BIAS, _SLIP, _OFFSET, _ACCEL_BIAS = 8, 11, 12, 15, 16
 
 
 @njit(PROPAGATE, cache=True)
@@ -49,6 +52,26 @@ def propagate(x: Array, dt: float, params: Array, x_next: Array, f: Array) -> No
     f[_VY, _AY], f[_VY, _W], f[_VY, _VX] = dt, -dt * x[_VX], -dt * x[_W]
 
 
+@njit(PROPAGATE, cache=True)
+def propagate_slip_speed(x: Array, dt: float, params: Array, x_next: Array, f: Array) -> None:
+    """vio15: slip speeds grow as their wheels' speeds, biases fade, the gyro's moves the IMU's yaw."""
+    propagate(x, dt, params, x_next, f)
+    for state, fading in (
+        (_BIAS, params[_BIAS_FADING]),
+        (_ACCEL_BIAS, params[_ACCEL_BIAS_FADING]),
+        (_ACCEL_BIAS + 1, params[_ACCEL_BIAS_FADING]),
+    ):
+        left = math.exp(-dt * fading)
+        x_next[state] = left * x[state]
+        f[state, state] = left
+    x_next[_OFFSET] += dt * x[_BIAS]
+    f[_OFFSET, _BIAS] = dt
+    for i in range(3):
+        grown = math.exp(dt * params[_GROWTH + i])
+        x_next[_SLIP + i] = grown * x[_SLIP + i]
+        f[_SLIP + i, _SLIP + i] = grown
+
+
 @njit(cache=True)
 def _observe_wheel(
     x: Array, params: Array, wheel: int, steer: int, scale: float, z_hat: Array, h: Array
@@ -71,8 +94,10 @@ def _observe_direct(z_hat: Array, h: Array, row: int, x: Array, state: int) -> N
 
 
 @njit(cache=True)
-def _observe_body(x: Array, params: Array, steer: int, bias: int, z_hat: Array, h: Array) -> None:
-    """All rows but those of the wheels; `bias` is negative where the filter has none."""
+def _observe_body(
+    x: Array, params: Array, steer: int, bias: int, at_rest: bool, z_hat: Array, h: Array
+) -> None:
+    """All rows but those of the wheels; `bias` is negative without one, `at_rest` says that of vio15."""
     _observe_direct(z_hat, h, 3, x, _AX)
     _observe_direct(z_hat, h, 4, x, _AY)
     _observe_direct(z_hat, h, 5, x, _W)
@@ -91,6 +116,11 @@ def _observe_body(x: Array, params: Array, steer: int, bias: int, z_hat: Array, 
         _observe_direct(z_hat, h, row + 2, x, _W)
         _observe_direct(z_hat, h, row + 3, x, _YAW)
         row += 4
+    if at_rest:
+        _observe_direct(z_hat, h, row, x, _VX)
+        _observe_direct(z_hat, h, row + 1, x, _VY)
+        _observe_direct(z_hat, h, row + 2, x, _W)
+        row += 3
     if params[_HAS_GNSS] > 0.0:
         _observe_gnss(x, params[_ANTENNA_X], params[_ANTENNA_Y], row, z_hat, h)
 
@@ -115,7 +145,7 @@ def observe_without_slip(x: Array, params: Array, z_hat: Array, h: Array) -> Non
     """(4.48) and (6.6): 12 states."""
     for i in range(3):
         _observe_wheel(x, params, i, 8 + i, 1.0 / params[_RADIUS], z_hat, h)
-    _observe_body(x, params, 8, 11, z_hat, h)
+    _observe_body(x, params, 8, 11, False, z_hat, h)
 
 
 @njit(OBSERVE, cache=True)
@@ -125,14 +155,19 @@ def observe_slip_ratio(x: Array, params: Array, z_hat: Array, h: Array) -> None:
         left = 1.0 - min(x[8 + i], LARGEST_SLIP_RATIO)
         _observe_wheel(x, params, i, 11 + i, 1.0 / (params[_RADIUS] * left), z_hat, h)
         h[i, 8 + i] = z_hat[i] / left
-    _observe_body(x, params, 11, -1, z_hat, h)
+    _observe_body(x, params, 11, -1, False, z_hat, h)
 
 
 @njit(OBSERVE, cache=True)
 def observe_slip_speed(x: Array, params: Array, z_hat: Array, h: Array) -> None:
-    """15 states."""
+    """vio15: slip speeds, and the offset of the IMU's yaw."""
     for i in range(3):
-        _observe_wheel(x, params, i, 8 + i, 1.0 / params[_RADIUS], z_hat, h)
-        z_hat[i] += x[12 + i] / params[_RADIUS]
-        h[i, 12 + i] = 1.0 / params[_RADIUS]
-    _observe_body(x, params, 8, 11, z_hat, h)
+        _observe_wheel(x, params, i, _STEER + i, 1.0 / params[_RADIUS], z_hat, h)
+        z_hat[i] += x[_SLIP + i] / params[_RADIUS]
+        h[i, _SLIP + i] = 1.0 / params[_RADIUS]
+    _observe_body(x, params, _STEER, _BIAS, True, z_hat, h)
+    z_hat[6] += x[_OFFSET]
+    h[6, _OFFSET] = 1.0
+    for i in range(2):
+        z_hat[3 + i] += x[_ACCEL_BIAS + i]
+        h[3 + i, _ACCEL_BIAS + i] = 1.0

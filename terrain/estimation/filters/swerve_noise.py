@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
+from numba import njit
 
 from terrain.errors import ConfigError
-from terrain.estimation.ekf.model import Noise
+from terrain.estimation.ekf.model import FilterModel, Given, Noise
 from terrain.estimation.filters.swerve import LAYOUTS, MOTION, initial_std, kind_of, layout_of, rows_of
+from terrain.estimation.measurements.table import DERIVED_ROWS, ROWS_OF_DRIVE, MeasurementTable
+from terrain.records import Array
 from terrain.robots import Robot
 
 # of how far a state walks within a second,
@@ -22,12 +27,14 @@ _WALK_STD = {
     "gyro_bias_radps": 2e-4,
     "slip_ratio": 0.05,
     "slip_speed_mps": 0.03,
+    "imu_yaw_offset_rad": 5e-4,
+    "accel_bias_mps2": 2e-3,
 }
 # and of what a sample scatters by on a robot that moves, with vibration and delays.  Chosen on simulated runs
 # so that the errors of vio15 are on average those that it states; likelihood is no guide where a low-pass
 # colours the noise of every sensor.
 _SAMPLE_STD = {
-    "accel_mps2": 0.7,
+    "accel_mps2": 0.1,
     "gyro_z_radps": 0.01,
     "imu_yaw_rad": 0.05,
     "steer_rad": 0.003,
@@ -36,6 +43,8 @@ _SAMPLE_STD = {
     "camera_yaw_rad": 0.005,
     "gnss_position_m": 0.02,
     "gnss_speed_mps": 0.03,
+    "rest_speed_mps": 0.005,
+    "rest_yaw_rate_radps": 0.002,
 }
 _WHEEL_SPEED_STD_MPS = 0.007  # circumferential speed of a wheel, mostly the ripple of the Hall steps
 _SLIP_STD_MPS = 0.15  # wheel speed minus ground speed, where both are measured and slip is no state
@@ -60,6 +69,136 @@ def _described_std(robot: Robot) -> dict[str, float]:
     return found
 
 
+# What a slip speed walks by beside _WALK_STD: within a second a part of the vibration, in s, and a part of
+# what the speed of its wheel changes by.
+_SHAKEN_S, _CHANGED_RATIO, _UNSEEN_RATIO = 0.09, 0.4, 1.0 / 3.0
+UNSEEN_AFTER_S = 0.15
+"""Age of the camera's speed from which on there is none."""
+
+
+def slip_walk(model: FilterModel, table: MeasurementTable) -> Array | None:
+    """Return the variances (n, d) a second by which slip speeds walk beside their process noise.
+
+    The slip of a wheel changes with the ground under it, which shows as vibration a_z, and with its thrust,
+    which shows as a change of the wheel's speed w.  The latter is written so that a start from rest leaves a
+    slip ratio of 0 +- 0.4, fast or slow::
+
+        q = (0.09 s a_z)^2 + 0.4^2 |d(w^2)/dt|
+
+    What vibration does to slip goes back and forth: it leads nowhere over seconds without a camera, and there
+    0.03 s stands for 0.09 s.
+
+    None for a filter without slip speeds.
+
+    Parameters
+    ----------
+    model : a filter
+    table : with the rows of :mod:`terrain.estimation.measurements.derived`
+    """
+    slips = [state for state in model.states if kind_of(state) == "slip_speed_mps"]
+    if not slips:
+        return None
+    found = np.zeros((len(table.time_s), len(model.states)))
+    shaken, *changed = np.nan_to_num(table.columns((DERIVED_ROWS[0], *DERIVED_ROWS[4:7]))).T
+    unseen = ~(table.columns(("camera_age_s",))[:, 0] <= UNSEEN_AFTER_S)
+    for state, change in zip(slips, changed, strict=True):
+        found[:, model.states.index(state)] = walk_of(shaken, change, unseen)
+    return found
+
+
+@njit(cache=True)
+def walk_of(vibration_mps2: Any, change_m2ps3: Any, unseen: Any) -> Any:
+    """Return the variance a second of :func:`slip_walk`."""
+    shaken_s = _SHAKEN_S * (1.0 - (1.0 - _UNSEEN_RATIO) * unseen)
+    return (shaken_s * vibration_mps2) ** 2 + 2.0 * _CHANGED_RATIO**2 * change_m2ps3
+
+
+_DERIVED = ROWS_OF_DRIVE["swerve"].index(DERIVED_ROWS[0])
+# Scatter of an accelerometer by vibration, as a part of the vertical one
+_SHAKEN_ACCEL_RATIO = 0.5
+UNKNOWN_MPS2 = 1.4
+"""Vibration where it is not known: that of rough ground."""
+
+
+def accel_variance(model: FilterModel, noise: Noise, table: MeasurementTable) -> Array:
+    """Return the measurement variances (n, m) of a noise with those of the accelerometer by vibration.
+
+    ``R = R_quiet + (0.5 a_z)^2`` with the vertical vibration a_z; as on rough ground where that is unknown.
+    """
+    shaken = table.columns(DERIVED_ROWS[:1])[:, 0]
+    variance = np.array(np.broadcast_to(noise.measurement_variance, (len(shaken), len(model.rows))))
+    for row in (row for row in model.rows if kind_of(row) == "accel_mps2"):
+        variance[:, model.rows.index(row)] += shaken_variance(
+            np.where(np.isnan(shaken), UNKNOWN_MPS2, shaken)
+        )
+    return variance
+
+
+@njit(cache=True)
+def shaken_variance(vibration_mps2: Any) -> Any:
+    """Return the part of an accelerometer's variance that is by vibration."""
+    return (_SHAKEN_ACCEL_RATIO * vibration_mps2) ** 2
+
+
+def scheduled(model: FilterModel, noise: Noise, table: MeasurementTable) -> tuple[Noise, Array | None]:
+    """Return a noise with what changes from tick to tick, and the inputs (n, k) of the process.
+
+    Parameters
+    ----------
+    model : a filter; one without inputs keeps its noise
+    noise : physical
+    table : the measurements
+    """
+    if not model.inputs:
+        return noise, None
+    variance, walk = accel_variance(model, noise, table), slip_walk(model, table)
+    found = replace(noise, measurement_variance=variance, walk_variance=walk)
+    return found, np.nan_to_num(table.columns(model.inputs))
+
+
+class Schedule:
+    """The variances of :func:`slip_walk` and :func:`accel_variance`, and the inputs, of one tick at a time.
+
+    Parameters
+    ----------
+    model : a filter with slip speeds
+    noise : of it, with one variance a row
+    """
+
+    def __init__(self, model: FilterModel, noise: Noise) -> None:
+        self._slips = np.array([i for i, s in enumerate(model.states) if kind_of(s) == "slip_speed_mps"])
+        self._accels = np.array([i for i, row in enumerate(model.rows) if kind_of(row) == "accel_mps2"])
+        self._quiet = noise.measurement_variance[self._accels]
+        self._variance = np.array(noise.measurement_variance)
+        self._given = Given(self._variance, np.zeros(len(model.states)), np.zeros(len(model.inputs)))
+
+    def __call__(self, z: Array, variance: Array | None = None) -> Given:
+        """Return what is known of a tick, given its rows, and variances (m,) that are not scheduled."""
+        if variance is not None:
+            self._variance[:] = variance
+        given = self._given
+        _schedule(
+            z, self._slips, self._accels, self._quiet, self._variance, given.walk_variance, given.inputs
+        )
+        return given
+
+
+@njit(cache=True)
+def _schedule(
+    z: Array, slips: Array, accels: Array, quiet: Array, variance: Array, walk: Array, inputs: Array
+) -> None:
+    """Write variances, walks and inputs of a tick: what :func:`scheduled` gives of a whole table."""
+    shaken = z[_DERIVED]
+    for i in range(accels.size):
+        variance[accels[i]] = quiet[i] + shaken_variance(UNKNOWN_MPS2 if math.isnan(shaken) else shaken)
+    known = 0.0 if math.isnan(shaken) else shaken
+    for i in range(3):
+        growth, change = z[_DERIVED + 1 + i], z[_DERIVED + 4 + i]
+        unseen = not z[_DERIVED + 7] <= UNSEEN_AFTER_S
+        walk[slips[i]] = walk_of(known, 0.0 if math.isnan(change) else change, 1.0 if unseen else 0.0)
+        inputs[i] = 0.0 if math.isnan(growth) else growth
+
+
 def default_noise(name: str, robot: Robot, with_gnss: bool = False) -> Noise:
     """Return physical noise for a filter: how fast a robot changes and what its sensors scatter by.
 
@@ -75,7 +214,7 @@ def default_noise(name: str, robot: Robot, with_gnss: bool = False) -> Noise:
     --------
     >>> from terrain.robots import load_robot
     >>> default_noise("vio15", load_robot("agrimaro")).measurement_variance.shape
-    (14,)
+    (17,)
     """
     layout = layout_of(name, robot)
     wheel_speed_std_mps = _SLIP_STD_MPS if name == "vio12" else _WHEEL_SPEED_STD_MPS

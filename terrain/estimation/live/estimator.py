@@ -3,7 +3,8 @@
 The chain of :func:`~terrain.estimation.measurements.batch.measurement_table` with ``causal=True``,
 :func:`~terrain.estimation.ekf.filter.run_filter` and :func:`~terrain.estimation.wheel_slip.wheel_slip`, with
 the same numbers, on memory of a fixed size.  Each sample of the wheels is a tick, whose estimate is returned
-at once; nothing waits for a sensor that is late.
+at once.  For what comes up to a quarter of a second late the estimator goes back to the tick before it
+(:mod:`~terrain.estimation.live.history`).  Where the wheels give nothing, ticks go on by the caller's time.
 
 What differs from the batch is what has to look ahead there:
 
@@ -19,67 +20,52 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import NamedTuple
 
 import numpy as np
 
 from terrain.errors import ConfigError
-from terrain.estimation.ekf.model import GATE_PROBABILITY, REOPEN_AFTER_S, FilterModel, FilterSettings, Noise
+from terrain.estimation.ekf.model import (
+    GATE_PROBABILITY,
+    REOPEN_AFTER_S,
+    FilterModel,
+    FilterSettings,
+    Given,
+    Noise,
+)
 from terrain.estimation.ekf.resident import ResidentFilter
+from terrain.estimation.ekf.state import in_one
 from terrain.estimation.filters.swerve import make_filter
-from terrain.estimation.filters.swerve_noise import default_noise
-from terrain.estimation.live.rows import KINDS, QUEUE, WHEEL_KINDS, push, rows_at
-from terrain.estimation.measurements.samples import ROWS, STREAMS, limits_of_rows, params_of, row_memory
+from terrain.estimation.filters.swerve_noise import Schedule, default_noise
+from terrain.estimation.live.estimate import LiveEstimate, predicted
+from terrain.estimation.live.history import History, Tick
+from terrain.estimation.live.monitor import HealthMonitor, RowMemory
+from terrain.estimation.live.rows import (
+    KINDS,
+    QUEUE,
+    WHEEL_KINDS,
+    check_numbers,
+    counts_by_kind,
+    described_limits,
+    push,
+    rows_at,
+)
+from terrain.estimation.live.slip import LiveSlip
+from terrain.estimation.measurements.derived import derived_memory
+from terrain.estimation.measurements.frozen import frozen_memory
+from terrain.estimation.measurements.samples import ROWS, STREAMS, params_of, row_memory
 from terrain.estimation.measurements.table import GNSS_LATENCY_S, GNSS_ROWS
 from terrain.estimation.measurements.yaw import yaw_memory
-from terrain.estimation.wheel_slip import STALE_AFTER_S, instant_slip, wheel_speed_scatter_mps
+from terrain.estimation.wheel_slip import STALE_AFTER_S
 from terrain.extension import Correction, RegionMonitor, check_corrected
 from terrain.logs.schema import WHEELS_CHANNELS
 from terrain.records import Array, Reading
 from terrain.robots import Robot, as_swerve
-
-GNSS_PERIOD_S = 0.1
-"""Between two positions; no robot's description tells it."""
 
 SETTINGS = FilterSettings(GATE_PROBABILITY, REOPEN_AFTER_S)
 """Those of the batch."""
 
 CHANNELS: Mapping[str, tuple[str, ...]] = {"wheels": WHEELS_CHANNELS, **STREAMS}
 """Default channels of each stream."""
-
-
-class LiveEstimate(NamedTuple):
-    """What is believed at one tick; arrays are the caller's to keep.
-
-    Parameters
-    ----------
-    time_s : stamp of the wheels
-    mean, std : (d,) states and their standard deviations, in the order of :attr:`LiveEstimator.states`
-    slip_ratio, slip_std : (3,) NaN where unknown or where the wheel stands
-    slip_stale : whether the speed over ground was not measured lately
-    reference_age_s : time since it was; infinite before the first time
-    rows : (18,) what was measured, in the order of ``ROWS_OF_DRIVE["swerve"]``; NaN where nothing was
-    speed_x_mps, speed_y_mps, yaw_rate_radps, accel_x_mps2, accel_y_mps2 : of the states, by name
-    motor_radps, current_a : (3,) of this sample of the wheels
-    wheel_speed_mps : (3,) circumferential speeds of that sample
-    """
-
-    time_s: float
-    mean: Array
-    std: Array
-    slip_ratio: Array
-    slip_std: Array
-    slip_stale: bool
-    reference_age_s: float
-    rows: Array
-    speed_x_mps: float
-    speed_y_mps: float
-    yaw_rate_radps: float
-    accel_x_mps2: float
-    accel_y_mps2: float
-    motor_radps: Array
-    current_a: Array
-    wheel_speed_mps: Array
 
 
 class LiveEstimator:
@@ -89,20 +75,17 @@ class LiveEstimator:
     ----------
     robot : a swerve robot with motors, steering and sensors, and a camera for vio12 and vio15, corrected
     filter_name : one of :data:`~terrain.estimation.filters.swerve.FILTERS`
-    channels : names of the columns of each stream's readings, in their order; by default those of the schema.
-        A stream that is not named is not read
+    channels : names of the columns of the streams that are read, in their order; those of the schema
     settings : when a measurement or a stamp is not believed
     noise : in place of the physical
     initial_yaw_rad : heading of the start in the world; without it the GNSS is not used
     gnss_latency_s : age of a position when it arrives
-    correction : takes the effects of an extended robot off what arrives, see
-        :func:`terrain.extension.correct_live`
+    correction : of :func:`terrain.extension.correct_live`
 
     Raises
     ------
     ConfigError
-        if the filter does not fit the robot, the robot is not corrected, a section of its description is
-        missing, the wheels' channels are not among those named, or a number is out of its range.
+        if filter, robot and channels do not fit, the robot is not corrected, or a number is out of its range.
     DataError
         if the noise does not fit the filter.
 
@@ -128,24 +111,32 @@ class LiveEstimator:
         gnss_latency_s: float = GNSS_LATENCY_S,
         correction: Correction | None = None,
     ) -> None:
-        for name, value in (("initial_yaw_rad", initial_yaw_rad or 0.0), ("gnss_latency_s", gnss_latency_s)):
-            if not math.isfinite(value):
-                raise ConfigError(f"{name} is {value}, a finite number is required")
-        if gnss_latency_s < 0:
-            raise ConfigError(f"gnss_latency_s is {gnss_latency_s:g}, a time from zero up is required")
+        check_numbers(initial_yaw_rad or 0.0, gnss_latency_s)
         has_gnss = initial_yaw_rad is not None and "gnss" in channels
         check_corrected(robot)
         self._channels, self._correction = channels, correction
         self._model = make_filter(filter_name, robot, with_gnss=has_gnss)
         robot = as_swerve(robot, "robot {name} has the drive {drive!r}: the live estimator is for 'swerve'")
         robot.require("motors", "steering", "sensors")
+        physical = noise is None
         noise = default_noise(filter_name, robot, has_gnss) if noise is None else noise
+        self._schedule = Schedule(self._model, noise) if physical and self._model.inputs else None
         self._filter = ResidentFilter(self._model, noise, settings)
         self._robot, self._region = robot, RegionMonitor(robot)
         self._unreadable: dict[str, int] = {}
         self._connect(channels, has_gnss)
         self._prepare_rows(initial_yaw_rad or 0.0, gnss_latency_s)
         self._prepare_filter(noise)
+        buffers = (
+            *self._filter.buffers,
+            self._row_buffer,
+            self._monitor.buffer,
+            self._counts,
+            self._wheel_counts,
+        )
+        self._history = History(buffers, ("wheels", *(name for name, *_ in self._streams)))
+        self._latest: LiveEstimate | None = None
+        self._counted = {"came late": 0, "ticks without wheels": 0}
 
     def _connect(self, channels: Mapping[str, tuple[str, ...]], has_gnss: bool) -> None:
         """Find each channel's column, and lay out the queues."""
@@ -163,12 +154,11 @@ class LiveEstimator:
         self._counts = np.zeros((len(STREAMS), len(KINDS)), np.int64)
         self._wheel_counts = np.zeros(len(WHEEL_KINDS), np.int64)
         self._queues = tuple(np.zeros((QUEUE, 2 + len(names))) for names in STREAMS.values())
-        self._inputs = []
-        for stream, (name, names) in enumerate(STREAMS.items()):
-            if name in read:
-                columns = np.array([_place(list(channels[name]), channel) for channel in names])
-                fixed = (self._queues[stream], self._n_queued, self._last_s, self._counts)
-                self._inputs.append((name, stream, columns, fixed))
+        self._streams = [
+            (name, stream, np.array([_place(list(channels[name]), channel) for channel in names]), queue)
+            for (stream, (name, names)), queue in zip(enumerate(STREAMS.items()), self._queues, strict=True)
+            if name in read
+        ]
 
     def _prepare_rows(self, initial_yaw_rad: float, gnss_latency_s: float) -> None:
         """Lay out what :func:`rows_at` is given: first what is fixed, then its memory."""
@@ -179,14 +169,33 @@ class LiveEstimator:
         self._motor_radps, self._z, self._gnss_variance = np.empty(3), np.empty(len(ROWS)), np.empty(4)
         self._unmeasured = np.ones(3, dtype=np.bool_)
         lines, turns, gnss = row_memory()
+        moved = (
+            *(self._last_s, np.full((2, 16), np.nan), turns, lines, yaw_memory(), gnss, derived_memory()),
+            *(frozen_memory(), np.full((2, 3), -np.inf)),
+        )
+        self._row_buffer, views = in_one(moved)
+        self._last_s, before, turns, lines, yaw, gnss, derived, frozen, received_s = views
+        rows = RowMemory(lines, received_s, frozen, derived)
+        self._monitor = HealthMonitor(robot, self._model, rows, self._n_columns["wheels"])
         self._row_memory = (
             self._motor_radps,
             *self._queues,
-            *(self._n_queued, self._last_s, latency_s, params_of(robot, initial_yaw_rad), _limits(robot)),
-            *(np.full((2, 16), np.nan), turns, lines, yaw_memory(), gnss, np.full((2, 3), -np.inf)),
+            *(
+                self._n_queued,
+                self._last_s,
+                latency_s,
+                params_of(robot, initial_yaw_rad),
+                described_limits(robot),
+            ),
+            *(before, turns, lines, yaw, gnss, derived, frozen, received_s),
             *(self._z, self._gnss_variance),
             *(self._unmeasured, self._counts, self._wheel_counts),
         )
+        self._inputs = [
+            (name, stream, columns, (queue, self._n_queued, self._last_s, self._counts))
+            for name, stream, columns, queue in self._streams
+        ]
+        self._period_s = 1.0 / sensors.wheels_rate_hz
         self._reduction_ratio, self._radius_m = motors.reduction_ratio, robot.wheel_radius_m
 
     def _prepare_filter(self, noise: Noise) -> None:
@@ -195,15 +204,11 @@ class LiveEstimator:
         places = [row for row in model.rows if row in GNSS_ROWS]
         self._variance = np.array(noise.measurement_variance) if places else None
         self._gnss_places = np.array([model.rows.index(row) for row in places], dtype=np.int64)
-        self._unknown = np.full(len(model.rows), np.nan)
-        named = [f"slip_speed_{i}_mps" for i in robot.wheels]
-        steered = [f"steer_{i}_rad" for i in robot.wheels]
-        states = ("speed_x_mps", "speed_y_mps", "yaw_rate_radps", *steered, *named)
-        self._in_state = named[0] in model.states
-        at = np.array([_place(list(model.states), state) for state in states])
-        self._slip = np.empty((2, len(robot.wheels)))
-        self._places_m, self._at = np.array(robot.wheel_positions_m), at
-        self._wheel_speed_variance = wheel_speed_scatter_mps(robot) ** 2
+        self._unknown, self._no_wheels = (
+            np.full(len(model.rows), np.nan),
+            np.full(self._n_columns["wheels"], np.nan),
+        )
+        self._slip = LiveSlip(robot, model.states)
         self._motion = [model.states.index(s) for s in LiveEstimate._fields[8:13]]
         self._variances = self._filter.cov.reshape(-1)[:: len(model.states) + 1]
 
@@ -225,49 +230,111 @@ class LiveEstimator:
     @property
     def dropped(self) -> dict[str, int]:
         """What was not taken so far, as counts by stream and kind, and by what the filter did not believe."""
-        counts: list[tuple[str, tuple[str, ...], Array]] = [("wheels", WHEEL_KINDS, self._wheel_counts)]
-        counts += [(name, KINDS, row) for name, row in zip(STREAMS, self._counts, strict=True)]
-        counted = {
-            f"{name}: {kind}": n
-            for name, kinds, row in counts
-            for kind, n in zip(kinds, row.tolist(), strict=True)
-        }
+        counted = counts_by_kind(self._wheel_counts, self._counts) | self._counted
         counted |= {f"{name}: unreadable": n for name, n in self._unreadable.items()}
         return {kind: n for kind, n in (counted | dict(self._filter.dropped)).items() if n}
 
-    def step(self, readings: Mapping[str, Reading]) -> list[LiveEstimate]:
+    @property
+    def latest(self) -> LiveEstimate | None:
+        """The estimate of the last tick, with all that has come since."""
+        return self._latest
+
+    def at(self, now_s: float) -> LiveEstimate | None:
+        """Return the last estimate, its means predicted to a later time; None before the first tick."""
+        seen = self._latest
+        if seen is None or not 1e-3 < now_s - seen.time_s < SETTINGS.max_gap_s:
+            return seen
+        return predicted(seen, self._model, self._motion, now_s)
+
+    @property
+    def health(self) -> dict[str, str]:
+        """Health of each sensor at the last tick, by name."""
+        return self._monitor.names
+
+    def step(self, readings: Mapping[str, Reading], now_s: float | None = None) -> list[LiveEstimate]:
         """Take in what arrived, and return an estimate for each sample of the wheels that was taken.
 
         Parameters
         ----------
         readings : by stream; any may be missing, late, repeated or wrong, and other streams are not looked at
+        now_s : the time by the clock of the stamps: a tick where the wheels have given nothing for one and a
+            half of their periods
 
         Returns
         -------
         list of LiveEstimate
             in order of time, unless the clock of the wheels was set back.  A stamp that leaps by more than
-            ``settings.max_gap_s`` is accepted, and reported, when the next one follows it.
+            ``settings.max_gap_s`` is reported when the next one follows; what was late is in :attr:`latest`
         """
+        history, late_s = self._history, math.inf
+        last_s = history.last_s
         for name, stream, columns, fixed in self._inputs:
-            reading = readings.get(name)
-            if reading is not None:
-                arrays = self._arrays(name, reading)
-                if arrays is not None:
-                    push(stream, *arrays, columns, *fixed)
-        wheels = readings.get("wheels")
-        arrays = None if wheels is None else self._arrays("wheels", wheels)
-        if arrays is None:
-            return []
-        ticks = zip(arrays[0].tolist(), arrays[1], strict=True)
-        estimates = (self._tick(time_s, values) for time_s, values in ticks)
-        return [estimate for estimate in estimates if estimate is not None]
+            arrays = self._taken(name, readings)
+            if arrays is None:
+                continue
+            first_s = min(arrays[0].tolist(), default=math.inf)
+            if first_s <= last_s and (late := self._late(name, arrays[0], last_s)) < math.inf:
+                late_s = min(late_s, late)
+            else:
+                push(stream, *arrays, columns, *fixed)
+        arrays = self._taken("wheels", readings)
+        ticks = []
+        if arrays is not None:
+            ticks = [Tick(*tick) for tick in zip(arrays[0].tolist(), arrays[1], strict=True)]
+            if ticks and history.last_measured_s < ticks[0].time_s <= last_s:
+                late_s = min(late_s, self._late("wheels", arrays[0], last_s))
+        if late_s < math.inf:
+            ticks = self._go_back(late_s, ticks)
+        if now_s is not None and history.last_s > -math.inf:
+            reached_s = ticks[-1].time_s if ticks else history.last_s
+            if 1.5 * self._period_s < now_s - reached_s < SETTINGS.max_gap_s:
+                ticks.append(Tick(now_s, None))
+                self._counted["ticks without wheels"] += 1
+        found = []
+        for tick in ticks:
+            estimate = self._tick(tick)
+            if estimate is not None:
+                self._latest = estimate
+                if not tick.time_s <= last_s or estimate.time_s < last_s - SETTINGS.max_gap_s:
+                    found.append(estimate)
+        return found
+
+    def _taken(self, name: str, readings: Mapping[str, Reading]) -> tuple[Array, Array] | None:
+        """Return stamps and values of a stream, remembered; None where there are none."""
+        reading = readings.get(name)
+        arrays = None if reading is None else self._arrays(name, reading)
+        if arrays is not None and arrays[0].size and math.isfinite(sum(arrays[0].tolist())):
+            self._history.keep_samples(name, *arrays, self._history.last_s)
+        return arrays
+
+    def _late(self, name: str, time_s: Array, last_s: float) -> float:
+        """Return the instant to go back to for late samples, infinite where there is none that is new."""
+        known = self._history.stamps_before_the_last(name)
+        late = [stamp_s for stamp_s in time_s.tolist() if stamp_s <= last_s and stamp_s not in known]
+        if not late or not self._history.reaches(min(late)):
+            return math.inf
+        self._counted["came late"] += 1
+        return float(min(late))
+
+    def _go_back(self, late_s: float, ticks: list[Tick]) -> list[Tick]:
+        """Put the memory back before an instant; return the ticks to be done again, with new ones."""
+        undone = self._history.back_to(late_s)
+        self._n_queued[:] = 0
+        for name, stream, columns, fixed in self._inputs:
+            later = self._history.since(name, float(self._last_s[stream]))
+            if later is not None:
+                push(stream, *later, columns, *fixed)
+        measured = {tick.time_s: tick for tick in (*ticks, *undone) if tick.wheels is not None}
+        reached_s = max(measured, default=-math.inf)
+        spare = [tick for tick in undone if tick.wheels is None and tick.time_s > reached_s]
+        return sorted([*measured.values(), *spare], key=lambda tick: tick.time_s)
 
     def _arrays(self, name: str, reading: Reading) -> tuple[Array, Array] | None:
         """Return stamps and values; values that do not fit are unknown, stamps that do not are nothing."""
         try:
             time_s = np.asarray(reading[0], dtype=np.float64)
             values = np.asarray(reading[1], dtype=np.float64)
-        except (TypeError, ValueError, LookupError):
+        except (TypeError, ValueError, LookupError, OverflowError):
             self._unreadable[name] = self._unreadable.get(name, 0) + 1
             return None
         if time_s.ndim == 1 and values.shape == (time_s.size, self._n_columns[name]):
@@ -279,20 +346,28 @@ class LiveEstimator:
             return time_s, np.full((time_s.size, self._n_columns[name]), np.nan)
         return None
 
-    def _tick(self, time_s: float, wheels: Array) -> LiveEstimate | None:
+    def _tick(self, tick: Tick) -> LiveEstimate | None:
+        time_s, wheels = tick
         follows = self._filter.follows(time_s)
         z, resident = self._z, self._filter
         if follows == 0:
             resident.step(time_s, self._unknown)  # for it to count, and to remember a leap
             return None
+        if wheels is None:
+            wheels = self._no_wheels
         motor_radps = wheels[self._motor_columns]
         self._motor_radps[:] = motor_radps
         rows_at(time_s, follows < 0, *self._row_memory)
         if self._variance is not None:
             self._variance[self._gnss_places] = self._gnss_variance
-        resident.step(time_s, z[self._columns], self._variance)
+        given = Given(self._variance) if self._schedule is None else self._schedule(z, self._variance)
+        resident.step(time_s, z[self._columns], given)
+        if follows < 0:
+            self._history.clear()
+        self._monitor.judge(time_s, wheels, motor_radps, z, resident)
+        self._history.keep_tick(tick)
         age_s = resident.reference_age_s
-        slip = self._slip_at(age_s)
+        slip = self._slip.at(resident, age_s, z[:3] * self._radius_m, self._unmeasured)
         mean = resident.mean.copy()
         v_x, v_y, turn, a_x, a_y = self._motion
         current_a = wheels[self._current_columns]
@@ -317,41 +392,9 @@ class LiveEstimator:
             motor_radps,
             current_a,
             wheel_speed_mps,
+            self._monitor.health.copy(),
         )
-
-    def _slip_at(self, age_s: float) -> Array:
-        """Return ratio and standard deviation (2, wheels) of the slip: ``wheel_slip`` of one tick."""
-        if math.isinf(age_s) or (age_s > STALE_AFTER_S and not self._in_state):
-            return np.full_like(self._slip, np.nan)
-        resident, wheel_speed_mps = self._filter, self._z[:3] * self._radius_m
-        slip = np.empty_like(self._slip)
-        instant_slip(
-            resident.mean,
-            resident.cov,
-            self._places_m,
-            self._at,
-            wheel_speed_mps,
-            self._wheel_speed_variance,
-            slip,
-        )
-        slip[:, self._unmeasured] = np.nan
-        return slip
 
 
 def _place(names: list[str], name: str) -> int:
     return names.index(name) if name in names else -1
-
-
-def _limits(robot: Robot) -> Array:
-    """Return the limits (18, 6) of the rows, by the described periods."""
-    sensors = robot.sensors
-    lag_s = dict.fromkeys(STREAMS, sensors.encoder_time_constant_s)
-    period_s = {
-        "imu": 1.0 / sensors.imu_rate_hz,
-        "steering": 1.0 / sensors.steering_rate_hz,
-        "gnss": GNSS_PERIOD_S,
-    }
-    if robot.describes("camera"):
-        lag_s["odometry"] = max(sensors.encoder_time_constant_s - robot.camera.time_constant_s, 0.0)
-        period_s["odometry"] = 1.0 / robot.camera.rate_hz
-    return limits_of_rows(lag_s, period_s, 1.0 / sensors.wheels_rate_hz)

@@ -11,7 +11,9 @@ import math
 import numpy as np
 from numba import boolean, float64, int64, njit, types, void
 
+from terrain.errors import ConfigError
 from terrain.estimation.measurements.cleaning import MIN_CONFIDENCE_RATIO, OFF_CLOCK_S
+from terrain.estimation.measurements.derived import is_moving
 from terrain.estimation.measurements.sample_hold import TICK_S
 from terrain.estimation.measurements.samples import (
     IMU,
@@ -19,6 +21,8 @@ from terrain.estimation.measurements.samples import (
     NO_ROTATION,
     ODOMETRY,
     STEER,
+    STREAMS,
+    limits_of_rows,
     rows_at_tick,
     take_sample,
     wheel_rates,
@@ -26,6 +30,7 @@ from terrain.estimation.measurements.samples import (
 from terrain.estimation.measurements.yaw import average_yaw, refer_yaw
 from terrain.estimation.wheel_slip import UNMEASURED_AFTER_S
 from terrain.records import Array
+from terrain.robots import Robot
 
 KINDS = (
     "stamp does not increase",
@@ -42,6 +47,9 @@ KINDS = (
 WHEEL_KINDS = ("not finite", "beyond the motors")
 """What is counted of the wheels."""
 
+GNSS_PERIOD_S = 0.1
+"""Between two positions; no robot's description tells it."""
+
 QUEUE = 1024
 """Samples of a stream that wait for the wheels; five seconds of a camera."""
 
@@ -55,7 +63,8 @@ _inline = njit(cache=True, error_model="numpy")
 
 
 @_inline
-def _drop_first(queue: Array, n_gone: int, n: int) -> None:
+def drop_first(queue: Array, n_gone: int, n: int) -> None:
+    """Move the samples of a queue up over those that are gone."""
     for k in range(n_gone, n):
         for c in range(queue.shape[1]):
             queue[k - n_gone, c] = queue[k, c]
@@ -93,7 +102,7 @@ def push(
         if n == queue.shape[0]:
             half = n // 2
             counts[stream, _WAITED] += half
-            _drop_first(queue, half, n)
+            drop_first(queue, half, n)
             n -= half
         finite = True
         for c in range(columns.size):
@@ -119,7 +128,7 @@ def _repeats(sample: Array, first: int, last: int, before: Array) -> bool:
 
 
 @_inline
-def _refused(stream: int, stamped: Array, before: Array) -> int:
+def refused_as(stream: int, stamped: Array, before: Array) -> int:
     """Return why a sample of a camera or IMU is left out, as a place in :data:`KINDS`; -1 where it is not."""
     complete = stamped[_FINITE_COLUMN] > 0.0
     if stream == IMU and complete and _repeats(stamped, 0, 6, before[0]):
@@ -134,7 +143,7 @@ def _refused(stream: int, stamped: Array, before: Array) -> int:
 @njit(
     void(
         *(float64, boolean, _V, _M, _M, _M, _M, _I, _V, _V, _V, _M),
-        *(_M, _M, _M, _V, _V, _M, _V, _V, boolean[::1], _IM, _I),
+        *(_M, _M, _M, _V, _V, _V, float64[:, :, ::1], _M, _V, _V, boolean[::1], _IM, _I),
     ),
     cache=True,
     error_model="numpy",
@@ -157,6 +166,8 @@ def rows_at(  # noqa: PLR0913 - a kernel keeps its memory in arrays of its calle
     lines: Array,
     yaw: Array,
     gnss_memory: Array,
+    derived: Array,
+    frozen: Array,
     received_s: Array,
     z: Array,
     gnss_variance: Array,
@@ -164,7 +175,7 @@ def rows_at(  # noqa: PLR0913 - a kernel keeps its memory in arrays of its calle
     counts: Array,
     wheel_counts: Array,
 ) -> None:
-    """Take from the queues what came by a tick of the wheels; write its rows z (18,) and variances (4,).
+    """Take from the queues what came by a tick of the wheels; write its rows z (29,) and variances (4,).
 
     ``set_back`` says that the clock was: what is remembered of its other time is forgotten.  ``unmeasured``
     (3,) tells the wheels of which rate or angle was not measured for too long.
@@ -174,6 +185,8 @@ def rows_at(  # noqa: PLR0913 - a kernel keeps its memory in arrays of its calle
         last_s[:] = -np.inf
         lines[:] = np.nan
         before[:] = np.nan
+        derived[:] = np.nan
+        frozen[:, 1] = 0.0
         received_s[:] = -np.inf
     for stream in range(4):
         queue = (steering, imu, odometry, gnss)[stream]
@@ -183,24 +196,29 @@ def rows_at(  # noqa: PLR0913 - a kernel keeps its memory in arrays of its calle
             n_due += 1
             came_s = stamped[_STAMP_COLUMN]
             last_s[stream] = came_s
-            refused = _refused(stream, stamped, before)
+            refused = refused_as(stream, stamped, before)
             if refused >= 0:
                 counts[stream, refused] += 1
+                if refused == _FROZEN:
+                    frozen[stream - IMU, 1] += 1.0
                 continue
             instant_s = came_s - latency_s[stream]
-            fate = take_sample(stream, sample, (instant_s, came_s), params, turns, lines, limits, gnss_memory)
+            stamps_s = instant_s, came_s
+            fate = take_sample(
+                stream, sample, stamps_s, params, turns, lines, limits, (gnss_memory, derived, frozen)
+            )
             counts[stream, _LEAP] += fate == LEAPT
             counts[stream, _NO_ROTATION] += fate == NO_ROTATION
         while n > n_due and queue[n - 1, _STAMP_COLUMN] > time_s + OFF_CLOCK_S:
             counts[stream, _OFF_CLOCK] += 1
             n -= 1
-        _drop_first(queue, n_due, n)
+        drop_first(queue, n_due, n)
         n_queued[stream] = n - n_due
 
-    finite, beyond = wheel_rates(motor_radps, params, z)
+    finite, beyond = wheel_rates(motor_radps, params, is_moving(derived), frozen, z)
     wheel_counts[0] += not finite
     wheel_counts[1] += beyond
-    rows_at_tick(time_s, lines, limits, gnss_memory, z, gnss_variance)
+    rows_at_tick(time_s, lines, limits, gnss_memory, params, derived, z, gnss_variance)
     for i in range(3):
         unmeasured[i] = False
         for k, row in enumerate((i, STEER + i)):
@@ -209,3 +227,35 @@ def rows_at(  # noqa: PLR0913 - a kernel keeps its memory in arrays of its calle
             unmeasured[i] |= time_s - received_s[k, i] > UNMEASURED_AFTER_S
     average_yaw(time_s, z, params, yaw)
     refer_yaw(time_s, z, params, yaw)
+
+
+def described_limits(robot: Robot) -> Array:
+    """Return the limits (29, 7) of the rows, by the described periods."""
+    sensors = robot.sensors
+    lag_s = dict.fromkeys(STREAMS, sensors.encoder_time_constant_s)
+    period_s = {
+        "imu": 1.0 / sensors.imu_rate_hz,
+        "steering": 1.0 / sensors.steering_rate_hz,
+        "gnss": GNSS_PERIOD_S,
+    }
+    if robot.describes("camera"):
+        lag_s["odometry"] = max(sensors.encoder_time_constant_s - robot.camera.time_constant_s, 0.0)
+        period_s["odometry"] = 1.0 / robot.camera.rate_hz
+    return limits_of_rows(lag_s, period_s, 1.0 / sensors.wheels_rate_hz)
+
+
+def counts_by_kind(wheel_counts: Array, counts: Array) -> dict[str, int]:
+    """Return what was counted of the wheels (2,) and of the streams (4, 8), by stream and kind."""
+    rows = [("wheels", WHEEL_KINDS, wheel_counts), *zip(STREAMS, [KINDS] * len(counts), counts, strict=True)]
+    return {
+        f"{name}: {kind}": n for name, kinds, row in rows for kind, n in zip(kinds, row.tolist(), strict=True)
+    }
+
+
+def check_numbers(initial_yaw_rad: float, gnss_latency_s: float) -> None:
+    """Refuse a heading or a latency that is none; ``ConfigError``."""
+    for name, value in (("initial_yaw_rad", initial_yaw_rad), ("gnss_latency_s", gnss_latency_s)):
+        if not math.isfinite(value):
+            raise ConfigError(f"{name} is {value}, a finite number is required")
+    if gnss_latency_s < 0:
+        raise ConfigError(f"gnss_latency_s is {gnss_latency_s:g}, a time from zero up is required")

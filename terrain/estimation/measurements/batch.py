@@ -29,6 +29,8 @@ from numba import njit
 
 from terrain.errors import ConfigError, DataError
 from terrain.estimation.measurements.cleaning import clean_stream
+from terrain.estimation.measurements.derived import derived_memory, is_moving
+from terrain.estimation.measurements.frozen import frozen_memory
 from terrain.estimation.measurements.resampling import ema, median_step_s
 from terrain.estimation.measurements.sample_hold import TICK_S
 from terrain.estimation.measurements.samples import (
@@ -44,6 +46,7 @@ from terrain.estimation.measurements.samples import (
     take_sample,
     wheel_rates,
 )
+from terrain.estimation.measurements.skid_rows import with_skid_rows
 from terrain.estimation.measurements.table import (
     CAMERA_ROWS,
     GNSS_LATENCY_S,
@@ -109,6 +112,8 @@ def measurement_table(
     sample; ``causal``, the average is that of the ticks so far.  The origin of positions is the first with a
     fix, or the first of all where no fix ever comes, or if ``causal``.
 
+    A robot that skids has a last row more, the gyro at rest, and its gyro is the mean since the last tick.
+
     A sensor slower than the clock gives each of its samples once, so that no filter counts it several times.
 
     A simulated camera or IMU without noise looks frozen where nothing changes: give it noise.
@@ -139,19 +144,21 @@ def measurement_table(
     if not robot.steered:  # their wheels report speeds
         columns |= dict(zip(rows, wheels.values.T, strict=False))
     table = np.column_stack([columns[row] for row in rows])
-    return MeasurementTable(clock, rows, table, variance, dropped)
+    found = MeasurementTable(clock, rows, table, variance, dropped)
+    return found if robot.steered else with_skid_rows(found, run, robot, time_constant_s)
 
 
 def _rows(
     clock: Array, motor_radps: Array, samples: _Samples, params: Array, limits: Array, origin_m: Array
 ) -> tuple[Array, Array, Counter[str]]:
-    """Return the rows (n, 18), the variances (n, 4) of the GNSS rows, and what was left out."""
+    """Return the rows (n, 29), the variances (n, 4) of the GNSS rows, and what was left out."""
     n = clock.size
     z, variance = np.empty((n, len(ROWS))), np.empty((n, len(GNSS_ROWS)))
     counts = np.zeros((len(STREAMS) + 1, N_FATES), np.int64)  # the last row is of the wheels
     lines, turns, gnss = row_memory()
     gnss[:2] = origin_m
-    _fill_rows(clock, motor_radps, *samples, params, limits, lines, turns, gnss, z, variance, counts)
+    memory = (lines, turns, gnss, derived_memory(), frozen_memory())
+    _fill_rows(clock, motor_radps, *samples, params, limits, *memory, z, variance, counts)
     dropped = Counter({"wheels: beyond the motors": int(counts[-1, 0])})
     for number, name in enumerate(STREAMS):
         dropped[f"{name}: leap"] = int(counts[number, LEAPT])
@@ -218,7 +225,7 @@ def _samples_of(streams: Mapping[str, Stream], latency_s: Mapping[str, float], c
 def _limits(
     streams: Mapping[str, Stream], robot: Robot, clock: Array, time_constant_s: float | None
 ) -> Array:
-    """Return the limits (18, 6) of the rows, by the median periods of the log."""
+    """Return the limits (29, 7) of the rows, by the median periods of the log."""
     lag_s = dict.fromkeys(STREAMS, robot.encoder_lag_s if time_constant_s is None else time_constant_s)
     if robot.describes("camera") and time_constant_s is None:
         lag_s["odometry"] = max(robot.encoder_lag_s - robot.camera.time_constant_s, 0.0)
@@ -248,11 +255,13 @@ def _fill_rows(  # noqa: PLR0913 - a kernel takes its arrays one by one
     lines: Array,
     turns: Array,
     gnss: Array,
+    derived: Array,
+    frozen: Array,
     z: Array,
     gnss_variance: Array,
     counts: Array,
 ) -> None:
-    """Write the rows z (n, 18) and variances (n, 4) of each tick, and count what became of the samples."""
+    """Write the rows z (n, 29) and variances (n, 4) of each tick, and count what became of the samples."""
     due = np.zeros(len(came_s), np.int64)
     for n in range(clock.size + 1):
         time_s = clock[n] + TICK_S if n < clock.size else np.inf  # what comes after the last tick is counted
@@ -267,15 +276,15 @@ def _fill_rows(  # noqa: PLR0913 - a kernel takes its arrays one by one
                     turns,
                     lines,
                     limits,
-                    gnss,
+                    (gnss, derived, frozen),
                 )
                 counts[stream, fate] += 1
                 k += 1
             due[stream] = k
         if n < clock.size:
-            _, beyond = wheel_rates(motor_radps[n], params, z[n])
+            _, beyond = wheel_rates(motor_radps[n], params, is_moving(derived), frozen, z[n])
             counts[-1, 0] += beyond
-            rows_at_tick(clock[n], lines, limits, gnss, z[n], gnss_variance[n])
+            rows_at_tick(clock[n], lines, limits, gnss, params, derived, z[n], gnss_variance[n])
 
 
 @njit(cache=True, error_model="numpy")

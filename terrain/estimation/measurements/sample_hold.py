@@ -26,54 +26,64 @@ TICK_S = 1e-9
 MAX_AGE_PERIODS = 1.5
 """A value is held until the next one is due and half a period more, of the slower of sensor and clock."""
 
-GAP_PERIODS = 5.0
-"""After a longer gap the low-pass starts anew: its memory is not the recent past of the next sample."""
+GAP_PERIODS = 5.5
+"""After a longer gap the low-pass starts anew: its memory is not the recent past of the next sample.  Steps
+are whole periods, so that half of one between two of them leaves nothing to how stamps are rounded, nor to
+whether the period is that of a description (live) or the median of a log (batch)."""
 
 BELIEVED_S = 0.1
 """A value that has leapt and stays is accepted after this long: it is left to the filter's gate."""
 
-LEAPS: dict[str, tuple[float, float]] = {
-    "accel_x_mps2": (20.0, 1000.0),
-    "accel_y_mps2": (20.0, 1000.0),
-    "gyro_z_radps": (0.5, 20.0),
-    "imu_yaw_rad": (0.1, 4.0),
-    **dict.fromkeys((f"steer_{i}_rad" for i in (1, 2, 3)), (0.1, 5.0)),
-    "camera_speed_x_mps": (0.1, 5.0),
-    "camera_speed_y_mps": (0.1, 5.0),
-    "camera_yaw_rate_radps": (0.2, 20.0),
-    "camera_yaw_rad": (0.1, 4.0),
+PASSING, LATCHED, BRIDGED = 0.0, 1.0, 2.0
+"""What becomes of a value that leapt: it is accepted after a while; it is left out until it leaps back, as a
+speed over ground cannot have leapt; its leap is taken off, as a heading counts from anywhere."""
+
+LEAPS: dict[str, tuple[float, float, float]] = {
+    "accel_x_mps2": (20.0, 1000.0, PASSING),
+    "accel_y_mps2": (20.0, 1000.0, PASSING),
+    "gyro_z_radps": (0.5, 20.0, PASSING),
+    "imu_yaw_rad": (0.1, 4.0, PASSING),
+    **dict.fromkeys((f"steer_{i}_rad" for i in (1, 2, 3)), (0.1, 5.0, PASSING)),
+    "camera_speed_x_mps": (0.1, 5.0, LATCHED),
+    "camera_speed_y_mps": (0.1, 5.0, LATCHED),
+    "camera_yaw_rate_radps": (0.2, 20.0, PASSING),
+    "camera_yaw_rad": (0.1, 4.0, BRIDGED),
 }
 """Largest change of a row between two samples: noise, and a second what a robot can do: half a g of speed,
-two thirds of a turn, twice the fastest steering; an accelerometer on rough terrain sees several g."""
+two thirds of a turn, twice the fastest steering; an accelerometer on rough terrain sees several g.  Then
+what becomes of a value that leapt."""
 
-NO_LEAP = (math.inf, math.inf)
+NO_LEAP = (math.inf, math.inf, PASSING)
 """Of a row whose changes are not judged."""
 
-LIMITS = ("time_constant_s", "gap_s", "age_s", "once", "leap", "leap_per_s")
+LIMITS = ("time_constant_s", "gap_s", "age_s", "once", "leap", "leap_per_s", "fate")
 """Columns of ``limits``: low-pass, longest step, oldest value, whether a sample is given at one tick only,
-and the largest change between two samples, a constant and a part per second."""
+the largest change between two samples, a constant and a part per second, and what becomes of a leap."""
 
-N_LINE = 8
+N_LINE = 13
 """Columns of ``lines``: value, instant, arrival and low-pass output of the last sample, whether it was given
-at a tick, value and instant that leaps are judged against, and since when values have been leaping."""
+at a tick, value and instant that leaps are judged against, since when values have been leaping, and of a
+row that is not passing the last sample, taken or not, its instant, the sum of its leaps, since
+when that is not 0, and whether a sample before it is known to be right."""
 
-_TAU, _GAP, _AGE, _ONCE, _LEAP, _LEAP_PER_S = range(len(LIMITS))
-_VALUE, _INSTANT, _CAME, _SMOOTH, _GIVEN, _LAST, _LAST_INSTANT, _SINCE = range(N_LINE)
+_TAU, _GAP, _AGE, _ONCE, _LEAP, _LEAP_PER_S, _FATE = range(len(LIMITS))
+_VALUE, _INSTANT, CAME, _SMOOTH, _GIVEN, _LAST, _LAST_INSTANT, SINCE = range(8)
+RAW, _RAW_INSTANT, LEAPT_BY, LEAPT_SINCE, _FOLLOWED = range(8, N_LINE)
 
 
 def limits_of(
-    time_constant_s: float, period_s: float, tick_s: float, leap: tuple[float, float] = NO_LEAP
+    time_constant_s: float, period_s: float, tick_s: float, leap: tuple[float, float, float] = NO_LEAP
 ) -> Array:
-    """Return the limits (6,) of a row: columns :data:`LIMITS`.
+    """Return the limits (7,) of a row: columns :data:`LIMITS`.
 
     Parameters
     ----------
     time_constant_s : of its low-pass; 0 for none
     period_s, tick_s : of its sensor, and of the clock
-    leap : largest change between two samples: a constant, and a part per second
+    leap : largest change between two samples: a constant, a part per second, and what becomes of a leap
     """
     age_s = MAX_AGE_PERIODS * np.fmax(period_s, tick_s)
-    once = period_s > MAX_AGE_PERIODS * tick_s
+    once = period_s > MAX_AGE_PERIODS * tick_s + TICK_S
     return np.array([time_constant_s, GAP_PERIODS * period_s, age_s, once, *leap])
 
 
@@ -85,21 +95,47 @@ def low_pass_step(value: float, before: float, smooth: float, step_s: float, tim
 
 
 @njit(cache=True, error_model="numpy")
+def leaps(value: float, instant_s: float, line: Array, limit: Array) -> float:
+    """Return the sum of a row's leaps: 0 after one that leapt back, and for a latched row after a gap."""
+    step_s, change = instant_s - line[_RAW_INSTANT], value - line[RAW]
+    line[RAW], line[_RAW_INSTANT] = value, instant_s
+    before = line[LEAPT_BY]
+    if math.isnan(step_s) or (limit[_FATE] == LATCHED and step_s > limit[_GAP]):
+        line[LEAPT_BY], line[_FOLLOWED] = 0.0, 0.0
+    else:
+        if abs(change) > limit[_LEAP] + limit[_LEAP_PER_S] * step_s and line[_FOLLOWED] > 0.0:
+            line[LEAPT_BY] += change  # of the first sample after a gap it was that one that was wrong
+            if abs(line[LEAPT_BY]) <= 0.5 * limit[_LEAP]:
+                line[LEAPT_BY] = 0.0
+        line[_FOLLOWED] = 1.0
+    if line[LEAPT_BY] == 0.0:
+        line[LEAPT_SINCE] = np.nan
+    elif before == 0.0:
+        line[LEAPT_SINCE] = instant_s
+    return float(line[LEAPT_BY])
+
+
+@njit(cache=True, error_model="numpy")
 def take(row: int, value: float, instant_s: float, came_s: float, lines: Array, limits: Array) -> bool:
     """Put a sample behind the low-pass of its row; return True, and do not, where it leapt."""
     if math.isnan(value):
         return False
     line, limit = lines[row], limits[row]
-    if abs(value - line[_LAST]) > limit[_LEAP] + limit[_LEAP_PER_S] * (instant_s - line[_LAST_INSTANT]):
-        if math.isnan(line[_SINCE]):
-            line[_SINCE] = instant_s
-        if instant_s - line[_SINCE] < BELIEVED_S:
+    if limit[_FATE] != PASSING:
+        leapt_by = leaps(value, instant_s, line, limit)
+        if limit[_FATE] == LATCHED and leapt_by != 0.0:
             return True
-    line[_LAST], line[_LAST_INSTANT], line[_SINCE] = value, instant_s, np.nan
+        value -= leapt_by
+    elif abs(value - line[_LAST]) > limit[_LEAP] + limit[_LEAP_PER_S] * (instant_s - line[_LAST_INSTANT]):
+        if math.isnan(line[SINCE]):
+            line[SINCE] = instant_s
+        if instant_s - line[SINCE] < BELIEVED_S - TICK_S:
+            return True
+    line[_LAST], line[_LAST_INSTANT], line[SINCE] = value, instant_s, np.nan
     step_s, smooth = instant_s - line[_INSTANT], value
     if limit[_TAU] > 0.0 and step_s <= limit[_GAP]:
         smooth = low_pass_step(value, line[_VALUE], line[_SMOOTH], step_s, limit[_TAU])
-    line[_VALUE], line[_INSTANT], line[_CAME], line[_SMOOTH] = value, instant_s, came_s, smooth
+    line[_VALUE], line[_INSTANT], line[CAME], line[_SMOOTH] = value, instant_s, came_s, smooth
     line[_GIVEN] = 0.0
     return False
 
@@ -114,7 +150,7 @@ def at_tick(row: int, time_s: float, lines: Array, limits: Array) -> float:
     line, limit = lines[row], limits[row]
     given = limit[_ONCE] > 0.0 and line[_GIVEN] > 0.0
     line[_GIVEN] = 1.0
-    if given or not time_s - line[_CAME] <= limit[_AGE] + TICK_S:
+    if given or not time_s - line[CAME] <= limit[_AGE] + TICK_S:
         return np.nan
     behind = line[_SMOOTH] - line[_VALUE]
     if limit[_TAU] > 0.0:

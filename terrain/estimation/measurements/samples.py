@@ -15,8 +15,33 @@ from numba import njit
 
 from terrain.angles import wrapped
 from terrain.constants import GRAVITY_MPS2
-from terrain.estimation.measurements.sample_hold import LEAPS, N_LINE, NO_LEAP, at_tick, limits_of, take
+from terrain.estimation.measurements.derived import REST_SEEN_MPS, derive_rows, is_moving, take_vibration
+from terrain.estimation.measurements.frozen import (
+    OF_CAMERA,
+    OF_IMU,
+    OF_SPEED,
+    OF_WHEELS,
+    REPEATED_CAMERA,
+    REPEATED_IMU,
+    REPEATED_SPEED,
+    find_frozen_wheels,
+    still_lives,
+)
+from terrain.estimation.measurements.sample_hold import (
+    LATCHED,
+    LEAPS,
+    LEAPT_BY,
+    LEAPT_SINCE,
+    N_LINE,
+    NO_LEAP,
+    RAW,
+    at_tick,
+    leaps,
+    limits_of,
+    take,
+)
 from terrain.estimation.measurements.table import (
+    DERIVED_ROWS,
     GNSS_SPEED_STD_MPS,
     GNSS_STD_M,
     MAX_RATE_FACTOR,
@@ -48,6 +73,7 @@ STREAM_OF_ROW = (
     *("steering",) * 3,
     *("odometry",) * 4,
     *("gnss",) * 4,
+    *("derived",) * len(DERIVED_ROWS),
 )
 """Which stream each row is measured by."""
 
@@ -55,8 +81,15 @@ PARAMS = (
     *("reduction_ratio", "fastest_radps", "wheel_radius_m", "initial_yaw_rad"),
     *("gyro_bias_z_radps", "accel_bias_x_mps2", "accel_bias_y_mps2"),
     *("accel_scale_x_ratio", "accel_scale_y_ratio", "zero_1_rad", "zero_2_rad", "zero_3_rad"),
+    *("accel_bias_z_mps2", "accel_scale_z_ratio"),
 )
 """Parameters of the robot that the kernels use, in the order of ``params``."""
+
+TILT = 18
+"""Lines of roll and pitch: the derived rows have no samples, and their lines are free."""
+
+TILT_LIMITS = limits_of(0.0, 0.02, 0.0, (0.05, 3.0, LATCHED))
+"""Roll and pitch turn by 3 rad/s at the most; a leap tilts gravity."""
 
 N_FATES = 3
 TAKEN, LEAPT, NO_ROTATION = range(N_FATES)
@@ -66,15 +99,16 @@ N_TURNS, N_GNSS = 5, 3
 """Angles in ``turns``; columns of ``gnss``: the origin of positions and the variance of the last one."""
 
 ACCEL_X, GYRO_Z, IMU_YAW, STEER = 3, 5, 6, 7
-CAMERA, CAMERA_YAW, POSITION = 10, 13, 14
+CAMERA, CAMERA_YAW, POSITION, DERIVED, REST = 10, 13, 14, 18, 26
 _REDUCTION, _FASTEST, RADIUS, YAW_0, _GYRO_BIAS, _BIAS_X, _BIAS_Y, _SCALE_X, _SCALE_Y, _ZERO = range(10)
+_BIAS_Z, _SCALE_Z = 12, 13
 _IMU_TURNS, _CAMERA_TURNS = 3, 4
 _FIX_STD, _FLOAT_STD = GNSS_STD_M[True], GNSS_STD_M[False]
 _inline = njit(cache=True, error_model="numpy")
 
 
 def params_of(robot: Robot, initial_yaw_rad: float) -> Array:
-    """Return the parameters (12,) of a robot, neutral ones for what it does not have."""
+    """Return the parameters (14,) of a robot, neutral ones for what it does not have."""
     motors, sensors = robot.completed.motors, robot.completed.sensors
     zeros = {f"zero_{i}_rad": zero for i, zero in enumerate(robot.steering_zeros_rad.tolist(), 1)}
     values: dict[str, float] = dict.fromkeys(PARAMS, 0.0)
@@ -91,7 +125,7 @@ def limits_of_rows(
     tick_s: float,
     judged: Sequence[str] = ROWS,
 ) -> Array:
-    """Return the limits (18, 6) of the rows.
+    """Return the limits (29, 7) of the rows.
 
     Parameters
     ----------
@@ -150,6 +184,7 @@ def take_imu(
     turns: Array,
     lines: Array,
     limits: Array,
+    derived: Array,
 ) -> bool:
     """Calibrated yaw rate, acceleration of the body without gravity, and yaw.
 
@@ -159,6 +194,12 @@ def take_imu(
     """
     gyro_z, force_x, force_y = sample[2], sample[3], sample[4]
     roll, pitch, yaw = sample[6], sample[7], sample[8]
+    for i in range(2):
+        if (
+            not math.isnan(sample[6 + i])
+            and leaps(sample[6 + i], instant_s, lines[TILT + i], TILT_LIMITS) != 0.0
+        ):
+            roll = pitch = np.nan
     accel_x = (force_x - params[_BIAS_X]) / params[_SCALE_X] + GRAVITY_MPS2 * math.sin(pitch)
     level_y = GRAVITY_MPS2 * math.sin(roll) * math.cos(pitch)
     accel_y = (force_y - params[_BIAS_Y]) / params[_SCALE_Y] - level_y
@@ -166,12 +207,21 @@ def take_imu(
     leapt |= take(ACCEL_X + 1, accel_y, instant_s, came_s, lines, limits)
     leapt |= take(GYRO_Z, gyro_z - params[_GYRO_BIAS], instant_s, came_s, lines, limits)
     leapt |= take(IMU_YAW, _unwrap(yaw, turns[_IMU_TURNS]), instant_s, came_s, lines, limits)
+    level_z = GRAVITY_MPS2 * math.cos(roll) * math.cos(pitch)
+    take_vibration((sample[5] - params[_BIAS_Z]) / params[_SCALE_Z] - level_z, instant_s, derived)
     return bool(leapt)
 
 
 @_inline
 def take_odometry(
-    sample: Array, instant_s: float, came_s: float, turns: Array, lines: Array, limits: Array
+    sample: Array,
+    instant_s: float,
+    came_s: float,
+    turns: Array,
+    lines: Array,
+    limits: Array,
+    moving: bool,
+    frozen: Array,
 ) -> int:
     """Speed of the camera point, yaw rate and yaw: ``kinematics.camera.body_motion`` of one sample."""
     # the camera's axes renamed to the body's: (-z, -x, y), of vectors and of the quaternion's vector alike
@@ -190,10 +240,14 @@ def take_odometry(
         angle[2] = yaw
     speed_x = r_00 * v_x + r_10 * v_y + r_20 * v_z
     speed_y = r_01 * v_x + r_11 * v_y + r_21 * v_z
-    leapt = take(CAMERA, speed_x, instant_s, came_s, lines, limits)
-    leapt |= take(CAMERA + 1, speed_y, instant_s, came_s, lines, limits)
+    speed = still_lives(np.array([speed_x, speed_y]), REPEATED_SPEED, moving, frozen)
+    turned_by = lines[CAMERA_YAW, LEAPT_BY]
+    leapt = take(CAMERA_YAW, yaw - angle[2], instant_s, came_s, lines, limits)
+    if lines[CAMERA_YAW, LEAPT_BY] != turned_by:  # its leap turns the speeds: they have not leapt themselves
+        lines[CAMERA, RAW], lines[CAMERA + 1, RAW] = speed[0], speed[1]
+    leapt |= take(CAMERA, speed[0], instant_s, came_s, lines, limits)
+    leapt |= take(CAMERA + 1, speed[1], instant_s, came_s, lines, limits)
     leapt |= take(CAMERA + 2, sample[11], instant_s, came_s, lines, limits)
-    leapt |= take(CAMERA_YAW, yaw - angle[2], instant_s, came_s, lines, limits)
     return LEAPT if leapt else TAKEN
 
 
@@ -225,47 +279,68 @@ def take_sample(
     turns: Array,
     lines: Array,
     limits: Array,
-    gnss: Array,
+    memories: tuple[Array, Array, Array],
 ) -> int:
     """Take a sample of any stream; return :data:`TAKEN`, :data:`LEAPT` or :data:`NO_ROTATION`.
 
-    ``stamps_s`` are the instant of the measurement and that of its arrival.
+    ``stamps_s`` are the instant of the measurement and that of its arrival; ``memories`` are those of the
+    GNSS, of the derived rows and of frozen channels.
     """
     instant_s, came_s = stamps_s
+    gnss, derived, frozen = memories
     if stream == ODOMETRY:
-        fate: int = take_odometry(sample, instant_s, came_s, turns, lines, limits)
+        moving = is_moving(derived)
+        lives = still_lives(sample, REPEATED_CAMERA, moving, frozen[OF_CAMERA])
+        fate: int = take_odometry(lives, instant_s, came_s, turns, lines, limits, moving, frozen[OF_SPEED])
         return fate
     leapt = False
     if stream == STEERING:
         leapt = take_steering(sample, came_s, params, turns, lines, limits)
     elif stream == IMU:
-        leapt = take_imu(sample, instant_s, came_s, params, turns, lines, limits)
+        lives = still_lives(sample, REPEATED_IMU, is_moving(derived), frozen[OF_IMU])
+        leapt = take_imu(lives, instant_s, came_s, params, turns, lines, limits, derived)
     else:
         take_gnss(sample, instant_s, came_s, lines, limits, gnss)
     return LEAPT if leapt else TAKEN
 
 
 @_inline
-def wheel_rates(motor_radps: Array, params: Array, z: Array) -> tuple[bool, bool]:
+def wheel_rates(
+    motor_radps: Array, params: Array, moving: bool, frozen: Array, z: Array
+) -> tuple[bool, bool]:
     """Write the rates of the wheels; return whether all are finite, and whether one is beyond the motors."""
     finite, beyond = True, False
+    stuck = np.empty(3, np.bool_)
+    find_frozen_wheels(motor_radps, moving, frozen[OF_WHEELS], stuck)
     for i in range(3):
         rate = motor_radps[i] / params[_REDUCTION]
         known = math.isfinite(rate)
         too_fast = known and abs(rate) > params[_FASTEST]
         finite &= known
         beyond |= too_fast
-        z[i] = np.nan if too_fast or not known else rate
+        z[i] = np.nan if too_fast or not known or stuck[i] else rate
     return finite, beyond
 
 
 @_inline
 def rows_at_tick(
-    time_s: float, lines: Array, limits: Array, gnss: Array, z: Array, gnss_variance: Array
+    time_s: float,
+    lines: Array,
+    limits: Array,
+    gnss: Array,
+    params: Array,
+    derived: Array,
+    z: Array,
+    gnss_variance: Array,
 ) -> None:
     """Write all rows but those of the wheels, and the variances (4,) of the GNSS rows."""
-    for row in range(3, z.size):
+    for row in range(3, DERIVED):
         z[row] = at_tick(row, time_s, lines, limits)
     for i in range(2):
         gnss_variance[i] = np.nan if math.isnan(z[POSITION + i]) else gnss[2]
         gnss_variance[2 + i] = np.nan if math.isnan(z[POSITION + 2 + i]) else GNSS_SPEED_STD_MPS**2
+    derive_rows(time_s, z, params[RADIUS], derived, DERIVED, GYRO_Z, ACCEL_X, CAMERA)
+    if z[REST] == 0.0:
+        for row in range(CAMERA, CAMERA + 2):  # at rest a camera that measures none is right again
+            if abs(lines[row, RAW]) <= REST_SEEN_MPS:
+                lines[row, LEAPT_BY], lines[row, LEAPT_SINCE] = 0.0, np.nan

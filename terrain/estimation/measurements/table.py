@@ -34,6 +34,13 @@ GNSS_SPEED_STD_MPS = 0.03
 
 CAMERA_ROWS = ("camera_speed_x_mps", "camera_speed_y_mps", "camera_yaw_rate_radps", "camera_yaw_rad")
 GNSS_ROWS = ("gnss_position_x_m", "gnss_position_y_m", "gnss_speed_x_mps", "gnss_speed_y_mps")
+DERIVED_ROWS = (
+    "vibration_mps2",
+    *(f"wheel_{i}_growth_per_s" for i in (1, 2, 3)),
+    *(f"wheel_{i}_change_m2ps3" for i in (1, 2, 3)),
+    "camera_age_s",
+    *("rest_speed_x_mps", "rest_speed_y_mps", "rest_yaw_rate_radps"),
+)
 ROWS_OF_DRIVE: dict[str, tuple[str, ...]] = {
     "swerve": (
         *(f"wheel_{i}_radps" for i in (1, 2, 3)),
@@ -44,13 +51,15 @@ ROWS_OF_DRIVE: dict[str, tuple[str, ...]] = {
         *(f"steer_{i}_rad" for i in (1, 2, 3)),
         *CAMERA_ROWS,
         *GNSS_ROWS,
+        *DERIVED_ROWS,
     ),
     "skid_steer": ("wheel_left_mps", "wheel_right_mps", "gyro_z_radps", *GNSS_ROWS),
 }
 """Rows of a table, of a swerve robot in the order of (6.3).
 
 Positions and GNSS speeds are in the world frame, east and north from where the antenna first was; yaw counts
-from east once the heading at the start is given; all else is in body axes."""
+from east once the heading at the start is given; all else is in body axes.  The last rows of a swerve robot
+are those of :mod:`~terrain.estimation.measurements.derived`."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -32,6 +32,7 @@ from terrain.simulation.dynamic.plant import Plant, make_plant, record_width
 from terrain.simulation.dynamic.profile import draw_profile
 from terrain.simulation.dynamic.states import start_state
 from terrain.simulation.dynamic.step import advance, settle
+from terrain.simulation.dynamic.step_limit import check_step
 from terrain.simulation.scenario.scenario import Scenario
 from terrain.simulation.sensors.camera import CameraSensor
 from terrain.simulation.sensors.gnss import Gnss, GnssSensor
@@ -271,7 +272,9 @@ def _plant(
     conditions: Conditions,
     rng: np.random.Generator,
 ) -> Plant:
-    return make_plant(robot, conditions, draw_profile(robot, scenario, soils, conditions, rng))
+    plant = make_plant(robot, conditions, draw_profile(robot, scenario, soils, conditions, rng))
+    check_step(plant, robot.name)
+    return plant
 
 
 def _labels(motion: Motion, scenario: Scenario) -> tuple[Label, ...]:

@@ -1,15 +1,24 @@
 """`terrain drive`: controllers, seeds, and equal conditions for their comparison."""
 
+import io
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from rich.console import Console
 
+from pipelines.drive import controllers
+from pipelines.drive.belief import belief_notes
 from pipelines.drive.controller_names import CONTROLLERS, earlier_name
-from pipelines.drive.controllers import drive_once, make_controller
+from pipelines.drive.controllers import DriveInputs, drive_once, make_controller
 from pipelines.drive.drive import drive, load_inputs, steepest
+from pipelines.drive.screen import print_drive
 from pipelines.drive.settings import DriveSettings
+from pipelines.drive.view import drive_view
+from pipelines.live.terrain_source import TerrainEstimate
+from pipelines.models.model_files import TerrainModel
 from pipelines.reporting.json_file import as_json
 from terrain.control.drive_evaluation import (
     METRICS,
@@ -80,8 +89,6 @@ def test_energy_is_compared_over_the_distance_that_all_travelled():
 
 
 def test_traction_control_starts_gently_in_any_direction():
-    from dataclasses import replace
-
     situation = make_situation("starts", ROBOT, "grass", 301)
     peaks = {}
     for angle in (0.0, 0.25 * math.pi, 0.5 * math.pi, math.pi):
@@ -117,6 +124,73 @@ def test_the_steepest_grade_is_found():
     assert 8.0 < steepest(settings, INPUTS, make_controller("plain", TABLE, 0.05), 302) < 20.0
 
 
+class Scripted:
+    """A source that gives one output every 2 s, and refuses a window in between."""
+
+    certain = False
+
+    def __init__(self, terrain, probability):
+        self.output, self.n_refused, self.next_s = (terrain, probability), 0, 2.0
+
+    def update(self, sample, estimates):
+        if sample.time_s < self.next_s:
+            return []
+        self.next_s += 2.0
+        self.n_refused += self.next_s == 6.0
+        return [TerrainEstimate(sample.time_s, *self.output)] if self.next_s != 6.0 else []
+
+
+def scripted(monkeypatch, probability, names=("plain", "thesis", "thesis:classified", "classified")):
+    """The drives on grass, with a classifier of that probability."""
+    monkeypatch.setattr(controllers, "Classifier", lambda model: Scripted("grass", probability))
+    settings = SHORT.with_(controllers=names, seeds=2, duration_s=16.0, jobs=1)
+    model = TerrainModel(None, None)  # which only the source uses
+    return drive(settings, DriveInputs(ROBOT, TABLE, model))
+
+
+def test_the_thesis_takes_the_targets_of_the_classified_terrain(monkeypatch):
+    result = scripted(monkeypatch, 0.9)
+    base, classified = (result.controllers[name] for name in ("thesis", "thesis:classified"))
+    assert base["believed_ratio"].mean is None
+    assert 0.4 < classified["believed_ratio"].mean < 0.8  # from the third window on, as the second is refused
+    counts = [classified[name].mean for name in ("n_accepted", "n_below_threshold", "n_refused")]
+    assert counts == [7, 0, 1]
+    assert base["mean_speed_mps"].mean != classified["mean_speed_mps"].mean
+    assert belief_notes(result) == ()
+
+
+@pytest.mark.parametrize("suffix", ["", "+track"])
+def test_the_thesis_with_the_true_terrain_drives_on_its_targets(suffix):
+    """The same as the thesis with a table whose fallback has the targets of that terrain."""
+    entry = dict(TABLE.targets["grass"])
+    grass = replace(TABLE, targets={**TABLE.targets, TABLE.fallback: entry})
+    settings = SHORT.with_(seeds=1)
+    name = f"thesis:true_terrain{suffix}"
+    adapting = drive(settings.with_(controllers=(name,)), INPUTS)
+    fixed = drive(settings.with_(controllers=(f"thesis{suffix}",)), DriveInputs(ROBOT, grass))
+    key = "energy_j_per_m"
+    assert adapting.controllers[name][key] == fixed.controllers[f"thesis{suffix}"][key]
+    assert adapting.controllers[name]["believed_ratio"].mean == 1.0
+
+
+def test_no_gain_is_credited_to_a_classifier_that_was_never_believed(monkeypatch):
+    result = scripted(monkeypatch, 0.3)
+    for name in ("classified", "thesis:classified"):
+        assert result.controllers[name]["believed_ratio"].mean == 0.0
+        assert result.controllers[name]["n_below_threshold"].mean == 7
+    notes = belief_notes(result)
+    assert [note.split()[0] for note in notes] == ["thesis:classified", "classified"]
+    assert "knew the terrain at no time" in notes[0]
+    assert "0 accepted, 7 below the threshold, 1 refused" in notes[0]
+    with Console(file=io.StringIO(), width=110) as console:
+        print_drive(result, console)
+    assert " ".join(notes[1].split()) in " ".join(console.file.getvalue().split())
+    view = drive_view(result, {})
+    assert view.notes == notes
+    assert "classified compared" not in view.verdict
+    assert "thesis compared with plain" in view.verdict
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -139,6 +213,8 @@ def test_the_steepest_grade_is_found():
         ({"controllers": ("ramp",), "ramp_mps2": 0.0}, "above zero"),
         ({"controllers": ("classified",)}, "needs a classifier"),
         ({"controllers": ("learned+track",)}, "needs a classifier"),
+        ({"controllers": ("thesis:classified",)}, "'thesis:classified' needs a classifier"),
+        ({"controllers": ("thesis:fallback",)}, "'thesis:fallback' is unknown"),
     ],
 )
 def test_invalid_settings_are_refused_in_one_sentence(changes, message):

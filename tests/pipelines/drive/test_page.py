@@ -16,7 +16,7 @@ from pipelines.drive.page import drive_page, write_drive_page
 from pipelines.drive.results import DriveResult
 from pipelines.drive.run_figures import drive_curves, run_figures, terrain_strips
 from pipelines.drive.view import difference, drive_figures, shown_metrics
-from pipelines.live.pilot import PilotStatus
+from pipelines.live.pilot_settings import PilotStatus
 from pipelines.reporting.drawing import png_bytes
 from pipelines.reporting.numbers import NOT_KNOWN
 from terrain.control.comparison import MeanInterval, mean_interval

@@ -48,10 +48,11 @@ def test_quickstart_needs_no_data(in_tracked, tmp_path):
     result = as_json(quickstart(asked, evaluation=settings, runs_a_terrain=2))
     assert json.loads(json.dumps(result)) == result
     assert result["imported"] == {"out": str(tmp_path / "out" / "runs"), "n_runs": 16, "reused": False}
-    assert len(result["slip"]) == 8
+    assert len(result["slip"]) == len(result["consistency"]) == 8
     assert result["commands"][0].startswith("terrain simulate --robot agrimaro --terrain all")
     page = (tmp_path / "out" / "report.html").read_text()
     assert "From logs to slip" in page
+    assert "How far the filter's uncertainty can be believed" in page.replace("&#39;", "'")
     assert len(re.findall("<figure", page)) >= 4
     run = read_run(tmp_path / "out" / "runs" / "grass_survey_01")
     assert run.robot == "agrimaro"

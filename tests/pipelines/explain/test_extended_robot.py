@@ -78,12 +78,13 @@ def test_the_filter_of_an_extended_robot_is_as_good_as_without_effects(name):
     assert found.run is run
 
 
-def test_a_position_that_drifts_with_the_gyro_comes_back():
+def test_biases_are_found_by_the_filter_and_by_their_correction():
     effects = {"gyro_bias_radps": 0.03, "accel_bias_mps2": 0.5}
     run = driven(tuple(effects.items()), Gnss())
     before = errors(estimate_run(run, ROBOT, "vio15"))[0]
     after = errors(estimate_run(run, replace(ROBOT, effects=effects), "vio15"))[0]
-    assert after < 0.005 < 0.05 < before
+    assert after < 0.005
+    assert before < 0.005  # biases are states, and found
 
 
 def test_the_written_run_holds_the_measurements_and_the_true_wheel_speeds():

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from pipelines.drive.controllers import DriveInputs, drive_once, make_controller
-from pipelines.live.pilot import CONTROLLERS, LivePilot, PilotSettings
+from pipelines.live.pilot import LivePilot
+from pipelines.live.pilot_settings import CONTROLLERS, PilotSettings
 from pipelines.live.terrain_source import KnownTerrain
 from terrain.control.drive_metrics import distance_within, drive_history, final_speed, slip_peak
 from terrain.control.pid import Gains
@@ -21,6 +22,7 @@ from terrain.control.slip_table import CurveEntry, load_slip_table
 from terrain.control.traction import TractionStatus
 from terrain.control.traction_settings import SETTINGS
 from terrain.errors import ConfigError
+from terrain.estimation.live.health import SENSORS, Health
 from terrain.logs.replay import replay
 from terrain.records import Reading, Sample
 from terrain.robots import load_robot
@@ -113,28 +115,45 @@ def test_without_readings_it_reports_so_and_fades_to_the_desired_speed(wrong):
     assert command.twist == pytest.approx(plain.twist)
 
 
-@pytest.mark.parametrize("time_s", [NAN, 8.0, 7.0, 8.6, math.inf])
-def test_a_wrong_clock_is_reported_and_causes_no_jump(time_s):
+@pytest.mark.parametrize("time_s", [NAN, 7.0, 8.6, 1e6, math.inf])
+def test_a_wrong_clock_causes_no_jump_and_no_end_of_slip_control(time_s):
+    """The clock of the steps is set once, for good or for a step; that of the streams is not."""
+    live, offset_s = pilot(), 0.0
+    for sample in recorded():
+        if sample.time_s > 8.0 and offset_s == 0.0:
+            before = live.step(sample._replace(time_s=time_s, twist=np.array([1.0, 0.0, 0.0])))
+            offset_s = time_s - sample.time_s if math.isfinite(time_s) else 1e-6
+            continue
+        command = live.step(sample._replace(time_s=sample.time_s + offset_s))
+        if 8.0 < sample.time_s < 8.3:
+            rise = command.wheel_radps - before.wheel_radps
+            assert (rise * ROBOT.wheel_radius_m <= SETTINGS.fade_mps2 * DT_S + 0.05).all()
+            before = command
+        if 8.3 < sample.time_s < 12.0:
+            assert sane(command) == TractionStatus.OK
+
+
+def test_a_step_at_the_same_time_is_reported():
     live = pilot()
-    samples = [sample for sample in recorded() if sample.time_s <= 8.0]
-    for sample in samples:
-        before = live.step(sample._replace(twist=np.array([0.2, 0.0, 0.0])))
-    more = np.array([1.0, 0.0, 0.0])
-    command = live.step(Sample(time_s, more, {}))
-    assert sane(command) == TractionStatus.BAD_TIME
-    rise = command.wheel_radps - before.wheel_radps
-    assert (rise * ROBOT.wheel_radius_m <= SETTINGS.fade_mps2 * DT_S + 0.01).all()
-    assert sane(live.step(Sample(8.7 if time_s == 8.6 else 8.02, more, {}))) == (
-        TractionStatus.OK if time_s != 7.0 else TractionStatus.BAD_TIME
-    )
+    for sample in recorded()[:300]:
+        live.step(sample)
+    assert sane(live.step(sample._replace(readings={}))) == TractionStatus.BAD_TIME
 
 
 def test_a_clock_that_is_never_valid_leaves_a_robot_that_drives():
     live, twist = pilot(), np.array([0.5, 0.0, 0.0])
     for _ in range(60):
         command = live.step(Sample(NAN, twist, {}))
-        assert sane(command) == TractionStatus.BAD_TIME
+        assert sane(command) == TractionStatus.UNSOUND
     assert command.wheel_radps == pytest.approx(np.full(3, 2.5))
+
+
+@pytest.mark.parametrize("wrong", [None, "sample", 7, Sample("now", "there", [1, 2], None)])
+def test_what_is_no_sample_at_all_costs_a_step(wrong):
+    live = pilot()
+    names = list(live.step(recorded()[0]).status)
+    for _ in range(3):
+        sane(live.step(wrong), names)
 
 
 @pytest.mark.parametrize("controller", CORRECTING)
@@ -170,7 +189,7 @@ def test_memory_does_not_grow():
     tracemalloc.stop()
     # bytes a step: less than an array takes, more than what numba's boxing leaves to its lists; what grows
     # does so in every lap, a cache that fills in one of them does not
-    assert min(np.diff(held)) < 50 * len(samples)
+    assert min(np.diff(held)) < 64 * len(samples)
 
 
 def test_it_needs_neither_tracking_nor_a_web_server():
@@ -250,21 +269,21 @@ def test_without_slip_it_drives_the_plain_command():
 
 
 @pytest.mark.parametrize("lost_s", [(4.0, 5.0), (4.0, 9.0)])
-def test_a_lost_camera_is_bridged_for_a_second_and_then_reported(lost_s):
+def test_a_lost_camera_is_named_within_a_third_of_a_second(lost_s):
     run, _ = driven("known:grass", "straight", "grass", 200, faults=Faults((lost_s,)), duration_s=14.0)
     control = run.streams["control"]
     time_s, why = control.time_s, control.channel("status_code")
-    assert set(why[(time_s > 2.0) & (time_s < 5.0)]) == {TractionStatus.OK}
-    assert not (
-        set(why[(time_s > 6.0) & (time_s < lost_s[1])]) - {TractionStatus.STALE, TractionStatus.UNCERTAIN}
-    )
-    assert set(why[(time_s > 7.2) & (time_s < lost_s[1])]) <= {TractionStatus.STALE}
+    assert set(why[(time_s > 2.0) & (time_s < 4.1)]) == {TractionStatus.OK}
+    gone = (time_s > 4.3) & (time_s < lost_s[1])
+    assert set(why[gone]) == {TractionStatus.UNSOUND}
+    named = {SENSORS[int(place)] for place in control.channel("sensor_code")[gone]}
+    assert named == {"camera_speed"}
+    assert set(control.channel("health_code")[gone]) == {Health.LOST}
     assert set(why[time_s > lost_s[1] + 0.5]) == {TractionStatus.OK}
     lost = (time_s > lost_s[0]) & (time_s < lost_s[1])
     assert control.channel("stale_s")[lost].max() == pytest.approx(lost_s[1] - lost_s[0], abs=0.1)
     assert np.isnan(control.channel("slip_ratio")[time_s > 2.0]).sum() == 0
-    balance = control.channel("balance_ratio")[lost & (why != TractionStatus.OK)]
-    assert np.ptp(balance) == 0 if balance.size else lost_s[1] == 5.0
+    assert np.ptp(control.channel("driven_mps")[gone]) < 0.01
 
 
 def test_a_start_without_a_camera_fades_in_and_learns_nothing():
@@ -274,7 +293,7 @@ def test_a_start_without_a_camera_fades_in_and_learns_nothing():
     control = run.streams["control"]
     time_s = control.time_s
     gone = (time_s > 4.0) & (time_s < 6.0)
-    assert set(control.channel("status_code")[gone]) <= {TractionStatus.STALE, TractionStatus.UNCERTAIN}
+    assert set(control.channel("status_code")[gone]) == {TractionStatus.UNSOUND}
     assert np.isnan(control.channel("balance_ratio")[time_s < 6.0]).all()
     assert control.channel("driven_mps")[gone] == pytest.approx(1.0)
     assert set(control.channel("status_code")[time_s > 6.5]) == {TractionStatus.OK}
@@ -284,7 +303,7 @@ def test_without_any_camera_the_plain_command_is_driven():
     faults = Faults(camera_lost_s=((0.0, 20.0),))
     run, _ = driven("known:grass", "straight", "grass", 200, faults=faults, duration_s=6.0)
     control = run.streams["control"]
-    assert set(control.channel("status_code")) == {TractionStatus.NO_SLIP}
+    assert set(control.channel("status_code")) == {TractionStatus.UNSOUND}
     assert control.channel("driven_mps") == pytest.approx(control.channel("desired_mps"), abs=0.03)
 
 
@@ -343,10 +362,9 @@ def test_backward_and_sideways_slip_is_estimated_and_limited_as_forward(scenario
     error = control.channel("slip_ratio")[fast] - true[fast]
     assert fast.sum() > 500
     assert np.sqrt(np.mean(error**2)) < 0.05
-    assert set(control.channel("status_code")[control.time_s > 1.0]) <= {
-        TractionStatus.OK,
-        TractionStatus.UNCERTAIN,
-    }
+    why = control.channel("status_code")[control.time_s > 1.0]
+    assert (why == TractionStatus.UNSOUND).mean() < 0.01  # a dropout of the camera
+    assert set(why) <= {TractionStatus.OK, TractionStatus.UNCERTAIN, TractionStatus.UNSOUND}
     plain = history(
         "plain",
         scenario,

@@ -10,9 +10,11 @@ from pipelines.classify.crossval import samples_of
 from pipelines.classify.settings import CrossvalSettings
 from pipelines.classify.train import model_info
 from pipelines.live.pilot import LivePilot
+from pipelines.live.pilot_settings import PilotSettings, PilotStatus
 from pipelines.live.terrain_source import Classifier, KnownTerrain, NoTerrain
 from pipelines.models.model_files import TerrainModel
 from terrain.control.slip_table import load_slip_table
+from terrain.control.switching import SWITCHING, OutputStatus
 from terrain.errors import DataError
 from terrain.estimation.enriched import enriched
 from terrain.estimation.estimate import estimate_run
@@ -103,6 +105,39 @@ def test_a_pilot_accepts_the_classification(model, log):
     assert set(accepted) == {-1.0, accepted[-1]}
 
 
+def test_the_belief_of_a_classifier_ends_when_a_sensor_of_its_windows_is_lost(model, log):
+    """Windows need the IMU: after 5 s of driving without one the terrain is unknown."""
+    switching = SWITCHING._replace(unconfirmed_max_s=5.0)
+    pilot = LivePilot(ROBOT, load_slip_table(), Classifier(model), PilotSettings(switching=switching))
+    seen = []
+    for sample in replay(log):
+        if sample.time_s > 12.0:
+            kept = {name: reading for name, reading in sample.readings.items() if name != "imu"}
+            sample = sample._replace(readings=kept)
+        seen.append((sample.time_s, *pilot.step(sample).status.values()))
+    fields = ("time_s", *PilotStatus._fields)
+    time_s, code, output, target = (
+        np.array([row[fields.index(name)] for row in seen])
+        for name in ("time_s", "terrain_code", "output_code", "target_ratio")
+    )
+    last_s = time_s[output == OutputStatus.ACCEPTED].max()
+    assert last_s < 12.5
+    assert (code[(time_s > last_s) & (time_s < last_s + 4.9)] >= 0).all()
+    assert (code[time_s > last_s + 5.1] == -1).all()
+    assert target[-1] == pilot._table.lookup("")["traction"].slip_ratio
+    assert np.abs(np.diff(target)).max() <= switching.rate_ratio * 0.0201
+
+
+def test_a_belief_outlasts_a_stop(model, log):
+    pilot = LivePilot(ROBOT, load_slip_table(), Classifier(model))
+    for sample in replay(log):
+        last = pilot.step(sample).status
+    assert last["terrain_code"] >= 0
+    for k in range(1500):  # half a minute
+        last = pilot.step(Sample(sample.time_s + 0.02 * (k + 1), np.zeros(3), {})).status
+    assert last["terrain_code"] >= 0
+
+
 WIDTHS = {"wheels": 6, "imu": 9}
 
 
@@ -148,6 +183,7 @@ def test_a_window_that_the_model_refuses_is_counted_and_raises_nothing(model, lo
     classifier = Classifier(model._replace(recipe=Refusing()))
     found, shown = live(classifier, log)
     assert classifier.failed == {"Input X contains NaN.": (len(shown) + 1) // 2}
+    assert classifier.n_refused == (len(shown) + 1) // 2
     assert len(found) == len(shown) // 2
 
 

@@ -15,12 +15,14 @@ from pipelines.classify.results import (
     Training,
     WindowPrediction,
 )
+from pipelines.estimate.consistency import TerrainConsistency
 from pipelines.estimate.labelled import TerrainSlip
 from pipelines.models.results import Registered
 from pipelines.quickstart.page import CAPTIONS, html_report
 from pipelines.quickstart.results import KeptRuns, QuickstartResult
 from pipelines.reporting.numbers import NOT_KNOWN
 from pipelines.reporting.versions import versions
+from terrain.control.comparison import MeanInterval
 
 MINUS_0_07 = "\N{MINUS SIGN}0.070"
 VOID = {"meta", "img", "br"}
@@ -98,6 +100,7 @@ def result(make_report):
         predict=predicted,
         imported=KeptRuns(Path("out/runs"), 3, reused=False),
         slip=None,
+        consistency=None,
         commands=("terrain quickstart --data 'a < b'",),
         report=Path("out/report.html"),
         created="2025-01-02",
@@ -255,6 +258,20 @@ def test_slip_of_simulated_runs_is_beside_its_truth(result):
     assert "From logs to slip" in page.text
     assert page.row("grass") == [["grass", "6", "0.042", "0.043", "0.0012", "1.12"]]
     assert page.row("sand") == [["sand", "6", *[NOT_KNOWN] * 4]]
+
+
+def test_consistency_is_shown_by_terrain_and_group(result):
+    known, alone = MeanInterval(4.9, (1.2, 8.6), 12), MeanInterval(0.25, None, 1)
+    none = MeanInterval(None, None, 0)
+    rows = (
+        TerrainConsistency("tilled_loam", 12, {"speed": known, "gyro_bias": alone}, known),
+        TerrainConsistency("tiles", 1, {"speed": none, "gyro_bias": alone}, alone),
+    )
+    page = Page(html_report(replace(result, consistency=rows), {}))
+    assert "survey, starts and complex" in page.text
+    assert page.row("tilled_loam") == [["tilled_loam", "12", "4.91.2 to 8.6", "0.25", "4.91.2 to 8.6"]]
+    assert page.row("tiles") == [["tiles", "1", NOT_KNOWN, "0.25", "0.25"]]
+    assert "uncertainty can be believed" not in Page(html_report(result, {})).text
 
 
 def test_the_published_protocol_is_named_as_such(result):

@@ -271,7 +271,7 @@ def test_the_same_seed_gives_the_same_rows_and_another_others(document):
         ("slip14", True, (9, 12)),
         ("slip14", False, (10, 12)),
         ("vio12", False, (10, 10)),
-        ("vio15", False, (13, 13)),
+        ("vio15", False, (16, 16)),
     ],
 )
 def test_all_states_are_observable_only_with_a_speed_over_ground(name, as_printed, expected):

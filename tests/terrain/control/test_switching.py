@@ -4,13 +4,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from features.windows import SteadyMotion
 from terrain.control.switching import (
+    DRIVING_MPS,
     NO_BELIEF,
     SWITCHING,
     UNKNOWN,
+    OutputStatus,
     TerrainBelief,
     approach,
     check_switching,
+    drive_on,
+    output_status,
     update,
 )
 from terrain.errors import ConfigError
@@ -86,6 +91,71 @@ def test_an_accepted_class_was_classified_for_the_whole_dwell(classified):
             assert time_s - row[0][0] < SWITCHING.dwell_s
 
 
+# A time of driving or standing, or an output (terrain, probability)
+events = st.one_of(
+    st.tuples(st.sampled_from([0.0, 0.02, 0.5, 1.0]), st.floats(0.01, 6.0)),
+    st.tuples(st.sampled_from(["grass", "clay", ""]), st.sampled_from([0.9, 0.3, NAN])),
+)
+
+
+@given(st.lists(events, max_size=60))
+def test_a_class_is_believed_for_a_bounded_time_of_driving_after_its_last_output(happened):
+    belief, time_s, driven_s = NO_BELIEF, 0.0, {"grass": INF, "clay": INF}
+    for first, second in happened:
+        before = belief
+        if isinstance(first, str):
+            time_s += 0.01
+            belief = update(belief, time_s, first, second)
+            if output_status(first, second) is OutputStatus.ACCEPTED:
+                driven_s[first] = 0.0
+            assert belief.terrain in (before.terrain, first if second >= 0.5 else UNKNOWN)
+        else:
+            time_s += second
+            belief = drive_on(belief, first, second)
+            if first >= DRIVING_MPS:
+                driven_s = {name: driven + second for name, driven in driven_s.items()}
+            assert belief.terrain in (before.terrain, UNKNOWN)
+            if before.terrain and not belief.terrain:
+                assert driven_s[before.terrain] > SWITCHING.unconfirmed_max_s - 1e-6
+        if belief.terrain:
+            assert driven_s[belief.terrain] <= SWITCHING.unconfirmed_max_s + 1e-6
+            assert math.isfinite(belief.probability)
+        else:
+            assert math.isnan(belief.probability)
+
+
+@given(st.floats(0.1, 100.0), st.lists(st.floats(0.001, 3.0), min_size=1, max_size=30))
+def test_when_a_class_expires_does_not_depend_on_the_steps(total_s, parts):
+    belief = GRASS
+    for part in parts:
+        belief = drive_on(belief, 1.0, total_s * part / sum(parts))
+    if abs(total_s - SWITCHING.unconfirmed_max_s) > 1e-6:
+        assert belief.terrain == drive_on(GRASS, 1.0, total_s).terrain
+
+
+@pytest.mark.parametrize("speed_mps", [0.0, DRIVING_MPS - 1e-9, NAN])
+def test_a_class_does_not_expire_while_the_robot_stands(speed_mps):
+    assert drive_on(GRASS, speed_mps, 1e6) is GRASS
+    assert drive_on(GRASS, 1.0, -1.0) is drive_on(GRASS, 1.0, NAN) is GRASS
+
+
+def test_a_class_that_expired_has_to_be_repeated_for_the_dwell_again():
+    expired = drive_on(GRASS, 1.0, 11.0, SWITCHING._replace(silent_s=100.0))
+    assert expired == NO_BELIEF._replace(received_s=GRASS.received_s)
+    assert accepted([("grass", 0.9)] * 2, expired, 104.0) == [UNKNOWN, "grass"]
+
+
+def test_outputs_that_contradict_each_other_end_a_belief():
+    belief = GRASS
+    for k in range(6):
+        belief = drive_on(update(belief, 102.0 + 2 * k, ("clay", "snow")[k % 2], 0.9), 1.0, 2.0)
+    assert belief.terrain == UNKNOWN
+
+
+def test_driving_is_what_windows_are_cut_of():
+    assert SteadyMotion().min_speed_mps == DRIVING_MPS
+
+
 finite = st.floats(-1.0, 1.0)
 
 
@@ -107,6 +177,7 @@ def test_a_target_moves_at_its_rate_and_never_past_its_end(now, desired, rate, d
         ("probability_least", NAN, "from 0 to 1"),
         ("dwell_s", -1, "from zero up"),
         ("silent_s", INF, "from zero up"),
+        ("unconfirmed_max_s", NAN, "from zero up"),
         ("rate_ratio", "fast", "from zero up"),
         ("rate_ratio", True, "from zero up"),
     ],

@@ -10,7 +10,7 @@ from terrain.errors import ConfigError, DataError
 from terrain.estimation.ekf.consistency import sample_from_model
 from terrain.estimation.ekf.filter import filter_step, log_likelihood, run_filter
 from terrain.estimation.ekf.kernel import OBSERVE, PROPAGATE
-from terrain.estimation.ekf.model import FilterModel, FilterSettings, Noise
+from terrain.estimation.ekf.model import FilterModel, FilterSettings, Given, Noise
 from terrain.estimation.ekf.resident import ResidentFilter
 from terrain.estimation.ekf.state import initial_state
 from terrain.records import ABSENT, GATED, REOPENED, USED
@@ -214,7 +214,7 @@ def test_sample_by_sample_equals_batch_bit_for_bit():
     track = run_filter(CARRIAGE, by_sample, time_s, z)
     state, states = initial_state(CARRIAGE, by_sample), []
     for k in range(time_s.size):
-        state = filter_step(CARRIAGE, by_sample, state, time_s[k], z[k], measurement_variance=r[k])
+        state = filter_step(CARRIAGE, by_sample, state, time_s[k], z[k], given=Given(r[k]))
         if state.time_s == time_s[k] and (not states or state.time_s > states[-1].time_s):
             states.append(state)
     for name in ("time_s", "mean", "cov", "nis", "nis_dof", "use", "reference_age_s"):
@@ -457,8 +457,8 @@ def test_a_resident_filter_takes_the_same_steps_to_the_last_bit(steps, seed):
         z = np.where(rng.random(5) < 0.2, np.nan, rng.normal([1000.0, 0.3, 1.0, 0.0, 0.0], 0.1))
         variance = rng.uniform(0.01, 0.1, 5) if rng.random() < 0.5 else None
         follows, before_s = resident.follows(time_s), state.time_s
-        state = filter_step(model, noise, state, time_s, z, measurement_variance=variance)
-        taken = resident.step(time_s, z, variance)
+        state = filter_step(model, noise, state, time_s, z, given=Given(variance))
+        taken = resident.step(time_s, z, Given(variance))
         assert taken == (follows != 0)
         assert taken == (state.time_s == time_s and before_s != time_s)
         assert not taken or (follows < 0) == (time_s < before_s)

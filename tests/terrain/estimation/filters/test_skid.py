@@ -1,10 +1,23 @@
 import numpy as np
 import pytest
 
+from terrain.angles import wrapped
 from terrain.errors import ConfigError
 from terrain.estimation.ekf.filter import run_filter
-from terrain.estimation.filters.skid import MIN_TURN_RADPS, make_skid_filter, skid_noise
+from terrain.estimation.estimate import estimate_run
+from terrain.estimation.filters.skid import (
+    FOLLOWS_S,
+    MAX_BIAS_RADPS,
+    MAX_TRACK_RATIO,
+    MIN_TURN_RADPS,
+    make_skid_filter,
+    skid_noise,
+    wheel_weight,
+    within_bounds,
+)
+from terrain.estimation.stuck import Motion
 from terrain.robots import load_robot
+from terrain.simulation.run import simulate_run
 
 HUSKY = load_robot("husky")
 MODEL, NOISE = make_skid_filter(HUSKY), skid_noise(HUSKY)
@@ -18,7 +31,8 @@ def drive(turn_radps, track_m=1.03, bias_radps=0.004, seed=0, speed_mps=0.7):
     speed = speed_mps * np.minimum(np.arange(n) / RATE_HZ / 2, 1)
     turn = np.asarray(turn_radps)
     z = np.column_stack([speed - turn * track_m / 2, speed + turn * track_m / 2, turn + bias_radps])
-    return np.arange(n) / RATE_HZ, z + rng.normal(0, [0.02, 0.02, 0.005], z.shape)
+    z += rng.normal(0, [0.02, 0.02, 0.005], z.shape)
+    return np.arange(n) / RATE_HZ, np.column_stack([z, np.full(n, np.nan)])
 
 
 SECONDS = np.arange(0, 60, 1 / RATE_HZ)
@@ -30,7 +44,7 @@ WINDING = 0.6 * np.sign(np.sin(SECONDS / 3)) * (np.abs(np.sin(SECONDS / 3)) > 0.
 def test_the_hidden_track_and_bias_come_back_from_a_drive_with_turns(hidden_m, seed):
     time_s, z = drive(WINDING, hidden_m, seed=seed)
     track = run_filter(MODEL, NOISE, time_s, z)
-    for state, truth, widest in (("effective_track_m", hidden_m, 0.06), ("gyro_bias_radps", 0.004, 0.006)):
+    for state, truth, widest in (("effective_track_m", hidden_m, 0.13), ("gyro_bias_radps", 0.004, 0.006)):
         std = track.std(state)[-1]
         assert abs(track.state(state)[-1] - truth) < 3 * std
         assert std < widest
@@ -54,27 +68,111 @@ def test_it_has_no_speed_over_ground():
     assert np.isinf(track.reference_age_s).all()
 
 
-@pytest.mark.parametrize("turns_radps", [0.5 * MIN_TURN_RADPS, 2 * MIN_TURN_RADPS])
-def test_jacobians_are_those_of_finite_differences(turns_radps):
-    """Below the least turn the row of the track is left out of them on purpose."""
-    x = np.array([1.0, 2.0, 0.4, 0.8, turns_radps, 0.9, 0.01])
-    d, m = x.size, 3
+@pytest.mark.parametrize("difference_mps", [0.5, -0.3, 2 * MIN_TURN_RADPS, 0.5 * MIN_TURN_RADPS])
+@pytest.mark.parametrize("turns_radps", [0.3, 0.01])
+def test_jacobians_are_those_of_finite_differences(difference_mps, turns_radps):
+    """With the weight of the wheels as a constant, and without the track where wheels hardly differ."""
+    difference_mps *= HUSKY.track_m
+    x = np.array([1.0, 2.0, 0.4, 0.8, turns_radps, 0.9, 0.01, difference_mps])
+    d, m, params = x.size, len(MODEL.rows), MODEL.params.copy()
     f, h, x_next, z_hat = np.zeros((d, d)), np.zeros((m, d)), np.zeros(d), np.zeros(m)
-    MODEL.propagate(x, 0.1, np.zeros(1), x_next, f)
-    MODEL.observe(x, np.zeros(1), z_hat, h)
+    MODEL.propagate(x, 0.1, params, x_next, f)
+    MODEL.observe(x, params, z_hat, h)
+    near = 1 - np.exp(-wheel_weight(turns_radps, difference_mps, HUSKY.track_m) * 0.1 / FOLLOWS_S)
+    assert x_next[4] == pytest.approx(turns_radps + near * (difference_mps / 0.9 - turns_radps))
     for j in range(d):
         ends = []
         for step in (1e-6, -1e-6):
             moved, there, seen = x.copy(), np.zeros(d), np.zeros(m)
             moved[j] += step
-            MODEL.propagate(moved, 0.1, np.zeros(1), there, np.zeros((d, d)))
-            MODEL.observe(moved, np.zeros(1), seen, np.zeros((m, d)))
+            MODEL.propagate(moved, 0.1, params, there, np.zeros((d, d)))
+            there[4] = moved[4] + near * (moved[7] / moved[5] - moved[4])
+            MODEL.observe(moved, params, seen, np.zeros((m, d)))
             ends.append((there, seen))
-        np.testing.assert_allclose(f[:, j], (ends[0][0] - ends[1][0]) / 2e-6, atol=1e-8)
-        slope = (ends[0][1] - ends[1][1]) / 2e-6
-        if MODEL.states[j] == "effective_track_m" and turns_radps < MIN_TURN_RADPS:
-            slope[:] = 0.0
-        np.testing.assert_allclose(h[:, j], slope, atol=1e-8)
+        slope = (ends[0][0] - ends[1][0]) / 2e-6
+        if MODEL.states[j] == "effective_track_m" and abs(difference_mps) < MIN_TURN_RADPS * HUSKY.track_m:
+            slope[4] = 0.0
+        np.testing.assert_allclose(f[:, j], slope, atol=1e-8)
+        np.testing.assert_allclose(h[:, j], (ends[0][1] - ends[1][1]) / 2e-6, atol=1e-8)
+
+
+def test_wheels_are_believed_less_where_they_differ_more_and_where_the_gyro_disagrees():
+    track_m = HUSKY.track_m
+    assert wheel_weight(0.0, 0.0, track_m) == 1.0
+    agreeing = [wheel_weight(turn / 1.6, turn * track_m, track_m) for turn in (0.05, 0.2, 0.8)]
+    assert (np.diff(agreeing) < 0).all()
+    apart = [wheel_weight(turn, 0.3, track_m) for turn in (0.3, 0.1, 0.0, -0.3)]
+    assert (np.diff(apart) < 0).all()
+    assert wheel_weight(0.1, -0.2, track_m) == wheel_weight(-0.1, 0.2, track_m)
+    assert apart[2] < 0.02
+
+
+@pytest.mark.parametrize("bias_radps", [-0.004, 0.006])
+@pytest.mark.parametrize("difference_mps", [0.11, 0.3, -0.39])
+def test_wheels_that_spin_without_turning_the_robot_leave_the_bias_alone(bias_radps, difference_mps):
+    time_s, z = drive(np.zeros(SECONDS.size), bias_radps=bias_radps, seed=3, speed_mps=0.0)
+    z[:, :2] += np.array([-0.5, 0.5]) * difference_mps
+    track = run_filter(MODEL, NOISE, time_s, z)
+    bias, std = track.state("gyro_bias_radps"), track.std("gyro_bias_radps")
+    assert (np.abs(bias - bias_radps) < 3 * std).all()
+    assert np.abs(bias).max() < 0.003
+    assert (np.abs(np.unwrap(track.state("yaw_rad"))) < 3 * track.std("yaw_rad")).all()
+
+
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_track_and_bias_stay_within_their_bounds(sign):
+    """Against a robot that turns faster than its wheels, or against them, and a gyro of a huge bias."""
+    time_s, z = drive(0.4 * np.ones(SECONDS.size), 0.2, speed_mps=0.0)
+    z[:, 2] = 5.0 * sign * z[:, 2] + 0.3
+    z[::40, 3] = 0.3 * sign
+    track = run_filter(MODEL, NOISE, time_s, z)
+    mean = within_bounds(track.mean, HUSKY.track_m)
+    track_m, bias = mean[:, 5], mean[:, 6]
+    assert (track_m >= HUSKY.track_m).all()
+    assert (track_m <= MAX_TRACK_RATIO * HUSKY.track_m).all()
+    assert (np.abs(bias) <= MAX_BIAS_RADPS).all()
+    assert np.abs(bias).max() > 0.05
+    assert np.isfinite(track.cov).all()
+    np.testing.assert_array_equal(mean[:, [0, 1, 2, 3, 4, 7]], track.mean[:, [0, 1, 2, 3, 4, 7]])
+
+
+@pytest.mark.parametrize("bias_radps", [0.01, -0.03, 0.05])
+def test_a_large_bias_comes_back_from_standing_still(bias_radps):
+    time_s, z = drive(np.concatenate([np.zeros(100), WINDING]), bias_radps=bias_radps, seed=5)
+    z[:100, :2] = 0.0
+    z[20:100:20, 3] = z[:80, 2].reshape(4, 20).mean(axis=1)
+    track = run_filter(MODEL, NOISE, time_s, z)
+    bias, std = track.state("gyro_bias_radps"), track.std("gyro_bias_radps")
+    assert abs(bias[100] - bias_radps) < 3 * std[100] < 0.005
+    assert abs(bias[-1] - bias_radps) < 3 * std[-1]
+
+
+def test_without_a_gyro_the_yaw_follows_the_wheels():
+    time_s, z = drive(0.3 * np.ones(SECONDS.size), HUSKY.track_m)
+    z[:, 2] = np.nan
+    track = run_filter(MODEL, NOISE, time_s, z)
+    assert np.median(track.state("yaw_rate_radps")[-600:]) == pytest.approx(0.3, abs=0.03)
+
+
+@pytest.mark.parametrize(
+    ("soil", "scenario", "seed"),
+    [
+        ("grass", "survey", 21),
+        ("tilled_loam", "complex", 22),
+        ("snow", "survey", 23),
+        ("snow", "straight", 24),
+    ],
+)
+def test_simulated_drives_are_within_their_stated_error(soil, scenario, seed):
+    """Yaw, yaw rate and bias of 40 s: their mean squared error is that of their covariance, or less."""
+    found = estimate_run(simulate_run(HUSKY, soil, scenario, seed, duration_s=40.0), HUSKY, "skid")
+    track = found.track
+    for state in ("yaw_rad", "yaw_rate_radps", "gyro_bias_radps"):
+        j = track.states.index(state)
+        error = wrapped(track.mean[:, j] - found.truth[:, j])
+        assert np.nanmean(error**2 / track.cov[:, j, j]) < 2.0, state
+    assert np.nanmax(np.abs(wrapped(track.state("yaw_rad") - found.truth[:, 2]))) < 0.1
+    assert (found.motion != Motion.STUCK).all()
 
 
 def test_a_swerve_robot_is_refused():

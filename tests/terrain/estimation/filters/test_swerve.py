@@ -11,7 +11,11 @@ from terrain.estimation.ekf.filter import run_filter
 from terrain.estimation.ekf.kernel import OBSERVE, PROPAGATE
 from terrain.estimation.ekf.model import FilterSettings, Noise
 from terrain.estimation.filters.swerve import FILTERS, make_filter
-from terrain.estimation.filters.swerve_model import observe_slip_ratio, observe_without_slip, propagate
+from terrain.estimation.filters.swerve_model import (
+    observe_slip_ratio,
+    observe_without_slip,
+    propagate_slip_speed,
+)
 from terrain.estimation.filters.swerve_noise import adaptive_noise, default_noise, thesis_noise
 from terrain.robots import load_robot
 
@@ -55,6 +59,8 @@ def drive(model, yaw_rate_radps=0.0, duration_s=20.0, seed=0, noise=1.0):
     z = np.column_stack(
         [
             columns[row] + noise * std[row.split("_")[0]] * rng.standard_normal(time_s.size)
+            if row in columns
+            else np.full_like(time_s, np.nan)  # never at rest
             for row in model.rows
         ]
     )
@@ -76,7 +82,8 @@ def raw_slip(model, track, z):
 def jacobians(model, x, dt=DT_S):
     d, m = len(model.states), len(model.rows)
     x_next, f, z_hat, h = np.zeros(d), np.zeros((d, d)), np.zeros(m), np.zeros((m, d))
-    model.propagate(x, dt, model.params.copy(), x_next, f)
+    params = np.append(model.params, np.linspace(-2.0, 3.0, len(model.inputs)))
+    model.propagate(x, dt, params, x_next, f)
     model.observe(x, model.params.copy(), z_hat, h)
     return x_next, f, z_hat, h
 
@@ -111,7 +118,7 @@ def test_states_and_rows_stand_in_the_order_of_the_thesis():
         "camera_yaw_rad",
     )
     sizes = {name: (len(m.states), len(m.rows)) for name in FILTERS for m in [make_filter(name, ROBOT)]}
-    assert sizes == {"encoder12": (12, 10), "slip14": (14, 10), "vio12": (12, 14), "vio15": (15, 14)}
+    assert sizes == {"encoder12": (12, 10), "slip14": (14, 10), "vio12": (12, 14), "vio15": (18, 17)}
     assert len(make_filter("slip14", ROBOT, with_gnss=True).rows) == 14
 
 
@@ -201,7 +208,7 @@ def observe_as_printed_4_48(x, params, z_hat, h):
 
 @njit(PROPAGATE)
 def propagate_as_printed_6_2(x, dt, params, x_next, f):
-    propagate(x, dt, params, x_next, f)
+    propagate_slip_speed(x, dt, params, x_next, f)
     x_next[3], x_next[4] = x[3] + dt * (x[6] - x[5] * x[4]), x[4] + dt * (x[7] + x[5] * x[3])
     f[3, 4], f[3, 5], f[4, 3], f[4, 5] = -dt * x[5], -dt * x[4], dt * x[5], dt * x[3]
 
@@ -218,9 +225,9 @@ def test_observable_rank_in_straight_driving():
         name: {s: v for s, v in straight.items() if s in make_filter(name, ROBOT).states} for name in FILTERS
     }
     ranks = {name: observable_rank(make_filter(name, ROBOT), straight[name]) for name in FILTERS}
-    assert ranks == {"encoder12": 9, "slip14": 10, "vio12": 10, "vio15": 13}
+    assert ranks == {"encoder12": 9, "slip14": 10, "vio12": 10, "vio15": 16}
     assert observable_rank(as_printed("slip14"), straight["slip14"]) == 9
-    assert observable_rank(make_filter("vio15", ROBOT, with_gnss=True), straight["vio15"]) == 15
+    assert observable_rank(make_filter("vio15", ROBOT, with_gnss=True), straight["vio15"]) == 18
 
 
 def test_slip14_ends_with_the_speed_that_it_was_started_with():
@@ -266,8 +273,8 @@ def test_coriolis_signs_as_printed_cost_the_speed_when_the_camera_is_lost_in_a_c
         error = np.hypot(track.state("speed_x_mps") - 1, track.state("speed_y_mps"))
         worst.append(error[lost].max())
     assert worst[0] < 0.05
-    assert worst[1] > 0.5
-    assert worst[1] > 20 * worst[0]
+    assert worst[1] > 0.15
+    assert worst[1] > 5 * worst[0]
 
 
 def test_adaptive_tuning_has_two_horns():
@@ -291,8 +298,10 @@ WALK = {
     "yaw_rad": 1e-4,
     "speed": 0.02,
     "yaw_rate": 0.1,
+    "accel_bias": 2e-3,
     "accel": 0.05,
     "steer": 0.1,
+    "imu_yaw_offset": 5e-4,
     "gyro_bias": 2e-4,
     "slip_speed": 0.05,
 }
@@ -301,8 +310,10 @@ START = {
     "yaw_rad": 0.05,
     "speed": 0.3,
     "yaw_rate": 0.1,
+    "accel_bias": 0.05,
     "accel": 0.05,
     "steer": 0.05,
+    "imu_yaw_offset": 0.01,
     "gyro_bias": 0.01,
     "slip_speed": 0.1,
 }
@@ -317,6 +328,8 @@ SAMPLE = {
     "camera_yaw_rad": 0.005,
     "gnss_position": 0.02,
     "gnss_speed": 0.03,
+    "rest_speed": 0.005,
+    "rest_yaw_rate": 0.002,
 }
 
 
@@ -339,21 +352,23 @@ def test_vio15_is_consistent_on_what_its_own_equations_draw():
         track = run_filter(model, noise, time_s, z, ALL_BELIEVED)
         squares["nees"] += nees(track, truth)[instants] / n_runs
         squares["nis"] += track.nis.sum(axis=1) / n_runs
-    for kind, dof in (("nees", 15), ("nis", 14)):
+    for kind, dof in (("nees", 18), ("nis", 17)):
         low, high = chi2.ppf([0.025, 0.975], dof * n_runs) / n_runs
         assert ((squares[kind] >= low) & (squares[kind] <= high)).mean() >= 0.9
-    assert chi2.ppf([0.025, 0.975], 15 * n_runs) / n_runs == pytest.approx([13.52, 16.56], abs=0.01)
+    assert chi2.ppf([0.025, 0.975], 18 * n_runs) / n_runs == pytest.approx([16.37, 19.70], abs=0.01)
 
 
 def test_gnss_is_another_reference():
     """Without a camera: position, heading of the world and slip come from the antenna alone."""
     model = make_filter("vio15", ROBOT, with_gnss=True, antenna_m=(0.2, -0.3))
     low = low_noise(model)
-    start = np.maximum(low.initial_variance.diagonal(), model.initial_std**2)
+    start = low.initial_variance.diagonal().copy()
+    start[:3] = [*model.initial_std[:2] ** 2, 0.3**2]  # with 1 rad of yaw it is the linearisation that fails
     noise = Noise(low.process_variance, low.measurement_variance, start)
     time_s, truth, z = sample_from_model(model, noise, 2001, DT_S, np.random.default_rng(0))
     z[:, [row.startswith(("camera", "imu_yaw")) for row in model.rows]] = np.nan
-    z[np.arange(2001) % 5 > 0, 14:] = np.nan  # 10 Hz
+    z[:, [row.startswith("rest") for row in model.rows]] = np.nan
+    z[np.arange(2001) % 5 > 0, 17:] = np.nan  # 10 Hz
     track = run_filter(model, noise, time_s, z)
     late = time_s > 20
     for state, widest in (
@@ -363,6 +378,7 @@ def test_gnss_is_another_reference():
         ("slip_speed_1_mps", 0.1),
     ):
         error, std = track.state(state) - truth[:, model.states.index(state)], track.std(state)
+        error = np.angle(np.exp(1j * error)) if state == "yaw_rad" else error
         assert (np.abs(error[late]) < 4 * std[late]).all(), state
         assert std[-1] < widest, state
     assert track.reference_age_s[late].max() == pytest.approx(0.08)

@@ -12,7 +12,7 @@ from terrain.errors import ConfigError
 from terrain.estimation.ekf.filter import run_filter
 from terrain.estimation.ekf.model import GATE_PROBABILITY, REOPEN_AFTER_S, FilterSettings, Noise
 from terrain.estimation.filters.swerve import make_filter
-from terrain.estimation.filters.swerve_noise import default_noise
+from terrain.estimation.filters.swerve_noise import default_noise, scheduled
 from terrain.estimation.live.estimator import CHANNELS, LiveEstimator
 from terrain.estimation.live.rows import QUEUE
 from terrain.estimation.measurements.batch import measurement_table
@@ -78,7 +78,8 @@ def batch(run, robot=ROBOT, name="vio15", yaw=None):
         variance[:, [model.rows.index(row) for row in GNSS_ROWS]] = table.gnss_variance
         noise = Noise(noise.process_variance, variance, noise.initial_variance)
     desired = FilterSettings(GATE_PROBABILITY, REOPEN_AFTER_S)
-    track = run_filter(model, noise, table.time_s, table.columns(model.rows), desired)
+    noise, inputs = scheduled(model, noise, table)
+    track = run_filter(model, noise, table.time_s, table.columns(model.rows), desired, inputs)
     return table.at(track.time_s), track, wheel_slip(track, table.at(track.time_s), robot)
 
 
@@ -87,8 +88,8 @@ def assert_equal(run, robot=ROBOT, name="vio15", yaw=None):
     estimator, estimates = live(run, robot, name, yaw)
     table, track, slip = batch(run, robot, name, yaw)
     np.testing.assert_array_equal(column(estimates, "time_s"), table.time_s)
-    n_rows = len(ROWS_OF_DRIVE["swerve"]) - (yaw is None) * len(GNSS_ROWS)
-    np.testing.assert_allclose(column(estimates, "rows")[:, :n_rows], table.z[:, :n_rows], rtol=0, atol=1e-12)
+    rows = [row not in GNSS_ROWS or yaw is not None for row in ROWS_OF_DRIVE["swerve"]]
+    np.testing.assert_allclose(column(estimates, "rows")[:, rows], table.z[:, rows], rtol=0, atol=1e-12)
     std = np.column_stack([track.std(state) for state in track.states])
     for what, desired in {
         "mean": track.mean,
@@ -382,3 +383,57 @@ def test_invalid_options_are_refused():
         LiveEstimator(ROBOT, initial_yaw_rad=np.nan)
     with pytest.raises(ConfigError, match="skid_steer"):
         LiveEstimator(load_robot("husky"))
+
+
+STARTS_S = np.arange(3.0, 15.0, 0.235)
+"""Of faults that come again and again: how floats round differs from one to the next."""
+
+
+def lost(n):
+    """Leave out samples again and again: gaps of exactly ``n`` periods."""
+
+    def edit(time_s, values):
+        kept = np.ones(len(time_s), dtype=bool)
+        for start in np.searchsorted(time_s, STARTS_S):
+            kept[start + 1 : start + n] = False
+        return time_s[kept], values[kept]
+
+    return edit
+
+
+def jump(n):
+    """Set the speed of ``n`` samples of a camera to another one, again and again."""
+
+    def edit(time_s, values):
+        for start in np.searchsorted(time_s, STARTS_S):
+            values[start : start + n, 7:10] += 3.0 + 0.001 * np.arange(n)[:, None]
+        return time_s, values
+
+    return edit
+
+
+def stamped(rate_hz, stamps):
+    """Stamp samples as a logger with six decimals does, or as a sum of periods is rounded."""
+
+    def edit(time_s, values):
+        n, offset_s = len(time_s), time_s[0]
+        if stamps == "decimal":
+            return np.round(offset_s + np.arange(n) / rate_hz, 6), values
+        return offset_s + np.cumsum(np.full(n, 1.0 / rate_hz)), values
+
+    return edit
+
+
+@pytest.mark.parametrize("stamps", ["decimal", "summed"])
+@pytest.mark.parametrize("n", range(1, 11))
+def test_a_jump_of_any_length_costs_live_what_it_costs_the_batch(n, stamps):
+    """Four samples that leapt are a step of five periods: the low-pass goes on over it, live and in batch."""
+    run = edited(edited(log(), "odometry", stamped(200.0, stamps)), "odometry", jump(n))
+    assert_equal(run)
+
+
+@pytest.mark.parametrize("stream", ["imu", "odometry", "steering"])
+@pytest.mark.parametrize("n", range(2, 11))
+def test_a_gap_of_whole_periods_costs_live_what_it_costs_the_batch(n, stream):
+    rate_hz = {"imu": 100.0, "odometry": 200.0, "steering": 50.0}[stream]
+    assert_equal(edited(edited(log(), stream, stamped(rate_hz, "decimal")), stream, lost(n)))

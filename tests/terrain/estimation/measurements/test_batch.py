@@ -11,6 +11,7 @@ from terrain.constants import GRAVITY_MPS2
 from terrain.errors import ConfigError, DataError
 from terrain.estimation.measurements.batch import measurement_table
 from terrain.estimation.measurements.resampling import low_pass
+from terrain.estimation.measurements.skid_rows import REST_ROW
 from terrain.estimation.measurements.table import CAMERA_ROWS, GNSS_ROWS, ROWS_OF_DRIVE
 from terrain.kinematics.camera import odometry_stream
 from terrain.records import RunLog, Stream
@@ -334,7 +335,7 @@ def test_a_stream_that_is_missing_or_ends_early_or_has_a_hole_is_unknown_there(s
     assert np.isnan(gone.columns(rows)).all()
     empty = change(RUN, stream, lambda t, v, c: (t[:0], v[:0]))
     assert np.isnan(measurement_table(empty, robot).columns(rows)).all()
-    others = [row for row in whole.rows if row not in rows]
+    others = [row for row in whole.rows if row not in (*rows, "vibration_mps2", "camera_age_s")]
     np.testing.assert_array_equal(gone.columns(others), whole.columns(others))
 
     def hole(time_s, values, _):
@@ -363,7 +364,10 @@ def test_samples_that_are_no_numbers_are_left_out_and_counted():
     assert table.dropped == {"imu: not finite": 3, "odometry: not finite": 199, "wheels: not finite": 1}
     plain = measurement_table(RUN, bare())
     changed = (table.z != plain.z) & ~(np.isnan(table.z) & np.isnan(plain.z))
-    assert set(np.array(table.rows)[changed.any(axis=0)]) == {"gyro_z_radps", "wheel_2_radps", *CAMERA_ROWS}
+    assert set(np.array(table.rows)[changed.any(axis=0)]) == {
+        *("gyro_z_radps", "wheel_2_radps", "wheel_2_change_m2ps3", "camera_age_s"),
+        *CAMERA_ROWS,
+    }
     assert np.flatnonzero(np.isnan(rows_of(table, "wheel_2_radps")[:, 0])).tolist() == [7]
     assert np.isfinite(rows_of(table, "gyro_z_radps")).all()  # held over the two
     lost = (table.time_s > 2.03) & (table.time_s < 2.99)
@@ -373,7 +377,7 @@ def test_samples_that_are_no_numbers_are_left_out_and_counted():
 def test_an_invalid_quaternion_is_left_out_and_counted():
     run = change(RUN, "odometry", set_rows(lambda t: t >= 4.0, 0.0, "quaternion_w_ratio"))
     table = measurement_table(run, bare())
-    assert table.dropped == {"odometry: no rotation": 400}
+    assert table.dropped == {"odometry: no rotation": 20}  # then the channel is frozen
     assert np.isnan(rows_of(table, *CAMERA_ROWS)[table.time_s > 4.03]).all()
 
 
@@ -419,10 +423,27 @@ def test_a_leap_is_taken_out_before_the_low_pass_smears_it():
 
     jumped = change(RUN, "odometry", set_rows(lambda t: t >= 2.0, 3.0, "velocity_z_mps"))
     table = measurement_table(jumped, bare())
-    assert table.dropped["odometry: leap"] == pytest.approx(
-        20, abs=1
-    )  # then it is believed: a gate has to tell
-    assert np.isfinite(rows_of(table, "camera_speed_x_mps")[table.time_s > 2.3]).all()
+    late = table.time_s > 2.05
+    assert table.dropped["odometry: leap"] == 10  # then the channel is frozen
+    assert np.isnan(rows_of(table, "camera_speed_x_mps")[late]).all()  # a speed over ground cannot leap
+    assert np.isfinite(rows_of(table, "camera_yaw_rate_radps", "camera_yaw_rad")[late]).all()
+    back = change(RUN, "odometry", set_rows(lambda t: (t >= 2.0) & (t < 3.0), 3.0, "velocity_z_mps"))
+    table = measurement_table(back, bare())
+    assert np.isfinite(rows_of(table, "camera_speed_x_mps")[table.time_s > 3.05]).all()
+
+
+def test_a_leap_of_the_camera_s_heading_is_taken_off():
+    def turned(time_s, values, channels):
+        late, q = time_s >= 3.0, [channels.index(f"quaternion_{a}_ratio") for a in "xyzw"]
+        # the camera's y axis points down: a turn to the left about it is negative
+        values[np.ix_(late, q)] = (
+            Rotation.from_euler("y", 0.3) * Rotation.from_quat(values[np.ix_(late, q)])
+        ).as_quat()
+        return time_s, values
+
+    plain, table = measurement_table(RUN, bare()), measurement_table(change(RUN, "odometry", turned), bare())
+    yaw = rows_of(table, "camera_yaw_rad") - rows_of(plain, "camera_yaw_rad")
+    assert np.nanmax(np.abs(yaw)) < 0.01
 
 
 def test_stamps_that_do_not_increase_cost_their_sample_only():
@@ -548,7 +569,7 @@ def husky_run(*, gnss=False):
 
 def test_a_skid_steered_robot_has_sides_and_a_gyro():
     table = measurement_table(husky_run(), HUSKY)
-    assert table.rows == ("wheel_left_mps", "wheel_right_mps", "gyro_z_radps", *GNSS_ROWS)
+    assert table.rows == ("wheel_left_mps", "wheel_right_mps", "gyro_z_radps", *GNSS_ROWS, REST_ROW)
     np.testing.assert_allclose(table.z[:, :2], np.column_stack([table.time_s, 2 * table.time_s]))
     np.testing.assert_allclose(table.z[:, 2], 0.3, atol=6 * NOISE)
     assert np.isnan(table.z[:, 3:]).all()

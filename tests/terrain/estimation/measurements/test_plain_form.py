@@ -2,6 +2,7 @@
 
 from collections import Counter
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -10,15 +11,38 @@ from terrain.angles import unwrapped, wrapped
 from terrain.constants import GRAVITY_MPS2
 from terrain.estimation.measurements.batch import measurement_table
 from terrain.estimation.measurements.cleaning import clean_stream
+from terrain.estimation.measurements.derived import (
+    CHANGE_S,
+    CRAWL_MPS,
+    MOVING_MPS,
+    REST_ACCEL_MPS2,
+    REST_AFTER_S,
+    REST_SEEN_MPS,
+    REST_TURN_RADPS,
+    REST_WHEEL_MPS,
+    RIPPLE_MPS,
+    VIBRATION_S,
+    WAVERING_MPS,
+)
+from terrain.estimation.measurements.frozen import (
+    REPEATED_CAMERA,
+    REPEATED_IMU,
+    REPEATED_SPEED,
+    REPEATED_WHEELS,
+    SAME,
+)
 from terrain.estimation.measurements.sample_hold import (
     BELIEVED_S,
     GAP_PERIODS,
+    LATCHED,
     LEAPS,
     MAX_AGE_PERIODS,
+    PASSING,
     TICK_S,
 )
 from terrain.estimation.measurements.table import (
     CAMERA_ROWS,
+    DERIVED_ROWS,
     GNSS_LATENCY_S,
     GNSS_ROWS,
     GNSS_SPEED_STD_MPS,
@@ -52,8 +76,10 @@ ODD = ROBOT.with_parts(
 )
 
 
-def plain_leaps(time_s, value, least, per_second):
+def plain_leaps(time_s, value, least, per_second, fate=PASSING):
     """Mark samples that are further from the last one kept than a robot gets, for at most BELIEVED_S."""
+    if fate != PASSING:
+        return plain_sums(time_s, value, least, per_second, fate) != 0.0
     leaps = np.zeros(value.size, dtype=bool)
     last, last_s, since_s = np.nan, np.nan, np.nan
     for k in np.flatnonzero(np.isfinite(value)):
@@ -64,6 +90,98 @@ def plain_leaps(time_s, value, least, per_second):
                 continue
         last, last_s, since_s = value[k], time_s[k], np.nan
     return leaps
+
+
+def plain_sums(time_s, value, least, per_second, fate, period_s=None):
+    """Sum the leaps of a row whose leaps last: from sample to sample; zero again within half of the least.
+
+    A leap from the first sample after a gap is that one's fault.
+    """
+    known = np.flatnonzero(np.isfinite(value))
+    gap_s = GAP_PERIODS * (np.median(np.diff(time_s)) if period_s is None else period_s)
+    sums, total, followed = np.zeros(value.size), 0.0, False
+    for before, k in pairwise(known):
+        step_s, change = time_s[k] - time_s[before], value[k] - value[before]
+        if fate == LATCHED and step_s > gap_s:
+            total, followed = 0.0, False
+            continue
+        if followed and abs(change) > least + per_second * step_s:
+            total = total + change if abs(total + change) > 0.5 * least else 0.0
+        followed, sums[k] = True, total
+    return sums
+
+
+def plain_frozen(value, most, moving):
+    """Mark values that have repeated themselves ``most`` times, or four times their longest run in motion."""
+    frozen = np.zeros(value.size, dtype=bool)
+    count, longest, began, last = 0, 0, False, np.nan
+    for k in np.flatnonzero(np.isfinite(value)):
+        if abs(value[k] - last) <= SAME:
+            count += 1
+        else:
+            longest = max(longest, count) if moving[k] and began else longest
+            count, began = 0, moving[k]
+        last = value[k]
+        frozen[k] = moving[k] and count >= max(most, 4 * longest)
+    return frozen
+
+
+def plain_moving(clock, wheel_speed_mps):
+    """Return the low-passed wheel speeds (n, 3) behind each tick, and a function from instants to motion."""
+    once, twice = np.full((2, clock.size, 3), np.nan)
+    for n in range(clock.size):
+        step_s = clock[n] - clock[n - 1] if n else np.nan
+        for i in range(3):
+            speed = wheel_speed_mps[n, i]
+            before = once[n - 1, i] if n else np.nan
+            if np.isnan(before):
+                once[n, i] = twice[n, i] = speed
+            elif np.isnan(speed):
+                once[n, i], twice[n, i] = before, twice[n - 1, i]
+            else:
+                keep = np.exp(-step_s / CHANGE_S)
+                twice[n, i] = before + (twice[n - 1, i] - before) * keep
+                once[n, i] = speed + (before - speed) * keep
+
+    def moving(came_s):
+        last = np.searchsorted(clock + TICK_S, came_s) - 1  # the tick that was done when a sample came
+        return np.array([n >= 0 and bool((np.abs(once[n]) > MOVING_MPS).any()) for n in last], dtype=bool)
+
+    return once, twice, moving
+
+
+def plain_derived(clock, table, once, twice, imu_s, accel_z, robot):
+    """Return the rows that follow from others, tick by tick."""
+    n = clock.size
+    rows = {row: np.full(n, np.nan) for row in DERIVED_ROWS}
+    square = np.full(imu_s.size, np.nan)
+    for k in np.flatnonzero(np.isfinite(accel_z)):
+        before = np.flatnonzero(np.isfinite(square[:k]))
+        keep = np.exp(-(imu_s[k] - imu_s[before[-1]]) / VIBRATION_S) if before.size else 0.0
+        square[k] = accel_z[k] ** 2 + ((square[before[-1]] - accel_z[k] ** 2) * keep if before.size else 0.0)
+    speeds = np.column_stack([table[f"wheel_{i}_radps"] for i in (1, 2, 3)]) * robot.wheel_radius_m
+    still_since, seen_s = np.nan, np.nan
+    for k in range(n):
+        for i in range(3):
+            slow, slower = (once[k - 1, i], twice[k - 1, i]) if k else (np.nan, np.nan)
+            rise = slow - slower
+            change = slower * np.sign(rise) * max(abs(rise) - WAVERING_MPS, 0.0) / CHANGE_S
+            rows[f"wheel_{i + 1}_growth_per_s"][k] = change / (slower**2 + CRAWL_MPS**2)
+            ahead = max(abs(speeds[k, i] - slow) - RIPPLE_MPS, 0.0) if slow == slow else np.nan
+            rows[f"wheel_{i + 1}_change_m2ps3"][k] = (abs(speeds[k, i]) + CRAWL_MPS) * ahead / CHANGE_S
+        seen_s = clock[k] if np.isfinite(table["camera_speed_x_mps"][k]) else seen_s
+        rows["camera_age_s"][k] = clock[k] - seen_s
+        still = (np.abs(speeds[k]) <= REST_WHEEL_MPS).all() and abs(
+            table["gyro_z_radps"][k]
+        ) <= REST_TURN_RADPS
+        for axis in "xy":
+            still &= abs(table[f"accel_{axis}_mps2"][k]) <= REST_ACCEL_MPS2
+            still &= not abs(table[f"camera_speed_{axis}_mps"][k]) > REST_SEEN_MPS
+        still_since = (still_since if still_since == still_since else clock[k]) if still else np.nan
+        if clock[k] - still_since >= REST_AFTER_S:
+            for row in DERIVED_ROWS[-3:]:
+                rows[row][k] = 0.0
+    return rows, square
 
 
 def plain_low_pass(time_s, value, tau_s, gap_s):
@@ -153,13 +271,16 @@ def plain_yaw(table, clock, wheel_speed_mps, initial_yaw_rad, causal):
 
 
 def plain_table(run, robot, causal, initial_yaw_rad):
-    """Return rows (n, 18), variances (n, 4) and counts of leaps of a swerve robot's run."""
+    """Return rows (n, 29), variances (n, 4) and counts of leaps of a swerve robot's run."""
     dropped, lag_s = Counter(), robot.sensors.encoder_time_constant_s
     wheels = clean_stream(run, "wheels", [f"motor_{i}_radps" for i in (1, 2, 3)], dropped)
     clock, rates = wheels.time_s, wheels.values / robot.motors.reduction_ratio
     rates = np.where(np.abs(rates) > MAX_RATE_FACTOR * robot.motors.speed_max_radps, np.nan, rates)
     rows = ROWS_OF_DRIVE["swerve"]
+    rates = plain_wheels(clock, wheels.values, rates, robot)
+    once, twice, moving = plain_moving(clock, rates * robot.wheel_radius_m)
     table, leaps = dict(zip(rows, rates.T, strict=False)), {}
+    imu_s, accel_z = np.zeros(0), np.zeros(0)
     camera_lag_s = max(lag_s - robot.camera.time_constant_s, 0.0)
     gnss_variance = dict.fromkeys(GNSS_ROWS, np.full(clock.size, np.nan))
     for name, channels, frozen, latency_s, tau_s in (
@@ -179,17 +300,86 @@ def plain_table(run, robot, causal, initial_yaw_rad):
                 row: plain_on_clock(clock, time_s, came_s, v, 0.0) for row, v in variance.items()
             }
         else:
+            stream = plain_lives(name, stream, moving(came_s))
             convert = {"imu": plain_imu, "steering": plain_steering, "odometry": plain_camera}[name]
             signals = convert(stream, robot)
-        found = {row: plain_leaps(time_s, v, *LEAPS.get(row, (np.inf, np.inf))) for row, v in signals.items()}
+        if name == "imu":
+            imu_s, accel_z = time_s, plain_vertical(stream, time_s, robot, signals)
+        if name == "odometry":
+            for row in CAMERA_ROWS[:2]:
+                frozen = plain_frozen(signals[row], REPEATED_SPEED[0], moving(came_s))
+                signals[row] = np.where(frozen, np.nan, signals[row])
+            yaw = signals["camera_yaw_rad"]
+            sums = plain_sums(time_s, yaw, *LEAPS["camera_yaw_rad"])
+            signals["camera_yaw_rad"] = np.where(np.isnan(yaw), np.nan, yaw - sums)
+        none = (np.inf, np.inf)
+        found = {
+            row: plain_leaps(time_s, v, *(LEAPS[row] if row in LEAPS and row != "camera_yaw_rad" else none))
+            for row, v in signals.items()
+        }
         leaps[name] = int(np.any(list(found.values()), axis=0).sum())
         for row, signal in signals.items():
             signal = np.where(found[row], np.nan, signal)
             table[row] = plain_on_clock(clock, time_s, came_s, signal, tau_s)
     table = {row: table.get(row, np.full(clock.size, np.nan)) for row in rows}
+    derived, square = plain_derived(clock, table, once, twice, imu_s, accel_z, robot)
+    came_s = imu_s + (robot.sensors.imu_latency_s if causal else 0.0)
+    known = np.isfinite(square)
+    last = np.searchsorted(came_s[known], clock + TICK_S, side="right") - 1
+    derived["vibration_mps2"] = np.where(last >= 0, np.sqrt(square[known][np.maximum(last, 0)]), np.nan)
+    table |= derived
     wheel_speed_mps = np.column_stack([table[row] for row in rows[:3]]) * robot.wheel_radius_m
     plain_yaw(table, clock, wheel_speed_mps, initial_yaw_rad, causal)
     return np.column_stack(list(table.values())), np.column_stack(list(gnss_variance.values())), leaps
+
+
+def plain_wheels(clock, motor_radps, rates, robot):
+    """Leave out the rate of a motor that repeats itself while another's changes."""
+    moving, rates = np.zeros(clock.size, dtype=bool), np.array(rates)
+    for _ in range(3):  # motion follows from the rates that are left, and is known one tick later
+        counts = np.column_stack([plain_counts(column) for column in motor_radps.T])
+        lively = (counts <= 2).any(axis=1)
+        frozen = [plain_frozen(v, REPEATED_WHEELS[0], moving) for v in motor_radps.T]
+        kept = np.where(np.column_stack(frozen) & lively[:, None], np.nan, rates)
+        once, _, _ = plain_moving(clock, kept * robot.wheel_radius_m)
+        moving = np.append(False, (np.abs(once[:-1]) > MOVING_MPS).any(axis=1))
+    return kept
+
+
+def plain_counts(value):
+    counts, last = np.zeros(value.size), np.nan
+    for k in range(value.size):
+        counts[k] = counts[k - 1] + 1 if abs(value[k] - last) <= SAME else 0
+        if np.isnan(value[k]):
+            counts[k] = counts[k - 1] if k else 0
+        else:
+            last = value[k]
+    return counts
+
+
+def plain_lives(name, stream, moving):
+    """Leave out the channels of an IMU or a camera that repeat themselves in motion."""
+    most = {"imu": REPEATED_IMU, "odometry": REPEATED_CAMERA}.get(name)
+    if most is None:
+        return stream
+    values = np.array(stream.values)
+    for c in range(values.shape[1]):
+        values[plain_frozen(values[:, c], most[c], moving), c] = np.nan
+    return Stream(stream.time_s, values, stream.channels)
+
+
+def plain_vertical(imu, time_s, robot, signals):
+    """Return the vertical acceleration without gravity; where the attitude leapt, nothing by it is known."""
+    sensors, roll, pitch = robot.sensors, imu.channel("roll_rad"), imu.channel("pitch_rad")
+    leapt = np.zeros(len(roll), dtype=bool)
+    for angle in (roll, pitch):
+        sums = plain_sums(time_s, angle, 0.05, 3.0, LATCHED, 0.02)
+        leapt |= np.isfinite(angle) & (sums != 0.0)
+    for row in ("accel_x_mps2", "accel_y_mps2"):
+        signals[row] = np.where(leapt, np.nan, signals[row])
+    force = (imu.channel("accel_z_mps2") - sensors.accel_bias_z_mps2) / sensors.accel_scale_z_ratio
+    level = GRAVITY_MPS2 * np.cos(roll) * np.cos(pitch)
+    return np.where(leapt, np.nan, force - level)
 
 
 def with_faults(run, rng):

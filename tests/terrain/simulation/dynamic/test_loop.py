@@ -268,6 +268,7 @@ def test_a_status_without_a_unit_is_refused():
         ("body", {"yaw_inertia_kgm2": 1e-9}),
         ("body", {"tyre_stiffness_npm": 1e12}),
         (None, {"mass_kg": 1e9}),
+        ("motors", {"friction_nm": 1e9}),  # found in the drive; the others before it
     ],
 )
 def test_a_robot_whose_motion_blows_up_is_refused_and_its_controller_sees_none_of_it(section, changes):

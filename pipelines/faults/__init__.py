@@ -1,0 +1,1 @@
+"""``terrain faults``: sensor faults in the closed loop, and what the controller makes of each."""

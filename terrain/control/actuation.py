@@ -1,0 +1,114 @@
+"""Whether wheels and steering do what they were commanded; else a sensor lies, or a motor does not follow.
+
+A motor's rate follows its command within a quarter of a second.  So it lies between the least and the largest
+command of that time, and what is outside by more than a tolerance for a while either measures something else
+or does not follow; and the same with steering angles.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from terrain.records import Array, Reading
+
+N_KEPT = 32
+WINDOW_S, PERSISTS_S, SETTLED_S, SMOOTH_S = 0.4, 0.06, 0.1, 0.04
+"""Time within which a command is followed; for which a deviation has to last; for which there must be none
+for it to be over; low-pass of what is measured, against the ripple of the Hall steps."""
+
+SPEED_MPS, SPEED_RATIO, STEER_RAD = 0.06, 0.06, 0.06
+"""Tolerances: of a wheel's speed, a constant and a part of the command, and of a steering angle."""
+
+
+def actuation_memory() -> tuple[Array, Array]:
+    """Return the memory before the first step.
+
+    Commands (32, 7) by time; and (3, 6): how long each is off and on, and what was measured, smoothed.
+    """
+    return np.full((N_KEPT, 7), np.nan), np.array([[0.0] * 6, [SETTLED_S] * 6, [np.nan] * 6])
+
+
+@njit(cache=True, error_model="numpy")
+def follow(
+    now_s: float,
+    step_s: float,
+    slot: int,
+    command: Array,
+    measured: Array,
+    kept: Array,
+    lasting: Array,
+    off: Array,
+) -> None:
+    """Write which (6,) of three wheel speeds and three steering angles are off their commands.
+
+    Parameters
+    ----------
+    now_s, step_s : time, and since the step before
+    slot : place in ``kept`` of this step: the number of the step modulo :data:`N_KEPT`
+    command : (6,) speeds in m/s and angles in rad that were in force until now; NaN for none
+    measured : (6,) of these now, NaN where unknown
+    kept, lasting : as :func:`actuation_memory` returns them; changed
+    off : (6,) is written
+    """
+    kept[slot, 0] = now_s
+    kept[slot, 1:] = command
+    for i in range(6):
+        low, high = math.inf, -math.inf
+        for k in range(N_KEPT):
+            if kept[k, 0] >= now_s - WINDOW_S and not math.isnan(kept[k, 1 + i]):
+                low, high = min(low, kept[k, 1 + i]), max(high, kept[k, 1 + i])
+        slack = STEER_RAD if i >= 3 else SPEED_MPS + SPEED_RATIO * max(abs(low), abs(high))
+        smooth = lasting[2, i]
+        if math.isnan(smooth) or math.isnan(measured[i]):
+            smooth = measured[i]
+        else:
+            smooth += (measured[i] - smooth) * -math.expm1(-step_s / SMOOTH_S)
+        lasting[2, i] = smooth
+        known = low <= high and not math.isnan(smooth)
+        if known and not low - slack <= smooth <= high + slack:
+            lasting[0, i] += step_s
+            lasting[1, i] = 0.0
+        else:
+            lasting[0, i] = 0.0
+            lasting[1, i] += step_s
+        if lasting[0, i] >= PERSISTS_S:
+            off[i] = True
+        elif lasting[1, i] >= SETTLED_S:
+            off[i] = False
+
+
+class Actuation:
+    """Wheels and steering of a robot against their commands, step by step.
+
+    Parameters
+    ----------
+    mps_per_radps : speed of a wheel by the rate of its motor
+
+    Attributes
+    ----------
+    off : (6,) wheels and steering angles that are off their commands
+    """
+
+    def __init__(self, mps_per_radps: float) -> None:
+        self._mps_per_radps = mps_per_radps
+        self._command, self._measured = np.full(6, math.nan), np.full(6, math.nan)
+        self._kept, self._lasting = actuation_memory()
+        self._slot = 0
+        self.off = np.zeros(6, dtype=np.bool_)
+
+    def commanded(self, wheel_mps: Array, steer_rad: Array) -> None:
+        """Take the commands (3,), (3,) that are in force from now on."""
+        self._command[:3], self._command[3:] = wheel_mps, steer_rad
+
+    def measured(self, now_s: float, step_s: float, wheels: Reading | None, steer_rad: Array | None) -> None:
+        """Compare the rates, first columns of the wheels, and steering angles (3,) with the commands."""
+        self._measured[:] = math.nan
+        if wheels is not None:
+            self._measured[:3] = wheels.values[-1, :3] * self._mps_per_radps
+        if steer_rad is not None:
+            self._measured[3:] = steer_rad
+        self._slot = (self._slot + 1) % N_KEPT
+        follow(now_s, step_s, self._slot, self._command, self._measured, self._kept, self._lasting, self.off)

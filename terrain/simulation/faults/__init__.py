@@ -1,0 +1,1 @@
+"""Faults of sensors in a closed loop: a catalogue, and the bus that applies one."""

@@ -1,0 +1,291 @@
+"""`terrain faults`: drives with sensor faults, their table and page, and what is refused."""
+
+import json
+import math
+import sys
+from enum import Enum
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipelines.cli import main as cli
+from pipelines.faults.drives import FaultInputs, Place, drive_case, drive_references, evaluate_case
+from pipelines.faults.faults import drawn_cases, faults, faults_robot
+from pipelines.faults.guard import GuardedPilot, blamed_sensors
+from pipelines.faults.results import FaultCase
+from pipelines.faults.settings import FaultsSettings
+from pipelines.faults.tables import details, overview
+from pipelines.live.pilot import LivePilot
+from pipelines.live.pilot_settings import PilotSettings
+from pipelines.reporting.json_file import as_json
+from terrain.control.drive_metrics import drive_history, stopping_distance
+from terrain.control.fault_evaluation import BARS, RATIO_ABOVE_MPS, fault_drive, fault_figures
+from terrain.control.fault_situations import FAULT_SITUATIONS, make_fault_situation
+from terrain.control.slip_table import load_slip_table
+from terrain.control.traction import TractionStatus
+from terrain.errors import ConfigError
+from terrain.records import Command, Sample
+from terrain.robots import load_robot
+from terrain.simulation.dynamic.simulate import simulate
+
+ROBOT = load_robot("agrimaro")
+INPUTS = FaultInputs(ROBOT, load_slip_table())
+TABLE = Path(__file__).resolve().parents[3] / "data" / "target_slip" / "default.yaml"
+FEW = FaultsSettings(
+    faults="loss_odometry,duplicates_imu", situations="steady", durations_s="3,inf", first_seed=400, jobs=1
+)
+
+
+@pytest.fixture
+def terrain(monkeypatch, capsys, tmp_path):
+    """Return a function that runs the command in an empty folder: exit code, stdout and stderr."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(*words):
+        monkeypatch.setattr(sys, "argv", ["terrain", "faults", *map(str, words)])
+        try:
+            cli.main()
+            code = 0
+        except SystemExit as stop:
+            code = stop.code or 0
+        output = capsys.readouterr()
+        return code, output.out, output.err
+
+    return run
+
+
+@pytest.mark.parametrize("name", FAULT_SITUATIONS)
+def test_a_drive_by_plain_commands_is_evaluated_from_its_log(name):
+    robot = ROBOT
+    situation, start_s = make_fault_situation(name, robot, "grass", 400)
+    pilot = LivePilot(robot, settings=PilotSettings(controller="plain"))
+    run = simulate(
+        robot,
+        situation.scenario,
+        situation.soils,
+        situation.seed,
+        conditions=situation.conditions,
+        faults=situation.faults,
+        controller=pilot.step,
+        command_delay_s=0.05,
+    )
+    history = drive_history(run, robot, situation.conditions.radius_factors)
+    drive = fault_drive(run, history, robot, situation.scenario)
+    assert drive.desired_mps == pytest.approx(run.streams["control"].channel("desired_mps"))
+    assert drive.commanded_mps == pytest.approx(drive.desired_mps)
+    at = int(np.searchsorted(drive.time_s, start_s))
+    changes = drive.desired_mps[at - 1] - drive.desired_mps[at + 1]
+    assert (changes < 0, changes > 0) == (name == "start", name == "stop")
+    steady = (drive.time_s > 4.0) & (drive.time_s < 6.0)
+    slip = 1.0 - drive.speed_mps / drive.commanded_mps.clip(1e-9)
+    assert drive.true_slip_ratio[steady].mean() == pytest.approx(slip[steady].mean(), abs=0.03)
+    assert drive.body_slip_ratio[steady].mean() == pytest.approx(slip[steady].mean(), abs=0.02)
+    assert np.isnan(drive.true_slip_ratio[drive.speed_mps < RATIO_ABOVE_MPS / 10]).mean() > 0.7
+    found = fault_figures(drive, drive, drive, start_s, math.inf)
+    assert (found.overspeed_s, found.not_ok_s) == (0.0, 0.0)
+    assert found.slip_peak_ratio == found.plain_slip_peak_ratio > 0.1
+    if name == "stop":
+        assert found.stop_ratio == 1.0
+        assert found.stop_m == stopping_distance(history, start_s)
+    else:
+        assert math.isnan(found.stop_ratio)
+
+
+@pytest.fixture(scope="module")
+def few():
+    return faults(FEW, INPUTS)
+
+
+def test_a_lost_camera_ends_ok_late_and_duplicates_cost_nothing(few):
+    rows = {(row.case.fault, row.case.duration_s): row for row in few.rows}
+    assert len(rows) == len(few.rows) == 4
+    lost = rows["loss_odometry", math.inf]
+    assert lost.figures.not_ok_s > 1.0  # the status changes some time after the camera is lost
+    assert math.isnan(lost.figures.recovery_s)
+    assert lost.bars["ok_ends"] is (lost.figures.ok_total_s <= 0.3)
+    assert rows["loss_odometry", 3.0].figures.recovery_s < 1.0
+    for duration_s in (3.0, math.inf):
+        row = rows["duplicates_imu", duration_s]
+        assert not row.unmet
+        assert row.figures.not_ok_s == 0.0
+        assert row.figures.slip_error_ratio == row.figures.clean_slip_error_ratio
+    assert all(set(row.bars) == set(BARS) for row in few.rows)
+    assert sum(bar.n_met + bar.n_unmet + bar.n_not_judged for bar in few.bars.values()) == 4 * len(BARS)
+    (clean,) = few.clean
+    assert clean.start_s == 5.0
+    assert clean.slip_error_ratio < 0.03
+
+
+@pytest.mark.slow
+def test_the_result_does_not_depend_on_the_number_of_processes(few):
+    two = faults(FEW.with_(jobs=2), INPUTS)
+    assert json.dumps(as_json(few), allow_nan=False) == json.dumps(as_json(two), allow_nan=False)
+
+
+def test_before_a_fault_begins_the_drive_is_the_clean_one():
+    clean, _, start_s = drive_references(INPUTS, Place("stop", "wet_floor", 401))
+    drive = drive_case(INPUTS, FaultCase("loss_all", 3.0, "stop", "wet_floor", 401)).drive
+    before = drive.time_s < start_s
+    for name in ("ok", "slip_ratio", "speed_mps", "commanded_mps"):
+        assert np.array_equal(getattr(drive, name)[before], getattr(clean, name)[before], equal_nan=True)
+    assert not np.array_equal(drive.slip_ratio, clean.slip_ratio, equal_nan=True)
+
+
+def test_the_cells_of_the_table_name_what_is_not_met(few):
+    by_fault = {row.fault: row for row in overview(few)}
+    assert by_fault["duplicates_imu"].cells == ("met",)
+    lost = [row for row in few.rows if row.case.fault == "loss_odometry"]
+    assert (by_fault["loss_odometry"].cells == ("met",)) == (not any(row.unmet for row in lost))
+    assert [row.duration for row in details(few)] == ["3 s", "for good"] * 2
+    drawn = drawn_cases(FEW.with_(draw="duplicates"), few)
+    assert drawn == [FaultCase("duplicates_imu", math.inf, "steady", "grass", 400)]
+    assert all(case.fault == "loss_odometry" for case in drawn_cases(FEW, few))
+
+
+class FakePilot:
+    """Commands the step's number, and fails as it is asked to."""
+
+    estimate = None
+
+    def __init__(self, fails=(), health=None):
+        self.k, self.fails, self.command = -1, dict(fails), None
+        if health is not None:
+            self.health = health
+
+    def step(self, sample):
+        self.k += 1
+        wheels = np.full(3, float(self.k))
+        wrong = self.fails.get(self.k)
+        if wrong == "raise":
+            raise ValueError("no such row")
+        if wrong == "nan":
+            wheels[1] = math.nan
+        if wrong == "shape":
+            wheels = np.zeros(2)
+        if wrong == "text":
+            wheels = ["fast"] * 3
+        return Command(wheels, np.zeros(3), np.zeros(3), {"status_code": 0.0, "slip_ratio": 0.1})
+
+
+def driven(pilot, n=6):
+    guarded = GuardedPilot(pilot)
+    return guarded, [guarded.step(Sample(0.02 * k, np.zeros(3), {})) for k in range(n)]
+
+
+def test_a_pilot_that_fails_keeps_its_last_command_and_is_counted():
+    guarded, commands = driven(FakePilot({2: "raise", 3: "nan", 4: "shape", 5: "text"}))
+    assert [command.wheel_radps[0] for command in commands] == [0.0, 1.0, 1.0, 1.0, 1.0, 1.0]
+    assert (guarded.n_exceptions, guarded.n_not_finite) == (1, 3)
+    assert guarded.exception == "ValueError: no such row"
+    codes = [command.status["status_code"] for command in commands]
+    assert codes == [TractionStatus.OK] * 2 + [TractionStatus.NO_SLIP] * 4
+    assert driven(FakePilot())[0].exception == ""
+    with pytest.raises(ValueError, match="no such row"):
+        driven(FakePilot({0: "raise"}))
+
+
+class Health(Enum):
+    FRESH = 0
+    LOST = 1
+
+
+@pytest.mark.parametrize("health", [{"imu": "lost"}, lambda: {"imu": Health.LOST, "wheels": Health.FRESH}])
+def test_the_sensors_that_a_pilot_names_are_recorded(health):
+    guarded, _ = driven(FakePilot(health=health))
+    assert blamed_sensors(guarded.health, [True] * 6, 0.02) == {"imu": "lost"}
+    assert blamed_sensors(guarded.health, [True] * 4 + [False] * 2, 0.02) == {}  # for 0.08 s
+    assert blamed_sensors(driven(FakePilot())[0].health, [True] * 6, 0.02) is None
+
+
+def test_an_exception_of_the_pilot_shows_in_its_row(monkeypatch):
+    step = LivePilot.step
+
+    def failing(self, sample):
+        if "imu" not in sample.readings and sample.time_s > 2.0:
+            raise ZeroDivisionError("nothing to divide")
+        return step(self, sample)
+
+    place = Place("steady", "grass", 402)
+    references = drive_references(INPUTS, place)
+    monkeypatch.setattr(LivePilot, "step", failing)
+    row = evaluate_case(INPUTS, FaultCase("loss_imu", 1.0, *place), references)
+    assert row.figures.n_exceptions == 50
+    assert row.exception == "ZeroDivisionError: nothing to divide"
+    assert row.bars["finite"] is False
+    assert row.figures.recovery_s <= 0.02
+
+
+def test_the_command_writes_table_json_and_page(terrain):
+    code, out, err = terrain(
+        *("--faults", "loss_wheels,late_30ms_imu", "--situations", "stop,start", "--durations", "3"),
+        *("--seed", 403, "--seeds", 2, "--table", TABLE, "--jobs", 1, "--json", "faults.json"),
+        *("--out", "page", "--draw", "loss_wheels"),
+    )
+    assert code == 0, err
+    assert "loss_wheels" in out
+    assert "rows meet all bars" in out
+    document = json.loads(Path("faults.json").read_text())
+    assert document["n_rows"] == len(document["rows"]) == 8
+    row = document["rows"][0]
+    assert (row["fault"], row["situation"], row["terrain"]) == ("loss_wheels", "stop", "wet_floor")
+    assert row["is_met"] is all(met is not False for met in row["bars"].values())
+    assert document["n_met"] == sum(row["is_met"] for row in document["rows"])
+    assert row["stop_ratio"] > 1.0
+    assert document["seeds"] == [403, 404]
+    page = Path("page/faults.html").read_text()
+    assert page.count("<figure") == 2
+    assert "no sample arrives" in page
+    assert len(list(Path("page/figures").glob("*.png"))) == 2
+
+
+def test_without_a_table_targets_are_learned(terrain):
+    code, _, err = terrain(
+        *(
+            "--faults",
+            "nan_imu",
+            "--situations",
+            "stop",
+            "--durations",
+            "inf",
+            "--jobs",
+            1,
+            "--json",
+            "found.json",
+        )
+    )
+    assert code == 0, err
+    document = json.loads(Path("found.json").read_text())
+    assert document["table"] == "learned"
+    assert document["rows"][0]["duration_s"] is None
+    assert document["clean"][0]["stop_m"] < document["clean"][0]["plain_stop_m"]  # by slip control
+
+
+@pytest.mark.parametrize(
+    ("sentence", "words"),
+    [
+        ("fault 'lost' is unknown: use a kind (loss, freeze", ("--faults", "lost")),
+        ("fault 'x' is unknown", ("--draw", "x")),
+        ("--draw has 'loss_imu', which is not among", ("--faults", "step", "--draw", "loss_imu")),
+        ("situation 'go' is unknown: use start, stop, steady", ("--situations", "go")),
+        ("soil 'moon' is unknown", ("--terrain", "moon")),
+        ("soil 'moon' is unknown", ("--stop-terrain", "moon")),
+        ("--durations has 0; times above 0 s", ("--durations", "0")),
+        ("--durations is 'long'", ("--durations", "long")),
+        ("one of each at least is required", ("--situations", ",")),
+        ("start, start: one is named twice", ("--situations", "start,start")),
+        ("--seeds is 0", ("--seeds", 0)),
+        ("only 'swerve' has", ("--robot", "husky")),
+    ],
+)
+def test_what_cannot_be_driven_is_refused_in_a_sentence(terrain, sentence, words):
+    code, out, err = terrain(*words)
+    assert (code, out) == (2, "")
+    assert err.startswith("error: ")
+    assert err.count("\n") == 1
+    assert sentence in err
+
+
+def test_a_wrong_name_lists_all_names():
+    with pytest.raises(ConfigError, match=r"loss_wheels, .*clock_back_all\)$"):
+        faults_robot(FaultsSettings(faults="lost"))

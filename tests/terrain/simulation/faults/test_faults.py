@@ -1,0 +1,415 @@
+"""Sensor faults: each does what it states to samples and stamps, and nothing else."""
+
+import math
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from terrain.errors import ConfigError
+from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
+from terrain.kinematics.camera import body_motion, to_camera
+from terrain.logs.schema import IMU_CHANNELS, STEERING_CHANNELS, WHEELS_CHANNELS
+from terrain.records import Command, Reading, Sample, Stream
+from terrain.robots import load_robot
+from terrain.simulation.faults.catalogue import (
+    JITTER_S,
+    NOISE_FACTOR,
+    OTHER_WIDTH,
+    SPIKE,
+    fault_catalogue,
+    noise_std,
+    select_faults,
+)
+from terrain.simulation.faults.changes import EVERY
+from terrain.simulation.faults.fault import STREAMS, FaultyBus, Nature
+from terrain.simulation.run import simulate_run
+
+ROBOT = load_robot("agrimaro")
+CATALOGUE = fault_catalogue(ROBOT)
+CHANNELS = {
+    "wheels": WHEELS_CHANNELS,
+    "steering": STEERING_CHANNELS,
+    "imu": IMU_CHANNELS,
+    "odometry": CAMERA_CHANNELS,
+}
+RATE_HZ = {"wheels": 50, "steering": 50, "imu": 100, "odometry": 200}
+STEP_S, START_S, END_S, LENGTH_S = 0.02, 1.0, 3.0, 4.0
+COMMAND = Command(np.zeros(3), np.zeros(3), np.zeros(3), {})
+
+
+@cache
+def samples():
+    """Steps with drawn readings that cannot be written to; the camera has rotations and a turned heading."""
+    rng = np.random.default_rng(3)
+    made = []
+    for k in range(round(LENGTH_S / STEP_S)):
+        readings = {}
+        for name, channels in CHANNELS.items():
+            n = round(RATE_HZ[name] * STEP_S)
+            time_s = (k + (np.arange(n) + 1 - n) / n) * STEP_S
+            values = rng.standard_normal((n, len(channels)))
+            if name == "odometry":
+                angles = np.column_stack([0.7 + 0.1 * values[:, 0], 0.2 * values[:, 1:3]])
+                q = Rotation.from_euler("ZYX", angles).as_quat()
+                values[:, 3:7] = np.column_stack([to_camera(q[:, :3]), q[:, 3]])
+            time_s.flags.writeable = values.flags.writeable = False
+            readings[name] = Reading(time_s, values)
+        made.append(Sample(k * STEP_S, np.zeros(3), readings, "grass"))
+    return made
+
+
+def arrived(name, seed=0, end_s=END_S):
+    """What arrives of all steps with a fault."""
+    given = []
+
+    def controller(sample):
+        given.append(sample)
+        return COMMAND
+
+    bus = FaultyBus(controller, CATALOGUE[name], START_S, end_s, seed)
+    for sample in samples():
+        assert bus(sample) is COMMAND
+    return given
+
+
+def acts(sample):
+    return START_S <= sample.time_s < END_S
+
+
+def pairs(name):
+    """The steps at which a fault acts, as the sensors gave them and as they arrive."""
+    return [pair for pair in zip(samples(), arrived(name), strict=True) if acts(pair[0])]
+
+
+def both(name, stream):
+    """Values and stamps of a stream while the fault acts: as given, and as arrived."""
+    given, found = zip(*pairs(name), strict=True)
+    return tuple(
+        (
+            np.concatenate([sample.readings[stream].time_s for sample in each]),
+            np.concatenate([sample.readings[stream].values for sample in each]),
+        )
+        for each in (given, found)
+    )
+
+
+def same(one, other):
+    return all(np.array_equal(a, b, equal_nan=True) for a, b in zip(one, other, strict=True))
+
+
+def named(kind):
+    return [fault.name for fault in CATALOGUE.values() if fault.kind == kind]
+
+
+@pytest.mark.parametrize("name", CATALOGUE)
+def test_a_fault_touches_its_streams_while_it_acts_and_nothing_else(name):
+    fault, n_touched = CATALOGUE[name], dict.fromkeys(STREAMS, 0)
+    was_acting = False
+    for given, found in zip(samples(), arrived(name), strict=True):
+        assert np.array_equal(found.twist, given.twist)
+        assert found.terrain == given.terrain
+        if not acts(given):
+            assert found.time_s == given.time_s
+            for stream, reading in given.readings.items():
+                n = len(reading.time_s)
+                held = len(found.readings[stream].time_s) - n
+                assert held == 0 or (was_acting and stream in fault.streams)
+                assert same([part[held:] for part in found.readings[stream]], reading)
+        else:
+            for stream, reading in given.readings.items():
+                if stream not in fault.streams:
+                    assert found.readings[stream] is reading
+                else:
+                    n_touched[stream] += (
+                        not (
+                            stream in found.readings
+                            and found.readings[stream][1] is not None
+                            and np.shape(found.readings[stream][0]) == reading.time_s.shape
+                            and np.shape(found.readings[stream][1]) == reading.values.shape
+                            and found.readings[stream][1].dtype == np.float64
+                            and same(found.readings[stream], reading)
+                        )
+                        if not isinstance(found.readings.get(stream, (0, 0))[1], list)
+                        else 1
+                    )
+        was_acting = acts(given)
+    for stream in fault.streams:
+        assert n_touched[stream] > 0
+    assert fault.about
+    assert fault.name.startswith(fault.kind)
+
+
+@pytest.mark.parametrize("name", ["noise_imu", "jitter_odometry", "late_100ms_wheels"])
+def test_the_same_seed_gives_the_same_bytes_and_another_one_does_not(name):
+    (stream,) = CATALOGUE[name].streams
+
+    def given(seed):
+        found = [sample.readings[stream] for sample in arrived(name, seed) if stream in sample.readings]
+        return b"".join(reading.values.tobytes() + b"|" for reading in found)
+
+    assert given(1) == given(1)
+    assert (given(1) == given(2)) == name.startswith("late")
+
+
+@pytest.mark.parametrize("name", named("loss"))
+def test_nothing_arrives_of_a_lost_stream(name):
+    for given, found in pairs(name):
+        assert set(found.readings) == set(given.readings) - set(CATALOGUE[name].streams)
+
+
+FROZEN = {
+    **{f"freeze_{stream}": (stream, range(len(CHANNELS[stream]))) for stream in STREAMS},
+    "freeze_camera_orientation": ("odometry", range(3, 7)),
+    **{f"freeze_motor_{i}": ("wheels", [i - 1]) for i in (1, 2, 3)},
+    "freeze_gyro": ("imu", range(3)),
+    "freeze_accel": ("imu", range(3, 6)),
+    "freeze_pitch": ("imu", [7]),
+    "freeze_steering_1": ("steering", [0]),
+}
+
+
+@pytest.mark.parametrize("name", FROZEN)
+def test_frozen_channels_repeat_the_last_values_and_stamps_go_on(name):
+    stream, columns = FROZEN[name]
+    (given_s, given), (found_s, found) = both(name, stream)
+    last = [sample.readings[stream].values[-1] for sample in samples() if sample.time_s < START_S][-1]
+    assert np.array_equal(found_s, given_s)
+    for column in range(given.shape[1]):
+        expected = np.full(len(given), last[column]) if column in columns else given[:, column]
+        assert np.array_equal(found[:, column], expected)
+
+
+def test_a_stream_that_freezes_before_its_first_sample_repeats_that_one():
+    given = []
+    bus = FaultyBus(given.append, CATALOGUE["freeze_wheels"], 0.0, math.inf, 0)
+    for sample in samples()[:3]:
+        bus(sample)
+    first = samples()[0].readings["wheels"].values
+    assert all(np.array_equal(sample.readings["wheels"].values, first) for sample in given)
+
+
+STEPPED = {
+    "step_pitch": ("imu", 7, 0.2),
+    "step_yaw": ("imu", 8, 0.3),
+    "step_gyro": ("imu", 2, 0.1),
+    "step_accel": ("imu", 3, 2.0),
+    "step_steering_1": ("steering", 0, 0.1),
+}
+
+
+@pytest.mark.parametrize("name", STEPPED)
+def test_a_step_adds_to_one_channel(name):
+    stream, column, amount = STEPPED[name]
+    (given_s, given), (found_s, found) = both(name, stream)
+    expected = given.copy()
+    expected[:, column] += amount
+    assert np.array_equal(found, expected)
+    assert np.array_equal(found_s, given_s)
+
+
+def test_one_motor_rate_is_a_fifth_high():
+    (_, given), (_, found) = both("step_motor_1", "wheels")
+    assert found[:, 0] == pytest.approx(1.2 * given[:, 0])
+    assert np.array_equal(found[:, 1:], given[:, 1:])
+
+
+def seen(name):
+    """The robot's motion as its camera shows it, by :mod:`terrain.kinematics.camera`."""
+    given, found = both(name, "odometry")
+    return tuple(
+        body_motion(Stream(*each, CAMERA_CHANNELS), ROBOT.equipment.camera) for each in (given, found)
+    )
+
+
+@pytest.mark.parametrize(("name", "amount"), [("step_camera_speed", 0.3), ("step_camera_speed_down", -0.3)])
+def test_the_cameras_forward_speed_steps_at_any_heading(name, amount):
+    given, found = seen(name)
+    assert found.speed_mps[:, 0] - given.speed_mps[:, 0] == pytest.approx(amount)
+    assert found.speed_mps[:, 1] == pytest.approx(given.speed_mps[:, 1])
+    assert found.yaw_rad == pytest.approx(given.yaw_rad)
+
+
+def test_the_cameras_forward_speed_freezes_alone():
+    given, found = seen("freeze_camera_speed")
+    before = [sample for sample in samples() if sample.time_s < START_S][-1].readings["odometry"]
+    last = body_motion(Stream(*before, CAMERA_CHANNELS), ROBOT.equipment.camera).speed_mps[-1, 0]
+    assert found.speed_mps[:, 0] == pytest.approx(last)
+    assert found.speed_mps[:, 1] == pytest.approx(given.speed_mps[:, 1])
+
+
+def test_the_camera_turns_about_the_vertical():
+    (_, given), (_, found) = both("step_camera_yaw", "odometry")
+    angles = []
+    for values in (given, found):
+        q = values[:, 3:7]
+        vector = np.column_stack([-q[:, 2], -q[:, 0], q[:, 1]])  # the camera looks along -z, left is -x
+        angles.append(Rotation.from_quat(np.column_stack([vector, q[:, 3]])).as_euler("ZYX"))
+    assert angles[1] - angles[0] == pytest.approx(np.tile([0.3, 0.0, 0.0], (len(given), 1)))
+    assert np.array_equal(np.delete(found, range(3, 7), axis=1), np.delete(given, range(3, 7), axis=1))
+
+
+@pytest.mark.parametrize("stream", STREAMS)
+@pytest.mark.parametrize(
+    ("kind", "value"), [("nan", math.nan), ("inf", math.inf), ("minus_inf", -math.inf), ("zeros", 0.0)]
+)
+def test_all_values_are_replaced(kind, value, stream):
+    (given_s, given), (found_s, found) = both(f"{kind}_{stream}", stream)
+    assert np.array_equal(found, np.full_like(given, value), equal_nan=True)
+    assert np.array_equal(found_s, given_s)
+
+
+@pytest.mark.parametrize("stream", STREAMS)
+@pytest.mark.parametrize(("kind", "value"), [("nan_some", math.nan), ("spikes", SPIKE)])
+def test_each_tenth_sample_is_replaced(kind, value, stream):
+    (given_s, given), (found_s, found) = both(f"{kind}_{stream}", stream)
+    expected = given.copy()
+    expected[EVERY - 1 :: EVERY] = value
+    assert np.array_equal(found, expected, equal_nan=True)
+    assert np.array_equal(found_s, given_s)
+
+
+@pytest.mark.parametrize("stream", STREAMS)
+def test_noise_has_ten_times_the_described_standard_deviation(stream):
+    (_, given), (_, found) = both(f"noise_{stream}", stream)
+    added, std = found - given, NOISE_FACTOR * noise_std(ROBOT)[stream]
+    assert len(std) == len(CHANNELS[stream])
+    assert added.std(axis=0) == pytest.approx(std, rel=4 / math.sqrt(2 * len(added)))
+    assert np.array_equal(added[:, std == 0], np.zeros((len(added), int((std == 0).sum()))))
+
+
+def test_the_described_noise_is_that_of_the_simulated_sensors():
+    run = simulate_run(ROBOT, "asphalt", "stand", 3, duration_s=20.0)
+    for stream, std in noise_std(ROBOT).items():
+        values = run.streams[stream].values
+        scatter = np.std(np.diff(values, axis=0), axis=0) / math.sqrt(2)
+        shown = (
+            scatter > 0.05 * std
+        )  # a robot that stands shows neither the rate's noise nor a tilt of the camera
+        shown &= std > 0.0
+        assert shown.any()
+        assert scatter[shown] == pytest.approx(std[shown], rel=0.12)
+
+
+@pytest.mark.parametrize("stream", STREAMS)
+def test_shapes_and_types_are_wrong(stream):
+    for given, found in pairs(f"text_{stream}"):
+        with pytest.raises(ValueError, match="could not convert"):
+            found.readings[stream].values.astype(float)
+        assert np.array_equal(found.readings[stream].time_s, given.readings[stream].time_s)
+    assert all(found.readings[stream] == (None, None) for _, found in pairs(f"none_{stream}"))
+    for _, found in pairs(f"ragged_{stream}"):
+        with pytest.raises(ValueError, match="inhomogeneous"):
+            np.asarray(found.readings[stream].values)
+    for given, found in pairs(f"width_{stream}"):
+        n, width = given.readings[stream].values.shape
+        assert found.readings[stream].values.shape == (n, OTHER_WIDTH[stream])
+        assert OTHER_WIDTH[stream] != width
+
+
+def delays(name):
+    """Stamps of a stream and the delays with which they arrive, of all samples stamped while a fault acts."""
+    (stream,) = CATALOGUE[name].streams
+    stamped = [
+        (sample.time_s, reading) for sample in arrived(name) for reading in [sample.readings.get(stream)]
+    ]
+    came_s = np.concatenate([np.full(len(r.time_s), time_s) for time_s, r in stamped if r is not None])
+    time_s = np.concatenate([r.time_s for _, r in stamped if r is not None])
+    every_s = np.concatenate([sample.readings[stream].time_s for sample in samples()])
+    assert np.array_equal(np.sort(time_s), every_s)  # none is lost, and none arrives twice
+    used = (came_s > START_S - STEP_S / 2) & (came_s < END_S - STEP_S / 2)
+    return time_s[used], (came_s - time_s)[used]
+
+
+@pytest.mark.parametrize("stream", STREAMS)
+@pytest.mark.parametrize("delay_s", [0.03, 0.1, 0.15])
+def test_late_samples_arrive_with_their_stamps_at_the_first_step_after_the_delay(stream, delay_s):
+    time_s, late_s = delays(f"late_{1000 * delay_s:g}ms_{stream}")
+    assert (np.diff(time_s) > 0).all()
+    assert late_s.min() >= delay_s - 1e-9
+    assert late_s.max() < delay_s + STEP_S - 1e-9 + STEP_S / 1000
+
+
+@pytest.mark.parametrize("stream", STREAMS)
+def test_jitter_is_bounded_and_keeps_the_order(stream):
+    time_s, late_s = delays(f"jitter_{stream}")
+    assert (np.diff(time_s) > 0).all()
+    assert late_s.min() >= -1e-9
+    assert late_s.max() < JITTER_S + STEP_S
+    assert len(np.unique(late_s.round(6))) >= 3
+
+
+@pytest.mark.parametrize("stream", STREAMS)
+def test_of_each_two_samples_the_later_one_comes_first(stream):
+    time_s, _ = delays(f"disorder_{stream}")
+    turned = time_s[: len(time_s) // 2 * 2].reshape(-1, 2)
+    assert (turned[:, 0] > turned[:, 1]).all()
+    assert (np.diff(turned[:, 0]) > 0).all()
+
+
+@pytest.mark.parametrize("stream", STREAMS)
+def test_duplicates_come_in_pairs(stream):
+    (given_s, given), (found_s, found) = both(f"duplicates_{stream}", stream)
+    for first in (0, 1):
+        assert np.array_equal(found_s[first::2], given_s)
+        assert np.array_equal(found[first::2], given)
+
+
+@pytest.mark.parametrize("stream", STREAMS)
+@pytest.mark.parametrize(
+    ("kind", "shift_s"),
+    [("behind", -0.03), ("stampless", math.nan), ("clock_forward", 3600.0), ("clock_back", -3600.0)],
+)
+def test_stamps_are_shifted_and_values_stay(kind, shift_s, stream):
+    (given_s, given), (found_s, found) = both(f"{kind}_{stream}", stream)
+    assert np.array_equal(found_s, given_s + shift_s, equal_nan=True)
+    assert np.array_equal(found, given)
+
+
+@pytest.mark.parametrize("stream", STREAMS)
+@pytest.mark.parametrize(("text", "shift_s"), [("1s", 1.0), ("1h", 3600.0)])
+def test_each_tenth_stamp_lies_in_the_future(text, shift_s, stream):
+    (given_s, given), (found_s, found) = both(f"future_{text}_{stream}", stream)
+    expected = given_s.copy()
+    expected[EVERY - 1 :: EVERY] += shift_s
+    assert np.array_equal(found_s, expected)
+    assert np.array_equal(found, given)
+
+
+@pytest.mark.parametrize(("name", "shift_s"), [("clock_forward_all", 3600.0), ("clock_back_all", -3600.0)])
+def test_the_clock_of_the_whole_robot_steps(name, shift_s):
+    for given, found in pairs(name):
+        assert found.time_s == given.time_s + shift_s
+        for stream, reading in given.readings.items():
+            assert np.array_equal(found.readings[stream].time_s, reading.time_s + shift_s)
+            assert np.array_equal(found.readings[stream].values, reading.values)
+
+
+def test_a_fault_for_good_does_not_end():
+    assert all("imu" not in sample.readings for sample in arrived("loss_imu", end_s=math.inf)[50:])
+
+
+@pytest.mark.parametrize(
+    ("start_s", "end_s"), [(2.0, 2.0), (math.nan, 3.0), (1.0, math.nan), (math.inf, math.inf)]
+)
+def test_times_that_are_none_are_refused(start_s, end_s):
+    with pytest.raises(ConfigError, match="start before end"):
+        FaultyBus(lambda sample: COMMAND, CATALOGUE["loss_imu"], start_s, end_s, 0)
+
+
+def test_faults_are_selected_by_name_or_kind_in_the_order_of_the_catalogue():
+    assert [fault.name for fault in select_faults(CATALOGUE, ["step_pitch", "loss"])] == [
+        *named("loss"),
+        "step_pitch",
+    ]
+    assert select_faults(CATALOGUE, []) == list(CATALOGUE.values())
+    with pytest.raises(ConfigError, match=r"fault 'loos' is unknown: .*loss_imu.*clock_back_all"):
+        select_faults(CATALOGUE, ["loos"])
+
+
+def test_every_nature_and_every_stream_has_faults():
+    assert {fault.nature for fault in CATALOGUE.values()} == set(Nature)
+    for stream in STREAMS:
+        kinds = {fault.kind for fault in CATALOGUE.values() if stream in fault.streams}
+        assert kinds == {fault.kind for fault in CATALOGUE.values()}
