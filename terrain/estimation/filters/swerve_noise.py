@@ -20,8 +20,8 @@ from terrain.robots import Robot
 _WALK_STD = {
     "position_m": 1e-3,
     "yaw_rad": 1e-4,
-    "speed_mps": 0.03,
-    "yaw_rate_radps": 0.1,
+    "speed_mps": 0.01,
+    "yaw_rate_radps": 0.05,
     "accel_mps2": 2.0,
     "steer_rad": 0.1,
     "gyro_bias_radps": 2e-4,
@@ -34,12 +34,12 @@ _WALK_STD = {
 # so that the errors of vio15 are on average those that it states; likelihood is no guide where a low-pass
 # colours the noise of every sensor.
 _SAMPLE_STD = {
-    "accel_mps2": 0.1,
-    "gyro_z_radps": 0.01,
+    "accel_mps2": 0.05,
+    "gyro_z_radps": 0.004,
     "imu_yaw_rad": 0.05,
-    "steer_rad": 0.003,
-    "camera_speed_mps": 0.003,
-    "camera_yaw_rate_radps": 0.01,
+    "steer_rad": 0.001,
+    "camera_speed_mps": 0.0012,
+    "camera_yaw_rate_radps": 0.004,
     "camera_yaw_rad": 0.005,
     "gnss_position_m": 0.02,
     "gnss_speed_mps": 0.03,

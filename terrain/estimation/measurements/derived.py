@@ -39,9 +39,9 @@ CRAWL_MPS = 0.1
 REST_AFTER_S = 0.5
 """Time for which nothing has to move."""
 
-REST_WHEEL_MPS, REST_TURN_RADPS, REST_ACCEL_MPS2, REST_SEEN_MPS = 0.005, 0.03, 0.4, 0.05
-"""What counts as nothing, of a wheel's speed, the gyro, the accelerometer and the camera: biases and noise at
-rest stay below."""
+REST_WHEEL_MPS, REST_TURN_RADPS, REST_ACCEL_MPS2, REST_SEEN_MPS = 0.01, 0.03, 0.4, 0.05
+"""What counts as nothing, of a wheel's low-passed speed, the gyro, the accelerometer and the camera: biases
+and noise at rest stay below, as does a wheel that is held to and fro on soft ground."""
 
 N_DERIVED = 11
 """Length of the memory: mean square of the vibration, instant of its last sample; of each wheel the speed
@@ -91,7 +91,7 @@ def derive_rows(
     keep = math.exp(-step_s / CHANGE_S) if step_s > 0.0 else 0.0
     for i in range(3):
         speed, once, twice = z[i] * radius_m, memory[_ONCE + i], memory[_TWICE + i]
-        still &= abs(speed) <= REST_WHEEL_MPS
+        still &= abs(twice) <= REST_WHEEL_MPS and abs(speed) <= MOVING_MPS
         rise = once - twice
         change = twice * math.copysign(max(abs(rise) - WAVERING_MPS, 0.0), rise) / CHANGE_S
         z[first + 1 + i] = change / (twice * twice + CRAWL_MPS * CRAWL_MPS)

@@ -405,7 +405,7 @@ def test_a_broken_sensor_is_counted_by_its_name_and_costs_little(sensor, fault):
     late = time_s > 8
     assert np.abs(track.state("speed_x_mps")[late] - 1).max() < 0.05
     lambdas = np.column_stack([track.state(f"slip_speed_{i}_mps") for i in (1, 2, 3)])[late]
-    assert np.abs(lambdas - along[late] * SLIP / (1 - SLIP)).max() < 0.05
+    assert np.abs(lambdas - along[late] * SLIP / (1 - SLIP)).max() < 0.07
 
 
 @pytest.mark.parametrize(

@@ -171,9 +171,8 @@ def plain_derived(clock, table, once, twice, imu_s, accel_z, robot):
             rows[f"wheel_{i + 1}_change_m2ps3"][k] = (abs(speeds[k, i]) + CRAWL_MPS) * ahead / CHANGE_S
         seen_s = clock[k] if np.isfinite(table["camera_speed_x_mps"][k]) else seen_s
         rows["camera_age_s"][k] = clock[k] - seen_s
-        still = (np.abs(speeds[k]) <= REST_WHEEL_MPS).all() and abs(
-            table["gyro_z_radps"][k]
-        ) <= REST_TURN_RADPS
+        still = k > 0 and (np.abs(twice[k - 1]) <= REST_WHEEL_MPS).all()
+        still &= (np.abs(speeds[k]) <= MOVING_MPS).all() and abs(table["gyro_z_radps"][k]) <= REST_TURN_RADPS
         for axis in "xy":
             still &= abs(table[f"accel_{axis}_mps2"][k]) <= REST_ACCEL_MPS2
             still &= not abs(table[f"camera_speed_{axis}_mps"][k]) > REST_SEEN_MPS
