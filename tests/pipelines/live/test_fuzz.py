@@ -1,0 +1,102 @@
+"""Whatever arrives at the pilot: no exception, no command that is not finite."""
+
+import numpy as np
+import pytest
+
+from pipelines.live.pilot import LivePilot
+from pipelines.live.pilot_settings import CONTROLLERS, PilotSettings
+from terrain.logs.replay import replay
+from terrain.records import Reading, Sample
+from terrain.robots import load_robot
+from terrain.simulation.run import simulate_run
+
+ROBOT = load_robot("agrimaro")
+WIDTH = {"wheels": 6, "steering": 3, "imu": 9, "odometry": 14}
+
+
+class Hostile:
+    """An object that fails wherever it is touched."""
+
+    def __array__(self, *args, **kwargs):
+        raise RuntimeError("not an array")
+
+    def __float__(self):
+        raise RuntimeError("not a number")
+
+    def __len__(self):
+        raise RuntimeError("no length")
+
+
+def odd_value(rng, width):
+    """One of many things that are no values (k, width), or are."""
+    k = int(rng.integers(0, 4))
+    return (
+        lambda: rng.standard_normal((k, width)),
+        lambda: rng.standard_normal((k, width + int(rng.integers(1, 3)))),
+        lambda: 10.0 ** rng.uniform(-300, 300, (k, width)),
+        lambda: np.full((k, width), rng.choice([np.nan, np.inf, -np.inf])),
+        lambda: rng.integers(-9, 9, (k, width)),
+        lambda: [["much"] * width] * k,
+        lambda: [[0.0], [0.0, 1.0]],
+        lambda: None,
+        lambda: 10**400,
+        lambda: np.zeros((k, width, 2)),
+        lambda: np.zeros(width),
+        lambda: np.zeros((k, width), dtype=complex),
+        lambda: np.full((k, width), None),
+        lambda: Hostile(),
+        lambda: "wheels",
+        lambda: {"a": 1},
+    )[int(rng.integers(16))]()
+
+
+def odd_stamp(rng, time_s):
+    k = int(rng.integers(0, 4))
+    return (
+        lambda: time_s + 0.005 * np.arange(k),
+        lambda: time_s - rng.uniform(0, 0.5, k),
+        lambda: time_s + rng.choice([3600.0, -3600.0, 1e300, -1e300]) + 0.005 * np.arange(k),
+        lambda: np.full(k, rng.choice([np.nan, np.inf, -np.inf])),
+        lambda: ["soon"] * k,
+        lambda: None,
+        lambda: time_s,
+        lambda: [10**400] * k,
+        lambda: Hostile(),
+        lambda: np.zeros((k, 1)),
+    )[int(rng.integers(10))]()
+
+
+def odd_sample(rng, sample):
+    """A sample of which one part or all of it is odd."""
+    time_s, twist, readings = sample.time_s, sample.twist, dict(sample.readings)
+    for name, width in WIDTH.items():
+        if rng.random() < 0.5:
+            readings[name] = (
+                lambda: Reading(odd_stamp(rng, time_s), odd_value(rng, width)),  # noqa: B023 - called at once
+                lambda: odd_value(rng, width),  # noqa: B023
+                lambda: (1, 2, 3),
+            )[int(rng.integers(3))]()
+    if rng.random() < 0.3:
+        twist = odd_value(rng, 3)
+    if rng.random() < 0.3:
+        stamps = odd_stamp(rng, time_s)
+        time_s = stamps[0] if isinstance(stamps, np.ndarray) and stamps.size else stamps
+    if rng.random() < 0.05:
+        readings = odd_value(rng, 3)
+    terrain = "grass" if rng.random() < 0.9 else odd_value(rng, 2)
+    whole = Sample(time_s, twist, readings, terrain)
+    return whole if rng.random() < 0.98 else odd_value(rng, 3)
+
+
+@pytest.mark.parametrize("controller", CONTROLLERS)
+def test_2500_odd_samples_of_each_controller_neither_raise_nor_command_nonsense(controller):
+    rng = np.random.default_rng(7)
+    pilot = LivePilot(ROBOT, settings=PilotSettings(controller=controller, track=controller == "traction"))
+    sound = list(replay(simulate_run(ROBOT, "grass", "complex", 3, duration_s=30.0)))
+    with np.errstate(all="ignore"):
+        for k in range(2500):
+            sample = sound[k % len(sound)]
+            command = pilot.step(odd_sample(rng, sample) if rng.random() < 0.7 else sample)
+            for row in (command.wheel_radps, command.steer_rad, command.twist):
+                assert row.shape == (3,)
+                assert np.isfinite(row).all()
