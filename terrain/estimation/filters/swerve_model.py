@@ -23,6 +23,9 @@ LARGEST_SLIP_RATIO = 0.95
 _RADIUS, _WHEELS, _CAMERA_X, _CAMERA_Y, _ANTENNA_X, _ANTENNA_Y = 0, 1, 7, 8, 9, 10
 _HAS_CAMERA, _HAS_GNSS, _FADING, _BIAS_FADING, _ACCEL_BIAS_FADING = range(11, 16)
 _GROWTH = 16
+WHEELS = slice(_WHEELS, _CAMERA_X)
+"""Places of the wheels in the parameters of a model: x_1, y_1, x_2 ..."""
+
 # Places in the state that all filters share, and those of vio15.
 _X, _Y, _YAW, _VX, _VY, _W, _AX, _AY = range(8)
 _STEER, _BIAS, _SLIP, _OFFSET, _ACCEL_BIAS = 8, 11, 12, 15, 16

@@ -12,6 +12,7 @@ from numba import njit
 from terrain.errors import ConfigError
 from terrain.estimation.ekf.model import FilterModel, Given, Noise
 from terrain.estimation.filters.swerve import LAYOUTS, MOTION, initial_std, kind_of, layout_of, rows_of
+from terrain.estimation.filters.swerve_model import WHEELS
 from terrain.estimation.measurements.table import DERIVED_ROWS, ROWS_OF_DRIVE, MeasurementTable
 from terrain.records import Array
 from terrain.robots import Robot
@@ -77,13 +78,16 @@ UNSEEN_AFTER_S = 0.15
 
 
 def slip_walk(model: FilterModel, table: MeasurementTable) -> Array | None:
-    """Return the variances (n, d) a second by which slip speeds walk beside their process noise.
+    """Return the variances (n, d) a second by which states of vio15 walk beside their process noise.
 
     The slip of a wheel changes with the ground under it, which shows as vibration a_z, and with its thrust,
     which shows as a change of the wheel's speed w.  The latter is written so that a start from rest leaves a
     slip ratio of 0 +- 0.4, fast or slow::
 
         q = (0.09 s a_z)^2 + 0.4^2 |d(w^2)/dt|
+
+    Wheels that change their speed while they are still being steered turn the robot, too: the variance of the
+    yaw rate walks by the mean of ``0.4^2 |d(w^2)/dt|`` over the squared distance of a wheel from the origin.
 
     What vibration does to slip goes back and forth: it leads nowhere over seconds without a camera, and there
     0.03 s stands for 0.09 s.
@@ -103,7 +107,19 @@ def slip_walk(model: FilterModel, table: MeasurementTable) -> Array | None:
     unseen = ~(table.columns(("camera_age_s",))[:, 0] <= UNSEEN_AFTER_S)
     for state, change in zip(slips, changed, strict=True):
         found[:, model.states.index(state)] = walk_of(shaken, change, unseen)
+    found[:, model.states.index("yaw_rate_radps")] = turn_walk_of(sum(changed), square_arms_m2(model))
     return found
+
+
+def square_arms_m2(model: FilterModel) -> float:
+    """Return the sum over the wheels of their squared distances from the origin."""
+    return float((model.params[WHEELS] ** 2).sum())
+
+
+@njit(cache=True)
+def turn_walk_of(changes_m2ps3: Any, square_arms_m2: float) -> Any:
+    """Return the variance of the yaw rate a second of :func:`slip_walk`, from sums over the wheels."""
+    return 2.0 * _CHANGED_RATIO**2 * changes_m2ps3 / square_arms_m2
 
 
 @njit(cache=True)
@@ -167,6 +183,7 @@ class Schedule:
 
     def __init__(self, model: FilterModel, noise: Noise) -> None:
         self._slips = np.array([i for i, s in enumerate(model.states) if kind_of(s) == "slip_speed_mps"])
+        self._turn, self._square_arms_m2 = model.states.index("yaw_rate_radps"), square_arms_m2(model)
         self._accels = np.array([i for i, row in enumerate(model.rows) if kind_of(row) == "accel_mps2"])
         self._quiet = noise.measurement_variance[self._accels]
         self._variance = np.array(noise.measurement_variance)
@@ -178,25 +195,45 @@ class Schedule:
             self._variance[:] = variance
         given = self._given
         _schedule(
-            z, self._slips, self._accels, self._quiet, self._variance, given.walk_variance, given.inputs
+            z,
+            self._slips,
+            self._turn,
+            self._square_arms_m2,
+            self._accels,
+            self._quiet,
+            self._variance,
+            given.walk_variance,
+            given.inputs,
         )
         return given
 
 
 @njit(cache=True)
-def _schedule(
-    z: Array, slips: Array, accels: Array, quiet: Array, variance: Array, walk: Array, inputs: Array
+def _schedule(  # noqa: PLR0913 - a kernel takes its arrays one by one
+    z: Array,
+    slips: Array,
+    turn: int,
+    square_arms_m2: float,
+    accels: Array,
+    quiet: Array,
+    variance: Array,
+    walk: Array,
+    inputs: Array,
 ) -> None:
     """Write variances, walks and inputs of a tick: what :func:`scheduled` gives of a whole table."""
     shaken = z[_DERIVED]
     for i in range(accels.size):
         variance[accels[i]] = quiet[i] + shaken_variance(UNKNOWN_MPS2 if math.isnan(shaken) else shaken)
     known = 0.0 if math.isnan(shaken) else shaken
+    changes = 0.0
     for i in range(3):
         growth, change = z[_DERIVED + 1 + i], z[_DERIVED + 4 + i]
         unseen = not z[_DERIVED + 7] <= UNSEEN_AFTER_S
-        walk[slips[i]] = walk_of(known, 0.0 if math.isnan(change) else change, 1.0 if unseen else 0.0)
+        change = 0.0 if math.isnan(change) else change
+        changes += change
+        walk[slips[i]] = walk_of(known, change, 1.0 if unseen else 0.0)
         inputs[i] = 0.0 if math.isnan(growth) else growth
+    walk[turn] = turn_walk_of(changes, square_arms_m2)
 
 
 def default_noise(name: str, robot: Robot, with_gnss: bool = False) -> Noise:
