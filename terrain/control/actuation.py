@@ -1,8 +1,9 @@
 """Whether wheels and steering do what they were commanded; else a sensor lies, or a motor does not follow.
 
-A motor's rate follows its command within a quarter of a second.  So it lies between the least and the largest
-command of that time, and what is outside by more than a tolerance for a while either measures something else
-or does not follow; and the same with steering angles.
+A motor's rate follows its command within 0.4 s.  So it lies between the least and the largest command of
+that time, and what is outside by more than a tolerance for a while either measures something else or does not
+follow; and the same with steering angles.  A rate that repeats itself to the last bit, as that of a motor
+that stands, has less than half of that time.  Of three measured values the middle one counts, not a spike.
 """
 
 from __future__ import annotations
@@ -15,9 +16,13 @@ from numba import njit
 from terrain.records import Array, Reading
 
 N_KEPT = 32
+_OFF, _ON, _SMOOTH, _LAST, _BEFORE, _STILL = range(6)
 WINDOW_S, PERSISTS_S, SETTLED_S, SMOOTH_S = 0.4, 0.06, 0.1, 0.04
 """Time within which a command is followed; for which a deviation has to last; for which there must be none
 for it to be over; low-pass of what is measured, against the ripple of the Hall steps."""
+
+STILL_S = 0.18
+"""Time within which a motor changes its rate where the command has; a loaded one takes 0.12 s to start."""
 
 SPEED_MPS, SPEED_RATIO, STEER_RAD = 0.06, 0.06, 0.06
 """Tolerances: of a wheel's speed, a constant and a part of the command, and of a steering angle."""
@@ -26,9 +31,23 @@ SPEED_MPS, SPEED_RATIO, STEER_RAD = 0.06, 0.06, 0.06
 def actuation_memory() -> tuple[Array, Array]:
     """Return the memory before the first step.
 
-    Commands (32, 7) by time; and (3, 6): how long each is off and on, and what was measured, smoothed.
+    Commands (32, 7) by time; and (6, 6): how long each is off and on, what was measured, smoothed, the two
+    values before, and for how long it has repeated itself.
     """
-    return np.full((N_KEPT, 7), np.nan), np.array([[0.0] * 6, [SETTLED_S] * 6, [np.nan] * 6])
+    lasting = np.full((6, 6), np.nan)
+    lasting[_OFF], lasting[_ON], lasting[_STILL] = 0.0, SETTLED_S, 0.0
+    return np.full((N_KEPT, 7), np.nan), lasting
+
+
+@njit(cache=True, error_model="numpy")
+def _middle(i: int, measured: float, step_s: float, lasting: Array) -> float:
+    """Take a value; return the middle one of the last three, or this one where there are fewer."""
+    last, before = lasting[_LAST, i], lasting[_BEFORE, i]
+    lasting[_STILL, i] = lasting[_STILL, i] + step_s if measured == last else 0.0
+    lasting[_LAST, i], lasting[_BEFORE, i] = measured, last
+    if math.isnan(measured + last + before):
+        return measured
+    return float(max(min(measured, last), min(max(measured, last), before)))
 
 
 @njit(cache=True, error_model="numpy")
@@ -57,26 +76,28 @@ def follow(
     kept[slot, 1:] = command
     for i in range(6):
         low, high = math.inf, -math.inf
+        middle = _middle(i, measured[i], step_s, lasting)
+        window_s = STILL_S if i < 3 and lasting[_STILL, i] >= STILL_S else WINDOW_S
         for k in range(N_KEPT):
-            if kept[k, 0] >= now_s - WINDOW_S and not math.isnan(kept[k, 1 + i]):
+            if kept[k, 0] >= now_s - window_s and not math.isnan(kept[k, 1 + i]):
                 low, high = min(low, kept[k, 1 + i]), max(high, kept[k, 1 + i])
         slack = STEER_RAD if i >= 3 else SPEED_MPS + SPEED_RATIO * max(abs(low), abs(high))
-        smooth = lasting[2, i]
-        if math.isnan(smooth) or math.isnan(measured[i]):
-            smooth = measured[i]
+        smooth = lasting[_SMOOTH, i]
+        if math.isnan(smooth) or math.isnan(middle):
+            smooth = middle
         else:
-            smooth += (measured[i] - smooth) * -math.expm1(-step_s / SMOOTH_S)
-        lasting[2, i] = smooth
+            smooth += (middle - smooth) * -math.expm1(-step_s / SMOOTH_S)
+        lasting[_SMOOTH, i] = smooth
         known = low <= high and not math.isnan(smooth)
         if known and not low - slack <= smooth <= high + slack:
-            lasting[0, i] += step_s
-            lasting[1, i] = 0.0
+            lasting[_OFF, i] += step_s
+            lasting[_ON, i] = 0.0
         else:
-            lasting[0, i] = 0.0
-            lasting[1, i] += step_s
-        if lasting[0, i] >= PERSISTS_S:
+            lasting[_OFF, i] = 0.0
+            lasting[_ON, i] += step_s
+        if lasting[_OFF, i] >= PERSISTS_S:
             off[i] = True
-        elif lasting[1, i] >= SETTLED_S:
+        elif lasting[_ON, i] >= SETTLED_S:
             off[i] = False
 
 

@@ -29,9 +29,11 @@ from terrain.estimation.measurements.frozen import (
     OF_CAMERA,
     OF_IMU,
     OF_SPEED,
+    OF_WHEELS,
     REPEATED_CAMERA,
     REPEATED_IMU,
     REPEATED_SPEED,
+    REPEATED_WHEELS,
     repeats,
 )
 from terrain.estimation.measurements.sample_hold import CAME, LEAPT_SINCE, SINCE
@@ -66,8 +68,11 @@ SLIP_SENSORS = tuple(name for name in SENSORS if name not in ("imu_yaw", "camera
 """Those that slip control is built on: the camera's yaw turns its speed into the body's axes."""
 
 LOST_AFTER_S, WHEELS_LOST_S, GATED_AFTER_S, LEAPING_S, LATE_PERIODS = 0.25, 0.1, 0.1, 0.03, 3.0
-N_STUCK = 8
+N_STUCK = 4
 """Repetitions of all that the wheels measure, from which on they are frozen."""
+
+AT_REST_MPS = 0.1
+"""A robot that is faster is not at rest, whatever its wheels measure."""
 
 BIAS_RADPS = 0.05
 """A gyro's bias beyond this, five times what is usual, is a gyro that is broken."""
@@ -187,12 +192,15 @@ def judge(  # noqa: PLR0913 - a kernel takes its arrays one by one
     if abs(bias[2]) > BIAS_RADPS:
         health[_GYRO] = max(health[_GYRO], Health.DISAGREES.value)
     if is_moving(derived):
-        _find_frozen(frozen, stuck, health)
+        _find_frozen(frozen, health)
+    for i in range(3):
+        if stuck[i]:
+            health[_W + i] = Health.FROZEN.value
 
 
 @njit(cache=True, error_model="numpy")
-def _find_frozen(frozen: Array, stuck: Array, health: Array) -> None:
-    """Mark the sensors of frozen channels."""
+def _find_frozen(frozen: Array, health: Array) -> None:
+    """Mark the sensors of frozen channels, of wheels aside."""
     for c in range(9):  # rates, forces, roll, pitch, yaw
         sensor = (-1, -1, _GYRO, _ACCEL, _ACCEL, -1, _TILT, _TILT, _YAW)[c]
         if sensor >= 0 and repeats(frozen[OF_IMU], c, REPEATED_IMU[c]):
@@ -204,14 +212,17 @@ def _find_frozen(frozen: Array, stuck: Array, health: Array) -> None:
     for c in range(2):
         if repeats(frozen[OF_SPEED], c, REPEATED_SPEED[c]):
             health[_SEEN] = Health.FROZEN.value
-    for i in range(3):
-        if stuck[i]:
-            health[_W + i] = Health.FROZEN.value
 
 
 @njit(cache=True, error_model="numpy")
-def find_stuck(z: Array, motor_radps: Array, n_repeated: float, stuck: Array) -> None:
-    """Write which (3,) wheels are frozen: left out by the rows, or the whole sample repeats itself."""
+def find_stuck(
+    z: Array, motor_radps: Array, n_repeated: float, speed_mps: float, frozen: Array, stuck: Array
+) -> None:
+    """Write which (3,) wheels are frozen: their rate repeats itself, or the whole sample does.
+
+    A sample of zeros may be that of a robot at rest: it is frozen where the robot has a speed.
+    """
     for i in range(3):
-        stuck[i] = math.isnan(z[i]) and math.isfinite(motor_radps[i])
-        stuck[i] |= n_repeated >= N_STUCK and motor_radps[i] != 0.0
+        left_out = math.isnan(z[i]) and math.isfinite(motor_radps[i])
+        stuck[i] = left_out and repeats(frozen[OF_WHEELS], i, REPEATED_WHEELS[i])
+        stuck[i] |= n_repeated >= N_STUCK and (motor_radps[i] != 0.0 or speed_mps > AT_REST_MPS)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -85,7 +86,9 @@ class HealthMonitor:
         same = bool((wheels == self._wheels).all())  # currents too, which no rounding keeps the same
         self._wheels[:] = wheels
         self._n_repeated[0] = self._n_repeated[0] + 1.0 if same else 0.0
-        find_stuck(z, motor_radps, self._n_repeated[0], self._stuck)
+        motion = resident.mean[self._motion_places]
+        speed_mps = math.hypot(motion[0], motion[1])
+        find_stuck(z, motor_radps, self._n_repeated[0], speed_mps, self._rows.frozen, self._stuck)
         self._bias[self._bias_known] = resident.mean[self._bias_places]
         judge(
             time_s,
@@ -99,7 +102,7 @@ class HealthMonitor:
             self._rows.derived,
             z,
             self._bias,
-            resident.mean[self._motion_places],
+            motion,
             self._gated_s,
             self._compared,
             self.health,

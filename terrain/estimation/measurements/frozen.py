@@ -27,7 +27,7 @@ REPEATED_CAMERA = np.array([np.inf] * 3 + [20.0] * 4 + [10.0] * 6 + [np.inf])
 """Of the camera, at 200 Hz: 0.1 s of the quaternion, 0.05 s of a velocity; its position is not used."""
 
 REPEATED_SPEED = np.full(2, 10.0)
-REPEATED_WHEELS = np.full(3, 8.0)
+REPEATED_WHEELS = np.full(3, 5.0)
 """Of the camera's speed in the body's axes, and of the rate of each motor."""
 
 LONGER, LIVELY = 4.0, 2.0
