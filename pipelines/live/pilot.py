@@ -73,6 +73,7 @@ table that aims for a peak."""
 
 _ROLL, _PITCH = IMU_CHANNELS.index("roll_rad"), IMU_CHANNELS.index("pitch_rad")
 _OF_SLIP = np.array([SENSORS.index(name) for name in SLIP_SENSORS])
+_GYRO, _SEEN, _SEEN_YAW = (SENSORS.index(name) for name in ("gyro", "camera_speed", "camera_yaw"))
 _NOT_ESTIMATED = UNOBSERVED._replace(stale_s=math.nan)
 _NOT_TRACKED = TrackReport(math.nan, math.nan, 0.0, TrackStatus.NO_POSE)
 
@@ -334,14 +335,22 @@ class LivePilot:
             return twist, _NOT_TRACKED
         x, y, yaw = self._pose_states
         mean = seen.mean
+        yaw_std_rad = float(seen.std[yaw]) if _pose_is_sound(self._health) else math.inf
         pose = PoseEstimate(
-            float(mean[x]), float(mean[y]), float(mean[yaw]), float(seen.std[yaw]), estimate_age(seen, time_s)
+            float(mean[x]), float(mean[y]), float(mean[yaw]), yaw_std_rad, estimate_age(seen, time_s)
         )
         ground_twist = np.array([seen.speed_x_mps, seen.speed_y_mps, seen.yaw_rate_radps])
         twist, now.tracking, report = track_step(
             self._tracking, now.tracking, twist, pose, ground_twist, dt_s
         )
         return twist, report
+
+
+def _pose_is_sound(health: Array) -> bool:
+    """Say whether a pose can be built on: with a lost camera it is until it is stale."""
+    turns, seen_yaw, seen = health[_GYRO], health[_SEEN_YAW], health[_SEEN]
+    heading = turns <= SOUND or seen_yaw <= SOUND
+    return bool(heading and (seen <= SOUND or seen == Health.LOST))
 
 
 def _finite_twist(given: object) -> Array:
