@@ -3,7 +3,8 @@
 A motor's rate follows its command within 0.4 s.  So it lies between the least and the largest command of
 that time, and what is outside by more than a tolerance for a while either measures something else or does not
 follow; and the same with steering angles.  A rate that repeats itself to the last bit, as that of a motor
-that stands, has less than half of that time.  Of three measured values the middle one counts, not a spike.
+that stands, has less than half of that time; one that is on its way to the command, as that of a motor under
+load, has more.  Of three measured values the middle one counts, not a spike.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from numba import njit
 from terrain.records import Array, Reading
 
 N_KEPT = 32
-_OFF, _ON, _SMOOTH, _LAST, _BEFORE, _STILL = range(6)
+_OFF, _ON, _SMOOTH, _SLOW, _LAST, _BEFORE, _STILL = range(7)
 WINDOW_S, PERSISTS_S, SETTLED_S, SMOOTH_S = 0.4, 0.06, 0.1, 0.04
 """Time within which a command is followed; for which a deviation has to last; for which there must be none
 for it to be over; low-pass of what is measured, against the ripple of the Hall steps."""
@@ -24,17 +25,20 @@ for it to be over; low-pass of what is measured, against the ripple of the Hall 
 STILL_S = 0.18
 """Time within which a motor changes its rate where the command has; a loaded one takes 0.12 s to start."""
 
-SPEED_MPS, SPEED_RATIO, STEER_RAD = 0.06, 0.06, 0.06
+SLOW_S, APPROACH = 0.2, 0.02
+"""A second low-pass, and how far the first is ahead of it, in m/s or rad, on the way to a command."""
+
+SPEED_MPS, SPEED_RATIO, STEER_RAD = 0.05, 0.06, 0.06
 """Tolerances: of a wheel's speed, a constant and a part of the command, and of a steering angle."""
 
 
 def actuation_memory() -> tuple[Array, Array]:
     """Return the memory before the first step.
 
-    Commands (32, 7) by time; and (6, 6): how long each is off and on, what was measured, smoothed, the two
-    values before, and for how long it has repeated itself.
+    Commands (32, 7) by time; and (7, 6): how long each is off and on, measured values behind two low-passes,
+    the two values before, and for how long it has repeated itself.
     """
-    lasting = np.full((6, 6), np.nan)
+    lasting = np.full((7, 6), np.nan)
     lasting[_OFF], lasting[_ON], lasting[_STILL] = 0.0, SETTLED_S, 0.0
     return np.full((N_KEPT, 7), np.nan), lasting
 
@@ -48,6 +52,16 @@ def _middle(i: int, measured: float, step_s: float, lasting: Array) -> float:
     if math.isnan(measured + last + before):
         return measured
     return float(max(min(measured, last), min(max(measured, last), before)))
+
+
+@njit(cache=True, error_model="numpy")
+def _low_passed(i: int, value: float, step_s: float, lasting: Array) -> tuple[float, float]:
+    """Put a value behind both low-passes; an unknown one leaves nothing there."""
+    for row, memory_s in ((_SMOOTH, SMOOTH_S), (_SLOW, SLOW_S)):
+        before = lasting[row, i]
+        unknown = math.isnan(before + value)
+        lasting[row, i] = value if unknown else before + (value - before) * -math.expm1(-step_s / memory_s)
+    return lasting[_SMOOTH, i], lasting[_SLOW, i]
 
 
 @njit(cache=True, error_model="numpy")
@@ -82,13 +96,12 @@ def follow(
             if kept[k, 0] >= now_s - window_s and not math.isnan(kept[k, 1 + i]):
                 low, high = min(low, kept[k, 1 + i]), max(high, kept[k, 1 + i])
         slack = STEER_RAD if i >= 3 else SPEED_MPS + SPEED_RATIO * max(abs(low), abs(high))
-        smooth = lasting[_SMOOTH, i]
-        if math.isnan(smooth) or math.isnan(middle):
-            smooth = middle
-        else:
-            smooth += (middle - smooth) * -math.expm1(-step_s / SMOOTH_S)
-        lasting[_SMOOTH, i] = smooth
+        smooth, slow = _low_passed(i, middle, step_s, lasting)
         known = low <= high and not math.isnan(smooth)
+        if known and (smooth < low - slack and smooth > slow + APPROACH):
+            continue
+        if known and (smooth > high + slack and smooth < slow - APPROACH):
+            continue
         if known and not low - slack <= smooth <= high + slack:
             lasting[_OFF, i] += step_s
             lasting[_ON, i] = 0.0

@@ -20,27 +20,27 @@ from terrain.robots import Robot
 # of how far a state walks within a second,
 _WALK_STD = {
     "position_m": 1e-3,
-    "yaw_rad": 1e-4,
+    "yaw_rad": 4e-4,
     "speed_mps": 0.01,
-    "yaw_rate_radps": 0.05,
+    "yaw_rate_radps": 0.02,
     "accel_mps2": 2.0,
     "steer_rad": 0.1,
     "gyro_bias_radps": 2e-4,
     "slip_ratio": 0.05,
     "slip_speed_mps": 0.03,
-    "imu_yaw_offset_rad": 5e-4,
+    "imu_yaw_offset_rad": 4e-4,
     "accel_bias_mps2": 2e-3,
 }
 # and of what a sample scatters by on a robot that moves, with vibration and delays.  Chosen on simulated runs
 # so that the errors of vio15 are on average those that it states; likelihood is no guide where a low-pass
 # colours the noise of every sensor.
 _SAMPLE_STD = {
-    "accel_mps2": 0.05,
-    "gyro_z_radps": 0.004,
+    "accel_mps2": 0.03,
+    "gyro_z_radps": 0.0015,
     "imu_yaw_rad": 0.05,
-    "steer_rad": 0.001,
-    "camera_speed_mps": 0.0012,
-    "camera_yaw_rate_radps": 0.004,
+    "steer_rad": 0.0005,
+    "camera_speed_mps": 0.0006,
+    "camera_yaw_rate_radps": 0.0015,
     "camera_yaw_rad": 0.005,
     "gnss_position_m": 0.02,
     "gnss_speed_mps": 0.03,
@@ -49,6 +49,11 @@ _SAMPLE_STD = {
 }
 _WHEEL_SPEED_STD_MPS = 0.007  # circumferential speed of a wheel, mostly the ripple of the Hall steps
 _SLIP_STD_MPS = 0.15  # wheel speed minus ground speed, where both are measured and slip is no state
+
+
+# Behind the low-pass of the encoders' rates, 0.1 s, a sample scatters by a third of what it did; it counts as
+# half, as then the scatter of one tick is much like that of the tick before.
+_LOW_PASSED = 0.5
 
 
 def _described_std(robot: Robot) -> dict[str, float]:
@@ -60,10 +65,10 @@ def _described_std(robot: Robot) -> dict[str, float]:
         found["accel_mps2"] = sensors.accel_std_mps2 * imu
         found["gyro_z_radps"] = sensors.gyro_std_radps * imu
         found["imu_yaw_rad"] = sensors.yaw_std_rad * imu
-        found["steer_rad"] = sensors.steering_std_rad
+        found["steer_rad"] = sensors.steering_std_rad * _LOW_PASSED
     if robot.describes("sensors", "camera"):
         sensors, camera = robot.sensors, robot.camera
-        seen = math.sqrt(sensors.wheels_rate_hz / max(camera.rate_hz, sensors.wheels_rate_hz))
+        seen = _LOW_PASSED * math.sqrt(sensors.wheels_rate_hz / max(camera.rate_hz, sensors.wheels_rate_hz))
         found["camera_speed_mps"] = camera.speed_std_mps * seen
         found["camera_yaw_rate_radps"] = camera.yaw_rate_std_radps * seen
         found["camera_yaw_rad"] = camera.yaw_std_rad * seen
