@@ -19,8 +19,8 @@ from terrain.robots import Robot
 
 # of how far a state walks within a second,
 _WALK_STD = {
-    "position_m": 1e-3,
-    "yaw_rad": 4e-4,
+    "position_m": 9e-4,
+    "yaw_rad": 3e-4,
     "speed_mps": 0.01,
     "yaw_rate_radps": 0.02,
     "accel_mps2": 2.0,
@@ -36,11 +36,11 @@ _WALK_STD = {
 # colours the noise of every sensor.
 _SAMPLE_STD = {
     "accel_mps2": 0.03,
-    "gyro_z_radps": 0.0015,
+    "gyro_z_radps": 0.0012,
     "imu_yaw_rad": 0.05,
     "steer_rad": 0.0005,
     "camera_speed_mps": 0.0006,
-    "camera_yaw_rate_radps": 0.0015,
+    "camera_yaw_rate_radps": 0.0012,
     "camera_yaw_rad": 0.005,
     "gnss_position_m": 0.02,
     "gnss_speed_mps": 0.03,
@@ -77,7 +77,7 @@ def _described_std(robot: Robot) -> dict[str, float]:
 
 # What a slip speed walks by beside _WALK_STD: within a second a part of the vibration, in s, and a part of
 # what the speed of its wheel changes by.
-_SHAKEN_S, _CHANGED_RATIO, _UNSEEN_RATIO = 0.09, 0.4, 1.0 / 3.0
+_SHAKEN_S, _CHANGED_RATIO, _UNSEEN_RATIO, _SHAKEN_TURN_S = 0.09, 0.4, 1.0 / 3.0, 0.02
 UNSEEN_AFTER_S = 0.15
 """Age of the camera's speed from which on there is none."""
 
@@ -91,8 +91,9 @@ def slip_walk(model: FilterModel, table: MeasurementTable) -> Array | None:
 
         q = (0.09 s a_z)^2 + 0.4^2 |d(w^2)/dt|
 
-    Wheels that change their speed while they are still being steered turn the robot, too: the variance of the
-    yaw rate walks by the mean of ``0.4^2 |d(w^2)/dt|`` over the squared distance of a wheel from the origin.
+    Rough ground, and wheels that change their speed while they are still being steered, turn the robot, too:
+    the yaw rate walks by the mean of ``(0.02 s a_z)^2 + 0.4^2 |d(w^2)/dt|`` over the squared distance of a
+    wheel from the origin.
 
     What vibration does to slip goes back and forth: it leads nowhere over seconds without a camera, and there
     0.03 s stands for 0.09 s.
@@ -112,7 +113,7 @@ def slip_walk(model: FilterModel, table: MeasurementTable) -> Array | None:
     unseen = ~(table.columns(("camera_age_s",))[:, 0] <= UNSEEN_AFTER_S)
     for state, change in zip(slips, changed, strict=True):
         found[:, model.states.index(state)] = walk_of(shaken, change, unseen)
-    found[:, model.states.index("yaw_rate_radps")] = turn_walk_of(sum(changed), square_arms_m2(model))
+    found[:, model.states.index("yaw_rate_radps")] = turn_walk_of(shaken, sum(changed), square_arms_m2(model))
     return found
 
 
@@ -122,9 +123,10 @@ def square_arms_m2(model: FilterModel) -> float:
 
 
 @njit(cache=True)
-def turn_walk_of(changes_m2ps3: Any, square_arms_m2: float) -> Any:
+def turn_walk_of(vibration_mps2: Any, changes_m2ps3: Any, square_arms_m2: float) -> Any:
     """Return the variance of the yaw rate a second of :func:`slip_walk`, from sums over the wheels."""
-    return 2.0 * _CHANGED_RATIO**2 * changes_m2ps3 / square_arms_m2
+    shaken = 3.0 * (_SHAKEN_TURN_S * vibration_mps2) ** 2
+    return (shaken + 2.0 * _CHANGED_RATIO**2 * changes_m2ps3) / square_arms_m2
 
 
 @njit(cache=True)
@@ -238,7 +240,7 @@ def _schedule(  # noqa: PLR0913 - a kernel takes its arrays one by one
         changes += change
         walk[slips[i]] = walk_of(known, change, 1.0 if unseen else 0.0)
         inputs[i] = 0.0 if math.isnan(growth) else growth
-    walk[turn] = turn_walk_of(changes, square_arms_m2)
+    walk[turn] = turn_walk_of(known, changes, square_arms_m2)
 
 
 def default_noise(name: str, robot: Robot, with_gnss: bool = False) -> Noise:
