@@ -200,7 +200,7 @@ def rows_of(name: str, with_gnss: bool) -> tuple[str, ...]:
 
 # Standard deviations by name without axis and wheel: of what is known of a robot that was just switched on,
 _INITIAL_STD = {
-    "position_m": 1e-3,  # without GNSS the origin is where that was; with it: _SITE_STD_M
+    "position_m": 4e-3,  # without GNSS the origin is where that was, but for what low-passes displace
     "yaw_rad": 1.0,
     "speed_mps": 0.5,
     "yaw_rate_radps": 0.5,

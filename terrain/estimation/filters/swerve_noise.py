@@ -19,7 +19,7 @@ from terrain.robots import Robot
 
 # of how far a state walks within a second,
 _WALK_STD = {
-    "position_m": 9e-4,
+    "position_m": 3e-4,
     "yaw_rad": 3e-4,
     "speed_mps": 0.01,
     "yaw_rate_radps": 0.02,
@@ -28,7 +28,7 @@ _WALK_STD = {
     "gyro_bias_radps": 2e-4,
     "slip_ratio": 0.05,
     "slip_speed_mps": 0.03,
-    "imu_yaw_offset_rad": 4e-4,
+    "imu_yaw_offset_rad": 3.5e-4,
     "accel_bias_mps2": 2e-3,
 }
 # and of what a sample scatters by on a robot that moves, with vibration and delays.  Chosen on simulated runs
