@@ -105,7 +105,7 @@ def print_drives(drives: Sequence[LongDrive], console: Any) -> None:
     for drive in drives:
         yaw = f"{drive.yaw_error_rad:.4f}", f"{drive.blind_yaw_error_rad:.4f}"
         table.add_row(drive.terrain, *yaw, f"{drive.slip_coverage:.3f}")
-    largest = [max(drive[i] for drive in drives) for i in (1, 2)]
+    largest = max(d.yaw_error_rad for d in drives), max(d.blind_yaw_error_rad for d in drives)
     coverage = float(np.mean([drive.slip_coverage for drive in drives]))
     table.add_row("largest, mean", *(f"{error:.4f}" for error in largest), f"{coverage:.3f}")
     console.print(table)

@@ -1,4 +1,4 @@
-"""Long drives: the yaw stays at the truth, the seed alone decides, and a drive that is too short is refused."""
+"""Long drives: the yaw stays at the truth, the seed alone decides, one that is too short is refused."""
 
 import io
 
