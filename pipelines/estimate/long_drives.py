@@ -67,6 +67,7 @@ def drive_long(robot: Robot, terrain: str, seed: int, number: int, duration_s: f
     )
     estimate = estimate_run(run, robot, FILTER)
     track, yaw = estimate.track, estimate.track.states.index("yaw_rad")
+    assert estimate.truth is not None  # a simulated run has it
     error_rad = np.abs(wrapped(track.mean[:, yaw] - estimate.truth[:, yaw]))
     return LongDrive(
         terrain,

@@ -7,24 +7,38 @@ encoder12 12     10   the speed of the wheels, which it takes for the speed over
 slip14    14     10   that, and a slip ratio of each wheel, which nothing determines as long as it drives
                       straight: an example of what cannot be observed
 vio12     12     14   the speed that the camera sees, drawn to that of the wheels: slip reads low
-vio15     15     14   the speed that the camera sees, and how fast each wheel slips: **the one to use**
+vio15     18     17   the speed that the camera sees, and how fast each wheel slips: **the one to use**;
+                      15 states of the thesis' kind, and what else its sensors have: the offset of the IMU's
+                      yaw and the biases of the accelerometer; and three rows that hold at rest
 ========= ====== ==== ================================================================================
 
 Each can be made with four rows of GNSS more, another source of absolute speed and position.
 
-Process, with T the step, psi the yaw and w its rate, v and a in the body frame.  All else is a random walk,
-but that the acceleration of vio15 fades, a <- a exp(-3 T): kept for ever, as in the thesis, it would let a
-truth that is drawn from the model reach hundreds of metres a second::
+Process, with T the step, psi the yaw and w its rate, v and a in the body frame.  All else is a random walk::
 
     p_x <- p_x + T (v_x cos psi - v_y sin psi)        v_x <- v_x + T (a_x + w v_y)
     p_y <- p_y + T (v_x sin psi + v_y cos psi)        v_y <- v_y + T (a_y - w v_x)        psi <- psi + T w
+
+vio15 has more than that, with the slip speed l_i, the growth g_i of the wheel's speed (an input), the gyro's
+bias b, the offset o of the IMU's yaw and the accelerometer's biases c::
+
+    a <- a exp(-3 T)        l_i <- l_i exp(g_i T)        o <- o + T b
+    b <- b exp(-T / 5000 s)        c <- c exp(-T / 1250 s)
+
+An acceleration kept for ever, as in the thesis, would let a truth that is drawn from the model reach hundreds
+of metres a second.  Slip speeds grow and shrink with the speed of their wheels, which keeps the slip ratio of a
+wheel when the camera is lost.  Biases fade to a prior.  How far slip speeds and the yaw rate walk, and an
+acceleration is believed, follows vibration and changes of the wheels' speeds:
+:func:`~terrain.estimation.filters.swerve_noise.slip_walk`.  Cameras, IMU and rest are held: what disagrees for
+less than two seconds is not believed, as these sensors fail rather than show the ground's doing.
 
 Measurements, of wheel i at (x_i, y_i) steered by d_i, the camera at (r_x, r_y) and the antenna at l::
 
     v_i = (v_x - w y_i) cos d_i + (v_y + w x_i) sin d_i     wheel_i = v_i / r               encoder12, vio12
                                                             wheel_i = v_i / ((1 - s_i) r)   slip14
                                                             wheel_i = (v_i + l_i) / r       vio15
-    accel = a        gyro = w + b        imu_yaw = camera_yaw = psi        steer_i = d_i
+    accel = a (+ c)      gyro = w + b      camera_yaw = psi      imu_yaw = psi (+ o)      steer_i = d_i
+    rest = (v_x, v_y, w), zero where the robot stands                                       vio15
     camera_speed = (v_x - w r_y, v_y + w r_x)        camera_yaw_rate = w
     gnss_position = p + R(psi) l        gnss_speed = R(psi) (v + w x l)        in the world frame
 
@@ -40,7 +54,7 @@ Source: Danzi, AgriMaRo thesis, 4.3-4.5 and 6.1.  Corrected:
 - (6.5): v - w x r; it is v + w x r, as in (6.6);
 - (4.38), (4.40), (6.8), (6.9)-(6.14): see :func:`thesis_noise`;
 - 6.1: beside a camera, wheel rows without slip draw the speed to that of the wheels, wholly once the camera
-  is lost.  A slip speed l_i = wheel_i r - v_i of each wheel, a slow random walk, frees them and stays linear
+  is lost.  A slip speed l_i = wheel_i r - v_i of each wheel, a random walk, frees them and stays linear
   (vio15).
 """
 
