@@ -3,7 +3,7 @@
 A motor's rate follows its command within 0.4 s.  So it lies between the least and the largest command of
 that time, and what is outside by more than a tolerance for a while either measures something else or does not
 follow; and the same with steering angles.  A rate that repeats itself to the last bit, as that of a motor
-that stands, has less than half of that time; one that is on its way to the command, as that of a motor under
+that stands, has less than half of that time; one that approaches its command, as that of a motor under
 load, has more.  Of three measured values the middle one counts, not a spike.
 """
 
@@ -26,7 +26,7 @@ STILL_S = 0.18
 """Time within which a motor changes its rate where the command has; a loaded one takes 0.12 s to start."""
 
 SLOW_S, APPROACH = 0.2, 0.02
-"""A second low-pass, and how far the first is ahead of it, in m/s or rad, on the way to a command."""
+"""A second low-pass, and how far the first is ahead of it, in m/s or rad, where a command is approached."""
 
 SPEED_MPS, SPEED_RATIO, STEER_RAD = 0.05, 0.06, 0.06
 """Tolerances: of a wheel's speed, a constant and a part of the command, and of a steering angle."""

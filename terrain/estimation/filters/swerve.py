@@ -26,10 +26,10 @@ bias b, the offset o of the IMU's yaw and the accelerometer's biases c::
     b <- b exp(-T / 5000 s)        c <- c exp(-T / 1250 s)
 
 An acceleration kept for ever, as in the thesis, would let a truth that is drawn from the model reach hundreds
-of metres a second.  Slip speeds grow and shrink with the speed of their wheels, which keeps the slip ratio of a
-wheel when the camera is lost.  Biases fade to a prior.  How far slip speeds and the yaw rate walk, and an
+of metres a second.  Slip speeds grow and shrink with the speed of their wheels, which keeps the slip ratio of
+a wheel when the camera is lost.  Biases fade to a prior.  How far slip speeds and the yaw rate walk, and an
 acceleration is believed, follows vibration and changes of the wheels' speeds:
-:func:`~terrain.estimation.filters.swerve_noise.slip_walk`.  Cameras, IMU and rest are held: what disagrees for
+:func:`~terrain.estimation.filters.swerve_noise.slip_walk`.  Camera, IMU and rest are held: what disagrees for
 less than two seconds is not believed, as these sensors fail rather than show the ground's doing.
 
 Measurements, of wheel i at (x_i, y_i) steered by d_i, the camera at (r_x, r_y) and the antenna at l::
