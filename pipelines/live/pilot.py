@@ -291,7 +291,7 @@ class LivePilot:
         steer_rad = None if seen is None else seen.mean[self._steer_states]
         self._actuation.measured(time_s, step_or_period(dt_s), wheels, steer_rad)
         off = self._actuation.off[:3]
-        if wheels is not None and off.any():
+        if wheels is not None and True in off.tolist():
             values = wheels.values.copy()
             values[:, np.flatnonzero(off)] = math.nan
             readings["wheels"] = Reading(wheels.time_s, values)

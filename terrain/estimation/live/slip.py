@@ -53,5 +53,6 @@ class LiveSlip:
             self._variance,
             slip,
         )
-        slip[:, unmeasured] = np.nan
+        if True in unmeasured.tolist():
+            slip[:, unmeasured] = np.nan
         return slip
