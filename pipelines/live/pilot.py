@@ -55,6 +55,7 @@ from terrain.control.wheel_controllers import (
     estimate_age,
     step_or_period,
 )
+from terrain.entry_point import entry_point
 from terrain.estimation.live.clocks import Clocks, numbers
 from terrain.estimation.live.estimate import LiveEstimate
 from terrain.estimation.live.estimator import LiveEstimator
@@ -73,6 +74,7 @@ table that aims for a peak."""
 
 _ROLL, _PITCH = IMU_CHANNELS.index("roll_rad"), IMU_CHANNELS.index("pitch_rad")
 _OF_SLIP = np.array([SENSORS.index(name) for name in SLIP_SENSORS])
+_wheel_command_step = entry_point(wheel_command_step)
 _NOT_ESTIMATED = UNOBSERVED._replace(stale_s=math.nan)
 _NOT_TRACKED = TrackReport(math.nan, math.nan, 0.0, TrackStatus.NO_POSE)
 
@@ -209,7 +211,7 @@ class LivePilot:
         sensor, health = self._judge()
         target = self._target(step_or_period(dt_s))
         twist, tracked = self._track(desired, time_s, dt_s)
-        admitted, wheel_radps, now.steer_rad = wheel_command_step(
+        admitted, wheel_radps, now.steer_rad = _wheel_command_step(
             self._positions_m, *self._limits, step_or_period(dt_s), FAR_RAD, twist, now.steer_rad
         )
         desired_mps = max(map(abs, wheel_radps.tolist())) * self._radius_m

@@ -31,6 +31,7 @@ from terrain.control.traction_settings import (
     check_settings,
     with_motor_driver,
 )
+from terrain.entry_point import entry_point
 from terrain.estimation.live.estimate import LiveEstimate
 from terrain.kinematics.wheel_velocity import in_wheel_frame, point_velocity
 from terrain.records import Array, SlipTarget
@@ -44,6 +45,9 @@ PERIOD_S = 0.02
 def step_or_period(dt_s: float) -> float:
     """Return a time step, or :data:`PERIOD_S` where it is none of a control loop."""
     return dt_s if 0.0 < dt_s <= MAX_STEP_S else PERIOD_S
+
+
+_traction_step = entry_point(traction_step)
 
 
 class Observation(NamedTuple):
@@ -256,7 +260,7 @@ class TractionController:
     def step(self, request: WheelRequest) -> tuple[Array, WheelReport]:
         """Return the commanded rates (wheels,) and what was decided."""
         observed = request.observed
-        command, self._state, report = traction_step(
+        command, self._state, report = _traction_step(
             self._settings,
             self._state,
             request.target,
