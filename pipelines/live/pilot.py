@@ -55,6 +55,7 @@ from terrain.control.wheel_controllers import (
     estimate_age,
     step_or_period,
 )
+from terrain.entry_point import entry_point
 from terrain.estimation.live.clocks import Clocks, numbers
 from terrain.estimation.live.estimate import LiveEstimate
 from terrain.estimation.live.estimator import LiveEstimator
@@ -74,6 +75,7 @@ table that aims for a peak."""
 _ROLL, _PITCH = IMU_CHANNELS.index("roll_rad"), IMU_CHANNELS.index("pitch_rad")
 _OF_SLIP = np.array([SENSORS.index(name) for name in SLIP_SENSORS])
 _GYRO, _SEEN, _SEEN_YAW = (SENSORS.index(name) for name in ("gyro", "camera_speed", "camera_yaw"))
+_wheel_command_step = entry_point(wheel_command_step)
 _NOT_ESTIMATED = UNOBSERVED._replace(stale_s=math.nan)
 _NOT_TRACKED = TrackReport(math.nan, math.nan, 0.0, TrackStatus.NO_POSE)
 
@@ -210,7 +212,7 @@ class LivePilot:
         sensor, health = self._judge()
         target = self._target(step_or_period(dt_s))
         twist, tracked = self._track(desired, time_s, dt_s)
-        admitted, wheel_radps, now.steer_rad = wheel_command_step(
+        admitted, wheel_radps, now.steer_rad = _wheel_command_step(
             self._positions_m, *self._limits, step_or_period(dt_s), FAR_RAD, twist, now.steer_rad
         )
         desired_mps = max(map(abs, wheel_radps.tolist())) * self._radius_m
@@ -292,7 +294,7 @@ class LivePilot:
         steer_rad = None if seen is None else seen.mean[self._steer_states]
         self._actuation.measured(time_s, step_or_period(dt_s), wheels, steer_rad)
         off = self._actuation.off[:3]
-        if wheels is not None and off.any():
+        if wheels is not None and True in off.tolist():
             values = wheels.values.copy()
             values[:, np.flatnonzero(off)] = math.nan
             readings["wheels"] = Reading(wheels.time_s, values)

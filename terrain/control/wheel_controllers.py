@@ -31,6 +31,7 @@ from terrain.control.traction_settings import (
     check_settings,
     with_motor_driver,
 )
+from terrain.entry_point import entry_point
 from terrain.estimation.live.estimate import LiveEstimate
 from terrain.kinematics.wheel_velocity import in_wheel_frame, point_velocity
 from terrain.records import Array, SlipTarget
@@ -44,6 +45,9 @@ PERIOD_S = 0.02
 def step_or_period(dt_s: float) -> float:
     """Return a time step, or :data:`PERIOD_S` where it is none of a control loop."""
     return dt_s if 0.0 < dt_s <= MAX_STEP_S else PERIOD_S
+
+
+_traction_step = entry_point(traction_step)
 
 
 class Observation(NamedTuple):
@@ -129,63 +133,76 @@ class WheelObserver:
         self._torque_per_amp_nm = (
             motors.torque_constant_nmpa * motors.reduction_ratio * motors.efficiency_ratio
         )
-        self._x_m, self._y_m = np.array(robot.wheel_positions_m).T
-        self._radius_m, self._steer_states = robot.wheel_radius_m, steer_states
+        self._x_m, self._y_m = np.array(robot.wheel_positions_m).T.copy()
+        self._radius_m, self._steer_states = robot.wheel_radius_m, np.array(steer_states)
 
     def observe(self, estimate: LiveEstimate | None, time_s: float) -> Observation:
         """Return the motion at the wheels; NaN before the first estimate."""
         if estimate is None:
             return UNOBSERVED
         stale_s = estimate_age(estimate, time_s)
-        motion = (estimate.speed_x_mps, estimate.speed_y_mps, estimate.yaw_rate_radps)
-        found = np.empty((5, 3))
+        found, wheel_radps = np.empty((5, 3)), np.empty(3)
         _observe_wheels(
-            estimate.mean[self._steer_states],
-            motion,
-            (estimate.accel_x_mps2, estimate.accel_y_mps2),
+            estimate.mean,
+            self._steer_states,
+            estimate.speed_x_mps,
+            estimate.speed_y_mps,
+            estimate.yaw_rate_radps,
+            estimate.accel_x_mps2,
+            estimate.accel_y_mps2,
             self._x_m,
             self._y_m,
             estimate.wheel_speed_mps,
             estimate.slip_ratio,
             estimate.slip_std,
+            estimate.current_a,
+            self._radius_m,
+            self._torque_per_amp_nm,
             math.isinf(stale_s),
             found,
+            wheel_radps,
         )
-        found[4] = estimate.current_a * self._torque_per_amp_nm
-        return Observation(
-            WheelMeasurements(*found),
-            estimate.wheel_speed_mps / self._radius_m,
-            math.hypot(motion[0], motion[1]),
-            stale_s,
-        )
+        chassis_mps = math.hypot(estimate.speed_x_mps, estimate.speed_y_mps)
+        return Observation(WheelMeasurements(*found), wheel_radps, chassis_mps, stale_s)
 
 
 @njit(cache=True, error_model="numpy")
 def _observe_wheels(  # noqa: PLR0913 - a kernel takes its arrays one by one
-    steer_rad: Array,
-    motion: tuple[float, float, float],
-    accel_mps2: tuple[float, float],
+    mean: Array,
+    steer_states: Array,
+    speed_x_mps: float,
+    speed_y_mps: float,
+    yaw_rate_radps: float,
+    accel_x_mps2: float,
+    accel_y_mps2: float,
     x_m: Array,
     y_m: Array,
     wheel_speed_mps: Array,
     slip_ratio: Array,
     slip_std: Array,
+    current_a: Array,
+    radius_m: float,
+    torque_per_amp_nm: float,
     never_seen: bool,
     found: Array,
+    wheel_radps: Array,
 ) -> None:
-    """Write speed, acceleration, slip and its standard deviation (4, wheels) along each wheel."""
-    for i in range(steer_rad.size):
-        cos, sin = math.cos(steer_rad[i]), math.sin(steer_rad[i])
-        forward, left = point_velocity(motion[0], motion[1], motion[2], x_m[i], y_m[i])
+    """Write speed, acceleration, slip, its standard deviation and torque (5, wheels), and rates (wheels,)."""
+    for i in range(steer_states.size):
+        steer_rad = mean[steer_states[i]]
+        cos, sin = math.cos(steer_rad), math.sin(steer_rad)
+        forward, left = point_velocity(speed_x_mps, speed_y_mps, yaw_rate_radps, x_m[i], y_m[i])
         speed, _ = in_wheel_frame(forward, left, cos, sin)
         fastest = abs(speed)
         if not abs(wheel_speed_mps[i]) <= fastest:  # NaN too
             fastest = abs(wheel_speed_mps[i])
         # a wheel stands by the filter's rate, which differs a little from the measured one
         standing = fastest < (2.0 if math.isnan(slip_ratio[i]) else 1.0) * MIN_SPEED_MPS
-        found[0, i], found[1, i] = speed, accel_mps2[0] * cos + accel_mps2[1] * sin
+        found[0, i], found[1, i] = speed, accel_x_mps2 * cos + accel_y_mps2 * sin
         found[2, i] = 0.0 if standing and not never_seen else slip_ratio[i]
         found[3, i] = 0.0 if standing else slip_std[i]
+        found[4, i] = current_a[i] * torque_per_amp_nm
+        wheel_radps[i] = wheel_speed_mps[i] / radius_m
 
 
 UNOBSERVED = Observation(
@@ -243,7 +260,7 @@ class TractionController:
     def step(self, request: WheelRequest) -> tuple[Array, WheelReport]:
         """Return the commanded rates (wheels,) and what was decided."""
         observed = request.observed
-        command, self._state, report = traction_step(
+        command, self._state, report = _traction_step(
             self._settings,
             self._state,
             request.target,

@@ -83,13 +83,14 @@ class _StreamClock:
         """Return a reading stamped by the time; None where none of it is to be believed."""
         time_s, values = reading
         stamps = time_s.tolist()
-        if not math.isfinite(sum(stamps)):
+        left_out = not math.isfinite(sum(stamps))
+        if left_out:
             finite = np.isfinite(time_s)
             time_s, values = time_s[finite], values[finite]
             stamps = time_s.tolist()
         if not stamps:
             return None
-        newest_s = max(stamps)
+        newest_s = stamps[0] if len(stamps) == 1 else max(stamps)
         self._find_leap(now_s, newest_s)
         late_s = now_s - (newest_s - self.offset_s)
         if -AHEAD_S <= late_s <= REWIND_S:
@@ -101,7 +102,7 @@ class _StreamClock:
             self.counts["off the clock"] += time_s.size
             return None
         if self.offset_s == 0.0:
-            return Reading(time_s, values)
+            return Reading(time_s, values) if left_out else reading
         return Reading(time_s - self.offset_s, values)
 
     def _find_leap(self, now_s: float, newest_s: float) -> None:
@@ -169,7 +170,7 @@ class Clocks:
         """
         now_s = self._advance(number(time_s))
         found: dict[str, Reading] = {}
-        if not isinstance(readings, Mapping):
+        if type(readings) is not dict and not isinstance(readings, Mapping):
             return now_s, found
         for name, given in readings.items():
             reading = readable(given)

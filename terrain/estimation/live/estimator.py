@@ -23,6 +23,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from terrain.entry_point import entry_point
 from terrain.errors import ConfigError
 from terrain.estimation.ekf.model import (
     GATE_PROBABILITY,
@@ -66,6 +67,9 @@ SETTINGS = FilterSettings(GATE_PROBABILITY, REOPEN_AFTER_S)
 
 CHANNELS: Mapping[str, tuple[str, ...]] = {"wheels": WHEELS_CHANNELS, **STREAMS}
 """Default channels of each stream."""
+
+
+_push, _rows_at = entry_point(push), entry_point(rows_at)
 
 
 class LiveEstimator:
@@ -129,10 +133,7 @@ class LiveEstimator:
         self._prepare_filter(noise)
         buffers = (
             *self._filter.buffers,
-            self._row_buffer,
-            self._monitor.buffer,
-            self._counts,
-            self._wheel_counts,
+            *(self._row_buffer, self._monitor.buffer, self._counts, self._wheel_counts),
         )
         self._history = History(buffers, ("wheels", *(name for name, *_ in self._streams)))
         self._latest: LiveEstimate | None = None
@@ -150,6 +151,7 @@ class LiveEstimator:
         self._n_columns = {name: len(channels[name]) for name in ("wheels", *read)}
         self._motor_columns = np.array([known.index(channel) for channel in WHEELS_CHANNELS[:3]])
         self._current_columns = np.array([_place(known, channel) for channel in WHEELS_CHANNELS[3:]])
+        self._lacks_currents = bool((self._current_columns < 0).any())
         self._n_queued, self._last_s = np.zeros(len(STREAMS), np.int64), np.full(len(STREAMS), -np.inf)
         self._counts = np.zeros((len(STREAMS), len(KINDS)), np.int64)
         self._wheel_counts = np.zeros(len(WHEEL_KINDS), np.int64)
@@ -204,10 +206,8 @@ class LiveEstimator:
         places = [row for row in model.rows if row in GNSS_ROWS]
         self._variance = np.array(noise.measurement_variance) if places else None
         self._gnss_places = np.array([model.rows.index(row) for row in places], dtype=np.int64)
-        self._unknown, self._no_wheels = (
-            np.full(len(model.rows), np.nan),
-            np.full(self._n_columns["wheels"], np.nan),
-        )
+        self._unknown = np.full(len(model.rows), np.nan)
+        self._no_wheels = np.full(self._n_columns["wheels"], np.nan)
         self._slip = LiveSlip(robot, model.states)
         self._motion = [model.states.index(s) for s in LiveEstimate._fields[8:13]]
         self._variances = self._filter.cov.reshape(-1)[:: len(model.states) + 1]
@@ -276,7 +276,7 @@ class LiveEstimator:
             if first_s <= last_s and (late := self._late(name, arrays[0], last_s)) < math.inf:
                 late_s = min(late_s, late)
             else:
-                push(stream, *arrays, columns, *fixed)
+                _push(stream, *arrays, columns, *fixed)
         arrays = self._taken("wheels", readings)
         ticks = []
         if arrays is not None:
@@ -332,8 +332,7 @@ class LiveEstimator:
     def _arrays(self, name: str, reading: Reading) -> tuple[Array, Array] | None:
         """Return stamps and values; values that do not fit are unknown, stamps that do not are nothing."""
         try:
-            time_s = np.asarray(reading[0], dtype=np.float64)
-            values = np.asarray(reading[1], dtype=np.float64)
+            time_s, values = np.asarray(reading[0], np.float64), np.asarray(reading[1], np.float64)
         except (TypeError, ValueError, LookupError, OverflowError):
             self._unreadable[name] = self._unreadable.get(name, 0) + 1
             return None
@@ -357,7 +356,7 @@ class LiveEstimator:
             wheels = self._no_wheels
         motor_radps = wheels[self._motor_columns]
         self._motor_radps[:] = motor_radps
-        rows_at(time_s, follows < 0, *self._row_memory)
+        _rows_at(time_s, follows < 0, *self._row_memory)
         if self._variance is not None:
             self._variance[self._gnss_places] = self._gnss_variance
         given = Given(self._variance) if self._schedule is None else self._schedule(z, self._variance)
@@ -371,7 +370,8 @@ class LiveEstimator:
         mean = resident.mean.copy()
         v_x, v_y, turn, a_x, a_y = self._motion
         current_a = wheels[self._current_columns]
-        current_a[self._current_columns < 0] = np.nan
+        if self._lacks_currents:
+            current_a[self._current_columns < 0] = np.nan
         wheel_speed_mps = motor_radps / self._reduction_ratio * self._radius_m
         if self._region.compares:
             self._region.step(time_s, float(wheel_speed_mps.mean()), mean.item(turn))

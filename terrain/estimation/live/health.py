@@ -226,3 +226,13 @@ def find_stuck(
         left_out = math.isnan(z[i]) and math.isfinite(motor_radps[i])
         stuck[i] = left_out and repeats(frozen[OF_WHEELS], i, REPEATED_WHEELS[i])
         stuck[i] |= n_repeated >= N_STUCK and (motor_radps[i] != 0.0 or speed_mps > AT_REST_MPS)
+
+
+@njit(cache=True, error_model="numpy")
+def count_repeated(wheels: Array, before: Array, n_repeated: Array) -> None:
+    """Count how often all that the wheels measure repeats itself to the last bit: currents too."""
+    same = True
+    for c in range(wheels.size):
+        same &= wheels[c] == before[c]
+        before[c] = wheels[c]
+    n_repeated[0] = n_repeated[0] + 1.0 if same else 0.0

@@ -6,11 +6,12 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 
 from terrain.estimation.ekf.model import FilterModel
 from terrain.estimation.ekf.resident import ResidentFilter
 from terrain.estimation.ekf.state import in_one
-from terrain.estimation.live.health import SENSORS, Health, find_stuck, health_memory, judge
+from terrain.estimation.live.health import SENSORS, Health, count_repeated, find_stuck, health_memory, judge
 from terrain.records import Array
 from terrain.robots import Robot
 
@@ -47,20 +48,20 @@ class HealthMonitor:
         sensors, camera = robot.sensors, robot.completed.camera
         rates_hz = [sensors.wheels_rate_hz] * 3 + [sensors.steering_rate_hz] * 3 + [sensors.imu_rate_hz] * 4
         rates_hz += [camera.rate_hz] * 3 + [sensors.wheels_rate_hz]
-        self._period_s = 1.0 / np.array(rates_hz)
+        period_s = 1.0 / np.array(rates_hz)
         names = list(model.sensor_names)
-        self._places = np.array([names.index(sensor) if sensor in names else -1 for sensor in SENSORS])
+        places = np.array([names.index(sensor) if sensor in names else -1 for sensor in SENSORS])
         states = list(model.states)
-        self._motion_places = np.array([states.index(state) for state in _MOTION])
-        known = [i for i, state in enumerate(_BIASES) if state in states]
-        self._bias_known = np.array(known, dtype=np.int64)
-        self._bias_places = np.array([states.index(_BIASES[i]) for i in known], dtype=np.int64)
-        self._bias, self._stuck = np.zeros(3), np.zeros(3, dtype=np.bool_)
-        self._rows = rows
+        motion = np.array([states.index(state) for state in _MOTION])
+        biases = np.array([states.index(state) if state in states else -1 for state in _BIASES])
         fresh = (*health_memory(), np.full(n_columns, np.nan), np.zeros(1))
         self.buffer, views = in_one(fresh)
-        self._gated_s, self._compared, self._wheels, self._n_repeated = views
+        gated_s, compared, wheels, n_repeated = views
         self.health = np.full(len(SENSORS), Health.LOST.value, dtype=np.int8)
+        self._fixed = (
+            *(motion, biases, places, period_s, *rows),
+            *(wheels, n_repeated, gated_s, compared, self.health),
+        )
 
     @property
     def names(self) -> dict[str, str]:
@@ -83,27 +84,51 @@ class HealthMonitor:
         z : (29,) rows
         resident : the filter, after the tick
         """
-        same = bool((wheels == self._wheels).all())  # currents too, which no rounding keeps the same
-        self._wheels[:] = wheels
-        self._n_repeated[0] = self._n_repeated[0] + 1.0 if same else 0.0
-        motion = resident.mean[self._motion_places]
-        speed_mps = math.hypot(motion[0], motion[1])
-        find_stuck(z, motor_radps, self._n_repeated[0], speed_mps, self._rows.frozen, self._stuck)
-        self._bias[self._bias_known] = resident.mean[self._bias_places]
-        judge(
+        judge_tick(
             time_s,
-            resident.use,
-            self._places,
-            self._period_s,
-            self._rows.lines,
-            self._rows.received_s,
-            self._rows.frozen,
-            self._stuck,
-            self._rows.derived,
+            wheels,
+            motor_radps,
             z,
-            self._bias,
-            motion,
-            self._gated_s,
-            self._compared,
-            self.health,
+            resident.mean,
+            resident.use,
+            *self._fixed,
         )
+
+
+@njit(cache=True, error_model="numpy")
+def judge_tick(  # noqa: PLR0913 - a kernel takes its arrays one by one
+    time_s: float,
+    wheels: Array,
+    motor_radps: Array,
+    z: Array,
+    mean: Array,
+    use: Array,
+    motion_places: Array,
+    bias_places: Array,
+    places: Array,
+    period_s: Array,
+    lines: Array,
+    received_s: Array,
+    frozen: Array,
+    derived: Array,
+    wheels_before: Array,
+    n_repeated: Array,
+    gated_s: Array,
+    compared: Array,
+    health: Array,
+) -> None:
+    """Write the health (13,) of the sensors at a tick, by the sample of the wheels and the filter's state.
+
+    ``motion_places`` (3,) and ``bias_places`` (3,) say where each stands in the state; a bias that the state
+    does not have is at -1, and 0.  The rest is as of :func:`judge`.
+    """
+    count_repeated(wheels, wheels_before, n_repeated)
+    stuck, bias, motion = np.empty(3, np.bool_), np.empty(3), np.empty(3)
+    for i in range(3):
+        bias[i] = mean[bias_places[i]] if bias_places[i] >= 0 else 0.0
+        motion[i] = mean[motion_places[i]]
+    find_stuck(z, motor_radps, n_repeated[0], math.hypot(motion[0], motion[1]), frozen, stuck)
+    judge(
+        *(time_s, use, places, period_s, lines, received_s, frozen, stuck, derived),
+        *(z, bias, motion, gated_s, compared, health),
+    )

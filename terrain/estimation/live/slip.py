@@ -6,10 +6,13 @@ import math
 
 import numpy as np
 
+from terrain.entry_point import entry_point
 from terrain.estimation.ekf.resident import ResidentFilter
 from terrain.estimation.wheel_slip import STALE_AFTER_S, instant_slip, wheel_speed_scatter_mps
 from terrain.records import Array
 from terrain.robots import Robot
+
+_instant_slip = entry_point(instant_slip)
 
 
 class LiveSlip:
@@ -44,7 +47,7 @@ class LiveSlip:
         if math.isinf(age_s) or (age_s > STALE_AFTER_S and not self._in_state):
             slip[:] = np.nan
             return slip
-        instant_slip(
+        _instant_slip(
             resident.mean,
             resident.cov,
             self._positions_m,
@@ -53,5 +56,6 @@ class LiveSlip:
             self._variance,
             slip,
         )
-        slip[:, unmeasured] = np.nan
+        if True in unmeasured.tolist():
+            slip[:, unmeasured] = np.nan
         return slip
