@@ -140,7 +140,7 @@ def test_lost_wheels_are_named_and_nothing_winds_up_meanwhile(situation):
     assert peak <= clean_peak + 0.03
 
 
-class Unsure:
+class LowProbability:
     """A classifier whose probability never suffices."""
 
     certain, n_refused = False, 0
@@ -160,7 +160,7 @@ class Unsure:
     [(0.45, OutputStatus.BELOW_THRESHOLD, False), (0.9, OutputStatus.ACCEPTED, True)],
 )
 def test_a_classifier_whose_probability_never_suffices_is_reported(probability, output, believed):
-    pilot, twist = LivePilot(ROBOT, TABLE, Unsure(probability)), np.array([0.5, 0.0, 0.0])
+    pilot, twist = LivePilot(ROBOT, TABLE, LowProbability(probability)), np.array([0.5, 0.0, 0.0])
     statuses = [pilot.step(Sample(0.02 * k, twist, {})).status for k in range(1000)]
     outputs = [status["output_code"] for status in statuses if status["output_code"]]
     assert set(outputs) == {output}

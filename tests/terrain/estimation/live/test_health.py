@@ -47,14 +47,14 @@ def health(fault, given=samples):
     """Return times, and health (n, 13) at each, of a drive with a fault; without one where it is empty."""
     estimator, clocks, times_s, found = LiveEstimator(ROBOT), Clocks(), [], []
 
-    def listen(sample):
+    def estimate(sample):
         now_s, readings = clocks.step(sample.time_s, sample.readings)
         estimator.step(readings, now_s)
         if estimator.latest is not None:
             times_s.append(sample.time_s)
             found.append(estimator.latest.health)
 
-    bus = FaultyBus(listen, CATALOGUE[fault], START_S, END_S, seed=0) if fault else listen
+    bus = FaultyBus(estimate, CATALOGUE[fault], START_S, END_S, seed=0) if fault else estimate
     for sample in given():
         bus(sample)
     return np.array(times_s), np.array(found)

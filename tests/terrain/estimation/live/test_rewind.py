@@ -36,7 +36,7 @@ def bare(sample):
 
 
 def drive(steps, now=False):
-    """Return an estimator that was given readings step by step, and the time of each where it is told."""
+    """Return an estimator that was given readings step by step, and the time of each where `now` says so."""
     estimator = LiveEstimator(ROBOT)
     for time_s, readings in steps:
         estimator.step(readings, time_s if now else None)
