@@ -325,7 +325,7 @@ class LiveEstimator:
             if later is not None:
                 push(stream, *later, columns, *fixed)
         measured = {tick.time_s: tick for tick in (*ticks, *undone) if tick.wheels is not None}
-        reached_s = max(measured, default=-math.inf)
+        reached_s = max(measured, default=-math.inf) + 1.5 * self._period_s  # none was due before
         spare = [tick for tick in undone if tick.wheels is None and tick.time_s > reached_s]
         return sorted([*measured.values(), *spare], key=lambda tick: tick.time_s)
 
