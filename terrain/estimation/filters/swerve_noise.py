@@ -13,6 +13,7 @@ from terrain.errors import ConfigError
 from terrain.estimation.ekf.model import FilterModel, Given, Noise
 from terrain.estimation.filters.swerve import LAYOUTS, MOTION, initial_std, kind_of, layout_of, rows_of
 from terrain.estimation.filters.swerve_model import WHEELS
+from terrain.estimation.measurements.derived import UNSEEN_AFTER_S
 from terrain.estimation.measurements.table import DERIVED_ROWS, ROWS_OF_DRIVE, MeasurementTable
 from terrain.records import Array
 from terrain.robots import Robot
@@ -78,8 +79,6 @@ def _described_std(robot: Robot) -> dict[str, float]:
 # What a slip speed walks by beside _WALK_STD: within a second a part of the vibration, in s, and a part of
 # what the speed of its wheel changes by.
 _SHAKEN_S, _CHANGED_RATIO, _UNSEEN_RATIO, _SHAKEN_TURN_S = 0.09, 0.4, 1.0 / 3.0, 0.02
-UNSEEN_AFTER_S = 0.15
-"""Age of the camera's speed from which on there is none."""
 
 
 def slip_walk(model: FilterModel, table: MeasurementTable) -> Array | None:

@@ -3,7 +3,7 @@
 - ``vibration_mps2``: root mean square of the vertical acceleration over the last 0.3 s;
 - ``wheel_<i>_growth_per_s`` and ``wheel_<i>_change_m2ps3``: ``w w' / (w^2 + w_0^2)`` and ``|w w'|`` of a
   wheel's circumferential speed w behind two low-passes of 0.15 s, with w_0 = 0.1 m/s: what keeps the ratio of
-  a slip speed to w, and what w^2 changes by;
+  a slip speed to w, and what w^2 changes by; without a camera the latter decays within 0.5 s, peaks held;
 - ``camera_age_s``: since the camera last measured a speed;
 - ``rest_*``: zero, where the robot is at rest: for half a second the wheels have stood, gyro and
   accelerometer have measured nothing, and a camera, if it measures, no speed.  Locked wheels that slide
@@ -43,16 +43,22 @@ REST_WHEEL_MPS, REST_TURN_RADPS, REST_ACCEL_MPS2, REST_SEEN_MPS = 0.01, 0.03, 0.
 """What counts as nothing, of a wheel's low-passed speed, the gyro, the accelerometer and the camera: biases
 and noise at rest stay below, as does a wheel that is held to and fro on soft ground."""
 
-N_DERIVED = 11
+UNSEEN_AFTER_S = 0.15
+"""Age of the camera's speed from which on there is none."""
+
+HELD_S = 0.5
+"""Without a camera a change of a wheel's speed counts for so long: the body, and slip, follow it late."""
+
+N_DERIVED = 14
 """Length of the memory: mean square of the vibration, instant of its last sample; of each wheel the speed
 behind one and two low-passes; the tick before; since when all is at rest;
-when the camera measured last."""
+when the camera measured last; of each wheel the change that is held."""
 
-_SQUARE, _INSTANT, _ONCE, _TWICE, _TICK, _SINCE, _SEEN = 0, 1, 2, 5, 8, 9, 10
+_SQUARE, _INSTANT, _ONCE, _TWICE, _TICK, _SINCE, _SEEN, _HELD = 0, 1, 2, 5, 8, 9, 10, 11
 
 
 def derived_memory() -> Array:
-    """Return the memory (11,) before the first sample."""
+    """Return the memory (14,) before the first sample."""
     return np.full(N_DERIVED, np.nan)
 
 
@@ -89,6 +95,9 @@ def derive_rows(
     z[first] = math.sqrt(memory[_SQUARE])
     still = True
     keep = math.exp(-step_s / CHANGE_S) if step_s > 0.0 else 0.0
+    if not math.isnan(z[camera]):
+        memory[_SEEN] = time_s
+    unseen = not time_s - memory[_SEEN] <= UNSEEN_AFTER_S
     for i in range(3):
         speed, once, twice = z[i] * radius_m, memory[_ONCE + i], memory[_TWICE + i]
         still &= abs(twice) <= REST_WHEEL_MPS and abs(speed) <= MOVING_MPS
@@ -96,7 +105,10 @@ def derive_rows(
         change = twice * math.copysign(max(abs(rise) - WAVERING_MPS, 0.0), rise) / CHANGE_S
         z[first + 1 + i] = change / (twice * twice + CRAWL_MPS * CRAWL_MPS)
         ahead = max(abs(speed - once) - RIPPLE_MPS, 0.0)
-        z[first + 4 + i] = (abs(speed) + CRAWL_MPS) * ahead / CHANGE_S
+        change = (abs(speed) + CRAWL_MPS) * ahead / CHANGE_S
+        held = memory[_HELD + i] * math.exp(-step_s / HELD_S) if step_s > 0.0 else np.nan
+        memory[_HELD + i] = change if math.isnan(held) or change > held else held
+        z[first + 4 + i] = memory[_HELD + i] if unseen else change
         if math.isnan(once) or not step_s > 0.0:
             memory[_ONCE + i] = memory[_TWICE + i] = speed
         elif not math.isnan(speed):
@@ -110,8 +122,6 @@ def derive_rows(
         memory[_SINCE] = np.nan
     elif math.isnan(memory[_SINCE]):
         memory[_SINCE] = time_s
-    if not math.isnan(z[camera]):
-        memory[_SEEN] = time_s
     z[first + 7] = time_s - memory[_SEEN]
     rests = time_s - memory[_SINCE] >= REST_AFTER_S
     for i in range(3):

@@ -14,6 +14,7 @@ from terrain.estimation.measurements.cleaning import clean_stream
 from terrain.estimation.measurements.derived import (
     CHANGE_S,
     CRAWL_MPS,
+    HELD_S,
     MOVING_MPS,
     REST_ACCEL_MPS2,
     REST_AFTER_S,
@@ -21,6 +22,7 @@ from terrain.estimation.measurements.derived import (
     REST_TURN_RADPS,
     REST_WHEEL_MPS,
     RIPPLE_MPS,
+    UNSEEN_AFTER_S,
     VIBRATION_S,
     WAVERING_MPS,
 )
@@ -160,7 +162,7 @@ def plain_derived(clock, table, once, twice, imu_s, accel_z, robot):
         keep = np.exp(-(imu_s[k] - imu_s[before[-1]]) / VIBRATION_S) if before.size else 0.0
         square[k] = accel_z[k] ** 2 + ((square[before[-1]] - accel_z[k] ** 2) * keep if before.size else 0.0)
     speeds = np.column_stack([table[f"wheel_{i}_radps"] for i in (1, 2, 3)]) * robot.wheel_radius_m
-    still_since, seen_s = np.nan, np.nan
+    still_since, seen_s, changes = np.nan, np.nan, np.full((n, 3), np.nan)
     for k in range(n):
         for i in range(3):
             slow, slower = (once[k - 1, i], twice[k - 1, i]) if k else (np.nan, np.nan)
@@ -168,9 +170,16 @@ def plain_derived(clock, table, once, twice, imu_s, accel_z, robot):
             change = slower * np.sign(rise) * max(abs(rise) - WAVERING_MPS, 0.0) / CHANGE_S
             rows[f"wheel_{i + 1}_growth_per_s"][k] = change / (slower**2 + CRAWL_MPS**2)
             ahead = max(abs(speeds[k, i] - slow) - RIPPLE_MPS, 0.0) if slow == slow else np.nan
-            rows[f"wheel_{i + 1}_change_m2ps3"][k] = (abs(speeds[k, i]) + CRAWL_MPS) * ahead / CHANGE_S
+            changes[k, i] = (abs(speeds[k, i]) + CRAWL_MPS) * ahead / CHANGE_S
+            rows[f"wheel_{i + 1}_change_m2ps3"][k] = changes[k, i]
         seen_s = clock[k] if np.isfinite(table["camera_speed_x_mps"][k]) else seen_s
         rows["camera_age_s"][k] = clock[k] - seen_s
+        if not clock[k] - seen_s <= UNSEEN_AFTER_S:
+            for i in range(3):
+                left = changes[: k + 1, i] * np.exp(-(clock[k] - clock[: k + 1]) / HELD_S)
+                rows[f"wheel_{i + 1}_change_m2ps3"][k] = (
+                    np.nanmax(left) if np.isfinite(left).any() else np.nan
+                )
         still = k > 0 and (np.abs(twice[k - 1]) <= REST_WHEEL_MPS).all()
         still &= (np.abs(speeds[k]) <= MOVING_MPS).all() and abs(table["gyro_z_radps"][k]) <= REST_TURN_RADPS
         for axis in "xy":
