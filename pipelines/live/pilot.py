@@ -74,6 +74,8 @@ table that aims for a peak."""
 
 _ROLL, _PITCH = IMU_CHANNELS.index("roll_rad"), IMU_CHANNELS.index("pitch_rad")
 _OF_SLIP = np.array([SENSORS.index(name) for name in SLIP_SENSORS])
+# Order in which sensors are named, by health: one that steps or freezes takes others with it, which are lost.
+_BLAMED = np.array([0, 1, 2, 3, 4, 6, 7, 5])
 _GYRO, _SEEN, _SEEN_YAW = (SENSORS.index(name) for name in ("gyro", "camera_speed", "camera_yaw"))
 _wheel_command_step = entry_point(wheel_command_step)
 _NOT_ESTIMATED = UNOBSERVED._replace(stale_s=math.nan)
@@ -308,13 +310,16 @@ class LivePilot:
             self._health[:] = Health.LOST
             return 0, Health.LOST
         self._health[:] = seen.health
-        if self._actuation.off.any():
-            for i in np.flatnonzero(self._actuation.off):
-                self._health[i] = max(self._health[i], Health.DISAGREES)
+        off, moved = (
+            self._actuation.off,
+            self._health[:6],
+        )  # what is off was taken from the filter, and lost there
+        moved[off & ((moved == Health.LOST) | (moved < Health.DISAGREES))] = Health.DISAGREES
         of_slip = self._health[_OF_SLIP]
-        worst = int(of_slip.argmax())
-        health = int(of_slip[worst])
-        return (int(_OF_SLIP[worst]), health) if health > SOUND else (-1, health)
+        if not of_slip.max() > SOUND:
+            return -1, int(of_slip.max())
+        worst = int(_BLAMED[of_slip].argmax())
+        return int(_OF_SLIP[worst]), int(of_slip[worst])
 
     def _target(self, dt_s: float) -> TractionTarget:
         """Return the slips to aim for; the target moves to that of the terrain at a bounded rate."""
