@@ -3,10 +3,12 @@
 On the command line, beside ``terrain quickstart``, which shows it::
 
     python -m pipelines.estimate.consistency --runs 20 --seed 0
+    python -m pipelines.estimate.consistency --runs 5 --scenarios starts --camera-lost 10
 """
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,6 +21,7 @@ from terrain.control.comparison import MeanInterval, mean_interval
 from terrain.estimation.coverage import nees_by_group, slip_coverage
 from terrain.estimation.estimate import estimate_run
 from terrain.robots import Robot, load_robot
+from terrain.simulation.conditions import Faults
 from terrain.simulation.run import simulate_run
 from terrain.terramechanics.soil import soil_names
 
@@ -60,7 +63,7 @@ class TerrainConsistency(NamedTuple):
     slip_coverage: MeanInterval
 
 
-def consistency_by_terrain(
+def consistency_by_terrain(  # noqa: PLR0913 - an entry whose options have defaults
     robot: Robot,
     seed: int,
     runs: int = RUNS_A_SCENARIO,
@@ -68,8 +71,10 @@ def consistency_by_terrain(
     progress: Progress = silent,
     n_jobs: int = 0,
     terrains: Sequence[str] = soil_names(),
+    scenarios: Sequence[str] = SCENARIOS,
+    lost_s: float = 0.0,
 ) -> tuple[TerrainConsistency, ...]:
-    """Simulate and filter runs of :data:`SCENARIOS` on each terrain, and compare errors with their variance.
+    """Simulate and filter runs of some scenarios on each terrain, and compare errors with their variance.
 
     Parameters
     ----------
@@ -80,6 +85,8 @@ def consistency_by_terrain(
     progress : of the runs
     n_jobs : processes at once; 0 for one a core
     terrains : names of soils
+    scenarios : names of scenarios
+    lost_s : for so long from the middle of each run there is no camera, and coverage is that of this time
 
     Raises
     ------
@@ -91,12 +98,12 @@ def consistency_by_terrain(
     jobs = [
         (terrain, scenario, number)
         for terrain in terrains
-        for scenario in SCENARIOS
+        for scenario in scenarios
         for number in range(1, runs + 1)
     ]
     pool = Parallel(n_jobs=n_jobs or os.cpu_count() or 1, return_as="generator")
     found: dict[str, list[dict[str, float]]] = {terrain: [] for terrain in terrains}
-    work = pool(delayed(_run_figures)(robot, *job, seed, filter_name) for job in jobs)
+    work = pool(delayed(_run_figures)(robot, *job, seed, filter_name, lost_s) for job in jobs)
     for done, ((terrain, _, _), figures) in enumerate(zip(jobs, work, strict=True), 1):
         found[terrain].append(figures)
         progress("consistency", done, len(jobs))
@@ -104,11 +111,17 @@ def consistency_by_terrain(
 
 
 def _run_figures(
-    robot: Robot, terrain: str, scenario: str, number: int, seed: int, filter_name: str
+    robot: Robot, terrain: str, scenario: str, number: int, seed: int, filter_name: str, lost_s: float
 ) -> dict[str, float]:
     run = simulate_run(robot, terrain, scenario, seed, number, vary=True)
+    between_s = (-math.inf, math.inf)
+    if lost_s > 0.0:
+        middle_s = float(run.streams["wheels"].time_s.mean())
+        between_s = (middle_s, middle_s + lost_s)
+        faults = Faults(camera_lost_s=(between_s,))
+        run = simulate_run(robot, terrain, scenario, seed, number, vary=True, faults=faults)
     estimate = estimate_run(run, robot, filter_name)
-    return nees_by_group(estimate) | {COVERAGE_HEADING: slip_coverage(estimate)}
+    return nees_by_group(estimate) | {COVERAGE_HEADING: slip_coverage(estimate, between_s)}
 
 
 def _terrain_row(terrain: str, rows: Sequence[dict[str, float]]) -> TerrainConsistency:
@@ -155,6 +168,10 @@ def main(
     seed: Annotated[int, typer.Option(min=0, help="Of all runs.")] = 0,
     robot: str = "agrimaro",
     filter_name: Annotated[str, typer.Option("--filter")] = FILTER,
+    scenarios: Annotated[str, typer.Option(help="By commas.")] = ",".join(SCENARIOS),
+    camera_lost: Annotated[
+        float, typer.Option(min=0.0, help="Time in s without a camera, from the middle of each run.")
+    ] = 0.0,
     jobs: Annotated[int, typer.Option(min=0, help="Processes at once; 0 for one a core.")] = 0,
     json_file: Annotated[Path | None, typer.Option("--json")] = None,
 ) -> None:
@@ -163,7 +180,10 @@ def main(
     from pipelines.reporting.terminal import output_console, progress_bar
 
     with progress_bar() as progress:
-        rows = consistency_by_terrain(load_robot(robot), seed, runs, filter_name, progress, jobs)
+        rows = consistency_by_terrain(
+            *(load_robot(robot), seed, runs, filter_name, progress, jobs, soil_names()),
+            *(scenarios.split(","), camera_lost),
+        )
     print_consistency(rows, output_console())
     write_json(json_file, {"seed": seed, "filter": filter_name, "consistency": rows})
 

@@ -45,7 +45,7 @@ def nees_by_group(estimate: Estimate) -> dict[str, float]:
     return {group.name: group.mean_per_dof for group in states if group.name != "all"}
 
 
-def slip_coverage(estimate: Estimate) -> float:
+def slip_coverage(estimate: Estimate, between_s: tuple[float, float] = (-math.inf, math.inf)) -> float:
     """Return the ratio of slips of a run whose 95 % interval contains the true slip; NaN where none is known.
 
     The interval is the estimate with 1.96 stated standard deviations on either side.  The truth comes behind
@@ -54,11 +54,13 @@ def slip_coverage(estimate: Estimate) -> float:
     Parameters
     ----------
     estimate : of a simulated run
+    between_s : only the slips in this time
     """
     if "truth" not in estimate.run.streams:
         return math.nan
     true = lagged_slip_at(estimate.run, estimate.robot, estimate.slip.time_s)
     error = np.abs(estimate.slip.slip_ratio - true)
     known = np.isfinite(error) & np.isfinite(estimate.slip.slip_std)
+    known &= ((estimate.slip.time_s >= between_s[0]) & (estimate.slip.time_s <= between_s[1]))[:, None]
     inside = error[known] <= _STDS * estimate.slip.slip_std[known]
     return float(inside.mean()) if inside.size else math.nan

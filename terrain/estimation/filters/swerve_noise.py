@@ -242,6 +242,22 @@ def _schedule(  # noqa: PLR0913 - a kernel takes its arrays one by one
     walk[turn] = turn_walk_of(known, changes, square_arms_m2)
 
 
+def _process_variance(states: tuple[str, ...], robot: Robot) -> Array:
+    """Return the variances a second (d, d) by which states walk.
+
+    An acceleration that walks by q a second moves the speed within a tick T, too: beside ``q T`` of its own
+    it leaves ``q T^2 / 2`` in common with the speed, and ``q T^3 / 3`` there.  Without these the speed would
+    follow a start half a tick late.
+    """
+    found = np.diag([_WALK_STD[kind_of(state)] ** 2 for state in states])
+    tick_s = 1.0 / robot.sensors.wheels_rate_hz if robot.describes("sensors") else 0.0
+    for axis in "xy":
+        speed, accel = states.index(f"speed_{axis}_mps"), states.index(f"accel_{axis}_mps2")
+        found[speed, accel] = found[accel, speed] = found[accel, accel] * tick_s / 2.0
+        found[speed, speed] += found[accel, accel] * tick_s**2 / 3.0
+    return found
+
+
 def default_noise(name: str, robot: Robot, with_gnss: bool = False) -> Noise:
     """Return physical noise for a filter: how fast a robot changes and what its sensors scatter by.
 
@@ -265,7 +281,7 @@ def default_noise(name: str, robot: Robot, with_gnss: bool = False) -> Noise:
     for kind, std in _described_std(robot).items():
         sample_std[kind] = max(sample_std[kind], std)
     return Noise(
-        np.array([_WALK_STD[kind_of(state)] ** 2 for state in layout.states]),
+        _process_variance(layout.states, robot),
         np.array([sample_std[kind_of(row)] ** 2 for row in rows_of(name, with_gnss)]),
         initial_std(name, with_gnss) ** 2,
     )
