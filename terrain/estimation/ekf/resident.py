@@ -65,7 +65,7 @@ class ResidentFilter:
         self._columns = Columns(
             np.empty((1, d)),
             np.empty((1, d, d)),
-            np.empty((1, k)),
+            np.full((1, k), np.nan),
             np.zeros((1, k), np.int8),
             np.zeros((1, k), np.int8),
             np.empty(1),
@@ -110,6 +110,13 @@ class ResidentFilter:
     def reference_age_s(self) -> float:
         """Time since the speed over ground was last measured; infinite before the first."""
         return float(self._memory.clock[AGE])
+
+    @property
+    def nis(self) -> dict[str, float]:
+        """NIS of each sensor at the last step, a row; NaN where it measured nothing or is not a number."""
+        squares, rows = self._columns.nis[0].tolist(), self._columns.nis_dof[0].tolist()
+        found = zip(self._sensors, squares, rows, strict=True)
+        return {name: square / n if n else math.nan for name, square, n in found}
 
     @property
     def dropped(self) -> Mapping[str, int]:

@@ -47,7 +47,9 @@ class LiveEstimate(NamedTuple):
     health: Array
 
 
-def predicted(seen: LiveEstimate, model: FilterModel, motion: list[int], now_s: float) -> LiveEstimate:
+def predicted(
+    seen: LiveEstimate, model: FilterModel, motion: list[int], now_s: float, longest_s: float
+) -> LiveEstimate:
     """Return an estimate whose means are those of a later time.
 
     Parameters
@@ -55,8 +57,10 @@ def predicted(seen: LiveEstimate, model: FilterModel, motion: list[int], now_s: 
     seen : estimate
     model : of its filter
     motion : places of speeds, yaw rate and accelerations among the states
-    now_s : time, at or after that of the estimate
+    now_s : time; one that is not later, or by more than ``longest_s``, changes nothing
     """
+    if not 1e-3 < now_s - seen.time_s < longest_s:
+        return seen
     d = len(model.states)
     mean, params = np.empty(d), np.append(model.params, np.zeros(len(model.inputs)))
     model.propagate(seen.mean, now_s - seen.time_s, params, mean, np.zeros((d, d)))

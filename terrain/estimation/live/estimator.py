@@ -47,6 +47,7 @@ from terrain.estimation.live.rows import (
     check_numbers,
     counts_by_kind,
     described_limits,
+    places_among,
     push,
     rows_at,
 )
@@ -150,14 +151,14 @@ class LiveEstimator:
             read.remove("odometry")
         self._n_columns = {name: len(channels[name]) for name in ("wheels", *read)}
         self._motor_columns = np.array([known.index(channel) for channel in WHEELS_CHANNELS[:3]])
-        self._current_columns = np.array([_place(known, channel) for channel in WHEELS_CHANNELS[3:]])
+        self._current_columns = places_among(WHEELS_CHANNELS[3:], known)
         self._lacks_currents = bool((self._current_columns < 0).any())
         self._n_queued, self._last_s = np.zeros(len(STREAMS), np.int64), np.full(len(STREAMS), -np.inf)
         self._counts = np.zeros((len(STREAMS), len(KINDS)), np.int64)
         self._wheel_counts = np.zeros(len(WHEEL_KINDS), np.int64)
         self._queues = tuple(np.zeros((QUEUE, 2 + len(names))) for names in STREAMS.values())
         self._streams = [
-            (name, stream, np.array([_place(list(channels[name]), channel) for channel in names]), queue)
+            (name, stream, places_among(names, list(channels[name])), queue)
             for (stream, (name, names)), queue in zip(enumerate(STREAMS.items()), self._queues, strict=True)
             if name in read
         ]
@@ -242,14 +243,17 @@ class LiveEstimator:
     def at(self, now_s: float) -> LiveEstimate | None:
         """Return the last estimate, its means predicted to a later time; None before the first tick."""
         seen = self._latest
-        if seen is None or not 1e-3 < now_s - seen.time_s < SETTINGS.max_gap_s:
-            return seen
-        return predicted(seen, self._model, self._motion, now_s)
+        return None if seen is None else predicted(seen, self._model, self._motion, now_s, SETTINGS.max_gap_s)
 
     @property
     def health(self) -> dict[str, str]:
         """Health of each sensor at the last tick, by name."""
         return self._monitor.names
+
+    @property
+    def nis(self) -> dict[str, float]:
+        """NIS of each sensor of the filter at the last tick, a row; NaN where it measured nothing."""
+        return self._filter.nis
 
     def step(self, readings: Mapping[str, Reading], now_s: float | None = None) -> list[LiveEstimate]:
         """Take in what arrived, and return an estimate for each sample of the wheels that was taken.
@@ -394,7 +398,3 @@ class LiveEstimator:
             wheel_speed_mps,
             self._monitor.health.copy(),
         )
-
-
-def _place(names: list[str], name: str) -> int:
-    return names.index(name) if name in names else -1

@@ -7,6 +7,7 @@ ahead; from a sample to the rows the steps are the very same ones (``measurement
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numba import boolean, float64, int64, njit, types, void
@@ -259,3 +260,8 @@ def check_numbers(initial_yaw_rad: float, gnss_latency_s: float) -> None:
             raise ConfigError(f"{name} is {value}, a finite number is required")
     if gnss_latency_s < 0:
         raise ConfigError(f"gnss_latency_s is {gnss_latency_s:g}, a time from zero up is required")
+
+
+def places_among(names: Sequence[str], among: Sequence[str]) -> Array:
+    """Return the place of each name among others, -1 where it is not there."""
+    return np.array([among.index(name) if name in among else -1 for name in names])

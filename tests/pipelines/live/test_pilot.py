@@ -402,3 +402,16 @@ def test_the_expected_deceleration_is_larger_uphill_in_any_direction(direction, 
     found = live._target(0.02)
     assert found.braking_mps2 - level == pytest.approx(uphill * 9.81 * math.sin(0.1), rel=0.01)
     assert live._target(0.02).braking_ratio == live._braking["snow"].slip_ratio
+
+
+def test_nis_is_read_by_sensor_and_nan_where_nothing_was_measured():
+    driver = pilot()
+    assert np.isnan(list(driver.nis.values())).all()
+    for sample in recorded():
+        driver.step(sample)
+        if 7.0 < sample.time_s < 8.0:
+            break
+    assert {"gyro", "camera_speed", "wheel_1", "rest"} <= set(driver.nis)
+    assert driver.nis["gyro"] >= 0.0
+    assert np.isnan(driver.nis["rest"])  # it moves
+    assert pilot("plain").nis == {}
