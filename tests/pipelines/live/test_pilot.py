@@ -405,13 +405,13 @@ def test_the_expected_deceleration_is_larger_uphill_in_any_direction(direction, 
 
 
 def test_nis_is_read_by_sensor_and_nan_where_nothing_was_measured():
-    driver = pilot()
-    assert np.isnan(list(driver.nis.values())).all()
+    live = pilot()
+    assert np.isnan(list(live.nis.values())).all()
     for sample in recorded():
-        driver.step(sample)
+        live.step(sample)
         if 7.0 < sample.time_s < 8.0:
             break
-    assert {"gyro", "camera_speed", "wheel_1", "rest"} <= set(driver.nis)
-    assert driver.nis["gyro"] >= 0.0
-    assert np.isnan(driver.nis["rest"])  # it moves
+    assert {"gyro", "camera_speed", "wheel_1", "rest"} <= set(live.nis)
+    assert live.nis["gyro"] >= 0.0
+    assert np.isnan(live.nis["rest"])  # it moves
     assert pilot("plain").nis == {}
