@@ -103,5 +103,12 @@ def _short(names: Iterable[str]) -> str:
 
 
 def _blamed(rows: Sequence[FaultRow]) -> str:
-    named = {f"{sensor}: {status}" for row in rows for sensor, status in (row.blamed or {}).items()}
-    return "; ".join(sorted(named))
+    """Return the sensors that were named in any row, those with the same statuses together."""
+    named: dict[str, set[str]] = {}
+    for row in rows:
+        for sensor, statuses in (row.blamed or {}).items():
+            named.setdefault(sensor, set()).update(statuses.split(", "))
+    together: dict[str, list[str]] = {}
+    for sensor in sorted(named):
+        together.setdefault(", ".join(sorted(named[sensor])), []).append(sensor)
+    return "; ".join(f"{', '.join(sensors)}: {statuses}" for statuses, sensors in together.items())
