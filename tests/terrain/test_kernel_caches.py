@@ -66,6 +66,7 @@ def answer(package, guarded=True):
     return float(done.stdout)
 
 
+@pytest.mark.slow
 def test_a_change_of_what_a_kernel_takes_from_another_file_changes_its_answer(package):
     assert answer(package) == 2.0
     write_callee(package, 3.0)

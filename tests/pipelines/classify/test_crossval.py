@@ -67,6 +67,7 @@ def test_one_seed_gives_one_report_and_another_seed_another(report, runs, settin
     assert other.per_run != report.per_run
 
 
+@pytest.mark.slow
 def test_where_labels_only_identify_runs_grouped_gives_chance_and_published_does_not(drive, settings):
     def mislabelled(seed):
         """Eight runs, each with a vibration of its own; their labels do not depend on it."""

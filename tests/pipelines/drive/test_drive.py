@@ -49,6 +49,7 @@ def test_the_result_does_not_depend_on_the_number_of_processes():
     assert json.dumps(as_json(one), allow_nan=False) == json.dumps(as_json(two), allow_nan=False)
 
 
+@pytest.mark.slow
 def test_every_controller_has_every_metric():
     result = drive(ALL, INPUTS)
     assert tuple(result.controllers) == ALL.controllers
@@ -148,6 +149,7 @@ def scripted(monkeypatch, probability, names=("plain", "thesis", "thesis:classif
     return drive(settings, DriveInputs(ROBOT, TABLE, model))
 
 
+@pytest.mark.slow
 def test_the_thesis_takes_the_targets_of_the_classified_terrain(monkeypatch):
     result = scripted(monkeypatch, 0.9)
     base, classified = (result.controllers[name] for name in ("thesis", "thesis:classified"))

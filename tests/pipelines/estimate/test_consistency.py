@@ -31,6 +31,7 @@ def test_every_group_of_every_terrain_has_a_mean_and_an_interval(rows):
         assert 0.3 < row.slip_coverage.mean <= 1.0
 
 
+@pytest.mark.slow
 def test_the_seed_alone_decides(rows):
     again = consistency_by_terrain(ROBOT, 41, 1, n_jobs=2, terrains=("tiles", "tilled_loam"))
     assert json.dumps(as_json(again)) == json.dumps(as_json(rows))

@@ -188,6 +188,7 @@ def test_an_unfit_run_is_excluded_and_the_rest_is_diagnosed(worlds):
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.slow
 def test_the_same_runs_give_the_same_answer(worlds):
     world = worlds["husky"]
     runs = world.runs(world.hidden("camera_yaw"))
