@@ -123,7 +123,7 @@ def test_filterpy(benchmark, vio12):
         assert filterpy_us >= LEAST_RATIO * MEASURED["run_filter"]
 
 
-@pytest.mark.benchmark(group=f"{N_STEPS} steps of 15 states by 14 measurements", timer=time.process_time)
+@pytest.mark.benchmark(group=f"{N_STEPS} steps of 18 states by 17 measurements", timer=time.process_time)
 def test_vio15_at_once(benchmark):
     model, noise, time_s, z = log_of("vio15")
     benchmark(run_filter, model, noise, time_s, z)
