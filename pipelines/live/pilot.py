@@ -11,7 +11,9 @@ same object.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+from operator import itemgetter
 
 import numpy as np
 
@@ -37,6 +39,7 @@ from terrain.control.slick import braking_by_slip
 from terrain.control.slip_table import SlipTable, load_slip_table
 from terrain.control.switching import (
     NO_BELIEF,
+    UNKNOWN,
     OutputStatus,
     TerrainBelief,
     approach,
@@ -63,7 +66,7 @@ from terrain.estimation.live.health import SENSORS, SLIP_SENSORS, SOUND, Health
 from terrain.extension import correct_live
 from terrain.kinematics.swerve import FAR_RAD, wheel_command_step
 from terrain.logs.schema import IMU_CHANNELS, WHEELS_CHANNELS
-from terrain.records import Array, Command, Reading, Sample
+from terrain.records import Array, Command, Reading, Sample, SlipTarget
 from terrain.robots import Robot
 from terrain.slip import MIN_SPEED_MPS
 
@@ -73,9 +76,12 @@ gives the working pull; up to this much is added to the measured balance.  A lar
 table that aims for a peak."""
 
 _ROLL, _PITCH = IMU_CHANNELS.index("roll_rad"), IMU_CHANNELS.index("pitch_rad")
-_OF_SLIP = np.array([SENSORS.index(name) for name in SLIP_SENSORS])
+_OF_SLIP = tuple(SENSORS.index(name) for name in SLIP_SENSORS)
+_of_slip = itemgetter(*_OF_SLIP)
 # Order in which sensors are named, by health: one that steps or freezes takes others with it, which are lost.
-_BLAMED = np.array([0, 1, 2, 3, 4, 6, 7, 5])
+_BLAMED = (0, 1, 2, 3, 4, 6, 7, 5)
+# as plain numbers, which compare in a tenth of the time
+_SOUND, _DISAGREES, _LOST = int(SOUND), int(Health.DISAGREES), int(Health.LOST)
 _GYRO, _SEEN, _SEEN_YAW = (SENSORS.index(name) for name in ("gyro", "camera_speed", "camera_yaw"))
 _wheel_command_step = entry_point(wheel_command_step)
 _NOT_ESTIMATED = UNOBSERVED._replace(stale_s=math.nan)
@@ -136,6 +142,7 @@ class LivePilot:
         self._table, self._settings, self._radius_m = table, settings, driven.wheel_radius_m
         self._source = NoTerrain() if source is None else source
         self._terrains = {terrain: index for index, terrain in enumerate(table.targets)}
+        self._targets = {terrain: table.lookup(terrain) for terrain in (UNKNOWN, *table.targets)}
         self._braking = {name: braking_by_slip(curve) for name, curve in table.curves.items()}
         self._positions_m = np.array(driven.wheel_positions_m)
         self._limits = (
@@ -148,15 +155,15 @@ class LivePilot:
         if settings.controller not in OPEN_LOOP:
             self._estimator = LiveEstimator(driven, correction=correction)
             states = self._estimator.states
-            self._observer = WheelObserver(driven, [states.index(f"steer_{i}_rad") for i in driven.wheels])
+            self._steer_states = np.array([states.index(f"steer_{i}_rad") for i in driven.wheels])
+            self._observer = WheelObserver(driven, self._steer_states)
             if settings.track:
                 self._tracking = check_tracking(driven, settings.tracking, settings.delay_s)
             pose = ("position_x_m", "position_y_m", "yaw_rad")
             self._pose_states = [states.index(state) for state in pose]
-            self._steer_states = [states.index(f"steer_{i}_rad") for i in driven.wheels]
         self._clocks = Clocks()
         self._actuation = Actuation(driven.wheel_radius_m / driven.equipment.motors.reduction_ratio)
-        self._health = np.zeros(len(SENSORS), dtype=np.int8)
+        self._health, self._off = [0] * len(SENSORS), [False] * len(self._actuation.off)
         steer = np.zeros(3) if steer_rad is None else np.array(steer_rad, dtype=np.float64)
         self._now = _Memory(steer, initial_tracking())
 
@@ -173,10 +180,7 @@ class LivePilot:
     @property
     def health(self) -> dict[str, str]:
         """Health of each sensor at the last step, by name, as those of ``Health`` in small letters."""
-        return {
-            name: Health(status).name.lower()
-            for name, status in zip(SENSORS, self._health.tolist(), strict=True)
-        }
+        return {name: Health(status).name.lower() for name, status in zip(SENSORS, self._health, strict=True)}
 
     @property
     def nis(self) -> dict[str, float]:
@@ -211,27 +215,28 @@ class LivePilot:
         )
         dt_s = PERIOD_S if math.isnan(before_s) else time_s - before_s
         now.time_s = time_s
+        step_s = step_or_period(dt_s)
         terrain = getattr(sample, "terrain", "")
         desired = _finite_twist(getattr(sample, "twist", None))
         if self._estimator is not None:
-            self._compare(time_s, dt_s, readings)
+            self._compare(time_s, step_s, readings)
         self._estimate(Sample(time_s, desired, readings, terrain if isinstance(terrain, str) else ""))
         sensor, health = self._judge()
-        target = self._target(step_or_period(dt_s))
+        target = self._target(step_s)
         twist, tracked = self._track(desired, time_s, dt_s)
         admitted, wheel_radps, now.steer_rad = _wheel_command_step(
-            self._positions_m, *self._limits, step_or_period(dt_s), FAR_RAD, twist, now.steer_rad
+            self._positions_m, *self._limits, step_s, FAR_RAD, twist, now.steer_rad
         )
         desired_mps = max(map(abs, wheel_radps.tolist())) * self._radius_m
         if not self._source.certain:
-            now.belief = drive_on(now.belief, desired_mps, step_or_period(dt_s), self._settings.switching)
+            now.belief = drive_on(now.belief, desired_mps, step_s, self._settings.switching)
         observed = _NOT_ESTIMATED if self._estimator is None else self._observer.observe(now.estimate, time_s)
-        sound = health <= SOUND
+        sound = health <= _SOUND
         request = WheelRequest(
             wheel_radps,
             desired_mps,
             target,
-            self._table.lookup(now.belief.terrain),
+            self._targets_on(now.belief.terrain),
             observed if sound else UNOBSERVED,
             dt_s,
         )
@@ -291,19 +296,17 @@ class LivePilot:
         if now.belief.terrain != before:
             self._controller.forget_terrain()
 
-    def _compare(self, time_s: float, dt_s: float, readings: dict[str, Reading]) -> None:
+    def _compare(self, time_s: float, step_s: float, readings: dict[str, Reading]) -> None:
         """Compare wheels and steering with their commands; take away rates that are not to be believed."""
         wheels, seen = readings.get("wheels"), self._now.estimate
-        if wheels is not None and (
-            wheels.values.shape[1:] != (len(WHEELS_CHANNELS),) or not len(wheels.values)
-        ):
+        if wheels is not None and (not len(wheels.values) or wheels.values.shape[1] != len(WHEELS_CHANNELS)):
             wheels = None
         steer_rad = None if seen is None else seen.mean[self._steer_states]
-        self._actuation.measured(time_s, step_or_period(dt_s), wheels, steer_rad)
-        off = self._actuation.off[:3]
-        if wheels is not None and True in off.tolist():
+        self._actuation.measured(time_s, step_s, wheels, steer_rad)
+        self._off = off = self._actuation.off.tolist()
+        if wheels is not None and True in off[:3]:
             values = wheels.values.copy()
-            values[:, np.flatnonzero(off)] = math.nan
+            values[:, np.flatnonzero(off[:3])] = math.nan
             readings["wheels"] = Reading(wheels.time_s, values)
 
     def _judge(self) -> tuple[int, int]:
@@ -312,24 +315,23 @@ class LivePilot:
         if self._estimator is None:
             return -1, Health.FRESH
         if seen is None:
-            self._health[:] = Health.LOST
-            return 0, Health.LOST
-        self._health[:] = seen.health
-        off, moved = (
-            self._actuation.off,
-            self._health[:6],
-        )  # what is off was taken from the filter, and lost there
-        moved[off & ((moved == Health.LOST) | (moved < Health.DISAGREES))] = Health.DISAGREES
-        of_slip = self._health[_OF_SLIP]
-        if not of_slip.max() > SOUND:
-            return -1, int(of_slip.max())
-        worst = int(_BLAMED[of_slip].argmax())
-        return int(_OF_SLIP[worst]), int(of_slip[worst])
+            self._health = [_LOST] * len(SENSORS)
+            return 0, _LOST
+        self._health = health = seen.health.tolist()
+        if True in self._off:
+            for i, off in enumerate(self._off):
+                if off and (health[i] == _LOST or health[i] < _DISAGREES):  # it was taken from the filter
+                    health[i] = _DISAGREES
+        worst = max(_of_slip(health))
+        if worst <= _SOUND:
+            return -1, worst
+        blamed = max(_OF_SLIP, key=lambda i: _BLAMED[health[i]])
+        return blamed, health[blamed]
 
     def _target(self, dt_s: float) -> TractionTarget:
         """Return the slips to aim for; the target moves to that of the terrain at a bounded rate."""
         now = self._now
-        entry = self._table.lookup(now.belief.terrain)
+        entry = self._targets_on(now.belief.terrain)
         now.target_ratio = approach(
             now.target_ratio, entry["traction"].slip_ratio, self._settings.switching.rate_ratio, dt_s
         )
@@ -339,6 +341,10 @@ class LivePilot:
             return TractionTarget(now.target_ratio, margin_ratio=margin)
         mps2 = max(braking.mps2 + _uphill_mps2(now.estimate, *now.tilt_rad), 0.0)
         return TractionTarget(now.target_ratio, braking.slip_ratio, mps2, margin)
+
+    def _targets_on(self, terrain: str) -> Mapping[str, SlipTarget]:
+        """Return the table's targets for a terrain, or for an unknown one."""
+        return self._targets.get(terrain) or self._targets[UNKNOWN]
 
     def _track(self, twist: Array, time_s: float, dt_s: float) -> tuple[Array, TrackReport]:
         """Return the twist that keeps the path, and how far the robot is from it."""
@@ -358,11 +364,11 @@ class LivePilot:
         return twist, report
 
 
-def _pose_is_sound(health: Array) -> bool:
+def _pose_is_sound(health: list[int]) -> bool:
     """Say whether a pose can be built on: with a lost camera it is until it is stale."""
     turns, seen_yaw, seen = health[_GYRO], health[_SEEN_YAW], health[_SEEN]
-    heading = turns <= SOUND or seen_yaw <= SOUND
-    return bool(heading and (seen <= SOUND or seen == Health.LOST))
+    heading = turns <= _SOUND or seen_yaw <= _SOUND
+    return heading and (seen <= _SOUND or seen == _LOST)
 
 
 def _finite_twist(given: object) -> Array:
@@ -375,7 +381,7 @@ def _finite_twist(given: object) -> Array:
 
 def _largest(values: list[float]) -> float:
     """Return the largest of some values; NaN where one is."""
-    return math.nan if any(map(math.isnan, values)) else max(values)
+    return math.nan if math.isnan(sum(values)) else max(values)
 
 
 def _largest_slip(slip_ratio: Array, wheel_radps: Array) -> float:

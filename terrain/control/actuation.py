@@ -12,8 +12,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
+from numba import boolean, float64, int64, njit, types, void
 
+from terrain.entry_point import entry_point
 from terrain.records import Array, Reading
 
 N_KEPT = 32
@@ -30,6 +31,10 @@ SLOW_S, APPROACH = 0.2, 0.02
 
 SPEED_MPS, SPEED_RATIO, STEER_RAD = 0.05, 0.06, 0.06
 """Tolerances: of a wheel's speed, a constant and a part of the command, and of a steering angle."""
+
+
+_V, _M = float64[::1], float64[:, ::1]
+_IN = types.Array(float64, 1, "A", readonly=True)
 
 
 def actuation_memory() -> tuple[Array, Array]:
@@ -64,13 +69,19 @@ def _low_passed(i: int, value: float, step_s: float, lasting: Array) -> tuple[fl
     return lasting[_SMOOTH, i], lasting[_SLOW, i]
 
 
-@njit(cache=True, error_model="numpy")
-def follow(
+@njit(
+    void(float64, float64, int64, _V, _IN, float64, _IN, _M, _M, boolean[::1]),
+    cache=True,
+    error_model="numpy",
+)
+def follow(  # noqa: PLR0913 - a kernel takes its arrays one by one
     now_s: float,
     step_s: float,
     slot: int,
     command: Array,
-    measured: Array,
+    rates: Array,
+    mps_per_radps: float,
+    steer_rad: Array,
     kept: Array,
     lasting: Array,
     off: Array,
@@ -82,7 +93,8 @@ def follow(
     now_s, step_s : time, and since the step before
     slot : place in ``kept`` of this step: the number of the step modulo :data:`N_KEPT`
     command : (6,) speeds in m/s and angles in rad that were in force until now; NaN for none
-    measured : (6,) of these now, NaN where unknown
+    rates, mps_per_radps : of the motors, first of (c,), NaN where unknown, and the speed of a wheel by them
+    steer_rad : (3,) measured, NaN where unknown
     kept, lasting : as :func:`actuation_memory` returns them; changed
     off : (6,) is written
     """
@@ -90,7 +102,8 @@ def follow(
     kept[slot, 1:] = command
     for i in range(6):
         low, high = math.inf, -math.inf
-        middle = _middle(i, measured[i], step_s, lasting)
+        measured = rates[i] * mps_per_radps if i < 3 else steer_rad[i - 3]
+        middle = _middle(i, measured, step_s, lasting)
         window_s = STILL_S if i < 3 and lasting[_STILL, i] >= STILL_S else WINDOW_S
         for k in range(N_KEPT):
             if kept[k, 0] >= now_s - window_s and not math.isnan(kept[k, 1 + i]):
@@ -114,6 +127,10 @@ def follow(
             off[i] = False
 
 
+_follow = entry_point(follow)
+_UNKNOWN = np.full(3, math.nan)
+
+
 class Actuation:
     """Wheels and steering of a robot against their commands, step by step.
 
@@ -128,7 +145,7 @@ class Actuation:
 
     def __init__(self, mps_per_radps: float) -> None:
         self._mps_per_radps = mps_per_radps
-        self._command, self._measured = np.full(6, math.nan), np.full(6, math.nan)
+        self._command = np.full(6, math.nan)
         self._kept, self._lasting = actuation_memory()
         self._slot = 0
         self.off = np.zeros(6, dtype=np.bool_)
@@ -139,10 +156,10 @@ class Actuation:
 
     def measured(self, now_s: float, step_s: float, wheels: Reading | None, steer_rad: Array | None) -> None:
         """Compare the rates, first columns of the wheels, and steering angles (3,) with the commands."""
-        self._measured[:] = math.nan
-        if wheels is not None:
-            self._measured[:3] = wheels.values[-1, :3] * self._mps_per_radps
-        if steer_rad is not None:
-            self._measured[3:] = steer_rad
         self._slot = (self._slot + 1) % N_KEPT
-        follow(now_s, step_s, self._slot, self._command, self._measured, self._kept, self._lasting, self.off)
+        rates = _UNKNOWN if wheels is None else wheels.values[-1]
+        steer_rad = _UNKNOWN if steer_rad is None else steer_rad
+        _follow(
+            *(now_s, step_s, self._slot, self._command, rates, self._mps_per_radps, steer_rad),
+            *(self._kept, self._lasting, self.off),
+        )

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numba import njit
+from numba import boolean, float64, int64, njit, void
 
 from terrain.control.danzi_pid import new_state, thesis_settings, thesis_step
 from terrain.control.pid import Gains
@@ -125,16 +125,16 @@ class WheelObserver:
     Parameters
     ----------
     robot : swerve robot with motors
-    steer_states : places of the steering angles among the estimate's states
+    steer_states : (wheels,) places of the steering angles among the estimate's states
     """
 
-    def __init__(self, robot: Robot, steer_states: list[int]) -> None:
+    def __init__(self, robot: Robot, steer_states: Array) -> None:
         motors = robot.equipment.motors
         self._torque_per_amp_nm = (
             motors.torque_constant_nmpa * motors.reduction_ratio * motors.efficiency_ratio
         )
         self._x_m, self._y_m = np.array(robot.wheel_positions_m).T.copy()
-        self._radius_m, self._steer_states = robot.wheel_radius_m, np.array(steer_states)
+        self._radius_m, self._steer_states = robot.wheel_radius_m, steer_states
 
     def observe(self, estimate: LiveEstimate | None, time_s: float) -> Observation:
         """Return the motion at the wheels; NaN before the first estimate."""
@@ -142,7 +142,7 @@ class WheelObserver:
             return UNOBSERVED
         stale_s = estimate_age(estimate, time_s)
         found, wheel_radps = np.empty((5, 3)), np.empty(3)
-        _observe_wheels(
+        _observe(
             estimate.mean,
             self._steer_states,
             estimate.speed_x_mps,
@@ -166,7 +166,17 @@ class WheelObserver:
         return Observation(WheelMeasurements(*found), wheel_radps, chassis_mps, stale_s)
 
 
-@njit(cache=True, error_model="numpy")
+_V, _M = float64[::1], float64[:, ::1]
+
+
+@njit(
+    void(
+        *(_V, int64[::1], float64, float64, float64, float64, float64, _V, _V, _V, _V, _V, _V),
+        *(float64, float64, boolean, _M, _V),
+    ),
+    cache=True,
+    error_model="numpy",
+)
 def _observe_wheels(  # noqa: PLR0913 - a kernel takes its arrays one by one
     mean: Array,
     steer_states: Array,
@@ -204,6 +214,8 @@ def _observe_wheels(  # noqa: PLR0913 - a kernel takes its arrays one by one
         found[4, i] = current_a[i] * torque_per_amp_nm
         wheel_radps[i] = wheel_speed_mps[i] / radius_m
 
+
+_observe = entry_point(_observe_wheels)
 
 UNOBSERVED = Observation(
     WheelMeasurements(*np.full((5, 3), math.nan)), np.full(3, math.nan), math.nan, math.inf

@@ -22,8 +22,8 @@ from terrain.simulation.run import simulate_run
 N_STEPS = 2000
 MOST_US = {"traction": 30.0, "thesis": 60.0}
 """Of a step called from the interpreter, which is most of it: a thousandth of a period of 20 ms."""
-MOST_PILOT_US = 400.0
-"""Of a whole step of the chain: a fiftieth of its period."""
+MOST_PILOT_US = 200.0
+"""Of a whole step of the chain: a hundredth of its period."""
 ROBOT = load_robot("agrimaro")
 GAINS = Gains(0.5, 0.5, 0.0, 2.0)
 DT_S = 0.02

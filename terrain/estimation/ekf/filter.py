@@ -235,5 +235,7 @@ def _feed(
         values,
         *memory,
         *columns,
+        model.propagate,
+        model.observe,
     )
     return columns

@@ -80,21 +80,31 @@ def _read_stamp(time_s: float, clock: Array, max_gap_s: float, counts: Array) ->
     return kind, dt
 
 
+@njit(int64(float64, _VECTOR, float64), cache=True, error_model="numpy")
+def follows(time_s: float, clock: Array, max_gap_s: float) -> int:
+    """Return what a stamp would be: 1 taken, -1 taken as that of a clock set back, 0 not taken."""
+    if not math.isfinite(time_s):
+        return 0
+    step_s = time_s - clock[TIME]
+    if abs(step_s) > max_gap_s:
+        since_leap_s = time_s - clock[PENDING]
+        believed = since_leap_s > 0.0 and since_leap_s <= max_gap_s
+        return (1 if step_s > 0.0 else -1) if believed else 0
+    return 0 if step_s <= 0.0 else 1
+
+
 @njit(
     void(
-        types.FunctionType(PROPAGATE),
-        types.FunctionType(OBSERVE),
         *(_VECTOR, _COUNTS, _COUNTS, _FLAGS, _FLAGS, _FLAGS, _FLAGS, _FLAGS, _VECTOR),
         *(_MATRIX, _MATRIX, _VECTOR, _MATRIX, _MATRIX, _MATRIX, float64, float64, _VECTOR, _MATRIX),
         *(_VECTOR, _MATRIX, _VECTOR, _VECTOR, _COUNTS),
         *(_MATRIX, float64[:, :, ::1], _MATRIX, _SMALL, _SMALL, _VECTOR, _FLAGS),
+        *(types.FunctionType(PROPAGATE), types.FunctionType(OBSERVE)),
     ),
     cache=True,
     error_model="numpy",
 )
 def run(  # noqa: C901, PLR0913 - one loop: cut into functions a step takes 6.7 us in place of 3.7
-    propagate: Any,
-    observe: Any,
     params: Array,
     order: Array,
     starts: Array,
@@ -126,6 +136,8 @@ def run(  # noqa: C901, PLR0913 - one loop: cut into functions a step takes 6.7 
     use_out: Array,
     age_out: Array,
     taken: Array,
+    propagate: Any,
+    observe: Any,
 ) -> None:
     """Filter rows one by one: move x, P, the clock and the counts, fill the columns, mark the rows taken."""
     d, m, n_sensors = x.size, order.size, starts.size - 1

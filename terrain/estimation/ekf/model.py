@@ -127,7 +127,7 @@ class FilterModel:
 
     @cached_property
     def _constants(self) -> tuple[Any, ...]:
-        """What the kernel needs of the model, in its order."""
+        """What the kernel needs of the model beside its functions, in its order."""
         order = [self.rows.index(row) for _, rows in self.sensors for row in rows]
         starts = np.cumsum([0, *(len(rows) for _, rows in self.sensors)])
         marks = (
@@ -138,8 +138,6 @@ class FilterModel:
             (self.states, self.positions),
         )
         return (
-            self.propagate,
-            self.observe,
             np.append(self.params, np.zeros(len(self.inputs))),
             np.array(order, dtype=np.int64),
             starts.astype(np.int64),

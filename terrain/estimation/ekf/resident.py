@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
-from functools import partial
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
+from numba import njit
 from numba.core.types.function_type import CompileResultWAP
 
+from terrain.entry_point import entry_point
 from terrain.errors import DataError
-from terrain.estimation.ekf.kernel import AGE, OBSERVE, PENDING, PROPAGATE, TIME, run
+from terrain.estimation.ekf.kernel import AGE, OBSERVE, PROPAGATE, follows, run
 from terrain.estimation.ekf.model import (
     DEFAULT_SETTINGS,
     NOTHING_GIVEN,
@@ -33,6 +34,93 @@ from terrain.estimation.ekf.state import (
 )
 from terrain.records import Array
 
+_follows, _run = entry_point(follows), entry_point(run)
+
+
+class FilterArrays(NamedTuple):
+    """What the kernel is given beside the model's functions, in its order; one row of each column.
+
+    Parameters
+    ----------
+    params to position : of the model
+    x0 to max_gap_s : first state, noise, gates, and what is known of a sample
+    stamps, values : of the sample
+    x to counts : the memory
+    mean to taken : what is written of the sample
+    """
+
+    params: Array
+    order: Array
+    starts: Array
+    is_reference: Array
+    is_held: Array
+    is_angle_row: Array
+    is_angle_state: Array
+    is_position: Array
+    x0: Array
+    p0: Array
+    q: Array
+    thresholds: Array
+    variances: Array
+    walks: Array
+    inputs: Array
+    reopen_after_s: float
+    max_gap_s: float
+    stamps: Array
+    values: Array
+    x: Array
+    p: Array
+    clock: Array
+    rejected_s: Array
+    counts: Array
+    mean: Array
+    cov: Array
+    nis: Array
+    nis_dof: Array
+    use: Array
+    reference_age_s: Array
+    taken: Array
+
+
+@njit(cache=True, error_model="numpy")
+def run_resident(arrays: FilterArrays, propagate: Any, observe: Any) -> None:
+    """Filter one sample; arguments one by one and functions last, as numba warns of tuples of functions."""
+    run(
+        arrays.params,
+        arrays.order,
+        arrays.starts,
+        arrays.is_reference,
+        arrays.is_held,
+        arrays.is_angle_row,
+        arrays.is_angle_state,
+        arrays.is_position,
+        arrays.x0,
+        arrays.p0,
+        arrays.q,
+        arrays.thresholds,
+        arrays.variances,
+        arrays.walks,
+        arrays.inputs,
+        arrays.reopen_after_s,
+        arrays.max_gap_s,
+        arrays.stamps,
+        arrays.values,
+        arrays.x,
+        arrays.p,
+        arrays.clock,
+        arrays.rejected_s,
+        arrays.counts,
+        arrays.mean,
+        arrays.cov,
+        arrays.nis,
+        arrays.nis_dof,
+        arrays.use,
+        arrays.reference_age_s,
+        arrays.taken,
+        propagate,
+        observe,
+    )
+
 
 class ResidentFilter:
     """A filter that keeps its memory, for loops that cannot wait: the numbers of :func:`filter_step`.
@@ -48,8 +136,9 @@ class ResidentFilter:
 
     Notes
     -----
-    ``mean`` and ``cov`` are the memory itself, which the next step writes over; ``buffers`` are all of it,
-    for callers that go back to an earlier step.  Most of what :func:`filter_step` takes goes into copies and
+    ``functions`` and ``arrays`` are what the kernel is given; ``mean`` and ``cov`` are the memory itself,
+    which the next step writes over; ``buffers`` are all of it, for callers that go back to an earlier step.
+    Most of what :func:`filter_step` takes goes into copies and
     into finding the model's compiled functions anew.
     """
 
@@ -75,13 +164,14 @@ class ResidentFilter:
         self._noise_variance, self._variance = noise.measurement_variance, np.empty((1, m))
         self._walk, self._inputs = np.zeros((1, d)), np.zeros((1, len(model.inputs)))
         self._stamp, self._z = np.empty(1), np.empty((1, m))
-        self._run = _bound_run(model)
-        self._arguments = (
-            *model._constants[2:],
+        self.functions = _addresses(model)
+        given = (
+            *model._constants,
             *(p0, q, gate_thresholds(model, settings), self._variance, self._walk, self._inputs),
             *(settings.reopen_after_s - SLACK_S, self._max_gap_s),
             *(self._stamp, self._z, *self._memory, *self._columns),
         )
+        self.arrays = FilterArrays._make(given)
         self.mean, self.cov, self.use = self._memory.x, self._memory.p, self._columns.use[0]
 
     def step(self, time_s: float, z: Array, given: Given = NOTHING_GIVEN) -> bool:
@@ -92,19 +182,12 @@ class ResidentFilter:
         self._variance[0] = self._noise_variance if r is None else r
         self._walk[0] = 0.0 if walk is None else walk
         self._inputs[0] = 0.0 if inputs is None else inputs
-        self._run(*self._arguments)
+        _run(*self.arrays, *self.functions)
         return bool(self._columns.taken[0])
 
     def follows(self, time_s: float) -> int:
         """Return what a stamp would be: 1 taken, -1 taken as that of a clock set back, 0 not taken."""
-        seen_s, pending_s = float(self._memory.clock[TIME]), float(self._memory.clock[PENDING])
-        if not math.isfinite(time_s):
-            return 0
-        step_s = time_s - seen_s
-        if abs(step_s) > self._max_gap_s:
-            believed = 0.0 < time_s - pending_s <= self._max_gap_s
-            return (1 if step_s > 0.0 else -1) if believed else 0
-        return int(not step_s <= 0.0)
+        return _follows(time_s, self._memory.clock, self._max_gap_s)  # type: ignore[no-any-return]
 
     @property
     def reference_age_s(self) -> float:
@@ -124,12 +207,10 @@ class ResidentFilter:
         return dropped_counts(self._sensors, self._memory.counts)
 
 
-def _bound_run(model: FilterModel) -> Callable[..., Any]:
-    """Return the loop for the functions of a model, by their addresses.
-
-    The machine code is called directly: finding it, and that of the two functions, costs 17 us a call.
-    """
-    functions = zip((model.propagate, model.observe), (PROPAGATE, OBSERVE), strict=True)
-    (compiled,) = run.overloads.values()
-    addresses = (CompileResultWAP(f.overloads[tuple(signature.args)]) for f, signature in functions)
-    return partial(compiled.entry_point, *addresses)
+def _addresses(model: FilterModel) -> tuple[Any, Any]:
+    """Return the addresses of a model's functions: finding them costs more than a step."""
+    propagate, observe = (
+        CompileResultWAP(f.overloads[tuple(signature.args)])
+        for f, signature in ((model.propagate, PROPAGATE), (model.observe, OBSERVE))
+    )
+    return propagate, observe

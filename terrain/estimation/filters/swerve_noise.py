@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
+from numba import float64, int64, njit, void
 
 from terrain.errors import ConfigError
-from terrain.estimation.ekf.model import FilterModel, Given, Noise
+from terrain.estimation.ekf.model import FilterModel, Noise
 from terrain.estimation.filters.swerve import LAYOUTS, MOTION, initial_std, kind_of, layout_of, rows_of
 from terrain.estimation.filters.swerve_model import WHEELS
 from terrain.estimation.measurements.derived import UNSEEN_AFTER_S
 from terrain.estimation.measurements.table import DERIVED_ROWS, ROWS_OF_DRIVE, MeasurementTable
 from terrain.records import Array
 from terrain.robots import Robot
+
+_V, _I = float64[::1], int64[::1]
 
 # of how far a state walks within a second,
 _WALK_STD = {
@@ -178,44 +180,49 @@ def scheduled(model: FilterModel, noise: Noise, table: MeasurementTable) -> tupl
     return found, np.nan_to_num(table.columns(model.inputs))
 
 
-class Schedule:
-    """The variances of :func:`slip_walk` and :func:`accel_variance`, and the inputs, of one tick at a time.
+class ScheduleArrays(NamedTuple):
+    """What :func:`schedule_tick` is given of a filter.
 
     Parameters
     ----------
-    model : a filter with slip speeds
-    noise : of it, with one variance a row
+    variance : (m,) of the noise, of rows that are not scheduled
+    slips, turn : places of the slip speeds, none where nothing is scheduled, and of the yaw rate among the
+        states
+    square_arms_m2 : as :func:`square_arms_m2`
+    accels, quiet : (2,) places of the accelerations among the rows, and their variances on quiet ground
     """
 
-    def __init__(self, model: FilterModel, noise: Noise) -> None:
-        self._slips = np.array([i for i, s in enumerate(model.states) if kind_of(s) == "slip_speed_mps"])
-        self._turn, self._square_arms_m2 = model.states.index("yaw_rate_radps"), square_arms_m2(model)
-        self._accels = np.array([i for i, row in enumerate(model.rows) if kind_of(row) == "accel_mps2"])
-        self._quiet = noise.measurement_variance[self._accels]
-        self._variance = np.array(noise.measurement_variance)
-        self._given = Given(self._variance, np.zeros(len(model.states)), np.zeros(len(model.inputs)))
-
-    def __call__(self, z: Array, variance: Array | None = None) -> Given:
-        """Return what is known of a tick, given its rows, and variances (m,) that are not scheduled."""
-        if variance is not None:
-            self._variance[:] = variance
-        given = self._given
-        _schedule(
-            z,
-            self._slips,
-            self._turn,
-            self._square_arms_m2,
-            self._accels,
-            self._quiet,
-            self._variance,
-            given.walk_variance,
-            given.inputs,
-        )
-        return given
+    variance: Array
+    slips: Array
+    turn: int
+    square_arms_m2: float
+    accels: Array
+    quiet: Array
 
 
-@njit(cache=True)
-def _schedule(  # noqa: PLR0913 - a kernel takes its arrays one by one
+def schedule_arrays(model: FilterModel, noise: Noise, scheduled: bool = True) -> ScheduleArrays:
+    """Return what :func:`schedule_tick` is given.
+
+    Parameters
+    ----------
+    model : filter
+    noise : of it, with one variance a row
+    scheduled : False for a noise that stays as it is, as for a model without slip speeds
+    """
+    slips = [i for i, s in enumerate(model.states) if kind_of(s) == "slip_speed_mps"]
+    accels = [i for i, row in enumerate(model.rows) if kind_of(row) == "accel_mps2"]
+    places = np.array(slips if scheduled else [], dtype=np.int64), np.array(accels, dtype=np.int64)
+    arms_m2 = square_arms_m2(model) if slips else math.nan
+    variance = np.array(noise.measurement_variance)
+    turn = model.states.index("yaw_rate_radps")
+    return ScheduleArrays(variance, places[0], turn, arms_m2, places[1], variance[places[1]])
+
+
+@njit(
+    void(*(_V, _I, int64, float64, _I, _V), *(_V, _V, _V)),
+    cache=True,
+)
+def schedule_tick(  # noqa: PLR0913 - a kernel takes its arrays one by one
     z: Array,
     slips: Array,
     turn: int,

@@ -32,6 +32,9 @@ LEAP_S, AGREED_S, N_AGREED = 0.25, 0.05, 3
 same within this, and how many of them are believed."""
 
 
+_FLOATS = np.dtype(np.float64)
+
+
 def number(value: Any) -> float:
     """Return a value as a number; NaN where it is none.
 
@@ -54,7 +57,7 @@ def numbers(value: Any) -> Array | None:
     >>> numbers([[1.0], [2.0, 3.0]]) is None, numbers(["a"]) is None, numbers([1, 2])
     (True, True, array([1., 2.]))
     """
-    if type(value) is np.ndarray and value.dtype == np.float64:
+    if type(value) is np.ndarray and value.dtype == _FLOATS:
         return value
     try:
         array = np.asarray(value)
@@ -91,7 +94,10 @@ class _StreamClock:
         if not stamps:
             return None
         newest_s = stamps[0] if len(stamps) == 1 else max(stamps)
-        self._find_leap(now_s, newest_s)
+        advanced_s = newest_s - self._stamp_s
+        if advanced_s < -REWIND_S or advanced_s > now_s - self._now_s + LEAP_S:
+            self._leapt, self._n_due = True, 0
+        self._stamp_s, self._now_s = newest_s, now_s
         late_s = now_s - (newest_s - self.offset_s)
         if -AHEAD_S <= late_s <= REWIND_S:
             self.lateness_s, self._leapt, self._n_due = late_s, False, 0
@@ -104,13 +110,6 @@ class _StreamClock:
         if self.offset_s == 0.0:
             return Reading(time_s, values) if left_out else reading
         return Reading(time_s - self.offset_s, values)
-
-    def _find_leap(self, now_s: float, newest_s: float) -> None:
-        """Note whether the stamps have leapt since the reading before."""
-        advanced_s = newest_s - self._stamp_s
-        if advanced_s < -REWIND_S or advanced_s > now_s - self._now_s + LEAP_S:
-            self._leapt, self._n_due = True, 0
-        self._stamp_s, self._now_s = newest_s, now_s
 
     def _agrees(self, behind_s: float) -> bool:
         """Take the difference of stamps to the time anew where enough readings agree; say whether it was."""
@@ -211,4 +210,6 @@ def readable(given: Any) -> Reading | None:
     stamps, array = numbers(time_s), numbers(values)
     if stamps is None or array is None or stamps.ndim != 1 or array.ndim != 2 or len(array) != stamps.size:
         return None
+    if type(given) is Reading and stamps is time_s and array is values:
+        return given
     return Reading(stamps, array)

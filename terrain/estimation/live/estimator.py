@@ -30,28 +30,28 @@ from terrain.estimation.ekf.model import (
     REOPEN_AFTER_S,
     FilterModel,
     FilterSettings,
-    Given,
     Noise,
 )
 from terrain.estimation.ekf.resident import ResidentFilter
 from terrain.estimation.ekf.state import in_one
 from terrain.estimation.filters.swerve import make_filter
-from terrain.estimation.filters.swerve_noise import Schedule, default_noise
+from terrain.estimation.filters.swerve_noise import default_noise, schedule_arrays
+from terrain.estimation.live.clocks import numbers
 from terrain.estimation.live.estimate import LiveEstimate, predicted
-from terrain.estimation.live.history import History, Tick
+from terrain.estimation.live.history import History, Samples, Tick
 from terrain.estimation.live.monitor import HealthMonitor, RowMemory
 from terrain.estimation.live.rows import (
     KINDS,
     QUEUE,
     WHEEL_KINDS,
+    RowArrays,
     check_numbers,
     counts_by_kind,
     described_limits,
     places_among,
     push,
-    rows_at,
 )
-from terrain.estimation.live.slip import LiveSlip
+from terrain.estimation.live.tick import TickOutput, TickPlaces, bound_tick, parts_of_output, slip_places
 from terrain.estimation.measurements.derived import derived_memory
 from terrain.estimation.measurements.frozen import frozen_memory
 from terrain.estimation.measurements.samples import ROWS, STREAMS, params_of, row_memory
@@ -70,7 +70,7 @@ CHANNELS: Mapping[str, tuple[str, ...]] = {"wheels": WHEELS_CHANNELS, **STREAMS}
 """Default channels of each stream."""
 
 
-_push, _rows_at = entry_point(push), entry_point(rows_at)
+_push = entry_point(push)
 
 
 class LiveEstimator:
@@ -123,20 +123,18 @@ class LiveEstimator:
         self._model = make_filter(filter_name, robot, with_gnss=has_gnss)
         robot = as_swerve(robot, "robot {name} has the drive {drive!r}: the live estimator is for 'swerve'")
         robot.require("motors", "steering", "sensors")
-        physical = noise is None
+        scheduled = noise is None and bool(self._model.inputs)
         noise = default_noise(filter_name, robot, has_gnss) if noise is None else noise
-        self._schedule = Schedule(self._model, noise) if physical and self._model.inputs else None
+        self._noise = schedule_arrays(self._model, noise, scheduled=scheduled)
         self._filter = ResidentFilter(self._model, noise, settings)
         self._robot, self._region = robot, RegionMonitor(robot)
         self._unreadable: dict[str, int] = {}
         self._connect(channels, has_gnss)
         self._prepare_rows(initial_yaw_rad or 0.0, gnss_latency_s)
-        self._prepare_filter(noise)
-        buffers = (
-            *self._filter.buffers,
-            *(self._row_buffer, self._monitor.buffer, self._counts, self._wheel_counts),
-        )
-        self._history = History(buffers, ("wheels", *(name for name, *_ in self._streams)))
+        floats, counts = self._filter.buffers
+        buffers = floats, self._row_buffer, self._monitor.buffer
+        self._history = History(buffers, (counts, self._counts.reshape(-1), self._wheel_counts))
+        self._prepare_tick()
         self._latest: LiveEstimate | None = None
         self._counted = {"came late": 0, "ticks without wheels": 0}
 
@@ -152,7 +150,6 @@ class LiveEstimator:
         self._n_columns = {name: len(channels[name]) for name in ("wheels", *read)}
         self._motor_columns = np.array([known.index(channel) for channel in WHEELS_CHANNELS[:3]])
         self._current_columns = places_among(WHEELS_CHANNELS[3:], known)
-        self._lacks_currents = bool((self._current_columns < 0).any())
         self._n_queued, self._last_s = np.zeros(len(STREAMS), np.int64), np.full(len(STREAMS), -np.inf)
         self._counts = np.zeros((len(STREAMS), len(KINDS)), np.int64)
         self._wheel_counts = np.zeros(len(WHEEL_KINDS), np.int64)
@@ -166,11 +163,9 @@ class LiveEstimator:
     def _prepare_rows(self, initial_yaw_rad: float, gnss_latency_s: float) -> None:
         """Lay out what :func:`rows_at` is given: first what is fixed, then its memory."""
         robot = self._robot
-        motors, sensors = robot.motors, robot.sensors
+        sensors = robot.sensors
         latency_s = np.zeros(len(STREAMS))
         latency_s[1:] = sensors.imu_latency_s, robot.completed.camera.latency_s, gnss_latency_s
-        self._motor_radps, self._z, self._gnss_variance = np.empty(3), np.empty(len(ROWS)), np.empty(4)
-        self._unmeasured = np.ones(3, dtype=np.bool_)
         lines, turns, gnss = row_memory()
         moved = (
             *(self._last_s, np.full((2, 16), np.nan), turns, lines, yaw_memory(), gnss, derived_memory()),
@@ -180,38 +175,42 @@ class LiveEstimator:
         self._last_s, before, turns, lines, yaw, gnss, derived, frozen, received_s = views
         rows = RowMemory(lines, received_s, frozen, derived)
         self._monitor = HealthMonitor(robot, self._model, rows, self._n_columns["wheels"])
-        self._row_memory = (
-            self._motor_radps,
-            *self._queues,
-            *(
-                self._n_queued,
-                self._last_s,
-                latency_s,
-                params_of(robot, initial_yaw_rad),
-                described_limits(robot),
-            ),
+        z, gnss_variance, unmeasured = np.empty(len(ROWS)), np.empty(4), np.ones(3, dtype=np.bool_)
+        given = (
+            *(np.empty(3), *self._queues, self._n_queued, self._last_s, latency_s),
+            *(params_of(robot, initial_yaw_rad), described_limits(robot)),
             *(before, turns, lines, yaw, gnss, derived, frozen, received_s),
-            *(self._z, self._gnss_variance),
-            *(self._unmeasured, self._counts, self._wheel_counts),
+            *(z, gnss_variance, unmeasured, self._counts, self._wheel_counts),
         )
+        self._rows = RowArrays._make(given)
         self._inputs = [
             (name, stream, columns, (queue, self._n_queued, self._last_s, self._counts))
             for name, stream, columns, queue in self._streams
         ]
         self._period_s = 1.0 / sensors.wheels_rate_hz
-        self._reduction_ratio, self._radius_m = motors.reduction_ratio, robot.wheel_radius_m
 
-    def _prepare_filter(self, noise: Noise) -> None:
+    def _prepare_tick(self) -> None:
+        """Bind the compiled tick to all that it moves."""
         model, robot = self._model, self._robot
-        self._columns = np.array([ROWS.index(row) for row in model.rows])
-        places = [row for row in model.rows if row in GNSS_ROWS]
-        self._variance = np.array(noise.measurement_variance) if places else None
-        self._gnss_places = np.array([model.rows.index(row) for row in places], dtype=np.int64)
-        self._unknown = np.full(len(model.rows), np.nan)
+        gnss = [i for i, row in enumerate(model.rows) if row in GNSS_ROWS]
+        slip_states, positions_m, variance = slip_places(robot, model.states)
+        motion = self._motion = [model.states.index(s) for s in LiveEstimate._fields[8:13]]
+        places = TickPlaces(
+            *(self._motor_columns, self._current_columns, np.array(motion)),
+            *(np.array([ROWS.index(row) for row in model.rows]), np.array(gnss, dtype=np.int64)),
+            slip_states,
+            positions_m,
+            variance,
+            robot.motors.reduction_ratio,
+            robot.wheel_radius_m,
+        )
+        self._run_tick = bound_tick(
+            self._filter,
+            *(places, self._rows, self._noise, self._filter.arrays, self._monitor.arrays),
+            self._history.memory,
+        )
+        self._written = parts_of_output(len(model.states), len(ROWS))
         self._no_wheels = np.full(self._n_columns["wheels"], np.nan)
-        self._slip = LiveSlip(robot, model.states)
-        self._motion = [model.states.index(s) for s in LiveEstimate._fields[8:13]]
-        self._variances = self._filter.cov.reshape(-1)[:: len(model.states) + 1]
 
     @property
     def model(self) -> FilterModel:
@@ -270,23 +269,19 @@ class LiveEstimator:
             in order of time, unless the clock of the wheels was set back.  A stamp that leaps by more than
             ``settings.max_gap_s`` is reported when the next one follows; what was late is in :attr:`latest`
         """
-        history, late_s = self._history, math.inf
+        history = self._history
         last_s = history.last_s
-        for name, stream, columns, fixed in self._inputs:
-            arrays = self._taken(name, readings)
-            if arrays is None:
-                continue
-            first_s = min(arrays[0].tolist(), default=math.inf)
-            if first_s <= last_s and (late := self._late(name, arrays[0], last_s)) < math.inf:
-                late_s = min(late_s, late)
-            else:
-                _push(stream, *arrays, columns, *fixed)
-        arrays = self._taken("wheels", readings)
+        came: dict[str, Samples] = {}
+        late_s = self._queue_up(readings, came, last_s)
+        taken = self._taken("wheels", readings, came)
         ticks = []
-        if arrays is not None:
-            ticks = [Tick(*tick) for tick in zip(arrays[0].tolist(), arrays[1], strict=True)]
-            if ticks and history.last_measured_s < ticks[0].time_s <= last_s:
-                late_s = min(late_s, self._late("wheels", arrays[0], last_s))
+        if taken is not None:
+            stamps, _, values = taken
+            ticks = [Tick(*tick) for tick in zip(stamps, values, strict=True)]
+            if ticks and stamps[0] <= last_s and history.last_measured_s < stamps[0]:
+                late_s = min(late_s, self._late("wheels", stamps, last_s))
+        if came:
+            history.keep_samples(came, last_s)
         if late_s < math.inf:
             ticks = self._go_back(late_s, ticks)
         if now_s is not None and history.last_s > -math.inf:
@@ -303,22 +298,40 @@ class LiveEstimator:
                     found.append(estimate)
         return found
 
-    def _taken(self, name: str, readings: Mapping[str, Reading]) -> tuple[Array, Array] | None:
-        """Return stamps and values of a stream, remembered; None where there are none."""
+    def _queue_up(self, readings: Mapping[str, Reading], came: dict[str, Samples], last_s: float) -> float:
+        """Queue the samples of all streams but the wheels; return the instant to go back to, or infinity."""
+        late_s = math.inf
+        for name, stream, columns, fixed in self._inputs:
+            taken = self._taken(name, readings, came)
+            if taken is None:
+                continue
+            stamps, time_s, values = taken
+            if stamps and min(stamps) <= last_s and (late := self._late(name, stamps, last_s)) < math.inf:
+                late_s = min(late_s, late)
+            else:
+                _push(stream, time_s, values, columns, *fixed)
+        return late_s
+
+    def _taken(self, name: str, readings: Mapping[str, Reading], came: dict[str, Samples]) -> Samples | None:
+        """Return what came of a stream, noted where it has stamps to go back to; None where nothing did."""
         reading = readings.get(name)
         arrays = None if reading is None else self._arrays(name, reading)
-        if arrays is not None and arrays[0].size and math.isfinite(sum(arrays[0].tolist())):
-            self._history.keep_samples(name, *arrays, self._history.last_s)
-        return arrays
+        if arrays is None:
+            return None
+        stamps: list[float] = arrays[0].tolist()
+        taken = stamps, *arrays
+        if stamps and math.isfinite(sum(stamps)):
+            came[name] = taken
+        return taken
 
-    def _late(self, name: str, time_s: Array, last_s: float) -> float:
+    def _late(self, name: str, stamps: list[float], last_s: float) -> float:
         """Return the instant to go back to for late samples, infinite where there is none that is new."""
-        known = self._history.stamps_before_the_last(name)
-        late = [stamp_s for stamp_s in time_s.tolist() if stamp_s <= last_s and stamp_s not in known]
+        known = self._history.stamps(name)
+        late = [stamp_s for stamp_s in stamps if stamp_s <= last_s and stamp_s not in known]
         if not late or not self._history.reaches(min(late)):
             return math.inf
         self._counted["came late"] += 1
-        return float(min(late))
+        return min(late)
 
     def _go_back(self, late_s: float, ticks: list[Tick]) -> list[Tick]:
         """Put the memory back before an instant; return the ticks to be done again, with new ones."""
@@ -336,8 +349,10 @@ class LiveEstimator:
     def _arrays(self, name: str, reading: Reading) -> tuple[Array, Array] | None:
         """Return stamps and values; values that do not fit are unknown, stamps that do not are nothing."""
         try:
-            time_s, values = np.asarray(reading[0], np.float64), np.asarray(reading[1], np.float64)
-        except (TypeError, ValueError, LookupError, OverflowError):
+            time_s, values = numbers(reading[0]), numbers(reading[1])
+        except (TypeError, ValueError, LookupError):
+            time_s = values = None
+        if time_s is None or values is None:
             self._unreadable[name] = self._unreadable.get(name, 0) + 1
             return None
         if time_s.ndim == 1 and values.shape == (time_s.size, self._n_columns[name]):
@@ -351,50 +366,33 @@ class LiveEstimator:
 
     def _tick(self, tick: Tick) -> LiveEstimate | None:
         time_s, wheels = tick
-        follows = self._filter.follows(time_s)
-        z, resident = self._z, self._filter
-        if follows == 0:
-            resident.step(time_s, self._unknown)  # for it to count, and to remember a leap
+        written, history = np.empty(self._written[-1].stop), self._history
+        taken = self._run_tick(time_s, self._no_wheels if wheels is None else wheels, history.slot, written)
+        if taken == 0:
             return None
-        if wheels is None:
-            wheels = self._no_wheels
-        motor_radps = wheels[self._motor_columns]
-        self._motor_radps[:] = motor_radps
-        _rows_at(time_s, follows < 0, *self._row_memory)
-        if self._variance is not None:
-            self._variance[self._gnss_places] = self._gnss_variance
-        given = Given(self._variance) if self._schedule is None else self._schedule(z, self._variance)
-        resident.step(time_s, z[self._columns], given)
-        if follows < 0:
-            self._history.clear()
-        self._monitor.judge(time_s, wheels, motor_radps, z, resident)
-        self._history.keep_tick(tick)
-        age_s = resident.reference_age_s
-        slip = self._slip.at(resident, age_s, z[:3] * self._radius_m, self._unmeasured)
-        mean = resident.mean.copy()
-        v_x, v_y, turn, a_x, a_y = self._motion
-        current_a = wheels[self._current_columns]
-        if self._lacks_currents:
-            current_a[self._current_columns < 0] = np.nan
-        wheel_speed_mps = motor_radps / self._reduction_ratio * self._radius_m
+        out = TickOutput(*[written[part] for part in self._written])
+        if taken < 0:
+            history.clear()
+        history.keep_tick(tick)
+        v_x, v_y, turn, a_x, a_y, age_s = out.motion_and_age.tolist()
         if self._region.compares:
-            self._region.step(time_s, float(wheel_speed_mps.mean()), mean.item(turn))
+            self._region.step(time_s, float(out.wheel_speed_mps.mean()), turn)
         return LiveEstimate(
             time_s,
-            mean,
-            np.sqrt(self._variances),
-            slip[0],
-            slip[1],
-            bool(age_s > STALE_AFTER_S),
+            out.mean,
+            out.std,
+            out.slip_ratio,
+            out.slip_std,
+            age_s > STALE_AFTER_S,
             age_s,
-            z.copy(),
-            mean.item(v_x),
-            mean.item(v_y),
-            mean.item(turn),
-            mean.item(a_x),
-            mean.item(a_y),
-            motor_radps,
-            current_a,
-            wheel_speed_mps,
+            out.rows,
+            v_x,
+            v_y,
+            turn,
+            a_x,
+            a_y,
+            out.motor_radps,
+            out.current_a,
+            out.wheel_speed_mps,
             self._monitor.health.copy(),
         )

@@ -7,7 +7,6 @@ all that has come since once more, in order: the same numbers as if nothing had 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -20,6 +19,34 @@ REWIND_S = 0.25
 
 N_TICKS = 64
 """Most ticks that are kept; at 200 Hz a little more than :data:`REWIND_S`."""
+
+N_STEPS = 1024
+"""Most steps whose samples are kept, where no tick says that they are old."""
+
+Samples = tuple[list[float], Array, Array]
+"""Stamps, twice, and values of a stream."""
+
+Buffers = tuple[Array, Array, Array]
+
+
+class KeptMemory(NamedTuple):
+    """What an estimator remembers, and where it is kept tick by tick.
+
+    Parameters
+    ----------
+    floats, kept_floats : buffers (n,), and the same with a row for each slot (slots, n)
+    counts, kept_counts : likewise, of whole numbers
+    """
+
+    floats: Buffers
+    kept_floats: Buffers
+    counts: Buffers
+    kept_counts: Buffers
+
+
+def _slots(buffers: Buffers) -> Buffers:
+    first, second, third = (np.empty((N_TICKS, buffer.size), buffer.dtype) for buffer in buffers)
+    return first, second, third
 
 
 class Tick(NamedTuple):
@@ -34,36 +61,36 @@ class History:
 
     Parameters
     ----------
-    memory : buffers that are all an estimator remembers
-    streams : names of the streams
+    floats, counts : buffers that are all an estimator remembers, each (n,)
+
+    Attributes
+    ----------
+    memory : of the kernel that keeps it
+    slot : where it is kept at the next tick
     """
 
-    def __init__(self, memory: Sequence[Array], streams: Sequence[str]) -> None:
-        self._memory = tuple(memory)
-        self._kept = tuple(np.empty((N_TICKS, *buffer.shape), buffer.dtype) for buffer in memory)
+    def __init__(self, floats: Buffers, counts: Buffers) -> None:
+        self.memory = KeptMemory(floats, _slots(floats), counts, _slots(counts))
         self._ticks: deque[tuple[Tick, int]] = deque(maxlen=N_TICKS)
-        self._slot = 0
-        self.samples: dict[str, deque[tuple[Array, Array]]] = {name: deque() for name in streams}
+        self.slot = 0
+        self._samples: deque[tuple[float, dict[str, Samples]]] = deque(maxlen=N_STEPS)
 
-    def keep_samples(self, stream: str, time_s: Array, values: Array, now_s: float) -> None:
-        """Remember samples of a stream, and forget the old ones."""
-        kept = self.samples[stream]
-        kept.append((time_s, values))
-        while kept and not kept[0][0][-1] > now_s - 2.0 * REWIND_S:
+    def keep_samples(self, came: dict[str, Samples], now_s: float) -> None:
+        """Remember what came of each stream at a step, and forget what is old."""
+        kept = self._samples
+        kept.append((max([stamps[-1] for stamps, _, _ in came.values()]), came))
+        while kept and not kept[0][0] > now_s - 2.0 * REWIND_S:
             kept.popleft()
 
     def keep_tick(self, tick: Tick) -> None:
-        """Remember the memory behind a tick that was just done."""
-        slot = self._slot
-        for buffer, kept in zip(self._memory, self._kept, strict=True):
-            kept[slot] = buffer
-        self._ticks.append((tick, slot))
-        self._slot = (slot + 1) % N_TICKS
+        """Remember a tick that was just done, and whose memory is kept in the slot."""
+        self._ticks.append((tick, self.slot))
+        self.slot = (self.slot + 1) % N_TICKS
 
-    def stamps_before_the_last(self, stream: str) -> set[float]:
-        """Return the stamps of a stream that came before its last samples."""
-        blocks = list(self.samples[stream])[:-1]
-        return {stamp_s for time_s, _ in blocks for stamp_s in time_s.tolist()}
+    def stamps(self, stream: str) -> set[float]:
+        """Return the stamps of a stream that came."""
+        steps = (came[stream][0] for _, came in self._samples if stream in came)
+        return {stamp_s for stamps in steps for stamp_s in stamps}
 
     @property
     def last_s(self) -> float:
@@ -85,16 +112,17 @@ class History:
         while self._ticks[-1][0].time_s >= time_s - TICK_S:
             undone.append(self._ticks.pop()[0])
         slot = self._ticks[-1][1]
-        for buffer, kept in zip(self._memory, self._kept, strict=True):
-            buffer[...] = kept[slot]
-        self._slot = (slot + 1) % N_TICKS
+        memory = self.memory
+        buffers, kept = memory.floats + memory.counts, memory.kept_floats + memory.kept_counts
+        for buffer, slots in zip(buffers, kept, strict=True):
+            buffer[:] = slots[slot]
+        self.slot = (slot + 1) % N_TICKS
         return undone[::-1]
 
     def since(self, stream: str, time_s: float) -> tuple[Array, Array] | None:
         """Return the samples of a stream that are stamped after an instant, in order, each stamp once."""
-        blocks = [
-            block for block in self.samples[stream] if block[0][-1] > time_s or (block[0] > time_s).any()
-        ]
+        steps = [came[stream] for _, came in self._samples if stream in came]
+        blocks = [(at_s, values) for stamps, at_s, values in steps if max(stamps) > time_s]
         if not blocks:
             return None
         stamps, values = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
@@ -105,5 +133,4 @@ class History:
     def clear(self) -> None:
         """Forget all: the clock was set back."""
         self._ticks.clear()
-        for kept in self.samples.values():
-            kept.clear()
+        self._samples.clear()

@@ -6,10 +6,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
+from numba import float64, int8, int64, njit, types, void
 
 from terrain.estimation.ekf.model import FilterModel
-from terrain.estimation.ekf.resident import ResidentFilter
 from terrain.estimation.ekf.state import in_one
 from terrain.estimation.live.health import SENSORS, Health, count_repeated, find_stuck, health_memory, judge
 from terrain.records import Array
@@ -41,6 +40,7 @@ class HealthMonitor:
     Attributes
     ----------
     buffer : all that it remembers
+    arrays : what :func:`judge_tick` is given of it
     health : (13,) of the last tick
     """
 
@@ -58,7 +58,7 @@ class HealthMonitor:
         self.buffer, views = in_one(fresh)
         gated_s, compared, wheels, n_repeated = views
         self.health = np.full(len(SENSORS), Health.LOST.value, dtype=np.int8)
-        self._fixed = (
+        self.arrays = (
             *(motion, biases, places, period_s, *rows),
             *(wheels, n_repeated, gated_s, compared, self.health),
         )
@@ -71,31 +71,19 @@ class HealthMonitor:
             for name, status in zip(SENSORS, self.health.tolist(), strict=True)
         }
 
-    def judge(
-        self, time_s: float, wheels: Array, motor_radps: Array, z: Array, resident: ResidentFilter
-    ) -> None:
-        """Judge the sensors at a tick.
 
-        Parameters
-        ----------
-        time_s : stamp
-        wheels : (c,) sample of the wheels
-        motor_radps : (3,) rates in it
-        z : (29,) rows
-        resident : the filter, after the tick
-        """
-        judge_tick(
-            time_s,
-            wheels,
-            motor_radps,
-            z,
-            resident.mean,
-            resident.use,
-            *self._fixed,
-        )
+_V, _I = float64[::1], int64[::1]
+_IN = types.Array(float64, 1, "A", readonly=True)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(
+    void(
+        *(float64, _IN, _IN, _V, _V, int8[::1], _I, _I, _I, _V, float64[:, ::1], float64[:, ::1]),
+        *(float64[:, :, ::1], _V, _V, _V, _V, _V, int8[::1]),
+    ),
+    cache=True,
+    error_model="numpy",
+)
 def judge_tick(  # noqa: PLR0913 - a kernel takes its arrays one by one
     time_s: float,
     wheels: Array,

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numba import boolean, float64, int64, njit, types, void
@@ -60,6 +61,47 @@ _STAMP_COLUMN, _FINITE_COLUMN, _FIRST_COLUMN = 0, 1, 2  # of a queue
 _V, _M, _I, _IM = float64[::1], float64[:, ::1], int64[::1], int64[:, ::1]
 _VECTOR_IN = types.Array(float64, 1, "A", readonly=True)
 _MATRIX_IN = types.Array(float64, 2, "A", readonly=True)
+
+
+class RowArrays(NamedTuple):
+    """What :func:`rows_at` is given beside the time, in its order.
+
+    Parameters
+    ----------
+    motor_radps : (3,) of the sample of the wheels
+    steering, imu, odometry, gnss : queues
+    n_queued, last_s, latency_s : by stream
+    params, limits : of the robot
+    before to received_s : what is remembered of the samples
+    z, gnss_variance, unmeasured : what is written
+    counts, wheel_counts : of what was left out
+    """
+
+    motor_radps: Array
+    steering: Array
+    imu: Array
+    odometry: Array
+    gnss: Array
+    n_queued: Array
+    last_s: Array
+    latency_s: Array
+    params: Array
+    limits: Array
+    before: Array
+    turns: Array
+    lines: Array
+    yaw: Array
+    gnss_memory: Array
+    derived: Array
+    frozen: Array
+    received_s: Array
+    z: Array
+    gnss_variance: Array
+    unmeasured: Array
+    counts: Array
+    wheel_counts: Array
+
+
 _inline = njit(cache=True, error_model="numpy")
 
 

@@ -155,8 +155,9 @@ def test_the_compiled_form_gives_what_its_plain_form_gives(seed):
             command = np.where(rng.random(6) < 0.1, math.nan, rng.uniform(-1.0, 1.0, 6))
         measured = command + rng.choice([0.0, 0.05, 0.5], 6) * (k // 20 % 2)
         measured[rng.random(6) < 0.05] = rng.choice([math.nan, 1e6, -3.0])
+        rates = measured[:3] / 0.01
         for using, (kept, lasting, off) in ((follow, compiled), (follow.py_func, plain)):
-            using(time_s, step_s, k % N_KEPT, command, measured, kept, lasting, off)
+            using(time_s, step_s, k % N_KEPT, command, rates, 0.01, measured[3:], kept, lasting, off)
         np.testing.assert_array_equal(compiled[2], plain[2])
         np.testing.assert_allclose(compiled[1], plain[1], rtol=1e-12, equal_nan=True)
         n_off += int(compiled[2].sum())

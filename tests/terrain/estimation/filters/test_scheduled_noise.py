@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from terrain.estimation.ekf.kernel import HELD_S
-from terrain.estimation.ekf.model import GATE_PROBABILITY, REOPEN_AFTER_S, FilterSettings
+from terrain.estimation.ekf.model import GATE_PROBABILITY, REOPEN_AFTER_S, FilterSettings, Given
 from terrain.estimation.ekf.resident import ResidentFilter
 from terrain.estimation.filters.swerve import make_filter
-from terrain.estimation.filters.swerve_noise import Schedule, default_noise, scheduled
+from terrain.estimation.filters.swerve_noise import default_noise, schedule_arrays, schedule_tick, scheduled
 from terrain.estimation.live.estimator import LiveEstimator
 from terrain.estimation.measurements.batch import measurement_table
 from terrain.estimation.measurements.derived import REST_AFTER_S
@@ -41,6 +41,18 @@ def parts():
     return model, noise, measurement_table(log(), ROBOT, causal=True)
 
 
+def schedule_of(model, noise):
+    """Return what gives the noise of a tick by its rows."""
+    variance, *fixed = schedule_arrays(model, noise)
+    given = Given(variance, np.zeros(len(model.states)), np.zeros(len(model.inputs)))
+
+    def schedule(z):
+        schedule_tick(np.array(z), *fixed, *given)
+        return given
+
+    return schedule
+
+
 def test_the_schedule_of_a_tick_is_that_of_a_table():
     """With derived rows that are unknown, too, and without a camera."""
     model, noise, table = parts()
@@ -50,7 +62,7 @@ def test_the_schedule_of_a_tick_is_that_of_a_table():
     z[:, places] = np.where(unknown, np.nan, z[:, places])
     table = replace(table, z=z)
     varied, inputs = scheduled(model, noise, table)
-    schedule = Schedule(model, noise)
+    schedule = schedule_of(model, noise)
     for n, row in enumerate(z):
         given = schedule(row)
         np.testing.assert_allclose(given.measurement_variance, varied.measurement_variance[n], rtol=1e-13)
@@ -69,7 +81,7 @@ def test_slip_walks_more_where_it_shakes_where_wheels_accelerate_and_less_withou
         z = np.zeros(len(names))
         for row, value in rows.items():
             z[names.index(row)] = value
-        return np.array(Schedule(model, noise)(z).walk_variance)
+        return np.array(schedule_of(model, noise)(z).walk_variance)
 
     still, shaken, unseen = walk(), walk(vibration_mps2=1.0), walk(vibration_mps2=1.0, camera_age_s=1.0)
     assert still[slip] == 0.0
@@ -85,7 +97,12 @@ def gated_until(name, amount, duration_s=4.0):
     """Return uses of a sensor, tick by tick, whose rows are off by an amount from 6 s on."""
     model, noise, table = parts()
     sensors = dict(model.sensors)
-    resident, schedule, uses, times_s = ResidentFilter(model, noise, SETTINGS), Schedule(model, noise), [], []
+    resident, schedule, uses, times_s = (
+        ResidentFilter(model, noise, SETTINGS),
+        schedule_of(model, noise),
+        [],
+        [],
+    )
     off = [model.rows.index(row) for row in sensors[name]]
     z = table.columns(model.rows).copy()
     z[np.ix_(table.time_s > 6.0, off)] += amount

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from terrain.estimation.live.estimator import LiveEstimator
-from terrain.estimation.live.history import REWIND_S
+from terrain.estimation.live.history import N_STEPS, REWIND_S
 from terrain.logs.replay import replay
 from terrain.records import Reading
 from terrain.robots import load_robot
@@ -81,8 +81,18 @@ def assert_same(estimator, expected):
     for one, other in zip(estimator.latest, expected.latest, strict=True):
         np.testing.assert_array_equal(one, other)
     assert estimator.health == expected.health
-    for one, other in zip(estimator._history._memory, expected._history._memory, strict=True):
+    memory, same = estimator._history.memory, expected._history.memory
+    for one, other in zip(memory.floats + memory.counts, same.floats + same.counts, strict=True):
         np.testing.assert_array_equal(one, other)
+
+
+def test_without_wheels_samples_do_not_pile_up():
+    estimator, imu = LiveEstimator(ROBOT), samples()[50].readings["imu"]
+    for k in range(N_STEPS + 50):
+        time_s = imu.time_s + k * PERIOD_S
+        assert not estimator.step({"imu": Reading(time_s, imu.values)}, float(time_s[-1]))
+    assert len(estimator._history._samples) == N_STEPS
+    assert len(estimator.step(samples()[50].readings, samples()[50].time_s)) == 1
 
 
 @cache
