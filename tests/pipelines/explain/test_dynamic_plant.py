@@ -34,7 +34,7 @@ def explained(runs):
 QUIET = (Verdict.NONE, Verdict.NOT_EXCITED)
 
 
-@pytest.mark.parametrize("vary", [False, True])
+@pytest.mark.parametrize("vary", [pytest.param(False, marks=pytest.mark.slow), True])
 @pytest.mark.parametrize("terrain", ["grass", pytest.param("firm_soil_gravel", marks=pytest.mark.slow)])
 def test_without_a_hidden_effect_nothing_is_stated(terrain, vary):
     found = explained(runs_of(terrain=terrain, vary=vary))
@@ -45,11 +45,11 @@ def test_without_a_hidden_effect_nothing_is_stated(terrain, vary):
 @pytest.mark.parametrize(
     ("parameter", "value"),
     [
-        ("wheel_radius_ratio", 0.05),
+        pytest.param("wheel_radius_ratio", 0.05, marks=pytest.mark.slow),
         ("camera_yaw_rad", 0.05),
         pytest.param("camera_latency_s", 0.1, marks=pytest.mark.slow),
         pytest.param("gyro_scale_ratio", 0.1, marks=pytest.mark.slow),
-        ("payload_ratio", 0.3),
+        pytest.param("payload_ratio", 0.3, marks=pytest.mark.slow),
     ],
 )
 def test_an_effect_hidden_in_the_plant_is_named_and_nothing_else(parameter, value):

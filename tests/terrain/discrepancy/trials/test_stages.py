@@ -74,7 +74,9 @@ def median_lag_s(runs, late, reference):
     return float(np.median([lag_s(on_clock(run, *late), on_clock(run, *reference)) for run in runs]))
 
 
-@pytest.mark.parametrize("row", NEW_ROWS)
+@pytest.mark.parametrize(
+    "row", [pytest.param(row, marks=[pytest.mark.slow] * (row == "dynamic")) for row in NEW_ROWS]
+)
 def test_the_same_seed_gives_the_same_trial_and_nothing_of_the_truth_leaks(row):
     n_runs = 4
 
