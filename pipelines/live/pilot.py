@@ -11,7 +11,6 @@ same object.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from operator import itemgetter
 
@@ -39,7 +38,6 @@ from terrain.control.slick import braking_by_slip
 from terrain.control.slip_table import SlipTable, load_slip_table
 from terrain.control.switching import (
     NO_BELIEF,
-    UNKNOWN,
     OutputStatus,
     TerrainBelief,
     approach,
@@ -66,7 +64,7 @@ from terrain.estimation.live.health import SENSORS, SLIP_SENSORS, SOUND, Health
 from terrain.extension import correct_live
 from terrain.kinematics.swerve import FAR_RAD, wheel_command_step
 from terrain.logs.schema import IMU_CHANNELS, WHEELS_CHANNELS
-from terrain.records import Array, Command, Reading, Sample, SlipTarget
+from terrain.records import Array, Command, Reading, Sample
 from terrain.robots import Robot
 from terrain.slip import MIN_SPEED_MPS
 
@@ -142,7 +140,6 @@ class LivePilot:
         self._table, self._settings, self._radius_m = table, settings, driven.wheel_radius_m
         self._source = NoTerrain() if source is None else source
         self._terrains = {terrain: index for index, terrain in enumerate(table.targets)}
-        self._targets = {terrain: table.lookup(terrain) for terrain in (UNKNOWN, *table.targets)}
         self._braking = {name: braking_by_slip(curve) for name, curve in table.curves.items()}
         self._positions_m = np.array(driven.wheel_positions_m)
         self._limits = (
@@ -163,7 +160,7 @@ class LivePilot:
             self._pose_states = [states.index(state) for state in pose]
         self._clocks = Clocks()
         self._actuation = Actuation(driven.wheel_radius_m / driven.equipment.motors.reduction_ratio)
-        self._health, self._off = [0] * len(SENSORS), [False] * len(self._actuation.off)
+        self._health = [0] * len(SENSORS)
         steer = np.zeros(3) if steer_rad is None else np.array(steer_rad, dtype=np.float64)
         self._now = _Memory(steer, initial_tracking())
 
@@ -236,7 +233,7 @@ class LivePilot:
             wheel_radps,
             desired_mps,
             target,
-            self._targets_on(now.belief.terrain),
+            self._table.lookup(now.belief.terrain),
             observed if sound else UNOBSERVED,
             dt_s,
         )
@@ -303,10 +300,10 @@ class LivePilot:
             wheels = None
         steer_rad = None if seen is None else seen.mean[self._steer_states]
         self._actuation.measured(time_s, step_s, wheels, steer_rad)
-        self._off = off = self._actuation.off.tolist()
-        if wheels is not None and True in off[:3]:
+        off = self._actuation.off.tolist()[:3]
+        if wheels is not None and True in off:
             values = wheels.values.copy()
-            values[:, np.flatnonzero(off[:3])] = math.nan
+            values[:, np.flatnonzero(off)] = math.nan
             readings["wheels"] = Reading(wheels.time_s, values)
 
     def _judge(self) -> tuple[int, int]:
@@ -318,8 +315,9 @@ class LivePilot:
             self._health = [_LOST] * len(SENSORS)
             return 0, _LOST
         self._health = health = seen.health.tolist()
-        if True in self._off:
-            for i, off in enumerate(self._off):
+        all_off = self._actuation.off.tolist()
+        if True in all_off:
+            for i, off in enumerate(all_off):
                 if off and (health[i] == _LOST or health[i] < _DISAGREES):  # it was taken from the filter
                     health[i] = _DISAGREES
         worst = max(_of_slip(health))
@@ -331,7 +329,7 @@ class LivePilot:
     def _target(self, dt_s: float) -> TractionTarget:
         """Return the slips to aim for; the target moves to that of the terrain at a bounded rate."""
         now = self._now
-        entry = self._targets_on(now.belief.terrain)
+        entry = self._table.lookup(now.belief.terrain)
         now.target_ratio = approach(
             now.target_ratio, entry["traction"].slip_ratio, self._settings.switching.rate_ratio, dt_s
         )
@@ -341,10 +339,6 @@ class LivePilot:
             return TractionTarget(now.target_ratio, margin_ratio=margin)
         mps2 = max(braking.mps2 + _uphill_mps2(now.estimate, *now.tilt_rad), 0.0)
         return TractionTarget(now.target_ratio, braking.slip_ratio, mps2, margin)
-
-    def _targets_on(self, terrain: str) -> Mapping[str, SlipTarget]:
-        """Return the table's targets for a terrain, or for an unknown one."""
-        return self._targets.get(terrain) or self._targets[UNKNOWN]
 
     def _track(self, twist: Array, time_s: float, dt_s: float) -> tuple[Array, TrackReport]:
         """Return the twist that keeps the path, and how far the robot is from it."""

@@ -99,10 +99,13 @@ class SlipTable:
     robot: str = ""
     curves: Mapping[str, CurveEntry] = field(default_factory=dict)
     reasons: Mapping[str, str] = field(default_factory=dict)
+    _valid: Mapping[str, Mapping[str, SlipTarget]] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         for name in ("targets", "curves", "reasons"):
             object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
+        valid = {terrain: entry for terrain, entry in self.targets.items() if _is_valid(entry)}
+        object.__setattr__(self, "_valid", valid)
 
     def lookup(self, terrain: str) -> Mapping[str, SlipTarget]:
         """Return the targets for a terrain, or those of the fallback; each names the entry that it is from.
@@ -115,10 +118,12 @@ class SlipTable:
         >>> table.lookup("ICE")["traction"].terrain, table.lookup("mud")["traction"].terrain
         ('ICE', 'unknown')
         """
-        entry = self.targets.get(terrain)
-        if entry is None or any(target.status is TargetStatus.INVALID for target in entry.values()):
-            return self.targets[self.fallback]
-        return entry
+        entry = self._valid.get(terrain)
+        return self.targets[self.fallback] if entry is None else entry
+
+
+def _is_valid(entry: Mapping[str, SlipTarget]) -> bool:
+    return not any(target.status is TargetStatus.INVALID for target in entry.values())
 
 
 def load_slip_table(path: str | Path | None = None, robot: str | None = None) -> SlipTable:

@@ -59,30 +59,12 @@ _SKIP, _START, _STEP, _LEAP = range(4)  # what the clock says of a row
 _UNSOUND = -1  # a use that is never reported
 
 
-@fast
-def _read_stamp(time_s: float, clock: Array, max_gap_s: float, counts: Array) -> tuple[int, float]:
-    """Say what the clock does, and move it."""
-    dt = time_s - clock[TIME]
-    since_leap_s = time_s - clock[PENDING]
-    kind = _STEP
-    if np.isnan(clock[TIME]):
-        kind = _START
-    elif abs(dt) > max_gap_s:
-        kind = _LEAP
-    if not np.isfinite(time_s) or (kind == _STEP and dt <= 0.0):
-        counts[_NOT_ADVANCED] += 1
-        return _SKIP, dt
-    if kind == _LEAP and not (since_leap_s > 0.0 and since_leap_s <= max_gap_s):  # does not follow one before
-        counts[_JUMPED] += 1
-        clock[PENDING] = time_s
-        return _SKIP, dt
-    clock[TIME], clock[PENDING] = time_s, np.nan
-    return kind, dt
-
-
 @njit(int64(float64, _VECTOR, float64), cache=True, error_model="numpy")
 def follows(time_s: float, clock: Array, max_gap_s: float) -> int:
-    """Return what a stamp would be: 1 taken, -1 taken as that of a clock set back, 0 not taken."""
+    """Return what a stamp would be: 1 taken, -1 taken as that of a clock set back, 0 not taken.
+
+    A leap is believed where the stamp follows one that leapt before.
+    """
     if not math.isfinite(time_s):
         return 0
     step_s = time_s - clock[TIME]
@@ -91,6 +73,23 @@ def follows(time_s: float, clock: Array, max_gap_s: float) -> int:
         believed = since_leap_s > 0.0 and since_leap_s <= max_gap_s
         return (1 if step_s > 0.0 else -1) if believed else 0
     return 0 if step_s <= 0.0 else 1
+
+
+@fast
+def _read_stamp(time_s: float, clock: Array, max_gap_s: float, counts: Array) -> tuple[int, float]:
+    """Say what the clock does, and move it."""
+    dt = time_s - clock[TIME]
+    leaps = abs(dt) > max_gap_s  # not the first, whose dt is NaN
+    if follows(time_s, clock, max_gap_s) == 0:
+        if leaps and np.isfinite(time_s):
+            counts[_JUMPED] += 1
+            clock[PENDING] = time_s
+        else:
+            counts[_NOT_ADVANCED] += 1
+        return _SKIP, dt
+    kind = _LEAP if leaps else (_START if np.isnan(dt) else _STEP)
+    clock[TIME], clock[PENDING] = time_s, np.nan
+    return kind, dt
 
 
 @njit(

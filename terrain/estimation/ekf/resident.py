@@ -138,8 +138,8 @@ class ResidentFilter:
     -----
     ``functions`` and ``arrays`` are what the kernel is given; ``mean`` and ``cov`` are the memory itself,
     which the next step writes over; ``buffers`` are all of it, for callers that go back to an earlier step.
-    Most of what :func:`filter_step` takes goes into copies and
-    into finding the model's compiled functions anew.
+    Most of what :func:`filter_step` takes goes into copies and into finding the model's compiled functions
+    anew.
     """
 
     def __init__(self, model: FilterModel, noise: Noise, settings: FilterSettings = DEFAULT_SETTINGS) -> None:

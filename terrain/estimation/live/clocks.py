@@ -94,7 +94,7 @@ class _StreamClock:
         if not stamps:
             return None
         newest_s = stamps[0] if len(stamps) == 1 else max(stamps)
-        advanced_s = newest_s - self._stamp_s
+        advanced_s = newest_s - self._stamp_s  # since the reading before
         if advanced_s < -REWIND_S or advanced_s > now_s - self._now_s + LEAP_S:
             self._leapt, self._n_due = True, 0
         self._stamp_s, self._now_s = newest_s, now_s

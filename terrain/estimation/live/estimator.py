@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from itertools import pairwise
 
 import numpy as np
 
@@ -51,7 +52,7 @@ from terrain.estimation.live.rows import (
     places_among,
     push,
 )
-from terrain.estimation.live.tick import TickOutput, TickPlaces, bound_tick, parts_of_output, slip_places
+from terrain.estimation.live.tick import TickOutput, TickPlaces, bound_tick, output_ends, slip_places
 from terrain.estimation.measurements.derived import derived_memory
 from terrain.estimation.measurements.frozen import frozen_memory
 from terrain.estimation.measurements.samples import ROWS, STREAMS, params_of, row_memory
@@ -195,9 +196,10 @@ class LiveEstimator:
         gnss = [i for i, row in enumerate(model.rows) if row in GNSS_ROWS]
         slip_states, positions_m, variance = slip_places(robot, model.states)
         motion = self._motion = [model.states.index(s) for s in LiveEstimate._fields[8:13]]
+        ends = output_ends(len(model.states), len(ROWS))
         places = TickPlaces(
             *(self._motor_columns, self._current_columns, np.array(motion)),
-            *(np.array([ROWS.index(row) for row in model.rows]), np.array(gnss, dtype=np.int64)),
+            *(np.array([ROWS.index(row) for row in model.rows]), np.array(gnss, dtype=np.int64), ends),
             slip_states,
             positions_m,
             variance,
@@ -209,7 +211,7 @@ class LiveEstimator:
             *(places, self._rows, self._noise, self._filter.arrays, self._monitor.arrays),
             self._history.memory,
         )
-        self._written = parts_of_output(len(model.states), len(ROWS))
+        self._written = [slice(*pair) for pair in pairwise(ends.tolist())]
         self._no_wheels = np.full(self._n_columns["wheels"], np.nan)
 
     @property

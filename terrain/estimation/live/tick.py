@@ -6,7 +6,6 @@ longer to hand over their arrays than they take to compute.
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable
 from functools import partial
@@ -35,9 +34,10 @@ class TickPlaces(NamedTuple):
 
     Parameters
     ----------
-    motors, currents : (3,) columns of the wheels' sample, -1 for none
+    motors, currents : (3,) columns of the wheels' sample, of currents -1 for none
     motion : (5,) speeds, yaw rate and accelerations among the states
     rows, gnss : places of the filter's rows among all, and of the positions' among the filter's
+    ends : where each part of :class:`TickOutput` begins, and the last ends
     slip_states : as of :func:`~terrain.estimation.wheel_slip.instant_slip`
     positions_m : (3, 2) of the wheels
     wheel_speed_variance : of a measured wheel speed
@@ -49,6 +49,7 @@ class TickPlaces(NamedTuple):
     motion: Array
     rows: Array
     gnss: Array
+    ends: Array
     slip_states: Array
     positions_m: Array
     wheel_speed_variance: float
@@ -116,7 +117,7 @@ _N_OWN_JUDGED = 6  # arguments of the health that a tick makes
 _TYPES = (
     types.FunctionType(PROPAGATE),
     types.FunctionType(OBSERVE),
-    _group(TickPlaces, (_I, _I, _I, _I, _I, _I, _M, float64, float64, float64)),
+    _group(TickPlaces, (_I, _I, _I, _I, _I, _I, _I, _M, float64, float64, float64)),
     _group(RowArrays, _of(rows_at, 2)),
     _group(ScheduleArrays, (_V, *_of(schedule_tick, 1)[:5])),
     _group(FilterArrays, _of(run, 0)[:-2]),
@@ -150,18 +151,17 @@ def _write(
     wheels: Array, places: TickPlaces, rows: RowArrays, resident: FilterArrays, written: Array
 ) -> None:
     """Write state, slip and what was measured, as :class:`TickOutput`."""
-    d, m = resident.x.size, rows.z.size
-    k = 2 * d + 6 + m
+    e = places.ends
     out = TickOutput(
-        written[:d],
-        written[d : 2 * d],
-        written[2 * d : 2 * d + 3],
-        written[2 * d + 3 : 2 * d + 6],
-        written[2 * d + 6 : k],
-        written[k : k + 3],
-        written[k + 3 : k + 6],
-        written[k + 6 : k + 9],
-        written[k + 9 : k + 15],
+        written[e[0] : e[1]],
+        written[e[1] : e[2]],
+        written[e[2] : e[3]],
+        written[e[3] : e[4]],
+        written[e[4] : e[5]],
+        written[e[5] : e[6]],
+        written[e[6] : e[7]],
+        written[e[7] : e[8]],
+        written[e[8] : e[9]],
     )
     for i in range(out.mean.size):
         out.mean[i], out.std[i] = resident.x[i], math.sqrt(resident.p[i, i])
@@ -178,7 +178,7 @@ def _write(
         out.motion_and_age[i] = resident.x[places.motion[i]]
     out.motion_and_age[5] = age_s
     slip[:] = np.nan
-    if not math.isinf(age_s) and (age_s <= STALE_AFTER_S or places.slip_states[6] >= 0):
+    if not math.isinf(age_s) and (age_s <= STALE_AFTER_S or places.slip_states[-1] >= 0):
         instant_slip(
             resident.x,
             resident.p,
@@ -242,7 +242,6 @@ def bound_tick(resident: ResidentFilter, *arrays: Any) -> Callable[..., int]:
     return partial(entry_point(tick), tick_memory(*resident.functions, *arrays))
 
 
-def parts_of_output(n_states: int, n_rows: int) -> tuple[slice, ...]:
-    """Return where each part of :class:`TickOutput` stands in what a tick writes."""
-    ends = itertools.accumulate((0, n_states, n_states, 3, 3, n_rows, 3, 3, 3, 6))
-    return tuple(itertools.starmap(slice, itertools.pairwise(ends)))
+def output_ends(n_states: int, n_rows: int) -> Array:
+    """Return ``ends`` of :class:`TickPlaces`."""
+    return np.cumsum((0, n_states, n_states, 3, 3, n_rows, 3, 3, 3, 6))

@@ -87,14 +87,14 @@ def select_faults(catalogue: Mapping[str, SensorFault], names: Sequence[str]) ->
     Raises
     ------
     ConfigError
-        if a name is neither; the message lists the names.
+        if a name is neither; the message lists the kinds.
     """
     kinds = list(dict.fromkeys(fault.kind for fault in catalogue.values()))
     for name in names:
         if name not in catalogue and name not in kinds:
             raise ConfigError(
-                f"fault {name!r} is unknown: use a kind ({', '.join(kinds)}) or a name "
-                f"({', '.join(catalogue)})"
+                f"fault {name!r} is unknown: use a kind ({', '.join(kinds)}) or one fault of a kind, "
+                f"as {next(iter(catalogue))}"
             )
     return [fault for fault in catalogue.values() if not names or fault.name in names or fault.kind in names]
 

@@ -415,3 +415,37 @@ def test_nis_is_read_by_sensor_and_nan_where_nothing_was_measured():
     assert live.nis["gyro"] >= 0.0
     assert np.isnan(live.nis["rest"])  # it moves
     assert pilot("plain").nis == {}
+
+
+def judged(**statuses):
+    """Return the sensor that a pilot names, and its status, where the estimator has found some statuses."""
+    live = pilot()
+    for sample in recorded()[:50]:
+        live.step(sample)
+    health = np.zeros(len(SENSORS), np.int8)
+    for name, status in statuses.items():
+        health[SENSORS.index(name)] = status
+    live._now.estimate = live.estimate._replace(health=health)
+    place, status = live._judge()
+    return (SENSORS[place] if place >= 0 else None), Health(status)
+
+
+def test_the_sensor_is_named_that_takes_others_with_it():
+    assert judged() == (None, Health.FRESH)
+    assert judged(gyro=Health.LATE) == (None, Health.LATE)
+    assert judged(wheel_1=Health.LOST, camera_speed=Health.FROZEN) == ("camera_speed", Health.FROZEN)
+    assert judged(wheel_1=Health.STEPPED, camera_speed=Health.LOST) == ("wheel_1", Health.STEPPED)
+    assert judged(wheel_1=Health.GATED, camera_speed=Health.LOST) == ("camera_speed", Health.LOST)
+
+
+def test_a_wheel_that_does_not_follow_its_command_disagrees_and_is_not_called_lost():
+    live = pilot()
+    for sample in recorded():
+        readings = dict(sample.readings)
+        if "wheels" in readings and sample.time_s > 6.0:
+            values = readings["wheels"].values.copy()
+            values[:, 1] *= 0.5
+            readings["wheels"] = Reading(readings["wheels"].time_s, values)
+        live.step(sample._replace(readings=readings))
+    assert live.health["wheel_2"] == "disagrees"
+    assert live.estimate.health[SENSORS.index("wheel_2")] == Health.LOST

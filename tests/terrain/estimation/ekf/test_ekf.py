@@ -224,6 +224,15 @@ def test_sample_by_sample_equals_batch_bit_for_bit():
     assert {USED, GATED, REOPENED, ABSENT} == set(np.unique(track.use))
 
 
+@pytest.mark.parametrize("stamp_s", [np.inf, -np.inf, np.nan])
+def test_a_stamp_that_is_no_number_is_no_leap_of_the_clock(stamp_s):
+    state = initial_state(CARRIAGE, CARRIAGE_NOISE)
+    for time_s in (0.0, stamp_s, 0.02):
+        state = filter_step(CARRIAGE, CARRIAGE_NOISE, state, time_s, np.zeros(2))
+    assert state.dropped == {"time did not advance": 1}
+    assert state.time_s == 0.02
+
+
 def test_every_fault_is_counted_by_its_name():
     time_s, z = spoilt()
     track = run_filter(CARRIAGE, CARRIAGE_NOISE, time_s, z)

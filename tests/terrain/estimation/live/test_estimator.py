@@ -256,6 +256,25 @@ def test_wheels_alone_give_wheel_speeds_and_no_slip():
     assert estimator.lag_s == ROBOT.sensors.encoder_time_constant_s
 
 
+def test_a_given_noise_stays_as_it_is():
+    run, noise = log(), default_noise("vio15", ROBOT)
+    estimator = LiveEstimator(ROBOT, noise=noise)
+    estimates = [estimate for sample in replay(run) for estimate in estimator.step(sample.readings)]
+    table, model = measurement_table(run, ROBOT, causal=True), make_filter("vio15", ROBOT)
+    settings = FilterSettings(GATE_PROBABILITY, REOPEN_AFTER_S)
+    track = run_filter(model, noise, table.time_s, table.columns(model.rows), settings)
+    np.testing.assert_allclose(column(estimates, "mean"), track.mean, rtol=0, atol=1e-9)
+
+
+def test_without_a_camera_from_the_start_there_is_no_slip():
+    estimator = LiveEstimator(ROBOT)
+    without = ({name: r for name, r in s.readings.items() if name != "odometry"} for s in replay(log()))
+    estimates = [estimate for readings in without for estimate in estimator.step(readings)]
+    assert np.abs(column(estimates, "wheel_speed_mps")).max() > 0.5
+    for figure in ("slip_ratio", "slip_std"):
+        assert np.isnan(column(estimates, figure)).all()
+
+
 def test_a_wheel_without_measurements_has_no_slip():
     def mute(time_s, values):
         values[time_s > MIDDLE_S, 1] = np.nan

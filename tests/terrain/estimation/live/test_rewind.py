@@ -86,6 +86,20 @@ def assert_same(estimator, expected):
         np.testing.assert_array_equal(one, other)
 
 
+def shifted(steps, by_s):
+    return [
+        (time_s + by_s, {name: Reading(r.time_s + by_s, r.values) for name, r in readings.items()})
+        for time_s, readings in steps
+    ]
+
+
+def test_late_samples_after_a_clock_was_set_back_are_taken_among_those_of_the_new_time():
+    late = shifted(delayed({"imu": [3] * N_MIXED}), -50.0)
+    estimator, expected = (drive([*in_order(), *after]) for after in (late, shifted(in_order(), -50.0)))
+    assert estimator.dropped["came late"] > 0
+    assert_same(estimator, expected)
+
+
 def test_without_wheels_samples_do_not_pile_up():
     estimator, imu = LiveEstimator(ROBOT), samples()[50].readings["imu"]
     for k in range(N_STEPS + 50):
