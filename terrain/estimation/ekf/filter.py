@@ -23,6 +23,7 @@ from __future__ import annotations
 import numpy as np
 
 from terrain.errors import DataError
+from terrain.estimation.ekf.arrays import Columns, FilterArrays, Memory, SampleArrays
 from terrain.estimation.ekf.kernel import LIKELIHOOD, run
 from terrain.estimation.ekf.model import (
     DEFAULT_SETTINGS,
@@ -34,15 +35,12 @@ from terrain.estimation.ekf.model import (
     Noise,
 )
 from terrain.estimation.ekf.state import (
-    SLACK_S,
-    Columns,
     FilterState,
-    Memory,
+    columns_of,
     dropped_counts,
-    gate_thresholds,
     initial_state,
-    matrices_of,
     memory_of,
+    noise_arrays,
 )
 from terrain.records import Array, StateTrack
 
@@ -194,8 +192,8 @@ def _feed(
     keep: bool = True,
 ) -> Columns:
     """Run the kernel, which moves the memory; return its columns, empty ones but the last unless kept."""
-    matrices = matrices_of(model, noise)
-    n, k, d, m = len(stamps), len(model.sensors), len(model.states), len(model.rows)
+    fixed = noise_arrays(model, noise, settings)
+    n, d, m = len(stamps), len(model.states), len(model.rows)
     values = np.array(z, dtype=np.float64, order="C")
     variance, walks, inputs = (
         np.zeros((1, columns))
@@ -212,30 +210,7 @@ def _feed(
     ):
         if shape not in desired:
             raise DataError(f"filter {model.name}: {name} has shape {shape}, {desired[0]} is needed")
-    rows = n if keep else 0
-    columns = Columns(
-        np.empty((rows, d)),
-        np.empty((rows, d, d)),
-        np.empty((rows, k)),
-        np.empty((rows, k), np.int8),
-        np.empty((rows, k), np.int8),
-        np.empty(rows),
-        np.zeros(n, np.bool_),
-    )
-    run(
-        *model._constants,
-        *matrices,
-        gate_thresholds(model, settings),
-        variance,
-        walks,
-        inputs,
-        settings.reopen_after_s - SLACK_S,
-        settings.max_gap_s + SLACK_S,
-        stamps,
-        values,
-        *memory,
-        *columns,
-        model.propagate,
-        model.observe,
-    )
+    columns = columns_of(model, n, keep=keep)
+    samples = SampleArrays(stamps, values, variance, walks, inputs)
+    run(FilterArrays(model.arrays, fixed, samples, memory, columns), model.propagate, model.observe)
     return columns

@@ -1,8 +1,7 @@
 """The loop behind every filter: predict, judge, condition on, one row of measurements after the other.
 
-Loops are written out, divisions unchecked and arrays handed over one by one: at these sizes the assignment of
-a slice costs as much as a measurement, and a call with a tuple of arrays more.  The plain form is in the
-tests.
+Loops are written out and divisions unchecked: at these sizes the assignment of a slice costs as much as a
+measurement.  The plain form is in the tests.
 """
 
 from __future__ import annotations
@@ -11,9 +10,10 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import boolean, float64, int64, njit, types, void
+from numba import float64, int64, njit, types, void
 
 from terrain.angles import wrapped
+from terrain.estimation.ekf.arrays import FILTER_ARRAYS, FilterArrays
 from terrain.estimation.ekf.steps import (
     LARGEST,
     LONGEST_GAP_S,
@@ -32,8 +32,7 @@ from terrain.estimation.ekf.steps import (
 )
 from terrain.records import ABSENT, GATED, REOPENED, USED, Array
 
-_VECTOR, _MATRIX, _FLAGS, _COUNTS = float64[::1], float64[:, ::1], boolean[::1], int64[::1]
-_SMALL = types.int8[:, ::1]
+_VECTOR, _MATRIX = float64[::1], float64[:, ::1]
 
 PROPAGATE = void(_VECTOR, float64, _VECTOR, _VECTOR, _MATRIX)
 """Signature of ``propagate(x, dt, params, x_next, F)``."""
@@ -93,52 +92,19 @@ def _read_stamp(time_s: float, clock: Array, max_gap_s: float, counts: Array) ->
 
 
 @njit(
-    void(
-        *(_VECTOR, _COUNTS, _COUNTS, _FLAGS, _FLAGS, _FLAGS, _FLAGS, _FLAGS, _VECTOR),
-        *(_MATRIX, _MATRIX, _VECTOR, _MATRIX, _MATRIX, _MATRIX, float64, float64, _VECTOR, _MATRIX),
-        *(_VECTOR, _MATRIX, _VECTOR, _VECTOR, _COUNTS),
-        *(_MATRIX, float64[:, :, ::1], _MATRIX, _SMALL, _SMALL, _VECTOR, _FLAGS),
-        *(types.FunctionType(PROPAGATE), types.FunctionType(OBSERVE)),
-    ),
+    void(FILTER_ARRAYS, types.FunctionType(PROPAGATE), types.FunctionType(OBSERVE)),
     cache=True,
     error_model="numpy",
 )
-def run(  # noqa: C901, PLR0913 - one loop: cut into functions a step takes 6.7 us in place of 3.7
-    params: Array,
-    order: Array,
-    starts: Array,
-    is_reference: Array,
-    is_held: Array,
-    is_angle_row: Array,
-    is_angle_state: Array,
-    is_position: Array,
-    x0: Array,
-    p0: Array,
-    q: Array,
-    thresholds: Array,
-    variances: Array,
-    walks: Array,
-    inputs: Array,
-    reopen_after_s: float,
-    max_gap_s: float,
-    stamps: Array,
-    values: Array,
-    x: Array,
-    p: Array,
-    clock: Array,
-    rejected_s: Array,
-    counts: Array,
-    mean: Array,
-    cov: Array,
-    nis_out: Array,
-    dof_out: Array,
-    use_out: Array,
-    age_out: Array,
-    taken: Array,
-    propagate: Any,
-    observe: Any,
+def run(  # noqa: C901 - one loop: cut into functions a step takes 6.7 us in place of 3.7
+    arrays: FilterArrays, propagate: Any, observe: Any
 ) -> None:
-    """Filter rows one by one: move x, P, the clock and the counts, fill the columns, mark the rows taken."""
+    """Filter samples one by one: move the memory, and write the columns."""
+    params, order, starts, is_reference, is_held, is_angle_row, is_angle_state, is_position, x0 = arrays.model
+    p0, q, thresholds, reopen_after_s, max_gap_s = arrays.noise
+    stamps, values, variances, walks, inputs = arrays.samples
+    x, p, clock, rejected_s, counts = arrays.memory
+    mean, cov, nis_out, dof_out, use_out, age_out, taken = arrays.columns
     d, m, n_sensors = x.size, order.size, starts.size - 1
     f, fp, f_cols, n_f_cols = (
         np.zeros((d, d)),

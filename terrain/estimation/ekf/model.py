@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from terrain.errors import ConfigError, LogError
+from terrain.estimation.ekf.arrays import ModelArrays
 from terrain.estimation.ekf.kernel import OBSERVE, PROPAGATE
 from terrain.logs.schema import unit_of
 from terrain.records import Array, read_only
@@ -126,23 +127,24 @@ class FilterModel:
         return tuple(name for name, _ in self.sensors)
 
     @cached_property
-    def _constants(self) -> tuple[Any, ...]:
-        """What the kernel needs of the model beside its functions, in its order."""
+    def arrays(self) -> ModelArrays:
+        """What the kernel is given beside the two functions."""
+
+        def marks(names: tuple[str, ...], chosen: tuple[str, ...]) -> Array:
+            return np.array([name in chosen for name in names], dtype=np.bool_)
+
         order = [self.rows.index(row) for _, rows in self.sensors for row in rows]
         starts = np.cumsum([0, *(len(rows) for _, rows in self.sensors)])
-        marks = (
-            (self.sensor_names, self.references),
-            (self.sensor_names, self.held),
-            (self.rows, self.angle_rows),
-            (self.states, self.angle_states),
-            (self.states, self.positions),
-        )
-        return (
+        return ModelArrays(
             np.append(self.params, np.zeros(len(self.inputs))),
             np.array(order, dtype=np.int64),
             starts.astype(np.int64),
-            *(np.array([name in chosen for name in names], dtype=np.bool_) for names, chosen in marks),
-            self.initial_mean.copy(),
+            is_reference=marks(self.sensor_names, self.references),
+            is_held=marks(self.sensor_names, self.held),
+            is_angle_row=marks(self.rows, self.angle_rows),
+            is_angle_state=marks(self.states, self.angle_states),
+            is_position=marks(self.states, self.positions),
+            x0=self.initial_mean.copy(),
         )
 
 

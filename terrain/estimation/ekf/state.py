@@ -1,4 +1,4 @@
-"""What a filter carries from one sample to the next, and the arrays that its kernel moves and writes."""
+"""What a filter carries from one sample to the next, and the arrays that hold it for the kernel."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ import numpy as np
 from scipy.special import chdtri
 
 from terrain.errors import DataError
+from terrain.estimation.ekf.arrays import Columns, Memory, NoiseArrays
 from terrain.estimation.ekf.kernel import PER_ROW, PER_SENSOR
 from terrain.estimation.ekf.model import FilterModel, FilterSettings, Noise
 from terrain.records import Array
 
-SLACK_S = 1e-9  # what sums of steps may be off by
+_SLACK_S = 1e-9  # what sums of steps may be off by
 
 
 class FilterState(NamedTuple):
@@ -63,6 +64,20 @@ def initial_state(model: FilterModel, noise: Noise) -> FilterState:
     )
 
 
+def columns_of(model: FilterModel, n: int, *, keep: bool = True) -> Columns:
+    """Return columns for n samples, those but ``taken`` without rows unless kept; no sensor was used yet."""
+    d, k, rows = len(model.states), len(model.sensors), n if keep else 0
+    return Columns(
+        np.empty((rows, d)),
+        np.empty((rows, d, d)),
+        np.full((rows, k), np.nan),
+        np.zeros((rows, k), np.int8),
+        np.zeros((rows, k), np.int8),
+        np.empty(rows),
+        np.zeros(n, np.bool_),
+    )
+
+
 def in_one(arrays: Sequence[Array]) -> tuple[Array, list[Array]]:
     """Return one buffer that holds copies of arrays of one type, and the arrays as views of it.
 
@@ -77,28 +92,6 @@ def in_one(arrays: Sequence[Array]) -> tuple[Array, list[Array]]:
     ends = np.cumsum([np.size(array) for array in arrays])
     parts = np.split(buffer, ends[:-1])
     return buffer, [part.reshape(np.shape(array)) for part, array in zip(parts, arrays, strict=True)]
-
-
-class Memory(NamedTuple):
-    """What the kernel moves from sample to sample."""
-
-    x: Array
-    p: Array
-    clock: Array
-    rejected_s: Array
-    counts: Array
-
-
-class Columns(NamedTuple):
-    """What the kernel writes of each sample."""
-
-    mean: Array
-    cov: Array
-    nis: Array
-    nis_dof: Array
-    use: Array
-    reference_age_s: Array
-    taken: Array
 
 
 def memory_of(state: FilterState) -> Memory:
@@ -119,8 +112,8 @@ def _initial_variance(model: FilterModel, noise: Noise) -> Array:
 
 
 @lru_cache(maxsize=16)
-def matrices_of(model: FilterModel, noise: Noise) -> tuple[Array, Array]:
-    """Return P0 and Q in the layout of the kernel, checked against the model."""
+def noise_arrays(model: FilterModel, noise: Noise, settings: FilterSettings) -> NoiseArrays:
+    """Return what the kernel is given of noise and settings, checked against the model."""
     d, m = len(model.states), len(model.rows)
     for name in ("process_variance", "initial_variance"):
         matrix = getattr(noise, name)
@@ -129,11 +122,17 @@ def matrices_of(model: FilterModel, noise: Noise) -> tuple[Array, Array]:
     if noise.measurement_variance.shape[-1] != m:
         given = noise.measurement_variance.shape[-1]
         raise DataError(f"filter {model.name}: measurement_variance is for {given} rows, it has {m}")
-    return _initial_variance(model, noise).copy(), noise.process_variance.copy()
+    return NoiseArrays(
+        _initial_variance(model, noise).copy(),
+        noise.process_variance.copy(),
+        _gate_thresholds(model, settings),
+        settings.reopen_after_s - _SLACK_S,
+        settings.max_gap_s + _SLACK_S,
+    )
 
 
 @lru_cache(maxsize=16)
-def gate_thresholds(model: FilterModel, settings: FilterSettings) -> Array:
+def _gate_thresholds(model: FilterModel, settings: FilterSettings) -> Array:
     """Return the largest squared innovation that is believed, by its number of rows."""
     widest = max(len(rows) for _, rows in model.sensors)
     found: Array = chdtri(np.arange(1.0, widest + 1), 1 - settings.gate_probability)

@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import float64, int64, njit, void
+from numba import float64, int64, njit, types, void
 
 from terrain.errors import ConfigError
 from terrain.estimation.ekf.model import FilterModel, Noise
@@ -200,6 +200,10 @@ class ScheduleArrays(NamedTuple):
     quiet: Array
 
 
+SCHEDULE_ARRAYS = types.NamedTuple((_V, _I, int64, float64, _I, _V), ScheduleArrays)
+"""Their type in compiled code."""
+
+
 def schedule_arrays(model: FilterModel, noise: Noise, scheduled: bool = True) -> ScheduleArrays:
     """Return what :func:`schedule_tick` is given.
 
@@ -218,25 +222,13 @@ def schedule_arrays(model: FilterModel, noise: Noise, scheduled: bool = True) ->
     return ScheduleArrays(variance, places[0], turn, arms_m2, places[1], variance[places[1]])
 
 
-@njit(
-    void(*(_V, _I, int64, float64, _I, _V), *(_V, _V, _V)),
-    cache=True,
-)
-def schedule_tick(  # noqa: PLR0913 - a kernel takes its arrays one by one
-    z: Array,
-    slips: Array,
-    turn: int,
-    square_arms_m2: float,
-    accels: Array,
-    quiet: Array,
-    variance: Array,
-    walk: Array,
-    inputs: Array,
-) -> None:
+@njit(void(_V, SCHEDULE_ARRAYS, _V, _V, _V), cache=True)
+def schedule_tick(z: Array, fixed: ScheduleArrays, variance: Array, walk: Array, inputs: Array) -> None:
     """Write variances, walks and inputs of a tick: what :func:`scheduled` gives of a whole table."""
+    slips, accels = fixed.slips, fixed.accels
     shaken = z[_DERIVED]
     for i in range(accels.size):
-        variance[accels[i]] = quiet[i] + shaken_variance(UNKNOWN_MPS2 if math.isnan(shaken) else shaken)
+        variance[accels[i]] = fixed.quiet[i] + shaken_variance(UNKNOWN_MPS2 if math.isnan(shaken) else shaken)
     known = 0.0 if math.isnan(shaken) else shaken
     changes = 0.0
     for i in range(3):
@@ -246,7 +238,7 @@ def schedule_tick(  # noqa: PLR0913 - a kernel takes its arrays one by one
         changes += change
         walk[slips[i]] = walk_of(known, change, 1.0 if unseen else 0.0)
         inputs[i] = 0.0 if math.isnan(growth) else growth
-    walk[turn] = turn_walk_of(known, changes, square_arms_m2)
+    walk[fixed.turn] = turn_walk_of(known, changes, fixed.square_arms_m2)
 
 
 def _process_variance(states: tuple[str, ...], robot: Robot) -> Array:

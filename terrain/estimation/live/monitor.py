@@ -27,6 +27,39 @@ class RowMemory(NamedTuple):
     derived: Array
 
 
+class HealthArrays(NamedTuple):
+    """What :func:`judge_tick` is given beside a tick; the rest is as of :func:`judge`.
+
+    Parameters
+    ----------
+    motion_places, bias_places : (3,) among the states; of a bias that is none of them -1, and 0 is taken
+    wheels_before, n_repeated : (c,) sample of the tick before, and how often it repeated itself
+    """
+
+    motion_places: Array
+    bias_places: Array
+    places: Array
+    period_s: Array
+    lines: Array
+    received_s: Array
+    frozen: Array
+    derived: Array
+    wheels_before: Array
+    n_repeated: Array
+    gated_s: Array
+    compared: Array
+    health: Array
+
+
+_V, _M, _I = float64[::1], float64[:, ::1], int64[::1]
+_IN = types.Array(float64, 1, "A", readonly=True)
+
+HEALTH_ARRAYS = types.NamedTuple(
+    (_I, _I, _I, _V, _M, _M, float64[:, :, ::1], _V, _V, _V, _V, _V, int8[::1]), HealthArrays
+)
+"""Their type in compiled code."""
+
+
 class HealthMonitor:
     """Judges the sensors at each tick of a live estimator.
 
@@ -58,10 +91,8 @@ class HealthMonitor:
         self.buffer, views = in_one(fresh)
         gated_s, compared, wheels, n_repeated = views
         self.health = np.full(len(SENSORS), Health.LOST.value, dtype=np.int8)
-        self.arrays = (
-            *(motion, biases, places, period_s, *rows),
-            *(wheels, n_repeated, gated_s, compared, self.health),
-        )
+        remembered = wheels, n_repeated, gated_s, compared, self.health
+        self.arrays = HealthArrays(motion, biases, places, period_s, *rows, *remembered)
 
     @property
     def names(self) -> dict[str, str]:
@@ -72,51 +103,18 @@ class HealthMonitor:
         }
 
 
-_V, _I = float64[::1], int64[::1]
-_IN = types.Array(float64, 1, "A", readonly=True)
-
-
-@njit(
-    void(
-        *(float64, _IN, _IN, _V, _V, int8[::1], _I, _I, _I, _V, float64[:, ::1], float64[:, ::1]),
-        *(float64[:, :, ::1], _V, _V, _V, _V, _V, int8[::1]),
-    ),
-    cache=True,
-    error_model="numpy",
-)
-def judge_tick(  # noqa: PLR0913 - a kernel takes its arrays one by one
-    time_s: float,
-    wheels: Array,
-    motor_radps: Array,
-    z: Array,
-    mean: Array,
-    use: Array,
-    motion_places: Array,
-    bias_places: Array,
-    places: Array,
-    period_s: Array,
-    lines: Array,
-    received_s: Array,
-    frozen: Array,
-    derived: Array,
-    wheels_before: Array,
-    n_repeated: Array,
-    gated_s: Array,
-    compared: Array,
-    health: Array,
+@njit(void(float64, _IN, _IN, _V, _V, int8[::1], HEALTH_ARRAYS), cache=True, error_model="numpy")
+def judge_tick(
+    time_s: float, wheels: Array, motor_radps: Array, z: Array, mean: Array, use: Array, of: HealthArrays
 ) -> None:
-    """Write the health (13,) of the sensors at a tick, by the sample of the wheels and the filter's state.
-
-    ``motion_places`` (3,) and ``bias_places`` (3,) say where each stands in the state; a bias that the state
-    does not have is at -1, and 0.  The rest is as of :func:`judge`.
-    """
-    count_repeated(wheels, wheels_before, n_repeated)
+    """Write the health (13,) of the sensors at a tick, by the sample of the wheels and the filter's state."""
+    count_repeated(wheels, of.wheels_before, of.n_repeated)
     stuck, bias, motion = np.empty(3, np.bool_), np.empty(3), np.empty(3)
     for i in range(3):
-        bias[i] = mean[bias_places[i]] if bias_places[i] >= 0 else 0.0
-        motion[i] = mean[motion_places[i]]
-    find_stuck(z, motor_radps, n_repeated[0], math.hypot(motion[0], motion[1]), frozen, stuck)
+        bias[i] = mean[of.bias_places[i]] if of.bias_places[i] >= 0 else 0.0
+        motion[i] = mean[of.motion_places[i]]
+    find_stuck(z, motor_radps, of.n_repeated[0], math.hypot(motion[0], motion[1]), of.frozen, stuck)
     judge(
-        *(time_s, use, places, period_s, lines, received_s, frozen, stuck, derived),
-        *(z, bias, motion, gated_s, compared, health),
+        *(time_s, use, of.places, of.period_s, of.lines, of.received_s, of.frozen, stuck, of.derived),
+        *(z, bias, motion, of.gated_s, of.compared, of.health),
     )

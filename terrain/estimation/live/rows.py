@@ -64,7 +64,7 @@ _MATRIX_IN = types.Array(float64, 2, "A", readonly=True)
 
 
 class RowArrays(NamedTuple):
-    """What :func:`rows_at` is given beside the time, in its order.
+    """What :func:`rows_at` is given beside the time.
 
     Parameters
     ----------
@@ -101,6 +101,15 @@ class RowArrays(NamedTuple):
     counts: Array
     wheel_counts: Array
 
+
+ROW_ARRAYS = types.NamedTuple(
+    (
+        *(_V, _M, _M, _M, _M, _I, _V, _V, _V, _M),
+        *(_M, _M, _M, _V, _V, _V, float64[:, :, ::1], _M, _V, _V, boolean[::1], _IM, _I),
+    ),
+    RowArrays,
+)
+"""Their type in compiled code."""
 
 _inline = njit(cache=True, error_model="numpy")
 
@@ -183,73 +192,40 @@ def refused_as(stream: int, stamped: Array, before: Array) -> int:
     return -1
 
 
-@njit(
-    void(
-        *(float64, boolean, _V, _M, _M, _M, _M, _I, _V, _V, _V, _M),
-        *(_M, _M, _M, _V, _V, _V, float64[:, :, ::1], _M, _V, _V, boolean[::1], _IM, _I),
-    ),
-    cache=True,
-    error_model="numpy",
-)
-def rows_at(  # noqa: PLR0913 - a kernel keeps its memory in arrays of its caller
-    time_s: float,
-    set_back: bool,
-    motor_radps: Array,
-    steering: Array,
-    imu: Array,
-    odometry: Array,
-    gnss: Array,
-    n_queued: Array,
-    last_s: Array,
-    latency_s: Array,
-    params: Array,
-    limits: Array,
-    before: Array,
-    turns: Array,
-    lines: Array,
-    yaw: Array,
-    gnss_memory: Array,
-    derived: Array,
-    frozen: Array,
-    received_s: Array,
-    z: Array,
-    gnss_variance: Array,
-    unmeasured: Array,
-    counts: Array,
-    wheel_counts: Array,
-) -> None:
+@njit(void(float64, boolean, ROW_ARRAYS), cache=True, error_model="numpy")
+def rows_at(time_s: float, set_back: bool, rows: RowArrays) -> None:
     """Take from the queues what came by a tick of the wheels; write its rows z (29,) and variances (4,).
 
     ``set_back`` says that the clock was: what is remembered of its other time is forgotten.  ``unmeasured``
     (3,) tells the wheels of which rate or angle was not measured for too long.
     """
+    params, lines, derived, frozen, z = rows.params, rows.lines, rows.derived, rows.frozen, rows.z
+    n_queued, last_s, received_s, counts = rows.n_queued, rows.last_s, rows.received_s, rows.counts
     if set_back:
         n_queued[:] = 0
         last_s[:] = -np.inf
         lines[:] = np.nan
-        before[:] = np.nan
+        rows.before[:] = np.nan
         derived[:] = np.nan
         frozen[:, 1] = 0.0
         received_s[:] = -np.inf
     for stream in range(4):
-        queue = (steering, imu, odometry, gnss)[stream]
+        queue = (rows.steering, rows.imu, rows.odometry, rows.gnss)[stream]
         n, n_due = n_queued[stream], 0
         while n_due < n and queue[n_due, _STAMP_COLUMN] <= time_s + TICK_S:
             stamped, sample = queue[n_due], queue[n_due, _FIRST_COLUMN:]
             n_due += 1
             came_s = stamped[_STAMP_COLUMN]
             last_s[stream] = came_s
-            refused = refused_as(stream, stamped, before)
+            refused = refused_as(stream, stamped, rows.before)
             if refused >= 0:
                 counts[stream, refused] += 1
                 if refused == _FROZEN:
                     frozen[stream - IMU, 1] += 1.0
                 continue
-            instant_s = came_s - latency_s[stream]
-            stamps_s = instant_s, came_s
-            fate = take_sample(
-                stream, sample, stamps_s, params, turns, lines, limits, (gnss_memory, derived, frozen)
-            )
+            instant_s = came_s - rows.latency_s[stream]
+            stamps_s, moved = (instant_s, came_s), (rows.gnss_memory, derived, frozen)
+            fate = take_sample(stream, sample, stamps_s, params, rows.turns, lines, rows.limits, moved)
             counts[stream, _LEAP] += fate == LEAPT
             counts[stream, _NO_ROTATION] += fate == NO_ROTATION
         while n > n_due and queue[n - 1, _STAMP_COLUMN] > time_s + OFF_CLOCK_S:
@@ -258,18 +234,18 @@ def rows_at(  # noqa: PLR0913 - a kernel keeps its memory in arrays of its calle
         drop_first(queue, n_due, n)
         n_queued[stream] = n - n_due
 
-    finite, beyond = wheel_rates(motor_radps, params, is_moving(derived), frozen, z)
-    wheel_counts[0] += not finite
-    wheel_counts[1] += beyond
-    rows_at_tick(time_s, lines, limits, gnss_memory, params, derived, z, gnss_variance)
+    finite, beyond = wheel_rates(rows.motor_radps, params, is_moving(derived), frozen, z)
+    rows.wheel_counts[0] += not finite
+    rows.wheel_counts[1] += beyond
+    rows_at_tick(time_s, lines, rows.limits, rows.gnss_memory, params, derived, z, rows.gnss_variance)
     for i in range(3):
-        unmeasured[i] = False
+        rows.unmeasured[i] = False
         for k, row in enumerate((i, STEER + i)):
             if not math.isnan(z[row]):
                 received_s[k, i] = time_s
-            unmeasured[i] |= time_s - received_s[k, i] > UNMEASURED_AFTER_S
-    average_yaw(time_s, z, params, yaw)
-    refer_yaw(time_s, z, params, yaw)
+            rows.unmeasured[i] |= time_s - received_s[k, i] > UNMEASURED_AFTER_S
+    average_yaw(time_s, z, params, rows.yaw)
+    refer_yaw(time_s, z, params, rows.yaw)
 
 
 def described_limits(robot: Robot) -> Array:

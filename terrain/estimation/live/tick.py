@@ -16,12 +16,13 @@ from numba import float64, int64, njit, types
 from numba.experimental import structref
 
 from terrain.entry_point import entry_point
+from terrain.estimation.ekf.arrays import FILTER_ARRAYS, FilterArrays, Memory
 from terrain.estimation.ekf.kernel import AGE, OBSERVE, PROPAGATE, follows, run
-from terrain.estimation.ekf.resident import FilterArrays, ResidentFilter, run_resident
-from terrain.estimation.filters.swerve_noise import ScheduleArrays, schedule_tick
+from terrain.estimation.ekf.resident import ResidentFilter
+from terrain.estimation.filters.swerve_noise import SCHEDULE_ARRAYS, ScheduleArrays, schedule_tick
 from terrain.estimation.live.history import KeptMemory
-from terrain.estimation.live.monitor import judge_tick
-from terrain.estimation.live.rows import RowArrays, rows_at
+from terrain.estimation.live.monitor import HEALTH_ARRAYS, HealthArrays, judge_tick
+from terrain.estimation.live.rows import ROW_ARRAYS, RowArrays, rows_at
 from terrain.estimation.wheel_slip import STALE_AFTER_S, instant_slip, wheel_speed_scatter_mps
 from terrain.records import Array
 from terrain.robots import Robot
@@ -82,8 +83,7 @@ class TickMemory(structref.StructRefProxy):
     Parameters
     ----------
     propagate, observe : of the filter
-    places, rows, noise, resident, kept : groups of arrays
-    judged : as of :func:`~terrain.estimation.live.monitor.judge_tick`
+    places, rows, noise, resident, judged, kept : groups of arrays
     """
 
 
@@ -103,26 +103,15 @@ def slip_places(robot: Robot, states: tuple[str, ...]) -> tuple[Array, Array, fl
     return places, np.array(robot.wheel_positions_m), wheel_speed_scatter_mps(robot) ** 2
 
 
-def _group(named: Any, fields: Any) -> types.NamedTuple:
-    return types.NamedTuple(tuple(fields), named)
-
-
-def _of(kernel: Any, first: int) -> tuple[Any, ...]:
-    """Return the types of a kernel's arguments from one on."""
-    (signature,) = kernel.nopython_signatures
-    return tuple(signature.args[first:])
-
-
-_N_OWN_JUDGED = 6  # arguments of the health that a tick makes
 _TYPES = (
     types.FunctionType(PROPAGATE),
     types.FunctionType(OBSERVE),
-    _group(TickPlaces, (_I, _I, _I, _I, _I, _I, _I, _M, float64, float64, float64)),
-    _group(RowArrays, _of(rows_at, 2)),
-    _group(ScheduleArrays, (_V, *_of(schedule_tick, 1)[:5])),
-    _group(FilterArrays, _of(run, 0)[:-2]),
-    types.BaseTuple.from_types(_of(judge_tick, _N_OWN_JUDGED)),
-    _group(KeptMemory, (types.UniTuple(kind, 3) for kind in (_V, _M, _I, int64[:, ::1]))),
+    types.NamedTuple((*[_I] * 7, _M, float64, float64, float64), TickPlaces),
+    ROW_ARRAYS,
+    SCHEDULE_ARRAYS,
+    FILTER_ARRAYS,
+    HEALTH_ARRAYS,
+    types.NamedTuple(tuple(types.UniTuple(kind, 3) for kind in (_V, _M, _I, int64[:, ::1])), KeptMemory),
 )
 _MEMORY = _TickMemoryType(tuple(zip(_FIELDS, _TYPES, strict=True)))
 
@@ -135,23 +124,21 @@ def tick_memory(
     rows: RowArrays,
     noise: ScheduleArrays,
     resident: FilterArrays,
-    judged: tuple[Array, ...],
+    judged: HealthArrays,
     kept: KeptMemory,
 ) -> TickMemory:
     """Return a :class:`TickMemory`."""
-    memory = structref.new(_MEMORY)
+    memory: TickMemory = structref.new(_MEMORY)
     memory.propagate, memory.observe = propagate, observe
     memory.places, memory.rows, memory.noise = places, rows, noise
     memory.resident, memory.judged, memory.kept = resident, judged, kept
-    return memory  # type: ignore[no-any-return]
+    return memory
 
 
 @njit(cache=True, error_model="numpy")
-def _write(
-    wheels: Array, places: TickPlaces, rows: RowArrays, resident: FilterArrays, written: Array
-) -> None:
+def _write(wheels: Array, places: TickPlaces, rows: RowArrays, memory: Memory, written: Array) -> None:
     """Write state, slip and what was measured, as :class:`TickOutput`."""
-    e = places.ends
+    e, x, p = places.ends, memory.x, memory.p
     out = TickOutput(
         written[e[0] : e[1]],
         written[e[1] : e[2]],
@@ -164,7 +151,7 @@ def _write(
         written[e[8] : e[9]],
     )
     for i in range(out.mean.size):
-        out.mean[i], out.std[i] = resident.x[i], math.sqrt(resident.p[i, i])
+        out.mean[i], out.std[i] = x[i], math.sqrt(p[i, i])
     for i in range(out.rows.size):
         out.rows[i] = rows.z[i]
     measured, slip = np.empty(3), np.empty((2, 3))
@@ -173,15 +160,15 @@ def _write(
         out.current_a[i] = wheels[places.currents[i]] if places.currents[i] >= 0 else np.nan
         out.wheel_speed_mps[i] = rows.motor_radps[i] / places.reduction_ratio * places.radius_m
         measured[i] = rows.z[i] * places.radius_m
-    age_s = resident.clock[AGE]
+    age_s = memory.clock[AGE]
     for i in range(5):
-        out.motion_and_age[i] = resident.x[places.motion[i]]
+        out.motion_and_age[i] = x[places.motion[i]]
     out.motion_and_age[5] = age_s
     slip[:] = np.nan
     if not math.isinf(age_s) and (age_s <= STALE_AFTER_S or places.slip_states[-1] >= 0):
         instant_slip(
-            resident.x,
-            resident.p,
+            x,
+            p,
             places.positions_m,
             places.slip_states,
             measured,
@@ -206,31 +193,29 @@ def tick(memory: TickMemory, time_s: float, wheels: Array, slot: int, written: A
     """
     places, rows, noise = memory.places, memory.rows, memory.noise
     resident, kept = memory.resident, memory.kept
-    resident.stamps[0] = time_s
-    taken: int = follows(time_s, resident.clock, resident.max_gap_s)
+    sample, moved = resident.samples, resident.memory
+    sample.stamps[0] = time_s
+    taken: int = follows(time_s, moved.clock, resident.noise.max_gap_s)
     if taken == 0:
-        run_resident(resident, memory.propagate, memory.observe)  # for it to count, and to remember a leap
+        run(resident, memory.propagate, memory.observe)  # for it to count, and to remember a leap
         return taken
     z = rows.z
     for i in range(3):
         rows.motor_radps[i] = wheels[places.motors[i]]
-    rows_at(time_s, taken < 0, *rows[:])
+    rows_at(time_s, taken < 0, rows)
     for i in range(places.gnss.size):
         noise.variance[places.gnss[i]] = rows.gnss_variance[i]
-    resident.variances[0, :] = noise.variance
+    sample.variances[0, :] = noise.variance
     if noise.slips.size:
-        schedule_tick(
-            *(z, noise.slips, noise.turn, noise.square_arms_m2, noise.accels, noise.quiet),
-            *(resident.variances[0], resident.walks[0], resident.inputs[0]),
-        )
+        schedule_tick(z, noise, sample.variances[0], sample.walks[0], sample.inputs[0])
     for i in range(places.rows.size):
-        resident.values[0, i] = z[places.rows[i]]
-    run_resident(resident, memory.propagate, memory.observe)
-    judge_tick(time_s, wheels, rows.motor_radps, z, resident.x, resident.use[0], *memory.judged)
+        sample.values[0, i] = z[places.rows[i]]
+    run(resident, memory.propagate, memory.observe)
+    judge_tick(time_s, wheels, rows.motor_radps, z, moved.x, resident.columns.use[0], memory.judged)
     for k in range(3):
         kept.kept_floats[k][slot, :] = kept.floats[k]
         kept.kept_counts[k][slot, :] = kept.counts[k]
-    _write(wheels, places, rows, resident, written)
+    _write(wheels, places, rows, moved, written)
     return taken
 
 

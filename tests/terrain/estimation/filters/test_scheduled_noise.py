@@ -43,11 +43,11 @@ def parts():
 
 def schedule_of(model, noise):
     """Return what gives the noise of a tick by its rows."""
-    variance, *fixed = schedule_arrays(model, noise)
-    given = Given(variance, np.zeros(len(model.states)), np.zeros(len(model.inputs)))
+    fixed = schedule_arrays(model, noise)
+    given = Given(fixed.variance, np.zeros(len(model.states)), np.zeros(len(model.inputs)))
 
     def schedule(z):
-        schedule_tick(np.array(z), *fixed, *given)
+        schedule_tick(np.array(z), fixed, *given)
         return given
 
     return schedule
