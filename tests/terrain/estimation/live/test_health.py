@@ -153,6 +153,14 @@ def test_sound_sensors_stay_fresh(name, terrain):
     assert (after == Health.FRESH).mean() > 0.999
 
 
+def test_sound_sensors_stay_fresh_by_a_filter_without_biases():
+    estimator = LiveEstimator(ROBOT, "slip14")
+    assert not any("bias" in state for state in estimator.states)
+    found = np.array([seen.health for sample in samples() for seen in estimator.step(sample.readings)])
+    assert len(found) > 600
+    assert (found == Health.FRESH).all()
+
+
 def test_a_stop_at_once_on_hard_ground_is_gated_for_a_moment_only():
     """From 1 m/s within 0.2 s: a change of the acceleration that the filter takes for none."""
     time_s, found = clean(STOP, "tiles")
