@@ -358,7 +358,7 @@ def cut_windows(
         cut = _cut_run(run, at, rule, layout)
         parts.append(cut.windows)
         dropped.update(cut.dropped)
-    return WindowCut(_concatenated(parts), dict(dropped))
+    return WindowCut(join_windows(parts), dict(dropped))
 
 
 def _no_windows(rule: WindowRule, layout: Layout) -> Windows:
@@ -386,8 +386,8 @@ def _cut_run(run: RunLog, starts_s: Array, rule: WindowRule, layout: Layout) -> 
     return WindowCut(windows, Counter(str(r) for r in reason[~kept] if r != "incomplete"))
 
 
-def _concatenated(parts: Sequence[Windows]) -> Windows:
-    """Return the windows of all parts, which share channels, rates and length."""
+def join_windows(parts: Sequence[Windows]) -> Windows:
+    """Return the windows of all parts, at least one, which share channels, rates and length."""
     first = parts[0]
     return Windows(
         {name: np.concatenate([part.values[name] for part in parts]) for name in first.values},

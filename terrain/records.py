@@ -103,6 +103,7 @@ class RunLog:
     dropped : what a repairing reader removed, as counts by kind; empty after a strict read
     session : outing that the run is part of, by name: runs of one session share what changes from one to the
         next, as the weather, the ground and how the sensors were mounted; empty where unknown
+    filter : that made the streams ``estimator``, ``slip`` and ``state``, by name; empty without them
     """
 
     run_id: str
@@ -112,6 +113,7 @@ class RunLog:
     source: str = ""
     dropped: Mapping[str, int] = field(default_factory=dict)
     session: str = ""
+    filter: str = ""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "streams", MappingProxyType(dict(self.streams)))

@@ -7,25 +7,35 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from features.windows import cut_windows
+from features.windows import WindowCut, cut_windows, join_windows
 from pipelines.classify.results import Predictions, TargetSlipRow, WindowPrediction
+from pipelines.live.log_windows import lacking_estimates, windows_of_log
 from pipelines.models.model_files import TerrainModel
-from pipelines.runs.datasets import data_digest
+from pipelines.runs.datasets import data_digest, robot_of
 from terrain.control.slip_table import DRIVE_STATES, SlipTable
 from terrain.errors import ConfigError
 from terrain.records import RunLog, SlipTarget
+from terrain.robots import Robot
 
 
 def predict(
-    runs: Sequence[RunLog], model: TerrainModel, table: SlipTable, *, skip_short: bool = False
+    runs: Sequence[RunLog],
+    model: TerrainModel,
+    table: SlipTable,
+    *,
+    robot: Robot | None = None,
+    skip_short: bool = False,
 ) -> Predictions:
     """Predict every window that the model's own rule keeps.
+
+    Where a model uses what a filter estimates and a log has none of it, the live chain runs over the log.
 
     Parameters
     ----------
     runs : run logs, labelled or not
     model : fitted recipe with the rule by which its windows are cut
     table : target slips
+    robot : description of the robot of runs that bear its name; the package's by default
     skip_short : leave out and count runs that are shorter than a window instead of refusing them
 
     Raises
@@ -40,8 +50,11 @@ def predict(
         raise ConfigError(
             f"table {table.name} is for robot {table.robot!r}, run {other.run_id} is of {other.robot!r}"
         )
-    cut = cut_windows(runs, model.rule, layout=model.layout, skip_short=skip_short)
-    windows = cut.windows
+    raw = [run for run in runs if lacking_estimates(run, model.info)]
+    cuts = [_cut(run, model, robot, skip_short=skip_short) for run in runs]
+    windows = join_windows(
+        [cut_windows([], model.rule, layout=model.layout).windows, *(c.windows for c in cuts)]
+    )
     classes = np.asarray(model.recipe.classes_, dtype=str)
     probability = model.recipe.predict_proba(windows) if len(windows) else np.zeros((0, len(classes)))
     best = probability.argmax(axis=1)
@@ -73,10 +86,17 @@ def predict(
         repaired=dict(sum((Counter(run.dropped) for run in runs), Counter())),
         unknown_labels={str(name): int(count) for name, count in zip(unknown, counts, strict=True)},
         n_unknown_labels=int(counts.sum()),
-        dropped=dict(cut.dropped),
+        dropped=dict(sum((Counter(cut.dropped) for cut in cuts), Counter())),
+        filtered=tuple(run.run_id for run in raw),
         table_name=table.name,
         table={terrain: _table_row(found) for terrain, found in targets.items()},
     )
+
+
+def _cut(run: RunLog, model: TerrainModel, robot: Robot | None, *, skip_short: bool) -> WindowCut:
+    if lacking_estimates(run, model.info):
+        return windows_of_log(run, model.info, robot_of(run, robot), skip_short=skip_short)
+    return cut_windows([run], model.rule, layout=model.layout, skip_short=skip_short)
 
 
 def _table_row(targets: Mapping[str, SlipTarget]) -> TargetSlipRow:

@@ -219,6 +219,7 @@ class Predictions:
     unknown_labels : windows by labels that the model was not trained on
     dropped : windows left out, as counts by reason
     table : target slips by terrain
+    filtered : runs that the live chain filtered, as they had no estimates
     """
 
     windows: tuple[WindowPrediction, ...]
@@ -234,6 +235,7 @@ class Predictions:
     dropped: Mapping[str, int]
     table_name: str
     table: Mapping[str, TargetSlipRow]
+    filtered: tuple[str, ...] = ()
     model: str | None = None
     dataset: str | None = None
     skipped: tuple[str, ...] | None = None

@@ -117,6 +117,8 @@ def _accuracy_lines(result: Predictions) -> Iterator[str]:
             else ""
         )
         yield f"accuracy {percent(result.accuracy)} over {result.n_judged} labelled windows{caution}"
+    if result.filtered:
+        yield f"{len(result.filtered)} runs had no estimates: filtered as on the robot, sample by sample"
     for name, count in result.unknown_labels.items():
         yield f"{count} windows are labelled {name}, which the model was not trained on: not judged"
     for text, counts in (("windows left out", result.dropped), ("repaired", result.repaired)):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,11 +14,13 @@ from pipelines.classify.importance import channel_importance
 from pipelines.classify.results import CrossvalReport, Training
 from pipelines.classify.settings import RecipeSettings, TrainSettings
 from pipelines.classify.splits import folds_of
+from pipelines.live.window_feed import ESTIMATED
 from pipelines.models.results import ModelInfo
 from pipelines.reporting.json_file import as_json
 from pipelines.reporting.progress import Progress, silent
 from pipelines.runs.datasets import data_digest
 from terrain import __version__
+from terrain.errors import DataError
 from terrain.records import RunLog, Windows
 
 METRICS = ("accuracy", "balanced_accuracy", "macro_f1", "vote_accuracy", "ece")
@@ -68,14 +71,15 @@ def train(
         progress,
     )
     chosen = recipe[-1].best_._asdict()
-    info = model_info(runs, settings, windows, dataset, code_commit())
+    metrics = _metrics(report)
+    info = replace(model_info(runs, settings, windows, dataset, code_commit()), evaluation=metrics)
     registered = log_training(
         settings.name,
         recipe,
         windows,
         info,
         _params(settings, report, len(windows), dataset, chosen),
-        _metrics(report),
+        metrics,
         {"crossval.json": as_json(report), "importance.json": {"channels": as_json(importance)}},
         all_figures(report, importance),
     )
@@ -121,8 +125,18 @@ def _params(
 def model_info(
     runs: Sequence[RunLog], settings: RecipeSettings, windows: Windows, dataset: str, commit: str
 ) -> ModelInfo:
-    """Return how the training windows were cut, as those of a new log must be, and where they came from."""
+    """Return how the training windows were cut, as those of a new log must be, and where they came from.
+
+    Raises
+    ------
+    DataError
+        if the model uses estimates that several filters made.
+    """
     rule = settings.rule
+    filters = {run.filter for run in runs} if set(ESTIMATED) & set(windows.channels) else {""}
+    if len(filters) > 1:
+        names = " and ".join(sorted(name or "an unknown filter" for name in filters))
+        raise DataError(f"the runs hold estimates of {names}: estimate all of them with one filter")
     return ModelInfo(
         classes=tuple(np.unique(windows.terrain.astype(str)).tolist()),
         window_s=rule.length_s,
@@ -138,4 +152,6 @@ def model_info(
         dataset=dataset,
         commit=commit,
         package_version=__version__,
+        robots=tuple(sorted({run.robot for run in runs})),
+        filter=filters.pop(),
     )

@@ -60,10 +60,12 @@ def predict_command(source: AlignedRunsSettings, settings: PredictSettings, json
     from pipelines.reporting.json_file import write_json
     from pipelines.reporting.terminal import output_console
     from terrain.control.slip_table import load_slip_table
+    from terrain.robots import load_robot
 
     table = load_slip_table(settings.table)
     runs, skipped = load(source)
-    predicted = predict(runs, load_model(settings.model), table, skip_short=source.repair)
+    robot = None if source.robot is None else load_robot(source.robot)
+    predicted = predict(runs, load_model(settings.model), table, robot=robot, skip_short=source.repair)
     result = replace(predicted, model=settings.model, dataset=source.dataset, skipped=tuple(skipped))
     print_predictions(result, output_console())
     write_json(json_file, result)

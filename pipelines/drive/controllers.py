@@ -167,7 +167,7 @@ def drive_once(
     ConfigError
         if the controller needs a classifier and there is none.
     """
-    source = _terrain_source(controller, inputs.model)
+    source = _terrain_source(controller, inputs.model, inputs.robot)
     pilot = LivePilot(inputs.robot, controller.table, source, controller.pilot)
     return simulate(
         inputs.simulated,
@@ -182,7 +182,7 @@ def drive_once(
     )
 
 
-def _terrain_source(controller: Controller, model: TerrainModel | None) -> TerrainSource:
+def _terrain_source(controller: Controller, model: TerrainModel | None, robot: Robot) -> TerrainSource:
     if controller.source is Source.NONE:
         return NoTerrain()
     if controller.source is Source.TRUTH:
@@ -191,4 +191,4 @@ def _terrain_source(controller: Controller, model: TerrainModel | None) -> Terra
         return KnownTerrain(lambda _: controller.known_terrain)
     if model is None:
         raise ConfigError(f"controller {controller.name!r} needs a classifier: give a model")
-    return Classifier(model)
+    return Classifier(model, robot)

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
-import numpy as np
-
-from features.stream import WindowStream
+from pipelines.live.classifying import AtOnce, Classifying, WindowOutput
+from pipelines.live.window_feed import WindowFeed, live_filter, needs_filter
 from pipelines.models.model_files import TerrainModel
 from terrain.errors import DataError
 from terrain.estimation.live.estimate import LiveEstimate
-from terrain.logs.schema import IMU_CHANNELS
-from terrain.records import Array, Reading, Sample
+from terrain.estimation.live.estimator import CHANNELS
+from terrain.extension import correct_live
+from terrain.records import Sample
+from terrain.robots import Robot
+
+PILOT_FILTER = "vio15"
+"""Filter of :class:`pipelines.live.pilot.LivePilot`."""
 
 
 class TerrainEstimate(NamedTuple):
@@ -22,16 +26,6 @@ class TerrainEstimate(NamedTuple):
     time_s: float
     terrain: str
     probability: float
-
-
-def readable(reading: Reading | None, n_columns: int) -> Reading | None:
-    """Return a reading as arrays (k,) and (k, n_columns), k at least 1; None where it is not that."""
-    try:
-        time_s, values = (np.asarray(part, dtype=np.float64) for part in reading or ())
-    except (TypeError, ValueError):
-        return None
-    fits = time_s.ndim == 1 and time_s.size and values.shape == (time_s.size, n_columns)
-    return Reading(time_s, values) if fits else None
 
 
 class TerrainSource(Protocol):
@@ -86,40 +80,14 @@ class KnownTerrain:
         return [TerrainEstimate(sample.time_s, self._name_of(sample.terrain), 1.0)]
 
 
-_COMPUTED: dict[str, Callable[[LiveEstimate], Array]] = {
-    "wheels": lambda estimate: np.concatenate(
-        [estimate.motor_radps, estimate.current_a, estimate.wheel_speed_mps]
-    ),
-    "estimator": lambda estimate: np.array(
-        [
-            estimate.speed_x_mps,
-            estimate.speed_y_mps,
-            estimate.yaw_rate_radps,
-            estimate.accel_x_mps2,
-            estimate.accel_y_mps2,
-        ]
-    ),
-    "slip": lambda estimate: estimate.slip_ratio,
-}
-_COLUMNS: dict[str, tuple[str, ...]] = {
-    "wheels": tuple(
-        f"{name.format(i)}" for name in ("motor_{}_radps", "current_{}_a", "speed_{}_mps") for i in (1, 2, 3)
-    ),
-    "estimator": ("speed_x_mps", "speed_y_mps", "yaw_rate_radps", "accel_x_mps2", "accel_y_mps2"),
-    "slip": tuple(f"slip_{i}_ratio" for i in (1, 2, 3)),
-    "imu": IMU_CHANNELS,
-}
-
-
 class Classifier:
     """The output of a model for each live window, cut as the windows of its training.
-
-    Windows hold the channels that ``pipelines.estimate.estimate.enriched`` adds to a log, computed live:
-    wheel speeds beside motor rates, the estimator's states, slip, and the IMU.
 
     Parameters
     ----------
     model : fitted on such windows
+    robot : that is driven
+    classifying : where windows are classified; at once by default
 
     Attributes
     ----------
@@ -128,26 +96,23 @@ class Classifier:
     Raises
     ------
     DataError
-        if the model requires a stream or a channel that is not computed live.
+        if the model requires a stream or a channel that is not computed live, or was trained on the estimates
+        of another filter than the pilot's.
     """
 
     certain = False
 
-    def __init__(self, model: TerrainModel) -> None:
-        layout = model.layout
-        for stream, channels in layout.channels.items():
-            lacking = sorted(set(channels) - set(_COLUMNS.get(stream, ())))
-            if lacking:
-                raise DataError(
-                    f"the model requires {lacking[0]!r} of the stream {stream!r}, which is not computed live"
-                )
-        self._recipe: Any = model.recipe
-        self._classes = [str(name) for name in model.recipe.classes_]
-        self._stream = WindowStream(model.rule, layout)
-        self._columns = {
-            stream: np.array([_COLUMNS[stream].index(channel) for channel in channels])
-            for stream, channels in layout.channels.items()
-        }
+    def __init__(self, model: TerrainModel, robot: Robot, classifying: Classifying | None = None) -> None:
+        driven, _ = correct_live(robot)
+        if needs_filter(model.info, CHANNELS) and live_filter(model.info, driven) != PILOT_FILTER:
+            raise DataError(
+                f"the model was trained on estimates of the filter {model.info.filter!r}; the pilot runs "
+                f"{PILOT_FILTER!r}"
+            )
+        self.model = model
+        self.last: WindowOutput | None = None
+        self._feed = WindowFeed(model.info, CHANNELS, driven)
+        self._classifying = AtOnce() if classifying is None else classifying
         self.failed: Counter[str] = Counter()
 
     @property
@@ -155,25 +120,21 @@ class Classifier:
         """Number of windows that the model refused."""
         return self.failed.total()
 
+    @property
+    def dropped(self) -> dict[str, int]:
+        """Windows and samples that were not used, as counts by kind."""
+        counts = self._feed.dropped | {f"window: refused, {why}": n for why, n in self.failed.items()}
+        return counts | ({"window: overrun": n} if (n := self._classifying.n_overrun) else {})
+
     def update(self, sample: Sample, estimates: Sequence[LiveEstimate]) -> list[TerrainEstimate]:
-        """Return the terrain of each window that is complete by now."""
-        windows = []
-        imu = readable(sample.readings.get("imu"), len(IMU_CHANNELS))
-        if imu is not None and "imu" in self._columns:
-            for time_s, values in zip(imu.time_s.tolist(), imu.values[:, self._columns["imu"]], strict=True):
-                windows += self._stream.push("imu", time_s, values)
-        for estimate in estimates:
-            for stream, compute in _COMPUTED.items():
-                if stream in self._columns:
-                    values = compute(estimate)[self._columns[stream]]
-                    windows += self._stream.push(stream, estimate.time_s, values)
+        """Return the terrain of each window whose output is there by now."""
+        for window in self._feed.push(sample.readings, estimates):
+            self._classifying.submit(self.model, window)
         found: list[TerrainEstimate] = []
-        for window in windows:
-            try:
-                probability = self._recipe.predict_proba(window)[0]
-            except (ValueError, DataError) as error:  # a window of broken samples must not stop the loop
-                self.failed[str(error)] += 1
-                continue
-            best = int(probability.argmax())
-            found.append(TerrainEstimate(sample.time_s, self._classes[best], float(probability[best])))
+        for output in self._classifying.finished():
+            self.last = output
+            if output.refused:
+                self.failed[output.refused] += 1
+            else:
+                found.append(TerrainEstimate(sample.time_s, output.terrain, output.probability))
         return found

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Self
 
 from features.windows import Layout, SteadyMotion, WindowRule
@@ -32,6 +32,9 @@ class ModelInfo:
     recipe, signal_sets, seed : what was trained
     data_digest, dataset : of the training runs
     commit, package_version : of the code
+    robots : whose runs the training runs were, by name
+    filter : that made the streams ``estimator`` and ``slip``; empty where the model uses neither
+    evaluation : figures on held-out runs by name, as ``accuracy``; empty where it was not evaluated
     """
 
     classes: tuple[str, ...]
@@ -48,6 +51,9 @@ class ModelInfo:
     dataset: str = ""
     commit: str = ""
     package_version: str = ""
+    robots: tuple[str, ...] = ()
+    filter: str = ""
+    evaluation: Mapping[str, float] = field(default_factory=dict)
 
     @classmethod
     def from_json(cls, document: Mapping[str, Any]) -> Self:
@@ -57,7 +63,7 @@ class ModelInfo:
             "steady": None if steady is None else SteadyMotion(**steady),
             "channels": {stream: tuple(names) for stream, names in document["channels"].items()},
         }
-        for name in ("classes", "run_digests", "signal_sets"):
+        for name in ("classes", "run_digests", "signal_sets", "robots"):
             changed[name] = tuple(document.get(name, ()))
         return cls(**{**document, **changed})
 

@@ -31,7 +31,7 @@ def enriched(estimate: Estimate) -> RunLog:
     streams["estimator"] = Stream(track.time_s, values, channels)
     streams["slip"] = estimate.slip.as_stream()
     streams["state"] = _state_stream(estimate)
-    return replace(run, streams=streams)
+    return replace(run, streams=streams, filter=estimate.name)
 
 
 def _state_stream(estimate: Estimate) -> Stream:

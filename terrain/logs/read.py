@@ -25,7 +25,8 @@ One folder per run holds ``run.json`` and one Parquet file per stream::
 Times are seconds on the clock of the run and strictly increase.  A label holds from ``start_s`` to just
 before ``end_s``; labels do not overlap.  Each channel is named with its SI unit word, which is written
 beside it too.  ``dropped`` (may be left out) counts what a repairing reader took away before; ``session``
-(may be left out) names the outing that the run is part of.
+(may be left out) names the outing that the run is part of, ``filter`` the one that made the streams
+``estimator``, ``slip`` and ``state``.
 """
 
 from __future__ import annotations
@@ -108,6 +109,7 @@ def read_run(folder: str | Path, *, repair: bool = False) -> RunLog:
         source=_entry(place, head, "source", str),
         dropped=dropped,
         session=_entry(place, {"session": ""} | head, "session", str),
+        filter=_entry(place, {"filter": ""} | head, "filter", str),
     )
 
 

@@ -60,6 +60,7 @@ def write_run(run: RunLog, folder: str | Path, *, replace: bool = False) -> Path
         "run_id": run.run_id,
         "robot": run.robot,
         **({"session": run.session} if run.session else {}),
+        **({"filter": run.filter} if run.filter else {}),
         "source": run.source,
         "labels": [label._asdict() for label in run.labels],
         "streams": {

@@ -143,7 +143,7 @@ class Scripted:
 
 def scripted(monkeypatch, probability, names=("plain", "thesis", "thesis:classified", "classified")):
     """The drives on grass, with a classifier of that probability."""
-    monkeypatch.setattr(controllers, "Classifier", lambda model: Scripted("grass", probability))
+    monkeypatch.setattr(controllers, "Classifier", lambda model, robot: Scripted("grass", probability))
     settings = SHORT.with_(controllers=names, seeds=2, duration_s=16.0, jobs=1)
     model = TerrainModel(None, None)  # which only the source uses
     return drive(settings, DriveInputs(ROBOT, TABLE, model))

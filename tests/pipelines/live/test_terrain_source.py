@@ -68,21 +68,21 @@ def estimated(run):
 def live(classifier, run, change=lambda sample: sample):
     """The outputs of a classifier for a replayed run, and its windows."""
     estimator, shown, found = LiveEstimator(ROBOT), [], []
-    push = classifier._stream.push
+    push = classifier._feed.push
 
     def keep(*sample):
         windows = push(*sample)
         shown.extend(windows)
         return windows
 
-    classifier._stream.push = keep
+    classifier._feed.push = keep
     for sample in map(change, replay(run)):
         found += classifier.update(sample, estimator.step(sample.readings))
     return found, shown
 
 
 def test_live_windows_and_outputs_equal_those_of_the_enriched_log(model, log):
-    found, shown = live(Classifier(model), log)
+    found, shown = live(Classifier(model, ROBOT), log)
     batch = cut_windows([estimated(log)], model.rule, layout=model.layout).windows
     assert len(shown) == len(batch) == len(found) > 5
     for k, window in enumerate(shown):
@@ -99,7 +99,7 @@ def test_live_windows_and_outputs_equal_those_of_the_enriched_log(model, log):
 
 
 def test_a_pilot_accepts_the_classification(model, log):
-    pilot = LivePilot(ROBOT, load_slip_table(), Classifier(model))
+    pilot = LivePilot(ROBOT, load_slip_table(), Classifier(model, ROBOT))
     accepted = [pilot.step(sample).status["terrain_code"] for sample in replay(log)]
     assert pilot.terrains[int(accepted[-1])] == "grass"
     assert set(accepted) == {-1.0, accepted[-1]}
@@ -108,7 +108,7 @@ def test_a_pilot_accepts_the_classification(model, log):
 def test_the_belief_of_a_classifier_ends_when_a_sensor_of_its_windows_is_lost(model, log):
     """Windows need the IMU: after 5 s of driving without one the terrain is unknown."""
     switching = SWITCHING._replace(unconfirmed_max_s=5.0)
-    pilot = LivePilot(ROBOT, load_slip_table(), Classifier(model), PilotSettings(switching=switching))
+    pilot = LivePilot(ROBOT, load_slip_table(), Classifier(model, ROBOT), PilotSettings(switching=switching))
     seen = []
     for sample in replay(log):
         if sample.time_s > 12.0:
@@ -129,7 +129,7 @@ def test_the_belief_of_a_classifier_ends_when_a_sensor_of_its_windows_is_lost(mo
 
 
 def test_a_belief_outlasts_a_stop(model, log):
-    pilot = LivePilot(ROBOT, load_slip_table(), Classifier(model))
+    pilot = LivePilot(ROBOT, load_slip_table(), Classifier(model, ROBOT))
     for sample in replay(log):
         last = pilot.step(sample).status
     assert last["terrain_code"] >= 0
@@ -160,8 +160,8 @@ def test_invalid_readings_cost_windows_and_no_more(model, log, make):
             return sample
         return sample._replace(readings={name: make(width) for name, width in WIDTHS.items()})
 
-    found, _ = live(Classifier(model), log, spoil)
-    whole, _ = live(Classifier(model), log)
+    found, _ = live(Classifier(model, ROBOT), log, spoil)
+    whole, _ = live(Classifier(model, ROBOT), log)
     assert [one[:2] for one in found[-3:]] == [one[:2] for one in whole[-3:]]
     assert [one.probability for one in found[-3:]] == pytest.approx(
         [one.probability for one in whole[-3:]], abs=0.01
@@ -180,7 +180,7 @@ def test_a_window_that_the_model_refuses_is_counted_and_raises_nothing(model, lo
                 raise ValueError("Input X contains NaN.")
             return model.recipe.predict_proba(windows)
 
-    classifier = Classifier(model._replace(recipe=Refusing()))
+    classifier = Classifier(model._replace(recipe=Refusing()), ROBOT)
     found, shown = live(classifier, log)
     assert classifier.failed == {"Input X contains NaN.": (len(shown) + 1) // 2}
     assert classifier.n_refused == (len(shown) + 1) // 2
@@ -196,10 +196,9 @@ def test_a_model_that_requires_a_missing_channel_is_refused(model, stream, chann
     rates = {**model.info.rate_hz, stream: 50.0}
     wanting = model._replace(info=replace(model.info, channels=channels, rate_hz=rates))
     with pytest.raises(DataError) as refused:
-        Classifier(wanting)
-    assert (
-        str(refused.value)
-        == f"the model requires {channel!r} of the stream {stream!r}, which is not computed live"
+        Classifier(wanting, ROBOT)
+    assert str(refused.value).startswith(
+        f"the model requires {channel!r} of the stream {stream!r}, which is neither measured nor estimated"
     )
 
 

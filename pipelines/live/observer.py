@@ -1,0 +1,220 @@
+"""Terrain and target slip of any robot with a model, from samples as they come."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from pipelines.live.classifying import AtOnce, Classifying, WindowOutput
+from pipelines.live.window_feed import Estimate, WindowFeed, live_filter, needs_filter
+from pipelines.models.model_files import TerrainModel
+from pipelines.models.results import ModelInfo
+from terrain.control.slip_table import SlipTable, load_slip_table
+from terrain.control.switching import (
+    NO_BELIEF,
+    SWITCHING,
+    SwitchSettings,
+    TerrainBelief,
+    check_switching,
+    drive_on,
+    update,
+)
+from terrain.errors import ConfigError
+from terrain.estimation.live.estimator import CHANNELS, LiveEstimator
+from terrain.estimation.live.skid_live import LiveSkidEstimator
+from terrain.extension import correct_live
+from terrain.records import Reading, SlipTarget
+from terrain.robots import Robot
+
+LONGEST_STEP_S = 1.0
+"""A longer time between two samples of the wheels is no driving time."""
+
+
+class TerrainObservation(NamedTuple):
+    """What one window tells.
+
+    Parameters
+    ----------
+    start_s, end_s : of the window, on the clock of the samples
+    terrain, probability : class of the largest probability; empty and NaN where the model refused the window
+    probabilities : of each class
+    target : target slip of that terrain, by drive state
+    refused : why there is no class; empty where there is one
+    """
+
+    start_s: float
+    end_s: float
+    terrain: str
+    probability: float
+    probabilities: Mapping[str, float]
+    target: Mapping[str, SlipTarget]
+    refused: str = ""
+
+
+class TerrainObserver:
+    """The terrain under a robot and its target slips, from its samples.
+
+    Parameters
+    ----------
+    model : that classifies
+    table : of target slips; the packaged one by default
+    robot : its description; needed where the model uses what a filter estimates, or wheel speeds that are
+        computed from motor rates
+    channels : of each stream, in the order of the columns of its samples; those of the model by default
+    classifying : where windows are classified; at once by default
+    switching : when a class is accepted as the terrain (:attr:`belief`)
+
+    Attributes
+    ----------
+    refused : number of windows that the model refused, by message
+
+    Raises
+    ------
+    DataError
+        if the model needs a channel that is neither measured nor estimated.
+    ConfigError
+        if the table is another robot's, or a setting is not accepted.
+
+    Notes
+    -----
+    Fed with a log in order of time, it gives the windows and probabilities that
+    :func:`pipelines.classify.predict.predict` gives for it.  Whatever arrives, :meth:`update` does not raise.
+    """
+
+    def __init__(
+        self,
+        model: TerrainModel,
+        table: SlipTable | None = None,
+        robot: Robot | None = None,
+        channels: Mapping[str, Sequence[str]] | None = None,
+        *,
+        classifying: Classifying | None = None,
+        switching: SwitchSettings = SWITCHING,
+    ) -> None:
+        self.table = load_slip_table() if table is None else table
+        if robot is not None and self.table.robot and self.table.robot != robot.name:
+            raise ConfigError(
+                f"slip table {self.table.name}: is of the robot {self.table.robot!r}, not of {robot.name!r}"
+            )
+        check_switching(switching)
+        self.model, self.switching = model, switching
+        self.channels = {stream: tuple(names) for stream, names in (channels or model.info.channels).items()}
+        self._filter = None
+        corrected = robot
+        if robot is not None:
+            self._filter, corrected = live_estimator(model.info, robot, self.channels)
+        self._feed = WindowFeed(model.info, self.channels, corrected)
+        self._classifying = AtOnce() if classifying is None else classifying
+        self._speed_columns, self._mps_per_unit = _speeds(self.channels.get("wheels", ()), corrected)
+        self._latest: Estimate | None = None
+        self._wheels_s = math.nan
+        self.belief: TerrainBelief = NO_BELIEF
+        self.refused: Counter[str] = Counter()
+
+    @property
+    def estimate(self) -> Estimate | None:
+        """Last estimate of the motion; None before the first, and where the model needs none."""
+        return self._latest
+
+    @property
+    def dropped(self) -> dict[str, int]:
+        """What was not used so far, as counts by kind."""
+        counts = dict(self._feed.dropped)
+        counts |= {f"window: refused, {why}": n for why, n in self.refused.items()}
+        if self._classifying.n_overrun:
+            counts["window: overrun"] = self._classifying.n_overrun
+        return counts | (dict(self._filter.dropped) if self._filter is not None else {})
+
+    def update(self, samples: Mapping[str, Reading]) -> list[TerrainObservation]:
+        """Take what was measured since the last call; return what has been found, in most calls nothing.
+
+        Parameters
+        ----------
+        samples : by stream, stamps ``(k,)`` and values ``(k, channels)`` in order of time
+        """
+        if not isinstance(samples, Mapping):
+            return []
+        estimates: Sequence[Estimate] = ()
+        if self._filter is not None:
+            estimates = self._filter.step(samples)
+            if estimates:
+                self._latest = estimates[-1]
+        for window in self._feed.push(samples, estimates):
+            self._classifying.submit(self.model, window)
+        self._drive_on(samples)
+        return [self._observed(output) for output in self._classifying.finished()]
+
+    def _observed(self, output: WindowOutput) -> TerrainObservation:
+        if output.refused:
+            self.refused[output.refused] += 1
+        else:
+            self.belief = update(
+                self.belief, output.end_s, output.terrain, output.probability, self.switching
+            )
+        return TerrainObservation(
+            output.start_s,
+            output.end_s,
+            output.terrain,
+            output.probability,
+            dict(zip(output.classes, output.probabilities.tolist(), strict=True)),
+            self.table.lookup(output.terrain),
+            output.refused,
+        )
+
+    def _drive_on(self, samples: Mapping[str, Reading]) -> None:
+        """Let the belief age by the time that the robot drove."""
+        reading = samples.get("wheels")
+        if reading is None or not self._speed_columns:
+            return
+        try:
+            time_s = float(reading.time_s[-1])
+            speeds = np.abs(np.asarray(reading.values, dtype=float)[-1, self._speed_columns])
+        except (TypeError, ValueError, LookupError, AttributeError, OverflowError):
+            return
+        dt_s, self._wheels_s = time_s - self._wheels_s, time_s
+        if 0.0 < dt_s <= LONGEST_STEP_S:
+            speed_mps = float(np.nanmax(speeds, initial=0.0)) * self._mps_per_unit
+            self.belief = drive_on(self.belief, speed_mps, dt_s, self.switching)
+
+
+def _speeds(wheels: Sequence[str], robot: Robot | None) -> tuple[list[int], float]:
+    """Return the columns that tell how fast the wheels turn, and what makes them speeds in m/s."""
+    columns = [i for i, name in enumerate(wheels) if name.startswith("speed_")]
+    if columns or robot is None or not robot.describes("motors"):
+        return columns, 1.0
+    motors = [i for i, name in enumerate(wheels) if name.startswith("motor_")]
+    return motors, robot.wheel_radius_m / robot.motors.reduction_ratio
+
+
+def live_estimator(
+    info: ModelInfo, robot: Robot, channels: Mapping[str, Sequence[str]]
+) -> tuple[LiveEstimator | LiveSkidEstimator | None, Robot]:
+    """Return the filter whose estimates a model needs, or None, and the robot as filters take it.
+
+    Raises
+    ------
+    DataError
+        if the robot does not run the filter that the model was trained with.
+    ConfigError
+        if a channel that the filter needs is not measured.
+    """
+    driven, correction = correct_live(robot)
+    if not needs_filter(info, channels):
+        return None, driven
+    name = live_filter(info, driven)
+    known = {stream: tuple(names) for stream, names in channels.items()}
+    if name != "skid":
+        read = {stream: names for stream, names in known.items() if stream in CHANNELS}
+        return LiveEstimator(driven, name, read, correction=correction), driven
+    periods = {stream: 1.0 / rate for stream, rate in info.rate_hz.items()}
+    return LiveSkidEstimator(
+        driven,
+        known,
+        wheels_period_s=periods.get("wheels"),
+        imu_period_s=periods.get("imu"),
+        correction=correction,
+    ), driven

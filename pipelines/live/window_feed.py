@@ -1,0 +1,193 @@
+"""The windows of a model, cut from samples as they come: measured channels, and those that a filter adds."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from features.stream import WindowStream
+from pipelines.models.results import ModelInfo
+from terrain.errors import DataError
+from terrain.estimation.enriched import ESTIMATOR_CHANNELS
+from terrain.estimation.live.estimate import LiveEstimate
+from terrain.estimation.live.skid_live import LiveSkidEstimate
+from terrain.records import Array, Reading, Windows
+from terrain.robots import Robot
+
+Estimate = LiveEstimate | LiveSkidEstimate
+
+LIVE_FILTERS: Mapping[str, tuple[str, ...]] = {
+    "swerve": ("vio15", "vio12", "slip14", "encoder12"),
+    "skid_steer": ("skid",),
+}
+"""Filters that run sample by sample, by drive; the first is used where a model names none."""
+
+ESTIMATED = ("estimator", "slip")
+"""Streams that a filter adds to what is measured."""
+
+
+def needs_filter(info: ModelInfo, channels: Mapping[str, Sequence[str]]) -> bool:
+    """Say whether a model needs a stream that only a filter gives."""
+    return any(stream in info.channels and stream not in channels for stream in ESTIMATED)
+
+
+def live_filter(info: ModelInfo, robot: Robot) -> str:
+    """Return the filter that gives what a model was trained on.
+
+    Raises
+    ------
+    DataError
+        if that filter is none of the robot's.
+    """
+    filters = LIVE_FILTERS.get(robot.drive, ())
+    name = info.filter or (filters[0] if filters else "")
+    if name not in filters:
+        raise DataError(
+            f"the model was trained on estimates of the filter {name!r}, which robot {robot.name} does not "
+            f"run live (its filters: {', '.join(filters) or 'none'})"
+        )
+    return name
+
+
+class WindowFeed:
+    """Cut the windows of a model from readings and estimates.
+
+    Wheel speeds are computed from motor rates as :func:`terrain.kinematics.wheel_speed.with_wheel_speeds`
+    does, ``estimator`` and ``slip`` are those of :func:`terrain.estimation.enriched.enriched`; all else is
+    measured.  The windows are those that :func:`features.windows.cut_windows` cuts from such a log.
+
+    Parameters
+    ----------
+    info : of the model
+    channels : of each stream that is measured, in the order of the columns of its readings
+    robot : corrected; may be missing where every channel of the model is measured
+
+    Attributes
+    ----------
+    unreadable : number of readings that were no arrays of the right shape, by stream
+
+    Raises
+    ------
+    DataError
+        if the model needs a channel that is neither measured nor estimated.
+
+    Examples
+    --------
+    >>> info = ModelInfo(("grass",), 1.0, None, None, {"imu": ("gyro_z_radps",)}, {"imu": 10.0}, ())
+    >>> feed = WindowFeed(info, {"imu": ("accel_x_mps2", "gyro_z_radps")})
+    >>> time_s = np.arange(12) / 10
+    >>> window, = feed.push({"imu": Reading(time_s, np.column_stack([time_s, -time_s]))})
+    >>> float(window.values["imu"][0, 0, -1])
+    -0.9
+    """
+
+    def __init__(
+        self, info: ModelInfo, channels: Mapping[str, Sequence[str]], robot: Robot | None = None
+    ) -> None:
+        self.info = info
+        self.unreadable: Counter[str] = Counter()
+        self._stream = WindowStream(info.rule, info.layout)
+        self._measured: dict[str, tuple[int, Callable[[Array], Array]]] = {}
+        self._estimated: dict[str, Callable[[Any], Array]] = {}
+        for stream, needed in info.channels.items():
+            if stream in channels:
+                self._measured[stream] = (
+                    len(channels[stream]),
+                    _columns(stream, needed, list(channels[stream]), robot),
+                )
+            elif stream in ESTIMATED and robot is not None and robot.drive in LIVE_FILTERS:
+                self._estimated[stream] = _estimates(stream, needed, robot)
+            else:
+                raise DataError(
+                    f"the model requires {needed[0]!r} of the stream {stream!r}, which is neither measured "
+                    f"nor estimated here (there are {', '.join(channels) or 'no streams'})"
+                )
+
+    @property
+    def dropped(self) -> dict[str, int]:
+        """Windows and samples that were not used, as counts by kind."""
+        counts = {f"window: {reason}": n for reason, n in self._stream.dropped.items()}
+        counts |= {f"{name}: {why}": n for (name, why), n in self._stream.dropped_samples.items()}
+        return counts | {f"{name}: unreadable": n for name, n in self.unreadable.items()}
+
+    @property
+    def silent_streams(self) -> tuple[str, ...]:
+        """Streams that no windows can be cut for, as they have stopped."""
+        return self._stream.silent_streams
+
+    def push(self, readings: Mapping[str, Reading], estimates: Sequence[Estimate] = ()) -> list[Windows]:
+        """Take what was measured and estimated since the last call; return the windows it completes."""
+        windows: list[Windows] = []
+        push = self._stream.push
+        for stream, (n_columns, columns) in self._measured.items():
+            if stream not in readings:
+                continue
+            reading = readable(readings[stream], n_columns)
+            if reading is None:
+                self.unreadable[stream] += 1
+                continue
+            for time_s, values in zip(reading.time_s.tolist(), columns(reading.values), strict=True):
+                windows += push(stream, time_s, values)
+        for estimate in estimates:
+            for stream, compute in self._estimated.items():
+                windows += push(stream, estimate.time_s, compute(estimate))
+        return windows
+
+
+def readable(reading: Any, n_columns: int) -> Reading | None:
+    """Return a reading as arrays (k,) and (k, n_columns), k at least 1; None where it is not that."""
+    try:
+        time_s, values = (np.asarray(part, dtype=np.float64) for part in reading or ())
+    except (TypeError, ValueError, OverflowError):
+        return None
+    fits = time_s.ndim == 1 and time_s.size and values.shape == (time_s.size, n_columns)
+    return Reading(time_s, values) if fits else None
+
+
+def _columns(
+    stream: str, needed: Sequence[str], measured: list[str], robot: Robot | None
+) -> Callable[[Array], Array]:
+    """Return what takes the channels of a model out of the columns that are measured."""
+    rates = () if robot is None else tuple(f"motor_{wheel}_radps" for wheel in robot.wheels)
+    if robot is not None and stream == "wheels" and rates and set(rates) <= set(measured):
+        speeds = [f"speed_{wheel}_mps" for wheel in robot.wheels]
+        kept = [i for i, channel in enumerate(measured) if channel not in speeds]
+        motors = [measured.index(rate) for rate in rates]
+        ratio, radius_m = robot.motors.reduction_ratio, robot.wheel_radius_m
+        order = _places(stream, needed, [*(measured[i] for i in kept), *speeds])
+
+        def with_speeds(values: Array) -> Array:
+            speed_mps = values[:, motors] / ratio * radius_m
+            return np.hstack([values[:, kept], speed_mps])[:, order]
+
+        return with_speeds
+    places = _places(stream, needed, measured)
+    return lambda values: values[:, places]
+
+
+def _estimates(stream: str, needed: Sequence[str], robot: Robot) -> Callable[[Any], Array]:
+    """Return what takes the channels of a model out of an estimate."""
+    if stream == "slip":
+        places = _places(stream, needed, [f"slip_{wheel}_ratio" for wheel in robot.wheels])
+        if robot.drive == "skid_steer":  # nothing sees the ground go by
+            unknown = np.full(len(places), np.nan)
+            return lambda _: unknown
+        return lambda estimate: np.asarray(estimate.slip_ratio)[places]
+    known = [
+        channel for channel in ESTIMATOR_CHANNELS if robot.drive == "swerve" or channel == "yaw_rate_radps"
+    ]
+    _places(stream, needed, known)
+    return lambda estimate: np.array([getattr(estimate, channel) for channel in needed])
+
+
+def _places(stream: str, needed: Sequence[str], known: list[str]) -> list[int]:
+    lacking = [channel for channel in needed if channel not in known]
+    if lacking:
+        raise DataError(
+            f"the model requires {lacking[0]!r} of the stream {stream!r}, which is neither measured nor "
+            f"estimated here (there are {', '.join(known)})"
+        )
+    return [known.index(channel) for channel in needed]

@@ -1,0 +1,242 @@
+"""The live observer gives the terrain that the log gives, of every robot, and no input stops it."""
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipelines.classify.crossval import samples_of
+from pipelines.classify.predict import predict
+from pipelines.classify.settings import CrossvalSettings
+from pipelines.classify.train import model_info
+from pipelines.live.observer import TerrainObserver
+from pipelines.models.model_files import TerrainModel
+from pipelines.runs.datasets import load_runs
+from terrain.control.slip_table import load_slip_table
+from terrain.errors import ConfigError, DataError
+from terrain.estimation.enriched import enriched
+from terrain.estimation.estimate import estimate_run
+from terrain.logs.replay import replay
+from terrain.records import Reading, RunLog, Stream
+from terrain.robots import load_robot
+from terrain.simulation.run import simulate_run
+
+AGRIMARO, HUSKY = load_robot("agrimaro"), load_robot("husky")
+DATA = Path(os.environ.get("TERRAIN_DATA", "/nowhere"))
+
+
+def trained(runs):
+    settings = CrossvalSettings()
+    windows = samples_of(runs, settings).cut.windows
+    recipe = settings.new_recipe().fit(windows, windows.terrain.astype(str))
+    return TerrainModel(recipe, model_info(runs, settings, windows, "drawn", ""))
+
+
+def simulated(terrain, number, duration_s=25.0):
+    return simulate_run(AGRIMARO, terrain, "survey", 5, number, duration_s=duration_s)
+
+
+@pytest.fixture(scope="module")
+def swerve_model():
+    """Trained on what a filter adds to simulated runs."""
+    return trained(
+        [
+            enriched(estimate_run(simulated(terrain, number), AGRIMARO, "vio15"))
+            for terrain in ("grass", "tiles")
+            for number in (1, 2)
+        ]
+    )
+
+
+def observed(observer, run, rate_hz=50.0):
+    return [one for sample in replay(run, rate_hz) for one in observer.update(sample.readings)]
+
+
+def channels_of(run):
+    return {name: stream.channels for name, stream in run.streams.items()}
+
+
+def assert_same(found, rows):
+    assert [(one.start_s, one.terrain) for one in found] == [(row.start_s, row.terrain) for row in rows]
+    assert [one.probability for one in found] == pytest.approx([row.probability for row in rows], abs=1e-12)
+    for one, row in zip(found, rows, strict=True):
+        assert {state: target.slip_ratio for state, target in one.target.items()} == row.target_slip
+
+
+def test_a_raw_log_is_filtered_by_predict_and_live_alike(swerve_model):
+    run = simulated("grass", 7)
+    result = predict([run], swerve_model, load_slip_table())
+    assert result.filtered == (run.run_id,)
+    assert result.n_windows > 5
+    assert result.n_judged == result.n_windows
+    found = observed(TerrainObserver(swerve_model, robot=AGRIMARO, channels=channels_of(run)), run)
+    assert_same(found, result.windows)
+
+
+def test_a_filtered_log_and_a_raw_one_give_the_same_terrain_but_for_what_a_log_sees_ahead(swerve_model):
+    """The filter of a log takes latencies off, which a live one cannot: nearly all windows agree."""
+    run = simulated("grass", 7)
+    raw = predict([run], swerve_model, load_slip_table())
+    whole = predict([enriched(estimate_run(run, AGRIMARO, "vio15"))], swerve_model, load_slip_table())
+    assert whole.filtered == ()
+    assert [row.start_s for row in raw.windows] == [row.start_s for row in whole.windows]
+    same = [a.terrain == b.terrain for a, b in zip(raw.windows, whole.windows, strict=True)]
+    assert np.mean(same) >= 0.9
+
+
+def test_the_belief_follows_windows_that_agree_and_ends_with_driving_on_in_silence(swerve_model):
+    run = simulated("grass", 8)
+    observer = TerrainObserver(swerve_model, robot=AGRIMARO, channels=channels_of(run))
+    assert observer.belief.terrain == ""
+    observed(observer, run)
+    assert observer.belief.terrain == "grass"
+    wheels, end_s = run.streams["wheels"], run.streams["wheels"].time_s[-1]
+    for k in range(1, 12 * 50):
+        observer.update({"wheels": Reading(np.array([end_s + k / 50]), wheels.values[-200:-199])})
+    assert observer.belief.terrain == ""
+
+
+@pytest.mark.parametrize("set_name", ["borealtc", "vulpi"])
+def test_live_equals_the_log_on_all_measured_runs(set_name):
+    if not (DATA / set_name).is_dir():
+        pytest.skip(f"TERRAIN_DATA has no {set_name}")
+    runs = load_runs(DATA / set_name)
+    model = trained(runs[:: max(len(runs) // 9, 1)])
+    result = predict(runs, model, load_slip_table(), skip_short=True)
+    by_run = {run.run_id: [] for run in runs}
+    for row in result.windows:
+        by_run[row.run_id].append(row)
+    for run in runs:
+        found = observed(TerrainObserver(model, channels=channels_of(run)), run, rate_hz=10.0)
+        assert_same(found, by_run[run.run_id])
+    assert result.n_windows > 200
+
+
+def test_a_skid_steer_robot_is_filtered_where_its_model_needs_the_filter():
+    if not (DATA / "vulpi").is_dir():
+        pytest.skip("TERRAIN_DATA has no vulpi")
+    runs = load_runs(DATA / "vulpi")
+    model = trained([enriched(estimate_run(run, HUSKY, "skid")) for run in runs[::2]])
+    assert model.info.filter == "skid"
+    assert model.info.robots == ("husky",)
+    rows = predict(runs[5:6], model, load_slip_table()).windows
+    assert len(rows) > 5
+    observer = TerrainObserver(model, robot=HUSKY, channels=channels_of(runs[5]))
+    assert_same(observed(observer, runs[5]), rows)
+    assert observer.estimate.speed_mps > 0.1
+
+
+def two_drives():
+    rng = np.random.default_rng(1)
+    runs = []
+    for terrain, noise in (("a", 0.1), ("b", 2.0)):
+        for number in range(3):
+            time_s = np.arange(0, 12, 0.02)
+            shaking = rng.normal(0, noise, (time_s.size, 1))
+            speed = np.full((time_s.size, 1), 0.5)
+            streams = {
+                "imu": Stream(time_s, shaking, ("accel_z_mps2",)),
+                "wheels": Stream(time_s, speed, ("speed_left_mps",)),
+            }
+            runs.append(RunLog(f"{terrain}{number}", "mower", streams, ((0.0, 12.0, terrain),)))
+    return runs
+
+
+@pytest.fixture(scope="module")
+def mower():
+    return trained(two_drives())
+
+
+def test_a_robot_without_a_description_is_observed_by_its_channels(mower):
+    run = two_drives()[4]
+    assert_same(observed(TerrainObserver(mower), run), predict([run], mower, load_slip_table()).windows)
+
+
+def test_columns_may_come_in_any_order_and_more_than_are_needed(mower):
+    run = two_drives()[4]
+    plain = observed(TerrainObserver(mower), run)
+    channels = {"imu": ("gyro_z_radps", "accel_z_mps2"), "wheels": ("current_left_a", "speed_left_mps")}
+    streams = {
+        name: Stream(s.time_s, np.hstack([np.full((len(s), 1), np.nan), s.values]), channels[name])
+        for name, s in run.streams.items()
+    }
+    more = observed(TerrainObserver(mower, channels=channels), RunLog("m", "mower", streams))
+    assert [one[:4] for one in more] == [one[:4] for one in plain]
+
+
+@pytest.mark.parametrize(
+    "broken",
+    [
+        None,
+        "text",
+        {},
+        {"imu": None},
+        {"imu": "text"},
+        {"imu": (1.0, 2.0)},
+        {"imu": Reading(np.array([1.0]), np.zeros((2, 1)))},
+        {"imu": Reading(np.array([1.0]), np.zeros((1, 5)))},
+        {"imu": Reading(np.array([np.nan]), np.array([[np.inf]]))},
+        {"imu": Reading(np.array(["a"]), np.array([["b"]]))},
+        {"imu": Reading(np.array([10**400], dtype=object), np.array([[1.0]]))},
+        {"wheels": Reading(np.array([]), np.zeros((0, 1)))},
+        {"wheels": 3},
+        {3: Reading(np.array([1.0]), np.zeros((1, 1)))},
+        {"unknown": Reading(np.array([1.0]), np.zeros((1, 1)))},
+    ],
+)
+def test_whatever_arrives_nothing_raises_and_the_next_windows_are_as_before(mower, broken):
+    run = two_drives()[1]
+    observer, found = TerrainObserver(mower), []
+    for k, sample in enumerate(replay(run)):
+        if k % 40 == 5:
+            assert observer.update(broken) == []
+        found += observer.update(sample.readings)
+    plain = observed(TerrainObserver(mower), run)
+    assert [one[:4] for one in found] == [one[:4] for one in plain]
+
+
+def test_a_window_that_the_model_refuses_is_named(mower):
+    class Refusing:
+        classes_ = mower.recipe.classes_
+
+        def predict_proba(self, windows):
+            raise ValueError("Input X contains NaN.")
+
+    observer = TerrainObserver(mower._replace(recipe=Refusing()))
+    found = observed(observer, two_drives()[0])
+    assert {one.refused for one in found} == {"Input X contains NaN."}
+    assert {one.terrain for one in found} == {""}
+    assert np.isnan([one.probability for one in found]).all()
+    assert observer.refused == {"Input X contains NaN.": len(found)}
+    assert observer.belief.terrain == ""
+
+
+def test_what_does_not_fit_is_refused_at_once(mower, swerve_model):
+    with pytest.raises(DataError, match="requires 'accel_z_mps2' of the stream 'imu'"):
+        TerrainObserver(mower, channels={"imu": ("gyro_z_radps",), "wheels": ("speed_left_mps",)})
+    with pytest.raises(DataError, match=r"requires .* of the stream 'estimator', which is neither"):
+        TerrainObserver(
+            swerve_model,
+            channels={
+                "imu": swerve_model.info.channels["imu"],
+                "wheels": swerve_model.info.channels["wheels"],
+            },
+        )
+    table = replace(load_slip_table(), robot="warthog")
+    with pytest.raises(ConfigError, match="is of the robot 'warthog', not of 'agrimaro'"):
+        TerrainObserver(swerve_model, table, AGRIMARO, channels_of(simulated("grass", 1, 9.0)))
+    other = swerve_model._replace(info=replace(swerve_model.info, filter="skid"))
+    with pytest.raises(DataError, match="filter 'skid', which robot agrimaro does not run live"):
+        TerrainObserver(other, robot=AGRIMARO, channels=channels_of(simulated("grass", 1, 9.0)))
+
+
+def test_runs_of_several_filters_do_not_train_one_model():
+    run = simulated("grass", 1)
+    runs = [enriched(estimate_run(run, AGRIMARO, name)) for name in ("vio15", "slip14")]
+    windows = samples_of(
+        [replace(run, run_id=f"r{k}") for k, run in enumerate(runs)], CrossvalSettings()
+    ).cut.windows
+    with pytest.raises(DataError, match="estimates of slip14 and vio15"):
+        model_info(runs, CrossvalSettings(), windows, "drawn", "")
