@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pipelines.live.classifying import AtOnce, Classifying, WindowOutput
+from pipelines.live.state import LiveState, Restorable, restorable, state_of
 from pipelines.live.window_feed import Estimate, WindowFeed, live_filter, needs_filter
 from pipelines.models.model_files import TerrainModel
 from pipelines.models.results import ModelInfo
@@ -107,6 +108,8 @@ class TerrainObserver:
         corrected = robot
         if robot is not None:
             self._filter, corrected = live_estimator(model.info, robot, self.channels)
+        self._robot_name = "" if robot is None else robot.name
+        self._filter_name = "" if self._filter is None else self._filter.model.name
         self._feed = WindowFeed(model.info, self.channels, corrected)
         self._classifying = AtOnce() if classifying is None else classifying
         self._speed_columns, self._mps_per_unit = _speeds(self.channels.get("wheels", ()), corrected)
@@ -128,6 +131,25 @@ class TerrainObserver:
         if self._classifying.n_overrun:
             counts["window: overrun"] = self._classifying.n_overrun
         return counts | (dict(self._filter.dropped) if self._filter is not None else {})
+
+    def state(self, now_s: float) -> LiveState:
+        """Return what is worth keeping over a restart, at a time in seconds since 1970."""
+        resident = None if self._filter is None else self._filter.resident
+        return state_of(self._robot_name, self._filter_name, resident, self.belief, math.nan, now_s)
+
+    def restore(self, state: LiveState, now_s: float) -> Restorable:
+        """Start from a saved state; return what of it is used.
+
+        Raises
+        ------
+        DataError
+            if the filter has run already.
+        """
+        fresh = restorable(state, self._robot_name, self._filter_name, now_s)
+        if self._filter is not None:
+            self._filter.resident.begin_from(fresh.biases, fresh.age_s)
+        self.belief = fresh.belief
+        return fresh
 
     def update(self, samples: Mapping[str, Reading]) -> list[TerrainObservation]:
         """Take what was measured since the last call; return what has been found, in most calls nothing.

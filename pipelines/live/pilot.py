@@ -16,6 +16,7 @@ from operator import itemgetter
 
 import numpy as np
 
+from pipelines.live.pilot_figures import finite_twist, largest, largest_slip, pose_is_sound, uphill_mps2
 from pipelines.live.pilot_settings import (
     DEFAULT_SETTINGS,
     OPEN_LOOP,
@@ -24,8 +25,8 @@ from pipelines.live.pilot_settings import (
     check_pilot,
     wheel_controller,
 )
+from pipelines.live.state import LiveState, Restorable, restorable, state_of
 from pipelines.live.terrain_source import NoTerrain, TerrainSource
-from terrain.constants import GRAVITY_MPS2
 from terrain.control.actuation import Actuation
 from terrain.control.path_tracking import (
     PoseEstimate,
@@ -57,7 +58,7 @@ from terrain.control.wheel_controllers import (
     step_or_period,
 )
 from terrain.entry_point import entry_point
-from terrain.estimation.live.clocks import Clocks, numbers
+from terrain.estimation.live.clocks import Clocks
 from terrain.estimation.live.estimate import LiveEstimate
 from terrain.estimation.live.estimator import LiveEstimator
 from terrain.estimation.live.health import SENSORS, SLIP_SENSORS, SOUND, Health
@@ -66,7 +67,6 @@ from terrain.kinematics.swerve import FAR_RAD, wheel_command_step
 from terrain.logs.schema import IMU_CHANNELS, WHEELS_CHANNELS
 from terrain.records import Array, Command, Reading, Sample
 from terrain.robots import Robot
-from terrain.slip import MIN_SPEED_MPS
 
 MARGIN_MAX_RATIO = 0.06
 """The difference of a table's targets in traction and in steady motion is the slip above the balance that
@@ -80,7 +80,6 @@ _of_slip = itemgetter(*_OF_SLIP)
 _BLAMED = (0, 1, 2, 3, 4, 6, 7, 5)
 # as plain numbers, which compare in a tenth of the time
 _SOUND, _DISAGREES, _LOST = int(SOUND), int(Health.DISAGREES), int(Health.LOST)
-_GYRO, _SEEN, _SEEN_YAW = (SENSORS.index(name) for name in ("gyro", "camera_speed", "camera_yaw"))
 _wheel_command_step = entry_point(wheel_command_step)
 _NOT_ESTIMATED = UNOBSERVED._replace(stale_s=math.nan)
 _NOT_TRACKED = TrackReport(math.nan, math.nan, 0.0, TrackStatus.NO_POSE)
@@ -138,6 +137,7 @@ class LivePilot:
         table = load_slip_table() if table is None else table
         driven, correction = correct_live(check_pilot(robot, table, settings))
         self._table, self._settings, self._radius_m = table, settings, driven.wheel_radius_m
+        self._robot_name = robot.name
         self._source = NoTerrain() if source is None else source
         self._terrains = {terrain: index for index, terrain in enumerate(table.targets)}
         self._braking = {name: braking_by_slip(curve) for name, curve in table.curves.items()}
@@ -182,12 +182,38 @@ class LivePilot:
     @property
     def nis(self) -> dict[str, float]:
         """NIS of each sensor of the filter at the last step, a row; NaN where it measured nothing."""
-        return {} if self._estimator is None else self._estimator.nis
+        return {} if self._estimator is None else self._estimator.resident.nis
 
     @property
     def dropped(self) -> dict[str, int]:
         """What was not taken so far, and how often a clock was set, as counts by stream and kind."""
         return self._clocks.counts | ({} if self._estimator is None else self._estimator.dropped)
+
+    def state(self, now_s: float) -> LiveState:
+        """Return what is worth keeping over a restart, at a time in seconds since 1970."""
+        resident = None if self._estimator is None else self._estimator.resident
+        name = "" if self._estimator is None else self._estimator.model.name
+        return state_of(self._robot_name, name, resident, self._now.belief, self._now.target_ratio, now_s)
+
+    def restore(self, state: LiveState, now_s: float) -> Restorable:
+        """Start from a saved state; return what of it is used.
+
+        Parameters
+        ----------
+        state : of a pilot of the same robot
+        now_s : seconds since 1970
+
+        Raises
+        ------
+        DataError
+            if the pilot has estimated already.
+        """
+        name = "" if self._estimator is None else self._estimator.model.name
+        fresh = restorable(state, self._robot_name, name, now_s)
+        if self._estimator is not None:
+            self._estimator.resident.begin_from(fresh.biases, fresh.age_s)
+        self._now.belief, self._now.target_ratio = fresh.belief, fresh.target_ratio
+        return fresh
 
     @property
     def lateness_s(self) -> dict[str, float]:
@@ -214,7 +240,7 @@ class LivePilot:
         now.time_s = time_s
         step_s = step_or_period(dt_s)
         terrain = getattr(sample, "terrain", "")
-        desired = _finite_twist(getattr(sample, "twist", None))
+        desired = finite_twist(getattr(sample, "twist", None))
         if self._estimator is not None:
             self._compare(time_s, step_s, readings)
         self._estimate(Sample(time_s, desired, readings, terrain if isinstance(terrain, str) else ""))
@@ -249,8 +275,8 @@ class LivePilot:
             now.target_ratio,
             done.aimed_ratio,
             done.balance_ratio,
-            done.slip_ratio if sound else _largest_slip(observed.wheels.slip_ratio, wheel_radps),
-            _largest(observed.wheels.slip_std.tolist()),
+            done.slip_ratio if sound else largest_slip(observed.wheels.slip_ratio, wheel_radps),
+            largest(observed.wheels.slip_std.tolist()),
             observed.stale_s,
             float(done.drive_state),
             done.driven_mps,
@@ -337,7 +363,7 @@ class LivePilot:
         margin = min(entry["traction"].slip_ratio - entry["steady"].slip_ratio, MARGIN_MAX_RATIO)
         if braking is None:
             return TractionTarget(now.target_ratio, margin_ratio=margin)
-        mps2 = max(braking.mps2 + _uphill_mps2(now.estimate, *now.tilt_rad), 0.0)
+        mps2 = max(braking.mps2 + uphill_mps2(now.estimate, *now.tilt_rad), 0.0)
         return TractionTarget(now.target_ratio, braking.slip_ratio, mps2, margin)
 
     def _track(self, twist: Array, time_s: float, dt_s: float) -> tuple[Array, TrackReport]:
@@ -347,7 +373,7 @@ class LivePilot:
             return twist, _NOT_TRACKED
         x, y, yaw = self._pose_states
         mean = seen.mean
-        yaw_std_rad = float(seen.std[yaw]) if _pose_is_sound(self._health) else math.inf
+        yaw_std_rad = float(seen.std[yaw]) if pose_is_sound(self._health) else math.inf
         pose = PoseEstimate(
             float(mean[x]), float(mean[y]), float(mean[yaw]), yaw_std_rad, estimate_age(seen, time_s)
         )
@@ -356,37 +382,3 @@ class LivePilot:
             self._tracking, now.tracking, twist, pose, ground_twist, dt_s
         )
         return twist, report
-
-
-def _pose_is_sound(health: list[int]) -> bool:
-    """Say whether a pose can be built on: with a lost camera it is until it is stale."""
-    turns, seen_yaw, seen = health[_GYRO], health[_SEEN_YAW], health[_SEEN]
-    heading = turns <= _SOUND or seen_yaw <= _SOUND
-    return heading and (seen <= _SOUND or seen == _LOST)
-
-
-def _finite_twist(given: object) -> Array:
-    """Return a desired twist (3,); zeros where it is none."""
-    twist = numbers(given)
-    if twist is None or twist.shape != (3,) or not math.isfinite(sum(twist.tolist())):
-        return np.zeros(3)
-    return twist
-
-
-def _largest(values: list[float]) -> float:
-    """Return the largest of some values; NaN where one is."""
-    return math.nan if math.isnan(sum(values)) else max(values)
-
-
-def _largest_slip(slip_ratio: Array, wheel_radps: Array) -> float:
-    """Return the largest slip of a wheel, positive in traction; NaN where it is not known."""
-    return float(np.where(wheel_radps < 0.0, -slip_ratio, slip_ratio).max())
-
-
-def _uphill_mps2(estimate: LiveEstimate | None, roll_rad: float, pitch_rad: float) -> float:
-    """Return the deceleration by gravity along the motion: positive uphill, 0 at rest."""
-    speed_mps = 0.0 if estimate is None else math.hypot(estimate.speed_x_mps, estimate.speed_y_mps)
-    if estimate is None or not speed_mps > MIN_SPEED_MPS:
-        return 0.0
-    along, across = estimate.speed_x_mps / speed_mps, estimate.speed_y_mps / speed_mps
-    return GRAVITY_MPS2 * (-math.sin(pitch_rad) * along + math.sin(roll_rad) * across)

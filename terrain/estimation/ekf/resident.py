@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -30,6 +30,9 @@ from terrain.estimation.ekf.state import (
     noise_arrays,
 )
 from terrain.records import Array
+
+BIASES = ("gyro_bias_radps", "accel_bias_x_mps2", "accel_bias_y_mps2")
+"""States that are of a sensor, and stay what they are while the robot does anything."""
 
 _follows, _run = entry_point(follows), entry_point(run)
 
@@ -64,6 +67,7 @@ class ResidentFilter:
         self.buffers = floats, first.counts
         self._columns, self._sensors = columns_of(model, 1), model.sensor_names
         self._noise_variance = noise.measurement_variance
+        self._states, self._walk = model.states, np.diagonal(noise.process_variance)
         rows = np.empty((1, m)), np.empty((1, m)), np.zeros((1, d)), np.zeros((1, len(model.inputs)))
         self._sample = SampleArrays(np.empty(1), *rows)
         self.functions = _addresses(model)
@@ -86,6 +90,35 @@ class ResidentFilter:
         sample.inputs[0] = 0.0 if inputs is None else inputs
         _run(self.arrays, *self.functions)
         return bool(self._columns.taken[0])
+
+    def known(self, states: Sequence[str]) -> dict[str, tuple[float, float]]:
+        """Return mean and standard deviation of those of some states that the filter has, by name."""
+        places = {name: self._states.index(name) for name in states if name in self._states}
+        return {name: (float(self.mean[i]), math.sqrt(float(self.cov[i, i]))) for name, i in places.items()}
+
+    def begin_from(self, known: Mapping[str, tuple[float, float]], age_s: float) -> tuple[str, ...]:
+        """Start from what was known of some states; return the names of those that are used.
+
+        Parameters
+        ----------
+        known : mean and standard deviation by name of the state
+        age_s : time since then, for which each walks; none is believed less than without it
+
+        Raises
+        ------
+        DataError
+            if a sample was taken already.
+        """
+        if not math.isnan(self._memory.clock[0]):
+            raise DataError("a filter that runs cannot start from another state")
+        used = [name for name in known if name in self._states]
+        for name in used:
+            i = self._states.index(name)
+            mean, std = known[name]
+            variance = std**2 + float(self._walk[i]) * age_s
+            if variance < self.cov[i, i]:
+                self.mean[i], self.cov[i, i] = mean, variance
+        return tuple(used)
 
     def follows(self, time_s: float) -> int:
         """Return what a stamp would be: 1 taken, -1 taken as that of a clock set back, 0 not taken."""

@@ -64,12 +64,10 @@ from terrain.logs.schema import WHEELS_CHANNELS
 from terrain.records import Array, Reading
 from terrain.robots import Robot, as_swerve
 
-SETTINGS = FilterSettings(GATE_PROBABILITY, REOPEN_AFTER_S)
-"""Those of the batch."""
+SETTINGS = FilterSettings(GATE_PROBABILITY, REOPEN_AFTER_S)  # those of the batch
 
 CHANNELS: Mapping[str, tuple[str, ...]] = {"wheels": WHEELS_CHANNELS, **STREAMS}
 """Default channels of each stream."""
-
 
 _push = entry_point(push)
 
@@ -230,6 +228,11 @@ class LiveEstimator:
         return self._robot.sensors.encoder_time_constant_s
 
     @property
+    def resident(self) -> ResidentFilter:
+        """The filter's memory."""
+        return self._filter
+
+    @property
     def dropped(self) -> dict[str, int]:
         """What was not taken so far, as counts by stream and kind, and by what the filter did not believe."""
         counted = counts_by_kind(self._wheel_counts, self._counts) | self._counted
@@ -250,11 +253,6 @@ class LiveEstimator:
     def health(self) -> dict[str, str]:
         """Health of each sensor at the last tick, by name."""
         return self._monitor.names
-
-    @property
-    def nis(self) -> dict[str, float]:
-        """NIS of each sensor of the filter at the last tick, a row; NaN where it measured nothing."""
-        return self._filter.nis
 
     def step(self, readings: Mapping[str, Reading], now_s: float | None = None) -> list[LiveEstimate]:
         """Take in what arrived, and return an estimate for each sample of the wheels that was taken.

@@ -175,6 +175,11 @@ class LiveSkidEstimator:
         return self._model.states
 
     @property
+    def resident(self) -> ResidentFilter:
+        """The filter's memory."""
+        return self._filter
+
+    @property
     def dropped(self) -> dict[str, int]:
         """What was not taken so far, as counts by stream and kind, and by what the filter did not believe."""
         counts = {f"imu: {kind}": n for kind, n in zip(KINDS, self._counts[IMU].tolist(), strict=True)}

@@ -12,7 +12,6 @@ from pipelines.classify.predict import predict
 from pipelines.classify.settings import CrossvalSettings
 from pipelines.classify.train import model_info
 from pipelines.live.observer import TerrainObserver
-from pipelines.models.model_files import TerrainModel
 from pipelines.runs.datasets import load_runs
 from terrain.control.slip_table import load_slip_table
 from terrain.errors import ConfigError, DataError
@@ -27,27 +26,8 @@ AGRIMARO, HUSKY = load_robot("agrimaro"), load_robot("husky")
 DATA = Path(os.environ.get("TERRAIN_DATA", "/nowhere"))
 
 
-def trained(runs):
-    settings = CrossvalSettings()
-    windows = samples_of(runs, settings).cut.windows
-    recipe = settings.new_recipe().fit(windows, windows.terrain.astype(str))
-    return TerrainModel(recipe, model_info(runs, settings, windows, "drawn", ""))
-
-
 def simulated(terrain, number, duration_s=25.0):
     return simulate_run(AGRIMARO, terrain, "survey", 5, number, duration_s=duration_s)
-
-
-@pytest.fixture(scope="module")
-def swerve_model():
-    """Trained on what a filter adds to simulated runs."""
-    return trained(
-        [
-            enriched(estimate_run(simulated(terrain, number), AGRIMARO, "vio15"))
-            for terrain in ("grass", "tiles")
-            for number in (1, 2)
-        ]
-    )
 
 
 def observed(observer, run, rate_hz=50.0):
@@ -99,7 +79,7 @@ def test_the_belief_follows_windows_that_agree_and_ends_with_driving_on_in_silen
 
 
 @pytest.mark.parametrize("set_name", ["borealtc", "vulpi"])
-def test_live_equals_the_log_on_all_measured_runs(set_name):
+def test_live_equals_the_log_on_all_measured_runs(set_name, trained):
     if not (DATA / set_name).is_dir():
         pytest.skip(f"TERRAIN_DATA has no {set_name}")
     runs = load_runs(DATA / set_name)
@@ -114,7 +94,7 @@ def test_live_equals_the_log_on_all_measured_runs(set_name):
     assert result.n_windows > 200
 
 
-def test_a_skid_steer_robot_is_filtered_where_its_model_needs_the_filter():
+def test_a_skid_steer_robot_is_filtered_where_its_model_needs_the_filter(trained):
     if not (DATA / "vulpi").is_dir():
         pytest.skip("TERRAIN_DATA has no vulpi")
     runs = load_runs(DATA / "vulpi")
@@ -128,41 +108,22 @@ def test_a_skid_steer_robot_is_filtered_where_its_model_needs_the_filter():
     assert observer.estimate.speed_mps > 0.1
 
 
-def two_drives():
-    rng = np.random.default_rng(1)
-    runs = []
-    for terrain, noise in (("a", 0.1), ("b", 2.0)):
-        for number in range(3):
-            time_s = np.arange(0, 12, 0.02)
-            shaking = rng.normal(0, noise, (time_s.size, 1))
-            speed = np.full((time_s.size, 1), 0.5)
-            streams = {
-                "imu": Stream(time_s, shaking, ("accel_z_mps2",)),
-                "wheels": Stream(time_s, speed, ("speed_left_mps",)),
-            }
-            runs.append(RunLog(f"{terrain}{number}", "mower", streams, ((0.0, 12.0, terrain),)))
-    return runs
+def test_a_robot_without_a_description_is_observed_by_its_channels(mower_model, two_drives):
+    run = two_drives[4]
+    assert_same(
+        observed(TerrainObserver(mower_model), run), predict([run], mower_model, load_slip_table()).windows
+    )
 
 
-@pytest.fixture(scope="module")
-def mower():
-    return trained(two_drives())
-
-
-def test_a_robot_without_a_description_is_observed_by_its_channels(mower):
-    run = two_drives()[4]
-    assert_same(observed(TerrainObserver(mower), run), predict([run], mower, load_slip_table()).windows)
-
-
-def test_columns_may_come_in_any_order_and_more_than_are_needed(mower):
-    run = two_drives()[4]
-    plain = observed(TerrainObserver(mower), run)
+def test_columns_may_come_in_any_order_and_more_than_are_needed(mower_model, two_drives):
+    run = two_drives[4]
+    plain = observed(TerrainObserver(mower_model), run)
     channels = {"imu": ("gyro_z_radps", "accel_z_mps2"), "wheels": ("current_left_a", "speed_left_mps")}
     streams = {
         name: Stream(s.time_s, np.hstack([np.full((len(s), 1), np.nan), s.values]), channels[name])
         for name, s in run.streams.items()
     }
-    more = observed(TerrainObserver(mower, channels=channels), RunLog("m", "mower", streams))
+    more = observed(TerrainObserver(mower_model, channels=channels), RunLog("m", "mower", streams))
     assert [one[:4] for one in more] == [one[:4] for one in plain]
 
 
@@ -186,26 +147,26 @@ def test_columns_may_come_in_any_order_and_more_than_are_needed(mower):
         {"unknown": Reading(np.array([1.0]), np.zeros((1, 1)))},
     ],
 )
-def test_whatever_arrives_nothing_raises_and_the_next_windows_are_as_before(mower, broken):
-    run = two_drives()[1]
-    observer, found = TerrainObserver(mower), []
+def test_whatever_arrives_nothing_raises_and_the_next_windows_are_as_before(mower_model, two_drives, broken):
+    run = two_drives[1]
+    observer, found = TerrainObserver(mower_model), []
     for k, sample in enumerate(replay(run)):
         if k % 40 == 5:
             assert observer.update(broken) == []
         found += observer.update(sample.readings)
-    plain = observed(TerrainObserver(mower), run)
+    plain = observed(TerrainObserver(mower_model), run)
     assert [one[:4] for one in found] == [one[:4] for one in plain]
 
 
-def test_a_window_that_the_model_refuses_is_named(mower):
+def test_a_window_that_the_model_refuses_is_named(mower_model, two_drives):
     class Refusing:
-        classes_ = mower.recipe.classes_
+        classes_ = mower_model.recipe.classes_
 
         def predict_proba(self, windows):
             raise ValueError("Input X contains NaN.")
 
-    observer = TerrainObserver(mower._replace(recipe=Refusing()))
-    found = observed(observer, two_drives()[0])
+    observer = TerrainObserver(mower_model._replace(recipe=Refusing()))
+    found = observed(observer, two_drives[0])
     assert {one.refused for one in found} == {"Input X contains NaN."}
     assert {one.terrain for one in found} == {""}
     assert np.isnan([one.probability for one in found]).all()
@@ -213,9 +174,9 @@ def test_a_window_that_the_model_refuses_is_named(mower):
     assert observer.belief.terrain == ""
 
 
-def test_what_does_not_fit_is_refused_at_once(mower, swerve_model):
+def test_what_does_not_fit_is_refused_at_once(mower_model, swerve_model):
     with pytest.raises(DataError, match="requires 'accel_z_mps2' of the stream 'imu'"):
-        TerrainObserver(mower, channels={"imu": ("gyro_z_radps",), "wheels": ("speed_left_mps",)})
+        TerrainObserver(mower_model, channels={"imu": ("gyro_z_radps",), "wheels": ("speed_left_mps",)})
     with pytest.raises(DataError, match=r"requires .* of the stream 'estimator', which is neither"):
         TerrainObserver(
             swerve_model,

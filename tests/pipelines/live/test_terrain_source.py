@@ -6,18 +6,12 @@ import numpy as np
 import pytest
 
 from features.windows import cut_windows
-from pipelines.classify.crossval import samples_of
-from pipelines.classify.settings import CrossvalSettings
-from pipelines.classify.train import model_info
 from pipelines.live.pilot import LivePilot
 from pipelines.live.pilot_settings import PilotSettings, PilotStatus
 from pipelines.live.terrain_source import Classifier, KnownTerrain, NoTerrain
-from pipelines.models.model_files import TerrainModel
 from terrain.control.slip_table import load_slip_table
 from terrain.control.switching import SWITCHING, OutputStatus
 from terrain.errors import DataError
-from terrain.estimation.enriched import enriched
-from terrain.estimation.estimate import estimate_run
 from terrain.estimation.live.estimator import LiveEstimator
 from terrain.kinematics.wheel_speed import with_wheel_speeds
 from terrain.logs.replay import replay
@@ -30,19 +24,8 @@ TERRAINS = ("grass", "tiles")
 
 
 @pytest.fixture(scope="module")
-def model():
-    """Trained on two short runs of each of two terrains."""
-    runs = [
-        enriched(
-            estimate_run(simulate_run(ROBOT, terrain, "survey", 5, number, duration_s=25.0), ROBOT, "vio15")
-        )
-        for terrain in TERRAINS
-        for number in (1, 2)
-    ]
-    settings = CrossvalSettings()
-    windows = samples_of(runs, settings).cut.windows
-    recipe = settings.new_recipe().fit(windows, windows.terrain.astype(str))
-    return TerrainModel(recipe, model_info(runs, settings, windows, "drawn", ""))
+def model(swerve_model):
+    return swerve_model
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,222 @@
+"""What outlives a restart: the biases of the sensors, and the terrain, each only while it is fresh.
+
+All else of a live chain (pose, speeds, samples of a window that is not whole) is measured anew in seconds.
+A bias walks: the variance that it was saved with grows by that of its walk for the time that has passed.  The
+terrain is that under the robot when it was saved, and the robot may have been moved since.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from terrain.control.switching import NO_BELIEF, UNKNOWN, TerrainBelief
+from terrain.errors import DataError
+from terrain.estimation.ekf.resident import BIASES, ResidentFilter
+from terrain.files.atomic import atomic_write
+
+VERSION = 1
+
+BIASES_FRESH_S = 600.0
+"""A bias older than that is estimated anew: with temperature it moves further than its walk says."""
+
+BELIEF_FRESH_S = 10.0
+"""As long as a terrain is believed without a window that confirms it (``SwitchSettings``)."""
+
+CLOCK_SLACK_S = 1.0
+"""A state may seem so far from the future: clocks are adjusted."""
+
+LARGEST_FILE = 65536
+
+
+class Bias(NamedTuple):
+    """A sensor's bias and its standard deviation, in the unit of its name."""
+
+    mean: float
+    std: float
+
+
+class LiveState(NamedTuple):
+    """What a live chain knew at a time.
+
+    Parameters
+    ----------
+    robot, filter : whose and which filter's biases, by name
+    saved_s : seconds since 1970
+    biases : by name of the state
+    terrain, probability : believed; empty and NaN where it was unknown
+    target_ratio : target slip that was aimed for; NaN where there was none
+    """
+
+    robot: str
+    filter: str
+    saved_s: float
+    biases: Mapping[str, Bias]
+    terrain: str = UNKNOWN
+    probability: float = math.nan
+    target_ratio: float = math.nan
+
+
+class Restorable(NamedTuple):
+    """What of a state is fresh enough to be used.
+
+    Parameters
+    ----------
+    biases : none where they are too old, or another robot's or filter's
+    belief : unknown where it is too old
+    target_ratio : NaN where the terrain is too old
+    age_s : since it was saved
+    """
+
+    biases: Mapping[str, Bias]
+    belief: TerrainBelief
+    target_ratio: float
+    age_s: float
+
+
+def restorable(state: LiveState, robot: str, filter_name: str, now_s: float) -> Restorable:
+    """Return what of a state may be used now.
+
+    Parameters
+    ----------
+    state : as saved
+    robot, filter_name : that it is to be used for
+    now_s : seconds since 1970
+
+    Examples
+    --------
+    >>> biases = {"gyro_bias_radps": Bias(0.01, 0.001)}
+    >>> state = LiveState("agrimaro", "vio15", 1000.0, biases, "grass", 0.9, 0.1)
+    >>> restorable(state, "agrimaro", "vio15", 1005.0).belief.terrain
+    'grass'
+    >>> later = restorable(state, "agrimaro", "vio15", 1060.0)
+    >>> later.belief.terrain, later.biases["gyro_bias_radps"].mean
+    ('', 0.01)
+    """
+    age_s = now_s - state.saved_s
+    suits = state.robot == robot and age_s >= -CLOCK_SLACK_S  # False for NaN
+    fresh_biases = suits and state.filter == filter_name and age_s <= BIASES_FRESH_S
+    fresh_belief = suits and age_s <= BELIEF_FRESH_S and state.terrain != UNKNOWN
+    belief = TerrainBelief(state.terrain, state.probability) if fresh_belief else NO_BELIEF
+    return Restorable(
+        state.biases if fresh_biases else {},
+        belief,
+        state.target_ratio if fresh_belief else math.nan,
+        max(age_s, 0.0),
+    )
+
+
+def state_of(
+    robot: str,
+    filter_name: str,
+    resident: ResidentFilter | None,
+    belief: TerrainBelief,
+    target_ratio: float,
+    now_s: float,
+) -> LiveState:
+    """Return what is to be saved of a live chain.
+
+    Parameters
+    ----------
+    robot, filter_name : whose
+    resident : its filter; None where it has none
+    belief, target_ratio : of the terrain
+    now_s : seconds since 1970
+    """
+    known = {} if resident is None else resident.known(BIASES)
+    biases = {name: Bias(mean, std) for name, (mean, std) in known.items() if math.isfinite(mean + std)}
+    return LiveState(robot, filter_name, now_s, biases, belief.terrain, belief.probability, target_ratio)
+
+
+def to_text(state: LiveState) -> str:
+    """Return a state as JSON, with a checksum of its content."""
+    content: dict[str, Any] = {
+        name: _written(value) for name, value in state._asdict().items() if name != "biases"
+    }
+    content["biases"] = {name: list(bias) for name, bias in sorted(state.biases.items())}
+    return json.dumps({"version": VERSION, "sha256": _digest(content), "state": content}, indent=1) + "\n"
+
+
+def from_text(text: str) -> LiveState:
+    """Return the state that a text holds.
+
+    Raises
+    ------
+    DataError
+        if it is damaged, of another version, or its checksum is another.
+
+    Examples
+    --------
+    >>> from_text("{}")
+    Traceback (most recent call last):
+    terrain.errors.DataError: saved state: is damaged ('version')
+    """
+    try:
+        document = json.loads(text)
+        version, digest, content = document["version"], document["sha256"], document["state"]
+        if version != VERSION:
+            raise DataError(f"saved state: has version {version!r}; version {VERSION} is read here")
+        if _digest(content) != digest:
+            raise DataError("saved state: is damaged (its checksum is another)")
+        biases = {
+            str(name): Bias(_number(mean), _number(std)) for name, (mean, std) in content["biases"].items()
+        }
+        if not all(math.isfinite(one.mean) and one.std > 0.0 for one in biases.values()):
+            raise DataError("saved state: is damaged (a bias is no number)")
+        return LiveState(
+            str(content["robot"]),
+            str(content["filter"]),
+            _number(content["saved_s"]),
+            biases,
+            str(content["terrain"]),
+            _number(content["probability"]),
+            _number(content["target_ratio"]),
+        )
+    except DataError:
+        raise
+    except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
+        raise DataError(f"saved state: is damaged ({error})") from error
+
+
+def save_state(path: Path, state: LiveState) -> None:
+    """Write a state, whole or not at all; ``TerrainError`` where it cannot be written."""
+    atomic_write(path, to_text(state))
+
+
+def load_state(path: Path) -> LiveState | None:
+    """Return the state of a file; None where there is none.
+
+    Raises
+    ------
+    DataError
+        if it cannot be read or is damaged.
+    """
+    try:
+        with path.open("rb") as file:
+            content = file.read(LARGEST_FILE + 1)
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise DataError(f"{path}: cannot be opened ({error.strerror})") from error
+    if len(content) > LARGEST_FILE:
+        raise DataError(f"{path}: is no saved state, it is larger than {LARGEST_FILE} bytes")
+    try:
+        return from_text(content.decode("utf-8"))
+    except (DataError, UnicodeDecodeError) as error:
+        raise DataError(f"{path}: {error}") from error
+
+
+def _digest(content: Any) -> str:
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def _written(value: Any) -> Any:
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _number(value: Any) -> float:
+    return math.nan if value is None else float(value)
