@@ -128,7 +128,7 @@ def test_robots_get_their_own_outputs_and_one_cannot_take_the_turns_of_another(g
     assert all(one.start_s < 100.0 for one in wait_for(busy.finished, MAX_WAITING))
 
 
-def test_an_error_that_nobody_foresaw_costs_one_window():
+def test_an_unforeseen_error_costs_one_window():
     def classify(model, window):
         if window.start_s[0] == 0.0:
             raise KeyError("unforeseen")
