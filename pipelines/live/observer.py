@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pipelines.live.classifying import AtOnce, Classifying, WindowOutput
+from pipelines.live.pilot_settings import check_table
 from pipelines.live.state import LiveState, Restorable, restorable, state_of
 from pipelines.live.window_feed import Estimate, WindowFeed, live_filter, needs_filter
 from pipelines.models.model_files import TerrainModel
@@ -24,7 +25,7 @@ from terrain.control.switching import (
     drive_on,
     update,
 )
-from terrain.errors import ConfigError
+from terrain.errors import DataError
 from terrain.estimation.live.estimator import CHANNELS, LiveEstimator
 from terrain.estimation.live.skid_live import LiveSkidEstimator
 from terrain.extension import correct_live
@@ -45,6 +46,7 @@ class TerrainObservation(NamedTuple):
     probabilities : of each class
     target : target slip of that terrain, by drive state
     refused : why there is no class; empty where there is one
+    output : of the model
     """
 
     start_s: float
@@ -53,7 +55,8 @@ class TerrainObservation(NamedTuple):
     probability: float
     probabilities: Mapping[str, float]
     target: Mapping[str, SlipTarget]
-    refused: str = ""
+    refused: str
+    output: WindowOutput
 
 
 class TerrainObserver:
@@ -97,10 +100,8 @@ class TerrainObserver:
         switching: SwitchSettings = SWITCHING,
     ) -> None:
         self.table = load_slip_table() if table is None else table
-        if robot is not None and self.table.robot and self.table.robot != robot.name:
-            raise ConfigError(
-                f"slip table {self.table.name}: is of the robot {self.table.robot!r}, not of {robot.name!r}"
-            )
+        if robot is not None:
+            check_table(self.table, robot.name)
         check_switching(switching)
         self.model, self.switching = model, switching
         self.channels = {stream: tuple(names) for stream, names in (channels or model.info.channels).items()}
@@ -110,6 +111,7 @@ class TerrainObserver:
             self._filter, corrected = live_estimator(model.info, robot, self.channels)
         self._robot_name = "" if robot is None else robot.name
         self._filter_name = "" if self._filter is None else self._filter.model.name
+        self._robot = corrected
         self._feed = WindowFeed(model.info, self.channels, corrected)
         self._classifying = AtOnce() if classifying is None else classifying
         self._speed_columns, self._mps_per_unit = _speeds(self.channels.get("wheels", ()), corrected)
@@ -131,6 +133,39 @@ class TerrainObserver:
         if self._classifying.n_overrun:
             counts["window: overrun"] = self._classifying.n_overrun
         return counts | (dict(self._filter.dropped) if self._filter is not None else {})
+
+    def check(self, model: TerrainModel) -> None:
+        """Raise what :meth:`swap` would."""
+        if not self._feed.suits(model.info):
+            WindowFeed(model.info, self.channels, self._robot)
+            if needs_filter(model.info, self.channels) and (
+                self._robot is None or live_filter(model.info, self._robot) != self._filter_name
+            ):
+                raise DataError(
+                    f"the model was trained on estimates of the filter {model.info.filter!r}; "
+                    f"{self._filter_name or 'none'!r} runs here"
+                )
+
+    def swap(self, model: TerrainModel, table: SlipTable) -> None:
+        """Go on with another model and table, between two samples; the filter runs on.
+
+        Where both take the same windows, the one that is being cut is the first of the new model; otherwise
+        its windows begin with the next sample.
+
+        Raises
+        ------
+        DataError
+            if the model needs a channel that is neither measured nor estimated, or another filter.
+        ConfigError
+            if the table is another robot's.
+        """
+        self.check(model)
+        if self._robot is not None:
+            check_table(table, self._robot_name)
+        self.table = table
+        if not self._feed.suits(model.info):
+            self._feed = WindowFeed(model.info, self.channels, self._robot)
+        self.model = model
 
     def state(self, now_s: float) -> LiveState:
         """Return what is worth keeping over a restart, at a time in seconds since 1970."""
@@ -185,6 +220,7 @@ class TerrainObserver:
             dict(zip(output.classes, output.probabilities.tolist(), strict=True)),
             self.table.lookup(output.terrain),
             output.refused,
+            output,
         )
 
     def _drive_on(self, samples: Mapping[str, Reading]) -> None:

@@ -23,6 +23,7 @@ from pipelines.live.pilot_settings import (
     PilotSettings,
     PilotStatus,
     check_pilot,
+    check_table,
     wheel_controller,
 )
 from pipelines.live.state import LiveState, Restorable, restorable, state_of
@@ -136,11 +137,9 @@ class LivePilot:
     ) -> None:
         table = load_slip_table() if table is None else table
         driven, correction = correct_live(check_pilot(robot, table, settings))
-        self._table, self._settings, self._radius_m = table, settings, driven.wheel_radius_m
         self._robot_name = robot.name
-        self._source = NoTerrain() if source is None else source
-        self._terrains = {terrain: index for index, terrain in enumerate(table.targets)}
-        self._braking = {name: braking_by_slip(curve) for name, curve in table.curves.items()}
+        self._settings, self._radius_m = settings, driven.wheel_radius_m
+        self.swap(table, NoTerrain() if source is None else source)
         self._positions_m = np.array(driven.wheel_positions_m)
         self._limits = (
             driven.wheel_radius_m,
@@ -170,6 +169,11 @@ class LivePilot:
         return tuple(self._terrains)
 
     @property
+    def belief(self) -> TerrainBelief:
+        """The terrain that is believed."""
+        return self._now.belief
+
+    @property
     def estimate(self) -> LiveEstimate | None:
         """Last estimate of the motion; None before the first, and of controllers that use none."""
         return self._now.estimate
@@ -196,17 +200,9 @@ class LivePilot:
         return state_of(self._robot_name, name, resident, self._now.belief, self._now.target_ratio, now_s)
 
     def restore(self, state: LiveState, now_s: float) -> Restorable:
-        """Start from a saved state; return what of it is used.
+        """Start from a saved state at a time in seconds since 1970; return what of it is used.
 
-        Parameters
-        ----------
-        state : of a pilot of the same robot
-        now_s : seconds since 1970
-
-        Raises
-        ------
-        DataError
-            if the pilot has estimated already.
+        A pilot that has estimated already raises ``DataError``.
         """
         name = "" if self._estimator is None else self._estimator.model.name
         fresh = restorable(state, self._robot_name, name, now_s)
@@ -219,6 +215,13 @@ class LivePilot:
     def lateness_s(self) -> dict[str, float]:
         """How late the last reading of each stream came."""
         return self._clocks.lateness_s
+
+    def swap(self, table: SlipTable, source: TerrainSource) -> None:
+        """Go on with another table (``ConfigError`` if another robot's) and source, between two steps."""
+        check_table(table, self._robot_name)
+        self._table, self._source = table, source
+        self._terrains = {terrain: index for index, terrain in enumerate(table.targets)}
+        self._braking = {name: braking_by_slip(curve) for name, curve in table.curves.items()}
 
     def step(self, sample: Sample) -> Command:
         """Return the wheels' commands for a sample; whatever arrives, it does not raise.

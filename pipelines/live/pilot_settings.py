@@ -118,14 +118,19 @@ def check_pilot(robot: Robot, table: SlipTable, settings: PilotSettings) -> Swer
     swerve = as_swerve(robot, "robot {name}: drive {drive!r} has no pilot, only 'swerve' has")
     if not (math.isfinite(settings.ramp_mps2) and settings.ramp_mps2 > 0):
         raise ConfigError(f"ramp_mps2 is {settings.ramp_mps2!r}, a number above zero is required")
-    if table.robot and table.robot != robot.name:
-        raise ConfigError(f"slip table {table.name}: is of the robot {table.robot!r}, not of {robot.name!r}")
+    check_table(table, robot.name)
     check_switching(settings.switching)
     if settings.track and settings.controller in OPEN_LOOP:
         raise ConfigError(f"controller {settings.controller!r} estimates no pose: it has no path tracking")
     if settings.controller == "thesis":
         check_stable(swerve, settings.gains, settings.form, settings.delay_s)
     return swerve
+
+
+def check_table(table: SlipTable, robot: str) -> None:
+    """Raise ``ConfigError`` where a table is another robot's."""
+    if table.robot and table.robot != robot:
+        raise ConfigError(f"slip table {table.name}: is of the robot {table.robot!r}, not of {robot!r}")
 
 
 def wheel_controller(robot: Robot, settings: PilotSettings) -> WheelController:

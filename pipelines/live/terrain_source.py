@@ -103,17 +103,31 @@ class Classifier:
     certain = False
 
     def __init__(self, model: TerrainModel, robot: Robot, classifying: Classifying | None = None) -> None:
-        driven, _ = correct_live(robot)
-        if needs_filter(model.info, CHANNELS) and live_filter(model.info, driven) != PILOT_FILTER:
+        self.model, self._robot = model, correct_live(robot)[0]
+        self.last: WindowOutput | None = None
+        self._feed = self.feed_of(model)
+        self._classifying = AtOnce() if classifying is None else classifying
+        self.failed: Counter[str] = Counter()
+
+    def feed_of(self, model: TerrainModel) -> WindowFeed:
+        """Return what cuts the windows of a model; ``DataError`` where it does not suit the pilot."""
+        needed = needs_filter(model.info, CHANNELS)
+        if needed and live_filter(model.info, self._robot) != PILOT_FILTER:
             raise DataError(
                 f"the model was trained on estimates of the filter {model.info.filter!r}; the pilot runs "
                 f"{PILOT_FILTER!r}"
             )
+        return WindowFeed(model.info, CHANNELS, self._robot)
+
+    def swap(self, model: TerrainModel) -> None:
+        """Go on with another model, between two samples.
+
+        Where both take the same windows, the one that is being cut is the first of the new model; otherwise
+        its windows begin with the next sample.
+        """
+        if not self._feed.suits(model.info):
+            self._feed = self.feed_of(model)
         self.model = model
-        self.last: WindowOutput | None = None
-        self._feed = WindowFeed(model.info, CHANNELS, driven)
-        self._classifying = AtOnce() if classifying is None else classifying
-        self.failed: Counter[str] = Counter()
 
     @property
     def n_refused(self) -> int:

@@ -106,6 +106,13 @@ class WindowFeed:
                     f"nor estimated here (there are {', '.join(channels) or 'no streams'})"
                 )
 
+    def suits(self, info: ModelInfo) -> bool:
+        """Say whether another model takes the same windows."""
+        return all(
+            getattr(info, name) == getattr(self.info, name)
+            for name in ("channels", "rate_hz", "rule", "filter")
+        )
+
     @property
     def dropped(self) -> dict[str, int]:
         """Windows and samples that were not used, as counts by kind."""
