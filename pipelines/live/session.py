@@ -97,6 +97,11 @@ class RobotSession:
         self._pilot = LivePilot(self._robot, served.table, self._source)
 
     @property
+    def window(self) -> WindowOutput | None:
+        """Output of the last window."""
+        return self._window
+
+    @property
     def belief(self) -> TerrainBelief:
         """The terrain that is believed."""
         if self._pilot is not None:

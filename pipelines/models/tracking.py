@@ -295,8 +295,22 @@ def load_model(uri: str) -> TerrainModel:
     ModelError
         if there is no such model, or it is damaged or foreign.
     """
-    if Path(uri).exists():
-        return read_model(Path(uri))
+    return read_model(Path(uri) if Path(uri).exists() else fetch_model(uri))
+
+
+def fetch_model(uri: str, into: str | None = None) -> Path:
+    """Return the folder of a registered model, copied to where a store is not of this machine.
+
+    Parameters
+    ----------
+    uri : ``models:/...`` or ``runs:/...``
+    into : folder of the copy; one of the tracking library by default
+
+    Raises
+    ------
+    ModelError
+        if there is no such model.
+    """
     if not uri.startswith(("models:/", "runs:/")):
         raise ModelError(f"{uri}: is neither a folder nor a model URI such as models:/NAME@champion")
     if os.environ.get("MLFLOW_TRACKING_URI"):
@@ -306,7 +320,6 @@ def load_model(uri: str) -> TerrainModel:
         # some storages need a package of their own
         failures: tuple[type[Exception], ...] = (*_failures(mlflow), ImportError)
         try:
-            folder = mlflow.artifacts.download_artifacts(uri)
+            return Path(mlflow.artifacts.download_artifacts(uri, dst_path=into))
         except failures as error:
             raise ModelError(f"{uri}: cannot be loaded ({' '.join(str(error).split())[:200]})") from error
-        return read_model(Path(folder))

@@ -1,0 +1,211 @@
+"""A client of the live service, for a robot's own program.
+
+It needs ``websockets`` and ``msgpack`` and nothing else of the service::
+
+    with TerrainClient("ws://127.0.0.1:8765", "mower-1", "husky", streams, rate_hz=10.0) as client:
+        client.send({"imu": (stamps, rows)})
+        step = client.latest()
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from time import monotonic
+from types import TracebackType
+from typing import Any, Self
+
+from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidURI
+from websockets.sync.client import ClientConnection, connect
+
+from pipelines.serve.wire import Encoding, decode, encode, plain
+from terrain.errors import TerrainError
+
+MAX_ERRORS = 100
+
+TIMEOUT_S = 10.0
+"""For the connection, and for a step that is waited for."""
+
+
+class ServiceError(TerrainError):
+    """The service refused something; ``code`` is one of :data:`pipelines.serve.wire.CODES`."""
+
+    def __init__(self, code: str, sentence: str) -> None:
+        super().__init__(sentence)
+        self.code = code
+
+
+class TerrainClient:
+    """One robot's connection to the live service, in MessagePack.
+
+    Parameters
+    ----------
+    url : ``ws://HOST:PORT`` of the service
+    session : name of the robot, one a connection
+    robot : name of its description
+    streams : channels of each stream that is sent, in the order of the columns
+    control : whether commands are asked for
+    rate_hz : of the steps that come back; 0 for one at each message that asks for it
+    token : that the service requires
+    record : whether the session is recorded there
+
+    Attributes
+    ----------
+    welcome : the service's answer to the hello
+    errors : the last errors that it sent
+    n_steps : number of steps that came
+
+    Raises
+    ------
+    ServiceError
+        if the service cannot be reached (code ``unreachable``) or refuses the session.
+    """
+
+    def __init__(
+        self,
+        url: str,
+        session: str,
+        robot: str,
+        streams: Mapping[str, Sequence[str]],
+        *,
+        control: bool = False,
+        rate_hz: float = 10.0,
+        token: str = "",
+        record: bool = False,
+    ) -> None:
+        self._steps: deque[tuple[float, dict[str, Any]]] = deque(maxlen=1)
+        self._came = threading.Condition()
+        self._closed: ServiceError | None = None
+        self.errors: deque[dict[str, Any]] = deque(maxlen=MAX_ERRORS)
+        self.n_steps = 0
+        try:
+            self._socket: ClientConnection = connect(
+                f"{url.rstrip('/')}/robots", open_timeout=TIMEOUT_S, compression=None, max_size=None
+            )
+        except (OSError, TimeoutError, InvalidURI, InvalidHandshake, ValueError) as error:
+            raise ServiceError("unreachable", f"{url}: cannot be reached ({error})") from None
+        try:
+            self._send(
+                {
+                    "type": "hello",
+                    "session": session,
+                    "robot": robot,
+                    "streams": {name: list(channels) for name, channels in streams.items()},
+                    "control": control,
+                    "rate_hz": rate_hz,
+                    "record": record,
+                    "token": token,
+                }
+            )
+            self.welcome = decode(self._socket.recv(TIMEOUT_S))
+        except (ConnectionClosed, TimeoutError) as error:
+            self._socket.close()
+            raise ServiceError("unreachable", f"{url}: did not answer ({error})") from None
+        if self.welcome.get("type") != "welcome":
+            self._socket.close()
+            raise ServiceError(str(self.welcome.get("code")), str(self.welcome.get("message")))
+        self._reader = threading.Thread(target=self._read, name="terrain client", daemon=True)
+        self._reader.start()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, place: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def send(
+        self,
+        streams: Mapping[str, tuple[Sequence[float], Sequence[Sequence[float]]]],
+        twist: Sequence[float] | None = None,
+        *,
+        step: bool = False,
+    ) -> None:
+        """Send samples, and the desired motion.
+
+        Parameters
+        ----------
+        streams : by name, stamps ``(k,)`` and rows ``(k, channels)``; NaN or None where nothing was measured
+        twist : desired ``(speed_x_mps, speed_y_mps, yaw_rate_radps)``; it holds for half a second
+        step : ask for a step now, where the session has no rate
+
+        Raises
+        ------
+        ServiceError
+            if the connection has ended.
+        """
+        content: dict[str, Any] = {
+            "type": "samples",
+            "streams": {name: plain([stamps, rows]) for name, (stamps, rows) in streams.items()},
+        }
+        if twist is not None:
+            content["twist"] = plain(list(twist))
+        if step:
+            content["step"] = True
+        self._send(content)
+
+    def latest(self, max_age_s: float | None = None) -> dict[str, Any] | None:
+        """Return the newest step; None before the first, and where it came longer ago than an age.
+
+        Parameters
+        ----------
+        max_age_s : by default a command's time of validity
+        """
+        age_s = float(self.welcome["command_valid_s"]) if max_age_s is None else max_age_s
+        with self._came:
+            if not self._steps or monotonic() - self._steps[-1][0] > age_s:
+                return None
+            return self._steps[-1][1]
+
+    def step(self, timeout_s: float = TIMEOUT_S) -> dict[str, Any]:
+        """Wait for a step that has not been returned by this method yet.
+
+        Raises
+        ------
+        ServiceError
+            if none comes in time (code ``timeout``), or the connection has ended.
+        """
+        end_s = monotonic() + (timeout_s)
+        with self._came:
+            while not self._steps:
+                if self._closed is not None:
+                    raise self._closed
+                if not self._came.wait(end_s - monotonic()) and monotonic() >= end_s:
+                    raise ServiceError("timeout", "the service gave no step in time")
+            return self._steps.pop()[1]
+
+    def close(self) -> None:
+        """End the session."""
+        with suppress(ServiceError):
+            self._send({"type": "bye"})
+        self._socket.close()
+        self._reader.join(TIMEOUT_S)
+
+    def _send(self, content: dict[str, Any]) -> None:
+        try:
+            self._socket.send(encode(content, Encoding.MSGPACK))
+        except ConnectionClosed as error:
+            raise self._closed or ServiceError("closed", f"the connection has ended ({error})") from None
+
+    def _read(self) -> None:
+        try:
+            for message in self._socket:
+                content = decode(message)
+                with self._came:
+                    if content.get("type") == "step":
+                        self._steps.append((monotonic(), content))
+                        self.n_steps += 1
+                    elif content.get("type") == "error":
+                        self.errors.append(content)
+                        if content.get("fatal"):
+                            self._closed = ServiceError(content["code"], content["message"])
+                    self._came.notify_all()
+        except (ConnectionClosed, TerrainError, OSError):
+            pass
+        finally:
+            with self._came:
+                self._closed = self._closed or ServiceError("closed", "the connection has ended")
+                self._came.notify_all()

@@ -1,0 +1,200 @@
+"""All that is served: model and table, the robots' sessions, and what outlives them."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from time import monotonic
+from typing import NamedTuple
+
+from pipelines.live.classifying import ClassifierThread
+from pipelines.live.session import RobotSession
+from pipelines.live.session_records import Served, StepOutput
+from pipelines.live.state import LiveState, Restorable, load_state, save_state
+from pipelines.models.model_files import TerrainModel
+from pipelines.serve.messages import Hello
+from pipelines.serve.metrics import Metrics
+from pipelines.serve.wire import WireError
+from terrain.control.slip_table import SlipTable
+from terrain.errors import ConfigError, DataError, TerrainError
+from terrain.robots import Robot, load_robot
+
+REMEMBERED = 1000
+"""States of robots that have left, which are kept in memory for their return."""
+
+SILENT_S = 2.0
+"""A connection that has said nothing for so long gives up its session to one that asks for it."""
+
+
+class Limits(NamedTuple):
+    """How much is accepted.
+
+    Parameters
+    ----------
+    sessions : open at once
+    message_bytes : of one message
+    messages_per_s, rows_per_s : of one session
+    hello_s : to say hello
+    too_slow_s : for which a receiver may not read
+    """
+
+    sessions: int = 64
+    message_bytes: int = 262_144
+    messages_per_s: float = 2000.0
+    rows_per_s: float = 20_000.0
+    hello_s: float = 10.0
+    too_slow_s: float = 5.0
+
+
+LIMITS = Limits()
+
+
+@dataclass(eq=False)
+class OpenSession:
+    """A session and who is connected to it."""
+
+    name: str
+    chain: RobotSession
+    restored: Restorable | None
+    leave: Callable[[str, str], None]
+    heard_s: float = field(default_factory=monotonic)
+    last: StepOutput | None = None
+
+
+class Hub:
+    """Sessions of robots on one model and table.
+
+    Parameters
+    ----------
+    served : at first
+    given : a robot's description that the package does not have, or has otherwise
+    limits : of sessions and messages
+    states : folder of the states that outlive the service; None for memory only
+    """
+
+    def __init__(
+        self,
+        served: Served,
+        given: Robot | None = None,
+        limits: Limits = LIMITS,
+        states: Path | None = None,
+    ) -> None:
+        self.served, self.limits, self.metrics = served, limits, Metrics()
+        self.metrics.served.set(served.number)
+        self.sessions: dict[str, OpenSession] = {}
+        self.closing = False
+        self.watchers = 0
+        self.trouble: dict[str, str] = {}
+        self._given, self._folder = given, states
+        self._thread = ClassifierThread()
+        self._left: OrderedDict[str, LiveState] = OrderedDict()
+        self._opening: set[str] = set()
+
+    def robot(self, name: str) -> Robot | None:
+        """Return the description of a robot by its name, never by a path; None where it has none."""
+        if self._given is not None and self._given.name == name:
+            return self._given
+        try:
+            return None if name.endswith((".yaml", ".yml")) else load_robot(name)
+        except ConfigError:
+            return None
+
+    async def open(self, hello: Hello, leave: Callable[[str, str], None]) -> OpenSession:
+        """Begin a session.
+
+        Parameters
+        ----------
+        hello : what the robot said
+        leave : called with a code and a sentence where the connection has to end
+
+        Raises
+        ------
+        WireError
+            if the session cannot be served, or there is one of that name already.
+        """
+        if self.closing:
+            raise WireError("closing", "the service ends")
+        before = self.sessions.get(hello.session)
+        if before is not None and monotonic() - before.heard_s > SILENT_S:
+            before.leave("name-taken", "another connection took the session, as this one was silent")
+            self.close(before)
+        elif before is not None or hello.session in self._opening:
+            raise WireError("name-taken", f"a session {hello.session!r} is open already")
+        if len(self.sessions) + len(self._opening) >= self.limits.sessions:
+            raise WireError("too-many", f"{self.limits.sessions} sessions are open, no more are accepted")
+        self._opening.add(hello.session)
+        try:
+            chain, restored = await asyncio.to_thread(self._begin, hello)
+        except (ConfigError, DataError) as error:
+            raise WireError("refused", str(error)) from None
+        finally:
+            self._opening.discard(hello.session)
+        if chain.served.number != self.served.number:  # replaced meanwhile
+            chain.swap(self.served)
+        opened = OpenSession(hello.session, chain, restored, leave)
+        self.sessions[hello.session] = opened
+        self.metrics.sessions.set(len(self.sessions))
+        return opened
+
+    def _begin(self, hello: Hello) -> tuple[RobotSession, Restorable | None]:
+        chain = RobotSession(hello.request, self.served, self.robot(hello.robot), self._thread.robot())
+        state = self._left.get(hello.session)
+        if state is None and self._folder is not None:
+            try:
+                state = load_state(self._folder / f"{hello.session}.json")
+            except DataError as error:  # a damaged state is none
+                self.trouble[f"state of {hello.session}"] = str(error)
+        return chain, None if state is None else chain.restore(state)
+
+    def close(self, opened: OpenSession) -> None:
+        """End a session; its state is kept for the robot's return."""
+        if self.sessions.get(opened.name) is not opened:
+            return
+        del self.sessions[opened.name]
+        self.metrics.sessions.set(len(self.sessions))
+        self._left[opened.name] = opened.chain.state()
+        self._left.move_to_end(opened.name)
+        while len(self._left) > REMEMBERED:
+            self._left.popitem(last=False)
+
+    def swap(self, model: TerrainModel | None, model_name: str, table: SlipTable) -> Served:
+        """Serve another model and table: all sessions at once, or none.
+
+        Raises
+        ------
+        ConfigError, DataError
+            if they do not suit a session, which the sentence names; nothing has changed then.
+        """
+        served = Served(self.served.number + 1, model, model_name, table)
+        for opened in self.sessions.values():
+            try:
+                opened.chain.check(served)
+            except (ConfigError, DataError) as error:
+                raise DataError(f"session {opened.name!r}: {error}") from None
+        for opened in self.sessions.values():
+            opened.chain.swap(served)
+        self.served = served
+        self.metrics.served.set(served.number)
+        return served
+
+    def states(self) -> dict[str, LiveState]:
+        """Return the states of all robots that are or were connected."""
+        return {**self._left, **{name: opened.chain.state() for name, opened in self.sessions.items()}}
+
+    def save_states(self, states: dict[str, LiveState]) -> None:
+        """Write states to the folder, if there is one; one that cannot be written is named in ``trouble``."""
+        if self._folder is None:
+            return
+        self.trouble.pop("states", None)
+        for name, state in states.items():
+            try:
+                save_state(self._folder / f"{name}.json", state)
+            except TerrainError as error:
+                self.trouble["states"] = str(error)
+
+    def stop(self) -> None:
+        """End the thread that classifies."""
+        self._thread.stop()

@@ -1,0 +1,180 @@
+"""What the messages of a robot and of the service hold; ``docs/service.md`` describes them."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
+
+from pipelines.live.session import COMMAND_VALID_S
+from pipelines.live.session_records import Observation, Served, SessionRequest, StepOutput
+from pipelines.live.state import Restorable
+from pipelines.serve.wire import WireError, plain
+from terrain.control.traction import TractionStatus
+
+PROTOCOL: Literal[1] = 1
+
+Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9 ._+-]*$", max_length=64)]
+Channel = Annotated[str, StringConstraints(pattern=r"^[A-Za-z][A-Za-z0-9_]*$", max_length=64)]
+
+
+class Hello(BaseModel):
+    """First message of a robot: what it is, what it sends, and what it asks for.
+
+    ``rate_hz`` is the rate of the answers; 0 asks for one at each message with ``"step": true``.
+    """
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+
+    type: Literal["hello"]
+    protocol: Literal[1] = PROTOCOL
+    session: Name
+    robot: Name
+    streams: Annotated[
+        dict[Name, Annotated[list[Channel], Field(min_length=1, max_length=64)]],
+        Field(min_length=1, max_length=16),
+    ]
+    control: bool = False
+    rate_hz: Annotated[float, Field(ge=0.0, le=200.0, strict=False)] = 10.0
+    record: bool = False
+    token: Annotated[str, StringConstraints(max_length=512)] = ""
+
+    @property
+    def request(self) -> SessionRequest:
+        """What the session is made of."""
+        channels = {stream: tuple(names) for stream, names in self.streams.items()}
+        return SessionRequest(self.session, self.robot, channels, self.control)
+
+
+def read_hello(content: dict[str, Any]) -> Hello:
+    """Return a hello.
+
+    Raises
+    ------
+    WireError
+        if it is none, or something in it is not accepted; the sentence names the first thing that is not.
+
+    Examples
+    --------
+    >>> said = {"type": "hello", "session": "r7", "robot": "husky", "streams": {"imu": ["gyro_z_radps"]}}
+    >>> read_hello(said).rate_hz
+    10.0
+    >>> read_hello({"type": "samples"})
+    Traceback (most recent call last):
+    pipelines.serve.wire.WireError: the first message is of the type 'samples', a hello is required
+    """
+    if content.get("type") != "hello":
+        kind = str(content.get("type"))[:40]
+        raise WireError("hello-first", f"the first message is of the type {kind!r}, a hello is required")
+    try:
+        hello = Hello.model_validate(content)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        place = ".".join(map(str, first["loc"]))[:120] or "the message"
+        raise WireError("malformed", f"hello: {place}: {first['msg']}") from None
+    for stream, channels in hello.streams.items():
+        if len(set(channels)) < len(channels):
+            raise WireError("malformed", f"hello: stream {stream!r} names a channel twice")
+    return hello
+
+
+def welcome(
+    hello: Hello, served: Served, restored: Restorable | None, limits: dict[str, float]
+) -> dict[str, Any]:
+    """Return the answer to a hello."""
+    content: dict[str, Any] = plain(
+        {
+            "type": "welcome",
+            "protocol": PROTOCOL,
+            "session": hello.session,
+            "rate_hz": hello.rate_hz,
+            "control": hello.control,
+            "command_valid_s": COMMAND_VALID_S,
+            "served": served_content(served),
+            "restored": None
+            if restored is None
+            else {
+                "age_s": restored.age_s,
+                "biases": sorted(restored.biases),
+                "terrain": restored.belief.terrain or None,
+            },
+            "limits": limits,
+        }
+    )
+    return content
+
+
+def served_content(served: Served) -> dict[str, Any]:
+    """Return which model and table are used."""
+    return {
+        "number": served.number,
+        "model": served.model_name or None,
+        "classes": [] if served.model is None else list(served.model.info.classes),
+        "table": served.table.name,
+    }
+
+
+def step_content(output: StepOutput) -> dict[str, Any]:
+    """Return the message of a step."""
+    content: dict[str, Any] = {
+        "type": "step",
+        "time_s": output.time_s,
+        "number": output.number,
+        "message": output.message,
+        "latency_s": output.latency_s,
+        "observation": observation_content(output.observation),
+    }
+    if output.command is not None:
+        command = output.command
+        code = int(command.status.get("status_code", TractionStatus.UNSOUND))
+        content["command"] = {
+            "status": output.status.value,
+            "traction": TractionStatus(code).label,
+            "valid_s": COMMAND_VALID_S,
+            "wheel_radps": command.wheel_radps,
+            "steer_rad": command.steer_rad,
+            "twist": command.twist,
+        }
+    found: dict[str, Any] = plain(content)
+    return found
+
+
+def observation_content(seen: Observation) -> dict[str, Any]:
+    """Return what is known of the robot."""
+    window = seen.window
+    return {
+        "terrain": seen.terrain or None,
+        "probability": seen.probability,
+        "window": None
+        if window is None
+        else {
+            "start_s": window.start_s,
+            "end_s": window.end_s,
+            "terrain": window.terrain or None,
+            "probabilities": dict(zip(window.classes, window.probabilities.tolist(), strict=True)),
+            "refused": window.refused or None,
+        },
+        "target_slip": {
+            state: {
+                "slip_ratio": target.slip_ratio,
+                "slip_std": target.slip_std,
+                "status": str(target.status),
+            }
+            for state, target in seen.target.items()
+        },
+        "target_of": next(iter(seen.target.values())).terrain,
+        "slip_ratio": seen.slip_ratio,
+        "slip_std": seen.slip_std,
+        "wheel_speed_mps": seen.wheel_speed_mps,
+        "current_a": seen.current_a,
+        "speed_x_mps": seen.speed_x_mps,
+        "speed_y_mps": seen.speed_y_mps,
+        "yaw_rate_radps": seen.yaw_rate_radps,
+        "sensors": dict(seen.sensors),
+        "served": seen.served,
+    }
+
+
+def error_content(code: str, sentence: str, *, fatal: bool = False) -> dict[str, Any]:
+    """Return the message of an error; after a fatal one the connection is closed."""
+    return {"type": "error", "code": code, "message": sentence, "fatal": fatal}

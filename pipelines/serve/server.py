@@ -1,0 +1,239 @@
+"""``terrain serve``: all that is checked before a robot may come, then the server until it is told to end."""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import os
+import signal
+import socket
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import uvicorn
+
+from pipelines.live.classifying import AtOnce, classify_window
+from pipelines.live.pilot import LivePilot
+from pipelines.live.session_records import Served
+from pipelines.live.terrain_source import Classifier
+from pipelines.models.model_files import TerrainModel
+from pipelines.serve.app import make_app
+from pipelines.serve.guard import check_token, is_loopback
+from pipelines.serve.hub import Hub, Limits
+from pipelines.serve.resolve import load_model
+from pipelines.serve.settings import ServeSettings
+from terrain.control.slip_table import load_slip_table
+from terrain.errors import ConfigError, DataError, TerrainError
+from terrain.estimation.live.estimator import CHANNELS
+from terrain.files.atomic import ensure_writable
+from terrain.records import Reading, Sample, Windows
+from terrain.robots import Robot, load_robot
+
+SWITCH_S = 0.0005
+"""How long the classifier's thread may keep the interpreter from a step that waits; Python's own is 5 ms."""
+
+SAVE_EVERY_S = 5.0
+LARGEST_MESSAGE = 4_194_304
+"""Bytes of a message that is not even read: the connection is closed (code 1009)."""
+
+PING_S = 10.0
+WARM_STEPS = 30
+
+
+class Prepared(NamedTuple):
+    """A service that is ready to listen."""
+
+    hub: Hub
+    listening: socket.socket
+    token: str
+    url: str
+
+
+def prepare(settings: ServeSettings) -> Prepared:
+    """Load, check and warm up what is served, and take the port.
+
+    Raises
+    ------
+    TerrainError
+        in one sentence, if anything does not fit: model, table, robot, token, folder, port.
+    """
+    token = _token(settings)
+    check_token(settings.host, token)
+    robot = None if settings.robot is None else load_robot(settings.robot)
+    table = load_slip_table(settings.table, None if robot is None else robot.name)
+    for folder in (settings.state, settings.record):
+        if folder is not None:
+            ensure_writable(folder)
+            folder.mkdir(parents=True, exist_ok=True)
+    listening = _listen(settings.host, settings.port)
+    try:
+        model = load_model(settings.model)
+        served = Served(1, model, settings.model, table)
+        if robot is not None:
+            check_fit(model, robot)
+        hub = Hub(served, robot, Limits(sessions=settings.max_sessions), settings.state)
+        warm_up(model, robot)
+    except BaseException:
+        listening.close()
+        raise
+    host, port = listening.getsockname()[:2]
+    return Prepared(hub, listening, token, f"http://{f'[{host}]' if ':' in host else host}:{port}")
+
+
+def serve(prepared: Prepared, announce: Callable[[str], None]) -> None:
+    """Serve until the process is told to end (SIGTERM, Ctrl-C): robots are told, states are saved.
+
+    Parameters
+    ----------
+    prepared : by :func:`prepare`
+    announce : called with the address once robots can come
+    """
+    hub = prepared.hub
+    loopback = is_loopback(prepared.listening.getsockname()[0])
+    app = make_app(hub, prepared.token, load_model, loopback=loopback)
+    config = uvicorn.Config(
+        app,
+        log_level="warning",
+        access_log=False,
+        lifespan="off",
+        ws="websockets-sansio",
+        ws_max_size=LARGEST_MESSAGE,
+        ws_ping_interval=PING_S,
+        ws_ping_timeout=PING_S,
+        ws_per_message_deflate=False,
+        timeout_graceful_shutdown=5,
+        server_header=False,
+    )
+    sys.setswitchinterval(SWITCH_S)
+    gc.collect()
+    gc.freeze()  # what is loaded now stays: no collection has to look at it
+    try:
+        asyncio.run(_run(_Server(config, hub), prepared, announce))
+    finally:
+        hub.stop()
+        prepared.listening.close()
+
+
+class _Server(uvicorn.Server):
+    """A server that tells the robots before it ends."""
+
+    def __init__(self, config: uvicorn.Config, hub: Hub) -> None:
+        super().__init__(config)
+        self._hub = hub
+        self._ending: asyncio.Task[None] | None = None
+
+    def handle_exit(self, sig: int, frame: Any) -> None:
+        """End in order at the first signal, at once at the second."""
+        if self._hub.closing:
+            super().handle_exit(sig, frame)
+            return
+        self._hub.closing = True
+        loop = asyncio.get_event_loop()
+
+        def begin() -> None:
+            self._ending = loop.create_task(self._end(sig, frame))
+
+        loop.call_soon_threadsafe(begin)
+
+    async def _end(self, sig: int, frame: Any) -> None:
+        for opened in list(self._hub.sessions.values()):
+            opened.leave("closing", "the service ends")
+        for _ in range(150):
+            if not self._hub.sessions:
+                break
+            await asyncio.sleep(0.01)
+        super().handle_exit(signal.SIGTERM if sig == signal.SIGINT else sig, frame)
+
+
+async def _run(server: _Server, prepared: Prepared, announce: Callable[[str], None]) -> None:
+    hub = prepared.hub
+
+    async def save() -> None:
+        while True:
+            await asyncio.sleep(SAVE_EVERY_S)
+            await asyncio.to_thread(hub.save_states, hub.states())
+
+    async def tell() -> None:
+        while not server.started:
+            await asyncio.sleep(0.005)
+        announce(prepared.url)
+
+    tasks = [asyncio.create_task(save()), asyncio.create_task(tell())]
+    try:
+        await server.serve(sockets=[prepared.listening])
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+        hub.save_states(hub.states())
+
+
+def check_fit(model: TerrainModel, robot: Robot) -> None:
+    """Refuse a model that cannot classify a robot's windows.
+
+    Raises
+    ------
+    DataError
+        if it needs channels that neither the robot's sensors nor its filter give.
+    """
+    if robot.drive == "swerve":
+        Classifier(model, robot)
+    elif model.info.robots and robot.name not in model.info.robots:
+        raise DataError(
+            f"the model was trained on runs of {', '.join(model.info.robots)}, not of {robot.name}"
+        )
+
+
+def warm_up(model: TerrainModel, robot: Robot | None) -> None:
+    """Run all code once, so that the first robot does not wait for it."""
+    rng = np.random.default_rng(0)
+    layout, rule = model.layout, model.rule
+    values = {
+        stream: rng.normal(size=(1, len(names), layout.n_samples(stream, rule.length_s)))
+        for stream, names in layout.channels.items()
+    }
+    nothing = np.array([""], dtype=object)
+    window = Windows(values, layout.channels, layout.rate_hz, rule.length_s, np.zeros(1), nothing, nothing)
+    classify_window(model, window)
+    if robot is None or robot.drive != "swerve":
+        return
+    try:
+        pilot = LivePilot(robot, source=Classifier(model, robot, AtOnce()))
+    except (ConfigError, DataError):
+        return
+    for k in range(WARM_STEPS):
+        time_s = np.array([0.02 * k])
+        readings = {
+            stream: Reading(time_s, rng.normal(size=(1, len(names)))) for stream, names in CHANNELS.items()
+        }
+        pilot.step(Sample(0.02 * k, np.array([0.5, 0.0, 0.0]), readings))
+
+
+def _token(settings: ServeSettings) -> str:
+    if settings.token_file is None:
+        return os.environ.get("TERRAIN_TOKEN", "").strip()
+    try:
+        return Path(settings.token_file).read_text(encoding="utf-8").strip()
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or "no text"
+        raise ConfigError(f"{settings.token_file}: cannot be read ({reason})") from None
+
+
+def _listen(host: str, port: int) -> socket.socket:
+    """Return a socket that listens; ``TerrainError`` where the address is taken or none of this machine."""
+    try:
+        family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
+        listening = socket.socket(family, socket.SOCK_STREAM)
+    except OSError as error:
+        raise ConfigError(f"--host {host}: is no address ({error.strerror})") from None
+    try:
+        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listening.bind((host, port))
+        listening.listen(1024)
+    except OSError as error:
+        listening.close()
+        raise TerrainError(f"port {port} of {host} cannot be listened on ({error.strerror})") from None
+    return listening
