@@ -31,6 +31,6 @@ def without(package: str) -> Iterator[None]:
 def serve_command(settings: ServeSettings) -> None:
     """Serve terrain, target slips and commands to robots, live."""
     with without("pandas"):  # scikit-learn takes it: 67 MB and a second, and the service has no use for it
-        from pipelines.serve.server import prepare, serve
+        from pipelines.serve.server import Service, prepare
 
-    serve(prepare(settings), lambda url: typer.echo(f"serving {settings.model} at {url}"))
+    Service(prepare(settings)).run(lambda url: typer.echo(f"serving {settings.model} at {url}"))

@@ -97,6 +97,11 @@ class RobotSession:
         self._pilot = LivePilot(self._robot, served.table, self._source)
 
     @property
+    def newest_s(self) -> float:
+        """Newest stamp that has come; NaN before the first."""
+        return self._clock.newest_s
+
+    @property
     def window(self) -> WindowOutput | None:
         """Output of the last window."""
         return self._window
@@ -194,17 +199,19 @@ class RobotSession:
                 self._twist, self._twist_s = desired, now_s
         return self.inbox.received.total() - before
 
-    def step(self, now_s: float | None = None) -> StepOutput:
+    def step(self, now_s: float | None = None, time_s: float | None = None) -> StepOutput:
         """Run the chain over what has come since the last step; it does not raise.
 
         Parameters
         ----------
         now_s : of the local clock that never goes back
+        time_s : of the robot's clock, where it says so itself; by default that of its clock now, as far as
+            its messages tell
         """
         begun_s = monotonic()
         now_s = begun_s if now_s is None else now_s
         readings = self.inbox.take()
-        time_s = self._clock.at(now_s)
+        time_s = self._clock.at(now_s) if time_s is None else time_s
         self._n_steps += 1
         command, status = None, CommandStatus.OK
         if self._pilot is not None:

@@ -37,7 +37,7 @@ OPEN = ("/", "/health", "/ready", *(f"/page/{name}" for name in PAGE_FILES))
 
 LARGEST_TABLE = 262_144
 SECURITY = {
-    "Content-Security-Policy": "default-src 'self'; style-src 'self' 'unsafe-inline'; frame-ancestors 'none'",
+    "Content-Security-Policy": "default-src 'self'; frame-ancestors 'none'",
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",
     "Cache-Control": "no-store",

@@ -123,6 +123,7 @@ class TerrainClient:
         twist: Sequence[float] | None = None,
         *,
         step: bool = False,
+        time_s: float | None = None,
     ) -> None:
         """Send samples, and the desired motion.
 
@@ -131,6 +132,7 @@ class TerrainClient:
         streams : by name, stamps ``(k,)`` and rows ``(k, channels)``; NaN or None where nothing was measured
         twist : desired ``(speed_x_mps, speed_y_mps, yaw_rate_radps)``; it holds for half a second
         step : ask for a step now, where the session has no rate
+        time_s : of that step, on the clock of the stamps; by default the newest stamp
 
         Raises
         ------
@@ -145,6 +147,8 @@ class TerrainClient:
             content["twist"] = plain(list(twist))
         if step:
             content["step"] = True
+        if time_s is not None:
+            content["time_s"] = float(time_s)
         self._send(content)
 
     def latest(self, max_age_s: float | None = None) -> dict[str, Any] | None:

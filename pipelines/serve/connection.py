@@ -121,7 +121,8 @@ class Connection:
                     raise WireError("unknown-type", f"there is no message of the type {kind!r}")
                 self._take(opened, content, now_s)
                 if rate_hz == 0.0 and content.get("step") is True:
-                    self._run(opened)
+                    time_s = content.get("time_s")
+                    self._run(opened, time_s if type(time_s) is float else opened.chain.newest_s)
             except WireError as error:
                 self._note(error.code, str(error))
 
@@ -152,10 +153,10 @@ class Connection:
             await asyncio.sleep(max(wait_s, 0.0))
             self._run(opened)
 
-    def _run(self, opened: OpenSession) -> None:
+    def _run(self, opened: OpenSession, time_s: float | None = None) -> None:
         metrics, begun_s = self._hub.metrics, perf_counter()
         windows_before = opened.chain.window
-        output = opened.chain.step()
+        output = opened.chain.step(time_s=time_s)
         metrics.step_s.observe(perf_counter() - begun_s)
         metrics.steps.inc()
         if output.latency_s == output.latency_s:  # a number

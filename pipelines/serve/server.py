@@ -42,6 +42,9 @@ LARGEST_MESSAGE = 4_194_304
 PING_S = 10.0
 WARM_STEPS = 30
 
+LEAVING_STEPS = 150
+"""Hundredths of a second that robots have to read that the service ends."""
+
 
 class Prepared(NamedTuple):
     """A service that is ready to listen."""
@@ -83,42 +86,80 @@ def prepare(settings: ServeSettings) -> Prepared:
     return Prepared(hub, listening, token, f"http://{f'[{host}]' if ':' in host else host}:{port}")
 
 
-def serve(prepared: Prepared, announce: Callable[[str], None]) -> None:
-    """Serve until the process is told to end (SIGTERM, Ctrl-C): robots are told, states are saved.
+class Service:
+    """A prepared service, from its first robot to its end.
 
     Parameters
     ----------
     prepared : by :func:`prepare`
-    announce : called with the address once robots can come
     """
-    hub = prepared.hub
-    loopback = is_loopback(prepared.listening.getsockname()[0])
-    app = make_app(hub, prepared.token, load_model, loopback=loopback)
-    config = uvicorn.Config(
-        app,
-        log_level="warning",
-        access_log=False,
-        lifespan="off",
-        ws="websockets-sansio",
-        ws_max_size=LARGEST_MESSAGE,
-        ws_ping_interval=PING_S,
-        ws_ping_timeout=PING_S,
-        ws_per_message_deflate=False,
-        timeout_graceful_shutdown=5,
-        server_header=False,
-    )
-    sys.setswitchinterval(SWITCH_S)
-    gc.collect()
-    gc.freeze()  # what is loaded now stays: no collection has to look at it
-    try:
-        asyncio.run(_run(_Server(config, hub), prepared, announce))
-    finally:
-        hub.stop()
-        prepared.listening.close()
+
+    def __init__(self, prepared: Prepared) -> None:
+        self._prepared, hub = prepared, prepared.hub
+        loopback = is_loopback(prepared.listening.getsockname()[0])
+        config = uvicorn.Config(
+            make_app(hub, prepared.token, load_model, loopback=loopback),
+            log_level="critical",
+            access_log=False,
+            lifespan="off",
+            ws="websockets-sansio",
+            ws_max_size=LARGEST_MESSAGE,
+            ws_ping_interval=PING_S,
+            ws_ping_timeout=PING_S,
+            ws_per_message_deflate=False,
+            timeout_graceful_shutdown=5,
+            server_header=False,
+        )
+        self._server = _Server(config, hub)
+
+    def run(self, announce: Callable[[str], None]) -> None:
+        """Serve until the process is told to end (SIGTERM, Ctrl-C): robots are told, states are saved.
+
+        Parameters
+        ----------
+        announce : called with the address once robots can come
+        """
+        sys.setswitchinterval(SWITCH_S)
+        gc.collect()
+        gc.freeze()  # what is loaded now stays: no collection has to look at it
+        try:
+            asyncio.run(self._run(announce))
+        finally:
+            self._prepared.hub.stop()
+            self._prepared.listening.close()
+
+    def stop(self) -> None:
+        """End in order, from another thread."""
+        self._server.handle_exit(signal.SIGTERM, None)
+
+    async def _run(self, announce: Callable[[str], None]) -> None:
+        hub, server = self._prepared.hub, self._server
+        server.loop = asyncio.get_running_loop()
+
+        async def save() -> None:
+            while True:
+                await asyncio.sleep(SAVE_EVERY_S)
+                await asyncio.to_thread(hub.save_states, hub.states())
+
+        async def tell() -> None:
+            while not server.started:
+                await asyncio.sleep(0.005)
+            announce(self._prepared.url)
+
+        tasks = [asyncio.create_task(save()), asyncio.create_task(tell())]
+        try:
+            await server.serve(sockets=[self._prepared.listening])
+        finally:
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+            hub.save_states(hub.states())
 
 
 class _Server(uvicorn.Server):
     """A server that tells the robots before it ends."""
+
+    loop: asyncio.AbstractEventLoop
 
     def __init__(self, config: uvicorn.Config, hub: Hub) -> None:
         super().__init__(config)
@@ -131,44 +172,20 @@ class _Server(uvicorn.Server):
             super().handle_exit(sig, frame)
             return
         self._hub.closing = True
-        loop = asyncio.get_event_loop()
 
         def begin() -> None:
-            self._ending = loop.create_task(self._end(sig, frame))
+            self._ending = self.loop.create_task(self._end())
 
-        loop.call_soon_threadsafe(begin)
+        self.loop.call_soon_threadsafe(begin)
 
-    async def _end(self, sig: int, frame: Any) -> None:
+    async def _end(self) -> None:
         for opened in list(self._hub.sessions.values()):
             opened.leave("closing", "the service ends")
-        for _ in range(150):
+        for _ in range(LEAVING_STEPS):
             if not self._hub.sessions:
                 break
             await asyncio.sleep(0.01)
-        super().handle_exit(signal.SIGTERM if sig == signal.SIGINT else sig, frame)
-
-
-async def _run(server: _Server, prepared: Prepared, announce: Callable[[str], None]) -> None:
-    hub = prepared.hub
-
-    async def save() -> None:
-        while True:
-            await asyncio.sleep(SAVE_EVERY_S)
-            await asyncio.to_thread(hub.save_states, hub.states())
-
-    async def tell() -> None:
-        while not server.started:
-            await asyncio.sleep(0.005)
-        announce(prepared.url)
-
-    tasks = [asyncio.create_task(save()), asyncio.create_task(tell())]
-    try:
-        await server.serve(sockets=[prepared.listening])
-    finally:
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
-        hub.save_states(hub.states())
+        self.should_exit = True
 
 
 def check_fit(model: TerrainModel, robot: Robot) -> None:

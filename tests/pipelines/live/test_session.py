@@ -134,6 +134,19 @@ def test_columns_are_taken_by_name_and_what_is_not_sent_is_unknown(log, swerve_m
     assert all(np.isfinite(o.command.wheel_radps).all() for o in outputs)
 
 
+def test_a_robot_that_asks_for_its_steps_gets_them_at_its_own_time_however_late_messages_are(log):
+    rng, now_s = np.random.default_rng(2), NOW_S
+    session, pilot = agrimaro(), LivePilot(ROBOT, TABLE)
+    for sample in replay(log):
+        now_s = max(now_s, NOW_S + sample.time_s + rng.exponential(0.05))
+        streams = {name: (t.tolist(), values.tolist()) for name, (t, values) in sample.readings.items()}
+        session.put(streams, sample.twist.tolist(), now_s)
+        output, desired = session.step(now_s, sample.time_s), pilot.step(sample)
+        assert output.time_s == sample.time_s
+        np.testing.assert_array_equal(output.command.wheel_radps, desired.wheel_radps)
+        np.testing.assert_array_equal(output.command.steer_rad, desired.steer_rad)
+
+
 def test_a_desired_motion_that_is_too_old_stops_the_robot_until_a_new_one_comes(log):
     session = agrimaro()
     seen = []

@@ -1,0 +1,137 @@
+"""A service that listens, on a small model, and robots to talk to it."""
+
+import json
+import threading
+import urllib.error
+import urllib.request
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+from skops import io
+from websockets.sync.client import connect
+
+from pipelines.classify.crossval import samples_of
+from pipelines.classify.settings import CrossvalSettings
+from pipelines.classify.train import model_info
+from pipelines.models.model_files import TerrainModel, write_info
+from pipelines.serve.server import Service, prepare
+from pipelines.serve.settings import ServeSettings
+from terrain.logs.replay import replay
+from terrain.records import RunLog, Stream
+
+CHANNELS = {"imu": ["accel_z_mps2"], "wheels": ["speed_left_mps"]}
+
+
+def _drive(terrain, noise, number, duration_s=12.0):
+    rng = np.random.default_rng([number, int(10 * noise)])
+    time_s = np.arange(0, duration_s, 0.02)
+    streams = {
+        "imu": Stream(time_s, rng.normal(0, noise, (time_s.size, 1)), ("accel_z_mps2",)),
+        "wheels": Stream(time_s, np.full((time_s.size, 1), 0.5), ("speed_left_mps",)),
+    }
+    return RunLog(f"{terrain}{number}", "mower", streams, ((0.0, duration_s, terrain),))
+
+
+@pytest.fixture(scope="session")
+def drives():
+    """Runs of a robot without a description on two terrains that differ in shaking."""
+    return [
+        _drive(terrain, noise, number) for terrain, noise in (("a", 0.1), ("b", 2.0)) for number in range(3)
+    ]
+
+
+@pytest.fixture(scope="session")
+def mower_model(drives):
+    settings = CrossvalSettings()
+    windows = samples_of(drives, settings).cut.windows
+    recipe = settings.new_recipe().fit(windows, windows.terrain.astype(str))
+    return TerrainModel(recipe, model_info(drives, settings, windows, "drawn", ""))
+
+
+@pytest.fixture(scope="session")
+def model_folder(mower_model, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("model")
+    io.dump(mower_model.recipe, folder / "model.skops")
+    write_info(folder, mower_model.info)
+    return folder
+
+
+class Running:
+    """A service in this process, its address, and its hub."""
+
+    def __init__(self, prepared):
+        self.hub, self.token = prepared.hub, prepared.token
+        self.http = prepared.url
+        self.ws = prepared.url.replace("http", "ws")
+
+    def socket(self, place="/robots", **options):
+        return connect(self.ws + place, compression=None, max_size=None, open_timeout=30, **options)
+
+    def get(self, place, method="GET", body=None, headers=()):
+        """Status and text of an answer."""
+        request = urllib.request.Request(self.http + place, body, dict(headers), method=method)
+        try:
+            with urllib.request.urlopen(request, timeout=30) as answer:
+                return answer.status, answer.read().decode()
+        except urllib.error.HTTPError as error:
+            with error:
+                return error.code, error.read().decode()
+
+    def put(self, place, content, kind="application/json"):
+        body = (content if isinstance(content, str) else json.dumps(content)).encode()
+        return self.get(place, "PUT", body, {"Content-Type": kind})
+
+
+@contextmanager
+def _running(limits=None, **options):
+    prepared = prepare(ServeSettings(port=0, **options))
+    if limits is not None:
+        prepared.hub.limits = limits
+    service, ready = Service(prepared), threading.Event()
+    thread = threading.Thread(target=service.run, args=(lambda url: ready.set(),))
+    thread.start()
+    try:
+        assert ready.wait(60.0)
+        yield Running(prepared)
+    finally:
+        service.stop()
+        thread.join(30.0)
+        assert not thread.is_alive()
+
+
+@pytest.fixture(scope="session")
+def running():
+    """What runs a service with settings until a block ends."""
+    return _running
+
+
+@pytest.fixture(scope="module")
+def service(running, model_folder):
+    """A service that several tests of a file use; each has sessions of its own name."""
+    with running(model=str(model_folder)) as found:
+        yield found
+
+
+@pytest.fixture(scope="session")
+def hello():
+    def said(session, **changed):
+        first = {"type": "hello", "session": session, "robot": "mower", "streams": CHANNELS, "rate_hz": 0}
+        return {**first, **changed}
+
+    return said
+
+
+@pytest.fixture(scope="session")
+def messages():
+    """The messages of a run, each asking for a step."""
+
+    def of(run, rate_hz=50.0):
+        for sample in replay(run, rate_hz):
+            streams = {
+                name: [reading.time_s.tolist(), reading.values.tolist()]
+                for name, reading in sample.readings.items()
+            }
+            yield {"type": "samples", "streams": streams, "step": True, "time_s": sample.time_s}
+
+    return of

@@ -1,0 +1,259 @@
+"""Robots talk to a real service over loopback: what comes back is what the live chain says, each to its own."""
+
+import json
+import time
+
+import msgpack
+import pytest
+from prometheus_client.parser import text_string_to_metric_families
+from websockets.exceptions import ConnectionClosed
+
+from pipelines.live.observer import TerrainObserver
+from pipelines.serve.client import ServiceError, TerrainClient
+from terrain.control.slip_table import load_slip_table
+from terrain.files.resources import data_folder
+from terrain.logs.replay import replay
+
+CHANNELS = {"imu": ["accel_z_mps2"], "wheels": ["speed_left_mps"]}
+TABLE = (data_folder("target_slip") / "default.yaml").read_text()
+
+
+def talk(socket, packed):
+    """Send a message and return the answer."""
+
+    def say(content):
+        socket.send(msgpack.packb(content) if packed else json.dumps(content))
+        answer = socket.recv(30)
+        return msgpack.unpackb(answer) if packed else json.loads(answer)
+
+    return say
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_a_robot_gets_the_terrain_and_target_slips_of_its_samples(
+    service, hello, messages, drives, mower_model, packed
+):
+    run, observer = drives[4], TerrainObserver(mower_model)
+    found, seen = [], []
+    with service.socket() as socket:
+        say = talk(socket, packed)
+        welcome = say(hello(f"alone-{packed}"))
+        assert (welcome["type"], welcome["served"]["classes"]) == ("welcome", ["a", "b"])
+        for message in messages(run):
+            answer = say(message)
+            assert (answer["type"], answer["time_s"]) == ("step", message["time_s"])
+            seen.append(answer["observation"])
+            deadline_s = time.monotonic() + 0.02  # a window is classified beside the steps
+            while len(message["streams"]) == 2 and time.monotonic() < deadline_s and not seen[-1]["window"]:
+                break
+        time.sleep(0.2)
+        seen.append(say({"type": "samples", "streams": {}, "step": True})["observation"])
+    for sample in replay(run):
+        found += observer.update(sample.readings)
+    windows = {}
+    for one in seen:
+        if one["window"]:
+            windows[one["window"]["start_s"]] = one["window"]
+    assert list(windows) == [one.start_s for one in found]
+    for one in found:
+        assert windows[one.start_s]["terrain"] == one.terrain
+        assert windows[one.start_s]["probabilities"] == pytest.approx(dict(one.probabilities), abs=1e-12)
+    assert seen[-1]["terrain"] == "b"
+    assert (
+        seen[-1]["target_slip"]["traction"]["slip_ratio"]
+        == load_slip_table().lookup("b")["traction"].slip_ratio
+    )
+    assert seen[-1]["slip_ratio"] == []
+
+
+def test_steps_come_at_the_rate_that_was_asked_for(service):
+    with TerrainClient(service.ws, "ticking", "mower", CHANNELS, rate_hz=50.0) as client:
+        begun_s, n_sent = time.monotonic(), 0
+        while time.monotonic() - begun_s < 1.5:
+            client.send({"imu": ([n_sent / 100], [[0.1]]), "wheels": ([n_sent / 100], [[0.5]])})
+            n_sent += 1
+            time.sleep(0.01)
+        step = client.latest()
+        assert step["message"] >= n_sent - 20
+        assert 40 <= client.n_steps <= 76
+        assert step["observation"]["sensors"] == {"imu": "fresh", "wheels": "fresh"}
+        assert "command" not in step
+        assert list(client.errors) == []
+    assert client.latest(0.0) is None
+
+
+def test_the_client_waits_for_steps_and_says_what_went_wrong(service):
+    with TerrainClient(service.ws, "waiting", "mower", CHANNELS, rate_hz=0.0) as client:
+        with pytest.raises(ServiceError, match="no step in time"):
+            client.step(0.1)
+        client.send({"imu": ([0.0], [[0.1]])}, step=True, time_s=5.0)
+        assert client.step()["time_s"] == 5.0
+        with pytest.raises(ServiceError, match="'waiting' is open already"):
+            TerrainClient(service.ws, "waiting", "mower", CHANNELS)
+    with pytest.raises(ServiceError, match="the connection has ended"):
+        client.send({}, step=True)
+    with pytest.raises(ServiceError, match="cannot be reached"):
+        TerrainClient("ws://127.0.0.1:1", "x", "mower", CHANNELS)
+    with pytest.raises(ServiceError, match="neither measured nor estimated"):
+        TerrainClient(service.ws, "x", "mower", {"imu": ["gyro_z_radps"]})
+
+
+def test_robots_are_kept_apart(service, hello, messages, drives):
+    sockets = [service.socket(), service.socket()]
+    try:
+        says = [talk(socket, packed) for socket, packed in zip(sockets, (False, True), strict=True)]
+        for k, say in enumerate(says):
+            assert say(hello(f"apart-{k}"))["type"] == "welcome"
+        for pair in zip(messages(drives[0]), messages(drives[3]), strict=True):
+            last = [say(message) for say, message in zip(says, pair, strict=True)]
+            time.sleep(0.0005)
+        assert [one["observation"]["terrain"] for one in last] == ["a", "b"]
+        listed = {one["session"]: one for one in json.loads(service.get("/sessions")[1])}
+        assert {listed[f"apart-{k}"]["terrain"] for k in (0, 1)} == {"a", "b"}
+    finally:
+        for socket in sockets:
+            socket.close()
+
+
+def test_commands_are_asked_for_and_stop_with_the_desired_motion(running, model_folder):
+    """A model without a robot's channels cannot serve it; a robot without samples stands."""
+    with running(model=str(model_folder)) as service:
+        service.hub.swap(None, "", load_slip_table())
+        streams = {"wheels": [f"motor_{i}_radps" for i in (1, 2, 3)]}
+        with TerrainClient(service.ws, "driven", "agrimaro", streams, control=True, rate_hz=50.0) as client:
+            assert client.step()["command"]["status"] == "no samples yet"
+            begun_s = time.monotonic()
+            while time.monotonic() - begun_s < 0.5:
+                client.send({"wheels": ([time.monotonic()], [[20.0, 20.0, 20.0]])}, (0.5, 0.0, 0.0))
+                time.sleep(0.02)
+            driven = client.latest()["command"]
+            assert driven["status"] == "ok"
+            assert min(driven["wheel_radps"]) > 0.0
+            time.sleep(0.7)
+            stopped = client.latest()["command"]
+            assert stopped["status"] == "stopped: the desired motion is too old"
+            assert stopped["twist"] == [0.0, 0.0, 0.0]
+
+
+def test_health_readiness_and_the_card_of_the_model(service):
+    assert json.loads(service.get("/health")[1])["status"] == "ok"
+    status, text = service.get("/ready")
+    assert (status, json.loads(text)["ready"]) == (200, True)
+    card = json.loads(service.get("/model")[1])
+    assert card["card"]["classes"] == ["a", "b"]
+    assert card["card"]["robots"] == ["mower"]
+    assert card["served"]["number"] == 1
+    assert service.get("/nothing")[0] == 404
+
+
+def test_figures_are_in_the_form_of_prometheus(service, hello, messages, drives):
+    def figures():
+        families = text_string_to_metric_families(service.get("/metrics")[1])
+        return {
+            sample.name: sample.value for family in families for sample in family.samples if not sample.labels
+        }
+
+    before = figures()
+    with service.socket() as socket:
+        say = talk(socket, True)
+        say(hello("counted"))
+        for message in list(messages(drives[0]))[:100]:
+            say(message)
+        during = figures()
+        say({"type": "nonsense"})
+    assert during["terrain_sessions"] == before["terrain_sessions"] + 1
+    assert during["terrain_messages_total"] == before["terrain_messages_total"] + 100
+    assert during["terrain_rows_total"] == before["terrain_rows_total"] + 200
+    assert during["terrain_step_seconds_count"] == before["terrain_step_seconds_count"] + 100
+    assert 1e7 < during["terrain_memory_bytes"] < 1e10
+
+
+def test_the_http_side_is_described(service):
+    described = json.loads(service.get("/openapi.json")[1])
+    assert {"/health", "/ready", "/metrics", "/model", "/table", "/sessions"} <= set(described["paths"])
+    for path, ways in described["paths"].items():
+        for way in ways.values():
+            assert way.get("description") or way.get("summary"), path
+
+
+def test_another_model_is_put_in_while_a_robot_is_served_and_no_window_is_lost(
+    running, model_folder, hello, messages, drives
+):
+    with running(model=str(model_folder)) as service, service.socket() as socket:
+        say, starts, numbers = talk(socket, False), [], []
+        say(hello("swapped"))
+        for k, message in enumerate(messages(drives[4])):
+            if k in (150, 320):
+                status, text = service.put("/model", {"uri": str(model_folder)})
+                assert (status, json.loads(text)["number"]) == (200, 2 if k == 150 else 3)
+            seen = say(message)["observation"]
+            time.sleep(0.0005)
+            numbers.append(seen["served"])
+            if seen["window"]:
+                starts.append(seen["window"]["start_s"])
+        assert numbers == [1] * 150 + [2] * 170 + [3] * (len(numbers) - 320)
+        assert sorted(set(starts)) == [0.0, 2.0, 4.0, 6.0, 8.0][: len(set(starts))]
+        assert len(set(starts)) >= 5
+        lower = TABLE.replace("0.1", "0.11")
+        status, text = service.put("/table", lower, "application/yaml")
+        assert (status, json.loads(text)["number"]) == (200, 4)
+
+
+@pytest.mark.parametrize(
+    ("place", "content", "kind", "status", "fault"),
+    [
+        ("/model", {"uri": "/nowhere"}, "application/json", 409, "is neither a folder nor a model URI"),
+        ("/model", {"url": "x"}, "application/json", 422, "uri"),
+        ("/model", "[" * 100_000, "application/json", 422, "JSON"),
+        ("/table", "name: [", "application/yaml", 409, "the table: is no YAML"),
+        ("/table", "name: x", "application/yaml", 409, "the table"),
+        ("/table", "x" * 300_000, "application/yaml", 422, "at most"),
+    ],
+)
+def test_what_cannot_be_served_is_refused_and_the_old_goes_on(service, place, content, kind, status, fault):
+    number = service.hub.served.number
+    found, text = service.put(place, content, kind)
+    assert found == status, text
+    assert fault in text
+    assert "Traceback" not in text
+    assert service.hub.served.number == number
+
+
+def test_a_damaged_model_is_refused(service, model_folder, tmp_path):
+    for file in model_folder.iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    content = bytearray((tmp_path / "model.skops").read_bytes())
+    content[len(content) // 2] ^= 1
+    (tmp_path / "model.skops").write_bytes(content)
+    status, text = service.put("/model", {"uri": str(tmp_path)})
+    assert (status, service.hub.served.number) == (409, 1)
+    assert "is damaged" in text
+
+
+def test_a_session_that_is_silent_gives_way_to_its_robot_that_comes_back(service, hello, monkeypatch):
+    monkeypatch.setattr("pipelines.serve.hub.SILENT_S", 0.3)
+    with service.socket() as first, service.socket() as second:
+        assert talk(first, False)(hello("back"))["type"] == "welcome"
+        assert talk(second, False)(hello("back"))["code"] == "name-taken"
+        time.sleep(0.4)
+        assert talk(second, False)(hello("back"))["type"] == "welcome"
+        said = json.loads(first.recv(10))
+        assert (said["code"], said["fatal"]) == ("name-taken", True)
+        with pytest.raises(ConnectionClosed):
+            first.recv(10)
+
+
+def test_a_robot_that_comes_back_knows_its_terrain(service, hello, messages, drives):
+    for restored in (None, "b"):
+        with service.socket() as socket:
+            say = talk(socket, True)
+            welcome = say(hello("returning"))
+            assert (welcome["restored"] or {}).get("terrain") == restored
+            if restored:
+                first = say({"type": "samples", "streams": {}, "step": True})
+                assert first["observation"]["terrain"] == "b"
+                continue
+            for message in messages(drives[4]):
+                say(message)
+                time.sleep(0.0005)
+        time.sleep(0.2)
