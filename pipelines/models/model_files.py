@@ -7,8 +7,11 @@ code of its own; the checksum distinguishes a damaged file from an intact one.
 from __future__ import annotations
 
 import hashlib
+import io as streams
 import json
+import struct
 import zipfile
+import zlib
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,11 +21,20 @@ from pipelines.models.results import ModelInfo
 from pipelines.reporting.json_file import as_json
 from terrain.errors import ConfigError, DataError, ModelError
 from terrain.files.atomic import atomic_write
+from terrain.files.documents import MAX_JSON_BYTES, parse_json
+from terrain.files.names import shown
+from terrain.files.regular import MEBIBYTE, check_inside, read_regular
 
 MODEL_FILE = "model.skops"
 INFO_FILE = "terrain_model.json"
 INFO_VERSION = 1
 INFO_KEYS = {"window_s", "stride_s", "steady", "classes", "channels", "rate_hz", "run_digests"}
+
+MAX_MODEL_BYTES = 256 * MEBIBYTE
+"""Of a model as it lies on disk; those of this package have some MiB."""
+
+MAX_UNPACKED_BYTES = 1024 * MEBIBYTE
+"""Of all that a model's archive unpacks to: megabytes of zeros pack to kilobytes."""
 
 TRUSTED_TYPES: tuple[str, ...] = (
     "builtins.frozenset",
@@ -49,6 +61,12 @@ _LOADER_ERRORS = (
     RuntimeError,
     OSError,
     EOFError,
+    SyntaxError,
+    ArithmeticError,
+    AssertionError,
+    MemoryError,
+    struct.error,
+    zlib.error,
 )
 """Errors that skops passes on when a file is damaged or not its own."""
 
@@ -88,15 +106,17 @@ def read_model(folder: Path) -> TerrainModel:
     file, info_file = folder / MODEL_FILE, folder / INFO_FILE
     if not file.is_file() or not info_file.is_file():
         raise ModelError(f"{folder}: holds no model of this package ({MODEL_FILE} and {INFO_FILE})")
+    for each in (file, info_file):
+        check_inside(each, folder, str(each), ModelError)
     try:
-        document = json.loads(info_file.read_text(encoding="utf-8"))
+        document = parse_json(read_regular(info_file, str(info_file), ModelError, MAX_JSON_BYTES))
         version, expected = document.pop("version"), document.pop("sha256")
         missing = INFO_KEYS - set(document)
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise ModelError(f"{info_file}: is damaged ({error})") from error
     if version != INFO_VERSION or missing:
-        raise ModelError(f"{info_file}: has version {version!r}; version {INFO_VERSION} is read here")
-    content = file.read_bytes()
+        raise ModelError(f"{info_file}: has version {shown(version)}; version {INFO_VERSION} is read here")
+    content = read_regular(file, str(file), ModelError, MAX_MODEL_BYTES)
     found = hashlib.sha256(content).hexdigest()
     if found != expected:
         raise ModelError(f"{file}: is damaged (SHA-256 {found[:12]}..., {str(expected)[:12]}... expected)")
@@ -113,6 +133,7 @@ def _load(file: Path, content: bytes) -> WindowPipeline:
     from skops import io
 
     try:
+        _check_archive(file, content)
         foreign = sorted(set(io.get_untrusted_types(data=content)) - set(TRUSTED_TYPES))
         if foreign:
             raise ModelError(f"{file}: holds {foreign[0]}, a type that models of this package do not hold")
@@ -126,3 +147,10 @@ def _load(file: Path, content: bytes) -> WindowPipeline:
     if not hasattr(recipe[0], "layout_"):
         raise ModelError(f"{file}: holds a recipe that was never fitted")
     return recipe
+
+
+def _check_archive(file: Path, content: bytes) -> None:
+    with zipfile.ZipFile(streams.BytesIO(content)) as archive:
+        unpacked_bytes = sum(entry.file_size for entry in archive.infolist())
+    if unpacked_bytes > MAX_UNPACKED_BYTES:
+        raise ModelError(f"{file}: unpacks to {unpacked_bytes} bytes, {MAX_UNPACKED_BYTES} are read")

@@ -19,18 +19,19 @@ from typing import TextIO
 import numpy as np
 
 from terrain.errors import LogError
+from terrain.files.names import shown
+from terrain.files.regular import check_regular
+from terrain.logs.log_files import short_name
 from terrain.logs.samples import BAD_CELL, SHORT_ROW
 from terrain.records import Array
 
 MISSING = ("", "nan", "NaN", "NAN", "NA")
 """Cells that stand for a missing value."""
 
+MAX_NAMES_SHOWN = 20
+"""Columns of a file that a message names."""
+
 _UNREADABLE = (OSError, EOFError, zlib.error, UnicodeDecodeError, csv.Error)
-
-
-def short_name(path: Path) -> str:
-    """Return folder and name of a file, as messages call it: ``ASPHALT/imu_03.csv``."""
-    return "/".join(path.parts[-2:])
 
 
 def read_columns(
@@ -61,9 +62,9 @@ def read_columns(
     for column in columns:
         if header.count(column) != 1:
             fault = "is missing" if column not in header else "is there twice"
-            raise LogError(
-                f"{short_name(path)}: column {column!r} {fault} (the file has {', '.join(header)})"
-            )
+            names = ", ".join(header[:MAX_NAMES_SHOWN])
+            more = f" and {len(header) - MAX_NAMES_SHOWN} more" if len(header) > MAX_NAMES_SHOWN else ""
+            raise LogError(f"{short_name(path)}: column {column!r} {fault} (the file has {names}{more})")
     fast = _fast_columns(path, header, columns, delimiter)
     if fast is not None:
         return fast
@@ -83,7 +84,8 @@ def read_columns(
             if number is None:
                 if not repair:
                     raise LogError(
-                        f"{short_name(path)}: {column} at row {row} is {cells[place]!r}, which is no number"
+                        f"{short_name(path)}: {column} at row {row} is {shown(cells[place])}, which is no "
+                        "number"
                     )
                 counts[BAD_CELL] += 1
         table.append([np.nan if number is None else number for number in numbers])
@@ -99,6 +101,7 @@ def data_row(path: Path, index: int, *, delimiter: str = ",") -> int:
 
 
 def _open(path: Path) -> TextIO:
+    check_regular(path, short_name(path), LogError)
     if path.suffix == ".gz":
         return gzip.open(path, "rt", encoding="utf-8-sig", newline="")
     return path.open(encoding="utf-8-sig", newline="")
