@@ -10,6 +10,7 @@ import typer
 
 from pipelines.cli import classify, drive, estimate, explain, faults, quickstart, reproduce, runs, slip
 from terrain.errors import OutsideRegionWarning, TerrainError
+from terrain.files.names import printable
 
 app = typer.Typer(
     name="terrain",
@@ -58,9 +59,7 @@ def one_line(message: str) -> str:
     >>> print(one_line("run 'a\nb'"))
     run 'a\nb'
     """
-    line = "".join(
-        letter if letter.isprintable() else letter.encode("unicode_escape").decode() for letter in message
-    )
+    line = printable(message)
     return line if len(line) <= MAX_MESSAGE else f"{line[: MAX_MESSAGE - 200]} ... {line[-195:]}"
 
 

@@ -9,9 +9,7 @@ from __future__ import annotations
 import hashlib
 import io as streams
 import json
-import struct
 import zipfile
-import zlib
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,7 +20,7 @@ from pipelines.reporting.json_file import as_json
 from terrain.errors import ConfigError, DataError, ModelError
 from terrain.files.atomic import atomic_write
 from terrain.files.documents import MAX_JSON_BYTES, parse_json
-from terrain.files.names import shown
+from terrain.files.names import printable, shown
 from terrain.files.regular import MEBIBYTE, check_inside, read_regular
 
 MODEL_FILE = "model.skops"
@@ -51,24 +49,8 @@ TRUSTED_TYPES: tuple[str, ...] = (
 """Types beyond those that skops trusts itself which a model of this package may hold."""
 
 
-_LOADER_ERRORS = (
-    zipfile.BadZipFile,
-    ValueError,
-    LookupError,
-    TypeError,
-    AttributeError,
-    ImportError,
-    RuntimeError,
-    OSError,
-    EOFError,
-    SyntaxError,
-    ArithmeticError,
-    AssertionError,
-    MemoryError,
-    struct.error,
-    zlib.error,
-)
-"""Errors that skops passes on when a file is damaged or not its own."""
+_INFO_ERRORS = (TypeError, KeyError, AttributeError, ValueError, ArithmeticError)
+"""What a document of another form, or one with impossible numbers, leads to."""
 
 
 class TerrainModel(NamedTuple):
@@ -112,8 +94,8 @@ def read_model(folder: Path) -> TerrainModel:
         document = parse_json(read_regular(info_file, str(info_file), ModelError, MAX_JSON_BYTES))
         version, expected = document.pop("version"), document.pop("sha256")
         missing = INFO_KEYS - set(document)
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise ModelError(f"{info_file}: is damaged ({error})") from error
+    except _INFO_ERRORS as error:
+        raise _damaged(info_file, error) from error
     if version != INFO_VERSION or missing:
         raise ModelError(f"{info_file}: has version {shown(version)}; version {INFO_VERSION} is read here")
     content = read_regular(file, str(file), ModelError, MAX_MODEL_BYTES)
@@ -124,9 +106,17 @@ def read_model(folder: Path) -> TerrainModel:
         model = TerrainModel(_load(file, content), ModelInfo.from_json(document))
         for stream in model.layout.channels:
             model.layout.n_samples(stream, model.rule.length_s)
-    except (TypeError, KeyError, AttributeError, ConfigError, DataError) as error:
-        raise ModelError(f"{info_file}: is damaged ({error})") from error
+    except (*_INFO_ERRORS, ConfigError, DataError) as error:
+        raise _damaged(info_file, error) from error
     return model
+
+
+def _damaged(info_file: Path, error: Exception) -> ModelError:
+    return ModelError(f"{info_file}: is damaged ({_words(error)})")
+
+
+def _words(error: Exception) -> str:
+    return printable(" ".join(str(error).split())[:200])
 
 
 def _load(file: Path, content: bytes) -> WindowPipeline:
@@ -140,8 +130,10 @@ def _load(file: Path, content: bytes) -> WindowPipeline:
         recipe = io.loads(content, trusted=list(TRUSTED_TYPES))
     except ModelError:
         raise
-    except _LOADER_ERRORS as error:
-        raise ModelError(f"{file}: cannot be loaded ({' '.join(str(error).split())[:200]})") from error
+    except Exception as error:  # skops, numpy and scikit-learn raise whatever a damaged archive leads them to
+        raise ModelError(
+            f"{file}: cannot be loaded ({printable(' '.join(str(error).split())[:200])})"
+        ) from error
     if not isinstance(recipe, WindowPipeline):
         raise ModelError(f"{file}: holds a {type(recipe).__name__}, not a recipe of this package")
     if not hasattr(recipe[0], "layout_"):

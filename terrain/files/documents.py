@@ -123,7 +123,7 @@ def _whole(digits: str) -> int:
 
 def _is_deep(found: Any) -> bool:
     level = [found]
-    for _ in range(MAX_DEPTH + 1):
+    for _ in range(MAX_DEPTH):
         level = [
             child
             for parent in level

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from typing import Any
 
 from terrain.errors import TerrainError
@@ -12,6 +13,9 @@ MAX_NAME = 128
 
 MAX_NAME_BYTES = 240
 """The same in bytes of UTF-8, of which letters of some scripts have three each."""
+
+MAX_LISTED = 20
+"""Names that a message lists: files can have thousands of columns."""
 
 MAX_SHOWN = 120
 """Characters of a value that a message shows: files can hold values of megabytes."""
@@ -76,6 +80,32 @@ def check_name(place: str, name: str, kind: type[TerrainError]) -> str:
     if fault is not None:
         raise kind(f"{place} {shown(name)} is no plain name: it {fault}")
     return name
+
+
+def printable(text: str) -> str:
+    r"""Return a text on one line, with escapes for what cannot be printed and a terminal would act on.
+
+    Examples
+    --------
+    >>> print(printable("wet\tgrass"))
+    wet\tgrass
+    """
+    if text.isprintable():
+        return text
+    return "".join(each if each.isprintable() else each.encode("unicode_escape").decode() for each in text)
+
+
+def listed(names: Sequence[str]) -> str:
+    """Return names as messages list them: the first ones, control characters as escapes.
+
+    Examples
+    --------
+    >>> listed(["time_s", "gyro_z_radps"])
+    'time_s, gyro_z_radps'
+    """
+    first = [printable(name[:MAX_NAME]) for name in names[:MAX_LISTED]]
+    more = f" and {len(names) - MAX_LISTED} more" if len(names) > MAX_LISTED else ""
+    return ", ".join(first) + more
 
 
 def shown(value: Any) -> str:

@@ -169,10 +169,13 @@ def read_run(folder: Path, mapping: Mapping, words: dict[str, str], *, repair: b
             dropped=dropped,
         )
         scale, offset, factor = np.array([(c.scale, c.offset, UNIT_SCALES[c.unit][1]) for c in columns]).T
+        with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is judged below
+            time_s = table[:, 0] * UNIT_SCALES[stream.time.unit][1]
+            values = (table[:, 1:] * scale + offset) * factor
         streams[name] = checked_stream(
             short_name(path),
-            table[:, 0] * UNIT_SCALES[stream.time.unit][1],
-            (table[:, 1:] * scale + offset) * factor,
+            time_s,
+            values,
             list(stream.channels),
             row_of=partial(data_row, path, delimiter=stream.delimiter),
             columns=[column.column for column in columns],

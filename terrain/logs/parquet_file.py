@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from terrain.errors import LogError
-from terrain.files.names import shown
+from terrain.files.names import listed, printable, shown
 from terrain.files.regular import MEBIBYTE
 from terrain.logs.log_files import short_name
 from terrain.records import Array
@@ -22,8 +22,6 @@ MAX_VALUES = 200_000_000
 """Rows times columns that are read, 1.6 GB as numbers: ten hours at 500 Hz of eleven channels.
 
 A file of constant columns has thousands of millions in some kilobytes."""
-
-_MAX_NAMES_SHOWN = 20
 
 
 def read_parquet(path: Path, columns: Sequence[str]) -> list[Array]:
@@ -53,7 +51,7 @@ def read_parquet(path: Path, columns: Sequence[str]) -> list[Array]:
 
 
 def _words(error: Exception) -> str:
-    return " ".join(str(error).split())[:200]
+    return printable(" ".join(str(error).split())[:200])
 
 
 def _check_footer(place: str, file: BinaryIO) -> None:
@@ -94,10 +92,8 @@ def _check_column(place: str, schema: Any, name: str) -> None:
     import pyarrow
 
     if schema.names.count(name) != 1:
-        names = schema.names[:_MAX_NAMES_SHOWN]
-        more = f" and {len(schema.names) - len(names)} more" if len(schema.names) > len(names) else ""
         fault = "is there twice" if name in schema.names else "is missing"
-        raise LogError(f"{place}: column {shown(name)} {fault} (the file has {', '.join(names)}{more})")
+        raise LogError(f"{place}: column {shown(name)} {fault} (the file has {listed(schema.names)})")
     kind = schema.field(name).type
     if not (pyarrow.types.is_floating(kind) or pyarrow.types.is_integer(kind)):
         raise LogError(f"{place}: column {shown(name)} holds {str(kind)[:80]}, numbers are required")
