@@ -20,7 +20,7 @@ from pipelines.reporting.json_file import as_json
 from terrain.errors import ConfigError, DataError, ModelError
 from terrain.files.atomic import atomic_write
 from terrain.files.documents import MAX_JSON_BYTES, parse_json
-from terrain.files.names import printable, shown
+from terrain.files.names import MAX_NAME, printable, shown
 from terrain.files.regular import MEBIBYTE, check_inside, read_regular
 
 MODEL_FILE = "model.skops"
@@ -126,14 +126,13 @@ def _load(file: Path, content: bytes) -> WindowPipeline:
         _check_archive(file, content)
         foreign = sorted(set(io.get_untrusted_types(data=content)) - set(TRUSTED_TYPES))
         if foreign:
-            raise ModelError(f"{file}: holds {foreign[0]}, a type that models of this package do not hold")
+            name = printable(foreign[0][:MAX_NAME])
+            raise ModelError(f"{file}: holds {name}, a type that models of this package do not hold")
         recipe = io.loads(content, trusted=list(TRUSTED_TYPES))
     except ModelError:
         raise
     except Exception as error:  # skops, numpy and scikit-learn raise whatever a damaged archive leads them to
-        raise ModelError(
-            f"{file}: cannot be loaded ({printable(' '.join(str(error).split())[:200])})"
-        ) from error
+        raise ModelError(f"{file}: cannot be loaded ({_words(error)})") from error
     if not isinstance(recipe, WindowPipeline):
         raise ModelError(f"{file}: holds a {type(recipe).__name__}, not a recipe of this package")
     if not hasattr(recipe[0], "layout_"):

@@ -13,6 +13,9 @@ from terrain.files.resources import data_folder
 from terrain.logs.write import write_run
 
 DEEP = "[" * 100_000
+LAUGHS = b"0: &a0 [x, x]\n" + b"".join(
+    b"%d: &a%d [%s]\n" % (i, i, b"*a%d, " % (i - 1) * 9) for i in range(1, 9)
+)
 
 
 @pytest.fixture
@@ -65,7 +68,7 @@ def test_a_robot_that_the_user_gives_may_be_a_file(place, monkeypatch, capsys):
     edit(place, robot="mule")
     words = ["terrain", "estimate", "--data", "data", "--filter", "skid", "--robot", "mule.yaml"]
     monkeypatch.setattr(sys, "argv", words)
-    cli.main.__globals__["app"](words[1:], standalone_mode=False)
+    cli.app(words[1:], standalone_mode=False)
     assert "skid" in capsys.readouterr().out
 
 
@@ -116,7 +119,11 @@ def test_json_of_a_stranger_is_one_line(refused, place, content, sentence):
     ("content", "sentence"),
     [
         (DEEP.encode(), "is nested deeper than 32 levels"),
-        (b"a: &a [x, x]\n" + b"".join(b"a%d: &a [%s]\n" % (i, b"*a, " * 9) for i in range(9)), "aliases"),
+        (
+            b"0: &a0 [x, x]\n"
+            + b"".join(b"%d: &a%d [%s]\n" % (i, i, b"*a%d, " % (i - 1) * 9) for i in range(1, 9)),
+            "aliases",
+        ),
         (b"a: 2026-13-45", "is no YAML"),
         (b"a: \x00", "is no YAML"),
         (b"\xff\xfe", "is no YAML"),
