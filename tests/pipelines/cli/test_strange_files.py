@@ -119,11 +119,7 @@ def test_json_of_a_stranger_is_one_line(refused, place, content, sentence):
     ("content", "sentence"),
     [
         (DEEP.encode(), "is nested deeper than 32 levels"),
-        (
-            b"0: &a0 [x, x]\n"
-            + b"".join(b"%d: &a%d [%s]\n" % (i, i, b"*a%d, " % (i - 1) * 9) for i in range(1, 9)),
-            "aliases",
-        ),
+        (LAUGHS, "those of aliases counted each time"),
         (b"a: 2026-13-45", "is no YAML"),
         (b"a: \x00", "is no YAML"),
         (b"\xff\xfe", "is no YAML"),
