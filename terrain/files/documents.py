@@ -19,7 +19,7 @@ from terrain.files.names import shown
 from terrain.files.regular import MEBIBYTE, read_regular
 
 MAX_JSON_BYTES = 16 * MEBIBYTE
-"""A run with a label each second of a day has 7 MiB of them."""
+"""A run with a label each second of 24 hours has 7 MiB of them."""
 
 MAX_YAML_BYTES = MEBIBYTE
 """Descriptions are written and read by people: the longest of the package has 20 KiB."""

@@ -29,7 +29,7 @@ MISSING = ("", "nan", "NaN", "NAN", "NA")
 """Cells that stand for a missing value."""
 
 MAX_UNPACKED_BYTES = 1024 * MEBIBYTE
-"""Of a packed file: two days of DRIVE, and gigabytes of zeros pack to megabytes."""
+"""Of a packed file: 48 hours of DRIVE, and gigabytes of zeros pack to megabytes."""
 
 _UNREADABLE = (OSError, EOFError, zlib.error, UnicodeDecodeError, csv.Error)
 

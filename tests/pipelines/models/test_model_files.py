@@ -197,7 +197,7 @@ def test_damaged_members_of_an_archive_end_in_one_sentence(model_dir):
     with zipfile.ZipFile(model_dir / MODEL_FILE) as source:
         members = {name: source.read(name) for name in source.namelist()}
     names = sorted(members, key=lambda name: len(members[name]))[:40]
-    rng, said = np.random.default_rng(3), []
+    rng, refusals = np.random.default_rng(3), []
     for _ in range(25):
         hit = names[rng.integers(len(names))]
         content = bytearray(members[hit])
@@ -211,6 +211,6 @@ def test_damaged_members_of_an_archive_end_in_one_sentence(model_dir):
         try:
             read_model(model_dir)
         except ModelError as error:
-            said.append(str(error))
-    assert len(said) > 10
-    assert all(sentence.isprintable() for sentence in said)
+            refusals.append(str(error))
+    assert len(refusals) > 10
+    assert all(sentence.isprintable() for sentence in refusals)

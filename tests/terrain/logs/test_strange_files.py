@@ -65,9 +65,9 @@ def refusal(call, *given):
 )  # fmt: skip
 def test_names_of_a_log_are_names(folder, change, sentence):
     edit(folder, change)
-    said = refusal(read_run, folder)
-    assert sentence in said
-    assert len(said) < 500
+    message = refusal(read_run, folder)
+    assert sentence in message
+    assert len(message) < 500
 
 
 def test_names_in_any_language_are_read_and_written(tmp_path, make_run, borealtc_dir):
@@ -120,13 +120,13 @@ def test_folders_may_be_links_and_so_may_files_within(tmp_path, folder):
 def test_links_out_of_a_folder_of_csv_files_are_refused(tmp_path, borealtc_dir):
     shutil.move(borealtc_dir / "ICE" / "imu_01.csv", tmp_path / "imu_01.csv")
     (borealtc_dir / "ICE" / "imu_01.csv").symlink_to(tmp_path / "imu_01.csv")
-    said = "ICE/imu_01.csv: is a link that leads out of"
-    assert said in refusal(load_runs, borealtc_dir)
+    message = "ICE/imu_01.csv: is a link that leads out of"
+    assert message in refusal(load_runs, borealtc_dir)
     time = {"column": "time", "unit": "s"}
     gyro = {"gyro_z_radps": {"column": "wz", "unit": "rad/s"}}
     imu = {"file": "{class}/imu_{n}.csv", "time": time, "channels": gyro}
     (tmp_path / "map.yaml").write_text(yaml.safe_dump({"robot": "husky", "streams": {"imu": imu}}))
-    assert said in refusal(lambda: load_runs(borealtc_dir, mapping=tmp_path / "map.yaml"))
+    assert message in refusal(lambda: load_runs(borealtc_dir, mapping=tmp_path / "map.yaml"))
     (tmp_path / "elsewhere").mkdir()
     shutil.move(borealtc_dir / "SNOW", tmp_path / "elsewhere")
     shutil.rmtree(borealtc_dir / "ICE")
@@ -185,9 +185,9 @@ def test_a_parquet_file_is_judged_before_it_is_read(folder, monkeypatch):
     parquet.write_table(wide, file)
     assert "imu.parquet: has 5000 columns, at most 4096 are read" in refusal(read_run, folder)
     parquet.write_table(wide.select(range(4000)), file)
-    said = refusal(read_run, folder)
-    assert "column 'time_s' is missing (the file has c0_m, c1_m" in said
-    assert said.endswith("c19_m and 3980 more)")
+    message = refusal(read_run, folder)
+    assert "column 'time_s' is missing (the file has c0_m, c1_m" in message
+    assert message.endswith("c19_m and 3980 more)")
     nested = pyarrow.array([[1.0]] * whole.num_rows)
     gyro = whole.column_names.index("gyro_z_radps")
     parquet.write_table(whole.set_column(gyro, "gyro_z_radps", nested), file)
@@ -242,15 +242,15 @@ def test_damaged_bytes_are_one_sentence(folder, name):
         lines = packaged[name].read_text().splitlines()
         (folder / name).write_text("\n".join(line for line in lines if not line.startswith("#")))
     whole = (folder / name).read_bytes()
-    rng, said = np.random.default_rng(0), []
+    rng, message = np.random.default_rng(0), []
     for _ in range(N_FUZZED if name != "table.yaml" else 80):
         (folder / name).write_bytes(fuzzed(whole, rng))
         try:
             READERS[name](folder / name)
         except TerrainError as error:
-            said.append(str(error))
-    assert len(said) > 40
-    assert all(sentence.isprintable() for sentence in said)
+            message.append(str(error))
+    assert len(message) > 40
+    assert all(sentence.isprintable() for sentence in message)
 
 
 ODD = [[], {}, None, True, -1, 0, 1e308, 5e-324, "x" * 1000, "", "../x", "a\0", "\n", 2**62, [[1]], {"a": 1}]
@@ -272,7 +272,7 @@ def test_odd_values_anywhere_are_one_sentence(folder, name):
     else:
         kind, stem = ("robots", "husky") if name == "robot.yaml" else ("target_slip", "default")
         whole = yaml.safe_load((data_folder(kind) / f"{stem}.yaml").read_text())
-    rng, said = np.random.default_rng(1), []
+    rng, message = np.random.default_rng(1), []
     for _ in range(N_FUZZED if name == "run.json" else 80):
         document = json.loads(json.dumps(whole))
         places = places_of(document, [])
@@ -282,6 +282,6 @@ def test_odd_values_anywhere_are_one_sentence(folder, name):
         try:
             READERS[name](folder / name)
         except TerrainError as error:
-            said.append(str(error))
-    assert len(said) > 40
-    assert max(map(len, said)) < 3000
+            message.append(str(error))
+    assert len(message) > 40
+    assert max(map(len, message)) < 3000
