@@ -10,6 +10,7 @@ import typer
 
 from pipelines.cli import classify, drive, estimate, explain, faults, quickstart, reproduce, runs, serve, slip
 from terrain.errors import OutsideRegionWarning, TerrainError
+from terrain.files.names import printable
 
 app = typer.Typer(
     name="terrain",
@@ -30,6 +31,10 @@ for group in GROUPS:
     app.add_typer(group)
 
 
+MAX_MESSAGE = 1000
+"""Characters of an error's message on the screen; of a longer one the middle is left out."""
+
+
 class _Notes:
     """Shows warnings of drives outside a robot's region in a sentence, the first of a command."""
 
@@ -44,13 +49,27 @@ class _Notes:
             typer.echo(f"note: {message}", err=True)
 
 
+def one_line(message: str) -> str:
+    r"""Return a message as one line of a bounded length: files of strangers are quoted in messages.
+
+    Control characters, which a terminal would act on, are written as escapes.
+
+    Examples
+    --------
+    >>> print(one_line("run 'a\nb'"))
+    run 'a\nb'
+    """
+    line = printable(message)
+    return line if len(line) <= MAX_MESSAGE else f"{line[: MAX_MESSAGE - 200]} ... {line[-195:]}"
+
+
 def main() -> None:
     """Run the command line: a user's mistake is one sentence and exit code 2, a fault keeps its traceback."""
     warnings.showwarning = _Notes()
     try:
         app()
     except TerrainError as error:
-        typer.echo(f"error: {error}", err=True)
+        typer.echo(f"error: {one_line(str(error))}", err=True)
         sys.exit(2)
     except KeyboardInterrupt:
         typer.echo("stopped", err=True)

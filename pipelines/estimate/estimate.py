@@ -18,7 +18,7 @@ from terrain.extension import correct, corrected, corrected_log
 from terrain.files.atomic import ensure_writable
 from terrain.logs.write import run_folder, write_run
 from terrain.records import RunLog
-from terrain.robots import Robot, load_robot
+from terrain.robots import Robot, load_robot, packaged_robot
 
 
 def estimate(
@@ -50,9 +50,9 @@ def estimate(
     if settings.tune_on is not None and tuning != "likelihood":
         raise ConfigError(f"runs to tune on go with the tuning 'likelihood', not {tuning!r}")
     process_noise, tuned = _tuned(runs, settings) if tuning == "likelihood" else (None, None)
-    rows = []
+    rows, given = [], None if settings.robot is None else load_robot(settings.robot)
     for done, run in enumerate(runs):
-        (log, robot), noise = correct(run, load_robot(settings.robot or run.robot)), None
+        (log, robot), noise = correct(run, given or packaged_robot(run.robot)), None
         if process_noise is not None:  # not every run has the sensors of the runs tuned on
             _, own = model_and_noise(log, robot, settings.filter, tuning)
             noise = Noise(process_noise.process_variance, own.measurement_variance, own.initial_variance)
@@ -73,7 +73,7 @@ def _refuse_existing(runs: Sequence[RunLog], out: Path) -> None:
 
 def _tuned(runs: Sequence[RunLog], settings: EstimateSettings) -> tuple[Noise, TunedNoise]:
     chosen = tuning_runs(runs, settings.tune_on)
-    robot: Robot = load_robot(settings.robot or chosen[0].robot)
+    robot: Robot = load_robot(settings.robot) if settings.robot else packaged_robot(chosen[0].robot)
     logs, robot = [corrected_log(run, robot) for run in chosen], corrected(robot)
     return tuned_noise(*model_and_noise(logs[0], robot, settings.filter), logs, robot)
 

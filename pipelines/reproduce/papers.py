@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from pipelines.reproduce.results import AssumedNumber, Paper
-from terrain.files.descriptions import read_yaml
+from terrain.files.documents import read_yaml
 from terrain.files.resources import data_folder
 
 PAPERS: Mapping[str, Paper] = {

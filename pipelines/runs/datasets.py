@@ -212,9 +212,9 @@ def robot_of(run: RunLog, robot: Robot | None) -> Robot:
     ConfigError
         if the package has no robot of the name.
     """
-    from terrain.robots import load_robot
+    from terrain.robots import packaged_robot
 
-    return robot if robot is not None and robot.name == run.robot else load_robot(run.robot)
+    return robot if robot is not None and robot.name == run.robot else packaged_robot(run.robot)
 
 
 def _aligned(run: RunLog, robot: Robot | None) -> RunLog:

@@ -81,9 +81,10 @@ class TerrainClient:
         self.errors: deque[dict[str, Any]] = deque(maxlen=MAX_ERRORS)
         self.n_steps = 0
         try:
-            self._socket: ClientConnection = connect(
+            connecting = connect(
                 f"{url.rstrip('/')}/robots", open_timeout=TIMEOUT_S, compression=None, max_size=None
             )
+            self._socket: ClientConnection = connecting.__enter__()  # close() ends it
         except (OSError, TimeoutError, InvalidURI, InvalidHandshake, ValueError) as error:
             raise ServiceError("unreachable", f"{url}: cannot be reached ({error})") from None
         try:

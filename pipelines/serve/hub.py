@@ -20,7 +20,7 @@ from pipelines.serve.metrics import Metrics
 from pipelines.serve.wire import WireError
 from terrain.control.slip_table import SlipTable
 from terrain.errors import ConfigError, DataError, TerrainError
-from terrain.robots import Robot, load_robot
+from terrain.robots import Robot, packaged_robot
 
 REMEMBERED = 1000
 """States of robots that have left, which are kept in memory for their return."""
@@ -98,7 +98,7 @@ class Hub:
         if self._given is not None and self._given.name == name:
             return self._given
         try:
-            return None if name.endswith((".yaml", ".yml")) else load_robot(name)
+            return packaged_robot(name)
         except ConfigError:
             return None
 

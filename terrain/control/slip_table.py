@@ -19,7 +19,8 @@ import yaml
 
 from terrain.errors import ConfigError
 from terrain.files.atomic import atomic_write
-from terrain.files.descriptions import check_keys, read_yaml
+from terrain.files.descriptions import check_keys
+from terrain.files.documents import read_yaml
 from terrain.files.resources import data_folder
 from terrain.records import SlipTarget, TargetStatus
 from terrain.slip_learning.laws import LAW_BOUNDS, LAW_PARAMETERS

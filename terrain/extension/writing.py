@@ -13,7 +13,7 @@ import yaml
 from terrain.effects import SCHEMA, Parameter, checked_covariance, checked_effects, parameters_of
 from terrain.errors import ConfigError
 from terrain.files.atomic import atomic_write
-from terrain.files.descriptions import read_yaml
+from terrain.files.documents import parse_yaml, read_yaml
 from terrain.records import Array
 from terrain.robots import Region, Robot, description_file, robot_from
 
@@ -70,10 +70,10 @@ def extended_yaml(
         )
     lines = _section_lines(values, parameters_of(robot.drive), cov, intervals, source)
     lines += [] if region is None else _region_lines(region)
-    text = _without_effects(path.read_text(encoding="utf-8")) + "\n".join(lines) + "\n"
+    text = _without_effects(path.read_text(encoding="utf-8-sig")) + "\n".join(lines) + "\n"
     try:
-        content = yaml.safe_load(text)
-    except yaml.YAMLError:
+        content = parse_yaml(text)
+    except ValueError:
         content = None
     others = {name: entry for name, entry in described.items() if name != "effects"}
     if not isinstance(content, dict) or {n: e for n, e in content.items() if n != "effects"} != others:
@@ -105,7 +105,7 @@ def write_extended(
         raise ConfigError(f"{out}: is there already, and is left as it is; choose another name")
     text = extended_yaml(robot_name, values, covariance, intervals, source, region)
     atomic_write(out, text)
-    return robot_from(out.name, yaml.safe_load(text))
+    return robot_from(out.name, parse_yaml(text))
 
 
 def _section_lines(

@@ -1,1 +1,1 @@
-"""Writing files whole or not at all, packaged data, and reading YAML descriptions."""
+"""Writing files whole or not at all, packaged data, and reading JSON, YAML and names of strangers."""

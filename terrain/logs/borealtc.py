@@ -28,7 +28,9 @@ from pathlib import Path
 
 import numpy as np
 
-from terrain.logs.csv_table import data_row, read_columns, short_name
+from terrain.files.names import shown
+from terrain.logs.csv_table import data_row, read_columns
+from terrain.logs.log_files import check_log_file, checked_names, short_name
 from terrain.logs.samples import checked_stream, refuse_apart
 from terrain.records import Label, RunLog, Stream
 
@@ -90,7 +92,7 @@ def read_run(class_folder: Path, number: str, *, repair: bool = False) -> RunLog
     dropped: Counter[str] = Counter()
     streams = {}
     for prefix, (stream, columns) in TABLES.items():
-        path = class_folder / f"{prefix}_{number}.csv"
+        path = check_log_file(class_folder / f"{prefix}_{number}.csv", class_folder)
         table = read_columns(path, ["time", *columns.values()], repair=repair, dropped=dropped)
         streams[stream] = checked_stream(
             short_name(path),
@@ -103,7 +105,7 @@ def read_run(class_folder: Path, number: str, *, repair: bool = False) -> RunLog
         )
     run_id = f"{class_folder.name}_{number}"
     refuse_apart(run_id, streams)
-    return RunLog(
+    run = RunLog(
         run_id,
         "husky",
         streams,
@@ -111,6 +113,7 @@ def read_run(class_folder: Path, number: str, *, repair: bool = False) -> RunLog
         source=f"{class_folder.name}/imu_{number}.csv and pro_{number}.csv, BorealTC layout",
         dropped=dropped,
     )
+    return checked_names(f"run {shown(run_id)}", run)
 
 
 def whole_run_label(streams: dict[str, Stream], terrain: str) -> Label:

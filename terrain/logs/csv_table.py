@@ -19,18 +19,19 @@ from typing import TextIO
 import numpy as np
 
 from terrain.errors import LogError
+from terrain.files.names import listed, shown
+from terrain.files.regular import MEBIBYTE, check_regular
+from terrain.logs.log_files import short_name
 from terrain.logs.samples import BAD_CELL, SHORT_ROW
 from terrain.records import Array
 
 MISSING = ("", "nan", "NaN", "NAN", "NA")
 """Cells that stand for a missing value."""
 
+MAX_UNPACKED_BYTES = 1024 * MEBIBYTE
+"""Of a packed file: 48 hours of DRIVE, and gigabytes of zeros pack to megabytes."""
+
 _UNREADABLE = (OSError, EOFError, zlib.error, UnicodeDecodeError, csv.Error)
-
-
-def short_name(path: Path) -> str:
-    """Return folder and name of a file, as messages call it: ``ASPHALT/imu_03.csv``."""
-    return "/".join(path.parts[-2:])
 
 
 def read_columns(
@@ -57,13 +58,12 @@ def read_columns(
         if the file is missing, empty, no text, lacks a column or has it twice, or (unless repairing) holds
         a cell that is no number or a row of the wrong length.
     """
+    _refuse_too_large(path)
     header = _header(path, delimiter)
     for column in columns:
         if header.count(column) != 1:
             fault = "is missing" if column not in header else "is there twice"
-            raise LogError(
-                f"{short_name(path)}: column {column!r} {fault} (the file has {', '.join(header)})"
-            )
+            raise LogError(f"{short_name(path)}: column {column!r} {fault} (the file has {listed(header)})")
     fast = _fast_columns(path, header, columns, delimiter)
     if fast is not None:
         return fast
@@ -83,7 +83,8 @@ def read_columns(
             if number is None:
                 if not repair:
                     raise LogError(
-                        f"{short_name(path)}: {column} at row {row} is {cells[place]!r}, which is no number"
+                        f"{short_name(path)}: {column} at row {row} is {shown(cells[place])}, which is no "
+                        "number"
                     )
                 counts[BAD_CELL] += 1
         table.append([np.nan if number is None else number for number in numbers])
@@ -98,7 +99,26 @@ def data_row(path: Path, index: int, *, delimiter: str = ",") -> int:
     raise IndexError(index)
 
 
+def _refuse_too_large(path: Path) -> None:
+    if path.suffix != ".gz":
+        return
+    check_regular(path, short_name(path), LogError)
+    n_bytes = 0
+    try:
+        with gzip.open(path, "rb") as file:
+            while n_bytes <= MAX_UNPACKED_BYTES and (part := file.read(MEBIBYTE)):
+                n_bytes += len(part)
+    except _UNREADABLE as error:
+        raise _unreadable(path, error) from error
+    if n_bytes > MAX_UNPACKED_BYTES:
+        raise LogError(
+            f"{short_name(path)}: unpacks to more than {MAX_UNPACKED_BYTES // MEBIBYTE} MiB, the most that "
+            "is read"
+        )
+
+
 def _open(path: Path) -> TextIO:
+    check_regular(path, short_name(path), LogError)
     if path.suffix == ".gz":
         return gzip.open(path, "rt", encoding="utf-8-sig", newline="")
     return path.open(encoding="utf-8-sig", newline="")

@@ -64,9 +64,10 @@ from typing import NamedTuple
 import numpy as np
 
 from terrain.errors import LogError
-from terrain.logs.csv_table import data_row, read_columns, short_name
+from terrain.logs.csv_table import data_row, read_columns
 from terrain.logs.lidar_twist import CHANNELS as TWIST_CHANNELS
 from terrain.logs.lidar_twist import N_FRAME, body_twists
+from terrain.logs.log_files import check_log_file, checked_names, short_name
 from terrain.logs.samples import checked_stream
 from terrain.records import Array, Label, RunLog
 
@@ -180,7 +181,9 @@ def find_runs(folder: Path, robot: DriveRobot) -> list[Callable[..., RunLog]]:
             continue
         numbered = _SESSION_NAME.fullmatch(path.resolve().name)
         session = path.resolve().name if numbered or path != folder else ""
-        windows = _read_windows(path / FILE_NAME, robot, session, numbered[1] if numbered else "")
+        windows = _read_windows(
+            check_log_file(path / FILE_NAME, path), robot, session, numbered[1] if numbered else ""
+        )
         starts = np.flatnonzero(windows.steady == 0)
         if starts.size == 0 or starts[0] != 0:
             raise LogError(f"{windows.name}: the first window has steady 1; a command begins with steady 0")
@@ -264,7 +267,7 @@ def _run(windows: _Windows, start: int, end: int, *, repair: bool = False) -> Ru
             unknown_is_a_value=is_lidar,
         )
     until_s = float(time_s[-1] + windows.time_s[1] - windows.time_s[0])
-    return RunLog(
+    run = RunLog(
         run_id,
         windows.robot,
         streams,
@@ -273,6 +276,7 @@ def _run(windows: _Windows, start: int, end: int, *, repair: bool = False) -> Ru
         dropped=dropped,
         session=windows.session,
     )
+    return checked_names(windows.name, run)
 
 
 def _on_one_clock(windows: _Windows, start: int, end: int) -> tuple[Array, Array]:

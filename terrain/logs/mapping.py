@@ -20,8 +20,10 @@
           speed_right_mps: {column: vr, unit: km/h, offset: -0.2}
 
 A word in braces stands for any text without a slash, and the files of which all such words agree make one
-run; every stream has the same words.  Several streams may name one file.  A cell becomes
-``(scale * cell + offset)`` in the unit given, and then SI; the unit must suit the name of the channel.
+run; every stream has the same words.  Several streams may name one file.  The files lie under the data
+folder, and so does what links in it lead to.  The robot is a name, of the package or of the description that
+the user gives.  A cell becomes ``(scale * cell + offset)`` in the unit given, and then SI; the unit must suit
+the name of the channel.
 """
 
 from __future__ import annotations
@@ -35,17 +37,20 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import yaml
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, ValidationError
 
 from terrain.errors import ConfigError, LogError
+from terrain.files.documents import read_yaml
+from terrain.files.names import check_name, has_control_characters, shown
 from terrain.logs.borealtc import whole_run_label
-from terrain.logs.csv_table import data_row, read_columns, short_name
+from terrain.logs.csv_table import data_row, read_columns
+from terrain.logs.log_files import check_log_file, checked_names, short_name
 from terrain.logs.samples import checked_stream, refuse_apart
 from terrain.logs.schema import UNIT_SCALES, unit_of
 from terrain.records import RunLog, Stream
 
-_FIELD = re.compile(r"\{(\w+)\}")
+_FIELD = re.compile(r"\{([^\W\d]\w*)\}")
+_SPLIT_AT_FIELDS = re.compile(r"(\{[^\W\d]\w*\})")
 
 Unit = Annotated[str, BeforeValidator(lambda unit: unit if isinstance(unit, str) else repr(unit))]
 Word = Annotated[str, Field(min_length=1)]
@@ -99,16 +104,12 @@ def load_mapping(path: str | Path) -> Mapping:
         channel, or the file patterns do not agree on the words in braces.
     """
     path = Path(path)
-    try:
-        described = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be opened ({error.strerror})") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: is no YAML ({' '.join(str(error).split())})") from error
+    described = read_yaml(path)
     try:
         mapping = Mapping.model_validate(described)
     except ValidationError as error:
         raise ConfigError(f"{path.name}: {_first_fault(error)}") from error
+    check_name(f"{path.name}: robot", mapping.robot, ConfigError)
     _check_units(path.name, mapping)
     _check_fields(path.name, mapping)
     return mapping
@@ -126,7 +127,7 @@ def find_runs(folder: Path, mapping: Mapping) -> list[Callable[..., RunLog]]:
     for stream in mapping.streams.values():
         pattern = _pattern(stream.file)
         pattern_text = "".join(
-            "*" if part.startswith("{") else glob.escape(part) for part in re.split(r"(\{\w+\})", stream.file)
+            "*" if part.startswith("{") else glob.escape(part) for part in _SPLIT_AT_FIELDS.split(stream.file)
         )
         for path in folder.glob(pattern_text):
             match = pattern.fullmatch(path.relative_to(folder).as_posix())
@@ -157,7 +158,7 @@ def read_run(folder: Path, mapping: Mapping, words: dict[str, str], *, repair: b
     streams: dict[str, Stream] = {}
     files = []
     for name, stream in mapping.streams.items():
-        path = folder / stream.file.format(**words)
+        path = check_log_file(folder / stream.file.format(**words), folder)
         files.append(path.relative_to(folder).as_posix())
         columns = list(stream.channels.values())
         table = read_columns(
@@ -168,10 +169,13 @@ def read_run(folder: Path, mapping: Mapping, words: dict[str, str], *, repair: b
             dropped=dropped,
         )
         scale, offset, factor = np.array([(c.scale, c.offset, UNIT_SCALES[c.unit][1]) for c in columns]).T
+        with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is judged below
+            time_s = table[:, 0] * UNIT_SCALES[stream.time.unit][1]
+            values = (table[:, 1:] * scale + offset) * factor
         streams[name] = checked_stream(
             short_name(path),
-            table[:, 0] * UNIT_SCALES[stream.time.unit][1],
-            (table[:, 1:] * scale + offset) * factor,
+            time_s,
+            values,
             list(stream.channels),
             row_of=partial(data_row, path, delimiter=stream.delimiter),
             columns=[column.column for column in columns],
@@ -180,20 +184,23 @@ def read_run(folder: Path, mapping: Mapping, words: dict[str, str], *, repair: b
     run_id = (mapping.run_id or "_".join(f"{{{word}}}" for word in words)).format(**words)
     refuse_apart(run_id, streams)
     terrain = mapping.terrain.format(**words)
-    return RunLog(
-        run_id,
-        mapping.robot,
-        streams,
-        (whole_run_label(streams, terrain),) if terrain else (),
-        source=f"{' and '.join(dict.fromkeys(files))}, by a mapping",
-        dropped=dropped,
+    return checked_names(
+        f"run {shown(run_id)}",
+        RunLog(
+            run_id,
+            mapping.robot,
+            streams,
+            (whole_run_label(streams, terrain),) if terrain else (),
+            source=f"{' and '.join(dict.fromkeys(files))}, by a mapping",
+            dropped=dropped,
+        ),
     )
 
 
 def _pattern(file: str) -> re.Pattern[str]:
     seen: set[str] = set()
     pattern = ""
-    for part in re.split(r"(\{\w+\})", file):
+    for part in _SPLIT_AT_FIELDS.split(file):
         word = _FIELD.fullmatch(part)
         if word is None:
             pattern += re.escape(part)
@@ -233,6 +240,8 @@ def _check_fields(file: str, mapping: Mapping) -> None:
             raise ConfigError(f"{file}: streams {first} and {name} do not have the same words in braces")
         if re.search(r"[{}]", _FIELD.sub("", stream.file)):
             raise ConfigError(f"{file}: stream {name}: file {stream.file!r} has a brace without its partner")
+        if has_control_characters(stream.file) or not Path(stream.file).name:
+            raise ConfigError(f"{file}: stream {name}: file {shown(stream.file)} names no file")
         if Path(stream.file).is_absolute() or ".." in Path(stream.file).parts:
             raise ConfigError(f"{file}: stream {name}: file {stream.file!r} must lie under the data folder")
     if not words[first] and not mapping.run_id:
@@ -248,7 +257,7 @@ def _first_fault(error: ValidationError) -> str:
     fault: dict[str, Any] = dict(error.errors()[0])
     place = ".".join(str(part) for part in fault["loc"]) or "the file"
     if fault["type"] == "extra_forbidden":
-        return f"key {place!r} is unknown"
+        return f"key {shown(place)} is unknown"
     if fault["type"] == "missing":
         return f"key {place!r} is missing"
-    return f"{place} is {fault['input']!r}: {fault['msg'][0].lower()}{fault['msg'][1:]}"
+    return f"{place} is {shown(fault['input'])}: {fault['msg'][0].lower()}{fault['msg'][1:]}"

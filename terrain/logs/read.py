@@ -27,11 +27,14 @@ before ``end_s``; labels do not overlap.  Each channel is named with its SI unit
 beside it too.  ``dropped`` (may be left out) counts what a repairing reader took away before; ``session``
 (may be left out) names the outing that the run is part of, ``filter`` the one that made the streams
 ``estimator``, ``slip`` and ``state``.
+
+Run id, robot, session, terrains, streams, channels and files are plain names, in letters of any language: no
+path separator, no control character, no dot in front, 128 characters at most.  A robot is one of the package,
+or one that the user gives; a log names no file.  The folder may be a link, its files may not lead out of it.
 """
 
 from __future__ import annotations
 
-import json
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping
@@ -43,10 +46,16 @@ from typing import Any
 import numpy as np
 
 from terrain.errors import LogError
-from terrain.logs.csv_table import short_name
+from terrain.files.documents import read_json
+from terrain.files.names import name_fault, shown
+from terrain.logs.log_files import check_log_file, checked_names, short_name
+from terrain.logs.parquet_file import read_parquet
 from terrain.logs.samples import checked_stream, refuse_apart
 from terrain.logs.schema import SCHEMA_VERSION, unit_of
-from terrain.records import Array, Label, RunLog
+from terrain.records import Label, RunLog
+
+MAX_STREAMS = 64
+"""Streams of a run; each is held in memory, and several may name one file."""
 
 
 def find_runs(folder: Path) -> list[Callable[..., RunLog]]:
@@ -72,26 +81,33 @@ def read_run(folder: str | Path, *, repair: bool = False) -> RunLog:
     ------
     LogError
         if ``run.json`` is missing, is not JSON, has another schema version, lacks a key or holds something
-        that is not accepted there; if a Parquet file is missing, damaged or lacks a column; or if a stream
-        is broken.
+        that is not accepted there; if a name in it is no plain one; if a Parquet file is missing, damaged,
+        too large or lacks a column; if a file is a link that leads out of the folder; or if a stream is
+        broken.
     """
     folder = Path(folder)
     head = _read_head(folder / "run.json")
     place = short_name(folder / "run.json")
     dropped = Counter(_counts(place, head.get("dropped", {})))
     streams = {}
-    for name, entry in _entry(place, head, "streams", dict).items():
+    described = _entry(place, head, "streams", dict)
+    if len(described) > MAX_STREAMS:
+        raise LogError(f"{place}: the run has {len(described)} streams, at most {MAX_STREAMS} are read")
+    for name, entry in described.items():
         file = _entry(f"{place}: stream {name}", entry, "file", str)
-        if Path(file).name != file:
-            raise LogError(f"{place}: stream {name}: {file!r} is not the name of a file in the run folder")
+        if (fault := name_fault(file)) is not None:
+            raise LogError(
+                f"{place}: stream {name}: {shown(file)} is not the name of a file in the run folder: "
+                f"it {fault}"
+            )
         channels = _channels(
             f"{place}: stream {name}", _entry(f"{place}: stream {name}", entry, "channels", dict)
         )
-        time_s, values = _read_parquet(folder / file, channels)
+        time_s, *values = read_parquet(check_log_file(folder / file, folder), ["time_s", *channels])
         streams[name] = checked_stream(
             short_name(folder / file),
             time_s,
-            values,
+            np.column_stack(values),
             channels,
             row_of=lambda index: index + 1,
             repairs=dropped if repair else None,
@@ -101,28 +117,24 @@ def read_run(folder: str | Path, *, repair: bool = False) -> RunLog:
         raise LogError(f"{place}: the run has no stream")
     run_id = _entry(place, head, "run_id", str)
     refuse_apart(run_id, streams)
-    return RunLog(
-        run_id,
-        _entry(place, head, "robot", str),
-        streams,
-        _labels(place, _entry(place, head, "labels", list)),
-        source=_entry(place, head, "source", str),
-        dropped=dropped,
-        session=_entry(place, {"session": ""} | head, "session", str),
-        filter=_entry(place, {"filter": ""} | head, "filter", str),
+    return checked_names(
+        place,
+        RunLog(
+            run_id,
+            _entry(place, head, "robot", str),
+            streams,
+            _labels(place, _entry(place, head, "labels", list)),
+            source=_entry(place, head, "source", str),
+            dropped=dropped,
+            session=_entry(place, {"session": ""} | head, "session", str),
+            filter=_entry(place, {"filter": ""} | head, "filter", str),
+        ),
     )
 
 
 def _read_head(path: Path) -> dict[str, Any]:
     place = short_name(path)
-    try:
-        head = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise LogError(f"{place}: is missing") from error
-    except OSError as error:
-        raise LogError(f"{place}: cannot be opened ({error.strerror})") from error
-    except ValueError as error:
-        raise LogError(f"{place}: is no JSON ({error})") from error
+    head = read_json(check_log_file(path, path.parent), place, LogError)
     version = _entry(place, head, "schema_version", int)
     if version != SCHEMA_VERSION:
         raise LogError(f"{place}: schema version {version} is unknown, this package reads {SCHEMA_VERSION}")
@@ -131,19 +143,21 @@ def _read_head(path: Path) -> dict[str, Any]:
 
 def _entry(place: str, mapping: Any, key: str, kind: type) -> Any:
     if not isinstance(mapping, dict):
-        raise LogError(f"{place}: {mapping!r} is no JSON object")
+        raise LogError(f"{place}: {shown(mapping)} is no JSON object")
     if key not in mapping:
         raise LogError(f"{place}: key {key!r} is missing")
     if not isinstance(mapping[key], kind):
         words = {str: "a text", int: "a whole number", dict: "an object", list: "a list"}
-        raise LogError(f"{place}: {key!r} is {mapping[key]!r}, {words[kind]} is required")
+        raise LogError(f"{place}: {key!r} is {shown(mapping[key])}, {words[kind]} is required")
     return mapping[key]
 
 
 def _channels(place: str, channels: dict[str, Any]) -> list[str]:
     for channel, unit in channels.items():
         if unit_of(channel) != unit:
-            raise LogError(f"{place}: channel {channel!r} is declared in {unit!r}, its name states otherwise")
+            raise LogError(
+                f"{place}: channel {channel!r} is declared in {shown(unit)}, its name states otherwise"
+            )
     if not channels:
         raise LogError(f"{place}: has no channel")
     return list(channels)
@@ -169,35 +183,11 @@ def _labels(place: str, entries: list[Any]) -> tuple[Label, ...]:
 def _time(place: str, entry: dict[str, Any], key: str) -> float:
     value = entry.get(key)
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise LogError(f"{place}: {key} is {value!r}, seconds are required")
+        raise LogError(f"{place}: {key} is {shown(value)}, seconds are required")
     return float(value)
 
 
 def _counts(place: str, counts: Any) -> Mapping[str, int]:
     if not isinstance(counts, dict) or not all(type(n) is int and n >= 0 for n in counts.values()):
-        raise LogError(f"{place}: 'dropped' is {counts!r}, counts by kind are required")
+        raise LogError(f"{place}: 'dropped' is {shown(counts)}, counts by kind are required")
     return counts
-
-
-def _read_parquet(path: Path, channels: list[str]) -> tuple[Array, Array]:
-    import pyarrow
-    from pyarrow import parquet
-
-    place = short_name(path)
-    try:
-        table = parquet.read_table(path, partitioning=None)
-    except FileNotFoundError as error:
-        raise LogError(f"{place}: is missing") from error
-    except (pyarrow.ArrowException, OSError) as error:
-        raise LogError(f"{place}: is no whole Parquet file ({' '.join(str(error).split())})") from error
-    columns = []
-    for name in ["time_s", *channels]:
-        if table.column_names.count(name) != 1:
-            raise LogError(
-                f"{place}: column {name!r} is missing (the file has {', '.join(table.column_names)})"
-            )
-        column = table.column(name)
-        if not (pyarrow.types.is_floating(column.type) or pyarrow.types.is_integer(column.type)):
-            raise LogError(f"{place}: column {name!r} holds {column.type}, numbers are required")
-        columns.append(column.cast("float64", safe=False).to_numpy())
-    return columns[0], np.column_stack(columns[1:])

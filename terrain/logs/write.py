@@ -8,10 +8,12 @@ from pathlib import Path
 
 from terrain.errors import LogError
 from terrain.files.atomic import atomic_folder
+from terrain.files.names import name_fault, shown
+from terrain.logs.log_files import checked_names
 from terrain.logs.schema import SCHEMA_VERSION, unit_of
 from terrain.records import RunLog, Stream
 
-_PLAIN_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9 ._+-]*")
+_SAFE_NAME = re.compile(r"[^\W_][\w ._+-]*")
 
 
 def run_folder(run_id: str, folder: str | Path) -> Path:
@@ -28,8 +30,8 @@ def run_folder(run_id: str, folder: str | Path) -> Path:
     Traceback (most recent call last):
     terrain.errors.LogError: run id '../SNOW' cannot name a folder: use letters, digits and ' ._+-'
     """
-    if not _PLAIN_NAME.fullmatch(run_id):
-        raise LogError(f"run id {run_id!r} cannot name a folder: use letters, digits and ' ._+-'")
+    if not _SAFE_NAME.fullmatch(run_id) or name_fault(run_id):
+        raise LogError(f"run id {shown(run_id)} cannot name a folder: use letters, digits and ' ._+-'")
     return Path(folder) / run_id
 
 
@@ -52,6 +54,7 @@ def write_run(run: RunLog, folder: str | Path, *, replace: bool = False) -> Path
         if the place cannot be written; nothing is left behind.
     """
     target = run_folder(run.run_id, folder)
+    checked_names(f"run {run.run_id}", run)
     if target.exists() and not (replace and (target / "run.json").is_file()):
         kind = "a run folder" if (target / "run.json").is_file() else "something else"
         raise LogError(f"{target}: {kind} is there already, and is left as it is")
@@ -82,8 +85,8 @@ def write_run(run: RunLog, folder: str | Path, *, replace: bool = False) -> Path
 
 
 def _file_name(stream: str) -> str:
-    if not _PLAIN_NAME.fullmatch(stream):
-        raise LogError(f"stream {stream!r} cannot name a file: use letters, digits and ' ._+-'")
+    if not _SAFE_NAME.fullmatch(stream) or name_fault(stream):
+        raise LogError(f"stream {shown(stream)} cannot name a file: use letters, digits and ' ._+-'")
     return f"{stream}.parquet"
 
 

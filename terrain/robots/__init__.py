@@ -1,7 +1,7 @@
 """Robots: one type a drive, the sections of their descriptions, and the reader of those."""
 
 from terrain.robots.parts import Body, Camera, Equipment, Motors, Part, Sensors, Steering
-from terrain.robots.reader import description_file, load_robot, read_description, robot_from
+from terrain.robots.reader import description_file, load_robot, packaged_robot, read_description, robot_from
 from terrain.robots.region import Region
 from terrain.robots.robot import Robot
 from terrain.robots.skid_steer import SkidSteerRobot, as_skid_steer
@@ -23,6 +23,7 @@ __all__ = [
     "as_swerve",
     "description_file",
     "load_robot",
+    "packaged_robot",
     "read_description",
     "robot_from",
 ]

@@ -23,7 +23,9 @@ from typing import Any, get_type_hints
 
 from terrain.effects import read_effects
 from terrain.errors import ConfigError
-from terrain.files.descriptions import check_keys, number, read_yaml
+from terrain.files.descriptions import check_keys, number
+from terrain.files.documents import read_yaml
+from terrain.files.names import check_name, shown
 from terrain.files.resources import data_folder
 from terrain.robots.parts import KIND_OF_SECTION
 from terrain.robots.region import read_region
@@ -81,12 +83,50 @@ def description_file(name_or_path: str | Path) -> Path:
         if there is no robot of that name.
     """
     path = Path(name_or_path)
-    if path.suffix not in (".yaml", ".yml"):
-        path = data_folder("robots") / f"{name_or_path}.yaml"
-        if path.parent != data_folder("robots") or not path.is_file():
-            known = ", ".join(sorted(file.stem for file in data_folder("robots").glob("*.yaml")))
-            raise ConfigError(f"robot {str(name_or_path)!r} is unknown: give one of {known}, or a .yaml file")
-    return path
+    if path.suffix in (".yaml", ".yml"):
+        return path
+    known = robot_names()
+    if str(name_or_path) not in known:
+        raise ConfigError(
+            f"robot {shown(str(name_or_path))} is unknown: give one of {', '.join(known)}, or a .yaml file"
+        )
+    return data_folder("robots") / f"{name_or_path}.yaml"
+
+
+def robot_names() -> tuple[str, ...]:
+    """Return the names of the robots that travel with the package.
+
+    Examples
+    --------
+    >>> "husky" in robot_names()
+    True
+    """
+    return tuple(sorted(file.stem for file in data_folder("robots").glob("*.yaml")))
+
+
+def packaged_robot(name: str) -> Robot:
+    """Return a robot of the package by the name that a log gives: a name, never the path of a file.
+
+    Raises
+    ------
+    ConfigError
+        if the package has no robot of the name.
+
+    Examples
+    --------
+    >>> packaged_robot("husky").drive
+    'skid_steer'
+    >>> packaged_robot("/tmp/husky.yaml")
+    Traceback (most recent call last):
+    terrain.errors.ConfigError: robot '/tmp/husky.yaml' is unknown: a log names one of agrimaro, ...
+    """
+    known = robot_names()
+    if name not in known:
+        raise ConfigError(
+            f"robot {shown(name)} is unknown: a log names one of {', '.join(known)}, or the one whose "
+            ".yaml file is given"
+        )
+    return load_robot(name)
 
 
 def robot_from(file: str, described: Any) -> Robot:
@@ -100,9 +140,10 @@ def robot_from(file: str, described: Any) -> Robot:
     check_keys(file, described, ["name", "drive", *NUMBERS], optional=(*KIND_OF_SECTION, "effects"))
     name, drive = described["name"], described["drive"]
     if not isinstance(name, str) or not name:
-        raise ConfigError(f"{file}: name is {name!r}, a word is required")
-    if drive not in KIND_OF_DRIVE:
-        raise ConfigError(f"{file}: drive {drive!r} is unknown: use one of {', '.join(KIND_OF_DRIVE)}")
+        raise ConfigError(f"{file}: name is {shown(name)}, a word is required")
+    check_name(f"{file}: name", name, ConfigError)
+    if not isinstance(drive, str) or drive not in KIND_OF_DRIVE:
+        raise ConfigError(f"{file}: drive {shown(drive)} is unknown: use one of {', '.join(KIND_OF_DRIVE)}")
     wheel_radius_m, track_m, wheelbase_m, mass_kg = (
         number(f"{file}: {key}", described[key], _unit(key)) for key in NUMBERS
     )

@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from terrain.errors import ConfigError
-from terrain.files.descriptions import read_yaml
+from terrain.files.documents import read_yaml
 from terrain.files.resources import data_folder
 from terrain.records import Array
 

@@ -146,3 +146,71 @@ def test_a_spoilt_sidecar_is_named(model_dir, change, fault):
     file.write_text(change(json.loads(file.read_text())))
     with pytest.raises(ModelError, match=fault):
         read_model(model_dir)
+
+
+@pytest.mark.parametrize("name", [MODEL_FILE, INFO_FILE])
+def test_a_link_out_of_the_model_folder_is_refused(model_dir, tmp_path, name):
+    (model_dir / name).rename(tmp_path / name)
+    (model_dir / name).symlink_to(tmp_path / name)
+    with pytest.raises(ModelError, match="is a link that leads out of"):
+        read_model(model_dir)
+    (model_dir / name).unlink()
+    (tmp_path / name).rename(model_dir / name)
+    (tmp_path / "link").symlink_to(model_dir)
+    read_model(tmp_path / "link")
+
+
+@pytest.mark.parametrize(
+    ("change", "fault"),
+    [
+        (lambda info: "[" * 100_000, r"is damaged \(is nested deeper than 32 levels\)"),
+        (lambda info: json.dumps(info | {"window_s": 10**400}), "more than 64 bits"),
+        (lambda info: json.dumps(info | {"window_s": float("nan")}), "holds NaN, finite numbers"),
+        (lambda info: json.dumps(info | {"rate_hz": dict.fromkeys(info["rate_hz"], 1e308)}), "is damaged"),
+        (lambda info: json.dumps(info | {"steady": {"a\nb": 1}}), "is damaged"),
+        (lambda info: json.dumps(info | {"version": ["x"] * 10**5}), "has version"),
+    ],
+)
+def test_a_sidecar_of_a_stranger_is_one_sentence(model_dir, change, fault):
+    file = model_dir / INFO_FILE
+    file.write_text(change(json.loads(file.read_text())))
+    with pytest.raises(ModelError, match=fault) as error:
+        read_model(model_dir)
+    assert str(error.value).isprintable()
+    assert len(str(error.value)) < 500
+
+
+def test_an_archive_that_unpacks_to_gigabytes_or_nests_deep_is_refused(model_dir, monkeypatch):
+    monkeypatch.setattr("pipelines.models.model_files.MAX_UNPACKED_BYTES", 1 << 24)
+    for content, fault in ((b" " * (1 << 20), "unpacks to"), (b"[" * 100_000, "cannot be loaded")):
+        packed = io.BytesIO()
+        with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
+            for number in range(17 if fault == "unpacks to" else 1):
+                archive.writestr(f"{number}.bin" if number else "schema.json", content)
+        put(model_dir, packed.getvalue())
+        with pytest.raises(ModelError, match=fault):
+            read_model(model_dir)
+
+
+def test_damaged_members_of_an_archive_end_in_one_sentence(model_dir):
+    """The bytes inside of the archive, which its own checksums then do not cover."""
+    with zipfile.ZipFile(model_dir / MODEL_FILE) as source:
+        members = {name: source.read(name) for name in source.namelist()}
+    names = sorted(members, key=lambda name: len(members[name]))[:40]
+    rng, refusals = np.random.default_rng(3), []
+    for _ in range(25):
+        hit = names[rng.integers(len(names))]
+        content = bytearray(members[hit])
+        for place in rng.integers(min(len(content), 128), size=3):
+            content[place] = rng.integers(256)
+        packed = io.BytesIO()
+        with zipfile.ZipFile(packed, "w") as target:
+            for name, whole in members.items():
+                target.writestr(name, bytes(content) if name == hit else whole)
+        put(model_dir, packed.getvalue())
+        try:
+            read_model(model_dir)
+        except ModelError as error:
+            refusals.append(str(error))
+    assert len(refusals) > 10
+    assert all(sentence.isprintable() for sentence in refusals)

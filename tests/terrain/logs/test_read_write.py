@@ -17,18 +17,27 @@ VALUES = npst.arrays(
     np.float64, (8, 2), elements=st.one_of(st.just(np.nan), st.floats(allow_nan=False, allow_infinity=False))
 )
 
+NAMES = st.text(
+    st.characters(exclude_categories=["C", "Zl", "Zp"], exclude_characters="/\\"), min_size=1, max_size=8
+).filter(lambda name: name.strip() and not name.startswith("."))
+KINDS = st.text(st.characters(exclude_categories=["C", "Zl", "Zp"]), max_size=5)
+
 
 @settings(max_examples=30, deadline=None)
 @given(
-    TIMES, VALUES, st.text(max_size=8), st.dictionaries(st.text(max_size=5), st.integers(0, 9), max_size=2)
+    TIMES,
+    VALUES,
+    NAMES,
+    st.text(st.characters(exclude_categories=["Cs"]), max_size=8),
+    st.dictionaries(KINDS, st.integers(0, 9), max_size=2),
 )
-def test_a_written_log_is_read_back_unchanged(time_s, values, words, dropped):
+def test_a_written_log_is_read_back_unchanged(time_s, values, name, words, dropped):
     values[0] = 1.0
     stream = Stream(time_s, values[: len(time_s)], ("gyro_z_radps", "accel_x_mps2"))
-    run = RunLog("A_1", words, {"imu": stream}, (Label(0.1, 0.3, words),), words, dropped)
+    run = RunLog("A_1", name, {"imu": stream}, (Label(0.1, 0.3, name),), words, dropped)
     with tempfile.TemporaryDirectory() as folder:
         back = read_run(write_run(run, folder))
-    assert (back.run_id, back.robot, back.labels, back.source) == (run.run_id, words, run.labels, words)
+    assert (back.run_id, back.robot, back.labels, back.source) == (run.run_id, name, run.labels, words)
     assert dict(back.dropped) == dropped
     assert back.streams["imu"].channels == stream.channels
     np.testing.assert_array_equal(back.streams["imu"].time_s, stream.time_s)

@@ -1,0 +1,236 @@
+"""Reading JSON and YAML of strangers: bounded in size, depth and aliases, and no key twice.
+
+All JSON and YAML files are read here.  What a file may hold is bounded so that no file takes the memory or
+the stack of the process, and so that what comes back can be shown, compared and converted: whole numbers
+have 64 bits at most, numbers of JSON are finite, and texts can be written as UTF-8.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from terrain.errors import ConfigError, TerrainError
+from terrain.files.names import shown
+from terrain.files.regular import MEBIBYTE, read_regular
+
+MAX_JSON_BYTES = 16 * MEBIBYTE
+"""A run with a label each second of 24 hours has 7 MiB of them."""
+
+MAX_YAML_BYTES = MEBIBYTE
+"""Descriptions are written and read by people: the longest of the package has 20 KiB."""
+
+MAX_DEPTH = 32
+"""Levels of lists and mappings; those of this package have 6 at most."""
+
+MAX_NODES = 100_000
+"""Values of a YAML file, those of an alias counted each time: reading as many takes some seconds."""
+
+_MAX_WHOLE = 2**63
+_DEEP = f"is nested deeper than {MAX_DEPTH} levels"
+
+_BAD_VALUES = (ValueError, LookupError, AttributeError, TypeError, OverflowError)
+"""What the constructors of YAML raise on a scalar that does not suit its tag, as the date 2026-13-45."""
+
+
+def read_json(path: Path, place: str, kind: type[TerrainError], most_bytes: int = MAX_JSON_BYTES) -> Any:
+    """Return what a JSON file holds, unchecked.
+
+    Parameters
+    ----------
+    path : file to read
+    place : as messages name it
+    kind : of error that is raised
+    most_bytes : that it may have
+
+    Raises
+    ------
+    TerrainError
+        of the kind, if it is missing, no regular file or too large, or as :func:`parse_json` does.
+    """
+    try:
+        return parse_json(read_regular(path, place, kind, most_bytes))
+    except ValueError as error:
+        raise kind(f"{place}: {error}") from error
+
+
+def parse_json(content: bytes | str) -> Any:
+    """Return what a JSON text holds.
+
+    Raises
+    ------
+    ValueError
+        if it is no JSON or no UTF-8, nests too deep, gives a key twice, or holds a number that is not finite
+        or a whole number of more than 64 bits; the message says what the text does.
+
+    Examples
+    --------
+    >>> parse_json('{"mean": [NaN]}')
+    Traceback (most recent call last):
+    ValueError: holds NaN, finite numbers are required
+    """
+    try:
+        text = content if isinstance(content, str) else content.decode("utf-8-sig")
+        found = json.loads(
+            text,
+            object_pairs_hook=_object,
+            parse_constant=_refuse_constant,
+            parse_float=_finite,
+            parse_int=_whole,
+        )
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"is no JSON ({error})") from error
+    except RecursionError as error:
+        raise ValueError(_DEEP) from error
+    if _is_deep(found):
+        raise ValueError(_DEEP)
+    if "\\u" in text:
+        try:
+            json.dumps(found, ensure_ascii=False).encode()
+        except UnicodeEncodeError as error:
+            raise ValueError("holds half of a UTF-16 pair, which is no character") from error
+    return found
+
+
+def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for key, value in pairs:
+        if key in found:
+            raise ValueError(f"is no JSON (key {shown(key)} is given twice)")
+        found[key] = value
+    return found
+
+
+def _refuse_constant(name: str) -> Any:
+    raise ValueError(f"holds {name}, finite numbers are required")
+
+
+def _finite(digits: str) -> float:
+    if not math.isfinite(number := float(digits)):
+        _refuse_constant(digits[:20])
+    return number
+
+
+def _whole(digits: str) -> int:
+    if len(digits) > 20 or abs(int(digits)) >= _MAX_WHOLE:
+        raise ValueError("holds a whole number of more than 64 bits")
+    return int(digits)
+
+
+def _is_deep(found: Any) -> bool:
+    level = [found]
+    for _ in range(MAX_DEPTH):
+        level = [
+            child
+            for parent in level
+            if isinstance(parent, dict | list)
+            for child in (parent.values() if isinstance(parent, dict) else parent)
+            if isinstance(child, dict | list)
+        ]
+        if not level:
+            return False
+    return True
+
+
+def read_yaml(path: Path) -> Any:
+    """Return what a YAML file holds, unchecked; no file can run code.
+
+    Raises
+    ------
+    ConfigError
+        if it cannot be opened, is no regular file or too large, or as :func:`parse_yaml` does.
+    """
+    try:
+        return parse_yaml(read_regular(path, str(path), ConfigError, MAX_YAML_BYTES))
+    except ValueError as error:
+        raise ConfigError(f"{path}: {error}") from error
+
+
+def parse_yaml(content: bytes | str) -> Any:
+    """Return what a YAML text holds; no text can run code.
+
+    Raises
+    ------
+    ValueError
+        if it is no YAML or no UTF-8, nests too deep, gives a key twice, or holds too many values, a whole
+        number of more than 64 bits or an alias of itself; the message says what the text does.
+
+    Examples
+    --------
+    >>> parse_yaml("track_m: {value: 0.57, unit: m}")
+    {'track_m': {'value': 0.57, 'unit': 'm'}}
+    """
+    try:
+        text = content if isinstance(content, str) else content.decode("utf-8-sig")
+        return yaml.load(text, Loader=_BoundedLoader)  # a SafeLoader
+    except _TooMuchError as error:
+        raise ValueError(str(error)) from error
+    except (yaml.YAMLError, *_BAD_VALUES) as error:
+        raise ValueError(f"is no YAML ({' '.join(str(error).split())})") from error
+
+
+class _TooMuchError(yaml.YAMLError):
+    """A text that is YAML and is not read."""
+
+
+class _BoundedLoader(yaml.SafeLoader):
+    """A safe loader that refuses a key given twice, of which plain YAML takes the last, and what is too much.
+
+    An alias counts as many values as the node that it repeats: a few lines of aliases of aliases stand for
+    thousands of millions.
+    """
+
+    def __init__(self, stream: str) -> None:
+        super().__init__(stream)
+        self._depth = 0
+        self._n_nodes = 0
+        self._sizes: dict[str, int] = {}
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        """Compose a node, and count those below it."""
+        event: Any = self.peek_event()  # type: ignore[no-untyped-call]
+        if isinstance(event, yaml.AliasEvent):
+            anchor: Any = event.anchor
+            if anchor in self.anchors and anchor not in self._sizes:
+                raise _TooMuchError(f"holds an alias of itself (*{anchor})")
+            self._count(self._sizes.get(anchor, 1))
+            return super().compose_node(parent, index)
+        before = self._n_nodes
+        self._count(1)
+        self._depth += 1
+        if self._depth > MAX_DEPTH + 1:  # the value within the deepest list
+            raise _TooMuchError(_DEEP)
+        node = super().compose_node(parent, index)
+        self._depth -= 1
+        if event.anchor is not None:
+            self._sizes[event.anchor] = self._n_nodes - before
+        return node
+
+    def _count(self, n_nodes: int) -> None:
+        self._n_nodes += n_nodes
+        if self._n_nodes > MAX_NODES:
+            raise _TooMuchError(f"holds more than {MAX_NODES} values, those of aliases counted each time")
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        """Construct a mapping whose keys differ."""
+        keys: set[str] = set()
+        for key in (key for key, _ in node.value if isinstance(key, yaml.ScalarNode)):
+            if key.value in keys:
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"key {shown(key.value)} is given twice", key.start_mark
+                )
+            keys.add(key.value)
+        return super().construct_mapping(node, deep=deep)
+
+    def construct_yaml_int(self, node: yaml.ScalarNode) -> int:
+        """Construct a whole number of 64 bits at most."""
+        if len(node.value) > 80 or abs(found := super().construct_yaml_int(node)) >= _MAX_WHOLE:
+            raise _TooMuchError("holds a whole number of more than 64 bits")
+        return int(found)
+
+
+_BoundedLoader.add_constructor("tag:yaml.org,2002:int", _BoundedLoader.construct_yaml_int)

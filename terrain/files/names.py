@@ -1,0 +1,120 @@
+"""Names that files give: what may name a run, a robot or a terrain, and how a message shows a value."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from typing import Any
+
+from terrain.errors import TerrainError
+
+MAX_NAME = 128
+"""Characters of the longest name; file systems take 255 bytes, and writing adds some for a temporary name."""
+
+MAX_NAME_BYTES = 240
+"""The same in bytes of UTF-8, of which letters of some scripts have three each."""
+
+MAX_LISTED = 20
+"""Names that a message lists: files can have thousands of columns."""
+
+MAX_SHOWN = 120
+"""Characters of a value that a message shows: files can hold values of megabytes."""
+
+_SEPARATOR = re.compile(r"[/\\]")
+# C0 and C1, separators of lines, marks that turn the direction of writing, and halves of UTF-16 pairs
+_CONTROL = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u2069\ufeff\ud800-\udfff]")
+
+
+def name_fault(name: str) -> str | None:
+    """Return why a text is no plain name, None where it is one.
+
+    Letters of any language are accepted, and all signs but path separators and control characters.
+
+    Examples
+    --------
+    >>> name_fault("мокрая трава 2")
+    >>> name_fault("../husky.yaml")
+    'begins with a dot'
+    """
+    if not name.strip():
+        return "is empty"
+    if len(name) > MAX_NAME:
+        return f"is longer than {MAX_NAME} characters"
+    if name.startswith("."):
+        return "begins with a dot"
+    if _SEPARATOR.search(name):
+        return "holds a path separator"
+    if has_control_characters(name):
+        return "holds a control character"
+    return f"is longer than {MAX_NAME_BYTES} bytes" if len(name.encode()) > MAX_NAME_BYTES else None
+
+
+def has_control_characters(text: str) -> bool:
+    """Return whether a text holds a control character, which a terminal would act on or hide."""
+    return _CONTROL.search(text) is not None
+
+
+def check_name(place: str, name: str, kind: type[TerrainError]) -> str:
+    """Return a name that is a plain one.
+
+    Parameters
+    ----------
+    place : file and key, as messages name them
+    name : what the file holds
+    kind : of error that is raised
+
+    Raises
+    ------
+    TerrainError
+        of the kind, if it is empty, too long, begins with a dot, or holds a path separator or a control
+        character.
+
+    Examples
+    --------
+    >>> from terrain.errors import LogError
+    >>> check_name("run.json: robot", "/etc/robot.yaml", LogError)
+    Traceback (most recent call last):
+    terrain.errors.LogError: run.json: robot '/etc/robot.yaml' is no plain name: it holds a path separator
+    """
+    fault = name_fault(name)
+    if fault is not None:
+        raise kind(f"{place} {shown(name)} is no plain name: it {fault}")
+    return name
+
+
+def printable(text: str) -> str:
+    r"""Return a text on one line, with escapes for what cannot be printed and a terminal would act on.
+
+    Examples
+    --------
+    >>> print(printable("wet\tgrass"))
+    wet\tgrass
+    """
+    if text.isprintable():
+        return text
+    return "".join(each if each.isprintable() else each.encode("unicode_escape").decode() for each in text)
+
+
+def listed(names: Sequence[str]) -> str:
+    """Return names as messages list them: the first ones, control characters as escapes.
+
+    Examples
+    --------
+    >>> listed(["time_s", "gyro_z_radps"])
+    'time_s, gyro_z_radps'
+    """
+    first = [printable(name[:MAX_NAME]) for name in names[:MAX_LISTED]]
+    more = f" and {len(names) - MAX_LISTED} more" if len(names) > MAX_LISTED else ""
+    return ", ".join(first) + more
+
+
+def shown(value: Any) -> str:
+    """Return a value as messages show it, in quotes where it is a text, and cut where it is long.
+
+    Examples
+    --------
+    >>> shown("a b"), len(shown("x" * 10**6))
+    ("'a b'", 123)
+    """
+    text = repr(value)
+    return text if len(text) <= MAX_SHOWN else f"{text[:MAX_SHOWN]}..."

@@ -1,0 +1,287 @@
+"""Logs that strangers wrote: every fault is one sentence, and nothing outside of the log is read."""
+
+import json
+import os
+import shutil
+
+import numpy as np
+import pyarrow
+import pytest
+import yaml
+from pyarrow import parquet
+
+from pipelines.runs.datasets import load_runs
+from terrain.control.slip_table import load_slip_table
+from terrain.errors import ConfigError, LogError, TerrainError
+from terrain.files.resources import data_folder
+from terrain.logs import csv_table, parquet_file
+from terrain.logs.mapping import load_mapping
+from terrain.logs.read import read_run
+from terrain.logs.write import write_run
+from terrain.robots import load_robot, packaged_robot
+
+N_FUZZED = 300
+
+
+@pytest.fixture
+def folder(tmp_path, make_run):
+    return write_run(make_run(), tmp_path / "data")
+
+
+def edit(folder, change):
+    head = json.loads((folder / "run.json").read_text())
+    change(head)
+    (folder / "run.json").write_text(json.dumps(head))
+
+
+def refusal(call, *given):
+    with pytest.raises(TerrainError) as error:
+        call(*given)
+    assert "\n" not in str(error.value)
+    return str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (lambda d: d.update(robot="/tmp/evil.yaml"),
+         "SNOW_01/run.json: robot '/tmp/evil.yaml' is no plain name: it holds a path separator"),
+        (lambda d: d.update(robot="..\\evil"), "it begins with a dot"),
+        (lambda d: d.update(robot="a\x1b[2J"), "it holds a control character"),
+        (lambda d: d.update(robot="x" * 10**6), "it is longer than 128 characters"),
+        (lambda d: d.update(run_id="../../etc"), "run_id '../../etc' is no plain name"),
+        (lambda d: d.update(session="a/b"), "session 'a/b' is no plain name"),
+        (lambda d: d["labels"][0].update(terrain="a\nb"), "terrain 'a\\nb' is no plain name"),
+        (lambda d: d["streams"].update({"../imu": d["streams"].pop("imu")}), "stream '../imu' is no plain"),
+        (lambda d: d["streams"]["imu"].update(file=".."), "it begins with a dot"),
+        (lambda d: d["streams"]["imu"].update(file=""), "it is empty"),
+        (lambda d: d["streams"]["imu"].update(file="a\0b"), "it holds a control character"),
+        (lambda d: d.update(dropped={"\x1b[2J": 1}), "of 'dropped' holds a control character"),
+        (lambda d: d.update(streams=dict.fromkeys(map(str, range(65)), d["streams"]["imu"])),
+         "the run has 65 streams, at most 64 are read"),
+        (lambda d: d["labels"][0].update(start_s=10**300), "a whole number of more than 64 bits"),
+        (lambda d: d.update(labels={"x": "y" * 10**6}), "a list is required"),
+    ],
+)  # fmt: skip
+def test_names_of_a_log_are_names(folder, change, sentence):
+    edit(folder, change)
+    message = refusal(read_run, folder)
+    assert sentence in message
+    assert len(message) < 500
+
+
+def test_names_in_any_language_are_read_and_written(tmp_path, make_run, borealtc_dir):
+    edit(write_run(make_run(), tmp_path / "a"), lambda d: d.update(run_id="雪 1", session="мокрая трава"))
+    run = read_run(tmp_path / "a" / "SNOW_01")
+    assert read_run(write_run(run, tmp_path / "b")).session == "мокрая трава"
+    (borealtc_dir / "ICE").rename(borealtc_dir / "Schnee über Gras")
+    assert load_runs(borealtc_dir)[-1].run_id == "Schnee über Gras_01"
+    (borealtc_dir / "SNOW").rename(borealtc_dir / "a\x1b[2J")
+    assert "it holds a control character" in refusal(load_runs, borealtc_dir)
+
+
+def test_a_name_that_could_not_be_read_is_not_written(tmp_path, make_run):
+    from dataclasses import replace
+
+    assert "robot 'a/b' is no plain name" in refusal(write_run, replace(make_run(), robot="a/b"), tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_log_names_a_robot_of_the_package_or_the_one_that_is_given(tmp_path, monkeypatch):
+    text = (data_folder("robots") / "husky.yaml").read_text().replace("name: husky", "name: mule")
+    (tmp_path / "mule.yaml").write_text(text)
+    monkeypatch.chdir(tmp_path)
+    assert load_robot("mule.yaml").name == "mule"
+    for name in ("mule.yaml", str(tmp_path / "mule.yaml"), "mule", "../robots/husky", "x" * 10**5):
+        assert "is unknown: a log names one of agrimaro" in refusal(packaged_robot, name)
+    (tmp_path / "mule.yaml").write_text(text.replace("name: mule", "name: a/b"))
+    assert "mule.yaml: name 'a/b' is no plain name" in refusal(load_robot, "mule.yaml")
+
+
+@pytest.mark.parametrize("name", ["run.json", "imu.parquet"])
+def test_a_link_out_of_the_run_folder_is_refused(tmp_path, folder, name):
+    shutil.move(folder / name, tmp_path / name)
+    (folder / name).symlink_to(tmp_path / name)
+    assert f"SNOW_01/{name}: is a link that leads out of" in refusal(read_run, folder)
+    (folder / name).unlink()
+    (folder / name).symlink_to(name)
+    assert f"SNOW_01/{name}: cannot be opened (a link that leads nowhere)" in refusal(read_run, folder)
+
+
+def test_folders_may_be_links_and_so_may_files_within(tmp_path, folder):
+    (folder / "imu.parquet").rename(folder / "first.parquet")
+    (folder / "imu.parquet").symlink_to("first.parquet")
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "SNOW_01").symlink_to(folder)
+    (tmp_path / "link").symlink_to(tmp_path / "other")
+    assert [run.run_id for run in load_runs(tmp_path / "link")] == ["SNOW_01"]
+
+
+def test_links_out_of_a_folder_of_csv_files_are_refused(tmp_path, borealtc_dir):
+    shutil.move(borealtc_dir / "ICE" / "imu_01.csv", tmp_path / "imu_01.csv")
+    (borealtc_dir / "ICE" / "imu_01.csv").symlink_to(tmp_path / "imu_01.csv")
+    message = "ICE/imu_01.csv: is a link that leads out of"
+    assert message in refusal(load_runs, borealtc_dir)
+    time = {"column": "time", "unit": "s"}
+    gyro = {"gyro_z_radps": {"column": "wz", "unit": "rad/s"}}
+    imu = {"file": "{class}/imu_{n}.csv", "time": time, "channels": gyro}
+    (tmp_path / "map.yaml").write_text(yaml.safe_dump({"robot": "husky", "streams": {"imu": imu}}))
+    assert message in refusal(lambda: load_runs(borealtc_dir, mapping=tmp_path / "map.yaml"))
+    (tmp_path / "elsewhere").mkdir()
+    shutil.move(borealtc_dir / "SNOW", tmp_path / "elsewhere")
+    shutil.rmtree(borealtc_dir / "ICE")
+    (borealtc_dir / "SNOW").symlink_to(tmp_path / "elsewhere" / "SNOW")
+    assert "SNOW/imu_01.csv: is a link" in refusal(
+        lambda: load_runs(borealtc_dir, mapping=tmp_path / "map.yaml")
+    )
+    assert len(load_runs(borealtc_dir)) == 2  # a folder of runs may be a link, as for run folders
+
+
+def test_pipes_and_folders_are_no_logs(tmp_path, folder, borealtc_dir):
+    for name in ("imu.parquet", "run.json"):
+        (folder / name).unlink()
+        os.mkfifo(folder / name)
+        assert f"{name}: is a pipe, a socket or a device" in refusal(read_run, folder)
+        (folder / name).unlink()
+        (folder / name).mkdir()
+        assert f"{name}: is a folder" in refusal(read_run, folder)
+    (borealtc_dir / "ICE" / "imu_01.csv").unlink()
+    os.mkfifo(borealtc_dir / "ICE" / "imu_01.csv")
+    assert "imu_01.csv: is a pipe" in refusal(load_runs, borealtc_dir)
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"robot": "../husky.yaml"}, "map.yaml: robot '../husky.yaml' is no plain name"),
+        ({"file": "{0}/imu.csv"}, "has a brace without its partner"),
+        ({"file": "a\0b"}, "names no file"),
+        ({"file": "."}, "names no file"),
+    ],
+)
+def test_a_mapping_names_a_robot_and_files(tmp_path, change, sentence):
+    time = {"column": "time", "unit": "s"}
+    gyro = {"gyro_z_radps": {"column": "wz", "unit": "rad/s"}}
+    imu = {"file": change.get("file", "{n}.csv"), "time": time, "channels": gyro}
+    mapping = {"robot": change.get("robot", "husky"), "run_id": "a", "streams": {"imu": imu}}
+    (tmp_path / "map.yaml").write_text(yaml.safe_dump(mapping))
+    with pytest.raises(ConfigError) as error:
+        load_mapping(tmp_path / "map.yaml")
+    assert sentence in str(error.value)
+
+
+def test_numbers_beyond_all_bounds_are_no_samples(tmp_path):
+    (tmp_path / "a.csv").write_text("t,w\n0,1e300\n1,2e300\n2,3e300\n")
+    imu = {"file": "{n}.csv", "time": {"column": "t", "unit": "s"}}
+    imu["channels"] = {"gyro_z_radps": {"column": "w", "unit": "rad/s", "scale": 1e300}}
+    (tmp_path / "map.yaml").write_text(yaml.safe_dump({"robot": "husky", "streams": {"imu": imu}}))
+    assert "has nothing finite" in refusal(lambda: load_runs(tmp_path, mapping=tmp_path / "map.yaml"))
+
+
+def test_a_parquet_file_is_judged_before_it_is_read(folder, monkeypatch):
+    file = folder / "imu.parquet"
+    whole = parquet.read_table(file)
+    wide = pyarrow.table({f"c{i}_m": [0.0, 1.0] for i in range(5000)})
+    parquet.write_table(wide, file)
+    assert "imu.parquet: has 5000 columns, at most 4096 are read" in refusal(read_run, folder)
+    parquet.write_table(wide.select(range(4000)), file)
+    message = refusal(read_run, folder)
+    assert "column 'time_s' is missing (the file has c0_m, c1_m" in message
+    assert message.endswith("c19_m and 3980 more)")
+    nested = pyarrow.array([[1.0]] * whole.num_rows)
+    gyro = whole.column_names.index("gyro_z_radps")
+    parquet.write_table(whole.set_column(gyro, "gyro_z_radps", nested), file)
+    assert "column 'gyro_z_radps' holds list<" in refusal(read_run, folder)
+    parquet.write_table(whole, file)
+    monkeypatch.setattr(parquet_file, "MAX_VALUES", 100)
+    assert "has 200 rows of 7 columns, at most 100 values are read" in refusal(read_run, folder)
+    monkeypatch.undo()
+    monkeypatch.setattr(parquet_file, "MAX_FOOTER_BYTES", 100)
+    assert "imu.parquet: describes itself in" in refusal(read_run, folder)
+
+
+def test_a_packed_csv_file_that_grows_too_large_is_refused(tmp_path, monkeypatch):
+    import gzip
+
+    path = tmp_path / "samples.csv.gz"
+    path.write_bytes(gzip.compress(b"a\n" + b"0\n" * 2_000_000))
+    assert len(csv_table.read_columns(path, ["a"])) == 2_000_000
+    monkeypatch.setattr(csv_table, "MAX_UNPACKED_BYTES", 2**20)
+    with pytest.raises(LogError, match="unpacks to more than 1 MiB"):
+        csv_table.read_columns(path, ["a"])
+
+
+def fuzzed(whole, rng):
+    """Return bytes cut short, with a piece left out, or with some bytes changed."""
+    content = bytearray(whole)
+    if (draw := rng.random()) < 0.2:
+        return bytes(content[: rng.integers(len(content))])
+    if draw < 0.3:
+        start, end = sorted(rng.integers(len(content), size=2))
+        return bytes(content[:start] + content[end:])
+    for place in rng.integers(len(content), size=rng.integers(1, 6)):
+        content[place] = rng.integers(256)
+    return bytes(content)
+
+
+READERS = {
+    "run.json": lambda path: read_run(path.parent),
+    "imu.parquet": lambda path: read_run(path.parent),
+    "robot.yaml": load_robot,
+    "table.yaml": load_slip_table,
+}
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_damaged_bytes_are_one_sentence(folder, name):
+    packaged = {
+        "robot.yaml": data_folder("robots") / "husky.yaml",
+        "table.yaml": data_folder("target_slip") / "default.yaml",
+    }
+    if name in packaged:
+        lines = packaged[name].read_text().splitlines()
+        (folder / name).write_text("\n".join(line for line in lines if not line.startswith("#")))
+    whole = (folder / name).read_bytes()
+    rng, message = np.random.default_rng(0), []
+    for _ in range(N_FUZZED if name != "table.yaml" else 80):
+        (folder / name).write_bytes(fuzzed(whole, rng))
+        try:
+            READERS[name](folder / name)
+        except TerrainError as error:
+            message.append(str(error))
+    assert len(message) > 40
+    assert all(sentence.isprintable() for sentence in message)
+
+
+ODD = [[], {}, None, True, -1, 0, 1e308, 5e-324, "x" * 1000, "", "../x", "a\0", "\n", 2**62, [[1]], {"a": 1}]
+
+
+def places_of(document, found):
+    pairs = document.items() if isinstance(document, dict) else enumerate(document)
+    for key, value in list(pairs):
+        found.append((document, key))
+        if isinstance(value, dict | list):
+            places_of(value, found)
+    return found
+
+
+@pytest.mark.parametrize("name", ["run.json", "robot.yaml", "table.yaml"])
+def test_odd_values_anywhere_are_one_sentence(folder, name):
+    if name == "run.json":
+        whole = json.loads((folder / name).read_text())
+    else:
+        kind, stem = ("robots", "husky") if name == "robot.yaml" else ("target_slip", "default")
+        whole = yaml.safe_load((data_folder(kind) / f"{stem}.yaml").read_text())
+    rng, message = np.random.default_rng(1), []
+    for _ in range(N_FUZZED if name == "run.json" else 80):
+        document = json.loads(json.dumps(whole))
+        places = places_of(document, [])
+        holder, key = places[rng.integers(len(places))]
+        holder[key] = ODD[rng.integers(len(ODD))]
+        (folder / name).write_text(json.dumps(document))  # JSON is YAML
+        try:
+            READERS[name](folder / name)
+        except TerrainError as error:
+            message.append(str(error))
+    assert len(message) > 40
+    assert max(map(len, message)) < 3000
