@@ -11,11 +11,11 @@ from typing import Any
 from fastapi import WebSocket
 from starlette.websockets import WebSocketDisconnect, WebSocketState
 
-from pipelines.live.session_records import CommandStatus, StepOutput
 from pipelines.serve.guard import Bucket, token_fits
 from pipelines.serve.hub import Hub, OpenSession
 from pipelines.serve.messages import error_content, read_hello, step_content, welcome
 from pipelines.serve.wire import Encoding, WireError, decode, encode
+from pipelines.sessions.records import CommandStatus, StepOutput
 
 MAX_NOTES = 1000
 """Answers to messages that wait to be read; of more, the oldest are left out."""
@@ -109,7 +109,7 @@ class Connection:
         while True:
             try:
                 content = await self._next()
-                now_s = opened.heard_s = monotonic()
+                now_s = opened.received_s = monotonic()
                 metrics.messages.inc()
                 if not self._messages.take(1, now_s):
                     most = self._hub.limits.messages_per_s
@@ -127,7 +127,7 @@ class Connection:
                 self._note(error.code, str(error))
 
     def _take(self, opened: OpenSession, content: dict[str, Any], now_s: float) -> None:
-        """Take the samples of a message; what is refused of it is said in one error."""
+        """Take the samples of a message; what is refused of it is named in one error."""
         chain = opened.chain
         n_rows = _n_rows(content.get("streams"))
         if not self._rows.take(n_rows, now_s):

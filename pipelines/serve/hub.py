@@ -11,13 +11,13 @@ from time import monotonic
 from typing import NamedTuple
 
 from pipelines.live.classifying import ClassifierThread
-from pipelines.live.session import RobotSession
-from pipelines.live.session_records import Served, StepOutput
 from pipelines.live.state import LiveState, Restorable, load_state, save_state
 from pipelines.models.model_files import TerrainModel
 from pipelines.serve.messages import Hello
 from pipelines.serve.metrics import Metrics
 from pipelines.serve.wire import WireError
+from pipelines.sessions.records import Served, StepOutput
+from pipelines.sessions.session import RobotSession
 from terrain.control.slip_table import SlipTable
 from terrain.errors import ConfigError, DataError, TerrainError
 from terrain.robots import Robot, packaged_robot
@@ -26,7 +26,7 @@ REMEMBERED = 1000
 """States of robots that have left, which are kept in memory for their return."""
 
 SILENT_S = 2.0
-"""A connection that has said nothing for so long gives up its session to one that asks for it."""
+"""A connection that has sent nothing for so long gives up its session to one that asks for it."""
 
 
 class Limits(NamedTuple):
@@ -60,7 +60,7 @@ class OpenSession:
     chain: RobotSession
     restored: Restorable | None
     leave: Callable[[str, str], None]
-    heard_s: float = field(default_factory=monotonic)
+    received_s: float = field(default_factory=monotonic)
     last: StepOutput | None = None
 
 
@@ -107,7 +107,7 @@ class Hub:
 
         Parameters
         ----------
-        hello : what the robot said
+        hello : of the robot
         leave : called with a code and a sentence where the connection has to end
 
         Raises
@@ -118,7 +118,7 @@ class Hub:
         if self.closing:
             raise WireError("closing", "the service ends")
         before = self.sessions.get(hello.session)
-        if before is not None and monotonic() - before.heard_s > SILENT_S:
+        if before is not None and monotonic() - before.received_s > SILENT_S:
             before.leave("name-taken", "another connection took the session, as this one was silent")
             self.close(before)
         elif before is not None or hello.session in self._opening:

@@ -6,10 +6,10 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
 
-from pipelines.live.session import COMMAND_VALID_S
-from pipelines.live.session_records import Observation, Served, SessionRequest, StepOutput
 from pipelines.live.state import Restorable
 from pipelines.serve.wire import WireError, plain
+from pipelines.sessions.records import Observation, Served, SessionRequest, StepOutput
+from pipelines.sessions.session import COMMAND_VALID_S
 from terrain.control.traction import TractionStatus
 
 PROTOCOL: Literal[1] = 1
@@ -56,8 +56,8 @@ def read_hello(content: dict[str, Any]) -> Hello:
 
     Examples
     --------
-    >>> said = {"type": "hello", "session": "r7", "robot": "husky", "streams": {"imu": ["gyro_z_radps"]}}
-    >>> read_hello(said).rate_hz
+    >>> hello = {"type": "hello", "session": "r7", "robot": "husky", "streams": {"imu": ["gyro_z_radps"]}}
+    >>> read_hello(hello).rate_hz
     10.0
     >>> read_hello({"type": "samples"})
     Traceback (most recent call last):

@@ -34,8 +34,8 @@ def load_model(uri: str) -> TerrainModel:
         except subprocess.TimeoutExpired:
             raise ModelError(f"{uri}: was not loaded within {TIMEOUT_S:g} s") from None
         if done.returncode != 0:
-            said = done.stderr.strip().splitlines()
-            raise ModelError(said[-1] if said else f"{uri}: cannot be loaded")
+            lines = done.stderr.strip().splitlines()
+            raise ModelError(lines[-1] if lines else f"{uri}: cannot be loaded")
         return read_model(Path(done.stdout.strip().splitlines()[-1]))
 
 

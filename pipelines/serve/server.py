@@ -1,4 +1,4 @@
-"""``terrain serve``: all that is checked before a robot may come, then the server until it is told to end."""
+"""``terrain serve``: all that is checked before a robot may come, then the server until it has to end."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ import uvicorn
 
 from pipelines.live.classifying import AtOnce, classify_window
 from pipelines.live.pilot import LivePilot
-from pipelines.live.session_records import Served
 from pipelines.live.terrain_source import Classifier
 from pipelines.models.model_files import TerrainModel
 from pipelines.serve.app import make_app
@@ -25,6 +24,7 @@ from pipelines.serve.guard import check_token, is_loopback
 from pipelines.serve.hub import Hub, Limits
 from pipelines.serve.resolve import load_model
 from pipelines.serve.settings import ServeSettings
+from pipelines.sessions.records import Served
 from terrain.control.slip_table import load_slip_table
 from terrain.errors import ConfigError, DataError, TerrainError
 from terrain.estimation.live.estimator import CHANNELS
@@ -113,7 +113,7 @@ class Service:
         self._server = _Server(config, hub)
 
     def run(self, announce: Callable[[str], None]) -> None:
-        """Serve until the process is told to end (SIGTERM, Ctrl-C): robots are told, states are saved.
+        """Serve until SIGTERM or Ctrl-C: the robots get a message then, and their states are saved.
 
         Parameters
         ----------

@@ -31,7 +31,7 @@ async def watch(socket: WebSocket, hub: Hub, token: str, given_token: str) -> No
     try:
         if not token_fits(token, given_token):
             async with asyncio.timeout(10.0):
-                first = await _said(socket)
+                first = await _message(socket)
             if not token_fits(token, str(first.get("token", ""))):
                 refusal = error_content("token", "a token is required, or it is another", fatal=True)
                 await socket.send_text(str(encode(refusal, Encoding.JSON)))
@@ -58,7 +58,7 @@ async def watch(socket: WebSocket, hub: Hub, token: str, given_token: str) -> No
             await socket.close()
 
 
-async def _said(socket: WebSocket) -> dict[str, Any]:
+async def _message(socket: WebSocket) -> dict[str, Any]:
     received = await socket.receive()
     if received["type"] == "websocket.disconnect":
         raise WebSocketDisconnect(received.get("code", 1006))
@@ -68,7 +68,7 @@ async def _said(socket: WebSocket) -> dict[str, Any]:
 async def _listen(socket: WebSocket, chosen: dict[str, str]) -> None:
     while True:
         with suppress(WireError):
-            chosen["session"] = str((await _said(socket)).get("session", ""))
+            chosen["session"] = str((await _message(socket)).get("session", ""))
 
 
 async def _show(socket: WebSocket, hub: Hub, chosen: dict[str, str]) -> None:

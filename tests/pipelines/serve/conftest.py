@@ -6,47 +6,16 @@ import urllib.error
 import urllib.request
 from contextlib import contextmanager
 
-import numpy as np
 import pytest
 from skops import io
 from websockets.sync.client import connect
 
-from pipelines.classify.crossval import samples_of
-from pipelines.classify.settings import CrossvalSettings
-from pipelines.classify.train import model_info
-from pipelines.models.model_files import TerrainModel, write_info
+from pipelines.models.model_files import write_info
 from pipelines.serve.server import Service, prepare
 from pipelines.serve.settings import ServeSettings
 from terrain.logs.replay import replay
-from terrain.records import RunLog, Stream
 
 CHANNELS = {"imu": ["accel_z_mps2"], "wheels": ["speed_left_mps"]}
-
-
-def _drive(terrain, noise, number, duration_s=12.0):
-    rng = np.random.default_rng([number, int(10 * noise)])
-    time_s = np.arange(0, duration_s, 0.02)
-    streams = {
-        "imu": Stream(time_s, rng.normal(0, noise, (time_s.size, 1)), ("accel_z_mps2",)),
-        "wheels": Stream(time_s, np.full((time_s.size, 1), 0.5), ("speed_left_mps",)),
-    }
-    return RunLog(f"{terrain}{number}", "mower", streams, ((0.0, duration_s, terrain),))
-
-
-@pytest.fixture(scope="session")
-def drives():
-    """Runs of a robot without a description on two terrains that differ in shaking."""
-    return [
-        _drive(terrain, noise, number) for terrain, noise in (("a", 0.1), ("b", 2.0)) for number in range(3)
-    ]
-
-
-@pytest.fixture(scope="session")
-def mower_model(drives):
-    settings = CrossvalSettings()
-    windows = samples_of(drives, settings).cut.windows
-    recipe = settings.new_recipe().fit(windows, windows.terrain.astype(str))
-    return TerrainModel(recipe, model_info(drives, settings, windows, "drawn", ""))
 
 
 @pytest.fixture(scope="session")
@@ -115,11 +84,11 @@ def service(running, model_folder):
 
 @pytest.fixture(scope="session")
 def hello():
-    def said(session, **changed):
+    def message(session, **changed):
         first = {"type": "hello", "session": session, "robot": "mower", "streams": CHANNELS, "rate_hz": 0}
         return {**first, **changed}
 
-    return said
+    return message
 
 
 @pytest.fixture(scope="session")

@@ -31,9 +31,9 @@ def talk(socket, packed):
 
 @pytest.mark.parametrize("packed", [False, True])
 def test_a_robot_gets_the_terrain_and_target_slips_of_its_samples(
-    service, hello, messages, drives, mower_model, packed
+    service, hello, messages, two_drives, mower_model, packed
 ):
-    run, observer = drives[4], TerrainObserver(mower_model)
+    run, observer = two_drives[4], TerrainObserver(mower_model)
     found, seen = [], []
     with service.socket() as socket:
         say = talk(socket, packed)
@@ -95,12 +95,12 @@ def test_the_client_waits_for_steps_and_says_what_went_wrong(service):
         TerrainClient(service.ws, "x", "mower", {"imu": ["gyro_z_radps"]})
 
 
-def test_robots_are_kept_apart(service, hello, messages, drives):
+def test_robots_are_kept_apart(service, hello, messages, two_drives):
     with service.socket() as one, service.socket() as other:
         says = [talk(one, False), talk(other, True)]
         for k, say in enumerate(says):
             assert say(hello(f"apart-{k}"))["type"] == "welcome"
-        for pair in zip(messages(drives[0]), messages(drives[3]), strict=True):
+        for pair in zip(messages(two_drives[0]), messages(two_drives[3]), strict=True):
             last = [say(message) for say, message in zip(says, pair, strict=True)]
             time.sleep(0.0005)
         assert [one["observation"]["terrain"] for one in last] == ["a", "b"]
@@ -139,7 +139,7 @@ def test_health_readiness_and_the_card_of_the_model(service):
     assert service.get("/nothing")[0] == 404
 
 
-def test_figures_are_in_the_form_of_prometheus(service, hello, messages, drives):
+def test_figures_are_in_the_form_of_prometheus(service, hello, messages, two_drives):
     def figures():
         families = text_string_to_metric_families(service.get("/metrics")[1])
         return {
@@ -150,7 +150,7 @@ def test_figures_are_in_the_form_of_prometheus(service, hello, messages, drives)
     with service.socket() as socket:
         say = talk(socket, True)
         say(hello("counted"))
-        for message in list(messages(drives[0]))[:100]:
+        for message in list(messages(two_drives[0]))[:100]:
             say(message)
         during = figures()
         say({"type": "nonsense"})
@@ -164,18 +164,18 @@ def test_figures_are_in_the_form_of_prometheus(service, hello, messages, drives)
 def test_the_http_side_is_described(service):
     described = json.loads(service.get("/openapi.json")[1])
     assert {"/health", "/ready", "/metrics", "/model", "/table", "/sessions"} <= set(described["paths"])
-    for path, ways in described["paths"].items():
-        for way in ways.values():
-            assert way.get("description") or way.get("summary"), path
+    for path, methods in described["paths"].items():
+        for method in methods.values():
+            assert method.get("description") or method.get("summary"), path
 
 
 def test_another_model_is_put_in_while_a_robot_is_served_and_no_window_is_lost(
-    running, model_folder, hello, messages, drives
+    running, model_folder, hello, messages, two_drives
 ):
     with running(model=str(model_folder)) as service, service.socket() as socket:
         say, starts, numbers = talk(socket, False), [], []
         say(hello("swapped"))
-        for k, message in enumerate(messages(drives[4])):
+        for k, message in enumerate(messages(two_drives[4])):
             if k in (150, 320):
                 status, text = service.put("/model", {"uri": str(model_folder)})
                 assert (status, json.loads(text)["number"]) == (200, 2 if k == 150 else 3)
@@ -223,20 +223,20 @@ def test_a_damaged_model_is_refused(service, model_folder, tmp_path):
     assert "is damaged" in text
 
 
-def test_a_session_that_is_silent_gives_way_to_its_robot_that_comes_back(service, hello, monkeypatch):
+def test_a_session_that_is_silent_is_taken_by_its_robot_that_comes_back(service, hello, monkeypatch):
     monkeypatch.setattr("pipelines.serve.hub.SILENT_S", 0.3)
     with service.socket() as first, service.socket() as second:
         assert talk(first, False)(hello("back"))["type"] == "welcome"
         assert talk(second, False)(hello("back"))["code"] == "name-taken"
         time.sleep(0.4)
         assert talk(second, False)(hello("back"))["type"] == "welcome"
-        said = json.loads(first.recv(10))
-        assert (said["code"], said["fatal"]) == ("name-taken", True)
+        last = json.loads(first.recv(10))
+        assert (last["code"], last["fatal"]) == ("name-taken", True)
         with pytest.raises(ConnectionClosed):
             first.recv(10)
 
 
-def test_a_robot_that_comes_back_knows_its_terrain(service, hello, messages, drives):
+def test_a_robot_that_comes_back_knows_its_terrain(service, hello, messages, two_drives):
     for restored in (None, "b"):
         with service.socket() as socket:
             say = talk(socket, True)
@@ -246,7 +246,7 @@ def test_a_robot_that_comes_back_knows_its_terrain(service, hello, messages, dri
                 first = say({"type": "samples", "streams": {}, "step": True})
                 assert first["observation"]["terrain"] == "b"
                 continue
-            for message in messages(drives[4]):
+            for message in messages(two_drives[4]):
                 say(message)
                 time.sleep(0.0005)
         time.sleep(0.2)

@@ -19,7 +19,7 @@ class Served(NamedTuple):
     Parameters
     ----------
     number : rises with each replacement
-    model, model_name : that classifies, and how it was named; without one no terrain is told
+    model, model_name : that classifies, and its URI; without one the terrain is unknown
     table : of target slips
     """
 

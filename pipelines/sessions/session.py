@@ -14,14 +14,14 @@ from typing import Any
 import numpy as np
 
 from pipelines.live.classifying import Classifying, WindowOutput
-from pipelines.live.inbox import Inbox, as_numbers
 from pipelines.live.observer import TerrainObserver
 from pipelines.live.pilot import LivePilot
-from pipelines.live.session_clock import SessionClock
-from pipelines.live.session_records import CommandStatus, Observation, Served, SessionRequest, StepOutput
 from pipelines.live.state import LiveState, Restorable
-from pipelines.live.stream_health import StreamHealth
 from pipelines.live.terrain_source import Classifier, NoTerrain
+from pipelines.sessions.clock import SessionClock
+from pipelines.sessions.inbox import Inbox, as_numbers
+from pipelines.sessions.records import CommandStatus, Observation, Served, SessionRequest, StepOutput
+from pipelines.sessions.stream_health import StreamHealth
 from terrain.control.switching import TerrainBelief
 from terrain.control.traction import TractionStatus
 from terrain.errors import ConfigError, DataError
@@ -44,7 +44,7 @@ class RobotSession:
 
     Parameters
     ----------
-    request : what the robot said
+    request : of the robot
     served : model and table
     robot : its description; None for a robot that has none
     classifying : where its windows are classified
@@ -83,7 +83,7 @@ class RobotSession:
         self._streams = StreamHealth(request.channels)
         self._clock = SessionClock()
         self._twist, self._twist_s = _NO_TWIST, -math.inf
-        self._heard_s = math.nan
+        self._received_s = math.nan
         self._n_steps = self._n_messages = 0
         self._window: WindowOutput | None = None
 
@@ -187,8 +187,8 @@ class RobotSession:
                     continue
                 newest_s = self.inbox.put(str(name), time_s, values)
                 if newest_s is not None:
-                    self._clock.heard(newest_s, now_s)
-                    self._heard_s = now_s
+                    self._clock.received(newest_s, now_s)
+                    self._received_s = now_s
         elif streams is not None:
             self.inbox.refused["samples that are not given by stream"] += 1
         if twist is not None:
@@ -227,7 +227,7 @@ class RobotSession:
             command,
             status,
             self._observation(time_s),
-            now_s - self._heard_s + (monotonic() - begun_s),
+            now_s - self._received_s + (monotonic() - begun_s),
         )
 
     def _commanded(

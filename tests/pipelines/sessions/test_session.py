@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from pipelines.live.classifying import AtOnce
 from pipelines.live.observer import TerrainObserver
 from pipelines.live.pilot import LivePilot
-from pipelines.live.session import TWIST_FRESH_S, RobotSession
-from pipelines.live.session_records import CommandStatus, Served, SessionRequest
 from pipelines.live.terrain_source import Classifier
+from pipelines.sessions.records import CommandStatus, Served, SessionRequest
+from pipelines.sessions.session import TWIST_FRESH_S, RobotSession
 from terrain.control.slip_table import load_slip_table
 from terrain.errors import ConfigError, DataError
 from terrain.estimation.live.estimator import CHANNELS
@@ -164,7 +164,7 @@ def test_a_desired_motion_that_is_too_old_stops_the_robot_until_a_new_one_comes(
     assert seen[-1][2] > 1.0
 
 
-def test_before_the_first_sample_the_robot_is_told_to_stand():
+def test_before_the_first_sample_the_command_is_to_stand():
     session = agrimaro()
     session.put(None, [1.0, 0.0, 0.0], NOW_S)
     output = session.step(NOW_S)

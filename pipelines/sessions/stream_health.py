@@ -16,7 +16,7 @@ PERIODS = 3.0
 
 
 class StreamHealth:
-    """Tell of each stream whether it comes, and what it said last.
+    """Judge whether each stream comes, and keep its last values.
 
     Parameters
     ----------

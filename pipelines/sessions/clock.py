@@ -24,8 +24,8 @@ class SessionClock:
     Examples
     --------
     >>> clock = SessionClock()
-    >>> clock.heard(100.0, now_s=5.0)
-    >>> clock.heard(100.1, now_s=5.3)  # this one waited for 0.2 s
+    >>> clock.received(100.0, now_s=5.0)
+    >>> clock.received(100.1, now_s=5.3)  # this one waited for 0.2 s
     >>> round(clock.at(5.3), 6)
     100.3
     """
@@ -37,7 +37,7 @@ class SessionClock:
         self.newest_s = math.nan
         self.times_set = 0
 
-    def heard(self, stamp_s: float, now_s: float) -> None:
+    def received(self, stamp_s: float, now_s: float) -> None:
         """Take the newest stamp of a message that has just arrived; a stamp that is no number is left out."""
         ahead_s = stamp_s - now_s
         if not math.isfinite(ahead_s):
