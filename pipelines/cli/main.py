@@ -8,7 +8,19 @@ from typing import Any
 
 import typer
 
-from pipelines.cli import classify, drive, estimate, explain, faults, quickstart, reproduce, runs, serve, slip
+from pipelines.cli import (
+    bench,
+    classify,
+    drive,
+    estimate,
+    explain,
+    faults,
+    quickstart,
+    reproduce,
+    runs,
+    serve,
+    slip,
+)
 from terrain.errors import OutsideRegionWarning, TerrainError
 from terrain.files.names import printable
 
@@ -29,6 +41,7 @@ GROUPS = (
 
 for group in GROUPS:
     app.add_typer(group)
+app.add_typer(bench.app, name="bench")
 
 
 MAX_MESSAGE = 1000

@@ -1,0 +1,24 @@
+"""The commands that measure the live chain and load the service: bench live, bench soak."""
+
+from __future__ import annotations
+
+import typer
+
+from pipelines.bench.settings import BenchSettings
+from pipelines.cli.command import Json, command
+
+app = typer.Typer(help="Measure the live chain and the service.", no_args_is_help=True)
+
+
+@command(app, "live")
+def live_command(settings: BenchSettings, json_file: Json = None) -> None:
+    """Measure latencies by stage, and the service with one robot and with many."""
+    from pipelines.bench.live import bench_live
+    from pipelines.bench.screen import print_bench
+    from pipelines.reporting.json_file import write_json
+    from pipelines.reporting.terminal import output_console, progress_bar
+
+    with progress_bar() as progress:
+        result = bench_live(settings, progress)
+    print_bench(result, output_console())
+    write_json(json_file, result)
