@@ -14,7 +14,7 @@ import numpy as np
 
 from pipelines.can.codec import Drop, Frame, Part, decode
 from pipelines.can.dbc import Layout
-from pipelines.can.signals import channels_of
+from pipelines.can.signals import QUATERNION, channels_of, real_part
 from terrain.records import Reading
 
 QUEUE = 1000
@@ -37,6 +37,7 @@ class _Assembler:
     def __init__(self, stream: str, columns: frozenset[int], dropped: Counter[str]) -> None:
         self._stream, self._needed, self._dropped = stream, columns, dropped
         self._width = len(channels_of(stream))
+        self._adds_real_part = stream == "odometry" and QUATERNION[3] not in columns
         self._row = [math.nan] * self._width
         self._there: set[int] = set()
         self._counter: int | None = None
@@ -79,6 +80,9 @@ class _Assembler:
             return
         if not self._there >= self._needed:
             self._dropped[f"{self._stream}: part missing"] += 1
+        if self._adds_real_part:
+            x, y, z, w = QUATERNION
+            self._row[w] = real_part(self._row[x], self._row[y], self._row[z])
         if len(self.done) >= QUEUE:
             del self.done[0]
             self._dropped[f"{self._stream}: queue full"] += 1

@@ -126,7 +126,7 @@ def decode(layout: Layout, frame: Frame) -> Part | Drop:
         return Drop.TIME
     try:
         raw = plan.message.decode(frame.data, decode_choices=False, scaling=False)
-        if plan.has_crc and raw[CRC] != _crc_of(plan, raw):
+        if plan.crc_bits and raw[CRC] != _crc_of(plan, frame.data):
             return Drop.CHECKSUM
     except Exception:  # whatever a DBC makes of bytes, as of a multiplexer that it does not describe
         return Drop.UNREADABLE
@@ -189,13 +189,15 @@ def _encode(
     if plan.has_counter:
         length = plan.message.get_signal_by_name(COUNTER).length
         raw[COUNTER] = counter % 2**length
-    if plan.has_crc:
-        raw[CRC] = _crc_of(plan, raw)
-    data = plan.message.encode(raw, scaling=False, padding=False, strict=False)
-    return Frame(time_s, plan.message.frame_id, bytes(data), plan.message.is_extended_frame)
+    data = bytes(plan.message.encode(raw, scaling=False, padding=False, strict=False))
+    if plan.crc_bits:
+        raw[CRC] = _crc_of(plan, data)
+        data = bytes(plan.message.encode(raw, scaling=False, padding=False, strict=False))
+    return Frame(time_s, plan.message.frame_id, data, plan.message.is_extended_frame)
 
 
-def _crc_of(plan: MessagePlan, raw: dict[str, int | float]) -> int:
-    data = plan.message.encode(raw | {CRC: 0}, scaling=False, padding=False, strict=False)
+def _crc_of(plan: MessagePlan, data: bytes) -> int:
+    """Return the CRC over the identifier and all bits of the data but its own, unused ones too."""
     width = 4 if plan.message.is_extended_frame else 2
-    return crc8(plan.message.frame_id.to_bytes(width, "big") + bytes(data))
+    others = (int.from_bytes(data, "big") & ~plan.crc_bits).to_bytes(len(data), "big")
+    return crc8(plan.message.frame_id.to_bytes(width, "big") + others)

@@ -59,7 +59,8 @@ class MessagePlan:
     message : of cantools
     stream : that it carries
     signals : of the stream's channels
-    has_counter, has_crc : whether it has those signals
+    has_counter : whether it has a counter
+    crc_bits : bits of its CRC in the data, the first byte the highest; 0 without one
     others : raw value of each further signal when it is sent
     """
 
@@ -67,7 +68,7 @@ class MessagePlan:
     stream: str
     signals: tuple[SignalPlan, ...]
     has_counter: bool
-    has_crc: bool
+    crc_bits: int
     others: Mapping[str, int | float]
 
     @property
@@ -228,7 +229,14 @@ def _message_plan(message: Any, stream: str, signals: list[SignalPlan]) -> Messa
     names = {signal.name: signal for signal in message.signals}
     others = {name: signal.raw_initial or 0 for name, signal in names.items() if name not in used}
     has_crc = CRC in names and names[CRC].length == 8
-    return MessagePlan(message, stream, tuple(signals), COUNTER in names, has_crc, others)
+    crc_bits = _bits_of_crc(message) if has_crc else 0
+    return MessagePlan(message, stream, tuple(signals), COUNTER in names, crc_bits, others)
+
+
+def _bits_of_crc(message: Any) -> int:
+    zeros = dict.fromkeys((signal.name for signal in message.signals), 0)
+    with_crc = message.encode(zeros | {CRC: 255}, scaling=False, padding=False, strict=False)
+    return int.from_bytes(with_crc, "big")
 
 
 def lacking(layout: Layout, stream: str) -> list[str]:

@@ -8,13 +8,9 @@ from collections.abc import Iterator
 
 from pipelines.can.codec import Frame, encode
 from pipelines.can.dbc import Layout
-from pipelines.can.signals import SENSORS, channels_of
-from terrain.angles import wrapped
+from pipelines.can.signals import SENSORS, as_sent, channels_of
 from terrain.logs.replay import TWIST
 from terrain.records import RunLog, Stream
-
-_ANGLES = ("steering", "imu")
-"""Streams whose angles are sent within half a turn."""
 
 
 def run_frames(layout: Layout, run: RunLog) -> Iterator[Frame]:
@@ -36,11 +32,6 @@ def run_frames(layout: Layout, run: RunLog) -> Iterator[Frame]:
 def _stream_frames(layout: Layout, name: str, stream: Stream) -> Iterator[Frame]:
     channels = channels_of(name)
     columns = [stream.channels.index(channel) if channel in stream.channels else -1 for channel in channels]
-    turned = [name in _ANGLES and channel.endswith("_rad") for channel in channels]
     for number, (time_s, row) in enumerate(zip(stream.time_s.tolist(), stream.values.tolist(), strict=True)):
         values = [math.nan if column < 0 else row[column] for column in columns]
-        values = [
-            float(wrapped(value)) if angle and math.isfinite(value) else value
-            for value, angle in zip(values, turned, strict=True)
-        ]
-        yield from encode(layout, name, values, number, time_s)
+        yield from encode(layout, name, as_sent(name, values), number, time_s)
