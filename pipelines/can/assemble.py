@@ -134,7 +134,7 @@ class Receiver:
             return None
         assembler = self._streams.get(part.stream)
         if assembler is None:
-            self.dropped[f"{part.stream}: sent by another node"] += 1
+            self.dropped[f"{part.stream}: not read here"] += 1
             return None
         assembler.take(frame.time_s, part)
         self.n_used += 1

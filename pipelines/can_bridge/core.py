@@ -39,7 +39,7 @@ KEPT = 100_000
 _STATUS = channels_of("status")
 
 
-class _Last:
+class LastSample:
     """Newest sample of a stream that measured anything.
 
     Parameters
@@ -99,7 +99,7 @@ class BridgeCore:
         self._receiver = Receiver(layout, RECEIVED)
         self._kinematics, self.clock = LowLevelKinematics(robot), BusClock()
         self._zeros_rad = robot.steering_zeros_rad
-        self._last = {name: _Last(stale_s, 3) for name, stale_s in STALE_S.items()}
+        self._last = {name: LastSample(stale_s, 3) for name, stale_s in STALE_S.items()}
         self._before_s, self._counter, self._new_wheels = math.nan, 0, False
         self.n_in = 0
         self.samples: Counter[str] = Counter()

@@ -65,10 +65,10 @@ def test_streams_are_taken_in_any_order_of_their_frames():
     assert np.isfinite(found["imu"].values).all()
 
 
-def test_frames_that_another_node_sends_in_this_ones_place_are_counted():
+def test_frames_of_this_side_that_come_back_are_counted():
     receiver, found = received(encode(LAYOUT, "corrections", [1.0, 1.0, 1.0], 0))
     assert found == {}
-    assert receiver.dropped == {"corrections: sent by another node": 1}
+    assert receiver.dropped == {"corrections: not read here": 1}
 
 
 def test_memory_is_bounded_when_nothing_is_read():

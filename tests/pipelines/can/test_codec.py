@@ -147,6 +147,8 @@ def test_a_frame_that_is_not_used_says_why(frame, drop):
 def test_what_was_not_measured_is_nan_and_no_zero():
     found = round_trip("wheels", [1.0, math.nan, -3.0, math.nan, 0.0, 2.0])
     assert [math.isnan(value) for value in found] == [False, True, False, True, False, False]
+    parts = [decode(LAYOUT, frame) for frame in encode(LAYOUT, "wheels", [math.nan] * 6, 0)]
+    assert [part.n_out_of_range for part in parts] == [0, 0], "no value out of range was sent"
 
 
 def test_resolutions_are_far_below_the_noise_and_ranges_cover_the_robot():

@@ -12,13 +12,13 @@ from pipelines.can.codec import Frame, decode, encode
 from pipelines.can.dbc import load_layout
 from pipelines.can.recorded import run_frames
 from pipelines.can.signals import RECEIVED
-from pipelines.can_bridge.core import STALE_S, BridgeCore
+from pipelines.can_bridge.core import STALE_S, BridgeCore, LastSample
 from pipelines.can_bridge.corrections import BridgeState, LowLevelKinematics
 from pipelines.live.pilot import LivePilot
 from pipelines.live.pilot_settings import PilotSettings
 from terrain.control.slip_table import load_slip_table
 from terrain.control.wheel_controllers import PERIOD_S
-from terrain.records import Command, Sample, Stream
+from terrain.records import Command, Reading, Sample, Stream
 from terrain.robots import load_robot
 from terrain.simulation.run import simulate_run
 
@@ -186,6 +186,18 @@ def test_values_that_are_not_measured_are_no_samples(frames, stream):
     assert ACTIVE not in states(rows, 3.0 + STALE_S[stream] + PERIOD_S, 4.0)
 
 
+@pytest.mark.parametrize(
+    ("now_s", "read_s", "fresh"),
+    [(5.05, 9.05, True), (5.15, 9.05, False), (5.05, 9.15, False), (4.95, 9.0, True), (4.8, 9.0, False)],
+)
+def test_a_sample_is_fresh_on_both_clocks_and_not_of_the_future(now_s, read_s, fresh):
+    last = LastSample(0.1, 3)
+    assert not last.came
+    assert not last.is_fresh(5.0, 9.0)
+    assert last.take(Reading(np.array([5.0]), np.ones((1, 3))), 9.0, whole=True)
+    assert last.is_fresh(now_s, read_s) == fresh
+
+
 def test_a_damaged_twist_is_not_driven(frames):
     def flipped(frame):
         if not of("twist")(frame) or frame.time_s < 3.0:
@@ -245,6 +257,17 @@ def test_steering_elsewhere_than_computed_gets_no_correction(run):
         if state == ACTIVE:
             sign = np.array([-1.0, 1.0 if turn_rad else -1.0, -1.0])
             np.testing.assert_allclose(rows[-1][1], sign, atol=0.001)
+
+
+def test_a_drive_that_begins_with_turned_steering_is_corrected_at_once():
+    """Kinematics and controller begin at the measured angles, not at zero: nothing steers there first."""
+    angle_rad, sent = 1.3, []
+    for number, time_s in enumerate(np.arange(0.0, 1.0, 0.02).tolist()):
+        twist = [0.5 * math.cos(angle_rad), 0.5 * math.sin(angle_rad), 0.0]
+        rows = {"wheels": [25.0] * 3 + [1.0] * 3, "steering": [angle_rad] * 3, "twist": twist}
+        sent += [f for name, row in rows.items() for f in encode(LAYOUT, name, row, number, time_s)]
+    rows = ticks(BridgeCore(LAYOUT, ROBOT, Slower), sent, 1.0)
+    assert states(rows, 0.0, 1.0) == {ACTIVE}
 
 
 def broken(kind):
