@@ -48,7 +48,7 @@ def run_can(settings: CanSettings) -> BridgeReport:
         channel=settings.channel,
         dbc=layout.name,
         robot=robot.name,
-        duration_s=bridge.duration_s,
+        duration_s=round(bridge.duration_s, 3),
         frames_in=core.n_in,
         frames_used=core.n_used,
         frames_out=link.n_out,

@@ -2,12 +2,15 @@
 
 import math
 import re
+import sys
 
+import can
+import cantools
 import numpy as np
 import pytest
 
 from pipelines.can.assemble import Receiver
-from pipelines.can.codec import decode, encode
+from pipelines.can.codec import Frame, decode, encode
 from pipelines.can.dbc import lacking, load_layout
 from pipelines.can.signals import SIGNALS
 from terrain.errors import ConfigError
@@ -103,9 +106,6 @@ def test_another_dbc_with_units_and_layouts_of_its_own_is_read(tmp_path):
     (tmp_path / "own.dbc").write_text(OWN)
     layout = load_layout(tmp_path / "own.dbc", ("wheels", "steering"))
     receiver = Receiver(layout, ("wheels", "steering"))
-    import can
-    import cantools
-
     database = cantools.database.load_file(tmp_path / "own.dbc")
     sent = [("Fast", {"MotorRate1": 600, "MotorRate2": -1200.5, "MotorRate3": 0, "Alive": 0})]
     sent += [("Multiplexed", {"Which": i, f"MotorCurrent{i + 1}": 1000 * (i - 1)}) for i in range(3)]
@@ -113,8 +113,6 @@ def test_another_dbc_with_units_and_layouts_of_its_own_is_read(tmp_path):
     for name, values in sent:
         data = database.encode_message(name, values, strict=False)
         message = can.Message(arbitration_id=database.get_message_by_name(name).frame_id, data=data)
-        from pipelines.can.codec import Frame
-
         extended = database.get_message_by_name(name).is_extended_frame
         receiver.take(Frame(2.0, message.arbitration_id, bytes(message.data), extended))
     readings = receiver.readings(3.0)
@@ -133,3 +131,9 @@ def test_another_dbc_with_units_and_layouts_of_its_own_is_read(tmp_path):
 
 def test_every_stream_may_be_asked_for():
     assert set(load_layout().by_stream) == set(SIGNALS)
+
+
+def test_without_the_packages_the_extra_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "cantools", None)
+    with pytest.raises(ConfigError, match=r"terrain-slip\[can\]"):
+        load_layout()
