@@ -10,6 +10,7 @@ import typer
 
 from pipelines.cli import (
     bench,
+    can,
     classify,
     drive,
     estimate,
@@ -34,7 +35,7 @@ app = typer.Typer(
 )
 
 GROUPS = (
-    *(runs.app, estimate.app, classify.app, slip.app, drive.app, serve.app),
+    *(runs.app, estimate.app, classify.app, slip.app, drive.app, serve.app, can.app),
     *(faults.app, explain.app, reproduce.app, quickstart.app),
 )
 """Files of commands, in the order of help."""

@@ -19,9 +19,12 @@ if TYPE_CHECKING:
     from terrain.logs.drive import DriveRobot
     from terrain.robots import Robot
 
-LAYOUTS = ("auto", "runs", "borealtc", "csv", "drive")
+LAYOUTS = ("auto", "runs", "borealtc", "csv", "drive", "can")
 """``runs``: run folders as this package writes them; ``csv``: any CSV, by a mapping file; ``drive``: the
-files ``samples.csv.gz`` of DRIVE, one a session."""
+files ``samples.csv.gz`` of DRIVE, one a session; ``can``: logs of a CAN bus, by a DBC."""
+
+CAN_ROBOT = "agrimaro"
+"""Robot of a log of a CAN bus where none is named."""
 
 DRIVE_ROBOT = "husky"
 """Robot of a log of DRIVE where none is named: that of the log that was published with the paper."""
@@ -51,7 +54,8 @@ def load_runs(
     folder : a run folder, a folder of run folders, a folder in the BorealTC or the DRIVE layout (a session,
         or folders of sessions), or the folder that the files of ``mapping`` are found under
     layout : one of ``LAYOUTS``; ``auto`` looks
-    mapping : YAML file that describes how to read CSV files (``terrain.logs.mapping``)
+    mapping : YAML file that describes how to read CSV files (``terrain.logs.mapping``); of logs of a CAN bus
+        their DBC, by default AgriMaRo's
     repair : drop and count what a strict read refuses, and skip runs that cannot be read at all
     align : bring the wheel stream onto the clock of the IMU where the two clocks can be compared
     robot : the robot of logs that do not name theirs, those of DRIVE, by name or its YAML file;
@@ -153,6 +157,11 @@ def _readers(
         raise LogError(f"{folder}: {fault}; {ACCEPTED}")
     if (mapping is not None) and layout in ("runs", "borealtc", "drive"):
         raise ConfigError(f"a mapping file is for CSV files, not for the layout {layout!r}")
+    if layout == "can":
+        from pipelines.can import dbc, logs
+
+        name = CAN_ROBOT if robot is None else robot.name
+        return _some(logs.find_runs(folder, dbc.load_layout(mapping, ()), name), folder)
     if mapping is not None or layout == "csv":
         if mapping is None:
             raise ConfigError("the layout 'csv' needs a mapping file")

@@ -12,9 +12,9 @@ from pipelines.config.settings import Settings, setting
 if TYPE_CHECKING:
     from terrain.records import RunLog
 
-Layout = Literal["auto", "runs", "borealtc", "csv", "drive"]
+Layout = Literal["auto", "runs", "borealtc", "csv", "drive", "can"]
 """``auto``: found out; ``runs``: run folders as this package writes them; ``csv``: any CSV, by a mapping
-file; ``drive``: the files ``samples.csv.gz`` of DRIVE, one a session."""
+file; ``drive``: the files ``samples.csv.gz`` of DRIVE, one a session; ``can``: logs of a CAN bus."""
 
 
 ROBOT_TEXT = "Robot of logs that do not name theirs (DRIVE), by name or its YAML file; the husky by default."
@@ -24,7 +24,9 @@ class ReadSettings(Settings):
     """How files are read."""
 
     layout: Layout = setting("auto", "Layout of the folder.", option="--format")
-    mapping: Path | None = setting(None, "YAML file that describes how to read CSV files.")
+    mapping: Path | None = setting(
+        None, "YAML file that describes how to read CSV files; with --format can a DBC."
+    )
     repair: bool = setting(False, "Drop and count what a strict read refuses.")
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 
 COMMANDS = (
     *("import", "inspect", "simulate", "calibrate", "estimate", "crossval", "train", "predict"),
-    *("learn-slip", "drive", "faults", "explain", "explain-trials", "quickstart", "reproduce"),
+    *("learn-slip", "drive", "faults", "can", "explain", "explain-trials", "quickstart", "reproduce"),
 )
 
 
@@ -90,6 +90,8 @@ streams:
       speed_left_mps: {column: vl, unit: km/h}
       speed_right_mps: {column: vr, unit: km/h}
 """
+
+LACKING_DBC = 'VERSION ""\nBU_: PC\nBO_ 16 A: 8 PC\n SG_ MotorRate1 : 0|8@1+ (1,0) [0|9] "rpm" PC\n'
 
 DRIVE_COLUMNS = (
     "step,window,steady,time,cmd_left,cmd_right,wheel_left,wheel_right,"
@@ -267,6 +269,17 @@ CASES: tuple[Case, ...] = (
         steps("explain-trials --n 2 --seed 3 --runs 4 --jobs 1"),
     ),
     Case("reproduce", steps("reproduce danzi --out page")),
+    Case(
+        "can",
+        steps(
+            "can --interface virtual --channel behaviour --duration 0",
+            refused("can --interface nothing --channel can0"),
+            refused("can --interface virtual --channel behaviour --robot husky"),
+            refused("can --interface virtual --channel behaviour --dbc none.dbc"),
+            refused("can --interface virtual --channel behaviour --dbc lacking.dbc"),
+        ),
+        lambda: {"lacking.dbc": LACKING_DBC.encode()},
+    ),
     Case(
         "refusals",
         steps(

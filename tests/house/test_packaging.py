@@ -66,6 +66,7 @@ def test_the_wheel_runs_elsewhere_with_its_yaml(installed_wheel, tmp_path):
     assert Path(place).is_relative_to(installed_wheel)
     assert (float(track_m), fallback) == (0.5708, "unknown")
     assert (installed_wheel / "pipelines" / "reporting" / "templates" / "report.css").is_file()
+    assert (installed_wheel / "terrain" / "_data" / "can" / "agrimaro.dbc").is_file()
     packaged = {file.name for file in (installed_wheel / "terrain" / "_data").rglob("*.yaml")}
     assert packaged == {file.name for file in (ROOT / "data").rglob("*.yaml")}
 
