@@ -7,6 +7,7 @@ current, d = v_right - v_left, w the yaw rate.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -98,20 +99,34 @@ def correlation_features(values: Array, channels: Sequence[str], stream: str) ->
     -------
     features, and their values (n_windows, n_features)
     """
-    features: list[Feature] = []
     parts: list[Array] = [np.empty((values.shape[0], 0))]
-    for quantities, signal_set in ((("gyro", "accel"), "imu"), (("current",), "currents")):
-        rows = [i for quantity in quantities for i in rows_of(channels, quantity)]
-        if len(rows) < 2:
-            continue
+    for rows, _ in _correlated(channels):
         parts.append(channel_correlations(values[:, rows]))
+    return list(_correlations_of(tuple(channels), stream)), np.concatenate(parts, axis=1)
+
+
+@lru_cache(maxsize=256)
+def _correlations_of(channels: tuple[str, ...], stream: str) -> tuple[Feature, ...]:
+    """Return the features of :func:`correlation_features`, made once."""
+    features: list[Feature] = []
+    for rows, signal_set in _correlated(channels):
         short = [channels[i].rpartition("_")[0] for i in rows]
         features += [
             Feature(f"{stream}.{a}~{b}.correlation", "1", frozenset({signal_set}))
             for j, a in enumerate(short)
             for b in short[j + 1 :]
         ]
-    return features, np.concatenate(parts, axis=1)
+    return tuple(features)
+
+
+def _correlated(channels: Sequence[str]) -> list[tuple[list[int], str]]:
+    """Return the channels whose pairs are correlated, by signal set."""
+    found = []
+    for quantities, signal_set in ((("gyro", "accel"), "imu"), (("current",), "currents")):
+        rows = [i for quantity in quantities for i in rows_of(channels, quantity)]
+        if len(rows) >= 2:
+            found.append((rows, signal_set))
+    return found
 
 
 def speed_features(

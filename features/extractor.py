@@ -8,6 +8,7 @@ window or on the rate of a stream (bands, lags) is relative to that stream's own
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -189,21 +190,34 @@ class FeatureExtractor(TransformerMixin, BaseEstimator):
         if values.shape[2] >= MIN_SAMPLES:
             columns += spectrum_names(values.shape[2])
             table = np.concatenate([table, channel_spectra(values, rate_hz)], axis=2)
-        features, kept = [], np.zeros(table.shape[1:], dtype=bool)
-        for i, name in enumerate(names):
-            signal_set = signal_set_of(stream, name) or ""
-            driving = signal_set == "estimator" and name.startswith(("speed_", "yaw_"))
-            left_out = LEFT_OUT.get("driving" if driving else signal_set, frozenset())
-            unit = UNIT_SYMBOLS[unit_of(name)]
-            for j, (statistic, statistic_unit) in enumerate(columns):
-                if statistic in left_out and signal_set not in self.level_sets:
-                    continue
-                kept[i, j] = True
-                features.append(
-                    Feature(
-                        f"{stream}.{name.rpartition('_')[0]}.{statistic}",
-                        unit if statistic_unit == "x" else statistic_unit,
-                        frozenset({signal_set}),
-                    )
+        described, kept = _described(stream, tuple(names), tuple(columns), frozenset(self.level_sets))
+        return list(described), table[:, kept]
+
+
+@lru_cache(maxsize=256)
+def _described(
+    stream: str, names: tuple[str, ...], columns: tuple[tuple[str, str], ...], level_sets: frozenset[str]
+) -> tuple[tuple[Feature, ...], Array]:
+    """Return the features of a stream's channels, and which (channels, statistics) they are.
+
+    They are those of every window of a model: made once, as their names cost more than their values.
+    """
+    features, kept = [], np.zeros((len(names), len(columns)), dtype=bool)
+    for i, name in enumerate(names):
+        signal_set = signal_set_of(stream, name) or ""
+        driving = signal_set == "estimator" and name.startswith(("speed_", "yaw_"))
+        left_out = LEFT_OUT.get("driving" if driving else signal_set, frozenset())
+        unit = UNIT_SYMBOLS[unit_of(name)]
+        for j, (statistic, statistic_unit) in enumerate(columns):
+            if statistic in left_out and signal_set not in level_sets:
+                continue
+            kept[i, j] = True
+            features.append(
+                Feature(
+                    f"{stream}.{name.rpartition('_')[0]}.{statistic}",
+                    unit if statistic_unit == "x" else statistic_unit,
+                    frozenset({signal_set}),
                 )
-        return features, table[:, kept]
+            )
+    kept.flags.writeable = False
+    return tuple(features), kept
