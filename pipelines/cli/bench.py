@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from pipelines.bench.settings import BenchSettings
+from pipelines.bench.settings import BenchSettings, SoakSettings
 from pipelines.cli.command import Json, command
 
 app = typer.Typer(help="Measure the live chain and the service.", no_args_is_help=True)
@@ -22,3 +22,19 @@ def live_command(settings: BenchSettings, json_file: Json = None) -> None:
         result = bench_live(settings, progress)
     print_bench(result, output_console())
     write_json(json_file, result)
+
+
+@command(app, "soak")
+def soak_command(settings: SoakSettings, json_file: Json = None) -> None:
+    """Load the service with robots and faults at random; exit code 1 where anything is not accepted."""
+    from pipelines.bench.screen import print_soak
+    from pipelines.bench.soak import soak
+    from pipelines.reporting.json_file import write_json
+    from pipelines.reporting.terminal import output_console, progress_bar
+
+    with progress_bar() as progress:
+        result = soak(settings, progress)
+    print_soak(result, output_console())
+    write_json(json_file, result)
+    if result.problems:
+        raise typer.Exit(1)

@@ -1,0 +1,281 @@
+"""``terrain bench soak``: the service for minutes or hours under robots that misbehave at random."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import math
+import urllib.error
+import urllib.request
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from time import monotonic
+from typing import Any
+
+import msgpack
+import numpy as np
+from websockets.asyncio.client import ClientConnection, connect
+from websockets.exceptions import ConnectionClosed, InvalidHandshake
+
+from pipelines.bench.drive import ROBOT, bench_drive, messages_of, model_folder, sent_channels
+from pipelines.bench.process import ServiceProcess
+from pipelines.bench.results import Soak
+from pipelines.bench.robots import Packed, hello, packed
+from pipelines.bench.settings import SoakSettings
+from pipelines.reporting.progress import Progress, silent
+
+ANSWER_S = 5.0
+MEMORY_GROWTH_MOST = 0.05
+FAULTS = (
+    "garbage",
+    "oversized",
+    "wrong rows",
+    "not finite",
+    "clock set",
+    "gone",
+    "half a message",
+    "silent",
+    "flood",
+    "swap",
+)
+"""What robots and the operator do, each with the same chance."""
+
+FAULTS_PER_MINUTE = 20.0
+
+
+class _Seen:
+    """What all robots saw."""
+
+    def __init__(self) -> None:
+        self.steps = self.not_finite = self.stale = self.wrong_session = self.unanswered = self.crashes = 0
+        self.faults: Counter[str] = Counter()
+        self.errors: Counter[str] = Counter()
+        self.rss_mb: list[float] = []
+        self.problems: list[str] = []
+
+
+class _Robot:
+    """One robot that drives again and again, and meets the faults that are due."""
+
+    def __init__(
+        self, number: int, first: bytes, messages: Sequence[Packed], seen: _Seen, rng: np.random.Generator
+    ) -> None:
+        self.name, self._first, self._messages = f"soak-{number}", first, messages
+        self._seen, self._rng = seen, rng
+        self.due: list[str] = []
+
+    async def drive(self, url: str, end_s: float) -> None:
+        """Drive until a time; a connection that ends is made anew."""
+        while monotonic() < end_s:
+            try:
+                async with connect(f"{url}/robots", compression=None, max_size=None) as socket:
+                    await self._session(socket, end_s)
+            except (OSError, ConnectionClosed, InvalidHandshake, TimeoutError, EOFError):
+                await asyncio.sleep(0.3)
+
+    async def _session(self, socket: ClientConnection, end_s: float) -> None:
+        await socket.send(self._first)
+        while True:
+            answer = msgpack.unpackb(await asyncio.wait_for(socket.recv(), ANSWER_S))
+            if answer["type"] == "welcome":
+                break
+            self._seen.errors[answer.get("code", "?")] += 1
+            await asyncio.sleep(0.5)
+            await socket.send(self._first)
+        begin_s = monotonic()
+        for one in self._messages:
+            if monotonic() > end_s:
+                return
+            await asyncio.sleep(max(begin_s + one.time_s - monotonic(), 0.0))
+            if self.due and await self._fault(socket, self.due.pop()):
+                return
+            await socket.send(one.message)
+            if one.step:
+                await self._answer(socket, one, asked_s=monotonic())
+
+    async def _answer(self, socket: ClientConnection, one: Packed, asked_s: float) -> None:
+        """Wait for the step that was asked for, and judge it."""
+        while True:
+            try:
+                answer = msgpack.unpackb(await asyncio.wait_for(socket.recv(), ANSWER_S))
+            except TimeoutError:
+                self._seen.unanswered += 1
+                return
+            if answer["type"] == "error":
+                self._seen.errors[answer["code"]] += 1
+                if answer["fatal"]:
+                    return
+                continue
+            self._judge(answer, one, asked_s)
+            return
+
+    def _judge(self, answer: dict[str, Any], one: Packed, asked_s: float) -> None:
+        seen, command = self._seen, answer["command"]
+        seen.steps += 1
+        numbers = [*command["wheel_radps"], *command["steer_rad"], *command["twist"]]
+        if not all(isinstance(value, float) and math.isfinite(value) for value in numbers):
+            seen.not_finite += 1
+        if monotonic() - asked_s > command["valid_s"]:
+            seen.stale += 1
+        if set(answer["observation"]["target_slip"]) != {"traction", "braking", "steady"}:
+            seen.wrong_session += 1
+
+    async def _fault(self, socket: ClientConnection, kind: str) -> bool:
+        """Make a fault; say whether the connection has ended by it."""
+        self._seen.faults[kind] += 1
+        rng = self._rng
+        if kind == "garbage":
+            for _ in range(20):
+                await socket.send(rng.bytes(int(rng.integers(1, 200))))
+        elif kind == "oversized":
+            await socket.send(b"\x00" * 300_000)
+        elif kind == "wrong rows":
+            await socket.send(
+                msgpack.packb({"type": "samples", "streams": {"imu": [[1.0], [[1.0, "a"]]], "x": 3}})
+            )
+        elif kind == "not finite":
+            row = [math.nan if rng.random() < 0.5 else math.inf] * 9
+            await socket.send(msgpack.packb({"type": "samples", "streams": {"imu": [[math.nan], [row]]}}))
+        elif kind == "clock set":
+            far_s = float(rng.choice([-1e4, 1e4, 1e9]))
+            await socket.send(msgpack.packb({"type": "samples", "streams": {"imu": [[far_s], [[0.0] * 9]]}}))
+        elif kind == "flood":
+            for _ in range(3000):
+                await socket.send(msgpack.packb({"type": "samples", "streams": {}}))
+        elif kind == "silent":
+            await asyncio.sleep(3.0)
+        elif kind == "half a message":
+            socket.transport.write(b"\x82\xfe\x04\x00half")
+            socket.transport.abort()
+            return True
+        elif kind == "gone":
+            socket.transport.abort()
+            return True
+        return False
+
+
+async def _run(
+    service: ServiceProcess,
+    robots: list[_Robot],
+    uri: str,
+    settings: SoakSettings,
+    seen: _Seen,
+    progress: Progress,
+) -> None:
+    begin_s = monotonic()
+    end_s = begin_s + 60.0 * settings.minutes
+    rng = np.random.default_rng(settings.seed)
+    tasks = [asyncio.create_task(robot.drive(service.socket_url, end_s)) for robot in robots]
+    every_s = min(60.0, 60.0 * settings.minutes / 12)
+    next_memory_s = begin_s + every_s
+    while monotonic() < end_s:
+        await asyncio.sleep(float(rng.exponential(60.0 / FAULTS_PER_MINUTE)))
+        if monotonic() >= next_memory_s:
+            seen.rss_mb.append(service.rss_mb)
+            next_memory_s += every_s
+        kind = str(rng.choice(FAULTS))
+        if kind == "swap":
+            seen.faults[kind] += 1
+            await asyncio.to_thread(_swap, service, uri if rng.random() < 0.5 else "/nowhere", seen)
+        else:
+            robots[int(rng.integers(len(robots)))].due.append(kind)
+        if service.process.poll() is not None:
+            seen.crashes += 1
+            seen.problems.append("the service ended by itself")
+            break
+        progress("soak", int(monotonic() - begin_s), int(60.0 * settings.minutes))
+    await asyncio.wait(tasks, timeout=30.0)
+    for task in tasks:
+        task.cancel()
+    for error in await asyncio.gather(*tasks, return_exceptions=True):
+        if isinstance(error, Exception):
+            seen.problems.append(f"a robot failed: {type(error).__name__}: {error}")
+
+
+def _swap(service: ServiceProcess, uri: str, seen: _Seen) -> None:
+    """Put in another model, or one that does not exist."""
+    body = json.dumps({"uri": uri}).encode()
+    request = urllib.request.Request(
+        f"{service.url}/model", body, {"Content-Type": "application/json"}, method="PUT"
+    )
+    try:
+        with urllib.request.urlopen(request, timeout=30):
+            pass
+    except urllib.error.HTTPError as error:
+        with error:
+            seen.errors[f"HTTP {error.code}"] += 1
+    except OSError as error:
+        seen.problems.append(f"the service does not answer: {error}")
+
+
+def soak(settings: SoakSettings, progress: Progress = silent) -> Soak:
+    """Load a service of its own process with robots and faults, and judge what it did.
+
+    Parameters
+    ----------
+    settings : how long, how many, and the seed of the faults
+    progress : in seconds
+
+    Raises
+    ------
+    TerrainError
+        if the model cannot be loaded, or the service does not start.
+    """
+    run, seen = bench_drive(settings.seed), _Seen()
+    channels, messages = sent_channels(run), packed(list(messages_of(run)))
+    with TemporaryDirectory() as folder:
+        uri = model_folder(settings.model, settings.seed, Path(folder) / "model")
+        states = Path(folder) / "states" if settings.out is None else settings.out
+        service = ServiceProcess(["--model", uri, "--robot", ROBOT, "--state", str(states)])
+        try:
+            robots = [
+                _Robot(
+                    k,
+                    hello(f"soak-{k}", ROBOT, channels),
+                    messages,
+                    seen,
+                    np.random.default_rng([settings.seed, k]),
+                )
+                for k in range(settings.robots)
+            ]
+            asyncio.run(_run(service, robots, uri, settings, seen, progress))
+            seen.rss_mb.append(service.rss_mb)
+        finally:
+            code = service.stop()
+    if code != 0 and not seen.crashes:
+        seen.crashes += 1
+        seen.problems.append(f"the service ended with code {code}")
+    return _judged(settings, seen)
+
+
+def _judged(settings: SoakSettings, seen: _Seen) -> Soak:
+    third = max(len(seen.rss_mb) // 3, 1)
+    growth = float(np.mean(seen.rss_mb[-third:]) / np.mean(seen.rss_mb[:third]) - 1.0)
+    counts = {
+        "commands were not finite": seen.not_finite,
+        "commands were stale": seen.stale,
+        "answers were of another robot": seen.wrong_session,
+        "steps were not answered": seen.unanswered,
+    }
+    problems = [*seen.problems, *(f"{n} {words}" for words, n in counts.items() if n)]
+    if growth > MEMORY_GROWTH_MOST:
+        problems.append(f"memory grew by {growth:.1%}, {MEMORY_GROWTH_MOST:.0%} are accepted")
+    if not seen.steps:
+        problems.append("no step was answered")
+    return Soak(
+        minutes=settings.minutes,
+        seed=settings.seed,
+        steps=seen.steps,
+        not_finite=seen.not_finite,
+        stale=seen.stale,
+        wrong_session=seen.wrong_session,
+        unanswered=seen.unanswered,
+        crashes=seen.crashes,
+        faults=dict(sorted(seen.faults.items())),
+        errors=dict(sorted(seen.errors.items())),
+        rss_mb=tuple(seen.rss_mb),
+        memory_growth=growth,
+        problems=tuple(problems),
+    )
