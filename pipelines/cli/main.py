@@ -8,7 +8,19 @@ from typing import Any
 
 import typer
 
-from pipelines.cli import classify, drive, estimate, explain, faults, quickstart, reproduce, runs, slip
+from pipelines.cli import (
+    classify,
+    drive,
+    estimate,
+    explain,
+    faults,
+    label,
+    quickstart,
+    replay,
+    reproduce,
+    runs,
+    slip,
+)
 from terrain.errors import OutsideRegionWarning, TerrainError
 
 app = typer.Typer(
@@ -21,7 +33,7 @@ app = typer.Typer(
 )
 
 GROUPS = (
-    *(runs.app, estimate.app, classify.app, slip.app, drive.app),
+    *(runs.app, estimate.app, classify.app, slip.app, drive.app, replay.app, label.app),
     *(faults.app, explain.app, reproduce.app, quickstart.app),
 )
 """Files of commands, in the order of help."""

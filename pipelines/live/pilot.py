@@ -175,6 +175,11 @@ class LivePilot:
         return self._now.estimate
 
     @property
+    def belief(self) -> TerrainBelief:
+        """Terrain that is believed."""
+        return self._now.belief
+
+    @property
     def health(self) -> dict[str, str]:
         """Health of each sensor at the last step, by name, as those of ``Health`` in small letters."""
         return {name: Health(status).name.lower() for name, status in zip(SENSORS, self._health, strict=True)}
@@ -241,7 +246,7 @@ class LivePilot:
         step_s = step_or_period(dt_s)
         terrain = getattr(sample, "terrain", "")
         desired = finite_twist(getattr(sample, "twist", None))
-        if self._estimator is not None:
+        if self._estimator is not None and self._settings.follows:
             self._compare(time_s, step_s, readings)
         self._estimate(Sample(time_s, desired, readings, terrain if isinstance(terrain, str) else ""))
         sensor, health = self._judge()
