@@ -69,7 +69,7 @@ class SessionRecorder:
     Parameters
     ----------
     folder : of the run folders; made when missing
-    run_id : of the run; gets a number where a run or a recording of the name is there
+    run_id : of the run; gets a number behind it where a run of the name is there at the end
     robot : name
     channels : of each stream that is recorded, in the order of the columns of its readings
     wheels : names of the wheels that are commanded
@@ -128,7 +128,7 @@ class SessionRecorder:
 
     @property
     def run_id(self) -> str:
-        """Name of the run as far as it is known."""
+        """Name of the run; as long as its folder is not there, the one that was asked for."""
         return str(self._head["run_id"]) if self.folder is None else self.folder.name
 
     @property
@@ -252,8 +252,7 @@ class SessionRecorder:
         return False
 
     def _flush(self) -> None:
-        if self._journal is None:
-            self._journal = self._begin()
+        journal = self._journal or self._begin()
         with self._lock:
             waiting, self._waiting = self._waiting, []
             outputs, self._outputs = self._outputs, []
@@ -272,29 +271,24 @@ class SessionRecorder:
                 entries.append(window_entry(output))
             except (TypeError, ValueError, AttributeError):
                 dropped[BAD_WINDOW] += 1
-        self._journal.append([Record({"windows": entries, "dropped": dropped}, tuple(blocks))])
+        journal.append([Record({"windows": entries, "dropped": dropped}, tuple(blocks))])
 
     def _begin(self) -> Journal:
-        """Take a name that is free, and write the first record."""
+        """Make a journal that no other recording has, and write its first record."""
         self._place.mkdir(parents=True, exist_ok=True)
-        asked, number_ = str(self._head["run_id"]), 1
-        while True:
-            name = asked if number_ == 1 else f"{asked}_{number_}"
-            number_ += 1
-            if (self._place / name).exists():
-                continue
+        name, count = str(self._head["run_id"]), 1
+        while self._journal is None:
             try:
-                journal = Journal(journal_path(self._place, name))
+                self._journal = Journal(journal_path(self._place, name))
             except FileExistsError:
-                continue
-            if not (self._place / name).exists():  # it may have been finished just now
-                break
-            journal.path.unlink()
-            journal.close()
-        self._head["run_id"] = name
-        self._journal = journal  # closed at the end, whatever happens
-        journal.append([Record(self._head)])
-        return journal
+                count += 1
+                name = f"{self._head['run_id']}_{count}"
+        try:
+            self._journal.append([Record(self._head)])
+        except OSError:
+            self._journal.path.unlink(missing_ok=True)  # nothing is in it
+            raise
+        return self._journal
 
     def _limit(self) -> str:
         if self._journal is not None and self._journal.n_bytes > self._limits.max_bytes:

@@ -92,18 +92,22 @@ def test_what_was_recorded_is_a_strict_run_folder_with_all_samples(writer, tmp_p
     assert [path.name for path in tmp_path.iterdir()] == ["field"]
 
 
-def test_the_last_samples_before_the_end_are_in_the_run(writer, tmp_path):
-    """The thread writes at any moment: none of the samples before ``close`` is after its last writing."""
-    recorders_ = []
-    for number in range(30):
-        recorder = SessionRecorder(tmp_path, f"run_{number}", "husky", CHANNELS, writer=writer)
-        for k in range(3 + 40 * number):
-            recorder.readings(sample(k / 50))
-        recorder.close()
-        recorders_.append(recorder)
-    until(lambda: all(one.settled for one in recorders_))
-    lengths = [len(read_run(one.folder).streams["wheels"]) for one in recorders_]
-    assert lengths == [3 + 40 * number for number in range(30)]
+def test_samples_that_come_while_others_are_written_are_in_the_run(writer, tmp_path, monkeypatch):
+    """The session ends while the thread writes: what came since is written before the run is made."""
+    recorder = SessionRecorder(tmp_path, "field", "husky", CHANNELS, writer=writer)
+    append, ended = journals.Journal.append, []
+
+    def end_meanwhile(journal, records):
+        append(journal, records)
+        if records[0].blocks and not ended:
+            recorder.readings(sample(7.0))
+            ended.append(recorder.close())
+
+    monkeypatch.setattr(journals.Journal, "append", end_meanwhile)
+    recorded(recorder)
+    until(lambda: recorder.settled)
+    assert ended == [None]
+    assert read_run(recorder.folder).streams["wheels"].time_s[-1] == 7.0
 
 
 def test_commands_are_those_of_simulated_runs_and_replay_desires_the_same_motion(writer, tmp_path):
@@ -260,6 +264,18 @@ def test_a_full_disk_stops_the_recording_and_keeps_what_was_written(writer, tmp_
     assert recover_recordings(tmp_path) == []
 
 
+def test_a_disk_that_is_full_from_the_start_leaves_nothing(writer, tmp_path, monkeypatch):
+    def no_room(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(journals.os, "write", no_room)
+    recorder = SessionRecorder(tmp_path, "field", "husky", CHANNELS, writer=writer)
+    recorded(recorder)
+    until(lambda: recorder.settled)
+    assert (recorder.status, recorder.folder) == ("stopped: no space left on the disk", None)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_folder_that_is_removed_stops_the_recording_and_no_other(writer, tmp_path):
     one = SessionRecorder(tmp_path / "one", "field", "husky", CHANNELS, writer=writer)
     other = SessionRecorder(tmp_path / "other", "field", "husky", CHANNELS, writer=writer)
@@ -372,6 +388,23 @@ def test_a_torn_journal_gives_what_is_whole_and_never_raises(writer, tmp_path, c
         np.testing.assert_allclose(
             stamps, np.concatenate([k / 5 + np.arange(10) / 50 for k in range(4)])[: len(stamps)]
         )
+
+
+def test_nothing_is_taken_from_a_record_that_was_spoilt(writer, tmp_path):
+    recorder = SessionRecorder(tmp_path, "field", "husky", CHANNELS, writer=writer)
+    path = tmp_path / ".field.recording"
+    sizes = []
+    for k in range(3):
+        recorder.readings(sample(k / 5, n=10))
+        until(lambda least=(k + 1) * 400: path.exists() and path.stat().st_size > least)
+        sizes.append(path.stat().st_size)
+    content = bytearray(path.read_bytes())
+    content[sizes[1] - 40] ^= 1  # the last samples of the second of three
+    recorder.close(10.0)
+    shutil.rmtree(tmp_path / "field")
+    path.write_bytes(content)
+    (folder,) = recover_recordings(tmp_path)
+    np.testing.assert_allclose(read_run(folder).streams["imu"].time_s, np.arange(10) / 50)
 
 
 def test_foreign_files_stay_and_a_folder_that_is_not_there_is_empty(tmp_path):
