@@ -12,12 +12,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipelines.recording.journal import SUFFIX, Block, lock, read_head, read_journal
+from pipelines.recording.journal import SUFFIX, lock, read_head, read_journal
 from pipelines.recording.windows_file import WINDOWS_FILE, windows_text
 from terrain.errors import LogError, TerrainError
 from terrain.logs.samples import DEAD_CHANNEL, checked_stream
 from terrain.logs.write import run_folder, write_run
-from terrain.records import RunLog, Stream
+from terrain.records import Array, RunLog, Stream
 
 SHORT_STREAM = "streams with fewer than 2 samples"
 DEAD_STREAM = "streams with nothing finite"
@@ -55,17 +55,19 @@ def run_of_journal(path: Path, note: str = "") -> RecordedRun:
         if it cannot be read.
     """
     head = read_head(path)
-    blocks: dict[str, list[Block]] = {}
     windows: list[Mapping[str, Any]] = []
     dropped: Counter[str] = Counter()
+    n_rows: Counter[str] = Counter()
+    channels: dict[str, tuple[str, ...]] = {}
     for record in read_journal(path):
         dropped.update(record.line.get("dropped", {}))
         windows += record.line.get("windows", [])
         for block in record.blocks:
-            blocks.setdefault(block.stream, []).append(block)
+            channels.setdefault(block.stream, block.channels)
+            n_rows[block.stream] += len(block.rows)
     streams = {}
-    for name in list(blocks):
-        stream = _stream(name, blocks.pop(name), dropped)
+    for name, each in channels.items():  # one after the other: a recording is large
+        stream = _stream(name, each, _rows(path, name, n_rows[name]), dropped)
         if stream is not None:
             streams[name] = stream
     streams = _overlapping(streams, dropped)
@@ -133,16 +135,26 @@ def _just_begun(path: Path) -> bool:
     return not status.st_size and time.time() - status.st_mtime < JUST_BEGUN_S
 
 
-def _stream(name: str, blocks: list[Block], dropped: Counter[str]) -> Stream | None:
+def _rows(path: Path, stream: str, n_rows: int) -> Array:
+    """Return the rows (n, 1 + c) of a stream in the order in which they came."""
+    rows, end = np.empty((n_rows, 0)), 0
+    for record in read_journal(path):
+        for block in record.blocks:
+            if block.stream == stream:
+                if not end:
+                    rows = np.empty((n_rows, block.rows.shape[1]))
+                rows[end : end + len(block.rows)] = block.rows
+                end += len(block.rows)
+    return rows
+
+
+def _stream(name: str, channels: tuple[str, ...], rows: Array, dropped: Counter[str]) -> Stream | None:
     """Return the samples of a stream in order of time, without channels that never had a value."""
-    channels = blocks[0].channels
-    rows = np.concatenate([block.rows for block in blocks if block.channels == channels])
-    time_s, values = rows[:, 0], rows[:, 1:]
     try:
         stream = checked_stream(
             name,
-            time_s,
-            values,
+            rows[:, 0],
+            rows[:, 1:],
             channels,
             row_of=lambda index: index + 1,
             repairs=dropped,

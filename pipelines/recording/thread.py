@@ -8,6 +8,8 @@ from pathlib import Path
 from time import monotonic
 from typing import Protocol
 
+import numpy as np
+
 FLUSH_S = 2.0
 """Time between two writings of a recording: what a killed process loses."""
 
@@ -39,6 +41,10 @@ class RecordingThread:
     """
 
     def __init__(self, flush_s: float = FLUSH_S) -> None:
+        import pyarrow.parquet
+
+        pyarrow.table({"now": np.zeros(1)})  # imports what it needs; later that would hold up the sessions
+
         self._flush_s = flush_s
         self._changed = threading.Condition()
         self._recordings: list[Recording] = []
