@@ -16,7 +16,9 @@ from pipelines.cli import (
     estimate,
     explain,
     faults,
+    label,
     quickstart,
+    replay,
     reproduce,
     runs,
     serve,
@@ -35,7 +37,8 @@ app = typer.Typer(
 )
 
 GROUPS = (
-    *(runs.app, estimate.app, classify.app, slip.app, drive.app, serve.app, can.app),
+    *(runs.app, estimate.app, classify.app, slip.app, drive.app),
+    *(replay.app, serve.app, can.app, label.app),
     *(faults.app, explain.app, reproduce.app, quickstart.app),
 )
 """Files of commands, in the order of help."""

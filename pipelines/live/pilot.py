@@ -244,7 +244,7 @@ class LivePilot:
         step_s = step_or_period(dt_s)
         terrain = getattr(sample, "terrain", "")
         desired = finite_twist(getattr(sample, "twist", None))
-        if self._estimator is not None:
+        if self._estimator is not None and self._settings.follows:
             self._compare(time_s, step_s, readings)
         self._estimate(Sample(time_s, desired, readings, terrain if isinstance(terrain, str) else ""))
         sensor, health = self._judge()

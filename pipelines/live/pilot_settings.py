@@ -46,6 +46,8 @@ class PilotSettings:
     delay_s : from a sample to the wheel; the loops have to be stable with it
     track : with path tracking; not with ``plain`` and ``ramp``, which estimate no pose
     tracking : its settings
+    follows : wheels and steering are driven by this pilot's commands, and are compared with them; not where a
+        log is replayed
     """
 
     controller: str = "traction"
@@ -57,6 +59,7 @@ class PilotSettings:
     delay_s: float = 0.05
     track: bool = False
     tracking: TrackSettings = TRACKING
+    follows: bool = True
 
 
 DEFAULT_SETTINGS = PilotSettings()

@@ -20,6 +20,7 @@ MAX_LISTED = 20
 MAX_SHOWN = 120
 """Characters of a value that a message shows: files can hold values of megabytes."""
 
+_FOLDER_NAME = re.compile(r"[^\W_][\w ._+-]*")
 _SEPARATOR = re.compile(r"[/\\]")
 # C0 and C1, separators of lines, marks that turn the direction of writing, and halves of UTF-16 pairs
 _CONTROL = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u2069\ufeff\ud800-\udfff]")
@@ -118,3 +119,14 @@ def shown(value: Any) -> str:
     """
     text = repr(value)
     return text if len(text) <= MAX_SHOWN else f"{text[:MAX_SHOWN]}..."
+
+
+def plain_name(name: str) -> bool:
+    """Return whether a text can name a folder or a file on any system.
+
+    Examples
+    --------
+    >>> plain_name("SNOW_01"), plain_name("../SNOW"), plain_name("trawa:1"), plain_name("")
+    (True, False, False, False)
+    """
+    return _FOLDER_NAME.fullmatch(name) is not None and name_fault(name) is None

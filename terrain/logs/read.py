@@ -31,6 +31,7 @@ beside it too.  ``dropped`` (may be left out) counts what a repairing reader too
 Run id, robot, session, terrains, streams, channels and files are plain names, in letters of any language: no
 path separator, no control character, no dot in front, 128 characters at most.  A robot is one of the package,
 or one that the user gives; a log names no file.  The folder may be a link, its files may not lead out of it.
+Other files in the folder are passed over.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -59,14 +60,18 @@ MAX_STREAMS = 64
 
 
 def find_runs(folder: Path) -> list[Callable[..., RunLog]]:
-    """Return one reader per run folder: ``folder`` itself, or those in it; call it with ``repair=``.
+    """Return one reader per run folder of :func:`run_folders`; call it with ``repair=``."""
+    return [partial(read_run, path) for path in run_folders(folder)]
+
+
+def run_folders(folder: Path) -> list[Path]:
+    """Return the run folders: ``folder`` itself, or those in it, sorted.
 
     Hidden folders (unfinished writes) are passed over.
     """
     if (folder / "run.json").exists():
-        return [partial(read_run, folder)]
-    found = sorted(path.parent for path in folder.glob("*/run.json") if not path.parent.name.startswith("."))
-    return [partial(read_run, path) for path in found]
+        return [folder]
+    return sorted(path.parent for path in folder.glob("*/run.json") if not path.parent.name.startswith("."))
 
 
 def read_run(folder: str | Path, *, repair: bool = False) -> RunLog:
@@ -111,7 +116,7 @@ def read_run(folder: str | Path, *, repair: bool = False) -> RunLog:
             channels,
             row_of=lambda index: index + 1,
             repairs=dropped if repair else None,
-            unknown_is_a_value=name in ("slip", "truth"),
+            unknown_is_a_value=name in ("slip", "truth", "control"),
         )
     if not streams:
         raise LogError(f"{place}: the run has no stream")
@@ -129,6 +134,36 @@ def read_run(folder: str | Path, *, repair: bool = False) -> RunLog:
             session=_entry(place, {"session": ""} | head, "session", str),
             filter=_entry(place, {"filter": ""} | head, "filter", str),
         ),
+    )
+
+
+class RunHead(NamedTuple):
+    """What ``run.json`` states of a run.
+
+    Parameters
+    ----------
+    run_id : of the run
+    labels : terrain intervals
+    document : all of the file
+    """
+
+    run_id: str
+    labels: tuple[Label, ...]
+    document: dict[str, Any]
+
+
+def read_run_head(folder: str | Path) -> RunHead:
+    """Return what ``run.json`` states, without reading the streams.
+
+    Raises
+    ------
+    LogError
+        if ``run.json`` is not accepted.
+    """
+    path = Path(folder) / "run.json"
+    head, place = _read_head(path), short_name(path)
+    return RunHead(
+        _entry(place, head, "run_id", str), _labels(place, _entry(place, head, "labels", list)), head
     )
 
 

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import json
-import re
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 
 from terrain.errors import LogError
 from terrain.files.atomic import atomic_folder
-from terrain.files.names import name_fault, shown
+from terrain.files.names import plain_name, shown
 from terrain.logs.log_files import checked_names
 from terrain.logs.schema import SCHEMA_VERSION, unit_of
 from terrain.records import RunLog, Stream
-
-_SAFE_NAME = re.compile(r"[^\W_][\w ._+-]*")
 
 
 def run_folder(run_id: str, folder: str | Path) -> Path:
@@ -30,12 +29,18 @@ def run_folder(run_id: str, folder: str | Path) -> Path:
     Traceback (most recent call last):
     terrain.errors.LogError: run id '../SNOW' cannot name a folder: use letters, digits and ' ._+-'
     """
-    if not _SAFE_NAME.fullmatch(run_id) or name_fault(run_id):
+    if not plain_name(run_id):
         raise LogError(f"run id {shown(run_id)} cannot name a folder: use letters, digits and ' ._+-'")
     return Path(folder) / run_id
 
 
-def write_run(run: RunLog, folder: str | Path, *, replace: bool = False) -> Path:
+def write_run(
+    run: RunLog,
+    folder: str | Path,
+    *,
+    replace: bool = False,
+    beside: Mapping[str, str] = MappingProxyType({}),
+) -> Path:
     """Write one run as ``<folder>/<run_id>/`` and return that folder.
 
     The run folder appears whole or not at all, and the same run gives the same bytes.
@@ -45,6 +50,7 @@ def write_run(run: RunLog, folder: str | Path, *, replace: bool = False) -> Path
     run : run log with at least one stream
     folder : folder of the data set; made when missing
     replace : replace a run folder of that name; refused otherwise
+    beside : text of further files of the folder, by name; readers pass them over
 
     Raises
     ------
@@ -78,6 +84,8 @@ def write_run(run: RunLog, folder: str | Path, *, replace: bool = False) -> Path
     with atomic_folder(target) as unfinished:
         for name, stream in run.streams.items():
             _write_parquet(stream, unfinished / _file_name(name))
+        for file, text in beside.items():
+            (unfinished / file).write_text(text, encoding="utf-8")
         (unfinished / "run.json").write_text(
             json.dumps(head, indent=2, allow_nan=False) + "\n", encoding="utf-8"
         )
@@ -85,7 +93,7 @@ def write_run(run: RunLog, folder: str | Path, *, replace: bool = False) -> Path
 
 
 def _file_name(stream: str) -> str:
-    if not _SAFE_NAME.fullmatch(stream) or name_fault(stream):
+    if not plain_name(stream):
         raise LogError(f"stream {shown(stream)} cannot name a file: use letters, digits and ' ._+-'")
     return f"{stream}.parquet"
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 COMMANDS = (
     *("import", "inspect", "simulate", "calibrate", "estimate", "crossval", "train", "predict"),
     *("learn-slip", "drive", "faults", "can", "explain", "explain-trials", "quickstart", "reproduce"),
+    *("replay", "label"),
 )
 
 
@@ -246,6 +247,30 @@ CASES: tuple[Case, ...] = (
             "drive --scenario brake --terrain wet_floor --grade -5 --ramp 0.4 --seeds 2 "
             "--controllers plain,ramp,oracle --seed 7 --jobs 1",
         ),
+    ),
+    Case(
+        "replay",
+        steps(
+            "simulate --robot agrimaro --terrain grass --scenario survey --duration 12 --out raw",
+            "replay raw",
+            "replay raw --speed 40 --rate 20",
+            refused("replay raw --speed 0"),
+            refused("replay nowhere"),
+        ),
+    ),
+    Case(
+        "label",
+        steps(
+            "import borealtc --out raw",
+            "label raw",
+            "label raw --run ICE_01 --from 2 --to 6 --terrain SLUSH",
+            "label raw --run ICE_02 --all --remove",
+            "label raw/ICE_03 --run ICE_03 --from 4 --to 5 --remove",
+            "inspect raw",
+            refused("label raw --run ICE_9 --all --terrain SLUSH"),
+            refused("label raw --run ICE_01 --from 2 --to 600 --terrain SLUSH"),
+        ),
+        foreign_logs,
     ),
     Case(
         "explain_husky",

@@ -62,6 +62,7 @@ ALIASES_OF_VALUES: dict[str, str] = {
 IGNORED: dict[str, str] = {
     "seconds": "time that computing took",
     "elapsed_s": "time that computing took",
+    "times_real_time": "how fast computing was",
     "created": "time of writing",
     "commit": "state of the code",
     "data_digest": "the last bit of one sample changes it; the samples are compared themselves",

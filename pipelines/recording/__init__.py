@@ -1,0 +1,1 @@
+"""Recording of live sessions as run folders: what was measured, commanded and classified."""

@@ -1,0 +1,1 @@
+"""A log replayed through the live chain."""

@@ -1,0 +1,189 @@
+"""``terrain replay``: runs sent through the live chain, at their own speed or as fast as it goes."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from time import perf_counter, sleep
+from typing import Protocol
+
+import numpy as np
+
+from features.windows import label_windows
+from pipelines.live.classifying import WindowOutput
+from pipelines.models.model_files import TerrainModel
+from pipelines.replay.chains import Chain, Replayed, chain_of
+from pipelines.replay.results import ObservedWindow, Replay, ReplayedRun, ReplayMoment
+from pipelines.replay.settings import ReplaySettings
+from pipelines.runs.settings import InspectSettings, load
+from terrain.control.slip_table import SlipTable, load_slip_table
+from terrain.logs.replay import replay
+from terrain.records import RunLog
+from terrain.robots import Robot, load_robot
+
+LONGEST_SLEEP_S = 0.2
+"""The screen moves at least so often."""
+
+
+class View(Protocol):
+    """Watches a replay."""
+
+    def moment(self, moment: ReplayMoment) -> None:
+        """See where the replay is; called at each step."""
+        ...
+
+    def observed(self, run_id: str, window: ObservedWindow) -> None:
+        """See a window."""
+        ...
+
+
+class NoView:
+    """Watches nothing."""
+
+    def moment(self, moment: ReplayMoment) -> None:
+        """Do nothing."""
+
+    def observed(self, run_id: str, window: ObservedWindow) -> None:
+        """Do nothing."""
+
+
+def replay_logs(source: InspectSettings, settings: ReplaySettings, view: View | None = None) -> Replay:
+    """Replay all runs of a log, one after the other; Ctrl-C ends it with what was found until then.
+
+    Raises
+    ------
+    ConfigError, DataError, LogError, ModelError
+        if the log, the model or the table cannot be read, or do not fit each other.
+    """
+    table = load_slip_table(settings.table)
+    model = _model(settings.model)
+    runs, skipped = load(source)
+    robot = None if source.robot is None else load_robot(source.robot)
+    replayed: list[ReplayedRun] = []
+    for run in runs:
+        replayed.append(replay_run(run, model, table, settings, robot=robot, view=view))
+        if replayed[-1].interrupted:
+            break
+    duration_s, elapsed_s = (
+        sum(getattr(one, name) for one in replayed) for name in ("duration_s", "elapsed_s")
+    )
+    n_judged = sum(one.n_judged for one in replayed)
+    n_right = sum(one.n_judged * (one.accuracy or 0.0) for one in replayed)
+    return Replay(
+        settings.model,
+        table.name,
+        tuple(replayed),
+        sum(one.n_windows for one in replayed),
+        n_right / n_judged if n_judged else None,
+        n_judged,
+        duration_s,
+        elapsed_s,
+        duration_s / elapsed_s if elapsed_s else math.nan,
+        any(one.interrupted for one in replayed),
+        tuple(skipped),
+    )
+
+
+def replay_run(
+    run: RunLog,
+    model: TerrainModel | None,
+    table: SlipTable,
+    settings: ReplaySettings,
+    *,
+    robot: Robot | None = None,
+    view: View | None = None,
+) -> ReplayedRun:
+    """Send one run through the live chain of its robot.
+
+    Raises
+    ------
+    ConfigError, DataError
+        as :func:`pipelines.replay.chains.chain_of`.
+    """
+    chain, fitting = chain_of(run, model, table, robot)
+    steps = _Steps(fitting, chain, settings, view or NoView())
+    begin_s = perf_counter()
+    interrupted = False
+    try:
+        steps.run()
+    except KeyboardInterrupt:
+        interrupted = True
+    elapsed_s = perf_counter() - begin_s
+    classes = () if model is None else model.info.classes
+    given = [window for window in steps.windows if not window.refused]
+    judged = [window for window in given if window.label in classes]
+    counts = Counter(window.terrain for window in given)
+    return ReplayedRun(
+        run.run_id,
+        run.robot,
+        chain.name,
+        steps.passed_s,
+        elapsed_s,
+        steps.passed_s / elapsed_s if elapsed_s else math.nan,
+        steps.believed.total(),
+        len(steps.windows),
+        len(steps.windows) - len(given),
+        {terrain: n / len(given) for terrain, n in counts.most_common()},
+        {terrain: n / steps.believed.total() for terrain, n in steps.believed.most_common()},
+        float(np.mean([window.terrain == window.label for window in judged])) if judged else None,
+        len(judged),
+        dict(chain.dropped),
+        interrupted,
+        tuple(steps.windows),
+    )
+
+
+class _Steps:
+    """The steps of one replay, and what they have given so far."""
+
+    def __init__(self, run: RunLog, chain: Chain, settings: ReplaySettings, view: View) -> None:
+        self._run, self._chain, self._settings, self._view = run, chain, settings, view
+        self.windows: list[ObservedWindow] = []
+        self.believed: Counter[str] = Counter()
+        self.passed_s = 0.0
+
+    def run(self) -> None:
+        """Take all steps, each when it is due."""
+        run, view, chain = self._run, self._view, self._chain
+        speed, wall_s, start_s = self._settings.speed_ratio, perf_counter(), math.nan
+        end_s = max(stream.time_s[-1] for stream in run.streams.values())
+        for sample in replay(run, self._settings.rate_hz):
+            if math.isnan(start_s):
+                start_s = sample.time_s
+            self.passed_s = sample.time_s - start_s
+            if speed < math.inf:
+                _wait(wall_s + self.passed_s / speed)
+            done = chain.step(sample)
+            self.believed[done.believed] += 1
+            for output in done.windows:
+                self.windows.append(self._observed(output, done))
+                view.observed(run.run_id, self.windows[-1])
+            view.moment(
+                ReplayMoment(run.run_id, self.passed_s, end_s - start_s, done.believed, done.target_ratio)
+            )
+
+    def _observed(self, output: WindowOutput, done: Replayed) -> ObservedWindow:
+        label = label_windows(self._run, np.array([output.start_s]), output.end_s - output.start_s)[0]
+        return ObservedWindow(
+            output.start_s,
+            output.end_s,
+            output.terrain,
+            output.probability,
+            output.refused,
+            done.believed,
+            done.target_ratio,
+            label or None,
+        )
+
+
+def _model(uri: str | None) -> TerrainModel | None:
+    if uri is None:
+        return None
+    from pipelines.models.tracking import load_model
+
+    return load_model(uri)
+
+
+def _wait(until_s: float) -> None:
+    while (rest_s := until_s - perf_counter()) > 0.0:
+        sleep(min(rest_s, LONGEST_SLEEP_S))
