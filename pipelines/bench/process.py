@@ -32,8 +32,8 @@ class ServiceProcess:
         assert self.process.stdout is not None
         line = self.process.stdout.readline()
         if " at http" not in line:
-            _, said = self.process.communicate(timeout=30)
-            lines = said.strip().splitlines()
+            _, text = self.process.communicate(timeout=30)
+            lines = text.strip().splitlines()
             raise TerrainError(f"the service did not start: {lines[-1] if lines else 'it says nothing'}")
         self.url = line.rsplit(" at ", 1)[1].strip()
 

@@ -49,8 +49,8 @@ def packed(messages: Sequence[dict[str, Any]]) -> list[Packed]:
 def hello(session: str, robot: str, channels: dict[str, list[str]]) -> bytes:
     """Return the first message of a robot that asks for each of its steps."""
     content = {"type": "hello", "session": session, "robot": robot, "streams": channels}
-    said: bytes = msgpack.packb({**content, "control": True, "rate_hz": 0.0})
-    return said
+    message: bytes = msgpack.packb({**content, "control": True, "rate_hz": 0.0})
+    return message
 
 
 async def drive(url: str, first: bytes, messages: Sequence[Packed], delay_s: float = 0.0) -> Driven:

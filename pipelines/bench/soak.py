@@ -105,7 +105,7 @@ class _Robot:
                 return
             if answer["type"] == "error":
                 self._seen.errors[answer["code"]] += 1
-                if answer["fatal"]:
+                if answer["fatal"] or answer["code"] == "too-fast":
                     return
                 continue
             self._judge(answer, one, asked_s)

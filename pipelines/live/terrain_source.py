@@ -92,6 +92,7 @@ class Classifier:
     Attributes
     ----------
     failed : number of windows that the model refused, by error message
+    outputs : those of the last sample, in most cases none
 
     Raises
     ------
@@ -104,7 +105,7 @@ class Classifier:
 
     def __init__(self, model: TerrainModel, robot: Robot, classifying: Classifying | None = None) -> None:
         self.model, self._robot = model, correct_live(robot)[0]
-        self.last: WindowOutput | None = None
+        self.outputs: list[WindowOutput] = []
         self._feed = self.feed_of(model)
         self._classifying = AtOnce() if classifying is None else classifying
         self.failed: Counter[str] = Counter()
@@ -145,8 +146,8 @@ class Classifier:
         for window in self._feed.push(sample.readings, estimates):
             self._classifying.submit(self.model, window)
         found: list[TerrainEstimate] = []
-        for output in self._classifying.finished():
-            self.last = output
+        self.outputs = self._classifying.finished()
+        for output in self.outputs:
             if output.refused:
                 self.failed[output.refused] += 1
             else:

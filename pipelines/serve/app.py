@@ -155,6 +155,7 @@ def _add_state(app: FastAPI, hub: Hub) -> None:
                 "robot": opened.chain.request.robot,
                 "control": opened.chain.request.control,
                 "terrain": opened.chain.belief.terrain or None,
+                "recording": opened.chain.recording,
                 "dropped": opened.chain.dropped,
             }
             for opened in hub.sessions.values()

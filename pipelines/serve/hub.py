@@ -6,6 +6,7 @@ import asyncio
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from pathlib import Path
 from time import monotonic
 from typing import NamedTuple
@@ -13,13 +14,16 @@ from typing import NamedTuple
 from pipelines.live.classifying import ClassifierThread
 from pipelines.live.state import LiveState, Restorable, load_state, save_state
 from pipelines.models.model_files import TerrainModel
+from pipelines.recording.finishing import recover_recordings
+from pipelines.recording.recorder import SessionRecorder
+from pipelines.recording.thread import RecordingThread
 from pipelines.serve.messages import Hello
 from pipelines.serve.metrics import Metrics
 from pipelines.serve.wire import WireError
 from pipelines.sessions.records import Served, StepOutput
 from pipelines.sessions.session import RobotSession
 from terrain.control.slip_table import SlipTable
-from terrain.errors import ConfigError, DataError, TerrainError
+from terrain.errors import ConfigError, DataError, LogError, TerrainError
 from terrain.robots import Robot, packaged_robot
 
 REMEMBERED = 1000
@@ -73,6 +77,7 @@ class Hub:
     given : a robot's description that the package does not have, or has otherwise
     limits : of sessions and messages
     states : folder of the states that outlive the service; None for memory only
+    recordings : folder of the run folders of sessions that ask to be recorded; None for no recording
     """
 
     def __init__(
@@ -81,6 +86,7 @@ class Hub:
         given: Robot | None = None,
         limits: Limits = LIMITS,
         states: Path | None = None,
+        recordings: Path | None = None,
     ) -> None:
         self.served, self.limits, self.metrics = served, limits, Metrics()
         self.metrics.served.set(served.number)
@@ -90,6 +96,11 @@ class Hub:
         self.trouble: dict[str, str] = {}
         self._given, self._folder = given, states
         self._thread = ClassifierThread()
+        self._recordings = recordings
+        self._writer: RecordingThread | None = None
+        if recordings is not None:
+            self.recovered = recover_recordings(recordings)
+            self._writer = RecordingThread()
         self._left: OrderedDict[str, LiveState] = OrderedDict()
         self._opening: set[str] = set()
 
@@ -128,7 +139,7 @@ class Hub:
         self._opening.add(hello.session)
         try:
             chain, restored = await asyncio.to_thread(self._begin, hello)
-        except (ConfigError, DataError) as error:
+        except (ConfigError, DataError, LogError) as error:
             raise WireError("refused", str(error)) from None
         finally:
             self._opening.discard(hello.session)
@@ -140,7 +151,15 @@ class Hub:
         return opened
 
     def _begin(self, hello: Hello) -> tuple[RobotSession, Restorable | None]:
-        chain = RobotSession(hello.request, self.served, self.robot(hello.robot), self._thread.robot())
+        robot = self.robot(hello.robot)
+        chain = RobotSession(hello.request, self.served, robot, self._thread.robot())
+        if hello.record and self._recordings is not None and self._writer is not None:
+            wheels = robot.wheels if robot is not None and hello.control else ()
+            name = f"{hello.session}_{datetime.now(UTC):%Y%m%d_%H%M%S}"
+            channels = hello.request.channels
+            chain.record(
+                SessionRecorder(self._recordings, name, hello.robot, channels, wheels, writer=self._writer)
+            )
         state = self._left.get(hello.session)
         if state is None and self._folder is not None:
             try:
@@ -154,6 +173,7 @@ class Hub:
         if self.sessions.get(opened.name) is not opened:
             return
         del self.sessions[opened.name]
+        opened.chain.end()
         self.metrics.sessions.set(len(self.sessions))
         self._left[opened.name] = opened.chain.state()
         self._left.move_to_end(opened.name)
@@ -196,5 +216,7 @@ class Hub:
                 self.trouble["states"] = str(error)
 
     def stop(self) -> None:
-        """End the thread that classifies."""
+        """End the threads; recordings are written."""
         self._thread.stop()
+        if self._writer is not None:
+            self._writer.stop()

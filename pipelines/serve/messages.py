@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, StringConstraints, Validation
 from pipelines.live.state import Restorable
 from pipelines.serve.wire import WireError, plain
 from pipelines.sessions.records import Observation, Served, SessionRequest, StepOutput
-from pipelines.sessions.session import COMMAND_VALID_S
+from pipelines.sessions.session import COMMAND_VALID_S, RobotSession
 from terrain.control.traction import TractionStatus
 
 PROTOCOL: Literal[1] = 1
@@ -79,7 +79,7 @@ def read_hello(content: dict[str, Any]) -> Hello:
 
 
 def welcome(
-    hello: Hello, served: Served, restored: Restorable | None, limits: dict[str, float]
+    hello: Hello, chain: RobotSession, restored: Restorable | None, limits: dict[str, float]
 ) -> dict[str, Any]:
     """Return the answer to a hello."""
     content: dict[str, Any] = plain(
@@ -90,7 +90,8 @@ def welcome(
             "rate_hz": hello.rate_hz,
             "control": hello.control,
             "command_valid_s": COMMAND_VALID_S,
-            "served": served_content(served),
+            "served": served_content(chain.served),
+            "recording": chain.recording,
             "restored": None
             if restored is None
             else {

@@ -77,7 +77,8 @@ def prepare(settings: ServeSettings) -> Prepared:
         served = Served(1, model, settings.model, table)
         if robot is not None:
             check_fit(model, robot)
-        hub = Hub(served, robot, Limits(sessions=settings.max_sessions), settings.state)
+        limits = Limits(sessions=settings.max_sessions)
+        hub = Hub(served, robot, limits, settings.state, settings.record)
         warm_up(model, robot)
     except BaseException:
         listening.close()

@@ -95,6 +95,7 @@ def shown(hub: Hub, session: str) -> dict[str, Any]:
             "robot": opened.chain.request.robot,
             "control": opened.chain.request.control,
             "wheels": [] if robot is None else list(robot.wheels),
+            "recording": opened.chain.recording,
             "dropped": opened.chain.dropped,
             "step": None if opened.last is None else step_content(opened.last),
         }

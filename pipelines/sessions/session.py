@@ -18,6 +18,7 @@ from pipelines.live.observer import TerrainObserver
 from pipelines.live.pilot import LivePilot
 from pipelines.live.state import LiveState, Restorable
 from pipelines.live.terrain_source import Classifier, NoTerrain
+from pipelines.recording.recorder import SessionRecorder
 from pipelines.sessions.clock import SessionClock
 from pipelines.sessions.inbox import Inbox, as_numbers
 from pipelines.sessions.records import CommandStatus, Observation, Served, SessionRequest, StepOutput
@@ -86,6 +87,7 @@ class RobotSession:
         self._received_s = math.nan
         self._n_steps = self._n_messages = 0
         self._window: WindowOutput | None = None
+        self._recorder: SessionRecorder | None = None
 
     def _begin_pilot(self, served: Served) -> None:
         if self._robot is None:
@@ -95,6 +97,20 @@ class RobotSession:
         if served.model is not None:
             self._source = Classifier(served.model, self._robot, self._classifying)
         self._pilot = LivePilot(self._robot, served.table, self._source)
+
+    def record(self, recorder: SessionRecorder) -> None:
+        """Record samples, commands and windows from now on."""
+        self._recorder = recorder
+
+    @property
+    def recording(self) -> str:
+        """What the recording does: its status, or that there is none."""
+        return "off" if self._recorder is None else self._recorder.status
+
+    def end(self) -> None:
+        """End the recording; it is written by its thread."""
+        if self._recorder is not None:
+            self._recorder.close()
 
     @property
     def newest_s(self) -> float:
@@ -211,14 +227,15 @@ class RobotSession:
         begun_s = monotonic()
         now_s = begun_s if now_s is None else now_s
         readings = self.inbox.take()
+        if self._recorder is not None and readings:
+            self._recorder.readings(readings)
         time_s = self._clock.at(now_s) if time_s is None else time_s
         self._n_steps += 1
         command, status = None, CommandStatus.OK
         if self._pilot is not None:
             command, status = self._commanded(self._pilot, time_s, readings, now_s)
         elif self._observer is not None:
-            for found in self._observer.update(readings):
-                self._window = found.output
+            self._found([found.output for found in self._observer.update(readings)])
         self._streams.take(readings, time_s)
         return StepOutput(
             time_s,
@@ -242,16 +259,26 @@ class RobotSession:
             for name, reading in readings.items()
             if name in self._columns
         }
+        twist = self._twist if fresh else _NO_TWIST
         try:
-            command = pilot.step(Sample(time_s, self._twist if fresh else _NO_TWIST, in_order))
+            command = pilot.step(Sample(time_s, twist, in_order))
         except Exception:  # never seen; a robot without a command would go on with its last one
             return _standing(), CommandStatus.FAILED
         if self._source is not None:
-            self._window = self._source.last
+            self._found(self._source.outputs)
+        if self._recorder is not None:
+            self._recorder.command(time_s, twist, command, command.status)
         numbers = (*command.wheel_radps.tolist(), *command.steer_rad.tolist(), *command.twist.tolist())
         if not all(map(math.isfinite, numbers)):
             return _standing()._replace(status=command.status), CommandStatus.NOT_FINITE
         return command, status
+
+    def _found(self, outputs: Sequence[WindowOutput]) -> None:
+        """Keep the newest output, and record all."""
+        for output in outputs:
+            self._window = output
+            if self._recorder is not None:
+                self._recorder.window(output)
 
     def _observation(self, time_s: float) -> Observation:
         belief = self.belief

@@ -84,6 +84,7 @@
     showSensors(seen.sensors);
     text("latency", fixed(step.latency_s === null ? null : step.latency_s * 1000, 1, " ms"));
     text("speed", fixed(seen.speed_x_mps, 2, " m/s") + ", " + fixed(degrees(seen.yaw_rate_radps), 1, " deg/s"));
+    text("recording", session.recording);
     const dropped = Object.entries(session.dropped).map(([kind, n]) => kind + ": " + n);
     text("dropped", dropped.length ? dropped.join("; ") : "nothing");
     keep(step, seen);

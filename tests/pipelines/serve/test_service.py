@@ -8,7 +8,9 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 from websockets.exceptions import ConnectionClosed
 
+from pipelines.classify.predict import predict
 from pipelines.live.observer import TerrainObserver
+from pipelines.runs.datasets import load_runs
 from pipelines.serve.client import ServiceError, TerrainClient
 from terrain.control.slip_table import load_slip_table
 from terrain.files.resources import data_folder
@@ -250,3 +252,31 @@ def test_a_robot_that_comes_back_knows_its_terrain(service, hello, messages, two
                 say(message)
                 time.sleep(0.0005)
         time.sleep(0.2)
+
+
+def test_a_session_that_asks_for_it_becomes_a_run_that_predicts_as_it_was_driven(
+    running, model_folder, mower_model, hello, messages, two_drives, tmp_path
+):
+    windows = {}
+    with running(model=str(model_folder), record=tmp_path) as service:
+        with service.socket() as socket:
+            say = talk(socket, True)
+            assert say(hello("kept", record=True))["recording"] == "recording"
+            for message in messages(two_drives[4]):
+                window = say(message)["observation"]["window"]
+                if window:
+                    windows[window["start_s"]] = window
+                time.sleep(0.0005)
+        with service.socket() as socket:
+            assert talk(socket, True)(hello("not kept"))["recording"] == "off"
+    (run,) = load_runs(tmp_path)
+    assert run.run_id.startswith("kept_")
+    rows = predict([run], mower_model, load_slip_table()).windows
+    assert len(rows) >= 5
+    for row in rows[: len(windows)]:
+        assert windows[row.start_s]["terrain"] == row.terrain
+        assert max(windows[row.start_s]["probabilities"].values()) == pytest.approx(
+            row.probability, abs=1e-12
+        )
+    kept = json.loads((tmp_path / run.run_id / "windows.json").read_text())
+    assert len(kept["windows"]) == len(rows)
