@@ -139,6 +139,11 @@ class WindowStream:
         self._due_s = dict.fromkeys(layout.channels, -math.inf)  # no sample before this can finish it
 
     @property
+    def due_s(self) -> float:
+        """No sample before this time can finish a window; minus infinity before all streams have begun."""
+        return min(self._due_s.values())
+
+    @property
     def silent_streams(self) -> tuple[str, ...]:
         """Streams that lag behind the others by more than ``patience_s``, or have not begun by then."""
         begun = [b.last_s for b in self._buffers.values() if b.end]

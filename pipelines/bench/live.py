@@ -44,7 +44,7 @@ def bench_live(settings: BenchSettings, progress: Progress = silent) -> LiveBenc
         uri = model_folder(settings.model, settings.seed, Path(folder) / "model")
         model = load_model(uri)
         progress("bench", 1, n_stages)
-        steps = step_times_us(robot, model, run)
+        steps, beside = step_times_us(robot, model, run)
         progress("bench", 2, n_stages)
         paced = paced_step_times_us(robot, model, run, settings.seconds)
         progress("bench", 3, n_stages)
@@ -73,6 +73,7 @@ def bench_live(settings: BenchSettings, progress: Progress = silent) -> LiveBenc
             asked = by_sessions[0]
             result = LiveBench(
                 step_us=steps,
+                step_beside_window_us=beside,
                 step_paced_us=paced,
                 window_ms=window_ms,
                 websocket_ms=spread(one.times_ms[20:]),

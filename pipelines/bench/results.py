@@ -48,8 +48,9 @@ class LiveBench:
 
     Parameters
     ----------
-    step_us : one control step, as fast as a log goes, windows classified on their thread
-    step_paced_us : the same at 50 Hz in real time, where nothing is warm
+    step_us : one control step, as fast as a log goes, while the thread has no window
+    step_beside_window_us : the same while the thread classifies one
+    step_paced_us : one at 50 Hz in real time, where nothing is warm
     window_ms : from a whole window to its terrain
     websocket_ms : round trip of one robot at 100 Hz
     sessions, sessions_p99_ms, lost_samples : of as many robots at once
@@ -60,6 +61,7 @@ class LiveBench:
     """
 
     step_us: Spread
+    step_beside_window_us: Spread
     step_paced_us: Spread
     window_ms: Spread
     websocket_ms: Spread

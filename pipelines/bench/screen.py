@@ -17,6 +17,7 @@ def print_bench(result: LiveBench, console: Console) -> None:
         table.add_row(name, *(f"{value:.3g} {unit}" for value in found))
 
     row("control step", result.step_us, "us")
+    row("control step while a window is classified", result.step_beside_window_us, "us")
     row("control step at 50 Hz in real time", result.step_paced_us, "us")
     row("window to terrain", result.window_ms, "ms")
     row("round trip, one robot at 100 Hz", result.websocket_ms, "ms")

@@ -1,26 +1,30 @@
-"""Classification of single windows: at once, or on a thread of its own that no control step waits for."""
+"""Cutting and classifying windows: at once, or on a thread of its own that no control step waits for."""
 
 from __future__ import annotations
 
 import math
 import threading
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from time import perf_counter
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from pipelines.live.window_feed import Estimate, WindowFeed
 from pipelines.models.model_files import TerrainModel
 from terrain.errors import DataError
-from terrain.records import Array, Windows
+from terrain.records import Array, Reading, Windows
 
-MAX_WAITING = 4
-"""Windows of one robot that may wait for the thread; of more, the oldest is left out and counted."""
+MAX_WAITING = 1000
+"""Steps of one robot that may wait for the thread: 20 s; of more, the oldest are left out and counted."""
+
+AT_MOST = 25
+"""The thread takes what waits at the end of a window, and before that whenever so many steps wait."""
 
 
 class WindowOutput(NamedTuple):
-    """What a model says of a window.
+    """What a model gives for a window.
 
     Parameters
     ----------
@@ -64,11 +68,22 @@ def classify_window(model: TerrainModel, window: Windows) -> WindowOutput:
     return WindowOutput(start_s, end_s, *found, probabilities, classes, "", took_s)
 
 
-class Classifying(Protocol):
-    """Takes windows, and gives their outputs some time later."""
+class Part(NamedTuple):
+    """A model, and what cuts its windows."""
 
-    def submit(self, model: TerrainModel, window: Windows) -> None:
-        """Take a window."""
+    model: TerrainModel
+    feed: WindowFeed
+
+
+class Classifying(Protocol):
+    """Takes what was measured and estimated, and gives the outputs of its windows some time later."""
+
+    def begin(self, part: Part) -> None:
+        """Cut and classify from now on with a model; what was taken before is for the model before."""
+        ...
+
+    def put(self, readings: Mapping[str, Reading], estimates: Sequence[Estimate]) -> None:
+        """Take what came since the last call; the arrays are kept and must not change."""
         ...
 
     def finished(self) -> list[WindowOutput]:
@@ -76,31 +91,41 @@ class Classifying(Protocol):
         ...
 
     @property
-    def n_overrun(self) -> int:
-        """Number of windows that were left out, as too many waited."""
+    def dropped(self) -> Mapping[str, int]:
+        """Windows and samples that were not used, as counts by kind."""
         ...
 
 
 class AtOnce:
-    """Classifies each window as it is submitted: for logs and simulations, which can wait."""
-
-    n_overrun = 0
+    """Cuts and classifies in the caller's own time: for logs and simulations, which can wait."""
 
     def __init__(self) -> None:
         self._finished: list[WindowOutput] = []
+        self._part: Part | None = None
 
-    def submit(self, model: TerrainModel, window: Windows) -> None:
-        """Classify a window."""
-        self._finished.append(classify_window(model, window))
+    def begin(self, part: Part) -> None:
+        """Go on with a model."""
+        self._part = part
+
+    def put(self, readings: Mapping[str, Reading], estimates: Sequence[Estimate]) -> None:
+        """Classify the windows that are whole by now."""
+        if self._part is not None:
+            for window in self._part.feed.push(readings, estimates):
+                self._finished.append(classify_window(self._part.model, window))
 
     def finished(self) -> list[WindowOutput]:
         """Return the outputs since the last call."""
         found, self._finished = self._finished, []
         return found
 
+    @property
+    def dropped(self) -> Mapping[str, int]:
+        """Windows and samples that were not used, as counts by kind."""
+        return {} if self._part is None else self._part.feed.dropped
+
 
 class ClassifierThread:
-    """A thread that classifies the windows of any number of robots, one after the other.
+    """A thread that cuts and classifies the windows of any number of robots, one after the other.
 
     Parameters
     ----------
@@ -110,8 +135,8 @@ class ClassifierThread:
     --------
     >>> thread = ClassifierThread()
     >>> robot = thread.robot()
-    >>> robot.finished(), robot.n_overrun
-    ([], 0)
+    >>> robot.finished(), robot.dropped
+    ([], {})
     >>> thread.stop()
     """
 
@@ -119,14 +144,19 @@ class ClassifierThread:
         self._classify = classify
         self._due: deque[_OfRobot] = deque()
         self._changed = threading.Condition()
-        self._stopped = False
+        self._stopped = self._working = False
         self.failures: Counter[str] = Counter()
         self._thread = threading.Thread(target=self._run, name="classifier", daemon=True)
         self._thread.start()
 
     def robot(self) -> _OfRobot:
-        """Return what takes the windows of one robot, and gives their outputs."""
+        """Return what takes the samples of one robot, and gives the outputs of its windows."""
         return _OfRobot(self)
+
+    @property
+    def busy(self) -> bool:
+        """Whether the thread has something to do."""
+        return self._working or bool(self._due)
 
     def stop(self, timeout_s: float = 5.0) -> None:
         """Let the thread finish the window that it is at, and end."""
@@ -136,7 +166,7 @@ class ClassifierThread:
         self._thread.join(timeout_s)
 
     def due(self, robot: _OfRobot) -> None:
-        """Note that a robot has a window."""
+        """Note that a robot has something to be done."""
         with self._changed:
             self._due.append(robot)
             self._changed.notify()
@@ -148,32 +178,58 @@ class ClassifierThread:
                     self._changed.wait()
                 if self._stopped:
                     return
+                self._working = True
                 robot = self._due.popleft()
             try:
-                robot.classify(self._classify)
+                robot.work(self._classify)
             except Exception as error:  # of one window: the thread serves the next
                 self.failures[type(error).__name__] += 1
+            self._working = False
+
+
+_Taken = tuple[Mapping[str, Reading], Sequence[Estimate]]
 
 
 class _OfRobot:
-    """The windows of one robot, on a thread that several share."""
+    """The samples and windows of one robot, on a thread that several share.
+
+    Only the thread touches the feed; both sides share queues whose ends are atomic, and plain numbers.
+    """
 
     def __init__(self, thread: ClassifierThread) -> None:
         self._thread = thread
-        self._waiting: deque[tuple[TerrainModel, Windows]] = deque()
+        self._waiting: deque[_Taken | Part] = deque()
         self._finished: deque[WindowOutput] = deque()
-        self.n_overrun = 0
+        self._part: Part | None = None
+        self._due_s, self._n_overrun = math.inf, 0
+        self._counts: Mapping[str, int] = {}
 
-    def submit(self, model: TerrainModel, window: Windows) -> None:
-        """Queue a window; where too many wait, the oldest is left out."""
-        if len(self._waiting) >= MAX_WAITING:
-            try:
-                self._waiting.popleft()
-                self.n_overrun += 1
-            except IndexError:  # the thread has just taken it
-                pass
-        self._waiting.append((model, window))
+    def begin(self, part: Part) -> None:
+        """Go on with a model; ``put`` comes in order with it."""
+        self._due_s = math.inf
+        self._waiting.append(part)
         self._thread.due(self)
+
+    def put(self, readings: Mapping[str, Reading], estimates: Sequence[Estimate]) -> None:
+        """Queue what came; wake the thread where a window may be whole."""
+        waiting = self._waiting
+        waiting.append((readings, estimates))
+        n = len(waiting)
+        if n > MAX_WAITING:
+            self._leave_out()
+        if n % AT_MOST == 0 or _newest_s(readings, estimates) >= self._due_s:
+            self._thread.due(self)
+
+    def _leave_out(self) -> None:
+        """Remove the oldest step that waits; a model that waits before it is taken first."""
+        try:
+            oldest = self._waiting.popleft()
+            if isinstance(oldest, Part):
+                self._waiting.appendleft(oldest)
+            else:
+                self._n_overrun += 1
+        except IndexError:  # the thread has just taken it
+            pass
 
     def finished(self) -> list[WindowOutput]:
         """Return the outputs since the last call."""
@@ -182,10 +238,34 @@ class _OfRobot:
             found.append(self._finished.popleft())
         return found
 
-    def classify(self, classify: Callable[[TerrainModel, Windows], WindowOutput]) -> None:
-        """Classify the oldest window that waits, if one does."""
+    @property
+    def dropped(self) -> Mapping[str, int]:
+        """Windows and samples that were not used by the last time that the thread worked, by kind."""
+        return {**self._counts, "steps: overrun": self._n_overrun} if self._n_overrun else self._counts
+
+    def work(self, classify: Callable[[TerrainModel, Windows], WindowOutput]) -> None:
+        """Cut and classify what waits; called by the thread."""
         try:
-            model, window = self._waiting.popleft()
-        except IndexError:
-            return
-        self._finished.append(classify(model, window))
+            while self._waiting:
+                taken = self._waiting.popleft()
+                if isinstance(taken, Part):
+                    self._part = taken
+                elif self._part is not None:
+                    for window in self._part.feed.push(*taken):
+                        self._finished.append(classify(self._part.model, window))
+        finally:
+            if self._part is not None:
+                due_s = self._part.feed.due_s  # minus infinity before all streams have begun
+                self._due_s = due_s if math.isfinite(due_s) else math.inf
+                self._counts = self._part.feed.dropped
+
+
+def _newest_s(readings: Mapping[str, Reading], estimates: Sequence[Estimate]) -> float:
+    """Return the newest stamp, as far as it is in order; minus infinity where there is none."""
+    newest_s = estimates[-1].time_s if estimates else -math.inf
+    for reading in readings.values():
+        try:
+            newest_s = max(newest_s, float(reading[0][-1]))
+        except (TypeError, ValueError, LookupError):  # broken: the feed counts it
+            continue
+    return newest_s

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipelines.live.classifying import AtOnce, Classifying, WindowOutput
+from pipelines.live.classifying import AtOnce, Classifying, Part, WindowOutput
 from pipelines.live.pilot_settings import check_table
 from pipelines.live.state import LiveState, Restorable, restorable, state_of
 from pipelines.live.window_feed import Estimate, WindowFeed, live_filter, needs_filter
@@ -113,7 +113,8 @@ class TerrainObserver:
         self._filter_name = "" if self._filter is None else self._filter.model.name
         self._robot = corrected
         self._feed = WindowFeed(model.info, self.channels, corrected)
-        self._classifying = AtOnce() if classifying is None else classifying
+        self._classifying: Classifying = AtOnce() if classifying is None else classifying
+        self._classifying.begin(Part(model, self._feed))
         self._speed_columns, self._mps_per_unit = _speeds(self.channels.get("wheels", ()), corrected)
         self._latest: Estimate | None = None
         self._wheels_s = math.nan
@@ -128,10 +129,8 @@ class TerrainObserver:
     @property
     def dropped(self) -> dict[str, int]:
         """What was not used so far, as counts by kind."""
-        counts = dict(self._feed.dropped)
+        counts = dict(self._classifying.dropped)
         counts |= {f"window: refused, {why}": n for why, n in self.refused.items()}
-        if self._classifying.n_overrun:
-            counts["window: overrun"] = self._classifying.n_overrun
         return counts | (dict(self._filter.dropped) if self._filter is not None else {})
 
     def check(self, model: TerrainModel) -> None:
@@ -166,6 +165,7 @@ class TerrainObserver:
         if not self._feed.suits(model.info):
             self._feed = WindowFeed(model.info, self.channels, self._robot)
         self.model = model
+        self._classifying.begin(Part(model, self._feed))
 
     def state(self, now_s: float) -> LiveState:
         """Return what is worth keeping over a restart, at a time in seconds since 1970."""
@@ -200,8 +200,7 @@ class TerrainObserver:
             estimates = self._filter.step(samples)
             if estimates:
                 self._latest = estimates[-1]
-        for window in self._feed.push(samples, estimates):
-            self._classifying.submit(self.model, window)
+        self._classifying.put(samples, estimates)
         self._drive_on(samples)
         return [self._observed(output) for output in self._classifying.finished()]
 

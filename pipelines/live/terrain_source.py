@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import NamedTuple, Protocol
 
-from pipelines.live.classifying import AtOnce, Classifying, WindowOutput
+from pipelines.live.classifying import AtOnce, Classifying, Part, WindowOutput
 from pipelines.live.window_feed import WindowFeed, live_filter, needs_filter
 from pipelines.models.model_files import TerrainModel
 from terrain.errors import DataError
@@ -107,7 +107,8 @@ class Classifier:
         self.model, self._robot = model, correct_live(robot)[0]
         self.outputs: list[WindowOutput] = []
         self._feed = self.feed_of(model)
-        self._classifying = AtOnce() if classifying is None else classifying
+        self._classifying: Classifying = AtOnce() if classifying is None else classifying
+        self._classifying.begin(Part(model, self._feed))
         self.failed: Counter[str] = Counter()
 
     def feed_of(self, model: TerrainModel) -> WindowFeed:
@@ -129,6 +130,7 @@ class Classifier:
         if not self._feed.suits(model.info):
             self._feed = self.feed_of(model)
         self.model = model
+        self._classifying.begin(Part(model, self._feed))
 
     @property
     def n_refused(self) -> int:
@@ -138,13 +140,12 @@ class Classifier:
     @property
     def dropped(self) -> dict[str, int]:
         """Windows and samples that were not used, as counts by kind."""
-        counts = self._feed.dropped | {f"window: refused, {why}": n for why, n in self.failed.items()}
-        return counts | ({"window: overrun": n} if (n := self._classifying.n_overrun) else {})
+        refused = {f"window: refused, {why}": n for why, n in self.failed.items()}
+        return {**self._classifying.dropped, **refused}
 
     def update(self, sample: Sample, estimates: Sequence[LiveEstimate]) -> list[TerrainEstimate]:
         """Return the terrain of each window whose output is there by now."""
-        for window in self._feed.push(sample.readings, estimates):
-            self._classifying.submit(self.model, window)
+        self._classifying.put(sample.readings, estimates)
         found: list[TerrainEstimate] = []
         self.outputs = self._classifying.finished()
         for output in self.outputs:

@@ -121,6 +121,11 @@ class WindowFeed:
         return counts | {f"{name}: unreadable": n for name, n in self.unreadable.items()}
 
     @property
+    def due_s(self) -> float:
+        """No sample before this time can finish a window; minus infinity before all streams have begun."""
+        return self._stream.due_s
+
+    @property
     def silent_streams(self) -> tuple[str, ...]:
         """Streams that no windows can be cut for, as they have stopped."""
         return self._stream.silent_streams

@@ -7,7 +7,6 @@ import gc
 import os
 import signal
 import socket
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -31,9 +30,6 @@ from terrain.estimation.live.estimator import CHANNELS
 from terrain.files.atomic import ensure_writable
 from terrain.records import Reading, Sample, Windows
 from terrain.robots import Robot, load_robot
-
-SWITCH_S = 0.0005
-"""How long the classifier's thread may keep the interpreter from a step that waits; Python's own is 5 ms."""
 
 SAVE_EVERY_S = 5.0
 LARGEST_MESSAGE = 4_194_304
@@ -120,7 +116,6 @@ class Service:
         ----------
         announce : called with the address once robots can come
         """
-        sys.setswitchinterval(SWITCH_S)
         gc.collect()
         gc.freeze()  # what is loaded now stays: no collection has to look at it
         try:

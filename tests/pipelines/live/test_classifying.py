@@ -1,13 +1,24 @@
-"""Windows classified on a thread: in order, bounded, apart by robot, and nothing stops it."""
+"""Windows cut and classified on a thread: in order, bounded, apart by robot, and nothing stops it."""
 
 import threading
 import time
-from collections import namedtuple
+from collections import Counter, namedtuple
 
 import numpy as np
 import pytest
 
-from pipelines.live.classifying import MAX_WAITING, AtOnce, ClassifierThread, WindowOutput, classify_window
+from pipelines.live.classifying import (
+    AT_MOST,
+    MAX_WAITING,
+    AtOnce,
+    ClassifierThread,
+    Part,
+    WindowOutput,
+    classify_window,
+)
+from pipelines.live.observer import TerrainObserver
+from terrain.logs.replay import replay
+from terrain.records import Reading
 
 Info = namedtuple("Info", "classes")
 Model = namedtuple("Model", "recipe info")
@@ -39,6 +50,22 @@ def output(start_s):
     return WindowOutput(start_s, start_s + 2.0, "a", 1.0, np.array([1.0, 0.0]), ("a", "b"))
 
 
+class EachStep:
+    """A feed for which each step is a window, which starts at its newest stamp."""
+
+    due_s = 0.0
+
+    def __init__(self):
+        self.dropped = Counter()
+
+    def push(self, readings, estimates):
+        return [window(float(readings["imu"].time_s[-1]))]
+
+
+def step(start_s):
+    return {"imu": Reading(np.array([start_s]), np.zeros((1, 1)))}
+
+
 def wait_for(found, n, timeout_s=10.0):
     """The outputs of a robot, once there are n."""
     outputs, end_s = [], time.monotonic() + timeout_s
@@ -46,6 +73,15 @@ def wait_for(found, n, timeout_s=10.0):
         outputs += found()
         time.sleep(0.001)
     return outputs
+
+
+def begun(thread, name="m"):
+    robot = thread.robot()
+    robot.begin(Part(name, EachStep()))
+    end_s = time.monotonic() + 10.0
+    while (robot._waiting or robot._due_s > 0.0) and time.monotonic() < end_s:
+        time.sleep(0.001)
+    return robot
 
 
 @pytest.fixture
@@ -86,46 +122,77 @@ def test_a_refused_window_has_no_class_and_the_reason(row, refused):
 
 def test_at_once_gives_each_output_once():
     classifying = AtOnce()
-    classifying.submit(model([0.9, 0.1]), window(0.0))
+    classifying.put(step(0.0), [])
+    assert classifying.finished() == []
+    classifying.begin(Part(model([0.9, 0.1]), EachStep()))
+    classifying.put(step(0.0), [])
     assert [one.terrain for one in classifying.finished()] == ["a"]
     assert classifying.finished() == []
 
 
-def test_submitting_waits_for_nothing_and_outputs_come_in_order(gate):
+def test_putting_waits_for_nothing_and_outputs_come_in_order(gate):
     event, thread = gate
-    robot = thread.robot()
+    robot = begun(thread)
     for start_s in (0.0, 2.0, 4.0):
-        robot.submit(model(), window(start_s))
+        robot.put(step(start_s), [])
     assert robot.finished() == []
     event.set()
     assert [one.start_s for one in wait_for(robot.finished, 3)] == [0.0, 2.0, 4.0]
-    assert robot.n_overrun == 0
+    assert robot.dropped == {}
 
 
-def test_of_too_many_windows_the_oldest_are_left_out_and_counted(gate):
+def test_of_too_many_steps_the_oldest_are_left_out_and_counted(gate):
     event, thread = gate
-    robot = thread.robot()
-    n = MAX_WAITING + 6
-    robot.submit(model(), window(0.0))
+    robot = begun(thread)
+    robot.put(step(0.0), [])
     while robot._waiting:  # until the thread is at the first
         time.sleep(0.001)
+    n = MAX_WAITING + 6
     for k in range(1, n):
-        robot.submit(model(), window(2.0 * k))
+        robot.put(step(float(k)), [])
     event.set()
     starts = [one.start_s for one in wait_for(robot.finished, MAX_WAITING + 1)]
-    assert starts == [0.0, *(2.0 * k for k in range(n - MAX_WAITING, n))]
-    assert robot.n_overrun == n - 1 - MAX_WAITING
+    assert starts == [0.0, *map(float, range(n - MAX_WAITING, n))]
+    assert robot.dropped == {"steps: overrun": n - 1 - MAX_WAITING}
 
 
-def test_robots_get_their_own_outputs_and_one_cannot_take_the_turns_of_another(gate):
+def test_the_thread_works_where_a_window_may_be_whole_and_after_many_steps(gate):
     event, thread = gate
-    busy, other = thread.robot(), thread.robot()
+    event.set()
+    robot = begun(thread)
+    robot._part.feed.due_s = robot._due_s = 100.0
+    for k in range(AT_MOST - 1):
+        robot.put(step(float(k)), [])
+    time.sleep(0.05)
+    assert robot.finished() == []
+    robot.put(step(99.0), [])
+    assert len(wait_for(robot.finished, AT_MOST)) == AT_MOST
+    robot.put(step(100.0), [])
+    assert [one.start_s for one in wait_for(robot.finished, 1)] == [100.0]
+
+
+def test_robots_get_their_own_outputs(gate):
+    event, thread = gate
+    busy, other = begun(thread), begun(thread)
     for k in range(40):
-        busy.submit(model(), window(2.0 * k))
-    other.submit(model(), window(100.0))
+        busy.put(step(2.0 * k), [])
+    other.put(step(100.0), [])
     event.set()
     assert [one.start_s for one in wait_for(other.finished, 1)] == [100.0]
-    assert all(one.start_s < 100.0 for one in wait_for(busy.finished, MAX_WAITING))
+    assert [one.start_s for one in wait_for(busy.finished, 40)] == [2.0 * k for k in range(40)]
+
+
+def test_what_was_put_before_another_model_is_classified_by_the_one_before():
+    thread = ClassifierThread(lambda model, window: output(float(window.start_s[0]))._replace(terrain=model))
+    robot = begun(thread, "first")
+    for name in ("second", "third"):
+        robot.put(step(0.0), [])
+        robot.begin(Part(name, EachStep()))
+    robot.put(step(1.0), [])
+    time.sleep(0.01)
+    robot.put(step(2.0), [])
+    assert [one.terrain for one in wait_for(robot.finished, 4)] == ["first", "second", "third", "third"]
+    thread.stop()
 
 
 def test_an_unforeseen_error_costs_one_window():
@@ -135,10 +202,27 @@ def test_an_unforeseen_error_costs_one_window():
         return output(float(window.start_s[0]))
 
     thread = ClassifierThread(classify)
-    robot = thread.robot()
-    robot.submit(model(), window(0.0))
-    robot.submit(model(), window(2.0))
+    robot = begun(thread)
+    robot.put(step(0.0), [])
+    robot.put(step(2.0), [])
     assert [one.start_s for one in wait_for(robot.finished, 1)] == [2.0]
     assert thread.failures == {"KeyError": 1}
     thread.stop()
     assert not thread._thread.is_alive()
+
+
+def test_on_a_thread_a_robot_gets_the_windows_that_it_would_get_at_once(mower_model, two_drives):
+    run, thread = two_drives[4], ClassifierThread()
+    at_once = TerrainObserver(mower_model)
+    beside = TerrainObserver(mower_model, classifying=thread.robot())
+    desired, found = [], []
+    for sample in replay(run):
+        desired += at_once.update(sample.readings)
+        found += beside.update(sample.readings)
+    end_s = time.monotonic() + 10.0
+    while len(found) < len(desired) and time.monotonic() < end_s:
+        time.sleep(0.005)
+        found += beside.update({})
+    assert [one[:5] for one in found] == [one[:5] for one in desired]
+    assert beside.belief.terrain == "b"
+    thread.stop()

@@ -187,7 +187,7 @@ def test_another_model_is_put_in_while_a_robot_is_served_and_no_window_is_lost(
             if seen["window"]:
                 starts.append(seen["window"]["start_s"])
         assert numbers == [1] * 150 + [2] * 170 + [3] * (len(numbers) - 320)
-        assert sorted(set(starts)) == [0.0, 2.0, 4.0, 6.0, 8.0][: len(set(starts))]
+        assert sorted(set(starts)) == [0.0, 2.0, 4.0, 6.0, 8.0, 10.0][: len(set(starts))]
         assert len(set(starts)) >= 5
         lower = TABLE.replace("0.1", "0.11")
         status, text = service.put("/table", lower, "application/yaml")
@@ -279,4 +279,4 @@ def test_a_session_that_asks_for_it_becomes_a_run_that_predicts_as_it_was_driven
             row.probability, abs=1e-12
         )
     kept = json.loads((tmp_path / run.run_id / "windows.json").read_text())
-    assert len(kept["windows"]) == len(rows)
+    assert len(rows) - 1 <= len(kept["windows"]) <= len(rows)  # of the last one the robot may not have waited
