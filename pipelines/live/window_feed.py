@@ -11,9 +11,9 @@ import numpy as np
 from features.stream import WindowStream
 from pipelines.models.results import ModelInfo
 from terrain.errors import DataError
-from terrain.estimation.enriched import ESTIMATOR_CHANNELS
 from terrain.estimation.live.estimate import LiveEstimate
 from terrain.estimation.live.skid_live import LiveSkidEstimate
+from terrain.logs.schema import ESTIMATOR_CHANNELS
 from terrain.records import Array, Reading, Windows
 from terrain.robots import Robot
 

@@ -9,10 +9,8 @@ import numpy as np
 from terrain.estimation.estimate import Estimate
 from terrain.estimation.stuck import Motion
 from terrain.kinematics.wheel_speed import with_wheel_speeds
+from terrain.logs.schema import ESTIMATOR_CHANNELS
 from terrain.records import RunLog, Stream
-
-ESTIMATOR_CHANNELS = ("speed_x_mps", "speed_y_mps", "yaw_rate_radps", "accel_x_mps2", "accel_y_mps2")
-"""States that go into windows."""
 
 
 def enriched(estimate: Estimate) -> RunLog:

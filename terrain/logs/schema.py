@@ -81,6 +81,11 @@ GNSS_CHANNELS: tuple[str, ...] = (
 )
 """Channels of a receiver: the antenna, east and north."""
 
+ESTIMATOR_CHANNELS: tuple[str, ...] = (
+    *("speed_x_mps", "speed_y_mps", "yaw_rate_radps", "accel_x_mps2", "accel_y_mps2"),
+)
+"""States of a filter that go into windows."""
+
 SIGNAL_SETS: tuple[str, ...] = ("imu", "wheels", "currents", "slip", "estimator")
 """Groups of signals that can be switched off by name."""
 
