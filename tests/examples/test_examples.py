@@ -1,0 +1,142 @@
+"""The examples run: a robot's program against a service, the ROS 2 node on what it uses of ROS."""
+
+import importlib.util
+import sys
+import threading
+from types import ModuleType, SimpleNamespace
+
+import numpy as np
+import pytest
+from skops import io
+
+from pipelines.classify.crossval import samples_of
+from pipelines.classify.settings import CrossvalSettings
+from pipelines.classify.train import model_info
+from pipelines.models.model_files import write_info
+from pipelines.serve.server import Service, prepare
+from pipelines.serve.settings import ServeSettings
+from terrain.logs.write import write_run
+from terrain.records import RunLog, Stream
+
+IMU = tuple(
+    f"{quantity}_{axis}_{unit}" for quantity, unit in (("gyro", "radps"), ("accel", "mps2")) for axis in "xyz"
+)
+WHEELS = ("speed_left_mps", "speed_right_mps", "current_left_a", "current_right_a")
+
+
+def run_on(terrain, shaking, number):
+    rng = np.random.default_rng([number, int(100 * shaking)])
+    time_s, wheels_s = np.arange(0, 12, 0.02), np.arange(0, 12, 0.1)
+    wheels = np.column_stack([np.full((120, 2), 0.5), 2.0 + rng.normal(0, 0.1, (120, 2))])
+    streams = {
+        "imu": Stream(time_s, rng.normal(0, shaking, (600, 6)), IMU),
+        "wheels": Stream(wheels_s, wheels, WHEELS),
+    }
+    return RunLog(f"{terrain}{number}", "husky", streams, ((0.0, 12.0, terrain),))
+
+
+@pytest.fixture(scope="module")
+def runs():
+    return [run_on(terrain, shaking, n) for terrain, shaking in (("a", 0.1), ("b", 2.0)) for n in range(3)]
+
+
+@pytest.fixture(scope="module")
+def model_folder(runs, tmp_path_factory):
+    settings, folder = CrossvalSettings(), tmp_path_factory.mktemp("model")
+    windows = samples_of(runs, settings).cut.windows
+    io.dump(settings.new_recipe().fit(windows, windows.terrain.astype(str)), folder / "model.skops")
+    write_info(folder, model_info(runs, settings, windows, "drawn", ""))
+    return folder
+
+
+def example(name):
+    """The module of an example."""
+    from pathlib import Path
+
+    path = Path(__file__).parents[2] / "examples" / f"{name}.py"
+    spec = importlib.util.spec_from_file_location(name, path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_a_robots_program_gets_its_terrain(runs, model_folder, tmp_path, capsys):
+    prepared, ready = prepare(ServeSettings(model=str(model_folder), port=0)), threading.Event()
+    service = Service(prepared)
+    thread = threading.Thread(target=service.run, args=(lambda url: ready.set(),))
+    thread.start()
+    try:
+        assert ready.wait(30.0)
+        folder = write_run(runs[4], tmp_path)
+        assert example("live_robot").drive(str(folder), prepared.url.replace("http", "ws"), speed=4.0) == "b"
+    finally:
+        service.stop()
+        thread.join(30.0)
+    assert "b" in capsys.readouterr().out
+
+
+class Publisher:
+    def __init__(self):
+        self.messages = []
+
+    def publish(self, message):
+        self.messages.append(message.data)
+
+
+class Node:
+    """What the example uses of a ROS 2 node."""
+
+    def __init__(self, name):
+        self.publishers, self.callbacks = {}, {}
+
+    def create_publisher(self, kind, topic, depth):
+        return self.publishers.setdefault(topic, Publisher())
+
+    def create_subscription(self, kind, topic, callback, depth):
+        self.callbacks[topic] = callback
+
+
+@pytest.fixture
+def ros(monkeypatch):
+    def module(name, **content):
+        found = ModuleType(name)
+        vars(found).update(content)
+        monkeypatch.setitem(sys.modules, name, found)
+        return found
+
+    module("rclpy", node=module("rclpy.node", Node=Node))
+    for package, kinds in (("sensor_msgs", ("Imu", "JointState")), ("std_msgs", ("Float64", "String"))):
+        module(package, msg=module(f"{package}.msg", **dict.fromkeys(kinds, SimpleNamespace)))
+
+
+def stamp(time_s):
+    return SimpleNamespace(stamp=SimpleNamespace(sec=int(time_s), nanosec=round((time_s % 1.0) * 1e9)))
+
+
+def vector(values):
+    return SimpleNamespace(**dict(zip("xyz", values, strict=True)))
+
+
+def test_the_ros_node_publishes_terrain_and_target_slip(ros, runs, model_folder):
+    node = example("ros2_node").terrain_node(model_folder)
+    imu, wheels = runs[4].streams["imu"], runs[4].streams["wheels"]
+    samples = [("imu/data", t, row) for t, row in zip(imu.time_s, imu.values, strict=True)]
+    samples += [("joint_states", t, row) for t, row in zip(wheels.time_s, wheels.values, strict=True)]
+    for topic, time_s, row in sorted(samples, key=lambda one: one[1]):
+        if topic == "imu/data":
+            message = SimpleNamespace(
+                header=stamp(time_s), angular_velocity=vector(row[:3]), linear_acceleration=vector(row[3:])
+            )
+        else:
+            radius_m = 0.1651
+            message = SimpleNamespace(
+                header=stamp(time_s),
+                name=["arm", "right_wheel", "left_wheel"],
+                velocity=[9.0, row[1] / radius_m, row[0] / radius_m],
+                effort=[0.0, row[3], row[2]],
+            )
+        node.callbacks[topic](message)
+    terrain, target = node.publishers["terrain"].messages, node.publishers["target_slip"].messages
+    assert len(terrain) == len(target) >= 5
+    assert terrain[-1] == "b"
+    assert all(0.0 < slip < 1.0 for slip in target)

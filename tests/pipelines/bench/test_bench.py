@@ -1,0 +1,135 @@
+"""The benchmarks measure what they say, and the soak finds what is not accepted."""
+
+import json
+
+import numpy as np
+import pytest
+
+from pipelines.bench.chain import paced_step_times_us, step_times_us, window_times_ms
+from pipelines.bench.drive import bench_drive, messages_of, model_folder, sent_channels
+from pipelines.bench.live import bench_live
+from pipelines.bench.process import ServiceProcess, service_process
+from pipelines.bench.results import Soak, spread
+from pipelines.bench.robots import packed
+from pipelines.bench.settings import BenchSettings, SoakSettings
+from pipelines.bench.soak import FAULTS, _judged, _Seen, soak
+from pipelines.reporting.json_file import as_json
+from terrain.errors import TerrainError
+from terrain.logs.replay import replay
+from terrain.records import RunLog
+from terrain.robots import load_robot
+
+ROBOT = load_robot("agrimaro")
+
+
+@pytest.fixture(scope="module")
+def run():
+    return bench_drive(3)
+
+
+@pytest.fixture(scope="module")
+def uri(tmp_path_factory):
+    return model_folder(None, 3, tmp_path_factory.mktemp("bench") / "model")
+
+
+def test_the_spread_is_median_99th_percentile_and_largest():
+    found = spread(list(range(101)))
+    assert found == (50.0, 99.0, 100.0)
+    assert all(np.isnan(spread([])))
+
+
+def test_messages_hold_every_sample_of_the_drive_once(run):
+    messages, channels = list(messages_of(run)), sent_channels(run)
+    for stream in channels:
+        sent = [t for one in messages if stream in one["streams"] for t in one["streams"][stream][0]]
+        assert sent == run.streams[stream].time_s.tolist()
+    steps = [one["time_s"] for one in messages if one.get("step")]
+    assert np.diff(steps) == pytest.approx(0.05, abs=1e-9)
+    bytes_ = packed(messages)
+    assert sum(one.rows for one in bytes_) == sum(len(run.streams[stream]) for stream in channels)
+    assert bytes_[0].time_s == 0.0
+
+
+def test_steps_and_windows_are_timed(run, swerve_model):
+    short = RunLog(run.run_id, run.robot, run.streams)
+    alone, beside = step_times_us(ROBOT, swerve_model, short, repeats=1)
+    assert 5.0 < alone.median <= alone.p99 <= alone.largest < 1e6
+    assert beside.median > 5.0
+    assert paced_step_times_us(ROBOT, swerve_model, short, 0.5).median > 5.0
+    assert len(list(replay(short))) > 1000
+
+
+def test_a_window_is_timed_alone(swerve_model, monkeypatch):
+    from features.windows import cut_windows
+    from terrain.estimation.enriched import enriched
+    from terrain.estimation.estimate import estimate_run
+
+    monkeypatch.setattr("pipelines.bench.chain.N_WINDOWS", 40)
+    run = enriched(estimate_run(bench_drive(4), ROBOT, "vio15"))
+    windows = cut_windows([run], swerve_model.rule, layout=swerve_model.layout).windows
+    assert 0.05 < window_times_ms(windows, swerve_model).median < 1000.0
+
+
+def test_a_service_that_does_not_start_is_named():
+    with pytest.raises(TerrainError, match="the service did not start: error: /nowhere"):
+        ServiceProcess(["--model", "/nowhere"])
+
+
+@pytest.mark.slow
+def test_the_live_benchmark_has_all_its_figures(uri):
+    settings = BenchSettings(model=uri, robots=3, seconds=3.0, seed=3)
+    document = as_json(bench_live(settings))
+    json.dumps(document, allow_nan=False)
+    for name in ("step_us", "window_ms", "websocket_ms"):
+        assert 0.0 < document[name]["median"] <= document[name]["p99"]
+    assert document["sessions"] == 3
+    assert document["lost_samples"] == 0
+    assert [row["sessions"] for row in document["by_sessions"]] == [2, 3, 5]
+    assert 0.5 < document["start_s"] < 60.0
+    assert 50.0 < document["rss_mb"] < 1000.0
+
+
+@pytest.mark.slow
+def test_a_soak_of_half_a_minute_with_every_fault_is_accepted(uri, monkeypatch):
+    monkeypatch.setattr("pipelines.bench.soak.FAULTS_PER_MINUTE", 120.0)
+    found = soak(SoakSettings(model=uri, robots=4, minutes=0.5, seed=5))
+    assert found.problems == ()
+    assert found.steps > 500
+    assert sum(found.faults.values()) >= 20
+    assert set(found.faults) <= set(FAULTS)
+
+
+def seen(**changed):
+    found = _Seen()
+    found.steps, found.rss_mb = 100, [300.0] * 6
+    for name, value in changed.items():
+        setattr(found, name, value)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("changed", "problem"),
+    [
+        ({}, ""),
+        ({"rss_mb": [300.0, 300.0, 305.0, 310.0, 312.0, 314.0]}, ""),
+        ({"rss_mb": [300.0, 300.0, 310.0, 320.0, 330.0, 340.0]}, "memory grew by 11.7%, 5% are accepted"),
+        ({"not_finite": 1}, "1 commands were not finite"),
+        ({"stale": 2}, "2 commands were stale"),
+        ({"wrong_session": 1}, "1 answers were of another robot"),
+        ({"unanswered": 3}, "3 steps were not answered"),
+        ({"steps": 0}, "no step was answered"),
+        ({"problems": ["the service ended by itself"]}, "the service ended by itself"),
+    ],
+)
+def test_what_is_not_accepted_is_named(changed, problem):
+    judged = _judged(SoakSettings(), seen(**changed))
+    assert isinstance(judged, Soak)
+    assert list(judged.problems) == ([problem] if problem else [])
+
+
+@pytest.mark.slow
+def test_a_service_process_ends_in_order(uri):
+    with service_process(["--model", uri]) as service:
+        assert service.rss_mb > 50.0
+        assert service.figure("terrain_served_number") == 1.0
+    assert service.process.returncode == 0
