@@ -1,4 +1,4 @@
-"""ROS 2 node of the live observer: ``python examples/ros2_node.py MODEL_FOLDER``, where ROS 2 is installed."""
+"""ROS 2 node of the live observer: ``python examples/ros2_node.py MODEL_FOLDER`` where ROS 2 is installed."""
 
 import sys
 from pathlib import Path

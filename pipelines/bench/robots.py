@@ -49,7 +49,7 @@ def packed(messages: Sequence[dict[str, Any]]) -> list[Packed]:
 def hello(session: str, robot: str, channels: dict[str, list[str]]) -> bytes:
     """Return the first message of a robot that asks for each of its steps."""
     content = {"type": "hello", "session": session, "robot": robot, "streams": channels}
-    message: bytes = msgpack.packb({**content, "control": True, "rate_hz": 0.0})
+    message: bytes = msgpack.packb({**content, "control": True, "follows": False, "rate_hz": 0.0})
     return message
 
 

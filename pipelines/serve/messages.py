@@ -35,6 +35,7 @@ class Hello(BaseModel):
         Field(min_length=1, max_length=16),
     ]
     control: bool = False
+    follows: bool = True
     rate_hz: Annotated[float, Field(ge=0.0, le=200.0, strict=False)] = 10.0
     record: bool = False
     token: Annotated[str, StringConstraints(max_length=512)] = ""
@@ -43,7 +44,7 @@ class Hello(BaseModel):
     def request(self) -> SessionRequest:
         """What the session is made of."""
         channels = {stream: tuple(names) for stream, names in self.streams.items()}
-        return SessionRequest(self.session, self.robot, channels, self.control)
+        return SessionRequest(self.session, self.robot, channels, self.control, self.follows)
 
 
 def read_hello(content: dict[str, Any]) -> Hello:

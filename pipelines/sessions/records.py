@@ -39,12 +39,14 @@ class SessionRequest:
     robot : name of its description; a robot that has none is observed by its channels
     channels : of each stream that it sends, in the order of the columns
     control : whether commands are asked for
+    follows : whether they drive the wheels; not where another controller does and these are only watched
     """
 
     session: str
     robot: str
     channels: Mapping[str, tuple[str, ...]]
     control: bool = False
+    follows: bool = True
 
 
 class CommandStatus(StrEnum):

@@ -16,6 +16,7 @@ import numpy as np
 from pipelines.live.classifying import Classifying, WindowOutput
 from pipelines.live.observer import TerrainObserver
 from pipelines.live.pilot import LivePilot
+from pipelines.live.pilot_settings import PilotSettings
 from pipelines.live.state import LiveState, Restorable
 from pipelines.live.terrain_source import Classifier, NoTerrain
 from pipelines.recording.recorder import SessionRecorder
@@ -96,7 +97,8 @@ class RobotSession:
             )
         if served.model is not None:
             self._source = Classifier(served.model, self._robot, self._classifying)
-        self._pilot = LivePilot(self._robot, served.table, self._source)
+        settings = PilotSettings(follows=self.request.follows)
+        self._pilot = LivePilot(self._robot, served.table, self._source, settings)
 
     def record(self, recorder: SessionRecorder) -> None:
         """Record samples, commands and windows from now on."""
