@@ -8,7 +8,7 @@ from contextlib import contextmanager
 
 import typer
 
-from pipelines.cli.command import command
+from pipelines.cli.command import Json, command
 from pipelines.serve.settings import ServeSettings
 
 app = typer.Typer()
@@ -28,9 +28,17 @@ def without(package: str) -> Iterator[None]:
 
 
 @command(app, "serve")
-def serve_command(settings: ServeSettings) -> None:
+def serve_command(settings: ServeSettings, json_file: Json = None) -> None:
     """Serve terrain, target slips and commands to robots, live."""
     with without("pandas"):  # scikit-learn takes it: 67 MB and a second, and the service has no use for it
-        from pipelines.serve.server import Service, prepare
+        from pipelines.serve.server import Service, checked, prepare
 
-    Service(prepare(settings)).run(lambda url: typer.echo(f"serving {settings.model} at {url}"))
+    prepared = prepare(settings)
+    if not settings.check:
+        Service(prepared).run(lambda url: typer.echo(f"serving {settings.model} at {url}"))
+        return
+    from pipelines.reporting.json_file import write_json
+
+    result = checked(prepared, settings.robot)
+    typer.echo(f"{settings.model} can be served: {', '.join(result.classes)}")
+    write_json(json_file, result)

@@ -97,6 +97,7 @@ class Hub:
         self._given, self._folder = given, states
         self._thread = ClassifierThread()
         self._recordings = recordings
+        self.recovered: list[Path] = []
         self._writer: RecordingThread | None = None
         if recordings is not None:
             self.recovered = recover_recordings(recordings)

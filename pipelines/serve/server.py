@@ -22,6 +22,7 @@ from pipelines.serve.app import make_app
 from pipelines.serve.guard import check_token, is_loopback
 from pipelines.serve.hub import Hub, Limits
 from pipelines.serve.resolve import load_model
+from pipelines.serve.results import ServiceCheck
 from pipelines.serve.settings import ServeSettings
 from pipelines.sessions.records import Served
 from terrain.control.slip_table import load_slip_table
@@ -81,6 +82,26 @@ def prepare(settings: ServeSettings) -> Prepared:
         raise
     host, port = listening.getsockname()[:2]
     return Prepared(hub, listening, token, f"http://{f'[{host}]' if ':' in host else host}:{port}")
+
+
+def checked(prepared: Prepared, robot: str | None) -> ServiceCheck:
+    """Return what a prepared service would serve, and give its port back."""
+    prepared.listening.close()
+    prepared.hub.stop()
+    served = prepared.hub.served
+    assert served.model is not None  # prepare() loads one
+    info = served.model.info
+    return ServiceCheck(
+        served.model_name,
+        info.classes,
+        info.channels,
+        info.rate_hz,
+        info.filter,
+        info.robots,
+        served.table.name,
+        robot,
+        len(prepared.hub.recovered),
+    )
 
 
 class Service:

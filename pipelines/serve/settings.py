@@ -25,3 +25,4 @@ class ServeSettings(Settings):
     max_sessions: int = setting(64, "Robots at once.", ge=1, le=10_000)
     state: Path | None = setting(None, "Folder of what outlives a restart: biases and terrain of each robot.")
     record: Path | None = setting(None, "Folder of the run folders of sessions that ask to be recorded.")
+    check: bool = setting(False, "Load and check all of it, take the port, and end.")

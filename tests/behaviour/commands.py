@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 COMMANDS = (
     *("import", "inspect", "simulate", "calibrate", "estimate", "crossval", "train", "predict"),
     *("learn-slip", "drive", "faults", "can", "explain", "explain-trials", "quickstart", "reproduce"),
-    *("replay", "label"),
+    *("replay", "label", "serve", "bench"),
 )
 
 
@@ -140,7 +140,7 @@ def _csv(head: str, rows: Iterable[Iterable[float]]) -> bytes:
 SLIPPING = "--robot agrimaro --terrain grass --scenario slip --runs 6"
 
 CASES: tuple[Case, ...] = (
-    Case("help", helps=("", *COMMANDS)),
+    Case("help", helps=("", *COMMANDS, "bench live", "bench soak")),
     Case(
         "reading",
         steps(
@@ -224,6 +224,10 @@ CASES: tuple[Case, ...] = (
             "crossval --data runs --protocol published --repeats 1 --no-extras --jobs 1",
             "train --data runs --name field --repeats 1 --jobs 1",
             "predict --model models:/field@champion --data runs",
+            "serve --model models:/field@champion --robot agrimaro --port 0 --check",
+            refused("serve --model models:/field@champion --robot husky --port 0 --check"),
+            refused("serve --model models:/field@champion --host 0.0.0.0 --port 0"),
+            refused("serve --model nowhere --port 0"),
             "drive --scenario starts --terrain grass --controllers plain,learned --seeds 2 --jobs 1 "
             "--model models:/field@champion",
         ),
@@ -294,6 +298,7 @@ CASES: tuple[Case, ...] = (
         steps("explain-trials --n 2 --seed 3 --runs 4 --jobs 1"),
     ),
     Case("reproduce", steps("reproduce danzi --out page")),
+    Case("bench", steps("bench live --robots 1 --seconds 2", refused("bench live --robots 0"))),
     Case(
         "can",
         steps(
