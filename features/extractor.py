@@ -8,34 +8,16 @@ window or on the rate of a stream (bands, lags) is relative to that stream's own
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from sklearn.base import BaseEstimator, TransformerMixin
 from sklearn.utils.validation import check_is_fitted
 
-from features.cross_channel import Feature, correlation_features, derived_channels, speed_features
-from features.slip_features import SLIP_STATISTICS, slip_statistics
-from features.spectral import MIN_SAMPLES, channel_spectra, spectrum_names
-from features.statistics import STATISTICS, channel_statistics
-from features.windows import MAX_RATE_DEVIATION, Layout
+from features.matrix import FeatureMatrix, of_signal_sets
 from terrain.errors import ConfigError, DataError
-from terrain.logs.schema import SIGNAL_SETS, UNIT_SYMBOLS, signal_set_of, unit_of
+from terrain.logs.schema import SIGNAL_SETS
 from terrain.records import Array, Windows
-
-LEVEL_STATISTICS = frozenset({"mean", "min", "max", "q05", "q25", "median", "q75", "q95", "rms", "mean_abs"})
-"""Statistics that move with the level of a signal."""
-
-LEFT_OUT = {
-    "imu": frozenset({"mean", "median"}),
-    "wheels": LEVEL_STATISTICS,
-    "driving": LEVEL_STATISTICS,
-}
-"""Statistics that are computed only on request.  The mean of an IMU channel depends on mounting, bias and
-slope, the level of a speed, measured or estimated, on how the robot was driven; neither is a property of the
-terrain.  ``driving``: speeds and yaw rates among the estimator's states.
-"""
 
 
 class FeatureExtractor(TransformerMixin, BaseEstimator):
@@ -85,15 +67,9 @@ class FeatureExtractor(TransformerMixin, BaseEstimator):
         for name in (*self.signal_sets, *self.level_sets):
             if name not in SIGNAL_SETS:
                 raise ConfigError(f"unknown signal set {name!r}; there are {', '.join(SIGNAL_SETS)}")
-        channels = {
-            stream: kept
-            for stream, names in X.channels.items()
-            if (kept := tuple(c for c in names if signal_set_of(stream, c) in set(self.signal_sets)))
-        }
-        self.layout_ = Layout(channels, {stream: float(X.rate_hz[stream]) for stream in channels})
-        self.length_s_ = float(X.length_s)
-        self.n_samples_ = {stream: int(X.values[stream].shape[2]) for stream in channels}
-        self.features_ = self._extract(self._selected(X[:0]))[0]
+        matrix = of_signal_sets(X, self.signal_sets, self.level_sets)
+        self.layout_, self.length_s_, self.n_samples_, _ = matrix
+        self.features_ = matrix.named(X[:0])[0]
         if not self.features_:
             raise DataError(f"the windows hold no channel of the signal sets {', '.join(self.signal_sets)}")
         return self
@@ -112,7 +88,13 @@ class FeatureExtractor(TransformerMixin, BaseEstimator):
         """
         check_is_fitted(self)
         windows = X if isinstance(X, Windows) else self._as_windows(X)
-        return self._extract(self._selected(windows))[1]
+        return self.matrix.of(windows)
+
+    @property
+    def matrix(self) -> FeatureMatrix:
+        """What the features are computed from."""
+        check_is_fitted(self)
+        return FeatureMatrix(self.layout_, self.length_s_, self.n_samples_, tuple(self.level_sets))
 
     def get_feature_names_out(self, input_features: Any = None) -> Array:
         """Return the name of each column with its unit."""
@@ -133,91 +115,3 @@ class FeatureExtractor(TransformerMixin, BaseEstimator):
         return Windows(
             values, self.layout_.channels, self.layout_.rate_hz, self.length_s_, np.zeros(n), unknown, unknown
         )
-
-    def _selected(self, X: Windows) -> dict[str, Array]:
-        if abs(X.length_s - self.length_s_) > 1e-9:
-            raise DataError(
-                f"windows last {X.length_s:g} s; the features were learned on {self.length_s_:g} s"
-            )
-        values = {}
-        for stream, names in self.layout_.channels.items():
-            missing = [name for name in names if name not in X.channels.get(stream, ())]
-            if missing:
-                raise DataError(f"stream {stream!r} lacks channel {missing[0]!r}, which the features need")
-            rate_hz = X.rate_hz[stream]
-            if abs(rate_hz / self.layout_.rate_hz[stream] - 1) > MAX_RATE_DEVIATION:
-                raise DataError(
-                    f"stream {stream!r} runs at {rate_hz:.4g} Hz; the features were learned at "
-                    f"{self.layout_.rate_hz[stream]:.4g} Hz"
-                )
-            order = [X.channels[stream].index(name) for name in names]
-            array = X.values[stream]
-            if array.shape[2] != self.n_samples_[stream]:
-                raise DataError(
-                    f"a window holds {array.shape[2]} samples of stream {stream!r}; the features were "
-                    f"learned on {self.n_samples_[stream]}"
-                )
-            values[stream] = array if order == list(range(array.shape[1])) else array[:, order]
-        return values
-
-    def _extract(self, values: Mapping[str, Array]) -> tuple[list[Feature], Array]:
-        features: list[Feature] = []
-        parts: list[Array] = []
-        for stream, names in self.layout_.channels.items():
-            for found, part in (
-                self._channel_features(stream, values[stream], names),
-                correlation_features(values[stream], names, stream),
-            ):
-                features += found
-                parts.append(part)
-        found, part = speed_features(values, self.layout_.channels) if values else ([], np.empty((0, 0)))
-        return features + found, np.concatenate([*parts, part], axis=1)
-
-    def _channel_features(
-        self, stream: str, values: Array, names: tuple[str, ...]
-    ) -> tuple[list[Feature], Array]:
-        if stream == "slip":
-            features = [
-                Feature(f"slip.{name.rpartition('_')[0]}.{statistic}", "1", frozenset({"slip"}))
-                for name in names
-                for statistic in SLIP_STATISTICS
-            ]
-            return features, slip_statistics(values).reshape(len(values), len(features))
-        derived, derived_names = derived_channels(values, names)
-        values, names = np.concatenate([values, derived], axis=1), names + derived_names
-        rate_hz = self.layout_.rate_hz[stream]
-        columns, table = list(STATISTICS), channel_statistics(values, rate_hz)
-        if values.shape[2] >= MIN_SAMPLES:
-            columns += spectrum_names(values.shape[2])
-            table = np.concatenate([table, channel_spectra(values, rate_hz)], axis=2)
-        described, kept = _described(stream, tuple(names), tuple(columns), frozenset(self.level_sets))
-        return list(described), table[:, kept]
-
-
-@lru_cache(maxsize=256)
-def _described(
-    stream: str, names: tuple[str, ...], columns: tuple[tuple[str, str], ...], level_sets: frozenset[str]
-) -> tuple[tuple[Feature, ...], Array]:
-    """Return the features of a stream's channels, and which (channels, statistics) they are.
-
-    They are those of every window of a model: made once, as their names cost more than their values.
-    """
-    features, kept = [], np.zeros((len(names), len(columns)), dtype=bool)
-    for i, name in enumerate(names):
-        signal_set = signal_set_of(stream, name) or ""
-        driving = signal_set == "estimator" and name.startswith(("speed_", "yaw_"))
-        left_out = LEFT_OUT.get("driving" if driving else signal_set, frozenset())
-        unit = UNIT_SYMBOLS[unit_of(name)]
-        for j, (statistic, statistic_unit) in enumerate(columns):
-            if statistic in left_out and signal_set not in level_sets:
-                continue
-            kept[i, j] = True
-            features.append(
-                Feature(
-                    f"{stream}.{name.rpartition('_')[0]}.{statistic}",
-                    unit if statistic_unit == "x" else statistic_unit,
-                    frozenset({signal_set}),
-                )
-            )
-    kept.flags.writeable = False
-    return tuple(features), kept

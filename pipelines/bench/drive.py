@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from pipelines.models.lean import write_numbers
 from pipelines.models.model_files import MODEL_FILE, TerrainModel, write_info
 from pipelines.models.tracking import load_model
 from terrain.estimation.enriched import enriched
@@ -60,6 +61,7 @@ def model_folder(uri: str | None, seed: int, into: Path) -> str:
     model = bench_model(None, seed)
     into.mkdir(parents=True, exist_ok=True)
     io.dump(model.recipe, into / MODEL_FILE)
+    write_numbers(into, model.recipe)  # type: ignore[arg-type]
     write_info(into, model.info)
     return str(into)
 

@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
-
 import typer
 
 from pipelines.cli.command import Json, command
@@ -14,24 +10,10 @@ from pipelines.serve.settings import ServeSettings
 app = typer.Typer()
 
 
-@contextmanager
-def without(package: str) -> Iterator[None]:
-    """Keep a package that others import where they find it from being imported."""
-    if package in sys.modules:
-        yield
-        return
-    sys.modules[package] = None  # type: ignore[assignment]
-    try:
-        yield
-    finally:
-        del sys.modules[package]
-
-
 @command(app, "serve")
 def serve_command(settings: ServeSettings, json_file: Json = None) -> None:
     """Serve terrain, target slips and commands to robots, live."""
-    with without("pandas"):  # scikit-learn takes it: 67 MB and a second, and the service has no use for it
-        from pipelines.serve.server import Service, checked, prepare
+    from pipelines.serve.server import Service, checked, prepare
 
     prepared = prepare(settings)
     if not settings.check:

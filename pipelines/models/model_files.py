@@ -11,10 +11,10 @@ import io as streams
 import json
 import zipfile
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from features.windows import Layout, WindowRule
-from pipelines.models.recipes import WindowPipeline
+from pipelines.models.lean import NUMBERS_FILE, LeanRecipe, read_numbers
 from pipelines.models.results import ModelInfo
 from pipelines.reporting.json_file import as_json
 from terrain.errors import ConfigError, DataError, ModelError
@@ -22,6 +22,9 @@ from terrain.files.atomic import atomic_write
 from terrain.files.documents import MAX_JSON_BYTES, parse_json
 from terrain.files.names import MAX_NAME, printable, shown
 from terrain.files.regular import MEBIBYTE, check_inside, read_regular
+
+if TYPE_CHECKING:
+    from pipelines.models.recipes import WindowPipeline
 
 MODEL_FILE = "model.skops"
 INFO_FILE = "terrain_model.json"
@@ -54,9 +57,12 @@ _INFO_ERRORS = (TypeError, KeyError, AttributeError, ValueError, ArithmeticError
 
 
 class TerrainModel(NamedTuple):
-    """A fitted recipe, and how its training windows were cut."""
+    """A fitted recipe, and how its training windows were cut.
 
-    recipe: WindowPipeline
+    ``recipe`` has ``predict_proba(windows)`` and ``classes_``: the scikit-learn pipeline, or its numbers.
+    """
+
+    recipe: WindowPipeline | LeanRecipe
     info: ModelInfo
 
     @property
@@ -71,10 +77,15 @@ class TerrainModel(NamedTuple):
 
 
 def write_info(folder: Path, info: ModelInfo) -> None:
-    """Write ``terrain_model.json`` beside a ``model.skops``, with the checksum of the latter."""
-    sha256 = hashlib.sha256((folder / MODEL_FILE).read_bytes()).hexdigest()
-    content = {"version": INFO_VERSION, "sha256": sha256, **as_json(info)}
+    """Write ``terrain_model.json`` beside a model's files, with their checksums."""
+    content = {"version": INFO_VERSION, "sha256": _sha256(folder / MODEL_FILE), **as_json(info)}
+    if (folder / NUMBERS_FILE).is_file():
+        content["numbers_sha256"] = _sha256(folder / NUMBERS_FILE)
     atomic_write(folder / INFO_FILE, json.dumps(content, indent=2, sort_keys=True) + "\n")
+
+
+def _sha256(file: Path) -> str:
+    return hashlib.sha256(file.read_bytes()).hexdigest()
 
 
 def read_model(folder: Path) -> TerrainModel:
@@ -85,30 +96,77 @@ def read_model(folder: Path) -> TerrainModel:
     ModelError
         if it is no model of this package, is damaged, or holds a type that is not on the list.
     """
+    document = _read_info(folder)
+    file = folder / MODEL_FILE
+    content = _checked(file, MAX_MODEL_BYTES, document["sha256"])
+    return _model(_load(file, content), folder, document)
+
+
+def read_lean_model(folder: Path) -> TerrainModel:
+    """Read a model folder for a service: its numbers where they are there, without scikit-learn.
+
+    Raises
+    ------
+    ModelError
+        as :func:`read_model`.
+    """
+    document = _read_info(folder)
+    file = folder / NUMBERS_FILE
+    if "numbers_sha256" not in document or not file.is_file():  # of an earlier release
+        return read_model(folder)
+    check_inside(file, folder, str(file), ModelError)
+    content = _checked(file, MAX_MODEL_BYTES, document["numbers_sha256"])
+    info = _info(folder, document)
+    try:
+        recipe = read_numbers(content, info)
+    except (*_INFO_ERRORS, DataError) as error:
+        raise ModelError(f"{file}: cannot be loaded ({_words(error)})") from error
+    return _model(recipe, folder, document)
+
+
+def _read_info(folder: Path) -> dict[str, Any]:
+    """Return the document beside a model, whose version and keys are checked."""
     file, info_file = folder / MODEL_FILE, folder / INFO_FILE
     if not file.is_file() or not info_file.is_file():
         raise ModelError(f"{folder}: holds no model of this package ({MODEL_FILE} and {INFO_FILE})")
     for each in (file, info_file):
         check_inside(each, folder, str(each), ModelError)
     try:
-        document = parse_json(read_regular(info_file, str(info_file), ModelError, MAX_JSON_BYTES))
-        version, expected = document.pop("version"), document.pop("sha256")
+        document: dict[str, Any] = parse_json(
+            read_regular(info_file, str(info_file), ModelError, MAX_JSON_BYTES)
+        )
+        version, _ = document["version"], document["sha256"]
         missing = INFO_KEYS - set(document)
     except _INFO_ERRORS as error:
         raise _damaged(info_file, error) from error
     if version != INFO_VERSION or missing:
         raise ModelError(f"{info_file}: has version {shown(version)}; version {INFO_VERSION} is read here")
-    content = read_regular(file, str(file), ModelError, MAX_MODEL_BYTES)
+    return document
+
+
+def _checked(file: Path, most_bytes: int, expected: Any) -> bytes:
+    content = read_regular(file, str(file), ModelError, most_bytes)
     found = hashlib.sha256(content).hexdigest()
     if found != expected:
         raise ModelError(f"{file}: is damaged (SHA-256 {found[:12]}..., {str(expected)[:12]}... expected)")
+    return content
+
+
+def _info(folder: Path, document: dict[str, Any]) -> ModelInfo:
+    kept = {
+        name: value for name, value in document.items() if name not in ("version", "sha256", "numbers_sha256")
+    }
     try:
-        model = TerrainModel(_load(file, content), ModelInfo.from_json(document))
-        for stream in model.layout.channels:
-            model.layout.n_samples(stream, model.rule.length_s)
+        info = ModelInfo.from_json(kept)
+        for stream in info.layout.channels:
+            info.layout.n_samples(stream, info.rule.length_s)
     except (*_INFO_ERRORS, ConfigError, DataError) as error:
-        raise _damaged(info_file, error) from error
-    return model
+        raise _damaged(folder / INFO_FILE, error) from error
+    return info
+
+
+def _model(recipe: WindowPipeline | LeanRecipe, folder: Path, document: dict[str, Any]) -> TerrainModel:
+    return TerrainModel(recipe, _info(folder, document))
 
 
 def _damaged(info_file: Path, error: Exception) -> ModelError:
@@ -121,6 +179,8 @@ def _words(error: Exception) -> str:
 
 def _load(file: Path, content: bytes) -> WindowPipeline:
     from skops import io
+
+    from pipelines.models.recipes import WindowPipeline
 
     try:
         _check_archive(file, content)

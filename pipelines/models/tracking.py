@@ -19,6 +19,7 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, NamedTuple
 from urllib.parse import urlsplit
 
+from pipelines.models.lean import write_numbers
 from pipelines.models.model_files import TRUSTED_TYPES, TerrainModel, read_model, write_info
 from pipelines.models.recipes import WindowPipeline
 from pipelines.models.results import ModelInfo, Registered
@@ -241,6 +242,7 @@ def _log_model(mlflow: Any, name: str, recipe: WindowPipeline, windows: Windows,
 
     def save_model(path: str, mlflow_model: Any, **options: Any) -> None:
         mlflow.sklearn.save_model(recipe, path, mlflow_model=mlflow_model, **options)
+        write_numbers(Path(path), recipe)
         write_info(Path(path), info)
 
     flavor = SimpleNamespace(save_model=save_model, __name__="mlflow.sklearn")

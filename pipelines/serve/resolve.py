@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from pipelines.models.model_files import TerrainModel, read_model
+from pipelines.models.model_files import TerrainModel, read_lean_model
 from terrain.errors import ModelError
 
 TIMEOUT_S = 120.0
@@ -36,10 +36,10 @@ def load_model(uri: str) -> TerrainModel:
         if done.returncode != 0:
             lines = done.stderr.strip().splitlines()
             raise ModelError(lines[-1] if lines else f"{uri}: cannot be loaded")
-        return read_model(Path(done.stdout.strip().splitlines()[-1]))
+        return read_lean_model(Path(done.stdout.strip().splitlines()[-1]))
 
 
 def _read(folder: Path, uri: str) -> TerrainModel:
     if not folder.exists():
         raise ModelError(f"{uri}: is neither a folder nor a model URI such as models:/NAME@champion")
-    return read_model(folder)
+    return read_lean_model(folder)

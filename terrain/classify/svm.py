@@ -30,6 +30,7 @@ from sklearn.utils.multiclass import check_classification_targets
 from sklearn.utils.validation import check_is_fitted, validate_data
 
 from terrain.classify.folds import block_groups, split_runs
+from terrain.classify.svm_numbers import SvmNumbers
 from terrain.errors import DataError
 from terrain.records import Array
 
@@ -195,6 +196,32 @@ class GroupedSVC(ClassifierMixin, BaseEstimator):
         """Return the class of the highest probability (n,)."""
         best = self._decisions(X).argmax(axis=1)
         return np.asarray(self.classes_[best])
+
+    def numbers(self) -> SvmNumbers:
+        """Return all that the fitted classifier computes with, for :mod:`terrain.classify.svm_numbers`."""
+        check_is_fitted(self)
+        steps, svc = self.preparation_.named_steps, self.svc_
+        varying = np.flatnonzero(steps["constant"].get_support())
+        selected = steps["select"].get_support()
+        columns = varying[selected]
+        sign = -1.0 if len(svc.classes_) == 2 else 1.0  # scikit-learn turns the two-class decision around
+        bounds = np.concatenate(([0], np.cumsum(svc.n_support_)))
+        pairs = [(a, b) for a in range(len(svc.classes_)) for b in range(a + 1, len(svc.classes_))]
+        weights = np.zeros((len(svc.support_vectors_), len(pairs)))
+        for pair, (a, b) in enumerate(pairs):
+            of_a, of_b = slice(bounds[a], bounds[a + 1]), slice(bounds[b], bounds[b + 1])
+            weights[of_a, pair] = sign * svc.dual_coef_[b - 1, of_a]
+            weights[of_b, pair] = sign * svc.dual_coef_[a, of_b]
+        return SvmNumbers(
+            columns.astype(np.int64),
+            np.nan_to_num(steps["impute"].statistics_[columns]),  # of a feature without any value
+            steps["scale"].mean_[selected],
+            steps["scale"].scale_[selected],
+            svc.support_vectors_,
+            weights,
+            sign * svc.intercept_,
+            np.array([CLIP_STD, float(svc.gamma), self.temperature_, self.n_features_in_]),
+        )
 
     def __sklearn_tags__(self) -> Any:
         """Declare that NaN is accepted."""

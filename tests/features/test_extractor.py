@@ -5,7 +5,8 @@ import pytest
 from sklearn.base import clone
 from skops import io
 
-from features.extractor import LEFT_OUT, LEVEL_STATISTICS, FeatureExtractor
+from features.extractor import FeatureExtractor
+from features.matrix import LEFT_OUT, LEVEL_STATISTICS
 from features.stream import WindowStream
 from features.windows import WindowRule, cut_windows, layout_of
 from terrain.errors import ConfigError, DataError

@@ -1,0 +1,114 @@
+"""A fitted :class:`~terrain.classify.svm.GroupedSVC` as plain numbers: probabilities without scikit-learn.
+
+Importing scikit-learn takes longer than all else that a live service imports, and most of a window's time on
+the robot goes into checks of its inputs.  The numbers are those that it fitted:
+
+- missing features take their median, the columns that were kept are scaled and clipped;
+- of each pair of classes (a, b), a before b: ``f = sum_i w_i exp(-gamma |x - v_i|^2) + c``, positive for a;
+- decisions of the classes are votes of the pairs, and their margins within a vote: ``V + M / (3 (|M| + 1))``
+  with the sum M of a class's margins (scikit-learn's one-vs-rest form of one-vs-one);
+- ``p = softmax(d / T)``.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from terrain.errors import DataError
+from terrain.records import Array
+
+
+class SvmNumbers(NamedTuple):
+    """What a fitted classifier computes with.
+
+    Parameters
+    ----------
+    columns : (m,) places of the features that are used
+    fill, mean, scale : (m,) median, mean and standard deviation of each
+    vectors : (s, m) support vectors, scaled and clipped
+    weights : (s, p) of each support vector in each pair of classes
+    offsets : (p,) of each pair
+    settings : (4,) clip in standard deviations, gamma, temperature, number of features before selection
+    """
+
+    columns: Array
+    fill: Array
+    mean: Array
+    scale: Array
+    vectors: Array
+    weights: Array
+    offsets: Array
+    settings: Array
+
+    @property
+    def n_classes(self) -> int:
+        """Number of classes k, of which there are k (k - 1) / 2 pairs."""
+        return (1 + math.isqrt(1 + 8 * len(self.offsets))) // 2
+
+
+def check_numbers(numbers: SvmNumbers, n_classes: int) -> None:
+    """Refuse numbers that do not fit each other.
+
+    Raises
+    ------
+    DataError
+        if a shape is another, a number is not finite, or a place is none.
+    """
+    m, s, p = len(numbers.columns), len(numbers.vectors), n_classes * (n_classes - 1) // 2
+    shapes = ((m,), (m,), (m,), (m,), (s, m), (s, p), (p,), (4,))
+    for name, array, shape in zip(numbers._fields, numbers, shapes, strict=True):
+        kind = "iu" if name == "columns" else "f"
+        if array.shape != shape or array.dtype.kind not in kind or not np.isfinite(array).all():
+            raise DataError(f"the classifier's {name} are not {shape} finite numbers")
+    if m == 0 or numbers.columns.min() < 0 or numbers.columns.max() >= numbers.settings[3]:
+        raise DataError("the classifier's columns are none of its features")
+    if (numbers.scale <= 0.0).any() or (numbers.settings <= 0.0).any():
+        raise DataError("the classifier's scales are not above zero")
+
+
+def probabilities(numbers: SvmNumbers, features: Array) -> Array:
+    """Return calibrated probabilities (n, k) in the order of the classes.
+
+    Parameters
+    ----------
+    numbers : of the classifier
+    features : (n, f), NaN where not defined
+
+    Raises
+    ------
+    DataError
+        if there are not as many features, or one is infinite.
+    """
+    clip, gamma, temperature, n_features = numbers.settings.tolist()
+    if features.ndim != 2 or features.shape[1] != n_features:
+        raise DataError(f"features have the shape {features.shape}, (n, {n_features:.0f}) is needed")
+    if np.isinf(features).any():
+        raise DataError("a feature is infinite")
+    used = features[:, numbers.columns]
+    used = np.where(np.isnan(used), numbers.fill, used)
+    scaled = np.clip((used - numbers.mean) / numbers.scale, -clip, clip)
+    decisions = np.array([_decision(numbers, gamma, row) for row in scaled])
+    logits = decisions / temperature
+    weights = np.exp(logits - logits.max(axis=1, keepdims=True))
+    found: Array = weights / weights.sum(axis=1, keepdims=True)
+    return found
+
+
+def _decision(numbers: SvmNumbers, gamma: float, row: Array) -> Array:
+    difference = numbers.vectors - row
+    kernel = np.exp(-gamma * np.einsum("ij,ij->i", difference, difference))
+    margins = kernel @ numbers.weights + numbers.offsets
+    k = numbers.n_classes
+    votes, sums = np.zeros(k), np.zeros(k)
+    first, second = np.triu_indices(k, 1)
+    np.add.at(sums, first, margins)
+    np.subtract.at(sums, second, margins)
+    for_first = margins >= 0.0
+    np.add.at(votes, np.where(for_first, first, second), 1.0)
+    if k == 2:
+        return np.array([margins[0], -margins[0]])
+    found: Array = votes + sums / (3.0 * (np.abs(sums) + 1.0))
+    return found
