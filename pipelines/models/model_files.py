@@ -115,6 +115,7 @@ def read_lean_model(folder: Path) -> TerrainModel:
     if "numbers_sha256" not in document or not file.is_file():  # of an earlier release
         return read_model(folder)
     check_inside(file, folder, str(file), ModelError)
+    _checked(folder / MODEL_FILE, MAX_MODEL_BYTES, document["sha256"])  # damaged in part is damaged
     content = _checked(file, MAX_MODEL_BYTES, document["numbers_sha256"])
     info = _info(folder, document)
     try:

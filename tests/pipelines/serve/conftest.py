@@ -10,6 +10,7 @@ import pytest
 from skops import io
 from websockets.sync.client import connect
 
+from pipelines.models.lean import write_numbers
 from pipelines.models.model_files import write_info
 from pipelines.serve.server import Service, prepare
 from pipelines.serve.settings import ServeSettings
@@ -22,6 +23,7 @@ CHANNELS = {"imu": ["accel_z_mps2"], "wheels": ["speed_left_mps"]}
 def model_folder(mower_model, tmp_path_factory):
     folder = tmp_path_factory.mktemp("model")
     io.dump(mower_model.recipe, folder / "model.skops")
+    write_numbers(folder, mower_model.recipe)
     write_info(folder, mower_model.info)
     return folder
 
