@@ -14,6 +14,9 @@ from terrain.errors import TerrainError
 
 ANSWER_S = 5.0
 
+APART_S = 2.0
+"""Robots do not start at one instant, and their windows do not end at one."""
+
 
 class Driven(NamedTuple):
     """What a robot saw: round trips, rows sent, and answers that did not come."""
@@ -90,6 +93,8 @@ async def drive(url: str, first: bytes, messages: Sequence[Packed], delay_s: flo
 async def drive_all(
     url: str, robot: str, channels: dict[str, list[str]], messages: Sequence[Packed], n: int
 ) -> list[Driven]:
-    """Drive several robots at once, their steps spread over a period."""
-    tasks = [drive(url, hello(f"bench-{k}", robot, channels), messages, 0.5 + 0.05 * k / n) for k in range(n)]
+    """Drive several robots at once, their starts spread over the time of a window."""
+    tasks = [
+        drive(url, hello(f"bench-{k}", robot, channels), messages, 0.5 + APART_S * k / n) for k in range(n)
+    ]
     return list(await asyncio.gather(*tasks))

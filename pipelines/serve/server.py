@@ -8,6 +8,7 @@ import os
 import signal
 import socket
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -152,6 +153,8 @@ class Service:
     async def _run(self, announce: Callable[[str], None]) -> None:
         hub, server = self._prepared.hub, self._server
         server.loop = asyncio.get_running_loop()
+        # few threads for what takes long: each has memory of its own that is not given back
+        server.loop.set_default_executor(ThreadPoolExecutor(max_workers=2))
 
         async def save() -> None:
             while True:

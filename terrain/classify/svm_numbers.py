@@ -13,9 +13,11 @@ the robot goes into checks of its inputs.  The numbers are those that it fitted:
 from __future__ import annotations
 
 import math
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 
 from terrain.errors import DataError
 from terrain.records import Array
@@ -90,25 +92,41 @@ def probabilities(numbers: SvmNumbers, features: Array) -> Array:
     used = features[:, numbers.columns]
     used = np.where(np.isnan(used), numbers.fill, used)
     scaled = np.clip((used - numbers.mean) / numbers.scale, -clip, clip)
-    decisions = np.array([_decision(numbers, gamma, row) for row in scaled])
+    margins = _margins(numbers.vectors, numbers.weights, numbers.offsets, gamma, scaled)
+    decisions = _decisions(margins, numbers.n_classes)
     logits = decisions / temperature
     weights = np.exp(logits - logits.max(axis=1, keepdims=True))
     found: Array = weights / weights.sum(axis=1, keepdims=True)
     return found
 
 
-def _decision(numbers: SvmNumbers, gamma: float, row: Array) -> Array:
-    difference = numbers.vectors - row
-    kernel = np.exp(-gamma * np.einsum("ij,ij->i", difference, difference))
-    margins = kernel @ numbers.weights + numbers.offsets
-    k = numbers.n_classes
-    votes, sums = np.zeros(k), np.zeros(k)
-    first, second = np.triu_indices(k, 1)
-    np.add.at(sums, first, margins)
-    np.subtract.at(sums, second, margins)
-    for_first = margins >= 0.0
-    np.add.at(votes, np.where(for_first, first, second), 1.0)
-    if k == 2:
-        return np.array([margins[0], -margins[0]])
+@njit(cache=True, nogil=True, error_model="numpy")
+def _margins(vectors: Array, weights: Array, offsets: Array, gamma: float, rows: Array) -> Array:
+    """Return the margin (n, p) of each pair of classes; other threads go on meanwhile."""
+    margins = np.empty((rows.shape[0], offsets.size))
+    for n in range(rows.shape[0]):
+        margins[n] = offsets
+        for i in range(vectors.shape[0]):
+            squares = 0.0
+            for j in range(vectors.shape[1]):
+                difference = vectors[i, j] - rows[n, j]
+                squares += difference * difference
+            kernel = np.exp(-gamma * squares)
+            for pair in range(offsets.size):
+                margins[n, pair] += kernel * weights[i, pair]
+    return margins
+
+
+def _decisions(margins: Array, n_classes: int) -> Array:
+    """Return the decision (n, k) of each class: votes of its pairs, and margins within a vote."""
+    if n_classes == 2:
+        return np.hstack([margins, -margins])
+    votes, sums = np.zeros((2, len(margins), n_classes))
+    for pair, (a, b) in enumerate(combinations(range(n_classes), 2)):
+        margin = margins[:, pair]
+        sums[:, a] += margin
+        sums[:, b] -= margin
+        votes[:, a] += margin >= 0.0
+        votes[:, b] += margin < 0.0
     found: Array = votes + sums / (3.0 * (np.abs(sums) + 1.0))
     return found
