@@ -250,10 +250,13 @@ def _token(settings: ServeSettings) -> str:
     if settings.token_file is None:
         return os.environ.get("TERRAIN_TOKEN", "").strip()
     try:
-        return Path(settings.token_file).read_text(encoding="utf-8").strip()
+        token = Path(settings.token_file).read_text(encoding="utf-8").strip()
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "no text"
         raise ConfigError(f"{settings.token_file}: cannot be read ({reason})") from None
+    if not token:
+        raise ConfigError(f"{settings.token_file}: holds no token")
+    return token
 
 
 def _listen(host: str, port: int) -> socket.socket:
@@ -261,8 +264,9 @@ def _listen(host: str, port: int) -> socket.socket:
     try:
         family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
         listening = socket.socket(family, socket.SOCK_STREAM)
-    except OSError as error:
-        raise ConfigError(f"--host {host}: is no address ({error.strerror})") from None
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or "no name of a machine"
+        raise ConfigError(f"--host {host[:100]!r}: is no address ({reason})") from None
     try:
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listening.bind((host, port))
