@@ -101,7 +101,11 @@ class Connection:
             self._end = (POLICY, "no hello came in time")
             return None, 0.0
         accepted = {name: value for name, value in limits._asdict().items() if name != "sessions"}
-        await self._write(welcome(hello, opened.chain, opened.restored, accepted))
+        try:
+            await self._write(welcome(hello, opened.chain, opened.restored, accepted))
+        except BaseException:  # it has left meanwhile
+            self._hub.close(opened)
+            raise
         return opened, hello.rate_hz
 
     async def _receive(self, opened: OpenSession, rate_hz: float) -> None:
