@@ -131,7 +131,7 @@ class Connection:
                 self._note(error.code, str(error))
 
     def _take(self, opened: OpenSession, content: dict[str, Any], now_s: float) -> None:
-        """Take the samples of a message; what is refused of it is named in one error."""
+        """Take the samples of a message; what is refused of it is named in one error, the rest is used."""
         chain = opened.chain
         n_rows = _n_rows(content.get("streams"))
         if not self._rows.take(n_rows, now_s):
@@ -141,7 +141,7 @@ class Connection:
         self._hub.metrics.rows.inc(chain.put(content.get("streams"), content.get("twist"), now_s))
         refused = chain.inbox.refused - before
         if refused:
-            raise WireError("malformed", f"samples: {'; '.join(sorted(refused))}")
+            self._note("malformed", f"samples: {'; '.join(sorted(refused))}")
 
     async def _tick(self, opened: OpenSession, rate_hz: float) -> None:
         """Step at the rate that was asked for; ticks that cannot be kept are left out and counted."""

@@ -21,6 +21,7 @@ from pipelines.models.model_files import TerrainModel
 from pipelines.serve.app import make_app
 from pipelines.serve.guard import check_token, is_loopback
 from pipelines.serve.hub import Hub, Limits
+from pipelines.serve.protocol import HttpProtocol, SocketProtocol
 from pipelines.serve.resolve import load_model
 from pipelines.serve.results import ServiceCheck
 from pipelines.serve.settings import ServeSettings
@@ -120,7 +121,8 @@ class Service:
             log_level="critical",
             access_log=False,
             lifespan="off",
-            ws="websockets-sansio",
+            http=HttpProtocol,
+            ws=SocketProtocol,
             ws_max_size=LARGEST_MESSAGE,
             ws_ping_interval=PING_S,
             ws_ping_timeout=PING_S,
