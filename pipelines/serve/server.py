@@ -43,6 +43,9 @@ WARM_STEPS = 30
 LEAVING_STEPS = 150
 """Hundredths of a second that robots have to read that the service ends."""
 
+CLOSING_STEPS = 20
+"""Twentieths of a second for their answers."""
+
 
 class Prepared(NamedTuple):
     """A service that is ready to listen."""
@@ -204,6 +207,10 @@ class _Server(uvicorn.Server):
             if not self._hub.sessions:
                 break
             await asyncio.sleep(0.01)
+        for _ in range(CLOSING_STEPS):  # ended at once, what was sent last would be lost
+            await asyncio.sleep(0.05)
+            if not any(getattr(one, "close_sent", False) for one in self.server_state.connections):
+                break
         self.should_exit = True
 
 
