@@ -88,7 +88,7 @@ def test_connections_that_say_nothing_are_ended(driving, monkeypatch):
     assert driving.get("/health")[0] == 200
 
 
-def test_a_receiver_that_does_not_read_is_ended_and_disturbs_nobody(driving):
+def test_a_receiver_that_does_not_read_is_ended_and_disturbs_no_other(driving):
     begun = {**DRIVEN, "type": "hello", "rate_hz": 200}
     with raw(driving, {**begun, "session": "slow"}, buffer=8192) as slow:
         until(lambda: "slow" in driving.hub.sessions)
