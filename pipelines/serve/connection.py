@@ -101,7 +101,11 @@ class Connection:
             self._end = (POLICY, "no hello came in time")
             return None, 0.0
         accepted = {name: value for name, value in limits._asdict().items() if name != "sessions"}
-        await self._write(welcome(hello, opened.chain, opened.restored, accepted))
+        try:
+            await self._write(welcome(hello, opened.chain, opened.restored, accepted))
+        except BaseException:  # it has left meanwhile
+            self._hub.close(opened)
+            raise
         return opened, hello.rate_hz
 
     async def _receive(self, opened: OpenSession, rate_hz: float) -> None:
@@ -127,7 +131,7 @@ class Connection:
                 self._note(error.code, str(error))
 
     def _take(self, opened: OpenSession, content: dict[str, Any], now_s: float) -> None:
-        """Take the samples of a message; what is refused of it is named in one error."""
+        """Take the samples of a message; what is refused of it is named in one error, the rest is used."""
         chain = opened.chain
         n_rows = _n_rows(content.get("streams"))
         if not self._rows.take(n_rows, now_s):
@@ -137,7 +141,7 @@ class Connection:
         self._hub.metrics.rows.inc(chain.put(content.get("streams"), content.get("twist"), now_s))
         refused = chain.inbox.refused - before
         if refused:
-            raise WireError("malformed", f"samples: {'; '.join(sorted(refused))}")
+            self._note("malformed", f"samples: {'; '.join(sorted(refused))}")
 
     async def _tick(self, opened: OpenSession, rate_hz: float) -> None:
         """Step at the rate that was asked for; ticks that cannot be kept are left out and counted."""

@@ -209,12 +209,16 @@ class Hub:
         """Write states to the folder, if there is one; one that cannot be written is named in ``trouble``."""
         if self._folder is None:
             return
-        self.trouble.pop("states", None)
+        failed = ""
         for name, state in states.items():
             try:
                 save_state(self._folder / f"{name}.json", state)
             except TerrainError as error:
-                self.trouble["states"] = str(error)
+                failed = str(error)
+        if failed:
+            self.trouble["states"] = failed
+        else:
+            self.trouble.pop("states", None)
 
     def stop(self) -> None:
         """End the threads; recordings are written."""

@@ -25,7 +25,7 @@ def load_model(uri: str) -> TerrainModel:
     ModelError
         if there is no such model, or it is damaged or foreign.
     """
-    if Path(uri).exists() or not uri.startswith(("models:/", "runs:/")):
+    if not uri.startswith(("models:/", "runs:/")) or Path(uri).exists():
         return _read(Path(uri), uri)
     with TemporaryDirectory() as folder:
         command = [sys.executable, "-m", "pipelines.models.fetch", uri, folder]
@@ -40,6 +40,10 @@ def load_model(uri: str) -> TerrainModel:
 
 
 def _read(folder: Path, uri: str) -> TerrainModel:
-    if not folder.exists():
+    try:
+        there = folder.exists()
+    except OSError as error:
+        raise ModelError(f"{uri[:100]}: cannot be opened ({error.strerror})") from None
+    if not there:
         raise ModelError(f"{uri}: is neither a folder nor a model URI such as models:/NAME@champion")
     return read_lean_model(folder)

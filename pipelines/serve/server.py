@@ -22,6 +22,7 @@ from pipelines.models.model_files import TerrainModel
 from pipelines.serve.app import make_app
 from pipelines.serve.guard import check_token, is_loopback
 from pipelines.serve.hub import Hub, Limits
+from pipelines.serve.protocol import HttpProtocol, SocketProtocol
 from pipelines.serve.resolve import load_model
 from pipelines.serve.results import ServiceCheck
 from pipelines.serve.settings import ServeSettings
@@ -42,6 +43,9 @@ WARM_STEPS = 30
 
 LEAVING_STEPS = 150
 """Hundredths of a second that robots have to read that the service ends."""
+
+CLOSING_STEPS = 20
+"""Twentieths of a second for their answers."""
 
 
 class Prepared(NamedTuple):
@@ -121,7 +125,8 @@ class Service:
             log_level="critical",
             access_log=False,
             lifespan="off",
-            ws="websockets-sansio",
+            http=HttpProtocol,
+            ws=SocketProtocol,
             ws_max_size=LARGEST_MESSAGE,
             ws_ping_interval=PING_S,
             ws_ping_timeout=PING_S,
@@ -205,6 +210,10 @@ class _Server(uvicorn.Server):
             if not self._hub.sessions:
                 break
             await asyncio.sleep(0.01)
+        for _ in range(CLOSING_STEPS):  # ended at once, what was sent last would be lost
+            await asyncio.sleep(0.05)
+            if not any(getattr(one, "close_sent", False) for one in self.server_state.connections):
+                break
         self.should_exit = True
 
 
@@ -253,10 +262,13 @@ def _token(settings: ServeSettings) -> str:
     if settings.token_file is None:
         return os.environ.get("TERRAIN_TOKEN", "").strip()
     try:
-        return Path(settings.token_file).read_text(encoding="utf-8").strip()
+        token = Path(settings.token_file).read_text(encoding="utf-8").strip()
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "no text"
         raise ConfigError(f"{settings.token_file}: cannot be read ({reason})") from None
+    if not token:
+        raise ConfigError(f"{settings.token_file}: holds no token")
+    return token
 
 
 def _listen(host: str, port: int) -> socket.socket:
@@ -264,8 +276,9 @@ def _listen(host: str, port: int) -> socket.socket:
     try:
         family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
         listening = socket.socket(family, socket.SOCK_STREAM)
-    except OSError as error:
-        raise ConfigError(f"--host {host}: is no address ({error.strerror})") from None
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or "no name of a machine"
+        raise ConfigError(f"--host {host[:100]!r}: is no address ({reason})") from None
     try:
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listening.bind((host, port))

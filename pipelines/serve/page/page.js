@@ -5,7 +5,7 @@
   const COLOURS = ["#2f7ed8", "#e07a1f", "#2c9c5a", "#b5489c", "#8a6d3b", "#5ab4c9", "#d0433f", "#7a7f2a", "#6b63c4", "#c98f00", "#3f8f8a", "#9a5a44"];
   const BAD = ["lost", "frozen", "stepped", "disagrees", "gated"], DOUBTFUL = ["late", "reopened", "not finite"];
   const byId = (id) => document.getElementById(id);
-  const state = { socket: null, session: "", token: sessionStorage.getItem("token") || "", wheels: null, name: null, heard: 0, retry: 500, terrains: [], number: -1 };
+  const state = { socket: null, session: "", token: sessionStorage.getItem("token") || "", wheels: null, name: null, heard: 0, stepped: 0, retry: 500, terrains: [], number: -1 };
   const history = { t: [], terrain: [], probability: [] };
   let plots = { slip: [], current: null }, series = null;
 
@@ -28,6 +28,7 @@
     socket.onmessage = (event) => take(JSON.parse(event.data));
     socket.onclose = () => {
       if (byId("token-form").hidden) {
+        document.body.classList.add("stale");
         setConnection("lost", "not connected, trying again");
         setTimeout(connect, state.retry);
         state.retry = Math.min(state.retry * 2, 5000);
@@ -54,14 +55,16 @@
     byId("token-form").hidden = true;
     state.retry = 500;
     state.heard = performance.now();
-    document.body.classList.remove("stale");
     show(message);
   }
   setInterval(() => {
-    if (state.heard && performance.now() - state.heard > STALE_MS) {
-      document.body.classList.add("stale");
-      setConnection("lost", "nothing heard for " + Math.round((performance.now() - state.heard) / 1000) + " s");
-    }
+    const now = performance.now(), silent = now - state.heard > STALE_MS;
+    if (!state.heard || !byId("token-form").hidden) return;
+    if (silent) setConnection("lost", "nothing heard for " + Math.round((now - state.heard) / 1000) + " s");
+    else if (state.present && now - state.stepped > STALE_MS)
+      setConnection("lost", "no step of this robot for " + Math.round((now - state.stepped) / 1000) + " s");
+    else return;
+    document.body.classList.add("stale");
   }, 500);
 
   // --- what is shown ----------------------------------------------------------------------------------
@@ -71,11 +74,18 @@
     text("table", message.served.table);
     text("trouble", message.trouble.length ? message.trouble.join("; ") : "none");
     const session = message.session, step = session && session.step;
-    if (!session) { setConnection("waiting", "connected, no robot yet"); return; }
+    state.present = Boolean(step);
+    if (!session) {
+      if (state.name !== null) document.body.classList.add("stale");
+      setConnection("waiting", state.name === null ? "connected, no robot yet" : "connected, no robot any more");
+      return;
+    }
     if (session.name !== state.name) begin(session);
     if (!step) { setConnection("waiting", "connected, no step yet"); return; }
     if (step.number === state.number) return;
     state.number = step.number;
+    state.stepped = performance.now();
+    document.body.classList.remove("stale");
     setConnection("live", "live");
     const seen = step.observation;
     showTerrain(step, seen);

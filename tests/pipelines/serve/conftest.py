@@ -56,7 +56,7 @@ class Running:
 
 @contextmanager
 def _running(limits=None, **options):
-    prepared = prepare(ServeSettings(port=0, **options))
+    prepared = prepare(ServeSettings(**{"port": 0, **options}))
     if limits is not None:
         prepared.hub.limits = limits
     service, ready = Service(prepared), threading.Event()

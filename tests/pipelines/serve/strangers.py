@@ -1,0 +1,97 @@
+"""Connections that keep to no rule, and a robot that drives beside them."""
+
+import json
+import socket
+import struct
+import threading
+import time
+from contextlib import contextmanager
+from urllib.parse import urlsplit
+
+HANDSHAKE = (
+    "GET /robots HTTP/1.1\r\nHost: {}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+    "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n"
+)
+
+
+def until(fact, timeout_s=5.0):
+    """Wait for something to become true."""
+    end_s = time.monotonic() + timeout_s
+    while not fact():
+        assert time.monotonic() < end_s, "it did not become true"
+        time.sleep(0.01)
+
+
+def frame(payload, opcode=1, fin=True):
+    """A masked frame as a client sends it."""
+    length = len(payload)
+    head = bytes([opcode | (0x80 if fin else 0)])
+    if length < 126:
+        head += bytes([0x80 | length])
+    elif length < 65536:
+        head += b"\xfe" + struct.pack("!H", length)
+    else:
+        head += b"\xff" + struct.pack("!Q", length)
+    return head + b"\x00" * 4 + payload
+
+
+@contextmanager
+def raw(service, first=None, buffer=None):
+    """A TCP connection on which the WebSocket has begun."""
+    place = urlsplit(service.http)
+    with socket.socket() as connection:
+        connection.settimeout(10)
+        if buffer is not None:
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, buffer)
+        connection.connect((place.hostname, place.port))
+        connection.sendall(HANDSHAKE.format(place.netloc).encode())
+        answer = b""
+        while b"\r\n\r\n" not in answer:
+            answer += connection.recv(4096)
+        assert b" 101 " in answer
+        if first is not None:
+            connection.sendall(frame(json.dumps(first).encode()))
+            assert b"welcome" in connection.recv(8192)
+        yield connection
+
+
+@contextmanager
+def beside(service, hello, messages, run):
+    """A robot that drives while the block runs; afterwards each of its steps is judged."""
+    answers, ended, failed = [], threading.Event(), []
+
+    def drive():
+        try:
+            with service.socket() as robot:
+                robot.send(json.dumps(hello("beside")))
+                robot.recv(10)
+                k = 0
+                while not ended.is_set() or not answers:
+                    for message in messages(run):
+                        if k and ended.is_set():
+                            break
+                        shifted = {
+                            name: [[stamp + 12.0 * k for stamp in stamps], rows]
+                            for name, (stamps, rows) in message["streams"].items()
+                        }
+                        time_s = message["time_s"] + 12.0 * k
+                        robot.send(json.dumps({**message, "streams": shifted, "time_s": time_s}))
+                        answers.append((time_s, json.loads(robot.recv(10))))
+                        time.sleep(0.001)
+                    k += 1
+        except BaseException as error:
+            failed.append(error)
+
+    thread = threading.Thread(target=drive)
+    thread.start()
+    try:
+        yield answers
+    finally:
+        ended.set()
+        thread.join(30)
+    assert not failed, failed
+    assert [answer["number"] for _, answer in answers] == list(range(1, len(answers) + 1))
+    for time_s, answer in answers:
+        assert (answer["type"], answer["time_s"]) == ("step", time_s)
+        assert answer["observation"]["terrain"] in (None, "b")
+    assert answers[-1][1]["observation"]["terrain"] == "b"

@@ -1,0 +1,276 @@
+"""The page in a real browser: what it shows, and that it goes on when robots and the service come and go."""
+
+import shutil
+import threading
+import time
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from pipelines.models.model_files import write_info
+from pipelines.serve.client import TerrainClient
+from terrain.control.slip_table import load_slip_table
+
+playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
+
+DRIVEN = {"wheels": [f"motor_{i}_radps" for i in (1, 2, 3)] + [f"current_{i}_a" for i in (1, 2, 3)]}
+CHANNELS = {"imu": ["accel_z_mps2"], "wheels": ["speed_left_mps"]}
+TOKEN = "a token of the page's test"
+MARKUP = "<img src=x onerror=document.title='run'>"
+
+CONTRAST = """() => {
+  const linear = (v) => v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4;
+  const light = (text) => {
+    const [r, g, b] = text.match(/[\\d.]+/g).slice(0, 3).map((v) => linear(v / 255));
+    return 0.2126 * r + 0.7152 * g + 0.0722 * b;
+  };
+  const back = (node) => {
+    for (; node; node = node.parentElement) {
+      const colour = getComputedStyle(node).backgroundColor;
+      if (!/, 0\\)$/.test(colour) && colour !== "transparent") return colour;
+    }
+    return "rgb(255, 255, 255)";
+  };
+  return [...document.querySelectorAll("body *")].filter((node) =>
+    node.checkVisibility() && [...node.childNodes].some((one) => one.nodeType === 3 && one.data.trim())
+  ).map((node) => {
+    const [a, b] = [light(getComputedStyle(node).color), light(back(node))].sort();
+    return [(b + 0.05) / (a + 0.05), node.id || node.tagName, node.textContent.slice(0, 30)];
+  }).sort((a, b) => a[0] - b[0])[0];
+}"""
+"""The lowest contrast of all text that is seen, and where."""
+
+INK = """(canvas) => {
+  const { data } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
+  const seen = new Set();
+  for (let k = 0; k < data.length; k += 4) if (data[k + 3]) seen.add(data.slice(k, k + 3).join());
+  return seen.size;
+}"""
+"""Number of colours of a canvas."""
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with playwright.sync_playwright() as started:
+        found = started.chromium.launch(
+            executable_path=CHROMIUM, args=["--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage"]
+        )
+        yield found
+        found.close()
+
+
+@pytest.fixture
+def opened(browser):
+    """Opens pages; afterwards none of them has complained or asked another host."""
+    contexts, faults = [], []
+
+    def of(service, complaints=True, **options):
+        context = browser.new_context(**options)
+        contexts.append(context)
+        page = context.new_page()
+        page.set_default_timeout(10_000)
+        page.on("pageerror", lambda error: faults.append(str(error)))
+        page.on("request", lambda one: one.url.startswith(service.http) or faults.append(one.url))
+        if complaints:
+            page.on("console", lambda one: faults.append(one.text) if one.type == "error" else None)
+        page.goto(service.http)
+        return page
+
+    yield of
+    for context in contexts:
+        context.close()
+    assert faults == []
+
+
+@contextmanager
+def robot(service, session="mower-1", token="", **options):
+    """A robot that drives until the block ends."""
+    ended = threading.Event()
+
+    def drive():
+        control = options.get("control", False)
+        streams = DRIVEN if control else CHANNELS
+        name = "agrimaro" if control else "mower"
+        with TerrainClient(
+            service.ws, session, name, streams, rate_hz=20.0, token=token, **options
+        ) as client:
+            while not ended.wait(0.02):
+                now_s = time.monotonic()
+                if control:
+                    row = [20.0, 21.0, 19.0, 1.0, 1.5, 2.0]
+                    client.send({"wheels": ([now_s], [row])}, (0.5, 0.0, 0.0))
+                else:
+                    noise = 2.0 if int(now_s * 50) % 2 else -2.0
+                    client.send({"imu": ([now_s], [[noise]]), "wheels": ([now_s], [[0.5]])})
+
+    thread = threading.Thread(target=drive)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join(20)
+
+
+def shows(page, place, text, timeout_s=8.0):
+    """Wait until an element holds a text."""
+    playwright.expect(page.locator(place)).to_contain_text(text, timeout=timeout_s * 1000)
+
+
+def shot(page, name):
+    """Keep a picture where somebody wants to look at it."""
+    folder = Path("/tmp/shots")
+    if folder.is_dir():
+        page.screenshot(path=folder / f"{name}.png", full_page=True)
+
+
+@pytest.fixture(scope="module")
+def driving(running, model_folder):
+    """A service for robots of any channels, without a model."""
+    with running(model=str(model_folder)) as service:
+        service.hub.swap(None, "", load_slip_table())
+        yield service
+
+
+def test_a_robot_is_shown_with_terrain_target_and_model(service, opened):
+    with robot(service):
+        page = opened(service, viewport={"width": 1280, "height": 900})
+        shows(page, "#connection", "live")
+        shows(page, "#probability", "%")
+        assert page.inner_text("#terrain") in ("a", "b")
+        shows(page, "#window", "last window")
+        shows(page, "#target", "traction")
+        shows(page, "#latency", " ms")
+        shows(page, "#model", "(number 1)")
+        shows(page, "#sensors", "fresh")
+        shows(page, "#command-status", "none asked for")
+        page.wait_for_timeout(300)
+        assert page.eval_on_selector("#band", INK) > 3
+        assert page.evaluate(CONTRAST)[0] >= 4.5, page.evaluate(CONTRAST)
+        shot(page, "light")
+        page.reload()
+        shows(page, "#probability", "%")
+        assert page.inner_text("#terrain") in ("a", "b")
+
+
+def test_a_driven_robot_is_shown_with_command_and_plots_in_light_and_dark(driving, opened):
+    with robot(driving, "driven", control=True):
+        page = opened(driving, color_scheme="dark", viewport={"width": 1280, "height": 900})
+        shows(page, "#command-status", "ok")
+        shows(page, "#twist", "driven: 0.50")
+        playwright.expect(page.locator("#slip canvas")).to_have_count(3)
+        page.wait_for_timeout(1000)
+        for canvas in page.query_selector_all("#slip canvas, #current canvas"):
+            assert canvas.evaluate(INK) > 3
+        dark = page.eval_on_selector("body", "(body) => getComputedStyle(body).backgroundColor")
+        assert page.evaluate(CONTRAST)[0] >= 4.5, page.evaluate(CONTRAST)
+        shot(page, "dark")
+        page.click("#theme")
+        assert page.eval_on_selector("body", "(body) => getComputedStyle(body).backgroundColor") != dark
+        assert page.get_attribute("#theme", "aria-pressed") == "false"
+        assert page.evaluate(CONTRAST)[0] >= 4.5, page.evaluate(CONTRAST)
+        page.wait_for_timeout(400)
+        shot(page, "light-driven")
+        page.reload()
+        assert page.get_attribute("html", "data-theme") == "light"
+
+
+def test_a_phone_shows_it_without_scrolling_aside(driving, opened):
+    with robot(driving, "R" * 64, control=True):
+        page = opened(driving, viewport={"width": 390, "height": 844}, is_mobile=True, device_scale_factor=2)
+        shows(page, "#command-status", "ok")
+        page.wait_for_timeout(500)
+        assert page.evaluate("document.documentElement.scrollWidth") <= 390
+        shot(page, "phone")
+
+
+def test_robots_come_and_go_and_are_chosen_by_the_keyboard(driving, opened):
+    page = opened(driving)
+    shows(page, "#connection", "no robot yet")
+    with robot(driving, "first", control=True):
+        shows(page, "#connection", "live")
+        with robot(driving, "second", control=True):
+            playwright.expect(page.locator("#session option")).to_have_count(2)
+            for _ in range(6):
+                page.keyboard.press("Tab")
+                if page.evaluate("document.activeElement.id") == "session":
+                    break
+            assert page.evaluate("document.activeElement.id") == "session"
+            outline = "getComputedStyle(document.activeElement).outlineStyle"
+            assert page.evaluate(outline) == "solid"
+            page.keyboard.press("ArrowDown")
+            page.wait_for_timeout(400)
+            assert page.input_value("#session") == "second"
+            page.keyboard.press("Tab")
+            assert page.evaluate("document.activeElement.id") == "theme"
+        shows(page, "#session", "first")
+        shows(page, "#connection", "live")
+    shows(page, "#connection", "no robot any more")
+    assert page.evaluate("document.body.classList.contains('stale')")
+    with robot(driving, "first", control=True):
+        shows(page, "#connection", "live")
+        assert not page.evaluate("document.body.classList.contains('stale')")
+
+
+def test_the_page_says_that_the_service_has_gone_and_goes_on_when_it_is_back(running, model_folder, opened):
+    with running(model=str(model_folder)) as service, robot(service):
+        page = opened(service, complaints=False)  # Chromium's own, that it could not connect
+        shows(page, "#connection", "live")
+        port = int(service.http.rpartition(":")[2])
+    playwright.expect(page.locator("#connection")).to_have_attribute("data-state", "lost", timeout=3000)
+    assert page.evaluate("document.body.classList.contains('stale')")
+    page.wait_for_timeout(600)
+    assert page.evaluate(CONTRAST)[0] >= 4.5
+    shot(page, "stale")
+    with running(port=port, model=str(model_folder)) as service, robot(service):
+        shows(page, "#connection", "live", 8.0)
+        assert not page.evaluate("document.body.classList.contains('stale')")
+
+
+def test_a_token_is_asked_for(running, model_folder, opened, monkeypatch):
+    monkeypatch.setenv("TERRAIN_TOKEN", TOKEN)
+    with running(model=str(model_folder)) as service, robot(service, token=TOKEN):
+        page = opened(service, color_scheme="dark")
+        shows(page, "#connection", "a token is required")
+        assert page.evaluate("document.activeElement.id") == "token"
+        page.keyboard.type("x" * 20)
+        page.keyboard.press("Enter")
+        shows(page, "#token-error", "That is not the token.")
+        assert page.evaluate(CONTRAST)[0] >= 4.5
+        shot(page, "token")
+        page.fill("#token", TOKEN)
+        page.keyboard.press("Enter")
+        shows(page, "#connection", "live")
+        playwright.expect(page.locator("#token-form")).to_be_hidden()
+        page.reload()
+        shows(page, "#connection", "live")
+
+
+def test_a_robot_that_sends_nothing_more_is_not_shown_as_live(service, opened):
+    with TerrainClient(service.ws, "silent", "mower", CHANNELS, rate_hz=0.0) as client:
+        client.send({"imu": ([0.0], [[0.1]])}, step=True)
+        page = opened(service)
+        shows(page, "#connection", "live")
+        shows(page, "#connection", "no step of this robot for", 3.0)
+        assert page.evaluate("document.body.classList.contains('stale')")
+        client.send({"imu": ([0.1], [[0.1]])}, step=True)
+        shows(page, "#connection", "live")
+
+
+def test_names_with_markup_are_text(running, mower_model, model_folder, tmp_path, opened):
+    shutil.copy(model_folder / "model.skops", tmp_path)
+    classes = tuple(MARKUP if name == "b" else name for name in mower_model.info.classes)
+    write_info(tmp_path, replace(mower_model.info, classes=classes))
+    with running(model=str(tmp_path)) as service:
+        hub = service.hub
+        hub.trouble["<b>"] = MARKUP
+        with robot(service):
+            page = opened(service)
+            shows(page, "#trouble", MARKUP)
+            shows(page, "#window", "last window")
+            assert page.query_selector("main img") is None
+            assert page.title() == "Terrain, live"

@@ -1,0 +1,201 @@
+"""What is swapped, saved and ended while robots stream: what should be kept is, and nothing is shared."""
+
+import errno
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import pytest
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
+
+from .strangers import until
+
+SERVE = "from pipelines.cli.main import main; main()"
+N_ROBOTS = 8
+
+
+@contextmanager
+def process(model_folder, states):
+    """``terrain serve`` in a process of its own; gives it, and its address."""
+    command = [sys.executable, "-c", SERVE, "serve", "--model", str(model_folder), "--port", "0"]
+    environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
+    environment.pop("TERRAIN_TOKEN", None)
+    pipe = subprocess.PIPE
+    serving = subprocess.Popen(
+        [*command, "--state", str(states)], stdout=pipe, stderr=pipe, text=True, env=environment
+    )
+    try:
+        line = serving.stdout.readline()
+        yield serving, "ws" + line[line.index("http") + 4 :].split()[0]
+    finally:
+        if serving.poll() is None:
+            serving.kill()
+        serving.wait(10)
+        serving.stdout.close()
+        serving.stderr.close()
+
+
+def stream(url, k, hello, messages, run, ended):
+    """Drive until the connection ends; keep the terrain and the last message."""
+    found = ended[k] = {}
+    with connect(url + "/robots", compression=None, max_size=None) as robot, suppress(ConnectionClosed):
+        try:
+            robot.send(json.dumps(hello(f"robot-{k}")))
+            found["welcome"] = found["last"] = json.loads(robot.recv(10))
+            n = 0
+            while True:
+                for message in messages(run, 10.0):
+                    streams = {
+                        name: [[stamp + 12.0 * n for stamp in stamps], rows]
+                        for name, (stamps, rows) in message["streams"].items()
+                    }
+                    time_s = message["time_s"] + 12.0 * n
+                    robot.send(json.dumps({**message, "streams": streams, "time_s": time_s}))
+                    found["last"] = json.loads(robot.recv(10))
+                    if found["last"]["type"] == "step":
+                        found["terrain"] = found["last"]["observation"]["terrain"]
+                    time.sleep(0.002)
+                n += 1
+        except ConnectionClosed:
+            while True:  # what had come before it was closed
+                found["last"] = json.loads(robot.recv(10))
+
+
+@contextmanager
+def robots(url, hello, messages, two_drives):
+    """Robots on two terrains, which stream until their connections end."""
+    ended = {}
+    threads = [
+        threading.Thread(target=stream, args=(url, k, hello, messages, two_drives[3 * (k % 2)], ended))
+        for k in range(N_ROBOTS)
+    ]
+    for thread in threads:
+        thread.start()
+    yield ended
+    for thread in threads:
+        thread.join(20)
+        assert not thread.is_alive()
+
+
+def know_their_terrain(ended):
+    return len(ended) == N_ROBOTS and all(
+        found.get("terrain") == "ab"[k % 2] for k, found in list(ended.items())
+    )
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+def test_a_service_that_is_ended_under_load_goes_on_after_a_restart(
+    model_folder, hello, messages, two_drives, tmp_path, number
+):
+    with process(model_folder, tmp_path) as (serving, url), robots(url, hello, messages, two_drives) as ended:
+        until(lambda: know_their_terrain(ended), 20.0)
+        if number == signal.SIGKILL:
+            until(
+                lambda: (
+                    sum('"terrain": "' in file.read_text() for file in tmp_path.glob("*.json")) >= N_ROBOTS
+                    and all('"terrain": ""' not in file.read_text() for file in tmp_path.glob("*.json"))
+                ),
+                15.0,
+            )
+        serving.send_signal(number)
+        code = serving.wait(5.0)
+        assert code == (-signal.SIGKILL if number == signal.SIGKILL else 0)
+        assert "Traceback" not in serving.stderr.read()
+    if number != signal.SIGKILL:
+        assert {found["last"].get("code") for found in ended.values()} == {"closing"}
+    assert {file.name for file in tmp_path.iterdir()} == {f"robot-{k}.json" for k in range(N_ROBOTS)}
+    saved = {file.name: json.loads(file.read_text())["state"] for file in Path(tmp_path).iterdir()}
+    assert all(saved[f"robot-{k}.json"]["terrain"] == "ab"[k % 2] for k in range(N_ROBOTS))
+    with process(model_folder, tmp_path) as (serving, url):
+        for k in range(N_ROBOTS):
+            with connect(url + "/robots") as robot:
+                robot.send(json.dumps(hello(f"robot-{k}")))
+                assert json.loads(robot.recv(10))["restored"]["terrain"] == "ab"[k % 2]
+
+
+def test_models_are_replaced_and_damaged_ones_refused_while_robots_stream(
+    running, model_folder, hello, messages, two_drives, tmp_path
+):
+    for file in model_folder.iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes()[:-100])
+    with running(model=str(model_folder)) as service:  # noqa: SIM117 - the robots end first
+        with robots(service.ws, hello, messages, two_drives) as ended:
+            until(lambda: know_their_terrain(ended), 20.0)
+            for k in range(5):
+                assert service.put("/model", {"uri": str(tmp_path)})[0] == 409
+                assert service.put("/model", {"uri": "x" * 900})[0] == 409
+                assert json.loads(service.put("/model", {"uri": str(model_folder)})[1])["number"] == k + 2
+            until(
+                lambda: all(
+                    one["last"].get("observation", {}).get("served") == 6 for one in list(ended.values())
+                )
+            )
+            assert know_their_terrain(ended)
+            assert service.hub.trouble == {}
+            for opened in list(service.hub.sessions.values()):
+                opened.leave("closing", "the test ends")
+
+
+def test_a_full_disk_is_named_until_there_is_room_again(running, model_folder, hello, tmp_path, monkeypatch):
+    def full(self, *arguments, **named):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    def trouble(service):
+        return json.loads(service.get("/ready")[1])["trouble"]
+
+    monkeypatch.setattr("pipelines.serve.server.SAVE_EVERY_S", 0.05)
+    with running(model=str(model_folder), state=tmp_path) as service, service.socket() as robot:
+        robot.send(json.dumps(hello("full")))
+        robot.recv(10)
+        with monkeypatch.context() as patch:
+            patch.setattr("terrain.files.atomic.os.fsync", full)
+            until(lambda: "No space left on device" in trouble(service).get("states", ""))
+            robot.send(json.dumps({"type": "samples", "streams": {}, "step": True}))
+            assert json.loads(robot.recv(10))["type"] == "step"
+            seen = [trouble(service).get("states", "") for _ in range(30)]
+            assert all(seen), "the trouble is not gone while it is tried again"
+        until(lambda: trouble(service) == {})
+        assert [file.name for file in tmp_path.iterdir()] == ["full.json"]
+
+
+def test_robots_that_come_back_in_each_others_streams_do_not_leak(
+    running, model_folder, hello, messages, two_drives
+):
+    """Two robots interleaved answer as each does alone, step by step."""
+
+    def alone(service, name, run, others=None):
+        answers = []
+        with service.socket() as one, service.socket() as other:
+            one.send(json.dumps(hello(name)))
+            one.recv(10)
+            if others is not None:
+                other.send(json.dumps(hello(f"{name}-other")))
+                other.recv(10)
+            for k, message in enumerate(messages(run)):
+                if others is not None:
+                    other.send(json.dumps(others[k]))
+                    other.recv(10)
+                one.send(json.dumps(message))
+                answers.append(json.loads(one.recv(10)))
+                time.sleep(0.001)
+            time.sleep(0.1)  # for the last window
+            one.send(json.dumps({"type": "samples", "streams": {}, "step": True}))
+            answers.append(json.loads(one.recv(10)))
+        return {
+            (window["start_s"], window["terrain"], *window["probabilities"].values())
+            for answer in answers
+            if (window := answer["observation"]["window"])
+        }
+
+    with running(model=str(model_folder)) as service:
+        first, second = two_drives[1], two_drives[5]
+        both = list(messages(first)), list(messages(second))
+        assert alone(service, "a", first) == alone(service, "b", first, both[1])
+        assert alone(service, "c", second) == alone(service, "d", second, both[0])
