@@ -19,7 +19,7 @@ SEND_BUFFER = 8192
 REQUEST_S = 10.0
 """For the first request of a connection."""
 
-FLUSH_S = 1.0
+FLUSH_S = 3.0
 """For what is buffered when a connection ends; a receiver that does not read would keep it for ever."""
 
 

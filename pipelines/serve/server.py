@@ -44,7 +44,7 @@ WARM_STEPS = 30
 LEAVING_STEPS = 150
 """Hundredths of a second that robots have to read that the service ends."""
 
-CLOSING_STEPS = 20
+CLOSING_STEPS = 60
 """Twentieths of a second for their answers."""
 
 

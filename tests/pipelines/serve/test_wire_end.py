@@ -105,7 +105,7 @@ def test_a_service_that_is_ended_under_load_goes_on_after_a_restart(
                 15.0,
             )
         serving.send_signal(number)
-        code = serving.wait(5.0)
+        code = serving.wait(10.0)
         assert code == (-signal.SIGKILL if number == signal.SIGKILL else 0)
         assert "Traceback" not in serving.stderr.read()
     if number != signal.SIGKILL:
