@@ -20,6 +20,9 @@ from pipelines.sessions.records import CommandStatus, StepOutput
 MAX_NOTES = 1000
 """Answers to messages that wait to be read; of more, the oldest are left out."""
 
+LEAVING_S = 3.0
+"""For a robot to be sent why its connection ends."""
+
 TRY_AGAIN_LATER, POLICY = 1013, 1008
 """Codes of closed WebSockets (RFC 6455)."""
 
@@ -196,7 +199,7 @@ class Connection:
 
     async def _leaving(self) -> None:
         await self._left.wait()
-        async with asyncio.timeout(1.0):
+        async with asyncio.timeout(LEAVING_S):
             while self._notes or self._changed.is_set():
                 await asyncio.sleep(0.01)
 

@@ -41,7 +41,7 @@ LARGEST_MESSAGE = 4_194_304
 PING_S = 10.0
 WARM_STEPS = 30
 
-LEAVING_STEPS = 150
+LEAVING_STEPS = 350
 """Hundredths of a second that robots have to read that the service ends."""
 
 CLOSING_STEPS = 60

@@ -265,6 +265,8 @@ EDGES = {
     "terrain/estimation/estimate.py",
     "pipelines/estimate/estimate.py",
     "terrain/slip_learning/learn.py",
+    "pipelines/live/observer.py",
+    "pipelines/live/terrain_source.py",
     "pipelines/live/pilot.py",
 }
 """Where a run as measured meets the robot as described."""
