@@ -188,7 +188,8 @@ class Connection:
             try:
                 async with asyncio.timeout(self._hub.limits.too_slow_s):
                     while self._notes:
-                        await self._write(self._notes.popleft())
+                        await self._write(self._notes[0])
+                        self._notes.popleft()  # once it is written: who ends the connection waits for it
                     output, self._step = self._step, None
                     if output is not None:
                         await self._write(step_content(output))

@@ -63,7 +63,8 @@ def stream(url, k, hello, messages, run, ended):
                         found["terrain"] = found["last"]["observation"]["terrain"]
                     time.sleep(0.002)
                 n += 1
-        except ConnectionClosed:
+        except ConnectionClosed as closed:
+            found["closed"] = str(closed)
             while True:  # what had come before it was closed
                 found["last"] = json.loads(robot.recv(10))
 
@@ -109,7 +110,8 @@ def test_a_service_that_is_ended_under_load_goes_on_after_a_restart(
         assert code == (-signal.SIGKILL if number == signal.SIGKILL else 0)
         assert "Traceback" not in serving.stderr.read()
     if number != signal.SIGKILL:
-        assert {found["last"].get("code") for found in ended.values()} == {"closing"}
+        for found in ended.values():  # the message, or where a robot was writing then, the reason of the end
+            assert found["last"].get("code") == "closing" or "the service ends" in found["closed"]
     assert {file.name for file in tmp_path.iterdir()} == {f"robot-{k}.json" for k in range(N_ROBOTS)}
     saved = {file.name: json.loads(file.read_text())["state"] for file in Path(tmp_path).iterdir()}
     assert all(saved[f"robot-{k}.json"]["terrain"] == "ab"[k % 2] for k in range(N_ROBOTS))
