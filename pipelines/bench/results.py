@@ -82,7 +82,8 @@ class Soak:
     ----------
     minutes, seed : as asked for
     steps : answers that robots got
-    not_finite, stale, wrong_session : of the commands; none is accepted
+    not_finite, stale : commands that are; none is accepted
+    wrong_session : answers with a window of another robot; none is accepted
     unanswered : steps that were asked for on a sound connection and did not come in time
     crashes : how often the process ended
     faults : by kind, how often it was made

@@ -22,7 +22,7 @@ from websockets.exceptions import ConnectionClosed, InvalidHandshake
 from pipelines.bench.drive import ROBOT, bench_drive, messages_of, model_folder, sent_channels
 from pipelines.bench.process import ServiceProcess
 from pipelines.bench.results import Soak
-from pipelines.bench.robots import Packed, hello, packed
+from pipelines.bench.robots import hello, packed
 from pipelines.bench.settings import SoakSettings
 from pipelines.reporting.progress import Progress, silent
 
@@ -45,6 +45,10 @@ FAULTS = (
 FAULTS_PER_MINUTE = 20.0
 
 
+CLOCKS_APART_S = 1000.0
+"""Each robot has a clock of its own: a window by another's clock is one of another robot."""
+
+
 class _Seen:
     """What all robots saw."""
 
@@ -57,13 +61,31 @@ class _Seen:
 
 
 class _Robot:
-    """One robot that drives again and again, and meets the faults that are due."""
+    """One robot that drives again and again, and meets the faults that are due.
+
+    Parameters
+    ----------
+    number : of the robot; its clock is as many times :data:`CLOCKS_APART_S` ahead
+    channels : of each stream
+    messages : of a drive; no clock is far from them
+    seen : of all robots
+    seed : of the faults
+    """
 
     def __init__(
-        self, number: int, first: bytes, messages: Sequence[Packed], seen: _Seen, rng: np.random.Generator
+        self,
+        number: int,
+        channels: dict[str, list[str]],
+        messages: Sequence[dict[str, Any]],
+        seen: _Seen,
+        seed: int,
     ) -> None:
-        self.name, self._first, self._messages = f"soak-{number}", first, messages
-        self._seen, self._rng = seen, rng
+        ahead_s = CLOCKS_APART_S * number
+        self._first = hello(f"soak-{number}", ROBOT, channels)
+        self._messages = packed([_later(content, ahead_s) for content in messages])
+        self._begin_s = ahead_s + messages[0]["time_s"]
+        self._seen, self._rng = seen, np.random.default_rng([seed, number])
+        self._own_clock = True
         self.due: list[str] = []
 
     async def drive(self, url: str, end_s: float) -> None:
@@ -84,6 +106,7 @@ class _Robot:
             self._seen.errors[answer.get("code", "?")] += 1
             await asyncio.sleep(0.5)
             await socket.send(self._first)
+        self._own_clock = True
         begin_s = monotonic()
         for one in self._messages:
             if monotonic() > end_s:
@@ -93,9 +116,9 @@ class _Robot:
                 return
             await socket.send(one.message)
             if one.step:
-                await self._answer(socket, one, asked_s=monotonic())
+                await self._answer(socket, asked_s=monotonic())
 
-    async def _answer(self, socket: ClientConnection, one: Packed, asked_s: float) -> None:
+    async def _answer(self, socket: ClientConnection, asked_s: float) -> None:
         """Wait for the step that was asked for, and judge it."""
         while True:
             try:
@@ -108,10 +131,10 @@ class _Robot:
                 if answer["fatal"] or answer["code"] == "too-fast":
                     return
                 continue
-            self._judge(answer, one, asked_s)
+            self._judge(answer, asked_s)
             return
 
-    def _judge(self, answer: dict[str, Any], one: Packed, asked_s: float) -> None:
+    def _judge(self, answer: dict[str, Any], asked_s: float) -> None:
         seen, command = self._seen, answer["command"]
         seen.steps += 1
         numbers = [*command["wheel_radps"], *command["steer_rad"], *command["twist"]]
@@ -119,8 +142,11 @@ class _Robot:
             seen.not_finite += 1
         if monotonic() - asked_s > command["valid_s"]:
             seen.stale += 1
-        if set(answer["observation"]["target_slip"]) != {"traction", "braking", "steady"}:
-            seen.wrong_session += 1
+        window = answer["observation"]["window"]
+        if window is not None and self._own_clock:
+            length_s = self._messages[-1].time_s + CLOCKS_APART_S / 2
+            if not self._begin_s - 1.0 < window["start_s"] < window["end_s"] < self._begin_s + length_s:
+                seen.wrong_session += 1
 
     async def _fault(self, socket: ClientConnection, kind: str) -> bool:
         """Make a fault; say whether the connection has ended by it."""
@@ -139,6 +165,7 @@ class _Robot:
             row = [math.nan if rng.random() < 0.5 else math.inf] * 9
             await socket.send(msgpack.packb({"type": "samples", "streams": {"imu": [[math.nan], [row]]}}))
         elif kind == "clock set":
+            self._own_clock = False
             far_s = float(rng.choice([-1e4, 1e4, 1e9]))
             await socket.send(msgpack.packb({"type": "samples", "streams": {"imu": [[far_s], [[0.0] * 9]]}}))
         elif kind == "flood":
@@ -154,6 +181,15 @@ class _Robot:
             socket.transport.abort()
             return True
         return False
+
+
+def _later(content: dict[str, Any], by_s: float) -> dict[str, Any]:
+    """Return a message as a robot whose clock is ahead would send it."""
+    streams = {
+        name: [[stamp + by_s for stamp in stamps], rows]
+        for name, (stamps, rows) in content["streams"].items()
+    }
+    return {**content, "time_s": content["time_s"] + by_s, "streams": streams}
 
 
 async def _run(
@@ -224,21 +260,14 @@ def soak(settings: SoakSettings, progress: Progress = silent) -> Soak:
         if the model cannot be loaded, or the service does not start.
     """
     run, seen = bench_drive(settings.seed), _Seen()
-    channels, messages = sent_channels(run), packed(list(messages_of(run)))
+    channels, messages = sent_channels(run), list(messages_of(run))
     with TemporaryDirectory() as folder:
         uri = model_folder(settings.model, settings.seed, Path(folder) / "model")
         states = Path(folder) / "states" if settings.out is None else settings.out
         service = ServiceProcess(["--model", uri, "--robot", ROBOT, "--state", str(states)])
         try:
             robots = [
-                _Robot(
-                    k,
-                    hello(f"soak-{k}", ROBOT, channels),
-                    messages,
-                    seen,
-                    np.random.default_rng([settings.seed, k]),
-                )
-                for k in range(settings.robots)
+                _Robot(number, channels, messages, seen, settings.seed) for number in range(settings.robots)
             ]
             asyncio.run(_run(service, robots, uri, settings, seen, progress))
             seen.rss_mb.append(service.rss_mb)

@@ -57,14 +57,14 @@ class ModelInfo:
 
     @classmethod
     def from_json(cls, document: Mapping[str, Any]) -> Self:
-        """Return the record of a JSON document; ``TypeError`` where a key is unknown or missing."""
+        """Return the record of a JSON document; ``TypeError`` or ``KeyError`` where it is no such."""
         steady = document.get("steady")
         changed: dict[str, Any] = {
             "steady": None if steady is None else SteadyMotion(**steady),
-            "channels": {stream: tuple(names) for stream, names in document["channels"].items()},
+            "channels": {stream: _texts(names) for stream, names in document["channels"].items()},
         }
         for name in ("classes", "run_digests", "signal_sets", "robots"):
-            changed[name] = tuple(document.get(name, ()))
+            changed[name] = _texts(document.get(name, ()))
         return cls(**{**document, **changed})
 
     @property
@@ -76,3 +76,10 @@ class ModelInfo:
     def rule(self) -> WindowRule:
         """How windows must be cut."""
         return WindowRule(self.window_s, self.stride_s, self.steady)
+
+
+def _texts(given: Any) -> tuple[str, ...]:
+    texts = tuple(given)
+    if isinstance(given, str) or not all(isinstance(text, str) for text in texts):
+        raise TypeError(f"{given!r:.40} is no list of texts")
+    return texts

@@ -9,6 +9,7 @@ It needs ``websockets`` and ``msgpack`` and nothing else of the service::
 
 from __future__ import annotations
 
+import math
 import threading
 from collections import deque
 from collections.abc import Mapping, Sequence
@@ -78,6 +79,7 @@ class TerrainClient:
         self._steps: deque[tuple[float, dict[str, Any]]] = deque(maxlen=1)
         self._came = threading.Condition()
         self._closed: ServiceError | None = None
+        self._newest_s = -math.inf  # of the last samples: a clock may be set back
         self.errors: deque[dict[str, Any]] = deque(maxlen=MAX_ERRORS)
         self.n_steps = 0
         try:
@@ -151,9 +153,13 @@ class TerrainClient:
         if time_s is not None:
             content["time_s"] = float(time_s)
         self._send(content)
+        stamps = [stamp for stamps, _ in content["streams"].values() for stamp in stamps]
+        self._newest_s = max((stamp for stamp in stamps if stamp is not None), default=self._newest_s)
 
     def latest(self, max_age_s: float | None = None) -> dict[str, Any] | None:
-        """Return the newest step; None before the first, and where it came longer ago than an age.
+        """Return the newest step; None before the first, and where it is older than an age.
+
+        It is old where it came so long ago, or where samples that much newer than its time have been sent.
 
         Parameters
         ----------
@@ -161,9 +167,12 @@ class TerrainClient:
         """
         age_s = float(self.welcome["command_valid_s"]) if max_age_s is None else max_age_s
         with self._came:
-            if not self._steps or monotonic() - self._steps[-1][0] > age_s:
+            if not self._steps:
                 return None
-            return self._steps[-1][1]
+            came_s, step = self._steps[-1]
+        of_s = step["time_s"]
+        late = of_s is not None and self._newest_s - of_s > age_s
+        return None if late or monotonic() - came_s > age_s else step
 
     def step(self, timeout_s: float = TIMEOUT_S) -> dict[str, Any]:
         """Wait for a step that has not been returned by this method yet.
@@ -173,7 +182,7 @@ class TerrainClient:
         ServiceError
             if none comes in time (code ``timeout``), or the connection has ended.
         """
-        end_s = monotonic() + (timeout_s)
+        end_s = monotonic() + timeout_s
         with self._came:
             while not self._steps:
                 if self._closed is not None:

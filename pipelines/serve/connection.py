@@ -45,6 +45,7 @@ class Connection:
         self._notes: deque[dict[str, Any]] = deque(maxlen=MAX_NOTES)
         self._step: StepOutput | None = None
         self._changed = asyncio.Event()
+        self._writing = False
         self._left = asyncio.Event()
         self._messages = Bucket(hub.limits.messages_per_s)
         self._rows = Bucket(hub.limits.rows_per_s)
@@ -64,7 +65,7 @@ class Connection:
             if rate_hz > 0.0:
                 tasks.append(loop.create_task(self._tick(opened, rate_hz)))
             await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-        except (WebSocketDisconnect, RuntimeError, OSError):
+        except (WebSocketDisconnect, RuntimeError, OSError):  # TimeoutError is an OSError
             pass  # the robot has left, in the middle of anything
         finally:
             for task in tasks:
@@ -85,24 +86,25 @@ class Connection:
     async def _greet(self) -> tuple[OpenSession | None, float]:
         """Wait for a hello and answer it; None where none came in time or it was refused for good."""
         limits = self._hub.limits
-        try:
-            async with asyncio.timeout(limits.hello_s):
-                while True:
-                    try:
-                        hello = read_hello(await self._next())
-                        if not token_fits(self._token, hello.token or self._given_token):
-                            raise WireError("token", "a token is required, or it is another")
-                        opened = await self._hub.open(hello, self.leave)
-                        break
-                    except WireError as error:
-                        final = error.code in ("token", "closing")
-                        await self._write(self._error(error.code, str(error), fatal=final))
-                        if final:
-                            self._end = (POLICY, error.code)
-                            return None, 0.0
-        except TimeoutError:
-            self._end = (POLICY, "no hello came in time")
-            return None, 0.0
+        latest_s = asyncio.get_running_loop().time() + limits.hello_s
+        while True:
+            try:
+                async with asyncio.timeout_at(latest_s):
+                    hello = read_hello(await self._next())
+                if not token_fits(self._token, hello.token or self._given_token):
+                    raise WireError("token", "a token is required, or it is another")
+                opened = await self._hub.open(hello, self.leave)
+                break
+            except WireError as error:
+                final = error.code in ("token", "closing")
+                async with asyncio.timeout(limits.too_slow_s):
+                    await self._write(self._error(error.code, str(error), fatal=final))
+                if final:
+                    self._end = (POLICY, error.code)
+                    return None, 0.0
+            except TimeoutError:
+                self._end = (POLICY, "no hello came in time")
+                return None, 0.0
         accepted = {name: value for name, value in limits._asdict().items() if name != "sessions"}
         try:
             await self._write(welcome(hello, opened.chain, opened.restored, accepted))
@@ -162,7 +164,6 @@ class Connection:
 
     def _run(self, opened: OpenSession, time_s: float | None = None) -> None:
         metrics, begun_s = self._hub.metrics, perf_counter()
-        windows_before = opened.chain.window
         output = opened.chain.step(time_s=time_s)
         metrics.step_s.observe(perf_counter() - begun_s)
         metrics.steps.inc()
@@ -170,8 +171,9 @@ class Connection:
             metrics.latency_s.observe(output.latency_s)
         if output.status is not CommandStatus.OK:
             metrics.stopped.labels(output.status.value).inc()
-        window = output.observation.window
-        if window is not None and window is not windows_before:
+        if output.status is CommandStatus.FAILED:
+            self._hub.trouble[f"session {opened.name}"] = opened.chain.failure
+        for window in opened.chain.finished:
             metrics.window_s.observe(window.took_s)
             metrics.windows.labels(window.terrain or "refused").inc()
         if self._step is not None:
@@ -187,12 +189,13 @@ class Connection:
             self._changed.clear()
             try:
                 async with asyncio.timeout(self._hub.limits.too_slow_s):
+                    self._writing = True
                     while self._notes:
-                        await self._write(self._notes[0])
-                        self._notes.popleft()  # once it is written: who ends the connection waits for it
+                        await self._write(self._notes.popleft())
                     output, self._step = self._step, None
                     if output is not None:
                         await self._write(step_content(output))
+                    self._writing = False
             except TimeoutError:
                 self._end = (TRY_AGAIN_LATER, "the receiver did not read for too long")
                 self._hub.metrics.errors.labels("too-slow").inc()
@@ -201,7 +204,7 @@ class Connection:
     async def _leaving(self) -> None:
         await self._left.wait()
         async with asyncio.timeout(LEAVING_S):
-            while self._notes or self._changed.is_set():
+            while self._notes or self._writing or self._changed.is_set():
                 await asyncio.sleep(0.01)
 
     async def _next(self) -> dict[str, Any]:

@@ -138,14 +138,22 @@ class Hub:
         if len(self.sessions) + len(self._opening) >= self.limits.sessions:
             raise WireError("too-many", f"{self.limits.sessions} sessions are open, no more are accepted")
         self._opening.add(hello.session)
+        beginning = asyncio.ensure_future(asyncio.to_thread(self._begin, hello))
         try:
-            chain, restored = await asyncio.to_thread(self._begin, hello)
+            chain, restored = await asyncio.shield(beginning)
         except (ConfigError, DataError, LogError) as error:
             raise WireError("refused", str(error)) from None
+        except asyncio.CancelledError:
+            beginning.add_done_callback(_end_unused)
+            raise
         finally:
             self._opening.discard(hello.session)
         if chain.served.number != self.served.number:  # replaced meanwhile
-            chain.swap(self.served)
+            try:
+                chain.swap(self.served)
+            except (ConfigError, DataError) as error:
+                chain.end()
+                raise WireError("refused", str(error)) from None
         opened = OpenSession(hello.session, chain, restored, leave)
         self.sessions[hello.session] = opened
         self.metrics.sessions.set(len(self.sessions))
@@ -225,3 +233,9 @@ class Hub:
         self._thread.stop()
         if self._writer is not None:
             self._writer.stop()
+
+
+def _end_unused(beginning: asyncio.Future[tuple[RobotSession, Restorable | None]]) -> None:
+    """End a session whose connection did not wait for it."""
+    if not beginning.cancelled() and beginning.exception() is None:
+        beginning.result()[0].end()

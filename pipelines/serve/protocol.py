@@ -10,6 +10,7 @@ import asyncio
 import socket
 from typing import Any
 
+import h11
 from uvicorn.protocols.http.h11_impl import H11Protocol
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
@@ -17,23 +18,36 @@ SEND_BUFFER = 8192
 """Bytes that the system may buffer towards a robot; it doubles them."""
 
 REQUEST_S = 10.0
-"""For the first request of a connection."""
+"""For a request to come whole, from the connection or from its first byte on."""
 
 FLUSH_S = 3.0
 """For what is buffered when a connection ends; a receiver that does not read would keep it for ever."""
 
 
 class HttpProtocol(H11Protocol):
-    """HTTP, and the end of a connection on which no request comes."""
+    """HTTP, and the end of a connection on which a request does not come whole."""
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Begin, with a time limit for the first request."""
         super().connection_made(transport)
-        self.loop.call_later(REQUEST_S, self._end_silent, transport)
+        self._limit: asyncio.TimerHandle | None = self._end_in_time(transport)
 
-    def _end_silent(self, transport: asyncio.Transport) -> None:
-        if self.cycle is None and transport.get_protocol() is self:
-            transport.abort()
+    def data_received(self, data: bytes) -> None:
+        """Take a part of a request; the rest has to come in time."""
+        super().data_received(data)
+        state = self.conn.their_state
+        if state is h11.SEND_BODY or (state is h11.IDLE and self.conn.trailing_data[0]):
+            self._limit = self._limit or self._end_in_time(self.transport)
+        elif self._limit is not None:
+            self._limit.cancel()
+            self._limit = None
+
+    def _end_in_time(self, transport: asyncio.Transport) -> asyncio.TimerHandle:
+        def end() -> None:
+            if transport.get_protocol() is self:  # and not that of a WebSocket
+                transport.abort()
+
+        return self.loop.call_later(REQUEST_S, end)
 
 
 class SocketProtocol(WebSocketsSansIOProtocol):

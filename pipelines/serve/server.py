@@ -81,7 +81,11 @@ def prepare(settings: ServeSettings) -> Prepared:
             check_fit(model, robot)
         limits = Limits(sessions=settings.max_sessions)
         hub = Hub(served, robot, limits, settings.state, settings.record)
-        warm_up(model, robot)
+        try:
+            warm_up(model, robot)
+        except BaseException:
+            hub.stop()
+            raise
     except BaseException:
         listening.close()
         raise

@@ -54,6 +54,8 @@ class RobotSession:
     Attributes
     ----------
     inbox : of its samples
+    finished : outputs of windows at the last step, in most cases none
+    failure : why the last step that failed did; empty where none has
 
     Raises
     ------
@@ -85,8 +87,11 @@ class RobotSession:
         self._streams = StreamHealth(request.channels)
         self._clock = SessionClock()
         self._twist, self._twist_s = _NO_TWIST, -math.inf
+        self._steer_rad = np.zeros(3)
         self._received_s = math.nan
         self._n_steps = self._n_messages = 0
+        self.finished: Sequence[WindowOutput] = ()
+        self.failure = ""
         self._window: WindowOutput | None = None
         self._recorder: SessionRecorder | None = None
 
@@ -120,11 +125,6 @@ class RobotSession:
         return self._clock.newest_s
 
     @property
-    def window(self) -> WindowOutput | None:
-        """Output of the last window."""
-        return self._window
-
-    @property
     def belief(self) -> TerrainBelief:
         """The terrain that is believed."""
         if self._pilot is not None:
@@ -156,6 +156,8 @@ class RobotSession:
     def check(self, served: Served) -> None:
         """Raise what :meth:`swap` would."""
         if served.model is None:
+            if self._source is not None or self._observer is not None:
+                raise DataError("a model cannot be replaced by none")
             return
         if self._source is not None:
             self._source.feed_of(served.model)
@@ -233,6 +235,7 @@ class RobotSession:
             self._recorder.readings(readings)
         time_s = self._clock.at(now_s) if time_s is None else time_s
         self._n_steps += 1
+        self.finished = ()
         command, status = None, CommandStatus.OK
         if self._pilot is not None:
             command, status = self._commanded(self._pilot, time_s, readings, now_s)
@@ -255,7 +258,7 @@ class RobotSession:
         fresh = now_s - self._twist_s <= TWIST_FRESH_S
         status = CommandStatus.OK if fresh else CommandStatus.NO_TWIST
         if math.isnan(time_s):
-            return _standing(), CommandStatus.NO_SAMPLES
+            return self._standing(), CommandStatus.NO_SAMPLES
         in_order = {
             name: Reading(reading.time_s, _ordered(reading.values, *self._columns[name]))
             for name, reading in readings.items()
@@ -264,19 +267,27 @@ class RobotSession:
         twist = self._twist if fresh else _NO_TWIST
         try:
             command = pilot.step(Sample(time_s, twist, in_order))
-        except Exception:  # never seen; a robot without a command would go on with its last one
-            return _standing(), CommandStatus.FAILED
+        except Exception as error:  # a robot without a command would go on with its last one
+            self.failure = f"a step failed: {type(error).__name__}: {error}"
+            return self._standing(), CommandStatus.FAILED
         if self._source is not None:
             self._found(self._source.outputs)
-        if self._recorder is not None:
-            self._recorder.command(time_s, twist, command, command.status)
         numbers = (*command.wheel_radps.tolist(), *command.steer_rad.tolist(), *command.twist.tolist())
         if not all(map(math.isfinite, numbers)):
-            return _standing()._replace(status=command.status), CommandStatus.NOT_FINITE
+            command, status = self._standing()._replace(status=command.status), CommandStatus.NOT_FINITE
+        self._steer_rad = command.steer_rad
+        if self._recorder is not None:
+            self._recorder.command(time_s, twist, command, command.status)
         return command, status
 
+    def _standing(self) -> Command:
+        """Return the command to stand, steered as before."""
+        status = {"status_code": float(TractionStatus.UNSOUND)}
+        return Command(np.zeros(3), self._steer_rad, np.zeros(3), status)
+
     def _found(self, outputs: Sequence[WindowOutput]) -> None:
-        """Keep the newest output, and record all."""
+        """Keep the outputs of a step, and record them."""
+        self.finished = outputs
         for output in outputs:
             self._window = output
             if self._recorder is not None:
@@ -316,11 +327,6 @@ class RobotSession:
             sensors,
             self.served.number,
         )
-
-
-def _standing() -> Command:
-    """Return the command to stand, of a step that says nothing else."""
-    return Command(np.zeros(3), np.zeros(3), np.zeros(3), {"status_code": float(TractionStatus.UNSOUND)})
 
 
 def _schema_columns(channels: Mapping[str, Sequence[str]]) -> dict[str, tuple[list[int], list[int], int]]:

@@ -1,6 +1,7 @@
 """The benchmarks measure what they say, and the soak finds what is not accepted."""
 
 import json
+import time
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from pipelines.bench.process import ServiceProcess, service_process
 from pipelines.bench.results import Soak, spread
 from pipelines.bench.robots import packed
 from pipelines.bench.settings import BenchSettings, SoakSettings
-from pipelines.bench.soak import FAULTS, _judged, _Seen, soak
+from pipelines.bench.soak import FAULTS, _judged, _Robot, _Seen, soak
 from pipelines.reporting.json_file import as_json
 from terrain.errors import TerrainError
 from terrain.logs.replay import replay
@@ -125,6 +126,17 @@ def test_what_is_not_accepted_is_named(changed, problem):
     judged = _judged(SoakSettings(), seen(**changed))
     assert isinstance(judged, Soak)
     assert list(judged.problems) == ([problem] if problem else [])
+
+
+@pytest.mark.parametrize(("end_s", "n"), [(2005.0, 0), (5.0, 1), (3005.0, 1)])
+def test_a_window_by_another_robots_clock_is_one_of_another_robot(end_s, n):
+    message = {"streams": {"imu": [[0.01], [[0.0]]]}, "time_s": 0.01}
+    robot = _Robot(2, {"imu": ["gyro_z_radps"]}, [message, {**message, "time_s": 40.0}], _Seen(), 0)
+    assert [one.time_s for one in robot._messages] == pytest.approx([0.0, 39.99])
+    command = {"wheel_radps": [0.0], "steer_rad": [0.0], "twist": [0.0], "valid_s": 1.0}
+    answer = {"command": command, "observation": {"window": {"start_s": end_s - 2.0, "end_s": end_s}}}
+    robot._judge(answer, time.monotonic())
+    assert (robot._seen.steps, robot._seen.wrong_session) == (1, n)
 
 
 @pytest.mark.slow

@@ -137,6 +137,8 @@ def test_a_folder_that_lacks_a_file_holds_no_model(model_dir, missing):
         ),
         (lambda info: json.dumps(info | {"version": 99}), "has version 99; version 1 is read here"),
         (lambda info: json.dumps(info | {"window_s": "two"}), "is damaged"),
+        (lambda info: json.dumps(info | {"classes": ["grass", 3]}), "is no list of texts"),
+        (lambda info: json.dumps(info | {"classes": "grass"}), "is no list of texts"),
         (lambda info: json.dumps(info | {"window_s": -2.0}), r"is damaged \(window length_s is -2\.0"),
         (lambda info: json.dumps(info | {"steady": {"speed": 1}}), "is damaged"),
         (lambda info: json.dumps(info | {"sha256": 5}), r"is damaged \(SHA-256"),

@@ -1,6 +1,7 @@
 """Robots talk to a real service over loopback: what comes back is what the live chain says of each."""
 
 import json
+import math
 import time
 
 import msgpack
@@ -79,6 +80,20 @@ def test_steps_come_at_the_rate_that_was_asked_for(service):
         assert "command" not in step
         assert list(client.errors) == []
     assert client.latest(0.0) is None
+
+
+def test_a_step_of_old_samples_is_no_latest_step(service):
+    with TerrainClient(service.ws, "late", "mower", CHANNELS, rate_hz=0.0) as client:
+        client.send({"imu": ([10.0], [[0.1]])}, step=True)
+        until = time.monotonic() + 10.0
+        while client.latest(60.0) is None:
+            assert time.monotonic() < until
+            time.sleep(0.01)
+        client.send({"imu": ([70.5], [[0.1]])})
+        assert client.latest(60.0) is None
+        assert client.latest(61.0)["time_s"] == 10.0
+        client.send({"imu": ([3.0, math.nan], [[0.1], [0.1]])})  # the clock was set back
+        assert client.latest(60.0)["time_s"] == 10.0
 
 
 def test_the_client_waits_for_steps_and_says_what_went_wrong(service):

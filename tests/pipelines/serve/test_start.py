@@ -5,6 +5,7 @@ import os
 import socket
 import subprocess
 import sys
+import threading
 from dataclasses import replace
 
 import pytest
@@ -130,6 +131,16 @@ def test_after_a_refused_start_the_port_is_free(refusal, model_folder):
         port = probe.getsockname()[1]
     refusal(port=port, robot="husky")
     assert checked(prepare(ServeSettings(model=str(model_folder), port=port)), None).classes == ("a", "b")
+
+
+def test_after_a_start_that_fails_late_no_thread_is_left(refusal, monkeypatch, tmp_path):
+    def fails(*_):
+        raise TerrainError("the code does not run")
+
+    monkeypatch.setattr("pipelines.serve.server.warm_up", fails)
+    before = threading.active_count()
+    assert refusal(record=tmp_path / "runs") == "the code does not run"
+    assert threading.active_count() == before
 
 
 def test_damaged_states_of_robots_do_not_keep_the_service_from_starting(

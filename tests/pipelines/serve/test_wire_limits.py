@@ -88,6 +88,30 @@ def test_connections_that_say_nothing_are_ended(driving, monkeypatch):
     assert driving.get("/health")[0] == 200
 
 
+@pytest.mark.parametrize(
+    ("first", "rest"),
+    [
+        ("", "GET /health HT"),
+        ("GET /health HTTP/1.1\r\nHost: {host}\r\n\r\n", "GET /health HTTP/1.1\r\nHos"),
+        ("", "PUT /table HTTP/1.1\r\nHost: {host}\r\nContent-Length: 9\r\n\r\nhalf"),
+    ],
+    ids=["first", "second", "body"],
+)
+def test_a_request_that_does_not_come_whole_is_ended(driving, monkeypatch, first, rest):
+    monkeypatch.setattr(protocol, "REQUEST_S", 1.0)
+    place = urlsplit(driving.http)
+    with socket.create_connection((place.hostname, place.port), 10) as one:
+        if first:
+            one.sendall(first.format(host=place.netloc).encode())
+            assert one.recv(10_000).startswith(b"HTTP/1.1 200")
+        begun_s = time.monotonic()
+        one.sendall(rest.format(host=place.netloc).encode())
+        with suppress(ConnectionResetError):
+            assert one.recv(10) == b""
+        assert 0.5 < time.monotonic() - begun_s < 4.0
+    assert driving.get("/health")[0] == 200
+
+
 def test_a_receiver_that_does_not_read_is_ended_and_disturbs_no_other(driving):
     begun = {**DRIVEN, "type": "hello", "rate_hz": 200}
     with raw(driving, {**begun, "session": "slow"}, buffer=8192) as slow:

@@ -185,6 +185,7 @@ def test_before_the_first_sample_the_command_is_to_stand():
 def test_a_step_that_fails_commands_to_stand(log, monkeypatch, fault, status):
     session = agrimaro()
     drive(session, replace(log, streams={k: v for k, v in log.streams.items() if k in SENSORS}))
+    steer_rad = session.step(NOW_S + 20.0).command.steer_rad
     step = session._pilot.step
 
     def broken(sample):
@@ -196,7 +197,8 @@ def test_a_step_that_fails_commands_to_stand(log, monkeypatch, fault, status):
     output = session.step(NOW_S + 30.0)
     assert output.status is status
     assert not output.command.wheel_radps.any()
-    assert not output.command.steer_rad.any()
+    assert output.command.steer_rad.tolist() == steer_rad.tolist()
+    assert ("unforeseen" in session.failure) is (status is CommandStatus.FAILED)
     monkeypatch.undo()
     session.put(None, [0.5, 0.0, 0.0], NOW_S + 30.1)
     assert session.step(NOW_S + 30.1).status is CommandStatus.OK
@@ -275,8 +277,9 @@ def test_a_swap_that_does_not_suit_is_refused_and_changes_nothing(mower_model, s
     with pytest.raises(ConfigError, match="is of the robot 'husky', not of 'agrimaro'"):
         driven.swap(Served(2, swerve_model, "other", replace(TABLE, robot="husky")))
     assert driven.served.number == 1
-    driven.swap(Served(2, None, "", TABLE))
-    assert driven.served.number == 2
+    for one in (session, driven):
+        with pytest.raises(DataError, match="cannot be replaced by none"):
+            one.swap(Served(2, None, "", TABLE))
 
 
 def test_a_model_can_come_after_the_robot(log, swerve_model):
