@@ -16,6 +16,7 @@ from operator import itemgetter
 
 import numpy as np
 
+from pipelines.live.aims import Aims
 from pipelines.live.pilot_figures import finite_twist, largest, largest_slip, pose_is_sound, uphill_mps2
 from pipelines.live.pilot_settings import (
     DEFAULT_SETTINGS,
@@ -36,7 +37,6 @@ from terrain.control.path_tracking import (
     initial_tracking,
     track_step,
 )
-from terrain.control.slick import braking_by_slip
 from terrain.control.slip_table import SlipTable, load_slip_table
 from terrain.control.switching import (
     NO_BELIEF,
@@ -69,11 +69,6 @@ from terrain.logs.schema import IMU_CHANNELS, WHEELS_CHANNELS
 from terrain.records import Array, Command, Reading, Sample
 from terrain.robots import Robot
 
-MARGIN_MAX_RATIO = 0.06
-"""The difference of a table's targets in traction and in steady motion is the slip above the balance that
-gives the working pull; up to this much is added to the measured balance.  A larger difference is that of a
-table that aims for a peak."""
-
 _ROLL, _PITCH = IMU_CHANNELS.index("roll_rad"), IMU_CHANNELS.index("pitch_rad")
 _OF_SLIP = tuple(SENSORS.index(name) for name in SLIP_SENSORS)
 _of_slip = itemgetter(*_OF_SLIP)
@@ -82,6 +77,7 @@ _BLAMED = (0, 1, 2, 3, 4, 6, 7, 5)
 # as plain numbers, which compare in a tenth of the time
 _SOUND, _DISAGREES, _LOST = int(SOUND), int(Health.DISAGREES), int(Health.LOST)
 _wheel_command_step = entry_point(wheel_command_step)
+_FIGURES = PilotStatus._fields
 _NOT_ESTIMATED = UNOBSERVED._replace(stale_s=math.nan)
 _NOT_TRACKED = TrackReport(math.nan, math.nan, 0.0, TrackStatus.NO_POSE)
 
@@ -219,9 +215,8 @@ class LivePilot:
     def swap(self, table: SlipTable, source: TerrainSource) -> None:
         """Go on with another table (``ConfigError`` if another robot's) and source, between two steps."""
         check_table(table, self._robot_name)
-        self._table, self._source = table, source
+        self._aims, self._source = Aims(table), source
         self._terrains = {terrain: index for index, terrain in enumerate(table.targets)}
-        self._braking = {name: braking_by_slip(curve) for name, curve in table.curves.items()}
 
     def step(self, sample: Sample) -> Command:
         """Return the wheels' commands for a sample; whatever arrives, it does not raise.
@@ -262,7 +257,7 @@ class LivePilot:
             wheel_radps,
             desired_mps,
             target,
-            self._table.lookup(now.belief.terrain),
+            self._aims.of(now.belief.terrain).entry,
             observed if sound else UNOBSERVED,
             dt_s,
         )
@@ -271,7 +266,7 @@ class LivePilot:
         if not sound and status != TractionStatus.BAD_TIME:
             status = TractionStatus.UNSOUND
         self._actuation.commanded(command_radps * self._radius_m, now.steer_rad)
-        figures = PilotStatus(
+        figures = (
             float(status),
             float(self._terrains.get(now.belief.terrain, -1)),
             now.belief.probability,
@@ -292,7 +287,9 @@ class LivePilot:
             float(now.output),
         )
         scale = done.driven_mps / desired_mps if desired_mps > 0.0 else 0.0
-        return Command(command_radps, now.steer_rad, admitted * scale, figures._asdict())
+        return Command(
+            command_radps, now.steer_rad, admitted * scale, dict(zip(_FIGURES, figures, strict=True))
+        )
 
     def _estimate(self, sample: Sample) -> None:
         """Update the motion, the tilt, and the current terrain."""
@@ -358,16 +355,15 @@ class LivePilot:
     def _target(self, dt_s: float) -> TractionTarget:
         """Return the slips to aim for; the target moves to that of the terrain at a bounded rate."""
         now = self._now
-        entry = self._table.lookup(now.belief.terrain)
+        aim = self._aims.of(now.belief.terrain)
         now.target_ratio = approach(
-            now.target_ratio, entry["traction"].slip_ratio, self._settings.switching.rate_ratio, dt_s
+            now.target_ratio, aim.slip_ratio, self._settings.switching.rate_ratio, dt_s
         )
-        braking = self._braking.get(entry["traction"].terrain)
-        margin = min(entry["traction"].slip_ratio - entry["steady"].slip_ratio, MARGIN_MAX_RATIO)
+        braking = aim.braking
         if braking is None:
-            return TractionTarget(now.target_ratio, margin_ratio=margin)
+            return TractionTarget(now.target_ratio, margin_ratio=aim.margin_ratio)
         mps2 = max(braking.mps2 + uphill_mps2(now.estimate, *now.tilt_rad), 0.0)
-        return TractionTarget(now.target_ratio, braking.slip_ratio, mps2, margin)
+        return TractionTarget(now.target_ratio, braking.slip_ratio, mps2, aim.margin_ratio)
 
     def _track(self, twist: Array, time_s: float, dt_s: float) -> tuple[Array, TrackReport]:
         """Return the twist that keeps the path, and how far the robot is from it."""

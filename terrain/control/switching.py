@@ -176,7 +176,7 @@ def drive_on(
     unconfirmed_s = belief.unconfirmed_s + dt_s
     if unconfirmed_s > settings.unconfirmed_max_s:
         return TerrainBelief(received_s=belief.received_s)
-    return belief._replace(unconfirmed_s=unconfirmed_s)
+    return TerrainBelief(*belief[:-1], unconfirmed_s)
 
 
 def approach(now: float, desired: float, rate: float, dt_s: float) -> float:

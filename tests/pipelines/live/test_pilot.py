@@ -398,10 +398,10 @@ def test_the_expected_deceleration_is_larger_uphill_in_any_direction(direction, 
     live.step(Sample(0.02, np.zeros(3), {"wheels": wheels, "imu": imu}, "snow"))
     now = live._now
     now.estimate = now.estimate._replace(speed_x_mps=direction[0], speed_y_mps=direction[1])
-    level = live._braking["snow"].mps2
+    level = live._aims.of("snow").braking.mps2
     found = live._target(0.02)
     assert found.braking_mps2 - level == pytest.approx(uphill * 9.81 * math.sin(0.1), rel=0.01)
-    assert live._target(0.02).braking_ratio == live._braking["snow"].slip_ratio
+    assert live._target(0.02).braking_ratio == live._aims.of("snow").braking.slip_ratio
 
 
 def test_nis_is_read_by_sensor_and_nan_where_nothing_was_measured():

@@ -107,7 +107,7 @@ def test_the_belief_of_a_classifier_ends_when_a_sensor_of_its_windows_is_lost(mo
     assert last_s < 12.5
     assert (code[(time_s > last_s) & (time_s < last_s + 4.9)] >= 0).all()
     assert (code[time_s > last_s + 5.1] == -1).all()
-    assert target[-1] == pilot._table.lookup("")["traction"].slip_ratio
+    assert target[-1] == load_slip_table().lookup("")["traction"].slip_ratio
     assert np.abs(np.diff(target)).max() <= switching.rate_ratio * 0.0201
 
 
