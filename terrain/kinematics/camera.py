@@ -16,7 +16,6 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from terrain.angles import unwrapped
 from terrain.records import Array, Stream, read_only
@@ -83,6 +82,8 @@ def body_motion(odometry: Stream, camera: Camera) -> BodyMotion:
     It is taken off the position: ``P = P_camera - R_robot r`` (5.8 with the robot's rotation for the printed
     camera's, 5.9), zeroed at the start (5.10).
     """
+    from scipy.spatial.transform import Rotation  # long to import, and no live chain needs it
+
     position, velocity, rate = (
         to_body(_channels(odometry, f"{quantity}_{{}}_{unit}", "xyz"))
         for quantity, unit in (("position", "m"), ("velocity", "mps"), ("rate", "radps"))
@@ -140,6 +141,8 @@ def odometry_stream(
     -----
     The inverse of :func:`body_motion`.  Nothing is differentiated, so that any of the arrays may hold noise.
     """
+    from scipy.spatial.transform import Rotation
+
     n = len(time_s)
     rotation = Rotation.from_euler("ZYX", attitude_rad[:, ::-1] - [yaw_0, 0.0, 0.0])
     lever_m = np.array([camera.lever_x_m, camera.lever_y_m, camera.lever_z_m])
