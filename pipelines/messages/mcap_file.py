@@ -35,7 +35,7 @@ MAGIC = b"\x89MCAP0\r\n"
 FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, DATA_END = 2, 3, 4, 5, 6, 15
 """Opcodes of the records that are read; the others are passed over."""
 
-MAX_RATIO = 2000
+MAX_RATIO = 200
 """Most that a chunk of more than 16 MiB may grow by when it is unpacked; measurements grow by 2 to 20."""
 
 SMALL_BYTES = 16 * MEBIBYTE
