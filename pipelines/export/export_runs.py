@@ -14,14 +14,13 @@ from pipelines.export.outgoing import Outgoing, outgoing_topics, text_topic
 from pipelines.export.results import Exported
 from pipelines.export.settings import ExportSettings, Target
 from pipelines.export.write import write_mcap, write_ros2
-from pipelines.recording.windows_file import WINDOWS_FILE
+from pipelines.recording.windows_file import RecordedWindow, read_windows
+from pipelines.reporting.json_file import as_json
 from pipelines.reporting.progress import Progress, silent
 from pipelines.runs.datasets import data_digest
 from pipelines.runs.settings import InspectSettings, load
 from terrain.errors import LogError
 from terrain.files.atomic import atomic_file, atomic_folder
-from terrain.files.documents import read_json
-from terrain.logs.log_files import short_name
 from terrain.logs.read import read_run_head, run_folders
 from terrain.logs.write import run_folder
 from terrain.records import RunLog
@@ -53,11 +52,12 @@ def export_runs(source: InspectSettings, settings: ExportSettings, progress: Pro
     written: list[Path] = []
     try:
         for run in runs:
-            topics = [*outgoing_topics(run), *_window_topic(run, windows)]
+            topics = [*outgoing_topics(run), *_window_topic(run, windows.get(run.run_id, []))]
             _write(targets[run.run_id], run, topics, settings.target)
             written.append(targets[run.run_id])
             dropped.update(run.dropped)
-            counts.update({topic.topic: len(topic.messages) for topic in topics})
+            for topic in topics:  # several streams may share one
+                counts[topic.topic] += len(topic.messages)
             progress("write runs", len(written), len(runs))
     except BaseException:
         for target in written:
@@ -93,24 +93,16 @@ def _write(target: Path, run: RunLog, topics: list[Outgoing], kind: Target) -> N
         (unfinished / target.name).rmdir()
 
 
-def _recorded_windows(folder: Path) -> dict[str, list[dict[str, object]]]:
-    """Return the entries of the windows that lie beside the streams of run folders, by run."""
-    found = {}
-    for place in run_folders(folder) if folder.is_dir() else []:
-        path = place / WINDOWS_FILE
-        if path.is_file():
-            document = read_json(path, short_name(path), LogError)
-            try:
-                found[read_run_head(place).run_id] = [dict(entry) for entry in document["windows"]]
-            except (KeyError, TypeError, ValueError) as error:
-                raise LogError(f"{short_name(path)}: is damaged ({type(error).__name__}: {error})") from error
-    return found
+def _recorded_windows(folder: Path) -> dict[str, list[RecordedWindow]]:
+    """Return the windows that lie beside the streams of run folders, by run."""
+    places = run_folders(folder) if folder.is_dir() else []
+    found = {place: read_windows(place) for place in places}
+    return {read_run_head(place).run_id: windows for place, windows in found.items() if windows}
 
 
-def _window_topic(run: RunLog, windows: dict[str, list[dict[str, object]]]) -> list[Outgoing]:
+def _window_topic(run: RunLog, windows: list[RecordedWindow]) -> list[Outgoing]:
     """Return the topic of recorded windows: each as JSON, at its end."""
-    entries = windows.get(run.run_id, [])
-    if not entries:
+    if not windows:
         return []
-    ends = np.array([float(str(entry["end_s"])) for entry in entries])
-    return [text_topic(WINDOW_TOPIC, ends, [json.dumps(entry) for entry in entries], run)]
+    texts = [json.dumps(as_json(window)) for window in windows]
+    return [text_topic(WINDOW_TOPIC, np.array([window.end_s for window in windows]), texts, run)]

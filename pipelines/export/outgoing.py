@@ -69,8 +69,7 @@ def outgoing_topics(run: RunLog) -> Iterator[Outgoing]:
     changes = _label_changes(run)
     if changes:
         times, names = zip(*changes, strict=True)
-        log_ns = stamps_ns(np.clip(np.array(times), origin_s, origin_s + LATEST_S), origin_s)
-        yield _texts(LABEL_TOPIC, log_ns.tolist(), list(names))
+        yield text_topic(LABEL_TOPIC, np.array(times), list(names), run)
     for name, stream in run.streams.items():
         topic = topics[name]
         columns = {field: stream.channel(channel) for field, channel in topic.fields.items()}
@@ -85,8 +84,15 @@ def outgoing_topics(run: RunLog) -> Iterator[Outgoing]:
 
 
 def text_topic(topic: str, time_s: Array, texts: list[str], run: RunLog) -> Outgoing:
-    """Return texts at times of a run as a topic."""
-    return _texts(topic, stamps_ns(np.asarray(time_s), _origin_s(run)).tolist(), texts)
+    """Return texts at times of a run as a topic; times outside what stamps can be are its ends."""
+    origin_s = _origin_s(run)
+    return _texts(
+        topic,
+        stamps_ns(
+            np.clip(np.nan_to_num(time_s, nan=origin_s), origin_s, origin_s + LATEST_S), origin_s
+        ).tolist(),
+        texts,
+    )
 
 
 def _origin_s(run: RunLog) -> float:

@@ -197,7 +197,8 @@ def _bags(place: Path, mapping: str | Path | None, robot: Robot | None) -> list[
 
     if not place.exists():
         raise LogError(f"{place}: does not exist; {ACCEPTED}")
-    return _some(logs.find_runs(place, mapping, robot), place)
+    named = place.resolve() if place.is_file() else place  # a file that the user names may be a link
+    return _some(logs.find_runs(named, mapping, robot), place)
 
 
 def _drive_robot(robot: Robot | None) -> DriveRobot:
