@@ -15,6 +15,7 @@ from pipelines.cli import (
     drive,
     estimate,
     explain,
+    export,
     faults,
     label,
     quickstart,
@@ -37,7 +38,7 @@ app = typer.Typer(
 )
 
 GROUPS = (
-    *(runs.app, estimate.app, classify.app, slip.app, drive.app),
+    *(runs.app, export.app, estimate.app, classify.app, slip.app, drive.app),
     *(replay.app, serve.app, can.app, label.app),
     *(faults.app, explain.app, reproduce.app, quickstart.app),
 )

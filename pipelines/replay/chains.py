@@ -27,6 +27,9 @@ from terrain.logs.replay import SENSORS
 from terrain.records import RunLog, Sample, Stream
 from terrain.robots import Robot
 
+UNNEEDED = "confidence_ratio"
+"""Channel that the pilot does without: other cameras than AgriMaRo's do not give it."""
+
 _FOLLOWED = PilotSettings(follows=False)  # another controller drove when the log was written
 
 
@@ -166,8 +169,11 @@ def _columns_of_pilot(run: RunLog) -> RunLog:
         if stream is None:
             continue
         lacking = [channel for channel in channels if channel not in stream.channels]
-        if lacking:
+        if set(lacking) - {UNNEEDED}:
             raise DataError(f"run {run.run_id}: stream {name} has no channel {lacking[0]!r} for the pilot")
-        values = np.column_stack([stream.channel(channel) for channel in channels])
+        unknown = np.full(len(stream), np.nan)
+        values = np.column_stack(
+            [unknown if channel in lacking else stream.channel(channel) for channel in channels]
+        )
         streams[name] = Stream(stream.time_s, values, channels)
     return RunLog(run.run_id, run.robot, streams, run.labels)

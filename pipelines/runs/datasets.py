@@ -19,9 +19,10 @@ if TYPE_CHECKING:
     from terrain.logs.drive import DriveRobot
     from terrain.robots import Robot
 
-LAYOUTS = ("auto", "runs", "borealtc", "csv", "drive", "can")
+LAYOUTS = ("auto", "runs", "borealtc", "csv", "drive", "can", "bag")
 """``runs``: run folders as this package writes them; ``csv``: any CSV, by a mapping file; ``drive``: the
-files ``samples.csv.gz`` of DRIVE, one a session; ``can``: logs of a CAN bus, by a DBC."""
+files ``samples.csv.gz`` of DRIVE, one a session; ``can``: logs of a CAN bus, by a DBC; ``bag``: MCAP files
+and ROS 2 bags, by a mapping or by the types of their topics."""
 
 CAN_ROBOT = "agrimaro"
 """Robot of a log of a CAN bus where none is named."""
@@ -31,7 +32,8 @@ DRIVE_ROBOT = "husky"
 
 ACCEPTED = (
     "accepted are run folders (run.json), the BorealTC layout (<CLASS>/imu_N.csv and pro_N.csv), "
-    "the DRIVE layout (samples.csv.gz, or folders of sessions with one each), and any CSV with a mapping file"
+    "the DRIVE layout (samples.csv.gz, or folders of sessions with one each), MCAP files and ROS 2 bags, and "
+    "any CSV with a mapping file"
 )
 
 _log = logging.getLogger(__name__)
@@ -52,13 +54,14 @@ def load_runs(
     Parameters
     ----------
     folder : a run folder, a folder of run folders, a folder in the BorealTC or the DRIVE layout (a session,
-        or folders of sessions), or the folder that the files of ``mapping`` are found under
+        or folders of sessions), or the folder that the files of ``mapping`` or bags are found under; or an
+        MCAP file
     layout : one of ``LAYOUTS``; ``auto`` looks
     mapping : YAML file that describes how to read CSV files (``terrain.logs.mapping``); of logs of a CAN bus
-        their DBC, by default AgriMaRo's
+        their DBC, by default AgriMaRo's; of bags their topics (``pipelines.bags.mapping``)
     repair : drop and count what a strict read refuses, and skip runs that cannot be read at all
     align : bring the wheel stream onto the clock of the IMU where the two clocks can be compared
-    robot : the robot of logs that do not name theirs, those of DRIVE, by name or its YAML file;
+    robot : the robot of logs that do not name theirs, by name or its YAML file; of those of DRIVE
         :data:`DRIVE_ROBOT` by default
     on_skip : called with a sentence for each run that is skipped when repairing; logs a warning by default
 
@@ -152,6 +155,8 @@ def _readers(
 ) -> list[Callable[..., RunLog]]:
     if layout not in LAYOUTS:
         raise ConfigError(f"layout {layout!r} is unknown: choose one of {', '.join(LAYOUTS)}")
+    if layout == "bag" or (layout == "auto" and folder.is_file()):
+        return _bags(folder, mapping, robot)
     if not folder.is_dir():
         fault = "is no folder" if folder.exists() else "does not exist"
         raise LogError(f"{folder}: {fault}; {ACCEPTED}")
@@ -168,6 +173,7 @@ def _readers(
         from terrain.logs import mapping as by_mapping
 
         return by_mapping.find_runs(folder, by_mapping.load_mapping(mapping))
+    from pipelines.messages.finding import find_bags
     from terrain.logs import borealtc, drive, read
 
     found: dict[str, list[Any]] = {
@@ -178,9 +184,21 @@ def _readers(
     names = [name for name, readers in found.items() if readers]
     if len(names) > 1:
         raise LogError(f"{folder}: mixes the layouts {' and '.join(names)}; choose one with --format")
+    if not names and layout == "auto" and find_bags(folder):
+        return _bags(folder, None, robot)
     if names == ["drive"]:
         return drive.find_runs(folder, _drive_robot(robot))
     return _some([reader for readers in found.values() for reader in readers], folder)
+
+
+def _bags(place: Path, mapping: str | Path | None, robot: Robot | None) -> list[Callable[..., RunLog]]:
+    """Return the readers of bags; a place without any is refused."""
+    from pipelines.bags import logs
+
+    if not place.exists():
+        raise LogError(f"{place}: does not exist; {ACCEPTED}")
+    named = place.resolve() if place.is_file() else place  # a file that the user names may be a link
+    return _some(logs.find_runs(named, mapping, robot), place)
 
 
 def _drive_robot(robot: Robot | None) -> DriveRobot:

@@ -12,12 +12,15 @@ from pipelines.config.settings import Settings, setting
 if TYPE_CHECKING:
     from terrain.records import RunLog
 
-Layout = Literal["auto", "runs", "borealtc", "csv", "drive", "can"]
+Layout = Literal["auto", "runs", "borealtc", "csv", "drive", "can", "bag"]
 """``auto``: found out; ``runs``: run folders as this package writes them; ``csv``: any CSV, by a mapping
-file; ``drive``: the files ``samples.csv.gz`` of DRIVE, one a session; ``can``: logs of a CAN bus."""
+file; ``drive``: the files ``samples.csv.gz`` of DRIVE, one a session; ``can``: logs of a CAN bus; ``bag``:
+MCAP files and ROS 2 bags."""
 
 
-ROBOT_TEXT = "Robot of logs that do not name theirs (DRIVE), by name or its YAML file; the husky by default."
+ROBOT_TEXT = (
+    "Robot of logs that do not name theirs (DRIVE, CAN, bags), by name or its YAML file; of DRIVE the husky."
+)
 
 
 class ReadSettings(Settings):
@@ -25,7 +28,7 @@ class ReadSettings(Settings):
 
     layout: Layout = setting("auto", "Layout of the folder.", option="--format")
     mapping: Path | None = setting(
-        None, "YAML file that describes how to read CSV files; with --format can a DBC."
+        None, "YAML file that describes how to read CSV files, or with --format bag topics; with can a DBC."
     )
     repair: bool = setting(False, "Drop and count what a strict read refuses.")
 
@@ -33,7 +36,7 @@ class ReadSettings(Settings):
 class RunsSettings(ReadSettings):
     """The runs that a command works on."""
 
-    data: Path = setting(..., "Folder of runs in any readable layout.")
+    data: Path = setting(..., "Folder of runs in any readable layout, or an MCAP file.")
 
     @property
     def dataset(self) -> str:
@@ -51,7 +54,7 @@ class AlignedRunsSettings(RunsSettings):
 class InspectSettings(RunsSettings):
     """What is inspected."""
 
-    data: Path = setting(..., "Folder to read.", option="FOLDER")
+    data: Path = setting(..., "Folder to read, or an MCAP file.", option="FOLDER")
     robot: str | None = setting(None, ROBOT_TEXT)
 
 

@@ -8,6 +8,7 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import BinaryIO
 
 from terrain.errors import TerrainError
 
@@ -33,13 +34,29 @@ def atomic_write(path: str | Path, content: bytes | str) -> None:
     ...     (Path(folder) / "report.json").read_text()
     '{}'
     """
-    path = Path(path)
+    with atomic_file(Path(path)) as file:
+        file.write(content.encode() if isinstance(content, str) else content)
+
+
+@contextmanager
+def atomic_file(path: Path) -> Iterator[BinaryIO]:
+    """Give a file to write; when the block ends well it becomes ``path``, else it is removed.
+
+    Parameters
+    ----------
+    path : file to write or replace; its folder is made when missing
+
+    Raises
+    ------
+    TerrainError
+        if the place cannot be written; what was there is there still.
+    """
     temporary = _name_beside(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
             with temporary.open("xb") as file:
-                file.write(content.encode() if isinstance(content, str) else content)
+                yield file
                 file.flush()
                 os.fsync(file.fileno())
             temporary.replace(path)

@@ -56,11 +56,13 @@ Unit = Annotated[str, BeforeValidator(lambda unit: unit if isinstance(unit, str)
 Word = Annotated[str, Field(min_length=1)]
 
 
-class _Strict(BaseModel):
+class Strict(BaseModel):
+    """Part of a mapping: unknown keys are refused."""
+
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class Column(_Strict):
+class Column(Strict):
     """Where a channel is: ``(scale * cell + offset)`` is in ``unit``."""
 
     column: Word
@@ -69,14 +71,14 @@ class Column(_Strict):
     offset: FiniteFloat = 0.0
 
 
-class TimeColumn(_Strict):
+class TimeColumn(Strict):
     """Where the time is."""
 
     column: Word
     unit: Unit
 
 
-class StreamMapping(_Strict):
+class StreamMapping(Strict):
     """Where a stream is."""
 
     file: Word
@@ -85,7 +87,7 @@ class StreamMapping(_Strict):
     delimiter: Annotated[str, Field(min_length=1, max_length=1)] = ","
 
 
-class Mapping(_Strict):
+class Mapping(Strict):
     """How CSV files become run logs."""
 
     robot: Word
@@ -108,7 +110,7 @@ def load_mapping(path: str | Path) -> Mapping:
     try:
         mapping = Mapping.model_validate(described)
     except ValidationError as error:
-        raise ConfigError(f"{path.name}: {_first_fault(error)}") from error
+        raise ConfigError(f"{path.name}: {first_fault(error)}") from error
     check_name(f"{path.name}: robot", mapping.robot, ConfigError)
     _check_units(path.name, mapping)
     _check_fields(path.name, mapping)
@@ -214,17 +216,25 @@ def _pattern(file: str) -> re.Pattern[str]:
 
 def _check_units(file: str, mapping: Mapping) -> None:
     for name, stream in mapping.streams.items():
-        _si_word(f"{file}: stream {name}: time", stream.time.unit, "s")
+        check_unit(f"{file}: stream {name}: time", stream.time.unit, "s")
         for channel, column in stream.channels.items():
             place = f"{file}: stream {name}: channel {channel}"
             try:
                 desired = unit_of(channel)
             except LogError as error:
                 raise ConfigError(f"{file}: stream {name}: {error}") from error
-            _si_word(place, column.unit, desired)
+            check_unit(place, column.unit, desired)
 
 
-def _si_word(place: str, unit: str, desired: str) -> None:
+def check_unit(place: str, unit: str, desired: str) -> None:
+    """Raise :class:`ConfigError` where a unit is unknown, or another than that of an SI unit word.
+
+    Examples
+    --------
+    >>> check_unit("gyro_z_radps", "m", "radps")
+    Traceback (most recent call last):
+    terrain.errors.ConfigError: gyro_z_radps: unit 'm' does not suit it (accepted here: rad/s, deg/s, rpm)
+    """
     suitable = ", ".join(name for name, (word, _) in UNIT_SCALES.items() if word == desired)
     if unit not in UNIT_SCALES:
         raise ConfigError(f"{place}: unit {unit!r} is unknown (accepted here: {suitable})")
@@ -253,7 +263,8 @@ def _check_fields(file: str, mapping: Mapping) -> None:
             raise ConfigError(f"{file}: {key} {rule!r} uses a word that the files lack (they have {known})")
 
 
-def _first_fault(error: ValidationError) -> str:
+def first_fault(error: ValidationError) -> str:
+    """Return the first thing in a mapping that is not accepted, in one sentence."""
     fault: dict[str, Any] = dict(error.errors()[0])
     place = ".".join(str(part) for part in fault["loc"]) or "the file"
     if fault["type"] == "extra_forbidden":

@@ -58,6 +58,9 @@ from terrain.records import Label, RunLog
 MAX_STREAMS = 64
 """Streams of a run; each is held in memory, and several may name one file."""
 
+MAY_BE_UNKNOWN = ("slip", "truth", "control")
+"""Streams of which a channel may hold nothing but NaN."""
+
 
 def find_runs(folder: Path) -> list[Callable[..., RunLog]]:
     """Return one reader per run folder of :func:`run_folders`; call it with ``repair=``."""
@@ -116,7 +119,7 @@ def read_run(folder: str | Path, *, repair: bool = False) -> RunLog:
             channels,
             row_of=lambda index: index + 1,
             repairs=dropped if repair else None,
-            unknown_is_a_value=name in ("slip", "truth", "control"),
+            unknown_is_a_value=name in MAY_BE_UNKNOWN,
         )
     if not streams:
         raise LogError(f"{place}: the run has no stream")
@@ -128,7 +131,7 @@ def read_run(folder: str | Path, *, repair: bool = False) -> RunLog:
             run_id,
             _entry(place, head, "robot", str),
             streams,
-            _labels(place, _entry(place, head, "labels", list)),
+            read_labels(place, _entry(place, head, "labels", list)),
             source=_entry(place, head, "source", str),
             dropped=dropped,
             session=_entry(place, {"session": ""} | head, "session", str),
@@ -163,7 +166,7 @@ def read_run_head(folder: str | Path) -> RunHead:
     path = Path(folder) / "run.json"
     head, place = _read_head(path), short_name(path)
     return RunHead(
-        _entry(place, head, "run_id", str), _labels(place, _entry(place, head, "labels", list)), head
+        _entry(place, head, "run_id", str), read_labels(place, _entry(place, head, "labels", list)), head
     )
 
 
@@ -198,7 +201,8 @@ def _channels(place: str, channels: dict[str, Any]) -> list[str]:
     return list(channels)
 
 
-def _labels(place: str, entries: list[Any]) -> tuple[Label, ...]:
+def read_labels(place: str, entries: list[Any]) -> tuple[Label, ...]:
+    """Return the terrain intervals that ``run.json`` lists; ``LogError`` where they are broken or overlap."""
     labels = []
     for entry in entries:
         terrain = _entry(f"{place}: labels", entry, "terrain", str)

@@ -13,7 +13,17 @@ from dataclasses import dataclass, field
 
 COMMANDS = (
     *("import", "inspect", "simulate", "calibrate", "estimate", "crossval", "train", "predict"),
-    *("learn-slip", "drive", "faults", "can", "explain", "explain-trials", "quickstart", "reproduce"),
+    *(
+        "learn-slip",
+        "drive",
+        "faults",
+        "can",
+        "export",
+        "explain",
+        "explain-trials",
+        "quickstart",
+        "reproduce",
+    ),
     *("replay", "label", "serve", "bench"),
 )
 
@@ -90,6 +100,22 @@ streams:
     channels:
       speed_left_mps: {column: vl, unit: km/h}
       speed_right_mps: {column: vr, unit: km/h}
+"""
+
+TOPICS = """\
+robot: agrimaro
+labels: /terrain/label
+streams:
+  imu: {topic: /imu, kind: imu}
+  odometry: {topic: /odometry, kind: odometry}
+  commands: {topic: /cmd_vel, kind: twist}
+  wheels:
+    topic: /joint_states
+    kind: joints
+    channels:
+      motor_1_radps: {joint: motor_1, field: velocity}
+      motor_2_radps: {joint: motor_2, field: velocity}
+      motor_3_radps: {joint: motor_3, field: velocity}
 """
 
 LACKING_DBC = 'VERSION ""\nBU_: PC\nBO_ 16 A: 8 PC\n SG_ MotorRate1 : 0|8@1+ (1,0) [0|9] "rpm" PC\n'
@@ -309,6 +335,23 @@ CASES: tuple[Case, ...] = (
             refused("can --interface virtual --channel behaviour --dbc lacking.dbc"),
         ),
         lambda: {"lacking.dbc": LACKING_DBC.encode()},
+    ),
+    Case(
+        "bags",
+        steps(
+            "simulate --robot agrimaro --terrain grass --scenario survey --duration 12 --out raw",
+            "export raw --out mcap",
+            "export raw --as ros2 --out ros2",
+            "import mcap --out of_mcap",
+            "import ros2 --format bag --out of_ros2",
+            "import mcap --format bag --mapping topics.yaml --out of_topics",
+            "inspect mcap",
+            "replay mcap/grass_survey_01.mcap --rate 20",
+            refused("export raw --out mcap"),
+            refused("export raw --as bag --out other"),
+            refused("import mcap --format bag --mapping husky_topics --out other"),
+        ),
+        lambda: {"topics.yaml": TOPICS.encode()},
     ),
     Case(
         "refusals",

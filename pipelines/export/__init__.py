@@ -1,0 +1,1 @@
+"""Runs as MCAP files and ROS 2 bags."""

@@ -1,0 +1,114 @@
+"""Bags as other programs write them, by rosbags and mcap; the messages are serialized by rosbags."""
+
+from __future__ import annotations
+
+import numpy as np
+from mcap.writer import CompressionType
+from mcap.writer import Writer as McapWriter
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+
+STORE = get_typestore(Stores.ROS2_HUMBLE)
+TYPES = STORE.types
+START_NS = 1_700_000_000_123_456_789
+
+
+def header(stamp_ns, frame="base_link"):
+    time = TYPES["builtin_interfaces/msg/Time"](stamp_ns // 10**9, stamp_ns % 10**9)
+    return TYPES["std_msgs/msg/Header"](time, frame)
+
+
+def vector(x, y, z):
+    return TYPES["geometry_msgs/msg/Vector3"](x, y, z)
+
+
+def imu(stamp_ns, gyro, accel=(0.0, 0.0, 9.81), quaternion=(0.0, 0.0, 0.0, 1.0), unknown=False, frame="imu"):
+    covariance = np.zeros(9)
+    attitude = np.array([-1.0 if unknown else 0.0, *covariance[1:]])
+    return TYPES["sensor_msgs/msg/Imu"](
+        header(stamp_ns, frame),
+        TYPES["geometry_msgs/msg/Quaternion"](*quaternion),
+        attitude,
+        vector(*gyro),
+        covariance,
+        vector(*accel),
+        covariance,
+    )
+
+
+def joints(stamp_ns, names, velocity, position=(), effort=()):
+    numbers = (np.array(each, dtype=np.float64) for each in (position, velocity, effort))
+    return TYPES["sensor_msgs/msg/JointState"](header(stamp_ns), list(names), *numbers)
+
+
+def twist(x, y, yaw_rate):
+    return TYPES["geometry_msgs/msg/Twist"](vector(x, y, 0.0), vector(0.0, 0.0, yaw_rate))
+
+
+def odometry(stamp_ns, position, quaternion, linear, angular):
+    pose = TYPES["geometry_msgs/msg/Pose"](
+        TYPES["geometry_msgs/msg/Point"](*position), TYPES["geometry_msgs/msg/Quaternion"](*quaternion)
+    )
+    return TYPES["nav_msgs/msg/Odometry"](
+        header(stamp_ns, "odom"),
+        "base_link",
+        TYPES["geometry_msgs/msg/PoseWithCovariance"](pose, np.zeros(36)),
+        TYPES["geometry_msgs/msg/TwistWithCovariance"](
+            TYPES["geometry_msgs/msg/Twist"](vector(*linear), vector(*angular)), np.zeros(36)
+        ),
+    )
+
+
+def text(content):
+    return TYPES["std_msgs/msg/String"](content)
+
+
+def write_bag(folder, rows, storage="sqlite3"):
+    """Write ``(topic, log time in ns, message)`` as a bag of rosbag2."""
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with Writer(folder, version=9, storage_plugin=StoragePlugin[storage.upper()]) as writer:
+        connections = {}
+        for topic, log_ns, message in rows:
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, message.__msgtype__, typestore=STORE)
+            content = STORE.serialize_cdr(message, message.__msgtype__)
+            writer.write(connections[topic], log_ns, content)
+    return folder
+
+
+def write_mcap(path, rows, compression=CompressionType.ZSTD, chunk_size=20_000, **options):
+    """Write ``(topic, log time in ns, message)`` as an MCAP file of one's own."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("wb") as file:
+        writer = McapWriter(file, compression=compression, chunk_size=chunk_size, **options)
+        writer.start(profile="ros2", library="test")
+        channels = {}
+        for topic, log_ns, message in rows:
+            kind = message.__msgtype__
+            if topic not in channels:
+                definition = STORE.generate_msgdef(kind, ros_version=2)[0]
+                schema = writer.register_schema(kind, "ros2msg", definition.encode())
+                channels[topic] = writer.register_channel(topic, "cdr", schema)
+            content = bytes(STORE.serialize_cdr(message, kind))
+            writer.add_message(channels[topic], log_ns, content, log_ns)
+        writer.finish()
+    return path
+
+
+def husky_rows(n=200, start_ns=START_NS, late_ns=2_000_000):
+    """Return a drive: IMU at 100 Hz, the others at 50 Hz; logged a little after its stamps."""
+    rng = np.random.default_rng(3)
+    rows = []
+    for i in range(n):
+        stamp = start_ns + 10_000_000 * i
+        rows.append(("/imu/data", stamp + late_ns, imu(stamp, rng.normal(size=3), rng.normal(size=3))))
+        if i % 2:
+            continue
+        names = ("front_left_wheel_joint", "front_right_wheel_joint", "rear_left_wheel_joint")
+        rows.append(("/joint_states", stamp + late_ns, joints(stamp, names, rng.normal(size=3), np.zeros(3))))
+        quaternion = rng.normal(size=4)
+        quaternion /= np.linalg.norm(quaternion)
+        moving = (rng.normal(size=3), quaternion, rng.normal(size=3), rng.normal(size=3))
+        rows.append(("/odometry/filtered", stamp + late_ns, odometry(stamp, *moving)))
+        rows.append(("/cmd_vel", stamp + late_ns, twist(*rng.normal(size=3))))
+    return sorted(rows, key=lambda row: row[1])

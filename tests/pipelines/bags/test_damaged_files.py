@@ -1,0 +1,168 @@
+"""Damaged files are one sentence, or give what can be read; none takes forever or all memory."""
+
+import sqlite3
+import struct
+import tracemalloc
+
+import lz4.frame
+import numpy as np
+import pytest
+import zstandard
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.writer import CompressionType
+
+from pipelines.messages.mcap_file import MAGIC
+from pipelines.runs.datasets import load_runs
+from terrain.errors import ConfigError, LogError
+
+from .foreign import START_NS, husky_rows, imu, write_bag, write_mcap
+
+KNOWN = {
+    "files that end early",
+    "damaged blocks of messages",
+    "damaged messages",
+    "rows with a bad time",
+    "channels with nothing finite",
+}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """Return the bytes of a whole file of each kind, and a folder to work in."""
+    folder = tmp_path_factory.mktemp("whole")
+    rows = husky_rows(40)
+    files = {
+        "zstd": write_mcap(folder / "zstd.mcap", rows, chunk_size=5000),
+        "lz4": write_mcap(folder / "lz4.mcap", rows, CompressionType.LZ4, chunk_size=5000),
+        "none": write_mcap(folder / "none.mcap", rows, CompressionType.NONE, chunk_size=5000),
+        "loose": write_mcap(folder / "loose.mcap", rows, use_chunking=False),
+        "sqlite": write_bag(folder / "sqlite", rows) / "sqlite.db3",
+    }
+    return folder, {name: path.read_bytes() for name, path in files.items()}
+
+
+def read(folder, kind, content, repair):
+    """Return the run of a file's bytes; None where it is refused in one sentence."""
+    path = folder / ("damaged.db3" if kind == "sqlite" else "damaged.mcap")
+    path.write_bytes(content)
+    try:
+        (run,) = load_runs(path, mapping="husky_topics", repair=repair)
+    except (LogError, ConfigError) as error:
+        sentence = str(error)
+    else:
+        return run
+    assert "\n" not in sentence
+    assert len(sentence) < 1500
+    return None
+
+
+def kinds():
+    return st.sampled_from(["zstd", "lz4", "none", "loose", "sqlite"])
+
+
+@given(kinds(), st.floats(0.0, 1.0), st.booleans())
+@settings(max_examples=60, deadline=None)
+def test_a_file_that_is_cut_off_is_refused_or_read_as_far_as_it_goes(whole, kind, part, repair):
+    folder, files = whole
+    content = files[kind][: int(part * len(files[kind]))]
+    run = read(folder, kind, content, repair)
+    if run is not None and kind != "sqlite":
+        ends = files[kind].find(b"\x0f\x04\x00\x00\x00\x00\x00\x00\x00") + 9  # the end of the messages
+        assert repair or len(content) >= ends
+        assert set(run.dropped) <= KNOWN
+        if len(content) < ends:
+            assert run.dropped["files that end early"] == 1
+
+
+@given(
+    kinds(),
+    st.lists(st.tuples(st.floats(0.0, 1.0), st.integers(0, 255)), min_size=1, max_size=8),
+    st.booleans(),
+)
+@settings(max_examples=100, deadline=None)
+def test_bytes_that_are_changed_are_refused_or_counted_or_are_other_numbers(whole, kind, changes, repair):
+    folder, files = whole
+    content = bytearray(files[kind])
+    for part, value in changes:
+        content[min(int(part * len(content)), len(content) - 1)] ^= value
+    run = read(folder, kind, bytes(content), repair)
+    if run is not None:
+        assert set(run.dropped) <= KNOWN
+        assert all(np.all(np.diff(stream.time_s) > 0) for stream in run.streams.values())
+
+
+def test_a_chunk_that_is_changed_is_refused_and_left_out_when_repairing(whole):
+    folder, files = whole
+    content = bytearray(files["none"])
+    content[len(content) // 2] ^= 1
+    assert read(folder, "none", bytes(content), repair=False) is None
+    run = read(folder, "none", bytes(content), repair=True)
+    assert run.dropped["damaged blocks of messages"] == 1
+    assert 20 < len(run.streams["imu"]) < 40
+
+
+def record(op, content):
+    return bytes([op]) + struct.pack("<Q", len(content)) + content
+
+
+def chunk(size, compression, packed, crc=0):
+    name = compression.encode()
+    head = struct.pack("<QQQII", 0, 0, size, crc, len(name)) + name
+    return record(6, head + struct.pack("<Q", len(packed)) + packed)
+
+
+@pytest.mark.parametrize("compression", ["zstd", "lz4"])
+@pytest.mark.parametrize("stated", [100, 200_000_000, 2**40])
+def test_a_chunk_that_grows_beyond_bounds_is_refused_without_being_unpacked(tmp_path, compression, stated):
+    zeros = bytes(100_000_000)
+    packed = zstandard.compress(zeros) if compression == "zstd" else lz4.frame.compress(zeros)
+    content = MAGIC + chunk(stated, compression, packed)
+    del zeros
+    tracemalloc.start()
+    try:
+        assert read(tmp_path, "zstd", content, repair=False) is None
+        assert read(tmp_path, "zstd", content, repair=True) is None
+        assert tracemalloc.get_traced_memory()[1] < 60_000_000
+    finally:
+        tracemalloc.stop()
+
+
+def test_records_and_chunks_that_are_nonsense_are_one_sentence(tmp_path):
+    for content in (
+        MAGIC,
+        MAGIC + record(6, b""),
+        MAGIC + chunk(5, "", b"\x05\xff\xff\xff\xff"),
+        MAGIC + chunk(9, "rar", b"123456789"),
+        MAGIC + b"\x05" + b"\xff" * 8,
+        MAGIC + record(3, b"\x01\x00\xff\xff\xff\xff"),
+        MAGIC + record(5, bytes(22)) + record(15, bytes(4)),
+        MAGIC * 2,
+    ):
+        for repair in (False, True):
+            assert read(tmp_path, "zstd", content, repair) is None
+
+
+def test_a_message_that_is_not_as_defined_is_refused_or_counted(tmp_path):
+    rows = [("/imu/data", START_NS + i * 10**7, imu(START_NS + i * 10**7, (0, 0, 1))) for i in range(20)]
+    bag = write_bag(tmp_path / "bag", rows)
+    for change in ("x'00'", "'text'", "x'0001000000'"):
+        with sqlite3.connect(bag / "bag.db3") as store:
+            store.execute(f"update messages set data = {change} where id = 7")
+        store.close()
+        with pytest.raises(LogError, match="--repair"):
+            load_runs(bag, layout="bag", robot="husky")
+        (run,) = load_runs(bag, layout="bag", robot="husky", repair=True)
+        assert (len(run.streams["imu"]), dict(run.dropped)) == (19, {"damaged messages": 1})
+
+
+def test_a_view_in_the_place_of_a_table_is_refused(tmp_path):
+    with sqlite3.connect(tmp_path / "a.db3") as store:
+        store.execute("create table topics (id integer, name text, type text, serialization_format text)")
+        store.execute(
+            "create view messages as with recursive r(x) as (select 1 union all select x from r) "
+            "select x as topic_id, x as timestamp, x as data from r"
+        )
+    store.close()
+    with pytest.raises(LogError, match="table 'messages' is missing"):
+        load_runs(tmp_path / "a.db3", robot="husky")

@@ -1,0 +1,353 @@
+"""Bags become the runs whose messages they hold; rosbags writes them."""
+
+import numpy as np
+import pytest
+from mcap.writer import CompressionType, IndexType
+from scipy.spatial.transform import Rotation
+
+from pipelines.runs.datasets import load_runs
+from terrain.errors import ConfigError, LogError
+from terrain.kinematics.camera import body_motion
+from terrain.robots import Camera, load_robot
+
+from . import foreign
+from .foreign import START_NS, husky_rows, imu, joints, text, twist, write_bag, write_mcap
+
+HUSKY = "husky_topics"
+
+
+def of_topic(rows, topic):
+    return [message for name, _, message in rows if name == topic]
+
+
+@pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
+def test_a_bag_is_the_run_of_its_messages(tmp_path, storage):
+    rows = husky_rows()
+    write_bag(tmp_path / "GRASS" / "first.drive", rows, storage)
+    (run,) = load_runs(tmp_path, layout="bag", mapping=HUSKY)
+    assert (run.run_id, run.robot, run.terrains) == ("GRASS_first.drive", "husky", ("GRASS",))
+    assert set(run.streams) == {"imu", "wheels", "odometry", "commands"}
+    check_husky(run, rows)
+
+
+def check_husky(run, rows):
+    """Compare a run with the messages that it was written from."""
+    seen = run.streams["imu"]
+    sent = of_topic(rows, "/imu/data")
+    stamps = np.array([m.header.stamp.sec * 10**9 + m.header.stamp.nanosec - START_NS for m in sent])
+    np.testing.assert_array_equal(seen.time_s, stamps / 1e9)
+    for channel, numbers in (
+        ("gyro_y_radps", [m.angular_velocity.y for m in sent]),
+        ("accel_z_mps2", [m.linear_acceleration.z for m in sent]),
+        ("yaw_rad", np.zeros(len(sent))),
+    ):
+        np.testing.assert_array_equal(seen.channel(channel), numbers)
+    radius_m = load_robot("husky").wheel_radius_m
+    left = np.array([m.velocity[0] for m in of_topic(rows, "/joint_states")])
+    np.testing.assert_allclose(run.streams["wheels"].channel("speed_left_mps"), radius_m * left, rtol=1e-15)
+    sent = of_topic(rows, "/cmd_vel")
+    np.testing.assert_array_equal(
+        run.streams["commands"].channel("yaw_rate_radps"), [m.angular.z for m in sent]
+    )
+    motion = body_motion(run.streams["odometry"], Camera(*[0.0] * len(Camera.__dataclass_fields__)))
+    sent = [m.twist.twist for m in of_topic(rows, "/odometry/filtered")]
+    np.testing.assert_allclose(motion.speed_mps[:, 0], [m.linear.x for m in sent], atol=1e-12)
+    np.testing.assert_allclose(motion.yaw_rate_radps, [m.angular.z for m in sent], atol=1e-12)
+
+
+@pytest.mark.parametrize("compression", list(CompressionType))
+@pytest.mark.parametrize(
+    "options", [{}, {"use_chunking": False}, {"index_types": IndexType.NONE, "repeat_channels": False}]
+)
+def test_an_mcap_file_is_the_run_of_its_messages(tmp_path, compression, options):
+    rows = husky_rows(60)
+    path = write_mcap(tmp_path / "drive.mcap", rows, compression, **options)
+    (run,) = load_runs(path, mapping=HUSKY)
+    check_husky(run, rows)
+    assert (run.run_id, run.labels) == ("drive", ())
+
+
+def test_without_a_mapping_topics_are_read_by_their_types(tmp_path):
+    path = write_mcap(tmp_path / "drive.mcap", husky_rows(60))
+    (run,) = load_runs(path, robot="husky")
+    assert set(run.streams) == {"imu", "odometry", "commands"}
+    (by_folder,) = load_runs(tmp_path, robot="husky")
+    assert by_folder.streams["imu"].values.tobytes() == run.streams["imu"].values.tobytes()
+    with pytest.raises(ConfigError, match="does not name its robot"):
+        load_runs(path)
+    rows = [*husky_rows(60), *(("/imu/other", START_NS + i, imu(START_NS + i, (0, 0, 0))) for i in (1, 2))]
+    with pytest.raises(ConfigError, match="/imu/data, /imu/other are all of type sensor_msgs/Imu"):
+        load_runs(write_mcap(tmp_path / "two.mcap", rows), robot="husky")
+    names = write_mcap(tmp_path / "none.mcap", [("/name", START_NS, text("a"))])
+    with pytest.raises(ConfigError, match=r"needs a mapping.*/name \(std_msgs/msg/String\)"):
+        load_runs(names, robot="husky")
+
+
+def mapping_of(folder, lines):
+    path = folder / "mapping.yaml"
+    path.write_text("robot: husky\n" + lines, encoding="utf-8")
+    return path
+
+
+def read(folder, rows, lines, **options):
+    path = write_mcap(folder / "drive.mcap", rows)
+    (run,) = load_runs(path, mapping=mapping_of(folder, lines), **options)
+    return run
+
+
+IMU = "streams: {imu: {topic: /imu, kind: imu}}"
+
+
+def imu_rows(stamps, **options):
+    return [
+        ("/imu", START_NS + i, imu(stamp, (0.1 * i, 0.0, 1.0), **options)) for i, stamp in enumerate(stamps)
+    ]
+
+
+def test_an_unknown_attitude_is_no_channel_or_nan(tmp_path):
+    stamps = [START_NS + 10_000_000 * i for i in range(10)]
+    run = read(tmp_path, imu_rows(stamps, unknown=True), IMU)
+    assert len(run.streams["imu"].channels) == 6
+    kinds = [{}] * 4 + [{"unknown": True}] * 5 + [{"quaternion": (0.0,) * 4}]
+    mixed = [
+        ("/imu", stamp, imu(stamp, (1.0, 0.0, i), **kind))
+        for i, (stamp, kind) in enumerate(zip(stamps, kinds, strict=True))
+    ]
+    run = read(tmp_path, mixed, IMU)
+    assert np.isnan(run.streams["imu"].channel("pitch_rad")).tolist() == [False] * 4 + [True] * 6
+    run = read(tmp_path, imu_rows(stamps, quaternion=(0.0,) * 4), IMU)
+    assert len(run.streams["imu"].channels) == 6
+
+
+def test_the_attitude_is_that_of_the_quaternion(tmp_path):
+    angles = np.random.default_rng(1).uniform(-1.5, 1.5, (20, 3))
+    quaternions = Rotation.from_euler("ZYX", angles[:, ::-1]).as_quat()
+    rows = [
+        ("/imu", START_NS + i, imu(START_NS + i * 10**7, (0, 0, 1), quaternion=tuple(q)))
+        for i, q in enumerate(quaternions)
+    ]
+    run = read(tmp_path, rows, IMU)
+    np.testing.assert_allclose(run.streams["imu"].values[:, 6:], angles, atol=1e-12)
+
+
+def test_stamps_are_refused_or_repaired_and_the_log_time_helps(tmp_path):
+    stamps = [START_NS + 10_000_000 * i for i in range(20)]
+    stamps[7], stamps[11] = stamps[9], stamps[10]
+    with pytest.raises(LogError, match=r"stream imu: time goes back at row 9 \(0\.08 s after 0\.09 s\)"):
+        read(tmp_path, imu_rows(stamps), IMU)
+    run = read(tmp_path, imu_rows(stamps), IMU, repair=True)
+    assert (len(run.streams["imu"]), dict(run.dropped)) == (18, {"rows with a bad time": 2})
+    run = read(tmp_path, imu_rows(stamps), "time: log\n" + IMU)
+    np.testing.assert_array_equal(run.streams["imu"].time_s, np.arange(20) / 1e9)
+    repeated = [START_NS, START_NS + 5, START_NS + 5]
+    with pytest.raises(LogError, match="time repeats at row 3"):
+        read(tmp_path, imu_rows(repeated), IMU)
+    with pytest.raises(LogError, match=r"all headers are stamped 0; take the log times \(time: log\)"):
+        read(tmp_path, imu_rows([0, 0, 0]), IMU)
+
+
+def test_messages_are_put_in_the_order_of_their_log_times(tmp_path):
+    rows = imu_rows([START_NS + 10_000_000 * i for i in range(50)])
+    straight = read(tmp_path, rows, IMU)
+    mixed = read(tmp_path, rows[25:] + rows[:25], IMU)
+    assert mixed.streams["imu"].values.tobytes() == straight.streams["imu"].values.tobytes()
+
+
+def test_two_topics_of_one_frame_are_two_streams(tmp_path):
+    stamps = [START_NS + 10_000_000 * i for i in range(9)]
+    rows = imu_rows(stamps) + [("/back", t, imu(t, (9.0, 0.0, 0.0))) for t in stamps]
+    run = read(tmp_path, rows, "streams: {imu: {topic: /imu, kind: imu}, back: {topic: /back, kind: imu}}")
+    assert run.streams["back"].channel("gyro_x_radps").tolist() == [9.0] * 9
+    assert run.streams["imu"].channel("gyro_x_radps")[3] == pytest.approx(0.3)
+
+
+JOINTS = """\
+streams:
+  wheels:
+    topic: /joints
+    kind: joints
+    wheel_radius: {value: 200, unit: mm, source: measured}
+    channels:
+      speed_left_mps: {joint: left, field: velocity, scale: -1}
+      motor_2_radps: {joint: right, field: velocity, unit: rpm}
+      current_1_a: {joint: left, field: effort, unit: mA}
+      angle_1_rad: {joint: steer, field: position, unit: deg}
+"""
+
+
+def test_joints_are_found_by_name_in_any_order_and_in_several_messages(tmp_path):
+    names = {"left": (0.0, 2.0, 500.0), "right": (0.0, 60.0, 0.0), "steer": (90.0, 0.0, 0.0)}
+    orders = [
+        ("left", "right", "steer"),
+        ("steer", "left", "right"),
+        ("right", "gripper", "left"),
+        ("gripper",),
+    ]
+    rows = []
+    for i in range(40):
+        order = orders[i % 4]
+        position, velocity, effort = zip(*(names.get(name, (7.0, 7.0, 7.0)) for name in order), strict=True)
+        stamp = START_NS + i * 10**7
+        rows.append(("/joints", stamp, joints(stamp, order, velocity, position, effort)))
+    wheels = read(tmp_path, rows, JOINTS).streams["wheels"]
+    assert len(wheels) == 30
+    assert wheels.channel("speed_left_mps") == pytest.approx(np.full(30, -0.4))
+    assert wheels.channel("motor_2_radps") == pytest.approx(np.full(30, 2 * np.pi))
+    assert wheels.channel("current_1_a") == pytest.approx(np.full(30, 0.5))
+    assert np.isnan(wheels.channel("angle_1_rad")).sum() == 10
+    assert np.nanmax(wheels.channel("angle_1_rad")) == pytest.approx(np.pi / 2)
+
+
+FIELDS = """\
+streams:
+  wheels:
+    topic: /a
+    {join}
+    channels:
+      speed_left_mps: {{field: linear.x, unit: km/h, offset: 3.6}}
+      speed_right_mps: {{topic: /b, field: linear.x, unit: m/s}}
+"""
+
+
+def test_topics_are_joined_by_equal_stamps_or_by_the_value_before(tmp_path):
+    rows = [("/a", START_NS + 10 * i, twist(3.6 * i, 0, 0)) for i in range(6)]
+    rows += [("/b", START_NS + 10 * i + (3 if i == 4 else 0), twist(i, 0, 0)) for i in range(1, 6)]
+    with pytest.raises(LogError, match="wheels: 3 messages of '/a' and '/b' lack one of equal stamp"):
+        read(tmp_path, rows, FIELDS.format(join=""))
+    run = read(tmp_path, rows, FIELDS.format(join=""), repair=True)
+    assert run.streams["wheels"].values == pytest.approx(np.array([[2, 1], [3, 2], [4, 3], [6, 5]]))
+    run = read(tmp_path, rows, FIELDS.format(join="join: previous"))
+    assert run.streams["wheels"].channel("speed_right_mps")[1:].tolist() == [1, 2, 3, 3, 5]
+    assert np.isnan(run.streams["wheels"].channel("speed_right_mps")[0])
+
+
+def test_terrains_of_a_topic_are_labels(tmp_path):
+    rows = imu_rows([START_NS + 10**9 * i for i in range(11)])
+    rows = [(topic, START_NS + 10**9 * i, message) for i, (topic, _, message) in enumerate(rows)]
+    changes = [(2.5, "ICE"), (3.0, "ICE"), (5.0, "SNOW"), (7.0, ""), (8.0, "ICE")]
+    rows += [("/terrain_name", START_NS + int(t * 1e9), text(name)) for t, name in changes]
+    run = read(tmp_path, rows, "labels: /terrain_name\n" + IMU)
+    assert [tuple(label) for label in run.labels] == [
+        (2.5, 5.0, "ICE"),
+        (5.0, 7.0, "SNOW"),
+        (8.0, 11.0, "ICE"),
+    ]
+    assert read(tmp_path, rows, "terrain: MUD\n" + IMU).terrains == ("MUD",)
+
+
+OF_TWIST = "streams: {a: {topic: /cmd_vel, channels: "
+OF_IMU = "streams: {a: {topic: /imu/data, channels: "
+OF_JOINTS = "streams: {a: {topic: /j, kind: joints, channels: "
+
+
+@pytest.mark.parametrize(
+    ("lines", "fault"),
+    [
+        ("streams: {imu: {topic: /gyro, kind: imu}}", r"no topic '/gyro' \(there are /cmd_vel "),
+        ("streams: {imu: {topic: /cmd_vel, kind: imu}}", "is of type geometry_msgs/msg/Twist, kind 'imu' is"),
+        (OF_TWIST + "{v_mps: {field: linear.w, unit: m/s}}}}", "no 'w' .it has x, y, z"),
+        (OF_TWIST + "{v_mps: {field: linear, unit: m/s}}}}", "a number is required"),
+        (OF_TWIST + "{v_mps: {field: linear.x.y, unit: m/s}}}}", "'x' has no fields"),
+        (OF_TWIST + "{v_mps: {field: 'linear[0]', unit: m/s}}}}", "is no array"),
+        (OF_IMU + "{v_mps: {field: 'orientation_covariance[9]', unit: m/s}}}}",
+         "has 9 elements"),
+        (OF_IMU + "{v_mps: {field: orientation_covariance, unit: m/s}}}}",
+         "is an array: give an index"),
+        ("labels: /cmd_vel\n" + IMU.replace("/imu", "/imu/data"), "std_msgs/String is required"),
+        ("labels: /nothing\n" + IMU.replace("/imu", "/imu/data"), "labels: there is no topic '/nothing'"),
+        (OF_TWIST + "{v_mps: {field: linear.x, unit: furlong}}}}", "'furlong' is unknown"),
+        (OF_TWIST + "{v_mps: {field: linear.x, unit: rad}}}}", "does not suit it"),
+        (OF_TWIST + "{speed: {field: linear.x, unit: rad}}}}", "known unit"),
+        ("streams: {a: {topic: /a, kind: twist, channels: {v_mps: {field: a, unit: m/s}}}}", "of its own"),
+        ("streams: {a: {topic: /cmd_vel}}", "has no channels"),
+        ("streams: {a: {topic: /cmd_vel, kind: twist, colour: red}}", "key 'streams.a.colour' is unknown"),
+        ("streams: {a: {topic: /cmd_vel, kind: video}}", "streams.a.kind is 'video'"),
+        (OF_JOINTS + "{v_mps: {joint: b, field: speed}}}}", "none of velocity"),
+        (OF_JOINTS + "{v_a: {joint: b, field: effort}}}}", "does not suit"),
+        (OF_JOINTS + "{v_mps: {field: velocity}}}}", "'joint' is missing"),
+        ("terrain: MUD\nlabels: /a\n" + IMU, "both 'terrain' and 'labels'"),
+        ("streams: {}", "at least 1 item"),
+    ],
+)  # fmt: skip
+def test_a_mistake_in_a_mapping_is_one_sentence(tmp_path, lines, fault):
+    path = write_mcap(tmp_path / "drive.mcap", husky_rows(20))
+    with pytest.raises(ConfigError, match=fault) as raised:
+        load_runs(path, mapping=mapping_of(tmp_path, lines))
+    assert "\n" not in str(raised.value)
+
+
+def test_a_wheel_radius_is_required_where_no_robot_has_one(tmp_path):
+    path = write_mcap(tmp_path / "drive.mcap", husky_rows(20))
+    lines = (
+        "streams: {w: {topic: /joint_states, kind: joints, channels: {v_mps: {joint: a, field: velocity}}}}"
+    )
+    own = tmp_path / "mapping.yaml"
+    own.write_text(f"robot: mine\n{lines}", encoding="utf-8")
+    with pytest.raises(ConfigError, match="'wheel_radius' is missing, and the robot has no description"):
+        load_runs(path, mapping=own)
+    with pytest.raises(LogError, match="'/joint_states' has no message with any of the joints"):
+        load_runs(path, mapping=mapping_of(tmp_path, lines))
+
+
+def test_other_encodings_and_bags_without_definitions(tmp_path):
+    path = tmp_path / "text.mcap"
+    with path.open("wb") as file:
+        writer = foreign.McapWriter(file)
+        writer.start()
+        schema = writer.register_schema("sensor_msgs/msg/Imu", "jsonschema", b"{}")
+        writer.add_message(writer.register_channel("/imu", "json", schema), 1, b"{}", 1)
+        writer.finish()
+    with pytest.raises(LogError, match="topic '/imu' is encoded as 'json', 'cdr' is read"):
+        load_runs(path, mapping=mapping_of(tmp_path, IMU))
+    rows = husky_rows(40)
+    bag = write_bag(tmp_path / "bag", rows)
+    import sqlite3
+
+    with sqlite3.connect(bag / "bag.db3") as store:
+        store.execute("drop table message_definitions")
+    store.close()
+    (run,) = load_runs(bag, layout="bag", mapping=HUSKY)
+    check_husky(run, rows)
+    assert run.run_id == "bag"
+    with sqlite3.connect(bag / "bag.db3") as store:
+        store.execute("update topics set type = 'own_msgs/msg/Imu' where name = '/imu/data'")
+    store.close()
+    own = OF_IMU + "{gyro_x_radps: {field: angular_velocity.x, unit: rad/s}}}}"
+    with pytest.raises(LogError, match="'own_msgs/msg/Imu', which is not defined"):
+        load_runs(bag, layout="bag", mapping=mapping_of(tmp_path, own))
+
+
+def test_a_bag_in_parts_is_one_run_and_its_files_are_not_read_twice(tmp_path):
+    rows = husky_rows(100)
+    bag = write_bag(tmp_path / "bag", rows[:120], "mcap")
+    write_bag(tmp_path / "rest", rows[120:], "mcap")
+    (tmp_path / "rest" / "rest.mcap").rename(bag / "bag_1.mcap")
+    (tmp_path / "rest" / "metadata.yaml").unlink()
+    description = bag / "metadata.yaml"
+    text_before = description.read_text()
+    description.write_text(text_before.replace("  - bag.mcap", "  - bag.mcap\n  - bag_1.mcap", 1))
+    (run,) = load_runs(tmp_path, layout="bag", mapping=HUSKY)
+    check_husky(run, rows)
+    description.write_text(text_before.replace("  - bag.mcap", "  - ../bag.mcap", 1))
+    with pytest.raises(LogError, match=r"is missing|leads out"):
+        load_runs(tmp_path, layout="bag", mapping=HUSKY)
+    description.write_text(text_before.replace("compression_mode: ''", "compression_mode: file"))
+    with pytest.raises(LogError, match="is compressed by 'file'"):
+        load_runs(tmp_path, layout="bag", mapping=HUSKY)
+
+
+def test_what_is_no_bag_is_one_sentence(tmp_path):
+    (tmp_path / "notes.txt").write_text("no bag")
+    for place, fault in (
+        ("nothing.mcap", "does not exist"),
+        ("notes.txt", "holds no run"),
+        (".", "holds no run"),
+    ):
+        with pytest.raises(LogError, match=fault):
+            load_runs(tmp_path / place, layout="bag", robot="husky")
+    (tmp_path / "notes.mcap").write_text("no bag")
+    with pytest.raises(LogError, match="is no MCAP file"):
+        load_runs(tmp_path, robot="husky")
+    (tmp_path / "notes.mcap").rename(tmp_path / "notes.db3")
+    with pytest.raises(LogError, match="is no file of SQLite"):
+        load_runs(tmp_path, robot="husky")

@@ -1,0 +1,248 @@
+"""What was exported is imported as the same run, bit for bit; other libraries read the same numbers."""
+
+import json
+import string
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from rosbags.highlevel import AnyReader
+from scipy.spatial.transform import Rotation
+
+from pipelines.bags.logs import find_runs
+from pipelines.export.export_runs import export_runs
+from pipelines.export.outgoing import outgoing_topics
+from pipelines.export.settings import ExportSettings
+from pipelines.export.write import write_mcap
+from pipelines.runs.datasets import data_digest, load_runs
+from pipelines.runs.settings import InspectSettings
+from terrain.errors import ConfigError, DataError, LogError
+from terrain.estimation.enriched import enriched
+from terrain.estimation.estimate import estimate_run
+from terrain.logs.read import read_run
+from terrain.logs.write import write_run
+from terrain.records import Label, RunLog, Stream
+from terrain.robots import load_robot
+from terrain.simulation.run import simulate_run
+
+TARGETS = ("mcap", "ros2", "ros2-mcap")
+
+
+@pytest.fixture(scope="module")
+def raw(tmp_path_factory):
+    """Return a folder with a simulated run of each robot, one of them with its estimates."""
+    folder = tmp_path_factory.mktemp("raw")
+    swerve = load_robot("agrimaro")
+    run = simulate_run(swerve, "grass", "survey", 7, duration_s=9.0)
+    write_run(enriched(estimate_run(run, swerve, "vio15")), folder)
+    write_run(simulate_run(load_robot("husky"), "clay", "arc", 2, duration_s=6.0), folder)
+    return folder
+
+
+def exported(source, out, target="mcap", **options):
+    return export_runs(InspectSettings(data=source, **options), ExportSettings(out=out, target=target))
+
+
+@pytest.mark.parametrize("target", TARGETS)
+def test_an_export_is_imported_as_the_same_runs(raw, tmp_path, target):
+    before = load_runs(raw)
+    result = exported(raw, tmp_path, target)
+    after = load_runs(tmp_path)
+    assert data_digest(after) == data_digest(before) == result.digest
+    for one, other in zip(before, after, strict=True):
+        for name in ("run_id", "robot", "labels", "session", "filter", "source", "dropped"):
+            assert getattr(one, name) == getattr(other, name)
+        for name, stream in one.streams.items():
+            assert stream.channels == other.streams[name].channels
+            assert stream.values.tobytes() == other.streams[name].values.tobytes()
+    assert any("estimator" in run.streams for run in after)
+
+
+def test_a_measured_run_survives(datasets_dir, tmp_path):
+    source = next(path for path in sorted((datasets_dir / "borealtc").iterdir()) if path.is_dir()).parent
+    runs = load_runs(source)[:3]
+    for run in runs:
+        write_run(run, tmp_path / "raw")
+    exported(tmp_path / "raw", tmp_path / "out")
+    assert data_digest(load_runs(tmp_path / "out")) == data_digest(runs)
+
+
+def test_other_libraries_read_the_same_numbers(raw, tmp_path):
+    (run,) = (run for run in load_runs(raw) if run.robot == "agrimaro")
+    for target in TARGETS:
+        exported(raw, tmp_path / target, target)
+    path = tmp_path / "mcap" / f"{run.run_id}.mcap"
+    with path.open("rb") as file:
+        by_mcap = decoded(make_reader(file, decoder_factories=[DecoderFactory()]))
+    assert {"/imu", "/joint_states", "/odometry", "/cmd_vel", "/terrain/imu", "/terrain/run"} <= set(by_mcap)
+    for target in TARGETS[1:]:
+        with AnyReader([tmp_path / target / run.run_id]) as reader:
+            by_rosbags = [
+                (connection.topic, log_ns, reader.deserialize(content, connection.msgtype))
+                for connection, log_ns, content in reader.messages()
+            ]
+        assert [log_ns for _, log_ns, _ in by_rosbags] == sorted(log_ns for _, log_ns, _ in by_rosbags)
+        check(run, {topic: [m for name, _, m in by_rosbags if name == topic] for topic in by_mcap})
+    check(run, by_mcap)
+
+
+def decoded(reader):
+    found = {}
+    for _, channel, message, content in reader.iter_decoded_messages():
+        stamp = getattr(content, "header", None)
+        if stamp is not None:
+            assert message.log_time == stamp.stamp.sec * 10**9 + stamp.stamp.nanosec
+        found.setdefault(channel.topic, []).append(content)
+    return found
+
+
+def check(run, messages):
+    """Compare a run with the messages that a library decoded."""
+    for name, stream in run.streams.items():
+        seen = messages[f"/terrain/{name}"]
+        assert [each.time_s for each in seen] == stream.time_s.tolist()
+        for channel in stream.channels:
+            np.testing.assert_array_equal([getattr(m, channel) for m in seen], stream.channel(channel))
+    imu = messages["/imu"]
+    np.testing.assert_array_equal(
+        [m.linear_acceleration.z for m in imu], run.streams["imu"].channel("accel_z_mps2")
+    )
+    angles = Rotation.from_quat(
+        [[m.orientation.x, m.orientation.y, m.orientation.z, m.orientation.w] for m in imu]
+    ).as_euler("ZYX")
+    np.testing.assert_allclose(angles[:, 2], run.streams["imu"].channel("roll_rad"), atol=1e-12)
+    driven = [m for m in messages["/joint_states"] if m.name[0] == "motor_1"]
+    np.testing.assert_array_equal(
+        [m.velocity[2] for m in driven], run.streams["wheels"].channel("motor_3_radps")
+    )
+    np.testing.assert_array_equal(
+        [m.twist.angular.z for m in messages["/cmd_vel"]], run.streams["commands"].channel("yaw_rate_radps")
+    )
+    assert messages["/terrain/label"][0].data == run.labels[0].terrain
+    assert json.loads(messages["/terrain/run"][0].data)["run_id"] == run.run_id
+
+
+def test_standard_messages_of_an_export_are_a_run_by_a_mapping_too(raw, tmp_path):
+    (run,) = (run for run in load_runs(raw) if run.robot == "agrimaro")
+    exported(raw, tmp_path)
+    (tmp_path / "own.yaml").write_text(
+        "robot: agrimaro\nstreams:\n  imu: {topic: /imu, kind: imu}\n"
+        "  odometry: {topic: /odometry, kind: odometry}\n"
+        "  commands: {topic: /cmd_vel, kind: twist}\n  wheels:\n    topic: /joint_states\n    kind: joints\n"
+        "    channels: {motor_1_radps: {joint: motor_1, field: velocity}}\n"
+    )
+    (again,) = load_runs(tmp_path / f"{run.run_id}.mcap", mapping=tmp_path / "own.yaml")
+    for name, tolerance in (("imu", 1e-12), ("odometry", 1e-9), ("commands", 0.0)):
+        for channel in again.streams[name].channels:
+            sent = run.streams[name].channel(channel)
+            np.testing.assert_allclose(again.streams[name].channel(channel), sent, atol=tolerance)
+
+
+numbers = st.floats(allow_nan=True, allow_infinity=True)
+words = st.text(string.ascii_letters + "_ üж.", min_size=1, max_size=12).filter(
+    lambda text: text.strip() and text[0] not in "._ " and text[-1] not in "_ "
+)
+
+
+@st.composite
+def runs(draw):
+    """Return a run with streams and channels of any names, as far as run folders accept them."""
+    streams = {}
+    start_s = draw(st.sampled_from([0.0, -3.5, 1.7e9, 1e12]))
+    for name in draw(st.lists(words, min_size=1, max_size=3, unique=True)):
+        channels = draw(st.lists(words, min_size=1, max_size=4, unique=True))
+        channels = [
+            f"{channel}_{unit}" for channel, unit in zip(channels, ("m", "radps", "ratio", "s"), strict=False)
+        ]
+        n = draw(st.integers(2, 6))
+        steps = draw(st.lists(st.floats(1e-3, 2.0), min_size=n - 1, max_size=n - 1))
+        time_s = start_s + np.concatenate([[0.0], np.cumsum(steps)])
+        values = draw(st.lists(numbers, min_size=n * len(channels), max_size=n * len(channels)))
+        values = np.array(values).reshape(n, len(channels))
+        values[0] = 1.0
+        streams[name] = Stream(time_s, values, tuple(channels))
+    labels = draw(
+        st.sampled_from(
+            [(), (Label(start_s - 1, start_s + 1, "мокрая трава"), Label(start_s + 1, start_s + 9, "A"))]
+        )
+    )
+    dropped = draw(st.dictionaries(words, st.integers(0, 9), max_size=2))
+    return RunLog(draw(words), draw(words), streams, labels, "drawn", dropped, draw(words), draw(words))
+
+
+@given(runs())
+@settings(max_examples=100, deadline=None)
+def test_whatever_a_run_folder_keeps_a_bag_keeps(tmp_path_factory, run):
+    folder = tmp_path_factory.mktemp("drawn")
+    try:
+        by_folder = read_run(write_run(run, folder / "run"))
+    except LogError:
+        assume(False)  # names that no run folder accepts
+    path = folder / "run.mcap"
+    with path.open("wb") as file:
+        write_mcap(file, list(outgoing_topics(by_folder)), {})
+    (read,) = find_runs(path, None, None)
+    by_bag = read(repair=False)
+    assert data_digest([by_bag]) == data_digest([by_folder])
+    assert (by_bag.filter, dict(by_bag.dropped)) == (by_folder.filter, dict(by_folder.dropped))
+
+
+def test_nothing_is_overwritten_and_nothing_is_left_behind(raw, tmp_path):
+    out = tmp_path / "out"
+    out.mkdir()
+    other = load_runs(raw)[1]
+    taken = out / f"{other.run_id}.mcap"
+    taken.write_text("mine")
+    with pytest.raises(LogError, match="is there already"):
+        exported(raw, out)
+    assert [path.name for path in out.iterdir()] == [taken.name]
+    assert taken.read_text() == "mine"
+
+
+def test_a_run_that_is_too_long_for_stamps_is_refused(tmp_path):
+    stream = Stream([0.0, 3e9], [[1.0], [2.0]], ("gyro_z_radps",))
+    write_run(RunLog("long", "husky", {"imu": stream}), tmp_path / "raw")
+    with pytest.raises(DataError, match="stamps have"):
+        exported(tmp_path / "raw", tmp_path / "out")
+    assert not list((tmp_path / "out").glob("*"))
+
+
+def test_an_export_whose_document_is_changed_is_refused(raw, tmp_path):
+    from mcap.reader import make_reader as reader_of
+    from mcap.writer import Writer
+
+    exported(raw, tmp_path)
+    first = sorted(tmp_path.glob("*.mcap"))[0]
+    with first.open("rb") as file:
+        reader = reader_of(file)
+        rows = [(s, c, m) for s, c, m in reader.iter_messages()]
+    for old, new in (
+        (b'"version": 1', b'"version": 9'),
+        (b'"run_id"', b'"run_ix"'),
+        (b'"robot": "', b'"robot": "/'),
+        (b"terrain/imu", b"terrain/imx"),
+        (b'gyro_x_radps"', b'gyro_x_furlo"'),
+        (b'"labels": [', b'"labels": {'),
+    ):
+        path = tmp_path / "changed.mcap"
+        with path.open("wb") as file:
+            writer = Writer(file)
+            writer.start()
+            channels = {}
+            for schema, channel, message in rows:
+                if channel.topic not in channels:
+                    number = writer.register_schema(schema.name, schema.encoding, schema.data)
+                    channels[channel.topic] = writer.register_channel(channel.topic, "cdr", number)
+                content = message.data
+                if channel.topic == "/terrain/run":
+                    assert old in content
+                    content = content.replace(old, new, 1)
+                    content = content[:4] + (len(content) - 8).to_bytes(4, "little") + content[8:]
+                writer.add_message(channels[channel.topic], message.log_time, content, message.log_time)
+            writer.finish()
+        with pytest.raises((LogError, ConfigError)) as raised:
+            load_runs(path)
+        assert "\n" not in str(raised.value)
