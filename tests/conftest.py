@@ -7,10 +7,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 from hypothesis import settings
+from threadpoolctl import threadpool_limits
 
 from terrain.records import Label, RunLog, Stream
 
 REPOSITORY = Path(__file__).resolve().parents[1]
+
+
+def pytest_configure():
+    """Give linear algebra one thread a process, as the tests run in several.
+
+    Of small matrices two processes with a thread a core take up to three times as long, as threads wait for
+    one another.  What is loaded already is limited directly, the rest and the processes of tests by their
+    environment.
+    """
+    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
+    threadpool_limits(1)
 
 
 @pytest.fixture(scope="session")

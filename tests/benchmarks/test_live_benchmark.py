@@ -15,7 +15,7 @@ MOST_US = 150.0
 @pytest.mark.benchmark(timer=time.process_time)
 def test_a_live_step_leaves_a_control_loop_its_time(benchmark):
     robot = load_robot("agrimaro")
-    samples = list(replay(simulate_run(robot, "grass", "straight", 0, duration_s=16.0)))
+    samples = list(replay(simulate_run(robot, "grass", "straight", 0, duration_s=5.0)))
 
     def drive():
         estimator = LiveEstimator(robot)

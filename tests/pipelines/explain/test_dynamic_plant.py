@@ -34,8 +34,9 @@ def explained(runs):
 QUIET = (Verdict.NONE, Verdict.NOT_EXCITED)
 
 
-@pytest.mark.parametrize("vary", [pytest.param(False, marks=pytest.mark.slow), True])
-@pytest.mark.parametrize("terrain", ["grass", pytest.param("firm_soil_gravel", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("vary", [False, True])
+@pytest.mark.parametrize("terrain", ["grass", "firm_soil_gravel"])
 def test_without_a_hidden_effect_nothing_is_stated(terrain, vary):
     found = explained(runs_of(terrain=terrain, vary=vary))
     assert found.verdict in QUIET

@@ -209,6 +209,7 @@ def test_the_command_replays_all_runs_of_a_folder(logs, in_tracked, tmp_path, mo
     assert "48.0 s of driving" in printed or "47.9 s of driving" in printed
 
 
+@pytest.mark.slow
 def test_a_signal_ends_the_command_with_a_summary(logs, in_tracked, tmp_path):
     code = "from pipelines.cli.main import main; main()"
     words = ["replay", logs, "--speed", "1", "--model", "model", "--json", tmp_path / "out.json"]
