@@ -153,9 +153,11 @@ def _described(robot: str | Path | None) -> Robot | None:
 def _readers(
     folder: Path, layout: str, mapping: str | Path | None, robot: Robot | None
 ) -> list[Callable[..., RunLog]]:
+    from pipelines.messages.finding import find_bags
+
     if layout not in LAYOUTS:
         raise ConfigError(f"layout {layout!r} is unknown: choose one of {', '.join(LAYOUTS)}")
-    if layout == "bag" or (layout == "auto" and folder.is_file()):
+    if layout == "bag" or (layout == "auto" and folder.is_file() and find_bags(folder)):
         return _bags(folder, mapping, robot)
     if not folder.is_dir():
         fault = "is no folder" if folder.exists() else "does not exist"
@@ -173,7 +175,6 @@ def _readers(
         from terrain.logs import mapping as by_mapping
 
         return by_mapping.find_runs(folder, by_mapping.load_mapping(mapping))
-    from pipelines.messages.finding import find_bags
     from terrain.logs import borealtc, drive, read
 
     found: dict[str, list[Any]] = {

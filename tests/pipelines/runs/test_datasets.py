@@ -48,8 +48,8 @@ def test_a_folder_without_runs_names_what_is_accepted(tmp_path, layout):
 
 
 def test_options_that_do_not_go_together_are_refused(borealtc_dir, tmp_path):
-    with pytest.raises(ConfigError, match="layout 'bag' is unknown: choose one of auto, runs, borealtc, csv"):
-        load_runs(borealtc_dir, layout="bag")
+    with pytest.raises(ConfigError, match="layout 'rosbag' is unknown: choose one of auto, runs"):
+        load_runs(borealtc_dir, layout="rosbag")
     with pytest.raises(ConfigError, match="the layout 'csv' needs a mapping file"):
         load_runs(borealtc_dir, layout="csv")
     with pytest.raises(ConfigError, match="a mapping file is for CSV files, not for the layout 'runs'"):
