@@ -66,9 +66,9 @@ def read_run(
     Raises
     ------
     LogError
-        if the bag cannot be read or is damaged.
+        if the bag cannot be read, is damaged, or lacks a topic of the mapping.
     ConfigError
-        if the mapping does not fit its topics, or no robot is named.
+        if the mapping does not fit the messages, or no robot is named.
     """
     faults = Faults(Counter() if repair else None)
     bag, place = open_bag(path), short_name(path)
@@ -76,6 +76,8 @@ def read_run(
     exported = topics.get(RUN_TOPIC)
     if mapping is None and exported is not None and exported.kind == STRING:
         return _exported_run(bag, place, topics, faults)
+    if not topics:
+        raise LogError(f"{place}: has no topic")
     mapping = standard_mapping(place, list(topics.values())) if mapping is None else mapping
     name = robot.name if robot is not None else mapping.robot
     if not name:
@@ -148,15 +150,15 @@ def _check_topics(place: str, mapping: Mapping, topics: dict[str, Topic]) -> Non
     for name, stream in mapping.streams.items():
         for topic in (stream.topic, *(channel.topic for channel in stream.channels.values())):
             if topic and topic not in topics:
-                raise ConfigError(
+                raise LogError(
                     f"{place}: stream {name}: there is no topic {shown(topic)} (there are {there})"
                 )
     if not mapping.labels:
         return
     if mapping.labels not in topics:
-        raise ConfigError(f"{place}: labels: there is no topic {shown(mapping.labels)} (there are {there})")
+        raise LogError(f"{place}: labels: there is no topic {shown(mapping.labels)} (there are {there})")
     if short_type(topics[mapping.labels].kind) != LABELS_TYPE:
-        raise ConfigError(
+        raise LogError(
             f"{place}: labels: topic {mapping.labels} is of type {topics[mapping.labels].kind}, "
             f"{LABELS_TYPE} is required"
         )

@@ -46,8 +46,10 @@ class StreamCollector:
 
     Raises
     ------
+    LogError
+        if a topic is of another type than the kind has.
     ConfigError
-        if a topic or a field is unknown, or of a type that does not fit, or a radius is missing.
+        if a field is unknown or no number, or a radius is missing.
     """
 
     def __init__(
@@ -70,7 +72,7 @@ class StreamCollector:
         self._by_topic = _channels_by_topic(mapping)
         self._kind = short_type(topics[mapping.topic].kind)
         if mapping.kind != "fields" and self._kind not in TYPES[mapping.kind]:
-            raise ConfigError(
+            raise LogError(
                 f"{place}: stream {name}: topic {mapping.topic} is of type {topics[mapping.topic].kind}, "
                 f"kind {mapping.kind!r} is {' or '.join(TYPES[mapping.kind])} "
                 f"(there are {described([*topics.values()])})"

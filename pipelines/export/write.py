@@ -67,7 +67,7 @@ def write_ros2(folder: Path, topics: Sequence[Outgoing], storage: str) -> None:
         raise ConfigError(MISSING_PACKAGE) from error
     store = get_typestore(Stores[ASSUMED_DISTRO])
     for each in topics:
-        if each.kind not in store.fielddefs:
+        if each.kind not in store.types:
             first, _, _ = each.text.partition("=" * 80)
             store.register(get_types_from_msg(first, each.kind))
     with Writer(folder, version=9, storage_plugin=StoragePlugin[storage.upper()]) as writer:

@@ -252,4 +252,4 @@ def known_text(name: str, distro: str = ASSUMED_DISTRO) -> str:
     store = get_typestore(Stores.__members__.get(distro, Stores[ASSUMED_DISTRO]))
     package, _, kind = short_type(name).partition("/")
     full = f"{package}/msg/{kind}"
-    return str(store.generate_msgdef(full, ros_version=2)[0]) if full in store.fielddefs else ""
+    return str(store.generate_msgdef(full, ros_version=2)[0]) if full in store.types else ""

@@ -125,13 +125,15 @@ class McapFile:
             return False
         file.seek(end)
         footer = file.read(_FOOTER.size)
-        op, length, start, _, _ = _FOOTER.unpack(footer)
+        op, length, start, _, crc = _FOOTER.unpack(footer)
         if op != FOOTER or length != 20 or file.read() != MAGIC or not len(MAGIC) < start < end:
             return False
         if end - start > MAX_MESSAGE_BYTES:
             return False
         file.seek(start)
         summary = file.read(end - start)
+        if crc and zlib.crc32(summary + footer[:-4]) != crc:
+            return False
         try:
             position = 0
             while position < len(summary):

@@ -271,9 +271,19 @@ OF_JOINTS = "streams: {a: {topic: /j, kind: joints, channels: "
 )  # fmt: skip
 def test_a_mistake_in_a_mapping_is_one_sentence(tmp_path, lines, fault):
     path = write_mcap(tmp_path / "drive.mcap", husky_rows(20))
-    with pytest.raises(ConfigError, match=fault) as raised:
+    with pytest.raises((ConfigError, LogError), match=fault) as raised:
         load_runs(path, mapping=mapping_of(tmp_path, lines))
     assert "\n" not in str(raised.value)
+
+
+def test_a_bag_without_a_topic_is_skipped_when_repairing(tmp_path):
+    write_mcap(tmp_path / "a.mcap", husky_rows(20))
+    write_mcap(tmp_path / "b.mcap", imu_rows([START_NS, START_NS + 10**7]))
+    with pytest.raises(LogError, match=r"b\.mcap: stream imu: there is no topic '/imu/data' \(there are"):
+        load_runs(tmp_path, layout="bag", mapping=HUSKY)
+    skipped = []
+    (run,) = load_runs(tmp_path, layout="bag", mapping=HUSKY, repair=True, on_skip=skipped.append)
+    assert (run.run_id, len(skipped)) == ("a", 1)
 
 
 def test_a_wheel_radius_is_required_where_no_robot_has_one(tmp_path):
