@@ -18,9 +18,10 @@ def drive(folder: str, url: str, speed: float = 1.0) -> str:
     channels = {name: run.streams[name].channels for name in SENSORS if name in run.streams}
     terrain = ""
     with TerrainClient(url, run.run_id, run.robot, channels, rate_hz=20.0) as client:
-        begin_s = time.monotonic()
+        begin_s, first_s = time.monotonic(), run.start_s
         for sample in replay(run):
-            time.sleep(max(begin_s + sample.time_s / speed - time.monotonic(), 0.0))
+            due_s = begin_s + (sample.time_s - first_s) / speed
+            time.sleep(max(due_s - time.monotonic(), 0.0))
             readings = sample.readings.items()
             client.send({name: (r.time_s.tolist(), r.values.tolist()) for name, r in readings})
             step = client.latest()  # None where the last one is too old

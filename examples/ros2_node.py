@@ -1,5 +1,6 @@
 """ROS 2 node of the live observer: ``python examples/ros2_node.py MODEL_FOLDER`` where ROS 2 is installed."""
 
+import math
 import sys
 from pathlib import Path
 
@@ -27,18 +28,24 @@ def terrain_node(model: Path) -> Node:
 
     def take(stream: str, stamp: object, values: list[float]) -> None:
         reading = Reading(np.array([stamp.sec + stamp.nanosec * 1e-9]), np.array([values]))
-        for found in observer.update({stream: reading}):
-            terrain.publish(String(data=observer.belief.terrain))
-            target.publish(Float64(data=found.target["traction"].slip_ratio))
+        if observer.update({stream: reading}):
+            believed = observer.belief.terrain
+            terrain.publish(String(data=believed))
+            target.publish(Float64(data=observer.table.lookup(believed)["traction"].slip_ratio))
 
     def on_imu(message: Imu) -> None:  # axes of REP 103, as in the run logs
         turn, accel = message.angular_velocity, message.linear_acceleration
         take("imu", message.header.stamp, [turn.x, turn.y, turn.z, accel.x, accel.y, accel.z])
 
     def on_joints(message: JointState) -> None:  # by name; efforts are currents here
+        if not set(JOINTS) <= set(message.name):  # of an arm
+            return
         at = [message.name.index(joint) for joint in JOINTS]
-        speeds_mps = [message.velocity[i] * WHEEL_RADIUS_M for i in at]
-        take("wheels", message.header.stamp, [*speeds_mps, *(message.effort[i] for i in at)])
+        rates, efforts = (
+            part or [math.nan] * len(message.name) for part in (message.velocity, message.effort)
+        )
+        speeds_mps = [rates[i] * WHEEL_RADIUS_M for i in at]
+        take("wheels", message.header.stamp, [*speeds_mps, *(efforts[i] for i in at)])
 
     node.create_subscription(Imu, "imu/data", on_imu, 50)
     node.create_subscription(JointState, "joint_states", on_joints, 50)

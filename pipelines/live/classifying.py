@@ -13,7 +13,6 @@ import numpy as np
 
 from pipelines.live.window_feed import Estimate, WindowFeed
 from pipelines.models.model_files import TerrainModel
-from terrain.errors import DataError
 from terrain.records import Array, Reading, Windows
 
 MAX_WAITING = 1000
@@ -56,8 +55,8 @@ def classify_window(model: TerrainModel, window: Windows) -> WindowOutput:
         probabilities = np.asarray(recipe.predict_proba(window)[0])
         if not np.isfinite(probabilities).all():
             refused = "a probability is not finite"
-    except (ValueError, ArithmeticError, DataError) as error:  # broken samples must not stop the loop
-        refused = str(error)
+    except Exception as error:  # whatever broken samples lead a recipe to, it must not stop the loop
+        refused = str(error) or type(error).__name__
     took_s = perf_counter() - started_s
     end_s = start_s + window.length_s
     if refused:

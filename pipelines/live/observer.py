@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pipelines.live.classifying import AtOnce, Classifying, Part, WindowOutput
+from pipelines.live.clock_watch import ClockWatch, last_stamp_s
 from pipelines.live.pilot_settings import check_table
 from pipelines.live.state import LiveState, Restorable, restorable, state_of
 from pipelines.live.window_feed import Estimate, WindowFeed, live_filter, needs_filter
@@ -117,7 +118,8 @@ class TerrainObserver:
         self._classifying.begin(Part(model, self._feed))
         self._speed_columns, self._mps_per_unit = _speeds(self.channels.get("wheels", ()), corrected)
         self._latest: Estimate | None = None
-        self._wheels_s = math.nan
+        self._speed_mps, self._speed_s, self._now_s = math.inf, -math.inf, math.nan
+        self._watch = ClockWatch()
         self.belief: TerrainBelief = NO_BELIEF
         self.refused: Counter[str] = Counter()
 
@@ -131,6 +133,7 @@ class TerrainObserver:
         """What was not used so far, as counts by kind."""
         counts = dict(self._classifying.dropped)
         counts |= {f"window: refused, {why}": n for why, n in self.refused.items()}
+        counts |= {"time: clock set": n} if (n := self._watch.n_set) else {}
         return counts | (dict(self._filter.dropped) if self._filter is not None else {})
 
     def check(self, model: TerrainModel) -> None:
@@ -186,12 +189,16 @@ class TerrainObserver:
         self.belief = fresh.belief
         return fresh
 
-    def update(self, samples: Mapping[str, Reading]) -> list[TerrainObservation]:
+    def update(self, samples: Mapping[str, Reading], now_s: float = math.nan) -> list[TerrainObservation]:
         """Take what was measured since the last call; return what has been found, in most calls nothing.
+
+        Where the clock of the stamps was set, windows begin anew.
 
         Parameters
         ----------
         samples : by stream, stamps ``(k,)`` and values ``(k, channels)`` in order of time
+        now_s : on the clock of the stamps; by default the newest one.  With it, a terrain becomes unknown in
+            time where no more samples come
         """
         if not isinstance(samples, Mapping):
             return []
@@ -200,8 +207,10 @@ class TerrainObserver:
             estimates = self._filter.step(samples)
             if estimates:
                 self._latest = estimates[-1]
+        if self._watch.was_set(samples):
+            self._begin_again()
         self._classifying.put(samples, estimates)
-        self._drive_on(samples)
+        self._drive_on(samples, now_s)
         return [self._observed(output) for output in self._classifying.finished()]
 
     def _observed(self, output: WindowOutput) -> TerrainObservation:
@@ -222,20 +231,35 @@ class TerrainObserver:
             output,
         )
 
-    def _drive_on(self, samples: Mapping[str, Reading]) -> None:
-        """Let the belief age by the time that the robot drove."""
-        reading = samples.get("wheels")
-        if reading is None or not self._speed_columns:
-            return
+    def _begin_again(self) -> None:
+        """Cut windows from here on; what was believed stays, and its outputs begin anew."""
+        self._feed = WindowFeed(self.model.info, self.channels, self._robot)
+        self._classifying.begin(Part(self.model, self._feed))
+        self.belief = TerrainBelief(self.belief.terrain, self.belief.probability)
+        self._speed_s, self._now_s = -math.inf, math.nan
+
+    def _drive_on(self, samples: Mapping[str, Reading], now_s: float) -> None:
+        """Let the belief age by the time in which the wheels turned, or were not seen to stand."""
+        stamps = [stamp_s for stream in samples if math.isfinite(stamp_s := last_stamp_s(samples, stream))]
+        newest_s = max(stamps, default=math.nan)
+        if "wheels" in samples and self._speed_columns:
+            self._speed_mps, self._speed_s = self._wheel_speed_mps(samples["wheels"]), newest_s
+        if math.isnan(now_s):
+            now_s = newest_s
+        dt_s = now_s - self._now_s
+        if not math.isnan(now_s):
+            self._now_s = now_s
+        if dt_s > 0.0:  # False for NaN
+            seen = now_s - self._speed_s <= LONGEST_STEP_S
+            self.belief = drive_on(self.belief, self._speed_mps if seen else math.inf, dt_s, self.switching)
+
+    def _wheel_speed_mps(self, reading: Reading) -> float:
+        """Return the speed of the fastest wheel; infinite where it is unknown."""
         try:
-            time_s = float(reading.time_s[-1])
             speeds = np.abs(np.asarray(reading.values, dtype=float)[-1, self._speed_columns])
         except (TypeError, ValueError, LookupError, AttributeError, OverflowError):
-            return
-        dt_s, self._wheels_s = time_s - self._wheels_s, time_s
-        if 0.0 < dt_s <= LONGEST_STEP_S:
-            speed_mps = float(np.nanmax(speeds, initial=0.0)) * self._mps_per_unit
-            self.belief = drive_on(self.belief, speed_mps, dt_s, self.switching)
+            return math.inf
+        return math.inf if np.isnan(speeds).all() else float(np.nanmax(speeds)) * self._mps_per_unit
 
 
 def _speeds(wheels: Sequence[str], robot: Robot | None) -> tuple[list[int], float]:

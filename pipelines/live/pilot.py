@@ -136,6 +136,7 @@ class LivePilot:
         self._robot_name = robot.name
         self._settings, self._radius_m = settings, driven.wheel_radius_m
         self.swap(table, NoTerrain() if source is None else source)
+        self._steering_zeros_rad = np.array(driven.steering_zeros_rad)
         self._positions_m = np.array(driven.wheel_positions_m)
         self._limits = (
             driven.wheel_radius_m,
@@ -206,6 +207,11 @@ class LivePilot:
             self._estimator.resident.begin_from(fresh.biases, fresh.age_s)
         self._now.belief, self._now.target_ratio = fresh.belief, fresh.target_ratio
         return fresh
+
+    def start_steering(self, measured_rad: Array) -> Array:
+        """Take measured angles (3,), zeros not subtracted, for the last command, before a step; return it."""
+        self._now.steer_rad = measured_rad - self._steering_zeros_rad
+        return self._now.steer_rad
 
     @property
     def lateness_s(self) -> dict[str, float]:

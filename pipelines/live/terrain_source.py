@@ -151,6 +151,6 @@ class Classifier:
         for output in self.outputs:
             if output.refused:
                 self.failed[output.refused] += 1
-            else:
-                found.append(TerrainEstimate(sample.time_s, output.terrain, output.probability))
+            else:  # of several that come at once, as after a stall, the newest stands
+                found = [TerrainEstimate(sample.time_s, output.terrain, output.probability)]
         return found

@@ -135,7 +135,7 @@ class TerrainClient:
         streams : by name, stamps ``(k,)`` and rows ``(k, channels)``; NaN or None where nothing was measured
         twist : desired ``(speed_x_mps, speed_y_mps, yaw_rate_radps)``; it holds for half a second
         step : ask for a step now, where the session has no rate
-        time_s : of that step, on the clock of the stamps; by default the newest stamp
+        time_s : of that step, on the clock of the stamps; by default that clock's time now, as far as known
 
         Raises
         ------

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections import deque
 from contextlib import suppress
+from math import isfinite
 from time import monotonic, perf_counter
 from typing import Any
 
@@ -16,6 +17,7 @@ from pipelines.serve.hub import Hub, OpenSession
 from pipelines.serve.messages import error_content, read_hello, step_content, welcome
 from pipelines.serve.wire import Encoding, WireError, decode, encode
 from pipelines.sessions.records import CommandStatus, StepOutput
+from terrain.estimation.live.clocks import number
 
 MAX_NOTES = 1000
 """Answers to messages that wait to be read; of more, the oldest are left out."""
@@ -130,8 +132,8 @@ class Connection:
                     raise WireError("unknown-type", f"there is no message of the type {kind!r}")
                 self._take(opened, content, now_s)
                 if rate_hz == 0.0 and content.get("step") is True:
-                    time_s = content.get("time_s")
-                    self._run(opened, time_s if type(time_s) is float else opened.chain.newest_s)
+                    time_s = number(content.get("time_s"))
+                    self._run(opened, time_s if isfinite(time_s) else None)
             except WireError as error:
                 self._note(error.code, str(error))
 

@@ -18,6 +18,11 @@ Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9 ._+-]*$
 Channel = Annotated[str, StringConstraints(pattern=r"^[A-Za-z][A-Za-z0-9_]*$", max_length=64)]
 
 
+CONTROL_RATE_LEAST_HZ = 5.0
+"""Of commands: a longer step than half a second is taken for a clock that was set, and a command holds for a
+quarter of a second."""
+
+
 class Hello(BaseModel):
     """First message of a robot: what it is, what it sends, and what it asks for.
 
@@ -73,6 +78,11 @@ def read_hello(content: dict[str, Any]) -> Hello:
         first = error.errors(include_url=False)[0]
         place = ".".join(map(str, first["loc"]))[:120] or "the message"
         raise WireError("malformed", f"hello: {place}: {first['msg']}") from None
+    if hello.control and 0.0 < hello.rate_hz < CONTROL_RATE_LEAST_HZ:
+        raise WireError(
+            "malformed",
+            f"hello: rate_hz: commands need {CONTROL_RATE_LEAST_HZ:g} Hz or more, or 0: one at each message",
+        )
     for stream, channels in hello.streams.items():
         if len(set(channels)) < len(channels):
             raise WireError("malformed", f"hello: stream {stream!r} names a channel twice")

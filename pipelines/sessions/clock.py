@@ -16,7 +16,7 @@ N_SET = 5
 
 
 class SessionClock:
-    """Tell the time of a robot's clock now, and its newest stamp.
+    """Tell the time of a robot's clock now.
 
     A message that was sent at once and one that waited differ in their delay, which is never below zero: the
     difference of the clocks is that of the message that was least late among the last ones.
@@ -34,7 +34,6 @@ class SessionClock:
         self._ahead: deque[float] = deque(maxlen=REMEMBERED)
         self._n_behind = 0
         self._offset_s = math.nan
-        self.newest_s = math.nan
         self.times_set = 0
 
     def received(self, stamp_s: float, now_s: float) -> None:
@@ -48,8 +47,6 @@ class SessionClock:
                 self._ahead.clear()
                 self._n_behind = 0
                 self.times_set += 1
-                self.newest_s = math.nan
-        self.newest_s = stamp_s if math.isnan(self.newest_s) else max(self.newest_s, stamp_s)
         self._ahead.append(ahead_s)
         self._offset_s = max(self._ahead)
 

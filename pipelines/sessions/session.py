@@ -16,7 +16,7 @@ import numpy as np
 from pipelines.live.classifying import Classifying, WindowOutput
 from pipelines.live.observer import TerrainObserver
 from pipelines.live.pilot import LivePilot
-from pipelines.live.pilot_settings import PilotSettings
+from pipelines.live.pilot_settings import PilotSettings, check_table
 from pipelines.live.state import LiveState, Restorable
 from pipelines.live.terrain_source import Classifier, NoTerrain
 from pipelines.recording.recorder import SessionRecorder
@@ -88,7 +88,8 @@ class RobotSession:
         self._clock = SessionClock()
         self._twist, self._twist_s = _NO_TWIST, -math.inf
         self._steer_rad = np.zeros(3)
-        self._received_s = math.nan
+        self._awaits_steering = request.control and "steering" in request.channels
+        self._received_s = self._known_s = math.nan
         self._n_steps = self._n_messages = 0
         self.finished: Sequence[WindowOutput] = ()
         self.failure = ""
@@ -120,11 +121,6 @@ class RobotSession:
             self._recorder.close()
 
     @property
-    def newest_s(self) -> float:
-        """Newest stamp that has come; NaN before the first."""
-        return self._clock.newest_s
-
-    @property
     def belief(self) -> TerrainBelief:
         """The terrain that is believed."""
         if self._pilot is not None:
@@ -142,19 +138,29 @@ class RobotSession:
         return counts | ({"time: clock set": n} if (n := self._clock.times_set) else {})
 
     def state(self, now_s: float | None = None) -> LiveState:
-        """Return what is worth keeping over a restart, at a time in seconds since 1970 (now)."""
+        """Return what is worth keeping over a restart.
+
+        Parameters
+        ----------
+        now_s : in seconds since 1970; by default when the last sample came: what is known is as old as that
+        """
         chain = self._pilot or self._observer
         assert chain is not None
-        return chain.state(time() if now_s is None else now_s)
+        if now_s is None:
+            now_s = time() if math.isnan(self._known_s) else self._known_s
+        return chain.state(now_s)
 
     def restore(self, state: LiveState, now_s: float | None = None) -> Restorable:
         """Start from a saved state, before the first step; return what of it is used."""
         chain = self._pilot or self._observer
         assert chain is not None
+        self._known_s = state.saved_s
         return chain.restore(state, time() if now_s is None else now_s)
 
     def check(self, served: Served) -> None:
         """Raise what :meth:`swap` would."""
+        if self._robot is not None:
+            check_table(served.table, self._robot.name)
         if served.model is None:
             if self._source is not None or self._observer is not None:
                 raise DataError("a model cannot be replaced by none")
@@ -208,7 +214,7 @@ class RobotSession:
                 newest_s = self.inbox.put(str(name), time_s, values)
                 if newest_s is not None:
                     self._clock.received(newest_s, now_s)
-                    self._received_s = now_s
+                    self._received_s, self._known_s = now_s, time()
         elif streams is not None:
             self.inbox.refused["samples that are not given by stream"] += 1
         if twist is not None:
@@ -240,7 +246,7 @@ class RobotSession:
         if self._pilot is not None:
             command, status = self._commanded(self._pilot, time_s, readings, now_s)
         elif self._observer is not None:
-            self._found([found.output for found in self._observer.update(readings)])
+            self._found([found.output for found in self._observer.update(readings, time_s)])
         self._streams.take(readings, time_s)
         return StepOutput(
             time_s,
@@ -257,7 +263,7 @@ class RobotSession:
     ) -> tuple[Command, CommandStatus]:
         fresh = now_s - self._twist_s <= TWIST_FRESH_S
         status = CommandStatus.OK if fresh else CommandStatus.NO_TWIST
-        if math.isnan(time_s):
+        if math.isnan(time_s) or not self._is_steered(pilot, readings):
             return self._standing(), CommandStatus.NO_SAMPLES
         in_order = {
             name: Reading(reading.time_s, _ordered(reading.values, *self._columns[name]))
@@ -279,6 +285,20 @@ class RobotSession:
         if self._recorder is not None:
             self._recorder.command(time_s, twist, command, command.status)
         return command, status
+
+    def _is_steered(self, pilot: LivePilot, readings: Mapping[str, Reading]) -> bool:
+        """Begin with the steering where it stands; return whether that is known, where it is measured."""
+        if not self._awaits_steering:
+            return True
+        reading, columns = readings.get("steering"), self._columns["steering"]
+        if reading is None or not len(reading.values):
+            return False
+        measured_rad = _ordered(reading.values, *columns)[-1]
+        if not np.isfinite(measured_rad).all():
+            return False
+        self._steer_rad = pilot.start_steering(measured_rad)
+        self._awaits_steering = False
+        return True
 
     def _standing(self) -> Command:
         """Return the command to stand, steered as before."""

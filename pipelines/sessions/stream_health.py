@@ -51,7 +51,7 @@ class StreamHealth:
         found = {}
         for stream, last_s in self._last_s.items():
             allowed_s = max(LOST_AFTER_S, PERIODS * self._period_s[stream])
-            if not time_s - last_s <= allowed_s:  # True for NaN
+            if not abs(time_s - last_s) <= allowed_s:  # True for NaN, and a clock that was set back
                 found[stream] = "lost"
             else:
                 found[stream] = "fresh" if np.isfinite(self._values[stream]).all() else "not finite"

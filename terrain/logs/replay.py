@@ -16,6 +16,9 @@ SENSORS: tuple[str, ...] = ("wheels", "steering", "imu", "odometry", "gnss")
 TWIST: tuple[str, ...] = ("speed_x_mps", "speed_y_mps", "yaw_rate_radps")
 """Channels of the desired motion in the stream ``commands``."""
 
+MAX_STEPS = 20_000_000
+"""Of a replay: four days at 50 Hz."""
+
 _SLACK_S = 1e-9  # stamps that differ by less are the same instant, written by two clocks' arithmetic
 
 
@@ -58,6 +61,12 @@ def replay(run: RunLog, rate_hz: float = 50.0) -> Iterator[Sample]:
     came = {name: time_s for name, time_s in came.items() if time_s.size}
     if not came:
         raise DataError(f"run {run.run_id}: there is no sensor to replay, none of {', '.join(SENSORS)}")
+    span_s = max(c[-1] for c in came.values()) - min(c[0] for c in came.values())
+    if span_s * rate_hz > MAX_STEPS:
+        raise DataError(
+            f"run {run.run_id}: has stamps {span_s / 86400:.1f} days apart, its clock was set; at most "
+            f"{MAX_STEPS / rate_hz / 86400:.1f} days are replayed at {rate_hz:g} Hz"
+        )
     return _steps(run, came, 1.0 / rate_hz)
 
 

@@ -135,6 +135,8 @@ def test_the_ros_node_publishes_terrain_and_target_slip(ros, runs, model_folder)
                 velocity=[9.0, row[1] / radius_m, row[0] / radius_m],
                 effort=[0.0, row[3], row[2]],
             )
+            other = SimpleNamespace(header=stamp(time_s), name=["arm"], velocity=[], effort=[])
+            node.callbacks[topic](other)
         node.callbacks[topic](message)
     terrain, target = node.publishers["terrain"].messages, node.publishers["target_slip"].messages
     assert len(terrain) == len(target) >= 5

@@ -1,5 +1,6 @@
 """The live observer gives the terrain that the log gives, of every robot, and no input stops it."""
 
+import math
 import os
 from dataclasses import replace
 from pathlib import Path
@@ -108,6 +109,33 @@ def test_a_skid_steer_robot_is_filtered_where_its_model_needs_the_filter(trained
     assert observer.estimate.speed_mps > 0.1
 
 
+@pytest.mark.parametrize("far_s", [-600.0, 4000.0])
+def test_after_a_clock_was_set_windows_begin_anew(mower_model, two_drives, far_s):
+    """Set back for good, or far ahead for two samples."""
+    observer, run, stamps = TerrainObserver(mower_model), two_drives[4], []
+    for k, sample in enumerate(replay(run)):
+        ahead_s = far_s * (sample.time_s > 6.0 if far_s < 0 else k in (300, 301))
+        readings = {name: Reading(t + ahead_s, values) for name, (t, values) in sample.readings.items()}
+        stamps += [found.end_s for found in observer.update(readings)]
+    assert observer.dropped["time: clock set"] >= 1
+    assert sum(stamp_s > 1000.0 for stamp_s in stamps) == 0
+    assert min(stamps) < -500.0 if far_s < 0 else max(stamps) > 8.5
+    assert observer.belief.terrain == "b"
+
+
+def test_a_terrain_that_nothing_confirms_becomes_unknown_where_no_wheels_are_measured(
+    mower_model, two_drives
+):
+    observer = TerrainObserver(mower_model)
+    for sample in replay(two_drives[4]):
+        observer.update(sample.readings)
+    assert observer.belief.terrain == "b"
+    end_s = two_drives[4].end_s
+    for k in range(1, 150):
+        observer.update({"imu": Reading(np.array([end_s + 0.1 * k]), np.full((1, 1), math.nan))})
+    assert observer.belief.terrain == ""
+
+
 def test_a_robot_without_a_description_is_observed_by_its_channels(mower_model, two_drives):
     run = two_drives[4]
     assert_same(
@@ -158,12 +186,13 @@ def test_whatever_arrives_nothing_raises_and_the_next_windows_are_as_before(mowe
     assert [one[:4] for one in found] == [one[:4] for one in plain]
 
 
-def test_a_window_that_the_model_refuses_is_named(mower_model, two_drives):
+@pytest.mark.parametrize("kind", [ValueError, TypeError])
+def test_a_window_that_the_model_refuses_is_named(mower_model, two_drives, kind):
     class Refusing:
         classes_ = mower_model.recipe.classes_
 
         def predict_proba(self, windows):
-            raise ValueError("Input X contains NaN.")
+            raise kind("Input X contains NaN.")
 
     observer = TerrainObserver(mower_model._replace(recipe=Refusing()))
     found = observed(observer, two_drives[0])

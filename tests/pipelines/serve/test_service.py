@@ -96,6 +96,32 @@ def test_a_step_of_old_samples_is_no_latest_step(service):
         assert client.latest(60.0)["time_s"] == 10.0
 
 
+def test_commands_at_a_rate_at_which_every_step_is_a_clock_that_was_set_are_refused(service, hello):
+    with service.socket() as socket:
+        answer = talk(socket, False)(hello("slow", control=True, rate_hz=1.0))
+    assert (answer["code"], "5 Hz or more" in answer["message"]) == ("malformed", True)
+
+
+@pytest.mark.parametrize(
+    ("given", "time_s"), [(7, 7.0), (7.5, 7.5), ("x", None), (None, None), (10**400, None)]
+)
+def test_a_step_is_at_the_robots_time_or_where_it_has_none_at_its_clocks(service, hello, given, time_s):
+    with service.socket() as socket:
+        say = talk(socket, False)
+        assert say(hello(f"at-{str(given)[:4]}"))["type"] == "welcome"
+        steps = []
+        for _ in range(2):
+            streams = {"imu": [[5.0], [[0.1]]]}
+            steps.append(
+                say({"type": "samples", "streams": streams, "step": True, "time_s": given})["time_s"]
+            )
+            time.sleep(0.05)
+    if time_s is not None:
+        assert steps == [time_s] * 2
+    else:  # its clock goes on where its stamps do not
+        assert 5.0 <= steps[0] < steps[0] + 0.04 < steps[1] < 10.0
+
+
 def test_the_client_waits_for_steps_and_says_what_went_wrong(service):
     with TerrainClient(service.ws, "waiting", "mower", CHANNELS, rate_hz=0.0) as client:
         with pytest.raises(ServiceError, match="no step in time"):

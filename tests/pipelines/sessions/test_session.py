@@ -14,11 +14,12 @@ from pipelines.live.pilot import LivePilot
 from pipelines.live.terrain_source import Classifier
 from pipelines.sessions.records import CommandStatus, Served, SessionRequest
 from pipelines.sessions.session import TWIST_FRESH_S, RobotSession
+from pipelines.sessions.stream_health import StreamHealth
 from terrain.control.slip_table import load_slip_table
 from terrain.errors import ConfigError, DataError
 from terrain.estimation.live.estimator import CHANNELS
 from terrain.logs.replay import SENSORS, replay
-from terrain.records import Stream
+from terrain.records import Reading, Stream
 from terrain.robots import load_robot
 from terrain.simulation.run import simulate_run
 
@@ -65,9 +66,15 @@ def drive(session, log, change=lambda session, sample: None):
     return outputs
 
 
+def steered(pilot, log):
+    """A pilot that begins with the steering where it is measured first."""
+    pilot.start_steering(log.streams["steering"].values[0])
+    return pilot
+
+
 def test_commands_are_those_of_a_pilot_that_is_given_the_samples_at_once(log, swerve_model):
     outputs = drive(agrimaro(swerve_model), log)
-    pilot = LivePilot(ROBOT, TABLE, Classifier(swerve_model, ROBOT))
+    pilot = steered(LivePilot(ROBOT, TABLE, Classifier(swerve_model, ROBOT)), log)
     n_driving = 0
     for output, sample in zip(outputs, replay(log), strict=True):
         desired = pilot.step(sample)
@@ -136,7 +143,7 @@ def test_columns_are_taken_by_name_and_what_is_not_sent_is_unknown(log, swerve_m
 
 def test_a_robot_that_asks_for_its_steps_gets_them_at_its_own_time_however_late_messages_are(log):
     rng, now_s = np.random.default_rng(2), NOW_S
-    session, pilot = agrimaro(), LivePilot(ROBOT, TABLE)
+    session, pilot = agrimaro(), steered(LivePilot(ROBOT, TABLE), log)
     for sample in replay(log):
         now_s = max(now_s, NOW_S + sample.time_s + rng.exponential(0.05))
         streams = {name: (t.tolist(), values.tolist()) for name, (t, values) in sample.readings.items()}
@@ -276,6 +283,8 @@ def test_a_swap_that_does_not_suit_is_refused_and_changes_nothing(mower_model, s
     driven = agrimaro(swerve_model)
     with pytest.raises(ConfigError, match="is of the robot 'husky', not of 'agrimaro'"):
         driven.swap(Served(2, swerve_model, "other", replace(TABLE, robot="husky")))
+    with pytest.raises(ConfigError, match="is of the robot 'husky', not of 'agrimaro'"):
+        driven.check(Served(2, swerve_model, "other", replace(TABLE, robot="husky")))  # before any is swapped
     assert driven.served.number == 1
     for one in (session, driven):
         with pytest.raises(DataError, match="cannot be replaced by none"):
@@ -318,6 +327,66 @@ def test_streams_that_stop_are_lost_and_come_back(mower_model, two_drives):
             assert health == "fresh", time_s
         elif 4.6 < time_s < 6.0:
             assert health == "lost", time_s
+
+
+def test_a_robot_whose_sensors_died_is_not_driven_on_by_messages_without_samples(log):
+    session = agrimaro()
+    drive(session, log)
+    for k in range(200):
+        now_s = NOW_S + log.end_s + 0.05 * (k + 1)
+        session.put(None, [0.5, 0.0, 0.0], now_s)
+        output = session.step(now_s)
+    assert set(output.observation.sensors.values()) == {"lost"}
+    assert output.command.status["stale_s"] > 5.0
+    assert not np.isfinite(output.observation.slip_ratio).any()
+
+
+def test_a_robot_begins_with_its_steering_where_it_is_and_stands_until_that_is_known():
+    session = agrimaro()
+    angles_rad = ROBOT.steering_zeros_rad + np.array([1.4, 1.5, 1.6])
+    wheels, unknown = [[0.0], [[0.0] * 6]], [[0.0], [[math.nan] * 3]]
+    for streams in ({"wheels": wheels}, {"steering": unknown}):
+        session.put(streams, [0.0, 0.5, 0.0], NOW_S)
+        output = session.step(NOW_S)
+        assert output.status is CommandStatus.NO_SAMPLES
+        assert not output.command.wheel_radps.any()
+    session.put({"steering": [[0.02], [angles_rad.tolist()]]}, [0.0, 0.5, 0.0], NOW_S + 0.02)
+    output = session.step(NOW_S + 0.02)
+    assert output.status is CommandStatus.OK
+    assert np.abs(output.command.steer_rad - [1.4, 1.5, 1.6]).max() < 0.2
+
+
+def test_a_silent_robots_terrain_becomes_unknown(mower_model, two_drives):
+    session = mower(mower_model)
+    last = drive(session, two_drives[4])[-1]
+    assert last.observation.terrain == "b"
+    for k in range(300):
+        seen = session.step(NOW_S + last.time_s + 0.1 * (k + 1)).observation
+    assert (seen.terrain, set(seen.sensors.values())) == ("", {"lost"})
+
+
+def test_what_is_kept_is_as_old_as_the_last_sample_over_any_number_of_restarts(
+    mower_model, two_drives, monkeypatch
+):
+    clock = {"now_s": 1000.0}
+    monkeypatch.setattr("pipelines.sessions.session.time", lambda: clock["now_s"])
+    session = mower(mower_model)
+    drive(session, two_drives[4])
+    clock["now_s"] = 1008.0
+    again = mower(mower_model)
+    assert again.restore(session.state()).belief.terrain == "b"
+    clock["now_s"] = 1016.0  # it sent nothing meanwhile
+    third = mower(mower_model)
+    assert third.restore(again.state()).belief.terrain == ""
+
+
+def test_a_stream_that_ended_before_the_clock_was_set_back_is_lost():
+    health = StreamHealth({"imu": ("gyro_z_radps",), "wheels": ("speed_left_mps",)})
+    reading = Reading(np.array([0.0]), np.array([[0.1]]))
+    health.take({"imu": reading, "wheels": reading}, 5000.0)
+    for k in range(20):
+        health.take({"imu": reading}, 1000.0 + 0.1 * k)
+    assert health.health(1002.0) == {"imu": "fresh", "wheels": "lost"}
 
 
 def test_a_restart_with_state_knows_the_terrain(log, swerve_model):
