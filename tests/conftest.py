@@ -2,6 +2,7 @@
 
 import csv
 import os
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +15,8 @@ from terrain.records import Label, RunLog, Stream
 REPOSITORY = Path(__file__).resolve().parents[1]
 
 
-def pytest_configure():
-    """Give linear algebra one thread a process, as the tests run in several.
+def pytest_configure(config):
+    """Give linear algebra one thread a process, as the tests run in several, and compile kernels first.
 
     Of small matrices two processes with a thread a core take up to three times as long, as threads wait for
     one another.  What is loaded already is limited directly, the rest and the processes of tests by their
@@ -24,6 +25,47 @@ def pytest_configure():
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")
     threadpool_limits(1)
+    for name in getattr(config, "workerinput", {}).get("kernels", ()):
+        with suppress(Exception):  # what cannot run fails in its tests
+            KERNELS[name]()
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_configure_node(node):
+    """Have two processes of tests compile the kernels from either end, where there are none yet.
+
+    Each then takes from the cache what the other has compiled, and no kernel is compiled by both.
+    """
+    if not any((REPOSITORY / "terrain").rglob("__pycache__/*.nbc")):
+        backward = node.workerinput["workerid"] != "gw0"
+        node.workerinput["kernels"] = list(KERNELS)[:: -1 if backward else 1]
+
+
+def _import_live():
+    import pipelines.live.pilot  # noqa: F401 - kernels with signatures are compiled when they are imported
+
+
+def _simulate_plant():
+    from terrain.robots import load_robot
+    from terrain.simulation.run import simulate_run
+
+    simulate_run(load_robot("agrimaro"), "grass", "straight", 0, duration_s=5.0)
+
+
+def _explain_planar():
+    from terrain.discrepancy.diagnose import diagnose
+    from terrain.discrepancy.simulation import Simulation
+    from terrain.effects import effect_named
+    from terrain.robots import load_robot
+    from terrain.simulation.run import simulate_run
+
+    husky = load_robot("husky")
+    runs = [simulate_run(husky, "grass", "survey", 0, number, duration_s=20.0) for number in range(6)]
+    diagnose(runs, Simulation(husky), [effect_named("effective_track")])
+
+
+KERNELS = {"live": _import_live, "plant": _simulate_plant, "planar": _explain_planar}
+"""What compiles most kernels; the first takes as long as the others together."""
 
 
 @pytest.fixture(scope="session")

@@ -285,7 +285,7 @@ def _inputs(robot: Robot, name: str) -> tuple[Array, Array] | None:
     keep = math.exp(-1.0 / (RATE_HZ * FOLLOW_S))
     every = round(RATE_HZ / CLOCK_HZ)
     wheel_speed_mps, steer_rad = (
-        lfilter([1 - keep], [1, -keep], x, axis=0)[::every]
+        np.ascontiguousarray(lfilter([1 - keep], [1, -keep], x, axis=0)[::every])  # as all callers of kernels
         for x in (motion.wheel_speed_mps, motion.steer_rad)
     )
     return wheel_speed_mps, steer_rad

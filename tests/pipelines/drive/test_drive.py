@@ -36,7 +36,7 @@ SHORT = DriveSettings(
     seeds=2,
     first_seed=300,
     duration_s=6.0,
-    jobs=2,
+    jobs=1,
 )
 ALL = SHORT.with_(controllers=("plain", "ramp", "thesis", "fallback", "true_terrain+track", "known:clay"))
 INPUTS = load_inputs(SHORT)
