@@ -17,7 +17,7 @@ TWIST: tuple[str, ...] = ("speed_x_mps", "speed_y_mps", "yaw_rate_radps")
 """Channels of the desired motion in the stream ``commands``."""
 
 MAX_STEPS = 20_000_000
-"""Of a replay: four days at 50 Hz."""
+"""Of a replay: 111 hours at 50 Hz."""
 
 _SLACK_S = 1e-9  # stamps that differ by less are the same instant, written by two clocks' arithmetic
 
@@ -64,8 +64,8 @@ def replay(run: RunLog, rate_hz: float = 50.0) -> Iterator[Sample]:
     span_s = max(c[-1] for c in came.values()) - min(c[0] for c in came.values())
     if span_s * rate_hz > MAX_STEPS:
         raise DataError(
-            f"run {run.run_id}: has stamps {span_s / 86400:.1f} days apart, its clock was set; at most "
-            f"{MAX_STEPS / rate_hz / 86400:.1f} days are replayed at {rate_hz:g} Hz"
+            f"run {run.run_id}: has stamps {span_s / 3600:.1f} h apart, its clock was set; at most "
+            f"{MAX_STEPS / rate_hz / 3600:.1f} h are replayed at {rate_hz:g} Hz"
         )
     return _steps(run, came, 1.0 / rate_hz)
 

@@ -98,13 +98,14 @@ def robot(service, session="mower-1", token="", **options):
         with TerrainClient(
             service.ws, session, name, streams, rate_hz=20.0, token=token, **options
         ) as client:
-            while not ended.wait(0.02):
-                now_s = time.monotonic()
+            begun_s, k = time.monotonic(), 0
+            while not ended.wait(max(begun_s + 0.02 * k - time.monotonic(), 0.0)):
+                now_s, k = begun_s + 0.02 * k, k + 1  # of a sensor: even, however late they are sent
                 if control:
                     row = [20.0, 21.0, 19.0, 1.0, 1.5, 2.0]
                     client.send({"wheels": ([now_s], [row])}, (0.5, 0.0, 0.0))
                 else:
-                    noise = 2.0 if int(now_s * 50) % 2 else -2.0
+                    noise = 2.0 if k % 2 else -2.0
                     client.send({"imu": ([now_s], [[noise]]), "wheels": ([now_s], [[0.5]])})
 
     thread = threading.Thread(target=drive)

@@ -84,7 +84,7 @@ def test_steps_come_at_the_rate_that_was_asked_for(service):
 
 def test_a_step_of_old_samples_is_no_latest_step(service):
     with TerrainClient(service.ws, "late", "mower", CHANNELS, rate_hz=0.0) as client:
-        client.send({"imu": ([10.0], [[0.1]])}, step=True)
+        client.send({"imu": ([10.0], [[0.1]])}, step=True, time_s=10.0)
         until = time.monotonic() + 10.0
         while client.latest(60.0) is None:
             assert time.monotonic() < until

@@ -62,3 +62,9 @@ def test_logs_and_rates_that_cannot_be_replayed_are_refused():
         replay(run_of(imu=imu([0.0])), 0.0)
     with pytest.raises(DataError, match="no sensor to replay"):
         replay(run_of(truth=imu([0.0])))
+
+
+def test_a_run_whose_clock_was_set_by_years_is_refused():
+    run = run_of(imu=imu(np.array([0.0, 1.0, 1.7e9])))
+    with pytest.raises(DataError, match=r"472222\.2 h apart, its clock was set; at most 111\.1 h"):
+        replay(run)
