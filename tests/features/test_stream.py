@@ -67,7 +67,7 @@ def logs(draw):
         streams[name] = Stream(time_s, values, CHANNELS[name])
     rule = WindowRule(
         length_s=draw(st.floats(0.6, 3.0)),
-        stride_s=draw(st.one_of(st.none(), st.floats(0.05, 5.0))),
+        stride_s=draw(st.one_of(st.none(), st.floats(1 / max(rates_hz.values()), 5.0))),
         steady=draw(st.sampled_from([None, SteadyMotion(), SteadyMotion(0.3, 0.1)])),
     )
     layout = Layout({name: CHANNELS[name] for name in names}, rates_hz)

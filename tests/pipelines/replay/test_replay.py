@@ -12,21 +12,15 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from pipelines.classify.crossval import samples_of
 from pipelines.classify.predict import predict
-from pipelines.classify.settings import CrossvalSettings
-from pipelines.classify.train import model_info
 from pipelines.cli import main as cli
 from pipelines.live.pilot import LivePilot
 from pipelines.live.pilot_settings import PilotSettings
-from pipelines.models.model_files import TerrainModel
 from pipelines.replay.replay import replay_run
 from pipelines.replay.screen import live_view
 from pipelines.replay.settings import ReplaySettings
 from terrain.control.slip_table import load_slip_table
 from terrain.errors import ConfigError, DataError
-from terrain.estimation.enriched import enriched
-from terrain.estimation.estimate import estimate_run
 from terrain.logs.replay import replay
 from terrain.logs.write import write_run
 from terrain.records import RunLog, Stream
@@ -36,26 +30,9 @@ from terrain.simulation.run import simulate_run
 AGRIMARO, TABLE = load_robot("agrimaro"), load_slip_table()
 
 
-def fitted(runs):
-    settings = CrossvalSettings()
-    windows = samples_of(runs, settings).cut.windows
-    recipe = settings.new_recipe().fit(windows, windows.terrain.astype(str))
-    return TerrainModel(recipe, model_info(runs, settings, windows, "drawn", ""))
-
-
 @pytest.fixture(scope="module")
-def husky_model(runs):
-    return fitted(runs)
-
-
-@pytest.fixture(scope="module")
-def agrimaro_model():
-    simulated = [
-        simulate_run(AGRIMARO, terrain, "survey", 5, number, duration_s=20.0)
-        for terrain in ("grass", "tiles")
-        for number in (1, 2)
-    ]
-    return fitted([enriched(estimate_run(run, AGRIMARO, "vio15")) for run in simulated])
+def husky_model(trained, runs):
+    return trained(runs)
 
 
 @pytest.fixture(scope="module")
@@ -96,9 +73,9 @@ def test_an_observer_gives_what_predict_gives(runs, husky_model):
     assert result.duration_s == pytest.approx(24.0, abs=0.1)
 
 
-def test_a_pilot_gives_what_predict_gives_though_another_controller_drove(grass, agrimaro_model):
-    result = replay_run(grass, agrimaro_model, TABLE, ReplaySettings())
-    rows = predict([grass], agrimaro_model, TABLE).windows
+def test_a_pilot_gives_what_predict_gives_though_another_controller_drove(grass, swerve_model):
+    result = replay_run(grass, swerve_model, TABLE, ReplaySettings())
+    rows = predict([grass], swerve_model, TABLE).windows
     assert result.chain == "pilot"
     assert [(w.start_s, w.terrain) for w in result.windows] == [(row.start_s, row.terrain) for row in rows]
     assert result.windows[-1].believed == "grass"
@@ -130,12 +107,12 @@ def test_a_pilot_needs_no_model_and_another_robot_does(grass, runs):
 
 
 def test_a_robot_without_a_description_is_replayed_where_the_model_needs_none(
-    runs, husky_model, agrimaro_model
+    runs, husky_model, swerve_model
 ):
     run = RunLog("X", "nothing known", runs[0].streams, runs[0].labels)
     assert replay_run(run, husky_model, TABLE, ReplaySettings()).n_windows > 8
     with pytest.raises(ConfigError, match="nothing known"):
-        replay_run(run, agrimaro_model, TABLE, ReplaySettings())
+        replay_run(run, swerve_model, TABLE, ReplaySettings())
 
 
 def test_a_run_that_lacks_what_is_needed_is_refused_in_a_sentence(grass, runs, husky_model):

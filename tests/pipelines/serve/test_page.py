@@ -263,7 +263,8 @@ def test_a_robot_that_sends_nothing_more_is_not_shown_as_live(service, opened):
 
 
 def test_names_with_markup_are_text(running, mower_model, model_folder, tmp_path, opened):
-    shutil.copy(model_folder / "model.skops", tmp_path)
+    for file in model_folder.iterdir():
+        shutil.copy(file, tmp_path)
     classes = tuple(MARKUP if name == "b" else name for name in mower_model.info.classes)
     write_info(tmp_path, replace(mower_model.info, classes=classes))
     with running(model=str(tmp_path)) as service:
