@@ -19,11 +19,11 @@ from pipelines.live.classifying import AtOnce, classify_window
 from pipelines.live.pilot import LivePilot
 from pipelines.live.terrain_source import Classifier
 from pipelines.models.model_files import TerrainModel
+from pipelines.models.resolve import load_model
 from pipelines.serve.app import make_app
 from pipelines.serve.guard import check_token, is_loopback
 from pipelines.serve.hub import Hub, Limits
 from pipelines.serve.protocol import HttpProtocol, SocketProtocol
-from pipelines.serve.resolve import load_model
 from pipelines.serve.results import ServiceCheck
 from pipelines.serve.settings import ServeSettings
 from pipelines.sessions.records import Served
