@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import signal
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-
 import numpy as np
 
 from pipelines.can.dbc import load_layout
@@ -19,6 +15,7 @@ from pipelines.live.classifying import ClassifierThread
 from pipelines.live.pilot import LivePilot
 from pipelines.live.pilot_settings import PilotSettings
 from pipelines.live.terrain_source import Classifier
+from pipelines.reporting.stopping import stopping
 from terrain.control.slip_table import load_slip_table
 from terrain.records import Array
 from terrain.robots import as_swerve, load_robot
@@ -42,7 +39,7 @@ def run_can(settings: CanSettings) -> BridgeReport:
     core = BridgeCore(layout, robot, _pilot(settings))
     link = Link(lambda: open_bus(settings.interface, settings.channel, settings.bitrate))
     bridge = Bridge(core, link, settings.rate_hz)
-    with _stopping(bridge.stop):
+    with stopping(bridge.stop):
         bridge.run(settings.duration_s)
     return BridgeReport(
         interface=settings.interface,
@@ -79,16 +76,3 @@ def _pilot(settings: CanSettings) -> MakeStep:
 
     make(np.zeros(3))  # before the bus is opened
     return make
-
-
-@contextmanager
-def _stopping(stop: Callable[[], None]) -> Iterator[None]:
-    """Call a function at an interrupt or a request to end, in place of ending at once."""
-    before = {name: signal.getsignal(name) for name in (signal.SIGINT, signal.SIGTERM)}
-    for name in before:
-        signal.signal(name, lambda *_: stop())
-    try:
-        yield
-    finally:
-        for name, handler in before.items():
-            signal.signal(name, handler)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from threading import Event
+
 import typer
 
 from pipelines.cli.command import Json, command
@@ -17,11 +19,12 @@ def replay_command(source: InspectSettings, settings: ReplaySettings, json_file:
     from pipelines.replay.replay import replay_logs
     from pipelines.replay.screen import live_view, print_replay
     from pipelines.reporting.json_file import write_json
+    from pipelines.reporting.stopping import stopping
     from pipelines.reporting.terminal import output_console
 
-    console = output_console()
-    with live_view(console) as show:
-        result = replay_logs(source, settings, show)
+    console, stopped = output_console(), Event()
+    with live_view(console) as show, stopping(stopped.set):
+        result = replay_logs(source, settings, show, stopped.is_set)
     print_replay(result, console)
     write_json(json_file, result)
     if result.interrupted:

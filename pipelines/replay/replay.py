@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Callable
 from time import perf_counter, sleep
 from typing import Protocol
 
@@ -47,8 +48,19 @@ class NoView:
         """Do nothing."""
 
 
-def replay_logs(source: InspectSettings, settings: ReplaySettings, view: View | None = None) -> Replay:
+def replay_logs(
+    source: InspectSettings,
+    settings: ReplaySettings,
+    view: View | None = None,
+    stopped: Callable[[], bool] = lambda: False,
+) -> Replay:
     """Replay all runs of a log, one after the other; Ctrl-C ends it with what was found until then.
+
+    Parameters
+    ----------
+    source, settings : logs, and how they are replayed
+    view : watches it
+    stopped : asked at each step whether it ends there
 
     Raises
     ------
@@ -61,7 +73,7 @@ def replay_logs(source: InspectSettings, settings: ReplaySettings, view: View | 
     robot = None if source.robot is None else load_robot(source.robot)
     replayed: list[ReplayedRun] = []
     for run in runs:
-        replayed.append(replay_run(run, model, table, settings, robot=robot, view=view))
+        replayed.append(replay_run(run, model, table, settings, robot=robot, view=view, stopped=stopped))
         if replayed[-1].interrupted:
             break
     duration_s, elapsed_s = (
@@ -92,6 +104,7 @@ def replay_run(
     *,
     robot: Robot | None = None,
     view: View | None = None,
+    stopped: Callable[[], bool] = lambda: False,
 ) -> ReplayedRun:
     """Send one run through the live chain of its robot.
 
@@ -101,11 +114,10 @@ def replay_run(
         as :func:`pipelines.replay.chains.chain_of`.
     """
     chain, fitting = chain_of(run, model, table, robot)
-    steps = _Steps(fitting, chain, settings, view or NoView())
+    steps = _Steps(fitting, chain, settings, view or NoView(), stopped)
     begin_s = perf_counter()
-    interrupted = False
     try:
-        steps.run()
+        interrupted = not steps.run()
     except KeyboardInterrupt:
         interrupted = True
     elapsed_s = perf_counter() - begin_s
@@ -136,23 +148,28 @@ def replay_run(
 class _Steps:
     """The steps of one replay, and what they have given so far."""
 
-    def __init__(self, run: RunLog, chain: Chain, settings: ReplaySettings, view: View) -> None:
+    def __init__(
+        self, run: RunLog, chain: Chain, settings: ReplaySettings, view: View, stopped: Callable[[], bool]
+    ) -> None:
         self._run, self._chain, self._settings, self._view = run, chain, settings, view
+        self._stopped = stopped
         self.windows: list[ObservedWindow] = []
         self.believed: Counter[str] = Counter()
         self.passed_s = 0.0
 
-    def run(self) -> None:
-        """Take all steps, each when it is due."""
+    def run(self) -> bool:
+        """Take all steps, each when it is due; return whether all were taken."""
         run, view, chain = self._run, self._view, self._chain
         speed, wall_s, start_s = self._settings.speed_ratio, perf_counter(), math.nan
         end_s = max(stream.time_s[-1] for stream in run.streams.values())
         for sample in replay(run, self._settings.rate_hz):
+            if self._stopped():
+                return False
             if math.isnan(start_s):
                 start_s = sample.time_s
             self.passed_s = sample.time_s - start_s
             if speed < math.inf:
-                _wait(wall_s + self.passed_s / speed)
+                _wait(wall_s + self.passed_s / speed, self._stopped)
             done = chain.step(sample)
             self.believed[done.believed] += 1
             for output in done.windows:
@@ -161,6 +178,7 @@ class _Steps:
             view.moment(
                 ReplayMoment(run.run_id, self.passed_s, end_s - start_s, done.believed, done.target_ratio)
             )
+        return True
 
     def _observed(self, output: WindowOutput, done: Replayed) -> ObservedWindow:
         label = label_windows(self._run, np.array([output.start_s]), output.end_s - output.start_s)[0]
@@ -184,6 +202,6 @@ def _model(uri: str | None) -> TerrainModel | None:
     return load_model(uri)
 
 
-def _wait(until_s: float) -> None:
-    while (rest_s := until_s - perf_counter()) > 0.0:
+def _wait(until_s: float, stopped: Callable[[], bool]) -> None:
+    while (rest_s := until_s - perf_counter()) > 0.0 and not stopped():
         sleep(min(rest_s, LONGEST_SLEEP_S))

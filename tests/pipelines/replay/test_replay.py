@@ -5,7 +5,6 @@ import json
 import signal
 import subprocess
 import sys
-from contextlib import suppress
 from time import perf_counter
 
 import numpy as np
@@ -197,14 +196,8 @@ def test_a_signal_ends_the_command_with_a_summary(logs, in_tracked, tmp_path):
         text=True,
     )
     assert "believed" in process.stdout.readline()
-    for _ in range(6):  # a signal in the middle of compiling is lost
-        process.send_signal(signal.SIGINT)
-        with suppress(subprocess.TimeoutExpired):
-            out, err = process.communicate(timeout=15.0)
-            break
-    else:
-        process.kill()
-        process.communicate()
+    process.send_signal(signal.SIGINT)  # once, and whatever is compiled just then
+    out, err = process.communicate(timeout=60.0)
     assert (process.returncode, err) == (130, "")
     assert "stopped before the end" in out
     assert 1.0 < json.loads((tmp_path / "out.json").read_text())["duration_s"] < 20.0
