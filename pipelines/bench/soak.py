@@ -26,7 +26,9 @@ from pipelines.bench.robots import hello, packed
 from pipelines.bench.settings import SoakSettings
 from pipelines.reporting.progress import Progress, silent
 
-ANSWER_S = 5.0
+ANSWER_S, DROPPED_S = 5.0, 1.0
+"""For an answer; for that of a request that was dropped, if it was not."""
+
 MEMORY_GROWTH_MOST = 0.05
 FAULTS = (
     "garbage",
@@ -116,23 +118,26 @@ class _Robot:
                 return
             await socket.send(one.message)
             if one.step:
-                await self._answer(socket, asked_s=monotonic())
+                await self._answer(socket, self._begin_s + one.time_s, asked_s=monotonic())
 
-    async def _answer(self, socket: ClientConnection, asked_s: float) -> None:
-        """Wait for the step that was asked for, and judge it."""
+    async def _answer(self, socket: ClientConnection, time_s: float, asked_s: float) -> None:
+        """Wait for the step that was asked for at a time of the robot's clock, and judge it."""
+        dropped = False  # the request may be among the messages that came too fast
         while True:
             try:
-                answer = msgpack.unpackb(await asyncio.wait_for(socket.recv(), ANSWER_S))
+                limit_s = DROPPED_S if dropped else ANSWER_S
+                answer = msgpack.unpackb(await asyncio.wait_for(socket.recv(), limit_s))
             except TimeoutError:
-                self._seen.unanswered += 1
+                self._seen.unanswered += not dropped
                 return
             if answer["type"] == "error":
                 self._seen.errors[answer["code"]] += 1
-                if answer["fatal"] or answer["code"] == "too-fast":
+                if answer["fatal"]:
                     return
-                continue
-            self._judge(answer, asked_s)
-            return
+                dropped = dropped or answer["code"] == "too-fast"
+            elif abs(answer["time_s"] - time_s) < 1e-6:  # and not that of a request before
+                self._judge(answer, asked_s)
+                return
 
     def _judge(self, answer: dict[str, Any], asked_s: float) -> None:
         seen, command = self._seen, answer["command"]

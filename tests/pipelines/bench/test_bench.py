@@ -1,8 +1,10 @@
 """The benchmarks measure what they say, and the soak finds what is not accepted."""
 
+import asyncio
 import json
 import time
 
+import msgpack
 import numpy as np
 import pytest
 
@@ -137,6 +139,37 @@ def test_a_window_by_another_robots_clock_is_one_of_another_robot(end_s, n):
     answer = {"command": command, "observation": {"window": {"start_s": end_s - 2.0, "end_s": end_s}}}
     robot._judge(answer, time.monotonic())
     assert (robot._seen.steps, robot._seen.wrong_session) == (1, n)
+
+
+@pytest.mark.parametrize(
+    ("answers", "steps", "unanswered"),
+    [
+        (["step 1", "step 2"], 1, 0),
+        (["too-fast", "step 2"], 1, 0),
+        (["too-fast"], 0, 0),
+        (["step 1"], 0, 1),
+    ],
+)
+def test_an_answer_is_that_of_its_request(monkeypatch, answers, steps, unanswered):
+    monkeypatch.setattr("pipelines.bench.soak.ANSWER_S", 0.05)
+    monkeypatch.setattr("pipelines.bench.soak.DROPPED_S", 0.05)
+    command = {"wheel_radps": [0.0], "steer_rad": [0.0], "twist": [0.0], "valid_s": 1.0}
+
+    class Socket:
+        async def recv(self):
+            if not answers:
+                await asyncio.sleep(1.0)
+            what = answers.pop(0)
+            if what == "too-fast":
+                return msgpack.packb({"type": "error", "code": what, "fatal": False})
+            step = {"type": "step", "time_s": float(what[-1]), "command": command}
+            return msgpack.packb({**step, "observation": {"window": None}})
+
+    answers = list(answers)
+    message = {"streams": {"imu": [[0.0], [[0.0]]]}, "time_s": 0.0}
+    robot = _Robot(0, {"imu": ["gyro_z_radps"]}, [message], _Seen(), 0)
+    asyncio.run(robot._answer(Socket(), 2.0, time.monotonic()))
+    assert (robot._seen.steps, robot._seen.unanswered) == (steps, unanswered)
 
 
 @pytest.mark.slow
