@@ -32,9 +32,9 @@ def bench_model(uri: str | None, seed: int) -> TerrainModel:
     """Return a model by its URI, or one that is trained on four short simulated runs."""
     if uri is not None:
         return load_model(uri)
-    from pipelines.classify.crossval import samples_of
-    from pipelines.classify.settings import CrossvalSettings
     from pipelines.classify.train import model_info
+    from pipelines.crossval.crossval import samples_of
+    from pipelines.crossval.settings import CrossvalSettings
 
     robot = load_robot(ROBOT)
     runs = [

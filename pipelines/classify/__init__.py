@@ -1,1 +1,1 @@
-"""``terrain crossval``, ``train`` and ``predict``."""
+"""``terrain train`` and ``predict``."""

@@ -8,12 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.classify.crossval import crossval, samples_of
-from pipelines.classify.evaluation import Examples
-from pipelines.classify.importance import channel_importance
-from pipelines.classify.results import CrossvalReport, Training
-from pipelines.classify.settings import RecipeSettings, TrainSettings
-from pipelines.classify.splits import folds_of
+from pipelines.classify.results import Training
+from pipelines.classify.settings import TrainSettings
+from pipelines.crossval.crossval import crossval, samples_of
+from pipelines.crossval.evaluation import Examples
+from pipelines.crossval.importance import channel_importance
+from pipelines.crossval.results import CrossvalReport
+from pipelines.crossval.settings import RecipeSettings
+from pipelines.crossval.splits import folds_of
 from pipelines.live.window_feed import ESTIMATED
 from pipelines.models.results import ModelInfo
 from pipelines.reporting.json_file import as_json
@@ -48,7 +50,7 @@ def train(
     TerrainError
         if the data do not suffice or the tracking folder cannot be written.
     """
-    from pipelines.classify.figures import all_figures
+    from pipelines.crossval.figures import all_figures
     from pipelines.models.tracking import code_commit, ensure_tracking, log_training
 
     ensure_tracking()

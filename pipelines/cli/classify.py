@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import typer
 
-from pipelines.classify.settings import CrossvalSettings, PredictSettings, TrainSettings
+from pipelines.classify.settings import PredictSettings, TrainSettings
 from pipelines.cli.command import Json, command
+from pipelines.crossval.settings import CrossvalSettings
 from pipelines.runs.settings import AlignedRunsSettings, load
 
 app = typer.Typer()
@@ -16,8 +17,8 @@ def crossval_command(source: AlignedRunsSettings, settings: CrossvalSettings, js
     """Evaluate a recipe on held-out runs."""
     from dataclasses import replace
 
-    from pipelines.classify.crossval import crossval
-    from pipelines.classify.screen import print_crossval
+    from pipelines.crossval.crossval import crossval
+    from pipelines.crossval.screen import print_crossval
     from pipelines.reporting.json_file import write_json
     from pipelines.reporting.terminal import output_console, progress_bar
     from pipelines.runs.datasets import data_digest
@@ -35,8 +36,9 @@ def train_command(source: AlignedRunsSettings, settings: TrainSettings, json_fil
     """Evaluate on held-out runs, fit on all of them, track in MLflow and register."""
     from dataclasses import replace
 
-    from pipelines.classify.screen import print_crossval, print_training
+    from pipelines.classify.screen import print_training
     from pipelines.classify.train import train
+    from pipelines.crossval.screen import print_crossval
     from pipelines.reporting.json_file import write_json
     from pipelines.reporting.terminal import output_console, progress_bar
 

@@ -142,9 +142,9 @@ def train_classifier(
     progress : of the runs and the training
     runs_a_terrain : number of runs; that of ``terrain quickstart`` by default
     """
-    from pipelines.classify.crossval import samples_of
-    from pipelines.classify.settings import CrossvalSettings
     from pipelines.classify.train import model_info
+    from pipelines.crossval.crossval import samples_of
+    from pipelines.crossval.settings import CrossvalSettings
     from pipelines.estimate.labelled import RUNS_A_TERRAIN, labelled_runs
 
     runs, _, _ = labelled_runs(seed, runs_a_terrain or RUNS_A_TERRAIN, progress, robot)

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from features.windows import Layout, cut_windows, layout_of
-from pipelines.classify.settings import CrossvalSettings
-from pipelines.classify.splits import labelled
+from pipelines.crossval.settings import CrossvalSettings
+from pipelines.crossval.splits import labelled
 from pipelines.estimate.labelled import RUNS_A_TERRAIN, SCENARIO
 from pipelines.reporting.progress import Progress, silent
 from terrain.discrepancy.filter_gain import Comparison, accuracy_change

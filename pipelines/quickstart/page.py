@@ -8,13 +8,12 @@ from typing import NamedTuple
 
 from matplotlib.figure import Figure
 
-from pipelines.classify.results import (
+from pipelines.classify.results import Predictions, WindowPrediction
+from pipelines.crossval.results import (
     MIN_CLASSES,
     Applicability,
     CrossvalReport,
-    Predictions,
     SlowFast,
-    WindowPrediction,
 )
 from pipelines.quickstart.consistency_view import ConsistencyTable, consistency_table
 from pipelines.quickstart.results import QuickstartResult

@@ -7,8 +7,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from pipelines.classify.crossval import crossval
-from pipelines.classify.settings import CrossvalSettings
+from pipelines.crossval.crossval import crossval
+from pipelines.crossval.settings import CrossvalSettings
 from pipelines.estimate.consistency import TerrainConsistency
 from pipelines.estimate.labelled import TerrainSlip
 from pipelines.quickstart.results import KeptRuns, QuickstartResult
@@ -54,9 +54,9 @@ def quickstart(
     evaluation : how the recipe is evaluated; ``settings.evaluation`` by default
     runs_a_terrain : simulated runs of each terrain
     """
-    from pipelines.classify.figures import all_figures
     from pipelines.classify.predict import predict
     from pipelines.classify.train import train
+    from pipelines.crossval.figures import all_figures
     from pipelines.models.tracking import ensure_tracking, load_model
     from pipelines.quickstart.page import html_report
     from terrain.control.slip_table import load_slip_table

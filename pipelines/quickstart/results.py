@@ -6,7 +6,8 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from pipelines.classify.results import CrossvalReport, Predictions, Training
+from pipelines.classify.results import Predictions, Training
+from pipelines.crossval.results import CrossvalReport
 from pipelines.estimate.consistency import TerrainConsistency
 from pipelines.estimate.labelled import TerrainSlip
 from pipelines.runs.results import Imported

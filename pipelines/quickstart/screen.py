@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from rich.console import Console
 from rich.table import Table
 
-from pipelines.classify.screen import print_crossval, print_predictions, print_training
+from pipelines.classify.screen import print_predictions, print_training
+from pipelines.crossval.screen import print_crossval
 from pipelines.estimate.consistency import print_consistency
 from pipelines.estimate.labelled import TerrainSlip
 from pipelines.quickstart.results import QuickstartResult

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pipelines.classify.settings import CrossvalSettings, TrainSettings
+from pipelines.classify.settings import TrainSettings
 from pipelines.config.settings import Settings, setting
+from pipelines.crossval.settings import CrossvalSettings
 
 
 class QuickstartSettings(Settings):

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from skops import io
 
-from pipelines.classify.crossval import samples_of
-from pipelines.classify.settings import CrossvalSettings
 from pipelines.classify.train import model_info
+from pipelines.crossval.crossval import samples_of
+from pipelines.crossval.settings import CrossvalSettings
 from pipelines.models.model_files import write_info
 from pipelines.serve.server import Service, prepare
 from pipelines.serve.settings import ServeSettings

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipelines.classify.crossval import samples_of
-from pipelines.classify.settings import CrossvalSettings
 from pipelines.classify.train import model_info
+from pipelines.crossval.crossval import samples_of
+from pipelines.crossval.settings import CrossvalSettings
 from pipelines.models.model_files import TerrainModel
 from terrain.estimation.enriched import enriched
 from terrain.estimation.estimate import estimate_run
@@ -111,7 +111,7 @@ def runs():
 @pytest.fixture(scope="session")
 def settings():
     """Return a maker of settings for one process, one repeat and no extras unless asked for."""
-    from pipelines.classify.settings import CrossvalSettings
+    from pipelines.crossval.settings import CrossvalSettings
 
     def make(**options):
         return CrossvalSettings(**({"repeats": 1, "extras": False, "n_jobs": 1} | options))
@@ -122,7 +122,7 @@ def settings():
 @pytest.fixture(scope="session")
 def make_report():
     """Return a maker of a report of two terrains and three runs; what is given replaces its fields."""
-    from pipelines.classify.results import (
+    from pipelines.crossval.results import (
         Applicability,
         ClassSpeeds,
         CrossvalReport,

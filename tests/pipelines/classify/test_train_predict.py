@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipelines.classify.crossval import samples_of
 from pipelines.classify.predict import predict
 from pipelines.classify.settings import TrainSettings
 from pipelines.classify.train import model_info, train
+from pipelines.crossval.crossval import samples_of
 from pipelines.models.model_files import TerrainModel, read_model
 from pipelines.quickstart.settings import QuickstartSettings
 from pipelines.reporting.json_file import as_json, with_deprecated_keys
@@ -190,7 +190,7 @@ def test_a_tracking_folder_that_cannot_be_written_is_reported_before_any_work(tm
 def test_quickstart_ends_in_a_report_in_one_file(in_tracked, drive_all, settings, tmp_path, monkeypatch):
     from pipelines.quickstart.quickstart import quickstart
 
-    monkeypatch.setattr("pipelines.classify.extras.CURVE_RUNS", (1,))
+    monkeypatch.setattr("pipelines.crossval.extras.CURVE_RUNS", (1,))
     for run in drive_all(n_runs=2, duration_s=16.0):
         write_run(run, tmp_path / "data")
     steps = []

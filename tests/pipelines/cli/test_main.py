@@ -174,7 +174,7 @@ def test_an_output_that_cannot_be_written_is_reported_before_the_work(refused, p
     data = keep(drive_all(n_runs=2, duration_s=4.0), place)
     (place / "file").write_text("an obstacle")
     (place / "mlruns").write_text("an obstacle")
-    monkeypatch.setattr("pipelines.classify.crossval.fit_folds", lambda *_: pytest.fail("the work was begun"))
+    monkeypatch.setattr("pipelines.crossval.crossval.fit_folds", lambda *_: pytest.fail("the work was begun"))
     cannot = "cannot be written"
     refused(cannot, "import", data, "--out", place / "file" / "out")
     refused(cannot, "crossval", "--data", data, "--json", place / "file" / "report.json")
@@ -248,7 +248,7 @@ def test_usage_errors_are_code_2_too(terrain, place, words):
 def test_a_fault_of_the_package_keeps_its_traceback(terrain, place, drive, monkeypatch):
     data = keep([drive("r", "GRASS", 0, 4.0)], place)
     monkeypatch.setattr("pipelines.runs.datasets.data_digest", lambda runs: 1 / 0)
-    monkeypatch.setattr("pipelines.classify.crossval.crossval", lambda *_: 1 / 0)
+    monkeypatch.setattr("pipelines.crossval.crossval.crossval", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         terrain("crossval", "--data", data)
 
@@ -336,7 +336,7 @@ def test_the_choices_of_the_command_line_are_those_that_there_are():
     """They are written twice, so that help need not load what offers them."""
     from typing import get_args
 
-    from pipelines.classify.settings import RECIPES as RECIPE_CHOICES
+    from pipelines.crossval.settings import RECIPES as RECIPE_CHOICES
     from pipelines.estimate.settings import Filter, Tuning
     from pipelines.models.recipes import RECIPES
     from pipelines.runs.datasets import LAYOUTS

@@ -6,8 +6,8 @@ import re
 import numpy as np
 import pytest
 
-from pipelines.classify.crossval import crossval
-from pipelines.classify.settings import CrossvalSettings
+from pipelines.crossval.crossval import crossval
+from pipelines.crossval.settings import CrossvalSettings
 from pipelines.estimate.labelled import labelled_runs
 from pipelines.quickstart.quickstart import quickstart
 from pipelines.quickstart.settings import QuickstartSettings

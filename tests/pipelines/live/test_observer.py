@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipelines.classify.crossval import samples_of
 from pipelines.classify.predict import predict
-from pipelines.classify.settings import CrossvalSettings
 from pipelines.classify.train import model_info
+from pipelines.crossval.crossval import samples_of
+from pipelines.crossval.settings import CrossvalSettings
 from pipelines.live.observer import TerrainObserver
 from pipelines.runs.datasets import load_runs
 from terrain.control.slip_table import load_slip_table

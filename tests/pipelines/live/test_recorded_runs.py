@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipelines.classify.crossval import samples_of
 from pipelines.classify.predict import predict
-from pipelines.classify.settings import CrossvalSettings
+from pipelines.crossval.crossval import samples_of
+from pipelines.crossval.settings import CrossvalSettings
 from pipelines.live.classifying import AtOnce
 from pipelines.live.observer import TerrainObserver
 from pipelines.live.pilot import LivePilot

@@ -7,14 +7,14 @@ from pathlib import Path
 
 import pytest
 
-from pipelines.classify.figures import confusion_figure
 from pipelines.classify.results import (
-    Applicability,
     Predictions,
     TargetSlipRow,
     Training,
     WindowPrediction,
 )
+from pipelines.crossval.figures import confusion_figure
+from pipelines.crossval.results import Applicability
 from pipelines.estimate.consistency import TerrainConsistency
 from pipelines.estimate.labelled import TerrainSlip
 from pipelines.models.results import Registered

@@ -8,9 +8,9 @@ import numpy as np
 from joblib import Parallel, delayed
 from sklearn.base import BaseEstimator
 
-from pipelines.classify.evaluation import Examples, fit_on
-from pipelines.classify.results import ChannelImportance
-from pipelines.classify.splits import Fold
+from pipelines.crossval.evaluation import Examples, fit_on
+from pipelines.crossval.results import ChannelImportance
+from pipelines.crossval.splits import Fold
 from pipelines.reporting.progress import Progress, silent
 from terrain.records import Array
 

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, PercentFormatter
 
-from pipelines.classify.results import ChannelImportance, CrossvalReport, LearningCurve
+from pipelines.crossval.results import ChannelImportance, CrossvalReport, LearningCurve
 from pipelines.reporting.drawing import (
     BARE,
     BLUE,

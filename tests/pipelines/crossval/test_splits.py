@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from features.windows import WindowRule
-from pipelines.classify.settings import PUBLISHED_WINDOW_S
-from pipelines.classify.splits import (
+from pipelines.crossval.settings import PUBLISHED_WINDOW_S
+from pipelines.crossval.splits import (
     N_FOLDS,
     PARTITION_S,
     PUBLISHED_STRIDE_S,

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from features.windows import WindowRule
-from pipelines.classify import extras
-from pipelines.classify.crossval import crossval
-from pipelines.classify.evaluation import Examples, fit_folds
-from pipelines.classify.extras import (
+from pipelines.crossval import extras
+from pipelines.crossval.crossval import crossval
+from pipelines.crossval.evaluation import Examples, fit_folds
+from pipelines.crossval.extras import (
     CURVE_DRAWS,
     enough_runs,
     learning_curve,
@@ -15,7 +15,7 @@ from pipelines.classify.extras import (
     slow_fast,
     slow_fast_split,
 )
-from pipelines.classify.splits import folds_of, grouped_samples
+from pipelines.crossval.splits import folds_of, grouped_samples
 from pipelines.models.recipes import feature_matrix, make_recipe
 from terrain.records import RunLog, Stream
 

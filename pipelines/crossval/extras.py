@@ -11,9 +11,15 @@ from scipy.optimize import least_squares
 from sklearn.base import BaseEstimator
 
 from features.windows import wheel_speeds
-from pipelines.classify.evaluation import Examples, FoldResult, fit_folds
-from pipelines.classify.results import MIN_CLASSES, Applicability, ClassSpeeds, LearningCurve, SlowFast
-from pipelines.classify.splits import Fold, Samples
+from pipelines.crossval.evaluation import Examples, FoldResult, fit_folds
+from pipelines.crossval.results import (
+    MIN_CLASSES,
+    Applicability,
+    ClassSpeeds,
+    LearningCurve,
+    SlowFast,
+)
+from pipelines.crossval.splits import Fold, Samples
 from pipelines.reporting.progress import Progress, silent
 from terrain.logs.schema import signal_set_of
 from terrain.records import Array, Windows

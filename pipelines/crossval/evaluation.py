@@ -9,8 +9,8 @@ import numpy as np
 from joblib import Parallel, delayed
 from sklearn.base import BaseEstimator, clone
 
-from pipelines.classify.results import Figures, FoldFigures
-from pipelines.classify.splits import Fold, Samples
+from pipelines.crossval.results import Figures, FoldFigures
+from pipelines.crossval.splits import Fold, Samples
 from pipelines.reporting.progress import Progress, silent
 from terrain.classify.metrics import (
     calibration,

@@ -3,8 +3,8 @@ import pytest
 from sklearn.model_selection import StratifiedGroupKFold, cross_val_predict, cross_validate
 
 from features.windows import WindowCut, WindowRule
-from pipelines.classify.evaluation import Examples, FoldResult, fit_folds, pool, summarise
-from pipelines.classify.splits import Fold, Samples, folds_of, grouped_samples
+from pipelines.crossval.evaluation import Examples, FoldResult, fit_folds, pool, summarise
+from pipelines.crossval.splits import Fold, Samples, folds_of, grouped_samples
 from pipelines.models.recipes import WindowPipeline, feature_matrix, make_recipe
 from terrain.errors import ConfigError
 from terrain.records import Windows

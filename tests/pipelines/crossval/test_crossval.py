@@ -3,8 +3,8 @@ import json
 import numpy as np
 import pytest
 
-from pipelines.classify.crossval import crossval
-from pipelines.classify.settings import CrossvalSettings
+from pipelines.crossval.crossval import crossval
+from pipelines.crossval.settings import CrossvalSettings
 from pipelines.reporting.json_file import as_json
 from pipelines.runs.datasets import load_runs
 from terrain.errors import ConfigError, DataError

@@ -9,11 +9,11 @@ from dataclasses import fields
 from sklearn.base import clone
 
 from features.extractor import FeatureExtractor
-from pipelines.classify.evaluation import fit_folds, pool, summarise
-from pipelines.classify.extras import examples_of, fold_accuracy, has_speed, learning_curve, slow_fast
-from pipelines.classify.results import CrossvalReport, Extras, Figures
-from pipelines.classify.settings import CrossvalSettings
-from pipelines.classify.splits import (
+from pipelines.crossval.evaluation import fit_folds, pool, summarise
+from pipelines.crossval.extras import examples_of, fold_accuracy, has_speed, learning_curve, slow_fast
+from pipelines.crossval.results import CrossvalReport, Extras, Figures
+from pipelines.crossval.settings import CrossvalSettings
+from pipelines.crossval.splits import (
     N_FOLDS,
     Fold,
     Samples,

@@ -1,0 +1,151 @@
+"""What a cross-validation finds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from enum import StrEnum
+from typing import Any, NamedTuple
+
+from terrain.classify.metrics import ClassFigures, ReliabilityBin, RunFigures
+
+
+class FoldFigures(NamedTuple):
+    """One fold: how many windows train and test, its accuracy, and what the inner folds chose."""
+
+    repeat: int
+    fold: int
+    n_train: int
+    n_test: int
+    accuracy: float
+    chosen: Mapping[str, Any]
+
+
+class Applicability(StrEnum):
+    """Whether the data allow a comparison."""
+
+    APPLICABLE = "applicable"
+    NOT_APPLICABLE = "not applicable"
+
+
+MIN_CLASSES = 3
+"""Slow and fast runs are compared where at least so many classes have enough of both."""
+
+
+class ClassSpeeds(NamedTuple):
+    """Median speeds of the slow and of the fast runs of a class."""
+
+    slow_mps: float
+    fast_mps: float
+
+
+class SlowFast(NamedTuple):
+    """Accuracy when slow runs train and fast runs test, and the reverse; None where not applicable.
+
+    ``left_out`` gives the reason for each class without enough runs on both sides.
+    """
+
+    status: Applicability
+    classes: Mapping[str, ClassSpeeds]
+    left_out: Mapping[str, str]
+    slow_to_fast: float | None = None
+    fast_to_slow: float | None = None
+
+
+class LearningCurve(NamedTuple):
+    """Accuracy against the number of training runs of each class.
+
+    Parameters
+    ----------
+    runs_per_class : mean over classes and folds, since a class may have fewer than were asked for
+    accuracy : with so many training runs
+    accuracy_spread : over draws of runs; None for all runs
+    enough_runs : the number of runs beyond which doubling brings next to nothing; None when not reached
+    statement : the same in a sentence
+    """
+
+    runs_per_class: tuple[float, ...]
+    accuracy: tuple[float, ...]
+    accuracy_spread: tuple[float | None, ...]
+    enough_runs: int | None
+    statement: str
+
+
+class Extras(NamedTuple):
+    """What the headline figure does not show; ``speed_only_accuracy`` is None without wheel speeds."""
+
+    speed_only_accuracy: float | None
+    slow_fast: SlowFast
+    learning_curve: LearningCurve
+
+
+@dataclass(frozen=True, slots=True)
+class Figures:
+    """Figures of merit of a cross-validation, means over the repeats.
+
+    ``accuracy_spread`` is the standard deviation over the repeats (None with a single one), ``accuracy_ci``
+    the 95 % interval by bootstrap over runs within classes; ``confusion``, ``per_class`` and
+    ``reliability`` count all repeats together.
+    """
+
+    classes: tuple[str, ...]
+    n_windows: int
+    n_runs: int
+    repeats: int
+    accuracy: float
+    accuracy_spread: float | None
+    accuracy_per_repeat: tuple[float, ...]
+    accuracy_ci: tuple[float, float]
+    balanced_accuracy: float
+    macro_f1: float
+    per_class: Mapping[str, ClassFigures]
+    confusion: tuple[tuple[int, ...], ...]
+    vote_accuracy: float
+    ece: float
+    reliability: tuple[ReliabilityBin, ...]
+    per_run: tuple[RunFigures, ...]
+    folds: tuple[FoldFigures, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class CrossvalReport(Figures):
+    """A cross-validation: its figures, how they were obtained, and what a reader has to know of them.
+
+    ``extras`` is None where they were not asked for, ``dataset``, ``data_digest`` and ``skipped`` where the
+    caller did not give them.
+    """
+
+    protocol: str
+    recipe: str
+    window_s: float
+    stride_s: float | None
+    steady: bool
+    signal_sets: tuple[str, ...]
+    seed: int
+    n_features: int
+    dropped: Mapping[str, int]
+    repaired: Mapping[str, int]
+    notes: tuple[str, ...]
+    extras: Extras | None = None
+    dataset: str | None = None
+    data_digest: str | None = None
+    skipped: tuple[str, ...] | None = None
+
+    def named(self, dataset: str, data_digest: str) -> CrossvalReport:
+        """Return the report with the name and the digest of its data."""
+        return replace(self, dataset=dataset, data_digest=data_digest)
+
+    def as_json(self) -> dict[str, Any]:
+        """Return all fields, the extras among them, without those that are not there."""
+        found = {each.name: getattr(self, each.name) for each in fields(self) if each.name != "extras"}
+        unknown = [name for name in ("dataset", "data_digest", "skipped") if found[name] is None]
+        extras = {} if self.extras is None else self.extras._asdict()
+        return {name: value for name, value in (found | extras).items() if name not in unknown}
+
+
+class ChannelImportance(NamedTuple):
+    """By how much balanced accuracy drops when a channel is shuffled; ``std`` over folds."""
+
+    feature: str
+    drop: float
+    std: float

@@ -1,0 +1,58 @@
+"""What ``terrain crossval`` prints."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from rich.console import Console
+from rich.table import Table
+
+from pipelines.crossval.results import Applicability, CrossvalReport, Extras, SlowFast
+from pipelines.reporting.numbers import percent
+from pipelines.reporting.terminal import print_lines
+
+
+def print_crossval(report: CrossvalReport, console: Console) -> None:
+    """Print the headline, the classes, and the extras."""
+    low, high = report.accuracy_ci
+    spread = report.accuracy_spread
+    repeats = "" if spread is None else f", spread over {report.repeats} fold assignments {spread:.1%}"
+    console.print(
+        f"{report.dataset}, protocol {report.protocol}, recipe {report.recipe}: "
+        f"{report.n_windows} windows of {report.window_s:g} s from {report.n_runs} runs"
+    )
+    print_lines(
+        console,
+        (
+            f"accuracy {percent(report.accuracy)} (95 % over runs: {low:.1%} to {high:.1%}{repeats})",
+            f"balanced accuracy {percent(report.balanced_accuracy)}, macro F1 {report.macro_f1:.3f}, "
+            f"vote over 5 s {percent(report.vote_accuracy)}, calibration error {report.ece:.3f}",
+        ),
+    )
+    table = Table("terrain", "windows", "precision", "recall", "F1", title="per class, all repeats together")
+    for name, row in report.per_class.items():
+        table.add_row(name, str(row.n_windows), percent(row.precision), percent(row.recall), f"{row.f1:.3f}")
+    console.print(table)
+    if report.extras is not None:
+        print_lines(console, _extras_lines(report.extras))
+    print_lines(console, (f"note: {note}" for note in (*report.notes, *(report.skipped or ()))))
+
+
+def _extras_lines(extras: Extras) -> Iterator[str]:
+    speed = extras.speed_only_accuracy
+    yield (
+        f"from wheel speed alone: {'-' if speed is None else percent(speed)} "
+        "(what recognising the driving would give)"
+    )
+    yield _slow_fast_line(extras.slow_fast)
+    yield f"runs: {extras.learning_curve.statement}"
+
+
+def _slow_fast_line(result: SlowFast) -> str:
+    out = "".join(f"; {name} left out ({reason})" for name, reason in result.left_out.items())
+    if result.status is Applicability.NOT_APPLICABLE:
+        return f"trained slow, tested fast: not applicable{out}"
+    to_fast, to_slow = (
+        "-" if ratio is None else percent(ratio) for ratio in (result.slow_to_fast, result.fast_to_slow)
+    )
+    return f"trained slow, tested fast: {to_fast}; back: {to_slow} ({', '.join(result.classes)}{out})"
