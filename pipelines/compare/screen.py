@@ -39,7 +39,7 @@ def _cells(row: Difference) -> tuple[str, ...]:
     if row.difference != row.difference:
         return "-", "-", "-", "-", str(row.verdict), str(row.n_runs)
     low, high = row.interval
-    interval = f"{100 * low:+.1f} to {100 * high:+.1f} points"
+    interval = f"{100 * low:+.1f} to {100 * high:+.1f} points" if low == low else "too few runs"
     difference = f"{100 * row.difference:+.1f}"
     return percent(row.a), percent(row.b), difference, interval, str(row.verdict), str(row.n_runs)
 

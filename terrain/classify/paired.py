@@ -20,6 +20,9 @@ from terrain.records import Array
 
 N_DRAWS = 2000
 
+MIN_RUNS = 3
+"""With fewer runs a bootstrap over runs gives no interval: that of one run would have no width."""
+
 
 class Verdict(StrEnum):
     """Whether the interval of a difference leaves zero out."""
@@ -45,7 +48,10 @@ class Outcome(NamedTuple):
 
 
 class Difference(NamedTuple):
-    """A figure of two classifiers; ``difference`` is b minus a, with its ``interval`` of 95 % over runs."""
+    """A figure of two classifiers; ``difference`` is b minus a, with its ``interval`` of 95 % over runs.
+
+    The interval is NaN where there are fewer runs than :data:`MIN_RUNS`.
+    """
 
     a: float
     b: float
@@ -167,6 +173,7 @@ def _area(each: Outcome, place: Array, weights: Array) -> Array:
 def _difference(of_a: Array, of_b: Array, n_runs: int) -> Difference:
     """Return the difference of figures of which the first is of all runs, the others of bootstrap samples."""
     draws = of_b[1:] - of_a[1:]
-    low, high = percentile_interval(draws) if np.isfinite(draws).any() else (np.nan, np.nan)
+    known = n_runs >= MIN_RUNS and np.isfinite(draws).any()
+    low, high = percentile_interval(draws) if known else (np.nan, np.nan)
     verdict = Verdict.BETTER if low > 0 else Verdict.WORSE if high < 0 else Verdict.NOT_DISTINGUISHED
     return Difference(float(of_a[0]), float(of_b[0]), float(of_b[0] - of_a[0]), (low, high), verdict, n_runs)

@@ -67,6 +67,16 @@ def test_figures_are_those_of_counting():
     assert found.macro_run_accuracy.b == pytest.approx(np.mean(per_class))
 
 
+def test_one_run_gives_no_interval():
+    a, b = outcomes(0.5, 2)
+    alone = [each._replace(terrain=np.where(each.run_id == "3", "sand", each.terrain)) for each in (a, b)]
+    row = compare_outcomes(*alone, np.random.default_rng(0)).by_class["sand"]
+    assert row.n_runs == 1
+    assert row.difference > 0
+    assert np.isnan(row.interval).all()
+    assert row.verdict is Verdict.NOT_DISTINGUISHED
+
+
 def test_windows_may_differ_but_runs_may_not():
     a, b = outcomes(0.0, 1)
     half = np.arange(len(b.run_id)) % 2 == 0
