@@ -26,7 +26,8 @@ from pipelines.reporting.numbers import format_counts
 from pipelines.reporting.progress import Progress, silent
 from pipelines.runs.duplicates import distinct_runs
 from terrain.classify.folds import single_run_classes
-from terrain.records import Array, RunLog
+from terrain.errors import DataError
+from terrain.records import Array, RunLog, Windows
 
 
 def crossval(
@@ -113,7 +114,14 @@ def samples_of(runs: Sequence[RunLog], settings: CrossvalSettings) -> Samples:
         samples = grouped_samples(
             distinct.runs, settings.rule, settings.signal_sets, skip_short=settings.skip_short
         )
+    _refuse_constant(samples.cut.windows)
     return samples._replace(merged=distinct.merged)
+
+
+def _refuse_constant(windows: Windows) -> None:
+    if not any((values != values[:1, :, :1]).any() for values in windows.values.values()):
+        streams = " and ".join(repr(name) for name in windows.values)
+        raise DataError(f"no channel of the streams {streams} ever varies: nothing can be learned from them")
 
 
 def notes(samples: Samples, settings: CrossvalSettings, repaired: Mapping[str, int]) -> list[str]:

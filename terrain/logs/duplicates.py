@@ -9,7 +9,7 @@ data, not with the number of pairs.  Equal numbers are candidates only; heights 
 agree as well, in several stretches with one offset.
 
 Found: copies, cut pieces of at least about five seconds with the vibrations of a drive, overlaps, rounding
-to a tenth of the standard deviation of a channel, resampling by interpolation, and channels that were
+to a tenth of the standard deviation of a channel, resampling of 50 Hz and more, and channels that were
 scaled, renamed or exchanged.  Not found: shorter pieces, copies of which all channels changed their sign,
 copies at less than half of the sampling rate, and copies to which noise was added.  Channels that do not vary
 take no part.
@@ -24,7 +24,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from terrain.logs.schema import MAX_MAGNITUDE, signal_set_of
+from terrain.logs.plausible import MAX_MAGNITUDE
+from terrain.logs.schema import signal_set_of
 from terrain.records import Array, RunLog, Stream
 
 N_PEAKS = 16
@@ -43,7 +44,7 @@ MIN_CORRELATION = 0.99
 """Of the heights of two stretches whose order agrees already; copies rounded to a tenth of the standard
 deviation of their channel are above 0.995."""
 
-MIN_SPREAD_RATIO = 0.02
+MIN_SPREAD_RATIO = 0.1
 """Heights that differ by less than this part of the channel's standard deviation are those of a periodic
 signal or of noise in the last digit, which repeats from run to run."""
 

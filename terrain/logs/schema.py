@@ -12,10 +12,6 @@ from terrain.errors import LogError
 
 SCHEMA_VERSION = 1
 
-MAX_MAGNITUDE = 1e12
-"""No quantity of a vehicle is larger in its SI unit (a position on Earth in m has 8 digits, a time since 1970
-in s has 10); the fourth power of what is much larger, which features need, is no finite number."""
-
 UNIT_SYMBOLS: dict[str, str] = {
     "s": "s",
     "m": "m",
