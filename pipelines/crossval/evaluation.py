@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from joblib import Parallel, delayed
 from sklearn.base import BaseEstimator, clone
 
+from pipelines.compute.parallel import parallel
 from pipelines.crossval.results import Figures, FoldFigures
 from pipelines.crossval.splits import Fold, Samples
 from pipelines.reporting.progress import Progress, silent
@@ -87,14 +87,14 @@ def fit_folds(
     classifier : estimator with ``fit(X, y, groups)`` and ``predict_proba``
     examples : rows that the folds number
     folds : train and test rows
-    n_jobs : processes at once
+    n_jobs : processes at once on this machine, see :func:`pipelines.compute.parallel.parallel`
     task, progress : name of the work, and what is called as it goes on
     """
     classes = np.unique(examples.terrain)
-    jobs = (delayed(_fit_fold)(classifier, examples, classes, fold) for fold in folds)
     results = []
     progress(task, 0, len(folds))
-    for result in Parallel(n_jobs=max(min(n_jobs, len(folds)), 1), return_as="generator")(jobs):
+    each = ((fold,) for fold in folds)
+    for result in parallel(_fit_fold, (classifier, examples, classes), each, min(n_jobs, len(folds))):
         results.append(result)
         progress(task, len(results), len(folds))
     return results
