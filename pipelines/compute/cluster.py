@@ -132,8 +132,14 @@ class Cluster:
 
 
 def _pickled(value: Any) -> bytes:
-    """Return the bytes of a value; dask would look into its tuples for tasks, and make lists of some."""
-    return pickle.dumps(value, protocol=pickle.HIGHEST_PROTOCOL)
+    """Return the bytes of a value; dask would look into its tuples for tasks, and make lists of some.
+
+    As on this machine's cores, read-only mappings and local functions are packed as well.
+    """
+    import cloudpickle
+
+    packed: bytes = cloudpickle.dumps(value)
+    return packed
 
 
 def _compute(shared: tuple[Any, ...], packed: bytes) -> Any:

@@ -9,7 +9,10 @@ from dataclasses import fields
 from sklearn.base import clone
 
 from features.extractor import FeatureExtractor
-from pipelines.crossval.evaluation import fit_folds, pool, summarise
+from pipelines.courses.following import following
+from pipelines.courses.judgement import find_breakaways, judge
+from pipelines.courses.results import OverTime
+from pipelines.crossval.evaluation import HeldOut, fit_folds, pool, summarise
 from pipelines.crossval.extras import examples_of, fold_accuracy, has_speed, learning_curve, slow_fast
 from pipelines.crossval.results import CrossvalReport, Extras, Figures
 from pipelines.crossval.settings import CrossvalSettings
@@ -48,12 +51,19 @@ def crossval(
     features = feature_matrix(recipe, windows)
     progress("features", 1, 1)
     examples = examples_of(features, samples)
-    results = fit_folds(recipe[-1], examples, folds, settings.jobs, settings.protocol, progress)
-    figures = summarise(pool(results, examples.terrain), samples, settings.seed)
+    beside = settings.extras and settings.protocol == "grouped"
+    asks = None
+    if beside:
+        followed = following(recipe, runs, windows, settings.rule, folds, settings.seed)
+        asks = [each.follow for each in followed]
+    results = fit_folds(recipe[-1], examples, folds, settings.jobs, settings.protocol, progress, asks)
+    held_out = pool(results, examples.terrain)
+    figures = summarise(held_out, samples, settings.seed)
     extras = None
-    if settings.extras and settings.protocol == "grouped":
+    if beside:
         first = [fold for fold in folds if fold.repeat == 0]
         extras = _extras(recipe, features, samples, first, figures.accuracy_per_repeat[0], settings, progress)
+        extras = extras._replace(over_time=_over_time(held_out, windows, settings.seed))
     repaired = dict(sum((Counter(run.dropped) for run in runs), Counter()))
     published = settings.protocol == "published"
     return CrossvalReport(
@@ -96,6 +106,16 @@ def _extras(
         learning_curve(
             classifier, examples_of(features, samples), folds, accuracy, settings.seed, jobs, progress
         ),
+    )
+
+
+def _over_time(held_out: HeldOut, windows: Windows, seed: int) -> OverTime:
+    """Return what held-out runs show over time."""
+    tracks = [track for result in held_out.results for track in result.found]
+    return OverTime(
+        judge([track for track in tracks if track.spliced], seed),
+        judge([track for track in tracks if not track.spliced], seed),
+        find_breakaways(held_out.probability.mean(axis=0), held_out.classes, windows),
     )
 
 

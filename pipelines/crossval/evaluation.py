@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -40,11 +40,12 @@ class Examples(NamedTuple):
 
 
 class FoldResult(NamedTuple):
-    """Held-out class probabilities of one fold."""
+    """Held-out class probabilities of one fold, and what else was asked of its classifier."""
 
     fold: Fold
     probability: Array
     chosen: Mapping[str, Any]
+    found: Any = None
 
 
 class HeldOut(NamedTuple):
@@ -56,14 +57,21 @@ class HeldOut(NamedTuple):
     results: list[FoldResult]
 
 
-def _fit_fold(classifier: BaseEstimator, examples: Examples, classes: Array, fold: Fold) -> FoldResult:
+def _fit_fold(
+    classifier: BaseEstimator,
+    examples: Examples,
+    classes: Array,
+    fold: Fold,
+    ask: Callable[[Any], Any] | None = None,
+) -> FoldResult:
     fitted = fit_on(classifier, examples, fold.train)
     probability = np.zeros((len(fold.test), len(classes)))
     probability[:, np.searchsorted(classes, fitted.classes_)] = fitted.predict_proba(
         examples.features[fold.test]
     )
     best = getattr(fitted, "best_", None)
-    return FoldResult(fold, probability, dict(best._asdict()) if best is not None else {})
+    chosen = dict(best._asdict()) if best is not None else {}
+    return FoldResult(fold, probability, chosen, None if ask is None else ask(fitted))
 
 
 def fit_on(classifier: BaseEstimator, examples: Examples, rows: Array) -> Any:
@@ -79,6 +87,7 @@ def fit_folds(
     n_jobs: int,
     task: str,
     progress: Progress = silent,
+    asks: Sequence[Callable[[Any], Any] | None] | None = None,
 ) -> list[FoldResult]:
     """Fit a clone of the classifier on each fold and return its held-out probabilities in order.
 
@@ -89,11 +98,12 @@ def fit_folds(
     folds : train and test rows
     n_jobs : processes at once on this machine, see :func:`pipelines.compute.parallel.parallel`
     task, progress : name of the work, and what is called as it goes on
+    asks : for each fold, what is called with its fitted classifier, where it is fitted
     """
     classes = np.unique(examples.terrain)
     results = []
     progress(task, 0, len(folds))
-    each = ((fold,) for fold in folds)
+    each = zip(folds, [None] * len(folds) if asks is None else asks, strict=True)
     for result in parallel(_fit_fold, (classifier, examples, classes), each, min(n_jobs, len(folds))):
         results.append(result)
         progress(task, len(results), len(folds))

@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields, replace
 from enum import StrEnum
 from typing import Any, NamedTuple
 
+from pipelines.courses.results import OverTime
 from terrain.classify.confidence import CoverageFigures, ReliabilityBin
 from terrain.classify.metrics import ClassFigures, RunFigures
 
@@ -78,6 +79,23 @@ class Extras(NamedTuple):
     speed_only_accuracy: float | None
     slow_fast: SlowFast
     learning_curve: LearningCurve
+    over_time: OverTime | None = None
+
+    def as_json(self) -> dict[str, Any]:
+        """Return all fields, those over time by names of their own."""
+        document = self._asdict()
+        over_time = document.pop("over_time")
+        if over_time is None:
+            return document
+        spliced = over_time.spliced
+        if spliced is not None:
+            names = ("filtered_accuracy", "filtered_accuracy_ci", "filter_delay_s")
+            document |= {name: getattr(spliced, name) for name in names}
+        return document | {
+            "courses": spliced,
+            "recorded_courses": over_time.recorded,
+            "breakaways": over_time.breakaways,
+        }
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,7 +164,7 @@ class CrossvalReport(Figures):
         """Return all fields, the extras among them, without those that are not there."""
         found = {each.name: getattr(self, each.name) for each in fields(self) if each.name != "extras"}
         unknown = [name for name in ("dataset", "data_digest", "skipped") if found[name] is None]
-        extras = {} if self.extras is None else self.extras._asdict()
+        extras = {} if self.extras is None else self.extras.as_json()
         return {name: value for name, value in (found | extras).items() if name not in unknown}
 
 

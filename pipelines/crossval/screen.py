@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from rich.console import Console
 from rich.table import Table
 
+from pipelines.courses.screen import over_time_lines
 from pipelines.crossval.results import Applicability, CrossvalReport, Extras, SlowFast
 from pipelines.reporting.numbers import percent
 from pipelines.reporting.terminal import print_lines
@@ -60,6 +61,8 @@ def _extras_lines(extras: Extras) -> Iterator[str]:
     )
     yield _slow_fast_line(extras.slow_fast)
     yield f"runs: {extras.learning_curve.statement}"
+    if extras.over_time is not None:
+        yield from over_time_lines(extras.over_time)
 
 
 def _slow_fast_line(result: SlowFast) -> str:

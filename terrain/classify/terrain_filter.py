@@ -1,0 +1,279 @@
+r"""Causal filter over the class probabilities of windows: the terrain now, or "unknown".
+
+Hidden Markov model with k classes and the state "unknown", in continuous time.  With state probabilities
+:math:`b` and a step :math:`\Delta t`:
+
+.. math::
+
+    \text{transition:}\quad & \bar b = e^{-r\,\Delta t}\, b + (1 - e^{-r\,\Delta t})\, \pi \\
+    \text{emission:}\quad & b_c \propto \bar b_c\, \ell_c^{\lambda}, \qquad
+    \ell_c = (1 - \varepsilon)\, p_c / q_c + \varepsilon, \qquad \ell_\text{unknown} = \nu \\
+    \text{evidence:}\quad & \lambda = \min(\Delta t_\text{output} / T, 1)
+
+- A ground holds for a mean dwell D; then the next one is drawn from :math:`\pi`, uniform over the classes
+  beside a small share of "unknown".  As a draw may repeat the ground, :math:`r = 1 / (D (1 - \pi_c))`.  Two
+  steps are one long step exactly, so that a gap in time or a refused window is a longer transition and no
+  special case.
+- A classifier gives the posterior p under the class shares q of its training; the likelihood is p / q up to a
+  factor (Bourlard and Morgan 1994, chapter 7), which a share :math:`\varepsilon` of windows that follow no
+  model bounds.  Of an unknown ground, windows are as frequent as of all grounds together: likelihood 1, or
+  :math:`\nu` where a score of novelty is given.
+- Windows that overlap repeat each other: one that comes :math:`\Delta t_\text{output}` after the last adds
+  that part of a window's evidence, to the power :math:`\lambda` (Gruenwald and van Ommen 2017 call it the
+  learning rate).  Below T, any stride gives the same evidence per second.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from terrain.errors import ConfigError, DataError
+from terrain.records import Array
+
+DWELL_S = 20.0
+"""Mean time on one ground: assumed.  Robots of the thesis cross fields and paths at 0.5 to 1 m/s, so 10 to 20
+m."""
+
+EVIDENCE_S = 0.4
+"""Time between windows that bring evidence of their own.  The length of a window would be right of windows
+that err independently of the ground's age, but makes a change of ground cost seconds.  A settled belief has
+to be outweighed by about 6 nats (0.98 against the 0.002 of a ground that may have come since the last
+window), and a window at 0.8 among five classes brings 2.8: at 0.4 s a change is found within 1 s of windows
+on the new ground, beside the time in which windows hold samples of both.  0.25, 0.5, 1 and 2 s were compared
+on spliced courses of BorealTC and Vulpi, where accuracy falls beyond 0.5 s: the value was chosen with these
+figures in view."""
+
+THRESHOLD = 0.5
+"""Above it one terrain is more likely than all others and "unknown" together."""
+
+OUTLIER_RATIO = 0.02
+"""Assumed share of windows that follow no class, as at an obstacle; it bounds the evidence of a window."""
+
+UNKNOWN_RATIO = 0.05
+"""Assumed share of grounds that no class describes; it only decides where no class is likely."""
+
+
+class TerrainFilter(NamedTuple):
+    """Settings of the filter.
+
+    Parameters
+    ----------
+    prior : share of each of the k classes among the training windows, in the order of the probabilities
+    evidence_s : T, time between windows that bring evidence of their own
+    dwell_s : D, mean time on one ground
+    threshold : probability from which a class is reported
+    outlier_ratio, unknown_ratio : share of windows that follow no class, and of grounds that are unknown
+    """
+
+    prior: tuple[float, ...]
+    evidence_s: float = EVIDENCE_S
+    dwell_s: float = DWELL_S
+    threshold: float = THRESHOLD
+    outlier_ratio: float = OUTLIER_RATIO
+    unknown_ratio: float = UNKNOWN_RATIO
+
+    @property
+    def grounds(self) -> Array:
+        """Share of each state (k + 1,) among the grounds that are come to; "unknown" is the last."""
+        n_classes = len(self.prior)
+        return np.append(np.full(n_classes, (1.0 - self.unknown_ratio) / n_classes), self.unknown_ratio)
+
+    @property
+    def renewal_hz(self) -> float:
+        """Rate r at which a ground is drawn anew, so that a class holds for ``dwell_s`` on average."""
+        return 1.0 / (self.dwell_s * (1.0 - (1.0 - self.unknown_ratio) / len(self.prior)))
+
+
+class FilterBelief(NamedTuple):
+    """Probability of each state (k + 1,), "unknown" last, and the time since the last output in s."""
+
+    probability: Array
+    silent_s: float = math.inf
+
+
+def check_filter(settings: TerrainFilter) -> TerrainFilter:
+    """Return settings that are accepted.
+
+    Raises
+    ------
+    ConfigError
+        if there are fewer than two classes, a share is not within 0 and 1, or a time is not above zero.
+
+    Examples
+    --------
+    >>> check_filter(TerrainFilter((0.5, 0.5), dwell_s=0.0))
+    Traceback (most recent call last):
+    terrain.errors.ConfigError: terrain filter: dwell_s is 0.0, a finite number above zero is required
+    """
+    if len(settings.prior) < 2:
+        raise ConfigError(f"terrain filter: {len(settings.prior)} classes, at least 2 are required")
+    shares = {f"prior of class {i + 1}": value for i, value in enumerate(settings.prior)}
+    shares |= {name: getattr(settings, name) for name in ("outlier_ratio", "unknown_ratio")}
+    for name, value in shares.items():
+        if not 0.0 < value < 1.0:
+            raise ConfigError(f"terrain filter: {name} is {value!r}, a number between 0 and 1 is required")
+    if not 0.0 <= settings.threshold <= 1.0:
+        raise ConfigError(f"terrain filter: threshold is {settings.threshold!r}, 0 to 1 is required")
+    for name in ("evidence_s", "dwell_s"):
+        value = getattr(settings, name)
+        if not (math.isfinite(value) and value > 0.0):
+            raise ConfigError(f"terrain filter: {name} is {value!r}, a finite number above zero is required")
+    return settings
+
+
+def initial_belief(settings: TerrainFilter) -> FilterBelief:
+    """Return the belief before any output: the shares of the grounds."""
+    return FilterBelief(settings.grounds)
+
+
+def filter_step(
+    belief: FilterBelief, probability: Array, dt_s: float, settings: TerrainFilter, novelty: float = 0.0
+) -> FilterBelief:
+    """Return the belief after a time, and one output of the classifier.
+
+    Parameters
+    ----------
+    belief : before
+    probability : (k,) class probabilities of the window that ends now; NaN where there is none
+    dt_s : time since the step before, not below zero
+    settings : of the filter
+    novelty : log-likelihood of "unknown" against that of all known grounds together
+
+    Examples
+    --------
+    >>> settings = TerrainFilter((0.5, 0.5))
+    >>> belief = initial_belief(settings)
+    >>> for _ in range(8):
+    ...     belief = filter_step(belief, np.array([0.9, 0.1]), 0.25, settings)
+    >>> belief.probability.round(2)
+    array([0.99, 0.  , 0.01])
+    """
+    rows = np.asarray(probability, dtype=np.float64).reshape(1, -1)
+    out = np.empty((1, len(belief.probability)))
+    silent_s = _run(
+        np.ascontiguousarray(belief.probability, dtype=np.float64),
+        float(belief.silent_s),
+        rows,
+        np.array([[dt_s, novelty]], dtype=np.float64),
+        *_numbers(settings),
+        out,
+    )
+    return FilterBelief(out[0], silent_s)
+
+
+def filter_run(
+    probability: Array, time_s: Array, settings: TerrainFilter, novelty: Array | None = None
+) -> Array:
+    """Return the belief (n, k + 1) after each of the windows of a run; it knows nothing of later ones.
+
+    Parameters
+    ----------
+    probability : (n, k) class probabilities; rows of NaN where the classifier refused a window
+    time_s : (n,) end of each window, not decreasing
+    settings : of the filter
+    novelty : (n,) log-likelihood of "unknown" against that of all known grounds together; 0 by default
+
+    Raises
+    ------
+    DataError
+        if shapes do not fit, or time goes back.
+
+    Examples
+    --------
+    >>> probability = np.repeat([[0.9, 0.1], [0.1, 0.9]], 24, axis=0)
+    >>> belief = filter_run(probability, np.arange(48) / 4, TerrainFilter((0.5, 0.5)))
+    >>> float((reported(belief[24:], 0.5) == 1).argmax() / 4)  # s from the change to where it is reported
+    0.75
+    """
+    rows = np.ascontiguousarray(probability, dtype=np.float64)
+    time_s = np.asarray(time_s, dtype=np.float64)
+    if rows.shape != (len(time_s), len(settings.prior)):
+        raise DataError(
+            f"class probabilities have the shape {rows.shape}, "
+            f"({len(time_s)}, {len(settings.prior)}) is needed"
+        )
+    scores = np.zeros(len(rows)) if novelty is None else np.asarray(novelty, dtype=np.float64)
+    if scores.shape != time_s.shape:
+        raise DataError(f"{len(scores)} scores of novelty do not fit {len(time_s)} windows")
+    dt_s = np.diff(time_s, prepend=time_s[:1])
+    if not (dt_s >= 0.0).all():
+        raise DataError("the windows of a run must be in order of time")
+    begin = initial_belief(settings)
+    out = np.empty((len(rows), len(begin.probability)))
+    _run(
+        begin.probability,
+        begin.silent_s,
+        rows,
+        np.column_stack([dt_s, scores]),
+        *_numbers(settings),
+        out,
+    )
+    return out
+
+
+def reported(belief: Array, threshold: float) -> Array:
+    """Return the class (n,) that is certain enough in each belief (n, k + 1); -1 for "unknown".
+
+    Examples
+    --------
+    >>> reported(np.array([[0.7, 0.2, 0.1], [0.4, 0.4, 0.2], [0.2, 0.2, 0.6]]), 0.5)
+    array([ 0, -1, -1])
+    """
+    best = belief[:, :-1].argmax(axis=1)
+    certain = belief[np.arange(len(belief)), best] >= threshold
+    found: Array = np.where(certain, best, -1)
+    return found
+
+
+def _numbers(settings: TerrainFilter) -> tuple[Array, Array, Array]:
+    """Return prior, shares of grounds, and renewal rate, evidence time and share of outliers."""
+    prior = np.array(settings.prior, dtype=np.float64)
+    rates = np.array([settings.renewal_hz, settings.evidence_s, settings.outlier_ratio])
+    return prior, settings.grounds, rates
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _run(
+    belief: Array,
+    silent_s: float,
+    probability: Array,
+    steps: Array,
+    prior: Array,
+    grounds: Array,
+    rates: Array,
+    out: Array,
+) -> float:
+    """Write the belief after each row; return the time since the last output.
+
+    ``steps`` has time and novelty of each row, ``rates`` those of :func:`_numbers`.
+    """
+    renewal_hz, evidence_s, outlier_ratio = rates[0], rates[1], rates[2]
+    n_classes = prior.size
+    now = belief.copy()
+    for n in range(probability.shape[0]):
+        kept = math.exp(-renewal_hz * steps[n, 0])
+        for c in range(n_classes + 1):
+            now[c] = kept * now[c] + (1.0 - kept) * grounds[c]
+        silent_s += steps[n, 0]
+        finite = True
+        for c in range(n_classes):
+            finite = finite and math.isfinite(probability[n, c])
+        if finite:
+            power = min(silent_s / evidence_s, 1.0)
+            total = 0.0
+            for c in range(n_classes):
+                ratio = (1.0 - outlier_ratio) * probability[n, c] / prior[c] + outlier_ratio
+                now[c] *= ratio**power
+                total += now[c]
+            if math.isfinite(steps[n, 1]):
+                now[n_classes] *= math.exp(power * steps[n, 1])
+            total += now[n_classes]
+            for c in range(n_classes + 1):
+                now[c] /= total
+            silent_s = 0.0
+        out[n] = now
+    return silent_s

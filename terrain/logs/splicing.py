@@ -1,0 +1,96 @@
+"""Courses over several grounds, spliced from parts of runs that each lie on one.
+
+Logs that cross from one ground to another are rare.  The samples of parts of runs, one after the other on one
+clock, are such a log but for the change of driving at the splice: windows across it hold samples of both
+grounds, as they would on a robot.
+
+Samples keep their distance within a part.  At a splice a stream's next sample may come too early or too late
+by up to a period, as the parts were cut without regard to it: one sample more or less is taken there, so that
+the distance is between half and one and a half periods wherever the run holds such a sample.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from terrain.errors import DataError
+from terrain.records import Array, Label, RunLog, Stream
+
+TIME_TOLERANCE_S = 1e-6
+"""Stamps are compared to this, far below any sample period."""
+
+LEAST_PERIODS, MOST_PERIODS = 0.5, 1.5
+"""Distance of two samples across a splice, in periods: within what the clocks of loggers do."""
+
+
+class Part(NamedTuple):
+    """A part ``[start_s, end_s)`` of a run, on one ground."""
+
+    run: RunLog
+    start_s: float
+    end_s: float
+    terrain: str
+
+
+def splice_runs(parts: Sequence[Part], channels: Mapping[str, Sequence[str]], run_id: str) -> RunLog:
+    """Return one log of all parts, from 0 s on, labelled with their grounds.
+
+    Parameters
+    ----------
+    parts : in order, at least one; their runs have all channels at about one rate
+    channels : of each stream, those that are taken and their order
+    run_id : of the log
+
+    Raises
+    ------
+    DataError
+        if there is no part, or one holds no sample of a stream.
+
+    Examples
+    --------
+    >>> imu = Stream(np.arange(100) / 10, np.ones((100, 1)), ("gyro_z_radps",))
+    >>> run = RunLog("a", "husky", {"imu": imu})
+    >>> parts = [Part(run, 1.0, 3.0, "grass"), Part(run, 5.05, 7.0, "sand")]
+    >>> course = splice_runs(parts, {"imu": ("gyro_z_radps",)}, "course")
+    >>> course.labels[1], course.streams["imu"].time_s[18:23].round(3).tolist()
+    (Label(start_s=2.0, end_s=3.95, terrain='sand'), [1.8, 1.9, 2.05, 2.15, 2.25])
+    """
+    if not parts:
+        raise DataError(f"{run_id}: there is no part to splice")
+    begins_s = np.concatenate(([0.0], np.cumsum([part.end_s - part.start_s for part in parts])))
+    streams = {name: _spliced(parts, begins_s, name, tuple(names)) for name, names in channels.items()}
+    labels = tuple(
+        Label(float(begin_s), float(end_s), part.terrain)
+        for part, begin_s, end_s in zip(parts, begins_s, begins_s[1:], strict=False)
+    )
+    return RunLog(run_id, parts[0].run.robot, streams, labels, source="spliced from parts of runs")
+
+
+def _spliced(parts: Sequence[Part], begins_s: Array, name: str, channels: tuple[str, ...]) -> Stream:
+    times: list[Array] = []
+    values: list[Array] = []
+    before_s = -np.inf
+    for part, begin_s in zip(parts, begins_s, strict=False):
+        stream = part.run.streams[name]
+        shift_s = begin_s - part.start_s
+        first, end = np.searchsorted(stream.time_s, np.array([part.start_s, part.end_s]) - TIME_TOLERANCE_S)
+        if first == end:
+            raise DataError(
+                f"run {part.run.run_id}: no sample of stream {name!r} from {part.start_s:g} to "
+                f"{part.end_s:g} s"
+            )
+        if times:
+            period_s = 1.0 / stream.rate_hz
+            distance_s = stream.time_s[first] + shift_s - before_s
+            if distance_s < LEAST_PERIODS * period_s and first + 1 < end:
+                first += 1
+            elif distance_s > MOST_PERIODS * period_s and first > 0:
+                first -= int(stream.time_s[first - 1] + shift_s - before_s > TIME_TOLERANCE_S)
+        order = [stream.channels.index(channel) for channel in channels]
+        times.append(stream.time_s[first:end] + shift_s)
+        values.append(stream.values[first:end][:, order])
+        before_s = times[-1][-1]
+    return Stream(np.concatenate(times), np.concatenate(values), channels)

@@ -1,0 +1,156 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.linalg import expm
+
+from terrain.classify.terrain_filter import (
+    FilterBelief,
+    TerrainFilter,
+    check_filter,
+    filter_run,
+    filter_step,
+    initial_belief,
+    reported,
+)
+from terrain.errors import ConfigError, DataError
+
+THREE = TerrainFilter((0.5, 0.3, 0.2))
+
+
+def draw(seed, n=40, k=3, refused_ratio=0.2):
+    """Return class probabilities with refused windows, times with gaps, and scores of novelty."""
+    rng = np.random.default_rng(seed)
+    probability = rng.dirichlet(np.full(k, 0.3), n)
+    probability[rng.random(n) < refused_ratio] = np.nan
+    return probability, np.cumsum(rng.choice([0.0, 0.25, 0.25, 2.0, 30.0], n)), rng.normal(0.0, 1.0, n)
+
+
+def dense_filter(probability, time_s, settings, novelty):
+    """Return the beliefs by a full generator matrix and logarithms."""
+    k = len(settings.prior)
+    shares = np.append(np.full(k, (1 - settings.unknown_ratio) / k), settings.unknown_ratio)
+    rate = 1.0 / (settings.dwell_s * (1.0 - shares[0]))
+    generator = rate * (np.tile(shares, (k + 1, 1)) - np.eye(k + 1))
+    belief, before_s, output_s, found = shares, time_s[0], -np.inf, []
+    for p, now_s, score in zip(probability, time_s, novelty, strict=True):
+        belief = belief @ expm(generator * (now_s - before_s))
+        before_s = now_s
+        if not np.isnan(p).any():
+            power = min((now_s - output_s) / settings.evidence_s, 1.0)
+            output_s = now_s
+            mixed = (1 - settings.outlier_ratio) * p / np.array(settings.prior) + settings.outlier_ratio
+            log_belief = np.log(belief) + power * np.append(np.log(mixed), score)
+            belief = np.exp(log_belief - log_belief.max())
+            belief = belief / belief.sum()
+        found.append(belief)
+    return np.array(found)
+
+
+@settings(deadline=None, max_examples=30)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_the_filter_agrees_with_a_dense_matrix_exponential(seed):
+    probability, time_s, novelty = draw(seed)
+    found = filter_run(probability, time_s, THREE, novelty)
+    np.testing.assert_allclose(found, dense_filter(probability, time_s, THREE, novelty), atol=1e-9)
+    np.testing.assert_allclose(found.sum(axis=1), 1.0, atol=1e-12)
+
+
+def test_step_by_step_equals_the_whole_run():
+    probability, time_s, novelty = draw(1)
+    belief, found = initial_belief(THREE), []
+    for p, dt_s, score in zip(probability, np.diff(time_s, prepend=time_s[0]), novelty, strict=True):
+        belief = filter_step(belief, p, dt_s, THREE, score)
+        found.append(belief.probability)
+    np.testing.assert_array_equal(found, filter_run(probability, time_s, THREE, novelty))
+
+
+def test_later_windows_change_nothing():
+    probability, time_s, _ = draw(2)
+    np.testing.assert_array_equal(
+        filter_run(probability, time_s, THREE)[:20], filter_run(probability[:20], time_s[:20], THREE)
+    )
+
+
+def test_refused_windows_only_let_time_pass():
+    refused = np.full(3, np.nan)
+    begin = FilterBelief(np.array([0.9, 0.05, 0.03, 0.02]), 0.0)
+    in_steps = begin
+    for _ in range(28):
+        in_steps = filter_step(in_steps, refused, 0.25, THREE)
+    at_once = filter_step(begin, refused, 7.0, THREE)
+    np.testing.assert_allclose(in_steps.probability, at_once.probability, atol=1e-12)
+    assert in_steps.silent_s == at_once.silent_s == 7.0
+    forgotten = filter_step(begin, refused, 1e6, THREE)
+    np.testing.assert_allclose(forgotten.probability, THREE.grounds, atol=1e-12)
+
+
+def test_a_finer_stride_brings_no_more_evidence():
+    row = np.array([0.6, 0.3, 0.1])
+    long = THREE._replace(dwell_s=1e9, evidence_s=2.0)
+    begin = FilterBelief(THREE.grounds, 0.0)
+    coarse = filter_step(begin, row, 2.0, long)
+    fine = begin
+    for _ in range(16):
+        fine = filter_step(fine, row, 0.125, long)
+    np.testing.assert_allclose(fine.probability, coarse.probability, atol=1e-6)
+
+
+def test_the_hidden_terrain_of_a_model_is_recovered_more_often_than_by_single_windows():
+    rng = np.random.default_rng(3)
+    ten = TerrainFilter((0.25,) * 4, evidence_s=1.0, dwell_s=20.0)
+    truth, time_s = [], np.arange(4000.0)
+    now = 0
+    for _ in time_s:
+        if rng.random() < 1.0 / 20.0:
+            now = (now + rng.integers(1, 4)) % 4
+        truth.append(now)
+    truth = np.array(truth)
+    strength = 1.5  # log-likelihood that a window of a class brings, with unit noise
+    score = rng.normal(0.0, 1.0, (4000, 4)) * np.sqrt(2 * strength) + 2 * strength * np.eye(4)[truth] / 1.0
+    probability = np.exp(score - score.max(axis=1, keepdims=True))
+    probability /= probability.sum(axis=1, keepdims=True)
+    belief = filter_run(probability, time_s, ten)
+    single = np.mean(probability.argmax(axis=1) == truth)
+    assert np.mean(belief[:, :4].argmax(axis=1) == truth) > single + 0.05
+    answered = reported(belief, 0.8)
+    assert np.mean(answered[answered >= 0] == truth[answered >= 0]) > 0.8  # as certain as it claims
+
+
+def test_one_window_whatever_it_claims_does_not_settle_a_change():
+    belief = FilterBelief(np.array([0.97, 0.01, 0.01, 0.01]), 0.0)
+    after = filter_step(belief, np.array([0.0, 1.0, 0.0]), 0.25, THREE)
+    assert reported(after.probability[None], 0.5)[0] == 0
+
+
+def test_novelty_leads_to_unknown_and_flat_outputs_to_no_class():
+    flat = np.tile(np.array(THREE.prior), (100, 1))
+    time_s = np.arange(100) / 4
+    assert reported(filter_run(flat, time_s, THREE), 0.5)[-1] == -1
+    novel = filter_run(flat, time_s, THREE, np.full(100, 3.0))
+    assert novel[-1, -1] > 0.9
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"prior": (1.0,)}, "1 classes, at least 2"),
+        ({"prior": (0.0, 1.0)}, "prior of class 1 is 0.0"),
+        ({"dwell_s": float("nan")}, "dwell_s is nan"),
+        ({"evidence_s": -1.0}, "evidence_s is -1.0"),
+        ({"threshold": 1.5}, "threshold is 1.5"),
+        ({"outlier_ratio": 0.0}, "outlier_ratio is 0.0"),
+    ],
+)
+def test_settings_that_mean_nothing_are_refused(changed, message):
+    with pytest.raises(ConfigError, match=message):
+        check_filter(THREE._replace(**changed))
+
+
+def test_shapes_and_times_that_do_not_fit_are_refused():
+    with pytest.raises(DataError, match=r"shape \(4, 2\), \(4, 3\) is needed"):
+        filter_run(np.ones((4, 2)), np.arange(4.0), THREE)
+    with pytest.raises(DataError, match="in order of time"):
+        filter_run(np.ones((2, 3)), np.array([1.0, 0.0]), THREE)
+    with pytest.raises(DataError, match="1 scores of novelty do not fit 2 windows"):
+        filter_run(np.ones((2, 3)), np.array([0.0, 1.0]), THREE, np.zeros(1))
