@@ -12,9 +12,10 @@ from pipelines.classify.results import Predictions, TargetSlipRow, WindowPredict
 from pipelines.live.log_windows import lacking_estimates, windows_of_log
 from pipelines.models.model_files import TerrainModel
 from pipelines.runs.datasets import data_digest, robot_of
+from terrain.classify.terrain_filter import TerrainFilter, check_filter, filter_run, reported
 from terrain.control.slip_table import DRIVE_STATES, SlipTable
 from terrain.errors import ConfigError
-from terrain.records import RunLog, SlipTarget
+from terrain.records import Array, RunLog, SlipTarget, Windows
 from terrain.robots import Robot
 
 
@@ -59,6 +60,7 @@ def predict(
     probability = model.recipe.predict_proba(windows) if len(windows) else np.zeros((0, len(classes)))
     best = probability.argmax(axis=1)
     predicted, label = classes[best], windows.terrain.astype(str)
+    over_time = filtered_terrains(windows, probability, model)
     targets = {terrain: table.lookup(terrain) for terrain in classes.tolist()}
     rows = tuple(
         WindowPrediction(
@@ -70,6 +72,7 @@ def predict(
             slip_entry=targets[predicted[i]]["traction"].terrain,
             status={state: targets[predicted[i]][state].status for state in DRIVE_STATES},
             label=str(label[i]) or None,
+            filtered_terrain=str(over_time[i]) or None,
         )
         for i in range(len(windows))
     )
@@ -81,6 +84,7 @@ def predict(
         n_runs=len(runs),
         classes=tuple(targets),
         accuracy=float(np.mean(predicted[known] == label[known])) if known.any() else None,
+        filtered_accuracy=float(np.mean(over_time[known] == label[known])) if known.any() else None,
         n_judged=int(known.sum()),
         training_runs=tuple(run.run_id for run in runs if data_digest([run]) in model.info.run_digests),
         repaired=dict(sum((Counter(run.dropped) for run in runs), Counter())),
@@ -91,6 +95,28 @@ def predict(
         table_name=table.name,
         table={terrain: _table_row(found) for terrain, found in targets.items()},
     )
+
+
+def filtered_terrains(windows: Windows, probability: Array, model: TerrainModel) -> Array:
+    """Return the terrain (n,) by each run's windows up to each; empty where none is certain enough.
+
+    Parameters
+    ----------
+    windows : n, of each run in order of time
+    probability : (n, k) of the model's classes
+    model : whose training gives the class shares; equal ones where it does not know them
+    """
+    classes = np.asarray(model.recipe.classes_, dtype=str)
+    ratio = model.info.class_ratio
+    prior = tuple(float(ratio.get(name, 1.0 / len(classes))) for name in classes.tolist())
+    settings = check_filter(TerrainFilter(prior))
+    named = np.append(classes, "")  # the last, at -1, is unknown
+    found = np.full(len(windows), "", dtype=object)
+    for run_id in dict.fromkeys(windows.run_id):
+        rows = np.flatnonzero(windows.run_id == run_id)
+        belief = filter_run(probability[rows], windows.start_s[rows] + windows.length_s, settings)
+        found[rows] = named[reported(belief, settings.threshold)]
+    return found
 
 
 def _cut(run: RunLog, model: TerrainModel, robot: Robot | None, *, skip_short: bool) -> WindowCut:

@@ -42,6 +42,7 @@ class WindowPrediction(NamedTuple):
     target_slip, status : by drive state
     slip_entry : entry of the table of target slips; the fallback where the terrain has none
     label : true terrain; None where it is not known
+    filtered_terrain : by the windows of the run up to this one; None where none is certain enough
     """
 
     run_id: str
@@ -52,6 +53,7 @@ class WindowPrediction(NamedTuple):
     slip_entry: str
     status: Mapping[str, str]
     label: str | None
+    filtered_terrain: str | None = None
 
 
 class TargetSlipRow(NamedTuple):
@@ -78,6 +80,7 @@ class Predictions:
     dropped : windows left out, as counts by reason
     table : target slips by terrain
     filtered : runs that the live chain filtered, as they had no estimates
+    filtered_accuracy : as ``accuracy``, of the terrain filtered over time
     """
 
     windows: tuple[WindowPrediction, ...]
@@ -94,6 +97,7 @@ class Predictions:
     table_name: str
     table: Mapping[str, TargetSlipRow]
     filtered: tuple[str, ...] = ()
+    filtered_accuracy: float | None = None
     model: str | None = None
     dataset: str | None = None
     skipped: tuple[str, ...] | None = None

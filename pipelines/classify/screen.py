@@ -63,6 +63,8 @@ def _accuracy_lines(result: Predictions) -> Iterator[str]:
             else ""
         )
         yield f"accuracy {percent(result.accuracy)} over {result.n_judged} labelled windows{caution}"
+    if result.filtered_accuracy is not None:
+        yield f"filtered over time {percent(result.filtered_accuracy)}; what stays uncertain counts as wrong"
     if result.filtered:
         yield f"{len(result.filtered)} runs had no estimates: filtered as on the robot, sample by sample"
     for name, count in result.unknown_labels.items():

@@ -139,8 +139,9 @@ def model_info(
     if len(filters) > 1:
         names = " and ".join(sorted(name or "an unknown filter" for name in filters))
         raise DataError(f"the runs hold estimates of {names}: estimate all of them with one filter")
+    classes, counts = np.unique(windows.terrain.astype(str), return_counts=True)
     return ModelInfo(
-        classes=tuple(np.unique(windows.terrain.astype(str)).tolist()),
+        classes=tuple(classes.tolist()),
         window_s=rule.length_s,
         stride_s=rule.stride_s,
         steady=rule.steady,
@@ -156,4 +157,5 @@ def model_info(
         package_version=__version__,
         robots=tuple(sorted({run.robot for run in runs})),
         filter=filters.pop(),
+        class_ratio=dict(zip(classes.tolist(), (counts / counts.sum()).tolist(), strict=True)),
     )

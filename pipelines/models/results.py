@@ -35,6 +35,7 @@ class ModelInfo:
     robots : whose runs the training runs were, by name
     filter : that made the streams ``estimator`` and ``slip``; empty where the model uses neither
     evaluation : figures on held-out runs by name, as ``accuracy``; empty where it was not evaluated
+    class_ratio : share of each class among the training windows; empty of models of earlier releases
     """
 
     classes: tuple[str, ...]
@@ -54,6 +55,7 @@ class ModelInfo:
     robots: tuple[str, ...] = ()
     filter: str = ""
     evaluation: Mapping[str, float] = field(default_factory=dict)
+    class_ratio: Mapping[str, float] = field(default_factory=dict)
 
     @classmethod
     def from_json(cls, document: Mapping[str, Any]) -> Self:
@@ -61,6 +63,9 @@ class ModelInfo:
         steady = document.get("steady")
         changed: dict[str, Any] = {
             "steady": None if steady is None else SteadyMotion(**steady),
+            "class_ratio": {
+                name: float(ratio) for name, ratio in dict(document.get("class_ratio", {})).items()
+            },
             "channels": {stream: _texts(names) for stream, names in document["channels"].items()},
         }
         for name in ("classes", "run_digests", "signal_sets", "robots"):

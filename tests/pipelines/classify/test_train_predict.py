@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipelines.classify.predict import predict
+from pipelines.classify.predict import filtered_terrains, predict
 from pipelines.classify.settings import TrainSettings
 from pipelines.classify.train import model_info, train
 from pipelines.crossval.crossval import samples_of
@@ -241,3 +241,31 @@ def test_quickstart_reuses_its_own_import_and_no_other(drive_all, drive, tmp_pat
     with pytest.raises(DataError, match=r"out/runs: holds other runs than .*data; choose another --out"):
         module.quickstart(asked)
     assert sorted(path.name for path in (tmp_path / "out" / "runs").iterdir()) == imported
+
+
+def test_the_filtered_terrain_is_that_of_the_windows_so_far(model, drive):
+    """Windows of one terrain that follow each other are a run; the run before it does not matter."""
+    runs = [drive("a", "GRASS", 21), drive("b", "GRAVEL", 22)]
+    both = predict(runs, model, load_slip_table())
+    alone = predict(runs[1:], model, load_slip_table())
+    of_b = [row.filtered_terrain for row in both.windows if row.run_id == "b"]
+    assert of_b == [row.filtered_terrain for row in alone.windows]
+    assert both.filtered_accuracy >= both.accuracy - 0.1
+    classes = np.array(both.classes)
+    probability = np.full((24, len(classes)), 0.05)
+    probability[:, 1] = 0.9
+    probability[10] = [0.6, 0.2, 0.2]  # one window alone
+    windows = samples_of(runs, TrainSettings(name="drawn").evaluation).cut.windows
+    first = windows[windows.run_id == "a"]
+    found = filtered_terrains(first, probability[: len(first)], model)
+    assert set(found.tolist()) == {classes[1]}
+    flat = np.tile([model.info.class_ratio[name] for name in classes], (len(first), 1))
+    assert set(filtered_terrains(first, flat, model)) == {""}
+
+
+def test_a_model_of_an_earlier_release_filters_with_equal_shares(model, drive):
+    earlier = TerrainModel(model.recipe, replace(model.info, class_ratio={}))
+    assert sum(model.info.class_ratio.values()) == pytest.approx(1.0)
+    run = drive("a", "GRASS", 21)
+    rows = predict([run], earlier, load_slip_table()).windows
+    assert {row.filtered_terrain for row in rows} <= {*model.info.classes, None}
