@@ -21,6 +21,7 @@ from pipelines.crossval.splits import (
     grouped_samples,
     published_samples,
 )
+from pipelines.crossval.unknown import leave_terrain_out
 from pipelines.models.recipes import WindowPipeline, feature_matrix
 from pipelines.reporting.numbers import format_counts
 from pipelines.reporting.progress import Progress, silent
@@ -52,6 +53,9 @@ def crossval(
     if settings.extras and settings.protocol == "grouped":
         first = [fold for fold in folds if fold.repeat == 0]
         extras = _extras(recipe, features, samples, first, figures.accuracy_per_repeat[0], settings, progress)
+    unknown = None
+    if settings.protocol == "leave-terrain-out":
+        unknown = leave_terrain_out(examples, samples, settings.seed, settings.jobs, progress)
     repaired = dict(sum((Counter(run.dropped) for run in runs), Counter()))
     published = settings.protocol == "published"
     return CrossvalReport(
@@ -68,6 +72,7 @@ def crossval(
         repaired=repaired,
         notes=tuple(notes(samples, settings, repaired)),
         extras=extras,
+        unknown=unknown,
     )
 
 
@@ -119,6 +124,8 @@ def notes(samples: Samples, settings: CrossvalSettings, repaired: Mapping[str, i
             "published protocol: parts of one run lie on both sides of the split; "
             "for comparison with papers only"
         )
+    if settings.protocol == "leave-terrain-out":
+        sentences.append("accuracy and the table of classes are of folds in which all terrains are known")
     if samples.cut.dropped:
         sentences.append(f"windows left out: {format_counts(samples.cut.dropped)}")
     if repaired:
