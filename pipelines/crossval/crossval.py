@@ -24,6 +24,7 @@ from pipelines.crossval.splits import (
     grouped_samples,
     published_samples,
 )
+from pipelines.crossval.unknown import leave_terrain_out
 from pipelines.models.recipes import WindowPipeline, feature_matrix
 from pipelines.reporting.numbers import format_counts
 from pipelines.reporting.progress import Progress, silent
@@ -54,7 +55,7 @@ def crossval(
     beside = settings.extras and settings.protocol == "grouped"
     asks = None
     if beside:
-        followed = following(recipe, runs, windows, settings.rule, folds, settings.seed)
+        followed = following(recipe, samples.runs, windows, settings.rule, folds, settings.seed)
         asks = [each.follow for each in followed]
     results = fit_folds(recipe[-1], examples, folds, settings.jobs, settings.protocol, progress, asks)
     held_out = pool(results, examples.terrain)
@@ -64,6 +65,9 @@ def crossval(
         first = [fold for fold in folds if fold.repeat == 0]
         extras = _extras(recipe, features, samples, first, figures.accuracy_per_repeat[0], settings, progress)
         extras = extras._replace(over_time=_over_time(held_out, windows, settings.seed))
+    unknown = None
+    if settings.protocol == "leave-terrain-out":
+        unknown = leave_terrain_out(examples, samples, settings.seed, settings.jobs, progress)
     repaired = dict(sum((Counter(run.dropped) for run in runs), Counter()))
     published = settings.protocol == "published"
     return CrossvalReport(
@@ -80,6 +84,7 @@ def crossval(
         repaired=repaired,
         notes=tuple(notes(samples, settings, repaired)),
         extras=extras,
+        unknown=unknown,
     )
 
 
@@ -135,7 +140,7 @@ def samples_of(runs: Sequence[RunLog], settings: CrossvalSettings) -> Samples:
             distinct.runs, settings.rule, settings.signal_sets, skip_short=settings.skip_short
         )
     _refuse_constant(samples.cut.windows)
-    return samples._replace(merged=distinct.merged)
+    return samples._replace(merged=distinct.merged, runs=distinct.runs)
 
 
 def _refuse_constant(windows: Windows) -> None:
@@ -163,6 +168,8 @@ def notes(samples: Samples, settings: CrossvalSettings, repaired: Mapping[str, i
             "published protocol: parts of one run lie on both sides of the split; "
             "for comparison with papers only"
         )
+    if settings.protocol == "leave-terrain-out":
+        sentences.append("accuracy and the table of classes are of folds in which all terrains are known")
     if samples.cut.dropped:
         sentences.append(f"windows left out: {format_counts(samples.cut.dropped)}")
     if repaired:

@@ -73,6 +73,38 @@ class LearningCurve(NamedTuple):
     statement: str
 
 
+class LeftOutTerrain(NamedTuple):
+    """How well the windows of a terrain that was left out differ in score from held-out ones of others.
+
+    Parameters
+    ----------
+    auroc, auroc_10s : area under the ROC curve of single windows, and of means over 10 s
+    accepted : part of its windows that are taken for a known terrain
+    known_kept : part of the held-out windows of the other terrains that are not called unknown
+    """
+
+    auroc: float
+    auroc_10s: float
+    accepted: float
+    known_kept: float
+
+
+class UnknownTerrain(NamedTuple):
+    """Leave-one-terrain-out: means over the terrains, intervals by bootstrap over runs, and each terrain.
+
+    The threshold of the score keeps ``known_kept_target`` of the known windows of inner held-out runs.
+    """
+
+    auroc_unknown: float
+    auroc_unknown_ci: tuple[float, float]
+    auroc_unknown_10s: float
+    auroc_unknown_10s_ci: tuple[float, float]
+    unknown_accepted: float
+    known_kept: float
+    known_kept_target: float
+    unknown_by_terrain: Mapping[str, LeftOutTerrain]
+
+
 class Extras(NamedTuple):
     """What the headline figure does not show; ``speed_only_accuracy`` is None without wheel speeds."""
 
@@ -136,8 +168,8 @@ class Figures:
 class CrossvalReport(Figures):
     """A cross-validation: its figures, how they were obtained, and what a reader has to know of them.
 
-    ``extras`` is None where they were not asked for, ``dataset``, ``data_digest`` and ``skipped`` where the
-    caller did not give them.
+    ``extras`` and ``unknown`` are None where they were not asked for, ``dataset``, ``data_digest`` and
+    ``skipped`` where the caller did not give them.
     """
 
     protocol: str
@@ -152,6 +184,7 @@ class CrossvalReport(Figures):
     repaired: Mapping[str, int]
     notes: tuple[str, ...]
     extras: Extras | None = None
+    unknown: UnknownTerrain | None = None
     dataset: str | None = None
     data_digest: str | None = None
     skipped: tuple[str, ...] | None = None
@@ -162,9 +195,11 @@ class CrossvalReport(Figures):
 
     def as_json(self) -> dict[str, Any]:
         """Return all fields, the extras among them, without those that are not there."""
-        found = {each.name: getattr(self, each.name) for each in fields(self) if each.name != "extras"}
+        apart = ("extras", "unknown")
+        found = {each.name: getattr(self, each.name) for each in fields(self) if each.name not in apart}
         unknown = [name for name in ("dataset", "data_digest", "skipped") if found[name] is None]
         extras = {} if self.extras is None else self.extras.as_json()
+        extras |= {} if self.unknown is None else self.unknown._asdict()
         return {name: value for name, value in (found | extras).items() if name not in unknown}
 
 

@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.table import Table
 
 from pipelines.courses.screen import over_time_lines
-from pipelines.crossval.results import Applicability, CrossvalReport, Extras, SlowFast
+from pipelines.crossval.results import Applicability, CrossvalReport, Extras, SlowFast, UnknownTerrain
 from pipelines.reporting.numbers import percent
 from pipelines.reporting.terminal import print_lines
 
@@ -36,6 +36,8 @@ def print_crossval(report: CrossvalReport, console: Console) -> None:
     for name, row in report.per_class.items():
         table.add_row(name, str(row.n_windows), percent(row.precision), percent(row.recall), f"{row.f1:.3f}")
     console.print(table)
+    if report.unknown is not None:
+        print_lines(console, _unknown_lines(report.unknown))
     if report.extras is not None:
         print_lines(console, _extras_lines(report.extras))
     print_lines(console, (f"note: {note}" for note in (*report.notes, *(report.skipped or ()))))
@@ -51,6 +53,25 @@ def _confidence_line(report: CrossvalReport) -> str:
         for row in report.accuracy_at_coverage
     )
     return f"from confidence to correctness: {ranked}; {most_confident}; calibration error {report.ece:.3f}"
+
+
+def _unknown_lines(found: UnknownTerrain) -> Iterator[str]:
+    (low, high), (low_10s, high_10s) = found.auroc_unknown_ci, found.auroc_unknown_10s_ci
+    yield (
+        f"a terrain left out of training, area under the ROC curve of the novelty score: a window "
+        f"{found.auroc_unknown:.3f} (95 % over runs: {low:.3f} to {high:.3f}), mean over 10 s "
+        f"{found.auroc_unknown_10s:.3f} ({low_10s:.3f} to {high_10s:.3f})"
+    )
+    yield (
+        f"at a threshold meant to keep {percent(found.known_kept_target)} of the known windows: "
+        f"{percent(found.known_kept)} of held-out known windows are kept, "
+        f"{percent(found.unknown_accepted)} of unknown ones are accepted as known"
+    )
+    for name, row in found.unknown_by_terrain.items():
+        yield (
+            f"{name} left out: {row.auroc:.3f}, over 10 s {row.auroc_10s:.3f}, "
+            f"accepted {percent(row.accepted)}"
+        )
 
 
 def _extras_lines(extras: Extras) -> Iterator[str]:

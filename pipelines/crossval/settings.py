@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from features.windows import WindowRule
     from pipelines.models.recipes import WindowPipeline
 
-Protocol = Literal["grouped", "leave-one-run-out", "published"]
+Protocol = Literal["grouped", "leave-one-run-out", "leave-terrain-out", "published"]
 PROTOCOLS: tuple[str, ...] = get_args(Protocol)
 Recipe = Literal["svm"]
 RECIPES: tuple[str, ...] = get_args(Recipe)
@@ -102,7 +102,7 @@ class CrossvalSettings(RecipeSettings):
     @property
     def n_repeats(self) -> int:
         """Fold assignments: what was asked for, or what the protocol asks for."""
-        return self.repeats or (1 if self.protocol == "leave-one-run-out" else 5)
+        return self.repeats or (5 if self.protocol in ("grouped", "published") else 1)
 
 
 def _rule(settings: RecipeSettings, default_s: float) -> WindowRule:

@@ -1,6 +1,8 @@
 """The protocols of cross-validation: which windows train and which test.
 
 ``grouped`` is the headline: whole runs are held out.  ``leave-one-run-out`` holds out one run at a time.
+``leave-terrain-out`` has the folds of ``grouped``, and asks besides whether a terrain that was left out of
+training is found to be unknown (:mod:`pipelines.crossval.unknown`).
 ``published`` deals 5 s partitions of runs at random into folds, as the papers do, so that a test
 partition nearly always has its own run in training; it serves to compare with papers only.
 """
@@ -48,13 +50,14 @@ class Samples(NamedTuple):
     """Windows, and what protocols need besides.
 
     ``group`` is what must not be split: the run, or the partition under ``published``.  ``merged`` has the
-    ids of runs that hold the same measurements and were made one.
+    ids of runs that hold the same measurements and were made one, ``runs`` what the windows were cut from.
     """
 
     cut: WindowCut
     group: Array
     gap: int
     merged: tuple[tuple[str, ...], ...] = ()
+    runs: Sequence[RunLog] = ()
 
 
 def grouped_samples(
@@ -147,14 +150,15 @@ def folds_of(samples: Samples, protocol: str, repeats: int, seed: int) -> list[F
     if protocol == "leave-one-run-out":
         return _leave_one_out(y, group, samples.gap)
     n_runs = len(np.unique(samples.cut.windows.run_id.astype(str)))
-    if protocol == "grouped" and n_runs < N_FOLDS:
+    whole_runs = protocol in ("grouped", "leave-terrain-out")
+    if whole_runs and n_runs < N_FOLDS:
         raise DataError(f"{n_runs} runs are fewer than {N_FOLDS} folds")
     folds = []
     for repeat in range(repeats):
         rng = np.random.default_rng((seed, repeat))
         splits = (
             split_runs(y, group, N_FOLDS, rng, samples.gap)
-            if protocol == "grouped"
+            if whole_runs
             else _stratified_partitions(y, group, rng)
         )
         folds += [Fold(repeat, number, train, test) for number, (train, test) in enumerate(splits)]

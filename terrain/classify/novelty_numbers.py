@@ -190,7 +190,9 @@ def _least_squares(rows: Array, points: Array) -> Array:
 def pair_margins(vectors: Array, weights: Array, offsets: Array, gamma: float, rows: Array) -> Array:
     """Return the margin (n, p) of each pair of classes of each row (n, m)."""
     squares = (
-        np.square(rows).sum(axis=1)[:, np.newaxis] + np.square(vectors).sum(axis=1) - 2.0 * rows @ vectors.T
+        np.square(rows).sum(axis=1)[:, np.newaxis]
+        + np.einsum("ij,ij->i", vectors, vectors)
+        - 2.0 * rows @ vectors.T
     )
     found: Array = np.exp(-gamma * np.maximum(squares, 0.0)) @ weights + offsets
     return found
