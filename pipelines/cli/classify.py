@@ -21,20 +21,28 @@ def crossval_command(
     compute: ComputeSettings,
     json_file: Json = None,
 ) -> None:
-    """Evaluate a recipe on held-out runs."""
+    """Evaluate a recipe on held-out runs, of run logs or of a store of features."""
     from dataclasses import replace
 
     from pipelines.compute.parallel import computing
     from pipelines.crossval.crossval import crossval
     from pipelines.crossval.screen import print_crossval
+    from pipelines.feature_store.crossval import crossval_store
+    from pipelines.feature_store.store import is_store, open_store
     from pipelines.reporting.json_file import write_json
     from pipelines.reporting.terminal import output_console, progress_bar
     from pipelines.runs.datasets import data_digest
 
-    runs, skipped = load(source)
     with computing(compute.compute), progress_bar() as progress:
-        report = crossval(runs, settings.with_(skip_short=source.repair), progress)
-    report = replace(report.named(source.dataset, data_digest(runs)), skipped=tuple(skipped))
+        if is_store(source.data):
+            store = open_store(source.data, settings.rule, settings.signal_sets)
+            report = crossval_store(store, settings, progress).named(source.dataset, store.digest)
+            skipped: list[str] = []
+        else:
+            runs, skipped = load(source)
+            found = crossval(runs, settings.with_(skip_short=source.repair), progress)
+            report = found.named(source.dataset, data_digest(runs))
+    report = replace(report, skipped=tuple(skipped))
     print_crossval(report, output_console())
     write_json(json_file, report)
 

@@ -17,6 +17,7 @@ from pipelines.cli import (
     explain,
     export,
     faults,
+    features,
     label,
     quickstart,
     replay,
@@ -38,7 +39,7 @@ app = typer.Typer(
 )
 
 GROUPS = (
-    *(runs.app, export.app, estimate.app, classify.app, slip.app, drive.app),
+    *(runs.app, export.app, estimate.app, features.app, classify.app, slip.app, drive.app),
     *(replay.app, serve.app, can.app, label.app),
     *(faults.app, explain.app, reproduce.app, quickstart.app),
 )

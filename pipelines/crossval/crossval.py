@@ -69,6 +69,27 @@ def crossval(
     if settings.protocol == "leave-terrain-out":
         unknown = leave_terrain_out(examples, samples, settings.seed, settings.jobs, progress)
     repaired = dict(sum((Counter(run.dropped) for run in runs), Counter()))
+    return report_of(figures, samples, settings, features.shape[1], repaired, extras)
+
+
+def report_of(
+    figures: Figures,
+    samples: Samples,
+    settings: CrossvalSettings,
+    n_features: int,
+    repaired: Mapping[str, int],
+    extras: Extras | None,
+) -> CrossvalReport:
+    """Return the report of a cross-validation.
+
+    Parameters
+    ----------
+    figures : of merit
+    samples, settings : that they were found with
+    n_features : features of a window
+    repaired : what a repairing reader dropped, as counts by kind
+    extras : checks beside the figures; None where there are none
+    """
     published = settings.protocol == "published"
     return CrossvalReport(
         **{each.name: getattr(figures, each.name) for each in fields(Figures)},
@@ -79,9 +100,9 @@ def crossval(
         steady=settings.rule.steady is not None and not published,
         signal_sets=settings.signal_sets,
         seed=settings.seed,
-        n_features=features.shape[1],
+        n_features=n_features,
         dropped=dict(samples.cut.dropped),
-        repaired=repaired,
+        repaired=dict(repaired),
         notes=tuple(notes(samples, settings, repaired)),
         extras=extras,
         unknown=unknown,
