@@ -21,6 +21,7 @@ from pipelines.crossval.splits import (
     grouped_samples,
     published_samples,
 )
+from pipelines.models.champion import weaknesses
 from pipelines.models.recipes import WindowPipeline, feature_matrix
 from pipelines.reporting.numbers import format_counts
 from pipelines.reporting.progress import Progress, silent
@@ -68,7 +69,7 @@ def crossval(
         n_features=features.shape[1],
         dropped=dict(samples.cut.dropped),
         repaired=repaired,
-        notes=tuple(notes(samples, settings, repaired)),
+        notes=(*notes(samples, settings, repaired), *weaknesses(figures.accuracy_ci, figures.chance)),
         extras=extras,
     )
 

@@ -35,6 +35,7 @@ class ModelInfo:
     robots : whose runs the training runs were, by name
     filter : that made the streams ``estimator`` and ``slip``; empty where the model uses neither
     evaluation : figures on held-out runs by name, as ``accuracy``; empty where it was not evaluated
+    run_accuracy : of the windows of each training run when it was held out, by its digest
     """
 
     classes: tuple[str, ...]
@@ -54,6 +55,7 @@ class ModelInfo:
     robots: tuple[str, ...] = ()
     filter: str = ""
     evaluation: Mapping[str, float] = field(default_factory=dict)
+    run_accuracy: Mapping[str, float] = field(default_factory=dict)
 
     @classmethod
     def from_json(cls, document: Mapping[str, Any]) -> Self:
