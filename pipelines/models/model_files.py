@@ -20,7 +20,7 @@ from pipelines.reporting.json_file import as_json
 from terrain.errors import ConfigError, DataError, ModelError
 from terrain.files.atomic import atomic_write
 from terrain.files.documents import MAX_JSON_BYTES, parse_json
-from terrain.files.names import MAX_NAME, printable, shown
+from terrain.files.names import MAX_NAME, name_fault, printable, shown
 from terrain.files.regular import MEBIBYTE, check_inside, read_regular
 
 if TYPE_CHECKING:
@@ -178,8 +178,11 @@ def _check_others(folder: Path, document: dict[str, Any]) -> None:
     if not isinstance(listed, dict) or len(listed) > MAX_OTHER_FILES:
         raise _damaged(folder / INFO_FILE, ValueError("files_sha256 is no list of files"))
     for name, expected in listed.items():
+        fault = next(filter(None, (name_fault(part) for part in name.split("/"))), None)
+        if fault is not None:
+            raise _damaged(folder / INFO_FILE, ValueError(f"a file {shown(name)} {fault}"))
         file = folder / name
-        check_inside(file, folder, printable(str(file)[-MAX_NAME:]), ModelError)
+        check_inside(file, folder, str(file), ModelError)
         _checked(file, MAX_MODEL_BYTES, expected)
 
 

@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import NamedTuple
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 from pipelines.classify.card import CARD_FILE, CARD_JSON, figure_rows, model_card
 from pipelines.crossval.crossval import samples_of
 from pipelines.models.model_files import INFO_FILE, read_lean_model, read_model
+from pipelines.reporting.numbers import NOT_KNOWN
 from terrain.errors import ModelError
 
 
@@ -21,7 +23,9 @@ def card(tracked, runs, settings, make_report):
     windows = samples_of(runs, settings()).cut.windows
 
     def make(report=None, **changed):
-        return model_card("drawn", replace(info, **changed), windows, report or tracked[1].crossval, {"C": 10.0})
+        return model_card(
+            "drawn", replace(info, **changed), windows, report or tracked[1].crossval, {"C": 10.0}
+        )
 
     return make
 
@@ -77,25 +81,23 @@ class Estimate(NamedTuple):
     ci: tuple[float, float] | None
 
 
-class WithMore:
-    """A report that has further figures."""
-
-    accuracy, accuracy_ci = 0.8, (0.7, 0.9)
-    confidence_auc = Estimate(0.81234, (0.75, 0.86))
-    accuracy_at_coverage = {0.8: Estimate(0.91, (0.85, 0.95)), 0.5: Estimate(0.97, None)}
-    ece = 0.05
-    filter_delay_s = 2.5
-    auroc_unknown = None
-
-
 def test_figures_are_taken_as_the_report_has_them():
-    assert [tuple(row) for row in figure_rows(WithMore())] == [
+    report = SimpleNamespace(
+        accuracy=0.8,
+        accuracy_ci=(0.7, 0.9),
+        confidence_auc=Estimate(0.81234, (0.75, 0.86)),
+        accuracy_at_coverage={0.8: Estimate(0.91, (0.85, 0.95)), 0.5: Estimate(0.97, None)},
+        ece=0.05,
+        filter_delay_s=2.5,
+        auroc_unknown=None,
+    )
+    assert [tuple(row) for row in figure_rows(report)] == [
         ("accuracy of single windows", "80.0%", "70.0% to 90.0%"),
-        ("expected calibration error of the confidence", "5.0%", "–"),
+        ("expected calibration error of the confidence", "5.0%", NOT_KNOWN),
         ("area from confidence to correctness", "0.812", "0.750 to 0.860"),
         ("accuracy of the most certain windows at 0.8", "91.0%", "85.0% to 95.0%"),
-        ("accuracy of the most certain windows at 0.5", "97.0%", "–"),
-        ("delay of the filter in s", "2.500", "–"),
+        ("accuracy of the most certain windows at 0.5", "97.0%", NOT_KNOWN),
+        ("delay of the filter in s", "2.500", NOT_KNOWN),
     ]
 
 

@@ -32,9 +32,8 @@ def test_the_champion_is_judged_on_runs_that_it_never_saw(model, drive_all, sett
     predicted = model.recipe.predict(windows)
     theirs = float(np.mean(predicted == windows.terrain.astype(str)))
     assert verdict.moved == (report.accuracy >= theirs)
-    assert verdict.reason.startswith(
-        f"new data: on 9 runs, each held out, accuracy {report.accuracy:.1%} against {theirs:.1%} of version 1"
-    )
+    figures = f"accuracy {report.accuracy:.1%} against {theirs:.1%} of version 1"
+    assert verdict.reason.startswith(f"new data: on 9 runs, each held out, {figures}")
 
 
 class Oracle:
