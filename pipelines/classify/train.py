@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from pipelines.classify.card import model_card, written
 from pipelines.classify.results import Training
 from pipelines.classify.settings import TrainSettings
 from pipelines.crossval.crossval import crossval, samples_of
@@ -17,6 +18,7 @@ from pipelines.crossval.results import CrossvalReport
 from pipelines.crossval.settings import RecipeSettings
 from pipelines.crossval.splits import folds_of
 from pipelines.live.window_feed import ESTIMATED
+from pipelines.models.champion import scope_of
 from pipelines.models.results import ModelInfo
 from pipelines.reporting.json_file import as_json
 from pipelines.reporting.progress import Progress, silent
@@ -50,8 +52,9 @@ def train(
     TerrainError
         if the data do not suffice or the tracking folder cannot be written.
     """
+    from pipelines.classify.judging import held_out_runs, judge_of, standing_of, standing_tags
     from pipelines.crossval.figures import all_figures
-    from pipelines.models.tracking import code_commit, ensure_tracking, log_training
+    from pipelines.models.tracking import TrainingRecord, code_commit, ensure_tracking, log_training
 
     ensure_tracking()
     report = crossval(runs, settings.evaluation, progress) if evaluation is None else evaluation
@@ -60,9 +63,7 @@ def train(
     windows = samples.cut.windows
     terrain = windows.terrain.astype(str)
     recipe = settings.new_recipe()
-    progress("fit on all runs", 0, 1)
     recipe.fit(windows, terrain)
-    progress("fit on all runs", 1, 1)
     importance = channel_importance(
         settings.new_recipe()[-1],
         Examples(recipe[:-1].transform(windows), terrain, samples.group),
@@ -74,16 +75,29 @@ def train(
     )
     chosen = recipe[-1].best_._asdict()
     metrics = _metrics(report)
-    info = replace(model_info(runs, settings, windows, dataset, code_commit()), evaluation=metrics)
+    digests = {run.run_id: data_digest([run]) for run in runs}
+    info = replace(
+        model_info(runs, settings, windows, dataset, code_commit()),
+        evaluation=metrics,
+        run_accuracy={digests[k]: each.accuracy for k, each in held_out_runs(samples, report).items()},
+    )
+    standing = standing_of(info, report)
+    record = TrainingRecord(
+        _params(settings, report, len(windows), dataset, chosen),
+        metrics,
+        standing_tags(standing, scope_of(info)),
+        {"crossval.json": as_json(report), "importance.json": {"channels": as_json(importance)}},
+        all_figures(report, importance),
+    )
+    card = model_card(settings.name, info, windows, report, chosen)
     registered = log_training(
         settings.name,
         recipe,
         windows,
         info,
-        _params(settings, report, len(windows), dataset, chosen),
-        metrics,
-        {"crossval.json": as_json(report), "importance.json": {"channels": as_json(importance)}},
-        all_figures(report, importance),
+        record,
+        judge_of(runs, samples, report, standing, settings.seed),
+        lambda folder: written(card, folder, windows[0]).texts(),
     )
     return Training(
         registered=registered,

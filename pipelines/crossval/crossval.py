@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 
 from sklearn.base import clone
 
@@ -25,6 +25,7 @@ from pipelines.crossval.splits import (
     published_samples,
 )
 from pipelines.crossval.unknown import leave_terrain_out
+from pipelines.models.champion import weaknesses
 from pipelines.models.recipes import WindowPipeline, feature_matrix
 from pipelines.reporting.numbers import format_counts
 from pipelines.reporting.progress import Progress, silent
@@ -65,11 +66,12 @@ def crossval(
         first = [fold for fold in folds if fold.repeat == 0]
         extras = _extras(recipe, features, samples, first, figures.accuracy_per_repeat[0], settings, progress)
         extras = extras._replace(over_time=_over_time(held_out, windows, settings.seed))
-    unknown = None
+    repaired = dict(sum((Counter(run.dropped) for run in runs), Counter()))
+    report = report_of(figures, samples, settings, features.shape[1], repaired, extras)
     if settings.protocol == "leave-terrain-out":
         unknown = leave_terrain_out(examples, samples, settings.seed, settings.jobs, progress)
-    repaired = dict(sum((Counter(run.dropped) for run in runs), Counter()))
-    return report_of(figures, samples, settings, features.shape[1], repaired, extras)
+        report = replace(report, unknown=unknown)
+    return report
 
 
 def report_of(
@@ -103,9 +105,8 @@ def report_of(
         n_features=n_features,
         dropped=dict(samples.cut.dropped),
         repaired=dict(repaired),
-        notes=tuple(notes(samples, settings, repaired)),
+        notes=(*notes(samples, settings, repaired), *weaknesses(figures.accuracy_ci, figures.chance)),
         extras=extras,
-        unknown=unknown,
     )
 
 

@@ -163,6 +163,12 @@ class Figures:
     per_run: tuple[RunFigures, ...]
     folds: tuple[FoldFigures, ...]
 
+    @property
+    def chance(self) -> float:
+        """Accuracy of always predicting the class with the most windows."""
+        counts = [figures.n_windows for figures in self.per_class.values()]
+        return max(counts) / sum(counts)
+
 
 @dataclass(frozen=True, slots=True)
 class CrossvalReport(Figures):

@@ -20,7 +20,7 @@ from pipelines.reporting.json_file import as_json
 from terrain.errors import ConfigError, DataError, ModelError
 from terrain.files.atomic import atomic_write
 from terrain.files.documents import MAX_JSON_BYTES, parse_json
-from terrain.files.names import MAX_NAME, printable, shown
+from terrain.files.names import MAX_NAME, name_fault, printable, shown
 from terrain.files.regular import MEBIBYTE, check_inside, read_regular
 
 if TYPE_CHECKING:
@@ -31,10 +31,18 @@ INFO_FILE = "terrain_model.json"
 INFO_VERSION = 2
 """1: probabilities of votes of the pairs of classes; 2: of their margins."""
 
+UNCHECKED = (MODEL_FILE, NUMBERS_FILE, INFO_FILE, "MLmodel")
+"""Files that have a checksum of their own, the one that holds the checksums, and one that MLflow writes to
+afterwards and that is not read here."""
+
+CHECKSUMS = ("sha256", "numbers_sha256", "files_sha256")
 INFO_KEYS = {"window_s", "stride_s", "steady", "classes", "channels", "rate_hz", "run_digests"}
 
 MAX_MODEL_BYTES = 256 * MEBIBYTE
 """Of a model as it lies on disk; those of this package have some MiB."""
+
+MAX_OTHER_FILES = 64
+"""Files beside a model; those of this package have half a dozen."""
 
 MAX_UNPACKED_BYTES = 1024 * MEBIBYTE
 """Of all that a model's archive unpacks to: megabytes of zeros pack to kilobytes."""
@@ -79,10 +87,12 @@ class TerrainModel(NamedTuple):
 
 
 def write_info(folder: Path, info: ModelInfo) -> None:
-    """Write ``terrain_model.json`` beside a model's files, with their checksums."""
+    """Write ``terrain_model.json`` beside a model's files, with the checksums of all of them."""
     content = {"version": INFO_VERSION, "sha256": _sha256(folder / MODEL_FILE), **as_json(info)}
     if (folder / NUMBERS_FILE).is_file():
         content["numbers_sha256"] = _sha256(folder / NUMBERS_FILE)
+    others = sorted(path for path in folder.rglob("*") if path.is_file() and path.name not in UNCHECKED)
+    content["files_sha256"] = {path.relative_to(folder).as_posix(): _sha256(path) for path in others}
     atomic_write(folder / INFO_FILE, json.dumps(content, indent=2, sort_keys=True) + "\n")
 
 
@@ -101,6 +111,9 @@ def read_model(folder: Path) -> TerrainModel:
     document = _read_info(folder)
     file = folder / MODEL_FILE
     content = _checked(file, MAX_MODEL_BYTES, document["sha256"])
+    if "numbers_sha256" in document:
+        _numbers_content(folder, document)
+    _check_others(folder, document)
     return _model(_load(file, content), folder, document)
 
 
@@ -114,11 +127,11 @@ def read_lean_model(folder: Path) -> TerrainModel:
     """
     document = _read_info(folder)
     file = folder / NUMBERS_FILE
-    if "numbers_sha256" not in document or not file.is_file():  # of an earlier release
+    if "numbers_sha256" not in document:  # of an earlier release, or of a recipe without numbers
         return read_model(folder)
-    check_inside(file, folder, str(file), ModelError)
     _checked(folder / MODEL_FILE, MAX_MODEL_BYTES, document["sha256"])  # damaged in part is damaged
-    content = _checked(file, MAX_MODEL_BYTES, document["numbers_sha256"])
+    content = _numbers_content(folder, document)
+    _check_others(folder, document)
     info = _info(folder, document)
     try:
         recipe = read_numbers(content, info)
@@ -155,10 +168,28 @@ def _checked(file: Path, most_bytes: int, expected: Any) -> bytes:
     return content
 
 
+def _numbers_content(folder: Path, document: dict[str, Any]) -> bytes:
+    file = folder / NUMBERS_FILE
+    check_inside(file, folder, str(file), ModelError)
+    return _checked(file, MAX_MODEL_BYTES, document["numbers_sha256"])
+
+
+def _check_others(folder: Path, document: dict[str, Any]) -> None:
+    """Refuse a folder in which another file than the model is damaged, missing or a link out of it."""
+    listed = document.get("files_sha256", {})  # none of an earlier release
+    if not isinstance(listed, dict) or len(listed) > MAX_OTHER_FILES:
+        raise _damaged(folder / INFO_FILE, ValueError("files_sha256 is no list of files"))
+    for name, expected in listed.items():
+        fault = next(filter(None, (name_fault(part) for part in name.split("/"))), None)
+        if fault is not None:
+            raise _damaged(folder / INFO_FILE, ValueError(f"a file {shown(name)} {fault}"))
+        file = folder / name
+        check_inside(file, folder, str(file), ModelError)
+        _checked(file, MAX_MODEL_BYTES, expected)
+
+
 def _info(folder: Path, document: dict[str, Any]) -> ModelInfo:
-    kept = {
-        name: value for name, value in document.items() if name not in ("version", "sha256", "numbers_sha256")
-    }
+    kept = {name: value for name, value in document.items() if name not in ("version", *CHECKSUMS)}
     try:
         info = ModelInfo.from_json(kept)
         for stream in info.layout.channels:

@@ -36,6 +36,7 @@ class ModelInfo:
     filter : that made the streams ``estimator`` and ``slip``; empty where the model uses neither
     evaluation : figures on held-out runs by name, as ``accuracy``; empty where it was not evaluated
     class_ratio : share of each class among the training windows; empty of models of earlier releases
+    run_accuracy : of the windows of each training run when it was held out, by its digest
     """
 
     classes: tuple[str, ...]
@@ -56,6 +57,7 @@ class ModelInfo:
     filter: str = ""
     evaluation: Mapping[str, float] = field(default_factory=dict)
     class_ratio: Mapping[str, float] = field(default_factory=dict)
+    run_accuracy: Mapping[str, float] = field(default_factory=dict)
 
     @classmethod
     def from_json(cls, document: Mapping[str, Any]) -> Self:

@@ -11,8 +11,8 @@ import os
 import socket
 import subprocess
 import warnings
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, redirect_stderr
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, nullcontext, redirect_stderr
 from importlib.metadata import version
 from pathlib import Path
 from types import SimpleNamespace
@@ -24,7 +24,8 @@ from pipelines.models.model_files import TRUSTED_TYPES, TerrainModel, read_model
 from pipelines.models.recipes import WindowPipeline
 from pipelines.models.results import ModelInfo, Registered
 from terrain.errors import ModelError, TerrainError
-from terrain.files.atomic import ensure_writable
+from terrain.files.atomic import atomic_write, ensure_writable
+from terrain.files.lock import file_lock
 from terrain.records import Windows
 
 if TYPE_CHECKING:
@@ -34,37 +35,49 @@ FOLDER = "mlruns"
 EXPERIMENT = "terrain"
 CHAMPION = "champion"
 SERVER_TIMEOUT_S = 5.0
+LOCK_TIMEOUT_S = 300.0
+"""Logging a training takes some seconds, the first time ten; several may wait for one another."""
 REQUIREMENTS = ("terrain-slip", "scikit-learn", "numpy", "scipy", "numba", "skops")
 
 
-class Standing(NamedTuple):
-    """What the choice of the champion depends on."""
+class TrainingRecord(NamedTuple):
+    """What is logged of a training besides its model.
+
+    Parameters
+    ----------
+    params, metrics : as MLflow holds them
+    tags : of the registered version, and of the run
+    documents : JSON documents by file name
+    figures : by name, logged as PNG
+    """
+
+    params: Mapping[str, Any]
+    metrics: Mapping[str, float]
+    tags: Mapping[str, str]
+    documents: Mapping[str, Any]
+    figures: Mapping[str, Figure]
+
+
+class Champion(NamedTuple):
+    """The present champion; ``model`` is None where it cannot be loaded."""
 
     version: str
-    data_digest: str
-    macro_f1: float
+    tags: Mapping[str, str]
+    model: TerrainModel | None
 
 
-def champion_decision(champion: Standing | None, candidate: Standing) -> tuple[bool, str]:
-    """Return whether a candidate becomes champion, and why.
+class Verdict(NamedTuple):
+    """Whether a new version becomes champion, and why."""
 
-    Examples
-    --------
-    >>> champion_decision(None, Standing("1", "aa", 0.9))
-    (True, 'first version')
-    >>> champion_decision(Standing("1", "aa", 0.9), Standing("2", "aa", 0.8))
-    (False, 'macro F1 0.8000 is not better than 0.9000 of version 1 on the same data')
-    >>> champion_decision(Standing("1", "aa", 0.9), Standing("2", "bb", 0.8))
-    (True, 'new data: the digest differs from that of version 1')
-    """
-    if champion is None:
-        return True, "first version"
-    if champion.data_digest != candidate.data_digest:
-        return True, f"new data: the digest differs from that of version {champion.version}"
-    comparison = f"{champion.macro_f1:.4f} of version {champion.version} on the same data"
-    if candidate.macro_f1 > champion.macro_f1:
-        return True, f"macro F1 {candidate.macro_f1:.4f} is better than {comparison}"
-    return False, f"macro F1 {candidate.macro_f1:.4f} is not better than {comparison}"
+    moved: bool
+    reason: str
+
+
+Judge = Callable[[Champion | None, str], Verdict]
+"""Judges a new version, whose number is given, against the present champion."""
+
+CardWriter = Callable[[Path], Mapping[str, str]]
+"""Returns texts by file name that lie beside a model, whose files are in the folder that is given."""
 
 
 def code_commit() -> str:
@@ -134,6 +147,38 @@ def _connect(mlflow: Any, *, create: bool) -> None:
     os.environ.pop("MLFLOW_TRACKING_URI", None)  # MLflow sets it itself; only the user may set it
 
 
+def _database() -> Path | None:
+    """Return the file of the database, None where a server keeps it."""
+    uri = os.environ.get("MLFLOW_TRACKING_URI")
+    if not uri:
+        return Path(FOLDER).resolve() / "mlflow.db"
+    _, scheme, file = uri.partition("sqlite:///")
+    return Path(file) if scheme else None
+
+
+@contextmanager
+def _alone(*, create: bool) -> Iterator[None]:
+    """Keep other processes of this package away from the database.
+
+    MLflow makes its tables when it first opens a database; of two processes that do so at once one fails.
+    A database that can only be read is opened without.
+    """
+    database = _database()
+    if database is None or (not create and not (database.is_file() and os.access(database.parent, os.W_OK))):
+        waiting: Any = nullcontext()
+    else:
+        lock = database.with_name(f"{database.name}.lock")
+        waiting = file_lock(lock, LOCK_TIMEOUT_S, "writes to the tracking database")
+    with waiting:
+        yield
+
+
+def _open_store(mlflow: Any) -> None:
+    """Have MLflow open the database, which makes or checks its tables."""
+    mlflow.search_experiments(max_results=1)
+    mlflow.MlflowClient().search_registered_models(max_results=1)
+
+
 def _failures(mlflow: Any) -> tuple[type[Exception], ...]:
     """Return what MLflow raises when a server, a database or a folder fails."""
     from sqlalchemy.exc import SQLAlchemyError
@@ -146,38 +191,40 @@ def log_training(
     recipe: WindowPipeline,
     windows: Windows,
     info: ModelInfo,
-    params: Mapping[str, Any],
-    metrics: Mapping[str, float],
-    documents: Mapping[str, Any],
-    figures: Mapping[str, Figure],
+    record: TrainingRecord,
+    judge: Judge,
+    card: CardWriter | None = None,
 ) -> Registered:
-    """Log one training run with its model, register the model, and decide on the champion.
+    """Log one training run with its model, register the model, and have the champion decided on.
+
+    Other processes wait meanwhile, so that the champion that is judged against is the present one.
 
     Parameters
     ----------
     name : name of the registered model
     recipe : fitted recipe
     windows : the windows it was fitted on, for the signature
-    info : content of ``terrain_model.json``; ``data_digest`` is compared with the champion's
-    params, metrics : as MLflow holds them; ``macro_f1`` must be among the metrics
-    documents : JSON documents by file name
-    figures : figures by name, logged as PNG
+    info : content of ``terrain_model.json``
+    record : what else is logged
+    judge : decides whether the alias moves
+    card : texts that lie beside the model
 
     Raises
     ------
     TerrainError
-        if the tracking folder cannot be written or the server cannot be reached.
+        if the tracking folder cannot be written, the server cannot be reached, or another process holds the
+        database for too long.
     """
-    with _quiet() as mlflow:
+    with _quiet() as mlflow, _alone(create=True):
         _connect(mlflow, create=True)
         try:
             mlflow.set_experiment(EXPERIMENT)
             with mlflow.start_run(run_name=name) as run:
                 tags = {key: getattr(info, key) for key in ("data_digest", "commit", "seed")}
-                _log(mlflow, params, metrics, tags, documents, figures)
-                logged = _log_model(mlflow, name, recipe, windows, info)
+                _log(mlflow, record.params, record.metrics, tags, record.documents, record.figures)
+                logged = _log_model(mlflow, name, recipe, windows, info, card)
             return _promote(
-                mlflow, name, str(logged.registered_model_version), run.info.run_id, info, metrics
+                mlflow, name, str(logged.registered_model_version), run.info.run_id, record.tags, judge
             )
         except _failures(mlflow) as error:
             raise TerrainError(f"MLflow: {' '.join(str(error).split())[:300]}") from error
@@ -206,7 +253,7 @@ def log_learning(
     TerrainError
         if the tracking folder cannot be written or the server cannot be reached.
     """
-    with _quiet() as mlflow:
+    with _quiet() as mlflow, _alone(create=True):
         _connect(mlflow, create=True)
         try:
             mlflow.set_experiment(EXPERIMENT)
@@ -237,13 +284,25 @@ def _log(
         mlflow.log_figure(figure, f"figures/{name}.png")
 
 
-def _log_model(mlflow: Any, name: str, recipe: WindowPipeline, windows: Windows, info: ModelInfo) -> Any:
+def _log_model(
+    mlflow: Any,
+    name: str,
+    recipe: WindowPipeline,
+    windows: Windows,
+    info: ModelInfo,
+    card: CardWriter | None,
+) -> Any:
     from mlflow.models import Model
 
     def save_model(path: str, mlflow_model: Any, **options: Any) -> None:
         mlflow.sklearn.save_model(recipe, path, mlflow_model=mlflow_model, **options)
         write_numbers(Path(path), recipe)
         write_info(Path(path), info)
+        if card is not None:
+            for file, text in card(Path(path)).items():
+                atomic_write(Path(path) / file, text)
+                mlflow.log_text(text, file)
+            write_info(Path(path), info)
 
     flavor = SimpleNamespace(save_model=save_model, __name__="mlflow.sklearn")
     with redirect_stderr(io.StringIO()):  # the caller reports what it prints
@@ -273,20 +332,27 @@ def _signature(recipe: WindowPipeline, windows: Windows) -> Any:
 
 
 def _promote(
-    mlflow: Any, name: str, number: str, run_id: str, info: ModelInfo, metrics: Mapping[str, float]
+    mlflow: Any, name: str, number: str, run_id: str, tags: Mapping[str, str], judge: Judge
 ) -> Registered:
     client = mlflow.MlflowClient()
-    candidate = Standing(number, info.data_digest, float(metrics["macro_f1"]))
-    client.set_model_version_tag(name, number, "data_digest", candidate.data_digest)
-    client.set_model_version_tag(name, number, "macro_f1", repr(candidate.macro_f1))
+    for key, text in tags.items():
+        client.set_model_version_tag(name, number, key, text)
     champion = None
     if (current := client.get_registered_model(name).aliases.get(CHAMPION)) is not None:
-        tags = client.get_model_version(name, current).tags
-        champion = Standing(str(current), tags.get("data_digest", ""), float(tags.get("macro_f1", "-inf")))
-    moved, reason = champion_decision(champion, candidate)
+        found = client.get_model_version(name, current)
+        champion = Champion(str(current), found.tags, _model_or_none(mlflow, f"models:/{name}/{current}"))
+    moved, reason = judge(champion, number)
     if moved:
         client.set_registered_model_alias(name, CHAMPION, number)
     return Registered(f"models:/{name}/{number}", number, run_id, moved, reason)
+
+
+def _model_or_none(mlflow: Any, uri: str) -> TerrainModel | None:
+    failures: tuple[type[Exception], ...] = (*_failures(mlflow), ImportError, ModelError)
+    try:
+        return read_model(Path(mlflow.artifacts.download_artifacts(uri)))
+    except failures:
+        return None
 
 
 def load_model(uri: str) -> TerrainModel:
@@ -322,6 +388,8 @@ def fetch_model(uri: str, into: str | None = None) -> Path:
         # some storages need a package of their own
         failures: tuple[type[Exception], ...] = (*_failures(mlflow), ImportError)
         try:
+            with _alone(create=False):
+                _open_store(mlflow)
             return Path(mlflow.artifacts.download_artifacts(uri, dst_path=into))
         except failures as error:
             raise ModelError(f"{uri}: cannot be loaded ({' '.join(str(error).split())[:200]})") from error

@@ -173,7 +173,7 @@ def html_report(result: QuickstartResult, figures: Mapping[str, Figure]) -> str:
         consistency=consistency_table(result.consistency) if result.consistency else None,
         terrains=terrains,
         weak=tuple(row.terrain for row in terrains if row.weak),
-        most_frequent=_most_frequent(report),
+        most_frequent=report.chance,
         slow_fast=None if extras is None else _slow_fast(extras.slow_fast),
         model=_model(result),
         runs=_run_rows(result),
@@ -204,7 +204,7 @@ def _headline(report: CrossvalReport) -> Headline:
     text = HEADLINES[report.protocol]
     if alone and report.protocol != "published":
         text += f", except {listed(alone)}"
-    marks = [Mark("guess", _most_frequent(report), "always the most frequent terrain")]
+    marks = [Mark("guess", report.chance, "always the most frequent terrain")]
     if report.extras is not None and report.extras.speed_only_accuracy is not None:
         marks.append(Mark("speed", report.extras.speed_only_accuracy, "speed alone"))
     cards = (
@@ -214,12 +214,6 @@ def _headline(report: CrossvalReport) -> Headline:
         ("calibration error", report.ece, "stated probability against accuracy (ECE)"),
     )
     return Headline(text, alone, tuple(marks), cards)
-
-
-def _most_frequent(report: CrossvalReport) -> float:
-    """Return the accuracy of always predicting the class with the most windows."""
-    counts = [figures.n_windows for figures in report.per_class.values()]
-    return max(counts) / sum(counts)
 
 
 def _images(figures: Mapping[str, Figure]) -> tuple[tuple[Image, bool], ...]:

@@ -6,11 +6,14 @@ import os
 import secrets
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
 from terrain.errors import TerrainError
+
+ATTEMPTS = 100
+"""How often a folder is made that another process removes; each attempt takes some microseconds."""
 
 
 def atomic_write(path: str | Path, content: bytes | str) -> None:
@@ -77,17 +80,28 @@ def ensure_writable(folder: str | Path) -> None:
     """
     folder = Path(folder).absolute()
     made = [parent for parent in (folder, *folder.parents) if not parent.exists()]
-    probe = _name_beside(folder / "probe")
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        probe.touch()
-        probe.unlink()
+        _try_to_write(folder)
     except OSError as error:
         raise _not_written(folder, error) from error
     finally:
         for parent in made:
-            if parent.is_dir():
+            with suppress(OSError):  # another process writes there already
                 parent.rmdir()
+
+
+def _try_to_write(folder: Path) -> None:
+    """Make a folder and a file in it; another process that tries the same may remove the folder meanwhile."""
+    probe = _name_beside(folder / "probe")
+    for attempt in range(ATTEMPTS):
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            probe.touch()
+            probe.unlink()
+            return
+        except (FileNotFoundError, FileExistsError):  # removed between two calls
+            if attempt == ATTEMPTS - 1:
+                raise
 
 
 @contextmanager

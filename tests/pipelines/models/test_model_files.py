@@ -21,7 +21,7 @@ def put(folder, content, **changed):
     """Put other bytes in place of the model, with a checksum that fits them."""
     info = json.loads((folder / INFO_FILE).read_text()) | changed
     (folder / MODEL_FILE).write_bytes(content)
-    checks = ("version", "sha256", "numbers_sha256")
+    checks = ("version", "sha256", "numbers_sha256", "files_sha256")
     write_info(folder, ModelInfo.from_json({k: v for k, v in info.items() if k not in checks}))
 
 
