@@ -1,10 +1,11 @@
-"""Benchmarks of the live chain on the screen."""
+"""Benchmarks on the screen."""
 
 from __future__ import annotations
 
 from rich.console import Console
 from rich.table import Table
 
+from pipelines.bench.fleet import FleetBench
 from pipelines.bench.results import LiveBench, Soak, Spread
 from pipelines.reporting.terminal import print_lines
 
@@ -53,3 +54,33 @@ def print_soak(result: Soak, console: Console) -> None:
         *(f"not accepted: {problem}" for problem in result.problems),
     ]
     print_lines(console, lines if result.problems else [*lines, "nothing that is not accepted"])
+
+
+def print_fleet(result: FleetBench, console: Console) -> None:
+    """Print time and memory by size and number of processes, and what follows from them."""
+    table = Table(
+        "runs", "processes", "seconds", "runs/s", "CPU seconds", "peak memory", title="features of a fleet"
+    )
+    for one in result.points:
+        table.add_row(
+            str(one.n_runs),
+            str(one.n_workers),
+            f"{one.seconds:.1f}",
+            f"{one.runs_per_s:.1f}",
+            f"{one.cpu_s:.1f}",
+            f"{one.peak_mb:.0f} MB",
+        )
+    console.print(table)
+    ups = "; ".join(f"{n} processes {times:.2f} times one" for n, times in result.speed_up.items())
+    print_lines(
+        console,
+        [
+            f"time a run deviates by at most {result.nonlinearity_ratio:.1%} from that of the largest size, "
+            f"processor time a run by {result.cpu_nonlinearity_ratio:.1%}",
+            f"peak memory of all processes grows by {result.memory_growth_ratio:+.1%} "
+            "from the smallest to the largest size",
+            *([ups] if ups else []),
+            f"before: runs of {result.run_s:g} s generated in {result.generate_ms:.1f} ms each, "
+            f"all of them generated and written in {result.write_s:.1f} s",
+        ],
+    )

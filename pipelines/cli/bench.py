@@ -1,13 +1,15 @@
-"""The commands that measure the live chain and load the service: bench live, bench soak."""
+"""The commands that measure: bench live and soak the live chain and the service, bench fleet many runs."""
 
 from __future__ import annotations
 
 import typer
 
-from pipelines.bench.settings import BenchSettings, SoakSettings
+from pipelines.bench.settings import BenchSettings, FleetSettings, SoakSettings
 from pipelines.cli.command import Json, command
 
-app = typer.Typer(help="Measure the live chain and the service.", no_args_is_help=True)
+app = typer.Typer(
+    help="Measure the live chain, the service, and features of many runs.", no_args_is_help=True
+)
 
 
 @command(app, "live")
@@ -38,3 +40,17 @@ def soak_command(settings: SoakSettings, json_file: Json = None) -> None:
     write_json(json_file, result)
     if result.problems:
         raise typer.Exit(1)
+
+
+@command(app, "fleet")
+def fleet_command(settings: FleetSettings, json_file: Json = None) -> None:
+    """Measure time and memory of features against the number of runs, on a generated fleet."""
+    from pipelines.bench.fleet import bench_fleet
+    from pipelines.bench.screen import print_fleet
+    from pipelines.reporting.json_file import write_json
+    from pipelines.reporting.terminal import output_console, progress_bar
+
+    with progress_bar() as progress:
+        result = bench_fleet(settings, progress)
+    print_fleet(result, output_console())
+    write_json(json_file, result)

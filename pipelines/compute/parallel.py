@@ -59,6 +59,13 @@ def place() -> str:
     return LOCAL if cluster is None else cluster.address
 
 
+def end_processes() -> None:
+    """End the processes that local tasks left behind to be used again, with the memory they hold."""
+    from joblib.externals.loky import get_reusable_executor
+
+    get_reusable_executor().shutdown(wait=True)
+
+
 def parallel(
     function: Callable[..., Any], shared: Sequence[Any], each: Iterable[Sequence[Any]], n_jobs: int
 ) -> Iterator[Any]:
