@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import shlex
 import time
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -11,6 +13,7 @@ from pipelines.crossval.crossval import crossval
 from pipelines.crossval.settings import CrossvalSettings
 from pipelines.estimate.consistency import TerrainConsistency
 from pipelines.estimate.labelled import TerrainSlip
+from pipelines.quickstart.holding_out import divide
 from pipelines.quickstart.results import KeptRuns, QuickstartResult
 from pipelines.quickstart.settings import QuickstartSettings
 from pipelines.reporting.progress import Progress, silent
@@ -49,7 +52,8 @@ def quickstart(
     Parameters
     ----------
     settings : where runs are read, and where runs (``out/runs``) and report (``out/report.html``) go; without
-        data, runs are simulated and filtered (:mod:`pipelines.estimate.labelled`)
+        data, runs are simulated and filtered (:mod:`pipelines.estimate.labelled`); where there are enough,
+        some are held out, and these are predicted
     progress : called as the work goes on
     evaluation : how the recipe is evaluated; ``settings.evaluation`` by default
     runs_a_terrain : simulated runs of each terrain
@@ -73,12 +77,13 @@ def quickstart(
     )
     _refuse_other_runs(runs, data, out / "runs")
     dataset = SIMULATED if data is None else data.resolve().name
-    report = crossval(runs, evaluation, progress).named(dataset, data_digest(runs))
+    training, held_out = divide(runs)
+    report = crossval(training, evaluation, progress).named(dataset, data_digest(training))
     imported = _keep(runs, data, out / "runs", progress)
-    trained = train(runs, settings.training(evaluation), dataset, progress, evaluation=report)
+    trained = train(training, settings.training(evaluation), dataset, progress, evaluation=report)
     model_uri = trained.registered.model_uri
     progress("predict", 0, 1)
-    predicted = predict(runs, load_model(model_uri), load_slip_table())
+    predicted = predict(held_out or runs, load_model(model_uri), load_slip_table())
     progress("predict", 1, 1)
     result = QuickstartResult(
         dataset=dataset,
@@ -91,7 +96,8 @@ def quickstart(
         imported=imported,
         slip=slip,
         consistency=consistency,
-        commands=_commands(settings, evaluation.seed, model_uri, runs_a_terrain),
+        commands=_commands(settings, evaluation.seed, model_uri, runs_a_terrain, held_out),
+        held_out=tuple(run.run_id for run in held_out),
         report=out / REPORT_FILE,
         created=datetime.now(UTC).isoformat(timespec="seconds"),
         elapsed_s=time.monotonic() - began_s,
@@ -117,10 +123,16 @@ def _simulated(evaluation: CrossvalSettings, runs_a_terrain: int | None, progres
 
 
 def _commands(
-    settings: QuickstartSettings, seed: int, model_uri: str, runs_a_terrain: int | None
+    settings: QuickstartSettings,
+    seed: int,
+    model_uri: str,
+    runs_a_terrain: int | None,
+    held_out: Sequence[RunLog],
 ) -> tuple[str, ...]:
     """Return what to type for the same, step by step."""
     data, steps = settings.data, []
+    names = shlex.quote(",".join(run.run_id for run in held_out))
+    without, only = (f" --without {names}", f" --only {names}") if held_out else ("", "")
     if data is None:
         from pipelines.estimate.labelled import FILTER, ROBOT, RUNS_A_TERRAIN, SCENARIO
 
@@ -132,9 +144,9 @@ def _commands(
         ]
     return (
         *steps,
-        f"terrain crossval --data {data} --protocol grouped --seed {seed}",
-        f"terrain train --data {data} --name {settings.name} --seed {seed}",
-        f"terrain predict --model {model_uri} --data {data}",
+        f"terrain crossval --data {data} --protocol grouped --seed {seed}{without}",
+        f"terrain train --data {data} --name {settings.name} --seed {seed}{without}",
+        f"terrain predict --model {model_uri} --data {data}{only}",
     )
 
 

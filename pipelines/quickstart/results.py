@@ -44,6 +44,8 @@ class QuickstartResult:
     commands : what to type for the same, step by step
     report : file of the page
     created, elapsed_s : when the work was done, and how long it took
+    held_out : runs that are predicted and that the model was neither evaluated nor trained on; none where the
+        runs were too few
     """
 
     dataset: str
@@ -60,6 +62,7 @@ class QuickstartResult:
     report: Path
     created: str
     elapsed_s: float
+    held_out: tuple[str, ...] = ()
 
     def as_json(self) -> dict[str, Any]:
         """Return all fields; the evaluation is given once, beside the training."""

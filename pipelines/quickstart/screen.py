@@ -24,8 +24,25 @@ def print_quickstart(result: QuickstartResult, console: Console) -> None:
         print_consistency(result.consistency, console)
     print_crossval(result.crossval, console)
     print_training(result.train, console)
+    print_lines(console, [held_out_sentence(result.held_out)])
     print_predictions(result.predict, console)
     print_lines(console, [f"report: {result.report}"])
+
+
+def held_out_sentence(held_out: Sequence[str]) -> str:
+    """Return which runs are predicted.
+
+    Examples
+    --------
+    >>> held_out_sentence(["ICE_07"])
+    'predictions are those of ICE_07, held out: the model was neither trained nor evaluated on them'
+    """
+    if not held_out:
+        return "the runs are too few to hold one out: predictions are those of training runs"
+    return (
+        f"predictions are those of {', '.join(held_out)}, held out: the model was neither trained nor "
+        "evaluated on them"
+    )
 
 
 def print_slip(rows: Sequence[TerrainSlip], console: Console) -> None:

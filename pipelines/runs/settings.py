@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 from pydantic import field_validator
 
 from pipelines.config.settings import Settings, setting
+from terrain.errors import ConfigError
+from terrain.files.names import listed, shown
 
 if TYPE_CHECKING:
     from terrain.records import RunLog
@@ -45,9 +47,11 @@ class RunsSettings(ReadSettings):
 
 
 class AlignedRunsSettings(RunsSettings):
-    """The runs of a command that can also bring their two loggers onto one clock."""
+    """The runs of a command that can choose among them, and bring their two loggers onto one clock."""
 
     robot: str | None = setting(None, ROBOT_TEXT)
+    only: tuple[str, ...] = setting((), "Ids of the runs to use, by commas; all by default.", separated=True)
+    without: tuple[str, ...] = setting((), "Ids of runs to leave out, by commas.", separated=True)
     align: bool = setting(False, "Bring the wheel stream onto the IMU's clock where both see the turns.")
 
 
@@ -96,7 +100,25 @@ def load(settings: RunsSettings, robot: str | None = None) -> LoadedRuns:
         robot=getattr(settings, "robot", None) if robot is None else robot,
         on_skip=skipped.append,
     )
+    if isinstance(settings, AlignedRunsSettings):
+        runs = _chosen(runs, settings)
     return LoadedRuns(runs, skipped)
+
+
+def _chosen(runs: list[RunLog], settings: AlignedRunsSettings) -> list[RunLog]:
+    known = [run.run_id for run in runs]
+    for option, names in (("--only", settings.only), ("--without", settings.without)):
+        for name in names:
+            if name not in known:
+                raise ConfigError(f"{option}: there is no run {shown(name)}; there are {listed(known)}")
+    chosen = [
+        run
+        for run in runs
+        if (not settings.only or run.run_id in settings.only) and run.run_id not in settings.without
+    ]
+    if not chosen:
+        raise ConfigError("--only and --without leave no run")
+    return chosen
 
 
 class SimulateSettings(Settings):
