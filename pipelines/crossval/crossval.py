@@ -21,6 +21,7 @@ from pipelines.crossval.splits import (
     grouped_samples,
     published_samples,
 )
+from pipelines.crossval.stiffness import stiffness_figures
 from pipelines.models.recipes import WindowPipeline, feature_matrix
 from pipelines.reporting.numbers import format_counts
 from pipelines.reporting.progress import Progress, silent
@@ -47,11 +48,13 @@ def crossval(
     progress("features", 1, 1)
     examples = examples_of(features, samples)
     results = fit_folds(recipe[-1], examples, folds, settings.jobs, settings.protocol, progress)
-    figures = summarise(pool(results, examples.terrain), samples, settings.seed)
+    held_out = pool(results, examples.terrain)
+    figures = summarise(held_out, samples, settings.seed)
     extras = None
     if settings.extras and settings.protocol == "grouped":
         first = [fold for fold in folds if fold.repeat == 0]
         extras = _extras(recipe, features, samples, first, figures.accuracy_per_repeat[0], settings, progress)
+        extras = extras._replace(stiffness=stiffness_figures(held_out, features, samples, settings.seed))
     repaired = dict(sum((Counter(run.dropped) for run in runs), Counter()))
     published = settings.protocol == "published"
     return CrossvalReport(

@@ -5,9 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from enum import StrEnum
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from terrain.classify.metrics import ClassFigures, ReliabilityBin, RunFigures
+
+if TYPE_CHECKING:
+    from pipelines.crossval.stiffness import StiffnessFigures
 
 
 class FoldFigures(NamedTuple):
@@ -72,11 +75,16 @@ class LearningCurve(NamedTuple):
 
 
 class Extras(NamedTuple):
-    """What the headline figure does not show; ``speed_only_accuracy`` is None without wheel speeds."""
+    """What the headline figure does not show.
+
+    ``speed_only_accuracy`` is None without wheel speeds, ``stiffness`` where the stiffness of a class is not
+    known.
+    """
 
     speed_only_accuracy: float | None
     slow_fast: SlowFast
     learning_curve: LearningCurve
+    stiffness: StiffnessFigures | None = None
 
 
 @dataclass(frozen=True, slots=True)
