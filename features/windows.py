@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from terrain.errors import ConfigError, DataError
+from terrain.logs.plausible import refuse_implausible, usable_rows
 from terrain.logs.schema import SIGNAL_SETS, signal_set_of
 from terrain.records import Array, RunLog, Stream, Windows
 
@@ -211,7 +212,7 @@ def cut_at(
         order = [stream.channels.index(channel) for channel in channels]
         samples = stream.values[:, order]
         gaps_before = np.concatenate(([0], np.cumsum(np.diff(stream.time_s) > limit_s)))
-        bad = ~np.isfinite(samples).all(axis=1) & (name not in NAN_TOLERANT_STREAMS)
+        bad = ~usable_rows(samples, unknown_is_a_value=name in NAN_TOLERANT_STREAMS)
         bad_before = np.concatenate(([0], np.cumsum(bad)))
         has_gap = (gaps_before[first + n - 1] > gaps_before[first]) | (
             stream.time_s[first] - starts_s > limit_s
@@ -316,7 +317,7 @@ def cut_windows(
     Raises
     ------
     DataError
-        if a run lacks a channel, has another rate, or is shorter than a window.
+        if a run lacks a channel, has another rate or an implausible value, or is shorter than a window.
 
     Examples
     --------
@@ -328,11 +329,9 @@ def cut_windows(
     (2, (2, 2, 20), ['grass', 'grass'])
     """
     rule = WindowRule() if rule is None else rule
-    if layout is None:
-        layout = layout_of(runs)
-    else:
-        for run in runs:
-            check_layout(run, layout)
+    layout = layout_of(runs) if layout is None else layout
+    for run in runs:
+        check_layout(run, layout)
     fastest_s = 1 / max(layout.rate_hz.values())
     if starts_s is None and rule.step_s < (1 - MAX_RATE_DEVIATION) * fastest_s:
         raise ConfigError(
@@ -342,6 +341,7 @@ def cut_windows(
     parts = [_no_windows(rule, layout)]
     dropped: Counter[str] = Counter()
     for run in runs:
+        refuse_implausible(run, layout.channels)
         begin_s, end_s = span_of(run, layout)
         if end_s - begin_s + TIME_TOLERANCE_S < rule.length_s:
             if not skip_short:

@@ -1,4 +1,4 @@
-"""Commands of terrain classification: crossval, train, predict."""
+"""Commands of terrain classification: crossval, compare, train, predict."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import typer
 
 from pipelines.classify.settings import PredictSettings, TrainSettings
 from pipelines.cli.command import Json, command
+from pipelines.compare.settings import CompareSettings
+from pipelines.compute.settings import ComputeSettings
 from pipelines.crossval.settings import CrossvalSettings
 from pipelines.runs.settings import AlignedRunsSettings, load
 
@@ -13,10 +15,16 @@ app = typer.Typer()
 
 
 @command(app, "crossval")
-def crossval_command(source: AlignedRunsSettings, settings: CrossvalSettings, json_file: Json = None) -> None:
+def crossval_command(
+    source: AlignedRunsSettings,
+    settings: CrossvalSettings,
+    compute: ComputeSettings,
+    json_file: Json = None,
+) -> None:
     """Evaluate a recipe on held-out runs."""
     from dataclasses import replace
 
+    from pipelines.compute.parallel import computing
     from pipelines.crossval.crossval import crossval
     from pipelines.crossval.screen import print_crossval
     from pipelines.reporting.json_file import write_json
@@ -24,26 +32,54 @@ def crossval_command(source: AlignedRunsSettings, settings: CrossvalSettings, js
     from pipelines.runs.datasets import data_digest
 
     runs, skipped = load(source)
-    with progress_bar() as progress:
+    with computing(compute.compute), progress_bar() as progress:
         report = crossval(runs, settings.with_(skip_short=source.repair), progress)
     report = replace(report.named(source.dataset, data_digest(runs)), skipped=tuple(skipped))
     print_crossval(report, output_console())
     write_json(json_file, report)
 
 
+@command(app, "compare")
+def compare_command(source: AlignedRunsSettings, settings: CompareSettings, json_file: Json = None) -> None:
+    """Compare two recipes or models on held-out runs."""
+    from pipelines.compare.compare import compare_models, compare_recipes
+    from pipelines.compare.screen import print_compare
+    from pipelines.reporting.json_file import write_json
+    from pipelines.reporting.terminal import output_console, progress_bar
+
+    runs, _ = load(source)
+    asked = settings.with_(skip_short=source.repair)
+    if settings.contenders is not None:
+        with progress_bar() as progress:
+            report = compare_recipes(runs, settings.contenders, asked, source.dataset, progress)
+    else:
+        from pipelines.models.tracking import load_model
+
+        models = load_model(settings.a), load_model(settings.b)
+        report = compare_models(runs, models, asked, source.dataset)
+    print_compare(report, output_console())
+    write_json(json_file, report)
+
+
 @command(app, "train")
-def train_command(source: AlignedRunsSettings, settings: TrainSettings, json_file: Json = None) -> None:
+def train_command(
+    source: AlignedRunsSettings,
+    settings: TrainSettings,
+    compute: ComputeSettings,
+    json_file: Json = None,
+) -> None:
     """Evaluate on held-out runs, fit on all of them, track in MLflow and register."""
     from dataclasses import replace
 
     from pipelines.classify.screen import print_training
     from pipelines.classify.train import train
+    from pipelines.compute.parallel import computing
     from pipelines.crossval.screen import print_crossval
     from pipelines.reporting.json_file import write_json
     from pipelines.reporting.terminal import output_console, progress_bar
 
     runs, skipped = load(source)
-    with progress_bar() as progress:
+    with computing(compute.compute), progress_bar() as progress:
         found = train(runs, settings.with_(skip_short=source.repair), source.dataset, progress)
     result = replace(found, skipped=tuple(skipped))
     print_crossval(replace(result.crossval, skipped=result.skipped), output_console())

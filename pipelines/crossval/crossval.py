@@ -25,8 +25,10 @@ from pipelines.crossval.stiffness import stiffness_figures
 from pipelines.models.recipes import WindowPipeline, feature_matrix
 from pipelines.reporting.numbers import format_counts
 from pipelines.reporting.progress import Progress, silent
+from pipelines.runs.duplicates import distinct_runs
 from terrain.classify.folds import single_run_classes
-from terrain.records import Array, RunLog
+from terrain.errors import DataError
+from terrain.records import Array, RunLog, Windows
 
 
 def crossval(
@@ -101,15 +103,37 @@ def _extras(
 
 
 def samples_of(runs: Sequence[RunLog], settings: CrossvalSettings) -> Samples:
-    """Cut the windows that the protocol asks for."""
+    """Cut the windows that the protocol asks for.
+
+    Raises
+    ------
+    DataError
+        if runs hold the same measurements and are not to be merged, or the data do not fit the protocol.
+    """
+    distinct = distinct_runs(runs, merge=settings.merge_duplicates)
     if settings.protocol == "published":
-        return published_samples(runs, settings.rule, settings.signal_sets)
-    return grouped_samples(runs, settings.rule, settings.signal_sets, skip_short=settings.skip_short)
+        samples = published_samples(distinct.runs, settings.rule, settings.signal_sets)
+    else:
+        samples = grouped_samples(
+            distinct.runs, settings.rule, settings.signal_sets, skip_short=settings.skip_short
+        )
+    _refuse_constant(samples.cut.windows)
+    return samples._replace(merged=distinct.merged)
+
+
+def _refuse_constant(windows: Windows) -> None:
+    if not any((values != values[:1, :, :1]).any() for values in windows.values.values()):
+        streams = " and ".join(repr(name) for name in windows.values)
+        raise DataError(f"no channel of the streams {streams} ever varies: nothing can be learned from them")
 
 
 def notes(samples: Samples, settings: CrossvalSettings, repaired: Mapping[str, int]) -> list[str]:
     """Return in sentences what a reader of the figures must know."""
-    sentences = []
+    sentences = [
+        f"runs {', '.join(group)} hold the same measurements: they are one run, in which each stretch "
+        "counts once"
+        for group in samples.merged
+    ]
     windows = samples.cut.windows
     alone = single_run_classes(windows.terrain.astype(str), windows.run_id.astype(str))
     if alone and settings.protocol != "published":

@@ -6,15 +6,16 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from joblib import Parallel, delayed
 from sklearn.base import BaseEstimator, clone
 
+from pipelines.compute.parallel import parallel
 from pipelines.crossval.results import Figures, FoldFigures
 from pipelines.crossval.splits import Fold, Samples
 from pipelines.reporting.progress import Progress, silent
+from terrain.classify.confidence import confidence_figures
 from terrain.classify.metrics import (
-    calibration,
     class_figures,
+    macro_run_accuracy,
     per_run_figures,
     run_bootstrap,
     runs_by_terrain,
@@ -86,14 +87,14 @@ def fit_folds(
     classifier : estimator with ``fit(X, y, groups)`` and ``predict_proba``
     examples : rows that the folds number
     folds : train and test rows
-    n_jobs : processes at once
+    n_jobs : processes at once on this machine, see :func:`pipelines.compute.parallel.parallel`
     task, progress : name of the work, and what is called as it goes on
     """
     classes = np.unique(examples.terrain)
-    jobs = (delayed(_fit_fold)(classifier, examples, classes, fold) for fold in folds)
     results = []
     progress(task, 0, len(folds))
-    for result in Parallel(n_jobs=max(min(n_jobs, len(folds)), 1), return_as="generator")(jobs):
+    each = ((fold,) for fold in folds)
+    for result in parallel(_fit_fold, (classifier, examples, classes), each, min(n_jobs, len(folds))):
         results.append(result)
         progress(task, len(results), len(folds))
     return results
@@ -134,7 +135,8 @@ def summarise(held_out: HeldOut, samples: Samples, seed: int) -> Figures:
     pooled = class_figures(np.tile(terrain, len(predicted)), predicted.ravel(), classes)
     accuracies = np.array([repeat.accuracy for repeat in repeats])
     confidence = held_out.probability.max(axis=2)
-    calibrated = [calibration(c, right) for c, right in zip(confidence, correct, strict=True)]
+    stated = confidence_figures(confidence, correct, run_id, terrain, np.random.default_rng(seed))
+    per_run = per_run_figures(correct, predicted[0], voted == terrain, run_id, terrain)
     return Figures(
         classes=tuple(str(name) for name in classes),
         n_windows=len(terrain),
@@ -146,12 +148,17 @@ def summarise(held_out: HeldOut, samples: Samples, seed: int) -> Figures:
         accuracy_ci=run_bootstrap(correct.mean(axis=0), run_id, terrain, np.random.default_rng(seed)),
         balanced_accuracy=float(np.mean([repeat.balanced_accuracy for repeat in repeats])),
         macro_f1=float(np.mean([repeat.macro_f1 for repeat in repeats])),
+        macro_run_accuracy=macro_run_accuracy(per_run),
         per_class=pooled.per_class,
         confusion=pooled.confusion,
         vote_accuracy=float(np.mean(voted == terrain)),
-        ece=float(np.mean([figures.ece for figures in calibrated])),
-        reliability=calibration(confidence.ravel(), correct.ravel()).reliability,
-        per_run=per_run_figures(correct, predicted[0], voted == terrain, run_id, terrain),
+        ece=stated.ece,
+        ece_ci=stated.ece_ci,
+        confidence_auc=stated.auc,
+        confidence_auc_ci=stated.auc_ci,
+        accuracy_at_coverage=stated.at_coverage,
+        reliability=stated.reliability,
+        per_run=per_run,
         folds=tuple(
             FoldFigures(
                 result.fold.repeat,

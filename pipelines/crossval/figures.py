@@ -108,12 +108,14 @@ def _cell(axes: Axes, row: int, column: int, ratio: float, count: float, k: int)
 
 
 def reliability_figure(report: CrossvalReport) -> Figure:
-    """Draw the accuracy against the probability of the predicted class, in bins of equal mass."""
+    """Draw accuracy against the probability of the predicted class in bins of equal mass; bars are 95 %."""
     table = report.reliability
     confidence = np.array([row.confidence for row in table])
     accuracy = np.array([row.accuracy for row in table])
+    interval = np.array([row.accuracy_ci for row in table])
     gap = accuracy - confidence
-    low = max(np.floor(20 * (min(confidence.min(), accuracy.min()) - 0.01)) / 20, 0.0)
+    least = float(np.nanmin([*confidence, *accuracy, *interval[:, 0]]))
+    low = max(np.floor(20 * (least - 0.01)) / 20, 0.0)
     with styled():
         figure = new_figure(5.6, 5.4)
         axes, strip = figure.subplots(2, 1, sharex=True, height_ratios=[12, 1])
@@ -122,6 +124,7 @@ def reliability_figure(report: CrossvalReport) -> Figure:
             (gap >= 0, BLUE, "under-confident"),
             (gap < 0, VERMILION, "over-confident"),
         ):
+            axes.vlines(confidence[side], *interval[side].T, color=colour, lw=5, alpha=0.15)
             axes.vlines(confidence[side], confidence[side], accuracy[side], color=colour, lw=1.5, alpha=0.6)
             axes.plot(confidence[side], accuracy[side], "o", color=colour, ms=6, label=label)
         axes.set(xlim=(low, 1.005), ylim=(low, 1.005))

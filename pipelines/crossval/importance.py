@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from joblib import Parallel, delayed
 from sklearn.base import BaseEstimator
 
+from pipelines.compute.parallel import parallel
 from pipelines.crossval.evaluation import Examples, fit_on
 from pipelines.crossval.results import ChannelImportance
 from pipelines.crossval.splits import Fold
@@ -62,10 +62,10 @@ def channel_importance(
     one a channel, the largest drop first
     """
     channels = np.array([channel_of(name) for name in names])
-    jobs = (delayed(_fold_drops)(classifier, examples, channels, fold, seed) for fold in folds)
     drops = []
     progress("importance", 0, len(folds))
-    for drop in Parallel(n_jobs=min(n_jobs, len(folds)), return_as="generator")(jobs):
+    each = ((fold, seed) for fold in folds)
+    for drop in parallel(_fold_drops, (classifier, examples, channels), each, min(n_jobs, len(folds))):
         drops.append(drop)
         progress("importance", len(drops), len(folds))
     table = np.array(drops)

@@ -7,7 +7,8 @@ from dataclasses import dataclass, fields, replace
 from enum import StrEnum
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from terrain.classify.metrics import ClassFigures, ReliabilityBin, RunFigures
+from terrain.classify.confidence import CoverageFigures, ReliabilityBin
+from terrain.classify.metrics import ClassFigures, RunFigures
 
 if TYPE_CHECKING:
     from pipelines.crossval.stiffness import StiffnessFigures
@@ -92,7 +93,8 @@ class Figures:
     """Figures of merit of a cross-validation, means over the repeats.
 
     ``accuracy_spread`` is the standard deviation over the repeats (None with a single one), ``accuracy_ci``
-    the 95 % interval by bootstrap over runs within classes; ``confusion``, ``per_class`` and
+    the 95 % interval by bootstrap over runs within classes, as every ``_ci``; ``confidence_auc`` is the area
+    under the curve from confidence to correctness, NaN where all are right; ``confusion``, ``per_class`` and
     ``reliability`` count all repeats together.
     """
 
@@ -106,10 +108,15 @@ class Figures:
     accuracy_ci: tuple[float, float]
     balanced_accuracy: float
     macro_f1: float
+    macro_run_accuracy: float
     per_class: Mapping[str, ClassFigures]
     confusion: tuple[tuple[int, ...], ...]
     vote_accuracy: float
     ece: float
+    ece_ci: tuple[float, float]
+    confidence_auc: float
+    confidence_auc_ci: tuple[float, float]
+    accuracy_at_coverage: tuple[CoverageFigures, ...]
     reliability: tuple[ReliabilityBin, ...]
     per_run: tuple[RunFigures, ...]
     folds: tuple[FoldFigures, ...]

@@ -27,7 +27,9 @@ def print_crossval(report: CrossvalReport, console: Console) -> None:
         (
             f"accuracy {percent(report.accuracy)} (95 % over runs: {low:.1%} to {high:.1%}{repeats})",
             f"balanced accuracy {percent(report.balanced_accuracy)}, macro F1 {report.macro_f1:.3f}, "
-            f"vote over 5 s {percent(report.vote_accuracy)}, calibration error {report.ece:.3f}",
+            f"mean over classes then runs {percent(report.macro_run_accuracy)}, "
+            f"vote over 5 s {percent(report.vote_accuracy)}",
+            _confidence_line(report),
         ),
     )
     table = Table("terrain", "windows", "precision", "recall", "F1", title="per class, all repeats together")
@@ -37,6 +39,18 @@ def print_crossval(report: CrossvalReport, console: Console) -> None:
     if report.extras is not None:
         print_lines(console, _extras_lines(report.extras))
     print_lines(console, (f"note: {note}" for note in (*report.notes, *(report.skipped or ()))))
+
+
+def _confidence_line(report: CrossvalReport) -> str:
+    """Return how the probability of the predicted class relates to whether it is right."""
+    area, (low, high) = report.confidence_auc, report.confidence_auc_ci
+    ranked = f"area {area:.2f} ({low:.2f} to {high:.2f})" if area == area else "all alike right or wrong"
+    most_confident = "; ".join(
+        f"the most confident {row.coverage:.0%} are right in {percent(row.accuracy)} "
+        f"({row.accuracy_ci[0]:.1%} to {row.accuracy_ci[1]:.1%})"
+        for row in report.accuracy_at_coverage
+    )
+    return f"from confidence to correctness: {ranked}; {most_confident}; calibration error {report.ece:.3f}"
 
 
 def _extras_lines(extras: Extras) -> Iterator[str]:

@@ -40,6 +40,9 @@ class RecipeSettings(Settings):
     repeats: int | None = setting(None, "Fold assignments (5).", ge=1)
     seed: int = setting(0, "Deals runs into folds.", ge=0)
     n_jobs: int = setting(0, "Processes at once; 0 for one a core.", "--jobs", ge=0)
+    merge_duplicates: bool = setting(
+        False, "Treat runs that hold the same measurements as one run instead of refusing them."
+    )
     skip_short: bool = setting(False, "Leave out and count runs shorter than a window.", option="")
 
     @model_validator(mode="after")

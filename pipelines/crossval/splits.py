@@ -47,12 +47,14 @@ class Fold(NamedTuple):
 class Samples(NamedTuple):
     """Windows, and what protocols need besides.
 
-    ``group`` is what must not be split: the run, or the partition under ``published``.
+    ``group`` is what must not be split: the run, or the partition under ``published``.  ``merged`` has the
+    ids of runs that hold the same measurements and were made one.
     """
 
     cut: WindowCut
     group: Array
     gap: int
+    merged: tuple[tuple[str, ...], ...] = ()
 
 
 def grouped_samples(

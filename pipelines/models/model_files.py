@@ -28,7 +28,9 @@ if TYPE_CHECKING:
 
 MODEL_FILE = "model.skops"
 INFO_FILE = "terrain_model.json"
-INFO_VERSION = 1
+INFO_VERSION = 2
+"""1: probabilities of votes of the pairs of classes; 2: of their margins."""
+
 INFO_KEYS = {"window_s", "stride_s", "steady", "classes", "channels", "rate_hz", "run_digests"}
 
 MAX_MODEL_BYTES = 256 * MEBIBYTE

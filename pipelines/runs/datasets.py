@@ -8,7 +8,7 @@ import logging
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -98,6 +98,55 @@ def load_runs(
             raise LogError(f"{folder}: {len(found)} runs have the id {run_id!r} ({' and '.join(found)})")
     runs = sorted((_with_wheel_speeds(run, described) for run in runs), key=lambda run: run.run_id)
     return [_aligned(run, described) for run in runs] if align else runs
+
+
+class RunLoader(NamedTuple):
+    """Reads one run of a data set as :func:`load_runs` gives it; it can be sent to another process.
+
+    Parameters
+    ----------
+    read : reader of the layout
+    repair, align : as :func:`load_runs`
+    robot : description of the robot that is named; None where none is
+    """
+
+    read: Callable[..., RunLog]
+    repair: bool
+    align: bool
+    robot: Robot | None
+
+    def __call__(self) -> RunLog:
+        """Return the run; errors as :func:`load_runs`."""
+        run = _with_wheel_speeds(self.read(repair=self.repair), self.robot)
+        return _aligned(run, self.robot) if self.align else run
+
+    @property
+    def plain_folder(self) -> Path | None:
+        """The run folder that is given as it is stored; None of other layouts and of what is changed."""
+        first = getattr(self.read, "args", (None,))[0]
+        plain = isinstance(first, Path) and (first / "run.json").is_file()
+        return first if plain and not (self.repair or self.align) else None
+
+
+def run_loaders(
+    folder: str | Path,
+    *,
+    layout: str = "auto",
+    mapping: str | Path | None = None,
+    repair: bool = False,
+    align: bool = False,
+    robot: str | Path | None = None,
+) -> list[RunLoader]:
+    """Return what reads each run under a folder, without reading any; parameters as :func:`load_runs`.
+
+    Raises
+    ------
+    LogError, ConfigError
+        as :func:`load_runs`, where no run is found or a setting is not accepted.
+    """
+    described = _described(robot)
+    readers = _readers(Path(folder).resolve(), layout, mapping, described)
+    return [RunLoader(read, repair, align, described) for read in readers]
 
 
 def data_digest(runs: Sequence[RunLog]) -> str:

@@ -11,6 +11,7 @@ from pipelines.runs.datasets import data_digest
 from pipelines.runs.results import Imported
 from pipelines.runs.settings import ImportSettings, load
 from terrain.errors import LogError
+from terrain.logs.duplicates import shared_stretches
 from terrain.logs.write import run_folder, write_run
 
 
@@ -53,4 +54,5 @@ def import_logs(settings: ImportSettings, progress: Progress = silent) -> Import
         dropped=dict(sorted(dropped.items())),
         skipped=tuple(skipped),
         digest=data_digest(runs),
+        duplicates=shared_stretches(runs),
     )

@@ -7,6 +7,7 @@ from pipelines.runs.results import InspectedRun, Inspection
 from pipelines.runs.settings import RunsSettings, load
 from terrain.errors import ConfigError, DataError
 from terrain.logs.clock import estimate_clock
+from terrain.logs.duplicates import shared_stretches
 from terrain.logs.quality import stream_quality
 from terrain.records import RunLog
 from terrain.robots import Robot, load_robot
@@ -24,7 +25,7 @@ def inspect_logs(settings: RunsSettings) -> Inspection:
     given = getattr(settings, "robot", None)
     robot = None if given is None else load_robot(given)
     inspected = tuple(_inspected(run, robot) for run in runs)
-    return Inspection(len(runs), data_digest(runs), tuple(skipped), inspected)
+    return Inspection(len(runs), data_digest(runs), tuple(skipped), inspected, shared_stretches(runs))
 
 
 def _inspected(run: RunLog, robot: Robot | None) -> InspectedRun:

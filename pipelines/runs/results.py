@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from terrain.logs.clock import ClockEstimate
+from terrain.logs.duplicates import SharedStretch
 from terrain.logs.quality import StreamQuality
 
 
@@ -23,6 +24,7 @@ class Imported:
     dropped : what a repairing reader dropped, as counts by kind
     skipped : a sentence for each run that could not be read
     digest : of all runs
+    duplicates : stretches that two of the runs share
     """
 
     out: Path
@@ -32,6 +34,7 @@ class Imported:
     dropped: Mapping[str, int]
     skipped: tuple[str, ...]
     digest: str
+    duplicates: tuple[SharedStretch, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,9 +73,14 @@ def _stream_json(quality: StreamQuality) -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True)
 class Inspection:
-    """The quality of all runs; ``skipped`` has a sentence for each run that could not be read."""
+    """The quality of all runs.
+
+    ``skipped`` has a sentence for each run that could not be read, ``duplicates`` the stretches that two
+    runs share.
+    """
 
     n_runs: int
     digest: str
     skipped: tuple[str, ...]
     runs: tuple[InspectedRun, ...]
+    duplicates: tuple[SharedStretch, ...] = ()

@@ -9,6 +9,7 @@ from rich.table import Column, Table
 
 from pipelines.reporting.numbers import format_counts
 from pipelines.reporting.terminal import print_lines
+from pipelines.runs.duplicates import sentences
 from pipelines.runs.results import Imported, Inspection
 from terrain.logs.clock import ClockEstimate
 
@@ -30,6 +31,7 @@ def print_import(result: Imported, console: Console) -> None:
     print_lines(console, (f"skipped: {sentence}" for sentence in result.skipped))
     counts = f", {format_counts(result.dropped)}" if result.dropped else ""
     print_lines(console, [f"{result.n_runs} runs written to {result.out}{counts}"])
+    print_lines(console, sentences(result.duplicates))
 
 
 def print_inspection(result: Inspection, console: Console) -> None:
@@ -55,6 +57,7 @@ def print_inspection(result: Inspection, console: Console) -> None:
             console.print(f"{run.run_id}: dropped {format_counts(run.dropped)}")
     for sentence in result.skipped:
         console.print(sentence)
+    print_lines(console, sentences(result.duplicates))
 
 
 def _clock_text(clock: ClockEstimate | None) -> str:

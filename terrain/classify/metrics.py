@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -10,7 +11,6 @@ from sklearn.metrics import confusion_matrix, precision_recall_fscore_support
 from terrain.bootstrap import bootstrap_rows, percentile_interval
 from terrain.records import Array
 
-CALIBRATION_BINS = 15
 VOTE_SPAN_S = 5.0
 INTERVAL = 0.95
 N_BOOTSTRAP = 2000
@@ -34,21 +34,6 @@ class Classification(NamedTuple):
     macro_f1: float
     per_class: dict[str, ClassFigures]
     confusion: tuple[tuple[int, ...], ...]
-
-
-class ReliabilityBin(NamedTuple):
-    """Mean confidence and accuracy of a bin of windows."""
-
-    confidence: float
-    accuracy: float
-    n_windows: int
-
-
-class Calibration(NamedTuple):
-    """Expected calibration error, and the bins that it is a mean over."""
-
-    ece: float
-    reliability: tuple[ReliabilityBin, ...]
 
 
 class RunFigures(NamedTuple):
@@ -90,33 +75,6 @@ def class_figures(y: Array, predicted: Array, classes: Array) -> Classification:
         },
         confusion=tuple(map(tuple, confusion_matrix(y, predicted, labels=classes).tolist())),
     )
-
-
-def calibration(confidence: Array, correct: Array, n_bins: int = CALIBRATION_BINS) -> Calibration:
-    """Return the expected calibration error of the top label over bins of equal mass.
-
-    ``ece = sum_b n_b / n |accuracy_b - confidence_b|`` with the windows sorted by confidence and cut into
-    ``n_bins`` bins of equal count (Guo et al. 2017, eq. 3, equal mass instead of equal width).
-
-    Parameters
-    ----------
-    confidence : (n,) probability of the predicted class
-    correct : (n,) whether the prediction is right
-    n_bins : number of bins; fewer where there are fewer windows
-
-    Examples
-    --------
-    >>> calibration(np.full(100, 0.9), np.arange(100) < 60, 1).ece
-    0.3
-    """
-    order = np.argsort(confidence, kind="stable")
-    bins = tuple(
-        ReliabilityBin(float(confidence[part].mean()), float(correct[part].mean()), len(part))
-        for part in np.array_split(order, n_bins)
-        if len(part)
-    )
-    ece = sum(each.n_windows * abs(each.accuracy - each.confidence) for each in bins) / len(order)
-    return Calibration(round(float(ece), 12), bins)
 
 
 def vote(
@@ -216,3 +174,19 @@ def per_run_figures(
             )
         )
     return tuple(figures)
+
+
+def macro_run_accuracy(runs: Iterable[RunFigures]) -> float:
+    """Return the mean over classes of the mean accuracy of their runs, whatever their numbers of windows.
+
+    Examples
+    --------
+    >>> runs = [RunFigures("a", "ice", 90, 1.0, 1.0, None), RunFigures("b", "ice", 10, 0.5, 0.5, "snow"),
+    ...         RunFigures("c", "snow", 5, 0.25, 0.25, "ice")]
+    >>> macro_run_accuracy(runs)
+    0.5
+    """
+    of_class: dict[str, list[float]] = {}
+    for run in runs:
+        of_class.setdefault(run.terrain, []).append(run.accuracy)
+    return float(np.mean([np.mean(accuracies) for accuracies in of_class.values()]))

@@ -5,9 +5,9 @@ Hyper-parameters chosen, or probabilities calibrated, on folds that split runs a
 here the inner folds are made of whole groups wherever a class has more than one.
 
 Steps of ``fit``: scale and select on each inner training part, fit every candidate there, keep the
-candidate with the best accuracy on the held-out parts; its held-out decision values d give the
-temperature T of ``p = softmax(d / T)`` that makes them most likely (Guo et al. 2017, section 4.2), which
-sets the confidence and never changes the predicted class; scale, select and fit once more on everything.
+candidate with the best accuracy on the held-out parts; its held-out margins of pairs of classes give the one
+scale of :mod:`terrain.classify.coupling` that makes the true classes most likely; scale, select and fit once
+more on everything.
 """
 
 from __future__ import annotations
@@ -17,18 +17,16 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.optimize import minimize_scalar
-from scipy.special import log_softmax, softmax
 from sklearn.base import BaseEstimator, ClassifierMixin
 from sklearn.feature_selection import SelectPercentile, VarianceThreshold, f_classif
 from sklearn.impute import SimpleImputer
-from sklearn.metrics import accuracy_score
 from sklearn.pipeline import Pipeline
 from sklearn.preprocessing import FunctionTransformer, StandardScaler
 from sklearn.svm import SVC
 from sklearn.utils.multiclass import check_classification_targets
 from sklearn.utils.validation import check_is_fitted, validate_data
 
+from terrain.classify.coupling import class_probabilities, fit_scale, pairs_of, probabilities_of_known
 from terrain.classify.folds import block_groups, split_runs
 from terrain.classify.svm_numbers import SvmNumbers
 from terrain.errors import DataError
@@ -36,9 +34,6 @@ from terrain.records import Array
 
 CLIP_STD = 5.0
 """Scaled features are clipped here, so that one faulty sample cannot move a window far from all others."""
-
-LOG_TEMPERATURE_BOUNDS = (-4.0, 4.0)
-"""Decision values lie within about +-k for k classes: beyond these bounds probabilities are 0, 1 or flat."""
 
 MAX_INNER_ROWS = 4000
 """Hyper-parameters are chosen on at most so many rows, thinned evenly: overlapping windows repeat each other,
@@ -126,25 +121,24 @@ class GroupedSVC(ClassifierMixin, BaseEstimator):
         candidates = [Candidate(*candidate) for candidate in self.candidates]
         step = -(-len(y) // MAX_INNER_ROWS)
         inner_y, gap = y[::step], -(-self.gap // step)
-        held_out, decisions = self._inner_decisions(
+        held_out, margins = self._inner_margins(
             X[::step], inner_y, groups[::step], gap, np.random.default_rng(self.seed), candidates
         )
+        truth, k = np.searchsorted(self.classes_, inner_y[held_out]), len(self.classes_)
+        scales = [fit_scale(margin[held_out], truth, k) for margin in margins]
         self.inner_scores_ = np.array(
             [
-                accuracy_score(inner_y[held_out], self.classes_[decision[held_out].argmax(axis=1)])
-                for decision in decisions
+                np.mean(probabilities_of_known(margin[held_out], k, scale).argmax(axis=1) == truth)
+                for margin, scale in zip(margins, scales, strict=True)
             ]
         )
         best = int(np.argmax(self.inner_scores_))
-        self.best_ = candidates[best]
-        self.temperature_ = fit_temperature(
-            decisions[best][held_out], np.searchsorted(self.classes_, inner_y[held_out])
-        )
+        self.best_, self.scale_ = candidates[best], scales[best]
         self.preparation_ = _preparation(self.best_.percentile)
         self.svc_ = _fit_svc(self.best_, self.preparation_.fit_transform(X, y), y)
         return self
 
-    def _inner_decisions(
+    def _inner_margins(
         self,
         X: Array,
         y: Array,
@@ -155,7 +149,8 @@ class GroupedSVC(ClassifierMixin, BaseEstimator):
     ) -> tuple[Array, Array]:
         n_groups = len(np.unique(block_groups(y, groups, self.n_inner_folds).astype(str)))
         n_folds = min(self.n_inner_folds, n_groups, *np.unique(y, return_counts=True)[1])
-        decisions = np.zeros((len(candidates), len(y), len(self.classes_)))
+        k = len(self.classes_)
+        margins = np.full((len(candidates), len(y), k * (k - 1) // 2), np.nan)
         held_out = np.zeros(len(y), dtype=bool)
         self.n_inner_fits_ = 0
         for train, test in split_runs(y, groups, n_folds, rng, gap):
@@ -169,32 +164,36 @@ class GroupedSVC(ClassifierMixin, BaseEstimator):
                 for i, candidate in enumerate(candidates):
                     if candidate.percentile == percentile:
                         svc = _fit_svc(candidate, prepared, y[train])
-                        decisions[i, test] = _decision(svc, prepared_test, self.classes_)
+                        margins[i, test] = _margins(svc, prepared_test, self.classes_)
                         self.n_inner_fits_ += 1
         if not held_out.any():
             raise DataError("the windows are too few to hold some of them out; add runs")
-        return held_out, decisions
+        return held_out, margins
 
     def decision_function(self, X: Array) -> Array:
-        """Return one decision value a class (n, k), of which the largest wins.
+        """Return the logarithm of each class's probability (n, k), of which the largest wins.
 
         As in all of scikit-learn, two classes have one value (n,), positive for the second.
         """
-        decisions = self._decisions(X)
-        return decisions[:, 1] if len(self.classes_) == 2 else decisions
+        check_is_fitted(self)
+        if len(self.classes_) == 2:
+            return -self.scale_ * self.margins(X)[:, 0]
+        return np.asarray(np.log(np.maximum(self.predict_proba(X), np.finfo(float).tiny)))
 
-    def _decisions(self, X: Array) -> Array:
+    def margins(self, X: Array) -> Array:
+        """Return the margins of the pairs of classes (n, k (k - 1) / 2), positive for the first of a pair."""
         check_is_fitted(self)
         X = validate_data(self, X, reset=False, ensure_all_finite="allow-nan")
-        return _decision(self.svc_, self.preparation_.transform(X), self.classes_)
+        return _margins(self.svc_, self.preparation_.transform(X), self.classes_)
 
     def predict_proba(self, X: Array) -> Array:
         """Return calibrated probabilities (n, k) in the order of ``classes_``."""
-        return np.asarray(softmax(self._decisions(X) / self.temperature_, axis=1))
+        check_is_fitted(self)
+        return class_probabilities(self.margins(X), len(self.classes_), self.scale_)
 
     def predict(self, X: Array) -> Array:
         """Return the class of the highest probability (n,)."""
-        best = self._decisions(X).argmax(axis=1)
+        best = self.predict_proba(X).argmax(axis=1)
         return np.asarray(self.classes_[best])
 
     def numbers(self) -> SvmNumbers:
@@ -206,7 +205,7 @@ class GroupedSVC(ClassifierMixin, BaseEstimator):
         columns = varying[selected]
         sign = -1.0 if len(svc.classes_) == 2 else 1.0  # scikit-learn turns the two-class decision around
         bounds = np.concatenate(([0], np.cumsum(svc.n_support_)))
-        pairs = [(a, b) for a in range(len(svc.classes_)) for b in range(a + 1, len(svc.classes_))]
+        pairs = pairs_of(len(svc.classes_))
         weights = np.zeros((len(svc.support_vectors_), len(pairs)))
         for pair, (a, b) in enumerate(pairs):
             of_a, of_b = slice(bounds[a], bounds[a + 1]), slice(bounds[b], bounds[b + 1])
@@ -220,7 +219,7 @@ class GroupedSVC(ClassifierMixin, BaseEstimator):
             svc.support_vectors_,
             weights,
             sign * svc.intercept_,
-            np.array([CLIP_STD, float(svc.gamma), self.temperature_, self.n_features_in_]),
+            np.array([CLIP_STD, float(svc.gamma), self.scale_, self.n_features_in_]),
         )
 
     def __sklearn_tags__(self) -> Any:
@@ -228,32 +227,6 @@ class GroupedSVC(ClassifierMixin, BaseEstimator):
         tags = super().__sklearn_tags__()
         tags.input_tags.allow_nan = True
         return tags
-
-
-def fit_temperature(decisions: Array, class_index: Array) -> float:
-    """Return the temperature under which held-out decisions are most likely.
-
-    Parameters
-    ----------
-    decisions : (n, k) decision values
-    class_index : (n,) true column of each row
-
-    Examples
-    --------
-    >>> rng = np.random.default_rng(0)
-    >>> logits = rng.normal(size=(5000, 3))
-    >>> chances = softmax(logits, axis=1).cumsum(axis=1)
-    >>> drawn = (rng.random((5000, 1)) > chances).sum(axis=1)
-    >>> abs(fit_temperature(4.0 * logits, drawn) - 4.0) < 0.2
-    True
-    """
-
-    def loss(log_temperature: float) -> float:
-        likelihood = log_softmax(decisions / np.exp(log_temperature), axis=1)
-        return float(-likelihood[np.arange(len(class_index)), class_index].mean())
-
-    found = minimize_scalar(loss, bounds=LOG_TEMPERATURE_BOUNDS, method="bounded")
-    return float(np.exp(found.x))
 
 
 def f_score(X: Array, y: Array) -> tuple[Array, Array]:
@@ -277,13 +250,17 @@ def _preparation(percentile: float) -> Pipeline:
 
 
 def _fit_svc(candidate: Candidate, prepared: Array, y: Array) -> SVC:
-    return SVC(C=candidate.C, gamma=candidate.gamma / prepared.shape[1], cache_size=500).fit(prepared, y)
+    gamma = candidate.gamma / prepared.shape[1]
+    return SVC(C=candidate.C, gamma=gamma, cache_size=500, decision_function_shape="ovo").fit(prepared, y)
 
 
-def _decision(svc: SVC, prepared: Array, classes: Array) -> Array:
+def _margins(svc: SVC, prepared: Array, classes: Array) -> Array:
+    """Return the margins of all pairs of classes; NaN in those of a class that was not there to train on."""
     values = svc.decision_function(prepared)
     if values.ndim == 1:
-        values = np.stack([-values, values], axis=1)
-    decision = np.full((len(prepared), len(classes)), values.min(initial=0.0) - 1.0)
-    decision[:, np.searchsorted(classes, svc.classes_)] = values
-    return decision
+        values = -values[:, None]  # scikit-learn turns the two-class decision around
+    places = np.searchsorted(classes, svc.classes_)
+    column = {pair: i for i, pair in enumerate(pairs_of(len(classes)))}
+    margins = np.full((len(prepared), len(column)), np.nan)
+    margins[:, [column[places[a], places[b]] for a, b in pairs_of(len(places))]] = values
+    return margins

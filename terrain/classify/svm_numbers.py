@@ -5,20 +5,18 @@ the robot goes into checks of its inputs.  The numbers are those that it fitted:
 
 - missing features take their median, the columns that were kept are scaled and clipped;
 - of each pair of classes (a, b), a before b: ``f = sum_i w_i exp(-gamma |x - v_i|^2) + c``, positive for a;
-- decisions of the classes are votes of the pairs, and their margins within a vote: ``V + M / (3 (|M| + 1))``
-  with the sum M of a class's margins (scikit-learn's one-vs-rest form of one-vs-one);
-- ``p = softmax(d / T)``.
+- one scale of the margins gives the probabilities of the classes (:mod:`terrain.classify.coupling`).
 """
 
 from __future__ import annotations
 
 import math
-from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
+from terrain.classify.coupling import class_probabilities
 from terrain.errors import DataError
 from terrain.records import Array
 
@@ -33,7 +31,7 @@ class SvmNumbers(NamedTuple):
     vectors : (s, m) support vectors, scaled and clipped
     weights : (s, p) of each support vector in each pair of classes
     offsets : (p,) of each pair
-    settings : (4,) clip in standard deviations, gamma, temperature, number of features before selection
+    settings : (4,) clip in standard deviations, gamma, scale of the margins, features before selection
     """
 
     columns: Array
@@ -84,7 +82,7 @@ def probabilities(numbers: SvmNumbers, features: Array) -> Array:
     DataError
         if there are not as many features, or one is infinite.
     """
-    clip, gamma, temperature, n_features = numbers.settings.tolist()
+    clip, gamma, margin_scale, n_features = numbers.settings.tolist()
     if features.ndim != 2 or features.shape[1] != n_features:
         raise DataError(f"features have the shape {features.shape}, (n, {n_features:.0f}) is needed")
     if np.isinf(features).any():
@@ -93,11 +91,7 @@ def probabilities(numbers: SvmNumbers, features: Array) -> Array:
     used = np.where(np.isnan(used), numbers.fill, used)
     scaled = np.clip((used - numbers.mean) / numbers.scale, -clip, clip)
     margins = _margins(numbers.vectors, numbers.weights, numbers.offsets, gamma, scaled)
-    decisions = _decisions(margins, numbers.n_classes)
-    logits = decisions / temperature
-    weights = np.exp(logits - logits.max(axis=1, keepdims=True))
-    found: Array = weights / weights.sum(axis=1, keepdims=True)
-    return found
+    return class_probabilities(margins, numbers.n_classes, margin_scale)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -115,18 +109,3 @@ def _margins(vectors: Array, weights: Array, offsets: Array, gamma: float, rows:
             for pair in range(offsets.size):
                 margins[n, pair] += kernel * weights[i, pair]
     return margins
-
-
-def _decisions(margins: Array, n_classes: int) -> Array:
-    """Return the decision (n, k) of each class: votes of its pairs, and margins within a vote."""
-    if n_classes == 2:
-        return np.hstack([margins, -margins])
-    votes, sums = np.zeros((2, len(margins), n_classes))
-    for pair, (a, b) in enumerate(combinations(range(n_classes), 2)):
-        margin = margins[:, pair]
-        sums[:, a] += margin
-        sums[:, b] -= margin
-        votes[:, a] += margin >= 0.0
-        votes[:, b] += margin < 0.0
-    found: Array = votes + sums / (3.0 * (np.abs(sums) + 1.0))
-    return found

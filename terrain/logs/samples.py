@@ -4,7 +4,8 @@ Every reader hands its arrays to :func:`checked_stream`.  A strict read refuses 
 go back or repeat, channels with nothing finite in them and streams of fewer than two samples.  A
 repairing read drops the rows at fault, keeps a dead channel as NaN (all runs of a data set must have the
 same channels), and counts what it did.  NaN among finite values is no fault: it stays NaN, infinite values
-become NaN, and the windows that touch them are dropped and counted later.
+become NaN, and the windows that touch them are dropped and counted later.  A finite value that no quantity
+can have, as of damaged bytes, stays as it is; a repairing read makes it NaN and counts it.
 """
 
 from __future__ import annotations
@@ -16,12 +17,14 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from terrain.errors import LogError
+from terrain.logs.plausible import MAX_MAGNITUDE
 from terrain.records import Array, Stream
 
 BAD_TIME = "rows with a bad time"
 BAD_CELL = "cells that are no number"
 SHORT_ROW = "rows with missing or extra cells"
 DEAD_CHANNEL = "channels with nothing finite"
+IMPLAUSIBLE = "values beyond any quantity"
 
 
 def longest_rise(time_s: Array) -> Array:
@@ -113,6 +116,10 @@ def checked_stream(
         _refuse_bad_time(name, time_s, row_of)
     if time_s.size < 2:
         raise LogError(f"{name}: has {time_s.size} usable rows of data, at least 2 are needed")
+    implausible = np.abs(values) > MAX_MAGNITUDE
+    if repairs is not None and implausible.any():
+        repairs[IMPLAUSIBLE] += int(implausible.sum())
+        values = np.where(implausible, np.nan, values)
     dead = [
         channel
         for channel, column in zip(channels, values.T, strict=True)

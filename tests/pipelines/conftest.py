@@ -130,7 +130,8 @@ def make_report():
         LearningCurve,
         SlowFast,
     )
-    from terrain.classify.metrics import ClassFigures, ReliabilityBin, RunFigures
+    from terrain.classify.confidence import CoverageFigures, ReliabilityBin
+    from terrain.classify.metrics import ClassFigures, RunFigures
 
     statement = "3 sizes are too few to estimate how many runs are enough"
     curve = LearningCurve((1.0, 2.0, 3.5), (0.5, 0.6, 0.65), (0.02, 0.01, None), None, statement)
@@ -162,13 +163,22 @@ def make_report():
             "accuracy_ci": (0.7236, 0.9079),
             "balanced_accuracy": 0.77139,
             "macro_f1": 0.7844,
+            "macro_run_accuracy": 0.75,
             "vote_accuracy": 0.82131,
             "ece": 0.10776,
+            "ece_ci": (0.06, 0.15),
+            "confidence_auc": 0.7912,
+            "confidence_auc_ci": (0.71, 0.86),
+            "accuracy_at_coverage": (
+                CoverageFigures(0.8, 0.88, (0.8, 0.94), 0.55), CoverageFigures(0.5, 0.95, (0.9, 0.99), 0.8)
+            ),
             "per_class": {
                 "GRASS": ClassFigures(0.61, 0.45, 0.52, 60), "ICE": ClassFigures(0.61, 0.95, 0.52, 100)
             },
             "confusion": ((27, 33), (5, 95)),
-            "reliability": (ReliabilityBin(0.6, 0.7, 80), ReliabilityBin(0.9, 0.85, 80)),
+            "reliability": (
+                ReliabilityBin(0.6, 0.7, 80, (0.5, 0.9)), ReliabilityBin(0.9, 0.85, 80, (0.7, 0.95))
+            ),
             "per_run": (
                 RunFigures("<b>g1</b>", "GRASS", 10, 0.3, 0.3, None),
                 RunFigures("g2", "GRASS", 5, 0.75, 0.75, None),

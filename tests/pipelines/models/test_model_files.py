@@ -135,7 +135,7 @@ def test_a_folder_that_lacks_a_file_holds_no_model(model_dir, missing):
             lambda info: json.dumps({k: v for k, v in info.items() if k != "sha256"}),
             r"is damaged \('sha256'\)",
         ),
-        (lambda info: json.dumps(info | {"version": 99}), "has version 99; version 1 is read here"),
+        (lambda info: json.dumps(info | {"version": 99}), "has version 99; version 2 is read here"),
         (lambda info: json.dumps(info | {"window_s": "two"}), "is damaged"),
         (lambda info: json.dumps(info | {"classes": ["grass", 3]}), "is no list of texts"),
         (lambda info: json.dumps(info | {"classes": "grass"}), "is no list of texts"),

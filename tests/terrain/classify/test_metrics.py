@@ -3,10 +3,8 @@ import pytest
 from sklearn.metrics import accuracy_score, balanced_accuracy_score, f1_score
 
 from terrain.classify.metrics import (
-    CALIBRATION_BINS,
     ClassFigures,
     RunFigures,
-    calibration,
     class_figures,
     per_run_figures,
     run_bootstrap,
@@ -40,38 +38,6 @@ def test_a_class_without_windows_does_not_count_against_the_means():
     assert figures.balanced_accuracy == pytest.approx((0.5 + 1.0) / 2)
     assert figures.macro_f1 == pytest.approx((2 / 3 + 1.0) / 2)
     assert figures.per_class["snow"] == ClassFigures(0.0, 0.0, 0.0, 0)
-
-
-def test_calibration_error_of_known_cases():
-    # 15 bins of 100: in bin b the confidence is c_b and exactly c_b of 100 are right.
-    confidence = np.repeat(np.arange(60, 90, 2) / 100, 100)
-    right = np.concatenate([np.arange(100) < round(100 * c) for c in np.arange(60, 90, 2) / 100])
-    assert calibration(confidence, right).ece == pytest.approx(0.0, abs=1e-12)
-    assert calibration(confidence, np.ones(1500, dtype=bool)).ece == pytest.approx(1 - confidence.mean())
-    # Too bold in one half and too shy in the other: the signs must not cancel.
-    half = np.repeat([0.6, 0.9], 750)
-    assert calibration(half, np.arange(1500) % 4 < 3).ece == pytest.approx(0.15, abs=0.01)
-    assert calibration(half, np.arange(1500) % 4 < 3, n_bins=1).ece == pytest.approx(0.0, abs=1e-9)
-
-
-def test_calibration_bins_are_of_equal_mass_whatever_the_order():
-    rng = np.random.default_rng(1)
-    confidence = rng.beta(8, 1, 1003)  # crowded near 1: bins of equal width would be empty
-    right = rng.random(1003) < confidence**2
-    figures = calibration(confidence, right)
-    table = figures.reliability
-    counts = [row.n_windows for row in table]
-    assert len(table) == CALIBRATION_BINS
-    assert sum(counts) == 1003
-    assert max(counts) - min(counts) <= 1
-    assert np.all(np.diff([row.confidence for row in table]) > 0)
-    expected = (
-        sum(n * abs(row.accuracy - row.confidence) for n, row in zip(counts, table, strict=True)) / 1003
-    )
-    assert figures.ece == pytest.approx(expected)
-    shuffled = rng.permutation(1003)
-    assert calibration(confidence[shuffled], right[shuffled]) == figures
-    assert [row.n_windows for row in calibration(confidence[:4], right[:4]).reliability] == [1] * 4
 
 
 def ballots(*votes):

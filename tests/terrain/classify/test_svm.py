@@ -5,6 +5,7 @@ from sklearn.base import clone
 from sklearn.utils.estimator_checks import parametrize_with_checks
 
 from terrain.classify import svm
+from terrain.classify.coupling import class_probabilities
 from terrain.classify.folds import split_runs
 from terrain.classify.svm import CANDIDATES, GroupedSVC
 from terrain.errors import DataError
@@ -130,7 +131,7 @@ def test_confidence_agrees_with_accuracy():
     assert ece < 0.06  # of which 0.02 is the chance of 400 samples a bin
     posterior = expit(1.2 * new[:, 0] - 0.72)
     assert np.mean(np.abs(posterior - probability[:, 1])) < 0.1
-    uncalibrated = svm.softmax(model._decisions(new) / 0.2, axis=1).max(axis=1)
+    uncalibrated = class_probabilities(model.margins(new), 2, 5.0 * model.scale_).max(axis=1)
     assert abs(uncalibrated.mean() - right.mean()) > 3 * abs(confidence.mean() - right.mean())
 
 

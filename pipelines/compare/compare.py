@@ -1,0 +1,158 @@
+"""``terrain compare``: two recipes on the same folds, or two models on the same runs, paired by run."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from features.windows import cut_windows
+from pipelines.compare.results import CompareReport
+from pipelines.compare.settings import CompareSettings, Contender
+from pipelines.crossval.crossval import samples_of
+from pipelines.crossval.evaluation import fit_folds, pool
+from pipelines.crossval.extras import examples_of
+from pipelines.crossval.settings import CrossvalSettings
+from pipelines.crossval.splits import Samples, folds_of
+from pipelines.models.model_files import TerrainModel
+from pipelines.models.recipes import feature_matrix
+from pipelines.reporting.progress import Progress, silent
+from pipelines.runs.datasets import data_digest
+from terrain.classify.paired import Comparison, Outcome, compare_outcomes
+from terrain.errors import DataError
+from terrain.records import Array, RunLog
+
+
+def compare_recipes(
+    runs: Sequence[RunLog],
+    contenders: tuple[Contender, Contender],
+    settings: CompareSettings,
+    dataset: str,
+    progress: Progress = silent,
+) -> CompareReport:
+    """Compare two recipes on the same folds of whole runs.
+
+    Parameters
+    ----------
+    runs : labelled runs
+    contenders : the two
+    settings : windows, seed and number of fold assignments
+    dataset : name of the data, for the record
+    progress : called as the work goes on
+
+    Raises
+    ------
+    DataError
+        if the data do not suffice, or the two cut different windows from them.
+    """
+    evaluations = [settings.evaluation(each) for each in contenders]
+    samples = [samples_of(runs, evaluation) for evaluation in evaluations]
+    if not np.array_equal(samples[0].cut.windows.start_s, samples[1].cut.windows.start_s):
+        raise DataError(
+            "the two recipes keep different windows of these runs, whose streams end at different times: "
+            "compare them on signal sets of the same streams"
+        )
+    a, b = (
+        _recipe_outcome(each, evaluation, progress)
+        for each, evaluation in zip(samples, evaluations, strict=True)
+    )
+    return _report(runs, settings, "recipes", (a, b), dataset, (), ())
+
+
+def _recipe_outcome(samples: Samples, evaluation: CrossvalSettings, progress: Progress) -> Outcome:
+    """Return what a recipe makes of held-out windows."""
+    recipe, windows = evaluation.new_recipe(), samples.cut.windows
+    examples = examples_of(feature_matrix(recipe, windows), samples)
+    folds = folds_of(samples, "grouped", evaluation.n_repeats, evaluation.seed)
+    results = fit_folds(recipe[-1], examples, folds, evaluation.jobs, evaluation.recipe, progress)
+    held_out = pool(results, examples.terrain)
+    return outcome_of(held_out.classes, held_out.probability, windows.run_id, examples.terrain)
+
+
+def compare_models(
+    runs: Sequence[RunLog],
+    models: tuple[TerrainModel, TerrainModel],
+    settings: CompareSettings,
+    dataset: str,
+) -> CompareReport:
+    """Compare two models on the runs that neither was trained on.
+
+    Parameters
+    ----------
+    runs : labelled runs
+    models : the two; each cuts its own windows
+    settings : names of the models, and the seed of the bootstrap
+    dataset : name of the data, for the record
+
+    Raises
+    ------
+    DataError
+        if no run is left, or a run lacks a channel that a model requires.
+    """
+    trained = {digest for model in models for digest in model.info.run_digests}
+    excluded = tuple(run.run_id for run in runs if data_digest([run]) in trained)
+    kept = [run for run in runs if run.run_id not in excluded]
+    if not kept:
+        raise DataError(
+            f"all {len(runs)} runs were used to train {settings.a} or {settings.b}: "
+            "no run is left to compare on"
+        )
+    shared = sorted(set(models[0].info.classes) & set(models[1].info.classes))
+    a, b = (_model_outcome(kept, model, shared) for model in models)
+    notes = []
+    if models[0].info.classes != models[1].info.classes:
+        notes.append(
+            f"the models have other classes: compared on windows of {', '.join(shared) or 'no terrain'}"
+        )
+    return _report(kept, settings, "models", (a, b), dataset, excluded, tuple(notes))
+
+
+def _model_outcome(runs: Sequence[RunLog], model: TerrainModel, classes: Sequence[str]) -> Outcome:
+    windows = cut_windows(runs, model.rule, layout=model.layout).windows
+    windows = windows[np.isin(windows.terrain.astype(str), classes)]
+    if not len(windows):
+        raise DataError(
+            f"no window of these runs is labelled as a class of both models ({', '.join(classes)})"
+        )
+    probability = np.asarray(model.recipe.predict_proba(windows))[None]
+    return outcome_of(
+        np.asarray(model.recipe.classes_, dtype=str), probability, windows.run_id, windows.terrain.astype(str)
+    )
+
+
+def outcome_of(classes: Array, probability: Array, run_id: Array, terrain: Array) -> Outcome:
+    """Return which windows were classified correctly, and how confidently.
+
+    Parameters
+    ----------
+    classes : (k,)
+    probability : (repeats, n, k)
+    run_id, terrain : (n,)
+    """
+    predicted = classes[probability.argmax(axis=2)]
+    return Outcome(run_id.astype(str), terrain, predicted == terrain, probability.max(axis=2))
+
+
+def _report(
+    runs: Sequence[RunLog],
+    settings: CompareSettings,
+    kind: str,
+    outcomes: tuple[Outcome, Outcome],
+    dataset: str,
+    excluded: tuple[str, ...],
+    notes: tuple[str, ...],
+) -> CompareReport:
+    comparison: Comparison = compare_outcomes(*outcomes, np.random.default_rng(settings.seed))
+    return CompareReport(
+        dataset=dataset,
+        data_digest=data_digest(runs),
+        a=settings.a,
+        b=settings.b,
+        kind=kind,
+        comparison=comparison,
+        n_runs=len(np.unique(outcomes[0].run_id)),
+        n_windows=outcomes[0].correct.shape[1],
+        repeats=len(outcomes[0].correct),
+        excluded_runs=excluded,
+        notes=notes,
+    )

@@ -1,0 +1,179 @@
+"""Two classifiers on the same runs: differences of their figures, paired by run.
+
+Both are judged on the same runs, and a run that is hard for one is mostly hard for the other.  A bootstrap
+that draws whole runs, within their classes, and takes the figures of both from the same draw leaves this
+common part out of the interval of the difference.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from enum import StrEnum
+from typing import NamedTuple
+
+import numpy as np
+
+from terrain.bootstrap import percentile_interval
+from terrain.classify.confidence import Interval, confidence_auc
+from terrain.errors import DataError
+from terrain.records import Array
+
+N_DRAWS = 2000
+
+MIN_RUNS = 3
+"""With fewer runs a bootstrap over runs gives no interval: that of one run would have no width."""
+
+
+class Verdict(StrEnum):
+    """Whether the interval of a difference leaves zero out."""
+
+    BETTER = "better"
+    WORSE = "worse"
+    NOT_DISTINGUISHED = "not distinguished"
+
+
+class Outcome(NamedTuple):
+    """What a classifier made of held-out windows.
+
+    Parameters
+    ----------
+    run_id, terrain : (n,) run and true class of each window
+    correct, confidence : (repeats, n) whether the predicted class is right, and its probability
+    """
+
+    run_id: Array
+    terrain: Array
+    correct: Array
+    confidence: Array
+
+
+class Difference(NamedTuple):
+    """A figure of two classifiers; ``difference`` is b minus a, with its ``interval`` of 95 % over runs.
+
+    The interval is NaN where there are fewer runs than :data:`MIN_RUNS`.
+    """
+
+    a: float
+    b: float
+    difference: float
+    interval: Interval
+    verdict: Verdict
+    n_runs: int
+
+
+class RunDifference(NamedTuple):
+    """Accuracies of two classifiers on the windows of one run."""
+
+    run_id: str
+    terrain: str
+    a: float
+    b: float
+
+
+class Comparison(NamedTuple):
+    """Differences between two classifiers; those of each class are of accuracy."""
+
+    accuracy: Difference
+    macro_run_accuracy: Difference
+    confidence_auc: Difference
+    by_class: dict[str, Difference]
+    by_run: tuple[RunDifference, ...]
+
+
+def compare_outcomes(a: Outcome, b: Outcome, rng: np.random.Generator) -> Comparison:
+    """Return the differences between two classifiers, paired by run.
+
+    Parameters
+    ----------
+    a, b : of the same runs; their windows may differ
+    rng : source of the bootstrap
+
+    Raises
+    ------
+    DataError
+        if they were not judged on the same runs and classes.
+
+    Examples
+    --------
+    >>> run, terrain = np.repeat(np.arange(8).astype(str), 10), np.repeat(["ice", "mud"], 40)
+    >>> half, all_right = np.tile([True, False], (1, 40)), np.ones((1, 80), dtype=bool)
+    >>> worse, better = (Outcome(run, terrain, right, np.full((1, 80), 0.9)) for right in (half, all_right))
+    >>> found = compare_outcomes(worse, better, np.random.default_rng(0))
+    >>> found.accuracy.difference, found.accuracy.verdict.value, found.by_class["ice"].n_runs
+    (0.5, 'better', 4)
+    """
+    cells, places = _common_cells(a, b)
+    terrain = np.array([name for _, name in cells])
+    counts = _drawn_counts(terrain, N_DRAWS, rng)
+
+    def compared(figure: Callable[[Outcome, Array, Array], Array], kept: Array) -> Difference:
+        weights = np.vstack([np.ones(len(cells)), counts]) * kept
+        of_a, of_b = (figure(each, place, weights) for each, place in zip((a, b), places, strict=True))
+        return _difference(of_a, of_b, int(kept.sum()))
+
+    everything = np.ones(len(cells))
+    hits = [_cell_accuracies(each, place, len(cells)) for each, place in zip((a, b), places, strict=True)]
+    return Comparison(
+        compared(_accuracy, everything),
+        compared(lambda each, place, w: _macro_accuracy(each, place, w, terrain), everything),
+        compared(_area, everything),
+        {str(name): compared(_accuracy, (terrain == name).astype(float)) for name in np.unique(terrain)},
+        tuple(
+            RunDifference(run, name, float(of_a), float(of_b))
+            for (run, name), of_a, of_b in zip(cells, *hits, strict=True)
+        ),
+    )
+
+
+def _common_cells(a: Outcome, b: Outcome) -> tuple[list[tuple[str, str]], list[Array]]:
+    """Return the runs with their classes, and of each classifier's windows which of them they belong to."""
+    pairs = [list(zip(each.run_id.astype(str), each.terrain.astype(str), strict=True)) for each in (a, b)]
+    cells = sorted(set(pairs[0]))
+    if cells != sorted(set(pairs[1])):
+        other = sorted(set(pairs[0]) ^ set(pairs[1]))[0]
+        raise DataError(f"run {other[0]} ({other[1]}) was judged by one of the two only")
+    number = {cell: i for i, cell in enumerate(cells)}
+    return cells, [np.array([number[pair] for pair in each]) for each in pairs]
+
+
+def _drawn_counts(terrain: Array, n_draws: int, rng: np.random.Generator) -> Array:
+    """Return how often each run is drawn (n_draws, runs), as many of a class as there are."""
+    counts = np.zeros((n_draws, len(terrain)))
+    for name in np.unique(terrain):
+        members = np.flatnonzero(terrain == name)
+        counts[:, members] = rng.multinomial(len(members), np.full(len(members), 1 / len(members)), n_draws)
+    return counts
+
+
+def _cell_accuracies(each: Outcome, place: Array, n_cells: int) -> Array:
+    hits = np.bincount(place, weights=each.correct.mean(axis=0), minlength=n_cells)
+    return np.asarray(hits / np.bincount(place, minlength=n_cells))
+
+
+def _accuracy(each: Outcome, place: Array, weights: Array) -> Array:
+    sizes = np.bincount(place, minlength=weights.shape[1])
+    hits = _cell_accuracies(each, place, weights.shape[1]) * sizes
+    return np.asarray((weights @ hits) / (weights @ sizes))
+
+
+def _macro_accuracy(each: Outcome, place: Array, weights: Array, terrain: Array) -> Array:
+    accuracies = _cell_accuracies(each, place, weights.shape[1])
+    of_class = [
+        weights[:, terrain == name] @ accuracies[terrain == name] / weights[:, terrain == name].sum(axis=1)
+        for name in np.unique(terrain)
+    ]
+    return np.asarray(np.mean(of_class, axis=0))
+
+
+def _area(each: Outcome, place: Array, weights: Array) -> Array:
+    pairs: Sequence[tuple[Array, Array]] = list(zip(each.confidence, each.correct.astype(float), strict=True))
+    return np.asarray(np.mean([confidence_auc(c, right, weights[:, place]) for c, right in pairs], axis=0))
+
+
+def _difference(of_a: Array, of_b: Array, n_runs: int) -> Difference:
+    """Return the difference of figures of which the first is of all runs, the others of bootstrap samples."""
+    draws = of_b[1:] - of_a[1:]
+    known = n_runs >= MIN_RUNS and np.isfinite(draws).any()
+    low, high = percentile_interval(draws) if known else (np.nan, np.nan)
+    verdict = Verdict.BETTER if low > 0 else Verdict.WORSE if high < 0 else Verdict.NOT_DISTINGUISHED
+    return Difference(float(of_a[0]), float(of_b[0]), float(of_b[0] - of_a[0]), (low, high), verdict, n_runs)

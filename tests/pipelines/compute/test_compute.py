@@ -1,0 +1,200 @@
+"""Tasks give the same wherever they are computed, and what is lost is one sentence."""
+
+import os
+import signal
+import subprocess
+import sys
+import warnings
+
+import numpy as np
+import pytest
+
+from features.windows import WindowRule
+from pipelines.compute import cluster
+from pipelines.compute.parallel import computing, parallel, place
+from pipelines.compute.settings import ComputeSettings, scheduler_address
+from pipelines.compute.software import difference, software
+from terrain.errors import ConfigError, TerrainError
+
+
+@pytest.mark.parametrize(
+    ("compute", "address"),
+    [
+        ("dask:127.0.0.1:8786", "tcp://127.0.0.1:8786"),
+        ("dask:tcp://node-3.lab:1", "tcp://node-3.lab:1"),
+        ("dask:tls://[::1]:8786", "tls://[::1]:8786"),
+        ("local", None),
+    ],
+)
+def test_an_address_is_read(compute, address):
+    assert scheduler_address(compute) == address
+    assert ComputeSettings(compute=compute).compute == compute
+
+
+@pytest.mark.parametrize(
+    "compute",
+    ["", "dask", "dask:", "dask:host", "dask:host:0", "dask:host:65536", "dask:http://h:1", "ray:h:1"],
+)
+def test_another_text_is_refused_in_one_sentence(compute):
+    with pytest.raises(ConfigError, match="'local' or the address of a Dask scheduler"):
+        ComputeSettings(compute=compute)
+
+
+def test_local_results_come_in_order_while_tasks_are_still_made():
+    made = []
+
+    def numbers():
+        for number in range(40):
+            made.append(number)
+            yield (number,)
+
+    results = parallel(pow, (2,), numbers(), 1)
+    assert next(results) == 1
+    assert len(made) < 40
+    assert list(results) == [2**k for k in range(1, 40)]
+
+
+def test_the_place_is_that_of_the_block():
+    with computing("local"):
+        assert place() == "local"
+    assert place() == "local"
+
+
+def test_no_scheduler_is_one_sentence():
+    pytest.importorskip("distributed")
+    with pytest.raises(TerrainError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:9:"):
+        computing("dask:127.0.0.1:9").__enter__()
+
+
+def test_a_process_that_ends_is_one_sentence():
+    with pytest.raises(TerrainError, match="ended in the middle of its task"):
+        list(parallel(os._exit, (), [(3,), (3,)], 2))
+
+
+def test_dask_is_not_imported_before_it_is_needed():
+    code = (
+        "import sys; from pipelines.cli.main import app; from pipelines.compute.parallel import computing;"
+        "computing('local').__enter__(); print('distributed' in sys.modules or 'optuna' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"
+
+
+def test_software_that_differs_is_named():
+    here = software()
+    assert difference(here, software()) is None
+    assert difference(here, here | {"its code": "0"}) == f"its code 0 where {here['its code']} is needed"
+    assert "scipy missing" in difference(here, {k: v for k, v in here.items() if k != "scipy"})
+
+
+@pytest.fixture(scope="module")
+def threads_cluster():
+    """A cluster in this process."""
+    distributed = pytest.importorskip("distributed")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        with distributed.LocalCluster(
+            n_workers=2, threads_per_worker=1, processes=False, protocol="tcp", dashboard_address=None
+        ) as running:
+            yield "dask:" + running.scheduler_address
+
+
+def test_a_cluster_gives_the_bytes_of_this_machine(threads_cluster):
+    rng = np.random.default_rng(0)
+    table = rng.normal(size=(500, 20))
+    each = [(float(k),) for k in rng.normal(size=30)]
+    with computing(threads_cluster):
+        assert place() == threads_cluster.removeprefix("dask:")
+        there = list(parallel(np.multiply, (table,), each, 1))
+    here = list(parallel(np.multiply, (table,), each, 1))
+    assert [a.tobytes() for a in here] == [b.tobytes() for b in there]
+
+
+def test_errors_of_a_task_keep_their_sentence(threads_cluster):
+    results = parallel(WindowRule, (), [(2.0,), (-1.0,)], 1)
+    with computing(threads_cluster), pytest.raises(ConfigError, match="it must be positive"):
+        list(results)
+
+
+def test_other_software_on_a_worker_is_refused(threads_cluster, monkeypatch):
+    other = software() | {"numpy": "1.0"}
+    monkeypatch.setattr(cluster, "software", software)
+    monkeypatch.setattr(cluster, "difference", lambda _, there: difference(other, there))
+    with pytest.raises(TerrainError, match=r"worker tcp://.* has numpy .* where 1\.0 is needed"):
+        computing(threads_cluster).__enter__()
+
+
+def test_a_cluster_without_workers_is_one_sentence(monkeypatch):
+    distributed = pytest.importorskip("distributed")
+    monkeypatch.setattr(cluster, "FIRST_WORKER_S", 0.2)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        with (
+            distributed.LocalCluster(
+                n_workers=0, processes=False, protocol="tcp", dashboard_address=None
+            ) as empty,
+            pytest.raises(TerrainError, match="has no worker: start one with 'dask worker tcp://"),
+        ):
+            computing("dask:" + empty.scheduler_address).__enter__()
+
+
+@pytest.mark.slow
+def test_a_killed_worker_costs_its_task_only(cluster_processes):
+    import tasks
+
+    first, _ = cluster_processes.add_worker("--no-nanny"), cluster_processes.add_worker("--no-nanny")
+    table = np.arange(1e5)
+    with computing(cluster_processes.compute):
+        found = []
+        for result in parallel(tasks.slowly, (table,), [(k,) for k in range(20)], 1):
+            found.append(result)
+            if len(found) == 3:
+                first.kill()
+    assert found == [k + table.sum() for k in range(20)]
+
+
+def disturbed(running, disturb):
+    """Compute many tasks, and disturb the cluster when the first is done."""
+    import tasks
+
+    with computing(running.compute):
+        for number, _ in enumerate(parallel(tasks.slowly, (np.ones(3),), [(k,) for k in range(200)], 1)):
+            if number == 0:
+                disturb()
+
+
+@pytest.mark.slow
+def test_a_dead_scheduler_is_one_sentence_soon(cluster_processes):
+    cluster_processes.add_worker("--no-nanny")
+    with pytest.raises(TerrainError, match=r"does not answer any more"):
+        disturbed(cluster_processes, lambda: cluster_processes.scheduler.kill())
+
+
+@pytest.mark.slow
+def test_a_stopped_scheduler_is_one_sentence_in_a_bounded_time(cluster_processes, monkeypatch):
+    monkeypatch.setattr(cluster, "ANSWER_S", 2.0)
+    monkeypatch.setattr(cluster, "PING_EVERY_S", 1.0)
+    cluster_processes.add_worker("--no-nanny")
+    with pytest.raises(TerrainError, match=r"does not answer any more"):
+        disturbed(cluster_processes, lambda: cluster_processes.scheduler.send_signal(signal.SIGSTOP))
+
+
+@pytest.mark.slow
+def test_tasks_that_end_their_worker_are_one_sentence(cluster_processes):
+    import tasks
+
+    cluster_processes.add_worker("--nanny")
+    with (
+        pytest.raises(TerrainError, match="were killed or ran out of memory"),
+        computing(cluster_processes.compute),
+    ):
+        list(parallel(tasks.end_process, (), [(0,)], 1))
+
+
+@pytest.mark.slow
+def test_no_worker_left_is_one_sentence(cluster_processes, monkeypatch):
+    monkeypatch.setattr(cluster, "PING_EVERY_S", 0.5)
+    monkeypatch.setattr(cluster, "NO_WORKER_S", 2.0)
+    worker = cluster_processes.add_worker("--no-nanny")
+    with pytest.raises(TerrainError, match=r"no worker of .* has taken a task"):
+        disturbed(cluster_processes, lambda: worker.kill())
