@@ -7,8 +7,7 @@ from collections.abc import Iterator
 from rich.console import Console
 from rich.table import Table
 
-from pipelines.crossval.results import Applicability, CrossvalReport, Extras, SlowFast
-from pipelines.crossval.stiffness import StiffnessFigures
+from pipelines.crossval.results import Applicability, CrossvalReport, Extras, SlowFast, StiffnessFigures
 from pipelines.reporting.numbers import percent
 from pipelines.reporting.terminal import print_lines
 

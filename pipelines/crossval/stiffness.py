@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import NamedTuple
-
 import numpy as np
 
 from pipelines.crossval.evaluation import HeldOut
 from pipelines.crossval.extras import run_speeds
+from pipelines.crossval.results import LevelClusters, StiffnessFigures
 from pipelines.crossval.splits import Samples
 from terrain.classify.metrics import run_bootstrap, runs_by_terrain
 from terrain.classify.stiffness import (
@@ -22,51 +20,6 @@ from terrain.classify.stiffness import (
 from terrain.errors import DataError
 from terrain.records import Array
 from terrain.terramechanics.stiffness import known_levels
-
-
-class LevelClusters(NamedTuple):
-    """Clusters of runs without labels, and how far they agree with the stiffness levels.
-
-    Parameters
-    ----------
-    n_clusters : by the Bayesian information criterion
-    adjusted_rand, interval : agreement with the levels, 1 the same, 0 by chance; 95 % over runs
-    adjusted_rand_of_classes : the same with the terrains in place of their levels
-    """
-
-    n_clusters: int
-    adjusted_rand: float
-    interval: tuple[float, float]
-    adjusted_rand_of_classes: float
-
-
-class StiffnessFigures(NamedTuple):
-    """Accuracy by stiffness level and the cost of confusing levels, all with 95 % intervals over runs.
-
-    Parameters
-    ----------
-    levels : of each class
-    accuracy, accuracy_ci : of the level, whichever the class
-    cost, cost_ci : mean cost a window of the most probable class
-    least_cost, least_cost_ci : mean cost of the class of least expected cost
-    gain, gain_ci : the first less the second, run by run
-    least_cost_accuracy : accuracy of the class of least expected cost
-    soft_hard_ratio : windows of which soft was taken for hard or hard for soft, by the most probable class
-    clusters : None where there are too few runs
-    """
-
-    levels: Mapping[str, str]
-    accuracy: float
-    accuracy_ci: tuple[float, float]
-    cost: float
-    cost_ci: tuple[float, float]
-    least_cost: float
-    least_cost_ci: tuple[float, float]
-    gain: float
-    gain_ci: tuple[float, float]
-    least_cost_accuracy: float
-    soft_hard_ratio: float
-    clusters: LevelClusters | None
 
 
 def stiffness_figures(
