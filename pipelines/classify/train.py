@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from pipelines.classify.card import model_card, written
+from pipelines.classify.importance import channel_importance
 from pipelines.classify.results import Training
 from pipelines.classify.settings import TrainSettings
 from pipelines.crossval.crossval import crossval, samples_of
 from pipelines.crossval.evaluation import Examples
-from pipelines.crossval.importance import channel_importance
 from pipelines.crossval.results import CrossvalReport
 from pipelines.crossval.settings import RecipeSettings
 from pipelines.crossval.splits import folds_of

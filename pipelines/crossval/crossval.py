@@ -24,6 +24,7 @@ from pipelines.crossval.splits import (
     grouped_samples,
     published_samples,
 )
+from pipelines.crossval.stiffness import stiffness_figures
 from pipelines.crossval.unknown import leave_terrain_out
 from pipelines.models.champion import weaknesses
 from pipelines.models.recipes import WindowPipeline, feature_matrix
@@ -66,6 +67,7 @@ def crossval(
         first = [fold for fold in folds if fold.repeat == 0]
         extras = _extras(recipe, features, samples, first, figures.accuracy_per_repeat[0], settings, progress)
         extras = extras._replace(over_time=_over_time(held_out, windows, settings.seed))
+        extras = extras._replace(stiffness=stiffness_figures(held_out, features, samples, settings.seed))
     repaired = dict(sum((Counter(run.dropped) for run in runs), Counter()))
     report = report_of(figures, samples, settings, features.shape[1], repaired, extras)
     if settings.protocol == "leave-terrain-out":

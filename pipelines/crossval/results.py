@@ -105,12 +105,62 @@ class UnknownTerrain(NamedTuple):
     unknown_by_terrain: Mapping[str, LeftOutTerrain]
 
 
+class LevelClusters(NamedTuple):
+    """Clusters of runs without labels, and how far they agree with the stiffness levels.
+
+    Parameters
+    ----------
+    n_clusters : by the Bayesian information criterion
+    adjusted_rand, interval : agreement with the levels, 1 the same, 0 by chance; 95 % over runs
+    adjusted_rand_of_classes : the same with the terrains in place of their levels
+    """
+
+    n_clusters: int
+    adjusted_rand: float
+    interval: tuple[float, float]
+    adjusted_rand_of_classes: float
+
+
+class StiffnessFigures(NamedTuple):
+    """Accuracy by stiffness level and the cost of confusing levels, all with 95 % intervals over runs.
+
+    Parameters
+    ----------
+    levels : of each class
+    accuracy, accuracy_ci : of the level, whichever the class
+    cost, cost_ci : mean cost a window of the most probable class
+    least_cost, least_cost_ci : mean cost of the class of least expected cost
+    gain, gain_ci : the first less the second, run by run
+    least_cost_accuracy : accuracy of the class of least expected cost
+    soft_hard_ratio : windows of which soft was taken for hard or hard for soft, by the most probable class
+    clusters : None where there are too few runs
+    """
+
+    levels: Mapping[str, str]
+    accuracy: float
+    accuracy_ci: tuple[float, float]
+    cost: float
+    cost_ci: tuple[float, float]
+    least_cost: float
+    least_cost_ci: tuple[float, float]
+    gain: float
+    gain_ci: tuple[float, float]
+    least_cost_accuracy: float
+    soft_hard_ratio: float
+    clusters: LevelClusters | None
+
+
 class Extras(NamedTuple):
-    """What the headline figure does not show; ``speed_only_accuracy`` is None without wheel speeds."""
+    """What the headline figure does not show.
+
+    ``speed_only_accuracy`` is None without wheel speeds, ``stiffness`` where the stiffness of a class is not
+    known.
+    """
 
     speed_only_accuracy: float | None
     slow_fast: SlowFast
     learning_curve: LearningCurve
+    stiffness: StiffnessFigures | None = None
     over_time: OverTime | None = None
 
     def as_json(self) -> dict[str, Any]:

@@ -8,7 +8,14 @@ from rich.console import Console
 from rich.table import Table
 
 from pipelines.courses.screen import over_time_lines
-from pipelines.crossval.results import Applicability, CrossvalReport, Extras, SlowFast, UnknownTerrain
+from pipelines.crossval.results import (
+    Applicability,
+    CrossvalReport,
+    Extras,
+    SlowFast,
+    StiffnessFigures,
+    UnknownTerrain,
+)
 from pipelines.reporting.numbers import percent
 from pipelines.reporting.terminal import print_lines
 
@@ -84,6 +91,27 @@ def _extras_lines(extras: Extras) -> Iterator[str]:
     yield f"runs: {extras.learning_curve.statement}"
     if extras.over_time is not None:
         yield from over_time_lines(extras.over_time)
+    if extras.stiffness is not None:
+        yield from _stiffness_lines(extras.stiffness)
+
+
+def _stiffness_lines(found: StiffnessFigures) -> Iterator[str]:
+    low, high = found.accuracy_ci
+    yield (
+        f"stiffness level: {percent(found.accuracy)} (95 % over runs: {low:.1%} to {high:.1%}), "
+        f"soft and hard confused in {percent(found.soft_hard_ratio)}"
+    )
+    low, high = found.gain_ci
+    yield (
+        f"cost of confusing levels: {found.cost:.3f} a window, {found.least_cost:.3f} by the class of least "
+        f"expected cost (gain {found.gain:.4f}, 95 % over runs: {low:.4f} to {high:.4f})"
+    )
+    if found.clusters is not None:
+        low, high = found.clusters.interval
+        yield (
+            f"clusters of runs without labels: {found.clusters.n_clusters}, adjusted Rand index with the "
+            f"levels {found.clusters.adjusted_rand:.2f} (95 % over runs: {low:.2f} to {high:.2f})"
+        )
 
 
 def _slow_fast_line(result: SlowFast) -> str:

@@ -12,7 +12,18 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 
 COMMANDS = (
-    *("import", "inspect", "simulate", "calibrate", "estimate", "crossval", "compare", "train", "predict"),
+    *(
+        "import",
+        "inspect",
+        "simulate",
+        "calibrate",
+        "estimate",
+        "features",
+        "crossval",
+        "compare",
+        "train",
+        "predict",
+    ),
     *(
         "learn-slip",
         "drive",
@@ -248,6 +259,9 @@ CASES: tuple[Case, ...] = (
             "crossval --data runs --repeats 2 --jobs 1",
             "crossval --data runs --protocol leave-one-run-out --signals imu,currents --no-extras --jobs 1",
             "crossval --data runs --protocol published --repeats 1 --no-extras --jobs 1",
+            "features --data runs --out store --jobs 1",
+            "crossval --data store --repeats 1 --no-extras --jobs 1",
+            "crossval --data runs --protocol leave-terrain-out --repeats 1 --no-extras --jobs 1",
             "compare svm@imu,wheels svm@currents --data runs --repeats 1 --jobs 1",
             "train --data runs --name field --repeats 1 --jobs 1",
             "predict --model models:/field@champion --data runs",

@@ -8,12 +8,11 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from pipelines.reporting.drawing import CLASS_COLOURS
+from pipelines.reporting.line_figure import Line, lines_figure
 from pipelines.reporting.numbers import format_number
 from pipelines.reproduce.danzi.runs import (
     NO_SLIP_RATIO,
     ROBOT,
-    Line,
-    lines_figure,
     mean_between,
     over_runs,
     seeded_runs,

@@ -11,7 +11,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from pipelines.reporting.drawing import CLASS_COLOURS, finished, new_figure, styled
-from pipelines.reproduce.danzi.runs import ROBOT, add_legend
+from pipelines.reporting.line_figure import add_legend
+from pipelines.reproduce.danzi.runs import ROBOT
 from pipelines.reproduce.results import Finding, Picture, Row, Verdict, verdict_of
 from terrain.kinematics.swerve import wheel_velocities
 from terrain.kinematics.swerve_limits import admissible_scale, admissible_yaw_rate

@@ -6,14 +6,13 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from pipelines.reporting.drawing import BLUE, INK, VERMILION
+from pipelines.reporting.line_figure import Line, lines_figure
 from pipelines.reproduce.danzi.observability import straight_line_rank
 from pipelines.reproduce.danzi.runs import (
     NO_SLIP_RATIO,
     ROBOT,
     START_S,
-    Line,
     OverRuns,
-    lines_figure,
     over_runs,
     seeded_runs,
     steady_mean,

@@ -8,13 +8,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from pipelines.reporting.drawing import BLUE, GRID, INK, VERMILION
+from pipelines.reporting.line_figure import Line, lines_figure
 from pipelines.reporting.numbers import format_number
 from pipelines.reproduce.danzi.runs import (
     ROBOT,
-    Line,
     OverRuns,
     estimate_with_both_filters,
-    lines_figure,
     mean_between,
     over_runs,
     seeded_runs,

@@ -7,6 +7,7 @@ from pipelines.reproduce.danzi.admissible_twists import admissible_twists
 from pipelines.reproduce.danzi.blind_filters import blind_filters
 from pipelines.reproduce.danzi.camera_frames import camera_frames
 from pipelines.reproduce.danzi.camera_lost import camera_lost
+from pipelines.reproduce.danzi.classify_terrain import classify_terrain
 from pipelines.reproduce.danzi.dead_band import dead_band
 from pipelines.reproduce.danzi.innovations import innovations
 from pipelines.reproduce.danzi.slip_bias import slip_bias
@@ -26,5 +27,6 @@ EXPERIMENTS: tuple[Experiment, ...] = (
     Experiment("Slip on three terrains (7.2.3)", slip_on_terrains),
     Experiment("Bias by the zero-slip wheel rows (6.1)", slip_bias),
     Experiment("Loss of the camera (6.1)", camera_lost),
+    Experiment("Terrain recognition (8.1)", classify_terrain),
     Experiment("Traction control, case by case (8.3.2)", traction_control),
 )

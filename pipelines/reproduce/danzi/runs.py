@@ -1,4 +1,4 @@
-"""What the experiments of a paper share: seeded runs, the true slip, means over runs, line figures."""
+"""What the experiments of a paper share: seeded runs, the true slip, means over runs."""
 
 from __future__ import annotations
 
@@ -6,10 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
-from pipelines.reporting.drawing import finished, new_figure, styled
 from terrain.estimation.estimate import Estimate, estimate_run
 from terrain.estimation.reference import lagged_slip, lagged_slip_at
 from terrain.estimation.slip_figures import STEADY_SPEED_MPS, slip_figures
@@ -34,15 +31,6 @@ class Curve(NamedTuple):
     time_s: Array
     slip_ratio: Array
     speed_mps: Array
-
-
-class Line(NamedTuple):
-    """A line of a figure: times (n,) in s, values (n,), colour and label."""
-
-    time_s: Array
-    values: Array
-    colour: str
-    label: str
 
 
 class OverRuns(NamedTuple):
@@ -126,28 +114,3 @@ def over_runs(values: Sequence[float]) -> OverRuns:
     OverRuns(mean=3.0, spread=(1.0, 6.0))
     """
     return OverRuns(float(np.mean(values)), (float(np.min(values)), float(np.max(values))))
-
-
-def lines_figure(
-    title: str,
-    y_label: str,
-    lines: Sequence[Line],
-    draw_background: Callable[[Axes], object] | None = None,
-) -> Figure:
-    """Draw lines over time, on top of what ``draw_background`` draws."""
-    with styled():
-        figure = new_figure(8.4, 3.8)
-        axes = figure.add_subplot()
-        if draw_background is not None:
-            draw_background(axes)
-        for line in lines:
-            axes.plot(line.time_s, line.values, color=line.colour, lw=1.2, label=line.label)
-        axes.set(xlabel="time [s]", ylabel=y_label)
-        add_legend(axes)
-        return finished(figure, title)
-
-
-def add_legend(axes: Axes) -> None:
-    """Add a grid, and a legend above the axes."""
-    axes.grid()
-    axes.legend(ncols=4, fontsize=8, frameon=False, loc="lower left", bbox_to_anchor=(0, 1), borderpad=0)

@@ -13,14 +13,13 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from pipelines.reporting.drawing import BLUE, CLASS_COLOURS, FAINT_INK, INK, VERMILION
+from pipelines.reporting.line_figure import Line, lines_figure
 from pipelines.reproduce.danzi.runs import (
     ROBOT,
     START_S,
     Curve,
-    Line,
     extreme_in_start,
     lagged_truth,
-    lines_figure,
     over_runs,
     seeded_runs,
 )

@@ -167,7 +167,7 @@ def test_a_first_version_at_chance_is_registered_and_no_champion(in_tracked, log
     assert wide.alias_reason.startswith("first version; the interval of the accuracy is 40 points wide")
 
 
-def test_a_champion_that_cannot_be_loaded_gives_way(in_tracked, log, mlflow):
+def test_a_champion_that_cannot_be_loaded_is_replaced(in_tracked, log, mlflow):
     first = log("broken", 0.99)
     (Path(mlflow.artifacts.download_artifacts(first.model_uri)) / "model.skops").write_bytes(b"")
     second = log("broken", 0.5, "bb")

@@ -253,6 +253,17 @@ def test_table_8_1_is_reproduced_and_its_iteration_corrected(document):
     assert normalised["spread"] == pytest.approx([0.5, 0.56], abs=0.005)
 
 
+def test_terrain_recognition_has_the_honest_figure_beside_the_one_by_windows(document):
+    rows = [found for found in document["rows"] if "8.1" in found["experiment"]]
+    at_random, by_run, weakest, level, difficulty = rows
+    assert {at_random["verdict"], by_run["verdict"], level["verdict"]} == {"not printed"}
+    assert by_run["simulated"] < at_random["simulated"]
+    assert by_run["spread"][0] <= by_run["simulated"] <= by_run["spread"][1]
+    assert weakest["simulated"] == min(weakest["beside"].values())
+    assert level["simulated"] > by_run["simulated"]
+    assert difficulty["verdict"] == "as printed"
+
+
 def test_the_same_seed_gives_the_same_rows_and_another_others(document):
     for experiment, run in (("zero-slip wheel rows", slip_bias), ("Loss of the camera", camera_lost)):
         rows = [found for found in document["rows"] if experiment in found["experiment"]]

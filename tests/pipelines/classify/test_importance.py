@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
+from pipelines.classify.importance import channel_importance, channel_of
 from pipelines.crossval.evaluation import Examples
-from pipelines.crossval.importance import channel_importance, channel_of
 from pipelines.crossval.splits import Fold
 from terrain.classify.folds import split_runs
 from terrain.classify.svm import GroupedSVC

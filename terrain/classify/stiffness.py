@@ -1,0 +1,232 @@
+"""Terrains by stiffness: levels, the cost of confusing soft with hard, and clusters of runs without labels.
+
+The AgriMaRo thesis (8.1) groups terrains "primarily on the level of stiffness or deformability": compact and
+paved surfaces are the low-difficulty extreme, yielding ones the other.  A wrong class within a level costs
+little, as the slip to aim for is alike; hard taken for soft, or soft for hard, costs most::
+
+    C_ij = 0                                                  i = j
+    C_ij = w + (1 - w) |l_i - l_j| / (HARD - SOFT)            i != j
+
+with the level l of each class and w = :data:`WITHIN_LEVEL_COST`.  The decision of least expected cost under
+the probabilities p is ``argmin_j sum_i p_i C_ij`` (Duda, Hart and Stork, Pattern Classification, 2.2).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from enum import IntEnum
+from typing import NamedTuple
+
+import numpy as np
+
+from terrain.bootstrap import bootstrap_rows, percentile_interval
+from terrain.errors import DataError
+from terrain.records import Array
+
+WITHIN_LEVEL_COST = 0.25
+"""Cost of a wrong class of the right level, where soft taken for hard costs 1; chosen, not measured: the slip
+to aim for differs less within a level than between levels, and is not the same."""
+
+MAX_CLUSTERS = 6
+"""More clusters are not tried: with 50 runs each would have eight."""
+
+MIN_RUNS = 8
+"""Fewer runs are not clustered: two clusters and their covariance have more numbers than these."""
+
+N_COMPONENTS = 5
+"""Principal components in which runs are clustered, at most; at most one for each four runs."""
+
+EXPLAINED_RATIO = 0.8
+"""So much of the variance the components have to explain; what is left is mostly noise of single features."""
+
+N_STARTS = 10
+"""Starts of the mixture model, of which the most likely result is kept."""
+
+MIN_VARIANCE = 1e-3
+"""Added to the variance of a cluster, so that two runs alike are no cluster of infinite density."""
+
+CLIP_STD = 5.0
+"""Scaled values are clipped here, so that one run is not a cluster because of one feature."""
+
+N_BOOTSTRAP = 1000
+
+
+class StiffnessLevel(IntEnum):
+    """How a terrain carries a wheel.
+
+    ``SOFT``: it sinks in; ``FIRM``: it is carried, and the top layer yields; ``HARD``: nothing yields.
+    """
+
+    SOFT = 0
+    FIRM = 1
+    HARD = 2
+
+
+def cost_matrix(levels: Sequence[int], within: float = WITHIN_LEVEL_COST) -> Array:
+    """Return the cost (k, k) of predicting the class of a column where that of the row is true.
+
+    Parameters
+    ----------
+    levels : :class:`StiffnessLevel` of each class
+    within : cost of a wrong class of the right level, 0 to 1
+
+    Examples
+    --------
+    >>> cost_matrix([StiffnessLevel.SOFT, StiffnessLevel.FIRM, StiffnessLevel.HARD, StiffnessLevel.HARD], 0.2)
+    array([[0. , 0.6, 1. , 1. ],
+           [0.6, 0. , 0.6, 0.6],
+           [1. , 0.6, 0. , 0.2],
+           [1. , 0.6, 0.2, 0. ]])
+    """
+    level = np.asarray(levels, dtype=float)
+    largest = float(StiffnessLevel.HARD - StiffnessLevel.SOFT)
+    cost: Array = within + (1 - within) * np.abs(level[:, None] - level[None, :]) / largest
+    np.fill_diagonal(cost, 0.0)
+    return cost
+
+
+def least_cost_class(probability: Array, cost: Array) -> Array:
+    """Return the column (n,) of least expected cost; of equal ones that of the highest probability.
+
+    Parameters
+    ----------
+    probability : (n, k) of each class
+    cost : (k, k) as :func:`cost_matrix` gives it
+
+    Examples
+    --------
+    >>> cost = cost_matrix([StiffnessLevel.SOFT, StiffnessLevel.HARD, StiffnessLevel.HARD])
+    >>> least_cost_class(np.array([[0.4, 0.3, 0.3], [0.9, 0.1, 0.0]]), cost)
+    array([1, 0])
+    """
+    expected = probability @ cost
+    best = expected.min(axis=1, keepdims=True)
+    candidates = np.where(expected <= best + 1e-12, probability, -1.0)
+    return np.asarray(candidates.argmax(axis=1))
+
+
+class RunClusters(NamedTuple):
+    """Clusters of runs, found without labels.
+
+    Parameters
+    ----------
+    cluster : (n_runs,) number of the cluster of each run, from 0
+    n_clusters : of the smallest Bayesian information criterion
+    bic : (k,) the criterion with 1, 2, ... clusters; the smallest is best
+    """
+
+    cluster: Array
+    n_clusters: int
+    bic: Array
+
+
+def cluster_runs(values: Array, speed_mps: Array, seed: int, n_clusters: int | None = None) -> RunClusters:
+    """Cluster runs by what they have in common beside their speed.
+
+    Each value is scaled over the runs and freed of its linear dependence on the logarithm of the speed, as
+    vibration and current grow with speed on any terrain.  Gaussian mixtures of one covariance are fitted to
+    the first principal components; their number is that of the smallest Bayesian information criterion
+    (Schwarz 1978).
+
+    Parameters
+    ----------
+    values : (n_runs, f) features of each run, as medians over its windows; NaN where not defined
+    speed_mps : (n_runs,) typical speed of each run; NaN where unknown
+    seed : of the starts
+    n_clusters : fixed number; by the criterion where None
+
+    Raises
+    ------
+    DataError
+        if there are fewer than :data:`MIN_RUNS` runs, or no value differs between them.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(0)
+    >>> values = np.repeat([[0.0] * 6, [4.0] * 6], 10, axis=0) + 0.3 * rng.normal(size=(20, 6))
+    >>> cluster_runs(values, np.full(20, 0.5), 0).n_clusters
+    2
+    """
+    from sklearn.decomposition import PCA
+    from sklearn.mixture import GaussianMixture
+
+    n_runs = len(values)
+    if n_runs < MIN_RUNS:
+        raise DataError(f"{n_runs} runs are too few to be clustered; at least {MIN_RUNS} are needed")
+    scaled = values[:, np.isfinite(values).all(axis=0)]
+    scaled = scaled[:, scaled.std(axis=0) > 0]
+    if not scaled.size:
+        raise DataError("no feature differs between the runs: they cannot be clustered")
+    scaled = np.clip((scaled - scaled.mean(axis=0)) / scaled.std(axis=0), -CLIP_STD, CLIP_STD)
+    n_components = min(N_COMPONENTS, max(n_runs // 4, 1), scaled.shape[1])
+    pca = PCA(n_components, svd_solver="full")
+    reduced = pca.fit_transform(_without_speed(scaled, speed_mps))
+    explained = np.cumsum(pca.explained_variance_ratio_)
+    reduced = reduced[:, : 1 + int(np.sum(explained < EXPLAINED_RATIO))]
+    numbers = range(1, min(MAX_CLUSTERS, n_runs - 1) + 1) if n_clusters is None else (n_clusters,)
+    found = []
+    for number in numbers:
+        mixture = GaussianMixture(
+            number, covariance_type="tied", n_init=N_STARTS, reg_covar=MIN_VARIANCE, random_state=seed
+        ).fit(reduced)
+        found.append((float(mixture.bic(reduced)), np.asarray(mixture.predict(reduced))))
+    bic = np.array([each[0] for each in found])
+    best = int(bic.argmin())
+    return RunClusters(found[best][1], numbers[best], bic)
+
+
+def _without_speed(scaled: Array, speed_mps: Array) -> Array:
+    """Return what a least-squares line over the logarithm of the speed leaves of each column."""
+    known = np.isfinite(speed_mps) & (speed_mps > 0)
+    if not known.all() or np.ptp(speed_mps) == 0:
+        return scaled
+    line = np.column_stack([np.ones(len(scaled)), np.log(speed_mps)])
+    rest: Array = scaled - line @ np.linalg.lstsq(line, scaled, rcond=None)[0]
+    return rest
+
+
+class Agreement(NamedTuple):
+    """Adjusted Rand index of two groupings of runs, and its 95 % interval over the runs."""
+
+    adjusted_rand: float
+    interval: tuple[float, float]
+
+
+def agreement(one: Array, other: Array, rng: np.random.Generator) -> Agreement:
+    """Return how far two groupings agree: 1 the same, 0 as by chance (Hubert and Arabie 1985).
+
+    A bootstrap over runs repeats runs, which always agree with themselves, so its index is taken over pairs
+    of *different* runs only.
+
+    Parameters
+    ----------
+    one, other : (n_runs,) groups, by any names
+    rng : source of the draws
+
+    Examples
+    --------
+    >>> groups = np.repeat(["soft", "hard"], 6)
+    >>> agreement(groups, np.repeat([1, 0], 6), np.random.default_rng(0)).adjusted_rand
+    1.0
+    """
+    first, second = (np.unique(each, return_inverse=True)[1] for each in (one, other))
+    n = len(first)
+    same = first[:, None] == first[None, :], second[:, None] == second[None, :]
+    draws = np.empty(N_BOOTSTRAP)
+    for i, rows in enumerate(bootstrap_rows(n, N_BOOTSTRAP, rng)):
+        draws[i] = _adjusted_rand(np.bincount(rows, minlength=n).astype(float), *same)
+    finite = draws[np.isfinite(draws)]
+    interval = percentile_interval(finite) if len(finite) else (np.nan, np.nan)
+    return Agreement(_adjusted_rand(np.ones(n), *same), interval)
+
+
+def _adjusted_rand(weight: Array, same_one: Array, same_other: Array) -> float:
+    """Return the index over pairs of different runs, each pair with the product of its weights."""
+    pairs = np.outer(weight, weight)
+    np.fill_diagonal(pairs, 0.0)
+    total = pairs.sum()
+    one, other = (pairs * same_one).sum(), (pairs * same_other).sum()
+    both = (pairs * (same_one & same_other)).sum()
+    by_chance = one * other / total if total else 0.0
+    most = (one + other) / 2
+    return float((both - by_chance) / (most - by_chance)) if most > by_chance else float("nan")

@@ -1,0 +1,103 @@
+"""Costs of confusing stiffness levels are laws; clusters of runs without labels find a hidden grouping."""
+
+import numpy as np
+import pytest
+from sklearn.metrics import adjusted_rand_score
+
+from terrain.classify.stiffness import (
+    MIN_RUNS,
+    StiffnessLevel,
+    agreement,
+    cluster_runs,
+    cost_matrix,
+    least_cost_class,
+)
+from terrain.errors import DataError
+
+SOFT, FIRM, HARD = StiffnessLevel
+
+
+@pytest.mark.parametrize("within", [0.0, 0.25, 1.0])
+def test_costs_grow_with_the_distance_in_stiffness(within):
+    cost = cost_matrix([SOFT, SOFT, FIRM, HARD], within)
+    assert np.array_equal(cost, cost.T)
+    assert np.all(np.diag(cost) == 0)
+    assert cost[0, 3] == 1.0
+    assert within == cost[0, 1] <= cost[0, 2] <= cost[0, 3]
+
+
+def test_the_decision_of_least_cost_has_the_least_cost_of_all_decisions():
+    """Two routes: the vectorised decision, and every decision tried on its own."""
+    rng = np.random.default_rng(0)
+    probability = rng.dirichlet([0.5] * 4, size=200)
+    cost = cost_matrix([SOFT, FIRM, HARD, HARD])
+    chosen = least_cost_class(probability, cost)
+    for p, column in zip(probability, chosen, strict=True):
+        expected = [sum(p[i] * cost[i, j] for i in range(4)) for j in range(4)]
+        assert expected[column] == pytest.approx(min(expected))
+    assert np.any(chosen != probability.argmax(axis=1))
+
+
+def test_equal_costs_decide_for_the_most_probable_class():
+    probability = np.random.default_rng(1).dirichlet([1.0] * 3, size=100)
+    assert np.array_equal(least_cost_class(probability, 1.0 - np.eye(3)), probability.argmax(axis=1))
+
+
+def test_where_the_probabilities_are_true_least_cost_costs_least():
+    rng = np.random.default_rng(2)
+    probability = rng.dirichlet([0.3] * 5, size=100_000)
+    true = (rng.random((len(probability), 1)) > probability.cumsum(axis=1)).sum(axis=1)
+    cost = cost_matrix([SOFT, SOFT, FIRM, HARD, HARD])
+    by_cost = cost[true, least_cost_class(probability, cost)]
+    by_class = cost[true, probability.argmax(axis=1)]
+    error = (by_class - by_cost).std() / np.sqrt(len(true))
+    assert (by_class - by_cost).mean() > 3 * error
+
+
+def hidden_groups(seed, n_runs=30, speed_gain=3.0):
+    """Return run features of three groups, on which speed acts more than the group does."""
+    rng = np.random.default_rng(seed)
+    group = np.arange(n_runs) % 3
+    speed = rng.uniform(0.2, 1.2, n_runs)
+    values = rng.normal(size=(3, 8))[group] * 2 + 0.25 * rng.normal(size=(n_runs, 8))
+    return values + speed_gain * np.log(speed)[:, None], speed, group
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_groups_behind_a_strong_effect_of_speed_are_found(seed):
+    values, speed, group = hidden_groups(seed)
+    found = cluster_runs(values, speed, 0)
+    assert agreement(found.cluster, group, np.random.default_rng(0)).adjusted_rand > 0.8
+    blind = cluster_runs(values, np.full(len(speed), np.nan), 0, n_clusters=3)
+    assert agreement(blind.cluster, group, np.random.default_rng(0)).adjusted_rand < 0.8
+
+
+def test_runs_without_groups_agree_with_nothing():
+    rng = np.random.default_rng(4)
+    found = cluster_runs(rng.normal(size=(40, 8)), rng.uniform(0.2, 1.0, 40), 0, n_clusters=3)
+    index, (low, high) = agreement(found.cluster, np.arange(40) % 3, rng)
+    assert low < 0 < high
+    assert abs(index) < 0.2
+
+
+def test_the_same_seed_gives_the_same_clusters():
+    values, speed, _ = hidden_groups(5)
+    one, other = cluster_runs(values, speed, 7), cluster_runs(values, speed, 7)
+    assert np.array_equal(one.cluster, other.cluster)
+    assert np.array_equal(one.bic, other.bic)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_index_is_that_of_the_library(seed):
+    rng = np.random.default_rng(seed)
+    one, other = rng.integers(4, size=25), rng.integers(3, size=25)
+    assert agreement(one, other, rng).adjusted_rand == pytest.approx(adjusted_rand_score(one, other))
+
+
+def test_what_cannot_be_clustered_is_refused():
+    with pytest.raises(DataError, match=f"at least {MIN_RUNS} are needed"):
+        cluster_runs(np.zeros((MIN_RUNS - 1, 3)), np.ones(MIN_RUNS - 1), 0)
+    with pytest.raises(DataError, match="no feature differs"):
+        cluster_runs(np.zeros((10, 3)), np.ones(10), 0)
+    with pytest.raises(DataError, match="no feature differs"):
+        cluster_runs(np.full((10, 3), np.nan), np.ones(10), 0)
