@@ -93,13 +93,16 @@ def outline(page: str) -> dict[str, Any]:
 
 
 def statistics(values: Any) -> dict[str, Any]:
-    """Return what is kept of many numbers.
+    """Return what is kept of many numbers, or of many texts.
 
     Examples
     --------
     >>> statistics([1.0, float("nan"), 3.0])
     {'n': 3, 'nan': 1, 'sum': 4.0, 'sum_sq': 10.0, 'first': 1.0, 'last': 3.0}
     """
+    if any(isinstance(value, str) for value in values):
+        texts = [str(value) for value in values]
+        return {"n": len(texts), "distinct": len(set(texts)), "first": texts[0], "last": texts[-1]}
     array = np.asarray(values, dtype=np.float64)
     known = array[~np.isnan(array)]
     ends = (array[0], array[-1]) if array.size else (math.nan, math.nan)
@@ -250,7 +253,13 @@ def _channels(path: Path) -> dict[str, Any]:
     import pyarrow.parquet as pq
 
     table = pq.read_table(path)
-    return {name: statistics(table.column(name).to_numpy()) for name in table.column_names}
+    columns = {name: table.column(name).combine_chunks() for name in table.column_names}
+    return {
+        name: statistics(
+            (column.flatten() if hasattr(column, "flatten") else column).to_numpy(zero_copy_only=False)
+        )
+        for name, column in columns.items()
+    }
 
 
 def _rounded(number: float) -> float:
