@@ -223,8 +223,10 @@ def test_what_does_not_fit_is_refused_at_once(mower_model, swerve_model):
 
 
 def test_runs_of_several_filters_do_not_train_one_model():
-    run = simulated("grass", 1)
-    runs = [enriched(estimate_run(run, AGRIMARO, name)) for name in ("vio15", "slip14")]
+    runs = [
+        enriched(estimate_run(simulated("grass", number), AGRIMARO, name))
+        for number, name in enumerate(("vio15", "slip14"), 1)
+    ]
     windows = samples_of(
         [replace(run, run_id=f"r{k}") for k, run in enumerate(runs)], CrossvalSettings()
     ).cut.windows
