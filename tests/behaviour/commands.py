@@ -155,7 +155,7 @@ def _shaken(size: float, n_channels: int, n: int) -> list[list[float]]:
     """Return waves with noise of their own for each run: copies of one run would be refused."""
     rng = random.Random(round(1000 * size) + n_channels)
     return [
-        [round(size * (_wave(i, k) + rng.gauss(0.0, 1.0)), 6) for k in range(n_channels)] for i in range(n)
+        [round(size * (_wave(i, k) + rng.gauss(0.0, 0.3)), 6) for k in range(n_channels)] for i in range(n)
     ]
 
 
