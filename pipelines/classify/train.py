@@ -64,6 +64,7 @@ def train(
     terrain = windows.terrain.astype(str)
     recipe = settings.new_recipe()
     recipe.fit(windows, terrain)
+    progress("fit on all runs", 1, 1)
     importance = channel_importance(
         settings.new_recipe()[-1],
         Examples(recipe[:-1].transform(windows), terrain, samples.group),
