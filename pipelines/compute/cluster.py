@@ -80,8 +80,8 @@ class Cluster:
                 n_threads = max(sum(self._workers().values()), 1)
                 add(TASKS_A_THREAD * n_threads)
                 while waiting:
-                    self._await(waiting[0])
-                    result = waiting.popleft().result(timeout=ANSWER_S)
+                    result = self._result(waiting[0])
+                    waiting.popleft()
                     add(1)
                     yield result
             finally:
@@ -102,6 +102,22 @@ class Cluster:
                 raise TerrainError(
                     f"worker {worker} of {self.address} has {found}: install the same version on it"
                 )
+
+    def _result(self, future: Any) -> Any:
+        """Return what a task gave; where it was lost with its worker, what another worker makes of it.
+
+        A worker that is killed is asked for its results until its connection is given up, which takes longer
+        than the scheduler needs for an answer: only a scheduler without an answer ends the wait.
+        """
+        end_s = monotonic() + NO_WORKER_S
+        while True:
+            self._await(future)
+            try:
+                return future.result(timeout=ANSWER_S)
+            except TimeoutError:
+                if future.status == "error" or monotonic() > end_s:  # the task's own, or never fetched
+                    raise
+                self._workers()
 
     def _await(self, future: Any) -> None:
         """Wait for a task while its scheduler answers and a worker takes tasks."""

@@ -88,7 +88,7 @@ def build_store(
     _remove_others(store, runs)
     _write_json(store / RUNS_FILE, {"runs": [run._asdict() for run in runs]})
     return StoreReport(
-        out=store,
+        out=settings.out,
         n_runs=len(runs),
         n_computed=n_computed,
         n_windows=sum(run.n_windows for run in runs),

@@ -138,6 +138,56 @@ def test_a_cluster_without_workers_is_one_sentence(monkeypatch):
             computing("dask:" + empty.scheduler_address).__enter__()
 
 
+class Lost:
+    """A result that went with its worker: it is there, cannot be fetched, and is then computed again."""
+
+    def __init__(self, n_lost, status="finished"):
+        self.n_lost, self.status = n_lost, status
+
+    def add_done_callback(self, call):
+        call(self)
+
+    def done(self):
+        return True
+
+    def result(self, timeout):
+        self.n_lost -= 1
+        if self.n_lost >= 0:
+            raise TimeoutError
+        return 7
+
+
+class Answering:
+    """A client whose scheduler answers a number of times."""
+
+    status = "running"
+
+    def __init__(self, n_answers):
+        self.n_answers = n_answers
+        self.scheduler = self
+
+    def identity(self):
+        """Asked for through ``sync`` only."""
+
+    def sync(self, function, callback_timeout):
+        self.n_answers -= 1
+        if self.n_answers < 0:
+            raise TimeoutError
+        return {"workers": {}}
+
+
+def test_a_result_lost_with_its_worker_is_waited_for_while_the_scheduler_answers(monkeypatch):
+    pytest.importorskip("distributed")
+    assert cluster.Cluster(Answering(3), "tcp://h:1")._result(Lost(3)) == 7
+    with pytest.raises(TimeoutError):
+        cluster.Cluster(Answering(2), "tcp://h:1")._result(Lost(3))
+    with pytest.raises(TimeoutError):  # of the task itself
+        cluster.Cluster(Answering(3), "tcp://h:1")._result(Lost(1, "error"))
+    monkeypatch.setattr(cluster, "NO_WORKER_S", -1.0)
+    with pytest.raises(TimeoutError):  # one that is never fetched
+        cluster.Cluster(Answering(3), "tcp://h:1")._result(Lost(1))
+
+
 @pytest.mark.slow
 def test_a_killed_worker_costs_its_task_only(cluster_processes):
     import tasks
