@@ -53,7 +53,7 @@ def train(
         if the data do not suffice or the tracking folder cannot be written.
     """
     from pipelines.classify.judging import held_out_runs, judge_of, standing_of, standing_tags
-    from pipelines.crossval.figures import all_figures
+    from pipelines.crossval_figures.figures import all_figures
     from pipelines.models.tracking import TrainingRecord, code_commit, ensure_tracking, log_training
 
     ensure_tracking()

@@ -9,6 +9,7 @@ from dataclasses import fields, replace
 from sklearn.base import clone
 
 from features.extractor import FeatureExtractor
+from features.motion import NO_MOTION, window_motion
 from pipelines.courses.following import following
 from pipelines.courses.judgement import find_breakaways, judge
 from pipelines.courses.results import OverTime
@@ -31,6 +32,7 @@ from pipelines.models.recipes import WindowPipeline, feature_matrix
 from pipelines.reporting.numbers import format_counts
 from pipelines.reporting.progress import Progress, silent
 from pipelines.runs.duplicates import distinct_runs
+from pipelines.support.evaluate import Judged, support_report
 from terrain.classify.folds import single_run_classes
 from terrain.errors import DataError
 from terrain.records import Array, RunLog, Windows
@@ -70,6 +72,8 @@ def crossval(
         extras = extras._replace(stiffness=stiffness_figures(held_out, features, samples, settings.seed))
     repaired = dict(sum((Counter(run.dropped) for run in runs), Counter()))
     report = report_of(figures, samples, settings, features.shape[1], repaired, extras)
+    if settings.protocol != "published":
+        report = _with_support(report, held_out, windows, settings.seed)
     if settings.protocol == "leave-terrain-out":
         unknown = leave_terrain_out(examples, samples, settings.seed, settings.jobs, progress)
         report = replace(report, unknown=unknown)
@@ -146,6 +150,17 @@ def _over_time(held_out: HeldOut, windows: Windows, seed: int) -> OverTime:
         judge([track for track in tracks if not track.spliced], seed),
         find_breakaways(held_out.probability.mean(axis=0), held_out.classes, windows),
     )
+
+
+def _with_support(report: CrossvalReport, held_out: HeldOut, windows: Windows, seed: int) -> CrossvalReport:
+    """Return a report with the support of its held-out windows, or with the reason why there is none."""
+    motion = window_motion(windows)
+    if motion is None:
+        return replace(report, notes=(*report.notes, f"support: {NO_MOTION}"))
+    splits = [(each.fold.repeat, each.fold.train, each.fold.test) for each in held_out.results]
+    run_id, terrain = windows.run_id.astype(str), windows.terrain.astype(str)
+    judged = Judged(motion, run_id, terrain, held_out.classes, held_out.probability, splits, windows.length_s)
+    return replace(report, support=support_report(judged, seed))
 
 
 def samples_of(runs: Sequence[RunLog], settings: CrossvalSettings) -> Samples:

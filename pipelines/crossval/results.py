@@ -8,6 +8,7 @@ from enum import StrEnum
 from typing import Any, NamedTuple
 
 from pipelines.courses.results import OverTime
+from pipelines.support.results import SupportReport
 from terrain.classify.confidence import CoverageFigures, ReliabilityBin
 from terrain.classify.metrics import ClassFigures, RunFigures
 
@@ -224,8 +225,9 @@ class Figures:
 class CrossvalReport(Figures):
     """A cross-validation: its figures, how they were obtained, and what a reader has to know of them.
 
-    ``extras`` and ``unknown`` are None where they were not asked for, ``dataset``, ``data_digest`` and
-    ``skipped`` where the caller did not give them.
+    ``extras`` and ``unknown`` are None where they were not asked for, ``support`` where the motion of
+    the robot is not known or a run trains and tests, ``dataset``, ``data_digest`` and ``skipped`` where the
+    caller did not give them.
     """
 
     protocol: str
@@ -241,6 +243,7 @@ class CrossvalReport(Figures):
     notes: tuple[str, ...]
     extras: Extras | None = None
     unknown: UnknownTerrain | None = None
+    support: SupportReport | None = None
     dataset: str | None = None
     data_digest: str | None = None
     skipped: tuple[str, ...] | None = None
@@ -251,11 +254,12 @@ class CrossvalReport(Figures):
 
     def as_json(self) -> dict[str, Any]:
         """Return all fields, the extras among them, without those that are not there."""
-        apart = ("extras", "unknown")
+        apart = ("extras", "unknown", "support")
         found = {each.name: getattr(self, each.name) for each in fields(self) if each.name not in apart}
         unknown = [name for name in ("dataset", "data_digest", "skipped") if found[name] is None]
         extras = {} if self.extras is None else self.extras.as_json()
         extras |= {} if self.unknown is None else self.unknown._asdict()
+        extras |= {} if self.support is None else self.support.as_json()
         return {name: value for name, value in (found | extras).items() if name not in unknown}
 
 

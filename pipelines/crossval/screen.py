@@ -18,6 +18,7 @@ from pipelines.crossval.results import (
 )
 from pipelines.reporting.numbers import percent
 from pipelines.reporting.terminal import print_lines
+from pipelines.support.screen import support_lines
 
 
 def print_crossval(report: CrossvalReport, console: Console) -> None:
@@ -45,6 +46,8 @@ def print_crossval(report: CrossvalReport, console: Console) -> None:
     console.print(table)
     if report.unknown is not None:
         print_lines(console, _unknown_lines(report.unknown))
+    if report.support is not None:
+        print_lines(console, support_lines(report.support))
     if report.extras is not None:
         print_lines(console, _extras_lines(report.extras))
     print_lines(console, (f"note: {note}" for note in (*report.notes, *(report.skipped or ()))))

@@ -17,6 +17,7 @@ from terrain.errors import ConfigError
 NO_EXTRAS = (
     "from a store of features: speed alone, slow against fast and the learning curve need the runs themselves"
 )
+NO_SUPPORT = "support: a store of features does not hold how the robot moved"
 
 
 def crossval_store(
@@ -40,4 +41,4 @@ def crossval_store(
     results = fit_folds(classifier, examples, folds, settings.jobs, settings.protocol, progress)
     figures = summarise(pool(results, examples.terrain), samples, settings.seed)
     report = report_of(figures, samples, settings, features.shape[1], store.repaired, None)
-    return replace(report, notes=(*report.notes, *((NO_EXTRAS,) if settings.extras else ())))
+    return replace(report, notes=(*report.notes, NO_SUPPORT, *((NO_EXTRAS,) if settings.extras else ())))

@@ -25,7 +25,7 @@ from terrain.classify.metrics import VOTE_SPAN_S, RunFigures
 from terrain.control.slip_table import DRIVE_STATES
 
 WEAK_BELOW = 0.5
-WIDE = ("per_run", "motion", "slip")
+WIDE = ("per_run", "support", "motion", "slip")
 """Figures that take the whole width; they come after those that stand side by side."""
 
 HEADLINES = {
@@ -47,6 +47,10 @@ CAPTIONS = {
     "reliability": (
         "Each point is a bin of equally many windows; below the dashed line the stated probability is "
         "higher than the accuracy, above it lower."
+    ),
+    "support": (
+        "Accuracy of each terrain by how it was driven; a dash is driving that no run shows, where an answer "
+        "rests on nothing that was recorded."
     ),
     "learning_curve": (
         "The curve shows what each further run brought; where it is still rising at its right end, more runs "

@@ -60,7 +60,7 @@ def quickstart(
     """
     from pipelines.classify.predict import predict
     from pipelines.classify.train import train
-    from pipelines.crossval.figures import all_figures
+    from pipelines.crossval_figures.figures import all_figures
     from pipelines.models.tracking import ensure_tracking, load_model
     from pipelines.quickstart.page import html_report
     from terrain.control.slip_table import load_slip_table

@@ -44,6 +44,12 @@ PROMISED = {
     "accuracy_per_repeat",
     "reliability",
     "n_features",
+    "support",
+    "accuracy_by_support",
+    "unsupported",
+    "supported",
+    "supported_auc",
+    "next_drives",
 }
 
 

@@ -13,8 +13,8 @@ from pipelines.classify.results import (
     Training,
     WindowPrediction,
 )
-from pipelines.crossval.figures import confusion_figure
 from pipelines.crossval.results import Applicability
+from pipelines.crossval_figures.figures import confusion_figure
 from pipelines.estimate.consistency import TerrainConsistency
 from pipelines.estimate.labelled import TerrainSlip
 from pipelines.models.results import Registered

@@ -9,7 +9,8 @@ import pytest
 from matplotlib.collections import LineCollection
 from matplotlib.container import BarContainer, ErrorbarContainer
 
-from pipelines.crossval.figures import (
+from pipelines.crossval.results import ChannelImportance
+from pipelines.crossval_figures.figures import (
     MAX_FEATURES,
     MAX_RUNS,
     all_figures,
@@ -19,7 +20,6 @@ from pipelines.crossval.figures import (
     per_run_figure,
     reliability_figure,
 )
-from pipelines.crossval.results import ChannelImportance
 from pipelines.reporting.drawing import png_bytes, svg_text
 from pipelines.reporting.numbers import NOT_KNOWN
 from terrain.classify.metrics import RunFigures
@@ -193,7 +193,7 @@ def test_no_global_state_is_touched():
         "settings = lambda: {k: v for k, v in matplotlib.rcParams.copy().items() if k != 'backend'}\n"
         "before = settings()\n"
         "from pipelines.reporting.drawing import svg_text\n"
-        "from pipelines.crossval.figures import importance_figure\n"
+        "from pipelines.crossval_figures.figures import importance_figure\n"
         "from pipelines.crossval.results import ChannelImportance\n"
         "svg_text(importance_figure([ChannelImportance('imu.gyro_x', 0.2, 0.01)]))\n"
         "assert settings() == before, 'settings changed'\n"

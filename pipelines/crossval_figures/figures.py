@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, PercentFormatter
 
 from pipelines.crossval.results import ChannelImportance, CrossvalReport, LearningCurve
+from pipelines.crossval_figures.support import support_figure
 from pipelines.reporting.drawing import (
     BARE,
     BLUE,
@@ -44,6 +45,8 @@ def all_figures(report: CrossvalReport, importances: Sequence[ChannelImportance]
         "per_run": per_run_figure(report),
         "reliability": reliability_figure(report),
     }
+    if report.support is not None:
+        figures["support"] = support_figure(report.support, report.dataset)
     if report.extras is not None:
         figures["learning_curve"] = learning_curve_figure(report, report.extras.learning_curve)
     if importances:

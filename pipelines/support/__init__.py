@@ -1,0 +1,1 @@
+"""Support of held-out predictions by training runs, and which drives to record next."""

@@ -1,0 +1,148 @@
+"""Accuracy by support: by the true terrain, and by the mark that needs no label.
+
+Figures are ratios of sums over windows, their intervals those of a bootstrap that draws whole runs within
+their classes.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from terrain.bootstrap import percentile_interval
+from terrain.classify.confidence import Interval, confidence_auc
+from terrain.classify.metrics import N_BOOTSTRAP
+from terrain.classify.support import SupportLevel, support_levels
+from terrain.records import Array
+
+
+class HeldOutSupport(NamedTuple):
+    """Support of held-out windows by the training runs of their folds, each (repeats, n).
+
+    Parameters
+    ----------
+    correct : whether the prediction is right
+    true_runs : training runs of the true terrain near the motion of the window
+    predicted_runs : of the predicted terrain
+    probability : supported probability of the predicted terrain
+    supported : whether the prediction is marked supported
+    """
+
+    correct: Array
+    true_runs: Array
+    predicted_runs: Array
+    probability: Array
+    supported: Array
+
+
+class PartFigures(NamedTuple):
+    """A part of the held-out windows; intervals are of 95 % over runs, None where it holds no window.
+
+    Parameters
+    ----------
+    windows_ratio, windows_ratio_ci : of all windows
+    accuracy, accuracy_ci : of the part
+    errors_ratio, errors_ratio_ci : of all errors, those in the part; None where there is no error
+    """
+
+    windows_ratio: float
+    windows_ratio_ci: Interval
+    accuracy: float | None
+    accuracy_ci: Interval | None
+    errors_ratio: float | None
+    errors_ratio_ci: Interval | None
+
+
+class SupportAccuracy(NamedTuple):
+    """Accuracy by support.
+
+    Parameters
+    ----------
+    by_true_terrain : by :class:`~terrain.classify.support.SupportLevel` of the true terrain: needs labels
+    unsupported, supported : by the mark of the prediction, without a label
+    auc : area from the supported probability to correctness; None where all are right
+    """
+
+    by_true_terrain: dict[str, PartFigures]
+    unsupported: PartFigures
+    supported: PartFigures
+    auc: float | None
+
+
+def support_accuracy(
+    held_out: HeldOutSupport, run_id: Array, terrain: Array, rng: np.random.Generator
+) -> SupportAccuracy:
+    """Return the accuracy of held-out windows by their support.
+
+    Parameters
+    ----------
+    held_out : of n windows
+    run_id, terrain : (n,) run and true terrain of each window
+    rng : source of the bootstrap
+
+    Examples
+    --------
+    >>> right, runs = np.array([[True, True, False, True]]), np.array([[5, 5, 0, 2]])
+    >>> held_out = HeldOutSupport(right, runs, runs, 0.9 * runs / (1 + runs), runs > 1)
+    >>> run, terrain = np.array(list("aabb")), np.array(["ice"] * 4)
+    >>> found = support_accuracy(held_out, run, terrain, np.random.default_rng(0))
+    >>> found.unsupported.windows_ratio, found.unsupported.errors_ratio, found.supported.accuracy
+    (0.25, 1.0, 1.0)
+    >>> found.by_true_terrain["1 to 3 runs"].accuracy, found.auc
+    (1.0, 1.0)
+    """
+    weights, place = _run_weights(run_id, terrain, rng)
+    level = support_levels(held_out.true_runs)
+
+    def part(inside: Array) -> PartFigures:
+        return _part(inside, held_out.correct, place, weights)
+
+    areas = [
+        confidence_auc(probability, right.astype(float), np.ones((1, right.size)))[0]
+        for probability, right in zip(held_out.probability, held_out.correct, strict=True)
+    ]
+    known = np.isfinite(areas)
+    return SupportAccuracy(
+        {each.value: part(level == each.value) for each in SupportLevel},
+        part(~held_out.supported),
+        part(held_out.supported),
+        float(np.mean(np.array(areas)[known])) if known.any() else None,
+    )
+
+
+def _run_weights(run_id: Array, terrain: Array, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Return how often each run of a class is drawn (1 + draws, runs), first once each, and of windows."""
+    names = np.char.add(np.char.add(terrain.astype(str), "\n"), run_id.astype(str))
+    _, first, place = np.unique(names, return_index=True, return_inverse=True)
+    of_class = terrain[first]
+    weights = np.ones((1 + N_BOOTSTRAP, len(first)))
+    for name in np.unique(of_class):
+        members = np.flatnonzero(of_class == name)
+        odds = np.full(len(members), 1 / len(members))
+        weights[1:, members] = rng.multinomial(len(members), odds, N_BOOTSTRAP)
+    return weights, place
+
+
+def _part(inside: Array, correct: Array, place: Array, weights: Array) -> PartFigures:
+    def total(values: Array) -> Array:
+        return np.asarray(weights @ np.bincount(place, values.sum(axis=0), weights.shape[1]))
+
+    n, errors = total(np.ones(correct.shape)), total((~correct).astype(float))
+    n_inside, wrong_inside = total(inside.astype(float)), total((inside & ~correct).astype(float))
+    ratio, interval = _ratio(n_inside, n)
+    return PartFigures(
+        ratio or 0.0,
+        interval or (0.0, 0.0),
+        *_ratio(n_inside - wrong_inside, n_inside),
+        *_ratio(wrong_inside, errors),
+    )
+
+
+def _ratio(numerator: Array, denominator: Array) -> tuple[float | None, Interval | None]:
+    """Return the first ratio, and the interval of the others; None where the first has no denominator."""
+    if not denominator[0]:
+        return None, None
+    ratio: Array = np.full(len(numerator), np.nan)
+    np.divide(numerator, denominator, out=ratio, where=denominator > 0)
+    return float(ratio[0]), percentile_interval(ratio[1:]) if np.isfinite(ratio[1:]).any() else None
