@@ -22,6 +22,9 @@ MIN_SPEED_MPS = 0.05
 MIN_WHEEL_DIFFERENCE_MPS = 0.03
 """A smaller wheel difference (rms) does not count as a turn; the yaw rate per wheel difference is NaN."""
 
+N_PARTS = 8
+"""Parts of a window over which wheel difference and yaw rate are averaged."""
+
 _LOG_FLOOR = 1e-4
 
 
@@ -138,7 +141,8 @@ def speed_features(
     ``log_std_per_speed = log10(std / v)`` of each IMU channel, and the turning-slip measure
     ``yaw_per_wheel_difference = sum(w d) / sum(d d)``, which is one over the track width for wheels
     that do not slip and less the more they do; NaN where the robot does not turn.  The means of w and d
-    are taken in eight equal parts of the window, since the two streams have different rates.
+    are taken in eight equal parts of the window, since the two streams have different rates, or in as many
+    as the slower stream has samples.
 
     Returns
     -------
@@ -192,8 +196,10 @@ def speed_features(
     sides = left_right(wheel_channels, "speed")
     yaw_stream = next((stream for stream, names in channels.items() if "gyro_z_radps" in names), None)
     if sides and yaw_stream:
-        difference = _part_means(wheels[:, sides[1]] - wheels[:, sides[0]])
-        yaw_rate = _part_means(values[yaw_stream][:, channels[yaw_stream].index("gyro_z_radps")])
+        turning_mps = wheels[:, sides[1]] - wheels[:, sides[0]]
+        gyro = values[yaw_stream][:, channels[yaw_stream].index("gyro_z_radps")]
+        n_parts = min(N_PARTS, turning_mps.shape[1], gyro.shape[1])
+        difference, yaw_rate = _part_means(turning_mps, n_parts), _part_means(gyro, n_parts)
         power = np.sum(difference**2, axis=1)
         gain = np.full(n, np.nan)
         turning = np.sqrt(power / difference.shape[1]) >= MIN_WHEEL_DIFFERENCE_MPS
@@ -203,8 +209,7 @@ def speed_features(
     return features, np.stack(columns, axis=1) if columns else np.empty((n, 0))
 
 
-def _part_means(signal: Array, n_parts: int = 8) -> Array:
-    n_parts = min(n_parts, signal.shape[1])
+def _part_means(signal: Array, n_parts: int) -> Array:
     edges = np.linspace(0, signal.shape[1], n_parts + 1).round().astype(int)
     sums: Array = np.add.reduceat(signal, edges[:-1], axis=1)
     return sums / np.diff(edges)

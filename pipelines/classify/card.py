@@ -38,6 +38,7 @@ FIGURES: Mapping[str, str] = {
     "balanced_accuracy": "balanced accuracy",
     "macro_f1": "macro F1",
     "vote_accuracy": f"accuracy of the vote over {VOTE_SPAN_S:g} s",
+    "vote_windows": "windows in such a vote, mean",
     "filtered_accuracy": "accuracy behind the filter over time",
     "ece": "expected calibration error of the confidence",
     "confidence_auc": "area from confidence to correctness",
@@ -47,7 +48,7 @@ FIGURES: Mapping[str, str] = {
 }
 """Fields of a report and what they are called; those that a report lacks are passed over."""
 
-PLAIN = ("filter_delay_s", "confidence_auc", "auroc_unknown")
+PLAIN = ("vote_windows", "filter_delay_s", "confidence_auc", "auroc_unknown")
 """Figures that are no percentages."""
 
 

@@ -20,6 +20,7 @@ from terrain.classify.metrics import (
     run_bootstrap,
     runs_by_terrain,
     vote,
+    vote_sizes,
 )
 from terrain.records import Array
 
@@ -141,6 +142,10 @@ def summarise(held_out: HeldOut, samples: Samples, seed: int) -> Figures:
             for p, number in zip(held_out.probability, held_out.fold_number, strict=True)
         ]
     )  # fmt: skip
+    sizes = [
+        vote_sizes(_segments(samples.group, number), windows.start_s, windows.length_s)
+        for number in held_out.fold_number
+    ]
     repeats = [class_figures(terrain, p, classes) for p in predicted]
     pooled = class_figures(np.tile(terrain, len(predicted)), predicted.ravel(), classes)
     accuracies = np.array([repeat.accuracy for repeat in repeats])
@@ -162,6 +167,7 @@ def summarise(held_out: HeldOut, samples: Samples, seed: int) -> Figures:
         per_class=pooled.per_class,
         confusion=pooled.confusion,
         vote_accuracy=float(np.mean(voted == terrain)),
+        vote_windows=float(np.mean(sizes)),
         ece=stated.ece,
         ece_ci=stated.ece_ci,
         confidence_auc=stated.auc,

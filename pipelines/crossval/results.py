@@ -187,7 +187,8 @@ class Figures:
 
     ``accuracy_spread`` is the standard deviation over the repeats (None with a single one), ``accuracy_ci``
     the 95 % interval by bootstrap over runs within classes, as every ``_ci``; ``confidence_auc`` is the area
-    under the curve from confidence to correctness, NaN where all are right; ``confusion``, ``per_class`` and
+    under the curve from confidence to correctness, NaN where all are right; ``vote_windows`` is the
+    mean number of windows that a vote over 5 s has; ``confusion``, ``per_class`` and
     ``reliability`` count all repeats together.
     """
 
@@ -205,6 +206,7 @@ class Figures:
     per_class: Mapping[str, ClassFigures]
     confusion: tuple[tuple[int, ...], ...]
     vote_accuracy: float
+    vote_windows: float
     ece: float
     ece_ci: tuple[float, float]
     confidence_auc: float

@@ -36,7 +36,7 @@ def print_crossval(report: CrossvalReport, console: Console) -> None:
             f"accuracy {percent(report.accuracy)} (95 % over runs: {low:.1%} to {high:.1%}{repeats})",
             f"balanced accuracy {percent(report.balanced_accuracy)}, macro F1 {report.macro_f1:.3f}, "
             f"mean over classes then runs {percent(report.macro_run_accuracy)}, "
-            f"vote over 5 s {percent(report.vote_accuracy)}",
+            f"vote over 5 s ({report.vote_windows:.1f} windows on average) {percent(report.vote_accuracy)}",
             _confidence_line(report),
         ),
     )

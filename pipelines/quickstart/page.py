@@ -214,7 +214,11 @@ def _headline(report: CrossvalReport) -> Headline:
     cards = (
         ("balanced accuracy", report.balanced_accuracy, "every terrain counts the same"),
         ("macro F1", report.macro_f1, "mean of F1 over terrains"),
-        ("vote accuracy", report.vote_accuracy, f"majority of the last {VOTE_SPAN_S:g} s"),
+        (
+            "vote accuracy",
+            report.vote_accuracy,
+            f"majority of the last {VOTE_SPAN_S:g} s, {report.vote_windows:.1f} windows on average",
+        ),
         ("calibration error", report.ece, "stated probability against accuracy (ECE)"),
     )
     return Headline(text, alone, tuple(marks), cards)

@@ -15,8 +15,8 @@ from terrain.classify.support import SupportTable, learn_support, support_of
 from terrain.classify.support_figures import HeldOutSupport, support_accuracy
 from terrain.records import Array
 
-RUN_WINDOWS = 10
-"""Windows that a run to be recorded should give: as many as the prior of a cell."""
+RUN_WINDOWS, MIN_RUN_S = 10, 20.0
+"""Windows that a run to be recorded should give, as many as the prior of a cell, and its least length."""
 
 MAX_DRIVES = 20
 MIN_GAIN = 5e-5
@@ -140,7 +140,7 @@ def _next_drives(
                 terrain=classes[i],
                 regime=regimes.name(number),
                 runs=ADDED_RUNS,
-                duration_s=RUN_WINDOWS * judged.window_s,
+                duration_s=max(RUN_WINDOWS * judged.window_s, MIN_RUN_S),
                 gain=float(gain[at]),
                 support_runs=float(cells.all_runs[at]),
                 windows=n,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -94,16 +94,37 @@ def vote(
     """
     ballots = np.eye(probability.shape[1])[probability.argmax(axis=1)]
     voted = np.empty(len(probability), dtype=int)
+    for row, voters in _voters(segment, start_s, length_s, span_s):
+        count, weight = ballots[voters].sum(axis=0), probability[voters].sum(axis=0)
+        voted[row] = np.lexsort((weight, count))[-1]
+    return voted
+
+
+def vote_sizes(segment: Array, start_s: Array, length_s: float, span_s: float = VOTE_SPAN_S) -> Array:
+    """Return how many windows (n,) take part in each vote; parameters as :func:`vote`.
+
+    Two windows of 2 s lie wholly in 5 s, and one window of 5 s does: such a vote is no vote.
+
+    Examples
+    --------
+    >>> vote_sizes(np.array(["a"] * 4), np.array([0.0, 2.0, 4.0, 6.0]), 2.0).tolist()
+    [1, 2, 2, 2]
+    """
+    sizes = np.empty(len(start_s), dtype=int)
+    for row, voters in _voters(segment, start_s, length_s, span_s):
+        sizes[row] = len(voters)
+    return sizes
+
+
+def _voters(segment: Array, start_s: Array, length_s: float, span_s: float) -> Iterator[tuple[int, Array]]:
+    """Yield each row with the rows that vote with it, its own among them."""
     for name in np.unique(segment):
         rows = np.flatnonzero(segment == name)
         rows = rows[np.argsort(start_s[rows], kind="stable")]
         starts = start_s[rows]
         first = np.searchsorted(starts, starts + length_s - span_s - TIME_TOLERANCE_S)
         for position, row in enumerate(rows):
-            voters = rows[min(first[position], position) : position + 1]
-            count, weight = ballots[voters].sum(axis=0), probability[voters].sum(axis=0)
-            voted[row] = np.lexsort((weight, count))[-1]
-    return voted
+            yield int(row), rows[min(first[position], position) : position + 1]
 
 
 def runs_by_terrain(run_id: Array, terrain: Array) -> Array:

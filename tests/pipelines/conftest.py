@@ -165,6 +165,7 @@ def make_report():
             "macro_f1": 0.7844,
             "macro_run_accuracy": 0.75,
             "vote_accuracy": 0.82131,
+            "vote_windows": 1.9,
             "ece": 0.10776,
             "ece_ci": (0.06, 0.15),
             "confidence_auc": 0.7912,

@@ -27,6 +27,7 @@ PROMISED = {
     "folds",
     "per_run",
     "vote_accuracy",
+    "vote_windows",
     "ece",
     "ece_ci",
     "confidence_auc",
@@ -182,3 +183,16 @@ def test_terrains_of_vulpi_are_classified_on_held_out_runs(datasets_dir, setting
     assert report.ece < 0.08
     assert report.n_runs == 18
     assert any(note.startswith("DIRT_ROAD: one run only") for note in report.notes)
+
+
+@pytest.mark.parametrize("window_s", [0.4, 0.5, 0.7, 0.8, 1.0])
+def test_a_window_with_few_samples_of_a_slow_stream_is_classified(drive_all, settings, window_s):
+    runs = drive_all(("ASPHALT", "GRAVEL"), 3, duration_s=8.0)
+    report = crossval(runs, settings(window_s=window_s))
+    assert report.n_windows > 40
+    assert np.isfinite(report.accuracy)
+
+
+def test_a_window_too_short_for_a_slow_stream_is_one_sentence(runs, settings):
+    with pytest.raises(DataError, match=r"^a window of 0\.3 s holds 3 samples of stream 'wheels' at 10 Hz; "):
+        crossval(runs, settings(window_s=0.3))

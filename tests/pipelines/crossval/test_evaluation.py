@@ -136,6 +136,13 @@ def test_votes_never_mix_two_runs_whatever_their_names_and_folds():
     assert summarise(pool(results, np.array(y)), samples, 0).vote_accuracy == 1.0
 
 
+def test_a_vote_states_how_many_windows_it_has():
+    y = ["ice"] * 3 + ["mud"]
+    folds = [Fold(0, 0, np.empty(0, dtype=int), np.arange(4))]
+    samples, results = hand_made(["a"] * 3 + ["b"], [0, 1, 2, 0], y, [y], folds)
+    assert summarise(pool(results, np.array(y)), samples, 0).vote_windows == (1 + 2 + 3 + 1) / 4
+
+
 def test_votes_do_not_reach_across_the_blocks_of_a_run():
     y = ["ice"] * 6 + ["mud"]
     folds = [

@@ -71,7 +71,7 @@ def test_a_training_run_holds_what_is_needed_to_judge_and_repeat_it(in_tracked, 
     client = mlflow.MlflowClient()
     figures = {file.path for file in client.list_artifacts(model.run_id, "figures")}
     assert figures == {
-        f"figures/{name}.png" for name in ("confusion", "reliability", "per_run", "importance")
+        f"figures/{name}.png" for name in ("confusion", "reliability", "per_run", "support", "importance")
     }
     logged = mlflow.artifacts.load_text(f"runs:/{model.run_id}/crossval.json")
     assert json.loads(logged)["accuracy"] == report.accuracy
