@@ -14,9 +14,16 @@ from pipelines.courses.following import following
 from pipelines.courses.judgement import find_breakaways, judge
 from pipelines.courses.results import OverTime
 from pipelines.crossval.evaluation import HeldOut, fit_folds, pool, summarise
-from pipelines.crossval.extras import examples_of, fold_accuracy, has_speed, learning_curve, slow_fast
+from pipelines.crossval.extras import (
+    examples_of,
+    fold_accuracy,
+    has_speed,
+    learning_curve,
+    slow_fast,
+    speed_split,
+)
 from pipelines.crossval.results import CrossvalReport, Extras, Figures
-from pipelines.crossval.settings import CrossvalSettings
+from pipelines.crossval.settings import SPEED_PROTOCOLS, CrossvalSettings
 from pipelines.crossval.splits import (
     N_FOLDS,
     Fold,
@@ -49,8 +56,13 @@ def crossval(
         if the data cannot answer: one class, fewer runs than folds, a run shorter than a window.
     """
     samples = samples_of(runs, settings)
+    speed = None
+    if settings.protocol in SPEED_PROTOCOLS:
+        speed = speed_split(samples, settings.protocol)
+        samples, folds = speed.samples, [speed.fold]
+    else:
+        folds = folds_of(samples, settings.protocol, settings.n_repeats, settings.seed)
     windows = samples.cut.windows
-    folds = folds_of(samples, settings.protocol, settings.n_repeats, settings.seed)
     recipe = settings.new_recipe()
     progress("features", 0, 1)
     features = feature_matrix(recipe, windows)
@@ -72,6 +84,8 @@ def crossval(
         extras = extras._replace(stiffness=stiffness_figures(held_out, features, samples, settings.seed))
     repaired = dict(sum((Counter(run.dropped) for run in runs), Counter()))
     report = report_of(figures, samples, settings, features.shape[1], repaired, extras)
+    if speed is not None:
+        report = replace(report, notes=(speed.note, *report.notes))
     if settings.protocol != "published":
         report = _with_support(report, held_out, windows, settings.seed)
     if settings.protocol == "leave-terrain-out":

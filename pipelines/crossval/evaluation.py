@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from sklearn.base import BaseEstimator, clone
 
+from features.windows import WindowCut
 from pipelines.compute.parallel import parallel
 from pipelines.crossval.results import Figures, FoldFigures
 from pipelines.crossval.splits import Fold, Samples
@@ -123,6 +124,27 @@ def pool(results: Sequence[FoldResult], terrain: Array) -> HeldOut:
     return HeldOut(classes, probability, fold_number, list(results))
 
 
+def _tested(held_out: HeldOut, samples: Samples) -> tuple[HeldOut, Samples]:
+    """Return only the windows that were held out in every repeat; folds number these."""
+    tested = np.isfinite(held_out.probability).all(axis=(0, 2))
+    if tested.all():
+        return held_out, samples
+    place = np.cumsum(tested) - 1
+    results = [
+        result._replace(fold=result.fold._replace(test=place[result.fold.test]))
+        for result in held_out.results
+    ]
+    cut = WindowCut(samples.cut.windows[tested], samples.cut.dropped)
+    return (
+        held_out._replace(
+            probability=held_out.probability[:, tested],
+            fold_number=held_out.fold_number[:, tested],
+            results=results,
+        ),
+        samples._replace(cut=cut, group=samples.group[tested]),
+    )
+
+
 def _segments(group: Array, fold_number: Array) -> Array:
     """Return a number for each stretch of a group that was tested by one fold."""
     group_of = np.unique(group.astype(str), return_inverse=True)[1]
@@ -131,6 +153,7 @@ def _segments(group: Array, fold_number: Array) -> Array:
 
 def summarise(held_out: HeldOut, samples: Samples, seed: int) -> Figures:
     """Return the figures of merit of a cross-validation; ``seed`` is that of the bootstrap over runs."""
+    held_out, samples = _tested(held_out, samples)
     windows = samples.cut.windows
     terrain, classes = windows.terrain.astype(str), held_out.classes
     run_id = runs_by_terrain(windows.run_id.astype(str), terrain)

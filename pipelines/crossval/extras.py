@@ -10,7 +10,7 @@ import numpy as np
 from scipy.optimize import least_squares
 from sklearn.base import BaseEstimator
 
-from features.windows import wheel_speeds
+from features.windows import WindowCut, wheel_speeds
 from pipelines.crossval.evaluation import Examples, FoldResult, fit_folds
 from pipelines.crossval.results import (
     MIN_CLASSES,
@@ -21,6 +21,7 @@ from pipelines.crossval.results import (
 )
 from pipelines.crossval.splits import Fold, Samples
 from pipelines.reporting.progress import Progress, silent
+from terrain.errors import DataError
 from terrain.logs.schema import signal_set_of
 from terrain.records import Array, Windows
 
@@ -132,17 +133,57 @@ def slow_fast(
     if status is Applicability.NOT_APPLICABLE:
         return SlowFast(status, classes, left_out)
     examples = examples_of(features, samples)
-    run_id = samples.cut.windows.run_id.astype(str)
-    both = {run for run, _ in split.slow} & {run for run, _ in split.fast}
-    pairs = list(zip(run_id, examples.terrain, strict=True))
-    rows_slow, rows_fast = (
-        np.array([i for i, pair in enumerate(pairs) if pair in set(side) and pair[0] not in both])
-        for side in (split.slow, split.fast)
-    )
-    folds = [Fold(0, 0, rows_slow, rows_fast), Fold(0, 1, rows_fast, rows_slow)]
+    slow, fast = _rows_of_sides(samples, split)
+    folds = [Fold(0, 0, slow, fast), Fold(0, 1, fast, slow)]
     results = fit_folds(classifier, examples, folds, n_jobs, "slow to fast", progress)
     to_fast, to_slow = (_accuracy([result], examples.terrain) for result in results)
     return SlowFast(status, classes, left_out, to_fast, to_slow)
+
+
+def _rows_of_sides(samples: Samples, split: SlowFastSplit) -> tuple[Array, Array]:
+    windows = samples.cut.windows
+    both = {run for run, _ in split.slow} & {run for run, _ in split.fast}
+    pairs = list(zip(windows.run_id.astype(str), windows.terrain.astype(str), strict=True))
+    slow, fast = (
+        np.array([i for i, pair in enumerate(pairs) if pair in set(side) and pair[0] not in both], dtype=int)
+        for side in (split.slow, split.fast)
+    )
+    return slow, fast
+
+
+class SpeedSplit(NamedTuple):
+    """Windows of slow and fast runs alone, the fold that trains on one side, and what a reader must know."""
+
+    samples: Samples
+    fold: Fold
+    note: str
+
+
+def speed_split(samples: Samples, protocol: str) -> SpeedSplit:
+    """Return what ``slow-fast`` or ``fast-slow`` trains and tests on, as :func:`slow_fast` does.
+
+    Raises
+    ------
+    DataError
+        if too few classes have enough slow and fast runs.
+    """
+    split = slow_fast_split(samples)
+    out = "; ".join(f"{name}: {reason}" for name, reason in split.left_out.items())
+    if split.status is Applicability.NOT_APPLICABLE:
+        raise DataError(
+            f"{protocol!r} needs {MIN_CLASSES} terrains with slow and fast runs, at least {MIN_RUNS_A_SIDE} "
+            f"and {MIN_TIME_A_SIDE_S:g} s of each; there are {len(split.classes)} ({out})"
+        )
+    sides = dict(zip(("slow", "fast"), _rows_of_sides(samples, split), strict=True))
+    trained, tested = protocol.split("-")
+    rows = np.sort(np.concatenate(list(sides.values())))
+    train, test = (np.searchsorted(rows, sides[side]) for side in (trained, tested))
+    cut = WindowCut(samples.cut.windows[rows], samples.cut.dropped)
+    note = (
+        f"trained on the {trained} runs of each terrain ({len(train)} windows), tested on the {tested} ones, "
+        f"on either side of its median speed{'; left out: ' if out else ''}{out}"
+    )
+    return SpeedSplit(samples._replace(cut=cut, group=samples.group[rows]), Fold(0, 0, train, test), note)
 
 
 def examples_of(features: Array, samples: Samples) -> Examples:

@@ -15,8 +15,9 @@ if TYPE_CHECKING:
     from features.windows import WindowRule
     from pipelines.models.recipes import WindowPipeline
 
-Protocol = Literal["grouped", "leave-one-run-out", "leave-terrain-out", "published"]
+Protocol = Literal["grouped", "leave-one-run-out", "leave-terrain-out", "published", "slow-fast", "fast-slow"]
 PROTOCOLS: tuple[str, ...] = get_args(Protocol)
+SPEED_PROTOCOLS = ("slow-fast", "fast-slow")
 Recipe = Literal["svm"]
 RECIPES: tuple[str, ...] = get_args(Recipe)
 
@@ -90,8 +91,8 @@ class CrossvalSettings(RecipeSettings):
             raise ConfigError(
                 "'published' sets its own strides and keeps all motion: stride and steady do not apply"
             )
-        if self.protocol == "leave-one-run-out" and (self.repeats or 1) > 1:
-            raise ConfigError("'leave-one-run-out' has a single fold assignment: it has one repeat")
+        if self.protocol in ("leave-one-run-out", *SPEED_PROTOCOLS) and (self.repeats or 1) > 1:
+            raise ConfigError(f"{self.protocol!r} has a single fold assignment: it has one repeat")
         return self
 
     @property

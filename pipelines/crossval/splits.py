@@ -3,6 +3,8 @@
 ``grouped`` is the headline: whole runs are held out.  ``leave-one-run-out`` holds out one run at a time.
 ``leave-terrain-out`` has the folds of ``grouped``, and asks besides whether a terrain that was left out of
 training is found to be unknown (:mod:`pipelines.crossval.unknown`).
+``slow-fast`` trains on the slow runs of each class and tests on its fast ones, ``fast-slow`` the reverse
+(:func:`pipelines.crossval.extras.speed_split`).
 ``published`` deals 5 s partitions of runs at random into folds, as the papers do, so that a test
 partition nearly always has its own run in training; it serves to compare with papers only.
 """

@@ -286,7 +286,10 @@ def importance_figure(importances: Sequence[ChannelImportance]) -> Figure:
 PROTOCOL_WORDS = {
     "grouped": "grouped by run",
     "leave-one-run-out": "leave one run out",
+    "leave-terrain-out": "grouped by run",
     "published": "published protocol",
+    "slow-fast": "trained slow, tested fast",
+    "fast-slow": "trained fast, tested slow",
 }
 
 

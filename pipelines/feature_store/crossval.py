@@ -8,7 +8,7 @@ from pipelines.crossval.crossval import report_of
 from pipelines.crossval.evaluation import fit_folds, pool, summarise
 from pipelines.crossval.extras import examples_of
 from pipelines.crossval.results import CrossvalReport
-from pipelines.crossval.settings import CrossvalSettings
+from pipelines.crossval.settings import SPEED_PROTOCOLS, CrossvalSettings
 from pipelines.crossval.splits import folds_of
 from pipelines.feature_store.store import FeatureStore, read_store
 from pipelines.reporting.progress import Progress, silent
@@ -34,6 +34,8 @@ def crossval_store(
     """
     if settings.protocol == "published":
         raise ConfigError("'published' cuts windows of its own: it needs runs, not a store of features")
+    if settings.protocol in SPEED_PROTOCOLS:
+        raise ConfigError(f"{settings.protocol!r} needs the speeds of runs, not a store of features")
     samples, features = read_store(store, progress)
     folds = folds_of(samples, settings.protocol, settings.n_repeats, settings.seed)
     examples = examples_of(features, samples)

@@ -17,6 +17,7 @@ from pipelines.crossval.extras import (
 )
 from pipelines.crossval.splits import folds_of, grouped_samples
 from pipelines.models.recipes import feature_matrix, make_recipe
+from terrain.errors import ConfigError, DataError
 from terrain.records import RunLog, Stream
 
 SPEEDS = (0.3, 0.4, 0.7, 0.8)
@@ -199,6 +200,32 @@ def test_a_curve_that_still_climbs_gives_no_number():
         enough_runs(m[:3], m[:3] / 4).statement == "3 sizes are too few to estimate how many runs are enough"
     )
     assert enough_runs(m, np.full(4, 0.8)).n_runs == 1
+
+
+def test_a_protocol_and_the_extra_of_one_name_give_one_number(runs_at, settings):
+    runs = [run for terrain in ("ASPHALT", "GRASS", "GRAVEL") for run in runs_at(terrain, SPEEDS)]
+    samples = grouped_samples(runs, WindowRule())
+    recipe = settings().new_recipe()
+    extra = slow_fast(recipe[-1], feature_matrix(recipe, samples.cut.windows), samples, 1)
+    for protocol, expected in (("slow-fast", extra.slow_to_fast), ("fast-slow", extra.fast_to_slow)):
+        report = crossval(runs, settings(protocol=protocol))
+        assert report.accuracy == pytest.approx(expected)
+        assert len(report.folds) == 1
+        trained, tested = protocol.split("-")
+        assert f"trained on the {trained} runs" in report.notes[0]
+        fast = {run.run_id[-1] for run in report.per_run} == {"2", "3"}
+        assert fast == (tested == "fast")
+        assert report.n_windows == report.folds[0].n_test == sum(run.n_windows for run in report.per_run)
+
+
+def test_a_speed_protocol_on_runs_of_one_speed_is_one_sentence(runs_at, settings):
+    runs = [run for terrain in ("ASPHALT", "GRASS", "GRAVEL") for run in runs_at(terrain, (0.5,))]
+    with pytest.raises(
+        DataError, match=r"^'slow-fast' needs 3 terrains with slow and fast runs, .*GRASS: slow"
+    ):
+        crossval(runs, settings(protocol="slow-fast"))
+    with pytest.raises(ConfigError, match=r"^'fast-slow' has a single fold assignment"):
+        settings(protocol="fast-slow", repeats=3)
 
 
 def test_a_run_slow_on_one_class_and_fast_on_another_is_on_no_side(runs_at, settings, monkeypatch):

@@ -74,6 +74,13 @@ def test_cross_validation_of_a_store_gives_the_figures_of_its_runs(runs_dir, tmp
     assert json.dumps(as_json(from_store)) == json.dumps(as_json(expected))
 
 
+def test_a_store_has_no_speeds_for_a_speed_protocol(runs_dir, tmp_path):
+    build_store(run_loaders(runs_dir), features_settings(tmp_path / "store"))
+    asked = CrossvalSettings(protocol="slow-fast", steady=False)
+    with pytest.raises(ConfigError, match=r"^'slow-fast' needs the speeds of runs"):
+        crossval_store(opened(tmp_path / "store"), asked)
+
+
 def test_extras_of_a_store_are_noted_as_missing(runs_dir, tmp_path):
     build_store(run_loaders(runs_dir), features_settings(tmp_path / "store"))
     report = crossval_store(opened(tmp_path / "store"), SETTINGS.with_(extras=True))
