@@ -22,6 +22,7 @@ from pipelines.reporting.json_file import as_json
 from pipelines.reporting.markdown import render_markdown
 from pipelines.reporting.numbers import NOT_KNOWN, percent, sentence
 from pipelines.reporting.versions import versions
+from pipelines.support.results import SupportReport
 from terrain.classify.metrics import VOTE_SPAN_S
 from terrain.records import Windows
 
@@ -239,20 +240,23 @@ def _limits(info: ModelInfo, windows: Windows, report: CrossvalReport) -> list[s
     weak = [name for name, row in report.per_class.items() if row.recall < WEAK_BELOW]
     if weak:
         limits.append(f"decisions that rest on {', '.join(weak)}: recognised in under half of the windows")
-    limits += _unsupported(getattr(report, "support", None))
+    limits += _unsupported(report.support)
     return limits
 
 
-def _unsupported(support: Any) -> list[str]:
-    """Return what the table of support, where there is one, lacks altogether."""
-    rows = as_json(support) if support is not None else []
-    rows = rows.get("rows", []) if isinstance(rows, dict) else rows
-    missing = [
-        f"{row['class']} at {row['regime']}"
-        for row in rows
-        if isinstance(row, dict) and {"class", "regime", "windows"} <= row.keys() and not row["windows"]
-    ]
-    return [f"regimes without a training window: {', '.join(missing)}"] if missing else []
+def _unsupported(support: SupportReport | None) -> list[str]:
+    """Return the regimes without a window of a terrain, and how often unsupported predictions are right."""
+    if support is None:
+        return []
+    missing = [f"{row.terrain} at {row.regime}" for row in support.rows if not row.windows]
+    limits = [f"regimes without a training window: {', '.join(missing)}"] if missing else []
+    marked = support.accuracy.unsupported
+    if marked.accuracy is not None:
+        limits.append(
+            f"predictions that no training run supports, {marked.windows_ratio:.0%} of the windows: "
+            f"{marked.accuracy:.0%} correct"
+        )
+    return limits
 
 
 def _plain(value: Any) -> str:

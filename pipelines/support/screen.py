@@ -31,7 +31,7 @@ def support_lines(found: SupportReport) -> Iterator[str]:
         )
     for number, drive in enumerate(found.next_drives[:SHOWN_DRIVES], 1):
         yield (
-            f"record next {number}: {drive.request} (expected gain {drive.gain:.2%} of all windows; so far "
+            f"record next {number}: {drive.request} (so far "
             f"{drive.support_runs:.1f} runs near it, {drive.windows} windows, accuracy "
             f"{format_known(drive.accuracy, '{:.1%}')})"
         )

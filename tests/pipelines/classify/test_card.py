@@ -13,6 +13,7 @@ from pipelines.classify.card import CARD_FILE, CARD_JSON, figure_rows, model_car
 from pipelines.crossval.crossval import samples_of
 from pipelines.models.model_files import INFO_FILE, read_lean_model, read_model
 from pipelines.reporting.numbers import NOT_KNOWN
+from pipelines.support.results import SupportRow
 from terrain.errors import ModelError
 
 
@@ -179,3 +180,23 @@ def test_a_list_of_files_of_a_stranger_is_one_sentence(model_dir, listed):
             read(model_dir)
         assert str(refusal.value).isprintable()
         assert len(str(refusal.value)) < 700
+
+
+def test_the_limits_name_regimes_without_windows_and_predictions_without_support(card, in_tracked):
+    report = in_tracked.crossval
+    limits = card().limits
+    empty = [row for row in report.support.rows if not row.windows]
+    named = [text for text in limits if text.startswith("Regimes without a training window")]
+    assert len(named) == bool(empty)
+    assert all(f"{row.terrain} at {row.regime}" in named[0] for row in empty)
+    part = report.support.accuracy.unsupported
+    marked = [text for text in limits if text.startswith("Predictions that no training run supports")]
+    assert len(marked) == (part.accuracy is not None)
+    assert not any("support" in text for text in card(replace(report, support=None)).limits)
+
+
+def test_a_regime_without_a_window_is_a_limit(card, in_tracked):
+    report = in_tracked.crossval
+    row = SupportRow("GRAVEL", "spin at 0.3 to 0.4 m/s", 0, 0, None)
+    without = replace(report, support=report.support._replace(rows=(row,)))
+    assert "Regimes without a training window: GRAVEL at spin at 0.3 to 0.4 m/s." in card(without).limits
