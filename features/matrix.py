@@ -62,9 +62,16 @@ class FeatureMatrix(NamedTuple):
 
     def named(self, windows: Windows) -> tuple[list[Feature], Array]:
         """Return the features' names beside their values."""
-        return self._extract(self._selected(windows))
+        return self._extract(self.selected(windows))
 
-    def _selected(self, X: Windows) -> dict[str, Array]:
+    def selected(self, X: Windows) -> dict[str, Array]:
+        """Return the samples of the channels that are used, by stream (n, channels, samples).
+
+        Raises
+        ------
+        DataError
+            as :meth:`of`.
+        """
         if abs(X.length_s - self.length_s) > 1e-9:
             raise DataError(
                 f"windows last {X.length_s:g} s; the features were learned on {self.length_s:g} s"
@@ -147,6 +154,12 @@ def of_signal_sets(windows: Windows, signal_sets: Iterable[str], level_sets: Ite
     )
 
 
+def left_out_of(signal_set: str, channel: str) -> frozenset[str]:
+    """Return the statistics of a channel that are computed on request only."""
+    driving = signal_set == "estimator" and channel.startswith(("speed_", "yaw_"))
+    return LEFT_OUT.get("driving" if driving else signal_set, frozenset())
+
+
 @lru_cache(maxsize=256)
 def _described(
     stream: str, names: tuple[str, ...], columns: tuple[tuple[str, str], ...], level_sets: frozenset[str]
@@ -158,8 +171,7 @@ def _described(
     features, kept = [], np.zeros((len(names), len(columns)), dtype=bool)
     for i, name in enumerate(names):
         signal_set = signal_set_of(stream, name) or ""
-        driving = signal_set == "estimator" and name.startswith(("speed_", "yaw_"))
-        left_out = LEFT_OUT.get("driving" if driving else signal_set, frozenset())
+        left_out = left_out_of(signal_set, name)
         unit = UNIT_SYMBOLS[unit_of(name)]
         for j, (statistic, statistic_unit) in enumerate(columns):
             if statistic in left_out and signal_set not in level_sets:

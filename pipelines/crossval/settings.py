@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 Protocol = Literal["grouped", "leave-one-run-out", "leave-terrain-out", "published", "slow-fast", "fast-slow"]
 PROTOCOLS: tuple[str, ...] = get_args(Protocol)
 SPEED_PROTOCOLS = ("slow-fast", "fast-slow")
-Recipe = Literal["svm"]
+Recipe = Literal["svm", "cnn", "stack", "best"]
 RECIPES: tuple[str, ...] = get_args(Recipe)
 
 WINDOW_S = 2.0
@@ -28,7 +28,9 @@ PUBLISHED_WINDOW_S = 1.7
 class RecipeSettings(Settings):
     """A recipe, how its windows are cut, and how it is evaluated."""
 
-    recipe: Recipe = setting("svm", "Recipe from windows to terrain.")
+    recipe: Recipe = setting(
+        "svm", "SVM on features, network, both joined, or the best of them."
+    )
     window_s: float | None = setting(None, "Window length in s (2; 1.7 under 'published').", "--window")
     stride_s: float | None = setting(None, "From window to window in s; one length by default.", "--stride")
     steady: bool = setting(True, "Keep windows of steady motion only.")

@@ -6,15 +6,20 @@ from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
+from sklearn.base import ClassifierMixin
 from sklearn.pipeline import Pipeline
 
 from features.extractor import FeatureExtractor
+from features.sample_extractor import SampleExtractor
+from terrain.classify.grouped_network import GroupedNetwork
+from terrain.classify.stack import GroupedStack
 from terrain.classify.svm import GroupedSVC
 from terrain.errors import ConfigError
 from terrain.logs.schema import SIGNAL_SETS
 from terrain.records import Array, Windows
 
-RECIPES = ("svm",)
+RECIPES = ("svm", "cnn", "stack", "best")
+"""SVM on features, network on samples, both joined, and which of these three held-out runs favour."""
 
 
 class WindowPipeline(Pipeline):
@@ -25,7 +30,8 @@ class WindowPipeline(Pipeline):
     """
 
     def fit(self, X: Windows, y: Any = None, **params: Any) -> WindowPipeline:
-        """Fit all steps; the last one is given ``groups``."""
+        """Fit all steps; the last one is given ``groups``, and which columns are samples."""
+        inform(self, self[0].fit(X))
         groups = f"{self.steps[-1][0]}__groups"
         fitted: WindowPipeline = super().fit(X, y, **{groups: X.run_id, **params})
         return fitted
@@ -59,18 +65,30 @@ def make_recipe(
     """
     if name not in RECIPES:
         raise ConfigError(f"there is no recipe {name!r}; there are {', '.join(RECIPES)}")
-    return WindowPipeline(
-        [
-            ("features", FeatureExtractor(tuple(signal_sets), tuple(level_sets))),
-            ("classifier", GroupedSVC(gap=gap, seed=seed)),
-        ]
-    )
+    sets = tuple(signal_sets), tuple(level_sets)
+    features: FeatureExtractor = FeatureExtractor(*sets)
+    classifier: ClassifierMixin = GroupedSVC(gap=gap, seed=seed)
+    if name == "cnn":
+        features, classifier = SampleExtractor(*sets), GroupedNetwork(gap=gap, seed=seed)
+    elif name != "svm":
+        features = SampleExtractor(*sets, with_features=True)
+        classifier = GroupedStack(choose=name == "best", gap=gap, seed=seed)
+    return WindowPipeline([("features", features), ("classifier", classifier)])
+
+
+def inform(recipe: WindowPipeline, fitted: Any) -> None:
+    """Pass on to the last step which columns of the matrix are samples, where it asks for them."""
+    if "columns" in recipe[-1].get_params():
+        recipe[-1].set_params(columns=getattr(fitted, "columns_", ()))
 
 
 def feature_matrix(recipe: WindowPipeline, windows: Windows) -> Array:
     """Return the output of the steps before the last one.
 
     These steps learn nothing but the channels and rates that all windows have in common, so their output for
-    a window does not depend on the other windows, and one computation serves all folds.
+    a window does not depend on the other windows, and one computation serves all folds.  The last step is
+    informed, so that a clone of it can be fitted on rows of the matrix.
     """
-    return np.asarray(recipe[:-1].fit_transform(windows))
+    matrix = np.asarray(recipe[:-1].fit_transform(windows))
+    inform(recipe, recipe[0])
+    return matrix

@@ -78,6 +78,7 @@ class GroupedSVC(ClassifierMixin, BaseEstimator):
     classes_ : (k,) class names
     best_ : the chosen :class:`Candidate`
     inner_scores_ : (n_candidates,) accuracy on the held-out inner parts
+    inner_probability_ : (n, k) of training rows when their run was held out to choose; NaN where it never was
     n_inner_fits_ : how many SVMs were fitted to choose and to calibrate
     """
 
@@ -134,6 +135,10 @@ class GroupedSVC(ClassifierMixin, BaseEstimator):
         )
         best = int(np.argmax(self.inner_scores_))
         self.best_, self.scale_ = candidates[best], scales[best]
+        self.inner_probability_ = np.full((len(y), k), np.nan)
+        self.inner_probability_[np.arange(0, len(y), step)[held_out]] = probabilities_of_known(
+            margins[best][held_out], k, self.scale_
+        )
         self.preparation_ = _preparation(self.best_.percentile)
         self.svc_ = _fit_svc(self.best_, self.preparation_.fit_transform(X, y), y)
         return self

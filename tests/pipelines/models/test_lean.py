@@ -49,7 +49,7 @@ def test_numbers_give_the_probabilities_of_any_number_of_classes(n_classes):
 
 
 def test_features_that_do_not_fit_are_refused(model_dir):
-    numbers = read_lean_model(model_dir).recipe.numbers
+    numbers = read_lean_model(model_dir).recipe.numbers.svm
     n = int(numbers.settings[3])
     with pytest.raises(DataError, match=rf"\(n, {n}\) is needed"):
         probabilities(numbers, np.zeros((1, n - 1)))
