@@ -6,6 +6,7 @@ computes need not know.  A process that is started by a task computes its own ta
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -98,6 +99,8 @@ def parallel(
     from joblib import Parallel, delayed
     from joblib.externals.loky.process_executor import TerminatedWorkerError
 
+    # a process whose memory has grown, as that of the first task to import torch, is replaced; nothing is lost
+    warnings.filterwarnings("ignore", "A worker stopped while some jobs", UserWarning)
     tasks = (delayed(function)(*shared, *one) for one in each)
     try:
         yield from Parallel(n_jobs=max(n_jobs, 1), return_as="generator")(tasks)

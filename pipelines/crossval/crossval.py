@@ -5,15 +5,16 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
+from typing import NamedTuple
 
-from sklearn.base import clone
+from sklearn.base import BaseEstimator, clone
 
 from features.extractor import FeatureExtractor
 from features.motion import NO_MOTION, window_motion
 from pipelines.courses.following import following
 from pipelines.courses.judgement import find_breakaways, judge
 from pipelines.courses.results import OverTime
-from pipelines.crossval.evaluation import HeldOut, fit_folds, pool, summarise
+from pipelines.crossval.evaluation import Examples, HeldOut, fit_folds, pool, summarise
 from pipelines.crossval.extras import (
     examples_of,
     fold_accuracy,
@@ -42,7 +43,10 @@ from pipelines.runs.duplicates import distinct_runs
 from pipelines.support.evaluate import Judged, support_report
 from terrain.classify.folds import single_run_classes
 from terrain.errors import DataError
-from terrain.records import Array, RunLog, Windows
+from terrain.records import RunLog, Windows
+
+CHECKED_WITH = "svm"
+"""The recipe of the checks beside the figures."""
 
 
 def crossval(
@@ -77,11 +81,15 @@ def crossval(
     held_out = pool(results, examples.terrain)
     figures = summarise(held_out, samples, settings.seed)
     extras = None
+    checks = _checks(recipe, examples, windows, settings)
     if beside:
         first = [fold for fold in folds if fold.repeat == 0]
-        extras = _extras(recipe, features, samples, first, figures.accuracy_per_repeat[0], settings, progress)
+        accuracy = figures.accuracy_per_repeat[0] if settings.recipe == CHECKED_WITH else None
+        extras = _extras(checks, samples, first, accuracy, settings, progress)
         extras = extras._replace(over_time=_over_time(held_out, windows, settings.seed))
-        extras = extras._replace(stiffness=stiffness_figures(held_out, features, samples, settings.seed))
+        extras = extras._replace(
+            stiffness=stiffness_figures(held_out, checks.examples.features, samples, settings.seed)
+        )
     repaired = dict(sum((Counter(run.dropped) for run in runs), Counter()))
     report = report_of(figures, samples, settings, features.shape[1], repaired, extras)
     if speed is not None:
@@ -89,7 +97,7 @@ def crossval(
     if settings.protocol != "published":
         report = _with_support(report, held_out, windows, settings.seed)
     if settings.protocol == "leave-terrain-out":
-        unknown = leave_terrain_out(examples, samples, settings.seed, settings.jobs, progress)
+        unknown = leave_terrain_out(checks.examples, samples, settings.seed, settings.jobs, progress)
         report = replace(report, unknown=unknown)
     return report
 
@@ -130,17 +138,35 @@ def report_of(
     )
 
 
+class _Checks(NamedTuple):
+    """The classifier and the features that the checks beside the figures are made with."""
+
+    classifier: BaseEstimator
+    examples: Examples
+
+
+def _checks(
+    recipe: WindowPipeline, examples: Examples, windows: Windows, settings: CrossvalSettings
+) -> _Checks:
+    """Return the SVM and its features whatever the recipe: the checks are of the data and have many fits."""
+    if settings.recipe == CHECKED_WITH:
+        return _Checks(recipe[-1], examples)
+    svm = settings.model_copy(update={"recipe": CHECKED_WITH}).new_recipe()
+    return _Checks(svm[-1], examples._replace(features=feature_matrix(svm, windows)))
+
+
 def _extras(
-    recipe: WindowPipeline,
-    features: Array,
+    checks: _Checks,
     samples: Samples,
     folds: Sequence[Fold],
-    accuracy: float,
+    accuracy: float | None,
     settings: CrossvalSettings,
     progress: Progress,
 ) -> Extras:
-    """Return the checks beside an ``accuracy`` that was found on ``folds``."""
-    classifier, windows, jobs = recipe[-1], samples.cut.windows, settings.jobs
+    """Return the checks beside an ``accuracy`` that was found on ``folds``, or is found here."""
+    (classifier, examples), windows, jobs = checks, samples.cut.windows, settings.jobs
+    if accuracy is None:
+        accuracy = fold_accuracy(classifier, examples, folds, jobs, "svm", progress)
     speed_only = None
     if has_speed(windows):
         speed = FeatureExtractor(("wheels",), ("wheels",)).fit_transform(windows)
@@ -149,10 +175,8 @@ def _extras(
         )
     return Extras(
         speed_only,
-        slow_fast(classifier, features, samples, jobs, progress),
-        learning_curve(
-            classifier, examples_of(features, samples), folds, accuracy, settings.seed, jobs, progress
-        ),
+        slow_fast(classifier, examples.features, samples, jobs, progress),
+        learning_curve(classifier, examples, folds, accuracy, settings.seed, jobs, progress),
     )
 
 
@@ -220,6 +244,10 @@ def notes(samples: Samples, settings: CrossvalSettings, repaired: Mapping[str, i
         sentences.append(
             "published protocol: parts of one run lie on both sides of the split; "
             "for comparison with papers only"
+        )
+    if settings.recipe != CHECKED_WITH and settings.extras and settings.protocol == "grouped":
+        sentences.append(
+            f"speed alone, slow against fast and the learning curve are of recipe {CHECKED_WITH!r}"
         )
     if settings.protocol == "leave-terrain-out":
         sentences.append("accuracy and the table of classes are of folds in which all terrains are known")

@@ -28,9 +28,7 @@ PUBLISHED_WINDOW_S = 1.7
 class RecipeSettings(Settings):
     """A recipe, how its windows are cut, and how it is evaluated."""
 
-    recipe: Recipe = setting(
-        "svm", "SVM on features, network, both joined, or the best of them."
-    )
+    recipe: Recipe = setting("svm", "SVM on features, network, both joined, or the best of them.")
     window_s: float | None = setting(None, "Window length in s (2; 1.7 under 'published').", "--window")
     stride_s: float | None = setting(None, "From window to window in s; one length by default.", "--stride")
     steady: bool = setting(True, "Keep windows of steady motion only.")

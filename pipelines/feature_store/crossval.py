@@ -34,6 +34,8 @@ def crossval_store(
     """
     if settings.protocol == "published":
         raise ConfigError("'published' cuts windows of its own: it needs runs, not a store of features")
+    if settings.recipe != "svm":
+        raise ConfigError(f"recipe {settings.recipe!r} needs the samples of runs, not a store of features")
     if settings.protocol in SPEED_PROTOCOLS:
         raise ConfigError(f"{settings.protocol!r} needs the speeds of runs, not a store of features")
     samples, features = read_store(store, progress)
