@@ -99,7 +99,7 @@ def parallel(
     from joblib import Parallel, delayed
     from joblib.externals.loky.process_executor import TerminatedWorkerError
 
-    # a process whose memory has grown, as that of the first task to import torch, is replaced; nothing is lost
+    # a process whose memory has grown, as by the import of torch, is replaced; nothing is lost
     warnings.filterwarnings("ignore", "A worker stopped while some jobs", UserWarning)
     tasks = (delayed(function)(*shared, *one) for one in each)
     try:
