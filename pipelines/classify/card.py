@@ -17,6 +17,7 @@ from pipelines.crossval.extras import run_speeds
 from pipelines.crossval.results import CrossvalReport
 from pipelines.models.champion import scope_of
 from pipelines.models.model_files import read_lean_model
+from pipelines.models.onnx_file import ONNX_FILE, time_of_onnx
 from pipelines.models.results import ModelInfo
 from pipelines.reporting.json_file import as_json
 from pipelines.reporting.markdown import render_markdown
@@ -111,6 +112,7 @@ class ModelCard:
     versions: str
     files: tuple[FileRow, ...] = ()
     latency_ms: float | None = None
+    onnx_latency_ms: float | None = None
     n_timed: int = 0
 
     @property
@@ -118,7 +120,10 @@ class ModelCard:
         """The time of one window in words."""
         if self.latency_ms is None:
             return "not measured"
-        return f"{self.latency_ms:.2f} ms (median of {self.n_timed}, on the machine that trained it)"
+        beside = (
+            "" if self.onnx_latency_ms is None else f"; its network by ONNX {self.onnx_latency_ms:.2f} ms"
+        )
+        return f"{self.latency_ms:.2f} ms (median of {self.n_timed}, on the machine that trained it){beside}"
 
     def texts(self) -> dict[str, str]:
         """Return the card as Markdown and as JSON, by file name."""
@@ -290,4 +295,12 @@ def written(card: ModelCard, folder: Path, window: Windows) -> ModelCard:
         for path in sorted(folder.rglob("*"))
         if path.is_file() and path.suffix in (".skops", ".npz", ".onnx", ".data")
     )
-    return replace(card, files=sizes, latency_ms=1e3 * float(np.median(times_s)), n_timed=N_TIMED)
+    onnx = folder / ONNX_FILE
+    onnx_times_s = time_of_onnx(onnx, window, N_TIMED) if onnx.is_file() else None
+    return replace(
+        card,
+        files=sizes,
+        latency_ms=1e3 * float(np.median(times_s)),
+        onnx_latency_ms=None if onnx_times_s is None else 1e3 * float(np.median(onnx_times_s)),
+        n_timed=N_TIMED,
+    )

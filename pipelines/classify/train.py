@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from sklearn.base import clone
 
 from pipelines.classify.card import model_card, written
 from pipelines.classify.importance import channel_importance
@@ -54,8 +55,11 @@ def train(
     """
     from pipelines.classify.judging import held_out_runs, judge_of, standing_of, standing_tags
     from pipelines.crossval_figures.figures import all_figures
+    from pipelines.models.onnx_file import require_onnx
     from pipelines.models.tracking import TrainingRecord, code_commit, ensure_tracking, log_training
 
+    if settings.recipe != "svm":
+        require_onnx()
     ensure_tracking()
     report = crossval(runs, settings.evaluation, progress) if evaluation is None else evaluation
     report = report.named(dataset, data_digest(runs))
@@ -66,7 +70,7 @@ def train(
     recipe.fit(windows, terrain)
     progress("fit on all runs", 1, 1)
     importance = channel_importance(
-        settings.new_recipe()[-1],
+        clone(recipe[-1]),
         Examples(recipe[:-1].transform(windows), terrain, samples.group),
         list(recipe[0].get_feature_names_out()),
         folds_of(samples, "grouped", 1, settings.seed),

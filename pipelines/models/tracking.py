@@ -21,6 +21,7 @@ from urllib.parse import urlsplit
 
 from pipelines.models.lean import write_numbers
 from pipelines.models.model_files import TRUSTED_TYPES, TerrainModel, read_model, write_info
+from pipelines.models.onnx_file import write_onnx
 from pipelines.models.recipes import WindowPipeline
 from pipelines.models.results import ModelInfo, Registered
 from terrain.errors import ModelError, TerrainError
@@ -297,6 +298,7 @@ def _log_model(
     def save_model(path: str, mlflow_model: Any, **options: Any) -> None:
         mlflow.sklearn.save_model(recipe, path, mlflow_model=mlflow_model, **options)
         write_numbers(Path(path), recipe)
+        write_onnx(Path(path), recipe)
         write_info(Path(path), info)
         if card is not None:
             for file, text in card(Path(path)).items():

@@ -65,8 +65,7 @@ class GroupedNetwork(ClassifierMixin, BaseEstimator):
 
     Parameters
     ----------
-    columns : :class:`~terrain.classify.network_numbers.SampleColumns` of each stream; the rows are one
-        stream of one channel when empty
+    columns : :class:`~terrain.classify.network_numbers.SampleColumns` of each stream
     n_members : networks, one an inner fold
     epochs : at most, of each
     trial_epochs : of the networks that choose the augmentation; 0 for none, and no choice
@@ -112,7 +111,7 @@ class GroupedNetwork(ClassifierMixin, BaseEstimator):
         ConfigError
             if torch is not installed.
         DataError
-            if there is one class only, or too few windows to hold some of them out.
+            if there is one class only, too few windows to hold some of them out, or other columns.
         """
         X, y = validate_data(self, X, y, ensure_all_finite="allow-nan")
         check_classification_targets(y)
@@ -123,7 +122,9 @@ class GroupedNetwork(ClassifierMixin, BaseEstimator):
                 f"all windows are {str(self.classes_[0])!r}: a classifier needs at least two classes"
             )
         groups = np.arange(len(y)) if groups is None else np.asarray(groups)
-        columns = tuple(self.columns) or (SampleColumns("row", ("value",), 1.0, X.shape[1]),)
+        columns = tuple(self.columns)
+        if not columns or sum(each.width for each in columns) != X.shape[1]:
+            raise DataError(f"the columns of the samples do not describe rows of {X.shape[1]} columns")
         fill = fill_of(columns, X)
         task = task_of(columns, np.where(np.isnan(X), fill, X).astype(np.float32), class_index)
         splits = list(inner_splits(y, groups, self.n_members, self.seed, self.gap))

@@ -1,0 +1,230 @@
+"""A network as an ONNX file, for programs that classify without this package: windows in, probabilities out.
+
+The graph has one input a stream, ``(windows, channels, samples)`` as they were measured, missing ones NaN,
+and one output, ``(windows, classes)``.  Channels, rates, length and classes are in the file's metadata.  It
+is the computation of :mod:`terrain.classify.network_numbers`, step by step.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from features.matrix import FeatureMatrix
+from features.samples import is_centred
+from terrain.classify.network_numbers import (
+    CLIP_STD,
+    BranchNumbers,
+    NetworkNumbers,
+    SampleColumns,
+    fourier_kernel,
+)
+from terrain.classify.stack_numbers import stack_of
+from terrain.errors import ConfigError
+from terrain.records import Array, Windows
+
+if TYPE_CHECKING:
+    from pipelines.models.recipes import WindowPipeline
+
+ONNX_FILE = "network.onnx"
+OPSET = 17
+IR_VERSION = 8
+OUTPUT = "probabilities"
+
+
+def require_onnx() -> Any:
+    """Return onnx; a :class:`~terrain.errors.ConfigError` where it is not installed."""
+    try:
+        import onnx
+    except ModuleNotFoundError as error:
+        raise ConfigError("a network is exported with onnx: pip install 'terrain-slip[cnn]'") from error
+    return onnx
+
+
+class _Graph:
+    """Nodes and constants of a graph; each step returns the name of its output."""
+
+    def __init__(self) -> None:
+        self.helper = require_onnx().helper
+        self.numpy_helper = require_onnx().numpy_helper
+        self.nodes: list[Any] = []
+        self.constants: list[Any] = []
+
+    def constant(self, array: Any) -> str:
+        values = np.asarray(array)
+        values = values.astype(np.float32) if values.dtype.kind == "f" else values
+        name = f"c{len(self.constants)}"
+        self.constants.append(self.numpy_helper.from_array(np.ascontiguousarray(values), name))
+        return name
+
+    def step(self, kind: str, *inputs: str, output: str | None = None, **attributes: Any) -> str:
+        name = output or f"n{len(self.nodes)}"
+        self.nodes.append(self.helper.make_node(kind, list(inputs), [name], **attributes))
+        return name
+
+    def mean(self, values: str, axis: int) -> str:
+        return self.step("ReduceMean", values, axes=[axis], keepdims=1)
+
+    def shaped(self, values: str, shape: Sequence[int]) -> str:
+        return self.step("Reshape", values, self.constant(np.array(shape, dtype=np.int64)))
+
+
+def network_onnx(numbers: NetworkNumbers, matrix: FeatureMatrix, classes: Sequence[str]) -> bytes:
+    """Return the content of an ONNX file.
+
+    Parameters
+    ----------
+    numbers : of the fitted network
+    matrix : of its recipe: the channels of each stream, and which of them lose their mean
+    classes : (k,) names in the order of the output
+
+    Raises
+    ------
+    ConfigError
+        if onnx is not installed.
+    """
+    onnx, graph = require_onnx(), _Graph()
+    helper = onnx.helper
+    n_members, k = numbers.head_bias.shape
+    inputs, pooled, place = [], [], 0
+    for columns, branch in zip(numbers.columns, numbers.branches, strict=True):
+        shape = ["windows", len(columns.channels), columns.n_samples]
+        inputs.append(helper.make_tensor_value_info(columns.stream, onnx.TensorProto.FLOAT, shape))
+        fill = numbers.fill[place : place + columns.width].reshape(len(columns.channels), -1)
+        place += columns.width
+        centred = [is_centred(columns.stream, name, matrix.level_sets) for name in columns.channels]
+        pooled += _branch(graph, columns, branch, _filled(graph, columns.stream, centred, fill))
+    joined = graph.step("Concat", *pooled, axis=2)
+    column = graph.step("Unsqueeze", joined, graph.constant(np.array([3])))
+    product = graph.step("MatMul", graph.constant(numbers.head_weight), column)
+    flat = graph.step("Squeeze", product, graph.constant(np.array([3])))
+    logits = graph.step("Add", flat, graph.constant(numbers.head_bias))
+    mean = graph.step("ReduceMean", graph.step("LogSoftmax", logits, axis=2), axes=[1], keepdims=0)
+    tempered = graph.step("Div", mean, graph.constant(np.array(numbers.temperature)))
+    graph.step("Softmax", tempered, output=OUTPUT, axis=1)
+    output = helper.make_tensor_value_info(OUTPUT, onnx.TensorProto.FLOAT, ["windows", k])
+    model = helper.make_model(
+        helper.make_graph(graph.nodes, "terrain", inputs, [output], graph.constants),
+        opset_imports=[helper.make_opsetid("", OPSET)],
+        ir_version=IR_VERSION,
+        producer_name="terrain-slip",
+    )
+    helper.set_model_props(model, _metadata(numbers, matrix, classes, n_members))
+    onnx.checker.check_model(model)
+    return bytes(model.SerializeToString())
+
+
+def _metadata(
+    numbers: NetworkNumbers, matrix: FeatureMatrix, classes: Sequence[str], n_members: int
+) -> dict[str, str]:
+    streams = {
+        each.stream: {"channels": each.channels, "rate_hz": each.rate_hz, "n_samples": each.n_samples}
+        for each in numbers.columns
+    }
+    return {
+        "classes": json.dumps([str(name) for name in classes]),
+        "streams": json.dumps(streams),
+        "length_s": json.dumps(matrix.length_s),
+        "members": json.dumps(n_members),
+    }
+
+
+def _filled(graph: _Graph, stream: str, centred: Sequence[bool], fill: Array) -> str:
+    """Subtract the mean over the window of some channels, and fill what is missing."""
+    mask = graph.constant(np.array(centred)[:, None])
+    mean = graph.step("Where", mask, graph.mean(stream, 2), graph.constant(np.array(0.0)))
+    values = graph.step("Sub", stream, mean)
+    return graph.step("Where", graph.step("IsNaN", values), graph.constant(fill), values)
+
+
+def _branch(graph: _Graph, columns: SampleColumns, branch: BranchNumbers, values: str) -> list[str]:
+    """Return what a branch passes on, each (windows, K, p)."""
+    c, frame = len(columns.channels), columns.frame
+    n_members, hidden = branch.bias_1.shape
+    half = frame // 2
+    if frame:
+        values = graph.step("Sub", values, graph.mean(values, 2))
+        waves = graph.step(
+            "Conv",
+            graph.shaped(values, (-1, 1, columns.n_samples)),
+            graph.constant(fourier_kernel(frame).T[:, None]),
+            strides=[columns.hop],
+        )
+        squares = graph.step("Mul", waves, waves)
+        parts = [graph.constant(np.array([at])) for at in (0, half, 2 * half)]
+        axis = graph.constant(np.array([1]))
+        cosine, sine = (graph.step("Slice", squares, parts[i], parts[i + 1], axis) for i in (0, 1))
+        n_frames = (columns.n_samples - frame) // columns.hop + 1
+        power = graph.shaped(graph.step("Add", cosine, sine), (-1, c, half, n_frames))
+        values = graph.step("Log", graph.step("Add", power, graph.constant(branch.floor[:, None, None])))
+    else:
+        values = graph.shaped(values, (-1, c, 1, columns.n_samples))
+    scaled = graph.step("Sub", values, graph.constant(branch.mean[:, :, None]))
+    scaled = graph.step("Div", scaled, graph.constant(branch.std[:, :, None]))
+    limits = [graph.constant(np.array(limit)) for limit in (-CLIP_STD, CLIP_STD)]
+    rows = graph.shaped(
+        graph.step("Clip", scaled, *limits),
+        (0, branch.mean.size, n_frames if frame else columns.n_samples),
+    )
+    found = rows
+    for weight, bias, groups in (
+        (branch.weight_1, branch.bias_1, 1),
+        (branch.weight_2, branch.bias_2, n_members),
+    ):
+        kernel = graph.constant(weight.reshape(n_members * hidden, *weight.shape[2:]))
+        found = graph.step("Conv", found, kernel, graph.constant(bias.ravel()), pads=[1, 1], group=groups)
+        found = graph.step("Relu", found)
+    each = (-1, n_members, hidden)
+    pooled = [
+        graph.shaped(graph.mean(found, 2), each),
+        graph.shaped(graph.step("ReduceMax", found, axes=[2], keepdims=1), each),
+    ]
+    if not frame:
+        mean = graph.mean(rows, 2)
+        offset = graph.step("Sub", rows, mean)
+        spread = graph.step("Sqrt", graph.mean(graph.step("Mul", offset, offset), 2))
+        ones = graph.constant(np.ones((1, n_members, 1)))
+        pooled += [graph.step("Mul", graph.shaped(part, (-1, 1, c)), ones) for part in (mean, spread)]
+    return pooled
+
+
+def write_onnx(folder: Path, recipe: WindowPipeline) -> None:
+    """Write ``network.onnx`` beside a fitted recipe that has a network; errors as :func:`network_onnx`."""
+    network = stack_of(recipe[-1].numbers()).network
+    if network is not None:
+        content = network_onnx(network, recipe[0].matrix, recipe.classes_.tolist())
+        (folder / ONNX_FILE).write_bytes(content)
+
+
+def time_of_onnx(file: Path, window: Windows, n: int) -> Array | None:
+    """Return how long (n,) in s one window takes on one core; None where onnxruntime is not installed.
+
+    Parameters
+    ----------
+    file : that :func:`write_onnx` wrote
+    window : a single one, with the channels of the file
+    n : repetitions, after a first one
+    """
+    try:
+        import onnxruntime
+    except ModuleNotFoundError:
+        return None
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    session = onnxruntime.InferenceSession(file.read_bytes(), options, providers=["CPUExecutionProvider"])
+    streams = json.loads(session.get_modelmeta().custom_metadata_map["streams"])
+    inputs = {}
+    for stream, described in streams.items():
+        rows = [window.channels[stream].index(name) for name in described["channels"]]
+        inputs[stream] = window.values[stream][:, rows].astype(np.float32)
+    times_s = np.empty(n + 1)
+    for number in range(n + 1):
+        began_s = time.perf_counter()
+        session.run(None, inputs)
+        times_s[number] = time.perf_counter() - began_s
+    return times_s[1:]
