@@ -83,9 +83,9 @@ def _arrays_of(numbers: StackNumbers) -> dict[str, Array]:
 
 def _numbers_of(found: Mapping[str, Array], matrix: FeatureMatrix) -> StackNumbers:
     svm = SvmNumbers(*(found[name] for name in SvmNumbers._fields)) if "vectors" in found else None
-    if "network_fill" not in found:
-        if svm is None:
-            raise DataError("it holds no classifier")
+    if "joint_weights" not in found:
+        if svm is None or any(name.startswith("network_") for name in found):
+            raise DataError("it holds no whole classifier")
         return stack_of(svm)
     columns = columns_of(matrix)
     branches = tuple(

@@ -23,6 +23,9 @@ from terrain.errors import ConfigError
 from terrain.records import Array
 
 BATCH = 64
+MIN_BATCHES, SMALL_BATCH = 4, 8
+"""Few windows make so many batches an epoch, of at least so many windows."""
+
 LEARNING_RATE = 3e-3
 WEIGHT_DECAY = 1e-2
 LABEL_SMOOTHING = 0.05
@@ -124,7 +127,7 @@ def fit_member(task: Task, split: tuple[Array, Array], used: Augmentation, epoch
     plain = task.rows(streams) if used == Augmentation() else []
     held_out = [torch.from_numpy(rows) for rows in task.rows([values[test] for values in task.streams])]
     truth, test_truth = (torch.from_numpy(task.class_index[rows]) for rows in (train, test))
-    n_batches = max(1, len(train) // BATCH)
+    n_batches = max(len(train) // BATCH, min(MIN_BATCHES, len(train) // SMALL_BATCH), 1)
     optimizer = torch.optim.AdamW(net.parameters(), lr=LEARNING_RATE, weight_decay=WEIGHT_DECAY)
     schedule = torch.optim.lr_scheduler.OneCycleLR(
         optimizer, LEARNING_RATE, total_steps=epochs * n_batches, pct_start=0.15

@@ -254,11 +254,11 @@ def check_network(numbers: NetworkNumbers, n_classes: int) -> None:
     DataError
         if a shape is another or a number is not finite.
     """
-    members = len(numbers.head_bias)
+    members = len(numbers.head_bias) if numbers.head_bias.ndim else 0
     pooled = 0
     arrays: list[tuple[str, Array, tuple[int, ...]]] = []
     for columns, branch in zip(numbers.columns, numbers.branches, strict=True):
-        c, hidden = len(columns.channels), branch.bias_1.shape[-1]
+        c, hidden = len(columns.channels), max(branch.bias_1.shape, default=0)
         f = columns.frame // 2 if columns.frame else 1
         shapes = {
             "floor": (c,),

@@ -1,0 +1,159 @@
+"""Models with a network: by scikit-learn, by their numbers and by ONNX they classify alike."""
+
+import json
+import sys
+from dataclasses import replace
+
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+from skops import io
+
+from features.windows import WindowRule, cut_windows
+from pipelines.models.lean import NUMBERS_FILE, LeanRecipe, read_numbers, write_numbers
+from pipelines.models.model_files import (
+    MODEL_FILE,
+    TRUSTED_TYPES,
+    read_lean_model,
+    read_model,
+    write_info,
+)
+from pipelines.models.onnx_file import ONNX_FILE, network_onnx, time_of_onnx, write_onnx
+from pipelines.models.recipes import feature_matrix, inform, make_recipe
+from terrain.errors import ConfigError, DataError, ModelError
+
+
+@pytest.fixture(scope="module")
+def windows(runs):
+    return cut_windows(runs, WindowRule()).windows
+
+
+def quick(name):
+    recipe = make_recipe(name, seed=1)
+    recipe[-1].set_params(n_members=2, epochs=3, trial_epochs=0)
+    if name != "cnn":
+        recipe[-1].set_params(candidates=((10.0, 0.4, 100.0),))
+    return recipe
+
+
+RECIPES = ("cnn", "stack", "best")
+with_network = pytest.mark.parametrize("fitted", RECIPES[:2], indirect=True)  # "best" may be the SVM
+every_recipe = pytest.mark.parametrize("fitted", RECIPES, indirect=True)
+
+
+@pytest.fixture(scope="module")
+def fitted(request, windows):
+    return quick(request.param).fit(windows, windows.terrain.astype(str))
+
+
+@pytest.fixture
+def folder(fitted, model_dir):
+    """A model folder with the fitted recipe in it."""
+    info = read_model(model_dir).info
+    io.dump(fitted, model_dir / MODEL_FILE)
+    write_numbers(model_dir, fitted)
+    write_onnx(model_dir, fitted)
+    write_info(model_dir, info)
+    return model_dir
+
+
+@every_recipe
+def test_a_model_read_back_gives_the_same_bytes(folder, fitted, windows):
+    desired = fitted.predict_proba(windows)
+    assert np.array_equal(read_model(folder).recipe.predict_proba(windows), desired)
+    lean = read_lean_model(folder).recipe
+    assert isinstance(lean, LeanRecipe)
+    np.testing.assert_allclose(lean.predict_proba(windows), desired, atol=1e-12)
+    assert set(io.get_untrusted_types(file=folder / MODEL_FILE)) <= set(TRUSTED_TYPES)
+
+
+def test_a_classifier_fitted_on_the_matrix_is_that_of_the_windows(windows):
+    recipe = quick("stack")
+    features = feature_matrix(recipe, windows)
+    terrain = windows.terrain.astype(str)
+    alone = recipe[-1].fit(features, terrain, groups=windows.run_id)
+    whole = quick("stack").fit(windows, terrain)
+    assert np.array_equal(alone.predict_proba(features), whole.predict_proba(windows))
+
+
+@with_network
+def test_onnx_computes_the_network(folder, fitted, windows):
+    network = getattr(fitted[-1], "network_", fitted[-1])
+    session = onnxruntime.InferenceSession((folder / ONNX_FILE).read_bytes())
+    inputs = {stream: values.astype(np.float32) for stream, values in windows.values.items()}
+    inputs["wheels"][3, 0, 2:4] = np.nan
+    inputs["imu"][5, 1] = np.nan
+    given = replace(windows, values={stream: values.astype(float) for stream, values in inputs.items()})
+    samples = fitted[0].transform(given)[:, -len(network.numbers_.fill) :]
+    (found,) = session.run(None, inputs)
+    np.testing.assert_allclose(found, network.predict_proba(samples), atol=1e-5)
+    described = session.get_modelmeta().custom_metadata_map
+    assert json.loads(described["classes"]) == fitted.classes_.tolist()
+    assert json.loads(described["streams"])["imu"]["channels"] == list(windows.channels["imu"])
+    times_s = time_of_onnx(folder / ONNX_FILE, windows[0], 3)
+    assert times_s.shape == (3,)
+    assert (times_s > 0).all()
+
+
+@every_recipe
+def test_there_is_an_onnx_file_where_there_is_a_network(folder, fitted):
+    assert (folder / ONNX_FILE).exists() == (getattr(fitted[-1], "network_", fitted[-1]) is not None)
+
+
+@with_network
+def test_other_channels_are_refused_by_the_onnx_file(folder, fitted, windows):
+    session = onnxruntime.InferenceSession((folder / ONNX_FILE).read_bytes())
+    inputs = {stream: values[:, 1:].astype(np.float32) for stream, values in windows.values.items()}
+    with pytest.raises(onnxruntime.capi.onnxruntime_pybind11_state.InvalidArgument):
+        session.run(None, inputs)
+    onnx.checker.check_model(onnx.load_from_string((folder / ONNX_FILE).read_bytes()))
+
+
+@with_network
+def test_a_damaged_onnx_file_is_refused_in_one_sentence(folder):
+    file = folder / ONNX_FILE
+    content = bytearray(file.read_bytes())
+    content[len(content) // 2] ^= 1
+    file.write_bytes(content)
+    for read in (read_model, read_lean_model):
+        with pytest.raises(ModelError, match=r"network\.onnx: is damaged"):
+            read(folder)
+
+
+@with_network
+def test_numbers_of_a_network_that_a_checksum_covers_up_end_in_one_sentence(folder):
+    file, info = folder / NUMBERS_FILE, read_model(folder).info
+    with np.load(file) as arrays:
+        whole = {name: arrays[name] for name in arrays.files}
+    for name in [name for name in whole if name.startswith(("network_", "joint_"))]:
+        for array in (None, np.zeros(7), np.full_like(whole[name], np.nan), np.array("text")):
+            found = {key: each for key, each in whole.items() if key != name}
+            np.savez(file, **(found if array is None else found | {name: array}))
+            write_info(folder, info)
+            with pytest.raises(ModelError, match="cannot be loaded") as refusal:
+                read_lean_model(folder)
+            assert len(str(refusal.value).splitlines()) == 1
+    np.savez(
+        file, **{name: array for name, array in whole.items() if name not in ("vectors", "joint_weights")}
+    )
+    with pytest.raises(DataError, match="holds no whole classifier"):
+        read_numbers(file.read_bytes(), info)
+
+
+def test_without_onnx_there_is_one_sentence(windows, monkeypatch, tmp_path):
+    recipe = quick("cnn").fit(windows, windows.terrain.astype(str))
+    monkeypatch.setitem(sys.modules, "onnx", None)
+    with pytest.raises(ConfigError, match="pip install"):
+        network_onnx(recipe[-1].numbers(), recipe[0].matrix, ["a"])
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    assert time_of_onnx(tmp_path / ONNX_FILE, windows[0], 1) is None
+
+
+def test_only_a_classifier_of_samples_is_informed_of_columns(windows):
+    svm = make_recipe("svm")
+    inform(svm, svm[0].fit(windows))
+    assert "columns" not in svm[-1].get_params()
+    cnn = make_recipe("cnn")
+    inform(cnn, cnn[0].fit(windows))
+    assert [each.stream for each in cnn[-1].columns] == list(windows.channels)

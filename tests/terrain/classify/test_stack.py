@@ -1,0 +1,117 @@
+"""The stack: whichever of SVM and network knows more, and the same numbers by both routes."""
+
+import numpy as np
+import pytest
+from sklearn.base import clone
+
+from terrain.classify.network_numbers import SampleColumns
+from terrain.classify.stack import GroupedStack, chosen_of, fit_weights
+from terrain.classify.stack_numbers import check_stack, joined, joined_of, probabilities, stack_of
+from terrain.errors import DataError
+
+COLUMNS = (SampleColumns("imu", ("accel_z_mps2",), 50.0, 50),)
+N_FEATURES = 4
+
+
+def draw(informed, n_runs=5, n_windows=10, seed=0):
+    """Return rows of features and samples of which one, both or none shows the terrain."""
+    rng = np.random.default_rng(seed)
+    y = np.repeat(["ice", "sand"], n_runs * n_windows)
+    run = np.repeat(np.arange(2 * n_runs), n_windows)
+    ice = (y == "ice")[:, None]
+    features = rng.standard_normal((len(y), N_FEATURES)) + (3.0 * ice if "features" in informed else 0.0)
+    hz = np.where(ice, 8.0, 18.0) if "samples" in informed else 8.0
+    phase = rng.uniform(0, 2 * np.pi, (len(y), 1))
+    samples = 2 * np.sin(2 * np.pi * hz * np.arange(50) / 50 + phase) + 2.0 * rng.standard_normal(
+        (len(y), 50)
+    )
+    return np.concatenate([features, samples], axis=1), y, run
+
+
+def quick(**changed):
+    settings = {"candidates": ((10.0, 0.4, 100.0),), "n_members": 2, "epochs": 8, "trial_epochs": 0}
+    return GroupedStack(COLUMNS, **(settings | changed))
+
+
+@pytest.mark.parametrize(("informed", "weight"), [("features", "weight_svm"), ("samples", "weight_cnn")])
+def test_the_one_that_knows_has_the_weight_and_is_chosen(informed, weight):
+    X, y, run = draw(informed)
+    stack = quick().fit(X, y, run)
+    other = {"weight_svm": "weight_cnn", "weight_cnn": "weight_svm"}[weight]
+    assert getattr(stack.best_, weight) > getattr(stack.best_, other)
+    test, truth, _ = draw(informed, seed=1)
+    assert np.mean(stack.predict(test) == truth) > 0.9
+    best = quick(choose=True).fit(X, y, run)
+    assert best.best_.used in ({"svm"} if informed == "features" else {"cnn", "stack"})
+    assert np.mean(best.predict(test) == truth) > 0.9
+
+
+def test_what_does_not_help_is_not_kept():
+    best = quick(choose=True).fit(*draw("features"))
+    assert best.best_.used == "svm"
+    assert best.network_ is None
+    X = draw("features", seed=2)[0]
+    assert np.array_equal(best.predict_proba(X), best.svm_.predict_proba(X[:, :N_FEATURES]))
+
+
+@pytest.mark.parametrize("choose", [False, True])
+def test_the_numbers_compute_the_same_bytes(choose):
+    X, y, run = draw("features and samples")
+    stack = quick(choose=choose).fit(X, y, run)
+    numbers = stack.numbers()
+    check_stack(numbers, 2)
+    found = probabilities(numbers, X[:, :N_FEATURES], X[:, N_FEATURES:])
+    np.testing.assert_allclose(found, stack.predict_proba(X), atol=1e-12)
+    np.testing.assert_allclose(found.sum(axis=1), 1.0)
+
+
+def test_the_same_seed_gives_the_same_bytes():
+    X, y, run = draw("features and samples")
+    one, two = (clone(quick()).fit(X, y, run) for _ in range(2))
+    assert one.best_ == two.best_
+    assert np.array_equal(one.predict_proba(X), two.predict_proba(X))
+
+
+def test_weights_are_those_of_a_search_over_a_grid():
+    rng = np.random.default_rng(0)
+    truth = rng.integers(3, size=300)
+    both = np.stack([rng.dirichlet(np.ones(3), 300) for _ in range(2)])
+    both[0, np.arange(300), truth] += 1.0
+    both /= both.sum(axis=2, keepdims=True)
+
+    def loss(w):
+        p = joined(both, np.array(w))[np.arange(300), truth]
+        return -np.log(p).mean() + 0.1 * ((np.array(w) - 0.5) ** 2).sum()
+
+    grid = [(a, b) for a in np.linspace(0, 3, 61) for b in np.linspace(0, 3, 61)]
+    np.testing.assert_allclose(fit_weights(both, truth), min(grid, key=loss), atol=0.06)
+    assert (fit_weights(both[::-1], truth) >= 0).all()
+
+
+def test_the_choice_needs_more_than_the_noise_between_runs():
+    run = np.repeat(np.arange(10), 5)
+    rng = np.random.default_rng(0)
+    svm = np.full(50, 0.5)
+    noisy = np.repeat(0.49 + 2.0 * rng.standard_normal(10), 5)
+    assert chosen_of(np.stack([svm, noisy, noisy]), run) == "svm"
+    assert chosen_of(np.stack([svm, svm - 0.1, svm - 0.2]), run) == "stack"
+    assert chosen_of(np.stack([svm, svm - 0.2, svm - 0.1]), run) == "cnn"
+    assert chosen_of(np.stack([svm, svm - 9, svm - 9]), np.zeros(50)) == "svm"  # one run says nothing
+
+
+def test_rows_without_features_and_other_weights_are_refused():
+    X, y, run = draw("features")
+    with pytest.raises(DataError, match="are not features and 50 samples"):
+        quick().fit(X[:, N_FEATURES:], y, run)
+    with pytest.raises(DataError, match="all windows are 'ice'"):
+        quick().fit(X, np.full(len(y), "ice"), run)
+    numbers = quick(epochs=1).fit(X, y, run).numbers()
+    for weights in (np.zeros(2), np.array([1.0, np.nan]), np.array([-1.0, 1.0]), np.ones(3)):
+        with pytest.raises(DataError, match="weights"):
+            check_stack(numbers._replace(weights=weights), 2)
+    with pytest.raises(DataError, match="lacks one"):
+        check_stack(numbers._replace(network=None), 2)
+    assert stack_of(numbers.svm).weights.tolist() == [1.0, 0.0]
+    assert stack_of(numbers.network).weights.tolist() == [0.0, 1.0]
+    with pytest.raises(ValueError, match="neither"):
+        joined_of(None, None, np.ones(2))
