@@ -9,9 +9,9 @@ import numpy as np
 
 from features.windows import WindowCut, cut_windows, join_windows
 from pipelines.classify.results import Predictions, TargetSlipRow, WindowPrediction
-from pipelines.live.log_windows import lacking_estimates, windows_of_log
 from pipelines.models.model_files import TerrainModel
 from pipelines.runs.datasets import data_digest, robot_of
+from pipelines.streaming.log_windows import lacking_estimates, windows_of_log
 from terrain.classify.terrain_filter import TerrainFilter, check_filter, filter_run, reported
 from terrain.control.slip_table import DRIVE_STATES, SlipTable
 from terrain.errors import ConfigError

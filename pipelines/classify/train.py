@@ -18,12 +18,12 @@ from pipelines.crossval.evaluation import Examples
 from pipelines.crossval.results import CrossvalReport
 from pipelines.crossval.settings import RecipeSettings
 from pipelines.crossval.splits import folds_of
-from pipelines.live.window_feed import ESTIMATED
 from pipelines.models.champion import scope_of
 from pipelines.models.results import ModelInfo
 from pipelines.reporting.json_file import as_json
 from pipelines.reporting.progress import Progress, silent
 from pipelines.runs.datasets import data_digest
+from pipelines.streaming.window_feed import ESTIMATED
 from terrain import __version__
 from terrain.errors import DataError
 from terrain.records import RunLog, Windows

@@ -9,13 +9,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipelines.live.classifying import AtOnce, Classifying, Part, WindowOutput
 from pipelines.live.clock_watch import ClockWatch, last_stamp_s
 from pipelines.live.pilot_settings import check_table
 from pipelines.live.state import LiveState, Restorable, restorable, state_of
-from pipelines.live.window_feed import Estimate, WindowFeed, live_filter, needs_filter
 from pipelines.models.model_files import TerrainModel
-from pipelines.models.results import ModelInfo
+from pipelines.streaming.classifying import AtOnce, Classifying, Part, WindowOutput
+from pipelines.streaming.estimator import live_estimator
+from pipelines.streaming.window_feed import Estimate, WindowFeed, live_filter, needs_filter
 from terrain.control.slip_table import SlipTable, load_slip_table
 from terrain.control.switching import (
     NO_BELIEF,
@@ -27,9 +27,6 @@ from terrain.control.switching import (
     update,
 )
 from terrain.errors import DataError
-from terrain.estimation.live.estimator import CHANNELS, LiveEstimator
-from terrain.estimation.live.skid_live import LiveSkidEstimator
-from terrain.extension import correct_live
 from terrain.records import Reading, SlipTarget
 from terrain.robots import Robot
 
@@ -269,33 +266,3 @@ def _speeds(wheels: Sequence[str], robot: Robot | None) -> tuple[list[int], floa
         return columns, 1.0
     motors = [i for i, name in enumerate(wheels) if name.startswith("motor_")]
     return motors, robot.wheel_radius_m / robot.motors.reduction_ratio
-
-
-def live_estimator(
-    info: ModelInfo, robot: Robot, channels: Mapping[str, Sequence[str]]
-) -> tuple[LiveEstimator | LiveSkidEstimator | None, Robot]:
-    """Return the filter whose estimates a model needs, or None, and the robot as filters take it.
-
-    Raises
-    ------
-    DataError
-        if the robot does not run the filter that the model was trained with.
-    ConfigError
-        if a channel that the filter needs is not measured.
-    """
-    driven, correction = correct_live(robot)
-    if not needs_filter(info, channels):
-        return None, driven
-    name = live_filter(info, driven)
-    known = {stream: tuple(names) for stream, names in channels.items()}
-    if name != "skid":
-        read = {stream: names for stream, names in known.items() if stream in CHANNELS}
-        return LiveEstimator(driven, name, read, correction=correction), driven
-    periods = {stream: 1.0 / rate for stream, rate in info.rate_hz.items()}
-    return LiveSkidEstimator(
-        driven,
-        known,
-        wheels_period_s=periods.get("wheels"),
-        imu_period_s=periods.get("imu"),
-        correction=correction,
-    ), driven

@@ -6,9 +6,9 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import NamedTuple, Protocol
 
-from pipelines.live.classifying import AtOnce, Classifying, Part, WindowOutput
-from pipelines.live.window_feed import WindowFeed, live_filter, needs_filter
 from pipelines.models.model_files import TerrainModel
+from pipelines.streaming.classifying import AtOnce, Classifying, Part, WindowOutput
+from pipelines.streaming.window_feed import WindowFeed, live_filter, needs_filter
 from terrain.errors import DataError
 from terrain.estimation.live.estimate import LiveEstimate
 from terrain.estimation.live.estimator import CHANNELS

@@ -12,14 +12,14 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from pipelines.live.classifying import AtOnce, WindowOutput
 from pipelines.live.observer import TerrainObserver
 from pipelines.live.pilot import LivePilot
 from pipelines.live.pilot_settings import PilotSettings
 from pipelines.live.terrain_source import Classifier, NoTerrain
-from pipelines.live.window_feed import needs_filter
 from pipelines.models.model_files import TerrainModel
 from pipelines.runs.datasets import robot_of
+from pipelines.streaming.classifying import AtOnce, WindowOutput
+from pipelines.streaming.window_feed import needs_filter
 from terrain.control.slip_table import SlipTable
 from terrain.errors import ConfigError, DataError
 from terrain.estimation.live.estimator import CHANNELS

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import NamedTuple
 
-from pipelines.live.classifying import WindowOutput
 from pipelines.models.model_files import TerrainModel
+from pipelines.streaming.classifying import WindowOutput
 from terrain.control.slip_table import SlipTable
 from terrain.records import Array, Command, SlipTarget
 

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.live.classifying import Classifying, WindowOutput
 from pipelines.live.observer import TerrainObserver
 from pipelines.live.pilot import LivePilot
 from pipelines.live.pilot_settings import PilotSettings, check_table
@@ -24,6 +23,7 @@ from pipelines.sessions.clock import SessionClock
 from pipelines.sessions.inbox import Inbox, as_numbers
 from pipelines.sessions.records import CommandStatus, Observation, Served, SessionRequest, StepOutput
 from pipelines.sessions.stream_health import StreamHealth
+from pipelines.streaming.classifying import Classifying, WindowOutput
 from terrain.control.switching import TerrainBelief
 from terrain.control.traction import TractionStatus
 from terrain.errors import ConfigError, DataError

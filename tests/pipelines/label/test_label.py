@@ -13,8 +13,8 @@ from pipelines.cli import main as cli
 from pipelines.label.labels import doubtful_windows, relabelled, set_label
 from pipelines.label.screen import time_text
 from pipelines.label.settings import LabelSettings
-from pipelines.live.classifying import WindowOutput
 from pipelines.recording.windows_file import WINDOWS_FILE, window_entry, windows_text
+from pipelines.streaming.classifying import WindowOutput
 from terrain.errors import ConfigError, LogError
 from terrain.files import atomic
 from terrain.logs.read import read_run

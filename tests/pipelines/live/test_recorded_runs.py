@@ -8,7 +8,6 @@ import pytest
 from pipelines.classify.predict import predict
 from pipelines.crossval.crossval import samples_of
 from pipelines.crossval.settings import CrossvalSettings
-from pipelines.live.classifying import AtOnce
 from pipelines.live.observer import TerrainObserver
 from pipelines.live.pilot import LivePilot
 from pipelines.live.terrain_source import Classifier
@@ -18,6 +17,7 @@ from pipelines.recording.windows_file import read_windows
 from pipelines.runs.datasets import load_runs
 from pipelines.runs.inspect_logs import inspect_logs
 from pipelines.runs.settings import InspectSettings
+from pipelines.streaming.classifying import AtOnce
 from terrain.control.slip_table import load_slip_table
 from terrain.estimation.live.estimator import CHANNELS
 from terrain.logs.replay import replay

@@ -13,7 +13,6 @@ import time
 import numpy as np
 import pytest
 
-from pipelines.live.classifying import WindowOutput
 from pipelines.recording import journal as journals
 from pipelines.recording import recorder as recorders
 from pipelines.recording.finishing import APART, SHORT_STREAM, recover_recordings
@@ -27,6 +26,7 @@ from pipelines.recording.recorder import (
 from pipelines.recording.thread import RecordingThread
 from pipelines.recording.windows_file import WINDOWS_FILE, read_windows
 from pipelines.runs.datasets import data_digest, load_runs
+from pipelines.streaming.classifying import WindowOutput
 from terrain.errors import LogError
 from terrain.logs.read import read_run
 from terrain.logs.replay import replay

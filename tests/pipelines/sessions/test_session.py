@@ -8,13 +8,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipelines.live.classifying import AtOnce
 from pipelines.live.observer import TerrainObserver
 from pipelines.live.pilot import LivePilot
 from pipelines.live.terrain_source import Classifier
 from pipelines.sessions.records import CommandStatus, Served, SessionRequest
 from pipelines.sessions.session import TWIST_FRESH_S, RobotSession
 from pipelines.sessions.stream_health import StreamHealth
+from pipelines.streaming.classifying import AtOnce
 from terrain.control.slip_table import load_slip_table
 from terrain.errors import ConfigError, DataError
 from terrain.estimation.live.estimator import CHANNELS

@@ -7,7 +7,8 @@ from collections import Counter, namedtuple
 import numpy as np
 import pytest
 
-from pipelines.live.classifying import (
+from pipelines.live.observer import TerrainObserver
+from pipelines.streaming.classifying import (
     AT_MOST,
     MAX_WAITING,
     AtOnce,
@@ -16,7 +17,6 @@ from pipelines.live.classifying import (
     WindowOutput,
     classify_window,
 )
-from pipelines.live.observer import TerrainObserver
 from terrain.logs.replay import replay
 from terrain.records import Reading
 

@@ -11,8 +11,8 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from pipelines.live.window_feed import Estimate, WindowFeed
 from pipelines.models.model_files import TerrainModel
+from pipelines.streaming.window_feed import Estimate, WindowFeed
 from terrain.records import Array, Reading, Windows
 
 MAX_WAITING = 1000

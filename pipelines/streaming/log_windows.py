@@ -16,9 +16,9 @@ from features.windows import (
     label_windows,
     span_of,
 )
-from pipelines.live.observer import live_estimator
-from pipelines.live.window_feed import ESTIMATED, WindowFeed
 from pipelines.models.results import ModelInfo
+from pipelines.streaming.estimator import live_estimator
+from pipelines.streaming.window_feed import ESTIMATED, WindowFeed
 from terrain.errors import ConfigError, DataError
 from terrain.logs.replay import SENSORS, replay
 from terrain.records import RunLog, Windows
