@@ -9,14 +9,19 @@ import numpy as np
 
 from features.windows import WindowCut, cut_windows, join_windows
 from pipelines.classify.results import Predictions, TargetSlipRow, WindowPrediction
+from pipelines.models.assess import Assessed, assess, class_sets
 from pipelines.models.model_files import TerrainModel
 from pipelines.runs.datasets import data_digest, robot_of
 from pipelines.streaming.log_windows import lacking_estimates, windows_of_log
 from terrain.classify.terrain_filter import TerrainFilter, check_filter, filter_run, reported
 from terrain.control.slip_table import DRIVE_STATES, SlipTable
+from terrain.control.switching import UNKNOWN
 from terrain.errors import ConfigError
 from terrain.records import Array, RunLog, SlipTarget, Windows
 from terrain.robots import Robot
+
+NOT_LEARNED = "unknown"
+"""Terrain of a window that is like none that was learned."""
 
 
 def predict(
@@ -57,25 +62,12 @@ def predict(
         [cut_windows([], model.rule, layout=model.layout).windows, *(c.windows for c in cuts)]
     )
     classes = np.asarray(model.recipe.classes_, dtype=str)
-    probability = model.recipe.predict_proba(windows) if len(windows) else np.zeros((0, len(classes)))
-    best = probability.argmax(axis=1)
-    predicted, label = classes[best], windows.terrain.astype(str)
-    over_time = filtered_terrains(windows, probability, model)
+    assessed = assess(model, windows) if len(windows) else _nothing(len(classes))
+    predicted = classes[assessed.probability.argmax(axis=1)]
+    label = windows.terrain.astype(str)
+    over_time = filtered_terrains(windows, assessed.probability, model)
     targets = {terrain: table.lookup(terrain) for terrain in classes.tolist()}
-    rows = tuple(
-        WindowPrediction(
-            run_id=str(windows.run_id[i]),
-            start_s=float(windows.start_s[i]),
-            terrain=str(predicted[i]),
-            probability=float(probability[i, best[i]]),
-            target_slip={state: targets[predicted[i]][state].slip_ratio for state in DRIVE_STATES},
-            slip_entry=targets[predicted[i]]["traction"].terrain,
-            status={state: targets[predicted[i]][state].status for state in DRIVE_STATES},
-            label=str(label[i]) or None,
-            filtered_terrain=str(over_time[i]) or None,
-        )
-        for i in range(len(windows))
-    )
+    rows = _rows(windows, assessed, over_time, model, table)
     known = np.isin(label, classes)
     unknown, counts = np.unique(label[(label != "") & ~known], return_counts=True)
     return Predictions(
@@ -94,7 +86,46 @@ def predict(
         filtered=tuple(run.run_id for run in raw),
         table_name=table.name,
         table={terrain: _table_row(found) for terrain, found in targets.items()},
+        n_unknown=int(assessed.unknown.sum()),
+        n_unsupported=None if model.support is None else int((assessed.supported == 0).sum()),
     )
+
+
+def _nothing(n_classes: int) -> Assessed:
+    empty = np.zeros(0)
+    return Assessed(np.zeros((0, n_classes)), empty, empty.astype(bool), empty, empty)
+
+
+def _rows(
+    windows: Windows, assessed: Assessed, over_time: Array, model: TerrainModel, table: SlipTable
+) -> tuple[WindowPrediction, ...]:
+    """Return the prediction of each window; an unknown one has no terrain, and the table's fallback."""
+    classes = np.asarray(model.recipe.classes_, dtype=str)
+    best = assessed.probability.argmax(axis=1)
+    sets = class_sets(model, assessed.probability)
+    rows = []
+    for i in range(len(windows)):
+        nearest = str(classes[best[i]])
+        terrain = UNKNOWN if assessed.unknown[i] else nearest
+        targets = table.lookup(terrain)
+        rows.append(
+            WindowPrediction(
+                run_id=str(windows.run_id[i]),
+                start_s=float(windows.start_s[i]),
+                terrain=terrain or NOT_LEARNED,
+                probability=float(assessed.probability[i, best[i]]),
+                target_slip={state: targets[state].slip_ratio for state in DRIVE_STATES},
+                slip_entry=targets["traction"].terrain,
+                status={state: targets[state].status for state in DRIVE_STATES},
+                label=str(windows.terrain[i]) or None,
+                filtered_terrain=str(over_time[i]) or None,
+                nearest=nearest,
+                novelty=None if np.isnan(assessed.novelty[i]) else float(assessed.novelty[i]),
+                supported=None if np.isnan(assessed.supported[i]) else bool(assessed.supported[i]),
+                terrain_set=None if sets is None else sets[i],
+            )
+        )
+    return tuple(rows)
 
 
 def filtered_terrains(windows: Windows, probability: Array, model: TerrainModel) -> Array:

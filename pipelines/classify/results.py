@@ -38,11 +38,16 @@ class WindowPrediction(NamedTuple):
     Parameters
     ----------
     run_id, start_s : of the window
-    terrain, probability : predicted
+    terrain : predicted; ``unknown`` where the window is like none that was learned
+    probability : of ``nearest``
     target_slip, status : by drive state
-    slip_entry : entry of the table of target slips; the fallback where the terrain has none
+    slip_entry : entry of the table of target slips; the fallback where the terrain has none or is unknown
     label : true terrain; None where it is not known
     filtered_terrain : by the windows of the run up to this one; None where none is certain enough
+    nearest : the most probable of the learned terrains
+    novelty : how unlike all of them the window is; None where the model has no such score
+    supported : whether training runs that drove like this support the prediction; None where not counted
+    terrain_set : terrains that hold the true one in 90 % of windows; None where not calibrated
     """
 
     run_id: str
@@ -54,6 +59,10 @@ class WindowPrediction(NamedTuple):
     status: Mapping[str, str]
     label: str | None
     filtered_terrain: str | None = None
+    nearest: str = ""
+    novelty: float | None = None
+    supported: bool | None = None
+    terrain_set: tuple[str, ...] | None = None
 
 
 class TargetSlipRow(NamedTuple):
@@ -73,7 +82,7 @@ class Predictions:
 
     Parameters
     ----------
-    accuracy : over the ``n_judged`` windows whose label the model knows; None where there are none
+    accuracy : of ``nearest`` over the ``n_judged`` windows whose label the model knows; None without any
     training_runs : runs that the model was trained on, whose accuracy does not measure its skill
     repaired : what a repairing reader dropped, as counts by kind
     unknown_labels : windows by labels that the model was not trained on
@@ -81,6 +90,8 @@ class Predictions:
     table : target slips by terrain
     filtered : runs that the live chain filtered, as they had no estimates
     filtered_accuracy : as ``accuracy``, of the terrain filtered over time
+    n_unknown : windows that are like no terrain that was learned
+    n_unsupported : windows whose prediction no training run supports; None where not counted
     """
 
     windows: tuple[WindowPrediction, ...]
@@ -98,6 +109,8 @@ class Predictions:
     table: Mapping[str, TargetSlipRow]
     filtered: tuple[str, ...] = ()
     filtered_accuracy: float | None = None
+    n_unknown: int = 0
+    n_unsupported: int | None = None
     model: str | None = None
     dataset: str | None = None
     skipped: tuple[str, ...] | None = None

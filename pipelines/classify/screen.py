@@ -35,7 +35,7 @@ def print_predictions(result: Predictions, console: Console) -> None:
     console.print(table)
     if len(stretches) > MAX_ROWS:
         console.print(f"... and {len(stretches) - MAX_ROWS} stretches more; --json has every window")
-    without_entry = [row for row in result.windows if row.slip_entry != row.terrain]
+    without_entry = [row for row in result.windows if row.slip_entry != row.terrain == row.nearest]
     if without_entry:
         names = ", ".join(sorted({row.terrain for row in without_entry}))
         entry = without_entry[0].slip_entry
@@ -63,6 +63,13 @@ def _accuracy_lines(result: Predictions) -> Iterator[str]:
             else ""
         )
         yield f"accuracy {percent(result.accuracy)} over {result.n_judged} labelled windows{caution}"
+    if result.n_unknown:
+        yield (
+            f"{result.n_unknown} windows are like no terrain that was learned, as are 5% of those of learned "
+            "ones: unknown, for which the table's fallback stands"
+        )
+    if result.n_unsupported:
+        yield f"{result.n_unsupported} predictions are supported by no training run that drove like this"
     if result.filtered_accuracy is not None:
         yield f"filtered over time {percent(result.filtered_accuracy)}; what stays uncertain counts as wrong"
     if result.filtered:

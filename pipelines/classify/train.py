@@ -11,14 +11,17 @@ from sklearn.base import clone
 
 from pipelines.classify.card import model_card, written
 from pipelines.classify.importance import channel_importance
+from pipelines.classify.limits import limits_of
 from pipelines.classify.results import Training
 from pipelines.classify.settings import TrainSettings
 from pipelines.crossval.crossval import crossval, samples_of
 from pipelines.crossval.evaluation import Examples
-from pipelines.crossval.results import CrossvalReport
+from pipelines.crossval.results import ChannelImportance, CrossvalReport
 from pipelines.crossval.settings import RecipeSettings
-from pipelines.crossval.splits import folds_of
+from pipelines.crossval.splits import Samples, folds_of
 from pipelines.models.champion import scope_of
+from pipelines.models.novelty_file import NOVELTY_FILE, novelty_bytes
+from pipelines.models.recipes import WindowPipeline
 from pipelines.models.results import ModelInfo
 from pipelines.reporting.json_file import as_json
 from pipelines.reporting.progress import Progress, silent
@@ -65,19 +68,13 @@ def train(
     report = report.named(dataset, data_digest(runs))
     samples = samples_of(runs, settings.evaluation)
     windows = samples.cut.windows
-    terrain = windows.terrain.astype(str)
-    recipe = settings.new_recipe()
-    recipe.fit(windows, terrain)
+    recipe = settings.new_recipe().fit(windows, windows.terrain.astype(str))
     progress("fit on all runs", 1, 1)
-    importance = channel_importance(
-        clone(recipe[-1]),
-        Examples(recipe[:-1].transform(windows), terrain, samples.group),
-        list(recipe[0].get_feature_names_out()),
-        folds_of(samples, "grouped", 1, settings.seed),
-        settings.seed,
-        settings.jobs,
-        progress,
+    importance = _importance(recipe, samples, settings, progress)
+    limits = limits_of(
+        recipe[-1], recipe.matrix, windows, samples.group, settings.rule.overlap, settings.seed
     )
+    report = replace(report, notes=(*report.notes, *limits.notes))
     chosen = recipe[-1].best_._asdict()
     metrics = _metrics(report)
     digests = {run.run_id: data_digest([run]) for run in runs}
@@ -85,6 +82,8 @@ def train(
         model_info(runs, settings, windows, dataset, code_commit()),
         evaluation=metrics,
         run_accuracy={digests[k]: each.accuracy for k, each in held_out_runs(samples, report).items()},
+        support=None if limits.support is None else limits.support.as_json(),
+        conformal=limits.conformal,
     )
     standing = standing_of(info, report)
     record = TrainingRecord(
@@ -93,6 +92,7 @@ def train(
         standing_tags(standing, scope_of(info)),
         {"crossval.json": as_json(report), "importance.json": {"channels": as_json(importance)}},
         all_figures(report, importance),
+        {} if limits.novelty is None else {NOVELTY_FILE: novelty_bytes(limits.novelty)},
     )
     card = model_card(settings.name, info, windows, report, chosen)
     registered = log_training(
@@ -113,6 +113,21 @@ def train(
         chosen=chosen,
         importance=importance,
         crossval=report,
+    )
+
+
+def _importance(
+    recipe: WindowPipeline, samples: Samples, settings: TrainSettings, progress: Progress
+) -> tuple[ChannelImportance, ...]:
+    windows = samples.cut.windows
+    return channel_importance(
+        clone(recipe[-1]),
+        Examples(recipe[:-1].transform(windows), windows.terrain.astype(str), samples.group),
+        list(recipe[0].get_feature_names_out()),
+        folds_of(samples, "grouped", 1, settings.seed),
+        settings.seed,
+        settings.jobs,
+        progress,
     )
 
 

@@ -24,7 +24,7 @@ def print_doubtful(result: DoubtfulWindows, console: Console) -> None:
                 row.run_id,
                 time_text(row.start_s),
                 time_text(row.end_s),
-                row.terrain or f"refused: {row.refused}",
+                row.terrain or (f"refused: {row.refused}" if row.refused else "unknown"),
                 format_known(row.probability, "{:.2f}", ""),
                 row.label or "",
             )

@@ -43,9 +43,15 @@ class LeanRecipe:
 
     def predict_proba(self, windows: Windows) -> Array:
         """Return calibrated probabilities (n_windows, k)."""
+        return self.probabilities(windows)
+
+    def probabilities(self, windows: Windows, features: Array | None = None) -> Array:
+        """Return calibrated probabilities (n_windows, k), from features where they are there already."""
+        if features is None and self.numbers.svm is not None:
+            features = self.matrix.of(windows)
         return probabilities(
             self.numbers,
-            None if self.numbers.svm is None else self.matrix.of(windows),
+            features,
             None if self.numbers.network is None else window_samples(self.matrix, windows),
         )
 

@@ -13,10 +13,13 @@ import zipfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from features.windows import Layout, WindowRule
+from features.windows import Layout, WindowRule, cut_windows
 from pipelines.models.lean import NUMBERS_FILE, LeanRecipe, read_numbers
+from pipelines.models.novelty_file import NOVELTY_FILE, read_novelty
 from pipelines.models.results import ModelInfo
 from pipelines.reporting.json_file import as_json
+from terrain.classify.novelty_numbers import NoveltyNumbers
+from terrain.classify.support import SupportTable
 from terrain.errors import ConfigError, DataError, ModelError
 from terrain.files.atomic import atomic_write
 from terrain.files.documents import MAX_JSON_BYTES, parse_json
@@ -80,10 +83,13 @@ class TerrainModel(NamedTuple):
     """A fitted recipe, and how its training windows were cut.
 
     ``recipe`` has ``predict_proba(windows)`` and ``classes_``: the scikit-learn pipeline, or its numbers.
+    ``novelty`` and ``support`` are None of models of earlier releases, and of training runs that give none.
     """
 
     recipe: WindowPipeline | LeanRecipe
     info: ModelInfo
+    novelty: NoveltyNumbers | None = None
+    support: SupportTable | None = None
 
     @property
     def layout(self) -> Layout:
@@ -210,7 +216,31 @@ def _info(folder: Path, document: dict[str, Any]) -> ModelInfo:
 
 
 def _model(recipe: WindowPipeline | LeanRecipe, folder: Path, document: dict[str, Any]) -> TerrainModel:
-    return TerrainModel(recipe, _info(folder, document))
+    info = _info(folder, document)
+    novelty = support = None
+    try:
+        if info.support is not None:
+            support = SupportTable.from_json(info.support, info.classes)
+    except DataError as error:
+        raise _damaged(folder / INFO_FILE, error) from error
+    file = folder / NOVELTY_FILE
+    if NOVELTY_FILE in document.get("files_sha256", {}):
+        try:
+            novelty = read_novelty(
+                read_regular(file, str(file), ModelError, MAX_MODEL_BYTES), len(info.classes)
+            )
+            _check_features(novelty, recipe, info)
+        except DataError as error:
+            raise ModelError(f"{file}: {_words(error)}") from error
+    return TerrainModel(recipe, info, novelty, support)
+
+
+def _check_features(novelty: NoveltyNumbers, recipe: WindowPipeline | LeanRecipe, info: ModelInfo) -> None:
+    """Refuse a novelty score of other features than those of the model."""
+    nothing = cut_windows([], info.rule, layout=info.layout).windows
+    n_features = recipe.matrix.of(nothing).shape[1]
+    if novelty.settings[1] != n_features:
+        raise DataError(f"is of {novelty.settings[1]:.0f} features; the model has {n_features}")
 
 
 def _damaged(info_file: Path, error: Exception) -> ModelError:

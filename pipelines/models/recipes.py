@@ -10,6 +10,7 @@ from sklearn.base import ClassifierMixin
 from sklearn.pipeline import Pipeline
 
 from features.extractor import FeatureExtractor
+from features.matrix import FeatureMatrix
 from features.sample_extractor import SampleExtractor
 from terrain.classify.grouped_network import GroupedNetwork
 from terrain.classify.stack import GroupedStack
@@ -28,6 +29,12 @@ class WindowPipeline(Pipeline):
     The last step makes its inner folds of whole runs; ``cross_validate(recipe, windows, terrain,
     groups=windows.run_id)`` therefore needs no further argument.  ``classifier__groups`` overrides the run.
     """
+
+    @property
+    def matrix(self) -> FeatureMatrix:
+        """What the features are computed from, once fitted."""
+        found: FeatureMatrix = self[0].matrix
+        return found
 
     def fit(self, X: Windows, y: Any = None, **params: Any) -> WindowPipeline:
         """Fit all steps; the last one is given ``groups``, and which columns are samples."""

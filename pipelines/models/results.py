@@ -37,6 +37,8 @@ class ModelInfo:
     evaluation : figures on held-out runs by name, as ``accuracy``; empty where it was not evaluated
     class_ratio : share of each class among the training windows; empty of models of earlier releases
     run_accuracy : of the windows of each training run when it was held out, by its digest
+    support : training runs of each terrain by motion, a :class:`~terrain.classify.support.SupportTable`
+    conformal : threshold of the sets of classes; None, as ``support``, where there is none
     """
 
     classes: tuple[str, ...]
@@ -58,6 +60,8 @@ class ModelInfo:
     evaluation: Mapping[str, float] = field(default_factory=dict)
     class_ratio: Mapping[str, float] = field(default_factory=dict)
     run_accuracy: Mapping[str, float] = field(default_factory=dict)
+    support: Mapping[str, Any] | None = None
+    conformal: float | None = None
 
     @classmethod
     def from_json(cls, document: Mapping[str, Any]) -> Self:
@@ -70,6 +74,8 @@ class ModelInfo:
             },
             "channels": {stream: _texts(names) for stream, names in document["channels"].items()},
         }
+        conformal = document.get("conformal")
+        changed["conformal"] = None if conformal is None else float(conformal)
         for name in ("classes", "run_digests", "signal_sets", "robots"):
             changed[name] = _texts(document.get(name, ()))
         return cls(**{**document, **changed})

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext, redirect_stderr
 from importlib.metadata import version
 from pathlib import Path
-from types import SimpleNamespace
+from types import MappingProxyType, SimpleNamespace
 from typing import TYPE_CHECKING, Any, NamedTuple
 from urllib.parse import urlsplit
 
@@ -46,10 +46,10 @@ class TrainingRecord(NamedTuple):
 
     Parameters
     ----------
-    params, metrics : as MLflow holds them
-    tags : of the registered version, and of the run
+    params, metrics, tags : as MLflow holds them; the tags also of the registered version
     documents : JSON documents by file name
     figures : by name, logged as PNG
+    files : that lie beside the model, by name
     """
 
     params: Mapping[str, Any]
@@ -57,6 +57,7 @@ class TrainingRecord(NamedTuple):
     tags: Mapping[str, str]
     documents: Mapping[str, Any]
     figures: Mapping[str, Figure]
+    files: Mapping[str, bytes] = MappingProxyType({})
 
 
 class Champion(NamedTuple):
@@ -223,7 +224,7 @@ def log_training(
             with mlflow.start_run(run_name=name) as run:
                 tags = {key: getattr(info, key) for key in ("data_digest", "commit", "seed")}
                 _log(mlflow, record.params, record.metrics, tags, record.documents, record.figures)
-                logged = _log_model(mlflow, name, recipe, windows, info, card)
+                logged = _log_model(mlflow, name, recipe, windows, info, card, record.files)
             return _promote(
                 mlflow, name, str(logged.registered_model_version), run.info.run_id, record.tags, judge
             )
@@ -292,6 +293,7 @@ def _log_model(
     windows: Windows,
     info: ModelInfo,
     card: CardWriter | None,
+    files: Mapping[str, bytes],
 ) -> Any:
     from mlflow.models import Model
 
@@ -299,6 +301,8 @@ def _log_model(
         mlflow.sklearn.save_model(recipe, path, mlflow_model=mlflow_model, **options)
         write_numbers(Path(path), recipe)
         write_onnx(Path(path), recipe)
+        for file, content in files.items():
+            (Path(path) / file).write_bytes(content)
         write_info(Path(path), info)
         if card is not None:
             for file, text in card(Path(path)).items():
@@ -325,10 +329,9 @@ def _signature(recipe: WindowPipeline, windows: Windows) -> Any:
     from mlflow.models import ModelSignature
     from mlflow.types import Schema, TensorSpec
 
-    channels = recipe[0].layout_.channels
     inputs = [
         TensorSpec(np.dtype("float64"), (-1, len(names), windows.values[stream].shape[2]), stream)
-        for stream, names in channels.items()
+        for stream, names in recipe.matrix.layout.channels.items()
     ]
     return ModelSignature(Schema(inputs), Schema([TensorSpec(np.dtype("str"), (-1,))]))
 

@@ -48,7 +48,7 @@ class RecordedWindow(NamedTuple):
     start_s, end_s : on the clock of the run
     terrain, probability : class of the largest probability; empty and NaN where the model refused the window
     probabilities : of each class; NaN where it was refused
-    doubtful : the probability is below that from which an output counts, or there is none
+    doubtful : the probability is below that from which an output counts, or no terrain is named
     refused : why; empty where there is an output
     """
 
@@ -73,7 +73,7 @@ def window_entry(output: WindowResult) -> dict[str, Any]:
             str(name): _or_none(float(each))
             for name, each in zip(output.classes, output.probabilities, strict=True)
         },
-        "doubtful": not probability >= SWITCHING.probability_least,
+        "doubtful": not (output.terrain and probability >= SWITCHING.probability_least),
         "refused": str(output.refused),
     }
 

@@ -69,7 +69,8 @@ def window_text(window: ObservedWindow) -> str:
     >>> window_text(ObservedWindow(2.0, 4.0, "grass", 0.83, "", "grass", 0.12, None))
     '4.00 s  grass 83 %  believed grass  target slip 0.120'
     """
-    found = f"refused: {window.refused}" if window.refused else f"{window.terrain} {window.probability:.0%}"
+    named = f"{window.terrain} {window.probability:.0%}" if window.terrain else "unknown"
+    found = f"refused: {window.refused}" if window.refused else named
     return (
         f"{window.end_s:.2f} s  {found.replace('%', ' %')}  believed {window.believed or UNKNOWN}  "
         f"target slip {format_known(window.target_ratio, '{:.3f}')}"

@@ -165,6 +165,9 @@ def observation_content(seen: Observation) -> dict[str, Any]:
             "terrain": window.terrain or None,
             "probabilities": dict(zip(window.classes, window.probabilities.tolist(), strict=True)),
             "refused": window.refused or None,
+            "nearest": window.nearest or None,
+            "novelty": window.novelty,
+            "supported": window.supported,
         },
         "target_slip": {
             state: {

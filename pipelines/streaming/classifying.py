@@ -7,12 +7,14 @@ import threading
 from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from time import perf_counter
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from pipelines.models.assess import assess
 from pipelines.models.model_files import TerrainModel
 from pipelines.streaming.window_feed import Estimate, WindowFeed
+from terrain.control.switching import UNKNOWN
 from terrain.records import Array, Reading, Windows
 
 MAX_WAITING = 1000
@@ -28,11 +30,15 @@ class WindowOutput(NamedTuple):
     Parameters
     ----------
     start_s, end_s : of the window, on the clock of its stamps
-    terrain, probability : class of the largest probability; empty and NaN where the window was refused
+    terrain, probability : class of the largest probability; empty and NaN where the window was refused, empty
+        where it is like no terrain that was learned
     probabilities : (k,) in the order of ``classes``
     classes : of the model
     refused : why there is no output; empty where there is one
     took_s : time of features and classifier
+    nearest : class of the largest probability also where the terrain is unknown
+    novelty : how unlike all learned terrains the window is; NaN where the model has no such score
+    supported : whether training runs that drove like this support the class; None where not counted
     """
 
     start_s: float
@@ -43,6 +49,14 @@ class WindowOutput(NamedTuple):
     classes: tuple[str, ...]
     refused: str = ""
     took_s: float = math.nan
+    nearest: str = ""
+    novelty: float = math.nan
+    supported: bool | None = None
+
+    @property
+    def unknown(self) -> bool:
+        """Whether the window is like no terrain that was learned."""
+        return not self.refused and not self.terrain
 
 
 def classify_window(model: TerrainModel, window: Windows) -> WindowOutput:
@@ -50,9 +64,9 @@ def classify_window(model: TerrainModel, window: Windows) -> WindowOutput:
     classes = model.info.classes
     start_s = float(window.start_s[0])
     started_s, refused = perf_counter(), ""
-    recipe: Any = model.recipe
     try:
-        probabilities = np.asarray(recipe.predict_proba(window)[0])
+        assessed = assess(model, window)
+        probabilities = assessed.probability[0]
         if not np.isfinite(probabilities).all():
             refused = "a probability is not finite"
     except Exception as error:  # whatever broken samples lead a recipe to, it must not stop the loop
@@ -63,8 +77,20 @@ def classify_window(model: TerrainModel, window: Windows) -> WindowOutput:
         nothing = np.full(len(classes), math.nan)
         return WindowOutput(start_s, end_s, "", math.nan, nothing, classes, refused, took_s)
     best = int(probabilities.argmax())
-    found = str(recipe.classes_[best]), float(probabilities[best])
-    return WindowOutput(start_s, end_s, *found, probabilities, classes, "", took_s)
+    nearest, supported = str(model.recipe.classes_[best]), assessed.supported[0]
+    return WindowOutput(
+        start_s,
+        end_s,
+        UNKNOWN if assessed.unknown[0] else nearest,
+        float(probabilities[best]),
+        probabilities,
+        classes,
+        "",
+        took_s,
+        nearest,
+        float(assessed.novelty[0]),
+        None if math.isnan(supported) else bool(supported),
+    )
 
 
 class Part(NamedTuple):

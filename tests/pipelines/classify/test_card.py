@@ -43,7 +43,9 @@ def test_a_trained_model_has_its_card_and_its_figures(model_dir, in_tracked):
     assert document["figures"][0]["interval"] == f"{low:.1%} to {high:.1%}"
     assert document["latency_ms"] > 0
     sizes = {row["name"]: row["n_bytes"] for row in document["files"]}
-    assert sizes == {name: (model_dir / name).stat().st_size for name in ("model.skops", "numbers.npz")}
+    assert sizes == {
+        name: (model_dir / name).stat().st_size for name in ("model.skops", "novelty.npz", "numbers.npz")
+    }
     assert any("robots other than husky" in text.lower() for text in document["limits"])
     text = (model_dir / CARD_FILE).read_text()
     assert text.startswith("# Model card: drawn\n")

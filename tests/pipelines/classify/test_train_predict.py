@@ -49,7 +49,7 @@ def test_new_runs_of_known_terrain_are_predicted(model, drive_all):
     assert document["taught_runs"] == document["training_runs"] == []
     assert result.n_windows == len(result.windows) == result.n_judged == 2 * 3 * 12
     assert result.accuracy > 0.6  # chance is one third
-    right = [row.terrain == row.run_id.rpartition("_")[0] for row in result.windows]
+    right = [row.nearest == row.run_id.rpartition("_")[0] for row in result.windows]
     assert result.accuracy == pytest.approx(np.mean(right))
     starts = [row.start_s for row in result.windows if row.run_id == "GRASS_1"]
     assert starts == pytest.approx(np.arange(0, 24, 2))

@@ -21,7 +21,7 @@ from terrain.logs.replay import replay
 from terrain.records import Reading
 
 Info = namedtuple("Info", "classes")
-Model = namedtuple("Model", "recipe info")
+Model = namedtuple("Model", "recipe info novelty support", defaults=(None, None))
 Window = namedtuple("Window", "start_s length_s")
 
 
