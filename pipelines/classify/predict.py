@@ -13,7 +13,8 @@ from pipelines.models.assess import Assessed, assess, class_sets
 from pipelines.models.model_files import TerrainModel
 from pipelines.runs.datasets import data_digest, robot_of
 from pipelines.streaming.log_windows import lacking_estimates, windows_of_log
-from terrain.classify.terrain_filter import TerrainFilter, check_filter, filter_run, reported
+from pipelines.streaming.over_time import filter_of, novelty_evidence
+from terrain.classify.terrain_filter import filter_run, reported
 from terrain.control.slip_table import DRIVE_STATES, SlipTable
 from terrain.control.switching import UNKNOWN
 from terrain.errors import ConfigError
@@ -65,7 +66,7 @@ def predict(
     assessed = assess(model, windows) if len(windows) else _nothing(len(classes))
     predicted = classes[assessed.probability.argmax(axis=1)]
     label = windows.terrain.astype(str)
-    over_time = filtered_terrains(windows, assessed.probability, model)
+    over_time = filtered_terrains(windows, assessed, model)
     targets = {terrain: table.lookup(terrain) for terrain in classes.tolist()}
     rows = _rows(windows, assessed, over_time, model, table)
     known = np.isin(label, classes)
@@ -128,24 +129,24 @@ def _rows(
     return tuple(rows)
 
 
-def filtered_terrains(windows: Windows, probability: Array, model: TerrainModel) -> Array:
+def filtered_terrains(windows: Windows, assessed: Assessed, model: TerrainModel) -> Array:
     """Return the terrain (n,) by each run's windows up to each; empty where none is certain enough.
 
     Parameters
     ----------
     windows : n, of each run in order of time
-    probability : (n, k) of the model's classes
+    assessed : what the model says of them
     model : whose training gives the class shares; equal ones where it does not know them
     """
     classes = np.asarray(model.recipe.classes_, dtype=str)
-    ratio = model.info.class_ratio
-    prior = tuple(float(ratio.get(name, 1.0 / len(classes))) for name in classes.tolist())
-    settings = check_filter(TerrainFilter(prior))
+    settings = filter_of(model.info)
+    evidence = novelty_evidence(assessed.novelty, assessed.unknown)
     named = np.append(classes, "")  # the last, at -1, is unknown
     found = np.full(len(windows), "", dtype=object)
     for run_id in dict.fromkeys(windows.run_id):
         rows = np.flatnonzero(windows.run_id == run_id)
-        belief = filter_run(probability[rows], windows.start_s[rows] + windows.length_s, settings)
+        end_s = windows.start_s[rows] + windows.length_s
+        belief = filter_run(assessed.probability[rows], end_s, settings, evidence[rows])
         found[rows] = named[reported(belief, settings.threshold)]
     return found
 

@@ -36,3 +36,6 @@ class PredictSettings(Settings):
 
     model: str = setting(..., "models:/NAME@champion, models:/NAME/3, or a model folder.")
     table: Path | None = setting(None, "Table of target slips; the packaged one by default.")
+    filter_stride_s: float | None = setting(
+        None, "From window to window in s, as the filter of a live chain has them (0.25).", "--filter-stride"
+    )

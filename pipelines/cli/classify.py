@@ -105,13 +105,15 @@ def predict_command(source: AlignedRunsSettings, settings: PredictSettings, json
     from pipelines.models.tracking import load_model
     from pipelines.reporting.json_file import write_json
     from pipelines.reporting.terminal import output_console
+    from pipelines.streaming.over_time import filtered
     from terrain.control.slip_table import load_slip_table
     from terrain.robots import load_robot
 
     table = load_slip_table(settings.table)
     runs, skipped = load(source)
     robot = None if source.robot is None else load_robot(source.robot)
-    predicted = predict(runs, load_model(settings.model), table, robot=robot, skip_short=source.repair)
+    model = filtered(load_model(settings.model), settings.filter_stride_s)
+    predicted = predict(runs, model, table, robot=robot, skip_short=source.repair)
     result = replace(predicted, model=settings.model, dataset=source.dataset, skipped=tuple(skipped))
     print_predictions(result, output_console())
     write_json(json_file, result)

@@ -15,6 +15,7 @@ from pipelines.live.state import LiveState, Restorable, restorable, state_of
 from pipelines.models.model_files import TerrainModel
 from pipelines.streaming.classifying import AtOnce, Classifying, Part, WindowOutput
 from pipelines.streaming.estimator import live_estimator
+from pipelines.streaming.over_time import ground_filter, without_dwell
 from pipelines.streaming.window_feed import Estimate, WindowFeed, live_filter, needs_filter
 from terrain.control.slip_table import SlipTable, load_slip_table
 from terrain.control.switching import (
@@ -40,10 +41,11 @@ class TerrainObservation(NamedTuple):
     Parameters
     ----------
     start_s, end_s : of the window, on the clock of the samples
-    terrain, probability : class of the largest probability; empty and NaN where the model refused the window
+    terrain, probability : class of the largest probability; empty and NaN where the model refused the window,
+        empty where the window is like no terrain that was learned
     probabilities : of each class
     target : target slip of that terrain, by drive state
-    refused : why there is no class; empty where there is one
+    refused : why there is no output; empty where there is one, also of a terrain that was never learned
     output : of the model
     """
 
@@ -117,6 +119,7 @@ class TerrainObserver:
         self._latest: Estimate | None = None
         self._speed_mps, self._speed_s, self._now_s = math.inf, -math.inf, math.nan
         self._watch = ClockWatch()
+        self._over_time = ground_filter(model)
         self.belief: TerrainBelief = NO_BELIEF
         self.refused: Counter[str] = Counter()
 
@@ -164,7 +167,7 @@ class TerrainObserver:
         self.table = table
         if not self._feed.suits(model.info):
             self._feed = WindowFeed(model.info, self.channels, self._robot)
-        self.model = model
+        self.model, self._over_time = model, ground_filter(model)
         self._classifying.begin(Part(model, self._feed))
 
     def state(self, now_s: float) -> LiveState:
@@ -213,7 +216,10 @@ class TerrainObserver:
     def _observed(self, output: WindowOutput) -> TerrainObservation:
         if output.refused:
             self.refused[output.refused] += 1
-        else:
+        if self._over_time is not None:
+            settings = without_dwell(self.switching)
+            self.belief = update(self.belief, output.end_s, *self._over_time.take(output), settings)
+        elif not output.refused:
             self.belief = update(
                 self.belief, output.end_s, output.terrain, output.probability, self.switching
             )
@@ -233,6 +239,7 @@ class TerrainObserver:
         self._feed = WindowFeed(self.model.info, self.channels, self._robot)
         self._classifying.begin(Part(self.model, self._feed))
         self.belief = TerrainBelief(self.belief.terrain, self.belief.probability)
+        self._over_time = ground_filter(self.model)
         self._speed_s, self._now_s = -math.inf, math.nan
 
     def _drive_on(self, samples: Mapping[str, Reading], now_s: float) -> None:

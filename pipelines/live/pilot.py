@@ -29,6 +29,7 @@ from pipelines.live.pilot_settings import (
 )
 from pipelines.live.state import LiveState, Restorable, restorable, state_of
 from pipelines.live.terrain_source import NoTerrain, TerrainSource
+from pipelines.streaming.over_time import without_dwell
 from terrain.control.actuation import Actuation
 from terrain.control.path_tracking import (
     PoseEstimate,
@@ -310,16 +311,17 @@ class LivePilot:
             if math.isfinite(roll) and math.isfinite(pitch):
                 now.tilt_rad = roll, pitch
         before, n_refused, now.output = now.belief.terrain, self._source.n_refused, OutputStatus.NONE
+        switching = self._settings.switching
+        if self._source.settled:
+            switching = without_dwell(switching)
         for found in self._source.update(sample, estimates):
             if self._source.certain:
                 now.belief = TerrainBelief(
                     found.terrain, found.probability, found.terrain, found.time_s, found.time_s
                 )
             else:
-                now.belief = update(
-                    now.belief, found.time_s, found.terrain, found.probability, self._settings.switching
-                )
-            now.output = output_status(found.terrain, found.probability, self._settings.switching)
+                now.belief = update(now.belief, found.time_s, found.terrain, found.probability, switching)
+            now.output = output_status(found.terrain, found.probability, switching)
         if self._source.n_refused > n_refused:
             now.output = OutputStatus.REFUSED
         if now.belief.terrain != before:

@@ -8,6 +8,7 @@ from typing import NamedTuple, Protocol
 
 from pipelines.models.model_files import TerrainModel
 from pipelines.streaming.classifying import AtOnce, Classifying, Part, WindowOutput
+from pipelines.streaming.over_time import ground_filter
 from pipelines.streaming.window_feed import WindowFeed, live_filter, needs_filter
 from terrain.errors import DataError
 from terrain.estimation.live.estimate import LiveEstimate
@@ -31,10 +32,16 @@ class TerrainEstimate(NamedTuple):
 class TerrainSource(Protocol):
     """Gives the terrain from time to time.
 
-    ``certain``: each output is accepted at once, and holds until the next.
+    ``certain``: each output is accepted at once, and holds until the next.  ``settled``: it was filtered over
+    time, and waits for no dwell.
     """
 
     certain: bool
+
+    @property
+    def settled(self) -> bool:
+        """Whether outputs were filtered over time."""
+        ...
 
     @property
     def n_refused(self) -> int:
@@ -49,7 +56,7 @@ class TerrainSource(Protocol):
 class NoTerrain:
     """No source: the terrain stays unknown, and the table's fallback is used."""
 
-    certain = False
+    certain = settled = False
     n_refused = 0
 
     def update(self, sample: Sample, estimates: Sequence[LiveEstimate]) -> list[TerrainEstimate]:
@@ -65,7 +72,7 @@ class KnownTerrain:
     name_of : from the true terrain to the one that is given, to be wrong on purpose
     """
 
-    certain = True
+    certain = settled = True
     n_refused = 0
 
     def __init__(self, name_of: Callable[[str], str] = str) -> None:
@@ -110,6 +117,12 @@ class Classifier:
         self._classifying: Classifying = AtOnce() if classifying is None else classifying
         self._classifying.begin(Part(model, self._feed))
         self.failed: Counter[str] = Counter()
+        self._over_time = ground_filter(model)
+
+    @property
+    def settled(self) -> bool:
+        """Whether the model's outputs are filtered over time."""
+        return self._over_time is not None
 
     def feed_of(self, model: TerrainModel) -> WindowFeed:
         """Return what cuts the windows of a model; ``DataError`` where it does not suit the pilot."""
@@ -129,7 +142,7 @@ class Classifier:
         """
         if not self._feed.suits(model.info):
             self._feed = self.feed_of(model)
-        self.model = model
+        self.model, self._over_time = model, ground_filter(model)
         self._classifying.begin(Part(model, self._feed))
 
     @property
@@ -151,6 +164,8 @@ class Classifier:
         for output in self.outputs:
             if output.refused:
                 self.failed[output.refused] += 1
-            else:  # of several that come at once, as after a stall, the newest stands
+            if self._over_time is not None:
+                found = [TerrainEstimate(sample.time_s, *self._over_time.take(output))]
+            elif not output.refused:  # of several that come at once, as after a stall, the newest stands
                 found = [TerrainEstimate(sample.time_s, output.terrain, output.probability)]
         return found

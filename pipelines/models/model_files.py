@@ -20,6 +20,7 @@ from pipelines.models.results import ModelInfo
 from pipelines.reporting.json_file import as_json
 from terrain.classify.novelty_numbers import NoveltyNumbers
 from terrain.classify.support import SupportTable
+from terrain.classify.terrain_filter import TerrainFilter
 from terrain.errors import ConfigError, DataError, ModelError
 from terrain.files.atomic import atomic_write
 from terrain.files.documents import MAX_JSON_BYTES, parse_json
@@ -83,13 +84,15 @@ class TerrainModel(NamedTuple):
     """A fitted recipe, and how its training windows were cut.
 
     ``recipe`` has ``predict_proba(windows)`` and ``classes_``: the scikit-learn pipeline, or its numbers.
-    ``novelty`` and ``support`` are None of models of earlier releases, and of training runs that give none.
+    ``novelty`` and ``support`` are None of models of earlier releases, and of training runs that give none;
+    ``over_time`` is the filter of its outputs, where they are to be filtered.
     """
 
     recipe: WindowPipeline | LeanRecipe
     info: ModelInfo
     novelty: NoveltyNumbers | None = None
     support: SupportTable | None = None
+    over_time: TerrainFilter | None = None
 
     @property
     def layout(self) -> Layout:

@@ -17,6 +17,7 @@ from pipelines.replay.results import ObservedWindow, Replay, ReplayedRun, Replay
 from pipelines.replay.settings import ReplaySettings
 from pipelines.runs.settings import InspectSettings, load
 from pipelines.streaming.classifying import WindowOutput
+from pipelines.streaming.over_time import filtered
 from terrain.control.slip_table import SlipTable, load_slip_table
 from terrain.logs.replay import replay
 from terrain.records import RunLog
@@ -68,7 +69,7 @@ def replay_logs(
         if the log, the model or the table cannot be read, or do not fit each other.
     """
     table = load_slip_table(settings.table)
-    model = _model(settings.model)
+    model = _model(settings.model, settings.filter_stride_s)
     runs, skipped = load(source)
     robot = None if source.robot is None else load_robot(source.robot)
     replayed: list[ReplayedRun] = []
@@ -194,12 +195,12 @@ class _Steps:
         )
 
 
-def _model(uri: str | None) -> TerrainModel | None:
+def _model(uri: str | None, filter_stride_s: float | None) -> TerrainModel | None:
     if uri is None:
         return None
     from pipelines.models.tracking import load_model
 
-    return load_model(uri)
+    return filtered(load_model(uri), filter_stride_s)
 
 
 def _wait(until_s: float, stopped: Callable[[], bool]) -> None:

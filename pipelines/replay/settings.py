@@ -22,6 +22,9 @@ class ReplaySettings(Settings):
         None, "models:/NAME@champion, models:/NAME/3, or a model folder; a robot without a pilot needs one."
     )
     table: Path | None = setting(None, "Table of target slips; the packaged one by default.")
+    filter_stride_s: float | None = setting(
+        None, "Windows so far apart in s (0.25), filtered over time; as trained otherwise.", "--filter-stride"
+    )
     rate_hz: float = setting(50.0, "Steps of the live chain a second.", option="--rate", ge=1.0, le=1000.0)
 
     @property

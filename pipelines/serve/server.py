@@ -9,6 +9,7 @@ import signal
 import socket
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -27,6 +28,7 @@ from pipelines.serve.results import ServiceCheck
 from pipelines.serve.settings import ServeSettings
 from pipelines.sessions.records import Served
 from pipelines.streaming.classifying import AtOnce, classify_window
+from pipelines.streaming.over_time import filtered
 from terrain.control.slip_table import load_slip_table
 from terrain.errors import ConfigError, DataError, TerrainError
 from terrain.estimation.live.estimator import CHANNELS
@@ -55,6 +57,7 @@ class Prepared(NamedTuple):
     listening: socket.socket
     token: str
     url: str
+    load: Callable[[str], TerrainModel]
 
 
 def prepare(settings: ServeSettings) -> Prepared:
@@ -74,8 +77,9 @@ def prepare(settings: ServeSettings) -> Prepared:
             ensure_writable(folder)
             folder.mkdir(parents=True, exist_ok=True)
     listening = _listen(settings.host, settings.port)
+    load = partial(_load, filter_stride_s=settings.filter_stride_s)
     try:
-        model = load_model(settings.model)
+        model = load(settings.model)
         served = Served(1, model, settings.model, table)
         if robot is not None:
             check_fit(model, robot)
@@ -90,7 +94,11 @@ def prepare(settings: ServeSettings) -> Prepared:
         listening.close()
         raise
     host, port = listening.getsockname()[:2]
-    return Prepared(hub, listening, token, f"http://{f'[{host}]' if ':' in host else host}:{port}")
+    return Prepared(hub, listening, token, f"http://{f'[{host}]' if ':' in host else host}:{port}", load)
+
+
+def _load(name: str, filter_stride_s: float | None) -> TerrainModel:
+    return filtered(load_model(name), filter_stride_s)
 
 
 def checked(prepared: Prepared, robot: str | None) -> ServiceCheck:
@@ -125,7 +133,7 @@ class Service:
         self._prepared, hub = prepared, prepared.hub
         loopback = is_loopback(prepared.listening.getsockname()[0])
         config = uvicorn.Config(
-            make_app(hub, prepared.token, load_model, loopback=loopback),
+            make_app(hub, prepared.token, prepared.load, loopback=loopback),
             log_level="critical",
             access_log=False,
             lifespan="off",

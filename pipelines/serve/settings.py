@@ -14,6 +14,9 @@ class ServeSettings(Settings):
 
     model: str = setting(..., "models:/NAME@champion, models:/NAME/3, or a model folder.")
     table: Path | None = setting(None, "Table of target slips; the packaged one by default.")
+    filter_stride_s: float | None = setting(
+        None, "Windows so far apart in s (0.25), filtered over time; as trained otherwise.", "--filter-stride"
+    )
     robot: str | None = setting(
         None, "Robot by name, or its YAML file: its description is used for robots of its name."
     )

@@ -9,6 +9,7 @@ from pipelines.classify.predict import filtered_terrains, predict
 from pipelines.classify.settings import TrainSettings
 from pipelines.classify.train import model_info, train
 from pipelines.crossval.crossval import samples_of
+from pipelines.models.assess import Assessed
 from pipelines.models.model_files import TerrainModel, read_model
 from pipelines.quickstart.settings import QuickstartSettings
 from pipelines.reporting.json_file import as_json, with_deprecated_keys
@@ -243,6 +244,12 @@ def test_quickstart_reuses_its_own_import_and_no_other(drive_all, drive, tmp_pat
     assert sorted(path.name for path in (tmp_path / "out" / "runs").iterdir()) == imported
 
 
+def outputs(probability):
+    """Return outputs without a score of novelty."""
+    nothing = np.full(len(probability), np.nan)
+    return Assessed(probability, nothing, np.zeros(len(probability), dtype=bool), nothing, nothing)
+
+
 def test_the_filtered_terrain_is_that_of_the_windows_so_far(model, drive):
     """Windows of one terrain that follow each other are a run; the run before it does not matter."""
     runs = [drive("a", "GRASS", 21), drive("b", "GRAVEL", 22)]
@@ -257,10 +264,10 @@ def test_the_filtered_terrain_is_that_of_the_windows_so_far(model, drive):
     probability[10] = [0.6, 0.2, 0.2]  # one window alone
     windows = samples_of(runs, TrainSettings(name="drawn").evaluation).cut.windows
     first = windows[windows.run_id == "a"]
-    found = filtered_terrains(first, probability[: len(first)], model)
+    found = filtered_terrains(first, outputs(probability[: len(first)]), model)
     assert set(found.tolist()) == {classes[1]}
     flat = np.tile([model.info.class_ratio[name] for name in classes], (len(first), 1))
-    assert set(filtered_terrains(first, flat, model)) == {""}
+    assert set(filtered_terrains(first, outputs(flat), model)) == {""}
 
 
 def test_a_model_of_an_earlier_release_filters_with_equal_shares(model, drive):

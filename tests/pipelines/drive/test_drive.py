@@ -128,7 +128,7 @@ def test_the_steepest_grade_is_found():
 class Scripted:
     """A source that gives one output every 2 s, and refuses a window in between."""
 
-    certain = False
+    certain = settled = False
 
     def __init__(self, terrain, probability):
         self.output, self.n_refused, self.next_s = (terrain, probability), 0, 2.0
