@@ -180,9 +180,15 @@ def speed_features(
         columns.append(np.log10(effort + _LOG_FLOOR))
 
     for stream, names in channels.items():
-        for i in rows_of(names, "gyro") + rows_of(names, "accel"):
-            if signal_set_of(stream, names[i]) != "imu":
-                continue
+        rows = [
+            i
+            for i in rows_of(names, "gyro") + rows_of(names, "accel")
+            if signal_set_of(stream, names[i]) == "imu"
+        ]
+        if rows:
+            std = values[stream][:, rows].std(axis=2) + _LOG_FLOOR
+            columns += list(np.log10(std / fastest_mps[:, None]).T)
+        for i in rows:
             unit = UNIT_SYMBOLS[unit_of(names[i])]
             features.append(
                 Feature(
@@ -191,7 +197,6 @@ def speed_features(
                     frozenset({"imu", "wheels"}),
                 )
             )
-            columns.append(np.log10((values[stream][:, i].std(axis=1) + _LOG_FLOOR) / fastest_mps))
 
     sides = left_right(wheel_channels, "speed")
     yaw_stream = next((stream for stream, names in channels.items() if "gyro_z_radps" in names), None)

@@ -9,7 +9,7 @@ import numpy as np
 from features.matrix import FeatureMatrix
 from features.motion import NO_MOTION, window_motion
 from pipelines.support.evaluate import table_of
-from terrain.classify.conformal import conformal_threshold
+from terrain.classify.conformal import conformal_threshold, held_out_scores
 from terrain.classify.novelty import NoveltyScore
 from terrain.classify.novelty_numbers import NoveltyNumbers
 from terrain.classify.support import SupportTable
@@ -56,9 +56,3 @@ def limits_of(
     else:
         support = table_of(motion, terrain, windows.run_id.astype(str), np.unique(terrain).tolist())
     return Limits(novelty, support, conformal, tuple(notes))
-
-
-def held_out_scores(classifier: Any, terrain: Array) -> Array:
-    """Return ``1 - p`` of the true class (n,) of each row when its run was held out; NaN where it was not."""
-    truth = np.searchsorted(classifier.classes_, terrain)
-    return np.asarray(1.0 - classifier.inner_probability_[np.arange(len(terrain)), truth])

@@ -14,7 +14,7 @@ from features.motion import NO_MOTION, window_motion
 from pipelines.courses.following import following
 from pipelines.courses.judgement import find_breakaways, judge
 from pipelines.courses.results import OverTime
-from pipelines.crossval.evaluation import Examples, HeldOut, fit_folds, pool, summarise
+from pipelines.crossval.evaluation import Examples, HeldOut, fit_folds, pool, sets_of, summarise
 from pipelines.crossval.extras import (
     examples_of,
     fold_accuracy,
@@ -96,6 +96,7 @@ def crossval(
         report = replace(report, notes=(speed.note, *report.notes))
     if settings.protocol != "published":
         report = _with_support(report, held_out, windows, settings.seed)
+        report = replace(report, conformal=sets_of(held_out, samples, settings.seed))
     if settings.protocol == "leave-terrain-out":
         unknown = leave_terrain_out(checks.examples, samples, settings.seed, settings.jobs, progress)
         report = replace(report, unknown=unknown)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -14,6 +15,13 @@ from pipelines.crossval.results import Figures, FoldFigures
 from pipelines.crossval.splits import Fold, Samples
 from pipelines.reporting.progress import Progress, silent
 from terrain.classify.confidence import confidence_figures
+from terrain.classify.conformal import (
+    ConformalFigures,
+    conformal_figures,
+    conformal_sets,
+    conformal_threshold,
+    held_out_scores,
+)
 from terrain.classify.metrics import (
     class_figures,
     macro_run_accuracy,
@@ -23,6 +31,7 @@ from terrain.classify.metrics import (
     vote,
     vote_sizes,
 )
+from terrain.errors import DataError
 from terrain.records import Array
 
 
@@ -42,12 +51,16 @@ class Examples(NamedTuple):
 
 
 class FoldResult(NamedTuple):
-    """Held-out class probabilities of one fold, and what else was asked of its classifier."""
+    """Held-out class probabilities of one fold, and what else was asked of its classifier.
+
+    ``conformal`` is the threshold of its sets of classes; NaN where its training part does not give one.
+    """
 
     fold: Fold
     probability: Array
     chosen: Mapping[str, Any]
     found: Any = None
+    conformal: float = math.nan
 
 
 class HeldOut(NamedTuple):
@@ -73,7 +86,19 @@ def _fit_fold(
     )
     best = getattr(fitted, "best_", None)
     chosen = dict(best._asdict()) if best is not None else {}
-    return FoldResult(fold, probability, chosen, None if ask is None else ask(fitted))
+    found = None if ask is None else ask(fitted)
+    return FoldResult(fold, probability, chosen, found, _threshold(fitted, examples, fold.train))
+
+
+def _threshold(fitted: Any, examples: Examples, rows: Array) -> float:
+    """Return the threshold of the sets of classes of a classifier that was fitted on some rows."""
+    if not hasattr(fitted, "inner_probability_"):
+        return math.nan
+    try:
+        scores = held_out_scores(fitted, examples.terrain[rows])
+        return conformal_threshold(scores, np.asarray(examples.group)[rows].astype(str))
+    except DataError:
+        return math.nan
 
 
 def fit_on(classifier: BaseEstimator, examples: Examples, rows: Array) -> Any:
@@ -122,6 +147,22 @@ def pool(results: Sequence[FoldResult], terrain: Array) -> HeldOut:
         probability[result.fold.repeat, result.fold.test] = result.probability
         fold_number[result.fold.repeat, result.fold.test] = result.fold.number
     return HeldOut(classes, probability, fold_number, list(results))
+
+
+def sets_of(held_out: HeldOut, samples: Samples, seed: int) -> ConformalFigures | None:
+    """Return the figures of the sets of classes; None where a fold has no threshold."""
+    if any(math.isnan(result.conformal) for result in held_out.results):
+        return None
+    held_out, samples = _tested(held_out, samples)
+    windows = samples.cut.windows
+    terrain = windows.terrain.astype(str)
+    member = np.zeros(held_out.probability.shape, dtype=bool)
+    for result in held_out.results:
+        repeat, test = result.fold.repeat, result.fold.test
+        member[repeat, test] = conformal_sets(held_out.probability[repeat, test], result.conformal)
+    run_id = runs_by_terrain(windows.run_id.astype(str), terrain)
+    truth = np.searchsorted(held_out.classes, terrain)
+    return conformal_figures(member, truth, run_id, terrain, np.random.default_rng(seed))
 
 
 def _tested(held_out: HeldOut, samples: Samples) -> tuple[HeldOut, Samples]:

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 from pipelines.courses.results import OverTime
 from pipelines.support.results import SupportReport
 from terrain.classify.confidence import CoverageFigures, ReliabilityBin
+from terrain.classify.conformal import ConformalFigures
 from terrain.classify.metrics import ClassFigures, RunFigures
 
 
@@ -228,8 +229,8 @@ class CrossvalReport(Figures):
     """A cross-validation: its figures, how they were obtained, and what a reader has to know of them.
 
     ``extras`` and ``unknown`` are None where they were not asked for, ``support`` where the motion of
-    the robot is not known or a run trains and tests, ``dataset``, ``data_digest`` and ``skipped`` where the
-    caller did not give them.
+    the robot is not known or a run trains and tests, ``conformal`` where a run does or there are too few,
+    ``dataset``, ``data_digest`` and ``skipped`` where the caller did not give them.
     """
 
     protocol: str
@@ -246,6 +247,7 @@ class CrossvalReport(Figures):
     extras: Extras | None = None
     unknown: UnknownTerrain | None = None
     support: SupportReport | None = None
+    conformal: ConformalFigures | None = None
     dataset: str | None = None
     data_digest: str | None = None
     skipped: tuple[str, ...] | None = None
@@ -256,12 +258,13 @@ class CrossvalReport(Figures):
 
     def as_json(self) -> dict[str, Any]:
         """Return all fields, the extras among them, without those that are not there."""
-        apart = ("extras", "unknown", "support")
+        apart = ("extras", "unknown", "support", "conformal")
         found = {each.name: getattr(self, each.name) for each in fields(self) if each.name not in apart}
         unknown = [name for name in ("dataset", "data_digest", "skipped") if found[name] is None]
         extras = {} if self.extras is None else self.extras.as_json()
         extras |= {} if self.unknown is None else self.unknown._asdict()
         extras |= {} if self.support is None else self.support.as_json()
+        extras |= {} if self.conformal is None else {"conformal": self.conformal._asdict()}
         return {name: value for name, value in (found | extras).items() if name not in unknown}
 
 

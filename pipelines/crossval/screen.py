@@ -19,6 +19,7 @@ from pipelines.crossval.results import (
 from pipelines.reporting.numbers import percent
 from pipelines.reporting.terminal import print_lines
 from pipelines.support.screen import support_lines
+from terrain.classify.conformal import ConformalFigures
 
 
 def print_crossval(report: CrossvalReport, console: Console) -> None:
@@ -46,6 +47,8 @@ def print_crossval(report: CrossvalReport, console: Console) -> None:
     console.print(table)
     if report.unknown is not None:
         print_lines(console, _unknown_lines(report.unknown))
+    if report.conformal is not None:
+        print_lines(console, [_sets_line(report.conformal)])
     if report.support is not None:
         print_lines(console, support_lines(report.support))
     if report.extras is not None:
@@ -63,6 +66,15 @@ def _confidence_line(report: CrossvalReport) -> str:
         for row in report.accuracy_at_coverage
     )
     return f"from confidence to correctness: {ranked}; {most_confident}; calibration error {report.ece:.3f}"
+
+
+def _sets_line(found: ConformalFigures) -> str:
+    low, high = found.coverage_ci
+    return (
+        f"sets of terrains at {found.level:.0%}: hold the true one in {percent(found.coverage)} of windows "
+        f"({low:.1%} to {high:.1%}), in the worst run in {percent(found.coverage_worst_run)}; "
+        f"{found.set_size:.2f} terrains a set, one alone in {percent(found.single_ratio)}"
+    )
 
 
 def _unknown_lines(found: UnknownTerrain) -> Iterator[str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from pipelines.crossval.crossval import report_of
-from pipelines.crossval.evaluation import fit_folds, pool, summarise
+from pipelines.crossval.evaluation import fit_folds, pool, sets_of, summarise
 from pipelines.crossval.extras import examples_of
 from pipelines.crossval.results import CrossvalReport
 from pipelines.crossval.settings import SPEED_PROTOCOLS, CrossvalSettings
@@ -43,6 +43,8 @@ def crossval_store(
     examples = examples_of(features, samples)
     classifier = settings.new_recipe()[-1]
     results = fit_folds(classifier, examples, folds, settings.jobs, settings.protocol, progress)
-    figures = summarise(pool(results, examples.terrain), samples, settings.seed)
+    held_out = pool(results, examples.terrain)
+    figures = summarise(held_out, samples, settings.seed)
     report = report_of(figures, samples, settings, features.shape[1], store.repaired, None)
+    report = replace(report, conformal=sets_of(held_out, samples, settings.seed))
     return replace(report, notes=(*report.notes, NO_SUPPORT, *((NO_EXTRAS,) if settings.extras else ())))

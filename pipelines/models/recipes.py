@@ -85,7 +85,7 @@ def make_recipe(
 
 def inform(recipe: WindowPipeline, fitted: Any) -> None:
     """Pass on to the last step which columns of the matrix are samples, where it asks for them."""
-    if "columns" in recipe[-1].get_params():
+    if hasattr(recipe[-1], "columns"):
         recipe[-1].set_params(columns=getattr(fitted, "columns_", ()))
 
 

@@ -43,6 +43,7 @@ class NoveltyNumbers(NamedTuple):
     prototypes : (s, at most 10) training windows in the leading components
     vectors, weights, offsets : (v, m), (v, p) and (p,) of the pairs' margins
         ``f = sum_i w_i exp(-gamma / m |x - v_i|^2) + c``, positive for the first class of a pair
+    squares : (v,) squared lengths of the vectors
     reference : (n, 3) ascending terms of held-out known windows
     settings : (4,) clip in standard deviations, number of features before selection, gamma, threshold of the
         score
@@ -61,6 +62,7 @@ class NoveltyNumbers(NamedTuple):
     vectors: Array
     weights: Array
     offsets: Array
+    squares: Array
     reference: Array
     settings: Array
 
@@ -87,7 +89,7 @@ def check_novelty(numbers: NoveltyNumbers, n_classes: int) -> None:
     near, v, p = min(q, N_NEAR), len(numbers.vectors), n_classes * (n_classes - 1) // 2
     shapes = (
         (m,), (m,), (m,), (m,), (q, m), (q, q), (q, q), (n_classes, q), (q,), (s, near),
-        (v, m), (v, p), (p,), (n, N_TERMS), (4,)
+        (v, m), (v, p), (p,), (v,), (n, N_TERMS), (4,)
     )  # fmt: skip
     for name, array, shape in zip(numbers._fields, numbers, shapes, strict=True):
         kind = "iu" if name == "columns" else "f"
@@ -125,9 +127,7 @@ def novelty_terms(numbers: NoveltyNumbers, features: Array) -> Array:
     scaled = np.clip((used - numbers.mean) / numbers.scale, -clip, clip)
     components = scaled @ numbers.components.T
     terms = np.empty((len(features), N_TERMS))
-    margins = pair_margins(
-        numbers.vectors, numbers.weights, numbers.offsets, gamma / len(numbers.columns), scaled
-    )
+    margins = pair_margins(numbers, gamma / len(numbers.columns), scaled)
     terms[:, 0] = -largest_margin(margins, len(numbers.means))
     terms[:, 1] = _least_squares(components @ numbers.within.T, numbers.means)
     terms[:, 1] -= np.square(components @ numbers.background.T - numbers.centre).sum(axis=1)
@@ -187,12 +187,9 @@ def _least_squares(rows: Array, points: Array) -> Array:
     return found
 
 
-def pair_margins(vectors: Array, weights: Array, offsets: Array, gamma: float, rows: Array) -> Array:
+def pair_margins(numbers: NoveltyNumbers, gamma: float, rows: Array) -> Array:
     """Return the margin (n, p) of each pair of classes of each row (n, m)."""
-    squares = (
-        np.square(rows).sum(axis=1)[:, np.newaxis]
-        + np.einsum("ij,ij->i", vectors, vectors)
-        - 2.0 * rows @ vectors.T
-    )
-    found: Array = np.exp(-gamma * np.maximum(squares, 0.0)) @ weights + offsets
+    products = rows.astype(numbers.vectors.dtype) @ numbers.vectors.T
+    squares = np.square(rows).sum(axis=1)[:, np.newaxis] + numbers.squares - 2.0 * products
+    found: Array = np.exp(-gamma * np.maximum(squares, 0.0)) @ numbers.weights + numbers.offsets
     return found

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from features.windows import cut_windows
-from pipelines.classify.limits import held_out_scores, limits_of
+from pipelines.classify.limits import limits_of
 from pipelines.classify.predict import NOT_LEARNED, predict
 from pipelines.live.observer import TerrainObserver
 from pipelines.models.assess import assess, class_sets
@@ -17,6 +17,7 @@ from pipelines.models.novelty_file import NOVELTY_FILE
 from pipelines.reporting.json_file import as_json
 from pipelines.streaming.classifying import classify_window
 from pipelines.streaming.over_time import filtered, novelty_evidence
+from terrain.classify.conformal import held_out_scores
 from terrain.control.slip_table import load_slip_table
 from terrain.errors import ConfigError, ModelError
 from terrain.logs.replay import replay
@@ -144,7 +145,7 @@ def test_a_model_without_limits_names_every_window(model, strange):
     assert row.terrain == row.nearest
 
 
-def test_both_ways_of_reading_a_model_assess_alike(tracked, runs):
+def test_a_model_read_whole_and_lean_assesses_alike(tracked, runs):
     whole, lean = (read(tracked[0] / "model") for read in (read_model, read_lean_model))
     windows = cut_windows(runs[:2], whole.rule, layout=whole.layout).windows
     one, two = assess(whole, windows), assess(lean, windows)

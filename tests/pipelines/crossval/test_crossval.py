@@ -51,6 +51,7 @@ PROMISED = {
     "supported",
     "supported_auc",
     "next_drives",
+    "conformal",
 }
 
 

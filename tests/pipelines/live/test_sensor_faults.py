@@ -146,7 +146,7 @@ def test_lost_wheels_are_named_and_nothing_winds_up_meanwhile(situation):
 class LowProbability:
     """A classifier whose probability never suffices."""
 
-    certain, n_refused = False, 0
+    certain, settled, n_refused = False, False, 0
 
     def __init__(self, probability):
         self.probability, self.last_s = probability, 0.0

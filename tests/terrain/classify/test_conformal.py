@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from terrain.classify.conformal import conformal_sets, conformal_threshold
+from terrain.classify.conformal import conformal_figures, conformal_sets, conformal_threshold
 from terrain.errors import DataError
 
 
@@ -47,3 +47,19 @@ def test_few_runs_and_no_scores():
     assert conformal_threshold(np.append(np.zeros(20), np.nan), np.arange(21), 0.9) == 0.0
     with pytest.raises(DataError, match="no held-out window"):
         conformal_threshold(np.full(3, np.nan), np.arange(3))
+
+
+def test_figures_count_windows_runs_and_sizes():
+    rng = np.random.default_rng(0)
+    member = rng.random((3, 40, 4)) < 0.5
+    truth = rng.integers(4, size=40)
+    run = np.repeat(np.arange(8), 5).astype(str)
+    found = conformal_figures(member, truth, run, np.array(["ice"] * 40), np.random.default_rng(0))
+    held = member[:, np.arange(40), truth]
+    of_run = [held[:, run == r].mean() for r in np.unique(run)]
+    assert found.coverage == pytest.approx(held.mean())
+    assert found.coverage_per_run == pytest.approx(np.mean(of_run))
+    assert found.coverage_worst_run == pytest.approx(min(of_run))
+    assert found.set_size == pytest.approx(member.sum() / 120)
+    assert found.single_ratio == pytest.approx((member.sum(axis=2) == 1).mean())
+    assert found.coverage_ci[0] < found.coverage < found.coverage_ci[1]
