@@ -15,6 +15,7 @@ import numpy as np
 
 from pipelines.crossval.extras import run_speeds
 from pipelines.crossval.results import CrossvalReport
+from pipelines.models.assess import assess
 from pipelines.models.champion import scope_of
 from pipelines.models.model_files import read_lean_model
 from pipelines.models.onnx_file import ONNX_FILE, time_of_onnx
@@ -283,12 +284,12 @@ def written(card: ModelCard, folder: Path, window: Windows) -> ModelCard:
     folder : of its files
     window : a single one
     """
-    recipe = read_lean_model(folder).recipe
-    recipe.predict_proba(window)  # compiles and fills caches
+    model = read_lean_model(folder)
+    assess(model, window)  # compiles and fills caches
     times_s = np.empty(N_TIMED)
     for number in range(N_TIMED):
         began_s = time.perf_counter()
-        recipe.predict_proba(window)
+        assess(model, window)
         times_s[number] = time.perf_counter() - began_s
     sizes = tuple(
         FileRow(path.relative_to(folder).as_posix(), path.stat().st_size)

@@ -31,6 +31,12 @@ class TrainSettings(RecipeSettings):
         return CrossvalSettings(**self.shared(), extras=False)
 
 
+class ModelSettings(Settings):
+    """Whose card is printed."""
+
+    model: str = setting(..., "models:/NAME@champion, models:/NAME/3, or a model folder.", option="MODEL")
+
+
 class PredictSettings(Settings):
     """Which model predicts, and which table gives the target slips."""
 

@@ -1,10 +1,10 @@
-"""Commands of terrain classification: crossval, compare, train, predict."""
+"""Commands of terrain classification: crossval, compare, train, model, predict."""
 
 from __future__ import annotations
 
 import typer
 
-from pipelines.classify.settings import PredictSettings, TrainSettings
+from pipelines.classify.settings import ModelSettings, PredictSettings, TrainSettings
 from pipelines.cli.command import Json, command
 from pipelines.compare.settings import CompareSettings
 from pipelines.compute.settings import ComputeSettings
@@ -93,6 +93,18 @@ def train_command(
     print_crossval(replace(result.crossval, skipped=result.skipped), output_console())
     print_training(result, output_console())
     write_json(json_file, result)
+
+
+@command(app, "model")
+def model_command(settings: ModelSettings, json_file: Json = None) -> None:
+    """Print the card of a model: training runs, figures, limits, size and time."""
+    from pipelines.classify.show import model_statement, print_model
+    from pipelines.reporting.json_file import write_json
+    from pipelines.reporting.terminal import output_console
+
+    found = model_statement(settings.model)
+    print_model(found, output_console())
+    write_json(json_file, found)
 
 
 @command(app, "predict")

@@ -227,13 +227,18 @@ def _refuse_constant(windows: Windows) -> None:
         raise DataError(f"no channel of the streams {streams} ever varies: nothing can be learned from them")
 
 
-def notes(samples: Samples, settings: CrossvalSettings, repaired: Mapping[str, int]) -> list[str]:
-    """Return in sentences what a reader of the figures must know."""
-    sentences = [
+def merge_notes(merged: Sequence[Sequence[str]]) -> list[str]:
+    """Return in a sentence each what groups of runs were taken for one run."""
+    return [
         f"runs {', '.join(group)} hold the same measurements: they are one run, in which each stretch "
         "counts once"
-        for group in samples.merged
+        for group in merged
     ]
+
+
+def notes(samples: Samples, settings: CrossvalSettings, repaired: Mapping[str, int]) -> list[str]:
+    """Return in sentences what a reader of the figures must know."""
+    sentences = merge_notes(samples.merged)
     windows = samples.cut.windows
     alone = single_run_classes(windows.terrain.astype(str), windows.run_id.astype(str))
     if alone and settings.protocol != "published":

@@ -5,11 +5,12 @@ from __future__ import annotations
 import shlex
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from pipelines.crossval.crossval import crossval
+from pipelines.crossval.crossval import crossval, merge_notes
 from pipelines.crossval.settings import CrossvalSettings
 from pipelines.estimate.consistency import TerrainConsistency
 from pipelines.estimate.labelled import TerrainSlip
@@ -18,6 +19,7 @@ from pipelines.quickstart.results import KeptRuns, QuickstartResult
 from pipelines.quickstart.settings import QuickstartSettings
 from pipelines.reporting.progress import Progress, silent
 from pipelines.runs.datasets import data_digest, load_runs
+from pipelines.runs.duplicates import distinct_runs
 from pipelines.runs.import_logs import import_logs
 from pipelines.runs.settings import ImportSettings
 from terrain.errors import DataError
@@ -76,9 +78,12 @@ def quickstart(
         else _Source(load_runs(data), None, None, {})
     )
     _refuse_other_runs(runs, data, out / "runs")
+    distinct = distinct_runs(runs, merge=settings.merge_duplicates)
+    runs = distinct.runs
     dataset = SIMULATED if data is None else data.resolve().name
     training, held_out = divide(runs)
     report = crossval(training, evaluation, progress).named(dataset, data_digest(training))
+    report = replace(report, notes=(*merge_notes(distinct.merged), *report.notes))
     imported = _keep(runs, data, out / "runs", progress)
     trained = train(training, settings.training(evaluation), dataset, progress, evaluation=report)
     model_uri = trained.registered.model_uri

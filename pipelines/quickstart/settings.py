@@ -18,6 +18,10 @@ class QuickstartSettings(Settings):
     seed: int = setting(0, "Deals runs into folds; of the simulation, too.", ge=0)
     n_jobs: int = setting(0, "Processes at once; 0 for one a core.", "--jobs", ge=0)
 
+    merge_duplicates: bool = setting(
+        False, "Treat runs that hold the same measurements as one run instead of refusing them."
+    )
+
     @property
     def evaluation(self) -> CrossvalSettings:
         """How the recipe is evaluated: by the defaults of ``terrain crossval``."""

@@ -1,5 +1,6 @@
 """What quickstart predicts is held out for real, and its page says so."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -9,7 +10,7 @@ from pipelines.quickstart.holding_out import divide
 from pipelines.quickstart.settings import QuickstartSettings
 from pipelines.runs.datasets import data_digest
 from pipelines.runs.settings import AlignedRunsSettings, load
-from terrain.errors import ConfigError
+from terrain.errors import ConfigError, DataError
 from terrain.logs.write import write_run
 
 
@@ -36,6 +37,21 @@ def test_the_runs_that_are_predicted_took_no_part(in_tracked, drive_all, setting
     assert "the model was neither trained nor evaluated on ASPHALT_3" in page
     loaded = load(AlignedRunsSettings(data=tmp_path / "data", without="ASPHALT_3")).runs
     assert data_digest(loaded) == result.data_digest
+
+
+def test_copies_of_runs_are_refused_or_merged(in_tracked, drive_all, settings, tmp_path, monkeypatch):
+    from pipelines.quickstart.quickstart import quickstart
+
+    monkeypatch.setattr("pipelines.crossval.extras.CURVE_RUNS", (1,))
+    runs = drive_all(n_runs=3, duration_s=16.0)
+    for run in [*runs, replace(runs[0], run_id="copy")]:
+        write_run(run, tmp_path / "data")
+    asked = QuickstartSettings(data=tmp_path / "data", out=tmp_path / "out", name="copied")
+    with pytest.raises(DataError, match="--merge-duplicates"):
+        quickstart(asked, evaluation=settings())
+    result = quickstart(asked.with_(merge_duplicates=True), evaluation=settings())
+    assert result.crossval.notes[0].startswith("runs ASPHALT_1, copy hold the same measurements")
+    assert result.crossval.n_runs + len(result.held_out) == 9
 
 
 @pytest.mark.parametrize(
