@@ -32,6 +32,15 @@ class SoakSettings(Settings):
     out: Path | None = setting(None, "Folder of the service's states; a temporary one by default.")
 
 
+class LabelsSettings(Settings):
+    """On which runs label strategies are compared."""
+
+    data: Path = setting(..., "Folder of labelled runs.")
+    repeats: int = setting(5, "Fold assignments.", ge=1)
+    seed: int = setting(0, "Deals runs into folds, and draws the first labels.", ge=0)
+    n_jobs: int = setting(0, "Processes at once; 0 for one a core.", "--jobs", ge=0)
+
+
 class FleetSettings(Settings):
     """How many runs are generated, and how many processes compute their features."""
 

@@ -1,10 +1,10 @@
-"""The commands that measure: bench live and soak the live chain and the service, bench fleet many runs."""
+"""The commands that measure: bench live, soak (chain, service), fleet (many runs), labels (questions)."""
 
 from __future__ import annotations
 
 import typer
 
-from pipelines.bench.settings import BenchSettings, FleetSettings, SoakSettings
+from pipelines.bench.settings import BenchSettings, FleetSettings, LabelsSettings, SoakSettings
 from pipelines.cli.command import Json, command
 
 app = typer.Typer(
@@ -53,4 +53,22 @@ def fleet_command(settings: FleetSettings, json_file: Json = None) -> None:
     with progress_bar() as progress:
         result = bench_fleet(settings, progress)
     print_fleet(result, output_console())
+    write_json(json_file, result)
+
+
+@command(app, "labels")
+def labels_command(settings: LabelsSettings, json_file: Json = None) -> None:
+    """Measure what chosen questions and self-training gain on held-out runs, from few labels."""
+    from pipelines.crossval.settings import CrossvalSettings
+    from pipelines.propose.screen import print_study
+    from pipelines.propose.study import label_study
+    from pipelines.reporting.json_file import write_json
+    from pipelines.reporting.terminal import output_console, progress_bar
+
+    evaluation = CrossvalSettings(
+        repeats=settings.repeats, seed=settings.seed, n_jobs=settings.n_jobs, extras=False
+    )
+    with progress_bar() as progress:
+        result = label_study(settings.data, evaluation, progress)
+    print_study(result, output_console())
     write_json(json_file, result)

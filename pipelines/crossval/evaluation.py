@@ -15,13 +15,8 @@ from pipelines.crossval.results import Figures, FoldFigures
 from pipelines.crossval.splits import Fold, Samples
 from pipelines.reporting.progress import Progress, silent
 from terrain.classify.confidence import confidence_figures
-from terrain.classify.conformal import (
-    ConformalFigures,
-    conformal_figures,
-    conformal_sets,
-    conformal_threshold,
-    held_out_scores,
-)
+from terrain.classify.conformal import conformal_sets, conformal_threshold, held_out_scores
+from terrain.classify.conformal_figures import ConformalFigures, conformal_figures
 from terrain.classify.metrics import (
     class_figures,
     macro_run_accuracy,

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 from pipelines.courses.results import OverTime
 from pipelines.support.results import SupportReport
 from terrain.classify.confidence import CoverageFigures, ReliabilityBin
-from terrain.classify.conformal import ConformalFigures
+from terrain.classify.conformal_figures import ConformalFigures
 from terrain.classify.metrics import ClassFigures, RunFigures
 
 

@@ -19,7 +19,7 @@ from pipelines.crossval.results import (
 from pipelines.reporting.numbers import percent
 from pipelines.reporting.terminal import print_lines
 from pipelines.support.screen import support_lines
-from terrain.classify.conformal import ConformalFigures
+from terrain.classify.conformal_figures import ConformalFigures
 
 
 def print_crossval(report: CrossvalReport, console: Console) -> None:

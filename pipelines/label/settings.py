@@ -23,6 +23,13 @@ class LabelSettings(Settings):
     whole: bool = setting(False, "Label the whole run.", option="--all")
     terrain: str | None = setting(None, "Terrain that the label names; an empty one removes labels.")
     remove: bool = setting(False, "Remove labels in place of setting one.")
+    model: str | None = setting(None, "Model that proposes labels of the runs: as of train, or a folder.")
+    ask: int = setting(10, "Questions, the stretches most worth an answer.", ge=0)
+    proposals: Path = setting(Path("proposals.csv"), "Table of the proposals, to be answered.")
+    answers: Path | None = setting(None, "Table with answers: a terrain, 'yes', or 'none'.")
+    out: Path | None = setting(None, "New folder of the runs with their labels.")
+    accept: float = setting(0.9, "Confidence from which a proposal needs no answer.", ge=0.0, le=1.01)
+    new_class: bool = setting(False, "Accept answers with terrains that are not known yet.")
 
     @property
     def sets(self) -> bool:
@@ -33,6 +40,14 @@ class LabelSettings(Settings):
     def new_terrain(self) -> str:
         """Terrain of the label; empty where labels are removed."""
         return "" if self.remove else (self.terrain or "")
+
+    @model_validator(mode="after")
+    def _check_proposals(self) -> Self:
+        if self.model is not None and (self.answers is not None or self.sets):
+            raise ConfigError("--model proposes labels: leave out --answers, --terrain and --remove")
+        if (self.answers is None) != (self.out is None):
+            raise ConfigError("--answers FILE sets labels in the new folder --out DIR: give both")
+        return self
 
     @model_validator(mode="after")
     def _check(self) -> Self:

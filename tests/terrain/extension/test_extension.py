@@ -265,7 +265,7 @@ EDGES = {
     "terrain/estimation/estimate.py",
     "pipelines/estimate/estimate.py",
     "terrain/slip_learning/learn.py",
-    "pipelines/live/observer.py",
+    "pipelines/streaming/estimator.py",
     "pipelines/live/terrain_source.py",
     "pipelines/live/pilot.py",
 }

@@ -1,0 +1,180 @@
+"""What questions and self-training are worth: few labels, and runs that the model never saw to judge it.
+
+In each fold of whole runs the training part is one labelled run of each terrain and a pool without labels.
+As many pool runs as there are terrains are labelled: chosen by the model's doubt, or at random.  With
+self-training, pool runs that the model is certain of are labelled by it, and it is fitted again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from sklearn.base import clone
+
+from features.motion import Motion, window_motion
+from pipelines.compute.parallel import parallel
+from pipelines.crossval.crossval import samples_of
+from pipelines.crossval.evaluation import Examples
+from pipelines.crossval.extras import examples_of
+from pipelines.crossval.settings import CrossvalSettings
+from pipelines.crossval.splits import Fold, folds_of
+from pipelines.models.recipes import feature_matrix
+from pipelines.propose.proposals import ACCEPTED, Proposal, questions
+from pipelines.reporting.progress import Progress, silent
+from pipelines.runs.datasets import load_runs
+from terrain.classify.paired import Difference, Outcome, compare_outcomes
+from terrain.classify.support import learn_support, support_of
+from terrain.errors import DataError
+from terrain.records import Array
+
+STRATEGIES = ("first run of each terrain", "random", "doubt", "random, self-trained", "doubt, self-trained")
+
+
+class StudyRow(NamedTuple):
+    """Accuracy on held-out runs with the labels of a strategy; ``n_labelled`` runs have one on average."""
+
+    name: str
+    n_labelled: float
+    accuracy: float
+
+
+class LabelStudy(NamedTuple):
+    """The strategies side by side, and their differences paired by run."""
+
+    dataset: str
+    repeats: int
+    rows: tuple[StudyRow, ...]
+    differences: Mapping[str, Difference]
+
+
+class _FoldLabels(NamedTuple):
+    """Probabilities (strategies, n, k) of a fold's test rows, and the runs that were labelled for each."""
+
+    probability: Array
+    n_labelled: tuple[int, ...]
+
+
+def label_study(data: Path, settings: CrossvalSettings, progress: Progress = silent) -> LabelStudy:
+    """Compare strategies on a folder of labelled runs.
+
+    Parameters
+    ----------
+    data : folder of labelled runs, more than two of each terrain
+    settings : recipe, windows, seed and repeats
+    progress : called as folds are done
+
+    Raises
+    ------
+    DataError
+        if a terrain has too few runs.
+    """
+    samples = samples_of(load_runs(data), settings)
+    windows = samples.cut.windows
+    recipe = settings.new_recipe()
+    examples = examples_of(feature_matrix(recipe, windows), samples)
+    motion = window_motion(windows)
+    folds = folds_of(samples, "grouped", settings.n_repeats, settings.seed)
+    classes = np.unique(examples.terrain)
+    probability = np.full((len(STRATEGIES), settings.n_repeats, len(windows), len(classes)), np.nan)
+    counts = []
+    progress("labels", 0, len(folds))
+    each = ((fold, settings.seed + number) for number, fold in enumerate(folds))
+    shared = (recipe[-1], examples, motion)
+    for fold, found in zip(folds, parallel(_fold_labels, shared, each, settings.jobs), strict=True):
+        probability[:, fold.repeat, fold.test] = found.probability
+        counts.append(found.n_labelled)
+        progress("labels", len(counts), len(folds))
+    outcomes = [
+        Outcome(
+            windows.run_id.astype(str),
+            examples.terrain,
+            classes[of.argmax(axis=2)] == examples.terrain,
+            of.max(axis=2),
+        )
+        for of in probability
+    ]
+    pairs = {
+        "doubt against random": (1, 2),
+        "self-training after random": (1, 3),
+        "self-training after doubt": (2, 4),
+    }
+    rng = np.random.default_rng(settings.seed)
+    return LabelStudy(
+        data.resolve().name,
+        settings.n_repeats,
+        tuple(
+            StudyRow(name, float(np.mean([c[i] for c in counts])), float(outcomes[i].correct.mean()))
+            for i, name in enumerate(STRATEGIES)
+        ),
+        {name: compare_outcomes(outcomes[a], outcomes[b], rng).accuracy for name, (a, b) in pairs.items()},
+    )
+
+
+def _fold_labels(
+    classifier: Any, examples: Examples, motion: Motion | None, fold: Fold, seed: int
+) -> _FoldLabels:
+    rng = np.random.default_rng(seed)
+    rows = fold.train
+    truth = examples.terrain[rows]
+    runs = np.char.add(np.char.add(examples.group[rows].astype(str), " "), truth)
+    of_class = [np.unique(runs[truth == name]) for name in np.unique(truth)]
+    if len(of_class) < len(np.unique(examples.terrain)):
+        raise DataError("a terrain has no run to train on in a fold; add runs")
+    first = {str(rng.choice(names)) for names in of_class}
+    pool = [str(run) for run in np.unique(runs) if run not in first]
+    budget = min(len(of_class), len(pool))
+    begun = np.isin(runs, list(first))
+    fitted = _fit(classifier, examples, rows, truth, begun)
+    proposals = [_proposal(fitted, examples, motion, rows, runs, run, begun) for run in pool]
+    chosen = {pool[i] for i in questions(proposals, budget)}
+    drawn = set(rng.permutation(pool)[:budget].tolist())
+    found, counts = [_on(fitted, examples, fold.test)], [len(first)]
+    again = []
+    for asked in (drawn, chosen):
+        known = np.isin(runs, list(first | asked))
+        model = _fit(classifier, examples, rows, truth, known)
+        found.append(_on(model, examples, fold.test))
+        counts.append(len(first | asked))
+        again.append((model, known, [run for run in pool if run not in asked]))
+    for model, known, rest in again:
+        terrain, used = truth.copy(), known.copy()
+        n_taken = 0
+        for run in rest:
+            proposal = _proposal(model, examples, motion, rows, runs, run, known)
+            if proposal.taken_over(ACCEPTED):
+                terrain[runs == run], used[runs == run] = proposal.terrain, True
+                n_taken += 1
+        found.append(_on(_fit(classifier, examples, rows, terrain, used), examples, fold.test))
+        counts.append(len(np.unique(runs[known])) + n_taken)
+    return _FoldLabels(np.stack(found), tuple(counts))
+
+
+def _fit(classifier: Any, examples: Examples, rows: Array, terrain: Array, used: Array) -> Any:
+    kept = rows[used]
+    return clone(classifier).fit(examples.features[kept], terrain[used], groups=examples.group[kept])
+
+
+def _on(fitted: Any, examples: Examples, test: Array) -> Array:
+    return np.asarray(fitted.predict_proba(examples.features[test]))
+
+
+def _proposal(
+    fitted: Any, examples: Examples, motion: Motion | None, rows: Array, runs: Array, run: str, known: Array
+) -> Proposal:
+    """Return what a model proposes for a run of one terrain."""
+    of = rows[runs == run]
+    probability = _on(fitted, examples, of)
+    best = int(probability.mean(axis=0).argmax())
+    supported = 1.0
+    if motion is not None:
+        seen, now = motion.of(rows[known]), motion.of(of)
+        table = learn_support(
+            seen.speed_mps, seen.yaw_rate_radps, examples.terrain[rows[known]], runs[known], fitted.classes_
+        )
+        near = table.near_runs(now.speed_mps, now.yaw_rate_radps)
+        supported = float(support_of(probability, near).supported.mean())
+    confidence = float(probability[:, best].mean())
+    return Proposal(run, 0.0, float(len(of)), str(fitted.classes_[best]), confidence, supported, 0.0, len(of))
