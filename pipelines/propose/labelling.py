@@ -156,7 +156,7 @@ def _label_of(row: Answered, accept: float) -> LabelSource | None:
 
 
 def _with(labels: Sequence[LabelSource], added: LabelSource) -> list[LabelSource]:
-    """Return labels with one more: a person's replaces what it covers, the model's stays off what has a label."""
+    """Return labels with one more: a person's replaces what it covers, the model's only fills gaps."""
     if added.source == "model":
         free = not any(each.start_s < added.end_s and added.start_s < each.end_s for each in labels)
         return [*labels, added] if free else list(labels)
