@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
+from features.motion import window_motion
 from features.windows import cut_windows
 from pipelines.compare.results import CompareReport
 from pipelines.compare.settings import CompareSettings, Contender
 from pipelines.crossval.crossval import samples_of
-from pipelines.crossval.evaluation import fit_folds, pool
+from pipelines.crossval.evaluation import HeldOut, fit_folds, pool
 from pipelines.crossval.extras import examples_of
 from pipelines.crossval.settings import CrossvalSettings
 from pipelines.crossval.splits import Samples, folds_of
@@ -18,9 +20,11 @@ from pipelines.models.model_files import TerrainModel
 from pipelines.models.recipes import feature_matrix
 from pipelines.reporting.progress import Progress, silent
 from pipelines.runs.datasets import data_digest
-from terrain.classify.paired import Comparison, Outcome, compare_outcomes
+from pipelines.support.evaluate import Judged, held_out_support
+from terrain.classify.paired import Comparison, Difference, Outcome, compare_outcomes
+from terrain.classify.support import SupportLevel, support_levels
 from terrain.errors import DataError
-from terrain.records import Array, RunLog
+from terrain.records import Array, RunLog, Windows
 
 
 def compare_recipes(
@@ -52,21 +56,50 @@ def compare_recipes(
             "the two recipes keep different windows of these runs, whose streams end at different times: "
             "compare them on signal sets of the same streams"
         )
-    a, b = (
-        _recipe_outcome(each, evaluation, progress)
-        for each, evaluation in zip(samples, evaluations, strict=True)
-    )
-    return _report(runs, settings, "recipes", (a, b), dataset, (), ())
+    held_out = [
+        _held_out(each, evaluation, progress) for each, evaluation in zip(samples, evaluations, strict=True)
+    ]
+    windows = samples[0].cut.windows
+    terrain = windows.terrain.astype(str)
+    a, b = (outcome_of(each.classes, each.probability, windows.run_id, terrain) for each in held_out)
+    report = _report(runs, settings, "recipes", (a, b), dataset, (), ())
+    levels = _levels(held_out[0], windows)
+    return report if levels is None else replace(report, by_support=_by_support(a, b, levels, settings.seed))
 
 
-def _recipe_outcome(samples: Samples, evaluation: CrossvalSettings, progress: Progress) -> Outcome:
+def _levels(held_out: HeldOut, windows: Windows) -> Array | None:
+    """Return the level of support (n,) of each window's true terrain, by its median over the repeats."""
+    motion = window_motion(windows)
+    if motion is None:
+        return None
+    splits = [(each.fold.repeat, each.fold.train, each.fold.test) for each in held_out.results]
+    run_id, terrain = windows.run_id.astype(str), windows.terrain.astype(str)
+    judged = Judged(motion, run_id, terrain, held_out.classes, held_out.probability, splits, windows.length_s)
+    return support_levels(np.median(held_out_support(judged).true_runs, axis=0))
+
+
+def _by_support(a: Outcome, b: Outcome, levels: Array, seed: int) -> dict[str, Difference]:
+    found = {}
+    for level in SupportLevel:
+        rows = np.flatnonzero(levels == level.value)
+        if len(rows):
+            of_a, of_b = (
+                Outcome(
+                    each.run_id[rows], each.terrain[rows], each.correct[:, rows], each.confidence[:, rows]
+                )
+                for each in (a, b)
+            )
+            found[level.value] = compare_outcomes(of_a, of_b, np.random.default_rng(seed)).accuracy
+    return found
+
+
+def _held_out(samples: Samples, evaluation: CrossvalSettings, progress: Progress) -> HeldOut:
     """Return what a recipe makes of held-out windows."""
     recipe, windows = evaluation.new_recipe(), samples.cut.windows
     examples = examples_of(feature_matrix(recipe, windows), samples)
     folds = folds_of(samples, "grouped", evaluation.n_repeats, evaluation.seed)
     results = fit_folds(recipe[-1], examples, folds, evaluation.jobs, evaluation.recipe, progress)
-    held_out = pool(results, examples.terrain)
-    return outcome_of(held_out.classes, held_out.probability, windows.run_id, examples.terrain)
+    return pool(results, examples.terrain)
 
 
 def compare_models(

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
 from typing import Any
 
-from terrain.classify.paired import Comparison
+from terrain.classify.paired import Comparison, Difference
 
 
 @dataclass(frozen=True, slots=True)
@@ -17,6 +18,8 @@ class CompareReport:
     a, b : as named by the user
     kind : ``recipes`` or ``models``
     comparison : figures of both, with differences of b minus a
+    by_support : differences of accuracy by how many training runs drove the true terrain with the motion of a
+        window; empty of models, and where the motion is not known
     n_runs, n_windows, repeats : that the figures are over; windows of a
     excluded_runs : of which one of the models was trained on
     notes : what a reader has to know
@@ -31,6 +34,7 @@ class CompareReport:
     n_runs: int
     n_windows: int
     repeats: int
+    by_support: Mapping[str, Difference] = field(default_factory=dict)
     excluded_runs: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
 

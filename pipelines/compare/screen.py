@@ -29,6 +29,7 @@ def print_compare(report: CompareReport, console: Console) -> None:
         ("mean over classes then runs", found.macro_run_accuracy),
         ("from confidence to correctness", found.confidence_auc),
         *((f"accuracy on {terrain}", row) for terrain, row in found.by_class.items()),
+        *((f"accuracy, {level}", row) for level, row in report.by_support.items()),
     ):
         table.add_row(name, *_cells(row))
     console.print(table)

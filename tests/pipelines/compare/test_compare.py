@@ -15,6 +15,7 @@ from pipelines.models.model_files import TerrainModel, read_model
 from pipelines.reporting.json_file import as_json
 from pipelines.runs.datasets import data_digest
 from terrain.classify.paired import Verdict
+from terrain.classify.support import SupportLevel
 from terrain.errors import ConfigError, DataError
 
 
@@ -50,6 +51,18 @@ def test_a_recipe_has_the_figures_of_its_cross_validation_and_does_not_differ_fr
     found = compare_recipes(runs, comparing.contenders, comparing, "moor").comparison
     assert found.accuracy.a == found.accuracy.b == crossval(runs, settings()).accuracy
     assert found.accuracy.verdict is Verdict.NOT_DISTINGUISHED
+
+
+def test_differences_by_support_are_of_the_windows_of_a_level(runs):
+    comparing = settings_of("svm@currents", "svm@imu")
+    report = compare_recipes(runs, comparing.contenders, comparing, "moor")
+    assert set(report.by_support) <= {level.value for level in SupportLevel}
+    assert report.by_support
+    n_runs = [row.n_runs for row in report.by_support.values()]
+    assert max(n_runs) <= report.n_runs <= sum(n_runs)
+    of_all = report.comparison.accuracy.difference
+    differences = [row.difference for row in report.by_support.values()]
+    assert min(differences) <= of_all <= max(differences)
 
 
 class Constant:
