@@ -1,4 +1,4 @@
-"""Commands of terrain classification: crossval, compare, train, model, predict."""
+"""Commands of terrain classification: crossval, compare, train, sweep, model, predict."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from pipelines.compare.settings import CompareSettings
 from pipelines.compute.settings import ComputeSettings
 from pipelines.crossval.settings import CrossvalSettings
 from pipelines.runs.settings import AlignedRunsSettings, load
+from pipelines.sweep.settings import SweepSettings
 
 app = typer.Typer()
 
@@ -93,6 +94,24 @@ def train_command(
     print_crossval(replace(result.crossval, skipped=result.skipped), output_console())
     print_training(result, output_console())
     write_json(json_file, result)
+
+
+@command(app, "sweep")
+def sweep_command(
+    source: AlignedRunsSettings, settings: SweepSettings, compute: ComputeSettings, json_file: Json = None
+) -> None:
+    """Search hyper-parameters on inner folds; a search that was interrupted goes on."""
+    from pipelines.compute.parallel import computing
+    from pipelines.reporting.json_file import write_json
+    from pipelines.reporting.terminal import output_console, progress_bar
+    from pipelines.sweep.screen import print_sweep
+    from pipelines.sweep.sweep import sweep
+
+    runs, _ = load(source)
+    with computing(compute.compute), progress_bar() as progress:
+        found = sweep(runs, settings.with_(skip_short=source.repair), source.dataset, progress)
+    print_sweep(found, output_console())
+    write_json(json_file, found)
 
 
 @command(app, "model")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self, get_args
 
 from pydantic import model_validator
@@ -44,12 +45,15 @@ class RecipeSettings(Settings):
     merge_duplicates: bool = setting(
         False, "Treat runs that hold the same measurements as one run instead of refusing them."
     )
+    params: Path | None = setting(None, "Result of terrain sweep, in place of the SVM's own choice.")
     skip_short: bool = setting(False, "Leave out and count runs shorter than a window.", option="")
 
     @model_validator(mode="after")
     def _check_signal_sets(self) -> Self:
         if not self.signal_sets:
             raise ConfigError(f"no signal set is named; there are {','.join(SIGNAL_SETS)}")
+        if self.params is not None and self.recipe == "cnn":
+            raise ConfigError("--params has hyper-parameters of the SVM, which 'cnn' does not have")
         for name in self.signal_sets:
             if name not in SIGNAL_SETS:
                 raise ConfigError(f"unknown signal set {name!r}; there are {', '.join(SIGNAL_SETS)}")
@@ -71,9 +75,14 @@ class RecipeSettings(Settings):
 
     def new_recipe(self) -> WindowPipeline:
         """Return the recipe, unfitted."""
+        from pipelines.models.params_file import read_params
         from pipelines.models.recipes import make_recipe
+        from terrain.classify.svm import CANDIDATES
 
-        return make_recipe(self.recipe, self.signal_sets, gap=self.rule.overlap, seed=self.seed)
+        candidates = CANDIDATES if self.params is None else (read_params(self.params),)
+        return make_recipe(
+            self.recipe, self.signal_sets, gap=self.rule.overlap, seed=self.seed, candidates=candidates
+        )
 
 
 class CrossvalSettings(RecipeSettings):

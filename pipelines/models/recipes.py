@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from features.matrix import FeatureMatrix
 from features.sample_extractor import SampleExtractor
 from terrain.classify.grouped_network import GroupedNetwork
 from terrain.classify.stack import GroupedStack
-from terrain.classify.svm import GroupedSVC
+from terrain.classify.svm import CANDIDATES, GroupedSVC
 from terrain.errors import ConfigError
 from terrain.logs.schema import SIGNAL_SETS
 from terrain.records import Array, Windows
@@ -50,6 +50,7 @@ def make_recipe(
     level_sets: Iterable[str] = (),
     gap: int = 1,
     seed: int = 0,
+    candidates: Sequence[Sequence[float]] = CANDIDATES,
 ) -> WindowPipeline:
     """Return an unfitted recipe.
 
@@ -59,6 +60,7 @@ def make_recipe(
     signal_sets, level_sets : as :class:`~features.extractor.FeatureExtractor`
     gap : windows left out beside an inner test block; as many as share samples with a window
     seed : deals runs into the inner folds
+    candidates : hyper-parameters that the SVM chooses among
 
     Raises
     ------
@@ -74,12 +76,12 @@ def make_recipe(
         raise ConfigError(f"there is no recipe {name!r}; there are {', '.join(RECIPES)}")
     sets = tuple(signal_sets), tuple(level_sets)
     features: FeatureExtractor = FeatureExtractor(*sets)
-    classifier: ClassifierMixin = GroupedSVC(gap=gap, seed=seed)
+    classifier: ClassifierMixin = GroupedSVC(candidates, gap=gap, seed=seed)
     if name == "cnn":
         features, classifier = SampleExtractor(*sets), GroupedNetwork(gap=gap, seed=seed)
     elif name != "svm":
         features = SampleExtractor(*sets, with_features=True)
-        classifier = GroupedStack(choose=name == "best", gap=gap, seed=seed)
+        classifier = GroupedStack(choose=name == "best", candidates=candidates, gap=gap, seed=seed)
     return WindowPipeline([("features", features), ("classifier", classifier)])
 
 
