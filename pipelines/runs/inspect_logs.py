@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pipelines.runs.breaks import odd_stretches
 from pipelines.runs.datasets import data_digest, robot_of
 from pipelines.runs.results import InspectedRun, Inspection
 from pipelines.runs.settings import RunsSettings, load
@@ -34,4 +35,5 @@ def _inspected(run: RunLog, robot: Robot | None) -> InspectedRun:
     except (ConfigError, DataError):
         clock = None
     streams = {name: stream_quality(stream) for name, stream in run.streams.items()}
-    return InspectedRun(run.run_id, run.terrains, dict(run.dropped), streams, clock)
+    odd = odd_stretches(run)
+    return InspectedRun(run.run_id, run.terrains, dict(run.dropped), streams, clock, odd)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from pipelines.runs.breaks import OddStretch
 from terrain.logs.clock import ClockEstimate
 from terrain.logs.duplicates import SharedStretch
 from terrain.logs.quality import StreamQuality
@@ -42,7 +43,7 @@ class InspectedRun:
     """The quality of the streams of one run.
 
     ``clock`` is None where the run has no gyro or no speeds of a left and a right wheel, or its robot is
-    unknown.
+    unknown.  ``odd_stretches`` differ from the rest of the run.
     """
 
     run_id: str
@@ -50,6 +51,7 @@ class InspectedRun:
     dropped: Mapping[str, int]
     streams: Mapping[str, StreamQuality]
     clock: ClockEstimate | None
+    odd_stretches: tuple[OddStretch, ...] = ()
 
     def as_json(self) -> dict[str, Any]:
         """Return all fields, the figures of channels by quantity."""
@@ -59,6 +61,7 @@ class InspectedRun:
             "dropped": self.dropped,
             "streams": {name: _stream_json(quality) for name, quality in self.streams.items()},
             "clock": self.clock,
+            "odd_stretches": self.odd_stretches,
         }
 
 

@@ -55,6 +55,15 @@ def print_inspection(result: Inspection, console: Console) -> None:
     for run in result.runs:
         if run.dropped:
             console.print(f"{run.run_id}: dropped {format_counts(run.dropped)}")
+        print_lines(
+            console,
+            (
+                f"{run.run_id}: {odd.start_s:g} to {odd.end_s:g} s differs from the rest of the run by "
+                f"{odd.shift:.1f} times its scatter (vibration at its speed; {odd.speed_mps:.2f} m/s, "
+                f"the run {odd.run_speed_mps:.2f}): a stuck robot, another ground?"
+                for odd in run.odd_stretches
+            ),
+        )
     for sentence in result.skipped:
         console.print(sentence)
     print_lines(console, sentences(result.duplicates))
