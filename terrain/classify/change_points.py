@@ -21,7 +21,7 @@ the criterion of Schwarz asks, as neighbouring windows resemble each other."""
 
 SHIFT_LEAST = 4.0
 """A segment that differs from the longest by so many times the scatter, in the root mean square of all
-columns, stands out.  Both numbers were chosen with the runs of BorealTC and Vulpi in view: 10 of 69 have one."""
+columns, stands out.  Both were chosen with the runs of BorealTC and Vulpi in view: 10 of 69 have one."""
 
 LEAST_ROWS = 3
 MIN_SCATTER = 0.05
