@@ -62,6 +62,8 @@ ALIASES_OF_VALUES: dict[str, str] = {
 IGNORED: dict[str, str] = {
     "seconds": "time that computing took",
     "elapsed_s": "time that computing took",
+    "latency_ms": "time that computing took",
+    "onnx_latency_ms": "time that computing took",
     "times_real_time": "how fast computing was",
     "created": "time of writing",
     "commit": "state of the code",
