@@ -1,7 +1,7 @@
 """Variations of measured windows that leave the terrain as it is: a network trains on more than was measured.
 
-Each is one that the physics allows: a window might have begun earlier, a sensor might amplify a little more,
-the robot might have driven the mirror image of its path, a sensor might have failed.
+Each is one that the physics allows: a window might have begun earlier, the ground might shake
+the robot more, it might have driven the mirror image of its path, a sensor might have failed.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ import numpy as np
 from terrain.classify.network_numbers import SampleColumns
 from terrain.records import Array
 
-GAIN_STD = 0.1
-"""Standard deviation of the logarithm of a channel's gain."""
+GAIN_STD = 0.4
+"""Standard deviation of the logarithm of a stream's gain: assumed."""
 
 DROPOUT_RATIO = 0.1
 """How often a stream is taken for failed."""
@@ -32,7 +32,7 @@ class Augmentation(NamedTuple):
     Parameters
     ----------
     shift : of the window, its end continued by its beginning
-    gain : of each channel of a window, log-normal
+    gain : of a window, log-normal, one for all channels of a stream: speed, load and tyres shake all axes
     mirror : half of the windows, left for right
     dropout : a stream at its training mean, in a window out of ten
     """
@@ -111,7 +111,7 @@ def augmented(
             found[i] = np.take_along_axis(values, places[:, None], axis=2)
     if used.gain:
         found = [
-            values * np.exp(GAIN_STD * rng.standard_normal((n, values.shape[1], 1))).astype(values.dtype)
+            values * np.exp(GAIN_STD * rng.standard_normal((n, 1, 1))).astype(values.dtype)
             for values in found
         ]
     if used.mirror and mirrors is not None:

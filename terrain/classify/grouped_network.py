@@ -1,8 +1,9 @@
 """Ensemble of networks that chooses and calibrates itself on folds which keep runs whole.
 
 Steps of ``fit``: standardise by all rows; on inner folds of whole runs choose the augmentation; fit one
-member an inner fold, stopped where its held-out runs are most likely; the held-out probabilities of all
-members give the temperature.  What is fitted is kept as
+network an inner fold, stopped where its held-out runs are most likely; their held-out probabilities give the
+temperature; fit the members anew on all runs, for the mean number of epochs of these networks: with few runs,
+each one counts.  What is fitted is kept as
 :class:`~terrain.classify.network_numbers.NetworkNumbers`: it predicts without torch.
 """
 
@@ -22,6 +23,7 @@ from terrain.classify.inner import inner_splits
 from terrain.classify.network import (
     Task,
     fit_member,
+    fit_on_all,
     network_numbers_of,
     reproducible,
     require_torch,
@@ -66,7 +68,8 @@ class GroupedNetwork(ClassifierMixin, BaseEstimator):
     Parameters
     ----------
     columns : :class:`~terrain.classify.network_numbers.SampleColumns` of each stream
-    n_members : networks, one an inner fold
+    n_inner_folds : networks that choose and calibrate, one an inner fold
+    n_members : networks that predict, each fitted on all runs
     epochs : at most, of each
     trial_epochs : of the networks that choose the augmentation; 0 for none, and no choice
     gap : windows left out beside an inner test block, where the only run of a class is cut
@@ -84,13 +87,15 @@ class GroupedNetwork(ClassifierMixin, BaseEstimator):
     def __init__(
         self,
         columns: Sequence[SampleColumns] = (),
-        n_members: int = 5,
-        epochs: int = 15,
+        n_inner_folds: int = 5,
+        n_members: int = 3,
+        epochs: int = 30,
         trial_epochs: int = 8,
         gap: int = 1,
         seed: int = 0,
     ) -> None:
         self.columns = columns
+        self.n_inner_folds = n_inner_folds
         self.n_members = n_members
         self.epochs = epochs
         self.trial_epochs = trial_epochs
@@ -127,22 +132,27 @@ class GroupedNetwork(ClassifierMixin, BaseEstimator):
             raise DataError(f"the columns of the samples do not describe rows of {X.shape[1]} columns")
         fill = fill_of(columns, X)
         task = task_of(columns, np.where(np.isnan(X), fill, X).astype(np.float32), class_index)
-        splits = list(inner_splits(y, groups, self.n_members, self.seed, self.gap))
+        splits = list(inner_splits(y, groups, self.n_inner_folds, self.seed, self.gap))
         if not splits:
             raise DataError("the windows are too few to hold some of them out; add runs")
         with reproducible():
             used = self._choose(task, splits)
-            members = [
+            inner = [
                 fit_member(task, split, used, self.epochs, self.seed + i) for i, split in enumerate(splits)
             ]
+            epochs = float(np.mean([each.epoch + 1 for each in inner]))
+            nets = [
+                fit_on_all(task, used, round(epochs), self.seed + len(splits) + i)
+                for i in range(self.n_members)
+            ]
         log_probability = np.full((len(y), len(self.classes_)), np.nan)
-        for (_, test), member in zip(splits, members, strict=True):
+        for (_, test), member in zip(splits, inner, strict=True):
             log_probability[test] = member.held_out
         held_out = np.isfinite(log_probability).all(axis=1)
         temperature = fit_temperature(log_probability[held_out], class_index[held_out])
         self.inner_probability_ = softmax(log_probability / temperature)
-        self.best_ = NetworkChoice(*used, float(np.mean([member.epoch + 1 for member in members])))
-        self.numbers_ = network_numbers_of(task, fill, [member.net for member in members], temperature)
+        self.best_ = NetworkChoice(*used, epochs)
+        self.numbers_ = network_numbers_of(task, fill, nets, temperature)
         return self
 
     def _choose(self, task: Task, splits: Sequence[tuple[Array, Array]]) -> Augmentation:

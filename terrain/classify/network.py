@@ -119,21 +119,45 @@ def fit_member(task: Task, split: tuple[Array, Array], used: Augmentation, epoch
     torch = require_torch()
     functional = torch.nn.functional
     train, test = split
+    held_out = [torch.from_numpy(rows) for rows in task.rows([values[test] for values in task.streams])]
+    test_truth = torch.from_numpy(task.class_index[test])
+    best, at, net = np.inf, 0, None
+    kept: dict[str, Any] = {}
+    for epoch, net in enumerate(_epochs(task, train, used, epochs, seed)):
+        with torch.no_grad():
+            found = float(functional.cross_entropy(net(held_out), test_truth))
+        if found < best or not kept:
+            best, at = found, epoch
+            kept = {name: value.clone() for name, value in net.state_dict().items()}
+    assert net is not None
+    net.load_state_dict(kept)
+    with torch.no_grad():
+        log_probability = functional.log_softmax(net(held_out), dim=1).numpy().astype(float)
+    return Member(net, log_probability, float(best), at)
+
+
+def fit_on_all(task: Task, used: Augmentation, epochs: int, seed: int) -> Any:
+    """Return a network fitted on all rows; parameters as of :func:`fit_member`."""
+    return list(_epochs(task, np.arange(len(task.class_index)), used, max(epochs, 1), seed))[-1]
+
+
+def _epochs(task: Task, train: Array, used: Augmentation, epochs: int, seed: int) -> Iterator[Any]:
+    """Yield the network, ready to predict, after each epoch on some rows."""
+    torch = require_torch()
+    functional = torch.nn.functional
     torch.manual_seed(seed)
     rng = np.random.default_rng((seed, 1))
     mirrors = mirrors_of(task.columns)
     net = _network(task)
     streams = [values[train] for values in task.streams]
     plain = task.rows(streams) if used == Augmentation() else []
-    held_out = [torch.from_numpy(rows) for rows in task.rows([values[test] for values in task.streams])]
-    truth, test_truth = (torch.from_numpy(task.class_index[rows]) for rows in (train, test))
+    truth = torch.from_numpy(task.class_index[train])
     n_batches = max(len(train) // BATCH, min(MIN_BATCHES, len(train) // SMALL_BATCH), 1)
     optimizer = torch.optim.AdamW(net.parameters(), lr=LEARNING_RATE, weight_decay=WEIGHT_DECAY)
     schedule = torch.optim.lr_scheduler.OneCycleLR(
         optimizer, LEARNING_RATE, total_steps=epochs * n_batches, pct_start=0.15
     )
-    best, kept, at = np.inf, net.state_dict(), 0
-    for epoch in range(epochs):
+    for _ in range(epochs):
         net.train()
         for batch in np.array_split(rng.permutation(len(train)), n_batches):
             rows = (
@@ -150,16 +174,7 @@ def fit_member(task: Task, split: tuple[Array, Array], used: Augmentation, epoch
             optimizer.step()
             schedule.step()
         net.eval()
-        with torch.no_grad():
-            found = float(functional.cross_entropy(net(held_out), test_truth))
-        if found < best:
-            best, at = found, epoch
-            kept = {name: value.clone() for name, value in net.state_dict().items()}
-    net.load_state_dict(kept)
-    net.eval()
-    with torch.no_grad():
-        log_probability = functional.log_softmax(net(held_out), dim=1).numpy().astype(float)
-    return Member(net, log_probability, float(best), at)
+        yield net
 
 
 def _network(task: Task) -> Any:

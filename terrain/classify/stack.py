@@ -73,8 +73,8 @@ class GroupedStack(ClassifierMixin, BaseEstimator):
         columns: Sequence[SampleColumns] = (),
         choose: bool = False,
         candidates: Sequence[Sequence[float]] = CANDIDATES,
-        n_members: int = 5,
-        epochs: int = 15,
+        n_members: int = 3,
+        epochs: int = 30,
         trial_epochs: int = 8,
         gap: int = 1,
         seed: int = 0,
@@ -101,7 +101,12 @@ class GroupedStack(ClassifierMixin, BaseEstimator):
         features, samples = self._parts(X)
         svm = GroupedSVC(self.candidates, gap=self.gap, seed=self.seed).fit(features, y, groups)
         network = GroupedNetwork(
-            self.columns, self.n_members, self.epochs, self.trial_epochs, self.gap, self.seed
+            self.columns,
+            n_members=self.n_members,
+            epochs=self.epochs,
+            trial_epochs=self.trial_epochs,
+            gap=self.gap,
+            seed=self.seed,
         ).fit(samples, y, groups)
         self.classes_ = svm.classes_
         both = np.stack([svm.inner_probability_, network.inner_probability_])
