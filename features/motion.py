@@ -5,6 +5,7 @@ Only what is measured of the driving counts here, nothing that the terrain shake
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -53,14 +54,7 @@ def window_motion(windows: Windows) -> Motion | None:
     >>> motion.speed_mps.tolist(), motion.turn_ratio.tolist(), motion.yaw_rate_radps.tolist()
     ([0.5, 0.2], [0.0, 1.0], [nan, nan])
     """
-    stream = next(
-        (
-            stream
-            for stream, names in windows.channels.items()
-            if any(signal_set_of(stream, name) == "wheels" for name in names)
-        ),
-        None,
-    )
+    stream = wheel_stream(windows.channels)
     if stream is None:
         return None
     speed = wheel_speeds(windows.values, windows.channels)
@@ -70,6 +64,20 @@ def window_motion(windows: Windows) -> Motion | None:
         _yaw_rate(windows, unknown),
         _turn_ratio(windows.values[stream], windows.channels[stream], unknown),
     )
+
+
+def wheel_stream(channels: Mapping[str, tuple[str, ...]]) -> str | None:
+    """Return the stream that measures wheel speeds; None where none does, so that there is no motion.
+
+    Examples
+    --------
+    >>> wheel_stream({"imu": ("gyro_z_radps",), "wheels": ("speed_left_mps",)})
+    'wheels'
+    """
+    for stream, names in channels.items():
+        if any(signal_set_of(stream, name) == "wheels" for name in names):
+            return stream
+    return None
 
 
 def _yaw_rate(windows: Windows, unknown: Array) -> Array:

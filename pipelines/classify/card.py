@@ -13,7 +13,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipelines.crossval.extras import run_speeds
+from features.motion import Motion
+from features.windows import Layout
+from pipelines.classify.card_support import RegimeRow, regime_rows
+from pipelines.crossval.extras import MOVING_MPS
 from pipelines.crossval.results import CrossvalReport
 from pipelines.models.assess import assess
 from pipelines.models.champion import scope_of
@@ -26,7 +29,7 @@ from pipelines.reporting.numbers import NOT_KNOWN, percent, sentence
 from pipelines.reporting.versions import versions
 from pipelines.support.results import SupportReport
 from terrain.classify.metrics import VOTE_SPAN_S
-from terrain.records import Windows
+from terrain.records import Array, Windows
 
 CARD_FILE, CARD_JSON = "model_card.md", "model_card.json"
 N_TIMED = 50
@@ -91,7 +94,10 @@ class FileRow(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class ModelCard:
-    """What is stated of a model; ``latency_ms`` is the median of one window, None where not measured."""
+    """What is stated of a model; ``latency_ms`` is the median of one window, None where not measured.
+
+    ``support`` has a row a regime of driving, empty where how the robot moved is not known.
+    """
 
     name: str
     recipe: str
@@ -111,6 +117,7 @@ class ModelCard:
     commit: str
     licence: str
     versions: str
+    support: tuple[RegimeRow, ...] = ()
     files: tuple[FileRow, ...] = ()
     latency_ms: float | None = None
     onnx_latency_ms: float | None = None
@@ -136,7 +143,12 @@ class ModelCard:
 
 
 def model_card(
-    name: str, info: ModelInfo, windows: Windows, report: CrossvalReport, chosen: Mapping[str, Any]
+    name: str,
+    info: ModelInfo,
+    windows: Windows,
+    motion: Motion | None,
+    report: CrossvalReport,
+    chosen: Mapping[str, Any],
 ) -> ModelCard:
     """Return the card of a model that is not written yet.
 
@@ -144,7 +156,8 @@ def model_card(
     ----------
     name : of the registered model
     info : content of ``terrain_model.json``
-    windows : that it was trained on
+    windows : that it was trained on; they need no samples
+    motion : how the robot moved in each window; None where that is not known
     report : its cross-validation, whatever figures it has
     chosen : hyper-parameters
     """
@@ -169,11 +182,12 @@ def model_card(
             f"seed {report.seed}. Scaling, selection and calibration are fitted inside of each training part."
         ),
         figures=tuple(figure_rows(report)),
-        limits=tuple(sentence(text) for text in _limits(info, windows, report)),
+        limits=tuple(sentence(text) for text in _limits(info, windows, motion, report)),
         notes=tuple(sentence(text) for text in report.notes),
         commit=info.commit,
         licence=_licence(),
         versions=", ".join(f"{package} {number}" for package, number in versions().items()),
+        support=regime_rows(report.support),
     )
 
 
@@ -222,7 +236,7 @@ def _rows(text: str, value: Any, interval: Any, *, plain: bool) -> list[FigureRo
     ]
 
 
-def _limits(info: ModelInfo, windows: Windows, report: CrossvalReport) -> list[str]:
+def _limits(info: ModelInfo, windows: Windows, motion: Motion | None, report: CrossvalReport) -> list[str]:
     """Return in sentences what the model is not for."""
     limits = [
         f"robots other than {', '.join(info.robots)}, and logs without its channels or with rates that "
@@ -237,7 +251,7 @@ def _limits(info: ModelInfo, windows: Windows, report: CrossvalReport) -> list[s
             f"standing, and speed changes above {info.steady.max_accel_mps2:g} m/s²: such windows are "
             "left out"
         )
-    speeds = [speed for speed in run_speeds(windows).values() if np.isfinite(speed)]
+    speeds = [] if motion is None else _run_speeds(windows.run_id.astype(str), motion.speed_mps)
     if speeds:
         limits.append(
             f"speeds outside of {min(speeds):.2f} to {max(speeds):.2f} m/s, the medians of the slowest and "
@@ -248,6 +262,12 @@ def _limits(info: ModelInfo, windows: Windows, report: CrossvalReport) -> list[s
         limits.append(f"decisions that rest on {', '.join(weak)}: recognised in under half of the windows")
     limits += _unsupported(report.support)
     return limits
+
+
+def _run_speeds(run_id: Array, speed_mps: Array) -> list[float]:
+    """Return the median speed of the windows of each run in which it moves, of runs that have such."""
+    moving = speed_mps > MOVING_MPS
+    return [float(np.median(speed_mps[moving & (run_id == run)])) for run in np.unique(run_id[moving])]
 
 
 def _unsupported(support: SupportReport | None) -> list[str]:
@@ -275,16 +295,30 @@ def _licence() -> str:
     return str(named[0]) if named else NOT_KNOWN
 
 
-def written(card: ModelCard, folder: Path, window: Windows) -> ModelCard:
+def drawn_window(layout: Layout, length_s: float) -> Windows:
+    """Return a window of noise with the channels and rates of a layout.
+
+    The time that a window takes does not depend on what was measured in it.
+    """
+    rng = np.random.default_rng(0)
+    unknown = np.full(1, "", dtype=object)
+    values = {
+        stream: rng.standard_normal((1, len(names), layout.n_samples(stream, length_s)))
+        for stream, names in layout.channels.items()
+    }
+    return Windows(values, layout.channels, layout.rate_hz, length_s, np.zeros(1), unknown, unknown)
+
+
+def written(card: ModelCard, folder: Path) -> ModelCard:
     """Return the card with the sizes of the files in a folder, and with the time that one window takes.
 
     Parameters
     ----------
     card : of the model
     folder : of its files
-    window : a single one
     """
     model = read_lean_model(folder)
+    window = drawn_window(model.layout, model.info.window_s)
     assess(model, window)  # compiles and fills caches
     times_s = np.empty(N_TIMED)
     for number in range(N_TIMED):

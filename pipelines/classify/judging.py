@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
 
+from pipelines.classify.training_data import TrainingData
 from pipelines.crossval.results import CrossvalReport
 from pipelines.crossval.splits import Samples
 from pipelines.models.champion import Comparison, Scope, Standing, champion_decision, scope_of
 from pipelines.models.model_files import TerrainModel
 from pipelines.models.results import ModelInfo
 from pipelines.models.tracking import Champion, Judge, Verdict
-from pipelines.runs.datasets import data_digest
+from pipelines.runs.datasets import joint_digest
 from terrain.bootstrap import bootstrap_rows, percentile_interval
 from terrain.classify.metrics import runs_by_terrain
-from terrain.errors import DataError
-from terrain.records import Array, RunLog
+from terrain.records import Array
 
 N_BOOTSTRAP = 2000
 
@@ -63,20 +63,17 @@ def standing_tags(standing: Standing, scope: Scope) -> dict[str, str]:
     }
 
 
-def judge_of(
-    runs: Sequence[RunLog], samples: Samples, report: CrossvalReport, standing: Standing, seed: int
-) -> Judge:
+def judge_of(data: TrainingData, report: CrossvalReport, standing: Standing, seed: int) -> Judge:
     """Return what judges a new version of a model against the present champion.
 
     Parameters
     ----------
-    runs : training runs of the new version
-    samples, report : its windows, and its cross-validation
+    data : that the new version was trained on
+    report : its cross-validation
     standing : of the new version
     seed : of the bootstrap over runs
     """
-    held_out = held_out_runs(samples, report)
-    digests = {run.run_id: data_digest([run]) for run in runs}
+    held_out = held_out_runs(data.samples, report)
 
     def judge(champion: Champion | None, version: str) -> Verdict:
         candidate = standing._replace(version=version)
@@ -84,50 +81,55 @@ def judge_of(
             present = None if champion is None else candidate._replace(version=champion.version, scope=None)
             return Verdict(*champion_decision(present, candidate, lambda: None))
         model = champion.model
+        same = same_data(model.info, candidate.data_digest, data)
         present = Standing(
             champion.version,
             scope_of(model.info),
-            model.info.data_digest,
+            candidate.data_digest if same else model.info.data_digest,
             float(champion.tags.get("macro_f1", model.info.evaluation.get("macro_f1", "-inf"))),
             (0.0, 1.0),
             0.0,
         )
-        return Verdict(
-            *champion_decision(present, candidate, lambda: compare(model, samples, held_out, digests, seed))
-        )
+        return Verdict(*champion_decision(present, candidate, lambda: compare(model, data, held_out, seed)))
 
     return judge
 
 
+def same_data(info: ModelInfo, digest: str, data: TrainingData) -> bool:
+    """Return whether a model was trained on data with a digest, be it as runs or as a store of features.
+
+    Parameters
+    ----------
+    info : of the model
+    digest : of the data as they are given now
+    data : the same
+    """
+    joint = joint_digest([run.digest for run in data.runs])
+    return info.data_digest in (digest, joint) or joint_digest(info.run_digests) == digest
+
+
 def compare(
-    model: TerrainModel,
-    samples: Samples,
-    held_out: Mapping[str, HeldOutRun],
-    digests: Mapping[str, str],
-    seed: int,
+    model: TerrainModel, data: TrainingData, held_out: Mapping[str, HeldOutRun], seed: int
 ) -> Comparison | None:
     """Return how a model does against the held-out figures of another one, None where it cannot be judged.
 
-    A run that the model was not trained on is predicted; one that it was trained on counts with the accuracy
-    that it had when it was held out, where that is known.
+    A run that the model was not trained on is predicted, where it can be; one that it was trained on counts
+    with the accuracy that it had when it was held out, where that is known.
 
     Parameters
     ----------
     model : to be judged
-    samples : windows of the other model's runs
-    held_out, digests : held-out accuracy and digest of each of these runs, by id
+    data : of the other model
+    held_out : held-out accuracy of each of its runs, by id
     seed : of the bootstrap over runs
     """
-    windows = samples.cut.windows
-    run_id, terrain = windows.run_id.astype(str), windows.terrain.astype(str)
+    run_id, terrain = data.run_id, data.terrain
+    digests = {run.run_id: run.digest for run in data.runs}
     theirs: dict[str, float] = {}
     new = [name for name in held_out if digests[name] not in model.info.run_digests]
     rows = np.isin(run_id, new)
-    if rows.any():
-        try:
-            probability = model.recipe.predict_proba(windows[rows])
-        except DataError:  # other rates
-            return None
+    probability = data.probabilities(model, rows) if rows.any() else None
+    if probability is not None:
         right = np.asarray(model.recipe.classes_, dtype=str)[probability.argmax(axis=1)] == terrain[rows]
         theirs = {name: float(right[run_id[rows] == name].mean()) for name in new}
     known = model.info.run_accuracy

@@ -6,15 +6,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from features.matrix import FeatureMatrix
-from features.motion import NO_MOTION, window_motion
+from features.motion import NO_MOTION, Motion
 from pipelines.support.evaluate import table_of
 from terrain.classify.conformal import conformal_threshold, held_out_scores
 from terrain.classify.novelty import NoveltyScore
 from terrain.classify.novelty_numbers import NoveltyNumbers
 from terrain.classify.support import SupportTable
 from terrain.errors import DataError
-from terrain.records import Array, Windows
+from terrain.records import Array
 
 
 class Limits(NamedTuple):
@@ -26,33 +25,44 @@ class Limits(NamedTuple):
     notes: tuple[str, ...]
 
 
-def limits_of(
-    classifier: Any, matrix: FeatureMatrix, windows: Windows, group: Array, gap: int, seed: int
-) -> Limits:
+class LimitData(NamedTuple):
+    """Labelled windows that a model was fitted on.
+
+    Parameters
+    ----------
+    features, terrain, run_id : (n, f), (n,) and (n,)
+    motion : how the robot moved in each; None where no wheel speed was measured
+    """
+
+    features: Array
+    terrain: Array
+    run_id: Array
+    motion: Motion | None
+
+
+def limits_of(classifier: Any, data: LimitData, gap: int, seed: int) -> Limits:
     """Return the limits of a model that was fitted on windows.
 
     Parameters
     ----------
     classifier : fitted, with its out-of-fold probabilities as ``inner_probability_``
-    matrix : of the features
-    windows : labelled, that it was fitted on
-    group : (n,) what must not be split, the run of each window
+    data : that it was fitted on
     gap, seed : of the inner folds
     """
-    terrain, notes = windows.terrain.astype(str), []
+    features, terrain, run_id, motion = data
+    notes = []
     novelty = conformal = support = None
     try:
-        score = NoveltyScore(gap=gap, seed=seed).fit(matrix.of(windows), terrain, group)
+        score = NoveltyScore(gap=gap, seed=seed).fit(features, terrain, run_id)
         novelty = score.numbers_
     except DataError as error:
         notes.append(f"no window is ever called unknown: {error}")
     try:
-        conformal = conformal_threshold(held_out_scores(classifier, terrain), group.astype(str))
+        conformal = conformal_threshold(held_out_scores(classifier, terrain), run_id)
     except DataError as error:
         notes.append(f"no sets of terrains: {error}")
-    motion = window_motion(windows)
     if motion is None:
         notes.append(f"support: {NO_MOTION}")
     else:
-        support = table_of(motion, terrain, windows.run_id.astype(str), np.unique(terrain).tolist())
+        support = table_of(motion, terrain, run_id, np.unique(terrain).tolist())
     return Limits(novelty, support, conformal, tuple(notes))

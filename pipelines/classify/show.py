@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from pipelines.classify.card import CARD_JSON
+from pipelines.classify.card_support import rows_of_card, support_tables
 from pipelines.models.model_files import TerrainModel, read_lean_model
 from pipelines.reporting.json_file import as_json
 from pipelines.reporting.numbers import NOT_KNOWN
@@ -119,6 +120,8 @@ def print_model(found: ModelStatement, console: Console) -> None:
             f"{row['recall']:.1%}",
         )
     console.print(table)
+    for part in support_tables(rows_of_card(found.card), console.width):
+        console.print(part)
     for row in found.card["figures"]:
         console.print(
             f"{row['name']}: {row['value']}"

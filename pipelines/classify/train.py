@@ -4,24 +4,34 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from sklearn.base import clone
 
+from features.windows import Layout
 from pipelines.classify.card import model_card, written
 from pipelines.classify.importance import channel_importance
-from pipelines.classify.limits import limits_of
+from pipelines.classify.limits import LimitData, limits_of
 from pipelines.classify.results import Training
 from pipelines.classify.settings import TrainSettings
-from pipelines.crossval.crossval import crossval, samples_of
+from pipelines.classify.training_data import (
+    FEATURE_RECIPE,
+    RunIdentity,
+    TrainingData,
+    data_of_runs,
+    data_of_store,
+    identities,
+)
+from pipelines.crossval.crossval import crossval
 from pipelines.crossval.evaluation import Examples
 from pipelines.crossval.results import ChannelImportance, CrossvalReport
 from pipelines.crossval.settings import RecipeSettings
-from pipelines.crossval.splits import Samples, folds_of
+from pipelines.crossval.splits import folds_of
+from pipelines.feature_store.crossval import crossval_stored, refuse_recipe
+from pipelines.feature_store.store import FeatureStore, read_store
 from pipelines.models.champion import scope_of
 from pipelines.models.novelty_file import NOVELTY_FILE, novelty_bytes
-from pipelines.models.recipes import WindowPipeline
 from pipelines.models.results import ModelInfo
 from pipelines.reporting.json_file import as_json
 from pipelines.reporting.progress import Progress, silent
@@ -29,7 +39,7 @@ from pipelines.runs.datasets import data_digest
 from pipelines.streaming.window_feed import ESTIMATED
 from terrain import __version__
 from terrain.errors import DataError
-from terrain.records import RunLog, Windows
+from terrain.records import Array, RunLog, Windows
 
 METRICS = ("accuracy", "balanced_accuracy", "macro_f1", "vote_accuracy", "ece")
 
@@ -56,60 +66,94 @@ def train(
     TerrainError
         if the data do not suffice or the tracking folder cannot be written.
     """
-    from pipelines.classify.judging import held_out_runs, judge_of, standing_of, standing_tags
-    from pipelines.crossval_figures.figures import all_figures
     from pipelines.models.onnx_file import require_onnx
-    from pipelines.models.tracking import TrainingRecord, code_commit, ensure_tracking, log_training
+    from pipelines.models.tracking import ensure_tracking
 
-    if settings.recipe != "svm":
+    if settings.recipe != FEATURE_RECIPE:
         require_onnx()
     ensure_tracking()
     report = crossval(runs, settings.evaluation, progress) if evaluation is None else evaluation
-    report = report.named(dataset, data_digest(runs))
-    samples = samples_of(runs, settings.evaluation)
-    windows = samples.cut.windows
-    recipe = settings.new_recipe().fit(windows, windows.terrain.astype(str))
+    return _train(data_of_runs(runs, settings), report, settings, dataset, progress)
+
+
+def train_store(
+    store: FeatureStore, settings: TrainSettings, dataset: str, progress: Progress = silent
+) -> Training:
+    """Evaluate, fit, track and register a recipe of features on a store; the model is that of its runs.
+
+    Only the digest of the data differs, and where the champion needs samples to be judged on new runs.
+
+    Parameters
+    ----------
+    store : of labelled windows
+    settings, dataset, progress : as :func:`train`
+
+    Raises
+    ------
+    ConfigError
+        if the recipe needs samples.
+    TerrainError
+        if the store is damaged, its data do not suffice, or the tracking folder cannot be written.
+    """
+    from pipelines.models.tracking import ensure_tracking
+
+    refuse_recipe(settings)
+    ensure_tracking()
+    stored = read_store(store, progress)
+    report = crossval_stored(stored, settings.evaluation, store.repaired, progress)
+    return _train(data_of_store(store, stored, settings), report, settings, dataset, progress)
+
+
+def _train(
+    data: TrainingData, report: CrossvalReport, settings: TrainSettings, dataset: str, progress: Progress
+) -> Training:
+    """Fit a recipe that was evaluated, find its limits, and track and register it."""
+    from pipelines.classify.judging import held_out_runs, judge_of, standing_of, standing_tags
+    from pipelines.crossval_figures.figures import all_figures
+    from pipelines.models.tracking import TrainingRecord, code_commit, log_training
+
+    report = report.named(dataset, data.digest)
+    recipe = data.fitted()
     progress("fit on all runs", 1, 1)
-    importance = _importance(recipe, samples, settings, progress)
-    limits = limits_of(
-        recipe[-1], recipe.matrix, windows, samples.group, settings.rule.overlap, settings.seed
-    )
+    importance = _importance(data, settings, progress)
+    limit_data = LimitData(data.features, data.terrain, data.samples.group.astype(str), data.motion)
+    limits = limits_of(recipe[-1], limit_data, settings.rule.overlap, settings.seed)
     report = replace(report, notes=(*report.notes, *limits.notes))
     chosen = recipe[-1].best_._asdict()
     metrics = _metrics(report)
-    digests = {run.run_id: data_digest([run]) for run in runs}
+    digests = {run.run_id: run.digest for run in data.runs}
+    held_out = held_out_runs(data.samples, report)
     info = replace(
-        model_info(runs, settings, windows, dataset, code_commit()),
+        info_of(data, settings, dataset, code_commit()),
         evaluation=metrics,
-        run_accuracy={digests[k]: each.accuracy for k, each in held_out_runs(samples, report).items()},
+        run_accuracy={digests[run_id]: each.accuracy for run_id, each in held_out.items()},
         support=None if limits.support is None else limits.support.as_json(),
         conformal=limits.conformal,
     )
     standing = standing_of(info, report)
     record = TrainingRecord(
-        _params(settings, report, len(windows), dataset, chosen),
+        _params(settings, report, len(data), dataset, chosen),
         metrics,
         standing_tags(standing, scope_of(info)),
         {"crossval.json": as_json(report), "importance.json": {"channels": as_json(importance)}},
         all_figures(report, importance),
         {} if limits.novelty is None else {NOVELTY_FILE: novelty_bytes(limits.novelty)},
     )
-    card = model_card(settings.name, info, windows, report, chosen)
+    card = model_card(settings.name, info, data.samples.cut.windows, data.motion, report, chosen)
     registered = log_training(
         settings.name,
         recipe,
-        windows,
         info,
         record,
-        judge_of(runs, samples, report, standing, settings.seed),
-        lambda folder: written(card, folder, windows[0]).texts(),
+        judge_of(data, report, standing, settings.seed),
+        lambda folder: written(card, folder).texts(),
     )
     return Training(
         registered=registered,
         dataset=dataset,
         data_digest=info.data_digest,
         commit=info.commit,
-        n_windows=len(windows),
+        n_windows=len(data),
         chosen=chosen,
         importance=importance,
         crossval=report,
@@ -117,14 +161,13 @@ def train(
 
 
 def _importance(
-    recipe: WindowPipeline, samples: Samples, settings: TrainSettings, progress: Progress
+    data: TrainingData, settings: TrainSettings, progress: Progress
 ) -> tuple[ChannelImportance, ...]:
-    windows = samples.cut.windows
     return channel_importance(
-        clone(recipe[-1]),
-        Examples(recipe[:-1].transform(windows), windows.terrain.astype(str), samples.group),
-        list(recipe[0].get_feature_names_out()),
-        folds_of(samples, "grouped", 1, settings.seed),
+        clone(data.recipe[-1]),
+        Examples(data.rows, data.terrain, data.samples.group),
+        list(data.recipe[0].get_feature_names_out()),
+        folds_of(data.samples, "grouped", 1, settings.seed),
         settings.seed,
         settings.jobs,
         progress,
@@ -168,26 +211,46 @@ def model_info(
     DataError
         if the model uses estimates that several filters made.
     """
-    rule = settings.rule
-    filters = {run.filter for run in runs} if set(ESTIMATED) & set(windows.channels) else {""}
+    layout = Layout(windows.channels, windows.rate_hz)
+    where = _Origin(identities(runs), data_digest(runs), dataset, commit)
+    return _info(layout, windows.terrain.astype(str), settings, where)
+
+
+def info_of(data: TrainingData, settings: RecipeSettings, dataset: str, commit: str) -> ModelInfo:
+    """Return the same of data that are runs or a store; errors as :func:`model_info`."""
+    return _info(data.layout, data.terrain, settings, _Origin(data.runs, data.digest, dataset, commit))
+
+
+class _Origin(NamedTuple):
+    """Where a model comes from."""
+
+    runs: tuple[RunIdentity, ...]
+    data_digest: str
+    dataset: str
+    commit: str
+
+
+def _info(layout: Layout, terrain: Array, settings: RecipeSettings, origin: _Origin) -> ModelInfo:
+    rule, runs = settings.rule, origin.runs
+    filters = {run.filter for run in runs} if set(ESTIMATED) & set(layout.channels) else {""}
     if len(filters) > 1:
         names = " and ".join(sorted(name or "an unknown filter" for name in filters))
         raise DataError(f"the runs hold estimates of {names}: estimate all of them with one filter")
-    classes, counts = np.unique(windows.terrain.astype(str), return_counts=True)
+    classes, counts = np.unique(terrain, return_counts=True)
     return ModelInfo(
         classes=tuple(classes.tolist()),
         window_s=rule.length_s,
         stride_s=rule.stride_s,
         steady=rule.steady,
-        channels={stream: tuple(names) for stream, names in windows.channels.items()},
-        rate_hz=dict(windows.rate_hz),
-        run_digests=tuple(data_digest([run]) for run in runs),
+        channels={stream: tuple(names) for stream, names in layout.channels.items()},
+        rate_hz=dict(layout.rate_hz),
+        run_digests=tuple(run.digest for run in runs),
         recipe=settings.recipe,
         signal_sets=settings.signal_sets,
         seed=settings.seed,
-        data_digest=data_digest(runs),
-        dataset=dataset,
-        commit=commit,
+        data_digest=origin.data_digest,
+        dataset=origin.dataset,
+        commit=origin.commit,
         package_version=__version__,
         robots=tuple(sorted({run.robot for run in runs})),
         filter=filters.pop(),

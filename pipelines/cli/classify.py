@@ -29,14 +29,14 @@ def crossval_command(
     from pipelines.crossval.crossval import crossval
     from pipelines.crossval.screen import print_crossval
     from pipelines.feature_store.crossval import crossval_store
-    from pipelines.feature_store.store import is_store, open_store
+    from pipelines.feature_store.store import is_store, store_of
     from pipelines.reporting.json_file import write_json
     from pipelines.reporting.terminal import output_console, progress_bar
     from pipelines.runs.datasets import data_digest
 
     with computing(compute.compute), progress_bar() as progress:
         if is_store(source.data):
-            store = open_store(source.data, settings.rule, settings.signal_sets)
+            store = store_of(source, settings.rule, settings.signal_sets)
             report = crossval_store(store, settings, progress).named(source.dataset, store.digest)
             skipped: list[str] = []
         else:
@@ -77,19 +77,25 @@ def train_command(
     compute: ComputeSettings,
     json_file: Json = None,
 ) -> None:
-    """Evaluate on held-out runs, fit on all of them, track in MLflow and register."""
+    """Evaluate on held-out runs, fit on all of them, track in MLflow and register; also of a store."""
     from dataclasses import replace
 
     from pipelines.classify.screen import print_training
-    from pipelines.classify.train import train
+    from pipelines.classify.train import train, train_store
     from pipelines.compute.parallel import computing
     from pipelines.crossval.screen import print_crossval
+    from pipelines.feature_store.store import is_store, store_of
     from pipelines.reporting.json_file import write_json
     from pipelines.reporting.terminal import output_console, progress_bar
 
-    runs, skipped = load(source)
+    skipped: list[str] = []
     with computing(compute.compute), progress_bar() as progress:
-        found = train(runs, settings.with_(skip_short=source.repair), source.dataset, progress)
+        if is_store(source.data):
+            store = store_of(source, settings.rule, settings.signal_sets)
+            found = train_store(store, settings, source.dataset, progress)
+        else:
+            runs, skipped = load(source)
+            found = train(runs, settings.with_(skip_short=source.repair), source.dataset, progress)
     result = replace(found, skipped=tuple(skipped))
     print_crossval(replace(result.crossval, skipped=result.skipped), output_console())
     print_training(result, output_console())

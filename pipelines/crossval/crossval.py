@@ -10,7 +10,7 @@ from typing import NamedTuple
 from sklearn.base import BaseEstimator, clone
 
 from features.extractor import FeatureExtractor
-from features.motion import NO_MOTION, window_motion
+from features.motion import NO_MOTION, Motion, window_motion
 from pipelines.courses.following import following
 from pipelines.courses.judgement import find_breakaways, judge
 from pipelines.courses.results import OverTime
@@ -95,8 +95,7 @@ def crossval(
     if speed is not None:
         report = replace(report, notes=(speed.note, *report.notes))
     if settings.protocol != "published":
-        report = _with_support(report, held_out, windows, settings.seed)
-        report = replace(report, conformal=sets_of(held_out, samples, settings.seed))
+        report = with_limits(report, held_out, samples, window_motion(windows))
     if settings.protocol == "leave-terrain-out":
         unknown = leave_terrain_out(checks.examples, samples, settings.seed, settings.jobs, progress)
         report = replace(report, unknown=unknown)
@@ -191,15 +190,25 @@ def _over_time(held_out: HeldOut, windows: Windows, seed: int) -> OverTime:
     )
 
 
-def _with_support(report: CrossvalReport, held_out: HeldOut, windows: Windows, seed: int) -> CrossvalReport:
-    """Return a report with the support of its held-out windows, or with the reason why there is none."""
-    motion = window_motion(windows)
+def with_limits(
+    report: CrossvalReport, held_out: HeldOut, samples: Samples, motion: Motion | None
+) -> CrossvalReport:
+    """Return a report with the support of its held-out windows, and the figures of sets of classes.
+
+    Parameters
+    ----------
+    report : of the cross-validation
+    held_out, samples : its probabilities and windows, which need not have samples
+    motion : how the robot moved in each window; where it is None, the reason is noted
+    """
+    report = replace(report, conformal=sets_of(held_out, samples, report.seed))
     if motion is None:
         return replace(report, notes=(*report.notes, f"support: {NO_MOTION}"))
+    windows = samples.cut.windows
     splits = [(each.fold.repeat, each.fold.train, each.fold.test) for each in held_out.results]
     run_id, terrain = windows.run_id.astype(str), windows.terrain.astype(str)
     judged = Judged(motion, run_id, terrain, held_out.classes, held_out.probability, splits, windows.length_s)
-    return replace(report, support=support_report(judged, seed))
+    return replace(report, support=support_report(judged, report.seed))
 
 
 def samples_of(runs: Sequence[RunLog], settings: CrossvalSettings) -> Samples:

@@ -2,6 +2,8 @@
 
 Two passes, so that memory is bounded by a run: the first finds channels and rates that all runs have in
 common, the second cuts, computes and writes.  A run whose file is there and agrees is not computed again.
+Fingerprints of each run, some kilobytes, show which pairs of runs may hold the same measurements; these are
+read again and compared.
 """
 
 from __future__ import annotations
@@ -12,7 +14,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
 from features.extractor import FeatureExtractor
+from features.motion import Motion, window_motion
 from features.windows import cut_windows, layout_of
 from pipelines.compute.parallel import parallel
 from pipelines.feature_store.heads import Head, head_of
@@ -30,6 +35,9 @@ from pipelines.reporting.progress import Progress, silent
 from pipelines.runs.datasets import RunLoader, data_digest
 from terrain.errors import ConfigError, LogError
 from terrain.files.atomic import atomic_write, ensure_writable
+from terrain.logs.duplicates import SharedStretch, possible_pairs, shared_stretches
+from terrain.logs.fingerprints import RunPrint, run_print
+from terrain.records import Windows
 
 
 class _Plan(NamedTuple):
@@ -44,6 +52,7 @@ class _Plan(NamedTuple):
 class _Made(NamedTuple):
     run: StoredRun
     computed: bool
+    print: RunPrint
 
 
 def build_store(
@@ -77,25 +86,26 @@ def build_store(
     (store / WINDOWS_FOLDER).mkdir(parents=True, exist_ok=True)
     _write_json(store / STORE_FILE, manifest.as_json())
     plan = _Plan(manifest, extractor, manifest.identity, store)
-    runs: list[StoredRun] = []
-    n_computed = 0
+    made: list[_Made] = []
     progress("features", 0, len(kept))
-    for made in parallel(_store_run, (plan,), ((load,) for load in kept), settings.jobs):
-        runs.append(made.run)
-        n_computed += made.computed
-        progress("features", len(runs), len(kept))
-    runs.sort()
+    for one in parallel(_store_run, (plan,), ((load,) for load in kept), settings.jobs):
+        made.append(one)
+        progress("features", len(made), len(kept))
+    runs = sorted(one.run for one in made)
+    shared = _shared(kept, [one.print for one in made], settings.jobs, progress)
     _remove_others(store, runs)
-    _write_json(store / RUNS_FILE, {"runs": [run._asdict() for run in runs]})
+    lists = {"runs": [run._asdict() for run in runs], "shared": [each._asdict() for each in shared]}
+    _write_json(store / RUNS_FILE, lists)
     return StoreReport(
         out=settings.out,
         n_runs=len(runs),
-        n_computed=n_computed,
+        n_computed=sum(one.computed for one in made),
         n_windows=sum(run.n_windows for run in runs),
         n_features=len(manifest.features),
         dropped=dict(sum((Counter(run.dropped) for run in runs), Counter())),
         repaired=dict(sum((Counter(run.repaired) for run in runs), Counter())),
         skipped=tuple(f"run skipped: {head.fault}" for head in heads if head.fault is not None),
+        duplicates=shared,
     )
 
 
@@ -127,11 +137,11 @@ def _manifest(heads: Sequence[Head], settings: FeaturesSettings) -> tuple[Manife
 
 def _store_run(plan: _Plan, load: RunLoader) -> _Made:
     run = load()
-    digest = data_digest([run])
+    digest, prints = data_digest([run]), run_print(run)
     try:
         found, _ = read_run_windows(plan.store, run.run_id, plan.identity, len(plan.manifest.features))
         if found.digest == digest:
-            return _Made(found, False)
+            return _Made(found, False, prints)
     except LogError:
         pass  # missing, damaged or of other features: it is made again
     cut = cut_windows([run], plan.manifest.rule, layout=plan.manifest.layout, skip_short=load.repair)
@@ -139,9 +149,33 @@ def _store_run(plan: _Plan, load: RunLoader) -> _Made:
     entry = StoredRun(
         run.run_id, run.robot, run.filter, digest, len(windows), dict(cut.dropped), dict(run.dropped)
     )
-    rows = RunWindows(windows.start_s, windows.terrain, plan.extractor.transform(windows))
+    rows = RunWindows(
+        windows.start_s, windows.terrain, plan.extractor.transform(windows), _motion_columns(windows)
+    )
     write_run_windows(plan.store, entry, plan.identity, rows)
-    return _Made(entry, True)
+    return _Made(entry, True, prints)
+
+
+def _motion_columns(windows: Windows) -> Motion:
+    """Return the motion of the windows, NaN where it is not known."""
+    motion = window_motion(windows)
+    return Motion(*np.full((len(Motion._fields), len(windows)), np.nan)) if motion is None else motion
+
+
+def _shared(
+    loaders: Sequence[RunLoader], prints: Sequence[RunPrint], n_jobs: int, progress: Progress
+) -> tuple[SharedStretch, ...]:
+    """Return the stretches that two of the runs share, in the order of their ids."""
+    pairs = [(loaders[first], loaders[second]) for first, second in possible_pairs(prints)]
+    found: list[SharedStretch] = []
+    for done, stretches in enumerate(parallel(_compared, (), pairs, n_jobs)):
+        found += stretches
+        progress("compare runs", done + 1, len(pairs))
+    return tuple(sorted(found))
+
+
+def _compared(first: RunLoader, second: RunLoader) -> tuple[SharedStretch, ...]:
+    return shared_stretches(sorted((first(), second()), key=lambda run: run.run_id))
 
 
 def _remove_others(store: Path, runs: Sequence[StoredRun]) -> None:

@@ -1,7 +1,7 @@
 """What all files of a store have in common, and the list of its runs: two JSON files.
 
 ``store.json`` is written before the first run, ``runs.json`` after the last:
-a store without it is unfinished.
+a store without it is unfinished.  ``runs.json`` lists the stretches that two runs share as well.
 """
 
 from __future__ import annotations
@@ -17,8 +17,12 @@ from features.windows import Layout, SteadyMotion, WindowRule
 from terrain import __version__
 from terrain.errors import ConfigError, LogError
 from terrain.files.documents import read_json
+from terrain.files.names import shown
+from terrain.logs.duplicates import SharedStretch
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
+"""1: without the motion of each window and the stretches that runs share."""
+
 STORE_FILE, RUNS_FILE, WINDOWS_FOLDER = "store.json", "runs.json", "windows"
 
 
@@ -107,11 +111,16 @@ def read_manifest(folder: Path) -> Manifest:
         raise LogError(f"{folder}: is no store of features ({STORE_FILE} is missing)")
     document = read_json(place, str(place), LogError)
     try:
-        made_by = (document["format_version"], document["package_version"])
-        if made_by != (FORMAT_VERSION, __version__):
+        made_as, made_by = document["format_version"], document["package_version"]
+        if made_as != FORMAT_VERSION:
             raise ConfigError(
-                f"{folder}: version {made_by[1]} made this store of features, this is {__version__}: "
-                "make it anew with terrain features"
+                f"{folder}: is a store of features of format {shown(made_as)}, format {FORMAT_VERSION} is "
+                "read here: build it again with terrain features"
+            )
+        if made_by != __version__:
+            raise ConfigError(
+                f"{folder}: version {shown(made_by)} made this store of features, this is {__version__}: "
+                "build it again with terrain features"
             )
         rule = dict(document["rule"])
         steady = None if rule["steady"] is None else SteadyMotion(**rule["steady"])
@@ -128,8 +137,15 @@ def read_manifest(folder: Path) -> Manifest:
         raise LogError(f"{place}: is damaged ({type(error).__name__}: {error})") from error
 
 
-def read_runs(folder: Path) -> tuple[StoredRun, ...]:
-    """Return the runs of a finished store, sorted by their id.
+class StoredRuns(NamedTuple):
+    """The runs of a finished store, sorted by their id, and the stretches that two of them share."""
+
+    runs: tuple[StoredRun, ...]
+    shared: tuple[SharedStretch, ...]
+
+
+def read_runs(folder: Path) -> StoredRuns:
+    """Return what ``runs.json`` holds.
 
     Raises
     ------
@@ -143,6 +159,9 @@ def read_runs(folder: Path) -> tuple[StoredRun, ...]:
         )
     document = read_json(place, str(place), LogError)
     try:
-        return tuple(StoredRun(**entry) for entry in document["runs"])
+        return StoredRuns(
+            tuple(StoredRun(**entry) for entry in document["runs"]),
+            tuple(SharedStretch(**entry) for entry in document["shared"]),
+        )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise LogError(f"{place}: is damaged ({type(error).__name__}: {error})") from error

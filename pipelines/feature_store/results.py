@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from terrain.logs.duplicates import SharedStretch
+
 
 @dataclass(frozen=True, slots=True)
 class StoreReport:
@@ -19,6 +21,7 @@ class StoreReport:
     dropped : windows left out, as counts by reason
     repaired : what a repairing reader dropped, as counts by kind
     skipped : a sentence for each run that could not be read
+    duplicates : stretches that two of the runs share; crossval and train refuse them
     """
 
     out: Path
@@ -29,3 +32,4 @@ class StoreReport:
     dropped: Mapping[str, int]
     repaired: Mapping[str, int]
     skipped: tuple[str, ...]
+    duplicates: tuple[SharedStretch, ...]

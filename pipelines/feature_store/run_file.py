@@ -1,4 +1,4 @@
-"""The file of a run: a row a window, its features as one column of lists of equal length."""
+"""The file of a run: a row a window: start, terrain, motion, and its features as a list of equal length."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from features.motion import Motion
 from pipelines.feature_store.manifest import WINDOWS_FOLDER, StoredRun
 from terrain.errors import LogError
 from terrain.files.atomic import atomic_file
@@ -20,11 +21,19 @@ KEY = b"terrain"
 
 
 class RunWindows(NamedTuple):
-    """The rows of a run: ``start_s (n,)``, ``terrain (n,)`` (empty without one), ``features (n, f)``."""
+    """The rows of a run.
+
+    Parameters
+    ----------
+    start_s, terrain : (n,) start and label of each window, the label empty without one
+    features : (n, f)
+    motion : how the robot moved in each window; NaN where that is not known
+    """
 
     start_s: Array
     terrain: Array
     features: Array
+    motion: Motion
 
 
 def file_of(store: Path, run_id: str) -> Path:
@@ -51,6 +60,7 @@ def write_run_windows(store: Path, entry: StoredRun, identity: str, rows: RunWin
         {
             "start_s": pyarrow.array(rows.start_s, pyarrow.float64()),
             "terrain": pyarrow.array([str(name) for name in rows.terrain], pyarrow.string()),
+            **{name: pyarrow.array(each, pyarrow.float64()) for name, each in rows.motion._asdict().items()},
             "features": pyarrow.FixedSizeListArray.from_arrays(flat, width),
         }
     )
@@ -85,6 +95,7 @@ def read_run_windows(
             table.column("start_s").to_numpy(),
             np.array(table.column("terrain").to_pylist(), dtype=object),
             flat.reshape(table.num_rows, n_features),
+            Motion(*(table.column(name).to_numpy() for name in Motion._fields)),
         )
         if document.pop("sha256") != _checksum(document, rows):
             raise ValueError("its checksum differs")
@@ -102,6 +113,6 @@ def _checksum(document: Mapping[str, Any], rows: RunWindows) -> str:
     """Return a SHA-256 over all that a file holds; page checksums of Parquet leave its headers out."""
     digest = hashlib.sha256(json.dumps(document, sort_keys=True).encode())
     digest.update("\n".join(str(name) for name in rows.terrain).encode())
-    for values in (rows.start_s, rows.features):
+    for values in (rows.start_s, rows.features, *rows.motion):
         digest.update(np.ascontiguousarray(values, dtype="<f8").tobytes())
     return digest.hexdigest()

@@ -7,6 +7,7 @@ from rich.console import Console
 from pipelines.feature_store.results import StoreReport
 from pipelines.reporting.numbers import format_counts
 from pipelines.reporting.terminal import print_lines
+from pipelines.runs.duplicates import sentences
 
 
 def print_store(report: StoreReport, console: Console) -> None:
@@ -19,4 +20,4 @@ def print_store(report: StoreReport, console: Console) -> None:
     for text, counts in (("windows left out", report.dropped), ("repaired", report.repaired)):
         if counts:
             lines.append(f"{text}: {format_counts(counts)}")
-    print_lines(console, [*lines, *report.skipped])
+    print_lines(console, [*lines, *sentences(report.duplicates), *report.skipped])

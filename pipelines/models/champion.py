@@ -178,8 +178,8 @@ _NOUNS = {"robots": "robots are", "classes": "classes are", "window": "windows a
 def _on_new_data(version: str, found: Comparison | None, remark: str) -> tuple[bool, str]:
     if found is None:
         return False, (
-            f"new data: no run on which version {version} can be judged, as it was trained on them and has "
-            "no figures by run"
+            f"new data: no run on which version {version} can be judged: it was trained on them and has no "
+            "figures by run, or it needs other rates, features or the samples of runs"
         )
     low, high = found.difference_ci
     unknown = f", {found.n_unknown} more not compared" if found.n_unknown else ""

@@ -27,7 +27,6 @@ from pipelines.models.results import ModelInfo, Registered
 from terrain.errors import ModelError, TerrainError
 from terrain.files.atomic import atomic_write, ensure_writable
 from terrain.files.lock import file_lock
-from terrain.records import Windows
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -191,7 +190,6 @@ def _failures(mlflow: Any) -> tuple[type[Exception], ...]:
 def log_training(
     name: str,
     recipe: WindowPipeline,
-    windows: Windows,
     info: ModelInfo,
     record: TrainingRecord,
     judge: Judge,
@@ -205,7 +203,6 @@ def log_training(
     ----------
     name : name of the registered model
     recipe : fitted recipe
-    windows : the windows it was fitted on, for the signature
     info : content of ``terrain_model.json``
     record : what else is logged
     judge : decides whether the alias moves
@@ -224,7 +221,7 @@ def log_training(
             with mlflow.start_run(run_name=name) as run:
                 tags = {key: getattr(info, key) for key in ("data_digest", "commit", "seed")}
                 _log(mlflow, record.params, record.metrics, tags, record.documents, record.figures)
-                logged = _log_model(mlflow, name, recipe, windows, info, card, record.files)
+                logged = _log_model(mlflow, name, recipe, info, card, record.files)
             return _promote(
                 mlflow, name, str(logged.registered_model_version), run.info.run_id, record.tags, judge
             )
@@ -290,7 +287,6 @@ def _log_model(
     mlflow: Any,
     name: str,
     recipe: WindowPipeline,
-    windows: Windows,
     info: ModelInfo,
     card: CardWriter | None,
     files: Mapping[str, bytes],
@@ -317,20 +313,20 @@ def _log_model(
             name="model",
             flavor=flavor,
             registered_model_name=name,
-            signature=_signature(recipe, windows),
+            signature=_signature(recipe),
             serialization_format="skops",
             skops_trusted_types=list(TRUSTED_TYPES),
             pip_requirements=[f"{package}=={version(package)}" for package in REQUIREMENTS],
         )
 
 
-def _signature(recipe: WindowPipeline, windows: Windows) -> Any:
+def _signature(recipe: WindowPipeline) -> Any:
     import numpy as np
     from mlflow.models import ModelSignature
     from mlflow.types import Schema, TensorSpec
 
     inputs = [
-        TensorSpec(np.dtype("float64"), (-1, len(names), windows.values[stream].shape[2]), stream)
+        TensorSpec(np.dtype("float64"), (-1, len(names), recipe.matrix.n_samples[stream]), stream)
         for stream, names in recipe.matrix.layout.channels.items()
     ]
     return ModelSignature(Schema(inputs), Schema([TensorSpec(np.dtype("str"), (-1,))]))

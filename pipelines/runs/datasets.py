@@ -180,6 +180,17 @@ def data_digest(runs: Sequence[RunLog]) -> str:
     return digest.hexdigest()
 
 
+def joint_digest(digests: Sequence[str]) -> str:
+    """Return a SHA-256 over the digests of runs, whatever their order.
+
+    Examples
+    --------
+    >>> joint_digest(["ab", "cd"]) == joint_digest(["cd", "ab"])
+    True
+    """
+    return hashlib.sha256("".join(f"{digest}\n" for digest in sorted(digests)).encode()).hexdigest()
+
+
 def _canonical_bytes(array: Array) -> bytes:
     """Return little-endian doubles with one form of NaN and one of zero."""
     return (np.where(np.isnan(array), np.nan, array) + 0.0).astype("<f8").tobytes()

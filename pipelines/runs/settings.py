@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple, Protocol, TypeVar
 
 from pydantic import field_validator
 
@@ -68,6 +69,17 @@ class ImportSettings(InspectSettings):
     out: Path = setting(..., "Folder of the new run folders.")
 
 
+class Named(Protocol):
+    """What has the id of a run."""
+
+    @property
+    def run_id(self) -> str:
+        """Id of the run."""
+
+
+AnyRun = TypeVar("AnyRun", bound=Named)
+
+
 class LoadedRuns(NamedTuple):
     """Runs, and a sentence for each run that a repairing read had to skip."""
 
@@ -101,11 +113,18 @@ def load(settings: RunsSettings, robot: str | None = None) -> LoadedRuns:
         on_skip=skipped.append,
     )
     if isinstance(settings, AlignedRunsSettings):
-        runs = _chosen(runs, settings)
+        runs = chosen_runs(runs, settings)
     return LoadedRuns(runs, skipped)
 
 
-def _chosen(runs: list[RunLog], settings: AlignedRunsSettings) -> list[RunLog]:
+def chosen_runs(runs: Sequence[AnyRun], settings: AlignedRunsSettings) -> list[AnyRun]:
+    """Return the runs that ``--only`` and ``--without`` leave.
+
+    Raises
+    ------
+    ConfigError
+        if there is no run of a name, or none is left.
+    """
     known = [run.run_id for run in runs]
     for option, names in (("--only", settings.only), ("--without", settings.without)):
         for name in names:

@@ -17,45 +17,36 @@ take no part.
 
 from __future__ import annotations
 
-import hashlib
 from collections import defaultdict
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from terrain.logs.plausible import MAX_MAGNITUDE
-from terrain.logs.schema import signal_set_of
-from terrain.records import Array, RunLog, Stream
-
-N_PEAKS = 16
-"""Peaks of a fingerprint: 42 comparisons, of which some 30 are independent."""
-
-LAGS = (1, 2, 3)
-"""A peak is compared with so many that follow it."""
-
-SMOOTHING_S = 0.04
-"""Standard deviation of the low-pass filter: some five peaks a second, whatever the sampling rate."""
-
-MEASURED_SETS = ("imu", "wheels", "currents")
-"""Signal sets whose channels are measured; what a filter makes of them adds nothing."""
+from terrain.logs.fingerprints import (
+    N_PEAKS,
+    Peaks,
+    RunPrint,
+    fingerprints,
+    measured_streams,
+    samples_digest,
+    scaled_heights,
+)
+from terrain.records import Array, RunLog
 
 MIN_CORRELATION = 0.99
 """Of the heights of two stretches whose order agrees already; copies rounded to a tenth of the standard
 deviation of their channel are above 0.995."""
-
-MIN_SPREAD_RATIO = 0.1
-"""Heights that differ by less than this part of the channel's standard deviation are those of a periodic
-signal or of noise in the last digit, which repeats from run to run."""
-
-MIN_LEVELS = 10
-"""Different heights of a stretch: channels that go back and forth between a few values repeat themselves."""
 
 MAX_RATE_RATIO = 1.1
 """Clocks of two copies may run at rates that differ by less than this; those of loggers differ by 4 %."""
 
 MIN_STRETCHES = 3
 """Fingerprints that must agree in their offset; three are one more peak each, not three times the time."""
+
+MIN_EQUAL = 6
+"""Equal fingerprints without their heights: 21 peaks of one channel, or fewer of several.  Of 10000 runs of
+noise of one kind, some hundred pairs agree in so many by chance."""
 
 OFFSET_TOLERANCE_S = 0.3
 """Fingerprints of one overlap agree in their offset within this, and a tenth of the time between them."""
@@ -65,9 +56,6 @@ MAX_HOLE_S = 15.0
 
 EDGE_S = 1.5
 """An overlap that reaches so close to the end of a run reaches its end: the first peaks come later."""
-
-MIN_DISTINCT = 64
-"""Values that a stream must have taken for its bytes to identify it."""
 
 
 class SharedStretch(NamedTuple):
@@ -99,16 +87,6 @@ class SharedStretch(NamedTuple):
         return self.first_end_s - self.first_start_s
 
 
-class _Peaks(NamedTuple):
-    """Peaks of all channels of all runs, one after the other; ``spread`` is that of the channel."""
-
-    run: Array
-    time_s: Array
-    height: Array
-    spread: Array
-    period_s: Array
-
-
 class _Matches(NamedTuple):
     """Stretches (m,) of two runs whose peaks agree."""
 
@@ -131,6 +109,7 @@ def shared_stretches(runs: Sequence[RunLog]) -> tuple[SharedStretch, ...]:
 
     Examples
     --------
+    >>> from terrain.records import Stream
     >>> noise = np.random.default_rng(0).normal(size=(1000, 1))
     >>> def run(run_id, rows, start_s):
     ...     time_s = start_s + np.arange(len(rows)) / 50.0
@@ -141,7 +120,7 @@ def shared_stretches(runs: Sequence[RunLog]) -> tuple[SharedStretch, ...]:
     """
     found = [
         stretch
-        for (first, second), rows in _by_pair(_matches(*_fingerprints(runs))).items()
+        for (first, second), rows in _by_pair(_matches(*fingerprints(runs))).items()
         for stretch in _stretches(rows, runs[first], runs[second])
     ]
     known = {(stretch.first, stretch.second) for stretch in found}
@@ -149,70 +128,7 @@ def shared_stretches(runs: Sequence[RunLog]) -> tuple[SharedStretch, ...]:
     return tuple(sorted(found, key=lambda stretch: (stretch.first, stretch.second, stretch.first_start_s)))
 
 
-def _measured(run: RunLog) -> list[tuple[Stream, list[int]]]:
-    """Return the streams that were measured, with the places of the channels that features are made of."""
-    chosen = []
-    for name, stream in run.streams.items():
-        places = [i for i, each in enumerate(stream.channels) if signal_set_of(name, each) in MEASURED_SETS]
-        if places and len(stream) > 1:
-            chosen.append((stream, places))
-    return chosen
-
-
-def _fingerprints(runs: Sequence[RunLog]) -> tuple[Array, Array, _Peaks]:
-    """Return the fingerprints (n,), the place (n,) of their first peak, and all peaks."""
-    parts: list[tuple[Array, ...]] = []
-    codes: list[Array] = []
-    starts: list[Array] = []
-    n_peaks = 0
-    for number, run in enumerate(runs):
-        for stream, places in _measured(run):
-            period_s = 1.0 / stream.rate_hz
-            for place in places:
-                smooth = _low_pass(stream.values[:, place], SMOOTHING_S / period_s)
-                at = 1 + np.flatnonzero((smooth[1:-1] > smooth[:-2]) & (smooth[1:-1] >= smooth[2:]))
-                if len(at) < N_PEAKS:
-                    continue
-                height = smooth[at]
-                codes.append(_codes(height))
-                starts.append(n_peaks + np.arange(len(codes[-1])))
-                spread = float(np.nanstd(smooth))
-                constant = (np.full(len(at), each) for each in (number, spread, period_s))
-                of_run, of_spread, of_period = constant
-                parts.append((of_run.astype(int), stream.time_s[at], height, of_spread, of_period))
-                n_peaks += len(at)
-    if not parts:
-        nothing = np.empty(0)
-        return np.empty(0, np.int64), np.empty(0, int), _Peaks(*[nothing] * 5)
-    peaks = _Peaks(*(np.concatenate(column) for column in zip(*parts, strict=True)))
-    return np.concatenate(codes), np.concatenate(starts), peaks
-
-
-def _low_pass(values: Array, std_samples: float) -> Array:
-    """Return values (n,) behind a Gaussian filter; NaN where one is near, and at both ends."""
-    values = np.where(np.abs(values) <= MAX_MAGNITUDE, values, np.nan)
-    half = min(int(np.ceil(3.0 * std_samples)), (len(values) - 1) // 2)
-    if std_samples < 0.5 or half < 1:
-        return values
-    weights = np.exp(-0.5 * (np.arange(-half, half + 1) / std_samples) ** 2)
-    smooth = np.convolve(values, weights / weights.sum(), mode="same")
-    smooth[:half] = smooth[len(smooth) - half :] = np.nan
-    return smooth
-
-
-def _codes(height: Array) -> Array:
-    """Return the fingerprint (n - N_PEAKS + 1,) that begins with each peak of a channel."""
-    n = len(height) - N_PEAKS + 1
-    codes = np.zeros(n, dtype=np.int64)
-    for lag in LAGS:
-        higher = (height[:-lag] < height[lag:]).astype(np.int64)
-        for i in range(N_PEAKS - lag):
-            codes <<= 1
-            codes |= higher[i : i + n]
-    return codes
-
-
-def _matches(codes: Array, start: Array, peaks: _Peaks) -> _Matches:
+def _matches(codes: Array, start: Array, peaks: Peaks) -> _Matches:
     """Return where two runs have one fingerprint, and heights and times of its peaks agree."""
     order = np.argsort(codes, kind="stable")
     codes, start = codes[order], start[order]
@@ -229,17 +145,8 @@ def _matches(codes: Array, start: Array, peaks: _Peaks) -> _Matches:
 
 def _heights_agree(heights: Sequence[Array], spreads: Sequence[Array]) -> Array:
     """Return where heights (m, N_PEAKS) of both runs are one another's up to offset and factor."""
-    scaled = []
-    varies = np.ones(len(heights[0]), dtype=bool)
-    for height, spread in zip(heights, spreads, strict=True):
-        centred = height - height.mean(axis=1, keepdims=True)
-        norm = np.sqrt(np.einsum("ij,ij->i", centred, centred))
-        varies &= norm > MIN_SPREAD_RATIO * spread * np.sqrt(N_PEAKS)
-        varies &= norm > 1e-9 * np.abs(height).max(axis=1)  # rounding
-        steps = np.diff(np.sort(centred, axis=1), axis=1)
-        varies &= 1 + (steps > 1e-6 * norm[:, None]).sum(axis=1) >= MIN_LEVELS
-        scaled.append(centred / np.where(norm > 0.0, norm, 1.0)[:, None])
-    return np.asarray(varies & (np.einsum("ij,ij->i", *scaled) > MIN_CORRELATION))
+    (a, a_varies), (b, b_varies) = map(scaled_heights, heights, spreads)
+    return np.asarray(a_varies & b_varies & (np.einsum("ij,ij->i", a, b) > MIN_CORRELATION))
 
 
 def _times_agree(times_s: Sequence[Array], period_s: Array) -> Array:
@@ -296,11 +203,11 @@ def _widened(rows: Array, first: RunLog, second: RunLog) -> SharedStretch:
 
 
 def _begin_s(run: RunLog) -> float:
-    return min(float(stream.time_s[0]) for stream, _ in _measured(run))
+    return min(float(stream.time_s[0]) for stream, _ in measured_streams(run))
 
 
 def _end_s(run: RunLog) -> float:
-    return max(float(stream.time_s[-1]) for stream, _ in _measured(run))
+    return max(float(stream.time_s[-1]) for stream, _ in measured_streams(run))
 
 
 def _same_bytes(runs: Sequence[RunLog]) -> list[SharedStretch]:
@@ -308,23 +215,43 @@ def _same_bytes(runs: Sequence[RunLog]) -> list[SharedStretch]:
     seen: dict[bytes, RunLog] = {}
     found = []
     for run in runs:
-        measured = _measured(run)
-        if not measured:
-            continue
-        stream, places = max(measured, key=lambda each: each[0].rate_hz)
-        with np.errstate(over="ignore"):
-            values = stream.values[:, places].astype(np.float32)
-        if max(len(np.unique(column)) for column in values.T) < min(MIN_DISTINCT, len(values)):
-            continue
-        digest = hashlib.blake2b(np.ascontiguousarray(values + np.float32(0.0)).tobytes()).digest()
-        first = seen.setdefault(digest, run)
-        if first is not run:
+        digest = samples_digest(run)
+        if digest and (first := seen.setdefault(digest, run)) is not run:
             found.append(
                 SharedStretch(
                     first.run_id, run.run_id, _begin_s(first), _end_s(first), _begin_s(run), _end_s(run)
                 )
             )
     return found
+
+
+def possible_pairs(prints: Sequence[RunPrint]) -> list[tuple[int, int]]:
+    """Return the pairs of runs, by their places, that may share a stretch; :func:`shared_stretches` decides.
+
+    Examples
+    --------
+    >>> codes, time_s = np.arange(9), np.arange(9.0)
+    >>> possible_pairs([RunPrint(codes, time_s, b""), RunPrint(codes[1:], 50.0 + time_s[1:], b"")])
+    [(0, 1)]
+    """
+    run = np.repeat(np.arange(len(prints)), [len(each.codes) for each in prints])
+    codes = np.concatenate([np.empty(0, np.int64), *(each.codes for each in prints)])
+    time_s = np.concatenate([np.empty(0), *(each.time_s for each in prints)])
+    order = np.argsort(codes, kind="stable")
+    codes, run, time_s = codes[order], run[order], time_s[order]
+    same = np.flatnonzero((codes[1:] == codes[:-1]) & (run[1:] != run[:-1]))
+    first, second, offset_s = run[same], run[same + 1], time_s[same + 1] - time_s[same]
+    order = np.lexsort((offset_s, second, first))
+    first, second, offset_s = first[order], second[order], offset_s[order]
+    a, b = slice(None, 1 - MIN_EQUAL), slice(MIN_EQUAL - 1, None)
+    near = offset_s[b] - offset_s[a] <= (MIN_EQUAL - 1) * (OFFSET_TOLERANCE_S + 0.1 * MAX_HOLE_S)
+    near &= (first[a] == first[b]) & (second[a] == second[b])
+    found = set(zip(first[a][near].tolist(), second[a][near].tolist(), strict=True))
+    seen: dict[bytes, int] = {}
+    for place, each in enumerate(prints):
+        if each.digest and (before := seen.setdefault(each.digest, place)) != place:
+            found.add((before, place))
+    return sorted(found)
 
 
 def groups_of(stretches: Sequence[SharedStretch]) -> tuple[tuple[str, ...], ...]:

@@ -1,5 +1,6 @@
 """Every model has a card beside it, which no name can break and no change escapes its checksum."""
 
+import io
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -8,8 +9,11 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from rich.console import Console
 
+from features.motion import window_motion
 from pipelines.classify.card import CARD_FILE, CARD_JSON, figure_rows, model_card
+from pipelines.classify.card_support import support_tables
 from pipelines.crossval.crossval import samples_of
 from pipelines.models.model_files import INFO_FILE, read_lean_model, read_model
 from pipelines.reporting.numbers import NOT_KNOWN
@@ -24,9 +28,8 @@ def card(tracked, runs, settings, make_report):
     windows = samples_of(runs, settings()).cut.windows
 
     def make(report=None, **changed):
-        return model_card(
-            "drawn", replace(info, **changed), windows, report or tracked[1].crossval, {"C": 10.0}
-        )
+        info_changed, of_report = replace(info, **changed), report or tracked[1].crossval
+        return model_card("drawn", info_changed, windows, window_motion(windows), of_report, {"C": 10.0})
 
     return make
 
@@ -202,3 +205,59 @@ def test_a_regime_without_a_window_is_a_limit(card, in_tracked):
     row = SupportRow("GRAVEL", "spin at 0.3 to 0.4 m/s", 0, 0, None)
     without = replace(report, support=report.support._replace(rows=(row,)))
     assert "Regimes without a training window: GRAVEL at spin at 0.3 to 0.4 m/s." in card(without).limits
+
+
+REGIMES = ("straight at 0.1 to 0.3 m/s", "curve at 0.1 to 0.3 m/s")
+
+
+def with_support(report, terrains, accuracy=0.931):
+    """Return the report with the last terrain never driven in a curve."""
+    rows = [
+        SupportRow(name, regime, 42, 3, accuracy)
+        if name != terrains[-1] or regime == REGIMES[0]
+        else SupportRow(name, regime, 0, 0, None)
+        for name in terrains
+        for regime in REGIMES
+    ]
+    return replace(report, support=report.support._replace(rows=tuple(rows)))
+
+
+def test_the_table_of_support_has_every_terrain_in_every_regime(card, in_tracked):
+    texts = card(with_support(in_tracked.crossval, ("A|B", "GRASS"))).texts()
+    lines = texts[CARD_FILE].splitlines()
+    at = lines.index("## Support")
+    table = [line for line in lines[at : at + 10] if line.startswith("|")]
+    assert table == [
+        "| driving | A\\|B | GRASS |",
+        "|---|---|---|",
+        "| straight at 0.1 to 0.3 m/s | 3/42 93% | 3/42 93% |",
+        "| curve at 0.1 to 0.3 m/s | 3/42 93% | **none** |",
+    ]
+    rows = json.loads(texts[CARD_JSON])["support"]
+    assert [row["regime"] for row in rows] == list(REGIMES)
+    assert rows[1]["cells"][1] == {"terrain": "GRASS", "n_runs": 0, "n_windows": 0, "accuracy": None}
+    assert "## Support" not in card(replace(in_tracked.crossval, support=None)).texts()[CARD_FILE]
+
+
+def test_a_trained_model_shows_the_runs_and_windows_of_its_terrains(model_dir, in_tracked):
+    rows = json.loads((model_dir / CARD_JSON).read_text())["support"]
+    cells = [cell for row in rows for cell in row["cells"]]
+    assert sum(cell["n_windows"] for cell in cells) == in_tracked.n_windows
+    of_report = {(row.regime, row.terrain): row.accuracy for row in in_tracked.crossval.support.rows}
+    assert {(r["regime"], c["terrain"]): c["accuracy"] for r in rows for c in r["cells"]} == of_report
+
+
+def test_the_table_for_a_terminal_is_split_where_it_is_too_wide(card, in_tracked):
+    names = tuple(f"TERRAIN_NUMBER_{i:02d}_OF_A_LONG_NAME" for i in range(12))
+    rows = card(with_support(in_tracked.crossval, names, None)).support
+    assert rows[0].cells[0].text == f"3/42 {NOT_KNOWN}"
+    for width in (30, 80, 110, 400):
+        console = Console(width=width, record=True, soft_wrap=True, markup=False, file=io.StringIO())
+        tables = list(support_tables(rows, width))
+        assert sum(len(table.columns) - 1 for table in tables) == 12
+        for table in tables:
+            console.print(table)
+        text = console.export_text()
+        assert text.count("none") == 1
+        assert all(len(line.rstrip()) <= max(width, 60) for line in text.splitlines())
+    assert list(support_tables((), 80)) == []

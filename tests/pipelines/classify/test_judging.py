@@ -6,10 +6,14 @@ import numpy as np
 import pytest
 
 from pipelines.classify.judging import compare, held_out_runs, judge_of, standing_of
+from pipelines.classify.settings import TrainSettings
+from pipelines.classify.training_data import data_of_runs, identities
 from pipelines.crossval.crossval import crossval, samples_of
 from pipelines.models.model_files import TerrainModel, read_model
 from pipelines.models.tracking import Champion
 from pipelines.runs.datasets import data_digest
+
+TRAINING = TrainSettings(name="drawn", repeats=1, n_jobs=1)
 
 
 @pytest.fixture(scope="module")
@@ -18,11 +22,11 @@ def model(tracked):
 
 
 def judged(model, runs, settings, report=None):
-    samples = samples_of(runs, settings())
+    data = data_of_runs(runs, TRAINING)
     report = crossval(runs, settings()) if report is None else report
     info = replace(model.info, data_digest=data_digest(runs))
-    judge = judge_of(runs, samples, report, standing_of(info, report), 0)
-    return judge(Champion("1", {"macro_f1": "0.9"}, model), "2"), samples, report
+    judge = judge_of(data, report, standing_of(info, report), 0)
+    return judge(Champion("1", {"macro_f1": "0.9"}, model), "2"), data.samples, report
 
 
 def test_the_champion_is_judged_on_runs_that_it_never_saw(model, drive_all, settings):
@@ -60,19 +64,19 @@ def test_it_stays_where_it_is_better_and_goes_where_it_is_not(model, drive_all, 
 
 
 def test_its_own_runs_count_with_the_figures_of_when_they_were_held_out(model, runs, drive_all, settings):
-    data = [*runs, *(replace(run, run_id=f"{run.run_id}_new") for run in drive_all(n_runs=1, seed=47))]
-    samples, report = samples_of(data, settings()), crossval(data, settings())
-    digests = {run.run_id: data_digest([run]) for run in data}
-    held_out = held_out_runs(samples, report)
+    more = [*runs, *(replace(run, run_id=f"{run.run_id}_new") for run in drive_all(n_runs=1, seed=47))]
+    data, report = data_of_runs(more, TRAINING), crossval(more, settings())
+    digests = {run.run_id: run.digest for run in identities(more)}
+    held_out = held_out_runs(data.samples, report)
     cheat = TerrainModel(Oracle(model.info.classes, None, True), model.info)
-    found = compare(cheat, samples, held_out, digests, 0)
+    found = compare(cheat, data, held_out, 0)
     own = [model.info.run_accuracy[digests[run.run_id]] for run in runs]
     assert found.n_runs == 15
     assert found.champion == pytest.approx((np.sum(own) + 3) / 15)  # what it was trained on is not predicted
     unknown = TerrainModel(cheat.recipe, replace(model.info, run_accuracy={}))
-    assert compare(unknown, samples, held_out, digests, 0).n_unknown == 12
+    assert compare(unknown, data, held_out, 0).n_unknown == 12
     only_old = {run.run_id: each for run in runs for each in [held_out[run.run_id]]}
-    assert compare(unknown, samples, only_old, digests, 0) is None
+    assert compare(unknown, data, only_old, 0) is None
 
 
 def test_held_out_figures_of_a_run_count_all_of_its_terrains(make_report, runs, settings):

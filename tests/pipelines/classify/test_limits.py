@@ -7,8 +7,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from features.motion import window_motion
 from features.windows import cut_windows
-from pipelines.classify.limits import limits_of
+from pipelines.classify.limits import LimitData, limits_of
 from pipelines.classify.predict import NOT_LEARNED, predict
 from pipelines.live.observer import TerrainObserver
 from pipelines.models.assess import assess, class_sets
@@ -160,7 +161,9 @@ def test_limits_that_the_data_do_not_give_are_none_with_a_reason(model, runs):
     classifier = SimpleNamespace(
         classes_=np.unique(windows.terrain), inner_probability_=np.full((12, 1), np.nan)
     )
-    found = limits_of(classifier, model.recipe.matrix, windows, windows.run_id, 1, 0)
+    terrain, run_id = windows.terrain.astype(str), windows.run_id.astype(str)
+    data = LimitData(model.recipe.matrix.of(windows), terrain, run_id, window_motion(windows))
+    found = limits_of(classifier, data, 1, 0)
     assert (found.novelty, found.conformal) == (None, None)
     assert [note.partition(":")[0] for note in found.notes] == [
         "no window is ever called unknown",

@@ -24,8 +24,23 @@ def test_a_registered_model_and_its_folder_state_the_same(in_tracked, model_dir)
     print_model(by_name, console)
     text = console.export_text()
     assert f"accuracy of single windows: {in_tracked.crossval.accuracy:.1%}" in text
+    for row in in_tracked.crossval.support.rows:
+        cell = f"{row.n_runs}/{row.windows} {row.accuracy:.0%}" if row.windows else "none"
+        (line,) = [each for each in text.splitlines() if each.lstrip().startswith(row.regime)]
+        assert cell in line
     for expected in ("GRAVEL", "not for: Robots other than husky", "novelty.npz", "answers unknown: yes"):
         assert expected in text
+
+
+def test_a_card_of_an_earlier_release_has_no_table_of_support(model_dir):
+    info = read_model(model_dir).info
+    card = json.loads((model_dir / CARD_JSON).read_text())
+    del card["support"]
+    (model_dir / CARD_JSON).write_text(json.dumps(card))
+    write_info(model_dir, info)
+    console = Console(width=200, record=True)
+    print_model(model_statement(str(model_dir)), console)
+    assert "when held out" not in console.export_text()
 
 
 def test_a_model_without_a_card_says_so(model_dir):

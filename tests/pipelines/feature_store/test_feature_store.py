@@ -2,6 +2,7 @@
 
 import gc
 import json
+import shutil
 import warnings
 import weakref
 from dataclasses import replace
@@ -9,22 +10,25 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from features.motion import NO_MOTION, Motion, window_motion
 from features.windows import layout_of
 from pipelines.compute.parallel import computing
 from pipelines.crossval.crossval import crossval, samples_of
 from pipelines.crossval.settings import CrossvalSettings
 from pipelines.feature_store import build, manifest
 from pipelines.feature_store.build import build_store
-from pipelines.feature_store.crossval import NO_SUPPORT, crossval_store
+from pipelines.feature_store.crossval import NO_EXTRAS, crossval_store
 from pipelines.feature_store.heads import Head, _head, head_of
 from pipelines.feature_store.run_file import read_run_windows
 from pipelines.feature_store.settings import FeaturesSettings
-from pipelines.feature_store.store import is_store, open_store, read_store
+from pipelines.feature_store.store import is_store, open_store, read_store, store_of
 from pipelines.models.recipes import feature_matrix
 from pipelines.reporting.json_file import as_json
-from pipelines.runs.datasets import load_runs, run_loaders
+from pipelines.runs.datasets import joint_digest, load_runs, run_loaders
+from pipelines.runs.settings import AlignedRunsSettings
 from terrain.errors import ConfigError, DataError, LogError
 from terrain.logs.write import write_run
+from terrain.records import Label, Stream
 
 SETTINGS = CrossvalSettings(repeats=1, steady=False, n_jobs=1, extras=False)
 
@@ -64,20 +68,90 @@ def test_a_store_holds_the_features_of_the_runs_bit_for_bit(runs_dir, tmp_path):
         assert (
             getattr(stored.samples.cut.windows, name).tolist() == getattr(samples.cut.windows, name).tolist()
         )
+    motion = window_motion(samples.cut.windows)
+    for name in Motion._fields:
+        assert getattr(stored.motion, name).tobytes() == getattr(motion, name).tobytes()
 
 
-def test_cross_validation_of_a_store_gives_the_figures_of_its_runs(runs_dir, tmp_path):
+@pytest.mark.parametrize("protocol", ["grouped", "leave-one-run-out"])
+def test_cross_validation_of_a_store_gives_the_report_of_its_runs(runs_dir, tmp_path, protocol):
     build_store(run_loaders(runs_dir), features_settings(tmp_path / "store"))
-    from_runs = crossval(load_runs(runs_dir), SETTINGS)
-    from_store = crossval_store(opened(tmp_path / "store"), SETTINGS)
-    expected = replace(from_runs, support=None, notes=(*from_runs.notes, NO_SUPPORT))
-    assert json.dumps(as_json(from_store)) == json.dumps(as_json(expected))
+    asked = SETTINGS.with_(protocol=protocol)
+    from_runs = crossval(load_runs(runs_dir), asked)
+    from_store = crossval_store(opened(tmp_path / "store"), asked)
+    assert from_store.support.rows
+    assert json.dumps(as_json(from_store)) == json.dumps(as_json(from_runs))
+
+
+def test_a_store_leaves_out_a_terrain_as_its_runs_do(runs_dir, tmp_path, make_run):
+    for k in range(4):
+        write_run(make_run(f"MUD_{k}", "MUD", 20 + k, 9.0), runs_dir)
+    build_store(run_loaders(runs_dir), features_settings(tmp_path / "store"))
+    asked = SETTINGS.with_(protocol="leave-terrain-out")
+    found = crossval_store(opened(tmp_path / "store"), asked)
+    assert set(found.unknown.unknown_by_terrain) == {"ICE", "MUD", "SNOW"}
+    assert json.dumps(as_json(found)) == json.dumps(as_json(crossval(load_runs(runs_dir), asked)))
+
+
+def test_a_store_without_wheels_has_no_support_and_says_why(runs_dir, tmp_path):
+    build_store(run_loaders(runs_dir), features_settings(tmp_path / "store", signal_sets=("imu",)))
+    asked = SETTINGS.with_(signal_sets=("imu",))
+    store = opened(tmp_path / "store", asked)
+    assert read_store(store).motion is None
+    found = crossval_store(store, asked)
+    assert (found.support, found.notes[-1]) == (None, f"support: {NO_MOTION}")
+    assert json.dumps(as_json(found)) == json.dumps(as_json(crossval(load_runs(runs_dir), asked)))
+
+
+def copied(run, run_id, offset_s=0.0):
+    streams = {
+        name: Stream(each.time_s + offset_s, each.values.round(2), each.channels)
+        for name, each in run.streams.items()
+    }
+    labels = tuple(Label(a + offset_s, b + offset_s, name) for a, b, name in run.labels)
+    return replace(run, run_id=run_id, streams=streams, labels=labels)
+
+
+def test_runs_with_the_same_measurements_are_named_and_refused_until_one_is_left_out(runs_dir, tmp_path):
+    store = tmp_path / "store"
+    write_run(copied(load_runs(runs_dir)[2], "again", 50.0), runs_dir)
+    report = build_store(run_loaders(runs_dir), features_settings(store))
+    assert [(each.first, each.second) for each in report.duplicates] == [("ICE_2", "again")]
+    with pytest.raises(DataError) as refusal:
+        crossval_store(opened(store), SETTINGS)
+    assert "ICE_2 and again hold the same measurements for 9.0 s" in str(refusal.value)
+    assert len(str(refusal.value).splitlines()) == 1
+    chosen = store_of(
+        AlignedRunsSettings(data=store, without=("again",)), SETTINGS.rule, SETTINGS.signal_sets
+    )
+    report = crossval_store(chosen, SETTINGS)
+    assert report.n_runs == 8
+    assert chosen.digest == joint_digest([run.digest for run in opened(store).runs if run.run_id != "again"])
+    again = build_store(run_loaders(runs_dir), features_settings(store))  # nothing is computed, all compared
+    assert (again.n_computed, len(again.duplicates)) == (0, 1)
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        ({"repair": True}, "^--repair: .* is a store of features, whose runs were read"),
+        ({"robot": "husky"}, "^--robot: "),
+        ({"layout": "runs"}, "^--format: "),
+        ({"only": ("LAVA",)}, "--only: there is no run 'LAVA'"),
+        ({"without": tuple(f"{n}_{k}" for n in ("ICE", "SNOW") for k in range(4))}, "leave no run"),
+    ],
+)
+def test_options_that_a_store_cannot_follow_are_refused(runs_dir, tmp_path, options, named):
+    build_store(run_loaders(runs_dir), features_settings(tmp_path / "store"))
+    source = AlignedRunsSettings(data=tmp_path / "store", **options)
+    with pytest.raises(ConfigError, match=named):
+        store_of(source, SETTINGS.rule, SETTINGS.signal_sets)
 
 
 def test_a_store_has_no_speeds_for_a_speed_protocol(runs_dir, tmp_path):
     build_store(run_loaders(runs_dir), features_settings(tmp_path / "store"))
     asked = CrossvalSettings(protocol="slow-fast", steady=False)
-    with pytest.raises(ConfigError, match=r"^'slow-fast' needs the speeds of runs"):
+    with pytest.raises(ConfigError, match=r"^'slow-fast' needs the wheel speeds of runs"):
         crossval_store(opened(tmp_path / "store"), asked)
 
 
@@ -85,7 +159,7 @@ def test_extras_of_a_store_are_noted_as_missing(runs_dir, tmp_path):
     build_store(run_loaders(runs_dir), features_settings(tmp_path / "store"))
     report = crossval_store(opened(tmp_path / "store"), SETTINGS.with_(extras=True))
     assert report.extras is None
-    assert "need the runs themselves" in report.notes[-1]
+    assert report.notes[-1] == NO_EXTRAS
 
 
 def test_processes_and_a_cluster_write_the_same_bytes(runs_dir, tmp_path):
@@ -179,6 +253,7 @@ def test_no_damaged_byte_changes_what_is_read(runs_dir, tmp_path):
         assert read.features.tobytes() == rows.features.tobytes()
         assert read.start_s.tobytes() == rows.start_s.tobytes()
         assert read.terrain.tolist() == rows.terrain.tolist()
+        assert np.stack(read.motion).tobytes() == np.stack(rows.motion).tobytes()
     assert refused > 100
 
 
@@ -216,8 +291,44 @@ def test_a_store_of_other_windows_is_refused(runs_dir, tmp_path, changed, named)
 def test_a_store_of_another_version_is_refused(runs_dir, tmp_path, monkeypatch):
     build_store(run_loaders(runs_dir), features_settings(tmp_path / "store"))
     monkeypatch.setattr(manifest, "__version__", "9.9")
-    with pytest.raises(ConfigError, match=r"version 0\.1\.0 made this store of features, this is 9\.9"):
+    with pytest.raises(ConfigError, match=r"version '0\.1\.0' made this store of features, this is 9\.9"):
         opened(tmp_path / "store")
+
+
+def test_a_store_of_an_earlier_format_is_refused_and_built_again(runs_dir, tmp_path):
+    store = tmp_path / "store"
+    build_store(run_loaders(runs_dir), features_settings(store))
+    whole = files_of(store)
+    document = json.loads((store / "store.json").read_text())
+    (store / "store.json").write_text(json.dumps(document | {"format_version": 1}))
+    with pytest.raises(ConfigError) as refusal:
+        opened(store)
+    assert str(refusal.value).endswith(
+        "is a store of features of format 1, format 2 is read here: build it again with terrain features"
+    )
+    build_store(run_loaders(runs_dir), features_settings(store))
+    assert files_of(store) == whole
+
+
+def test_a_store_of_one_class_is_refused(runs_dir, tmp_path):
+    for name in ("ICE_0", "ICE_1", "ICE_2", "ICE_3"):
+        shutil.rmtree(runs_dir / name)
+    build_store(run_loaders(runs_dir), features_settings(tmp_path / "store"))
+    with pytest.raises(DataError, match="two classes"):
+        crossval_store(opened(tmp_path / "store"), SETTINGS.with_(protocol="leave-one-run-out"))
+
+
+def test_features_that_never_vary_are_refused(tmp_path, make_run):
+    for k in range(3):
+        run = make_run(f"ICE_{k}", "ICE", k)
+        streams = {
+            name: Stream(each.time_s, np.ones_like(each.values), each.channels)
+            for name, each in run.streams.items()
+        }
+        write_run(replace(run, streams=streams), tmp_path / "runs")
+    build_store(run_loaders(tmp_path / "runs"), features_settings(tmp_path / "store"))
+    with pytest.raises(DataError, match="no feature ever varies"):
+        read_store(opened(tmp_path / "store"))
 
 
 @pytest.mark.parametrize("name", ["store.json", "runs.json"])

@@ -13,8 +13,8 @@ import pytest
 
 from features.windows import cut_windows
 from pipelines.classify.judging import judge_of, standing_of, standing_tags
-from pipelines.crossval.crossval import samples_of
-from pipelines.crossval.settings import CrossvalSettings
+from pipelines.classify.settings import TrainSettings
+from pipelines.classify.training_data import data_of_runs
 from pipelines.models.champion import scope_of
 from pipelines.models.model_files import read_model
 from pipelines.models.tracking import TrainingRecord, ensure_tracking, load_model, log_training
@@ -42,7 +42,7 @@ def log(tracked, runs):
     What is given besides replaces fields of ``terrain_model.json``.
     """
     model = read_model(tracked[0] / "model")
-    samples = samples_of(runs, CrossvalSettings())
+    data = data_of_runs(runs, TrainSettings(name="drawn"))
 
     def again(name, macro_f1, digest="aa", accuracy_ci=(0.9, 0.95), **changed):
         info = replace(model.info, data_digest=digest, **changed)
@@ -50,8 +50,8 @@ def log(tracked, runs):
         standing = standing_of(info, report)
         tags = standing_tags(standing, scope_of(info))
         record = TrainingRecord({"recipe": "svm"}, {"macro_f1": macro_f1}, tags, {}, {})
-        judge = judge_of(runs, samples, report, standing, 0)
-        return log_training(name, model.recipe, samples.cut.windows[:1], info, record, judge)
+        judge = judge_of(data, report, standing, 0)
+        return log_training(name, model.recipe, info, record, judge)
 
     return again
 
