@@ -14,8 +14,8 @@ import numpy as np
 from terrain.classify.network_numbers import SampleColumns
 from terrain.records import Array
 
-GAIN_STD = 0.4
-"""Standard deviation of the logarithm of a stream's gain: assumed."""
+GAIN_STD = 0.5
+"""Standard deviation of the logarithm of the amplitude of vibration: assumed."""
 
 DROPOUT_RATIO = 0.1
 """How often a stream is taken for failed."""
@@ -32,7 +32,8 @@ class Augmentation(NamedTuple):
     Parameters
     ----------
     shift : of the window, its end continued by its beginning
-    gain : of a window, log-normal, one for all channels of a stream: speed, load and tyres shake all axes
+    gain : of the vibration in a window, log-normal, one for all channels of a stream that is fast enough to
+        hold it: speed, load and tyres shake all axes; what a slow stream measures stays as it is
     mirror : half of the windows, left for right
     dropout : a stream at its training mean, in a window out of ten
     """
@@ -89,6 +90,7 @@ def augmented(
     means: Sequence[Array],
     used: Augmentation,
     mirrors: Sequence[Mirror] | None,
+    vibrates: Sequence[bool],
     rng: np.random.Generator,
 ) -> list[Array]:
     """Return varied windows, each with its own draw; the same draw in all streams where time or sides are.
@@ -99,6 +101,7 @@ def augmented(
     means : (channels,) of each stream in training windows
     used : variations; without mirrors there is no mirror image
     mirrors : of each stream
+    vibrates : of each stream, whether it is fast enough to hold vibration
     rng : source of the draws
     """
     n = len(streams[0])
@@ -110,10 +113,8 @@ def augmented(
             places = (np.arange(length) + (fraction * length).astype(int)[:, None]) % length
             found[i] = np.take_along_axis(values, places[:, None], axis=2)
     if used.gain:
-        found = [
-            values * np.exp(GAIN_STD * rng.standard_normal((n, 1, 1))).astype(values.dtype)
-            for values in found
-        ]
+        gains = [np.exp(GAIN_STD * fast * rng.standard_normal((n, 1, 1))) for fast in vibrates]
+        found = [values * gain.astype(values.dtype) for values, gain in zip(found, gains, strict=True)]
     if used.mirror and mirrors is not None:
         turned = (rng.random(n) < 0.5)[:, None, None]
         for i, (values, mirror) in enumerate(zip(found, mirrors, strict=True)):

@@ -1,6 +1,6 @@
 """Ensemble of networks that chooses and calibrates itself on folds which keep runs whole.
 
-Steps of ``fit``: standardise by all rows; on inner folds of whole runs choose the augmentation; fit one
+Steps of ``fit``: standardise by all rows; on all inner folds of whole runs choose the augmentation; fit one
 network an inner fold, stopped where its held-out runs are most likely; their held-out probabilities give the
 temperature; fit the members anew on all runs, for the mean number of epochs of these networks: with few runs,
 each one counts.  What is fitted is kept as
@@ -41,7 +41,6 @@ from terrain.classify.network_numbers import (
 from terrain.errors import DataError
 from terrain.records import Array
 
-N_TRIAL_FOLDS = 2
 LOG_TEMPERATURE_BOUNDS = (-3.0, 3.0)
 
 
@@ -90,7 +89,7 @@ class GroupedNetwork(ClassifierMixin, BaseEstimator):
         n_inner_folds: int = 5,
         n_members: int = 3,
         epochs: int = 30,
-        trial_epochs: int = 8,
+        trial_epochs: int = 12,
         gap: int = 1,
         seed: int = 0,
     ) -> None:
@@ -131,7 +130,7 @@ class GroupedNetwork(ClassifierMixin, BaseEstimator):
         if not columns or sum(each.width for each in columns) != X.shape[1]:
             raise DataError(f"the columns of the samples do not describe rows of {X.shape[1]} columns")
         fill = fill_of(columns, X)
-        task = task_of(columns, np.where(np.isnan(X), fill, X).astype(np.float32), class_index)
+        task = task_of(columns, np.where(np.isnan(X), fill, X).astype(np.float32), class_index, groups)
         splits = list(inner_splits(y, groups, self.n_inner_folds, self.seed, self.gap))
         if not splits:
             raise DataError("the windows are too few to hold some of them out; add runs")
@@ -166,14 +165,14 @@ class GroupedNetwork(ClassifierMixin, BaseEstimator):
             if used not in losses:
                 fitted = [
                     fit_member(task, split, used, self.trial_epochs, self.seed + i)
-                    for i, split in enumerate(splits[:N_TRIAL_FOLDS])
+                    for i, split in enumerate(splits)
                 ]
                 losses[used] = float(np.mean([member.loss for member in fitted]))
             return losses[used]
 
         possible = {
             "shift": True,
-            "gain": True,
+            "gain": any(each.frame for each in task.columns),
             "mirror": mirrors_of(task.columns) is not None,
             "dropout": len(task.columns) > 1,
         }

@@ -50,6 +50,7 @@ class Task(NamedTuple):
 
     streams: list[Array]
     class_index: Array
+    weight: Array
     n_classes: int
     columns: tuple[SampleColumns, ...]
     branches: list[BranchNumbers]
@@ -85,8 +86,12 @@ def reproducible() -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
-def task_of(columns: tuple[SampleColumns, ...], samples: Array, class_index: Array) -> Task:
-    """Return what all members share: ``samples`` (n, n_columns) without gaps, ``class_index`` (n,)."""
+def task_of(columns: tuple[SampleColumns, ...], samples: Array, class_index: Array, groups: Array) -> Task:
+    """Return what all members share: ``samples`` (n, n_columns) without gaps, ``class_index`` and run (n,).
+
+    A window of a run of ``n`` weighs ``1/sqrt(n)``: the windows of a run resemble each other, so a long run
+    tells more than a short one, but not as much more as it is longer.
+    """
     streams = list(streams_of(columns, samples))
     branches = []
     nothing = np.zeros(0, np.float32)
@@ -102,7 +107,10 @@ def task_of(columns: tuple[SampleColumns, ...], samples: Array, class_index: Arr
             BranchNumbers(floor, found.mean(axis=(0, 3)), std, nothing, nothing, nothing, nothing)
         )
     means = [values.mean(axis=(0, 2)) for values in streams]
-    return Task(streams, class_index, int(class_index.max()) + 1, columns, branches, means)
+    _, run, count = np.unique(groups, return_inverse=True, return_counts=True)
+    weight = 1.0 / np.sqrt(count[run])
+    weight = (weight / weight.mean()).astype(np.float32)
+    return Task(streams, class_index, weight, int(class_index.max()) + 1, columns, branches, means)
 
 
 def fit_member(task: Task, split: tuple[Array, Array], used: Augmentation, epochs: int, seed: int) -> Member:
@@ -148,10 +156,12 @@ def _epochs(task: Task, train: Array, used: Augmentation, epochs: int, seed: int
     torch.manual_seed(seed)
     rng = np.random.default_rng((seed, 1))
     mirrors = mirrors_of(task.columns)
+    vibrates = [each.frame > 0 for each in task.columns]
     net = _network(task)
     streams = [values[train] for values in task.streams]
     plain = task.rows(streams) if used == Augmentation() else []
     truth = torch.from_numpy(task.class_index[train])
+    weight = torch.from_numpy(task.weight[train])
     n_batches = max(len(train) // BATCH, min(MIN_BATCHES, len(train) // SMALL_BATCH), 1)
     optimizer = torch.optim.AdamW(net.parameters(), lr=LEARNING_RATE, weight_decay=WEIGHT_DECAY)
     schedule = torch.optim.lr_scheduler.OneCycleLR(
@@ -160,15 +170,17 @@ def _epochs(task: Task, train: Array, used: Augmentation, epochs: int, seed: int
     for _ in range(epochs):
         net.train()
         for batch in np.array_split(rng.permutation(len(train)), n_batches):
-            rows = (
-                [part[batch] for part in plain]
-                if plain
-                else task.rows(augmented([s[batch] for s in streams], task.means, used, mirrors, rng))
-            )
+            if plain:
+                rows = [part[batch] for part in plain]
+            else:
+                drawn = [values[batch] for values in streams]
+                rows = task.rows(augmented(drawn, task.means, used, mirrors, vibrates, rng))
             logits = net([torch.from_numpy(np.ascontiguousarray(part, np.float32)) for part in rows])
-            loss = functional.cross_entropy(
-                logits, truth[torch.from_numpy(batch)], label_smoothing=LABEL_SMOOTHING
+            places = torch.from_numpy(batch)
+            losses = functional.cross_entropy(
+                logits, truth[places], label_smoothing=LABEL_SMOOTHING, reduction="none"
             )
+            loss = (losses * weight[places]).mean()
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()

@@ -86,7 +86,7 @@ def test_labels_dealt_to_runs_at_random_are_not_learned():
 def test_the_numbers_compute_what_torch_computes():
     X, y, run = draw_windows()
     index = np.unique(y, return_inverse=True)[1]
-    task = task_of(COLUMNS, X.astype(np.float32), index)
+    task = task_of(COLUMNS, X.astype(np.float32), index, run)
     train, test = np.flatnonzero(run % 2 == 0), np.flatnonzero(run % 2 == 1)
     with reproducible():
         members = [fit_member(task, (train, test), Augmentation(shift=True), 2, seed) for seed in (0, 1)]
@@ -204,6 +204,14 @@ def test_the_spectrogram_is_that_of_scipy():
     assert fourier_kernel(40).shape == (40, 40)
 
 
+def test_a_window_of_a_long_run_weighs_less():
+    X, y, _ = draw_windows(n_runs=1, n_windows=10)
+    run = np.repeat(["long", "short"], [24, 6])
+    weight = task_of(COLUMNS, X.astype(np.float32), np.unique(y, return_inverse=True)[1], run).weight
+    assert weight.mean() == pytest.approx(1.0)
+    assert weight[-1] / weight[0] == pytest.approx(2.0)  # sqrt(24 / 6)
+
+
 def test_a_slow_stream_and_a_short_window_have_no_spectrum():
     assert [each.frame for each in COLUMNS] == [20, 0]
     assert SampleColumns("imu", ("accel_z_mps2",), 50.0, 10).frame == 0
@@ -216,15 +224,17 @@ def test_a_variation_keeps_what_it_must(seed, name):
     streams = list(streams_of(COLUMNS, X))
     means = [values.mean(axis=(0, 2)) for values in streams]
     used = Augmentation(**{name: True})
-    found = augmented(streams, means, used, mirrors_of(COLUMNS), rng)
+    vibrates = [each.frame > 0 for each in COLUMNS]
+    found = augmented(streams, means, used, mirrors_of(COLUMNS), vibrates, rng)
     for before, after, mean in zip(streams, found, means, strict=True):
         assert after.shape == before.shape
         if name == "shift":
             np.testing.assert_array_equal(np.sort(after, axis=2), np.sort(before, axis=2))
         elif name == "gain":
             ratio = after / before
-            np.testing.assert_allclose(ratio, np.broadcast_to(ratio[:, :, :1], ratio.shape))
+            np.testing.assert_allclose(ratio, np.broadcast_to(ratio[:, :1, :1], ratio.shape))
             assert (ratio > 0).all()
+            assert before.shape[2] == 50 or (ratio == 1).all()  # wheels turn as fast as they did
         elif name == "mirror":
             np.testing.assert_allclose(np.abs(after).sum(axis=(1, 2)), np.abs(before).sum(axis=(1, 2)))
         else:
