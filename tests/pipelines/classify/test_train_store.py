@@ -1,8 +1,8 @@
 """A model that a store of features gives is the one that its runs give."""
 
 import json
+import shutil
 from dataclasses import fields, replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -44,14 +44,26 @@ def place(runs, tmp_path_factory):
     return stored(runs, tmp_path_factory.mktemp("store"))
 
 
+@pytest.fixture(scope="module")
+def trained_there(place, tmp_path_factory):
+    """Train from the store in a folder of its own; return the folder, the result and the model's folder."""
+    folder = tmp_path_factory.mktemp("trained")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        patch.delenv("MLFLOW_TRACKING_URI", raising=False)
+        result = train_store(opened(place), SETTINGS, "twelve runs")
+    (file,) = (folder / "mlruns").rglob("model.skops")
+    return folder, result, file.parent
+
+
 @pytest.fixture
-def trained_here(place, tmp_path, monkeypatch):
-    """Train from the store in a folder of one's own; return the result and the folder of the model."""
-    monkeypatch.chdir(tmp_path)
+def trained_here(trained_there, tmp_path, monkeypatch):
+    """Return the result and the folder of the model, in a copy of the folder where it was trained."""
+    folder, result, model = trained_there
+    shutil.copytree(folder, tmp_path / "here")
+    monkeypatch.chdir(tmp_path / "here")
     monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
-    result = train_store(opened(place), SETTINGS, "twelve runs")
-    (file,) = Path("mlruns").rglob("model.skops")
-    return result, file.parent.resolve()
+    return result, model
 
 
 def test_the_model_of_a_store_is_that_of_its_runs(tracked, trained_here, runs, place):
@@ -81,6 +93,7 @@ def test_the_model_of_a_store_is_that_of_its_runs(tracked, trained_here, runs, p
             np.testing.assert_array_equal(a, b)
 
 
+@pytest.mark.slow
 def test_the_same_data_are_recognised_as_runs_and_as_a_store(trained_here, runs, place):
     again = train(runs, SETTINGS, "twelve runs")
     assert again.registered.alias_reason.endswith("of version 1 on the same data")

@@ -29,6 +29,7 @@ def noisy_runs(drive_all):
     return drive_all(n_runs=5, seed=4, current_a=3.0)
 
 
+@pytest.mark.slow
 def test_signal_sets_that_hold_the_terrain_are_better_than_those_that_do_not(noisy_runs):
     settings = settings_of("svm@currents", "svm@imu", repeats=2)
     report = compare_recipes(noisy_runs, settings.contenders, settings, "moor")

@@ -11,6 +11,7 @@ from pipelines.crossval.settings import CrossvalSettings
 from pipelines.reporting.json_file import as_json
 
 
+@pytest.mark.slow
 def test_a_cluster_gives_the_report_of_this_machine(make_run):
     distributed = pytest.importorskip("distributed")
     runs = [

@@ -258,6 +258,7 @@ def test_a_run_slow_on_one_class_and_fast_on_another_is_on_no_side(runs_at, sett
         assert "mixed" not in run_id[np.concatenate([fold.train, fold.test])]
 
 
+@pytest.mark.slow
 def test_runs_with_several_labels_can_be_learned_from_few(drive, settings):
     """One group may hold all classes: the inner folds are then as many as the groups allow."""
     runs = []

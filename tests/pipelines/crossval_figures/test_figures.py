@@ -187,6 +187,7 @@ def test_a_name_is_drawn_as_it_is_written(report):
     assert png_bytes(per_run_figure(replace(report, per_run=runs)))
 
 
+@pytest.mark.slow
 def test_no_global_state_is_touched():
     code = (
         "import sys, matplotlib\n"

@@ -89,6 +89,7 @@ def test_energy_is_compared_over_the_distance_that_all_travelled():
     assert found == pytest.approx([200.0 / 6.0, 300.0 / 6.0, math.nan], nan_ok=True)
 
 
+@pytest.mark.slow
 def test_traction_control_starts_gently_in_any_direction():
     situation = make_situation("starts", ROBOT, "grass", 301)
     peaks = {}

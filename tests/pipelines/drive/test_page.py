@@ -226,6 +226,7 @@ def test_curves_are_drawn_where_the_table_has_any():
     assert "curves" not in drive_figures(a_result(), {}, TABLE)
 
 
+@pytest.mark.slow
 def test_the_same_result_gives_the_same_bytes_whatever_matplotlib_is_set_to(tmp_path):
     def made(folder):
         write_drive_page(folder, a_result(("plain", "known:clay")), {"known:clay": a_run()}, with_curve())

@@ -22,6 +22,7 @@ def labelled():
     return labelled_runs(seed=3, runs_a_terrain=3)
 
 
+@pytest.mark.slow
 def test_every_terrain_is_driven_and_its_slip_is_near_the_truth(labelled):
     runs, rows, example = labelled
     assert [run.terrains for run in runs] == [(name,) for name in soil_names() for _ in range(3)]

@@ -12,6 +12,7 @@ from terrain.robots import load_robot
 ROBOT = load_robot("agrimaro")
 
 
+@pytest.mark.slow
 def test_yaw_and_uncertainty_of_drives_of_several_minutes():
     drives = drives_long(ROBOT, 21, 2, 200.0, n_jobs=1)
     assert [drive.terrain for drive in drives] == ["asphalt", "clay"]

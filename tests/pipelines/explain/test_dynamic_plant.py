@@ -47,7 +47,7 @@ def test_without_a_hidden_effect_nothing_is_stated(terrain, vary):
     ("parameter", "value"),
     [
         pytest.param("wheel_radius_ratio", 0.05, marks=pytest.mark.slow),
-        ("camera_yaw_rad", 0.05),
+        pytest.param("camera_yaw_rad", 0.05, marks=pytest.mark.slow),
         pytest.param("camera_latency_s", 0.1, marks=pytest.mark.slow),
         pytest.param("gyro_scale_ratio", 0.1, marks=pytest.mark.slow),
         pytest.param("payload_ratio", 0.3, marks=pytest.mark.slow),

@@ -61,6 +61,7 @@ def errors(found):
 
 
 @pytest.mark.parametrize("name", CASES)
+@pytest.mark.slow
 def test_the_filter_of_an_extended_robot_is_as_good_as_without_effects(name):
     effects, speed_gain, slip_gain = CASES[name]
     run, extended = driven(tuple(effects.items())), replace(ROBOT, effects=effects)

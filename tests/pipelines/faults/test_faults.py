@@ -239,6 +239,7 @@ def test_the_command_writes_table_json_and_page(terrain):
     assert len(list(Path("page/figures").glob("*.png"))) == 2
 
 
+@pytest.mark.slow
 def test_without_a_table_targets_are_learned(terrain):
     code, _, err = terrain(
         *(

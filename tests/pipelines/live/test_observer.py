@@ -79,7 +79,7 @@ def test_the_belief_follows_windows_that_agree_and_ends_with_driving_on_in_silen
     assert observer.belief.terrain == ""
 
 
-@pytest.mark.parametrize("set_name", ["borealtc", "vulpi"])
+@pytest.mark.parametrize("set_name", [pytest.param("borealtc", marks=pytest.mark.slow), "vulpi"])
 def test_live_equals_the_log_on_all_measured_runs(set_name, trained):
     if not (DATA / set_name).is_dir():
         pytest.skip(f"TERRAIN_DATA has no {set_name}")

@@ -169,6 +169,7 @@ def test_the_same_samples_give_the_same_bytes(controller):
     assert drive() == drive()
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow():
     live, samples = pilot(), recorded()
     step_s = samples[1].time_s - samples[0].time_s

@@ -71,6 +71,7 @@ def test_without_a_fault_braking_by_slip_stops_sooner_than_locked_wheels():
         "freeze_pitch",
     ],
 )
+@pytest.mark.slow
 def test_a_fault_at_the_brake_on_slick_ground_ends_the_braking_by_slip(fault, duration_s):
     found = row(fault, STOP, duration_s).figures
     assert found.stop_ratio <= LIMITS.stop_ratio

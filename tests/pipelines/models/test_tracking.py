@@ -194,6 +194,7 @@ print(log_learning("together", {}, {"figure": 1.0}, {}, {}, {}, {}))
 """
 
 
+@pytest.mark.slow
 def test_processes_that_start_together_in_an_empty_folder_all_succeed(tmp_path):
     environment = {k: v for k, v in os.environ.items() if k != "MLFLOW_TRACKING_URI"}
     processes = [

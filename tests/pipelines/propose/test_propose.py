@@ -215,6 +215,7 @@ def test_the_smoothed_sequence_is_the_best_of_all_of_them():
     assert smoothed_classes(np.zeros((0, 3)), np.zeros(0), prior).tolist() == []
 
 
+@pytest.mark.slow
 def test_the_study_labels_as_many_runs_by_doubt_as_at_random_and_gives_the_same_again(tmp_path, drive_all):
     for run in drive_all(n_runs=6, seed=3):
         write_run(run, tmp_path / "data")

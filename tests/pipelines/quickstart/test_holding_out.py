@@ -39,6 +39,7 @@ def test_the_runs_that_are_predicted_took_no_part(in_tracked, drive_all, setting
     assert data_digest(loaded) == result.data_digest
 
 
+@pytest.mark.slow
 def test_copies_of_runs_are_refused_or_merged(in_tracked, drive_all, settings, tmp_path, monkeypatch):
     from pipelines.quickstart.quickstart import quickstart
 

@@ -191,6 +191,7 @@ def test_assumed_numbers_are_those_with_an_assumed_source():
     assert not {"track_m", "steering.dead_band_rad", "camera.lever_x_m"} & names
 
 
+@pytest.mark.slow
 def test_every_experiment_gives_complete_rows_and_a_page(danzi, document, folder):
     assert json.loads(json.dumps(document, allow_nan=False)) == document
     assert {found["experiment"] for found in document["rows"]} == {one.title for one in EXPERIMENTS}
@@ -211,6 +212,7 @@ def find(result, pattern):
     return [found for found in result["rows"] if re.search(pattern, found["what"])]
 
 
+@pytest.mark.slow
 def test_errors_of_the_thesis_are_corrected(document):
     (turn,) = find(document, "sharpest left turn")
     (rank,) = find(document, "Independent states")
@@ -224,6 +226,7 @@ def test_errors_of_the_thesis_are_corrected(document):
     assert band["simulated"] == pytest.approx(0.021**2 / 3)
 
 
+@pytest.mark.slow
 def test_slip_agrees_with_the_thesis_and_with_its_corrections(document):
     (blind,) = find(document, "by the 12 states")
     assert abs(blind["simulated"]) < 0.01 < blind["beside"]["true slip"]
@@ -243,6 +246,7 @@ def test_slip_agrees_with_the_thesis_and_with_its_corrections(document):
     assert abs(off) < 3 * vio15["beside"]["standard deviation by the filter"]
 
 
+@pytest.mark.slow
 def test_table_8_1_is_reproduced_and_its_iteration_corrected(document):
     cases = find(document, "Rate sent to the wheel, case")
     assert [case["verdict"] for case in cases] == ["as printed"] * 8
@@ -253,6 +257,7 @@ def test_table_8_1_is_reproduced_and_its_iteration_corrected(document):
     assert normalised["spread"] == pytest.approx([0.5, 0.56], abs=0.005)
 
 
+@pytest.mark.slow
 def test_terrain_recognition_has_the_honest_figure_beside_the_one_by_windows(document):
     rows = [found for found in document["rows"] if "8.1" in found["experiment"]]
     at_random, by_run, weakest, level, difficulty = rows
@@ -264,6 +269,7 @@ def test_terrain_recognition_has_the_honest_figure_beside_the_one_by_windows(doc
     assert difficulty["verdict"] == "as printed"
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_rows_and_another_others(document):
     for experiment, run in (("zero-slip wheel rows", slip_bias), ("Loss of the camera", camera_lost)):
         rows = [found for found in document["rows"] if experiment in found["experiment"]]

@@ -170,6 +170,7 @@ def test_a_full_disk_is_named_until_there_is_room_again(running, model_folder, h
         assert [file.name for file in tmp_path.iterdir()] == ["full.json"]
 
 
+@pytest.mark.slow
 def test_robots_that_come_back_in_each_others_streams_do_not_leak(
     running, model_folder, hello, messages, two_drives
 ):

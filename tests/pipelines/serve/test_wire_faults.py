@@ -15,7 +15,6 @@ from pipelines.serve.metrics import resident_bytes
 
 from .strangers import beside, frame, raw, until
 
-N_MALFORMED = 10_000
 AT_ONCE = 100
 GENEROUS = LIMITS._replace(messages_per_s=1e6, rows_per_s=1e7)
 
@@ -152,14 +151,15 @@ def drain(stranger, mark):
         answers.append(answer)
 
 
-def test_ten_thousand_malformed_messages(running, model_folder, hello, messages, two_drives):
+@pytest.mark.parametrize("n_malformed", [2_000, pytest.param(10_000, marks=pytest.mark.slow)])
+def test_thousands_of_malformed_messages(running, model_folder, hello, messages, two_drives, n_malformed):
     random_ = random.Random(0)
     codes = set()
     with running(GENEROUS, model=str(model_folder)) as service:
         resident = []
         with beside(service, hello, messages, two_drives[4]):
             n_sent = 0
-            while n_sent < N_MALFORMED:
+            while n_sent < n_malformed:
                 begun = (n_sent // AT_ONCE) % 3
                 with service.socket() as stranger:
                     if begun:

@@ -167,7 +167,7 @@ def test_a_slow_receiver_that_goes_on_gets_fresh_commands(driving):
     assert max(ages[n_old:]) <= 0.25
 
 
-@pytest.mark.parametrize("rate_hz", [0, 100])
+@pytest.mark.parametrize("rate_hz", [0, pytest.param(100, marks=pytest.mark.slow)])
 def test_clocks_that_are_set_and_stamps_that_are_none(driving, rate_hz):
     """After each the session goes on, with commands that are finite and as new as the robot's last stamp."""
     strange = [None, 1e308, -1e308, 1e15, -1e15, 1e9, 5.0, 5.0, 4.99, 2**62, 0.0, -7200.0, 7200.0]

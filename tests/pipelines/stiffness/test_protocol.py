@@ -43,6 +43,7 @@ def test_the_same_seed_gives_the_same_windows(windows, robot):
     )
 
 
+@pytest.mark.slow
 def test_held_out_runs_are_recognised_above_chance_and_not_above_windows_dealt_at_random(robot):
     found = classify_soils(robot, 4, 2)
     chance, error = 1 / N_CLASSES, np.sqrt(1 / N_WINDOWS) / 2

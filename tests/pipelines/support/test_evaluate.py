@@ -117,5 +117,6 @@ def test_without_wheels_support_is_unknown_and_the_reason_is_stated(runs, settin
     assert "support" not in as_json(report)
 
 
+@pytest.mark.slow
 def test_runs_on_both_sides_have_no_support(runs, settings):
     assert crossval(runs, settings(protocol="published")).support is None

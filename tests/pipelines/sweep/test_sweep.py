@@ -40,6 +40,7 @@ def test_an_interrupted_search_goes_on_to_the_same_result(runs, searched, tmp_pa
     assert again.resumed == 8
 
 
+@pytest.mark.slow
 def test_two_processes_try_what_one_tries(runs, searched, tmp_path):
     sweep(runs, asked(tmp_path / "two", n_jobs=2), "drawn")
     assert (tmp_path / "two" / TRIALS_FILE).read_bytes() == (searched[0] / TRIALS_FILE).read_bytes()

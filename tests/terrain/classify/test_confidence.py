@@ -89,6 +89,7 @@ def test_runs_are_drawn_whole_and_within_their_classes():
     assert len(np.unique(per_run[:, 0])) == 3
 
 
+@pytest.mark.slow
 def test_intervals_hold_the_truth_where_runs_differ_and_those_over_windows_would_not():
     """Each run is right or wrong as a whole more often than by windows: 95 % have to hold in most trials."""
     held, widths = 0, []

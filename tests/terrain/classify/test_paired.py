@@ -21,6 +21,7 @@ def outcomes(gain, seed, n_runs=24, n_windows=25, run_std=0.2):
     return outcome(difficulty), outcome(difficulty + gain)
 
 
+@pytest.mark.slow
 def test_intervals_hold_the_hidden_difference_and_are_narrower_than_unpaired_ones():
     held, widths, found_better = 0, [], 0
     for seed in range(30):

@@ -323,6 +323,7 @@ def drifts(terrain, settings, seeds=range(3), **options):
 
 
 @pytest.mark.parametrize("terrain", ["tiles", "grass", "dry_sand"])
+@pytest.mark.slow
 def test_less_than_a_tenth_of_the_drift_by_backlash_remains(terrain):
     plain, tracked = drifts(terrain, None), drifts(terrain, SETTINGS)
     assert plain[0] > 0.08

@@ -89,7 +89,14 @@ def test_where_nothing_is_hidden_nothing_is_named(worlds):
         assert json.loads(json.dumps(found.as_json(), allow_nan=False))["verdict"] == Verdict.NONE
 
 
-@pytest.mark.parametrize(("robot", "name"), [(robot, name) for robot in EFFECTS for name in EFFECTS[robot]])
+@pytest.mark.parametrize(
+    ("robot", "name"),
+    [
+        pytest.param(robot, name, marks=[pytest.mark.slow] * (i % 2))
+        for robot in EFFECTS
+        for i, name in enumerate(EFFECTS[robot])
+    ],
+)
 def test_a_hidden_effect_is_named_with_its_value_and_nothing_beside_it(worlds, robot, name):
     world = worlds[robot]
     hidden = world.hidden(name)

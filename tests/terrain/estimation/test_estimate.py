@@ -131,6 +131,7 @@ def test_a_camera_outage_of_3_s_makes_slip_stale_and_less_certain_but_close(seed
     assert abs(thesis.blind.slip_ratio[lost][-20:].mean()) < 0.02
 
 
+@pytest.mark.slow
 def test_on_the_full_simulator_errors_are_what_the_filter_says():
     runs = [
         drive(scenario, terrain, seed, vary=True, duration_s=25.0)

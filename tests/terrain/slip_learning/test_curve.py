@@ -97,6 +97,7 @@ def test_slip_errors_do_not_bias_a_steep_law():
 
 
 @pytest.mark.parametrize(("law", "theta"), [SAND, SNOW])
+@pytest.mark.slow
 def test_interval_contains_the_true_peak_of_drawn_terrains(law, theta):
     rho, hits, n = 0.1 if law == "janosi" else 0.04, 0, 8
     for seed in range(n):

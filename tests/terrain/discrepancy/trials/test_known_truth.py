@@ -17,13 +17,8 @@ from terrain.robots import load_robot
 HUSKY = load_robot("husky")
 
 
-@pytest.mark.parametrize(
-    "number",
-    [
-        pytest.param(i, id=known.name, marks=[pytest.mark.slow] * (known.name != "all"))
-        for i, known in enumerate(KNOWN)
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("number", range(len(KNOWN)), ids=[known.name for known in KNOWN])
 def test_a_track_that_is_two_and_a_half_times_as_wide_is_named_in_short_runs(number):
     known = KNOWN[number]
     trial = run_trial(Case(Row.KNOWN, number, "husky", SHORT_RUNS, 0))

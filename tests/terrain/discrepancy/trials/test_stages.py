@@ -75,7 +75,11 @@ def median_lag_s(runs, late, reference):
 
 
 @pytest.mark.parametrize(
-    "row", [pytest.param(row, marks=[pytest.mark.slow] * (row == "dynamic")) for row in NEW_ROWS]
+    "row",
+    [
+        pytest.param(row, marks=[pytest.mark.slow] * (row in ("dynamic", "short", "known")))
+        for row in NEW_ROWS
+    ],
 )
 def test_the_same_seed_gives_the_same_trial_and_nothing_of_the_truth_leaks(row):
     n_runs = 4
@@ -175,6 +179,7 @@ def test_the_sensors_are_late_in_turn():
     ]
 
 
+@pytest.mark.slow
 def test_scatter_has_the_size_that_is_stated():
     """The track of a run is measured: the slope of its gyro over the turn of its wheels."""
     made = stage(Row.SCATTERED, 1, n_runs=40)
@@ -220,6 +225,7 @@ def test_half_of_the_runs_have_the_effect_and_the_others_have_none():
     assert abs(bias) > 0.008
 
 
+@pytest.mark.slow
 def test_trials_of_the_dynamic_simulation_take_every_setting_in_turn():
     settings = [setting_of(number) for number in range(60)]
     assert {s.scenario for s in settings} == {"complex", "starts", "survey"}
