@@ -2,8 +2,8 @@
 
 Two passes, so that memory is bounded by a run: the first finds channels and rates that all runs have in
 common, the second cuts, computes and writes.  A run whose file is there and agrees is not computed again.
-Fingerprints of each run, some kilobytes, show which pairs of runs may hold the same measurements; these are
-read again and compared.
+Fingerprints of each run, kept in files meanwhile, show which pairs of runs may hold the same measurements;
+these are read again and compared.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from pipelines.feature_store.manifest import (
     Manifest,
     StoredRun,
 )
+from pipelines.feature_store.print_files import PrintFiles
 from pipelines.feature_store.results import StoreReport
 from pipelines.feature_store.run_file import RunWindows, file_of, read_run_windows, write_run_windows
 from pipelines.feature_store.settings import FeaturesSettings
@@ -35,9 +36,11 @@ from pipelines.reporting.progress import Progress, silent
 from pipelines.runs.datasets import RunLoader, data_digest
 from terrain.errors import ConfigError, LogError
 from terrain.files.atomic import atomic_write, ensure_writable
-from terrain.logs.duplicates import SharedStretch, possible_pairs, shared_stretches
+from terrain.logs.duplicates import SharedStretch, shared_stretches
 from terrain.logs.fingerprints import RunPrint, run_print
 from terrain.records import Windows
+
+PRINTS_FOLDER = "prints"
 
 
 class _Plan(NamedTuple):
@@ -86,20 +89,25 @@ def build_store(
     (store / WINDOWS_FOLDER).mkdir(parents=True, exist_ok=True)
     _write_json(store / STORE_FILE, manifest.as_json())
     plan = _Plan(manifest, extractor, manifest.identity, store)
-    made: list[_Made] = []
+    runs: list[StoredRun] = []
+    n_computed = 0
     progress("features", 0, len(kept))
-    for one in parallel(_store_run, (plan,), ((load,) for load in kept), settings.jobs):
-        made.append(one)
-        progress("features", len(made), len(kept))
-    runs = sorted(one.run for one in made)
-    shared = _shared(kept, [one.print for one in made], settings.jobs, progress)
+    with PrintFiles(store / PRINTS_FOLDER) as prints:
+        for one in parallel(_store_run, (plan,), ((load,) for load in kept), settings.jobs):
+            runs.append(one.run)
+            prints.add(one.print)
+            n_computed += one.computed
+            progress("features", len(runs), len(kept))
+        pairs = prints.possible_pairs()
+    runs.sort()
+    shared = _shared([(kept[first], kept[second]) for first, second in pairs], settings.jobs, progress)
     _remove_others(store, runs)
     lists = {"runs": [run._asdict() for run in runs], "shared": [each._asdict() for each in shared]}
     _write_json(store / RUNS_FILE, lists)
     return StoreReport(
         out=settings.out,
         n_runs=len(runs),
-        n_computed=sum(one.computed for one in made),
+        n_computed=n_computed,
         n_windows=sum(run.n_windows for run in runs),
         n_features=len(manifest.features),
         dropped=dict(sum((Counter(run.dropped) for run in runs), Counter())),
@@ -163,10 +171,9 @@ def _motion_columns(windows: Windows) -> Motion:
 
 
 def _shared(
-    loaders: Sequence[RunLoader], prints: Sequence[RunPrint], n_jobs: int, progress: Progress
+    pairs: Sequence[tuple[RunLoader, RunLoader]], n_jobs: int, progress: Progress
 ) -> tuple[SharedStretch, ...]:
-    """Return the stretches that two of the runs share, in the order of their ids."""
-    pairs = [(loaders[first], loaders[second]) for first, second in possible_pairs(prints)]
+    """Return the stretches that the two runs of each pair share, in the order of their ids."""
     found: list[SharedStretch] = []
     for done, stretches in enumerate(parallel(_compared, (), pairs, n_jobs)):
         found += stretches

@@ -225,6 +225,43 @@ def _same_bytes(runs: Sequence[RunLog]) -> list[SharedStretch]:
     return found
 
 
+class EqualCodes(NamedTuple):
+    """Fingerprints (m,) that two runs have in common: places of the runs, and the offset of their clocks."""
+
+    first: Array
+    second: Array
+    offset_s: Array
+
+
+def equal_codes(codes: Array, run: Array, time_s: Array) -> EqualCodes:
+    """Return which fingerprints (n,) of runs, by their places (n,) in order, are equal."""
+    order = np.argsort(codes, kind="stable")
+    codes, run, time_s = codes[order], run[order], time_s[order]
+    same = np.flatnonzero((codes[1:] == codes[:-1]) & (run[1:] != run[:-1]))
+    return EqualCodes(run[same], run[same + 1], time_s[same + 1] - time_s[same])
+
+
+def pairs_of(equal: EqualCodes, digests: Sequence[bytes]) -> list[tuple[int, int]]:
+    """Return the pairs of runs with enough equal fingerprints near one offset, or with equal digests.
+
+    Parameters
+    ----------
+    equal : fingerprints of all runs
+    digests : of each run, see :class:`~terrain.logs.fingerprints.RunPrint`
+    """
+    order = np.lexsort((equal.offset_s, equal.second, equal.first))
+    first, second, offset_s = (each[order] for each in equal)
+    a, b = slice(None, 1 - MIN_EQUAL), slice(MIN_EQUAL - 1, None)
+    near = offset_s[b] - offset_s[a] <= (MIN_EQUAL - 1) * (OFFSET_TOLERANCE_S + 0.1 * MAX_HOLE_S)
+    near &= (first[a] == first[b]) & (second[a] == second[b])
+    found = set(zip(first[a][near].tolist(), second[a][near].tolist(), strict=True))
+    seen: dict[bytes, int] = {}
+    for place, digest in enumerate(digests):
+        if digest and (before := seen.setdefault(digest, place)) != place:
+            found.add((before, place))
+    return sorted(found)
+
+
 def possible_pairs(prints: Sequence[RunPrint]) -> list[tuple[int, int]]:
     """Return the pairs of runs, by their places, that may share a stretch; :func:`shared_stretches` decides.
 
@@ -237,21 +274,7 @@ def possible_pairs(prints: Sequence[RunPrint]) -> list[tuple[int, int]]:
     run = np.repeat(np.arange(len(prints)), [len(each.codes) for each in prints])
     codes = np.concatenate([np.empty(0, np.int64), *(each.codes for each in prints)])
     time_s = np.concatenate([np.empty(0), *(each.time_s for each in prints)])
-    order = np.argsort(codes, kind="stable")
-    codes, run, time_s = codes[order], run[order], time_s[order]
-    same = np.flatnonzero((codes[1:] == codes[:-1]) & (run[1:] != run[:-1]))
-    first, second, offset_s = run[same], run[same + 1], time_s[same + 1] - time_s[same]
-    order = np.lexsort((offset_s, second, first))
-    first, second, offset_s = first[order], second[order], offset_s[order]
-    a, b = slice(None, 1 - MIN_EQUAL), slice(MIN_EQUAL - 1, None)
-    near = offset_s[b] - offset_s[a] <= (MIN_EQUAL - 1) * (OFFSET_TOLERANCE_S + 0.1 * MAX_HOLE_S)
-    near &= (first[a] == first[b]) & (second[a] == second[b])
-    found = set(zip(first[a][near].tolist(), second[a][near].tolist(), strict=True))
-    seen: dict[bytes, int] = {}
-    for place, each in enumerate(prints):
-        if each.digest and (before := seen.setdefault(each.digest, place)) != place:
-            found.add((before, place))
-    return sorted(found)
+    return pairs_of(equal_codes(codes, run, time_s), [each.digest for each in prints])
 
 
 def groups_of(stretches: Sequence[SharedStretch]) -> tuple[tuple[str, ...], ...]:
