@@ -85,6 +85,8 @@ def build_store(
     heads = _heads(loaders, settings.jobs, progress)
     kept = [load for load, head in zip(loaders, heads, strict=True) if head.fault is None]
     manifest, extractor = _manifest([head for head in heads if head.fault is None], settings)
+    skipped = tuple(f"run skipped: {head.fault}" for head in heads if head.fault is not None)
+    del heads
     (store / RUNS_FILE).unlink(missing_ok=True)
     (store / WINDOWS_FOLDER).mkdir(parents=True, exist_ok=True)
     _write_json(store / STORE_FILE, manifest.as_json())
@@ -112,7 +114,7 @@ def build_store(
         n_features=len(manifest.features),
         dropped=dict(sum((Counter(run.dropped) for run in runs), Counter())),
         repaired=dict(sum((Counter(run.repaired) for run in runs), Counter())),
-        skipped=tuple(f"run skipped: {head.fault}" for head in heads if head.fault is not None),
+        skipped=skipped,
         duplicates=shared,
     )
 

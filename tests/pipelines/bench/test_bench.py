@@ -73,6 +73,7 @@ def test_a_window_is_timed_alone(swerve_model, monkeypatch):
     assert 0.05 < window_times_ms(windows, swerve_model).median < 1000.0
 
 
+@pytest.mark.slow
 def test_a_service_that_does_not_start_is_named():
     with pytest.raises(TerrainError, match="the service did not start: error: /nowhere"):
         ServiceProcess(["--model", "/nowhere"])

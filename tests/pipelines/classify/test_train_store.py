@@ -102,6 +102,7 @@ def test_the_same_data_are_recognised_as_runs_and_as_a_store(trained_here, runs,
     assert other.registered.alias_reason.endswith("of version 1 on the same data")
 
 
+@pytest.mark.slow
 def test_a_champion_is_judged_on_new_runs_by_their_features(tracked, trained_here, drive_all, tmp_path):
     new = [replace(run, run_id=f"{run.run_id}_new") for run in drive_all(n_runs=3, seed=41)]
     folder = stored(new, tmp_path / "new")

@@ -125,6 +125,7 @@ def test_breakaways_name_the_run_and_both_terrains():
     assert (found.label, found.looks_like) == ("ice", "snow")
 
 
+@pytest.mark.slow
 def test_crossval_judges_courses_beside_single_windows(drive):
     runs = [
         drive(f"{terrain}_{i}", terrain, 10 * i + len(terrain), 40.0)

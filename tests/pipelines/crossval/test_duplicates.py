@@ -35,6 +35,7 @@ def test_copies_are_refused_by_name_with_what_to_do(runs, settings, protocol):
     assert "\n" not in sentence
 
 
+@pytest.mark.slow
 def test_merged_copies_leave_every_window_as_it_was(runs, settings):
     copies = [copy_of(run, f"{run.run_id}_again", 50.0) for run in runs]
     merged = samples_of([*runs, *copies], settings(merge_duplicates=True))

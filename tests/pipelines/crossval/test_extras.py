@@ -145,6 +145,7 @@ def test_speed_alone_is_right_just_where_terrains_were_driven_at_speeds_of_their
     assert accuracy[1] < 0.55
 
 
+@pytest.mark.slow
 def test_the_learning_curve_draws_that_many_runs_and_leaves_test_folds_alone(drive_all, drive, monkeypatch):
     runs = [*drive_all(("ASPHALT", "GRASS"), 5, duration_s=10.0), drive("GRAVEL_1", "GRAVEL", 1, 40.0)]
     samples = grouped_samples(runs, WindowRule())

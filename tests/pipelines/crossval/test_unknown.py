@@ -43,6 +43,7 @@ def test_two_terrains_and_few_runs_are_refused(runs, settings):
         crossval(few, settings(protocol="leave-terrain-out"))
 
 
+@pytest.mark.slow
 def test_no_run_of_the_left_out_terrain_and_no_tested_run_trains(runs, settings, monkeypatch):
     trained = []
 

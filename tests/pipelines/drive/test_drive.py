@@ -177,6 +177,7 @@ def test_the_thesis_with_the_true_terrain_drives_on_its_targets(suffix):
     assert adapting.controllers[name]["believed_ratio"].mean == 1.0
 
 
+@pytest.mark.slow
 def test_no_gain_is_credited_to_a_classifier_that_was_never_believed(monkeypatch):
     result = scripted(monkeypatch, 0.3, duration_s=8.0)
     for name in ("classified", "thesis:classified"):

@@ -148,6 +148,7 @@ def test_the_hidden_cause_is_named_built_in_and_absent_when_tested_again(terrain
     assert "not measured: no cause was named" in out
 
 
+@pytest.mark.slow
 def test_of_few_runs_none_is_held_out_by_default_and_the_same_seed_gives_the_same_page(
     terrain, tmp_path, undrawn
 ):

@@ -48,6 +48,7 @@ def terrain(monkeypatch, capsys, tmp_path):
     return run
 
 
+@pytest.mark.slow
 def test_the_command_prints_its_table_and_writes_every_trial(terrain, tmp_path):
     words = ("--n", "1", "--rows", "none,found", "--runs", "3", "--jobs", "1", "--seed", "2")
     code, out, err = terrain(*words, "--json", "trials.json")

@@ -341,6 +341,7 @@ def test_a_wrong_target_costs_no_speed_on_dry_sand(target):
     assert limited == pytest.approx(plain, rel=0.005)
 
 
+@pytest.mark.slow
 def test_the_thesis_slows_below_the_balance_and_the_traction_controller_does_not():
     """On grass, whose balance is near 0.126, with 0.05 as the target of steady motion."""
     options = {"scenario": "straight", "terrain": "grass", "seed": 201, "duration_s": 40.0}

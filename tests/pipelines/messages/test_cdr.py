@@ -99,6 +99,7 @@ def rates(name, numbers):
     return bytes(store.serialize_cdr(message, "a_msgs/msg/Rates"))
 
 
+@pytest.mark.slow
 def test_more_layouts_than_are_kept_are_read_too():
     messages = [rates("a" * (i % 7) + "b" * 40 * (i // 100), [float(i)] * (i % 5)) for i in range(300)]
     messages += [rates("x" * i, [0.5] * (99 - i // 4)) for i in range(100) for _ in range(2)]

@@ -39,7 +39,9 @@ def quick(name):
 
 RECIPES = ("cnn", "stack", "best")
 with_network = pytest.mark.parametrize("fitted", RECIPES[:2], indirect=True)  # "best" may be the SVM
-every_recipe = pytest.mark.parametrize("fitted", RECIPES, indirect=True)
+every_recipe = pytest.mark.parametrize(
+    "fitted", [*RECIPES[:2], pytest.param("best", marks=pytest.mark.slow)], indirect=True
+)
 
 
 @pytest.fixture(scope="module")

@@ -14,6 +14,7 @@ from terrain.errors import ConfigError, DataError
 from terrain.logs.write import write_run
 
 
+@pytest.mark.slow
 def test_the_runs_that_are_predicted_took_no_part(in_tracked, drive_all, settings, tmp_path, monkeypatch):
     from pipelines.quickstart.quickstart import quickstart
 

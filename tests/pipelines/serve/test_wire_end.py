@@ -95,6 +95,7 @@ def know_their_terrain(ended):
     "number",
     [signal.SIGTERM, *(pytest.param(n, marks=pytest.mark.slow) for n in (signal.SIGINT, signal.SIGKILL))],
 )
+@pytest.mark.slow
 def test_a_service_that_is_ended_under_load_goes_on_after_a_restart(
     model_folder, hello, messages, two_drives, tmp_path, number
 ):

@@ -36,6 +36,7 @@ def test_there_are_208_windows_of_2_s_that_do_not_overlap(windows):
         assert np.all(np.diff(starts_s) > 2.0 - 1e-6)
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_windows(windows, robot):
     again = thesis_windows(robot, 4, 2)
     assert all(

@@ -107,6 +107,7 @@ def test_one_window_has_the_bytes_of_many(fitted):
     assert np.array_equal(np.concatenate([fitted.predict_proba(X[i : i + 1]) for i in range(40)]), whole[:40])
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_bytes_and_leaves_the_generator_alone(fitted):
     X, y, run = draw_windows()
     torch.manual_seed(3)

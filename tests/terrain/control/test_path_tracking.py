@@ -351,7 +351,9 @@ def test_the_steering_is_trimmed_and_does_not_chatter():
     assert np.abs(np.diff(steer, axis=0)).max() < 0.02
 
 
-@pytest.mark.parametrize("name", ["complex", "crab", "arc", "spot_turn"])
+@pytest.mark.parametrize(
+    "name", ["complex", *(pytest.param(n, marks=pytest.mark.slow) for n in ("crab", "arc", "spot_turn"))]
+)
 def test_tracking_reduces_the_distance_to_the_path_in_every_scenario(name):
     """Distance of the origin to the path of the desired twists, and the heading at the end."""
     drive = make_scenario(name, ROBOT, "tiles")

@@ -91,7 +91,9 @@ HIDDEN = {
 }
 
 
-@pytest.mark.parametrize("case", HIDDEN)
+@pytest.mark.parametrize(
+    "case", [pytest.param(case, marks=[pytest.mark.slow] * (i % 2)) for i, case in enumerate(HIDDEN)]
+)
 def test_what_is_hidden_comes_back_and_nothing_else(case):
     hidden, options = HIDDEN[case]
     found = powertrain_of(commanded_runs(hidden, **options), options.get("robot", HUSKY))
@@ -199,6 +201,7 @@ def replaced(run, factor):
     return RunLog(run.run_id, run.robot, {**run.streams, "wheels": faster})
 
 
+@pytest.mark.slow
 def test_the_commands_of_the_measured_husky_are_no_wheel_speeds(measured):
     """Its log: 1.8 times as fast forward, 0.8 times in turning, at most 6.1 rad/s (terrain.logs.drive)."""
     robot = DriveRobot("husky", HUSKY.wheel_radius_m)

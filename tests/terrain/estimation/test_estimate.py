@@ -231,15 +231,13 @@ def ended_early(time_s, values):
 )
 @pytest.mark.parametrize("stream", ["wheels", "imu", "odometry", "steering"])
 def test_the_filter_recovers_from_every_sensor_fault(straight, stream, change):
-    for name in ("vio15", "vio12", "encoder12"):
-        found = estimate_run(spoilt(straight, stream, change), ROBOT, name)
-        row = summarize(found)
+    for name in ("encoder12", "vio12", "vio15"):
+        row = summarize(estimate_run(spoilt(straight, stream, change), ROBOT, name))
         assert row.finite is True
         touched = row.n_dropped + row.n_gated
         assert touched > 0 or change is ended_early or (change is frozen and stream in ("wheels", "steering"))
     if stream != "wheels" and change not in (ended_early, an_hour_on, an_hour_back):
-        found = estimate_run(spoilt(straight, stream, change), ROBOT, "vio15")
-        assert summarize(found).slip_mean == pytest.approx(0.125, abs=0.01)
+        assert (name, row.slip_mean) == ("vio15", pytest.approx(0.125, abs=0.01))
 
 
 @pytest.mark.parametrize("missing", ["imu", "odometry", "steering", "commands", "truth"])

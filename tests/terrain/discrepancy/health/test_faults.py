@@ -323,6 +323,7 @@ def test_measured_huskies_have_no_fault(measured, folder):
     assert faults(on_one_clock(load_runs(measured(folder)))) == ()
 
 
+@pytest.mark.slow
 def test_the_gyro_of_the_measured_marmotte_is_turned(measured):
     robot = DriveRobot("husky", load_robot("husky").wheel_radius_m)  # a sign asks for no size
     runs = [read(repair=True) for read in find_runs(measured("drive_marmotte"), robot)]

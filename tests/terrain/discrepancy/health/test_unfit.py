@@ -82,11 +82,11 @@ def sound() -> list[RunLog]:
 @pytest.mark.parametrize(
     ("robot", "effects"),
     [
-        (HUSKY, {}),
+        pytest.param(HUSKY, {}, marks=pytest.mark.slow),
         (AGRIMARO, {}),
         (HUSKY, {"effective_track_ratio": 1.0, "rolling_resistance_ratio": 0.2}),
-        (HUSKY, {"clock_rate_ratio": 0.015, "camera_latency_s": 0.3}),
-        (HUSKY, {"yaw_delay_s": 0.4, "gyro_scale_ratio": -0.15}),
+        pytest.param(HUSKY, {"clock_rate_ratio": 0.015, "camera_latency_s": 0.3}, marks=pytest.mark.slow),
+        pytest.param(HUSKY, {"yaw_delay_s": 0.4, "gyro_scale_ratio": -0.15}, marks=pytest.mark.slow),
         (AGRIMARO, {"encoder_lag_s": 0.3, "force_slip_ratio": 2.0}),
         (AGRIMARO, {"clock_offset_s": 0.5, "steering_offset_1_rad": 0.2}),
     ],

@@ -32,7 +32,7 @@ def test_a_track_that_is_two_and_a_half_times_as_wide_is_named_in_short_runs(num
     assert len(trial.excluded) <= len(trial.stalled) + 1
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_short_runs_in_which_nothing_is_hidden_have_no_cause(seed):
     drives = command_drives(np.random.default_rng(seed), HUSKY, SHORT_RUNS)
     runs = hidden_runs(HUSKY, drives, np.random.SeedSequence(seed), {}, heading=True)

@@ -252,7 +252,9 @@ def test_a_larger_wheel_carries_the_dynamic_robot_further():
     assert travelled[1] / travelled[0] == pytest.approx(1.03, abs=0.01)
 
 
-@pytest.mark.parametrize("number", range(len(KNOWN)))
+@pytest.mark.parametrize(
+    "number", [0, *(pytest.param(n, marks=pytest.mark.slow) for n in range(1, len(KNOWN)))]
+)
 def test_the_known_truth_is_in_the_logs(number):
     known, made = KNOWN[number], stage(Row.KNOWN, number)
     assert made.variant == known.name
