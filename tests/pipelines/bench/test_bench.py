@@ -53,6 +53,7 @@ def test_messages_hold_every_sample_of_the_drive_once(run):
     assert bytes_[0].time_s == 0.0
 
 
+@pytest.mark.slow
 def test_steps_and_windows_are_timed(run, swerve_model):
     short = RunLog(run.run_id, run.robot, run.streams)
     alone, beside = step_times_us(ROBOT, swerve_model, short, repeats=1)

@@ -186,7 +186,9 @@ def test_terrains_of_vulpi_are_classified_on_held_out_runs(datasets_dir, setting
     assert any(note.startswith("DIRT_ROAD: one run only") for note in report.notes)
 
 
-@pytest.mark.parametrize("window_s", [0.4, 0.5, 0.7, 0.8, 1.0])
+@pytest.mark.parametrize(
+    "window_s", [0.4, 1.0, *(pytest.param(s, marks=pytest.mark.slow) for s in (0.5, 0.7, 0.8))]
+)
 def test_a_window_with_few_samples_of_a_slow_stream_is_classified(drive_all, settings, window_s):
     runs = drive_all(("ASPHALT", "GRAVEL"), 3, duration_s=8.0)
     report = crossval(runs, settings(window_s=window_s))

@@ -73,7 +73,7 @@ def test_a_store_holds_the_features_of_the_runs_bit_for_bit(runs_dir, tmp_path):
         assert getattr(stored.motion, name).tobytes() == getattr(motion, name).tobytes()
 
 
-@pytest.mark.parametrize("protocol", ["grouped", "leave-one-run-out"])
+@pytest.mark.parametrize("protocol", ["grouped", pytest.param("leave-one-run-out", marks=pytest.mark.slow)])
 def test_cross_validation_of_a_store_gives_the_report_of_its_runs(runs_dir, tmp_path, protocol):
     build_store(run_loaders(runs_dir), features_settings(tmp_path / "store"))
     asked = SETTINGS.with_(protocol=protocol)

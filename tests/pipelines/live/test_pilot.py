@@ -353,7 +353,7 @@ def test_the_thesis_slows_below_the_balance_and_the_traction_controller_does_not
     assert limited == pytest.approx(plain, rel=0.005)
 
 
-@pytest.mark.parametrize("scenario", ["crab", "complex"])
+@pytest.mark.parametrize("scenario", [pytest.param("crab", marks=pytest.mark.slow), "complex"])
 def test_backward_and_sideways_slip_is_estimated_and_limited_as_forward(scenario):
     run, where = driven("known:grass", scenario, "grass", 202)
     control = run.streams["control"]

@@ -83,7 +83,14 @@ def test_a_recorded_observer_is_predicted_as_it_was_live(writer, tmp_path, mower
     assert_same(read_windows(folder), rows)
 
 
-@pytest.mark.parametrize("begin_s", [{}, {"imu": 0.73, "odometry": 1.9}, {"wheels": 1.31, "steering": 0.4}])
+@pytest.mark.parametrize(
+    "begin_s",
+    [
+        {},
+        pytest.param({"imu": 0.73, "odometry": 1.9}, marks=pytest.mark.slow),
+        pytest.param({"wheels": 1.31, "steering": 0.4}, marks=pytest.mark.slow),
+    ],
+)
 def test_a_recorded_pilot_is_predicted_as_it_was_live(writer, tmp_path, swerve_model, begin_s):
     recorder = SessionRecorder(tmp_path, "drive", "agrimaro", CHANNELS, AGRIMARO.wheels, writer=writer)
     pilot = LivePilot(AGRIMARO, source=Classifier(swerve_model, AGRIMARO, Kept(recorder)))

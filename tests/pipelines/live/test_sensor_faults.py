@@ -110,7 +110,7 @@ def test_a_camera_that_is_a_tenth_of_a_second_late_costs_little(fault, situation
 STREAMS = ("wheels", "steering", "imu", "odometry")
 
 
-@pytest.mark.parametrize("stream", [*STREAMS, "all"])
+@pytest.mark.parametrize("stream", [*(pytest.param(name, marks=pytest.mark.slow) for name in STREAMS), "all"])
 @pytest.mark.parametrize("which", ["back", "forward"])
 def test_a_clock_that_is_set_by_an_hour_costs_a_moment(stream, which):
     found = row(f"clock_{which}_{stream}", Place("steady", "grass", SEED)).figures

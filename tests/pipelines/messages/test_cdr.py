@@ -53,7 +53,7 @@ def numbers_of(names, kind, value):
 
 
 @given(st.data(), fields, fields, st.sampled_from(["", "[2]", "[]"]))
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 def test_numbers_are_those_that_were_serialized(data, inner, outer, many):
     lines = [f"{kind}{array} f{i}" for i, (kind, array) in enumerate(outer)]
     lines.insert(len(lines) // 2, f"Inner{many} inner")

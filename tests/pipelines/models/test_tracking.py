@@ -141,6 +141,7 @@ def test_the_champion_moves_by_the_rule(in_tracked, log):
     assert in_tracked.registered.alias_reason.startswith("first version")
 
 
+@pytest.mark.slow
 def test_the_champion_of_a_robot_stays_whatever_is_trained_under_its_name(in_tracked, log):
     assert log("guarded", 0.80).alias_moved
     for changed, reason in (

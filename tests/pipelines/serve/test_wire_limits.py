@@ -115,6 +115,7 @@ def test_a_request_that_does_not_come_whole_is_ended(driving, monkeypatch, first
     assert driving.get("/health")[0] == 200
 
 
+@pytest.mark.slow
 def test_a_receiver_that_does_not_read_is_ended_and_disturbs_no_other(driving):
     begun = {**DRIVEN, "type": "hello", "rate_hz": 200}
     with raw(driving, {**begun, "session": "slow"}, buffer=8192) as slow:

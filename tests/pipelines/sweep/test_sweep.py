@@ -25,6 +25,7 @@ def searched(runs, tmp_path_factory):
     return out, sweep(runs, asked(out), "drawn")
 
 
+@pytest.mark.slow
 def test_an_interrupted_search_goes_on_to_the_same_result(runs, searched, tmp_path):
     out, whole = searched
     first = sweep(runs, asked(tmp_path / "two", trials=4), "drawn")

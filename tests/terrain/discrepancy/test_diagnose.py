@@ -92,7 +92,7 @@ def test_where_nothing_is_hidden_nothing_is_named(worlds):
 @pytest.mark.parametrize(
     ("robot", "name"),
     [
-        pytest.param(robot, name, marks=[pytest.mark.slow] * (i % 2))
+        pytest.param(robot, name, marks=[pytest.mark.slow] * (i % 4 > 0))
         for robot in EFFECTS
         for i, name in enumerate(EFFECTS[robot])
     ],
@@ -115,7 +115,10 @@ def test_a_hidden_effect_is_named_with_its_value_and_nothing_beside_it(worlds, r
 
 @pytest.mark.parametrize(
     ("robot", "names"),
-    [("husky", ("effective_track", "payload")), ("agrimaro", ("steering_offset_1", "camera_latency"))],
+    [
+        ("husky", ("effective_track", "payload")),
+        pytest.param("agrimaro", ("steering_offset_1", "camera_latency"), marks=pytest.mark.slow),
+    ],
 )
 def test_of_two_hidden_effects_both_are_named(worlds, robot, names):
     world = worlds[robot]

@@ -444,7 +444,9 @@ def stamped(rate_hz, stamps):
 
 
 @pytest.mark.parametrize("stamps", ["decimal", "summed"])
-@pytest.mark.parametrize("n", range(1, 11))
+@pytest.mark.parametrize(
+    "n", [1, 4, 10, *(pytest.param(n, marks=pytest.mark.slow) for n in (2, 3, 5, 6, 7, 8, 9))]
+)
 def test_a_jump_of_any_length_costs_live_what_it_costs_the_batch(n, stamps):
     """Four samples that leapt are a step of five periods: the low-pass goes on over it, live and in batch."""
     run = edited(edited(log(), "odometry", stamped(200.0, stamps)), "odometry", jump(n))
@@ -452,7 +454,9 @@ def test_a_jump_of_any_length_costs_live_what_it_costs_the_batch(n, stamps):
 
 
 @pytest.mark.parametrize("stream", ["imu", "odometry", "steering"])
-@pytest.mark.parametrize("n", range(2, 11))
+@pytest.mark.parametrize(
+    "n", [2, 5, 10, *(pytest.param(n, marks=pytest.mark.slow) for n in (3, 4, 6, 7, 8, 9))]
+)
 def test_a_gap_of_whole_periods_costs_live_what_it_costs_the_batch(n, stream):
     rate_hz = {"imu": 100.0, "odometry": 200.0, "steering": 50.0}[stream]
     assert_equal(edited(edited(log(), stream, stamped(rate_hz, "decimal")), stream, lost(n)))
