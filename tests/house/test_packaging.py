@@ -46,6 +46,7 @@ def installed_wheel(tmp_path_factory):
     return target
 
 
+@pytest.mark.slow
 def test_the_wheel_runs_elsewhere_with_its_yaml(installed_wheel, tmp_path):
     environment = {**os.environ, "PYTHONPATH": str(installed_wheel)}
     code = (

@@ -29,6 +29,7 @@ def judged(model, runs, settings, report=None):
     return judge(Champion("1", {"macro_f1": "0.9"}, model), "2"), data.samples, report
 
 
+@pytest.mark.slow
 def test_the_champion_is_judged_on_runs_that_it_never_saw(model, drive_all, settings):
     new = drive_all(n_runs=3, seed=41)
     verdict, samples, report = judged(model, new, settings)

@@ -188,6 +188,7 @@ def test_a_tracking_folder_that_cannot_be_written_is_reported_before_any_work(tm
     assert (tmp_path / "mlruns").read_text() == "an obstacle"
 
 
+@pytest.mark.slow
 def test_quickstart_ends_in_a_report_in_one_file(in_tracked, drive_all, settings, tmp_path, monkeypatch):
     from pipelines.quickstart.quickstart import quickstart
 

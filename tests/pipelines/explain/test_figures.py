@@ -57,7 +57,8 @@ def test_the_example_stretch_is_of_a_run_with_larger_residuals_than_most():
     assert len(short.time_s) == 50
 
 
-@pytest.mark.parametrize("after", [True, pytest.param(False, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("after", [True, False])
 def test_pictures_of_runs_are_the_same_bytes_again(after):
     runs = [a_run(f"run$_{i}^", off=0.05, seed=i, after=after) for i in range(3)]
     noise = a_noise()

@@ -216,6 +216,7 @@ def test_an_exception_of_the_pilot_shows_in_its_row(monkeypatch):
     assert row.figures.recovery_s <= 0.02
 
 
+@pytest.mark.slow
 def test_the_command_writes_table_json_and_page(terrain):
     code, out, err = terrain(
         *("--faults", "loss_wheels,late_30ms_imu", "--situations", "stop,start", "--durations", "3"),
