@@ -16,7 +16,6 @@ from pipelines.classify.limits import LimitData, limits_of
 from pipelines.classify.results import Training
 from pipelines.classify.settings import TrainSettings
 from pipelines.classify.training_data import (
-    FEATURE_RECIPE,
     RunIdentity,
     TrainingData,
     data_of_runs,
@@ -26,7 +25,7 @@ from pipelines.classify.training_data import (
 from pipelines.crossval.crossval import crossval
 from pipelines.crossval.evaluation import Examples
 from pipelines.crossval.results import ChannelImportance, CrossvalReport
-from pipelines.crossval.settings import RecipeSettings
+from pipelines.crossval.settings import FEATURE_RECIPE, RecipeSettings
 from pipelines.crossval.splits import folds_of
 from pipelines.feature_store.crossval import crossval_stored, refuse_recipe
 from pipelines.feature_store.store import FeatureStore, read_store

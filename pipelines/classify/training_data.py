@@ -13,6 +13,7 @@ from features.motion import Motion, window_motion
 from features.windows import Layout, cut_windows
 from pipelines.classify.settings import TrainSettings
 from pipelines.crossval.crossval import samples_of
+from pipelines.crossval.settings import FEATURE_RECIPE
 from pipelines.crossval.splits import Samples
 from pipelines.feature_store.store import FeatureStore, Stored
 from pipelines.models.model_files import TerrainModel
@@ -20,9 +21,6 @@ from pipelines.models.recipes import WindowPipeline, feature_matrix
 from pipelines.runs.datasets import data_digest
 from terrain.errors import DataError
 from terrain.records import Array, RunLog
-
-FEATURE_RECIPE = "svm"
-"""The recipe whose classifier learns from features alone."""
 
 SAME_RATE = 1e-6
 """Rates that differ by less, relative to one another, give the same features but for rounding."""

@@ -21,6 +21,8 @@ PROTOCOLS: tuple[str, ...] = get_args(Protocol)
 SPEED_PROTOCOLS = ("slow-fast", "fast-slow")
 Recipe = Literal["svm", "cnn", "stack", "best"]
 RECIPES: tuple[str, ...] = get_args(Recipe)
+FEATURE_RECIPE = "svm"
+"""The recipe that learns from features alone, and so from a store of them."""
 
 WINDOW_S = 2.0
 PUBLISHED_WINDOW_S = 1.7

@@ -9,7 +9,7 @@ from pipelines.crossval.crossval import report_of, with_limits
 from pipelines.crossval.evaluation import fit_folds, pool, summarise
 from pipelines.crossval.extras import examples_of
 from pipelines.crossval.results import CrossvalReport
-from pipelines.crossval.settings import SPEED_PROTOCOLS, CrossvalSettings, RecipeSettings
+from pipelines.crossval.settings import FEATURE_RECIPE, SPEED_PROTOCOLS, CrossvalSettings, RecipeSettings
 from pipelines.crossval.splits import folds_of
 from pipelines.crossval.unknown import leave_terrain_out
 from pipelines.feature_store.store import FeatureStore, Stored, read_store
@@ -24,7 +24,7 @@ NO_EXTRAS = (
 
 def refuse_recipe(settings: RecipeSettings) -> None:
     """Raise ``ConfigError`` where a recipe learns from samples, which a store does not hold."""
-    if settings.recipe != "svm":
+    if settings.recipe != FEATURE_RECIPE:
         raise ConfigError(f"recipe {settings.recipe!r} needs the samples of runs, not a store of features")
 
 

@@ -64,7 +64,10 @@ class PrintFiles:
             self._files[each].write(records[number == each].tobytes())
 
     def possible_pairs(self) -> list[tuple[int, int]]:
-        """Return what :func:`terrain.logs.duplicates.possible_pairs` returns."""
+        """Return the pairs of runs, by their places, that may share a stretch.
+
+        :func:`~terrain.logs.duplicates.shared_stretches` decides.
+        """
         found = []
         for file in self._files:
             file.seek(0)

@@ -1,4 +1,4 @@
-"""Kinematics of a robot on fixed omni wheels: twist to wheels, wheels to twist, motion of the rollers.
+"""Kinematics of a robot on fixed omni wheels: twist to wheels, and wheels to twist.
 
 Wheel i at ``p_i = (x_i, y_i)`` drives along ``d_i = (cos a_i, sin a_i)``; its rollers let it move freely
 across that, along ``e_i = (-sin a_i, cos a_i)``.  The velocity of its centre is
@@ -8,7 +8,8 @@ across that, along ``e_i = (-sin a_i, cos a_i)``.  The velocity of its centre is
 
 which for all wheels is ``u = J V``.  Three wheels determine the twist, ``V = J^-1 u``, unless the lines that
 they drive along all meet in one point or are parallel; more wheels contradict each other where one slips.
-The rollers turn with ``e_i . p_i'``, which no encoder measures.
+The rollers turn with ``e_i . p_i'``, which no encoder measures:
+:func:`~terrain.kinematics.wheel_velocity.wheel_frame_velocities` steered by ``a_i`` gives it.
 
 Source: Siegwart, Nourbakhsh, Scaramuzza, Introduction to Autonomous Mobile Robots, 3.2.3: the Swedish wheel
 with rollers at a right angle.  A twist is ``(speed_x_mps, speed_y_mps, yaw_rate_radps)``.
@@ -20,7 +21,6 @@ import numpy as np
 
 from terrain.errors import ConfigError
 from terrain.kinematics.arguments import finite_numbers, wheel_positions
-from terrain.kinematics.wheel_velocity import in_wheel_frame, point_velocity
 from terrain.records import Array
 
 MAX_CONDITION = 1e6
@@ -117,21 +117,3 @@ def forward(positions_m: Array, direction_rad: Array, wheel_speed_mps: Array) ->
         )
     twist = speed @ np.linalg.pinv(rows).T
     return twist, np.linalg.norm(speed - twist @ rows.T, axis=-1)
-
-
-def wheel_motion(positions_m: Array, direction_rad: Array, twist: Array) -> tuple[Array, Array]:
-    """Return the velocities (..., wheels) of the wheel centres along each wheel and across it, to its left.
-
-    What is along a wheel, beside its circumferential speed, gives its slip ratio; what is across it turns its
-    rollers.
-
-    Raises
-    ------
-    ConfigError
-        as :func:`inverse`.
-    """
-    rolling_matrix(positions_m, direction_rad)
-    v = finite_numbers("twist", twist, 3)[..., None, :]
-    velocity = point_velocity(v[..., 0], v[..., 1], v[..., 2], *wheel_positions(positions_m).T)
-    along_mps, across_mps = in_wheel_frame(*velocity, np.cos(direction_rad), np.sin(direction_rad))
-    return along_mps, across_mps

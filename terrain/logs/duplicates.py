@@ -26,7 +26,6 @@ import numpy as np
 from terrain.logs.fingerprints import (
     N_PEAKS,
     Peaks,
-    RunPrint,
     fingerprints,
     measured_streams,
     samples_digest,
@@ -260,21 +259,6 @@ def pairs_of(equal: EqualCodes, digests: Sequence[bytes]) -> list[tuple[int, int
         if digest and (before := seen.setdefault(digest, place)) != place:
             found.add((before, place))
     return sorted(found)
-
-
-def possible_pairs(prints: Sequence[RunPrint]) -> list[tuple[int, int]]:
-    """Return the pairs of runs, by their places, that may share a stretch; :func:`shared_stretches` decides.
-
-    Examples
-    --------
-    >>> codes, time_s = np.arange(9), np.arange(9.0)
-    >>> possible_pairs([RunPrint(codes, time_s, b""), RunPrint(codes[1:], 50.0 + time_s[1:], b"")])
-    [(0, 1)]
-    """
-    run = np.repeat(np.arange(len(prints)), [len(each.codes) for each in prints])
-    codes = np.concatenate([np.empty(0, np.int64), *(each.codes for each in prints)])
-    time_s = np.concatenate([np.empty(0), *(each.time_s for each in prints)])
-    return pairs_of(equal_codes(codes, run, time_s), [each.digest for each in prints])
 
 
 def groups_of(stretches: Sequence[SharedStretch]) -> tuple[tuple[str, ...], ...]:

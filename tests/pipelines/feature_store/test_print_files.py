@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pipelines.feature_store.print_files import PrintFiles
-from terrain.logs.duplicates import possible_pairs
+from terrain.logs.duplicates import equal_codes, pairs_of
 from terrain.logs.fingerprints import RunPrint
 
 
@@ -22,6 +22,13 @@ def drawn(seed, n_runs=30, n_codes=200):
         digest = b"same" if place in (4, 17) else b""
         prints.append(RunPrint(codes, time_s, digest))
     return [*prints, RunPrint(np.empty(0, np.int64), np.empty(0), b"")]
+
+
+def possible_pairs(prints):
+    """Return the pairs, all fingerprints in memory at once."""
+    run = np.repeat(np.arange(len(prints)), [len(each.codes) for each in prints])
+    codes, time_s = (np.concatenate([each[i] for each in prints]) for i in (0, 1))
+    return pairs_of(equal_codes(codes, run, time_s), [each.digest for each in prints])
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -14,9 +14,10 @@ from sklearn.utils.estimator_checks import (
     check_parameters_default_constructible,
 )
 
+from terrain.classify import grouped_network
 from terrain.classify.augment import Augmentation, augmented, mirror_of, mirrors_of
 from terrain.classify.grouped_network import GroupedNetwork, fit_temperature
-from terrain.classify.network import fit_member, network_numbers_of, reproducible, task_of
+from terrain.classify.network import fit_member, fit_on_all, network_numbers_of, reproducible, task_of
 from terrain.classify.network_numbers import (
     SampleColumns,
     check_network,
@@ -211,6 +212,29 @@ def test_a_window_of_a_long_run_weighs_less():
     weight = task_of(COLUMNS, X.astype(np.float32), np.unique(y, return_inverse=True)[1], run).weight
     assert weight.mean() == pytest.approx(1.0)
     assert weight[-1] / weight[0] == pytest.approx(2.0)  # sqrt(24 / 6)
+
+
+def test_many_short_runs_outweigh_one_long_run():
+    """Windows without any difference: 40 of one run against 30 of ten; their weights are 6.3 against 17.3."""
+    rng = np.random.default_rng(0)
+    index, run = np.repeat([0, 1], [40, 30]), np.concatenate([np.zeros(40), 1 + np.arange(30) // 3])
+    X = rng.standard_normal((70, WIDTH)).astype(np.float32)
+    task = task_of(COLUMNS, X, index, run)
+    with reproducible():
+        nets = [fit_on_all(task, Augmentation(shift=True), 6, seed) for seed in range(2)]
+    numbers = network_numbers_of(task, np.zeros(WIDTH), nets, 1.0)
+    other = rng.standard_normal((200, WIDTH))
+    assert softmax(mean_log_probabilities(numbers, other))[:, 1].mean() > 0.55
+
+
+def test_all_inner_folds_choose_the_augmentation(monkeypatch):
+    fits = []
+    monkeypatch.setattr(
+        grouped_network, "fit_member", lambda *given: fits.append(given) or fit_member(*given)
+    )
+    X, y, run = draw_windows(n_windows=4)
+    model = quick(trial_epochs=1, epochs=1, n_inner_folds=4).fit(X, y, run)
+    assert len(fits) == 4 * (len(model.trials_) + 1)
 
 
 def test_a_slow_stream_and_a_short_window_have_no_spectrum():

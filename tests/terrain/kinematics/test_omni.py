@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from terrain.errors import ConfigError
-from terrain.kinematics.omni import forward, inverse, rolling_matrix, wheel_motion, wheels_on_circle
+from terrain.kinematics.omni import forward, inverse, rolling_matrix, wheels_on_circle
+from terrain.kinematics.wheel_velocity import wheel_frame_velocities
 
 PLACE = wheels_on_circle(0.125, np.radians([60.0, 180.0, 300.0]))
 FOUR = wheels_on_circle(0.3, np.radians([45.0, 135.0, 225.0, 315.0]))
@@ -28,7 +29,7 @@ def test_forward_undoes_inverse(twist, place):
 def test_speeds_are_those_of_points_of_a_body_that_moves(twist):
     """Numeric derivative of the places of the wheels, in the axes of the body."""
     positions_m, direction_rad = PLACE
-    along_mps, across_mps = wheel_motion(*PLACE, twist)
+    along_mps, across_mps = wheel_frame_velocities(twist, positions_m, direction_rad)
     step_s = 1e-6
     for k, (vx, vy, rate) in enumerate(twist):
         places = []

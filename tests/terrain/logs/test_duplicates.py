@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pipelines.feature_store.print_files import PrintFiles
 from pipelines.runs.datasets import load_runs
 from terrain.errors import DataError
-from terrain.logs.duplicates import groups_of, possible_pairs, shared_stretches
+from terrain.logs.duplicates import groups_of, shared_stretches
 from terrain.logs.fingerprints import run_print
 from terrain.logs.merge import merge_runs
 from terrain.records import Label, RunLog, Stream
@@ -80,8 +81,21 @@ def test_a_copy_is_found_whatever_was_done_to_it(runs, kind):
     assert found.duration_s == pytest.approx(24.0, abs=1.0)
 
 
+@pytest.fixture
+def possible_pairs(tmp_path):
+    """Return what finds the pairs of runs whose prints have enough in common."""
+
+    def find(prints):
+        with PrintFiles(tmp_path / "prints") as files:
+            for each in prints:
+                files.add(each)
+            return files.possible_pairs()
+
+    return find
+
+
 @pytest.mark.parametrize("kind", CHANGES)
-def test_a_copy_is_found_by_the_prints_of_runs_alone(runs, kind):
+def test_a_copy_is_found_by_the_prints_of_runs_alone(runs, kind, possible_pairs):
     """Prints are made run by run; whole runs are compared for the pairs that they name only."""
     assert possible_pairs([run_print(run) for run in runs]) == []
     hidden = [changed(runs[5], CHANGES[kind]), cut(runs[2], 6.0, 12.0)]
@@ -89,13 +103,13 @@ def test_a_copy_is_found_by_the_prints_of_runs_alone(runs, kind):
     assert found == [(2, 9), (5, 8)]
 
 
-def test_short_runs_of_the_same_samples_are_found_by_their_bytes(runs):
+def test_short_runs_of_the_same_samples_are_found_by_their_bytes(runs, possible_pairs):
     short = [cut(runs[0], 0.0, 2.0, name) for name in "ab"]
     assert len(run_print(short[0]).codes) < 6
     assert possible_pairs([run_print(run) for run in (*short, runs[1])]) == [(0, 1)]
 
 
-def test_constant_and_missing_channels_have_no_prints(runs):
+def test_constant_and_missing_channels_have_no_prints(runs, possible_pairs):
     still = changed(runs[0], lambda each: Stream(each.time_s, np.ones_like(each.values), each.channels))
     lost = changed(runs[0], lambda each: Stream(each.time_s, each.values * np.nan, each.channels))
     assert possible_pairs([run_print(run) for run in (still, still, lost, lost)]) == []
