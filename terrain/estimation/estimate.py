@@ -30,7 +30,11 @@ from terrain.robots import Robot
 FILTERS = ("encoder12", "slip14", "vio12", "vio15", "skid")
 """Names of the filters; the numbers are those of their states."""
 
-FILTERS_OF_DRIVE = {"swerve": FILTERS[:-1], "skid_steer": FILTERS[-1:]}
+FILTERS_OF_DRIVE: Mapping[str, tuple[str, ...]] = {
+    "swerve": FILTERS[:-1],
+    "skid_steer": FILTERS[-1:],
+    "omni": (),
+}
 """Filters of each drive."""
 
 TUNINGS = ("physical", "thesis", "likelihood")
@@ -220,7 +224,7 @@ def model_and_noise(
     check_corrected(robot)
     suitable = FILTERS_OF_DRIVE[robot.drive]
     if name in FILTERS and name not in suitable:
-        fits = ", ".join(suitable)
+        fits = ", ".join(suitable) or "terrain measure-slip"
         raise ConfigError(
             f"filter {name!r} is not for robot {robot.name}, whose drive is {robot.drive}: use {fits}"
         )

@@ -8,9 +8,10 @@ from typing import NamedTuple
 import numpy as np
 
 from terrain.errors import ConfigError
+from terrain.kinematics import omni
 from terrain.kinematics.swerve import wheel_commands
 from terrain.records import Array
-from terrain.robots import Robot, SkidSteerRobot, SwerveRobot
+from terrain.robots import OmniRobot, Robot, SkidSteerRobot, SwerveRobot
 
 
 class WheelMotion(NamedTuple):
@@ -36,7 +37,7 @@ def wheel_motion(robot: Robot, twist: Array, dt_s: float) -> WheelMotion:
 
     Parameters
     ----------
-    robot : a swerve robot with motors and steering; a skid-steer robot without motors has no fastest speed
+    robot : a swerve robot with motors and steering; other robots without motors have no fastest speed
     twist : (n, 3) desired ``(speed_x_mps, speed_y_mps, yaw_rate_radps)``
     dt_s : time from one twist to the next
 
@@ -48,7 +49,8 @@ def wheel_motion(robot: Robot, twist: Array, dt_s: float) -> WheelMotion:
     Notes
     -----
     A swerve robot: :func:`terrain.kinematics.swerve.wheel_commands`.  A skid-steer robot of track B:
-    ``v_left = v - w B / 2``, ``v_right = v + w B / 2``, each within what its motor can do.
+    ``v_left = v - w B / 2``, ``v_right = v + w B / 2``, each within what its motor can do.  An omni robot:
+    :func:`terrain.kinematics.omni.inverse`, the twist shortened by what brings the fastest wheel to its limit.
 
     Examples
     --------
@@ -79,3 +81,13 @@ def _(robot: SkidSteerRobot, twist: Array, dt_s: float) -> WheelMotion:
     limit = robot.wheel_radius_m * robot.completed.motors.speed_max_radps
     speeds = np.clip(np.column_stack([twist[:, 0] - turn, twist[:, 0] + turn]), -limit, limit)
     return WheelMotion(twist, speeds, speeds / robot.wheel_radius_m, np.zeros_like(speeds))
+
+
+@wheel_motion.register
+def _(robot: OmniRobot, twist: Array, dt_s: float) -> WheelMotion:
+    speeds = omni.inverse(robot.wheel_positions_m, robot.wheel_directions_rad, twist)
+    limit = robot.wheel_radius_m * robot.completed.motors.speed_max_radps
+    over = np.maximum(np.abs(speeds).max(axis=1, keepdims=True) / limit, 1.0)
+    return WheelMotion(
+        twist / over, speeds / over, speeds / over / robot.wheel_radius_m, np.zeros_like(speeds)
+    )

@@ -13,6 +13,7 @@ import gzip
 import zlib
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from itertools import islice
 from pathlib import Path
 from typing import TextIO
 
@@ -39,6 +40,7 @@ def read_columns(
     columns: Sequence[str],
     *,
     delimiter: str = ",",
+    rows_before: int = 0,
     repair: bool = False,
     dropped: Counter[str] | None = None,
 ) -> Array:
@@ -46,9 +48,10 @@ def read_columns(
 
     Parameters
     ----------
-    path : file whose first line is a header
+    path : file with a header
     columns : names in the header, in the required order
     delimiter : one character
+    rows_before : rows above the header
     repair : turn cells that are no number into NaN, leave out rows of the wrong length, and count both
     dropped : counts by kind, added to when repairing
 
@@ -59,18 +62,18 @@ def read_columns(
         a cell that is no number or a row of the wrong length.
     """
     _refuse_too_large(path)
-    header = _header(path, delimiter)
+    header = header_of(path, delimiter=delimiter, rows_before=rows_before)
     for column in columns:
         if header.count(column) != 1:
             fault = "is missing" if column not in header else "is there twice"
             raise LogError(f"{short_name(path)}: column {column!r} {fault} (the file has {listed(header)})")
-    fast = _fast_columns(path, header, columns, delimiter)
+    fast = _fast_columns(path, header, columns, delimiter, rows_before)
     if fast is not None:
         return fast
     counts: Counter[str] = Counter() if dropped is None else dropped
     places = [header.index(column) for column in columns]
     table = []
-    for row, cells in _rows(path, delimiter):
+    for row, cells in _rows(path, delimiter, rows_before):
         if len(cells) != len(header):
             if not repair:
                 raise LogError(
@@ -91,9 +94,9 @@ def read_columns(
     return np.array(table, dtype=np.float64).reshape(len(table), len(columns))
 
 
-def data_row(path: Path, index: int, *, delimiter: str = ",") -> int:
+def data_row(path: Path, index: int, *, delimiter: str = ",", rows_before: int = 0) -> int:
     """Return the row number, as an editor shows it, of the data row ``index`` (blank rows count)."""
-    for number, (row, _) in enumerate(_rows(path, delimiter)):
+    for number, (row, _) in enumerate(_rows(path, delimiter, rows_before)):
         if number == index:
             return row
     raise IndexError(index)
@@ -124,10 +127,17 @@ def _open(path: Path) -> TextIO:
     return path.open(encoding="utf-8-sig", newline="")
 
 
-def _header(path: Path, delimiter: str) -> list[str]:
+def header_of(path: Path, *, delimiter: str = ",", rows_before: int = 0) -> list[str]:
+    """Return the names in the header of a CSV file.
+
+    Raises
+    ------
+    LogError
+        if the file is missing, empty or no text.
+    """
     try:
         with _open(path) as file:
-            first = next(csv.reader(file, delimiter=delimiter), [])
+            first = next(islice(csv.reader(file, delimiter=delimiter), rows_before, None), [])
     except _UNREADABLE as error:
         raise _unreadable(path, error) from error
     names = [name.strip() for name in first]
@@ -136,7 +146,9 @@ def _header(path: Path, delimiter: str) -> list[str]:
     return names
 
 
-def _fast_columns(path: Path, header: list[str], columns: Sequence[str], delimiter: str) -> Array | None:
+def _fast_columns(
+    path: Path, header: list[str], columns: Sequence[str], delimiter: str, rows_before: int
+) -> Array | None:
     from pyarrow import ArrowException
     from pyarrow import csv as arrow_csv
 
@@ -145,7 +157,7 @@ def _fast_columns(path: Path, header: list[str], columns: Sequence[str], delimit
         table = arrow_csv.read_csv(
             path,
             read_options=arrow_csv.ReadOptions(
-                column_names=[str(place) for place in range(len(header))], skip_rows=1
+                column_names=[str(place) for place in range(len(header))], skip_rows=rows_before + 1
             ),
             parse_options=arrow_csv.ParseOptions(delimiter=delimiter),
             convert_options=arrow_csv.ConvertOptions(
@@ -160,11 +172,12 @@ def _fast_columns(path: Path, header: list[str], columns: Sequence[str], delimit
     return np.column_stack([table.column(place).to_numpy() for place in places])
 
 
-def _rows(path: Path, delimiter: str) -> Iterator[tuple[int, list[str]]]:
+def _rows(path: Path, delimiter: str, rows_before: int) -> Iterator[tuple[int, list[str]]]:
     try:
         with _open(path) as file:
             reader = csv.reader(file, delimiter=delimiter)
-            next(reader, None)
+            for _ in range(rows_before + 1):
+                next(reader, None)
             for cells in reader:
                 if cells:
                     yield reader.line_num, cells

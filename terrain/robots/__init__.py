@@ -1,5 +1,6 @@
 """Robots: one type a drive, the sections of their descriptions, and the reader of those."""
 
+from terrain.robots.omni import OmniRobot, as_omni
 from terrain.robots.parts import Body, Camera, Equipment, Motors, Part, Sensors, Steering
 from terrain.robots.reader import description_file, load_robot, packaged_robot, read_description, robot_from
 from terrain.robots.region import Region
@@ -12,6 +13,7 @@ __all__ = [
     "Camera",
     "Equipment",
     "Motors",
+    "OmniRobot",
     "Part",
     "Region",
     "Robot",
@@ -19,6 +21,7 @@ __all__ = [
     "SkidSteerRobot",
     "Steering",
     "SwerveRobot",
+    "as_omni",
     "as_skid_steer",
     "as_swerve",
     "description_file",

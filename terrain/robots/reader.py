@@ -28,17 +28,17 @@ from terrain.files.descriptions import check_keys, number
 from terrain.files.documents import read_yaml
 from terrain.files.names import check_name, shown
 from terrain.files.resources import data_folder
+from terrain.robots.omni import OmniRobot
 from terrain.robots.parts import KIND_OF_SECTION
 from terrain.robots.region import read_region
 from terrain.robots.robot import Robot
 from terrain.robots.skid_steer import SkidSteerRobot
 from terrain.robots.swerve import SwerveRobot
 
-KIND_OF_DRIVE: dict[str, type[Robot]] = {kind.drive: kind for kind in (SkidSteerRobot, SwerveRobot)}
+KIND_OF_DRIVE: dict[str, type[Robot]] = {
+    kind.drive: kind for kind in (SkidSteerRobot, SwerveRobot, OmniRobot)
+}
 """The type of each drive."""
-
-NUMBERS = ("wheel_radius_m", "track_m", "wheelbase_m", "mass_kg")
-"""Numbers that every description has."""
 
 
 def load_robot(name_or_path: str | Path) -> Robot:
@@ -145,24 +145,23 @@ def robot_from(file: str, described: Any) -> Robot:
     ConfigError
         as :func:`load_robot` does.
     """
-    check_keys(file, described, ["name", "drive", *NUMBERS], optional=(*KIND_OF_SECTION, "effects"))
-    name, drive = described["name"], described["drive"]
+    drive = described.get("drive") if isinstance(described, dict) else None
+    kind = KIND_OF_DRIVE.get(drive, SkidSteerRobot) if isinstance(drive, str) else SkidSteerRobot
+    check_keys(file, described, ["name", "drive", *kind.numbers], optional=(*KIND_OF_SECTION, "effects"))
+    name = described["name"]
     if not isinstance(name, str) or not name:
         raise ConfigError(f"{file}: name is {shown(name)}, a word is required")
     check_name(f"{file}: name", name, ConfigError)
     if not isinstance(drive, str) or drive not in KIND_OF_DRIVE:
         raise ConfigError(f"{file}: drive {shown(drive)} is unknown: use one of {', '.join(KIND_OF_DRIVE)}")
-    wheel_radius_m, track_m, wheelbase_m, mass_kg = (
-        number(f"{file}: {key}", described[key], _unit(key)) for key in NUMBERS
-    )
+    numbers = {key: number(f"{file}: {key}", described[key], _unit(key)) for key in kind.numbers}
     parts = {
-        section: _part(f"{file}: {section}", kind, described[section])
-        for section, kind in KIND_OF_SECTION.items()
+        section: _part(f"{file}: {section}", part, described[section])
+        for section, part in KIND_OF_SECTION.items()
         if described.get(section) is not None
     }
-    kind = KIND_OF_DRIVE[drive]
-    assumed = frozenset(_assumed(described))
-    robot = kind(name, wheel_radius_m, track_m, wheelbase_m, mass_kg, parts, assumed=assumed)
+    assumed = frozenset(_assumed(described, kind.numbers))
+    robot = kind.described(name, numbers, parts=parts, assumed=assumed)
     if "effects" in described:
         effects, cov = read_effects(f"{file}: effects", described["effects"], drive)
         stated = described["effects"].get("region")
@@ -172,9 +171,9 @@ def robot_from(file: str, described: Any) -> Robot:
     return robot
 
 
-def _assumed(described: dict[str, Any]) -> Iterator[str]:
+def _assumed(described: dict[str, Any], numbers: tuple[str, ...]) -> Iterator[str]:
     """Yield the names of the numbers of a checked description whose source begins with "assumed"."""
-    sections = {"": {key: described[key] for key in NUMBERS}}
+    sections = {"": {key: described[key] for key in numbers}}
     sections |= {f"{name}.": described[name] for name in KIND_OF_SECTION if described.get(name) is not None}
     for prefix, entries in sections.items():
         for key, entry in entries.items():

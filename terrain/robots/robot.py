@@ -52,6 +52,8 @@ class Robot(ABC):
     region: Region | None = None
     assumed: frozenset[str] = frozenset()
 
+    numbers: ClassVar[tuple[str, ...]] = ("wheel_radius_m", "track_m", "wheelbase_m", "mass_kg")
+    """Numbers that every description of the drive has, beside its sections."""
     drive: ClassVar[str]
     """The kind of drive, as descriptions name it."""
     wheels: ClassVar[tuple[str, ...]]
@@ -61,7 +63,9 @@ class Robot(ABC):
     n_tyres: ClassVar[int]
     """Tyres that carry the weight."""
     steered: ClassVar[bool]
-    """Whether wheels are steered: there is a stream of angles, and a speed sideways is possible."""
+    """Whether wheels are steered: there is a stream of angles."""
+    sideways: ClassVar[bool]
+    """Whether it can drive sideways."""
     skids: ClassVar[bool]
     """Whether it turns by skidding, so that the turning moment takes a current of its own."""
 
@@ -82,10 +86,21 @@ class Robot(ABC):
         values = (getattr(self, item.name) for item in fields(self))
         return type(self), tuple(dict(v) if isinstance(v, MappingProxyType) else v for v in values)
 
+    @classmethod
+    def described(cls, name: str, numbers: Mapping[str, float], **also: Any) -> Self:
+        """Return the robot of a description's :attr:`numbers`; ``also`` are other parameters."""
+        radius_m, track_m, wheelbase_m, mass_kg = (numbers[key] for key in cls.numbers)
+        return cls(name, radius_m, track_m, wheelbase_m, mass_kg, **also)
+
     @property
     @abstractmethod
     def wheel_positions_m(self) -> Array:
         """Position (wheels, 2) of each wheel in the body frame."""
+
+    @property
+    def wheel_directions_rad(self) -> Array:
+        """Direction (wheels,) that each wheel drives along where it is not steered; 0 is ahead."""
+        return np.zeros(len(self.wheels))
 
     @property
     @abstractmethod
@@ -281,6 +296,23 @@ class Robot(ABC):
                 f"robot {self.name}: its description has no section {section!r}, which is needed here"
             )
         return part
+
+
+def check_centre_of_mass(place: str, positions_m: Array, body: Body) -> None:
+    """Refuse a centre of mass that lifts one of three wheels.
+
+    Raises
+    ------
+    ConfigError
+        if it is outside the triangle of the wheels (3, 2).
+    """
+    moments = np.vstack([np.ones(3), positions_m.T])
+    shares = np.linalg.solve(moments, [1.0, body.com_x_m, body.com_y_m])
+    if shares.min() <= 0:
+        raise ConfigError(
+            f"{place}: the centre of mass ({body.com_x_m:g}, {body.com_y_m:g}) m lies outside the "
+            f"triangle of the wheels: wheel {int(shares.argmin()) + 1} would carry nothing"
+        )
 
 
 def _neutral(kind: type[P], **values: float) -> P:

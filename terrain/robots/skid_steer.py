@@ -22,6 +22,7 @@ class SkidSteerRobot(Robot):
     sections: ClassVar[tuple[str, ...]] = ("body", "motors", "camera", "sensors")
     n_tyres: ClassVar[int] = 4
     steered: ClassVar[bool] = False
+    sideways: ClassVar[bool] = False
     skids: ClassVar[bool] = True
 
     @cached_property

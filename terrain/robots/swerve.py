@@ -11,7 +11,7 @@ import numpy as np
 from terrain.errors import ConfigError
 from terrain.records import Array, read_only
 from terrain.robots.parts import Steering
-from terrain.robots.robot import Robot
+from terrain.robots.robot import Robot, check_centre_of_mass
 
 
 @dataclass(frozen=True)
@@ -26,6 +26,7 @@ class SwerveRobot(Robot):
     sections: ClassVar[tuple[str, ...]] = ("body", "motors", "steering", "camera", "sensors")
     n_tyres: ClassVar[int] = 3
     steered: ClassVar[bool] = True
+    sideways: ClassVar[bool] = True
     skids: ClassVar[bool] = False
 
     @cached_property
@@ -90,17 +91,8 @@ class SwerveRobot(Robot):
             as :meth:`Robot.check_geometry`, and if the centre of mass is outside the triangle of the wheels.
         """
         super().check_geometry(place)
-        if not self.describes("body"):
-            return
-        body = self.body
-        share_3 = -body.com_y_m / self.track_m
-        share_2 = (1 - share_3) / 2 + body.com_x_m / self.wheelbase_m
-        shares = np.array([1 - share_2 - share_3, share_2, share_3])
-        if shares.min() <= 0:
-            raise ConfigError(
-                f"{place}: the centre of mass ({body.com_x_m:g}, {body.com_y_m:g}) m lies outside the "
-                f"triangle of the wheels: wheel {int(shares.argmin()) + 1} would carry nothing"
-            )
+        if self.describes("body"):
+            check_centre_of_mass(place, self.wheel_positions_m, self.body)
 
 
 def as_swerve(robot: Robot, refusal: str) -> SwerveRobot:

@@ -1,0 +1,318 @@
+r"""Reader of the logs of a Robotino on four surfaces: three motors, and a camera above.
+
+A data set is a folder with ``camera_params.json`` (millimetres a pixel) and folders of runs, each a
+``<name>.csv.gz`` with three header rows, semicolons and a row about every 31 ms (repository
+BrOleg5/research-wheel-slippage):
+
+=========================================  ==================  ==============================================
+folder                                     run                 label, session
+=========================================  ==================  ==============================================
+``one_surface/<surface>/exp129.csv.gz``    ``gray_129``        the surface
+``two_surfaces/<surfaces>/exp07.csv.gz``   ``green_table_07``  none: the instant of the change is not logged;
+\                                                              session ``green_table``
+``weights/<surface>/exp07.csv.gz``         ``weights_gray_07`` the surface; session ``weights_gray``
+``dc_motor/<name>.csv.gz``                 ``dc_motor_<name>`` none; some of these have no camera
+=========================================  ==================  ==============================================
+
+============  ================================================  =============================================
+stream        channels                                          from
+============  ================================================  =============================================
+``wheels``    ``motor_1_radps`` ...                             ``m1vel``, on the scale of ``m1pos``
+\             ``current_1_a`` ...                               ``m1cur``, magnitudes
+``commands``  ``speed_x_mps speed_y_mps yaw_rate_radps``        ``xsetspeed ysetspeed setvel``
+``pose``      ``position_x_m position_y_m yaw_rad``             ``xpos ypos ang``
+============  ================================================  =============================================
+
+What is assumed here was compared with the other columns:
+
+- *Frames*: commanded motor speeds are those of wheels at 60, 180 and 300 degrees of the body that each turn
+  the robot to the left, 16 turns of the motor to one of the wheel.  Pixels count to the right and down, so
+  that ``y = -ypos``; ``ang`` is counter-clockwise, and the body's x axis is 90 degrees ahead of it: so the
+  measured direction of travel is the commanded one within a few degrees in all runs.
+- *Scale*: ``m?vel`` has steps of 2.83 rad/s and is 1.1 to 1.7 % above the rate of ``m?pos`` at all speeds, by
+  a ratio that is each motor's own.  Encoder counts are right: rates are brought to their scale by the ratio
+  of the run, or by :data:`USUAL_SCALE` where a motor hardly turns or its counts are not logged.
+- *Held*: ``m?pos`` is sampled every 18.7 ms and held, so that its differences from row to row are wrong by up
+  to a half; it is used for the scale alone.  A pose that repeats is no new one and is left out.
+- *Magnitudes*: ``m?cur`` has steps of 0.0256 A and no sign.
+- ``xcur ycur rotcur dx dy dang`` are made of the other columns and are left out.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from terrain.errors import LogError
+from terrain.files.documents import read_json
+from terrain.files.names import shown
+from terrain.logs.csv_table import data_row, header_of, read_columns
+from terrain.logs.log_files import check_log_file, checked_names, short_name
+from terrain.logs.samples import checked_stream
+from terrain.records import Array, Label, RunLog, Stream
+
+ROBOT = "robotino"
+
+CAMERA_FILE = "camera_params.json"
+
+SCALED = "motor rates scaled to their encoders"
+NO_SIGN = "currents without a sign"
+HELD = "poses held from the row before"
+TURNED = "poses turned from the image into a right-handed frame"
+BLIND = "runs in which the camera sees no motion"
+"""Kinds of what is converted and, the last, dropped."""
+
+USUAL_SCALE = 1.0 / 1.0133
+"""Of a reported rate that has no counts beside it: the mean over the motors of all runs."""
+
+MIN_TICKS = 2000
+"""Counts, one turn of a motor, that a ratio is taken from: the hold of 155 counts is then under 8 %, and over
+a run of 10 s at 0.1 m/s under 0.5 %."""
+
+GEAR = 16.0
+TICKS_PER_TURN = 2000.0
+WHEEL_RADIUS_M = 0.04
+WHEEL_DISTANCE_M = 0.125
+"""Of the robot that drove the logs: what the commanded motor speeds follow from the commanded twist by."""
+
+MAX_SCALE_ERROR = 0.1
+"""Of a ratio against the usual one; beyond, counts or rates are damaged and the usual one is taken."""
+
+MIN_POSES = 10
+"""Different poses of a run in which the wheels turn, from 0.3 s of a camera that sees the robot."""
+
+MAX_COMMAND_ERROR_RADPS = 2.0
+"""Of a commanded motor speed against the commanded twist: 5 % of the slowest drive."""
+
+_FORM: Mapping[str, Any] = MappingProxyType({"delimiter": ";", "rows_before": 2})
+_MOTORS = (1, 2, 3)
+_RATES, _COUNTS, _CURRENTS = ([f"m{i}{name}" for i in _MOTORS] for name in ("vel", "pos", "cur"))
+_SET_RATES = [f"m{i}setvel" for i in _MOTORS]
+_TWIST, _POSE = ["xsetspeed", "ysetspeed", "setvel"], ["xpos", "ypos", "ang"]
+_MOTORS_ONLY = "dc_motor"
+_MAX_DEPTH = 3  # folders from a run's file up to that of the camera
+
+
+class Camera(NamedTuple):
+    """Millimetres a pixel of the camera above, over 1000."""
+
+    x_m: float
+    y_m: float
+
+
+def find_root(folder: Path) -> Path | None:
+    """Return the folder of the data set that a folder is or lies in; None where there is none.
+
+    Examples
+    --------
+    >>> find_root(Path("/")) is None
+    True
+    """
+    folder = folder.resolve()
+    for place in (folder, *folder.parents[:_MAX_DEPTH]):
+        if (place / CAMERA_FILE).is_file():
+            return place
+    return None
+
+
+def find_runs(folder: Path) -> list[Callable[..., RunLog]]:
+    """Return one reader per run in ``folder``, a data set or a folder of it; call it with ``repair=``.
+
+    The list is empty where there is no ``camera_params.json`` in the folder or above it, or no run.
+    """
+    root = find_root(folder)
+    if root is None:
+        return []
+    files = sorted(
+        path
+        for path in folder.resolve().rglob("*.csv.gz")
+        if not path.name.endswith("_load.csv.gz")
+        and not any(part.startswith(".") for part in path.relative_to(root).parts)
+    )
+    return [partial(read_run, path, root) for path in files]
+
+
+def read_run(path: Path, root: Path, *, repair: bool = False) -> RunLog:
+    """Return the run that a file holds.
+
+    Parameters
+    ----------
+    path : ``.csv.gz``
+    root : folder of the data set, with ``camera_params.json``
+    repair : drop and count what a strict read refuses
+
+    Raises
+    ------
+    LogError
+        if the file or that of the camera is broken, a column is missing, the times do not rise, a channel has
+        nothing finite, commanded motor speeds are not those of the commanded twist, or the camera sees no
+        motion while the wheels turn.
+    """
+    path = check_log_file(path, root)
+    parts = path.relative_to(root).parts
+    log = _Log(path, Counter() if repair else None, Counter())
+    with_camera = parts[0] != _MOTORS_ONLY or _POSE[0] in header_of(path, **_FORM)
+    table = _read(log, with_camera)
+    streams = {"wheels": _wheels(log, table)}
+    if with_camera:
+        streams["commands"] = _commands(log, table)
+        if (pose := _pose(log, table, read_camera(root))) is not None:
+            streams["pose"] = pose
+    run_id, terrain, session = _names(parts)
+    wheels = streams["wheels"].time_s
+    until_s = float(wheels[-1] + np.median(np.diff(wheels)))
+    return checked_names(
+        log.name,
+        RunLog(
+            run_id,
+            ROBOT,
+            streams,
+            (Label(float(wheels[0]), until_s, terrain),) if terrain else (),
+            source=f"{'/'.join(parts)}, Robotino layout",
+            dropped=log.repairs or {},
+            session=session,
+            converted=log.converted,
+        ),
+    )
+
+
+def read_camera(root: Path) -> Camera:
+    """Return the scale of the camera of a data set.
+
+    Raises
+    ------
+    LogError
+        if the file is missing, no JSON, or lacks a scale above zero.
+    """
+    path = root / CAMERA_FILE
+    place = short_name(path)
+    described = read_json(check_log_file(path, root), place, LogError)
+    scales = []
+    for axis in "xy":
+        value = described.get(f"pixel_resolution_{axis}") if isinstance(described, dict) else None
+        if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 < value < np.inf:
+            raise LogError(
+                f"{place}: pixel_resolution_{axis} is {shown(value)}, millimetres a pixel are required"
+            )
+        scales.append(float(value) * 1e-3)
+    return Camera(*scales)
+
+
+class _Log(NamedTuple):
+    """A file, what a repairing read drops of it (None refuses), and what is converted."""
+
+    path: Path
+    repairs: Counter[str] | None
+    converted: Counter[str]
+
+    @property
+    def name(self) -> str:
+        return short_name(self.path)
+
+    def stream(self, time_s: Array, values: Array, channels: list[str], columns: list[str]) -> Stream:
+        """Return a stream of some of the file's rows, as they stand in it."""
+        row_of = partial(data_row, self.path, **_FORM)
+        return checked_stream(
+            self.name, time_s, values, channels, row_of=row_of, columns=columns, repairs=self.repairs
+        )
+
+
+def _read(log: _Log, with_camera: bool) -> dict[str, Array]:
+    """Return the columns of a file by name; rows without a time stay in."""
+    names = ["t", *_SET_RATES, *_COUNTS, *_RATES, *_CURRENTS, *((*_TWIST, *_POSE) if with_camera else ())]
+    table = read_columns(log.path, names, **_FORM, repair=log.repairs is not None, dropped=log.repairs)
+    columns = dict(zip(names, table.T, strict=True))
+    columns["t"] = columns["t"] * 1e-3
+    return columns
+
+
+def _wheels(log: _Log, table: dict[str, Array]) -> Stream:
+    rates = np.column_stack([table[name] for name in _RATES])
+    counts = np.column_stack([table[name] for name in _COUNTS])
+    for i in range(len(_MOTORS)):
+        rates[:, i] *= _scale(table["t"], rates[:, i], counts[:, i])
+    log.converted[SCALED] += len(_MOTORS)
+    log.converted[NO_SIGN] += len(_MOTORS)
+    values = np.column_stack([rates, *(table[name] for name in _CURRENTS)])
+    channels = [f"motor_{i}_radps" for i in _MOTORS] + [f"current_{i}_a" for i in _MOTORS]
+    return log.stream(table["t"], values, channels, [*_RATES, *_CURRENTS])
+
+
+def _scale(time_s: Array, rate_radps: Array, counts: Array) -> float:
+    """Return the slope of encoder counts, as an angle, over the integral of the reported rate."""
+    known = np.isfinite(time_s) & np.isfinite(rate_radps) & np.isfinite(counts)
+    if known.sum() < 2 or np.ptp(counts[known]) < MIN_TICKS:
+        return USUAL_SCALE
+    time_s, rate_radps = time_s[known], rate_radps[known]
+    angle = counts[known] * (2.0 * np.pi / TICKS_PER_TURN)
+    turned = np.concatenate([[0.0], np.cumsum(np.diff(time_s) * (rate_radps[1:] + rate_radps[:-1]) / 2.0)])
+    turned = turned - turned.mean()
+    slope = float(turned @ angle / (turned @ turned))
+    return slope if abs(slope / USUAL_SCALE - 1.0) < MAX_SCALE_ERROR else USUAL_SCALE
+
+
+def _commands(log: _Log, table: dict[str, Array]) -> Stream:
+    twist = np.column_stack([table[name] for name in _TWIST])
+    set_rates = np.column_stack([table[name] for name in _SET_RATES])
+    expected = np.nan_to_num(twist) @ _to_motors().T
+    apart = np.nanmax(np.abs(set_rates - expected), axis=1, initial=0.0)
+    if (apart > MAX_COMMAND_ERROR_RADPS).any():
+        row = int(np.argmax(apart > MAX_COMMAND_ERROR_RADPS))
+        raise LogError(
+            f"{log.name}: at row {data_row(log.path, row, **_FORM)} the commanded motor speeds are "
+            f"{apart[row]:.3g} rad/s away from those of the commanded twist; at most "
+            f"{MAX_COMMAND_ERROR_RADPS:g} rad/s are accepted (are they of another robot or session?)"
+        )
+    return log.stream(table["t"], twist, ["speed_x_mps", "speed_y_mps", "yaw_rate_radps"], _TWIST)
+
+
+def _to_motors() -> Array:
+    """Return the matrix (3, 3) from a twist to motor speeds (:mod:`terrain.kinematics.omni`)."""
+    direction = np.radians([150.0, 270.0, 390.0])
+    rows = np.stack([np.cos(direction), np.sin(direction), np.full(3, WHEEL_DISTANCE_M)], axis=-1)
+    return np.asarray(rows * (GEAR / WHEEL_RADIUS_M))
+
+
+def _pose(log: _Log, table: dict[str, Array], camera: Camera) -> Stream | None:
+    """Return the poses that are new; None where a repairing read finds none while the wheels turn."""
+    seen = np.column_stack([table[name] for name in _POSE])
+    new = np.isfinite(seen).all(axis=1)
+    new[1:] &= (np.diff(seen, axis=0) != 0.0).any(axis=1)
+    moves = any(
+        np.ptp(
+            table[name][np.isfinite(table[name])],
+        )
+        >= MIN_TICKS
+        for name in _COUNTS
+    )
+    if moves and new.sum() < MIN_POSES:
+        if log.repairs is None:
+            raise LogError(
+                f"{log.name}: the camera shows {int(new.sum())} different poses while the wheels turn; at "
+                f"least {MIN_POSES} are required"
+            )
+        log.repairs[BLIND] += 1
+        return None
+    log.converted[HELD] += int((~new).sum())
+    log.converted[TURNED] += int(new.sum())
+    yaw = np.unwrap(np.radians(seen[new, 2])) + np.pi / 2
+    pose = np.column_stack([seen[new, 0] * camera.x_m, -seen[new, 1] * camera.y_m, yaw])
+    return log.stream(table["t"][new], pose, ["position_x_m", "position_y_m", "yaw_rad"], _POSE)
+
+
+def _names(parts: tuple[str, ...]) -> tuple[str, str, str]:
+    """Return id, terrain and session of a run by the folders of its file."""
+    stem = parts[-1].removesuffix(".csv.gz")
+    number = stem.removeprefix("exp")
+    if len(parts) == 3 and parts[0] == "one_surface":
+        return f"{parts[1]}_{number}", parts[1], ""
+    if len(parts) == 3 and parts[0] == "weights":
+        return f"weights_{parts[1]}_{number}", parts[1], f"weights_{parts[1]}"
+    folder = "_".join(parts[1:-1] or parts[:-1])
+    return "_".join(filter(None, [folder, number])), "", "" if parts[0] == _MOTORS_ONLY else folder
