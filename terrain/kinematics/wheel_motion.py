@@ -50,7 +50,7 @@ def wheel_motion(robot: Robot, twist: Array, dt_s: float) -> WheelMotion:
     -----
     A swerve robot: :func:`terrain.kinematics.swerve.wheel_commands`.  A skid-steer robot of track B:
     ``v_left = v - w B / 2``, ``v_right = v + w B / 2``, each within what its motor can do.  An omni robot:
-    :func:`terrain.kinematics.omni.inverse`, the twist shortened by what brings the fastest wheel to its limit.
+    :func:`terrain.kinematics.omni.inverse`, shortened by what brings the fastest wheel to its limit.
 
     Examples
     --------

@@ -1,0 +1,1 @@
+"""Slip that was measured from outside: poses or speeds over ground against what the wheels rolled."""

@@ -1,0 +1,330 @@
+"""Slip of each wheel, and of the body, over windows of a run: what was rolled against what was travelled.
+
+With the mean circumferential speed u_i of wheel i over a window, and the mean twist V of the body as measured
+from outside, the speed of the wheel's centre along its drive direction is ``v_i`` (2.2, 7.3 to 7.5 of Danzi,
+AgriMaRo thesis) and its slip
+
+    s_i = (u_i - v_i) / max(|u_i|, |v_i|)
+
+The *slip of the body* compares the twist that the wheels would roll without slip, V_w, with V along the
+direction d of V_w: ``s = (|V_w| - V . d) / max``.  It is what a desired speed is missed by, is defined where
+a single wheel stands still, and on omni wheels differs from all of the wheels' own.  ``side`` is the speed
+across d over the same denominator: what drives off the desired course.
+
+Standard deviations are those of the two slopes, to first order.  What is common to all windows of a robot,
+an error of the wheels' radius or of the outside measurement's scale, is not in them: 1 % of it is 0.01 times
+(1 - s) of slip.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from terrain.errors import ConfigError, DataError
+from terrain.kinematics.wheel_velocity import wheel_frame_velocities
+from terrain.measured_slip.rates import window_rates
+from terrain.measured_slip.travelled import travelled
+from terrain.records import Array, RunLog, SlipTrack, read_only
+from terrain.robots import Robot
+from terrain.slip import slip_ratio
+
+WINDOW_S = 2.0
+STRIDE_S = 1.0
+
+MIN_SPEED_MPS = 0.03
+"""Wheel speed and ground speed both lower: standing.  A camera's noise over 2 s is 0.1 % of it, so that the
+smallest robots are judged too; slip over shorter windows has the larger error that it states."""
+
+MAX_SLIP_STD = 0.2
+"""A slip that is less certain is not stated."""
+
+STEADY_RATIO, STEADY_STD = 0.1, 3.0
+"""Speeds of the halves of a window that differ by more than this share of it, and by more than so many
+standard deviations, are no steady motion."""
+
+MIN_SAMPLES = 6
+COVERAGE = 0.8
+"""Of a window, by samples of either stream."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MeasuredSlip:
+    """Slip over k windows of a run; NaN where it is not known.
+
+    Parameters
+    ----------
+    run_id : of the run
+    source : stream that measured the motion from outside
+    wheels : their names
+    start_s, end_s : (k,) of the windows, on the clock of the wheels
+    wheel_speed_mps, ground_speed_mps : (k, wheels) circumferential speed, and speed of its centre along it
+    slip_ratio, slip_std : (k, wheels)
+    twist, twist_std : (k, 3) as measured from outside
+    rolled_twist : (k, 3) of wheels that would not slip
+    body_slip, body_slip_std, body_side : (k,)
+    steady : (k,) whether both halves of a window have one speed
+    n_jumps, n_gaps : of the outside measurement
+    """
+
+    run_id: str
+    source: str
+    wheels: tuple[str, ...]
+    start_s: Array
+    end_s: Array
+    wheel_speed_mps: Array
+    ground_speed_mps: Array
+    slip_ratio: Array
+    slip_std: Array
+    twist: Array
+    twist_std: Array
+    rolled_twist: Array
+    body_slip: Array
+    body_slip_std: Array
+    body_side: Array
+    steady: Array
+    n_jumps: int = 0
+    n_gaps: int = 0
+
+    def __post_init__(self) -> None:
+        for name in self.__slots__:
+            value = getattr(self, name)
+            if isinstance(value, np.ndarray):
+                object.__setattr__(self, name, read_only(value, value.dtype))
+
+    @property
+    def time_s(self) -> Array:
+        """Middle (k,) of each window."""
+        return (self.start_s + self.end_s) / 2
+
+    @property
+    def track(self) -> SlipTrack:
+        """The slips of the wheels, at the middle of each window."""
+        return SlipTrack(self.time_s, self.slip_ratio, self.slip_std, self.wheels)
+
+
+def measured_slip(
+    run: RunLog,
+    robot: Robot,
+    *,
+    window_s: float = WINDOW_S,
+    stride_s: float = STRIDE_S,
+    delay_s: float = 0.0,
+    min_speed_mps: float = MIN_SPEED_MPS,
+) -> MeasuredSlip:
+    """Return the slip of a run over windows, from wheel speeds and a measurement from outside.
+
+    Parameters
+    ----------
+    run : with wheel speeds (``speed_<wheel>_mps``) and a stream that measured the motion from outside
+    robot : whose log it is, of any drive
+    window_s, stride_s : length of the windows, and from one to the next
+    delay_s : of the outside measurement behind the wheels
+    min_speed_mps : slower, in wheel speed and ground speed alike, a wheel or body is standing: no slip
+
+    Raises
+    ------
+    ConfigError
+        if a length is not above zero.
+    DataError
+        if the run has no wheel speeds, no measurement from outside, or no window that both cover.
+    """
+    if not (window_s > 0 and stride_s > 0):
+        raise ConfigError(f"window and stride are {window_s:g} and {stride_s:g} s, lengths above zero needed")
+    time_s, speeds = wheel_speeds(run, robot)
+    path = travelled(run, robot, delay_s)
+    start_s = _starts(run.run_id, time_s, path.time_s, window_s, stride_s)
+    end_s, middle_s = start_s + window_s, start_s + window_s / 2
+    rolled = np.concatenate(
+        [
+            np.zeros((1, speeds.shape[1])),
+            np.cumsum(np.diff(time_s)[:, None] * (speeds[1:] + speeds[:-1]) / 2, 0),
+        ]
+    )
+    known = np.isfinite(rolled).all(axis=1)
+    one = np.zeros(int(known.sum()), dtype=np.int64)
+
+    def wheel_rates(first_s: Array, last_s: Array) -> tuple[Array, Array]:
+        return window_rates(time_s[known], rolled[known], one, first_s, last_s, MIN_SAMPLES, COVERAGE)
+
+    u, u_std = wheel_rates(start_s, end_s)
+    twist, twist_std = window_rates(
+        path.time_s, path.values, path.part, start_s, end_s, MIN_SAMPLES, COVERAGE
+    )
+    direction = wheel_directions(run, robot, start_s, end_s)
+    along, _ = wheel_frame_velocities(twist, robot.wheel_positions_m, direction)
+    along_std = _along_std(twist_std, robot.wheel_positions_m, direction)
+    slip, slip_std = _slip(u, u_std, along, along_std, min_speed_mps)
+    rolled_twist = rolled_twists(u, robot.wheel_positions_m, direction, robot.sideways and not robot.steered)
+    body_slip, body_std, side = _body(rolled_twist, u_std, twist, twist_std, min_speed_mps)
+    first, first_std = wheel_rates(start_s, middle_s)
+    second, second_std = wheel_rates(middle_s, end_s)
+    apart = np.abs(second - first)
+    allowed = np.maximum(
+        STEADY_RATIO * np.abs(u).max(axis=1, keepdims=True), STEADY_STD * np.hypot(first_std, second_std)
+    )
+    return MeasuredSlip(
+        run_id=run.run_id,
+        source=path.source,
+        wheels=robot.wheels,
+        start_s=start_s,
+        end_s=end_s,
+        wheel_speed_mps=u,
+        ground_speed_mps=along,
+        slip_ratio=slip,
+        slip_std=slip_std,
+        twist=twist,
+        twist_std=twist_std,
+        rolled_twist=rolled_twist,
+        body_slip=body_slip,
+        body_slip_std=body_std,
+        body_side=side,
+        steady=(apart <= allowed).all(axis=1),
+        n_jumps=path.n_jumps,
+        n_gaps=path.n_gaps,
+    )
+
+
+def wheel_speeds(run: RunLog, robot: Robot) -> tuple[Array, Array]:
+    """Return times (n,) and circumferential speeds (n, wheels) of a run's wheels.
+
+    Raises
+    ------
+    DataError
+        if the run has none, or fewer than two samples.
+    """
+    names = [f"speed_{wheel}_mps" for wheel in robot.wheels]
+    wheels = run.streams.get("wheels")
+    if wheels is None or not set(names) <= set(wheels.channels) or len(wheels) < 2:
+        raise DataError(f"run {run.run_id}: has no wheel speeds ({', '.join(names)}) of two samples or more")
+    return wheels.time_s, np.column_stack([wheels.channel(name) for name in names])
+
+
+def wheel_directions(run: RunLog, robot: Robot, start_s: Array, end_s: Array) -> Array:
+    """Return the mean direction (k, wheels) that each wheel drives along over windows.
+
+    Raises
+    ------
+    DataError
+        if wheels are steered and the run has no steering angles.
+    """
+    if not robot.steered:
+        return np.broadcast_to(robot.wheel_directions_rad, (len(start_s), len(robot.wheels)))
+    steering = run.streams.get("steering")
+    names = [f"angle_{wheel}_rad" for wheel in robot.wheels]
+    if steering is None or not set(names) <= set(steering.channels):
+        raise DataError(f"run {run.run_id}: has no steering angles ({', '.join(names)})")
+    angles = np.column_stack([steering.channel(name) for name in names]) - robot.steering_zeros_rad
+    means = np.full((len(start_s), len(names)), np.nan)
+    for i, (first_s, last_s) in enumerate(zip(start_s, end_s, strict=True)):
+        inside = (steering.time_s >= first_s) & (steering.time_s <= last_s)
+        if inside.any():
+            means[i] = np.angle(np.nanmean(np.exp(1j * angles[inside]), axis=0))
+    return means
+
+
+def rolled_twists(
+    wheel_speed_mps: Array, positions_m: Array, direction_rad: Array, rolls_across: bool
+) -> Array:
+    """Return the twist (k, 3) that fits wheels which do not slip, by least squares.
+
+    Parameters
+    ----------
+    wheel_speed_mps : (k, wheels)
+    positions_m : (wheels, 2)
+    direction_rad : (k, wheels)
+    rolls_across : whether wheels roll across their direction too, as omni wheels; others do not move there
+
+    Examples
+    --------
+    >>> rolled_twists(np.array([[0.9, 1.1]]), np.array([[0, 0.5], [0, -0.5]]), np.zeros((1, 2)), False)
+    array([[1. , 0. , 0.2]])
+    """
+    x_m, y_m = positions_m.T
+    cos, sin = np.cos(direction_rad), np.sin(direction_rad)
+    rows = np.stack([cos, sin, x_m * sin - y_m * cos], axis=-1)
+    goal = wheel_speed_mps[..., None]
+    if not rolls_across:
+        rows = np.concatenate([rows, np.stack([-sin, cos, x_m * cos + y_m * sin], axis=-1)], axis=1)
+        goal = np.concatenate([goal, np.zeros_like(goal)], axis=1)
+    unknown = ~(np.isfinite(rows).all(axis=(1, 2)) & np.isfinite(goal).all(axis=(1, 2)))
+    found = np.linalg.pinv(np.where(unknown[:, None, None], 0.0, rows)) @ np.nan_to_num(goal)
+    return np.where(unknown[:, None], np.nan, found[..., 0] + 0.0)
+
+
+def spinning_wheels(found: MeasuredSlip, spin_ratio: float = 0.9, others_ratio: float = 0.5) -> Sequence[str]:
+    """Return the wheels that spin or lift in any window: nearly all their speed is slip, others grip.
+
+    Parameters
+    ----------
+    found : of a run
+    spin_ratio : slip of a wheel that spins; below minus that it is locked
+    others_ratio : slip that the others stay below, in magnitude
+
+    Examples
+    --------
+    A wheel of four that turns in the air is named in ``terrain measure-slip``.
+    """
+    names = []
+    magnitude = np.abs(found.slip_ratio)
+    for i, wheel in enumerate(found.wheels):
+        others = np.delete(magnitude, i, axis=1)
+        with np.errstate(invalid="ignore"):
+            alone = (magnitude[:, i] > spin_ratio) & (others < others_ratio).any(axis=1)
+            certain = found.slip_std[:, i] < 1.0 - spin_ratio
+        if (alone & certain).any():
+            names.append(wheel)
+    return names
+
+
+def _starts(run_id: str, wheels_s: Array, outside_s: Array, window_s: float, stride_s: float) -> Array:
+    if len(outside_s) < 2:
+        raise DataError(f"run {run_id}: has {len(outside_s)} samples measured from outside, two are needed")
+    begin_s = max(float(wheels_s[0]), float(outside_s[0]))
+    last_s = min(float(wheels_s[-1]), float(outside_s[-1])) - window_s
+    if last_s < begin_s - 0.02 * window_s:
+        raise DataError(
+            f"run {run_id}: wheels and outside measurement share {max(last_s + window_s - begin_s, 0.0):.2f} "
+            f"s, a window takes {window_s:g} s"
+        )
+    n = int(np.floor((last_s - begin_s) / stride_s + 1e-6)) + 1
+    return begin_s + stride_s * np.arange(max(n, 1))
+
+
+def _along_std(twist_std: Array, positions_m: Array, direction_rad: Array) -> Array:
+    """Return the standard deviation (k, wheels) of the speed along each wheel."""
+    x_m, y_m = positions_m.T
+    cos, sin = np.cos(direction_rad), np.sin(direction_rad)
+    slopes = np.stack([cos, sin, x_m * sin - y_m * cos], axis=-1)
+    return np.asarray(np.sqrt(((slopes * twist_std[:, None, :]) ** 2).sum(axis=-1)))
+
+
+def _slip(u: Array, u_std: Array, v: Array, v_std: Array, min_speed_mps: float) -> tuple[Array, Array]:
+    """Return slip and its standard deviation; NaN where standing or too uncertain."""
+    slip = slip_ratio(u, v, min_speed_mps)
+    fastest = np.maximum(np.maximum(np.abs(u), np.abs(v)), min_speed_mps)
+    slower = np.minimum(np.abs(u), np.abs(v))
+    driven = np.abs(u) >= np.abs(v)
+    by_fastest, by_slowest = slower / fastest**2, 1.0 / fastest
+    std = np.hypot(
+        np.where(driven, by_fastest, by_slowest) * u_std, np.where(driven, by_slowest, by_fastest) * v_std
+    )
+    unknown = np.isnan(slip) | ~(std <= MAX_SLIP_STD)
+    return np.where(unknown, np.nan, slip), np.where(unknown, np.nan, std)
+
+
+def _body(
+    rolled: Array, u_std: Array, twist: Array, twist_std: Array, min_speed_mps: float
+) -> tuple[Array, Array, Array]:
+    """Return slip of the body, its standard deviation, and the speed off course over the larger speed."""
+    speed = np.linalg.norm(rolled[:, :2], axis=1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        ahead = rolled[:, :2] / speed[:, None]
+    along = (twist[:, :2] * ahead).sum(axis=1)
+    across = ahead[:, 0] * twist[:, 1] - ahead[:, 1] * twist[:, 0]
+    along_std = np.sqrt(((ahead * twist_std[:, :2]) ** 2).sum(axis=1))
+    speed_std = np.sqrt((u_std**2).mean(axis=1))
+    slip, std = _slip(speed, speed_std, along, along_std, min_speed_mps)
+    return slip, std, np.where(np.isnan(slip), np.nan, across / np.maximum(speed, np.abs(along)))
