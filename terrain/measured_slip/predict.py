@@ -1,0 +1,150 @@
+r"""Slip from wheel speeds and motor currents alone, learned from runs whose slip was measured from outside.
+
+For each terrain of the training runs, currents and slip of the body are expected together, at the regime of
+motion, with one covariance of what is left (:mod:`terrain.classify.ground_response`).  A window's currents
+then say two things of its slip: which terrain expects them, by the classifier's probabilities
+:math:`p_c` (:mod:`terrain.classify.response`), and, on each, how far slip is from its expectation where the
+currents are,
+
+.. math:: \hat s_c = m_{s,c} + S_{sI} S_{II}^{-1} (I - m_{I,c}), \qquad
+          v_c = S_{ss} - S_{sI} S_{II}^{-1} S_{Is} .
+
+What is predicted is the mixture: mean :math:`\sum p_c \hat s_c`, variance
+:math:`\sum p_c (v_c + \hat s_c^2) - \hat s^2`, and the interval that leaves 2.5 % of it on each side.  Between terrains that currents do not tell apart it spans both.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.stats import norm
+from sklearn.base import BaseEstimator, RegressorMixin
+
+from terrain.classify.ground_response import fit_ground
+from terrain.classify.regime_process import regimes
+from terrain.classify.response import GroupedResponse, ResponseColumns
+from terrain.errors import DataError
+from terrain.records import Array
+
+TAIL = 0.025
+"""Probability on each side of an interval."""
+
+_BISECTIONS = 40
+
+
+class PredictedSlip(NamedTuple):
+    """Slip of windows: mean, standard deviation, and 95 % interval, (n,) each; NaN where nothing is known."""
+
+    slip_ratio: Array
+    slip_std: Array
+    low: Array
+    high: Array
+
+
+class SlipRegressor(RegressorMixin, BaseEstimator):
+    """Slip of the body by wheel speeds and responses of the wheels.
+
+    Parameters
+    ----------
+    columns : :class:`~terrain.classify.response.ResponseColumns` of the matrix
+
+    Attributes
+    ----------
+    terrains_ : (k,) names; one, empty, where none was given
+    """
+
+    def __init__(self, columns: ResponseColumns) -> None:
+        self.columns = columns
+
+    def fit(
+        self, X: Array, y: Array, terrain: Array | None = None, groups: Array | None = None
+    ) -> SlipRegressor:
+        """Learn currents and slip of each terrain.
+
+        Parameters
+        ----------
+        X : (n, columns) wheel speeds and responses, NaN where missing
+        y : (n,) measured slip; windows where it is NaN are not used
+        terrain : (n,) names; without any, all windows are of one
+        groups : (n,) run of each window
+
+        Raises
+        ------
+        DataError
+            if no window has a slip and all its responses.
+        """
+        terrain = np.full(len(y), "") if terrain is None else np.asarray(terrain).astype(str)
+        groups = np.arange(len(y)) if groups is None else np.asarray(groups)
+        n_wheels = self.columns.n_wheels
+        usable = np.isfinite(y) & np.isfinite(X).all(axis=1)
+        usable &= np.linalg.norm(np.nan_to_num(X[:, :n_wheels]), axis=1) > 0.0
+        if not usable.any():
+            raise DataError("no window has a measured slip beside all its wheel speeds and responses")
+        X, y, terrain, groups = X[usable], y[usable], terrain[usable], groups[usable]
+        self.terrains_ = np.unique(terrain)
+        self.classifier_ = None
+        if len(self.terrains_) > 1:
+            self.classifier_ = GroupedResponse(self.columns).fit(X, terrain, groups=groups)
+        self.fastest_mps_ = float(np.linalg.norm(X[:, :n_wheels], axis=1).max())
+        regime = regimes(X[:, :n_wheels], self.fastest_mps_)
+        both = np.column_stack([X[:, n_wheels:], y])
+        self.grounds_ = tuple(
+            fit_ground(regime[rows], both[rows], groups[rows], n_body=1)[0]
+            for rows in (np.flatnonzero(terrain == name) for name in self.terrains_)
+        )
+        return self
+
+    def predict(self, X: Array) -> Array:
+        """Return the expected slip (n,)."""
+        return self.predict_slip(X).slip_ratio
+
+    def predict_slip(self, X: Array) -> PredictedSlip:
+        """Return the slip of windows with its interval; NaN where the robot stands or a wheel speed lacks."""
+        n_wheels = self.columns.n_wheels
+        speed = X[:, :n_wheels]
+        known = np.isfinite(speed).all(axis=1) & (np.linalg.norm(np.nan_to_num(speed), axis=1) > 0.0)
+        out = np.full((4, len(X)), np.nan)
+        rows = np.flatnonzero(known)
+        if rows.size:
+            weight = np.ones((rows.size, 1))
+            if self.classifier_ is not None:
+                weight = self.classifier_.predict_proba(X[rows])
+            regime = regimes(speed[rows], self.fastest_mps_)
+            responses = X[rows, n_wheels:]
+            parts = [
+                _given(ground.expected(regime), ground.covariance, responses) for ground in self.grounds_
+            ]
+            mean, variance = (np.column_stack(part) for part in zip(*parts, strict=True))
+            slip = (weight * mean).sum(axis=1)
+            std = np.sqrt((weight * (variance + mean**2)).sum(axis=1) - slip**2)
+            low = _quantile(weight, mean, np.sqrt(variance), TAIL)
+            high = _quantile(weight, mean, np.sqrt(variance), 1.0 - TAIL)
+            out[:, rows] = slip, std, low, high
+        return PredictedSlip(*out)
+
+
+def _given(expected: Array, covariance: Array, responses: Array) -> tuple[Array, Array]:
+    """Return mean and variance (n,) of the last of jointly normal numbers, by those of the others known."""
+    mean, variance = expected[:, -1].copy(), np.full(len(expected), covariance[-1, -1])
+    apart = responses - expected[:, :-1]
+    known = np.isfinite(apart)
+    for pattern in np.unique(known, axis=0):
+        rows = (known == pattern).all(axis=1)
+        if pattern.any():
+            slope = np.linalg.solve(
+                covariance[:-1, :-1][np.ix_(pattern, pattern)], covariance[:-1, -1][pattern]
+            )
+            mean[rows] += apart[rows][:, pattern] @ slope
+            variance[rows] -= covariance[:-1, -1][pattern] @ slope
+    return mean, variance
+
+
+def _quantile(weight: Array, mean: Array, std: Array, probability: float) -> Array:
+    """Return the quantile (n,) of mixtures of normal distributions (n, k), by bisection."""
+    low, high = (mean - 8.0 * std).min(axis=1), (mean + 8.0 * std).max(axis=1)
+    for _ in range(_BISECTIONS):
+        middle = (low + high) / 2
+        below = (weight * norm.cdf((middle[:, None] - mean) / std)).sum(axis=1) < probability
+        low, high = np.where(below, middle, low), np.where(below, high, middle)
+    return np.asarray((low + high) / 2)
