@@ -16,10 +16,19 @@ if TYPE_CHECKING:
     from features.windows import WindowRule
     from pipelines.models.recipes import WindowPipeline
 
-Protocol = Literal["grouped", "leave-one-run-out", "leave-terrain-out", "published", "slow-fast", "fast-slow"]
+Protocol = Literal[
+    "grouped",
+    "leave-one-run-out",
+    "leave-sessions-out",
+    "leave-regimes-out",
+    "leave-terrain-out",
+    "published",
+    "slow-fast",
+    "fast-slow",
+]
 PROTOCOLS: tuple[str, ...] = get_args(Protocol)
 SPEED_PROTOCOLS = ("slow-fast", "fast-slow")
-Recipe = Literal["svm", "cnn", "stack", "best"]
+Recipe = Literal["svm", "cnn", "stack", "best", "response"]
 RECIPES: tuple[str, ...] = get_args(Recipe)
 FEATURE_RECIPE = "svm"
 """The recipe that learns from features alone, and so from a store of them."""
@@ -31,7 +40,9 @@ PUBLISHED_WINDOW_S = 1.7
 class RecipeSettings(Settings):
     """A recipe, how its windows are cut, and how it is evaluated."""
 
-    recipe: Recipe = setting("svm", "SVM on features, network, both joined, or the best of them.")
+    recipe: Recipe = setting(
+        "svm", "SVM on features, network, both joined, the best of them, or responses of wheels."
+    )
     window_s: float | None = setting(None, "Window length in s (2; 1.7 under 'published').", "--window")
     stride_s: float | None = setting(None, "From window to window in s; one length by default.", "--stride")
     steady: bool = setting(True, "Keep windows of steady motion only.")
@@ -54,8 +65,10 @@ class RecipeSettings(Settings):
     def _check_signal_sets(self) -> Self:
         if not self.signal_sets:
             raise ConfigError(f"no signal set is named; there are {','.join(SIGNAL_SETS)}")
-        if self.params is not None and self.recipe == "cnn":
-            raise ConfigError("--params has hyper-parameters of the SVM, which 'cnn' does not have")
+        if self.params is not None and self.recipe in ("cnn", "response"):
+            raise ConfigError(
+                f"--params has hyper-parameters of the SVM, which {self.recipe!r} does not have"
+            )
         for name in self.signal_sets:
             if name not in SIGNAL_SETS:
                 raise ConfigError(f"unknown signal set {name!r}; there are {', '.join(SIGNAL_SETS)}")
@@ -102,7 +115,10 @@ class CrossvalSettings(RecipeSettings):
             raise ConfigError(
                 "'published' sets its own strides and keeps all motion: stride and steady do not apply"
             )
-        if self.protocol in ("leave-one-run-out", *SPEED_PROTOCOLS) and (self.repeats or 1) > 1:
+        if (
+            self.protocol in ("leave-one-run-out", "leave-sessions-out", *SPEED_PROTOCOLS)
+            and (self.repeats or 1) > 1
+        ):
             raise ConfigError(f"{self.protocol!r} has a single fold assignment: it has one repeat")
         return self
 
@@ -114,7 +130,7 @@ class CrossvalSettings(RecipeSettings):
     @property
     def n_repeats(self) -> int:
         """Fold assignments: what was asked for, or what the protocol asks for."""
-        return self.repeats or (5 if self.protocol in ("grouped", "published") else 1)
+        return self.repeats or (5 if self.protocol in ("grouped", "leave-regimes-out", "published") else 1)
 
 
 def _rule(settings: RecipeSettings, default_s: float) -> WindowRule:

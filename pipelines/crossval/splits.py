@@ -1,6 +1,9 @@
 """The protocols of cross-validation: which windows train and which test.
 
 ``grouped`` is the headline: whole runs are held out.  ``leave-one-run-out`` holds out one run at a time.
+``leave-sessions-out`` holds out one session at a time; the only session of a class is cut into blocks of
+runs.  ``leave-regimes-out`` holds out speeds and directions of driving: runs that were driven alike are on
+one side, whatever their terrain.
 ``leave-terrain-out`` has the folds of ``grouped``, and asks besides whether a terrain that was left out of
 training is found to be unknown (:mod:`pipelines.crossval.unknown`).
 ``slow-fast`` trains on the slow runs of each class and tests on its fast ones, ``fast-slow`` the reverse
@@ -151,8 +154,12 @@ def folds_of(samples: Samples, protocol: str, repeats: int, seed: int) -> list[F
     y, group = samples.cut.windows.terrain.astype(str), samples.group
     if protocol == "leave-one-run-out":
         return _leave_one_out(y, group, samples.gap)
+    if protocol == "leave-sessions-out":
+        return _leave_one_out(y, _sessions(samples), samples.gap)
+    if protocol == "leave-regimes-out":
+        group = _regimes(samples)
     n_runs = len(np.unique(samples.cut.windows.run_id.astype(str)))
-    whole_runs = protocol in ("grouped", "leave-terrain-out")
+    whole_runs = protocol in ("grouped", "leave-regimes-out", "leave-terrain-out")
     if whole_runs and n_runs < N_FOLDS:
         raise DataError(f"{n_runs} runs are fewer than {N_FOLDS} folds")
     folds = []
@@ -165,6 +172,55 @@ def folds_of(samples: Samples, protocol: str, repeats: int, seed: int) -> list[F
         )
         folds += [Fold(repeat, number, train, test) for number, (train, test) in enumerate(splits)]
     return folds
+
+
+def _sessions(samples: Samples) -> Array:
+    """Return the session (n,) of each window; of a class with one session, a block of its runs."""
+    windows = samples.cut.windows
+    sessions = {run.run_id: run.session or run.run_id for run in samples.runs}
+    group = np.array([sessions[name] for name in windows.run_id], dtype=object)
+    for terrain in single_run_classes(windows.terrain.astype(str), group.astype(str)):
+        rows = np.flatnonzero(windows.terrain == terrain)
+        runs = list(dict.fromkeys(windows.run_id[rows]))
+        part = {name: i * N_FOLDS // len(runs) + 1 for i, name in enumerate(runs)}
+        if len(runs) >= N_FOLDS:
+            group[rows] = [f"{group[row]} part {part[windows.run_id[row]]}" for row in rows]
+    if len(set(group)) == len(set(windows.run_id)):
+        raise DataError("the runs name no sessions that could be held out; 'grouped' holds out runs")
+    return group
+
+
+def _regimes(samples: Samples) -> Array:
+    """Return what each window's run (n,) was commanded, or, where that varies or is unknown, its speeds."""
+    regime = {run.run_id: regime_of(run) for run in samples.runs}
+    return np.array([regime[name] for name in samples.cut.windows.run_id], dtype=object)
+
+
+def regime_of(run: RunLog) -> str:
+    """Return in words how a run was driven: its command where it has one alone, else its mean wheel speeds.
+
+    Examples
+    --------
+    >>> from terrain.records import Stream
+    >>> commands = Stream([0.0, 1.0], [[0.1, 0.0], [0.1, 0.0]], ("speed_x_mps", "yaw_rate_radps"))
+    >>> regime_of(RunLog("a", "husky", {"commands": commands}))
+    'speed_x_mps 0.1, yaw_rate_radps 0'
+    """
+    for name, decimals in (("commands", 3), ("wheels", 1)):
+        stream = run.streams.get(name)
+        if stream is None:
+            continue
+        chosen = [
+            i for i, channel in enumerate(stream.channels) if name == "commands" or channel[:6] == "speed_"
+        ]
+        values = stream.values[:, chosen]
+        if not chosen or not np.isfinite(values).any(axis=0).all():
+            continue
+        if name == "commands" and np.nanmax(np.ptp(values, axis=0)) > 10.0**-decimals:
+            continue
+        means = [round(float(mean), decimals) + 0.0 for mean in np.nanmean(values, axis=0)]
+        return ", ".join(f"{stream.channels[i]} {mean:g}" for i, mean in zip(chosen, means, strict=True))
+    return run.run_id
 
 
 def _leave_one_out(y: Array, run_id: Array, gap: int) -> list[Fold]:

@@ -11,16 +11,19 @@ from sklearn.pipeline import Pipeline
 
 from features.extractor import FeatureExtractor
 from features.matrix import FeatureMatrix
+from features.response import ResponseExtractor
 from features.sample_extractor import SampleExtractor
 from terrain.classify.grouped_network import GroupedNetwork
+from terrain.classify.response import GroupedResponse
 from terrain.classify.stack import GroupedStack
 from terrain.classify.svm import CANDIDATES, GroupedSVC
 from terrain.errors import ConfigError
 from terrain.logs.schema import SIGNAL_SETS
 from terrain.records import Array, Windows
 
-RECIPES = ("svm", "cnn", "stack", "best")
-"""SVM on features, network on samples, both joined, and which of these three held-out runs favour."""
+RECIPES = ("svm", "cnn", "stack", "best", "response")
+"""SVM on features, network on samples, both joined, and which of these three held-out runs favour; and what
+wheels answer to how they are driven."""
 
 
 class WindowPipeline(Pipeline):
@@ -79,10 +82,18 @@ def make_recipe(
     classifier: ClassifierMixin = GroupedSVC(candidates, gap=gap, seed=seed)
     if name == "cnn":
         features, classifier = SampleExtractor(*sets), GroupedNetwork(gap=gap, seed=seed)
+    elif name == "response":
+        features, classifier = ResponseExtractor(*_with_speeds(sets)), GroupedResponse()
     elif name != "svm":
         features = SampleExtractor(*sets, with_features=True)
         classifier = GroupedStack(choose=name == "best", candidates=candidates, gap=gap, seed=seed)
     return WindowPipeline([("features", features), ("classifier", classifier)])
+
+
+def _with_speeds(sets: tuple[tuple[str, ...], tuple[str, ...]]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the sets with that of the wheel speeds, at which responses are compared."""
+    signal_sets, level_sets = sets
+    return tuple(dict.fromkeys((*signal_sets, "wheels"))), level_sets
 
 
 def inform(recipe: WindowPipeline, fitted: Any) -> None:

@@ -75,7 +75,7 @@ def fit_ground(
         values = mean_response[kept][:, columns].T.ravel()
         process, apart = fit_process(points, wheel, values, np.tile(block[kept], len(columns)))
         processes.append(process)
-        left[np.ix_(kept, columns)] = apart.reshape(len(columns), -1).T
+        left[np.ix_(np.flatnonzero(kept), np.array(columns))] = apart.reshape(len(columns), -1).T
         for i, column in zip(wheels, columns, strict=True):
             rest = ~kept
             left[rest, column] = mean_response[rest, column] - process.predict(mean_regime[rest, i], i)

@@ -10,7 +10,8 @@ currents are,
           v_c = S_{ss} - S_{sI} S_{II}^{-1} S_{Is} .
 
 What is predicted is the mixture: mean :math:`\sum p_c \hat s_c`, variance
-:math:`\sum p_c (v_c + \hat s_c^2) - \hat s^2`, and the interval that leaves 2.5 % of it on each side.  Between terrains that currents do not tell apart it spans both.
+:math:`\sum p_c (v_c + \hat s_c^2) - \hat s^2`, and the interval that leaves 2.5 % of it on each side.
+Between terrains that currents do not tell apart it spans both.
 """
 
 from __future__ import annotations

@@ -147,7 +147,8 @@ def measured_slip(
     one = np.zeros(int(known.sum()), dtype=np.int64)
 
     def wheel_rates(first_s: Array, last_s: Array) -> tuple[Array, Array]:
-        return window_rates(time_s[known], rolled[known], one, first_s, last_s, MIN_SAMPLES, COVERAGE)
+        rates, std = window_rates(time_s[known], rolled[known], one, first_s, last_s, MIN_SAMPLES, COVERAGE)
+        return rates, std
 
     u, u_std = wheel_rates(start_s, end_s)
     twist, twist_std = window_rates(

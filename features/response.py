@@ -1,0 +1,135 @@
+"""Windows to wheel speeds and what the wheels answer: means of each wheel's current, or of its slip."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from features.extractor import FeatureExtractor
+from terrain.classify.response import ResponseColumns
+from terrain.errors import DataError
+from terrain.records import Array, Windows
+
+RESPONSES: Mapping[str, tuple[str, str]] = {"currents": ("current", "a"), "slip": ("slip", "ratio")}
+"""Quantity and unit of the channels that are responses, by signal set."""
+
+MIN_TURNING = 0.5
+"""Share of the median speed of a window below which its wheels do not turn yet, or no longer: such samples
+are left out of its means."""
+
+
+class ResponseExtractor(FeatureExtractor):
+    """Turn windows into means of wheel speeds and of responses, wheel by wheel.
+
+    A current that has a sign counts as positive where it drives the wheel on, so that it compares with one
+    that a logger stores as a magnitude.
+
+    Parameters
+    ----------
+    signal_sets : whose responses are used, of :data:`RESPONSES`; wheel speeds are always used
+    level_sets : not used; as :class:`~features.extractor.FeatureExtractor` has them
+
+    Attributes
+    ----------
+    columns_ : :class:`~terrain.classify.response.ResponseColumns` of the matrix
+
+    Examples
+    --------
+    >>> values = np.array([[[0.1] * 8, [0.2] * 8, [3.0] * 8, [4.0] * 8]])
+    >>> names = ("speed_left_mps", "speed_right_mps", "current_left_a", "current_right_a")
+    >>> windows = Windows({"wheels": values}, {"wheels": names}, {"wheels": 4.0}, 2.0, np.zeros(1),
+    ...                   np.array(["a"]), np.array(["grass"]))
+    >>> ResponseExtractor().fit_transform(windows)
+    array([[0.1, 0.2, 3. , 4. ]])
+    """
+
+    def fit(self, X: Windows, y: Any = None) -> ResponseExtractor:
+        """Learn which wheels and responses the windows have.
+
+        Raises
+        ------
+        DataError
+            if the windows have no wheel speeds, or no response of each wheel.
+        """
+        super().fit(X, y)
+        names = self.get_feature_names_out()
+        n_wheels = len(self._wheels())
+        self.columns_ = ResponseColumns(n_wheels, len(names) - n_wheels)
+        return self
+
+    def transform(self, X: Windows | Mapping[str, Array]) -> Array:
+        """Return the matrix (n_windows, n_wheels + n_responses); NaN where a window has no sample.
+
+        Raises
+        ------
+        DataError
+            as of the features.
+        """
+        windows = X if isinstance(X, Windows) else self._as_windows(X)
+        values = self.matrix.selected(windows)
+        speeds = np.stack([_channel(values, self.layout_.channels, name) for name in self._speed_names()], 1)
+        norm = np.linalg.norm(speeds, axis=1)
+        turning = norm >= MIN_TURNING * np.median(norm, axis=1, keepdims=True)
+        mean_speeds = _mean(speeds, turning)
+        sign = np.where(mean_speeds < 0.0, -1.0, 1.0)
+        columns = [mean_speeds]
+        for quantity, unit in self._quantities():
+            names = [f"{quantity}_{wheel}_{unit}" for wheel in self._wheels()]
+            each = np.stack([_channel(values, self.layout_.channels, name) for name in names], axis=1)
+            beside = each.shape[2] == turning.shape[1]
+            mean = _mean(each, turning if beside else np.ones((len(each), each.shape[2]), dtype=bool))
+            columns.append(mean if quantity == "current" and not (each < 0.0).any() else mean * sign)
+        return np.concatenate(columns, axis=1)
+
+    def get_feature_names_out(self, input_features: Any = None) -> Array:
+        """Return the name of each column with its unit."""
+        names = [f"wheels.speed_{wheel}.mean [m/s]" for wheel in self._wheels()]
+        for quantity, _ in self._quantities():
+            stream, unit = ("wheels", "A") if quantity == "current" else ("slip", "1")
+            names += [f"{stream}.{quantity}_{wheel}.mean [{unit}]" for wheel in self._wheels()]
+        return np.array(names, dtype=object)
+
+    def _wheels(self) -> list[str]:
+        return [name.removeprefix("speed_").removesuffix("_mps") for name in self._speed_names()]
+
+    def _speed_names(self) -> list[str]:
+        names = self.layout_.channels.get("wheels", ())
+        speeds = [name for name in names if name.startswith("speed_") and name.endswith("_mps")]
+        if not speeds:
+            raise DataError("responses are compared at the speeds of the wheels, and the windows have none")
+        return speeds
+
+    def _quantities(self) -> list[tuple[str, str]]:
+        """Return quantity and unit of each response that all wheels have."""
+        present = {name for names in self.layout_.channels.values() for name in names}
+        found = [
+            RESPONSES[name]
+            for name in RESPONSES
+            if name in self.signal_sets
+            and all(
+                f"{RESPONSES[name][0]}_{wheel}_{RESPONSES[name][1]}" in present for wheel in self._wheels()
+            )
+        ]
+        if not found:
+            raise DataError(
+                "the windows have no response of each wheel: a current or a slip (signal sets "
+                f"{' and '.join(RESPONSES)}) is needed beside the wheel speeds"
+            )
+        return found
+
+
+def _mean(values: Array, used: Array) -> Array:
+    """Return means (n, c) over the samples (n, c, s) that are used (n, s) and finite; NaN without any."""
+    known = np.isfinite(values) & used[:, None, :]
+    n = known.sum(axis=2)
+    total = np.where(known, values, 0.0).sum(axis=2)
+    return np.asarray(np.divide(total, n, out=np.full(n.shape, np.nan), where=n > 0))
+
+
+def _channel(values: Mapping[str, Array], channels: Mapping[str, tuple[str, ...]], name: str) -> Array:
+    for stream, names in channels.items():
+        if name in names:
+            return values[stream][:, names.index(name)]
+    raise DataError(f"the windows have no channel {name!r}")
