@@ -1,10 +1,11 @@
-"""The command learn-slip."""
+"""The commands learn-slip and measure-slip."""
 
 from __future__ import annotations
 
 import typer
 
 from pipelines.cli.command import Json, command
+from pipelines.measured_slip.settings import MeasureSlipSettings
 from pipelines.runs.settings import load
 from pipelines.slip.settings import LearnSlipSettings
 
@@ -23,4 +24,19 @@ def learn_slip_command(settings: LearnSlipSettings, json_file: Json = None) -> N
     with progress_bar() as progress:
         result = learn_slip(runs, settings, skipped, progress)
     print_learned_slip(result, output_console())
+    write_json(json_file, result)
+
+
+@command(app, "measure-slip")
+def measure_slip_command(settings: MeasureSlipSettings, json_file: Json = None) -> None:
+    """Measure slip against poses from outside, and show how well currents predict it."""
+    from pipelines.measured_slip.measure import measure_slip
+    from pipelines.measured_slip.screen import print_measured_slip
+    from pipelines.reporting.json_file import write_json
+    from pipelines.reporting.terminal import output_console, progress_bar
+
+    runs, skipped = load(settings)
+    with progress_bar() as progress:
+        result = measure_slip(runs, settings, skipped, progress)
+    print_measured_slip(result, output_console())
     write_json(json_file, result)

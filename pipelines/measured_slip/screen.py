@@ -1,0 +1,101 @@
+"""What ``terrain measure-slip`` prints."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+from rich.console import Console
+
+from pipelines.measured_slip.results import MeasuredSlipResult, PredictionFigures
+from pipelines.reporting.numbers import format_counts, format_known
+from pipelines.reporting.terminal import compact_table, number_columns, print_lines, text_column
+from terrain.measured_slip.delay import Delay, DelayStatus
+from terrain.measured_slip.surfaces import SurfaceSlip
+
+UNLABELLED = "(no label)"
+
+
+def print_measured_slip(result: MeasuredSlipResult, console: Console) -> None:
+    """Print slip by surface, delays, predictions, and which runs have no slip and why."""
+    table = compact_table(
+        text_column("terrain"),
+        *number_columns("runs", "windows", "slip", "95 %", "quartiles", "std", "held out", "wheels", "turn"),
+        title=f"slip of {result.robot} over {result.window_s:g} s, measured by "
+        f"{format_counts(result.sources)}",
+    )
+    for row in result.surfaces:
+        table.add_row(row.terrain or UNLABELLED, *surface_cells(row))
+    console.print(table)
+    print_lines(console, [delay_words(name, delay) for name, delay in result.delays.items()])
+    if result.predictions:
+        console.print(_predictions(result))
+    print_lines(console, _lines(result))
+
+
+def surface_cells(row: SurfaceSlip) -> tuple[str, ...]:
+    """Return the cells of a surface, as screen and page show them."""
+    return (
+        str(row.n_runs),
+        str(row.n_windows),
+        format_known(row.slip_ratio, "{:.3f}"),
+        f"{format_known(row.interval[0], '{:.3f}')} to {format_known(row.interval[1], '{:.3f}')}",
+        f"{format_known(row.spread[0], '{:.3f}')} to {format_known(row.spread[1], '{:.3f}')}",
+        format_known(row.std, "{:.3f}"),
+        format_known(row.held_out, "{:.3f}"),
+        " ".join(format_known(slip, "{:+.2f}") for slip in row.wheel_slip),
+        format_known(row.turn_ratio, "{:.2f}"),
+    )
+
+
+def delay_words(session: str, delay: Delay) -> str:
+    """Return in a sentence by how much the outside measurement is late."""
+    where = f"session {session}: " if session else ""
+    if delay.status is DelayStatus.UNDETERMINED:
+        return f"{where}no delay of the outside measurement was found, none is taken off"
+    return (
+        f"{where}the outside measurement is {delay.delay_s:+.3f} s behind the wheels "
+        f"(± {1.96 * delay.std_s:.3f}), which is taken off"
+    )
+
+
+def prediction_cells(row: PredictionFigures) -> tuple[str, ...]:
+    """Return the cells of a prediction, as screen and page show them."""
+    return (
+        str(row.n_runs),
+        str(row.n_windows),
+        f"{row.rms:.4f}",
+        f"{format_known(row.rms_interval[0], '{:.3f}')} to {format_known(row.rms_interval[1], '{:.3f}')}",
+        f"{row.bias:+.4f}",
+        f"{100 * row.coverage:.1f}%",
+        f"{row.width:.3f}",
+        ", ".join(f"{name} {rms:.3f}" for name, rms in row.by_terrain.items()),
+    )
+
+
+PREDICTION_COLUMNS = ("runs", "windows", "rms", "95 %", "bias", "inside", "width", "by terrain")
+
+
+def _predictions(result: MeasuredSlipResult) -> object:
+    table = compact_table(
+        text_column("held out"),
+        *number_columns(*PREDICTION_COLUMNS[:-1]),
+        text_column(PREDICTION_COLUMNS[-1]),
+        title="slip predicted from currents and wheel speeds alone",
+    )
+    for row in result.predictions:
+        table.add_row(row.held_out, *prediction_cells(row))
+    return table
+
+
+def _lines(result: MeasuredSlipResult) -> list[str]:
+    spinning = [name for row in result.surfaces for name in row.spinning]
+    lines = []
+    if spinning:
+        lines.append(f"a wheel spins or lifts in {len(spinning)} runs: {', '.join(spinning[:8])}")
+    if result.not_measured:
+        kinds = Counter(text.partition(": ")[2] for text in result.not_measured)
+        reason, n = kinds.most_common(1)[0]
+        lines.append(f"{len(result.not_measured)} of {result.n_runs} runs have no slip, {n} since: {reason}")
+    if result.out is not None:
+        lines.append(f"runs with the stream slip written to {result.out}")
+    return [*lines, *result.skipped]
