@@ -12,8 +12,8 @@ a change of unknown size; here the mean before it is unknown too).  It is an ala
 most likely j is the change; from there on everything begins anew.
 
 The threshold is what runs on one ground each exceed in a given share of the runs.  No label is needed, and
-none is given: what the ground changed to is the classifier's question.  A change of regime (speed or direction
-of the wheels) also begins anew, since responses then change on any ground; a standing robot answers nothing.
+none is given: what the ground changed to is for the classifier.  A change of regime (speed or direction of
+the wheels) also begins anew, since responses then change on any ground; a standing robot answers nothing.
 """
 
 from __future__ import annotations
