@@ -100,7 +100,8 @@ class RunLog:
         ``estimator``, ``truth``
     labels : terrain intervals; one for the whole run in the simple case, none when unlabelled
     source : where the log comes from, as text
-    dropped : what a repairing reader removed, as counts by kind; empty after a strict read
+    dropped : what a reader removed or changed, as counts by kind; after a strict read no more than signs and
+        axes that were turned, and what the log lacks
     session : outing that the run is part of, by name: runs of one session share what changes from one to the
         next, as the weather, the ground and how the sensors were mounted; empty where unknown
     filter : that made the streams ``estimator``, ``slip`` and ``state``, by name; empty without them
