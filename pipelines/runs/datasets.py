@@ -19,10 +19,10 @@ if TYPE_CHECKING:
     from terrain.logs.drive import DriveRobot
     from terrain.robots import Robot
 
-LAYOUTS = ("auto", "runs", "borealtc", "csv", "drive", "can", "bag")
+LAYOUTS = ("auto", "runs", "borealtc", "csv", "drive", "drive-recording", "can", "bag")
 """``runs``: run folders as this package writes them; ``csv``: any CSV, by a mapping file; ``drive``: the
-files ``samples.csv.gz`` of DRIVE, one a session; ``can``: logs of a CAN bus, by a DBC; ``bag``: MCAP files
-and ROS 2 bags, by a mapping or by the types of their topics."""
+files ``samples.csv.gz`` of DRIVE, one a session; ``drive-recording``: its whole recordings; ``can``: logs of
+a CAN bus, by a DBC; ``bag``: MCAP files and ROS 2 bags, by a mapping or by the types of their topics."""
 
 CAN_ROBOT = "agrimaro"
 """Robot of a log of a CAN bus where none is named."""
@@ -32,7 +32,8 @@ DRIVE_ROBOT = "husky"
 
 ACCEPTED = (
     "accepted are run folders (run.json), the BorealTC layout (<CLASS>/imu_N.csv and pro_N.csv), "
-    "the DRIVE layout (samples.csv.gz, or folders of sessions with one each), MCAP files and ROS 2 bags, and "
+    "the DRIVE layout (samples.csv.gz, or folders of sessions with one each), its whole recordings "
+    "(<robot>_<terrain>/*.csv.gz), MCAP files and ROS 2 bags, and "
     "any CSV with a mapping file"
 )
 
@@ -222,7 +223,7 @@ def _readers(
     if not folder.is_dir():
         fault = "is no folder" if folder.exists() else "does not exist"
         raise LogError(f"{folder}: {fault}; {ACCEPTED}")
-    if (mapping is not None) and layout in ("runs", "borealtc", "drive"):
+    if (mapping is not None) and layout in ("runs", "borealtc", "drive", "drive-recording"):
         raise ConfigError(f"a mapping file is for CSV files, not for the layout {layout!r}")
     if layout == "can":
         from pipelines.can import dbc, logs
@@ -235,12 +236,15 @@ def _readers(
         from terrain.logs import mapping as by_mapping
 
         return by_mapping.find_runs(folder, by_mapping.load_mapping(mapping))
-    from terrain.logs import borealtc, drive, read
+    from terrain.logs import borealtc, drive, drive_recording, read
 
     found: dict[str, list[Any]] = {
         "runs": read.find_runs(folder) if layout in ("auto", "runs") else [],
         "borealtc": borealtc.find_runs(folder) if layout in ("auto", "borealtc") else [],
         "drive": drive.find_sessions(folder) if layout in ("auto", "drive") else [],
+        "drive-recording": (
+            drive_recording.find_recordings(folder) if layout in ("auto", "drive-recording") else []
+        ),
     }
     names = [name for name, readers in found.items() if readers]
     if len(names) > 1:
@@ -249,6 +253,8 @@ def _readers(
         return _bags(folder, None, robot)
     if names == ["drive"]:
         return drive.find_runs(folder, _drive_robot(robot))
+    if names == ["drive-recording"]:
+        return drive_recording.find_runs(folder, lambda name: _drive_robot(_named(name, robot)))
     return _some([reader for readers in found.values() for reader in readers], folder)
 
 
@@ -300,9 +306,13 @@ def robot_of(run: RunLog, robot: Robot | None) -> Robot:
     ConfigError
         if the package has no robot of the name.
     """
+    return _named(run.robot, robot)
+
+
+def _named(name: str, robot: Robot | None) -> Robot:
     from terrain.robots import packaged_robot
 
-    return robot if robot is not None and robot.name == run.robot else packaged_robot(run.robot)
+    return robot if robot is not None and robot.name == name else packaged_robot(name)
 
 
 def _aligned(run: RunLog, robot: Robot | None) -> RunLog:

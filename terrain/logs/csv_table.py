@@ -14,7 +14,7 @@ import zlib
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TextIO
+from typing import Any, TextIO
 
 import numpy as np
 
@@ -91,6 +91,26 @@ def read_columns(
     return np.array(table, dtype=np.float64).reshape(len(table), len(columns))
 
 
+def read_words(path: Path, column: str, *, delimiter: str = ",") -> list[str]:
+    """Return a column of a CSV file as text, cell by cell, of the rows that have as many cells as the header.
+
+    Raises
+    ------
+    LogError
+        if the file is missing, empty, no text, or lacks the column or has it twice.
+    """
+    _refuse_too_large(path)
+    header = _header(path, delimiter)
+    if header.count(column) != 1:
+        fault = "is missing" if column not in header else "is there twice"
+        raise LogError(f"{short_name(path)}: column {column!r} {fault} (the file has {listed(header)})")
+    place = header.index(column)
+    fast = _fast(path, header, {place: "string"}, delimiter)
+    if fast is not None:
+        return ["" if cell is None else cell for cell in fast.column(str(place)).to_pylist()]
+    return [cells[place] for _, cells in _rows(path, delimiter) if len(cells) == len(header)]
+
+
 def data_row(path: Path, index: int, *, delimiter: str = ",") -> int:
     """Return the row number, as an editor shows it, of the data row ``index`` (blank rows count)."""
     for number, (row, _) in enumerate(_rows(path, delimiter)):
@@ -137,27 +157,32 @@ def _header(path: Path, delimiter: str) -> list[str]:
 
 
 def _fast_columns(path: Path, header: list[str], columns: Sequence[str], delimiter: str) -> Array | None:
+    places = [header.index(column) for column in columns]
+    table = _fast(path, header, dict.fromkeys(places, "float64"), delimiter)
+    return None if table is None else np.column_stack([table.column(str(i)).to_numpy() for i in places])
+
+
+def _fast(path: Path, header: list[str], types: dict[int, str], delimiter: str) -> Any:
+    """Return the table of some columns, by their place, that pyarrow reads; None where it stumbles."""
     from pyarrow import ArrowException
     from pyarrow import csv as arrow_csv
 
-    places = [str(header.index(column)) for column in columns]
     try:
-        table = arrow_csv.read_csv(
+        return arrow_csv.read_csv(
             path,
             read_options=arrow_csv.ReadOptions(
                 column_names=[str(place) for place in range(len(header))], skip_rows=1
             ),
             parse_options=arrow_csv.ParseOptions(delimiter=delimiter),
             convert_options=arrow_csv.ConvertOptions(
-                include_columns=places,
-                column_types=dict.fromkeys(places, "float64"),
+                include_columns=[str(place) for place in types],
+                column_types={str(place): kind for place, kind in types.items()},
                 null_values=list(MISSING),
                 quoted_strings_can_be_null=True,
             ),
         )
     except (ArrowException, OSError):
         return None
-    return np.column_stack([table.column(place).to_numpy() for place in places])
 
 
 def _rows(path: Path, delimiter: str) -> Iterator[tuple[int, list[str]]]:

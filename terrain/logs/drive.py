@@ -43,8 +43,8 @@ Husky's log, then of six sessions of a Warthog and one of a Marmotte:
   wheel speeds lag the gyro by 0.26 s while speeds change.  The Warthog's lidar lags by 0.4 to 0.7 s, its
   wheels by 0.05 s.  Times are as logged; nothing is shifted, but poses that took longer than usual.
 - *Held*: values are held from one message to the next.  A wheel speed that is usually held for over
-  :data:`~terrain.logs.held.MAX_HELD_S` is read as a measurement at the sample where it is new, and as a straight line to the
-  next one: held, the Warthog's wheels (4 Hz) would lag by 0.1 s more, in steps.
+  :data:`~terrain.logs.held.MAX_HELD_S` is read as a measurement at the sample where it is new, and as a
+  straight line to the next one: held, the Warthog's wheels (4 Hz) would lag by 0.1 s more, in steps.
 - ``cmd_*`` are no wheel speeds: below its limits the Husky drives 1.8 times as fast forward and turns its
   wheels 0.8 times as fast against each other.  Commands go up to 14.7 rad/s, steady wheels to 6.1 rad/s.
 - ``steady``, ``icp_z``, ``icp_roll`` and ``icp_pitch`` are left out: the first says which window of a
@@ -276,7 +276,7 @@ def _read_windows(path: Path, robot: DriveRobot, session: str, terrain: str) -> 
         for name, pairs in sources.items()
     }
     held = tuple(usual_hold(wheel, period_s) for wheel in np.moveaxis(values["wheels"], -1, 0))
-    _refuse_other_robot(short_name(path), values["wheels"], robot)
+    refuse_other_robot(short_name(path), values["wheels"], robot)
     values["wheels"] *= robot.wheel_radius_m
     axes = _imu_axes(values["wheels"], values["imu"], period_s)
     values["imu"] *= (axes.gyro_z, *axes.accel)
@@ -295,7 +295,20 @@ def _imu_axes(wheels_mps: Array, imu: Array, period_s: float) -> ImuAxes:
     )
 
 
-def _refuse_other_robot(name: str, wheel_radps: Array, robot: DriveRobot) -> None:
+def refuse_other_robot(name: str, wheel_radps: Array, robot: DriveRobot) -> None:
+    """Refuse wheels that turn much faster than those of a robot ever do.
+
+    Parameters
+    ----------
+    name : of the file, for the message
+    wheel_radps : (..., 2)
+    robot : that is taken for the one that drove
+
+    Raises
+    ------
+    LogError
+        if they do.
+    """
     fastest = float(np.nanmax(np.abs(wheel_radps), initial=0.0))
     if fastest > MAX_OVERSPEED * robot.wheel_rate_max_radps:
         raise LogError(

@@ -26,10 +26,13 @@ N_FRAME = 5
 """Samples whose mean heading the authors of DRIVE turned the positions of a window by."""
 
 
-MAX_STD = (0.4, 0.4, 0.4)
-"""Standard deviations, in m/s and rad/s, beyond which a recording's lidar has lost the robot: its poses
-scatter by 0.01 m about a parabola elsewhere, which is 0.03 m/s, and by 0.3 m where a registration jumps from
-one match to another."""
+MAX_STD = (0.2, 0.2, 0.2)
+"""Standard deviations, in m/s and rad/s, beyond which a recording's lidar has lost the robot: poses scatter
+by 0.01 m about a parabola elsewhere, which is 0.03 m/s, and by 0.3 m where a registration jumps.  Of
+recordings of a Warthog that takes 1 % of the twists, of a Husky on wet grass a sixth."""
+
+MIN_JUDGED_SCANS = 5.0
+"""So few poses at least show their scatter about a parabola, which takes three of them."""
 
 
 def body_twists(
@@ -37,7 +40,6 @@ def body_twists(
     period_s: float,
     *,
     frame_yaw: Array | None = None,
-    max_std: tuple[float, float, float] | None = None,
 ) -> Array:
     r"""Return speeds forward and to the left and yaw rate from poses that are held between two scans.
 
@@ -64,8 +66,6 @@ def body_twists(
     period_s : time from sample to sample
     frame_yaw : (n,) heading of the frame of the positions in that of the yaw; the mean over the first five
         by default, as the samples of DRIVE have it, 0 for poses in one fixed frame
-    max_std : of the three speeds, by the scatter of the poses about the parabola; NaN beyond it.  Not judged
-        by default
 
     Returns
     -------
@@ -79,6 +79,15 @@ def body_twists(
     >>> pose[0, :, 0] = 0.5 * 0.1 * (np.arange(40) // 2)
     >>> body_twists(pose, 0.05)[0, 20].round(6).tolist()
     [0.5, 0.0, 0.0]
+    """
+    return twists_and_std(pose, period_s, frame_yaw=frame_yaw)[0]
+
+
+def twists_and_std(pose: Array, period_s: float, *, frame_yaw: Array | None = None) -> tuple[Array, Array]:
+    """Return twists as :func:`body_twists` does, and their standard deviations (n, k, 3).
+
+    The latter come from the scatter of the poses about the parabola; NaN where fewer than
+    :data:`MIN_JUDGED_SCANS` poses show one.
     """
     n, k, _ = pose.shape
     new = new_poses(pose)
@@ -109,13 +118,12 @@ def body_twists(
     with np.errstate(invalid="ignore"):
         gain_per_s = np.sqrt(inverse[..., 1, 1]) / (half * period_s)
         certain = gain_per_s <= MAX_GAIN_PER_S
-        if max_std is not None:
-            squares = view(np.pad(driven**2, [*padding, (0, 0)]), width, axis=1).sum(axis=-1)
-            left = np.maximum(squares - (fitted * sums).sum(axis=-2), 0.0)
-            spare = np.maximum(normal[..., 0, 0] - 3.0, 1.0)
-            std = np.sqrt(left / spare[..., None]) * gain_per_s[..., None]
-            certain &= (std <= max_std).all(axis=-1)
-    return np.where(certain[..., None], slope, np.nan)
+        squares = view(np.pad(driven**2, [*padding, (0, 0)]), width, axis=1).sum(axis=-1)
+        left = np.maximum(squares - (fitted * sums).sum(axis=-2), 0.0)
+        judged = normal[..., 0, 0] >= MIN_JUDGED_SCANS
+        spare = np.where(judged, normal[..., 0, 0] - 3.0, np.nan)
+        std = np.sqrt(left / spare[..., None]) * gain_per_s[..., None]
+    return np.where(certain[..., None], slope, np.nan), np.where(certain[..., None], std, np.nan)
 
 
 def new_poses(pose: Array) -> Array:
