@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -29,6 +30,10 @@ driving measured runs reach 0.93 to 1.085."""
 
 IMPLAUSIBLE_GRAVITY_RATIO = (0.8, 1.2)
 """Beyond, no driving explains it: the mean acceleration of a run is that of its change of speed."""
+
+NO_GRAVITY_RATIO = 0.2
+"""Less is an accelerometer without gravity, as some fusing IMUs report it: of use for vibration, not for
+tilt, so that it is doubtful."""
 
 UPRIGHT_RATIO = 0.9
 """Least part of the mean specific force along z, a tilt of 26 degrees; measured runs reach 0.97."""
@@ -81,12 +86,13 @@ def judge(run: RunLog, scale: Scale = UNKNOWN_ROBOT) -> tuple[Check, ...]:
     >>> [check.sentence for check in judge(RunLog("a", "husky", {"imu": accel})) if check.check == "gravity"]
     ['gravity: the mean specific force is 1 m/s^2, 9.81 is expected: an accelerometer in g read as m/s^2?']
     """
-    checks: list[Check] = [_gravity(run), check_turns(run, scale), check_speeds(run, scale)]
+    known = _within_bounds(run)
+    checks: list[Check] = [_gravity(known), check_turns(known, scale), check_speeds(known, scale)]
     for name, stream in run.streams.items():
         checks.append(_sampling(name, stream))
         checks += check_names(name, stream)
     checks += _values(run)
-    checks += _constants(run)
+    checks += _constants(known)
     checks.append(_overlap(run))
     return tuple(checks)
 
@@ -103,6 +109,16 @@ def worst(checks: Sequence[Check]) -> Level:
     return max((check.level for check in checks), key=order.index, default=Level.UNKNOWN)
 
 
+def _within_bounds(run: RunLog) -> RunLog:
+    """Return the run with NaN for values that no quantity can have, which one check is about."""
+    streams = dict(run.streams)
+    for name, stream in streams.items():
+        beyond = np.abs(stream.values) > MAX_MAGNITUDE
+        if beyond.any():
+            streams[name] = Stream(stream.time_s, np.where(beyond, np.nan, stream.values), stream.channels)
+    return replace(run, streams=streams)
+
+
 def _gravity(run: RunLog) -> Check:
     def check(level: Level, measured: float, sentence: str) -> Check:
         return Check("gravity", level, "imu", measured, f"gravity: {sentence}")
@@ -116,7 +132,7 @@ def _gravity(run: RunLog) -> Check:
     if finite.sum() < MIN_SAMPLES or np.ptp(stream.time_s[finite]) < MIN_GRAVITY_S:
         return check(Level.UNKNOWN, math.nan, f"fewer than {MIN_GRAVITY_S:g} s of the accelerometer")
     values = values[finite]
-    mean = np.where(np.abs(values) <= MAX_MAGNITUDE, values, 0.0).mean(axis=0)
+    mean = values.mean(axis=0)
     size = float(np.linalg.norm(mean))
     measured = f"the mean specific force is {size:.3g} m/s^2, {GRAVITY_MPS2:.3g} is expected"
     ratio = size / GRAVITY_MPS2
@@ -125,9 +141,10 @@ def _gravity(run: RunLog) -> Check:
         return check(Level.IMPLAUSIBLE, size, f"{measured}: an accelerometer in g read as m/s^2?")
     if abs(size / GRAVITY_MPS2**2 - 1.0) <= 1.0 - low:
         return check(Level.IMPLAUSIBLE, size, f"{measured}: one in m/s^2 read as g?")
+    if ratio < NO_GRAVITY_RATIO:
+        return check(Level.DOUBTFUL, size, f"{measured}: gravity removed?")
     if not low <= ratio <= high:
-        why = "gravity removed?" if ratio < low else "another unit?"
-        return check(Level.IMPLAUSIBLE, size, f"{measured}: {why}")
+        return check(Level.IMPLAUSIBLE, size, f"{measured}: another unit, or a scale?")
     upright = float(mean[2] / size)
     along = ", ".join(f"{part:.3g}" for part in mean)
     expected = f"it is ({along}) m/s^2 along x, y and z, mostly along +z is expected"
@@ -195,32 +212,36 @@ def _values(run: RunLog) -> Iterator[Check]:
 
 
 def _constants(run: RunLog) -> Iterator[Check]:
-    judged, n_odd = False, 0
+    """Yield channels that are constant while another one of their signals varies, or the wheels turn."""
+    still: dict[tuple[str, str], bool] = {}
     for name, stream in run.streams.items():
         if len(stream) < MIN_SAMPLES or stream.duration_s < MIN_CONSTANT_S:
             continue
-        still = [not np.ptp(v[np.isfinite(v)]) if np.isfinite(v).any() else True for v in stream.values.T]
-        for channel, value, constant in zip(stream.channels, stream.values[0], still, strict=True):
-            signals = signal_set_of(name, channel)
-            if signals not in ("imu", "wheels", "currents"):
-                continue
-            judged = True
-            alike = [
-                s for c, s in zip(stream.channels, still, strict=True) if signal_set_of(name, c) == signals
-            ]
-            if constant and (signals == "imu" or not all(alike)):  # a robot that stands has constant wheels
-                n_odd += 1
-                yield Check(
-                    "constant channels",
-                    Level.DOUBTFUL,
-                    channel,
-                    float(value),
-                    f"channel {channel!r} of stream {name!r}: is {value:.4g} throughout; a sensor that works "
-                    "varies",
-                )
+        for channel, values in zip(stream.channels, stream.values.T, strict=True):
+            if signal_set_of(name, channel) in ("imu", "wheels", "currents"):
+                finite = values[np.isfinite(values)]
+                still[name, channel] = not finite.size or not np.ptp(finite)
+    varying = {
+        (name, signal_set_of(name, channel)) for (name, channel), constant in still.items() if not constant
+    }
+    turning = any(signals == "wheels" for _, signals in varying)
+    n_odd = 0
+    for (name, channel), constant in still.items():
+        signals = signal_set_of(name, channel)
+        if constant and ((name, signals) in varying or (turning and signals == "imu")):
+            n_odd += 1
+            value = float(run.streams[name].channel(channel)[0])
+            yield Check(
+                "constant channels",
+                Level.DOUBTFUL,
+                channel,
+                value,
+                f"channel {channel!r} of stream {name!r}: is {value:.4g} throughout; a sensor that works "
+                "varies",
+            )
     if not n_odd:
-        level = Level.OK if judged else Level.UNKNOWN
-        what = "none is" if judged else "there is none to judge"
+        level = Level.OK if varying else Level.UNKNOWN
+        what = "none is" if varying else "there is none to judge"
         yield Check("constant channels", level, "all", math.nan, f"constant channels: {what}")
 
 

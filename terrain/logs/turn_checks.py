@@ -42,8 +42,9 @@ MAX_IMPLAUSIBLE_TURN_RATIO = 8.0
 MAX_SPEED_MPS = (12.0, 50.0)
 """Of off-road robots without a described top speed; from the first on doubtful, then implausible."""
 
-MAX_OVERSPEED = (1.5, 2.5)
-"""Wheel speed over the described top speed: downhill, or with noise, up to 1.1; in km/h 3.6."""
+MAX_OVERSPEED = (1.5, 5.0)
+"""Wheel speed over the described top speed: downhill, or with noise, up to 1.1; in km/h 3.6, which another
+gear may explain; in rad/s 3.3 (a wheel of 0.3 m) to 6."""
 
 SPEED_QUANTILE = 0.99
 
