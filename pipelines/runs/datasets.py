@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from terrain.errors import ConfigError, LogError
+from terrain.logs.spelling import one_spelling
 from terrain.records import Array, RunLog
 
 if TYPE_CHECKING:
@@ -69,7 +70,8 @@ def load_runs(
     Raises
     ------
     LogError
-        if nothing readable is there, a run cannot be read, two runs have one id, or layouts are mixed.
+        if nothing readable is there, a run cannot be read, two runs have one id, layouts are mixed, or a
+        terrain has two spellings.
     ConfigError
         if the layout is unknown, the mapping is not accepted, or a robot is unknown (to align, or to turn
         motor rates into wheel speeds).
@@ -97,6 +99,7 @@ def load_runs(
     for run_id, found in places.items():
         if len(found) > 1:
             raise LogError(f"{folder}: {len(found)} runs have the id {run_id!r} ({' and '.join(found)})")
+    runs = one_spelling(str(folder), runs, repair=repair)
     runs = sorted((_with_wheel_speeds(run, described) for run in runs), key=lambda run: run.run_id)
     return [_aligned(run, described) for run in runs] if align else runs
 

@@ -26,6 +26,13 @@ ROBOT_TEXT = (
 )
 
 
+MAPPING_TEXT = (
+    "YAML file that describes CSV files by the keys robot, run_id, terrain, streams; of a stream file, time, "
+    "channels, delimiter, decimal, skip_rows, header_rows; of time and channels column, unit; of channels "
+    "scale, offset (docs/mapping.md). With --format bag topics; with can a DBC."
+)
+
+
 class ReadSettings(Settings):
     """How files are read."""
 
@@ -66,6 +73,7 @@ class InspectSettings(RunsSettings):
 class ImportSettings(InspectSettings):
     """What is imported, and where to."""
 
+    mapping: Path | None = setting(None, MAPPING_TEXT)
     out: Path = setting(..., "Folder of the new run folders.")
 
 

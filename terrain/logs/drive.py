@@ -65,6 +65,7 @@ from typing import NamedTuple
 import numpy as np
 
 from terrain.errors import LogError
+from terrain.files.names import normal_name
 from terrain.logs.csv_table import data_row, read_columns
 from terrain.logs.held import undo_hold, usual_hold
 from terrain.logs.imu_axes import ImuAxes, find_axes
@@ -179,8 +180,9 @@ def find_runs(folder: Path, robot: DriveRobot) -> list[Callable[..., RunLog]]:
         if not (path / FILE_NAME).is_file():
             readers.append(partial(_refuse, path))
             continue
-        numbered = _SESSION_NAME.fullmatch(path.resolve().name)
-        session = path.resolve().name if numbered or path != folder else ""
+        name = normal_name(path.resolve().name)
+        numbered = _SESSION_NAME.fullmatch(name)
+        session = name if numbered or path != folder else ""
         windows = _read_windows(
             check_log_file(path / FILE_NAME, path), robot, session, numbered[1] if numbered else ""
         )

@@ -51,6 +51,7 @@ from pathlib import Path
 import numpy as np
 
 from terrain.errors import LogError
+from terrain.files.names import normal_name
 from terrain.logs.csv_table import data_row, read_columns, read_words
 from terrain.logs.drive import FILE_NAME as SAMPLES_FILE
 from terrain.logs.drive import DriveRobot, refuse_other_robot
@@ -167,7 +168,7 @@ def named_by_folder(path: Path) -> tuple[str, str]:
     >>> named_by_folder(Path("husky_wet_grass/wetgrass.csv.gz"))
     ('husky', 'wet_grass')
     """
-    name = path.resolve().parent.name
+    name = normal_name(path.resolve().parent.name)
     robot, _, terrain = name.partition("_")
     if not robot or not terrain:
         raise LogError(
@@ -283,7 +284,7 @@ def _read(path: Path, robot: DriveRobot, terrain: str, *, repair: bool) -> tuple
     }
     channels |= {"lidar": TWIST_CHANNELS, "pose": POSE_CHANNELS, "commands": tuple(COMMANDS)}
     dropped[STILL] += n_still
-    session = f"{path.resolve().parent.name}_{path.name.removesuffix(SUFFIX)}"
+    session = normal_name(f"{path.resolve().parent.name}_{path.name.removesuffix(SUFFIX)}")
     recording = _Recording(
         name, session, robot.name, terrain, time_s, period_s, values, channels, posed, dropped
     )

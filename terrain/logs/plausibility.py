@@ -48,7 +48,7 @@ RATE_HZ = (0.5, 1e4)
 """Of any sensor of a vehicle; milliseconds read as seconds make 10 Hz 0.01 Hz, the reverse 10 kHz."""
 
 DURATION_S = (0.5, 2 * 24 * 3600.0)
-"""Of a run: shorter holds nothing to classify, longer than two nights nobody records at one stretch."""
+"""Of a run: shorter holds nothing to classify, longer than two nights is no single recording."""
 
 MIN_SAMPLES = 5
 """Fewer show no rate."""
