@@ -10,7 +10,9 @@ where it was calibrated, its 95 % interval::
       gyro_bias_z_radps: {value: 0.0021, unit: radps, source: "terrain calibrate", interval: [0.0019, 0.0023]}
 
 Geometry and mass are required of every robot; the sections ``body``, ``motors``, ``steering``, ``camera`` and
-``sensors`` by what simulates a robot or filters its log.  The section ``effects`` of an extended robot
+``sensors`` by what simulates a robot or filters its log.  The section ``identified`` keeps what logs of one
+robot showed beside its nominal figures: its effective track, the radius that its wheels roll on, delays.  The
+section ``effects`` of an extended robot
 (:mod:`terrain.effects`) says what else acts; :mod:`terrain.extension` makes use of it.
 """
 
@@ -28,7 +30,7 @@ from terrain.files.descriptions import check_keys, number
 from terrain.files.documents import read_yaml
 from terrain.files.names import check_name, shown
 from terrain.files.resources import data_folder
-from terrain.robots.parts import KIND_OF_SECTION
+from terrain.robots.parts import IDENTIFIED, KIND_OF_SECTION
 from terrain.robots.region import read_region
 from terrain.robots.robot import Robot
 from terrain.robots.skid_steer import SkidSteerRobot
@@ -145,7 +147,9 @@ def robot_from(file: str, described: Any) -> Robot:
     ConfigError
         as :func:`load_robot` does.
     """
-    check_keys(file, described, ["name", "drive", *NUMBERS], optional=(*KIND_OF_SECTION, "effects"))
+    check_keys(
+        file, described, ["name", "drive", *NUMBERS], optional=(*KIND_OF_SECTION, "identified", "effects")
+    )
     name, drive = described["name"], described["drive"]
     if not isinstance(name, str) or not name:
         raise ConfigError(f"{file}: name is {shown(name)}, a word is required")
@@ -162,7 +166,10 @@ def robot_from(file: str, described: Any) -> Robot:
     }
     kind = KIND_OF_DRIVE[drive]
     assumed = frozenset(_assumed(described))
-    robot = kind(name, wheel_radius_m, track_m, wheelbase_m, mass_kg, parts, assumed=assumed)
+    identified = _identified(f"{file}: identified", described.get("identified", {}))
+    robot = kind(
+        name, wheel_radius_m, track_m, wheelbase_m, mass_kg, parts, assumed=assumed, identified=identified
+    )
     if "effects" in described:
         effects, cov = read_effects(f"{file}: effects", described["effects"], drive)
         stated = described["effects"].get("region")
@@ -180,6 +187,13 @@ def _assumed(described: dict[str, Any]) -> Iterator[str]:
         for key, entry in entries.items():
             if entry["source"].strip().lower().startswith("assumed"):
                 yield f"{prefix}{key}"
+
+
+def _identified(place: str, described: Any) -> dict[str, float]:
+    check_keys(place, described, [], optional=tuple(IDENTIFIED))
+    return {
+        key: number(f"{place}: {key}", entry, _unit(key), IDENTIFIED[key]) for key, entry in described.items()
+    }
 
 
 def _part(place: str, kind: Any, described: Any) -> Any:
