@@ -7,7 +7,7 @@ Over steady stretches of a second, with the speeds of the sides by the described
 
 where rho is the rolling radius of a tyre under its load (of a track that of the sprocket), s the slip of a
 side that drives straight on, and B the effective track, skidding included (Mandow et al., Experimental
-kinematics for wheeled skid-steer mobile robots, IROS 2007).  Radius and slip are told apart by an assumption
+kinematics for wheeled skid-steer mobile robots, IROS 2007).  Radius and slip are separated by an assumption
 on s alone: :data:`SLIP_RATIO` on hard ground, where a tyre rolls on, :data:`SOFT_SLIP_RATIO` elsewhere; the
 interval holds all of it.  B goes with r: with another described radius it scales alike, and it is one of the
 terrain and of the turns driven.

@@ -32,9 +32,10 @@ Warthog and one of a Husky show:
 - *Late*: lidar poses lag the gyro by 0.25 to 0.5 s, the wheels by 0.05 to 0.1 s.  Times are as logged.
 - *Held*: the Warthog's wheels are new every 0.25 s, its currents and voltages every second, the Husky's every
   0.15 s; they are read as straight lines between (:mod:`terrain.logs.held`).
-- *Currents* of the Husky never are negative: magnitudes, or a supply's.  The Warthog's are positive where a
-  side drives, forwards or backwards, and negative where it brakes: the sign is that of the power.  They stay
-  as they are, and are counted as such.  Voltages are the supply's, not the motors'.
+- *Currents* of the Husky are never negative: magnitudes, which stay as they are and are counted.  The
+  Warthog's are positive where a side drives, forwards or backwards, and negative where it brakes: the sign of
+  the power, which is turned into that of the torque (forward positive) by the rotation of the wheel, and
+  counted.  Voltages are the supply's, not the motors'.
 - *Missing*: a column that holds nothing but 0 was not recorded (the Husky's imu), and the imu is 0 before its
   first message.  Both are left out.
 - *Lost*: on the wet grass poses jump by up to 12 m.  Where they scatter too much for a speed they are NaN.
@@ -53,6 +54,7 @@ import numpy as np
 from terrain.errors import LogError
 from terrain.files.names import normal_name
 from terrain.logs.csv_table import data_row, read_columns, read_words
+from terrain.logs.current_signs import MIN_MOVING_RADPS, POWER_SIGN, current_sign, with_sign_of_torque
 from terrain.logs.drive import FILE_NAME as SAMPLES_FILE
 from terrain.logs.drive import DriveRobot, refuse_other_robot
 from terrain.logs.held import undo_hold, usual_hold
@@ -89,14 +91,6 @@ STATE, STEP, TIME = "calib_state", "calib_step", "time"
 BREAK_PERIODS = 2.5
 """A longer wait between two rows ends a run: samples are lost."""
 
-MIN_MOVING_RADPS = 0.05
-"""Slower wheels stand."""
-
-MIN_CURRENT_A = 1.0
-"""Smaller currents show no sign."""
-
-NO_SIGN = "currents without a sign"
-POWER_SIGN = "currents with the sign of the power"
 NOT_RECORDED = "columns that were not recorded"
 LOST = "poses where the lidar lost the robot"
 STILL = "commands under which nothing moved"
@@ -324,34 +318,14 @@ def _wheels(
     if currents:
         kind = current_sign(logged[:, currents], logged[:, [i - 2 for i in currents]])
         dropped[kind] += len(currents) if kind else 0
+        if kind == POWER_SIGN:
+            logged = logged.copy()
+            for i in currents:
+                logged[:, i] = with_sign_of_torque(logged[:, i], logged[:, i - 2], period_s)
     values = logged[:, recorded]
     values = undo_hold(values, time_s, tuple(usual_hold(column[None], period_s) for column in values.T))
     values[:, :2] *= robot.wheel_radius_m
     return values, channels
-
-
-def current_sign(current_a: Array, speed_radps: Array) -> str:
-    """Return how a current is signed, where not by direction: as a magnitude, or as the power; else empty.
-
-    Parameters
-    ----------
-    current_a : (n, sides) motor currents
-    speed_radps : (n, sides) of their wheels
-
-    Examples
-    --------
-    >>> speed = np.array([[1.0], [1.0], [-1.0], [-1.0]])
-    >>> current_sign(np.array([[5.0], [4.0], [5.0], [6.0]]), speed)
-    'currents without a sign'
-    >>> current_sign(np.array([[5.0], [-4.0], [5.0], [6.0]]), speed)
-    'currents with the sign of the power'
-    >>> current_sign(np.array([[5.0], [4.0], [-5.0], [-6.0]]), speed)
-    ''
-    """
-    backward = (speed_radps <= -MIN_MOVING_RADPS) & (np.abs(current_a) >= MIN_CURRENT_A)
-    if not (current_a <= -MIN_CURRENT_A).any():
-        return NO_SIGN
-    return POWER_SIGN if backward.any() and np.mean(current_a[backward] > 0) > 0.5 else ""
 
 
 def _imu(

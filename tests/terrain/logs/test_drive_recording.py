@@ -11,7 +11,8 @@ from pipelines.runs.datasets import data_digest, load_runs
 from pipelines.runs.import_logs import import_logs
 from pipelines.runs.settings import ImportSettings
 from terrain.errors import ConfigError, LogError
-from terrain.logs.drive_recording import LOST, NO_SIGN, NOT_RECORDED, POWER_SIGN, STILL, current_sign
+from terrain.logs.current_signs import NO_SIGN, POWER_SIGN, current_sign
+from terrain.logs.drive_recording import LOST, NOT_RECORDED, STILL
 from terrain.logs.imu_axes import GYRO_IN_DEGREES, GYRO_TURNED, TURNED
 from terrain.logs.samples import BAD_CELL, BAD_TIME
 from terrain.robots import load_robot
@@ -186,6 +187,23 @@ def test_currents_are_marked_by_their_sign(save):
     )
 
 
+def test_a_current_with_the_sign_of_the_power_gets_that_of_the_torque(save):
+    """Drive forwards, brake, drive backwards: what is logged is the torque times the sense of rotation."""
+    columns = recording(((1, "calib", 20.0),))
+    t = columns["time"]
+    speed = np.sin(0.5 * t)
+    torque = 7.0 * np.gradient(speed, PERIOD_S) + 2.0 * np.sign(speed)
+    for side in ("left", "right"):
+        columns[f"meas_{side}_vel"] = held(speed, 5) / RADIUS_M
+        columns[f"{side}_wheel_current"] = held(torque * np.sign(speed), 20)
+    (run,) = load_runs(save(columns))
+    assert run.dropped[POWER_SIGN] == 2
+    found = run.streams["wheels"].channel("current_left_a")[::20]
+    expected = torque[::20][: len(found)]
+    turning = np.abs(speed[::20][: len(found)]) > 0.2
+    np.testing.assert_allclose(found[turning], expected[turning], atol=1e-9)
+
+
 def test_a_pose_that_jumps_is_unknown_and_counted(save):
     columns = recording()
     columns["icp_pos_x"][400:402] += 30.0
@@ -328,7 +346,13 @@ def test_of_measured_recordings_lidar_wheels_and_gyro_agree(measured_runs, folde
     if folder.startswith("warthog"):
         known = np.isfinite(gyro)
         assert (turn[known] @ gyro[known]) / (gyro[known] @ gyro[known]) == pytest.approx(1.0, abs=0.06)
-        assert "currents with the sign of the power" in {kind for run in runs for kind in run.dropped}
+        assert POWER_SIGN in {kind for run in runs for kind in run.dropped}
+        # a side that drives backwards takes a negative current, as one that drives forwards a positive one
+        rows = np.concatenate([run.streams["wheels"].values for run in runs])
+        faster = np.abs(rows[:, :2]).argmax(axis=1)
+        speed = np.take_along_axis(rows[:, :2], faster[:, None], axis=1)[:, 0]
+        current = np.take_along_axis(rows[:, 2:4], faster[:, None], axis=1)[:, 0]
+        assert np.nanmean(current[speed < -0.5]) < -2.0 < 2.0 < np.nanmean(current[speed > 0.5])
     else:
         assert not any("imu" in run.streams for run in runs)
         assert NO_SIGN in {kind for run in runs for kind in run.dropped}
