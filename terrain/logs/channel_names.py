@@ -15,14 +15,28 @@ FEATURE_UNITS: dict[str, str] = {
     "accel": "mps2",
     "speed": "mps",
     "current": "a",
-    "slip": "ratio",
 }
-"""Unit of each quantity that features are made of."""
+"""Unit of each quantity that features are made of by name."""
+
+IMU = ("gyro", "accel")
 
 OTHER_QUANTITIES: tuple[str, ...] = (
     *("motor", "angle", "roll", "pitch", "yaw", "voltage", "position", "velocity", "quaternion", "rate"),
     *("std", "fix", "confidence", "torque", "temperature", "wheel", "steer", "status", "force", "load"),
-    *("sinkage", "slip", "lambda", "heading", "power", "pressure", "magnetic", "height", "tick", "pulse"),
+    *(
+        "sinkage",
+        "slip",
+        "traction",
+        "side",
+        "normal",
+        "heading",
+        "power",
+        "pressure",
+        "magnetic",
+        "height",
+        "tick",
+        "pulse",
+    ),
 )
 """Quantities that logs have and no feature is made of."""
 
@@ -56,7 +70,7 @@ def _odd(stream: str, channel: str) -> Check | None:
         near = difflib.get_close_matches(quantity, known, 1, NEAR)
         if near:
             return _check(
-                Level.IMPLAUSIBLE,
+                Level.IMPLAUSIBLE if near[0] in FEATURE_UNITS else Level.DOUBTFUL,
                 channel,
                 f"{place}: no feature is made of {quantity!r}; is it {f'{near[0]}_{rest}'!r}?",
             )
@@ -66,7 +80,7 @@ def _odd(stream: str, channel: str) -> Check | None:
             channel,
             f"{place}: no feature is made of {quantity!r} (features are made of {of_features})",
         )
-    if signal_set_of(stream, channel) is None:
+    if signal_set_of(stream, channel) is None or quantity not in FEATURE_UNITS:
         return None
     try:
         unit = unit_of(channel)
@@ -75,12 +89,12 @@ def _odd(stream: str, channel: str) -> Check | None:
     expected = FEATURE_UNITS[quantity]
     if unit != expected:
         return _check(
-            Level.IMPLAUSIBLE,
+            Level.IMPLAUSIBLE if quantity in IMU else Level.DOUBTFUL,
             channel,
             f"{place}: {quantity} is in {unit!r}, {expected!r} is expected (a name ends in its unit)",
         )
     axis = rest.rpartition("_")[0]
-    if quantity in ("gyro", "accel") and axis not in AXES:
+    if quantity in IMU and axis not in AXES:
         return _check(
             Level.DOUBTFUL, channel, f"{place}: {axis!r} is no axis, one of {', '.join(AXES)} is expected"
         )
