@@ -178,7 +178,7 @@ def test_what_cannot_be_judged_is_unknown_and_not_ok():
     assert levels["constant channels"] == Level.OK
 
 
-@pytest.mark.parametrize("robot", ["agrimaro", "husky", "warthog"])
+@pytest.mark.parametrize("robot", ["agrimaro", "husky", "warthog", "marmotte"])
 @pytest.mark.parametrize(
     ("terrain", "scenario"), [("grass", "survey"), ("asphalt", "stand"), ("clay", "starts")]
 )
