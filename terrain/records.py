@@ -100,13 +100,11 @@ class RunLog:
         ``estimator``, ``truth``
     labels : terrain intervals; one for the whole run in the simple case, none when unlabelled
     source : where the log comes from, as text
-    dropped : what a repairing reader removed, as counts by kind; empty after a strict read
+    dropped : what a reader removed or changed, as counts by kind; after a strict read no more than signs and
+        axes that were turned, and what the log lacks
     session : outing that the run is part of, by name: runs of one session share what changes from one to the
         next, as the weather, the ground and how the sensors were mounted; empty where unknown
     filter : that made the streams ``estimator``, ``slip`` and ``state``, by name; empty without them
-    converted : what a reader changed of a sound log to bring it into the project's frames and units, as
-        counts by kind: values that are held, signs, scales, and what stays different, as currents without a
-        sign
     """
 
     run_id: str
@@ -117,13 +115,11 @@ class RunLog:
     dropped: Mapping[str, int] = field(default_factory=dict)
     session: str = ""
     filter: str = ""
-    converted: Mapping[str, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "streams", MappingProxyType(dict(self.streams)))
         object.__setattr__(self, "labels", tuple(Label(*label) for label in self.labels))
         object.__setattr__(self, "dropped", MappingProxyType(dict(self.dropped)))
-        object.__setattr__(self, "converted", MappingProxyType(dict(self.converted)))
 
     @property
     def start_s(self) -> float:

@@ -109,7 +109,9 @@ def noisy_run(run_id="SNOW_01", terrain="SNOW", seed=0, duration_s=4.0):
         ("wheels", 10.0, ["speed_left_mps", "speed_right_mps", "current_left_a", "current_right_a"]),
     ):
         n = round(duration_s * rate_hz)
-        streams[name] = Stream(np.arange(n) / rate_hz, rng.standard_normal((n, len(channels))), channels)
+        values = rng.standard_normal((n, len(channels)))
+        values += [9.81 if channel == "accel_z_mps2" else 0.0 for channel in channels]
+        streams[name] = Stream(np.arange(n) / rate_hz, values, channels)
     return RunLog(run_id, "husky", streams, (Label(0.0, duration_s, terrain),), source="noise")
 
 

@@ -16,7 +16,7 @@ from pipelines.messages.storage import Faults, Topic
 from terrain.errors import ConfigError, LogError
 from terrain.files.names import shown
 from terrain.logs.samples import checked_stream, longest_rise
-from terrain.logs.schema import UNIT_SCALES, unit_of
+from terrain.logs.schema import UNIT_OFFSETS, UNIT_SCALES, unit_of
 from terrain.records import Array, Stream
 
 UNMATCHED = "messages without one of equal stamp on the other topics"
@@ -126,10 +126,11 @@ class StreamCollector:
             channel, desired = self._mapping.channels[name], unit_of(name)
             unit = joint_unit(channel) if self._mapping.kind == "joints" else channel.unit
             factor = 1.0 if desired == "code" else UNIT_SCALES[unit][1]
+            zero = UNIT_OFFSETS.get(unit, 0.0)
             if self._mapping.kind == "joints" and by_radius(channel, desired):
                 factor *= self._radius_m or np.nan
             with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is judged later
-                columns.append((column * channel.scale + channel.offset) * factor)
+                columns.append((column * channel.scale + channel.offset) * factor + zero)
         order = [names.index(name) for name in self._mapping.channels]
         return Converted(tuple(self._mapping.channels), np.column_stack(columns)[:, order])
 

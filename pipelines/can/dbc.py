@@ -16,7 +16,7 @@ from typing import Any
 from pipelines.can.signals import COUNTER, CRC, OPTIONAL, SIGNALS, channels_of
 from terrain.errors import ConfigError
 from terrain.files.resources import data_folder
-from terrain.logs.schema import UNIT_SCALES, unit_of
+from terrain.logs.schema import UNIT_OFFSETS, UNIT_SCALES, unit_of
 
 DEFAULT_DBC = "agrimaro.dbc"
 MAX_BYTES = 8
@@ -213,7 +213,7 @@ def _factor(path: Path, signal: Any, channel: str) -> float:
     if required == "code" or (required == "ratio" and given == ""):
         known = ("", 1.0) if given in UNITLESS else None
     else:
-        known = UNIT_SCALES.get(given)
+        known = None if given in UNIT_OFFSETS else UNIT_SCALES.get(given)  # a DBC has offsets of its own
         known = known if known is not None and known[0] == required else None
     if known is None:
         fitting = [repr(unit) for unit, (word, _) in UNIT_SCALES.items() if word == required] or ["none"]

@@ -28,7 +28,7 @@ def estimate_command(source: RunsSettings, settings: EstimateSettings, json_file
 
 @command(app, "calibrate")
 def calibrate_command(source: RunsSettings, settings: CalibrateSettings, json_file: Json = None) -> None:
-    """Find zeros, ratio, biases, noise and time constants of a robot from its logs."""
+    """Find zeros, ratio, track, biases, noise and time constants of a robot from its logs."""
     from pipelines.estimate.calibrate import calibrate
     from pipelines.estimate.calibration_screen import print_calibration
     from pipelines.reporting.json_file import write_json

@@ -269,5 +269,5 @@ def notes(samples: Samples, settings: CrossvalSettings, repaired: Mapping[str, i
     if samples.cut.dropped:
         sentences.append(f"windows left out: {format_counts(samples.cut.dropped)}")
     if repaired:
-        sentences.append(f"dropped to repair the logs: {format_counts(repaired)}")
+        sentences.append(f"changed or left out in reading the logs: {format_counts(repaired)}")
     return sentences

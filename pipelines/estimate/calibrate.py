@@ -16,6 +16,7 @@ from terrain.calibration.finding import Finding
 from terrain.calibration.lag import starts_and_stops, time_constants
 from terrain.calibration.noise import measurement_variances, sensor_noise
 from terrain.calibration.six_positions import MIN_POSITION_S, accelerometer
+from terrain.calibration.skid_steer import identify
 from terrain.calibration.standing import gyro_bias, standing
 from terrain.calibration.steady import steady_stretches, why_none
 from terrain.calibration.wheels import SLIP_RATIO, reduction_ratio, steering_zeros
@@ -24,6 +25,9 @@ from terrain.files.atomic import atomic_write, ensure_writable
 from terrain.records import RunLog
 from terrain.robots import Robot, SwerveRobot, read_description, robot_from
 from terrain.terramechanics.soil import load_soil, soil_names
+
+IDENTIFIED = "identified"
+"""Section of a description that need not be there before."""
 
 MAX_NAMED_RUNS = 4
 """A source names that many runs, and counts more."""
@@ -60,29 +64,22 @@ def calibrate(
         if the robot's description is not accepted, lacks a section or has effects, or ``out`` is there
         already or is no YAML file.
     DataError
-        if the robot is no swerve robot, a run is another robot's, or the runs tell nothing.
+        if a run is another robot's, the runs show nothing, or those of a skid-steer robot have no lidar.
     """
     file, described = read_description(robot_name)
     robot = robot_from(file, described)
-    if not isinstance(robot, SwerveRobot):
-        raise DataError(
-            f"robot {robot.name}: drive {robot.drive!r} is not calibrated from logs, only 'swerve' is"
-        )
-    robot.require(*robot.sections)
-    if robot.effects:  # what is calibrated would hold them a second time
-        raise ConfigError(
-            f"robot {robot.name}: {file} is extended by effects; calibrate the description without them, "
-            "then explain again"
-        )
+    _check_robot(robot, file)
     out = None if out is None else _new_file(Path(out))
-    runs = load_runs(data, layout=layout, mapping=mapping, repair=repair)
-    for run in runs:
-        if run.robot != robot.name:
-            raise DataError(
-                f"run {run.run_id} is one of robot {run.robot!r}, and {robot.name!r} is calibrated"
-            )
+    runs = load_runs(
+        data, layout=layout, mapping=mapping, repair=repair, robot=robot_name if robot.skids else None
+    )
+    _check_runs(runs, robot)
     grounds = hard_grounds() if hard is None else tuple(hard)
-    findings = find(runs, described, robot, grounds)
+    findings = (
+        identify(runs, robot.wheel_radius_m, grounds)
+        if robot.skids
+        else find(runs, described, robot, grounds)
+    )
     if not any(finding.determined for finding in findings):
         reasons = "; ".join(dict.fromkeys(finding.note for finding in findings))
         raise DataError(f"{data}: nothing of robot {robot.name} can be calibrated from this: {reasons}")
@@ -94,12 +91,42 @@ def calibrate(
         hard=grounds,
         run_ids=tuple(run.run_id for run in runs),
         findings=tuple(_row(finding, described) for finding in findings),
-        measurement_variances=measurement_variances(robot_from(name, calibrated)),
+        measurement_variances={} if robot.skids else measurement_variances(robot_from(name, calibrated)),
     )
     if out is not None:
         head = f"# Calibrated from {len(runs)} runs; what they could not tell is as it was in {file}.\n"
         atomic_write(out, head + _yaml_text(calibrated))
     return result
+
+
+def _check_robot(robot: Robot, file: str) -> None:
+    """Refuse a robot of another drive, one that lacks a section, and one that is extended."""
+    if isinstance(robot, SwerveRobot):
+        robot.require(*robot.sections)
+    elif not robot.skids:
+        raise DataError(
+            f"robot {robot.name}: drive {robot.drive!r} is not calibrated from logs, only 'swerve' and "
+            "'skid_steer' are"
+        )
+    if robot.effects:  # what is calibrated would hold them a second time
+        raise ConfigError(
+            f"robot {robot.name}: {file} is extended by effects; calibrate the description without them, "
+            "then explain again"
+        )
+
+
+def _check_runs(runs: Sequence[RunLog], robot: Robot) -> None:
+    """Refuse runs of another robot, and, of a skid-steer robot, runs without speeds over ground."""
+    if robot.skids and not any("lidar" in run.streams for run in runs):
+        raise DataError(
+            f"robot {robot.name}: drive {robot.drive!r} is not calibrated from logs without the stream "
+            "'lidar', speeds over ground, which those of DRIVE have"
+        )
+    for run in runs:
+        if run.robot != robot.name:
+            raise DataError(
+                f"run {run.run_id} is one of robot {run.robot!r}, and {robot.name!r} is calibrated"
+            )
 
 
 def hard_grounds() -> tuple[str, ...]:
@@ -144,6 +171,9 @@ def described_with(described: Any, findings: Sequence[Finding]) -> Any:
     found = copy.deepcopy(described)
     for finding in findings:
         section, _, name = finding.parameter.partition(".")
+        if section == IDENTIFIED and finding.determined:
+            unit = name.rpartition("_")[2]
+            found.setdefault(section, {}).setdefault(name, {"unit": unit})
         if not finding.determined or name not in found.get(section, {}):
             continue
         half = (finding.high - finding.low) / 2
@@ -176,7 +206,7 @@ def _row(finding: Finding, described: Any) -> FindingRow:
     )
     return FindingRow(
         finding.parameter,
-        entry["unit"] if entry else "s",
+        entry["unit"] if entry else name.rpartition("_")[2] if section == IDENTIFIED else "s",
         float(entry["value"]) if entry else None,
         value,
         low,

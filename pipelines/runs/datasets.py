@@ -13,17 +13,18 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from terrain.errors import ConfigError, LogError
+from terrain.logs.spelling import one_spelling
 from terrain.records import Array, RunLog
 
 if TYPE_CHECKING:
     from terrain.logs.drive import DriveRobot
     from terrain.robots import Robot
 
-LAYOUTS = ("auto", "runs", "borealtc", "csv", "drive", "robotino", "can", "bag")
+LAYOUTS = ("auto", "runs", "borealtc", "csv", "drive", "drive-recording", "robotino", "can", "bag")
 """``runs``: run folders as this package writes them; ``csv``: any CSV, by a mapping file; ``drive``: the
-files ``samples.csv.gz`` of DRIVE, one a session; ``robotino``: files of three motors and a camera above;
-``can``: logs of a CAN bus, by a DBC; ``bag``: MCAP files
-and ROS 2 bags, by a mapping or by the types of their topics."""
+files ``samples.csv.gz`` of DRIVE, one a session; ``drive-recording``: its whole recordings; ``robotino``:
+files of three motors and a camera above; ``can``: logs of a CAN bus, by a DBC; ``bag``: MCAP files and ROS 2
+bags, by a mapping or by the types of their topics."""
 
 CAN_ROBOT = "agrimaro"
 """Robot of a log of a CAN bus where none is named."""
@@ -33,8 +34,9 @@ DRIVE_ROBOT = "husky"
 
 ACCEPTED = (
     "accepted are run folders (run.json), the BorealTC layout (<CLASS>/imu_N.csv and pro_N.csv), "
-    "the DRIVE layout (samples.csv.gz, or folders of sessions with one each), the Robotino layout "
-    "(camera_params.json over folders of .csv.gz), MCAP files and ROS 2 bags, and "
+    "the DRIVE layout (samples.csv.gz, or folders of sessions with one each), its whole recordings "
+    "(<robot>_<terrain>/*.csv.gz), the Robotino layout (camera_params.json over folders of .csv.gz), MCAP "
+    "files and ROS 2 bags, and "
     "any CSV with a mapping file"
 )
 
@@ -70,7 +72,8 @@ def load_runs(
     Raises
     ------
     LogError
-        if nothing readable is there, a run cannot be read, two runs have one id, or layouts are mixed.
+        if nothing readable is there, a run cannot be read, two runs have one id, layouts are mixed, or a
+        terrain has two spellings.
     ConfigError
         if the layout is unknown, the mapping is not accepted, or a robot is unknown (to align, or to turn
         motor rates into wheel speeds).
@@ -98,6 +101,7 @@ def load_runs(
     for run_id, found in places.items():
         if len(found) > 1:
             raise LogError(f"{folder}: {len(found)} runs have the id {run_id!r} ({' and '.join(found)})")
+    runs = one_spelling(str(folder), runs, repair=repair)
     runs = sorted((_with_wheel_speeds(run, described) for run in runs), key=lambda run: run.run_id)
     return [_aligned(run, described) for run in runs] if align else runs
 
@@ -224,7 +228,7 @@ def _readers(
     if not folder.is_dir():
         fault = "is no folder" if folder.exists() else "does not exist"
         raise LogError(f"{folder}: {fault}; {ACCEPTED}")
-    if (mapping is not None) and layout in ("runs", "borealtc", "drive", "robotino"):
+    if (mapping is not None) and layout in ("runs", "borealtc", "drive", "drive-recording", "robotino"):
         raise ConfigError(f"a mapping file is for CSV files, not for the layout {layout!r}")
     if layout == "can":
         from pipelines.can import dbc, logs
@@ -237,12 +241,15 @@ def _readers(
         from terrain.logs import mapping as by_mapping
 
         return by_mapping.find_runs(folder, by_mapping.load_mapping(mapping))
-    from terrain.logs import borealtc, drive, read, robotino
+    from terrain.logs import borealtc, drive, drive_recording, read, robotino
 
+    # files of a Robotino have the ending of recordings, and a camera's file above them
+    recorded = layout == "drive-recording" or (layout == "auto" and robotino.find_root(folder) is None)
     found: dict[str, list[Any]] = {
         "runs": read.find_runs(folder) if layout in ("auto", "runs") else [],
         "borealtc": borealtc.find_runs(folder) if layout in ("auto", "borealtc") else [],
         "drive": drive.find_sessions(folder) if layout in ("auto", "drive") else [],
+        "drive-recording": drive_recording.find_recordings(folder) if recorded else [],
         "robotino": robotino.find_runs(folder) if layout in ("auto", "robotino") else [],
     }
     names = [name for name, readers in found.items() if readers]
@@ -252,6 +259,8 @@ def _readers(
         return _bags(folder, None, robot)
     if names == ["drive"]:
         return drive.find_runs(folder, _drive_robot(robot))
+    if names == ["drive-recording"]:
+        return drive_recording.find_runs(folder, lambda name: _drive_robot(_named(name, robot)))
     return _some([reader for readers in found.values() for reader in readers], folder)
 
 
@@ -303,9 +312,13 @@ def robot_of(run: RunLog, robot: Robot | None) -> Robot:
     ConfigError
         if the package has no robot of the name.
     """
+    return _named(run.robot, robot)
+
+
+def _named(name: str, robot: Robot | None) -> Robot:
     from terrain.robots import packaged_robot
 
-    return robot if robot is not None and robot.name == run.robot else packaged_robot(run.robot)
+    return robot if robot is not None and robot.name == name else packaged_robot(name)
 
 
 def _aligned(run: RunLog, robot: Robot | None) -> RunLog:

@@ -10,21 +10,24 @@ from pipelines.reporting.progress import Progress, silent
 from pipelines.runs.datasets import data_digest
 from pipelines.runs.results import Imported
 from pipelines.runs.settings import ImportSettings, load
+from pipelines.runs.verdicts import counted, doubts_of, refuse_implausible_runs, verdict
 from terrain.errors import LogError
 from terrain.logs.duplicates import shared_stretches
 from terrain.logs.write import run_folder, write_run
+from terrain.robots import load_robot
 
 
 def import_logs(settings: ImportSettings, progress: Progress = silent) -> Imported:
     """Read every run under a folder, then write each as a run folder under ``settings.out``.
 
     All runs are read and checked, and all places found free, before the first one is written; nothing that
-    is already in the folder is touched.
+    is already in the folder is touched.  With ``repair``, an implausible run is written as it is, and counts
+    which checks it does not pass.
 
     Raises
     ------
     LogError
-        if a run cannot be read, or a place under ``out`` is taken.
+        if a run cannot be read or is implausible, or a place under ``out`` is taken.
     TerrainError
         if ``out`` cannot be written.
     """
@@ -33,6 +36,12 @@ def import_logs(settings: ImportSettings, progress: Progress = silent) -> Import
         target = run_folder(run.run_id, settings.out)
         if target.exists():
             raise LogError(f"{target}: is there already, and is left as it is; import into another folder")
+    given = None if settings.robot is None else load_robot(settings.robot)
+    verdicts = {run.run_id: verdict(run, given) for run in runs}
+    doubts = doubts_of(verdicts)
+    if not settings.repair:
+        refuse_implausible_runs(doubts)
+    runs = [counted(run, verdicts[run.run_id]) for run in runs]
     dropped: Counter[str] = Counter()
     labels: Counter[str] = Counter()
     written: list[Path] = []
@@ -55,4 +64,5 @@ def import_logs(settings: ImportSettings, progress: Progress = silent) -> Import
         skipped=tuple(skipped),
         digest=data_digest(runs),
         duplicates=shared_stretches(runs),
+        doubts=doubts,
     )

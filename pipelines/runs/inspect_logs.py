@@ -1,4 +1,4 @@
-"""``terrain inspect``: rates, lengths, gaps, stuck channels, and whether the loggers share one clock."""
+"""``terrain inspect``: rates, lengths, gaps, stuck channels, plausibility, and the clocks of the loggers."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from pipelines.runs.breaks import odd_stretches
 from pipelines.runs.datasets import data_digest, robot_of
 from pipelines.runs.results import InspectedRun, Inspection
 from pipelines.runs.settings import RunsSettings, load
+from pipelines.runs.verdicts import verdict
 from terrain.errors import ConfigError, DataError
 from terrain.logs.clock import estimate_clock
 from terrain.logs.duplicates import shared_stretches
@@ -36,4 +37,5 @@ def _inspected(run: RunLog, robot: Robot | None) -> InspectedRun:
         clock = None
     streams = {name: stream_quality(stream) for name, stream in run.streams.items()}
     odd = odd_stretches(run)
-    return InspectedRun(run.run_id, run.terrains, dict(run.dropped), streams, clock, odd)
+    checks = verdict(run, robot)
+    return InspectedRun(run.run_id, run.terrains, dict(run.dropped), streams, clock, odd, checks)

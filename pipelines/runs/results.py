@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from pipelines.runs.breaks import OddStretch
+from pipelines.runs.verdicts import Doubt
+from terrain.logs.checks import Check
 from terrain.logs.clock import ClockEstimate
 from terrain.logs.duplicates import SharedStretch
 from terrain.logs.quality import StreamQuality
@@ -26,6 +28,7 @@ class Imported:
     skipped : a sentence for each run that could not be read
     digest : of all runs
     duplicates : stretches that two of the runs share
+    doubts : checks that are doubtful or implausible
     """
 
     out: Path
@@ -36,6 +39,7 @@ class Imported:
     skipped: tuple[str, ...]
     digest: str
     duplicates: tuple[SharedStretch, ...] = ()
+    doubts: tuple[Doubt, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +47,7 @@ class InspectedRun:
     """The quality of the streams of one run.
 
     ``clock`` is None where the run has no gyro or no speeds of a left and a right wheel, or its robot is
-    unknown.  ``odd_stretches`` differ from the rest of the run.
+    unknown.  ``odd_stretches`` differ from the rest of the run.  ``plausibility`` has every check.
     """
 
     run_id: str
@@ -52,6 +56,7 @@ class InspectedRun:
     streams: Mapping[str, StreamQuality]
     clock: ClockEstimate | None
     odd_stretches: tuple[OddStretch, ...] = ()
+    plausibility: tuple[Check, ...] = ()
 
     def as_json(self) -> dict[str, Any]:
         """Return all fields, the figures of channels by quantity."""
@@ -62,6 +67,7 @@ class InspectedRun:
             "streams": {name: _stream_json(quality) for name, quality in self.streams.items()},
             "clock": self.clock,
             "odd_stretches": self.odd_stretches,
+            "plausibility": self.plausibility,
         }
 
 

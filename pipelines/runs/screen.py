@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 
 from rich.console import Console
 from rich.table import Column, Table
@@ -11,7 +12,9 @@ from pipelines.reporting.numbers import format_counts
 from pipelines.reporting.terminal import print_lines
 from pipelines.runs.duplicates import sentences
 from pipelines.runs.results import Imported, Inspection
+from pipelines.runs.verdicts import doubt_sentences, doubts_of
 from terrain.logs.clock import ClockEstimate
+from terrain.logs.plausibility import worst
 
 COLUMNS = {
     "run": "left",
@@ -30,6 +33,7 @@ def print_import(result: Imported, console: Console) -> None:
     """Print what was skipped, how many runs were written, and what was dropped."""
     print_lines(console, (f"skipped: {sentence}" for sentence in result.skipped))
     counts = f", {format_counts(result.dropped)}" if result.dropped else ""
+    print_lines(console, doubt_sentences(result.doubts))
     print_lines(console, [f"{result.n_runs} runs written to {result.out}{counts}"])
     print_lines(console, sentences(result.duplicates))
 
@@ -64,6 +68,9 @@ def print_inspection(result: Inspection, console: Console) -> None:
                 for odd in run.odd_stretches
             ),
         )
+    print_lines(console, doubt_sentences(doubts_of({run.run_id: run.plausibility for run in result.runs})))
+    levels = Counter(str(worst(run.plausibility)) for run in result.runs)
+    console.print(f"plausibility of the runs: {format_counts(levels)}")
     for sentence in result.skipped:
         console.print(sentence)
     print_lines(console, sentences(result.duplicates))

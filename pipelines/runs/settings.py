@@ -15,15 +15,22 @@ from terrain.files.names import listed, shown
 if TYPE_CHECKING:
     from terrain.records import RunLog
 
-Layout = Literal["auto", "runs", "borealtc", "csv", "drive", "robotino", "can", "bag"]
+Layout = Literal["auto", "runs", "borealtc", "csv", "drive", "drive-recording", "robotino", "can", "bag"]
 """``auto``: found out; ``runs``: run folders as this package writes them; ``csv``: any CSV, by a mapping
-file; ``drive``: the files ``samples.csv.gz`` of DRIVE, one a session; ``robotino``: three motors and a
-camera above; ``can``: logs of a CAN bus; ``bag``:
-MCAP files and ROS 2 bags."""
+file; ``drive``: the files ``samples.csv.gz`` of DRIVE, one a session; ``drive-recording``: its whole
+recordings; ``robotino``: three motors and a camera above; ``can``: logs of a CAN bus; ``bag``: MCAP files
+and ROS 2 bags."""
 
 
 ROBOT_TEXT = (
     "Robot of logs that do not name theirs (DRIVE, CAN, bags), by name or its YAML file; of DRIVE the husky."
+)
+
+
+MAPPING_TEXT = (
+    "YAML file that describes CSV files by the keys robot, run_id, terrain, streams; of a stream file, time, "
+    "channels, delimiter, decimal, skip_rows, header_rows; of time and channels column, unit; of channels "
+    "scale, offset (docs/mapping.md). With --format bag topics; with can a DBC."
 )
 
 
@@ -67,6 +74,7 @@ class InspectSettings(RunsSettings):
 class ImportSettings(InspectSettings):
     """What is imported, and where to."""
 
+    mapping: Path | None = setting(None, MAPPING_TEXT)
     out: Path = setting(..., "Folder of the new run folders.")
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import unicodedata
 from collections.abc import Sequence
 from typing import Any
 
@@ -130,3 +131,14 @@ def plain_name(name: str) -> bool:
     (True, False, False, False)
     """
     return _FOLDER_NAME.fullmatch(name) is not None and name_fault(name) is None
+
+
+def normal_name(name: str) -> str:
+    r"""Return a name in Unicode's normal form C, in which names are compared; file systems keep either form.
+
+    Examples
+    --------
+    >>> len("Ac\N{COMBINING ACUTE ACCENT}"), len(normal_name("Ac\N{COMBINING ACUTE ACCENT}"))
+    (3, 2)
+    """
+    return unicodedata.normalize("NFC", name)

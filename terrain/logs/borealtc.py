@@ -28,7 +28,7 @@ from pathlib import Path
 
 import numpy as np
 
-from terrain.files.names import shown
+from terrain.files.names import normal_name, shown
 from terrain.logs.csv_table import data_row, read_columns
 from terrain.logs.log_files import check_log_file, checked_names, short_name
 from terrain.logs.samples import checked_stream, refuse_apart
@@ -103,13 +103,14 @@ def read_run(class_folder: Path, number: str, *, repair: bool = False) -> RunLog
             columns=list(columns.values()),
             repairs=dropped if repair else None,
         )
-    run_id = f"{class_folder.name}_{number}"
+    terrain = normal_name(class_folder.name)
+    run_id = f"{terrain}_{number}"
     refuse_apart(run_id, streams)
     run = RunLog(
         run_id,
         "husky",
         streams,
-        (whole_run_label(streams, class_folder.name),),
+        (whole_run_label(streams, terrain),),
         source=f"{class_folder.name}/imu_{number}.csv and pro_{number}.csv, BorealTC layout",
         dropped=dropped,
     )

@@ -15,12 +15,12 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from itertools import islice
 from pathlib import Path
-from typing import TextIO
+from typing import Any, NamedTuple, TextIO
 
 import numpy as np
 
 from terrain.errors import LogError
-from terrain.files.names import listed, shown
+from terrain.files.names import listed, normal_name, shown
 from terrain.files.regular import MEBIBYTE, check_regular
 from terrain.logs.log_files import short_name
 from terrain.logs.samples import BAD_CELL, SHORT_ROW
@@ -35,23 +35,49 @@ MAX_UNPACKED_BYTES = 1024 * MEBIBYTE
 _UNREADABLE = (OSError, EOFError, zlib.error, UnicodeDecodeError, csv.Error)
 
 
+class TextLayout(NamedTuple):
+    """How a text file holds its table.
+
+    Parameters
+    ----------
+    delimiter : one character
+    decimal : character between the digits of a number: a point or a comma
+    skip_rows : lines above the names of the columns
+    header_rows : lines of the header from the names on: 2 where units stand below them
+    """
+
+    delimiter: str = ","
+    decimal: str = "."
+    skip_rows: int = 0
+    header_rows: int = 1
+
+    @property
+    def first_row(self) -> int:
+        """Lines above the first one of data."""
+        return self.skip_rows + self.header_rows
+
+
+PLAIN = TextLayout()
+"""Commas, points, and names in the first line."""
+
+
 def read_columns(
     path: Path,
     columns: Sequence[str],
     *,
-    delimiter: str = ",",
-    rows_before: int = 0,
+    layout: TextLayout = PLAIN,
     repair: bool = False,
     dropped: Counter[str] | None = None,
 ) -> Array:
     """Return the named columns of a CSV file as (n, len(columns)) floats, NaN where a cell is missing.
 
+    A delimiter too many at the end of each row, or of the header, is passed over.
+
     Parameters
     ----------
     path : file with a header
     columns : names in the header, in the required order
-    delimiter : one character
-    rows_before : rows above the header
+    layout : of the file
     repair : turn cells that are no number into NaN, leave out rows of the wrong length, and count both
     dropped : counts by kind, added to when repairing
 
@@ -62,18 +88,16 @@ def read_columns(
         a cell that is no number or a row of the wrong length.
     """
     _refuse_too_large(path)
-    header = header_of(path, delimiter=delimiter, rows_before=rows_before)
+    header = header_of(path, layout)
     for column in columns:
-        if header.count(column) != 1:
-            fault = "is missing" if column not in header else "is there twice"
-            raise LogError(f"{short_name(path)}: column {column!r} {fault} (the file has {listed(header)})")
-    fast = _fast_columns(path, header, columns, delimiter, rows_before)
+        _place(path, header, column)
+    fast = _fast_columns(path, header, columns, layout)
     if fast is not None:
         return fast
     counts: Counter[str] = Counter() if dropped is None else dropped
     places = [header.index(column) for column in columns]
     table = []
-    for row, cells in _rows(path, delimiter, rows_before):
+    for row, cells in _rows(path, layout):
         if len(cells) != len(header):
             if not repair:
                 raise LogError(
@@ -81,7 +105,7 @@ def read_columns(
                 )
             counts[SHORT_ROW] += 1
             continue
-        numbers = [_number(cells[place]) for place in places]
+        numbers = [_number(cells[place], layout.decimal) for place in places]
         for column, place, number in zip(columns, places, numbers, strict=True):
             if number is None:
                 if not repair:
@@ -94,12 +118,36 @@ def read_columns(
     return np.array(table, dtype=np.float64).reshape(len(table), len(columns))
 
 
-def data_row(path: Path, index: int, *, delimiter: str = ",", rows_before: int = 0) -> int:
+def read_words(path: Path, column: str) -> list[str]:
+    """Return a column of a CSV file as text, cell by cell, of the rows that have as many cells as the header.
+
+    Raises
+    ------
+    LogError
+        if the file is missing, empty, no text, or lacks the column or has it twice.
+    """
+    _refuse_too_large(path)
+    header = header_of(path, PLAIN)
+    place = _place(path, header, column)
+    fast = _fast(path, header, {place: "string"}, PLAIN)
+    if fast is not None:
+        return ["" if cell is None else cell for cell in fast.column(str(place)).to_pylist()]
+    return [cells[place] for _, cells in _rows(path, PLAIN) if len(cells) == len(header)]
+
+
+def data_row(path: Path, index: int, *, layout: TextLayout = PLAIN) -> int:
     """Return the row number, as an editor shows it, of the data row ``index`` (blank rows count)."""
-    for number, (row, _) in enumerate(_rows(path, delimiter, rows_before)):
+    for number, (row, _) in enumerate(_rows(path, layout)):
         if number == index:
             return row
     raise IndexError(index)
+
+
+def _place(path: Path, header: list[str], column: str) -> int:
+    if header.count(column) != 1:
+        fault = "is missing" if column not in header else "is there twice"
+        raise LogError(f"{short_name(path)}: column {column!r} {fault} (the file has {listed(header)})")
+    return header.index(column)
 
 
 def _refuse_too_large(path: Path) -> None:
@@ -127,68 +175,76 @@ def _open(path: Path) -> TextIO:
     return path.open(encoding="utf-8-sig", newline="")
 
 
-def header_of(path: Path, *, delimiter: str = ",", rows_before: int = 0) -> list[str]:
-    """Return the names in the header of a CSV file.
-
-    Raises
-    ------
-    LogError
-        if the file is missing, empty or no text.
-    """
+def header_of(path: Path, layout: TextLayout) -> list[str]:
+    """Return the names of the columns, with or without an empty last one as the first row of data has it."""
     try:
         with _open(path) as file:
-            first = next(islice(csv.reader(file, delimiter=delimiter), rows_before, None), [])
+            reader = csv.reader(file, delimiter=layout.delimiter)
+            rows = list(islice(reader, layout.skip_rows, layout.first_row + 1))
     except _UNREADABLE as error:
         raise _unreadable(path, error) from error
-    names = [name.strip() for name in first]
+    names = [normal_name(name.strip()) for name in (rows[0] if rows else [])]
     if not any(names):
+        if layout.skip_rows:
+            raise LogError(f"{short_name(path)}: has no names of columns in row {layout.skip_rows + 1}")
         raise LogError(f"{short_name(path)}: is empty (a header and at least 2 rows are needed)")
+    first = rows[layout.header_rows] if len(rows) > layout.header_rows else names
+    if len(first) == len(names) + 1 and not first[-1].strip():
+        names.append("")
+    if len(first) == len(names) - 1 and not names[-1]:
+        names.pop()
     return names
 
 
-def _fast_columns(
-    path: Path, header: list[str], columns: Sequence[str], delimiter: str, rows_before: int
-) -> Array | None:
+def _fast_columns(path: Path, header: list[str], columns: Sequence[str], layout: TextLayout) -> Array | None:
+    places = [header.index(column) for column in columns]
+    table = _fast(path, header, dict.fromkeys(places, "float64"), layout)
+    return None if table is None else np.column_stack([table.column(str(i)).to_numpy() for i in places])
+
+
+def _fast(path: Path, header: list[str], types: dict[int, str], layout: TextLayout) -> Any:
+    """Return the table of some columns, by their place, that pyarrow reads; None where it stumbles."""
     from pyarrow import ArrowException
     from pyarrow import csv as arrow_csv
 
-    places = [str(header.index(column)) for column in columns]
     try:
-        table = arrow_csv.read_csv(
+        return arrow_csv.read_csv(
             path,
             read_options=arrow_csv.ReadOptions(
-                column_names=[str(place) for place in range(len(header))], skip_rows=rows_before + 1
+                column_names=[str(place) for place in range(len(header))], skip_rows=layout.first_row
             ),
-            parse_options=arrow_csv.ParseOptions(delimiter=delimiter),
+            parse_options=arrow_csv.ParseOptions(delimiter=layout.delimiter),
             convert_options=arrow_csv.ConvertOptions(
-                include_columns=places,
-                column_types=dict.fromkeys(places, "float64"),
+                include_columns=[str(place) for place in types],
+                column_types={str(place): kind for place, kind in types.items()},
                 null_values=list(MISSING),
                 quoted_strings_can_be_null=True,
+                decimal_point=layout.decimal,
             ),
         )
     except (ArrowException, OSError):
         return None
-    return np.column_stack([table.column(place).to_numpy() for place in places])
 
 
-def _rows(path: Path, delimiter: str, rows_before: int) -> Iterator[tuple[int, list[str]]]:
+def _rows(path: Path, layout: TextLayout) -> Iterator[tuple[int, list[str]]]:
     try:
         with _open(path) as file:
-            reader = csv.reader(file, delimiter=delimiter)
-            for _ in range(rows_before + 1):
-                next(reader, None)
-            for cells in reader:
+            reader = csv.reader(file, delimiter=layout.delimiter)
+            for cells in islice(reader, layout.first_row, None):
                 if cells:
                     yield reader.line_num, cells
     except _UNREADABLE as error:
         raise _unreadable(path, error) from error
 
 
-def _number(cell: str) -> float | None:
+def _number(cell: str, decimal: str) -> float | None:
     text = cell.strip()
     if text in MISSING:
         return float("nan")
+    if decimal != ".":
+        if "." in text:
+            return None
+        text = text.replace(decimal, ".")
     try:
         return None if "_" in text else float(text)
     except ValueError:

@@ -32,9 +32,10 @@ Husky's log, then of six sessions of a Warthog and one of a Marmotte:
 - *Runs* begin where ``steady`` falls to 0.  ``step`` of such a window may still be the one before (62 of
   201), so that the windows after it number the run.
 - ``imu_yaw`` is the rate of ``icp_yaw`` (of the Husky slope 1.00, offset 2 mrad/s); on a few sessions its
-  sign is turned.  Signs and axes are documented nowhere and are read as those of the Husky, whose
-  accelerometer is turned by half a turn about z: speeding up and turning left both read negative, and the
-  tilt of the lidar pose agrees.  On other robots they may differ.
+  sign is turned.  The Husky's accelerometer is turned by half a turn about z: speeding up and turning left
+  both read negative, and the tilt of the lidar pose agrees.  The Warthog's is not, the Marmotte's lies upside
+  down: what differs from the Husky's is found for each session by :mod:`terrain.logs.imu_axes`, turned and
+  counted.
 - ``icp_yaw`` is a difference of two wrapped angles, and the position of a window is turned by the mean of
   the first five of them, not by the first: ``icp_x`` points along the mean heading of the first 0.25 s.
   Where the heading wraps within these (11 windows) that mean is no direction that the robot ever had.
@@ -42,8 +43,8 @@ Husky's log, then of six sessions of a Warthog and one of a Marmotte:
   wheel speeds lag the gyro by 0.26 s while speeds change.  The Warthog's lidar lags by 0.4 to 0.7 s, its
   wheels by 0.05 s.  Times are as logged; nothing is shifted, but poses that took longer than usual.
 - *Held*: values are held from one message to the next.  A wheel speed that is usually held for over
-  :data:`MAX_HELD_S` is read as a measurement at the sample where it is new, and as a straight line to the
-  next one: held, the Warthog's wheels (4 Hz) would lag by 0.1 s more, in steps.
+  :data:`~terrain.logs.held.MAX_HELD_S` is read as a measurement at the sample where it is new, and as a
+  straight line to the next one: held, the Warthog's wheels (4 Hz) would lag by 0.1 s more, in steps.
 - ``cmd_*`` are no wheel speeds: below its limits the Husky drives 1.8 times as fast forward and turns its
   wheels 0.8 times as fast against each other.  Commands go up to 14.7 rad/s, steady wheels to 6.1 rad/s.
 - ``steady``, ``icp_z``, ``icp_roll`` and ``icp_pitch`` are left out: the first says which window of a
@@ -64,7 +65,10 @@ from typing import NamedTuple
 import numpy as np
 
 from terrain.errors import LogError
+from terrain.files.names import normal_name
 from terrain.logs.csv_table import data_row, read_columns
+from terrain.logs.held import undo_hold, usual_hold
+from terrain.logs.imu_axes import ImuAxes, find_axes
 from terrain.logs.lidar_twist import CHANNELS as TWIST_CHANNELS
 from terrain.logs.lidar_twist import N_FRAME, body_twists
 from terrain.logs.log_files import check_log_file, checked_names, short_name
@@ -90,10 +94,6 @@ STREAMS: dict[str, dict[str, tuple[str, float]]] = {
     },
 }
 """Column and factor of each channel that is read as it stands; those of the wheels are times the radius."""
-
-MAX_HELD_S = 0.1
-"""A wheel speed that is usually held for longer is read as straight lines.  Held for 0.1 s it lags by 0.025 s
-on samples at 20 Hz, half a sample; held for 0.25 s by 0.1 s."""
 
 MAX_OVERSPEED = 1.5
 """Wheels that turn so many times as fast as the robot's own ever do are those of another robot; downhill, or
@@ -133,6 +133,7 @@ class _Windows:
     time_s: Array  # (k,) within a window
     values: dict[str, Array]  # by stream (n, k, channels)
     held: tuple[int, ...]  # usual samples from one new value of a wheel to the next; 1 where not to be undone
+    repairs: dict[str, int]  # of signs, as counts by kind
 
 
 def find_sessions(folder: Path) -> list[Path]:
@@ -179,8 +180,9 @@ def find_runs(folder: Path, robot: DriveRobot) -> list[Callable[..., RunLog]]:
         if not (path / FILE_NAME).is_file():
             readers.append(partial(_refuse, path))
             continue
-        numbered = _SESSION_NAME.fullmatch(path.resolve().name)
-        session = path.resolve().name if numbered or path != folder else ""
+        name = normal_name(path.resolve().name)
+        numbered = _SESSION_NAME.fullmatch(name)
+        session = name if numbered or path != folder else ""
         windows = _read_windows(
             check_log_file(path / FILE_NAME, path), robot, session, numbered[1] if numbered else ""
         )
@@ -198,37 +200,6 @@ def _refuse(folder: Path, *, repair: bool = False) -> RunLog:
     raise LogError(f"{folder}: has no {FILE_NAME}, which the other sessions beside it have")
 
 
-def between_updates(values: Array, time_s: Array, held: int) -> Array:
-    """Return a held signal as straight lines between the samples where it is new.
-
-    A value that stays for longer than usual was measured again and found the same: it is held until the usual
-    time before the next one.
-
-    Parameters
-    ----------
-    values : (n,) as held
-    time_s : (n,)
-    held : usual number of samples from one new value to the next
-
-    Examples
-    --------
-    >>> between_updates(np.array([0.0, 0.0, 0.0, 0.0, 4.0, 4.0, 8.0]), np.arange(7.0), 2).tolist()
-    [0.0, 0.0, 0.0, 2.0, 4.0, 6.0, 8.0]
-    """
-    new = np.flatnonzero(np.diff(values, prepend=np.nan) != 0.0)
-    stayed = new[1:][np.diff(new) > held] - held
-    known = np.sort(np.concatenate([new, stayed]))
-    return np.asarray(np.interp(time_s, time_s[known], values[known]))
-
-
-def _usual_hold(values: Array, period_s: float) -> int:
-    """Return the median samples from one new value (n, k) to the next; 1 where that is short or unknown."""
-    window, sample = np.nonzero(np.diff(values, axis=1) != 0.0)
-    waits = np.diff(sample)[np.diff(window) == 0]
-    usual = int(np.median(waits)) if waits.size else 1
-    return usual if usual * period_s > MAX_HELD_S * (1.0 + 1e-6) else 1
-
-
 def _run(windows: _Windows, start: int, end: int, *, repair: bool = False) -> RunLog:
     """Return the run of the windows ``start`` to ``end``, the last not included."""
     if end - start < 2:
@@ -243,18 +214,13 @@ def _run(windows: _Windows, start: int, end: int, *, repair: bool = False) -> Ru
         )
     kept, time_s = _on_one_clock(windows, start, end)
     run_id = "_".join([*filter(None, [windows.session]), f"step_{steps[0]:03d}"])
-    dropped: Counter[str] = Counter()
+    dropped: Counter[str] = Counter(windows.repairs)
     streams = {}
     for name, logged in windows.values.items():
         is_lidar = name == "lidar"
         values = logged[start:end][kept]
         if name == "wheels":
-            values = np.column_stack(
-                [
-                    between_updates(v, time_s, n) if n > 1 else v
-                    for v, n in zip(values.T, windows.held, strict=True)
-                ]
-            )
+            values = undo_hold(values, time_s, windows.held)
         columns = () if is_lidar else [column for column, _ in STREAMS[name].values()]
         streams[name] = checked_stream(
             f"{windows.name}, {run_id}",
@@ -311,16 +277,40 @@ def _read_windows(path: Path, robot: DriveRobot, session: str, terrain: str) -> 
         name: np.stack([columns[column] * factor for column, factor in pairs], axis=-1)
         for name, pairs in sources.items()
     }
-    held = tuple(_usual_hold(wheel, period_s) for wheel in np.moveaxis(values["wheels"], -1, 0))
-    _refuse_other_robot(short_name(path), values["wheels"], robot)
+    held = tuple(usual_hold(wheel, period_s) for wheel in np.moveaxis(values["wheels"], -1, 0))
+    refuse_other_robot(short_name(path), values["wheels"], robot)
     values["wheels"] *= robot.wheel_radius_m
+    axes = _imu_axes(values["wheels"], values["imu"], period_s)
+    values["imu"] *= (axes.gyro_z, *axes.accel)
     values["lidar"] = body_twists(np.stack([columns[name] for name in _POSE], axis=-1), period_s)
     step, steady = (keys[:, 0, i].astype(np.int64) for i in (0, 2))
     time_s = np.arange(k) * period_s
-    return _Windows(short_name(path), robot.name, session, terrain, step, steady, time_s, values, held)
+    name, repairs = short_name(path), axes.repairs()
+    return _Windows(name, robot.name, session, terrain, step, steady, time_s, values, held, repairs)
 
 
-def _refuse_other_robot(name: str, wheel_radps: Array, robot: DriveRobot) -> None:
+def _imu_axes(wheels_mps: Array, imu: Array, period_s: float) -> ImuAxes:
+    """Return what brings the imu of a session, read as the Husky's, into the robot's axes."""
+    return find_axes(
+        [(each[:, 0], each[:, 1], own[:, 0], own[:, 1:]) for each, own in zip(wheels_mps, imu, strict=True)],
+        period_s,
+    )
+
+
+def refuse_other_robot(name: str, wheel_radps: Array, robot: DriveRobot) -> None:
+    """Refuse wheels that turn much faster than those of a robot ever do.
+
+    Parameters
+    ----------
+    name : of the file, for the message
+    wheel_radps : (..., 2)
+    robot : that is taken for the one that drove
+
+    Raises
+    ------
+    LogError
+        if they do.
+    """
     fastest = float(np.nanmax(np.abs(wheel_radps), initial=0.0))
     if fastest > MAX_OVERSPEED * robot.wheel_rate_max_radps:
         raise LogError(

@@ -13,7 +13,10 @@
           gyro_z_radps: {column: yaw rate, unit: deg/s, scale: -1}
       wheels:
         file: "{terrain}/wheels {run}.csv"
-        delimiter: ";"
+        delimiter: ";"                 # or a tab, or another single character
+        decimal: ","                   # numbers as 0,25
+        skip_rows: 2                   # lines above the names of the columns
+        header_rows: 2                 # lines of the header from the names on, as with units below them
         time: {column: t, unit: s}
         channels:
           speed_left_mps: {column: vl, unit: km/h}
@@ -23,7 +26,8 @@ A word in braces stands for any text without a slash, and the files of which all
 run; every stream has the same words.  Several streams may name one file.  The files lie under the data
 folder, and so does what links in it lead to.  The robot is a name, of the package or of the description that
 the user gives.  A cell becomes ``(scale * cell + offset)`` in the unit given, and then SI; the unit must suit
-the name of the channel.
+the name of the channel (:data:`~terrain.logs.schema.UNIT_SCALES`).  Names are compared in Unicode's normal
+form C, whichever form the file system keeps.
 """
 
 from __future__ import annotations
@@ -34,25 +38,30 @@ from collections import Counter
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, ValidationError
 
 from terrain.errors import ConfigError, LogError
 from terrain.files.documents import read_yaml
-from terrain.files.names import check_name, has_control_characters, shown
+from terrain.files.names import check_name, has_control_characters, normal_name, shown
 from terrain.logs.borealtc import whole_run_label
-from terrain.logs.csv_table import data_row, read_columns
+from terrain.logs.csv_table import TextLayout, data_row, read_columns
 from terrain.logs.log_files import check_log_file, checked_names, short_name
 from terrain.logs.samples import checked_stream, refuse_apart
-from terrain.logs.schema import UNIT_SCALES, unit_of
+from terrain.logs.schema import UNIT_OFFSETS, UNIT_SCALES, canonical_unit, unit_of
 from terrain.records import RunLog, Stream
+
+MAX_HEADER_ROWS = 1000
+"""No instrument writes a longer head."""
 
 _FIELD = re.compile(r"\{([^\W\d]\w*)\}")
 _SPLIT_AT_FIELDS = re.compile(r"(\{[^\W\d]\w*\})")
 
-Unit = Annotated[str, BeforeValidator(lambda unit: unit if isinstance(unit, str) else repr(unit))]
+Unit = Annotated[
+    str, BeforeValidator(lambda unit: canonical_unit(unit) if isinstance(unit, str) else repr(unit))
+]
 Word = Annotated[str, Field(min_length=1)]
 
 
@@ -85,6 +94,14 @@ class StreamMapping(Strict):
     time: TimeColumn
     channels: Annotated[dict[str, Column], Field(min_length=1)]
     delimiter: Annotated[str, Field(min_length=1, max_length=1)] = ","
+    decimal: Literal[".", ","] = "."
+    skip_rows: Annotated[int, Field(ge=0, le=MAX_HEADER_ROWS)] = 0
+    header_rows: Annotated[int, Field(ge=1, le=MAX_HEADER_ROWS)] = 1
+
+    @property
+    def layout(self) -> TextLayout:
+        """How its files hold their table."""
+        return TextLayout(self.delimiter, self.decimal, self.skip_rows, self.header_rows)
 
 
 class Mapping(Strict):
@@ -94,6 +111,19 @@ class Mapping(Strict):
     streams: Annotated[dict[Word, StreamMapping], Field(min_length=1)]
     run_id: Word = ""
     terrain: str = ""
+
+
+class Found(NamedTuple):
+    """Files of one run.
+
+    Parameters
+    ----------
+    words : text for each word in braces
+    places : file of each stream, under the data folder, as it is spelt on disk
+    """
+
+    words: dict[str, str]
+    places: dict[str, str]
 
 
 def load_mapping(path: str | Path) -> Mapping:
@@ -112,6 +142,12 @@ def load_mapping(path: str | Path) -> Mapping:
     except ValidationError as error:
         raise ConfigError(f"{path.name}: {first_fault(error)}") from error
     check_name(f"{path.name}: robot", mapping.robot, ConfigError)
+    for name, stream in mapping.streams.items():
+        if stream.decimal == stream.delimiter:
+            raise ConfigError(
+                f"{path.name}: stream {name}: delimiter and decimal are both {stream.decimal!r}; numbers "
+                "with a comma need another delimiter, such as ';'"
+            )
     _check_units(path.name, mapping)
     _check_fields(path.name, mapping)
     return mapping
@@ -125,30 +161,36 @@ def find_runs(folder: Path, mapping: Mapping) -> list[Callable[..., RunLog]]:
     LogError
         if no file fits.
     """
-    found: dict[str, dict[str, str]] = {}
-    for stream in mapping.streams.values():
-        pattern = _pattern(stream.file)
-        pattern_text = "".join(
-            "*" if part.startswith("{") else glob.escape(part) for part in _SPLIT_AT_FIELDS.split(stream.file)
-        )
-        for path in folder.glob(pattern_text):
-            match = pattern.fullmatch(path.relative_to(folder).as_posix())
-            if match:
-                found[repr(sorted(match.groupdict().items()))] = match.groupdict()
+    found: dict[str, Found] = {}
+    for name, stream in mapping.streams.items():
+        pattern = _pattern(normal_name(stream.file))
+        for path in folder.glob(_glob_of(stream.file)):
+            place = path.relative_to(folder).as_posix()
+            if match := pattern.fullmatch(normal_name(place)):
+                words = match.groupdict()
+                found.setdefault(repr(sorted(words.items())), Found(words, {})).places[name] = place
     if not found:
         patterns = ", ".join(stream.file for stream in mapping.streams.values())
         raise LogError(f"{folder}: no file there fits the mapping ({patterns})")
-    return [partial(read_run, folder, mapping, words) for _, words in sorted(found.items())]
+    return [partial(read_run, folder, mapping, run) for _, run in sorted(found.items())]
 
 
-def read_run(folder: Path, mapping: Mapping, words: dict[str, str], *, repair: bool = False) -> RunLog:
-    """Return the run whose files have ``words`` in the place of the words in braces.
+def _glob_of(file: str) -> str:
+    """Return a pattern of :mod:`glob` that finds a file pattern in any of Unicode's forms."""
+    return "".join(
+        "*" if part.startswith("{") else re.sub(r"[^\x00-\x7f]+", "*", glob.escape(normal_name(part)))
+        for part in _SPLIT_AT_FIELDS.split(file)
+    )
+
+
+def read_run(folder: Path, mapping: Mapping, found: Found, *, repair: bool = False) -> RunLog:
+    """Return the run whose files were found.
 
     Parameters
     ----------
     folder : folder that the file patterns start from
     mapping : as :func:`load_mapping` returns it
-    words : text for each word in braces
+    found : its words and files; a stream whose file was not found is missing there
     repair : drop and count what a strict read refuses
 
     Raises
@@ -156,30 +198,33 @@ def read_run(folder: Path, mapping: Mapping, words: dict[str, str], *, repair: b
     LogError
         if a file is missing, empty or broken, or the streams do not overlap in time.
     """
+    words = found.words
     dropped: Counter[str] = Counter()
     streams: dict[str, Stream] = {}
     files = []
     for name, stream in mapping.streams.items():
-        path = check_log_file(folder / stream.file.format(**words), folder)
+        path = check_log_file(folder / found.places.get(name, stream.file.format(**words)), folder)
         files.append(path.relative_to(folder).as_posix())
         columns = list(stream.channels.values())
         table = read_columns(
             path,
-            [stream.time.column, *(column.column for column in columns)],
-            delimiter=stream.delimiter,
+            [normal_name(name) for name in (stream.time.column, *(column.column for column in columns))],
+            layout=stream.layout,
             repair=repair,
             dropped=dropped,
         )
-        scale, offset, factor = np.array([(c.scale, c.offset, UNIT_SCALES[c.unit][1]) for c in columns]).T
+        scale, offset, factor, zero = np.array(
+            [(c.scale, c.offset, UNIT_SCALES[c.unit][1], UNIT_OFFSETS.get(c.unit, 0.0)) for c in columns]
+        ).T
         with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is judged below
             time_s = table[:, 0] * UNIT_SCALES[stream.time.unit][1]
-            values = (table[:, 1:] * scale + offset) * factor
+            values = (table[:, 1:] * scale + offset) * factor + zero
         streams[name] = checked_stream(
             short_name(path),
             time_s,
             values,
             list(stream.channels),
-            row_of=partial(data_row, path, delimiter=stream.delimiter),
+            row_of=partial(data_row, path, layout=stream.layout),
             columns=[column.column for column in columns],
             repairs=dropped if repair else None,
         )
@@ -235,6 +280,7 @@ def check_unit(place: str, unit: str, desired: str) -> None:
     Traceback (most recent call last):
     terrain.errors.ConfigError: gyro_z_radps: unit 'm' does not suit it (accepted here: rad/s, deg/s, rpm)
     """
+    unit = canonical_unit(unit)
     suitable = ", ".join(name for name, (word, _) in UNIT_SCALES.items() if word == desired)
     if unit not in UNIT_SCALES:
         raise ConfigError(f"{place}: unit {unit!r} is unknown (accepted here: {suitable})")

@@ -13,6 +13,9 @@ MAX_MAGNITUDE = 1e12
 """No quantity of a vehicle is larger in its SI unit (a position on Earth in m has 8 digits, a time since 1970
 in s has 10); the fourth power of what is much larger, which features need, is no finite number."""
 
+BEYOND = f"beyond {MAX_MAGNITUDE:g} in its SI unit no quantity is plausible: --repair leaves such values out"
+"""What a message states of a value that is larger, wherever it is found."""
+
 
 def usable_rows(samples: Array, *, unknown_is_a_value: bool = False) -> Array:
     """Return which rows (n,) of samples (n, c) hold plausible values only.
@@ -49,6 +52,5 @@ def refuse_implausible(run: RunLog, channels: Mapping[str, Sequence[str]]) -> No
             if len(beyond):
                 raise DataError(
                     f"run {run.run_id}, stream {name!r}: channel {channel!r} is {values[beyond[0]]:.6g} at "
-                    f"{stream.time_s[beyond[0]]:.2f} s; beyond {MAX_MAGNITUDE:g} in its SI unit no quantity "
-                    "is plausible: --repair leaves such values out"
+                    f"{stream.time_s[beyond[0]]:.2f} s; {BEYOND}"
                 )

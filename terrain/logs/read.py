@@ -26,8 +26,7 @@ Times are seconds on the clock of the run and strictly increase.  A label holds 
 before ``end_s``; labels do not overlap.  Each channel is named with its SI unit word, which is written
 beside it too.  ``dropped`` (may be left out) counts what a repairing reader took away before; ``session``
 (may be left out) names the outing that the run is part of, ``filter`` the one that made the streams
-``estimator``, ``slip`` and ``state``, ``converted`` (may be left out) counts what a reader changed of a sound
-log: held values, signs, scales.
+``estimator``, ``slip`` and ``state``.
 
 Run id, robot, session, terrains, streams, channels and files are plain names, in letters of any language: no
 path separator, no control character, no dot in front, 128 characters at most.  A robot is one of the package,
@@ -137,7 +136,6 @@ def read_run(folder: str | Path, *, repair: bool = False) -> RunLog:
             dropped=dropped,
             session=_entry(place, {"session": ""} | head, "session", str),
             filter=_entry(place, {"filter": ""} | head, "filter", str),
-            converted=_counts(place, head.get("converted", {}), "converted"),
         ),
     )
 
@@ -228,7 +226,7 @@ def _time(place: str, entry: dict[str, Any], key: str) -> float:
     return float(value)
 
 
-def _counts(place: str, counts: Any, key: str = "dropped") -> Mapping[str, int]:
+def _counts(place: str, counts: Any) -> Mapping[str, int]:
     if not isinstance(counts, dict) or not all(type(n) is int and n >= 0 for n in counts.values()):
-        raise LogError(f"{place}: {key!r} is {shown(counts)}, counts by kind are required")
+        raise LogError(f"{place}: 'dropped' is {shown(counts)}, counts by kind are required")
     return counts

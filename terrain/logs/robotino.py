@@ -41,18 +41,17 @@ What is assumed here was compared with the other columns:
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from terrain.errors import LogError
 from terrain.files.documents import read_json
-from terrain.files.names import shown
-from terrain.logs.csv_table import data_row, header_of, read_columns
+from terrain.files.names import normal_name, shown
+from terrain.logs.csv_table import TextLayout, data_row, header_of, read_columns
 from terrain.logs.log_files import check_log_file, checked_names, short_name
 from terrain.logs.samples import checked_stream
 from terrain.records import Array, Label, RunLog, Stream
@@ -64,9 +63,8 @@ CAMERA_FILE = "camera_params.json"
 SCALED = "motor rates scaled to their encoders"
 NO_SIGN = "currents without a sign"
 HELD = "poses held from the row before"
-TURNED = "poses turned from the image into a right-handed frame"
 BLIND = "runs in which the camera sees no motion"
-"""Kinds of what is converted and, the last, dropped."""
+"""Kinds of what is changed, left out and, the last, dropped by a repairing read."""
 
 USUAL_SCALE = 1.0 / 1.0133
 """Of a reported rate that has no counts beside it: the mean over the motors of all runs."""
@@ -90,7 +88,7 @@ MIN_POSES = 10
 MAX_COMMAND_ERROR_RADPS = 2.0
 """Of a commanded motor speed against the commanded twist: 5 % of the slowest drive."""
 
-_FORM: Mapping[str, Any] = MappingProxyType({"delimiter": ";", "rows_before": 2})
+_FORM = TextLayout(delimiter=";", skip_rows=2)
 _MOTORS = (1, 2, 3)
 _RATES, _COUNTS, _CURRENTS = ([f"m{i}{name}" for i in _MOTORS] for name in ("vel", "pos", "cur"))
 _SET_RATES = [f"m{i}setvel" for i in _MOTORS]
@@ -157,7 +155,7 @@ def read_run(path: Path, root: Path, *, repair: bool = False) -> RunLog:
     path = check_log_file(path, root)
     parts = path.relative_to(root).parts
     log = _Log(path, Counter() if repair else None, Counter())
-    with_camera = parts[0] != _MOTORS_ONLY or _POSE[0] in header_of(path, **_FORM)
+    with_camera = parts[0] != _MOTORS_ONLY or _POSE[0] in header_of(path, _FORM)
     table = _read(log, with_camera)
     streams = {"wheels": _wheels(log, table)}
     if with_camera:
@@ -175,9 +173,8 @@ def read_run(path: Path, root: Path, *, repair: bool = False) -> RunLog:
             streams,
             (Label(float(wheels[0]), until_s, terrain),) if terrain else (),
             source=f"{'/'.join(parts)}, Robotino layout",
-            dropped=log.repairs or {},
+            dropped=log.converted + (log.repairs or Counter()),
             session=session,
-            converted=log.converted,
         ),
     )
 
@@ -205,7 +202,7 @@ def read_camera(root: Path) -> Camera:
 
 
 class _Log(NamedTuple):
-    """A file, what a repairing read drops of it (None refuses), and what is converted."""
+    """A file, what a repairing read drops of it (None refuses), and what is changed in any read."""
 
     path: Path
     repairs: Counter[str] | None
@@ -217,7 +214,7 @@ class _Log(NamedTuple):
 
     def stream(self, time_s: Array, values: Array, channels: list[str], columns: list[str]) -> Stream:
         """Return a stream of some of the file's rows, as they stand in it."""
-        row_of = partial(data_row, self.path, **_FORM)
+        row_of = partial(data_row, self.path, layout=_FORM)
         return checked_stream(
             self.name, time_s, values, channels, row_of=row_of, columns=columns, repairs=self.repairs
         )
@@ -226,7 +223,7 @@ class _Log(NamedTuple):
 def _read(log: _Log, with_camera: bool) -> dict[str, Array]:
     """Return the columns of a file by name; rows without a time stay in."""
     names = ["t", *_SET_RATES, *_COUNTS, *_RATES, *_CURRENTS, *((*_TWIST, *_POSE) if with_camera else ())]
-    table = read_columns(log.path, names, **_FORM, repair=log.repairs is not None, dropped=log.repairs)
+    table = read_columns(log.path, names, layout=_FORM, repair=log.repairs is not None, dropped=log.repairs)
     columns = dict(zip(names, table.T, strict=True))
     columns["t"] = columns["t"] * 1e-3
     return columns
@@ -265,7 +262,7 @@ def _commands(log: _Log, table: dict[str, Array]) -> Stream:
     if (apart > MAX_COMMAND_ERROR_RADPS).any():
         row = int(np.argmax(apart > MAX_COMMAND_ERROR_RADPS))
         raise LogError(
-            f"{log.name}: at row {data_row(log.path, row, **_FORM)} the commanded motor speeds are "
+            f"{log.name}: at row {data_row(log.path, row, layout=_FORM)} the commanded motor speeds are "
             f"{apart[row]:.3g} rad/s away from those of the commanded twist; at most "
             f"{MAX_COMMAND_ERROR_RADPS:g} rad/s are accepted (are they of another robot or session?)"
         )
@@ -300,7 +297,6 @@ def _pose(log: _Log, table: dict[str, Array], camera: Camera) -> Stream | None:
         log.repairs[BLIND] += 1
         return None
     log.converted[HELD] += int((~new).sum())
-    log.converted[TURNED] += int(new.sum())
     yaw = np.unwrap(np.radians(seen[new, 2])) + np.pi / 2
     pose = np.column_stack([seen[new, 0] * camera.x_m, -seen[new, 1] * camera.y_m, yaw])
     return log.stream(table["t"][new], pose, ["position_x_m", "position_y_m", "yaw_rad"], _POSE)
@@ -308,6 +304,7 @@ def _pose(log: _Log, table: dict[str, Array], camera: Camera) -> Stream | None:
 
 def _names(parts: tuple[str, ...]) -> tuple[str, str, str]:
     """Return id, terrain and session of a run by the folders of its file."""
+    parts = tuple(normal_name(part) for part in parts)
     stem = parts[-1].removesuffix(".csv.gz")
     number = stem.removeprefix("exp")
     if len(parts) == 3 and parts[0] == "one_surface":

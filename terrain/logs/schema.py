@@ -36,12 +36,20 @@ UNIT_SCALES: dict[str, tuple[str, float]] = {
     "us": ("s", 1e-6),
     "ns": ("s", 1e-9),
     "m": ("m", 1.0),
+    "cm": ("m", 1e-2),
     "mm": ("m", 1e-3),
+    "km": ("m", 1e3),
     "m/s": ("mps", 1.0),
+    "cm/s": ("mps", 1e-2),
+    "mm/s": ("mps", 1e-3),
     "km/h": ("mps", 1.0 / 3.6),
+    "mph": ("mps", 0.44704),
     "m/s^2": ("mps2", 1.0),
+    "mm/s^2": ("mps2", 1e-3),
     "g": ("mps2", GRAVITY_MPS2),
+    "mg": ("mps2", 1e-3 * GRAVITY_MPS2),
     "rad": ("rad", 1.0),
+    "mrad": ("rad", 1e-3),
     "deg": ("rad", 0.017453292519943295),
     "rad/s": ("radps", 1.0),
     "deg/s": ("radps", 0.017453292519943295),
@@ -49,15 +57,75 @@ UNIT_SCALES: dict[str, tuple[str, float]] = {
     "A": ("a", 1.0),
     "mA": ("a", 1e-3),
     "V": ("v", 1.0),
+    "mV": ("v", 1e-3),
+    "kV": ("v", 1e3),
     "Nm": ("nm", 1.0),
+    "mNm": ("nm", 1e-3),
+    "kNm": ("nm", 1e3),
     "N": ("n", 1.0),
+    "kN": ("n", 1e3),
     "1": ("ratio", 1.0),
     "%": ("ratio", 1e-2),
     "K": ("k", 1.0),
+    "degC": ("k", 1.0),
+    "degF": ("k", 5.0 / 9.0),
+    "kg": ("kg", 1.0),
+    "t": ("kg", 1e3),
 }
 """Unit accepted in a mapping file: the SI unit word it becomes, and the factor.
 
-``g`` is standard gravity."""
+``g`` is standard gravity, ``t`` a tonne."""
+
+UNIT_OFFSETS: dict[str, float] = {"degC": 273.15, "degF": 273.15 - 32.0 * 5.0 / 9.0}
+"""What is added after the factor, where the zero of a unit is not that of the SI unit."""
+
+UNIT_ALIASES: dict[str, str] = {
+    "sec": "s",
+    "seconds": "s",
+    "msec": "ms",
+    "\u00b5s": "us",
+    "\u03bcs": "us",
+    "m/s2": "m/s^2",
+    "m/s\u00b2": "m/s^2",
+    "m s^-2": "m/s^2",
+    "mm/s2": "mm/s^2",
+    "mm/s\u00b2": "mm/s^2",
+    "kmh": "km/h",
+    "kph": "km/h",
+    "km/hr": "km/h",
+    "m s^-1": "m/s",
+    "m/sec": "m/s",
+    "\u00b0": "deg",
+    "degree": "deg",
+    "degrees": "deg",
+    "\u00b0/s": "deg/s",
+    "deg/sec": "deg/s",
+    "rad/sec": "rad/s",
+    "1/min": "rpm",
+    "r/min": "rpm",
+    "U/min": "rpm",
+    "RPM": "rpm",
+    "N m": "Nm",
+    "N*m": "Nm",
+    "N\u00b7m": "Nm",
+    "\u00b0C": "degC",
+    "\u00b0F": "degF",
+    "percent": "%",
+}
+"""Other spellings of units, as labs and instruments write them."""
+
+
+def canonical_unit(unit: str) -> str:
+    """Return a unit as :data:`UNIT_SCALES` spells it; one that is unknown as it is.
+
+    Examples
+    --------
+    >>> canonical_unit("m/s\u00b2"), canonical_unit(" kmh "), canonical_unit("furlong")
+    ('m/s^2', 'km/h', 'furlong')
+    """
+    text = unit.strip()
+    return UNIT_ALIASES.get(text, text if text in UNIT_SCALES else unit)
+
 
 WHEELS_CHANNELS: tuple[str, ...] = (
     *(f"motor_{i}_radps" for i in (1, 2, 3)),

@@ -80,7 +80,6 @@ def write_run(
             for name, stream in run.streams.items()
         },
         "dropped": dict(sorted(run.dropped.items())),
-        **({"converted": dict(sorted(run.converted.items()))} if run.converted else {}),
     }
     with atomic_folder(target) as unfinished:
         for name, stream in run.streams.items():

@@ -140,3 +140,12 @@ KIND_OF_SECTION: Mapping[str, type[Part]] = {
     "sensors": Sensors,
 }
 """What each section of a description is read into, by its key in the file."""
+
+IDENTIFIED: Mapping[str, float | None] = {
+    "rolling_radius_m": None,
+    "effective_track_m": None,
+    "lidar_delay_s": -math.inf,
+    "wheels_delay_s": -math.inf,
+}
+"""Numbers of the section ``identified``, which logs of one robot showed and no nominal figure is: the least
+value of each, None for above zero (:mod:`terrain.calibration.skid_steer`)."""

@@ -10,7 +10,9 @@ where it was calibrated, its 95 % interval::
       gyro_bias_z_radps: {value: 0.0021, unit: radps, source: "terrain calibrate", interval: [0.0019, 0.0023]}
 
 Geometry and mass are required of every robot; the sections ``body``, ``motors``, ``steering``, ``camera`` and
-``sensors`` by what simulates a robot or filters its log.  The section ``effects`` of an extended robot
+``sensors`` by what simulates a robot or filters its log.  The section ``identified`` keeps what logs of one
+robot showed beside its nominal figures: its effective track, the radius that its wheels roll on, delays.  The
+section ``effects`` of an extended robot
 (:mod:`terrain.effects`) says what else acts; :mod:`terrain.extension` makes use of it.
 """
 
@@ -29,7 +31,7 @@ from terrain.files.documents import read_yaml
 from terrain.files.names import check_name, shown
 from terrain.files.resources import data_folder
 from terrain.robots.omni import OmniRobot
-from terrain.robots.parts import KIND_OF_SECTION
+from terrain.robots.parts import IDENTIFIED, KIND_OF_SECTION
 from terrain.robots.region import read_region
 from terrain.robots.robot import Robot
 from terrain.robots.skid_steer import SkidSteerRobot
@@ -147,7 +149,8 @@ def robot_from(file: str, described: Any) -> Robot:
     """
     drive = described.get("drive") if isinstance(described, dict) else None
     kind = KIND_OF_DRIVE.get(drive, SkidSteerRobot) if isinstance(drive, str) else SkidSteerRobot
-    check_keys(file, described, ["name", "drive", *kind.numbers], optional=(*KIND_OF_SECTION, "effects"))
+    optional = (*KIND_OF_SECTION, "identified", "effects")
+    check_keys(file, described, ["name", "drive", *kind.numbers], optional=optional)
     name = described["name"]
     if not isinstance(name, str) or not name:
         raise ConfigError(f"{file}: name is {shown(name)}, a word is required")
@@ -161,7 +164,8 @@ def robot_from(file: str, described: Any) -> Robot:
         if described.get(section) is not None
     }
     assumed = frozenset(_assumed(described, kind.numbers))
-    robot = kind.described(name, numbers, parts=parts, assumed=assumed)
+    identified = _identified(f"{file}: identified", described.get("identified", {}))
+    robot = kind.described(name, numbers, parts=parts, assumed=assumed, identified=identified)
     if "effects" in described:
         effects, cov = read_effects(f"{file}: effects", described["effects"], drive)
         stated = described["effects"].get("region")
@@ -179,6 +183,13 @@ def _assumed(described: dict[str, Any], numbers: tuple[str, ...]) -> Iterator[st
         for key, entry in entries.items():
             if entry["source"].strip().lower().startswith("assumed"):
                 yield f"{prefix}{key}"
+
+
+def _identified(place: str, described: Any) -> dict[str, float]:
+    check_keys(place, described, [], optional=tuple(IDENTIFIED))
+    return {
+        key: number(f"{place}: {key}", entry, _unit(key), IDENTIFIED[key]) for key, entry in described.items()
+    }
 
 
 def _part(place: str, kind: Any, described: Any) -> Any:

@@ -39,6 +39,7 @@ class Robot(ABC):
     effects_cov : (n, n) covariance of the effects in their order; NaN where unknown
     region : of driving, that the effects were validated in; None where none is stated
     assumed : numbers whose source begins with "assumed", as ``track_m`` and ``camera.lever_x_m``
+    identified : what logs of it showed beside its nominal figures, as ``effective_track_m``
     """
 
     name: str
@@ -51,6 +52,7 @@ class Robot(ABC):
     effects_cov: Array = field(default_factory=lambda: np.empty((0, 0)), compare=False)
     region: Region | None = None
     assumed: frozenset[str] = frozenset()
+    identified: Mapping[str, float] = field(default_factory=dict, hash=False)
 
     numbers: ClassVar[tuple[str, ...]] = ("wheel_radius_m", "track_m", "wheelbase_m", "mass_kg")
     """Numbers that every description of the drive has, beside its sections."""
@@ -79,6 +81,7 @@ class Robot(ABC):
                 raise TypeError(f"section {name!r} is a {type(part).__name__}")
         object.__setattr__(self, "parts", MappingProxyType(dict(self.parts)))
         object.__setattr__(self, "effects", MappingProxyType(dict(self.effects)))
+        object.__setattr__(self, "identified", MappingProxyType(dict(self.identified)))
         object.__setattr__(self, "effects_cov", read_only(cov))
 
     def __reduce__(self) -> tuple[Any, ...]:

@@ -10,7 +10,7 @@ from terrain.extension import Origin, apply_homes, basis_of
 from terrain.files.resources import data_folder
 from terrain.robots import load_robot, robot_from
 
-NAMES = ("agrimaro", "husky", "warthog")
+NAMES = ("agrimaro", "husky", "warthog", "marmotte")
 
 
 def yaml_of(name):

@@ -11,7 +11,7 @@ from pipelines.runs.settings import ImportSettings
 from terrain.errors import LogError
 from terrain.kinematics import omni
 from terrain.logs import robotino
-from terrain.logs.robotino import HELD, NO_SIGN, SCALED, TURNED
+from terrain.logs.robotino import HELD, NO_SIGN, SCALED
 from terrain.robots import load_robot
 
 PIXEL_M = 0.0018
@@ -90,14 +90,13 @@ def test_a_run_comes_back_in_the_frames_of_the_project(root):
     np.testing.assert_allclose(run.streams["commands"].values, np.broadcast_to(twist, (120, 3)))
 
 
-def test_every_conversion_is_counted_and_named(root):
+def test_every_change_is_counted_and_named(root):
     table = columns_of()
     for name in ("xpos", "ypos", "ang"):
         table[name][40:43] = table[name][39]
     (run,) = load_runs(written(root, table))
-    assert run.converted == {SCALED: 3, NO_SIGN: 3, HELD: 3, TURNED: 117}
+    assert run.dropped == {SCALED: 3, NO_SIGN: 3, HELD: 3}
     assert len(run.streams["pose"]) == 117
-    assert run.dropped == {}
 
 
 def test_the_scale_of_a_rate_is_that_of_its_counts_whatever_the_direction(root):
@@ -136,7 +135,7 @@ def test_import_and_read_again_give_one_digest(root, tmp_path):
     result = import_logs(ImportSettings(data=root, out=out))
     again = load_runs(out)
     assert data_digest(again) == data_digest(load_runs(root)) == result.digest
-    assert again[0].converted == load_runs(root)[0].converted
+    assert again[0].dropped == load_runs(root)[0].dropped
 
 
 def _cell(column, row, value):

@@ -1,0 +1,366 @@
+r"""Reader of whole recordings of DRIVE: the topics of a robot at 20 Hz, with motor currents and lidar poses.
+
+``<robot>_<terrain>/<recording>.csv.gz`` (Baril et al., DRIVE, ICRA 2024; repositories norlab-ulaval/DRIVE and
+norlab-ulaval/doughnut_calib, ``raw_dataframe``).  The folder names robot and terrain, as ``husky_wet_grass``;
+a recording is the session of its runs.  A step is one command: what was driven under it is a run
+``<folder>_<recording>_step_001``; an operator drives before the first one and between them, which makes the
+runs ``..._hand_000`` (:mod:`terrain.logs.recording_stretches`).  Terrain is taken to be that of the folder
+throughout.
+
+============  =================================================  ========================================
+stream        channels                                           from
+============  =================================================  ========================================
+``wheels``    ``speed_left_mps speed_right_mps``                 ``meas_*_vel`` times the nominal radius
+\             ``current_left_a ...`` ``voltage_left_v ...``      ``*_wheel_current``, ``*_wheel_voltage``
+``imu``       ``gyro_x_radps ...`` ``accel_x_mps2 ...``          ``imu_x ...``, ``imu_acceleration_x ...``
+``lidar``     ``speed_x_mps speed_y_mps yaw_rate_radps``         poses, see :mod:`~terrain.logs.lidar_twist`
+``pose``      ``position_x_m position_y_m yaw_rad``              ``icp_pos_*``, ``icp_quat_*``
+``commands``  ``speed_x_mps yaw_rate_radps``                     ``cmd_vel_x``, ``cmd_vel_omega``
+============  =================================================  ========================================
+
+Nothing of this is documented by the authors.  Compared with one another, the columns of four recordings of a
+Warthog and one of a Husky show:
+
+- *State*: ``calib`` while a command drives, ``idle`` while an operator does, who then lets the command begin
+  anew; empty before the first command, ``drive_finished`` after the last.  ``cmd_*`` of what an operator
+  drives is not logged (it is 0, or that of the step): these runs have no ``commands``.
+- *Signs*: the imu is a gyro in rad/s and a specific force, with the axes of the robot on the Warthog
+  (:mod:`terrain.logs.imu_axes` finds others).  It agrees with the lidar's yaw rate to 2 % and with the
+  wheels' at r = 0.998.
+- *Poses* are of one fixed frame, that of the first scan, and head where the robot does: turned by their yaw
+  their speed sideways is 0.02 m/s rms.
+- *Late*: lidar poses lag the gyro by 0.25 to 0.5 s, the wheels by 0.05 to 0.1 s.  Times are as logged.
+- *Held*: the Warthog's wheels are new every 0.25 s, its currents and voltages every second, the Husky's every
+  0.15 s; they are read as straight lines between (:mod:`terrain.logs.held`).
+- *Currents* of the Husky are never negative: magnitudes, which stay as they are and are counted.  The
+  Warthog's are positive where a side drives, forwards or backwards, and negative where it brakes: the sign of
+  the power, which is turned into that of the torque (forward positive) by the rotation of the wheel, and
+  counted.  Voltages are the supply's, not the motors'.
+- *Missing*: a column that holds nothing but 0 was not recorded (the Husky's imu), and the imu is 0 before its
+  first message.  Both are left out.
+- *Lost*: on the wet grass poses jump by up to 12 m.  Where they scatter too much for a speed they are NaN.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from terrain.errors import LogError
+from terrain.files.names import normal_name
+from terrain.logs.csv_table import data_row, read_columns, read_words
+from terrain.logs.current_signs import MIN_MOVING_RADPS, POWER_SIGN, current_sign, with_sign_of_torque
+from terrain.logs.drive import FILE_NAME as SAMPLES_FILE
+from terrain.logs.drive import DriveRobot, refuse_other_robot
+from terrain.logs.held import undo_hold, usual_hold
+from terrain.logs.imu_axes import find_axes
+from terrain.logs.lidar_twist import CHANNELS as TWIST_CHANNELS
+from terrain.logs.lidar_twist import MAX_STD, dated, new_poses, twists_and_std, usual_wait
+from terrain.logs.log_files import check_log_file, checked_names, short_name
+from terrain.logs.recording_stretches import Cut, cut_recording
+from terrain.logs.samples import BAD_TIME, checked_stream, longest_rise
+from terrain.records import Array, Label, RunLog
+
+SUFFIX = ".csv.gz"
+
+COMMANDED = "calib"
+"""State in which the logged command drives."""
+
+WHEELS: dict[str, str] = {
+    "speed_left_mps": "meas_left_vel",
+    "speed_right_mps": "meas_right_vel",
+    "current_left_a": "left_wheel_current",
+    "current_right_a": "right_wheel_current",
+    "voltage_left_v": "left_wheel_voltage",
+    "voltage_right_v": "right_wheel_voltage",
+}
+IMU: dict[str, str] = {
+    **{f"gyro_{axis}_radps": f"imu_{axis}" for axis in "xyz"},
+    **{f"accel_{axis}_mps2": f"imu_acceleration_{axis}" for axis in "xyz"},
+}
+COMMANDS: dict[str, str] = {"speed_x_mps": "cmd_vel_x", "yaw_rate_radps": "cmd_vel_omega"}
+POSE: tuple[str, ...] = ("icp_pos_x", "icp_pos_y", "icp_quat_x", "icp_quat_y", "icp_quat_z", "icp_quat_w")
+POSE_CHANNELS: tuple[str, ...] = ("position_x_m", "position_y_m", "yaw_rad")
+STATE, STEP, TIME = "calib_state", "calib_step", "time"
+
+BREAK_PERIODS = 2.5
+"""A longer wait between two rows ends a run: samples are lost."""
+
+NOT_RECORDED = "columns that were not recorded"
+LOST = "poses where the lidar lost the robot"
+STILL = "commands under which nothing moved"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Recording:
+    """A whole recording, row by row; streams that it lacks are missing."""
+
+    name: str
+    session: str
+    robot: str
+    terrain: str
+    time_s: Array  # (n,)
+    period_s: float
+    values: dict[str, Array]  # by stream (n, channels)
+    channels: dict[str, tuple[str, ...]]
+    posed: Array  # (n,) whether a pose is of a row
+    dropped: Counter[str]
+
+
+def find_recordings(folder: Path) -> list[Path]:
+    """Return the recordings in a folder, or in the folders in it, sorted; hidden ones are passed over."""
+    own = [path for path in folder.glob(f"*{SUFFIX}") if _is_recording(path)]
+    return sorted(own or [path for path in folder.glob(f"*/*{SUFFIX}") if _is_recording(path)])
+
+
+def _is_recording(path: Path) -> bool:
+    return (
+        not path.name.startswith(".") and not path.parent.name.startswith(".") and path.name != SAMPLES_FILE
+    )
+
+
+def find_runs(folder: Path, robot_of: Callable[[str], DriveRobot]) -> list[Callable[..., RunLog]]:
+    """Return one reader per run of the recordings in ``folder``; call it with ``repair=``.
+
+    The recordings are read at once.  One that cannot be read has a reader too, which raises
+    :class:`LogError`; where a repairing read can, its runs' readers raise unless they repair.
+
+    Parameters
+    ----------
+    folder : of recordings, or of such folders, named ``<robot>_<terrain>``
+    robot_of : the robot of a name
+
+    Raises
+    ------
+    LogError
+        if a folder's name has no terrain.
+    ConfigError
+        if there is no robot of a folder's name.
+    """
+    readers: list[Callable[..., RunLog]] = []
+    for path in find_recordings(folder):
+        robot, terrain = named_by_folder(path)
+        readers += _readers_of(path, robot_of(robot), terrain)
+    return readers
+
+
+def named_by_folder(path: Path) -> tuple[str, str]:
+    """Return robot and terrain of a recording by the name of its folder.
+
+    Raises
+    ------
+    LogError
+        if the name is not ``<robot>_<terrain>``.
+
+    Examples
+    --------
+    >>> named_by_folder(Path("husky_wet_grass/wetgrass.csv.gz"))
+    ('husky', 'wet_grass')
+    """
+    name = normal_name(path.resolve().parent.name)
+    robot, _, terrain = name.partition("_")
+    if not robot or not terrain:
+        raise LogError(
+            f"{short_name(path)}: its folder is called {name!r}, which has to name robot and terrain, as "
+            "husky_wet_grass"
+        )
+    return robot, terrain
+
+
+def _readers_of(path: Path, robot: DriveRobot, terrain: str) -> list[Callable[..., RunLog]]:
+    fault: LogError | None = None
+    try:
+        recording, cuts = _read(path, robot, terrain, repair=False)
+    except LogError as error:
+        fault = error
+        try:
+            recording, cuts = _read(path, robot, terrain, repair=True)
+        except LogError:
+            return [partial(_refuse, error)]
+    return [partial(_run, recording, cut, fault, index == 0) for index, cut in enumerate(cuts)]
+
+
+def _refuse(fault: LogError, *, repair: bool = False) -> RunLog:
+    raise fault
+
+
+def _run(
+    recording: _Recording, cut: Cut, fault: LogError | None, first: bool, *, repair: bool = False
+) -> RunLog:
+    """Return one run; what concerns the whole recording is counted with its first one."""
+    if fault is not None and not repair:
+        raise fault
+    dropped: Counter[str] = Counter(recording.dropped if first else {})
+    rows = slice(cut.first, cut.end)
+    run_id = f"{recording.session}_{cut.name}"
+    time_s = recording.time_s[rows] - recording.time_s[cut.first]
+    streams = {}
+    for name, values in recording.values.items():
+        if name == "commands" and not cut.commanded:
+            continue
+        kept = np.ones(len(time_s), dtype=bool)
+        if name == "pose":
+            kept = recording.posed[rows]
+            if kept.sum() < 2:
+                continue
+        if name == "imu":
+            kept = np.asarray(~np.isnan(values[rows]).all(axis=1))
+        streams[name] = checked_stream(
+            f"{recording.name}, {run_id}",
+            time_s[kept],
+            values[rows][kept],
+            recording.channels[name],
+            row_of=lambda row: row + cut.first + 2,
+            repairs=dropped if repair else None,
+            unknown_is_a_value=name in ("lidar", "pose"),
+        )
+    if "pose" in streams:
+        dropped[LOST] += int(np.isnan(streams["pose"].values[:, 0]).sum())
+    run = RunLog(
+        run_id,
+        recording.robot,
+        streams,
+        (Label(0.0, float(time_s[-1]) + recording.period_s, recording.terrain),),
+        source=f"{recording.name}, rows {cut.first + 2} to {cut.end + 1}, recording of DRIVE",
+        dropped={kind: n for kind, n in dropped.items() if n},
+        session=recording.session,
+    )
+    return checked_names(recording.name, run)
+
+
+def _read(path: Path, robot: DriveRobot, terrain: str, *, repair: bool) -> tuple[_Recording, tuple[Cut, ...]]:
+    """Read a recording, and cut it into runs."""
+    name = short_name(path)
+    check_log_file(path, path.parent)
+    dropped: Counter[str] = Counter()
+    columns = [TIME, STEP, *WHEELS.values(), *IMU.values(), *COMMANDS.values(), *POSE]
+    table = read_columns(path, columns, repair=repair, dropped=dropped)
+    state = np.array(read_words(path, STATE))
+    if len(table) < 2:
+        raise LogError(f"{name}: has {len(table)} rows of data, at least 2 are needed")
+    table, state = _with_rising_time(path, table, state, dropped if repair else None)
+    column = dict(zip(columns, table.T, strict=True))
+    time_s, step = column[TIME], column[STEP]
+    for row in np.flatnonzero(~((step >= 0) & (step == np.floor(step)))):
+        raise LogError(
+            f"{name}: {STEP} at row {row + 2} is {step[row]:.15g}; it must be a whole number from 0 up"
+        )
+    period_s = float(np.median(np.diff(time_s)))
+    wheels = np.column_stack([column[each] for each in WHEELS.values()])
+    refuse_other_robot(name, wheels[:, :2], robot)
+    moving = (np.abs(wheels[:, :2]) >= MIN_MOVING_RADPS).any(axis=1)
+    breaks = np.diff(time_s, prepend=time_s[0]) > BREAK_PERIODS * period_s
+    runs, n_still = cut_recording(step, state == COMMANDED, moving, breaks, period_s)
+    if not runs:
+        raise LogError(f"{name}: its wheels turn for no more than a moment: it holds no run")
+    values, channels = {}, {}
+    values["wheels"], channels["wheels"] = _wheels(wheels, time_s, period_s, robot, dropped)
+    imu = np.column_stack([column[each] for each in IMU.values()])
+    if imu.any():
+        values["imu"], channels["imu"] = (
+            _imu(imu, values["wheels"][:, :2], runs, period_s, dropped),
+            tuple(IMU),
+        )
+    else:
+        dropped[NOT_RECORDED] += imu.shape[1]
+    pose, posed, twist = _lidar(np.column_stack([column[each] for each in POSE]), time_s, period_s)
+    if not np.isfinite(twist).any():
+        raise LogError(f"{name}: its lidar has lost the robot throughout: no pose gives a speed")
+    values |= {
+        "lidar": twist,
+        "pose": pose,
+        "commands": np.column_stack([column[each] for each in COMMANDS.values()]),
+    }
+    channels |= {"lidar": TWIST_CHANNELS, "pose": POSE_CHANNELS, "commands": tuple(COMMANDS)}
+    dropped[STILL] += n_still
+    session = normal_name(f"{path.resolve().parent.name}_{path.name.removesuffix(SUFFIX)}")
+    recording = _Recording(
+        name, session, robot.name, terrain, time_s, period_s, values, channels, posed, dropped
+    )
+    return recording, runs
+
+
+def _with_rising_time(
+    path: Path, table: Array, state: Array, repairs: Counter[str] | None
+) -> tuple[Array, Array]:
+    """Return the rows whose time rises, or refuse; a repairing read drops the others and counts them."""
+    time_s = table[:, 0]
+    if len(state) != len(table):  # rows of another length, which both readers leave out alike
+        raise LogError(f"{short_name(path)}: its rows do not have one state each")
+    fallen = np.flatnonzero(~(np.diff(time_s) > 0.0))
+    if not fallen.size and np.isfinite(time_s).all():
+        return table, state
+    if repairs is None:
+        row = int(fallen[0]) + 1 if fallen.size else int(np.flatnonzero(~np.isfinite(time_s))[0])
+        raise LogError(
+            f"{short_name(path)}: time does not rise at row {data_row(path, row)} "
+            f"({time_s[row]:.15g} s after {time_s[row - 1]:.15g} s): a clock that restarts?"
+        )
+    finite = np.flatnonzero(np.isfinite(time_s))
+    kept = finite[longest_rise(time_s[finite])]
+    repairs[BAD_TIME] += len(table) - len(kept)
+    return table[kept], state[kept]
+
+
+def _wheels(
+    logged: Array, time_s: Array, period_s: float, robot: DriveRobot, dropped: Counter[str]
+) -> tuple[Array, tuple[str, ...]]:
+    """Return what was recorded of the wheels, as it really changes, and its channels."""
+    recorded = [i for i, values in enumerate(logged.T) if i < 2 or np.nan_to_num(values).any()]
+    dropped[NOT_RECORDED] += logged.shape[1] - len(recorded)
+    channels = tuple(tuple(WHEELS)[i] for i in recorded)
+    currents = [i for i in (2, 3) if i in recorded]
+    if currents:
+        kind = current_sign(logged[:, currents], logged[:, [i - 2 for i in currents]])
+        dropped[kind] += len(currents) if kind else 0
+        if kind == POWER_SIGN:
+            logged = logged.copy()
+            for i in currents:
+                logged[:, i] = with_sign_of_torque(logged[:, i], logged[:, i - 2], period_s)
+    values = logged[:, recorded]
+    values = undo_hold(values, time_s, tuple(usual_hold(column[None], period_s) for column in values.T))
+    values[:, :2] *= robot.wheel_radius_m
+    return values, channels
+
+
+def _imu(
+    imu: Array, wheels_mps: Array, runs: tuple[Cut, ...], period_s: float, dropped: Counter[str]
+) -> Array:
+    """Return gyro and accelerometer in the robot's axes; NaN before the first message."""
+    first = int(np.flatnonzero(imu.any(axis=1))[0])
+    imu = imu.copy()
+    imu[:first] = np.nan
+    rows = [slice(cut.first, cut.end) for cut in runs]
+    axes = find_axes([(*wheels_mps[each].T, imu[each, 2], imu[each, 3:]) for each in rows], period_s)
+    dropped.update(axes.repairs())
+    return np.asarray(imu * (*axes.gyro(), *axes.accel))
+
+
+def _lidar(logged: Array, time_s: Array, period_s: float) -> tuple[Array, Array, Array]:
+    """Return poses (n, 3), which rows (n,) they are of, and the twist (n, 3) at each row."""
+    position, (x, y, z, w) = logged[:, :2], logged[:, 2:].T
+    yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    pose = np.column_stack([position, np.where(x * x + y * y + z * z + w * w > 0.5, yaw, np.nan)])
+    place = np.round((time_s - time_s[0]) / period_s).astype(np.intp)  # on an even grid, gaps and all
+    last = np.searchsorted(place, np.arange(place[-1] + 1), side="right") - 1
+    even = pose[last][None]
+    twists, stds = twists_and_std(even, period_s, frame_yaw=np.zeros(1))
+    twist, std = twists[0], stds[0]
+    lost = (std > MAX_STD).any(axis=1)
+    twist[~(std <= MAX_STD).all(axis=1)] = np.nan
+    new = new_poses(even)
+    arrival = np.flatnonzero(new[0])
+    at, usable = dated(arrival, len(last), usual_wait(new))
+    at, came = at[usable], even[0, arrival[usable]]
+    came[:, 2] = np.unwrap(came[:, 2])
+    came[lost[at]] = np.nan
+    poses = np.full((len(last), 3), np.nan)
+    poses[at] = came
+    posed = np.zeros(len(last), dtype=bool)
+    posed[at] = True
+    return poses[place], posed[place], twist[place]

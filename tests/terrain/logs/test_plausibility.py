@@ -1,0 +1,270 @@
+"""A sound run is plausible, and each usual mistake in it is found, named and measured."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipelines.runs.datasets import load_runs
+from pipelines.runs.import_logs import import_logs
+from pipelines.runs.inspect_logs import inspect_logs
+from pipelines.runs.settings import ImportSettings, InspectSettings
+from pipelines.runs.verdicts import doubt_sentences, doubts_of, verdict
+from terrain.errors import LogError
+from terrain.logs.checks import Level
+from terrain.logs.plausibility import judge, worst
+from terrain.logs.turn_checks import Scale
+from terrain.logs.write import write_run
+from terrain.records import RunLog, Stream
+from terrain.robots import load_robot
+from terrain.simulation.run import simulate_run
+
+HUSKY = Scale(0.5708, 1.0065)
+DEGREE = np.pi / 180.0
+
+
+def sound_run(duration_s=40.0, seed=0):
+    """A husky that starts, drives and turns; its wheels skid by half of the turn."""
+    rng = np.random.default_rng(seed)
+    t, s = np.arange(0.0, duration_s, 0.01), np.arange(0.0, duration_s, 0.1)
+    rate = 0.4 * np.sin(0.5 * t) + 0.1
+    imu = np.column_stack([np.zeros((len(t), 2)), rate, np.zeros((len(t), 2)), np.full(len(t), 9.81)])
+    imu += rng.normal(0.0, [0.02] * 3 + [0.5] * 3, imu.shape)
+    turn = 2.0 * np.interp(s, t, rate) * 0.5708 / 2
+    wheels = np.column_stack([0.6 - turn, 0.6 + turn, 4.0 - turn, 4.0 + turn]) + rng.normal(
+        0, 0.01, (len(s), 4)
+    )
+    names = (*(f"gyro_{a}_radps" for a in "xyz"), *(f"accel_{a}_mps2" for a in "xyz"))
+    sides = ("speed_left_mps", "speed_right_mps", "current_left_a", "current_right_a")
+    return RunLog("SNOW_01", "husky", {"imu": Stream(t, imu, names), "wheels": Stream(s, wheels, sides)})
+
+
+def changed(stream, factors, start=None):
+    """Return the sound run with some channels of a stream multiplied."""
+    run = sound_run()
+    old = run.streams[stream]
+    values = old.values.copy()
+    for channel, factor in factors.items():
+        values[:, old.channels.index(channel)] *= factor
+    return replace(run, streams={**run.streams, stream: Stream(old.time_s, values, old.channels)})
+
+
+def retimed(factor, names=("imu", "wheels")):
+    run = sound_run()
+    return replace(
+        run,
+        streams={
+            name: Stream(s.time_s * factor, s.values, s.channels) if name in names else s
+            for name, s in run.streams.items()
+        },
+    )
+
+
+def renamed(stream, old, new):
+    run = sound_run()
+    s = run.streams[stream]
+    channels = tuple(new if name == old else name for name in s.channels)
+    return replace(run, streams={**run.streams, stream: Stream(s.time_s, s.values, channels)})
+
+
+def with_axes(order, signs):
+    run = sound_run()
+    s = run.streams["imu"]
+    values = s.values.copy()
+    values[:, 3:] = values[:, 3:][:, order] * signs
+    return replace(run, streams={**run.streams, "imu": Stream(s.time_s, values, s.channels)})
+
+
+ACCEL = {f"accel_{axis}_mps2": 1 / 9.81 for axis in "xyz"}
+GYRO = {f"gyro_{axis}_radps": 1 / DEGREE for axis in "xyz"}
+SPEEDS = ("speed_left_mps", "speed_right_mps")
+
+
+def test_a_sound_run_is_ok_in_every_respect():
+    checks = judge(sound_run(), HUSKY)
+    assert {check.level for check in checks} == {Level.OK}, checks
+    assert {check.check for check in checks} == {
+        *("gravity", "yaw rate", "wheel speed", "sampling", "channel names", "values"),
+        *("constant channels", "overlap"),
+    }
+
+
+@pytest.mark.parametrize(
+    ("run", "check", "level", "sentence"),
+    [
+        (
+            changed("imu", ACCEL),
+            "gravity",
+            "implausible",
+            "is 1 m/s^2, 9.81 is expected: an accelerometer in g",
+        ),
+        (changed("imu", dict.fromkeys(ACCEL, 9.81)), "gravity", "implausible", "one in m/s^2 read as g"),
+        (changed("imu", dict.fromkeys(ACCEL, 0.5)), "gravity", "implausible", "another unit, or a scale"),
+        (changed("imu", {"accel_z_mps2": 0.0}), "gravity", "doubtful", "gravity removed"),
+        (with_axes([0, 1, 2], [1, -1, -1]), "gravity", "implausible", "z points down"),
+        (with_axes([2, 0, 1], [1, 1, 1]), "gravity", "implausible", "another axis points up"),
+        (changed("imu", GYRO), "yaw rate", "implausible", "a gyro in deg/s read as rad/s"),
+        (changed("imu", {"gyro_z_radps": -1.0}), "yaw rate", "implausible", "turned sign of the gyro"),
+        (changed("imu", {"gyro_z_radps": 0.1}), "yaw rate", "doubtful", "wheels that dig in"),
+        (
+            changed("wheels", dict.fromkeys(SPEEDS, 3.6)),
+            "wheel speed",
+            "doubtful",
+            "rad/s or km/h read as m/s",
+        ),
+        (
+            changed("wheels", dict.fromkeys(SPEEDS, 6.1)),
+            "wheel speed",
+            "implausible",
+            "top speed is 1.01 m/s",
+        ),
+        (retimed(1000.0), "sampling", "implausible", "0.1 Hz, 0.5 Hz to 10 kHz is expected: ms read as s"),
+        (retimed(0.001), "sampling", "implausible", "1e+05 Hz, 0.5 Hz to 10 kHz is expected: s read as ms"),
+        (retimed(1000.0, ["wheels"]), "overlap", "implausible", "0 % of the longest stream"),
+        (retimed(0.3, ["wheels"]), "overlap", "doubtful", "30 % of the longest stream"),
+        (
+            changed("wheels", {"speed_left_mps": 1e300}),
+            "values",
+            "implausible",
+            "--repair leaves such values out",
+        ),
+        (changed("imu", {"gyro_x_radps": 1e5}), "values", "doubtful", "up to 70 is expected"),
+        (changed("imu", {"accel_x_mps2": 0.0}), "constant channels", "doubtful", "is 0 throughout"),
+        (changed("wheels", {"current_left_a": 0.0}), "constant channels", "doubtful", "is 0 throughout"),
+        (
+            renamed("imu", "gyro_z_radps", "gyor_z_radps"),
+            "channel names",
+            "implausible",
+            "is it 'gyro_z_radps'",
+        ),
+        (
+            renamed("imu", "accel_z_mps2", "acel_z_mps2"),
+            "channel names",
+            "implausible",
+            "is it 'accel_z_mps2'",
+        ),
+        (
+            renamed("imu", "gyro_x_radps", "gyro_x_mps2"),
+            "channel names",
+            "implausible",
+            "'radps' is expected",
+        ),
+        (renamed("imu", "gyro_x_radps", "gyro_u_radps"), "channel names", "doubtful", "'u' is no axis"),
+        (renamed("wheels", "current_left_a", "flux_left_a"), "channel names", "doubtful", "made of 'flux'"),
+    ],
+    ids=lambda value: value if isinstance(value, str) and len(value) > 12 else "",
+)
+def test_a_mistake_is_found_named_and_measured(run, check, level, sentence):
+    found = [c for c in judge(run, HUSKY) if c.check == check and c.level == level]
+    assert found, judge(run, HUSKY)
+    assert any(sentence in c.sentence for c in found), found
+    assert worst(judge(run, HUSKY)) in (Level.DOUBTFUL, Level.IMPLAUSIBLE)
+
+
+def test_several_mistakes_are_all_named():
+    run = changed("imu", {**ACCEL, **GYRO})
+    odd = {check.check for check in judge(run, HUSKY) if check.level == Level.IMPLAUSIBLE}
+    assert odd == {"gravity", "yaw rate"}
+
+
+def test_what_cannot_be_judged_is_unknown_and_not_ok():
+    stream = Stream([0.0, 1.0], [[3.0], [4.0]], ("temperature_k",))
+    levels = {check.check: check.level for check in judge(RunLog("a", "husky", {"weather": stream}))}
+    for check in ("gravity", "yaw rate", "wheel speed", "sampling", "constant channels", "overlap"):
+        assert levels[check] == Level.UNKNOWN
+    standing = changed("wheels", dict.fromkeys((*SPEEDS, "current_left_a", "current_right_a"), 0.0))
+    levels = {check.check: check.level for check in judge(standing, HUSKY)}
+    assert levels["yaw rate"] == levels["wheel speed"] == Level.UNKNOWN
+    assert levels["constant channels"] == Level.OK
+
+
+@pytest.mark.parametrize("robot", ["agrimaro", "husky", "warthog", "marmotte"])
+@pytest.mark.parametrize(
+    ("terrain", "scenario"), [("grass", "survey"), ("asphalt", "stand"), ("clay", "starts")]
+)
+def test_simulated_runs_are_plausible(robot, terrain, scenario):
+    described = load_robot(robot)
+    run = simulate_run(described, terrain, scenario, 3, 1, duration_s=15.0)
+    odd = [c for c in verdict(run, described) if c.level in (Level.DOUBTFUL, Level.IMPLAUSIBLE)]
+    assert not odd
+
+
+SETS = (
+    "borealtc",
+    "vulpi",
+    "drive_husky",
+    "drive_warthog_terrains/sand_1",
+    "drive_marmotte",
+    "drive_recordings",
+)
+
+
+@pytest.mark.parametrize("name", SETS)
+def test_no_measured_run_is_implausible(measured, name):
+    robot = {"drive_warthog_terrains/sand_1": "warthog", "drive_marmotte": "marmotte"}.get(name)
+    runs = load_runs(measured(name), robot=robot)
+    verdicts = {run.run_id: verdict(run) for run in runs}
+    doubts = doubts_of(verdicts)
+    assert not [doubt for doubt in doubts if doubt.check.level == Level.IMPLAUSIBLE]
+    assert len(doubts) <= 0.02 * len(runs)
+    # the same runs with a usual mistake are found out: the verdict is no constant
+    judged = [run for run in runs if "imu" in run.streams]
+    turned = [replace_imu(run, -1.0) for run in judged]
+    found = [
+        any(c.check == "gravity" and c.level == Level.IMPLAUSIBLE for c in verdict(run)) for run in turned
+    ]
+    assert all(found)
+
+
+def replace_imu(run, factor):
+    imu = run.streams["imu"]
+    return replace(run, streams={**run.streams, "imu": Stream(imu.time_s, factor * imu.values, imu.channels)})
+
+
+def test_the_sign_of_measured_gyros_is_judged_right_wherever_it_is_judged(measured):
+    runs = load_runs(measured("drive_husky"))
+    before = [next(c for c in verdict(run) if c.check == "yaw rate") for run in runs]
+    after = [next(c for c in verdict(replace_imu(run, -1.0)) if c.check == "yaw rate") for run in runs]
+    judged = [b.level != Level.UNKNOWN for b in before]
+    assert np.mean(judged) > 0.8
+    assert all(a.level == Level.IMPLAUSIBLE for a, j in zip(after, judged, strict=True) if j)
+
+
+def test_import_refuses_an_implausible_run_and_repair_counts_it(tmp_path):
+    for run_id, run in (("SNOW_01", sound_run()), ("SNOW_02", changed("imu", ACCEL))):
+        write_run(replace(run, run_id=run_id), tmp_path / "data")
+    settings = ImportSettings(data=tmp_path / "data", out=tmp_path / "out")
+    with pytest.raises(LogError, match=r"SNOW_02: implausible gravity.*9\.81 is expected") as refused:
+        import_logs(settings)
+    assert "\n" not in str(refused.value)
+    assert not (tmp_path / "out" / "SNOW_01").exists()
+    result = import_logs(settings.model_copy(update={"repair": True}))
+    assert result.n_runs == 2
+    assert result.dropped == {"implausible gravity": 1}
+    assert load_runs(tmp_path / "out")[1].dropped == {"implausible gravity": 1}
+    assert [doubt.run_id for doubt in result.doubts] == ["SNOW_02"]
+
+
+def test_values_beyond_any_quantity_are_refused_or_repaired_by_one_rule(tmp_path):
+    write_run(changed("wheels", {"speed_left_mps": 1e300}), tmp_path / "data")
+    settings = ImportSettings(data=tmp_path / "data", out=tmp_path / "out")
+    with pytest.raises(LogError, match="--repair leaves such values out"):
+        import_logs(settings)
+    result = import_logs(settings.model_copy(update={"repair": True}))
+    assert result.dropped["values beyond any quantity"] == 400
+
+
+def test_inspect_has_every_check_and_its_figure(tmp_path):
+    write_run(changed("imu", GYRO), tmp_path / "data")
+    [run] = inspect_logs(InspectSettings(data=tmp_path / "data")).runs
+    [check] = [c for c in run.as_json()["plausibility"] if c.check == "yaw rate"]
+    assert check.level == "implausible"
+    assert check.measured == pytest.approx(0.5 / DEGREE, rel=0.1)
+
+
+def test_a_sentence_that_concerns_many_runs_is_counted():
+    run = changed("imu", ACCEL)
+    doubts = doubts_of({f"SNOW_{i:02d}": judge(run, HUSKY) for i in range(9)})
+    sentences = list(doubt_sentences(doubts))
+    assert len(sentences) == 4
+    assert sentences[-1] == "6 more runs: implausible gravity (imu)"
