@@ -19,10 +19,11 @@ if TYPE_CHECKING:
     from terrain.logs.drive import DriveRobot
     from terrain.robots import Robot
 
-LAYOUTS = ("auto", "runs", "borealtc", "csv", "drive", "can", "bag")
+LAYOUTS = ("auto", "runs", "borealtc", "csv", "drive", "testbed", "can", "bag")
 """``runs``: run folders as this package writes them; ``csv``: any CSV, by a mapping file; ``drive``: the
-files ``samples.csv.gz`` of DRIVE, one a session; ``can``: logs of a CAN bus, by a DBC; ``bag``: MCAP files
-and ROS 2 bags, by a mapping or by the types of their topics."""
+files ``samples.csv.gz`` of DRIVE, one a session; ``testbed``: ``smooth.csv`` and ``grouser.csv`` of a wheel in
+a box of sand, a trial a row; ``can``: logs of a CAN bus, by a DBC; ``bag``: MCAP files and ROS 2 bags, by a
+mapping or by the types of their topics."""
 
 CAN_ROBOT = "agrimaro"
 """Robot of a log of a CAN bus where none is named."""
@@ -32,7 +33,8 @@ DRIVE_ROBOT = "husky"
 
 ACCEPTED = (
     "accepted are run folders (run.json), the BorealTC layout (<CLASS>/imu_N.csv and pro_N.csv), "
-    "the DRIVE layout (samples.csv.gz, or folders of sessions with one each), MCAP files and ROS 2 bags, and "
+    "the DRIVE layout (samples.csv.gz, or folders of sessions with one each), the wheel "
+    "testbed's (smooth.csv, grouser.csv), MCAP files and ROS 2 bags, and "
     "any CSV with a mapping file"
 )
 
@@ -222,7 +224,7 @@ def _readers(
     if not folder.is_dir():
         fault = "is no folder" if folder.exists() else "does not exist"
         raise LogError(f"{folder}: {fault}; {ACCEPTED}")
-    if (mapping is not None) and layout in ("runs", "borealtc", "drive"):
+    if (mapping is not None) and layout in ("runs", "borealtc", "drive", "testbed"):
         raise ConfigError(f"a mapping file is for CSV files, not for the layout {layout!r}")
     if layout == "can":
         from pipelines.can import dbc, logs
@@ -235,12 +237,13 @@ def _readers(
         from terrain.logs import mapping as by_mapping
 
         return by_mapping.find_runs(folder, by_mapping.load_mapping(mapping))
-    from terrain.logs import borealtc, drive, read
+    from terrain.logs import borealtc, drive, read, testbed
 
     found: dict[str, list[Any]] = {
         "runs": read.find_runs(folder) if layout in ("auto", "runs") else [],
         "borealtc": borealtc.find_runs(folder) if layout in ("auto", "borealtc") else [],
         "drive": drive.find_sessions(folder) if layout in ("auto", "drive") else [],
+        "testbed": testbed.find_runs(folder) if layout in ("auto", "testbed") else [],
     }
     names = [name for name, readers in found.items() if readers]
     if len(names) > 1:

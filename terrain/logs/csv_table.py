@@ -59,11 +59,7 @@ def read_columns(
         a cell that is no number or a row of the wrong length.
     """
     _refuse_too_large(path)
-    header = _header(path, delimiter)
-    for column in columns:
-        if header.count(column) != 1:
-            fault = "is missing" if column not in header else "is there twice"
-            raise LogError(f"{short_name(path)}: column {column!r} {fault} (the file has {listed(header)})")
+    header = _checked_header(path, columns, delimiter)
     fast = _fast_columns(path, header, columns, delimiter)
     if fast is not None:
         return fast
@@ -78,7 +74,7 @@ def read_columns(
                 )
             counts[SHORT_ROW] += 1
             continue
-        numbers = [_number(cells[place]) for place in places]
+        numbers = [number_in(cells[place]) for place in places]
         for column, place, number in zip(columns, places, numbers, strict=True):
             if number is None:
                 if not repair:
@@ -89,6 +85,46 @@ def read_columns(
                 counts[BAD_CELL] += 1
         table.append([np.nan if number is None else number for number in numbers])
     return np.array(table, dtype=np.float64).reshape(len(table), len(columns))
+
+
+def text_rows(path: Path, columns: Sequence[str]) -> list[tuple[int, tuple[str, ...] | None]]:
+    """Return the number of each row, as an editor shows it, and the texts of its named columns.
+
+    The texts are None of a row that is shorter or longer than the header.
+
+    Parameters
+    ----------
+    path : file whose first line is a header, comma-separated
+    columns : names in the header, in the required order
+
+    Raises
+    ------
+    LogError
+        if the file is missing, empty or no text, or lacks a column or has it twice.
+    """
+    header = _checked_header(path, columns, ",")
+    places = [header.index(column) for column in columns]
+    return [
+        (row, tuple(cells[place] for place in places) if len(cells) == len(header) else None)
+        for row, cells in _rows(path, ",")
+    ]
+
+
+def number_in(cell: str) -> float | None:
+    """Return the number in a cell: NaN where it is missing, None where it is no number.
+
+    Examples
+    --------
+    >>> number_in(" 1.5 "), number_in("NA"), number_in("wet")
+    (1.5, nan, None)
+    """
+    text = cell.strip()
+    if text in MISSING:
+        return float("nan")
+    try:
+        return None if "_" in text else float(text)
+    except ValueError:
+        return None
 
 
 def data_row(path: Path, index: int, *, delimiter: str = ",") -> int:
@@ -136,6 +172,15 @@ def _header(path: Path, delimiter: str) -> list[str]:
     return names
 
 
+def _checked_header(path: Path, columns: Sequence[str], delimiter: str) -> list[str]:
+    header = _header(path, delimiter)
+    for column in columns:
+        if header.count(column) != 1:
+            fault = "is missing" if column not in header else "is there twice"
+            raise LogError(f"{short_name(path)}: column {column!r} {fault} (the file has {listed(header)})")
+    return header
+
+
 def _fast_columns(path: Path, header: list[str], columns: Sequence[str], delimiter: str) -> Array | None:
     from pyarrow import ArrowException
     from pyarrow import csv as arrow_csv
@@ -170,16 +215,6 @@ def _rows(path: Path, delimiter: str) -> Iterator[tuple[int, list[str]]]:
                     yield reader.line_num, cells
     except _UNREADABLE as error:
         raise _unreadable(path, error) from error
-
-
-def _number(cell: str) -> float | None:
-    text = cell.strip()
-    if text in MISSING:
-        return float("nan")
-    try:
-        return None if "_" in text else float(text)
-    except ValueError:
-        return None
 
 
 def _unreadable(path: Path, error: Exception) -> LogError:

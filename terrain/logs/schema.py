@@ -89,7 +89,7 @@ ESTIMATOR_CHANNELS: tuple[str, ...] = (
 SIGNAL_SETS: tuple[str, ...] = ("imu", "wheels", "currents", "slip", "estimator")
 """Groups of signals that can be switched off by name."""
 
-NO_FEATURES: tuple[str, ...] = ("truth", "commands", "control", "odometry", "state", "lidar")
+NO_FEATURES: tuple[str, ...] = ("truth", "commands", "control", "odometry", "state", "lidar", "testbed")
 """Streams that no feature is made of."""
 
 _SET_OF_QUANTITY: dict[str, str] = {
