@@ -21,9 +21,9 @@ if TYPE_CHECKING:
 
 LAYOUTS = ("auto", "runs", "borealtc", "csv", "drive", "testbed", "can", "bag")
 """``runs``: run folders as this package writes them; ``csv``: any CSV, by a mapping file; ``drive``: the
-files ``samples.csv.gz`` of DRIVE, one a session; ``testbed``: ``smooth.csv`` and ``grouser.csv`` of a wheel in
-a box of sand, a trial a row; ``can``: logs of a CAN bus, by a DBC; ``bag``: MCAP files and ROS 2 bags, by a
-mapping or by the types of their topics."""
+files ``samples.csv.gz`` of DRIVE, one a session; ``testbed``: ``smooth.csv`` and ``grouser.csv`` of a wheel
+in a box of sand, a trial a row; ``can``: logs of a CAN bus, by a DBC; ``bag``: MCAP files and ROS 2 bags, by
+a mapping or by the types of their topics."""
 
 CAN_ROBOT = "agrimaro"
 """Robot of a log of a CAN bus where none is named."""
