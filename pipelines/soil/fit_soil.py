@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from pipelines.reporting.progress import Progress, silent
-from pipelines.runs.datasets import data_digest
+from pipelines.runs.datasets import data_digest, load_runs
 from pipelines.soil.results import BAR_RATIO, Drawn, FitSoilResult, WheelResult
 from pipelines.soil.settings import FitSoilSettings
 from terrain.errors import ConfigError, DataError
@@ -40,6 +40,8 @@ def fit_soil(
     ------
     ConfigError
         if ``out`` is a file.
+    LogError
+        if a trial of ``check`` cannot be read.
     DataError
         if no run is a trial of the testbed, or a wheel has too few settings.
     TerrainError
@@ -53,6 +55,7 @@ def fit_soil(
     if settings.out.is_file():
         raise ConfigError(f"{settings.out}: is a file; --out names a folder")
     ensure_writable(settings.out)
+    further = _further(settings)
     by_wheel = {robot: [run for run in runs if run.robot == robot] for robot in WHEELS}
     if not any(by_wheel.values()):
         raise DataError(
@@ -67,7 +70,15 @@ def fit_soil(
         wheel = WHEELS[robot]
         name = SOIL_NAME.format(wheel=wheel.name)
         path = settings.out / f"{name}.yaml"
-        result, drawn = wheel_result(trials_of(own, wheel), wheel, path, settings, progress)
+        others = [run for run in further if run.robot == robot]
+        result, drawn = wheel_result(
+            trials_of(own, wheel),
+            trials_of(others, wheel) if others else None,
+            wheel,
+            path,
+            settings,
+            progress,
+        )
         text = soil_yaml(
             name, wheel.name, settings.dataset, result.soil.fit, result.parameters["tan_friction"], result.law
         )
@@ -92,6 +103,16 @@ def fit_soil(
         files=(*files, str(page)),
         skipped=tuple(skipped),
     )
+
+
+def _further(settings: FitSoilSettings) -> list[RunLog]:
+    """Return the runs of ``--check``; none without it."""
+    if settings.check is None:
+        return []
+    runs = load_runs(settings.check, layout=settings.layout, repair=settings.repair)
+    if not any(run.robot in WHEELS for run in runs):
+        raise DataError(f"--check {settings.check}: none of {len(runs)} runs is a trial of a wheel testbed")
+    return runs
 
 
 def _write_figures(figures: Mapping[str, Figure], settings: FitSoilSettings) -> list[str]:

@@ -79,6 +79,9 @@ def verdict(result: WheelResult) -> str:
             "reached" if found.reached else f"not reached ({rest} without the wheel dragged along its axle)"
         )
         parts.append(f"{held} left out, traction and side force off by {errors} of the load: {state}")
+    if result.checked is not None:
+        errors_text = f"{result.checked.load.pull_ratio:.1%} and {result.checked.load.side_ratio:.1%}"
+        parts.append(f"{result.checked.load.n_trials} further trials: {errors_text}")
     return f"{BAR_RATIO:.0%} aimed at; " + "; ".join(parts)
 
 

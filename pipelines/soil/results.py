@@ -47,6 +47,13 @@ class LawRow(NamedTuple):
     angle: HeldOut
 
 
+class Checked(NamedTuple):
+    """Errors of the last law, fitted to all trials, on further ones: sinkage predicted, and measured."""
+
+    load: Misfit
+    sinkage: Misfit
+
+
 class SoilFile(NamedTuple):
     """The soil that the simulator takes.
 
@@ -79,6 +86,7 @@ class WheelResult:
     cohesion : what friction goes with a cohesion that is given
     modulus : of the soil, as it seems from each trial
     surrogate_slip, surrogate_angle : errors of a polynomial of slip and angle, for reference
+    checked : on the trials of ``--check``; None without any
     not_identified : a sentence for each thing that these trials cannot say
     soil : that was written for the simulator
     """
@@ -99,6 +107,7 @@ class WheelResult:
     modulus: ModulusSpread
     surrogate_slip: Misfit
     surrogate_angle: Misfit
+    checked: Checked | None
     not_identified: tuple[str, ...]
     soil: SoilFile
 

@@ -24,6 +24,9 @@ class FitSoilSettings(RunsSettings):
     laws: tuple[str, ...] = setting(
         LAW_NAMES, "Laws to compare, by commas; the last one is reported in full.", separated=True
     )
+    check: Path | None = setting(
+        None, "Folder of further trials, which the last law predicts and no fit has."
+    )
     draws: int = setting(60, "Bootstrap samples behind the intervals.", ge=2, le=10_000)
     seed: int = setting(0, "Of the bootstrap.", ge=0)
 

@@ -9,12 +9,22 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.reporting.progress import Progress
-from pipelines.soil.results import AXLE_ANGLE_DEG, BAR_RATIO, Drawn, HeldOut, LawRow, SoilFile, WheelResult
+from pipelines.soil.results import (
+    AXLE_ANGLE_DEG,
+    BAR_RATIO,
+    Checked,
+    Drawn,
+    HeldOut,
+    LawRow,
+    SoilFile,
+    WheelResult,
+)
 from pipelines.soil.settings import FitSoilSettings
 from pipelines.soil.surrogate import surrogate_predictions
 from terrain.records import Array
-from terrain.soil_identification.fit import fit_law
+from terrain.soil_identification.fit import LawFit, fit_law, predict
 from terrain.soil_identification.held_out import (
+    GIVEN,
     HELD_OUT,
     Predictor,
     held_out_predictions,
@@ -46,13 +56,19 @@ SIMULATOR_TEXT = "the law of terrain simulate: one limit, one rise, along the re
 
 
 def wheel_result(
-    trials: Trials, wheel: Wheel, soil_file: Path, settings: FitSoilSettings, progress: Progress
+    trials: Trials,
+    further: Trials | None,
+    wheel: Wheel,
+    soil_file: Path,
+    settings: FitSoilSettings,
+    progress: Progress,
 ) -> tuple[WheelResult, Drawn]:
     """Return what the trials of one wheel say, and what its figures show.
 
     Parameters
     ----------
     trials : single ones
+    further : trials that the last law predicts, fitted to all of ``trials``; None without any
     wheel : of the trials
     soil_file : where its soil is written
     settings : of the command
@@ -99,6 +115,7 @@ def wheel_result(
         modulus=modulus,
         surrogate_slip=misfit(trials, reference["slip"]["load"]),
         surrogate_angle=misfit(trials, reference["angle"]["load"]),
+        checked=None if further is None else _checked(fit, further),
         not_identified=tuple(_not_identified(parameters, cohesion, modulus)),
         soil=SoilFile(soil_file, plain, misfit(own, plain_prediction(soil, own, wheel))),
     )
@@ -153,6 +170,10 @@ def _law_row(name: str, trials: Trials, predictions: Mapping[str, Mapping[str, P
     return LawRow(name, law.text, n_parameters, found["slip"], found["angle"])
 
 
+def _checked(fit: LawFit, further: Trials) -> Checked:
+    return Checked(*(misfit(further, predict(fit, further, given)) for given in GIVEN))
+
+
 def _not_identified(
     parameters: Mapping[str, Parameter], cohesion: Sequence[CohesionRow], modulus: ModulusSpread
 ) -> list[str]:
@@ -161,11 +182,11 @@ def _not_identified(
     with_it, without = (math.degrees(row.friction_angle_rad) for row in (last, first))
     sentences = [
         f"Cohesion against friction: with {last.cohesion_pa:.0f} Pa in place of 0 the friction angle is "
-        f"{with_it:.1f} in place of {without:.1f} degrees, and the sum of squares {2 * last.cost:.1f} in place "
-        f"of {2 * first.cost:.1f}.",
+        f"{with_it:.1f} in place of {without:.1f} degrees, and the sum of squares {2 * last.cost:.1f} in "
+        f"place of {2 * first.cost:.1f}.",
         "kc, kphi and n: there is one wheel width and one dead weight. The pressure at a depth of one wheel "
-        f"width that carries the measured load is {modulus.rolling_pa / 1e3:.0f} kPa when rolling straight and "
-        f"{modulus.smallest_pa / 1e3:.1f} to {modulus.largest_pa / 1e3:.0f} kPa over nine tenths of all "
+        f"width that carries the measured load is {modulus.rolling_pa / 1e3:.0f} kPa when rolling straight "
+        f"and {modulus.smallest_pa / 1e3:.1f} to {modulus.largest_pa / 1e3:.0f} kPa over nine tenths of all "
         "trials: it goes with how the wheel travels.",
         "How sinkage depends on the load: all trials have one dead weight, and their measured loads differ "
         "by what the guide takes, not by what was put on.",

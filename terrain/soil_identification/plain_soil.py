@@ -34,7 +34,7 @@ SINKAGE_M = 5e-3
 
 
 class PlainFit(NamedTuple):
-    """Values and 95 % intervals over settings of :data:`PARAMETERS`; number of trials that were fitted."""
+    """Values and 95 % intervals of :data:`PARAMETERS`, NaN of what was held, and the number of trials."""
 
     values: dict[str, float]
     intervals: dict[str, tuple[float, float]]
@@ -114,7 +114,10 @@ def fit_plain_soil(
         for counts in bootstrap_counts(len(trials), n_draws, seed)
     ]
     columns = np.array(draws).T if draws else np.full((len(PARAMETERS), 1), np.nan)
-    intervals = [percentile_interval(column) if draws else (math.nan, math.nan) for column in columns]
+    intervals = [
+        percentile_interval(column) if draws and place >= fixed else (math.nan, math.nan)
+        for place, column in enumerate(columns)
+    ]
     return PlainFit(
         dict(zip(PARAMETERS, best.tolist(), strict=True)),
         dict(zip(PARAMETERS, intervals, strict=True)),
