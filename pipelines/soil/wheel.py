@@ -92,11 +92,6 @@ def wheel_result(
     parameters = parameters_of(fit, means, settings.draws, settings.seed, count)
     cohesion = tuple(cohesion_profile(law, means, wheel, COHESIONS_PA))
     modulus = modulus_spread(fit, trials)
-    straight = nearly_straight(means)
-    friction_rad = math.atan(parameters["tan_friction"].value)
-    plain = fit_plain_soil(straight, wheel, friction_rad, settings.draws, settings.seed)
-    soil = plain_soil(np.array(list(plain.values.values())), soil_file.stem)
-    own = nearly_straight(trials)
     slip, angle = (predictions[held]["load"] for held in HELD_OUT)
     result = WheelResult(
         wheel=wheel.name,
@@ -117,9 +112,21 @@ def wheel_result(
         surrogate_angle=misfit(trials, reference["angle"]["load"]),
         checked=None if further is None else _checked(fit, further),
         not_identified=tuple(_not_identified(parameters, cohesion, modulus)),
-        soil=SoilFile(soil_file, plain, misfit(own, plain_prediction(soil, own, wheel))),
+        soil=_soil(trials, wheel, parameters["tan_friction"].value, soil_file, settings),
     )
     return result, Drawn(wheel.name, law.name, trials, slip, angle)
+
+
+def _soil(
+    trials: Trials, wheel: Wheel, tan_friction: float, file: Path, settings: FitSoilSettings
+) -> SoilFile:
+    """Fit the simulator's law, with a friction that is given, to the trials that roll nearly straight."""
+    own = nearly_straight(trials)
+    fit = fit_plain_soil(
+        nearly_straight(setting_means(trials)), wheel, math.atan(tan_friction), settings.draws, settings.seed
+    )
+    soil = plain_soil(np.array(list(fit.values.values())), file.stem)
+    return SoilFile(file, fit, misfit(own, plain_prediction(soil, own, wheel)))
 
 
 def _counter(

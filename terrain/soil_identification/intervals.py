@@ -102,7 +102,7 @@ class CohesionRow(NamedTuple):
 def cohesion_profile(
     law: Law, trials: Trials, wheel: Wheel, cohesions_pa: Sequence[float]
 ) -> list[CohesionRow]:
-    """Return how friction gives way to a cohesion that is given.
+    """Return how much less friction goes with a cohesion that is given.
 
     Parameters
     ----------
