@@ -49,8 +49,6 @@ def fit_soil(
     """
     from pipelines.soil.figures import wheel_figures
     from pipelines.soil.page import soil_page
-    from pipelines.soil.soil_file import soil_yaml
-    from pipelines.soil.wheel import wheel_result
 
     if settings.out.is_file():
         raise ConfigError(f"{settings.out}: is a file; --out names a folder")
@@ -65,26 +63,10 @@ def fit_soil(
     found: list[tuple[WheelResult, Drawn]] = []
     files: list[str] = []
     for robot, own in by_wheel.items():
-        if not own:
-            continue
-        wheel = WHEELS[robot]
-        name = SOIL_NAME.format(wheel=wheel.name)
-        path = settings.out / f"{name}.yaml"
-        others = [run for run in further if run.robot == robot]
-        result, drawn = wheel_result(
-            trials_of(own, wheel),
-            trials_of(others, wheel) if others else None,
-            wheel,
-            path,
-            settings,
-            progress,
-        )
-        text = soil_yaml(
-            name, wheel.name, settings.dataset, result.soil.fit, result.parameters["tan_friction"], result.law
-        )
-        atomic_write(path, text)
-        files.append(str(path))
-        found.append((result, drawn))
+        if own:
+            others = [run for run in further if run.robot == robot]
+            found.append(_one_wheel(robot, own, others, settings, progress))
+            files.append(str(found[-1][0].soil.file))
     results = tuple(result for result, _ in found)
     figures: dict[str, Figure] = {}
     for result, drawn in found:
@@ -103,6 +85,23 @@ def fit_soil(
         files=(*files, str(page)),
         skipped=tuple(skipped),
     )
+
+
+def _one_wheel(
+    robot: str, own: Sequence[RunLog], others: Sequence[RunLog], settings: FitSoilSettings, progress: Progress
+) -> tuple[WheelResult, Drawn]:
+    """Fit one wheel's trials and write its soil."""
+    from pipelines.soil.soil_file import soil_yaml
+    from pipelines.soil.wheel import wheel_result
+
+    wheel = WHEELS[robot]
+    name = SOIL_NAME.format(wheel=wheel.name)
+    path = settings.out / f"{name}.yaml"
+    further = trials_of(others, wheel) if others else None
+    result, drawn = wheel_result(trials_of(own, wheel), further, wheel, path, settings, progress)
+    friction = result.parameters["tan_friction"]
+    atomic_write(path, soil_yaml(name, wheel.name, settings.dataset, result.soil.fit, friction, result.law))
+    return result, drawn
 
 
 def _further(settings: FitSoilSettings) -> list[RunLog]:
