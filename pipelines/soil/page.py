@@ -85,12 +85,24 @@ def verdict(result: WheelResult) -> str:
     return f"{BAR_RATIO:.0%} aimed at; " + "; ".join(parts)
 
 
+def coupling_text(result: WheelResult) -> str:
+    """Return by how much the measured traction is corrected, or that it is not."""
+    ratio, std, n_trials = result.coupling
+    if math.isnan(ratio):
+        return "traction as measured, no trials of a locked wheel along its axle"
+    return (
+        f"traction less {ratio:.3f} ± {std:.3f} of the side force, what {n_trials} trials of a locked wheel "
+        "along its axle show"
+    )
+
+
 def _view(result: WheelResult, images: Mapping[str, Image]) -> WheelView:
     low, high = result.load_range_n
     shallow, deep = result.sinkage_range_m
     lead = (
         f"{result.n_trials} trials at {result.n_settings} settings, load {low:.1f} to {high:.1f} N, sinkage "
-        f"{shallow * 1e3:.0f} to {deep * 1e3:.0f} mm, {result.deeper_than_axle} trials deeper than the axle"
+        f"{shallow * 1e3:.0f} to {deep * 1e3:.0f} mm, {result.deeper_than_axle} trials deeper than the axle; "
+        f"{coupling_text(result)}"
     )
     tables = {
         "By regime, slips left out": result.regimes,

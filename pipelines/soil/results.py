@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
+from terrain.soil_identification.coupling import Coupling
 from terrain.soil_identification.held_out import Misfit
 from terrain.soil_identification.intervals import CohesionRow, ModulusSpread, Parameter
 from terrain.soil_identification.laws import Prediction
@@ -77,6 +78,7 @@ class WheelResult:
     ----------
     wheel, n_trials, n_settings : which, and how much of it
     load_range_n, sinkage_range_m : smallest and largest mean of a trial
+    coupling : of the testbed, by which the measured traction is corrected; its trials are judged nowhere
     deeper_than_axle : number of trials whose sinkage is over the wheel's radius
     laws : compared, in the order in which they were asked for
     law : the last one, whose figures follow
@@ -96,6 +98,7 @@ class WheelResult:
     n_settings: int
     load_range_n: tuple[float, float]
     sinkage_range_m: tuple[float, float]
+    coupling: Coupling
     deeper_than_axle: int
     laws: tuple[LawRow, ...]
     law: str

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from rich.console import Console
 
+from pipelines.reporting.numbers import sentence
 from pipelines.reporting.terminal import compact_table, number_columns, print_lines, text_column
-from pipelines.soil.page import misfit_cells, verdict
+from pipelines.soil.page import coupling_text, misfit_cells, verdict
 from pipelines.soil.results import FitSoilResult, WheelResult
 
 
@@ -14,7 +15,15 @@ def print_soil(result: FitSoilResult, console: Console) -> None:
     for wheel in result.wheels:
         _print_laws(wheel, console)
         _print_parameters(wheel, console)
-        print_lines(console, [verdict(wheel), *wheel.not_identified, f"soil written to {wheel.soil.file}"])
+        print_lines(
+            console,
+            [
+                sentence(coupling_text(wheel)),
+                verdict(wheel),
+                *wheel.not_identified,
+                f"soil written to {wheel.soil.file}",
+            ],
+        )
     print_lines(console, [f"page and pictures in {result.out}", *result.skipped])
 
 

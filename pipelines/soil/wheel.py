@@ -22,6 +22,7 @@ from pipelines.soil.results import (
 from pipelines.soil.settings import FitSoilSettings
 from pipelines.soil.surrogate import surrogate_predictions
 from terrain.records import Array
+from terrain.soil_identification.coupling import Coupling, side_coupling, without_coupling
 from terrain.soil_identification.fit import LawFit, fit_law, predict
 from terrain.soil_identification.held_out import (
     GIVEN,
@@ -41,7 +42,7 @@ from terrain.soil_identification.intervals import (
     modulus_spread,
     parameters_of,
 )
-from terrain.soil_identification.laws import LAWS, SINKAGES, Prediction
+from terrain.soil_identification.laws import LAWS, SINKAGES, Law, Prediction
 from terrain.soil_identification.plain_soil import (
     PARAMETERS,
     fit_plain_soil,
@@ -79,14 +80,20 @@ def wheel_result(
     DataError
         if there are too few settings to fit.
     """
+    coupling = side_coupling(trials)
+    raw, trials = trials, without_coupling(trials, coupling)
+    if further is not None:
+        further = without_coupling(further, coupling)
     means = setting_means(trials)
     count = _counter(trials, wheel, settings, progress)
     rows, predictions = [], {}
     for name in settings.laws:
-        predictor = _simulator_predictor(wheel) if name == "simulator" else law_predictor(LAWS[name], wheel)
+        predictor = (
+            _simulator_predictor(wheel) if name == "simulator" else law_predictor(_law(name, coupling), wheel)
+        )
         predictions = _both(trials, predictor, count)
-        rows.append(_law_row(name, trials, predictions))
-    law = LAWS[settings.laws[-1]]
+        rows.append(_law_row(name, coupling, trials, predictions))
+    law = _law(settings.laws[-1], coupling)
     reference = _both(trials, surrogate_predictions, count)
     fit = fit_law(law, means, wheel)
     parameters = parameters_of(fit, means, settings.draws, settings.seed, count)
@@ -95,11 +102,12 @@ def wheel_result(
     slip, angle = (predictions[held]["load"] for held in HELD_OUT)
     result = WheelResult(
         wheel=wheel.name,
-        n_trials=len(trials),
-        n_settings=len(means),
-        load_range_n=_range(trials.load_n),
-        sinkage_range_m=_range(trials.sinkage_m),
-        deeper_than_axle=int((trials.sinkage_m > wheel.tip_radius_m).sum()),
+        n_trials=len(raw),
+        n_settings=len(setting_means(raw)),
+        load_range_n=_range(raw.load_n),
+        sinkage_range_m=_range(raw.sinkage_m),
+        coupling=coupling,
+        deeper_than_axle=int((raw.sinkage_m > wheel.tip_radius_m).sum()),
         laws=tuple(rows),
         law=law.name,
         parameters=parameters,
@@ -111,7 +119,7 @@ def wheel_result(
         surrogate_slip=misfit(trials, reference["slip"]["load"]),
         surrogate_angle=misfit(trials, reference["angle"]["load"]),
         checked=None if further is None else _checked(fit, further),
-        not_identified=tuple(_not_identified(parameters, cohesion, modulus)),
+        not_identified=tuple(_not_identified(parameters, cohesion, modulus, coupling)),
         soil=_soil(trials, wheel, parameters["tan_friction"].value, soil_file, settings),
     )
     return result, Drawn(wheel.name, law.name, trials, slip, angle)
@@ -127,6 +135,14 @@ def _soil(
     )
     soil = plain_soil(np.array(list(fit.values.values())), file.stem)
     return SoilFile(file, fit, misfit(own, plain_prediction(soil, own, wheel)))
+
+
+def _law(name: str, coupling: Coupling) -> Law:
+    """Return a law, without the coupling among its parameters where the testbed's is known."""
+    law = LAWS[name]
+    if math.isnan(coupling.ratio):
+        return law
+    return law._replace(free=tuple(each for each in law.free if each != "coupling_ratio"))
 
 
 def _counter(
@@ -162,7 +178,9 @@ def _simulator_predictor(wheel: Wheel) -> Predictor:
     return predictions
 
 
-def _law_row(name: str, trials: Trials, predictions: Mapping[str, Mapping[str, Prediction]]) -> LawRow:
+def _law_row(
+    name: str, coupling: Coupling, trials: Trials, predictions: Mapping[str, Mapping[str, Prediction]]
+) -> LawRow:
     straight = np.abs(trials.angle_setting) < AXLE_ANGLE_DEG
     found = {}
     for held, given in predictions.items():
@@ -172,7 +190,7 @@ def _law_row(name: str, trials: Trials, predictions: Mapping[str, Mapping[str, P
         found[held] = HeldOut(by_load, misfit(trials, given["sinkage"]), below, reached)
     if name == "simulator":
         return LawRow(name, SIMULATOR_TEXT, len(PARAMETERS), found["slip"], found["angle"])
-    law = LAWS[name]
+    law = _law(name, coupling)
     n_parameters = len(law.free) + len(SINKAGES[law.sinkage])
     return LawRow(name, law.text, n_parameters, found["slip"], found["angle"])
 
@@ -182,7 +200,10 @@ def _checked(fit: LawFit, further: Trials) -> Checked:
 
 
 def _not_identified(
-    parameters: Mapping[str, Parameter], cohesion: Sequence[CohesionRow], modulus: ModulusSpread
+    parameters: Mapping[str, Parameter],
+    cohesion: Sequence[CohesionRow],
+    modulus: ModulusSpread,
+    coupling: Coupling,
 ) -> list[str]:
     unknown = [name for name, parameter in parameters.items() if not parameter.identified]
     first, last = cohesion[0], cohesion[-1]
@@ -198,6 +219,11 @@ def _not_identified(
         "How sinkage depends on the load: all trials have one dead weight, and their measured loads differ "
         "by what the guide takes, not by what was put on.",
     ]
+    if math.isnan(coupling.ratio):
+        sentences.append(
+            "What the testbed adds to the traction of its side force: there are no trials of a locked wheel "
+            "along its axle."
+        )
     if unknown:
         sentences.append(f"Narrowed to no less than half of the prior, or at a bound: {', '.join(unknown)}.")
     return sentences

@@ -41,7 +41,7 @@ r cos t dt.  The side face presses the wedge of soil before it sideways and up: 
 The amplitude A follows from the load, W = (arc's push up) + lift; A in Pa is the pressure at a depth of one
 wheel width, an apparent modulus, and never below what carries a tenth of the load.  The measured traction
 may hold a fraction x of the side force (``coupling_ratio``): a locked wheel that is dragged along its axle
-has no traction, by symmetry.
+has no traction, by symmetry; where such trials are there, it is not fitted but taken from them.
 """
 
 from __future__ import annotations

@@ -9,6 +9,7 @@ import pytest
 
 from pipelines.runs.datasets import load_runs
 from terrain.errors import DataError
+from terrain.soil_identification.coupling import calibration_rows, side_coupling, without_coupling
 from terrain.soil_identification.fit import fit_law, predict
 from terrain.soil_identification.held_out import (
     folds,
@@ -134,10 +135,27 @@ def test_too_few_settings_and_runs_of_another_kind_are_refused(make_run):
         trials_of([make_run()], WHEEL)
 
 
+def test_the_coupling_of_a_testbed_is_found_by_symmetry_and_taken_off():
+    trials = simulated(6)
+    clean = trials.chosen(~calibration_rows(trials))
+    three = trials.chosen(np.flatnonzero(calibration_rows(trials)).repeat(3))
+    bent = trials.chosen(np.r_[np.arange(len(trials)), np.flatnonzero(calibration_rows(trials)).repeat(2)])
+    bent = replace(bent, pull_n=bent.pull_n - 0.13 * bent.side_n)
+    found = side_coupling(bent)
+    assert found.n_trials == len(three)
+    assert found.ratio == pytest.approx(-0.13, abs=3 * 0.03 * 22.0 / three.side_n[0])
+    back = without_coupling(bent, found)
+    np.testing.assert_allclose(back.pull_n, clean.pull_n, atol=0.04 * 60.0)
+    none = side_coupling(clean)
+    assert (none.n_trials, np.isnan(none.ratio)) == (0, True)
+    assert without_coupling(clean, none) is clean
+
+
 @pytest.mark.parametrize("robot", list(WHEELS))
 def test_measured_trials_are_predicted_at_slips_that_were_held_out(measured, robot):
     runs = [run for run in load_runs(measured("wheel_testbed")) if run.robot == robot]
-    trials = trials_of(runs, WHEELS[robot])
+    measured_trials = trials_of(runs, WHEELS[robot])
+    trials = without_coupling(measured_trials, side_coupling(measured_trials))
     found = held_out_predictions(trials, law_predictor(LAW, WHEELS[robot]), "slip")
     load, sinkage = (misfit(trials, found[given]) for given in ("load", "sinkage"))
     assert max(load.pull_ratio, load.side_ratio, sinkage.pull_ratio, sinkage.side_ratio) < 0.25
