@@ -25,6 +25,7 @@ from pipelines.cli import (
     runs,
     serve,
     slip,
+    soil,
 )
 from terrain.errors import OutsideRegionWarning, TerrainError
 from terrain.files.names import printable
@@ -39,7 +40,7 @@ app = typer.Typer(
 )
 
 GROUPS = (
-    *(runs.app, export.app, estimate.app, features.app, classify.app, slip.app, drive.app),
+    *(runs.app, export.app, estimate.app, features.app, classify.app, slip.app, soil.app, drive.app),
     *(replay.app, serve.app, can.app, label.app),
     *(faults.app, explain.app, reproduce.app, quickstart.app),
 )

@@ -20,11 +20,12 @@ if TYPE_CHECKING:
     from terrain.logs.drive import DriveRobot
     from terrain.robots import Robot
 
-LAYOUTS = ("auto", "runs", "borealtc", "csv", "drive", "drive-recording", "robotino", "can", "bag")
+LAYOUTS = ("auto", "runs", "borealtc", "csv", "drive", "drive-recording", "robotino", "testbed", "can", "bag")
 """``runs``: run folders as this package writes them; ``csv``: any CSV, by a mapping file; ``drive``: the
 files ``samples.csv.gz`` of DRIVE, one a session; ``drive-recording``: its whole recordings; ``robotino``:
-files of three motors and a camera above; ``can``: logs of a CAN bus, by a DBC; ``bag``: MCAP files and ROS 2
-bags, by a mapping or by the types of their topics."""
+files of three motors and a camera above; ``testbed``: ``smooth.csv`` and ``grouser.csv`` of a wheel in a
+box of sand, a trial a row; ``can``: logs of a CAN bus, by a DBC; ``bag``: MCAP files and ROS 2 bags, by a
+mapping or by the types of their topics."""
 
 CAN_ROBOT = "agrimaro"
 """Robot of a log of a CAN bus where none is named."""
@@ -35,8 +36,8 @@ DRIVE_ROBOT = "husky"
 ACCEPTED = (
     "accepted are run folders (run.json), the BorealTC layout (<CLASS>/imu_N.csv and pro_N.csv), "
     "the DRIVE layout (samples.csv.gz, or folders of sessions with one each), its whole recordings "
-    "(<robot>_<terrain>/*.csv.gz), the Robotino layout (camera_params.json over folders of .csv.gz), MCAP "
-    "files and ROS 2 bags, and "
+    "(<robot>_<terrain>/*.csv.gz), the Robotino layout (camera_params.json over folders of .csv.gz), "
+    "the wheel testbed's (smooth.csv, grouser.csv), MCAP files and ROS 2 bags, and "
     "any CSV with a mapping file"
 )
 
@@ -228,7 +229,8 @@ def _readers(
     if not folder.is_dir():
         fault = "is no folder" if folder.exists() else "does not exist"
         raise LogError(f"{folder}: {fault}; {ACCEPTED}")
-    if (mapping is not None) and layout in ("runs", "borealtc", "drive", "drive-recording", "robotino"):
+    of_files = ("runs", "borealtc", "drive", "drive-recording", "robotino", "testbed")
+    if (mapping is not None) and layout in of_files:
         raise ConfigError(f"a mapping file is for CSV files, not for the layout {layout!r}")
     if layout == "can":
         from pipelines.can import dbc, logs
@@ -241,7 +243,7 @@ def _readers(
         from terrain.logs import mapping as by_mapping
 
         return by_mapping.find_runs(folder, by_mapping.load_mapping(mapping))
-    from terrain.logs import borealtc, drive, drive_recording, read, robotino
+    from terrain.logs import borealtc, drive, drive_recording, read, robotino, testbed
 
     # files of a Robotino have the ending of recordings, and a camera's file above them
     recorded = layout == "drive-recording" or (layout == "auto" and robotino.find_root(folder) is None)
@@ -251,6 +253,7 @@ def _readers(
         "drive": drive.find_sessions(folder) if layout in ("auto", "drive") else [],
         "drive-recording": drive_recording.find_recordings(folder) if recorded else [],
         "robotino": robotino.find_runs(folder) if layout in ("auto", "robotino") else [],
+        "testbed": testbed.find_runs(folder) if layout in ("auto", "testbed") else [],
     }
     names = [name for name, readers in found.items() if readers]
     if len(names) > 1:

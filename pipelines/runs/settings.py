@@ -15,11 +15,13 @@ from terrain.files.names import listed, shown
 if TYPE_CHECKING:
     from terrain.records import RunLog
 
-Layout = Literal["auto", "runs", "borealtc", "csv", "drive", "drive-recording", "robotino", "can", "bag"]
+Layout = Literal[
+    "auto", "runs", "borealtc", "csv", "drive", "drive-recording", "robotino", "testbed", "can", "bag"
+]
 """``auto``: found out; ``runs``: run folders as this package writes them; ``csv``: any CSV, by a mapping
 file; ``drive``: the files ``samples.csv.gz`` of DRIVE, one a session; ``drive-recording``: its whole
-recordings; ``robotino``: three motors and a camera above; ``can``: logs of a CAN bus; ``bag``: MCAP files
-and ROS 2 bags."""
+recordings; ``robotino``: three motors and a camera above; ``testbed``: ``smooth.csv`` and ``grouser.csv`` of
+a wheel in a box of sand, a trial a row; ``can``: logs of a CAN bus; ``bag``: MCAP files and ROS 2 bags."""
 
 
 ROBOT_TEXT = (

@@ -105,7 +105,7 @@ def read_columns(
                 )
             counts[SHORT_ROW] += 1
             continue
-        numbers = [_number(cells[place], layout.decimal) for place in places]
+        numbers = [number_in(cells[place], layout.decimal) for place in places]
         for column, place, number in zip(columns, places, numbers, strict=True):
             if number is None:
                 if not repair:
@@ -133,6 +133,30 @@ def read_words(path: Path, column: str) -> list[str]:
     if fast is not None:
         return ["" if cell is None else cell for cell in fast.column(str(place)).to_pylist()]
     return [cells[place] for _, cells in _rows(path, PLAIN) if len(cells) == len(header)]
+
+
+def text_rows(path: Path, columns: Sequence[str]) -> list[tuple[int, tuple[str, ...] | None]]:
+    """Return the number of each row, as an editor shows it, and the texts of its named columns.
+
+    The texts are None of a row that is shorter or longer than the header.
+
+    Parameters
+    ----------
+    path : file whose first line is a header, comma-separated
+    columns : names in the header, in the required order
+
+    Raises
+    ------
+    LogError
+        if the file is missing, empty or no text, or lacks a column or has it twice.
+    """
+    _refuse_too_large(path)
+    header = header_of(path, PLAIN)
+    places = [_place(path, header, column) for column in columns]
+    return [
+        (row, tuple(cells[place] for place in places) if len(cells) == len(header) else None)
+        for row, cells in _rows(path, PLAIN)
+    ]
 
 
 def data_row(path: Path, index: int, *, layout: TextLayout = PLAIN) -> int:
@@ -237,7 +261,14 @@ def _rows(path: Path, layout: TextLayout) -> Iterator[tuple[int, list[str]]]:
         raise _unreadable(path, error) from error
 
 
-def _number(cell: str, decimal: str) -> float | None:
+def number_in(cell: str, decimal: str = ".") -> float | None:
+    """Return the number in a cell: NaN where it is missing, None where it is no number.
+
+    Examples
+    --------
+    >>> number_in(" 1.5 "), number_in("NA"), number_in("wet")
+    (1.5, nan, None)
+    """
     text = cell.strip()
     if text in MISSING:
         return float("nan")

@@ -58,7 +58,7 @@ from terrain.records import Label, RunLog
 MAX_STREAMS = 64
 """Streams of a run; each is held in memory, and several may name one file."""
 
-MAY_BE_UNKNOWN = ("slip", "truth", "control")
+MAY_BE_UNKNOWN = ("slip", "truth", "control", "testbed")
 """Streams of which a channel may hold nothing but NaN."""
 
 

@@ -157,7 +157,9 @@ ESTIMATOR_CHANNELS: tuple[str, ...] = (
 SIGNAL_SETS: tuple[str, ...] = ("imu", "wheels", "currents", "slip", "estimator")
 """Groups of signals that can be switched off by name."""
 
-NO_FEATURES: tuple[str, ...] = ("truth", "commands", "control", "odometry", "state", "lidar", "pose")
+NO_FEATURES: tuple[str, ...] = (
+    *("truth", "commands", "control", "odometry", "state", "lidar", "pose", "testbed"),
+)
 """Streams that no feature is made of."""
 
 _SET_OF_QUANTITY: dict[str, str] = {

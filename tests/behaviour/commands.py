@@ -29,6 +29,7 @@ COMMANDS = (
     ),
     *(
         "learn-slip",
+        "fit-soil",
         "drive",
         "faults",
         "can",
@@ -96,6 +97,26 @@ def foreign_logs() -> dict[str, bytes]:
     files["mapping.yaml"] = MAPPING.encode()
     files["drive/samples.csv.gz"] = gzip.compress(_csv(DRIVE_COLUMNS, _drive_rows()), mtime=0)
     return files
+
+
+TRIAL_COLUMNS = (
+    "trial_num,beta,slip,Vry,avg_Vx,std_Vx,avg_Vry,std_Vry,avg_Fx,std_Fx,avg_Fy,std_Fy,avg_Fz,std_Fz,"
+    "avg_angle,avg_Z,std_Z"
+)
+
+
+def testbed_trials() -> dict[str, bytes]:
+    """Return trials of a wheel testbed at 35 settings, by a formula, and a file with a fault."""
+    rows = []
+    for speed in (0.0, 5.0, 10.0, 20.0, 40.0):
+        for beta in range(0, 91, 15):
+            slip, angle = (speed - 10.0) / max(speed, 10.0), math.radians(beta)
+            pull, side = 12.0 * slip - 4.0 * math.cos(angle), 14.0 * math.sin(angle) * (1.5 - slip)
+            depth = 14.0 + 12.0 * abs(slip) + 20.0 * math.sin(angle)
+            speeds = (1.0, beta, slip, speed, 10.0, 0.1, speed, 0.1)
+            rows.append([*speeds, side, 0.5, -pull, 0.5, -22.0, 0.2, beta, -depth, 0.1])
+    spoilt = [*rows[:2], rows[1]]
+    return {"bed/smooth.csv": _csv(TRIAL_COLUMNS, rows), "spoilt/smooth.csv": _csv(TRIAL_COLUMNS, spoilt)}
 
 
 MAPPING = """\
@@ -358,6 +379,18 @@ CASES: tuple[Case, ...] = (
     Case(
         "explain_trials",
         steps("explain-trials --n 2 --seed 3 --runs 4 --jobs 1"),
+    ),
+    Case(
+        "testbed",
+        steps(
+            "import bed --out trials",
+            refused("import spoilt --out other"),
+            "import spoilt --format testbed --repair --out other",
+            "fit-soil --data trials --out soil --laws simulator,wong_reece --draws 2",
+            refused("fit-soil --data other --out soil --laws bekker"),
+            refused("fit-soil --data trials --out soil --laws mud"),
+        ),
+        testbed_trials,
     ),
     Case("reproduce", steps("reproduce danzi --out page")),
     Case("bench", steps("bench live --robots 1 --seconds 2", refused("bench live --robots 0"))),

@@ -1,0 +1,1 @@
+"""Which law of a wheel in sand, with which numbers, agrees with trials of measured forces and sinkage."""

@@ -1,0 +1,164 @@
+"""Laws fitted to trials: hidden numbers come back, held-out trials are not seen, measured ones agree."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipelines.runs.datasets import load_runs
+from terrain.errors import DataError
+from terrain.soil_identification.coupling import calibration_rows, side_coupling, without_coupling
+from terrain.soil_identification.fit import fit_law, predict
+from terrain.soil_identification.held_out import (
+    folds,
+    held_out_predictions,
+    law_predictor,
+    misfit,
+    regime_misfits,
+)
+from terrain.soil_identification.intervals import cohesion_profile, modulus_spread, parameters_of
+from terrain.soil_identification.laws import LAWS, force_vector, forces_of, sinkage_of
+from terrain.soil_identification.plain_soil import fit_plain_soil, plain_prediction, plain_soil
+from terrain.soil_identification.trials import WHEELS, Trials, setting_means, trials_of
+from terrain.terramechanics.inflow_wheel import FORCE, bulldozing_ratio
+from terrain.terramechanics.travel_sinkage import TRAVEL
+
+WHEEL = WHEELS["testbed_smooth"]
+LAW = LAWS["inflow"]
+SPEEDS_MMPS = (0.0, 3.0, 5.0, 8.0, 10.0, 12.0, 20.0, 40.0, 100.0)
+HIDDEN = {"tan_friction": 0.65, "shear_modulus_m": 0.016, "side_pressure_ratio": 19.0}
+SHALLOW = {"rolling_m": 0.017, "slip_ratio": 0.6}
+
+
+def simulated(seed, noise_ratio=0.03):
+    """Trials of a wheel that the law with hidden numbers describes, with noise of forces and depth."""
+    wheel_mps, angle = (
+        grid.ravel() * 1.0 for grid in np.meshgrid(np.array(SPEEDS_MMPS) / 1e3, np.arange(0.0, 91.0, 15.0))
+    )
+    n = len(wheel_mps)
+    travel = np.full(n, 0.01)
+    slip = (wheel_mps - travel) / np.maximum(wheel_mps, travel)
+    blank = np.zeros(n)
+    trials = Trials(
+        wheel_mps / WHEEL.radius_m,
+        *(travel, np.radians(angle), slip, np.full(n, 22.0), blank, blank, blank),
+        *(wheel_mps * 1e3, angle, np.ones(n)),
+    )
+    rng = np.random.default_rng(seed)
+    depth = np.array([SHALLOW.get(name, value) for name, (value, _) in TRAVEL.items()])
+    force = np.array([HIDDEN.get(name, FORCE[name][0]) for name in LAW.free])
+    found = forces_of(LAW, force, trials, WHEEL, sinkage_of(LAW, depth, trials, WHEEL))
+    spread = noise_ratio * trials.load_n
+    return replace(
+        trials,
+        pull_n=found.pull_n + spread * rng.standard_normal(n),
+        side_n=found.side_n + spread * rng.standard_normal(n),
+        sinkage_m=found.sinkage_m + 5e-4 * rng.standard_normal(n),
+    )
+
+
+def test_hidden_numbers_come_back_within_their_intervals():
+    trials = simulated(0)
+    fit = fit_law(LAW, trials, WHEEL)
+    found = parameters_of(fit, trials, 20, 0)
+    for name, value in (HIDDEN | SHALLOW).items():
+        low, high = found[name].interval
+        half = max((high - low) / 2.0, 1e-3 * value)
+        assert found[name].identified, name
+        assert abs(found[name].value - value) < 1.5 * half, (name, found[name])
+    assert misfit(trials, predict(fit, trials)).pull_ratio < 0.05
+
+
+def test_what_the_trials_do_not_hold_is_marked_so():
+    skid_only = simulated(1)
+    skid_only = skid_only.chosen(skid_only.slip_ratio <= 0.01)
+    found = parameters_of(fit_law(LAW, skid_only, WHEEL), skid_only, 4, 0)
+    assert not found["peak_slip_ratio"].identified
+    assert found["peak_slip_ratio"].informed_ratio == pytest.approx(1.0, abs=0.02)
+    assert found["tan_friction"].identified
+
+
+def test_cohesion_takes_the_place_of_friction():
+    rows = cohesion_profile(LAW, simulated(2), WHEEL, (0.0, 500.0, 1000.0))
+    angles = [row.friction_angle_rad for row in rows]
+    assert angles[0] > angles[1] > angles[2]
+
+
+def test_held_out_trials_are_in_no_fit_and_all_are_predicted():
+    trials = simulated(3)
+    seen = []
+
+    def predictor(training, tested):
+        seen.append((set(training.slip_setting.tolist()), set(tested.slip_setting.tolist())))
+        fit = fit_law(LAWS["wong_reece"], training, WHEEL)
+        return {"load": predict(fit, tested)}
+
+    found = held_out_predictions(trials, predictor, "slip")["load"]
+    assert np.isfinite(found.pull_n).all()
+    assert len(seen) == len(SPEEDS_MMPS)
+    assert all(not training & tested for training, tested in seen)
+    assert sum(tested.sum() for _, tested in folds(trials, "angle")) == len(trials)
+
+
+def test_the_truth_predicts_what_is_held_out_within_its_noise():
+    trials = simulated(4)
+    inside = trials.chosen((trials.angle_setting > 0) & (trials.angle_setting < 90))
+    found = held_out_predictions(inside, law_predictor(LAW, WHEEL), "angle")
+    assert misfit(inside, found["load"]).side_ratio < 0.10
+    assert regime_misfits(inside, found["sinkage"])["rolling, 45 to 75 deg"].pull_ratio < 0.10
+
+
+def test_bulldozing_of_a_tied_law_follows_its_friction():
+    law = LAWS["ishigami"]
+    values = [FORCE[name][0] for name in law.free]
+    vector = dict(zip(FORCE, force_vector(law, np.array(values)), strict=True))
+    assert vector["side_pressure_ratio"] == pytest.approx(bulldozing_ratio(vector["tan_friction"]))
+    assert vector["inflow"] == vector["side_friction_ratio"] == 0.0
+
+
+def test_the_simulators_law_gets_its_own_soil_back():
+    trials = simulated(5)
+    straight = trials.chosen((trials.angle_setting < 31) & (trials.slip_ratio > -0.6))
+    truth = plain_soil(np.array([0.5, 0.012, 8e5, 0.3]), "truth")
+    made = plain_prediction(truth, straight, WHEEL)
+    own = replace(straight, pull_n=made.pull_n, side_n=made.side_n, sinkage_m=made.sinkage_m)
+    found = fit_plain_soil(own, WHEEL).values
+    assert list(found.values()) == pytest.approx([0.5, 0.012, 8e5, 0.3], rel=1e-3)
+
+
+def test_too_few_settings_and_runs_of_another_kind_are_refused(make_run):
+    with pytest.raises(DataError, match="trials have 9 settings of slip and angle, a fit needs 20 or more"):
+        setting_means(simulated(0).chosen(simulated(0).angle_setting == 15.0))
+    with pytest.raises(DataError, match="run SNOW_01: has no stream 'testbed'"):
+        trials_of([make_run()], WHEEL)
+
+
+def test_the_coupling_of_a_testbed_is_found_by_symmetry_and_taken_off():
+    trials = simulated(6)
+    clean = trials.chosen(~calibration_rows(trials))
+    three = trials.chosen(np.flatnonzero(calibration_rows(trials)).repeat(3))
+    bent = trials.chosen(np.r_[np.arange(len(trials)), np.flatnonzero(calibration_rows(trials)).repeat(2)])
+    bent = replace(bent, pull_n=bent.pull_n - 0.13 * bent.side_n)
+    found = side_coupling(bent)
+    assert found.n_trials == len(three)
+    assert found.ratio == pytest.approx(-0.13, abs=3 * 0.03 * 22.0 / three.side_n[0])
+    back = without_coupling(bent, found)
+    np.testing.assert_allclose(back.pull_n, clean.pull_n, atol=0.04 * 60.0)
+    none = side_coupling(clean)
+    assert (none.n_trials, np.isnan(none.ratio)) == (0, True)
+    assert without_coupling(clean, none) is clean
+
+
+@pytest.mark.parametrize("robot", ["testbed_smooth", pytest.param("testbed_grouser", marks=pytest.mark.slow)])
+def test_measured_trials_are_predicted_at_slips_that_were_held_out(measured, robot):
+    runs = [run for run in load_runs(measured("wheel_testbed")) if run.robot == robot]
+    measured_trials = trials_of(runs, WHEELS[robot])
+    trials = without_coupling(measured_trials, side_coupling(measured_trials))
+    found = held_out_predictions(trials, law_predictor(LAW, WHEELS[robot]), "slip")
+    load, sinkage = (misfit(trials, found[given]) for given in ("load", "sinkage"))
+    assert max(load.pull_ratio, load.side_ratio, sinkage.pull_ratio, sinkage.side_ratio) < 0.4
+    assert load.sinkage_m < 0.008
+    spread = modulus_spread(fit_law(LAW, setting_means(trials), WHEELS[robot]), trials)
+    assert spread.smallest_pa < spread.rolling_pa
