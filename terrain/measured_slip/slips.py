@@ -136,21 +136,9 @@ def measured_slip(
     time_s, speeds = wheel_speeds(run, robot)
     path = travelled(run, robot, delay_s)
     start_s = _starts(run.run_id, time_s, path.time_s, window_s, stride_s)
-    end_s, middle_s = start_s + window_s, start_s + window_s / 2
-    rolled = np.concatenate(
-        [
-            np.zeros((1, speeds.shape[1])),
-            np.cumsum(np.diff(time_s)[:, None] * (speeds[1:] + speeds[:-1]) / 2, 0),
-        ]
-    )
-    known = np.isfinite(rolled).all(axis=1)
-    one = np.zeros(int(known.sum()), dtype=np.int64)
-
-    def wheel_rates(first_s: Array, last_s: Array) -> tuple[Array, Array]:
-        rates, std = window_rates(time_s[known], rolled[known], one, first_s, last_s, MIN_SAMPLES, COVERAGE)
-        return rates, std
-
-    u, u_std = wheel_rates(start_s, end_s)
+    end_s = start_s + window_s
+    wheels = _WheelSums(time_s, speeds)
+    u, u_std = wheels.rates(start_s, end_s)
     twist, twist_std = window_rates(
         path.time_s, path.values, path.part, start_s, end_s, MIN_SAMPLES, COVERAGE
     )
@@ -160,12 +148,6 @@ def measured_slip(
     slip, slip_std = _slip(u, u_std, along, along_std, min_speed_mps)
     rolled_twist = rolled_twists(u, robot.wheel_positions_m, direction, robot.sideways and not robot.steered)
     body_slip, body_std, side = _body(rolled_twist, u_std, twist, twist_std, min_speed_mps)
-    first, first_std = wheel_rates(start_s, middle_s)
-    second, second_std = wheel_rates(middle_s, end_s)
-    apart = np.abs(second - first)
-    allowed = np.maximum(
-        STEADY_RATIO * np.abs(u).max(axis=1, keepdims=True), STEADY_STD * np.hypot(first_std, second_std)
-    )
     return MeasuredSlip(
         run_id=run.run_id,
         source=path.source,
@@ -182,10 +164,39 @@ def measured_slip(
         body_slip=body_slip,
         body_slip_std=body_std,
         body_side=side,
-        steady=(apart <= allowed).all(axis=1),
+        steady=wheels.steady(start_s, end_s, u),
         n_jumps=path.n_jumps,
         n_gaps=path.n_gaps,
     )
+
+
+class _WheelSums:
+    """What wheels rolled up to each sample."""
+
+    def __init__(self, time_s: Array, speeds_mps: Array) -> None:
+        steps = np.diff(time_s)[:, None] * (speeds_mps[1:] + speeds_mps[:-1]) / 2
+        rolled = np.concatenate([np.zeros((1, speeds_mps.shape[1])), np.cumsum(steps, axis=0)])
+        known = np.isfinite(rolled).all(axis=1)
+        self._time_s, self._rolled = time_s[known], rolled[known]
+        self._part = np.zeros(int(known.sum()), dtype=np.int64)
+
+    def rates(self, start_s: Array, end_s: Array) -> tuple[Array, Array]:
+        """Return mean speeds (k, wheels) over windows, and their standard deviations."""
+        rates, std = window_rates(
+            self._time_s, self._rolled, self._part, start_s, end_s, MIN_SAMPLES, COVERAGE
+        )
+        return rates, std
+
+    def steady(self, start_s: Array, end_s: Array, speed_mps: Array) -> Array:
+        """Return whether (k,) both halves of a window have the speed of the whole."""
+        middle_s = (start_s + end_s) / 2
+        first, first_std = self.rates(start_s, middle_s)
+        second, second_std = self.rates(middle_s, end_s)
+        allowed = np.maximum(
+            STEADY_RATIO * np.abs(speed_mps).max(axis=1, keepdims=True),
+            STEADY_STD * np.hypot(first_std, second_std),
+        )
+        return np.asarray((np.abs(second - first) <= allowed).all(axis=1))
 
 
 def wheel_speeds(run: RunLog, robot: Robot) -> tuple[Array, Array]:

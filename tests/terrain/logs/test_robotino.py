@@ -110,22 +110,22 @@ def test_the_scale_of_a_rate_is_that_of_its_counts_whatever_the_direction(root):
 
 def test_names_come_from_the_folders(root):
     table = columns_of()
-    for where in ("one_surface/草地/exp01", "two_surfaces/moss_felt/exp02", "weights/felt/exp03"):
+    for where in ("one_surface/草地/exp01", "two_surfaces/moss_cork/exp02", "weights/cork/exp03"):
         write_log(root / f"{where}.csv.gz", table)
     motors = {name: table[name] for name in COLUMNS[:1] + COLUMNS[4:16]}
     write_log(root / "dc_motor/bench.csv.gz", motors, tuple(motors))
-    write_log(root / "weights/felt/uniform_load.csv.gz", motors, tuple(motors))
+    write_log(root / "weights/cork/uniform_load.csv.gz", motors, tuple(motors))
     runs = {run.run_id: run for run in load_runs(root)}
-    assert sorted(runs) == ["dc_motor_bench", "moss_felt_02", "weights_felt_03", "草地_01"]
+    assert sorted(runs) == ["dc_motor_bench", "moss_cork_02", "weights_cork_03", "草地_01"]
     assert runs["草地_01"].terrains == ("草地",)
-    assert (runs["moss_felt_02"].terrains, runs["moss_felt_02"].session) == ((), "moss_felt")
-    assert (runs["weights_felt_03"].terrains, runs["weights_felt_03"].session) == (("felt",), "weights_felt")
+    assert (runs["moss_cork_02"].terrains, runs["moss_cork_02"].session) == ((), "moss_cork")
+    assert (runs["weights_cork_03"].terrains, runs["weights_cork_03"].session) == (("cork",), "weights_cork")
     assert sorted(runs["dc_motor_bench"].streams) == ["wheels"]
 
 
 def test_a_folder_of_the_data_set_is_read_alone(root):
     write_log(root / "one_surface/moss/exp01.csv.gz", columns_of())
-    write_log(root / "one_surface/felt/exp01.csv.gz", columns_of())
+    write_log(root / "one_surface/cork/exp01.csv.gz", columns_of())
     assert [run.run_id for run in load_runs(root / "one_surface" / "moss")] == ["moss_01"]
 
 
