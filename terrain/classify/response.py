@@ -7,9 +7,9 @@ the more likely the better it expects them,
 .. math:: \log p = -\tfrac{\nu + r}{2} \log\left(1 + \tfrac1\nu d^T S^{-1} d\right) - \tfrac12\log|S| ,
 
 a Student distribution of few degrees of freedom, since runs differ more at times than most do.  A terrain is
-distinguished from another only where both are expected to answer differently: what a direction or a speed of driving
-says of the terrain, because some terrains were driven in it and others not, does not count.  A response that
-is missing is left out of d; a robot that stands says nothing.
+distinguished from another only where both are expected to answer differently: what a direction or a speed of
+driving says of the terrain, because some terrains were driven in it and others not, does not count.  A
+response that is missing is left out of d; a robot that stands says nothing.
 
 Probabilities are ``softmax(T log p)``: the temperature T makes the terrains of training windows most likely,
 each expected by the other runs alone.

@@ -1,0 +1,183 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from terrain.errors import ConfigError, DataError
+from terrain.measured_slip.delay import DelayStatus, estimate_delay
+from terrain.measured_slip.rates import window_rates
+from terrain.measured_slip.slips import measured_slip, rolled_twists, spinning_wheels
+from terrain.measured_slip.steps import slip_step
+from terrain.measured_slip.surfaces import surface_slip
+from terrain.measured_slip.travelled import outside_source, travelled
+from terrain.records import RunLog, Stream
+from terrain.robots import load_robot
+from terrain.simulation.planar.run import simulate_planar
+
+HUSKY = load_robot("husky")
+
+
+def test_the_std_of_a_rate_is_its_scatter():
+    rng = np.random.default_rng(0)
+    time_s = np.sort(rng.uniform(0.0, 2.0, 60))
+    part, start, end = np.zeros(60, np.int64), np.zeros(1), np.full(1, 2.0)
+    found = [
+        window_rates(time_s, (0.3 * time_s + rng.normal(0, 0.01, 60))[:, None], part, start, end, 3, 0.5)
+        for _ in range(400)
+    ]
+    rates, std = (np.array([each[i][0, 0] for each in found]) for i in (0, 1))
+    assert rates.mean() == pytest.approx(0.3, abs=4 * rates.std() / 20)
+    assert np.mean(np.abs(rates - 0.3) < 1.96 * std) > 0.9
+    assert np.median(std) == pytest.approx(rates.std(), rel=0.35)  # at most wider, for what is correlated
+
+
+def test_a_window_across_two_parts_or_with_few_samples_has_no_rate():
+    time_s = np.linspace(0.0, 4.0, 41)
+    part = (time_s > 2.0).astype(np.int64)
+    rates, _ = window_rates(
+        time_s, time_s[:, None], part, np.array([0.0, 1.0, 2.1, 3.8]), np.array([2.0, 3.0, 4.0, 5.0]), 4, 0.8
+    )
+    np.testing.assert_allclose(rates[:, 0], [1.0, np.nan, 1.0, np.nan], equal_nan=True)
+
+
+def test_a_jump_and_a_gap_begin_new_parts_and_add_nothing(make_omni_run, robotino):
+    run = make_omni_run(noise_m=0.0, slip=0.0)
+    pose = run.streams["pose"]
+    values = pose.values.copy()
+    values[100:, :2] += 3.0
+    kept = np.r_[0:200, 240:320]
+    broken = replace(
+        run, streams={**run.streams, "pose": Stream(pose.time_s[kept], values[kept], pose.channels)}
+    )
+    found = travelled(broken, robotino)
+    assert (found.n_jumps, found.n_gaps) == (1, 1)
+    assert found.part[[0, 99, 100, 199, 200, -1]].tolist() == [0, 0, 1, 1, 2, 2]
+    length_m = np.hypot(*found.values[-1, :2])
+    assert length_m < 0.1 * 10.0  # what was driven in the gap is not made up
+
+
+@pytest.mark.parametrize("slip", [0.0, 0.1, 0.5, -0.2])
+@pytest.mark.parametrize("twist", [(0.1, 0.0, 0.0), (-0.05, 0.0866, 0.0), (0.2, 0.1, 0.4), (0.0, -0.3, -0.8)])
+def test_a_hidden_slip_of_an_omni_robot_comes_back(make_omni_run, robotino, slip, twist):
+    found = measured_slip(make_omni_run(twist=twist, slip=slip, noise_m=0.0, start_s=-1.0), robotino)
+    steady = found.steady
+    assert steady.sum() >= 7
+    expected = slip if slip >= 0 else slip / (1 - slip)  # relative to the faster, here the ground
+    np.testing.assert_allclose(found.body_slip[steady], expected, atol=2e-3)
+    known = np.isfinite(found.slip_ratio[steady])
+    sign = np.where(found.wheel_speed_mps[steady] < 0, -1.0, 1.0)
+    np.testing.assert_allclose((found.slip_ratio[steady] * sign)[known], expected, atol=5e-3)
+    np.testing.assert_allclose(
+        found.rolled_twist[steady], np.broadcast_to(twist, (steady.sum(), 3)), atol=1e-3
+    )
+
+
+def test_the_stated_std_of_a_slip_covers_its_error(make_omni_run, robotino):
+    inside, errors = [], []
+    for seed in range(12):
+        run = make_omni_run(np.random.default_rng(seed), slip=0.3, noise_m=0.002)
+        found = measured_slip(run, robotino)
+        errors.append((found.body_slip - 0.3)[found.steady])
+        inside.append(np.abs(errors[-1]) < 1.96 * found.body_slip_std[found.steady])
+    assert 0.85 < np.mean(np.concatenate(inside)) <= 1.0
+    assert np.std(np.concatenate(errors)) > 0.002
+
+
+def test_skid_steer_slip_is_measured_against_a_speed_over_ground():
+    twist = np.zeros((800, 3))
+    twist[50:, 0] = 0.8
+    run = simulate_planar(HUSKY, twist, 0, effects={"force_slip_ratio": 2.0, "wheel_radius_ratio": -0.1})
+    found = measured_slip(run, HUSKY)
+    truth = run.streams["truth"]
+    true = 1.0 - np.median(truth.channel("speed_x_mps")[1000:]) / 0.8
+    np.testing.assert_allclose(np.median(found.body_slip[found.steady]), true, atol=0.01)
+    assert true > 0.1
+
+
+def test_a_standing_robot_has_no_slip(make_omni_run, robotino):
+    found = measured_slip(make_omni_run(start_s=7.0), robotino)
+    standing = found.end_s < 6.9
+    assert standing.sum() >= 4
+    assert np.isnan(found.body_slip[standing]).all()
+    assert np.isnan(found.slip_ratio[standing]).all()
+    assert np.isfinite(found.body_slip[found.start_s > 7.4]).all()
+
+
+def test_a_wheel_that_spins_is_named(make_omni_run, robotino):
+    run = make_omni_run(twist=(0.1, 0.0, 0.0), slip=0.1)
+    wheels = run.streams["wheels"]
+    values = wheels.values.copy()
+    column = wheels.channels.index("speed_2_mps")
+    values[:, column] = 0.4
+    lifted = replace(run, streams={**run.streams, "wheels": Stream(wheels.time_s, values, wheels.channels)})
+    assert list(spinning_wheels(measured_slip(lifted, robotino))) == ["2"]
+    assert list(spinning_wheels(measured_slip(run, robotino))) == []
+
+
+@pytest.mark.parametrize("delay_s", [0.0, 0.15, 0.4])
+def test_a_hidden_delay_is_found_within_its_interval(make_omni_run, robotino, delay_s):
+    rng = np.random.default_rng(1)
+    runs = [
+        make_omni_run(
+            rng, start_s=0.5 + 0.2 * i, delay_s=delay_s, slip=0.1 + 0.02 * i, twist=(0.2, 0.1 * i, 0.0)
+        )
+        for i in range(6)
+    ]
+    found = estimate_delay(runs, robotino)
+    assert found.status is DelayStatus.ESTIMATED
+    assert abs(found.delay_s - delay_s) < max(3 * found.std_s, 0.02)
+
+
+def test_a_robot_that_never_changes_its_speed_shows_no_delay(make_omni_run, robotino):
+    runs = [make_omni_run(np.random.default_rng(i), start_s=-1.0) for i in range(3)]
+    assert estimate_delay(runs, robotino).status is DelayStatus.UNDETERMINED
+    assert estimate_delay([RunLog("a", "robotino", {})], robotino).applied_s == 0.0
+
+
+@pytest.mark.parametrize(("before", "after"), [(0.15, 0.5), (0.5, 0.15), (0.3, 0.3)])
+def test_a_step_of_slip_is_dated(make_omni_run, robotino, before, after):
+    run = make_omni_run(slip=before, slip_after=after, change_s=6.0)
+    found = slip_step(run, robotino)
+    if before == after:
+        assert found is None
+    else:
+        assert found.time_s == pytest.approx(6.0, abs=0.3)
+        assert (found.before, found.after) == pytest.approx((before, after), abs=0.03)
+        assert found.crossing_s == pytest.approx(0.25 / (0.1 * (1 - (before + after) / 2)), rel=0.4)
+
+
+def test_wheels_that_do_not_roll_across_determine_a_swerve_twist():
+    positions = load_robot("agrimaro").wheel_positions_m
+    twist = np.array([[0.5, 0.2, 0.3]])
+    ahead = twist[:, :1] - twist[:, 2:] * positions[:, 1]
+    left = twist[:, 1:2] + twist[:, 2:] * positions[:, 0]
+    found = rolled_twists(np.hypot(ahead, left), positions, np.arctan2(left, ahead), False)
+    np.testing.assert_allclose(found, twist, atol=1e-12)
+
+
+def test_a_surface_counts_runs_and_states_how_its_median_carries_over(make_omni_run, robotino):
+    rng = np.random.default_rng(2)
+    slips = rng.normal(0.3, 0.02, 25)
+    runs = [
+        measured_slip(make_omni_run(rng, slip=s, twist=(0.1 * np.cos(i), 0.1 * np.sin(i), 0.0)), robotino)
+        for i, s in enumerate(slips)
+    ]
+    found = surface_slip("cork", runs, np.random.default_rng(0))
+    assert found.slip_ratio == pytest.approx(np.median(slips), abs=0.005)
+    assert found.interval[0] < 0.3 < found.interval[1]
+    assert 0.0 < found.held_out < 0.05
+    assert (found.n_runs, found.spinning) == (25, ())
+
+
+def test_what_cannot_be_measured_is_refused_in_one_sentence(make_omni_run, robotino):
+    run = make_omni_run()
+    blind = replace(run, streams={"wheels": run.streams["wheels"]})
+    with pytest.raises(DataError, match=r"run cork_1: nothing measured the motion from outside"):
+        measured_slip(blind, robotino)
+    assert outside_source(blind) is None
+    with pytest.raises(DataError, match=r"run cork_1: has no wheel speeds"):
+        measured_slip(replace(run, streams={"pose": run.streams["pose"]}), robotino)
+    with pytest.raises(DataError, match=r"share 9\.9\d s, a window takes 20 s"):
+        measured_slip(run, robotino, window_s=20.0)
+    with pytest.raises(ConfigError, match="lengths above zero"):
+        measured_slip(run, robotino, window_s=0.0)
