@@ -29,6 +29,7 @@ from pipelines.crossval.splits import (
     N_FOLDS,
     Fold,
     Samples,
+    driven_at,
     folds_of,
     grouped_samples,
     published_samples,
@@ -219,6 +220,10 @@ def samples_of(runs: Sequence[RunLog], settings: CrossvalSettings) -> Samples:
     DataError
         if runs hold the same measurements and are not to be merged, or the data do not fit the protocol.
     """
+    if settings.speed_mps is not None:
+        runs = [run for run in runs if driven_at(run, *settings.speed_mps)]
+        if not runs:
+            raise DataError(f"no run is driven at a speed of {settings.speed} m/s")
     distinct = distinct_runs(runs, merge=settings.merge_duplicates)
     if settings.protocol == "published":
         samples = published_samples(distinct.runs, settings.rule, settings.signal_sets)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self, get_args
 
-from pydantic import model_validator
+from pydantic import field_validator, model_validator
 
 from pipelines.config.settings import Settings, setting
 from terrain.errors import ConfigError
@@ -108,6 +109,21 @@ class CrossvalSettings(RecipeSettings):
 
     protocol: Protocol = setting("grouped", "Which windows train and which test.")
     extras: bool = setting(True, "Speed alone, slow against fast, learning curve.")
+    speed: str | None = setting(
+        None, "LOW:HIGH in m/s: runs commanded at such a speed alone (or, without commands, driven at)."
+    )
+
+    @property
+    def speed_mps(self) -> tuple[float, float] | None:
+        """Speeds of the runs that are used; None for all."""
+        return None if self.speed is None else _speeds(self.speed)
+
+    @field_validator("speed")
+    @classmethod
+    def _check_speed(cls, text: str | None) -> str | None:
+        if text is not None:
+            _speeds(text)
+        return text
 
     @model_validator(mode="after")
     def _check_protocol(self) -> Self:
@@ -131,6 +147,18 @@ class CrossvalSettings(RecipeSettings):
     def n_repeats(self) -> int:
         """Fold assignments: what was asked for, or what the protocol asks for."""
         return self.repeats or (5 if self.protocol in ("grouped", "leave-regimes-out", "published") else 1)
+
+
+def _speeds(text: str) -> tuple[float, float]:
+    """Read ``LOW:HIGH``."""
+    low, _, high = text.partition(":")
+    try:
+        low_mps, high_mps = float(low), float(high)
+    except ValueError:
+        low_mps = high_mps = 0.0
+    if not 0.0 <= low_mps < high_mps < math.inf:
+        raise ConfigError(f"--speed is {text!r}; LOW:HIGH in m/s is required, as in 0:0.15")
+    return low_mps, high_mps
 
 
 def _rule(settings: RecipeSettings, default_s: float) -> WindowRule:

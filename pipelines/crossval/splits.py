@@ -223,6 +223,29 @@ def regime_of(run: RunLog) -> str:
     return run.run_id
 
 
+def driven_at(run: RunLog, low_mps: float, high_mps: float) -> bool:
+    """Return whether a run's mean commanded speed, or without one that of its wheels, is within bounds.
+
+    Examples
+    --------
+    >>> from terrain.records import Stream
+    >>> commands = Stream([0.0, 1.0], [[0.03, 0.04], [0.03, 0.04]], ("speed_x_mps", "speed_y_mps"))
+    >>> driven_at(RunLog("a", "robotino", {"commands": commands}), 0.0, 0.06)
+    True
+    """
+    commands, wheels = run.streams.get("commands"), run.streams.get("wheels")
+    if commands is not None and "speed_x_mps" in commands.channels:
+        parts = [name for name in ("speed_x_mps", "speed_y_mps") if name in commands.channels]
+        speed = np.linalg.norm(np.column_stack([commands.channel(name) for name in parts]), axis=1)
+    elif wheels is not None and any(name.startswith("speed_") for name in wheels.channels):
+        chosen = [name for name in wheels.channels if name.startswith("speed_")]
+        speed = np.abs(np.column_stack([wheels.channel(name) for name in chosen])).mean(axis=1)
+    else:
+        return False
+    known = speed[np.isfinite(speed)]
+    return bool(known.size and low_mps <= known.mean() <= high_mps)
+
+
 def _leave_one_out(y: Array, run_id: Array, gap: int) -> list[Fold]:
     alone = single_run_classes(y, run_id)
     if len(np.unique(y)) < 2:
