@@ -169,6 +169,7 @@ def _write(found: Measured, robot: Robot, settings: MeasureSlipSettings, progres
             window_s=SHORT_S,
             stride_s=SHORT_STRIDE_S,
             delay_s=found.delays[run.session].applied_s,
+            whole=True,
         )
         write_run(replace(run, streams={**run.streams, "slip": slip.track.as_stream()}), settings.out)
         progress("write runs", done, len(found.runs))

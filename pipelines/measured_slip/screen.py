@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
-
 from rich.console import Console
 
 from pipelines.measured_slip.results import MeasuredSlipResult, PredictionFigures
@@ -93,9 +91,10 @@ def _lines(result: MeasuredSlipResult) -> list[str]:
     if spinning:
         lines.append(f"a wheel spins or lifts in {len(spinning)} runs: {', '.join(spinning[:8])}")
     if result.not_measured:
-        kinds = Counter(text.partition(": ")[2] for text in result.not_measured)
-        reason, n = kinds.most_common(1)[0]
-        lines.append(f"{len(result.not_measured)} of {result.n_runs} runs have no slip, {n} since: {reason}")
+        lines.append(
+            f"{len(result.not_measured)} of {result.n_runs} runs have no slip, the first: "
+            f"{result.not_measured[0]}"
+        )
     if result.out is not None:
         lines.append(f"runs with the stream slip written to {result.out}")
     return [*lines, *result.skipped]

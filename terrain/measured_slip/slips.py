@@ -113,6 +113,7 @@ def measured_slip(
     stride_s: float = STRIDE_S,
     delay_s: float = 0.0,
     min_speed_mps: float = MIN_SPEED_MPS,
+    whole: bool = False,
 ) -> MeasuredSlip:
     """Return the slip of a run over windows, from wheel speeds and a measurement from outside.
 
@@ -123,6 +124,8 @@ def measured_slip(
     window_s, stride_s : length of the windows, and from one to the next
     delay_s : of the outside measurement behind the wheels
     min_speed_mps : slower, in wheel speed and ground speed alike, a wheel or body is standing: no slip
+    whole : windows over all that the wheels were logged, NaN where the motion was not measured; by default
+        they begin and end where both were
 
     Raises
     ------
@@ -135,7 +138,7 @@ def measured_slip(
         raise ConfigError(f"window and stride are {window_s:g} and {stride_s:g} s, lengths above zero needed")
     time_s, speeds = wheel_speeds(run, robot)
     path = travelled(run, robot, delay_s)
-    start_s = _starts(run.run_id, time_s, path.time_s, window_s, stride_s)
+    start_s = _starts(run.run_id, time_s, time_s if whole else path.time_s, window_s, stride_s)
     end_s = start_s + window_s
     wheels = _WheelSums(time_s, speeds)
     u, u_std = wheels.rates(start_s, end_s)
