@@ -19,7 +19,7 @@ def estimate_command(source: RunsSettings, settings: EstimateSettings, json_file
     from pipelines.reporting.json_file import write_json
     from pipelines.reporting.terminal import output_console, progress_bar
 
-    runs, skipped = load(source, settings.robot)
+    runs, skipped = load(source, settings.robot, align=settings.align)
     with progress_bar() as progress:
         result = estimate(runs, settings, skipped, progress)
     print_estimates(result, output_console())

@@ -8,7 +8,7 @@ from pathlib import Path
 from pipelines.estimate.results import EstimateResult
 from pipelines.estimate.settings import EstimateSettings
 from pipelines.reporting.progress import Progress, silent
-from terrain.errors import ConfigError, LogError
+from terrain.errors import ConfigError, DataError, LogError
 from terrain.estimation.ekf.model import Noise
 from terrain.estimation.enriched import enriched
 from terrain.estimation.estimate import Estimate, beside, filter_run, model_and_noise, tuning_of
@@ -16,6 +16,7 @@ from terrain.estimation.summary import summarize
 from terrain.estimation.tuned_noise import TunedNoise, tuned_noise, tuning_runs
 from terrain.extension import correct, corrected, corrected_log
 from terrain.files.atomic import ensure_writable
+from terrain.logs.clock import estimate_clock
 from terrain.logs.write import run_folder, write_run
 from terrain.records import RunLog
 from terrain.robots import Robot, load_robot, packaged_robot
@@ -61,7 +62,34 @@ def estimate(
         if settings.out is not None:
             _write(found, settings.out, settings.figures)
         progress(f"estimate {settings.filter}", done + 1, len(runs))
-    return EstimateResult(settings.filter, tuning, tuned, settings.out, tuple(rows), tuple(skipped))
+    clocks = () if settings.align or settings.filter != "skid" else _apart(runs, given)
+    return EstimateResult(settings.filter, tuning, tuned, settings.out, tuple(rows), tuple(skipped), clocks)
+
+
+MAX_APART_S = 0.1
+"""Between the clocks of wheels and IMU: in more, a robot that begins to turn is seen to turn without wheels,
+and the effective track is wrong by as much as its turns are short."""
+
+
+def _apart(runs: Sequence[RunLog], given: Robot | None) -> tuple[str, ...]:
+    """Return a sentence where wheels and IMU of runs clearly do not share a clock."""
+    offsets_s = {}
+    for run in runs:
+        try:
+            found = estimate_clock(run, track_m=(given or packaged_robot(run.robot)).track_m)
+        except DataError:  # no gyro, or no speeds of two sides
+            continue
+        known = found.status in ("estimated", "offset only")
+        if known and abs(found.offset_s) > max(MAX_APART_S, 3.0 * found.offset_std_s):
+            offsets_s[run.run_id] = found.offset_s
+    if not offsets_s:
+        return ()
+    worst = max(offsets_s, key=lambda name: abs(offsets_s[name]))
+    return (
+        f"the clocks of wheels and IMU are apart in {len(offsets_s)} of {len(runs)} runs, by "
+        f"{offsets_s[worst]:+.2f} s in {worst}: tracks and yaw rates of these are wrong; --align brings the "
+        "wheels onto the IMU's clock",
+    )
 
 
 def _refuse_existing(runs: Sequence[RunLog], out: Path) -> None:

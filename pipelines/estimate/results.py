@@ -20,6 +20,7 @@ class EstimateResult:
     out : folder that the runs were written to, or None
     runs : figures of each run
     skipped : a sentence for each run that a repairing read left out
+    clocks : a sentence where wheels and IMU of runs do not share a clock
     """
 
     filter: str
@@ -28,3 +29,4 @@ class EstimateResult:
     out: Path | None
     runs: tuple[EstimateSummary, ...]
     skipped: tuple[str, ...] = ()
+    clocks: tuple[str, ...] = ()

@@ -33,9 +33,12 @@ def print_estimates(result: EstimateResult, console: Console) -> None:
             console.print(f"{row.run_id}: {_motion_words(row.motion, row.stuck)}", highlight=False)
     if not all(row.slip_observable for row in result.runs):
         console.print(
-            "blind: nothing measured the speed over ground, so the figure is the wheels against themselves, "
-            "and the slip in the tracks is NaN"
+            "blind: this filter takes no measurement of the speed over ground, so the figure is the wheels "
+            "against themselves, and the slip in the tracks is NaN; where logs have poses or a twist by lidar, "
+            "terrain measure-slip measures it"
         )
+    for sentence in result.clocks:
+        console.print(sentence, highlight=False)
     if result.out is not None:
         console.print(f"runs with state and slip written to {result.out}", highlight=False)
     for sentence in result.skipped:

@@ -25,6 +25,7 @@ class EstimateSettings(Settings):
         None, "Runs, by commas, for the tuning 'likelihood'; the first three.", separated=True
     )
     figures: bool = setting(True, "Draw pictures into OUT/figures.")
+    align: bool = setting(False, "Bring the wheel stream onto the IMU's clock where both see the turns.")
 
 
 class CalibrateSettings(Settings):

@@ -207,6 +207,11 @@ def _robot(robot_name: str, model: str | None) -> Robot:
 def _library(robot: Robot, names: Sequence[str] | None) -> tuple[Effect, ...]:
     """Return the effects that may be named, in the order of the catalogue."""
     applicable = library_of(robot.drive)
+    if not applicable:
+        raise ConfigError(
+            f"robot {robot.name}: no effects are known for the drive {robot.drive!r}, so none could be "
+            "named; terrain measure-slip shows its slip by surface and direction"
+        )
     if names is None:
         return applicable
     chosen = [effect_named(name) for name in names]

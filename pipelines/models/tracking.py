@@ -295,8 +295,9 @@ def _log_model(
 
     def save_model(path: str, mlflow_model: Any, **options: Any) -> None:
         mlflow.sklearn.save_model(recipe, path, mlflow_model=mlflow_model, **options)
-        write_numbers(Path(path), recipe)
-        write_onnx(Path(path), recipe)
+        if hasattr(recipe[-1], "numbers"):
+            write_numbers(Path(path), recipe)
+            write_onnx(Path(path), recipe)
         for file, content in files.items():
             (Path(path) / file).write_bytes(content)
         write_info(Path(path), info)

@@ -98,13 +98,14 @@ class LoadedRuns(NamedTuple):
     skipped: list[str]
 
 
-def load(settings: RunsSettings, robot: str | None = None) -> LoadedRuns:
+def load(settings: RunsSettings, robot: str | None = None, *, align: bool = False) -> LoadedRuns:
     """Return the runs, sorted by their id.
 
     Parameters
     ----------
     settings : which runs, and how they are read
     robot : of logs that do not name theirs; that of the settings by default, where they have one
+    align : bring the wheel stream onto the clock of the IMU; as the settings have it, where they do
 
     Raises
     ------
@@ -119,7 +120,7 @@ def load(settings: RunsSettings, robot: str | None = None) -> LoadedRuns:
         layout=settings.layout,
         mapping=settings.mapping,
         repair=settings.repair,
-        align=isinstance(settings, AlignedRunsSettings) and settings.align,
+        align=align or (isinstance(settings, AlignedRunsSettings) and settings.align),
         robot=getattr(settings, "robot", None) if robot is None else robot,
         on_skip=skipped.append,
     )

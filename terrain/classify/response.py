@@ -45,6 +45,12 @@ class ResponseColumns(NamedTuple):
     n_responses: int
 
 
+class ResponseChoice(NamedTuple):
+    """What training rows chose: the temperature of the probabilities."""
+
+    temperature: float
+
+
 class GroupedResponse(ClassifierMixin, BaseEstimator):
     """Terrain by the responses of wheels, with whole runs left out where it judges itself.
 
@@ -57,7 +63,7 @@ class GroupedResponse(ClassifierMixin, BaseEstimator):
     classes_ : (k,) class names
     grounds_ : :class:`~terrain.classify.ground_response.GroundResponse` of each class
     fastest_mps_ : norm of the wheel speeds that counts as 1
-    temperature_ : T
+    temperature_, best_ : T, also as what was chosen
     inner_probability_ : (n, k) of each training row, its own terrain expected by other runs; NaN where the
         robot stands
     """
@@ -114,6 +120,7 @@ class GroupedResponse(ClassifierMixin, BaseEstimator):
             likely[own, j] = log_density(X[own, n_wheels:] - left[own], grounds[j].covariance)
         truth = np.searchsorted(self.classes_, y[rows])
         self.temperature_ = _temperature(likely[rows], truth)
+        self.best_ = ResponseChoice(self.temperature_)
         self.inner_probability_ = _softmax(self.temperature_ * likely)
         return self
 
