@@ -75,7 +75,7 @@ def grouped_samples(
     """Cut windows by the rule, labelled ones only; the group of a window is its run."""
     layout = layout_of(runs, signal_sets, speeds=rule.steady is not None)
     cut = labelled(cut_windows(runs, rule, layout=layout, skip_short=skip_short))
-    return Samples(cut, cut.windows.run_id, rule.overlap)
+    return Samples(cut, cut.windows.run_id, rule.overlap, runs=runs)
 
 
 def labelled(cut: WindowCut) -> WindowCut:
@@ -174,10 +174,17 @@ def folds_of(samples: Samples, protocol: str, repeats: int, seed: int) -> list[F
     return folds
 
 
+def _logs(samples: Samples) -> Sequence[RunLog]:
+    """Return the runs of samples; a store of features does not have them."""
+    if not samples.runs:
+        raise DataError("sessions and regimes are those of run logs; a store of features does not hold them")
+    return samples.runs
+
+
 def _sessions(samples: Samples) -> Array:
     """Return the session (n,) of each window; of a class with one session, a block of its runs."""
     windows = samples.cut.windows
-    sessions = {run.run_id: run.session or run.run_id for run in samples.runs}
+    sessions = {run.run_id: run.session or run.run_id for run in _logs(samples)}
     group = np.array([sessions[name] for name in windows.run_id], dtype=object)
     for terrain in single_run_classes(windows.terrain.astype(str), group.astype(str)):
         rows = np.flatnonzero(windows.terrain == terrain)
@@ -192,7 +199,7 @@ def _sessions(samples: Samples) -> Array:
 
 def _regimes(samples: Samples) -> Array:
     """Return what each window's run (n,) was commanded, or, where that varies or is unknown, its speeds."""
-    regime = {run.run_id: regime_of(run) for run in samples.runs}
+    regime = {run.run_id: regime_of(run) for run in _logs(samples)}
     return np.array([regime[name] for name in samples.cut.windows.run_id], dtype=object)
 
 

@@ -34,7 +34,7 @@ def print_estimates(result: EstimateResult, console: Console) -> None:
     if not all(row.slip_observable for row in result.runs):
         console.print(
             "blind: this filter takes no measurement of the speed over ground, so the figure is the wheels "
-            "against themselves, and the slip in the tracks is NaN; where logs have poses or a twist by lidar, "
+            "against themselves, and the slip in the tracks is NaN; where logs have poses or a lidar twist, "
             "terrain measure-slip measures it"
         )
     for sentence in result.clocks:

@@ -2,17 +2,18 @@ import numpy as np
 import pytest
 
 from features.windows import WindowRule
-from pipelines.crossval.settings import PUBLISHED_WINDOW_S
+from pipelines.crossval.settings import PUBLISHED_WINDOW_S, CrossvalSettings
 from pipelines.crossval.splits import (
     N_FOLDS,
     PARTITION_S,
     PUBLISHED_STRIDE_S,
+    driven_at,
     folds_of,
     grouped_samples,
     published_samples,
 )
-from terrain.errors import DataError
-from terrain.records import Label, RunLog
+from terrain.errors import ConfigError, DataError
+from terrain.records import Label, RunLog, Stream
 
 PUBLISHED_RULE = WindowRule(PUBLISHED_WINDOW_S)
 
@@ -175,3 +176,67 @@ def test_what_cannot_be_split_is_refused(drive, drive_all):
         folds_of(published_samples(few, PUBLISHED_RULE), "published", 1, 0)
     with pytest.raises(DataError, match=r"run r lasts 1\.50 s, shorter than a window of 2 s"):
         samples([drive("r", "GRASS", 0, duration_s=1.5)])
+
+
+def commanded(run_id, terrain, speed_mps, number=0, session="", length_s=9.0):
+    """Return a run at one commanded speed, with wheels that follow it."""
+    rng = np.random.default_rng(number)
+    time_s = np.arange(0.0, length_s, 0.1)
+    speeds = speed_mps + 0.01 * rng.normal(size=(time_s.size, 2))
+    streams = {
+        "wheels": Stream(time_s, speeds, ("speed_left_mps", "speed_right_mps")),
+        "commands": Stream(time_s, np.full((time_s.size, 1), speed_mps), ("speed_x_mps",)),
+    }
+    return RunLog(run_id, "husky", streams, (Label(0.0, length_s, terrain),), session=session)
+
+
+def test_regimes_are_on_one_side_whatever_the_terrain():
+    speeds = [0.2, 0.4, 0.6, 0.8, 1.0, 1.2, 1.4]
+    runs = [
+        commanded(f"{terrain}_{i}", terrain, speed, i)
+        for terrain in ("ICE", "SAND")
+        for i, speed in enumerate(speeds)
+    ]
+    samples = grouped_samples(runs, WindowRule())
+    regime = np.array([name.split("_")[1] for name in samples.cut.windows.run_id])
+    folds = folds_of(samples, "leave-regimes-out", 2, 0)
+    assert len(folds) == 2 * N_FOLDS
+    for fold in folds:
+        assert not set(regime[fold.train]) & set(regime[fold.test])
+    assert_each_tested_once(folds, len(regime), 2)
+
+
+def test_sessions_are_held_out_whole_and_the_only_one_of_a_terrain_by_blocks_of_runs():
+    runs = [commanded(f"a_{i}", "ICE", 0.5, i, session=f"monday_{i % 3}") for i in range(9)]
+    runs += [commanded(f"b_{i}", "SAND", 0.5, i, session="only") for i in range(10)]
+    samples = grouped_samples(runs, WindowRule())
+    windows = samples.cut.windows
+    session = {run.run_id: run.session for run in runs}
+    folds = folds_of(samples, "leave-sessions-out", 1, 0)
+    assert len(folds) == 3 + N_FOLDS
+    for fold in folds:
+        assert not set(windows.run_id[fold.train]) & set(windows.run_id[fold.test])
+        of_test = {session[name] for name in windows.run_id[fold.test]} - {"only"}
+        assert not of_test & {session[name] for name in windows.run_id[fold.train]}
+    assert_each_tested_once(folds, len(windows), 1)
+
+
+def test_runs_without_sessions_are_refused_for_leaving_sessions_out():
+    runs = [commanded(f"{t}_{i}", t, 0.5, i) for t in ("ICE", "SAND") for i in range(5)]
+    with pytest.raises(DataError, match="name no sessions"):
+        folds_of(grouped_samples(runs, WindowRule()), "leave-sessions-out", 1, 0)
+
+
+def test_runs_are_chosen_by_their_commanded_speed():
+    runs = [commanded("slow", "ICE", 0.1), commanded("fast", "ICE", 0.6)]
+    bare = RunLog("bare", "husky", {"wheels": runs[1].streams["wheels"]})
+    assert [driven_at(run, 0.0, 0.2) for run in (*runs, bare, RunLog("none", "husky", {}))] == [
+        True,
+        False,
+        False,
+        False,
+    ]
+    assert driven_at(bare, 0.5, 0.7)
+    for text in ("fast", "0.3:0.1", "-1:2", "0:inf"):
+        with pytest.raises(ConfigError, match="LOW:HIGH"):
+            CrossvalSettings(speed=text)

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from terrain.errors import ConfigError
-from terrain.robots import SkidSteerRobot, SwerveRobot, as_skid_steer, as_swerve, load_robot
+from terrain.robots import SkidSteerRobot, SwerveRobot, as_omni, as_skid_steer, as_swerve, load_robot
 
-AGRIMARO, HUSKY = load_robot("agrimaro"), load_robot("husky")
+AGRIMARO, HUSKY, ROBOTINO = (load_robot(name) for name in ("agrimaro", "husky", "robotino"))
 
 
 def test_the_drive_of_a_description_is_the_type_of_the_robot():
@@ -16,11 +16,12 @@ def test_the_drive_of_a_description_is_the_type_of_the_robot():
     assert not hasattr(HUSKY, "steering")
 
 
-@pytest.mark.parametrize("robot", [AGRIMARO, HUSKY], ids=lambda robot: robot.name)
+@pytest.mark.parametrize("robot", [AGRIMARO, HUSKY, ROBOTINO], ids=lambda robot: robot.name)
 def test_every_drive_type_provides_the_robot_interface(robot):
     n = len(robot.wheels)
     assert robot.wheel_positions_m.shape == (n, 2)
     assert len(robot.rate_channels) == len(robot.wheel_rows) == len(robot.steering_zeros_rad) == n
+    assert robot.wheel_directions_rad.shape == (n,)
     assert len(robot.steer_rows) == (n if robot.steered else 0)
     assert (robot.steering_rate_max_radps > 0) == robot.steered
     assert robot.describes(*robot.sections)
@@ -66,6 +67,7 @@ def test_a_robot_is_pickled_with_its_parts_and_effects():
 def test_robots_of_another_drive_are_refused_with_the_sentence_given():
     assert as_swerve(AGRIMARO, "") is AGRIMARO
     assert as_skid_steer(HUSKY, "") is HUSKY
+    assert as_omni(ROBOTINO, "") is ROBOTINO
     with pytest.raises(ConfigError, match=r"^agrimaro: 'swerve' does not skid$"):
         as_skid_steer(AGRIMARO, "{name}: {drive!r} does not skid")
 
@@ -75,4 +77,31 @@ def test_log_rates_and_rows_are_two_views_of_wheel_speeds():
     motors = AGRIMARO.logged_rates(speed_mps)
     back = AGRIMARO.wheel_speeds_mps(motors / AGRIMARO.motors.reduction_ratio)
     np.testing.assert_allclose(back, speed_mps, rtol=1e-12)
+    motors = ROBOTINO.logged_rates(speed_mps)
+    back = ROBOTINO.wheel_speeds_mps(motors / ROBOTINO.motors.reduction_ratio)
+    np.testing.assert_allclose(back, speed_mps, rtol=1e-12)
     np.testing.assert_array_equal(HUSKY.wheel_speeds_mps(HUSKY.logged_rates(speed_mps[:2])), speed_mps[:2])
+
+
+def test_wheels_of_an_omni_robot_turn_it_to_the_left_from_a_third_of_a_turn_apart():
+    positions, directions = ROBOTINO.wheel_positions_m, ROBOTINO.wheel_directions_rad
+    np.testing.assert_allclose(np.linalg.norm(positions, axis=1), 0.125, rtol=1e-9)
+    lever = positions[:, 0] * np.sin(directions) - positions[:, 1] * np.cos(directions)
+    np.testing.assert_allclose(lever, 0.125, rtol=1e-9)
+    np.testing.assert_allclose(positions.sum(axis=0), 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"track_m": 0.5}, "the footprint allows up to 0.185 m"),
+        ({"track_m": -0.1}, "wheel_distance_m must be above zero"),
+        ({"body": {"com_x_m": 0.2}}, "outside the triangle of the wheels: wheel 2 would carry nothing"),
+    ],
+)
+def test_an_omni_robot_with_impossible_dimensions_is_refused(change, message):
+    robot = ROBOTINO
+    if "body" in change:
+        robot = robot.with_parts(body=replace(robot.body, **change.pop("body")))
+    with pytest.raises(ConfigError, match=message):
+        replace(robot, **change).check_geometry("robot robotino")
