@@ -5,7 +5,9 @@ next, an arc: with the chord :math:`\Delta p` and the turn :math:`\Delta\psi`,
 
 .. math:: \Delta s = \frac{\Delta\psi / 2}{\sin(\Delta\psi / 2)} R(-\bar\psi)\,\Delta p ,
 
-along the axes of the body at the mean heading of the two.  A stream of speeds over ground is integrated.
+along the axes of the body at the mean heading of the two.  A stream of speeds over ground is integrated.  A
+receiver of satellites measures a velocity without a heading: of a robot that cannot drive sideways it is taken
+along its x axis, forward where the wheels roll forward, and the turn by the gyro where there is one.
 The sums of a steady motion are straight lines in time, however tight the turn, so that a slope over a window
 is the mean twist of it (:mod:`~terrain.measured_slip.rates`).
 
@@ -26,11 +28,14 @@ from terrain.kinematics.wheel_velocity import TWIST, point_velocity
 from terrain.records import Array, RunLog, Stream, read_only
 from terrain.robots import Robot
 
-SOURCES: tuple[str, ...] = ("pose", "lidar", "odometry")
+SOURCES: tuple[str, ...] = ("pose", "lidar", "odometry", "gnss")
 """Streams that measure motion from outside, the most direct first."""
 
 POSE: tuple[str, ...] = ("position_x_m", "position_y_m", "yaw_rad")
 """Channels of a stream of poses of the body's origin, in a frame that is fixed and right-handed."""
+
+VELOCITY: tuple[str, ...] = ("velocity_x_mps", "velocity_y_mps")
+"""Channels of a receiver's velocity, east and north."""
 
 MAX_GAP_S = 0.5
 """Longer without a sample, what was driven meanwhile is not known well enough to be summed."""
@@ -76,7 +81,12 @@ def outside_source(run: RunLog) -> str | None:
         stream = run.streams.get(name)
         if stream is None or len(stream) < 2:
             continue
-        needed = {"pose": (POSE,), "lidar": (TWIST,), "odometry": (CAMERA_CHANNELS[:-1], TWIST[:2])}[name]
+        needed = {
+            "pose": (POSE,),
+            "lidar": (TWIST,),
+            "odometry": (CAMERA_CHANNELS[:-1], TWIST[:2]),
+            "gnss": (VELOCITY,),
+        }[name]
         if any(set(channels) <= set(stream.channels) for channels in needed):
             return name
     return None
@@ -94,7 +104,7 @@ def travelled(run: RunLog, robot: Robot, delay_s: float = 0.0) -> Travelled:
     Raises
     ------
     DataError
-        if nothing measured the motion from outside.
+        if nothing measured the motion from outside, or only a receiver whose velocity has no heading did.
 
     Examples
     --------
@@ -116,6 +126,8 @@ def travelled(run: RunLog, robot: Robot, delay_s: float = 0.0) -> Travelled:
     stream = run.streams[name]
     if name == "pose":
         found = _of_poses(stream, _fastest_mps(run))
+    elif name == "gnss":
+        found = _of_twists(name, _receiver_twist(run, robot))
     else:
         found = _of_twists(name, _twist_stream(stream, robot))
     if delay_s == 0.0:
@@ -165,6 +177,28 @@ def _summed(name: str, time_s: Array, steps: Array, gap: Array, jumped: Array) -
     part = np.concatenate([[0], np.cumsum(broken)])
     values = np.concatenate([np.zeros((1, 3)), np.cumsum(np.where(broken[:, None], 0.0, steps), axis=0)])
     return Travelled(name, time_s, values, part, int(jumped.sum()), int(gap.sum()))
+
+
+def _receiver_twist(run: RunLog, robot: Robot) -> Stream:
+    """Return the twist of a body that moves along its x axis, by a receiver's velocity and the gyro."""
+    if robot.sideways:
+        raise DataError(
+            f"run {run.run_id}: the velocity of its receiver has no heading, and robot {robot.name} can drive "
+            "sideways; poses are needed"
+        )
+    gnss, imu = run.streams["gnss"], run.streams.get("imu")
+    speed_mps = np.hypot(*(gnss.channel(name) for name in VELOCITY))
+    wheels = run.streams.get("wheels")
+    if wheels is not None:
+        speeds = [wheels.channel(c) for c in wheels.channels if c.startswith("speed_")]
+        if speeds:
+            speed_mps = speed_mps * np.sign(np.interp(gnss.time_s, wheels.time_s, np.mean(speeds, axis=0)))
+    turn_radps = np.zeros(len(gnss))
+    if imu is not None and "gyro_z_radps" in imu.channels:
+        gyro = imu.channel("gyro_z_radps")
+        known = np.isfinite(gyro)
+        turn_radps = np.interp(gnss.time_s, imu.time_s[known], gyro[known]) if known.any() else turn_radps
+    return Stream(gnss.time_s, np.column_stack([speed_mps, np.zeros(len(gnss)), turn_radps]), TWIST)
 
 
 def _twist_stream(stream: Stream, robot: Robot) -> Stream:

@@ -1,4 +1,4 @@
-"""How fast whole recordings of DRIVE are read: ``pytest tests/benchmarks --benchmark-enable``.
+"""How fast recordings of DRIVE and of a Robotino are read: ``pytest tests/benchmarks --benchmark-enable``.
 
 Required: 100 MB of logs, unpacked, in 10 s on one core.
 """
@@ -34,5 +34,14 @@ def test_recordings_are_read_at_ten_megabytes_a_second(benchmark, packed_recordi
     runs = benchmark.pedantic(load_runs, args=(folder,), rounds=3, warmup_rounds=1)
     assert len({run.session for run in runs}) == n_files
     assert all(np.isfinite(run.streams["wheels"].values[:, :2]).all() for run in runs)
+    if benchmark.enabled:
+        assert n_bytes / MEGABYTE / benchmark.stats["min"] > MIN_MEGABYTES_PER_S
+
+
+def test_runs_of_a_robotino_are_read_at_ten_megabytes_a_second(benchmark, measured):
+    folder = measured("robotino")
+    n_bytes = sum(len(gzip.decompress(path.read_bytes())) for path in folder.rglob("*.csv.gz"))
+    runs = benchmark.pedantic(load_runs, args=(folder,), rounds=3, warmup_rounds=1)
+    assert len(runs) > 100
     if benchmark.enabled:
         assert n_bytes / MEGABYTE / benchmark.stats["min"] > MIN_MEGABYTES_PER_S

@@ -94,6 +94,29 @@ def test_skid_steer_slip_is_measured_against_a_speed_over_ground():
     assert true > 0.1
 
 
+def test_a_receiver_measures_the_slip_of_a_robot_that_cannot_drive_sideways(make_omni_run, robotino):
+    rng = np.random.default_rng(0)
+    time_s = np.arange(0.0, 10.0, 0.1)
+    speeds = np.tile([-0.4, -0.6], (time_s.size, 1))
+    course = 0.3 + 0.2 * time_s
+    velocity = -0.4 * np.column_stack([np.cos(course), np.sin(course)]) + rng.normal(
+        0.0, 0.01, (time_s.size, 2)
+    )
+    streams = {
+        "wheels": Stream(time_s, speeds, ("speed_left_mps", "speed_right_mps")),
+        "gnss": Stream(time_s, velocity, ("velocity_x_mps", "velocity_y_mps")),
+        "imu": Stream(time_s, np.full((time_s.size, 1), 0.2), ("gyro_z_radps",)),
+    }
+    found = measured_slip(RunLog("field", "husky", streams), HUSKY)
+    assert found.source == "gnss"
+    np.testing.assert_allclose(found.body_slip, 0.2, atol=0.02)
+    np.testing.assert_allclose(found.twist[:, 2], 0.2, atol=1e-9)
+    run = make_omni_run()
+    only = replace(run, streams={"wheels": run.streams["wheels"], "gnss": streams["gnss"]})
+    with pytest.raises(DataError, match="has no heading, and robot robotino can drive sideways"):
+        measured_slip(only, robotino)
+
+
 def test_a_standing_robot_has_no_slip(make_omni_run, robotino):
     found = measured_slip(make_omni_run(start_s=7.0), robotino)
     standing = found.end_s < 6.9
