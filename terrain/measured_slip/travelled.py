@@ -5,11 +5,11 @@ next, an arc: with the chord :math:`\Delta p` and the turn :math:`\Delta\psi`,
 
 .. math:: \Delta s = \frac{\Delta\psi / 2}{\sin(\Delta\psi / 2)} R(-\bar\psi)\,\Delta p ,
 
-along the axes of the body at the mean heading of the two.  A stream of speeds over ground is integrated.  A
-receiver of satellites measures a velocity without a heading: of a robot that cannot drive sideways it is taken
-along its x axis, forward where the wheels roll forward, and the turn by the gyro where there is one.
-The sums of a steady motion are straight lines in time, however tight the turn, so that a slope over a window
-is the mean twist of it (:mod:`~terrain.measured_slip.rates`).
+along the axes of the body at the mean heading of the two.  The sums of a steady motion are straight lines in
+time, however tight the turn, so that a slope over a window is the mean twist of it
+(:mod:`~terrain.measured_slip.rates`).  A stream of speeds over ground is integrated.  A receiver of
+satellites measures a velocity without a heading: of a robot that cannot drive sideways it is taken along its
+x axis, forward where the wheels roll forward, and the turn by the gyro where there is one.
 
 Where a measurement pauses or jumps (a camera that loses the robot, a scan that is matched elsewhere) nothing
 is known of what was driven meanwhile: a new part begins, and no window reaches across.
@@ -183,8 +183,8 @@ def _receiver_twist(run: RunLog, robot: Robot) -> Stream:
     """Return the twist of a body that moves along its x axis, by a receiver's velocity and the gyro."""
     if robot.sideways:
         raise DataError(
-            f"run {run.run_id}: the velocity of its receiver has no heading, and robot {robot.name} can drive "
-            "sideways; poses are needed"
+            f"run {run.run_id}: the velocity of its receiver has no heading, and robot {robot.name} can "
+            "drive sideways; poses are needed"
         )
     gnss, imu = run.streams["gnss"], run.streams.get("imu")
     speed_mps = np.hypot(*(gnss.channel(name) for name in VELOCITY))
