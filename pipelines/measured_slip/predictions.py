@@ -63,7 +63,10 @@ def cases_of(runs: Sequence[RunLog], measured: Sequence[MeasuredSlip], window_s:
     starts = {each.run_id: each.start_s[each.steady & np.isfinite(each.body_slip)] for each in measured}
     chosen = [run for run in runs if starts.get(run.run_id, np.empty(0)).size]
     if not chosen:
-        raise DataError("no window has a measured slip in steady motion that could be predicted")
+        raise DataError(
+            f"no window of {window_s:g} s has a measured slip in steady motion that could be predicted; a "
+            "shorter --window may"
+        )
     rule = WindowRule(window_s, None, None)
     layout = layout_of(chosen, ("wheels", "currents"), speeds=True)
     windows = cut_windows(chosen, rule, layout=layout, starts_s=starts, skip_short=True).windows

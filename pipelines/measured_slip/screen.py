@@ -88,6 +88,11 @@ def _predictions(result: MeasuredSlipResult) -> object:
 def _lines(result: MeasuredSlipResult) -> list[str]:
     spinning = [name for row in result.surfaces for name in row.spinning]
     lines = []
+    if not any(row.n_windows for row in result.surfaces):
+        lines.append(
+            f"no window of {result.window_s:g} s is covered by the outside measurement; a shorter "
+            "--window may be"
+        )
     if spinning:
         lines.append(f"a wheel spins or lifts in {len(spinning)} runs: {', '.join(spinning[:8])}")
     if result.not_measured:

@@ -91,8 +91,8 @@ class ChangeDetector:
     >>> time_s = np.arange(0.0, 10.0, 0.05)
     >>> current_a = np.where(time_s < 5.0, 1.0, 2.0)
     >>> found = [detector.update(t, [a], [0.5]) for t, a in zip(time_s, current_a)]
-    >>> [(round(each.change_s, 2), round(each.alarm_s, 2)) for each in found if each is not None]
-    [(5.0, 5.75)]
+    >>> [(float(each.change_s), float(each.alarm_s)) for each in found if each is not None]
+    [(4.75, 5.5)]
     """
 
     def __init__(self, settings: DetectorSettings) -> None:

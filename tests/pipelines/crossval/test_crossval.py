@@ -167,7 +167,7 @@ def test_extras_do_without_what_the_data_lack(drive, settings):
 def test_settings_that_make_no_sense_are_refused():
     with pytest.raises(
         ConfigError,
-        match="--protocol is 'lucky': input should be 'grouped', 'leave-one-run-out', 'leave-terrain-out', ",
+        match="--protocol is 'lucky': input should be 'grouped', 'leave-one-run-out', 'leave-sessions-out', ",
     ):
         CrossvalSettings(protocol="lucky")
     with pytest.raises(ConfigError, match="--repeats is 0: input should be greater than or equal to 1"):

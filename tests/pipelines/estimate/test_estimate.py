@@ -8,11 +8,14 @@ import pytest
 from pipelines.estimate.estimate import estimate
 from pipelines.estimate.settings import EstimateSettings
 from pipelines.reporting.json_file import as_json
+from pipelines.runs.settings import RunsSettings, load
 from terrain.errors import ConfigError, DataError, LogError
 from terrain.estimation.estimate import estimate_run
 from terrain.estimation.filters.tuning import TuningStatus
 from terrain.logs.read import read_run
 from terrain.logs.schema import signal_set_of
+from terrain.logs.write import write_run
+from terrain.records import Label, RunLog, Stream
 from terrain.robots import load_robot
 from terrain.simulation.run import simulate_run
 from terrain.simulation.sensors.gnss import Gnss
@@ -60,7 +63,7 @@ def test_runs_are_written_with_their_tracks_and_pictures(straight, tmp_path):
     result = estimate([straight], settings, progress=lambda *step: seen.append(step))
     assert seen == [("estimate vio15", 1, 1)]
     document = as_json(result)
-    assert set(document) == {"filter", "tuning", "tuned", "out", "runs", "skipped"}
+    assert set(document) == {"filter", "tuning", "tuned", "out", "runs", "skipped", "clocks"}
     assert set(document["runs"][0]) >= KEYS
     assert json.loads(json.dumps(document)) == document
     run = read_run(tmp_path / straight.run_id)
@@ -101,3 +104,23 @@ def test_noise_tuned_with_a_receiver_serves_runs_without_one_and_the_reverse(tra
     result = estimate(runs, tuned_on(runs[training_run].run_id))
     assert all(row.finite and row.slip_observable for row in result.runs)
     assert ["gnss_position" in row.nis for row in result.runs] == [True, False]
+
+
+def test_loggers_that_are_apart_are_named_and_aligned_on_request(tmp_path):
+    """The wheels are logged 0.4 s late: without a word the effective track would be a fiction."""
+    rng = np.random.default_rng(0)
+    time_s = np.arange(0.0, 60.0, 0.02)
+    turn = np.convolve(rng.normal(size=time_s.size), np.ones(50) / 50, "same") * 4.0
+    gyro = Stream(time_s, np.column_stack([turn + 0.01 * rng.normal(size=time_s.size)]), ("gyro_z_radps",))
+    half = 0.5 * 1.5 * turn * 0.5708
+    wheels = Stream(
+        time_s + 0.4, np.column_stack([0.5 - half, 0.5 + half]), ("speed_left_mps", "speed_right_mps")
+    )
+    run = RunLog("late", "husky", {"imu": gyro, "wheels": wheels}, (Label(0.0, 60.0, "ICE"),))
+    result = estimate([run], EstimateSettings(filter="skid"))
+    assert len(result.clocks) == 1
+    assert "apart in 1 of 1 runs, by -0.4" in result.clocks[0]
+    assert estimate([run], EstimateSettings(filter="skid", align=True)).clocks == ()
+    write_run(run, tmp_path)
+    loaded = load(RunsSettings(data=tmp_path), align=True).runs[0]
+    assert loaded.streams["wheels"].time_s[0] == pytest.approx(0.0, abs=0.05)
