@@ -29,7 +29,6 @@ from pipelines.crossval.splits import (
     N_FOLDS,
     Fold,
     Samples,
-    driven_at,
     folds_of,
     grouped_samples,
     published_samples,
@@ -41,6 +40,7 @@ from pipelines.models.recipes import WindowPipeline, feature_matrix
 from pipelines.reporting.numbers import format_counts
 from pipelines.reporting.progress import Progress, silent
 from pipelines.runs.duplicates import distinct_runs
+from pipelines.runs.regimes import driven_at
 from pipelines.support.evaluate import Judged, support_report
 from terrain.classify.folds import single_run_classes
 from terrain.errors import DataError

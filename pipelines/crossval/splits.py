@@ -32,6 +32,7 @@ from features.windows import (
     span_of,
 )
 from pipelines.reporting.numbers import format_counts
+from pipelines.runs.regimes import regime_of
 from terrain.classify.folds import block_groups, single_run_classes, split_runs
 from terrain.errors import ConfigError, DataError
 from terrain.logs.schema import SIGNAL_SETS
@@ -201,56 +202,6 @@ def _regimes(samples: Samples) -> Array:
     """Return what each window's run (n,) was commanded, or, where that varies or is unknown, its speeds."""
     regime = {run.run_id: regime_of(run) for run in _logs(samples)}
     return np.array([regime[name] for name in samples.cut.windows.run_id], dtype=object)
-
-
-def regime_of(run: RunLog) -> str:
-    """Return in words how a run was driven: its command where it has one alone, else its mean wheel speeds.
-
-    Examples
-    --------
-    >>> from terrain.records import Stream
-    >>> commands = Stream([0.0, 1.0], [[0.1, 0.0], [0.1, 0.0]], ("speed_x_mps", "yaw_rate_radps"))
-    >>> regime_of(RunLog("a", "husky", {"commands": commands}))
-    'speed_x_mps 0.1, yaw_rate_radps 0'
-    """
-    for name, decimals in (("commands", 3), ("wheels", 1)):
-        stream = run.streams.get(name)
-        if stream is None:
-            continue
-        chosen = [
-            i for i, channel in enumerate(stream.channels) if name == "commands" or channel[:6] == "speed_"
-        ]
-        values = stream.values[:, chosen]
-        if not chosen or not np.isfinite(values).any(axis=0).all():
-            continue
-        if name == "commands" and np.nanmax(np.ptp(values, axis=0)) > 10.0**-decimals:
-            continue
-        means = [round(float(mean), decimals) + 0.0 for mean in np.nanmean(values, axis=0)]
-        return ", ".join(f"{stream.channels[i]} {mean:g}" for i, mean in zip(chosen, means, strict=True))
-    return run.run_id
-
-
-def driven_at(run: RunLog, low_mps: float, high_mps: float) -> bool:
-    """Return whether a run's mean commanded speed, or without one that of its wheels, is within bounds.
-
-    Examples
-    --------
-    >>> from terrain.records import Stream
-    >>> commands = Stream([0.0, 1.0], [[0.03, 0.04], [0.03, 0.04]], ("speed_x_mps", "speed_y_mps"))
-    >>> driven_at(RunLog("a", "robotino", {"commands": commands}), 0.0, 0.06)
-    True
-    """
-    commands, wheels = run.streams.get("commands"), run.streams.get("wheels")
-    if commands is not None and "speed_x_mps" in commands.channels:
-        parts = [name for name in ("speed_x_mps", "speed_y_mps") if name in commands.channels]
-        speed = np.linalg.norm(np.column_stack([commands.channel(name) for name in parts]), axis=1)
-    elif wheels is not None and any(name.startswith("speed_") for name in wheels.channels):
-        chosen = [name for name in wheels.channels if name.startswith("speed_")]
-        speed = np.abs(np.column_stack([wheels.channel(name) for name in chosen])).mean(axis=1)
-    else:
-        return False
-    known = speed[np.isfinite(speed)]
-    return bool(known.size and low_mps <= known.mean() <= high_mps)
 
 
 def _leave_one_out(y: Array, run_id: Array, gap: int) -> list[Fold]:

@@ -7,11 +7,11 @@ from pipelines.crossval.splits import (
     N_FOLDS,
     PARTITION_S,
     PUBLISHED_STRIDE_S,
-    driven_at,
     folds_of,
     grouped_samples,
     published_samples,
 )
+from pipelines.runs.regimes import driven_at
 from terrain.errors import ConfigError, DataError
 from terrain.records import Label, RunLog, Stream
 
