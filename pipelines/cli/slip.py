@@ -15,13 +15,23 @@ app = typer.Typer()
 
 @command(app, "learn-slip")
 def learn_slip_command(settings: LearnSlipSettings, json_file: Json = None) -> None:
-    """Learn slip curves of labelled runs, and the target slip on each terrain."""
+    """Learn slip of labelled runs, and the target slip on each terrain."""
     from pipelines.reporting.json_file import write_json
     from pipelines.reporting.terminal import output_console, progress_bar
     from pipelines.slip.learn_slip import learn_slip
+    from pipelines.slip.measured import learn_measured
+    from pipelines.slip.measured_screen import print_measured_targets
     from pipelines.slip.screen import print_learned_slip
+    from terrain.robots import load_robot
 
+    robot = load_robot(settings.robot)
     runs, skipped = load(settings)
+    if not robot.steered:
+        with progress_bar() as progress:
+            targets = learn_measured(runs, robot, settings, skipped, progress)
+        print_measured_targets(targets, output_console())
+        write_json(json_file, targets)
+        return
     with progress_bar() as progress:
         result = learn_slip(runs, settings, skipped, progress)
     print_learned_slip(result, output_console())

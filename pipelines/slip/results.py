@@ -174,13 +174,14 @@ def terrain_row(learned: LearnedTerrain, table: SlipTable) -> TerrainRow:
         len(learned.runs_with_bins),
         sum(run.n_samples for run in learned.runs),
         None if math.isnan(learned.slip_range[0]) else _rounded(*learned.slip_range),
-        {state: _target_row(target) for state, target in table.targets[learned.terrain].items()},
+        {state: target_row(target) for state, target in table.targets[learned.terrain].items()},
         entry,
         {law: round(score, 3) for law, score in scores.items()},
     )
 
 
-def _target_row(target: SlipTarget) -> TargetRow:
+def target_row(target: SlipTarget) -> TargetRow:
+    """Return the row of a target."""
     return TargetRow(target.slip_ratio, target.slip_std, target.status, target.source)
 
 

@@ -11,7 +11,7 @@ from pipelines.runs.settings import RunsSettings
 class LearnSlipSettings(RunsSettings):
     """Labelled runs of one robot, and what is written."""
 
-    robot: str = setting(..., "Swerve robot by name, or its YAML file.")
+    robot: str = setting(..., "Robot by name, or its YAML file; slip of others than swerve is measured.")
     out: Path = setting(..., "YAML file of the table of target slips.")
     figures: Path | None = setting(None, "Folder of a page and its pictures; MLflow gets them anyway.")
     seed: int = setting(0, "Of the bootstrap.", ge=0)

@@ -1,0 +1,115 @@
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from pipelines.cli.main import app
+from pipelines.runs.datasets import load_runs
+from pipelines.slip.measured import learn_measured
+from pipelines.slip.settings import LearnSlipSettings
+from terrain.control.measured_table import FEW_RUNS, NO_PEAK
+from terrain.control.slip_table import load_slip_table
+from terrain.errors import DataError
+from terrain.kinematics import omni
+from terrain.kinematics.wheel_speed import with_wheel_speeds
+from terrain.logs.write import write_run
+from terrain.records import Label, RunLog, Stream, TargetStatus
+from terrain.robots import load_robot
+
+ROBOTINO = load_robot("robotino")
+
+
+def run_of(rng, number, terrain, slip, session="", current_a=0.6):
+    time_s = np.arange(0.0, 8.0, 0.031)
+    direction = 0.3 * number
+    wheels = omni.inverse(
+        ROBOTINO.wheel_positions_m,
+        ROBOTINO.wheel_directions_rad,
+        0.1 * np.array([np.cos(direction), np.sin(direction), 0.0]),
+    )
+    far = 0.1 * (1 - slip) * time_s
+    pose = np.column_stack([far * np.cos(direction), far * np.sin(direction), np.zeros(time_s.size)])
+    pose += rng.normal(0.0, 0.0005, pose.shape)
+    rates = np.tile(ROBOTINO.logged_rates(wheels), (time_s.size, 1))
+    values = np.hstack([rates, np.full((time_s.size, 3), current_a)])
+    channels = [f"motor_{i}_radps" for i in (1, 2, 3)] + [f"current_{i}_a" for i in (1, 2, 3)]
+    streams = {
+        "wheels": Stream(time_s, values, channels),
+        "pose": Stream(time_s, pose, ("position_x_m", "position_y_m", "yaw_rad")),
+    }
+    run_id = f"{terrain}_{session}_{number}"
+    labels = (Label(0.0, 8.0, terrain),)
+    return with_wheel_speeds(RunLog(run_id, "robotino", streams, labels, session=session), ROBOTINO)
+
+
+@pytest.fixture(scope="module")
+def runs():
+    rng = np.random.default_rng(0)
+    slips = rng.normal(0.3, 0.02, 12)
+    return [
+        *(run_of(rng, i, "moss", slip, "monday") for i, slip in enumerate(slips)),
+        *(run_of(rng, i, "moss", slip + 0.1, "friday") for i, slip in enumerate(slips)),
+        *(run_of(rng, i, "cork", 0.1) for i in range(2)),
+    ]
+
+
+def settings_of(tmp_path):
+    return LearnSlipSettings(data=tmp_path, robot="robotino", out=tmp_path / "table.yaml")
+
+
+def test_steady_slip_is_learned_and_what_was_not_driven_stays_assumed(tmp_path, runs):
+    result = learn_measured(runs, ROBOTINO, settings_of(tmp_path))
+    table = load_slip_table(tmp_path / "table.yaml", robot="robotino")
+    moss, cork = table.targets["moss"], table.targets["cork"]
+    assert moss["steady"].status is TargetStatus.ESTIMATED
+    assert moss["steady"].slip_ratio == pytest.approx(0.35, abs=0.02)
+    assert 0.0 < moss["steady"].slip_std < 0.05
+    assert moss["steady"].n_runs == 24
+    assert moss["traction"].status is TargetStatus.UNESTIMATED
+    assert moss["traction"].slip_ratio >= moss["steady"].slip_ratio + 0.03
+    assert {target.status for target in cork.values()} == {TargetStatus.UNESTIMATED}
+    assert (result.surfaces["moss"].reason, result.surfaces["cork"].reason) == (NO_PEAK, FEW_RUNS)
+
+
+def test_the_thrust_of_a_point_is_that_of_its_current(tmp_path, runs):
+    motors = ROBOTINO.motors
+    torque = 0.6 * motors.torque_constant_nmpa * motors.reduction_ratio * motors.efficiency_ratio
+    expected = (torque - motors.friction_nm) / ROBOTINO.wheel_radius_m / (ROBOTINO.mass_kg * 9.80665 / 3)
+    found = learn_measured(runs, ROBOTINO, settings_of(tmp_path)).surfaces["moss"]
+    assert found.current_a[0] == pytest.approx(0.6)
+    assert found.thrust_ratio[0] == pytest.approx(expected)
+
+
+def test_what_a_session_costs_another_is_the_difference_that_was_hidden(tmp_path, runs):
+    transfers = learn_measured(runs, ROBOTINO, settings_of(tmp_path)).transfers
+    assert [(each.learned, each.driven) for each in transfers] == [("friday", "monday"), ("monday", "friday")]
+    low, high = transfers[1].interval
+    assert low < 0.1 < high
+    assert high - low < 0.1
+
+
+def test_runs_that_show_no_slip_are_refused(tmp_path, runs):
+    blind = RunLog("a", "robotino", {"wheels": runs[0].streams["wheels"]}, runs[0].labels)
+    with pytest.raises(DataError, match="none of 1 runs has a slip; the first for this: run a: nothing"):
+        learn_measured([blind], ROBOTINO, settings_of(tmp_path))
+    unlabelled = RunLog("a", "robotino", dict(runs[0].streams))
+    with pytest.raises(DataError, match="none of 1 runs has a label"):
+        learn_measured([unlabelled], ROBOTINO, settings_of(tmp_path))
+    with pytest.raises(DataError, match="of the robot 'robotino': a table is learned for one, 'husky'"):
+        learn_measured(runs, load_robot("husky"), settings_of(tmp_path))
+
+
+def test_the_command_writes_the_table_and_says_what_is_assumed(tmp_path, runs):
+    for run in runs:
+        write_run(run, tmp_path / "runs")
+    command = ["learn-slip", "--robot", "robotino", "--data", str(tmp_path / "runs")]
+    found = CliRunner().invoke(app, [*command, "--out", str(tmp_path / "table.yaml")])
+    assert found.exit_code == 0, found.output
+    assert "assumed, not measured" in found.output
+    assert (tmp_path / "table.yaml").is_file()
+
+
+def test_measured_medians_of_the_robotino(tmp_path, measured):
+    loaded = load_runs(measured("robotino") / "one_surface")
+    result = learn_measured(loaded, ROBOTINO, settings_of(tmp_path))
+    slips = {name: row.slip.slip_ratio for name, row in result.surfaces.items()}
+    assert slips == pytest.approx({"table": 0.10, "brown": 0.14, "gray": 0.29, "green": 0.50}, abs=0.03)
