@@ -18,10 +18,11 @@ from terrain.errors import DataError, LogError
 from terrain.files.atomic import ensure_writable
 from terrain.logs.write import run_folder, write_run
 from terrain.measured_slip.delay import Delay, DelayStatus, estimate_delay
+from terrain.measured_slip.rollers import RollerFindings, roller_findings
 from terrain.measured_slip.slips import MeasuredSlip, measured_slip
 from terrain.measured_slip.surfaces import surface_slip
 from terrain.records import RunLog
-from terrain.robots import Robot, load_robot
+from terrain.robots import Robot, as_omni, load_robot
 
 SHORT_S, SHORT_STRIDE_S = 0.5, 0.1
 """Windows of the stream ``slip`` that runs are written with."""
@@ -75,6 +76,7 @@ def measure_slip(
     if settings.predict:
         cases = cases_of(found.runs, found.slips, settings.window_s)
         predicted = predictions(cases, settings.hold_out, settings.seed, progress)
+    rollers = _rollers(found, robot, settings) if settings.rollers else None
     result = MeasuredSlipResult(
         robot=robot.name,
         window_s=settings.window_s,
@@ -84,6 +86,7 @@ def measure_slip(
         delays=found.delays,
         surfaces=surfaces,
         predictions=tuple(predicted),
+        rollers=rollers,
         not_measured=tuple(found.failed),
         n_runs=len(runs),
         out=settings.out,
@@ -146,6 +149,15 @@ def measure(
             failed.append(str(error))
         progress("slip", done, len(runs))
     return Measured(kept, slips, delays, failed)
+
+
+def _rollers(found: Measured, robot: Robot, settings: MeasureSlipSettings) -> RollerFindings:
+    """Return what makes an omni robot slip; sessions are groups that are asked for their load."""
+    as_omni(robot, "robot {name}: drive {drive!r} has no rollers, only 'omni' has")
+    known = [i for i, run in enumerate(found.runs) if _terrain(run)]
+    groups = [found.runs[i].session or _terrain(found.runs[i]) for i in known]
+    surfaces = sorted({_terrain(found.runs[i]) for i in known if not found.runs[i].session})
+    return roller_findings([found.slips[i] for i in known], groups, robot, surfaces, settings.seed)
 
 
 def _terrain(run: RunLog) -> str:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from terrain.measured_slip.delay import Delay
+from terrain.measured_slip.rollers import RollerFindings
 from terrain.measured_slip.surfaces import SurfaceSlip
 
 
@@ -49,6 +50,7 @@ class MeasuredSlipResult:
     delays : of that behind the wheels, by session
     surfaces : by terrain, runs without a label last
     predictions : of slip from currents and wheel speeds; none unless asked for
+    rollers : what makes an omni robot slip; None unless asked for
     not_measured : a sentence for each run without a slip
     n_runs : that were read
     out : folder of the runs with their slip
@@ -64,6 +66,7 @@ class MeasuredSlipResult:
     delays: Mapping[str, Delay]
     surfaces: tuple[SurfaceSlip, ...]
     predictions: tuple[PredictionFigures, ...]
+    rollers: RollerFindings | None
     not_measured: tuple[str, ...]
     n_runs: int
     out: Path | None

@@ -8,6 +8,7 @@ from pipelines.measured_slip.results import MeasuredSlipResult, PredictionFigure
 from pipelines.reporting.numbers import format_counts, format_known
 from pipelines.reporting.terminal import compact_table, number_columns, print_lines, text_column
 from terrain.measured_slip.delay import Delay, DelayStatus
+from terrain.measured_slip.rollers import RollerFindings
 from terrain.measured_slip.surfaces import SurfaceSlip
 
 UNLABELLED = "(no label)"
@@ -27,6 +28,9 @@ def print_measured_slip(result: MeasuredSlipResult, console: Console) -> None:
     print_lines(console, [delay_words(name, delay) for name, delay in result.delays.items()])
     if result.predictions:
         console.print(_predictions(result))
+    if result.rollers is not None:
+        console.print(_rollers(result.rollers))
+        print_lines(console, roller_words(result.rollers))
     print_lines(console, _lines(result))
 
 
@@ -83,6 +87,41 @@ def _predictions(result: MeasuredSlipResult) -> object:
     for row in result.predictions:
         table.add_row(row.held_out, *prediction_cells(row))
     return table
+
+
+def _rollers(found: RollerFindings) -> object:
+    table = compact_table(
+        text_column("surface"),
+        *number_columns("roller friction", "95 %", "slip left", "of"),
+        title="friction of the rollers over the stiffness of traction; rms of the slip of held-out runs",
+    )
+    for name, ratio in found.roller_ratio.items():
+        low, high = found.roller_interval[name]
+        rms = f"{found.held_out_rms[name]:.4f}", f"{found.plain_rms[name]:.4f}"
+        table.add_row(name, f"{ratio:.3f}", f"{low:.3f} to {high:.3f}", *rms)
+    return table
+
+
+def roller_words(found: RollerFindings) -> list[str]:
+    """Return in sentences what of the slip is the robot's own."""
+    loads = ", ".join(
+        f"{load:.3f} ({low:.3f} to {high:.3f})"
+        for load, (low, high) in zip(found.load_ratio, found.load_interval, strict=True)
+    )
+    low, high = found.scale_interval
+    lines = [
+        f"load of the wheels: {loads}",
+        f"slip alike in all directions on all surfaces: {found.scale_error:.3f} ({low:.3f} to {high:.3f}); "
+        "the wheels' radius or the scale of the outside measurement, which these runs do not distinguish",
+    ]
+    for name, other in found.other_loads.items():
+        before, after = found.other_rms[name]
+        text = ", ".join(f"{load:.3f}" for load in other)
+        lines.append(
+            f"{name}: the surface is {found.other_surface[name]}, the load of the wheels {text}, by which "
+            f"{before:.4f} of rms falls to {after:.4f}"
+        )
+    return lines
 
 
 def _lines(result: MeasuredSlipResult) -> list[str]:

@@ -26,6 +26,7 @@ class MeasureSlipSettings(AlignedRunsSettings):
         "Sessions that predictions never train on, by commas; runs without a label never are.",
         separated=True,
     )
+    rollers: bool = setting(False, "Of omni robots: rollers' friction by surface, load of the wheels.")
     seed: int = setting(0, "Deals and draws runs.", ge=0)
 
     @field_validator("delay")

@@ -1,0 +1,104 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from terrain.errors import DataError
+from terrain.kinematics import omni
+from terrain.measured_slip.rollers import roller_findings
+from terrain.measured_slip.slips import measured_slip
+from terrain.simulation.planar.omni_contact import steady_twist
+
+LOADS = {"": np.array([0.25, 0.45, 0.30]), "loaded": np.array([0.40, 0.35, 0.25])}
+RATIO = {"cork": 0.05, "moss": 0.6}
+KAPPA = 0.06
+
+
+def place_of(robot):
+    return robot.wheel_positions_m, robot.wheel_directions_rad
+
+
+def test_free_rollers_drive_what_the_wheels_roll(robotino):
+    twist = np.array([[0.1, 0.2, 0.5], [-0.3, 0.0, 0.0]])
+    wheels = omni.inverse(*place_of(robotino), twist)
+    np.testing.assert_allclose(steady_twist(wheels, *place_of(robotino), LOADS[""], 0.0), twist, atol=1e-12)
+    half = steady_twist(wheels, *place_of(robotino), LOADS[""], 0.0, 0.5)
+    np.testing.assert_allclose(half, twist / 2, atol=1e-12)
+
+
+def test_slip_depends_on_the_direction_and_not_on_the_speed(robotino):
+    wheels = omni.inverse(*place_of(robotino), np.array([[0.1, 0.0, 0.0], [0.0, 0.1, 0.0]]))
+    slow = steady_twist(wheels, *place_of(robotino), LOADS[""], 0.5)
+    np.testing.assert_allclose(steady_twist(3 * wheels, *place_of(robotino), LOADS[""], 0.5), 3 * slow)
+    assert slow[0, 0] < slow[1, 1]  # the wheel that carries most rolls across, driving ahead
+    even = steady_twist(wheels, *place_of(robotino), np.full(3, 1 / 3), 0.5)
+    assert even[0, 0] == pytest.approx(even[1, 1])
+    assert even[0, 0] == pytest.approx(0.1 / 1.5)
+
+
+def test_the_balance_of_forces_holds(robotino):
+    """The other route: forces of each wheel by the law, summed, are none."""
+    positions, direction = place_of(robotino)
+    wheels = np.array([[0.05, -0.08, 0.02]])
+    twist = steady_twist(wheels, positions, direction, LOADS[""], 0.7)[0]
+    total = np.zeros(3)
+    for i, (x, y) in enumerate(positions):
+        along = np.array([np.cos(direction[i]), np.sin(direction[i])])
+        across = np.array([-along[1], along[0]])
+        centre = twist[:2] + twist[2] * np.array([-y, x])
+        force = LOADS[""][i] * ((wheels[0, i] - along @ centre) * along - 0.7 * (across @ centre) * across)
+        total += [*force, x * force[1] - y * force[0]]
+    np.testing.assert_allclose(total, 0.0, atol=1e-15)
+
+
+def slips_of(make_omni_run, robot, rng, surface, group, n=24):
+    """Return measured runs of a robot that moves by the law, each at one speed and direction."""
+    found = []
+    for i in range(n):
+        direction = 2 * np.pi * i / n
+        desired = 0.1 * (1 + i % 3) * np.array([[np.cos(direction), np.sin(direction), 0.0]])
+        wheels = omni.inverse(*place_of(robot), desired)
+        twist = steady_twist(wheels, *place_of(robot), LOADS[group], RATIO[surface], KAPPA)[0]
+        twist[:2] += rng.normal(0.0, 0.003, 2) * np.linalg.norm(desired)
+        run = make_omni_run(rng, twist=tuple(twist), slip=0.0, start_s=-1.0, length_s=6.0)
+        values = run.streams["wheels"].values.copy()
+        names = [run.streams["wheels"].channels.index(f"speed_{w}_mps") for w in robot.wheels]
+        values[:, names] = wheels
+        stream = replace(run.streams["wheels"], values=values)
+        found.append(measured_slip(replace(run, streams={**run.streams, "wheels": stream}), robot))
+    return found
+
+
+@pytest.fixture(scope="module")
+def found(make_omni_run, robotino):
+    rng = np.random.default_rng(0)
+    parts = [("cork", ""), ("moss", ""), ("moss", "loaded")]
+    runs = [slips_of(make_omni_run, robotino, rng, *part) for part in parts]
+    groups = ["cork"] * 24 + ["moss"] * 24 + ["loaded"] * 24
+    return roller_findings([run for part in runs for run in part], groups, robotino, ["cork", "moss"])
+
+
+def test_hidden_rollers_loads_and_scale_come_back_within_their_intervals(found):
+    for name, ratio in RATIO.items():
+        low, high = found.roller_interval[name]
+        assert low - 0.01 < ratio < high + 0.01
+        assert high - low < 0.1
+    for load, (low, high) in zip(LOADS[""], found.load_interval, strict=True):
+        assert low - 0.005 < load < high + 0.005
+    assert found.scale_interval[0] - 0.003 < KAPPA < found.scale_interval[1] + 0.003
+    assert found.held_out_rms["moss"] < 0.2 * found.plain_rms["moss"]
+
+
+def test_a_load_that_was_put_on_and_its_surface_are_named(found):
+    assert found.other_surface == {"loaded": "moss"}
+    np.testing.assert_allclose(found.other_loads["loaded"], LOADS["loaded"], atol=0.02)
+    before, after = found.other_rms["loaded"]
+    assert after < 0.5 * before
+
+
+def test_too_few_runs_are_refused(make_omni_run, robotino):
+    runs = [measured_slip(make_omni_run(), robotino)] * 4
+    with pytest.raises(DataError, match="surface 'cork' has 4 runs in steady motion; 10 are needed"):
+        roller_findings(runs, ["cork"] * 4, robotino, ["cork"])
+    with pytest.raises(DataError, match="no surface is named"):
+        roller_findings(runs, ["cork"] * 4, robotino, [])
