@@ -108,6 +108,7 @@ def test_the_command_writes_the_table_and_says_what_is_assumed(tmp_path, runs):
     assert (tmp_path / "table.yaml").is_file()
 
 
+@pytest.mark.slow
 def test_measured_medians_of_the_robotino(tmp_path, measured):
     loaded = load_runs(measured("robotino") / "one_surface")
     result = learn_measured(loaded, ROBOTINO, settings_of(tmp_path))
