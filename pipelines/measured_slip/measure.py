@@ -21,6 +21,7 @@ from terrain.measured_slip.delay import Delay, DelayStatus, estimate_delay
 from terrain.measured_slip.rollers import RollerFindings, roller_findings
 from terrain.measured_slip.slips import MeasuredSlip, measured_slip
 from terrain.measured_slip.surfaces import surface_slip
+from terrain.measured_slip.wheel_distance import DistanceBound, distance_bound
 from terrain.records import RunLog
 from terrain.robots import Robot, as_omni, load_robot
 
@@ -87,6 +88,7 @@ def measure_slip(
         surfaces=surfaces,
         predictions=tuple(predicted),
         rollers=rollers,
+        distances=_distances(found, robot, settings) if settings.rollers else {},
         not_measured=tuple(found.failed),
         n_runs=len(runs),
         out=settings.out,
@@ -158,6 +160,22 @@ def _rollers(found: Measured, robot: Robot, settings: MeasureSlipSettings) -> Ro
     groups = [found.runs[i].session or _terrain(found.runs[i]) for i in known]
     surfaces = sorted({_terrain(found.runs[i]) for i in known if not found.runs[i].session})
     return roller_findings([found.slips[i] for i in known], groups, robot, surfaces, settings.seed)
+
+
+def _distances(found: Measured, robot: Robot, settings: MeasureSlipSettings) -> dict[str, DistanceBound]:
+    """Return the distance of the wheels by each surface on which the robot's turns follow them."""
+    omni = as_omni(robot, "robot {name}: drive {drive!r} has no rollers, only 'omni' has")
+    bounds = {}
+    for name in sorted({_terrain(run) for run in found.runs if not run.session} - {""}):
+        slips = [
+            slip
+            for run, slip in zip(found.runs, found.slips, strict=True)
+            if _terrain(run) == name and not run.session
+        ]
+        bound = distance_bound(slips, omni, np.random.default_rng(settings.seed))
+        if bound is not None:
+            bounds[name] = bound
+    return bounds
 
 
 def _terrain(run: RunLog) -> str:

@@ -12,7 +12,10 @@ from pipelines.measured_slip.screen import (
     PREDICTION_COLUMNS,
     UNLABELLED,
     delay_words,
+    distance_words,
     prediction_cells,
+    roller_cells,
+    roller_words,
     surface_cells,
 )
 from pipelines.reporting.drawing import png_bytes
@@ -47,6 +50,8 @@ class MeasuredSlipView:
     delays: tuple[str, ...]
     prediction_headings: tuple[str, ...]
     predictions: tuple[tuple[str, ...], ...]
+    rollers: tuple[tuple[str, ...], ...]
+    roller_sentences: tuple[str, ...]
     not_measured: tuple[str, ...]
     images: Mapping[str, Image]
 
@@ -65,6 +70,10 @@ def write_page(
         delays=tuple(delay_words(name, delay) for name, delay in result.delays.items()),
         prediction_headings=("held out", *PREDICTION_COLUMNS),
         predictions=tuple((row.held_out, *prediction_cells(row)) for row in result.predictions),
+        rollers=() if result.rollers is None else tuple(roller_cells(result.rollers)),
+        roller_sentences=()
+        if result.rollers is None
+        else (*roller_words(result.rollers), *distance_words(result)),
         not_measured=result.not_measured,
         images={name: png_image(content, name, CAPTIONS[name]) for name, content in contents.items()},
     )

@@ -9,6 +9,7 @@ from pathlib import Path
 from terrain.measured_slip.delay import Delay
 from terrain.measured_slip.rollers import RollerFindings
 from terrain.measured_slip.surfaces import SurfaceSlip
+from terrain.measured_slip.wheel_distance import DistanceBound
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +52,7 @@ class MeasuredSlipResult:
     surfaces : by terrain, runs without a label last
     predictions : of slip from currents and wheel speeds; none unless asked for
     rollers : what makes an omni robot slip; None unless asked for
+    distances : of the wheels of an omni robot, by surface, where its turns follow the wheels
     not_measured : a sentence for each run without a slip
     n_runs : that were read
     out : folder of the runs with their slip
@@ -67,6 +69,7 @@ class MeasuredSlipResult:
     surfaces: tuple[SurfaceSlip, ...]
     predictions: tuple[PredictionFigures, ...]
     rollers: RollerFindings | None
+    distances: Mapping[str, DistanceBound]
     not_measured: tuple[str, ...]
     n_runs: int
     out: Path | None

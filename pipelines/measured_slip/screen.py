@@ -30,7 +30,7 @@ def print_measured_slip(result: MeasuredSlipResult, console: Console) -> None:
         console.print(_predictions(result))
     if result.rollers is not None:
         console.print(_rollers(result.rollers))
-        print_lines(console, roller_words(result.rollers))
+        print_lines(console, [*roller_words(result.rollers), *distance_words(result)])
     print_lines(console, _lines(result))
 
 
@@ -95,11 +95,23 @@ def _rollers(found: RollerFindings) -> object:
         *number_columns("roller friction", "95 %", "slip left", "of"),
         title="friction of the rollers over the stiffness of traction; rms of the slip of held-out runs",
     )
-    for name, ratio in found.roller_ratio.items():
-        low, high = found.roller_interval[name]
-        rms = f"{found.held_out_rms[name]:.4f}", f"{found.plain_rms[name]:.4f}"
-        table.add_row(name, f"{ratio:.3f}", f"{low:.3f} to {high:.3f}", *rms)
+    for cells in roller_cells(found):
+        table.add_row(*cells)
     return table
+
+
+def roller_cells(found: RollerFindings) -> list[tuple[str, ...]]:
+    """Return the cells of each surface, as screen and page show them."""
+    return [
+        (
+            name,
+            f"{ratio:.3f}",
+            f"{found.roller_interval[name][0]:.3f} to {found.roller_interval[name][1]:.3f}",
+            f"{found.held_out_rms[name]:.4f}",
+            f"{found.plain_rms[name]:.4f}",
+        )
+        for name, ratio in found.roller_ratio.items()
+    ]
 
 
 def roller_words(found: RollerFindings) -> list[str]:
@@ -122,6 +134,15 @@ def roller_words(found: RollerFindings) -> list[str]:
             f"{before:.4f} of rms falls to {after:.4f}"
         )
     return lines
+
+
+def distance_words(result: MeasuredSlipResult) -> list[str]:
+    """Return in sentences how far the wheels of an omni robot are from its middle, by its turns."""
+    return [
+        f"{name}: turns are those of wheels {each.distance_m:.4f} m from the middle that turn without slip "
+        f"({each.interval_m[0]:.4f} to {each.interval_m[1]:.4f}, {each.n_runs} runs)"
+        for name, each in result.distances.items()
+    ]
 
 
 def _lines(result: MeasuredSlipResult) -> list[str]:

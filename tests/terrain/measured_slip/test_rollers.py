@@ -7,6 +7,7 @@ from terrain.errors import DataError
 from terrain.kinematics import omni
 from terrain.measured_slip.rollers import roller_findings
 from terrain.measured_slip.slips import measured_slip
+from terrain.measured_slip.wheel_distance import distance_bound
 from terrain.simulation.planar.omni_contact import steady_twist
 
 LOADS = {"": np.array([0.25, 0.45, 0.30]), "loaded": np.array([0.40, 0.35, 0.25])}
@@ -102,3 +103,33 @@ def test_too_few_runs_are_refused(make_omni_run, robotino):
         roller_findings(runs, ["cork"] * 4, robotino, ["cork"])
     with pytest.raises(DataError, match="no surface is named"):
         roller_findings(runs, ["cork"] * 4, robotino, [])
+
+
+@pytest.mark.parametrize("distance_m", [0.115, 0.125, 0.135])
+def test_a_hidden_distance_of_the_wheels_comes_back_by_small_turns(make_omni_run, robotino, distance_m):
+    rng = np.random.default_rng(3)
+    runs = []
+    for _ in range(20):
+        turn = rng.normal(0.0, 0.05)
+        run = make_omni_run(rng, twist=(0.1, 0.0, turn), slip=0.0, start_s=-1.0)
+        pose = run.streams["pose"]
+        values = pose.values.copy()
+        values[:, 2] *= 0.125 / distance_m
+        seen = replace(pose, values=values)
+        runs.append(measured_slip(replace(run, streams={**run.streams, "pose": seen}), robotino))
+    found = distance_bound(runs, robotino, rng)
+    assert found.interval_m[0] - 0.001 < distance_m < found.interval_m[1] + 0.001
+    assert found.correlation > 0.95
+
+
+def test_turns_that_do_not_follow_the_wheels_say_nothing_of_their_distance(make_omni_run, robotino):
+    rng = np.random.default_rng(4)
+    runs = []
+    for _ in range(8):
+        run = make_omni_run(rng, twist=(0.1, 0.0, rng.normal(0.0, 0.05)), slip=0.0, start_s=-1.0)
+        values = run.streams["pose"].values.copy()
+        values[:, 2] = 0.4 + rng.normal(0.0, 0.05) * run.streams["pose"].time_s
+        seen = replace(run.streams["pose"], values=values)
+        runs.append(measured_slip(replace(run, streams={**run.streams, "pose": seen}), robotino))
+    assert distance_bound(runs, robotino, rng) is None
+    assert distance_bound(runs[:2], robotino, rng) is None
