@@ -16,10 +16,10 @@ from pipelines.measured_slip.screen import (
     prediction_cells,
     roller_cells,
     roller_words,
+    source_words,
     surface_cells,
 )
 from pipelines.reporting.drawing import png_bytes
-from pipelines.reporting.numbers import format_counts
 from pipelines.reporting.pictures import Image, png_image
 from pipelines.reporting.templates import render
 from terrain.files.atomic import atomic_write
@@ -63,8 +63,7 @@ def write_page(
     contents = {name: png_bytes(figure) for name, figure in measured_figures(result, runs, slips).items()}
     view = MeasuredSlipView(
         robot=result.robot,
-        lead=f"{result.n_runs} runs · windows of {result.window_s:g} s · "
-        f"measured by {format_counts(result.sources)}",
+        lead=f"{result.n_runs} runs · windows of {result.window_s:g} s · measured by {source_words(result)}",
         surface_headings=SURFACE_HEADINGS,
         surfaces=tuple((row.terrain or UNLABELLED, *surface_cells(row)) for row in result.surfaces),
         delays=tuple(delay_words(name, delay) for name, delay in result.delays.items()),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from rich.console import Console
 
 from pipelines.measured_slip.results import MeasuredSlipResult, PredictionFigures
-from pipelines.reporting.numbers import format_counts, format_known
+from pipelines.reporting.numbers import format_known
 from pipelines.reporting.terminal import compact_table, number_columns, print_lines, text_column
 from terrain.measured_slip.delay import Delay, DelayStatus
 from terrain.measured_slip.rollers import RollerFindings
@@ -19,8 +19,7 @@ def print_measured_slip(result: MeasuredSlipResult, console: Console) -> None:
     table = compact_table(
         text_column("terrain"),
         *number_columns("runs", "windows", "slip", "95 %", "quartiles", "std", "held out", "wheels", "turn"),
-        title=f"slip of {result.robot} over {result.window_s:g} s, measured by "
-        f"{format_counts(result.sources)}",
+        title=f"slip of {result.robot} over {result.window_s:g} s, measured by {source_words(result)}",
     )
     for row in result.surfaces:
         table.add_row(row.terrain or UNLABELLED, *surface_cells(row))
@@ -32,6 +31,11 @@ def print_measured_slip(result: MeasuredSlipResult, console: Console) -> None:
         console.print(_rollers(result.rollers))
         print_lines(console, [*roller_words(result.rollers), *distance_words(result)])
     print_lines(console, _lines(result))
+
+
+def source_words(result: MeasuredSlipResult) -> str:
+    """Return which streams measured the motion from outside, and in how many runs."""
+    return ", ".join(f"the stream {name} in {n} runs" for name, n in result.sources.items())
 
 
 def surface_cells(row: SurfaceSlip) -> tuple[str, ...]:
