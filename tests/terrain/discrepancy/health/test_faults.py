@@ -22,6 +22,7 @@ from terrain.discrepancy.trials.hidden_effects import hidden_runs
 from terrain.discrepancy.trials.trial import simulation_of
 from terrain.effects import CHANNELS
 from terrain.logs.drive import DriveRobot, find_runs
+from terrain.logs.imu_axes import GYRO_TURNED
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import load_robot
 
@@ -325,9 +326,20 @@ def test_measured_huskies_have_no_fault(measured, folder):
 
 @pytest.mark.slow
 def test_the_gyro_of_the_measured_marmotte_is_turned(measured):
+    """The reader turns it and counts that; turned back, as it is logged, it is found as a fault."""
     robot = DriveRobot("husky", load_robot("husky").wheel_radius_m)  # a sign asks for no size
     runs = [read(repair=True) for read in find_runs(measured("drive_marmotte"), robot)]
-    (fault,) = faults(on_one_clock(runs))
+    assert faults(on_one_clock(runs)) == ()
+    assert all(run.dropped[GYRO_TURNED] == 1 for run in runs)
+    logged = [_with_gyro_turned(run) for run in runs]
+    (fault,) = faults(on_one_clock(logged))
     assert (fault.kind, fault.column, len(fault.run_ids)) == (SIGN, Column.GYRO, len(runs))
     assert "the heading rate with -0.9" in fault.sentence
-    assert latencies_of(repaired(on_one_clock(runs), [fault]), simulation_of(load_robot("husky"))).channels
+    assert latencies_of(repaired(on_one_clock(logged), [fault]), simulation_of(load_robot("husky"))).channels
+
+
+def _with_gyro_turned(run):
+    imu = run.streams["imu"]
+    values = imu.values.copy()
+    values[:, imu.channels.index("gyro_z_radps")] *= -1.0
+    return replace(run, streams={**run.streams, "imu": replace(imu, values=values)})
