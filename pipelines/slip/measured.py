@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
-from typing import NamedTuple
+from dataclasses import replace
 
 import numpy as np
 
@@ -13,71 +11,21 @@ from pipelines.measured_slip.measure import Measured, measure
 from pipelines.measured_slip.settings import MeasureSlipSettings
 from pipelines.reporting.progress import Progress, silent
 from pipelines.runs.datasets import data_digest
-from pipelines.slip.results import TargetRow, target_row
+from pipelines.slip.measured_rows import MeasuredTargets, SurfaceTargets
+from pipelines.slip.results import target_row
 from pipelines.slip.settings import LearnSlipSettings
+from pipelines.slip.transfer import transfers
 from terrain.control.measured_table import measured_table, reason_of
 from terrain.control.slip_table import DRIVE_STATES, write_slip_table
 from terrain.errors import ConfigError, DataError
 from terrain.files.atomic import ensure_writable
 from terrain.measured_slip.operating import operating_points
-from terrain.measured_slip.surfaces import SurfaceSlip, surface_slip
+from terrain.measured_slip.surfaces import surface_slip
 from terrain.records import Array, RunLog
 from terrain.robots import Robot
 
 WINDOW_S, SHORT_WINDOW_S = 2.0, 0.5
 """Windows; short ones where the outside measurement does not cover longer ones, as a lidar's twist."""
-
-
-class SurfaceTargets(NamedTuple):
-    """What was learned of a surface.
-
-    Parameters
-    ----------
-    slip : as measured
-    current_a, thrust_ratio : medians over runs, and their quartiles; NaN where unknown
-    targets : by drive state
-    reason : why there are no more
-    """
-
-    slip: SurfaceSlip
-    current_a: tuple[float, float, float]
-    thrust_ratio: tuple[float, float, float]
-    targets: dict[str, TargetRow]
-    reason: str
-
-
-class Transfer(NamedTuple):
-    """The slip of one session taken for another of the same surface: what it costs.
-
-    Parameters
-    ----------
-    terrain, learned, driven : surface, and the two sessions
-    slip_learned, slip_driven : medians over runs
-    interval : 95 % of their difference, by draws of runs of both
-    """
-
-    terrain: str
-    learned: str
-    driven: str
-    slip_learned: float
-    slip_driven: float
-    interval: tuple[float, float]
-
-
-@dataclass(frozen=True, slots=True)
-class MeasuredTargets:
-    """Targets of a robot by slip that was measured from outside; ``skipped`` has what was not used."""
-
-    table: Path
-    robot: str
-    dataset: str
-    data_digest: str
-    seed: int
-    window_s: float
-    n_runs: int
-    surfaces: dict[str, SurfaceTargets]
-    transfers: tuple[Transfer, ...]
-    skipped: tuple[str, ...]
 
 
 def learn_measured(
@@ -87,7 +35,7 @@ def learn_measured(
     skipped: Sequence[str] = (),
     progress: Progress = silent,
 ) -> MeasuredTargets:
-    """Learn the table of steady targets, and write it.
+    """Learn the table of steady targets, write it, and draw it on request.
 
     Raises
     ------
@@ -99,6 +47,8 @@ def learn_measured(
     if settings.out.is_dir():
         raise ConfigError(f"{settings.out}: is a folder; --out names the file of the table")
     ensure_writable(settings.out.parent)
+    if settings.figures is not None:
+        ensure_writable(settings.figures)
     labelled = [run for run in runs if len(run.terrains) == 1]
     if not labelled:
         raise DataError(f"none of {len(runs)} runs has a label: target slips are learned by terrain")
@@ -112,19 +62,21 @@ def learn_measured(
         places.setdefault(run.terrains[0], []).append(i)
     slips = {name: surface_slip(name, [found.slips[i] for i in places[name]], rng) for name in sorted(places)}
     table = measured_table(list(slips.values()), robot, settings.out.stem)
+    points = {
+        name: operating_points([found.runs[i] for i in here], [found.slips[i] for i in here], robot)
+        for name, here in sorted(places.items())
+    }
     surfaces = {}
     for name, slip in slips.items():
-        here = places[name]
-        points = operating_points([found.runs[i] for i in here], [found.slips[i] for i in here], robot)
         surfaces[name] = SurfaceTargets(
             slip,
-            _quartiles(points.current_a),
-            _quartiles(points.thrust_ratio),
+            _quartiles(points[name].current_a),
+            _quartiles(points[name].thrust_ratio),
             {state: target_row(table.targets[name][state]) for state in DRIVE_STATES},
             reason_of(slip),
         )
     write_slip_table(table, settings.out)
-    return MeasuredTargets(
+    result = MeasuredTargets(
         table=settings.out,
         robot=robot.name,
         dataset=settings.dataset,
@@ -133,9 +85,26 @@ def learn_measured(
         window_s=window_s,
         n_runs=len(found.runs),
         surfaces=surfaces,
-        transfers=tuple(_transfers(found, rng)),
-        skipped=(*skipped, *found.failed),
+        transfers=tuple(transfers(found.runs, found.slips, rng)),
+        figures=(),
+        skipped=(*skipped, *_not_labelled(runs), *found.failed),
     )
+    if settings.figures is not None:
+        from pipelines.slip.measured_page import write_measured_page
+
+        result = replace(result, figures=write_measured_page(result, points, settings.figures))
+    return result
+
+
+def _not_labelled(runs: Sequence[RunLog]) -> list[str]:
+    """Return a sentence for each run that is not on one terrain by its labels."""
+    return [
+        f"run {run.run_id}: is on {len(run.terrains)} terrains: {', '.join(run.terrains)}"
+        if run.terrains
+        else f"run {run.run_id}: has no label"
+        for run in runs
+        if len(run.terrains) != 1
+    ]
 
 
 def _measured(
@@ -160,32 +129,3 @@ def _quartiles(values: Array) -> tuple[float, float, float]:
         return float("nan"), float("nan"), float("nan")
     low, middle, high = np.quantile(known, [0.25, 0.5, 0.75])
     return float(middle), float(low), float(high)
-
-
-def _transfers(found: Measured, rng: np.random.Generator) -> list[Transfer]:
-    """Return what each session shows beside each other one of the same surface."""
-    medians: dict[tuple[str, str], list[float]] = {}
-    for run, slip in zip(found.runs, found.slips, strict=True):
-        known = slip.body_slip[slip.steady & np.isfinite(slip.body_slip)]
-        if known.size:
-            medians.setdefault((run.terrains[0], run.session), []).append(float(np.median(known)))
-    transfers = []
-    for terrain, learned in sorted(medians):
-        for other, driven in sorted(medians):
-            if other == terrain and driven != learned:
-                one, two = np.array(medians[terrain, learned]), np.array(medians[terrain, driven])
-                draws = np.median(rng.choice(two, (1000, two.size)), axis=1) - np.median(
-                    rng.choice(one, (1000, one.size)), axis=1
-                )
-                low, high = np.quantile(draws, [0.025, 0.975])
-                transfers.append(
-                    Transfer(
-                        terrain,
-                        learned,
-                        driven,
-                        float(np.median(one)),
-                        float(np.median(two)),
-                        (float(low), float(high)),
-                    )
-                )
-    return transfers

@@ -13,5 +13,7 @@ class LearnSlipSettings(RunsSettings):
 
     robot: str = setting(..., "Robot by name, or its YAML file; slip of others than swerve is measured.")
     out: Path = setting(..., "YAML file of the table of target slips.")
-    figures: Path | None = setting(None, "Folder of a page and its pictures; MLflow gets them anyway.")
+    figures: Path | None = setting(
+        None, "Folder of a page and its pictures; MLflow gets those of swerve anyway."
+    )
     seed: int = setting(0, "Of the bootstrap.", ge=0)

@@ -21,7 +21,9 @@ from terrain.slip_learning.targets import MIN_ABOVE_BALANCE_SLIP
 MIN_RUNS = 3
 """From fewer, how a median differs from run to run is not known."""
 
-NO_PEAK = "driven at constant speed alone: thrust and slip of the steady drive, no peak of thrust was reached"
+NO_PEAK = (
+    "steady motion alone is used: the slip where thrust balances resistance, which shows no peak of thrust"
+)
 FEW_RUNS = f"fewer than {MIN_RUNS} runs with a slip in steady motion"
 BRAKES = "the median slip is negative: the robot is faster than its wheels, downhill or by a wrong radius"
 

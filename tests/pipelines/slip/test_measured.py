@@ -14,6 +14,7 @@ from terrain.kinematics.wheel_speed import with_wheel_speeds
 from terrain.logs.write import write_run
 from terrain.records import Label, RunLog, Stream, TargetStatus
 from terrain.robots import load_robot
+from terrain.simulation.run import simulate_run
 
 ROBOTINO = load_robot("robotino")
 
@@ -41,6 +42,14 @@ def run_of(rng, number, terrain, slip, session="", current_a=0.6):
     return with_wheel_speeds(RunLog(run_id, "robotino", streams, labels, session=session), ROBOTINO)
 
 
+def without_currents(run):
+    wheels = run.streams["wheels"]
+    names = [name for name in wheels.channels if not name.startswith("current")]
+    values = np.column_stack([wheels.channel(name) for name in names])
+    streams = {**run.streams, "wheels": Stream(wheels.time_s, values, names)}
+    return RunLog(run.run_id, run.robot, streams, run.labels)
+
+
 @pytest.fixture(scope="module")
 def runs():
     rng = np.random.default_rng(0)
@@ -52,8 +61,8 @@ def runs():
     ]
 
 
-def settings_of(tmp_path):
-    return LearnSlipSettings(data=tmp_path, robot="robotino", out=tmp_path / "table.yaml")
+def settings_of(tmp_path, **more):
+    return LearnSlipSettings(data=tmp_path, robot="robotino", out=tmp_path / "table.yaml", **more)
 
 
 def test_steady_slip_is_learned_and_what_was_not_driven_stays_assumed(tmp_path, runs):
@@ -85,6 +94,62 @@ def test_what_a_session_costs_another_is_the_difference_that_was_hidden(tmp_path
     low, high = transfers[1].interval
     assert low < 0.1 < high
     assert high - low < 0.1
+    assert low < transfers[1].difference < high
+    assert transfers[1].difference == -transfers[0].difference
+    assert (transfers[1].n_learned, transfers[1].n_driven) == (12, 12)
+
+
+@pytest.mark.parametrize("n_runs", [1, 2])
+def test_a_session_of_few_runs_has_a_difference_without_an_interval(tmp_path, runs, n_runs):
+    monday, friday = runs[:12], runs[12 : 12 + n_runs]
+    for each in learn_measured([*monday, *friday], ROBOTINO, settings_of(tmp_path)).transfers:
+        assert abs(each.difference) > 0.05
+        assert np.isnan(each.interval).all()
+
+
+@pytest.mark.parametrize(("soil", "least"), [("dry_sand", 0.1), ("clay", 0.01)])
+def test_slip_of_a_simulated_skid_steer_robot_is_that_of_its_truth(tmp_path, soil, least):
+    husky = load_robot("husky")
+    driven = [simulate_run(husky, soil, "straight", 3, i, duration_s=12.0) for i in range(3)]
+    truths = [run.streams["truth"] for run in driven]
+    late = [truth.channel("slip_left_ratio")[truth.time_s > 6.0] for truth in truths]
+    truth = float(np.median(np.concatenate(late)))
+    result = learn_measured(driven, husky, settings_of(tmp_path))
+    (row,) = result.surfaces.values()
+    assert truth > least
+    assert row.slip.slip_ratio == pytest.approx(truth, abs=3 * row.slip.std)
+    assert row.slip.std < 0.02
+    steady = load_slip_table(tmp_path / "table.yaml", robot="husky").targets[soil]["steady"]
+    assert steady.slip_ratio == pytest.approx(row.slip.slip_ratio, abs=1e-4)
+
+
+def test_runs_that_are_not_used_are_named(tmp_path, runs):
+    streams = dict(runs[0].streams)
+    halves = (Label(0.0, 4.0, "moss"), Label(4.0, 8.0, "cork"))
+    others = [RunLog("bare", "robotino", streams), RunLog("both", "robotino", streams, halves)]
+    result = learn_measured([*runs, *others], ROBOTINO, settings_of(tmp_path))
+    assert result.skipped == ("run bare: has no label", "run both: is on 2 terrains: moss, cork")
+    assert result.n_runs == len(runs)
+
+
+@pytest.mark.parametrize("kept", ["motors", "currents", "slip alone"])
+def test_the_page_has_every_surface_and_its_figure(tmp_path, runs, kept):
+    robot = ROBOTINO if kept == "motors" else load_robot("husky")
+    if kept != "motors":
+        runs = [simulate_run(robot, "clay", "straight", 3, i, duration_s=8.0) for i in range(3)]
+    if kept == "slip alone":
+        runs = [without_currents(run) for run in runs]
+    result = learn_measured(runs, robot, settings_of(tmp_path, figures=tmp_path / "page"))
+    names = sorted(path.name for path in (tmp_path / "page").iterdir())
+    assert names == ["operating_points.png", "operating_points.svg", "slip.html"]
+    assert sorted(result.figures) == sorted(str(tmp_path / "page" / name) for name in names)
+    page = (tmp_path / "page" / "slip.html").read_text(encoding="utf-8")
+    for name, row in result.surfaces.items():
+        assert f"<td>{name}</td>" in page
+        assert row.reason in page
+    assert ("From session to session" in page) == bool(result.transfers)
+    known = np.isfinite([row.current_a[0] for row in result.surfaces.values()])
+    assert known.all() == (kept != "slip alone")
 
 
 def test_runs_that_show_no_slip_are_refused(tmp_path, runs):
