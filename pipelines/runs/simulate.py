@@ -85,7 +85,7 @@ def simulate_runs(settings: SimulateSettings, progress: Progress = silent) -> Si
         )
         write_run(run, out)
         run_ids.append(run.run_id)
-        total_s += run.streams["imu"].duration_s
+        total_s += run.streams["imu" if "imu" in run.streams else "wheels"].duration_s
         progress("simulate", done + 1, len(jobs))
     return SimulatedRuns(
         out, robot.name, scenario, settings.seed, effects, len(run_ids), tuple(run_ids), total_s

@@ -74,7 +74,7 @@ def simulate_run(  # noqa: PLR0913 - an entry whose options have defaults
 
     Parameters
     ----------
-    robot : swerve robot with all sections, or skid-steer robot with all but steering
+    robot : swerve robot with all sections, or another robot with all but steering
     terrain : name of a soil or path of its YAML file, or ``course`` for all soils in one run
     scenario : name of a scenario; ``course`` goes with the terrain ``course``, ``six_positions`` (the IMU
         alone, for calibration) with ``bench``; ``slip`` sweeps the slip of the wheels under varied conditions
@@ -166,12 +166,13 @@ def _without_camera(run: RunLog, faults: Faults) -> RunLog:
     """Return the run without the samples of the lost camera."""
     if not faults.camera_lost_s:
         return run
-    seen = run.streams["odometry"]
+    name = "odometry" if "odometry" in run.streams else "pose"
+    seen = run.streams[name]
     kept = ~is_lost(seen.time_s, faults.camera_lost_s)
     left = Stream(seen.time_s[kept], seen.values[kept], seen.channels)
-    streams = {name: left if name == "odometry" else stream for name, stream in run.streams.items()}
+    streams = {**run.streams, name: left}
     if len(left) < 2:
-        del streams["odometry"]
+        del streams[name]
     return RunLog(run.run_id, run.robot, streams, run.labels, run.source)
 
 

@@ -12,7 +12,8 @@ of variation from one run to the next and, of friction and rolling resistance, a
       scatter: {run: 0.08, field: 0.05, source: "Phoon and Kulhawy 1999"}
 
 ``law`` names the traction law: ``janosi`` on ground that shears, ``magic`` on hard ground; a description has
-the numbers of its own law and no other.  Ground that shears may also have Bekker's three numbers of sinkage.
+the numbers of its own law and no other.  Ground that shears may also have Bekker's three numbers of sinkage,
+and any ground ``roller_friction_ratio``, what it does to the rollers of omni wheels.
 The unit of his moduli depends on the exponent n: ``npmn1`` is N/m^(n+1), ``npmn2`` is N/m^(n+2).
 """
 
@@ -37,6 +38,9 @@ LAWS: dict[str, tuple[str, ...]] = {
 """The numbers of each traction law."""
 
 RESISTANCE = ("rolling_resistance_ratio", "slip_sinkage_ratio")
+ROLLERS = "roller_friction_ratio"
+"""Of omni wheels: friction of their rollers over the stiffness of traction; may be left out."""
+
 SINKAGE = ("kc_npmn1", "kphi_npmn2", "sinkage_exponent_ratio")
 
 RANGES: dict[str, tuple[float | None, float]] = {
@@ -53,6 +57,7 @@ RANGES: dict[str, tuple[float | None, float]] = {
     "kc_npmn1": (0.0, 1e9),
     "kphi_npmn2": (None, 1e12),
     "sinkage_exponent_ratio": (None, 2.0),
+    "roller_friction_ratio": (0.0, 20.0),
 }
 """Lowest and highest value of each number, so that an angle in degrees is noticed; None: above zero.
 
@@ -84,6 +89,7 @@ class Soil:
     cohesion_pa, friction_angle_rad, shear_modulus_m : c and phi of Mohr and Coulomb, K of Janosi and Hanamoto
     stiffness_ratio, shape_ratio, peak_friction_ratio, curvature_ratio : B, C, D, E of the Magic Formula
     kc_npmn1, kphi_npmn2, sinkage_exponent_ratio : kc, kphi and n of Bekker
+    roller_friction_ratio : of omni wheels' rollers over the stiffness of traction, with any law
     scatter : how numbers differ from run to run and along a run
     """
 
@@ -102,6 +108,7 @@ class Soil:
     kc_npmn1: float = math.nan
     kphi_npmn2: float = math.nan
     sinkage_exponent_ratio: float = math.nan
+    roller_friction_ratio: float = math.nan
     scatter: tuple[Scatter, ...] = ()
 
     @property
@@ -187,6 +194,7 @@ def soil_from(file: str, described: Any) -> Soil:
         raise ConfigError(f"{file}: law {law!r} is unknown: use one of {', '.join(LAWS)}")
     sinks = law == "janosi" and any(key in described for key in SINKAGE)
     parameters = [*RESISTANCE, "roughness_m3", *LAWS[law], *(SINKAGE if sinks else ())]
+    parameters += [ROLLERS] if ROLLERS in described else []
     check_keys(file, described, ["name", "law", *parameters])
     numbers = {key: _parameter(f"{file}: {key}", key, described[key]) for key in parameters}
     scatter = tuple(

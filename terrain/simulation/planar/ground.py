@@ -32,6 +32,7 @@ def planar_ground(robot: Robot, soil: Soil) -> Ground:
 
     The thrust curve is that of one tyre with its share of the weight; ``slip_ratio`` is its chord through the
     slip at which the robot drives steadily on the level.  How thrust grows with load is taken there, too.
+    Rollers of omni wheels turn freely where the soil does not say what it does to them.
 
     Parameters
     ----------
@@ -71,4 +72,5 @@ def planar_ground(robot: Robot, soil: Soil) -> Ground:
         scrub_ratio=SCRUB_SHARE * grip,
         thrust_ratio=tuple(thrusts),
         load_ratio=(more_n / thrust_n - 1.0) / (_MORE - 1.0),
+        roller_ratio=float(np.nan_to_num(soil.roller_friction_ratio)),
     )

@@ -13,6 +13,8 @@ absent.
   it is a twist of three parts, along, across with what the roll asks for, and turning, of a contact that
   springs.  Both are stepped exactly for inputs that run straight from sample to sample, so that the answer
   hardly depends on the step;
+- **omni robots**: each wheel pulls along its direction by its own load and slip, its rollers resist across
+  it (:mod:`~terrain.simulation.planar.omni`), and each motor's current is that of its wheel;
 - **currents**: their sum is ``F r`` along the wheels' mean heading and the motors' friction over the torque
   that an ampere gives at the wheel; of a skid-steer robot also the difference of the sides, from yaw inertia
   and scrub;
@@ -24,18 +26,19 @@ Load transfer and roughness are left out: what they do to a log is noise here.  
 effects.
 
 This module holds what all of it shares: the terrain, the robot's numbers on it, and the columns of a motion.
-Motion is in :mod:`~terrain.simulation.planar.motion`, :mod:`~terrain.simulation.planar.skid_steer` and
-:mod:`~terrain.simulation.planar.swerve`, sensors without noise in
+Motion is in :mod:`~terrain.simulation.planar.motion`, :mod:`~terrain.simulation.planar.skid_steer`,
+:mod:`~terrain.simulation.planar.swerve` and :mod:`~terrain.simulation.planar.omni`, sensors without noise in
 :mod:`~terrain.simulation.planar.ideal_sensors`, and both together over a log in
 :mod:`~terrain.simulation.planar.replay`.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from terrain.kinematics.omni import rolling_matrix
 from terrain.kinematics.wheel_velocity import velocity_matrix
 from terrain.records import Array
 from terrain.robots import Robot
@@ -51,7 +54,8 @@ TRUTH: tuple[str, ...] = (
     "slip_ratio",
 )
 """What the body does, before any sensor: speeds of the body's origin, specific force along x, traction,
-currents of motors as described, and slip; traction and slip are those along x."""
+currents of motors as described, and slip; traction and slip are those along x, of an omni robot the slip of
+the body along what its wheels roll, and the sum of its currents' magnitudes."""
 
 N_TRUTH = len(TRUTH)
 VX, VY, W, AX, FORCE, AMPS, TURNING_AMPS, SLIP = range(N_TRUTH)
@@ -75,6 +79,7 @@ class Ground(NamedTuple):
     thrust_ratio : traction over weight at slips evenly spaced from 0 to 1, which takes the place of
         ``slip_ratio``; without any the thrust curve is straight
     load_ratio : by how much the traction at a slip grows with a load, as a share of the load's own share
+    roller_ratio : friction of the rollers of omni wheels over the stiffness of traction
     effective_ratio : share of the measured tilt that is a slope to drive up; the rest is a body that rides
         over bumps
     """
@@ -86,6 +91,7 @@ class Ground(NamedTuple):
     thrust_ratio: tuple[float, ...] = ()
     load_ratio: float = 0.0
     effective_ratio: float = 1.0
+    roller_ratio: float = 0.0
 
 
 class Planar(NamedTuple):
@@ -118,6 +124,12 @@ class Planar(NamedTuple):
     arm_ratio: Array
     spread_m: float
     relaxation_m: float
+    omni: bool
+    along: Array
+    across: Array
+    to_rolled: Array
+    wheel_load_ratio: Array
+    roller_ratio: float
 
 
 def make_planar(robot: Robot, ground: Ground) -> Planar:
@@ -160,7 +172,36 @@ def make_planar(robot: Robot, ground: Ground) -> Planar:
         arm_ratio=np.ascontiguousarray(arm_m / spread_m),
         spread_m=spread_m,
         relaxation_m=body.relaxation_length_m,
+        **_omni_wheels(robot, arm_m, ground),
     )
+
+
+def _omni_wheels(robot: Robot, arm_m: Array, ground: Ground) -> dict[str, Any]:
+    """Return what omni wheels at arms (wheels, 2) from the centre of mass do; zeros of other robots.
+
+    ``along`` and ``across`` (wheels, 3) give the speed of each wheel's centre along and across its direction
+    for a twist of the centre of mass, ``to_rolled`` (3, wheels) the twist of the body without slip.
+    """
+    if not robot.sideways or robot.steered:
+        n, none = len(robot.wheels), np.zeros((len(robot.wheels), 3))
+        return {
+            "omni": False,
+            "along": none,
+            "across": none,
+            "to_rolled": np.zeros((3, n)),
+            "wheel_load_ratio": np.zeros(n),
+            "roller_ratio": 0.0,
+        }
+    direction = robot.wheel_directions_rad
+    moments = np.vstack([np.ones(len(arm_m)), arm_m.T])
+    return {
+        "omni": True,
+        "along": np.ascontiguousarray(rolling_matrix(arm_m, direction)),
+        "across": np.ascontiguousarray(rolling_matrix(arm_m, direction + np.pi / 2)),
+        "to_rolled": np.ascontiguousarray(np.linalg.pinv(rolling_matrix(robot.wheel_positions_m, direction))),
+        "wheel_load_ratio": np.linalg.pinv(moments) @ np.array([1.0, 0.0, 0.0]),
+        "roller_ratio": ground.roller_ratio,
+    }
 
 
 def _slip_per_traction(ground: Ground) -> Array:

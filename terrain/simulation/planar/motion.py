@@ -10,6 +10,7 @@ from terrain.constants import GRAVITY_MPS2
 from terrain.effects import INDEX
 from terrain.records import Array
 from terrain.simulation.planar.model import AX, SWERVE_WHEELS, VX, VY, Planar, W
+from terrain.simulation.planar.omni import move_omni
 from terrain.simulation.planar.signals import slopes
 from terrain.simulation.planar.skid_steer import move_skid
 from terrain.simulation.planar.swerve import move_swerve
@@ -35,13 +36,15 @@ def move(
     planar, p : the simulation, and its parameters in the order of ``effects.PARAMETERS``
     dt : step in s
     wheel_speed_mps : (n, wheels) wheel rates times the nominal radius
-    steer_rad : (n, wheels) angles as encoders without error show them; not looked at for a skid-steer robot
+    steer_rad : (n, wheels) angles as encoders without error show them; not looked at for other robots
     grade_rad, roll_rad : (n,) true tilt
     disturbance : (n, 3) what the ground adds to speeds (shares of ``|u|``, along and across) and yaw rate
         (rad/s), or none: (0, 3)
     """
-    if planar.n_wheels == SWERVE_WHEELS:
-        out: Array = move_swerve(planar, p, dt, wheel_speed_mps, steer_rad, grade_rad, roll_rad, disturbance)
+    if planar.omni:
+        out: Array = move_omni(planar, p, dt, wheel_speed_mps, grade_rad, roll_rad, disturbance)
+    elif planar.n_wheels == SWERVE_WHEELS:
+        out = move_swerve(planar, p, dt, wheel_speed_mps, steer_rad, grade_rad, roll_rad, disturbance)
     else:
         out = move_skid(planar, p, dt, wheel_speed_mps, grade_rad, disturbance)
     for k in range(out.shape[0]):

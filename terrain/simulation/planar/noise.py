@@ -65,7 +65,9 @@ class Noise(NamedTuple):
     moving_mps: float
 
     def current_a(self, robot: Robot) -> float:
-        """Return the noise of the sum of a robot's currents."""
+        """Return the noise of the sum of a robot's currents; that of an omni robot is in its description."""
+        if robot.sideways and not robot.steered:
+            return 0.0
         return self.current_skid_a if robot.skids else self.current_swerve_a
 
 

@@ -26,7 +26,7 @@ from terrain.effects import (
 )
 from terrain.errors import ConfigError
 from terrain.kinematics.wheel_motion import WheelMotion, wheel_motion
-from terrain.records import Array, Label, RunLog
+from terrain.records import Array, Label, RunLog, Stream
 from terrain.robots import Part, Robot
 from terrain.simulation.planar.drives import COMMANDS_HZ, commands_stream, follow_commands
 from terrain.simulation.planar.hills import Hills, path_of, tilt_along, undulations
@@ -48,6 +48,7 @@ from terrain.simulation.planar.streams import (
     imu_stream,
     lidar_stream,
     planar_truth,
+    pose_stream,
     steering_stream,
     wheels_stream,
 )
@@ -82,7 +83,7 @@ def simulate_planar(  # noqa: PLR0913 - an entry whose options have defaults
 
     Parameters
     ----------
-    robot : a swerve robot with all its sections; of a skid-steer robot those that are missing do not act
+    robot : a swerve robot with all its sections; of other robots those that are missing do not act
         (:func:`~terrain.simulation.planar.model.make_planar`); without motors there are no currents
     twist : (n, 3) desired ``(speed_x_mps, speed_y_mps, yaw_rate_radps)`` at 50 Hz, from rest
     seed : of everything that is drawn; the same gives the same bytes, and a sequence is left as it is
@@ -99,6 +100,7 @@ def simulate_planar(  # noqa: PLR0913 - an entry whose options have defaults
     RunLog
         streams wheels, imu, odometry, commands, truth, and steering of a swerve robot, whose odometry is a
         tracking camera's pose.  That of a skid-steer robot is the speed of the camera's point in body axes.
+        An omni robot has wheels, commands, truth, and pose of a camera above, as its measured runs.
 
     Raises
     ------
@@ -129,19 +131,27 @@ def simulate_planar(  # noqa: PLR0913 - an entry whose options have defaults
     setup = PlanarSetup(robot, planar, p, step_s, noise, outside)
     motion = _motion(setup, desired, hills or Hills(), rngs)
     run = PlanarRun(robot, planar, p, step_s, motion, sense(planar, p, step_s, motion.truth), noise)
-    streams = {
-        "wheels": wheels_stream(run, outside.get("stick_slip_a", 0.0), rngs, currents),
-        "imu": imu_stream(run, rngs["imu"]),
-        "odometry": camera_stream(run, rngs["camera"]),
-        "commands": commands_stream(robot, desired),
-        "truth": planar_truth(run),
-    }
-    if robot.steered:
-        streams["steering"] = steering_stream(run, rngs["steering"])
+    streams = _streams(run, commands_stream(robot, desired), rngs, outside, currents)
     if heading:
         streams["lidar"] = lidar_stream(run, rngs["lidar"])
     labels = (Label(0.0, (len(twist) - 1) / COMMANDS_HZ, terrain),) if terrain else ()
     return RunLog(run_id, robot.name, streams, labels, source="simulated, planar")
+
+
+def _streams(
+    run: PlanarRun, commands: Stream, rngs: Generators, outside: Mapping[str, float], currents: bool
+) -> dict[str, Stream]:
+    """Return what the loggers of a robot's drive wrote, and the truth."""
+    streams = {"wheels": wheels_stream(run, outside.get("stick_slip_a", 0.0), rngs, currents)}
+    if run.planar.omni:
+        streams["pose"] = pose_stream(run, rngs["camera"])
+    else:
+        streams["imu"] = imu_stream(run, rngs["imu"])
+        streams["odometry"] = camera_stream(run, rngs["camera"])
+    streams |= {"commands": commands, "truth": planar_truth(run)}
+    if run.robot.steered:
+        streams["steering"] = steering_stream(run, rngs["steering"])
+    return streams
 
 
 def _check(robot: Robot, twist: Array, outside: Mapping[str, float], step_s: float) -> None:
@@ -149,8 +159,10 @@ def _check(robot: Robot, twist: Array, outside: Mapping[str, float], step_s: flo
         robot.require(*robot.sections)
     if twist.ndim != 2 or twist.shape[1] != 3 or len(twist) < 2 or not np.isfinite(twist).all():
         raise ConfigError(f"twist has shape {twist.shape}, (n, 3) finite numbers with two rows are required")
-    if not robot.steered and twist[:, 1].any():
-        raise ConfigError(f"twist drives robot {robot.name} sideways, which needs steered wheels")
+    if not robot.sideways and twist[:, 1].any():
+        raise ConfigError(
+            f"twist drives robot {robot.name} sideways, which needs steered wheels or omni wheels"
+        )
     for name, value in outside.items():
         if name not in OUTSIDE or not math.isfinite(value):
             raise ConfigError(

@@ -22,8 +22,9 @@ from terrain.kinematics.wheel_velocity import point_velocity, wheel_frame_veloci
 from terrain.logs.schema import IMU_CHANNELS, STEERING_CHANNELS
 from terrain.records import Array, Stream
 from terrain.robots import Robot
-from terrain.simulation.planar.model import AX, VX, VY, Planar, W
+from terrain.simulation.planar.model import AX, SLIP, VX, VY, Planar, W
 from terrain.simulation.planar.noise import CAMERA_HZ, IMU_HZ, WHEELS_HZ, Noise, coloured, lag_weights
+from terrain.simulation.planar.omni import currents_of
 from terrain.simulation.planar.signals import delayed
 from terrain.simulation.sensors.camera import N_ERRORS, camera_samples
 from terrain.simulation.sensors.imu import ImuErrors, described_calibration, imu_values
@@ -40,6 +41,12 @@ SPIKE_HZ, SPIKE_S = 5.0, 0.06
 
 STANDSTILL_MPS = 1e-6
 """Speed below which an encoder counts nothing: its low-pass ends there."""
+
+POSE_CHANNELS = ("position_x_m", "position_y_m", "yaw_rad")
+"""Of a camera above, as measured runs have them."""
+
+BODY_SLIP = ("slip_body_ratio",)
+"""Channel of the truth of an omni robot, whose body slips otherwise than any of its wheels."""
 
 _SEEN_X = CHANNELS.index(SPEED_X)
 
@@ -105,11 +112,15 @@ def wheels_stream(run: PlanarRun, stick_slip_a: float, rngs: Generators, logs_cu
     if stick_slip_a:
         current = current + _spikes(motion, rows, run.dt, stick_slip_a, rngs["outside"])
     wheels = len(robot.wheels)
-    if robot.skids:
+    if run.planar.omni:
+        currents = _omni_currents(run, rows)
+    elif robot.skids:
         currents = np.column_stack([current - turning, current + turning]) / 2.0
     else:
         currents = np.repeat(current[:, None] / wheels, wheels, axis=1)
     speed, currents = _measured(run, rows, currents, rngs["wheels"])
+    if run.planar.omni:
+        currents = np.abs(currents)  # as its logs have them
     if not logs_currents:
         return Stream(time_s, robot.logged_rates(speed), robot.rate_channels)
     channels = (*robot.rate_channels, *wheel_channels("current_a", robot.wheels))
@@ -142,6 +153,29 @@ def _measured(
     speed = encoder_speed(motion.wheel_speed_mps, every, run.dt, step_m, jitter, lag_s)
     speed[np.abs(speed) <= STANDSTILL_MPS] = 0.0
     return add_rate_noise(speed, white, STANDSTILL_MPS), currents_a
+
+
+def _omni_currents(run: PlanarRun, rows: Array) -> Array:
+    """Return the current (k, wheels) of each motor, with the errors that the sum of the ideal ones has."""
+    motion, p = run.motion, run.p
+    each = currents_of(
+        run.planar, p, run.dt, motion.rolled_mps / (1.0 + p[INDEX["wheel_radius_ratio"]]), motion.truth
+    )
+    warm = 1.0 + p[INDEX["motor_drift_ratio"]] * np.arange(len(each)) * run.dt / 60.0
+    each = each * ((1.0 + p[INDEX["motor_constant_ratio"]]) * warm)[:, None] + p[INDEX["current_offset_a"]]
+    return np.asarray(each[rows])
+
+
+def pose_stream(run: PlanarRun, rng: np.random.Generator) -> Stream:
+    """Return the poses that a camera above measures of an omni robot: the world's axes, its own noise."""
+    camera = run.robot.camera
+    rows, time_s = run.samples(CAMERA_HZ)
+    latency_s = run.planar.latency_s + run.p[INDEX["camera_latency_s"]]
+    seen = np.column_stack([run.delayed(column, latency_s)[rows] for column in run.motion.pose.T])
+    if run.noise is not None:
+        std = np.array([camera.position_std_m, camera.position_std_m, camera.yaw_std_rad])
+        seen = seen + std * rng.standard_normal(seen.shape)
+    return Stream(time_s, seen, POSE_CHANNELS)
 
 
 def encoder_scales(robot: Robot, p: Array) -> Array:
@@ -322,16 +356,23 @@ def planar_truth(run: PlanarRun) -> Stream:
     grade = motion.grade_rad[rows]
     accel_x = motion.truth[rows, AX] - GRAVITY_MPS2 * np.sin(grade)
     accel_y = np.gradient(v_y, 1.0 / IMU_HZ) + turn * v_x
-    steer = motion.steer_rad[rows]
+    steer = motion.steer_rad[rows] + robot.wheel_directions_rad
     along, _ = wheel_frame_velocities(np.column_stack([v_x, v_y, turn]), robot.wheel_positions_m, steer)
     columns = [
         motion.pose[rows],
         np.column_stack([motion.roll_rad[rows], -grade, v_x, v_y, turn, accel_x, accel_y]),
         motion.wheel_speed_mps[rows] * encoder_scales(robot, run.p) / robot.wheel_radius_m,
-        steer,
+        motion.steer_rad[rows],
         slip_ratio(motion.rolled_mps[rows], along),
         np.full((len(rows), 1), run.p[INDEX["gyro_bias_radps"]] + robot.sensors.gyro_bias_z_radps),
     ]
+    if run.planar.omni:
+        columns.append(motion.truth[rows, SLIP, None])
     wheels = (wheel_channels(each, robot.wheels) for each in ("wheel_radps", "steer_rad", "slip_ratio"))
-    channels = (*BODY_TRUTH, *(name for each in wheels for name in each), GYRO_BIAS)
+    channels = (
+        *BODY_TRUTH,
+        *(name for each in wheels for name in each),
+        GYRO_BIAS,
+        *BODY_SLIP[: run.planar.omni],
+    )
     return Stream(time_s, np.hstack(columns), channels)

@@ -152,7 +152,7 @@ _CRAB: tuple[tuple[float, float, float, float], ...] = (
 
 
 def _complex(request: DriveRequest, length_s: float) -> list[Leg]:
-    if request.steered:
+    if request.sideways:
         return _tour("complex", _COMPLEX, request, length_s)
     ahead = tuple(leg for leg in _COMPLEX if not leg[1])
     return _tour("complex", (*ahead[:8], *_ON_THE_SPOT), request, length_s)

@@ -42,7 +42,7 @@ class DriveRequest(NamedTuple):
     limit: Callable[[Any], Array]
     rng: np.random.Generator
     accel_mps2: float
-    steered: bool
+    sideways: bool
 
 
 class NamedDrive(NamedTuple):

@@ -23,8 +23,8 @@ LONGEST_S = 3600.0
 _RAMPED = ("straight", "climb", "starts")
 """Those whose acceleration can be chosen."""
 
-_STEERED = ("crab", "course")
-"""Those that only steered wheels drive, or only the simulation of a robot that has them."""
+CRUISING_MPS, CRUISING_SHARE = 1.0, 1.0 / 3.0
+"""Speed where none is given, and the share of its fastest speed that a robot drives which is slower."""
 
 SCENARIOS: tuple[str, ...] = (*DRIVES, "course")
 """Names that :func:`make_scenario` accepts."""
@@ -35,7 +35,7 @@ def make_scenario(
     robot: Robot,
     terrains: str | Sequence[str],
     duration_s: float | None = None,
-    speed_mps: float = 1.0,
+    speed_mps: float | None = None,
     seed: int | np.random.Generator = 0,
     accel_mps2: float = ACCEL_MPS2,
 ) -> Scenario:
@@ -55,8 +55,8 @@ def make_scenario(
     course        over patches of 6 to 12 m of every terrain in turn, in drawn request, at changing speed
     ============= ===================================================================================
 
-    A robot without steered wheels has no ``crab`` and no ``course``, and in ``complex`` turns on the spot
-    instead of driving sideways.
+    Robots that cannot drive sideways have no ``crab``, and in ``complex`` turn on the spot instead; only
+    those with steered wheels have ``course``.
 
     Parameters
     ----------
@@ -64,7 +64,8 @@ def make_scenario(
     robot : no twist saturates its wheels; without motors, which swerve robots need, they have no limit
     terrains : of the ground, one unless the scenario is ``course``; the names are not looked up
     duration_s : what the scenario is made for by default; taken to a whole number of samples
-    speed_mps : cruising speed; ``survey`` and ``course`` draw from 0.4 to 1.2 times it, backward and sideways
+    speed_mps : cruising speed, by default 1 m/s, of a slower robot a third of its fastest; ``survey`` and
+        ``course`` draw from 0.4 to 1.2 times it, backward and sideways
         ``complex`` is slower, and so is all of ``crab``
     seed : of everything drawn; the same gives the same bytes
     accel_mps2 : of the ramps of ``straight``, ``climb`` and ``starts``; infinite, they are steps
@@ -92,11 +93,10 @@ def make_scenario(
         raise ConfigError(
             f"scenario {name!r} is driven on one terrain, {len(grounds)} are given: use 'course'"
         )
-    steered = robot.steered
-    if not steered and name in _STEERED:
+    if not {"crab": robot.sideways, "course": robot.steered}.get(name, True):
         raise ConfigError(f"scenario {name!r} is not for robot {robot.name} with the drive {robot.drive!r}")
     request = DriveRequest(
-        *_ability(robot, speed_mps), _generator(seed), _checked_accel(name, accel_mps2), steered
+        *_ability(robot, speed_mps), _generator(seed), _checked_accel(name, accel_mps2), robot.sideways
     )
     desired_s = _checked_duration(duration_s)
     if name == "course":
@@ -120,11 +120,14 @@ def _checked_duration(duration_s: float | None) -> float | None:
     return float(duration_s)
 
 
-def _ability(robot: Robot, speed_mps: float) -> tuple[float, Callable[[Any], Array]]:
+def _ability(robot: Robot, speed_mps: float | None) -> tuple[float, Callable[[Any], Array]]:
     """Return the speed, checked, and what shortens a twist to what the robot can."""
     positions_m, radius_m = robot.wheel_positions_m, robot.wheel_radius_m
     motors = robot.motors if robot.steered else robot.completed.motors
     speed_max_radps = motors.speed_max_radps
+    if speed_mps is None:
+        fastest_mps = radius_m * speed_max_radps
+        speed_mps = CRUISING_MPS if fastest_mps >= CRUISING_MPS else CRUISING_SHARE * fastest_mps
     if not _is_number(speed_mps) or not 0 < speed_mps <= radius_m * speed_max_radps:
         raise ConfigError(
             f"speed_mps is {speed_mps!r}: robot {robot.name} drives above 0 and up to "

@@ -1,0 +1,205 @@
+r"""Motion of an omni robot: each wheel pulls along its drive direction, and its rollers resist across it.
+
+Wheel i at :math:`p_i` carries the share :math:`n_i` of the weight W, turns with the circumferential speed
+:math:`u_i`, and with the twist V of the centre of mass its own centre moves by :math:`D_i V` along the
+direction that it drives and by :math:`E_i V` across it.  The forces on it are those of
+:mod:`~terrain.simulation.planar.omni_contact`, over the root mean square speed U of the wheels or, where that
+is larger, of their centres,
+
+.. math::
+    F_i = n_i W C \frac{u_i - D_i V}{U}, \qquad G_i = -\rho\, n_i W C \frac{E_i V}{U},
+
+so that slip does not depend on speed.  C is the traction over the load of the ground at the root mean square
+slip of the wheels, over that slip, and :math:`\rho` the friction of the rollers over it.  Rolling resistance
+:math:`R_i` opposes the motion along each wheel.  With the masses M and gravity P of a slope
+
+.. math:: M \dot V = \sum_i D_i^T (F_i - R_i) + E_i^T G_i + P + M\,(w v_y, -w v_x, 0) .
+
+A contact follows within :math:`U / (C g)`, some milliseconds: steps are implicit in V, which is stable at
+rest, too, and without the inertia is :func:`~terrain.simulation.planar.omni_contact.steady_twist`.
+
+What is assumed: three wheels at even angles whose loads follow from the centre of mass and do not shift; one
+C and :math:`\rho` for all wheels; rollers whose friction grows with traction where the thrust curve bends.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from terrain.constants import GRAVITY_MPS2
+from terrain.effects import INDEX
+from terrain.records import Array
+from terrain.simulation.contact import softness
+from terrain.simulation.planar.model import AMPS, FORCE, N_TRUTH, SLIP, VX, VY, Planar, W
+from terrain.simulation.planar.signals import slopes
+
+ROLLING_MPS = 0.02
+"""Speed below which slip is no more over the speed itself, and over which a resistance takes its full size;
+assumed: a fifth of the slowest measured drive."""
+
+STIFFEST_GROUND = 1e-6
+"""Slip per traction of the stiffest ground."""
+
+SUBSTEPS = 4
+"""Implicit steps within one of the simulation, so that their lag, half of each, is about a millisecond."""
+
+_RADIUS = INDEX["wheel_radius_ratio"]
+_ROLLING = INDEX["rolling_resistance_ratio"]
+_PAYLOAD = INDEX["payload_ratio"]
+
+
+@njit(cache=True)
+def move_omni(
+    planar: Planar,
+    p: Array,
+    dt: float,
+    wheel_speed_mps: Array,
+    grade_rad: Array,
+    roll_rad: Array,
+    disturbance: Array,
+) -> Array:
+    """Return motion and net traction along x; arguments are those of ``planar.motion.move``.
+
+    Slip is that of the body, against the twist that the wheels would roll; the current is the sum of the
+    magnitudes of the motors' (:func:`currents_of`).
+    """
+    n = wheel_speed_mps.shape[0]
+    out = np.zeros((n, N_TRUTH))
+    along, across = planar.along, planar.across
+    twist, before = np.zeros(3), np.zeros(3)
+    matrix, pushed = np.empty((3, 3)), np.empty(3)
+    mass = planar.mass_kg * (1.0 + p[_PAYLOAD])
+    inertia = mass, mass, planar.yaw_inertia_kgm2 * (1.0 + p[_PAYLOAD])
+    weight, gravity = mass * GRAVITY_MPS2, GRAVITY_MPS2 * planar.effective_ratio
+    rolling = planar.rolling_ratio + p[_ROLLING]
+    step, size = dt / SUBSTEPS, 0.0
+    for k in range(n):
+        slope = (-mass * gravity * math.sin(grade_rad[k]), -mass * gravity * math.sin(roll_rad[k]), 0.0)
+        u = wheel_speed_mps[k] * (1.0 + p[_RADIUS])
+        last = wheel_speed_mps[max(k - 1, 0)] * (1.0 + p[_RADIUS])
+        started_x, started_y = before[0], before[1]
+        for part in range(SUBSTEPS):
+            rolled = last + (u - last) * ((part + 1) / SUBSTEPS)
+            speed = fastest(planar, rolled, before)
+            stiff = weight / max(softness(planar.soft_ratio, size), STIFFEST_GROUND) / speed
+            w = before[2]
+            turning = (mass * w * before[1], -mass * w * before[0], 0.0)
+            for a in range(3):
+                pushed[a] = inertia[a] / step * before[a] + turning[a] + slope[a]
+                for b in range(3):
+                    matrix[a, b] = inertia[a] / step if a == b else 0.0
+            for i in range(planar.n_wheels):
+                v = dot(along[i], before)
+                drag = rolling * weight / math.sqrt(v * v + ROLLING_MPS * ROLLING_MPS)
+                share = planar.wheel_load_ratio[i]
+                for a in range(3):
+                    pushed[a] += share * stiff * rolled[i] * along[i, a]
+                    for b in range(3):
+                        matrix[a, b] += share * (stiff + drag) * along[i, a] * along[i, b]
+                        matrix[a, b] += share * stiff * planar.roller_ratio * across[i, a] * across[i, b]
+            solve3(matrix, pushed, twist)
+            slip = 0.0
+            for i in range(planar.n_wheels):
+                slip += (rolled[i] - dot(along[i], twist)) ** 2
+            size = min(math.sqrt(slip / planar.n_wheels) / speed, 1.0)
+            before[:] = twist
+        v_x, v_y = twist[0] + twist[2] * planar.com_y_m, twist[1] - twist[2] * planar.com_x_m
+        if disturbance.shape[0] > 0:
+            v_x, v_y = v_x * (1.0 - disturbance[k, 0]), v_y * (1.0 - disturbance[k, 0])
+        out[k, VX], out[k, VY], out[k, W] = v_x, v_y, twist[2]
+        out[k, FORCE] = (
+            mass * ((twist[0] - started_x) / dt - twist[2] * 0.5 * (twist[1] + started_y)) - slope[0]
+        )
+        out[k, SLIP] = _body_slip(planar, u, v_x, v_y)
+    out[:, AMPS] = np.abs(currents_of(planar, p, dt, wheel_speed_mps, out)).sum(axis=1)
+    return out
+
+
+@njit(cache=True)
+def currents_of(planar: Planar, p: Array, dt: float, wheel_speed_mps: Array, truth: Array) -> Array:
+    """Return the current (n, wheels) of each motor along a motion: traction, its own inertia and friction.
+
+    Parameters
+    ----------
+    planar, p, dt, wheel_speed_mps : as :func:`move_omni` takes them
+    truth : (n, N_TRUTH) of the motion
+    """
+    n, wheels = wheel_speed_mps.shape
+    out = np.empty((n, wheels))
+    weight = planar.mass_kg * (1.0 + p[_PAYLOAD]) * GRAVITY_MPS2
+    radius_m, twist = planar.radius_m * (1.0 + p[_RADIUS]), np.empty(3)
+    spun = np.empty((n, wheels))
+    for i in range(wheels):
+        spun[:, i] = slopes(wheel_speed_mps[:, i].copy(), dt)
+    for k in range(n):
+        u = wheel_speed_mps[k] * (1.0 + p[_RADIUS])
+        twist[0] = truth[k, VX] - truth[k, W] * planar.com_y_m
+        twist[1] = truth[k, VY] + truth[k, W] * planar.com_x_m
+        twist[2] = truth[k, W]
+        speed, slip = fastest(planar, u, twist), 0.0
+        for i in range(wheels):
+            slip += (u[i] - dot(planar.along[i], twist)) ** 2
+        size = min(math.sqrt(slip / wheels) / speed, 1.0)
+        stiff = weight / max(softness(planar.soft_ratio, size), STIFFEST_GROUND) / speed
+        for i in range(wheels):
+            pull = planar.wheel_load_ratio[i] * stiff * (u[i] - dot(planar.along[i], twist))
+            torque = (pull + planar.rotating_kg / wheels * spun[k, i]) * radius_m
+            direction = u[i] / math.sqrt(u[i] * u[i] + ROLLING_MPS * ROLLING_MPS)
+            out[k, i] = (torque + planar.friction_nm / wheels * direction) / planar.nm_per_a
+    return out
+
+
+@njit(cache=True)
+def fastest(planar: Planar, wheel_speed_mps: Array, twist: Array) -> float:
+    """Return the speed U that slip is over: of wheels (wheels,) or their centres, never below a minimum."""
+    rolled, moved = 0.0, 0.0
+    for i in range(planar.n_wheels):
+        rolled += wheel_speed_mps[i] ** 2
+        moved += dot(planar.along[i], twist) ** 2
+    return math.sqrt(max(rolled, moved) / planar.n_wheels + ROLLING_MPS * ROLLING_MPS)
+
+
+@njit(cache=True)
+def dot(row: Array, twist: Array) -> float:
+    """Return the product of two rows of three."""
+    product: float = row[0] * twist[0] + row[1] * twist[1] + row[2] * twist[2]
+    return product
+
+
+@njit(cache=True)
+def solve3(matrix: Array, pushed: Array, out: Array) -> None:
+    """Solve a symmetric positive system of three in place of ``out``, by Cramer's rule.
+
+    Examples
+    --------
+    >>> x = np.empty(3)
+    >>> solve3(np.diag(np.array([1.0, 2.0, 4.0])), np.ones(3), x)
+    >>> x.tolist()
+    [1.0, 0.5, 0.25]
+    """
+    a, b, c = matrix[0, 0], matrix[0, 1], matrix[0, 2]
+    d, e, f = matrix[1, 1], matrix[1, 2], matrix[2, 2]
+    p0, p1, p2 = d * f - e * e, c * e - b * f, b * e - c * d
+    by = 1.0 / (a * p0 + b * p1 + c * p2)
+    q1, q2, r2 = a * f - c * c, b * c - a * e, a * d - b * b
+    x, y, z = pushed[0], pushed[1], pushed[2]
+    out[0] = (p0 * x + p1 * y + p2 * z) * by
+    out[1] = (p1 * x + q1 * y + q2 * z) * by
+    out[2] = (p2 * x + q2 * y + r2 * z) * by
+
+
+@njit(cache=True)
+def _body_slip(planar: Planar, wheel_speed_mps: Array, v_x: float, v_y: float) -> float:
+    """Return the slip of the body along what the wheels roll; 0 where neither moves, and in place."""
+    x, y = 0.0, 0.0
+    for i in range(planar.n_wheels):
+        x += planar.to_rolled[0, i] * wheel_speed_mps[i]
+        y += planar.to_rolled[1, i] * wheel_speed_mps[i]
+    rolled = math.sqrt(x * x + y * y)
+    if rolled < ROLLING_MPS:
+        return 0.0
+    along = (v_x * x + v_y * y) / rolled
+    return (rolled - along) / max(rolled, abs(along))
