@@ -15,6 +15,7 @@ from pipelines.runs.datasets import load_runs
 from terrain.calibration.finding import Finding
 from terrain.calibration.lag import starts_and_stops, time_constants
 from terrain.calibration.noise import measurement_variances, sensor_noise
+from terrain.calibration.omni import identify_omni
 from terrain.calibration.six_positions import MIN_POSITION_S, accelerometer
 from terrain.calibration.skid_steer import identify
 from terrain.calibration.standing import gyro_bias, standing
@@ -23,7 +24,7 @@ from terrain.calibration.wheels import SLIP_RATIO, reduction_ratio, steering_zer
 from terrain.errors import ConfigError, DataError
 from terrain.files.atomic import atomic_write, ensure_writable
 from terrain.records import RunLog
-from terrain.robots import Robot, SwerveRobot, read_description, robot_from
+from terrain.robots import OmniRobot, Robot, SwerveRobot, read_description, robot_from
 from terrain.terramechanics.soil import load_soil, soil_names
 
 IDENTIFIED = "identified"
@@ -75,11 +76,7 @@ def calibrate(
     )
     _check_runs(runs, robot)
     grounds = hard_grounds() if hard is None else tuple(hard)
-    findings = (
-        identify(runs, robot.wheel_radius_m, grounds)
-        if robot.skids
-        else find(runs, described, robot, grounds)
-    )
+    findings = _findings(runs, described, robot, grounds)
     if not any(finding.determined for finding in findings):
         reasons = "; ".join(dict.fromkeys(finding.note for finding in findings))
         raise DataError(f"{data}: nothing of robot {robot.name} can be calibrated from this: {reasons}")
@@ -91,7 +88,9 @@ def calibrate(
         hard=grounds,
         run_ids=tuple(run.run_id for run in runs),
         findings=tuple(_row(finding, described) for finding in findings),
-        measurement_variances={} if robot.skids else measurement_variances(robot_from(name, calibrated)),
+        measurement_variances=(
+            measurement_variances(robot_from(name, calibrated)) if isinstance(robot, SwerveRobot) else {}
+        ),
     )
     if out is not None:
         head = f"# Calibrated from {len(runs)} runs; what they could not tell is as it was in {file}.\n"
@@ -99,15 +98,19 @@ def calibrate(
     return result
 
 
+def _findings(runs: Sequence[RunLog], described: Any, robot: Robot, hard: Sequence[str]) -> list[Finding]:
+    """Return what the runs of a robot show, by its drive."""
+    if robot.skids:
+        return identify(runs, robot.wheel_radius_m, hard)
+    if isinstance(robot, OmniRobot):
+        return identify_omni(runs, robot)
+    return find(runs, described, robot, hard)
+
+
 def _check_robot(robot: Robot, file: str) -> None:
-    """Refuse a robot of another drive, one that lacks a section, and one that is extended."""
-    if isinstance(robot, SwerveRobot):
+    """Refuse a robot that lacks a section, and one that is extended."""
+    if not robot.skids:
         robot.require(*robot.sections)
-    elif not robot.skids:
-        raise DataError(
-            f"robot {robot.name}: drive {robot.drive!r} is not calibrated from logs, only 'swerve' and "
-            "'skid_steer' are"
-        )
     if robot.effects:  # what is calibrated would hold them a second time
         raise ConfigError(
             f"robot {robot.name}: {file} is extended by effects; calibrate the description without them, "

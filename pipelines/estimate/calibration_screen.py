@@ -21,11 +21,11 @@ def print_calibration(result: CalibrationResult, console: Console) -> None:
     table.add_column("of")
     for finding in found:
         figures = (finding.described, finding.value, finding.low, finding.high)
-        runs = len(finding.runs)
+        runs = f", {len(finding.runs)} run{'s' * (len(finding.runs) > 1)}" * (finding.counted != "runs")
         table.add_row(
             finding.parameter,
             *("" if figure is None else f"{figure:.4g}" for figure in figures),
-            f"{finding.n} {finding.counted}, {runs} run{'s' * (runs > 1)}",
+            f"{finding.n} {finding.counted}{runs}",
         )
     console.print(table)
     for title, chosen in (("not determined", False), ("assumed", True)):

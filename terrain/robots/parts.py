@@ -146,6 +146,8 @@ IDENTIFIED: Mapping[str, float | None] = {
     "effective_track_m": None,
     "lidar_delay_s": -math.inf,
     "wheels_delay_s": -math.inf,
+    "wheel_distance_m": None,
 }
 """Numbers of the section ``identified``, which logs of one robot showed and no nominal figure is: the least
-value of each, None for above zero (:mod:`terrain.calibration.skid_steer`)."""
+value of each, None for above zero (:mod:`terrain.calibration.skid_steer`,
+:mod:`terrain.calibration.omni`)."""

@@ -1,0 +1,136 @@
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipelines.estimate.calibrate import calibrate
+from terrain.calibration.omni import COM_X, COM_Y, DISTANCE, FRICTION, RADIUS, identify_omni, motor_friction
+from terrain.errors import DataError
+from terrain.kinematics.wheel_speed import with_wheel_speeds
+from terrain.logs.write import write_run
+from terrain.records import RunLog, Stream
+from terrain.robots import load_robot
+from terrain.simulation.planar.model import Ground
+from terrain.simulation.planar.noise import load_noise
+from terrain.simulation.planar.run import simulate_planar
+
+ROBOT = load_robot("robotino")
+NM_PER_A = 0.0514 * 16 * 0.75
+BODY = replace(ROBOT.body, com_x_m=0.02, com_y_m=-0.015)
+HIDDEN = ROBOT.with_parts(body=BODY)
+
+
+def alone(rng, levels=(20.0, 60.0, 120.0, -90.0), least_a=(0.18, 0.15, 0.17), slope=3e-4, run_id="motors"):
+    """A run of motors that turn nothing but the wheels, as they are tried on a bench."""
+    rate = np.repeat(levels, 150)[:, None] + rng.normal(0.0, 1.0, (150 * len(levels), 3))
+    current = np.array(least_a) + slope * np.abs(rate) + rng.normal(0.0, 0.02, rate.shape)
+    channels = [f"motor_{i}_radps" for i in (1, 2, 3)] + [f"current_{i}_a" for i in (1, 2, 3)]
+    time_s = 0.031 * np.arange(len(rate))
+    return with_wheel_speeds(
+        RunLog(run_id, "robotino", {"wheels": Stream(time_s, np.hstack([rate, current]), channels)}), ROBOT
+    )
+
+
+def drives(n=18, ratio=0.5, terrain="felt"):
+    runs = []
+    for i in range(n):
+        angle, twist = 2 * np.pi * i / n, np.zeros((201, 3))
+        twist[25:] = 0.2 * np.cos(angle), 0.2 * np.sin(angle), 0.0
+        ground = Ground(slip_ratio=1.5, rolling_ratio=0.0, roller_ratio=ratio)
+        effects = {"wheel_radius_ratio": -0.06}
+        run = simulate_planar(
+            HIDDEN,
+            twist,
+            i,
+            ground=ground,
+            effects=effects,
+            noise=load_noise(),
+            run_id=f"{terrain}_{i}",
+            terrain=terrain,
+        )
+        runs.append(with_wheel_speeds(run, ROBOT))
+    return runs
+
+
+@pytest.fixture(scope="module")
+def runs():
+    rng = np.random.default_rng(0)
+    return [*drives(), *drives(12, 0.02, "cork"), alone(rng), alone(rng, run_id="motors_2")]
+
+
+@pytest.fixture(scope="module")
+def found(runs):
+    return {finding.parameter: finding for finding in identify_omni(runs, ROBOT)}
+
+
+def test_hidden_load_radius_and_friction_come_back_within_their_intervals(found):
+    truth = {
+        COM_X: 0.02,
+        COM_Y: -0.015,
+        RADIUS: 0.94 * 0.04,
+        FRICTION: np.mean([0.18, 0.15, 0.17]) * NM_PER_A,
+    }
+    margin = {COM_X: 0.001, COM_Y: 0.001, RADIUS: 0.0002, FRICTION: 0.0}
+    for name, value in truth.items():
+        finding = found[name]
+        assert finding.low - margin[name] < value < finding.high + margin[name], name
+        assert finding.high - finding.low < {FRICTION: 0.06}.get(name, 0.01), name
+    assert found[FRICTION].runs == ("motors", "motors_2")
+    assert "0.30 mA more per rad/s" in found[FRICTION].note
+
+
+def test_one_surface_does_not_part_radius_and_rollers_and_its_interval_says_so(runs, found):
+    felt = [run for run in runs if run.terrains == ("felt",)]
+    alone_on_felt = next(each for each in identify_omni(felt, ROBOT) if each.parameter == RADIUS)
+    assert alone_on_felt.low < 0.94 * 0.04 < alone_on_felt.high
+    assert alone_on_felt.high - alone_on_felt.low > 3.0 * (found[RADIUS].high - found[RADIUS].low)
+
+
+def test_runs_with_another_load_say_nothing_of_the_robot_as_described(runs):
+    loaded = [replace(run, session="weights_felt") for run in runs if run.terrains]
+    for finding in identify_omni(loaded, ROBOT):
+        assert math.isnan(finding.value)
+        assert finding.note
+
+
+def test_a_drive_at_one_speed_is_not_taken_for_motors_alone():
+    rng = np.random.default_rng(1)
+    one = alone(rng, levels=(60.0, 60.0), least_a=(1.0, 1.0, 1.0))
+    finding = motor_friction([one], ROBOT)
+    assert not finding.determined
+    assert "several speeds" in finding.note
+    standing = alone(rng, levels=(0.0, 0.0))
+    assert not motor_friction([standing], ROBOT).determined
+    broken = replace(one, streams={"wheels": Stream(np.arange(3.0), np.zeros((3, 1)), ("motor_1_radps",))})
+    assert not motor_friction([broken], ROBOT).determined
+
+
+def test_few_runs_determine_no_load_and_turns_no_distance(runs):
+    few = {finding.parameter: finding for finding in identify_omni(runs[:4], ROBOT)}
+    assert "10 runs in steady motion" in few[COM_X].note
+    assert not few[DISTANCE].determined
+
+
+def test_calibrate_writes_a_description_that_is_read_again(runs, tmp_path):
+    for run in runs:
+        write_run(run, tmp_path / "runs")
+    result = calibrate(tmp_path / "runs", "robotino", tmp_path / "mine.yaml")
+    again = load_robot(str(tmp_path / "mine.yaml"))
+    rows = {row.parameter: row for row in result.findings}
+    assert again.body.com_x_m == pytest.approx(rows[COM_X].value, abs=1e-4)
+    assert again.identified["rolling_radius_m"] == pytest.approx(0.0376, abs=0.0003)
+    assert result.measurement_variances == {}
+    (tmp_path / "none").mkdir()
+    write_run(alone(np.random.default_rng(2), levels=(60.0, 60.0)), tmp_path / "none")
+    with pytest.raises(DataError, match="nothing of robot robotino can be calibrated"):
+        calibrate(tmp_path / "none", "robotino")
+
+
+def test_friction_of_the_measured_motors_is_near_the_described_one(measured):
+    from terrain.logs import robotino
+
+    root = measured("robotino")
+    finding = motor_friction([read() for read in robotino.find_runs(root / "dc_motor")], ROBOT)
+    assert finding.determined
+    assert finding.low < ROBOT.motors.friction_nm < finding.high
