@@ -31,7 +31,7 @@ from terrain.discrepancy.signals import Signals, signals_of
 from terrain.discrepancy.statements import acting_causes, statements_of, terrains_apart
 from terrain.discrepancy.terrain_match import check_robots, runs_of_terrain, simulation_for
 from terrain.discrepancy.verdict import Diagnosis, NextDrive
-from terrain.effects import Effect, effect_named, library_of
+from terrain.effects import Effect, effect_named, library_of, showing
 from terrain.errors import ConfigError, DataError
 from terrain.extension import extended_yaml, region_of
 from terrain.files.atomic import atomic_write, ensure_writable
@@ -207,13 +207,8 @@ def _robot(robot_name: str, model: str | None) -> Robot:
 def _library(robot: Robot, names: Sequence[str] | None) -> tuple[Effect, ...]:
     """Return the effects that may be named, in the order of the catalogue."""
     applicable = library_of(robot.drive)
-    if not applicable:
-        raise ConfigError(
-            f"robot {robot.name}: no effects are known for the drive {robot.drive!r}, so none could be "
-            "named; terrain measure-slip shows its slip by surface and direction"
-        )
     if names is None:
-        return applicable
+        return showing(robot.drive, robot.effects)
     chosen = [effect_named(name) for name in names]
     if not chosen:
         raise ConfigError("--effects names none; leave it out for all of them")

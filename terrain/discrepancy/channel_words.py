@@ -26,6 +26,7 @@ INPUT_LABELS = {
     "grade_rad": "grade [rad]",
     "roll_rad": "roll [rad]",
     "force_ratio": "force [weight]",
+    "sideways_mps": "speed to the left [m/s]",
     "time_s": "time [s]",
 }
 """Inputs of the simulation as axes call them."""

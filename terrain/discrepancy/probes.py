@@ -66,7 +66,7 @@ class ProbeResult(NamedTuple):
 
 def probe_inputs(rows: Rows, rate_hz: float) -> dict[str, Array]:
     """Return the inputs (m,) that residuals are compared with, by name."""
-    speed, turn, steer, grade, roll, force = (rows.inputs[:, i] for i in range(6))
+    speed, turn, steer, grade, roll, force, sideways = (rows.inputs[:, i] for i in range(7))
     accel = np.gradient(speed) * rate_hz if len(speed) > 1 else np.zeros_like(speed)
     tau = rows.time_s / 60.0 - 0.5
     direction = np.tanh(speed / STANDSTILL_MPS)
@@ -85,6 +85,9 @@ def probe_inputs(rows: Rows, rate_hz: float) -> dict[str, Array]:
         "|turn|": np.abs(turn),
         "turn |turn|": turn * np.abs(turn),
         "speed turn": speed * turn,
+        "sideways": sideways,
+        "|sideways|": np.abs(sideways),
+        "speed sideways": speed * sideways,
         "steering": steer,
         "steering rate": np.gradient(steer) * rate_hz if len(steer) > 1 else np.zeros_like(steer),
         "acceleration": accel,

@@ -108,8 +108,9 @@ class Rows(NamedTuple):
 
     @property
     def pace_mps(self) -> Array:
-        """Speed (m,) of the wheels, straight ahead or against each other."""
-        return np.maximum(np.abs(self.inputs[:, 0]), 0.5 * np.abs(self.inputs[:, 1]))
+        """Speed (m,) of the wheels, straight ahead or against each other; of omni wheels in any direction."""
+        speed = np.hypot(self.inputs[:, 0], self.inputs[:, INPUTS.index("sideways_mps")])
+        return np.maximum(speed, 0.5 * np.abs(self.inputs[:, 1]))
 
 
 INPUTS: tuple[str, ...] = (
@@ -119,10 +120,12 @@ INPUTS: tuple[str, ...] = (
     "grade_rad",
     "roll_rad",
     "force_ratio",
+    "sideways_mps",
     "wheel_phase_rad",
 )
-"""Mean wheel speed, right minus left (last minus first) wheel speed, mean steering, tilt,
-traction over weight, and how far the wheels have turned: a column for each of them."""
+"""Mean wheel speed, right minus left (last minus first) wheel speed, mean steering, tilt, traction over
+weight, 0, and how far the wheels have turned: a column for each of them.  Of an omni robot speed, turn and
+sideways are those that its wheels would roll ahead, in place (twice the speed of a wheel) and to the left."""
 
 
 def low_pass_of(signals: Sequence[Signals]) -> LowPass:
@@ -217,11 +220,9 @@ def rows_of(
         :, keep
     ]
     change = (both[::2] - both[1::2]) / spans[:, None, None]
-    speed = instruments.mean(axis=1)
+    speed, turn, sideways = _rolled(planar, instruments)
     force = truth[:, 4] / (GRAVITY_MPS2 * planar.mass_kg)
-    inputs = np.column_stack(
-        [speed, instruments[:, -1] - instruments[:, 0], steer.mean(axis=1), grade, roll, force]
-    )
+    inputs = np.column_stack([speed, turn, steer.mean(axis=1), grade, roll, force, sideways])
     phase = np.cumsum(instruments, axis=0) * (dt / planar.radius_m)
     at = first + low_pass.every * np.arange(n_rows)[keep]
     return Rows(
@@ -233,6 +234,15 @@ def rows_of(
         change,
         np.column_stack([plain(inputs), phase[at]]),
     )
+
+
+def _rolled(planar: Planar, wheel_speed: Array) -> tuple[Array, Array, Array]:
+    """Return speed, turn and sideways speed (n,) of wheels, as :data:`INPUTS` has them."""
+    if planar.omni:
+        ahead, left, turn = planar.to_rolled @ wheel_speed.T
+        return ahead, 2.0 * planar.wheel_distance_m * turn, left
+    speed = wheel_speed.mean(axis=1)
+    return speed, wheel_speed[:, -1] - wheel_speed[:, 0], np.zeros_like(speed)
 
 
 def _begins_steadily(wheel_speed: Array, steer: Array, dt: float) -> bool:

@@ -13,6 +13,7 @@ from terrain.discrepancy.verdict import Value
 from terrain.effects import PARAMETER, Wording, effect_named
 from terrain.extension import Basis, Origin, basis_of
 from terrain.robots import Robot
+from terrain.robots.omni import as_omni
 from terrain.simulation.planar.skid_steer import SLIDING_RADPS
 
 EXAMPLE_RADPS, EXAMPLE_MPS = 0.5, 1.0
@@ -172,6 +173,25 @@ def _lever(values: Sequence[Value], total: Total, robot: Robot) -> str:
     return f"the measured point {' and '.join(parts)}{joint}the centre {notes[0]}"
 
 
+def _centre_of_mass(values: Sequence[Value], total: Total, robot: Robot) -> str:
+    parts, notes = [], []
+    for value, (ahead, behind) in zip(values, (("ahead", "behind"), ("left", "right")), strict=True):
+        (basis,) = basis_of(robot, value.name, total[value.name])
+        side = ahead if basis.extended >= 0.0 else behind
+        parts.append(f"{rounded(1000.0 * abs(basis.extended), 1000.0 * _half(value))} mm {side}")
+        notes.append(f"{1000.0 * basis.described:.3g}")
+    return f"the centre of mass {' and '.join(parts)} of the middle (described: {', '.join(notes)} mm)"
+
+
+def _wheel_distance(values: Sequence[Value], total: Total, robot: Robot) -> str:
+    (value,) = values
+    distance_m = as_omni(
+        robot, "robot {name}: drive {drive!r} has no distance of omni wheels"
+    ).wheel_distance_m
+    number = rounded(distance_m * (1.0 + total[value.name]), distance_m * _half(value))
+    return f"wheels {number} m from the middle (described: {distance_m:.3g} m)"
+
+
 def _late(values: Sequence[Value], total: Total, robot: Robot) -> str:
     (value,) = values
     homes = basis_of(robot, value.name, total[value.name])
@@ -229,6 +249,8 @@ def _one_sided(values: Sequence[Value], total: Total, robot: Robot) -> str:
 TERMS: dict[Wording, Callable[[Sequence[Value], Total, Robot], str]] = {
     Wording.TRACK: _track,
     Wording.MEASURED_POINT: _lever,
+    Wording.CENTRE_OF_MASS: _centre_of_mass,
+    Wording.WHEEL_DISTANCE: _wheel_distance,
     Wording.LATE: _late,
     Wording.CAMERA_YAW: _camera_yaw,
     Wording.FAST_TURNS: _fast_turns,

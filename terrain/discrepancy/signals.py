@@ -23,6 +23,7 @@ from terrain.effects import (
 from terrain.errors import DataError
 from terrain.kinematics.camera import CHANNELS as POSE_CHANNELS
 from terrain.kinematics.camera import body_motion
+from terrain.measured_slip.travelled import POSE, travelled
 from terrain.records import Array, RunLog, Stream, read_only
 from terrain.robots import Robot
 
@@ -136,6 +137,7 @@ def signals_of(run: RunLog, robot: Robot) -> Signals:
 def _clock(run: RunLog, inputs: Sequence[str]) -> tuple[Array, float]:
     """Return the instants (n,) that all streams have in common, and their period."""
     used = [*inputs, *(name for name in ("imu", "odometry", "lidar") if name in run.streams)]
+    used += ["pose"] if _by_pose(run) else []
     start_s = max(float(run.streams[name].time_s[0]) for name in used)
     end_s = min(float(run.streams[name].time_s[-1]) for name in used)
     rate_hz = min(MAX_RATE_HZ, run.streams["wheels"].rate_hz)
@@ -180,7 +182,12 @@ def _put_imu(measured: Array, run: RunLog, time_s: Array) -> None:
 
 
 def _put_motion(measured: Array, run: RunLog, robot: Robot, time_s: Array) -> None:
-    """Put in speeds over ground and the heading rate, from a camera's poses, its speeds, or a lidar."""
+    """Put in speeds over ground and the heading rate, from a camera's poses, its speeds, or a lidar.
+
+    Poses from outside (a camera above, motion capture) count where there is neither.
+    """
+    if _by_pose(run):
+        _put_pose(measured, run, robot, time_s)
     if (seen := run.streams.get("odometry")) is not None:
         if set(POSE_CHANNELS) <= set(seen.channels):
             speed = _without_jumps(seen, body_motion(seen, robot.camera).speed_mps)
@@ -195,17 +202,40 @@ def _put_motion(measured: Array, run: RunLog, robot: Robot, time_s: Array) -> No
         _put(measured, HEADING, time_s, lidar, "yaw_rate_radps")
 
 
+def _by_pose(run: RunLog) -> bool:
+    """Return whether poses of the body are all that measured its motion from outside."""
+    pose = run.streams.get("pose")
+    return (
+        pose is not None and set(POSE) <= set(pose.channels) and not {"odometry", "lidar"} & set(run.streams)
+    )
+
+
+def _put_pose(measured: Array, run: RunLog, robot: Robot, time_s: Array) -> None:
+    """Put in speeds along the body's axes and heading rate of poses, none where these pause or jump."""
+    seen = travelled(run, robot)
+    step_s, inside = np.diff(seen.time_s), np.diff(seen.part) == 0
+    rates = np.where(inside[:, None], np.diff(seen.values, axis=0), np.nan) / step_s[:, None]
+    middle_s = seen.time_s[:-1] + 0.5 * step_s
+    for c, name in enumerate((SPEED_X, SPEED_Y, HEADING)):
+        measured[:, CHANNELS.index(name)] = _resample(time_s, middle_s, rates[:, c])
+
+
 def _put_currents(
     measured: Array, wheels: Stream, wheel_speeds: Array, steer: Array, robot: Robot, time_s: Array
 ) -> None:
-    """Put in the sum of the motor currents, and of a skid-steer robot their difference."""
+    """Put in the sum of the motor currents, and of a skid-steer robot their difference.
+
+    Wheels of an omni robot drive in three directions: of their currents the magnitudes are summed.
+    """
     currents = [f"current_{wheel}_a" for wheel in robot.wheels]
     if not set(currents) <= set(wheels.channels):
         return
-    each = [
-        _resample(time_s, wheels.time_s, _signed(wheels.channel(name), wheel_speeds[:, i]))
-        for i, name in enumerate(currents)
-    ]
+    is_omni = robot.sideways and not robot.steered
+    each = []
+    for i, name in enumerate(currents):
+        logged = wheels.channel(name)
+        current = np.abs(logged) if is_omni else _signed(logged, wheel_speeds[:, i])
+        each.append(_resample(time_s, wheels.time_s, current))
     measured[:, CHANNELS.index(CURRENT)] = np.sum(each, axis=0)
     parallel = np.abs(np.exp(1j * steer).mean(axis=1)) > PARALLEL
     measured[~parallel, CHANNELS.index(CURRENT)] = np.nan

@@ -26,6 +26,7 @@ from terrain.effects.catalogue import (
     nuisances_of,
     parameters_of,
     read_effect,
+    showing,
 )
 from terrain.effects.described import SCHEMA, checked_covariance, checked_effects, read_effects
 from terrain.effects.sensors import OTHER_LOGGER
@@ -34,8 +35,10 @@ from terrain.effects.types import (
     BOTH,
     CHANNELS,
     CURRENT,
+    EVERY,
     GYRO,
     HEADING,
+    OMNI,
     SKID,
     SPEED_X,
     SPEED_Y,
@@ -58,11 +61,13 @@ __all__ = [
     "CHANNELS",
     "CURRENT",
     "DEPRECATED",
+    "EVERY",
     "GYRO",
     "HEADING",
     "INDEX",
     "LIBRARY",
     "NUISANCES",
+    "OMNI",
     "ONE_SIDED",
     "OTHER_LOGGER",
     "PARAMETER",
@@ -92,5 +97,6 @@ __all__ = [
     "parameters_of",
     "read_effect",
     "read_effects",
+    "showing",
     "vector_of",
 ]

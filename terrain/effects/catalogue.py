@@ -13,9 +13,11 @@ To add an effect, write its entry into the module of its kind, and its formula i
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 
 from terrain.effects.ground import SIDEWAYS, SLIP_AND_RESISTANCE
 from terrain.effects.motors import LOAD_AND_MOTORS
+from terrain.effects.omni import OMNI_WHEELS
 from terrain.effects.sensors import SENSORS
 from terrain.effects.types import Effect, Parameter, PlantPart
 from terrain.effects.wheels import WHEELS_AND_STEERING
@@ -27,6 +29,7 @@ LIBRARY: tuple[Effect, ...] = (
     *SLIP_AND_RESISTANCE,
     *LOAD_AND_MOTORS,
     *SIDEWAYS,
+    *OMNI_WHEELS,
 )
 """Every known effect.  The order is no ranking, but results list effects in it."""
 
@@ -86,6 +89,24 @@ def effect_named(name: str) -> Effect:
 def library_of(drive: str) -> tuple[Effect, ...]:
     """Return the effects that apply to robots of a drive."""
     return tuple(effect for effect in LIBRARY if drive in effect.drives)
+
+
+def showing(drive: str, known: Collection[str] = ()) -> tuple[Effect, ...]:
+    """Return those effects of a drive that runs may show, with the parameters that are known already.
+
+    Examples
+    --------
+    >>> {e.name for e in library_of("omni")} - {e.name for e in showing("omni")}
+    {'payload'}
+    >>> showing("omni", ["roller_friction_ratio"]) == library_of("omni")
+    True
+    """
+
+    def shows(effect: Effect) -> bool:
+        others = [effect_named(name) for of, name in effect.beside if of == drive]
+        return all(any(p.name in known for p in other.parameters) for other in others)
+
+    return tuple(effect for effect in library_of(drive) if shows(effect))
 
 
 def parameters_of(drive: str) -> dict[str, Parameter]:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from terrain.effects.types import (
     BOTH,
     CURRENT,
+    EVERY,
+    OMNI,
     SPEED_X,
     TURNING_CURRENT,
     Combine,
@@ -33,11 +35,12 @@ LOAD_AND_MOTORS: tuple[Effect, ...] = (
         ),
         "mass m (1 + p)",
         "Newton",
-        BOTH,
+        EVERY,
         (CURRENT, SPEED_X),
         "accelerations and slopes",
         plant=PlantPart.BODY,
         twins=(("motor_constant", SPEED_X),),
+        beside=((OMNI, "roller_friction"),),  # there it scales the currents as that does, and no motion
     ),
     Effect(
         "motor_constant",

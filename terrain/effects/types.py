@@ -21,8 +21,11 @@ currents, right minus left current, and the rate of a heading that no gyro measu
 MOTION: tuple[str, ...] = (GYRO, SPEED_X, SPEED_Y)
 """Channels of the planar motion."""
 
-SKID, SWERVE = "skid_steer", "swerve"
+SKID, SWERVE, OMNI = "skid_steer", "swerve", "omni"
 BOTH = (SKID, SWERVE)
+"""Drives of wheels that do not roll across."""
+
+EVERY = (*BOTH, OMNI)
 
 
 class Combine(Enum):
@@ -147,6 +150,8 @@ class Wording(Enum):
     LOSS_IN_TURNS = "the speed that a turn takes"
     SIDE_SLIP = "the speed to the outside of a turn"
     GYRO_SCALE = "by how much the gyro reads too much"
+    CENTRE_OF_MASS = "where the centre of mass is"
+    WHEEL_DISTANCE = "a distance of the wheels in m"
     SIDES = "by how much the wheels of a side are larger"
 
 
@@ -170,6 +175,7 @@ class Effect(NamedTuple):
     wording : what sentences make of its values
     late : who is late by a positive and by a negative value, of an effect that is worded so
     modifies : name of the effect without which it does nothing; empty for an effect that acts by itself
+    beside : drive, and name of the effect that has to be known before runs of it can show this one
     """
 
     name: str
@@ -187,3 +193,4 @@ class Effect(NamedTuple):
     wording: Wording = Wording.NUMBER
     late: tuple[str, str] = ("", "")
     modifies: str = ""
+    beside: tuple[tuple[str, str], ...] = ()

@@ -5,6 +5,7 @@ from __future__ import annotations
 from terrain.effects.types import (
     BOTH,
     CURRENT,
+    EVERY,
     GYRO,
     HEADING,
     MOTION,
@@ -93,7 +94,7 @@ WHEELS_AND_STEERING: tuple[Effect, ...] = (
         ),
         "wheel speed = (1 + e) r x wheel rate, torque = (1 + e) r F",
         KINEMATICS,
-        BOTH,
+        EVERY,
         (*MOTION, CURRENT, HEADING),
         "any speed; slopes and accelerations to part it from slip",
         plant=PlantPart.BODY,

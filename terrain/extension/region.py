@@ -10,6 +10,7 @@ import numpy as np
 
 from terrain.angles import unwrapped
 from terrain.errors import OutsideRegionWarning
+from terrain.kinematics import omni
 from terrain.kinematics.swerve import forward
 from terrain.records import Array, RunLog
 from terrain.robots import Region, Robot
@@ -117,7 +118,10 @@ class RegionMonitor:
 
 
 def _driven(run: RunLog, robot: Robot) -> tuple[Array, Array, Array]:
-    """Return mean wheel speed (n,), yaw rate by the wheels (n,) and slope (m,); empty where not measured."""
+    """Return mean wheel speed (n,), yaw rate by the wheels (n,) and slope (m,); empty where not measured.
+
+    Of omni wheels, which drive in three directions, the speed is what they would roll in any.
+    """
     none = np.empty(0)
     wheels, imu = run.streams.get("wheels"), run.streams.get("imu")
     grade = -imu.channel("pitch_rad") if imu is not None and "pitch_rad" in imu.channels else none
@@ -126,6 +130,9 @@ def _driven(run: RunLog, robot: Robot) -> tuple[Array, Array, Array]:
     rates = np.column_stack([wheels.channel(name) for name in robot.rate_channels])
     if robot.rate_channels[0].startswith("motor_"):
         rates = rates * (robot.wheel_radius_m / robot.motors.reduction_ratio)
+    if robot.sideways and not robot.steered:
+        rolled, _ = omni.forward(robot.wheel_positions_m, robot.wheel_directions_rad, rates)
+        return np.hypot(rolled[:, 0], rolled[:, 1]), rolled[:, 2], grade
     speed = rates.mean(axis=1)
     if not robot.steered:
         return speed, forward(robot.wheel_positions_m, 1.0, rates, np.zeros_like(rates))[0][:, 2], grade

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from terrain.angles import unwrapped, wrapped
-from terrain.effects import OTHER_LOGGER, parameters_of
+from terrain.effects import OTHER_LOGGER, PARAMETER
 from terrain.extension.description import AnyRobot, apply_homes, corrected
 from terrain.extension.region import warn_outside
 from terrain.kinematics.camera import turned
@@ -109,7 +109,7 @@ class Correction:
 
     def __init__(self, robot: Robot, start_s: float = math.nan) -> None:
         self._start_s = start_s
-        self._p = dict.fromkeys(parameters_of(robot.drive), 0.0) | dict(robot.effects)
+        self._p = dict.fromkeys(PARAMETER, 0.0) | dict(robot.effects)
         applied = apply_homes(robot)
         homeless = applied.effects
         self._gyro_bias = applied.completed.sensors.gyro_bias_z_radps
@@ -120,7 +120,7 @@ class Correction:
         half = 0.5 * self._p["one_sided_radius_ratio"]
         self._side = {wheel: 1.0 + half if wheel in ("3", "right") else 1.0 - half for wheel in robot.wheels}
         self._scale = {wheel: 1.0 + self._p.get(f"wheel_scale_{wheel}_ratio", 0.0) for wheel in robot.wheels}
-        self._has_backlash = self._p.get("steering_backlash_rad", 0.0) > 0.0
+        self._has_backlash = self._p["steering_backlash_rad"] > 0.0
         self._follower, self._angle, self._yaw = np.full(3, np.nan), np.full(3, np.nan), (np.nan, np.nan)
         self._inverses: Mapping[str, Callable[[tuple[str, ...], Array, Array], None]] = {
             "wheels": self._wheels,
@@ -128,6 +128,7 @@ class Correction:
             "imu": self._imu,
             "odometry": self._camera,
             "lidar": self._camera,
+            "pose": self._pose,
             "truth": self._true_wheels,
         }
 
@@ -159,7 +160,7 @@ class Correction:
         if name in OTHER_LOGGER and (p["clock_offset_s"] or p["clock_rate_ratio"]):
             since_s = (time_s - self._start_s - p["clock_offset_s"]) / (1.0 + p["clock_rate_ratio"])
             return np.asarray(self._start_s + since_s)
-        if name == "steering" and p.get("steering_delay_s"):  # which skid-steer robots do not have
+        if name == "steering" and p["steering_delay_s"]:
             return np.asarray(time_s + p["steering_delay_s"])
         return time_s
 
@@ -228,3 +229,11 @@ class Correction:
     def _camera(self, channels: tuple[str, ...], time_s: Array, values: Array) -> None:
         if self._p["camera_yaw_rad"]:
             turned(values, channels, -self._p["camera_yaw_rad"])
+
+    def _pose(self, channels: tuple[str, ...], time_s: Array, values: Array) -> None:
+        scale, angle = 1.0 + self._p["camera_scale_ratio"], self._p["camera_yaw_rad"]
+        for i, channel in enumerate(channels):
+            if channel.startswith("position_") and scale != 1.0:
+                values[:, i] /= scale
+            elif channel == "yaw_rad" and angle:
+                values[:, i] += angle

@@ -39,7 +39,7 @@ LAWS: dict[str, tuple[str, ...]] = {
 
 RESISTANCE = ("rolling_resistance_ratio", "slip_sinkage_ratio")
 ROLLERS = "roller_friction_ratio"
-"""Of omni wheels: friction of their rollers over the stiffness of traction; may be left out."""
+"""Of omni wheels: friction of their rollers over the load; may be left out."""
 
 SINKAGE = ("kc_npmn1", "kphi_npmn2", "sinkage_exponent_ratio")
 
@@ -57,7 +57,7 @@ RANGES: dict[str, tuple[float | None, float]] = {
     "kc_npmn1": (0.0, 1e9),
     "kphi_npmn2": (None, 1e12),
     "sinkage_exponent_ratio": (None, 2.0),
-    "roller_friction_ratio": (0.0, 20.0),
+    "roller_friction_ratio": (0.0, 2.0),
 }
 """Lowest and highest value of each number, so that an angle in degrees is noticed; None: above zero.
 
@@ -89,7 +89,7 @@ class Soil:
     cohesion_pa, friction_angle_rad, shear_modulus_m : c and phi of Mohr and Coulomb, K of Janosi and Hanamoto
     stiffness_ratio, shape_ratio, peak_friction_ratio, curvature_ratio : B, C, D, E of the Magic Formula
     kc_npmn1, kphi_npmn2, sinkage_exponent_ratio : kc, kphi and n of Bekker
-    roller_friction_ratio : of omni wheels' rollers over the stiffness of traction, with any law
+    roller_friction_ratio : of omni wheels' rollers over the load, with any law
     scatter : how numbers differ from run to run and along a run
     """
 

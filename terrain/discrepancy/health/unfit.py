@@ -252,9 +252,10 @@ def common_fit_cost(info: Information, left: Sequence[int]) -> tuple[Array, Arra
 
     own = loss(a, g)
     n_rows = np.array([int((info.white_residual[i] != 0.0).sum()) for i in left])
-    noise = float(np.median((c + own) / n_rows))
+    seen = n_rows > 0  # of a short run nothing may be left once filters have settled
+    noise = float(np.median((c + own)[seen] / n_rows[seen])) if seen.any() else 1.0
     without = loss(a.sum(axis=0) - a, g.sum(axis=0) - g)
     cost = float(loss(a.sum(axis=0), g.sum(axis=0))) - own.sum()
     others = without - (own.sum() - own)
     alone = cost - others
-    return alone / (others / max(n - 2, 1) + k * noise), alone / (noise * n_rows)
+    return alone / (others / max(n - 2, 1) + k * noise), alone / (noise * np.maximum(n_rows, 1))

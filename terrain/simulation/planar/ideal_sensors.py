@@ -19,6 +19,7 @@ _ACCEL_BIAS = INDEX["accel_bias_mps2"]
 _LATENCY = INDEX["camera_latency_s"]
 _IMU_LATENCY = INDEX["imu_latency_s"]
 _CAMERA_YAW = INDEX["camera_yaw_rad"]
+_CAMERA_SCALE = INDEX["camera_scale_ratio"]
 _LEVER_X = INDEX["lever_x_m"]
 _LEVER_Y = INDEX["lever_y_m"]
 _CLOCK_OFFSET = INDEX["clock_offset_s"]
@@ -40,7 +41,8 @@ def sense(planar: Planar, p: Array, dt: float, truth: Array) -> Array:
     n = truth.shape[0]
     out = np.empty((n, 7))
     lever_x, lever_y = planar.lever_x_m + p[_LEVER_X], planar.lever_y_m + p[_LEVER_Y]
-    cos, sin = math.cos(p[_CAMERA_YAW]), math.sin(p[_CAMERA_YAW])
+    scale = 1.0 + p[_CAMERA_SCALE] if planar.omni else 1.0
+    cos, sin = scale * math.cos(p[_CAMERA_YAW]), scale * math.sin(p[_CAMERA_YAW])
     for k in range(n):
         w = truth[k, W]
         v_x, v_y = point_velocity(truth[k, VX], truth[k, VY], w, lever_x, lever_y)

@@ -79,7 +79,7 @@ class Ground(NamedTuple):
     thrust_ratio : traction over weight at slips evenly spaced from 0 to 1, which takes the place of
         ``slip_ratio``; without any the thrust curve is straight
     load_ratio : by how much the traction at a slip grows with a load, as a share of the load's own share
-    roller_ratio : friction of the rollers of omni wheels over the stiffness of traction
+    roller_ratio : friction of the rollers of omni wheels over the load, at a speed across of the wheels' own
     effective_ratio : share of the measured tilt that is a slope to drive up; the rest is a body that rides
         over bumps
     """
@@ -129,6 +129,7 @@ class Planar(NamedTuple):
     across: Array
     to_rolled: Array
     wheel_load_ratio: Array
+    wheel_distance_m: float
     roller_ratio: float
 
 
@@ -190,6 +191,7 @@ def _omni_wheels(robot: Robot, arm_m: Array, ground: Ground) -> dict[str, Any]:
             "across": none,
             "to_rolled": np.zeros((3, n)),
             "wheel_load_ratio": np.zeros(n),
+            "wheel_distance_m": 0.0,
             "roller_ratio": 0.0,
         }
     direction = robot.wheel_directions_rad
@@ -200,6 +202,7 @@ def _omni_wheels(robot: Robot, arm_m: Array, ground: Ground) -> dict[str, Any]:
         "across": np.ascontiguousarray(rolling_matrix(arm_m, direction + np.pi / 2)),
         "to_rolled": np.ascontiguousarray(np.linalg.pinv(rolling_matrix(robot.wheel_positions_m, direction))),
         "wheel_load_ratio": np.linalg.pinv(moments) @ np.array([1.0, 0.0, 0.0]),
+        "wheel_distance_m": float(np.hypot(*robot.wheel_positions_m[0])),
         "roller_ratio": ground.roller_ratio,
     }
 

@@ -49,7 +49,8 @@ def move(
         out = move_skid(planar, p, dt, wheel_speed_mps, grade_rad, disturbance)
     for k in range(out.shape[0]):
         fast = math.sqrt(out[k, VX] * out[k, VX] + out[k, VY] * out[k, VY])
-        out[k, VY] -= p[_SIDE_HILL] * planar.effective_ratio * roll_rad[k] * fast
+        if not planar.omni:
+            out[k, VY] -= p[_SIDE_HILL] * planar.effective_ratio * roll_rad[k] * fast
         if disturbance.shape[0] > 0:
             out[k, VY] += fast * disturbance[k, 1]
             out[k, W] += disturbance[k, 2]

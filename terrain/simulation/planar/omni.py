@@ -7,10 +7,11 @@ direction that it drives and by :math:`E_i V` across it.  The forces on it are t
 is larger, of their centres,
 
 .. math::
-    F_i = n_i W C \frac{u_i - D_i V}{U}, \qquad G_i = -\rho\, n_i W C \frac{E_i V}{U},
+    F_i = n_i W C \frac{u_i - D_i V}{U}, \qquad G_i = -r\, n_i W \frac{E_i V}{U},
 
 so that slip does not depend on speed.  C is the traction over the load of the ground at the root mean square
-slip of the wheels, over that slip, and :math:`\rho` the friction of the rollers over it.  Rolling resistance
+slip of the wheels, over that slip, and r the friction of the rollers over the load; steady motion depends on
+:math:`\rho = r / C` alone, the force that it takes on r and C.  Rolling resistance
 :math:`R_i` opposes the motion along each wheel.  With the masses M and gravity P of a slope
 
 .. math:: M \dot V = \sum_i D_i^T (F_i - R_i) + E_i^T G_i + P + M\,(w v_y, -w v_x, 0) .
@@ -19,7 +20,7 @@ A contact follows within :math:`U / (C g)`, some milliseconds: steps are implici
 rest, too, and without the inertia is :func:`~terrain.simulation.planar.omni_contact.steady_twist`.
 
 What is assumed: three wheels at even angles whose loads follow from the centre of mass and do not shift; one
-C and :math:`\rho` for all wheels; rollers whose friction grows with traction where the thrust curve bends.
+C and r for all wheels; friction of the rollers that grows with the speed across over U.
 """
 
 from __future__ import annotations
@@ -40,8 +41,8 @@ ROLLING_MPS = 0.02
 """Speed below which slip is no more over the speed itself, and over which a resistance takes its full size;
 assumed: a fifth of the slowest measured drive."""
 
-STIFFEST_GROUND = 1e-6
-"""Slip per traction of the stiffest ground."""
+STIFFEST, STIFFEST_GROUND = 0.1, 1e-6
+"""Slip per traction that an effect leaves of the ground's own at the least, and that of the stiffest."""
 
 SUBSTEPS = 4
 """Implicit steps within one of the simulation, so that their lag, half of each, is about a millisecond."""
@@ -49,6 +50,10 @@ SUBSTEPS = 4
 _RADIUS = INDEX["wheel_radius_ratio"]
 _ROLLING = INDEX["rolling_resistance_ratio"]
 _PAYLOAD = INDEX["payload_ratio"]
+_FORCE_SLIP = INDEX["force_slip_ratio"]
+_ROLLERS = INDEX["roller_friction_ratio"]
+_DISTANCE = INDEX["wheel_distance_ratio"]
+_SHIFT_X, _SHIFT_Y = INDEX["load_shift_x_m"], INDEX["load_shift_y_m"]
 
 
 @njit(cache=True)
@@ -68,7 +73,9 @@ def move_omni(
     """
     n = wheel_speed_mps.shape[0]
     out = np.zeros((n, N_TRUTH))
-    along, across = planar.along, planar.across
+    along, across, load = placed(planar, p)
+    com_x, com_y = planar.com_x_m + p[_SHIFT_X], planar.com_y_m + p[_SHIFT_Y]
+    rollers = planar.roller_ratio + p[_ROLLERS]
     twist, before = np.zeros(3), np.zeros(3)
     matrix, pushed = np.empty((3, 3)), np.empty(3)
     mass = planar.mass_kg * (1.0 + p[_PAYLOAD])
@@ -83,8 +90,9 @@ def move_omni(
         started_x, started_y = before[0], before[1]
         for part in range(SUBSTEPS):
             rolled = last + (u - last) * ((part + 1) / SUBSTEPS)
-            speed = fastest(planar, rolled, before)
-            stiff = weight / max(softness(planar.soft_ratio, size), STIFFEST_GROUND) / speed
+            speed = fastest(along, rolled, before)
+            stiff = stiffness(planar, p, size) * weight / speed
+            resists = rollers * weight / speed
             w = before[2]
             turning = (mass * w * before[1], -mass * w * before[0], 0.0)
             for a in range(3):
@@ -93,20 +101,20 @@ def move_omni(
                     matrix[a, b] = inertia[a] / step if a == b else 0.0
             for i in range(planar.n_wheels):
                 v = dot(along[i], before)
-                drag = rolling * weight / math.sqrt(v * v + ROLLING_MPS * ROLLING_MPS)
-                share = planar.wheel_load_ratio[i]
+                share = load[i]
+                drag = share * rolling * weight / math.sqrt(v * v + ROLLING_MPS * ROLLING_MPS)
                 for a in range(3):
                     pushed[a] += share * stiff * rolled[i] * along[i, a]
                     for b in range(3):
-                        matrix[a, b] += share * (stiff + drag) * along[i, a] * along[i, b]
-                        matrix[a, b] += share * stiff * planar.roller_ratio * across[i, a] * across[i, b]
+                        matrix[a, b] += (share * stiff + drag) * along[i, a] * along[i, b]
+                        matrix[a, b] += share * resists * across[i, a] * across[i, b]
             solve3(matrix, pushed, twist)
             slip = 0.0
             for i in range(planar.n_wheels):
                 slip += (rolled[i] - dot(along[i], twist)) ** 2
             size = min(math.sqrt(slip / planar.n_wheels) / speed, 1.0)
             before[:] = twist
-        v_x, v_y = twist[0] + twist[2] * planar.com_y_m, twist[1] - twist[2] * planar.com_x_m
+        v_x, v_y = twist[0] + twist[2] * com_y, twist[1] - twist[2] * com_x
         if disturbance.shape[0] > 0:
             v_x, v_y = v_x * (1.0 - disturbance[k, 0]), v_y * (1.0 - disturbance[k, 0])
         out[k, VX], out[k, VY], out[k, W] = v_x, v_y, twist[2]
@@ -131,21 +139,23 @@ def currents_of(planar: Planar, p: Array, dt: float, wheel_speed_mps: Array, tru
     out = np.empty((n, wheels))
     weight = planar.mass_kg * (1.0 + p[_PAYLOAD]) * GRAVITY_MPS2
     radius_m, twist = planar.radius_m * (1.0 + p[_RADIUS]), np.empty(3)
+    along, _, load = placed(planar, p)
+    com_x, com_y = planar.com_x_m + p[_SHIFT_X], planar.com_y_m + p[_SHIFT_Y]
     spun = np.empty((n, wheels))
     for i in range(wheels):
         spun[:, i] = slopes(wheel_speed_mps[:, i].copy(), dt)
     for k in range(n):
         u = wheel_speed_mps[k] * (1.0 + p[_RADIUS])
-        twist[0] = truth[k, VX] - truth[k, W] * planar.com_y_m
-        twist[1] = truth[k, VY] + truth[k, W] * planar.com_x_m
+        twist[0] = truth[k, VX] - truth[k, W] * com_y
+        twist[1] = truth[k, VY] + truth[k, W] * com_x
         twist[2] = truth[k, W]
-        speed, slip = fastest(planar, u, twist), 0.0
+        speed, slip = fastest(along, u, twist), 0.0
         for i in range(wheels):
-            slip += (u[i] - dot(planar.along[i], twist)) ** 2
+            slip += (u[i] - dot(along[i], twist)) ** 2
         size = min(math.sqrt(slip / wheels) / speed, 1.0)
-        stiff = weight / max(softness(planar.soft_ratio, size), STIFFEST_GROUND) / speed
+        stiff = stiffness(planar, p, size) * weight / speed
         for i in range(wheels):
-            pull = planar.wheel_load_ratio[i] * stiff * (u[i] - dot(planar.along[i], twist))
+            pull = load[i] * stiff * (u[i] - dot(along[i], twist))
             torque = (pull + planar.rotating_kg / wheels * spun[k, i]) * radius_m
             direction = u[i] / math.sqrt(u[i] * u[i] + ROLLING_MPS * ROLLING_MPS)
             out[k, i] = (torque + planar.friction_nm / wheels * direction) / planar.nm_per_a
@@ -153,13 +163,43 @@ def currents_of(planar: Planar, p: Array, dt: float, wheel_speed_mps: Array, tru
 
 
 @njit(cache=True)
-def fastest(planar: Planar, wheel_speed_mps: Array, twist: Array) -> float:
-    """Return the speed U that slip is over: of wheels (wheels,) or their centres, never below a minimum."""
-    rolled, moved = 0.0, 0.0
+def placed(planar: Planar, p: Array) -> tuple[Array, Array, Array]:
+    """Return ``along`` and ``across`` (wheels, 3) and the loads (wheels,) with wheels and load as p has them.
+
+    With the distance d of the wheels, the directions along and across them and out to them, and the centre
+    of mass c, ``D_i`` ends in ``d - c x along``, ``E_i`` in ``-c x across``, and wheel i of three carries
+    ``(1 + 2 c . out / d) / 3``; one that would carry less than nothing carries nothing.
+    """
+    along, across, load = planar.along.copy(), planar.across.copy(), planar.wheel_load_ratio.copy()
+    shift_x, shift_y = p[_SHIFT_X], p[_SHIFT_Y]
+    distance = planar.wheel_distance_m * (1.0 + p[_DISTANCE])
+    if shift_x == 0.0 and shift_y == 0.0 and p[_DISTANCE] == 0.0:
+        return along, across, load
+    com_x, com_y, total = planar.com_x_m + shift_x, planar.com_y_m + shift_y, 0.0
     for i in range(planar.n_wheels):
+        along[i, 2] = distance - (com_x * along[i, 1] - com_y * along[i, 0])
+        across[i, 2] = -(com_x * across[i, 1] - com_y * across[i, 0])
+        out = com_x * along[i, 1] - com_y * along[i, 0]
+        load[i] = max(1.0 + 2.0 * out / distance, 0.0) / planar.n_wheels
+        total += load[i]
+    return along, across, load / total
+
+
+@njit(cache=True)
+def stiffness(planar: Planar, p: Array, slip_ratio: float) -> float:
+    """Return traction over load and slip of the ground, with the effect that makes it softer."""
+    soft = max(softness(planar.soft_ratio, slip_ratio), STIFFEST_GROUND)
+    return float(1.0 / max(soft + p[_FORCE_SLIP], STIFFEST * soft))
+
+
+@njit(cache=True)
+def fastest(along: Array, wheel_speed_mps: Array, twist: Array) -> float:
+    """Return the speed U that slip is over: of wheels (wheels,) or their centres, never below a minimum."""
+    rolled, moved, n = 0.0, 0.0, wheel_speed_mps.shape[0]
+    for i in range(n):
         rolled += wheel_speed_mps[i] ** 2
-        moved += dot(planar.along[i], twist) ** 2
-    return math.sqrt(max(rolled, moved) / planar.n_wheels + ROLLING_MPS * ROLLING_MPS)
+        moved += dot(along[i], twist) ** 2
+    return math.sqrt(max(rolled, moved) / n + ROLLING_MPS * ROLLING_MPS)
 
 
 @njit(cache=True)

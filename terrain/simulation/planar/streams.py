@@ -171,7 +171,14 @@ def pose_stream(run: PlanarRun, rng: np.random.Generator) -> Stream:
     camera = run.robot.camera
     rows, time_s = run.samples(CAMERA_HZ)
     latency_s = run.planar.latency_s + run.p[INDEX["camera_latency_s"]]
-    seen = np.column_stack([run.delayed(column, latency_s)[rows] for column in run.motion.pose.T])
+    x_m, y_m, yaw_rad = (run.delayed(column, latency_s)[rows] for column in run.motion.pose.T)
+    lever_m = [
+        at + run.p[INDEX[f"lever_{axis}_m"]]
+        for axis, at in zip("xy", (camera.lever_x_m, camera.lever_y_m), strict=True)
+    ]
+    marker = x_m + 1j * y_m + np.exp(1j * yaw_rad) * complex(*lever_m)
+    marker = marker * (1.0 + run.p[INDEX["camera_scale_ratio"]])
+    seen = np.column_stack([marker.real, marker.imag, yaw_rad - run.p[INDEX["camera_yaw_rad"]]])
     if run.noise is not None:
         std = np.array([camera.position_std_m, camera.position_std_m, camera.yaw_std_rad])
         seen = seen + std * rng.standard_normal(seen.shape)
@@ -357,7 +364,8 @@ def planar_truth(run: PlanarRun) -> Stream:
     accel_x = motion.truth[rows, AX] - GRAVITY_MPS2 * np.sin(grade)
     accel_y = np.gradient(v_y, 1.0 / IMU_HZ) + turn * v_x
     steer = motion.steer_rad[rows] + robot.wheel_directions_rad
-    along, _ = wheel_frame_velocities(np.column_stack([v_x, v_y, turn]), robot.wheel_positions_m, steer)
+    places_m = robot.wheel_positions_m * (1.0 + run.p[INDEX["wheel_distance_ratio"]])
+    along, _ = wheel_frame_velocities(np.column_stack([v_x, v_y, turn]), places_m, steer)
     columns = [
         motion.pose[rows],
         np.column_stack([motion.roll_rad[rows], -grade, v_x, v_y, turn, accel_x, accel_y]),

@@ -28,10 +28,12 @@ from terrain.logs.replay import replay
 from terrain.records import RunLog, Stream
 from terrain.robots import load_robot
 from terrain.simulation.dynamic.simulate import simulate
+from terrain.simulation.planar.ground import planar_ground
+from terrain.simulation.planar.run import simulate_planar
 from terrain.simulation.scenario.make import make_scenario
 from terrain.terramechanics.soil import load_soil
 
-ROBOT, HUSKY = load_robot("agrimaro"), load_robot("husky")
+ROBOT, HUSKY, OMNI = load_robot("agrimaro"), load_robot("husky"), load_robot("robotino")
 BARE = HUSKY.without("body", "motors", "camera", "sensors")
 VALUES = {"wheel_radius_ratio": 0.031234567, "camera_yaw_rad": -0.012, "force_slip_ratio": 0.3}
 ROOT = np.array([[2e-3, 0.0, 0.0], [1e-3, 5e-4, 0.0], [0.01, -0.02, 0.03]])
@@ -108,7 +110,7 @@ def test_corrections_are_applied_once():
 
 
 def every_stream():
-    """Streams of both drives with all channels that a correction looks at, none of them constant."""
+    """Streams of all drives with all channels that a correction looks at, none of them constant."""
     time_s = np.linspace(1.0, 31.0, 301)
     wave = 0.4 * np.sin(time_s)
     wheels = ("1", "2", "3", "left", "right")
@@ -119,6 +121,7 @@ def every_stream():
         "steering": [f"angle_{i}_rad" for i in (1, 2, 3)],
         "imu": ["gyro_z_radps", "accel_x_mps2", "yaw_rad"],
         **{name: ["speed_x_mps", "speed_y_mps"] for name in ("odometry", "lidar", "gnss")},
+        "pose": ["position_x_m", "position_y_m", "yaw_rad"],
         "commands": ["speed_x_mps", "wheel_1_radps"],
     }
     return {
@@ -127,7 +130,7 @@ def every_stream():
     }
 
 
-@pytest.mark.parametrize("robot", [ROBOT, HUSKY, ROBOT.without("sensors", "motors"), BARE])
+@pytest.mark.parametrize("robot", [ROBOT, HUSKY, ROBOT.without("sensors", "motors"), BARE, OMNI])
 def test_a_correction_changes_the_streams_that_the_catalogue_names_and_no_others(robot):
     """What has a home is taken off samples only as far as the catalogue says."""
     run = RunLog("a", robot.name, every_stream())
@@ -180,6 +183,16 @@ def test_a_correction_is_the_inverse_of_what_sensors_do(names):
     per_a = robot.motors.torque_constant_nmpa / ROBOT.motors.torque_constant_nmpa
     current = per_a * back.streams["wheels"].values[:, 3:]
     np.testing.assert_allclose(current, clean.streams["wheels"].values[:, 3:], atol=0.15)
+
+
+def test_a_pose_of_a_camera_whose_scale_and_angle_are_off_comes_back():
+    effects = {"camera_scale_ratio": -0.08, "camera_yaw_rad": 0.05}
+    drive = make_scenario("crab", OMNI, "grass", 20.0)
+    ground = planar_ground(OMNI, load_soil("grass"))
+    clean, run = (simulate_planar(OMNI, drive.twist, 0, ground=ground, effects=e) for e in ({}, effects))
+    back = corrected_log(run, replace(OMNI, effects=effects)).streams["pose"]
+    assert np.abs(run.streams["pose"].values - clean.streams["pose"].values).max() > 0.04
+    np.testing.assert_allclose(back.values, clean.streams["pose"].values, atol=1e-9)
 
 
 @pytest.mark.parametrize("block", [1, 7, 1000])

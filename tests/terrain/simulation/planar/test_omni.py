@@ -25,7 +25,8 @@ from terrain.terramechanics.soil import load_soil, soil_from
 
 ROBOT = load_robot("robotino")
 PLACE = ROBOT.wheel_positions_m, ROBOT.wheel_directions_rad
-FELT = Ground(slip_ratio=1.5, rolling_ratio=0.0, roller_ratio=0.7)
+SOFT = 1.5
+CARPET = Ground(slip_ratio=SOFT, rolling_ratio=0.0, roller_ratio=0.7 / SOFT)
 NONE = vector_of({})
 DT = 0.01
 
@@ -58,23 +59,23 @@ def heading_to(direction_rad, speed_mps=0.2):
 
 @pytest.mark.parametrize("twist", [(0.2, 0.1, 0.0), (0.0, -0.3, 0.0), (0.1, 0.0, 0.8)])
 def test_without_friction_of_rollers_or_resistance_the_body_moves_as_its_wheels_roll(twist):
-    steady = moved(centred(ROBOT), FELT._replace(roller_ratio=0.0), wheels_for(twist))[-1]
+    steady = moved(centred(ROBOT), CARPET._replace(roller_ratio=0.0), wheels_for(twist))[-1]
     spin = abs(twist[2] * twist[0])  # a turn takes a force to the inside, and slip with it
-    np.testing.assert_allclose(steady[[VX, VY, W]], twist, atol=1e-9 + spin * FELT.slip_ratio)
+    np.testing.assert_allclose(steady[[VX, VY, W]], twist, atol=1e-9 + spin * CARPET.slip_ratio)
 
 
 @pytest.mark.parametrize("ratio", [0.04, 0.25, 0.8])
 @pytest.mark.parametrize("direction_rad", [0.0, 0.7, 2.9, 4.4])
 def test_steady_motion_is_that_of_the_balance_of_forces(ratio, direction_rad):
     wheels = wheels_for(heading_to(direction_rad))
-    ground = FELT._replace(roller_ratio=ratio)
+    ground = CARPET._replace(roller_ratio=ratio / SOFT)
     load = make_planar(ROBOT, ground).wheel_load_ratio
     assert load.sum() == pytest.approx(1.0)
     np.testing.assert_allclose(load @ PLACE[0], [ROBOT.body.com_x_m, ROBOT.body.com_y_m], atol=1e-12)
     expected = steady_twist(wheels[-1:], *PLACE, load, ratio)[0]
     found = moved(ROBOT, ground, wheels)[-1, [VX, VY, W]]
     # rollers turn the robot, which takes a force to the inside, and slip with it
-    inside = 2.0 * FELT.slip_ratio * abs(expected[2]) * np.hypot(*expected[:2]) / 9.8
+    inside = 2.0 * CARPET.slip_ratio * abs(expected[2]) * np.hypot(*expected[:2]) / 9.8
     np.testing.assert_allclose(found[:2], expected[:2], atol=1e-4 + 0.2 * inside)
     assert found[2] == pytest.approx(expected[2], abs=1e-4 + inside / ROBOT.wheel_distance_m)
 
@@ -82,7 +83,7 @@ def test_steady_motion_is_that_of_the_balance_of_forces(ratio, direction_rad):
 def test_slip_depends_on_the_direction_and_not_on_the_speed():
     slips = np.array(
         [
-            [moved(ROBOT, FELT, wheels_for(heading_to(a, speed)))[-1, SLIP] for speed in (0.2, 0.4)]
+            [moved(ROBOT, CARPET, wheels_for(heading_to(a, speed)))[-1, SLIP] for speed in (0.2, 0.4)]
             for a in np.radians([0.0, 30.0, 60.0, 90.0])
         ]
     )
@@ -93,7 +94,7 @@ def test_slip_depends_on_the_direction_and_not_on_the_speed():
 def test_with_equal_loads_a_third_of_a_turn_changes_nothing():
     for angle in (0.2, 1.1):
         one, other = (
-            moved(centred(ROBOT), FELT, wheels_for(heading_to(angle + more)))[-1]
+            moved(centred(ROBOT), CARPET, wheels_for(heading_to(angle + more)))[-1]
             for more in (0.0, 2 * np.pi / 3)
         )
         assert one[SLIP] == pytest.approx(other[SLIP], abs=1e-9)
@@ -112,7 +113,8 @@ def law(planar, u, twist, stiff, rolling):
     v = planar.along @ twist
     drag = rolling * planar.mass_kg * 9.80665 * v / np.hypot(v, ROLLING_MPS)
     force = stiff * (u - v)[:, None] * planar.along - drag[:, None] * planar.along
-    force -= stiff * planar.roller_ratio * (planar.across @ twist)[:, None] * planar.across
+    resists = planar.roller_ratio * planar.mass_kg * 9.80665 / speed_of(planar, u, twist)
+    force -= resists * (planar.across @ twist)[:, None] * planar.across
     return (load * force).sum(axis=0)
 
 
@@ -122,7 +124,7 @@ def speed_of(planar, u, twist):
 
 
 def test_the_kernel_is_the_plain_form_of_its_implicit_steps():
-    ground = FELT._replace(rolling_ratio=0.02)
+    ground = CARPET._replace(rolling_ratio=0.02)
     planar, wheels = make_planar(ROBOT, ground), starting()
     masses = np.array([planar.mass_kg, planar.mass_kg, planar.yaw_inertia_kgm2])
     weight, step, twist, size, last = planar.mass_kg * 9.80665, DT / SUBSTEPS, np.zeros(3), 0.0, wheels[0]
@@ -134,7 +136,7 @@ def test_the_kernel_is_the_plain_form_of_its_implicit_steps():
             stiff = weight / softness(planar.soft_ratio, size) / speed
             drag = planar.rolling_ratio * weight / np.hypot(planar.along @ twist, ROLLING_MPS)
             balance = (planar.along.T * (load * (stiff + drag))) @ planar.along
-            balance += (planar.across.T * (load * stiff * planar.roller_ratio)) @ planar.across
+            balance += (planar.across.T * (load * planar.roller_ratio * weight / speed)) @ planar.across
             turning = planar.mass_kg * twist[2] * np.array([twist[1], -twist[0], 0.0])
             driven = planar.along.T @ (load * stiff * u)
             twist = np.linalg.solve(
@@ -148,7 +150,7 @@ def test_the_kernel_is_the_plain_form_of_its_implicit_steps():
 
 def test_a_start_is_that_of_the_differential_equation():
     """The other route: an integrator that chooses its own steps."""
-    ground = FELT._replace(rolling_ratio=0.02)
+    ground = CARPET._replace(rolling_ratio=0.02)
     planar, wheels = make_planar(ROBOT, ground), starting()
     masses = np.array([planar.mass_kg, planar.mass_kg, planar.yaw_inertia_kgm2])
     time_s = DT * np.arange(len(wheels))
@@ -168,45 +170,47 @@ def test_a_start_is_that_of_the_differential_equation():
 
 
 def test_currents_are_those_of_friction_where_nothing_resists_and_grow_with_the_rollers():
-    planar = make_planar(centred(ROBOT), FELT._replace(roller_ratio=0.0))
+    planar = make_planar(centred(ROBOT), CARPET._replace(roller_ratio=0.0))
     wheels = wheels_for((0.3, 0.1, 0.0))
-    free = moved(centred(ROBOT), FELT._replace(roller_ratio=0.0), wheels)
+    free = moved(centred(ROBOT), CARPET._replace(roller_ratio=0.0), wheels)
     direction = wheels[-1] / np.hypot(wheels[-1], ROLLING_MPS)
     motors = ROBOT.motors
     per_a = motors.torque_constant_nmpa * motors.reduction_ratio * motors.efficiency_ratio
     each = currents_of(planar, NONE, DT, wheels, free)[-1]
     np.testing.assert_allclose(each, motors.friction_nm / per_a * direction, atol=1e-9)
-    held = moved(centred(ROBOT), FELT, wheels)
+    held = moved(centred(ROBOT), CARPET, wheels)
     assert held[-1, AMPS] > free[-1, AMPS] + 0.5
 
 
 def test_motors_give_the_power_that_slip_and_rollers_take():
-    planar, wheels = make_planar(ROBOT, FELT), wheels_for((0.2, 0.15, 0.0))
-    truth = moved(ROBOT, FELT, wheels)
+    planar, wheels = make_planar(ROBOT, CARPET), wheels_for((0.2, 0.15, 0.0))
+    truth = moved(ROBOT, CARPET, wheels)
     twist = truth[-1, [VX, VY, W]]
     twist = twist + twist[2] * np.array([-planar.com_y_m, planar.com_x_m, 0.0])
     friction = planar.friction_nm / 3 * wheels[-1] / np.hypot(wheels[-1], ROLLING_MPS)
     torque = currents_of(planar, NONE, DT, wheels, truth)[-1] * planar.nm_per_a - friction
     u, v, across = wheels[-1], planar.along @ twist, planar.across @ twist
-    scale = planar.wheel_load_ratio * planar.mass_kg * 9.80665 / FELT.slip_ratio / speed_of(planar, u, twist)
-    lost = (scale * ((u - v) ** 2 + FELT.roller_ratio * across**2)).sum()
+    scale = (
+        planar.wheel_load_ratio * planar.mass_kg * 9.80665 / CARPET.slip_ratio / speed_of(planar, u, twist)
+    )
+    lost = (scale * ((u - v) ** 2 + SOFT * CARPET.roller_ratio * across**2)).sum()
     assert (torque / planar.radius_m * u).sum() == pytest.approx(lost, rel=1e-3)
 
 
 def test_up_a_slope_the_body_slips_more_and_payload_changes_nothing_on_the_level():
     wheels = wheels_for((0.2, 0.0, 0.0))
-    level, up = (moved(ROBOT, FELT, wheels, grade=grade)[-1, SLIP] for grade in (0.0, 0.05))
-    assert up == pytest.approx(level + 0.05 * FELT.slip_ratio / (1 + FELT.roller_ratio), abs=0.03)
+    level, up = (moved(ROBOT, CARPET, wheels, grade=grade)[-1, SLIP] for grade in (0.0, 0.05))
+    assert up == pytest.approx(level + 0.05 * SOFT / (1 + SOFT * CARPET.roller_ratio), abs=0.03)
     assert up > level + 0.02
-    loaded = moved(ROBOT, FELT, wheels, vector_of({"payload_ratio": 0.5}))[-1, SLIP]
+    loaded = moved(ROBOT, CARPET, wheels, vector_of({"payload_ratio": 0.5}))[-1, SLIP]
     assert loaded == pytest.approx(level, abs=1e-6)
 
 
-def driven(direction_rad, seed=0, ground=FELT, speed_mps=0.2, seconds=6.0, effects=None):
+def driven(direction_rad, seed=0, ground=CARPET, speed_mps=0.2, seconds=6.0, effects=None):
     twist = np.zeros((int(50 * seconds) + 1, 3))
     twist[25:] = heading_to(direction_rad, speed_mps)
     run = simulate_planar(
-        ROBOT, twist, seed, ground=ground, noise=load_noise(), terrain="felt", effects=effects
+        ROBOT, twist, seed, ground=ground, noise=load_noise(), terrain="carpet", effects=effects
     )
     return with_wheel_speeds(run, ROBOT)
 
@@ -240,10 +244,10 @@ def test_measured_slip_of_a_simulated_run_is_its_truth(direction_rad):
 
 
 def test_hidden_rollers_load_and_radius_of_simulated_runs_come_back_within_their_intervals():
-    hidden = {"cork": 0.1, "felt": 0.6}
+    hidden = {"cork": 0.1, "carpet": 0.6}
     slips, groups = [], []
     for j, (name, ratio) in enumerate(hidden.items()):
-        ground = FELT._replace(roller_ratio=ratio)
+        ground = CARPET._replace(roller_ratio=ratio / SOFT)
         for i in range(18):
             run = driven(2 * np.pi * i / 18, 100 * j + i, ground, 0.2, 4.0, {"wheel_radius_ratio": -0.05})
             slips.append(measured_slip(run, ROBOT))
@@ -252,7 +256,7 @@ def test_hidden_rollers_load_and_radius_of_simulated_runs_come_back_within_their
     for name, ratio in hidden.items():
         low, high = found.roller_interval[name]
         assert low - 0.01 < ratio < high + 0.01
-    load = make_planar(ROBOT, FELT).wheel_load_ratio
+    load = make_planar(ROBOT, CARPET).wheel_load_ratio
     for share, (low, high) in zip(load, found.load_interval, strict=True):
         assert low - 0.005 < share < high + 0.005
     assert found.scale_error == pytest.approx(0.05, abs=0.005)
@@ -281,9 +285,9 @@ def test_a_soil_says_what_it_does_to_rollers():
         "roller_friction_ratio": 0.4,
     }
     described = {name: {"value": value, **entry} for name, value in values.items()}
-    described |= {"name": "felt", "law": "magic"}
+    described |= {"name": "carpet", "law": "magic"}
     described["roughness_m3"] = {"value": 4e-6, "unit": "m3", "source": "test"}
-    assert planar_ground(ROBOT, soil_from("felt.yaml", described)).roller_ratio == 0.4
+    assert planar_ground(ROBOT, soil_from("carpet.yaml", described)).roller_ratio == 0.4
     described["roller_friction_ratio"]["value"] = -0.1
-    with pytest.raises(ConfigError, match=r"felt.yaml: roller_friction_ratio.*-0.1"):
-        soil_from("felt.yaml", described)
+    with pytest.raises(ConfigError, match=r"carpet.yaml: roller_friction_ratio.*-0.1"):
+        soil_from("carpet.yaml", described)

@@ -1,0 +1,123 @@
+"""Omni robots: what makes them slip is named from their wheels, currents and a camera above."""
+
+import numpy as np
+import pytest
+
+from terrain.discrepancy.diagnose import diagnose
+from terrain.discrepancy.signals import signals_of
+from terrain.discrepancy.simulation import Simulation
+from terrain.discrepancy.verdict import Verdict
+from terrain.effects import CHANNELS, CURRENT, HEADING, SPEED_X, SPEED_Y
+from terrain.errors import DataError
+from terrain.kinematics.wheel_speed import with_wheel_speeds
+from terrain.records import Stream
+from terrain.robots import load_robot
+from terrain.simulation.planar.model import Ground
+from terrain.simulation.planar.noise import load_noise, load_scatter
+from terrain.simulation.planar.run import simulate_planar
+
+ROBOT = load_robot("robotino")
+CARPET = Ground(slip_ratio=0.8, rolling_ratio=0.03, roller_ratio=0.3)
+N_RUNS = 16
+
+
+def driven(hidden, ground=CARPET, n=N_RUNS, turns=True, seed=0):
+    """Runs in as many directions, at changing speed, turning now and then."""
+    rng, runs = np.random.default_rng(seed), []
+    for i in range(n):
+        angle, twist = 2 * np.pi * (i + 0.5) / n, np.zeros((601, 3))
+        for k in range(25, 575, 110):
+            speed = rng.uniform(0.15, 0.45)
+            turn = turns * rng.choice([-1.0, 0.0, 1.0]) * rng.uniform(0.3, 0.9)
+            twist[k : k + 110] = speed * np.cos(angle), speed * np.sin(angle), turn
+        ramp = np.cumsum(np.clip(np.diff(twist, axis=0, prepend=0.0), -9.0, 9.0), axis=0)
+        run = simulate_planar(
+            ROBOT,
+            ramp,
+            1000 * seed + i,
+            ground=ground,
+            effects=hidden,
+            noise=load_noise(),
+            run_id=f"carpet_{i:02d}",
+            terrain="carpet",
+        )
+        runs.append(with_wheel_speeds(run, ROBOT))
+    return runs
+
+
+def diagnosed(runs, ground=CARPET):
+    return diagnose(runs, Simulation(ROBOT, ground, scatter=load_scatter()._asdict()))
+
+
+def test_where_nothing_is_hidden_nothing_is_named():
+    found = diagnosed(driven({}))
+    assert found.causes == ()
+    assert found.ambiguous_sets == ()
+    assert found.excluded_runs == ()
+    assert found.faults == ()
+
+
+@pytest.mark.parametrize(
+    "hidden",
+    [
+        {"roller_friction_ratio": 0.1},
+        {"load_shift_x_m": 0.012, "load_shift_y_m": -0.006},
+        {"wheel_distance_ratio": 0.06},
+        {"camera_yaw_rad": 0.05},
+        {"camera_latency_s": 0.12},
+        {"force_slip_ratio": 0.4},
+        {"lever_x_m": 0.05, "lever_y_m": 0.02},
+    ],
+    ids=lambda hidden: next(iter(hidden)),
+)
+def test_a_hidden_effect_is_named_with_its_value_and_nothing_beside_it(hidden):
+    found = diagnosed(driven(hidden))
+    values = {value.name: value for cause in found.causes for value in cause.values}
+    assert set(values) == set(hidden), (found.verdict, found.ambiguous_sets)
+    for name, size in hidden.items():
+        value = values[name]
+        assert value.low - 0.1 * abs(size) < size < value.high + 0.1 * abs(size), name
+
+
+def test_scale_of_a_camera_and_radius_of_the_wheels_are_one_on_straight_drives_and_two_where_it_turns():
+    free = CARPET._replace(roller_ratio=0.0)  # rollers that resist turn the robot, which no scale does
+    straight = diagnosed(driven({"camera_scale_ratio": -0.08}, free, turns=False), free)
+    assert straight.verdict is Verdict.AMBIGUOUS
+    assert any({"camera_scale", "wheel_radius"} <= set(names) for names in straight.ambiguous_sets)
+    turning = diagnosed(driven({"camera_scale_ratio": -0.08}))
+    assert [cause.name for cause in turning.causes] == ["camera_scale"]
+
+
+def test_signals_are_those_of_the_pose_and_the_sum_of_the_magnitudes_of_the_currents():
+    run = driven({}, n=1)[0]
+    signals, truth = signals_of(run, ROBOT), run.streams["truth"]
+    at = {name: signals.measured[:, CHANNELS.index(name)] for name in CHANNELS}
+    for channel, true, std in (
+        (SPEED_X, "speed_x_mps", 0.04),
+        (SPEED_Y, "speed_y_mps", 0.04),
+        (HEADING, "yaw_rate_radps", 0.4),
+    ):
+        expected = np.interp(signals.time_s, truth.time_s, truth.channel(true))
+        known = np.isfinite(at[channel])
+        assert known.mean() > 0.95
+        assert np.sqrt(np.mean((at[channel] - expected)[known] ** 2)) < std
+        assert abs(np.mean((at[channel] - expected)[known])) < 0.1 * std
+    wheels = run.streams["wheels"]
+    total = sum(np.abs(wheels.channel(f"current_{i}_a")) for i in (1, 2, 3))
+    np.testing.assert_allclose(at[CURRENT], np.interp(signals.time_s, wheels.time_s, total), atol=1e-9)
+
+
+def test_a_camera_that_loses_the_robot_leaves_holes_and_one_that_never_saw_it_is_refused():
+    run = driven({}, n=1)[0]
+    pose = run.streams["pose"]
+    seen = (pose.time_s < 4.0) | (pose.time_s > 6.0)
+    holes = Stream(pose.time_s[seen], pose.values[seen], pose.channels)
+    streams = run.streams | {"pose": holes}
+    measured = signals_of(type(run)(run.run_id, run.robot, streams, run.labels), ROBOT).measured
+    speed = measured[:, CHANNELS.index(SPEED_X)]
+    lost = (signals_of(run, ROBOT).time_s > 4.1) & (signals_of(run, ROBOT).time_s < 5.9)
+    assert np.isnan(speed[lost]).all()
+    assert np.isfinite(speed[~lost]).mean() > 0.95
+    none = {name: stream for name, stream in run.streams.items() if name not in ("pose", "wheels")}
+    with pytest.raises(DataError, match="no stream 'wheels'"):
+        signals_of(type(run)(run.run_id, run.robot, none, run.labels), ROBOT)
