@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pipelines.measured_slip.predictions import cases_of, predictions
-from pipelines.measured_slip.results import MeasuredSlipResult
+from pipelines.measured_slip.results import MeasuredSlipResult, NamedSurface
 from pipelines.measured_slip.settings import MeasureSlipSettings
 from pipelines.reporting.progress import Progress, silent
 from pipelines.runs.datasets import robot_of
@@ -18,7 +18,7 @@ from terrain.errors import DataError, LogError
 from terrain.files.atomic import ensure_writable
 from terrain.logs.write import run_folder, write_run
 from terrain.measured_slip.delay import Delay, DelayStatus, estimate_delay
-from terrain.measured_slip.rollers import RollerFindings, roller_findings
+from terrain.measured_slip.rollers import RollerFindings, roller_findings, surface_of_windows
 from terrain.measured_slip.slips import MeasuredSlip, measured_slip
 from terrain.measured_slip.surfaces import surface_slip
 from terrain.measured_slip.wheel_distance import DistanceBound, distance_bound
@@ -56,6 +56,8 @@ def measure_slip(
         if a run is in ``out`` already; nothing is written then.
     """
     robot = one_robot(runs, settings.robot)
+    if settings.rollers:
+        as_omni(robot, "robot {name}: drive {drive!r} has no rollers, only 'omni' has")
     if settings.out is not None:
         _refuse_existing(runs, settings)
     if settings.figures is not None:
@@ -88,6 +90,7 @@ def measure_slip(
         surfaces=surfaces,
         predictions=tuple(predicted),
         rollers=rollers,
+        named=() if rollers is None else _named(found, robot, rollers),
         distances=_distances(found, robot, settings) if settings.rollers else {},
         not_measured=tuple(found.failed),
         n_runs=len(runs),
@@ -155,11 +158,29 @@ def measure(
 
 def _rollers(found: Measured, robot: Robot, settings: MeasureSlipSettings) -> RollerFindings:
     """Return what makes an omni robot slip; sessions are groups that are asked for their load."""
-    as_omni(robot, "robot {name}: drive {drive!r} has no rollers, only 'omni' has")
     known = [i for i, run in enumerate(found.runs) if _terrain(run)]
     groups = [found.runs[i].session or _terrain(found.runs[i]) for i in known]
     surfaces = sorted({_terrain(found.runs[i]) for i in known if not found.runs[i].session})
     return roller_findings([found.slips[i] for i in known], groups, robot, surfaces, settings.seed)
+
+
+def _named(found: Measured, robot: Robot, rollers: RollerFindings) -> tuple[NamedSurface, ...]:
+    """Return which surface rollers name in the windows of each group, runs without a label by session."""
+    windows: dict[str, Counter[str]] = {}
+    right: dict[str, list[bool]] = {}
+    for run, slip in zip(found.runs, found.slips, strict=True):
+        names = [name for name in surface_of_windows(slip, rollers, robot) if name]
+        if not names:
+            continue
+        group = run.session or _terrain(run)
+        windows.setdefault(group, Counter()).update(names)
+        right.setdefault(group, []).append(Counter(names).most_common(1)[0][0] == _terrain(run))
+    labelled = {run.session or _terrain(run) for run in found.runs if _terrain(run)}
+    rows = []
+    for group, counts in sorted(windows.items()):
+        n_right = sum(right[group]) if group in labelled else None
+        rows.append(NamedSurface(group, len(right[group]), n_right, dict(sorted(counts.items()))))
+    return tuple(rows)
 
 
 def _distances(found: Measured, robot: Robot, settings: MeasureSlipSettings) -> dict[str, DistanceBound]:

@@ -13,6 +13,7 @@ from pipelines.measured_slip.screen import (
     UNLABELLED,
     delay_words,
     distance_words,
+    named_words,
     prediction_cells,
     roller_cells,
     roller_words,
@@ -72,7 +73,7 @@ def write_page(
         rollers=() if result.rollers is None else tuple(roller_cells(result.rollers)),
         roller_sentences=()
         if result.rollers is None
-        else (*roller_words(result.rollers), *distance_words(result)),
+        else (*roller_words(result.rollers), *named_words(result), *distance_words(result)),
         not_measured=result.not_measured,
         images={name: png_image(content, name, CAPTIONS[name]) for name, content in contents.items()},
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from terrain.measured_slip.delay import Delay
 from terrain.measured_slip.rollers import RollerFindings
@@ -39,6 +40,23 @@ class PredictionFigures:
     by_terrain: Mapping[str, float]
 
 
+class NamedSurface(NamedTuple):
+    """Which surface the rollers of an omni robot say that runs of a group were on.
+
+    Parameters
+    ----------
+    group : surface or, of runs that were not fitted, session
+    n_runs : with windows in steady motion
+    n_right : whose windows are mostly named as their label; None without labels
+    windows : by the surface that they are named
+    """
+
+    group: str
+    n_runs: int
+    n_right: int | None
+    windows: Mapping[str, int]
+
+
 @dataclass(frozen=True, slots=True)
 class MeasuredSlipResult:
     """Slip measured from outside.
@@ -52,6 +70,7 @@ class MeasuredSlipResult:
     surfaces : by terrain, runs without a label last
     predictions : of slip from currents and wheel speeds; none unless asked for
     rollers : what makes an omni robot slip; None unless asked for
+    named : surfaces that rollers name window by window, by group; none unless rollers are asked for
     distances : of the wheels of an omni robot, by surface, where its turns follow the wheels
     not_measured : a sentence for each run without a slip
     n_runs : that were read
@@ -69,6 +88,7 @@ class MeasuredSlipResult:
     surfaces: tuple[SurfaceSlip, ...]
     predictions: tuple[PredictionFigures, ...]
     rollers: RollerFindings | None
+    named: tuple[NamedSurface, ...]
     distances: Mapping[str, DistanceBound]
     not_measured: tuple[str, ...]
     n_runs: int

@@ -29,7 +29,7 @@ def print_measured_slip(result: MeasuredSlipResult, console: Console) -> None:
         console.print(_predictions(result))
     if result.rollers is not None:
         console.print(_rollers(result.rollers))
-        print_lines(console, [*roller_words(result.rollers), *distance_words(result)])
+        print_lines(console, [*roller_words(result.rollers), *named_words(result), *distance_words(result)])
     print_lines(console, _lines(result))
 
 
@@ -137,6 +137,18 @@ def roller_words(found: RollerFindings) -> list[str]:
             f"{name}: the surface is {found.other_surface[name]}, the load of the wheels {text}, by which "
             f"{before:.4f} of rms falls to {after:.4f}"
         )
+    return lines
+
+
+def named_words(result: MeasuredSlipResult) -> list[str]:
+    """Return in sentences which surfaces the rollers name."""
+    lines = []
+    for each in result.named:
+        if each.n_right is not None:
+            lines.append(f"{each.group}: {each.n_right} of {each.n_runs} runs are named by their slip alone")
+            continue
+        counts = ", ".join(f"{name} {n}" for name, n in sorted(each.windows.items(), key=lambda x: -x[1]))
+        lines.append(f"{each.group or UNLABELLED}: windows of {each.n_runs} runs look like {counts}")
     return lines
 
 

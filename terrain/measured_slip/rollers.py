@@ -135,6 +135,33 @@ def roller_findings(
     )
 
 
+def surface_of_windows(slip: MeasuredSlip, found: RollerFindings, robot: Robot) -> list[str]:
+    """Return the surface whose rollers explain each window of a run best; empty where it is not steady.
+
+    Parameters
+    ----------
+    slip : of the run, which may cross from one surface to another
+    found : of runs on one surface each, of the robot with the same load
+    robot : whose runs they are
+    """
+    names = list(found.roller_ratio)
+    rows = np.flatnonzero(slip.steady & np.isfinite(slip.body_slip) & np.isfinite(slip.body_side))
+    windows = _Cases(
+        slip.wheel_speed_mps[rows], slip.body_slip[rows], slip.body_side[rows], np.full(len(rows), "")
+    )
+    law, load = _Law(robot, names), found.load_ratio
+    rho = np.log(np.maximum([found.roller_ratio[name] for name in names], 1e-6))
+    parameters = np.concatenate([[load[0] / load[1], load[2] / load[1], found.scale_error], rho])
+    off = np.empty((len(names), len(rows)))
+    for i, name in enumerate(names):
+        of_slip, side = law.motion(windows, parameters, name)
+        off[i] = np.hypot(of_slip - windows.slip, side - windows.side)
+    named = [""] * len(slip.steady)
+    for row, best in zip(rows.tolist(), off.argmin(axis=0).tolist(), strict=True):
+        named[row] = names[best]
+    return named
+
+
 def _drawn(places: Sequence[Array], rng: np.random.Generator) -> Array:
     """Return rows of runs drawn with replacement, as many of each surface as it has."""
     return np.concatenate([rows[bootstrap_rows(len(rows), 1, rng)[0]] for rows in places])

@@ -187,8 +187,8 @@ def test_a_correction_is_the_inverse_of_what_sensors_do(names):
 
 def test_a_pose_of_a_camera_whose_scale_and_angle_are_off_comes_back():
     effects = {"camera_scale_ratio": -0.08, "camera_yaw_rad": 0.05}
-    drive = make_scenario("crab", OMNI, "grass", 20.0)
-    ground = planar_ground(OMNI, load_soil("grass"))
+    drive = make_scenario("crab", OMNI, "tiles", 20.0)
+    ground = planar_ground(OMNI, load_soil("tiles"))
     clean, run = (simulate_planar(OMNI, drive.twist, 0, ground=ground, effects=e) for e in ({}, effects))
     back = corrected_log(run, replace(OMNI, effects=effects)).streams["pose"]
     assert np.abs(run.streams["pose"].values - clean.streams["pose"].values).max() > 0.04

@@ -5,7 +5,7 @@ import pytest
 
 from terrain.errors import DataError
 from terrain.kinematics import omni
-from terrain.measured_slip.rollers import roller_findings
+from terrain.measured_slip.rollers import roller_findings, surface_of_windows
 from terrain.measured_slip.slips import measured_slip
 from terrain.measured_slip.wheel_distance import distance_bound
 from terrain.simulation.planar.omni_contact import steady_twist
@@ -95,6 +95,16 @@ def test_a_load_that_was_put_on_and_its_surface_are_named(found):
     np.testing.assert_allclose(found.other_loads["loaded"], LOADS["loaded"], atol=0.02)
     before, after = found.other_rms["loaded"]
     assert after < 0.5 * before
+
+
+def test_rollers_name_the_surface_of_windows(make_omni_run, robotino, found):
+    rng = np.random.default_rng(1)
+    for surface in RATIO:
+        runs = slips_of(make_omni_run, robotino, rng, surface, "", n=6)
+        named = [name for run in runs for name in surface_of_windows(run, found, robotino)]
+        assert {surface} <= set(named) <= {surface, ""}
+        steady = sum(int((run.steady & np.isfinite(run.body_slip)).sum()) for run in runs)
+        assert sum(name != "" for name in named) == steady
 
 
 def test_too_few_runs_are_refused(make_omni_run, robotino):
