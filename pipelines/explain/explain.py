@@ -100,7 +100,7 @@ def explain(runs: Sequence[RunLog], settings: ExplainSettings, progress: Progres
         page=out / PAGE_FILE,
         statements=statements_of(diagnosis, robot, diagnosed.compared, gained.gain, diagnosed.acting),
         terms={cause.name: in_robot_terms(cause.name, cause.values, robot) for cause in diagnosis.causes},
-        next_command=next_command(diagnosis, description, diagnosed.terrains),
+        next_command=next_command(diagnosis, description, robot, diagnosed.terrains),
         terrains_apart=terrains_apart(diagnosis, diagnosed.compared),
         powertrain=powertrain_answer(chosen, robot, diagnosis.faults, seed),
     )

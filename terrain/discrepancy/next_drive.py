@@ -31,7 +31,7 @@ from terrain.discrepancy.residuals import low_pass_of, measured_channels
 from terrain.discrepancy.selection import EXCITED_RATIO, Z_EFFECT
 from terrain.discrepancy.signals import PARALLEL, Signals
 from terrain.discrepancy.simulation import Simulation
-from terrain.discrepancy.terrain_match import TerrainMatch
+from terrain.discrepancy.terrain_match import TerrainMatch, drivable
 from terrain.discrepancy.verdict import Diagnosis, Limit, NextDrive
 from terrain.effects import (
     ACCEL,
@@ -54,9 +54,9 @@ from terrain.simulation.planar.motion import move
 from terrain.simulation.scenario.make import SCENARIOS, make_scenario
 from terrain.simulation.scenario.scenario import RATE_HZ
 
-DEFAULT_SOIL, NEXT_RUNS = "grass", 8
-"""Of the command that simulates the next drive: a soil that every robot drives on, and as many runs as the
-blind trials have."""
+DEFAULT_SOIL, HARD_SOIL, NEXT_RUNS = "grass", "tiles", 8
+"""Of the command that simulates the next drive: a soil, one for robots that get stuck on it, and as many runs
+as the blind trials have."""
 
 GRADES_DEG = (0.0, 6.0)
 """Level, and a slope that every robot here climbs."""
@@ -336,12 +336,15 @@ def _statistics(simulation: Simulation, info: Information | None) -> Statistics:
     return Statistics(Noise(growth, filters, std), scatter)
 
 
-def next_command(diagnosis: Diagnosis, description: str, terrains: Sequence[TerrainMatch]) -> str | None:
+def next_command(
+    diagnosis: Diagnosis, description: str, robot: Robot, terrains: Sequence[TerrainMatch]
+) -> str | None:
     """Return the command that simulates the next drive; None where none is suggested."""
     coming = diagnosis.next_drive
     if coming is None:
         return None
-    soil = next((match.soil for match in terrains if match.soil), DEFAULT_SOIL)
+    default = DEFAULT_SOIL if drivable(robot, DEFAULT_SOIL) else HARD_SOIL
+    soil = next((match.soil for match in terrains if match.soil), default)
     grade = f" --grade {coming.grade_deg:g}" if coming.grade_deg else ""
     words = f"--robot {shlex.quote(description)} --terrain {soil} --scenario {coming.scenario}{grade}"
     return f"terrain simulate {words} --runs {NEXT_RUNS} --out next_drive"

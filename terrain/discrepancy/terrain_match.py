@@ -79,12 +79,17 @@ def with_model_error(simulation: Simulation) -> Simulation:
 
 def _ground(robot: Robot, label: str) -> Ground | None:
     """Return the soil of a label for the planar simulation; None where there is none that can be driven."""
-    if label not in (*soil_names(), *extra_soil_names()):
-        return None
+    known = label in (*soil_names(), *extra_soil_names())
+    return planar_ground(robot, load_soil(label)) if known and drivable(robot, label) else None
+
+
+def drivable(robot: Robot, soil: str) -> bool:
+    """Return whether a robot does not get stuck on a soil of the package."""
     try:
-        return planar_ground(robot, load_soil(label))
-    except ConfigError:  # the robot would get stuck on it
-        return None
+        planar_ground(robot, load_soil(soil))
+    except ConfigError:
+        return False
+    return True
 
 
 def runs_of_terrain(runs: Sequence[RunLog], terrain: str | None) -> list[RunLog]:

@@ -118,7 +118,7 @@ SLIP_AND_RESISTANCE: tuple[Effect, ...] = (
         (Parameter("rolling_resistance_ratio", -0.05, 0.5, 0.005, scatter_rank=7),),
         "resistance grows by c W",
         "Wong, Theory of Ground Vehicles",
-        EVERY,
+        BOTH,
         (CURRENT, SPEED_X),
         "several speeds, forward and backward",
         plant=PlantPart.CONTACT,

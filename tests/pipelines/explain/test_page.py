@@ -37,6 +37,7 @@ from terrain.discrepancy.verdict import (
     Varying,
     Verdict,
 )
+from terrain.robots import load_robot
 
 LIMITS = (
     Limit("steering_offset_1_rad", 0.003, "rad", "several speeds"),
@@ -278,7 +279,7 @@ def test_an_effect_that_differs_from_run_to_run_is_given_with_its_groups_and_riv
 
 def test_the_next_drive_is_a_command_and_terrains_that_differ_are_named():
     result = a_result(next_drive=NextDrive("climb", 6.0, "it parts them"))
-    assert next_command(result.diagnosis, "my robot.yaml", ()) == (
+    assert next_command(result.diagnosis, "my robot.yaml", load_robot("husky"), ()) == (
         "terrain simulate --robot 'my robot.yaml' --terrain grass --scenario climb --grade 6 --runs 8 "
         "--out next_drive"
     )
