@@ -7,9 +7,10 @@ from terrain.discrepancy.diagnose import diagnose
 from terrain.discrepancy.signals import signals_of
 from terrain.discrepancy.simulation import Simulation
 from terrain.discrepancy.verdict import Verdict
-from terrain.effects import CHANNELS, CURRENT, HEADING, SPEED_X, SPEED_Y
+from terrain.effects import CHANNELS, CURRENT, HEADING, SPEED_X, SPEED_Y, showing
 from terrain.errors import DataError
 from terrain.kinematics.wheel_speed import with_wheel_speeds
+from terrain.logs import robotino
 from terrain.records import Stream
 from terrain.robots import load_robot
 from terrain.simulation.planar.model import Ground
@@ -121,3 +122,16 @@ def test_a_camera_that_loses_the_robot_leaves_holes_and_one_that_never_saw_it_is
     none = {name: stream for name, stream in run.streams.items() if name not in ("pose", "wheels")}
     with pytest.raises(DataError, match="no stream 'wheels'"):
         signals_of(type(run)(run.run_id, run.robot, none, run.labels), ROBOT)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("surface", "low", "high"), [("brown", 0.05, 0.2), ("gray", 0.25, 0.6)])
+def test_rollers_of_measured_runs_are_named_and_explain_their_speed(measured, surface, low, high):
+    """Ground softness times roller friction is what slip alone shows: 0.04 and 0.25."""
+    root = measured("robotino") / "one_surface" / surface
+    runs = [with_wheel_speeds(read(), ROBOT) for read in robotino.find_runs(root)][::3]
+    found = diagnose(runs, Simulation(ROBOT, scatter=load_scatter()._asdict()), showing("omni"))
+    values = {value.name: value.value for cause in found.causes for value in cause.values}
+    assert low < values["roller_friction_ratio"] < high
+    before, after = found.residual_before["current_a"], found.residual_after["current_a"]
+    assert after.rms < 0.5 * before.rms
