@@ -124,6 +124,30 @@ def test_a_camera_that_loses_the_robot_leaves_holes_and_one_that_never_saw_it_is
         signals_of(type(run)(run.run_id, run.robot, none, run.labels), ROBOT)
 
 
+def drawn(rng, number):
+    """Return what is hidden in a trial: rollers and load, or radius and softness of the ground."""
+    if number % 2:
+        return {"wheel_radius_ratio": rng.uniform(-0.12, -0.04), "force_slip_ratio": rng.uniform(0.2, 0.9)}
+    return {
+        "roller_friction_ratio": rng.uniform(0.05, 0.4),
+        "load_shift_x_m": rng.uniform(0.006, 0.02),
+        "load_shift_y_m": rng.uniform(-0.015, 0.015),
+    }
+
+
+@pytest.mark.slow
+def test_pairs_of_hidden_effects_are_named_blindly_and_their_intervals_hold_them():
+    rng, held, n = np.random.default_rng(5), 0, 0
+    for trial in range(8):
+        hidden = drawn(rng, trial)
+        found = diagnosed(driven(hidden, seed=trial + 10))
+        values = {value.name: value for cause in found.causes for value in cause.values}
+        assert set(values) == set(hidden), (trial, hidden, found.verdict, found.ambiguous_sets)
+        held += sum(values[name].low < size < values[name].high for name, size in hidden.items())
+        n += len(hidden)
+    assert held >= 0.8 * n
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("surface", "low", "high"), [("brown", 0.05, 0.2), ("gray", 0.25, 0.6)])
 def test_rollers_of_measured_runs_are_named_and_explain_their_speed(measured, surface, low, high):
