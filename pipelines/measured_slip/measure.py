@@ -174,12 +174,14 @@ def _named(found: Measured, robot: Robot, rollers: RollerFindings) -> tuple[Name
             continue
         group = run.session or _terrain(run)
         windows.setdefault(group, Counter()).update(names)
-        right.setdefault(group, []).append(Counter(names).most_common(1)[0][0] == _terrain(run))
-    labelled = {run.session or _terrain(run) for run in found.runs if _terrain(run)}
+        if _terrain(run) in rollers.roller_ratio:
+            right.setdefault(group, []).append(Counter(names).most_common(1)[0][0] == _terrain(run))
     rows = []
     for group, counts in sorted(windows.items()):
-        n_right = sum(right[group]) if group in labelled else None
-        rows.append(NamedSurface(group, len(right[group]), n_right, dict(sorted(counts.items()))))
+        judged = right.get(group)
+        n_right = sum(judged) if judged else None
+        n_runs = len(judged) if judged else sum((run.session or _terrain(run)) == group for run in found.runs)
+        rows.append(NamedSurface(group, n_runs, n_right, dict(sorted(counts.items()))))
     return tuple(rows)
 
 

@@ -46,8 +46,8 @@ class NamedSurface(NamedTuple):
     Parameters
     ----------
     group : surface or, of runs that were not fitted, session
-    n_runs : with windows in steady motion
-    n_right : whose windows are mostly named as their label; None without labels
+    n_runs : of the group; where ``n_right`` is known those with a label of a fitted surface
+    n_right : whose windows are mostly named as their label; None without such labels
     windows : by the surface that they are named
     """
 

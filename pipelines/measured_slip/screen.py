@@ -144,8 +144,9 @@ def named_words(result: MeasuredSlipResult) -> list[str]:
     """Return in sentences which surfaces the rollers name."""
     lines = []
     for each in result.named:
-        if each.n_right is not None:
-            lines.append(f"{each.group}: {each.n_right} of {each.n_runs} runs are named by their slip alone")
+        if each.n_right is not None and result.rollers is not None:
+            of = "fitted" if each.group in result.rollers.roller_ratio else "not fitted"
+            lines.append(f"{each.group}, {of}: {each.n_right} of {each.n_runs} runs are named by their slip")
             continue
         counts = ", ".join(f"{name} {n}" for name, n in sorted(each.windows.items(), key=lambda x: -x[1]))
         lines.append(f"{each.group or UNLABELLED}: windows of {each.n_runs} runs look like {counts}")

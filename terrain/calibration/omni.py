@@ -5,14 +5,16 @@ r"""Friction of the motors, load, rolling radius and wheel distance of an omni r
 .. math:: |I| = I_c + b\,|\omega| ,
 
 and ``friction_nm`` is :math:`I_c` times the torque that an ampere gives at the wheel.  A run is taken for
-one of motors alone where nothing measured its motion from outside and each motor turned at several speeds.
+one of motors alone where it has no terrain, nothing measured its motion from outside, and each motor turned
+at several speeds and took no less current at the higher ones.
 
 *Driving runs* under a camera show by their slip over many directions which share :math:`n_i` of the weight
 each wheel carries (:mod:`terrain.measured_slip.rollers`), and so the centre of mass
 :math:`\sum_i n_i p_i`; a slip that is the same in all directions is a wheel that rolls on a radius
 :math:`(1 - \kappa) r`, or an outside measurement whose scale is off, which they do not distinguish.  The
 distance of the wheels follows from how small turns agree (:mod:`terrain.measured_slip.wheel_distance`),
-surface by surface: slip in turning makes it too large, so that where surfaces differ it lies between them.
+surface by surface: slip in turning makes it too large, what else turns the robot moves it up or down, so that
+the mean is given with the intervals of all surfaces.
 
 The friction of the rollers is one of a terrain and no number of the robot: ``terrain measure-slip --rollers``
 shows it.
@@ -68,12 +70,12 @@ def identify_omni(runs: Sequence[RunLog], robot: OmniRobot, seed: int = 0) -> li
     """
     measured = [run for run in runs if outside_source(run) is not None]
     own = [run for run in measured if not run.session and len(run.terrains) == 1]
-    alone = [run for run in runs if outside_source(run) is None]
+    alone = [run for run in runs if outside_source(run) is None and not run.terrains]
     return [motor_friction(alone, robot), *_driven(own, robot, seed)]
 
 
 class MotorFriction(NamedTuple):
-    """No-load current of one motor in one run: at the least speed, and its growth per rad/s of the motor."""
+    """No-load current of one motor in one run, extrapolated to rest, and its growth per rad/s."""
 
     motor: str
     run_id: str
@@ -126,8 +128,10 @@ def no_load_currents(run: RunLog, robot: OmniRobot) -> list[MotorFriction]:
         speed, current = _steady_blocks(wheels.time_s, wheels.channel(rate), wheels.channel(amps), robot)
         if len(speed) < MIN_BLOCKS or speed.max() < MIN_SPEED_RATIO * speed.min():
             return []
-        least, slope = np.polynomial.Polynomial.fit(speed, current, 1).convert().coef
-        fits.append(MotorFriction(wheel, run.run_id, float(least), float(slope), len(speed)))
+        intercept_a, slope = np.polynomial.Polynomial.fit(speed, current, 1).convert().coef.tolist()
+        if intercept_a <= 0.0 or slope < 0.0:
+            return []
+        fits.append(MotorFriction(wheel, run.run_id, intercept_a, slope, len(speed)))
     return fits
 
 
@@ -163,7 +167,11 @@ def _driven(runs: Sequence[RunLog], robot: OmniRobot, seed: int) -> list[Finding
     kept = [(slip, of) for slip, of in slips if of in fitted]
     found = roller_findings([slip for slip, _ in kept], [of for _, of in kept], robot, fitted, seed)
     ids = tuple(slip.run_id for slip, _ in kept)
-    return [*_load(found, robot, ids), _radius(found, robot, ids), _distance(surfaces, robot, seed)]
+    return [
+        *_load(found, robot, ids),
+        _radius(found, robot, ids),
+        _distance({name: surfaces[name] for name in fitted}, robot, seed),
+    ]
 
 
 def _slips(runs: Sequence[RunLog], robot: OmniRobot, seed: int) -> list[tuple[MeasuredSlip, str]]:
@@ -230,5 +238,6 @@ def _distance(surfaces: Mapping[str, Sequence[MeasuredSlip]], robot: OmniRobot, 
         sum(bound.n_runs for bound in bounds.values()),
         "runs",
         tuple(slip.run_id for name in bounds for slip in surfaces[name]),
-        f"{each}: too large by the slip of turning; the interval holds those of all surfaces",
+        f"{each}: too large by the slip of turning, and off by what else turns the robot; the interval "
+        "holds those of all surfaces",
     )

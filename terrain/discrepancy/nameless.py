@@ -25,7 +25,7 @@ from terrain.discrepancy.verdict import finite
 from terrain.effects import CHANNELS
 from terrain.records import Array
 
-DRIVEN = ("speed_mps", "turn_mps", "steer_rad", "grade_rad", "roll_rad")
+DRIVEN = ("speed_mps", "turn_mps", "sideways_mps", "steer_rad", "grade_rad", "roll_rad")
 """Inputs that are logged; the force is the simulation's own."""
 
 LAGS = (-2, -1, 0, 1, 2)

@@ -240,11 +240,17 @@ def _logged(robot: Robot, info: Information | None) -> tuple[str, ...]:
     """Return the channels of the runs, or those expected from the robot's description."""
     if info is not None:
         return measured_channels(info.rows)
+    if _is_omni(robot):
+        return (SPEED_X, SPEED_Y, CURRENT, HEADING)
     own = [GYRO, ACCEL]
     own += [SPEED_X, SPEED_Y] if robot.describes("camera") else []
     own += [CURRENT] if robot.describes("motors") else []
     own += [TURNING_CURRENT] if robot.describes("motors") and robot.skids else []
     return tuple(own)
+
+
+def _is_omni(robot: Robot) -> bool:
+    return robot.sideways and not robot.steered
 
 
 def _drives(
@@ -256,7 +262,7 @@ def _drives(
         inputs = _inputs(simulation.robot, name)
         if inputs is None:
             continue
-        for grade_deg in GRADES_DEG:
+        for grade_deg in GRADES_DEG[:1] if _is_omni(simulation.robot) else GRADES_DEG:  # no tilt is logged
             driven.append((name, grade_deg))
             signals.append(_signals(simulation, *inputs, grade_deg, channels))
     if not signals:
@@ -276,9 +282,9 @@ def _inputs(robot: Robot, name: str) -> tuple[Array, Array] | None:
     """Return wheel speeds and steering (n, wheels) of a scenario, or None if the robot cannot drive it."""
     if not robot.describes("motors"):
         return None
-    speed_mps = 0.6 * robot.wheel_radius_m * robot.motors.speed_max_radps
+    speed_mps = min(0.6 * robot.wheel_radius_m * robot.motors.speed_max_radps, 1.0)
     try:
-        scenario = make_scenario(name, robot, "ground", speed_mps=min(speed_mps, 1.0))
+        scenario = make_scenario(name, robot, "ground", speed_mps=None if _is_omni(robot) else speed_mps)
     except ConfigError:
         return None
     motion = wheel_motion(robot, scenario.twist[: round(LONGEST_S * RATE_HZ)], 1.0 / RATE_HZ)

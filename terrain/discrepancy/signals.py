@@ -107,7 +107,7 @@ def signals_of(run: RunLog, robot: Robot) -> Signals:
         raise DataError(f"run {run.run_id}: it has no stream 'steering', which drives the simulation")
     wheels = run.streams["wheels"]
     wheel_speeds = _wheel_speeds(run, wheels, robot)
-    time_s, dt_s = _clock(run, ("wheels", "steering") if robot.steered else ("wheels",))
+    time_s, dt_s = _clock(run, robot, ("wheels", "steering") if robot.steered else ("wheels",))
     steer = _steering(run, robot, time_s) if robot.steered else np.zeros((time_s.size, len(robot.wheels)))
     grade, roll = _tilt(run, time_s)
     measured = np.full((time_s.size, len(CHANNELS)), np.nan)
@@ -134,10 +134,10 @@ def signals_of(run: RunLog, robot: Robot) -> Signals:
     )
 
 
-def _clock(run: RunLog, inputs: Sequence[str]) -> tuple[Array, float]:
+def _clock(run: RunLog, robot: Robot, inputs: Sequence[str]) -> tuple[Array, float]:
     """Return the instants (n,) that all streams have in common, and their period."""
     used = [*inputs, *(name for name in ("imu", "odometry", "lidar") if name in run.streams)]
-    used += ["pose"] if _by_pose(run) else []
+    used += ["pose"] if _by_pose(run, robot) else []
     start_s = max(float(run.streams[name].time_s[0]) for name in used)
     end_s = min(float(run.streams[name].time_s[-1]) for name in used)
     rate_hz = min(MAX_RATE_HZ, run.streams["wheels"].rate_hz)
@@ -184,9 +184,9 @@ def _put_imu(measured: Array, run: RunLog, time_s: Array) -> None:
 def _put_motion(measured: Array, run: RunLog, robot: Robot, time_s: Array) -> None:
     """Put in speeds over ground and the heading rate, from a camera's poses, its speeds, or a lidar.
 
-    Poses from outside (a camera above, motion capture) count where there is neither.
+    Poses of an omni robot's body (of a camera above, motion capture) count where there is neither.
     """
-    if _by_pose(run):
+    if _by_pose(run, robot):
         _put_pose(measured, run, robot, time_s)
     if (seen := run.streams.get("odometry")) is not None:
         if set(POSE_CHANNELS) <= set(seen.channels):
@@ -202,12 +202,12 @@ def _put_motion(measured: Array, run: RunLog, robot: Robot, time_s: Array) -> No
         _put(measured, HEADING, time_s, lidar, "yaw_rate_radps")
 
 
-def _by_pose(run: RunLog) -> bool:
-    """Return whether poses of the body are all that measured its motion from outside."""
-    pose = run.streams.get("pose")
-    return (
-        pose is not None and set(POSE) <= set(pose.channels) and not {"odometry", "lidar"} & set(run.streams)
-    )
+def _by_pose(run: RunLog, robot: Robot) -> bool:
+    """Return whether poses of an omni robot's body are what measured its speed from outside."""
+    pose, lidar = run.streams.get("pose"), run.streams.get("lidar")
+    others = "odometry" in run.streams or (lidar is not None and "speed_x_mps" in lidar.channels)
+    is_omni = robot.sideways and not robot.steered
+    return is_omni and pose is not None and set(POSE) <= set(pose.channels) and not others
 
 
 def _put_pose(measured: Array, run: RunLog, robot: Robot, time_s: Array) -> None:

@@ -125,7 +125,7 @@ def travelled(run: RunLog, robot: Robot, delay_s: float = 0.0) -> Travelled:
         )
     stream = run.streams[name]
     if name == "pose":
-        found = _of_poses(stream, _fastest_mps(run))
+        found = _of_poses(stream, _fastest_mps(run, robot))
     elif name == "gnss":
         found = _of_twists(name, _receiver_twist(run, robot))
     else:
@@ -135,14 +135,21 @@ def travelled(run: RunLog, robot: Robot, delay_s: float = 0.0) -> Travelled:
     return Travelled(name, found.time_s - delay_s, found.values, found.part, found.n_jumps, found.n_gaps)
 
 
-def _fastest_mps(run: RunLog) -> float:
+def _fastest_mps(run: RunLog, robot: Robot) -> float:
+    """Return the speed of the fastest wheel; infinite where no wheel is known."""
     wheels = run.streams.get("wheels")
-    speeds = [] if wheels is None else [c for c in wheels.channels if c.startswith("speed_")]
-    if wheels is None or not speeds:
+    if wheels is None:
         return float("inf")
-    values = np.column_stack([wheels.channel(channel) for channel in speeds])
-    known = np.abs(values[np.isfinite(values)])
-    return float(known.max()) if known.size else float("inf")
+    scales = {"speed": 1.0}
+    if robot.describes("motors"):
+        scales["motor"] = robot.wheel_radius_m / robot.motors.reduction_ratio
+    for quantity, scale in scales.items():
+        columns = [wheels.channel(c) for c in wheels.channels if c.startswith(f"{quantity}_")]
+        values = np.column_stack(columns) if columns else np.empty(0)
+        known = np.abs(values[np.isfinite(values)])
+        if known.size:
+            return float(known.max()) * scale
+    return float("inf")
 
 
 def _of_poses(stream: Stream, fastest_mps: float) -> Travelled:

@@ -17,7 +17,8 @@ slip of the wheels, over that slip, and r the friction of the rollers over the l
 .. math:: M \dot V = \sum_i D_i^T (F_i - R_i) + E_i^T G_i + P + M\,(w v_y, -w v_x, 0) .
 
 A contact follows within :math:`U / (C g)`, some milliseconds: steps are implicit in V, which is stable at
-rest, too, and without the inertia is :func:`~terrain.simulation.planar.omni_contact.steady_twist`.
+rest, too, and without inertia, resistance and slope is
+:func:`~terrain.simulation.planar.omni_contact.steady_twist`.
 
 What is assumed: three wheels at even angles whose loads follow from the centre of mass and do not shift; one
 C and r for all wheels; friction of the rollers that grows with the speed across over U.
@@ -115,14 +116,17 @@ def move_omni(
             size = min(math.sqrt(slip / planar.n_wheels) / speed, 1.0)
             before[:] = twist
         v_x, v_y = twist[0] + twist[2] * com_y, twist[1] - twist[2] * com_x
-        if disturbance.shape[0] > 0:
-            v_x, v_y = v_x * (1.0 - disturbance[k, 0]), v_y * (1.0 - disturbance[k, 0])
         out[k, VX], out[k, VY], out[k, W] = v_x, v_y, twist[2]
         out[k, FORCE] = (
             mass * ((twist[0] - started_x) / dt - twist[2] * 0.5 * (twist[1] + started_y)) - slope[0]
         )
-        out[k, SLIP] = _body_slip(planar, u, v_x, v_y)
     out[:, AMPS] = np.abs(currents_of(planar, p, dt, wheel_speed_mps, out)).sum(axis=1)
+    for k in range(n):  # what the ground adds to the motion takes no force
+        if disturbance.shape[0] > 0:
+            out[k, VX] *= 1.0 - disturbance[k, 0]
+            out[k, VY] *= 1.0 - disturbance[k, 0]
+        u = wheel_speed_mps[k] * (1.0 + p[_RADIUS])
+        out[k, SLIP] = _body_slip(planar, u, out[k, VX], out[k, VY])
     return out
 
 
@@ -133,7 +137,7 @@ def currents_of(planar: Planar, p: Array, dt: float, wheel_speed_mps: Array, tru
     Parameters
     ----------
     planar, p, dt, wheel_speed_mps : as :func:`move_omni` takes them
-    truth : (n, N_TRUTH) of the motion
+    truth : (n, N_TRUTH) of the motion, without disturbance
     """
     n, wheels = wheel_speed_mps.shape
     out = np.empty((n, wheels))
@@ -168,7 +172,8 @@ def placed(planar: Planar, p: Array) -> tuple[Array, Array, Array]:
 
     With the distance d of the wheels, the directions along and across them and out to them, and the centre
     of mass c, ``D_i`` ends in ``d - c x along``, ``E_i`` in ``-c x across``, and wheel i of three carries
-    ``(1 + 2 c . out / d) / 3``; one that would carry less than nothing carries nothing.
+    ``(1 + 2 c . out / d) / 3``; one that would carry less than nothing carries nothing, and
+    the others then do not balance about c.
     """
     along, across, load = planar.along.copy(), planar.across.copy(), planar.wheel_load_ratio.copy()
     shift_x, shift_y = p[_SHIFT_X], p[_SHIFT_Y]

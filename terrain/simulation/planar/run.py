@@ -100,7 +100,8 @@ def simulate_planar(  # noqa: PLR0913 - an entry whose options have defaults
     RunLog
         streams wheels, imu, odometry, commands, truth, and steering of a swerve robot, whose odometry is a
         tracking camera's pose.  That of a skid-steer robot is the speed of the camera's point in body axes.
-        An omni robot has wheels, commands, truth, and pose of a camera above, as its measured runs.
+        An omni robot has wheels, commands, truth (with the slip of its body, ``slip_body_ratio``), and pose
+        of a camera above, as its measured runs.
 
     Raises
     ------
@@ -163,6 +164,8 @@ def _check(robot: Robot, twist: Array, outside: Mapping[str, float], step_s: flo
         raise ConfigError(
             f"twist drives robot {robot.name} sideways, which needs steered wheels or omni wheels"
         )
+    if robot.sideways and not robot.steered and outside.get("stick_slip_a"):
+        raise ConfigError(f"outside: stick_slip_a is not simulated of robot {robot.name} on omni wheels")
     for name, value in outside.items():
         if name not in OUTSIDE or not math.isfinite(value):
             raise ConfigError(

@@ -23,6 +23,7 @@ from terrain.logs.schema import IMU_CHANNELS, STEERING_CHANNELS
 from terrain.records import Array, Stream
 from terrain.robots import Robot
 from terrain.simulation.planar.model import AX, SLIP, VX, VY, Planar, W
+from terrain.simulation.planar.motion import move
 from terrain.simulation.planar.noise import CAMERA_HZ, IMU_HZ, WHEELS_HZ, Noise, coloured, lag_weights
 from terrain.simulation.planar.omni import currents_of
 from terrain.simulation.planar.signals import delayed
@@ -158,9 +159,10 @@ def _measured(
 def _omni_currents(run: PlanarRun, rows: Array) -> Array:
     """Return the current (k, wheels) of each motor, with the errors that the sum of the ideal ones has."""
     motion, p = run.motion, run.p
-    each = currents_of(
-        run.planar, p, run.dt, motion.rolled_mps / (1.0 + p[INDEX["wheel_radius_ratio"]]), motion.truth
-    )
+    wheels = np.ascontiguousarray(motion.rolled_mps / (1.0 + p[INDEX["wheel_radius_ratio"]]))
+    still = np.zeros((0, 3))
+    truth = move(run.planar, p, run.dt, wheels, motion.steer_rad, motion.grade_rad, motion.roll_rad, still)
+    each = currents_of(run.planar, p, run.dt, wheels, truth)
     warm = 1.0 + p[INDEX["motor_drift_ratio"]] * np.arange(len(each)) * run.dt / 60.0
     each = each * ((1.0 + p[INDEX["motor_constant_ratio"]]) * warm)[:, None] + p[INDEX["current_offset_a"]]
     return np.asarray(each[rows])

@@ -106,6 +106,16 @@ def test_a_drive_at_one_speed_is_not_taken_for_motors_alone():
     assert not motor_friction([broken], ROBOT).determined
 
 
+def test_a_drive_whose_camera_was_lost_says_nothing_of_the_motors(runs):
+    drive = next(run for run in runs if run.terrains)
+    wheels = {name: stream for name, stream in drive.streams.items() if name == "wheels"}
+    assert not motor_friction([], ROBOT).determined
+    for finding in identify_omni([replace(drive, streams=wheels)], ROBOT):
+        assert not finding.determined
+    falling = alone(np.random.default_rng(3), slope=-1e-3)
+    assert not motor_friction([falling], ROBOT).determined
+
+
 def test_few_runs_determine_no_load_and_turns_no_distance(runs):
     few = {finding.parameter: finding for finding in identify_omni(runs[:4], ROBOT)}
     assert "10 runs in steady motion" in few[COM_X].note

@@ -1,5 +1,7 @@
 """Omni robots: what makes them slip is named from their wheels, currents and a camera above."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -133,6 +135,22 @@ def drawn(rng, number):
         "load_shift_x_m": rng.uniform(0.006, 0.02),
         "load_shift_y_m": rng.uniform(-0.015, 0.015),
     }
+
+
+def test_a_jump_of_the_camera_is_no_speed_and_a_heading_of_a_lidar_leaves_the_pose():
+    run = driven({}, n=1)[0]
+    pose = run.streams["pose"]
+    values = pose.values.copy()
+    values[pose.time_s > 6.0, 0] += 3.0
+    wheels = run.streams["wheels"]
+    plain = [i for i, name in enumerate(wheels.channels) if not name.startswith("speed_")]
+    motors = Stream(wheels.time_s, wheels.values[:, plain], [wheels.channels[i] for i in plain])
+    streams = run.streams | {"pose": Stream(pose.time_s, values, pose.channels), "wheels": motors}
+    jumped = signals_of(replace(run, streams=streams), ROBOT).measured[:, CHANNELS.index(SPEED_X)]
+    assert np.nanmax(np.abs(jumped)) < 1.0
+    heading = Stream(pose.time_s, np.zeros((len(pose), 1)), ("yaw_rate_radps",))
+    measured = signals_of(replace(run, streams=run.streams | {"lidar": heading}), ROBOT).measured
+    assert np.isfinite(measured[:, CHANNELS.index(SPEED_X)]).mean() > 0.95
 
 
 @pytest.mark.slow

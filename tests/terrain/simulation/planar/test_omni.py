@@ -262,6 +262,24 @@ def test_hidden_rollers_load_and_radius_of_simulated_runs_come_back_within_their
     assert found.scale_error == pytest.approx(0.05, abs=0.005)
 
 
+def test_what_the_ground_adds_to_the_motion_is_in_no_current():
+    """Noise of the motion has no force: measured currents are those of the motion without it."""
+    quiet = load_noise()._replace(along_ratio=0.0, across_ratio=0.0, yaw_radps=0.0)
+    rough = load_noise()._replace(along_ratio=0.05, across_ratio=0.05, yaw_radps=0.05)
+    twist = np.zeros((301, 3))
+    twist[25:] = heading_to(0.4)
+    one, other = (
+        simulate_planar(ROBOT, twist, 3, ground=CARPET, noise=noise).streams for noise in (quiet, rough)
+    )
+    moved_by = np.abs(one["truth"].channel("speed_y_mps") - other["truth"].channel("speed_y_mps"))
+    assert moved_by.max() > 0.002
+    for i in (1, 2, 3):
+        name = f"current_{i}_a"
+        np.testing.assert_allclose(one["wheels"].channel(name), other["wheels"].channel(name), atol=1e-9)
+    with pytest.raises(ConfigError, match="stick_slip_a is not simulated of robot robotino"):
+        simulate_planar(ROBOT, twist, 3, ground=CARPET, outside={"stick_slip_a": 1.0})
+
+
 def test_scenarios_take_an_omni_robot_sideways_at_a_speed_of_its_own():
     crab = make_scenario("crab", ROBOT, "tiles")
     assert np.abs(crab.twist[:, 1]).max() > 0.1
