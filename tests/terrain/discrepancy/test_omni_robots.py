@@ -66,10 +66,10 @@ def test_where_nothing_is_hidden_nothing_is_named():
         {"roller_friction_ratio": 0.1},
         {"load_shift_x_m": 0.012, "load_shift_y_m": -0.006},
         {"wheel_distance_ratio": 0.06},
-        {"camera_yaw_rad": 0.05},
-        {"camera_latency_s": 0.12},
+        pytest.param({"camera_yaw_rad": 0.05}, marks=pytest.mark.slow),
+        pytest.param({"camera_latency_s": 0.12}, marks=pytest.mark.slow),
         {"force_slip_ratio": 0.4},
-        {"lever_x_m": 0.05, "lever_y_m": 0.02},
+        pytest.param({"lever_x_m": 0.05, "lever_y_m": 0.02}, marks=pytest.mark.slow),
     ],
     ids=lambda hidden: next(iter(hidden)),
 )
