@@ -25,7 +25,7 @@ from terrain.discrepancy.verdict import finite
 from terrain.effects import CHANNELS
 from terrain.records import Array
 
-DRIVEN = ("speed_mps", "turn_mps", "sideways_mps", "steer_rad", "grade_rad", "roll_rad")
+DRIVEN = ("speed_mps", "turn_mps", "steer_rad", "grade_rad", "roll_rad", "sideways_mps")
 """Inputs that are logged; the force is the simulation's own."""
 
 LAGS = (-2, -1, 0, 1, 2)
@@ -195,13 +195,14 @@ def _ratios(squares: Array) -> tuple[float, float]:
 def _columns(run: ComparedRun) -> Array:
     """Return the regressors (m, k) of a run: a row at its ends takes the last input that there is."""
     inputs = [run.inputs[name] for name in DRIVEN]
-    plain = [*inputs, *(np.abs(x) for x in inputs[:2]), *(np.tanh(x / 0.05) for x in inputs[:2])]
+    driven = [*inputs[:2], inputs[-1]]  # that is 0, and left out, but of omni robots
+    plain = [*inputs, *(np.abs(x) for x in driven), *(np.tanh(x / 0.05) for x in driven)]
     products = [a * b for a, b in combinations_with_replacement(inputs, 2)]
-    signed = [x * np.abs(x) for x in inputs[:2]]
+    signed = [x * np.abs(x) for x in driven]
     at = np.arange(len(run.time_s))
     rates = [np.gradient(x) if at.size > 1 else np.zeros_like(x) for x in inputs]
     now = np.column_stack([*plain, *products, *signed, *rates])
-    moving = np.column_stack([*inputs[:3], inputs[0] * inputs[1], *signed])
+    moving = np.column_stack([*inputs[:3], inputs[-1], inputs[0] * inputs[1], *signed])
     late = [moving[np.clip(at - lag, 0, at.size - 1)] for lag in LAGS if lag]
     return np.hstack([now, *late])
 
