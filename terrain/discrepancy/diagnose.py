@@ -84,11 +84,9 @@ def diagnose_signals(
     effects = simulation.library if library is None else tuple(library)
     prepared = prepare(signals, simulation, effects)
     problem = with_conditions(prepared.problem, prepared.aligned)
-    same = problem is prepared.problem and not (prepared.seeds or prepared.contact)
+    same = problem is prepared.problem and not prepared.seeds
     start = prepared.aligned if same else problem.at(simulation.vector)
-    found, withdrawn = _withdraw_wrong(
-        problem, start, search(problem, start, prepared.seeds, prepared.contact), {}
-    )
+    found, withdrawn = _withdraw_wrong(problem, start, search(problem, start, prepared.seeds), {})
     varying = varying_effects(problem, found)
     if _is_beside(problem, found, varying):
         problem = problem._replace(varying={varying[0].parameter: varying[0].scatter})

@@ -240,7 +240,7 @@ def _logged(robot: Robot, info: Information | None) -> tuple[str, ...]:
     """Return the channels of the runs, or those expected from the robot's description."""
     if info is not None:
         return measured_channels(info.rows)
-    if _is_omni(robot):
+    if robot.on_omni_wheels:
         return (SPEED_X, SPEED_Y, CURRENT, HEADING)
     own = [GYRO, ACCEL]
     own += [SPEED_X, SPEED_Y] if robot.describes("camera") else []
@@ -249,20 +249,17 @@ def _logged(robot: Robot, info: Information | None) -> tuple[str, ...]:
     return tuple(own)
 
 
-def _is_omni(robot: Robot) -> bool:
-    return robot.sideways and not robot.steered
-
-
 def _drives(
     simulation: Simulation, names: Sequence[str], channels: Sequence[str], info: Information | None
 ) -> list[_Drive]:
     """Return the information of each scenario on each grade on parameters, from channels."""
     driven, signals = [], []
+    grades = GRADES_DEG[:1] if simulation.robot.on_omni_wheels else GRADES_DEG  # those log no tilt
     for name in SCENARIOS:
         inputs = _inputs(simulation.robot, name)
         if inputs is None:
             continue
-        for grade_deg in GRADES_DEG[:1] if _is_omni(simulation.robot) else GRADES_DEG:  # no tilt is logged
+        for grade_deg in grades:
             driven.append((name, grade_deg))
             signals.append(_signals(simulation, *inputs, grade_deg, channels))
     if not signals:
@@ -284,7 +281,7 @@ def _inputs(robot: Robot, name: str) -> tuple[Array, Array] | None:
         return None
     speed_mps = min(0.6 * robot.wheel_radius_m * robot.motors.speed_max_radps, 1.0)
     try:
-        scenario = make_scenario(name, robot, "ground", speed_mps=None if _is_omni(robot) else speed_mps)
+        scenario = make_scenario(name, robot, "ground", speed_mps=None if robot.on_omni_wheels else speed_mps)
     except ConfigError:
         return None
     motion = wheel_motion(robot, scenario.twist[: round(LONGEST_S * RATE_HZ)], 1.0 / RATE_HZ)

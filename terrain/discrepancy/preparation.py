@@ -8,7 +8,6 @@ from typing import NamedTuple
 import numpy as np
 
 from terrain.discrepancy.clocks import Shift, shifts_of
-from terrain.discrepancy.contact_start import contact_seeds
 from terrain.discrepancy.fitting import Problem
 from terrain.discrepancy.health import Fault, faults_of, repaired, unfit_runs
 from terrain.discrepancy.health.runs import Excluded
@@ -36,8 +35,7 @@ class Prepared(NamedTuple):
     faults : that were found and repaired, in all runs that were given
     excluded : runs that are unfit
     seeds : lags of sensors, by parameter, that are so large that a search has to start from them
-    contact : how rollers of omni wheels resist and how soft the ground is, of which the same holds
-    aligned : information of the runs with these built in
+    aligned : information of the runs with these lags built in
     shift : clocks of the runs behind that
     """
 
@@ -45,7 +43,6 @@ class Prepared(NamedTuple):
     faults: tuple[Fault, ...]
     excluded: tuple[Excluded, ...]
     seeds: Mapping[str, float]
-    contact: Mapping[str, float]
     aligned: Information
     shift: Shift
 
@@ -68,7 +65,7 @@ def prepare(signals: Sequence[Signals], simulation: Simulation, library: Sequenc
     if faults:
         latencies = latencies_of(runs, simulation)
     problem = Problem(runs, simulation, low_pass, tuple(library))
-    seeds, contact, aligned, shift = _aligned(problem, latencies)
+    seeds, aligned, shift = _aligned(problem, latencies)
     excluded = unfit_runs(runs, aligned, shift)
     if excluded:
         gone = {run.run_id for run in excluded}
@@ -77,21 +74,17 @@ def prepare(signals: Sequence[Signals], simulation: Simulation, library: Sequenc
             reasons = "; ".join(f"{run.run_id}: {run.reason}" for run in excluded[:3])
             raise DataError(f"runs: only {len(kept)} of {len(signals)} are fit to be compared ({reasons})")
         problem = problem._replace(signals=kept)
-        seeds, contact, aligned, shift = _aligned(problem, latencies_of(kept, simulation))
+        seeds, aligned, shift = _aligned(problem, latencies_of(kept, simulation))
     if not any(np.nanmax(np.abs(run.wheel_speed_mps), initial=0.0) > REST_MPS for run in problem.signals):
         n = len(problem.signals)
         raise DataError(f"runs: in all {n} the wheels are at rest; runs that drive are required")
-    return Prepared(problem, faults, excluded, seeds, contact, aligned, shift)
+    return Prepared(problem, faults, excluded, seeds, aligned, shift)
 
 
-def _aligned(
-    problem: Problem, latencies: Latencies
-) -> tuple[dict[str, float], Mapping[str, float], Information, Shift]:
-    """Return lags and contact to start from, information of the runs with them built in, and clocks there."""
+def _aligned(problem: Problem, latencies: Latencies) -> tuple[dict[str, float], Information, Shift]:
+    """Return lags to start from, the information of the runs with them built in, and their clocks there."""
     values = starting_values(latencies)
     seeds = {name: value for name, value in values.items() if name in problem.parameters}
-    contact = contact_seeds(problem)
-    both = {**seeds, **contact}
-    there = move_point(problem.simulation.vector, tuple(both), np.array(list(both.values())))
+    there = move_point(problem.simulation.vector, tuple(seeds), np.array(list(seeds.values())))
     aligned = problem.at(there)
-    return seeds, contact, aligned, shifts_of(aligned)
+    return seeds, aligned, shifts_of(aligned)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence, Set
-from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -61,12 +60,7 @@ class Found(NamedTuple):
     assumed_scatter: Mapping[str, float]
 
 
-def search(
-    problem: Problem,
-    start: Information,
-    seeds: Mapping[str, float] = MappingProxyType({}),
-    contact: Mapping[str, float] = MappingProxyType({}),
-) -> Found:
+def search(problem: Problem, start: Information, seeds: Mapping[str, float] | None = None) -> Found:
     """Return the causes that explain the runs.
 
     Parameters
@@ -75,18 +69,11 @@ def search(
     start : information of the runs around the simulation as it is given
     seeds : parameters whose values are so large that sensitivities without them would mislead, as lags of
         sensors: other causes are first searched with them built in, then all are fitted together
-    contact : parameters of the contact of wheels and ground, of which the same holds; they are fitted first,
-        and others are searched beside them
     """
     base = start.vector
     causes: list[Effect] = []
     info = start
-    if contact:
-        both = {**seeds, **contact}
-        there = move_point(base, tuple(both), np.array(list(both.values())))
-        seeded = [each for each in problem.library if set(names_of([each])) & set(both)]
-        causes, info = _refit_significant(problem, recentre(problem.at(there), base), base, seeded)
-    elif seeds:
+    if seeds:
         there = move_point(base, tuple(seeds), np.array(list(seeds.values())))
         first, info = _grow(problem, problem.at(there), there, [])
         seeded = [each for each in problem.library if set(names_of([each])) & set(seeds)]

@@ -21,9 +21,10 @@ from terrain.effects import (
     TURNING_CURRENT,
 )
 from terrain.errors import DataError
-from terrain.kinematics.camera import CHANNELS as POSE_CHANNELS
+from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.kinematics.camera import body_motion
-from terrain.measured_slip.travelled import POSE, travelled
+from terrain.logs.schema import POSE_CHANNELS
+from terrain.measured_slip.travelled import travelled
 from terrain.records import Array, RunLog, Stream, read_only
 from terrain.robots import Robot
 
@@ -189,7 +190,7 @@ def _put_motion(measured: Array, run: RunLog, robot: Robot, time_s: Array) -> No
     if _by_pose(run, robot):
         _put_pose(measured, run, robot, time_s)
     if (seen := run.streams.get("odometry")) is not None:
-        if set(POSE_CHANNELS) <= set(seen.channels):
+        if set(CAMERA_CHANNELS) <= set(seen.channels):
             speed = _without_jumps(seen, body_motion(seen, robot.camera).speed_mps)
             measured[:, CHANNELS.index(SPEED_X)] = _resample(time_s, seen.time_s, speed[:, 0])
             measured[:, CHANNELS.index(SPEED_Y)] = _resample(time_s, seen.time_s, speed[:, 1])
@@ -206,8 +207,9 @@ def _by_pose(run: RunLog, robot: Robot) -> bool:
     """Return whether poses of an omni robot's body are what measured its speed from outside."""
     pose, lidar = run.streams.get("pose"), run.streams.get("lidar")
     others = "odometry" in run.streams or (lidar is not None and "speed_x_mps" in lidar.channels)
-    is_omni = robot.sideways and not robot.steered
-    return is_omni and pose is not None and set(POSE) <= set(pose.channels) and not others
+    return (
+        robot.on_omni_wheels and pose is not None and set(POSE_CHANNELS) <= set(pose.channels) and not others
+    )
 
 
 def _put_pose(measured: Array, run: RunLog, robot: Robot, time_s: Array) -> None:
@@ -230,11 +232,10 @@ def _put_currents(
     currents = [f"current_{wheel}_a" for wheel in robot.wheels]
     if not set(currents) <= set(wheels.channels):
         return
-    is_omni = robot.sideways and not robot.steered
     each = []
     for i, name in enumerate(currents):
         logged = wheels.channel(name)
-        current = np.abs(logged) if is_omni else _signed(logged, wheel_speeds[:, i])
+        current = np.abs(logged) if robot.on_omni_wheels else _signed(logged, wheel_speeds[:, i])
         each.append(_resample(time_s, wheels.time_s, current))
     measured[:, CHANNELS.index(CURRENT)] = np.sum(each, axis=0)
     parallel = np.abs(np.exp(1j * steer).mean(axis=1)) > PARALLEL

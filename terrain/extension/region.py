@@ -130,7 +130,7 @@ def _driven(run: RunLog, robot: Robot) -> tuple[Array, Array, Array]:
     rates = np.column_stack([wheels.channel(name) for name in robot.rate_channels])
     if robot.rate_channels[0].startswith("motor_"):
         rates = rates * (robot.wheel_radius_m / robot.motors.reduction_ratio)
-    if robot.sideways and not robot.steered:
+    if robot.on_omni_wheels:
         rolled, _ = omni.forward(robot.wheel_positions_m, robot.wheel_directions_rad, rates)
         return np.hypot(rolled[:, 0], rolled[:, 1]), rolled[:, 2], grade
     speed = rates.mean(axis=1)

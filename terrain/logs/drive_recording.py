@@ -64,6 +64,7 @@ from terrain.logs.lidar_twist import MAX_STD, dated, new_poses, twists_and_std, 
 from terrain.logs.log_files import check_log_file, checked_names, short_name
 from terrain.logs.recording_stretches import Cut, cut_recording
 from terrain.logs.samples import BAD_TIME, checked_stream, longest_rise
+from terrain.logs.schema import POSE_CHANNELS
 from terrain.records import Array, Label, RunLog
 
 SUFFIX = ".csv.gz"
@@ -85,7 +86,6 @@ IMU: dict[str, str] = {
 }
 COMMANDS: dict[str, str] = {"speed_x_mps": "cmd_vel_x", "yaw_rate_radps": "cmd_vel_omega"}
 POSE: tuple[str, ...] = ("icp_pos_x", "icp_pos_y", "icp_quat_x", "icp_quat_y", "icp_quat_z", "icp_quat_w")
-POSE_CHANNELS: tuple[str, ...] = ("position_x_m", "position_y_m", "yaw_rad")
 STATE, STEP, TIME = "calib_state", "calib_step", "time"
 
 BREAK_PERIODS = 2.5

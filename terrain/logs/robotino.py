@@ -54,6 +54,7 @@ from terrain.files.names import normal_name, shown
 from terrain.logs.csv_table import TextLayout, data_row, header_of, read_columns
 from terrain.logs.log_files import check_log_file, checked_names, short_name
 from terrain.logs.samples import checked_stream
+from terrain.logs.schema import POSE_CHANNELS
 from terrain.records import Array, Label, RunLog, Stream
 
 ROBOT = "robotino"
@@ -299,7 +300,7 @@ def _pose(log: _Log, table: dict[str, Array], camera: Camera) -> Stream | None:
     log.converted[HELD] += int((~new).sum())
     yaw = np.unwrap(np.radians(seen[new, 2])) + np.pi / 2
     pose = np.column_stack([seen[new, 0] * camera.x_m, -seen[new, 1] * camera.y_m, yaw])
-    return log.stream(table["t"][new], pose, ["position_x_m", "position_y_m", "yaw_rad"], _POSE)
+    return log.stream(table["t"][new], pose, list(POSE_CHANNELS), _POSE)
 
 
 def _names(parts: tuple[str, ...]) -> tuple[str, str, str]:

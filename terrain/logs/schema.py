@@ -149,6 +149,9 @@ GNSS_CHANNELS: tuple[str, ...] = (
 )
 """Channels of a receiver: the antenna, east and north."""
 
+POSE_CHANNELS: tuple[str, ...] = ("position_x_m", "position_y_m", "yaw_rad")
+"""Of a stream of poses of the body's origin, in a frame that is fixed and right-handed."""
+
 ESTIMATOR_CHANNELS: tuple[str, ...] = (
     *("speed_x_mps", "speed_y_mps", "yaw_rate_radps", "accel_x_mps2", "accel_y_mps2"),
 )

@@ -116,8 +116,8 @@ def _misfits(run: RunLog, robot: Robot, lags_s: Array, n_parts: int) -> list[Arr
     known = np.isfinite(sums).all(axis=1)
     one = np.zeros(int(known.sum()), dtype=np.int64)
     u, _ = window_rates(time_s[known], sums[known], one, start_s, end_s, 3, 0.4)
-    omni = robot.sideways and not robot.steered
-    rolled = rolled_twists(u, robot.wheel_positions_m, wheel_directions(run, robot, start_s, end_s), omni)
+    directions = wheel_directions(run, robot, start_s, end_s)
+    rolled = rolled_twists(u, robot.wheel_positions_m, directions, robot.on_omni_wheels)
     size_m = float(np.linalg.norm(robot.wheel_positions_m, axis=1).max())
     scale = np.array([1.0, 1.0, size_m])
     seen = np.array(

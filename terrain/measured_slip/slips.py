@@ -149,7 +149,7 @@ def measured_slip(
     along, _ = wheel_frame_velocities(twist, robot.wheel_positions_m, direction)
     along_std = _along_std(twist_std, robot.wheel_positions_m, direction)
     slip, slip_std = _slip(u, u_std, along, along_std, min_speed_mps)
-    rolled_twist = rolled_twists(u, robot.wheel_positions_m, direction, robot.sideways and not robot.steered)
+    rolled_twist = rolled_twists(u, robot.wheel_positions_m, direction, robot.on_omni_wheels)
     body_slip, body_std, side = _body(rolled_twist, u_std, twist, twist_std, min_speed_mps)
     return MeasuredSlip(
         run_id=run.run_id,

@@ -25,14 +25,12 @@ from terrain.errors import DataError
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.kinematics.camera import body_motion
 from terrain.kinematics.wheel_velocity import TWIST, point_velocity
+from terrain.logs.schema import POSE_CHANNELS
 from terrain.records import Array, RunLog, Stream, read_only
 from terrain.robots import Robot
 
 SOURCES: tuple[str, ...] = ("pose", "lidar", "odometry", "gnss")
 """Streams that measure motion from outside, the most direct first."""
-
-POSE: tuple[str, ...] = ("position_x_m", "position_y_m", "yaw_rad")
-"""Channels of a stream of poses of the body's origin, in a frame that is fixed and right-handed."""
 
 VELOCITY: tuple[str, ...] = ("velocity_x_mps", "velocity_y_mps")
 """Channels of a receiver's velocity, east and north."""
@@ -82,7 +80,7 @@ def outside_source(run: RunLog) -> str | None:
         if stream is None or len(stream) < 2:
             continue
         needed = {
-            "pose": (POSE,),
+            "pose": (POSE_CHANNELS,),
             "lidar": (TWIST,),
             "odometry": (CAMERA_CHANNELS[:-1], TWIST[:2]),
             "gnss": (VELOCITY,),
@@ -113,7 +111,7 @@ def travelled(run: RunLog, robot: Robot, delay_s: float = 0.0) -> Travelled:
     >>> from terrain.robots import load_robot
     >>> turn = np.linspace(0.0, np.pi / 2, 21)
     >>> pose = np.column_stack([np.sin(turn), 1.0 - np.cos(turn), turn])
-    >>> run = RunLog("a", "robotino", {"pose": Stream(np.linspace(0.0, 2.0, 21), pose, POSE)})
+    >>> run = RunLog("a", "robotino", {"pose": Stream(np.linspace(0.0, 2.0, 21), pose, POSE_CHANNELS)})
     >>> travelled(run, load_robot("robotino")).values[-1].round(4) + 0.0
     array([1.5708, 0.    , 1.5708])
     """
@@ -153,7 +151,7 @@ def _fastest_mps(run: RunLog, robot: Robot) -> float:
 
 
 def _of_poses(stream: Stream, fastest_mps: float) -> Travelled:
-    pose = np.column_stack([stream.channel(channel) for channel in POSE])
+    pose = np.column_stack([stream.channel(channel) for channel in POSE_CHANNELS])
     known = np.isfinite(pose).all(axis=1)
     time_s, pose = stream.time_s[known], pose[known]
     if len(time_s) < 2:

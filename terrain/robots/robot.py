@@ -71,6 +71,11 @@ class Robot(ABC):
     skids: ClassVar[bool]
     """Whether it turns by skidding, so that the turning moment takes a current of its own."""
 
+    @property
+    def on_omni_wheels(self) -> bool:
+        """Whether it drives sideways on wheels that are not steered, each along its own direction."""
+        return self.sideways and not self.steered
+
     def __post_init__(self) -> None:
         n = len(self.effects)
         cov = self.effects_cov if np.isfinite(self.effects_cov).any() else np.full((n, n), np.nan)

@@ -183,7 +183,7 @@ def _omni_wheels(robot: Robot, arm_m: Array, ground: Ground) -> dict[str, Any]:
     ``along`` and ``across`` (wheels, 3) give the speed of each wheel's centre along and across its direction
     for a twist of the centre of mass, ``to_rolled`` (3, wheels) the twist of the body without slip.
     """
-    if not robot.sideways or robot.steered:
+    if not robot.on_omni_wheels:
         n, none = len(robot.wheels), np.zeros((len(robot.wheels), 3))
         return {
             "omni": False,

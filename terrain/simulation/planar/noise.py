@@ -66,7 +66,7 @@ class Noise(NamedTuple):
 
     def current_a(self, robot: Robot) -> float:
         """Return the noise of the sum of a robot's currents; that of an omni robot is in its description."""
-        if robot.sideways and not robot.steered:
+        if robot.on_omni_wheels:
             return 0.0
         return self.current_skid_a if robot.skids else self.current_swerve_a
 

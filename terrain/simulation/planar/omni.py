@@ -49,7 +49,6 @@ SUBSTEPS = 4
 """Implicit steps within one of the simulation, so that their lag, half of each, is about a millisecond."""
 
 _RADIUS = INDEX["wheel_radius_ratio"]
-_ROLLING = INDEX["rolling_resistance_ratio"]
 _PAYLOAD = INDEX["payload_ratio"]
 _FORCE_SLIP = INDEX["force_slip_ratio"]
 _ROLLERS = INDEX["roller_friction_ratio"]
@@ -82,7 +81,6 @@ def move_omni(
     mass = planar.mass_kg * (1.0 + p[_PAYLOAD])
     inertia = mass, mass, planar.yaw_inertia_kgm2 * (1.0 + p[_PAYLOAD])
     weight, gravity = mass * GRAVITY_MPS2, GRAVITY_MPS2 * planar.effective_ratio
-    rolling = planar.rolling_ratio + p[_ROLLING]
     step, size = dt / SUBSTEPS, 0.0
     for k in range(n):
         slope = (-mass * gravity * math.sin(grade_rad[k]), -mass * gravity * math.sin(roll_rad[k]), 0.0)
@@ -103,7 +101,7 @@ def move_omni(
             for i in range(planar.n_wheels):
                 v = dot(along[i], before)
                 share = load[i]
-                drag = share * rolling * weight / math.sqrt(v * v + ROLLING_MPS * ROLLING_MPS)
+                drag = share * planar.rolling_ratio * weight / math.sqrt(v * v + ROLLING_MPS * ROLLING_MPS)
                 for a in range(3):
                     pushed[a] += share * stiff * rolled[i] * along[i, a]
                     for b in range(3):

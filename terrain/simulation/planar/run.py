@@ -164,7 +164,7 @@ def _check(robot: Robot, twist: Array, outside: Mapping[str, float], step_s: flo
         raise ConfigError(
             f"twist drives robot {robot.name} sideways, which needs steered wheels or omni wheels"
         )
-    if robot.sideways and not robot.steered and outside.get("stick_slip_a"):
+    if robot.on_omni_wheels and outside.get("stick_slip_a"):
         raise ConfigError(f"outside: stick_slip_a is not simulated of robot {robot.name} on omni wheels")
     for name, value in outside.items():
         if name not in OUTSIDE or not math.isfinite(value):

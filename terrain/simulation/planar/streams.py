@@ -19,7 +19,7 @@ from terrain.constants import GRAVITY_MPS2
 from terrain.effects import CHANNELS, CURRENT, HEADING, INDEX, SPEED_X, TURNING_CURRENT
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.kinematics.wheel_velocity import point_velocity, wheel_frame_velocities
-from terrain.logs.schema import IMU_CHANNELS, STEERING_CHANNELS
+from terrain.logs.schema import IMU_CHANNELS, POSE_CHANNELS, STEERING_CHANNELS
 from terrain.records import Array, Stream
 from terrain.robots import Robot
 from terrain.simulation.planar.model import AX, SLIP, VX, VY, Planar, W
@@ -43,10 +43,7 @@ SPIKE_HZ, SPIKE_S = 5.0, 0.06
 STANDSTILL_MPS = 1e-6
 """Speed below which an encoder counts nothing: its low-pass ends there."""
 
-POSE_CHANNELS = ("position_x_m", "position_y_m", "yaw_rad")
-"""Of a camera above, as measured runs have them."""
-
-BODY_SLIP = ("slip_body_ratio",)
+BODY_SLIP = "slip_body_ratio"
 """Channel of the truth of an omni robot, whose body slips otherwise than any of its wheels."""
 
 _SEEN_X = CHANNELS.index(SPEED_X)
@@ -157,15 +154,12 @@ def _measured(
 
 
 def _omni_currents(run: PlanarRun, rows: Array) -> Array:
-    """Return the current (k, wheels) of each motor, with the errors that the sum of the ideal ones has."""
+    """Return the current (k, wheels) of each motor: of the motion before the ground disturbs it."""
     motion, p = run.motion, run.p
     wheels = np.ascontiguousarray(motion.rolled_mps / (1.0 + p[INDEX["wheel_radius_ratio"]]))
     still = np.zeros((0, 3))
     truth = move(run.planar, p, run.dt, wheels, motion.steer_rad, motion.grade_rad, motion.roll_rad, still)
-    each = currents_of(run.planar, p, run.dt, wheels, truth)
-    warm = 1.0 + p[INDEX["motor_drift_ratio"]] * np.arange(len(each)) * run.dt / 60.0
-    each = each * ((1.0 + p[INDEX["motor_constant_ratio"]]) * warm)[:, None] + p[INDEX["current_offset_a"]]
-    return np.asarray(each[rows])
+    return np.asarray(currents_of(run.planar, p, run.dt, wheels, truth)[rows])
 
 
 def pose_stream(run: PlanarRun, rng: np.random.Generator) -> Stream:
@@ -376,13 +370,9 @@ def planar_truth(run: PlanarRun) -> Stream:
         slip_ratio(motion.rolled_mps[rows], along),
         np.full((len(rows), 1), run.p[INDEX["gyro_bias_radps"]] + robot.sensors.gyro_bias_z_radps),
     ]
+    wheels = (wheel_channels(each, robot.wheels) for each in ("wheel_radps", "steer_rad", "slip_ratio"))
+    channels = [*BODY_TRUTH, *(name for each in wheels for name in each), GYRO_BIAS]
     if run.planar.omni:
         columns.append(motion.truth[rows, SLIP, None])
-    wheels = (wheel_channels(each, robot.wheels) for each in ("wheel_radps", "steer_rad", "slip_ratio"))
-    channels = (
-        *BODY_TRUTH,
-        *(name for each in wheels for name in each),
-        GYRO_BIAS,
-        *BODY_SLIP[: run.planar.omni],
-    )
-    return Stream(time_s, np.hstack(columns), channels)
+        channels.append(BODY_SLIP)
+    return Stream(time_s, np.hstack(columns), tuple(channels))

@@ -8,7 +8,6 @@ import pytest
 from terrain.discrepancy.diagnose import diagnose
 from terrain.discrepancy.signals import signals_of
 from terrain.discrepancy.simulation import Simulation
-from terrain.discrepancy.verdict import Verdict
 from terrain.effects import CHANNELS, CURRENT, HEADING, SPEED_X, SPEED_Y, showing
 from terrain.errors import DataError
 from terrain.kinematics.wheel_speed import with_wheel_speeds
@@ -48,6 +47,14 @@ def driven(hidden, ground=CARPET, n=N_RUNS, turns=True, seed=0):
     return runs
 
 
+def without_currents(run):
+    wheels = run.streams["wheels"]
+    kept = [i for i, name in enumerate(wheels.channels) if not name.startswith("current_")]
+    channels = tuple(wheels.channels[i] for i in kept)
+    speeds = Stream(wheels.time_s, wheels.values[:, kept], channels)
+    return replace(run, streams=run.streams | {"wheels": speeds})
+
+
 def diagnosed(runs, ground=CARPET):
     return diagnose(runs, Simulation(ROBOT, ground, scatter=load_scatter()._asdict()))
 
@@ -82,13 +89,33 @@ def test_a_hidden_effect_is_named_with_its_value_and_nothing_beside_it(hidden):
         assert value.low - 0.1 * abs(size) < size < value.high + 0.1 * abs(size), name
 
 
+def scaled_and_straight(seed):
+    free = CARPET._replace(roller_ratio=0.0, rolling_ratio=0.0)  # what resists turns the robot: no scale does
+    return driven({"camera_scale_ratio": -0.08}, free, turns=False, seed=seed), free
+
+
+def answer(found):
+    return {cause.name for cause in found.causes}, [set(names) for names in found.ambiguous_sets]
+
+
+ONE, BOTH = ({"camera_scale"}, []), (set(), [{"camera_scale", "wheel_radius"}])
+
+
 def test_scale_of_a_camera_and_radius_of_the_wheels_are_one_on_straight_drives_and_two_where_it_turns():
-    free = CARPET._replace(roller_ratio=0.0)  # rollers that resist turn the robot, which no scale does
-    straight = diagnosed(driven({"camera_scale_ratio": -0.08}, free, turns=False), free)
-    assert straight.verdict is Verdict.AMBIGUOUS
-    assert any({"camera_scale", "wheel_radius"} <= set(names) for names in straight.ambiguous_sets)
+    """Straight, only the torque of a larger wheel parts them: the answer is the scale, or either."""
+    answers = [answer(diagnosed(*scaled_and_straight(seed))) for seed in range(4)]
+    assert all(each in (ONE, BOTH) for each in answers)
+    assert BOTH in answers
     turning = diagnosed(driven({"camera_scale_ratio": -0.08}))
     assert [cause.name for cause in turning.causes] == ["camera_scale"]
+
+
+@pytest.mark.slow
+@pytest.mark.xfail(strict=True, reason="a smaller radius predicts less of the encoders' noise in the heading")
+def test_without_currents_straight_drives_do_not_part_scale_and_radius():
+    for seed in range(4):
+        runs, free = scaled_and_straight(seed)
+        assert answer(diagnosed([without_currents(run) for run in runs], free)) == BOTH
 
 
 def test_signals_are_those_of_the_pose_and_the_sum_of_the_magnitudes_of_the_currents():

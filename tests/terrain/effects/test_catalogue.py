@@ -59,7 +59,7 @@ SMALL_ROBOT = {"omni": {CURRENT: 0.15}}
 LEFT_OUT = {
     "omni": (
         *("gyro_bias", "gyro_scale", "accel_bias", "imu_latency", "clock_offset", "clock_rate"),
-        *("encoder_lag", "motor_constant", "motor_drift", "current_offset", "rolling_resistance"),
+        *("encoder_lag", "motor_constant", "motor_drift", "current_offset"),
     )
 }
 """Effects that act and are not looked for: of an IMU, which these logs do not have, and of lags and currents

@@ -6,6 +6,7 @@ from scipy.integrate import solve_ivp
 
 from terrain.effects import vector_of
 from terrain.errors import ConfigError
+from terrain.extension import apply_homes
 from terrain.kinematics import omni
 from terrain.kinematics.wheel_speed import with_wheel_speeds
 from terrain.measured_slip.rollers import roller_findings
@@ -260,6 +261,30 @@ def test_hidden_rollers_load_and_radius_of_simulated_runs_come_back_within_their
     for share, (low, high) in zip(load, found.load_interval, strict=True):
         assert low - 0.005 < share < high + 0.005
     assert found.scale_error == pytest.approx(0.05, abs=0.005)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"load_shift_x_m": 0.02, "load_shift_y_m": -0.015},
+        {"wheel_distance_ratio": 0.08},
+        {"wheel_distance_ratio": -0.05, "load_shift_x_m": 0.01, "load_shift_y_m": 0.01},
+        {"payload_ratio": 0.3},
+        {"wheel_radius_ratio": -0.06},
+    ],
+)
+def test_an_effect_with_a_home_moves_the_robot_as_that_description_does(values):
+    """The other route: the kernel's geometry and loads against those of the description's numbers."""
+    described = apply_homes(replace(ROBOT, effects=values))
+    assert not described.effects
+    wheels = starting() + wheels_for((0.1, -0.05, 0.3), 60)
+    radius = described.wheel_radius_m / ROBOT.wheel_radius_m  # a larger wheel rolls further at one rate
+    effect, expected = (
+        moved(ROBOT, CARPET, wheels, vector_of(values)),
+        moved(described, CARPET, radius * wheels),
+    )
+    np.testing.assert_allclose(effect[:, [VX, VY, W]], expected[:, [VX, VY, W]], rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(effect[10:, AMPS], expected[10:, AMPS], rtol=0.02)  # rotors: by the rate
 
 
 def test_what_the_ground_adds_to_the_motion_is_in_no_current():
