@@ -14,11 +14,11 @@ from typing import NamedTuple
 import numpy as np
 
 from terrain.angles import wrapped
-from terrain.control.status import StatusCode
 from terrain.entry_point import entry_point
 from terrain.kinematics.swerve import FAR_RAD, wheel_command_step
 from terrain.records import Array, Command
 from terrain.robots import SwerveRobot
+from terrain.status import StatusCode
 
 _wheel_command_step = entry_point(wheel_command_step)
 

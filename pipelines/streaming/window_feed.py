@@ -22,6 +22,7 @@ Estimate = LiveEstimate | LiveSkidEstimate
 LIVE_FILTERS: Mapping[str, tuple[str, ...]] = {
     "swerve": ("vio15", "vio12", "slip14", "encoder12"),
     "skid_steer": ("skid",),
+    "tracked": ("skid",),
 }
 """Filters that run sample by sample, by drive; the first is used where a model names none."""
 
@@ -184,7 +185,7 @@ def _estimates(stream: str, needed: Sequence[str], robot: Robot) -> Callable[[An
     """Return what takes the channels of a model out of an estimate."""
     if stream == "slip":
         places = _places(stream, needed, [f"slip_{wheel}_ratio" for wheel in robot.wheels])
-        if robot.drive == "skid_steer":  # nothing sees the ground go by
+        if robot.skids:  # nothing sees the ground go by
             unknown = np.full(len(places), np.nan)
             return lambda _: unknown
         return lambda estimate: np.asarray(estimate.slip_ratio)[places]

@@ -49,9 +49,9 @@ from terrain.control.pid import (
     pid_step,
 )
 from terrain.control.power_state import POWER_THRESHOLD_WPKG, DriveState, power_state
-from terrain.control.status import StatusCode
 from terrain.errors import ConfigError
 from terrain.records import Array
+from terrain.status import StatusCode
 
 LOW_SPEED_MPS = 0.05
 """Thesis 8.3.2, of a wheel and of the robot."""

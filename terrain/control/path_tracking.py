@@ -40,9 +40,9 @@ from numba import njit, types
 
 from terrain.angles import wrapped
 from terrain.control.pid import LONGEST_STEP_S, Gains, PidState, PidStatus, pid_step
-from terrain.control.status import StatusCode
 from terrain.control.tracking_settings import MOVING_MPS, TrackSettings
 from terrain.records import Array
+from terrain.status import StatusCode
 
 
 class TrackStatus(StatusCode):

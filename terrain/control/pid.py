@@ -18,8 +18,8 @@ from typing import NamedTuple
 
 from numba import njit, types
 
-from terrain.control.status import StatusCode
 from terrain.errors import ConfigError
+from terrain.status import StatusCode
 
 LONGEST_STEP_S = 0.5
 """After a longer step the previous error carries no information on the present one."""

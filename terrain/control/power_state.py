@@ -11,7 +11,7 @@ import math
 
 from numba import njit, types
 
-from terrain.control.status import StatusCode
+from terrain.status import StatusCode
 
 
 class DriveState(StatusCode):

@@ -13,8 +13,8 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from terrain.control.status import StatusCode
 from terrain.errors import ConfigError
+from terrain.status import StatusCode
 
 DRIVING_MPS = 0.03
 """A robot whose fastest wheel is to turn at least so fast drives: windows are cut from this speed on

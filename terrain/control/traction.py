@@ -46,13 +46,13 @@ import numpy as np
 from numba import njit, types
 
 from terrain.control.power_state import DriveState
-from terrain.control.status import StatusCode
 from terrain.control.traction_settings import (
     TractionSettings,
     TractionTarget,
     WheelMeasurements,
 )
 from terrain.records import Array
+from terrain.status import StatusCode
 
 MAX_STEP_S = 0.5
 """A longer step between two calls is no step of a control loop."""

@@ -21,9 +21,12 @@ currents, right minus left current, and the rate of a heading that no gyro measu
 MOTION: tuple[str, ...] = (GYRO, SPEED_X, SPEED_Y)
 """Channels of the planar motion."""
 
-SKID, SWERVE, OMNI = "skid_steer", "swerve", "omni"
-BOTH = (SKID, SWERVE)
-"""Drives of wheels that do not roll across."""
+SKID, TRACKED, SWERVE, OMNI, BICYCLE = "skid_steer", "tracked", "swerve", "omni", "bicycle"
+SKIDDING = (SKID, TRACKED)
+"""Drives that turn by a difference of their sides."""
+
+BOTH = (*SKIDDING, SWERVE)
+"""Drives of wheels that do not roll across, but for cars."""
 
 EVERY = (*BOTH, OMNI)
 

@@ -33,7 +33,9 @@ FILTERS = ("encoder12", "slip14", "vio12", "vio15", "skid")
 FILTERS_OF_DRIVE: Mapping[str, tuple[str, ...]] = {
     "swerve": FILTERS[:-1],
     "skid_steer": FILTERS[-1:],
+    "tracked": FILTERS[-1:],
     "omni": (),
+    "bicycle": (),
 }
 """Filters of each drive."""
 

@@ -11,7 +11,7 @@ from terrain.errors import ConfigError
 from terrain.kinematics import omni
 from terrain.kinematics.swerve import wheel_commands
 from terrain.records import Array
-from terrain.robots import OmniRobot, Robot, SkidSteerRobot, SwerveRobot
+from terrain.robots import BicycleRobot, OmniRobot, Robot, SkidSteerRobot, SwerveRobot
 
 
 class WheelMotion(NamedTuple):
@@ -50,7 +50,9 @@ def wheel_motion(robot: Robot, twist: Array, dt_s: float) -> WheelMotion:
     -----
     A swerve robot: :func:`terrain.kinematics.swerve.wheel_commands`.  A skid-steer robot of track B:
     ``v_left = v - w B / 2``, ``v_right = v + w B / 2``, each within what its motor can do.  An omni robot:
-    :func:`terrain.kinematics.omni.inverse`, shortened by what brings the fastest wheel to its limit.
+    :func:`terrain.kinematics.omni.inverse`, shortened by what brings the fastest wheel to its limit.  A
+    car-like robot of wheelbase L: ``tan d = L w / v`` in front within its limits, straight at rest, and the
+    twist that it gives.
 
     Examples
     --------
@@ -91,3 +93,15 @@ def _(robot: OmniRobot, twist: Array, dt_s: float) -> WheelMotion:
     return WheelMotion(
         twist / over, speeds / over, speeds / over / robot.wheel_radius_m, np.zeros_like(speeds)
     )
+
+
+@wheel_motion.register
+def _(robot: BicycleRobot, twist: Array, dt_s: float) -> WheelMotion:
+    speed = np.clip(twist[:, 0], -robot.speed_max_mps, robot.speed_max_mps)
+    curvature = np.divide(twist[:, 2], twist[:, 0], out=np.zeros(len(twist)), where=twist[:, 0] != 0.0)
+    steer = np.arctan(robot.wheelbase_m * curvature)
+    steer = np.clip(steer, -robot.steering_max_rad, robot.steering_max_rad)
+    steers, still = np.column_stack([steer, np.zeros_like(steer)]), np.zeros_like(speed)
+    speeds = np.column_stack([speed / np.cos(steer), speed])
+    driven = np.column_stack([speed, still, speed * np.tan(steer) / robot.wheelbase_m])
+    return WheelMotion(driven, speeds, speeds / robot.wheel_radius_m, steers)

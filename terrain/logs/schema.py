@@ -161,7 +161,7 @@ SIGNAL_SETS: tuple[str, ...] = ("imu", "wheels", "currents", "slip", "estimator"
 """Groups of signals that can be switched off by name."""
 
 NO_FEATURES: tuple[str, ...] = (
-    *("truth", "commands", "control", "odometry", "state", "lidar", "pose", "testbed"),
+    *("truth", "commands", "control", "odometry", "state", "lidar", "pose", "compass", "testbed"),
 )
 """Streams that no feature is made of."""
 

@@ -30,15 +30,17 @@ from terrain.files.descriptions import check_keys, number
 from terrain.files.documents import read_yaml
 from terrain.files.names import check_name, shown
 from terrain.files.resources import data_folder
+from terrain.robots.bicycle import BicycleRobot
 from terrain.robots.omni import OmniRobot
 from terrain.robots.parts import IDENTIFIED, KIND_OF_SECTION
 from terrain.robots.region import read_region
 from terrain.robots.robot import Robot
 from terrain.robots.skid_steer import SkidSteerRobot
 from terrain.robots.swerve import SwerveRobot
+from terrain.robots.tracked import TrackedRobot
 
 KIND_OF_DRIVE: dict[str, type[Robot]] = {
-    kind.drive: kind for kind in (SkidSteerRobot, SwerveRobot, OmniRobot)
+    kind.drive: kind for kind in (SkidSteerRobot, TrackedRobot, SwerveRobot, OmniRobot, BicycleRobot)
 }
 """The type of each drive."""
 
@@ -128,7 +130,7 @@ def packaged_robot(name: str) -> Robot:
     'skid_steer'
     >>> packaged_robot("/tmp/husky.yaml")
     Traceback (most recent call last):
-    terrain.errors.ConfigError: robot '/tmp/husky.yaml' is unknown: a log names one of agrimaro, ...
+    terrain.errors.ConfigError: robot '/tmp/husky.yaml' is unknown: a log names one of adap2e, ...
     """
     known = robot_names()
     if name not in known:

@@ -41,6 +41,7 @@ DERIVED_ROWS = (
     "camera_age_s",
     *("rest_speed_x_mps", "rest_speed_y_mps", "rest_yaw_rate_radps"),
 )
+_SIDES = ("wheel_left_mps", "wheel_right_mps", "gyro_z_radps", *GNSS_ROWS)
 ROWS_OF_DRIVE: dict[str, tuple[str, ...]] = {
     "swerve": (
         *(f"wheel_{i}_radps" for i in (1, 2, 3)),
@@ -53,7 +54,8 @@ ROWS_OF_DRIVE: dict[str, tuple[str, ...]] = {
         *GNSS_ROWS,
         *DERIVED_ROWS,
     ),
-    "skid_steer": ("wheel_left_mps", "wheel_right_mps", "gyro_z_radps", *GNSS_ROWS),
+    "skid_steer": _SIDES,
+    "tracked": _SIDES,
 }
 """Rows of a table, of a swerve robot in the order of (6.3).
 

@@ -36,12 +36,18 @@ from terrain.effects import (
 )
 from terrain.errors import ConfigError
 from terrain.kinematics.omni import inverse
-from terrain.robots import load_robot
+from terrain.robots import TrackedRobot, load_robot
 from terrain.simulation.planar.model import Ground, make_planar
 from terrain.simulation.planar.noise import load_scatter
 from terrain.simulation.planar.replay import replay
 
-ROBOTS = {"skid_steer": load_robot("husky"), "swerve": load_robot("agrimaro"), "omni": load_robot("robotino")}
+HUSKY = load_robot("husky")
+ROBOTS = {
+    "skid_steer": HUSKY,
+    "tracked": TrackedRobot("crawler", 0.165, 0.5708, 0.512, 50.0, parts=HUSKY.parts),
+    "swerve": load_robot("agrimaro"),
+    "omni": load_robot("robotino"),
+}
 NOISE = {
     GYRO: 0.01,
     SPEED_X: 0.005,
@@ -79,7 +85,7 @@ def rich_drive(drive):
     t = DT * np.arange(1500)
     speed, turn = 0.5 * np.sin(0.9 * t) + 0.35 * np.sin(0.31 * t), 0.5 * np.sin(0.53 * t + 1.0)
     grade, roll = 0.08 * np.sin(0.23 * t), 0.06 * np.cos(0.29 * t)
-    if drive == "skid_steer":
+    if ROBOTS[drive].skids:
         half = 0.5 * ROBOTS[drive].track_m * turn
         return np.column_stack([speed - half, speed + half]), np.zeros((t.size, 2)), grade, roll
     if drive == "omni":
@@ -184,7 +190,7 @@ from terrain.discrepancy import residuals, search, information
 from terrain.discrepancy.simulation import Simulation
 from terrain.discrepancy.verdict import Limit
 from terrain.extension import corrected
-from terrain.robots import load_robot, robot_from
+from terrain.robots import TrackedRobot, load_robot, robot_from
 from terrain.simulation.dynamic.simulate import _built
 
 robot, name = load_robot("agrimaro"), "gear_wear_ratio"

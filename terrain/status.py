@@ -1,4 +1,4 @@
-"""Base of the statuses of controllers: enums whose numbers compiled steps and streams can hold."""
+"""Base of statuses: enums whose numbers compiled steps and streams can hold."""
 
 from __future__ import annotations
 

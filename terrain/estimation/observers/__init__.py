@@ -1,0 +1,1 @@
+"""Observers of slip: one a file, all behind one interface."""
