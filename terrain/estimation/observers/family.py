@@ -1,8 +1,8 @@
 """The interface of all observers of slip: memory in, measurements in, memory out.
 
-An observer is a compiled step and what it reads out of its memory.  A row holds what was measured at a tick of
-the wheels, NaN where a sensor gave nothing; it may be late, wrong or absent, and the memory that comes out is
-finite whatever comes in.  Nothing is hidden in an object: a whole log (:func:`observe`), a run sample by
+An observer is a compiled step and what it reads out of its memory.  A row holds what was measured at a tick
+of the wheels, NaN where a sensor gave nothing; it may be late, wrong or absent, and the memory that comes out
+is finite whatever comes in.  Nothing is hidden in an object: a whole log (:func:`observe`), a run sample by
 sample (:mod:`terrain.estimation.observers.live`) and a simulated robot call the same step.
 """
 
