@@ -13,6 +13,7 @@ import numpy as np
 
 from terrain.calibration.clustered_fit import LinearFit, fit_runs
 from terrain.calibration.track_motion import SlipSamples
+from terrain.errors import DataError
 from terrain.estimation.observers.slip_model import N_ANGLE, REGRESSORS, angle_regressors
 from terrain.records import Array
 
@@ -26,9 +27,9 @@ assumed, the residual of the regression of Yamauchi et al."""
 
 def angle_columns(samples: SlipSamples, half_track_m: float) -> tuple[Array, Array]:
     """Return the variables (n, 8) of (28), and the slip angle (n,), of a left turn driven forward."""
-    x, mirror = np.empty((len(samples.run), N_ANGLE)), np.empty(len(samples.run))
+    x = np.empty((len(samples.run), N_ANGLE))
     for i in range(len(x)):
-        mirror[i] = angle_regressors(
+        angle_regressors(
             (samples.left_mps[i], samples.right_mps[i]),
             samples.yaw_rate_radps[i],
             samples.roll_rad[i],
@@ -37,7 +38,9 @@ def angle_columns(samples: SlipSamples, half_track_m: float) -> tuple[Array, Arr
             half_track_m,
             x[i],
         )
-    return x, mirror * np.arctan2(samples.lateral_mps, np.abs(samples.forward_mps))
+    mirror = np.where(x[:, 0] < 0.0, -1.0, 1.0)
+    angle = np.arctan2(samples.lateral_mps, np.abs(samples.forward_mps))
+    return x * mirror[:, None], angle * mirror
 
 
 def fit_turning_angle(samples: SlipSamples, half_track_m: float, *, ridge: bool = True) -> LinearFit:
@@ -54,6 +57,8 @@ def fit_turning_angle(samples: SlipSamples, half_track_m: float, *, ridge: bool 
     DataError
         if there are too few runs, or they do not vary the variables apart.
     """
+    if len(np.unique(samples.run)) < 3:
+        raise DataError("fewer than three runs turn tightly, three or more are required")
     x, angle = angle_columns(samples, half_track_m)
     mean = np.abs(x.mean(axis=0))
     varied = x.std(axis=0) > CONSTANT_RATIO * mean

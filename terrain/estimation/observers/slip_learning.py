@@ -37,12 +37,15 @@ from terrain.errors import ConfigError
 from terrain.estimation.observers.family import Observer, ObserverOutput, ObserverStatus
 from terrain.estimation.observers.slip_model import N_MODEL, PARAMETERS, TRACK_RATIO, SlipModel, model_of
 from terrain.estimation.observers.slip_odometry import (
+    ANGLE_STD,
+    CORRELATION,
     COVARIANCE,
     FASTEST_RADPS,
     PARAMS_SIZE,
     POSE,
     READ_ONLY,
     SIZE,
+    SLIP_STD,
     SLIPS,
     STATES,
     STATUS,
@@ -123,7 +126,6 @@ _FIX_STD, _YAW_STD, _RATIO_STD, _FORGET = range(PARAMS_SIZE, PARAMS_SIZE + 4)
 _PRIOR = PARAMS_SIZE + 4
 _LOCATED, _REJECTED, _OFFSET = SIZE, SIZE + 1, SIZE + 2
 LEARNING_SIZE = SIZE + 4
-_CORRELATION = 2 + 4  # of the parameters of the odometry: correlation_s behind geometry and four settings
 
 
 @njit(cache=True)
@@ -154,7 +156,7 @@ def _learn_track_ratio(params: Array, after: Array, row: Array, dt_s: float) -> 
     rate, tracks = row[2], (row[1] - row[0]) / (2.0 * params[0])
     if abs(rate) > TURNING_RADPS and abs(rate) <= FASTEST_RADPS and rate * tracks > 0.0 and dt_s > 0.0:
         ratio = tracks / rate
-        variance = params[_RATIO_STD] ** 2 * max(2.0 * params[_CORRELATION] / dt_s, 1.0)
+        variance = params[_RATIO_STD] ** 2 * max(2.0 * params[CORRELATION] / dt_s, 1.0)
         innovation = ratio - after[THETA + TRACK_RATIO]
         if abs(innovation) < 5.0:
             _correct(after, params[_PRIOR:], 3 + TRACK_RATIO, innovation, variance)
@@ -255,18 +257,24 @@ def learning_output(params: Array, memory: Array) -> ObserverOutput:
     return motion._replace(mean=mean, std=std)
 
 
-def learned_model(memory: Array, found: str = "online") -> SlipModel:
-    """Return the slip model that a memory has come to, with its covariance.
+def learned_model(params: Array, memory: Array) -> SlipModel:
+    """Return the slip model that a memory has come to, with its covariance and the residuals assumed.
 
     Examples
     --------
     >>> from terrain.robots import load_robot
-    >>> learned_model(slip_learning_observer(load_robot("patako")).start).turning_exponent
+    >>> observer = slip_learning_observer(load_robot("patako"))
+    >>> learned_model(observer.params, observer.start).turning_exponent
     0.85
     """
     covariance = memory[COVARIANCE : COVARIANCE + N * N].reshape(N, N)[3 : 3 + N_MODEL, 3 : 3 + N_MODEL]
-    vector = memory[THETA : THETA + N_MODEL]
-    return model_of(vector, covariance=covariance, found=found)
+    return model_of(
+        memory[THETA : THETA + N_MODEL],
+        covariance=covariance,
+        slip_std_ratio=float(params[SLIP_STD]),
+        angle_std_rad=float(params[ANGLE_STD]),
+        found="fixes while driving",
+    )
 
 
 def slip_learning_observer(

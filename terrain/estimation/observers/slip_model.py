@@ -26,8 +26,11 @@ in common, with a mean of 0:
 
 So the velocity is continuous in all that is measured.  The regressors X are those of (28) as seen in a left
 turn driven forward: a right turn is its mirror image (m = -1), and so is a reversed one, end to end; the
-coefficients of one turn hold for all four.  The yaw displacement since the turn began is forgotten over a
-length of the track travelled straight, which leaves behind the soil that the turn heaped up.
+coefficients of one turn hold for all four.  Towards a spin in place, which has no forward end, what differs
+between the two ends fades out.  The yaw displacement since the turn began is forgotten over a length of the
+track travelled straight, which leaves behind the soil that the turn heaped up.
+
+A slip angle cannot express that a robot spinning in place drifts across a slope: V_y vanishes there with V_x.
 """
 
 from __future__ import annotations
@@ -65,6 +68,9 @@ PARAMETERS: tuple[str, ...] = (
 
 TIGHT_RATIO = 0.5
 """theta_1: an arc around a centre one track away from the middle of the robot."""
+
+SPIN_RATIO = 0.3
+"""Sum of the speeds of the tracks over that of their magnitudes below which a turn is a spin, in part."""
 
 STEEPEST_RAD = 1.2
 """Slip angles beyond, by coefficients that do not fit, are held at this: tan is 2.6 there."""
@@ -189,18 +195,19 @@ def angle_regressors(
     displacement_rad: float,
     half_track_m: float,
     out: Array,
-) -> float:
-    """Write the regressors X (8,) of (28) as seen in a left turn driven forward, and return m = 1 or -1."""
+) -> None:
+    """Write m times the regressors X (8,) of (28); the first is m, 1 in a left turn driven forward."""
     left, right = speeds_mps
-    forward = 1.0 if left + right >= 0.0 else -1.0
-    mirror = 1.0 if forward * (right - left) >= 0.0 else -1.0
-    out[0], out[1] = 1.0, 0.5 * abs(left + right)
-    out[2] = abs(right - left) / (2.0 * half_track_m)
-    out[3] = mirror * forward * yaw_rate_radps
-    out[4], out[5] = mirror * roll_rad, forward * pitch_rad
-    out[6] = mirror * forward * displacement_rad
-    out[7] = math.acos(min(max(math.cos(roll_rad) * math.cos(pitch_rad), -1.0), 1.0))
-    return mirror
+    total = max(abs(left) + abs(right), 1e-300)
+    forward = min(max((left + right) / total / SPIN_RATIO, -1.0), 1.0)
+    turn = 1.0 if right >= left else -1.0
+    out[0], out[1] = turn * forward, turn * forward * 0.5 * abs(left + right)
+    out[2] = forward * (right - left) / (2.0 * half_track_m)
+    out[3] = forward * yaw_rate_radps
+    out[4], out[5] = roll_rad, turn * pitch_rad
+    out[6] = forward * displacement_rad
+    slope = math.acos(min(max(math.cos(roll_rad) * math.cos(pitch_rad), -1.0), 1.0))
+    out[7] = turn * forward * slope
 
 
 @njit(cache=True)
@@ -240,13 +247,13 @@ def body_velocity(
     slopes[0, GRADE], slopes[0, TURN_GRADE] = grade * (half_size * kappa - mean_size), -turning * grade
     tight, beta = turn_weight(left, right), 0.0
     regressors = np.empty(N_ANGLE)
-    mirror = angle_regressors(
+    angle_regressors(
         speeds_mps, yaw_rate_radps, roll, tilt_rad[1], displacement_rad, half_track_m, regressors
     )
     for i in range(N_ANGLE):
-        slopes[2, ANGLE + i] = tight * mirror * regressors[i]
+        slopes[2, ANGLE + i] = tight * regressors[i]
         beta += slopes[2, ANGLE + i] * theta[ANGLE + i]
-    slopes[2, RUN_ANGLE] = tight * mirror
+    slopes[2, RUN_ANGLE] = tight * regressors[0]
     beta += slopes[2, RUN_ANGLE] * theta[RUN_ANGLE] - (1.0 - tight) * math.atan(theta[SIDE] * roll)
     slopes[2, SIDE] = -(1.0 - tight) * roll / (1.0 + (theta[SIDE] * roll) ** 2)
     if abs(beta) > STEEPEST_RAD:

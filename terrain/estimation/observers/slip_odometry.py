@@ -98,10 +98,10 @@ class OdometrySettings:
 
 _HALF, _LENGTH = 0, 1
 _SETTINGS = 2
-(_THRESHOLD, _GYRO_STD, _BIAS_STD, _ENCODER_STD, _CORRELATION, _STAND, _PUSHED, _MIN_SPEED) = range(
+(_THRESHOLD, _GYRO_STD, _BIAS_STD, _ENCODER_STD, CORRELATION, _STAND, _PUSHED, _MIN_SPEED) = range(
     _SETTINGS, _SETTINGS + 8
 )
-_SLIP_STD, _ANGLE_STD = _SETTINGS + 8, _SETTINGS + 9
+SLIP_STD, ANGLE_STD = _SETTINGS + 8, _SETTINGS + 9
 PARAMS_SIZE = _SETTINGS + 10
 
 _F8 = types.float64
@@ -232,8 +232,8 @@ def advance(params: Array, after: Array, row: Array, dt_s: float) -> None:
     after[VELOCITY], after[VELOCITY + 1], after[VELOCITY + 2] = v_x, v_y, rate
     after[ANGLE_NOW], after[STATUS] = beta, status
     after[DISPLACEMENT] = next_displacement(after[DISPLACEMENT], belts, rate, params[_LENGTH], dt_s)
-    slip_variance = (params[_SLIP_STD] * 0.5 * (belts[0] + belts[1])) ** 2
-    angle_variance = params[_ANGLE_STD] ** 2
+    slip_variance = (params[SLIP_STD] * 0.5 * (belts[0] + belts[1])) ** 2
+    angle_variance = params[ANGLE_STD] ** 2
     encoder_variance = 0.5 * params[_ENCODER_STD] ** 2
     side_variance = angle_variance * (v_x * (1.0 + tangent * tangent)) ** 2 + slip_variance * tangent**2
     after[VARIANCE] = _quadratic(covariance, slopes[0]) + slip_variance + encoder_variance
@@ -241,7 +241,7 @@ def advance(params: Array, after: Array, row: Array, dt_s: float) -> None:
     after[VARIANCE + 2] = _quadratic(covariance, rate_slopes) + rate_variance
     after[VARIANCE + 3] = _quadratic(covariance, slopes[2]) + angle_variance
     if dt_s > 0.0:
-        twice = 2.0 * params[_CORRELATION] * dt_s
+        twice = 2.0 * params[CORRELATION] * dt_s
         noise = (
             (slip_variance * twice + encoder_variance * dt_s * dt_s),
             side_variance * twice,
