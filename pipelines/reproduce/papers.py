@@ -24,6 +24,15 @@ PAPERS: Mapping[str, Paper] = {
             ("soils", "firm_soil_gravel"),
         ),
     ),
+    "yamauchi": Paper(
+        title="Yamauchi et al., slip-compensated odometry",
+        about=(
+            "G. Yamauchi, K. Nagatani, T. Hashimoto and K. Fujino, Slip-compensated odometry for tracked "
+            "vehicle on loose and weak slope, ROBOMECH Journal, 2017"
+        ),
+        module="pipelines.reproduce.yamauchi.experiments",
+        descriptions=(("robots", "patako"), ("soils", "extra/toyoura_sand"), ("soils", "firm_soil_gravel")),
+    ),
 }
 """Papers by the name that the command takes."""
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from terrain.calibration.clustered_fit import LinearFit
 from terrain.calibration.straight_slip import fit_side_slip, fit_straight_slip
-from terrain.calibration.track_motion import HALF_WINDOW_S, SlipSamples, slip_samples
+from terrain.calibration.track_motion import HALF_WINDOW_S, SPACING_S, SlipSamples, slip_samples
 from terrain.calibration.turning_angle import fit_turning_angle
 from terrain.calibration.turning_exponent import TurningFit, fit_track_ratio, fit_turning
 from terrain.errors import DataError
@@ -127,6 +127,7 @@ def _joined(
         within.append(endo.residual_std_mps / speed)
         of_runs.append(endo.run_std_mps / speed)
     angles = [fit for fit in (side, angle) if fit is not None]
+    alike = [fit.alike_n for fit in (*angles, line, endo) if fit is not None]
     return model_of(
         vector,
         covariance=covariance,
@@ -134,5 +135,6 @@ def _joined(
         angle_std_rad=max((fit.residual_std for fit in angles), default=prior.angle_std_rad),
         run_slip_std_ratio=max(of_runs),
         run_angle_std_rad=max((fit.run_std for fit in angles), default=0.0),
+        correlation_s=SPACING_S * max(alike, default=0.0) or prior.correlation_s,
         found=f"{len(np.unique(samples.run))} runs with poses, {len(samples.run)} samples",
     )

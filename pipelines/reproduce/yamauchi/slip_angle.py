@@ -1,6 +1,4 @@
-"""Experiment II of Yamauchi et al., second half (tables 3 and 4): the regression (28) of the slip angle "
-"in turns.
-"""
+"""Experiment II of Yamauchi et al., second half (tables 3 and 4): the regression (28) in turns."""
 
 from __future__ import annotations
 

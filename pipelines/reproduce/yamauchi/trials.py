@@ -64,9 +64,11 @@ def patako() -> TrackedRobot:
     return as_tracked(load_robot(ROBOT), "{name} is no tracked robot")
 
 
-def run_trial(trial: Trial, soil: Soil | None = None, duration_s: float = 10.0) -> RunLog:
+def run_trial(
+    trial: Trial, soil: Soil | None = None, duration_s: float = 10.0, robot: TrackedRobot | None = None
+) -> RunLog:
     """Return the log of a trial; a turn ends near 90 degrees, a straight run after ``duration_s``."""
-    robot = patako()
+    robot = robot or patako()
     turn = math.radians(trial.rate_dps)
     if turn > 0.0:
         duration_s = SETTLE_S + TURNED_RAD / turn / (1.0 - LOST_RATIO)
@@ -117,9 +119,23 @@ def train(seed: int, quick: bool, uphill_rad: Sequence[float], *, turn_grade: bo
     return Trained(found, fit_turning(turning, robot.half_track_m, grade=False))
 
 
-def follow(observer: Observer, run: RunLog) -> ObserverTrack:
+class Drive(NamedTuple):
+    """A trial as an odometry has it: its log, and the ticks and rows of an observer."""
+
+    run: RunLog
+    time_s: Array
+    rows: Array
+
+
+def driven(trial: Trial) -> Drive:
+    """Return a trial with the rows of an odometry."""
+    run = run_trial(trial)
+    return Drive(run, *odometry_rows(run, patako()))
+
+
+def follow(observer: Observer, drive: Drive) -> ObserverTrack:
     """Return the estimates of an odometry over a trial."""
-    return observe(observer, *odometry_rows(run, patako()))
+    return observe(observer, drive.time_s, drive.rows)
 
 
 def position_error(track: ObserverTrack, run: RunLog) -> Array:

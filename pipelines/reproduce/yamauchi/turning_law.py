@@ -71,7 +71,7 @@ def turning_law(seed: int, quick: bool) -> Finding:
         ).exponent
         for slope in SLOPES_DEG
     }
-    rows = _rows(found, lines, of_slope) + [_hidden(seed, quick)]
+    rows = [*_rows(found, lines, of_slope), _hidden(seed, quick)]
     return Finding(rows, [Picture(_CAPTION, _figure(sand, floor, found, lines))])
 
 

@@ -273,6 +273,7 @@ def learned_model(params: Array, memory: Array) -> SlipModel:
         covariance=covariance,
         slip_std_ratio=float(params[SLIP_STD]),
         angle_std_rad=float(params[ANGLE_STD]),
+        correlation_s=float(params[CORRELATION]),
         found="fixes while driving",
     )
 

@@ -90,6 +90,7 @@ class SlipModel:
     track_ratio : effective distance of the tracks over the described one, for a robot without a gyro
     covariance : (14, 14) of :data:`PARAMETERS`
     slip_std_ratio, angle_std_rad : residuals within a run
+    correlation_s : over which the residuals within a run are alike
     run_slip_std_ratio, run_angle_std_rad : what a whole run has in common
     found : how the numbers were found
 
@@ -114,6 +115,7 @@ class SlipModel:
     covariance: Array = field(default_factory=lambda: np.zeros((N_MODEL, N_MODEL)))
     slip_std_ratio: float = 0.0
     angle_std_rad: float = 0.0
+    correlation_s: float = 0.5
     run_slip_std_ratio: float = 0.0
     run_angle_std_rad: float = 0.0
     found: str = "given"

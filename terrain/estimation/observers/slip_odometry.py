@@ -80,7 +80,6 @@ class OdometrySettings:
     gyro_threshold_radps : the gyro is used where it differs from the tracks by more; 0: always
     gyro_noise_radps, gyro_bias_std_radps : of a sample, and of what is left of the bias
     encoder_noise_mps : of a sample of the speed of a track
-    correlation_s : over which the residuals of the slip model are alike
     stand_mps : both tracks slower: the robot stands, or is pushed
     pushed_radps : yaw rate above which a robot on standing tracks is pushed
     min_speed_mps : tracks and ground slower: the slip of the track is NaN
@@ -90,7 +89,6 @@ class OdometrySettings:
     gyro_noise_radps: float = 0.002
     gyro_bias_std_radps: float = 0.0005
     encoder_noise_mps: float = 0.001
-    correlation_s: float = 0.5
     stand_mps: float = 0.003
     pushed_radps: float = 0.02
     min_speed_mps: float = 0.005
@@ -98,10 +96,10 @@ class OdometrySettings:
 
 _HALF, _LENGTH = 0, 1
 _SETTINGS = 2
-(_THRESHOLD, _GYRO_STD, _BIAS_STD, _ENCODER_STD, CORRELATION, _STAND, _PUSHED, _MIN_SPEED) = range(
-    _SETTINGS, _SETTINGS + 8
+(_THRESHOLD, _GYRO_STD, _BIAS_STD, _ENCODER_STD, _STAND, _PUSHED, _MIN_SPEED) = range(
+    _SETTINGS, _SETTINGS + 7
 )
-SLIP_STD, ANGLE_STD = _SETTINGS + 8, _SETTINGS + 9
+SLIP_STD, ANGLE_STD, CORRELATION = range(_SETTINGS + 7, _SETTINGS + 10)
 PARAMS_SIZE = _SETTINGS + 10
 
 _F8 = types.float64
@@ -116,17 +114,18 @@ def odometry_params(robot: TrackedRobot, model: SlipModel, settings: OdometrySet
     Raises
     ------
     ConfigError
-        if a setting is negative or not a number, or the correlation time or a least speed is 0.
+        if a setting is negative or not a number, or a least speed is 0.
     """
     for each in fields(settings):
         value = getattr(settings, each.name)
-        zero = each.name not in ("correlation_s", "stand_mps", "min_speed_mps")
+        zero = each.name not in ("stand_mps", "min_speed_mps")
         valid = value == value and (value >= 0.0 if zero else 0.0 < value < math.inf)
         if not valid or (value == math.inf and each.name != "gyro_threshold_radps"):
             accepted = "a number from zero up" if zero else "a number above zero"
             raise ConfigError(f"odometry: {each.name} is {value!r}, {accepted} is required")
     geometry = (robot.half_track_m, robot.contact_length_m)
-    return np.array([*geometry, *astuple(settings), model.slip_std_ratio, model.angle_std_rad])
+    residuals = (model.slip_std_ratio, model.angle_std_rad, model.correlation_s)
+    return np.array([*geometry, *astuple(settings), *residuals])
 
 
 def odometry_memory(model: SlipModel, settings: OdometrySettings) -> Array:

@@ -207,8 +207,8 @@ def test_any_input_leaves_a_finite_memory(name):
 
 
 def test_settings_are_checked():
-    with pytest.raises(ConfigError, match="correlation_s is 0"):
-        slip_odometry_observer(ROBOT, MODEL, OdometrySettings(correlation_s=0.0))
+    with pytest.raises(ConfigError, match="stand_mps is 0"):
+        slip_odometry_observer(ROBOT, MODEL, OdometrySettings(stand_mps=0.0))
     with pytest.raises(ConfigError, match="gyro_noise_radps is nan"):
         slip_odometry_observer(ROBOT, MODEL, OdometrySettings(gyro_noise_radps=np.nan))
     assert OBSERVERS["slip"].rows == ROWS
