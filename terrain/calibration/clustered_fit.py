@@ -38,7 +38,6 @@ class LinearFit(NamedTuple):
     covariance : (k, k)
     r2_ratio : part of the variance that is explained; about 0 where there is no intercept
     residual_std, run_std : within the runs, and of their means
-    alike_n : samples in a row over which residuals within a run are alike: the sum of their autocorrelation
     condition : number of the columns, scaled to length 1
     inflation : (k,) variance inflation factors; NaN of the intercept
     ridge_ratio : that was chosen, over the number of samples
@@ -53,7 +52,6 @@ class LinearFit(NamedTuple):
     r2_ratio: float
     residual_std: float
     run_std: float
-    alike_n: float
     condition: float
     inflation: Array
     ridge_ratio: float
@@ -122,39 +120,12 @@ def fit_runs(x: Array, y: Array, run: Array, names: tuple[str, ...], *, ridge: b
         1.0 - float(residual @ residual) / max(total, 1e-300),
         float(np.sqrt(np.sum((residual - means[number]) ** 2) / max(n - len(runs), 1))),
         float(np.sqrt(np.mean(means**2))),
-        alike_samples(residual, number),
         condition,
         _inflation(x),
         size,
         n,
         len(runs),
     )
-
-
-def alike_samples(residual: Array, run: Array) -> float:
-    """Return over how many samples residuals (n,) within their runs are alike, 0.5 for white noise.
-
-    Half of one, and the autocorrelation about the means of the runs up to where it crosses 0.
-
-    Examples
-    --------
-    >>> alike_samples(np.array([1.0, -1, 1, -1, 1, -1]), np.zeros(6, int))
-    0.5
-    >>> alike_samples(np.sin(np.arange(100) / 8), np.zeros(100, int)) > 5
-    True
-    """
-    means = np.bincount(run, residual) / np.maximum(np.bincount(run), 1)
-    within, total = residual - means[run], 0.5
-    power = float(np.mean(within**2))
-    for lag in range(1, len(residual)):
-        same = run[lag:] == run[:-lag]
-        if not same.any() or power == 0.0:
-            break
-        correlation = float(np.mean((within[lag:] * within[:-lag])[same])) / power
-        if correlation <= 0.0:
-            break
-        total += correlation
-    return total
 
 
 def _penalty(x: Array, size: float) -> Array:

@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import least_squares
 
-from terrain.calibration.clustered_fit import LinearFit, alike_samples, fit_runs
+from terrain.calibration.clustered_fit import LinearFit, fit_runs
 from terrain.calibration.track_motion import SlipSamples
 from terrain.errors import DataError
 from terrain.records import Array
@@ -38,7 +38,6 @@ class TurningFit(NamedTuple):
     exponent, turn_grade_m : n and lambda
     covariance : (2, 2) of both, by runs
     residual_std_mps, run_std_mps : of the speed, within the runs and of their means
-    alike_n : samples in a row over which residuals are alike
     n, n_runs : samples and runs
     """
 
@@ -47,7 +46,6 @@ class TurningFit(NamedTuple):
     covariance: Array
     residual_std_mps: float
     run_std_mps: float
-    alike_n: float
     n: int
     n_runs: int
 
@@ -107,7 +105,6 @@ def fit_turning(
         covariance,
         float(np.sqrt(within)),
         float(np.sqrt(np.mean(means**2))),
-        alike_samples(error, number),
         len(error),
         len(runs),
     )

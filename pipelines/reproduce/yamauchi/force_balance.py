@@ -87,7 +87,7 @@ def _equations() -> list[Row]:
     carried = [float(bekker_pressure(each, *numbers)) / pressure for each in (depth, printed)]
     x = 0.5
     sheared = 1.0 - (1.0 - math.exp(-x)) / x
-    theta, slopes = np.zeros(N_PARAMETERS), np.empty((3, N_PARAMETERS))
+    theta, slopes = np.zeros(N_PARAMETERS), np.empty((2, N_PARAMETERS))
     theta[SIDE] = 0.5
     drift = body_velocity(theta, robot.half_track_m, (-0.05, -0.05), 0.0, (0.1, 0.0), 0.0, slopes)[1]
     right = -0.05 * math.tan(math.atan(0.05))

@@ -1,8 +1,8 @@
 """Future work of Yamauchi et al.: the slip model identified while driving, without a motion-capture system.
 
-Patako drives the trials of experiments I and II one after the other, with satellite fixes of 2 cm at 10 Hz and
-a compass in place of cameras.  It starts from what is assumed of unknown ground, and takes what a trial shows
-into the next one.  Odometry without fixes is then judged in the held-out turns of experiment III.
+Patako drives the trials of experiments I and II one after the other, with satellite fixes of 2 cm at 10 Hz
+and a compass in place of cameras.  It starts from what is assumed of unknown ground, and takes what a trial
+shows into the next one.  Odometry without fixes is then judged in the held-out turns of experiment III.
 """
 
 from __future__ import annotations
@@ -47,12 +47,12 @@ RESIDUALS = (0.1, 0.15)
 """Of slip ratio and slip angle in turns on sand, assumed before: that of the printed regression is 8 "
 "degrees."""
 
-SHOWN = ("turning_exponent", "turn_grade_m", "side_slip_ratio", "angle_roll_rad")
+SHOWN = ("turning_exponent", "turn_grade_m", "turn_side_m", "turn_shift_m")
 """Parameters of the figure."""
 
 
 class Progress(NamedTuple):
-    """Means and standard deviations (trials + 1, 14) of the parameters, and the last model."""
+    """Means and standard deviations (trials + 1, 16) of the parameters, and the last model."""
 
     mean: Array
     std: Array
@@ -65,7 +65,7 @@ def online(seed: int, quick: bool) -> Finding:
     trials = turning_trials(seed, repeats, (UPHILL, DOWNHILL)) + straight_trials(seed, max(repeats, 2))
     order = np.random.default_rng(seed).permutation(len(trials))
     progress = learn([run_trial(trials[k]) for k in order])
-    offline = train(seed, quick, (UPHILL, DOWNHILL), turn_grade=True)
+    offline = train(seed, quick, (UPHILL, DOWNHILL), drift=True)
     methods = odometries(offline) | {"online": slip_odometry_observer(robot, progress.model)}
     errors = {case: errors_of(methods, judged_trials(seed, quick, case)) for case in (UPHILL, DOWNHILL)}
     rows = [

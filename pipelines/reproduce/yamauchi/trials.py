@@ -109,12 +109,12 @@ class Trained(NamedTuple):
     endo: TurningFit
 
 
-def train(seed: int, quick: bool, uphill_rad: Sequence[float], *, turn_grade: bool) -> Trained:
+def train(seed: int, quick: bool, uphill_rad: Sequence[float], *, drift: bool) -> Trained:
     """Identify the slip model on trials of experiments I and II."""
     repeats, robot = FEW_REPEATS if quick else REPEATS, patako()
     trials = turning_trials(seed, repeats, uphill_rad) + straight_trials(seed, max(repeats, 2))
     runs = [run_trial(trial) for trial in trials]
-    found = identify_slip_model(runs, robot, turn_grade=turn_grade)
+    found = identify_slip_model(runs, robot, drift=drift)
     turning = slip_samples(runs, robot).turning
     return Trained(found, fit_turning(turning, robot.half_track_m, grade=False))
 

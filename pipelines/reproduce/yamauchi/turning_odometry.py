@@ -1,8 +1,8 @@
 """Experiment III of Yamauchi et al. (figs. 14 to 18): position in turns by four odometries.
 
 Judged trials have seeds and sand of their own.  Turns go uphill, as in the paper, and downhill as well.  The
-model as printed, trained on turns uphill alone, stands beside the one of this project, which has one term
-more (:mod:`terrain.estimation.observers.slip_model`) and is trained on turns uphill and downhill.
+model as printed, trained on turns uphill alone, stands beside the one of this project, which has drift in
+turns (:mod:`terrain.estimation.observers.slip_model`) and is trained on turns uphill and downhill.
 """
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ Errors = Mapping[tuple[float, float], Mapping[str, Array]]
 
 def turning_odometry(seed: int, quick: bool) -> Finding:
     """Train on experiments I and II and judge the position in held-out turns."""
-    plain = train(seed, quick, (UPHILL,), turn_grade=False)
-    trained = train(seed, quick, (UPHILL, DOWNHILL), turn_grade=True)
+    plain = train(seed, quick, (UPHILL,), drift=False)
+    trained = train(seed, quick, (UPHILL, DOWNHILL), drift=True)
     methods = odometries(trained) | {PLAIN: slip_odometry_observer(patako(), plain.found.model)}
     uphill, downhill = judged_trials(seed, quick, UPHILL), judged_trials(seed, quick, DOWNHILL)
     errors = {UPHILL: errors_of(methods, uphill), DOWNHILL: errors_of(methods, downhill)}
@@ -82,7 +82,7 @@ _WHY_PLAIN = (
 _CAPTION = (
     "Position in the first judged trial of each condition of experiment III, turning uphill to the left: "
     "truth, "
-    "gyrodometry, Endo's law, and slip-compensated odometry as printed and with a term for the grade in "
+    "gyrodometry, Endo's law, and slip-compensated odometry as printed and with drift in turns in "
     "turns."
 )
 _ANGLE_CAPTION = (
@@ -158,7 +158,7 @@ def _bars(what: str, errors: Errors, seed: int) -> list[Row]:
             f"{1e3 * rmse[0]:.0f} mm against {1e3 * rmse[1]:.0f} mm; it is worse in {lost} of {n} trials. At "
             f"least {LEAST_GAIN:g} {reached} reached with 95 % probability."
         )
-        rows.append(_gain_row(f"{what}, with a term for the grade", errors, SLIP, against, seed, why))
+        rows.append(_gain_row(f"{what}, with drift in turns", errors, SLIP, against, seed, why))
     return rows
 
 
