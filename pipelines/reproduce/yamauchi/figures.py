@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from pipelines.reporting.drawing import finished, new_figure, styled
-from pipelines.reporting.line_figure import add_legend
 from terrain.records import Array
 
 
@@ -36,45 +36,34 @@ class Panel(NamedTuple):
 
 
 def panels_figure(title: str, panels: Sequence[Panel], columns: int = 2) -> Figure:
-    """Draw panels beside each other; the legend is that of the first."""
+    """Draw panels beside each other, with one legend below them."""
     rows = -(-len(panels) // columns)
     with styled():
-        figure = new_figure(8.4, 3.5 * rows + 0.2)
+        figure = new_figure(8.4, 3.2 * rows + 0.5)
         grid = figure.subplots(rows, columns, squeeze=False).ravel()
-        for number, (axes, panel) in enumerate(zip(grid, panels, strict=False)):
+        labelled: dict[str, Artist] = {}
+        for axes, panel in zip(grid, panels, strict=False):
             for mark in panel.marks:
-                style = ("--" if mark.dashed else "-") if mark.joined else "none"
-                if mark.spread is None:
-                    marker = "none" if mark.joined else "o"
-                    axes.plot(
-                        mark.x,
-                        mark.y,
-                        style,
-                        color=mark.colour,
-                        label=mark.label,
-                        marker=marker,
-                        ms=2.5,
-                        lw=1.3,
-                    )
-                else:
-                    axes.errorbar(
-                        mark.x,
-                        mark.y,
-                        np.asarray(mark.spread),
-                        fmt="o",
-                        color=mark.colour,
-                        label=mark.label,
-                        ms=4,
-                        capsize=2.5,
-                    )
+                drawn = _draw(axes, mark)
+                if mark.label:
+                    labelled.setdefault(mark.label, drawn)
             axes.set(xlabel=panel.x_label, ylabel=panel.y_label)
-            if panel.title:
-                axes.set_title(panel.title, loc="right", fontsize=8.5, pad=18 if number == 0 else 4)
+            axes.set_title(panel.title, loc="left", fontsize=9)
             if panel.equal:
                 axes.set_aspect("equal", adjustable="datalim")
-            if number == 0:
-                add_legend(axes)
             axes.grid(visible=True)
         for axes in grid[len(panels) :]:
             axes.set_visible(False)
+        figure.legend(
+            labelled.values(), labelled.keys(), loc="outside lower left", ncols=6, fontsize=8, frameon=False
+        )
         return finished(figure, title)
+
+
+def _draw(axes: Axes, mark: Mark) -> Artist:
+    if mark.spread is not None:
+        bars = axes.errorbar(mark.x, mark.y, mark.spread, fmt="o", color=mark.colour, ms=4, capsize=2.5)
+        return bars.lines[0]
+    if not mark.joined:
+        return axes.scatter(mark.x, mark.y, s=4, color=mark.colour)
+    return axes.plot(mark.x, mark.y, color=mark.colour, lw=1.3, ls="--" if mark.dashed else "-")[0]

@@ -64,7 +64,7 @@ def _figure(x: Array, compaction: dict[str, Array], grade: Array) -> Figure:
     marks = [Mark(x, grade, BLUE, "grade", dashed=True)]
     colours = CLASS_COLOURS[1:]
     marks += [
-        Mark(x, row, colour, name.replace("_", " "))
+        Mark(x, row, colour, name.replace("_", " "), dashed=name == SAND)
         for (name, row), colour in zip(compaction.items(), colours, strict=False)
     ]
     return panels_figure(

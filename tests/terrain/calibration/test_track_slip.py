@@ -65,7 +65,7 @@ def test_all_numbers_of_given_slip_come_back_within_their_intervals():
         assert abs(found.model.vector[place] - true) < 3 * std[place] + 0.01
     wider = identify_slip_model(runs, ROBOT).model  # terms that nothing in these runs asks for stay small
     for name in ("turn_grade_m", "turn_side_m", "turn_shift_m"):
-        assert abs(wider.vector[PARAMETERS.index(name)]) < 0.02
+        assert abs(wider.vector[PARAMETERS.index(name)]) < 0.05
     assert found.model.track_ratio == pytest.approx(1 / (0.65 * 0.92), rel=0.02)
     assert found.straight is not None
     assert found.straight.r2_ratio > 0.8
