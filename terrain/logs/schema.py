@@ -15,6 +15,7 @@ SCHEMA_VERSION = 1
 UNIT_SYMBOLS: dict[str, str] = {
     "s": "s",
     "m": "m",
+    "m2": "m^2",
     "mps": "m/s",
     "mps2": "m/s^2",
     "rad": "rad",

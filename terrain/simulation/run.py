@@ -1,14 +1,17 @@
 """One simulated run by names: robot, terrain, scenario and number in, a run log out.
 
 This entry picks the plant by the robot's drive: swerve robots are simulated by the dynamic plant
-(:mod:`terrain.simulation.dynamic.simulate`), all others by the planar one
+(:mod:`terrain.simulation.dynamic.simulate`), tracked ones on ground that shears by the forces under their
+tracks (:mod:`terrain.simulation.tracked.run`), all others, and whatever has effects, by the planar one
 (:mod:`terrain.simulation.planar.run`).
 """
 
 from __future__ import annotations
 
+import math
 import zlib
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -16,8 +19,9 @@ import numpy as np
 from terrain.effects import NUISANCES, PARAMETER, SENSED_ONLY
 from terrain.errors import ConfigError
 from terrain.extension import warn_outside
+from terrain.kinematics.wheel_motion import wheel_motion
 from terrain.records import Array, RunLog, Stream
-from terrain.robots import Robot
+from terrain.robots import Robot, TrackedRobot
 from terrain.simulation.bench import POSITIONS, TURN_S, six_positions_log
 from terrain.simulation.conditions import Conditions, Faults, draw_conditions, load_spread
 from terrain.simulation.dynamic.simulate import simulate
@@ -29,6 +33,8 @@ from terrain.simulation.scenario.make import make_scenario
 from terrain.simulation.sensors.gnss import Gnss
 from terrain.simulation.sensors.sensor import is_lost
 from terrain.simulation.slip_sweep import learning_run
+from terrain.simulation.tracked.run import COMMANDS_HZ, simulate_tracked
+from terrain.simulation.tracked.slope import Slope
 from terrain.terramechanics.soil import Soil, load_soil, scattered, soil_names
 
 COURSE = "course"
@@ -121,12 +127,37 @@ def simulate_run(  # noqa: PLR0913 - an entry whose options have defaults
     drive_seed = int(driven.generate_state(1)[0])
     drive = make_scenario(scenario, robot, names, duration_s, seed=drive_seed)
     setup = Setup(conditions or Conditions(), faults or Faults(), gnss, effects or {})
-    if planar:
+    if (
+        isinstance(robot, TrackedRobot)
+        and soils[terrain].law == "janosi"
+        and not {**robot.effects, **setup.effects}
+    ):
+        run = _tracked_run(robot, soils[terrain], drive.twist, simulated, run_id, setup)
+    elif planar:
         run = _planar_run(robot, soils[terrain], drive.twist, simulated, run_id, setup, vary)
     else:
         run = simulate(robot, drive, soils, simulated, run_id=run_id, **setup._asdict())
     warn_outside(run, robot)
     return run
+
+
+def _tracked_run(
+    robot: TrackedRobot,
+    soil: Soil,
+    twist: Array,
+    seed: np.random.SeedSequence,
+    run_id: str,
+    setup: Setup,
+) -> RunLog:
+    """Return a run on an even slope, without undulations; a receiver is always on board."""
+    conditions = setup.conditions
+    ahead, left = conditions.grade_ratio
+    slope = Slope(math.atan(math.hypot(ahead, left)), math.atan2(left, ahead))
+    loaded = replace(robot, mass_kg=robot.mass_kg + conditions.payload_kg)
+    speeds = wheel_motion(robot, twist, 1.0 / COMMANDS_HZ).wheel_speed_mps
+    return _without_camera(
+        simulate_tracked(loaded, soil, speeds, seed, slope=slope, run_id=run_id), setup.faults
+    )
 
 
 def _planar_run(

@@ -54,6 +54,29 @@ def rigid_wheel_sinkage(normal_n: float, wheel_radius_m: float, modulus: float, 
 
 
 @njit(cache=True)
+def plate_sinkage(
+    pressure_pa: float, width_m: float, kc_npmn1: float, kphi_npmn2: float, exponent: float
+) -> float:
+    """Return the depth in m at which soil carries a plate, a track, say: (p / (kc / b + kphi))^(1 / n).
+
+    Corrected: Yamauchi (8) prints n times the root; it is the n-th root.
+
+    Parameters
+    ----------
+    pressure_pa : not negative
+    width_m : smaller side of the plate
+    kc_npmn1, kphi_npmn2, exponent : of Bekker
+
+    Examples
+    --------
+    >>> depth_m = plate_sinkage(5000.0, 0.15, 990.0, 1528430.0, 1.1)
+    >>> round(bekker_pressure(depth_m, 0.15, 990.0, 1528430.0, 1.1))
+    5000
+    """
+    return math.pow(pressure_pa / (kc_npmn1 / width_m + kphi_npmn2), 1.0 / exponent)
+
+
+@njit(cache=True)
 def slip_sinkage_factor(slip_ratio: float, exponent: float) -> float:
     """Return by what slip multiplies sinkage: ((1 + |s|) / (1 - |s| / 2))^exponent, 1 for an exponent of 0.
 

@@ -142,7 +142,7 @@ def extra_soil_names() -> tuple[str, ...]:
     Examples
     --------
     >>> extra_soil_names()
-    ('digging_sand', 'wet_floor')
+    ('digging_sand', 'toyoura_sand', 'wet_floor')
     """
     return tuple(sorted(file.stem for file in (data_folder("soils") / "extra").glob("*.yaml")))
 

@@ -1,0 +1,129 @@
+"""Rows of observers: what a tick has of each stream, live as of a whole log, and samples that cannot be."""
+
+import math
+
+import numpy as np
+import pytest
+
+from terrain.errors import ConfigError, DataError
+from terrain.estimation.observers.family import Observer, ObserverOutput, ObserverStatus, observe
+from terrain.estimation.observers.live import LiveObserver
+from terrain.estimation.observers.rows import CHANNELS, ROWS, RowFeed, ticks
+from terrain.records import Reading, RunLog, Stream
+from terrain.robots import load_robot
+from terrain.simulation.tracked.given_slip import GivenSlip
+from terrain.simulation.tracked.run import QUIET, simulate_tracked
+
+UGV = load_robot("orchard_ugv")
+NAMES = tuple(name for name in ROWS if "rear" not in name and "front" not in name)
+
+
+def rows_of(run, names=NAMES):
+    feed = RowFeed(UGV, names, {name: stream.channels for name, stream in run.streams.items()})
+    found = list(ticks(run, feed))
+    return np.array([time for time, _ in found]), np.array([row for _, row in found]), feed
+
+
+def without(run, *names):
+    return RunLog(run.run_id, run.robot, {k: v for k, v in run.streams.items() if k not in names})
+
+
+@pytest.fixture(scope="module")
+def run():
+    return simulate_tracked(UGV, GivenSlip(0.9, 0.8), np.tile([0.4, 0.6], (301, 1)), 0, sensors=QUIET)
+
+
+def test_rows_hold_what_sensors_without_noise_measured(run):
+    time_s, rows, feed = rows_of(without(run, "pose"))
+    truth = run.streams["truth"]
+    at = np.searchsorted(truth.time_s, time_s - 1e-9)
+    assert rows[:, :2] == pytest.approx(np.tile([0.4, 0.6], (len(rows), 1)))
+    assert rows[5:, NAMES.index("yaw_rate_radps")] == pytest.approx(truth.values[at[5:], 7], abs=1e-9)
+    fixed = np.isfinite(rows[:, 2])
+    assert fixed.sum() == len(run.streams["gnss"])
+    assert np.isfinite(rows[:, 4]).tolist() == fixed.tolist()
+    assert rows[fixed, 2:5] == pytest.approx(truth.values[at[fixed], :3], abs=1e-9)
+    assert not feed.dropped
+
+
+def test_a_fix_between_two_ticks_is_brought_to_the_later_one(run):
+    gnss, compass = run.streams["gnss"], run.streams["compass"]
+    late = {"gnss": 0.013, "compass": 0.013}
+    shifted = {k: Stream(s.time_s + late.get(k, 0.0), s.values, s.channels) for k, s in run.streams.items()}
+    _, rows, _ = rows_of(without(RunLog("a", "orchard_ugv", shifted), "pose"))
+    fixed = np.flatnonzero(np.isfinite(rows[:, 2]))[10]
+    step = rows[fixed, 2:4] - gnss.values[10, :2]
+    heading = compass.values[10, 0]
+    assert step == pytest.approx(0.007 * 0.5 * np.array([math.cos(heading), math.sin(heading)]))
+
+
+def test_a_sample_that_is_missing_is_held_for_a_while_and_then_unknown(run):
+    imu = run.streams["imu"]
+    kept = (imu.time_s < 1.0) | (imu.time_s > 2.0)
+    lost = dict(run.streams) | {"imu": Stream(imu.time_s[kept], imu.values[kept], imu.channels)}
+    time_s, rows, _ = rows_of(RunLog("a", "orchard_ugv", lost))
+    gyro = rows[:, NAMES.index("yaw_rate_radps")]
+    unknown = time_s[np.isnan(gyro)]
+    assert unknown.min() == pytest.approx(1.1, abs=0.021)
+    assert unknown.max() == pytest.approx(2.0, abs=0.021)
+
+
+def counting(rows):
+    """An observer that sums all known measurements and the time: any sample more or less shows."""
+
+    def step(params, memory, row, dt_s):
+        return memory + np.array([np.nansum(row), dt_s])
+
+    def read(params, memory):
+        return ObserverOutput(memory, memory, memory[:1], memory[:1], ObserverStatus.OK)
+
+    return Observer(
+        "sum", ("sum_m", "time_s"), ("slip_left_ratio",), rows, np.zeros(1), np.zeros(2), step, read
+    )
+
+
+def test_live_is_the_batch_whatever_comes_together(run):
+    observer, rng = counting(NAMES), np.random.default_rng(3)
+    time_s, rows, _ = rows_of(run)
+    batch = observe(observer, time_s, rows)
+    channels = {name: stream.channels for name, stream in run.streams.items()}
+    live, now, found = LiveObserver(observer, UGV, channels), 0.0, []
+    while now < 7.0:
+        later = now + rng.uniform(0.001, 0.3)
+        arrived = {}
+        for name in ("wheels", *CHANNELS):
+            if name in run.streams:
+                stream = run.streams[name]
+                new = (stream.time_s >= now) & (stream.time_s < later)
+                arrived[name] = Reading(stream.time_s[new], stream.values[new])
+        found += live.step(arrived)
+        now = later
+    assert np.array([e.mean for e in found]).tobytes() == batch.mean.tobytes()
+    assert [e.time_s for e in found] == time_s.tolist()
+    assert live.dropped == {}
+
+
+def test_samples_that_cannot_be_are_left_out_and_counted(run):
+    channels = {name: stream.channels for name, stream in run.streams.items()}
+    live = LiveObserver(counting(NAMES), UGV, channels)
+    imu = np.full((1, 9), 0.1)
+    assert live.step({"wheels": Reading(np.array([0.0, 0.02]), np.full((2, 2), 0.1))}) != []
+    live.step({"imu": Reading(np.array([0.01, 0.01]), np.vstack([imu, imu]))})
+    live.step({"imu": Reading(np.array([0.02]), np.full((1, 4), 0.1)), "pose": "nothing"})
+    assert live.step({"wheels": Reading(np.array([0.02, 0.01]), np.full((2, 2), 0.1))}) == []
+    assert live.step({"wheels": Reading(np.array([math.nan]), np.full((1, 2), 0.1))}) == []
+    assert live.dropped == {
+        "imu: not later than the sample before": 1,
+        "wheels: not later than the sample before": 3,
+        "imu: unreadable": 1,
+        "pose: unreadable": 1,
+    }
+    [estimate] = live.step({"wheels": Reading(np.array([0.04]), np.array([[math.inf, math.nan]]))})
+    assert estimate.status is ObserverStatus.OK
+
+
+def test_a_log_without_what_the_observer_takes_is_refused(run):
+    with pytest.raises(ConfigError, match="'speed_left_mps' must be among them"):
+        RowFeed(UGV, NAMES, {"wheels": ("motor_1_radps",)})
+    with pytest.raises(DataError, match="has no stream wheels"):
+        list(ticks(without(run, "wheels"), RowFeed(UGV, NAMES, {"wheels": UGV.rate_channels})))
