@@ -54,12 +54,12 @@ STATES = (
 SLIPS = ("slip_left_ratio", "slip_right_ratio")
 
 STATUS, STARTED, FIX, ERROR, ETA, OBSERVED = 0, 1, 2, 5, 8, 10
-TRAVEL, SPAN, PATH, HEADING, SPEED, RATE, DIRECTION = 12, 18, 19, 20, 21, 23, 24
-PENDING, BROKEN, REJECTED, EXCITATION, COVARIANCE, CROSS = 26, 27, 28, 29, 32, 57
-MEMORY_SIZE = 72
+TRAVEL, SPAN, PATH, HEADING, SPEED, DIRECTION = 12, 18, 19, 20, 21, 23
+PENDING, BROKEN, REJECTED, EXCITATION, COVARIANCE, CROSS = 25, 26, 27, 28, 31, 56
+MEMORY_SIZE = 71
 """Places in the memory: the last fix, e at it, n^ and whether it was ever observed; W, h, the distance the
-faster track turned, and the heading since that fix; speeds and yaw rate of the last tick, the directions in
-which tracks last turned; time of ticks without speeds, whether the travel since the fix is unknown, how many
+faster track turned, and the heading since that fix; speeds at the last tick, the directions in which tracks
+last turned; time of ticks without speeds, whether the travel since the fix is unknown, how many
 fixes were rejected; mean of M'M (LL, LR, RR); covariance (5, 5) of the errors, and (5, 3) of these with the
 noise of the last fix.
 """
@@ -74,12 +74,12 @@ _REJECTED, _RESET, _UNEXCITED, _PUSHED, _BAD = (ObserverStatus(k).value for k in
 
 @njit(cache=True)
 def _moved_on(params: Array, after: Array, left: float, right: float, rate: float, dt_s: float) -> None:
-    """Integrate M over a tick; speeds are those at its end, 0 of a track that stands."""
-    if not math.isfinite(rate):
-        rate = (after[ETA + 1] * right - after[ETA] * left) / (2.0 * params[at.HALF_TRACK])
+    """Integrate M over a tick: speeds at its end, 0 of a track that stands, and its mean yaw rate."""
     mean_left, mean_right = 0.5 * (after[SPEED] + left), 0.5 * (after[SPEED + 1] + right)
-    turn = 0.5 * dt_s * (after[RATE] + rate)
-    after[SPEED], after[SPEED + 1], after[RATE] = left, right, rate
+    after[SPEED], after[SPEED + 1] = left, right
+    if not math.isfinite(rate):
+        rate = (after[ETA + 1] * mean_right - after[ETA] * mean_left) / (2.0 * params[at.HALF_TRACK])
+    turn = dt_s * rate
     if dt_s > params[at.LONGEST_STEP]:
         after[BROKEN] = 1.0
     else:

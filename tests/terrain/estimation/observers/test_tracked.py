@@ -1,6 +1,7 @@
 """The adaptive observer of tracked vehicles: how fast and how well it settles, and what it does at faults."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -97,7 +98,7 @@ def test_raw_fixes_of_2_cm_leave_half_a_percent(drive_of):
 def test_errors_are_as_large_as_stated(settings, drive_of):
     """Squared errors of pose and efficiencies, normalised by their covariance, average to 1."""
     squares, rng = [], np.random.default_rng(0)
-    observer = tracked_observer(ROBOT, settings)
+    observer = tracked_observer(ROBOT, replace(settings, eta_std_ratio=0.05))
     for _ in range(30):
         walk = settings.eta_walk_ratio / math.sqrt(HZ) * rng.standard_normal((2, 40 * HZ + 1))
         true = np.array(drive_of[1])[:, None] + 0.05 * rng.standard_normal((2, 1)) + np.cumsum(walk, axis=1)
