@@ -143,8 +143,9 @@ def test_slip_of_a_braking_track_is_that_of_the_project():
     assert np.isnan(track.slip[0]).all()
 
 
-def test_missing_fixes_are_dead_reckoning_and_long_ones_begin_the_pose_anew():
-    time_s, rows, pose, _ = drive(*CIRCLE, 80.0)
+@pytest.mark.parametrize("gyro", [False, True])
+def test_missing_fixes_are_dead_reckoning_and_long_ones_begin_the_pose_anew(gyro):
+    time_s, rows, pose, _ = drive(*CIRCLE, 80.0, gyro=gyro)
     for start_s, end_s in ((50, 51.5), (60, 70)):
         rows[(time_s > start_s) & (time_s < end_s), 2:5] = np.nan
     track = observe(tracked_observer(ROBOT), time_s, rows)
