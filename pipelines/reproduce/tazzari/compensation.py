@@ -22,7 +22,7 @@ from terrain.terramechanics.soil import load_soil
 
 FORWARD_MPS, TURN_RADPS = 0.5, 0.15
 DURATION_S, SETTLED_S = 60.0, 15.0
-SOILS, FIRST_M = ("grass", "dry_sand"), 15.0
+SOILS, FIRST_M = ("grass", "dry_sand"), 10.0
 """The soil changes after a distance; on both a turn needs much of the friction."""
 TICK_S, FIX_TICKS = 0.02, 5
 
