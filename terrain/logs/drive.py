@@ -37,7 +37,8 @@ Husky's log, then of six sessions of a Warthog and one of a Marmotte:
   down: what differs from the Husky's is found for each session by :mod:`terrain.logs.imu_axes`, turned and
   counted.
 - ``icp_yaw`` is a difference of two wrapped angles, and the position of a window is turned by the mean of
-  the first five of them, not by the first: ``icp_x`` points along the mean heading of the first 0.25 s.
+  the first five of them, not by the first: ``icp_x`` points along the mean heading of the first 0.25 s.  The
+  Marmotte's, of another repository, are in the frame of the first: :mod:`terrain.logs.window_frame` finds it.
   Where the heading wraps within these (11 windows) that mean is no direction that the robot ever had.
 - *Late*: the Husky's lidar lags the gyro by 0.16 s; after that their yaw rates agree to 0.03 rad/s rms.  Its
   wheel speeds lag the gyro by 0.26 s while speeds change.  The Warthog's lidar lags by 0.4 to 0.7 s, its
@@ -73,6 +74,7 @@ from terrain.logs.lidar_twist import CHANNELS as TWIST_CHANNELS
 from terrain.logs.lidar_twist import N_FRAME, body_twists
 from terrain.logs.log_files import check_log_file, checked_names, short_name
 from terrain.logs.samples import checked_stream
+from terrain.logs.window_frame import frame_coefficient, is_first_pose
 from terrain.records import Array, Label, RunLog
 
 FILE_NAME = "samples.csv.gz"
@@ -121,7 +123,7 @@ class DriveRobot(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Windows:
+class DriveWindows:
     """A whole session: n windows of k samples."""
 
     name: str
@@ -134,6 +136,8 @@ class _Windows:
     values: dict[str, Array]  # by stream (n, k, channels)
     held: tuple[int, ...]  # usual samples from one new value of a wheel to the next; 1 where not to be undone
     repairs: dict[str, int]  # of signs, as counts by kind
+    pose: Array  # (n, k, 3) as published
+    frame_yaw: Array  # (n,) heading of the frame of a window's positions
 
 
 def find_sessions(folder: Path) -> list[Path]:
@@ -180,40 +184,45 @@ def find_runs(folder: Path, robot: DriveRobot) -> list[Callable[..., RunLog]]:
         if not (path / FILE_NAME).is_file():
             readers.append(partial(_refuse, path))
             continue
-        name = normal_name(path.resolve().name)
-        numbered = _SESSION_NAME.fullmatch(name)
-        session = name if numbered or path != folder else ""
-        windows = _read_windows(
-            check_log_file(path / FILE_NAME, path), robot, session, numbered[1] if numbered else ""
-        )
-        starts = np.flatnonzero(windows.steady == 0)
-        if starts.size == 0 or starts[0] != 0:
-            raise LogError(f"{windows.name}: the first window has steady 1; a command begins with steady 0")
-        ends = [*starts[1:].tolist(), len(windows.steady)]
-        readers += [
-            partial(_run, windows, start, end) for start, end in zip(starts.tolist(), ends, strict=True)
-        ]
+        readers += [partial(_run, *command) for command in commands_of(path, path != folder, robot)]
     return readers
+
+
+def commands_of(path: Path, named: bool, robot: DriveRobot) -> list[tuple[DriveWindows, int, int]]:
+    """Return the commands of a session: all its windows, and which of them are the command's.
+
+    Parameters
+    ----------
+    path : folder of the session
+    named : whether the name of its folder is that of the session, even without a number
+    robot : that drove it
+
+    Raises
+    ------
+    LogError
+        as :func:`find_runs` does.
+    """
+    name = normal_name(path.resolve().name)
+    numbered = _SESSION_NAME.fullmatch(name)
+    session = name if numbered or named else ""
+    windows = _read_windows(
+        check_log_file(path / FILE_NAME, path), robot, session, numbered[1] if numbered else ""
+    )
+    starts = np.flatnonzero(windows.steady == 0)
+    if starts.size == 0 or starts[0] != 0:
+        raise LogError(f"{windows.name}: the first window has steady 1; a command begins with steady 0")
+    ends = [*starts[1:].tolist(), len(windows.steady)]
+    return [(windows, start, end) for start, end in zip(starts.tolist(), ends, strict=True)]
 
 
 def _refuse(folder: Path, *, repair: bool = False) -> RunLog:
     raise LogError(f"{folder}: has no {FILE_NAME}, which the other sessions beside it have")
 
 
-def _run(windows: _Windows, start: int, end: int, *, repair: bool = False) -> RunLog:
+def _run(windows: DriveWindows, start: int, end: int, *, repair: bool = False) -> RunLog:
     """Return the run of the windows ``start`` to ``end``, the last not included."""
-    if end - start < 2:
-        raise LogError(
-            f"{windows.name}: the command of step {windows.step[start]} has one window only, "
-            f"at least one with steady 1 must follow it"
-        )
-    steps = np.unique(windows.step[start + 1 : end])
-    if steps.size > 1:
-        raise LogError(
-            f"{windows.name}: the windows of one command have the steps {', '.join(map(str, steps))}"
-        )
-    kept, time_s = _on_one_clock(windows, start, end)
-    run_id = "_".join([*filter(None, [windows.session]), f"step_{steps[0]:03d}"])
+    run_id, step = named_run(windows, start, end)
+    kept, time_s = on_one_clock(windows, start, end)
     dropped: Counter[str] = Counter(windows.repairs)
     streams = {}
     for name, logged in windows.values.items():
@@ -238,14 +247,29 @@ def _run(windows: _Windows, start: int, end: int, *, repair: bool = False) -> Ru
         windows.robot,
         streams,
         (Label(0.0, until_s, windows.terrain),) if windows.terrain else (),
-        source=f"{windows.name}, step {steps[0]}, DRIVE layout",
+        source=f"{windows.name}, step {step}, DRIVE layout",
         dropped=dropped,
         session=windows.session,
     )
     return checked_names(windows.name, run)
 
 
-def _on_one_clock(windows: _Windows, start: int, end: int) -> tuple[Array, Array]:
+def named_run(windows: DriveWindows, start: int, end: int) -> tuple[str, int]:
+    """Return the name and the step of the run of some windows."""
+    if end - start < 2:
+        raise LogError(
+            f"{windows.name}: the command of step {windows.step[start]} has one window only, "
+            f"at least one with steady 1 must follow it"
+        )
+    steps = np.unique(windows.step[start + 1 : end])
+    if steps.size > 1:
+        raise LogError(
+            f"{windows.name}: the windows of one command have the steps {', '.join(map(str, steps))}"
+        )
+    return "_".join([*filter(None, [windows.session]), f"step_{steps[0]:03d}"]), int(steps[0])
+
+
+def on_one_clock(windows: DriveWindows, start: int, end: int) -> tuple[Array, Array]:
     """Return which samples (windows, k) to keep, and the time of these from the first one of the run."""
     time_s = windows.time_s
     period_s = float(time_s[1] - time_s[0])
@@ -264,7 +288,7 @@ def _on_one_clock(windows: _Windows, start: int, end: int) -> tuple[Array, Array
     return kept, (at_s[:, None] + time_s - time_s[0])[kept]
 
 
-def _read_windows(path: Path, robot: DriveRobot, session: str, terrain: str) -> _Windows:
+def _read_windows(path: Path, robot: DriveRobot, session: str, terrain: str) -> DriveWindows:
     sources = {name: list(columns.values()) for name, columns in STREAMS.items()}
     read = [*_KEYS, *_POSE, *(column for pairs in sources.values() for column, _ in pairs)]
     table = read_columns(path, read)
@@ -282,11 +306,17 @@ def _read_windows(path: Path, robot: DriveRobot, session: str, terrain: str) -> 
     values["wheels"] *= robot.wheel_radius_m
     axes = _imu_axes(values["wheels"], values["imu"], period_s)
     values["imu"] *= (axes.gyro_z, *axes.accel)
-    values["lidar"] = body_twists(np.stack([columns[name] for name in _POSE], axis=-1), period_s)
+    pose = np.stack([columns[name] for name in _POSE], axis=-1)
+    own_frame = is_first_pose(*frame_coefficient(pose, values["wheels"], period_s))
+    frame_yaw = pose[:, 0, 2] if own_frame else pose[:, :N_FRAME, 2].mean(axis=1)
+    values["lidar"] = body_twists(pose, period_s, frame_yaw=frame_yaw)
     step, steady = (keys[:, 0, i].astype(np.int64) for i in (0, 2))
     time_s = np.arange(k) * period_s
     name, repairs = short_name(path), axes.repairs()
-    return _Windows(name, robot.name, session, terrain, step, steady, time_s, values, held, repairs)
+    if own_frame:
+        repairs["lidar: positions in the frame of the first pose"] = len(pose)
+    labels = (name, robot.name, session, terrain)
+    return DriveWindows(*labels, step, steady, time_s, values, held, repairs, pose, frame_yaw)
 
 
 def _imu_axes(wheels_mps: Array, imu: Array, period_s: float) -> ImuAxes:

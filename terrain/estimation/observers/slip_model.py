@@ -1,0 +1,265 @@
+r"""Slip of a tracked robot on a weak slope: the four laws of Yamauchi et al. as one that is continuous.
+
+Speeds v of the tracks, yaw rate w, half track d, grade :math:`= -pitch`; b are errors that a whole run has
+in common, with a mean of 0:
+
+.. math::
+    v_i' &= v_i (1 - \alpha_0 - b_\alpha) - |v_i|\, \alpha_1\, grade, \qquad
+    D = v_r' - v_l' - 2 d w \\
+    V_x &= \frac{v_r' + v_l'}{2} - \frac{D}{2} \kappa(n) - \lambda |w|\, grade \\
+    \beta &= -(1 - \eta) \arctan(k\, roll) + \eta\, m \Big(\sum_i a_i X_i + b_\beta\Big), \qquad
+    V_y = |V_x| \tan \beta \\
+    \eta &= 3 q^2 - 2 q^3, \quad q = \min(\theta / \theta_1, 1), \quad
+    \theta = |v_r - v_l| / (|v_r| + |v_l|)
+
+- *Longitudinal, straight*: (22), a slip ratio linear in the grade, with the compaction as its intercept.  It
+  needs no switch: each track has to overcome them in a turn as well.
+- *Longitudinal, turning*: Endo's law (27), :mod:`~terrain.estimation.observers.endo`, shares what slip is
+  left. D and kappa both vanish with the turn, so that its part falls with the square of it.
+- In a turn the ground's friction is spent on turning, and a grade moves the robot by
+  :math:`\lambda |w| grade` more: lambda is this project's, 0 for the laws as printed.
+- *Lateral, straight*: (26).  **Corrected**: gravity sets the sign, also in reverse, by the absolute value of
+  V_x.
+- *Lateral, turning*: the regression (28), weighted by how tight the turn is.  The weight eta is smooth and
+  has no memory: it is 0 in straight motion and 1 where the tightness theta (:math:`d |w| / |\bar v|` without
+  slip, 1 where the tracks run against each other) is at least theta_1.
+
+So the velocity is continuous in all that is measured.  The regressors X are those of (28) as seen in a left
+turn driven forward: a right turn is its mirror image (m = -1), and so is a reversed one, end to end; the
+coefficients of one turn hold for all four.  Towards a spin in place, which has no forward end, what differs
+between the two ends fades out.  The yaw displacement since the turn began is forgotten over a length of the
+track travelled straight, which leaves behind the soil that the turn heaped up.
+
+A slip angle cannot express that a robot spinning in place drifts across a slope: V_y vanishes there with V_x.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from terrain.errors import ConfigError
+from terrain.estimation.observers.endo import slip_imbalance
+from terrain.records import Array, read_only
+
+REGRESSORS: tuple[str, ...] = (
+    *("intercept", "input_speed_mps", "input_yaw_rate_radps", "gyro_yaw_rate_radps"),
+    *("roll_rad", "pitch_rad", "yaw_displacement_rad", "slope_rad"),
+)
+"""Explanatory variables X of (28), in its order."""
+
+N_ANGLE = len(REGRESSORS)
+EXPONENT, COMPACTION, GRADE, TURN_GRADE, SIDE, ANGLE = range(6)
+TRACK_RATIO = ANGLE + N_ANGLE
+N_MODEL = TRACK_RATIO + 1
+RUN_SLIP, RUN_ANGLE, GYRO_BIAS = N_MODEL, N_MODEL + 1, N_MODEL + 2
+N_PARAMETERS = N_MODEL + 3
+
+PARAMETERS: tuple[str, ...] = (
+    *("turning_exponent", "compaction_slip_ratio", "grade_slip_ratio", "turn_grade_m", "side_slip_ratio"),
+    *(f"angle_{name}" for name in REGRESSORS),
+    "track_ratio",
+)
+"""Names of the numbers of a model, in the order of its covariance."""
+
+TIGHT_RATIO = 0.5
+"""theta_1: an arc around a centre one track away from the middle of the robot."""
+
+SPIN_RATIO = 0.3
+"""Sum of the speeds of the tracks over that of their magnitudes below which a turn is a spin, in part."""
+
+STEEPEST_RAD = 1.2
+"""Slip angles beyond, by coefficients that do not fit, are held at this: tan is 2.6 there."""
+
+
+@dataclass(frozen=True, eq=False)
+class SlipModel:
+    """Numbers of the slip laws of one robot on one ground; without arguments there is no slip.
+
+    Parameters
+    ----------
+    turning_exponent : n of (27)
+    compaction_slip_ratio, grade_slip_ratio : intercept and slope (per rad) of (22)
+    turn_grade_m : lambda, speed downhill by yaw rate and grade
+    side_slip_ratio : k of (26), per rad
+    angle : (8,) coefficients of (28) in rad, for SI units, in the order of :data:`REGRESSORS`
+    track_ratio : effective distance of the tracks over the described one, for a robot without a gyro
+    covariance : (14, 14) of :data:`PARAMETERS`
+    slip_std_ratio, angle_std_rad : residuals within a run
+    run_slip_std_ratio, run_angle_std_rad : what a whole run has in common
+    found : how the numbers were found
+
+    Raises
+    ------
+    ConfigError
+        if a number is not finite, or the shape of an array is another.
+
+    Examples
+    --------
+    >>> SlipModel(turning_exponent=0.85).vector[:2]
+    array([0.85, 0.  ])
+    """
+
+    turning_exponent: float = 1.0
+    compaction_slip_ratio: float = 0.0
+    grade_slip_ratio: float = 0.0
+    turn_grade_m: float = 0.0
+    side_slip_ratio: float = 0.0
+    angle: Array = field(default_factory=lambda: np.zeros(N_ANGLE))
+    track_ratio: float = 1.0
+    covariance: Array = field(default_factory=lambda: np.zeros((N_MODEL, N_MODEL)))
+    slip_std_ratio: float = 0.0
+    angle_std_rad: float = 0.0
+    run_slip_std_ratio: float = 0.0
+    run_angle_std_rad: float = 0.0
+    found: str = "given"
+
+    def __post_init__(self) -> None:
+        for name, shape in (("angle", (N_ANGLE,)), ("covariance", (N_MODEL, N_MODEL))):
+            value = read_only(np.array(getattr(self, name), dtype=float))
+            if value.shape != shape:
+                raise ConfigError(f"slip model: {name} has the shape {value.shape}, {shape} is required")
+            object.__setattr__(self, name, value)
+        stds = (self.slip_std_ratio, self.angle_std_rad, self.run_slip_std_ratio, self.run_angle_std_rad)
+        if not (np.isfinite(self.vector).all() and np.isfinite(self.covariance).all()):
+            raise ConfigError("slip model: all numbers have to be finite")
+        if self.turning_exponent < 0 or self.track_ratio <= 0 or not all(0 <= std < np.inf for std in stds):
+            raise ConfigError(
+                "slip model: turning_exponent and standard deviations from zero up, track_ratio above zero "
+                "are required"
+            )
+
+    @property
+    def vector(self) -> Array:
+        """Numbers (14,) in the order of :data:`PARAMETERS`."""
+        first = (self.turning_exponent, self.compaction_slip_ratio, self.grade_slip_ratio)
+        return np.array([*first, self.turn_grade_m, self.side_slip_ratio, *self.angle, self.track_ratio])
+
+
+def model_of(vector: Array, **also: Any) -> SlipModel:
+    """Return the model of numbers (14,) in the order of :data:`PARAMETERS`; ``also`` are other fields.
+
+    Examples
+    --------
+    >>> model_of(SlipModel(turning_exponent=0.7).vector).turning_exponent
+    0.7
+    """
+    first = dict(zip(PARAMETERS[:ANGLE], vector[:ANGLE].tolist(), strict=True))
+    angle, ratio = vector[ANGLE:TRACK_RATIO], float(vector[TRACK_RATIO])
+    return SlipModel(**first, angle=angle, track_ratio=ratio, **also)
+
+
+@njit(cache=True)
+def turn_weight(speed_left_mps: float, speed_right_mps: float) -> float:
+    """Return eta, 0 in straight motion and 1 in a tight turn; 0 where both tracks stand.
+
+    Examples
+    --------
+    >>> turn_weight(0.1, 0.1), turn_weight(0.07, 0.12), turn_weight(-0.01, 0.12)
+    (0.0, 0.5394..., 1.0)
+    """
+    total = abs(speed_left_mps) + abs(speed_right_mps)
+    if total == 0.0:
+        return 0.0
+    q = min(abs(speed_right_mps - speed_left_mps) / total / TIGHT_RATIO, 1.0)
+    return q * q * (3.0 - 2.0 * q)
+
+
+@njit(cache=True)
+def next_displacement(
+    displacement_rad: float,
+    speeds_mps: tuple[float, float],
+    yaw_rate_radps: float,
+    length_m: float,
+    dt_s: float,
+) -> float:
+    """Return the yaw displacement since the turn began, a step later.
+
+    It is forgotten over the length of the track travelled straight.
+    """
+    straight = 1.0 - turn_weight(speeds_mps[0], speeds_mps[1])
+    travelled = 0.5 * abs(speeds_mps[0] + speeds_mps[1]) * dt_s
+    return (displacement_rad + yaw_rate_radps * dt_s) * math.exp(-straight * travelled / length_m)
+
+
+@njit(cache=True)
+def angle_regressors(
+    speeds_mps: tuple[float, float],
+    yaw_rate_radps: float,
+    roll_rad: float,
+    pitch_rad: float,
+    displacement_rad: float,
+    half_track_m: float,
+    out: Array,
+) -> None:
+    """Write m times the regressors X (8,) of (28); the first is m, 1 in a left turn driven forward."""
+    left, right = speeds_mps
+    total = max(abs(left) + abs(right), 1e-300)
+    forward = min(max((left + right) / total / SPIN_RATIO, -1.0), 1.0)
+    turn = 1.0 if right >= left else -1.0
+    out[0], out[1] = turn * forward, turn * forward * 0.5 * abs(left + right)
+    out[2] = forward * (right - left) / (2.0 * half_track_m)
+    out[3] = forward * yaw_rate_radps
+    out[4], out[5] = roll_rad, turn * pitch_rad
+    out[6] = forward * displacement_rad
+    slope = math.acos(min(max(math.cos(roll_rad) * math.cos(pitch_rad), -1.0), 1.0))
+    out[7] = turn * forward * slope
+
+
+@njit(cache=True)
+def body_velocity(
+    theta: Array,
+    half_track_m: float,
+    speeds_mps: tuple[float, float],
+    yaw_rate_radps: float,
+    tilt_rad: tuple[float, float],
+    displacement_rad: float,
+    slopes: Array,
+) -> tuple[float, float, float, float]:
+    """Return V_x, V_y, beta and dV_x/dw, and write the derivatives (3, N_PARAMETERS) of the first three.
+
+    Parameters
+    ----------
+    theta : (N_PARAMETERS,) numbers of the model and errors of the run
+    half_track_m : d
+    speeds_mps : left, right
+    yaw_rate_radps : w, without the gyro's bias
+    tilt_rad : roll, pitch
+    displacement_rad : yaw since the turn began
+    slopes : (3, N_PARAMETERS); those by the track ratio and the gyro's bias, which act through w, stay 0
+    """
+    left, right = speeds_mps
+    roll, grade, turning = tilt_rad[0], -tilt_rad[1], abs(yaw_rate_radps)
+    kappa, by_exponent = slip_imbalance(left, right, theta[EXPONENT])
+    kept, climbed = 1.0 - theta[COMPACTION] - theta[RUN_SLIP], theta[GRADE] * grade
+    mean, half = 0.5 * (left + right), 0.5 * (right - left)
+    mean_size, half_size = 0.5 * (abs(left) + abs(right)), 0.5 * (abs(right) - abs(left))
+    lost = kept * half - climbed * half_size - half_track_m * yaw_rate_radps
+    v_x = kept * mean - climbed * mean_size - lost * kappa - turning * theta[TURN_GRADE] * grade
+    by_rate = half_track_m * kappa - math.copysign(theta[TURN_GRADE], yaw_rate_radps) * grade
+    slopes[:] = 0.0
+    slopes[0, EXPONENT] = -lost * by_exponent
+    slopes[0, COMPACTION] = slopes[0, RUN_SLIP] = half * kappa - mean
+    slopes[0, GRADE], slopes[0, TURN_GRADE] = grade * (half_size * kappa - mean_size), -turning * grade
+    tight, beta = turn_weight(left, right), 0.0
+    regressors = np.empty(N_ANGLE)
+    angle_regressors(
+        speeds_mps, yaw_rate_radps, roll, tilt_rad[1], displacement_rad, half_track_m, regressors
+    )
+    for i in range(N_ANGLE):
+        slopes[2, ANGLE + i] = tight * regressors[i]
+        beta += slopes[2, ANGLE + i] * theta[ANGLE + i]
+    slopes[2, RUN_ANGLE] = tight * regressors[0]
+    beta += slopes[2, RUN_ANGLE] * theta[RUN_ANGLE] - (1.0 - tight) * math.atan(theta[SIDE] * roll)
+    slopes[2, SIDE] = -(1.0 - tight) * roll / (1.0 + (theta[SIDE] * roll) ** 2)
+    if abs(beta) > STEEPEST_RAD:
+        beta = math.copysign(STEEPEST_RAD, beta)
+        slopes[2] = 0.0
+    tangent, sign = math.tan(beta), math.copysign(1.0, v_x)
+    for i in range(N_PARAMETERS):
+        slopes[1, i] = sign * tangent * slopes[0, i] + abs(v_x) * (1.0 + tangent * tangent) * slopes[2, i]
+    return v_x, abs(v_x) * tangent, beta, by_rate

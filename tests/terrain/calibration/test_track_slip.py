@@ -1,0 +1,144 @@
+"""Slip of a tracked robot from runs with poses: hidden numbers come back; regression and plain algebra."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from terrain.calibration.clustered_fit import ILL_CONDITIONED, fit_runs
+from terrain.calibration.slip_model import identify_slip_model
+from terrain.calibration.track_motion import local_polynomial, slip_samples
+from terrain.calibration.turning_angle import fit_turning_angle
+from terrain.calibration.turning_exponent import fit_track_ratio, fit_turning
+from terrain.errors import DataError
+from terrain.estimation.observers.slip_model import PARAMETERS
+from terrain.robots import load_robot
+from terrain.simulation.tracked.given_slip import GivenSlip
+from terrain.simulation.tracked.run import simulate_tracked
+from terrain.simulation.tracked.slope import LEVEL, Slope
+from terrain.terramechanics.soil import load_soil
+
+ROBOT = load_robot("patako")
+D = ROBOT.half_track_m
+
+
+def turns(ground, seed, rates_dps=(10, 20, 30), slope=LEVEL, speed_mps=0.05):
+    """Turns by about a quarter, left and right."""
+    runs = []
+    for k, rate in enumerate(rates_dps):
+        w = math.radians(rate) * (1 if (k + seed) % 2 == 0 else -1)
+        n = int(50 * (1.0 + math.pi / 2 / abs(w) / 0.65))
+        belts = np.tile([speed_mps - D * w, speed_mps + D * w], (n, 1))
+        runs.append(simulate_tracked(ROBOT, ground, belts, seed * 100 + k, slope=slope))
+    return runs
+
+
+def straights(ground, seed, slopes_rad=(0.0, 0.1, 0.2, 0.3)):
+    return [
+        simulate_tracked(ROBOT, ground, np.full((400, 2), 0.05), seed * 100 + k, slope=Slope(slope, up))
+        for k, (slope, up) in enumerate((s, u) for s in slopes_rad for u in (0.0, math.pi / 2))
+    ]
+
+
+@pytest.mark.parametrize("n", [0.3, 0.5, 0.7, 0.847, 1.0, 1.15, 1.3])
+def test_the_exponent_is_found_within_two_hundredths(n):
+    ground = GivenSlip(turning_loss_ratio=0.36, turning_exponent=n)
+    runs = [run for seed in range(4) for run in turns(ground, 10 * seed + 1, (10, 16, 20, 30))]
+    found = fit_turning(slip_samples(runs, ROBOT).turning, D)
+    assert found.exponent == pytest.approx(n, abs=0.02)
+    assert abs(found.exponent - n) < 4 * found.exponent_std + 0.005  # smoothing sees arcs 0.3 % too slow
+    assert found.exponent_std < 0.02
+
+
+def test_all_numbers_of_given_slip_come_back_within_their_intervals():
+    ground = GivenSlip(1.0, 1.0, 0.08, 0.4, 0.6, 0.35, 0.8)
+    runs = straights(ground, 1)
+    for k, slope in enumerate((0.0, 0.09, 0.17, 0.26)):
+        runs += turns(ground, 20 + k, (10, 16, 20), Slope(slope, math.pi / 2 * (-1) ** k))
+    found = identify_slip_model(runs, ROBOT)
+    assert found.notes == ()
+    std = np.sqrt(np.diag(found.model.covariance))
+    hidden = {"compaction_slip_ratio": 0.08, "grade_slip_ratio": 0.4, "side_slip_ratio": 0.6}
+    for name, true in hidden.items():
+        place = PARAMETERS.index(name)
+        assert abs(found.model.vector[place] - true) < 3 * std[place] + 0.003
+    assert found.model.angle[4] == pytest.approx(-0.6, abs=3 * std[PARAMETERS.index("angle_roll_rad")] + 0.01)
+    assert found.model.track_ratio == pytest.approx(1 / (0.65 * 0.92), rel=0.02)
+    assert found.straight is not None
+    assert found.straight.r2_ratio > 0.8
+    assert found.straight.n_runs == 8
+
+
+def test_what_was_not_driven_is_named_and_stays_wide():
+    ground = load_soil("toyoura_sand")
+    found = identify_slip_model(straights(ground, 3, (0.0, 0.1)), ROBOT)
+    assert found.turning is None
+    assert found.angle is None
+    assert len(found.notes) == 3
+    assert found.model.covariance[0, 0] == pytest.approx(0.09)
+    with pytest.raises(DataError, match="poses of a moving robot"):
+        identify_slip_model([], ROBOT)
+
+
+def test_the_regression_reports_collinear_yaw_rates():
+    runs = []
+    for k, slope in enumerate((0.0, 0.09, 0.17, 0.26)):
+        for up in (1.6, -1.6):
+            runs += turns(load_soil("dry_sand"), 30 + k, slope=Slope(slope, up))
+    samples = slip_samples(runs, ROBOT).turning
+    found = fit_turning_angle(samples, D)
+    assert found.condition > ILL_CONDITIONED
+    assert min(found.inflation[2:4]) > 50
+    assert found.coefficient[1] == 0.0  # the input speed is the same in all runs
+    assert found.coefficient[4] < 0 < 0.5 < found.r2_ratio
+    ratio = fit_track_ratio(samples, D)
+    assert 1.4 < ratio.coefficient[0] < 1.8
+
+
+def test_the_fit_is_least_squares_and_its_intervals_hold_for_runs():
+    rng = np.random.default_rng(0)
+    true, inside = np.array([0.5, -2.0]), []
+    run = np.repeat(np.arange(15), 20)
+    for _ in range(200):
+        x = np.column_stack([np.ones(300), np.repeat(rng.normal(size=15), 20)])
+        y = x @ true + 0.3 * np.repeat(rng.normal(size=15), 20) + 0.1 * rng.normal(size=300)
+        found = fit_runs(x, y, run, ("intercept", "slope"))
+        inside.append((found.interval[0] < true) & (true < found.interval[1]))
+    assert found.coefficient == pytest.approx(np.linalg.lstsq(x, y, rcond=None)[0])
+    assert found.p_value == pytest.approx(2 * stats.t.sf(np.abs(found.coefficient / found.std), 14))
+    assert found.residual_std == pytest.approx(0.1, rel=0.15)
+    assert (np.mean(inside, axis=0) > 0.86).all()  # of 0.95: the sandwich is a little narrow for 15 runs
+
+
+def test_a_ridge_is_chosen_by_runs_left_out_only_where_columns_are_collinear():
+    rng = np.random.default_rng(1)
+    run = np.repeat(np.arange(10), 30)
+    a = rng.normal(size=300)
+    x = np.column_stack([np.ones(300), a, a + 0.002 * rng.normal(size=300)])
+    y = x[:, 1] + np.repeat(rng.normal(size=10), 30)
+    found = fit_runs(x, y, run, ("one", "a", "b"), ridge=True)
+    assert found.ridge_ratio > 0
+    assert found.coefficient[1] + found.coefficient[2] == pytest.approx(1.0, abs=0.4)
+    plain = fit_runs(x, y, run, ("one", "a", "b"))
+    assert np.abs(found.coefficient[1:]).max() < 0.9 * np.abs(plain.coefficient[1:]).max()
+    assert found.std[1] < plain.std[1]
+    assert fit_runs(x[:, :2], y, run, ("one", "a"), ridge=True).ridge_ratio == 0.0
+    with pytest.raises(DataError, match="not independent"):
+        fit_runs(np.column_stack([a, 2 * a]), y, run, ("a", "b"))
+    with pytest.raises(DataError, match="three or more runs"):
+        fit_runs(x, y, run // 5, ("one", "a", "b"))
+
+
+def test_parabolas_are_numpys():
+    rng = np.random.default_rng(2)
+    time_s = np.sort(rng.uniform(0, 2, 200))
+    values = rng.normal(size=(200, 2))
+    values[rng.random((200, 2)) < 0.1] = np.nan
+    found = local_polynomial(time_s, values, np.array([0.05, 1.0, 1.3, 1.95]), 0.3)
+    assert np.isnan(found[[0, 3]]).all()
+    for row, at in ((1, 1.0), (2, 1.3)):
+        for column in range(2):
+            own = (np.abs(time_s - at) <= 0.3) & np.isfinite(values[:, column])
+            _, slope, value = np.polyfit(time_s[own] - at, values[own, column], 2)
+            assert found[row, column] == pytest.approx([value, slope])
