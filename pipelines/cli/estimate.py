@@ -14,12 +14,23 @@ app = typer.Typer()
 @command(app, "estimate")
 def estimate_command(source: RunsSettings, settings: EstimateSettings, json_file: Json = None) -> None:
     """Estimate motion and slip, with their uncertainty."""
-    from pipelines.estimate.estimate import estimate
-    from pipelines.estimate.screen import print_estimates
     from pipelines.reporting.json_file import write_json
     from pipelines.reporting.terminal import output_console, progress_bar
+    from terrain.estimation.observers.choice import OBSERVERS
 
     runs, skipped = load(source, settings.robot, align=settings.align)
+    if settings.filter in OBSERVERS:
+        from pipelines.estimate.observed import estimate_observed
+        from pipelines.estimate.observed_screen import print_observed
+
+        with progress_bar() as progress:
+            observed = estimate_observed(runs, settings, skipped, progress)
+        print_observed(observed, output_console())
+        write_json(json_file, observed)
+        return
+    from pipelines.estimate.estimate import estimate
+    from pipelines.estimate.screen import print_estimates
+
     with progress_bar() as progress:
         result = estimate(runs, settings, skipped, progress)
     print_estimates(result, output_console())

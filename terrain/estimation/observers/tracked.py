@@ -335,5 +335,6 @@ def tracked_observer(robot: TrackedRobot, settings: TrackedSettings = DEFAULT_SE
     params = tracked_params(robot, settings)
     start = np.zeros(MEMORY_SIZE)
     start[ETA : ETA + 2] = start[DIRECTION : DIRECTION + 2] = 1.0
+    start[STATUS] = _STARTING
     start[COVARIANCE + 18] = start[COVARIANCE + 24] = params[at.ETA_STD] ** 2
     return Observer("tracked", STATES, SLIPS, ROWS, params, start, tracked_step, read_tracked)
