@@ -24,6 +24,15 @@ PAPERS: Mapping[str, Paper] = {
             ("soils", "firm_soil_gravel"),
         ),
     ),
+    "tazzari": Paper(
+        title="Tazzari et al., adaptive slip observer",
+        about=(
+            "R. Tazzari, I. A. Azzollini and L. Marconi, An adaptive observer approach to slip estimation "
+            "for agricultural tracked vehicles, University of Bologna"
+        ),
+        module="pipelines.reproduce.tazzari.experiments",
+        descriptions=(("robots", "orchard_ugv"), ("soils", "grass"), ("soils", "dry_sand")),
+    ),
 }
 """Papers by the name that the command takes."""
 

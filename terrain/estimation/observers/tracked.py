@@ -13,7 +13,8 @@ of a gyro where there is one.
 - Speeds come at every tick, fixes of the pose now and then.  Between two fixes M is integrated with the
   heading that follows from the last measured one by the gyro, else by the estimate; what the heading differs
   by at the next fix is spread over the interval.  At a fix (8) is integrated over the interval since the fix
-  before (:mod:`~terrain.estimation.observers.tracked_interval`).  The pose in between is dead reckoning.
+  before (:mod:`~terrain.estimation.observers.tracked_interval`).  The pose in between is dead reckoning, its
+  heading by the gyro where there is one.
 - A fix is position and heading at one tick.  One that deviates from the dead reckoning by more than noise and
   the distance that the tracks turned is rejected, and is not used for the efficiencies.
 - A track that stands turns nothing, so that its efficiency stays as it is; while both stand the pose follows
@@ -55,13 +56,13 @@ SLIPS = ("slip_left_ratio", "slip_right_ratio")
 
 STATUS, STARTED, FIX, ERROR, ETA, OBSERVED = 0, 1, 2, 5, 8, 10
 TRAVEL, SPAN, PATH, HEADING, SPEED, DIRECTION = 12, 18, 19, 20, 21, 23
-PENDING, BROKEN, REJECTED, EXCITATION, COVARIANCE, CROSS = 25, 26, 27, 28, 31, 56
-MEMORY_SIZE = 71
+PENDING, BROKEN, UNAIDED, REJECTED, EXCITATION, COVARIANCE, CROSS = 25, 26, 27, 28, 29, 32, 57
+MEMORY_SIZE = 72
 """Places in the memory: the last fix, e at it, n^ and whether it was ever observed; W, h, the distance the
 faster track turned, and the heading since that fix; speeds at the last tick, the directions in which tracks
-last turned; time of ticks without speeds, whether the travel since the fix is unknown, how many
-fixes were rejected; mean of M'M (LL, LR, RR); covariance (5, 5) of the errors, and (5, 3) of these with the
-noise of the last fix.
+last turned; time of ticks without speeds, whether the travel since the fix is unknown, and whether the gyro
+was absent in it, how many fixes were rejected; mean of M'M (LL, LR, RR); covariance (5, 5) of the errors, and
+(5, 3) of these with the noise of the last fix.
 """
 
 _FURTHEST_M = 1e8  # no position on Earth is further from an origin on it
@@ -78,6 +79,7 @@ def _moved_on(params: Array, after: Array, left: float, right: float, rate: floa
     mean_left, mean_right = 0.5 * (after[SPEED] + left), 0.5 * (after[SPEED + 1] + right)
     after[SPEED], after[SPEED + 1] = left, right
     if not math.isfinite(rate):
+        after[UNAIDED] = 1.0
         rate = (after[ETA + 1] * mean_right - after[ETA] * mean_left) / (2.0 * params[at.HALF_TRACK])
     turn = dt_s * rate
     if dt_s > params[at.LONGEST_STEP]:
@@ -124,7 +126,7 @@ def _begin_at(params: Array, after: Array, pose: Array) -> None:
 def _begin_interval(after: Array, heading_rad: float) -> None:
     """Forget the travel before a fix."""
     after[TRAVEL:SPAN] = 0.0
-    after[SPAN] = after[PATH] = after[BROKEN] = after[REJECTED] = 0.0
+    after[SPAN] = after[PATH] = after[BROKEN] = after[UNAIDED] = after[REJECTED] = 0.0
     after[HEADING] = heading_rad
 
 
@@ -276,7 +278,11 @@ def _read(params: Array, memory: Array) -> tuple[Array, Array, Array, Array, int
             mean[i] = memory[FIX + i] - memory[ERROR + i] + ahead[i]
             variance[i] = cov[i, i] + u * u * ll + 2.0 * u * v * lr + v * v * rr
             variance[i] += 2.0 * (u * cov[i, 3] + v * cov[i, 4])
-        heading = max(variance[2], 0.0) + params[at.YAW_STD] ** 2
+        if memory[UNAIDED] == 0.0:
+            mean[2] = memory[HEADING] - memory[ERROR + 2]
+            variance[2] = cov[2, 2] + (params[at.GYRO] * memory[SPAN]) ** 2
+        # half of what the heading is off by at the end acts on the distance since the fix
+        heading = params[at.YAW_STD] ** 2 + 0.25 * max(variance[2] - cov[2, 2], 0.0)
         variance[0] += ahead[1] * ahead[1] * heading
         variance[1] += ahead[0] * ahead[0] * heading
         std[:3] = np.sqrt(np.maximum(variance, 0.0))

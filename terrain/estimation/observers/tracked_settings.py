@@ -33,10 +33,11 @@ from terrain.robots.tracked import TrackedRobot
     LONGEST_INTERVAL,
     LONGEST_STEP,
     WINDOW,
-) = range(21)
+    GYRO,
+) = range(22)
 """Places in the parameters (N_PARAMS,) of the observer's step."""
 
-N_PARAMS = 21
+N_PARAMS = 22
 
 
 @dataclass(frozen=True)
@@ -61,6 +62,7 @@ class TrackedSettings:
     longest_interval_s : between two fixes, for the later one to be compared with the earlier
     longest_step_s : between two ticks, for the travel between them to be known
     window_s : T of (14), the time constant with which excitation is forgotten
+    gyro_std_radps : error of the gyro's rate that stays the same between two fixes
     """
 
     observation_gain_ps: tuple[float, float, float] = (1.0, 1.0, 1.0)
@@ -80,6 +82,7 @@ class TrackedSettings:
     longest_interval_s: float = 2.0
     longest_step_s: float = 0.5
     window_s: float = 5.0
+    gyro_std_radps: float = 0.002
 
 
 def tracked_params(robot: TrackedRobot, settings: TrackedSettings) -> Array:
@@ -133,4 +136,5 @@ _PLACES: tuple[tuple[tuple[int, ...], str], ...] = (
     ((LONGEST_INTERVAL,), "longest_interval_s"),
     ((LONGEST_STEP,), "longest_step_s"),
     ((WINDOW,), "window_s"),
+    ((GYRO,), "gyro_std_radps"),
 )
