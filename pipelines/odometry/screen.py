@@ -10,7 +10,7 @@ from rich.table import Column, Table
 from pipelines.odometry.results import OdometryResult
 from terrain.calibration.odometry_judge import LegScores
 
-_RIGHT = ("RMSE m", "95 % from", "to", "median m", "heading °", "below encoder", "below gyrodometry")
+_RIGHT = ("RMSE [m]", "median", "heading", "below encoder [%]", "below gyro [%]")
 
 
 def print_odometry(result: OdometryResult, console: Console) -> None:
@@ -45,10 +45,9 @@ def _table(scores: LegScores, title: str) -> Table:
     for kind in scores.kinds:
         table.add_row(
             kind.kind,
-            f"{kind.rmse_m:.4f}",
-            *(f"{end:.4f}" for end in kind.rmse_ci_m),
-            f"{kind.median_m:.4f}",
-            f"{math.degrees(kind.yaw_rmse_rad):.1f}",
+            f"{kind.rmse_m:.3f} ({kind.rmse_ci_m[0]:.3f} to {kind.rmse_ci_m[1]:.3f})",
+            f"{kind.median_m:.3f}",
+            f"{math.degrees(kind.yaw_rmse_rad):.1f}°",
             _percent(kind.gain_encoder, kind.gain_encoder_ci),
             _percent(kind.gain_gyro, kind.gain_gyro_ci),
         )
@@ -58,4 +57,4 @@ def _table(scores: LegScores, title: str) -> Table:
 def _percent(gain: float, interval: tuple[float, float]) -> str:
     if gain == 0.0:
         return ""
-    return f"{100 * gain:.1f} % ({100 * interval[0]:.1f} to {100 * interval[1]:.1f})"
+    return f"{100 * gain:.0f} ({100 * interval[0]:.0f} to {100 * interval[1]:.0f})"

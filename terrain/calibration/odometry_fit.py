@@ -5,9 +5,9 @@ body :math:`(p, \psi)` that the odometry sums from 0,
 
 .. math:: moved = R(\gamma)^T \big(p + R(\psi)\, l - l\big),
 
-and parameters minimise the distance from the measured end of each leg, bounded in its influence (soft L1),
-with the prior of unknown ground (:func:`~terrain.estimation.observers.slip_learning.unknown_ground`) as a
-ridge.  All kinds have the same scale of the tracks, l and :math:`\gamma` fitted, which are no slip.
+and parameters minimise the distance from the measured end of each leg, bounded in its influence (soft L1, at
+the median distance that is left), with the prior of unknown ground
+(:func:`~terrain.estimation.observers.slip_learning.unknown_ground`) as a ridge.  All kinds have the same scale of the tracks, l and :math:`\gamma` fitted, which are no slip.
 """
 
 from __future__ import annotations
@@ -52,8 +52,8 @@ MOUNT_STD = (0.3, 0.3, 0.1)
 SCALE_STD_RATIO = 0.1
 """Of the sprocket's radius beside the described one."""
 
-ERROR_M = 0.08
-"""Error of a leg of 2 s beyond which it counts less; three of what lidar poses and snow leave."""
+FIRST_ERROR_M, LEAST_ERROR_M, PASSES = 0.1, 1e-4, 4
+"""Error of a leg of 2 s that a fit begins with, and the least; each pass takes what the one before left."""
 
 MIN_LEGS = 10
 
@@ -125,27 +125,33 @@ def fit_odometry(kind: Kind, legs: Sequence[Leg], robot: TrackedRobot) -> Fitted
     known_std = np.concatenate([std[free], MOUNT_STD])
     first = np.concatenate([start[free], np.zeros(3)])
     packed, measured = _packed(legs), np.array([leg.moved[:2] for leg in legs])
-    scale_m = ERROR_M * np.array([max(leg.length_s / 2.0, 1.0) for leg in legs])
-
-    def errors(found: Array) -> Array:
-        vector = start.copy()
-        vector[free] = found[:-3]
-        ends = _ends(packed, vector, found[-3:], robot, kind.by_gyro)
-        return np.asarray(((ends[:, :2] - measured) / scale_m[:, None]).ravel())
-
-    def residual(found: Array) -> Array:
-        return np.concatenate([errors(found), (found - first) / known_std])
-
+    longer = np.array([max(leg.length_s / 2.0, 1.0) for leg in legs])
     low = np.full(len(first), -np.inf)
     low[:-3][free == EXPONENT] = 0.0
     low[:-3][free == TRACK_RATIO] = 0.05
-    done = least_squares(residual, first, bounds=(low, np.inf), loss="soft_l1", x_scale=known_std)
+
+    def errors_m(found: Array) -> Array:
+        vector = start.copy()
+        vector[free] = found[:-3]
+        ends = _ends(packed, vector, found[-3:], robot, kind.by_gyro)
+        return np.asarray((ends[:, :2] - measured) / longer[:, None])
+
+    error_m, found = FIRST_ERROR_M, first
+    for _ in range(PASSES):
+
+        def residual(found: Array, error_m: float = error_m) -> Array:
+            return np.concatenate([errors_m(found).ravel() / error_m, (found - first) / known_std])
+
+        done = least_squares(residual, found, bounds=(low, np.inf), loss="soft_l1", x_scale=known_std)
+        found = done.x
+        error_m = max(float(np.median(np.hypot(*errors_m(found).T))), LEAST_ERROR_M)
     vector = start.copy()
-    vector[free] = done.x[:-3]
+    vector[free] = found[:-3]
     covariance = np.zeros((N_MODEL, N_MODEL))
     by = done.jac[: 2 * len(legs)]
-    covariance[np.ix_(free, free)] = _clustered(by, errors(done.x), legs, known_std)[:-3, :-3]
-    left_m = np.hypot(*(errors(done.x).reshape(-1, 2) * scale_m[:, None]).T)
+    left = done.fun[: 2 * len(legs)]
+    covariance[np.ix_(free, free)] = _clustered(by, left, legs, known_std)[:-3, :-3]
+    left_m = np.hypot(*errors_m(found).T) * longer
     path_m = np.array([np.abs(leg.speeds_mps.mean(axis=1)).sum() * leg.step_s for leg in legs])
     ratio = float(np.sqrt((left_m**2).mean() / max((path_m**2).mean(), 1e-12)))
     model = model_of(
@@ -155,7 +161,7 @@ def fit_odometry(kind: Kind, legs: Sequence[Leg], robot: TrackedRobot) -> Fitted
         run_angle_std_rad=ratio / math.sqrt(2.0),
         found=f"{len({leg.run for leg in legs})} runs, {len(legs)} legs",
     )
-    return FittedOdometry(kind, model, done.x[-3:])
+    return FittedOdometry(kind, model, found[-3:])
 
 
 def predict_ends(fitted: FittedOdometry, legs: Sequence[Leg], robot: TrackedRobot) -> Array:
