@@ -7,7 +7,8 @@ body :math:`(p, \psi)` that the odometry sums from 0,
 
 and parameters minimise the distance from the measured end of each leg, bounded in its influence (soft L1, at
 the median distance that is left), with the prior of unknown ground
-(:func:`~terrain.estimation.observers.slip_learning.unknown_ground`) as a ridge.  All kinds have the same scale of the tracks, l and :math:`\gamma` fitted, which are no slip.
+(:func:`~terrain.estimation.observers.slip_learning.unknown_ground`) as a ridge.  All kinds have the same
+scale of the tracks, l and :math:`\gamma` fitted, which are no slip.
 """
 
 from __future__ import annotations
