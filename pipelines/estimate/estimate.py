@@ -5,19 +5,19 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from pipelines.estimate.observed import refuse_existing
 from pipelines.estimate.results import EstimateResult
 from pipelines.estimate.settings import EstimateSettings
 from pipelines.reporting.progress import Progress, silent
-from terrain.errors import ConfigError, DataError, LogError
+from terrain.errors import ConfigError, DataError
 from terrain.estimation.ekf.model import Noise
 from terrain.estimation.enriched import enriched
 from terrain.estimation.estimate import Estimate, beside, filter_run, model_and_noise, tuning_of
 from terrain.estimation.summary import summarize
 from terrain.estimation.tuned_noise import TunedNoise, tuned_noise, tuning_runs
 from terrain.extension import correct, corrected, corrected_log
-from terrain.files.atomic import ensure_writable
 from terrain.logs.clock import estimate_clock
-from terrain.logs.write import run_folder, write_run
+from terrain.logs.write import write_run
 from terrain.records import RunLog
 from terrain.robots import Robot, load_robot, packaged_robot
 
@@ -45,8 +45,12 @@ def estimate(
     LogError
         if a run is in ``out`` already; nothing is written then.
     """
+    if settings.slip_model is not None:
+        raise ConfigError(
+            f"a slip model is for observers of tracked robots, not for filter {settings.filter!r}"
+        )
     if settings.out is not None:
-        _refuse_existing(runs, settings.out)
+        refuse_existing(runs, settings.out)
     tuning = tuning_of(settings.filter, settings.tuning)
     if settings.tune_on is not None and tuning != "likelihood":
         raise ConfigError(f"runs to tune on go with the tuning 'likelihood', not {tuning!r}")
@@ -90,13 +94,6 @@ def _apart(runs: Sequence[RunLog], given: Robot | None) -> tuple[str, ...]:
         f"{offsets_s[worst]:+.2f} s in {worst}: tracks and yaw rates of these are wrong; --align brings the "
         "wheels onto the IMU's clock",
     )
-
-
-def _refuse_existing(runs: Sequence[RunLog], out: Path) -> None:
-    ensure_writable(out)
-    for run in runs:
-        if (folder := run_folder(run.run_id, out)).exists():
-            raise LogError(f"{folder}: is there already, and is left as it is; choose another --out")
 
 
 def _tuned(runs: Sequence[RunLog], settings: EstimateSettings) -> tuple[Noise, TunedNoise]:

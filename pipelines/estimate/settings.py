@@ -7,8 +7,23 @@ from typing import Literal
 
 from pipelines.config.settings import Settings, setting
 
-Filter = Literal["encoder12", "slip14", "vio12", "vio15", "skid"]
-"""Filters; the numbers are those of their states."""
+Filter = Literal[
+    "encoder12",
+    "slip14",
+    "vio12",
+    "vio15",
+    "skid",
+    "tracked",
+    "slip-odometry",
+    "slip-learning",
+    "encoder-odometry",
+    "gyrodometry",
+    "endo",
+    "sideslip-kinematic",
+    "sideslip-dynamic",
+    "sideslip-multi",
+]
+"""Filters, the numbers being those of their states, and observers of slip of tracked and car-like robots."""
 
 Tuning = Literal["physical", "thesis", "likelihood"]
 """Sources of a filter's noise."""
@@ -23,6 +38,9 @@ class EstimateSettings(Settings):
     tuning: Tuning | None = setting(None, "Noise; the thesis' own for vio12, else physical.")
     tune_on: tuple[str, ...] | None = setting(
         None, "Runs, by commas, for the tuning 'likelihood'; the first three.", separated=True
+    )
+    slip_model: Path | None = setting(
+        None, "Slip model of a tracked robot on its ground, for slip-odometry and endo (terrain odometry)."
     )
     figures: bool = setting(True, "Draw pictures into OUT/figures.")
     align: bool = setting(False, "Bring the wheel stream onto the IMU's clock where both see the turns.")

@@ -110,7 +110,7 @@ class TerrainObserver:
         if robot is not None:
             self._filter, corrected = live_estimator(model.info, robot, self.channels)
         self._robot_name = "" if robot is None else robot.name
-        self._filter_name = "" if self._filter is None else self._filter.model.name
+        self._filter_name = "" if self._filter is None else self._filter.name
         self._robot = corrected
         self._feed = WindowFeed(model.info, self.channels, corrected)
         self._classifying: Classifying = AtOnce() if classifying is None else classifying
@@ -184,7 +184,7 @@ class TerrainObserver:
             if the filter has run already.
         """
         fresh = restorable(state, self._robot_name, self._filter_name, now_s)
-        if self._filter is not None:
+        if self._filter is not None and self._filter.resident is not None:
             self._filter.resident.begin_from(fresh.biases, fresh.age_s)
         self.belief = fresh.belief
         return fresh

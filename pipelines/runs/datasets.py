@@ -261,9 +261,9 @@ def _readers(
     if not names and layout == "auto" and find_bags(folder):
         return _bags(folder, None, robot)
     if names == ["drive"]:
-        return drive.find_runs(folder, _drive_robot(robot))
+        return drive.find_runs(folder, drive_robot(robot))
     if names == ["drive-recording"]:
-        return drive_recording.find_runs(folder, lambda name: _drive_robot(_named(name, robot)))
+        return drive_recording.find_runs(folder, lambda name: drive_robot(_named(name, robot)))
     return _some([reader for readers in found.values() for reader in readers], folder)
 
 
@@ -277,7 +277,7 @@ def _bags(place: Path, mapping: str | Path | None, robot: Robot | None) -> list[
     return _some(logs.find_runs(named, mapping, robot), place)
 
 
-def _drive_robot(robot: Robot | None) -> DriveRobot:
+def drive_robot(robot: Robot | None) -> DriveRobot:
     """Return what the reader of DRIVE takes of a robot."""
     from terrain.logs.drive import DriveRobot
     from terrain.robots import as_skid_steer, load_robot

@@ -8,13 +8,15 @@ from pipelines.models.results import ModelInfo
 from pipelines.streaming.window_feed import live_filter, needs_filter
 from terrain.estimation.live.estimator import CHANNELS, LiveEstimator
 from terrain.estimation.live.skid_live import LiveSkidEstimator
+from terrain.estimation.observers.choice import OBSERVERS, make_observer
+from terrain.estimation.observers.live import LiveObserver
 from terrain.extension import correct_live
 from terrain.robots import Robot
 
 
 def live_estimator(
     info: ModelInfo, robot: Robot, channels: Mapping[str, Sequence[str]]
-) -> tuple[LiveEstimator | LiveSkidEstimator | None, Robot]:
+) -> tuple[LiveEstimator | LiveSkidEstimator | LiveObserver | None, Robot]:
     """Return the filter whose estimates a model needs, or None, and the robot as filters take it.
 
     Raises
@@ -29,6 +31,8 @@ def live_estimator(
         return None, driven
     name = live_filter(info, driven)
     known = {stream: tuple(names) for stream, names in channels.items()}
+    if name in OBSERVERS:
+        return LiveObserver(make_observer(name, driven), driven, known, correction), driven
     if name != "skid":
         read = {stream: names for stream, names in known.items() if stream in CHANNELS}
         return LiveEstimator(driven, name, read, correction=correction), driven

@@ -13,18 +13,22 @@ from pipelines.models.results import ModelInfo
 from terrain.errors import DataError
 from terrain.estimation.live.estimate import LiveEstimate
 from terrain.estimation.live.skid_live import LiveSkidEstimate
+from terrain.estimation.observers.choice import OBSERVERS, make_observer
+from terrain.estimation.observers.live import LiveObserverEstimate
 from terrain.logs.schema import ESTIMATOR_CHANNELS
 from terrain.records import Array, Reading, Windows
 from terrain.robots import Robot
 
-Estimate = LiveEstimate | LiveSkidEstimate
+Estimate = LiveEstimate | LiveSkidEstimate | LiveObserverEstimate
 
 LIVE_FILTERS: Mapping[str, tuple[str, ...]] = {
     "swerve": ("vio15", "vio12", "slip14", "encoder12"),
     "skid_steer": ("skid",),
-    "tracked": ("skid",),
+    "tracked": ("skid", "tracked", "slip-learning", "gyrodometry", "encoder-odometry"),
+    "bicycle": ("sideslip-multi", "sideslip-dynamic", "sideslip-kinematic"),
 }
-"""Filters that run sample by sample, by drive; the first is used where a model names none."""
+"""Filters and observers that run sample by sample, by drive, without a file of their own; the first is used
+where a model names none."""
 
 ESTIMATED = ("estimator", "slip")
 """Streams that a filter adds to what is measured."""
@@ -100,7 +104,7 @@ class WindowFeed:
                     _columns(stream, needed, list(channels[stream]), robot),
                 )
             elif stream in ESTIMATED and robot is not None and robot.drive in LIVE_FILTERS:
-                self._estimated[stream] = _estimates(stream, needed, robot)
+                self._estimated[stream] = _estimates(stream, needed, robot, live_filter(info, robot))
             else:
                 raise DataError(
                     f"the model requires {needed[0]!r} of the stream {stream!r}, which is neither measured "
@@ -181,8 +185,15 @@ def _columns(
     return lambda values: values[:, places]
 
 
-def _estimates(stream: str, needed: Sequence[str], robot: Robot) -> Callable[[Any], Array]:
-    """Return what takes the channels of a model out of an estimate."""
+def _estimates(stream: str, needed: Sequence[str], robot: Robot, name: str) -> Callable[[Any], Array]:
+    """Return what takes the channels of a model out of an estimate of the filter of that name."""
+    if name in OBSERVERS:
+        observer = make_observer(name, robot)
+        if stream == "slip":
+            places = _places(stream, needed, list(observer.slips))
+            return lambda estimate: np.asarray(estimate.slip)[places]
+        places = _places(stream, needed, list(observer.states))
+        return lambda estimate: np.asarray(estimate.mean)[places]
     if stream == "slip":
         places = _places(stream, needed, [f"slip_{wheel}_ratio" for wheel in robot.wheels])
         if robot.skids:  # nothing sees the ground go by

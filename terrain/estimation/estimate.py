@@ -19,6 +19,7 @@ from terrain.estimation.measurements.batch import measurement_table
 from terrain.estimation.measurements.heading import gnss_heading
 from terrain.estimation.measurements.skid_rows import WHEELS_AND_GYRO
 from terrain.estimation.measurements.table import GNSS_ROWS, MeasurementTable
+from terrain.estimation.observers.choice import observers_of
 from terrain.estimation.reference import true_states
 from terrain.estimation.slip_figures import SlipFigures, slip_figures
 from terrain.estimation.stuck import motion_track
@@ -225,8 +226,10 @@ def model_and_noise(
     """
     check_corrected(robot)
     suitable = FILTERS_OF_DRIVE[robot.drive]
+    if robot.filters:
+        suitable = tuple(each for each in suitable if each in robot.filters)
     if name in FILTERS and name not in suitable:
-        fits = ", ".join(suitable) or "terrain measure-slip"
+        fits = ", ".join((*suitable, *observers_of(robot))) or "terrain measure-slip"
         raise ConfigError(
             f"filter {name!r} is not for robot {robot.name}, whose drive is {robot.drive}: use {fits}"
         )

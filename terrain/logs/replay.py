@@ -10,7 +10,7 @@ from terrain.errors import ConfigError, DataError
 from terrain.logs.samples import longest_rise
 from terrain.records import Array, Reading, RunLog, Sample
 
-SENSORS: tuple[str, ...] = ("wheels", "steering", "imu", "odometry", "gnss")
+SENSORS: tuple[str, ...] = ("wheels", "steering", "imu", "odometry", "gnss", "compass", "pose")
 """Streams that a robot's sensors write; the others are commands, truth and what was made of them."""
 
 TWIST: tuple[str, ...] = ("speed_x_mps", "speed_y_mps", "yaw_rate_radps")

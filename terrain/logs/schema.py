@@ -24,6 +24,7 @@ UNIT_SYMBOLS: dict[str, str] = {
     "v": "V",
     "nm": "Nm",
     "n": "N",
+    "npr": "N/rad",
     "ratio": "1",
     "code": "-",
     "k": "K",

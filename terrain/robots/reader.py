@@ -12,8 +12,9 @@ where it was calibrated, its 95 % interval::
 Geometry and mass are required of every robot; the sections ``body``, ``motors``, ``steering``, ``camera`` and
 ``sensors`` by what simulates a robot or filters its log.  The section ``identified`` keeps what logs of one
 robot showed beside its nominal figures: its effective track, the radius that its wheels roll on, delays.  The
-section ``effects`` of an extended robot
-(:mod:`terrain.effects`) says what else acts; :mod:`terrain.extension` makes use of it.
+list ``filters`` names the filters and observers that apply, where not all of its drive do.  The section
+``effects`` of an extended robot (:mod:`terrain.effects`) says what else acts; :mod:`terrain.extension` makes
+use of it.
 """
 
 from __future__ import annotations
@@ -151,7 +152,7 @@ def robot_from(file: str, described: Any) -> Robot:
     """
     drive = described.get("drive") if isinstance(described, dict) else None
     kind = KIND_OF_DRIVE.get(drive, SkidSteerRobot) if isinstance(drive, str) else SkidSteerRobot
-    optional = (*KIND_OF_SECTION, "identified", "effects")
+    optional = (*KIND_OF_SECTION, "identified", "filters", "effects")
     check_keys(file, described, ["name", "drive", *kind.numbers], optional=optional)
     name = described["name"]
     if not isinstance(name, str) or not name:
@@ -167,7 +168,10 @@ def robot_from(file: str, described: Any) -> Robot:
     }
     assumed = frozenset(_assumed(described, kind.numbers))
     identified = _identified(f"{file}: identified", described.get("identified", {}))
-    robot = kind.described(name, numbers, parts=parts, assumed=assumed, identified=identified)
+    filters = _filters(f"{file}: filters", described.get("filters", []))
+    robot = kind.described(
+        name, numbers, parts=parts, assumed=assumed, identified=identified, filters=filters
+    )
     if "effects" in described:
         effects, cov = read_effects(f"{file}: effects", described["effects"], drive)
         stated = described["effects"].get("region")
@@ -185,6 +189,12 @@ def _assumed(described: dict[str, Any], numbers: tuple[str, ...]) -> Iterator[st
         for key, entry in entries.items():
             if entry["source"].strip().lower().startswith("assumed"):
                 yield f"{prefix}{key}"
+
+
+def _filters(place: str, described: Any) -> tuple[str, ...]:
+    if not isinstance(described, list) or not all(isinstance(name, str) and name for name in described):
+        raise ConfigError(f"{place} is {shown(described)}, a list of names is required")
+    return tuple(described)
 
 
 def _identified(place: str, described: Any) -> dict[str, float]:

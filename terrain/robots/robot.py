@@ -40,6 +40,7 @@ class Robot(ABC):
     region : of driving, that the effects were validated in; None where none is stated
     assumed : numbers whose source begins with "assumed", as ``track_m`` and ``camera.lever_x_m``
     identified : what logs of it showed beside its nominal figures, as ``effective_track_m``
+    filters : filters and observers that its description lists; none where all of its drive apply
     """
 
     name: str
@@ -53,6 +54,7 @@ class Robot(ABC):
     region: Region | None = None
     assumed: frozenset[str] = frozenset()
     identified: Mapping[str, float] = field(default_factory=dict, hash=False)
+    filters: tuple[str, ...] = ()
 
     numbers: ClassVar[tuple[str, ...]] = ("wheel_radius_m", "track_m", "wheelbase_m", "mass_kg")
     """Numbers that every description of the drive has, beside its sections."""

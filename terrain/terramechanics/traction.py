@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 from scipy.optimize import brentq
+from scipy.special import lambertw
 
 from terrain.records import Array
 from terrain.terramechanics.resistance import (
@@ -94,6 +95,52 @@ def janosi_force(slip: float, limit_n: float, contact_length_m: float, shear_mod
     """
     share: float = mobilised_ratio(abs(slip) * contact_length_m / shear_modulus_m)
     return math.copysign(limit_n, slip) * share
+
+
+def shear_of_ratio(ratio: Any) -> Array:
+    """Return the shearing ``x = s l / K`` (...) of a share of the limit; inverts :func:`mobilised_ratio`.
+
+    ``f = 1 - (1 - exp(-x)) / x`` is ``x = g + W(-g exp(-g))`` with ``g = 1 / (1 - f)`` and the branch W_0 of
+    Lambert's function.  Near f = 0 that is at the branch point, where half of the digits are lost: there a
+    series is taken, and a step of Newton's method follows everywhere.
+
+    Parameters
+    ----------
+    ratio : shares of the limit; NaN comes out for negative ones, and at or beyond the limit
+
+    Examples
+    --------
+    >>> shear_of_ratio([0.0, 0.367879441171, 0.99, 1.0]).round(6)
+    array([  0.,   1., 100.,  nan])
+    """
+    f = np.asarray(ratio, float)
+    f = np.where((f >= 0.0) & (f < 1.0), f, np.nan)
+    g = 1.0 / (1.0 - f)
+    closed = g + lambertw(-g * np.exp(-g)).real
+    x = np.where(f < 0.01, f * (2.0 + f * (4.0 / 3.0 + f * 10.0 / 9.0)), closed)
+    for _ in range(2):
+        shares = np.vectorize(mobilised_ratio, otypes=[float])(np.nan_to_num(x))
+        slope = np.where(x > 1e-4, (np.exp(-x) - (1.0 - shares)) / -np.maximum(x, 1e-4), 0.5 - x / 3.0)
+        x = np.where(x < 30.0, x - (shares - f) / slope, x)
+    return np.asarray(x)
+
+
+def janosi_slip(force_n: Any, limit_n: float, contact_length_m: float, shear_modulus_m: float) -> Array:
+    """Return the slip (...) that a force takes on ground that shears, with its sign: (7) of Tazzari inverted.
+
+    Parameters
+    ----------
+    force_n : any; NaN comes out at or beyond the limit
+    limit_n, contact_length_m, shear_modulus_m : as for :func:`janosi_force`
+
+    Examples
+    --------
+    >>> janosi_slip([42.1565, -42.1565, 170.0], 170.0, 0.12, 0.02).round(4)
+    array([ 0.1, -0.1,  nan])
+    """
+    force = np.asarray(force_n, float)
+    slip = shear_of_ratio(np.abs(force) / limit_n) * (shear_modulus_m / contact_length_m)
+    return np.asarray(np.copysign(slip, force))
 
 
 @njit(cache=True)

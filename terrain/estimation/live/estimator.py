@@ -213,6 +213,11 @@ class LiveEstimator:
         self._no_wheels = np.full(self._n_columns["wheels"], np.nan)
 
     @property
+    def name(self) -> str:
+        """Name of the filter."""
+        return self._model.name
+
+    @property
     def model(self) -> FilterModel:
         """The filter."""
         return self._model

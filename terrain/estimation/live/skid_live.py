@@ -170,6 +170,11 @@ class LiveSkidEstimator:
         return self._model
 
     @property
+    def name(self) -> str:
+        """Name of the filter."""
+        return self._model.name
+
+    @property
     def states(self) -> tuple[str, ...]:
         """Name of each state, in the order of ``mean`` and ``std``."""
         return self._model.states

@@ -64,6 +64,14 @@ class LiveObserver:
         self._last_s = math.nan
         self._unreadable: dict[str, int] = {}
 
+    resident: None = None
+    """No memory of it is kept over a restart: it starts from its first samples."""
+
+    @property
+    def name(self) -> str:
+        """Name of the observer."""
+        return self.observer.name
+
     @property
     def states(self) -> tuple[str, ...]:
         """Name of each state, in the order of ``mean`` and ``std``."""

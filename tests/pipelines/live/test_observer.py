@@ -18,9 +18,11 @@ from terrain.control.slip_table import load_slip_table
 from terrain.errors import ConfigError, DataError
 from terrain.estimation.enriched import enriched
 from terrain.estimation.estimate import estimate_run
+from terrain.estimation.observers.estimate import observe_run, with_estimates
 from terrain.logs.replay import replay
 from terrain.records import Reading, RunLog, Stream
 from terrain.robots import load_robot
+from terrain.simulation.conditions import Conditions
 from terrain.simulation.run import simulate_run
 
 AGRIMARO, HUSKY = load_robot("agrimaro"), load_robot("husky")
@@ -107,6 +109,28 @@ def test_a_skid_steer_robot_is_filtered_where_its_model_needs_the_filter(trained
     observer = TerrainObserver(model, robot=HUSKY, channels=channels_of(runs[5]))
     assert_same(observed(observer, runs[5]), rows)
     assert observer.estimate.speed_mps > 0.1
+
+
+def test_slip_by_an_observer_of_tracked_robots_is_a_feature_in_the_log_and_live(trained):
+    """What the observer adds is in the windows, and live the same as in the log."""
+    robot = load_robot("orchard_ugv")
+    runs = [
+        simulate_run(
+            robot, terrain, "survey", 5, k, duration_s=30.0, conditions=Conditions(grade_ratio=(0.15, 0))
+        )
+        for terrain in ("clay", "dry_sand")
+        for k in (1, 2, 3)
+    ]
+    model = trained(
+        [with_estimates(observe_run(run, robot, "tracked")) for run in runs if run.run_id[-1] != "3"]
+    )
+    assert model.info.filter == "tracked"
+    assert set(model.info.channels["slip"]) == {"slip_left_ratio", "slip_right_ratio"}
+    rows = predict([runs[2]], model, load_slip_table()).windows
+    assert len(rows) > 5
+    observer = TerrainObserver(model, robot=robot, channels=channels_of(runs[2]))
+    assert_same(observed(observer, runs[2]), rows)
+    assert observer.estimate.status.label == "standing"  # at the end of the drive
 
 
 @pytest.mark.parametrize("far_s", [-600.0, 4000.0])

@@ -156,7 +156,8 @@ def test_an_incomplete_row_is_refused(fault):
 
 
 def test_an_unknown_paper_is_refused_in_one_sentence(tmp_path):
-    with pytest.raises(ConfigError, match=r"^there is no paper 'newton' to reproduce; there are danzi$"):
+    known = ", ".join(PAPERS)
+    with pytest.raises(ConfigError, match=rf"^there is no paper 'newton' to reproduce; there are {known}$"):
         reproduce("newton", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 

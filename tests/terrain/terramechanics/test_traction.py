@@ -15,9 +15,11 @@ from terrain.terramechanics.traction import (
     friction_limit,
     ground_array,
     janosi_force,
+    janosi_slip,
     magic_force,
     mobilised_ratio,
     net_pull,
+    shear_of_ratio,
     wheel_ground,
 )
 
@@ -233,3 +235,18 @@ def test_slip_sinkage_makes_sand_a_trap():
     loss_n = net_pull(sand, NORMAL_N, at, *GEOMETRY) - net_pull(sinking, NORMAL_N, at, *GEOMETRY)
     assert loss_n[0] == 0.0
     assert (np.diff(loss_n) > 0).all()
+
+
+def test_shear_of_ratio_inverts_the_mobilised_ratio():
+    """To rounding: the ratio near 1 holds x to eps / (1 - f), which is what x itself allows."""
+    shear = np.concatenate([[0.0], np.logspace(-12, 3, 601)])
+    found = shear_of_ratio([mobilised_ratio(x) for x in shear])
+    np.testing.assert_allclose(found, shear, rtol=2e-13)
+    assert np.isnan(shear_of_ratio([-0.1, 1.0, 1.5, np.nan])).all()
+
+
+def test_slip_of_a_force_inverts_the_force():
+    slips = np.array([-1.0, -0.3, -1e-9, 0.0, 1e-9, 0.05, 0.3, 1.0])
+    forces = [janosi_force(slip, 2000.0, 1.2, 0.02) for slip in slips]
+    np.testing.assert_allclose(janosi_slip(forces, 2000.0, 1.2, 0.02), slips, rtol=1e-12)
+    assert np.isnan(janosi_slip([2000.0, -2500.0], 2000.0, 1.2, 0.02)).all()

@@ -1,0 +1,1 @@
+"""The experiments of Tazzari et al., An adaptive observer approach to slip estimation, in simulation."""

@@ -1,0 +1,114 @@
+"""An observer over a whole log: estimates beside the truth where a log has one, and the log with them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from terrain.angles import wrapped
+from terrain.estimation.observers.choice import make_observer
+from terrain.estimation.observers.family import Observer, ObserverStatus, ObserverTrack, observe
+from terrain.estimation.observers.rows import RowFeed, ticks
+from terrain.estimation.observers.slip_model import PARAMETERS, SlipModel
+from terrain.extension import correct
+from terrain.kinematics.wheel_speed import with_wheel_speeds
+from terrain.logs.schema import ESTIMATOR_CHANNELS
+from terrain.records import Array, RunLog, Stream
+from terrain.robots import Robot
+
+WITHOUT_UNIT = frozenset(name for name in PARAMETERS if not name.endswith(("_ratio", "_grade_m")))
+"""States that are numbers of a model, without a unit of their own."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ObserverEstimate:
+    """Estimates of an observer over one run.
+
+    Parameters
+    ----------
+    run : the log, as measured
+    robot : as the observer takes it, corrected
+    observer : that was run
+    track : its estimates
+    dropped : samples left out, as counts by stream and kind
+    """
+
+    run: RunLog
+    robot: Robot
+    observer: Observer
+    track: ObserverTrack
+    dropped: Mapping[str, int]
+
+    def true(self, channel: str) -> Array | None:
+        """Return a quantity (n,) of the truth at the ticks; None where the log has none of that name."""
+        truth = self.run.streams.get("truth")
+        if truth is None or channel not in truth.channels:
+            return None
+        values = truth.channel(channel)
+        if channel == "yaw_rad":
+            return np.asarray(wrapped(np.interp(self.track.time_s, truth.time_s, np.unwrap(values))))
+        return np.interp(self.track.time_s, truth.time_s, values)
+
+
+def observe_run(
+    run: RunLog, robot: Robot, name: str, slip_model: SlipModel | None = None
+) -> ObserverEstimate:
+    """Correct one run for the effects of its robot, and run an observer over it.
+
+    Parameters
+    ----------
+    run : log of the robot, as measured
+    robot : its description
+    name, slip_model : as :func:`~terrain.estimation.observers.choice.make_observer` takes them
+
+    Raises
+    ------
+    ConfigError
+        if the robot has no observer of that name, or the wheels have no speed that it takes.
+    DataError
+        if the log has no wheels.
+    """
+    log, driven = correct(with_wheel_speeds(run, robot), robot)
+    observer = make_observer(name, driven, slip_model)
+    feed = RowFeed(driven, observer.rows, {each: stream.channels for each, stream in log.streams.items()})
+    pairs = list(ticks(log, feed))
+    time_s = np.array([time for time, _ in pairs])
+    rows = np.array([row for _, row in pairs]).reshape(len(pairs), len(observer.rows))
+    return ObserverEstimate(run, driven, observer, observe(observer, time_s, rows), dict(feed.dropped))
+
+
+def with_estimates(found: ObserverEstimate) -> RunLog:
+    """Return the run with its estimates: streams ``slip``, ``estimator`` and ``state``.
+
+    ``estimator`` has the states that windows are made of; ``state``, of which no features are made, every
+    state, ``std_<state>``, ``std_<slip>`` and ``observer_code``, the number of an
+    :class:`~terrain.estimation.observers.family.ObserverStatus`.
+    """
+    run = with_wheel_speeds(found.run, found.robot)
+    track, streams = found.track, dict(run.streams)
+    states = {name: k for k, name in enumerate(track.states)}
+    channels = tuple(name for name in ESTIMATOR_CHANNELS if name in states)
+    if channels:
+        values = track.mean[:, [states[name] for name in channels]]
+        streams["estimator"] = Stream(track.time_s, values, channels)
+    if track.slips:
+        streams["slip"] = Stream(track.time_s, track.slip, track.slips)
+    named = [f"{name}_ratio" if name in WITHOUT_UNIT else name for name in track.states]
+    columns = dict(zip(named, track.mean.T, strict=True))
+    columns |= {f"std_{name}": std for name, std in zip(named, track.std.T, strict=True)}
+    columns |= {f"std_{name}": std for name, std in zip(track.slips, track.slip_std.T, strict=True)}
+    columns["observer_code"] = track.status.astype(float)
+    known = {name: column for name, column in columns.items() if np.isfinite(column).any()}
+    streams["state"] = Stream(track.time_s, np.column_stack(list(known.values())), tuple(known))
+    return replace(run, streams=streams, filter=found.observer.name)
+
+
+def seconds_by_status(track: ObserverTrack) -> dict[str, float]:
+    """Return for how long an observer had each status that it had."""
+    steps_s = np.diff(track.time_s, append=track.time_s[-1:])
+    return {
+        ObserverStatus(code).label: float(steps_s[track.status == code].sum())
+        for code in np.unique(track.status).tolist()
+    }

@@ -1,0 +1,160 @@
+"""Sideslip of a car-like robot from its pose alone: the extended kinematic model.
+
+State: position and heading of the rear axle, and the slip angles of both axles, which have no equation of
+their own (5); corrections (6) with the gains of the multi-model observer.  Equations, gains and what is done
+with fixes: :mod:`terrain.estimation.observers.sideslip_pose`.  Without dynamics the slip follows fixes
+only: it lags behind a bend or a slope by the time of its poles, 0.1 to 0.3 s.
+
+Deremetz et al., ICRA 2017, (5), (6); Guillet et al. 2014.  Corrected: line 3 of (2) is the derivative of
+theta~ (printed: of theta).  At rest J = 0 and the slip is as it was.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from terrain.estimation.observers import sideslip_pose as pose
+from terrain.estimation.observers.family import Observer, ObserverOutput, ObserverStatus
+from terrain.estimation.observers.sideslip_pose import (
+    HAS_POSITION,
+    HAS_YAW,
+    N_SHARED,
+    SHARED_SIZE,
+    SLIP_F,
+    SLIP_R,
+    SPEED,
+    STANDING_MPS,
+    STATUS,
+    STEER,
+    YAW,
+    YAW_STD,
+    X,
+    Y,
+    advance_pose,
+    correct_by_fix,
+    slip_jacobian,
+    status_of,
+    take_inputs,
+    yaw_rate_of,
+)
+from terrain.records import Array
+from terrain.robots.bicycle import BicycleRobot
+
+SLIP_WALK = N_SHARED
+COV = SHARED_SIZE
+_N = 4
+_UNKNOWN_STD_RAD = 0.15
+"""A slip that is less certain is not known."""
+
+
+def sideslip_kinematic_observer(
+    robot: BicycleRobot,
+    settings: pose.PoseSettings = pose.PoseSettings(),  # noqa: B008
+    slip_walk_radps: float = 0.05,
+) -> Observer:
+    """Return the observer of the extended kinematic model.
+
+    Parameters
+    ----------
+    robot : car-like
+    settings : gains, noise and gates of fixes
+    slip_walk_radps : change of a slip angle within a second, one standard deviation
+
+    Raises
+    ------
+    ConfigError
+        if a setting is not accepted.
+
+    Examples
+    --------
+    >>> from terrain.robots import load_robot
+    >>> from terrain.estimation.observers.family import observe
+    >>> observer = sideslip_kinematic_observer(load_robot("adap2e"))
+    >>> time_s, nan = np.arange(200) * 0.1, np.full(200, np.nan)
+    >>> crab = np.column_stack([nan + 2.0, nan * 0.0, 2.0 * time_s, 0.1 * time_s, nan, nan, nan, nan])
+    >>> crab[:, [0, 1, 4]] = 2.0, 0.0, 0.0  # straight ahead at 2 m/s, and 0.1 m/s sideways
+    >>> observe(observer, time_s, crab).slip[-1].round(3)
+    array([0.05, 0.05])
+    """
+    params = pose.shared_params(robot, settings, N_SHARED + 1)
+    params[SLIP_WALK] = slip_walk_radps
+    start = pose.shared_start(SHARED_SIZE + _N * _N)
+    start[COV:].reshape(_N, _N)[2:, 2:] = np.eye(2) * 0.1**2
+    states = ("position_x_m", "position_y_m", "yaw_rad")
+    return Observer(
+        "sideslip-kinematic", states, pose.SIDESLIPS, pose.SIDESLIP_ROWS, params, start, _step, read_pose
+    )
+
+
+@njit(cache=True)
+def error_growth(params: Array, after: Array, size: int, dt_s: float) -> Array:
+    """Return the transition (size, size) of errors of pose and slip over a tick."""
+    grown = np.eye(size)
+    grown[:2, 2:4] = dt_s * slip_jacobian(params, after[SPEED], after[STEER], after[SLIP_F], after[SLIP_R])
+    return grown
+
+
+@njit(cache=True)
+def add_pose_noise(params: Array, after: Array, cov: Array, slip_walk: float, dt_s: float) -> None:
+    """Add in place what the walk of the slip and the measured heading bring."""
+    moved = abs(after[SPEED]) * dt_s
+    cov[0, 0] += moved * abs(after[SPEED]) * pose.GAIN_TIME_S * params[YAW_STD] ** 2
+    if abs(after[SPEED]) >= STANDING_MPS:
+        cov[2, 2] = min(cov[2, 2] + slip_walk**2 * dt_s, 0.25)
+        cov[3, 3] = min(cov[3, 3] + slip_walk**2 * dt_s, 0.25)
+
+
+@njit(cache=True)
+def predict_pose(params: Array, after: Array, dt_s: float) -> None:
+    """Carry the pose on in place by the slip angles; a robot that stands stays."""
+    speed = after[SPEED]
+    if after[HAS_POSITION] == 0.0 or after[HAS_YAW] == 0.0 or abs(speed) < STANDING_MPS:
+        speed = 0.0
+    rate = yaw_rate_of(params, speed, after[STEER], after[SLIP_F], after[SLIP_R])
+    advance_pose(after, speed, abs(speed) * math.tan(after[SLIP_R]), rate, dt_s)
+
+
+@njit(cache=True)
+def _step(params: Array, memory: Array, row: Array, dt_s: float) -> Array:
+    after = memory.copy()
+    if take_inputs(params, after, row, dt_s) != ObserverStatus.OK.value:
+        return after
+    cov = after[COV : COV + _N * _N].reshape(_N, _N)
+    predict_pose(params, after, dt_s)
+    if after[HAS_POSITION] == 1.0 and after[HAS_YAW] == 1.0 and dt_s > 0.0:
+        grown = error_growth(params, after, _N, dt_s)
+        cov[:] = grown @ cov @ grown.T
+        add_pose_noise(params, after, cov, params[SLIP_WALK], dt_s)
+    after[STATUS] = status_of(memory, after, correct_by_fix(params, after, cov, row))
+    return after
+
+
+@njit(cache=True)
+def slip_known(after: Array, std: Array) -> Array:
+    """Return the slip angles (2,), NaN where nothing shows them."""
+    slip = np.array([after[SLIP_F], after[SLIP_R]])
+    for i in range(2):
+        if after[STATUS] == ObserverStatus.STARTING.value or not std[i] < _UNKNOWN_STD_RAD:
+            slip[i] = math.nan
+    return slip
+
+
+@njit(cache=True)
+def _read(memory: Array) -> tuple[Array, Array, Array, Array]:
+    var = np.array([memory[COV], memory[COV], memory[COV + 5], memory[COV + 10], memory[COV + 15]])
+    std = np.sqrt(np.maximum(var, 0.0))
+    mean = np.array([memory[X], memory[Y], memory[YAW]])
+    if memory[HAS_POSITION] == 0.0:
+        mean[:2] = math.nan
+    if memory[HAS_YAW] == 0.0:
+        mean[2] = math.nan
+    slip = slip_known(memory, std[3:])
+    return mean, std[:3], slip, np.where(np.isnan(slip), math.nan, std[3:])
+
+
+def read_pose(params: Array, memory: Array) -> ObserverOutput:
+    """Return what the memory says."""
+    return ObserverOutput(*_read(memory), int(memory[STATUS]))

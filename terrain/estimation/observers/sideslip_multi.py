@@ -1,0 +1,303 @@
+"""Sideslip and cornering stiffness by the multi-model observer: kinematics and dynamics in one state.
+
+State: pose, yaw rate r and lateral velocity w of the centre of mass, slip angles b and cornering stiffness C
+of both axles.  With f of :mod:`~terrain.estimation.observers.sideslip_pose` (path-free; on a straight path
+the paper's), g of :mod:`~terrain.estimation.observers.sideslip_forces`, and e for measured minus estimated::
+
+    dev' = f(dev, b) + K_dev e_dev         dyn' = g(dyn, b, C) + K_dyn e_dyn                   (8)
+    b' = (K_b / K_a) J_f^T e_dev + (K_C / K_a) G_b^T e_dyn       C' = K_C G_C^T e_dyn          (9)
+
+with J_f, G_b and G_C the derivatives of f by b, and of g by b and by C.  Gains of section VI: K_dev = 15 (of
+the two printed "K of yaw rate", 15 and 20, the first is for theta~), K_dyn = 20, K_b = 2e12, K_a = 5e11,
+K_C = 5e7.
+
+Discrete form: the part of e_dev is exact per fix, with the continuous poles; the part of e_dyn, at each tick
+of length h, is implicit, e+ = (1 + h K_dyn + h^2 M)^-1 e with M = (K_C/K_a) G_b G_b^T + K_C G_C G_C^T, which
+is stable for every gain.  w is not measured: (4) gives it from the slip angles that are estimated.  The proof
+(14)-(16) takes it as measured, and is approximate.
+
+C' vanishes with b: cornering stiffness is adapted only while the lateral specific force is above a bound, and
+is kept within physical limits; otherwise it is as it was, with status UNEXCITED.  Its estimate is the secant
+-F/b of a force that saturates, and has to follow it down and up again.
+
+Deremetz et al., ICRA 2017, (7)-(9).  Corrected: signs of line 2 of (3); with ``as_printed`` they are the
+paper's, and C runs to its limits although the robot is tracked as before.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from terrain.errors import ConfigError
+from terrain.estimation.observers import sideslip_pose as pose
+from terrain.estimation.observers.family import Observer, ObserverOutput, ObserverStatus
+from terrain.estimation.observers.sideslip_forces import (
+    BEHIND,
+    C_HIGH_F,
+    C_HIGH_R,
+    C_LOW,
+    N_DYNAMIC,
+    is_excited,
+    rates,
+    rates_by_force,
+    set_dynamics,
+)
+from terrain.estimation.observers.sideslip_kinematic import (
+    add_pose_noise,
+    error_growth,
+    predict_pose,
+    slip_known,
+)
+from terrain.estimation.observers.sideslip_pose import (
+    AHEAD,
+    BASE,
+    HAS_POSITION,
+    HAS_YAW,
+    IN_RATE,
+    ROLL,
+    SHARED_SIZE,
+    SLIP_F,
+    SLIP_MAX_RAD,
+    SLIP_R,
+    SPEED,
+    STANDING_MPS,
+    STATUS,
+    STEER,
+    YAW,
+    X,
+    Y,
+    correct_by_fix,
+    status_of,
+    take_inputs,
+)
+from terrain.records import Array
+from terrain.robots.bicycle import BicycleRobot
+
+RATE, SIDE, C_F, C_R, RATE_AGE = range(SHARED_SIZE, SHARED_SIZE + 5)
+"""Places of yaw rate, lateral velocity and cornering stiffness in the memory, and of the gyro's age."""
+COV = SHARED_SIZE + 5
+_N = 8
+K_DYN, K_C, K_C_A, SLIP_WALK, C_WALK, GYRO_STD = range(N_DYNAMIC, N_DYNAMIC + 6)
+_SLOW_MPS = 0.3
+"""Slower the dynamics are not used: side forces follow where the tyres were, not where they go."""
+
+
+class MultiModelSettings(NamedTuple):
+    """Gains and noise of the multi-model observer.
+
+    Parameters
+    ----------
+    pose : gains, noise and gates of fixes
+    dynamic_gain_ps : K of yaw rate and of w
+    stiffness_gain : K_C
+    dynamic_slip_ratio : K_C / K_alpha
+    excited_mps2 : least lateral specific force for adapting C
+    slip_walk_radps, stiffness_walk_npr : change within a second, one standard deviation
+    stiffness_std_ratio : of the nominal cornering stiffness at first
+    gyro_std_radps : of the yaw rate
+    as_printed : line 2 of (3) with the printed signs, to show what they do
+    """
+
+    pose: pose.PoseSettings = pose.PoseSettings()
+    dynamic_gain_ps: float = 20.0
+    stiffness_gain: float = 5e7
+    dynamic_slip_ratio: float = 1e-4
+    excited_mps2: float = 1.0
+    slip_walk_radps: float = 0.05
+    stiffness_walk_npr: float = 3000.0
+    stiffness_std_ratio: float = 0.4
+    gyro_std_radps: float = 0.003
+    as_printed: bool = False
+
+
+def sideslip_multi_observer(
+    robot: BicycleRobot,
+    settings: MultiModelSettings = MultiModelSettings(),  # noqa: B008
+) -> Observer:
+    """Return the multi-model observer.
+
+    Parameters
+    ----------
+    robot : car-like
+    settings : of the observer
+
+    Raises
+    ------
+    ConfigError
+        if a setting is not accepted.
+
+    Examples
+    --------
+    >>> from terrain.robots import load_robot
+    >>> observer = sideslip_multi_observer(load_robot("adap2e"))
+    >>> observer.states[3:]
+    ('yaw_rate_radps', 'speed_y_mps', 'cornering_front_npr', 'cornering_rear_npr')
+    """
+    own = settings._asdict()
+    own.pop("pose"), own.pop("as_printed")
+    bad = [f"{name} is {value:g}" for name, value in own.items() if not 0.0 <= value < math.inf]
+    if bad or settings.dynamic_gain_ps == 0.0:
+        raise ConfigError(
+            f"{', '.join(bad) or 'dynamic_gain_ps is 0'}; finite gains and deviations are needed"
+        )
+    params = pose.shared_params(robot, settings.pose, GYRO_STD + 1)
+    set_dynamics(params, robot, settings.excited_mps2, settings.as_printed)
+    params[[K_DYN, K_C, K_C_A]] = (
+        settings.dynamic_gain_ps, settings.stiffness_gain, settings.dynamic_slip_ratio
+    )  # fmt: skip
+    params[[SLIP_WALK, C_WALK]] = settings.slip_walk_radps, settings.stiffness_walk_npr
+    params[GYRO_STD] = settings.gyro_std_radps
+    start = pose.shared_start(COV + _N * _N)
+    nominal = np.array([robot.front_cornering_npr, robot.rear_cornering_npr])
+    start[[C_F, C_R]], start[RATE_AGE] = nominal, pose.LOST_S
+    std = [0.0, 0.0, 0.1, 0.1, 0.1, 0.1, *settings.stiffness_std_ratio * nominal]
+    start[COV:] = np.diag(np.square(std)).ravel()
+    states = ("position_x_m", "position_y_m", "yaw_rad", "yaw_rate_radps", "speed_y_mps")
+    states += ("cornering_front_npr", "cornering_rear_npr")
+    return Observer("sideslip-multi", states, pose.SIDESLIPS, pose.SIDESLIP_ROWS, params, start, _step, _read)
+
+
+@njit(cache=True)
+def _side_speed(params: Array, after: Array) -> float:
+    """Return w by (4), of the slip angles."""
+    sign = -1.0 if after[SPEED] < 0.0 else 1.0
+    front = math.tan(min(max(after[STEER] + sign * after[SLIP_F], -1.4), 1.4))
+    rear = math.tan(sign * after[SLIP_R])
+    return after[SPEED] * (params[AHEAD] * front + params[BEHIND] * rear) / params[BASE]
+
+
+@njit(cache=True)
+def _error_model(params: Array, after: Array, adapted: bool) -> tuple[Array, Array, Array]:
+    """Return derivatives of g by b and by C (2, 2), 0 where C is not adapted, and of w in (4) by b (2,)."""
+    by_force = rates_by_force(params, after[STEER])
+    by_slip, by_stiffness, side = np.zeros((2, 2)), np.zeros((2, 2)), np.zeros(2)
+    for i in range(2):
+        by_slip[i, 0], by_slip[i, 1] = by_force[i, 0] * after[C_F], by_force[i, 1] * after[C_R]
+        if adapted:
+            by_stiffness[i, 0] = by_force[i, 0] * after[SLIP_F]
+            by_stiffness[i, 1] = by_force[i, 1] * after[SLIP_R]
+    size, sign = abs(after[SPEED]), -1.0 if after[SPEED] < 0.0 else 1.0
+    front = math.cos(min(max(after[STEER] + sign * after[SLIP_F], -1.4), 1.4))
+    side[0] = size * params[AHEAD] / (params[BASE] * front**2)
+    side[1] = size * params[BEHIND] / (params[BASE] * math.cos(after[SLIP_R]) ** 2)
+    return by_slip, by_stiffness, side
+
+
+@njit(cache=True)
+def _dynamic_gains(params: Array, by_slip: Array, by_stiffness: Array, measured: bool, dt_s: float) -> Array:
+    """Return the gains (_N, 2) of a tick on the errors of yaw rate and of w."""
+    kept = np.eye(2) * (1.0 + dt_s * params[K_DYN])
+    for i in range(2):
+        for j in range(2):
+            for k in range(2):
+                kept[i, j] += dt_s**2 * params[K_C_A] * by_slip[i, k] * by_slip[j, k]
+                kept[i, j] += dt_s**2 * params[K_C] * by_stiffness[i, k] * by_stiffness[j, k]
+    if not measured:
+        kept[0, 1] = kept[1, 0] = 0.0
+    det = kept[0, 0] * kept[1, 1] - kept[0, 1] * kept[1, 0]
+    inverse = np.empty((2, 2))
+    inverse[0, 0], inverse[1, 1] = kept[1, 1] / det, kept[0, 0] / det
+    inverse[0, 1], inverse[1, 0] = -kept[0, 1] / det, -kept[1, 0] / det
+    if not measured:
+        inverse[:, 0] = 0.0
+    gains = np.zeros((_N, 2))
+    gains[2:4] = dt_s * params[K_C_A] * (by_slip.T @ inverse)
+    gains[4:6] = dt_s * params[K_DYN] * inverse
+    gains[6:8] = dt_s * params[K_C] * (by_stiffness.T @ inverse)
+    return gains
+
+
+@njit(cache=True)
+def _correct_dynamics(params: Array, after: Array, cov: Array, rate_measured: float, dt_s: float) -> bool:
+    """Predict and correct yaw rate, w, slip and C in place by a tick; return whether C was adapted."""
+    measured = after[RATE_AGE] == 0.0
+    rate = rate_measured if measured else after[RATE]
+    adapted = measured and is_excited(params, after[SPEED], after[ROLL], rate)
+    by_slip, by_stiffness, side = _error_model(params, after, adapted)
+    gains = _dynamic_gains(params, by_slip, by_stiffness, measured, dt_s)
+    slips, stiffness = np.array([after[SLIP_F], after[SLIP_R]]), np.array([after[C_F], after[C_R]])
+    turning, pushed = rates(params, after[SPEED], after[STEER], after[ROLL], rate, slips, stiffness)
+    after[RATE] += dt_s * turning
+    after[SIDE] += dt_s * pushed
+    error = np.array([rate - after[RATE] if measured else 0.0, _side_speed(params, after) - after[SIDE]])
+    change = gains @ error
+    after[SLIP_F] = min(max(after[SLIP_F] + change[2], -SLIP_MAX_RAD), SLIP_MAX_RAD)
+    after[SLIP_R] = min(max(after[SLIP_R] + change[3], -SLIP_MAX_RAD), SLIP_MAX_RAD)
+    after[RATE] += change[4]
+    after[SIDE] += change[5]
+    after[C_F] = min(max(after[C_F] + change[6], params[C_LOW]), params[C_HIGH_F])
+    after[C_R] = min(max(after[C_R] + change[7], params[C_LOW]), params[C_HIGH_R])
+    grown = error_growth(params, after, _N, dt_s)
+    grown[4:6, 2:4] = dt_s * by_slip
+    grown[4:6, 6:8] = dt_s * by_stiffness
+    if not measured:
+        grown[5, 4] = -dt_s * after[SPEED]
+    seen = np.zeros((2, _N))
+    seen[0, 4] = seen[1, 5] = 1.0
+    seen[1, 2], seen[1, 3] = -side[0], -side[1]
+    grown = grown - gains @ (seen @ grown)
+    cov[:] = grown @ cov @ grown.T
+    for i in range(_N):
+        for j in range(_N):
+            cov[i, j] += gains[i, 0] * gains[j, 0] * params[GYRO_STD] ** 2
+    if adapted:
+        for i in range(6, 8):
+            cov[i, i] = min(cov[i, i] + params[C_WALK] ** 2 * dt_s, params[C_HIGH_F] ** 2)
+    return adapted
+
+
+@njit(cache=True)
+def _step(params: Array, memory: Array, row: Array, dt_s: float) -> Array:
+    after = memory.copy()
+    if take_inputs(params, after, row, dt_s) != ObserverStatus.OK.value:
+        return after
+    cov = after[COV : COV + _N * _N].reshape(_N, _N)
+    predict_pose(params, after, dt_s)
+    rate_measured = row[IN_RATE]
+    known = abs(rate_measured) < 20.0
+    after[RATE_AGE] = 0.0 if known else min(after[RATE_AGE] + dt_s, 1e6)
+    adapted, posed = False, after[HAS_POSITION] == 1.0 and after[HAS_YAW] == 1.0
+    if posed and dt_s > 0.0 and abs(after[SPEED]) >= _SLOW_MPS:
+        adapted = _correct_dynamics(params, after, cov, rate_measured, min(dt_s, 0.1))
+        add_pose_noise(params, after, cov, params[SLIP_WALK], dt_s)
+    elif posed and dt_s > 0.0:
+        grown = error_growth(params, after, _N, dt_s)
+        cov[:] = grown @ cov @ grown.T
+        add_pose_noise(params, after, cov, params[SLIP_WALK], dt_s)
+        after[RATE] = rate_measured if known else after[RATE]
+        after[SIDE] = _side_speed(params, after) if abs(after[SPEED]) >= STANDING_MPS else 0.0
+        cov[4, 4] = params[GYRO_STD] ** 2
+    status = status_of(memory, after, correct_by_fix(params, after, cov, row))
+    if status == ObserverStatus.OK.value and not adapted:
+        status = ObserverStatus.UNEXCITED.value
+    after[STATUS] = status
+    return after
+
+
+@njit(cache=True)
+def _figures(memory: Array) -> tuple[Array, Array, Array, Array]:
+    var = np.empty(_N + 1)
+    for i in range(_N):
+        var[i + 1] = max(memory[COV + i * (_N + 1)], 0.0)
+    var[0] = var[1]
+    std = np.sqrt(var)
+    mean = np.empty(7)
+    mean[0], mean[1], mean[2] = memory[X], memory[Y], memory[YAW]
+    mean[3], mean[4], mean[5], mean[6] = memory[RATE], memory[SIDE], memory[C_F], memory[C_R]
+    if memory[HAS_POSITION] == 0.0:
+        mean[:2] = math.nan
+    if memory[HAS_YAW] == 0.0:
+        mean[2] = math.nan
+    if memory[STATUS] == ObserverStatus.STARTING.value:
+        mean[3:5] = math.nan
+    slip = slip_known(memory, std[3:5])
+    errors = np.array([std[0], std[1], std[2], std[5], std[6], std[7], std[8]])
+    return mean, errors, slip, np.where(np.isnan(slip), math.nan, std[3:5])
+
+
+def _read(params: Array, memory: Array) -> ObserverOutput:
+    return ObserverOutput(*_figures(memory), int(memory[STATUS]))

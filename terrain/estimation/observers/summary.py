@@ -1,0 +1,110 @@
+"""Estimates of an observer in a few figures, beside the truth where there is one."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from terrain.estimation.observers.estimate import ObserverEstimate, seconds_by_status
+from terrain.estimation.observers.family import ObserverStatus
+from terrain.records import Array
+
+
+@dataclass(frozen=True, slots=True)
+class ObservedSlip:
+    """One slip of a run; NaN where something is not known.
+
+    Parameters
+    ----------
+    mean, std : while the status is ok: mean of the slip, and root mean square of its standard deviation
+    true_mean, rmse : of the truth, and of the error
+    nees : mean squared error over the variance stated, 1 where that is right
+    """
+
+    mean: float
+    std: float
+    true_mean: float
+    rmse: float
+    nees: float
+
+
+@dataclass(frozen=True, slots=True)
+class ObserverSummary:
+    """Figures of one run; NaN where something is not known.
+
+    Parameters
+    ----------
+    run_id, filter : which run and which observer
+    slip : of each slip, by channel
+    position_rmse_m, position_end_m : error of the position over the run, and at its end
+    status_s : how long it had each status
+    dropped : samples left out, as counts by kind
+    finite : whether all estimates are finite once the observer has started
+    """
+
+    run_id: str
+    filter: str
+    slip: Mapping[str, ObservedSlip]
+    position_rmse_m: float
+    position_end_m: float
+    status_s: Mapping[str, float]
+    dropped: Mapping[str, int]
+    finite: bool
+
+
+def summarize_observer(found: ObserverEstimate) -> ObserverSummary:
+    """Return the figures of an estimate."""
+    track = found.track
+    started = track.status != ObserverStatus.STARTING
+    settled = track.status == ObserverStatus.OK
+    slips = {
+        name: _slip(track.slip[settled, k], track.slip_std[settled, k], found.true(name), settled)
+        for k, name in enumerate(track.slips)
+    }
+    error_m = _position_error(found)[started]
+    position = [k for k, name in enumerate(track.states) if name.startswith("position_")]
+    return ObserverSummary(
+        run_id=found.run.run_id,
+        filter=found.observer.name,
+        slip=slips,
+        position_rmse_m=_root_mean_square(error_m),
+        position_end_m=float(error_m[-1]) if len(error_m) else math.nan,
+        status_s=seconds_by_status(track),
+        dropped=dict(found.dropped),
+        finite=bool(np.isfinite(track.mean[started][:, position]).all()),
+    )
+
+
+def _slip(slip: Array, std: Array, true: Array | None, settled: Array) -> ObservedSlip:
+    true = np.full(len(slip), np.nan) if true is None else true[settled]
+    error = slip - true
+    with np.errstate(divide="ignore", invalid="ignore"):
+        squares = np.where(std > 0.0, (error / std) ** 2, np.nan)
+    return ObservedSlip(
+        _mean(slip), _root_mean_square(std), _mean(true), _root_mean_square(error), _mean(squares)
+    )
+
+
+def _position_error(found: ObserverEstimate) -> Array:
+    """Return the distance (n,) from the true position; odometry begins at the true pose."""
+    track = found.track
+    x, y, yaw = (found.true(name) for name in ("position_x_m", "position_y_m", "yaw_rad"))
+    if x is None or y is None or yaw is None or "position_x_m" not in track.states:
+        return np.full(len(track.time_s), np.nan)
+    own = track.state("position_x_m") + 1j * track.state("position_y_m")
+    true = x + 1j * y
+    if "position_x_m" not in found.observer.rows:  # it does not know where it begins
+        own = own * np.exp(1j * yaw[0]) + true[0]
+    return np.abs(own - true)
+
+
+def _mean(values: Array) -> float:
+    known = values[np.isfinite(values)]
+    return float(known.mean()) if known.size else math.nan
+
+
+def _root_mean_square(values: Array) -> float:
+    return math.sqrt(_mean(values**2))

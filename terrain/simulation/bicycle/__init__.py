@@ -1,0 +1,1 @@
+"""Car-like robots on side slopes, simulated with tyres whose side force saturates."""

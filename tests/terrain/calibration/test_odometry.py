@@ -1,0 +1,142 @@
+"""Odometry fitted to legs: a hidden slip model comes back, folds hold whole runs, mounts are taken off."""
+
+import math
+
+import numpy as np
+import pytest
+
+from terrain.calibration.adaptive_legs import dead_reckoning, of_body, of_point
+from terrain.calibration.odometry_fit import (
+    ENCODER,
+    ENDO,
+    GYRODOMETRY,
+    SLIP,
+    fit_odometry,
+    level,
+    predict_ends,
+    without_tilt,
+)
+from terrain.calibration.odometry_judge import held_out_ends, score_legs
+from terrain.calibration.odometry_legs import Leg, composed, legs_of_poses, legs_of_windows, relative
+from terrain.errors import DataError
+from terrain.logs.drive_poses import WindowPoses
+from terrain.robots import load_robot
+from terrain.simulation.tracked.given_slip import GivenSlip
+from terrain.simulation.tracked.run import QUIET, simulate_tracked
+
+PATAKO = load_robot("patako")
+GIVEN = GivenSlip(slip_ratio=0.08, turning_loss_ratio=0.4, turning_exponent=0.7)
+
+
+def drives(given=GIVEN, n=12, seed=0, sensors=None):
+    """Return runs of arcs of several radii with poses of cameras around."""
+    rng, runs = np.random.default_rng(seed), []
+    for k in range(n):
+        speeds = rng.uniform(-0.15, 0.15, 2)
+        belts = np.tile(speeds, (401, 1))
+        also = {} if sensors is None else {"sensors": sensors}
+        runs.append(simulate_tracked(PATAKO, given, belts, 100 * seed + k, run_id=f"run_{k}", **also))
+    return runs
+
+
+@pytest.fixture(scope="module")
+def legs():
+    return [leg for k, run in enumerate(drives()) for leg in legs_of_poses(run, k, PATAKO, 2.0)]
+
+
+def test_a_hidden_slip_model_comes_back_within_its_own_error(legs):
+    found = fit_odometry(level(SLIP), legs, PATAKO).model
+    std = np.sqrt(np.diag(found.covariance))
+    assert abs(found.turning_exponent - 0.7) < max(3.0 * std[0], 0.01) < 0.05
+    assert abs(found.compaction_slip_ratio - 0.08) < max(3.0 * std[1], 0.002) < 0.02
+    track = fit_odometry(ENCODER, legs, PATAKO).model.track_ratio
+    assert track == pytest.approx(1.0 / 0.6, rel=0.05)
+
+
+def test_legs_without_noise_are_predicted_exactly():
+    quiet = [leg for k, run in enumerate(drives(sensors=QUIET)) for leg in legs_of_poses(run, k, PATAKO, 2.0)]
+    ends = predict_ends(fit_odometry(ENDO, quiet, PATAKO), quiet, PATAKO)
+    assert ends[:, :2] == pytest.approx(np.array([leg.moved[:2] for leg in quiet]), abs=1e-3)
+
+
+def test_slip_that_is_known_beats_slip_that_is_not_on_runs_held_out(legs):
+    ends = held_out_ends({"2 s": legs}, PATAKO, 4, 0)
+    scores = score_legs(legs, {name: by["2 s"] for name, by in ends.items()}, 0)
+    by_name = {kind.kind: kind for kind in scores.kinds}
+    assert by_name[ENDO.name].gain_gyro > 0.5
+    assert by_name[ENDO.name].gain_gyro_ci[0] > 0.0
+    assert by_name[GYRODOMETRY.name].gain_gyro == 0.0
+    assert all(kind.rmse_ci_m[0] <= kind.rmse_m <= kind.rmse_ci_m[1] for kind in scores.kinds)
+    assert scores.n_runs == 12
+
+
+def test_a_run_is_never_in_the_fit_that_predicts_it(legs):
+    """A run whose poses are wrong changes what is predicted of others, not of itself."""
+    wrong = [leg._replace(moved=leg.moved * 5.0) if leg.run == 3 else leg for leg in legs]
+    clean = held_out_ends({"2 s": legs}, PATAKO, 12, 1)[ENDO.name]["2 s"]
+    spoiled = held_out_ends({"2 s": wrong}, PATAKO, 12, 1)[ENDO.name]["2 s"]
+    own = np.array([leg.run == 3 for leg in legs])
+    assert spoiled[own] == pytest.approx(clean[own], abs=1e-12)
+    assert not np.allclose(spoiled[~own], clean[~own], atol=1e-9)
+
+
+def test_a_mount_is_taken_off_and_put_back():
+    mount, pose = np.array([-0.3, 0.1, 0.2]), np.array([1.0, -0.5, 2.5])
+    assert of_point(of_body(pose, mount), mount) == pytest.approx(pose)
+    assert of_body(np.zeros(3), mount) == pytest.approx(np.zeros(3))
+    spin = of_point(np.array([0.0, 0.0, math.pi]), np.array([-0.3, 0.0, 0.0]))
+    assert spin == pytest.approx([0.6, 0.0, math.pi])
+
+
+def test_the_mount_is_found_from_spins(legs):
+    mount = np.array([-0.2, 0.05, 0.03])
+    seen = [leg._replace(moved=of_point(leg.moved, mount)) for leg in legs]
+    found = fit_odometry(level(SLIP), seen, PATAKO)
+    assert found.mount == pytest.approx(mount, abs=0.02)
+
+
+def test_poses_compose_and_relate():
+    rng = np.random.default_rng(0)
+    for first, then in rng.normal(size=(20, 2, 3)):
+        assert relative(first, composed(first, then)) == pytest.approx(then)
+
+
+def test_windows_are_chained_over_their_gaps():
+    run = drives(n=1)[0]
+    pose, time = run.streams["pose"].values, run.streams["pose"].time_s
+
+    def window(begin, end):
+        rows = np.flatnonzero((time >= begin) & (time <= end))[::10]
+        moved = np.array([relative(pose[rows[0]], pose[k]) for k in rows])
+        moved[:, 2] = np.unwrap(moved[:, 2])
+        return WindowPoses(time[rows], moved)
+
+    windows = [window(1.0, 2.9), window(3.0, 4.9)]
+    single, whole = legs_of_windows(run, 0, windows, PATAKO, 0.0)
+    assert [round(leg.length_s, 6) for leg in single] == [1.9, 1.9]
+    assert whole is None  # no lidar bridges the gap
+    assert legs_of_windows(run, 0, [], PATAKO, 0.0) == ([], None)
+
+
+def test_dead_reckoning_with_efficiencies_is_the_arc_of_the_paper():
+    speeds = np.tile([0.4, 0.6], (200, 1))
+    leg = Leg(0, np.zeros(3), 0.01, speeds, np.zeros(200), np.zeros((200, 2)), 2.0)
+    x, y, yaw = dead_reckoning(leg, np.array([1.1, 0.8]), PATAKO)
+    turn = (0.48 - 0.44) / PATAKO.track_m
+    assert yaw == pytest.approx(2.0 * turn)
+    radius = 0.46 / turn
+    assert (x, y) == pytest.approx((radius * math.sin(yaw), radius * (1.0 - math.cos(yaw))), rel=1e-3)
+
+
+def test_too_little_is_refused(legs):
+    with pytest.raises(DataError, match="3 legs have poses at both ends, 10 or more are required"):
+        fit_odometry(ENDO, legs[:3], PATAKO)
+    with pytest.raises(DataError, match="at least 20 are required for 20 folds"):
+        held_out_ends({"2 s": legs}, PATAKO, 20, 0)
+
+
+def test_without_tilt_slopes_are_left_out_of_the_fit(legs):
+    flat = [leg._replace(tilt_rad=np.zeros_like(leg.tilt_rad)) for leg in legs]
+    assert without_tilt(flat)
+    assert not without_tilt(legs)
+    assert fit_odometry(level(SLIP), flat, PATAKO).model.grade_slip_ratio == 0.0

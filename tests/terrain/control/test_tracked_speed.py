@@ -1,0 +1,127 @@
+"""Compensation of slip: with the observer in the loop the desired speeds are held."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from terrain.control.tracked_speed import (
+    TrackSpeedSettings,
+    TrackSpeedStatus,
+    track_speed_params,
+    track_speed_step,
+)
+from terrain.errors import ConfigError
+from terrain.estimation.observers.tracked import tracked_observer
+from terrain.estimation.observers.tracked_settings import TrackedSettings
+from terrain.robots import load_robot
+
+ROBOT = load_robot("orchard_ugv")
+D, DT_S = ROBOT.half_track_m, 0.02
+PARAMS = track_speed_params(ROBOT)
+ONES, NONE = np.ones(2), np.zeros(2)
+
+
+def command(eta, std=NONE, forward=0.5, turn=0.1, used=None, dt_s=DT_S, params=PARAMS):
+    return track_speed_step(
+        params, np.array(eta if used is None else used), forward, turn, np.array(eta), std, dt_s
+    )
+
+
+def closed_loop(true_eta, compensate, seed=0, forward=0.5, turn=0.1, lag_s=0.1):
+    """Return forward and turning speeds (n, 2) of a robot whose efficiencies are (n, 2), from raw 2 cm fixes.
+
+    Tracks follow their commands with a lag.
+    """
+    rng = np.random.default_rng(seed)
+    observer = tracked_observer(ROBOT, TrackedSettings(observation_gain_ps=(2.0, 2.0, 2.0), normalised=True))
+    memory, used, pose, tracks, motion = np.array(observer.start), ONES, np.zeros(3), np.zeros(2), []
+    for k, eta in enumerate(true_eta):
+        reading = observer.read(observer.params, memory)
+        known = (reading.mean[5:7], reading.std[5:7]) if compensate else (ONES, NONE)
+        asked = track_speed_step(PARAMS, used, forward, turn, *known, DT_S)
+        used = asked.eta
+        ground = eta * tracks
+        speed, rate = ground.mean(), (ground[1] - ground[0]) / (2 * D)
+        pose = pose + DT_S * np.array([speed * math.cos(pose[2]), speed * math.sin(pose[2]), rate])
+        tracks = tracks + DT_S / lag_s * (np.array([asked.left_mps, asked.right_mps]) - tracks)
+        row = np.r_[tracks, np.full(3, np.nan), rate + 0.002 * rng.standard_normal()]
+        if k % 5 == 0:
+            row[2:5] = pose + rng.standard_normal(3) * [0.02, 0.02, 0.009]
+        memory = observer.step(observer.params, memory, row, DT_S)
+        motion.append([speed, rate])
+    return np.array(motion)
+
+
+def test_constant_slip_is_compensated():
+    true_eta = np.tile([1.1, 0.8], (3000, 1))
+    held, plain = (closed_loop(true_eta, compensate)[1000:] for compensate in (True, False))
+    desired = [0.5, 0.1]
+    assert (abs(held.mean(axis=0) - desired) < [0.002, 0.004]).all()
+    # a normalised gain of 2 leaves 0.5 % of each track's 0.5 m/s
+    assert (np.sqrt(np.mean((held - desired) ** 2, axis=0)) < [0.005, 0.01]).all()
+    assert (abs(plain.mean(axis=0) - desired) > [0.03, 0.1]).all()
+
+
+def test_changing_slip_is_followed():
+    """A step of the soil, and a slow swing."""
+    time_s = np.arange(4000) * DT_S
+    true_eta = np.stack([np.where(time_s < 40, 0.95, 0.75), 0.85 + 0.1 * np.sin(time_s / 8)], axis=-1)
+    held, plain = (closed_loop(true_eta, compensate)[500:] for compensate in (True, False))
+    rmse_held, rmse_plain = (np.sqrt(np.mean((motion - [0.5, 0.1]) ** 2, axis=0)) for motion in (held, plain))
+    assert (rmse_held < rmse_plain / 2).all()
+    # a gain of 2 follows 2 s late: of an efficiency that changes by 0.0125 1/s, at a track speed of 0.7 m/s
+    assert abs(held[-500:].mean(axis=0) - [0.5, 0.1]).max() < 2 * 0.0125 * 0.7
+
+
+@pytest.mark.parametrize("speeds", [(0.5, 0.1), (-0.5, 0.1), (0.0, 0.4), (0.0, 0.0)])
+def test_known_efficiencies_give_the_desired_motion(speeds):
+    forward, turn = speeds
+    left, right, _, status = command([1.2, 0.7], forward=forward, turn=turn)
+    assert (1.2 * left + 0.7 * right) / 2 == pytest.approx(forward)
+    assert (0.7 * right - 1.2 * left) / (2 * D) == pytest.approx(turn)
+    assert status == TrackSpeedStatus.OK
+
+
+def test_too_fast_a_motion_keeps_its_curvature():
+    left, right, _, status = command([0.9, 0.6], forward=2.0, turn=0.8)
+    forward, turn = (0.9 * left + 0.6 * right) / 2, (0.6 * right - 0.9 * left) / (2 * D)
+    assert turn / forward == pytest.approx(0.4)
+    assert max(left, right) == pytest.approx(TrackSpeedSettings().track_speed_max_mps)
+    assert status == TrackSpeedStatus.SATURATED
+
+
+def test_an_estimate_is_used_as_far_as_it_is_known():
+    settled = {"dt_s": 0.5, "used": [0.8, 0.8]}
+    slow = track_speed_params(ROBOT, replace(TrackSpeedSettings(), eta_rate_ps=10.0))
+    used = [command([0.8, 0.8], np.full(2, std), params=slow, **settled).eta[0] for std in (0.0, 0.2, 1e3)]
+    np.testing.assert_allclose(used, [0.8, 0.9, 1.0], atol=1e-6)
+    unknown = command([np.nan, 0.8], params=slow, **settled)
+    assert unknown.eta[0] == 1.0
+    assert unknown.status == TrackSpeedStatus.UNESTIMATED
+
+
+def test_limits_of_the_compensation():
+    assert command([0.1, 1.0], used=[0.3, 1.0]).eta[0] == 0.3
+    assert command([0.1, 1.0], used=[0.3, 1.0]).status == TrackSpeedStatus.FLOORED
+    moved = command([0.6, 1.0], used=ONES).eta
+    np.testing.assert_allclose(moved, [1 - 0.2 * DT_S, 1.0])
+
+
+def test_whatever_comes_in_the_speeds_are_finite_and_within_limits():
+    rng, strange = np.random.default_rng(0), [math.nan, math.inf, -math.inf, 0.0, -1.0, 1e308, 0.5, 1e-320]
+    for _ in range(2000):
+        forward, turn, dt_s = rng.choice(strange, 3)
+        found = command(
+            rng.choice(strange, 2), rng.choice(strange, 2), forward, turn, rng.choice(strange, 2), dt_s
+        )
+        assert max(abs(found.left_mps), abs(found.right_mps)) <= 1.5 * (1 + 1e-12)
+        assert np.isfinite(found.eta).all() or found.status == TrackSpeedStatus.BAD_INPUT
+
+
+def test_settings_that_cannot_be():
+    with pytest.raises(ConfigError, match="eta_rate_ps is 0"):
+        track_speed_params(ROBOT, TrackSpeedSettings(eta_rate_ps=0.0))
+    with pytest.raises(ConfigError, match="at most 1"):
+        track_speed_params(ROBOT, TrackSpeedSettings(eta_floor_ratio=1.5))
