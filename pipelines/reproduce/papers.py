@@ -32,3 +32,41 @@ PAPERS: Mapping[str, Paper] = {
         ),
         module="pipelines.reproduce.tazzari.experiments",
         descriptions=(("robots", "orchard_ugv"), ("soils", "grass"), ("soils", "dry_sand")),
+    ),
+    "yamauchi": Paper(
+        title="Yamauchi et al., slip-compensated odometry",
+        about=(
+            "G. Yamauchi, K. Nagatani, T. Hashimoto and K. Fujino, Slip-compensated odometry for tracked "
+            "vehicle on loose and weak slope, ROBOMECH Journal, 2017"
+        ),
+        module="pipelines.reproduce.yamauchi.experiments",
+        descriptions=(("robots", "patako"), ("soils", "extra/toyoura_sand"), ("soils", "firm_soil_gravel")),
+    ),
+}
+"""Papers by the name that the command takes."""
+
+
+def assumed_numbers(descriptions: Iterable[tuple[str, str]]) -> tuple[AssumedNumber, ...]:
+    """Return every number of the descriptions that was assumed or fitted, by its own source.
+
+    Examples
+    --------
+    >>> assumed_numbers([("soils", "asphalt")])[-1].file
+    'soils/asphalt.yaml'
+    """
+    return tuple(
+        AssumedNumber(f"{kind}/{name}.yaml", key, entry["value"], entry["unit"], str(entry["source"]))
+        for kind, name in descriptions
+        for key, entry in _entries(read_yaml(data_folder(kind) / f"{name}.yaml"))
+        if "value" in entry
+        and any(mark in str(entry.get("source", "")) for mark in ("assumed", "identified"))
+    )
+
+
+def _entries(described: Any, place: str = "") -> Iterable[tuple[str, dict[str, Any]]]:
+    """Yield, by their dotted names, the mappings of a description that hold no further ones with a value."""
+    for key, value in described.items():
+        if isinstance(value, dict) and "value" in value:
+            yield f"{place}{key}", value
+        elif isinstance(value, dict):
+            yield from _entries(value, f"{place}{key}.")
