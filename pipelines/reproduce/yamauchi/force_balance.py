@@ -52,11 +52,9 @@ def force_balance(seed: int, quick: bool) -> Finding:
 
 
 _CAPTION = (
-    "Resistance of compaction and of the grade over the slope, of Patako (25 kg) on four soils, by (8) "
-    "with the "
-    "n-th root and (10) with the grade. The soils are those of this project; the paper's figure has sand, "
-    "snow, "
-    "loam and a lunar simulant."
+    "Resistance of compaction and of the grade over the slope, of Patako (25 kg) on four soils, by (8) with "
+    "the n-th root and (10) with the grade. The soils are those of this project, Toyoura sand with the moduli "
+    "of dry sand; the paper's figure has sand, snow, loam and a lunar simulant."
 )
 
 

@@ -130,9 +130,9 @@ def _rows(curves: Mapping[str, OnSlopes], slopes_deg: Array, line: Array, side: 
             simulated=spread,
             unit="ratio",
             verdict=holds(spread < ALIKE_RATIO),
-            why="Sideways force takes a part of the friction, so that the small slip of compaction and "
-            "rolling "
-            "grows a little with the roll.",
+            why="The slip of rolling and compaction does not change; on steep slopes the robot turns a "
+            "little "
+            "downhill, as its lower track carries more, and gravity helps.",
         ),
         Row(
             what="Slip angle over the slope from 0° to 20°, traversing: R² of the line through the means",
