@@ -72,19 +72,16 @@ def turning_odometry(seed: int, quick: bool) -> Finding:
 
 _WHY_PLAIN = (
     "Laws as printed, trained and judged on turns uphill. The paper's figure is of one trial of each "
-    "condition, "
-    "with respect to conventional odometry."
+    "condition, with respect to conventional odometry."
 )
 _CAPTION = (
     "Position in the first judged trial of each condition of experiment III, turning uphill to the left: "
-    "truth, "
-    "gyrodometry, Endo's law, and slip-compensated odometry as printed and with drift in turns in "
+    "truth, gyrodometry, Endo's law, and slip-compensated odometry as printed and with drift in turns in "
     "turns."
 )
 _ANGLE_CAPTION = (
     "Slip angle over time at 15° and 30°/s, turning uphill: first the robot drifts down the slope, then "
-    "towards "
-    "the middle of the turn, as in fig. 14."
+    "towards the middle of the turn, as in fig. 14."
 )
 
 
@@ -161,15 +158,15 @@ def _downhill_as_printed(errors: Errors, seed: int) -> Row:
     low, high = mean_interval(found, seed)
     return Row(
         what=f"Fall of the position RMSE against {GYRO}, as printed, trained uphill and judged turning "
-        f"downhill",
+        "downhill",
         where="(28)",
         printed="not evaluated",
         simulated=float(found.mean()),
         spread=(float(found.min()), float(found.max())),
         unit="ratio",
         verdict=Verdict.NOT_PRINTED,
-        why="What the regression learned of turns in one direction on the slope does not hold for the other. "
-        f"Interval of the mean: {low:.3f} to {high:.3f}.",
+        why="What the regression learned of turns in one direction on the slope does not hold for the "
+        f"other. Interval of the mean: {low:.3f} to {high:.3f}.",
     )
 
 
@@ -188,13 +185,10 @@ def _angle_row(trials: Sequence[Trial]) -> Row:
         spread=(float(ends[:, 1].min()), float(ends[:, 1].max())),
         unit="deg",
         verdict=holds(bool(ends[:, 0].mean() < 0.0 < ends[:, 1].mean())),
-        why="First the robot drifts down the slope. At the end it heads uphill, its load has moved to the "
-        "rear, "
-        "and it turns about a point behind its middle, which so moves towards the centre of the turn: "
-        "with the "
-        "centre of mass 1 cm above the ground, and the same heap, the angle is as given beside. The paper "
-        "has "
-        "the heap alone for a reason.",
+        why="First the robot drifts down the slope. At the end it heads uphill, its load has moved to "
+        "the rear, and it turns about a point behind its middle, which so moves towards the centre of "
+        "the turn: with the centre of mass 1 cm above the ground, and the same soil, the angle is as "
+        "given beside. The paper has the heap alone for a reason.",
         beside={"a second after the start": float(ends[:, 0].mean()), "low robot": float(low[:, 1].mean())},
     )
 
@@ -230,8 +224,7 @@ def _coverage_row(observer: Observer, trials: Sequence[Trial]) -> Row:
         unit="ratio",
         verdict=Verdict.NOT_PRINTED,
         why="1 is consistent. The model is the same for all rates and slopes, and what it misses under "
-        "one of them "
-        "is alike in all its turns.",
+        "one of them is alike in all its turns.",
     )
 
 

@@ -93,9 +93,9 @@ class SlipModel:
     track_ratio : effective distance of the tracks over the described one, for a robot without a gyro
     covariance : (16, 16) of :data:`PARAMETERS`
     slip_std_ratio, angle_std_rad : residuals of V_x and V_y within a run, over the speed of the tracks
-    correlation_s : over which the residuals within a run are alike
     run_slip_std_ratio, run_angle_std_rad : b, what a whole run has in common
     found : how the numbers were found
+    correlation_s : over which the residuals within a run are alike
     turn_side_m : lambda_y, speed down to the side by yaw rate and roll
     turn_shift_m : c, distance behind the middle of the point of turning, per rad of grade
 
@@ -120,10 +120,10 @@ class SlipModel:
     covariance: Array = field(default_factory=lambda: np.zeros((N_MODEL, N_MODEL)))
     slip_std_ratio: float = 0.0
     angle_std_rad: float = 0.0
-    correlation_s: float = 0.5
     run_slip_std_ratio: float = 0.0
     run_angle_std_rad: float = 0.0
     found: str = "given"
+    correlation_s: float = 0.5
     turn_side_m: float = 0.0
     turn_shift_m: float = 0.0
 
