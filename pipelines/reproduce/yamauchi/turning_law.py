@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from pipelines.reporting.drawing import BLUE, GREEN, INK, VERMILION
-from pipelines.reproduce.results import Finding, Picture, Row, Verdict, verdict_of
+from pipelines.reproduce.results import Finding, Picture, Row, Verdict, holds, verdict_of
 from pipelines.reproduce.yamauchi.figures import Mark, Panel, panels_figure
 from pipelines.reproduce.yamauchi.trials import (
     FEW_REPEATS,
@@ -38,6 +39,9 @@ FIRM = "firm_soil_gravel"
 
 EXPONENTS = (0.3, 0.6, 0.847, 1.0, 1.3)
 HIDDEN_LOSS = 0.36
+ALIKE_RATIO = 0.05
+"""Difference up to which two n are alike: twice that of the paper's two."""
+
 N_DRAWS, FEW_DRAWS = 200, 20
 
 
@@ -58,9 +62,10 @@ def turning_law(seed: int, quick: bool) -> Finding:
         [run_trial(trial, load_soil(FIRM)) for trial in _floor_trials(seed, 3)], robot
     ).turning
     found = {
-        "sand": _exponent(sand, grade=True, n_draws=n_draws, seed=seed),
-        "sand_as_printed": _exponent(sand, grade=False, n_draws=n_draws, seed=seed),
-        "floor": _exponent(floor, grade=False, n_draws=n_draws, seed=seed),
+        "sand": _exponent(sand, partial(_by_speed, grade=True), n_draws, seed),
+        "floor": _exponent(floor, partial(_by_speed, grade=False), n_draws, seed),
+        "sand, log": _exponent(sand, _by_logarithms, n_draws, seed),
+        "floor, log": _exponent(floor, _by_logarithms, n_draws, seed),
     }
     lines = {"sand": _log_line(sand), "floor": _log_line(floor)}
     of_slope = {
@@ -71,7 +76,8 @@ def turning_law(seed: int, quick: bool) -> Finding:
         ).exponent
         for slope in SLOPES_DEG
     }
-    rows = [*_rows(found, lines, of_slope), _hidden(seed, quick)]
+    plain = _by_speed(sand, grade=False)
+    rows = [*_rows(found, plain, of_slope), _hidden(seed, quick)]
     return Finding(rows, [Picture(_CAPTION, _figure(sand, floor, found, lines))])
 
 
@@ -89,9 +95,18 @@ def _floor_trials(seed: int, repeats: int) -> list[Trial]:
     return [Trial(0.0, rate, UPHILL, first + k) for k, rate in enumerate(cases)]
 
 
-def _exponent(samples: SlipSamples, *, grade: bool, n_draws: int, seed: int) -> Exponent:
+def _by_speed(samples: SlipSamples, *, grade: bool) -> float:
+    return fit_turning(samples, patako().half_track_m, grade=grade).exponent
+
+
+def _by_logarithms(samples: SlipSamples) -> float:
+    return _log_line(samples)[0]
+
+
+def _exponent(
+    samples: SlipSamples, found: Callable[[SlipSamples], float], n_draws: int, seed: int
+) -> Exponent:
     """Return n, and its interval by drawing trials with replacement."""
-    half = patako().half_track_m
     runs = np.unique(samples.run)
     rows = {run: np.flatnonzero(samples.run == run) for run in runs}
     rng, draws = np.random.default_rng(seed), []
@@ -99,18 +114,18 @@ def _exponent(samples: SlipSamples, *, grade: bool, n_draws: int, seed: int) -> 
         drawn = rng.choice(runs, len(runs))
         chosen = np.concatenate([rows[run] for run in drawn])
         number = np.repeat(np.arange(len(runs)), [len(rows[run]) for run in drawn])
-        part = samples.where(chosen)._replace(run=number)
-        draws.append(fit_turning(part, half, grade=grade).exponent)
-    value = fit_turning(samples, half, grade=grade).exponent
-    return Exponent(value, percentile_interval(np.array(draws)))
+        draws.append(found(samples.where(chosen)._replace(run=number)))
+    return Exponent(found(samples), percentile_interval(np.array(draws)))
 
 
 def _log_ratios(samples: SlipSamples) -> tuple[Array, Array]:
-    """Return ln |v_r / v_l| and ln |alpha_l / alpha_r|, with the slip of each track by its own truth."""
+    """Return ln |v_r / v_l| and ln |alpha_l / alpha_r|, by the speed of each track over the ground."""
     half = patako().half_track_m
     ground = [samples.forward_mps + sign * half * samples.yaw_rate_radps for sign in (-1.0, 1.0)]
     slips = [1.0 - own / v for own, v in zip(ground, (samples.left_mps, samples.right_mps), strict=True)]
-    return np.log(np.abs(samples.right_mps / samples.left_mps)), np.log(np.abs(slips[0] / slips[1]))
+    known = (slips[0] != 0.0) & (slips[1] != 0.0)
+    speeds = np.log(np.abs(samples.right_mps / samples.left_mps))
+    return speeds[known], np.log(np.abs(slips[0][known] / slips[1][known]))
 
 
 def _log_line(samples: SlipSamples) -> tuple[float, float]:
@@ -147,40 +162,25 @@ def _hidden(seed: int, quick: bool) -> Row:
     )
 
 
-def _rows(
-    found: dict[str, Exponent], lines: dict[str, tuple[float, float]], of_slope: dict[str, float]
-) -> list[Row]:
-    sand, plain, floor = (found[name] for name in ("sand", "sand_as_printed", "floor"))
+def _rows(found: dict[str, Exponent], plain: float, of_slope: dict[str, float]) -> list[Row]:
+    sand, floor = found["sand"], found["floor"]
     return [
+        _log_row("in turns on sand, slopes of 0° to 15°", "fig. 13", PRINTED_SAND, found["sand, log"]),
+        _log_row("on level firm ground", "fig. 7", PRINTED_FLOOR, found["floor, log"]),
         Row(
-            what="Exponent n in turns on sand, slopes of 0° to 15°",
+            what="Exponent n in turns on sand, by the speed of the body",
             where="fig. 13",
-            printed=f"{PRINTED_SAND}",
-            printed_interval=(PRINTED_SAND, PRINTED_SAND),
+            printed=f"{PRINTED_SAND} by logarithms",
             simulated=sand.value,
             spread=sand.interval,
             unit="ratio",
-            verdict=verdict_of(sand.value, (PRINTED_SAND, PRINTED_SAND), sand.interval),
-            why="By least squares on the speed of the body, with what a grade adds in a turn. Numbers of "
-            "the sand were assumed, and n goes with the shear modulus. Beside it n as printed, without a "
-            "part for the grade, and by logarithms as in fig. 13.",
-            beside={"as printed": plain.value, "by logarithms": lines["sand"][0]},
+            verdict=Verdict.NOT_PRINTED,
+            why="Least squares with what a grade adds in a turn; without that part n has to take it up, "
+            "as beside. Numbers of the sand were assumed, and n goes with the shear modulus.",
+            beside={"without a part for the grade": plain},
         ),
         Row(
-            what="Exponent n on level firm ground",
-            where="fig. 7",
-            printed=f"{PRINTED_FLOOR}",
-            printed_interval=(PRINTED_FLOOR, PRINTED_FLOOR),
-            simulated=floor.value,
-            spread=floor.interval,
-            unit="ratio",
-            verdict=verdict_of(floor.value, (PRINTED_FLOOR, PRINTED_FLOOR), floor.interval),
-            why="The paper's floor is rigid linoleum; the simulated ground is firm soil that shears, "
-            "with the interval of nine turns.",
-            beside={"by logarithms": lines["floor"][0]},
-        ),
-        Row(
-            what="n on sand less n on firm ground",
+            what="n on sand less n on firm ground, by the speed of the body",
             where="discussion",
             printed="0.026: does not change with the environment",
             printed_interval=(PRINTED_SAND - PRINTED_FLOOR, PRINTED_SAND - PRINTED_FLOOR),
@@ -192,12 +192,27 @@ def _rows(
                 (PRINTED_SAND - PRINTED_FLOOR, PRINTED_SAND - PRINTED_FLOOR),
                 (sand.interval[0] - floor.interval[1], sand.interval[1] - floor.interval[0]),
             ),
-            why="By forces n is no constant of the robot. Beside it n of each slope alone, as printed, "
-            "in turns uphill: with the grade in the speed but not in the law, n takes up what the grade "
-            "does.",
-            beside=of_slope,
+            why="By forces n is no constant of the robot. Beside it n of each slope alone, without a "
+            "part for the grade, in turns uphill.",
+            beside=of_slope | {"firm ground": floor.value},
         ),
     ]
+
+
+def _log_row(what: str, where: str, printed: float, found: Exponent) -> Row:
+    return Row(
+        what=f"Exponent n {what}, by logarithms as printed",
+        where=where,
+        printed=f"{printed}",
+        printed_interval=(printed, printed),
+        simulated=found.value,
+        spread=found.interval,
+        unit="ratio",
+        verdict=holds(abs(found.value - printed) < ALIKE_RATIO),
+        why="By forces the slip of a track passes through 0 within the range of the trials, where its "
+        "logarithm has no bound, and the law is no straight line: the interval over turns is so wide that it "
+        "holds almost any n.",
+    )
 
 
 def _figure(
