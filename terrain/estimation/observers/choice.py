@@ -22,10 +22,11 @@ from terrain.estimation.observers.tracked_settings import TrackedSettings
 from terrain.robots import BicycleRobot, Robot, TrackedRobot
 
 IN_MANOEUVRES = TrackedSettings(observation_gain_ps=(2.0, 2.0, 2.0), normalised=True, eta_walk_ratio=0.06)
-"""Gains of the adaptive observer for logs of any driving: as fast at every speed, and efficiencies that change
-by a tenth within some seconds, as from straight motion to a turn; errors over their standard deviations are
-then about 1 in manoeuvres and below it in steady motion.  The paper's gains, for slip that stays as it is, are
-:class:`~terrain.estimation.observers.tracked_settings.TrackedSettings` as they are."""
+"""Gains of the adaptive observer for logs of any driving: as fast at every speed, and efficiencies that
+change by a tenth within some seconds, as from straight motion to a turn.  Errors over their standard
+deviations are then about 1 in manoeuvres and below it in steady motion.  The paper's gains, for slip that
+stays as it is, are the defaults of
+:class:`~terrain.estimation.observers.tracked_settings.TrackedSettings`."""
 
 OF_TRACKED: Mapping[str, Callable[[TrackedRobot, SlipModel], Observer]] = {
     "tracked": lambda robot, _: tracked_observer(robot, IN_MANOEUVRES),
