@@ -9,12 +9,12 @@ corrected in
     r_measured = r                        a_measured = w' + u r + g sin a - (L_R - x_imu) r'
 
 An extended Kalman filter, with a linearly implicit step (1 - h A)^-1 h f: the poles of (r, w), about
--2C/(m u), are far faster than any tick at low speed.  Below 0.3 m/s these equations say nothing (the observer of the
-paper's Figs. 5 and 6 divides by u there, and diverges); slip and C are then as they were.
+-2C/(m u), are far faster than any tick at low speed.  Below 0.3 m/s these equations say nothing (the observer
+of the paper's Figs. 5 and 6 divides by u there, and diverges); slip and C are then as they were.
 
 It takes steering, speed, yaw rate, roll and, where it is logged, lateral specific force; positions and
-headings only correct the pose that it carries on.  Yaw rate and force show two combinations of w, C_F and C_R; the
-third comes from transients and from the stiffness assumed at first: standard deviations include that.
+headings only correct the pose that it carries on.  Yaw rate and force show two combinations of w, C_F and
+C_R; the third comes from the stiffness assumed at first: standard deviations include that.
 
 Deremetz et al., ICRA 2017, section III, and Lenain et al. 2010.
 """
@@ -86,7 +86,8 @@ class DynamicSettings(NamedTuple):
     pose : of fixes; its slip gain is not used
     gyro_std_radps, accel_std_mps2 : of yaw rate and lateral specific force
     imu_ahead_m : of the accelerometer ahead of the rear axle
-    turn_walk_radps2, side_walk_mps2 : what the model lacks of r and w within a second
+    turn_walk_radps2, side_walk_mps2 : what the model lacks of r and w within a second; the lag of a tyre that
+        rolls into its slip is in it, which would otherwise be taken for a softer tyre
     stiffness_walk_npr : change of cornering stiffness within a second
     stiffness_correlation : of that change, between the axles
     stiffness_std_ratio : of the nominal cornering stiffness at first
@@ -99,8 +100,8 @@ class DynamicSettings(NamedTuple):
     accel_std_mps2: float = 0.1
     imu_ahead_m: float = 0.0
     turn_walk_radps2: float = 0.1
-    side_walk_mps2: float = 0.1
-    stiffness_walk_npr: float = 3000.0
+    side_walk_mps2: float = 2.0
+    stiffness_walk_npr: float = 2000.0
     stiffness_correlation: float = 0.8
     stiffness_std_ratio: float = 0.3
     excited_mps2: float = 1.0

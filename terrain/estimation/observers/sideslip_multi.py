@@ -7,9 +7,14 @@ the paper's), g of :mod:`~terrain.estimation.observers.sideslip_forces`, and e f
     dev' = f(dev, b) + K_dev e_dev         dyn' = g(dyn, b, C) + K_dyn e_dyn                   (8)
     b' = (K_b / K_a) J_f^T e_dev + (K_C / K_a) G_b^T e_dyn       C' = K_C G_C^T e_dyn          (9)
 
-with J_f, G_b and G_C the derivatives of f by b, and of g by b and by C.  Gains of section VI: K_dev = 15 (of
-the two printed "K of yaw rate", 15 and 20, the first is for theta~), K_dyn = 20, K_b = 2e12, K_a = 5e11,
-K_C = 5e7.
+with J_f, G_b and G_C the derivatives of f by b, and of g by b and by C.  Gains of section VI
+(:data:`SECTION_VI`): K_dev = 15 (of the two printed "K of yaw rate", 15 and 20, the first is for theta~),
+K_dyn = 20, K_b = 2e12, K_a = 5e11, K_C = 5e7.  With fixes of 2 cm they leave 0.7 to 1 degree of noise in b,
+and C needs tens of seconds to follow; the gains that are used by default weigh the dynamics more.
+
+The regressors of C' in (9), -b times what is in G_C, carry the noise of the same fixes as e_dyn: C comes out
+a quarter too low.  Used instead are the slip angles that the side forces of steady cornering, which are known
+from speed, yaw rate and roll, have at the estimated C: they carry none (``instrument``; False is as printed).
 
 Discrete form: the part of e_dev is exact per fix, with the continuous poles; the part of e_dyn, at each tick
 of length h, is implicit, e+ = (1 + h K_dyn + h^2 M)^-1 e with M = (K_C/K_a) G_b G_b^T + K_C G_C G_C^T, which
@@ -32,6 +37,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from terrain.constants import GRAVITY_MPS2
 from terrain.errors import ConfigError
 from terrain.estimation.observers import sideslip_pose as pose
 from terrain.estimation.observers.family import Observer, ObserverOutput, ObserverStatus
@@ -40,6 +46,7 @@ from terrain.estimation.observers.sideslip_forces import (
     C_HIGH_F,
     C_HIGH_R,
     C_LOW,
+    MASS,
     N_DYNAMIC,
     is_excited,
     rates,
@@ -81,7 +88,7 @@ RATE, SIDE, C_F, C_R, RATE_AGE = range(SHARED_SIZE, SHARED_SIZE + 5)
 """Places of yaw rate, lateral velocity and cornering stiffness in the memory, and of the gyro's age."""
 COV = SHARED_SIZE + 5
 _N = 8
-K_DYN, K_C, K_C_A, SLIP_WALK, C_WALK, GYRO_STD = range(N_DYNAMIC, N_DYNAMIC + 6)
+K_DYN, K_C, K_C_A, SLIP_WALK, C_WALK, GYRO_STD, INSTRUMENT = range(N_DYNAMIC, N_DYNAMIC + 7)
 _SLOW_MPS = 0.3
 """Slower the dynamics are not used: side forces follow where the tyres were, not where they go."""
 
@@ -99,19 +106,30 @@ class MultiModelSettings(NamedTuple):
     slip_walk_radps, stiffness_walk_npr : change within a second, one standard deviation
     stiffness_std_ratio : of the nominal cornering stiffness at first
     gyro_std_radps : of the yaw rate
+    instrument : whether the regressors of C are those of side forces, without the noise of fixes
     as_printed : line 2 of (3) with the printed signs, to show what they do
     """
 
-    pose: pose.PoseSettings = pose.PoseSettings()
+    pose: pose.PoseSettings = pose.PoseSettings(slip_gain=2.0)
     dynamic_gain_ps: float = 20.0
-    stiffness_gain: float = 5e7
-    dynamic_slip_ratio: float = 1e-4
+    stiffness_gain: float = 2e9
+    dynamic_slip_ratio: float = 3e-2
     excited_mps2: float = 1.0
     slip_walk_radps: float = 0.05
     stiffness_walk_npr: float = 3000.0
     stiffness_std_ratio: float = 0.4
     gyro_std_radps: float = 0.003
+    instrument: bool = True
     as_printed: bool = False
+
+
+SECTION_VI = MultiModelSettings(
+    pose.PoseSettings(slip_gain=2e12 / 5e11),
+    stiffness_gain=5e7,
+    dynamic_slip_ratio=5e7 / 5e11,
+    instrument=False,
+)
+"""Gains and regressors as the paper prints them."""
 
 
 def sideslip_multi_observer(
@@ -138,19 +156,19 @@ def sideslip_multi_observer(
     ('yaw_rate_radps', 'speed_y_mps', 'cornering_front_npr', 'cornering_rear_npr')
     """
     own = settings._asdict()
-    own.pop("pose"), own.pop("as_printed")
+    own.pop("pose"), own.pop("as_printed"), own.pop("instrument")
     bad = [f"{name} is {value:g}" for name, value in own.items() if not 0.0 <= value < math.inf]
     if bad or settings.dynamic_gain_ps == 0.0:
         raise ConfigError(
             f"{', '.join(bad) or 'dynamic_gain_ps is 0'}; finite gains and deviations are needed"
         )
-    params = pose.shared_params(robot, settings.pose, GYRO_STD + 1)
+    params = pose.shared_params(robot, settings.pose, INSTRUMENT + 1)
     set_dynamics(params, robot, settings.excited_mps2, settings.as_printed)
     params[[K_DYN, K_C, K_C_A]] = (
         settings.dynamic_gain_ps, settings.stiffness_gain, settings.dynamic_slip_ratio
     )  # fmt: skip
     params[[SLIP_WALK, C_WALK]] = settings.slip_walk_radps, settings.stiffness_walk_npr
-    params[GYRO_STD] = settings.gyro_std_radps
+    params[[GYRO_STD, INSTRUMENT]] = settings.gyro_std_radps, settings.instrument
     start = pose.shared_start(COV + _N * _N)
     nominal = np.array([robot.front_cornering_npr, robot.rear_cornering_npr])
     start[[C_F, C_R]], start[RATE_AGE] = nominal, pose.LOST_S
@@ -171,15 +189,21 @@ def _side_speed(params: Array, after: Array) -> float:
 
 
 @njit(cache=True)
-def _error_model(params: Array, after: Array, adapted: bool) -> tuple[Array, Array, Array]:
+def _error_model(params: Array, after: Array, adapted: bool, rate: float) -> tuple[Array, Array, Array]:
     """Return derivatives of g by b and by C (2, 2), 0 where C is not adapted, and of w in (4) by b (2,)."""
+    regressors = np.array([after[SLIP_F], after[SLIP_R]])
+    if params[INSTRUMENT] == 1.0:
+        load = params[MASS] / params[BASE]
+        load *= after[SPEED] * rate + GRAVITY_MPS2 * math.sin(after[ROLL])
+        regressors[0] = -load * params[AHEAD] / (after[C_F] * math.cos(after[STEER]))
+        regressors[1] = -load * params[BEHIND] / after[C_R]
     by_force = rates_by_force(params, after[STEER])
     by_slip, by_stiffness, side = np.zeros((2, 2)), np.zeros((2, 2)), np.zeros(2)
     for i in range(2):
         by_slip[i, 0], by_slip[i, 1] = by_force[i, 0] * after[C_F], by_force[i, 1] * after[C_R]
         if adapted:
-            by_stiffness[i, 0] = by_force[i, 0] * after[SLIP_F]
-            by_stiffness[i, 1] = by_force[i, 1] * after[SLIP_R]
+            by_stiffness[i, 0] = by_force[i, 0] * regressors[0]
+            by_stiffness[i, 1] = by_force[i, 1] * regressors[1]
     size, sign = abs(after[SPEED]), -1.0 if after[SPEED] < 0.0 else 1.0
     front = math.cos(min(max(after[STEER] + sign * after[SLIP_F], -1.4), 1.4))
     side[0] = size * params[AHEAD] / (params[BASE] * front**2)
@@ -217,7 +241,7 @@ def _correct_dynamics(params: Array, after: Array, cov: Array, rate_measured: fl
     measured = after[RATE_AGE] == 0.0
     rate = rate_measured if measured else after[RATE]
     adapted = measured and is_excited(params, after[SPEED], after[ROLL], rate)
-    by_slip, by_stiffness, side = _error_model(params, after, adapted)
+    by_slip, by_stiffness, side = _error_model(params, after, adapted, rate)
     gains = _dynamic_gains(params, by_slip, by_stiffness, measured, dt_s)
     slips, stiffness = np.array([after[SLIP_F], after[SLIP_R]]), np.array([after[C_F], after[C_R]])
     turning, pushed = rates(params, after[SPEED], after[STEER], after[ROLL], rate, slips, stiffness)
