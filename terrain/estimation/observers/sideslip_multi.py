@@ -110,9 +110,9 @@ class MultiModelSettings(NamedTuple):
     as_printed : line 2 of (3) with the printed signs, to show what they do
     """
 
-    pose: pose.PoseSettings = pose.PoseSettings(slip_gain=2.0)
+    pose: pose.PoseSettings = pose.PoseSettings(slip_gain=3.0)
     dynamic_gain_ps: float = 20.0
-    stiffness_gain: float = 2e9
+    stiffness_gain: float = 1e9
     dynamic_slip_ratio: float = 3e-2
     excited_mps2: float = 1.0
     slip_walk_radps: float = 0.05
