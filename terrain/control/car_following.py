@@ -118,8 +118,8 @@ class CarFollower:
         grip: GripSettings = GripSettings(),  # noqa: B008
         observer: Observer | None = None,
     ) -> None:
-        self._path, self._source, self._steering = path, source, steering
-        self._observer = sideslip_observer(robot, source) if observer is None else observer
+        self._path, self._source = path, SlipSource(source)
+        self._observer = sideslip_observer(robot, self._source) if observer is None else observer
         self._memory, self._law_memory = np.array(self._observer.start), np.zeros(STATE_SIZE)
         self._law = steering_params(robot, steering)
         self._reach_s = steering.delay_s + REACH_TIME_CONSTANTS * robot.steering_time_constant_s

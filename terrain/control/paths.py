@@ -202,6 +202,19 @@ def path_warnings(path: ReferencePath, robot: BicycleRobot) -> tuple[str, ...]:
 
 _WINDOW_M = 3.0
 _REACH_M = 5.0
+_AS_NEAR_M = 0.3
+
+
+@njit(cache=True)
+def _first_as_near(rows: Array, x_m: float, y_m: float, least_m: float) -> int:
+    """Return the first row, closest among its neighbours, that is hardly further than the closest of all."""
+    before = math.inf
+    for i in range(rows.shape[0]):
+        away = math.hypot(rows[i, X] - x_m, rows[i, Y] - y_m)
+        if before <= away and before <= least_m + _AS_NEAR_M:
+            return i - 1
+        before = away
+    return int(rows.shape[0] - 1)
 
 
 @njit(cache=True)
@@ -214,7 +227,8 @@ def locate(
     ----------
     rows : of a path
     x_m, y_m, yaw_rad : pose of the robot
-    before_m : s at the step before; NaN at first, when all of the path is searched
+    before_m : s at the step before; NaN at first, when all of the path is searched, and of places on a path
+        that comes back to itself the first is taken
 
     Examples
     --------
@@ -234,6 +248,9 @@ def locate(
         square = (rows[i, X] - x_m) ** 2 + (rows[i, Y] - y_m) ** 2
         if square < least:
             nearest, least = i, square
+    if math.isnan(before_m):
+        nearest = _first_as_near(rows, x_m, y_m, math.sqrt(least))
+        least = (rows[nearest, X] - x_m) ** 2 + (rows[nearest, Y] - y_m) ** 2
     heading = rows[nearest, HEADING]
     off_x, off_y = x_m - rows[nearest, X], y_m - rows[nearest, Y]
     along = math.cos(heading) * off_x + math.sin(heading) * off_y

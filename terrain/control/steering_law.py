@@ -140,7 +140,7 @@ def law_17(params: Array, lateral: float, angle: float, curvature: float, front:
 def _curvature_at(rows: Array, distance_m: float) -> float:
     at = min(max(distance_m / GRID_M, 0.0), rows.shape[0] - 1.001)
     i = int(at)
-    return rows[i, CURVATURE] + (at - i) * (rows[i + 1, CURVATURE] - rows[i, CURVATURE])
+    return float(rows[i, CURVATURE] + (at - i) * (rows[i + 1, CURVATURE] - rows[i, CURVATURE]))
 
 
 @njit(cache=True)

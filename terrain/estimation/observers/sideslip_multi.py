@@ -57,7 +57,7 @@ from terrain.estimation.observers.sideslip_kinematic import (
     add_pose_noise,
     error_growth,
     predict_pose,
-    slip_known,
+    set_slips,
 )
 from terrain.estimation.observers.sideslip_pose import (
     AHEAD,
@@ -78,6 +78,7 @@ from terrain.estimation.observers.sideslip_pose import (
     X,
     Y,
     correct_by_fix,
+    spread,
     status_of,
     take_inputs,
 )
@@ -174,8 +175,10 @@ def sideslip_multi_observer(
     start[[C_F, C_R]], start[RATE_AGE] = nominal, pose.LOST_S
     std = [0.0, 0.0, 0.1, 0.1, 0.1, 0.1, *settings.stiffness_std_ratio * nominal]
     start[COV:] = np.diag(np.square(std)).ravel()
-    states = ("position_x_m", "position_y_m", "yaw_rad", "yaw_rate_radps", "speed_y_mps")
-    states += ("cornering_front_npr", "cornering_rear_npr")
+    states = (
+        *("position_x_m", "position_y_m", "yaw_rad", "yaw_rate_radps", "speed_y_mps"),
+        *("cornering_front_npr", "cornering_rear_npr"),
+    )
     return Observer("sideslip-multi", states, pose.SIDESLIPS, pose.SIDESLIP_ROWS, params, start, _step, _read)
 
 
@@ -185,7 +188,7 @@ def _side_speed(params: Array, after: Array) -> float:
     sign = -1.0 if after[SPEED] < 0.0 else 1.0
     front = math.tan(min(max(after[STEER] + sign * after[SLIP_F], -1.4), 1.4))
     rear = math.tan(sign * after[SLIP_R])
-    return after[SPEED] * (params[AHEAD] * front + params[BEHIND] * rear) / params[BASE]
+    return float(after[SPEED] * (params[AHEAD] * front + params[BEHIND] * rear) / params[BASE])
 
 
 @njit(cache=True)
@@ -229,9 +232,12 @@ def _dynamic_gains(params: Array, by_slip: Array, by_stiffness: Array, measured:
     if not measured:
         inverse[:, 0] = 0.0
     gains = np.zeros((_N, 2))
-    gains[2:4] = dt_s * params[K_C_A] * (by_slip.T @ inverse)
-    gains[4:6] = dt_s * params[K_DYN] * inverse
-    gains[6:8] = dt_s * params[K_C] * (by_stiffness.T @ inverse)
+    for i in range(2):
+        for j in range(2):
+            gains[4 + i, j] = dt_s * params[K_DYN] * inverse[i, j]
+            for k in range(2):
+                gains[2 + i, j] += dt_s * params[K_C_A] * by_slip[k, i] * inverse[k, j]
+                gains[6 + i, j] += dt_s * params[K_C] * by_stiffness[k, i] * inverse[k, j]
     return gains
 
 
@@ -248,7 +254,7 @@ def _correct_dynamics(params: Array, after: Array, cov: Array, rate_measured: fl
     after[RATE] += dt_s * turning
     after[SIDE] += dt_s * pushed
     error = np.array([rate - after[RATE] if measured else 0.0, _side_speed(params, after) - after[SIDE]])
-    change = gains @ error
+    change = gains[:, 0] * error[0] + gains[:, 1] * error[1]
     after[SLIP_F] = min(max(after[SLIP_F] + change[2], -SLIP_MAX_RAD), SLIP_MAX_RAD)
     after[SLIP_R] = min(max(after[SLIP_R] + change[3], -SLIP_MAX_RAD), SLIP_MAX_RAD)
     after[RATE] += change[4]
@@ -260,18 +266,19 @@ def _correct_dynamics(params: Array, after: Array, cov: Array, rate_measured: fl
     grown[4:6, 6:8] = dt_s * by_stiffness
     if not measured:
         grown[5, 4] = -dt_s * after[SPEED]
-    seen = np.zeros((2, _N))
-    seen[0, 4] = seen[1, 5] = 1.0
-    seen[1, 2], seen[1, 3] = -side[0], -side[1]
-    grown = grown - gains @ (seen @ grown)
-    cov[:] = grown @ cov @ grown.T
+    for j in range(_N):
+        of_rate = grown[4, j]
+        of_side = grown[5, j] - side[0] * grown[2, j] - side[1] * grown[3, j]
+        for i in range(2, _N):
+            grown[i, j] -= gains[i, 0] * of_rate + gains[i, 1] * of_side
+    spread(cov, grown)
     for i in range(_N):
         for j in range(_N):
             cov[i, j] += gains[i, 0] * gains[j, 0] * params[GYRO_STD] ** 2
     if adapted:
         for i in range(6, 8):
             cov[i, i] = min(cov[i, i] + params[C_WALK] ** 2 * dt_s, params[C_HIGH_F] ** 2)
-    return adapted
+    return bool(adapted)
 
 
 @njit(cache=True)
@@ -289,8 +296,7 @@ def _step(params: Array, memory: Array, row: Array, dt_s: float) -> Array:
         adapted = _correct_dynamics(params, after, cov, rate_measured, min(dt_s, 0.1))
         add_pose_noise(params, after, cov, params[SLIP_WALK], dt_s)
     elif posed and dt_s > 0.0:
-        grown = error_growth(params, after, _N, dt_s)
-        cov[:] = grown @ cov @ grown.T
+        spread(cov, error_growth(params, after, _N, dt_s))
         add_pose_noise(params, after, cov, params[SLIP_WALK], dt_s)
         after[RATE] = rate_measured if known else after[RATE]
         after[SIDE] = _side_speed(params, after) if abs(after[SPEED]) >= STANDING_MPS else 0.0
@@ -303,25 +309,28 @@ def _step(params: Array, memory: Array, row: Array, dt_s: float) -> Array:
 
 
 @njit(cache=True)
-def _figures(memory: Array) -> tuple[Array, Array, Array, Array]:
-    var = np.empty(_N + 1)
+def _figures(memory: Array) -> Array:
+    """Return means (7,), their deviations, slips (2,) and theirs, in one array."""
+    out = np.empty(18)
+    out[0], out[1], out[2] = memory[X], memory[Y], memory[YAW]
+    out[3], out[4], out[5], out[6] = memory[RATE], memory[SIDE], memory[C_F], memory[C_R]
     for i in range(_N):
-        var[i + 1] = max(memory[COV + i * (_N + 1)], 0.0)
-    var[0] = var[1]
-    std = np.sqrt(var)
-    mean = np.empty(7)
-    mean[0], mean[1], mean[2] = memory[X], memory[Y], memory[YAW]
-    mean[3], mean[4], mean[5], mean[6] = memory[RATE], memory[SIDE], memory[C_F], memory[C_R]
+        std = math.sqrt(max(memory[COV + i * (_N + 1)], 0.0))
+        if i in (2, 3):
+            out[14 + i] = std
+        else:
+            out[8 + i if i < 2 else 6 + i] = std
+    out[7] = out[8]
     if memory[HAS_POSITION] == 0.0:
-        mean[:2] = math.nan
+        out[:2] = math.nan
     if memory[HAS_YAW] == 0.0:
-        mean[2] = math.nan
+        out[2] = math.nan
     if memory[STATUS] == ObserverStatus.STARTING.value:
-        mean[3:5] = math.nan
-    slip = slip_known(memory, std[3:5])
-    errors = np.array([std[0], std[1], std[2], std[5], std[6], std[7], std[8]])
-    return mean, errors, slip, np.where(np.isnan(slip), math.nan, std[3:5])
+        out[3:5] = math.nan
+    set_slips(memory, out[14:16], out[16:18])
+    return out
 
 
 def _read(params: Array, memory: Array) -> ObserverOutput:
-    return ObserverOutput(*_figures(memory), int(memory[STATUS]))
+    out = _figures(memory)
+    return ObserverOutput(out[:7], out[7:14], out[14:16], out[16:], int(memory[STATUS]))

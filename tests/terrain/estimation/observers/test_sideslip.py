@@ -82,9 +82,7 @@ def test_gains_of_a_fix_give_the_sampled_error_the_continuous_poles(speed, ratio
     kept = np.eye(4)
     kept[:2, :2] -= g_e * np.eye(2)
     kept[2:, :2] = -g_b
-    continuous = np.block(
-        [[-gain * np.eye(2), jacobian], [-ratio * jacobian.T, np.zeros((2, 2))]]
-    )
+    continuous = np.block([[-gain * np.eye(2), jacobian], [-ratio * jacobian.T, np.zeros((2, 2))]])
     expected = np.linalg.eigvals(expm(continuous * time_s))
     found = np.linalg.eigvals(kept @ moved)
     assert np.sort_complex(found) == pytest.approx(np.sort_complex(expected), abs=1e-5)
@@ -273,7 +271,7 @@ def test_at_rest_slip_and_stiffness_are_frozen(factory):
 
 @ANY
 def test_jumps_flips_and_lost_fixes_have_their_statuses(factory):
-    time_s, rows, truth = drive(4.0, seed=8)
+    time_s, rows, _ = drive(4.0, seed=8)
     fixes = np.flatnonzero(np.isfinite(rows[:, 2]))
     faulty = rows.copy()
     jump, flip, lost, moved = fixes[100], fixes[120], fixes[140:160], fixes[200:]

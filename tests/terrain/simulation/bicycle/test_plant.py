@@ -109,7 +109,12 @@ def test_steering_has_dead_time_rate_and_limit():
 
 @pytest.mark.parametrize(
     ("distance", "grip", "roll"),
-    [([0.0, 0.0], [0.5, 0.5], [0, 0]), ([0.0], [0.0], [0.0]), ([0.0], [0.5], [1.0]), ([0.0], [0.5], [np.nan])],
+    [
+        ([0.0, 0.0], [0.5, 0.5], [0, 0]),
+        ([0.0], [0.0], [0.0]),
+        ([0.0], [0.5], [1.0]),
+        ([0.0], [0.5], [np.nan]),
+    ],
 )
 def test_ground_that_cannot_be_is_refused(distance, grip, roll):
     with pytest.raises(ConfigError, match="ground"):
