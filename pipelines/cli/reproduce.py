@@ -18,6 +18,7 @@ class PaperName(StrEnum):
 
     danzi = "danzi"
     tazzari = "tazzari"
+    yamauchi = "yamauchi"
 
 
 @command(app, "reproduce")

@@ -33,6 +33,15 @@ PAPERS: Mapping[str, Paper] = {
         module="pipelines.reproduce.tazzari.experiments",
         descriptions=(("robots", "orchard_ugv"), ("soils", "grass"), ("soils", "dry_sand")),
     ),
+    "yamauchi": Paper(
+        title="Yamauchi et al., slip-compensated odometry",
+        about=(
+            "G. Yamauchi, K. Nagatani, T. Hashimoto and K. Fujino, Slip-compensated odometry for tracked "
+            "vehicle on loose and weak slope, ROBOMECH Journal, 2017"
+        ),
+        module="pipelines.reproduce.yamauchi.experiments",
+        descriptions=(("robots", "patako"), ("soils", "extra/toyoura_sand"), ("soils", "firm_soil_gravel")),
+    ),
 }
 """Papers by the name that the command takes."""
 

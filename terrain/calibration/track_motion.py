@@ -16,8 +16,10 @@ from numba import njit
 
 from terrain.angles import unwrapped
 from terrain.errors import DataError
+from terrain.estimation.observers.rows import RowFeed, ticks
 from terrain.estimation.observers.slip_model import TIGHT_RATIO, next_displacement
-from terrain.records import Array, RunLog, Stream
+from terrain.estimation.observers.slip_odometry import ROWS
+from terrain.records import Array, RunLog
 from terrain.robots import TrackedRobot
 
 HALF_WINDOW_S = 0.3
@@ -135,23 +137,10 @@ def odometry_rows(run: RunLog, robot: TrackedRobot) -> tuple[Array, Array]:
     ------
     DataError
         if the run has no speeds of tracks.
-
-    Notes
-    -----
-    Gyro, roll and pitch are interpolated to the ticks; NaN without an IMU.
     """
-    if "wheels" not in run.streams:
-        raise DataError(f"run {run.run_id!r} has no stream 'wheels': the speeds of the tracks are required")
-    wheels = run.streams["wheels"]
-    speeds = robot.wheel_speeds_mps(np.column_stack([wheels.channel(name) for name in robot.rate_channels]))
-    rows = np.full((len(wheels), 5), np.nan)
-    rows[:, :2] = speeds
-    imu: Stream | None = run.streams.get("imu")
-    if imu is not None:
-        for column, name in enumerate(("gyro_z_radps", "roll_rad", "pitch_rad")):
-            if name in imu.channels:
-                rows[:, 2 + column] = np.interp(wheels.time_s, imu.time_s, imu.channel(name))
-    return wheels.time_s, rows
+    feed = RowFeed(robot, ROWS, {name: stream.channels for name, stream in run.streams.items()})
+    found = list(ticks(run, feed))
+    return np.array([time_s for time_s, _ in found]), np.array([row for _, row in found])
 
 
 def slip_samples(

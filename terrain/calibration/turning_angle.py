@@ -13,6 +13,7 @@ import numpy as np
 
 from terrain.calibration.clustered_fit import LinearFit, fit_runs
 from terrain.calibration.track_motion import SlipSamples
+from terrain.calibration.turning_drift import DRIFT, drift_columns
 from terrain.errors import DataError
 from terrain.estimation.observers.slip_model import N_ANGLE, REGRESSORS, angle_regressors
 from terrain.records import Array
@@ -38,18 +39,28 @@ def angle_columns(samples: SlipSamples, half_track_m: float) -> tuple[Array, Arr
             half_track_m,
             x[i],
         )
-    mirror = np.where(x[:, 0] < 0.0, -1.0, 1.0)
+    mirror = left_turn_sign(samples)
     angle = np.arctan2(samples.lateral_mps, np.abs(samples.forward_mps))
     return x * mirror[:, None], angle * mirror
 
 
-def fit_turning_angle(samples: SlipSamples, half_track_m: float, *, ridge: bool = True) -> LinearFit:
+def left_turn_sign(samples: SlipSamples) -> Array:
+    """Return m (n,), 1 in a left turn driven forward and in its image end to end and side to side."""
+    forward, turn = samples.left_mps + samples.right_mps, samples.right_mps - samples.left_mps
+    return np.where((forward >= 0.0) == (turn >= 0.0), 1.0, -1.0)
+
+
+def fit_turning_angle(
+    samples: SlipSamples, half_track_m: float, *, drift: bool = False, ridge: bool = True
+) -> LinearFit:
     """Fit (28) to turns.
 
     Parameters
     ----------
     samples : of turns, of several rates, slopes and headings
     half_track_m : d
+    drift : whether the two columns of :mod:`~terrain.calibration.turning_drift` come first; the sideways
+        speed is fitted then, in place of the angle, which has no value at a forward speed of 0
     ridge : whether to regularise where the condition number asks for it
 
     Raises
@@ -59,24 +70,33 @@ def fit_turning_angle(samples: SlipSamples, half_track_m: float, *, ridge: bool 
     """
     if len(np.unique(samples.run)) < 3:
         raise DataError("fewer than three runs turn tightly, three or more are required")
-    x, angle = angle_columns(samples, half_track_m)
+    x, y = angle_columns(samples, half_track_m)
     mean = np.abs(x.mean(axis=0))
     varied = x.std(axis=0) > CONSTANT_RATIO * mean
     varied[0] = True
-    kept = tuple(name for name, use in zip(REGRESSORS, varied.tolist(), strict=True) if use)
-    fit = fit_runs(x[:, varied], angle, samples.run, kept, ridge=ridge)
+    away = np.eye(N_ANGLE)[~varied]
+    away[:, 0] = -x[:, ~varied].mean(axis=0)
+    names = REGRESSORS
+    if drift:
+        mirror = left_turn_sign(samples)
+        x = np.column_stack(
+            [drift_columns(samples) * mirror[:, None], x * np.abs(samples.forward_mps)[:, None]]
+        )
+        y, names = mirror * samples.lateral_mps, DRIFT + REGRESSORS
+        varied = np.concatenate([np.ones(len(DRIFT), bool), varied])
+        away = np.column_stack([np.zeros((len(away), len(DRIFT))), away])
+    kept = tuple(name for name, use in zip(names, varied.tolist(), strict=True) if use)
+    fit = fit_runs(x[:, varied], y, samples.run, kept, ridge=ridge)
     if varied.all():
         return fit
-    coefficient, p_value, inflation = np.zeros(N_ANGLE), np.full(N_ANGLE, np.nan), np.full(N_ANGLE, np.nan)
-    covariance = np.zeros((N_ANGLE, N_ANGLE))
-    covariance[np.ix_(varied, varied)] = fit.covariance
+    size = len(names)
+    coefficient, p_value, inflation = np.zeros(size), np.full(size, np.nan), np.full(size, np.nan)
+    unknown = away * (CONSTANT_STD / mean[~varied[-N_ANGLE:], None])
+    covariance = unknown.T @ unknown
+    covariance[np.ix_(varied, varied)] += fit.covariance
     coefficient[varied], p_value[varied], inflation[varied] = fit.coefficient, fit.p_value, fit.inflation
-    for j in np.flatnonzero(~varied):
-        away = np.zeros(N_ANGLE)
-        away[j], away[0] = 1.0, -x[:, j].mean()
-        covariance += (CONSTANT_STD / max(mean[j], 1e-9)) ** 2 * np.outer(away, away)
     return fit._replace(
-        names=REGRESSORS,
+        names=names,
         coefficient=coefficient,
         std=np.sqrt(np.diag(covariance)),
         p_value=p_value,

@@ -80,7 +80,7 @@ def track_balance(robot: TrackedRobot, soil: Soil, grade_rad: float) -> TrackBal
     >>> [round(track_balance(robot, sand, grade).grade_n, 1) for grade in (0.0, 0.3)]
     [0.0, 72.5]
     >>> [round(track_balance(robot, sand, grade).slip_ratio, 4) for grade in (0.0, 0.3)]
-    [0.0045, 0.0621]
+    [0.0043, 0.0773]
     """
     _check(soil)
     weight = robot.mass_kg * GRAVITY_MPS2
@@ -115,7 +115,7 @@ def straight_slip_line(robot: TrackedRobot, soil: Soil) -> tuple[float, float]:
     >>> from terrain.robots import load_robot
     >>> from terrain.terramechanics.soil import load_soil
     >>> [round(number, 4) for number in straight_slip_line(load_robot("patako"), load_soil("toyoura_sand"))]
-    [0.0043, 0.1334]
+    [0.0042, 0.1334]
     """
     level = track_balance(robot, soil, 0.0)
     stiffness = level.limit_n * robot.contact_length_m / (2.0 * soil.shear_modulus_m)

@@ -80,7 +80,7 @@ OBSERVED_RATIO = 0.5
 TURNING_RADPS = 0.05
 """Slower, a yaw rate shows nothing of the distance of the tracks."""
 
-PRIOR_STD = np.array([0.3, 0.1, 1.0, 0.1, 1.0, 0.3, 3.0, 1.0, 1.0, 2.0, 1.0, 0.5, 2.0, 0.5])
+PRIOR_STD = np.array([0.3, 0.1, 1.0, 0.3, 1.0, 0.3, 0.2, 0.3, 3.0, 1.0, 1.0, 2.0, 1.0, 0.5, 2.0, 0.5])
 """Of :data:`~terrain.estimation.observers.slip_model.PARAMETERS` on unknown ground, wide around the values
 printed by Yamauchi et al. (converted from degrees) and those of sand."""
 
@@ -240,7 +240,7 @@ def learning_step(params: Array, memory: Array, row: Array, dt_s: float) -> Arra
 
 @njit(types.float64[:, ::1](READ_ONLY, READ_ONLY), cache=True)
 def read_parameters(params: Array, memory: Array) -> Array:
-    """Return parameters and their standard deviations (2, 14); NaN where one is not observed yet."""
+    """Return parameters and their standard deviations (2, 16); NaN where one is not observed yet."""
     out = np.full((2, N_MODEL), np.nan)
     for i in range(N_MODEL):
         std = math.sqrt(max(memory[COVARIANCE + (3 + i) * (N + 1)], 0.0))
@@ -273,6 +273,7 @@ def learned_model(params: Array, memory: Array) -> SlipModel:
         covariance=covariance,
         slip_std_ratio=float(params[SLIP_STD]),
         angle_std_rad=float(params[ANGLE_STD]),
+        correlation_s=float(params[CORRELATION]),
         found="fixes while driving",
     )
 

@@ -1,14 +1,13 @@
 r"""Slip of a tracked robot on a weak slope: the four laws of Yamauchi et al. as one that is continuous.
 
-Speeds v of the tracks, yaw rate w, half track d, grade :math:`= -pitch`; b are errors that a whole run has
-in common, with a mean of 0:
+Speeds v of the tracks, the mean :math:`\bar v` of their magnitudes, yaw rate w, half track d, grade
+:math:`= -pitch`; b are errors that a whole run has in common, with a mean of 0:
 
 .. math::
-    v_i' &= v_i (1 - \alpha_0 - b_\alpha) - |v_i|\, \alpha_1\, grade, \qquad
-    D = v_r' - v_l' - 2 d w \\
-    V_x &= \frac{v_r' + v_l'}{2} - \frac{D}{2} \kappa(n) - \lambda |w|\, grade \\
-    \beta &= -(1 - \eta) \arctan(k\, roll) + \eta\, m \Big(\sum_i a_i X_i + b_\beta\Big), \qquad
-    V_y = |V_x| \tan \beta \\
+    v_i' &= v_i (1 - \alpha_0) - |v_i|\, \alpha_1\, grade, \qquad D = v_r' - v_l' - 2 d w \\
+    V_x &= \frac{v_r' + v_l'}{2} - \frac{D}{2} \kappa(n) - \lambda_x |w|\, grade - \bar v\, b_\alpha \\
+    V_y &= |V_x| \tan \beta - \lambda_y |w|\, roll + c\, w\, grade + \bar v\, b_\beta \\
+    \beta &= -(1 - \eta) \arctan(k\, roll) + \eta\, m \sum_i a_i X_i \\
     \eta &= 3 q^2 - 2 q^3, \quad q = \min(\theta / \theta_1, 1), \quad
     \theta = |v_r - v_l| / (|v_r| + |v_l|)
 
@@ -16,8 +15,10 @@ in common, with a mean of 0:
   needs no switch: each track has to overcome them in a turn as well.
 - *Longitudinal, turning*: Endo's law (27), :mod:`~terrain.estimation.observers.endo`, shares what slip is
   left. D and kappa both vanish with the turn, so that its part falls with the square of it.
-- In a turn the ground's friction is spent on turning, and a grade moves the robot by
-  :math:`\lambda |w| grade` more: lambda is this project's, 0 for the laws as printed.
+- *Drift in a turn*, this project's: the ground's friction is spent on turning, so that gravity moves the
+  robot downhill at a speed in proportion to the yaw rate, by :math:`\lambda_x, \lambda_y`.  On a grade the
+  load moves to the rear, and the robot turns about a point that lies :math:`c\, grade` behind its middle.
+  All three are 0 for the laws as printed; with them little is left for (28).
 - *Lateral, straight*: (26).  **Corrected**: gravity sets the sign, also in reverse, by the absolute value of
   V_x.
 - *Lateral, turning*: the regression (28), weighted by how tight the turn is.  The weight eta is smooth and
@@ -30,7 +31,8 @@ coefficients of one turn hold for all four.  Towards a spin in place, which has 
 between the two ends fades out.  The yaw displacement since the turn began is forgotten over a length of the
 track travelled straight, which leaves behind the soil that the turn heaped up.
 
-A slip angle cannot express that a robot spinning in place drifts across a slope: V_y vanishes there with V_x.
+As printed, a slip angle cannot express that a robot spinning in place drifts across a slope: V_y vanishes
+with V_x.
 """
 
 from __future__ import annotations
@@ -53,14 +55,15 @@ REGRESSORS: tuple[str, ...] = (
 """Explanatory variables X of (28), in its order."""
 
 N_ANGLE = len(REGRESSORS)
-EXPONENT, COMPACTION, GRADE, TURN_GRADE, SIDE, ANGLE = range(6)
+EXPONENT, COMPACTION, GRADE, TURN_GRADE, SIDE, TURN_SIDE, TURN_SHIFT, ANGLE = range(8)
 TRACK_RATIO = ANGLE + N_ANGLE
 N_MODEL = TRACK_RATIO + 1
 RUN_SLIP, RUN_ANGLE, GYRO_BIAS = N_MODEL, N_MODEL + 1, N_MODEL + 2
 N_PARAMETERS = N_MODEL + 3
 
 PARAMETERS: tuple[str, ...] = (
-    *("turning_exponent", "compaction_slip_ratio", "grade_slip_ratio", "turn_grade_m", "side_slip_ratio"),
+    *("turning_exponent", "compaction_slip_ratio", "grade_slip_ratio", "turn_grade_m"),
+    *("side_slip_ratio", "turn_side_m", "turn_shift_m"),
     *(f"angle_{name}" for name in REGRESSORS),
     "track_ratio",
 )
@@ -84,13 +87,16 @@ class SlipModel:
     ----------
     turning_exponent : n of (27)
     compaction_slip_ratio, grade_slip_ratio : intercept and slope (per rad) of (22)
-    turn_grade_m : lambda, speed downhill by yaw rate and grade
+    turn_grade_m : lambda_x, speed back down by yaw rate and grade
     side_slip_ratio : k of (26), per rad
+    turn_side_m : lambda_y, speed down to the side by yaw rate and roll
+    turn_shift_m : c, distance behind the middle of the point of turning, per rad of grade
     angle : (8,) coefficients of (28) in rad, for SI units, in the order of :data:`REGRESSORS`
     track_ratio : effective distance of the tracks over the described one, for a robot without a gyro
-    covariance : (14, 14) of :data:`PARAMETERS`
-    slip_std_ratio, angle_std_rad : residuals within a run
-    run_slip_std_ratio, run_angle_std_rad : what a whole run has in common
+    covariance : (16, 16) of :data:`PARAMETERS`
+    slip_std_ratio, angle_std_rad : residuals of V_x and V_y within a run, over the speed of the tracks
+    correlation_s : over which the residuals within a run are alike
+    run_slip_std_ratio, run_angle_std_rad : b, what a whole run has in common
     found : how the numbers were found
 
     Raises
@@ -109,11 +115,14 @@ class SlipModel:
     grade_slip_ratio: float = 0.0
     turn_grade_m: float = 0.0
     side_slip_ratio: float = 0.0
+    turn_side_m: float = 0.0
+    turn_shift_m: float = 0.0
     angle: Array = field(default_factory=lambda: np.zeros(N_ANGLE))
     track_ratio: float = 1.0
     covariance: Array = field(default_factory=lambda: np.zeros((N_MODEL, N_MODEL)))
     slip_std_ratio: float = 0.0
     angle_std_rad: float = 0.0
+    correlation_s: float = 0.5
     run_slip_std_ratio: float = 0.0
     run_angle_std_rad: float = 0.0
     found: str = "given"
@@ -135,13 +144,13 @@ class SlipModel:
 
     @property
     def vector(self) -> Array:
-        """Numbers (14,) in the order of :data:`PARAMETERS`."""
-        first = (self.turning_exponent, self.compaction_slip_ratio, self.grade_slip_ratio)
-        return np.array([*first, self.turn_grade_m, self.side_slip_ratio, *self.angle, self.track_ratio])
+        """Numbers (16,) in the order of :data:`PARAMETERS`."""
+        first = [getattr(self, name) for name in PARAMETERS[:ANGLE]]
+        return np.array([*first, *self.angle, self.track_ratio])
 
 
 def model_of(vector: Array, **also: Any) -> SlipModel:
-    """Return the model of numbers (14,) in the order of :data:`PARAMETERS`; ``also`` are other fields.
+    """Return the model of numbers (16,) in the order of :data:`PARAMETERS`; ``also`` are other fields.
 
     Examples
     --------
@@ -220,7 +229,7 @@ def body_velocity(
     displacement_rad: float,
     slopes: Array,
 ) -> tuple[float, float, float, float]:
-    """Return V_x, V_y, beta and dV_x/dw, and write the derivatives (3, N_PARAMETERS) of the first three.
+    """Return V_x, V_y, dV_x/dw and dV_y/dw, and write the derivatives (2, N_PARAMETERS) of the first two.
 
     Parameters
     ----------
@@ -230,36 +239,46 @@ def body_velocity(
     yaw_rate_radps : w, without the gyro's bias
     tilt_rad : roll, pitch
     displacement_rad : yaw since the turn began
-    slopes : (3, N_PARAMETERS); those by the track ratio and the gyro's bias, which act through w, stay 0
+    slopes : (2, N_PARAMETERS); those by the track ratio and the gyro's bias, which act through w, stay 0
+
+    Notes
+    -----
+    dV_y/dw is that at constant beta.
     """
     left, right = speeds_mps
     roll, grade, turning = tilt_rad[0], -tilt_rad[1], abs(yaw_rate_radps)
+    direction = math.copysign(1.0, yaw_rate_radps)
     kappa, by_exponent = slip_imbalance(left, right, theta[EXPONENT])
-    kept, climbed = 1.0 - theta[COMPACTION] - theta[RUN_SLIP], theta[GRADE] * grade
+    kept, climbed = 1.0 - theta[COMPACTION], theta[GRADE] * grade
     mean, half = 0.5 * (left + right), 0.5 * (right - left)
     mean_size, half_size = 0.5 * (abs(left) + abs(right)), 0.5 * (abs(right) - abs(left))
     lost = kept * half - climbed * half_size - half_track_m * yaw_rate_radps
-    v_x = kept * mean - climbed * mean_size - lost * kappa - turning * theta[TURN_GRADE] * grade
-    by_rate = half_track_m * kappa - math.copysign(theta[TURN_GRADE], yaw_rate_radps) * grade
+    v_x = kept * mean - climbed * mean_size - lost * kappa
+    v_x -= turning * theta[TURN_GRADE] * grade + mean_size * theta[RUN_SLIP]
     slopes[:] = 0.0
-    slopes[0, EXPONENT] = -lost * by_exponent
-    slopes[0, COMPACTION] = slopes[0, RUN_SLIP] = half * kappa - mean
+    slopes[0, EXPONENT], slopes[0, COMPACTION] = -lost * by_exponent, half * kappa - mean
     slopes[0, GRADE], slopes[0, TURN_GRADE] = grade * (half_size * kappa - mean_size), -turning * grade
-    tight, beta = turn_weight(left, right), 0.0
+    slopes[0, RUN_SLIP] = -mean_size
     regressors = np.empty(N_ANGLE)
     angle_regressors(
         speeds_mps, yaw_rate_radps, roll, tilt_rad[1], displacement_rad, half_track_m, regressors
     )
+    tight = turn_weight(left, right)
+    beta = -(1.0 - tight) * math.atan(theta[SIDE] * roll)
     for i in range(N_ANGLE):
-        slopes[2, ANGLE + i] = tight * regressors[i]
-        beta += slopes[2, ANGLE + i] * theta[ANGLE + i]
-    slopes[2, RUN_ANGLE] = tight * regressors[0]
-    beta += slopes[2, RUN_ANGLE] * theta[RUN_ANGLE] - (1.0 - tight) * math.atan(theta[SIDE] * roll)
-    slopes[2, SIDE] = -(1.0 - tight) * roll / (1.0 + (theta[SIDE] * roll) ** 2)
-    if abs(beta) > STEEPEST_RAD:
-        beta = math.copysign(STEEPEST_RAD, beta)
-        slopes[2] = 0.0
-    tangent, sign = math.tan(beta), math.copysign(1.0, v_x)
+        beta += tight * regressors[i] * theta[ANGLE + i]
+    held = min(max(beta, -STEEPEST_RAD), STEEPEST_RAD)
+    tangent, sign = math.tan(held), math.copysign(1.0, v_x)
+    by_beta = abs(v_x) * (1.0 + tangent * tangent) if held == beta else 0.0
     for i in range(N_PARAMETERS):
-        slopes[1, i] = sign * tangent * slopes[0, i] + abs(v_x) * (1.0 + tangent * tangent) * slopes[2, i]
-    return v_x, abs(v_x) * tangent, beta, by_rate
+        slopes[1, i] = sign * tangent * slopes[0, i]
+    for i in range(N_ANGLE):
+        slopes[1, ANGLE + i] += by_beta * tight * regressors[i]
+    slopes[1, SIDE] -= by_beta * (1.0 - tight) * roll / (1.0 + (theta[SIDE] * roll) ** 2)
+    slopes[1, TURN_SIDE], slopes[1, TURN_SHIFT] = -turning * roll, yaw_rate_radps * grade
+    slopes[1, RUN_ANGLE] = mean_size
+    v_y = abs(v_x) * tangent - theta[TURN_SIDE] * turning * roll + theta[TURN_SHIFT] * yaw_rate_radps * grade
+    v_y += mean_size * theta[RUN_ANGLE]
+    by_rate = half_track_m * kappa - direction * theta[TURN_GRADE] * grade
+    drift_by_rate = theta[TURN_SHIFT] * grade - direction * theta[TURN_SIDE] * roll
+    return v_x, v_y, by_rate, sign * tangent * by_rate + drift_by_rate

@@ -62,12 +62,12 @@ FASTEST_MPS, FASTEST_RADPS = 20.0, 20.0
 
 N = 3 + N_PARAMETERS
 POSE, VELOCITY, TILT, DISPLACEMENT, STATUS = 0, 3, 6, 8, 9
-BELTS, GROUND, ANGLE_NOW, VARIANCE = 10, 12, 14, 15
-THETA = 19
+BELTS, GROUND, VARIANCE = 10, 12, 14
+THETA = 17
 COVARIANCE = THETA + N_PARAMETERS
 SIZE = COVARIANCE + N * N
 """Memory: pose, velocity, tilt last known, yaw since the turn began, status, speeds of belts and of the
-ground under them, slip angle, variances of velocity and angle, parameters, covariance of pose and
+ground under them, variances of the velocity, parameters, covariance of pose and
 parameters."""
 
 
@@ -80,7 +80,6 @@ class OdometrySettings:
     gyro_threshold_radps : the gyro is used where it differs from the tracks by more; 0: always
     gyro_noise_radps, gyro_bias_std_radps : of a sample, and of what is left of the bias
     encoder_noise_mps : of a sample of the speed of a track
-    correlation_s : over which the residuals of the slip model are alike
     stand_mps : both tracks slower: the robot stands, or is pushed
     pushed_radps : yaw rate above which a robot on standing tracks is pushed
     min_speed_mps : tracks and ground slower: the slip of the track is NaN
@@ -90,7 +89,6 @@ class OdometrySettings:
     gyro_noise_radps: float = 0.002
     gyro_bias_std_radps: float = 0.0005
     encoder_noise_mps: float = 0.001
-    correlation_s: float = 0.5
     stand_mps: float = 0.003
     pushed_radps: float = 0.02
     min_speed_mps: float = 0.005
@@ -98,10 +96,10 @@ class OdometrySettings:
 
 _HALF, _LENGTH = 0, 1
 _SETTINGS = 2
-(_THRESHOLD, _GYRO_STD, _BIAS_STD, _ENCODER_STD, CORRELATION, _STAND, _PUSHED, _MIN_SPEED) = range(
-    _SETTINGS, _SETTINGS + 8
+(_THRESHOLD, _GYRO_STD, _BIAS_STD, _ENCODER_STD, _STAND, _PUSHED, _MIN_SPEED) = range(
+    _SETTINGS, _SETTINGS + 7
 )
-SLIP_STD, ANGLE_STD = _SETTINGS + 8, _SETTINGS + 9
+SLIP_STD, ANGLE_STD, CORRELATION = range(_SETTINGS + 7, _SETTINGS + 10)
 PARAMS_SIZE = _SETTINGS + 10
 
 _F8 = types.float64
@@ -116,17 +114,18 @@ def odometry_params(robot: TrackedRobot, model: SlipModel, settings: OdometrySet
     Raises
     ------
     ConfigError
-        if a setting is negative or not a number, or the correlation time or a least speed is 0.
+        if a setting is negative or not a number, or a least speed is 0.
     """
     for each in fields(settings):
         value = getattr(settings, each.name)
-        zero = each.name not in ("correlation_s", "stand_mps", "min_speed_mps")
+        zero = each.name not in ("stand_mps", "min_speed_mps")
         valid = value == value and (value >= 0.0 if zero else 0.0 < value < math.inf)
         if not valid or (value == math.inf and each.name != "gyro_threshold_radps"):
             accepted = "a number from zero up" if zero else "a number above zero"
             raise ConfigError(f"odometry: {each.name} is {value!r}, {accepted} is required")
     geometry = (robot.half_track_m, robot.contact_length_m)
-    return np.array([*geometry, *astuple(settings), model.slip_std_ratio, model.angle_std_rad])
+    residuals = (model.slip_std_ratio, model.angle_std_rad, model.correlation_s)
+    return np.array([*geometry, *astuple(settings), *residuals])
 
 
 def odometry_memory(model: SlipModel, settings: OdometrySettings) -> Array:
@@ -211,7 +210,7 @@ def advance(params: Array, after: Array, row: Array, dt_s: float) -> None:
         return
     theta = after[THETA : THETA + N_PARAMETERS]
     covariance = after[COVARIANCE : COVARIANCE + N * N].reshape((N, N))
-    rate_slopes, slopes = np.empty(N_PARAMETERS), np.empty((3, N_PARAMETERS))
+    rate_slopes, slopes = np.empty(N_PARAMETERS), np.empty((2, N_PARAMETERS))
     rate, rate_variance, status = yaw_rate_of(params, theta, row, rate_slopes)
     if not take_tilt(after, row):
         status = ObserverStatus.PREDICTED.value
@@ -221,25 +220,22 @@ def advance(params: Array, after: Array, row: Array, dt_s: float) -> None:
         _stand(params, after, covariance, rate, rate_variance, dt_s)
         return
     tilt = (after[TILT], after[TILT + 1])
-    v_x, v_y, beta, by_rate = body_velocity(
+    v_x, v_y, x_by_rate, y_by_rate = body_velocity(
         theta, params[_HALF], belts, rate, tilt, after[DISPLACEMENT], slopes
     )
-    after[GROUND], after[GROUND + 1] = v_x - params[_HALF] * rate, v_x + params[_HALF] * rate
-    tangent, sign = math.tan(beta), math.copysign(1.0, v_x)
     for i in range(N_PARAMETERS):
-        slopes[0, i] += by_rate * rate_slopes[i]
-        slopes[1, i] += sign * tangent * by_rate * rate_slopes[i]
+        slopes[0, i] += x_by_rate * rate_slopes[i]
+        slopes[1, i] += y_by_rate * rate_slopes[i]
     after[VELOCITY], after[VELOCITY + 1], after[VELOCITY + 2] = v_x, v_y, rate
-    after[ANGLE_NOW], after[STATUS] = beta, status
+    after[GROUND], after[GROUND + 1] = v_x - params[_HALF] * rate, v_x + params[_HALF] * rate
     after[DISPLACEMENT] = next_displacement(after[DISPLACEMENT], belts, rate, params[_LENGTH], dt_s)
-    slip_variance = (params[SLIP_STD] * 0.5 * (belts[0] + belts[1])) ** 2
-    angle_variance = params[ANGLE_STD] ** 2
+    after[STATUS] = status
+    speed = 0.5 * (abs(belts[0]) + abs(belts[1]))
+    slip_variance, side_variance = (params[SLIP_STD] * speed) ** 2, (params[ANGLE_STD] * speed) ** 2
     encoder_variance = 0.5 * params[_ENCODER_STD] ** 2
-    side_variance = angle_variance * (v_x * (1.0 + tangent * tangent)) ** 2 + slip_variance * tangent**2
     after[VARIANCE] = _quadratic(covariance, slopes[0]) + slip_variance + encoder_variance
     after[VARIANCE + 1] = _quadratic(covariance, slopes[1]) + side_variance
     after[VARIANCE + 2] = _quadratic(covariance, rate_slopes) + rate_variance
-    after[VARIANCE + 3] = _quadratic(covariance, slopes[2]) + angle_variance
     if dt_s > 0.0:
         twice = 2.0 * params[CORRELATION] * dt_s
         noise = (
@@ -256,10 +252,10 @@ def _stand(
 ) -> None:
     """Hold the position of a robot whose tracks stand; its heading follows the gyro if it is pushed."""
     pushed = abs(rate) > params[_PUSHED]
-    after[VELOCITY] = after[VELOCITY + 1] = after[ANGLE_NOW] = 0.0
+    after[VELOCITY] = after[VELOCITY + 1] = 0.0
     after[VELOCITY + 2] = rate if pushed else 0.0
     after[GROUND] = after[GROUND + 1] = 0.0
-    after[VARIANCE] = after[VARIANCE + 1] = after[VARIANCE + 3] = 0.0
+    after[VARIANCE] = after[VARIANCE + 1] = 0.0
     after[VARIANCE + 2] = rate_variance
     after[STATUS] = ObserverStatus.PUSHED.value if pushed else ObserverStatus.STANDING.value
     if pushed:
@@ -320,8 +316,11 @@ def _read(params: Array, memory: Array) -> tuple[Array, Array, Array, Array, int
         if fastest >= params[_MIN_SPEED]:
             slip[i] = min(max((belt - ground) / fastest, -1.0), 1.0)
             slip_std[i] = std[3] / fastest
-    if math.hypot(mean[3], mean[4]) >= params[_MIN_SPEED]:
-        slip[2], slip_std[2] = memory[ANGLE_NOW], math.sqrt(max(memory[VARIANCE + 3], 0.0))
+    v_x, v_y = abs(mean[3]), mean[4]
+    square = v_x * v_x + v_y * v_y
+    if square >= params[_MIN_SPEED] ** 2:
+        slip[2] = math.atan2(v_y, v_x)
+        slip_std[2] = math.hypot(v_x * std[4], v_y * std[3]) / square
     return mean, std, slip, slip_std, status
 
 

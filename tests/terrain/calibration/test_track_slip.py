@@ -56,14 +56,16 @@ def test_all_numbers_of_given_slip_come_back_within_their_intervals():
     runs = straights(ground, 1)
     for k, slope in enumerate((0.0, 0.09, 0.17, 0.26)):
         runs += turns(ground, 20 + k, (10, 16, 20), Slope(slope, math.pi / 2 * (-1) ** k))
-    found = identify_slip_model(runs, ROBOT)
+    found = identify_slip_model(runs, ROBOT, drift=False)
     assert found.notes == ()
     std = np.sqrt(np.diag(found.model.covariance))
     hidden = {"compaction_slip_ratio": 0.08, "grade_slip_ratio": 0.4, "side_slip_ratio": 0.6}
-    for name, true in hidden.items():
+    for name, true in (hidden | {"angle_roll_rad": -0.6}).items():
         place = PARAMETERS.index(name)
-        assert abs(found.model.vector[place] - true) < 3 * std[place] + 0.003
-    assert found.model.angle[4] == pytest.approx(-0.6, abs=3 * std[PARAMETERS.index("angle_roll_rad")] + 0.01)
+        assert abs(found.model.vector[place] - true) < 3 * std[place] + 0.01
+    wider = identify_slip_model(runs, ROBOT).model  # terms that nothing in these runs asks for stay small
+    for name in ("turn_grade_m", "turn_side_m", "turn_shift_m"):
+        assert abs(wider.vector[PARAMETERS.index(name)]) < 0.05
     assert found.model.track_ratio == pytest.approx(1 / (0.65 * 0.92), rel=0.02)
     assert found.straight is not None
     assert found.straight.r2_ratio > 0.8

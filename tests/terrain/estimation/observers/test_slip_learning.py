@@ -75,7 +75,7 @@ def test_hidden_slip_comes_back_within_its_stated_error(seed, every):
         assert abs(mean - TRUE[name]) < 3 * std, (name, mean, std)
     assert found["compaction_slip_ratio"][1] < 0.02
     if every == 1:
-        assert found["turning_exponent"][1] < 0.12
+        assert found["turning_exponent"][1] < 0.14
         assert found["grade_slip_ratio"][1] < 0.1
 
 

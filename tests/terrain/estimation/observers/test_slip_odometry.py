@@ -24,7 +24,7 @@ from terrain.simulation.tracked.slope import Slope
 ROBOT = load_robot("patako")
 D = ROBOT.half_track_m
 MODEL = SlipModel(
-    0.8, 0.05, 0.4, 0.3, 0.5, np.array([0.05, 0.3, 0.2, -0.1, -1.2, -0.4, 0.05, 0.1]), track_ratio=1.5
+    0.8, 0.05, 0.4, 0.3, 0.5, 0.2, 0.15, np.array([0.05, 0.3, 0.2, -0.1, -1.2, -0.4, 0.05, 0.1]), 1.5
 )
 OBSERVERS = {
     "slip": slip_odometry_observer(ROBOT, MODEL),
@@ -51,7 +51,7 @@ def final(observer, time_s, rows):
 def test_the_pose_is_the_integral_of_5_to_7():
     model = replace(MODEL, angle=np.where(np.arange(8) == 6, 0.0, MODEL.angle))  # without memory of the turn
     theta = np.concatenate([model.vector, np.zeros(N_PARAMETERS - N_MODEL)])
-    slopes = np.empty((3, N_PARAMETERS))
+    slopes = np.empty((2, N_PARAMETERS))
 
     def rate(t, pose):
         left, right, w, roll, pitch = drive(t)
@@ -94,7 +94,7 @@ def test_given_slip_is_followed_to_the_millimetre(slope):
         [*belts[:-1].T, *(truth.channel(c)[::2][:-1] for c in ("yaw_rate_radps", "roll_rad", "pitch_rad"))],
         axis=1,
     )
-    model = SlipModel(0.8, 0.1, 0.3, 0.0, 0.4, np.array([0, 0, 0, 0, -0.4, 0, 0, 0]))
+    model = SlipModel(0.8, 0.1, 0.3, 0.0, 0.4, angle=np.array([0, 0, 0, 0, -0.4, 0, 0, 0]))
     found = observe(slip_odometry_observer(ROBOT, model), np.arange(699) / 50, rows)
     pose = run.streams["pose"].values[::2][:699]
     assert np.hypot(*(found.mean[:, :2] - pose[:, :2]).T).max() < 0.002
@@ -105,7 +105,7 @@ def test_given_slip_is_followed_to_the_millimetre(slope):
 
 def test_the_covariance_is_that_of_many_models():
     rng = np.random.default_rng(1)
-    std = np.array([0.02, 0.01, 0.03, 0.02, 0.04, *np.full(8, 0.02), 0.05])
+    std = np.array([0.02, 0.01, 0.03, 0.02, 0.04, 0.02, 0.02, *np.full(8, 0.02), 0.05])
     model = replace(MODEL, covariance=np.diag(std**2))
     time_s = np.arange(0, 8, 0.05)
     rows = drive(time_s)
@@ -207,8 +207,8 @@ def test_any_input_leaves_a_finite_memory(name):
 
 
 def test_settings_are_checked():
-    with pytest.raises(ConfigError, match="correlation_s is 0"):
-        slip_odometry_observer(ROBOT, MODEL, OdometrySettings(correlation_s=0.0))
+    with pytest.raises(ConfigError, match="stand_mps is 0"):
+        slip_odometry_observer(ROBOT, MODEL, OdometrySettings(stand_mps=0.0))
     with pytest.raises(ConfigError, match="gyro_noise_radps is nan"):
         slip_odometry_observer(ROBOT, MODEL, OdometrySettings(gyro_noise_radps=np.nan))
     assert OBSERVERS["slip"].rows == ROWS
