@@ -15,7 +15,7 @@ from terrain.estimation.observers.slip_odometry import slip_odometry_observer
 from terrain.robots import load_robot
 
 ROBOT = load_robot("patako")
-MODEL = SlipModel(0.85, 0.05, 0.4, 0.2, 0.5, 0.3, 0.1, np.full(8, 0.02))
+MODEL = SlipModel(0.85, 0.05, 0.4, 0.2, 0.5, np.full(8, 0.02), turn_side_m=0.3, turn_shift_m=0.1)
 OBSERVERS = {
     "slip-odometry": slip_odometry_observer(ROBOT, MODEL),
     "gyrodometry": gyrodometry_observer(ROBOT),

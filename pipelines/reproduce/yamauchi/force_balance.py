@@ -36,16 +36,16 @@ def force_balance(seed: int, quick: bool) -> Finding:
     changes = {name: float((row[0] - row[-1]) / grade[-1]) for name, row in compaction.items()}
     fallen = float(compaction[SAND][-1] / compaction[SAND][0])
     row = Row(
-        what=f"Fall of the compaction resistance from 0° to {STEEPEST_DEG:g}° over the rise of the grade's, "
-        "largest of four soils",
+        what=f"Fall of the compaction resistance from 0° to {STEEPEST_DEG:g}° over the rise of the "
+        "grade's, largest of four soils",
         where="fig. 3",
         printed="largely independent of the slope",
         simulated=max(changes.values()),
         unit="ratio",
         verdict=holds(max(changes.values()) < INDEPENDENT_RATIO),
-        why="The load on the ground falls with the cosine of the slope, and the compaction a little faster: "
-        f"on the sand to {fallen:.2f} of its {compaction[SAND][0]:.1f} N, while the grade comes to pull with "
-        f"{grade[-1]:.0f} N.",
+        why="The load on the ground falls with the cosine of the slope, and the compaction a little "
+        f"faster: on the sand to {fallen:.2f} of its {compaction[SAND][0]:.1f} N, while the grade comes "
+        f"to pull with {grade[-1]:.0f} N.",
         beside=changes,
     )
     return Finding([row, *_equations()], [Picture(_CAPTION, _figure(np.degrees(slopes), compaction, grade))])
@@ -53,10 +53,8 @@ def force_balance(seed: int, quick: bool) -> Finding:
 
 _CAPTION = (
     "Resistance of compaction and of the grade over the slope, of Patako (25 kg) on four soils, by (8) "
-    "with the "
-    "n-th root and (10) with the grade. The soils are those of this project; the paper's figure has sand, "
-    "snow, "
-    "loam and a lunar simulant."
+    "with the n-th root and (10) with the grade. The soils are those of this project, Toyoura sand with "
+    "the moduli of dry sand; the paper's figure has sand, snow, loam and a lunar simulant."
 )
 
 
@@ -108,8 +106,8 @@ def _equations() -> list[Row]:
             simulated=float(mobilised_ratio(x)),
             unit="ratio",
             verdict=equation_verdict(float(mobilised_ratio(x)), sheared, 1.0 - math.exp(-x) / x),
-            why="The integral of (14) is 1 - (1 - exp(-x)) / x; the printed 1 - exp(-x) / x falls without "
-            "limit towards a slip of 0.",
+            why="The integral of (14) is 1 - (1 - exp(-x)) / x; the printed 1 - exp(-x) / x falls "
+            "without limit towards a slip of 0.",
         ),
         Row(
             what="Sideways drift in reverse at 5 cm/s, left side 0.1 rad up, of a slope of (26) of 0.5",

@@ -79,8 +79,7 @@ def online(seed: int, quick: bool) -> Finding:
 
 _CAPTION = (
     "Parameters of the slip model after each trial, by fixes of 2 cm at 10 Hz from unknown ground on, "
-    "with two "
-    "standard deviations; and their values from all trials with cameras."
+    "with two standard deviations; and their values from all trials with cameras."
 )
 
 

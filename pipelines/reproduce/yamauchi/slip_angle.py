@@ -67,8 +67,7 @@ def _rows(found: LinearFit, without: LinearFit, independent_p: Array) -> list[Ro
             unit="ratio",
             verdict=verdict_of(round(found.r2_ratio, 3), (PRINTED_R2, PRINTED_R2)),
             why="By forces a turn drifts by roll times yaw rate, a product that (28) does not have; the "
-            "printed "
-            f"figure is of {PRINTED_N} samples, this one of {found.n} of {found.n_runs} turns.",
+            f"printed figure is of {PRINTED_N} samples, this one of {found.n} of {found.n_runs} turns.",
             beside={"residual within a turn, deg": found.residual_std, "of turns, deg": found.run_std},
         ),
         Row(
@@ -80,10 +79,8 @@ def _rows(found: LinearFit, without: LinearFit, independent_p: Array) -> list[Ro
             unit="variables",
             verdict=verdict_of(float(n_significant), (8.0, 8.0)),
             why="Samples of one turn are not independent of each other. Taken as independent, as in the "
-            "paper, "
-            f"{int(np.sum(independent_p < SIGNIFICANT))} variables have p < 0.05. All trials have the same "
-            f"input "
-            "speed, so that its coefficient is that of noise and shares the intercept's.",
+            f"paper, {int(np.sum(independent_p < SIGNIFICANT))} variables have p < 0.05. All trials have "
+            "the same input speed, so that its coefficient is that of noise and shares the intercept's.",
             beside=dict(zip(REGRESSORS, found.p_value.tolist(), strict=True)),
         ),
         Row(
@@ -105,11 +102,10 @@ def _rows(found: LinearFit, without: LinearFit, independent_p: Array) -> list[Ro
             simulated=found.condition,
             unit="ratio",
             verdict=Verdict.NOT_PRINTED,
-            why="On one ground the gyro's yaw rate is a constant part of the input's, and the input speed "
-            "is a "
-            "constant: neither pair of coefficients can be told apart, whatever their p values. Odometry "
-            "uses "
-            "a regression without the constant and with a ridge chosen by leaving turns out.",
+            why="On one ground the gyro's yaw rate is a constant part of the input's, and the input "
+            "speed is a constant: neither pair of coefficients can be separated, whatever their p "
+            "values. Odometry uses a regression without the constant and with a ridge chosen by leaving "
+            "turns out.",
             beside={
                 "input yaw rate": coefficients["input_yaw_rate_radps"],
                 "gyro yaw rate": coefficients["gyro_yaw_rate_radps"],

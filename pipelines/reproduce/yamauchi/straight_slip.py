@@ -58,9 +58,8 @@ def straight_slip(seed: int, quick: bool) -> Finding:
 
 _CAPTION = (
     "Slip ratio while climbing and while traversing, and slip angle while traversing, over the slope: "
-    "means and "
-    "standard deviations of three trials, each on sand of its own, and the lines (22) and (26) through 0° "
-    "to 20°."
+    "means and standard deviations of three trials, each on sand of its own, and the lines (22) and (26) "
+    "through 0° to 20°."
 )
 
 
@@ -107,8 +106,7 @@ def _rows(curves: Mapping[str, OnSlopes], slopes_deg: Array, line: Array, side: 
             unit="ratio",
             verdict=holds(fit > LINEAR_R2),
             why=f"Slope {line[1]:.3f} per rad; (22) from the soil's own numbers gives {theory[1]:.3f}, as "
-            f"small "
-            "slip does; the curve steepens towards the limit of friction.",
+            "small slip does; the curve steepens towards the limit of friction.",
             beside={"slope per rad": float(line[1]), "intercept": float(line[0])},
         ),
         Row(
@@ -119,8 +117,7 @@ def _rows(curves: Mapping[str, OnSlopes], slopes_deg: Array, line: Array, side: 
             unit="ratio",
             verdict=holds(beyond > 2 * float(climb.std[-1]) / np.sqrt(3)),
             why="The line is the shear stress near the origin; at 25° the grade asks for three quarters "
-            "of the "
-            "friction.",
+            "of the friction.",
             beside={"std of a trial": float(climb.std[-1]), "slip": float(climb.mean[-1])},
         ),
         Row(
@@ -130,9 +127,8 @@ def _rows(curves: Mapping[str, OnSlopes], slopes_deg: Array, line: Array, side: 
             simulated=spread,
             unit="ratio",
             verdict=holds(spread < ALIKE_RATIO),
-            why="Sideways force takes a part of the friction, so that the small slip of compaction and "
-            "rolling "
-            "grows a little with the roll.",
+            why="The slip of rolling and compaction does not change; on steep slopes the robot turns a "
+            "little downhill, as its lower track carries more, and gravity helps.",
         ),
         Row(
             what="Slip angle over the slope from 0° to 20°, traversing: R² of the line through the means",
@@ -162,8 +158,7 @@ def _rows(curves: Mapping[str, OnSlopes], slopes_deg: Array, line: Array, side: 
             unit="ratio",
             verdict=Verdict.NOT_PRINTED,
             why="Of three trials whose friction angle (3 %), shear modulus (10 %) and stiffness (10 %) "
-            "are drawn "
-            "anew.",
+            "are drawn anew.",
         ),
     ]
 

@@ -76,11 +76,10 @@ def turning_law(seed: int, quick: bool) -> Finding:
 
 
 _CAPTION = (
-    "Magnitude of the ratio of the slip ratios over that of the speeds of the tracks, in turns on sand of "
-    "four "
-    "slopes and on firm ground, with the line of Endo's law by the speed of the body and by logarithms as "
-    "in the "
-    "paper. Points with little slip scatter over decades: a logarithm of noise over noise."
+    "Magnitude of the ratio of the slip ratios over that of the speeds of the tracks, in turns on sand "
+    "of four slopes and on firm ground, with the line of Endo's law by the speed of the body and by "
+    "logarithms as in the paper. Points with little slip scatter over decades: a logarithm of noise over "
+    "noise."
 )
 
 
@@ -142,8 +141,8 @@ def _hidden(seed: int, quick: bool) -> Row:
         simulated=worst,
         unit="ratio",
         verdict=Verdict.NOT_PRINTED,
-        why="Sixteen turns of 90°, encoders with 1 mm/s, gyro with 0.003 rad/s, cameras with 1 mm at 100 Hz; "
-        "within 0.02 is required.",
+        why="Sixteen turns of 90°, encoders with 1 mm/s, gyro with 0.003 rad/s, cameras with 1 mm at 100 "
+        "Hz; within 0.02 is required.",
         beside=errors,
     )
 
@@ -163,9 +162,8 @@ def _rows(
             unit="ratio",
             verdict=verdict_of(sand.value, (PRINTED_SAND, PRINTED_SAND), sand.interval),
             why="By least squares on the speed of the body, with what a grade adds in a turn. Numbers of "
-            "the sand "
-            "were assumed, and n goes with the shear modulus. Beside it n as printed, without a part for the "
-            "grade, and by logarithms as in fig. 13.",
+            "the sand were assumed, and n goes with the shear modulus. Beside it n as printed, without a "
+            "part for the grade, and by logarithms as in fig. 13.",
             beside={"as printed": plain.value, "by logarithms": lines["sand"][0]},
         ),
         Row(
@@ -177,9 +175,8 @@ def _rows(
             spread=floor.interval,
             unit="ratio",
             verdict=verdict_of(floor.value, (PRINTED_FLOOR, PRINTED_FLOOR), floor.interval),
-            why="The paper's floor is rigid linoleum; the simulated ground is firm soil that shears, with "
-            "the "
-            "interval of nine turns.",
+            why="The paper's floor is rigid linoleum; the simulated ground is firm soil that shears, "
+            "with the interval of nine turns.",
             beside={"by logarithms": lines["floor"][0]},
         ),
         Row(
@@ -195,9 +192,9 @@ def _rows(
                 (PRINTED_SAND - PRINTED_FLOOR, PRINTED_SAND - PRINTED_FLOOR),
                 (sand.interval[0] - floor.interval[1], sand.interval[1] - floor.interval[0]),
             ),
-            why="By forces n is no constant of the robot. Beside it n of each slope alone, as printed, in "
-            "turns "
-            "uphill: with the grade in the speed but not in the law, n takes up what the grade does.",
+            why="By forces n is no constant of the robot. Beside it n of each slope alone, as printed, "
+            "in turns uphill: with the grade in the speed but not in the law, n takes up what the grade "
+            "does.",
             beside=of_slope,
         ),
     ]

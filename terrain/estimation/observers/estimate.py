@@ -18,7 +18,7 @@ from terrain.logs.schema import ESTIMATOR_CHANNELS
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import Robot
 
-WITHOUT_UNIT = frozenset(name for name in PARAMETERS if not name.endswith(("_ratio", "_grade_m")))
+WITHOUT_UNIT = frozenset(name for name in PARAMETERS if not name.endswith(("_ratio", "_m")))
 """States that are numbers of a model, without a unit of their own."""
 
 

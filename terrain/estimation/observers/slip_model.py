@@ -89,15 +89,15 @@ class SlipModel:
     compaction_slip_ratio, grade_slip_ratio : intercept and slope (per rad) of (22)
     turn_grade_m : lambda_x, speed back down by yaw rate and grade
     side_slip_ratio : k of (26), per rad
-    turn_side_m : lambda_y, speed down to the side by yaw rate and roll
-    turn_shift_m : c, distance behind the middle of the point of turning, per rad of grade
     angle : (8,) coefficients of (28) in rad, for SI units, in the order of :data:`REGRESSORS`
     track_ratio : effective distance of the tracks over the described one, for a robot without a gyro
     covariance : (16, 16) of :data:`PARAMETERS`
     slip_std_ratio, angle_std_rad : residuals of V_x and V_y within a run, over the speed of the tracks
-    correlation_s : over which the residuals within a run are alike
     run_slip_std_ratio, run_angle_std_rad : b, what a whole run has in common
     found : how the numbers were found
+    correlation_s : over which the residuals within a run are alike
+    turn_side_m : lambda_y, speed down to the side by yaw rate and roll
+    turn_shift_m : c, distance behind the middle of the point of turning, per rad of grade
 
     Raises
     ------
@@ -115,17 +115,17 @@ class SlipModel:
     grade_slip_ratio: float = 0.0
     turn_grade_m: float = 0.0
     side_slip_ratio: float = 0.0
-    turn_side_m: float = 0.0
-    turn_shift_m: float = 0.0
     angle: Array = field(default_factory=lambda: np.zeros(N_ANGLE))
     track_ratio: float = 1.0
     covariance: Array = field(default_factory=lambda: np.zeros((N_MODEL, N_MODEL)))
     slip_std_ratio: float = 0.0
     angle_std_rad: float = 0.0
-    correlation_s: float = 0.5
     run_slip_std_ratio: float = 0.0
     run_angle_std_rad: float = 0.0
     found: str = "given"
+    correlation_s: float = 0.5
+    turn_side_m: float = 0.0
+    turn_shift_m: float = 0.0
 
     def __post_init__(self) -> None:
         for name, shape in (("angle", (N_ANGLE,)), ("covariance", (N_MODEL, N_MODEL))):

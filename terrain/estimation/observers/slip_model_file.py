@@ -7,7 +7,9 @@ Each parameter has its value and its standard deviation; correlations are left o
     parameters:
       turning_exponent: {value: 0.86, std: 0.004}
       ...
-    residuals: {slip_std_ratio: 0.01, angle_std_rad: 0.02, run_slip_std_ratio: 0.01, run_angle_std_rad: 0.02}
+    residuals:
+      slip_std_ratio: 0.01
+      ...
     correlation: [[1.0, 0.1, ...], ...]
 """
 
@@ -28,8 +30,8 @@ from terrain.files.documents import read_yaml
 from terrain.files.names import shown
 from terrain.records import Array
 
-RESIDUALS = ("slip_std_ratio", "angle_std_rad", "run_slip_std_ratio", "run_angle_std_rad")
-"""Standard deviations of a model beside those of its parameters."""
+RESIDUALS = ("slip_std_ratio", "angle_std_rad", "run_slip_std_ratio", "run_angle_std_rad", "correlation_s")
+"""Residuals of a model, and the time over which they are alike."""
 
 DIGITS = 6
 

@@ -21,7 +21,11 @@ from terrain.estimation.observers.slip_model import (
 
 D = 0.1965
 MODEL = SlipModel(
-    0.8, 0.05, 0.4, 0.3, 0.5, 0.2, 0.15, np.array([0.05, 0.3, 0.2, -0.1, -1.2, -0.4, 0.05, 0.1]), 1.5
+    *(0.8, 0.05, 0.4, 0.3, 0.5),
+    angle=np.array([0.05, 0.3, 0.2, -0.1, -1.2, -0.4, 0.05, 0.1]),
+    track_ratio=1.5,
+    turn_side_m=0.2,
+    turn_shift_m=0.15,
 )
 
 

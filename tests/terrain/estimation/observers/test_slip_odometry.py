@@ -24,7 +24,11 @@ from terrain.simulation.tracked.slope import Slope
 ROBOT = load_robot("patako")
 D = ROBOT.half_track_m
 MODEL = SlipModel(
-    0.8, 0.05, 0.4, 0.3, 0.5, 0.2, 0.15, np.array([0.05, 0.3, 0.2, -0.1, -1.2, -0.4, 0.05, 0.1]), 1.5
+    *(0.8, 0.05, 0.4, 0.3, 0.5),
+    angle=np.array([0.05, 0.3, 0.2, -0.1, -1.2, -0.4, 0.05, 0.1]),
+    track_ratio=1.5,
+    turn_side_m=0.2,
+    turn_shift_m=0.15,
 )
 OBSERVERS = {
     "slip": slip_odometry_observer(ROBOT, MODEL),
