@@ -26,6 +26,7 @@ from pipelines.cli import (
     serve,
     slip,
     soil,
+    track,
 )
 from terrain.errors import OutsideRegionWarning, TerrainError
 from terrain.files.names import printable
@@ -42,7 +43,7 @@ app = typer.Typer(
 GROUPS = (
     *(runs.app, export.app, estimate.app, features.app, classify.app, slip.app, soil.app, drive.app),
     *(replay.app, serve.app, can.app, label.app),
-    *(faults.app, explain.app, reproduce.app, quickstart.app),
+    *(faults.app, explain.app, reproduce.app, quickstart.app, track.app),
 )
 """Files of commands, in the order of help."""
 

@@ -120,6 +120,7 @@ class LiveEstimator:
         check_corrected(robot)
         self._channels, self._correction = channels, correction
         self._model = make_filter(filter_name, robot, with_gnss=has_gnss)
+        self.name = self._model.name
         robot = as_swerve(robot, "robot {name} has the drive {drive!r}: the live estimator is for 'swerve'")
         robot.require("motors", "steering", "sensors")
         scheduled = noise is None and bool(self._model.inputs)
@@ -211,11 +212,6 @@ class LiveEstimator:
         )
         self._written = [slice(*pair) for pair in pairwise(ends.tolist())]
         self._no_wheels = np.full(self._n_columns["wheels"], np.nan)
-
-    @property
-    def name(self) -> str:
-        """Name of the filter."""
-        return self._model.name
 
     @property
     def model(self) -> FilterModel:

@@ -18,10 +18,18 @@ from terrain.estimation.observers.slip_learning import slip_learning_observer
 from terrain.estimation.observers.slip_model import SlipModel
 from terrain.estimation.observers.slip_odometry import slip_odometry_observer
 from terrain.estimation.observers.tracked import tracked_observer
+from terrain.estimation.observers.tracked_settings import TrackedSettings
 from terrain.robots import BicycleRobot, Robot, TrackedRobot
 
+IN_MANOEUVRES = TrackedSettings(observation_gain_ps=(2.0, 2.0, 2.0), normalised=True, eta_walk_ratio=0.06)
+"""Gains of the adaptive observer for logs of any driving: as fast at every speed, and efficiencies that
+change by a tenth within some seconds, as from straight motion to a turn.  Errors over their standard
+deviations are then about 1 in manoeuvres and below it in steady motion.  The paper's gains, for slip that
+stays as it is, are the defaults of
+:class:`~terrain.estimation.observers.tracked_settings.TrackedSettings`."""
+
 OF_TRACKED: Mapping[str, Callable[[TrackedRobot, SlipModel], Observer]] = {
-    "tracked": lambda robot, _: tracked_observer(robot),
+    "tracked": lambda robot, _: tracked_observer(robot, IN_MANOEUVRES),
     "slip-odometry": slip_odometry_observer,
     "slip-learning": lambda robot, model: slip_learning_observer(robot),
     "encoder-odometry": lambda robot, model: encoder_odometry_observer(robot, track_ratio=model.track_ratio),

@@ -9,12 +9,12 @@ corrected in
     r_measured = r                        a_measured = w' + u r + g sin a - (L_R - x_imu) r'
 
 An extended Kalman filter, with a linearly implicit step (1 - h A)^-1 h f: the poles of (r, w), about
--2C/(m u), are far faster than any tick at low speed.  Below 0.3 m/s these equations say nothing (the observer of the
-paper's Figs. 5 and 6 divides by u there, and diverges); slip and C are then as they were.
+-2C/(m u), are far faster than any tick at low speed.  Below 0.3 m/s these equations say nothing (the observer
+of the paper's Figs. 5 and 6 divides by u there, and diverges); slip and C are then as they were.
 
 It takes steering, speed, yaw rate, roll and, where it is logged, lateral specific force; positions and
-headings only correct the pose that it carries on.  Yaw rate and force show two combinations of w, C_F and C_R; the
-third comes from transients and from the stiffness assumed at first: standard deviations include that.
+headings only correct the pose that it carries on.  Yaw rate and force show two combinations of w, C_F and
+C_R; the third comes from the stiffness assumed at first: standard deviations include that.
 
 Deremetz et al., ICRA 2017, section III, and Lenain et al. 2010.
 """
@@ -62,6 +62,7 @@ from terrain.estimation.observers.sideslip_pose import (
     X,
     Y,
     correct_by_fix,
+    spread,
     status_of,
     take_inputs,
 )
@@ -86,7 +87,8 @@ class DynamicSettings(NamedTuple):
     pose : of fixes; its slip gain is not used
     gyro_std_radps, accel_std_mps2 : of yaw rate and lateral specific force
     imu_ahead_m : of the accelerometer ahead of the rear axle
-    turn_walk_radps2, side_walk_mps2 : what the model lacks of r and w within a second
+    turn_walk_radps2, side_walk_mps2 : what the model lacks of r and w within a second; the lag of a tyre that
+        rolls into its slip is in it, which would otherwise be taken for a softer tyre
     stiffness_walk_npr : change of cornering stiffness within a second
     stiffness_correlation : of that change, between the axles
     stiffness_std_ratio : of the nominal cornering stiffness at first
@@ -99,8 +101,8 @@ class DynamicSettings(NamedTuple):
     accel_std_mps2: float = 0.1
     imu_ahead_m: float = 0.0
     turn_walk_radps2: float = 0.1
-    side_walk_mps2: float = 0.1
-    stiffness_walk_npr: float = 3000.0
+    side_walk_mps2: float = 2.0
+    stiffness_walk_npr: float = 2000.0
     stiffness_correlation: float = 0.8
     stiffness_std_ratio: float = 0.3
     excited_mps2: float = 1.0
@@ -157,8 +159,10 @@ def sideslip_dynamic_observer(
     cov[2:, 2:] = np.outer(std, std) * (
         np.eye(2) * (1.0 - settings.stiffness_correlation) + settings.stiffness_correlation
     )
-    states = ("position_x_m", "position_y_m", "yaw_rad", "yaw_rate_radps", "speed_y_mps")
-    states += ("cornering_front_npr", "cornering_rear_npr")
+    states = (
+        *("position_x_m", "position_y_m", "yaw_rad", "yaw_rate_radps", "speed_y_mps"),
+        *("cornering_front_npr", "cornering_rear_npr"),
+    )
     return Observer(
         "sideslip-dynamic", states, pose.SIDESLIPS, pose.SIDESLIP_ROWS, params, start, _step, _read
     )
@@ -206,7 +210,7 @@ def _predict(params: Array, after: Array, cov: Array, excited: bool, dt_s: float
             grown[i, 2 + j] = (
                 dt_s * slips[j] * (inverse[i, 0] * by_force[0, j] + inverse[i, 1] * by_force[1, j])
             )
-    cov[:] = grown @ cov @ grown.T
+    spread(cov, grown)
     cov[0, 0] += params[TURN_WALK] ** 2 * dt_s
     cov[1, 1] += params[SIDE_WALK] ** 2 * dt_s
     if excited:
@@ -221,11 +225,14 @@ def _predict(params: Array, after: Array, cov: Array, excited: bool, dt_s: float
 @njit(cache=True)
 def _condition(after: Array, cov: Array, error: float, row: Array, std: float, excited: bool) -> bool:
     """Condition in place on a measurement; return False where it is too far to be one."""
-    spread = cov @ row
-    variance = row @ spread + std * std
+    variance, gain = std * std, np.zeros(4)
+    for i in range(4):
+        for j in range(4):
+            gain[i] += cov[i, j] * row[j]
+        variance += row[i] * gain[i]
     if error * error > _GATE_STDS**2 * variance:
         return False
-    gain = spread / variance
+    gain /= variance
     if not excited:
         gain[2:] = 0.0
     for i in range(4):
@@ -234,7 +241,7 @@ def _condition(after: Array, cov: Array, error: float, row: Array, std: float, e
     for i in range(4):
         for j in range(4):
             kept[i, j] -= gain[i] * row[j]
-    cov[:] = kept @ cov @ kept.T
+    spread(cov, kept)
     for i in range(4):
         for j in range(4):
             cov[i, j] += gain[i] * gain[j] * std * std
@@ -291,13 +298,17 @@ def _step(params: Array, memory: Array, row: Array, dt_s: float) -> Array:
         after[SLIP_F], after[SLIP_R] = slips[0], slips[1]
         pose_cov[2:, :] = 0.0
         pose_cov[:, 2:] = 0.0
-        pose_cov[2:, 2:] = by_motion @ np.ascontiguousarray(cov[:2, :2]) @ by_motion.T
+        for i in range(2):
+            for j in range(2):
+                for k in range(2):
+                    by = by_motion[i, 0] * cov[0, k] + by_motion[i, 1] * cov[1, k]
+                    pose_cov[2 + i, 2 + j] += by * by_motion[j, k]
     elif abs(after[SPEED]) < STANDING_MPS:
         after[RATE] = after[SIDE] = 0.0
     grown = error_growth(params, after, 4, dt_s)
     grown[:, 2:] *= 1.0 if after[HAS_POSITION] == 1.0 else 0.0
     grown[2, 2] = grown[3, 3] = 1.0
-    pose_cov[:] = grown @ pose_cov @ grown.T
+    spread(pose_cov, grown)
     add_pose_noise(params, after, pose_cov, 0.0, dt_s)
     fix = correct_by_fix(params, after, pose_cov, row)
     after[STATUS] = _status(memory, after, fix, used, excited)
@@ -312,7 +323,7 @@ def _status(before: Array, after: Array, fix: int, used: bool, excited: bool) ->
     if posed == ObserverStatus.REJECTED.value or not used:
         return ObserverStatus.REJECTED.value
     if posed == ObserverStatus.RESET.value:
-        return posed
+        return int(posed)
     if abs(after[SPEED]) < STANDING_MPS:
         return ObserverStatus.STANDING.value
     if 1.0 + after[TIME] - after[SEEN_AT] > pose.LOST_S:
@@ -321,25 +332,25 @@ def _status(before: Array, after: Array, fix: int, used: bool, excited: bool) ->
 
 
 @njit(cache=True)
-def _figures(memory: Array) -> tuple[Array, Array, Array, Array]:
-    mean, var = np.empty(7), np.empty(7)
-    mean[0], mean[1], mean[2] = memory[X], memory[Y], memory[YAW]
+def _figures(memory: Array) -> Array:
+    """Return means (7,), their deviations, slips (2,) and theirs, in one array."""
+    out = np.empty(18)
+    out[0], out[1], out[2] = memory[X], memory[Y], memory[YAW]
+    out[7] = out[8] = math.sqrt(max(memory[_POSE_COV], 0.0))
+    out[9] = math.sqrt(max(memory[_POSE_COV + 5], 0.0))
     for i in range(4):
-        mean[3 + i] = memory[RATE + i]
-        var[3 + i] = memory[_COV + 5 * i]
-    var[0] = var[1] = memory[_POSE_COV]
-    var[2] = memory[_POSE_COV + 5]
-    slip = np.array([memory[SLIP_F], memory[SLIP_R]])
-    slip_var = np.array([memory[_POSE_COV + 10], memory[_POSE_COV + 15]])
+        out[3 + i] = memory[RATE + i]
+        out[10 + i] = math.sqrt(max(memory[_COV + 5 * i], 0.0))
+    for i in range(2):
+        out[14 + i] = memory[SLIP_F + i]
+        out[16 + i] = math.sqrt(max(memory[_POSE_COV + 10 + 5 * i], 0.0))
     if memory[HAS_POSITION] == 0.0 or memory[HAS_YAW] == 0.0:
-        mean[:3] = math.nan
-        var[:3] = math.nan
+        out[:3] = out[7:10] = math.nan
     if memory[STATUS] == ObserverStatus.STARTING.value:
-        mean[3:5] = math.nan
-        slip[:] = math.nan
-        slip_var[:] = math.nan
-    return mean, np.sqrt(np.maximum(var, 0.0)), slip, np.sqrt(np.maximum(slip_var, 0.0))
+        out[3:5] = out[14:] = math.nan
+    return out
 
 
 def _read(params: Array, memory: Array) -> ObserverOutput:
-    return ObserverOutput(*_figures(memory), int(memory[STATUS]))
+    out = _figures(memory)
+    return ObserverOutput(out[:7], out[7:14], out[14:16], out[16:], int(memory[STATUS]))

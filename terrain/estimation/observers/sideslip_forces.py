@@ -73,4 +73,4 @@ def rates_by_force(params: Array, steer: float) -> Array:
 @njit(cache=True)
 def is_excited(params: Array, speed: float, roll: float, rate: float) -> bool:
     """Return whether side forces are large enough to show a cornering stiffness."""
-    return abs(speed * rate + GRAVITY_MPS2 * math.sin(roll)) > params[EXCITED]
+    return bool(abs(speed * rate + GRAVITY_MPS2 * math.sin(roll)) > params[EXCITED])

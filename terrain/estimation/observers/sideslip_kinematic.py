@@ -36,6 +36,7 @@ from terrain.estimation.observers.sideslip_pose import (
     advance_pose,
     correct_by_fix,
     slip_jacobian,
+    spread,
     status_of,
     take_inputs,
     yaw_rate_of,
@@ -85,7 +86,7 @@ def sideslip_kinematic_observer(
     start[COV:].reshape(_N, _N)[2:, 2:] = np.eye(2) * 0.1**2
     states = ("position_x_m", "position_y_m", "yaw_rad")
     return Observer(
-        "sideslip-kinematic", states, pose.SIDESLIPS, pose.SIDESLIP_ROWS, params, start, _step, read_pose
+        "sideslip-kinematic", states, pose.SIDESLIPS, pose.SIDESLIP_ROWS, params, start, _step, _read
     )
 
 
@@ -125,36 +126,41 @@ def _step(params: Array, memory: Array, row: Array, dt_s: float) -> Array:
     cov = after[COV : COV + _N * _N].reshape(_N, _N)
     predict_pose(params, after, dt_s)
     if after[HAS_POSITION] == 1.0 and after[HAS_YAW] == 1.0 and dt_s > 0.0:
-        grown = error_growth(params, after, _N, dt_s)
-        cov[:] = grown @ cov @ grown.T
+        spread(cov, error_growth(params, after, _N, dt_s))
         add_pose_noise(params, after, cov, params[SLIP_WALK], dt_s)
     after[STATUS] = status_of(memory, after, correct_by_fix(params, after, cov, row))
     return after
 
 
 @njit(cache=True)
-def slip_known(after: Array, std: Array) -> Array:
-    """Return the slip angles (2,), NaN where nothing shows them."""
-    slip = np.array([after[SLIP_F], after[SLIP_R]])
+def set_slips(after: Array, slips: Array, std: Array) -> None:
+    """Set the slip angles (2,) in place, NaN and so is their deviation where nothing shows them."""
+    slips[0], slips[1] = after[SLIP_F], after[SLIP_R]
     for i in range(2):
         if after[STATUS] == ObserverStatus.STARTING.value or not std[i] < _UNKNOWN_STD_RAD:
-            slip[i] = math.nan
-    return slip
+            slips[i] = std[i] = math.nan
 
 
 @njit(cache=True)
-def _read(memory: Array) -> tuple[Array, Array, Array, Array]:
-    var = np.array([memory[COV], memory[COV], memory[COV + 5], memory[COV + 10], memory[COV + 15]])
-    std = np.sqrt(np.maximum(var, 0.0))
-    mean = np.array([memory[X], memory[Y], memory[YAW]])
+def _figures(memory: Array) -> Array:
+    """Return means (3,), their deviations, slips (2,) and theirs, in one array."""
+    out = np.empty(10)
+    out[0], out[1], out[2] = memory[X], memory[Y], memory[YAW]
+    for i in range(4):
+        var = math.sqrt(max(memory[COV + 5 * i], 0.0))
+        if i < 2:
+            out[4 + i] = var
+        else:
+            out[6 + i] = var
+    out[3] = out[4]
     if memory[HAS_POSITION] == 0.0:
-        mean[:2] = math.nan
+        out[:2] = math.nan
     if memory[HAS_YAW] == 0.0:
-        mean[2] = math.nan
-    slip = slip_known(memory, std[3:])
-    return mean, std[:3], slip, np.where(np.isnan(slip), math.nan, std[3:])
+        out[2] = math.nan
+    set_slips(memory, out[6:8], out[8:10])
+    return out
 
 
-def read_pose(params: Array, memory: Array) -> ObserverOutput:
-    """Return what the memory says."""
-    return ObserverOutput(*_read(memory), int(memory[STATUS]))
+def _read(params: Array, memory: Array) -> ObserverOutput:
+    out = _figures(memory)
+    return ObserverOutput(out[:3], out[3:6], out[6:8], out[8:], int(memory[STATUS]))

@@ -7,9 +7,14 @@ the paper's), g of :mod:`~terrain.estimation.observers.sideslip_forces`, and e f
     dev' = f(dev, b) + K_dev e_dev         dyn' = g(dyn, b, C) + K_dyn e_dyn                   (8)
     b' = (K_b / K_a) J_f^T e_dev + (K_C / K_a) G_b^T e_dyn       C' = K_C G_C^T e_dyn          (9)
 
-with J_f, G_b and G_C the derivatives of f by b, and of g by b and by C.  Gains of section VI: K_dev = 15 (of
-the two printed "K of yaw rate", 15 and 20, the first is for theta~), K_dyn = 20, K_b = 2e12, K_a = 5e11,
-K_C = 5e7.
+with J_f, G_b and G_C the derivatives of f by b, and of g by b and by C.  Gains of section VI
+(:data:`SECTION_VI`): K_dev = 15 (of the two printed "K of yaw rate", 15 and 20, the first is for theta~),
+K_dyn = 20, K_b = 2e12, K_a = 5e11, K_C = 5e7.  With fixes of 2 cm they leave 0.7 to 1 degree of noise in b,
+and C needs tens of seconds to follow; the gains that are used by default weigh the dynamics more.
+
+The regressors of C' in (9), -b times what is in G_C, carry the noise of the same fixes as e_dyn: C comes out
+a quarter too low.  Used instead are the slip angles that the side forces of steady cornering, which are known
+from speed, yaw rate and roll, have at the estimated C: they carry none (``instrument``; False is as printed).
 
 Discrete form: the part of e_dev is exact per fix, with the continuous poles; the part of e_dyn, at each tick
 of length h, is implicit, e+ = (1 + h K_dyn + h^2 M)^-1 e with M = (K_C/K_a) G_b G_b^T + K_C G_C G_C^T, which
@@ -32,6 +37,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from terrain.constants import GRAVITY_MPS2
 from terrain.errors import ConfigError
 from terrain.estimation.observers import sideslip_pose as pose
 from terrain.estimation.observers.family import Observer, ObserverOutput, ObserverStatus
@@ -40,6 +46,7 @@ from terrain.estimation.observers.sideslip_forces import (
     C_HIGH_F,
     C_HIGH_R,
     C_LOW,
+    MASS,
     N_DYNAMIC,
     is_excited,
     rates,
@@ -50,7 +57,7 @@ from terrain.estimation.observers.sideslip_kinematic import (
     add_pose_noise,
     error_growth,
     predict_pose,
-    slip_known,
+    set_slips,
 )
 from terrain.estimation.observers.sideslip_pose import (
     AHEAD,
@@ -71,6 +78,7 @@ from terrain.estimation.observers.sideslip_pose import (
     X,
     Y,
     correct_by_fix,
+    spread,
     status_of,
     take_inputs,
 )
@@ -81,7 +89,7 @@ RATE, SIDE, C_F, C_R, RATE_AGE = range(SHARED_SIZE, SHARED_SIZE + 5)
 """Places of yaw rate, lateral velocity and cornering stiffness in the memory, and of the gyro's age."""
 COV = SHARED_SIZE + 5
 _N = 8
-K_DYN, K_C, K_C_A, SLIP_WALK, C_WALK, GYRO_STD = range(N_DYNAMIC, N_DYNAMIC + 6)
+K_DYN, K_C, K_C_A, SLIP_WALK, C_WALK, GYRO_STD, INSTRUMENT = range(N_DYNAMIC, N_DYNAMIC + 7)
 _SLOW_MPS = 0.3
 """Slower the dynamics are not used: side forces follow where the tyres were, not where they go."""
 
@@ -99,19 +107,30 @@ class MultiModelSettings(NamedTuple):
     slip_walk_radps, stiffness_walk_npr : change within a second, one standard deviation
     stiffness_std_ratio : of the nominal cornering stiffness at first
     gyro_std_radps : of the yaw rate
+    instrument : whether the regressors of C are those of side forces, without the noise of fixes
     as_printed : line 2 of (3) with the printed signs, to show what they do
     """
 
-    pose: pose.PoseSettings = pose.PoseSettings()
+    pose: pose.PoseSettings = pose.PoseSettings(slip_gain=3.0)
     dynamic_gain_ps: float = 20.0
-    stiffness_gain: float = 5e7
-    dynamic_slip_ratio: float = 1e-4
+    stiffness_gain: float = 1e9
+    dynamic_slip_ratio: float = 3e-2
     excited_mps2: float = 1.0
     slip_walk_radps: float = 0.05
     stiffness_walk_npr: float = 3000.0
     stiffness_std_ratio: float = 0.4
     gyro_std_radps: float = 0.003
+    instrument: bool = True
     as_printed: bool = False
+
+
+SECTION_VI = MultiModelSettings(
+    pose.PoseSettings(slip_gain=2e12 / 5e11),
+    stiffness_gain=5e7,
+    dynamic_slip_ratio=5e7 / 5e11,
+    instrument=False,
+)
+"""Gains and regressors as the paper prints them."""
 
 
 def sideslip_multi_observer(
@@ -138,26 +157,28 @@ def sideslip_multi_observer(
     ('yaw_rate_radps', 'speed_y_mps', 'cornering_front_npr', 'cornering_rear_npr')
     """
     own = settings._asdict()
-    own.pop("pose"), own.pop("as_printed")
+    own.pop("pose"), own.pop("as_printed"), own.pop("instrument")
     bad = [f"{name} is {value:g}" for name, value in own.items() if not 0.0 <= value < math.inf]
     if bad or settings.dynamic_gain_ps == 0.0:
         raise ConfigError(
             f"{', '.join(bad) or 'dynamic_gain_ps is 0'}; finite gains and deviations are needed"
         )
-    params = pose.shared_params(robot, settings.pose, GYRO_STD + 1)
+    params = pose.shared_params(robot, settings.pose, INSTRUMENT + 1)
     set_dynamics(params, robot, settings.excited_mps2, settings.as_printed)
     params[[K_DYN, K_C, K_C_A]] = (
         settings.dynamic_gain_ps, settings.stiffness_gain, settings.dynamic_slip_ratio
     )  # fmt: skip
     params[[SLIP_WALK, C_WALK]] = settings.slip_walk_radps, settings.stiffness_walk_npr
-    params[GYRO_STD] = settings.gyro_std_radps
+    params[[GYRO_STD, INSTRUMENT]] = settings.gyro_std_radps, settings.instrument
     start = pose.shared_start(COV + _N * _N)
     nominal = np.array([robot.front_cornering_npr, robot.rear_cornering_npr])
     start[[C_F, C_R]], start[RATE_AGE] = nominal, pose.LOST_S
     std = [0.0, 0.0, 0.1, 0.1, 0.1, 0.1, *settings.stiffness_std_ratio * nominal]
     start[COV:] = np.diag(np.square(std)).ravel()
-    states = ("position_x_m", "position_y_m", "yaw_rad", "yaw_rate_radps", "speed_y_mps")
-    states += ("cornering_front_npr", "cornering_rear_npr")
+    states = (
+        *("position_x_m", "position_y_m", "yaw_rad", "yaw_rate_radps", "speed_y_mps"),
+        *("cornering_front_npr", "cornering_rear_npr"),
+    )
     return Observer("sideslip-multi", states, pose.SIDESLIPS, pose.SIDESLIP_ROWS, params, start, _step, _read)
 
 
@@ -167,19 +188,25 @@ def _side_speed(params: Array, after: Array) -> float:
     sign = -1.0 if after[SPEED] < 0.0 else 1.0
     front = math.tan(min(max(after[STEER] + sign * after[SLIP_F], -1.4), 1.4))
     rear = math.tan(sign * after[SLIP_R])
-    return after[SPEED] * (params[AHEAD] * front + params[BEHIND] * rear) / params[BASE]
+    return float(after[SPEED] * (params[AHEAD] * front + params[BEHIND] * rear) / params[BASE])
 
 
 @njit(cache=True)
-def _error_model(params: Array, after: Array, adapted: bool) -> tuple[Array, Array, Array]:
+def _error_model(params: Array, after: Array, adapted: bool, rate: float) -> tuple[Array, Array, Array]:
     """Return derivatives of g by b and by C (2, 2), 0 where C is not adapted, and of w in (4) by b (2,)."""
+    regressors = np.array([after[SLIP_F], after[SLIP_R]])
+    if params[INSTRUMENT] == 1.0:
+        load = params[MASS] / params[BASE]
+        load *= after[SPEED] * rate + GRAVITY_MPS2 * math.sin(after[ROLL])
+        regressors[0] = -load * params[AHEAD] / (after[C_F] * math.cos(after[STEER]))
+        regressors[1] = -load * params[BEHIND] / after[C_R]
     by_force = rates_by_force(params, after[STEER])
     by_slip, by_stiffness, side = np.zeros((2, 2)), np.zeros((2, 2)), np.zeros(2)
     for i in range(2):
         by_slip[i, 0], by_slip[i, 1] = by_force[i, 0] * after[C_F], by_force[i, 1] * after[C_R]
         if adapted:
-            by_stiffness[i, 0] = by_force[i, 0] * after[SLIP_F]
-            by_stiffness[i, 1] = by_force[i, 1] * after[SLIP_R]
+            by_stiffness[i, 0] = by_force[i, 0] * regressors[0]
+            by_stiffness[i, 1] = by_force[i, 1] * regressors[1]
     size, sign = abs(after[SPEED]), -1.0 if after[SPEED] < 0.0 else 1.0
     front = math.cos(min(max(after[STEER] + sign * after[SLIP_F], -1.4), 1.4))
     side[0] = size * params[AHEAD] / (params[BASE] * front**2)
@@ -205,9 +232,12 @@ def _dynamic_gains(params: Array, by_slip: Array, by_stiffness: Array, measured:
     if not measured:
         inverse[:, 0] = 0.0
     gains = np.zeros((_N, 2))
-    gains[2:4] = dt_s * params[K_C_A] * (by_slip.T @ inverse)
-    gains[4:6] = dt_s * params[K_DYN] * inverse
-    gains[6:8] = dt_s * params[K_C] * (by_stiffness.T @ inverse)
+    for i in range(2):
+        for j in range(2):
+            gains[4 + i, j] = dt_s * params[K_DYN] * inverse[i, j]
+            for k in range(2):
+                gains[2 + i, j] += dt_s * params[K_C_A] * by_slip[k, i] * inverse[k, j]
+                gains[6 + i, j] += dt_s * params[K_C] * by_stiffness[k, i] * inverse[k, j]
     return gains
 
 
@@ -217,14 +247,14 @@ def _correct_dynamics(params: Array, after: Array, cov: Array, rate_measured: fl
     measured = after[RATE_AGE] == 0.0
     rate = rate_measured if measured else after[RATE]
     adapted = measured and is_excited(params, after[SPEED], after[ROLL], rate)
-    by_slip, by_stiffness, side = _error_model(params, after, adapted)
+    by_slip, by_stiffness, side = _error_model(params, after, adapted, rate)
     gains = _dynamic_gains(params, by_slip, by_stiffness, measured, dt_s)
     slips, stiffness = np.array([after[SLIP_F], after[SLIP_R]]), np.array([after[C_F], after[C_R]])
     turning, pushed = rates(params, after[SPEED], after[STEER], after[ROLL], rate, slips, stiffness)
     after[RATE] += dt_s * turning
     after[SIDE] += dt_s * pushed
     error = np.array([rate - after[RATE] if measured else 0.0, _side_speed(params, after) - after[SIDE]])
-    change = gains @ error
+    change = gains[:, 0] * error[0] + gains[:, 1] * error[1]
     after[SLIP_F] = min(max(after[SLIP_F] + change[2], -SLIP_MAX_RAD), SLIP_MAX_RAD)
     after[SLIP_R] = min(max(after[SLIP_R] + change[3], -SLIP_MAX_RAD), SLIP_MAX_RAD)
     after[RATE] += change[4]
@@ -236,18 +266,19 @@ def _correct_dynamics(params: Array, after: Array, cov: Array, rate_measured: fl
     grown[4:6, 6:8] = dt_s * by_stiffness
     if not measured:
         grown[5, 4] = -dt_s * after[SPEED]
-    seen = np.zeros((2, _N))
-    seen[0, 4] = seen[1, 5] = 1.0
-    seen[1, 2], seen[1, 3] = -side[0], -side[1]
-    grown = grown - gains @ (seen @ grown)
-    cov[:] = grown @ cov @ grown.T
+    for j in range(_N):
+        of_rate = grown[4, j]
+        of_side = grown[5, j] - side[0] * grown[2, j] - side[1] * grown[3, j]
+        for i in range(2, _N):
+            grown[i, j] -= gains[i, 0] * of_rate + gains[i, 1] * of_side
+    spread(cov, grown)
     for i in range(_N):
         for j in range(_N):
             cov[i, j] += gains[i, 0] * gains[j, 0] * params[GYRO_STD] ** 2
     if adapted:
         for i in range(6, 8):
             cov[i, i] = min(cov[i, i] + params[C_WALK] ** 2 * dt_s, params[C_HIGH_F] ** 2)
-    return adapted
+    return bool(adapted)
 
 
 @njit(cache=True)
@@ -265,8 +296,7 @@ def _step(params: Array, memory: Array, row: Array, dt_s: float) -> Array:
         adapted = _correct_dynamics(params, after, cov, rate_measured, min(dt_s, 0.1))
         add_pose_noise(params, after, cov, params[SLIP_WALK], dt_s)
     elif posed and dt_s > 0.0:
-        grown = error_growth(params, after, _N, dt_s)
-        cov[:] = grown @ cov @ grown.T
+        spread(cov, error_growth(params, after, _N, dt_s))
         add_pose_noise(params, after, cov, params[SLIP_WALK], dt_s)
         after[RATE] = rate_measured if known else after[RATE]
         after[SIDE] = _side_speed(params, after) if abs(after[SPEED]) >= STANDING_MPS else 0.0
@@ -279,25 +309,28 @@ def _step(params: Array, memory: Array, row: Array, dt_s: float) -> Array:
 
 
 @njit(cache=True)
-def _figures(memory: Array) -> tuple[Array, Array, Array, Array]:
-    var = np.empty(_N + 1)
+def _figures(memory: Array) -> Array:
+    """Return means (7,), their deviations, slips (2,) and theirs, in one array."""
+    out = np.empty(18)
+    out[0], out[1], out[2] = memory[X], memory[Y], memory[YAW]
+    out[3], out[4], out[5], out[6] = memory[RATE], memory[SIDE], memory[C_F], memory[C_R]
     for i in range(_N):
-        var[i + 1] = max(memory[COV + i * (_N + 1)], 0.0)
-    var[0] = var[1]
-    std = np.sqrt(var)
-    mean = np.empty(7)
-    mean[0], mean[1], mean[2] = memory[X], memory[Y], memory[YAW]
-    mean[3], mean[4], mean[5], mean[6] = memory[RATE], memory[SIDE], memory[C_F], memory[C_R]
+        std = math.sqrt(max(memory[COV + i * (_N + 1)], 0.0))
+        if i in (2, 3):
+            out[14 + i] = std
+        else:
+            out[8 + i if i < 2 else 6 + i] = std
+    out[7] = out[8]
     if memory[HAS_POSITION] == 0.0:
-        mean[:2] = math.nan
+        out[:2] = math.nan
     if memory[HAS_YAW] == 0.0:
-        mean[2] = math.nan
+        out[2] = math.nan
     if memory[STATUS] == ObserverStatus.STARTING.value:
-        mean[3:5] = math.nan
-    slip = slip_known(memory, std[3:5])
-    errors = np.array([std[0], std[1], std[2], std[5], std[6], std[7], std[8]])
-    return mean, errors, slip, np.where(np.isnan(slip), math.nan, std[3:5])
+        out[3:5] = math.nan
+    set_slips(memory, out[14:16], out[16:18])
+    return out
 
 
 def _read(params: Array, memory: Array) -> ObserverOutput:
-    return ObserverOutput(*_figures(memory), int(memory[STATUS]))
+    out = _figures(memory)
+    return ObserverOutput(out[:7], out[7:14], out[14:16], out[16:], int(memory[STATUS]))

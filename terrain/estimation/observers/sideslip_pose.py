@@ -147,7 +147,7 @@ def yaw_rate_of(params: Array, speed: float, steer: float, slip_f: float, slip_r
     """Return yaw' of slip angles."""
     sign = -1.0 if speed < 0.0 else 1.0
     front = min(max(steer + sign * slip_f, -1.4), 1.4)
-    return speed * (math.tan(front) - math.tan(sign * slip_r)) / params[BASE]
+    return float(speed * (math.tan(front) - math.tan(sign * slip_r)) / params[BASE])
 
 
 @njit(cache=True)
@@ -217,6 +217,26 @@ def fix_gains(jacobian: Array, gain: float, ratio: float, time_s: float) -> tupl
         for j in range(2):
             g_b[i, j] = jacobian[0, i] * h[0, j] + jacobian[1, i] * h[1, j]
     return 1.0 - math.exp(-gain * time_s), g_b
+
+
+@njit(cache=True)
+def spread(cov: Array, moved: Array) -> None:
+    """Set a covariance (n, n) in place to A P A^T; zeros of A, of which there are many, are left out."""
+    n = cov.shape[0]
+    half = np.zeros((n, n))
+    for i in range(n):
+        for k in range(n):
+            a = moved[i, k]
+            if a != 0.0:
+                for j in range(n):
+                    half[i, j] += a * cov[k, j]
+    cov[:] = 0.0
+    for j in range(n):
+        for k in range(n):
+            a = moved[j, k]
+            if a != 0.0:
+                for i in range(n):
+                    cov[i, j] += half[i, k] * a
 
 
 @njit(cache=True)
@@ -315,18 +335,25 @@ def correct_by_fix(params: Array, after: Array, cov: Array, row: Array) -> int:
             after[YAW], after[YAW_LEFT] = wrapped(after[YAW] + g_e * error), (1.0 - g_e) * error
         after[SLIP_F] = _bounded(after[SLIP_F] + g_b[0, 0] * across + g_b[0, 1] * error)
         after[SLIP_R] = _bounded(after[SLIP_R] + g_b[1, 0] * across + g_b[1, 1] * error)
-        gains = np.zeros((cov.shape[0], 2))
-        gains[0, 0], gains[1, 1] = g_e * used[0], g_e * used[1]
-        gains[2:4] = g_b
-        kept = np.eye(cov.shape[0])
-        kept[:, :2] -= gains
-        gains[:, 0] *= params[POSITION_STD]
-        gains[:, 1] *= params[YAW_STD]
-        cov[:] = kept @ cov @ kept.T + gains @ gains.T
+        _condition(params, cov, g_e * used, g_b)
     for status in (ObserverStatus.RESET.value, ObserverStatus.REJECTED.value):
         if heading == status or position == status:
             return status
     return ObserverStatus.OK.value
+
+
+@njit(cache=True)
+def _condition(params: Array, cov: Array, g_e: Array, g_b: Array) -> None:
+    """Set a covariance in place to (I - G H) P (I - G H)^T + G R G^T of a fix; ``g_e`` (2,) has its parts."""
+    kept, gains = np.eye(cov.shape[0]), np.zeros((4, 2))
+    gains[0, 0], gains[1, 1] = g_e[0], g_e[1]
+    gains[2:4] = g_b
+    kept[:4, :2] -= gains
+    spread(cov, kept)
+    for i in range(4):
+        for j in range(4):
+            cov[i, j] += gains[i, 0] * gains[j, 0] * params[POSITION_STD] ** 2
+            cov[i, j] += gains[i, 1] * gains[j, 1] * params[YAW_STD] ** 2
 
 
 @njit(cache=True)

@@ -22,6 +22,8 @@ of a gyro where there is one.
 - Standard deviations are those of the noise of fixes and a random walk of the efficiencies, propagated
   through the errors' own linear map; the noise of one fix acts in two intervals, and its covariance with the
   errors is kept.  Dead reckoning adds the heading's deviation times the distance since the last fix.
+- Where efficiencies change, the observation error is larger than its variance explains; their standard
+  deviations are then larger by the same ratio.
 - Excitation: the smallest eigenvalue of the mean of M'M, forgotten with the time constant T, as a speed (its
   root); T times its square is the mu of (14).
 
@@ -41,7 +43,7 @@ from numba import njit, types
 from terrain.angles import wrapped
 from terrain.estimation.observers import tracked_settings as at
 from terrain.estimation.observers.family import Observer, ObserverOutput, ObserverStatus
-from terrain.estimation.observers.tracked_interval import normalised_gain, observe_interval
+from terrain.estimation.observers.tracked_interval import inverse_3, normalised_gain, observe_interval
 from terrain.estimation.observers.tracked_settings import TrackedSettings, tracked_params
 from terrain.records import Array
 from terrain.robots.tracked import TrackedRobot
@@ -57,13 +59,16 @@ SLIPS = ("slip_left_ratio", "slip_right_ratio")
 STATUS, STARTED, FIX, ERROR, ETA, OBSERVED = 0, 1, 2, 5, 8, 10
 TRAVEL, SPAN, PATH, HEADING, SPEED, DIRECTION = 12, 18, 19, 20, 21, 23
 PENDING, BROKEN, UNAIDED, REJECTED, EXCITATION, COVARIANCE, CROSS = 25, 26, 27, 28, 29, 32, 57
-MEMORY_SIZE = 72
+MISFIT, MEMORY_SIZE = 72, 73
 """Places in the memory: the last fix, e at it, n^ and whether it was ever observed; W, h, the distance the
 faster track turned, and the heading since that fix; speeds at the last tick, the directions in which tracks
 last turned; time of ticks without speeds, whether the travel since the fix is unknown, and whether the gyro
 was absent in it, how many fixes were rejected; mean of M'M (LL, LR, RR); covariance (5, 5) of the errors, and
-(5, 3) of these with the noise of the last fix.
+(5, 3) of these with the noise of the last fix; square of the observation error over its variance, smoothed.
 """
+
+MISFIT_S = 1.0
+"""Over which the observation error is compared with its variance: about as long as efficiencies lag."""
 
 _FURTHEST_M = 1e8  # no position on Earth is further from an origin on it
 _FASTEST_RADPS = 50.0  # no gyro of a robot measures more
@@ -113,7 +118,7 @@ def _moved_on(params: Array, after: Array, left: float, right: float, rate: floa
 @njit(cache=True)
 def _begin_at(params: Array, after: Array, pose: Array) -> None:
     """Begin the pose anew at a fix; efficiencies are kept."""
-    cov, cross = after[COVARIANCE:CROSS].reshape(5, 5), after[CROSS:MEMORY_SIZE].reshape(5, 3)
+    cov, cross = after[COVARIANCE:CROSS].reshape(5, 5), after[CROSS:MISFIT].reshape(5, 3)
     cov[:3, :], cov[:, :3], cross[:, :] = 0.0, 0.0, 0.0
     for i in range(3):
         after[FIX + i], after[ERROR + i] = pose[i], 0.0
@@ -170,7 +175,7 @@ def _correct(params: Array, after: Array, pose: Array) -> None:
             after[ETA + j] = min(max(eta[j], 0.0), params[at.ETA_MAX])
             after[OBSERVED + j] = 1.0
     error[2] = wrapped(error[2])
-    cov, cross = after[COVARIANCE:CROSS].reshape(5, 5), after[CROSS:MEMORY_SIZE].reshape(5, 3)
+    cov, cross = after[COVARIANCE:CROSS].reshape(5, 5), after[CROSS:MISFIT].reshape(5, 3)
     variance = np.full(3, params[at.POSITION_STD] ** 2)
     variance[2] = params[at.YAW_STD] ** 2
     shared = (whole @ cross) @ from_start.T
@@ -179,6 +184,11 @@ def _correct(params: Array, after: Array, pose: Array) -> None:
     cov[:, :] = 0.5 * (fresh + fresh.T)
     cross[:, :] = from_end * variance
     after[ERROR : ERROR + 3], after[FIX : FIX + 3] = error, pose
+    seen = cov[:3, :3].copy()
+    for i in range(3):
+        seen[i, i] += variance[i]
+    square = error @ (inverse_3(seen) @ error) / 3.0
+    after[MISFIT] += -math.expm1(-span / MISFIT_S) * (square - after[MISFIT])
     _begin_interval(after, pose[2])
 
 
@@ -262,7 +272,8 @@ def _read(params: Array, memory: Array) -> tuple[Array, Array, Array, Array, int
     slip, slip_std = np.full(2, np.nan), np.full(2, np.nan)
     left, right, half = memory[SPEED], memory[SPEED + 1], 0.5 / params[at.HALF_TRACK]
     eta, cov = memory[ETA : ETA + 2], memory[COVARIANCE:CROSS].reshape(5, 5)
-    ll, lr, rr = cov[3, 3], cov[3, 4], cov[4, 4]
+    wider = max(memory[MISFIT], 1.0)
+    ll, lr, rr = cov[3, 3] * wider, cov[3, 4] * wider, cov[4, 4] * wider
     mean[3], mean[4] = 0.5 * (eta[0] * left + eta[1] * right), half * (eta[1] * right - eta[0] * left)
     common, cross = left * left * ll + right * right * rr, 2.0 * left * right * lr
     std[3], std[4] = 0.5 * math.sqrt(max(common + cross, 0.0)), half * math.sqrt(max(common - cross, 0.0))

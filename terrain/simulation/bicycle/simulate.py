@@ -207,7 +207,7 @@ def simulate_car(
         "gnss": _gnss(time_s[fixed], measured[fixed], rows[::per_tick][fixed], robot, noise, rng),
         "compass": Stream(time_s[fixed], measured[fixed, 4:5], ("yaw_rad",)),
         "imu": _imu(rows, measured, per_tick, robot, noise, rng),
-        "commands": Stream(time_s, commands, ("steer_front_rad", "speed_x_mps")),
+        "commands": Stream(time_s, commands[:n_ticks], ("steer_front_rad", "speed_x_mps")),
         "truth": _truth(rows, robot),
     }
     return RunLog(run_id, robot.name, streams, source="terrain.simulation.bicycle")

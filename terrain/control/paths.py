@@ -1,0 +1,273 @@
+"""Paths to follow: points or curvature along the distance, and where on a path a robot is.
+
+A path is a table on a uniform grid of distance s: position, heading, curvature c and side slope.  From
+points it is a smoothing spline of the fifth degree, whose curvature is continuous; points that repeat are
+merged and counted.  The place of a robot is searched next to where it was, and does not go back (Deremetz et
+al. 2017, Fig. 1: M is the point of the path closest to R); beyond the end it is the end, with a status.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from scipy.interpolate import splev, splprep
+
+from terrain.angles import unwrapped, wrapped
+from terrain.errors import DataError
+from terrain.records import Array, read_only
+from terrain.robots.bicycle import BicycleRobot
+from terrain.status import StatusCode
+
+GRID_M = 0.05
+"""Distance between the rows of a path."""
+S, X, Y, HEADING, CURVATURE, ROLL = range(6)
+"""Columns of :attr:`ReferencePath.rows`; the roll is NaN where it is not known."""
+_MERGED_M = 1e-3
+_LONGEST_M = 50_000.0
+
+
+class PathStatus(StatusCode):
+    """Where a robot is beside a path."""
+
+    OK = 0
+    END = 1
+    """At or beyond the end."""
+    FAR = 2
+    """Further from the path than the search reaches: the place is as it was."""
+    SINGULAR = 3
+    """Near the centre of curvature, 1 - c y close to 0 or below."""
+    NO_POSE = 4
+    """The pose is not known: the place is as it was."""
+
+
+class Place(NamedTuple):
+    """Where a robot is on a path.
+
+    Parameters
+    ----------
+    distance_m : s of the closest point
+    lateral_m : y, of the robot to the left of the path
+    angle_rad : theta~, heading of the robot less that of the path
+    curvature_pm : c(s)
+    status : number of a :class:`PathStatus`
+    """
+
+    distance_m: float
+    lateral_m: float
+    angle_rad: float
+    curvature_pm: float
+    status: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReferencePath:
+    """A path.
+
+    Parameters
+    ----------
+    rows : (n, 6) by the places S, X, Y, HEADING, CURVATURE, ROLL; s rises by :data:`GRID_M` from 0
+    n_merged : points that repeated the one before
+    """
+
+    rows: Array
+    n_merged: int = 0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "rows", read_only(self.rows))
+
+    @property
+    def length_m(self) -> float:
+        """Distance from its start to its end."""
+        return float(self.rows[-1, S])
+
+    @property
+    def start(self) -> tuple[float, float, float]:
+        """Pose at its start."""
+        return float(self.rows[0, X]), float(self.rows[0, Y]), float(self.rows[0, HEADING])
+
+    def with_roll(self, distance_m: Array, roll_rad: Array) -> ReferencePath:
+        """Return the path with side slopes (n,) over distance (n,), as a drive along it measured them."""
+        rows = self.rows.copy()
+        rows[:, ROLL] = np.interp(rows[:, S], distance_m, roll_rad)
+        return ReferencePath(rows, self.n_merged)
+
+
+def path_from_curvature(distance_m: Array, curvature_pm: Array) -> ReferencePath:
+    """Return the path from (0, 0) along x whose curvature runs linearly between given values.
+
+    Parameters
+    ----------
+    distance_m : (n,) rising from 0
+    curvature_pm : (n,)
+
+    Examples
+    --------
+    >>> circle = path_from_curvature(np.array([0.0, 2 * np.pi * 10]), np.array([0.1, 0.1]))
+    >>> bool(np.hypot(*circle.rows[-1, [X, Y]]) < 0.05)
+    True
+    """
+    s = np.arange(0.0, distance_m[-1] + 1e-9, GRID_M)
+    curvature = np.interp(s, distance_m, curvature_pm)
+    heading = np.concatenate([[0.0], np.cumsum(0.5 * (curvature[1:] + curvature[:-1]))]) * GRID_M
+    middle = 0.5 * (heading[1:] + heading[:-1])
+    x = np.concatenate([[0.0], np.cumsum(np.cos(middle))]) * GRID_M
+    y = np.concatenate([[0.0], np.cumsum(np.sin(middle))]) * GRID_M
+    return ReferencePath(np.column_stack([s, x, y, heading, curvature, np.full(s.size, np.nan)]))
+
+
+def path_from_points(points_m: Array, std_m: float = 0.0) -> ReferencePath:
+    """Return the path through points, or as near to them as their standard deviation.
+
+    Parameters
+    ----------
+    points_m : (n, 2) in their order
+    std_m : of each coordinate: 0 for points that were computed, the receiver's for points that were driven
+
+    Raises
+    ------
+    DataError
+        if there are fewer than four different points, one is not a finite number, or the path turns back at a
+        point.
+
+    Examples
+    --------
+    >>> angle = np.linspace(0.0, np.pi, 60)
+    >>> path = path_from_points(np.column_stack([10 * np.sin(angle), 10 - 10 * np.cos(angle)]))
+    >>> round(path.length_m, 1), path.rows[300, CURVATURE].round(3)
+    (31.4, np.float64(0.1))
+    """
+    points = np.asarray(points_m, float)
+    if points.ndim != 2 or points.shape[1] != 2:
+        raise DataError(f"path: points have shape {points.shape}, (n, 2) is needed")
+    bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
+    if bad.size:
+        raise DataError(f"path: point {bad[0] + 1} is {points[bad[0]].tolist()}, finite numbers are needed")
+    steps = np.hypot(*np.diff(points, axis=0).T)
+    kept = points[np.concatenate([[True], steps > _MERGED_M])]
+    if len(kept) < 4:
+        raise DataError(f"path: {len(kept)} different points, at least 4 are needed")
+    steps = np.hypot(*np.diff(kept, axis=0).T)
+    if steps.sum() > _LONGEST_M:
+        raise DataError(f"path: {steps.sum():g} m long, at most {_LONGEST_M:g} m are accepted")
+    turns = np.abs(wrapped(np.diff(np.arctan2(*np.diff(kept, axis=0).T[::-1]))))
+    if turns.max() > 0.75 * np.pi and std_m < 0.25 * steps.min():
+        back = int(turns.argmax()) + 1
+        raise DataError(
+            f"path: turns back by {np.degrees(turns[back - 1]):.0f} degrees at {kept[back].tolist()}"
+        )
+    return ReferencePath(_spline_rows(kept, steps, std_m), len(points) - len(kept))
+
+
+def _spline_rows(points: Array, steps: Array, std_m: float) -> Array:
+    along = np.concatenate([[0.0], np.cumsum(steps)])
+    spline, _ = splprep(points.T, u=along, k=min(5, len(points) - 1), s=2 * len(points) * std_m**2)
+    fine = np.linspace(0.0, along[-1], 1 + max(64, math.ceil(4 * along[-1] / GRID_M)))
+    x, y = splev(fine, spline)
+    length = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
+    s = np.arange(0.0, length[-1] + 1e-9, GRID_M)
+    at = np.interp(s, length, fine)
+    x, y = splev(at, spline)
+    (dx, dy), (ddx, ddy) = splev(at, spline, der=1), splev(at, spline, der=2)
+    curvature = (dx * ddy - dy * ddx) / np.maximum(np.hypot(dx, dy), 1e-9) ** 3
+    heading = unwrapped(np.arctan2(dy, dx))
+    return np.column_stack([s, x, y, heading, curvature, np.full(s.size, np.nan)])
+
+
+def path_warnings(path: ReferencePath, robot: BicycleRobot) -> tuple[str, ...]:
+    """Return a sentence for what of a path the robot cannot drive, and for what was changed.
+
+    Examples
+    --------
+    >>> from terrain.robots import load_robot
+    >>> tight = path_from_curvature(np.array([0.0, 2.0]), np.array([0.5, 0.5]))
+    >>> path_warnings(tight, load_robot("adap2e"))[0]
+    'curvature is 0.500 1/m at 0.0 m; steering to 20 degrees reaches 0.303 1/m'
+    """
+    found = []
+    reach = math.tan(robot.steering_max_rad) / robot.wheelbase_m
+    sharpest = int(np.abs(path.rows[:, CURVATURE]).argmax())
+    if abs(path.rows[sharpest, CURVATURE]) > reach:
+        found.append(
+            f"curvature is {path.rows[sharpest, CURVATURE]:.3f} 1/m at {path.rows[sharpest, S]:.1f} m; "
+            f"steering to {np.degrees(robot.steering_max_rad):.0f} degrees reaches {reach:.3f} 1/m"
+        )
+    if path.n_merged:
+        found.append(f"{path.n_merged} points that repeat the one before were merged with it")
+    return tuple(found)
+
+
+_WINDOW_M = 3.0
+_REACH_M = 5.0
+_AS_NEAR_M = 0.3
+
+
+@njit(cache=True)
+def _first_as_near(rows: Array, x_m: float, y_m: float, least_m: float) -> int:
+    """Return the first row, closest among its neighbours, that is hardly further than the closest of all."""
+    before = math.inf
+    for i in range(rows.shape[0]):
+        away = math.hypot(rows[i, X] - x_m, rows[i, Y] - y_m)
+        if before <= away and before <= least_m + _AS_NEAR_M:
+            return i - 1
+        before = away
+    return int(rows.shape[0] - 1)
+
+
+@njit(cache=True)
+def locate(
+    rows: Array, x_m: float, y_m: float, yaw_rad: float, before_m: float
+) -> tuple[float, float, float, float, int]:
+    """Return the fields of a :class:`Place`; compiled.
+
+    Parameters
+    ----------
+    rows : of a path
+    x_m, y_m, yaw_rad : pose of the robot
+    before_m : s at the step before; NaN at first, when all of the path is searched, and of places on a path
+        that comes back to itself the first is taken
+
+    Examples
+    --------
+    >>> ahead = path_from_curvature(np.array([0.0, 20.0]), np.zeros(2))
+    >>> Place(*locate(ahead.rows, 3.02, 0.1, 0.0, np.nan))._replace(status=0)
+    Place(distance_m=3.02, lateral_m=0.1, angle_rad=0.0, curvature_pm=0.0, status=0)
+    """
+    first, last = 0, rows.shape[0] - 1
+    if not math.isnan(before_m):
+        first = min(max(int(before_m / GRID_M), 0), last)
+        last = min(first + int(_WINDOW_M / GRID_M), last)
+    if not (abs(x_m) < 1e9 and abs(y_m) < 1e9 and abs(yaw_rad) < 1e6):
+        s = 0.0 if math.isnan(before_m) else before_m
+        return s, math.nan, math.nan, rows[first, CURVATURE], PathStatus.NO_POSE.value
+    nearest, least = first, math.inf
+    for i in range(first, last + 1):
+        square = (rows[i, X] - x_m) ** 2 + (rows[i, Y] - y_m) ** 2
+        if square < least:
+            nearest, least = i, square
+    if math.isnan(before_m):
+        nearest = _first_as_near(rows, x_m, y_m, math.sqrt(least))
+        least = (rows[nearest, X] - x_m) ** 2 + (rows[nearest, Y] - y_m) ** 2
+    heading = rows[nearest, HEADING]
+    off_x, off_y = x_m - rows[nearest, X], y_m - rows[nearest, Y]
+    along = math.cos(heading) * off_x + math.sin(heading) * off_y
+    lateral = math.cos(heading) * off_y - math.sin(heading) * off_x
+    curvature = rows[nearest, CURVATURE]
+    beside = 1.0 - curvature * lateral
+    along = min(max(along / max(beside, 0.2), -GRID_M), GRID_M) if nearest < rows.shape[0] - 1 else along
+    s = nearest * GRID_M + along
+    if not math.isnan(before_m):
+        s = max(s, before_m)
+    s = min(max(s, 0.0), (rows.shape[0] - 1) * GRID_M)
+    heading += curvature * (s - nearest * GRID_M)
+    status = PathStatus.OK.value
+    if beside < 0.2:
+        status = PathStatus.SINGULAR.value
+    if math.sqrt(least) > _REACH_M:
+        status = PathStatus.FAR.value
+    if nearest == rows.shape[0] - 1 and along >= 0.0:
+        status = PathStatus.END.value
+    return s, lateral, wrapped(yaw_rad - heading), curvature, status

@@ -1,0 +1,148 @@
+"""A car-like robot on the paths of the paper: bars of its controllers, lost fixes, grip, and the end."""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+import pytest
+
+from terrain.control.car_following import LOST_STOP_S, CarFollower, SlipSource
+from terrain.control.car_scenarios import STOP, Course, slope_course, stop_course
+from terrain.control.grip_preview import GRIP, VARIANCE, GripSettings, grip_params, grip_step, preview_speed
+from terrain.control.paths import locate, path_from_curvature
+from terrain.errors import ConfigError
+from terrain.robots import load_robot
+from terrain.simulation.bicycle.plant import Ground, level_ground, side_force
+from terrain.simulation.bicycle.simulate import simulate_car
+
+ROBOT = load_robot("adap2e")
+SEEDS = (0, 1, 2)
+
+
+def lateral_errors(run, path):
+    """Return true distance and lateral error (n, 2) at 50 Hz."""
+    truth, s, found = run.streams["truth"], np.nan, []
+    pose = np.column_stack([truth.channel(name) for name in ("position_x_m", "position_y_m", "yaw_rad")])
+    for row in pose[::2]:
+        s, lateral, *_ = locate(path.rows, *row, s)
+        found.append((s, lateral))
+    return np.array(found)
+
+
+@functools.cache
+def follow(course_name, speed_mps, source, seed):
+    course, stops = (slope_course()[0], ()) if course_name == "slope" else (stop_course(), STOP)
+    follower = CarFollower(ROBOT, course.path, source)
+    run = simulate_car(ROBOT, course.drive(speed_mps, stops), follower, np.random.default_rng(seed))
+    return follower, run, lateral_errors(run, course.path)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize(
+    ("speed_mps", "source"),
+    [(4.0, SlipSource.MULTI), (5.0, SlipSource.MULTI), (5.0, SlipSource.GRIP), (6.0, SlipSource.GRIP)],
+)
+def test_lateral_error_is_within_a_tenth_of_the_speed(speed_mps, source, seed):
+    _, run, lateral = follow("slope", speed_mps, source, seed)
+    assert lateral[-1, 0] > 0.99 * slope_course()[0].path.length_m
+    assert np.abs(lateral[:, 1]).max() < speed_mps / 10
+    assert run.streams["truth"].channel("speed_x_mps").max() == speed_mps
+
+
+def test_without_an_observer_the_error_is_larger():
+    none, multi = (
+        np.abs(follow("slope", 5.0, source, 0)[2][:, 1]).max()
+        for source in (SlipSource.NONE, SlipSource.MULTI)
+    )
+    assert none > 1.5 * multi
+    assert none > 0.5
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_stop_leaves_estimates_and_tracking_as_they_were(seed):
+    follower, run, lateral = follow("stop", 3.0, SlipSource.MULTI, seed)
+    slips = np.array([tick.estimate.slip for tick in follower.ticks])
+    assert np.isfinite(slips[1:]).all()
+    assert np.abs(slips[1:]).max() < np.radians(3.0)
+    speed = run.streams["truth"].channel("speed_x_mps")[::2]
+    stands = np.flatnonzero(speed[100:] == 0.0) + 100
+    assert stands.size == pytest.approx(150, abs=5)
+    before, after = np.abs(lateral[: stands[0], 1]).max(), np.abs(lateral[stands[-1] :, 1]).max()
+    assert after < before + 0.02  # one standard deviation of a fix
+
+
+def test_preview_slows_down_before_the_bend_and_knows_the_grip():
+    follower, run, _ = follow("slope", 6.0, SlipSource.GRIP, 0)
+    speed, distance = run.streams["truth"].channel("speed_x_mps"), run.streams["truth"].channel("distance_m")
+    bend = (distance > 66.0) & (distance < 88.0)
+    assert 3.0 < speed[bend].min() < 5.5
+    assert speed[distance > 110.0].max() == 6.0
+    last = follower.ticks[-1]
+    assert abs(last.grip_ratio - 0.7) < 3 * last.grip_std
+
+
+@pytest.mark.parametrize("grip", [0.35, 0.6, 0.8])
+def test_grip_comes_back_within_its_error(grip):
+    """Forces of the tyre over a sweep of slip that reaches nine tenths of the grip, b with noise."""
+    rng = np.random.default_rng(4)
+    params, memory = grip_params(ROBOT, GripSettings())
+    load = ROBOT.mass_kg * 9.80665 / 2
+    for k in range(1500):
+        slip = -0.16 * abs(np.sin(k / 100))
+        force = 2.0 * side_force(slip, ROBOT.front_cornering_npr, grip * load) / ROBOT.mass_kg
+        seen = slip + rng.normal(0.0, 0.01, 2)
+        memory = grip_step(params, memory, force, seen, np.full(2, 0.01), 0.02)
+    assert abs(memory[GRIP] - grip) < 3 * np.sqrt(memory[VARIANCE])
+    assert np.sqrt(memory[VARIANCE]) < 0.1
+
+
+def test_grip_stays_as_assumed_while_little_of_it_is_used_or_nothing_is_known():
+    params, memory = grip_params(ROBOT, GripSettings())
+    for force, slip in ((0.5, -0.01), (np.nan, -0.1), (4.0, np.nan), (4.0, 0.1)):
+        after = grip_step(params, memory, force, np.full(2, slip), np.full(2, 0.01), 0.02)
+        assert after[GRIP] == memory[GRIP]
+        assert after[VARIANCE] >= memory[VARIANCE]
+    for dt_s in (0.0, np.nan, -1.0, 1e9):
+        after = grip_step(params, memory, 4.0, np.full(2, -0.1), np.full(2, 0.01), dt_s)
+        assert (after == memory).all()
+
+
+def test_allowed_speed_falls_with_slope_uphill_and_is_free_on_the_straight():
+    params, memory = grip_params(ROBOT, GripSettings())
+    bend = path_from_curvature(np.array([0.0, 40.0]), np.array([0.1, 0.1])).rows
+    level, uphill, downhill = (preview_speed(params, memory, bend, 5.0, roll) for roll in (0.0, 0.2, -0.2))
+    assert uphill < downhill <= level
+    straight = path_from_curvature(np.array([0.0, 40.0]), np.zeros(2)).rows
+    assert preview_speed(params, memory, straight, 5.0, 0.2) > 100.0
+
+
+def test_robot_stops_when_fixes_are_lost():
+    path = path_from_curvature(np.array([0.0, 60.0]), np.zeros(2))
+    follower = CarFollower(ROBOT, path)
+
+    def without_fixes(sample):
+        if sample.time_s > 6.0:
+            sample.measured[2:5] = np.nan
+        return follower(sample)
+
+    drive = Course(path, level_ground()).drive(3.0)._replace(duration_s=14.0)
+    run = simulate_car(ROBOT, drive, without_fixes, np.random.default_rng(0))
+    speed = run.streams["truth"]
+    assert (speed.channel("speed_x_mps")[speed.time_s > 6.0 + LOST_STOP_S + 2.5] == 0.0).all()
+    assert (speed.channel("speed_x_mps")[(speed.time_s > 3.0) & (speed.time_s < 8.5)] == 3.0).all()
+
+
+def test_an_offset_is_kept_to_the_left():
+    from terrain.control.steering_law import SteeringSettings
+
+    path = path_from_curvature(np.array([0.0, 50.0]), np.zeros(2))
+    follower = CarFollower(ROBOT, path, SlipSource.MULTI, SteeringSettings(offset_m=1.0))
+    ground = Ground(np.zeros(1), np.array([0.7]), np.array([0.15]))
+    run = simulate_car(ROBOT, Course(path, ground).drive(3.0), follower, np.random.default_rng(0))
+    assert lateral_errors(run, path)[-100:, 1] == pytest.approx(1.0, abs=0.05)
+
+
+def test_settings_of_the_preview_that_cannot_be_are_refused():
+    with pytest.raises(ConfigError, match="used_part"):
+        grip_params(ROBOT, GripSettings(used_part=1.5))

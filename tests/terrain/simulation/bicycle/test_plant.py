@@ -1,0 +1,127 @@
+"""Plant of a car-like robot: laws, an independent integration, rest on a slope, and bad settings."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from terrain.constants import GRAVITY_MPS2
+from terrain.errors import ConfigError
+from terrain.robots import load_robot
+from terrain.simulation.bicycle import plant
+
+ROBOT = load_robot("adap2e")
+
+
+def drive(steer_rad, speed_mps, seconds, ground, start=None, **settings):
+    """Return rows (n, N_OUT) at 100 Hz and the state at the end."""
+    numbers = plant.plant_numbers(ROBOT, plant.PlantSettings(**settings))
+    rows = np.empty((round(seconds * 100), plant.N_OUT))
+    state = plant.initial_state(speed_mps=speed_mps) if start is None else start
+    after = plant.advance(numbers, plant.ground_grid(ground), state, steer_rad, speed_mps, rows, 10)
+    return rows, after
+
+
+@pytest.mark.parametrize(("steer_rad", "speed_mps", "roll_deg"), [(0.1, 4.0, 0.0), (-0.05, 5.0, 12.0)])
+def test_steady_cornering_balances_forces_and_moments(steer_rad, speed_mps, roll_deg):
+    rows, _ = drive(steer_rad, speed_mps, 12.0, plant.level_ground(0.8, np.deg2rad(roll_deg)))
+    end = rows[-1]
+    front = end[plant.SIDE_FRONT] * np.cos(end[plant.STEER])
+    push = speed_mps * end[plant.YAW_RATE] + GRAVITY_MPS2 * np.sin(np.deg2rad(roll_deg))
+    assert front + end[plant.SIDE_REAR] == pytest.approx(ROBOT.mass_kg * push, rel=1e-6)
+    assert ROBOT.com_behind_front_m * front == pytest.approx(ROBOT.com_ahead_m * end[plant.SIDE_REAR])
+    at_rear = end[plant.SIDE_SPEED] - ROBOT.com_ahead_m * end[plant.YAW_RATE]
+    assert end[plant.SLIP_REAR] == pytest.approx(np.arctan(at_rear / speed_mps), rel=1e-6)
+
+
+def test_plant_agrees_with_an_integration_of_its_equations():
+    speed, grip, roll, steer = 4.0, 0.6, 0.1, 0.12
+    mass, inertia = ROBOT.mass_kg, ROBOT.yaw_inertia_kgm2
+    ahead, behind = ROBOT.com_ahead_m, ROBOT.com_behind_front_m
+
+    def force(tangent, stiffness, load):
+        limit, slip = grip * load, np.arctan(tangent)
+        return -limit * (1 - np.exp(-stiffness * abs(slip) / limit)) * np.sign(slip)
+
+    def rates(_, y):
+        _, _, yaw, side, turning, front, rear = y
+        load = mass * GRAVITY_MPS2 * np.cos(roll) / 2
+        at_front, at_rear = side + behind * turning, side - ahead * turning
+        f_front = force(front, ROBOT.front_cornering_npr, load) * np.cos(steer)
+        f_rear = force(rear, ROBOT.rear_cornering_npr, load)
+        v_side = at_front * np.cos(steer) - speed * np.sin(steer)
+        v_ahead = speed * np.cos(steer) + at_front * np.sin(steer)
+        return [
+            speed * np.cos(yaw) - at_rear * np.sin(yaw),
+            speed * np.sin(yaw) + at_rear * np.cos(yaw),
+            turning,
+            (f_front + f_rear) / mass - GRAVITY_MPS2 * np.sin(roll) - speed * turning,
+            (behind * f_front - ahead * f_rear) / inertia,
+            (v_side - abs(v_ahead) * front) / 0.3,
+            (at_rear - speed * rear) / 0.3,
+        ]
+
+    start = plant.initial_state(speed_mps=speed)
+    start[plant.STEER] = steer
+    rows, _ = drive(
+        steer, speed, 3.0, plant.level_ground(grip, roll), start, steering_delay_s=0.0, damping_ratio=0.0
+    )
+    exact = solve_ivp(rates, (0.0, 3.0), np.zeros(7), rtol=1e-9, atol=1e-10).y[:, -1]
+    assert rows[-1, [plant.X, plant.Y]] == pytest.approx(exact[:2], abs=0.01)
+    assert rows[-1, [plant.SIDE_SPEED, plant.YAW_RATE]] == pytest.approx(exact[3:5], rel=2e-3)
+
+
+def test_side_force_rises_by_the_stiffness_and_saturates():
+    slip = np.linspace(-1.4, 1.4, 101)
+    force = np.array([plant.side_force(b, 15000.0, 1400.0) for b in slip])
+    assert (np.abs(force) <= 1400.0).all()
+    assert (np.diff(force) <= 0.0).all()
+    assert plant.side_force(1e-6, 15000.0, 1400.0) == pytest.approx(-0.015, rel=1e-3)
+
+
+def test_robot_stops_exactly_and_holds_on_a_slope_without_creep():
+    ground = plant.level_ground(0.7, np.deg2rad(15.0))
+    _, state = drive(0.1, 3.0, 3.0, ground)
+    numbers, grid = plant.plant_numbers(ROBOT, plant.PlantSettings()), plant.ground_grid(ground)
+    rows = np.empty((1500, plant.N_OUT))
+    plant.advance(numbers, grid, state, 0.1, 0.0, rows, 10)
+    assert (rows[500:, plant.SPEED] == 0.0).all()
+    assert np.ptp(rows[500:, [plant.X, plant.Y, plant.YAW]], axis=0) == pytest.approx(0.0, abs=1e-6)
+    held = rows[-1, plant.SIDE_FRONT] * np.cos(rows[-1, plant.STEER]) + rows[-1, plant.SIDE_REAR]
+    assert held == pytest.approx(ROBOT.mass_kg * GRAVITY_MPS2 * np.sin(np.deg2rad(15.0)), rel=1e-6)
+
+
+def test_robot_at_rest_slides_down_what_grip_does_not_hold():
+    rows, _ = drive(0.0, 0.0, 3.0, plant.level_ground(0.2, np.deg2rad(15.0)))
+    assert rows[-1, plant.Y] < -1.0
+    assert np.isfinite(rows).all()
+
+
+def test_steering_has_dead_time_rate_and_limit():
+    rows, _ = drive(1.0, 2.0, 2.0, plant.level_ground(), steering_delay_s=0.1)
+    steer = rows[:, plant.STEER]
+    assert (steer[:9] == 0.0).all()
+    assert np.diff(steer).max() <= ROBOT.steering_rate_radps * 0.01 + 1e-9
+    assert steer[-1] == pytest.approx(ROBOT.steering_max_rad, rel=1e-3)
+    assert (steer <= ROBOT.steering_max_rad).all()
+
+
+@pytest.mark.parametrize(
+    ("distance", "grip", "roll"),
+    [
+        ([0.0, 0.0], [0.5, 0.5], [0, 0]),
+        ([0.0], [0.0], [0.0]),
+        ([0.0], [0.5], [1.0]),
+        ([0.0], [0.5], [np.nan]),
+    ],
+)
+def test_ground_that_cannot_be_is_refused(distance, grip, roll):
+    with pytest.raises(ConfigError, match="ground"):
+        plant.ground_grid(plant.Ground(np.array(distance), np.array(grip), np.array(roll)))
+
+
+def test_settings_that_cannot_be_are_refused():
+    for bad in ({"steering_delay_s": 1.0}, {"relaxation_m": 0.0}, {"acceleration_mps2": -1.0}):
+        with pytest.raises(ConfigError):
+            plant.plant_numbers(ROBOT, plant.PlantSettings(**bad))
