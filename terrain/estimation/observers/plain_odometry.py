@@ -28,9 +28,9 @@ from terrain.estimation.observers.slip_odometry import (
     STATES,
     OdometrySettings,
     odometry_memory,
-    odometry_output,
     odometry_params,
     odometry_step,
+    read_odometry,
 )
 from terrain.records import Array
 from terrain.robots import TrackedRobot
@@ -59,8 +59,8 @@ def _observer(
     n = len(slips)
 
     def read(params: Array, memory: Array) -> ObserverOutput:
-        found = odometry_output(params, memory)
-        return found._replace(slip=found.slip[:n], slip_std=found.slip_std[:n])
+        mean, std, slip, slip_std, status = read_odometry(params, memory)
+        return ObserverOutput(mean, std, slip[:n], slip_std[:n], status)
 
     params, start = odometry_params(robot, model, settings), odometry_memory(model, settings)
     return Observer(name, STATES, tuple(slips), ROWS, params, start, odometry_step, read)

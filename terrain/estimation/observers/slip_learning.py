@@ -55,8 +55,8 @@ from terrain.estimation.observers.slip_odometry import (
     OdometrySettings,
     advance,
     odometry_memory,
-    odometry_output,
     odometry_params,
+    read_odometry,
 )
 from terrain.estimation.observers.slip_odometry import ROWS as ODOMETRY_ROWS
 from terrain.records import Array
@@ -122,6 +122,7 @@ class LearningSettings:
     forget_s: float = math.inf
 
 
+_F8 = types.float64
 _FIX_STD, _YAW_STD, _RATIO_STD, _FORGET = range(PARAMS_SIZE, PARAMS_SIZE + 4)
 _PRIOR = PARAMS_SIZE + 4
 _LOCATED, _REJECTED, _OFFSET = SIZE, SIZE + 1, SIZE + 2
@@ -238,7 +239,7 @@ def learning_step(params: Array, memory: Array, row: Array, dt_s: float) -> Arra
     return after
 
 
-@njit(types.float64[:, ::1](READ_ONLY, READ_ONLY), cache=True)
+@njit(_F8[:, ::1](READ_ONLY, READ_ONLY), cache=True)
 def read_parameters(params: Array, memory: Array) -> Array:
     """Return parameters and their standard deviations (2, 16); NaN where one is not observed yet."""
     out = np.full((2, N_MODEL), np.nan)
@@ -249,12 +250,16 @@ def read_parameters(params: Array, memory: Array) -> Array:
     return out
 
 
+@njit(types.Tuple((_F8[::1], _F8[::1], _F8[::1], _F8[::1], types.int64))(READ_ONLY, READ_ONLY), cache=True)
+def _read(params: Array, memory: Array) -> tuple[Array, Array, Array, Array, int]:
+    motion, motion_std, slip, slip_std, status = read_odometry(params, memory)
+    found = read_parameters(params, memory)
+    return np.concatenate((motion, found[0])), np.concatenate((motion_std, found[1])), slip, slip_std, status
+
+
 def learning_output(params: Array, memory: Array) -> ObserverOutput:
     """Return what a memory holds: motion, slips and parameters."""
-    motion = odometry_output(params, memory)
-    found = read_parameters(params, memory)
-    mean, std = np.concatenate((motion.mean, found[0])), np.concatenate((motion.std, found[1]))
-    return motion._replace(mean=mean, std=std)
+    return ObserverOutput(*_read(params, memory))
 
 
 def learned_model(params: Array, memory: Array) -> SlipModel:

@@ -301,7 +301,8 @@ def odometry_step(params: Array, memory: Array, row: Array, dt_s: float) -> Arra
 
 
 @njit(types.Tuple((_F8[::1], _F8[::1], _F8[::1], _F8[::1], types.int64))(READ_ONLY, READ_ONLY), cache=True)
-def _read(params: Array, memory: Array) -> tuple[Array, Array, Array, Array, int]:
+def read_odometry(params: Array, memory: Array) -> tuple[Array, Array, Array, Array, int]:
+    """Return states, their standard deviations, slips, theirs, and the status of a memory."""
     mean, std = memory[: VELOCITY + 3].copy(), np.empty(6)
     slip, slip_std = np.full(3, np.nan), np.full(3, np.nan)
     for i in range(3):
@@ -326,7 +327,7 @@ def _read(params: Array, memory: Array) -> tuple[Array, Array, Array, Array, int
 
 def odometry_output(params: Array, memory: Array) -> ObserverOutput:
     """Return what a memory holds: states, slips and their standard deviations."""
-    return ObserverOutput(*_read(params, memory))
+    return ObserverOutput(*read_odometry(params, memory))
 
 
 def slip_odometry_observer(
