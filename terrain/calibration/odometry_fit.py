@@ -30,12 +30,13 @@ from terrain.estimation.observers.slip_model import (
     COMPACTION,
     EXPONENT,
     GRADE,
-    N_ANGLE,
     N_MODEL,
     N_PARAMETERS,
     SIDE,
     TRACK_RATIO,
     TURN_GRADE,
+    TURN_SHIFT,
+    TURN_SIDE,
     SlipModel,
     body_velocity,
     model_of,
@@ -79,7 +80,7 @@ GYRODOMETRY = Kind("gyrodometry", (COMPACTION,), True)
 ENDO = Kind("Endo", (COMPACTION, EXPONENT), True)
 SLIP = Kind(
     "slip-compensated",
-    (EXPONENT, COMPACTION, GRADE, TURN_GRADE, SIDE, *range(ANGLE, ANGLE + N_ANGLE)),
+    tuple(place for place in range(N_MODEL) if place != TRACK_RATIO),
     True,
 )
 KINDS = (ENCODER, GYRODOMETRY, ENDO, SLIP)
@@ -177,7 +178,7 @@ def without_tilt(legs: Sequence[Leg]) -> bool:
 
 def level(kind: Kind) -> Kind:
     """Return a kind without the parameters that only slopes show."""
-    tilt = {GRADE, TURN_GRADE, SIDE, *(ANGLE + k for k in (4, 5, 7))}
+    tilt = {GRADE, TURN_GRADE, SIDE, TURN_SIDE, TURN_SHIFT, *(ANGLE + k for k in (4, 5, 7))}
     return replace_free(kind, tuple(place for place in kind.free if place not in tilt))
 
 

@@ -140,8 +140,8 @@ def test_a_log_without_fixes_or_gyro_is_run_and_says_so(straight):
 def test_a_slip_model_is_read_as_it_was_written(tmp_path):
     rng = np.random.default_rng(1)
     root = rng.normal(size=(len(PARAMETERS), len(PARAMETERS)))
-    numbers, stds = (0.87, 0.02, 0.4, 0.1, 0.3, rng.normal(size=8), 1.3), (0.01, 0.02, 0.03, 0.04)
-    model = SlipModel(*numbers, 1e-4 * root @ root.T, *stds)
+    first, stds = (0.87, 0.02, 0.4, 0.1, 0.3, 0.2, 0.1), (0.01, 0.02, 0.03, 0.04)
+    model = SlipModel(*first, rng.normal(size=8), 1.3, 1e-4 * root @ root.T, *stds)
     file = tmp_path / "slip.yaml"
     write_slip_model(file, model, "patako")
     read = read_slip_model(file, "patako")
