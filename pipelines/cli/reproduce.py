@@ -17,6 +17,7 @@ class PaperName(StrEnum):
     """Papers that can be reproduced."""
 
     danzi = "danzi"
+    deremetz = "deremetz"
 
 
 @command(app, "reproduce")

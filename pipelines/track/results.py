@@ -23,11 +23,11 @@ class TrackResult:
     lateral_max_at_m : distance along the path of the largest error
     limit_m : a tenth of the speed, the bound of Deremetz et al.
     within_limit : whether the largest error is below it and the end was reached
-    slip_max_rad, slip_error_rad : largest true slip angle, and root mean square of the estimate's error, above
-        0.5 m/s; NaN without an observer
+    slip_max_rad, slip_error_rad : largest true slip angle, and root mean square of the estimate's error,
+        above 0.5 m/s; NaN without an observer
     stiffness_error_ratio : median error of the cornering stiffness over the secant; NaN where it is not shown
     grip_ratio, grip_std : as known at the end; NaN without the preview
-    statuses : ticks by what observer, path and steering said
+    statuses : ticks by the status of observer, path and steering
     warnings : a sentence for each
     report : the page
     files : all that was written

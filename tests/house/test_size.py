@@ -49,9 +49,10 @@ def test_functions_are_short():
 
 
 def test_rooms_of_pipelines_are_small():
+    """The folder of a paper in the room ``reproduce`` is counted by itself."""
     rooms = {
-        room.name: sum(n_lines(path) for path in room.rglob("*.py"))
-        for room in (ROOT / "pipelines").iterdir()
+        str(room.relative_to(ROOT)): sum(n_lines(path) for path in room.glob("*.py"))
+        for room in (ROOT / "pipelines").rglob("*")
         if room.is_dir() and room.name != "__pycache__"
     }
     assert {name: length for name, length in rooms.items() if length > MAX_ROOM_LINES} == {}
