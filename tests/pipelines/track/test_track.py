@@ -55,14 +55,13 @@ def test_a_path_is_followed_and_written(path_csv, tmp_path, observer):
     assert np.abs(table["lateral_m"]).max() == pytest.approx(result.lateral_max_m, rel=1e-4)
 
 
-def test_an_offset_a_stop_and_the_same_seed(path_csv, tmp_path):
+def test_an_offset_and_a_stop(path_csv, tmp_path):
     settings = TrackSettings(
         robot="adap2e", path=path_csv, speed=2.0, offset=1.0, stop=(12.0,), out=tmp_path / "out"
     )
-    result, again = track(settings), track(settings)
+    result = track(settings)
     assert result.lateral_max_m < 0.2
     assert result.duration_s > 24.0 / 2.0 + 3.0
-    assert as_json(result) == as_json(again)
 
 
 def test_a_path_too_tight_is_driven_and_named(tmp_path):
