@@ -89,10 +89,11 @@ def test_gains_of_a_fix_give_the_sampled_error_the_continuous_poles(speed, ratio
     assert np.abs(found).max() <= 1.0 + 1e-9
 
 
-def test_on_a_straight_path_the_observer_is_the_papers():
-    """(5), (6) with deviations y, theta~ of the path y = 0, integrated at 1 ms; both without noise."""
-    dt_s, speed, steer, gain, ratio = 0.001, 3.0, 0.02, 15.0, 4.0
-    base, slips = ROBOT.wheelbase_m, np.array([-0.03, 0.04])
+@pytest.mark.parametrize("multi", [False, True], ids=["(5)", "(8)"])
+def test_on_a_straight_path_the_observer_is_the_papers(multi):
+    """(5), (6) and (8), (9) with deviations y, theta~ of the path y = 0, integrated at 1 ms without noise."""
+    dt_s, speed, steer, gain, ratio, dyn_ratio, k_c = 0.001, 3.0, 0.02, 15.0, 4.0, 1e-2, 5e9
+    base, arm, slips = ROBOT.wheelbase_m, ROBOT.com_ahead_m, np.array([-0.03, 0.04])
     time_s = np.arange(3000) * dt_s
     turning = speed * (np.tan(steer + slips[0]) - np.tan(slips[1])) / base
     yaw = turning * time_s
@@ -100,11 +101,18 @@ def test_on_a_straight_path_the_observer_is_the_papers():
     x = np.cumsum(along * np.cos(yaw + slips[1])) * dt_s
     y = np.cumsum(along * np.sin(yaw + slips[1])) * dt_s
     nan = np.full(time_s.size, np.nan)
-    rows = np.column_stack([nan + 1, nan + 1, x, y, yaw, nan, nan, nan])
-    rows[:, :2] = speed, steer
-    observer = sideslip_kinematic_observer(ROBOT, pose.PoseSettings(slip_gain=ratio))
-    found = observe(observer, time_s, rows).slip
-    dev, slip, paper = np.array([y[0], yaw[0]]), np.zeros(2), np.full((time_s.size, 2), np.nan)
+    rows = np.column_stack([nan, nan, x, y, yaw, nan, nan, nan])
+    rows[:, :2], rows[:, 5:7] = (speed, steer), (turning, 0.0)
+    fixes = pose.PoseSettings(slip_gain=ratio)
+    observer = sideslip_kinematic_observer(ROBOT, fixes)
+    if multi:
+        settings = MultiModelSettings(fixes, 20.0, k_c, dyn_ratio, excited_mps2=0.0, instrument=False)
+        observer = sideslip_multi_observer(ROBOT, settings)
+    track = observe(observer, time_s, rows)
+    dev, slip, paper = np.array([y[0], yaw[0]]), np.zeros(2), np.full((time_s.size, 4), np.nan)
+    dyn, stiffness, cos = np.zeros(2), np.full(2, 15000.0), np.cos(steer)
+    axles = np.array([[-arm * cos / ROBOT.yaw_inertia_kgm2, arm / ROBOT.yaw_inertia_kgm2], [0.0, 0.0]])
+    axles[1] = -cos / ROBOT.mass_kg, -1.0 / ROBOT.mass_kg
     for k in range(1, time_s.size):
         v = speed / np.cos(slip[1])
         error = np.array([y[k], yaw[k]]) - dev
@@ -119,10 +127,23 @@ def test_on_a_straight_path_the_observer_is_the_papers():
             ]
         )
         dev = dev + dt_s * (np.array(f) + gain * error)
-        slip = slip + dt_s * ratio * jacobian.T @ error
-        paper[k] = slip
-    assert found[500:] == pytest.approx(paper[500:], abs=0.003)
-    assert found[-1] == pytest.approx(slips, abs=0.003)
+        change = ratio * jacobian.T @ error
+        if multi:
+            beta = np.arctan((arm * np.tan(slip[0] + steer) + arm * np.tan(slip[1])) / base)  # (4)
+            virtual = v * np.cos(slip[1]) / np.cos(beta) * np.sin(beta)
+            g = axles @ (stiffness * slip) - np.array([0.0, speed * turning])
+            error = np.array([turning, virtual]) - dyn
+            dyn = dyn + dt_s * (g + 20.0 * error)
+            change = change + dyn_ratio * (axles * stiffness).T @ error
+            stiffness = np.clip(stiffness + dt_s * k_c * (axles * slip).T @ error, 1000.0, 30000.0)
+        slip = slip + dt_s * change
+        paper[k] = *slip, *stiffness
+    assert track.slip[500:] == pytest.approx(paper[500:, :2], abs=0.003)
+    if multi:
+        assert track.mean[500:, 5:7] == pytest.approx(paper[500:, 2:], rel=0.03)
+        assert np.ptp(paper[1:, 2:], axis=0).min() > 1000.0
+    else:
+        assert track.slip[-1] == pytest.approx(slips, abs=0.003)
 
 
 def test_jacobians_are_the_derivatives():
