@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -26,6 +27,8 @@ RUNS, FEW_RUNS = 5, 2
 """Drives that a figure is a mean of, and the number with ``quick``."""
 FASTEST_MPS, FAST_MPS, MEDIUM_MPS = 6.0, 5.0, 4.0
 """Speeds of the trials of section VI.B."""
+SOFT_FRONT_NPR, SOFT_REAR_NPR = 8000.0, 10000.0
+"""Tyres that are softer than the observers assume at first."""
 
 
 class Variant(NamedTuple):
@@ -61,14 +64,17 @@ def adap2e() -> BicycleRobot:
 
 
 @lru_cache(maxsize=64)
-def follow(course: str, speed_mps: float, variant: str, seed: int) -> FollowedDrive:
-    """Return a drive along the course ``stop`` or ``slope``."""
+def follow(course: str, speed_mps: float, variant: str, seed: int, soft: bool = False) -> FollowedDrive:
+    """Return a drive along the course ``stop`` or ``slope``, on tyres as described or on softer ones."""
     robot, chosen = adap2e(), VARIANTS[variant]
     along = course_of(course)
     observer = None if chosen.observer is None else chosen.observer(robot)
     follower = CarFollower(robot, along.path, chosen.source, observer=observer)
     drive = along.drive(speed_mps, STOP if course == "stop" else ())
-    run = simulate_car(robot, drive, follower, np.random.default_rng(seed))
+    driven = robot
+    if soft:
+        driven = replace(robot, front_cornering_npr=SOFT_FRONT_NPR, rear_cornering_npr=SOFT_REAR_NPR)
+    run = simulate_car(driven, drive, follower, np.random.default_rng(seed))
     return followed_drive(run, along.path, follower.ticks)
 
 
@@ -77,9 +83,12 @@ def course_of(name: str) -> Course:
     return stop_course() if name == "stop" else slope_course()[0]
 
 
-def drives(course: str, speed_mps: float, variant: str, seed: int, quick: bool) -> list[FollowedDrive]:
+def drives(
+    course: str, speed_mps: float, variant: str, seed: int, quick: bool, soft: bool = False
+) -> list[FollowedDrive]:
     """Return drives that differ in their noise."""
-    return [follow(course, speed_mps, variant, 1000 * seed + k) for k in range(FEW_RUNS if quick else RUNS)]
+    numbers = range(FEW_RUNS if quick else RUNS)
+    return [follow(course, speed_mps, variant, 1000 * seed + k, soft) for k in numbers]
 
 
 class OverDrives(NamedTuple):
