@@ -78,7 +78,8 @@ def _soft_row(seed: int, quick: bool) -> Row:
         unit="m",
         verdict=Verdict.NOT_PRINTED,
         why="Beyond a tenth of the speed, 0.4 m, and half of what it is without an observer: the sideslip is "
-        "larger, and the stiffness takes seconds of excited driving to come down. The preview halves it again.",
+        "larger, and the stiffness takes seconds of excited driving to come down. The preview halves it "
+        "again.",
         beside={
             "no observer": largest["no observer"].mean,
             "with preview": largest["multi-model with preview"].mean,
