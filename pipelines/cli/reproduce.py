@@ -19,6 +19,7 @@ class PaperName(StrEnum):
     danzi = "danzi"
     tazzari = "tazzari"
     yamauchi = "yamauchi"
+    deremetz = "deremetz"
 
 
 @command(app, "reproduce")

@@ -42,6 +42,15 @@ PAPERS: Mapping[str, Paper] = {
         module="pipelines.reproduce.yamauchi.experiments",
         descriptions=(("robots", "patako"), ("soils", "extra/toyoura_sand"), ("soils", "firm_soil_gravel")),
     ),
+    "deremetz": Paper(
+        title="Deremetz et al., ICRA 2017",
+        about=(
+            "M. Deremetz, R. Lenain, B. Thuilot, V. Rousseau, Adaptive trajectory control of off-road mobile "
+            "robots: A multi-model observer approach, ICRA 2017, 10.1109/ICRA.2017.7989509"
+        ),
+        module="pipelines.reproduce.deremetz.experiments",
+        descriptions=(("robots", "adap2e"),),
+    ),
 }
 """Papers by the name that the command takes."""
 

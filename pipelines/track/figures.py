@@ -81,7 +81,9 @@ def sideslip_figure(drive: FollowedDrive, title: str) -> Figure:
             )
             axes.plot(drive.time_s, estimate, color=BLUE, lw=1.1, label="estimate, ± 2 std")
             axes.plot(drive.time_s, np.degrees(drive.slip_true_rad[:, j]), color=INK, lw=1.0, label="true")
-            axes.set_ylabel(f"{wheel} [deg]")
+            known = np.abs(estimate[np.isfinite(estimate)])
+            shown = 1.4 * max(2.0, float(known.max(initial=0.0)))
+            axes.set(ylabel=f"{wheel} [deg]", ylim=(-shown, shown))
             axes.grid()
             if j == 0:
                 add_legend(axes)

@@ -130,8 +130,8 @@ def path_from_points(points_m: Array, std_m: float = 0.0) -> ReferencePath:
     Raises
     ------
     DataError
-        if there are fewer than four different points, one is not a finite number, or the path turns back at a
-        point.
+        if there are fewer than three different points, one is not a finite number, or the path turns back
+        at a point.
 
     Examples
     --------
@@ -148,8 +148,8 @@ def path_from_points(points_m: Array, std_m: float = 0.0) -> ReferencePath:
         raise DataError(f"path: point {bad[0] + 1} is {points[bad[0]].tolist()}, finite numbers are needed")
     steps = np.hypot(*np.diff(points, axis=0).T)
     kept = points[np.concatenate([[True], steps > _MERGED_M])]
-    if len(kept) < 4:
-        raise DataError(f"path: {len(kept)} different points, at least 4 are needed")
+    if len(kept) < 3:
+        raise DataError(f"path: {len(kept)} different points, at least 3 are needed")
     steps = np.hypot(*np.diff(kept, axis=0).T)
     if steps.sum() > _LONGEST_M:
         raise DataError(f"path: {steps.sum():g} m long, at most {_LONGEST_M:g} m are accepted")

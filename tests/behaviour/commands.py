@@ -40,6 +40,7 @@ COMMANDS = (
         "explain-trials",
         "quickstart",
         "reproduce",
+        "track",
     ),
     *("replay", "label", "serve", "bench"),
 )

@@ -101,7 +101,7 @@ class DynamicSettings(NamedTuple):
     accel_std_mps2: float = 0.1
     imu_ahead_m: float = 0.0
     turn_walk_radps2: float = 0.1
-    side_walk_mps2: float = 2.0
+    side_walk_mps2: float = 4.0
     stiffness_walk_npr: float = 2000.0
     stiffness_correlation: float = 0.8
     stiffness_std_ratio: float = 0.3

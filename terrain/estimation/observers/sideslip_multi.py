@@ -111,7 +111,7 @@ class MultiModelSettings(NamedTuple):
     as_printed : line 2 of (3) with the printed signs, to show what they do
     """
 
-    pose: pose.PoseSettings = pose.PoseSettings(slip_gain=3.0)
+    pose: pose.PoseSettings = pose.PoseSettings()
     dynamic_gain_ps: float = 20.0
     stiffness_gain: float = 1e9
     dynamic_slip_ratio: float = 3e-2

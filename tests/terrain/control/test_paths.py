@@ -80,8 +80,8 @@ def test_statuses_of_places():
 @pytest.mark.parametrize(
     ("points", "message"),
     [
-        ([[0, 0], [1, 0], [2, 0]], "3 different points"),
-        ([[0, 0], [0, 0], [1, 0], [1, 0], [2, 0]], "3 different points"),
+        ([[0, 0], [1, 0]], "2 different points"),
+        ([[0, 0], [0, 0], [1, 0], [1, 0]], "2 different points"),
         ([[0, 0], [1, np.nan], [2, 0], [3, 0]], "point 2"),
         ([[0, 0], [5, 0], [10, 0], [5, 0.01]], "turns back"),
         ([[0, 0], [1e6, 0], [2e6, 0], [3e6, 0]], "m long"),
@@ -91,6 +91,10 @@ def test_statuses_of_places():
 def test_points_that_are_no_path_are_refused(points, message):
     with pytest.raises(DataError, match=message):
         path_from_points(np.array(points, float))
+
+
+def test_three_points_make_a_path():
+    assert path_from_points(np.array([[0.0, 0.0], [5.0, 1.0], [10.0, 0.0]])).length_m > 10.0
 
 
 def test_repeated_points_are_merged_and_curvature_beyond_the_steering_is_named():

@@ -89,10 +89,11 @@ def test_gains_of_a_fix_give_the_sampled_error_the_continuous_poles(speed, ratio
     assert np.abs(found).max() <= 1.0 + 1e-9
 
 
-def test_on_a_straight_path_the_observer_is_the_papers():
-    """(5), (6) with deviations y, theta~ of the path y = 0, integrated at 1 ms; both without noise."""
-    dt_s, speed, steer, gain, ratio = 0.001, 3.0, 0.02, 15.0, 4.0
-    base, slips = ROBOT.wheelbase_m, np.array([-0.03, 0.04])
+@pytest.mark.parametrize("multi", [False, True], ids=["(5)", "(8)"])
+def test_on_a_straight_path_the_observer_is_the_papers(multi):
+    """(5), (6) and (8), (9) with deviations y, theta~ of the path y = 0, integrated at 1 ms without noise."""
+    dt_s, speed, steer, gain, ratio, dyn_ratio, k_c = 0.001, 3.0, 0.02, 15.0, 4.0, 1e-2, 5e9
+    base, arm, slips = ROBOT.wheelbase_m, ROBOT.com_ahead_m, np.array([-0.03, 0.04])
     time_s = np.arange(3000) * dt_s
     turning = speed * (np.tan(steer + slips[0]) - np.tan(slips[1])) / base
     yaw = turning * time_s
@@ -100,10 +101,18 @@ def test_on_a_straight_path_the_observer_is_the_papers():
     x = np.cumsum(along * np.cos(yaw + slips[1])) * dt_s
     y = np.cumsum(along * np.sin(yaw + slips[1])) * dt_s
     nan = np.full(time_s.size, np.nan)
-    rows = np.column_stack([nan + 1, nan + 1, x, y, yaw, nan, nan, nan])
-    rows[:, :2] = speed, steer
-    found = observe(sideslip_kinematic_observer(ROBOT), time_s, rows).slip
-    dev, slip, paper = np.array([y[0], yaw[0]]), np.zeros(2), np.full((time_s.size, 2), np.nan)
+    rows = np.column_stack([nan, nan, x, y, yaw, nan, nan, nan])
+    rows[:, :2], rows[:, 5:7] = (speed, steer), (turning, 0.0)
+    fixes = pose.PoseSettings(slip_gain=ratio)
+    observer = sideslip_kinematic_observer(ROBOT, fixes)
+    if multi:
+        settings = MultiModelSettings(fixes, 20.0, k_c, dyn_ratio, excited_mps2=0.0, instrument=False)
+        observer = sideslip_multi_observer(ROBOT, settings)
+    track = observe(observer, time_s, rows)
+    dev, slip, paper = np.array([y[0], yaw[0]]), np.zeros(2), np.full((time_s.size, 4), np.nan)
+    dyn, stiffness, cos = np.zeros(2), np.full(2, 15000.0), np.cos(steer)
+    axles = np.array([[-arm * cos / ROBOT.yaw_inertia_kgm2, arm / ROBOT.yaw_inertia_kgm2], [0.0, 0.0]])
+    axles[1] = -cos / ROBOT.mass_kg, -1.0 / ROBOT.mass_kg
     for k in range(1, time_s.size):
         v = speed / np.cos(slip[1])
         error = np.array([y[k], yaw[k]]) - dev
@@ -118,10 +127,23 @@ def test_on_a_straight_path_the_observer_is_the_papers():
             ]
         )
         dev = dev + dt_s * (np.array(f) + gain * error)
-        slip = slip + dt_s * ratio * jacobian.T @ error
-        paper[k] = slip
-    assert found[500:] == pytest.approx(paper[500:], abs=0.003)
-    assert found[-1] == pytest.approx(slips, abs=0.003)
+        change = ratio * jacobian.T @ error
+        if multi:
+            beta = np.arctan((arm * np.tan(slip[0] + steer) + arm * np.tan(slip[1])) / base)  # (4)
+            virtual = v * np.cos(slip[1]) / np.cos(beta) * np.sin(beta)
+            g = axles @ (stiffness * slip) - np.array([0.0, speed * turning])
+            error = np.array([turning, virtual]) - dyn
+            dyn = dyn + dt_s * (g + 20.0 * error)
+            change = change + dyn_ratio * (axles * stiffness).T @ error
+            stiffness = np.clip(stiffness + dt_s * k_c * (axles * slip).T @ error, 1000.0, 30000.0)
+        slip = slip + dt_s * change
+        paper[k] = *slip, *stiffness
+    assert track.slip[500:] == pytest.approx(paper[500:, :2], abs=0.003)
+    if multi:
+        assert track.mean[500:, 5:7] == pytest.approx(paper[500:, 2:], rel=0.03)
+        assert np.ptp(paper[1:, 2:], axis=0).min() > 1000.0
+    else:
+        assert track.slip[-1] == pytest.approx(slips, abs=0.003)
 
 
 def test_jacobians_are_the_derivatives():
@@ -143,45 +165,148 @@ def test_jacobians_are_the_derivatives():
             assert np.diff(change)[0] / (2 * step) == pytest.approx(at[1, j], rel=1e-6)
 
 
-def plain_kinematic(rows, gain=15.0, ratio=4.0):
-    """The kinematic observer in plain numpy: eigenvectors in place of closed forms, no gates."""
+def plain_fix(row, at, slip, left, since, speed, ratio, gain=15.0):
+    """One fix in plain numpy: eigenvectors in place of closed forms, no gates."""
+    base, (steer, rear) = ROBOT.wheelbase_m, (row[1], 1 / np.cos(slip[1]) ** 2)
+    jacobian = speed * np.array([[0, rear], [1 / base / np.cos(steer + slip[0]) ** 2, -rear / base]])
+    heading = at[2] + left
+    turn = np.array([[np.cos(heading), np.sin(heading)], [-np.sin(heading), np.cos(heading)]])
+    along, across = turn @ (row[2:4] - at[:2])
+    error = np.array([across, wrapped(row[4] - at[2])])
+    squares, vectors = np.linalg.eigh(jacobian @ jacobian.T)
+    h = []
+    for square in squares:
+        poles = np.exp(np.roots([1, gain, ratio * square]).astype(complex) * since)
+        exact = ((1 - poles[0]) * (1 - poles[1])).real / max(square * since, 1e-300)
+        h.append(exact if square > 1e-8 else ratio * (1 - np.exp(-gain * since)) / gain)
+    g_e = 1 - np.exp(-gain * since)
+    slip = slip + jacobian.T @ vectors @ np.diag(h) @ vectors.T @ error
+    moved = np.array([*(at[:2] + g_e * turn.T @ [along, across]), at[2] + g_e * error[1]])
+    return moved, slip, (1 - g_e) * error[1]
+
+
+def plain_dynamics(row, dyn, slip, stiffness, settings):
+    """One tick of e_dyn in plain numpy, for forward motion: (8), (9) with the implicit gains."""
+    u, steer, rate, roll, dt_s = row[0], row[1], row[5], row[6], TICK_S
+    ahead, behind, base = ROBOT.com_ahead_m, ROBOT.com_behind_front_m, ROBOT.wheelbase_m
+    mass, inertia = ROBOT.mass_kg, ROBOT.yaw_inertia_kgm2
+    axles = np.array([[-behind * np.cos(steer), ahead], [-np.cos(steer), -1.0]])
+    by_force = axles / np.array([[inertia], [mass]])
+    force = u * rate + 9.80665 * np.sin(roll)
+    held = -mass / base * force * np.array([ahead / np.cos(steer), behind]) / stiffness
+    by_slip = by_force * stiffness
+    by_stiffness = by_force * held * float(abs(force) > settings.excited_mps2)
+    dyn = dyn + dt_s * (by_force @ (stiffness * slip) - np.array([0.0, force]))
+    side = u * (ahead * np.tan(steer + slip[0]) + behind * np.tan(slip[1])) / base
+    ratio, k_c, k = settings.dynamic_slip_ratio, settings.stiffness_gain, settings.dynamic_gain_ps
+    spread = ratio * by_slip @ by_slip.T + k_c * by_stiffness @ by_stiffness.T
+    error = np.linalg.solve((1 + dt_s * k) * np.eye(2) + dt_s**2 * spread, np.array([rate, side]) - dyn)
+    dyn, slip = dyn + dt_s * k * error, slip + dt_s * ratio * by_slip.T @ error
+    return dyn, slip, np.clip(stiffness + dt_s * k_c * by_stiffness.T @ error, 1000.0, 30000.0)
+
+
+def plain(rows, settings=None):
+    """The kinematic observer, and with settings the multi-model one, in plain numpy."""
     base, dt_s = ROBOT.wheelbase_m, TICK_S
     at, slip, left, since, out = rows[0, 2:5].copy(), np.zeros(2), 0.0, 0.0, []
+    dyn, stiffness, ratio = np.zeros(2), np.full(2, 15000.0), pose.PoseSettings().slip_gain
     for row in rows[1:]:
         u, steer = row[:2]
-        moves = abs(u) >= pose.STANDING_MPS
-        speed = u if moves else 0.0
+        speed = u if abs(u) >= pose.STANDING_MPS else 0.0
         turning = speed * (np.tan(steer + slip[0]) - np.tan(slip[1])) / base
         middle, side = at[2] + left + 0.5 * dt_s * turning, speed * np.tan(slip[1])
         at[0] += dt_s * (speed * np.cos(middle) - side * np.sin(middle))
         at[1] += dt_s * (speed * np.sin(middle) + side * np.cos(middle))
         at[2] += dt_s * turning
         since += dt_s
+        if settings is not None and u >= 0.3:
+            dyn, slip, stiffness = plain_dynamics(row, dyn, slip, stiffness, settings)
+        elif settings is not None:
+            v = u * (ROBOT.com_ahead_m * np.tan(steer + slip[0]) + ROBOT.com_behind_front_m * np.tan(slip[1]))
+            dyn = np.array([row[5], v / base if abs(u) >= pose.STANDING_MPS else 0.0])
         if np.isfinite(row[2]):
-            rear = 1 / np.cos(slip[1]) ** 2
-            jacobian = speed * np.array([[0, rear], [1 / base / np.cos(steer + slip[0]) ** 2, -rear / base]])
-            heading = at[2] + left
-            turn = np.array([[np.cos(heading), np.sin(heading)], [-np.sin(heading), np.cos(heading)]])
-            along, across = turn @ (row[2:4] - at[:2])
-            error = np.array([across, wrapped(row[4] - at[2])])
-            squares, vectors = np.linalg.eigh(jacobian @ jacobian.T)
-            h = []
-            for square in squares:
-                poles = np.exp(np.roots([1, gain, ratio * square]).astype(complex) * since)
-                exact = ((1 - poles[0]) * (1 - poles[1])).real / max(square * since, 1e-300)
-                h.append(exact if square > 1e-8 else ratio * (1 - np.exp(-gain * since)) / gain)
-            g_e = 1 - np.exp(-gain * since)
-            slip = slip + jacobian.T @ vectors @ np.diag(h) @ vectors.T @ error
-            at[:2] += g_e * turn.T @ [along, across]
-            at[2], left, since = at[2] + g_e * error[1], (1 - g_e) * error[1], 0.0
-        out.append(slip)
+            at, slip, left = plain_fix(row, at, slip, left, since, speed, ratio)
+            since = 0.0
+        out.append([*slip, *stiffness])
     return np.array(out)
 
 
-def test_kinematic_step_agrees_with_its_plain_form():
-    time_s, rows, _ = drive(4.0, seed=3, stops=((20.0, 2.0),))
+def test_kinematic_and_multi_model_steps_agree_with_their_plain_form():
+    time_s, rows, _ = drive(4.0, seed=3, roll_rad=0.1, stops=((20.0, 2.0),))
     found = observe(sideslip_kinematic_observer(ROBOT), time_s, rows).slip
-    assert found[1:] == pytest.approx(plain_kinematic(rows), abs=1e-7, nan_ok=True)
+    assert found[1:] == pytest.approx(plain(rows)[:, :2], abs=1e-7, nan_ok=True)
+    settings = MultiModelSettings()
+    track = observe(sideslip_multi_observer(ROBOT, settings), time_s, rows)
+    expected = plain(rows, settings)
+    assert track.slip[1:] == pytest.approx(expected[:, :2], abs=1e-7, nan_ok=True)
+    assert track.state("cornering_rear_npr")[1:] == pytest.approx(expected[:, 3], rel=1e-6)
+
+
+def derivative(function, x, step=1e-6):
+    """Return the derivative of a function of a vector by central differences."""
+    scale = step * np.maximum(1.0, np.abs(x))
+    columns = [(function(x + d) - function(x - d)) / (2 * d.sum()) for d in np.diag(scale)]
+    return np.column_stack(columns)
+
+
+def plain_dynamic(rows):
+    """The dynamic observer in plain numpy: derivatives by differences, joint Kalman updates row by row."""
+    s, dt_s = DynamicSettings(), TICK_S
+    ahead, behind = ROBOT.com_ahead_m, ROBOT.com_behind_front_m
+    x = np.array([0.0, 0.0, 15000.0, 15000.0])
+    cov = np.diag([0.01, 0.01, *np.full(2, (s.stiffness_std_ratio * 15000.0) ** 2)])
+    cov[2, 3] = cov[3, 2] = s.stiffness_correlation * cov[2, 2]
+    out = []
+    for k, (u, steer, _, _, _, rate, roll, accel) in enumerate(rows):
+
+        def slips(x, u=u, steer=steer):
+            front, rear = (x[1] + behind * x[0]) / u, (x[1] - ahead * x[0]) / u
+            return np.array([np.arctan(front) - steer, np.arctan(rear)])
+
+        def model(x, u=u, steer=steer, roll=roll):
+            front, rear = x[2:] * slips(x) * np.array([np.cos(steer), 1.0])
+            turning = (ahead * rear - behind * front) / ROBOT.yaw_inertia_kgm2
+            return np.array([turning, -(front + rear) / ROBOT.mass_kg - 9.80665 * np.sin(roll) - u * x[0]])
+
+        def force(x, u=u, roll=roll):
+            turning, pushed = model(x)
+            return np.array([pushed + u * x[0] + 9.80665 * np.sin(roll) - ahead * turning])
+
+        excited = abs(u * rate + 9.80665 * np.sin(roll)) > s.excited_mps2
+        if u >= s.slowest_mps:
+            if k:
+                by = derivative(model, x)
+                inverse = np.linalg.inv(np.eye(2) - dt_s * by[:, :2])
+                moved = np.block([[inverse, dt_s * inverse @ by[:, 2:]], [np.zeros((2, 2)), np.eye(2)]])
+                x = x + np.concatenate([dt_s * inverse @ model(x), np.zeros(2)])
+                walk = np.zeros((4, 4))
+                walk[0, 0], walk[1, 1] = s.turn_walk_radps2**2, s.side_walk_mps2**2
+                if excited:
+                    walk[2:, 2:] = s.stiffness_walk_npr**2 * np.array(
+                        [[1, s.stiffness_correlation], [s.stiffness_correlation, 1]]
+                    )
+                cov = moved @ cov @ moved.T + dt_s * walk
+            for measured, function, std in (
+                (rate, lambda x: x[:1], s.gyro_std_radps),
+                (accel, force, s.accel_std_mps2),
+            ):
+                h = derivative(function, x)
+                gain = (cov @ h.T / (h @ cov @ h.T + std**2))[:, 0]
+                gain[2:] *= float(excited)
+                x = x + gain * (measured - function(x)[0])
+                kept = np.eye(4) - np.outer(gain, h)
+                cov = kept @ cov @ kept.T + np.outer(gain, gain) * std**2
+        out.append([*slips(x), x[2], np.sqrt(cov[3, 3])] if u > 0 else np.full(4, np.nan))
+    return np.array(out)
+
+
+def test_dynamic_step_agrees_with_its_plain_form():
+    time_s, rows, _ = drive(4.0, seed=3, roll_rad=0.1, seconds=15.0)
+    track, expected = observe(sideslip_dynamic_observer(ROBOT), time_s, rows), plain_dynamic(rows)
+    moves = slice(50, None)
+    assert track.slip[moves] == pytest.approx(expected[moves, :2], abs=1e-6)
+    assert track.state("cornering_front_npr")[moves] == pytest.approx(expected[moves, 2], rel=1e-4)
+    assert track.std[moves, 6] == pytest.approx(expected[moves, 3], rel=1e-3)
 
 
 @ANY

@@ -1,0 +1,1 @@
+"""Deremetz et al., ICRA 2017."""

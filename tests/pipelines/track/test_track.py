@@ -1,0 +1,127 @@
+"""``terrain track``: a path of the user is followed and judged, and wrong input is one sentence."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from pipelines.reporting.json_file import as_json
+from pipelines.track import settings as settings_module
+from pipelines.track.path_file import read_path
+from pipelines.track.settings import TrackSettings
+from pipelines.track.track import track
+from terrain.control.car_following import SlipSource
+from terrain.control.paths import ROLL
+from terrain.errors import ConfigError, TerrainError
+
+
+def bend(n=80, radius=12.0):
+    angle = np.linspace(0.0, 2.0, n)
+    return radius * np.column_stack([np.sin(angle), 1.0 - np.cos(angle)])
+
+
+@pytest.fixture
+def path_csv(tmp_path):
+    file = tmp_path / "bend.csv"
+    np.savetxt(file, bend(), delimiter=",", header="x_m,y_m", comments="")
+    return file
+
+
+def test_names_of_observers_are_those_of_the_controller():
+    assert tuple(SlipSource) == settings_module.SLIP_SOURCES
+
+
+@pytest.mark.parametrize("observer", ["multi-grip", "dynamic"])
+def test_a_path_is_followed_and_written(path_csv, tmp_path, observer):
+    out = tmp_path / "out"
+    settings = TrackSettings(
+        robot="adap2e", path=path_csv, speed=3.0, slope_deg=5.0, observer=observer, out=out
+    )
+    result = track(settings)
+    assert result.reached_end
+    assert result.within_limit
+    assert result.lateral_max_m < result.limit_m == pytest.approx(0.3)
+    assert result.length_m == pytest.approx(24.0, abs=0.1)
+    assert all(file.is_file() for file in result.files)
+    document = as_json(result)
+    assert json.loads(json.dumps(document, allow_nan=False)) == document
+    assert sum(result.statuses["steering"].values()) == sum(result.statuses["observer"].values())
+    page = result.report.read_text(encoding="utf-8")
+    assert "within a tenth of the speed" in page
+    table = np.genfromtxt(out / "drive.csv", delimiter=",", names=True)
+    assert table["lateral_m"].size == sum(result.statuses["path"].values())
+    assert np.abs(table["lateral_m"]).max() == pytest.approx(result.lateral_max_m, rel=1e-4)
+
+
+def test_an_offset_and_a_stop(path_csv, tmp_path):
+    settings = TrackSettings(
+        robot="adap2e", path=path_csv, speed=2.0, offset=1.0, stop=(12.0,), out=tmp_path / "out"
+    )
+    result = track(settings)
+    assert result.lateral_max_m < 0.2
+    assert result.duration_s > 24.0 / 2.0 + 3.0
+
+
+def test_a_path_too_tight_is_driven_and_named(tmp_path):
+    file = tmp_path / "tight.csv"
+    np.savetxt(file, bend(radius=1.5, n=60), delimiter=";")
+    result = track(TrackSettings(robot="adap2e", path=file, speed=1.0, out=tmp_path / "out"))
+    assert "curvature is 0.6" in result.warnings[0]
+    assert any("limit" in warning for warning in result.warnings)
+
+
+def test_roll_of_a_file_is_that_of_the_path(tmp_path):
+    file = tmp_path / "rolled.csv"
+    points = bend()
+    rows = np.column_stack([points, np.linspace(0.0, 0.2, len(points))])
+    np.savetxt(file, rows, delimiter=",", header="position_x_m,position_y_m,roll_rad", comments="")
+    path = read_path(file)
+    assert path.rows[[0, -1], ROLL] == pytest.approx([0.0, 0.2], abs=0.005)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "is empty"),
+        ("a,b\n1,2\n", "columns x_m and y_m"),
+        ("x_m,y_m\n0,0\n1,two\n", "row 3 has 'two'"),
+        ("x_m,y_m\n0,0\n1\n", "row 3 has 'nothing'"),
+        ("x_m,y_m\n0,0\n1,nan\n2,0\n3,0\n", "point 2"),
+        ("x_m,y_m\n0,0\n1,0\n", "2 different points"),
+        ("5\n6\n", "two columns"),
+        ("x_m,y_m,roll_rad\n0,0,0\n1,0,3\n2,0,0\n3,0,0\n", "roll_rad is beyond"),
+    ],
+)
+def test_a_file_that_is_no_path_is_one_sentence(tmp_path, text, message):
+    file = tmp_path / "path.csv"
+    file.write_text(text, encoding="utf-8")
+    with pytest.raises(TerrainError, match=message) as refused:
+        read_path(file)
+    assert str(file) in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_bytes_and_folders_are_no_path(tmp_path):
+    (tmp_path / "noise.csv").write_bytes(b"\xff\xfe\x00\x9f")
+    for place in (tmp_path, tmp_path / "noise.csv", tmp_path / "none.csv"):
+        with pytest.raises(TerrainError, match="cannot be read"):
+            read_path(place)
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"robot": "husky"}, "only 'bicycle' can"),
+        ({"speed": 30.0}, "at most 8 m/s"),
+        ({"speed": 0.0}, "--speed"),
+        ({"observer": "x"}, "--observer is 'x'"),
+        ({"slope_deg": 60.0}, "--slope is 60"),
+        ({"stop": (5.0, 3.0)}, "--stop"),
+    ],
+)
+def test_settings_that_cannot_be_are_one_sentence(path_csv, tmp_path, changed, message):
+    values = {"robot": "adap2e", "path": path_csv, "out": tmp_path / "out"} | changed
+    with pytest.raises(ConfigError, match=message):
+        track(TrackSettings(**values))
