@@ -11,7 +11,7 @@ from terrain.estimation.observers.estimate import observe_run, seconds_by_status
 from terrain.estimation.observers.family import ObserverStatus
 from terrain.estimation.observers.live import LiveObserver
 from terrain.estimation.observers.rows import ROWS
-from terrain.estimation.observers.slip_model import PARAMETERS, SlipModel
+from terrain.estimation.observers.slip_model import PARAMETERS, SlipModel, model_of
 from terrain.estimation.observers.slip_model_file import read_slip_model, write_slip_model
 from terrain.estimation.observers.summary import summarize_observer
 from terrain.logs.read import read_run
@@ -140,14 +140,16 @@ def test_a_log_without_fixes_or_gyro_is_run_and_says_so(straight):
 def test_a_slip_model_is_read_as_it_was_written(tmp_path):
     rng = np.random.default_rng(1)
     root = rng.normal(size=(len(PARAMETERS), len(PARAMETERS)))
-    first, stds = (0.87, 0.02, 0.4, 0.1, 0.3, 0.2, 0.1), (0.01, 0.02, 0.03, 0.04)
-    model = SlipModel(*first, rng.normal(size=8), 1.3, 1e-4 * root @ root.T, *stds)
+    given = model_of(rng.uniform(0.1, 1.0, len(PARAMETERS)))
+    model = replace(
+        given, covariance=1e-4 * root @ root.T, slip_std_ratio=0.01, run_angle_std_rad=0.04, correlation_s=0.7
+    )
     file = tmp_path / "slip.yaml"
     write_slip_model(file, model, "patako")
     read = read_slip_model(file, "patako")
     assert read.vector == pytest.approx(model.vector, rel=1e-5)
     assert read.covariance == pytest.approx(model.covariance, rel=1e-4, abs=1e-9)
-    assert (read.slip_std_ratio, read.run_angle_std_rad) == (0.01, 0.04)
+    assert (read.slip_std_ratio, read.run_angle_std_rad, read.correlation_s) == (0.01, 0.04, 0.7)
     with pytest.raises(ConfigError, match="is the slip model of robot 'patako', not 'marmotte'"):
         read_slip_model(file, "marmotte")
     with pytest.raises(ConfigError, match="is there already"):
