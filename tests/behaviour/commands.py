@@ -30,6 +30,7 @@ COMMANDS = (
     *(
         "learn-slip",
         "measure-slip",
+        "odometry",
         "find-changes",
         "fit-soil",
         "drive",
@@ -101,6 +102,9 @@ def foreign_logs() -> dict[str, bytes]:
     files["drive/samples.csv.gz"] = gzip.compress(_csv(DRIVE_COLUMNS, _drive_rows()), mtime=0)
     return files
 
+
+PATH_POINTS = "x_m,y_m\n0,0\n5,0\n10,0.5\n15,2\n20,4\n25,5\n30,5\n"
+"""Of a gentle S-bend."""
 
 TRIAL_COLUMNS = (
     "trial_num,beta,slip,Vry,avg_Vx,std_Vx,avg_Vry,std_Vry,avg_Fx,std_Fx,avg_Fy,std_Fy,avg_Fz,std_Fz,"
@@ -287,6 +291,24 @@ CASES: tuple[Case, ...] = (
         ),
     ),
     Case(
+        "observers",
+        steps(
+            "simulate --robot orchard_ugv --terrain tilled_loam --scenario complex --grade 5 --runs 5 "
+            "--out raw",
+            "estimate --data raw --filter tracked --out tracked",
+            "estimate --data raw --filter slip-learning --no-figures --out learning",
+            "estimate --data raw --filter gyrodometry --no-figures",
+            "odometry --data raw --robot orchard_ugv --folds 5 --lengths 4 --out slip.yaml",
+            "estimate --data raw --filter slip-odometry --slip-model slip.yaml --no-figures",
+            refused("estimate --data raw --filter slip-odometry"),
+            refused("estimate --data raw --filter sideslip-multi"),
+            refused("estimate --data raw --filter tracked --tuning thesis"),
+            refused("estimate --data raw --filter skid --slip-model slip.yaml"),
+            refused("odometry --data raw --robot husky"),
+            refused("odometry --data raw --robot orchard_ugv --lengths 0"),
+        ),
+    ),
+    Case(
         "learning",
         steps(
             "simulate --robot agrimaro --terrain all --scenario survey --duration 16 --runs 2 --vary "
@@ -415,6 +437,19 @@ CASES: tuple[Case, ...] = (
         ),
     ),
     Case("reproduce", steps("reproduce danzi --out page")),
+    Case("reproduce_tazzari", steps("reproduce tazzari --out page")),
+    Case(
+        "track",
+        steps(
+            "track --robot adap2e --path path.csv --speed 2 --stop 6 --out page",
+            "track --robot adap2e --path path.csv --speed 3 --observer none --slope 10 --out plain",
+            refused("track --robot husky --path path.csv"),
+            refused("track --robot adap2e --path short.csv"),
+            refused("track --robot adap2e --path path.csv --observer nothing"),
+            refused("track --robot adap2e --path path.csv --slope 50"),
+        ),
+        lambda: {"path.csv": PATH_POINTS.encode(), "short.csv": b"x_m,y_m\n0,0\n1,0\n1,0\n"},
+    ),
     Case("bench", steps("bench live --robots 1 --seconds 2", refused("bench live --robots 0"))),
     Case(
         "can",

@@ -58,7 +58,7 @@ def test_a_log_never_makes_a_command_read_a_file(refused, place):
         edit(place, robot=name)
         refused("is no plain name", *ask)
     edit(place, robot="evil.yaml")  # a name; not of the package, though such a file lies here
-    refused("robot 'evil.yaml' is unknown: a log names one of agrimaro", *ask)
+    refused("robot 'evil.yaml' is unknown: a log names one of adap2e", *ask)
     refused("robot 'evil.yaml' is unknown", "crossval", "--data", "data", "--align")
 
 
