@@ -144,7 +144,8 @@ def _gain_row(errors: dict[tuple[float, float], dict[str, Array]], against: str,
     found, offline = gains(errors, "online", against), gains(errors, SLIP, against)
     low, high = mean_interval(found, seed)
     return Row(
-        what=f"Fall of the position RMSE against {against} without fixes, turning {what}, model by fixes",
+        what=f"Fall of the position RMSE against {against.replace('endo', 'Endo')} without fixes, "
+        f"turning {what}, model by fixes",
         where="future work",
         printed="not evaluated",
         simulated=float(found.mean()),

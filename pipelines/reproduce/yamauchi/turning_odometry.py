@@ -138,7 +138,7 @@ def _gain_row(what: str, errors: Errors, method: str, against: str, seed: int) -
         f"{low:.3f} to {high:.3f}; {LEAST_GAIN:g} {reached} exceeded."
     )
     return Row(
-        what=f"Fall of the position RMSE against {against}, {what}",
+        what=f"Fall of the position RMSE against {against.replace('endo', 'Endo')}, {what}",
         where="figs. 15 to 18",
         printed=f"{PRINTED_GAIN}" if printed else "not evaluated",
         printed_interval=(PRINTED_GAIN, PRINTED_GAIN) if printed else None,

@@ -342,8 +342,9 @@ def test_the_choices_of_the_command_line_are_those_that_there_are():
     from pipelines.runs.datasets import LAYOUTS
     from pipelines.runs.settings import Layout
     from terrain.estimation.estimate import FILTERS, TUNINGS
+    from terrain.estimation.observers.choice import OBSERVERS
 
     assert get_args(Layout) == LAYOUTS
     assert RECIPE_CHOICES == RECIPES
-    assert get_args(Filter) == FILTERS
+    assert get_args(Filter) == (*FILTERS, *OBSERVERS)
     assert get_args(Tuning) == TUNINGS
