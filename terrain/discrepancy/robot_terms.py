@@ -13,6 +13,7 @@ from terrain.discrepancy.verdict import Value
 from terrain.effects import PARAMETER, Wording, effect_named
 from terrain.extension import Basis, Origin, basis_of
 from terrain.robots import Robot
+from terrain.robots.bicycle import as_bicycle
 from terrain.robots.omni import as_omni
 from terrain.simulation.planar.skid_steer import SLIDING_RADPS
 
@@ -27,7 +28,9 @@ UNITS = {
     "radps": "rad/s",
     "mps2": "m/s²",
     "s2": "s²",
+    "s2pm": "s²/m",
     "s2pm2": "s²/m²",
+    "npr": "N/rad",
     "a": "A",
     "nspm": "N s/m",
     "nmpa": "N m/A",
@@ -246,6 +249,17 @@ def _one_sided(values: Sequence[Value], total: Total, robot: Robot) -> str:
     return f"wheels that are {number} % {'larger' if error > 0 else 'smaller'} on the right than on the left"
 
 
+def _understeer(values: Sequence[Value], total: Total, robot: Robot) -> str:
+    (value,) = values
+    car = as_bicycle(robot, "robot {name}: drive {drive!r} has no understeer")
+    own, added = car.understeer_s2pm, total[value.name]
+    turned = [car.wheelbase_m / (car.wheelbase_m + each * FAST_MPS**2) for each in (own, own + added)]
+    percent = 100.0 * abs(turned[1] / turned[0] - 1.0)
+    number = f"{rounded(own + added, _half(value))} s²/m (described: {own:.2g} s²/m)"
+    change = "less" if added > 0 else "more"
+    return f"an understeer of {number}, which turns it {percent:.2g} % {change} at {FAST_MPS:g} m/s"
+
+
 TERMS: dict[Wording, Callable[[Sequence[Value], Total, Robot], str]] = {
     Wording.TRACK: _track,
     Wording.MEASURED_POINT: _lever,
@@ -258,5 +272,6 @@ TERMS: dict[Wording, Callable[[Sequence[Value], Total, Robot], str]] = {
     Wording.SIDE_SLIP: _side_slip,
     Wording.GYRO_SCALE: _gyro_scale,
     Wording.SIDES: _one_sided,
+    Wording.UNDERSTEER: _understeer,
 }
 """How the effects are worded whose numbers do not speak for themselves; the others by their home."""

@@ -32,6 +32,7 @@ from terrain.effects.described import SCHEMA, checked_covariance, checked_effect
 from terrain.effects.sensors import OTHER_LOGGER
 from terrain.effects.types import (
     ACCEL,
+    BICYCLE,
     BOTH,
     CHANNELS,
     CURRENT,
@@ -43,6 +44,7 @@ from terrain.effects.types import (
     SPEED_X,
     SPEED_Y,
     SWERVE,
+    TRACKED,
     TURNING_CURRENT,
     Combine,
     Effect,
@@ -56,6 +58,7 @@ from terrain.effects.vector import INDEX, PARAMETERS, vector_of
 
 __all__ = [
     "ACCEL",
+    "BICYCLE",
     "BOTH",
     "BOUNDS",
     "CHANNELS",
@@ -80,6 +83,7 @@ __all__ = [
     "STEPS",
     "SWERVE",
     "TILT_OFFSETS",
+    "TRACKED",
     "TURNING_CURRENT",
     "Combine",
     "Effect",

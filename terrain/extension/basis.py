@@ -77,12 +77,13 @@ def basis_of(robot: Robot, parameter: str, value: float = 0.0) -> tuple[Basis, .
     for home in PARAMETER[parameter].homes:
         if home.section and home.section not in before.parts:
             continue
-        name = f"{home.section}.{home.field}" if home.section else home.field
+        field = home.field if home.section else robot.spelled.get(home.field, home.field)
+        name = f"{home.section}.{field}" if home.section else field
         origin = Origin.ASSUMED if name in robot.assumed else Origin.SOURCED
         if home.section and not robot.describes(home.section):
             origin = Origin.LEFT_OUT
         described, extended = (_number(each, home.section, home.field) for each in (before, after))
-        found.append(Basis(home.section, home.field, described, extended, origin))
+        found.append(Basis(home.section, field, described, extended, origin))
     return tuple(found)
 
 
