@@ -16,6 +16,7 @@ from scipy.stats import norm
 
 from terrain.discrepancy.trials.drives import STEP_HZ, Drives
 from terrain.effects import (
+    MOTION,
     ACCEL,
     CHANNELS,
     CURRENT,
@@ -42,7 +43,7 @@ from terrain.simulation.planar.model import Ground, Planar, make_planar
 from terrain.simulation.planar.motion import move
 from terrain.simulation.planar.noise import Noise, Scatter, load_noise, load_scatter
 from terrain.simulation.planar.noise_spectra import WHEEL_SPEED, noise_psd
-from terrain.simulation.planar.run import simulate_planar
+from terrain.simulation.planar.run import simulate_planar, with_silent_parts
 
 TEST_SIZE = 0.02
 """Size of the test over the whole library, to which limits refer."""
@@ -154,6 +155,9 @@ def limits_of(robot: Robot, drives: Drives, sensing: Sensing | None = None) -> L
     True
     """
     sensing = sensing or Sensing()
+    if not robot.describes("motors") and not sensing.channels:
+        sensing = sensing._replace(channels=(*MOTION, ACCEL))  # no currents are logged
+    robot = with_silent_parts(robot)
     planar, noise, scatter = make_planar(robot, Ground()), load_noise(), sensing.scatter or load_scatter()
     names, nuisances = tuple(parameters_of(robot.drive)), nuisances_of(robot.drive)
     every = tuple(dict.fromkeys((*names, *nuisances)))
@@ -251,7 +255,7 @@ def _density(noise: Noise, robot: Robot, planar: Planar, channel: str, f: Array,
     wheel_speed = noise_psd(noise, robot, planar, WHEEL_SPEED, f, pace)
     lag_s = robot.completed.sensors.encoder_time_constant_s
     wheel_speed = wheel_speed * (1.0 + (2 * math.pi * f * lag_s) ** 2)  # the lag is undone
-    n = planar.n_wheels
+    n = 1 if planar.bicycle else planar.n_wheels
     mean, rate = wheel_speed / n, (2 * math.pi * f) ** 2
     if channel in (GYRO, HEADING):
         turn = 2.0 / planar.track_m**2 if robot.skids else np.sum(planar.to_twist[2] ** 2) / 2
