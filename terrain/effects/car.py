@@ -6,7 +6,6 @@ from terrain.effects.types import (
     BICYCLE,
     GYRO,
     HEADING,
-    MOTION,
     SPEED_Y,
     Combine,
     Effect,
@@ -17,7 +16,7 @@ from terrain.effects.types import (
 )
 from terrain.effects.wheels import KINEMATICS
 
-SINGLE_TRACK = "linear single-track model: Riekert and Schunck, Ingenieur-Archiv 1940; Rajamani, Vehicle Dynamics and Control"
+SINGLE_TRACK = "linear single-track model: Rajamani, Vehicle Dynamics and Control"
 
 CAR: tuple[Effect, ...] = (
     Effect(
@@ -72,7 +71,7 @@ CAR: tuple[Effect, ...] = (
         "stiffness of both axles x (1 + e); so does a load of 1 / (1 + e) - 1, with nothing else to show it",
         SINGLE_TRACK,
         (BICYCLE,),
-        (SPEED_Y,),
+        (SPEED_Y, GYRO),
         "fast arcs to both sides, side slopes and steps of the steering",
     ),
 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from terrain.effects.types import (
+    ACCEL,
     BOTH,
     CURRENT,
     EVERY,
@@ -64,7 +65,7 @@ SLIP_AND_RESISTANCE: tuple[Effect, ...] = (
         "n = 0.5 + e in turning_slip",
         "Endo et al., IROS 2007, as in Yamauchi et al., (27)",
         (TRACKED,),
-        (SPEED_X,),
+        (SPEED_X, ACCEL, CURRENT),
         "arcs of several radii with much turning slip",
         modifies="turning_slip",
     ),
