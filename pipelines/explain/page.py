@@ -20,6 +20,7 @@ from pipelines.explain.figures import (
 from pipelines.explain.results import DiagnosedRuns, Explanation
 from pipelines.explain.sections import page_view
 from pipelines.explain.view import FigureView, RunPicture
+from pipelines.explain.wording import in_words_of
 from pipelines.reporting.drawing import png_bytes, svg_text
 from pipelines.reporting.numbers import shorten
 from pipelines.reporting.pictures import MAX_SVG_BYTES, png_image, svg_image
@@ -179,4 +180,5 @@ def explain_page(result: Explanation, figures: Sequence[FigureView], runs: Seque
     figures : of all runs
     runs : figures of whole runs
     """
-    return render("explain/page.html.j2", view=page_view(result, figures, runs))
+    page = render("explain/page.html.j2", view=page_view(result, figures, runs))
+    return in_words_of(result.drive, page)

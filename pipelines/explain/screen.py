@@ -11,6 +11,7 @@ from pipelines.explain.wording import (
     caveat_text,
     effect_label,
     gain_text,
+    in_words_of,
     unexplained_text,
     varying_text,
     verdict_text,
@@ -29,22 +30,26 @@ from terrain.discrepancy.verdict import Cause, Diagnosis
 def print_explain(result: Explanation, console: Console) -> None:
     """Print faults, a sentence a channel, the verdict, causes, gains, and what was withdrawn or is left."""
     diagnosis = result.diagnosis
-    print_lines(console, (f"{diagnosis.robot}, {diagnosis.n_runs} runs: {diagnosis.verdict.value}",))
-    print_lines(console, (f"fault: {fault.sentence}" for fault in diagnosis.faults))
-    print_lines(console, (f"- {statement.text}" for statement in result.statements))
-    print_lines(console, (verdict_text(diagnosis),))
+
+    def say(*lines: str) -> None:
+        print_lines(console, (in_words_of(result.drive, line) for line in lines))
+
+    say(f"{diagnosis.robot}, {diagnosis.n_runs} runs: {diagnosis.verdict.value}")
+    say(*(f"fault: {fault.sentence}" for fault in diagnosis.faults))
+    say(*(f"- {statement.text}" for statement in result.statements))
+    say(verdict_text(diagnosis))
     if diagnosis.causes:
-        _print_causes(diagnosis.causes, console)
+        _print_causes(diagnosis.causes, result.drive, console)
     if rows := session_rows(diagnosis):
         table = compact_table(*map(text_column, SESSION_COLUMNS))
         for row in rows:
-            table.add_row(*row)
+            table.add_row(*(in_words_of(result.drive, cell) for cell in row))
         console.print(table)
     _print_gain(result.gain, console)
-    print_lines(console, _diagnosis_lines(diagnosis))
-    print_lines(console, result.notes)
+    say(*_diagnosis_lines(diagnosis))
+    say(*result.notes)
     if result.powertrain is not None:
-        print_lines(console, (f"powertrain: {text}" for text in result.powertrain.sentences))
+        say(*(f"powertrain: {text}" for text in result.powertrain.sentences))
     if result.next_command is not None:
         print_lines(console, (f"what to drive next: {result.next_command}",))
     print_lines(console, result.skipped)
@@ -53,13 +58,13 @@ def print_explain(result: Explanation, console: Console) -> None:
     print_lines(console, (f"page: {result.page}",))
 
 
-def _print_causes(causes: tuple[Cause, ...], console: Console) -> None:
+def _print_causes(causes: tuple[Cause, ...], drive: str, console: Console) -> None:
     table = compact_table(text_column("cause"), *number_columns("value", "95 %", "held-out gain", "z"))
     for cause in causes:
         for place, each in enumerate(cause.values):
             first = place == 0
             table.add_row(
-                effect_label(cause.name) if first else "",
+                in_words_of(drive, effect_label(cause.name)) if first else "",
                 f"{each.value:.4g} {unit_label(each.unit) or each.unit}",
                 f"{each.low:.4g} to {each.high:.4g}",
                 percent(cause.gain) if first else "",

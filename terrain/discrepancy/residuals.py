@@ -241,7 +241,11 @@ def _rolled(planar: Planar, wheel_speed: Array, steer: Array) -> tuple[Array, Ar
     """Return speed, turn and sideways speed (n,) of wheels, as :data:`INPUTS` has them."""
     if planar.bicycle:
         speed = wheel_speed[:, -1]
-        return speed, speed * np.tan(steer[:, 0]) * (planar.track_m / planar.wheelbase_m), np.zeros_like(speed)
+        return (
+            speed,
+            speed * np.tan(steer[:, 0]) * (planar.track_m / planar.wheelbase_m),
+            np.zeros_like(speed),
+        )
     if planar.omni:
         ahead, left, turn = planar.to_rolled @ wheel_speed.T
         return ahead, 2.0 * planar.wheel_distance_m * turn, left

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from terrain.discrepancy.verdict import Value
 from terrain.effects import PARAMETER, Wording, effect_named
 from terrain.extension import Basis, Origin, basis_of
-from terrain.robots import Robot
+from terrain.robots import Robot, TrackedRobot
 from terrain.robots.bicycle import as_bicycle
 from terrain.robots.omni import as_omni
 from terrain.simulation.planar.skid_steer import SLIDING_RADPS
@@ -246,7 +246,8 @@ def _one_sided(values: Sequence[Value], total: Total, robot: Robot) -> str:
     (value,) = values
     error = total[value.name]
     number = rounded(100.0 * abs(error), 100.0 * _half(value))
-    return f"wheels that are {number} % {'larger' if error > 0 else 'smaller'} on the right than on the left"
+    what = "sprockets" if isinstance(robot, TrackedRobot) else "wheels"
+    return f"{what} that are {number} % {'larger' if error > 0 else 'smaller'} on the right than on the left"
 
 
 def _understeer(values: Sequence[Value], total: Total, robot: Robot) -> str:

@@ -129,6 +129,7 @@ SLIP_AND_RESISTANCE: tuple[Effect, ...] = (
     ),
     Effect(
         "rolling_resistance",
+        # without currents it shows by the slip that it takes, as a smaller wheel radius does
         (Parameter("rolling_resistance_ratio", -0.05, 0.5, 0.005, scatter_rank=7),),
         "resistance grows by c W",
         "Wong, Theory of Ground Vehicles",

@@ -8,15 +8,15 @@ motion and from spectra of the simulated noise, not from anything that the diagn
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import norm
 
+from terrain.discrepancy.rivals import RIVAL_LOSS
 from terrain.discrepancy.trials.drives import STEP_HZ, Drives
 from terrain.effects import (
-    MOTION,
     ACCEL,
     CHANNELS,
     CURRENT,
@@ -24,6 +24,7 @@ from terrain.effects import (
     HEADING,
     INDEX,
     LIBRARY,
+    MOTION,
     ONE_SIDED,
     SENSED_ONLY,
     SPEED_X,
@@ -125,6 +126,19 @@ class Limits(NamedTuple):
         # the largest cosine between a change of the one and a change of the other
         shared = np.linalg.solve(own, cross) @ np.linalg.solve(its, cross.T)
         return math.sqrt(max(float(np.linalg.eigvals(shared).real.max()), 0.0)) > CONFUSABLE
+
+    def in_place_of(self, effect: Effect, values: Mapping[str, float], other: Effect) -> bool:
+        """Return whether another effect explains values of one so well that an answer has to state both.
+
+        So it is where minus twice the log-likelihood of its best fit is worse by less than ``RIVAL_LOSS``.
+        """
+        i, j = ([self.names.index(p.name) for p in each.parameters] for each in (effect, other))
+        hidden = np.array([values[p.name] for p in effect.parameters])
+        cross, its = self.information[np.ix_(j, i)] @ hidden, self.information[np.ix_(j, j)]
+        if np.diag(its).min() <= UNSEEN:
+            return False
+        own = hidden @ self.information[np.ix_(i, i)] @ hidden
+        return bool(own - cross @ np.linalg.solve(its, cross) < RIVAL_LOSS)
 
     def spanned(self, pair: tuple[Effect, Effect], other: Effect) -> bool:
         """Return whether two effects together look like another, which then takes the place of one of them.

@@ -20,8 +20,8 @@ class Row(StrEnum):
     half of the trials with nothing hidden.  ``KNOWN``: a skid-steer robot of which the effective track is far
     off, in 80 runs of 6 s.
 
-    Robots of other drives, none of which logs currents.  ``TRACKED``, ``CAR``: each effect in turn, of 3 times
-    its limit; nothing in every fifth trial.
+    Robots of other drives, none of which logs currents.  ``TRACKED``, ``CAR``: each effect in turn, of 3
+    times its limit; nothing in every fifth trial.
     """
 
     NONE = "none"
@@ -43,3 +43,7 @@ class Row(StrEnum):
     KNOWN = "known"
     TRACKED = "tracked"
     CAR = "car"
+
+
+DRIVE_ROWS = (Row.TRACKED, Row.CAR)
+"""Rows of drives whose robots log no currents."""

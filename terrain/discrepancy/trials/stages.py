@@ -115,8 +115,8 @@ def _standing(draw: Draw) -> Stage:
 def _of_drive(draw: Draw) -> Stage:
     """Rows of robots whose logs have no currents."""
     robot, number = draw.robot, draw.case.number
-    cars = isinstance(robot, BicycleRobot)
-    drives = car_drives(draw.rng, robot, draw.case.n_runs) if cars else draw.rich()
+    car = robot if isinstance(robot, BicycleRobot) else None
+    drives = car_drives(draw.rng, car, draw.case.n_runs) if car else draw.rich()
     turn = number // len(ROBOTS_OF_ROW[draw.case.row])
     if turn % NOTHING_EVERY == NOTHING_EVERY - 1:
         hidden, limits = Hidden({}, (), 0.0, "", library_of(robot.drive), {}), None

@@ -149,7 +149,8 @@ def make_planar(robot: Robot, ground: Ground) -> Planar:
     """
     complete = robot.completed
     motors, camera, body, sensors = complete.motors, complete.camera, complete.body, complete.sensors
-    n_motors, car = len(robot.wheels), isinstance(robot, BicycleRobot)
+    n_motors = len(robot.wheels)
+    car = robot if isinstance(robot, BicycleRobot) else None
     com_m = np.array([body.com_x_m, body.com_y_m])
     arm_m = robot.wheel_positions_m - com_m
     spread_m = float(np.sqrt((arm_m**2).sum(axis=1).mean()))
@@ -160,7 +161,7 @@ def make_planar(robot: Robot, ground: Ground) -> Planar:
         radius_m=robot.wheel_radius_m,
         mass_kg=robot.mass_kg,
         rotating_kg=n_motors * body.wheel_inertia_kgm2 / robot.wheel_radius_m**2,
-        yaw_inertia_kgm2=robot.yaw_inertia_kgm2 if car else body.yaw_inertia_kgm2,
+        yaw_inertia_kgm2=car.yaw_inertia_kgm2 if car else body.yaw_inertia_kgm2,
         nm_per_a=motors.torque_constant_nmpa * motors.reduction_ratio * motors.efficiency_ratio,
         friction_nm=n_motors * motors.friction_nm,
         lever_x_m=camera.lever_x_m,
@@ -182,11 +183,11 @@ def make_planar(robot: Robot, ground: Ground) -> Planar:
         spread_m=spread_m,
         relaxation_m=body.relaxation_length_m,
         **_omni_wheels(robot, arm_m, ground),
-        bicycle=car,
+        bicycle=car is not None,
         wheelbase_m=robot.wheelbase_m,
-        com_ahead_m=robot.com_ahead_m if car else 0.0,
-        front_cornering_npr=robot.front_cornering_npr if car else 0.0,
-        rear_cornering_npr=robot.rear_cornering_npr if car else 0.0,
+        com_ahead_m=car.com_ahead_m if car else 0.0,
+        front_cornering_npr=car.front_cornering_npr if car else 0.0,
+        rear_cornering_npr=car.rear_cornering_npr if car else 0.0,
     )
 
 

@@ -24,7 +24,7 @@ _RAMPED = ("straight", "climb", "starts")
 """Those whose acceleration can be chosen."""
 
 CRUISING_MPS, CRUISING_SHARE = 1.0, 1.0 / 3.0
-"""Speed where none is given, and the share of its fastest speed that a slower robot or a car-like one drives."""
+"""Speed where none is given, and the share of its fastest speed that a slower or car-like robot drives."""
 
 SCENARIOS: tuple[str, ...] = (*DRIVES, "course")
 """Names that :func:`make_scenario` accepts."""
@@ -64,8 +64,8 @@ def make_scenario(
     robot : no twist saturates its wheels; without motors, which swerve robots need, they have no limit
     terrains : of the ground, one unless the scenario is ``course``; the names are not looked up
     duration_s : what the scenario is made for by default; taken to a whole number of samples
-    speed_mps : cruising speed, by default 1 m/s, of a slower or car-like robot a third of its fastest; ``survey`` and
-        ``course`` draw from 0.4 to 1.2 times it, backward and sideways
+    speed_mps : cruising speed, by default 1 m/s, of a slower or car-like robot a third of its fastest;
+        ``survey`` and ``course`` draw from 0.4 to 1.2 times it, backward and sideways
         ``complex`` is slower, and so is all of ``crab``
     seed : of everything drawn; the same gives the same bytes
     accel_mps2 : of the ramps of ``straight``, ``climb`` and ``starts``; infinite, they are steps

@@ -71,8 +71,8 @@ LEFT_OUT = {
     "skid_steer": ("turning_slip_power",),
     "bicycle": ("payload", "rolling_resistance", "viscous_drag", "slip_resistance", "current_offset"),
 }
-"""Effects that act and are not looked for: on omni robots those of an IMU, which these logs do not have, and of
-lags and currents that the friction of the rollers hides; on wheels the exponent of tracks; on cars, whose
+"""Effects that act and are not looked for: on omni robots those of an IMU, which these logs do not have, and
+of lags and currents that the friction of the rollers hides; on wheels the exponent of tracks; on cars, whose
 currents are not logged, a load, which looks like softer tyres, and resistances, which look like a smaller
 radius."""
 
