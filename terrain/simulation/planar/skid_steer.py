@@ -2,7 +2,7 @@
 
 Slip along is that of :mod:`~terrain.simulation.planar.along`.  Turning slip takes of the difference of the
 sides by how tight the turn is, turn drag of the mean by the yaw rate; in fast arcs the track acts narrower.
-With friction against lateral motion, ``m (dv_y/dt + w v) = -K v_y``, the robot slips to the outside of a turn:
+With friction against lateral motion, ``m (dv_y/dt + w v) = -K v_y``, it slips to the outside of a turn:
 ``T dv_y/dt + v_y = -c v w``, ``c = T = m/K``; the two are parameters of their own.
 """
 
