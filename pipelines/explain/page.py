@@ -20,12 +20,12 @@ from pipelines.explain.figures import (
 from pipelines.explain.results import DiagnosedRuns, Explanation
 from pipelines.explain.sections import page_view
 from pipelines.explain.view import FigureView, RunPicture
-from pipelines.explain.wording import in_words_of
 from pipelines.reporting.drawing import png_bytes, svg_text
 from pipelines.reporting.numbers import shorten
 from pipelines.reporting.pictures import MAX_SVG_BYTES, png_image, svg_image
 from pipelines.reporting.progress import Progress, silent
 from pipelines.reporting.templates import render
+from pipelines.reporting.words import in_words_of
 from terrain.discrepancy.compared import STRETCH_S, ComparedRun, example_stretch, telling_runs
 from terrain.discrepancy.noise import Noise
 from terrain.files.atomic import atomic_write

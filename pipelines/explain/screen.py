@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 
 from rich.console import Console
 
@@ -11,7 +12,6 @@ from pipelines.explain.wording import (
     caveat_text,
     effect_label,
     gain_text,
-    in_words_of,
     unexplained_text,
     varying_text,
     verdict_text,
@@ -19,6 +19,7 @@ from pipelines.explain.wording import (
 from pipelines.reporting.numbers import format_known, percent
 from pipelines.reporting.quantities import quantity, unit_label
 from pipelines.reporting.terminal import compact_table, number_columns, print_lines, text_column
+from pipelines.reporting.words import in_words_of
 from terrain.discrepancy.channel_words import CHANNEL_WORDS
 from terrain.discrepancy.filter_gain import Comparison
 from terrain.discrepancy.statements import SESSION_COLUMNS, session_rows, split_ruled_out
@@ -31,13 +32,10 @@ def print_explain(result: Explanation, console: Console) -> None:
     """Print faults, a sentence a channel, the verdict, causes, gains, and what was withdrawn or is left."""
     diagnosis = result.diagnosis
 
-    def say(*lines: str) -> None:
-        print_lines(console, (in_words_of(result.drive, line) for line in lines))
-
+    say = partial(_say, result.drive, console)
     say(f"{diagnosis.robot}, {diagnosis.n_runs} runs: {diagnosis.verdict.value}")
     say(*(f"fault: {fault.sentence}" for fault in diagnosis.faults))
-    say(*(f"- {statement.text}" for statement in result.statements))
-    say(verdict_text(diagnosis))
+    say(*(f"- {statement.text}" for statement in result.statements), verdict_text(diagnosis))
     if diagnosis.causes:
         _print_causes(diagnosis.causes, result.drive, console)
     if rows := session_rows(diagnosis):
@@ -47,15 +45,16 @@ def print_explain(result: Explanation, console: Console) -> None:
         console.print(table)
     _print_gain(result.gain, console)
     say(*_diagnosis_lines(diagnosis))
-    say(*result.notes)
-    if result.powertrain is not None:
-        say(*(f"powertrain: {text}" for text in result.powertrain.sentences))
+    powertrain = () if result.powertrain is None else result.powertrain.sentences
+    say(*result.notes, *(f"powertrain: {text}" for text in powertrain))
     if result.next_command is not None:
         print_lines(console, (f"what to drive next: {result.next_command}",))
-    print_lines(console, result.skipped)
-    if result.extended is not None:
-        print_lines(console, (f"extended description: {result.extended.file}",))
-    print_lines(console, (f"page: {result.page}",))
+    extended = () if result.extended is None else (f"extended description: {result.extended.file}",)
+    print_lines(console, (*result.skipped, *extended, f"page: {result.page}"))
+
+
+def _say(drive: str, console: Console, *lines: str) -> None:
+    print_lines(console, (in_words_of(drive, line) for line in lines))
 
 
 def _print_causes(causes: tuple[Cause, ...], drive: str, console: Console) -> None:

@@ -125,8 +125,8 @@ INPUTS: tuple[str, ...] = (
 )
 """Mean wheel speed, right minus left (last minus first) wheel speed, mean steering, tilt, traction over
 weight, 0, and how far the wheels have turned: a column for each of them.  Of an omni robot speed, turn and
-sideways are those that its wheels would roll ahead, in place (twice the speed of a wheel) and to the left;
-of a car-like robot turn is what the wheels of its rear axle would differ by."""
+sideways are those that its wheels would roll ahead, in place (twice the speed of a wheel) and to the left; of
+a car-like robot turn is the difference of its rear wheels."""
 
 
 def low_pass_of(signals: Sequence[Signals]) -> LowPass:
@@ -239,17 +239,12 @@ def rows_of(
 
 def _rolled(planar: Planar, wheel_speed: Array, steer: Array) -> tuple[Array, Array, Array]:
     """Return speed, turn and sideways speed (n,) of wheels, as :data:`INPUTS` has them."""
-    if planar.bicycle:
-        speed = wheel_speed[:, -1]
-        return (
-            speed,
-            speed * np.tan(steer[:, 0]) * (planar.track_m / planar.wheelbase_m),
-            np.zeros_like(speed),
-        )
+    speed = wheel_speed.mean(axis=1)
     if planar.omni:
         ahead, left, turn = planar.to_rolled @ wheel_speed.T
         return ahead, 2.0 * planar.wheel_distance_m * turn, left
-    speed = wheel_speed.mean(axis=1)
+    if planar.bicycle:
+        return speed, speed * np.tan(steer[:, 0]) * (planar.track_m / planar.wheelbase_m), 0.0 * speed
     return speed, wheel_speed[:, -1] - wheel_speed[:, 0], np.zeros_like(speed)
 
 

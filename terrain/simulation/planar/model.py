@@ -44,7 +44,7 @@ import numpy as np
 from terrain.kinematics.omni import rolling_matrix
 from terrain.kinematics.wheel_velocity import velocity_matrix
 from terrain.records import Array
-from terrain.robots import BicycleRobot, Robot, SwerveRobot
+from terrain.robots import BicycleRobot, Robot, SwerveRobot, TrackedRobot
 
 TRUTH: tuple[str, ...] = (
     "speed_x_mps",
@@ -134,6 +134,7 @@ class Planar(NamedTuple):
     wheel_load_ratio: Array
     wheel_distance_m: float
     roller_ratio: float
+    tracked: bool
     bicycle: bool
     wheelbase_m: float
     com_ahead_m: float
@@ -183,6 +184,7 @@ def make_planar(robot: Robot, ground: Ground) -> Planar:
         spread_m=spread_m,
         relaxation_m=body.relaxation_length_m,
         **_omni_wheels(robot, arm_m, ground),
+        tracked=isinstance(robot, TrackedRobot),
         bicycle=car is not None,
         wheelbase_m=robot.wheelbase_m,
         com_ahead_m=car.com_ahead_m if car else 0.0,

@@ -91,7 +91,7 @@ def _differed(
         tight[k] = abs(dv) / size if size > 1e-6 else 0.0
         lost = p[_TURN_SLIP] * tight[k] * dv
         if lost != 0.0:
-            share = 1.0 - ENDO_POWER - p[_TURN_POWER]
+            share = 1.0 - ENDO_POWER - (p[_TURN_POWER] if planar.tracked else 0.0)
             a, b = abs(v_r) ** share, abs(v_l) ** share
             u[k] -= 0.5 * lost * (a - b) / (a + b)
         difference[k] = dv

@@ -93,12 +93,7 @@ def make_scenario(
         raise ConfigError(
             f"scenario {name!r} is driven on one terrain, {len(grounds)} are given: use 'course'"
         )
-    able = {
-        "crab": robot.sideways,
-        "course": isinstance(robot, SwerveRobot),
-        "spot_turn": not isinstance(robot, BicycleRobot),
-    }
-    if not able.get(name, True):
+    if not _can_drive(robot, name):
         raise ConfigError(f"scenario {name!r} is not for robot {robot.name} with the drive {robot.drive!r}")
     request = DriveRequest(
         *_ability(robot, speed_mps), _generator(seed), _checked_accel(name, accel_mps2), robot.sideways
@@ -113,6 +108,15 @@ def make_scenario(
         twist = twists_of(drive.legs(request, length_s), time_s, drive.smooth)
         patches = (Patch(0.0, grounds[0]),)
     return Scenario(name, RATE_HZ, time_s, twist, patches)
+
+
+def _can_drive(robot: Robot, name: str) -> bool:
+    able = {
+        "crab": robot.sideways,
+        "course": isinstance(robot, SwerveRobot),
+        "spot_turn": not isinstance(robot, BicycleRobot),
+    }
+    return able.get(name, True)
 
 
 def _checked_duration(duration_s: float | None) -> float | None:

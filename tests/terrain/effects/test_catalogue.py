@@ -68,13 +68,11 @@ LEFT_OUT = {
         *("gyro_bias", "gyro_scale", "accel_bias", "imu_latency", "clock_offset", "clock_rate"),
         *("encoder_lag", "motor_constant", "motor_drift", "current_offset"),
     ),
-    "skid_steer": ("turning_slip_power",),
     "bicycle": ("payload", "rolling_resistance", "viscous_drag", "slip_resistance", "current_offset"),
 }
 """Effects that act and are not looked for: on omni robots those of an IMU, which these logs do not have, and
-of lags and currents that the friction of the rollers hides; on wheels the exponent of tracks; on cars, whose
-currents are not logged, a load, which looks like softer tyres, and resistances, which look like a smaller
-radius."""
+of lags and currents that the friction of the rollers hides; on cars, whose currents are not logged, a load,
+which looks like softer tyres, and resistances, which look like a smaller radius."""
 
 NOTICEABLE, CLEAR = 0.1, 0.2
 """Response over noise, over that of the clearest channel, from which on one may be named and has to be."""

@@ -55,7 +55,7 @@ def test_a_steady_turn_has_the_effective_wheelbase_and_slides_to_its_outside(spe
 
 
 @pytest.mark.parametrize("speed", [-1.5, 2.0])
-def test_on_a_side_slope_it_drifts_downhill_whichever_way_it_drives(speed):
+def test_on_a_side_slope_it_drifts_downhill_driving_ahead_and_back(speed):
     out = moved(np.full(600, speed), 0.0, roll=0.1)[-1]
     down, k = GRAVITY_MPS2 * math.sin(0.1), understeer(CAR)
     turn = -abs(speed) * k * down / (CAR.wheelbase_m + k * speed * abs(speed))
