@@ -31,7 +31,6 @@ from terrain.discrepancy.verdict import Cause, Diagnosis
 def print_explain(result: Explanation, console: Console) -> None:
     """Print faults, a sentence a channel, the verdict, causes, gains, and what was withdrawn or is left."""
     diagnosis = result.diagnosis
-
     say = partial(_say, result.drive, console)
     say(f"{diagnosis.robot}, {diagnosis.n_runs} runs: {diagnosis.verdict.value}")
     say(*(f"fault: {fault.sentence}" for fault in diagnosis.faults))
@@ -44,12 +43,11 @@ def print_explain(result: Explanation, console: Console) -> None:
             table.add_row(*(in_words_of(result.drive, cell) for cell in row))
         console.print(table)
     _print_gain(result.gain, console)
-    say(*_diagnosis_lines(diagnosis))
-    powertrain = () if result.powertrain is None else result.powertrain.sentences
-    say(*result.notes, *(f"powertrain: {text}" for text in powertrain))
+    sentences = () if result.powertrain is None else result.powertrain.sentences
+    say(*_diagnosis_lines(diagnosis), *result.notes, *(f"powertrain: {text}" for text in sentences))
     if result.next_command is not None:
         print_lines(console, (f"what to drive next: {result.next_command}",))
-    extended = () if result.extended is None else (f"extended description: {result.extended.file}",)
+    extended = [] if result.extended is None else [f"extended description: {result.extended.file}"]
     print_lines(console, (*result.skipped, *extended, f"page: {result.page}"))
 
 
