@@ -24,9 +24,9 @@ before holds in it."""
 COMMAND_MPS2 = 2.0
 """The most by which the wheels of a side speed up in such a run, so that a command is reached in its lead."""
 
-CAR_MPS2 = 2.5
-"""The most by which a car-like robot speeds up or accelerates to the side, a quarter of g; and, over 1 m, the
-rate of its curvature: lock to lock in a quarter of a second a metre."""
+CAR_MPS2, CAR_SIDE_MPS2, CAR_CURVATURE_PMS = 1.5, 2.5, 1.0
+"""The most by which a car-like robot speeds up and accelerates to the side, and by which its curvature changes
+in a second."""
 
 COMMAND_GRADE_RATIO = 0.01
 """Standard deviation of the slope under such runs, which have no measured tilt: a yard."""
@@ -73,7 +73,7 @@ def car_drives(
     """Return drives of a car-like robot that excite all its effects: steps of speed and curvature, hills.
 
     It drives up to half its fastest speed, backward up to a quarter of that, and turns as tightly as
-    :data:`CAR_MPS2` lets it.
+    :data:`CAR_SIDE_MPS2` lets it.
     """
     fastest_mps = 0.5 * robot.speed_max_mps
     tightest_radpm = 0.9 * math.tan(robot.steering_max_rad) / robot.wheelbase_m
@@ -87,12 +87,13 @@ def car_drives(
             kind = rng.choice(["ahead", "turn", "back", "stop"], p=[0.25, 0.5, 0.15, 0.1])
             ahead = fastest_mps * (-0.25 * rng.uniform(0.4, 1.0) if kind == "back" else rng.uniform(0.2, 1.0))
             speed = 0.0 if kind == "stop" else ahead
-            most = min(tightest_radpm, CAR_MPS2 / max(speed**2, 1e-9))
+            most = min(tightest_radpm, CAR_SIDE_MPS2 / max(speed**2, 1e-9))
             turn = 0.0 if kind == "ahead" else rng.uniform(-most, most)
             desired[k : k + length] = speed, turn
             k += length
         desired[n - round(5.0 * STEP_HZ) :] = 0.0
-        speed, turn = _limit_rate(desired * [1.0, CAR_MPS2], CAR_MPS2).T / [[1.0], [CAR_MPS2]]
+        (speed,) = _limit_rate(desired[:, :1], CAR_MPS2).T
+        (turn,) = _limit_rate(desired[:, 1:], CAR_CURVATURE_PMS).T
         twists.append(np.column_stack([speed, np.zeros(n), speed * turn]))
     return Drives(tuple(twists), rich_hills(rng, n_runs))
 

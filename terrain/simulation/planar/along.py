@@ -2,7 +2,7 @@
 
 With ``f = (m dv/dt + F) / (m g)`` and ``F`` what slope and resistances ask for, ``v = u - |u| c f`` is a
 low-pass of ``u - |u| c F / (m g)`` with the time constant ``|u| c / g``, stepped exactly for what runs
-straight from sample to sample.
+straight from sample to sample; of car-like robots, which are fast, the time constant does, too.
 """
 
 from __future__ import annotations
@@ -25,6 +25,9 @@ MAX_SLIP = 0.9
 """Slip that forces take at the most, of either sign; assumed: a straight thrust curve has no end of its
 own."""
 
+SHORTEST_S, FALLS_MOST = 1e-6, -0.9
+"""Shorter time constants are none; one that falls faster than the second, in s/s, is taken as even."""
+
 _FORCE_SLIP = INDEX["force_slip_ratio"]
 _SHEAR_SLIP = INDEX["shear_slip_ratio"]
 _SLIP_RESISTANCE = INDEX["slip_resistance_ratio"]
@@ -46,6 +49,15 @@ def direction(speed_mps: float) -> float:
 
 
 @njit(cache=True)
+def _kept(before_s: float, after_s: float, dt: float) -> float:
+    """Return what a step leaves of an offset where the time constant runs straight: ``v' = -v / tau``."""
+    change = math.log(after_s / before_s)
+    if abs(change) < 1e-3:
+        return math.exp(-2.0 * dt / (before_s + after_s))
+    return math.exp(-dt * change / (after_s - before_s))
+
+
+@njit(cache=True)
 def slip_along(
     planar: Planar, p: Array, dt: float, u: Array, scrub_n: Array, grade_rad: Array, disturbance: Array
 ) -> tuple[Array, Array, Array]:
@@ -62,7 +74,7 @@ def slip_along(
     carried = weight * (1.0 + planar.load_ratio * p[_PAYLOAD])
     rolling = (planar.rolling_ratio + p[_ROLLING]) * (1.0 + p[_PAYLOAD]) * weight
     speed, rest, slips, ground = np.zeros(n), np.zeros(n), np.zeros(n), planar.soft_ratio
-    target_before, force_ratio, slip = 0.0, 0.0, 0.0
+    target_before, tau_before, force_ratio, slip = 0.0, 0.0, 0.0, 0.0
     for k in range(n):
         v = speed[k - 1] + u[k] - u[k - 1] if k > 0 else u[0]  # without the lag of a step
         smooth = math.sqrt(v * v + STANDSTILL_MPS * STANDSTILL_MPS)
@@ -78,12 +90,17 @@ def slip_along(
         if disturbance.shape[0] > 0:
             target -= fastest * disturbance[k, 0]
         tau = fastest * compliance * mass / carried
-        if k > 0 and tau > 1e-6:
+        grows = (tau - tau_before) / dt
+        if planar.bicycle and min(tau, tau_before) > SHORTEST_S and grows > FALLS_MOST:
+            slope = (target - target_before) / (dt * (1.0 + grows))
+            off = speed[k - 1] - target_before + tau_before * slope
+            speed[k] = target - tau * slope + _kept(tau_before, tau, dt) * off
+        elif k > 0 and tau > SHORTEST_S:
             lead = tau * (target - target_before) / dt
             speed[k] = target - lead + math.exp(-dt / tau) * (speed[k - 1] - target_before + lead)
         else:
             speed[k] = target
-        target_before = target
+        target_before, tau_before = target, tau
         rate = (speed[k] - speed[k - 1]) / dt if k > 0 else 0.0
         force_ratio = (mass * rate + force) / carried
         slip = min(max(compliance * force_ratio, -MAX_SLIP), MAX_SLIP)
