@@ -25,8 +25,8 @@ COMMAND_MPS2 = 2.0
 """The most by which the wheels of a side speed up in such a run, so that a command is reached in its lead."""
 
 CAR_MPS2, CAR_SIDE_MPS2, CAR_CURVATURE_PMS = 1.5, 2.5, 1.0
-"""The most by which a car-like robot speeds up and accelerates to the side, and by which its curvature changes
-in a second."""
+"""The most by which a car-like robot speeds up and accelerates to the side, and by which its curvature
+changes in a second."""
 
 COMMAND_GRADE_RATIO = 0.01
 """Standard deviation of the slope under such runs, which have no measured tilt: a yard."""

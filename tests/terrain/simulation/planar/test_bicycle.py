@@ -101,6 +101,19 @@ def test_steps_follow_the_equations_of_motion_through_reversals_and_do_not_depen
     assert (np.abs(coarse - out[::2]).max(axis=0) < 1e-2 * size).all()
 
 
+@pytest.mark.parametrize("accel", [-1.0, 2.0])
+def test_slip_along_is_exact_for_even_accelerations_at_any_step(accel):
+    """By hand: ``tau dv/dt + v = u``, tau = u c / g: v = u - u c a / (g + c a) once the start is past."""
+    soft = 0.3
+    for dt in (0.01, 0.1):
+        u = 4.0 + accel * dt * np.arange(round(3.0 / dt))
+        speed = moved(u, 0.0, ground=Ground(slip_ratio=soft, rolling_ratio=0.0), dt=dt)[:, VX]
+        share = soft * accel / (GRAVITY_MPS2 + soft * accel)
+        lag, rate = u * soft / GRAVITY_MPS2, accel * soft / GRAVITY_MPS2
+        started = u[0] * share * (lag / lag[0]) ** (-1.0 / rate)
+        np.testing.assert_allclose(speed, u * (1.0 - share) + started, atol=1e-9)
+
+
 @pytest.mark.parametrize(("speed", "added"), [(8.0, -0.01), (-8.0, 0.1), (-3.0, 0.1)])
 def test_a_car_that_would_spin_turns_ten_times_as_tightly_at_the_most(speed, added):
     free = replace(CAR, com_ahead_m=0.3, front_cornering_npr=30000.0)
