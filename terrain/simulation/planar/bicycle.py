@@ -107,10 +107,10 @@ def _turn(planar: Planar, p: Array, dt: float, steer: Array, roll_rad: Array, ou
         w_now = (v * math.tan(angle) - fast * understeer * down) / (wheelbase + understeer * v * fast)
         y_now = -fast * mass * b * rear / wheelbase * (v * w_now + down)
         c_now = y_now + a * w_now
-        if k == 0:
+        middle = 0.5 * (v + out[k - 1, VX]) if k > 0 else 0.0
+        if middle == 0.0:  # at the start, and at rest
             c, w = c_now, w_now
         else:
-            middle = 0.5 * (v + out[k - 1, VX])
             yields = _front(mass, wheelbase, a, front, rear, middle)
             by_speed = 1.0 / max(abs(middle), SLOW_MPS)
             c_f, c_r = by_speed / yields, by_speed / rear

@@ -67,6 +67,8 @@ def test_on_a_side_slope_it_drifts_downhill_driving_ahead_and_back(speed):
 def test_at_rest_it_rests_and_creeping_it_is_the_kinematic_bicycle():
     rest = moved(np.zeros(200), 0.3, roll=0.2)
     np.testing.assert_array_equal(rest[:, [VX, VY, W]], 0.0)
+    stopped = moved(np.concatenate([np.ones(100), np.zeros(100)]), 0.3, roll=0.2)[102:]
+    np.testing.assert_array_equal(stopped[:, [VX, VY, W]], 0.0)
     slow = moved(np.full(100, 1e-3), 0.3)[-1]
     np.testing.assert_allclose(slow[W], 1e-3 * math.tan(0.3) / CAR.wheelbase_m, rtol=1e-6)
 
