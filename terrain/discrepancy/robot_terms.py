@@ -137,7 +137,7 @@ def _generic(value: Value, total: float, robot: Robot) -> str:
     if bases and bases[0].described and bases[0].origin is not Origin.LEFT_OUT:
         basis = bases[0]
         scale = abs((basis.extended - basis.described) / total) if total else 0.0
-        name, _, unit = basis.field.rpartition("_")
+        name, _, unit = basis.written.rpartition("_")
         number = f"{rounded(basis.extended, scale * _half(value))} {UNITS.get(unit, unit)}".strip()
         name = name.replace("_", " ").removesuffix(" x").removesuffix(" z")
         return f"{_article(name)} {name} of {number} {described_as(basis)}"
