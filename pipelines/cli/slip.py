@@ -22,11 +22,11 @@ def learn_slip_command(settings: LearnSlipSettings, json_file: Json = None) -> N
     from pipelines.slip.measured import learn_measured
     from pipelines.slip.measured_screen import print_measured_targets
     from pipelines.slip.screen import print_learned_slip
-    from terrain.robots import load_robot
+    from terrain.robots import SwerveRobot, load_robot
 
     robot = load_robot(settings.robot)
     runs, skipped = load(settings)
-    if not robot.steered:
+    if not isinstance(robot, SwerveRobot):
         with progress_bar() as progress:
             targets = learn_measured(runs, robot, settings, skipped, progress)
         print_measured_targets(targets, output_console())

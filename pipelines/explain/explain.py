@@ -103,6 +103,7 @@ def explain(runs: Sequence[RunLog], settings: ExplainSettings, progress: Progres
         next_command=next_command(diagnosis, description, robot, diagnosed.terrains),
         terrains_apart=terrains_apart(diagnosis, diagnosed.compared),
         powertrain=powertrain_answer(chosen, robot, diagnosis.faults, seed),
+        drive=robot.drive,
     )
     write_explain_page(out, diagnosed, result, settings.max_pictures, progress)
     if extended is not None:

@@ -25,6 +25,7 @@ from pipelines.reporting.numbers import shorten
 from pipelines.reporting.pictures import MAX_SVG_BYTES, png_image, svg_image
 from pipelines.reporting.progress import Progress, silent
 from pipelines.reporting.templates import render
+from pipelines.reporting.words import in_words_of
 from terrain.discrepancy.compared import STRETCH_S, ComparedRun, example_stretch, telling_runs
 from terrain.discrepancy.noise import Noise
 from terrain.files.atomic import atomic_write
@@ -179,4 +180,5 @@ def explain_page(result: Explanation, figures: Sequence[FigureView], runs: Seque
     figures : of all runs
     runs : figures of whole runs
     """
-    return render("explain/page.html.j2", view=page_view(result, figures, runs))
+    page = render("explain/page.html.j2", view=page_view(result, figures, runs))
+    return in_words_of(result.drive, page)

@@ -117,6 +117,7 @@ class Explanation:
     terrains_apart : measured over simulated by label, where labels clearly differ
     skipped : a sentence for each run that could not be read
     powertrain : from commanded to measured wheel speeds; None where no run logs both
+    drive : of the robot, for words
     """
 
     data: str
@@ -140,6 +141,7 @@ class Explanation:
     terrains_apart: Mapping[str, Slope] = field(default_factory=dict)
     skipped: tuple[str, ...] = ()
     powertrain: PowertrainAnswer | None = None
+    drive: str = ""
 
     @property
     def notes(self) -> tuple[str, ...]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 
 from rich.console import Console
 
@@ -18,6 +19,7 @@ from pipelines.explain.wording import (
 from pipelines.reporting.numbers import format_known, percent
 from pipelines.reporting.quantities import quantity, unit_label
 from pipelines.reporting.terminal import compact_table, number_columns, print_lines, text_column
+from pipelines.reporting.words import in_words_of
 from terrain.discrepancy.channel_words import CHANNEL_WORDS
 from terrain.discrepancy.filter_gain import Comparison
 from terrain.discrepancy.statements import SESSION_COLUMNS, session_rows, split_ruled_out
@@ -29,37 +31,37 @@ from terrain.discrepancy.verdict import Cause, Diagnosis
 def print_explain(result: Explanation, console: Console) -> None:
     """Print faults, a sentence a channel, the verdict, causes, gains, and what was withdrawn or is left."""
     diagnosis = result.diagnosis
-    print_lines(console, (f"{diagnosis.robot}, {diagnosis.n_runs} runs: {diagnosis.verdict.value}",))
-    print_lines(console, (f"fault: {fault.sentence}" for fault in diagnosis.faults))
-    print_lines(console, (f"- {statement.text}" for statement in result.statements))
-    print_lines(console, (verdict_text(diagnosis),))
+    say = partial(_say, result.drive, console)
+    say(f"{diagnosis.robot}, {diagnosis.n_runs} runs: {diagnosis.verdict.value}")
+    say(*(f"fault: {fault.sentence}" for fault in diagnosis.faults))
+    say(*(f"- {statement.text}" for statement in result.statements), verdict_text(diagnosis))
     if diagnosis.causes:
-        _print_causes(diagnosis.causes, console)
+        _print_causes(diagnosis.causes, result.drive, console)
     if rows := session_rows(diagnosis):
         table = compact_table(*map(text_column, SESSION_COLUMNS))
         for row in rows:
-            table.add_row(*row)
+            table.add_row(*(in_words_of(result.drive, cell) for cell in row))
         console.print(table)
     _print_gain(result.gain, console)
-    print_lines(console, _diagnosis_lines(diagnosis))
-    print_lines(console, result.notes)
-    if result.powertrain is not None:
-        print_lines(console, (f"powertrain: {text}" for text in result.powertrain.sentences))
+    sentences = () if result.powertrain is None else result.powertrain.sentences
+    say(*_diagnosis_lines(diagnosis), *result.notes, *(f"powertrain: {text}" for text in sentences))
     if result.next_command is not None:
         print_lines(console, (f"what to drive next: {result.next_command}",))
-    print_lines(console, result.skipped)
-    if result.extended is not None:
-        print_lines(console, (f"extended description: {result.extended.file}",))
-    print_lines(console, (f"page: {result.page}",))
+    extended = [] if result.extended is None else [f"extended description: {result.extended.file}"]
+    print_lines(console, (*result.skipped, *extended, f"page: {result.page}"))
 
 
-def _print_causes(causes: tuple[Cause, ...], console: Console) -> None:
+def _say(drive: str, console: Console, *lines: str) -> None:
+    print_lines(console, (in_words_of(drive, line) for line in lines))
+
+
+def _print_causes(causes: tuple[Cause, ...], drive: str, console: Console) -> None:
     table = compact_table(text_column("cause"), *number_columns("value", "95 %", "held-out gain", "z"))
     for cause in causes:
         for place, each in enumerate(cause.values):
             first = place == 0
             table.add_row(
-                effect_label(cause.name) if first else "",
+                in_words_of(drive, effect_label(cause.name)) if first else "",
                 f"{each.value:.4g} {unit_label(each.unit) or each.unit}",
                 f"{each.low:.4g} to {each.high:.4g}",
                 percent(cause.gain) if first else "",

@@ -90,7 +90,8 @@ def is_commanded(run: RunLog, robot: Robot) -> bool:
     """Return whether a run logs the commanded and the measured speed of each wheel."""
     if not {"commands", "wheels"} <= run.streams.keys():
         return False
-    commanded = {f"wheel_{wheel}_radps" for wheel in robot.wheels} <= set(run.streams["commands"].channels)
+    ordered = {f"wheel_{wheel}_radps" for wheel in robot.logged_wheels}
+    commanded = ordered <= set(run.streams["commands"].channels)
     return commanded and set(robot.rate_channels) <= set(run.streams["wheels"].channels)
 
 
@@ -110,7 +111,7 @@ def traces_of(runs: Sequence[RunLog], robot: Robot) -> Traces:
             continue
         commands, wheels = run.streams["commands"], run.streams["wheels"]
         rates = np.column_stack([wheels.channel(name) for name in robot.rate_channels]) / per_radps
-        orders = np.column_stack([commands.channel(f"wheel_{wheel}_radps") for wheel in robot.wheels])
+        orders = np.column_stack([commands.channel(f"wheel_{wheel}_radps") for wheel in robot.logged_wheels])
         inside = (wheels.time_s >= commands.time_s[0]) & (wheels.time_s <= commands.time_s[-1])
         inside &= np.isfinite(rates).all(axis=1)
         time_s, rates = wheels.time_s[inside], rates[inside]

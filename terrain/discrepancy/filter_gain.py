@@ -17,7 +17,7 @@ from terrain.estimation.summary import summarize
 from terrain.records import Array, RunLog
 from terrain.robots import Robot
 
-FILTERS = {"swerve": "vio12", "skid_steer": "skid"}
+FILTERS = {"swerve": "vio12", "skid_steer": "skid", "tracked": "skid"}
 """By kind of drive, the filter whose errors are compared."""
 
 ERRORS = ("speed_mps", "yaw_rate_radps", "slip_ratio")

@@ -48,7 +48,7 @@ from terrain.effects import (
 from terrain.errors import ConfigError
 from terrain.kinematics.wheel_motion import wheel_motion
 from terrain.records import Array
-from terrain.robots import Robot
+from terrain.robots import BicycleRobot, Robot
 from terrain.simulation.planar.model import TRUTH
 from terrain.simulation.planar.motion import move
 from terrain.simulation.scenario.make import SCENARIOS, make_scenario
@@ -277,11 +277,14 @@ def _drives(
 
 def _inputs(robot: Robot, name: str) -> tuple[Array, Array] | None:
     """Return wheel speeds and steering (n, wheels) of a scenario, or None if the robot cannot drive it."""
-    if not robot.describes("motors"):
-        return None
-    speed_mps = min(0.6 * robot.wheel_radius_m * robot.motors.speed_max_radps, 1.0)
+    speed_mps = None  # that it cruises with
+    if not isinstance(robot, BicycleRobot):
+        if not robot.describes("motors"):
+            return None
+        if not robot.on_omni_wheels:
+            speed_mps = min(0.6 * robot.wheel_radius_m * robot.motors.speed_max_radps, 1.0)
     try:
-        scenario = make_scenario(name, robot, "ground", speed_mps=None if robot.on_omni_wheels else speed_mps)
+        scenario = make_scenario(name, robot, "ground", speed_mps=speed_mps)
     except ConfigError:
         return None
     motion = wheel_motion(robot, scenario.twist[: round(LONGEST_S * RATE_HZ)], 1.0 / RATE_HZ)

@@ -125,7 +125,8 @@ INPUTS: tuple[str, ...] = (
 )
 """Mean wheel speed, right minus left (last minus first) wheel speed, mean steering, tilt, traction over
 weight, 0, and how far the wheels have turned: a column for each of them.  Of an omni robot speed, turn and
-sideways are those that its wheels would roll ahead, in place (twice the speed of a wheel) and to the left."""
+sideways are those that its wheels would roll ahead, in place (twice the speed of a wheel) and to the left; of
+a car-like robot turn is the difference of its rear wheels."""
 
 
 def low_pass_of(signals: Sequence[Signals]) -> LowPass:
@@ -220,7 +221,7 @@ def rows_of(
         :, keep
     ]
     change = (both[::2] - both[1::2]) / spans[:, None, None]
-    speed, turn, sideways = _rolled(planar, instruments)
+    speed, turn, sideways = _rolled(planar, instruments, steer)
     force = truth[:, 4] / (GRAVITY_MPS2 * planar.mass_kg)
     inputs = np.column_stack([speed, turn, steer.mean(axis=1), grade, roll, force, sideways])
     phase = np.cumsum(instruments, axis=0) * (dt / planar.radius_m)
@@ -236,12 +237,14 @@ def rows_of(
     )
 
 
-def _rolled(planar: Planar, wheel_speed: Array) -> tuple[Array, Array, Array]:
+def _rolled(planar: Planar, wheel_speed: Array, steer: Array) -> tuple[Array, Array, Array]:
     """Return speed, turn and sideways speed (n,) of wheels, as :data:`INPUTS` has them."""
+    speed = wheel_speed.mean(axis=1)
     if planar.omni:
         ahead, left, turn = planar.to_rolled @ wheel_speed.T
         return ahead, 2.0 * planar.wheel_distance_m * turn, left
-    speed = wheel_speed.mean(axis=1)
+    if planar.bicycle:
+        return speed, speed * np.tan(steer[:, 0]) * (planar.track_m / planar.wheelbase_m), 0.0 * speed
     return speed, wheel_speed[:, -1] - wheel_speed[:, 0], np.zeros_like(speed)
 
 

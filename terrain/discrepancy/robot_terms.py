@@ -12,7 +12,8 @@ from collections.abc import Callable, Mapping, Sequence
 from terrain.discrepancy.verdict import Value
 from terrain.effects import PARAMETER, Wording, effect_named
 from terrain.extension import Basis, Origin, basis_of
-from terrain.robots import Robot
+from terrain.robots import Robot, TrackedRobot
+from terrain.robots.bicycle import as_bicycle
 from terrain.robots.omni import as_omni
 from terrain.simulation.planar.skid_steer import SLIDING_RADPS
 
@@ -27,7 +28,9 @@ UNITS = {
     "radps": "rad/s",
     "mps2": "m/s²",
     "s2": "s²",
+    "s2pm": "s²/m",
     "s2pm2": "s²/m²",
+    "npr": "N/rad",
     "a": "A",
     "nspm": "N s/m",
     "nmpa": "N m/A",
@@ -134,7 +137,7 @@ def _generic(value: Value, total: float, robot: Robot) -> str:
     if bases and bases[0].described and bases[0].origin is not Origin.LEFT_OUT:
         basis = bases[0]
         scale = abs((basis.extended - basis.described) / total) if total else 0.0
-        name, _, unit = basis.field.rpartition("_")
+        name, _, unit = basis.written.rpartition("_")
         number = f"{rounded(basis.extended, scale * _half(value))} {UNITS.get(unit, unit)}".strip()
         name = name.replace("_", " ").removesuffix(" x").removesuffix(" z")
         return f"{_article(name)} {name} of {number} {described_as(basis)}"
@@ -243,7 +246,19 @@ def _one_sided(values: Sequence[Value], total: Total, robot: Robot) -> str:
     (value,) = values
     error = total[value.name]
     number = rounded(100.0 * abs(error), 100.0 * _half(value))
-    return f"wheels that are {number} % {'larger' if error > 0 else 'smaller'} on the right than on the left"
+    what = "sprockets" if isinstance(robot, TrackedRobot) else "wheels"
+    return f"{what} that are {number} % {'larger' if error > 0 else 'smaller'} on the right than on the left"
+
+
+def _understeer(values: Sequence[Value], total: Total, robot: Robot) -> str:
+    (value,) = values
+    car = as_bicycle(robot, "robot {name}: drive {drive!r} has no understeer")
+    own, added = car.understeer_s2pm, total[value.name]
+    turned = [car.wheelbase_m / (car.wheelbase_m + each * FAST_MPS**2) for each in (own, own + added)]
+    percent = 100.0 * abs(turned[1] / turned[0] - 1.0)
+    number = f"{rounded(own + added, _half(value))} s²/m (described: {own:.2g} s²/m)"
+    change = "less" if added > 0 else "more"
+    return f"an understeer of {number}, which turns it {percent:.2g} % {change} at {FAST_MPS:g} m/s"
 
 
 TERMS: dict[Wording, Callable[[Sequence[Value], Total, Robot], str]] = {
@@ -258,5 +273,6 @@ TERMS: dict[Wording, Callable[[Sequence[Value], Total, Robot], str]] = {
     Wording.SIDE_SLIP: _side_slip,
     Wording.GYRO_SCALE: _gyro_scale,
     Wording.SIDES: _one_sided,
+    Wording.UNDERSTEER: _understeer,
 }
 """How the effects are worded whose numbers do not speak for themselves; the others by their home."""

@@ -58,8 +58,9 @@ class Signals:
     run_id, terrain : of the run; the terrain is empty where it has no label or several
     dt_s : period of the clock
     start_s : first instant on the run's own clock
-    wheel_speed_mps : (n, wheels) wheel speeds with the nominal radius; NaN where a logger was silent
-    steer_rad : (n, wheels) steering angles, zeros taken off; 0 for a robot that has none
+    wheel_speed_mps : (n, wheels) wheel speeds with the nominal radius, of a car-like robot (n, 1) that of
+        the rear axle; NaN where a logger was silent
+    steer_rad : (n, steered wheels) steering angles, zeros taken off; (n, wheels) zeros of a robot without
     grade_rad, roll_rad : (n,) measured tilt, uphill and left side up positive; 0 where none is measured
     measured : (n, len(CHANNELS)) what the simulation is compared with; NaN where nothing was measured
     session : that the run is part of; empty where that is not known
@@ -152,11 +153,11 @@ def _clock(run: RunLog, robot: Robot, inputs: Sequence[str]) -> tuple[Array, flo
 
 
 def _steering(run: RunLog, robot: Robot, time_s: Array) -> Array:
-    """Return the steering angles (n, wheels) of a swerve robot, zeros and whole turns subtracted."""
+    """Return the steering angles (n, steered wheels), zeros and whole turns subtracted."""
     stream = run.streams["steering"]
-    steer = np.zeros((time_s.size, len(robot.wheels)))
-    for i, zero in enumerate(robot.steering_zeros_rad):
-        raw = unwrapped(stream.channel(f"angle_{robot.wheels[i]}_rad"))
+    steer = np.zeros((time_s.size, len(robot.steer_channels)))
+    for i, (name, zero) in enumerate(zip(robot.steer_channels, robot.steering_zeros_rad, strict=False)):
+        raw = unwrapped(stream.channel(name))
         turn = 2 * math.pi * np.round((raw[np.isfinite(raw)][:1].sum() - zero) / (2 * math.pi))
         steer[:, i] = _resample(time_s, stream.time_s, raw - zero - turn)
     return steer
@@ -245,9 +246,9 @@ def _put_currents(
 
 
 def _wheel_speeds(run: RunLog, wheels: Stream, robot: Robot) -> Array:
-    """Wheel speeds (n, wheels), from wheel speeds or from the motors' rates."""
+    """Wheel speeds (n, wheels that are logged), from wheel speeds or from the motors' rates."""
     for pattern in ("motor_{}_radps", "speed_{}_mps"):
-        names = [pattern.format(wheel) for wheel in robot.wheels]
+        names = [pattern.format(wheel) for wheel in robot.logged_wheels]
         if set(names) <= set(wheels.channels):
             rates = np.column_stack([wheels.channel(name) for name in names])
             if pattern.startswith("speed"):
@@ -255,7 +256,7 @@ def _wheel_speeds(run: RunLog, wheels: Stream, robot: Robot) -> Array:
             return rates * (robot.wheel_radius_m / robot.motors.reduction_ratio)
     raise DataError(
         f"run {run.run_id}: its wheels have the channels {', '.join(wheels.channels)}; a speed of each of "
-        f"{', '.join(robot.wheels)} is required"
+        f"{', '.join(robot.logged_wheels)} is required"
     )
 
 

@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection
 
+from terrain.effects.car import CAR
 from terrain.effects.ground import SIDEWAYS, SLIP_AND_RESISTANCE
 from terrain.effects.motors import LOAD_AND_MOTORS
 from terrain.effects.omni import OMNI_WHEELS
@@ -30,6 +31,7 @@ LIBRARY: tuple[Effect, ...] = (
     *LOAD_AND_MOTORS,
     *SIDEWAYS,
     *OMNI_WHEELS,
+    *CAR,
 )
 """Every known effect.  The order is no ranking, but results list effects in it."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from terrain.effects.types import (
+    ACCEL,
     BOTH,
     CURRENT,
     EVERY,
@@ -12,7 +13,9 @@ from terrain.effects.types import (
     SKIDDING,
     SPEED_X,
     SPEED_Y,
+    TRACKED,
     TURNING_CURRENT,
+    WITH_IMU,
     Combine,
     Effect,
     Home,
@@ -54,6 +57,17 @@ SLIP_AND_RESISTANCE: tuple[Effect, ...] = (
         SKIDDING,
         (*MOTION, HEADING),
         "arcs of several radii and turns in place",
+    ),
+    Effect(
+        "turning_slip_power",
+        # n from 0, in proportion to the speeds, to 1, alike; Endo et al. fitted one to each ground
+        (Parameter("turning_slip_power_ratio", -0.5, 0.5, 0.02),),
+        "n = 0.5 + e in turning_slip",
+        "Endo et al., IROS 2007, as in Yamauchi et al., (27)",
+        (TRACKED,),
+        (SPEED_X, ACCEL, CURRENT),
+        "arcs of several radii with much turning slip",
+        modifies="turning_slip",
     ),
     Effect(
         "track_narrowing",
@@ -98,7 +112,7 @@ SLIP_AND_RESISTANCE: tuple[Effect, ...] = (
         "f = f_max (1 - K/(s l) (1 - exp(-s l/K))), with K/l = c f_max / 2 so that c is its slip per force "
         "at the start",
         "Janosi and Hanamoto 1961, as integrated along the contact (Yamauchi et al., (17), corrected)",
-        BOTH,
+        WITH_IMU,
         (SPEED_X, SPEED_Y),
         "tractions over half of f_max, of both small and large size",
         plant=PlantPart.CONTACT,
@@ -115,6 +129,7 @@ SLIP_AND_RESISTANCE: tuple[Effect, ...] = (
     ),
     Effect(
         "rolling_resistance",
+        # without currents it shows by the slip that it takes, as a smaller wheel radius does
         (Parameter("rolling_resistance_ratio", -0.05, 0.5, 0.005, scatter_rank=7),),
         "resistance grows by c W",
         "Wong, Theory of Ground Vehicles",
@@ -173,7 +188,7 @@ SIDEWAYS: tuple[Effect, ...] = (
         (Parameter("side_hill_slip_ratio", 0.0, 5.0, 0.05),),
         "v_y = -c ph |v|",
         "Yamauchi et al., (2), with the sign that gravity sets",
-        BOTH,
+        WITH_IMU,
         (SPEED_Y,),
         "both signs of roll",
         plant=PlantPart.CONTACT,

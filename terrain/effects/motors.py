@@ -5,7 +5,6 @@ from __future__ import annotations
 from terrain.effects.types import (
     BOTH,
     CURRENT,
-    EVERY,
     OMNI,
     SPEED_X,
     TURNING_CURRENT,
@@ -35,7 +34,7 @@ LOAD_AND_MOTORS: tuple[Effect, ...] = (
         ),
         "mass m (1 + p)",
         "Newton",
-        EVERY,
+        (*BOTH, OMNI),  # of a car, whose currents are not logged, it looks like its tyres
         (CURRENT, SPEED_X),
         "accelerations and slopes",
         plant=PlantPart.BODY,

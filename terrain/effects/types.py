@@ -28,7 +28,10 @@ SKIDDING = (SKID, TRACKED)
 BOTH = (*SKIDDING, SWERVE)
 """Drives of wheels that do not roll across, but for cars."""
 
-EVERY = (*BOTH, OMNI)
+WITH_IMU = (*BOTH, BICYCLE)
+"""Drives whose logs have an IMU."""
+
+EVERY = (*WITH_IMU, OMNI)
 
 
 class Combine(Enum):
@@ -156,6 +159,7 @@ class Wording(Enum):
     CENTRE_OF_MASS = "where the centre of mass is"
     WHEEL_DISTANCE = "a distance of the wheels in m"
     SIDES = "by how much the wheels of a side are larger"
+    UNDERSTEER = "by how much less it turns at a speed"
 
 
 class Effect(NamedTuple):

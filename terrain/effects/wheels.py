@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from terrain.effects.types import (
+    BICYCLE,
     BOTH,
     CURRENT,
     EVERY,
@@ -142,7 +143,7 @@ WHEELS_AND_STEERING: tuple[Effect, ...] = (
         ),
         "d follows the measured angle through a play of half width b",
         "play operator; Krasnosel'skii and Pokrovskii, Systems with Hysteresis, 1989",
-        (SWERVE,),
+        (SWERVE, BICYCLE),
         (*MOTION, HEADING),
         "reversals of the steering",
         plant=PlantPart.LINKAGE,
@@ -161,7 +162,7 @@ WHEELS_AND_STEERING: tuple[Effect, ...] = (
         ),
         "d(t) = measured angle at t - T",
         KINEMATICS,
-        (SWERVE,),
+        (SWERVE, BICYCLE),
         (*MOTION, HEADING),
         "steps of the steering",
         plant=PlantPart.LINKAGE,

@@ -132,9 +132,8 @@ def _ground_speed(track: StateTrack, robot: Robot, wheel: int) -> tuple[Array, A
     speed_name = "speed_mps" if "speed_mps" in track.states else "speed_x_mps"
     steer_name = f"steer_{robot.wheels[wheel]}_rad"
     zero = np.zeros(track.time_s.size)
-    across, steer = zero, zero  # what a robot without steered wheels cannot have
-    if robot.steered:
-        across, steer = _state(track, "speed_y_mps"), _state(track, steer_name)
+    across = _state(track, "speed_y_mps") if robot.steered else zero
+    steer = _state(track, steer_name) if steer_name in robot.steer_rows else zero
     turn = _state(track, "yaw_rate_radps")
     ahead, left = point_velocity(_state(track, speed_name), across, turn, x, y)
     cos, sin = np.cos(steer), np.sin(steer)

@@ -31,6 +31,7 @@ class Basis(NamedTuple):
         description lacks the section
     extended : the number with the parameter's value
     origin : where the described number comes from
+    written : what the description calls it: of tracks ``sprocket_radius_m`` is the ``wheel_radius_m``
     """
 
     section: str
@@ -38,11 +39,12 @@ class Basis(NamedTuple):
     described: float
     extended: float
     origin: Origin
+    written: str
 
     @property
     def name(self) -> str:
         """Name of the number, as :attr:`terrain.robots.Robot.assumed` has it."""
-        return f"{self.section}.{self.field}" if self.section else self.field
+        return f"{self.section}.{self.written}" if self.section else self.written
 
 
 def basis_of(robot: Robot, parameter: str, value: float = 0.0) -> tuple[Basis, ...]:
@@ -77,12 +79,13 @@ def basis_of(robot: Robot, parameter: str, value: float = 0.0) -> tuple[Basis, .
     for home in PARAMETER[parameter].homes:
         if home.section and home.section not in before.parts:
             continue
-        name = f"{home.section}.{home.field}" if home.section else home.field
+        written = home.field if home.section else robot.spelled.get(home.field, home.field)
+        name = f"{home.section}.{written}" if home.section else written
         origin = Origin.ASSUMED if name in robot.assumed else Origin.SOURCED
         if home.section and not robot.describes(home.section):
             origin = Origin.LEFT_OUT
         described, extended = (_number(each, home.section, home.field) for each in (before, after))
-        found.append(Basis(home.section, home.field, described, extended, origin))
+        found.append(Basis(home.section, home.field, described, extended, origin, written))
     return tuple(found)
 
 

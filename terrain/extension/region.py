@@ -13,7 +13,7 @@ from terrain.errors import OutsideRegionWarning
 from terrain.kinematics import omni
 from terrain.kinematics.swerve import forward
 from terrain.records import Array, RunLog
-from terrain.robots import Region, Robot
+from terrain.robots import BicycleRobot, Region, Robot
 from terrain.robots.region import Range, outside, widened
 
 OUTSIDE_S = 1.0
@@ -134,6 +134,8 @@ def _driven(run: RunLog, robot: Robot) -> tuple[Array, Array, Array]:
         rolled, _ = omni.forward(robot.wheel_positions_m, robot.wheel_directions_rad, rates)
         return np.hypot(rolled[:, 0], rolled[:, 1]), rolled[:, 2], grade
     speed = rates.mean(axis=1)
+    if isinstance(robot, BicycleRobot):
+        return speed, _turned(run, robot, wheels.time_s, speed), grade
     if not robot.steered:
         return speed, forward(robot.wheel_positions_m, 1.0, rates, np.zeros_like(rates))[0][:, 2], grade
     steering = run.streams.get("steering")
@@ -144,6 +146,15 @@ def _driven(run: RunLog, robot: Robot) -> tuple[Array, Array, Array]:
         for wheel, zero in zip(robot.wheels, robot.steering_zeros_rad, strict=True)
     ]
     return speed, forward(robot.wheel_positions_m, 1.0, rates, np.column_stack(columns))[0][:, 2], grade
+
+
+def _turned(run: RunLog, robot: BicycleRobot, time_s: Array, speed_mps: Array) -> Array:
+    """Return the yaw rate (n,) of a car-like robot without slip; empty without its steering."""
+    steering = run.streams.get("steering")
+    if steering is None or not set(robot.steer_channels) <= set(steering.channels):
+        return np.empty(0)
+    angle = np.interp(time_s, steering.time_s, steering.channel(robot.steer_channels[0]))
+    return np.asarray(speed_mps * np.tan(angle) / robot.wheelbase_m)
 
 
 def _range(values: Array) -> Range | None:

@@ -121,7 +121,8 @@ class Correction:
         self._side = {wheel: 1.0 + half if wheel in ("3", "right") else 1.0 - half for wheel in robot.wheels}
         self._scale = {wheel: 1.0 + self._p.get(f"wheel_scale_{wheel}_ratio", 0.0) for wheel in robot.wheels}
         self._has_backlash = self._p["steering_backlash_rad"] > 0.0
-        self._follower, self._angle, self._yaw = np.full(3, np.nan), np.full(3, np.nan), (np.nan, np.nan)
+        self._steered, n = robot.steer_channels, len(robot.steer_channels)
+        self._follower, self._angle, self._yaw = np.full(n, np.nan), np.full(n, np.nan), (np.nan, np.nan)
         self._inverses: Mapping[str, Callable[[tuple[str, ...], Array, Array], None]] = {
             "wheels": self._wheels,
             "steering": self._steering,
@@ -185,13 +186,15 @@ class Correction:
                 values[:, i] *= self._side[wheel]
 
     def _steering(self, channels: tuple[str, ...], time_s: Array, values: Array) -> None:
+        if self._p["steering_offset_front_rad"] and "angle_front_rad" in channels:
+            values[:, channels.index("angle_front_rad")] += self._p["steering_offset_front_rad"]
         if not self._has_backlash:
             return
         half = self._p["steering_backlash_rad"]
-        for wheel in range(3):
-            if f"angle_{wheel + 1}_rad" not in channels:
+        for wheel, name in enumerate(self._steered):
+            if name not in channels:
                 continue
-            column = channels.index(f"angle_{wheel + 1}_rad")
+            column = channels.index(name)
             angles = unwrapped(np.concatenate([[self._angle[wheel]], values[:, column]]))[1:]
             follower = self._follower[wheel]
             known = np.isfinite(angles)

@@ -228,11 +228,13 @@ def wheel_directions(run: RunLog, robot: Robot, start_s: Array, end_s: Array) ->
     if not robot.steered:
         return np.broadcast_to(robot.wheel_directions_rad, (len(start_s), len(robot.wheels)))
     steering = run.streams.get("steering")
-    names = [f"angle_{wheel}_rad" for wheel in robot.wheels]
+    names = robot.steer_channels
     if steering is None or not set(names) <= set(steering.channels):
         raise DataError(f"run {run.run_id}: has no steering angles ({', '.join(names)})")
-    angles = np.column_stack([steering.channel(name) for name in names]) - robot.steering_zeros_rad
-    means = np.full((len(start_s), len(names)), np.nan)
+    angles = np.zeros((len(steering), len(robot.wheels)))  # those that are not steered point ahead
+    angles[:, : len(names)] = np.column_stack([steering.channel(name) for name in names])
+    angles -= robot.steering_zeros_rad
+    means = np.full((len(start_s), len(robot.wheels)), np.nan)
     for i, (first_s, last_s) in enumerate(zip(start_s, end_s, strict=True)):
         inside = (steering.time_s >= first_s) & (steering.time_s <= last_s)
         if inside.any():

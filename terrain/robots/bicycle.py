@@ -76,6 +76,20 @@ class BicycleRobot(Robot):
         """
         return self.wheelbase_m - self.com_ahead_m
 
+    @property
+    def understeer_s2pm(self) -> float:
+        """Understeer K by its tyres: at speed v it turns as one with the wheelbase ``L + K v^2``.
+
+        Examples
+        --------
+        >>> from terrain.robots import load_robot
+        >>> load_robot("adap2e").understeer_s2pm
+        0.0
+        """
+        ahead = self.com_ahead_m / self.front_cornering_npr
+        behind = self.com_behind_front_m / self.rear_cornering_npr
+        return self.mass_kg * (ahead - behind) / self.wheelbase_m
+
     @cached_property
     def wheel_positions_m(self) -> Array:
         """Position (2, 2) of the front and the rear wheel; the rear axle is the body's origin."""

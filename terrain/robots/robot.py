@@ -58,6 +58,8 @@ class Robot(ABC):
 
     numbers: ClassVar[tuple[str, ...]] = ("wheel_radius_m", "track_m", "wheelbase_m", "mass_kg")
     """Numbers that every description of the drive has, beside its sections."""
+    spelled: ClassVar[Mapping[str, str]] = MappingProxyType({})
+    """What its descriptions call numbers that have another name here."""
     drive: ClassVar[str]
     """The kind of drive, as descriptions name it."""
     wheels: ClassVar[tuple[str, ...]]
@@ -126,6 +128,23 @@ class Robot(ABC):
     @abstractmethod
     def steer_rows(self) -> tuple[str, ...]:
         """Row of each wheel's steering angle in a table of measurements; none without steering."""
+
+    @property
+    def logged_wheels(self) -> tuple[str, ...]:
+        """Names of the wheels whose rates are logged, in the order of :attr:`rate_channels`."""
+        return tuple(channel.partition("_")[2].rpartition("_")[0] for channel in self.rate_channels)
+
+    @property
+    def steer_channels(self) -> tuple[str, ...]:
+        """Channels of the stream ``steering``, in the order of :attr:`steer_rows`; none without steering.
+
+        Examples
+        --------
+        >>> from terrain.robots import load_robot
+        >>> load_robot("adap2e").steer_channels, load_robot("husky").steer_channels
+        (('angle_front_rad',), ())
+        """
+        return tuple(row.replace("steer_", "angle_") for row in self.steer_rows)
 
     @property
     @abstractmethod

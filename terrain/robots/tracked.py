@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any, ClassVar, Self
 
 from terrain.errors import ConfigError
@@ -28,6 +29,9 @@ class TrackedRobot(SkidSteerRobot):
 
     numbers: ClassVar[tuple[str, ...]] = (
         *("sprocket_radius_m", "track_m", "contact_length_m", "track_width_m", "com_height_m", "mass_kg"),
+    )
+    spelled: ClassVar[Mapping[str, str]] = MappingProxyType(
+        {"wheel_radius_m": "sprocket_radius_m", "wheelbase_m": "contact_length_m"}
     )
     drive: ClassVar[str] = "tracked"
     n_tyres: ClassVar[int] = 2

@@ -21,7 +21,7 @@ from terrain.errors import ConfigError
 from terrain.extension import warn_outside
 from terrain.kinematics.wheel_motion import wheel_motion
 from terrain.records import Array, RunLog, Stream
-from terrain.robots import Robot, TrackedRobot
+from terrain.robots import Robot, SwerveRobot, TrackedRobot
 from terrain.simulation.bench import POSITIONS, TURN_S, six_positions_log
 from terrain.simulation.conditions import Conditions, Faults, draw_conditions, load_spread
 from terrain.simulation.dynamic.simulate import simulate
@@ -121,7 +121,7 @@ def simulate_run(  # noqa: PLR0913 - an entry whose options have defaults
         rng = np.random.default_rng(drawn)
         soils = {name: scattered(soil, rng) for name, soil in soils.items()}
         conditions = draw_conditions(load_spread(), rng, conditions)
-    run_id, planar = run_id_of(terrain, scenario, number), not robot.steered
+    run_id, planar = run_id_of(terrain, scenario, number), not isinstance(robot, SwerveRobot)
     if planar and terrain == COURSE:
         raise ConfigError(f"robot {robot.name}: scenario {COURSE!r} is for swerve robots")
     drive_seed = int(driven.generate_state(1)[0])

@@ -74,16 +74,17 @@ class Reading(NamedTuple):
 
 def candidate_changes(robot: Robot) -> tuple[Change, ...]:
     """Return the changes that are tried, those of fewest columns first."""
-    sign, swapped = FaultKind.SIGN, FaultKind.SWAPPED
+    sign, swapped, n_wheels = FaultKind.SIGN, FaultKind.SWAPPED, len(robot.rate_channels)
     single = (Column.GYRO, Column.HEADING, Column.SPEED, Column.ACCEL, Column.CURRENTS)
     changes = [Change(sign, column, -1.0) for column in single]
     changes.append(Change(swapped, Column.SPEED))
     if robot.skids:
         changes += [Change(swapped, column) for column in (Column.CURRENTS, Column.WHEELS, Column.SIDES)]
     else:
-        pairs = combinations(range(len(robot.wheels)), 2)
+        pairs = combinations(range(n_wheels), 2)
         changes += [Change(swapped, Column.WHEELS, pair=pair) for pair in pairs]
-    changes += [Change(sign, Column.WHEELS, -1.0, wheel) for wheel in (-1, *range(len(robot.wheels)))]
+    each = range(n_wheels) if n_wheels > 1 else ()
+    changes += [Change(sign, Column.WHEELS, -1.0, wheel) for wheel in (-1, *each)]
     return tuple(changes)
 
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from terrain.records import Array
-from terrain.robots import Robot
+from terrain.robots import BicycleRobot, Robot
 from terrain.simulation.planar.hills import Hills
 
 DURATION_S = 60.0
@@ -24,6 +24,10 @@ before holds in it."""
 COMMAND_MPS2 = 2.0
 """The most by which the wheels of a side speed up in such a run, so that a command is reached in its lead."""
 
+CAR_MPS2, CAR_SIDE_MPS2, CAR_CURVATURE_PMS = 1.5, 2.5, 1.0
+"""The most by which a car-like robot speeds up and accelerates to the side, and by which its curvature
+changes in a second."""
+
 COMMAND_GRADE_RATIO = 0.01
 """Standard deviation of the slope under such runs, which have no measured tilt: a yard."""
 
@@ -38,12 +42,14 @@ class Drives(NamedTuple):
 
 def rich_drives(rng: np.random.Generator, n_runs: int, duration_s: float = DURATION_S) -> Drives:
     """Return drives that excite all effects: steps of speed and turn, stops, reversals, spot turns, hills."""
-    return Drives(
-        tuple(_mixed_drive(rng, duration_s) for _ in range(n_runs)),
-        tuple(
-            Hills((rng.normal(0.0, 0.04), rng.normal(0.0, 0.04)), abs(rng.normal(0.0, 0.03)))
-            for _ in range(n_runs)
-        ),
+    return Drives(tuple(_mixed_drive(rng, duration_s) for _ in range(n_runs)), rich_hills(rng, n_runs))
+
+
+def rich_hills(rng: np.random.Generator, n_runs: int) -> tuple[Hills, ...]:
+    """Return slopes of all directions that undulate, one a run."""
+    return tuple(
+        Hills((rng.normal(0.0, 0.04), rng.normal(0.0, 0.04)), abs(rng.normal(0.0, 0.03)))
+        for _ in range(n_runs)
     )
 
 
@@ -59,6 +65,37 @@ def poor_drives(rng: np.random.Generator, n_runs: int, duration_s: float = DURAT
         twist[:, 2] = 0.01 * np.sin(2 * math.pi * time_s / 20.0 + phase) * (time_s > 5.0)
         twists.append(twist)
     return Drives(tuple(twists), tuple(Hills() for _ in range(n_runs)))
+
+
+def car_drives(
+    rng: np.random.Generator, robot: BicycleRobot, n_runs: int, duration_s: float = DURATION_S
+) -> Drives:
+    """Return drives of a car-like robot that excite all its effects: steps of speed and curvature, hills.
+
+    It drives up to half its fastest speed, backward up to a quarter of that, and turns as tightly as
+    :data:`CAR_SIDE_MPS2` lets it.
+    """
+    fastest_mps = 0.5 * robot.speed_max_mps
+    tightest_radpm = 0.9 * math.tan(robot.steering_max_rad) / robot.wheelbase_m
+    n = round(duration_s * STEP_HZ) + 1
+    twists = []
+    for _ in range(n_runs):
+        desired = np.zeros((n, 2))
+        k = round(1.5 * STEP_HZ)
+        while k < n - round(5.0 * STEP_HZ):
+            length = round(rng.uniform(2.0, 5.0) * STEP_HZ)
+            kind = rng.choice(["ahead", "turn", "back", "stop"], p=[0.25, 0.5, 0.15, 0.1])
+            ahead = fastest_mps * (-0.25 * rng.uniform(0.4, 1.0) if kind == "back" else rng.uniform(0.2, 1.0))
+            speed = 0.0 if kind == "stop" else ahead
+            most = min(tightest_radpm, CAR_SIDE_MPS2 / max(speed**2, 1e-9))
+            turn = 0.0 if kind == "ahead" else rng.uniform(-most, most)
+            desired[k : k + length] = speed, turn
+            k += length
+        desired[n - round(5.0 * STEP_HZ) :] = 0.0
+        (speed,) = _limit_rate(desired[:, :1], CAR_MPS2).T
+        (turn,) = _limit_rate(desired[:, 1:], CAR_CURVATURE_PMS).T
+        twists.append(np.column_stack([speed, np.zeros(n), speed * turn]))
+    return Drives(tuple(twists), rich_hills(rng, n_runs))
 
 
 def command_drives(rng: np.random.Generator, robot: Robot, n_runs: int) -> Drives:

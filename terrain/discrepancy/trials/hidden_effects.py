@@ -24,6 +24,15 @@ from terrain.simulation.planar.run import simulate_planar
 ROBOTS = ("agrimaro", "husky")
 """Trials take them in turn."""
 
+ROBOTS_OF_ROW = {
+    Row.SHORT: ROBOTS[1:],
+    Row.KNOWN: ROBOTS[1:],
+    Row.DYNAMIC: ROBOTS[:1],
+    Row.TRACKED: ("patako", "marmotte"),
+    Row.CAR: ("adap2e",),
+}
+"""Robots of rows that have others."""
+
 SHORT_RUNS = 80
 """Number of runs where a run is one command of 6 s."""
 
@@ -89,13 +98,12 @@ class Hidden(NamedTuple):
 
 
 def cases_of(row: Row, n: int, seed: int, n_runs: int) -> list[Case]:
-    """Return ``n`` cases of a row, the robots in turn where a row has both.
+    """Return ``n`` cases of a row, the robots in turn where a row has several.
 
     The rows of 6 s a run have :data:`SHORT_RUNS` of the skid-steer robot whatever is asked for.
     """
-    if row in (Row.SHORT, Row.KNOWN):
-        return [Case(row, i, ROBOTS[1], SHORT_RUNS, seed) for i in range(n)]
-    robots = ROBOTS[:1] if row is Row.DYNAMIC else ROBOTS
+    robots = ROBOTS_OF_ROW.get(row, ROBOTS)
+    n_runs = SHORT_RUNS if row in (Row.SHORT, Row.KNOWN) else n_runs
     return [Case(row, i, robots[i % len(robots)], n_runs, seed) for i in range(n)]
 
 

@@ -8,12 +8,13 @@ motion and from spectra of the simulated noise, not from anything that the diagn
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import norm
 
+from terrain.discrepancy.rivals import RIVAL_LOSS
 from terrain.discrepancy.trials.drives import STEP_HZ, Drives
 from terrain.effects import (
     ACCEL,
@@ -23,6 +24,7 @@ from terrain.effects import (
     HEADING,
     INDEX,
     LIBRARY,
+    MOTION,
     ONE_SIDED,
     SENSED_ONLY,
     SPEED_X,
@@ -42,7 +44,7 @@ from terrain.simulation.planar.model import Ground, Planar, make_planar
 from terrain.simulation.planar.motion import move
 from terrain.simulation.planar.noise import Noise, Scatter, load_noise, load_scatter
 from terrain.simulation.planar.noise_spectra import WHEEL_SPEED, noise_psd
-from terrain.simulation.planar.run import simulate_planar
+from terrain.simulation.planar.run import simulate_planar, with_silent_parts
 
 TEST_SIZE = 0.02
 """Size of the test over the whole library, to which limits refer."""
@@ -125,6 +127,19 @@ class Limits(NamedTuple):
         shared = np.linalg.solve(own, cross) @ np.linalg.solve(its, cross.T)
         return math.sqrt(max(float(np.linalg.eigvals(shared).real.max()), 0.0)) > CONFUSABLE
 
+    def in_place_of(self, effect: Effect, values: Mapping[str, float], other: Effect) -> bool:
+        """Return whether another effect explains values of one so well that an answer has to state both.
+
+        So it is where minus twice the log-likelihood of its best fit is worse by less than ``RIVAL_LOSS``.
+        """
+        i, j = ([self.names.index(p.name) for p in each.parameters] for each in (effect, other))
+        hidden = np.array([values[p.name] for p in effect.parameters])
+        cross, its = self.information[np.ix_(j, i)] @ hidden, self.information[np.ix_(j, j)]
+        if np.diag(its).min() <= UNSEEN:
+            return False
+        own = hidden @ self.information[np.ix_(i, i)] @ hidden
+        return bool(own - cross @ np.linalg.solve(its, cross) < RIVAL_LOSS)
+
     def spanned(self, pair: tuple[Effect, Effect], other: Effect) -> bool:
         """Return whether two effects together look like another, which then takes the place of one of them.
 
@@ -154,6 +169,9 @@ def limits_of(robot: Robot, drives: Drives, sensing: Sensing | None = None) -> L
     True
     """
     sensing = sensing or Sensing()
+    if not robot.describes("motors") and not sensing.channels:
+        sensing = sensing._replace(channels=(*MOTION, ACCEL))  # no currents are logged
+    robot = with_silent_parts(robot)
     planar, noise, scatter = make_planar(robot, Ground()), load_noise(), sensing.scatter or load_scatter()
     names, nuisances = tuple(parameters_of(robot.drive)), nuisances_of(robot.drive)
     every = tuple(dict.fromkeys((*names, *nuisances)))
@@ -251,7 +269,7 @@ def _density(noise: Noise, robot: Robot, planar: Planar, channel: str, f: Array,
     wheel_speed = noise_psd(noise, robot, planar, WHEEL_SPEED, f, pace)
     lag_s = robot.completed.sensors.encoder_time_constant_s
     wheel_speed = wheel_speed * (1.0 + (2 * math.pi * f * lag_s) ** 2)  # the lag is undone
-    n = planar.n_wheels
+    n = 1 if planar.bicycle else planar.n_wheels
     mean, rate = wheel_speed / n, (2 * math.pi * f) ** 2
     if channel in (GYRO, HEADING):
         turn = 2.0 / planar.track_m**2 if robot.skids else np.sum(planar.to_twist[2] ** 2) / 2

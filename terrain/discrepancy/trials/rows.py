@@ -19,6 +19,9 @@ class Row(StrEnum):
     ``FAULT``: a sign, a unit or an order written into the log.  ``DYNAMIC``: runs of the dynamic simulation,
     half of the trials with nothing hidden.  ``KNOWN``: a skid-steer robot of which the effective track is far
     off, in 80 runs of 6 s.
+
+    Robots of other drives, none of which logs currents.  ``TRACKED``, ``CAR``: each effect in turn, of 3
+    times its limit; nothing in every fifth trial.
     """
 
     NONE = "none"
@@ -38,3 +41,9 @@ class Row(StrEnum):
     FAULT = "fault"
     DYNAMIC = "dynamic"
     KNOWN = "known"
+    TRACKED = "tracked"
+    CAR = "car"
+
+
+DRIVE_ROWS = (Row.TRACKED, Row.CAR)
+"""Rows of drives whose robots log no currents."""

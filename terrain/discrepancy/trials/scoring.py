@@ -11,7 +11,7 @@ import numpy as np
 from terrain.discrepancy.trials.hidden_effects import OUTSIDE, ROBOTS
 from terrain.discrepancy.trials.measured_scores import is_covered, measured_scores, states_something
 from terrain.discrepancy.trials.rate import Rate, rate_of
-from terrain.discrepancy.trials.rows import Row
+from terrain.discrepancy.trials.rows import DRIVE_ROWS, Row
 from terrain.discrepancy.trials.trial import Trial
 from terrain.discrepancy.verdict import Verdict
 from terrain.effects import library_of
@@ -65,6 +65,8 @@ def _scores(trials: Sequence[Trial], rows: dict[Row, list[Trial]]) -> Iterator[t
     yield "value inside its 95 % interval", covered, "90 to 99 %, of at least 100", enough
     both = rate_of(t.right for t in rows[Row.TWO])
     yield "two: both, and only both", both, "at least 85 %", both.rate >= 0.85
+    for row in DRIVE_ROWS:
+        yield from _drive_scores(row.value, rows[row])
     yield from _outside_scores(rows[Row.OUTSIDE])
     wrong = rate_of(bool(set(t.named) - set(t.causes)) for t in rows[Row.POOR])
     yield "poor: a wrong single name", wrong, "at most 2 %", wrong.rate <= 0.02
@@ -72,6 +74,22 @@ def _scores(trials: Sequence[Trial], rows: dict[Row, list[Trial]]) -> Iterator[t
     yield "poor: ambiguous or not excited", undecided, "", True
     gain = rate_of(t.gain_low > 0 for t in trials if t.named)
     yield "held-out gain above zero with its interval", gain, "all", gain.rate == 1.0
+
+
+def _drive_scores(row: str, trials: Sequence[Trial]) -> Iterator[tuple[str, Rate, str, bool]]:
+    hidden = [t for t in trials if t.causes]
+    named = rate_of(all(t.found(c) for c in t.causes) for t in hidden)
+    yield f"{row}: named", named, "at least 95 %", named.rate >= 0.95
+    yield f"{row}: named alone", rate_of(t.causes[0] in t.named for t in hidden), "", True
+    wrong = rate_of(t.wrong for t in hidden)
+    yield f"{row}: wrongly named", wrong, "at most 1 %", wrong.rate <= 0.01
+    alarms = rate_of(states_something(t) for t in trials if not t.causes)
+    yield f"{row}: false alarms", alarms, "at most 2 %", alarms.rate <= 0.02
+    covered = rate_of(is_covered(t) for t in hidden if t.causes[0] in t.named)
+    yield f"{row}: value inside its 95 % interval", covered, "", True
+    for effect in dict.fromkeys(t.causes[0] for t in hidden):
+        own = rate_of(t.found(effect) for t in hidden if t.causes[0] == effect)
+        yield f"{row}, {effect}: named", own, "", True
 
 
 def _outside_scores(trials: Sequence[Trial]) -> Iterator[tuple[str, Rate, str, bool]]:

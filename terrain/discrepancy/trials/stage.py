@@ -11,7 +11,7 @@ import numpy as np
 from terrain.discrepancy.simulation import Simulation
 from terrain.discrepancy.terrain_match import simulation_for
 from terrain.discrepancy.trials.drives import Drives, rich_drives
-from terrain.discrepancy.trials.hidden_effects import STRONG, Case, Hidden, is_clipped, values_of
+from terrain.discrepancy.trials.hidden_effects import CLIP_RATIO, STRONG, Case, Hidden, is_clipped, values_of
 from terrain.discrepancy.trials.limits import Limits
 from terrain.effects import library_of
 from terrain.records import RunLog
@@ -78,6 +78,17 @@ class Draw(NamedTuple):
         raise RuntimeError(
             f"no effect of {over:.1f} times its limit is within its bounds"
         )  # no drives do that
+
+    def in_turn(self, limits: Limits, number: int) -> Hidden:
+        """Take in turn the effects that these drives show, of 3 times their limit, within their bounds."""
+        library = library_of(self.robot.drive)
+        most = {effect: CLIP_RATIO * min(p.high for p in effect.parameters) for effect in library}
+        shown = [effect for effect in library if STRONG * limits.of(effect) < most[effect]]
+        effect = shown[number % len(shown)]
+        values = values_of(effect, limits, STRONG, self.rng)
+        while is_clipped(values):  # in another direction it is not
+            values = values_of(effect, limits, STRONG, self.rng)
+        return Hidden(values, (effect.name,), STRONG, "", library, {})
 
     def compared(self, stage: Stage) -> Stage:
         """Return the stage with the simulation that ``terrain explain`` would test."""

@@ -9,10 +9,11 @@ import numpy as np
 
 from terrain.discrepancy.hold_out import split_runs
 from terrain.discrepancy.trials.command_logs import as_command_log, sensing_of, with_lidar
-from terrain.discrepancy.trials.drives import Drives, command_drives, poor_drives
+from terrain.discrepancy.trials.drives import Drives, car_drives, command_drives, poor_drives
 from terrain.discrepancy.trials.dynamic_runs import HIDDEN, drives_of, dynamic_runs, setting_of
 from terrain.discrepancy.trials.hidden_effects import (
     ROBOTS,
+    ROBOTS_OF_ROW,
     Case,
     Hidden,
     draw_hidden,
@@ -58,7 +59,7 @@ from terrain.effects import (
     library_of,
 )
 from terrain.records import RunLog
-from terrain.robots import Robot
+from terrain.robots import BicycleRobot, Robot
 from terrain.simulation.planar.noise import load_scatter
 
 GROSS = (20.0, 100.0)
@@ -67,6 +68,9 @@ GROSS = (20.0, 100.0)
 SHORT = (10.0, 50.0)
 """Range in row ``short``: a replay of samples at 20 Hz is off by one limit of a delay, 0.3 ms, and the effect
 that has to be named is clear of that."""
+
+NOTHING_EVERY = 5
+"""In rows of a drive one trial of so many hides nothing."""
 
 CLOCK = "clock_offset"
 """Effect that a late logger is."""
@@ -106,6 +110,20 @@ def _standing(draw: Draw) -> Stage:
     hidden = draw_hidden(case, robot, limits, rng)
     runs = hidden_runs(robot, drives, noise, hidden.effects, hidden.outside_values)
     return Stage(runs, hidden, limits)
+
+
+def _of_drive(draw: Draw) -> Stage:
+    """Rows of robots whose logs have no currents."""
+    robot, number = draw.robot, draw.case.number
+    car = robot if isinstance(robot, BicycleRobot) else None
+    drives = car_drives(draw.rng, car, draw.case.n_runs) if car else draw.rich()
+    turn = number // len(ROBOTS_OF_ROW[draw.case.row])
+    if turn % NOTHING_EVERY == NOTHING_EVERY - 1:
+        hidden, limits = Hidden({}, (), 0.0, "", library_of(robot.drive), {}), None
+    else:
+        limits = limits_of(robot, drives)
+        hidden = draw.in_turn(limits, turn - turn // NOTHING_EVERY)
+    return Stage(hidden_runs(robot, drives, draw.noise, hidden.effects), hidden, limits)
 
 
 def _gross(draw: Draw) -> Stage:
@@ -262,6 +280,8 @@ _STAGES: dict[Row, Callable[[Draw], Stage]] = {
     Row.FAULT: _fault,
     Row.DYNAMIC: _dynamic,
     Row.KNOWN: _known,
+    Row.TRACKED: _of_drive,
+    Row.CAR: _of_drive,
 }
 
 

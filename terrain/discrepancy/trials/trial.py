@@ -13,12 +13,12 @@ from terrain.discrepancy.diagnose import diagnose
 from terrain.discrepancy.simulation import Simulation
 from terrain.discrepancy.trials.hidden_effects import Case
 from terrain.discrepancy.trials.limits import confusable_class
-from terrain.discrepancy.trials.rows import Row
+from terrain.discrepancy.trials.rows import DRIVE_ROWS, Row
 from terrain.discrepancy.trials.stage import Stage
 from terrain.discrepancy.trials.stages import CLOCK, stage_of
 from terrain.discrepancy.trials.written_faults import Statement
 from terrain.discrepancy.verdict import Diagnosis, Verdict
-from terrain.effects import HEADING, LIBRARY, effect_named, nuisances_of
+from terrain.effects import HEADING, LIBRARY, effect_named, library_of, nuisances_of
 from terrain.errors import DataError
 from terrain.robots import Robot, load_robot
 from terrain.simulation.planar.model import Ground
@@ -156,7 +156,7 @@ def _trial(
         causes=hidden.causes,
         outside=hidden.outside,
         over_limit=hidden.over_limit,
-        classes=_classes(stage, robot),
+        classes=_classes(stage, robot, case.row),
         seconds=seconds,
         variant=stage.variant,
         accepted=stage.accepted,
@@ -204,7 +204,7 @@ def _answered(answer: Diagnosis | None) -> dict[str, Any]:
     }
 
 
-def _classes(stage: Stage, robot: Robot) -> dict[str, tuple[str, ...]]:
+def _classes(stage: Stage, robot: Robot, row: Row) -> dict[str, tuple[str, ...]]:
     """Return, by cause, the effects that no log of these drives distinguishes from it."""
     if stage.limits is None:
         return {}
@@ -215,5 +215,9 @@ def _classes(stage: Stage, robot: Robot) -> dict[str, tuple[str, ...]]:
             continue
         effect = effect_named(cause)
         twins = {name for name, channel in effect.twins if not (has_heading and channel == HEADING)}
-        classes[cause] = tuple(sorted(twins | confusable_class(stage.limits, effect, robot.drive)))
+        twins |= confusable_class(stage.limits, effect, robot.drive)
+        if row in DRIVE_ROWS:  # without currents a rolling resistance is nearly a smaller radius
+            others, values = library_of(robot.drive), stage.hidden.effects
+            twins |= {o.name for o in others if stage.limits.in_place_of(effect, values, o)}
+        classes[cause] = tuple(sorted(twins))
     return classes

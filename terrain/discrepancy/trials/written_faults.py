@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import NamedTuple
 
+from terrain.effects import BOTH, SKIDDING, SWERVE
 from terrain.records import RunLog, Stream
 from terrain.robots import Robot
 
@@ -93,7 +94,7 @@ def _swapped(*kinds: str) -> Callable[[Stream, Robot], Stream]:
 
 
 _GYRO = ("gyro", "yaw")
-_SKID, _SWERVE, _BOTH = ("skid_steer",), ("swerve",), ("skid_steer", "swerve")
+_SKID, _SWERVE, _BOTH = SKIDDING, (SWERVE,), BOTH
 
 FAULTS: tuple[WrittenFault, ...] = (
     WrittenFault("gyro_sign", _BOTH, "imu", _scaled("gyro_z_", -1.0), _GYRO, ("sign", "invert")),

@@ -20,6 +20,8 @@ absent.
   and scrub;
 - **turning** of a skid-steer robot: its wheels' yaw rate and speed are reduced by turning slip and turn drag,
   lateral acceleration makes its track act narrower, and it slips sideways by ``T dv_y/dt + v_y = -c v w``;
+- **car-like robots** turn by the linear single-track model
+  (:mod:`~terrain.simulation.planar.bicycle`), and have no currents;
 - **sensors**: gyro, accelerometer and camera with bias, scale, mounting, latency and their logger's clock.
 
 Load transfer and roughness are left out: what they do to a log is noise here.  Sources stand with the
@@ -27,7 +29,8 @@ effects.
 
 This module holds what all of it shares: the terrain, the robot's numbers on it, and the columns of a motion.
 Motion is in :mod:`~terrain.simulation.planar.motion`, :mod:`~terrain.simulation.planar.skid_steer`,
-:mod:`~terrain.simulation.planar.swerve` and :mod:`~terrain.simulation.planar.omni`, sensors without noise in
+:mod:`~terrain.simulation.planar.swerve`, :mod:`~terrain.simulation.planar.omni` and
+:mod:`~terrain.simulation.planar.bicycle`, sensors without noise in
 :mod:`~terrain.simulation.planar.ideal_sensors`, and both together over a log in
 :mod:`~terrain.simulation.planar.replay`.
 """
@@ -41,7 +44,7 @@ import numpy as np
 from terrain.kinematics.omni import rolling_matrix
 from terrain.kinematics.wheel_velocity import velocity_matrix
 from terrain.records import Array
-from terrain.robots import Robot
+from terrain.robots import BicycleRobot, Robot, SwerveRobot, TrackedRobot
 
 TRUTH: tuple[str, ...] = (
     "speed_x_mps",
@@ -131,6 +134,12 @@ class Planar(NamedTuple):
     wheel_load_ratio: Array
     wheel_distance_m: float
     roller_ratio: float
+    tracked: bool
+    bicycle: bool
+    wheelbase_m: float
+    com_ahead_m: float
+    front_cornering_npr: float
+    rear_cornering_npr: float
 
 
 def make_planar(robot: Robot, ground: Ground) -> Planar:
@@ -142,6 +151,7 @@ def make_planar(robot: Robot, ground: Ground) -> Planar:
     complete = robot.completed
     motors, camera, body, sensors = complete.motors, complete.camera, complete.body, complete.sensors
     n_motors = len(robot.wheels)
+    car = robot if isinstance(robot, BicycleRobot) else None
     com_m = np.array([body.com_x_m, body.com_y_m])
     arm_m = robot.wheel_positions_m - com_m
     spread_m = float(np.sqrt((arm_m**2).sum(axis=1).mean()))
@@ -152,14 +162,14 @@ def make_planar(robot: Robot, ground: Ground) -> Planar:
         radius_m=robot.wheel_radius_m,
         mass_kg=robot.mass_kg,
         rotating_kg=n_motors * body.wheel_inertia_kgm2 / robot.wheel_radius_m**2,
-        yaw_inertia_kgm2=body.yaw_inertia_kgm2,
+        yaw_inertia_kgm2=car.yaw_inertia_kgm2 if car else body.yaw_inertia_kgm2,
         nm_per_a=motors.torque_constant_nmpa * motors.reduction_ratio * motors.efficiency_ratio,
         friction_nm=n_motors * motors.friction_nm,
         lever_x_m=camera.lever_x_m,
         lever_y_m=camera.lever_y_m,
         latency_s=camera.latency_s + camera.time_constant_s,
         imu_latency_s=sensors.imu_latency_s,
-        imu_lag_s=IMU_LAG_S if robot.steered else 0.0,
+        imu_lag_s=IMU_LAG_S if isinstance(robot, SwerveRobot) else 0.0,
         encoder_lag_s=sensors.encoder_time_constant_s,
         slip_ratio=ground.slip_ratio,
         soft_ratio=_slip_per_traction(ground),
@@ -174,6 +184,12 @@ def make_planar(robot: Robot, ground: Ground) -> Planar:
         spread_m=spread_m,
         relaxation_m=body.relaxation_length_m,
         **_omni_wheels(robot, arm_m, ground),
+        tracked=isinstance(robot, TrackedRobot),
+        bicycle=car is not None,
+        wheelbase_m=robot.wheelbase_m,
+        com_ahead_m=car.com_ahead_m if car else 0.0,
+        front_cornering_npr=car.front_cornering_npr if car else 0.0,
+        rear_cornering_npr=car.rear_cornering_npr if car else 0.0,
     )
 
 

@@ -9,6 +9,7 @@ from numba import njit
 from terrain.constants import GRAVITY_MPS2
 from terrain.effects import INDEX
 from terrain.records import Array
+from terrain.simulation.planar.bicycle import move_bicycle
 from terrain.simulation.planar.model import AX, SWERVE_WHEELS, VX, VY, Planar, W
 from terrain.simulation.planar.omni import move_omni
 from terrain.simulation.planar.signals import slopes
@@ -36,13 +37,15 @@ def move(
     planar, p : the simulation, and its parameters in the order of ``effects.PARAMETERS``
     dt : step in s
     wheel_speed_mps : (n, wheels) wheel rates times the nominal radius
-    steer_rad : (n, wheels) angles as encoders without error show them; not looked at for other robots
+    steer_rad : (n, wheels) angles as encoders without error show them; not looked at without steering
     grade_rad, roll_rad : (n,) true tilt
     disturbance : (n, 3) what the ground adds to speeds (shares of ``|u|``, along and across) and yaw rate
         (rad/s), or none: (0, 3)
     """
     if planar.omni:
         out: Array = move_omni(planar, p, dt, wheel_speed_mps, grade_rad, roll_rad, disturbance)
+    elif planar.bicycle:
+        out = move_bicycle(planar, p, dt, wheel_speed_mps, steer_rad, grade_rad, roll_rad, disturbance)
     elif planar.n_wheels == SWERVE_WHEELS:
         out = move_swerve(planar, p, dt, wheel_speed_mps, steer_rad, grade_rad, roll_rad, disturbance)
     else:

@@ -157,7 +157,8 @@ class _Spectra(NamedTuple):
 
     def wheel_speed(self, f: Array) -> Array:
         robot, motors, sensors = self.robot, self.robot.motors, self.robot.sensors
-        step_m = 2.0 * math.pi * robot.wheel_radius_m / (sensors.hall_steps_ratio * motors.reduction_ratio)
+        turns = sensors.hall_steps_ratio * motors.reduction_ratio
+        step_m = 2.0 * math.pi * robot.wheel_radius_m / turns if turns > 0.0 else 0.0
         std_m = math.hypot(self.noise.encoder_m * self.moving, step_m / math.sqrt(12.0))
         rate = white_psd(f, std_m, WHEELS_HZ) * (2.0 * np.sin(math.pi * f / WHEELS_HZ) * WHEELS_HZ) ** 2
         rate = rate * lag_gain(f, sensors.encoder_time_constant_s + self.encoder_lag_s, WHEELS_HZ)

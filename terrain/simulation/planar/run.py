@@ -27,7 +27,7 @@ from terrain.effects import (
 from terrain.errors import ConfigError
 from terrain.kinematics.wheel_motion import WheelMotion, wheel_motion
 from terrain.records import Array, Label, RunLog, Stream
-from terrain.robots import Part, Robot
+from terrain.robots import Part, Robot, SwerveRobot
 from terrain.simulation.planar.drives import COMMANDS_HZ, commands_stream, follow_commands
 from terrain.simulation.planar.hills import Hills, path_of, tilt_along, undulations
 from terrain.simulation.planar.ideal_sensors import sense
@@ -98,8 +98,9 @@ def simulate_planar(  # noqa: PLR0913 - an entry whose options have defaults
     Returns
     -------
     RunLog
-        streams wheels, imu, odometry, commands, truth, and steering of a swerve robot, whose odometry is a
-        tracking camera's pose.  That of a skid-steer robot is the speed of the camera's point in body axes.
+        streams wheels, imu, odometry, commands, truth, and steering of a robot that has it.  The odometry of
+        a swerve robot is a tracking camera's pose, that of others the speed of the camera's point in body
+        axes.
         An omni robot has wheels, commands, truth (with the slip of its body, ``slip_body_ratio``), and pose
         of a camera above, as its measured runs.
 
@@ -121,7 +122,8 @@ def simulate_planar(  # noqa: PLR0913 - an entry whose options have defaults
     """
     outside = outside or {}
     _check(robot, twist, outside, step_s)
-    currents, robot = robot.describes("motors"), with_silent_parts(robot)
+    currents = robot.describes("motors") and "motors" in robot.sections
+    robot = with_silent_parts(robot)
     planar = make_planar(robot, ground or Ground())
     rngs = _generators(seed)
     p = vector_of({**robot.effects, **(effects or {})})
@@ -156,7 +158,7 @@ def _streams(
 
 
 def _check(robot: Robot, twist: Array, outside: Mapping[str, float], step_s: float) -> None:
-    if robot.steered:
+    if isinstance(robot, SwerveRobot):
         robot.require(*robot.sections)
     if twist.ndim != 2 or twist.shape[1] != 3 or len(twist) < 2 or not np.isfinite(twist).all():
         raise ConfigError(f"twist has shape {twist.shape}, (n, 3) finite numbers with two rows are required")

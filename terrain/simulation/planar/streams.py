@@ -19,9 +19,9 @@ from terrain.constants import GRAVITY_MPS2
 from terrain.effects import CHANNELS, CURRENT, HEADING, INDEX, SPEED_X, TURNING_CURRENT
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.kinematics.wheel_velocity import point_velocity, wheel_frame_velocities
-from terrain.logs.schema import IMU_CHANNELS, POSE_CHANNELS, STEERING_CHANNELS
+from terrain.logs.schema import IMU_CHANNELS, POSE_CHANNELS
 from terrain.records import Array, Stream
-from terrain.robots import Robot
+from terrain.robots import Robot, SwerveRobot
 from terrain.simulation.planar.model import AX, SLIP, VX, VY, Planar, W
 from terrain.simulation.planar.motion import move
 from terrain.simulation.planar.noise import CAMERA_HZ, IMU_HZ, WHEELS_HZ, Noise, coloured, lag_weights
@@ -244,12 +244,14 @@ def steering_stream(run: PlanarRun, rng: np.random.Generator) -> Stream:
     """Return the stream of steering angles."""
     sensors = run.robot.sensors
     rows, time_s = run.samples(WHEELS_HZ)
-    steer, noise, step_rad = run.motion.steer_rad[rows], np.zeros(1), 0.0
+    channels = run.robot.steer_channels
+    steer, noise, step_rad = run.motion.steer_rad[rows, : len(channels)], np.zeros(1), 0.0
     if run.noise is not None:
         noise = sensors.steering_std_rad * rng.standard_normal(steer.shape)
-        step_rad = 2.0 * math.pi / sensors.steering_steps_ratio
-    angle = encoder_angle(steer, run.robot.steering_zeros_rad, noise, step_rad)
-    return Stream(time_s, angle, STEERING_CHANNELS)
+        if sensors.steering_steps_ratio > 0.0:
+            step_rad = 2.0 * math.pi / sensors.steering_steps_ratio
+    angle = encoder_angle(steer, run.robot.steering_zeros_rad[: len(channels)], noise, step_rad)
+    return Stream(time_s, angle, channels)
 
 
 def imu_stream(run: PlanarRun, rng: np.random.Generator) -> Stream:
@@ -316,7 +318,7 @@ def camera_stream(run: PlanarRun, rng: np.random.Generator) -> Stream:
         std, tau = np.full(2, noise.camera_mps), np.full(2, noise.camera_s)
         seen += coloured(rng.standard_normal((2, n)), std, tau, 1.0 / CAMERA_HZ).T * active[:, None]
         seen += camera.speed_std_mps * rng.standard_normal((n, 2))
-    if not run.robot.steered:
+    if not isinstance(run.robot, SwerveRobot):
         return Stream(time_s, seen, ("speed_x_mps", "speed_y_mps"))
     turn = run.ideal[:, CHANNELS.index(HEADING)]
     yaw = ((np.cumsum(turn) - 0.5 * (turn + turn[0])) * run.dt)[rows]

@@ -119,7 +119,7 @@ def move_swerve(
             else:
                 if i != 1:  # the two axes of the ground are alike
                     kappa = by_soft * resisting[i]
-                    alpha, beta = _decayed(-0.5 * (kappa * damping + creep) * by_sigma, kappa * by_sigma, dt)
+                    alpha, beta = decayed(-0.5 * (kappa * damping + creep) * by_sigma, kappa * by_sigma, dt)
                 # what lasts, of a push that grows evenly, and what of the rest is left after the step
                 z_grows = yields * (pushed[i] - pushed_before[i]) * by_dt
                 z_lasts = yields * (pushed_before[i] - creep * z_grows) - damping * z_grows
@@ -152,7 +152,7 @@ def move_swerve(
 
 
 @njit(cache=True)
-def _decayed(half_trace: float, determinant: float, dt: float) -> tuple[float, float]:
+def decayed(half_trace: float, determinant: float, dt: float) -> tuple[float, float]:
     """Return ``a, b`` of ``exp(A dt) = a 1 + b A`` of a matrix (2, 2) that does not grow.
 
     Where roots are close to each other, two cosines are series: they take no more time than a square root.

@@ -11,7 +11,7 @@ import numpy as np
 from terrain.errors import ConfigError
 from terrain.kinematics.swerve_limits import scaled
 from terrain.records import Array
-from terrain.robots import Robot
+from terrain.robots import BicycleRobot, Robot, SwerveRobot
 from terrain.simulation.scenario.drawn import course
 from terrain.simulation.scenario.drives import DRIVES
 from terrain.simulation.scenario.legs import ACCEL_MPS2, DriveRequest, sample_times, twists_of
@@ -24,7 +24,7 @@ _RAMPED = ("straight", "climb", "starts")
 """Those whose acceleration can be chosen."""
 
 CRUISING_MPS, CRUISING_SHARE = 1.0, 1.0 / 3.0
-"""Speed where none is given, and the share of its fastest speed that a robot drives which is slower."""
+"""Speed where none is given, and the share of its fastest speed that a slower or car-like robot drives."""
 
 SCENARIOS: tuple[str, ...] = (*DRIVES, "course")
 """Names that :func:`make_scenario` accepts."""
@@ -56,7 +56,7 @@ def make_scenario(
     ============= ===================================================================================
 
     Robots that cannot drive sideways have no ``crab``, and in ``complex`` turn on the spot instead; only
-    those with steered wheels have ``course``.
+    swerve robots have ``course``, and car-like ones no ``spot_turn``.
 
     Parameters
     ----------
@@ -64,8 +64,8 @@ def make_scenario(
     robot : no twist saturates its wheels; without motors, which swerve robots need, they have no limit
     terrains : of the ground, one unless the scenario is ``course``; the names are not looked up
     duration_s : what the scenario is made for by default; taken to a whole number of samples
-    speed_mps : cruising speed, by default 1 m/s, of a slower robot a third of its fastest; ``survey`` and
-        ``course`` draw from 0.4 to 1.2 times it, backward and sideways
+    speed_mps : cruising speed, by default 1 m/s, of a slower or car-like robot a third of its fastest;
+        ``survey`` and ``course`` draw from 0.4 to 1.2 times it, backward and sideways
         ``complex`` is slower, and so is all of ``crab``
     seed : of everything drawn; the same gives the same bytes
     accel_mps2 : of the ramps of ``straight``, ``climb`` and ``starts``; infinite, they are steps
@@ -93,7 +93,7 @@ def make_scenario(
         raise ConfigError(
             f"scenario {name!r} is driven on one terrain, {len(grounds)} are given: use 'course'"
         )
-    if not {"crab": robot.sideways, "course": robot.steered}.get(name, True):
+    if not _can_drive(robot, name):
         raise ConfigError(f"scenario {name!r} is not for robot {robot.name} with the drive {robot.drive!r}")
     request = DriveRequest(
         *_ability(robot, speed_mps), _generator(seed), _checked_accel(name, accel_mps2), robot.sideways
@@ -110,6 +110,15 @@ def make_scenario(
     return Scenario(name, RATE_HZ, time_s, twist, patches)
 
 
+def _can_drive(robot: Robot, name: str) -> bool:
+    able = {
+        "crab": robot.sideways,
+        "course": isinstance(robot, SwerveRobot),
+        "spot_turn": not isinstance(robot, BicycleRobot),
+    }
+    return able.get(name, True)
+
+
 def _checked_duration(duration_s: float | None) -> float | None:
     if duration_s is None:
         return None
@@ -123,17 +132,20 @@ def _checked_duration(duration_s: float | None) -> float | None:
 def _ability(robot: Robot, speed_mps: float | None) -> tuple[float, Callable[[Any], Array]]:
     """Return the speed, checked, and what shortens a twist to what the robot can."""
     positions_m, radius_m = robot.wheel_positions_m, robot.wheel_radius_m
-    motors = robot.motors if robot.steered else robot.completed.motors
-    speed_max_radps = motors.speed_max_radps
+    motors = robot.motors if isinstance(robot, SwerveRobot) else robot.completed.motors
+    speed_max_radps, car = motors.speed_max_radps, isinstance(robot, BicycleRobot)
+    if isinstance(robot, BicycleRobot):
+        speed_max_radps = min(speed_max_radps, robot.speed_max_mps / radius_m)
     if speed_mps is None:
         fastest_mps = radius_m * speed_max_radps
-        speed_mps = CRUISING_MPS if fastest_mps >= CRUISING_MPS else CRUISING_SHARE * fastest_mps
+        slow = car or fastest_mps < CRUISING_MPS
+        speed_mps = CRUISING_SHARE * fastest_mps if slow else CRUISING_MPS
     if not _is_number(speed_mps) or not 0 < speed_mps <= radius_m * speed_max_radps:
         raise ConfigError(
             f"speed_mps is {speed_mps!r}: robot {robot.name} drives above 0 and up to "
             f"{radius_m * speed_max_radps:g} m/s"
         )
-    if math.isinf(speed_max_radps):
+    if car or math.isinf(speed_max_radps):  # wheels of a car turn as fast as it drives
         return float(speed_mps), lambda twist: np.asarray(twist, dtype=np.float64)
     return float(speed_mps), lambda twist: scaled(positions_m, radius_m, twist, speed_max_radps)
 

@@ -47,6 +47,7 @@ ROBOTS = {
     "tracked": TrackedRobot("crawler", 0.165, 0.5708, 0.512, 50.0, parts=HUSKY.parts),
     "swerve": load_robot("agrimaro"),
     "omni": load_robot("robotino"),
+    "bicycle": load_robot("adap2e"),
 }
 NOISE = {
     GYRO: 0.01,
@@ -66,10 +67,12 @@ LEFT_OUT = {
     "omni": (
         *("gyro_bias", "gyro_scale", "accel_bias", "imu_latency", "clock_offset", "clock_rate"),
         *("encoder_lag", "motor_constant", "motor_drift", "current_offset"),
-    )
+    ),
+    "bicycle": ("payload", "rolling_resistance", "viscous_drag", "slip_resistance", "current_offset"),
 }
-"""Effects that act and are not looked for: of an IMU, which these logs do not have, and of lags and currents
-that the friction of the rollers hides."""
+"""Effects that act and are not looked for: on omni robots those of an IMU, which these logs do not have, and
+of lags and currents that the friction of the rollers hides; on cars, whose currents are not logged, a load,
+which looks like softer tyres, and resistances, which look like a smaller radius."""
 
 NOTICEABLE, CLEAR = 0.1, 0.2
 """Response over noise, over that of the clearest channel, from which on one may be named and has to be."""
@@ -88,6 +91,9 @@ def rich_drive(drive):
     if ROBOTS[drive].skids:
         half = 0.5 * ROBOTS[drive].track_m * turn
         return np.column_stack([speed - half, speed + half]), np.zeros((t.size, 2)), grade, roll
+    if drive == "bicycle":
+        steer = np.column_stack([0.25 * np.sin(0.7 * t + 0.4), np.zeros(t.size)])
+        return 3.0 * speed[:, None], steer, grade, roll
     if drive == "omni":
         robot, twist = ROBOTS[drive], np.column_stack([speed, 0.4 * np.cos(0.7 * t), turn])
         wheels = inverse(robot.wheel_positions_m, robot.wheel_directions_rad, twist)
@@ -136,7 +142,7 @@ def test_names_are_unique_and_the_neutral_value_lies_within_the_bounds():
         for p in effect.parameters:
             assert p.low <= 0.0 < p.high
             assert 0.0 < p.step < 0.1 * p.high
-            assert p.unit in ("ratio", "rad", "s", "s2", "s2pm2", "m", "a", "radps", "mps2", "nspm")
+            assert p.unit in ("ratio", "rad", "s", "s2", "s2pm", "s2pm2", "m", "a", "radps", "mps2", "nspm")
 
 
 @pytest.mark.parametrize("name", ["steering_play=0.01", "steering_backlash=0.01"])
@@ -145,8 +151,8 @@ def test_a_former_name_is_accepted_on_the_command_line(name):
 
 
 def test_homes_are_numbers_of_a_description():
-    robot = ROBOTS["swerve"]
     for effect in LIBRARY:
+        robot = ROBOTS["swerve" if SWERVE in effect.drives else effect.drives[0]]
         for p in effect.parameters:
             for home in p.homes:
                 part = getattr(robot, home.section) if home.section else robot
@@ -249,9 +255,10 @@ def test_an_effect_shows_in_the_channels_that_it_names_and_in_no_others(response
         assert clear <= set(effect.channels) <= noticeable, effect.name
 
 
-def test_what_acts_on_every_robot_shows_most_in_the_same_channels_of_an_omni_robot(responses):
-    for effect in library_of("omni"):  # there a resistance also turns the body, and drives it sideways
-        assert CHANNELS[int(np.argmax(responses["omni", effect.name]))] in effect.channels, effect.name
+@pytest.mark.parametrize("drive", ["omni", "bicycle"])
+def test_what_acts_on_every_robot_shows_most_in_the_same_channels_of_others(responses, drive):
+    for effect in library_of(drive):  # omni wheels: a resistance also turns the body, and drives it sideways
+        assert CHANNELS[int(np.argmax(responses[drive, effect.name]))] in effect.channels, effect.name
 
 
 def test_twins_are_mutual_and_differ_in_their_distinguishing_channel(responses):

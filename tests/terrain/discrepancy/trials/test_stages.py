@@ -28,8 +28,7 @@ def stage(row, number, n_runs=4, seed=0):
     """Return a trial before the diagnosis; odd numbers are of the skid-steer robot where a row has both."""
     case = next(c for c in cases_of(row, number + 1, seed, n_runs) if c.number == number)
     drawn, noise = np.random.SeedSequence([seed, number]).spawn(2)
-    robot = HUSKY if case.robot == "husky" else AGRIMARO
-    return stage_of(case, robot, np.random.default_rng(drawn), noise)
+    return stage_of(case, load_robot(case.robot), np.random.default_rng(drawn), noise)
 
 
 def stage_hiding(row, causes):
