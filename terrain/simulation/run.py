@@ -21,7 +21,7 @@ from terrain.errors import ConfigError
 from terrain.extension import warn_outside
 from terrain.kinematics.wheel_motion import wheel_motion
 from terrain.records import Array, RunLog, Stream
-from terrain.robots import Robot, SwerveRobot, TrackedRobot
+from terrain.robots import BicycleRobot, Robot, SwerveRobot, TrackedRobot
 from terrain.simulation.bench import POSITIONS, TURN_S, six_positions_log
 from terrain.simulation.conditions import Conditions, Faults, draw_conditions, load_spread
 from terrain.simulation.dynamic.simulate import simulate
@@ -31,6 +31,7 @@ from terrain.simulation.planar.noise import load_noise, load_scatter
 from terrain.simulation.planar.run import simulate_planar
 from terrain.simulation.scenario.make import make_scenario
 from terrain.simulation.sensors.gnss import Gnss
+from terrain.simulation.sensors.raw_fixes import with_raw_fixes
 from terrain.simulation.sensors.sensor import is_lost
 from terrain.simulation.slip_sweep import learning_run
 from terrain.simulation.tracked.run import COMMANDS_HZ, simulate_tracked
@@ -190,6 +191,8 @@ def _planar_run(
         run_id=run_id,
         terrain=soil.name,
     )
+    if isinstance(robot, BicycleRobot):
+        run = replace(run, streams=with_raw_fixes(run, np.random.default_rng(seed.spawn(1)[0])))
     return _without_camera(run, faults)
 
 

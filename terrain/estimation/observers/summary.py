@@ -12,6 +12,9 @@ from terrain.estimation.observers.estimate import ObserverEstimate, seconds_by_s
 from terrain.estimation.observers.family import ObserverStatus
 from terrain.records import Array
 
+SETTLED = (ObserverStatus.OK, ObserverStatus.UNEXCITED)
+"""Statuses in which slip is judged; a part that is not excited may be the cornering stiffness alone."""
+
 
 @dataclass(frozen=True, slots=True)
 class ObservedSlip:
@@ -19,7 +22,7 @@ class ObservedSlip:
 
     Parameters
     ----------
-    mean, std : while the status is ok: mean of the slip, and root mean square of its standard deviation
+    mean, std : while the robot moves and is observed: mean of the slip, and of its standard deviation
     true_mean, rmse : of the truth, and of the error
     nees : mean squared error over the variance stated, 1 where that is right
     """
@@ -59,7 +62,7 @@ def summarize_observer(found: ObserverEstimate) -> ObserverSummary:
     """Return the figures of an estimate."""
     track = found.track
     started = track.status != ObserverStatus.STARTING
-    settled = track.status == ObserverStatus.OK
+    settled = np.isin(track.status, SETTLED)
     slips = {
         name: _slip(track.slip[settled, k], track.slip_std[settled, k], found.true(name), settled)
         for k, name in enumerate(track.slips)

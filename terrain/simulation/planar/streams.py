@@ -21,7 +21,7 @@ from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.kinematics.wheel_velocity import point_velocity, wheel_frame_velocities
 from terrain.logs.schema import IMU_CHANNELS, POSE_CHANNELS
 from terrain.records import Array, Stream
-from terrain.robots import Robot, SwerveRobot
+from terrain.robots import BicycleRobot, Robot, SwerveRobot
 from terrain.simulation.planar.model import AX, SLIP, VX, VY, Planar, W
 from terrain.simulation.planar.motion import move
 from terrain.simulation.planar.noise import CAMERA_HZ, IMU_HZ, WHEELS_HZ, Noise, coloured, lag_weights
@@ -32,7 +32,7 @@ from terrain.simulation.sensors.imu import ImuErrors, described_calibration, imu
 from terrain.simulation.sensors.steering import encoder_angle
 from terrain.simulation.sensors.truth import BODY_TRUTH, GYRO_BIAS, wheel_channels
 from terrain.simulation.sensors.wheels import add_rate_noise
-from terrain.slip import slip_ratio
+from terrain.slip import slip_angle, slip_ratio
 
 CRAWL_MPS = 0.25
 """Speed below which stick-slip shows as spikes of the current."""
@@ -363,7 +363,7 @@ def planar_truth(run: PlanarRun) -> Stream:
     accel_y = np.gradient(v_y, 1.0 / IMU_HZ) + turn * v_x
     steer = motion.steer_rad[rows] + robot.wheel_directions_rad
     places_m = robot.wheel_positions_m * (1.0 + run.p[INDEX["wheel_distance_ratio"]])
-    along, _ = wheel_frame_velocities(np.column_stack([v_x, v_y, turn]), places_m, steer)
+    along, across = wheel_frame_velocities(np.column_stack([v_x, v_y, turn]), places_m, steer)
     columns = [
         motion.pose[rows],
         np.column_stack([motion.roll_rad[rows], -grade, v_x, v_y, turn, accel_x, accel_y]),
@@ -374,6 +374,9 @@ def planar_truth(run: PlanarRun) -> Stream:
     ]
     wheels = (wheel_channels(each, robot.wheels) for each in ("wheel_radps", "steer_rad", "slip_ratio"))
     channels = [*BODY_TRUTH, *(name for each in wheels for name in each), GYRO_BIAS]
+    if isinstance(robot, BicycleRobot):
+        columns.append(slip_angle(along, across))
+        channels += wheel_channels("slip_rad", robot.wheels)
     if run.planar.omni:
         columns.append(motion.truth[rows, SLIP, None])
         channels.append(BODY_SLIP)

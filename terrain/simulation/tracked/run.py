@@ -16,9 +16,10 @@ import numpy as np
 from terrain.angles import wrapped
 from terrain.constants import GRAVITY_MPS2
 from terrain.errors import ConfigError
-from terrain.logs.schema import GNSS_CHANNELS, IMU_CHANNELS, POSE_CHANNELS
+from terrain.logs.schema import IMU_CHANNELS, POSE_CHANNELS
 from terrain.records import Array, Label, RunLog, Stream
 from terrain.robots import TrackedRobot
+from terrain.simulation.sensors.raw_fixes import COMPASS_STD_RAD, RAW_HZ, RAW_STD_M, raw_fixes
 from terrain.simulation.sensors.truth import BODY_TRUTH, GYRO_BIAS, wheel_channels
 from terrain.simulation.tracked.contact import CONTACT_SIZE, contact_array
 from terrain.simulation.tracked.given_slip import GivenSlip
@@ -51,9 +52,9 @@ class TrackedSensors(NamedTuple):
     accel_mps2: float = 0.05
     tilt_rad: float = 0.002
     yaw_rad: float = 0.001
-    gnss_hz: float = 10.0
-    gnss_m: float = 0.02
-    compass_rad: float = 0.0087
+    gnss_hz: float = RAW_HZ
+    gnss_m: float = RAW_STD_M
+    compass_rad: float = COMPASS_STD_RAD
     pose_hz: float = 100.0
     pose_m: float = 0.001
     pose_rad: float = 0.002
@@ -226,25 +227,9 @@ def _pose(states: Array, sensors: TrackedSensors, rng: np.random.Generator) -> S
 
 
 def _satellites(states: Array, sensors: TrackedSensors, rng: np.random.Generator) -> dict[str, Stream]:
-    """Return raw positions of the body's origin and the compass beside them, without a delay."""
     rows, time_s = _samples(len(states), sensors.gnss_hz)
-    yaw, n = states[rows, YAW], len(rows)
-    cos, sin = np.cos(yaw), np.sin(yaw)
-    v_x, v_y = states[rows, VX], states[rows, VY]
-    fixes = np.column_stack(
-        [
-            states[rows, X : Y + 1] + sensors.gnss_m * rng.standard_normal((n, 2)),
-            np.column_stack([v_x * cos - v_y * sin, v_x * sin + v_y * cos])
-            + 1.5 * sensors.gnss_m * rng.standard_normal((n, 2)),
-            np.full(n, sensors.gnss_m),
-            np.ones(n),
-        ]
-    )
-    heading = wrapped(yaw + sensors.compass_rad * rng.standard_normal(n))
-    return {
-        "gnss": Stream(time_s, fixes, GNSS_CHANNELS),
-        "compass": Stream(time_s, heading[:, None], ("yaw_rad",)),
-    }
+    pose, std = states[rows][:, [X, Y, YAW]], (sensors.gnss_m, sensors.compass_rad)
+    return raw_fixes(time_s, pose, states[rows, VX : VY + 1], std, rng)
 
 
 def _samples(n: int, rate_hz: float) -> tuple[Array, Array]:
