@@ -22,6 +22,7 @@ from pipelines.reporting.line_figure import add_legend
 from pipelines.reporting.numbers import shorten
 from terrain.estimation.observers.estimate import ObserverEstimate
 from terrain.estimation.observers.family import ObserverStatus
+from terrain.estimation.observers.summary import SETTLED
 from terrain.files.atomic import atomic_write
 
 RUN_WIDTH = 40
@@ -111,7 +112,7 @@ def _title(shown: str, found: ObserverEstimate) -> str:
 def _shade_status(axes: Axes, found: ObserverEstimate) -> None:
     """Shade where the observer's estimates do not follow measurements."""
     track = found.track
-    away = (track.status != ObserverStatus.OK) & (track.status != ObserverStatus.STANDING)
+    away = ~np.isin(track.status, (*SETTLED, ObserverStatus.STANDING))
     edges = np.flatnonzero(np.diff(np.concatenate([[False], away, [False]]).astype(int)))
     for begin, end in zip(edges[::2], edges[1::2], strict=True):
         until = track.time_s[min(end, len(track.time_s) - 1)]
