@@ -1,6 +1,6 @@
-"""The slip of a tracked robot sample by sample: what a robot's own computer would do with an observer.
+"""The slip of a tracked robot sample by sample, as its own computer would observe it, from grass on to sand.
 
-    python examples/observe_slip.py
+python examples/observe_slip.py
 """
 
 import numpy as np
@@ -13,18 +13,22 @@ from terrain.simulation.tracked.run import Stretch, simulate_tracked
 from terrain.simulation.tracked.slope import Slope
 from terrain.terramechanics.soil import load_soil
 
-robot = load_robot("orchard_ugv")
-ground = [Stretch(load_soil("grass"), 5.0), Stretch(load_soil("dry_sand"))]
-speeds = np.full((1500, 2), 0.5)  # m/s of the left and the right track at 50 Hz
-run = simulate_tracked(robot, ground, speeds, seed=1, slope=Slope(0.2))
 
-channels = {name: stream.channels for name, stream in run.streams.items()}
-observer = LiveObserver(make_observer("tracked", robot), robot, channels)
-for sample in replay(run):
-    for estimate in observer.step(sample.readings):
-        if round(estimate.time_s * 50) % 250 == 0:
-            left, right = estimate.slip
-            print(
-                f"{estimate.time_s:4.0f} s  {sample.terrain:9}  slip {left:.3f} and {right:.3f} "
-                f"± {estimate.slip_std[0]:.3f}  {estimate.status.label}"
-            )
+def observe(seed: int = 1) -> list[tuple[str, float, float]]:
+    """Return terrain, slip of the left track and its standard deviation, every five seconds."""
+    robot = load_robot("orchard_ugv")
+    ground = [Stretch(load_soil("grass"), 5.0), Stretch(load_soil("dry_sand"))]
+    speeds = np.full((1500, 2), 0.5)  # m/s of the left and the right track at 50 Hz
+    run = simulate_tracked(robot, ground, speeds, seed, slope=Slope(0.2))
+    channels = {name: stream.channels for name, stream in run.streams.items()}
+    observer, found = LiveObserver(make_observer("tracked", robot), robot, channels), []
+    for sample in replay(run):
+        for estimate in observer.step(sample.readings):
+            if round(estimate.time_s * 50) % 250 == 0:
+                found.append((sample.terrain, estimate.slip[0], estimate.slip_std[0]))
+    return found
+
+
+if __name__ == "__main__":
+    for terrain, slip, std in observe():
+        print(f"{terrain:9} slip {slip:.3f} ± {std:.3f}")

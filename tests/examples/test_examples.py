@@ -142,3 +142,10 @@ def test_the_ros_node_publishes_terrain_and_target_slip(ros, runs, model_folder)
     assert len(terrain) == len(target) >= 5
     assert terrain[-1] == "b"
     assert all(0.0 < slip < 1.0 for slip in target)
+
+
+def test_slip_changes_with_the_ground_sample_by_sample():
+    found = example("observe_slip").observe()
+    assert [terrain for terrain, _, _ in found] == ["grass"] * 3 + ["dry_sand"] * 3
+    assert found[2][1] == pytest.approx(0.033, abs=0.01)
+    assert found[5][1] == pytest.approx(0.014, abs=0.01)

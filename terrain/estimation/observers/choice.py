@@ -23,10 +23,9 @@ from terrain.robots import BicycleRobot, Robot, TrackedRobot
 
 IN_MANOEUVRES = TrackedSettings(observation_gain_ps=(2.0, 2.0, 2.0), normalised=True, eta_walk_ratio=0.03)
 """Gains of the adaptive observer for logs of any driving: as fast at every speed, and efficiencies that
-change by a tenth within some seconds, as from straight motion to a turn.  Errors over their standard
-deviations are then 1 to 2 in manoeuvres, squared, and well below 1 in steady motion.  The paper's gains, for slip that
-stays as it is, are the defaults of
-:class:`~terrain.estimation.observers.tracked_settings.TrackedSettings`."""
+change by a tenth within some seconds, as from straight motion to a turn.  Squared errors over their variance
+are then 1 to 2 in manoeuvres and well below 1 in steady motion.  The paper's gains, for slip that stays as it
+is, are the defaults of :class:`~terrain.estimation.observers.tracked_settings.TrackedSettings`."""
 
 OF_TRACKED: Mapping[str, Callable[[TrackedRobot, SlipModel], Observer]] = {
     "tracked": lambda robot, _: tracked_observer(robot, IN_MANOEUVRES),
