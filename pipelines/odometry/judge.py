@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+from scipy.stats import t as student
 
 from pipelines.odometry.results import OdometryResult, ParameterFound
 from pipelines.odometry.settings import OdometrySettings
@@ -80,6 +81,7 @@ def judge_odometry(
         for name, legs in groups.items()
     )
     every = [leg for legs in groups.values() for leg in legs]
+    n_runs = len({leg.run for leg in every})
     flat = without_tilt(every)
     fitted = fit_odometry(level(SLIP) if flat else SLIP, every, robot)
     if settings.out is not None:
@@ -89,9 +91,9 @@ def judge_odometry(
         robot.name,
         settings.seed,
         settings.folds,
-        len({leg.run for leg in every}),
+        n_runs,
         scores,
-        _parameters(fitted),
+        _parameters(fitted, n_runs),
         (float(fitted.mount[0]), float(fitted.mount[1])),
         float(fitted.mount[2]),
         delay_s if windows else 0.0,
@@ -135,9 +137,11 @@ def _pose_legs(runs: Sequence[RunLog], robot: TrackedRobot, length_s: float) -> 
     ]
 
 
-def _parameters(fitted: FittedOdometry) -> dict[str, ParameterFound]:
+def _parameters(fitted: FittedOdometry, n_runs: int) -> dict[str, ParameterFound]:
+    """Return the fitted parameters with intervals by Student's t over runs, which are the clusters of the fit."""
     std = np.sqrt(np.diag(fitted.model.covariance))
-    reach = np.where(np.isin(np.arange(len(std)), fitted.kind.free), 1.96 * std, np.nan)
+    wide = float(student.ppf(0.975, max(n_runs - 1, 1)))
+    reach = np.where(np.isin(np.arange(len(std)), fitted.kind.free), wide * std, np.nan)
     return {
         name: ParameterFound(float(value), float(value - half), float(value + half))
         for name, value, half in zip(PARAMETERS, fitted.model.vector, reach, strict=True)
