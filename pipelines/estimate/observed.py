@@ -9,6 +9,7 @@ from pathlib import Path
 from pipelines.estimate.settings import EstimateSettings
 from pipelines.reporting.progress import Progress, silent
 from terrain.errors import ConfigError, LogError
+from terrain.estimation.observers.choice import BY_MODEL
 from terrain.estimation.observers.estimate import observe_run, with_estimates
 from terrain.estimation.observers.slip_model_file import read_slip_model
 from terrain.estimation.observers.summary import ObserverSummary, summarize_observer
@@ -63,6 +64,8 @@ def estimate_observed(
     """
     if settings.tuning is not None or settings.tune_on is not None:
         raise ConfigError(f"filter {settings.filter!r} is an observer, which has gains and no tuning")
+    if settings.slip_model is not None and settings.filter not in (*BY_MODEL, "encoder-odometry"):
+        raise ConfigError(f"filter {settings.filter!r} takes no slip model: leave --slip-model out")
     if settings.out is not None:
         refuse_existing(runs, settings.out)
     given = None if settings.robot is None else load_robot(settings.robot)

@@ -27,11 +27,14 @@ from terrain.calibration.odometry_judge import LegScores, held_out_ends, score_l
 from terrain.calibration.odometry_legs import Leg, legs_of_poses, legs_of_windows
 from terrain.errors import ConfigError, DataError
 from terrain.estimation.observers.slip_model import PARAMETERS
-from terrain.estimation.observers.slip_model_file import write_slip_model
+from terrain.estimation.observers.slip_model_file import check_slip_model_file, write_slip_model
 from terrain.logs.drive import FILE_NAME, find_sessions
 from terrain.logs.drive_poses import WindowPoses, read_window_poses
 from terrain.records import Array, RunLog
 from terrain.robots import TrackedRobot, as_tracked, load_robot
+
+SHORTEST_S, LONGEST_S = 0.2, 3600.0
+"""Legs that are compared: the shortest has two poses of a lidar."""
 
 SHORT_RATIO = 0.8
 """A command's leg that is so much shorter than the longest of all is left out: its windows are not whole."""
@@ -59,10 +62,10 @@ def judge_odometry(
     """
     refusal = "robot {name}: drive {drive!r} has no tracks; terrain odometry is for 'tracked'"
     robot = as_tracked(load_robot(settings.robot), refusal)
-    if not all(0.0 < length < 3600.0 for length in settings.lengths) or not settings.lengths:
-        raise ConfigError("--lengths: seconds above zero are required")
-    if settings.out is not None and settings.out.exists():
-        raise ConfigError(f"{settings.out}: is there already, and is left as it is; choose another name")
+    if not all(SHORTEST_S <= length <= LONGEST_S for length in settings.lengths) or not settings.lengths:
+        raise ConfigError(f"--lengths: {SHORTEST_S:g} to {LONGEST_S:g} seconds are accepted")
+    if settings.out is not None:
+        check_slip_model_file(settings.out)
     delay_s = robot.identified.get("lidar_delay_s", 0.0)
     windows = _windows(source.data, robot)
     groups = (
@@ -72,7 +75,10 @@ def judge_odometry(
     )
     groups = {name: legs for name, legs in groups.items() if legs}
     if not groups:
-        raise DataError(f"{source.data}: no run has poses of a camera or lidar to judge odometry by")
+        raise DataError(
+            f"{source.data}: no run has poses of a camera or lidar, beside tracks and gyro, over "
+            f"{' or '.join(f'{length:g}' for length in settings.lengths)} s"
+        )
     ends = held_out_ends(
         groups, robot, settings.folds, settings.seed, lambda done, total: progress("odometry", done, total)
     )
@@ -138,7 +144,7 @@ def _pose_legs(runs: Sequence[RunLog], robot: TrackedRobot, length_s: float) -> 
 
 
 def _parameters(fitted: FittedOdometry, n_runs: int) -> dict[str, ParameterFound]:
-    """Return the fitted parameters with intervals by Student's t over runs, which are the clusters of the fit."""
+    """Return the fitted parameters, with intervals by Student's t over runs: the clusters of the fit."""
     std = np.sqrt(np.diag(fitted.model.covariance))
     wide = float(student.ppf(0.975, max(n_runs - 1, 1)))
     reach = np.where(np.isin(np.arange(len(std)), fitted.kind.free), wide * std, np.nan)

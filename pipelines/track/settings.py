@@ -22,7 +22,7 @@ class TrackSettings(Settings):
         ..., "CSV file of points in their order: columns x_m and y_m, and roll_rad where it is known."
     )
     out: Path = setting(Path("terrain-track"), "Folder of the page, its pictures and the table of the drive.")
-    speed: float = setting(3.0, "Speed in m/s.", gt=0.0)
+    speed: float = setting(3.0, "Speed in m/s.", ge=0.1)
     observer: str = setting("multi", f"Sideslip by: {', '.join(SLIP_SOURCES)}.")
     slope_deg: float = setting(
         0.0, "Side slope in degrees, left side up > 0; with roll_rad in the file, that.", option="--slope"

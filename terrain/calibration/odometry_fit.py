@@ -59,6 +59,9 @@ FIRST_ERROR_M, LEAST_ERROR_M, PASSES = 0.1, 1e-4, 4
 
 MIN_LEGS = 10
 
+FLAT_RAD = 0.02
+"""Root mean square tilt, a degree, below which the ground counts as level."""
+
 
 class Kind(NamedTuple):
     """A kind of odometry.
@@ -172,8 +175,9 @@ def predict_ends(fitted: FittedOdometry, legs: Sequence[Leg], robot: TrackedRobo
 
 
 def without_tilt(legs: Sequence[Leg]) -> bool:
-    """Return whether no leg has a measured tilt: slopes are then no part of a fit."""
-    return not any(leg.tilt_rad.any() for leg in legs)
+    """Return whether legs show no slopes: the rms of their mean tilts is below :data:`FLAT_RAD`."""
+    tilts = np.array([leg.tilt_rad.mean(axis=0) for leg in legs])
+    return bool(np.sqrt((tilts**2).mean(axis=0)).max() < FLAT_RAD)
 
 
 def level(kind: Kind) -> Kind:

@@ -15,12 +15,16 @@ import numpy as np
 
 from terrain.angles import unwrapped
 from terrain.calibration.track_motion import odometry_rows
+from terrain.errors import DataError
 from terrain.logs.drive_poses import WindowPoses
 from terrain.records import Array, RunLog
 from terrain.robots import TrackedRobot
 
 STEP_S = 0.05
 """Longest step within a leg: that of the logs of DRIVE."""
+
+GAP_S = 0.25
+"""Longest time without a sample within a leg, and without a pose at its ends."""
 
 MAX_BRIDGE_S = 0.5
 """Longest gap between two windows that is bridged."""
@@ -67,10 +71,11 @@ def legs_of_windows(
     Poses are of an earlier time than their stamps by the delay; before its first sample a run is taken to
     have driven as at that.
     """
-    single = [
+    found = (
         _leg(run, number, window.pose[-1], (window.time_s[0], window.time_s[-1]), robot, delay_s)
         for window in windows
-    ]
+    )
+    single = [leg for leg in found if leg is not None]
     moved = np.zeros(3)
     for k, window in enumerate(windows):
         if k > 0:
@@ -107,10 +112,14 @@ def legs_of_poses(
     if not len(time_s):
         return legs
     for begin_s in np.arange(time_s[0], time_s[-1] - length_s + 1e-9, length_s):
-        first, last = np.searchsorted(time_s, [begin_s - 1e-9, begin_s + length_s - 1e-9])
-        last = min(int(last), len(time_s) - 1)
+        first, last = np.searchsorted(time_s, [begin_s - 1e-9, begin_s + length_s - 1e-9]).tolist()
+        last = min(last, len(time_s) - 1)
+        late_s = max(time_s[first] - begin_s, abs(time_s[last] - begin_s - length_s))
+        if late_s > GAP_S:  # no pose there
+            continue
         moved = relative(values[first], values[last])
-        legs.append(_leg(run, number, moved, (time_s[first], time_s[last]), robot, delay_s))
+        leg = _leg(run, number, moved, (time_s[first], time_s[last]), robot, delay_s)
+        legs += [leg] if leg is not None else []
     return legs
 
 
@@ -143,8 +152,14 @@ def relative(first: Array, last: Array) -> Array:
 
 def _leg(
     run: RunLog, number: int, moved: Array, ends_s: tuple[float, float], robot: TrackedRobot, delay_s: float
-) -> Leg:
+) -> Leg | None:
+    """Return a leg; None where tracks or gyro were not measured in a part of it."""
     time_s, rows = odometry_rows(run, robot)
+    if not np.isfinite(rows[:, 2]).any():
+        raise DataError(f"run {run.run_id!r} has no gyro_z_radps, which odometry with slip needs")
+    for column in (0, 1, 2):
+        if _has_gap(time_s[np.isfinite(rows[:, column])], ends_s[0] - delay_s, ends_s[1] - delay_s):
+            return None
     length_s = ends_s[1] - ends_s[0]
     n = max(int(np.ceil(length_s / STEP_S)), 1)
     step_s = length_s / n
@@ -156,6 +171,16 @@ def _leg(
     )
     return Leg(
         number, moved, step_s, np.column_stack([left, right]), rate, np.column_stack([roll, pitch]), length_s
+    )
+
+
+def _has_gap(time_s: Array, from_s: float, to_s: float) -> bool:
+    """Return whether samples leave a gap between two times; a run may begin a delay after the first."""
+    inside = time_s[(time_s > from_s - GAP_S) & (time_s < to_s + GAP_S)]
+    if len(inside) < 2:
+        return True
+    return bool(
+        np.diff(inside).max() > GAP_S or inside[-1] < to_s - GAP_S or inside[0] > from_s + MAX_BRIDGE_S
     )
 
 

@@ -147,7 +147,7 @@ def path_from_points(points_m: Array, std_m: float = 0.0) -> ReferencePath:
     if bad.size:
         raise DataError(f"path: point {bad[0] + 1} is {points[bad[0]].tolist()}, finite numbers are needed")
     steps = np.hypot(*np.diff(points, axis=0).T)
-    kept = points[np.concatenate([[True], steps > _MERGED_M])]
+    kept = points[np.concatenate([[True], steps > _MERGED_M])] if len(points) else points
     if len(kept) < 3:
         raise DataError(f"path: {len(kept)} different points, at least 3 are needed")
     steps = np.hypot(*np.diff(kept, axis=0).T)

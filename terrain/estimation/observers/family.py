@@ -38,7 +38,7 @@ class ObserverStatus(StatusCode):
     PUSHED = 7
     """The robot turns though its tracks stand."""
     BAD_INPUT = 8
-    """Speeds or time are not numbers that can be; nothing was changed."""
+    """Speeds or time are not numbers that can be; estimates are as they were."""
 
 
 class ObserverOutput(NamedTuple):

@@ -90,6 +90,8 @@ class LiveObserver:
         readings : by stream; any may be missing, late, repeated or wrong, and streams without names of
             channels are not looked at
         """
+        if not isinstance(readings, Mapping):
+            return []
         for name in readings:
             if name != "wheels" and (arrays := self._arrays(name, readings[name])) is not None:
                 self._feed.push(name, *arrays)
@@ -107,7 +109,7 @@ class LiveObserver:
             return None
         try:
             time_s, values = (np.asarray(part, dtype=np.float64) for part in reading)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             time_s = values = np.empty(0)
         if time_s.ndim != 1 or values.shape != (time_s.size, len(self._channels[name])):
             self._unreadable[name] = self._unreadable.get(name, 0) + 1
@@ -120,7 +122,7 @@ class LiveObserver:
         row = self._feed.tick(time_s, wheels)
         if row is None:
             return None
-        dt_s = 0.0 if math.isnan(self._last_s) else time_s - self._last_s
+        dt_s = 0.0 if math.isnan(self._last_s) else max(time_s - self._last_s, 0.0)  # a clock may be set
         self._last_s = time_s
         self._memory = self.observer.step(self.observer.params, self._memory, row, dt_s)
         output = self.observer.read(self.observer.params, self._memory)

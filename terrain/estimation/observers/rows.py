@@ -36,11 +36,23 @@ HELD_S = 0.1
 TOGETHER_S = 0.06
 """A compass belongs to a position that is no further from it in time: half a period of 10 Hz, and more."""
 
+LATE_S = 0.3
+"""A fix that is older when its tick comes is left out: it would have to be moved along an unknown path."""
+
+INACCURATE_M = 0.2
+"""Standard deviation of a satellite fix from which on it is no fix: a float solution has half a metre."""
+
+WAITING_S = 2.0
+"""So long samples wait for a tick of the wheels."""
+
+CLOCK_SET_SAMPLES, CLOCK_SET_S = 10, 1.0
+"""So many samples in a row, so far behind the newest, are of a clock that was set back: all begins anew."""
+
 CHANNELS: Mapping[str, tuple[str, ...]] = {
     "steering": ("angle_front_rad",),
     "imu": ("gyro_z_radps", "roll_rad", "pitch_rad", "accel_y_mps2"),
     "pose": ("position_x_m", "position_y_m", "yaw_rad"),
-    "gnss": ("position_x_m", "position_y_m"),
+    "gnss": ("position_x_m", "position_y_m", "std_position_m"),
     "compass": ("yaw_rad",),
 }
 """Channels that are read of each stream beside the wheels; those that a log lacks are unknown."""
@@ -56,6 +68,12 @@ class RowFeed:
     robot : tracked or car-like
     rows : those of :data:`ROWS` that the observer takes
     channels : names of the columns of each stream
+
+    Attributes
+    ----------
+    dropped : samples left out, as counts by stream and kind: not later than the one before (ten in a row that
+        are a second behind are a clock that was set: all begins anew), late or inaccurate fixes, and what
+        waited in vain for the wheels
 
     Raises
     ------
@@ -78,7 +96,9 @@ class RowFeed:
         self._rows = rows
         self._pending: dict[str, list[tuple[float, list[float]]]] = {name: [] for name in self._places}
         self._last_s = dict.fromkeys(self._places, -math.inf)
-        self._held: dict[str, tuple[float, list[float]]] = {}
+        self._held: dict[str, list[tuple[float, float]]] = {}
+        self._heading = (-math.inf, math.nan)
+        self._n_behind: dict[str, int] = {}
         self._tick_s = -math.inf
         self.dropped: Counter[str] = Counter()
 
@@ -87,21 +107,25 @@ class RowFeed:
         if stream not in self._places:
             return
         for stamp_s, sample in zip(time_s.tolist(), values.tolist(), strict=True):
-            if not stamp_s > self._last_s[stream]:
-                self.dropped[f"{stream}: not later than the sample before"] += 1
+            if not math.isfinite(stamp_s) or not stamp_s > self._last_s[stream]:
+                self._behind(stream, stamp_s)
                 continue
             self._last_s[stream] = stamp_s
             known = [math.nan] * len(CHANNELS[stream])
             for k, column in self._places[stream]:
                 known[k] = sample[column] if math.isfinite(sample[column]) else math.nan
-            self._pending[stream].append((stamp_s, known))
+            waiting = self._pending[stream]
+            waiting.append((stamp_s, known))
+            if waiting[0][0] < stamp_s - WAITING_S:
+                self.dropped[f"{stream}: no wheels came"] += 1
+                del waiting[0]
 
     def tick(self, time_s: float, wheels: Array) -> Array | None:
         """Return the row (m,) at a sample of the wheels; None where that is not later than the one before."""
-        if not time_s > self._tick_s or not math.isfinite(time_s):
-            self.dropped["wheels: not later than the sample before"] += 1
+        if not math.isfinite(time_s) or not time_s > self._tick_s:
+            self._behind("wheels", time_s)
             return None
-        self._tick_s = time_s
+        self._tick_s, self._n_behind["wheels"] = time_s, 0
         row = dict.fromkeys(ROWS, math.nan)
         for column, name in self._speeds:
             row[name] = float(wheels[column])
@@ -110,6 +134,18 @@ class RowFeed:
         speeds = [row[name] for _, name in self._speeds]
         row |= self._fix(time_s, sum(speeds) / len(speeds))
         return np.array([row[name] for name in self._rows])
+
+    def _behind(self, stream: str, stamp_s: float) -> None:
+        """Count a sample that is not later than the one before; many in a row are a clock that was set."""
+        self.dropped[f"{stream}: not later than the sample before"] += 1
+        self._n_behind[stream] = self._n_behind.get(stream, 0) + 1 if math.isfinite(stamp_s) else 0
+        before_s = self._tick_s if stream == "wheels" else self._last_s[stream]
+        if self._n_behind[stream] < CLOCK_SET_SAMPLES or before_s - stamp_s < CLOCK_SET_S:
+            return
+        self.dropped["time: clock set"] += 1
+        self._tick_s, self._last_s = -math.inf, dict.fromkeys(self._places, -math.inf)
+        self._pending, self._held = {name: [] for name in self._places}, {}
+        self._n_behind = {}
 
     def _taken(self, stream: str, time_s: float) -> list[tuple[float, list[float]]]:
         """Take the samples that came by a time out of those that wait."""
@@ -120,41 +156,61 @@ class RowFeed:
         return taken
 
     def _last(self, stream: str, time_s: float) -> list[float]:
-        if taken := self._taken(stream, time_s):
-            self._held[stream] = taken[-1]
+        for stamp_s, known in self._taken(stream, time_s):
+            if not math.isnan(known[0]):
+                self._held[stream] = [(stamp_s, known[0])]
         return self._standing(stream, time_s)
 
     def _mean(self, stream: str, time_s: float) -> list[float]:
-        if taken := self._taken(stream, time_s):
-            self._held[stream] = taken[-1]
-            return [sum(column) / len(taken) for column in zip(*(known for _, known in taken), strict=True)]
-        return self._standing(stream, time_s)
+        """Return the mean of what is known of each channel since the tick before; else the last known."""
+        taken = self._taken(stream, time_s)
+        means = self._standing(stream, time_s)
+        held = self._held.setdefault(stream, [(-math.inf, math.nan)] * len(CHANNELS[stream]))
+        for k in range(len(means)):
+            known = [(stamp_s, sample[k]) for stamp_s, sample in taken if not math.isnan(sample[k])]
+            if known:
+                held[k] = known[-1]
+                means[k] = sum(value for _, value in known) / len(known)
+        return means
 
     def _standing(self, stream: str, time_s: float) -> list[float]:
-        """Return the last sample while it stands for one that is missing."""
-        stamp_s, known = self._held.get(stream, (-math.inf, []))
-        return known if time_s - stamp_s <= HELD_S else [math.nan] * len(CHANNELS[stream])
+        """Return the last sample of each channel while it stands for one that is missing."""
+        held = self._held.get(stream, [(-math.inf, math.nan)] * len(CHANNELS[stream]))
+        return [value if time_s - stamp_s <= HELD_S else math.nan for stamp_s, value in held]
+
+    def _known(self, stream: str, time_s: float) -> tuple[float, list[float]] | None:
+        """Return the last sample since the tick before that is known, accurate and not late; None without."""
+        found = None
+        for stamp_s, known in self._taken(stream, time_s):
+            needed = known[:2] if stream == "gnss" else known
+            if any(math.isnan(value) for value in needed):
+                continue
+            if time_s - stamp_s > LATE_S:
+                self.dropped[f"{stream}: late"] += 1
+            elif stream == "gnss" and known[2] > INACCURATE_M:
+                self.dropped["gnss: inaccurate"] += 1
+            else:
+                found = (stamp_s, known)
+        return found
 
     def _fix(self, time_s: float, speed_mps: float) -> dict[str, float]:
         """Return position and heading of the last fix since the tick before, brought to this one."""
-        poses, fixes, headings = (self._taken(name, time_s) for name in ("pose", "gnss", "compass"))
-        if headings:
-            self._held["compass"] = headings[-1]
-        x = y = math.nan
-        stamp_s, yaw = self._held.get("compass", (-math.inf, [math.nan]))
-        if poses:
-            stamp_s, (x, y, heading) = poses[-1]
-            yaw = [heading]
-        elif fixes:
-            if abs(fixes[-1][0] - stamp_s) > TOGETHER_S:
-                yaw = [math.nan]
-            stamp_s, (x, y) = fixes[-1]
-        elif not headings:
+        pose, fix, heading = (self._known(name, time_s) for name in ("pose", "gnss", "compass"))
+        if heading is not None:
+            self._heading = (heading[0], heading[1][0])
+        if pose is not None:
+            stamp_s, (x, y, yaw) = pose
+        elif fix is not None:
+            stamp_s, (x, y, _) = fix
+            yaw = self._heading[1] if abs(stamp_s - self._heading[0]) <= TOGETHER_S else math.nan
+        elif heading is not None:
+            return {"yaw_rad": heading[1][0]}
+        else:
             return {}
         moved = speed_mps * (time_s - stamp_s)
-        if math.isfinite(moved) and math.isfinite(yaw[0]):
-            x, y = x + moved * math.cos(yaw[0]), y + moved * math.sin(yaw[0])
-        return {"position_x_m": x, "position_y_m": y, "yaw_rad": yaw[0]}
+        if math.isfinite(moved) and math.isfinite(yaw):
+            x, y = x + moved * math.cos(yaw), y + moved * math.sin(yaw)
+        return {"position_x_m": x, "position_y_m": y, "yaw_rad": yaw}
 
 
 def ticks(run: RunLog, feed: RowFeed) -> Iterator[tuple[float, Array]]:

@@ -21,6 +21,8 @@ of length h, is implicit, e+ = (1 + h K_dyn + h^2 M)^-1 e with M = (K_C/K_a) G_b
 is stable for every gain.  w is not measured: (4) gives it from the slip angles that are estimated.  The proof
 (14)-(16) takes it as measured, and is approximate.
 
+Without a gyro e_dyn is not measured: yaw rate and w are then those of the slip angles, C is as it was.
+
 C' vanishes with b: cornering stiffness is adapted only while the lateral specific force is above a bound, and
 is kept within physical limits; otherwise it is as it was, with status UNEXCITED.  Its estimate is the secant
 -F/b of a force that saturates, and has to follow it down and up again.
@@ -81,6 +83,7 @@ from terrain.estimation.observers.sideslip_pose import (
     spread,
     status_of,
     take_inputs,
+    yaw_rate_of,
 )
 from terrain.records import Array
 from terrain.robots.bicycle import BicycleRobot
@@ -92,6 +95,8 @@ _N = 8
 K_DYN, K_C, K_C_A, SLIP_WALK, C_WALK, GYRO_STD, INSTRUMENT = range(N_DYNAMIC, N_DYNAMIC + 7)
 _SLOW_MPS = 0.3
 """Slower the dynamics are not used: side forces follow where the tyres were, not where they go."""
+_GYRO_LOST_S = 0.1
+"""So long the dynamics predict the yaw rate between samples of the gyro."""
 
 
 class MultiModelSettings(NamedTuple):
@@ -192,6 +197,16 @@ def _side_speed(params: Array, after: Array) -> float:
 
 
 @njit(cache=True)
+def _motion_by_slip(params: Array, after: Array) -> Array:
+    """Return derivatives (2, 2) of yaw rate and of w in (4) by slip angles."""
+    sign = -1.0 if after[SPEED] < 0.0 else 1.0
+    front = math.cos(min(max(after[STEER] + sign * after[SLIP_F], -1.4), 1.4))
+    by_front = abs(after[SPEED]) / (params[BASE] * front**2)
+    by_rear = abs(after[SPEED]) / (params[BASE] * math.cos(after[SLIP_R]) ** 2)
+    return np.array([[by_front, -by_rear], [params[AHEAD] * by_front, params[BEHIND] * by_rear]])
+
+
+@njit(cache=True)
 def _error_model(params: Array, after: Array, adapted: bool, rate: float) -> tuple[Array, Array, Array]:
     """Return derivatives of g by b and by C (2, 2), 0 where C is not adapted, and of w in (4) by b (2,)."""
     regressors = np.array([after[SLIP_F], after[SLIP_R]])
@@ -201,17 +216,13 @@ def _error_model(params: Array, after: Array, adapted: bool, rate: float) -> tup
         regressors[0] = -load * params[AHEAD] / (after[C_F] * math.cos(after[STEER]))
         regressors[1] = -load * params[BEHIND] / after[C_R]
     by_force = rates_by_force(params, after[STEER])
-    by_slip, by_stiffness, side = np.zeros((2, 2)), np.zeros((2, 2)), np.zeros(2)
+    by_slip, by_stiffness = np.zeros((2, 2)), np.zeros((2, 2))
     for i in range(2):
         by_slip[i, 0], by_slip[i, 1] = by_force[i, 0] * after[C_F], by_force[i, 1] * after[C_R]
         if adapted:
             by_stiffness[i, 0] = by_force[i, 0] * regressors[0]
             by_stiffness[i, 1] = by_force[i, 1] * regressors[1]
-    size, sign = abs(after[SPEED]), -1.0 if after[SPEED] < 0.0 else 1.0
-    front = math.cos(min(max(after[STEER] + sign * after[SLIP_F], -1.4), 1.4))
-    side[0] = size * params[AHEAD] / (params[BASE] * front**2)
-    side[1] = size * params[BEHIND] / (params[BASE] * math.cos(after[SLIP_R]) ** 2)
-    return by_slip, by_stiffness, side
+    return by_slip, by_stiffness, _motion_by_slip(params, after)[1]
 
 
 @njit(cache=True)
@@ -282,6 +293,20 @@ def _correct_dynamics(params: Array, after: Array, cov: Array, rate_measured: fl
 
 
 @njit(cache=True)
+def _follow_slips(params: Array, after: Array, cov: Array, dt_s: float) -> None:
+    """Predict a tick without dynamics in place: yaw rate and w, and their errors, are those of the slips."""
+    moves = abs(after[SPEED]) >= STANDING_MPS
+    add_pose_noise(params, after, cov, params[SLIP_WALK], dt_s)
+    grown = error_growth(params, after, _N, dt_s)
+    grown[4:6, :] = 0.0
+    grown[4:6, 2:4] = _motion_by_slip(params, after) if moves else np.zeros((2, 2))
+    spread(cov, grown)
+    speed = after[SPEED] if moves else 0.0
+    after[RATE] = yaw_rate_of(params, speed, after[STEER], after[SLIP_F], after[SLIP_R])
+    after[SIDE] = _side_speed(params, after) if moves else 0.0
+
+
+@njit(cache=True)
 def _step(params: Array, memory: Array, row: Array, dt_s: float) -> Array:
     after = memory.copy()
     if take_inputs(params, after, row, dt_s) != ObserverStatus.OK.value:
@@ -292,15 +317,17 @@ def _step(params: Array, memory: Array, row: Array, dt_s: float) -> Array:
     known = abs(rate_measured) < 20.0
     after[RATE_AGE] = 0.0 if known else min(after[RATE_AGE] + dt_s, 1e6)
     adapted, posed = False, after[HAS_POSITION] == 1.0 and after[HAS_YAW] == 1.0
-    if posed and dt_s > 0.0 and abs(after[SPEED]) >= _SLOW_MPS:
+    lost = after[RATE_AGE] > _GYRO_LOST_S
+    if posed and dt_s > 0.0 and abs(after[SPEED]) >= _SLOW_MPS and not lost:
+        if memory[RATE_AGE] > _GYRO_LOST_S:
+            after[RATE] = rate_measured
         adapted = _correct_dynamics(params, after, cov, rate_measured, min(dt_s, 0.1))
         add_pose_noise(params, after, cov, params[SLIP_WALK], dt_s)
     elif posed and dt_s > 0.0:
-        spread(cov, error_growth(params, after, _N, dt_s))
-        add_pose_noise(params, after, cov, params[SLIP_WALK], dt_s)
-        after[RATE] = rate_measured if known else after[RATE]
-        after[SIDE] = _side_speed(params, after) if abs(after[SPEED]) >= STANDING_MPS else 0.0
-        cov[4, 4] = params[GYRO_STD] ** 2
+        _follow_slips(params, after, cov, dt_s)
+        if known:
+            after[RATE], cov[4, :], cov[:, 4] = rate_measured, 0.0, 0.0
+            cov[4, 4] = params[GYRO_STD] ** 2
     status = status_of(memory, after, correct_by_fix(params, after, cov, row))
     if status == ObserverStatus.OK.value and not adapted:
         status = ObserverStatus.UNEXCITED.value

@@ -33,7 +33,8 @@ from terrain.records import Array
 RESIDUALS = ("slip_std_ratio", "angle_std_rad", "run_slip_std_ratio", "run_angle_std_rad", "correlation_s")
 """Residuals of a model, and the time over which they are alike."""
 
-DIGITS = 6
+DIGITS, ROUNDED = 6, 1e-4
+"""Of the numbers written, and what their rounding makes of correlations."""
 
 
 def write_slip_model(path: Path, model: SlipModel, robot: str) -> None:
@@ -50,13 +51,11 @@ def write_slip_model(path: Path, model: SlipModel, robot: str) -> None:
     ConfigError
         if the file is no YAML by its name, or is there already.
     """
-    if path.suffix not in (".yaml", ".yml"):
-        raise ConfigError(f"{path}: a slip model is a .yaml file")
-    if path.exists():
-        raise ConfigError(f"{path}: is there already, and is left as it is; choose another name")
+    check_slip_model_file(path)
     std = np.sqrt(np.diag(model.covariance))
     scale = np.where(std > 0.0, std, 1.0)
     correlation = model.covariance / np.outer(scale, scale)
+    np.fill_diagonal(correlation, 1.0)
     pairs = zip(PARAMETERS, model.vector, std, strict=True)
     lines = [
         "# Slip of a tracked robot on one ground, for terrain estimate --filter slip-odometry --slip-model.",
@@ -69,6 +68,20 @@ def write_slip_model(path: Path, model: SlipModel, robot: str) -> None:
         *(f"  - [{', '.join(_text(each) for each in row)}]" for row in correlation),
     ]
     atomic_write(path, "\n".join(lines) + "\n")
+
+
+def check_slip_model_file(path: Path) -> None:
+    """Refuse the place of a new slip model that is no YAML file by its name, or is there already.
+
+    Raises
+    ------
+    ConfigError
+        if it is.
+    """
+    if path.suffix not in (".yaml", ".yml"):
+        raise ConfigError(f"{path}: a slip model is a .yaml file")
+    if path.exists():
+        raise ConfigError(f"{path}: is there already, and is left as it is; choose another name")
 
 
 def read_slip_model(path: Path, robot: str) -> SlipModel:
@@ -120,10 +133,19 @@ def _correlation(place: str, rows: Any) -> Array:
     n = len(PARAMETERS)
     if rows is None:
         return np.eye(n)
-    if not isinstance(rows, list) or len(rows) != n or any(len(row) != n for row in rows):
+    if not isinstance(rows, list) or len(rows) != n or not all(isinstance(row, list) for row in rows):
         raise ConfigError(f"{place}: {n} rows of {n} numbers are required")
-    return np.array([[_number(place, each) for each in row] for row in rows])
+    if any(len(row) != n for row in rows):
+        raise ConfigError(f"{place}: {n} rows of {n} numbers are required")
+    found = np.array([[_number(place, each) for each in row] for row in rows])
+    one = np.abs(np.diag(found) - 1.0).max() <= ROUNDED and np.allclose(found, found.T, atol=ROUNDED)
+    if not one or np.linalg.eigvalsh(found)[0] < -ROUNDED:
+        raise ConfigError(f"{place}: these are no correlations: 1 on the diagonal, symmetric, none beyond 1")
+    return found
 
 
 def _text(value: float) -> str:
-    return repr(float(f"{value:.{DIGITS}g}"))
+    """Return a number as YAML 1.1 reads it: with a point before an exponent."""
+    text = repr(float(f"{value:.{DIGITS}g}"))
+    mantissa, _, exponent = text.partition("e")
+    return text if not exponent or "." in mantissa else f"{mantissa}.0e{exponent}"

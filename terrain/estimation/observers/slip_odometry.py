@@ -57,6 +57,11 @@ SLIPS = ("slip_left_ratio", "slip_right_ratio", "slip_body_rad")
 LONGEST_STEP_S = 1.0
 """Over a longer gap the tracks may have done anything."""
 
+BLIND_MPS = 0.5
+"""Of tracks whose speeds are not known: slow robots too may have begun to drive."""
+LOST_M = 1e6
+"""Standard deviation above which a position is not known at all."""
+
 FASTEST_MPS, FASTEST_RADPS = 20.0, 20.0
 """More than a track or a robot can; such a reading is wrong."""
 
@@ -202,14 +207,27 @@ def take_tilt(after: Array, row: Array) -> bool:
 
 
 @njit(cache=True)
+def _widen(params: Array, after: Array, covariance: Array, dt_s: float) -> None:
+    """Widen the pose by a motion that was not measured: as fast as the tracks were, or :data:`BLIND_MPS`."""
+    moved = max(abs(after[BELTS]), abs(after[BELTS + 1]), BLIND_MPS) * dt_s
+    for i in range(3):
+        std = math.sqrt(max(covariance[i, i], 0.0))
+        grown, most = (std + moved, LOST_M) if i < 2 else (std + moved / params[_HALF], math.pi)
+        grown = max(min(grown, most), std)
+        covariance[i, i] = grown * grown
+
+
+@njit(cache=True)
 def advance(params: Array, after: Array, row: Array, dt_s: float) -> None:
     """Take the measurements of a tick, and move pose and covariance in place."""
     valid = 0.0 <= dt_s <= LONGEST_STEP_S and abs(row[0]) <= FASTEST_MPS and abs(row[1]) <= FASTEST_MPS
+    covariance = after[COVARIANCE : COVARIANCE + N * N].reshape((N, N))
     if not valid:
         after[STATUS] = ObserverStatus.BAD_INPUT.value
+        if 0.0 < dt_s < math.inf:
+            _widen(params, after, covariance, dt_s)
         return
     theta = after[THETA : THETA + N_PARAMETERS]
-    covariance = after[COVARIANCE : COVARIANCE + N * N].reshape((N, N))
     rate_slopes, slopes = np.empty(N_PARAMETERS), np.empty((2, N_PARAMETERS))
     rate, rate_variance, status = yaw_rate_of(params, theta, row, rate_slopes)
     if not take_tilt(after, row):

@@ -31,7 +31,7 @@ from terrain.simulation.tracked.slope import tilt_at
 STEP_S = 0.01
 """From step to step; no sensor is sampled faster."""
 
-ITERATIONS, HALVINGS, TOLERANCE = 40, 12, 1e-8
+ITERATIONS, HALVINGS, TOLERANCE = 60, 40, 1e-8
 """Newton steps, halvings of each, and the residual over the weight at which the balance is reached."""
 
 NUDGE = 1e-7

@@ -199,11 +199,10 @@ def _labels(stretches: Sequence[Stretch], states: Array) -> tuple[Label, ...]:
 def _imu(
     states: Array, tilt: Array, bias_radps: float, sensors: TrackedSensors, rng: np.random.Generator
 ) -> Stream:
-    """Return gyro, specific force and attitude; rates of roll and pitch are those of the tilt."""
+    """Return gyro, specific force and attitude; on an even slope the body turns about its z axis alone."""
     n, turn = len(states), states[:, W]
     grade, roll = tilt.T
     values = np.zeros((n, len(IMU_CHANNELS)))
-    values[:, :2] = np.gradient(np.column_stack([roll, -grade]), STEP_S, axis=0)
     values[:, 2] = turn + bias_radps
     values[:, :3] += sensors.gyro_radps * rng.standard_normal((n, 3))
     values[:, 3] = np.gradient(states[:, VX], STEP_S) - turn * states[:, VY] + GRAVITY_MPS2 * np.sin(grade)
@@ -234,7 +233,11 @@ def _satellites(states: Array, sensors: TrackedSensors, rng: np.random.Generator
 
 def _samples(n: int, rate_hz: float) -> tuple[Array, Array]:
     """Return the steps and stamps of a sensor of a rate."""
-    rows = np.arange(0, n, max(round(1.0 / (rate_hz * STEP_S)), 1)) if rate_hz > 0.0 else np.arange(0, n)
+    if not 0.0 < rate_hz <= 1.0 / STEP_S:
+        raise ConfigError(
+            f"a sensor's rate is {rate_hz:g} Hz, above 0 and up to {1.0 / STEP_S:g} is required"
+        )
+    rows = np.arange(0, n, round(1.0 / (rate_hz * STEP_S)))
     return rows, rows * STEP_S
 
 
@@ -246,11 +249,12 @@ def _truth(robot: TrackedRobot, states: Array, tilt: Array, belts: Array, bias_r
         *(states[:, X], states[:, Y], wrapped(states[:, YAW]), roll, -grade, v_x, v_y, turn),
         np.gradient(v_x, STEP_S) - turn * v_y,
         np.gradient(v_y, STEP_S) + turn * v_x,
+        belts / robot.wheel_radius_m,
         slip_ratio(belts, along, min_speed_mps=0.005),
         slip_angle(v_x, v_y, min_speed_mps=0.005),
         np.full(len(states), bias_radps),
         states[:, HEAP],
     ]
-    slips = wheel_channels("slip_ratio", robot.wheels)
-    channels = (*BODY_TRUTH, *slips, "slip_body_rad", GYRO_BIAS, "heap_m2")
+    tracks = (*wheel_channels("wheel_radps", robot.wheels), *wheel_channels("slip_ratio", robot.wheels))
+    channels = (*BODY_TRUTH, *tracks, "slip_body_rad", GYRO_BIAS, "heap_m2")
     return Stream(np.arange(len(states)) * STEP_S, np.column_stack(columns), channels)

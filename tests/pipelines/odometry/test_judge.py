@@ -59,7 +59,7 @@ def test_commands_of_the_measured_marmotte_held_out(measured):
     ("also", "error", "message"),
     [
         ({"robot": "husky"}, ConfigError, "drive 'skid_steer' has no tracks"),
-        ({"lengths": "0"}, ConfigError, "seconds above zero are required"),
+        ({"lengths": "0"}, ConfigError, "--lengths: 0.2 to 3600 seconds"),
         ({"lengths": "60"}, DataError, "no run has poses"),
         ({"folds": 7}, DataError, "6 runs have legs, at least 7 are required"),
     ],

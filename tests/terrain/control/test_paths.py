@@ -80,6 +80,8 @@ def test_statuses_of_places():
 @pytest.mark.parametrize(
     ("points", "message"),
     [
+        (np.empty((0, 2)), "0 different points"),
+        ([[0, 0]], "1 different points"),
         ([[0, 0], [1, 0]], "2 different points"),
         ([[0, 0], [0, 0], [1, 0], [1, 0]], "2 different points"),
         ([[0, 0], [1, np.nan], [2, 0], [3, 0]], "point 2"),

@@ -127,3 +127,72 @@ def test_a_log_without_what_the_observer_takes_is_refused(run):
         RowFeed(UGV, NAMES, {"wheels": ("motor_1_radps",)})
     with pytest.raises(DataError, match="has no stream wheels"):
         list(ticks(without(run, "wheels"), RowFeed(UGV, NAMES, {"wheels": UGV.rate_channels})))
+
+
+def fed(run, change):
+    """Return rows of a run whose streams are changed, by the name of the stream."""
+    streams = {name: change(name, stream) for name, stream in run.streams.items()}
+    return rows_of(RunLog("a", "orchard_ugv", {name: stream for name, stream in streams.items() if stream}))
+
+
+def test_a_clock_that_is_set_back_begins_anew_and_one_stamp_far_ahead_is_left_behind(run):
+    channels = {name: stream.channels for name, stream in run.streams.items()}
+    for spoilt in ("back", "ahead"):
+        live, found = LiveObserver(counting(NAMES), UGV, channels), []
+        for k, time_s in enumerate(np.arange(0.0, 4.0, 0.02)):
+            stamp_s = (
+                time_s - 3600.0 * (spoilt == "back" and k >= 100) + 1e9 * (spoilt == "ahead" and k == 100)
+            )
+            sample = Reading(np.array([stamp_s]), np.full((1, 9), 0.1))
+            found += live.step({"imu": sample, "wheels": Reading(np.array([stamp_s]), np.full((1, 2), 0.5))})
+        assert len(found) > 180
+        assert live.dropped["time: clock set"] >= 1
+        assert all(np.isfinite(each.mean).all() for each in found)
+
+
+def test_stamps_that_are_no_time_and_channels_that_are_unknown_do_not_take_the_others_along(run):
+    feed = RowFeed(UGV, NAMES, {name: stream.channels for name, stream in run.streams.items()})
+    imu = run.streams["imu"].values[:4].copy()
+    imu[1, 2] = np.nan
+    feed.push("imu", np.array([0.0, np.inf, 0.005, 0.01]), imu)
+    row = feed.tick(0.02, np.array([0.4, 0.6]))
+    known = imu[[0, 2, 3], 2].mean()
+    assert row[NAMES.index("yaw_rate_radps")] == pytest.approx(known)
+    feed.push("imu", np.array([0.03]), np.where(np.arange(9) == 2, np.nan, imu[:1]))
+    row = feed.tick(0.04, np.array([0.4, 0.6]))
+    assert np.isfinite(row[NAMES.index("roll_rad")])
+    assert row[NAMES.index("yaw_rate_radps")] == pytest.approx(imu[3, 2])  # held
+
+
+def test_a_pose_that_is_lost_leaves_the_satellites_and_bad_fixes_are_none(run):
+    def lost(name, stream):
+        if name == "pose":
+            return Stream(stream.time_s, np.full_like(stream.values, np.nan), stream.channels)
+        return stream
+
+    def spoilt(column, value, late_s=0.0):
+        def change(name, stream):
+            if name == "pose":
+                return None
+            if name not in ("gnss", "compass"):
+                return stream
+            values = stream.values.copy()
+            if name == "gnss":
+                values[:, stream.channels.index(column)] = value
+            return Stream(stream.time_s + late_s, values, stream.channels)
+
+        return change
+
+    _, rows, _ = fed(run, lost)
+    assert np.isfinite(rows[:, 2]).sum() == len(run.streams["gnss"])
+    _, rows, feed = fed(run, spoilt("std_position_m", 1.5))
+    assert np.isnan(rows[:, 2]).all()
+    assert feed.dropped["gnss: inaccurate"] == len(run.streams["gnss"])
+
+
+def test_samples_do_not_pile_up_while_no_wheels_come(run):
+    feed = RowFeed(UGV, NAMES, {name: stream.channels for name, stream in run.streams.items()})
+    for k in range(5000):
+        feed.push("imu", np.array([0.01 * k]), np.full((1, 9), 0.1))
+    assert feed.dropped["imu: no wheels came"] > 4500
+    assert feed.tick(50.0, np.array([0.4, 0.6])) is not None

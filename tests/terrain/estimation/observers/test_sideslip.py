@@ -420,6 +420,32 @@ def test_jumps_flips_and_lost_fixes_have_their_statuses(factory):
         assert (track.status[lost[-3] : lost[-1]] == ObserverStatus.PREDICTED).any()
 
 
+def test_without_a_gyro_slip_is_that_of_the_pose_and_stiffness_as_it_was():
+    time_s, rows, truth = drive(4.0, seed=3)
+    silent = np.where(np.arange(8) == pose.IN_RATE, np.nan, rows)
+    track = observe(sideslip_multi_observer(ROBOT), time_s, silent)
+    kinematic = observe(sideslip_kinematic_observer(ROBOT), time_s, silent)
+    late = time_s > 5.0
+    error = np.sqrt(np.mean((track.slip - true_slips(truth))[late] ** 2, axis=0))
+    assert (error < np.radians(1.5)).all()
+    assert np.abs(track.slip - kinematic.slip)[late].max() < np.radians(0.5)
+    assert np.ptp(track.mean[:, 5:7], axis=0).max() == 0.0
+    rate_error = track.mean[late, 3] - truth("yaw_rate_radps")[late]
+    assert np.sqrt(np.mean(rate_error**2)) < 0.05
+    assert 0.25 < np.mean((rate_error / track.std[late, 3]) ** 2) ** 0.5 < 2.0
+    assert not (track.status[late] == ObserverStatus.OK).any()
+
+
+def test_a_gyro_that_fails_and_returns_leaves_the_slip_where_it_is():
+    time_s, rows, truth = drive(4.0, seed=4)
+    faulty = rows.copy()
+    faulty[(time_s > 8.0) & (time_s < 16.0), pose.IN_RATE] = np.nan
+    track = observe(sideslip_multi_observer(ROBOT), time_s, faulty)
+    error = np.abs(track.slip - true_slips(truth))[time_s > 4.0]
+    assert error.max() < np.radians(5.0)
+    assert np.abs(track.mean[:, 3] - truth("yaw_rate_radps"))[time_s > 16.5].max() < 0.1
+
+
 @ANY
 def test_memory_is_finite_for_any_input(factory):
     rng, observer = np.random.default_rng(9), factory(ROBOT)

@@ -190,6 +190,26 @@ def test_statuses():
             assert (found.mean == observer.read(observer.params, memory).mean).all()
 
 
+@pytest.mark.parametrize("name", ["slip", "learning"])
+def test_where_tracks_are_not_measured_the_pose_is_less_certain_by_what_was_driven(name):
+    observer, moving = OBSERVERS[name], np.zeros(len(OBSERVERS[name].rows))
+    moving[:3] = 0.5, 0.7, 0.3
+    if name == "learning":
+        moving[5:] = np.nan
+        moving = np.where(np.isnan(moving), 0.0, moving)
+    memory = observer.step(observer.params, observer.start, moving, 0.0)
+    before = observer.read(observer.params, memory)
+    blind = np.where(np.arange(len(moving)) < 2, np.nan, moving)
+    for missing, steps in ((moving, 1), (blind, 100)):
+        after = memory
+        for _ in range(steps):
+            after = observer.step(observer.params, after, missing, 3.0 / steps)
+        found = observer.read(observer.params, after)
+        assert found.std[:2] - before.std[:2] == pytest.approx(3.0 * 0.7)
+        assert found.std[2] == pytest.approx(np.pi)
+        assert (found.mean == before.mean).all() or name == "learning"
+
+
 @pytest.mark.parametrize("name", OBSERVERS)
 def test_any_input_leaves_a_finite_memory(name):
     observer, rng = OBSERVERS[name], np.random.default_rng(4)

@@ -123,6 +123,14 @@ def test_a_robot_at_rest_stays_on_a_slope():
     assert np.abs(steady(SAND, [0.0, 0.0], math.radians(15.0), 0.7, seconds=5.0)).max() < 1e-4
 
 
+def test_a_robot_that_backs_with_one_track_across_a_slope_does_not_stick():
+    """The balance of a track that stands is stiff in its slip: many halvings of a Newton step are needed."""
+    marmotte = load_robot("marmotte")
+    twist = steady(SAND, [-0.2, 0.0], math.radians(10.0), math.radians(45.0), 2.0, marmotte)
+    assert twist[0] == pytest.approx(-0.1, abs=0.06)
+    assert twist[2] > 0.1
+
+
 def test_bulldozing_resists_turning_and_grows_with_what_is_swept():
     plain = steady(replace(SAND, kphi_npmn2=math.nan, kc_npmn1=math.nan), [0.0, 0.1], seconds=0.3)[2]
     early = steady(SAND, [0.0, 0.1], seconds=0.3)[2]
