@@ -25,7 +25,8 @@ def print_observed(result: ObservedResult, console: Console) -> None:
     for row in result.runs:
         times = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in row.status_s.items())
         dropped = f"; left out: {sum(row.dropped.values())} samples" if row.dropped else ""
-        console.print(f"{row.run_id}: {times}{dropped}", highlight=False)
+        missing = f"; not measured: {', '.join(row.missing)}" if row.missing else ""
+        console.print(f"{row.run_id}: {times}{dropped}{missing}", highlight=False)
     if result.out is not None:
         console.print(f"runs with state and slip written to {result.out}", highlight=False)
     for sentence in result.skipped:

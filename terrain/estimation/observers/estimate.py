@@ -33,6 +33,7 @@ class ObserverEstimate:
     observer : that was run
     track : its estimates
     dropped : samples left out, as counts by stream and kind
+    missing : channels that the observer takes and the log never has
     """
 
     run: RunLog
@@ -40,6 +41,7 @@ class ObserverEstimate:
     observer: Observer
     track: ObserverTrack
     dropped: Mapping[str, int]
+    missing: tuple[str, ...]
 
     def true(self, channel: str) -> Array | None:
         """Return a quantity (n,) of the truth at the ticks; None where the log has none of that name."""
@@ -76,7 +78,10 @@ def observe_run(
     pairs = list(ticks(log, feed))
     time_s = np.array([time for time, _ in pairs])
     rows = np.array([row for _, row in pairs]).reshape(len(pairs), len(observer.rows))
-    return ObserverEstimate(run, driven, observer, observe(observer, time_s, rows), dict(feed.dropped))
+    known = np.isfinite(rows).any(axis=0)
+    missing = tuple(row for row, measured in zip(observer.rows, known, strict=True) if not measured)
+    track = observe(observer, time_s, rows)
+    return ObserverEstimate(run, driven, observer, track, dict(feed.dropped), missing)
 
 
 def with_estimates(found: ObserverEstimate) -> RunLog:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from terrain.estimation.observers.estimate import ObserverEstimate, seconds_by_status
-from terrain.estimation.observers.family import ObserverStatus
+from terrain.estimation.observers.family import ObserverStatus, ObserverTrack
 from terrain.records import Array
 
 SETTLED = (ObserverStatus.OK, ObserverStatus.UNEXCITED)
@@ -45,7 +45,8 @@ class ObserverSummary:
     position_rmse_m, position_end_m : error of the position over the run, and at its end
     status_s : how long it had each status
     dropped : samples left out, as counts by kind
-    finite : whether all estimates are finite once the observer has started
+    missing : what the observer takes and the run never has
+    finite : whether positions are finite once the observer has started, and nothing is infinite
     """
 
     run_id: str
@@ -55,6 +56,7 @@ class ObserverSummary:
     position_end_m: float
     status_s: Mapping[str, float]
     dropped: Mapping[str, int]
+    missing: tuple[str, ...]
     finite: bool
 
 
@@ -77,8 +79,13 @@ def summarize_observer(found: ObserverEstimate) -> ObserverSummary:
         position_end_m=float(error_m[-1]) if len(error_m) else math.nan,
         status_s=seconds_by_status(track),
         dropped=dict(found.dropped),
-        finite=bool(np.isfinite(track.mean[started][:, position]).all()),
+        missing=found.missing,
+        finite=bool(np.isfinite(track.mean[started][:, position]).all()) and not _infinite(track),
     )
+
+
+def _infinite(track: ObserverTrack) -> bool:
+    return any(np.isinf(part).any() for part in (track.mean, track.std, track.slip, track.slip_std))
 
 
 def _slip(slip: Array, std: Array, true: Array | None, settled: Array) -> ObservedSlip:

@@ -131,7 +131,11 @@ def test_a_log_without_fixes_or_gyro_is_run_and_says_so(straight):
     def without(*names):
         return RunLog("a", "orchard_ugv", {k: v for k, v in straight.streams.items() if k not in names})
 
-    blind = observe_run(without("pose", "gnss", "compass"), UGV, "tracked").track
+    found = observe_run(without("pose", "gnss", "compass"), UGV, "tracked")
+    assert found.missing == ("position_x_m", "position_y_m", "yaw_rad")
+    assert summarize_observer(found).missing == found.missing
+    assert summarize_observer(observe_run(straight, UGV, "tracked")).missing == ()
+    blind = found.track
     assert set(blind.status) == {ObserverStatus.STARTING}
     assert np.isnan(blind.slip).all()
     assert np.isfinite(observe_run(without("imu"), UGV, "gyrodometry").track.mean[:, :3]).all()
