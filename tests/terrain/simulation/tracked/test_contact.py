@@ -131,7 +131,7 @@ def test_a_robot_at_rest_stays_on_a_slope():
 
 
 def test_a_step_from_any_motion_reaches_the_balance():
-    """At a kink, where an element slides the other way, at most 2 mm/s are left for the step after."""
+    """At a kink, where an element starts to slide back, at most 2 mm/s are left for the step after."""
     rng, missing, off = np.random.default_rng(0), np.empty(3), []
     contact = contact_array(PATAKO, SAND)
     mass = contact[[MASS, MASS, INERTIA]]
