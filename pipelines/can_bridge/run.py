@@ -18,7 +18,7 @@ from pipelines.reporting.stopping import stopping
 from pipelines.streaming.classifying import ClassifierThread
 from terrain.control.slip_table import load_slip_table
 from terrain.records import Array
-from terrain.robots import as_swerve, load_robot
+from terrain.robots import SwerveRobot, as_drive, load_robot
 
 REQUIRED = tuple(name for name, channels in SIGNALS.items() if not set(channels) <= OPTIONAL)
 """Streams without which a pilot makes no correction."""
@@ -33,8 +33,10 @@ def run_can(settings: CanSettings) -> BridgeReport:
         if robot, table, model or DBC are not accepted, or the bus cannot be opened.
     """
     layout = load_layout(settings.dbc, REQUIRED)
-    robot = as_swerve(
-        load_robot(settings.robot), "robot {name}: drive {drive!r} has no pilot, only 'swerve' has"
+    robot = as_drive(
+        SwerveRobot,
+        load_robot(settings.robot),
+        "robot {name}: drive {drive!r} has no pilot, only 'swerve' has",
     )
     core = BridgeCore(layout, robot, _pilot(settings))
     link = Link(lambda: open_bus(settings.interface, settings.channel, settings.bitrate))

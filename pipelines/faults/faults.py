@@ -23,7 +23,7 @@ from terrain.control.fault_situations import STOP, make_fault_situation
 from terrain.control.learned_table import learned_table
 from terrain.control.slip_table import SlipTable, load_slip_table
 from terrain.errors import ConfigError
-from terrain.robots import Robot, as_swerve, load_robot
+from terrain.robots import Robot, SwerveRobot, as_drive, load_robot
 from terrain.simulation.faults.catalogue import fault_catalogue, select_faults
 from terrain.simulation.faults.fault import SensorFault
 from terrain.simulation.slip_sweep import learning_runs
@@ -44,8 +44,10 @@ def faults_robot(settings: FaultsSettings) -> Robot:
     TerrainError
         if its description cannot be read.
     """
-    robot = as_swerve(
-        load_robot(settings.robot), "robot {name}: drive {drive!r} has no pilot, only 'swerve' has"
+    robot = as_drive(
+        SwerveRobot,
+        load_robot(settings.robot),
+        "robot {name}: drive {drive!r} has no pilot, only 'swerve' has",
     )
     robot.require(*robot.sections)
     catalogue = fault_catalogue(robot)

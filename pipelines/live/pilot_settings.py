@@ -20,7 +20,7 @@ from terrain.control.wheel_controllers import (
     WheelController,
 )
 from terrain.errors import ConfigError
-from terrain.robots import Robot, SwerveRobot, as_swerve
+from terrain.robots import Robot, SwerveRobot, as_drive
 
 CONTROLLERS = ("plain", "ramp", "thesis", "traction")
 """Commands of the kinematics; with a bounded rise of speed; the thesis' PID on each wheel; the controller of
@@ -118,7 +118,7 @@ def check_pilot(robot: Robot, table: SlipTable, settings: PilotSettings) -> Swer
         raise ConfigError(
             f"controller {settings.controller!r} is unknown: use one of {', '.join(CONTROLLERS)}"
         )
-    swerve = as_swerve(robot, "robot {name}: drive {drive!r} has no pilot, only 'swerve' has")
+    swerve = as_drive(SwerveRobot, robot, "robot {name}: drive {drive!r} has no pilot, only 'swerve' has")
     if not (math.isfinite(settings.ramp_mps2) and settings.ramp_mps2 > 0):
         raise ConfigError(f"ramp_mps2 is {settings.ramp_mps2!r}, a number above zero is required")
     check_table(table, robot.name)

@@ -23,7 +23,7 @@ from terrain.measured_slip.slips import MeasuredSlip, measured_slip
 from terrain.measured_slip.surfaces import surface_slip
 from terrain.measured_slip.wheel_distance import DistanceBound, distance_bound
 from terrain.records import RunLog
-from terrain.robots import Robot, as_omni, load_robot
+from terrain.robots import OmniRobot, Robot, as_drive, load_robot
 
 SHORT_S, SHORT_STRIDE_S = 0.5, 0.1
 """Windows of the stream ``slip`` that runs are written with."""
@@ -57,7 +57,7 @@ def measure_slip(
     """
     robot = one_robot(runs, settings.robot)
     if settings.rollers:
-        as_omni(robot, "robot {name}: drive {drive!r} has no rollers, only 'omni' has")
+        as_drive(OmniRobot, robot, "robot {name}: drive {drive!r} has no rollers, only 'omni' has")
     if settings.out is not None:
         _refuse_existing(runs, settings)
     if settings.figures is not None:
@@ -187,7 +187,7 @@ def _named(found: Measured, robot: Robot, rollers: RollerFindings) -> tuple[Name
 
 def _distances(found: Measured, robot: Robot, settings: MeasureSlipSettings) -> dict[str, DistanceBound]:
     """Return the distance of the wheels by each surface on which the robot's turns follow them."""
-    omni = as_omni(robot, "robot {name}: drive {drive!r} has no rollers, only 'omni' has")
+    omni = as_drive(OmniRobot, robot, "robot {name}: drive {drive!r} has no rollers, only 'omni' has")
     bounds = {}
     for name in sorted({_terrain(run) for run in found.runs if not run.session} - {""}):
         slips = [

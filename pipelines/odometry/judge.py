@@ -31,7 +31,7 @@ from terrain.estimation.observers.slip_model_file import check_slip_model_file, 
 from terrain.logs.drive import FILE_NAME, find_sessions
 from terrain.logs.drive_poses import WindowPoses, read_window_poses
 from terrain.records import Array, RunLog
-from terrain.robots import TrackedRobot, as_tracked, load_robot
+from terrain.robots import TrackedRobot, as_drive, load_robot
 
 SHORTEST_S, LONGEST_S = 0.2, 3600.0
 """Legs that are compared: the shortest has two poses of a lidar."""
@@ -56,12 +56,12 @@ def judge_odometry(
     Raises
     ------
     ConfigError
-        if the robot is not tracked, a length is not above zero, or the file is there already.
+        if the robot is not tracked, a length is not accepted, or the file is there already.
     DataError
         if fewer runs than folds have poses.
     """
     refusal = "robot {name}: drive {drive!r} has no tracks; terrain odometry is for 'tracked'"
-    robot = as_tracked(load_robot(settings.robot), refusal)
+    robot = as_drive(TrackedRobot, load_robot(settings.robot), refusal)
     if not all(SHORTEST_S <= length <= LONGEST_S for length in settings.lengths) or not settings.lengths:
         raise ConfigError(f"--lengths: {SHORTEST_S:g} to {LONGEST_S:g} seconds are accepted")
     if settings.out is not None:
@@ -92,7 +92,7 @@ def judge_odometry(
     fitted = fit_odometry(level(SLIP) if flat else SLIP, every, robot)
     if settings.out is not None:
         write_slip_model(settings.out, fitted.model, robot.name)
-    notes = ("no tilt is measured: what slopes do is not fitted",) if flat else ()
+    notes = ("no slope was driven, or no tilt measured: what slopes do is not fitted",) if flat else ()
     return OdometryResult(
         robot.name,
         settings.seed,

@@ -280,9 +280,10 @@ def _bags(place: Path, mapping: str | Path | None, robot: Robot | None) -> list[
 def drive_robot(robot: Robot | None) -> DriveRobot:
     """Return what the reader of DRIVE takes of a robot."""
     from terrain.logs.drive import DriveRobot
-    from terrain.robots import as_skid_steer, load_robot
+    from terrain.robots import SkidSteerRobot, as_drive, load_robot
 
-    robot = as_skid_steer(
+    robot = as_drive(
+        SkidSteerRobot,
         load_robot(DRIVE_ROBOT) if robot is None else robot,
         "robot {name}: drive {drive!r} does not fit logs of DRIVE, which have a left and a right "
         "wheel speed, as 'skid_steer' has",

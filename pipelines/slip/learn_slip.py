@@ -16,7 +16,7 @@ from terrain.control.slip_table import DRIVE_STATES, write_slip_table
 from terrain.errors import ConfigError, DataError
 from terrain.files.atomic import atomic_write, ensure_writable
 from terrain.records import RunLog
-from terrain.robots import Robot, as_swerve, load_robot
+from terrain.robots import Robot, SwerveRobot, as_drive, load_robot
 from terrain.slip_learning.curve import N_BOOTSTRAP
 from terrain.slip_learning.learn import FILTER, LearnedTerrain, TerrainRun, learn_terrain, terrain_runs
 
@@ -94,7 +94,7 @@ def learn_slip(
 
 def _swerve_robot(name: str) -> Robot:
     refusal = "robot {name} has the drive {drive!r}: slip curves are learned for 'swerve' alone"
-    robot = as_swerve(load_robot(name), refusal)
+    robot = as_drive(SwerveRobot, load_robot(name), refusal)
     robot.require(*robot.sections)
     return robot
 

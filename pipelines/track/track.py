@@ -19,8 +19,7 @@ from terrain.control.steering_law import SteeringSettings, SteerStatus
 from terrain.errors import ConfigError
 from terrain.estimation.observers.family import ObserverStatus
 from terrain.files.atomic import atomic_write, ensure_writable
-from terrain.robots import load_robot
-from terrain.robots.bicycle import as_bicycle
+from terrain.robots import BicycleRobot, as_drive, load_robot
 from terrain.simulation.bicycle.plant import Ground
 from terrain.simulation.bicycle.simulate import CarDrive, SpeedProfile, simulate_car
 from terrain.status import StatusCode
@@ -48,8 +47,10 @@ def track(settings: TrackSettings) -> TrackResult:
     from pipelines.track.figures import drive_figures
     from pipelines.track.page import track_page
 
-    robot = as_bicycle(
-        load_robot(settings.robot), "robot {name}: drive {drive!r} cannot be tracked, only 'bicycle' can"
+    robot = as_drive(
+        BicycleRobot,
+        load_robot(settings.robot),
+        "robot {name}: drive {drive!r} cannot be tracked, only 'bicycle' can",
     )
     if settings.speed > robot.speed_max_mps:
         raise ConfigError(

@@ -103,9 +103,7 @@ def fit_runs(x: Array, y: Array, run: Array, names: tuple[str, ...], *, ridge: b
     inverse = np.linalg.inv(x.T @ x + _penalty(x, size))
     coefficient = inverse @ (x.T @ y)
     residual = y - x @ coefficient
-    scores = np.zeros((len(runs), k))
-    np.add.at(scores, number, x * residual[:, None])
-    covariance = len(runs) / (len(runs) - 1.0) * inverse @ (scores.T @ scores) @ inverse
+    covariance = clustered_covariance(inverse, x * residual[:, None], number)
     std = np.sqrt(np.diag(covariance))
     means = np.bincount(number, residual) / np.bincount(number)
     constant = bool((x == 1.0).all(axis=0).any())
@@ -126,6 +124,21 @@ def fit_runs(x: Array, y: Array, run: Array, names: tuple[str, ...], *, ridge: b
         n,
         len(runs),
     )
+
+
+def clustered_covariance(inverse: Array, by_error: Array, number: Array) -> Array:
+    """Return the covariance C (k, k) of a fit whose errors belong together within a run.
+
+    Parameters
+    ----------
+    inverse : (k, k) of the normal matrix
+    by_error : (n, k) derivatives of each error by the coefficients, times the error
+    number : (n,) of the run of each error, 0 to G - 1
+    """
+    n = int(number.max()) + 1
+    scores = np.zeros((n, by_error.shape[1]))
+    np.add.at(scores, number, by_error)
+    return np.asarray(n / max(n - 1, 1) * inverse @ (scores.T @ scores) @ inverse)
 
 
 def _penalty(x: Array, size: float) -> Array:

@@ -22,6 +22,7 @@ import numpy as np
 from numba import njit
 from scipy.optimize import least_squares
 
+from terrain.calibration.clustered_fit import clustered_covariance
 from terrain.calibration.odometry_legs import Leg
 from terrain.errors import DataError
 from terrain.estimation.observers.slip_learning import unknown_ground
@@ -155,7 +156,10 @@ def fit_odometry(kind: Kind, legs: Sequence[Leg], robot: TrackedRobot) -> Fitted
     covariance = np.zeros((N_MODEL, N_MODEL))
     by = done.jac[: 2 * len(legs)]
     left = done.fun[: 2 * len(legs)]
-    covariance[np.ix_(free, free)] = _clustered(by, left, legs, known_std)[:-3, :-3]
+    inverse = np.linalg.inv(by.T @ by + np.diag(1.0 / known_std**2))
+    _, number = np.unique([leg.run for leg in legs], return_inverse=True)
+    clustered = clustered_covariance(inverse, by * left[:, None], np.repeat(number, 2))
+    covariance[np.ix_(free, free)] = clustered[:-3, :-3]
     left_m = np.hypot(*errors_m(found).T) * longer
     path_m = np.array([np.abs(leg.speeds_mps.mean(axis=1)).sum() * leg.step_s for leg in legs])
     ratio = float(np.sqrt((left_m**2).mean() / max((path_m**2).mean(), 1e-12)))
@@ -183,22 +187,7 @@ def without_tilt(legs: Sequence[Leg]) -> bool:
 def level(kind: Kind) -> Kind:
     """Return a kind without the parameters that only slopes show."""
     tilt = {GRADE, TURN_GRADE, SIDE, TURN_SIDE, TURN_SHIFT, *(ANGLE + k for k in (4, 5, 7))}
-    return replace_free(kind, tuple(place for place in kind.free if place not in tilt))
-
-
-def replace_free(kind: Kind, free: tuple[int, ...]) -> Kind:
-    """Return a kind with other free parameters."""
-    return kind._replace(free=free)
-
-
-def _clustered(by: Array, error: Array, legs: Sequence[Leg], known_std: Array) -> Array:
-    """Return the covariance of a fit whose errors are alike within a run."""
-    inverse = np.linalg.inv(by.T @ by + np.diag(1.0 / known_std**2))
-    runs, number = np.unique([leg.run for leg in legs], return_inverse=True)
-    scores = np.zeros((len(runs), by.shape[1]))
-    np.add.at(scores, np.repeat(number, 2), by * error[:, None])
-    n = len(runs)
-    return np.asarray(n / max(n - 1, 1) * inverse @ (scores.T @ scores) @ inverse)
+    return kind._replace(free=tuple(place for place in kind.free if place not in tilt))
 
 
 class _Packed(NamedTuple):

@@ -16,7 +16,7 @@ from numba import njit
 
 from terrain.angles import unwrapped
 from terrain.errors import DataError
-from terrain.estimation.observers.rows import RowFeed, ticks
+from terrain.estimation.observers.rows import feed_of, rows_of
 from terrain.estimation.observers.slip_model import TIGHT_RATIO, next_displacement
 from terrain.estimation.observers.slip_odometry import ROWS
 from terrain.records import Array, RunLog
@@ -138,9 +138,7 @@ def odometry_rows(run: RunLog, robot: TrackedRobot) -> tuple[Array, Array]:
     DataError
         if the run has no speeds of tracks.
     """
-    feed = RowFeed(robot, ROWS, {name: stream.channels for name, stream in run.streams.items()})
-    found = list(ticks(run, feed))
-    return np.array([time_s for time_s, _ in found]), np.array([row for _, row in found])
+    return rows_of(run, feed_of(run, robot, ROWS))
 
 
 def slip_samples(

@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import least_squares
 
-from terrain.calibration.clustered_fit import LinearFit, fit_runs
+from terrain.calibration.clustered_fit import LinearFit, clustered_covariance, fit_runs
 from terrain.calibration.track_motion import SlipSamples
 from terrain.errors import DataError
 from terrain.records import Array
@@ -93,10 +93,7 @@ def fit_turning(
     error, by = done.fun, done.jac.copy()
     if not grade:
         by[:, 1] = 0.0
-    inverse = np.linalg.pinv(by.T @ by)
-    scores = np.zeros((len(runs), 2))
-    np.add.at(scores, number, by * error[:, None])
-    covariance = len(runs) / (len(runs) - 1.0) * inverse @ (scores.T @ scores) @ inverse
+    covariance = clustered_covariance(np.linalg.pinv(by.T @ by), by * error[:, None], number)
     means = np.bincount(number, error) / np.bincount(number)
     within = np.sum((error - means[number]) ** 2) / max(len(error) - len(runs), 1)
     return TurningFit(

@@ -12,9 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from terrain.discrepancy.verdict import Value
 from terrain.effects import PARAMETER, Wording, effect_named
 from terrain.extension import Basis, Origin, basis_of
-from terrain.robots import Robot, TrackedRobot
-from terrain.robots.bicycle import as_bicycle
-from terrain.robots.omni import as_omni
+from terrain.robots import BicycleRobot, OmniRobot, Robot, TrackedRobot, as_drive
 from terrain.simulation.planar.skid_steer import SLIDING_RADPS
 
 EXAMPLE_RADPS, EXAMPLE_MPS = 0.5, 1.0
@@ -188,8 +186,8 @@ def _centre_of_mass(values: Sequence[Value], total: Total, robot: Robot) -> str:
 
 def _wheel_distance(values: Sequence[Value], total: Total, robot: Robot) -> str:
     (value,) = values
-    distance_m = as_omni(
-        robot, "robot {name}: drive {drive!r} has no distance of omni wheels"
+    distance_m = as_drive(
+        OmniRobot, robot, "robot {name}: drive {drive!r} has no distance of omni wheels"
     ).wheel_distance_m
     number = rounded(distance_m * (1.0 + total[value.name]), distance_m * _half(value))
     return f"wheels {number} m from the middle (described: {distance_m:.3g} m)"
@@ -252,7 +250,7 @@ def _one_sided(values: Sequence[Value], total: Total, robot: Robot) -> str:
 
 def _understeer(values: Sequence[Value], total: Total, robot: Robot) -> str:
     (value,) = values
-    car = as_bicycle(robot, "robot {name}: drive {drive!r} has no understeer")
+    car = as_drive(BicycleRobot, robot, "robot {name}: drive {drive!r} has no understeer")
     own, added = car.understeer_s2pm, total[value.name]
     turned = [car.wheelbase_m / (car.wheelbase_m + each * FAST_MPS**2) for each in (own, own + added)]
     percent = 100.0 * abs(turned[1] / turned[0] - 1.0)

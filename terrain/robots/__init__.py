@@ -1,14 +1,14 @@
 """Robots: one type a drive, the sections of their descriptions, and the reader of those."""
 
-from terrain.robots.bicycle import BicycleRobot, as_bicycle
-from terrain.robots.omni import OmniRobot, as_omni
+from terrain.robots.bicycle import BicycleRobot
+from terrain.robots.omni import OmniRobot
 from terrain.robots.parts import Body, Camera, Equipment, Motors, Part, Sensors, Steering
 from terrain.robots.reader import description_file, load_robot, packaged_robot, read_description, robot_from
 from terrain.robots.region import Region
-from terrain.robots.robot import Robot
-from terrain.robots.skid_steer import SkidSteerRobot, as_skid_steer
-from terrain.robots.swerve import SwerveRobot, as_swerve
-from terrain.robots.tracked import TrackedRobot, as_tracked
+from terrain.robots.robot import Robot, as_drive
+from terrain.robots.skid_steer import SkidSteerRobot
+from terrain.robots.swerve import SwerveRobot
+from terrain.robots.tracked import TrackedRobot
 
 __all__ = [
     "BicycleRobot",
@@ -25,11 +25,7 @@ __all__ = [
     "Steering",
     "SwerveRobot",
     "TrackedRobot",
-    "as_bicycle",
-    "as_omni",
-    "as_skid_steer",
-    "as_swerve",
-    "as_tracked",
+    "as_drive",
     "description_file",
     "load_robot",
     "packaged_robot",

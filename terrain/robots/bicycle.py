@@ -146,21 +146,3 @@ class BicycleRobot(Robot):
             raise ConfigError(
                 f"{place}: steering_max_rad is {self.steering_max_rad:g}, below pi/2 is required"
             )
-
-
-def as_bicycle(robot: Robot, refusal: str) -> BicycleRobot:
-    """Return the robot as the car-like robot that it is.
-
-    Parameters
-    ----------
-    robot : any
-    refusal : the message for other robots, with ``{name}`` and ``{drive}`` in it
-
-    Raises
-    ------
-    ConfigError
-        if it has another drive.
-    """
-    if not isinstance(robot, BicycleRobot):
-        raise ConfigError(refusal.format(name=robot.name, drive=robot.drive))
-    return robot

@@ -139,21 +139,3 @@ class OmniRobot(Robot):
                 f"{self.body.footprint_max_m / 2.0:g} m"
             )
         check_centre_of_mass(place, self.wheel_positions_m, self.body)
-
-
-def as_omni(robot: Robot, refusal: str) -> OmniRobot:
-    """Return the robot as the omni robot that it is.
-
-    Parameters
-    ----------
-    robot : any
-    refusal : the message for other robots, with ``{name}`` and ``{drive}`` in it
-
-    Raises
-    ------
-    ConfigError
-        if it has another drive.
-    """
-    if not isinstance(robot, OmniRobot):
-        raise ConfigError(refusal.format(name=robot.name, drive=robot.drive))
-    return robot

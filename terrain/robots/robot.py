@@ -352,3 +352,32 @@ def _neutral(kind: type[P], **values: float) -> P:
         for name in named
     }
     return kind(**(default | values))
+
+
+_R = TypeVar("_R", bound=Robot)
+
+
+def as_drive(kind: type[_R], robot: Robot, refusal: str) -> _R:
+    """Return the robot as the one of a drive that it is.
+
+    Parameters
+    ----------
+    kind : of robot that is required
+    robot : any
+    refusal : the message for other robots, with ``{name}`` and ``{drive}`` in it
+
+    Raises
+    ------
+    ConfigError
+        if it has another drive.
+
+    Examples
+    --------
+    >>> from terrain.robots import SwerveRobot, load_robot
+    >>> as_drive(SwerveRobot, load_robot("husky"), "robot {name}: drive {drive!r} has no pilot")
+    Traceback (most recent call last):
+    terrain.errors.ConfigError: robot husky: drive 'skid_steer' has no pilot
+    """
+    if not isinstance(robot, kind):
+        raise ConfigError(refusal.format(name=robot.name, drive=robot.drive))
+    return robot

@@ -8,7 +8,6 @@ from typing import ClassVar
 
 import numpy as np
 
-from terrain.errors import ConfigError
 from terrain.records import Array, read_only
 from terrain.robots.robot import Robot
 
@@ -62,21 +61,3 @@ class SkidSteerRobot(Robot):
     def wheel_speeds_mps(self, rows: Array) -> Array:
         """Return the rows (..., 2) as they are: they are wheel circumferential speeds."""
         return np.asarray(rows)
-
-
-def as_skid_steer(robot: Robot, refusal: str) -> SkidSteerRobot:
-    """Return the robot as the skid-steer robot that it is.
-
-    Parameters
-    ----------
-    robot : any
-    refusal : the message for other robots, with ``{name}`` and ``{drive}`` in it
-
-    Raises
-    ------
-    ConfigError
-        if it has another drive.
-    """
-    if not isinstance(robot, SkidSteerRobot):
-        raise ConfigError(refusal.format(name=robot.name, drive=robot.drive))
-    return robot

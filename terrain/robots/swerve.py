@@ -8,7 +8,6 @@ from typing import ClassVar
 
 import numpy as np
 
-from terrain.errors import ConfigError
 from terrain.records import Array, read_only
 from terrain.robots.parts import Steering
 from terrain.robots.robot import Robot, check_centre_of_mass
@@ -93,28 +92,3 @@ class SwerveRobot(Robot):
         super().check_geometry(place)
         if self.describes("body"):
             check_centre_of_mass(place, self.wheel_positions_m, self.body)
-
-
-def as_swerve(robot: Robot, refusal: str) -> SwerveRobot:
-    """Return the robot as the swerve robot that it is.
-
-    Parameters
-    ----------
-    robot : any
-    refusal : the message for other robots, with ``{name}`` and ``{drive}`` in it
-
-    Raises
-    ------
-    ConfigError
-        if it has another drive.
-
-    Examples
-    --------
-    >>> from terrain.robots import load_robot
-    >>> as_swerve(load_robot("husky"), "robot {name}: drive {drive!r} has no pilot, only 'swerve' has")
-    Traceback (most recent call last):
-    terrain.errors.ConfigError: robot husky: drive 'skid_steer' has no pilot, only 'swerve' has
-    """
-    if not isinstance(robot, SwerveRobot):
-        raise ConfigError(refusal.format(name=robot.name, drive=robot.drive))
-    return robot

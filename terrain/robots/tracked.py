@@ -8,7 +8,6 @@ from types import MappingProxyType
 from typing import Any, ClassVar, Self
 
 from terrain.errors import ConfigError
-from terrain.robots.robot import Robot
 from terrain.robots.skid_steer import SkidSteerRobot
 
 
@@ -77,21 +76,3 @@ class TrackedRobot(SkidSteerRobot):
                 f"{place}: track_width_m is {self.track_width_m:g}, less than track_m "
                 f"({self.track_m:g} m) is required: the tracks would overlap"
             )
-
-
-def as_tracked(robot: Robot, refusal: str) -> TrackedRobot:
-    """Return the robot as the tracked robot that it is.
-
-    Parameters
-    ----------
-    robot : any
-    refusal : the message for other robots, with ``{name}`` and ``{drive}`` in it
-
-    Raises
-    ------
-    ConfigError
-        if it has another drive.
-    """
-    if not isinstance(robot, TrackedRobot):
-        raise ConfigError(refusal.format(name=robot.name, drive=robot.drive))
-    return robot

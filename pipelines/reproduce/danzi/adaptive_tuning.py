@@ -14,11 +14,11 @@ from pipelines.reproduce.danzi.runs import (
     NO_SLIP_RATIO,
     ROBOT,
     mean_between,
-    over_runs,
     seeded_runs,
     steady_mean,
     true_slip,
 )
+from pipelines.reproduce.over_runs import over_runs
 from pipelines.reproduce.results import Finding, Picture, Row, holds
 from terrain.estimation.estimate import Estimate, estimate_run
 from terrain.estimation.filters.swerve_noise import adaptive_noise

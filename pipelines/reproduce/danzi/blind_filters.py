@@ -12,12 +12,11 @@ from pipelines.reproduce.danzi.runs import (
     NO_SLIP_RATIO,
     ROBOT,
     START_S,
-    OverRuns,
-    over_runs,
     seeded_runs,
     steady_mean,
     true_slip,
 )
+from pipelines.reproduce.over_runs import OverRuns, over_runs
 from pipelines.reproduce.results import Finding, Picture, Row, Verdict, holds, verdict_of
 from terrain.estimation.estimate import Estimate, estimate_run
 from terrain.records import Array

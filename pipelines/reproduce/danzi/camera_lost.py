@@ -12,13 +12,12 @@ from pipelines.reporting.line_figure import Line, lines_figure
 from pipelines.reporting.numbers import format_number
 from pipelines.reproduce.danzi.runs import (
     ROBOT,
-    OverRuns,
     estimate_with_both_filters,
     mean_between,
-    over_runs,
     seeded_runs,
     true_slip,
 )
+from pipelines.reproduce.over_runs import OverRuns, over_runs
 from pipelines.reproduce.results import Finding, Picture, Row, Verdict
 from terrain.estimation.estimate import Estimate
 from terrain.records import Array

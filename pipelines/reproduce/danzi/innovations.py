@@ -11,7 +11,8 @@ from matplotlib.figure import Figure
 from pipelines.estimate.figures import motion_figure
 from pipelines.reporting.drawing import BLUE, FAINT_INK, GRID, finished, new_figure, styled
 from pipelines.reporting.numbers import format_number
-from pipelines.reproduce.danzi.runs import ROBOT, OverRuns, over_runs, seeded_runs
+from pipelines.reproduce.danzi.runs import ROBOT, seeded_runs
+from pipelines.reproduce.over_runs import OverRuns, over_runs
 from pipelines.reproduce.results import Finding, Picture, Row, Verdict, verdict_of
 from terrain.estimation.ekf.innovations import Innovations
 from terrain.estimation.estimate import THESIS_SAMPLE_TIME_S, Estimate, estimate_run

@@ -33,13 +33,6 @@ class Curve(NamedTuple):
     speed_mps: Array
 
 
-class OverRuns(NamedTuple):
-    """Mean of a number over several runs, and its range (lowest, highest)."""
-
-    mean: float
-    spread: tuple[float, float]
-
-
 def seeded_runs(
     robot: Robot,
     terrain: str,
@@ -103,14 +96,3 @@ def extreme_in_start(
     chosen = (curve.time_s > START_S[0]) & (curve.time_s < START_S[1]) & (curve.speed_mps > above_mps)
     values = curve.slip_ratio[chosen]
     return float(extreme(values[np.isfinite(values)]))
-
-
-def over_runs(values: Sequence[float]) -> OverRuns:
-    """Return the mean over runs and their range.
-
-    Examples
-    --------
-    >>> over_runs([1.0, 2.0, 6.0])
-    OverRuns(mean=3.0, spread=(1.0, 6.0))
-    """
-    return OverRuns(float(np.mean(values)), (float(np.min(values)), float(np.max(values))))

@@ -5,11 +5,11 @@ from __future__ import annotations
 from pipelines.reproduce.danzi.runs import (
     ROBOT,
     estimate_with_both_filters,
-    over_runs,
     seeded_runs,
     steady_mean,
     true_slip,
 )
+from pipelines.reproduce.over_runs import over_runs
 from pipelines.reproduce.results import Finding, Row, Verdict, verdict_of
 from terrain.robots import Robot, load_robot
 

@@ -16,11 +16,11 @@ from pipelines.reproduce.danzi.runs import (
     estimate_with_both_filters,
     extreme_in_start,
     lagged_truth,
-    over_runs,
     seeded_runs,
     steady_mean,
     true_slip,
 )
+from pipelines.reproduce.over_runs import over_runs
 from pipelines.reproduce.results import Finding, Picture, Row, Verdict, verdict_of
 from terrain.estimation.estimate import Estimate
 from terrain.robots import load_robot

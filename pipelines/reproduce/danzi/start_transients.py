@@ -20,9 +20,9 @@ from pipelines.reproduce.danzi.runs import (
     Curve,
     extreme_in_start,
     lagged_truth,
-    over_runs,
     seeded_runs,
 )
+from pipelines.reproduce.over_runs import over_runs
 from pipelines.reproduce.results import Finding, Picture, Row, Verdict, holds
 from terrain.estimation.ekf.filter import run_filter
 from terrain.estimation.ekf.model import FilterSettings

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipelines.reproduce.danzi.runs import over_runs
+from pipelines.reproduce.over_runs import over_runs
 from pipelines.reproduce.results import Finding, Row, Verdict, holds
 from terrain.control.danzi_pid import new_state, thesis_settings, thesis_step
 from terrain.control.pid import Gains

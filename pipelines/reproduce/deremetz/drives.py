@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pipelines.reproduce.over_runs import OverRuns, over_runs
 from terrain.control.car_evaluation import FollowedDrive, followed_drive
 from terrain.control.car_following import CarFollower, SlipSource
 from terrain.control.car_scenarios import STOP, Course, slope_course, stop_course
@@ -19,8 +20,7 @@ from terrain.estimation.observers.sideslip_multi import (
     MultiModelSettings,
     sideslip_multi_observer,
 )
-from terrain.robots import load_robot
-from terrain.robots.bicycle import BicycleRobot, as_bicycle
+from terrain.robots import BicycleRobot, as_drive, load_robot
 from terrain.simulation.bicycle.simulate import simulate_car
 
 RUNS, FEW_RUNS = 5, 2
@@ -60,7 +60,7 @@ VARIANTS: dict[str, Variant] = {
 
 def adap2e() -> BicycleRobot:
     """Return the robot of the paper."""
-    return as_bicycle(load_robot("adap2e"), "robot {name}: a car-like one is needed")
+    return as_drive(BicycleRobot, load_robot("adap2e"), "robot {name}: a car-like one is needed")
 
 
 @lru_cache(maxsize=64)
@@ -91,23 +91,6 @@ def drives(
     return [follow(course, speed_mps, variant, 1000 * seed + k, soft) for k in numbers]
 
 
-class OverDrives(NamedTuple):
-    """Mean of a number over drives, and its range."""
-
-    mean: float
-    spread: tuple[float, float]
-
-
-def over(found: list[FollowedDrive], value: Callable[[FollowedDrive], float]) -> OverDrives:
-    """Return a number over drives.
-
-    Examples
-    --------
-    >>> over([], lambda drive: 0.0)
-    Traceback (most recent call last):
-    ValueError: no drives
-    """
-    if not found:
-        raise ValueError("no drives")
-    values = [value(drive) for drive in found]
-    return OverDrives(float(np.mean(values)), (float(np.min(values)), float(np.max(values))))
+def over(found: list[FollowedDrive], value: Callable[[FollowedDrive], float]) -> OverRuns:
+    """Return a number over drives."""
+    return over_runs([value(drive) for drive in found])

@@ -8,9 +8,10 @@ import numpy as np
 
 from pipelines.reporting.drawing import BLUE, INK, VERMILION
 from pipelines.reporting.line_figure import Line
+from pipelines.reproduce.over_runs import OverRuns, over_runs
 from pipelines.reproduce.results import Finding, Picture, Row, Verdict
 from pipelines.reproduce.tazzari.figures import Panel, panels_figure
-from pipelines.reproduce.tazzari.runs import NORMALISED, OverSeeds, orchard_ugv, over_seeds, rms, seeds
+from pipelines.reproduce.tazzari.runs import NORMALISED, orchard_ugv, rms, seeds
 from terrain.control.tracked_speed import track_speed_params, track_speed_step
 from terrain.estimation.observers.tracked import tracked_observer
 from terrain.records import Array
@@ -44,10 +45,8 @@ def compensation(seed: int, quick: bool) -> Finding:
     }
     held, plain = runs[True], runs[False]
     rows = [
-        _row("Forward speed", "m/s", over_seeds(_off(held, 0)), over_seeds(_off(plain, 0)).mean, FORWARD_MPS),
-        _row(
-            "Turning speed", "rad/s", over_seeds(_off(held, 1)), over_seeds(_off(plain, 1)).mean, TURN_RADPS
-        ),
+        _row("Forward speed", "m/s", over_runs(_off(held, 0)), over_runs(_off(plain, 0)).mean, FORWARD_MPS),
+        _row("Turning speed", "rad/s", over_runs(_off(held, 1)), over_runs(_off(plain, 1)).mean, TURN_RADPS),
     ]
     return Finding(rows, [_picture(held[0], plain[0])])
 
@@ -92,7 +91,7 @@ def _off(runs: list[Held], which: int) -> list[float]:
     return [rms(run.speed[run.time_s > SETTLED_S, which] - desired) for run in runs]
 
 
-def _row(what: str, unit: str, off: OverSeeds, plain: float, desired: float) -> Row:
+def _row(what: str, unit: str, off: OverRuns, plain: float, desired: float) -> Row:
     return Row(
         what=f"{what}, root mean square from the desired {desired:g} {unit}",
         where="VI, future work",

@@ -9,13 +9,12 @@ from typing import NamedTuple
 import numpy as np
 
 from terrain.estimation.observers.family import ObserverTrack, observe
-from terrain.estimation.observers.rows import RowFeed, ticks
+from terrain.estimation.observers.rows import feed_of, rows_of
 from terrain.estimation.observers.track_efficiency import measured_efficiency
 from terrain.estimation.observers.tracked import tracked_observer
 from terrain.estimation.observers.tracked_settings import TrackedSettings
 from terrain.records import Array, RunLog
-from terrain.robots import TrackedRobot, load_robot
-from terrain.robots.tracked import as_tracked
+from terrain.robots import TrackedRobot, as_drive, load_robot
 from terrain.simulation.tracked.given_slip import GivenSlip
 from terrain.simulation.tracked.run import COMMANDS_HZ, NOISY, TrackedSensors, simulate_tracked
 from terrain.terramechanics.soil import Soil
@@ -77,7 +76,9 @@ class ObservedRun(NamedTuple):
 
 def orchard_ugv() -> TrackedRobot:
     """Return the vehicle of the paper."""
-    return as_tracked(load_robot("orchard_ugv"), "robot {name!r} is {drive}, a tracked one is required")
+    return as_drive(
+        TrackedRobot, load_robot("orchard_ugv"), "robot {name!r} is {drive}, a tracked one is required"
+    )
 
 
 def eta_of(track: ObserverTrack) -> Array:
@@ -109,9 +110,7 @@ def observed(
     streams = {name: stream for name, stream in run.streams.items() if name != "pose"}
     run = replace(run, streams=streams)
     observer = tracked_observer(robot, settings)
-    feed = RowFeed(robot, observer.rows, {name: stream.channels for name, stream in streams.items()})
-    found = list(ticks(run, feed))
-    time_s, rows = np.array([each[0] for each in found]), np.array([each[1] for each in found])
+    time_s, rows = rows_of(run, feed_of(run, robot, observer.rows))
     for start_s, end_s in lost_s:
         rows[(time_s >= start_s) & (time_s < end_s), 2:5] = np.nan
     truth = streams["truth"]
@@ -157,21 +156,3 @@ def converged_s(run: ObservedRun, ratio: float) -> float:
 def rms(values: Array) -> float:
     """Return the root of the mean square of all values."""
     return float(np.sqrt(np.mean(np.square(values))))
-
-
-class OverSeeds(NamedTuple):
-    """Mean of a number over several runs, and its range (lowest, highest)."""
-
-    mean: float
-    spread: tuple[float, float]
-
-
-def over_seeds(values: Sequence[float]) -> OverSeeds:
-    """Return the mean over runs and their range.
-
-    Examples
-    --------
-    >>> over_seeds([1.0, 2.0, 6.0])
-    OverSeeds(mean=3.0, spread=(1.0, 6.0))
-    """
-    return OverSeeds(float(np.mean(values)), (float(min(values)), float(max(values))))

@@ -31,7 +31,7 @@ from pipelines.reproduce.yamauchi.trials import (
     turning_trials,
 )
 from pipelines.reproduce.yamauchi.turning_odometry import ENDO, GYRO, SLIP, errors_of, gains, odometries
-from terrain.estimation.observers.rows import RowFeed, ticks
+from terrain.estimation.observers.rows import feed_of, ticks
 from terrain.estimation.observers.slip_learning import (
     OBSERVED_RATIO,
     PRIOR_STD,
@@ -97,8 +97,7 @@ def learn(runs: Sequence[RunLog]) -> Progress:
     for run in runs:
         observer = slip_learning_observer(patako(), model)
         memory, last_s = observer.start, None
-        feed = RowFeed(patako(), observer.rows, {name: each.channels for name, each in run.streams.items()})
-        for time_s, row in ticks(without_cameras(run), feed):
+        for time_s, row in ticks(without_cameras(run), feed_of(run, patako(), observer.rows)):
             memory = observer.step(observer.params, memory, row, 0.0 if last_s is None else time_s - last_s)
             last_s = time_s
         model = learned_model(observer.params, memory)

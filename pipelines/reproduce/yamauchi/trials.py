@@ -18,8 +18,7 @@ from terrain.calibration.track_motion import odometry_rows, slip_samples
 from terrain.calibration.turning_exponent import TurningFit, fit_turning
 from terrain.estimation.observers.family import Observer, ObserverTrack, observe
 from terrain.records import Array, RunLog
-from terrain.robots import TrackedRobot, load_robot
-from terrain.robots.tracked import as_tracked
+from terrain.robots import TrackedRobot, as_drive, load_robot
 from terrain.simulation.tracked.run import simulate_tracked
 from terrain.simulation.tracked.slope import Slope
 from terrain.terramechanics.soil import Soil, load_soil, scattered
@@ -35,8 +34,8 @@ JUDGED = ((8.0, 20.0), (8.0, 30.0), (15.0, 20.0), (15.0, 30.0))
 """Slope in deg and input yaw rate in deg/s of experiment III."""
 
 UPHILL, DOWNHILL = math.pi / 2, -math.pi / 2
-"""Heading of uphill of a robot that starts along the contour and turns to the left: uphill, as in the "
-"paper."""
+"""Heading of uphill of a robot that starts along the contour and turns to the left: uphill, as in the
+paper."""
 
 REPEATS, FEW_REPEATS = 3, 1
 TRIALS, FEW_TRIALS = 20, 3
@@ -46,8 +45,8 @@ N_DRAWS = 2000
 TURNED_RAD = math.pi / 2
 SETTLE_S = 1.0
 LOST_RATIO = 0.38
-"""Of the input yaw rate in a turn on sand: only how long a turn is commanded, so that it ends near 90 "
-"degrees."""
+"""Of the input yaw rate in a turn on sand: only how long a turn is commanded, so that it ends near 90
+degrees."""
 
 
 class Trial(NamedTuple):
@@ -61,7 +60,7 @@ class Trial(NamedTuple):
 
 def patako() -> TrackedRobot:
     """Return the robot."""
-    return as_tracked(load_robot(ROBOT), "{name} is no tracked robot")
+    return as_drive(TrackedRobot, load_robot(ROBOT), "{name} is no tracked robot")
 
 
 def run_trial(

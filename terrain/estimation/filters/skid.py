@@ -41,7 +41,7 @@ from terrain.estimation.ekf.kernel import OBSERVE, PROPAGATE
 from terrain.estimation.ekf.model import FilterModel, Noise
 from terrain.estimation.measurements.skid_rows import REST_ROW, WHEELS_AND_GYRO
 from terrain.records import Array
-from terrain.robots import Robot, as_skid_steer
+from terrain.robots import Robot, SkidSteerRobot, as_drive
 
 MIN_TURN_RADPS = 0.15
 """Wheels that differ by less, over the described track, show nothing of the effective one: D is noise."""
@@ -158,7 +158,7 @@ def make_skid_filter(robot: Robot) -> FilterModel:
     >>> make_skid_filter(load_robot("husky")).references
     ()
     """
-    as_skid_steer(robot, "robot {name} has the drive {drive!r}: this filter is for 'skid_steer'")
+    as_drive(SkidSteerRobot, robot, "robot {name} has the drive {drive!r}: this filter is for 'skid_steer'")
     mean = np.zeros(len(_STATES))
     mean[_TRACK] = robot.track_m
     sensors = ("wheel_left", "wheel_right", "gyro", "rest")

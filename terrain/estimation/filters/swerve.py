@@ -75,7 +75,7 @@ from terrain.estimation.filters.swerve_model import (
 )
 from terrain.estimation.measurements.table import CAMERA_ROWS, DERIVED_ROWS, GNSS_ROWS
 from terrain.records import Array
-from terrain.robots import Robot, as_swerve
+from terrain.robots import Robot, SwerveRobot, as_drive
 
 _WHEELS = ("1", "2", "3")
 _FADING_PER_S = 3.0  # of the acceleration of vio15: a third of a second, shorter than a start and a stop
@@ -200,7 +200,7 @@ def layout_of(name: str, robot: Robot) -> Layout:
     """Return the layout of a filter that fits the robot."""
     if name not in LAYOUTS:
         raise ConfigError(f"filter {name!r} is unknown: use one of {', '.join(FILTERS)}")
-    as_swerve(robot, f"robot {{name}} has the drive {{drive!r}}: filter {name} is for 'swerve'")
+    as_drive(SwerveRobot, robot, f"robot {{name}} has the drive {{drive!r}}: filter {name} is for 'swerve'")
     if LAYOUTS[name].has_camera:
         robot.require("camera")
     return LAYOUTS[name]

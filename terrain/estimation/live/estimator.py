@@ -62,7 +62,7 @@ from terrain.estimation.wheel_slip import STALE_AFTER_S
 from terrain.extension import Correction, RegionMonitor, check_corrected
 from terrain.logs.schema import WHEELS_CHANNELS
 from terrain.records import Array, Reading
-from terrain.robots import Robot, as_swerve
+from terrain.robots import Robot, SwerveRobot, as_drive
 
 SETTINGS = FilterSettings(GATE_PROBABILITY, REOPEN_AFTER_S)  # those of the batch
 
@@ -121,7 +121,8 @@ class LiveEstimator:
         self._channels, self._correction = channels, correction
         self._model = make_filter(filter_name, robot, with_gnss=has_gnss)
         self.name = self._model.name
-        robot = as_swerve(robot, "robot {name} has the drive {drive!r}: the live estimator is for 'swerve'")
+        refusal = "robot {name} has the drive {drive!r}: the live estimator is for 'swerve'"
+        robot = as_drive(SwerveRobot, robot, refusal)
         robot.require("motors", "steering", "sensors")
         scheduled = noise is None and bool(self._model.inputs)
         noise = default_noise(filter_name, robot, has_gnss) if noise is None else noise

@@ -39,7 +39,7 @@ from terrain.estimation.stuck import STUCK_AFTER_S, Motion, motion_at, motion_me
 from terrain.extension import Correction, check_corrected
 from terrain.logs.schema import IMU_CHANNELS
 from terrain.records import Array, Reading
-from terrain.robots import Robot, as_skid_steer
+from terrain.robots import Robot, SkidSteerRobot, as_drive
 
 SETTINGS = FilterSettings(GATE_PROBABILITY, REOPEN_AFTER_S)
 """Those of the batch."""
@@ -117,8 +117,10 @@ class LiveSkidEstimator:
         correction: Correction | None = None,
     ) -> None:
         check_corrected(robot)
-        robot = as_skid_steer(
-            robot, "robot {name} has the drive {drive!r}: this live estimator is for 'skid_steer'"
+        robot = as_drive(
+            SkidSteerRobot,
+            robot,
+            "robot {name} has the drive {drive!r}: this live estimator is for 'skid_steer'",
         )
         sensors = robot.completed.sensors
         wheels_period_s = 1.0 / sensors.wheels_rate_hz if wheels_period_s is None else wheels_period_s

@@ -10,7 +10,7 @@ import numpy as np
 from terrain.angles import wrapped
 from terrain.estimation.observers.choice import make_observer
 from terrain.estimation.observers.family import Observer, ObserverStatus, ObserverTrack, observe
-from terrain.estimation.observers.rows import RowFeed, ticks
+from terrain.estimation.observers.rows import feed_of, rows_of
 from terrain.estimation.observers.slip_model import PARAMETERS, SlipModel
 from terrain.extension import correct
 from terrain.kinematics.wheel_speed import with_wheel_speeds
@@ -74,12 +74,9 @@ def observe_run(
     """
     log, driven = correct(with_wheel_speeds(run, robot), robot)
     observer = make_observer(name, driven, slip_model)
-    feed = RowFeed(driven, observer.rows, {each: stream.channels for each, stream in log.streams.items()})
-    pairs = list(ticks(log, feed))
-    time_s = np.array([time for time, _ in pairs])
-    rows = np.array([row for _, row in pairs]).reshape(len(pairs), len(observer.rows))
-    known = np.isfinite(rows).any(axis=0)
-    missing = tuple(row for row, measured in zip(observer.rows, known, strict=True) if not measured)
+    feed = feed_of(log, driven, observer.rows)
+    time_s, rows = rows_of(log, feed)
+    missing = tuple(name for k, name in enumerate(observer.rows) if not np.isfinite(rows[:, k]).any())
     track = observe(observer, time_s, rows)
     return ObserverEstimate(run, driven, observer, track, dict(feed.dropped), missing)
 

@@ -71,6 +71,7 @@ class RowFeed:
 
     Attributes
     ----------
+    rows : as given
     dropped : samples left out, as counts by stream and kind: not later than the one before (ten in a row that
         are a second behind are a clock that was set: all begins anew), late or inaccurate fixes, and what
         waited in vain for the wheels
@@ -93,7 +94,7 @@ class RowFeed:
             for stream, names in CHANNELS.items()
             if stream in channels
         }
-        self._rows = rows
+        self.rows = rows
         self._pending: dict[str, list[tuple[float, list[float]]]] = {name: [] for name in self._places}
         self._last_s = dict.fromkeys(self._places, -math.inf)
         self._held: dict[str, list[tuple[float, float]]] = {}
@@ -133,7 +134,7 @@ class RowFeed:
         row |= zip(_IMU_ROWS, self._mean("imu", time_s), strict=True)
         speeds = [row[name] for _, name in self._speeds]
         row |= self._fix(time_s, sum(speeds) / len(speeds))
-        return np.array([row[name] for name in self._rows])
+        return np.array([row[name] for name in self.rows])
 
     def _behind(self, stream: str, stamp_s: float) -> None:
         """Count a sample that is not later than the one before; many in a row are a clock that was set."""
@@ -211,6 +212,18 @@ class RowFeed:
         if math.isfinite(moved) and math.isfinite(yaw):
             x, y = x + moved * math.cos(yaw), y + moved * math.sin(yaw)
         return {"position_x_m": x, "position_y_m": y, "yaw_rad": yaw}
+
+
+def feed_of(run: RunLog, robot: Robot, rows: tuple[str, ...]) -> RowFeed:
+    """Return the feed for a whole run, by the channels that it has."""
+    return RowFeed(robot, rows, {name: stream.channels for name, stream in run.streams.items()})
+
+
+def rows_of(run: RunLog, feed: RowFeed) -> tuple[Array, Array]:
+    """Return the times (n,) and rows (n, m) of all ticks of a run; as :func:`ticks`."""
+    found = list(ticks(run, feed))
+    rows = np.array([row for _, row in found]).reshape(len(found), len(feed.rows))
+    return np.array([time_s for time_s, _ in found]), rows
 
 
 def ticks(run: RunLog, feed: RowFeed) -> Iterator[tuple[float, Array]]:

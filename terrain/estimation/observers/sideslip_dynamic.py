@@ -35,7 +35,9 @@ from terrain.estimation.observers.sideslip_forces import (
     C_HIGH_F,
     C_HIGH_R,
     C_LOW,
+    DYNAMIC_STATES,
     N_DYNAMIC,
+    inverted,
     is_excited,
     rates,
     rates_by_force,
@@ -159,12 +161,8 @@ def sideslip_dynamic_observer(
     cov[2:, 2:] = np.outer(std, std) * (
         np.eye(2) * (1.0 - settings.stiffness_correlation) + settings.stiffness_correlation
     )
-    states = (
-        *("position_x_m", "position_y_m", "yaw_rad", "yaw_rate_radps", "speed_y_mps"),
-        *("cornering_front_npr", "cornering_rear_npr"),
-    )
     return Observer(
-        "sideslip-dynamic", states, pose.SIDESLIPS, pose.SIDESLIP_ROWS, params, start, _step, _read
+        "sideslip-dynamic", DYNAMIC_STATES, pose.SIDESLIPS, pose.SIDESLIP_ROWS, params, start, _step, _read
     )
 
 
@@ -196,10 +194,7 @@ def _predict(params: Array, after: Array, cov: Array, excited: bool, dt_s: float
             for k in range(2):
                 kept[i, j] -= dt_s * by_force[i, k] * stiffness[k] * by_motion[k, j]
     kept[1, 0] += dt_s * after[SPEED]
-    det = kept[0, 0] * kept[1, 1] - kept[0, 1] * kept[1, 0]
-    inverse = np.empty((2, 2))
-    inverse[0, 0], inverse[1, 1] = kept[1, 1] / det, kept[0, 0] / det
-    inverse[0, 1], inverse[1, 0] = -kept[0, 1] / det, -kept[1, 0] / det
+    inverse = inverted(kept)
     turning, pushed = rates(params, after[SPEED], after[STEER], after[ROLL], after[RATE], slips, stiffness)
     after[RATE] += dt_s * (inverse[0, 0] * turning + inverse[0, 1] * pushed)
     after[SIDE] += dt_s * (inverse[1, 0] * turning + inverse[1, 1] * pushed)

@@ -25,6 +25,12 @@ MASS, INERTIA, BEHIND, C_LOW, C_HIGH_F, C_HIGH_R, EXCITED, PRINTED = range(N_SHA
 """Places of the dynamics in parameters; ``PRINTED`` is 1 with line 2 as it is printed."""
 N_DYNAMIC = N_SHARED + 8
 
+DYNAMIC_STATES: tuple[str, ...] = (
+    *("position_x_m", "position_y_m", "yaw_rad", "yaw_rate_radps", "speed_y_mps"),
+    *("cornering_front_npr", "cornering_rear_npr"),
+)
+"""States of the observers that know the dynamics."""
+
 C_LOW_NPR = 1000.0
 """Least cornering stiffness of an axle: at a slip of 0.5 rad it carries 500 N."""
 C_HIGH_RATIO = 2.0
@@ -68,6 +74,16 @@ def rates_by_force(params: Array, steer: float) -> Array:
     by[0, 0], by[0, 1] = -params[BEHIND] * math.cos(steer) / params[INERTIA], params[AHEAD] / params[INERTIA]
     by[1, 0], by[1, 1] = sign * math.cos(steer) / params[MASS], sign / params[MASS]
     return by
+
+
+@njit(cache=True)
+def inverted(matrix: Array) -> Array:
+    """Return the inverse of a matrix (2, 2)."""
+    det = matrix[0, 0] * matrix[1, 1] - matrix[0, 1] * matrix[1, 0]
+    inverse = np.empty((2, 2))
+    inverse[0, 0], inverse[1, 1] = matrix[1, 1] / det, matrix[0, 0] / det
+    inverse[0, 1], inverse[1, 0] = -matrix[0, 1] / det, -matrix[1, 0] / det
+    return inverse
 
 
 @njit(cache=True)

@@ -48,8 +48,10 @@ from terrain.estimation.observers.sideslip_forces import (
     C_HIGH_F,
     C_HIGH_R,
     C_LOW,
+    DYNAMIC_STATES,
     MASS,
     N_DYNAMIC,
+    inverted,
     is_excited,
     rates,
     rates_by_force,
@@ -80,6 +82,7 @@ from terrain.estimation.observers.sideslip_pose import (
     X,
     Y,
     correct_by_fix,
+    slip_jacobian,
     spread,
     status_of,
     take_inputs,
@@ -180,30 +183,25 @@ def sideslip_multi_observer(
     start[[C_F, C_R]], start[RATE_AGE] = nominal, pose.LOST_S
     std = [0.0, 0.0, 0.1, 0.1, 0.1, 0.1, *settings.stiffness_std_ratio * nominal]
     start[COV:] = np.diag(np.square(std)).ravel()
-    states = (
-        *("position_x_m", "position_y_m", "yaw_rad", "yaw_rate_radps", "speed_y_mps"),
-        *("cornering_front_npr", "cornering_rear_npr"),
+    return Observer(
+        "sideslip-multi", DYNAMIC_STATES, pose.SIDESLIPS, pose.SIDESLIP_ROWS, params, start, _step, _read
     )
-    return Observer("sideslip-multi", states, pose.SIDESLIPS, pose.SIDESLIP_ROWS, params, start, _step, _read)
 
 
 @njit(cache=True)
-def _side_speed(params: Array, after: Array) -> float:
-    """Return w by (4), of the slip angles."""
-    sign = -1.0 if after[SPEED] < 0.0 else 1.0
-    front = math.tan(min(max(after[STEER] + sign * after[SLIP_F], -1.4), 1.4))
-    rear = math.tan(sign * after[SLIP_R])
-    return float(after[SPEED] * (params[AHEAD] * front + params[BEHIND] * rear) / params[BASE])
+def _motion_of(params: Array, after: Array) -> tuple[float, float]:
+    """Return yaw rate and w by (4), of the slip angles; w is the lateral speed ahead of the rear axle."""
+    rate = yaw_rate_of(params, after[SPEED], after[STEER], after[SLIP_F], after[SLIP_R])
+    return rate, abs(after[SPEED]) * math.tan(after[SLIP_R]) + params[AHEAD] * rate
 
 
 @njit(cache=True)
 def _motion_by_slip(params: Array, after: Array) -> Array:
-    """Return derivatives (2, 2) of yaw rate and of w in (4) by slip angles."""
-    sign = -1.0 if after[SPEED] < 0.0 else 1.0
-    front = math.cos(min(max(after[STEER] + sign * after[SLIP_F], -1.4), 1.4))
-    by_front = abs(after[SPEED]) / (params[BASE] * front**2)
-    by_rear = abs(after[SPEED]) / (params[BASE] * math.cos(after[SLIP_R]) ** 2)
-    return np.array([[by_front, -by_rear], [params[AHEAD] * by_front, params[BEHIND] * by_rear]])
+    """Return derivatives (2, 2) of the same by slip angles."""
+    by_slip = slip_jacobian(params, after[SPEED], after[STEER], after[SLIP_F], after[SLIP_R])
+    out = np.empty((2, 2))
+    out[0], out[1] = by_slip[1], by_slip[0] + params[AHEAD] * by_slip[1]
+    return out
 
 
 @njit(cache=True)
@@ -236,10 +234,7 @@ def _dynamic_gains(params: Array, by_slip: Array, by_stiffness: Array, measured:
                 kept[i, j] += dt_s**2 * params[K_C] * by_stiffness[i, k] * by_stiffness[j, k]
     if not measured:
         kept[0, 1] = kept[1, 0] = 0.0
-    det = kept[0, 0] * kept[1, 1] - kept[0, 1] * kept[1, 0]
-    inverse = np.empty((2, 2))
-    inverse[0, 0], inverse[1, 1] = kept[1, 1] / det, kept[0, 0] / det
-    inverse[0, 1], inverse[1, 0] = -kept[0, 1] / det, -kept[1, 0] / det
+    inverse = inverted(kept)
     if not measured:
         inverse[:, 0] = 0.0
     gains = np.zeros((_N, 2))
@@ -264,7 +259,7 @@ def _correct_dynamics(params: Array, after: Array, cov: Array, rate_measured: fl
     turning, pushed = rates(params, after[SPEED], after[STEER], after[ROLL], rate, slips, stiffness)
     after[RATE] += dt_s * turning
     after[SIDE] += dt_s * pushed
-    error = np.array([rate - after[RATE] if measured else 0.0, _side_speed(params, after) - after[SIDE]])
+    error = np.array([rate - after[RATE] if measured else 0.0, _motion_of(params, after)[1] - after[SIDE]])
     change = gains[:, 0] * error[0] + gains[:, 1] * error[1]
     after[SLIP_F] = min(max(after[SLIP_F] + change[2], -SLIP_MAX_RAD), SLIP_MAX_RAD)
     after[SLIP_R] = min(max(after[SLIP_R] + change[3], -SLIP_MAX_RAD), SLIP_MAX_RAD)
@@ -295,15 +290,14 @@ def _correct_dynamics(params: Array, after: Array, cov: Array, rate_measured: fl
 @njit(cache=True)
 def _follow_slips(params: Array, after: Array, cov: Array, dt_s: float) -> None:
     """Predict a tick without dynamics in place: yaw rate and w, and their errors, are those of the slips."""
-    moves = abs(after[SPEED]) >= STANDING_MPS
     add_pose_noise(params, after, cov, params[SLIP_WALK], dt_s)
     grown = error_growth(params, after, _N, dt_s)
     grown[4:6, :] = 0.0
-    grown[4:6, 2:4] = _motion_by_slip(params, after) if moves else np.zeros((2, 2))
+    after[RATE] = after[SIDE] = 0.0
+    if abs(after[SPEED]) >= STANDING_MPS:
+        grown[4:6, 2:4] = _motion_by_slip(params, after)
+        after[RATE], after[SIDE] = _motion_of(params, after)
     spread(cov, grown)
-    speed = after[SPEED] if moves else 0.0
-    after[RATE] = yaw_rate_of(params, speed, after[STEER], after[SLIP_F], after[SLIP_R])
-    after[SIDE] = _side_speed(params, after) if moves else 0.0
 
 
 @njit(cache=True)

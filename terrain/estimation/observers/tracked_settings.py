@@ -96,8 +96,8 @@ def tracked_params(robot: TrackedRobot, settings: TrackedSettings) -> Array:
     Examples
     --------
     >>> from terrain.robots import load_robot
-    >>> from terrain.robots.tracked import as_tracked
-    >>> robot = as_tracked(load_robot("orchard_ugv"), "{name} is {drive}")
+    >>> from terrain.robots import as_drive, TrackedRobot
+    >>> robot = as_drive(TrackedRobot, load_robot("orchard_ugv"), "{name} is {drive}")
     >>> tracked_params(robot, TrackedSettings())[:4]
     array([0.5, 1. , 1. , 1. ])
     >>> tracked_params(robot, TrackedSettings(standing_mps=0.0))

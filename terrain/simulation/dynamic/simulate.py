@@ -25,7 +25,7 @@ from terrain.errors import ConfigError
 from terrain.extension import apply_homes
 from terrain.kinematics.swerve import wheel_commands
 from terrain.records import Array, Command, Label, RunLog, Sample, Stream
-from terrain.robots import Robot, as_swerve
+from terrain.robots import Robot, SwerveRobot, as_drive
 from terrain.simulation.conditions import NO_FAULTS, Conditions, Faults
 from terrain.simulation.dynamic.loop import Drive, in_loop
 from terrain.simulation.dynamic.plant import Plant, make_plant, record_width
@@ -122,7 +122,7 @@ def simulate(  # noqa: PLR0913 - an entry whose options have defaults
         if a command is not one finite number a wheel, or its status not numbers by names that end in a unit,
         the same names throughout.
     """
-    robot = as_swerve(robot, "robot {name}: drive {drive!r} is not simulated, only 'swerve' is")
+    robot = as_drive(SwerveRobot, robot, "robot {name}: drive {drive!r} is not simulated, only 'swerve' is")
     substeps, delay_steps = _substeps(robot, scenario), _delay_steps(command_delay_s)
     rngs = _generators(seed)
     built = _built(robot, effects or {})

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from terrain.errors import ConfigError
-from terrain.robots import SkidSteerRobot, SwerveRobot, as_omni, as_skid_steer, as_swerve, load_robot
+from terrain.robots import OmniRobot, SkidSteerRobot, SwerveRobot, as_drive, load_robot
 
 AGRIMARO, HUSKY, ROBOTINO = (load_robot(name) for name in ("agrimaro", "husky", "robotino"))
 
@@ -65,11 +65,11 @@ def test_a_robot_is_pickled_with_its_parts_and_effects():
 
 
 def test_robots_of_another_drive_are_refused_with_the_sentence_given():
-    assert as_swerve(AGRIMARO, "") is AGRIMARO
-    assert as_skid_steer(HUSKY, "") is HUSKY
-    assert as_omni(ROBOTINO, "") is ROBOTINO
+    assert as_drive(SwerveRobot, AGRIMARO, "") is AGRIMARO
+    assert as_drive(SkidSteerRobot, HUSKY, "") is HUSKY
+    assert as_drive(OmniRobot, ROBOTINO, "") is ROBOTINO
     with pytest.raises(ConfigError, match=r"^agrimaro: 'swerve' does not skid$"):
-        as_skid_steer(AGRIMARO, "{name}: {drive!r} does not skid")
+        as_drive(SkidSteerRobot, AGRIMARO, "{name}: {drive!r} does not skid")
 
 
 def test_log_rates_and_rows_are_two_views_of_wheel_speeds():
