@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from terrain.errors import ConfigError, DataError
+from terrain.estimation.observers import rows as observer_rows
 from terrain.estimation.observers.family import Observer, ObserverOutput, ObserverStatus, observe
 from terrain.estimation.observers.live import LiveObserver
-from terrain.estimation.observers.rows import CHANNELS, ROWS, RowFeed, ticks
+from terrain.estimation.observers.rows import CHANNELS, ROWS, RowFeed, feed_of, ticks
 from terrain.records import Reading, RunLog, Stream
 from terrain.robots import load_robot
 from terrain.simulation.tracked.given_slip import GivenSlip
@@ -19,9 +20,8 @@ NAMES = tuple(name for name in ROWS if "rear" not in name and "front" not in nam
 
 
 def rows_of(run, names=NAMES):
-    feed = RowFeed(UGV, names, {name: stream.channels for name, stream in run.streams.items()})
-    found = list(ticks(run, feed))
-    return np.array([time for time, _ in found]), np.array([row for _, row in found]), feed
+    feed = feed_of(run, UGV, names)
+    return *observer_rows.rows_of(run, feed), feed
 
 
 def without(run, *names):
@@ -151,7 +151,7 @@ def test_a_clock_that_is_set_back_begins_anew_and_one_stamp_far_ahead_is_left_be
 
 
 def test_stamps_that_are_no_time_and_channels_that_are_unknown_do_not_take_the_others_along(run):
-    feed = RowFeed(UGV, NAMES, {name: stream.channels for name, stream in run.streams.items()})
+    feed = feed_of(run, UGV, NAMES)
     imu = run.streams["imu"].values[:4].copy()
     imu[1, 2] = np.nan
     feed.push("imu", np.array([0.0, np.inf, 0.005, 0.01]), imu)
@@ -170,7 +170,7 @@ def test_a_pose_that_is_lost_leaves_the_satellites_and_bad_fixes_are_none(run):
             return Stream(stream.time_s, np.full_like(stream.values, np.nan), stream.channels)
         return stream
 
-    def spoilt(column, value, late_s=0.0):
+    def spoilt(column, value):
         def change(name, stream):
             if name == "pose":
                 return None
@@ -179,7 +179,7 @@ def test_a_pose_that_is_lost_leaves_the_satellites_and_bad_fixes_are_none(run):
             values = stream.values.copy()
             if name == "gnss":
                 values[:, stream.channels.index(column)] = value
-            return Stream(stream.time_s + late_s, values, stream.channels)
+            return Stream(stream.time_s, values, stream.channels)
 
         return change
 
@@ -190,8 +190,18 @@ def test_a_pose_that_is_lost_leaves_the_satellites_and_bad_fixes_are_none(run):
     assert feed.dropped["gnss: inaccurate"] == len(run.streams["gnss"])
 
 
+@pytest.mark.parametrize(("tick_s", "late"), [(0.35, False), (0.45, True)])
+def test_a_fix_that_waited_long_for_the_wheels_is_left_out_and_counted(run, tick_s, late):
+    feed = feed_of(without(run, "pose"), UGV, NAMES)
+    for name in ("gnss", "compass"):
+        feed.push(name, np.array([0.1]), run.streams[name].values[:1])
+    row = feed.tick(tick_s, np.array([0.4, 0.6]))
+    assert np.isnan(row[2:5]).tolist() == [late] * 3
+    assert feed.dropped == ({"gnss: late": 1, "compass: late": 1} if late else {})
+
+
 def test_samples_do_not_pile_up_while_no_wheels_come(run):
-    feed = RowFeed(UGV, NAMES, {name: stream.channels for name, stream in run.streams.items()})
+    feed = feed_of(run, UGV, NAMES)
     for k in range(5000):
         feed.push("imu", np.array([0.01 * k]), np.full((1, 9), 0.1))
     assert feed.dropped["imu: no wheels came"] > 4500
