@@ -2,7 +2,7 @@
 
     python docs/import_graph.py
 
-writes the two graphs into ``docs/architecture.md``, between its markers.  A room imports rooms below it only;
+writes the graphs into ``docs/architecture.md``, between its markers.  A room imports rooms below it only;
 an arrow that follows from others is left out.
 """
 
@@ -70,9 +70,9 @@ def mermaid(package: str, graph: grimp.ImportGraph) -> str:
 
 
 def with_graphs(text: str) -> str:
-    """Return the text of the page with both graphs between their markers."""
+    """Return the text of the page with the graphs between their markers."""
     graph = grimp.build_graph(*PACKAGES, cache_dir=None)
-    for package in ("pipelines", "terrain"):
+    for package in ("terrain",):
         start, end = f"<!-- {package} -->", f"<!-- end of {package} -->"
         body = f"{start}\n{mermaid(package, graph)}\n{end}"
         text = re.sub(

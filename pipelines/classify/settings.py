@@ -7,8 +7,8 @@ from typing import Self
 
 from pydantic import model_validator
 
-from pipelines.config.settings import Settings, setting
 from pipelines.crossval.settings import CrossvalSettings, RecipeSettings
+from pipelines.report.settings import Settings, setting
 from terrain.errors import ConfigError
 
 

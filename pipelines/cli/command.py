@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import typer
 from pydantic.fields import FieldInfo
 
-from pipelines.config.settings import Settings, option_name, option_text
+from pipelines.report.settings import Settings, option_name, option_text
 
 
 def command(app: typer.Typer, name: str) -> Callable[[Callable[..., None]], Callable[..., None]]:

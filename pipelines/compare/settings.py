@@ -6,8 +6,8 @@ from typing import Any, NamedTuple, Self
 
 from pydantic import model_validator
 
-from pipelines.config.settings import setting
 from pipelines.crossval.settings import RECIPES, CrossvalSettings, Recipe, RecipeSettings
+from pipelines.report.settings import setting
 from terrain.errors import ConfigError
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal, Self, get_args
 
 from pydantic import field_validator, model_validator
 
-from pipelines.config.settings import Settings, setting
+from pipelines.report.settings import Settings, setting
 from terrain.errors import ConfigError
 from terrain.logs.schema import SIGNAL_SETS
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 from pydantic import field_validator, model_validator
 
-from pipelines.config.settings import Settings, setting
 from pipelines.drive.controller_names import CONTROLLERS, USING_CLASSIFIER, base_name, current_name
+from pipelines.report.settings import Settings, setting
 from terrain.errors import ConfigError
 
 MAX_GRADE_DEG = 30.0

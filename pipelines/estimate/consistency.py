@@ -63,7 +63,7 @@ class TerrainConsistency(NamedTuple):
     slip_coverage: MeanInterval
 
 
-def consistency_by_terrain(  # noqa: PLR0913 - an entry whose options have defaults
+def consistency_by_terrain(
     robot: Robot,
     seed: int,
     runs: int = RUNS_A_SCENARIO,

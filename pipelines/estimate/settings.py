@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from pipelines.config.settings import Settings, setting
+from pipelines.report.settings import Settings, setting
 
 Filter = Literal[
     "encoder12",

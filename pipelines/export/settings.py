@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from pipelines.config.settings import Settings, setting
+from pipelines.report.settings import Settings, setting
 
 Target = Literal["mcap", "ros2", "ros2-mcap"]
 """``mcap``: an MCAP file a run; ``ros2``: a bag of ROS 2 a run, stored in SQLite; ``ros2-mcap``: in MCAP."""

@@ -6,8 +6,8 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pipelines.config.settings import Settings, setting
 from pipelines.crossval.settings import WINDOW_S
+from pipelines.report.settings import Settings, setting
 from terrain.logs.schema import SIGNAL_SETS
 
 if TYPE_CHECKING:

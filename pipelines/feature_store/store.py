@@ -11,10 +11,10 @@ import numpy as np
 
 from features.motion import Motion, wheel_stream
 from features.windows import WindowCut, WindowRule
-from pipelines.config.settings import option_name
 from pipelines.crossval.splits import Samples
 from pipelines.feature_store.manifest import STORE_FILE, Manifest, StoredRun, read_manifest, read_runs
 from pipelines.feature_store.run_file import read_run_windows
+from pipelines.report.settings import option_name
 from pipelines.reporting.numbers import format_counts
 from pipelines.reporting.progress import Progress, silent
 from pipelines.runs.datasets import joint_digest

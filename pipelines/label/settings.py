@@ -8,7 +8,7 @@ from typing import Self
 
 from pydantic import model_validator
 
-from pipelines.config.settings import Settings, setting
+from pipelines.report.settings import Settings, setting
 from terrain.errors import ConfigError
 from terrain.files.names import plain_name
 

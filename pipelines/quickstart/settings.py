@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from pipelines.classify.settings import TrainSettings
-from pipelines.config.settings import Settings, setting
 from pipelines.crossval.settings import CrossvalSettings
+from pipelines.report.settings import Settings, setting
 
 
 class QuickstartSettings(Settings):

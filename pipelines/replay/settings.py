@@ -7,7 +7,7 @@ from pathlib import Path
 
 from pydantic import field_validator
 
-from pipelines.config.settings import Settings, setting
+from pipelines.report.settings import Settings, setting
 
 AS_FAST_AS_IT_GOES = "max"
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple, Protocol, TypeVar
 
 from pydantic import field_validator
 
-from pipelines.config.settings import Settings, setting
+from pipelines.report.settings import Settings, setting
 from terrain.errors import ConfigError
 from terrain.files.names import listed, shown
 

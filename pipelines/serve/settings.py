@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pipelines.config.settings import Settings, setting
+from pipelines.report.settings import Settings, setting
 
 PORT = 8765
 

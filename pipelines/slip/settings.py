@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pipelines.config.settings import setting
+from pipelines.report.settings import setting
 from pipelines.runs.settings import RunsSettings
 
 

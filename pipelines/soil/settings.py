@@ -6,7 +6,7 @@ from pathlib import Path
 
 from pydantic import field_validator
 
-from pipelines.config.settings import setting
+from pipelines.report.settings import setting
 from pipelines.runs.settings import RunsSettings
 
 LAW_NAMES = (

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pipelines.config.settings import setting
 from pipelines.crossval.settings import CrossvalSettings, RecipeSettings
+from pipelines.report.settings import setting
 
 
 class SweepSettings(RecipeSettings):

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from pydantic import field_validator
 
-from pipelines.config.settings import Settings, setting
+from pipelines.report.settings import Settings, setting
 
 SLIP_SOURCES = ("none", "dynamic", "kinematic", "multi", "multi-grip")
 """Names of :class:`terrain.control.car_following.SlipSource`, which would load compiled code here."""

@@ -74,7 +74,7 @@ def _low_passed(i: int, value: float, step_s: float, lasting: Array) -> tuple[fl
     cache=True,
     error_model="numpy",
 )
-def follow(  # noqa: PLR0913 - a kernel takes its arrays one by one
+def follow(
     now_s: float,
     step_s: float,
     slot: int,

@@ -179,7 +179,7 @@ def desired_slip(drive_state: int, direction: float, target_ratio: Array) -> flo
     ),
     cache=True,
 )
-def thesis_step(  # noqa: PLR0913 - a compiled step takes its arrays one by one
+def thesis_step(
     settings: ThesisSettings,
     state: Array,
     command_radps: Array,

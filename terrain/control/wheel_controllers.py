@@ -177,7 +177,7 @@ _V, _M = float64[::1], float64[:, ::1]
     cache=True,
     error_model="numpy",
 )
-def _observe_wheels(  # noqa: PLR0913 - a kernel takes its arrays one by one
+def _observe_wheels(
     mean: Array,
     steer_states: Array,
     speed_x_mps: float,

@@ -284,7 +284,7 @@ def _evaluation_points(vector: Array, parameters: Sequence[str]) -> tuple[Array,
 
 
 @njit(cache=True)
-def _predictions(  # noqa: PLR0913 - a kernel takes its arrays one by one
+def _predictions(
     planar: Planar,
     points: Array,
     sensed: Array,

@@ -60,7 +60,7 @@ class Setup(NamedTuple):
     effects: Mapping[str, float]
 
 
-def simulate_run(  # noqa: PLR0913 - an entry whose options have defaults
+def simulate_run(
     robot: Robot,
     terrain: str,
     scenario: str,

@@ -47,7 +47,7 @@ def find_columns(m: Array, i: int, cols: Array) -> int:
 
 
 @fast
-def predict(  # noqa: PLR0913 - a kernel writes into arrays that its caller owns
+def predict(
     propagate: Any,
     params: Array,
     x: Array,
@@ -157,7 +157,7 @@ def innovation(
 
 
 @fast
-def condition_on(  # noqa: PLR0913 - a kernel writes into arrays that its caller owns
+def condition_on(
     nu: float,
     spread: float,
     r: float,

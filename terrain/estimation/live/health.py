@@ -156,7 +156,7 @@ def _by_filter(use: int, before: int, step_s: float, gated_s: Array, i: int) -> 
 
 
 @njit(cache=True, error_model="numpy")
-def judge(  # noqa: PLR0913 - a kernel takes its arrays one by one
+def judge(
     time_s: float,
     use: Array,
     places: Array,

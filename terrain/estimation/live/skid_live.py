@@ -279,7 +279,7 @@ class LiveSkidEstimator:
 
 
 @njit(cache=True, error_model="numpy")
-def _gyro_of_tick(  # noqa: PLR0913 - a kernel keeps its memory in arrays of its caller
+def _gyro_of_tick(
     time_s: float,
     set_back: bool,
     queue: Array,

@@ -244,7 +244,7 @@ def _gnss_origin(gnss: Stream) -> Array:
 
 
 @njit(cache=True, error_model="numpy")
-def _fill_rows(  # noqa: PLR0913 - a kernel takes its arrays one by one
+def _fill_rows(
     clock: Array,
     motor_radps: Array,
     came_s: tuple[Array, ...],

@@ -68,7 +68,7 @@ COMMAND_CHANNELS = (
 """The admitted twist of the body, and what it asks of the wheels."""
 
 
-def simulate(  # noqa: PLR0913 - an entry whose options have defaults
+def simulate(
     robot: Robot,
     scenario: Scenario,
     soils: Mapping[str, Soil],

@@ -63,7 +63,7 @@ own phase, and spikes of the current at crawling speed."""
 _PURPOSES = ("scatter", "hills", "ground", "wheels", "steering", "imu", "camera", "outside", "lidar")
 
 
-def simulate_planar(  # noqa: PLR0913 - an entry whose options have defaults
+def simulate_planar(
     robot: Robot,
     twist: Array,
     seed: int | np.random.SeedSequence,

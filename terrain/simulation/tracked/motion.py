@@ -92,7 +92,7 @@ def twist_on_soil(
 
 
 @njit(cache=True)
-def _residual(  # noqa: PLR0913 - a compiled inner function
+def _residual(
     contact: Array,
     belt_mps: Array,
     twist: Array,

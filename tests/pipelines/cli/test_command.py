@@ -7,7 +7,7 @@ import typer
 from typer.testing import CliRunner
 
 from pipelines.cli.command import command
-from pipelines.config.settings import Settings, option_name, setting
+from pipelines.report.settings import Settings, option_name, setting
 from terrain.errors import ConfigError
 
 

@@ -1,0 +1,1 @@
+"""The Python API that ``import terrain`` gives lazily."""

@@ -1,0 +1,1 @@
+"""Runs in and out: layouts, bags, CAN logs, simulated runs, labels."""

@@ -1,0 +1,1 @@
+"""Terrain: evaluation, training, tracking, model files, prediction."""

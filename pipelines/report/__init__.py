@@ -1,0 +1,1 @@
+"""Reports: one tree of parts, three writers; and the settings and results of commands."""
