@@ -1,6 +1,6 @@
 """The commands: group, name, module and line of help; and where former commands went.
 
-A module of a command has ``EXAMPLE`` (a command line), ``Settings``, ``run(settings, progress)`` that returns a
+A module of a command has ``EXAMPLE`` (a command line), ``Settings``, ``run(settings, progress)`` which returns a
 result, and ``report(result)`` beside each kind of result.
 """
 
