@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.bags.exported import WINDOW_TOPIC
+from pipelines.data.recorded_windows import RecordedWindow, read_windows
 from pipelines.export.outgoing import Outgoing, outgoing_topics, text_topic
 from pipelines.export.results import Exported
 from pipelines.export.settings import ExportSettings, Target
 from pipelines.export.write import write_mcap, write_ros2
-from pipelines.recording.windows_file import RecordedWindow, read_windows
 from pipelines.reporting.json_file import as_json
 from pipelines.reporting.progress import Progress, silent
 from pipelines.runs.datasets import data_digest

@@ -7,9 +7,9 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from features.windows import TIME_TOLERANCE_S
+from pipelines.data.recorded_windows import read_windows
 from pipelines.label.results import DoubtfulWindow, DoubtfulWindows, LabelledRun, RunWindows
 from pipelines.label.settings import LabelSettings
-from pipelines.recording.windows_file import read_windows
 from terrain.errors import ConfigError, LogError
 from terrain.files.atomic import atomic_write
 from terrain.logs.read import read_run, read_run_head, run_folders

@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from pipelines.data.recorded_windows import WINDOWS_FILE, windows_text
 from pipelines.recording.journal import SUFFIX, lock, read_head, read_journal
-from pipelines.recording.windows_file import WINDOWS_FILE, windows_text
 from terrain.errors import LogError, TerrainError
 from terrain.logs.samples import DEAD_CHANNEL, checked_stream
 from terrain.logs.write import run_folder, write_run

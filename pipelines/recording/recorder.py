@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from pipelines.data.recorded_windows import WindowResult, window_entry
 from pipelines.recording.finishing import finish
 from pipelines.recording.journal import VERSION, Block, Journal, Record, journal_path
-from pipelines.recording.windows_file import WindowResult, window_entry
 from terrain.errors import LogError, TerrainError
 from terrain.estimation.live.clocks import number, numbers, readable
 from terrain.files.names import plain_name

@@ -6,9 +6,9 @@ import sys
 import numpy as np
 import pytest
 
+from pipelines.data.recorded_windows import WINDOWS_FILE, read_windows, windows_text
 from pipelines.export.export_runs import export_runs
 from pipelines.export.settings import ExportSettings
-from pipelines.recording.windows_file import WINDOWS_FILE, read_windows, windows_text
 from pipelines.replay.replay import replay_logs
 from pipelines.replay.settings import ReplaySettings
 from pipelines.runs.datasets import load_runs

@@ -10,10 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipelines.cli import main as cli
+from pipelines.data.recorded_windows import WINDOWS_FILE, window_entry, windows_text
 from pipelines.label.labels import doubtful_windows, relabelled, set_label
 from pipelines.label.screen import time_text
 from pipelines.label.settings import LabelSettings
-from pipelines.recording.windows_file import WINDOWS_FILE, window_entry, windows_text
 from pipelines.streaming.classifying import WindowOutput
 from terrain.errors import ConfigError, LogError
 from terrain.files import atomic

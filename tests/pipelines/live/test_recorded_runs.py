@@ -8,12 +8,12 @@ import pytest
 from pipelines.classify.predict import predict
 from pipelines.crossval.crossval import samples_of
 from pipelines.crossval.settings import CrossvalSettings
+from pipelines.data.recorded_windows import read_windows
 from pipelines.live.observer import TerrainObserver
 from pipelines.live.pilot import LivePilot
 from pipelines.live.terrain_source import Classifier
 from pipelines.recording.recorder import SessionRecorder
 from pipelines.recording.thread import RecordingThread
-from pipelines.recording.windows_file import read_windows
 from pipelines.runs.datasets import load_runs
 from pipelines.runs.inspect_logs import inspect_logs
 from pipelines.runs.settings import InspectSettings

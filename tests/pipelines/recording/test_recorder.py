@@ -13,6 +13,7 @@ import time
 import numpy as np
 import pytest
 
+from pipelines.data.recorded_windows import WINDOWS_FILE, read_windows
 from pipelines.recording import journal as journals
 from pipelines.recording import recorder as recorders
 from pipelines.recording.finishing import APART, SHORT_STREAM, recover_recordings
@@ -24,7 +25,6 @@ from pipelines.recording.recorder import (
     SessionRecorder,
 )
 from pipelines.recording.thread import RecordingThread
-from pipelines.recording.windows_file import WINDOWS_FILE, read_windows
 from pipelines.runs.datasets import data_digest, load_runs
 from pipelines.streaming.classifying import WindowOutput
 from terrain.errors import LogError

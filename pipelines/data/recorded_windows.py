@@ -22,7 +22,7 @@ VERSION = 1
 
 
 class WindowResult(Protocol):
-    """What a model gives for a window, as :class:`pipelines.streaming.classifying.WindowOutput` does."""
+    """What a model gives for a window, as the live classifier does."""
 
     @property
     def start_s(self) -> float: ...  # noqa: D102

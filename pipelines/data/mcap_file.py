@@ -1,0 +1,336 @@
+"""MCAP files: written at once or as a run comes, and read from their beginning.
+
+A file is a row of records.  What a program that was killed has left is read too, as far as it is whole; what
+a file states of its own sizes is judged before it is unpacked.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, BinaryIO
+
+from pipelines.data.faults import DAMAGED_BLOCK, EARLY_END, MISSING_PACKAGE, Faults, Topic
+from pipelines.data.run_topics import (
+    LABEL_TOPIC,
+    RUN_TOPIC,
+    STRING,
+    STRING_TEXT,
+    WINDOW_TOPIC,
+    Head,
+    StreamTopic,
+    run_document,
+    stamps_ns,
+    stream_messages,
+    stream_topic,
+    string_message,
+)
+from terrain.errors import ConfigError, LogError
+from terrain.files.names import shown
+from terrain.files.regular import MEBIBYTE
+from terrain.logs.log_files import short_name
+from terrain.records import Array, Label
+
+if TYPE_CHECKING:
+    from mcap.records import Chunk
+
+LIBRARY = "terrain-slip"
+MAGIC = b"\x89MCAP0\r\n"
+
+MAX_RECORD_BYTES = 256 * MEBIBYTE
+"""Of a message, and of a block of them once it is unpacked; an image has 20 MiB, blocks have 1 to 4."""
+
+MAX_RATIO = 200
+"""Most that a chunk of more than 16 MiB may grow by when it is unpacked; measurements grow by 2 to 20."""
+
+SMALL_BYTES = 16 * MEBIBYTE
+
+_LATEST_NS = 2**63 - 1
+
+
+class McapWriter:
+    """Topics and their messages as an MCAP file of profile ROS 2.
+
+    Parameters
+    ----------
+    file : opened for writing
+    metadata : shown by tools that list a file's metadata
+    packed : messages lie in packed chunks, with an index; else each is readable as soon as it is flushed
+
+    Raises
+    ------
+    ConfigError
+        if mcap is not installed.
+    """
+
+    def __init__(self, file: BinaryIO, metadata: Mapping[str, str], *, packed: bool = True) -> None:
+        try:
+            from mcap.writer import CompressionType, Writer
+        except ImportError as error:
+            raise ConfigError(MISSING_PACKAGE) from error
+        self._file = file
+        self._writer = Writer(file, compression=CompressionType.ZSTD, use_chunking=packed)
+        self._writer.start(profile="ros2", library=LIBRARY)
+        self._writer.add_metadata("terrain_run", dict(metadata))
+        self._schemas: dict[str, int] = {}
+        self._channels: dict[tuple[str, str], int] = {}
+
+    def write(self, topic: str, kind: str, definition: str, log_ns: int, message: bytes) -> None:
+        """Write one message; its topic is described before the first."""
+        if (topic, kind) not in self._channels:
+            if kind not in self._schemas:
+                self._schemas[kind] = self._writer.register_schema(kind, "ros2msg", definition.encode())
+            self._channels[topic, kind] = self._writer.register_channel(topic, "cdr", self._schemas[kind])
+        self._writer.add_message(self._channels[topic, kind], log_ns, message, log_ns)
+
+    def finish(self) -> None:
+        """Write the end of the file, which stays open."""
+        self._writer.finish()
+
+
+class RunRecorder:
+    """A run that is written as it comes: topics as those of a run that was exported.
+
+    After :meth:`flush` all that was appended is in the file; if the process is killed then, readers find it.
+
+    Parameters
+    ----------
+    file : opened for writing
+    head : of the run
+    origin_s : time on the clock of the run that is stamped 0; stamps reach 68 years from there
+
+    Examples
+    --------
+    >>> from io import BytesIO
+    >>> recorder = RunRecorder(BytesIO(), Head("drive_1", "husky", live=True))
+    >>> recorder.register("imu", ("gyro_z_radps",))
+    >>> recorder.append("imu", [0.0, 0.01], [[0.1], [0.2]])
+    >>> recorder.finish(dropped={"late": 1})
+    """
+
+    def __init__(self, file: BinaryIO, head: Head, origin_s: float = 0.0) -> None:
+        metadata = {name: value for name, value in head._asdict().items() if isinstance(value, str)}
+        self._writer = McapWriter(file, metadata, packed=False)
+        self._file, self._head, self._origin_s = file, head, origin_s
+        self._topics: dict[str, StreamTopic] = {}
+        self._is_described, self._last_ns = False, 0
+
+    def register(self, stream: str, channels: Sequence[str]) -> None:
+        """Announce a stream; streams may come later than samples of others."""
+        taken = [each.topic for each in self._topics.values()]
+        self._topics[stream] = stream_topic(stream, channels, taken)
+        self._is_described = False
+
+    def append(
+        self, stream: str, time_s: Array | Sequence[float], values: Array | Sequence[Sequence[float]]
+    ) -> None:
+        """Append samples (n,) and (n, c) of a stream that is registered."""
+        topic = self._topics[stream]
+        log_ns, messages = stream_messages(time_s, values, self._origin_s)
+        for stamp_ns, message in zip(log_ns.tolist(), messages, strict=True):
+            if not self._is_described:
+                self._describe(stamp_ns)
+            self._writer.write(topic.topic, topic.kind, topic.definition, stamp_ns, message)
+            self._last_ns = max(self._last_ns, stamp_ns)
+
+    def append_text(self, topic: str, time_s: float, text: str) -> None:
+        """Append a text, as of :data:`WINDOW_TOPIC` or :data:`LABEL_TOPIC`."""
+        (log_ns,) = stamps_ns([time_s], self._origin_s).tolist()
+        self._writer.write(topic, STRING, STRING_TEXT, log_ns, string_message(text))
+        self._last_ns = max(self._last_ns, log_ns)
+
+    def _describe(
+        self, log_ns: int, labels: Iterable[Label] = (), dropped: Mapping[str, int] | None = None
+    ) -> None:
+        text = run_document(self._head, self._topics, labels, dropped)
+        self._writer.write(RUN_TOPIC, STRING, STRING_TEXT, log_ns, string_message(text))
+        self._is_described = True
+
+    def flush(self) -> None:
+        """Give all that was appended to the system."""
+        self._file.flush()
+
+    def finish(self, labels: Iterable[Label] = (), dropped: Mapping[str, int] | None = None) -> None:
+        """Write the end of the file, which stays open.
+
+        Parameters
+        ----------
+        labels : of the run
+        dropped : counts by kind of what was not recorded
+        """
+        self._describe(self._last_ns, labels, dropped)
+        self._writer.finish()
+        self._file.flush()
+
+
+class McapReader:
+    """An MCAP file.
+
+    Parameters
+    ----------
+    path : of the file
+    faults : gets what is damaged
+
+    Raises
+    ------
+    ConfigError
+        if mcap is not installed.
+    """
+
+    def __init__(self, path: Path, faults: Faults) -> None:
+        self._path, self._faults, self._place = path, faults, short_name(path)
+        try:
+            import mcap.stream_reader
+        except ImportError as error:
+            raise ConfigError(MISSING_PACKAGE) from error
+        self._library = mcap
+
+    def topics(self) -> list[Topic]:
+        """Return the topics: those that the end of the file lists, else all that a walk through it finds.
+
+        Raises
+        ------
+        LogError
+            if the file is damaged, or a topic has two types.
+        """
+        found = self._of_summary() or self._walked_topics()
+        by_name: dict[str, Topic] = {}
+        for topic in found:
+            if by_name.setdefault(topic.name, topic).kind != topic.kind:
+                raise LogError(f"{self._place}: topic {shown(topic.name)} has messages of two types")
+        return list(by_name.values())
+
+    def _of_summary(self) -> list[Topic]:
+        from mcap.reader import SeekingReader
+
+        try:
+            with self._path.open("rb") as file:
+                summary = SeekingReader(file, record_size_limit=MAX_RECORD_BYTES).get_summary()
+        except OSError as error:
+            raise LogError(f"{self._place}: cannot be read ({error.strerror or error})") from error
+        except Exception:  # whatever the end of a file that was not closed looks like
+            return []
+        return [_topic(each, summary.schemas) for each in summary.channels.values()] if summary else []
+
+    def _walked_topics(self) -> list[Topic]:
+        from collections import Counter
+
+        from mcap.records import Channel, Schema
+
+        schemas: dict[int, Any] = {}
+        channels: dict[int, Any] = {}
+        walk = McapReader(self._path, Faults(Counter()))  # faults are found when messages are read
+        for record in walk._records():
+            if isinstance(record, Schema):
+                schemas[record.id] = record
+            elif isinstance(record, Channel):
+                channels[record.id] = record
+        return [_topic(each, schemas) for each in channels.values()]
+
+    def messages(self, names: frozenset[str]) -> Iterator[tuple[str, int, bytes]]:
+        """Yield topic, log time in ns and content of the messages of some topics, in the order of the file.
+
+        Raises
+        ------
+        LogError
+            if the file is damaged.
+        """
+        from mcap.records import Channel, Message
+
+        channels: dict[int, str] = {}
+        for record in self._records():
+            if isinstance(record, Message):
+                topic = channels.get(record.channel_id)
+                if topic is None:
+                    text = f"a message is of channel {record.channel_id}, which is unknown"
+                    self._faults.found(self._place, DAMAGED_BLOCK, text)
+                elif topic in names:
+                    yield topic, min(record.log_time, _LATEST_NS), record.data
+            elif isinstance(record, Channel):
+                channels[record.id] = record.topic
+
+    def _records(self) -> Iterator[Any]:
+        """Yield the records before the end of the data, those of chunks too."""
+        from mcap.exceptions import EndOfFile, McapError
+        from mcap.records import Chunk, DataEnd
+        from mcap.stream_reader import StreamReader
+
+        try:
+            with self._path.open("rb") as file:
+                if file.read(len(MAGIC)) != MAGIC:
+                    raise LogError(f"{self._place}: is no MCAP file")
+                reader = StreamReader(
+                    file, skip_magic=True, emit_chunks=True, record_size_limit=MAX_RECORD_BYTES
+                )
+                for record in reader.records:
+                    if isinstance(record, DataEnd):
+                        return
+                    if isinstance(record, Chunk):
+                        yield from self._chunk_records(record)
+                    else:
+                        yield record
+        except OSError as error:
+            raise LogError(f"{self._place}: cannot be read ({error.strerror or error})") from error
+        except (EndOfFile, struct.error):
+            self._faults.found(self._place, EARLY_END, "ends in the middle of a record, it was not closed")
+        except (McapError, ValueError) as error:
+            self._faults.found(self._place, DAMAGED_BLOCK, " ".join(str(error).split())[:160])
+
+    def _chunk_records(self, chunk: Chunk) -> list[Any]:
+        """Return the records of a chunk; none where it is damaged."""
+        from mcap.exceptions import EndOfFile
+        from mcap.stream_reader import breakup_chunk
+
+        try:
+            records: list[Any] = breakup_chunk(replace(chunk, compression="", data=_unpacked(chunk)))
+            return records
+        except (EndOfFile, struct.error):
+            text = "a chunk ends in the middle of a record"
+        except ValueError as error:
+            text = " ".join(str(error).split())[:160]
+        self._faults.found(self._place, DAMAGED_BLOCK, text)
+        return []
+
+
+def _topic(channel: Any, schemas: Mapping[int, Any]) -> Topic:
+    schema = schemas.get(channel.schema_id)
+    if schema is None:
+        return Topic(channel.topic, "", channel.message_encoding, "", "")
+    text = schema.data.decode("latin-1" if schema.encoding == "protobuf" else "utf-8", "replace")
+    return Topic(channel.topic, schema.name, channel.message_encoding, schema.encoding, text)
+
+
+def _unpacked(chunk: Chunk) -> bytes:
+    """Return the content of a chunk; ``ValueError`` where it is damaged, or would grow too large."""
+    packed: bytes = chunk.data
+    size: int = chunk.uncompressed_size
+    if size > MAX_RECORD_BYTES or size > max(MAX_RATIO * len(packed), SMALL_BYTES):
+        raise ValueError(f"a chunk of {len(packed)} bytes would have {size} bytes when unpacked")
+    if chunk.compression not in ("", "lz4", "zstd"):
+        raise ValueError(f"a chunk is packed by {shown(chunk.compression)}, lz4 and zstd are read")
+    content = packed
+    if chunk.compression:
+        try:
+            import lz4.frame
+            import zstandard
+        except ImportError as error:
+            raise ConfigError(MISSING_PACKAGE) from error
+        try:
+            if chunk.compression == "zstd":
+                with zstandard.ZstdDecompressor().stream_reader(packed) as reader:
+                    content = bytes(reader.read(size + 1))
+            else:
+                content = bytes(lz4.frame.LZ4FrameDecompressor().decompress(packed, max_length=size + 1))
+        except (zstandard.ZstdError, RuntimeError, EOFError) as error:
+            raise ValueError(f"a chunk cannot be unpacked ({error})") from error
+    if len(content) != size:
+        raise ValueError("a chunk is cut off, or has another size than it states")
+    if chunk.uncompressed_crc and zlib.crc32(content) != chunk.uncompressed_crc:
+        raise ValueError("a chunk has a wrong checksum")
+    return content
+
+
+__all__ = ["LABEL_TOPIC", "WINDOW_TOPIC", "Head", "McapReader", "McapWriter", "RunRecorder"]

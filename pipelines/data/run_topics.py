@@ -1,0 +1,370 @@
+"""A run as topics: names and types of its streams, its document, and messages as rows of numbers.
+
+``/terrain/run`` holds JSON in a ``std_msgs/String``: what ``run.json`` of a run folder states, and of each
+stream its topic and the channel of each field; the last such message of a file is the one that counts.  A
+stream's messages have a header, ``time_s`` as it is in the run, and a field a channel; the stamp of the
+header is ``time_s`` in whole nanoseconds.  All messages of a stream have one length, so that an array of
+records is both their encoder and their decoder.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import struct
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pipelines.data.faults import DAMAGED_MESSAGE, Faults, Topic
+from terrain.errors import LogError
+from terrain.files.documents import parse_json
+from terrain.files.names import shown
+from terrain.logs.log_files import checked_names
+from terrain.logs.read import MAX_STREAMS, MAY_BE_UNKNOWN, read_labels
+from terrain.logs.samples import DEAD_CHANNEL, checked_stream, refuse_apart
+from terrain.logs.schema import unit_of
+from terrain.records import Array, Label, RunLog, Stream
+
+PREFIX = "/terrain/"
+RUN_TOPIC, LABEL_TOPIC, WINDOW_TOPIC = "/terrain/run", "/terrain/label", "/terrain/window"
+RESERVED = tuple(topic.removeprefix(PREFIX) for topic in (RUN_TOPIC, LABEL_TOPIC, WINDOW_TOPIC))
+PACKAGE = "terrain_msgs"
+
+STRING, STRING_TEXT = "std_msgs/msg/String", "string data\n"
+HEADER_TEXT = f"""\
+{"=" * 80}
+MSG: std_msgs/Header
+builtin_interfaces/Time stamp
+string frame_id
+{"=" * 80}
+MSG: builtin_interfaces/Time
+int32 sec
+uint32 nanosec
+"""
+
+TIME_FIELD = "time_s"
+VERSION = 1
+
+LATEST_S = 2**31 - 1
+"""Latest stamp of a header in s: its seconds have 32 bits."""
+
+SHORT_STREAM = "streams with fewer than 2 samples"
+DEAD_STREAM = "streams with nothing finite"
+APART = "streams apart in time"
+
+DECIDED = ("commands", "control")
+"""Streams that a controller writes; sensors have precedence over them."""
+
+
+class StreamTopic(NamedTuple):
+    """A stream as a topic: its name and type, and the channel of each field."""
+
+    topic: str
+    kind: str
+    fields: Mapping[str, str]
+
+    @property
+    def definition(self) -> str:
+        """Definition of its messages, in the language of ``.msg`` files."""
+        lines = ["std_msgs/Header header", *(f"float64 {field}" for field in (TIME_FIELD, *self.fields))]
+        return "\n".join(lines) + "\n" + HEADER_TEXT
+
+
+class Head(NamedTuple):
+    """What a run states of itself beside its streams; ``live`` of one that was recorded as it came."""
+
+    run_id: str
+    robot: str
+    session: str = ""
+    filter: str = ""
+    source: str = ""
+    live: bool = False
+
+
+def stream_topic(stream: str, channels: Sequence[str], taken: Iterable[str] = ()) -> StreamTopic:
+    """Return the topic of a stream; names that ROS does not accept are replaced.
+
+    Parameters
+    ----------
+    stream, channels : names of both
+    taken : topics of the run's other streams
+
+    Examples
+    --------
+    >>> stream_topic("imu", ("gyro_z_radps",))
+    StreamTopic(topic='/terrain/imu', kind='terrain_msgs/msg/Imu', fields={'gyro_z_radps': 'gyro_z_radps'})
+    """
+    others = [topic.removeprefix(PREFIX) for topic in taken]
+    (name,) = _accepted_names([stream], f"stream_{len(others)}", [*RESERVED, *others])
+    fields = _accepted_names(channels, "channel", (TIME_FIELD, "header"))
+    kind = "".join(part.capitalize() for part in name.split("_"))
+    return StreamTopic(PREFIX + name, f"{PACKAGE}/msg/{kind}", dict(zip(fields, channels, strict=True)))
+
+
+def stream_topics(streams: Mapping[str, Stream]) -> dict[str, StreamTopic]:
+    """Return the topic of each stream of a run."""
+    found: dict[str, StreamTopic] = {}
+    for name, stream in streams.items():
+        found[name] = stream_topic(name, stream.channels, [each.topic for each in found.values()])
+    return found
+
+
+def _accepted_names(names: Iterable[str], fallback: str, reserved: Iterable[str]) -> list[str]:
+    """Return a name for each, as ROS accepts them: lower-case letters, digits and single underlines."""
+    taken = set(reserved)
+    found = []
+    for number, name in enumerate(names):
+        plain = re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")
+        plain = plain if re.match(r"[a-z]", plain) else f"{fallback}_{number}"
+        while plain in taken or plain.replace("_", "") in {each.replace("_", "") for each in taken}:
+            plain = f"{plain}_{number}"
+        taken.add(plain)
+        found.append(plain)
+    return found
+
+
+def run_document(
+    head: Head,
+    topics: Mapping[str, StreamTopic],
+    labels: Iterable[Label] = (),
+    dropped: Mapping[str, int] | None = None,
+) -> str:
+    """Return what a message of :data:`RUN_TOPIC` states."""
+    return json.dumps(
+        {
+            "version": VERSION,
+            **head._asdict(),
+            "labels": [label._asdict() for label in labels],
+            "streams": {
+                name: {"topic": each.topic, "type": each.kind, "fields": dict(each.fields)}
+                for name, each in topics.items()
+            },
+            "dropped": dict(sorted((dropped or {}).items())),
+        },
+        allow_nan=False,
+    )
+
+
+def string_message(text: str) -> bytes:
+    r"""Return a message of ``std_msgs/String``.
+
+    Examples
+    --------
+    >>> string_message("a")
+    b'\x00\x01\x00\x00\x02\x00\x00\x00a\x00'
+    """
+    content = text.encode() + b"\0"
+    return struct.pack("<4BI", 0, 1, 0, 0, len(content)) + content
+
+
+def stamps_ns(time_s: Array | Sequence[float], origin_s: float) -> Array:
+    """Return times in whole nanoseconds since an origin.
+
+    Examples
+    --------
+    >>> stamps_ns(np.array([-0.5, 0.25]), -1.0)
+    array([ 500000000, 1250000000])
+    """
+    return np.asarray(np.rint((np.asarray(time_s) - origin_s) * 1e9)).astype(np.int64)
+
+
+def _record(n_channels: int) -> np.dtype[Any]:
+    """Return a message of a stream as it lies in a file: a header with an empty frame, and its numbers."""
+    return np.dtype(
+        [
+            ("encapsulation", "u1", 4),
+            ("sec", "<i4"),
+            ("nanosec", "<u4"),
+            ("frame_bytes", "<u4"),
+            ("frame_and_padding", "u1", 4),
+            ("numbers", "<f8", (1 + n_channels,)),
+        ]
+    )
+
+
+def stream_messages(
+    time_s: Array | Sequence[float], values: Array | Sequence[Sequence[float]], origin_s: float = 0.0
+) -> tuple[Array, list[bytes]]:
+    """Return the stamps (n,) in ns and the messages of samples of a stream.
+
+    Parameters
+    ----------
+    time_s : (n,) on the clock of the run
+    values : (n, c) in the order of the topic's fields
+    origin_s : time that is stamped 0
+    """
+    numbers = np.asarray(values, dtype=float)
+    log_ns = stamps_ns(time_s, origin_s)
+    records = np.zeros(len(log_ns), dtype=_record(numbers.shape[1]))
+    records["encapsulation"][:, 1] = 1
+    records["sec"], records["nanosec"] = log_ns // 10**9, log_ns % 10**9
+    records["frame_bytes"] = 1
+    records["numbers"][:, 0], records["numbers"][:, 1:] = time_s, numbers
+    packed, size = records.tobytes(), records.dtype.itemsize
+    return log_ns, [packed[start : start + size] for start in range(0, len(packed), size)]
+
+
+def stream_samples(place: str, topic: StreamTopic, messages: Sequence[bytes], faults: Faults) -> Array:
+    """Return the numbers (n, 1 + c) in messages of a stream: time in s, and a value a field."""
+    record = _record(len(topic.fields))
+    whole = [each for each in messages if len(each) == record.itemsize and each[:4] == b"\0\1\0\0"]
+    damaged = len(messages) - len(whole)
+    if damaged:
+        text = f"topic {shown(topic.topic)} has {damaged} messages that are not as defined"
+        faults.found(place, DAMAGED_MESSAGE, text, damaged)
+    numbers: Array = np.frombuffer(b"".join(whole), dtype=record)["numbers"]
+    return numbers
+
+
+class RunDocument:
+    """The document of a run in a file of messages, and the run that its messages are.
+
+    Parameters
+    ----------
+    place : of the file, as messages name it
+    text : of the document
+
+    Raises
+    ------
+    LogError
+        if the document is damaged.
+    """
+
+    def __init__(self, place: str, text: str) -> None:
+        self._place = f"{place}: {RUN_TOPIC}"
+        try:
+            document = parse_json(text)
+            if document["version"] != VERSION:
+                raise LogError(f"{self._place}: version {shown(document['version'])} is unknown")
+            self.topics = {
+                str(name): StreamTopic(str(each["topic"]), str(each["type"]), _fields(each["fields"]))
+                for name, each in document["streams"].items()
+            }
+            texts = {name: str(document[name]) for name in Head._fields if name != "live"}
+            self.head = Head(**texts, live=bool(document.get("live", False)))
+            self._dropped = {str(kind): int(n) for kind, n in document["dropped"].items()}
+            self._labels = read_labels(self._place, document["labels"])
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise LogError(f"{self._place}: is damaged ({type(error).__name__}: {error})") from error
+        if not 0 < len(self.topics) <= MAX_STREAMS:
+            raise LogError(f"{self._place}: lists {len(self.topics)} streams, 1 to {MAX_STREAMS} are read")
+
+    def check(self, topics: Mapping[str, Topic]) -> None:
+        """Refuse a file that lacks a topic of a stream, or has one of another type or with other fields."""
+        for name, each in self.topics.items():
+            there = topics.get(each.topic)
+            if there is None or there.kind != each.kind:
+                raise LogError(
+                    f"{self._place}: stream {shown(name)} has no topic {shown(each.topic)} of its type"
+                )
+            for channel in each.fields.values():
+                unit_of(channel)
+            own = re.findall(r"^float64 (\w+)", there.definition.partition("=" * 80)[0], re.MULTILINE)
+            if there.encoding != "cdr" or (there.definition and own != [TIME_FIELD, *each.fields]):
+                raise LogError(f"{self._place}: topic {shown(each.topic)} has not the fields of its stream")
+
+    def run(self, messages: Mapping[str, Sequence[bytes]], faults: Faults) -> RunLog:
+        """Return the run.
+
+        What was recorded as it came is read as a repairing reader does: rows that go back in time, channels
+        without a value, streams of fewer than two samples and streams that no instant has in common with the
+        others are dropped and counted.
+
+        Parameters
+        ----------
+        messages : of each topic, in the order of the file
+        faults : counts what is dropped instead of refused, or refuses
+
+        Raises
+        ------
+        LogError
+            if a stream is broken, or none is left.
+        """
+        dropped = Counter(self._dropped)
+        streams: dict[str, Stream] = {}
+        for name, topic in self.topics.items():
+            numbers = stream_samples(self._place, topic, messages.get(topic.topic, ()), faults)
+            channels = tuple(topic.fields.values())
+            if self.head.live:
+                recorded = _recorded_stream(name, channels, numbers, dropped)
+                streams |= {name: recorded} if recorded is not None else {}
+                continue
+            streams[name] = checked_stream(
+                f"{self._place}: stream {shown(name)}",
+                numbers[:, 0],
+                numbers[:, 1:],
+                channels,
+                row_of=lambda index: index + 1,
+                repairs=faults.repairs,
+                unknown_is_a_value=name in MAY_BE_UNKNOWN,
+            )
+        if self.head.live:
+            streams = _overlapping(streams, dropped)
+            if not streams:
+                raise LogError(f"{self._place}: holds no stream of two samples or more")
+        refuse_apart(self.head.run_id, streams)
+        dropped.update(faults.repairs or {})
+        head = self.head
+        run = RunLog(
+            head.run_id,
+            head.robot,
+            streams,
+            self._labels,
+            source=head.source,
+            dropped=dict(dropped),
+            session=head.session,
+            filter=head.filter,
+        )
+        return checked_names(self._place, run)
+
+
+def _fields(fields: Mapping[str, Any]) -> dict[str, str]:
+    found = {str(field): str(channel) for field, channel in fields.items()}
+    if not found or len(set(found.values())) != len(found):
+        raise ValueError("the fields of a stream are no list of channels")
+    return found
+
+
+def _recorded_stream(
+    name: str, channels: tuple[str, ...], numbers: Array, dropped: Counter[str]
+) -> Stream | None:
+    """Return the samples of a recorded stream in order of time, without channels that never had a value."""
+    try:
+        stream = checked_stream(
+            name,
+            numbers[:, 0],
+            numbers[:, 1:],
+            channels,
+            row_of=lambda index: index + 1,
+            repairs=dropped,
+            unknown_is_a_value=True,
+        )
+    except LogError:
+        dropped[SHORT_STREAM] += 1
+        return None
+    alive = np.isfinite(stream.values).any(axis=0)
+    if name == "control" or alive.all():  # the figures of a decision may be unknown throughout
+        return stream
+    dropped[DEAD_CHANNEL] += int((~alive).sum())
+    if not alive.any():
+        dropped[DEAD_STREAM] += 1
+        return None
+    kept = tuple(channels[i] for i in np.flatnonzero(alive))
+    return Stream(stream.time_s, stream.values[:, alive], kept)
+
+
+def _overlapping(streams: Mapping[str, Stream], dropped: Counter[str]) -> dict[str, Stream]:
+    """Return the streams that have an instant in common, as the readers require: the longest ones."""
+    start_s, end_s, kept = -np.inf, np.inf, set()
+    for name in sorted(streams, key=lambda name: (name in DECIDED, -streams[name].duration_s)):
+        stream = streams[name]
+        latest_s, earliest_s = max(start_s, stream.time_s[0]), min(end_s, stream.time_s[-1])
+        if latest_s < earliest_s:
+            start_s, end_s = latest_s, earliest_s
+            kept.add(name)
+    if len(kept) < len(streams):
+        dropped[APART] += len(streams) - len(kept)
+    return {name: stream for name, stream in streams.items() if name in kept}
