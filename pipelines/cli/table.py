@@ -1,7 +1,7 @@
 """The commands: group, name, module and line of help; and where former commands went.
 
-A module of a command has ``EXAMPLE`` (a command line), ``Settings``, ``run(settings, progress)`` with a result,
-and ``report(result)`` beside each kind of result.
+A module of a command has ``EXAMPLE`` (a command line), ``Settings``, ``run(settings, progress)`` with a
+result, and ``report(result)`` beside each kind of result.
 """
 
 from __future__ import annotations

@@ -25,6 +25,7 @@ from terrain.control.slip_table import SlipTable, load_slip_table
 from terrain.errors import ConfigError, TerrainError
 
 PAGE = Path(__file__).parent / "page"
+ASSETS = Path(__file__).parents[1] / "report" / "assets"
 PAGE_FILES: Mapping[str, str] = {
     "page.js": "text/javascript",
     "page.css": "text/css",
@@ -118,7 +119,9 @@ def _add_page(app: FastAPI) -> None:
     async def page_file(name: str) -> FileResponse:
         if name not in PAGE_FILES:
             raise HTTPException(404, "there is no such file")
-        return FileResponse(PAGE / name, media_type=PAGE_FILES[name])
+        return FileResponse(
+            (ASSETS if name.startswith("uplot") else PAGE) / name, media_type=PAGE_FILES[name]
+        )
 
 
 def _add_state(app: FastAPI, hub: Hub) -> None:

@@ -70,7 +70,9 @@ def test_the_wheel_runs_elsewhere_with_its_yaml(installed_wheel, tmp_path):
     assert (installed_wheel / "terrain" / "_data" / "can" / "agrimaro.dbc").is_file()
     page = {file.name for file in (ROOT / "pipelines" / "serve" / "page").iterdir()}
     assert page == {file.name for file in (installed_wheel / "pipelines" / "serve" / "page").iterdir()}
-    assert {"index.html", "page.js", "page.css", "uplot.js", "uplot.css"} <= page
+    assert {"index.html", "page.js", "page.css"} <= page
+    assets = {file.name for file in (installed_wheel / "pipelines" / "report" / "assets").iterdir()}
+    assert {"uplot.js", "uplot.css"} <= assets
     packaged = {file.name for file in (installed_wheel / "terrain" / "_data").rglob("*.yaml")}
     assert packaged == {file.name for file in (ROOT / "data").rglob("*.yaml")}
 

@@ -1,0 +1,180 @@
+"""Figures as PNG or SVG by matplotlib: one style, the same bytes for the same figure.
+
+The object-oriented interface and an own style are used, so that nothing global is changed and a user's
+settings do not show.
+"""
+
+from __future__ import annotations
+
+import io
+import textwrap
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import matplotlib.style
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure as Drawn
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+
+from pipelines.report.tree import Band, Bars, Figure, Line, Panel, Points, Strip
+
+PNG_DPI = 160
+WIDTH_IN, PANEL_HEIGHT_IN, BAR_HEIGHT_IN, HEAD_IN = 8.4, 2.3, 0.26, 0.9
+TITLE_LETTERS_AN_INCH = 11
+
+INK, FAINT_INK, GRID = "#1f2933", "#66717d", "#dde2e7"
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#e69f00", "#cc79a7", "#56b4e9", "#8c8c8c")
+"""Okabe and Ito (2008), without black and yellow, and grey: distinguishable for colour-blind readers, too."""
+
+STYLE = {
+    "font.family": ["DejaVu Sans"],
+    "font.size": 9.0,
+    "axes.titlesize": 9.5,
+    "axes.labelsize": 9.0,
+    "axes.labelcolor": INK,
+    "axes.edgecolor": FAINT_INK,
+    "axes.linewidth": 0.8,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.axisbelow": True,
+    "text.color": INK,
+    "text.parse_math": False,
+    "text.hinting": "none",
+    "xtick.color": FAINT_INK,
+    "ytick.color": FAINT_INK,
+    "xtick.labelcolor": INK,
+    "ytick.labelcolor": INK,
+    "grid.color": GRID,
+    "grid.linewidth": 0.8,
+    "figure.facecolor": "white",
+    "savefig.facecolor": "white",
+    "svg.fonttype": "path",
+    "svg.hashsalt": "terrain",
+    "path.simplify": False,
+}
+"""Names of runs are drawn as they are: a dollar sign in one starts no formula.  Without hinting a text is
+as wide in one resolution as in another, so that a layout made for one fits the other."""
+
+
+def figure_png(figure: Figure, dpi: int = PNG_DPI) -> bytes:
+    """Return a figure as PNG: the same bytes for the same figure, with no date and no version inside."""
+    with _styled():
+        file = io.BytesIO()
+        draw(figure).savefig(file, format="png", dpi=dpi, metadata={"Software": None})
+    return file.getvalue()
+
+
+def figure_svg(figure: Figure) -> str:
+    """Return a figure as SVG: the same text for the same figure; letters are drawn, no font is needed."""
+    with _styled():
+        file = io.BytesIO()
+        draw(figure).savefig(file, format="svg", metadata={"Date": None, "Creator": None})
+    return file.getvalue().decode()
+
+
+@contextmanager
+def _styled() -> Iterator[None]:
+    with matplotlib.style.context(["default", STYLE]):
+        yield
+
+
+def draw(figure: Figure) -> Drawn:
+    """Return the figure as matplotlib has it: panels below one another, with the layout fixed."""
+    heights = [_height_in(panel) for panel in figure.panels]
+    drawn = Drawn(
+        figsize=(WIDTH_IN, sum(heights) + HEAD_IN),
+        dpi=PNG_DPI,
+        layout=ConstrainedLayoutEngine(w_pad=0.08, h_pad=0.05),
+    )
+    FigureCanvasAgg(drawn)
+    grid = drawn.add_gridspec(len(heights), 1, height_ratios=heights)
+    for i, panel in enumerate(figure.panels):
+        axes = drawn.add_subplot(grid[i])
+        _draw_panel(axes, panel)
+        if i == len(heights) - 1 and figure.x_label and not panel.x_label:
+            axes.set_xlabel(figure.x_label)
+    title = textwrap.fill(figure.title, int(TITLE_LETTERS_AN_INCH * WIDTH_IN))
+    drawn.suptitle(title, x=0.015, ha="left", fontsize=10.5, fontweight="bold")
+    drawn.draw_without_rendering()
+    drawn.set_layout_engine("none")
+    return drawn
+
+
+def _height_in(panel: Panel) -> float:
+    bars = [mark for mark in panel.marks if isinstance(mark, Bars)]
+    if bars:
+        return 0.6 + BAR_HEIGHT_IN * len(bars[0].categories) * max(1.0, 0.7 * len(bars))
+    return 4.5 if panel.equal else PANEL_HEIGHT_IN
+
+
+def _draw_panel(axes: Axes, panel: Panel) -> None:
+    bars = [mark for mark in panel.marks if isinstance(mark, Bars)]
+    others = [mark for mark in panel.marks if not isinstance(mark, Bars)]
+    for number, mark in enumerate(others):
+        _draw_mark(axes, mark, number)
+    for number, bar in enumerate(bars):
+        _draw_bars(axes, bar, number, len(bars))
+    axes.set(xlabel=panel.x_label, ylabel=panel.y_label)
+    if panel.title:
+        axes.set_title(panel.title, loc="left")
+    if panel.x_range is not None:
+        axes.set_xlim(*panel.x_range)
+    if panel.y_range is not None:
+        axes.set_ylim(*panel.y_range)
+    if panel.log_x:
+        axes.set_xscale("log")
+    if panel.equal:
+        axes.set_aspect("equal", adjustable="datalim")
+    axes.grid(axis="x" if bars else "both")
+    handles, labels = axes.get_legend_handles_labels()
+    if len(labels) > 1 or (labels and not panel.y_label):
+        place = "lower left", (0.0, 1.0 if not panel.title else 1.1)
+        axes.legend(
+            handles,
+            labels,
+            ncols=4,
+            fontsize=8,
+            frameon=False,
+            loc=place[0],
+            bbox_to_anchor=place[1],
+            borderpad=0,
+        )
+
+
+def _draw_mark(axes: Axes, mark: Line | Band | Points | Strip, number: int) -> None:
+    if isinstance(mark, Strip):
+        names = list(dict.fromkeys(name for _, _, name in mark.spans))
+        for start, end, name in mark.spans:
+            axes.axvspan(start, end, color=COLOURS[names.index(name) % len(COLOURS)], alpha=0.18, lw=0)
+        for i, name in enumerate(names):
+            axes.fill_between([], [], color=COLOURS[i % len(COLOURS)], alpha=0.18, lw=0, label=name)
+        return
+    colour = COLOURS[(number if mark.colour is None else mark.colour) % len(COLOURS)]
+    label = mark.label or "_nolegend_"
+    x = np.asarray(mark.x, float)
+    if isinstance(mark, Line):
+        axes.plot(
+            x, np.asarray(mark.y, float), color=colour, lw=1.2, ls="--" if mark.dashed else "-", label=label
+        )
+    elif isinstance(mark, Band):
+        low, high = np.asarray(mark.low, float), np.asarray(mark.high, float)
+        axes.fill_between(x, low, high, color=colour, alpha=0.2, lw=0, label=label)
+    else:
+        y = np.asarray(mark.y, float)
+        axes.plot(x, y, "o", ms=3.5, color=colour, label=label)
+        if mark.low is not None:
+            axes.vlines(x, np.asarray(mark.low, float), np.asarray(mark.high, float), color=colour, lw=1.0)
+
+
+def _draw_bars(axes: Axes, mark: Bars, number: int, n_bars: int) -> None:
+    height = 0.8 / n_bars
+    y = np.arange(len(mark.categories)) + (number - 0.5 * (n_bars - 1)) * height
+    values = np.asarray(mark.values, float)
+    colour = COLOURS[(number if mark.colour is None else mark.colour) % len(COLOURS)]
+    axes.barh(y, values, height=0.9 * height, color=colour, alpha=0.85, label=mark.label or "_nolegend_")
+    if mark.low is not None:
+        axes.hlines(y, np.asarray(mark.low, float), np.asarray(mark.high, float), color=INK, lw=1.0)
+    axes.set_yticks(np.arange(len(mark.categories)), mark.categories)
+    axes.set_ylim(len(mark.categories) - 0.4, -0.6)

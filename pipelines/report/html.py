@@ -1,0 +1,151 @@
+"""A report as one HTML file, whose figures zoom; and as a fragment with pictures, for notebooks.
+
+All that a report holds is escaped.  The page needs no network: style and scripts are inside it.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+from pipelines.report.numbers import format_value
+from pipelines.report.terminal import heading, is_numeric
+from pipelines.report.tree import Band, Bars, Figure, Line, Points, Report, Strip, Table, figures_of
+
+ASSETS = Path(__file__).parent / "assets"
+DIGITS = 6
+"""Significant digits of what a figure draws: more than can be seen."""
+
+MAX_SVG_BYTES = 300_000
+"""A figure of a fragment that needs more as lines becomes points."""
+
+
+@cache
+def _environment() -> Environment:
+    environment = Environment(
+        loader=PackageLoader("pipelines.report", "templates"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.globals |= {
+        "kind_of": lambda part: type(part).__name__,
+        "written": format_value,
+        "heading": heading,
+        "numeric": _numeric,
+        "shade": _shade,
+    }
+    return environment
+
+
+def html_page(report: Report) -> str:
+    """Return the report as one page.
+
+    Examples
+    --------
+    >>> page = html_page(Report("Runs of <ice>", "All are right."))
+    >>> "<h1>Runs of &lt;ice&gt;</h1>" in page, "<script" in page
+    (True, False)
+    """
+    figures = figures_of(report)
+    places = {id(figure): number for number, figure in enumerate(figures)}
+    data = json.dumps([figure_data(each) for each in figures], separators=(",", ":"), allow_nan=False)
+
+    def picture(figure: Figure) -> Markup:
+        holder = Markup('<div class="plot" role="img" aria-label="{}" data-figure="{}"></div>')
+        return holder.format(figure.alt or figure.caption or figure.title, places[id(figure)])
+
+    return (
+        _environment()
+        .get_template("page.html.j2", globals={"picture": picture})
+        .render(
+            report=report,
+            picture=picture,
+            style=Markup(_asset("report.css") + (_asset("uplot.css") if figures else "")),
+            figures=Markup(data.replace("<", "\\u003c")) if figures else "",
+            scripts=Markup(_asset("uplot.js") + _asset("report.js")),
+        )
+    )
+
+
+def html_fragment(report: Report) -> str:
+    """Return the report as a part of a page: figures are pictures, and nothing runs."""
+
+    def picture(figure: Figure) -> Markup:
+        from pipelines.report.drawing import figure_png, figure_svg
+
+        svg = figure_svg(figure).encode()
+        kind, content = ("svg+xml", svg) if len(svg) <= MAX_SVG_BYTES else ("png", figure_png(figure))
+        source = f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
+        return Markup('<img src="{}" alt="{}">').format(source, figure.alt or figure.caption or figure.title)
+
+    module = _environment().get_template("parts.html.j2").make_module({"picture": picture})
+    return f'<div class="terrain-report">{module.body(report)}</div>'  # type: ignore[attr-defined]
+
+
+def figure_data(figure: Figure) -> dict[str, Any]:
+    """Return what the page's script draws of a figure; what is not finite is None.
+
+    Examples
+    --------
+    >>> from pipelines.report import Panel
+    >>> figure = Figure("Speed", [Panel([Line("measured", [0, 1], [0.5, math.nan])], "m/s")])
+    >>> figure_data(figure)["panels"][0]["marks"][0]["y"]
+    [0.5, None]
+    """
+    panels = [
+        {
+            "marks": [_mark_data(mark) for mark in panel.marks],
+            "title": panel.title,
+            "x_label": panel.x_label,
+            "y_label": panel.y_label,
+            "x_range": panel.x_range and [float(end) for end in panel.x_range],
+            "y_range": panel.y_range and [float(end) for end in panel.y_range],
+            "equal": panel.equal,
+            "log_x": panel.log_x,
+        }
+        for panel in figure.panels
+    ]
+    return {"title": figure.title, "x_label": figure.x_label, "panels": panels}
+
+
+def _mark_data(mark: Line | Band | Points | Bars | Strip) -> dict[str, Any]:
+    found: dict[str, Any] = {"kind": type(mark).__name__.lower()}
+    for name, value in mark._asdict().items():
+        if name in ("x", "y", "low", "high", "values") and value is not None:
+            value = [_plain(each) for each in value]
+        elif name == "spans":
+            value = [[_plain(start), _plain(end), str(text)] for start, end, text in value]
+        elif name == "categories":
+            value = [str(each) for each in value]
+        found[name] = value
+    return found
+
+
+def _plain(value: Any) -> float | None:
+    if value is None or not math.isfinite(value):
+        return None
+    return float(f"{float(value):.{DIGITS}g}")
+
+
+@cache
+def _asset(name: str) -> str:
+    return (ASSETS / name).read_text(encoding="utf-8")
+
+
+def _numeric(table: Table, place: int) -> bool:
+    return is_numeric(table.heads[place], [row[place] for row in table.rows])
+
+
+def _shade(value: Any) -> str:
+    """Return the background of a cell that holds a ratio."""
+    known = isinstance(value, int | float) and math.isfinite(value)
+    return f"background: rgb(0 114 178 / {min(max(float(value), 0.0), 1.0) * 0.6:.2f})" if known else ""

@@ -1,0 +1,228 @@
+"""How a number is written: one function for screens, pages, cards and sentences."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from enum import Enum
+from typing import Any
+
+NOT_KNOWN = "\N{EN DASH}"
+"""Written where a figure is not known."""
+
+NBSP = "\N{NO-BREAK SPACE}"
+MINUS = "\N{MINUS SIGN}"
+
+SI = {
+    "ratio": "",
+    "radps": "rad/s",
+    "mps2": "m/s²",
+    "mps": "m/s",
+    "s2": "s²",
+    "s2pm": "s²/m",
+    "s2pm2": "s²/m²",
+    "a": "A",
+    "n": "N",
+    "nm": "Nm",
+    "hz": "Hz",
+    "nspm": "N s/m",
+}
+"""How the last word of a parameter's name is written as a unit; others are written as they are."""
+
+SMALL = {"rad": "mrad", "radps": "mrad/s", "s": "ms", "m": "mm"}
+"""Units of a thousandth."""
+
+TINY = 1e-12
+"""Ends of an interval below this are written as 0: rounding of two equal numbers."""
+
+_SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+def format_value(value: Any, form: str = "", unit: str = "") -> str:
+    r"""Return a value as it is written everywhere.
+
+    Parameters
+    ----------
+    value : a number, a text, a truth value, None, or a pair (low, high), which is an interval
+    form : Python's format, as ``.3f`` or ``.1%``; empty for three significant digits of a number with a
+        fraction, and for all others as they are
+    unit : behind the number
+
+    Examples
+    --------
+    >>> format_value(0.8134, ".1%"), format_value(-0.25, "+.2f"), format_value(None), format_value(3)
+    ('81.3\xa0%', '−0.25', '–', '3')
+    >>> format_value((0.7236, 0.9079), ".1%"), format_value(0.12648, unit="m/s")
+    ('72.4 to 90.8\xa0%', '0.126\xa0m/s')
+    """
+    if isinstance(value, tuple) and len(value) == 2 and not any(isinstance(end, str) for end in value):
+        return interval(value[0], value[1], form, unit)
+    text = _bare(value, form)
+    if text == NOT_KNOWN:
+        return text
+    ending = "%" if form.endswith("%") else unit
+    return f"{text}{NBSP}{ending}" if ending else text
+
+
+def interval(low: float | None, high: float | None, form: str = "", unit: str = "") -> str:
+    r"""Return an interval; a mark where an end is not known.
+
+    Examples
+    --------
+    >>> interval(0.1, 0.25, ".2f", "m"), interval(float("nan"), 1.0)
+    ('0.10 to 0.25\xa0m', '–')
+    """
+    if low is None or high is None:
+        return NOT_KNOWN
+    low, high = (0.0 if isinstance(end, float) and abs(end) < TINY else end for end in (low, high))
+    ends = _bare(low, form), _bare(high, form)
+    if NOT_KNOWN in ends:
+        return NOT_KNOWN
+    ending = "%" if form.endswith("%") else unit
+    return f"{ends[0]} to {ends[1]}{NBSP}{ending}" if ending else f"{ends[0]} to {ends[1]}"
+
+
+def _bare(value: Any, form: str) -> str:
+    """Return a value without its unit."""
+    if value is None:
+        return NOT_KNOWN
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, Enum):
+        return str(value.value)
+    if isinstance(value, str):
+        return value
+    if not isinstance(value, int | float) and hasattr(value, "item"):
+        value = value.item()
+    if isinstance(value, float) and not math.isfinite(value):
+        return NOT_KNOWN if math.isnan(value) else ("∞" if value > 0 else f"{MINUS}∞")
+    if form.endswith("%"):
+        text = f"{100.0 * value:{form[:-1]}f}" if not form.endswith("f%") else f"{100.0 * value:{form[:-1]}}"
+    elif form:
+        text = f"{value:{form}}"
+    else:
+        return format_number(value) if isinstance(value, float) else str(value).replace("-", MINUS)
+    return text.replace("-", MINUS)
+
+
+def format_number(number: float) -> str:
+    """Return a number with three significant digits.
+
+    Examples
+    --------
+    >>> format_number(0.12648), format_number(3.81e-4), format_number(7e-6)
+    ('0.126', '3.81·10⁻⁴', '7·10⁻⁶')
+    >>> format_number(-2.0), format_number(4096.0)
+    ('−2', '4096')
+    """
+    if number == 0:
+        return "0"
+    if not 1e-3 <= abs(number) < 1e5:
+        digits, _, power = f"{number:.2e}".partition("e")
+        text = f"{float(digits):g}·10{str(int(power)).translate(_SUPERSCRIPT)}"
+    else:
+        text = f"{number:.3g}" if abs(number) < 1000 else f"{number:.0f}"
+    return text.replace("-", MINUS)
+
+
+def two_digits(value: float) -> str:
+    """Return a number with two significant digits.
+
+    Examples
+    --------
+    >>> two_digits(0.0127)
+    '0.013'
+    """
+    return format_number(float(f"{value:.2g}"))
+
+
+def unit_of(parameter: str) -> str:
+    """Return the unit that the last word of a parameter's name gives.
+
+    Examples
+    --------
+    >>> unit_of("gyro_bias_radps"), unit_of("scrub_ratio")
+    ('rad/s', '')
+    """
+    unit = parameter.rpartition("_")[2]
+    return SI.get(unit, unit)
+
+
+def quantity(parameter: str, value: float) -> str:
+    r"""Return the value of an effect's parameter with its unit, in two significant digits.
+
+    Examples
+    --------
+    >>> quantity("gyro_bias_radps", 0.0031), quantity("wheel_radius_ratio", 0.004)
+    ('3.1\xa0mrad/s', '0.4\xa0%')
+    >>> quantity("scrub_ratio", 0.02), quantity("lever_x_m", math.nan)
+    ('0.02', '–')
+    """
+    from terrain.effects import PARAMETER
+
+    if not math.isfinite(value):
+        return NOT_KNOWN
+    if parameter in PARAMETER and PARAMETER[parameter].as_percent:
+        return f"{two_digits(100.0 * value)}{NBSP}%"
+    unit = parameter.rpartition("_")[2]
+    if unit in SMALL and abs(value) < 0.0995:
+        return f"{two_digits(1000.0 * value)}{NBSP}{SMALL[unit]}"
+    return f"{two_digits(value)}{NBSP}{unit_of(parameter)}".strip(NBSP)
+
+
+def format_counts(counts: Mapping[str, int]) -> str:
+    """Return counts by kind, sorted by kind.
+
+    Examples
+    --------
+    >>> format_counts({"not moving": 1, "gap": 2})
+    '2 gap, 1 not moving'
+    """
+    return ", ".join(f"{n} {kind}" for kind, n in sorted(counts.items()))
+
+
+def plural(n: int, thing: str) -> str:
+    """Return a number of things.
+
+    Examples
+    --------
+    >>> plural(1, "run"), plural(2, "class")
+    ('1 run', '2 classes')
+    """
+    return f"{n} {thing if n == 1 else thing + ('es' if thing.endswith('s') else 's')}"
+
+
+def enumerated(names: Sequence[str], last: str = "and") -> str:
+    """Return names as a sentence lists them.
+
+    Examples
+    --------
+    >>> enumerated(["a", "b", "c"]), enumerated(["a"]), enumerated([])
+    ('a, b and c', 'a', '')
+    """
+    return f"{', '.join(names[:-1])} {last} {names[-1]}" if len(names) > 1 else "".join(names)
+
+
+def shorten(text: str, width: int) -> str:
+    """Cut the middle out of a text that is too long; both ends of an id carry information.
+
+    Examples
+    --------
+    >>> shorten("2024-05-01_field_north_run_17", 16)
+    '2024-05…h_run_17'
+    """
+    if len(text) <= width:
+        return text
+    tail = width // 2
+    return f"{text[: width - tail - 1]}…{text[-tail:]}"
+
+
+def sentence(text: str) -> str:
+    """Write a remark as a sentence.
+
+    Examples
+    --------
+    >>> sentence("not enough yet")
+    'Not enough yet.'
+    """
+    return f"{text[:1].upper()}{text[1:]}{'' if text.endswith('.') else '.'}"

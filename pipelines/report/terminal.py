@@ -1,0 +1,168 @@
+"""A report on a terminal; and bars of progress, on stderr."""
+
+from __future__ import annotations
+
+import io
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+
+from rich.box import SIMPLE
+from rich.console import Console, RenderableType
+from rich.padding import Padding
+from rich.table import Column as RichColumn
+from rich.table import Table as RichTable
+from rich.text import Text as RichText
+
+from pipelines.report.numbers import NOT_KNOWN, format_value
+from pipelines.report.results import Progress
+from pipelines.report.tree import Cards, Column, Pairs, Part, Report, Section, Table, Text
+
+WIDTH_OF_A_FILE = 110
+"""Characters of a line where the output is no terminal, which has a width of its own."""
+
+
+@contextmanager
+def progress_bar() -> Iterator[Progress]:
+    """Show one bar a task on stderr; give the function that moves them."""
+    from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress as Bars
+
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
+    bars = Bars(*columns, console=Console(stderr=True))
+    tasks: dict[str, TaskID] = {}
+
+    def show(task: str, done: int, total: int) -> None:
+        if not tasks:
+            bars.start()  # not before: data that are refused at once are one line on stderr
+        if task not in tasks:
+            tasks[task] = bars.add_task(task, total=total)
+        bars.update(tasks[task], completed=done, total=total)
+
+    try:
+        yield show
+    finally:
+        if tasks:
+            bars.stop()
+
+
+def output_console() -> Console:
+    """Return the console that results are printed on."""
+    # names come from the user's files: brackets in them are no markup
+    return Console(soft_wrap=True, markup=False, width=None if sys.stdout.isatty() else WIDTH_OF_A_FILE)
+
+
+def print_report(report: Report, console: Console, *, details: bool = False) -> None:
+    """Print a report: its answer, what is decided by, and with ``details`` all of it."""
+    for part in _screen(report, details):
+        console.print(part, highlight=False)
+
+
+def terminal_text(report: Report, *, details: bool = False, width: int = WIDTH_OF_A_FILE) -> str:
+    """Return what :func:`print_report` prints.
+
+    Examples
+    --------
+    >>> table = Table(("terrain", Column("recall", ".1%")), [("grass", 0.5)])
+    >>> terminal_text(Report("Runs", "Half of them are right.", parts=[table])).split()[-3:]
+    ['grass', '50.0', '%']
+    """
+    console = Console(file=io.StringIO(), width=width, markup=False, soft_wrap=True, color_system=None)
+    print_report(report, console, details=details)
+    written: str = console.file.getvalue()  # type: ignore[attr-defined]
+    return "\n".join(line.rstrip() for line in written.rstrip().splitlines())
+
+
+def _screen(report: Report, details: bool) -> Iterator[RenderableType]:
+    yield RichText(report.answer, style="bold")
+    if report.lead:
+        yield RichText(report.lead, style="dim")
+    yield from _parts(report.parts)
+    if details:
+        for section in report.details:
+            yield from _parts([section])
+    elif report.details:
+        yield RichText(f"--details adds: {'; '.join(each.title for each in report.details)}", style="dim")
+    if report.next_step:
+        yield RichText(f"next: {report.next_step}")
+
+
+def _parts(parts: Sequence[Part]) -> Iterator[RenderableType]:
+    for part in parts:
+        if isinstance(part, Text):
+            mark = {"note": "note: ", "warning": "warning: "}.get(part.kind, "")
+            yield RichText(mark + part.text, style="yellow" if part.kind == "warning" else "")
+        elif isinstance(part, Table):
+            yield _table(part)
+            if part.note:
+                yield RichText(part.note, style="dim")
+        elif isinstance(part, Pairs):
+            yield _pairs(part)
+        elif isinstance(part, Cards):
+            rows = [
+                (card.title, format_value(card.value, card.form, card.unit), card.text) for card in part.cards
+            ]
+            yield _grid(rows)
+        elif isinstance(part, Section):
+            if part.title:
+                yield RichText(f"\n{part.title}", style="bold")
+            yield from _parts(part.parts)
+        # a figure is not drawn on a terminal: pages have it
+
+
+def _table(table: Table) -> RenderableType:
+    numeric = [is_numeric(head, [row[i] for row in table.rows]) for i, head in enumerate(table.heads)]
+    columns = [
+        RichColumn(
+            RichText(heading(head)),
+            justify="right" if right else "left",
+            overflow="fold",
+            min_width=24 if head.long else None,
+        )
+        for head, right in zip(table.heads, numeric, strict=True)
+    ]
+    drawn = RichTable(
+        *columns, title=table.title or None, box=SIMPLE, padding=(0, 1, 0, 0), title_justify="left"
+    )
+    for row in table.rows:
+        drawn.add_row(*(RichText(format_value(v, h.form)) for v, h in zip(row, table.heads, strict=True)))
+    return drawn
+
+
+def _pairs(pairs: Pairs) -> RenderableType:
+    rows = [(str(row[0]), format_value(*row[1:])) for row in pairs.rows]
+    grid = _grid(rows)
+    return grid if not pairs.title else Padding(_titled(pairs.title, grid), 0)
+
+
+def _titled(title: str, grid: RichTable) -> RichTable:
+    grid.title, grid.title_justify = title, "left"
+    return grid
+
+
+def _grid(rows: Sequence[Sequence[str]]) -> RichTable:
+    grid = RichTable.grid(padding=(0, 2, 0, 0))
+    for _ in rows[0] if rows else ():
+        grid.add_column(overflow="fold")
+    for row in rows:
+        grid.add_row(*map(RichText, row))
+    return grid
+
+
+def heading(column: Column) -> str:
+    """Return the heading of a column, with its unit.
+
+    Examples
+    --------
+    >>> heading(Column("speed", unit="m/s"))
+    'speed [m/s]'
+    """
+    return f"{column.title} [{column.unit}]" if column.unit else column.title
+
+
+def is_numeric(column: Column, values: Sequence[object]) -> bool:
+    """Return whether values are aligned on the right."""
+    known = [value for value in values if value is not None]
+    return bool(column.form) or (
+        bool(known) and all(not isinstance(value, str) and value != NOT_KNOWN for value in known)
+    )
