@@ -14,9 +14,9 @@ import numpy as np
 from pipelines.bench.fleet_runs import RUN_S, fleet_loaders, fleet_run, write_fleet_run
 from pipelines.bench.memory import cpu_s, peak_memory
 from pipelines.bench.settings import FleetSettings
-from pipelines.compute.parallel import end_processes, parallel
 from pipelines.feature_store.build import build_store
 from pipelines.feature_store.settings import FeaturesSettings
+from pipelines.learn.parallel import end_processes, parallel
 from pipelines.reporting.progress import Progress, silent
 
 FRACTIONS = (0.1, 0.3, 1.0)

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 from sklearn.base import BaseEstimator
 
-from pipelines.compute.parallel import parallel
 from pipelines.crossval.evaluation import Examples, fit_on
 from pipelines.crossval.results import ChannelImportance
 from pipelines.crossval.splits import Fold
+from pipelines.learn.parallel import parallel
 from pipelines.reporting.progress import Progress, silent
 from terrain.records import Array
 

@@ -7,8 +7,8 @@ import typer
 from pipelines.classify.settings import ModelSettings, PredictSettings, TrainSettings
 from pipelines.cli.command import Json, command
 from pipelines.compare.settings import CompareSettings
-from pipelines.compute.settings import ComputeSettings
 from pipelines.crossval.settings import CrossvalSettings
+from pipelines.learn.parallel import ComputeSettings
 from pipelines.runs.settings import AlignedRunsSettings, load
 from pipelines.sweep.settings import SweepSettings
 
@@ -25,11 +25,11 @@ def crossval_command(
     """Evaluate a recipe on held-out runs, of run logs or of a store of features."""
     from dataclasses import replace
 
-    from pipelines.compute.parallel import computing
     from pipelines.crossval.crossval import crossval
     from pipelines.crossval.screen import print_crossval
     from pipelines.feature_store.crossval import crossval_store
     from pipelines.feature_store.store import is_store, store_of
+    from pipelines.learn.parallel import computing
     from pipelines.reporting.json_file import write_json
     from pipelines.reporting.terminal import output_console, progress_bar
     from pipelines.runs.datasets import data_digest
@@ -82,9 +82,9 @@ def train_command(
 
     from pipelines.classify.screen import print_training
     from pipelines.classify.train import train, train_store
-    from pipelines.compute.parallel import computing
     from pipelines.crossval.screen import print_crossval
     from pipelines.feature_store.store import is_store, store_of
+    from pipelines.learn.parallel import computing
     from pipelines.reporting.json_file import write_json
     from pipelines.reporting.terminal import output_console, progress_bar
 
@@ -107,7 +107,7 @@ def sweep_command(
     source: AlignedRunsSettings, settings: SweepSettings, compute: ComputeSettings, json_file: Json = None
 ) -> None:
     """Search hyper-parameters on inner folds; a search that was interrupted goes on."""
-    from pipelines.compute.parallel import computing
+    from pipelines.learn.parallel import computing
     from pipelines.reporting.json_file import write_json
     from pipelines.reporting.terminal import output_console, progress_bar
     from pipelines.sweep.screen import print_sweep

@@ -5,8 +5,8 @@ from __future__ import annotations
 import typer
 
 from pipelines.cli.command import Json, command
-from pipelines.compute.settings import ComputeSettings
 from pipelines.feature_store.settings import FeaturesSettings
+from pipelines.learn.parallel import ComputeSettings
 from pipelines.runs.settings import AlignedRunsSettings
 
 app = typer.Typer()
@@ -20,9 +20,9 @@ def features_command(
     json_file: Json = None,
 ) -> None:
     """Write the features of runs, one file a run, for crossval, train and sweep; go on where interrupted."""
-    from pipelines.compute.parallel import computing
     from pipelines.feature_store.build import build_store
     from pipelines.feature_store.screen import print_store
+    from pipelines.learn.parallel import computing
     from pipelines.reporting.json_file import write_json
     from pipelines.reporting.terminal import output_console, progress_bar
     from pipelines.runs.datasets import run_loaders

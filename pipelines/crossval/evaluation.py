@@ -10,9 +10,9 @@ import numpy as np
 from sklearn.base import BaseEstimator, clone
 
 from features.windows import WindowCut
-from pipelines.compute.parallel import parallel
 from pipelines.crossval.results import Figures, FoldFigures
 from pipelines.crossval.splits import Fold, Samples
+from pipelines.learn.parallel import parallel
 from pipelines.reporting.progress import Progress, silent
 from terrain.classify.confidence import confidence_figures
 from terrain.classify.conformal import conformal_sets, conformal_threshold, held_out_scores
@@ -118,7 +118,7 @@ def fit_folds(
     classifier : estimator with ``fit(X, y, groups)`` and ``predict_proba``
     examples : rows that the folds number
     folds : train and test rows
-    n_jobs : processes at once on this machine, see :func:`pipelines.compute.parallel.parallel`
+    n_jobs : processes at once on this machine, see :func:`pipelines.learn.parallel.parallel`
     task, progress : name of the work, and what is called as it goes on
     asks : for each fold, what is called with its fitted classifier, where it is fitted
     """

@@ -19,7 +19,6 @@ import numpy as np
 from features.extractor import FeatureExtractor
 from features.motion import Motion, window_motion
 from features.windows import cut_windows, layout_of
-from pipelines.compute.parallel import parallel
 from pipelines.feature_store.heads import Head, head_of
 from pipelines.feature_store.manifest import (
     RUNS_FILE,
@@ -32,6 +31,7 @@ from pipelines.feature_store.print_files import PrintFiles
 from pipelines.feature_store.results import StoreReport
 from pipelines.feature_store.run_file import RunWindows, file_of, read_run_windows, write_run_windows
 from pipelines.feature_store.settings import FeaturesSettings
+from pipelines.learn.parallel import parallel
 from pipelines.reporting.progress import Progress, silent
 from pipelines.runs.datasets import RunLoader, data_digest
 from terrain.errors import ConfigError, LogError

@@ -15,12 +15,12 @@ import numpy as np
 from sklearn.base import clone
 
 from features.motion import Motion, window_motion
-from pipelines.compute.parallel import parallel
 from pipelines.crossval.crossval import samples_of
 from pipelines.crossval.evaluation import Examples
 from pipelines.crossval.extras import examples_of
 from pipelines.crossval.settings import CrossvalSettings
 from pipelines.crossval.splits import Fold, folds_of
+from pipelines.learn.parallel import parallel
 from pipelines.models.recipes import feature_matrix
 from pipelines.propose.proposals import ACCEPTED, Proposal, questions
 from pipelines.reporting.progress import Progress, silent

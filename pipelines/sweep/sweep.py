@@ -16,11 +16,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipelines.compute.parallel import parallel
 from pipelines.crossval.crossval import samples_of
 from pipelines.crossval.evaluation import Examples
 from pipelines.crossval.extras import examples_of
 from pipelines.crossval.splits import folds_of
+from pipelines.learn.parallel import parallel
 from pipelines.models.params_file import BEST_FILE, SvmParams, write_params
 from pipelines.models.recipes import feature_matrix
 from pipelines.reporting.progress import Progress, silent

@@ -5,7 +5,7 @@ import warnings
 
 import pytest
 
-from pipelines.compute.parallel import computing
+from pipelines.learn.parallel import computing
 from pipelines.crossval.crossval import crossval
 from pipelines.crossval.settings import CrossvalSettings
 from pipelines.reporting.json_file import as_json

@@ -12,7 +12,7 @@ import pytest
 
 from features.motion import NO_MOTION, Motion, window_motion
 from features.windows import layout_of
-from pipelines.compute.parallel import computing
+from pipelines.learn.parallel import computing
 from pipelines.crossval.crossval import crossval, samples_of
 from pipelines.crossval.settings import CrossvalSettings
 from pipelines.feature_store import build, manifest

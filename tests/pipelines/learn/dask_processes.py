@@ -8,8 +8,6 @@ import time
 from contextlib import contextmanager
 from pathlib import Path
 
-import pytest
-
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[2]
 
@@ -70,13 +68,3 @@ def processes():
         yield running
     finally:
         running.stop()
-
-
-@pytest.fixture
-def cluster_processes(tmp_path, monkeypatch):
-    """A scheduler without workers; ``add_worker`` adds them."""
-    pytest.importorskip("distributed")
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.syspath_prepend(str(HERE))
-    with processes() as running:
-        yield running

@@ -4,17 +4,28 @@ import os
 import signal
 import subprocess
 import sys
+import time
 import warnings
+from contextlib import suppress
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from features.windows import WindowRule
-from pipelines.compute import cluster
-from pipelines.compute.parallel import computing, parallel, place
-from pipelines.compute.settings import ComputeSettings, scheduler_address
-from pipelines.compute.software import difference, software
+from pipelines.learn import parallel as cluster
+from pipelines.learn.parallel import (
+    ComputeSettings,
+    computing,
+    difference,
+    parallel,
+    place,
+    scheduler_address,
+    software,
+)
 from terrain.errors import ConfigError, TerrainError
+
+HERE = Path(__file__).resolve().parent
 
 
 @pytest.mark.parametrize(
@@ -71,13 +82,48 @@ def test_a_process_that_ends_is_one_sentence():
         list(parallel(os._exit, (), [(3,), (3,)], 2))
 
 
-def test_dask_is_not_imported_before_it_is_needed():
+def children_of(process):
+    """Return the processes that a process started, directly or not."""
+    found = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        with suppress(OSError):
+            words = stat.read_text().rpartition(")")[2].split()
+            if int(words[1]) == process and words[0] != "Z":
+                found += [int(stat.parent.name), *children_of(int(stat.parent.name))]
+    return found
+
+
+@pytest.mark.parametrize("request_to_end", [signal.SIGTERM, signal.SIGKILL])
+def test_no_process_is_left_where_the_command_is_ended(request_to_end):
     code = (
-        "import sys; from pipelines.cli.main import app; from pipelines.compute.parallel import computing;"
-        "computing('local').__enter__(); print('distributed' in sys.modules or 'optuna' in sys.modules)"
+        "import time; from pipelines.learn.parallel import parallel; print('begun', flush=True);"
+        "list(parallel(time.sleep, (), [(0.0,), (0.0,), (300.0,), (300.0,)], 2))"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "False"
+    command = subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+    )
+    try:
+        assert command.stdout.readline() == "begun\n"
+        end_s = time.monotonic() + 60
+        while len(started := children_of(command.pid)) < 3 and time.monotonic() < end_s:
+            time.sleep(0.1)
+        assert len(started) >= 3  # two that compute, one that keeps count of files
+        time.sleep(2.0)
+    finally:
+        command.send_signal(request_to_end)
+        command.communicate()
+    end_s = time.monotonic() + 20
+    while any(map(running, started)) and time.monotonic() < end_s:
+        time.sleep(0.1)
+    assert not any(map(running, started))
+
+
+def running(process):
+    """Return whether a process is there and is not one that ended already."""
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
 
 
 def test_software_that_differs_is_named():
@@ -138,54 +184,16 @@ def test_a_cluster_without_workers_is_one_sentence(monkeypatch):
             computing("dask:" + empty.scheduler_address).__enter__()
 
 
-class Lost:
-    """A result that went with its worker: it is there, cannot be fetched, and is then computed again."""
-
-    def __init__(self, n_lost, status="finished"):
-        self.n_lost, self.status = n_lost, status
-
-    def add_done_callback(self, call):
-        call(self)
-
-    def done(self):
-        return True
-
-    def result(self, timeout):
-        self.n_lost -= 1
-        if self.n_lost >= 0:
-            raise TimeoutError
-        return 7
-
-
-class Answering:
-    """A client whose scheduler answers a number of times."""
-
-    status = "running"
-
-    def __init__(self, n_answers):
-        self.n_answers = n_answers
-        self.scheduler = self
-
-    def identity(self):
-        """Asked for through ``sync`` only."""
-
-    def sync(self, function, callback_timeout):
-        self.n_answers -= 1
-        if self.n_answers < 0:
-            raise TimeoutError
-        return {"workers": {}}
-
-
-def test_a_result_lost_with_its_worker_is_waited_for_while_the_scheduler_answers(monkeypatch):
+@pytest.fixture
+def cluster_processes(tmp_path, monkeypatch):
+    """A scheduler without workers; ``add_worker`` adds them."""
     pytest.importorskip("distributed")
-    assert cluster.Cluster(Answering(3), "tcp://h:1")._result(Lost(3)) == 7
-    with pytest.raises(TimeoutError):
-        cluster.Cluster(Answering(2), "tcp://h:1")._result(Lost(3))
-    with pytest.raises(TimeoutError):  # of the task itself
-        cluster.Cluster(Answering(3), "tcp://h:1")._result(Lost(1, "error"))
-    monkeypatch.setattr(cluster, "NO_WORKER_S", -1.0)
-    with pytest.raises(TimeoutError):  # one that is never fetched
-        cluster.Cluster(Answering(3), "tcp://h:1")._result(Lost(1))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(HERE))
+    from dask_processes import processes
+
+    with processes() as running:
+        yield running
 
 
 @pytest.mark.slow
@@ -223,7 +231,6 @@ def test_a_dead_scheduler_is_one_sentence_soon(cluster_processes):
 @pytest.mark.slow
 def test_a_stopped_scheduler_is_one_sentence_in_a_bounded_time(cluster_processes, monkeypatch):
     monkeypatch.setattr(cluster, "ANSWER_S", 2.0)
-    monkeypatch.setattr(cluster, "PING_EVERY_S", 1.0)
     cluster_processes.add_worker("--no-nanny")
     with pytest.raises(TerrainError, match=r"does not answer any more"):
         disturbed(cluster_processes, lambda: cluster_processes.scheduler.send_signal(signal.SIGSTOP))
@@ -243,7 +250,7 @@ def test_tasks_that_end_their_worker_are_one_sentence(cluster_processes):
 
 @pytest.mark.slow
 def test_no_worker_left_is_one_sentence(cluster_processes, monkeypatch):
-    monkeypatch.setattr(cluster, "PING_EVERY_S", 0.5)
+    monkeypatch.setattr(cluster, "ANSWER_S", 0.5)
     monkeypatch.setattr(cluster, "NO_WORKER_S", 2.0)
     worker = cluster_processes.add_worker("--no-nanny")
     with pytest.raises(TerrainError, match=r"no worker of .* has taken a task"):

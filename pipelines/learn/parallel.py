@@ -1,0 +1,427 @@
+"""Independent tasks, computed side by side, with their results in order.
+
+``with computing("dask:tcp://127.0.0.1:8786"):`` states where; :func:`parallel` asks for it, so that what
+computes need not know.  On this machine there is one pool of processes (joblib), which is used again, and
+whose processes end with the one that started them, however that ends.  On a cluster, ``dask.distributed``
+computes a task again whose worker is lost.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+import platform
+import re
+import warnings
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+from functools import cache
+from importlib import import_module
+from importlib.metadata import version
+from importlib.util import find_spec
+from itertools import islice
+from pathlib import Path
+from socket import create_connection
+from time import monotonic
+from typing import Any, Self
+
+from pydantic import model_validator
+
+from pipelines.report.settings import Settings, setting
+from terrain.errors import ConfigError, TerrainError
+
+LOCAL = "local"
+_ADDRESS = re.compile(
+    r"dask:(?:(?P<scheme>tcp|tls)://)?(?P<host>[A-Za-z0-9._-]+|\[[0-9A-Fa-f:]+\]):(?P<port>\d{1,5})"
+)
+MAX_PORT = 65535
+
+PARENT_POLL_S = 0.5
+"""From one look at the process that started a pool to the next."""
+
+CONNECT_S = 10.0
+"""To reach the scheduler, and to reach it again: a local network answers in milliseconds."""
+
+FIRST_WORKER_S = 20.0
+"""Until the first worker is there: one that was just started imports for some seconds."""
+
+ANSWER_S = 15.0
+"""From one look at a result that is not there to the next, and how long the scheduler may take to answer."""
+
+NO_WORKER_S = 60.0
+"""Without a worker: one whose nanny starts it again is back in 10 s."""
+
+TASKS_A_THREAD = 3
+"""In progress at once for each thread of a worker: one is computed, the next are there when it ends."""
+
+LIBRARIES = ("numpy", "scipy", "scikit-learn", "numba", "pyarrow")
+PACKAGES = ("terrain", "features", "pipelines")
+
+
+def scheduler_address(compute: str) -> str | None:
+    """Return the address of the scheduler that ``compute`` names; None for this machine's cores.
+
+    Parameters
+    ----------
+    compute : ``local``, or ``dask:HOST:PORT`` with or without ``tcp://`` or ``tls://`` before the host
+
+    Raises
+    ------
+    ConfigError
+        if it is none of these.
+
+    Examples
+    --------
+    >>> scheduler_address("dask:127.0.0.1:8786"), scheduler_address("local")
+    ('tcp://127.0.0.1:8786', None)
+    """
+    if compute == LOCAL:
+        return None
+    found = _ADDRESS.fullmatch(compute)
+    if found is None or not 0 < int(found["port"]) <= MAX_PORT:
+        raise ConfigError(
+            f"--compute is {compute!r}: 'local' or the address of a Dask scheduler is accepted, "
+            "as dask:tcp://127.0.0.1:8786"
+        )
+    return f"{found['scheme'] or 'tcp'}://{found['host']}:{found['port']}"
+
+
+class ComputeSettings(Settings):
+    """Where a command computes what can be computed side by side."""
+
+    compute: str = setting(LOCAL, "local, or dask:HOST:PORT: the workers of a Dask scheduler.")
+
+    @model_validator(mode="after")
+    def _check_address(self) -> Self:
+        scheduler_address(self.compute)
+        return self
+
+
+class _Cluster:
+    """A client of a scheduler, and the scheduler's address."""
+
+    def __init__(self, client: Any, address: str) -> None:
+        self.client, self.address = client, address
+
+    def results(
+        self, function: Callable[..., Any], shared: Sequence[Any], each: Iterable[Sequence[Any]]
+    ) -> Iterator[Any]:
+        """Yield the result of each task in order.
+
+        ``shared`` travels as the result of a task of its own, so that it is sent to a worker once and, where
+        all workers that have it are lost, made again from what the scheduler holds.
+        """
+        client, tasks = self.client, iter(each)
+        waiting: deque[Any] = deque()
+        with _failures(self.address):
+            given = client.submit(_unpacked, _packed((function, tuple(shared))), pure=False)
+
+            def add(number: int) -> None:
+                for one in islice(tasks, number):
+                    waiting.append(client.submit(_compute, given, _packed(tuple(one)), pure=False))
+
+            try:
+                add(TASKS_A_THREAD * max(self._n_threads(), 1))
+                while waiting:
+                    yield self._wait(waiting[0])
+                    waiting.popleft()
+                    add(1)
+            finally:
+                for future in waiting:
+                    future.release()
+
+    def _wait(self, future: Any) -> Any:
+        """Return a result; a scheduler that does not answer, or has no worker for long, ends the wait."""
+        with_worker_s = monotonic()
+        while True:
+            try:
+                return future.result(timeout=ANSWER_S)
+            except TimeoutError:
+                if future.status == "error":  # the task's own
+                    raise
+                if self._n_threads():
+                    with_worker_s = monotonic()
+                elif monotonic() - with_worker_s > NO_WORKER_S:
+                    raise TerrainError(
+                        f"no worker of {self.address} has taken a task for {NO_WORKER_S:.0f} s: they ended, "
+                        "or are out of memory"
+                    ) from None
+
+    def _n_threads(self) -> int:
+        """Return the threads of all workers, as the scheduler answers now."""
+        found = self.client.sync(self.client.scheduler.identity, callback_timeout=ANSWER_S)
+        return sum(int(worker["nthreads"]) for worker in found["workers"].values())
+
+    def check_software(self) -> None:
+        """Raise ``TerrainError`` where a worker computes with other software than this process."""
+        here = software()
+        for worker, there in sorted(self.client.run(software, on_error="return").items()):
+            if not isinstance(there, Mapping):
+                raise TerrainError(
+                    f"worker {worker} of {self.address} cannot import this package "
+                    f"({' '.join(str(there).split())[:120]}): install the same version on it"
+                )
+            if (found := difference(here, dict(there))) is not None:
+                raise TerrainError(
+                    f"worker {worker} of {self.address} has {found}: install the same version on it"
+                )
+
+
+_cluster: ContextVar[_Cluster | None] = ContextVar("cluster", default=None)
+
+
+@contextmanager
+def computing(compute: str) -> Iterator[None]:
+    """State where the tasks of a block are computed.
+
+    Parameters
+    ----------
+    compute : ``local`` or ``dask:ADDRESS``, as :func:`scheduler_address`
+
+    Raises
+    ------
+    ConfigError
+        if the address is not accepted, or dask is not installed.
+    TerrainError
+        if the scheduler cannot be reached, has no worker, or a worker has other software.
+    """
+    address = scheduler_address(compute)
+    with _local() if address is None else _connected(address) as cluster:
+        token = _cluster.set(cluster)
+        try:
+            yield
+        finally:
+            _cluster.reset(token)
+
+
+def place() -> str:
+    """Return where tasks are computed now: ``local`` or the address of the scheduler."""
+    cluster = _cluster.get()
+    return LOCAL if cluster is None else cluster.address
+
+
+def end_processes() -> None:
+    """End the processes that local tasks left behind to be used again, with the memory they hold."""
+    from joblib.externals.loky import get_reusable_executor
+
+    get_reusable_executor().shutdown(wait=True)
+
+
+def parallel(
+    function: Callable[..., Any], shared: Sequence[Any], each: Iterable[Sequence[Any]], n_jobs: int
+) -> Iterator[Any]:
+    """Yield ``function(*shared, *one)`` for each ``one``, in their order, as soon as they are there.
+
+    Few tasks are in progress at once, so that neither arguments nor results pile up; what is local and what a
+    cluster computes has the same bytes.
+
+    Parameters
+    ----------
+    function : of an importable module
+    shared : arguments that all tasks have; they are sent to a worker once
+    each : the other arguments of each task
+    n_jobs : processes at once on this machine; a cluster has as many as it has
+
+    Raises
+    ------
+    TerrainError
+        if the scheduler is lost, no worker is left, or a task ends the processes that compute it.
+
+    Examples
+    --------
+    >>> list(parallel(pow, (2,), [(3,), (5,)], 1))
+    [8, 32]
+    """
+    cluster = _cluster.get()
+    if cluster is not None:
+        yield from cluster.results(function, shared, each)
+        return
+    if n_jobs <= 1:
+        for one in each:
+            yield function(*shared, *one)
+        return
+    from joblib import Parallel, delayed
+    from joblib.externals.loky.process_executor import TerminatedWorkerError
+
+    # a process whose memory has grown, as by the import of torch, is replaced; nothing is lost
+    warnings.filterwarnings("ignore", "A worker stopped while some jobs", UserWarning)
+    tasks = (delayed(function)(*shared, *one) for one in each)
+    pool = Parallel(n_jobs, return_as="generator", initializer=end_with_parent, initargs=(os.getpid(),))
+    try:
+        yield from pool(tasks)
+    except TerminatedWorkerError as error:
+        raise TerrainError(
+            "a process ended in the middle of its task, killed or out of memory: "
+            "use fewer at once with --jobs, or give them more memory"
+        ) from error
+
+
+def end_with_parent(parent: int) -> None:
+    """End this process soon after the process ``parent`` has ended, were it killed: begun in a thread.
+
+    A pool's processes otherwise finish their task and wait for minutes for another.
+    """
+    from threading import Thread
+    from time import sleep
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            sleep(PARENT_POLL_S)
+        os._exit(1)
+
+    Thread(target=watch, name="end with parent", daemon=True).start()
+
+
+def software() -> dict[str, str]:
+    """Return the versions that the bytes of a result depend on, by name, and a digest of this package's code.
+
+    Examples
+    --------
+    >>> list(software())[:3]
+    ['terrain-slip', 'its code', 'python']
+    """
+    return {
+        "terrain-slip": import_module("terrain").__version__,
+        "its code": code_digest(),
+        "python": platform.python_version(),
+        **{name: version(name) for name in LIBRARIES},
+    }
+
+
+@cache
+def code_digest() -> str:
+    """Return the start of a SHA-256 over all source files of this package."""
+    digest = hashlib.sha256()
+    for name in PACKAGES:
+        folder = Path(str(import_module(name).__file__)).parent
+        for path in sorted(folder.rglob("*.py")):
+            digest.update(f"{name}/{path.relative_to(folder).as_posix()}".encode())
+            digest.update(path.read_bytes())
+    return digest.hexdigest()[:12]
+
+
+def difference(here: Mapping[str, str], there: Mapping[str, str]) -> str | None:
+    """Return in words what differs first between two of them, None where nothing does.
+
+    Examples
+    --------
+    >>> difference({"numpy": "2.3"}, {"numpy": "2.1"})
+    'numpy 2.1 where 2.3 is needed'
+    """
+    for name, needed in here.items():
+        if there.get(name) != needed:
+            return f"{name} {there.get(name, 'missing')} where {needed} is needed"
+    return None
+
+
+@contextmanager
+def _local() -> Iterator[None]:
+    yield
+
+
+@contextmanager
+def _connected(address: str) -> Iterator[_Cluster]:
+    """Give the workers of a scheduler, all of which have the software of this process."""
+    if find_spec("distributed") is None:
+        raise ConfigError("--compute dask:... needs the package distributed: install terrain-slip[cluster]")
+    with _quiet():
+        client = _client(address)
+        try:
+            try:
+                client.wait_for_workers(1, timeout=FIRST_WORKER_S)
+            except TimeoutError as error:
+                raise TerrainError(
+                    f"the Dask scheduler at {address} has no worker: start one with 'dask worker {address}'"
+                ) from error
+            cluster = _Cluster(client, address)
+            with _failures(address):
+                cluster.check_software()
+            yield cluster
+        finally:
+            client.close(timeout=PARENT_POLL_S)
+
+
+def _client(address: str) -> Any:
+    """Return a client; a port is tried first, as a client without a scheduler leaves its thread behind."""
+    from urllib.parse import urlsplit
+
+    from distributed import Client
+
+    where = urlsplit(address)
+    try:
+        create_connection((str(where.hostname), int(where.port or 0)), timeout=CONNECT_S).close()
+        return Client(address, timeout=CONNECT_S, set_as_default=False)
+    except (OSError, TimeoutError, ValueError) as error:
+        raise TerrainError(
+            f"no Dask scheduler answers at {address}: start one there with 'dask scheduler', "
+            "and workers with 'dask worker'"
+        ) from error
+
+
+@contextmanager
+def _failures(address: str) -> Iterator[None]:
+    """Turn what dask raises of its own into one sentence each; what a task raises stays as it is."""
+    from concurrent.futures import CancelledError
+
+    from distributed import KilledWorker
+    from distributed.comm import CommClosedError
+
+    try:
+        yield
+    except KilledWorker as error:
+        raise TerrainError(
+            f"a task ended {error.allowed_failures + 1} workers of {address} one after another: they "
+            "were killed or ran out of memory; give each more of it, or fewer threads"
+        ) from error
+    except (CancelledError, CommClosedError, ConnectionError, TimeoutError) as error:
+        raise TerrainError(
+            f"the Dask scheduler at {address} does not answer any more; what was computed is lost"
+        ) from error
+    except MemoryError as error:
+        raise TerrainError(f"a worker of {address} has too little memory for its task") from error
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep what dask and tornado log and warn of off the screen: what matters becomes an error here."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        import distributed.client  # noqa: F401 - its loggers get levels of their own when they are made
+
+        begins = ("distributed", "tornado", "asyncio")
+        loggers = [
+            logging.getLogger(name) for name in logging.root.manager.loggerDict if name.startswith(begins)
+        ]
+        levels = [logger.level for logger in loggers]
+        for logger in loggers:
+            logger.setLevel(logging.CRITICAL + 1)
+        try:
+            yield
+        finally:
+            for logger, level in zip(loggers, levels, strict=True):
+                logger.setLevel(level)
+
+
+def _packed(value: Any) -> bytes:
+    """Return the bytes of a value; dask would look into its tuples for tasks, and make lists of some.
+
+    As on this machine's cores, read-only mappings and local functions are packed as well.
+    """
+    import cloudpickle
+
+    packed: bytes = cloudpickle.dumps(value)
+    return packed
+
+
+def _unpacked(packed: bytes) -> Any:
+    import pickle
+
+    return pickle.loads(packed)
+
+
+def _compute(given: tuple[Callable[..., Any], tuple[Any, ...]], packed: bytes) -> Any:
+    function, shared = given
+    return function(*shared, *_unpacked(packed))
