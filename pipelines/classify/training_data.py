@@ -17,7 +17,7 @@ from pipelines.crossval.settings import FEATURE_RECIPE
 from pipelines.crossval.splits import Samples
 from pipelines.feature_store.store import FeatureStore, Stored
 from pipelines.models.model_files import TerrainModel
-from pipelines.models.recipes import WindowPipeline, feature_matrix
+from pipelines.learn.recipes import WindowPipeline, feature_matrix
 from pipelines.runs.datasets import data_digest
 from terrain.errors import DataError
 from terrain.records import Array, RunLog

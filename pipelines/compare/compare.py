@@ -17,7 +17,7 @@ from pipelines.crossval.extras import examples_of
 from pipelines.crossval.settings import CrossvalSettings
 from pipelines.crossval.splits import Samples, folds_of
 from pipelines.models.model_files import TerrainModel
-from pipelines.models.recipes import feature_matrix
+from pipelines.learn.recipes import feature_matrix
 from pipelines.reporting.progress import Progress, silent
 from pipelines.runs.datasets import data_digest
 from pipelines.support.evaluate import Judged, held_out_support

@@ -16,7 +16,7 @@ from pipelines.courses.stretches import (
     recorded_courses,
     spliced_course,
 )
-from pipelines.models.recipes import WindowPipeline, feature_matrix
+from pipelines.learn.recipes import WindowPipeline, feature_matrix
 from terrain.classify.terrain_filter import TerrainFilter, check_filter, filter_run, reported
 from terrain.records import Array, RunLog, Windows
 

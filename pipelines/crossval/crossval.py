@@ -36,7 +36,7 @@ from pipelines.crossval.splits import (
 from pipelines.crossval.stiffness import stiffness_figures
 from pipelines.crossval.unknown import leave_terrain_out
 from pipelines.models.champion import weaknesses
-from pipelines.models.recipes import WindowPipeline, feature_matrix
+from pipelines.learn.recipes import WindowPipeline, feature_matrix
 from pipelines.reporting.numbers import format_counts
 from pipelines.reporting.progress import Progress, silent
 from pipelines.runs.duplicates import distinct_runs

@@ -15,7 +15,7 @@ from terrain.logs.schema import SIGNAL_SETS
 
 if TYPE_CHECKING:
     from features.windows import WindowRule
-    from pipelines.models.recipes import WindowPipeline
+    from pipelines.learn.recipes import WindowPipeline
 
 Protocol = Literal[
     "grouped",
@@ -92,7 +92,7 @@ class RecipeSettings(Settings):
     def new_recipe(self) -> WindowPipeline:
         """Return the recipe, unfitted."""
         from pipelines.models.params_file import read_params
-        from pipelines.models.recipes import make_recipe
+        from pipelines.learn.recipes import make_recipe
         from terrain.classify.svm import CANDIDATES
 
         candidates = CANDIDATES if self.params is None else (read_params(self.params),)

@@ -21,7 +21,7 @@ from terrain.errors import DataError
 from terrain.records import Array, Windows
 
 if TYPE_CHECKING:
-    from pipelines.models.recipes import WindowPipeline
+    from pipelines.learn.recipes import WindowPipeline
 
 NUMBERS_FILE = "numbers.npz"
 MAX_UNPACKED_BYTES = 1 << 30

@@ -28,7 +28,7 @@ from terrain.files.names import MAX_NAME, name_fault, printable, shown
 from terrain.files.regular import MEBIBYTE, check_inside, read_regular
 
 if TYPE_CHECKING:
-    from pipelines.models.recipes import WindowPipeline
+    from pipelines.learn.recipes import WindowPipeline
 
 MODEL_FILE = "model.skops"
 INFO_FILE = "terrain_model.json"
@@ -60,7 +60,7 @@ TRUSTED_TYPES: tuple[str, ...] = (
     "features.windows.Layout",
     "numpy.clip",
     "numpy.dtype",
-    "pipelines.models.recipes.WindowPipeline",
+    "pipelines.learn.recipes.WindowPipeline",
     "terrain.classify.augment.Augmentation",
     "terrain.classify.grouped_network.GroupedNetwork",
     "terrain.classify.grouped_network.NetworkChoice",
@@ -263,7 +263,7 @@ def _words(error: Exception) -> str:
 def _load(file: Path, content: bytes) -> WindowPipeline:
     from skops import io
 
-    from pipelines.models.recipes import WindowPipeline
+    from pipelines.learn.recipes import WindowPipeline
 
     try:
         _check_archive(file, content)

@@ -29,7 +29,7 @@ from terrain.errors import ConfigError
 from terrain.records import Array, Windows
 
 if TYPE_CHECKING:
-    from pipelines.models.recipes import WindowPipeline
+    from pipelines.learn.recipes import WindowPipeline
 
 ONNX_FILE = "network.onnx"
 OPSET = 17

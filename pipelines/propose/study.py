@@ -21,7 +21,7 @@ from pipelines.crossval.extras import examples_of
 from pipelines.crossval.settings import CrossvalSettings
 from pipelines.crossval.splits import Fold, folds_of
 from pipelines.learn.parallel import parallel
-from pipelines.models.recipes import feature_matrix
+from pipelines.learn.recipes import feature_matrix
 from pipelines.propose.proposals import ACCEPTED, Proposal, questions
 from pipelines.reporting.progress import Progress, silent
 from pipelines.runs.datasets import load_runs

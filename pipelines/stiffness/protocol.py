@@ -14,7 +14,7 @@ from sklearn.model_selection import StratifiedKFold
 from features.windows import cut_windows, join_windows
 from pipelines.crossval.evaluation import Examples, fit_folds
 from pipelines.crossval.splits import Fold
-from pipelines.models.recipes import feature_matrix, make_recipe
+from pipelines.learn.recipes import feature_matrix, make_recipe
 from terrain.classify.folds import split_runs
 from terrain.classify.metrics import run_bootstrap
 from terrain.classify.stiffness import StiffnessLevel, cost_matrix, least_cost_class

@@ -22,7 +22,7 @@ from pipelines.crossval.extras import examples_of
 from pipelines.crossval.splits import folds_of
 from pipelines.learn.parallel import parallel
 from pipelines.models.params_file import BEST_FILE, SvmParams, write_params
-from pipelines.models.recipes import feature_matrix
+from pipelines.learn.recipes import feature_matrix
 from pipelines.reporting.progress import Progress, silent
 from pipelines.runs.datasets import data_digest
 from pipelines.sweep.settings import SweepSettings

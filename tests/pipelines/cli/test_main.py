@@ -338,7 +338,7 @@ def test_the_choices_of_the_command_line_are_those_that_there_are():
 
     from pipelines.crossval.settings import RECIPES as RECIPE_CHOICES
     from pipelines.estimate.settings import Filter, Tuning
-    from pipelines.models.recipes import RECIPES
+    from pipelines.learn.recipes import RECIPES
     from pipelines.runs.datasets import LAYOUTS
     from pipelines.runs.settings import Layout
     from terrain.estimation.estimate import FILTERS, TUNINGS

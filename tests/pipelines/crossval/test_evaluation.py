@@ -5,7 +5,7 @@ from sklearn.model_selection import StratifiedGroupKFold, cross_val_predict, cro
 from features.windows import WindowCut, WindowRule
 from pipelines.crossval.evaluation import Examples, FoldResult, fit_folds, pool, summarise
 from pipelines.crossval.splits import Fold, Samples, folds_of, grouped_samples
-from pipelines.models.recipes import WindowPipeline, feature_matrix, make_recipe
+from pipelines.learn.recipes import WindowPipeline, feature_matrix, make_recipe
 from terrain.errors import ConfigError
 from terrain.records import Windows
 

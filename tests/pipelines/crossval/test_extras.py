@@ -16,7 +16,7 @@ from pipelines.crossval.extras import (
     slow_fast_split,
 )
 from pipelines.crossval.splits import folds_of, grouped_samples
-from pipelines.models.recipes import feature_matrix, make_recipe
+from pipelines.learn.recipes import feature_matrix, make_recipe
 from terrain.errors import ConfigError, DataError
 from terrain.records import RunLog, Stream
 

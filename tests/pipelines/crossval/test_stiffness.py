@@ -6,7 +6,7 @@ import pytest
 from pipelines.crossval.evaluation import HeldOut
 from pipelines.crossval.splits import grouped_samples
 from pipelines.crossval.stiffness import stiffness_figures
-from pipelines.models.recipes import feature_matrix, make_recipe
+from pipelines.learn.recipes import feature_matrix, make_recipe
 
 NAMES = {"ASPHALT": "ASPHALT", "GRASS": "CONCRETE", "GRAVEL": "SNOW"}
 """Two hard terrains and a soft one, in place of the names of the drawn runs."""

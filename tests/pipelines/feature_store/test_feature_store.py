@@ -22,7 +22,7 @@ from pipelines.feature_store.heads import Head, _head, head_of
 from pipelines.feature_store.run_file import read_run_windows
 from pipelines.feature_store.settings import FeaturesSettings
 from pipelines.feature_store.store import is_store, open_store, read_store, store_of
-from pipelines.models.recipes import feature_matrix
+from pipelines.learn.recipes import feature_matrix
 from pipelines.reporting.json_file import as_json
 from pipelines.runs.datasets import joint_digest, load_runs, run_loaders
 from pipelines.runs.settings import AlignedRunsSettings

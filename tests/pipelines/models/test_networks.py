@@ -20,7 +20,7 @@ from pipelines.models.model_files import (
     write_info,
 )
 from pipelines.models.onnx_file import ONNX_FILE, network_onnx, time_of_onnx, write_onnx
-from pipelines.models.recipes import feature_matrix, inform, make_recipe
+from pipelines.learn.recipes import feature_matrix, inform, make_recipe
 from terrain.errors import ConfigError, DataError, ModelError
 
 

@@ -1,4 +1,4 @@
-"""Recipes: whole scikit-learn pipelines from windows to terrain, by name."""
+"""Recipes: whole scikit-learn pipelines from windows to terrain, by name or around one's own classifier."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ from features.extractor import FeatureExtractor
 from features.matrix import FeatureMatrix
 from features.response import ResponseExtractor
 from features.sample_extractor import SampleExtractor
+from pipelines.learn.own import FunctionExtractor, OwnClassifier, WindowFunction, load_named
+from pipelines.learn.settings import FEATURE_RECIPE, RECIPES, WITHOUT_SVM, LearnSettings
 from terrain.classify.grouped_network import GroupedNetwork
 from terrain.classify.response import GroupedResponse
 from terrain.classify.stack import GroupedStack
@@ -20,10 +22,6 @@ from terrain.classify.svm import CANDIDATES, GroupedSVC
 from terrain.errors import ConfigError
 from terrain.logs.schema import SIGNAL_SETS
 from terrain.records import Array, Windows
-
-RECIPES = ("svm", "cnn", "stack", "best", "response")
-"""SVM on features, network on samples, both joined, and which of these three held-out runs favour; and what
-wheels answer to how they are driven."""
 
 
 class WindowPipeline(Pipeline):
@@ -48,52 +46,97 @@ class WindowPipeline(Pipeline):
 
 
 def make_recipe(
-    name: str,
+    recipe: str | Any = FEATURE_RECIPE,
     signal_sets: Iterable[str] = SIGNAL_SETS,
     level_sets: Iterable[str] = (),
     gap: int = 1,
     seed: int = 0,
     candidates: Sequence[Sequence[float]] = CANDIDATES,
+    functions: Sequence[WindowFunction] = (),
 ) -> WindowPipeline:
     """Return an unfitted recipe.
 
     Parameters
     ----------
-    name : one of :data:`RECIPES`
+    recipe : one of :data:`RECIPES`; or a scikit-learn classifier of features, or what returns one; or a
+        :class:`WindowPipeline`, which is returned as it is
     signal_sets, level_sets : as :class:`~features.extractor.FeatureExtractor`
     gap : windows left out beside an inner test block; as many as share samples with a window
     seed : deals runs into the inner folds
     candidates : hyper-parameters that the SVM chooses among
+    functions : own functions of a window, beside the features
 
     Raises
     ------
     ConfigError
-        if there is no recipe of that name.
+        if there is no recipe of that name, or it does not learn from features and is given functions.
 
     Examples
     --------
     >>> [step for step, _ in make_recipe("svm").steps]
     ['features', 'classifier']
+    >>> from sklearn.neighbors import KNeighborsClassifier
+    >>> make_recipe(KNeighborsClassifier(3))[-1].outputs
+    'predict_proba'
     """
-    if name not in RECIPES:
-        raise ConfigError(f"there is no recipe {name!r}; there are {', '.join(RECIPES)}")
+    if isinstance(recipe, WindowPipeline):
+        return recipe
+    if isinstance(recipe, str) and recipe not in RECIPES:
+        raise ConfigError(f"there is no recipe {recipe!r}; there are {', '.join(RECIPES)}")
     sets = tuple(signal_sets), tuple(level_sets)
-    features: FeatureExtractor = FeatureExtractor(*sets)
-    classifier: ClassifierMixin = GroupedSVC(candidates, gap=gap, seed=seed)
-    if name == "cnn":
+    if functions and isinstance(recipe, str) and recipe != FEATURE_RECIPE:
+        raise ConfigError(f"recipe {recipe!r} does not take features of your own; {FEATURE_RECIPE!r} does")
+    features: FeatureExtractor = (
+        FunctionExtractor(*sets, tuple(functions)) if functions else FeatureExtractor(*sets)
+    )
+    classifier: ClassifierMixin
+    if recipe == "svm":
+        classifier = GroupedSVC(candidates, gap=gap, seed=seed)
+    elif recipe == "cnn":
         features, classifier = SampleExtractor(*sets), GroupedNetwork(gap=gap, seed=seed)
-    elif name == "response":
-        features, classifier = ResponseExtractor(*_with_speeds(sets)), GroupedResponse()
-    elif name != "svm":
+    elif recipe == "response":  # responses are compared at the speeds of the wheels
+        with_speeds = tuple(dict.fromkeys((*sets[0], "wheels")))
+        features, classifier = ResponseExtractor(with_speeds, sets[1]), GroupedResponse()
+    elif isinstance(recipe, str):
         features = SampleExtractor(*sets, with_features=True)
-        classifier = GroupedStack(choose=name == "best", candidates=candidates, gap=gap, seed=seed)
+        classifier = GroupedStack(choose=recipe == "best", candidates=candidates, gap=gap, seed=seed)
+    else:
+        made = recipe if hasattr(recipe, "fit") and not isinstance(recipe, type) else recipe()
+        if isinstance(made, WindowPipeline):
+            return made
+        if not (hasattr(made, "fit") and hasattr(made, "predict") and hasattr(made, "get_params")):
+            raise ConfigError(f"{made!r} is no scikit-learn classifier: it needs fit, predict and get_params")
+        classifier = OwnClassifier(made, gap, seed)
     return WindowPipeline([("features", features), ("classifier", classifier)])
 
 
-def _with_speeds(sets: tuple[tuple[str, ...], tuple[str, ...]]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the sets with that of the wheel speeds, at which responses are compared."""
-    signal_sets, level_sets = sets
-    return tuple(dict.fromkeys((*signal_sets, "wheels"))), level_sets
+def recipe_of(settings: LearnSettings, text: str = FEATURE_RECIPE) -> WindowPipeline:
+    """Return the unfitted recipe that a text names, with the options of a command.
+
+    Parameters
+    ----------
+    settings : signal sets, seed, own features and hyper-parameters
+    text : name of a recipe, or ``MODULE:NAME`` of one's own; after ``@`` its signal sets, by commas
+
+    Raises
+    ------
+    ConfigError
+        as :func:`make_recipe` and :func:`pipelines.learn.own.load_named`.
+    """
+    name, separator, sets = text.partition("@")
+    options: dict[str, Any] = {}
+    if settings.params is not None and name not in WITHOUT_SVM:
+        from pipelines.models.params_file import read_params
+
+        options["candidates"] = (read_params(settings.params),)
+    return make_recipe(
+        load_named(name) if ":" in name else name,
+        tuple(part.strip() for part in sets.split(",")) if separator else settings.signal_sets,
+        gap=settings.rule.overlap,
+        seed=settings.seed,
+        functions=[load_named(each) for each in settings.feature],
+        **options,
+    )
 
 
 def inform(recipe: WindowPipeline, fitted: Any) -> None:

@@ -1,0 +1,145 @@
+"""Settings that evaluation and training have in common: windows, folds, and the recipe."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
+
+from pydantic import field_validator, model_validator
+
+from pipelines.report.settings import Settings, setting
+from terrain.errors import ConfigError
+from terrain.logs.schema import SIGNAL_SETS
+
+if TYPE_CHECKING:
+    from features.windows import WindowRule
+
+RECIPES = ("svm", "cnn", "stack", "best", "response")
+"""SVM on features, network on samples, both joined, and which of these three held-out runs favour; and what
+wheels answer to how they are driven."""
+FEATURE_RECIPE = "svm"
+"""The recipe that learns from features alone, and so from cached ones."""
+WITHOUT_SVM = ("cnn", "response")
+
+WINDOW_S = 2.0
+
+RECIPE_TEXT = (
+    "svm on features, cnn (network on samples), stack (both joined), best of these three, response of the "
+    "wheels; MODULE:NAME of a scikit-learn classifier of your own. @SET,SET after it: signal sets."
+)
+
+
+def split_recipes(texts: tuple[str, ...]) -> tuple[str, ...]:
+    """Return recipes that are written one a text or several by commas; a signal set belongs to its recipe.
+
+    Examples
+    --------
+    >>> split_recipes(("svm@imu,wheels,cnn", "mine:make"))
+    ('svm@imu,wheels', 'cnn', 'mine:make')
+    """
+    found: list[str] = []
+    for part in (part.strip() for text in texts for part in text.split(",")):
+        if part in SIGNAL_SETS and found and "@" in found[-1]:
+            found[-1] += f",{part}"
+        elif part:
+            found.append(part)
+    return tuple(found)
+
+
+def check_signal_sets(names: tuple[str, ...]) -> tuple[str, ...]:
+    """Raise ``ConfigError`` where no signal set is named, or one that is not known."""
+    if not names:
+        raise ConfigError(f"no signal set is named; there are {','.join(SIGNAL_SETS)}")
+    for name in names:
+        if name not in SIGNAL_SETS:
+            raise ConfigError(f"unknown signal set {name!r}; there are {', '.join(SIGNAL_SETS)}")
+    return names
+
+
+def check_recipe(text: str) -> str:
+    """Raise ``ConfigError`` where a text names no recipe, or a signal set that is not known."""
+    name, separator, sets = text.partition("@")
+    if name not in RECIPES and ":" not in name:
+        raise ConfigError(
+            f"there is no recipe {name!r}; there are {', '.join(RECIPES)}, or MODULE:NAME of your own"
+        )
+    if separator:
+        check_signal_sets(tuple(part.strip() for part in sets.split(",")))
+    return text
+
+
+class WindowSettings(Settings):
+    """Windows: how runs are cut, and which signals are used."""
+
+    window_s: float | None = setting(None, "Window length in s (2; 1.7 under 'published').", "--window")
+    stride_s: float | None = setting(None, "From window to window in s; one length by default.", "--stride")
+    steady: bool = setting(True, "Keep windows of steady motion only.")
+    signal_sets: tuple[str, ...] = setting(
+        SIGNAL_SETS,
+        "Signal sets to use, by commas; leave one out to see what it is worth.",
+        option="--signals",
+        separated=True,
+    )
+    merge_duplicates: bool = setting(
+        False, "Treat runs that hold the same measurements as one run instead of refusing them."
+    )
+    skip_short: bool = setting(False, "Leave out and count runs shorter than a window.", option="")
+
+    @field_validator("signal_sets")
+    @classmethod
+    def _check_signal_sets(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+        return check_signal_sets(names)
+
+    @property
+    def rule(self) -> WindowRule:
+        """How windows are cut."""
+        return self.rule_of(WINDOW_S)
+
+    def rule_of(self, default_s: float) -> WindowRule:
+        """Return how windows are cut, of a length by default."""
+        from features.windows import WindowRule
+
+        length_s = default_s if self.window_s is None else self.window_s
+        return WindowRule(length_s, self.stride_s, WindowRule().steady if self.steady else None)
+
+
+class LearnSettings(WindowSettings):
+    """Learning: folds of runs, processes, features and hyper-parameters."""
+
+    repeats: int | None = setting(None, "Fold assignments (5).", ge=1)
+    seed: int = setting(0, "Deals runs into folds.", ge=0)
+    n_jobs: int = setting(0, "Processes at once; 0 for one a core.", "--jobs", ge=0)
+    feature: tuple[str, ...] = setting(
+        (), "MODULE:NAME of a function of a window of your own, beside the features; may be given again."
+    )
+    params: Path | None = setting(None, "Result of a search, in place of the SVM's own choice.")
+
+    @property
+    def jobs(self) -> int:
+        """Processes at once: what was asked for, or one a core."""
+        return self.n_jobs if self.n_jobs > 0 else os.cpu_count() or 1
+
+    def shared(self) -> dict[str, Any]:
+        """Return the fields that evaluation and training have in common, by name."""
+        return {name: getattr(self, name) for name in LearnSettings.model_fields}
+
+
+class RecipeSettings(LearnSettings):
+    """One recipe."""
+
+    recipe: str = setting(FEATURE_RECIPE, RECIPE_TEXT)
+
+    @model_validator(mode="after")
+    def _check_recipe(self) -> Self:
+        check_recipe(self.recipe)
+        check_params(self.params, (self.recipe,))
+        return self
+
+
+def check_params(params: Path | None, recipes: tuple[str, ...]) -> None:
+    """Raise ``ConfigError`` where hyper-parameters of the SVM are given to a recipe without one."""
+    for text in recipes:
+        name = text.partition("@")[0]
+        if params is not None and (name in WITHOUT_SVM or ":" in name):
+            raise ConfigError(f"--params has hyper-parameters of the SVM, which {name!r} does not have")
