@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from scipy.signal import lfilter
 
-from pipelines.runs.datasets import RunLoader
+from pipelines.data.datasets import RunLoader
 from terrain.logs.read import read_run
 from terrain.logs.write import write_run
 from terrain.records import Label, RunLog, Stream

@@ -27,6 +27,7 @@ from pipelines.crossval.evaluation import Examples
 from pipelines.crossval.results import ChannelImportance, CrossvalReport
 from pipelines.crossval.settings import FEATURE_RECIPE, RecipeSettings
 from pipelines.crossval.splits import folds_of
+from pipelines.data.datasets import data_digest
 from pipelines.feature_store.crossval import crossval_stored, refuse_recipe
 from pipelines.feature_store.store import FeatureStore, read_store
 from pipelines.models.champion import scope_of
@@ -34,7 +35,6 @@ from pipelines.models.novelty_file import NOVELTY_FILE, novelty_bytes
 from pipelines.models.results import ModelInfo
 from pipelines.reporting.json_file import as_json
 from pipelines.reporting.progress import Progress, silent
-from pipelines.runs.datasets import data_digest
 from pipelines.streaming.window_feed import ESTIMATED
 from terrain import __version__
 from terrain.errors import DataError

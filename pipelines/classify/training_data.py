@@ -15,10 +15,10 @@ from pipelines.classify.settings import TrainSettings
 from pipelines.crossval.crossval import samples_of
 from pipelines.crossval.settings import FEATURE_RECIPE
 from pipelines.crossval.splits import Samples
+from pipelines.data.datasets import data_digest
 from pipelines.feature_store.store import FeatureStore, Stored
-from pipelines.models.model_files import TerrainModel
 from pipelines.learn.recipes import WindowPipeline, feature_matrix
-from pipelines.runs.datasets import data_digest
+from pipelines.models.model_files import TerrainModel
 from terrain.errors import DataError
 from terrain.records import Array, RunLog
 

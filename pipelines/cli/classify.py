@@ -8,8 +8,8 @@ from pipelines.classify.settings import ModelSettings, PredictSettings, TrainSet
 from pipelines.cli.command import Json, command
 from pipelines.compare.settings import CompareSettings
 from pipelines.crossval.settings import CrossvalSettings
+from pipelines.data.settings import AlignedRunsSettings, load
 from pipelines.learn.parallel import ComputeSettings
-from pipelines.runs.settings import AlignedRunsSettings, load
 from pipelines.sweep.settings import SweepSettings
 
 app = typer.Typer()
@@ -27,12 +27,12 @@ def crossval_command(
 
     from pipelines.crossval.crossval import crossval
     from pipelines.crossval.screen import print_crossval
+    from pipelines.data.datasets import data_digest
     from pipelines.feature_store.crossval import crossval_store
     from pipelines.feature_store.store import is_store, store_of
     from pipelines.learn.parallel import computing
     from pipelines.reporting.json_file import write_json
     from pipelines.reporting.terminal import output_console, progress_bar
-    from pipelines.runs.datasets import data_digest
 
     with computing(compute.compute), progress_bar() as progress:
         if is_store(source.data):

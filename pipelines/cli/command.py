@@ -12,6 +12,7 @@ from typing import Annotated, Any
 import typer
 from pydantic.fields import FieldInfo
 
+from pipelines.report.json_file import checked_json
 from pipelines.report.settings import Settings, option_name, option_text
 
 
@@ -103,18 +104,6 @@ def _filled(model: type[Settings], given: dict[str, Any]) -> Settings:
             earlier = given.pop(f"{name}_alias_{number}")
             values[name] = values[name] if earlier is None else earlier
     return model(**values)
-
-
-def checked_json(path: Path | None) -> Path | None:
-    """Refuse a place that cannot be written before the work is done, not after."""
-    if path is not None:
-        from terrain.errors import ConfigError
-        from terrain.files.atomic import ensure_writable
-
-        if path.is_dir():
-            raise ConfigError(f"{path}: is a folder; --json names a file")
-        ensure_writable(path.parent)
-    return path
 
 
 Json = Annotated[

@@ -5,9 +5,9 @@ from __future__ import annotations
 import typer
 
 from pipelines.cli.command import Json, command
+from pipelines.data.settings import RunsSettings, load
 from pipelines.estimate.settings import CalibrateSettings, EstimateSettings
 from pipelines.odometry.settings import OdometrySettings
-from pipelines.runs.settings import RunsSettings, load
 
 app = typer.Typer()
 

@@ -7,8 +7,8 @@ from dataclasses import replace
 import typer
 
 from pipelines.cli.command import Json, command
+from pipelines.data.settings import load
 from pipelines.explain.settings import ExplainSettings, TrialsSettings
-from pipelines.runs.settings import load
 
 app = typer.Typer()
 

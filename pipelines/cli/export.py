@@ -5,8 +5,8 @@ from __future__ import annotations
 import typer
 
 from pipelines.cli.command import Json, command
+from pipelines.data.settings import InspectSettings
 from pipelines.export.settings import ExportSettings
-from pipelines.runs.settings import InspectSettings
 
 app = typer.Typer()
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import typer
 
 from pipelines.cli.command import Json, command
+from pipelines.data.settings import AlignedRunsSettings
 from pipelines.feature_store.settings import FeaturesSettings
 from pipelines.learn.parallel import ComputeSettings
-from pipelines.runs.settings import AlignedRunsSettings
 
 app = typer.Typer()
 
@@ -20,12 +20,12 @@ def features_command(
     json_file: Json = None,
 ) -> None:
     """Write the features of runs, one file a run, for crossval, train and sweep; go on where interrupted."""
+    from pipelines.data.datasets import run_loaders
     from pipelines.feature_store.build import build_store
     from pipelines.feature_store.screen import print_store
     from pipelines.learn.parallel import computing
     from pipelines.reporting.json_file import write_json
     from pipelines.reporting.terminal import output_console, progress_bar
-    from pipelines.runs.datasets import run_loaders
 
     loaders = run_loaders(
         source.data,

@@ -2,58 +2,68 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import warnings
 from typing import Any
 
-import typer
+import click
 
-from pipelines.cli import (
-    bench,
-    can,
-    classify,
-    drive,
-    estimate,
-    explain,
-    export,
-    faults,
-    features,
-    label,
-    quickstart,
-    replay,
-    reproduce,
-    runs,
-    serve,
-    slip,
-    soil,
-    track,
-)
+from pipelines.cli.table import COMMANDS, FORMER
+from terrain import __version__
 from terrain.errors import OutsideRegionWarning, TerrainError
 from terrain.files.names import printable
 
-app = typer.Typer(
-    name="terrain",
-    help="Terrain classification and slip learning for off-road robots.",
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    add_completion=False,
-    rich_markup_mode=None,
-)
-
-GROUPS = (
-    *(runs.app, export.app, estimate.app, features.app, classify.app, slip.app, soil.app, drive.app),
-    *(replay.app, serve.app, can.app, label.app),
-    *(faults.app, explain.app, reproduce.app, quickstart.app, track.app),
-)
-"""Files of commands, in the order of help."""
-
-for group in GROUPS:
-    app.add_typer(group)
-app.add_typer(bench.app, name="bench")
-
-
 MAX_MESSAGE = 1000
 """Characters of an error's message on the screen; of a longer one the middle is left out."""
+
+HELP = {"help_option_names": ["-h", "--help"], "max_content_width": 110}
+
+
+class Terrain(click.Group):
+    """All commands, by group; a command's module is imported when the command is asked for."""
+
+    def list_commands(self, context: click.Context) -> list[str]:
+        """Return the names in the order of help."""
+        return [each.name for each in COMMANDS]
+
+    def get_command(self, context: click.Context, name: str) -> click.Command | None:
+        """Return a command.
+
+        Raises
+        ------
+        click.UsageError
+            if it is a former one; the message names its successor.
+        """
+        for each in COMMANDS:
+            if each.name == name:
+                from pipelines.cli.options import click_command
+
+                return click_command(each)
+        if name in FORMER:
+            raise click.UsageError(f"there is no command {name!r} any more: {FORMER[name]}")
+        return None
+
+    def format_help(self, context: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write all commands on one screen, by group."""
+        formatter.write("Usage: terrain COMMAND [OPTIONS]\n\n")
+        formatter.write("Terrain classification and slip learning for off-road robots.\n")
+        formatter.write(
+            "terrain COMMAND -h begins with an example; every command takes --json, --report, --details.\n"
+        )
+        groups: dict[str, list[tuple[str, str]]] = {}
+        for each in COMMANDS:
+            groups.setdefault(each.group, []).append((each.name, each.text))
+        for group, rows in groups.items():
+            formatter.write(f"\n{group}\n")
+            for name, text in rows:
+                formatter.write(f"  {name:<12}{text}\n")
+
+
+@click.group(cls=Terrain, context_settings=HELP)
+@click.version_option(__version__, prog_name="terrain")
+def app() -> None:
+    """Terrain classification and slip learning for off-road robots."""
 
 
 class _Notes:
@@ -67,7 +77,7 @@ class _Notes:
             self._usual(message, category, *place, **more)
         elif not self._shown:
             self._shown = True
-            typer.echo(f"note: {message}", err=True)
+            click.echo(f"note: {message}", err=True)
 
 
 def one_line(message: str) -> str:
@@ -88,10 +98,26 @@ def main() -> None:
     """Run the command line: a user's mistake is one sentence and exit code 2, a fault keeps its traceback."""
     warnings.showwarning = _Notes()
     try:
-        app()
-    except TerrainError as error:
-        typer.echo(f"error: {one_line(str(error))}", err=True)
-        sys.exit(2)
-    except KeyboardInterrupt:
-        typer.echo("stopped", err=True)
-        sys.exit(130)
+        if (
+            len(sys.argv) > 1
+            and not sys.argv[1].startswith("-")
+            and not app.get_command(click.Context(app), sys.argv[1])
+        ):
+            from pipelines.cli.typer_app import app as typer_app
+
+            typer_app()
+        code = app(standalone_mode=False, prog_name="terrain")
+    except click.exceptions.NoArgsIsHelpError as error:
+        click.echo(error.format_message())
+        code = 2
+    except (TerrainError, click.ClickException) as error:
+        text = error.format_message() if isinstance(error, click.ClickException) else str(error)
+        click.echo(f"error: {one_line(text)}", err=True)
+        code = 2
+    except (KeyboardInterrupt, click.Abort):
+        click.echo("stopped", err=True)
+        code = 130
+    except BrokenPipeError:  # the reader of a pipe has gone, as of `terrain ... | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        code = 0
+    sys.exit(code if isinstance(code, int) else 0)

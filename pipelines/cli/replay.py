@@ -7,8 +7,8 @@ from threading import Event
 import typer
 
 from pipelines.cli.command import Json, command
+from pipelines.data.settings import InspectSettings
 from pipelines.replay.settings import ReplaySettings
-from pipelines.runs.settings import InspectSettings
 
 app = typer.Typer()
 

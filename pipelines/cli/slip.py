@@ -5,9 +5,9 @@ from __future__ import annotations
 import typer
 
 from pipelines.cli.command import Json, command
+from pipelines.data.settings import RunsSettings, load
 from pipelines.ground_changes.settings import FindChangesSettings
 from pipelines.measured_slip.settings import MeasureSlipSettings
-from pipelines.runs.settings import RunsSettings, load
 from pipelines.slip.settings import LearnSlipSettings
 
 app = typer.Typer()

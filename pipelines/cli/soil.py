@@ -5,7 +5,7 @@ from __future__ import annotations
 import typer
 
 from pipelines.cli.command import Json, command
-from pipelines.runs.settings import load
+from pipelines.data.settings import load
 from pipelines.soil.settings import FitSoilSettings
 
 app = typer.Typer()

@@ -18,7 +18,15 @@ class Command(NamedTuple):
     text: str
 
 
-COMMANDS: tuple[Command, ...] = ()
+COMMANDS: tuple[Command, ...] = (
+    Command(
+        "Data",
+        "inspect",
+        "pipelines.cli.inspect",
+        "rates, gaps, clocks, units, signs; the card of a model",
+    ),
+    Command("Data", "simulate", "pipelines.data.simulate", "runs of a described robot"),
+)
 
-FORMER: dict[str, str] = {}
+FORMER: dict[str, str] = {"model": "use terrain inspect MODEL"}
 """Former command: a sentence that names its successor."""

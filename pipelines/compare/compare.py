@@ -16,10 +16,10 @@ from pipelines.crossval.evaluation import HeldOut, fit_folds, pool
 from pipelines.crossval.extras import examples_of
 from pipelines.crossval.settings import CrossvalSettings
 from pipelines.crossval.splits import Samples, folds_of
-from pipelines.models.model_files import TerrainModel
+from pipelines.data.datasets import data_digest
 from pipelines.learn.recipes import feature_matrix
+from pipelines.models.model_files import TerrainModel
 from pipelines.reporting.progress import Progress, silent
-from pipelines.runs.datasets import data_digest
 from pipelines.support.evaluate import Judged, held_out_support
 from terrain.classify.paired import Comparison, Difference, Outcome, compare_outcomes
 from terrain.classify.support import SupportLevel, support_levels

@@ -35,12 +35,12 @@ from pipelines.crossval.splits import (
 )
 from pipelines.crossval.stiffness import stiffness_figures
 from pipelines.crossval.unknown import leave_terrain_out
-from pipelines.models.champion import weaknesses
+from pipelines.data.duplicates import distinct_runs
+from pipelines.data.regimes import driven_at
 from pipelines.learn.recipes import WindowPipeline, feature_matrix
+from pipelines.models.champion import weaknesses
 from pipelines.reporting.numbers import format_counts
 from pipelines.reporting.progress import Progress, silent
-from pipelines.runs.duplicates import distinct_runs
-from pipelines.runs.regimes import driven_at
 from pipelines.support.evaluate import Judged, support_report
 from terrain.classify.folds import single_run_classes
 from terrain.errors import DataError

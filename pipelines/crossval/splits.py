@@ -31,8 +31,8 @@ from features.windows import (
     regular_starts,
     span_of,
 )
+from pipelines.data.regimes import regime_of
 from pipelines.reporting.numbers import format_counts
-from pipelines.runs.regimes import regime_of
 from terrain.classify.folds import block_groups, single_run_classes, split_runs
 from terrain.errors import ConfigError, DataError
 from terrain.logs.schema import SIGNAL_SETS

@@ -10,8 +10,8 @@ from typing import Any
 
 import yaml
 
+from pipelines.data.datasets import load_runs
 from pipelines.estimate.calibration_results import CalibrationResult, FindingRow
-from pipelines.runs.datasets import load_runs
 from terrain.calibration.finding import Finding
 from terrain.calibration.lag import starts_and_stops, time_constants
 from terrain.calibration.noise import measurement_variances, sensor_noise
@@ -48,7 +48,7 @@ def calibrate(
 
     Parameters
     ----------
-    data, layout, mapping, repair : as in :func:`pipelines.runs.datasets.load_runs`
+    data, layout, mapping, repair : as in :func:`pipelines.data.datasets.load_runs`
     robot_name : name of a robot or path of its YAML file, from which the calibration starts
     out : new YAML file; nothing is written without
     hard : terrain labels of ground on which wheels slip next to nothing; :func:`hard_grounds` by default

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
+from pipelines.data.datasets import data_digest
 from pipelines.explain.classifier import classifier_gain
 from pipelines.explain.page import PAGE_FILE, write_explain_page
 from pipelines.explain.results import DiagnosedRuns, Explanation, ExtendedDescription, HeldOutGain
 from pipelines.explain.settings import ExplainSettings
 from pipelines.reporting.progress import Progress, silent
-from pipelines.runs.datasets import data_digest
 from terrain.discrepancy.compared import compare_runs, without_levels
 from terrain.discrepancy.diagnose import diagnose
 from terrain.discrepancy.extend import extend, extended_effects

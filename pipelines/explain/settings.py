@@ -7,8 +7,8 @@ from pathlib import Path
 
 from pydantic import field_validator
 
+from pipelines.data.settings import AlignedRunsSettings
 from pipelines.report.settings import Settings, setting
-from pipelines.runs.settings import AlignedRunsSettings
 from terrain.discrepancy.trials.rows import Row
 
 

@@ -10,15 +10,15 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.bags.exported import WINDOW_TOPIC
+from pipelines.data.datasets import data_digest
 from pipelines.data.recorded_windows import RecordedWindow, read_windows
+from pipelines.data.settings import InspectSettings, load
 from pipelines.export.outgoing import Outgoing, outgoing_topics, text_topic
 from pipelines.export.results import Exported
 from pipelines.export.settings import ExportSettings, Target
 from pipelines.export.write import write_mcap, write_ros2
 from pipelines.reporting.json_file import as_json
 from pipelines.reporting.progress import Progress, silent
-from pipelines.runs.datasets import data_digest
-from pipelines.runs.settings import InspectSettings, load
 from terrain.errors import LogError
 from terrain.files.atomic import atomic_file, atomic_folder
 from terrain.logs.read import read_run_head, run_folders

@@ -19,6 +19,7 @@ import numpy as np
 from features.extractor import FeatureExtractor
 from features.motion import Motion, window_motion
 from features.windows import cut_windows, layout_of
+from pipelines.data.datasets import RunLoader, data_digest
 from pipelines.feature_store.heads import Head, head_of
 from pipelines.feature_store.manifest import (
     RUNS_FILE,
@@ -33,7 +34,6 @@ from pipelines.feature_store.run_file import RunWindows, file_of, read_run_windo
 from pipelines.feature_store.settings import FeaturesSettings
 from pipelines.learn.parallel import parallel
 from pipelines.reporting.progress import Progress, silent
-from pipelines.runs.datasets import RunLoader, data_digest
 from terrain.errors import ConfigError, LogError
 from terrain.files.atomic import atomic_write, ensure_writable
 from terrain.logs.duplicates import SharedStretch, shared_stretches
@@ -65,7 +65,7 @@ def build_store(
 
     Parameters
     ----------
-    loaders : one a run, as :func:`pipelines.runs.datasets.run_loaders`
+    loaders : one a run, as :func:`pipelines.data.datasets.run_loaders`
     settings : how windows are cut, and the folder of the store
     progress : called as runs are done
 

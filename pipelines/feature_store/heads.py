@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipelines.runs.datasets import RunLoader
+from pipelines.data.datasets import RunLoader
 from terrain.errors import LogError
 from terrain.logs.log_files import check_log_file
 from terrain.logs.parquet_file import read_parquet

@@ -82,7 +82,7 @@ class StoredRun(NamedTuple):
     Parameters
     ----------
     run_id, robot, filter : of the run
-    digest : of its content, as :func:`pipelines.runs.datasets.data_digest`
+    digest : of its content, as :func:`pipelines.data.datasets.data_digest`
     n_windows : rows of its file
     dropped, repaired : windows left out, and what a repairing reader dropped, as counts
     """

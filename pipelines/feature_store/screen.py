@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from rich.console import Console
 
+from pipelines.data.duplicates import sentences
 from pipelines.feature_store.results import StoreReport
 from pipelines.reporting.numbers import format_counts
 from pipelines.reporting.terminal import print_lines
-from pipelines.runs.duplicates import sentences
 
 
 def print_store(report: StoreReport, console: Console) -> None:

@@ -12,14 +12,14 @@ import numpy as np
 from features.motion import Motion, wheel_stream
 from features.windows import WindowCut, WindowRule
 from pipelines.crossval.splits import Samples
+from pipelines.data.datasets import joint_digest
+from pipelines.data.duplicates import sentences
+from pipelines.data.settings import AlignedRunsSettings, chosen_runs
 from pipelines.feature_store.manifest import STORE_FILE, Manifest, StoredRun, read_manifest, read_runs
 from pipelines.feature_store.run_file import read_run_windows
 from pipelines.report.settings import option_name
 from pipelines.reporting.numbers import format_counts
 from pipelines.reporting.progress import Progress, silent
-from pipelines.runs.datasets import joint_digest
-from pipelines.runs.duplicates import sentences
-from pipelines.runs.settings import AlignedRunsSettings, chosen_runs
 from terrain.errors import ConfigError, DataError, LogError
 from terrain.logs.duplicates import SharedStretch
 from terrain.records import Array, Windows
@@ -101,7 +101,7 @@ def store_of(source: AlignedRunsSettings, rule: WindowRule, signal_sets: tuple[s
     Raises
     ------
     ConfigError
-        if an option states how runs are read, or as :func:`pipelines.runs.settings.chosen_runs`.
+        if an option states how runs are read, or as :func:`pipelines.data.settings.chosen_runs`.
     LogError, ConfigError
         as :func:`open_store`.
     """

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from pipelines.data.settings import AlignedRunsSettings
 from pipelines.report.settings import setting
-from pipelines.runs.settings import AlignedRunsSettings
 
 
 class FindChangesSettings(AlignedRunsSettings):

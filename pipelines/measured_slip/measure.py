@@ -9,11 +9,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pipelines.data.datasets import robot_of
 from pipelines.measured_slip.predictions import cases_of, predictions
 from pipelines.measured_slip.results import MeasuredSlipResult, NamedSurface
 from pipelines.measured_slip.settings import MeasureSlipSettings
 from pipelines.reporting.progress import Progress, silent
-from pipelines.runs.datasets import robot_of
 from terrain.errors import DataError, LogError
 from terrain.files.atomic import ensure_writable
 from terrain.logs.write import run_folder, write_run

@@ -9,9 +9,9 @@ import numpy as np
 
 from features.response import ResponseExtractor
 from features.windows import WindowRule, cut_windows, layout_of
+from pipelines.data.regimes import regime_of
 from pipelines.measured_slip.results import PredictionFigures
 from pipelines.reporting.progress import Progress, silent
-from pipelines.runs.regimes import regime_of
 from terrain.bootstrap import bootstrap_rows, percentile_interval
 from terrain.classify.folds import split_runs
 from terrain.classify.response import ResponseColumns

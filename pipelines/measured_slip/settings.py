@@ -6,8 +6,8 @@ from pathlib import Path
 
 from pydantic import field_validator
 
+from pipelines.data.settings import AlignedRunsSettings
 from pipelines.report.settings import setting
-from pipelines.runs.settings import AlignedRunsSettings
 
 
 class MeasureSlipSettings(AlignedRunsSettings):

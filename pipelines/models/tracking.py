@@ -19,10 +19,10 @@ from types import MappingProxyType, SimpleNamespace
 from typing import TYPE_CHECKING, Any, NamedTuple
 from urllib.parse import urlsplit
 
+from pipelines.learn.recipes import WindowPipeline
 from pipelines.models.lean import write_numbers
 from pipelines.models.model_files import TRUSTED_TYPES, TerrainModel, read_model, write_info
 from pipelines.models.onnx_file import write_onnx
-from pipelines.learn.recipes import WindowPipeline
 from pipelines.models.results import ModelInfo, Registered
 from terrain.errors import ModelError, TerrainError
 from terrain.files.atomic import atomic_write, ensure_writable

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import t as student
 
+from pipelines.data.datasets import drive_robot
+from pipelines.data.settings import RunsSettings
 from pipelines.odometry.results import OdometryResult, ParameterFound
 from pipelines.odometry.settings import OdometrySettings
 from pipelines.reporting.progress import Progress, silent
-from pipelines.runs.datasets import drive_robot
-from pipelines.runs.settings import RunsSettings
 from terrain.calibration.adaptive_legs import dead_reckoning, efficiencies_before, of_point
 from terrain.calibration.odometry_fit import (
     ENCODER,

@@ -20,11 +20,11 @@ from pipelines.crossval.evaluation import Examples
 from pipelines.crossval.extras import examples_of
 from pipelines.crossval.settings import CrossvalSettings
 from pipelines.crossval.splits import Fold, folds_of
+from pipelines.data.datasets import load_runs
 from pipelines.learn.parallel import parallel
 from pipelines.learn.recipes import feature_matrix
 from pipelines.propose.proposals import ACCEPTED, Proposal, questions
 from pipelines.reporting.progress import Progress, silent
-from pipelines.runs.datasets import load_runs
 from terrain.classify.paired import Difference, Outcome, compare_outcomes
 from terrain.classify.support import learn_support, support_of
 from terrain.errors import DataError

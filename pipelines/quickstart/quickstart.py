@@ -12,16 +12,16 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from pipelines.crossval.crossval import crossval, merge_notes
 from pipelines.crossval.settings import CrossvalSettings
+from pipelines.data.datasets import data_digest, load_runs
+from pipelines.data.duplicates import distinct_runs
+from pipelines.data.settings import ImportSettings
 from pipelines.estimate.consistency import TerrainConsistency
 from pipelines.estimate.labelled import TerrainSlip
 from pipelines.quickstart.holding_out import divide
 from pipelines.quickstart.results import KeptRuns, QuickstartResult
 from pipelines.quickstart.settings import QuickstartSettings
 from pipelines.reporting.progress import Progress, silent
-from pipelines.runs.datasets import data_digest, load_runs
-from pipelines.runs.duplicates import distinct_runs
 from pipelines.runs.import_logs import import_logs
-from pipelines.runs.settings import ImportSettings
 from terrain.errors import DataError
 from terrain.files.atomic import atomic_folder, atomic_write, ensure_writable
 from terrain.logs.write import write_run

@@ -12,12 +12,12 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from pipelines.data.datasets import robot_of
 from pipelines.live.observer import TerrainObserver
 from pipelines.live.pilot import LivePilot
 from pipelines.live.pilot_settings import PilotSettings
 from pipelines.live.terrain_source import Classifier, NoTerrain
 from pipelines.models.model_files import TerrainModel
-from pipelines.runs.datasets import robot_of
 from pipelines.streaming.classifying import AtOnce, WindowOutput
 from pipelines.streaming.window_feed import needs_filter
 from terrain.control.slip_table import SlipTable

@@ -11,11 +11,11 @@ from typing import Protocol
 import numpy as np
 
 from features.windows import label_windows
+from pipelines.data.settings import InspectSettings, load
 from pipelines.models.model_files import TerrainModel
 from pipelines.replay.chains import Chain, Replayed, chain_of
 from pipelines.replay.results import ObservedWindow, Replay, ReplayedRun, ReplayMoment
 from pipelines.replay.settings import ReplaySettings
-from pipelines.runs.settings import InspectSettings, load
 from pipelines.streaming.classifying import WindowOutput
 from pipelines.streaming.over_time import filtered
 from terrain.control.slip_table import SlipTable, load_slip_table

@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from terrain.files.atomic import atomic_write
+from terrain.errors import ConfigError
+from terrain.files.atomic import atomic_write, ensure_writable
 
 
 def as_json(value: Any) -> Any:
@@ -58,3 +59,18 @@ def write_json(path: Path | None, result: Any) -> None:
     if path is not None:
         document = as_json(result)
         atomic_write(path, json.dumps(document, indent=2, allow_nan=False) + "\n")
+
+
+def checked_json(path: Path | None) -> Path | None:
+    """Refuse a place that cannot be written before the work is done, not after.
+
+    Raises
+    ------
+    ConfigError
+        if it is a folder, or nothing can be written there.
+    """
+    if path is not None:
+        if path.is_dir():
+            raise ConfigError(f"{path}: is a folder; --json names a file")
+        ensure_writable(path.parent)
+    return path

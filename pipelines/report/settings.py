@@ -116,4 +116,14 @@ def _one_sentence(model: type[Settings], error: ValidationError) -> str:
     option = option_name(model, name)
     if first["type"] == "missing":
         return f"{option} is missing"
-    return f"{option} is {first['input']!r}: {message[:1].lower()}{message[1:]}"
+    given = first["input"]
+    shown = given if isinstance(given, str) and _is_number(given) else repr(given)
+    return f"{option} is {shown}: {message[:1].lower()}{message[1:]}"
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True

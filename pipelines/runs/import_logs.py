@@ -6,11 +6,11 @@ import shutil
 from collections import Counter
 from pathlib import Path
 
+from pipelines.data.datasets import data_digest
+from pipelines.data.plausibility import counted, doubts_of, refuse_implausible_runs, verdict
+from pipelines.data.settings import ImportSettings, load
 from pipelines.reporting.progress import Progress, silent
-from pipelines.runs.datasets import data_digest
 from pipelines.runs.results import Imported
-from pipelines.runs.settings import ImportSettings, load
-from pipelines.runs.verdicts import counted, doubts_of, refuse_implausible_runs, verdict
 from terrain.errors import LogError
 from terrain.logs.duplicates import shared_stretches
 from terrain.logs.write import run_folder, write_run

@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pipelines.data.datasets import data_digest
 from pipelines.reporting.json_file import as_json
 from pipelines.reporting.progress import Progress, silent
-from pipelines.runs.datasets import data_digest
 from pipelines.slip.results import LearnSlipResult, TerrainRow, run_row, terrain_row
 from pipelines.slip.settings import LearnSlipSettings
 from terrain.control.learned_table import FALLBACK, learned_table

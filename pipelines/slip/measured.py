@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from pipelines.data.datasets import data_digest
 from pipelines.measured_slip.measure import Measured, measure
 from pipelines.measured_slip.settings import MeasureSlipSettings
 from pipelines.reporting.progress import Progress, silent
-from pipelines.runs.datasets import data_digest
 from pipelines.slip.measured_rows import MeasuredTargets, SurfaceTargets
 from pipelines.slip.results import target_row
 from pipelines.slip.settings import LearnSlipSettings

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from pipelines.data.settings import RunsSettings
 from pipelines.report.settings import setting
-from pipelines.runs.settings import RunsSettings
 
 
 class LearnSlipSettings(RunsSettings):

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
+from pipelines.data.datasets import data_digest, load_runs
 from pipelines.reporting.progress import Progress, silent
-from pipelines.runs.datasets import data_digest, load_runs
 from pipelines.soil.results import BAR_RATIO, Drawn, FitSoilResult, WheelResult
 from pipelines.soil.settings import FitSoilSettings
 from terrain.errors import ConfigError, DataError

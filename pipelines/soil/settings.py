@@ -6,8 +6,8 @@ from pathlib import Path
 
 from pydantic import field_validator
 
+from pipelines.data.settings import RunsSettings
 from pipelines.report.settings import setting
-from pipelines.runs.settings import RunsSettings
 
 LAW_NAMES = (
     "simulator",

@@ -20,11 +20,11 @@ from pipelines.crossval.crossval import samples_of
 from pipelines.crossval.evaluation import Examples
 from pipelines.crossval.extras import examples_of
 from pipelines.crossval.splits import folds_of
+from pipelines.data.datasets import data_digest
 from pipelines.learn.parallel import parallel
-from pipelines.models.params_file import BEST_FILE, SvmParams, write_params
 from pipelines.learn.recipes import feature_matrix
+from pipelines.models.params_file import BEST_FILE, SvmParams, write_params
 from pipelines.reporting.progress import Progress, silent
-from pipelines.runs.datasets import data_digest
 from pipelines.sweep.settings import SweepSettings
 from terrain.bootstrap import percentile_interval
 from terrain.classify.confidence import run_weights

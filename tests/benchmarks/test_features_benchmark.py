@@ -10,7 +10,7 @@ import tsfel
 from features.extractor import FeatureExtractor
 from features.stream import WindowStream
 from features.windows import WindowRule, cut_windows, layout_of
-from pipelines.runs.datasets import load_runs
+from pipelines.data.datasets import load_runs
 from terrain.records import RunLog, Stream
 
 N_COMPARED = 8

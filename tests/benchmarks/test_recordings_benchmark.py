@@ -8,7 +8,7 @@ import gzip
 import numpy as np
 import pytest
 
-from pipelines.runs.datasets import load_runs
+from pipelines.data.datasets import load_runs
 
 MEGABYTE = 1e6
 MIN_MEGABYTES_PER_S = 10.0

@@ -6,13 +6,13 @@ import sys
 import numpy as np
 import pytest
 
+from pipelines.data.datasets import load_runs
 from pipelines.data.recorded_windows import WINDOWS_FILE, read_windows, windows_text
+from pipelines.data.settings import InspectSettings
 from pipelines.export.export_runs import export_runs
 from pipelines.export.settings import ExportSettings
 from pipelines.replay.replay import replay_logs
 from pipelines.replay.settings import ReplaySettings
-from pipelines.runs.datasets import load_runs
-from pipelines.runs.settings import InspectSettings
 from terrain.errors import ConfigError, LogError
 from terrain.logs.write import write_run
 from terrain.robots import load_robot

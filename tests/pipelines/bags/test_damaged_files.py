@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.writer import CompressionType
 
+from pipelines.data.datasets import load_runs
 from pipelines.messages.mcap_file import MAGIC
-from pipelines.runs.datasets import load_runs
 from terrain.errors import ConfigError, LogError
 
 from .foreign import START_NS, husky_rows, imu, write_bag, write_mcap

@@ -5,7 +5,7 @@ import pytest
 from mcap.writer import CompressionType, IndexType
 from scipy.spatial.transform import Rotation
 
-from pipelines.runs.datasets import load_runs
+from pipelines.data.datasets import load_runs
 from terrain.errors import ConfigError, LogError
 from terrain.kinematics.camera import body_motion
 from terrain.robots import Camera, load_robot

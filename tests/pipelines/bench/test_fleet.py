@@ -10,8 +10,8 @@ from pipelines.bench.fleet import FleetPoint, bench_fleet, memory_growth, nonlin
 from pipelines.bench.fleet_runs import TERRAINS, fleet_loaders, fleet_run, write_fleet_run
 from pipelines.bench.memory import peak_memory, process_tree
 from pipelines.bench.settings import FleetSettings
+from pipelines.data.datasets import data_digest
 from pipelines.reporting.json_file import as_json
-from pipelines.runs.datasets import data_digest
 from terrain.errors import ConfigError
 
 

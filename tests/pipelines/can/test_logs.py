@@ -8,7 +8,7 @@ from pipelines.can.codec import encode
 from pipelines.can.dbc import load_layout
 from pipelines.can.logs import READERS
 from pipelines.can.recorded import run_frames
-from pipelines.runs.datasets import load_runs
+from pipelines.data.datasets import load_runs
 from terrain.errors import ConfigError, LogError
 from terrain.robots import load_robot
 from terrain.simulation.run import simulate_run

@@ -9,9 +9,9 @@ from pipelines.classify.judging import compare, held_out_runs, judge_of, standin
 from pipelines.classify.settings import TrainSettings
 from pipelines.classify.training_data import data_of_runs, identities
 from pipelines.crossval.crossval import crossval, samples_of
+from pipelines.data.datasets import data_digest
 from pipelines.models.model_files import TerrainModel, read_model
 from pipelines.models.tracking import Champion
-from pipelines.runs.datasets import data_digest
 
 TRAINING = TrainSettings(name="drawn", repeats=1, n_jobs=1)
 

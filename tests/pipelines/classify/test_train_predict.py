@@ -9,12 +9,12 @@ from pipelines.classify.predict import filtered_terrains, predict
 from pipelines.classify.settings import TrainSettings
 from pipelines.classify.train import model_info, train
 from pipelines.crossval.crossval import samples_of
+from pipelines.data.settings import ImportSettings
 from pipelines.models.assess import Assessed
 from pipelines.models.model_files import TerrainModel, read_model
 from pipelines.quickstart.settings import QuickstartSettings
 from pipelines.reporting.json_file import as_json, with_deprecated_keys
 from pipelines.runs.import_logs import import_logs
-from pipelines.runs.settings import ImportSettings
 from terrain.control.slip_table import DRIVE_STATES, SlipTable, load_slip_table
 from terrain.errors import ConfigError, DataError, TerrainError
 from terrain.logs.write import write_run

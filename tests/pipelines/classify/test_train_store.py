@@ -12,6 +12,7 @@ from pipelines.classify.card import CARD_FILE, CARD_JSON, drawn_window
 from pipelines.classify.settings import TrainSettings
 from pipelines.classify.train import train, train_store
 from pipelines.classify.training_data import data_of_runs, data_of_store
+from pipelines.data.datasets import data_digest, joint_digest, load_runs, run_loaders
 from pipelines.feature_store.build import build_store
 from pipelines.feature_store.settings import FeaturesSettings
 from pipelines.feature_store.store import open_store, read_store
@@ -20,7 +21,6 @@ from pipelines.models.lean import NUMBERS_FILE
 from pipelines.models.model_files import read_lean_model, read_model
 from pipelines.models.novelty_file import NOVELTY_FILE
 from pipelines.reporting.json_file import as_json
-from pipelines.runs.datasets import data_digest, joint_digest, load_runs, run_loaders
 from terrain.errors import ConfigError, DataError, LogError
 from terrain.logs.write import write_run
 

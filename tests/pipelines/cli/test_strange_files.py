@@ -68,7 +68,9 @@ def test_a_robot_that_the_user_gives_may_be_a_file(place, monkeypatch, capsys):
     edit(place, robot="mule")
     words = ["terrain", "estimate", "--data", "data", "--filter", "skid", "--robot", "mule.yaml"]
     monkeypatch.setattr(sys, "argv", words)
-    cli.app(words[1:], standalone_mode=False)
+    with pytest.raises(SystemExit) as stop:
+        cli.main()
+    assert not stop.value.code
     assert "skid" in capsys.readouterr().out
 
 

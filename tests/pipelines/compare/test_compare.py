@@ -11,9 +11,9 @@ from pipelines.compare.compare import compare_models, compare_recipes
 from pipelines.compare.screen import print_compare
 from pipelines.compare.settings import CompareSettings
 from pipelines.crossval.crossval import crossval
+from pipelines.data.datasets import data_digest
 from pipelines.models.model_files import TerrainModel, read_model
 from pipelines.reporting.json_file import as_json
-from pipelines.runs.datasets import data_digest
 from terrain.classify.paired import Verdict
 from terrain.classify.support import SupportLevel
 from terrain.errors import ConfigError, DataError

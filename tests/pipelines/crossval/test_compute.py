@@ -5,9 +5,9 @@ import warnings
 
 import pytest
 
-from pipelines.learn.parallel import computing
 from pipelines.crossval.crossval import crossval
 from pipelines.crossval.settings import CrossvalSettings
+from pipelines.learn.parallel import computing
 from pipelines.reporting.json_file import as_json
 
 

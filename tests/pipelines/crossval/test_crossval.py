@@ -5,8 +5,8 @@ import pytest
 
 from pipelines.crossval.crossval import crossval
 from pipelines.crossval.settings import CrossvalSettings
+from pipelines.data.datasets import load_runs
 from pipelines.reporting.json_file import as_json
-from pipelines.runs.datasets import load_runs
 from terrain.errors import ConfigError, DataError
 from terrain.records import RunLog, Stream
 

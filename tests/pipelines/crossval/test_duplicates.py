@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from pipelines.crossval.crossval import crossval, samples_of
+from pipelines.data.inspect import Settings as InspectSettings
+from pipelines.data.inspect import run as inspect_runs
+from pipelines.data.settings import ImportSettings
 from pipelines.runs.import_logs import import_logs
-from pipelines.runs.inspect_logs import inspect_logs
-from pipelines.runs.settings import ImportSettings, InspectSettings
 from terrain.errors import DataError
 from terrain.logs.write import write_run
 from terrain.records import Label, Stream
@@ -52,7 +53,7 @@ def test_merged_copies_leave_every_window_as_it_was(runs, settings):
 def test_import_and_inspect_report_copies(runs, tmp_path):
     for run in (*runs[:2], copy_of(runs[0], "again", 9.0)):
         write_run(run, tmp_path / "data")
-    inspected = inspect_logs(InspectSettings(data=tmp_path / "data"))
+    inspected = inspect_runs(InspectSettings(data=tmp_path / "data"))
     imported = import_logs(ImportSettings(data=tmp_path / "data", out=tmp_path / "out"))
     for result in (inspected, imported):
         assert [(each.first, each.second) for each in result.duplicates] == [("ASPHALT_1", "again")]

@@ -11,7 +11,7 @@ from pipelines.crossval.splits import (
     grouped_samples,
     published_samples,
 )
-from pipelines.runs.regimes import driven_at
+from pipelines.data.regimes import driven_at
 from terrain.errors import ConfigError, DataError
 from terrain.records import Label, RunLog, Stream
 

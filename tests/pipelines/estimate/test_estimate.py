@@ -5,10 +5,10 @@ import json
 import numpy as np
 import pytest
 
+from pipelines.data.settings import RunsSettings, load
 from pipelines.estimate.estimate import estimate
 from pipelines.estimate.settings import EstimateSettings
 from pipelines.reporting.json_file import as_json
-from pipelines.runs.settings import RunsSettings, load
 from terrain.errors import ConfigError, DataError, LogError
 from terrain.estimation.estimate import estimate_run
 from terrain.estimation.filters.tuning import TuningStatus
@@ -44,7 +44,7 @@ def straight():
 
 
 def test_a_skid_steer_robot_without_a_reference_has_no_slip_to_show(datasets_dir, tmp_path):
-    from pipelines.runs.datasets import load_runs
+    from pipelines.data.datasets import load_runs
 
     run = load_runs(datasets_dir / "vulpi")[0]
     (row,) = estimate([run], EstimateSettings(filter="skid", out=tmp_path / "out")).runs

@@ -13,12 +13,12 @@ from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation
 
 from pipelines.bags.logs import find_runs
+from pipelines.data.datasets import data_digest, load_runs
+from pipelines.data.settings import InspectSettings
 from pipelines.export.export_runs import export_runs
 from pipelines.export.outgoing import outgoing_topics
 from pipelines.export.settings import ExportSettings
 from pipelines.export.write import write_mcap
-from pipelines.runs.datasets import data_digest, load_runs
-from pipelines.runs.settings import InspectSettings
 from terrain.errors import ConfigError, DataError, LogError
 from terrain.estimation.enriched import enriched
 from terrain.estimation.estimate import estimate_run

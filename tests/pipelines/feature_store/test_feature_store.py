@@ -12,9 +12,10 @@ import pytest
 
 from features.motion import NO_MOTION, Motion, window_motion
 from features.windows import layout_of
-from pipelines.learn.parallel import computing
 from pipelines.crossval.crossval import crossval, samples_of
 from pipelines.crossval.settings import CrossvalSettings
+from pipelines.data.datasets import joint_digest, load_runs, run_loaders
+from pipelines.data.settings import AlignedRunsSettings
 from pipelines.feature_store import build, manifest
 from pipelines.feature_store.build import build_store
 from pipelines.feature_store.crossval import NO_EXTRAS, crossval_store
@@ -22,10 +23,9 @@ from pipelines.feature_store.heads import Head, _head, head_of
 from pipelines.feature_store.run_file import read_run_windows
 from pipelines.feature_store.settings import FeaturesSettings
 from pipelines.feature_store.store import is_store, open_store, read_store, store_of
+from pipelines.learn.parallel import computing
 from pipelines.learn.recipes import feature_matrix
 from pipelines.reporting.json_file import as_json
-from pipelines.runs.datasets import joint_digest, load_runs, run_loaders
-from pipelines.runs.settings import AlignedRunsSettings
 from terrain.errors import ConfigError, DataError, LogError
 from terrain.logs.write import write_run
 from terrain.records import Label, Stream

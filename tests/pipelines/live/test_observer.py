@@ -12,8 +12,8 @@ from pipelines.classify.predict import predict
 from pipelines.classify.train import model_info
 from pipelines.crossval.crossval import samples_of
 from pipelines.crossval.settings import CrossvalSettings
+from pipelines.data.datasets import load_runs
 from pipelines.live.observer import TerrainObserver
-from pipelines.runs.datasets import load_runs
 from terrain.control.slip_table import load_slip_table
 from terrain.errors import ConfigError, DataError
 from terrain.estimation.enriched import enriched

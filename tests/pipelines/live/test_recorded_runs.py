@@ -8,15 +8,15 @@ import pytest
 from pipelines.classify.predict import predict
 from pipelines.crossval.crossval import samples_of
 from pipelines.crossval.settings import CrossvalSettings
+from pipelines.data.datasets import load_runs
+from pipelines.data.inspect import Settings as InspectSettings
+from pipelines.data.inspect import run as inspect_runs
 from pipelines.data.recorded_windows import read_windows
 from pipelines.live.observer import TerrainObserver
 from pipelines.live.pilot import LivePilot
 from pipelines.live.terrain_source import Classifier
 from pipelines.recording.recorder import SessionRecorder
 from pipelines.recording.thread import RecordingThread
-from pipelines.runs.datasets import load_runs
-from pipelines.runs.inspect_logs import inspect_logs
-from pipelines.runs.settings import InspectSettings
 from pipelines.streaming.classifying import AtOnce
 from terrain.control.slip_table import load_slip_table
 from terrain.estimation.live.estimator import CHANNELS
@@ -126,7 +126,7 @@ def test_a_recorded_run_is_inspected_and_trained_on_once_it_is_labelled(writer, 
             recorder.readings(sample.readings)
             recorder.command(sample.time_s, sample.twist, None, {"probability_ratio": 0.5})
         recorder.close(10.0)
-    assert inspect_logs(InspectSettings(data=tmp_path)).n_runs == len(two_drives)
+    assert inspect_runs(InspectSettings(data=tmp_path)).n_runs == len(two_drives)
     labelled = [
         RunLog(run.run_id, run.robot, run.streams, (Label(0.0, 12.0, run.run_id[0]),))
         for run in load_runs(tmp_path)

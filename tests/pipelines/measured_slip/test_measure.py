@@ -6,12 +6,12 @@ import pytest
 from typer.testing import CliRunner
 
 from pipelines.cli.main import app
+from pipelines.data.datasets import load_runs
 from pipelines.ground_changes.find import find_changes
 from pipelines.ground_changes.settings import FindChangesSettings
 from pipelines.measured_slip.measure import measure_slip
 from pipelines.measured_slip.settings import MeasureSlipSettings
 from pipelines.reporting.json_file import as_json
-from pipelines.runs.datasets import load_runs
 from terrain.errors import ConfigError, DataError, LogError
 from terrain.kinematics import omni
 from terrain.kinematics.wheel_speed import with_wheel_speeds

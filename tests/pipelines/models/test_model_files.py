@@ -11,8 +11,8 @@ from sklearn.preprocessing import FunctionTransformer, StandardScaler
 from skops import io as skops_io
 
 from features.windows import SteadyMotion, WindowRule, cut_windows
-from pipelines.models.model_files import INFO_FILE, MODEL_FILE, TRUSTED_TYPES, read_model, write_info
 from pipelines.learn.recipes import WindowPipeline, make_recipe
+from pipelines.models.model_files import INFO_FILE, MODEL_FILE, TRUSTED_TYPES, read_model, write_info
 from pipelines.models.results import ModelInfo
 from terrain.errors import ModelError
 

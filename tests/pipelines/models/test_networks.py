@@ -11,6 +11,7 @@ import pytest
 from skops import io
 
 from features.windows import WindowRule, cut_windows
+from pipelines.learn.recipes import feature_matrix, inform, make_recipe
 from pipelines.models.lean import NUMBERS_FILE, LeanRecipe, read_numbers, write_numbers
 from pipelines.models.model_files import (
     MODEL_FILE,
@@ -20,7 +21,6 @@ from pipelines.models.model_files import (
     write_info,
 )
 from pipelines.models.onnx_file import ONNX_FILE, network_onnx, time_of_onnx, write_onnx
-from pipelines.learn.recipes import feature_matrix, inform, make_recipe
 from terrain.errors import ConfigError, DataError, ModelError
 
 

@@ -15,10 +15,10 @@ from features.windows import cut_windows
 from pipelines.classify.judging import judge_of, standing_of, standing_tags
 from pipelines.classify.settings import TrainSettings
 from pipelines.classify.training_data import data_of_runs
+from pipelines.data.datasets import data_digest
 from pipelines.models.champion import scope_of
 from pipelines.models.model_files import read_model
 from pipelines.models.tracking import TrainingRecord, ensure_tracking, load_model, log_training
-from pipelines.runs.datasets import data_digest
 from terrain.errors import ModelError, TerrainError
 from terrain.files.lock import file_lock
 

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from pipelines.data.settings import RunsSettings, load
 from pipelines.odometry.judge import judge_odometry
 from pipelines.odometry.settings import OdometrySettings
-from pipelines.runs.settings import RunsSettings, load
 from terrain.errors import ConfigError, DataError
 from terrain.estimation.observers.slip_model_file import read_slip_model
 from terrain.logs.write import write_run

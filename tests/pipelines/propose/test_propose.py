@@ -10,6 +10,7 @@ import pytest
 
 from pipelines.cli.main import main
 from pipelines.crossval.settings import CrossvalSettings
+from pipelines.data.datasets import load_runs
 from pipelines.label.settings import LabelSettings
 from pipelines.models.model_files import read_model
 from pipelines.propose.answers_file import COLUMNS, read_answers
@@ -17,7 +18,6 @@ from pipelines.propose.labelling import SOURCES_FILE, propose_labels, write_labe
 from pipelines.propose.proposals import Proposal, questions
 from pipelines.propose.study import STRATEGIES, label_study
 from pipelines.reporting.json_file import as_json
-from pipelines.runs.datasets import load_runs
 from terrain.classify.smoothing import smoothed_classes
 from terrain.errors import ConfigError, DataError, LogError
 from terrain.logs.write import write_run

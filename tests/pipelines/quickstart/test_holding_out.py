@@ -5,11 +5,11 @@ from pathlib import Path
 
 import pytest
 
+from pipelines.data.datasets import data_digest
+from pipelines.data.settings import AlignedRunsSettings, load
 from pipelines.models.tracking import load_model
 from pipelines.quickstart.holding_out import divide
 from pipelines.quickstart.settings import QuickstartSettings
-from pipelines.runs.datasets import data_digest
-from pipelines.runs.settings import AlignedRunsSettings, load
 from terrain.errors import ConfigError, DataError
 from terrain.logs.write import write_run
 

@@ -13,6 +13,7 @@ import time
 import numpy as np
 import pytest
 
+from pipelines.data.datasets import data_digest, load_runs
 from pipelines.data.recorded_windows import WINDOWS_FILE, read_windows
 from pipelines.recording import journal as journals
 from pipelines.recording import recorder as recorders
@@ -25,7 +26,6 @@ from pipelines.recording.recorder import (
     SessionRecorder,
 )
 from pipelines.recording.thread import RecordingThread
-from pipelines.runs.datasets import data_digest, load_runs
 from pipelines.streaming.classifying import WindowOutput
 from terrain.errors import LogError
 from terrain.logs.read import read_run

@@ -10,8 +10,8 @@ from prometheus_client.parser import text_string_to_metric_families
 from websockets.exceptions import ConnectionClosed
 
 from pipelines.classify.predict import predict
+from pipelines.data.datasets import load_runs
 from pipelines.live.observer import TerrainObserver
-from pipelines.runs.datasets import load_runs
 from pipelines.serve.client import ServiceError, TerrainClient
 from terrain.control.slip_table import load_slip_table
 from terrain.files.resources import data_folder

@@ -3,7 +3,7 @@ import pytest
 from typer.testing import CliRunner
 
 from pipelines.cli.main import app
-from pipelines.runs.datasets import load_runs
+from pipelines.data.datasets import load_runs
 from pipelines.slip.measured import learn_measured
 from pipelines.slip.settings import LearnSlipSettings
 from terrain.control.measured_table import FEW_RUNS, NO_PEAK

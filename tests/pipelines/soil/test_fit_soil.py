@@ -9,8 +9,8 @@ import pytest
 from typer.testing import CliRunner
 
 from pipelines.cli.main import app
+from pipelines.data.datasets import load_runs
 from pipelines.reporting.json_file import as_json
-from pipelines.runs.datasets import load_runs
 from pipelines.soil.fit_soil import fit_soil
 from pipelines.soil.settings import FitSoilSettings
 from terrain.errors import ConfigError, DataError

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pipelines.data.datasets import load_runs
 from pipelines.estimate.calibrate import calibrate
-from pipelines.runs.datasets import load_runs
 from terrain.calibration.skid_steer import (
     LIDAR_DELAY,
     RADIUS,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from pipelines.runs.datasets import load_runs
+from pipelines.data.datasets import load_runs
 from terrain.discrepancy.latencies import latencies_of, starting_values
 from terrain.discrepancy.signals import signals_of
 from terrain.discrepancy.simulation import Simulation

@@ -109,7 +109,7 @@ NOT_STUCK = ("ASPHALT", "FLOORING", "ICE", "SANDY_LOAM")
 
 @pytest.fixture(scope="module")
 def boreal(datasets_dir):
-    from pipelines.runs.datasets import load_runs
+    from pipelines.data.datasets import load_runs
     from terrain.estimation.estimate import estimate_run
 
     husky = load_robot("husky")

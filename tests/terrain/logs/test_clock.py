@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter1d
 
-from pipelines.runs.datasets import load_runs
+from pipelines.data.datasets import load_runs
 from terrain.errors import DataError
 from terrain.logs.align import align
 from terrain.logs.clock import MAX_OFFSET_S, estimate_clock

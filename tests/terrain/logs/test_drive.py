@@ -4,9 +4,9 @@ import gzip
 import numpy as np
 import pytest
 
-from pipelines.runs.datasets import data_digest, load_runs
+from pipelines.data.datasets import data_digest, load_runs
+from pipelines.data.settings import ImportSettings
 from pipelines.runs.import_logs import import_logs
-from pipelines.runs.settings import ImportSettings
 from terrain.errors import ConfigError, LogError
 from terrain.logs.drive import FILE_NAME, STREAMS, DriveRobot, find_runs
 from terrain.logs.held import between_updates

@@ -7,9 +7,9 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from pipelines.runs.datasets import data_digest, load_runs
+from pipelines.data.datasets import data_digest, load_runs
+from pipelines.data.settings import ImportSettings
 from pipelines.runs.import_logs import import_logs
-from pipelines.runs.settings import ImportSettings
 from terrain.errors import ConfigError, LogError
 from terrain.logs.current_signs import NO_SIGN, POWER_SIGN, current_sign
 from terrain.logs.drive_recording import LOST, NOT_RECORDED, STILL

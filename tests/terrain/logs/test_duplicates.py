@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pipelines.data.datasets import load_runs
 from pipelines.feature_store.print_files import PrintFiles
-from pipelines.runs.datasets import load_runs
 from terrain.errors import DataError
 from terrain.logs.duplicates import groups_of, shared_stretches
 from terrain.logs.fingerprints import run_print

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import yaml
 
-from pipelines.runs.datasets import data_digest, load_runs
+from pipelines.data.datasets import data_digest, load_runs
+from pipelines.data.settings import ImportSettings
 from pipelines.runs.import_logs import import_logs
-from pipelines.runs.settings import ImportSettings
 from terrain.errors import ConfigError, LogError
 from terrain.logs.mapping import find_runs, load_mapping
 from terrain.logs.spelling import RESPELT

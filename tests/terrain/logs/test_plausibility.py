@@ -5,11 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipelines.runs.datasets import load_runs
+from pipelines.data.datasets import load_runs
+from pipelines.data.inspect import Settings as InspectSettings
+from pipelines.data.inspect import run as inspect_runs
+from pipelines.data.plausibility import doubt_sentences, doubts_of, verdict
+from pipelines.data.settings import ImportSettings
 from pipelines.runs.import_logs import import_logs
-from pipelines.runs.inspect_logs import inspect_logs
-from pipelines.runs.settings import ImportSettings, InspectSettings
-from pipelines.runs.verdicts import doubt_sentences, doubts_of, verdict
 from terrain.errors import LogError
 from terrain.logs.checks import Level
 from terrain.logs.plausibility import judge, worst
@@ -256,7 +257,7 @@ def test_values_beyond_any_quantity_are_refused_or_repaired_by_one_rule(tmp_path
 
 def test_inspect_has_every_check_and_its_figure(tmp_path):
     write_run(changed("imu", GYRO), tmp_path / "data")
-    [run] = inspect_logs(InspectSettings(data=tmp_path / "data")).runs
+    [run] = inspect_runs(InspectSettings(data=tmp_path / "data")).runs
     [check] = [c for c in run.as_json()["plausibility"] if c.check == "yaw rate"]
     assert check.level == "implausible"
     assert check.measured == pytest.approx(0.5 / DEGREE, rel=0.1)

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from pipelines.runs.datasets import load_runs
+from pipelines.data.datasets import load_runs
 from terrain.logs.quality import stream_quality
 from terrain.records import Stream
 

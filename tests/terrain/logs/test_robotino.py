@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipelines.runs.datasets import data_digest, load_runs
+from pipelines.data.datasets import data_digest, load_runs
+from pipelines.data.settings import ImportSettings
 from pipelines.runs.import_logs import import_logs
-from pipelines.runs.settings import ImportSettings
 from terrain.errors import LogError
 from terrain.kinematics import omni
 from terrain.logs import robotino

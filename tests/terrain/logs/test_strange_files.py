@@ -10,7 +10,7 @@ import pytest
 import yaml
 from pyarrow import parquet
 
-from pipelines.runs.datasets import load_runs
+from pipelines.data.datasets import load_runs
 from terrain.control.slip_table import load_slip_table
 from terrain.errors import ConfigError, LogError, TerrainError
 from terrain.files.resources import data_folder

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from pipelines.runs.datasets import data_digest, load_runs
+from pipelines.data.datasets import data_digest, load_runs
 from terrain.errors import LogError
 from terrain.logs import testbed
 from terrain.logs.write import write_run

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipelines.runs.datasets import load_runs
+from pipelines.data.datasets import load_runs
 from terrain.errors import DataError
 from terrain.soil_identification.coupling import calibration_rows, side_coupling, without_coupling
 from terrain.soil_identification.fit import fit_law, predict

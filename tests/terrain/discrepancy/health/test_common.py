@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipelines.runs.datasets import load_runs
+from pipelines.data.datasets import load_runs
 from terrain.discrepancy.health.common import common_gains, odd_runs, stalled_runs
 from terrain.discrepancy.health.response import Response, responses_of
 from terrain.discrepancy.latencies import latencies_of

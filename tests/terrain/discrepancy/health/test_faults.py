@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from pipelines.runs.datasets import load_runs
+from pipelines.data.datasets import load_runs
 from terrain.discrepancy.health import Column, Fault, FaultKind, faults_of, repaired
 from terrain.discrepancy.health.faults import Change
 from terrain.discrepancy.health.response import AMPS, A, G, X

@@ -1,16 +1,15 @@
-import io
 import json
 
 import numpy as np
 import pytest
-from rich.console import Console
 
+from pipelines.data.datasets import data_digest, load_runs
+from pipelines.data.inspect import Settings as InspectSettings
+from pipelines.data.inspect import run as inspect_runs
+from pipelines.data.settings import ImportSettings
+from pipelines.report.terminal import terminal_text
 from pipelines.reporting.json_file import as_json
-from pipelines.runs.datasets import data_digest, load_runs
 from pipelines.runs.import_logs import import_logs
-from pipelines.runs.inspect_logs import inspect_logs
-from pipelines.runs.screen import print_inspection
-from pipelines.runs.settings import ImportSettings, InspectSettings
 from terrain.errors import LogError, TerrainError
 from terrain.logs.write import write_run
 from terrain.records import RunLog
@@ -62,7 +61,7 @@ def test_repair_is_counted_and_the_counts_travel_with_the_runs(borealtc_dir, tmp
     assert report.run_ids == ("SNOW_01", "SNOW_02")
     assert report.dropped == {"rows with a bad time": 1}
     assert report.skipped == ("run skipped: ICE/pro_01.csv: is missing",)
-    inspected = inspect_logs(InspectSettings(data=tmp_path / "out"))
+    inspected = inspect_runs(InspectSettings(data=tmp_path / "out"))
     assert [run.dropped for run in inspected.runs] == [{"rows with a bad time": 1}, {}]
 
 
@@ -75,7 +74,7 @@ def test_inspect_shows_rates_gaps_stuck_channels_missing_values_and_the_clock(bo
         return [",".join(row) for row in rows[:60] + rows[70:]]
 
     edit(borealtc_dir / "SNOW" / "imu_01.csv", spoil)
-    report = as_json(inspect_logs(InspectSettings(data=borealtc_dir)))
+    report = as_json(inspect_runs(InspectSettings(data=borealtc_dir)))
     json.dumps(report, allow_nan=False)
     run = next(run for run in report["runs"] if run["run_id"] == "SNOW_01")
     imu = run["streams"]["imu"]
@@ -89,24 +88,25 @@ def test_inspect_shows_rates_gaps_stuck_channels_missing_values_and_the_clock(bo
     assert run["clock"]["offset_s"] is None
 
 
-def test_inspect_prints_a_row_for_every_stream(datasets_dir, tmp_path, make_run):
-    text = io.StringIO()
-    report = inspect_logs(InspectSettings(data=datasets_dir / "vulpi"))
-    print_inspection(report, Console(file=text, width=200))
-    lines = text.getvalue().splitlines()
-    assert sum("│ imu " in line for line in lines) == sum("│ wheels " in line for line in lines) == 18
-    assert any("PLOUGHED_4" in line and "estimated: offset" in line and "rate -1." in line for line in lines)
-    assert report.digest[:12] in text.getvalue()
+def test_the_report_has_a_row_for_every_stream(datasets_dir):
+    result = inspect_runs(InspectSettings(data=datasets_dir / "vulpi"))
+    assert result.to_pandas()["stream"].value_counts().to_dict() == {"imu": 18, "wheels": 18}
+    text = terminal_text(result.report, details=True)
+    assert any(
+        "PLOUGHED_4" in line and "estimated: offset" in line and "rate −1." in line
+        for line in text.splitlines()
+    )
+    assert result.digest[:12] in text
+    assert len(terminal_text(result.report).splitlines()) <= 25
 
 
 def test_runs_without_wheels_or_with_a_foreign_robot_are_inspected_too(tmp_path, make_run):
     run = make_run()
     write_run(RunLog("A", "husky", {"imu": run.streams["imu"]}), tmp_path)
     write_run(RunLog("B", "somebody's own", run.streams), tmp_path)
-    report = inspect_logs(InspectSettings(data=tmp_path))
+    report = inspect_runs(InspectSettings(data=tmp_path))
     assert [run.clock for run in report.runs] == [None, None]
     assert report.runs[0].terrains == ()
-    text = io.StringIO()
-    print_inspection(report, Console(file=text, width=200))
-    assert "no gyro, no speeds of a left and a right wheel, or an unknown robot" in text.getvalue()
+    text = terminal_text(report.report, details=True)
+    assert "no gyro, no speeds of a left and a right wheel, or an unknown robot" in text
     assert np.isfinite(report.runs[1].streams["wheels"].rate_hz)

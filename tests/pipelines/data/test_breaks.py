@@ -1,6 +1,6 @@
 import numpy as np
 
-from pipelines.runs.breaks import odd_stretches
+from pipelines.data.breaks import odd_stretches
 from terrain.records import RunLog, Stream
 
 

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
+from pipelines.data.datasets import load_runs
+from pipelines.data.simulate import Settings as SimulateSettings
+from pipelines.data.simulate import run as simulate_runs
 from pipelines.estimate.estimate import estimate
 from pipelines.estimate.settings import EstimateSettings
 from pipelines.explain.explain import diagnose_runs
-from pipelines.runs.datasets import load_runs
-from pipelines.runs.settings import SimulateSettings
-from pipelines.runs.simulate import simulate_runs
 from terrain.discrepancy.signals import signals_of
 from terrain.effects import CHANNELS, effect_named, vector_of
 from terrain.robots import load_robot

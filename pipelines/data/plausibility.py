@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
-from pipelines.runs.datasets import robot_of
+from pipelines.data.datasets import robot_of
 from terrain.errors import ConfigError, LogError
 from terrain.logs.checks import Check, Level
 from terrain.logs.plausibility import judge

@@ -3,7 +3,7 @@ import shutil
 import numpy as np
 import pytest
 
-from pipelines.runs.datasets import data_digest, load_runs
+from pipelines.data.datasets import data_digest, load_runs
 from terrain.errors import ConfigError, LogError
 from terrain.logs.write import write_run
 from terrain.records import Label, RunLog, Stream

@@ -6,8 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple, Protocol, TypeVar
 
-from pydantic import field_validator
-
 from pipelines.report.settings import Settings, setting
 from terrain.errors import ConfigError
 from terrain.files.names import listed, shown
@@ -110,9 +108,9 @@ def load(settings: RunsSettings, robot: str | None = None, *, align: bool = Fals
     Raises
     ------
     LogError, ConfigError, DataError
-        as :func:`pipelines.runs.datasets.load_runs`.
+        as :func:`pipelines.data.datasets.load_runs`.
     """
-    from pipelines.runs.datasets import load_runs
+    from pipelines.data.datasets import load_runs
 
     skipped: list[str] = []
     runs = load_runs(
@@ -150,53 +148,3 @@ def chosen_runs(runs: Sequence[AnyRun], settings: AlignedRunsSettings) -> list[A
     if not chosen:
         raise ConfigError("--only and --without leave no run")
     return chosen
-
-
-class SimulateSettings(Settings):
-    """What is simulated, and where to."""
-
-    robot: str = setting(..., "Robot by name, or its YAML file.")
-    terrain: str = setting(..., "Name of a soil, 'all' for each in turn, 'course' or 'bench'.")
-    scenario: str = setting(
-        ...,
-        "stand, straight, arc, starts, climb, brake, circle, crab, spot_turn, complex, survey; slip, for "
-        "learn-slip; course on 'course', six_positions on 'bench'.",
-    )
-    out: Path = setting(..., "Folder of the new run folders.")
-    runs: int = setting(1, "Number of runs for each terrain.", ge=1)
-    duration_s: float | None = setting(None, "Length of a run in s.", option="--duration")
-    seed: int = setting(0, "Seed of everything that is drawn.", ge=0)
-    vary: bool = setting(False, "Draw soil, slope, load and tyres anew for each run.")
-    grade_deg: float = setting(
-        0.0, "Slope along the start's heading in degrees, uphill > 0.", option="--grade", ge=-30.0, le=30.0
-    )
-    payload_kg: float = setting(0.0, "Load in kg.", option="--payload", ge=0.0)
-    camera_lost: tuple[str, ...] = setting((), "START:END in s without the camera; may be given again.")
-    gnss: bool = setting(False, "With an RTK receiver on board.")
-    effect: tuple[str, ...] = setting(
-        (), "NAME=VALUE of an effect that acts, as wheel_radius=0.03; may be given again."
-    )
-
-    @property
-    def camera_lost_s(self) -> tuple[tuple[float, float], ...]:
-        """Intervals (start, end) without the camera."""
-        return tuple(_interval(text) for text in self.camera_lost)
-
-    @field_validator("camera_lost")
-    @classmethod
-    def _check_intervals(cls, texts: tuple[str, ...]) -> tuple[str, ...]:
-        for text in texts:
-            _interval(text)
-        return texts
-
-
-def _interval(text: str) -> tuple[float, float]:
-    """Read ``START:END``."""
-    start, _, end = text.partition(":")
-    try:
-        start_s, end_s = float(start), float(end)
-    except ValueError:
-        start_s = end_s = 0.0
-    if not 0.0 <= start_s < end_s:
-        raise ValueError(f"--camera-lost is {text!r}; START:END in seconds is required, as in 10:13")
-    return start_s, end_s

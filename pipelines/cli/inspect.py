@@ -1,0 +1,24 @@
+"""Inspect runs: rates, gaps, clocks, units and signs; or a model: what it was trained on, its figures and limits."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pipelines.data import inspect as runs
+from pipelines.report import Progress, Result, silent
+from pipelines.report.settings import setting
+
+EXAMPLE = runs.EXAMPLE
+
+
+class Settings(runs.Settings):
+    """What is inspected."""
+
+    data: Path = setting(
+        ..., "Folder of runs, an MCAP file, or a model: its folder or models:/NAME.", option="DATA"
+    )
+
+
+def run(settings: Settings, progress: Progress = silent) -> Result:
+    """Return the quality of runs, or the card of a model."""
+    return runs.run(settings, progress)

@@ -1,0 +1,161 @@
+"""From the settings of a command to its options, and from its options to its result on the screen and in files."""
+
+from __future__ import annotations
+
+import types
+import typing
+from importlib import import_module
+from pathlib import Path
+from typing import Any, Literal
+
+import click
+from pydantic.fields import FieldInfo
+
+from pipelines.cli.table import Command
+from pipelines.report.results import Result
+from pipelines.report.settings import Settings, option_name, option_text
+
+PATH = click.Path(path_type=Path)
+COMMON = "Output"
+"""Heading of the options that every command has."""
+
+
+class Option(click.Option):
+    """An option that knows under which heading help lists it."""
+
+    heading: str = COMMON
+
+
+def click_command(command: Command) -> click.Command:
+    """Return a command of the table as click runs it."""
+    module = import_module(command.module)
+    parameters: list[click.Parameter] = []
+    for name in module.Settings.model_fields:
+        parameters += _parameters(module.Settings, name)
+    parameters += _common()
+    return OneFile(command, module, parameters)
+
+
+class OneFile(click.Command):
+    """A command whose settings, run and report are in one module."""
+
+    def __init__(self, command: Command, module: types.ModuleType, parameters: list[click.Parameter]) -> None:
+        super().__init__(
+            command.name,
+            params=parameters,
+            callback=self._execute,
+            context_settings={"help_option_names": ["-h", "--help"]},
+        )
+        self.module, self.command = module, command
+
+    def _execute(self, json_file: Path | None, report_file: Path | None, details: bool, **given: Any) -> None:
+        from pipelines.report.json_file import checked_json, write_json
+        from pipelines.report.terminal import output_console, print_report, progress_bar
+        from pipelines.report.writing import check_ending
+        from terrain.files.atomic import ensure_writable
+
+        checked_json(json_file)
+        if report_file is not None:
+            check_ending(report_file)
+            ensure_writable(report_file.parent)
+        settings = self.module.Settings(
+            **{name: value for name, value in given.items() if value not in (None, ())}
+        )
+        with progress_bar() as progress:
+            result: Result = self.module.run(settings, progress)
+        report = result.report
+        print_report(report, output_console(), details=details)
+        write_json(json_file, result)
+        if report_file is not None:
+            report.save(report_file)
+
+    def format_help(self, context: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write an example, what the command does, and its options by the class that declares them."""
+        formatter.write(f"{self.module.EXAMPLE}\n\n")
+        text = (self.module.__doc__ or self.command.text).strip()
+        formatter.write_text(" ".join(text.split("\n\n")[0].split()))
+        arguments = [each for each in self.params if isinstance(each, click.Argument)]
+        groups: dict[str, list[tuple[str, str]]] = {}
+        for parameter in self.params:
+            if isinstance(parameter, Option):
+                record = parameter.get_help_record(context)
+                if record is not None:
+                    groups.setdefault(parameter.heading, []).append(record)
+        if arguments:
+            with formatter.section("Arguments"):
+                formatter.write_dl(
+                    [(each.make_metavar(context), getattr(each, "text", "")) for each in arguments]
+                )
+        for heading in (*(each for each in groups if each != COMMON), COMMON):
+            with formatter.section(heading):
+                formatter.write_dl(groups[heading])
+
+
+def _parameters(model: type[Settings], name: str) -> list[click.Parameter]:
+    """Return the parameter of a field; the model reads all values, so that they are texts here."""
+    field, written = model.model_fields[name], option_text(model, name)
+    if written.option == "":
+        return []
+    shown, several = option_name(model, name), field.annotation == tuple[str, ...] and not written.separated
+    if not shown.startswith("-"):
+        argument = click.Argument([name], required=False, nargs=-1 if several else 1, metavar=shown)
+        argument.text = field.description  # type: ignore[attr-defined]
+        return [argument]
+    default = None if field.is_required() else field.get_default(call_default_factory=True)
+    flag = field.annotation is bool
+    names = f"{shown}/--no-{shown.removeprefix('--')}" if flag and default else shown
+    option = Option(
+        [names, name],
+        help=_help(field, default),
+        is_flag=flag,
+        multiple=several,
+        default=None,
+        metavar=None if flag else _metavar(field.annotation),
+        type=bool if flag else str,
+    )
+    option.heading = _heading(model, name)
+    return [option]
+
+
+def _help(field: FieldInfo, default: Any) -> str:
+    text = field.description or ""
+    if field.is_required():
+        return f"{text} [required]"
+    if default is None or isinstance(default, bool) or default in ("", ()):
+        return text
+    shown = ",".join(map(str, default)) if isinstance(default, tuple) else default
+    return f"{text} [default: {shown}]"
+
+
+def _metavar(kind: Any) -> str:
+    """Return what stands for the value in help: the choices, or the kind of value."""
+    if typing.get_origin(kind) is Literal:
+        return "|".join(map(str, typing.get_args(kind)))
+    if typing.get_origin(kind) in (typing.Union, types.UnionType):
+        return _metavar(next(each for each in typing.get_args(kind) if each is not type(None)))
+    return {int: "N", float: "X", Path: "PATH"}.get(kind, "TEXT")
+
+
+def _heading(model: type[Settings], name: str) -> str:
+    """Return the first line of the docstring of the class that declares a field."""
+    declaring = [kind for kind in model.__mro__ if name in vars(kind).get("__annotations__", {})]
+    text = (declaring[-1].__doc__ or "Options").strip().splitlines()[0]
+    return text.rstrip(".")
+
+
+def _common() -> list[click.Parameter]:
+    return [
+        Option(
+            ["--json", "json_file"],
+            metavar="FILE",
+            type=click.Path(path_type=Path),
+            help="Write the result as JSON.",
+        ),
+        Option(
+            ["--report", "report_file"],
+            metavar="FILE",
+            type=click.Path(path_type=Path),
+            help="Write the report as a page (.html) or as Markdown (.md).",
+        ),
+        Option(["--details"], is_flag=True, help="Print the details, too."),
+    ]

@@ -1,0 +1,46 @@
+"""Commands that are not yet one file: still made by typer, until they are."""
+
+from __future__ import annotations
+
+import typer
+
+from pipelines.cli import (
+    bench,
+    can,
+    classify,
+    drive,
+    estimate,
+    explain,
+    export,
+    faults,
+    features,
+    label,
+    quickstart,
+    replay,
+    reproduce,
+    runs,
+    serve,
+    slip,
+    soil,
+    track,
+)
+
+app = typer.Typer(
+    name="terrain",
+    help="Terrain classification and slip learning for off-road robots.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    add_completion=False,
+    rich_markup_mode=None,
+)
+
+GROUPS = (
+    *(runs.app, export.app, estimate.app, features.app, classify.app, slip.app, soil.app, drive.app),
+    *(replay.app, serve.app, can.app, label.app),
+    *(faults.app, explain.app, reproduce.app, quickstart.app, track.app),
+)
+"""Files of commands, in the order of help."""
+
+for group in GROUPS:
+    app.add_typer(group)
+app.add_typer(bench.app, name="bench")

@@ -1,0 +1,224 @@
+"""Inspect runs: rates, lengths, gaps, stuck channels, units and signs, and whether two loggers share one clock."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pipelines.data.settings import ROBOT_TEXT, RunsSettings, load
+from pipelines.report import (
+    Column,
+    Progress,
+    Report,
+    Result,
+    Section,
+    Table,
+    Text,
+    described,
+    format_counts,
+    format_value,
+    plural,
+    silent,
+)
+from pipelines.report.settings import setting
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from pipelines.data.breaks import OddStretch
+    from terrain.logs.checks import Check
+    from terrain.logs.clock import ClockEstimate
+    from terrain.logs.duplicates import SharedStretch
+    from terrain.logs.quality import StreamQuality
+    from terrain.records import RunLog
+    from terrain.robots import Robot
+
+EXAMPLE = "terrain inspect logs/ --robot husky"
+
+
+class Settings(RunsSettings):
+    """What is inspected."""
+
+    data: Path = setting(..., "Folder to read, or an MCAP file.", option="FOLDER")
+    robot: str | None = setting(None, ROBOT_TEXT)
+
+
+@dataclass(frozen=True, slots=True)
+class InspectedRun:
+    """The quality of the streams of one run.
+
+    ``clock`` is None where the run has no gyro or no speeds of a left and a right wheel, or its robot is
+    unknown.  ``odd_stretches`` differ from the rest of the run.  ``plausibility`` has every check.
+    """
+
+    run_id: str
+    terrains: tuple[str, ...]
+    dropped: Mapping[str, int]
+    streams: Mapping[str, StreamQuality]
+    clock: ClockEstimate | None
+    odd_stretches: tuple[OddStretch, ...] = ()
+    plausibility: tuple[Check, ...] = ()
+
+    def as_json(self) -> dict[str, Any]:
+        """Return all fields, the figures of channels by quantity."""
+        return {
+            "run_id": self.run_id,
+            "terrains": self.terrains,
+            "dropped": self.dropped,
+            "streams": {name: _stream_json(quality) for name, quality in self.streams.items()},
+            "clock": self.clock,
+            "odd_stretches": self.odd_stretches,
+            "plausibility": self.plausibility,
+        }
+
+
+def _stream_json(quality: StreamQuality) -> dict[str, Any]:
+    channels = quality.channels.items()
+    return {key: value for key, value in quality._asdict().items() if key != "channels"} | {
+        "stuck": quality.stuck,
+        "n_nonfinite": {name: channel.n_nonfinite for name, channel in channels},
+        "longest_constant_s": {name: channel.longest_constant_s for name, channel in channels},
+    }
+
+
+@dataclass(frozen=True)
+class Inspection(Result):
+    """The quality of all runs."""
+
+    n_runs: int = described("runs that were read")
+    digest: str = described("SHA-256 over the content of all runs")
+    skipped: tuple[str, ...] = described("a sentence for each run that could not be read")
+    runs: tuple[InspectedRun, ...] = described("streams, clock, odd stretches and checks of each run")
+    duplicates: tuple[SharedStretch, ...] = described("stretches that two runs share", default=())
+
+    def to_pandas(self) -> pd.DataFrame:
+        """Return a row a stream."""
+        import pandas as pd
+
+        rows = [_row(run, name) for run in self.runs for name in run.streams]
+        return pd.DataFrame(rows, columns=[head.title for head in COLUMNS])
+
+
+COLUMNS = (
+    Column("run"),
+    Column("stream"),
+    Column("rate", ".2f", "Hz"),
+    Column("length", ".2f", "s"),
+    Column("gaps"),
+    Column("longest", ".2f", "s"),
+    Column("missing"),
+    Column("stuck"),
+)
+MAX_ROWS = 12
+"""Rows of streams on the first screen: those that need a look come first."""
+
+
+def run(settings: Settings, progress: Progress = silent) -> Inspection:
+    """Return the quality of the runs under a folder.
+
+    Raises
+    ------
+    LogError
+        if a run cannot be read.
+    """
+    from pipelines.data.datasets import data_digest
+    from terrain.logs.duplicates import shared_stretches
+    from terrain.robots import load_robot
+
+    runs, skipped = load(settings)
+    robot = None if settings.robot is None else load_robot(settings.robot)
+    inspected = []
+    for done, each in enumerate(runs, 1):
+        inspected.append(_inspected(each, robot))
+        progress("inspect", done, len(runs))
+    return Inspection(len(runs), data_digest(runs), tuple(skipped), tuple(inspected), shared_stretches(runs))
+
+
+def _inspected(run: RunLog, robot: Robot | None) -> InspectedRun:
+    from pipelines.data.breaks import odd_stretches
+    from pipelines.data.datasets import robot_of
+    from pipelines.data.plausibility import verdict
+    from terrain.errors import ConfigError, DataError
+    from terrain.logs.clock import estimate_clock
+    from terrain.logs.quality import stream_quality
+
+    try:
+        clock = estimate_clock(run, track_m=robot_of(run, robot).track_m)
+    except (ConfigError, DataError):
+        clock = None
+    streams = {name: stream_quality(stream) for name, stream in run.streams.items()}
+    checks = verdict(run, robot)
+    return InspectedRun(
+        run.run_id, run.terrains, dict(run.dropped), streams, clock, odd_stretches(run), checks
+    )
+
+
+def report(result: Inspection) -> Report:
+    """Return what is odd about the runs first, then rates and gaps of their streams, then their clocks."""
+    from pipelines.data.duplicates import sentences
+    from pipelines.data.plausibility import doubt_sentences, doubts_of
+    from terrain.logs.plausibility import worst
+
+    doubts = list(doubt_sentences(doubts_of({each.run_id: each.plausibility for each in result.runs})))
+    odd = [_odd_sentence(each.run_id, stretch) for each in result.runs for stretch in each.odd_stretches]
+    faults = [*result.skipped, *doubts, *sentences(result.duplicates)]
+    levels = Counter(str(worst(each.plausibility)) for each in result.runs)
+    found = f"{len(faults)} faults" if faults else "no fault"
+    rows = [_row(each, name) for each in result.runs for name in each.streams]
+    notable = sorted(rows, key=lambda row: (not (row[4] or row[6] or row[7]), row[0]))
+    dropped = [
+        f"{each.run_id}: dropped {format_counts(each.dropped)}" for each in result.runs if each.dropped
+    ]
+    clocks = [(each.run_id, _clock_text(each.clock)) for each in result.runs if "wheels" in each.streams]
+    return Report(
+        "Inspection of runs",
+        f"{plural(result.n_runs, 'run')}: {found} found; plausibility {format_counts(levels)}.",
+        lead=f"digest {result.digest[:12]}",
+        parts=[
+            *(Text(each, "warning") for each in faults[:6]),
+            Table(
+                COLUMNS, notable[:MAX_ROWS], note="" if len(rows) <= MAX_ROWS else f"of {len(rows)} streams"
+            ),
+        ],
+        details=[
+            Section("All faults", [Text(each) for each in faults or ("none",)]),
+            Section("Stretches unlike the rest of their run", [Text(each) for each in odd or ("none",)]),
+            Section("Streams", [Table(COLUMNS, rows)]),
+            Section(
+                "Clock of the wheels against the IMU", [Table(("run", Column("clock", long=True)), clocks)]
+            ),
+            Section("Dropped", [Text(each) for each in dropped or ("nothing",)]),
+        ],
+        next_step="terrain convert FOLDER --out runs/",
+    )
+
+
+def _row(run: InspectedRun, name: str) -> tuple[Any, ...]:
+    stream = run.streams[name]
+    missing = sum(channel.n_nonfinite for channel in stream.channels.values())
+    longest = stream.longest_gap_s if stream.n_gaps else None
+    stuck = ", ".join(stream.stuck)
+    return run.run_id, name, stream.rate_hz, stream.duration_s, stream.n_gaps, longest, missing, stuck
+
+
+def _odd_sentence(run_id: str, odd: OddStretch) -> str:
+    return (
+        f"{run_id}: {odd.start_s:g} to {odd.end_s:g} s differs from the rest of the run by "
+        f"{odd.shift:.1f} times its scatter (vibration at its speed; {odd.speed_mps:.2f} m/s, "
+        f"the run {odd.run_speed_mps:.2f}): a stuck robot, another ground?"
+    )
+
+
+def _clock_text(clock: ClockEstimate | None) -> str:
+    if clock is None:
+        return "no gyro, no speeds of a left and a right wheel, or an unknown robot"
+    if math.isnan(clock.offset_s):
+        return str(clock.status)
+    text = f"{clock.status}: offset {format_value(clock.offset_s, '+.3f')} ± {clock.offset_std_s:.3f} s"
+    if not math.isnan(clock.rate):
+        text += f", rate {format_value(100 * clock.rate, '+.2f')} ± {100 * clock.rate_std:.2f} %"
+    return text

@@ -1,0 +1,162 @@
+"""Simulate runs of a described robot: ordinary run folders, with the truth beside the measurements."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from pydantic import field_validator
+
+from pipelines.report import Progress, Report, Result, described, plural, silent
+from pipelines.report.settings import Settings as BaseSettings
+from pipelines.report.settings import setting
+
+EXAMPLE = "terrain simulate --robot husky --terrain grass --scenario survey --runs 8 --out runs/"
+EVERY = "all"
+"""Given in place of a terrain: each soil in turn."""
+
+
+class Settings(BaseSettings):
+    """What is simulated, and where to."""
+
+    robot: str = setting(..., "Robot by name, or its YAML file.")
+    terrain: str = setting(..., "Name of a soil, 'all' for each in turn, 'course' or 'bench'.")
+    scenario: str = setting(
+        ...,
+        "stand, straight, arc, starts, climb, brake, circle, crab, spot_turn, complex, survey; slip, for "
+        "learn-slip; course on 'course', six_positions on 'bench'.",
+    )
+    out: Path = setting(..., "Folder of the new run folders.")
+    runs: int = setting(1, "Number of runs for each terrain.", ge=1)
+    duration_s: float | None = setting(None, "Length of a run in s.", option="--duration")
+    seed: int = setting(0, "Seed of everything that is drawn.", ge=0)
+    vary: bool = setting(False, "Draw soil, slope, load and tyres anew for each run.")
+    grade_deg: float = setting(
+        0.0, "Slope along the start's heading in degrees, uphill > 0.", option="--grade", ge=-30.0, le=30.0
+    )
+    payload_kg: float = setting(0.0, "Load in kg.", option="--payload", ge=0.0)
+    camera_lost: tuple[str, ...] = setting((), "START:END in s without the camera; may be given again.")
+    gnss: bool = setting(False, "With an RTK receiver on board.")
+    effect: tuple[str, ...] = setting(
+        (), "NAME=VALUE of an effect that acts, as wheel_radius=0.03; may be given again."
+    )
+
+    @property
+    def camera_lost_s(self) -> tuple[tuple[float, float], ...]:
+        """Intervals (start, end) without the camera."""
+        return tuple(_interval(text) for text in self.camera_lost)
+
+    @field_validator("camera_lost")
+    @classmethod
+    def _check_intervals(cls, texts: tuple[str, ...]) -> tuple[str, ...]:
+        for text in texts:
+            _interval(text)
+        return texts
+
+
+def _interval(text: str) -> tuple[float, float]:
+    """Read ``START:END``."""
+    start, _, end = text.partition(":")
+    try:
+        start_s, end_s = float(start), float(end)
+    except ValueError:
+        start_s = end_s = 0.0
+    if not 0.0 <= start_s < end_s:
+        raise ValueError(f"--camera-lost is {text!r}; START:END in seconds is required, as in 10:13")
+    return start_s, end_s
+
+
+@dataclass(frozen=True)
+class SimulatedRuns(Result):
+    """Run folders that were simulated."""
+
+    out: Path = described("folder of the run folders")
+    robot: str = described("robot of the runs")
+    scenario: str = described("scenario of the runs")
+    seed: int = described("of everything that was drawn")
+    effects: Mapping[str, float] = described("parameters of effects that act, by name")
+    n_runs: int = described("number of runs")
+    run_ids: tuple[str, ...] = described("names of the runs")
+    duration_s: float = described("of all runs together", "s")
+
+
+def run(settings: Settings, progress: Progress = silent) -> SimulatedRuns:
+    """Simulate runs and write them as run folders.
+
+    Raises
+    ------
+    ConfigError
+        if a setting is not accepted.
+    LogError
+        if a run of that name exists already; nothing is written then.
+    """
+    import math
+
+    from terrain.errors import LogError
+    from terrain.files.atomic import ensure_writable
+    from terrain.logs.write import run_folder, write_run
+    from terrain.robots import load_robot
+    from terrain.simulation.conditions import Conditions, Faults
+    from terrain.simulation.run import BENCH_TERRAIN, COURSE, run_id_of, simulate_run
+    from terrain.simulation.sensors.gnss import Gnss
+    from terrain.terramechanics.soil import load_soil, soil_names
+
+    scenario, out = settings.scenario, settings.out
+    robot = load_robot(settings.robot)
+    effects = _effects(settings.effect, robot.drive)
+    ensure_writable(out)
+    terrains = soil_names() if settings.terrain == EVERY else (settings.terrain,)
+    jobs = [(name, number) for name in terrains for number in range(1, settings.runs + 1)]
+    for name, number in jobs:
+        terrain = name if name in (COURSE, BENCH_TERRAIN) else load_soil(name).name
+        if (folder := run_folder(run_id_of(terrain, scenario, number), out)).exists():
+            raise LogError(f"{folder}: is there already, and is left as it is; choose another --out")
+    gradient = math.tan(math.radians(settings.grade_deg))
+    run_ids: list[str] = []
+    total_s = 0.0
+    for done, (name, number) in enumerate(jobs, 1):
+        simulated = simulate_run(
+            robot,
+            name,
+            scenario,
+            settings.seed,
+            number,
+            duration_s=settings.duration_s,
+            vary=settings.vary,
+            conditions=Conditions(payload_kg=settings.payload_kg, grade_ratio=(gradient, 0.0)),
+            faults=Faults(camera_lost_s=settings.camera_lost_s),
+            gnss=Gnss() if settings.gnss else None,
+            effects=effects,
+        )
+        write_run(simulated, out)
+        run_ids.append(simulated.run_id)
+        total_s += simulated.streams["imu" if "imu" in simulated.streams else "wheels"].duration_s
+        progress("simulate", done, len(jobs))
+    return SimulatedRuns(
+        out, robot.name, scenario, settings.seed, effects, len(run_ids), tuple(run_ids), total_s
+    )
+
+
+def _effects(given: Sequence[str], drive: str) -> dict[str, float]:
+    """Return the parameters that all ``NAME=VALUE`` set together."""
+    from terrain.effects import read_effect
+    from terrain.errors import ConfigError
+
+    acting: dict[str, float] = {}
+    for text in given:
+        for name, value in read_effect(text, drive).items():
+            if name in acting:
+                raise ConfigError(f"effect {text.partition('=')[0]!r} is given twice")
+            acting[name] = value
+    return acting
+
+
+def report(result: SimulatedRuns) -> Report:
+    """Return how much was simulated."""
+    in_all = "of" if result.n_runs == 1 else "with, in all,"
+    return Report(
+        f"Simulated runs of {result.robot}",
+        f"{plural(result.n_runs, 'run')} {in_all} {result.duration_s:.0f} s, written to {result.out}.",
+        next_step=f"terrain inspect {result.out}",
+    )

@@ -1,0 +1,174 @@
+"""The settings of a command become its options: defaults once, grouped help, mistakes in one sentence."""
+
+import json
+import sys
+from dataclasses import dataclass
+from typing import Literal
+
+import pytest
+
+from pipelines.cli import main as cli
+from pipelines.cli import table
+from pipelines.cli.table import COMMANDS, FORMER, Command
+from pipelines.report import Report, Result, Section, Text, described
+from pipelines.report.settings import Settings as BaseSettings
+from pipelines.report.settings import option_name, setting
+from terrain.errors import ConfigError, DataError
+
+EXAMPLE = "terrain draw --folder a"
+
+
+class Folding(BaseSettings):
+    """How it is folded."""
+
+    seed: int = setting(0, "Of all that is drawn.", ge=0)
+
+
+class Settings(Folding):
+    """What is drawn."""
+
+    folder: str = setting(..., "Where it goes.")
+    protocol: Literal["grouped", "published"] = setting("grouped", "Which.")
+    window_s: float | None = setting(None, "Length.", option="--window", gt=0)
+    figures: bool = setting(True, "Draw.")
+    signal_sets: tuple[str, ...] = setting(
+        ("imu", "currents"), "By commas.", option="--signals", separated=True
+    )
+    effect: tuple[str, ...] = setting((), "May be given again.")
+    inner: int = setting(3, "Not on the command line.", option="")
+
+
+@dataclass(frozen=True)
+class Drawn(Result):
+    settings: Settings = described("what was asked for")
+    ratio: float = described("of nothing", "1")
+
+    def as_json(self):
+        return {"ratio": None, "folder": self.settings.folder}
+
+
+TAKEN = []
+
+
+def run(settings, progress):
+    if settings.folder == "nowhere":
+        raise DataError("nowhere: is no folder")
+    TAKEN.append(settings)
+    return Drawn(settings, float("nan"))
+
+
+def report(result):
+    return Report(
+        "Drawing", "It is drawn.", details=[Section("More", [Text("all of it")])], next_step="terrain b"
+    )
+
+
+@pytest.fixture
+def terrain(monkeypatch, capsys):
+    """Run ``terrain draw`` with words: exit code, output, errors, settings that were taken."""
+    monkeypatch.setitem(sys.modules, "drawing_command", sys.modules[__name__])
+    drawing = Command("Data", "draw", "drawing_command", "draws")
+    for place in (cli, table):
+        monkeypatch.setattr(place, "COMMANDS", (*COMMANDS, drawing))
+
+    def run(*words):
+        TAKEN.clear()
+        monkeypatch.setattr(sys, "argv", ["terrain", *words])
+        with pytest.raises(SystemExit) as stop:
+            cli.main()
+        output = capsys.readouterr()
+        return stop.value.code, output.out, output.err, TAKEN[0] if TAKEN else None
+
+    return run
+
+
+def test_every_option_reaches_the_model_and_defaults_are_those_of_the_model(terrain):
+    assert terrain("draw", "--folder", "a")[3] == Settings(folder="a")
+    words = ["--folder", "a", "--protocol", "published", "--window", "1.5", "--seed", "4", "--no-figures"]
+    taken = terrain("draw", *words, "--signals", "imu, gnss", "--effect", "a=1", "--effect", "b=2")[3]
+    assert taken == Settings(
+        folder="a",
+        protocol="published",
+        window_s=1.5,
+        seed=4,
+        figures=False,
+        signal_sets=("imu", "gnss"),
+        effect=("a=1", "b=2"),
+    )
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["--folder", "a", "--seed", "-1"], "--seed is -1: input should be greater than or equal to 0"),
+        (["--folder", "a", "--window", "wide"], "--window is 'wide': input should be a valid number"),
+        (
+            ["--folder", "a", "--protocol", "odd"],
+            "--protocol is 'odd': input should be 'grouped' or 'published'",
+        ),
+        ([], "--folder is missing"),
+        (["--folder", "nowhere"], "nowhere: is no folder"),
+        (["--foldr", "a"], "No such option '--foldr'. Did you mean '--folder'?"),
+        (
+            ["--folder", "a", "--report", "page.pdf"],
+            "--report is 'page.pdf'; a name that ends in .html or .md is required",
+        ),
+    ],
+)
+def test_a_mistake_is_one_sentence_and_code_2(terrain, words, sentence):
+    code, out, err, taken = terrain("draw", *words)
+    assert (code, out, taken) == (2, "", None)
+    assert err.startswith(f"error: {sentence}")
+    assert err.count("\n") == 1
+
+
+def test_help_begins_with_an_example_and_groups_options(terrain):
+    code, out, _, _ = terrain("draw", "-h")
+    assert code == 0
+    assert out.startswith(EXAMPLE)
+    options = out[len(EXAMPLE) :]
+    places = [
+        options.index(word)
+        for word in ("How it is folded:", "--seed", "What is drawn:", "--folder", "Output:")
+    ]
+    assert places == sorted(places)
+    assert "[required]" in out
+    assert "[default: imu,currents]" in out
+    assert "inner" not in out
+
+
+def test_json_and_page_are_written_and_details_are_asked_for(terrain, tmp_path):
+    files = ["--json", str(tmp_path / "new" / "a.json"), "--report", str(tmp_path / "a.html")]
+    code, out, _, _ = terrain("draw", "--folder", "a", *files)
+    assert (code, out) == (0, "It is drawn.\n--details adds: More\nnext: terrain b\n")
+    assert json.loads((tmp_path / "new" / "a.json").read_text()) == {"ratio": None, "folder": "a"}
+    assert "<summary>More</summary>" in (tmp_path / "a.html").read_text()
+    assert "all of it" in terrain("draw", "--folder", "a", "--details")[1]
+
+
+def test_a_former_command_names_its_successor(terrain, monkeypatch):
+    monkeypatch.setitem(FORMER, "sketch", "use terrain draw")
+    code, _, err, _ = terrain("sketch", "--folder", "a")
+    assert (code, err) == (2, "error: there is no command 'sketch' any more: use terrain draw\n")
+
+
+def test_unknown_settings_are_refused_and_settings_do_not_change():
+    with pytest.raises(ConfigError, match=r"^there is no setting 'sed'$"):
+        Settings(folder="a", sed=1)
+    settings = Settings(folder="a")
+    with pytest.raises(ValueError, match="frozen"):
+        settings.seed = 1
+    assert settings.with_(seed=2).seed == 2
+    with pytest.raises(ConfigError, match="--seed is -2"):
+        settings.with_(seed=-2)
+    assert option_name(Settings, "window_s") == "--window"
+
+
+def test_every_command_has_what_a_command_needs():
+    from importlib import import_module
+
+    for command in COMMANDS:
+        module = import_module(command.module)
+        assert module.EXAMPLE.startswith(f"terrain {command.name}")
+        assert issubclass(module.Settings, BaseSettings)
+        assert callable(module.run)
