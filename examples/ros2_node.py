@@ -10,7 +10,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import Imu, JointState
 from std_msgs.msg import Float64, String
 
-from pipelines.live.observer import TerrainObserver
+from pipelines.live.observer import Observer
 from pipelines.models.model_files import read_model
 from terrain.records import Reading
 
@@ -21,7 +21,7 @@ JOINTS, WHEEL_RADIUS_M = ("left_wheel", "right_wheel"), 0.1651  # of the robot a
 
 def terrain_node(model: Path) -> Node:
     """Return a node that publishes ``terrain`` (empty where unknown) and ``target_slip`` in traction."""
-    observer = TerrainObserver(read_model(model), channels={"imu": IMU, "wheels": WHEELS})
+    observer = Observer(read_model(model), channels={"imu": IMU, "wheels": WHEELS})
     node = Node("terrain")
     terrain = node.create_publisher(String, "terrain", 1)
     target = node.create_publisher(Float64, "target_slip", 1)

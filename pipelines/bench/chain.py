@@ -8,10 +8,10 @@ from contextlib import contextmanager
 from time import monotonic, perf_counter, sleep
 
 from pipelines.bench.results import Spread, spread
+from pipelines.live.classifying import ClassifierThread, classify_window
 from pipelines.live.pilot import LivePilot
 from pipelines.live.terrain_source import Classifier
 from pipelines.models.model_files import TerrainModel
-from pipelines.streaming.classifying import ClassifierThread, classify_window
 from terrain.logs.replay import replay
 from terrain.records import RunLog, Windows
 from terrain.robots import Robot

@@ -11,11 +11,11 @@ from pipelines.can_bridge.core import BridgeCore, MakeStep, Step
 from pipelines.can_bridge.link import Link, open_bus
 from pipelines.can_bridge.results import BridgeReport
 from pipelines.can_bridge.settings import CanSettings
+from pipelines.live.classifying import ClassifierThread
 from pipelines.live.pilot import LivePilot
 from pipelines.live.pilot_settings import PilotSettings
 from pipelines.live.terrain_source import Classifier
 from pipelines.reporting.stopping import stopping
-from pipelines.streaming.classifying import ClassifierThread
 from terrain.control.slip_table import load_slip_table
 from terrain.records import Array
 from terrain.robots import SwerveRobot, as_drive, load_robot

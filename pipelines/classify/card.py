@@ -18,7 +18,7 @@ from features.windows import Layout
 from pipelines.classify.card_support import RegimeRow, regime_rows
 from pipelines.crossval.extras import MOVING_MPS
 from pipelines.crossval.results import CrossvalReport
-from pipelines.models.assess import assess
+from pipelines.live.model import assess
 from pipelines.models.champion import scope_of
 from pipelines.models.model_files import read_lean_model
 from pipelines.models.onnx_file import ONNX_FILE, time_of_onnx

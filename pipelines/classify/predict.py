@@ -10,10 +10,10 @@ import numpy as np
 from features.windows import WindowCut, cut_windows, join_windows
 from pipelines.classify.results import Predictions, TargetSlipRow, WindowPrediction
 from pipelines.data.datasets import data_digest, robot_of
-from pipelines.models.assess import Assessed, assess, class_sets
+from pipelines.live.model import Assessed, assess, class_sets
+from pipelines.live.over_time import filter_of, novelty_evidence
+from pipelines.live.windows import lacking_estimates, windows_of_log
 from pipelines.models.model_files import TerrainModel
-from pipelines.streaming.log_windows import lacking_estimates, windows_of_log
-from pipelines.streaming.over_time import filter_of, novelty_evidence
 from terrain.classify.terrain_filter import filter_run, reported
 from terrain.control.slip_table import DRIVE_STATES, SlipTable
 from terrain.control.switching import UNKNOWN

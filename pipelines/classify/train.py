@@ -30,12 +30,12 @@ from pipelines.crossval.splits import folds_of
 from pipelines.data.datasets import data_digest
 from pipelines.feature_store.crossval import crossval_stored, refuse_recipe
 from pipelines.feature_store.store import FeatureStore, read_store
+from pipelines.live.windows import ESTIMATED
 from pipelines.models.champion import scope_of
 from pipelines.models.novelty_file import NOVELTY_FILE, novelty_bytes
 from pipelines.models.results import ModelInfo
 from pipelines.reporting.json_file import as_json
 from pipelines.reporting.progress import Progress, silent
-from pipelines.streaming.window_feed import ESTIMATED
 from terrain import __version__
 from terrain.errors import DataError
 from terrain.records import Array, RunLog, Windows

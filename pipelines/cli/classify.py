@@ -139,10 +139,10 @@ def predict_command(source: AlignedRunsSettings, settings: PredictSettings, json
 
     from pipelines.classify.predict import predict
     from pipelines.classify.screen import print_predictions
+    from pipelines.live.over_time import filtered
     from pipelines.models.tracking import load_model
     from pipelines.reporting.json_file import write_json
     from pipelines.reporting.terminal import output_console
-    from pipelines.streaming.over_time import filtered
     from terrain.control.slip_table import load_slip_table
     from terrain.robots import load_robot
 

@@ -9,14 +9,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipelines.live.clock_watch import ClockWatch, last_stamp_s
+from pipelines.live.arrivals import ClockWatch, last_stamp_s
+from pipelines.live.chain import Step
+from pipelines.live.classifying import Classifying, WindowOutput
+from pipelines.live.model import LiveModel
 from pipelines.live.pilot_settings import check_table
 from pipelines.live.state import LiveState, Restorable, restorable, state_of
-from pipelines.models.model_files import TerrainModel
-from pipelines.streaming.classifying import AtOnce, Classifying, Part, WindowOutput
-from pipelines.streaming.estimator import live_estimator
-from pipelines.streaming.over_time import ground_filter, without_dwell
-from pipelines.streaming.window_feed import Estimate, WindowFeed, live_filter, needs_filter
+from pipelines.live.terrain_source import Classifier
+from pipelines.live.windows import Estimate, live_estimator
 from terrain.control.slip_table import SlipTable, load_slip_table
 from terrain.control.switching import (
     NO_BELIEF,
@@ -27,8 +27,7 @@ from terrain.control.switching import (
     drive_on,
     update,
 )
-from terrain.errors import DataError
-from terrain.records import Reading, SlipTarget
+from terrain.records import Reading, Sample, SlipTarget
 from terrain.robots import Robot
 
 LONGEST_STEP_S = 1.0
@@ -59,7 +58,7 @@ class TerrainObservation(NamedTuple):
     output: WindowOutput
 
 
-class TerrainObserver:
+class Observer:
     """The terrain under a robot and its target slips, from its samples.
 
     Parameters
@@ -68,13 +67,10 @@ class TerrainObserver:
     table : of target slips; the packaged one by default
     robot : its description; needed where the model uses what a filter estimates, or wheel speeds that are
         computed from motor rates
-    channels : of each stream, in the order of the columns of its samples; those of the model by default
+    channels : of each stream, in the order of the columns of its samples; by default those that the first
+        samples name (:func:`pipelines.live.samples.replay`), or those of the model
     classifying : where windows are classified; at once by default
     switching : when a class is accepted as the terrain (:attr:`belief`)
-
-    Attributes
-    ----------
-    refused : number of windows that the model refused, by message
 
     Raises
     ------
@@ -85,13 +81,18 @@ class TerrainObserver:
 
     Notes
     -----
-    Fed with a log in order of time, it gives the windows and probabilities that
-    :func:`pipelines.classify.predict.predict` gives for it.  Whatever arrives, :meth:`update` does not raise.
+    Fed with a log in order of time, it gives the windows and probabilities that ``terrain predict`` gives for
+    it.  Whatever arrives, :meth:`update` does not raise, but for a model that does not suit the channels that
+    the first samples name.
     """
+
+    name = "observer"
+    health: Mapping[str, str] = {}
+    """No sensor is judged one by one."""
 
     def __init__(
         self,
-        model: TerrainModel,
+        model: LiveModel,
         table: SlipTable | None = None,
         robot: Robot | None = None,
         channels: Mapping[str, Sequence[str]] | None = None,
@@ -103,25 +104,31 @@ class TerrainObserver:
         if robot is not None:
             check_table(self.table, robot.name)
         check_switching(switching)
-        self.model, self.switching = model, switching
-        self.channels = {stream: tuple(names) for stream, names in (channels or model.info.channels).items()}
-        self._filter = None
-        corrected = robot
-        if robot is not None:
-            self._filter, corrected = live_estimator(model.info, robot, self.channels)
+        self.switching, self._robot, self._given_classifying = switching, robot, classifying
         self._robot_name = "" if robot is None else robot.name
-        self._filter_name = "" if self._filter is None else self._filter.name
-        self._robot = corrected
-        self._feed = WindowFeed(model.info, self.channels, corrected)
-        self._classifying: Classifying = AtOnce() if classifying is None else classifying
-        self._classifying.begin(Part(model, self._feed))
-        self._speed_columns, self._mps_per_unit = _speeds(self.channels.get("wheels", ()), corrected)
+        self._takes_names = channels is None
+        self._set_up(model, channels or model.info.channels)
         self._latest: Estimate | None = None
         self._speed_mps, self._speed_s, self._now_s = math.inf, -math.inf, math.nan
         self._watch = ClockWatch()
-        self._over_time = ground_filter(model)
         self.belief: TerrainBelief = NO_BELIEF
-        self.refused: Counter[str] = Counter()
+
+    def _set_up(self, model: LiveModel, channels: Mapping[str, Sequence[str]]) -> None:
+        """Take samples with these columns from now on."""
+        self.channels = {stream: tuple(names) for stream, names in channels.items()}
+        self._filter, corrected = None, self._robot
+        if self._robot is not None:
+            self._filter, corrected = live_estimator(model.info, self._robot, self.channels)
+        self._filter_name = "" if self._filter is None else self._filter.name
+        self._source = Classifier(
+            model, self._robot, self._given_classifying, self.channels, self._filter_name
+        )
+        self._speed_columns, self._mps_per_unit = _speeds(self.channels.get("wheels", ()), corrected)
+
+    @property
+    def model(self) -> LiveModel:
+        """The model that classifies."""
+        return self._source.model
 
     @property
     def estimate(self) -> Estimate | None:
@@ -129,26 +136,28 @@ class TerrainObserver:
         return self._latest
 
     @property
+    def target_ratio(self) -> float:
+        """Target slip in traction of the terrain that is believed."""
+        return self.table.lookup(self.belief.terrain)["traction"].slip_ratio
+
+    @property
+    def refused(self) -> Counter[str]:
+        """Number of windows that the model refused, by message."""
+        return self._source.failed
+
+    @property
     def dropped(self) -> dict[str, int]:
         """What was not used so far, as counts by kind."""
-        counts = dict(self._classifying.dropped)
-        counts |= {f"window: refused, {why}": n for why, n in self.refused.items()}
-        counts |= {"time: clock set": n} if (n := self._watch.n_set) else {}
+        counts = self._source.dropped | ({"time: clock set": n} if (n := self._watch.n_set) else {})
         return counts | (dict(self._filter.dropped) if self._filter is not None else {})
 
-    def check(self, model: TerrainModel) -> None:
+    def check(self, model: LiveModel | None, table: SlipTable) -> None:
         """Raise what :meth:`swap` would."""
-        if not self._feed.suits(model.info):
-            WindowFeed(model.info, self.channels, self._robot)
-            if needs_filter(model.info, self.channels) and (
-                self._robot is None or live_filter(model.info, self._robot) != self._filter_name
-            ):
-                raise DataError(
-                    f"the model was trained on estimates of the filter {model.info.filter!r}; "
-                    f"{self._filter_name or 'none'!r} runs here"
-                )
+        if self._robot is not None:
+            check_table(table, self._robot_name)
+        self._source.check(model)
 
-    def swap(self, model: TerrainModel, table: SlipTable) -> None:
+    def swap(self, model: LiveModel | None, table: SlipTable) -> None:
         """Go on with another model and table, between two samples; the filter runs on.
 
         Where both take the same windows, the one that is being cut is the first of the new model; otherwise
@@ -157,18 +166,13 @@ class TerrainObserver:
         Raises
         ------
         DataError
-            if the model needs a channel that is neither measured nor estimated, or another filter.
+            if the model needs a channel that is neither measured nor estimated, another filter, or is none.
         ConfigError
             if the table is another robot's.
         """
-        self.check(model)
-        if self._robot is not None:
-            check_table(table, self._robot_name)
+        self.check(model, table)
+        self._source.swap(model)
         self.table = table
-        if not self._feed.suits(model.info):
-            self._feed = WindowFeed(model.info, self.channels, self._robot)
-        self.model, self._over_time = model, ground_filter(model)
-        self._classifying.begin(Part(model, self._feed))
 
     def state(self, now_s: float) -> LiveState:
         """Return what is worth keeping over a restart, at a time in seconds since 1970."""
@@ -189,6 +193,10 @@ class TerrainObserver:
         self.belief = fresh.belief
         return fresh
 
+    def step(self, sample: Sample) -> Step:
+        """Take a sample, as a chain does: no command is given."""
+        return Step([found.output for found in self.update(sample.readings, sample.time_s)])
+
     def update(self, samples: Mapping[str, Reading], now_s: float = math.nan) -> list[TerrainObservation]:
         """Take what was measured since the last call; return what has been found, in most calls nothing.
 
@@ -202,6 +210,10 @@ class TerrainObserver:
         """
         if not isinstance(samples, Mapping):
             return []
+        if self._takes_names:
+            self._takes_names = False
+            if named := getattr(samples, "channels", None):
+                self._set_up(self.model, named)
         estimates: Sequence[Estimate] = ()
         if self._filter is not None:
             estimates = self._filter.step(samples)
@@ -209,20 +221,14 @@ class TerrainObserver:
                 self._latest = estimates[-1]
         if self._watch.was_set(samples):
             self._begin_again()
-        self._classifying.put(samples, estimates)
+        outputs = self._source.take(samples, estimates)
         self._drive_on(samples, now_s)
-        return [self._observed(output) for output in self._classifying.finished()]
+        return [self._observed(output) for output in outputs]
 
     def _observed(self, output: WindowOutput) -> TerrainObservation:
-        if output.refused:
-            self.refused[output.refused] += 1
-        if self._over_time is not None:
-            settings = without_dwell(self.switching)
-            self.belief = update(self.belief, output.end_s, *self._over_time.take(output), settings)
-        elif not output.refused:
-            self.belief = update(
-                self.belief, output.end_s, output.terrain, output.probability, self.switching
-            )
+        found = self._source.terrain_of(output)
+        if found is not None:
+            self.belief = update(self.belief, output.end_s, *found, self._source.switching(self.switching))
         return TerrainObservation(
             output.start_s,
             output.end_s,
@@ -236,10 +242,8 @@ class TerrainObserver:
 
     def _begin_again(self) -> None:
         """Cut windows from here on; what was believed stays, and its outputs begin anew."""
-        self._feed = WindowFeed(self.model.info, self.channels, self._robot)
-        self._classifying.begin(Part(self.model, self._feed))
+        self._source.restart()
         self.belief = TerrainBelief(self.belief.terrain, self.belief.probability)
-        self._over_time = ground_filter(self.model)
         self._speed_s, self._now_s = -math.inf, math.nan
 
     def _drive_on(self, samples: Mapping[str, Reading], now_s: float) -> None:

@@ -17,7 +17,7 @@ from operator import itemgetter
 import numpy as np
 
 from pipelines.live.aims import Aims
-from pipelines.live.pilot_figures import finite_twist, largest, largest_slip, pose_is_sound, uphill_mps2
+from pipelines.live.over_time import without_dwell
 from pipelines.live.pilot_settings import (
     DEFAULT_SETTINGS,
     OPEN_LOOP,
@@ -29,7 +29,7 @@ from pipelines.live.pilot_settings import (
 )
 from pipelines.live.state import LiveState, Restorable, restorable, state_of
 from pipelines.live.terrain_source import NoTerrain, TerrainSource
-from pipelines.streaming.over_time import without_dwell
+from terrain.constants import GRAVITY_MPS2
 from terrain.control.actuation import Actuation
 from terrain.control.path_tracking import (
     PoseEstimate,
@@ -60,7 +60,7 @@ from terrain.control.wheel_controllers import (
     step_or_period,
 )
 from terrain.entry_point import entry_point
-from terrain.estimation.live.clocks import Clocks
+from terrain.estimation.live.clocks import Clocks, numbers
 from terrain.estimation.live.estimate import LiveEstimate
 from terrain.estimation.live.estimator import LiveEstimator
 from terrain.estimation.live.health import SENSORS, SLIP_SENSORS, SOUND, Health
@@ -69,6 +69,7 @@ from terrain.kinematics.swerve import FAR_RAD, wheel_command_step
 from terrain.logs.schema import IMU_CHANNELS, WHEELS_CHANNELS
 from terrain.records import Array, Command, Reading, Sample
 from terrain.robots import Robot
+from terrain.slip import MIN_SPEED_MPS
 
 _ROLL, _PITCH = IMU_CHANNELS.index("roll_rad"), IMU_CHANNELS.index("pitch_rad")
 _OF_SLIP = tuple(SENSORS.index(name) for name in SLIP_SENSORS)
@@ -77,6 +78,7 @@ _of_slip = itemgetter(*_OF_SLIP)
 _BLAMED = (0, 1, 2, 3, 4, 6, 7, 5)
 # as plain numbers, which compare in a tenth of the time
 _SOUND, _DISAGREES, _LOST = int(SOUND), int(Health.DISAGREES), int(Health.LOST)
+_GYRO, _SEEN, _SEEN_YAW = (SENSORS.index(name) for name in ("gyro", "camera_speed", "camera_yaw"))
 _wheel_command_step = entry_point(wheel_command_step)
 _FIGURES = PilotStatus._fields
 _NOT_ESTIMATED = UNOBSERVED._replace(stale_s=math.nan)
@@ -170,6 +172,11 @@ class LivePilot:
     def belief(self) -> TerrainBelief:
         """The terrain that is believed."""
         return self._now.belief
+
+    @property
+    def target_ratio(self) -> float:
+        """Target slip in traction that is aimed for; NaN before the first step."""
+        return self._now.target_ratio
 
     @property
     def estimate(self) -> LiveEstimate | None:
@@ -389,3 +396,37 @@ class LivePilot:
             self._tracking, now.tracking, twist, pose, ground_twist, dt_s
         )
         return twist, report
+
+
+def pose_is_sound(health: list[int]) -> bool:
+    """Say whether a pose can be built on: with a lost camera it is until it is stale."""
+    turns, seen_yaw, seen = health[_GYRO], health[_SEEN_YAW], health[_SEEN]
+    heading = turns <= _SOUND or seen_yaw <= _SOUND
+    return heading and (seen <= _SOUND or seen == _LOST)
+
+
+def finite_twist(given: object) -> Array:
+    """Return a desired twist (3,); zeros where it is none."""
+    twist = numbers(given)
+    if twist is None or twist.shape != (3,) or not math.isfinite(sum(twist.tolist())):
+        return np.zeros(3)
+    return twist
+
+
+def largest(values: list[float]) -> float:
+    """Return the largest of some values; NaN where one is."""
+    return math.nan if math.isnan(sum(values)) else max(values)
+
+
+def largest_slip(slip_ratio: Array, wheel_radps: Array) -> float:
+    """Return the largest slip of a wheel, positive in traction; NaN where it is not known."""
+    return float(np.where(wheel_radps < 0.0, -slip_ratio, slip_ratio).max())
+
+
+def uphill_mps2(estimate: LiveEstimate | None, roll_rad: float, pitch_rad: float) -> float:
+    """Return the deceleration by gravity along the motion: positive uphill, 0 at rest."""
+    speed_mps = 0.0 if estimate is None else math.hypot(estimate.speed_x_mps, estimate.speed_y_mps)
+    if estimate is None or not speed_mps > MIN_SPEED_MPS:
+        return 0.0
+    along, across = estimate.speed_x_mps / speed_mps, estimate.speed_y_mps / speed_mps
+    return GRAVITY_MPS2 * (-math.sin(pitch_rad) * along + math.sin(roll_rad) * across)

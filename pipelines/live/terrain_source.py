@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple, Protocol
 
-from pipelines.models.model_files import TerrainModel
-from pipelines.streaming.classifying import AtOnce, Classifying, Part, WindowOutput
-from pipelines.streaming.over_time import ground_filter
-from pipelines.streaming.window_feed import WindowFeed, live_filter, needs_filter
+from pipelines.live.classifying import AtOnce, Classifying, Part, WindowOutput
+from pipelines.live.model import LiveModel
+from pipelines.live.over_time import ground_filter, without_dwell
+from pipelines.live.windows import Estimate, WindowFeed, live_filter, needs_filter
+from terrain.control.switching import SwitchSettings
 from terrain.errors import DataError
-from terrain.estimation.live.estimate import LiveEstimate
 from terrain.estimation.live.estimator import CHANNELS
 from terrain.extension import correct_live
-from terrain.records import Sample
+from terrain.records import Reading, Sample
 from terrain.robots import Robot
 
 PILOT_FILTER = "vio15"
@@ -33,22 +33,17 @@ class TerrainSource(Protocol):
     """Gives the terrain from time to time.
 
     ``certain``: each output is accepted at once, and holds until the next.  ``settled``: it was filtered over
-    time, and waits for no dwell.
+    time, and waits for no dwell.  ``n_refused``: number of windows without an output.
     """
 
     certain: bool
 
     @property
-    def settled(self) -> bool:
-        """Whether outputs were filtered over time."""
-        ...
-
+    def settled(self) -> bool: ...  # noqa: D102
     @property
-    def n_refused(self) -> int:
-        """Number of windows without an output."""
-        ...
+    def n_refused(self) -> int: ...  # noqa: D102
 
-    def update(self, sample: Sample, estimates: Sequence[LiveEstimate]) -> list[TerrainEstimate]:
+    def update(self, sample: Sample, estimates: Sequence[Estimate]) -> list[TerrainEstimate]:
         """Take a sample and the estimates made from it; return the terrains found, in most steps none."""
         ...
 
@@ -58,13 +53,15 @@ class NoTerrain:
 
     certain = settled = False
     n_refused = 0
+    outputs: Sequence[WindowOutput] = ()
+    dropped: Mapping[str, int] = {}
 
-    def update(self, sample: Sample, estimates: Sequence[LiveEstimate]) -> list[TerrainEstimate]:
+    def update(self, sample: Sample, estimates: Sequence[Estimate]) -> list[TerrainEstimate]:
         """Return nothing."""
         return []
 
 
-class KnownTerrain:
+class KnownTerrain(NoTerrain):
     """The true terrain of the samples, at every change of it.
 
     Parameters
@@ -73,13 +70,12 @@ class KnownTerrain:
     """
 
     certain = settled = True
-    n_refused = 0
 
     def __init__(self, name_of: Callable[[str], str] = str) -> None:
         self._name_of = name_of
         self._last = ""
 
-    def update(self, sample: Sample, estimates: Sequence[LiveEstimate]) -> list[TerrainEstimate]:
+    def update(self, sample: Sample, estimates: Sequence[Estimate]) -> list[TerrainEstimate]:
         """Return the terrain of the sample where it has changed."""
         if not sample.terrain or sample.terrain == self._last:
             return []
@@ -93,8 +89,10 @@ class Classifier:
     Parameters
     ----------
     model : fitted on such windows
-    robot : that is driven
+    robot : its description; may be missing where every channel of the model is measured
     classifying : where windows are classified; at once by default
+    channels : of each stream that is measured; those of a pilot's robot by default
+    filter_name : filter that runs here; that of a pilot by default
 
     Attributes
     ----------
@@ -105,45 +103,31 @@ class Classifier:
     ------
     DataError
         if the model requires a stream or a channel that is not computed live, or was trained on the estimates
-        of another filter than the pilot's.
+        of another filter than runs here.
     """
 
     certain = False
 
-    def __init__(self, model: TerrainModel, robot: Robot, classifying: Classifying | None = None) -> None:
-        self.model, self._robot = model, correct_live(robot)[0]
-        self.outputs: list[WindowOutput] = []
-        self._feed = self.feed_of(model)
+    def __init__(
+        self,
+        model: LiveModel,
+        robot: Robot | None,
+        classifying: Classifying | None = None,
+        channels: Mapping[str, Sequence[str]] = CHANNELS,
+        filter_name: str = PILOT_FILTER,
+    ) -> None:
+        self.model, self._channels, self._filter_name = model, channels, filter_name
+        self._robot = None if robot is None else correct_live(robot)[0]
         self._classifying: Classifying = AtOnce() if classifying is None else classifying
-        self._classifying.begin(Part(model, self._feed))
+        self.outputs: list[WindowOutput] = []
         self.failed: Counter[str] = Counter()
-        self._over_time = ground_filter(model)
+        self._feed = self.feed_of(model)
+        self._begin(model)
 
     @property
     def settled(self) -> bool:
         """Whether the model's outputs are filtered over time."""
         return self._over_time is not None
-
-    def feed_of(self, model: TerrainModel) -> WindowFeed:
-        """Return what cuts the windows of a model; ``DataError`` where it does not suit the pilot."""
-        needed = needs_filter(model.info, CHANNELS)
-        if needed and live_filter(model.info, self._robot) != PILOT_FILTER:
-            raise DataError(
-                f"the model was trained on estimates of the filter {model.info.filter!r}; the pilot runs "
-                f"{PILOT_FILTER!r}"
-            )
-        return WindowFeed(model.info, CHANNELS, self._robot)
-
-    def swap(self, model: TerrainModel) -> None:
-        """Go on with another model, between two samples.
-
-        Where both take the same windows, the one that is being cut is the first of the new model; otherwise
-        its windows begin with the next sample.
-        """
-        if not self._feed.suits(model.info):
-            self._feed = self.feed_of(model)
-        self.model, self._over_time = model, ground_filter(model)
-        self._classifying.begin(Part(model, self._feed))
 
     @property
     def n_refused(self) -> int:
@@ -156,16 +140,70 @@ class Classifier:
         refused = {f"window: refused, {why}": n for why, n in self.failed.items()}
         return {**self._classifying.dropped, **refused}
 
-    def update(self, sample: Sample, estimates: Sequence[LiveEstimate]) -> list[TerrainEstimate]:
-        """Return the terrain of each window whose output is there by now."""
-        self._classifying.put(sample.readings, estimates)
-        found: list[TerrainEstimate] = []
+    def feed_of(self, model: LiveModel) -> WindowFeed:
+        """Return what cuts the windows of a model; ``DataError`` where it does not suit what runs here."""
+        feed = WindowFeed(model.info, self._channels, self._robot)
+        if needs_filter(model.info, self._channels) and (
+            self._robot is None or live_filter(model.info, self._robot) != self._filter_name
+        ):
+            raise DataError(
+                f"the model was trained on estimates of the filter {model.info.filter!r}; "
+                f"{self._filter_name or 'none'!r} runs here"
+            )
+        return feed
+
+    def check(self, model: LiveModel | None) -> LiveModel:
+        """Return a model that can replace this one; ``DataError`` where it cannot, or is none."""
+        if model is None:
+            raise DataError("a model cannot be replaced by none")
+        if not self._feed.suits(model.info):
+            self.feed_of(model)
+        return model
+
+    def swap(self, model: LiveModel | None) -> None:
+        """Go on with another model, between two samples; ``DataError`` as :meth:`check`.
+
+        Where both take the same windows, the one that is being cut is the first of the new model; otherwise
+        its windows begin with the next sample.
+        """
+        checked = self.check(model)
+        if not self._feed.suits(checked.info):
+            self._feed = self.feed_of(checked)
+        self._begin(checked)
+
+    def restart(self) -> None:
+        """Cut windows anew from the next sample on."""
+        self._feed = self.feed_of(self.model)
+        self._begin(self.model)
+
+    def _begin(self, model: LiveModel) -> None:
+        self.model, self._over_time = model, ground_filter(model)
+        self._classifying.begin(Part(model, self._feed))
+
+    def take(self, readings: Mapping[str, Reading], estimates: Sequence[Estimate]) -> list[WindowOutput]:
+        """Take readings and estimates; return the outputs of windows that are there by now."""
+        self._classifying.put(readings, estimates)
         self.outputs = self._classifying.finished()
         for output in self.outputs:
             if output.refused:
                 self.failed[output.refused] += 1
-            if self._over_time is not None:
-                found = [TerrainEstimate(sample.time_s, *self._over_time.take(output))]
-            elif not output.refused:  # of several that come at once, as after a stall, the newest stands
-                found = [TerrainEstimate(sample.time_s, output.terrain, output.probability)]
+        return self.outputs
+
+    def terrain_of(self, output: WindowOutput) -> tuple[str, float] | None:
+        """Return terrain and probability after an output, filtered over time where that is asked for."""
+        if self._over_time is not None:
+            return self._over_time.take(output)
+        return None if output.refused else (output.terrain, output.probability)
+
+    def switching(self, settings: SwitchSettings) -> SwitchSettings:
+        """Return the settings of the belief in these outputs: a filter over time is the dwell."""
+        return settings if self._over_time is None else without_dwell(settings)
+
+    def update(self, sample: Sample, estimates: Sequence[Estimate]) -> list[TerrainEstimate]:
+        """Return the terrain of the newest window whose output is there by now."""
+        found: list[TerrainEstimate] = []
+        for output in self.take(sample.readings, estimates):
+            terrain = self.terrain_of(output)
+            if terrain is not None:  # of several that come at once, as after a stall, the newest is used
+                found = [TerrainEstimate(sample.time_s, *terrain)]
         return found

@@ -12,10 +12,10 @@ from typing import NamedTuple
 from features.windows import cut_windows, join_windows
 from pipelines.data.datasets import load_runs, robot_of
 from pipelines.label.labels import relabelled
+from pipelines.live.windows import lacking_estimates, windows_of_log
 from pipelines.models.model_files import TerrainModel
 from pipelines.propose.answers_file import NONE, YES, Answered, read_answers, write_proposals
 from pipelines.propose.proposals import Proposal, propose, questions
-from pipelines.streaming.log_windows import lacking_estimates, windows_of_log
 from terrain.errors import ConfigError, DataError
 from terrain.files.atomic import atomic_folder
 from terrain.logs.write import write_run

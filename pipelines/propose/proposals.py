@@ -8,9 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipelines.models.assess import assess
+from pipelines.live.model import assess
+from pipelines.live.over_time import filter_of
 from pipelines.models.model_files import TerrainModel
-from pipelines.streaming.over_time import filter_of
 from terrain.classify.smoothing import smoothed_classes
 from terrain.records import Array, Windows
 

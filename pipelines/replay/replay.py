@@ -12,12 +12,13 @@ import numpy as np
 
 from features.windows import label_windows
 from pipelines.data.settings import InspectSettings, load
+from pipelines.live.chain import Chain
+from pipelines.live.classifying import WindowOutput
+from pipelines.live.over_time import filtered
 from pipelines.models.model_files import TerrainModel
-from pipelines.replay.chains import Chain, Replayed, chain_of
+from pipelines.replay.chains import chain_of
 from pipelines.replay.results import ObservedWindow, Replay, ReplayedRun, ReplayMoment
 from pipelines.replay.settings import ReplaySettings
-from pipelines.streaming.classifying import WindowOutput
-from pipelines.streaming.over_time import filtered
 from terrain.control.slip_table import SlipTable, load_slip_table
 from terrain.logs.replay import replay
 from terrain.records import RunLog
@@ -114,8 +115,8 @@ def replay_run(
     ConfigError, DataError
         as :func:`pipelines.replay.chains.chain_of`.
     """
-    chain, fitting = chain_of(run, model, table, robot)
-    steps = _Steps(fitting, chain, settings, view or NoView(), stopped)
+    chain = chain_of(run, model, table, robot)
+    steps = _Steps(run, chain, settings, view or NoView(), stopped)
     begin_s = perf_counter()
     try:
         interrupted = not steps.run()
@@ -172,16 +173,15 @@ class _Steps:
             if speed < math.inf:
                 _wait(wall_s + self.passed_s / speed, self._stopped)
             done = chain.step(sample)
-            self.believed[done.believed] += 1
+            believed, target_ratio = chain.belief.terrain, chain.target_ratio
+            self.believed[believed] += 1
             for output in done.windows:
-                self.windows.append(self._observed(output, done))
+                self.windows.append(self._observed(output, believed, target_ratio))
                 view.observed(run.run_id, self.windows[-1])
-            view.moment(
-                ReplayMoment(run.run_id, self.passed_s, end_s - start_s, done.believed, done.target_ratio)
-            )
+            view.moment(ReplayMoment(run.run_id, self.passed_s, end_s - start_s, believed, target_ratio))
         return True
 
-    def _observed(self, output: WindowOutput, done: Replayed) -> ObservedWindow:
+    def _observed(self, output: WindowOutput, believed: str, target_ratio: float) -> ObservedWindow:
         label = label_windows(self._run, np.array([output.start_s]), output.end_s - output.start_s)[0]
         return ObservedWindow(
             output.start_s,
@@ -189,8 +189,8 @@ class _Steps:
             output.terrain,
             output.probability,
             output.refused,
-            done.believed,
-            done.target_ratio,
+            believed,
+            target_ratio,
             label or None,
         )
 

@@ -12,11 +12,11 @@ from typing import Any
 from fastapi import WebSocket
 from starlette.websockets import WebSocketDisconnect, WebSocketState
 
+from pipelines.live.session import CommandStatus, StepOutput
 from pipelines.serve.guard import Bucket, token_fits
 from pipelines.serve.hub import Hub, OpenSession
 from pipelines.serve.messages import error_content, read_hello, step_content, welcome
 from pipelines.serve.wire import Encoding, WireError, decode, encode
-from pipelines.sessions.records import CommandStatus, StepOutput
 from terrain.estimation.live.clocks import number
 
 MAX_NOTES = 1000

@@ -11,17 +11,16 @@ from pathlib import Path
 from time import monotonic
 from typing import NamedTuple
 
+from pipelines.live.classifying import ClassifierThread
+from pipelines.live.recording import SessionRecorder
+from pipelines.live.session import RobotSession, Served, StepOutput
 from pipelines.live.state import LiveState, Restorable, load_state, save_state
 from pipelines.models.model_files import TerrainModel
 from pipelines.recording.finishing import recover_recordings
-from pipelines.recording.recorder import SessionRecorder
 from pipelines.recording.thread import RecordingThread
 from pipelines.serve.messages import Hello
 from pipelines.serve.metrics import Metrics
 from pipelines.serve.wire import WireError
-from pipelines.sessions.records import Served, StepOutput
-from pipelines.sessions.session import RobotSession
-from pipelines.streaming.classifying import ClassifierThread
 from terrain.control.slip_table import SlipTable
 from terrain.errors import ConfigError, DataError, LogError, TerrainError
 from terrain.robots import Robot, packaged_robot

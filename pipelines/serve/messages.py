@@ -6,10 +6,16 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
 
+from pipelines.live.session import (
+    COMMAND_VALID_S,
+    Observation,
+    RobotSession,
+    Served,
+    SessionRequest,
+    StepOutput,
+)
 from pipelines.live.state import Restorable
 from pipelines.serve.wire import WireError, plain
-from pipelines.sessions.records import Observation, Served, SessionRequest, StepOutput
-from pipelines.sessions.session import COMMAND_VALID_S, RobotSession
 from terrain.control.traction import TractionStatus
 
 PROTOCOL: Literal[1] = 1

@@ -16,7 +16,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import uvicorn
 
+from pipelines.live.classifying import AtOnce, classify_window
+from pipelines.live.over_time import filtered
 from pipelines.live.pilot import LivePilot
+from pipelines.live.session import Served
 from pipelines.live.terrain_source import Classifier
 from pipelines.models.model_files import TerrainModel
 from pipelines.models.resolve import load_model
@@ -26,9 +29,6 @@ from pipelines.serve.hub import Hub, Limits
 from pipelines.serve.protocol import HttpProtocol, SocketProtocol
 from pipelines.serve.results import ServiceCheck
 from pipelines.serve.settings import ServeSettings
-from pipelines.sessions.records import Served
-from pipelines.streaming.classifying import AtOnce, classify_window
-from pipelines.streaming.over_time import filtered
 from terrain.control.slip_table import load_slip_table
 from terrain.errors import ConfigError, DataError, TerrainError
 from terrain.estimation.live.estimator import CHANNELS

@@ -11,13 +11,13 @@ from features.motion import window_motion
 from features.windows import cut_windows
 from pipelines.classify.limits import LimitData, limits_of
 from pipelines.classify.predict import NOT_LEARNED, predict
-from pipelines.live.observer import TerrainObserver
-from pipelines.models.assess import assess, class_sets
+from pipelines.live.classifying import classify_window
+from pipelines.live.model import assess, class_sets
+from pipelines.live.observer import Observer
+from pipelines.live.over_time import filtered, novelty_evidence
 from pipelines.models.model_files import INFO_FILE, read_lean_model, read_model, write_info
 from pipelines.models.novelty_file import NOVELTY_FILE
 from pipelines.reporting.json_file import as_json
-from pipelines.streaming.classifying import classify_window
-from pipelines.streaming.over_time import filtered, novelty_evidence
 from terrain.classify.conformal import held_out_scores
 from terrain.control.slip_table import load_slip_table
 from terrain.errors import ConfigError, ModelError
@@ -57,7 +57,7 @@ def test_windows_unlike_all_training_are_unknown_and_take_the_fallback(model, dr
 def test_the_answer_of_each_window_live_is_that_of_a_log(model, strange, drive_all):
     for run in (strange, drive_all(n_runs=1, seed=78)[1]):
         rows = predict([run], model, load_slip_table()).windows
-        observer = TerrainObserver(model, load_slip_table())
+        observer = Observer(model, load_slip_table())
         live = [one for sample in replay(run, 50.0) for one in observer.update(sample.readings)]
         assert [one.start_s for one in live] == [row.start_s for row in rows]
         for one, row in zip(live, rows, strict=True):
@@ -90,7 +90,7 @@ def test_the_filter_follows_a_change_of_ground_live_as_in_a_log(model, drive_all
     run = spliced(grounds, 16.0)
     over_time = filtered(model)
     rows = predict([run], over_time, load_slip_table()).windows
-    observer = TerrainObserver(over_time, load_slip_table())
+    observer = Observer(over_time, load_slip_table())
     believed = []
     for sample in replay(run, 50.0):
         for _ in observer.update(sample.readings):
@@ -110,7 +110,7 @@ def test_the_filter_follows_a_change_of_ground_live_as_in_a_log(model, drive_all
 def test_a_gap_and_an_unknown_ground_widen_the_belief(model, strange):
     over_time = filtered(model)
     run = strange
-    observer = TerrainObserver(over_time, load_slip_table())
+    observer = Observer(over_time, load_slip_table())
     for sample in replay(run, 50.0):
         observer.update(sample.readings)
     assert observer.belief.terrain == ""

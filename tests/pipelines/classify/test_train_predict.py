@@ -10,7 +10,7 @@ from pipelines.classify.settings import TrainSettings
 from pipelines.classify.train import model_info, train
 from pipelines.crossval.crossval import samples_of
 from pipelines.data.settings import ImportSettings
-from pipelines.models.assess import Assessed
+from pipelines.live.model import Assessed
 from pipelines.models.model_files import TerrainModel, read_model
 from pipelines.quickstart.settings import QuickstartSettings
 from pipelines.reporting.json_file import as_json, with_deprecated_keys

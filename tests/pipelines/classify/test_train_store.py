@@ -16,7 +16,7 @@ from pipelines.data.datasets import data_digest, joint_digest, load_runs, run_lo
 from pipelines.feature_store.build import build_store
 from pipelines.feature_store.settings import FeaturesSettings
 from pipelines.feature_store.store import open_store, read_store
-from pipelines.models.assess import assess
+from pipelines.live.model import assess
 from pipelines.models.lean import NUMBERS_FILE
 from pipelines.models.model_files import read_lean_model, read_model
 from pipelines.models.novelty_file import NOVELTY_FILE

@@ -14,7 +14,7 @@ from pipelines.data.recorded_windows import WINDOWS_FILE, window_entry, windows_
 from pipelines.label.labels import doubtful_windows, relabelled, set_label
 from pipelines.label.screen import time_text
 from pipelines.label.settings import LabelSettings
-from pipelines.streaming.classifying import WindowOutput
+from pipelines.live.classifying import WindowOutput
 from terrain.errors import ConfigError, LogError
 from terrain.files import atomic
 from terrain.logs.read import read_run

@@ -13,7 +13,7 @@ from pipelines.classify.train import model_info
 from pipelines.crossval.crossval import samples_of
 from pipelines.crossval.settings import CrossvalSettings
 from pipelines.data.datasets import load_runs
-from pipelines.live.observer import TerrainObserver
+from pipelines.live.observer import Observer
 from terrain.control.slip_table import load_slip_table
 from terrain.errors import ConfigError, DataError
 from terrain.estimation.enriched import enriched
@@ -54,7 +54,7 @@ def test_a_raw_log_is_filtered_by_predict_and_live_alike(swerve_model):
     assert result.filtered == (run.run_id,)
     assert result.n_windows > 5
     assert result.n_judged == result.n_windows
-    found = observed(TerrainObserver(swerve_model, robot=AGRIMARO, channels=channels_of(run)), run)
+    found = observed(Observer(swerve_model, robot=AGRIMARO, channels=channels_of(run)), run)
     assert_same(found, result.windows)
 
 
@@ -71,7 +71,7 @@ def test_a_filtered_log_and_a_raw_one_give_the_same_terrain_but_for_what_a_log_s
 
 def test_the_belief_follows_windows_that_agree_and_ends_with_driving_on_in_silence(swerve_model):
     run = simulated("grass", 8)
-    observer = TerrainObserver(swerve_model, robot=AGRIMARO, channels=channels_of(run))
+    observer = Observer(swerve_model, robot=AGRIMARO, channels=channels_of(run))
     assert observer.belief.terrain == ""
     observed(observer, run)
     assert observer.belief.terrain == "grass"
@@ -92,7 +92,7 @@ def test_live_equals_the_log_on_all_measured_runs(set_name, trained):
     for row in result.windows:
         by_run[row.run_id].append(row)
     for run in runs:
-        found = observed(TerrainObserver(model, channels=channels_of(run)), run, rate_hz=10.0)
+        found = observed(Observer(model, channels=channels_of(run)), run, rate_hz=10.0)
         assert_same(found, by_run[run.run_id])
     assert result.n_windows > 200
 
@@ -106,7 +106,7 @@ def test_a_skid_steer_robot_is_filtered_where_its_model_needs_the_filter(trained
     assert model.info.robots == ("husky",)
     rows = predict(runs[5:6], model, load_slip_table()).windows
     assert len(rows) > 5
-    observer = TerrainObserver(model, robot=HUSKY, channels=channels_of(runs[5]))
+    observer = Observer(model, robot=HUSKY, channels=channels_of(runs[5]))
     assert_same(observed(observer, runs[5]), rows)
     assert observer.estimate.speed_mps > 0.1
 
@@ -128,7 +128,7 @@ def test_slip_by_an_observer_of_tracked_robots_is_a_feature_in_the_log_and_live(
     assert set(model.info.channels["slip"]) == {"slip_left_ratio", "slip_right_ratio"}
     rows = predict([runs[2]], model, load_slip_table()).windows
     assert len(rows) > 5
-    observer = TerrainObserver(model, robot=robot, channels=channels_of(runs[2]))
+    observer = Observer(model, robot=robot, channels=channels_of(runs[2]))
     assert_same(observed(observer, runs[2]), rows)
     assert observer.estimate.status.label == "standing"  # at the end of the drive
 
@@ -136,7 +136,7 @@ def test_slip_by_an_observer_of_tracked_robots_is_a_feature_in_the_log_and_live(
 @pytest.mark.parametrize("far_s", [-600.0, 4000.0])
 def test_after_a_clock_was_set_windows_begin_anew(mower_model, two_drives, far_s):
     """Set back for good, or far ahead for two samples."""
-    observer, run, stamps = TerrainObserver(mower_model), two_drives[4], []
+    observer, run, stamps = Observer(mower_model), two_drives[4], []
     for k, sample in enumerate(replay(run)):
         ahead_s = far_s * (sample.time_s > 6.0 if far_s < 0 else k in (300, 301))
         readings = {name: Reading(t + ahead_s, values) for name, (t, values) in sample.readings.items()}
@@ -150,7 +150,7 @@ def test_after_a_clock_was_set_windows_begin_anew(mower_model, two_drives, far_s
 def test_a_terrain_that_nothing_confirms_becomes_unknown_where_no_wheels_are_measured(
     mower_model, two_drives
 ):
-    observer = TerrainObserver(mower_model)
+    observer = Observer(mower_model)
     for sample in replay(two_drives[4]):
         observer.update(sample.readings)
     assert observer.belief.terrain == "b"
@@ -162,20 +162,18 @@ def test_a_terrain_that_nothing_confirms_becomes_unknown_where_no_wheels_are_mea
 
 def test_a_robot_without_a_description_is_observed_by_its_channels(mower_model, two_drives):
     run = two_drives[4]
-    assert_same(
-        observed(TerrainObserver(mower_model), run), predict([run], mower_model, load_slip_table()).windows
-    )
+    assert_same(observed(Observer(mower_model), run), predict([run], mower_model, load_slip_table()).windows)
 
 
 def test_columns_may_come_in_any_order_and_more_than_are_needed(mower_model, two_drives):
     run = two_drives[4]
-    plain = observed(TerrainObserver(mower_model), run)
+    plain = observed(Observer(mower_model), run)
     channels = {"imu": ("gyro_z_radps", "accel_z_mps2"), "wheels": ("current_left_a", "speed_left_mps")}
     streams = {
         name: Stream(s.time_s, np.hstack([np.full((len(s), 1), np.nan), s.values]), channels[name])
         for name, s in run.streams.items()
     }
-    more = observed(TerrainObserver(mower_model, channels=channels), RunLog("m", "mower", streams))
+    more = observed(Observer(mower_model, channels=channels), RunLog("m", "mower", streams))
     assert [one[:4] for one in more] == [one[:4] for one in plain]
 
 
@@ -201,12 +199,12 @@ def test_columns_may_come_in_any_order_and_more_than_are_needed(mower_model, two
 )
 def test_whatever_arrives_nothing_raises_and_the_next_windows_are_as_before(mower_model, two_drives, broken):
     run = two_drives[1]
-    observer, found = TerrainObserver(mower_model), []
+    observer, found = Observer(mower_model), []
     for k, sample in enumerate(replay(run)):
         if k % 40 == 5:
             assert observer.update(broken) == []
         found += observer.update(sample.readings)
-    plain = observed(TerrainObserver(mower_model), run)
+    plain = observed(Observer(mower_model), run)
     assert [one[:4] for one in found] == [one[:4] for one in plain]
 
 
@@ -218,7 +216,7 @@ def test_a_window_that_the_model_refuses_is_named(mower_model, two_drives, kind)
         def predict_proba(self, windows):
             raise kind("Input X contains NaN.")
 
-    observer = TerrainObserver(mower_model._replace(recipe=Refusing()))
+    observer = Observer(mower_model._replace(recipe=Refusing()))
     found = observed(observer, two_drives[0])
     assert {one.refused for one in found} == {"Input X contains NaN."}
     assert {one.terrain for one in found} == {""}
@@ -229,9 +227,9 @@ def test_a_window_that_the_model_refuses_is_named(mower_model, two_drives, kind)
 
 def test_what_does_not_fit_is_refused_at_once(mower_model, swerve_model):
     with pytest.raises(DataError, match="requires 'accel_z_mps2' of the stream 'imu'"):
-        TerrainObserver(mower_model, channels={"imu": ("gyro_z_radps",), "wheels": ("speed_left_mps",)})
+        Observer(mower_model, channels={"imu": ("gyro_z_radps",), "wheels": ("speed_left_mps",)})
     with pytest.raises(DataError, match=r"requires .* of the stream 'estimator', which is neither"):
-        TerrainObserver(
+        Observer(
             swerve_model,
             channels={
                 "imu": swerve_model.info.channels["imu"],
@@ -240,10 +238,10 @@ def test_what_does_not_fit_is_refused_at_once(mower_model, swerve_model):
         )
     table = replace(load_slip_table(), robot="warthog")
     with pytest.raises(ConfigError, match="is of the robot 'warthog', not of 'agrimaro'"):
-        TerrainObserver(swerve_model, table, AGRIMARO, channels_of(simulated("grass", 1, 9.0)))
+        Observer(swerve_model, table, AGRIMARO, channels_of(simulated("grass", 1, 9.0)))
     other = swerve_model._replace(info=replace(swerve_model.info, filter="skid"))
     with pytest.raises(DataError, match="filter 'skid', which robot agrimaro does not run live"):
-        TerrainObserver(other, robot=AGRIMARO, channels=channels_of(simulated("grass", 1, 9.0)))
+        Observer(other, robot=AGRIMARO, channels=channels_of(simulated("grass", 1, 9.0)))
 
 
 def test_runs_of_several_filters_do_not_train_one_model():

@@ -12,12 +12,12 @@ from pipelines.data.datasets import load_runs
 from pipelines.data.inspect import Settings as InspectSettings
 from pipelines.data.inspect import run as inspect_runs
 from pipelines.data.recorded_windows import read_windows
-from pipelines.live.observer import TerrainObserver
+from pipelines.live.classifying import AtOnce
+from pipelines.live.observer import Observer
 from pipelines.live.pilot import LivePilot
+from pipelines.live.recording import SessionRecorder
 from pipelines.live.terrain_source import Classifier
-from pipelines.recording.recorder import SessionRecorder
 from pipelines.recording.thread import RecordingThread
-from pipelines.streaming.classifying import AtOnce
 from terrain.control.slip_table import load_slip_table
 from terrain.estimation.live.estimator import CHANNELS
 from terrain.logs.replay import replay
@@ -71,7 +71,7 @@ def test_a_recorded_observer_is_predicted_as_it_was_live(writer, tmp_path, mower
     run = cut_at_the_start(two_drives[4], begin_s)
     channels = {name: stream.channels for name, stream in run.streams.items()}
     recorder = SessionRecorder(tmp_path, "session", "mower", channels, writer=writer)
-    observer = TerrainObserver(mower_model, channels=channels, classifying=Kept(recorder))
+    observer = Observer(mower_model, channels=channels, classifying=Kept(recorder))
     for sample in replay(run, 20.0):
         recorder.readings(sample.readings)
         observer.update(sample.readings)

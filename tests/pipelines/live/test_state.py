@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipelines.live.observer import TerrainObserver
+from pipelines.live.observer import Observer
 from pipelines.live.pilot import LivePilot
 from pipelines.live.pilot_settings import PilotSettings
 from pipelines.live.state import (
@@ -196,7 +196,7 @@ def test_a_file_is_written_whole_read_back_and_refused_with_its_name(tmp_path):
 
 
 def test_an_observer_keeps_its_belief(mower_model):
-    observer = TerrainObserver(mower_model)
+    observer = Observer(mower_model)
     observer.restore(STATE._replace(robot="", filter=""), STATE.saved_s)
     assert observer.belief.terrain == "grass"
     assert observer.state(7.0).terrain == "grass"

@@ -13,20 +13,20 @@ import time
 import numpy as np
 import pytest
 
+import pipelines.live.recording as recorders
 from pipelines.data.datasets import data_digest, load_runs
 from pipelines.data.recorded_windows import WINDOWS_FILE, read_windows
-from pipelines.recording import journal as journals
-from pipelines.recording import recorder as recorders
-from pipelines.recording.finishing import APART, SHORT_STREAM, recover_recordings
-from pipelines.recording.recorder import (
+from pipelines.live.classifying import WindowOutput
+from pipelines.live.recording import (
     BAD_COMMAND,
     UNKNOWN_STREAM,
     UNREADABLE,
     RecordingLimits,
     SessionRecorder,
 )
+from pipelines.recording import journal as journals
+from pipelines.recording.finishing import APART, SHORT_STREAM, recover_recordings
 from pipelines.recording.thread import RecordingThread
-from pipelines.streaming.classifying import WindowOutput
 from terrain.errors import LogError
 from terrain.logs.read import read_run
 from terrain.logs.replay import replay
@@ -335,7 +335,7 @@ import sys, time
 from pathlib import Path
 sys.path.insert(0, sys.argv[2])
 import numpy as np
-from pipelines.recording.recorder import SessionRecorder
+from pipelines.live.recording import SessionRecorder
 from pipelines.recording.thread import RecordingThread
 from terrain.records import Reading
 recorder = SessionRecorder(

@@ -5,10 +5,10 @@ import threading
 
 import pytest
 
+from pipelines.live.session import Served
 from pipelines.serve.hub import Hub
 from pipelines.serve.messages import read_hello
 from pipelines.serve.wire import WireError
-from pipelines.sessions.records import Served
 from terrain.control.slip_table import load_slip_table
 from terrain.errors import DataError
 
@@ -63,7 +63,7 @@ def test_a_session_that_begins_while_the_model_is_replaced_gets_the_new_one(
         raise DataError("the model does not suit")
 
     if not suits:
-        monkeypatch.setattr("pipelines.sessions.session.RobotSession.swap", refuses)
+        monkeypatch.setattr("pipelines.live.session.RobotSession.swap", refuses)
 
     async def swapped():
         opening = asyncio.create_task(hub.open(read_hello(hello("late")), lambda *_: None))

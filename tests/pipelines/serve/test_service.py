@@ -11,7 +11,7 @@ from websockets.exceptions import ConnectionClosed
 
 from pipelines.classify.predict import predict
 from pipelines.data.datasets import load_runs
-from pipelines.live.observer import TerrainObserver
+from pipelines.live.observer import Observer
 from pipelines.serve.client import ServiceError, TerrainClient
 from terrain.control.slip_table import load_slip_table
 from terrain.files.resources import data_folder
@@ -36,7 +36,7 @@ def talk(socket, packed):
 def test_a_robot_gets_the_terrain_and_target_slips_of_its_samples(
     service, hello, messages, two_drives, mower_model, packed
 ):
-    run, observer = two_drives[4], TerrainObserver(mower_model)
+    run, observer = two_drives[4], Observer(mower_model)
     found, seen = [], []
     with service.socket() as socket:
         say = talk(socket, packed)

@@ -8,13 +8,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipelines.live.observer import TerrainObserver
+from pipelines.live.arrivals import StreamHealth
+from pipelines.live.classifying import AtOnce
+from pipelines.live.observer import Observer
 from pipelines.live.pilot import LivePilot
+from pipelines.live.session import TWIST_FRESH_S, CommandStatus, RobotSession, Served, SessionRequest
 from pipelines.live.terrain_source import Classifier
-from pipelines.sessions.records import CommandStatus, Served, SessionRequest
-from pipelines.sessions.session import TWIST_FRESH_S, RobotSession
-from pipelines.sessions.stream_health import StreamHealth
-from pipelines.streaming.classifying import AtOnce
 from terrain.control.slip_table import load_slip_table
 from terrain.errors import ConfigError, DataError
 from terrain.estimation.live.estimator import CHANNELS
@@ -93,7 +92,7 @@ def test_commands_are_those_of_a_pilot_that_is_given_the_samples_at_once(log, sw
 def test_terrain_is_that_of_an_observer_for_a_robot_without_a_description(mower_model, two_drives):
     run = two_drives[4]
     outputs = drive(mower(mower_model), run)
-    observer = TerrainObserver(mower_model)
+    observer = Observer(mower_model)
     for output, sample in zip(outputs, replay(run), strict=True):
         observer.update(sample.readings)
         assert output.observation.terrain == observer.belief.terrain
@@ -193,14 +192,14 @@ def test_a_step_that_fails_commands_to_stand(log, monkeypatch, fault, status):
     session = agrimaro()
     drive(session, replace(log, streams={k: v for k, v in log.streams.items() if k in SENSORS}))
     steer_rad = session.step(NOW_S + 20.0).command.steer_rad
-    step = session._pilot.step
+    step = session.chain.pilot.step
 
     def broken(sample):
         if isinstance(fault, Exception):
             raise fault
         return step(sample)._replace(**fault)
 
-    monkeypatch.setattr(session._pilot, "step", broken)
+    monkeypatch.setattr(session.chain.pilot, "step", broken)
     output = session.step(NOW_S + 30.0)
     assert output.status is status
     assert not output.command.wheel_radps.any()
@@ -279,7 +278,7 @@ def test_a_swap_that_does_not_suit_is_refused_and_changes_nothing(mower_model, s
     session = mower(mower_model)
     with pytest.raises(DataError, match="neither measured nor estimated"):
         session.swap(Served(2, swerve_model, "other", TABLE))
-    assert (session.served.number, session._observer.model) == (1, mower_model)
+    assert (session.served.number, session.chain.model) == (1, mower_model)
     driven = agrimaro(swerve_model)
     with pytest.raises(ConfigError, match="is of the robot 'husky', not of 'agrimaro'"):
         driven.swap(Served(2, swerve_model, "other", replace(TABLE, robot="husky")))
@@ -369,7 +368,7 @@ def test_what_is_kept_is_as_old_as_the_last_sample_over_any_number_of_restarts(
     mower_model, two_drives, monkeypatch
 ):
     clock = {"now_s": 1000.0}
-    monkeypatch.setattr("pipelines.sessions.session.time", lambda: clock["now_s"])
+    monkeypatch.setattr("pipelines.live.session.time", lambda: clock["now_s"])
     session = mower(mower_model)
     drive(session, two_drives[4])
     clock["now_s"] = 1008.0

@@ -7,8 +7,7 @@ from collections import Counter, namedtuple
 import numpy as np
 import pytest
 
-from pipelines.live.observer import TerrainObserver
-from pipelines.streaming.classifying import (
+from pipelines.live.classifying import (
     AT_MOST,
     MAX_WAITING,
     AtOnce,
@@ -17,6 +16,7 @@ from pipelines.streaming.classifying import (
     WindowOutput,
     classify_window,
 )
+from pipelines.live.observer import Observer
 from terrain.logs.replay import replay
 from terrain.records import Reading
 
@@ -213,8 +213,8 @@ def test_an_unforeseen_error_costs_one_window():
 
 def test_on_a_thread_a_robot_gets_the_windows_that_it_would_get_at_once(mower_model, two_drives):
     run, thread = two_drives[4], ClassifierThread()
-    at_once = TerrainObserver(mower_model)
-    beside = TerrainObserver(mower_model, classifying=thread.robot())
+    at_once = Observer(mower_model)
+    beside = Observer(mower_model, classifying=thread.robot())
     desired, found = [], []
     for sample in replay(run):
         desired += at_once.update(sample.readings)

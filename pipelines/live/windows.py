@@ -9,17 +9,31 @@ from typing import Any
 import numpy as np
 
 from features.stream import WindowStream
-from pipelines.models.results import ModelInfo
-from terrain.errors import DataError
+from features.windows import (
+    TIME_TOLERANCE_S,
+    Layout,
+    WindowCut,
+    check_layout,
+    cut_windows,
+    join_windows,
+    label_windows,
+    span_of,
+)
+from pipelines.live.model import WindowsInfo
+from terrain.errors import ConfigError, DataError
 from terrain.estimation.live.estimate import LiveEstimate
-from terrain.estimation.live.skid_live import LiveSkidEstimate
+from terrain.estimation.live.estimator import CHANNELS, LiveEstimator
+from terrain.estimation.live.skid_live import LiveSkidEstimate, LiveSkidEstimator
 from terrain.estimation.observers.choice import OBSERVERS, make_observer
-from terrain.estimation.observers.live import LiveObserverEstimate
+from terrain.estimation.observers.live import LiveObserver, LiveObserverEstimate
+from terrain.extension import correct_live
+from terrain.logs.replay import SENSORS, replay
 from terrain.logs.schema import ESTIMATOR_CHANNELS
-from terrain.records import Array, Reading, Windows
+from terrain.records import Array, Reading, RunLog, Windows
 from terrain.robots import Robot
 
 Estimate = LiveEstimate | LiveSkidEstimate | LiveObserverEstimate
+Filter = LiveEstimator | LiveSkidEstimator | LiveObserver
 
 LIVE_FILTERS: Mapping[str, tuple[str, ...]] = {
     "swerve": ("vio15", "vio12", "slip14", "encoder12"),
@@ -34,12 +48,12 @@ ESTIMATED = ("estimator", "slip")
 """Streams that a filter adds to what is measured."""
 
 
-def needs_filter(info: ModelInfo, channels: Mapping[str, Sequence[str]]) -> bool:
+def needs_filter(info: WindowsInfo, channels: Mapping[str, Sequence[str]]) -> bool:
     """Say whether a model needs a stream that only a filter gives."""
     return any(stream in info.channels and stream not in channels for stream in ESTIMATED)
 
 
-def live_filter(info: ModelInfo, robot: Robot) -> str:
+def live_filter(info: WindowsInfo, robot: Robot) -> str:
     """Return the filter that gives what a model was trained on.
 
     Raises
@@ -55,6 +69,38 @@ def live_filter(info: ModelInfo, robot: Robot) -> str:
             f"run live (its filters: {', '.join(filters) or 'none'})"
         )
     return name
+
+
+def live_estimator(
+    info: WindowsInfo, robot: Robot, channels: Mapping[str, Sequence[str]]
+) -> tuple[Filter | None, Robot]:
+    """Return the filter whose estimates a model needs, or None, and the robot as filters take it.
+
+    Raises
+    ------
+    DataError
+        if the robot does not run the filter that the model was trained with.
+    ConfigError
+        if a channel that the filter needs is not measured.
+    """
+    driven, correction = correct_live(robot)
+    if not needs_filter(info, channels):
+        return None, driven
+    name = live_filter(info, driven)
+    known = {stream: tuple(names) for stream, names in channels.items()}
+    if name in OBSERVERS:
+        return LiveObserver(make_observer(name, driven), driven, known, correction), driven
+    if name != "skid":
+        read = {stream: names for stream, names in known.items() if stream in CHANNELS}
+        return LiveEstimator(driven, name, read, correction=correction), driven
+    periods = {stream: 1.0 / rate for stream, rate in info.rate_hz.items()}
+    return LiveSkidEstimator(
+        driven,
+        known,
+        wheels_period_s=periods.get("wheels"),
+        imu_period_s=periods.get("imu"),
+        correction=correction,
+    ), driven
 
 
 class WindowFeed:
@@ -81,6 +127,7 @@ class WindowFeed:
 
     Examples
     --------
+    >>> from pipelines.models.results import ModelInfo
     >>> info = ModelInfo(("grass",), 1.0, None, None, {"imu": ("gyro_z_radps",)}, {"imu": 10.0}, ())
     >>> feed = WindowFeed(info, {"imu": ("accel_x_mps2", "gyro_z_radps")})
     >>> time_s = np.arange(12) / 10
@@ -90,7 +137,7 @@ class WindowFeed:
     """
 
     def __init__(
-        self, info: ModelInfo, channels: Mapping[str, Sequence[str]], robot: Robot | None = None
+        self, info: WindowsInfo, channels: Mapping[str, Sequence[str]], robot: Robot | None = None
     ) -> None:
         self.info = info
         self.unreadable: Counter[str] = Counter()
@@ -111,7 +158,7 @@ class WindowFeed:
                     f"nor estimated here (there are {', '.join(channels) or 'no streams'})"
                 )
 
-    def suits(self, info: ModelInfo) -> bool:
+    def suits(self, info: WindowsInfo) -> bool:
         """Say whether another model takes the same windows."""
         return all(
             getattr(info, name) == getattr(self.info, name)
@@ -215,3 +262,70 @@ def _places(stream: str, needed: Sequence[str], known: list[str]) -> list[int]:
             f"estimated here (there are {', '.join(known)})"
         )
     return [known.index(channel) for channel in needed]
+
+
+def lacking_estimates(run: RunLog, info: WindowsInfo) -> tuple[str, ...]:
+    """Return the streams of estimates that a model uses and a run does not have."""
+    return tuple(stream for stream in ESTIMATED if stream in info.channels and stream not in run.streams)
+
+
+def windows_of_log(run: RunLog, info: WindowsInfo, robot: Robot, *, skip_short: bool = False) -> WindowCut:
+    """Return the windows of a log that lacks estimates, as the live observer cuts them.
+
+    Parameters
+    ----------
+    run : log of the robot's sensors
+    info : of the model
+    robot : whose log it is
+    skip_short : leave out a run that is shorter than a window instead of refusing it
+
+    Returns
+    -------
+    WindowCut
+        windows with the run and its labels, and what was dropped
+
+    Raises
+    ------
+    DataError
+        if the log lacks what the model or its filter needs, or a stream has another rate.
+    """
+    streams = {name: stream for name, stream in run.streams.items() if name in SENSORS}
+    channels = {name: stream.channels for name, stream in streams.items()}
+    try:
+        estimator, corrected = live_estimator(info, robot, channels)
+        feed = WindowFeed(info, channels, corrected)
+    except (ConfigError, DataError) as error:
+        raise DataError(f"run {run.run_id}: {error}") from error
+    measured = {
+        name: tuple(c for c in info.channels[name] if c in channels[name])
+        for name in info.channels
+        if name in channels
+    }
+    check_layout(run, Layout(measured, {name: info.rate_hz[name] for name in measured}))
+    begin_s, end_s = span_of(run, Layout(measured, info.rate_hz))
+    if end_s - begin_s + TIME_TOLERANCE_S < info.window_s:
+        if skip_short:
+            return WindowCut(cut_windows([], info.rule, layout=info.layout).windows, {"run too short": 1})
+        raise DataError(
+            f"run {run.run_id} lasts {max(end_s - begin_s, 0):.2f} s, "
+            f"shorter than a window of {info.window_s:g} s"
+        )
+    found: list[Windows] = [cut_windows([], info.rule, layout=info.layout).windows]
+    for sample in replay(RunLog(run.run_id, run.robot, streams)):
+        estimates = [] if estimator is None else estimator.step(sample.readings)
+        found += feed.push(sample.readings, estimates)
+    windows = join_windows(found)
+    n = len(windows)
+    labelled = Windows(
+        windows.values,
+        windows.channels,
+        windows.rate_hz,
+        windows.length_s,
+        windows.start_s,
+        np.full(n, run.run_id, dtype=object),
+        label_windows(run, windows.start_s, windows.length_s),
+    )
+    reasons = {
+        kind.removeprefix("window: "): k for kind, k in feed.dropped.items() if kind.startswith("window: ")
+    }
+    return WindowCut(labelled, Counter(reasons))

@@ -11,9 +11,8 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from pipelines.models.assess import assess
-from pipelines.models.model_files import TerrainModel
-from pipelines.streaming.window_feed import Estimate, WindowFeed
+from pipelines.live.model import LiveModel, assess
+from pipelines.live.windows import Estimate, WindowFeed
 from terrain.control.switching import UNKNOWN
 from terrain.records import Array, Reading, Windows
 
@@ -59,7 +58,7 @@ class WindowOutput(NamedTuple):
         return not self.refused and not self.terrain
 
 
-def classify_window(model: TerrainModel, window: Windows) -> WindowOutput:
+def classify_window(model: LiveModel, window: Windows) -> WindowOutput:
     """Return the output of a model for one window; one that it refuses gives none, and raises nothing."""
     classes = model.info.classes
     start_s = float(window.start_s[0])
@@ -96,7 +95,7 @@ def classify_window(model: TerrainModel, window: Windows) -> WindowOutput:
 class Part(NamedTuple):
     """A model, and what cuts its windows."""
 
-    model: TerrainModel
+    model: LiveModel
     feed: WindowFeed
 
 
@@ -165,7 +164,7 @@ class ClassifierThread:
     >>> thread.stop()
     """
 
-    def __init__(self, classify: Callable[[TerrainModel, Windows], WindowOutput] = classify_window) -> None:
+    def __init__(self, classify: Callable[[LiveModel, Windows], WindowOutput] = classify_window) -> None:
         self._classify = classify
         self._due: deque[_OfRobot] = deque()
         self._changed = threading.Condition()
@@ -268,7 +267,7 @@ class _OfRobot:
         """Windows and samples that were not used by the last time that the thread worked, by kind."""
         return {**self._counts, "steps: overrun": self._n_overrun} if self._n_overrun else self._counts
 
-    def work(self, classify: Callable[[TerrainModel, Windows], WindowOutput]) -> None:
+    def work(self, classify: Callable[[LiveModel, Windows], WindowOutput]) -> None:
         """Cut and classify what waits; called by the thread."""
         try:
             while self._waiting:

@@ -1,4 +1,4 @@
-"""What a model says of windows, and what it knows of its own limits there.
+"""What the live chain takes of a trained model, and what such a model says of windows.
 
 A window is *unknown* where it is less like all learned terrains than nearly all known windows are
 (:mod:`terrain.classify.novelty_numbers`), and *unsupported* where few training runs drove the predicted
@@ -8,17 +8,56 @@ terrain like this (:mod:`terrain.classify.support`).  Of windows of known terrai
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from features.motion import window_motion
-from pipelines.models.lean import LeanRecipe
-from pipelines.models.model_files import TerrainModel
+from features.windows import Layout, WindowRule
 from terrain.classify.conformal import conformal_sets
-from terrain.classify.novelty_numbers import novelty_scores
-from terrain.classify.support import support_of
+from terrain.classify.novelty_numbers import NoveltyNumbers, novelty_scores
+from terrain.classify.support import SupportTable, support_of
+from terrain.classify.terrain_filter import TerrainFilter
 from terrain.records import Array, Windows
+
+
+class WindowsInfo(Protocol):
+    """How the windows of a model are cut, and what its classes are."""
+
+    @property
+    def classes(self) -> tuple[str, ...]: ...  # noqa: D102
+    @property
+    def window_s(self) -> float: ...  # noqa: D102
+    @property
+    def channels(self) -> Mapping[str, tuple[str, ...]]: ...  # noqa: D102
+    @property
+    def rate_hz(self) -> Mapping[str, float]: ...  # noqa: D102
+    @property
+    def filter(self) -> str: ...  # noqa: D102
+    @property
+    def class_ratio(self) -> Mapping[str, float]: ...  # noqa: D102
+    @property
+    def conformal(self) -> float | None: ...  # noqa: D102
+    @property
+    def layout(self) -> Layout: ...  # noqa: D102
+    @property
+    def rule(self) -> WindowRule: ...  # noqa: D102
+
+
+class LiveModel(Protocol):
+    """A trained model; ``recipe`` has ``predict_proba(windows)``, ``classes_`` and ``matrix`` of features."""
+
+    @property
+    def recipe(self) -> Any: ...  # noqa: D102
+    @property
+    def info(self) -> WindowsInfo: ...  # noqa: D102
+    @property
+    def novelty(self) -> NoveltyNumbers | None: ...  # noqa: D102
+    @property
+    def support(self) -> SupportTable | None: ...  # noqa: D102
+    @property
+    def over_time(self) -> TerrainFilter | None: ...  # noqa: D102
 
 
 class Assessed(NamedTuple):
@@ -40,7 +79,7 @@ class Assessed(NamedTuple):
     supported: Array
 
 
-def assess(model: TerrainModel, windows: Windows) -> Assessed:
+def assess(model: LiveModel, windows: Windows) -> Assessed:
     """Return what a model says of windows.
 
     Raises
@@ -49,15 +88,13 @@ def assess(model: TerrainModel, windows: Windows) -> Assessed:
         if the windows are not those that the model requires.
     """
     nothing = np.full(len(windows), np.nan)
-    novelty, features = nothing, None
+    novelty, features, recipe = nothing, None, model.recipe
     if model.novelty is not None:
-        features = model.recipe.matrix.of(windows)
+        features = recipe.matrix.of(windows)
         novelty = novelty_scores(model.novelty, features)
-    recipe = model.recipe
-    probability = (
-        recipe.probabilities(windows, features)
-        if isinstance(recipe, LeanRecipe)
-        else np.asarray(recipe.predict_proba(windows))
+    from_features = getattr(recipe, "probabilities", None)  # takes features that are there already
+    probability = np.asarray(
+        recipe.predict_proba(windows) if from_features is None else from_features(windows, features)
     )
     unknown = np.zeros(len(windows), dtype=bool)
     if model.novelty is not None:
@@ -72,7 +109,7 @@ def assess(model: TerrainModel, windows: Windows) -> Assessed:
     )
 
 
-def class_sets(model: TerrainModel, probability: Array) -> list[tuple[str, ...]] | None:
+def class_sets(model: LiveModel, probability: Array) -> list[tuple[str, ...]] | None:
     """Return the classes of each window that hold the true one in 90 % of windows; None if not calibrated.
 
     Parameters

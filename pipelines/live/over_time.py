@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any, TypeVar, cast
 
 import numpy as np
 
-from pipelines.models.model_files import TerrainModel
-from pipelines.models.results import ModelInfo
-from pipelines.streaming.classifying import WindowOutput
+from pipelines.live.classifying import WindowOutput
+from pipelines.live.model import LiveModel, WindowsInfo
 from terrain.classify.terrain_filter import (
     FilterBelief,
     TerrainFilter,
@@ -26,6 +26,8 @@ from terrain.control.switching import UNKNOWN, SwitchSettings
 from terrain.errors import ConfigError
 from terrain.records import Array
 
+Model = TypeVar("Model", bound=LiveModel)
+
 STRIDE_S = 0.25
 
 DETECTED_RATIO = 0.2
@@ -36,13 +38,13 @@ KNOWN_FLAGGED_RATIO = 0.05
 """Share of windows of learned terrains that are taken for unknown, by the definition of the threshold."""
 
 
-def filter_of(info: ModelInfo) -> TerrainFilter:
+def filter_of(info: WindowsInfo) -> TerrainFilter:
     """Return the filter of a model: shares of its classes in training, equal ones where it has none."""
     prior = tuple(float(info.class_ratio.get(name, 1.0 / len(info.classes))) for name in info.classes)
     return check_filter(TerrainFilter(prior))
 
 
-def filtered(model: TerrainModel, stride_s: float | None = STRIDE_S) -> TerrainModel:
+def filtered(model: Model, stride_s: float | None = STRIDE_S) -> Model:
     """Return a model whose windows begin every ``stride_s`` and are filtered; the model itself for None.
 
     Raises
@@ -57,7 +59,9 @@ def filtered(model: TerrainModel, stride_s: float | None = STRIDE_S) -> TerrainM
             f"filter stride is {stride_s:g} s: above zero and at most a window, {model.info.window_s:g} s, "
             "is required"
         )
-    return model._replace(info=replace(model.info, stride_s=stride_s), over_time=filter_of(model.info))
+    changed: Any = model
+    info = replace(changed.info, stride_s=stride_s)
+    return cast(Model, changed._replace(info=info, over_time=filter_of(model.info)))
 
 
 def novelty_evidence(novelty: Array, unknown: Array) -> Array:
@@ -118,7 +122,7 @@ class GroundFilter:
         return (classes[best], float(belief[best])) if best >= 0 else (UNKNOWN, math.nan)
 
 
-def ground_filter(model: TerrainModel) -> GroundFilter | None:
+def ground_filter(model: LiveModel) -> GroundFilter | None:
     """Return the filter of a model's outputs, at its beginning; None where they are not filtered."""
     return None if model.over_time is None else GroundFilter(model.over_time)
 

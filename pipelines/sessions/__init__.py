@@ -1,1 +1,0 @@
-"""Sessions of robots that are served: samples in, steps out, recording; no network is used here."""

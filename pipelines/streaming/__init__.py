@@ -1,1 +1,0 @@
-"""The windows of samples as they come: cut, and classified at once or on a thread of their own."""
