@@ -64,8 +64,9 @@ class Chain(Protocol):
     """
 
     name: str
-    belief: TerrainBelief
 
+    @property
+    def belief(self) -> TerrainBelief: ...  # noqa: D102
     @property
     def target_ratio(self) -> float: ...  # noqa: D102
     @property

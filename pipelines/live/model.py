@@ -36,6 +36,8 @@ class WindowsInfo(Protocol):
     @property
     def filter(self) -> str: ...  # noqa: D102
     @property
+    def robots(self) -> tuple[str, ...]: ...  # noqa: D102
+    @property
     def class_ratio(self) -> Mapping[str, float]: ...  # noqa: D102
     @property
     def conformal(self) -> float | None: ...  # noqa: D102

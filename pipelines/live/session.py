@@ -26,6 +26,7 @@ from terrain.control.slip_table import SlipTable
 from terrain.control.switching import TerrainBelief
 from terrain.errors import ConfigError, DataError
 from terrain.estimation.live.estimate import LiveEstimate
+from terrain.estimation.live.skid_live import LiveSkidEstimate
 from terrain.records import Array, Command, Sample, SlipTarget
 from terrain.robots import Robot
 
@@ -308,8 +309,10 @@ class RobotSession:
         else:
             speeds_mps = self._streams.last("wheels", [f"speed_{wheel}_mps" for wheel in self._wheels])
             currents_a = self._streams.last("wheels", [f"current_{wheel}_a" for wheel in self._wheels])
-            if seen is not None:
+            if isinstance(seen, LiveSkidEstimate):
                 motion = seen.speed_mps, math.nan, seen.yaw_rate_radps
+            elif seen is not None and len(seen.slip) == len(self._wheels):
+                slip_ratio, slip_std = seen.slip, seen.slip_std
         sensors = self.chain.health or self._streams.health(time_s)
         if math.isnan(time_s):
             sensors = dict.fromkeys(sensors, "lost")

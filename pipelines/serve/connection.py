@@ -12,7 +12,8 @@ from typing import Any
 from fastapi import WebSocket
 from starlette.websockets import WebSocketDisconnect, WebSocketState
 
-from pipelines.live.session import CommandStatus, StepOutput
+from pipelines.live.chain import CommandStatus
+from pipelines.live.session import StepOutput
 from pipelines.serve.guard import Bucket, token_fits
 from pipelines.serve.hub import Hub, OpenSession
 from pipelines.serve.messages import error_content, read_hello, step_content, welcome

@@ -12,10 +12,10 @@ from time import monotonic
 from typing import NamedTuple
 
 from pipelines.live.classifying import ClassifierThread
+from pipelines.live.model import LiveModel
 from pipelines.live.recording import SessionRecorder
 from pipelines.live.session import RobotSession, Served, StepOutput
 from pipelines.live.state import LiveState, Restorable, load_state, save_state
-from pipelines.models.model_files import TerrainModel
 from pipelines.recording.finishing import recover_recordings
 from pipelines.recording.thread import RecordingThread
 from pipelines.serve.messages import Hello
@@ -188,7 +188,7 @@ class Hub:
         while len(self._left) > REMEMBERED:
             self._left.popitem(last=False)
 
-    def swap(self, model: TerrainModel | None, model_name: str, table: SlipTable) -> Served:
+    def swap(self, model: LiveModel | None, model_name: str, table: SlipTable) -> Served:
         """Serve another model and table: all sessions at once, or none.
 
         Raises

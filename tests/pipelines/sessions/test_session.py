@@ -9,10 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipelines.live.arrivals import StreamHealth
+from pipelines.live.chain import CommandStatus
 from pipelines.live.classifying import AtOnce
 from pipelines.live.observer import Observer
 from pipelines.live.pilot import LivePilot
-from pipelines.live.session import TWIST_FRESH_S, CommandStatus, RobotSession, Served, SessionRequest
+from pipelines.live.session import TWIST_FRESH_S, RobotSession, Served, SessionRequest
 from pipelines.live.terrain_source import Classifier
 from terrain.control.slip_table import load_slip_table
 from terrain.errors import ConfigError, DataError
