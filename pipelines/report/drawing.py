@@ -18,11 +18,14 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure as Drawn
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
+from pipelines.report.numbers import plain_line, shorten
 from pipelines.report.tree import Band, Bars, Figure, Line, Panel, Points, Strip
 
 PNG_DPI = 160
 WIDTH_IN, PANEL_HEIGHT_IN, BAR_HEIGHT_IN, HEAD_IN = 8.4, 2.3, 0.26, 0.9
 TITLE_LETTERS_AN_INCH = 11
+LONGEST_NAME = 40
+"""Letters of a category; of a longer name the middle is left out."""
 
 INK, FAINT_INK, GRID = "#1f2933", "#66717d", "#dde2e7"
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#e69f00", "#cc79a7", "#56b4e9", "#8c8c8c")
@@ -95,7 +98,7 @@ def draw(figure: Figure) -> Drawn:
         _draw_panel(axes, panel)
         if i == len(heights) - 1 and figure.x_label and not panel.x_label:
             axes.set_xlabel(figure.x_label)
-    title = textwrap.fill(figure.title, int(TITLE_LETTERS_AN_INCH * WIDTH_IN))
+    title = textwrap.fill(plain_line(figure.title), int(TITLE_LETTERS_AN_INCH * WIDTH_IN))
     drawn.suptitle(title, x=0.015, ha="left", fontsize=10.5, fontweight="bold")
     drawn.draw_without_rendering()
     drawn.set_layout_engine("none")
@@ -118,7 +121,7 @@ def _draw_panel(axes: Axes, panel: Panel) -> None:
         _draw_bars(axes, bar, number, len(bars))
     axes.set(xlabel=panel.x_label, ylabel=panel.y_label)
     if panel.title:
-        axes.set_title(panel.title, loc="left")
+        axes.set_title(plain_line(panel.title), loc="left")
     if panel.x_range is not None:
         axes.set_xlim(*panel.x_range)
     if panel.y_range is not None:
@@ -149,10 +152,12 @@ def _draw_mark(axes: Axes, mark: Line | Band | Points | Strip, number: int) -> N
         for start, end, name in mark.spans:
             axes.axvspan(start, end, color=COLOURS[names.index(name) % len(COLOURS)], alpha=0.18, lw=0)
         for i, name in enumerate(names):
-            axes.fill_between([], [], color=COLOURS[i % len(COLOURS)], alpha=0.18, lw=0, label=name)
+            axes.fill_between(
+                [], [], color=COLOURS[i % len(COLOURS)], alpha=0.18, lw=0, label=plain_line(name)
+            )
         return
     colour = COLOURS[(number if mark.colour is None else mark.colour) % len(COLOURS)]
-    label = mark.label or "_nolegend_"
+    label = plain_line(mark.label) or "_nolegend_"
     x = np.asarray(mark.x, float)
     if isinstance(mark, Line):
         axes.plot(
@@ -173,8 +178,11 @@ def _draw_bars(axes: Axes, mark: Bars, number: int, n_bars: int) -> None:
     y = np.arange(len(mark.categories)) + (number - 0.5 * (n_bars - 1)) * height
     values = np.asarray(mark.values, float)
     colour = COLOURS[(number if mark.colour is None else mark.colour) % len(COLOURS)]
-    axes.barh(y, values, height=0.9 * height, color=colour, alpha=0.85, label=mark.label or "_nolegend_")
+    axes.barh(
+        y, values, height=0.9 * height, color=colour, alpha=0.85, label=plain_line(mark.label) or "_nolegend_"
+    )
     if mark.low is not None:
         axes.hlines(y, np.asarray(mark.low, float), np.asarray(mark.high, float), color=INK, lw=1.0)
-    axes.set_yticks(np.arange(len(mark.categories)), mark.categories)
+    names = [shorten(plain_line(name), LONGEST_NAME) for name in mark.categories]
+    axes.set_yticks(np.arange(len(names)), names)
     axes.set_ylim(len(mark.categories) - 0.4, -0.6)

@@ -5,10 +5,9 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Sequence
 
-from pipelines.report.numbers import format_value
+from pipelines.report.numbers import format_value, plain_line
 from pipelines.report.terminal import heading, is_numeric
 from pipelines.report.tree import Cards, Figure, Pairs, Part, Report, Section, Table, Text
-from terrain.files.names import printable
 
 _SPECIAL = re.compile(r"([\\`*_{}\[\]<>|#~&!])")
 _ADDRESS = re.compile(r"(https?|ftp)(?=://)", re.IGNORECASE)
@@ -22,7 +21,7 @@ def escape_markdown(text: str) -> str:
     >>> print(escape_markdown("DIRT_ROAD | <b>\n# one"))
     DIRT\_ROAD \| \<b\>\\n\# one
     """
-    return _ADDRESS.sub(r"\1\\", _SPECIAL.sub(r"\\\1", printable(text)))
+    return _ADDRESS.sub(r"\1\\", _SPECIAL.sub(r"\\\1", plain_line(text)))
 
 
 def markdown_text(report: Report) -> str:

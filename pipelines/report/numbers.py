@@ -7,6 +7,8 @@ from collections.abc import Mapping, Sequence
 from enum import Enum
 from typing import Any
 
+from terrain.files.names import printable
+
 NOT_KNOWN = "\N{EN DASH}"
 """Written where a figure is not known."""
 
@@ -91,7 +93,7 @@ def _bare(value: Any, form: str) -> str:
     if isinstance(value, Enum):
         return str(value.value)
     if isinstance(value, str):
-        return value
+        return plain_line(value)
     if not isinstance(value, int | float) and hasattr(value, "item"):
         value = value.item()
     if isinstance(value, float) and not math.isfinite(value):
@@ -103,6 +105,17 @@ def _bare(value: Any, form: str) -> str:
     else:
         return format_number(value) if isinstance(value, float) else str(value).replace("-", MINUS)
     return text.replace("-", MINUS)
+
+
+def plain_line(text: str) -> str:
+    r"""Return a text on one line, with escapes for what a terminal would act on; spaces that do not break stay.
+
+    Examples
+    --------
+    >>> plain_line("a\nb 3\xa0m")
+    'a\\nb 3\xa0m'
+    """
+    return NBSP.join(printable(part) for part in text.split(NBSP))
 
 
 def format_number(number: float) -> str:

@@ -14,7 +14,7 @@ from rich.table import Column as RichColumn
 from rich.table import Table as RichTable
 from rich.text import Text as RichText
 
-from pipelines.report.numbers import NOT_KNOWN, format_value
+from pipelines.report.numbers import NOT_KNOWN, format_value, plain_line
 from pipelines.report.results import Progress
 from pipelines.report.tree import Cards, Column, Pairs, Part, Report, Section, Table, Text
 
@@ -74,7 +74,7 @@ def terminal_text(report: Report, *, details: bool = False, width: int = WIDTH_O
 
 
 def _screen(report: Report, details: bool) -> Iterator[RenderableType]:
-    yield RichText(report.answer, style="bold")
+    yield RichText(plain_line(report.answer), style="bold")
     if report.lead:
         yield RichText(report.lead, style="dim")
     yield from _parts(report.parts)
@@ -91,7 +91,10 @@ def _parts(parts: Sequence[Part]) -> Iterator[RenderableType]:
     for part in parts:
         if isinstance(part, Text):
             mark = {"note": "note: ", "warning": "warning: "}.get(part.kind, "")
-            yield RichText(mark + part.text, style="yellow" if part.kind == "warning" else "")
+            yield RichText(
+                mark + (part.text if part.kind == "code" else plain_line(part.text)),
+                style="yellow" if part.kind == "warning" else "",
+            )
         elif isinstance(part, Table):
             yield _table(part)
             if part.note:

@@ -1,4 +1,4 @@
-"""Results become JSON by one rule; former keys are written beside the new ones."""
+"""Results become JSON by one rule."""
 
 import json
 import math
@@ -10,8 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from pipelines.reporting import json_file
-from pipelines.reporting.json_file import as_json, with_deprecated_keys, write_json
+from pipelines.report.json_file import as_json, write_json
 
 
 class Colour(Enum):
@@ -52,15 +51,9 @@ def test_every_kind_of_value_becomes_what_json_holds():
     assert json.loads(json.dumps(found, allow_nan=False)) == found
 
 
-def test_former_keys_are_written_beside_the_new_ones_at_any_depth(monkeypatch, tmp_path):
-    monkeypatch.setattr(json_file, "DEPRECATED_KEYS", {"new": "old"})
-    assert with_deprecated_keys({"a": [{"new": 1}], "new": {"new": 2}}) == {
-        "a": [{"new": 1, "old": 1}],
-        "new": {"new": 2, "old": 2},
-        "old": {"new": 2, "old": 2},
-    }
-    write_json(tmp_path / "result.json", {"new": 1})
-    assert json.loads((tmp_path / "result.json").read_text()) == {"new": 1, "old": 1}
+def test_a_file_is_written_whole_and_only_where_one_is_named(tmp_path):
+    write_json(tmp_path / "result.json", {"new": math.nan})
+    assert json.loads((tmp_path / "result.json").read_text()) == {"new": None}
     write_json(None, {"new": 1})
 
 

@@ -1,0 +1,207 @@
+"""One tree, three writers: the same numbers in each, all escaped, nothing fetched, figures as described."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipelines.report import (
+    Band,
+    Bars,
+    Card,
+    Cards,
+    Column,
+    Figure,
+    Line,
+    Pairs,
+    Panel,
+    Points,
+    Report,
+    Result,
+    Section,
+    Strip,
+    Table,
+    Text,
+    described,
+    figure_png,
+    figure_svg,
+    format_value,
+    html_page,
+    markdown_text,
+)
+from pipelines.report.html import figure_data
+from pipelines.report.terminal import terminal_text
+from pipelines.report.tree import figures_of
+from terrain.errors import ConfigError
+
+EVIL = '<script>alert(1)</script> & "quoted" | \x1b[31mred'
+
+YAW = Figure(
+    "Yaw rate of a <run>",
+    [
+        Panel(
+            [
+                Strip([(0.0, 1.0, "grass"), (1.0, 2.0, "ice"), (2.0, 3.0, "grass")]),
+                Band("95 %", [0, 1, 2, 3], [0, 0, math.nan, 1], [1, 1, 2, 2]),
+                Line("measured", np.arange(4.0), [0.1, math.nan, 0.3, 0.123456789]),
+                Line("simulated", [0, 1, 2, 3], [0, 0.5, 0.3, 0.1], dashed=True),
+                Points("poses", [0, 2], [0.5, 1.0], [0.4, 0.8], [0.6, 1.2]),
+            ],
+            "yaw rate [rad/s]",
+        ),
+        Panel([Line("path", [0, 1, 0], [0, 1, 2])], equal=True, x_label="x [m]"),
+    ],
+    "Measured beside simulated.",
+    x_label="time [s]",
+)
+RECALL = Figure("Recall", [Panel([Bars("svm", ["a$b", EVIL], [0.9, math.nan], [0.8, 0.1], [1.0, 0.2])])])
+REPORT = Report(
+    "Runs of <vulpi>",
+    "95.8 % of windows are right.",
+    YAW,
+    parts=[
+        Cards([Card("accuracy", 0.9584, "over <b>runs</b>", ".1%")]),
+        Section(
+            "By terrain",
+            [
+                Table(
+                    (
+                        "terrain",
+                        Column("recall", ".1%"),
+                        Column("interval", ".1%"),
+                        Column("speed", ".2f", "m/s"),
+                    ),
+                    [(EVIL, 0.5, (0.25, 0.75), -1.234), ("ice", None, (math.nan, 1.0), math.nan)],
+                    note="note of a table",
+                )
+            ],
+        ),
+        Text("look <here>", "warning"),
+    ],
+    details=[Section("Provenance", [Pairs([("seed", 3), ("length", 2.0, ".1f", "s")]), RECALL])],
+    next_step="terrain train --data vulpi",
+    lead="18 runs",
+)
+NUMBERS = ("95.8\xa0%", "50.0\xa0%", "25.0 to 75.0\xa0%", "−1.23", "2.0\xa0s")
+
+
+def test_every_writer_shows_the_same_numbers():
+    texts = terminal_text(REPORT, details=True, width=200), html_page(REPORT), markdown_text(REPORT)
+    for number in NUMBERS:
+        assert [number in text for text in texts] == [True] * 3, number
+    assert [text.count("–") >= 3 for text in texts] == [True] * 3  # what is not known is marked
+
+
+def test_a_screen_leads_with_the_answer_and_keeps_details_back():
+    lines = terminal_text(REPORT).splitlines()
+    assert lines[0] == "95.8 % of windows are right."
+    assert lines[-2:] == ["--details adds: Provenance", "next: terrain train --data vulpi"]
+    assert "seed" not in "\n".join(lines)
+    assert "seed" in terminal_text(REPORT, details=True)
+
+
+def test_a_page_escapes_all_and_fetches_nothing():
+    page = html_page(REPORT)
+    assert "<h1>Runs of &lt;vulpi&gt;</h1>" in page
+    assert "alert(1)</script>" not in page
+    assert not re.findall(r"(?:src|href)=[\"']?https?:", page)
+    assert page.count("<details>") == len(REPORT.details)
+    data = json.loads(re.search(r'id="figures">(.*?)</script>', page, re.DOTALL)[1])
+    assert data == [figure_data(YAW), figure_data(RECALL)]
+    assert "<script" not in html_page(Report("a", "b"))
+
+
+def test_markdown_escapes_all():
+    text = markdown_text(REPORT)
+    assert "<script>" not in text
+    assert "\x1b" not in text
+    (row,) = (line for line in text.splitlines() if "alert" in line and line.startswith("|"))
+    assert len(re.findall(r"(?<!\\)\|", row)) == 5
+    assert text.endswith("Next: `terrain train --data vulpi`\n")
+
+
+def test_a_fragment_has_pictures_and_runs_nothing():
+    fragment = REPORT._repr_html_()
+    assert fragment.count("data:image/svg+xml;base64,") == 2
+    assert "<script" not in fragment
+
+
+def test_figures_are_in_the_order_in_which_they_are_read():
+    assert figures_of(REPORT) == [YAW, RECALL]
+
+
+def test_what_a_figure_draws_is_finite_and_short():
+    marks = figure_data(YAW)["panels"][0]["marks"]
+    assert [mark["kind"] for mark in marks] == ["strip", "band", "line", "line", "points"]
+    assert marks[2]["y"] == [0.1, None, 0.3, 0.123457]
+    assert marks[1]["low"] == [0.0, 0.0, None, 1.0]
+
+
+@pytest.mark.parametrize("figure", [YAW, RECALL], ids=["lines", "bars"])
+def test_a_figure_gives_the_same_bytes_and_draws_every_mark(figure):
+    assert figure_png(figure) == figure_png(figure)
+    assert figure_svg(figure) == figure_svg(figure)
+    assert figure_png(figure).startswith(b"\x89PNG")
+    fewer = Figure(figure.title, [Panel(figure.panels[0].marks[:-1], y_label="y")])
+    assert figure_svg(fewer) != figure_svg(Figure(figure.title, [Panel(figure.panels[0].marks, y_label="y")]))
+
+
+@pytest.mark.parametrize("name", ["a.pdf", "a", ""])
+def test_a_report_is_written_by_its_ending(tmp_path, name):
+    for ending, begin in ((".html", "<!DOCTYPE html>"), (".md", "# Runs of")):
+        assert REPORT.save(tmp_path / f"new{ending}").read_text().lstrip().startswith(begin)
+    with pytest.raises(ConfigError):
+        REPORT.save(tmp_path / name)
+
+
+@given(st.floats(allow_nan=False, allow_infinity=False))
+def test_three_digits_are_the_number(value):
+    text = format_value(value).replace("−", "-")
+    digits = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789")
+    mantissa, _, power = text.partition("·10")
+    read = float(mantissa) * (10.0 ** int(power.translate(digits)) if power else 1.0)
+    assert read == pytest.approx(value, rel=5.1e-3)
+
+
+class Pair(NamedTuple):
+    low: float
+    high: float | None
+
+
+@dataclass(frozen=True)
+class Found(Result):
+    name: str = described("of the robot")
+    kind: Literal["a", "b"] = described("which")
+    ratio: float = described("of slip", "1", form=".1%")
+    pairs: tuple[Pair, ...] = described("each", default=())
+    by_name: dict[str, Pair] | None = described("by name", default=None)
+
+
+def report(result):
+    return Report("Found", f"{format_value(result.ratio, '.1%')} of {result.name}.")
+
+
+def test_all_that_derives_from_a_result():
+    found = Found("husky", "a", 0.25, (Pair(0.0, None),))
+    assert repr(found) == "Found(name='husky', kind='a', ratio=25.0\xa0%)"
+    assert str(found) == "25.0\xa0% of husky."
+    assert "25.0" in found._repr_html_()
+    assert found.as_json()["pairs"] == [{"low": 0.0, "high": None}]
+    assert found.to_pandas().to_dict("records") == [{"name": "husky", "kind": "a", "ratio": 0.25}]
+
+
+def test_a_schema_describes_what_is_written():
+    schema = Found.schema()
+    assert schema["properties"]["ratio"] == {"type": "number", "description": "of slip", "unit": "1"}
+    assert schema["properties"]["kind"]["enum"] == ["a", "b"]
+    item = schema["properties"]["pairs"]["items"]
+    assert item["properties"]["high"] == {"anyOf": [{"type": "number"}, {"type": "null"}]}
+    assert list(schema["properties"]) == list(Found("a", "a", 1.0).as_json())
