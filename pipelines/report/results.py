@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import builtins
 import sys
 import types
 import typing
@@ -113,6 +114,16 @@ class Result:
 _PLAIN = {str: "string", int: "integer", float: "number", bool: "boolean", Path: "string"}
 
 
+class _Names(dict[str, Any]):
+    """Names of a module; those that are there for a type checker alone stand for any type."""
+
+    def __init__(self, module: types.ModuleType) -> None:
+        super().__init__(vars(module))
+
+    def __missing__(self, name: str) -> Any:
+        return getattr(builtins, name, Any)
+
+
 def type_schema(kind: Any) -> dict[str, Any]:
     """Return the JSON schema of a type: records by their fields, mappings and sequences by what they hold.
 
@@ -139,7 +150,7 @@ def type_schema(kind: Any) -> dict[str, Any]:
     if isinstance(kind, type) and issubclass(kind, Enum):
         return {"enum": [each.value for each in kind]}
     if is_dataclass(kind) or hasattr(kind, "_fields"):
-        hints = typing.get_type_hints(kind)
+        hints = typing.get_type_hints(kind, localns=_Names(sys.modules[kind.__module__]))
         described_fields = {each.name: each.metadata for each in fields(kind)} if is_dataclass(kind) else {}
         names = tuple(described_fields) or kind._fields
         properties = {}
