@@ -6,8 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from pipelines.models.lean import write_numbers
-from pipelines.models.model_files import MODEL_FILE, TerrainModel, write_info
+from pipelines.learn.model_file import TerrainModel, write_model
 from pipelines.models.tracking import load_model
 from terrain.estimation.enriched import enriched
 from terrain.estimation.estimate import estimate_run
@@ -56,13 +55,9 @@ def model_folder(uri: str | None, seed: int, into: Path) -> str:
     """Return what the service is given as its model: the URI, or the folder of the small model."""
     if uri is not None:
         return uri
-    from skops import io
-
     model = bench_model(None, seed)
     into.mkdir(parents=True, exist_ok=True)
-    io.dump(model.recipe, into / MODEL_FILE)
-    write_numbers(into, model.recipe)  # type: ignore[arg-type]
-    write_info(into, model.info)
+    write_model(into, model)
     return str(into)
 
 

@@ -14,15 +14,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from features.motion import Motion
-from features.windows import Layout
 from pipelines.classify.card_support import RegimeRow, regime_rows
 from pipelines.crossval.extras import MOVING_MPS
 from pipelines.crossval.results import CrossvalReport
+from pipelines.learn.model_file import ONNX_FILE, ModelInfo, drawn_window, read_model
+from pipelines.learn.network_onnx import time_of_onnx
 from pipelines.live.model import assess
 from pipelines.models.champion import scope_of
-from pipelines.models.model_files import read_lean_model
-from pipelines.models.onnx_file import ONNX_FILE, time_of_onnx
-from pipelines.models.results import ModelInfo
 from pipelines.reporting.json_file import as_json
 from pipelines.reporting.markdown import render_markdown
 from pipelines.reporting.numbers import NOT_KNOWN, percent, sentence
@@ -295,20 +293,6 @@ def _licence() -> str:
     return str(named[0]) if named else NOT_KNOWN
 
 
-def drawn_window(layout: Layout, length_s: float) -> Windows:
-    """Return a window of noise with the channels and rates of a layout.
-
-    The time that a window takes does not depend on what was measured in it.
-    """
-    rng = np.random.default_rng(0)
-    unknown = np.full(1, "", dtype=object)
-    values = {
-        stream: rng.standard_normal((1, len(names), layout.n_samples(stream, length_s)))
-        for stream, names in layout.channels.items()
-    }
-    return Windows(values, layout.channels, layout.rate_hz, length_s, np.zeros(1), unknown, unknown)
-
-
 def written(card: ModelCard, folder: Path) -> ModelCard:
     """Return the card with the sizes of the files in a folder, and with the time that one window takes.
 
@@ -317,7 +301,7 @@ def written(card: ModelCard, folder: Path) -> ModelCard:
     card : of the model
     folder : of its files
     """
-    model = read_lean_model(folder)
+    model = read_model(folder)
     window = drawn_window(model.layout, model.info.window_s)
     assess(model, window)  # compiles and fills caches
     times_s = np.empty(N_TIMED)
@@ -331,7 +315,7 @@ def written(card: ModelCard, folder: Path) -> ModelCard:
         if path.is_file() and path.suffix in (".skops", ".npz", ".onnx", ".data")
     )
     onnx = folder / ONNX_FILE
-    onnx_times_s = time_of_onnx(onnx, window, N_TIMED) if onnx.is_file() else None
+    onnx_times_s = time_of_onnx(onnx.read_bytes(), window, N_TIMED) if onnx.is_file() else None
     return replace(
         card,
         files=sizes,

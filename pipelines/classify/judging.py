@@ -11,10 +11,10 @@ from pipelines.classify.training_data import TrainingData
 from pipelines.crossval.results import CrossvalReport
 from pipelines.crossval.splits import Samples
 from pipelines.data.datasets import joint_digest
+from pipelines.learn.tracking import Champion, Judge, Verdict
 from pipelines.models.champion import Comparison, Scope, Standing, champion_decision, scope_of
 from pipelines.models.model_files import TerrainModel
 from pipelines.models.results import ModelInfo
-from pipelines.models.tracking import Champion, Judge, Verdict
 from terrain.bootstrap import bootstrap_rows, percentile_interval
 from terrain.classify.metrics import runs_by_terrain
 from terrain.records import Array

@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple
 
 from pipelines.crossval.results import ChannelImportance, CrossvalReport
-from pipelines.models.results import Registered
+from pipelines.learn.tracking import Registered
 
 
 @dataclass(frozen=True, slots=True)

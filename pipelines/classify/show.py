@@ -11,7 +11,7 @@ from rich.table import Table
 
 from pipelines.classify.card import CARD_JSON
 from pipelines.classify.card_support import rows_of_card, support_tables
-from pipelines.models.model_files import TerrainModel, read_lean_model
+from pipelines.learn.model_file import TerrainModel, read_model
 from pipelines.reporting.json_file import as_json
 from pipelines.reporting.numbers import NOT_KNOWN
 from pipelines.reporting.terminal import print_lines
@@ -68,10 +68,10 @@ def model_statement(uri: str) -> ModelStatement:
     if Path(uri).exists():
         folder = Path(uri)
     else:
-        from pipelines.models.tracking import fetch_model
+        from pipelines.learn.tracking import fetch_model
 
         folder = fetch_model(uri)
-    model: TerrainModel = read_lean_model(folder)
+    model: TerrainModel = read_model(folder)
     info = model.info
     return ModelStatement(
         uri,

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -30,10 +32,9 @@ from pipelines.crossval.splits import folds_of
 from pipelines.data.datasets import data_digest
 from pipelines.feature_store.crossval import crossval_stored, refuse_recipe
 from pipelines.feature_store.store import FeatureStore, read_store
+from pipelines.learn.model_file import ModelInfo, TerrainModel, seal, write_model
 from pipelines.live.windows import ESTIMATED
 from pipelines.models.champion import scope_of
-from pipelines.models.novelty_file import NOVELTY_FILE, novelty_bytes
-from pipelines.models.results import ModelInfo
 from pipelines.reporting.json_file import as_json
 from pipelines.reporting.progress import Progress, silent
 from terrain import __version__
@@ -65,8 +66,8 @@ def train(
     TerrainError
         if the data do not suffice or the tracking folder cannot be written.
     """
-    from pipelines.models.onnx_file import require_onnx
-    from pipelines.models.tracking import ensure_tracking
+    from pipelines.learn.network_onnx import require_onnx
+    from pipelines.learn.tracking import ensure_tracking
 
     if settings.recipe != FEATURE_RECIPE:
         require_onnx()
@@ -94,7 +95,7 @@ def train_store(
     TerrainError
         if the store is damaged, its data do not suffice, or the tracking folder cannot be written.
     """
-    from pipelines.models.tracking import ensure_tracking
+    from pipelines.learn.tracking import ensure_tracking
 
     refuse_recipe(settings)
     ensure_tracking()
@@ -109,7 +110,7 @@ def _train(
     """Fit a recipe that was evaluated, find its limits, and track and register it."""
     from pipelines.classify.judging import held_out_runs, judge_of, standing_of, standing_tags
     from pipelines.crossval_figures.figures import all_figures
-    from pipelines.models.tracking import TrainingRecord, code_commit, log_training
+    from pipelines.learn.tracking import TrainingRecord, _png, code_commit, log_training
 
     report = report.named(dataset, data.digest)
     recipe = data.fitted()
@@ -134,19 +135,19 @@ def _train(
         _params(settings, report, len(data), dataset, chosen),
         metrics,
         standing_tags(standing, scope_of(info)),
+        (),
         {"crossval.json": as_json(report), "importance.json": {"channels": as_json(importance)}},
-        all_figures(report, importance),
-        {} if limits.novelty is None else {NOVELTY_FILE: novelty_bytes(limits.novelty)},
+        {f"figures/{key}.png": _png(figure) for key, figure in all_figures(report, importance).items()},
     )
     card = model_card(settings.name, info, data.samples.cut.windows, data.motion, report, chosen)
-    registered = log_training(
-        settings.name,
-        recipe,
-        info,
-        record,
-        judge_of(data, report, standing, settings.seed),
-        lambda folder: written(card, folder).texts(),
-    )
+    with TemporaryDirectory() as place:
+        folder = Path(place)
+        write_model(folder, TerrainModel(recipe, info, limits.novelty, limits.support))
+        for name, text in written(card, folder).texts().items():
+            (folder / name).write_text(text, encoding="utf-8")
+        seal(folder, info)
+        judge = judge_of(data, report, standing, settings.seed)
+        registered = log_training(settings.name, folder, record, judge)
     return Training(
         registered=registered,
         dataset=dataset,

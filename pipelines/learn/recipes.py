@@ -44,6 +44,12 @@ class WindowPipeline(Pipeline):
         fitted: WindowPipeline = super().fit(X, y, **{groups: X.run_id, **params})
         return fitted
 
+    def probabilities(self, windows: Windows, features: Array | None = None) -> Array:
+        """Return probabilities (n_windows, k), from the windows' features where they are there already."""
+        if features is None or type(self[0]) is not FeatureExtractor:
+            return np.asarray(self.predict_proba(windows))
+        return np.asarray(self[-1].predict_proba(features))
+
 
 def make_recipe(
     recipe: str | Any = FEATURE_RECIPE,

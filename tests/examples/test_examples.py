@@ -7,12 +7,11 @@ from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
-from skops import io
 
 from pipelines.classify.train import model_info
 from pipelines.crossval.crossval import samples_of
 from pipelines.crossval.settings import CrossvalSettings
-from pipelines.models.model_files import write_info
+from pipelines.learn.model_file import TerrainModel, write_model
 from pipelines.serve.server import Service, prepare
 from pipelines.serve.settings import ServeSettings
 from terrain.logs.write import write_run
@@ -44,8 +43,8 @@ def runs():
 def model_folder(runs, tmp_path_factory):
     settings, folder = CrossvalSettings(), tmp_path_factory.mktemp("model")
     windows = samples_of(runs, settings).cut.windows
-    io.dump(settings.new_recipe().fit(windows, windows.terrain.astype(str)), folder / "model.skops")
-    write_info(folder, model_info(runs, settings, windows, "drawn", ""))
+    recipe = settings.new_recipe().fit(windows, windows.terrain.astype(str))
+    write_model(folder, TerrainModel(recipe, model_info(runs, settings, windows, "drawn", "")))
     return folder
 
 

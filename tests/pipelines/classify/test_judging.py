@@ -10,8 +10,8 @@ from pipelines.classify.settings import TrainSettings
 from pipelines.classify.training_data import data_of_runs, identities
 from pipelines.crossval.crossval import crossval, samples_of
 from pipelines.data.datasets import data_digest
+from pipelines.learn.tracking import Champion
 from pipelines.models.model_files import TerrainModel, read_model
-from pipelines.models.tracking import Champion
 
 TRAINING = TrainSettings(name="drawn", repeats=1, n_jobs=1)
 

@@ -10,7 +10,7 @@ from skops import io as skops_io
 
 from pipelines.cli import main as cli
 from pipelines.cli.table import COMMANDS
-from pipelines.models.model_files import MODEL_FILE, read_model, write_info
+from pipelines.learn.model_file import MODEL_FILE, read_model, seal
 from terrain.logs.write import write_run
 from terrain.records import RunLog, Stream
 
@@ -165,7 +165,7 @@ def test_a_model_that_cannot_be_trusted_is_one_sentence(refused, place, drive, t
     (model / MODEL_FILE).write_bytes(content)
     refused("model.skops: is damaged (SHA-256", *ask, model)
     (model / MODEL_FILE).write_bytes(skops_io.dumps(LogisticRegression().fit([[0.0], [1.0]], [0, 1])))
-    write_info(model, read_model(tracked[0] / "model").info)
+    seal(model, read_model(tracked[0] / "model").info)
     refused("holds a LogisticRegression, not a recipe of this package", *ask, model)
     (place / "table.yaml").write_text("name: [")
     refused("table.yaml: is no YAML", *ask, tracked[0] / "model", "--table", place / "table.yaml")

@@ -17,7 +17,7 @@ from pipelines.crossval.results import Applicability
 from pipelines.crossval_figures.figures import confusion_figure
 from pipelines.estimate.consistency import TerrainConsistency
 from pipelines.estimate.labelled import TerrainSlip
-from pipelines.models.results import Registered
+from pipelines.learn.tracking import Registered
 from pipelines.quickstart.page import CAPTIONS, html_report
 from pipelines.quickstart.results import KeptRuns, QuickstartResult
 from pipelines.reporting.numbers import NOT_KNOWN

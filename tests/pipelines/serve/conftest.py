@@ -7,11 +7,9 @@ import urllib.request
 from contextlib import contextmanager
 
 import pytest
-from skops import io
 from websockets.sync.client import connect
 
-from pipelines.models.lean import write_numbers
-from pipelines.models.model_files import write_info
+from pipelines.learn.model_file import write_model
 from pipelines.serve.server import Service, prepare
 from pipelines.serve.settings import ServeSettings
 from terrain.logs.replay import replay
@@ -22,9 +20,7 @@ CHANNELS = {"imu": ["accel_z_mps2"], "wheels": ["speed_left_mps"]}
 @pytest.fixture(scope="session")
 def model_folder(mower_model, tmp_path_factory):
     folder = tmp_path_factory.mktemp("model")
-    io.dump(mower_model.recipe, folder / "model.skops")
-    write_numbers(folder, mower_model.recipe)
-    write_info(folder, mower_model.info)
+    write_model(folder, mower_model)
     return folder
 
 

@@ -1,5 +1,6 @@
 """The page in a real browser: what it shows, and that it goes on when robots and the service come and go."""
 
+import copy
 import shutil
 import threading
 import time
@@ -7,9 +8,10 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from pipelines.models.model_files import write_info
+from pipelines.learn.model_file import write_model
 from pipelines.serve.client import TerrainClient
 from terrain.control.slip_table import load_slip_table
 
@@ -263,10 +265,10 @@ def test_a_robot_that_sends_nothing_more_is_not_shown_as_live(service, opened):
 
 
 def test_names_with_markup_are_text(running, mower_model, model_folder, tmp_path, opened):
-    for file in model_folder.iterdir():
-        shutil.copy(file, tmp_path)
     classes = tuple(MARKUP if name == "b" else name for name in mower_model.info.classes)
-    write_info(tmp_path, replace(mower_model.info, classes=classes))
+    recipe = copy.deepcopy(mower_model.recipe)
+    recipe[-1].classes_ = np.array(classes)
+    write_model(tmp_path, mower_model._replace(recipe=recipe, info=replace(mower_model.info, classes=classes)))
     with running(model=str(tmp_path)) as service:
         hub = service.hub
         hub.trouble["<b>"] = MARKUP

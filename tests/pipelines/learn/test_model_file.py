@@ -1,3 +1,5 @@
+"""What is read back is what was written; what is damaged, foreign or manipulated is one sentence."""
+
 import io
 import json
 import os
@@ -5,24 +7,38 @@ import pickle
 import zipfile
 
 import numpy as np
+import pandas as pd
 import pytest
 from sklearn.linear_model import LogisticRegression
 from sklearn.preprocessing import FunctionTransformer, StandardScaler
 from skops import io as skops_io
 
 from features.windows import SteadyMotion, WindowRule, cut_windows
+from pipelines.learn.load import load_model
+from pipelines.learn.model_file import (
+    MANIFEST_FILE,
+    MODEL_FILE,
+    TRUSTED_TYPES,
+    WindowProbabilities,
+    read_files,
+    read_model,
+    seal,
+    write_model,
+)
 from pipelines.learn.recipes import WindowPipeline, make_recipe
-from pipelines.models.model_files import INFO_FILE, MODEL_FILE, TRUSTED_TYPES, read_model, write_info
-from pipelines.models.results import ModelInfo
 from terrain.errors import ModelError
 
 
-def put(folder, content, **changed):
-    """Put other bytes in place of the model, with a checksum that fits them."""
-    info = json.loads((folder / INFO_FILE).read_text()) | changed
-    (folder / MODEL_FILE).write_bytes(content)
-    checks = ("version", "sha256", "numbers_sha256", "files_sha256")
-    write_info(folder, ModelInfo.from_json({k: v for k, v in info.items() if k not in checks}))
+@pytest.fixture
+def put(model_dir):
+    """What puts other bytes in place of the model, with a checksum that fits them."""
+    info, _ = read_files(model_dir)
+
+    def put(content):
+        (model_dir / MODEL_FILE).write_bytes(content)
+        seal(model_dir, info)
+
+    return put
 
 
 def test_a_saved_model_predicts_the_same_to_the_last_bit(model_dir, runs):
@@ -44,7 +60,7 @@ def test_one_flipped_bit_anywhere_is_seen(model_dir, place):
         read_model(model_dir)
 
 
-def test_damage_that_the_checksum_covers_up_ends_in_one_sentence(model_dir):
+def test_damage_that_the_checksum_covers_up_ends_in_one_sentence(model_dir, put):
     whole = (model_dir / MODEL_FILE).read_bytes()
     rng = np.random.default_rng(0)
     refusals = []
@@ -52,7 +68,7 @@ def test_damage_that_the_checksum_covers_up_ends_in_one_sentence(model_dir):
         content = bytearray(whole[: rng.integers(len(whole))] if rng.random() < 0.3 else whole)
         for place in rng.integers(max(len(content) - 4000, 0), max(len(content), 1), 3 if content else 0):
             content[place] = rng.integers(256)
-        put(model_dir, bytes(content))
+        put(bytes(content))
         try:
             read_model(model_dir)
         except ModelError as error:
@@ -61,23 +77,23 @@ def test_damage_that_the_checksum_covers_up_ends_in_one_sentence(model_dir):
     assert not [sentence for sentence in refusals if "\n" in sentence]
 
 
-def test_a_model_of_another_package_is_foreign(model_dir, tmp_path):
+def test_a_model_of_another_package_is_foreign(model_dir, put, tmp_path):
     other = LogisticRegression().fit([[0.0], [1.0]], [0, 1])
-    put(model_dir, skops_io.dumps(other))
+    put(skops_io.dumps(other))
     with pytest.raises(ModelError, match="holds a LogisticRegression, not a recipe of this package"):
         read_model(model_dir)
-    put(model_dir, skops_io.dumps(make_recipe("svm")))
+    put(skops_io.dumps(make_recipe("svm")))
     with pytest.raises(ModelError, match="holds a recipe that was never fitted"):
         read_model(model_dir)
-    put(model_dir, skops_io.dumps(WindowPipeline([("scale", StandardScaler()), ("classify", other)])))
+    put(skops_io.dumps(WindowPipeline([("scale", StandardScaler()), ("classify", other)])))
     with pytest.raises(ModelError, match="holds a recipe that was never fitted"):
         read_model(model_dir)
 
 
-def test_a_type_that_is_not_on_the_list_is_named_and_never_called(model_dir, tmp_path):
+def test_a_type_that_is_not_on_the_list_is_named_and_never_called(model_dir, put, tmp_path):
     marker = tmp_path / "called"
     hostile = FunctionTransformer(os.mkdir, kw_args={"path": str(marker)})
-    put(model_dir, skops_io.dumps(WindowPipeline([("features", hostile), ("last", LogisticRegression())])))
+    put(skops_io.dumps(WindowPipeline([("features", hostile), ("last", LogisticRegression())])))
     with pytest.raises(
         ModelError, match=r"holds posix\.mkdir, a type that models of this package do not hold"
     ):
@@ -95,21 +111,21 @@ class Bomb:
         return os.mkdir, (str(self.marker),)
 
 
-def test_nothing_is_ever_unpickled(model_dir, tmp_path):
+def test_nothing_is_ever_unpickled(model_dir, put, tmp_path):
     marker = tmp_path / "unpickled"
     bomb = pickle.dumps(Bomb(marker))
-    put(model_dir, bomb)
+    put(bomb)
     with pytest.raises(ModelError, match="cannot be loaded"):
         read_model(model_dir)
     # Arrays inside a model file are files of their own, and one of objects is a pickle.
     objects = io.BytesIO()
     np.save(objects, np.array([Bomb(marker)], dtype=object), allow_pickle=True)
     changed = io.BytesIO()
-    put(model_dir, whole := skops_io.dumps(np.arange(3.0)))
+    put(whole := skops_io.dumps(np.arange(3.0)))
     with zipfile.ZipFile(io.BytesIO(whole)) as source, zipfile.ZipFile(changed, "w") as target:
         for name in source.namelist():
             target.writestr(name, objects.getvalue() if name.endswith(".npy") else source.read(name))
-    put(model_dir, changed.getvalue())
+    put(changed.getvalue())
     with pytest.raises(ModelError, match="cannot be loaded"):
         read_model(model_dir)
     assert not marker.exists()
@@ -117,7 +133,7 @@ def test_nothing_is_ever_unpickled(model_dir, tmp_path):
     assert marker.is_dir()  # the test can fail
 
 
-@pytest.mark.parametrize("missing", [MODEL_FILE, INFO_FILE])
+@pytest.mark.parametrize("missing", [MODEL_FILE, MANIFEST_FILE])
 def test_a_folder_that_lacks_a_file_holds_no_model(model_dir, missing):
     (model_dir / missing).unlink()
     with pytest.raises(
@@ -126,32 +142,47 @@ def test_a_folder_that_lacks_a_file_holds_no_model(model_dir, missing):
         read_model(model_dir)
 
 
+def changed(document, **info):
+    return json.dumps(document | {"info": document["info"] | info})
+
+
 @pytest.mark.parametrize(
     ("change", "fault"),
     [
-        (lambda info: "{", "is damaged"),
-        (lambda info: "[]", "is damaged"),
+        (lambda it: "{", "is damaged"),
+        (lambda it: "[]", "is damaged"),
+        (lambda it: json.dumps({"version": 3, "info": it["info"]}), r"is damaged \(files: Field required\)"),
+        (lambda it: json.dumps(it | {"version": 99}), "has version 99; version 3 is read here"),
+        (lambda it: json.dumps(it | {"version": ["x"] * 10**5}), "has version"),
+        (lambda it: json.dumps(it | {"files": {}}), "its list of files is not that of a model"),
+        (lambda it: json.dumps(it | {"files": {**it["files"], "../x": "a"}}), "its list of files is not"),
+        (lambda it: json.dumps(it | {"files": {MODEL_FILE: "5"}}), r"is damaged \(SHA-256"),
+        (lambda it: changed(it, window_s="two"), "is damaged"),
+        (lambda it: changed(it, classes=["grass", 3]), r"info\.classes\.1: Input should be a valid string"),
+        (lambda it: changed(it, classes="grass"), "info.classes: Input should be a valid"),
         (
-            lambda info: json.dumps({k: v for k, v in info.items() if k != "sha256"}),
-            r"is damaged \('sha256'\)",
+            lambda it: changed(it, classes=["ice", "mud", "sand"], support=None),
+            "its classes are not those of the manifest",
         ),
-        (lambda info: json.dumps(info | {"version": 99}), "has version 99; version 2 is read here"),
-        (lambda info: json.dumps(info | {"window_s": "two"}), "is damaged"),
-        (lambda info: json.dumps(info | {"classes": ["grass", 3]}), "is no list of texts"),
-        (lambda info: json.dumps(info | {"classes": "grass"}), "is no list of texts"),
-        (lambda info: json.dumps(info | {"window_s": -2.0}), r"is damaged \(window length_s is -2\.0"),
-        (lambda info: json.dumps(info | {"steady": {"speed": 1}}), "is damaged"),
-        (lambda info: json.dumps(info | {"sha256": 5}), r"is damaged \(SHA-256"),
+        (lambda it: changed(it, window_s=-2.0), r"is damaged \(window length_s is -2\.0"),
+        (lambda it: changed(it, window_s=10**400), "more than 64 bits"),
+        (lambda it: changed(it, window_s=float("nan")), "holds NaN, finite numbers"),
+        (lambda it: changed(it, steady={"a\nb": 1}), "is damaged"),
+        (lambda it: changed(it, rate_hz=dict.fromkeys(it["info"]["rate_hz"], 1e308)), "is damaged"),
+        (lambda it: changed(it, channels={"imu": ["gyro_x_radps"]}), "cannot be loaded"),
+        (lambda it: "[" * 100_000, r"is damaged \(is nested deeper than 32 levels\)"),
     ],
 )
-def test_a_spoilt_sidecar_is_named(model_dir, change, fault):
-    file = model_dir / INFO_FILE
+def test_a_manifest_of_a_stranger_is_one_sentence(model_dir, change, fault):
+    file = model_dir / MANIFEST_FILE
     file.write_text(change(json.loads(file.read_text())))
-    with pytest.raises(ModelError, match=fault):
+    with pytest.raises(ModelError, match=fault) as error:
         read_model(model_dir)
+    assert str(error.value).isprintable()
+    assert len(str(error.value)) < 600
 
 
-@pytest.mark.parametrize("name", [MODEL_FILE, INFO_FILE])
+@pytest.mark.parametrize("name", [MODEL_FILE, MANIFEST_FILE])
 def test_a_link_out_of_the_model_folder_is_refused(model_dir, tmp_path, name):
     (model_dir / name).rename(tmp_path / name)
     (model_dir / name).symlink_to(tmp_path / name)
@@ -163,39 +194,19 @@ def test_a_link_out_of_the_model_folder_is_refused(model_dir, tmp_path, name):
     read_model(tmp_path / "link")
 
 
-@pytest.mark.parametrize(
-    ("change", "fault"),
-    [
-        (lambda info: "[" * 100_000, r"is damaged \(is nested deeper than 32 levels\)"),
-        (lambda info: json.dumps(info | {"window_s": 10**400}), "more than 64 bits"),
-        (lambda info: json.dumps(info | {"window_s": float("nan")}), "holds NaN, finite numbers"),
-        (lambda info: json.dumps(info | {"rate_hz": dict.fromkeys(info["rate_hz"], 1e308)}), "is damaged"),
-        (lambda info: json.dumps(info | {"steady": {"a\nb": 1}}), "is damaged"),
-        (lambda info: json.dumps(info | {"version": ["x"] * 10**5}), "has version"),
-    ],
-)
-def test_a_sidecar_of_a_stranger_is_one_sentence(model_dir, change, fault):
-    file = model_dir / INFO_FILE
-    file.write_text(change(json.loads(file.read_text())))
-    with pytest.raises(ModelError, match=fault) as error:
-        read_model(model_dir)
-    assert str(error.value).isprintable()
-    assert len(str(error.value)) < 500
-
-
-def test_an_archive_that_unpacks_to_gigabytes_or_nests_deep_is_refused(model_dir, monkeypatch):
-    monkeypatch.setattr("pipelines.models.model_files.MAX_UNPACKED_BYTES", 1 << 24)
+def test_an_archive_that_unpacks_to_gigabytes_or_nests_deep_is_refused(model_dir, put, monkeypatch):
+    monkeypatch.setattr("pipelines.learn.model_file.MAX_UNPACKED_BYTES", 1 << 24)
     for content, fault in ((b" " * (1 << 20), "unpacks to"), (b"[" * 100_000, "cannot be loaded")):
         packed = io.BytesIO()
         with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
             for number in range(17 if fault == "unpacks to" else 1):
                 archive.writestr(f"{number}.bin" if number else "schema.json", content)
-        put(model_dir, packed.getvalue())
+        put(packed.getvalue())
         with pytest.raises(ModelError, match=fault):
             read_model(model_dir)
 
 
-def test_damaged_members_of_an_archive_end_in_one_sentence(model_dir):
+def test_damaged_members_of_an_archive_end_in_one_sentence(model_dir, put):
     """The bytes inside of the archive, which its own checksums then do not cover."""
     with zipfile.ZipFile(model_dir / MODEL_FILE) as source:
         members = {name: source.read(name) for name in source.namelist()}
@@ -210,10 +221,45 @@ def test_damaged_members_of_an_archive_end_in_one_sentence(model_dir):
         with zipfile.ZipFile(packed, "w") as target:
             for name, whole in members.items():
                 target.writestr(name, bytes(content) if name == hit else whole)
-        put(model_dir, packed.getvalue())
+        put(packed.getvalue())
         try:
             read_model(model_dir)
         except ModelError as error:
             refusals.append(str(error))
     assert len(refusals) > 10
     assert all(sentence.isprintable() for sentence in refusals)
+
+
+def test_an_estimator_of_ones_own_is_refused_before_it_is_stored(model_dir, tmp_path):
+    model = read_model(model_dir)
+    recipe = WindowPipeline([*model.recipe.steps[:-1], ("classifier", Foreign())])
+    with pytest.raises(
+        ModelError, match="Foreign cannot be stored: a model holds estimators of scikit-learn"
+    ):
+        write_model(tmp_path, model._replace(recipe=recipe))
+    assert not list(tmp_path.glob("*.*"))
+
+
+class Foreign(LogisticRegression):
+    """Of no library."""
+
+
+def test_the_table_of_a_pyfunc_gives_the_probabilities_of_the_windows(model_dir, runs):
+    model = load_model(str(model_dir))
+    windows = cut_windows(runs, model.rule).windows[:5]
+    table = pd.DataFrame(
+        {
+            f"{stream}.{name}": list(samples[:, place])
+            for stream, samples in dict(windows.values).items()
+            for place, name in enumerate(windows.channels[stream])
+        }
+    )
+    found = WindowProbabilities(model).predict(table)
+    assert found.columns.tolist() == list(model.info.classes)
+    assert np.array_equal(found.to_numpy(), model.recipe.predict_proba(windows))
+
+
+@pytest.mark.parametrize("uri", ["nothing", "s3:/x", "a" * 5000])
+def test_what_is_no_model_is_one_sentence(uri):
+    with pytest.raises(ModelError, match=r"neither a folder nor a model URI|cannot be opened"):
+        load_model(uri)

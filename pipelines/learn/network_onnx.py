@@ -1,8 +1,9 @@
-"""A network as an ONNX file, for programs that classify without this package: windows in, probabilities out.
+"""A fitted network as an ONNX file, which is the one form it is stored in: windows in, probabilities out.
 
 The graph has one input a stream, ``(windows, channels, samples)`` as they were measured, missing ones NaN,
 and one output, ``(windows, classes)``.  Channels, rates, length and classes are in the file's metadata.  It
-is the computation of :mod:`terrain.classify.network_numbers`, step by step.
+is the computation of :mod:`terrain.classify.network_numbers`, step by step; this package reads the numbers
+back from it, and other programs run it as it is.
 """
 
 from __future__ import annotations
@@ -10,8 +11,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -24,14 +24,9 @@ from terrain.classify.network_numbers import (
     SampleColumns,
     fourier_kernel,
 )
-from terrain.classify.stack_numbers import stack_of
-from terrain.errors import ConfigError
+from terrain.errors import ConfigError, DataError
 from terrain.records import Array, Windows
 
-if TYPE_CHECKING:
-    from pipelines.learn.recipes import WindowPipeline
-
-ONNX_FILE = "network.onnx"
 OPSET = 17
 IR_VERSION = 8
 OUTPUT = "probabilities"
@@ -42,7 +37,7 @@ def require_onnx() -> Any:
     try:
         import onnx
     except ModuleNotFoundError as error:
-        raise ConfigError("a network is exported with onnx: pip install 'terrain-slip[cnn]'") from error
+        raise ConfigError("a network is stored as ONNX: pip install 'terrain-slip[cnn]'") from error
     return onnx
 
 
@@ -55,10 +50,10 @@ class _Graph:
         self.nodes: list[Any] = []
         self.constants: list[Any] = []
 
-    def constant(self, array: Any) -> str:
+    def constant(self, array: Any, name: str = "") -> str:
         values = np.asarray(array)
         values = values.astype(np.float32) if values.dtype.kind == "f" else values
-        name = f"c{len(self.constants)}"
+        name = name or f"c{len(self.constants)}"
         self.constants.append(self.numpy_helper.from_array(np.ascontiguousarray(values), name))
         return name
 
@@ -101,9 +96,9 @@ def network_onnx(numbers: NetworkNumbers, matrix: FeatureMatrix, classes: Sequen
         pooled += _branch(graph, columns, branch, _filled(graph, columns.stream, centred, fill))
     joined = graph.step("Concat", *pooled, axis=2)
     column = graph.step("Unsqueeze", joined, graph.constant(np.array([3])))
-    product = graph.step("MatMul", graph.constant(numbers.head_weight), column)
+    product = graph.step("MatMul", graph.constant(numbers.head_weight, "head_weight"), column)
     flat = graph.step("Squeeze", product, graph.constant(np.array([3])))
-    logits = graph.step("Add", flat, graph.constant(numbers.head_bias))
+    logits = graph.step("Add", flat, graph.constant(numbers.head_bias, "head_bias"))
     mean = graph.step("ReduceMean", graph.step("LogSoftmax", logits, axis=2), axes=[1], keepdims=0)
     tempered = graph.step("Div", mean, graph.constant(np.array(numbers.temperature)))
     graph.step("Softmax", tempered, output=OUTPUT, axis=1)
@@ -131,6 +126,7 @@ def _metadata(
         "streams": json.dumps(streams),
         "length_s": json.dumps(matrix.length_s),
         "members": json.dumps(n_members),
+        "temperature": repr(float(numbers.temperature)),
     }
 
 
@@ -139,7 +135,7 @@ def _filled(graph: _Graph, stream: str, centred: Sequence[bool], fill: Array) ->
     mask = graph.constant(np.array(centred)[:, None])
     mean = graph.step("Where", mask, graph.mean(stream, 2), graph.constant(np.array(0.0)))
     values = graph.step("Sub", stream, mean)
-    return graph.step("Where", graph.step("IsNaN", values), graph.constant(fill), values)
+    return graph.step("Where", graph.step("IsNaN", values), graph.constant(fill, f"{stream}.fill"), values)
 
 
 def _branch(graph: _Graph, columns: SampleColumns, branch: BranchNumbers, values: str) -> list[str]:
@@ -161,23 +157,27 @@ def _branch(graph: _Graph, columns: SampleColumns, branch: BranchNumbers, values
         cosine, sine = (graph.step("Slice", squares, parts[i], parts[i + 1], axis) for i in (0, 1))
         n_frames = (columns.n_samples - frame) // columns.hop + 1
         power = graph.shaped(graph.step("Add", cosine, sine), (-1, c, half, n_frames))
-        values = graph.step("Log", graph.step("Add", power, graph.constant(branch.floor[:, None, None])))
+        floor = graph.constant(branch.floor[:, None, None], f"{columns.stream}.floor")
+        values = graph.step("Log", graph.step("Add", power, floor))
     else:
         values = graph.shaped(values, (-1, c, 1, columns.n_samples))
-    scaled = graph.step("Sub", values, graph.constant(branch.mean[:, :, None]))
-    scaled = graph.step("Div", scaled, graph.constant(branch.std[:, :, None]))
+    scaled = graph.step("Sub", values, graph.constant(branch.mean[:, :, None], f"{columns.stream}.mean"))
+    scaled = graph.step("Div", scaled, graph.constant(branch.std[:, :, None], f"{columns.stream}.std"))
     limits = [graph.constant(np.array(limit)) for limit in (-CLIP_STD, CLIP_STD)]
     rows = graph.shaped(
         graph.step("Clip", scaled, *limits),
         (0, branch.mean.size, n_frames if frame else columns.n_samples),
     )
     found = rows
-    for weight, bias, groups in (
-        (branch.weight_1, branch.bias_1, 1),
-        (branch.weight_2, branch.bias_2, n_members),
+    for number, weight, bias, groups in (
+        (1, branch.weight_1, branch.bias_1, 1),
+        (2, branch.weight_2, branch.bias_2, n_members),
     ):
-        kernel = graph.constant(weight.reshape(n_members * hidden, *weight.shape[2:]))
-        found = graph.step("Conv", found, kernel, graph.constant(bias.ravel()), pads=[1, 1], group=groups)
+        kernel = graph.constant(
+            weight.reshape(n_members * hidden, *weight.shape[2:]), f"{columns.stream}.weight_{number}"
+        )
+        offset = graph.constant(bias.ravel(), f"{columns.stream}.bias_{number}")
+        found = graph.step("Conv", found, kernel, offset, pads=[1, 1], group=groups)
         found = graph.step("Relu", found)
     each = (-1, n_members, hidden)
     pooled = [
@@ -193,20 +193,58 @@ def _branch(graph: _Graph, columns: SampleColumns, branch: BranchNumbers, values
     return pooled
 
 
-def write_onnx(folder: Path, recipe: WindowPipeline) -> None:
-    """Write ``network.onnx`` beside a fitted recipe that has a network; errors as :func:`network_onnx`."""
-    network = stack_of(recipe[-1].numbers()).network
-    if network is not None:
-        content = network_onnx(network, recipe[0].matrix, recipe.classes_.tolist())
-        (folder / ONNX_FILE).write_bytes(content)
+def numbers_of_onnx(content: bytes, columns: Sequence[SampleColumns]) -> NetworkNumbers:
+    """Return the numbers of a network out of the ONNX file that it is stored in.
+
+    Parameters
+    ----------
+    content : as :func:`network_onnx` returns it
+    columns : that the network was fitted to
+
+    Raises
+    ------
+    ConfigError
+        if onnx is not installed.
+    DataError
+        if it is no such file; shapes are compared by :func:`terrain.classify.network_numbers.check_network`.
+    """
+    onnx = require_onnx()
+    try:
+        model = onnx.load_from_string(content)
+        found = {each.name: onnx.numpy_helper.to_array(each) for each in model.graph.initializer}
+        described = {each.key: each.value for each in model.metadata_props}
+        n_members = int(described["members"])
+        branches, fill = [], []
+        for each in columns:
+            named = {name: found.get(f"{each.stream}.{name}") for name in ("fill", *BranchNumbers._fields)}
+            if not each.frame:  # of samples, which have no spectrum
+                named["floor"] = np.zeros(len(each.channels), np.float32)
+            part = {name: np.asarray(array) for name, array in named.items()}
+            fill.append(part["fill"].ravel())
+            of_members = [
+                part[name].reshape(n_members, -1, *part[name].shape[1:]) for name in BranchNumbers._fields[3:]
+            ]
+            branches.append(
+                BranchNumbers(part["floor"].ravel(), part["mean"][..., 0], part["std"][..., 0], *of_members)
+            )
+        return NetworkNumbers(
+            tuple(columns),
+            np.concatenate(fill).astype(float),
+            tuple(branches),
+            found["head_weight"],
+            found["head_bias"],
+            float(described["temperature"]),
+        )
+    except Exception as error:  # whatever a damaged file leads protobuf and numpy to
+        raise DataError(str(error) or type(error).__name__) from error
 
 
-def time_of_onnx(file: Path, window: Windows, n: int) -> Array | None:
+def time_of_onnx(content: bytes, window: Windows, n: int) -> Array | None:
     """Return how long (n,) in s one window takes on one core; None where onnxruntime is not installed.
 
     Parameters
     ----------
-    file : that :func:`write_onnx` wrote
+    content : of the file
     window : a single one, with the channels of the file
     n : repetitions, after a first one
     """
@@ -216,7 +254,7 @@ def time_of_onnx(file: Path, window: Windows, n: int) -> Array | None:
         return None
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
-    session = onnxruntime.InferenceSession(file.read_bytes(), options, providers=["CPUExecutionProvider"])
+    session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
     streams = json.loads(session.get_modelmeta().custom_metadata_map["streams"])
     inputs = {}
     for stream, described in streams.items():

@@ -1,4 +1,4 @@
-"""Models with a network: by scikit-learn, by their numbers and by ONNX they classify alike."""
+"""A network is stored as ONNX: read back it gives the same bytes, and another program the same figures."""
 
 import json
 import sys
@@ -11,17 +11,10 @@ import pytest
 from skops import io
 
 from features.windows import WindowRule, cut_windows
+from pipelines.learn.model_file import MODEL_FILE, ONNX_FILE, TRUSTED_TYPES, read_model, seal, write_model
+from pipelines.learn.network_onnx import network_onnx, time_of_onnx
 from pipelines.learn.recipes import feature_matrix, inform, make_recipe
-from pipelines.models.lean import NUMBERS_FILE, LeanRecipe, read_numbers, write_numbers
-from pipelines.models.model_files import (
-    MODEL_FILE,
-    TRUSTED_TYPES,
-    read_lean_model,
-    read_model,
-    write_info,
-)
-from pipelines.models.onnx_file import ONNX_FILE, network_onnx, time_of_onnx, write_onnx
-from terrain.errors import ConfigError, DataError, ModelError
+from terrain.errors import ConfigError, ModelError
 
 
 @pytest.fixture(scope="module")
@@ -52,11 +45,7 @@ def fitted(request, windows):
 @pytest.fixture
 def folder(fitted, model_dir):
     """A model folder with the fitted recipe in it."""
-    info = read_model(model_dir).info
-    io.dump(fitted, model_dir / MODEL_FILE)
-    write_numbers(model_dir, fitted)
-    write_onnx(model_dir, fitted)
-    write_info(model_dir, info)
+    write_model(model_dir, read_model(model_dir)._replace(recipe=fitted, novelty=None))
     return model_dir
 
 
@@ -64,9 +53,6 @@ def folder(fitted, model_dir):
 def test_a_model_read_back_gives_the_same_bytes(folder, fitted, windows):
     desired = fitted.predict_proba(windows)
     assert np.array_equal(read_model(folder).recipe.predict_proba(windows), desired)
-    lean = read_lean_model(folder).recipe
-    assert isinstance(lean, LeanRecipe)
-    np.testing.assert_allclose(lean.predict_proba(windows), desired, atol=1e-12)
     assert set(io.get_untrusted_types(file=folder / MODEL_FILE)) <= set(TRUSTED_TYPES)
 
 
@@ -93,7 +79,7 @@ def test_onnx_computes_the_network(folder, fitted, windows):
     described = session.get_modelmeta().custom_metadata_map
     assert json.loads(described["classes"]) == fitted.classes_.tolist()
     assert json.loads(described["streams"])["imu"]["channels"] == list(windows.channels["imu"])
-    times_s = time_of_onnx(folder / ONNX_FILE, windows[0], 3)
+    times_s = time_of_onnx((folder / ONNX_FILE).read_bytes(), windows[0], 3)
     assert times_s.shape == (3,)
     assert (times_s > 0).all()
 
@@ -118,38 +104,41 @@ def test_a_damaged_onnx_file_is_refused_in_one_sentence(folder):
     content = bytearray(file.read_bytes())
     content[len(content) // 2] ^= 1
     file.write_bytes(content)
-    for read in (read_model, read_lean_model):
-        with pytest.raises(ModelError, match=r"network\.onnx: is damaged"):
-            read(folder)
+    with pytest.raises(ModelError, match=r"network\.onnx: is damaged"):
+        read_model(folder)
 
 
 @with_network
 def test_numbers_of_a_network_that_a_checksum_covers_up_end_in_one_sentence(folder):
-    file, info = folder / NUMBERS_FILE, read_model(folder).info
-    with np.load(file) as arrays:
-        whole = {name: arrays[name] for name in arrays.files}
-    for name in [name for name in whole if name.startswith(("network_", "joint_"))]:
-        for array in (None, np.zeros(7), np.full_like(whole[name], np.nan), np.array("text")):
-            found = {key: each for key, each in whole.items() if key != name}
-            np.savez(file, **(found if array is None else found | {name: array}))
-            write_info(folder, info)
-            with pytest.raises(ModelError, match="cannot be loaded") as refusal:
-                read_lean_model(folder)
+    file, info = folder / ONNX_FILE, read_model(folder).info
+    whole = file.read_bytes()
+    names = [
+        each.name for each in onnx.load_from_string(whole).graph.initializer if not each.name[1:].isdigit()
+    ]
+    assert len(names) > 10
+    for name in names:
+        for array in (None, np.zeros(7, np.float32), ...):
+            model = onnx.load_from_string(whole)
+            (place,) = [i for i, each in enumerate(model.graph.initializer) if each.name == name]
+            values = onnx.numpy_helper.to_array(model.graph.initializer[place])
+            del model.graph.initializer[place]
+            if array is not None:
+                other = np.full_like(values, np.nan) if array is ... else array
+                model.graph.initializer.append(onnx.numpy_helper.from_array(other, name))
+            file.write_bytes(model.SerializeToString())
+            seal(folder, info)
+            with pytest.raises(ModelError, match=r"network\.onnx: cannot be loaded") as refusal:
+                read_model(folder)
             assert len(str(refusal.value).splitlines()) == 1
-    np.savez(
-        file, **{name: array for name, array in whole.items() if name not in ("vectors", "joint_weights")}
-    )
-    with pytest.raises(DataError, match="holds no whole classifier"):
-        read_numbers(file.read_bytes(), info)
 
 
-def test_without_onnx_there_is_one_sentence(windows, monkeypatch, tmp_path):
+def test_without_onnx_there_is_one_sentence(windows, monkeypatch):
     recipe = quick("cnn").fit(windows, windows.terrain.astype(str))
     monkeypatch.setitem(sys.modules, "onnx", None)
     with pytest.raises(ConfigError, match="pip install"):
         network_onnx(recipe[-1].numbers(), recipe[0].matrix, ["a"])
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    assert time_of_onnx(tmp_path / ONNX_FILE, windows[0], 1) is None
+    assert time_of_onnx(b"", windows[0], 1) is None
 
 
 def test_only_a_classifier_of_samples_is_informed_of_columns(windows):
