@@ -28,5 +28,8 @@ COMMANDS: tuple[Command, ...] = (
     Command("Data", "simulate", "pipelines.data.simulate", "runs of a described robot"),
 )
 
-FORMER: dict[str, str] = {"model": "use terrain inspect MODEL"}
+FORMER: dict[str, str] = {
+    "model": "use terrain inspect MODEL",
+    "reproduce": "use python examples/papers PAPER, in the repository",
+}
 """Former command: a sentence that names its successor."""

@@ -17,7 +17,6 @@ from pipelines.cli import (
     label,
     quickstart,
     replay,
-    reproduce,
     runs,
     serve,
     slip,
@@ -37,7 +36,7 @@ app = typer.Typer(
 GROUPS = (
     *(runs.app, export.app, estimate.app, features.app, classify.app, slip.app, soil.app, drive.app),
     *(replay.app, serve.app, can.app, label.app),
-    *(faults.app, explain.app, reproduce.app, quickstart.app, track.app),
+    *(faults.app, explain.app, quickstart.app, track.app),
 )
 """Files of commands, in the order of help."""
 

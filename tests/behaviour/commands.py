@@ -40,7 +40,6 @@ COMMANDS = (
         "explain",
         "explain-trials",
         "quickstart",
-        "reproduce",
         "track",
     ),
     *("replay", "label", "serve", "bench"),
@@ -436,8 +435,6 @@ CASES: tuple[Case, ...] = (
             refused("learn-slip --robot warthog --data raw --out other.yaml"),
         ),
     ),
-    Case("reproduce", steps("reproduce danzi --out page")),
-    Case("reproduce_tazzari", steps("reproduce tazzari --out page")),
     Case(
         "track",
         steps(

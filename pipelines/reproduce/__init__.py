@@ -1,1 +1,0 @@
-"""``terrain reproduce``: one folder a paper."""

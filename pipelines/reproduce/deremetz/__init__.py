@@ -1,1 +1,0 @@
-"""Deremetz et al., ICRA 2017."""

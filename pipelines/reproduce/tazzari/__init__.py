@@ -1,1 +1,0 @@
-"""The experiments of Tazzari et al., An adaptive observer approach to slip estimation, in simulation."""

@@ -1,1 +1,0 @@
-"""Eight terrains by stiffness on simulated runs, by the protocol of the AgriMaRo thesis."""
