@@ -109,6 +109,20 @@ def read_windows(run_folder: Path) -> list[RecordedWindow] | None:
         raise LogError(f"{short_name(path)}: is damaged ({type(error).__name__}: {error})") from error
 
 
+def window_of_text(place: str, text: str) -> RecordedWindow:
+    """Return a window of its entry as JSON, as a bag has it.
+
+    Raises
+    ------
+    LogError
+        if it is damaged.
+    """
+    try:
+        return _window(json.loads(text))
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+        raise LogError(f"{place}: a recorded window is damaged ({type(error).__name__}: {error})") from error
+
+
 def _window(entry: Mapping[str, Any]) -> RecordedWindow:
     return RecordedWindow(
         float(entry["start_s"]),

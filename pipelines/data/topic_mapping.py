@@ -33,8 +33,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field, FiniteFloat, ValidationError
 
-from pipelines.messages.definitions import short_type
-from pipelines.messages.storage import Topic
+from pipelines.data.bag_files import short_type
+from pipelines.data.faults import Topic
 from terrain.errors import ConfigError, LogError
 from terrain.files.documents import read_yaml
 from terrain.files.names import check_name, listed, plain_name
@@ -42,12 +42,13 @@ from terrain.files.resources import data_folder
 from terrain.logs.mapping import Strict, Unit, Word, check_unit, first_fault
 from terrain.logs.schema import unit_of
 
-Kind = Literal["fields", "imu", "joints", "odometry", "twist"]
+Kind = Literal["fields", "imu", "joints", "odometry", "pose", "twist"]
 
 TYPES: Map[str, tuple[str, ...]] = {
     "imu": ("sensor_msgs/Imu",),
     "joints": ("sensor_msgs/JointState",),
     "odometry": ("nav_msgs/Odometry",),
+    "pose": ("geometry_msgs/PoseStamped", "geometry_msgs/PoseWithCovarianceStamped"),
     "twist": ("geometry_msgs/Twist", "geometry_msgs/TwistStamped"),
 }
 """Types of the messages of each kind."""

@@ -1,0 +1,379 @@
+"""Files of messages: where bags lie in a folder, what reads each, and how its messages are decoded.
+
+MCAP is read by :mod:`pipelines.data.mcap_file`, the SQLite of ROS 2 and bags of ROS 1 by rosbags.  Messages
+are decoded by rosbags (CDR, ROS 1), mcap-protobuf-support or :mod:`json`.
+"""
+
+from __future__ import annotations
+
+import bz2
+import json
+import sqlite3
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+from urllib.parse import quote
+
+from pipelines.data.faults import DAMAGED_BLOCK, EARLY_END, MISSING_PACKAGE, Faults, Topic
+from pipelines.data.mcap_file import MAGIC, MAX_RECORD_BYTES, McapReader
+from pipelines.data.standard_messages import DISTRO
+from terrain.errors import ConfigError, LogError, TerrainError
+from terrain.files.documents import read_yaml
+from terrain.files.names import shown
+from terrain.logs.log_files import check_log_file, short_name
+
+METADATA = "metadata.yaml"
+SUFFIXES = (".mcap", ".db3", ".bag")
+
+ROS1_MAGIC = b"#ROSBAG V2.0\n"
+SQLITE_MAGIC = b"SQLite format 3\0"
+ACCEPTED = "MCAP, SQLite of ROS 2 (.db3) and bags of ROS 1 (.bag, version 2.0) are read"
+
+ENCODINGS = "cdr, ros1, protobuf and json are read"
+
+MAX_DEFINITION_CHARACTERS = 1 << 18
+MAX_ELEMENTS = 10_000
+"""Bounds of a definition: those of ROS have a few hundred characters, and arrays of a few messages."""
+
+
+class Bag(NamedTuple):
+    """A bag: its files in order, and what names it.
+
+    Parameters
+    ----------
+    path : the file, or the folder with ``metadata.yaml``
+    files : with messages
+    distro : release of ROS 2 that wrote it, as rosbags names it; empty where unknown
+    """
+
+    path: Path
+    files: tuple[Path, ...]
+    distro: str = ""
+
+
+class Reader(Protocol):
+    """One file of messages."""
+
+    def topics(self) -> list[Topic]:
+        """Return the topics that it has."""
+        ...
+
+    def messages(self, names: frozenset[str]) -> Iterator[tuple[str, int, bytes]]:
+        """Yield topic, log time in ns and content of the messages of some topics."""
+        ...
+
+
+def short_type(name: str) -> str:
+    """Return the name of a type without its middle part.
+
+    Examples
+    --------
+    >>> short_type("sensor_msgs/msg/Imu")
+    'sensor_msgs/Imu'
+    """
+    parts = name.split("/")
+    return f"{parts[0]}/{parts[-1]}" if len(parts) == 3 else name
+
+
+def find_bags(place: Path) -> list[Path]:
+    """Return the bags under a folder, sorted: folders with ``metadata.yaml``, and files in no such folder.
+
+    Parameters
+    ----------
+    place : a folder, a bag's folder or a file
+    """
+    if place.is_file():
+        return [place] if place.suffix.lower() in SUFFIXES else []
+    folders = {path.parent for path in place.rglob(METADATA) if _is_description(path)}
+    files = {
+        path
+        for path in place.rglob("*")
+        if path.suffix.lower() in SUFFIXES
+        and path.is_file()
+        and path.parent not in folders
+        and not any(part.startswith(".") for part in path.relative_to(place).parts)
+    }
+    return sorted(folders | files)
+
+
+def _is_description(path: Path) -> bool:
+    """Return whether a file is the description of a bag; other programs have files of that name."""
+    try:
+        with path.open("rb") as file:
+            return b"rosbag2_bagfile_information" in file.read(4096)
+    except OSError:
+        return False
+
+
+def open_bag(path: Path) -> Bag:
+    """Return what a bag consists of.
+
+    Raises
+    ------
+    LogError
+        if its description is damaged, its messages are compressed one by one, or a file is missing.
+    """
+    if path.is_file():
+        return Bag(path, (check_log_file(path, path.parent),))
+    place = short_name(path / METADATA)
+    document = read_yaml(check_log_file(path / METADATA, path))
+    head = document.get("rosbag2_bagfile_information") if isinstance(document, dict) else None
+    names = head.get("relative_file_paths") if isinstance(head, dict) else None
+    if (
+        not isinstance(head, dict)
+        or not isinstance(names, list)
+        or not all(isinstance(n, str) for n in names)
+    ):
+        raise LogError(f"{place}: does not list the files of the bag")
+    if head.get("compression_mode"):
+        raise LogError(
+            f"{place}: the bag is compressed by {shown(head['compression_mode'])}, which is not read: "
+            f"'ros2 bag convert' writes it without, or as MCAP"
+        )
+    files = tuple(check_log_file(path / name, path) for name in names)
+    if not files or any(file.suffix.lower() not in SUFFIXES for file in files):
+        raise LogError(f"{place}: lists {shown(names)}, files {' or '.join(SUFFIXES)} are required")
+    distro = head.get("ros_distro")
+    return Bag(path, files, f"ROS2_{distro.upper()}" if isinstance(distro, str) else "")
+
+
+def reader_of(path: Path, faults: Faults) -> Reader:
+    """Return the reader of a file of messages, by its first bytes.
+
+    Raises
+    ------
+    LogError
+        if it is of an unknown type.
+    """
+    try:
+        with path.open("rb") as file:
+            begin = file.read(len(SQLITE_MAGIC))
+    except OSError as error:
+        raise LogError(f"{short_name(path)}: cannot be opened ({error.strerror or error})") from error
+    if begin.startswith(MAGIC):
+        return McapReader(path, faults)
+    if begin.startswith((ROS1_MAGIC, SQLITE_MAGIC)):
+        return RosbagsReader(path, faults, is_ros1=begin.startswith(ROS1_MAGIC))
+    what = f"begins with {begin[:12]!r}" if begin else "is empty"
+    raise LogError(f"{short_name(path)}: {what}, which is no bag of a known type: {ACCEPTED}")
+
+
+class RosbagsReader:
+    """A bag of ROS 1 or a storage file of ROS 2 in SQLite, by rosbags.
+
+    Parameters
+    ----------
+    path : of the file
+    faults : gets what is damaged
+    is_ros1 : which of the two
+    """
+
+    def __init__(self, path: Path, faults: Faults, *, is_ros1: bool) -> None:
+        self._path, self._faults, self._place, self._is_ros1 = path, faults, short_name(path), is_ros1
+
+    def _open(self) -> Any:
+        try:
+            from rosbags.rosbag1 import Reader as Ros1Reader
+            from rosbags.rosbag2 import Reader as Ros2Reader
+        except ImportError as error:
+            raise ConfigError(MISSING_PACKAGE) from error
+        try:
+            if not self._is_ros1:
+                self._refuse_views()
+            reader = Ros1Reader(self._path) if self._is_ros1 else Ros2Reader(self._path)
+            reader.open()
+        except TerrainError:
+            raise
+        except Exception as error:  # whatever the library makes of a damaged file
+            raise LogError(f"{self._place}: is damaged ({_sentence(error)})") from error
+        if self._is_ros1:
+            for position, chunk in reader.chunks.items():
+                reader.chunks[position] = chunk._replace(decompressor=_bounded(chunk.decompressor))
+        return reader
+
+    def _refuse_views(self) -> None:
+        """Refuse a database whose messages are a view: to look into it could take forever."""
+        query = (
+            "select count(*) from sqlite_master where name in ('topics', 'messages') "
+            "and type = 'table' and sql not like '%virtual%'"
+        )
+        place = f"file:{quote(str(self._path.absolute()))}?mode=ro&immutable=1"
+        with closing(sqlite3.connect(place, uri=True)) as store:
+            if store.execute(query).fetchone()[0] != 2:
+                raise LogError(f"{self._place}: is no bag, it lacks the tables 'topics' and 'messages'")
+
+    def topics(self) -> list[Topic]:
+        """Return the topics.
+
+        Raises
+        ------
+        LogError
+            if the file is damaged, or a topic has two types.
+        """
+        with closing(self._open()) as reader:
+            found: dict[str, Topic] = {}
+            for each in reader.connections:
+                if self._is_ros1:
+                    encoding, schema = "ros1", "ros1msg"
+                else:
+                    encoding, schema = each.ext.serialization_format, f"ros2{each.msgdef.format.name.lower()}"
+                topic = Topic(each.topic, each.msgtype, encoding, schema, each.msgdef.data or "")
+                if found.setdefault(topic.name, topic).kind != topic.kind:
+                    raise LogError(f"{self._place}: topic {shown(topic.name)} has messages of two types")
+        return list(found.values())
+
+    def messages(self, names: frozenset[str]) -> Iterator[tuple[str, int, bytes]]:
+        """Yield topic, log time in ns and content of the messages of some topics, in the order of log times.
+
+        Raises
+        ------
+        LogError
+            if the file is damaged.
+        """
+        with closing(self._open()) as reader:
+            connections = [each for each in reader.connections if each.topic in names]
+            try:
+                for connection, log_ns, content in reader.messages(connections) if connections else ():
+                    yield connection.topic, log_ns, content
+            except ValueError as error:
+                self._faults.found(self._place, DAMAGED_BLOCK, _sentence(error))
+            except Exception as error:  # whatever the library makes of a damaged file
+                self._faults.found(self._place, EARLY_END, f"is damaged ({_sentence(error)})")
+
+
+def _sentence(error: Exception) -> str:
+    return " ".join(str(error).split())[:160] or type(error).__name__
+
+
+def _bounded(decompress: Callable[[bytes], bytes]) -> Callable[[bytes], bytes]:
+    """Return what unpacks a chunk of ROS 1 as the library's function does, but no more than is accepted."""
+
+    def unpack(packed: bytes) -> bytes:
+        if packed[:3] == b"BZh":
+            content = bz2.BZ2Decompressor().decompress(packed, MAX_RECORD_BYTES + 1)
+        elif packed[:4] == b"\x04\x22\x4d\x18":
+            import lz4.frame
+
+            content = bytes(lz4.frame.LZ4FrameDecompressor().decompress(packed, MAX_RECORD_BYTES + 1))
+        else:
+            content = decompress(packed)
+        if len(content) > MAX_RECORD_BYTES:
+            raise ValueError(f"a chunk of {len(packed)} bytes would have more than {MAX_RECORD_BYTES} bytes")
+        return content
+
+    return unpack
+
+
+def topics_of(bag: Bag) -> dict[str, Topic]:
+    """Return the topics of all files of a bag, by name.
+
+    Raises
+    ------
+    LogError
+        if a file is damaged or of an unknown type, or a topic has two types.
+    """
+    found: dict[str, Topic] = {}
+    for file in bag.files:
+        for topic in reader_of(file, Faults(None)).topics():
+            if found.setdefault(topic.name, topic).kind != topic.kind:
+                place = short_name(bag.path)
+                raise LogError(f"{place}: topic {shown(topic.name)} has messages of two types")
+    return found
+
+
+def messages_of(bag: Bag, names: frozenset[str], faults: Faults) -> Iterator[tuple[str, int, bytes]]:
+    """Yield topic, log time in ns and content of the messages of some topics, of one file after another."""
+    for file in bag.files:
+        yield from reader_of(file, faults).messages(names)
+
+
+def decoder_of(place: str, topic: Topic, distro: str) -> Callable[[bytes], Any]:
+    """Return what makes an object (or, of JSON, a dictionary) of a message of a topic.
+
+    Parameters
+    ----------
+    place : of the bag, as messages name it
+    topic : of the bag
+    distro : whose definitions are taken where the file has none
+
+    Raises
+    ------
+    LogError
+        if the encoding is unknown, or the messages are not defined.
+    ConfigError
+        if a package is missing.
+    """
+    at = f"{place}: topic {shown(topic.name)}"
+    if topic.encoding == "json":
+        return json.loads
+    if topic.encoding == "protobuf":
+        return _of_protobuf(at, topic)
+    if topic.encoding not in ("cdr", "ros1"):
+        raise LogError(f"{at} is encoded as {shown(topic.encoding)}; {ENCODINGS}")
+    return _of_ros(at, topic, distro)
+
+
+def _of_protobuf(at: str, topic: Topic) -> Callable[[bytes], Any]:
+    try:
+        from mcap.records import Schema
+        from mcap_protobuf.decoder import DecoderFactory
+    except ImportError as error:
+        missing = MISSING_PACKAGE.replace("rosbags and mcap", "mcap and mcap-protobuf-support")
+        raise ConfigError(missing) from error
+    schema = Schema(1, topic.definition.encode("latin-1", "replace"), topic.schema_encoding, topic.kind)
+    try:
+        decoder: Callable[[bytes], Any] | None = DecoderFactory().decoder_for("protobuf", schema)
+    except Exception as error:  # whatever the library makes of a damaged definition
+        raise LogError(f"{at}: its definition is damaged ({_sentence(error)})") from error
+    if decoder is None:
+        raise LogError(f"{at} has a definition in {shown(topic.schema_encoding)}, 'protobuf' is read")
+    return decoder
+
+
+def _of_ros(at: str, topic: Topic, distro: str) -> Callable[[bytes], Any]:
+    try:
+        from rosbags.interfaces import Nodetype
+        from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+    except ImportError as error:
+        raise ConfigError(MISSING_PACKAGE) from error
+    package, _, name = short_type(topic.kind).partition("/")
+    kind = f"{package}/msg/{name}"
+    store = get_typestore(Stores.__members__.get(distro, Stores[DISTRO]))
+    try:
+        if topic.schema_encoding in ("ros1msg", "ros2msg", "ros2idl") and topic.definition.strip():
+            if len(topic.definition) > MAX_DEFINITION_CHARACTERS:
+                raise LogError(f"{at}: its definition is longer than {MAX_DEFINITION_CHARACTERS} characters")
+            store = get_typestore(Stores.EMPTY)
+            if topic.schema_encoding == "ros2idl":
+                parts = topic.definition.split("=" * 80 + "\n")
+                for part in (each for each in parts if each.strip()):
+                    store.register(
+                        get_types_from_idl(part.partition("\n")[2] if part[:4] == "IDL:" else part)
+                    )
+            else:
+                types = get_types_from_msg(topic.definition, kind)
+                sizes = [d for _, fields in types.values() for _, d in fields if d[0] == Nodetype.ARRAY]
+                unrolled = sum(
+                    size for (node, inner), size in (d[1] for d in sizes) if not _is_number(node, inner)
+                )
+                if unrolled > MAX_ELEMENTS or sum(len(fields) for _, fields in types.values()) > MAX_ELEMENTS:
+                    raise LogError(f"{at}: its definition has more than {MAX_ELEMENTS} fields or elements")
+                store.register(types)
+        if kind not in store.types:
+            raise LogError(f"{at} is of type {shown(topic.kind)}, which is not defined")
+        store.get_msgdef(kind)
+    except TerrainError:
+        raise
+    except RecursionError as error:
+        raise LogError(f"{at}: its definition holds itself, or is too deep") from error
+    except Exception as error:  # whatever the library makes of a damaged definition
+        raise LogError(f"{at}: its definition is damaged ({_sentence(error)})") from error
+    deserialize = store.deserialize_cdr if topic.encoding == "cdr" else store.deserialize_ros1
+    return lambda content: deserialize(content, kind)
+
+
+def _is_number(node: Any, inner: Any) -> bool:
+    from rosbags.interfaces import Nodetype
+
+    return bool(node == Nodetype.BASE and inner[0] != "string")
