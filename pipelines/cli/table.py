@@ -20,6 +20,9 @@ class Command(NamedTuple):
 
 COMMANDS: tuple[Command, ...] = (
     Command(
+        "Data", "convert", "pipelines.data.convert", "logs of any layout <-> run folders, MCAP, ROS bags, CSV"
+    ),
+    Command(
         "Data",
         "inspect",
         "pipelines.cli.inspect",
@@ -29,6 +32,8 @@ COMMANDS: tuple[Command, ...] = (
 )
 
 FORMER: dict[str, str] = {
+    "import": "use terrain convert LOGS --out RUNS",
+    "export": "use terrain convert RUNS --to mcap --out DIR",
     "model": "use terrain inspect MODEL",
     "reproduce": "use python examples/papers PAPER, in the repository",
 }

@@ -11,13 +11,11 @@ from pipelines.cli import (
     drive,
     estimate,
     explain,
-    export,
     faults,
     features,
     label,
     quickstart,
     replay,
-    runs,
     serve,
     slip,
     soil,
@@ -34,7 +32,7 @@ app = typer.Typer(
 )
 
 GROUPS = (
-    *(runs.app, export.app, estimate.app, features.app, classify.app, slip.app, soil.app, drive.app),
+    *(estimate.app, features.app, classify.app, slip.app, soil.app, drive.app),
     *(replay.app, serve.app, can.app, label.app),
     *(faults.app, explain.app, quickstart.app, track.app),
 )

@@ -165,7 +165,7 @@ def _exported_run(
             raise LogError(f"{place}: has more than {MAX_VALUES} values")
     if not messages.get(RUN_TOPIC):
         raise LogError(f"{place}: {RUN_TOPIC} has no message")
-    document = RunDocument(place, str(_text(place, topics[RUN_TOPIC], messages[RUN_TOPIC][-1])))
+    document = RunDocument(place, _text(place, topics[RUN_TOPIC], messages[RUN_TOPIC][-1]))
     document.check(topics)
     if document.head.live or repair:
         return document.run(messages, counted)
@@ -183,8 +183,8 @@ def _text(place: str, topic: Topic, content: bytes) -> str:
     return str(message.data)
 
 
-def recorded_windows(path: Path) -> list[RecordedWindow]:
-    """Return the windows that were recorded with the run of a bag, in their order; empty where none were.
+def recorded_windows(path: Path) -> tuple[str, list[RecordedWindow]] | None:
+    """Return the id of the run of a bag and the windows that were recorded with it; None where none were.
 
     Raises
     ------
@@ -193,11 +193,15 @@ def recorded_windows(path: Path) -> list[RecordedWindow]:
     """
     bag, place = open_bag(path), short_name(path)
     topics = topics_of(bag)
-    if WINDOW_TOPIC not in topics:
-        return []
-    counted = Faults(Counter())
-    contents = [content for _, _, content in messages_of(bag, frozenset((WINDOW_TOPIC,)), counted)]
-    return [window_of_text(place, _text(place, topics[WINDOW_TOPIC], content)) for content in contents]
+    if not {WINDOW_TOPIC, RUN_TOPIC} <= set(topics):
+        return None
+    texts: dict[str, list[str]] = {WINDOW_TOPIC: [], RUN_TOPIC: []}
+    for topic, _, content in messages_of(bag, frozenset(texts), Faults(Counter())):
+        texts[topic].append(_text(place, topics[topic], content))
+    if not texts[RUN_TOPIC]:
+        return None
+    run_id = RunDocument(place, texts[RUN_TOPIC][-1]).head.run_id
+    return run_id, [window_of_text(place, text) for text in texts[WINDOW_TOPIC]]
 
 
 def label_intervals(

@@ -63,7 +63,7 @@ def load_runs(
         MCAP file
     layout : one of ``LAYOUTS``; ``auto`` looks
     mapping : YAML file that describes how to read CSV files (``terrain.logs.mapping``); of logs of a CAN bus
-        their DBC, by default AgriMaRo's; of bags their topics (``pipelines.bags.mapping``)
+        their DBC, by default AgriMaRo's; of bags their topics (``pipelines.data.topic_mapping``)
     repair : drop and count what a strict read refuses, and skip runs that cannot be read at all
     align : bring the wheel stream onto the clock of the IMU where the two clocks can be compared
     robot : the robot of logs that do not name theirs, by name or its YAML file; of those of DRIVE
@@ -220,7 +220,7 @@ def _described(robot: str | Path | None) -> Robot | None:
 def _readers(
     folder: Path, layout: str, mapping: str | Path | None, robot: Robot | None
 ) -> list[Callable[..., RunLog]]:
-    from pipelines.messages.finding import find_bags
+    from pipelines.data.bag_files import find_bags
 
     if layout not in LAYOUTS:
         raise ConfigError(f"layout {layout!r} is unknown: choose one of {', '.join(LAYOUTS)}")
@@ -269,12 +269,12 @@ def _readers(
 
 def _bags(place: Path, mapping: str | Path | None, robot: Robot | None) -> list[Callable[..., RunLog]]:
     """Return the readers of bags; a place without any is refused."""
-    from pipelines.bags import logs
+    from pipelines.data import bag_runs
 
     if not place.exists():
         raise LogError(f"{place}: does not exist; {ACCEPTED}")
     named = place.resolve() if place.is_file() else place  # a file that the user names may be a link
-    return _some(logs.find_runs(named, mapping, robot), place)
+    return _some(bag_runs.find_runs(named, mapping, robot), place)
 
 
 def drive_robot(robot: Robot | None) -> DriveRobot:

@@ -66,8 +66,8 @@ def number_at(topic: str, kind: str, message: Any, path: str) -> Number:
         name, index = found[1], None if found[2] is None else int(found[2])
         fields = field_names(value)
         if name not in fields:
-            had = f" (it has {listed(fields)})" if fields else ""
-            raise ConfigError(f"{place}: {owner} has no {name!r}{had}")
+            lacks = f"has no {name!r} (it has {listed(fields)})" if fields else "has no fields of its own"
+            raise ConfigError(f"{place}: {owner} {lacks}")
         value, owner = _field(value, name), repr(name)
         steps.append(name)
         if is_array(value) == (index is None):

@@ -71,13 +71,6 @@ class InspectSettings(RunsSettings):
     robot: str | None = setting(None, ROBOT_TEXT)
 
 
-class ImportSettings(InspectSettings):
-    """What is imported, and where to."""
-
-    mapping: Path | None = setting(None, MAPPING_TEXT)
-    out: Path = setting(..., "Folder of the new run folders.")
-
-
 class Named(Protocol):
     """What has the id of a run."""
 

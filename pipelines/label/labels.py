@@ -131,7 +131,7 @@ def _folders(data: Path) -> list[Path]:
         raise LogError(f"{data}: {'is no folder' if data.exists() else 'does not exist'}")
     found = run_folders(data)
     if not found:
-        raise LogError(f"{data}: holds no run folder (run.json); 'terrain import' makes them of other logs")
+        raise LogError(f"{data}: holds no run folder (run.json); 'terrain convert' makes them of other logs")
     return found
 
 

@@ -12,16 +12,17 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from pipelines.crossval.crossval import crossval, merge_notes
 from pipelines.crossval.settings import CrossvalSettings
+from pipelines.data.convert import ImportResult
+from pipelines.data.convert import Settings as ConvertSettings
+from pipelines.data.convert import run as convert
 from pipelines.data.datasets import data_digest, load_runs
 from pipelines.data.duplicates import distinct_runs
-from pipelines.data.settings import ImportSettings
 from pipelines.estimate.consistency import TerrainConsistency
 from pipelines.estimate.labelled import TerrainSlip
 from pipelines.quickstart.holding_out import divide
 from pipelines.quickstart.results import KeptRuns, QuickstartResult
 from pipelines.quickstart.settings import QuickstartSettings
 from pipelines.reporting.progress import Progress, silent
-from pipelines.runs.import_logs import import_logs
 from terrain.errors import DataError
 from terrain.files.atomic import atomic_folder, atomic_write, ensure_writable
 from terrain.logs.write import write_run
@@ -166,7 +167,8 @@ def _keep(runs: list[RunLog], data: Path | None, folder: Path, progress: Progres
         progress("write runs", len(runs), len(runs))
         return KeptRuns(folder, len(runs), reused=True)
     if data is not None:
-        imported = import_logs(ImportSettings(data=data, out=folder), progress)
+        imported = convert(ConvertSettings(data=data, out=folder), progress)
+        assert isinstance(imported, ImportResult)
         return KeptRuns(folder, len(runs), reused=False, imported=imported)
     with atomic_folder(folder) as unfinished:
         for number, run in enumerate(runs, 1):

@@ -8,9 +8,9 @@ from typing import Any
 
 from pipelines.classify.results import Predictions, Training
 from pipelines.crossval.results import CrossvalReport
+from pipelines.data.convert import ImportResult
 from pipelines.estimate.consistency import TerrainConsistency
 from pipelines.estimate.labelled import TerrainSlip
-from pipelines.runs.results import Imported
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,7 +23,7 @@ class KeptRuns:
     out: Path
     n_runs: int
     reused: bool
-    imported: Imported | None = None
+    imported: ImportResult | None = None
 
     def as_json(self) -> dict[str, Any]:
         """Return all fields, those of the import among them."""

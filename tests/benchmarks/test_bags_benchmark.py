@@ -11,7 +11,7 @@ from mcap_ros2.decoder import DecoderFactory
 from mcap_ros2.writer import Writer
 from rosbags.highlevel import AnyReader
 
-from pipelines.bags.logs import find_runs
+from pipelines.data.bag_runs import find_runs
 
 DURATION_S = 60.0
 

@@ -9,12 +9,12 @@ from pipelines.classify.predict import filtered_terrains, predict
 from pipelines.classify.settings import TrainSettings
 from pipelines.classify.train import model_info, train
 from pipelines.crossval.crossval import samples_of
-from pipelines.data.settings import ImportSettings
+from pipelines.data.convert import Settings as ConvertSettings
+from pipelines.data.convert import run as convert
 from pipelines.live.model import Assessed
 from pipelines.models.model_files import TerrainModel, read_model
 from pipelines.quickstart.settings import QuickstartSettings
 from pipelines.reporting.json_file import as_json, with_deprecated_keys
-from pipelines.runs.import_logs import import_logs
 from terrain.control.slip_table import DRIVE_STATES, SlipTable, load_slip_table
 from terrain.errors import ConfigError, DataError, TerrainError
 from terrain.logs.write import write_run
@@ -234,7 +234,7 @@ def test_quickstart_reuses_its_own_import_and_no_other(drive_all, drive, tmp_pat
     with pytest.raises(DataError, match="as far as this"):
         module.quickstart(asked)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["data"]  # a refusal leaves nothing
-    import_logs(ImportSettings(data=tmp_path / "data", out=tmp_path / "out" / "runs"))
+    convert(ConvertSettings(data=tmp_path / "data", out=tmp_path / "out" / "runs"))
     with pytest.raises(DataError, match="as far as this"):
         module.quickstart(asked)
     imported = sorted(path.name for path in (tmp_path / "out" / "runs").iterdir())

@@ -102,15 +102,15 @@ SPOILT_FILES = {
 }
 
 
-@pytest.mark.parametrize("command", ["import", "crossval"])
+@pytest.mark.parametrize("command", ["convert", "crossval"])
 @pytest.mark.parametrize("fault", SPOILT_FILES)
 def test_a_spoilt_log_is_one_sentence(refused, borealtc_dir, place, edit, fault, command):
     change, sentence = SPOILT_FILES[fault]
     data = place / "logs"
     shutil.copytree(borealtc_dir, data)
     edit(data / "SNOW" / "imu_01.csv", change)
-    if command == "import":
-        refused(sentence, "import", data, "--out", place / "out")
+    if command == "convert":
+        refused(sentence, "convert", data, "--out", place / "out")
     else:
         refused(sentence, "crossval", "--data", data, "--json", place / "report.json")
 
@@ -177,7 +177,7 @@ def test_an_output_that_cannot_be_written_is_reported_before_the_work(refused, p
     (place / "mlruns").write_text("an obstacle")
     monkeypatch.setattr("pipelines.crossval.crossval.fit_folds", lambda *_: pytest.fail("the work was begun"))
     cannot = "cannot be written"
-    refused(cannot, "import", data, "--out", place / "file" / "out")
+    refused(cannot, "convert", data, "--out", place / "file" / "out")
     refused(cannot, "crossval", "--data", data, "--json", place / "file" / "report.json")
     refused("is a folder; --json names a file", "crossval", "--data", data, "--json", data)
     refused(cannot, "train", "--data", data, "--name", "m")

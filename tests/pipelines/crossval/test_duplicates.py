@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from pipelines.crossval.crossval import crossval, samples_of
+from pipelines.data.convert import Settings as ConvertSettings
+from pipelines.data.convert import run as convert
 from pipelines.data.inspect import Settings as InspectSettings
 from pipelines.data.inspect import run as inspect_runs
-from pipelines.data.settings import ImportSettings
-from pipelines.runs.import_logs import import_logs
 from terrain.errors import DataError
 from terrain.logs.write import write_run
 from terrain.records import Label, Stream
@@ -54,6 +54,6 @@ def test_import_and_inspect_report_copies(runs, tmp_path):
     for run in (*runs[:2], copy_of(runs[0], "again", 9.0)):
         write_run(run, tmp_path / "data")
     inspected = inspect_runs(InspectSettings(data=tmp_path / "data"))
-    imported = import_logs(ImportSettings(data=tmp_path / "data", out=tmp_path / "out"))
+    imported = convert(ConvertSettings(data=tmp_path / "data", out=tmp_path / "out"))
     for result in (inspected, imported):
         assert [(each.first, each.second) for each in result.duplicates] == [("ASPHALT_1", "again")]

@@ -3,13 +3,13 @@ import json
 import numpy as np
 import pytest
 
+from pipelines.data.convert import Settings as ConvertSettings
+from pipelines.data.convert import run as convert
 from pipelines.data.datasets import data_digest, load_runs
 from pipelines.data.inspect import Settings as InspectSettings
 from pipelines.data.inspect import run as inspect_runs
-from pipelines.data.settings import ImportSettings
 from pipelines.report.terminal import terminal_text
 from pipelines.reporting.json_file import as_json
-from pipelines.runs.import_logs import import_logs
 from terrain.errors import LogError, TerrainError
 from terrain.logs.write import write_run
 from terrain.records import RunLog
@@ -21,8 +21,8 @@ def tree(folder):
 
 def test_imported_runs_are_the_runs_that_were_read(borealtc_dir, tmp_path):
     steps = []
-    asked = ImportSettings(data=borealtc_dir, out=tmp_path / "out")
-    report = as_json(import_logs(asked, progress=lambda *step: steps.append(step)))
+    asked = ConvertSettings(data=borealtc_dir, out=tmp_path / "out")
+    report = as_json(convert(asked, progress=lambda *step: steps.append(step)))
     assert steps == [("write runs", n, 3) for n in (1, 2, 3)]
     assert report["run_ids"] == ["ICE_01", "SNOW_01", "SNOW_02"]
     assert (report["labels"], report["dropped"], report["skipped"]) == ({"ICE": 1, "SNOW": 2}, {}, [])
@@ -35,7 +35,7 @@ def test_imported_runs_are_the_runs_that_were_read(borealtc_dir, tmp_path):
 def test_nothing_is_written_when_one_run_cannot_be_read(borealtc_dir, tmp_path):
     (borealtc_dir / "SNOW" / "pro_02.csv").write_text("time\n")
     with pytest.raises(LogError, match=r"SNOW/pro_02\.csv: column 'velL' is missing"):
-        import_logs(ImportSettings(data=borealtc_dir, out=tmp_path / "out"))
+        convert(ConvertSettings(data=borealtc_dir, out=tmp_path / "out"))
     assert not (tmp_path / "out").exists()
 
 
@@ -43,21 +43,21 @@ def test_nothing_that_is_there_is_touched(borealtc_dir, tmp_path, make_run):
     write_run(make_run("SNOW_02", seed=9), tmp_path / "out")
     before = tree(tmp_path)
     with pytest.raises(LogError, match="SNOW_02: is there already, and is left as it is"):
-        import_logs(ImportSettings(data=borealtc_dir, out=tmp_path / "out"))
+        convert(ConvertSettings(data=borealtc_dir, out=tmp_path / "out"))
     assert tree(tmp_path) == before
 
 
 def test_a_place_that_cannot_be_written_is_one_sentence(borealtc_dir, tmp_path):
     (tmp_path / "file").write_text("an obstacle")
     with pytest.raises(TerrainError, match="cannot be written") as error:
-        import_logs(ImportSettings(data=borealtc_dir, out=tmp_path / "file" / "out"))
+        convert(ConvertSettings(data=borealtc_dir, out=tmp_path / "file" / "out"))
     assert "\n" not in str(error.value)
 
 
 def test_repair_is_counted_and_the_counts_travel_with_the_runs(borealtc_dir, tmp_path, edit):
     edit(borealtc_dir / "SNOW" / "imu_01.csv", lambda lines: [*lines[:30], *lines[29:]])
     (borealtc_dir / "ICE" / "pro_01.csv").unlink()
-    report = import_logs(ImportSettings(data=borealtc_dir, out=tmp_path / "out", repair=True))
+    report = convert(ConvertSettings(data=borealtc_dir, out=tmp_path / "out", repair=True))
     assert report.run_ids == ("SNOW_01", "SNOW_02")
     assert report.dropped == {"rows with a bad time": 1}
     assert report.skipped == ("run skipped: ICE/pro_01.csv: is missing",)

@@ -4,9 +4,9 @@ import gzip
 import numpy as np
 import pytest
 
+from pipelines.data.convert import Settings as ConvertSettings
+from pipelines.data.convert import run as convert
 from pipelines.data.datasets import data_digest, load_runs
-from pipelines.data.settings import ImportSettings
-from pipelines.runs.import_logs import import_logs
 from terrain.errors import ConfigError, LogError
 from terrain.logs.drive import FILE_NAME, STREAMS, DriveRobot, find_runs
 from terrain.logs.held import between_updates
@@ -347,8 +347,8 @@ def test_sessions_are_read_as_one_data_set_of_the_robot_that_is_named(tmp_path):
 
 
 def test_the_session_is_saved_and_loaded(tmp_path):
-    settings = ImportSettings(data=sessions(tmp_path), out=tmp_path / "raw", robot=str(robot_file(tmp_path)))
-    found = import_logs(settings)
+    settings = ConvertSettings(data=sessions(tmp_path), out=tmp_path / "raw", robot=str(robot_file(tmp_path)))
+    found = convert(settings)
     runs = load_runs(tmp_path / "raw")
     assert {run.session for run in runs} == {"asphalt_1", "asphalt_2", "sand_1"}
     assert data_digest(runs) == found.digest
@@ -423,7 +423,7 @@ def test_between_updates_keeps_every_measurement_and_holds_what_was_measured_aga
 
 def test_import_writes_what_was_read(tmp_path):
     folder = write(tmp_path / "log", table())
-    found = import_logs(ImportSettings(data=folder, out=tmp_path / "raw", layout="drive"))
+    found = convert(ConvertSettings(data=folder, out=tmp_path / "raw", layout="drive"))
     assert (found.n_runs, found.labels) == (3, {})
     assert data_digest(load_runs(tmp_path / "raw")) == found.digest == data_digest(load_runs(folder))
 

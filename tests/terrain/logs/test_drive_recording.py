@@ -7,9 +7,9 @@ from collections import Counter
 import numpy as np
 import pytest
 
+from pipelines.data.convert import Settings as ConvertSettings
+from pipelines.data.convert import run as convert
 from pipelines.data.datasets import data_digest, load_runs
-from pipelines.data.settings import ImportSettings
-from pipelines.runs.import_logs import import_logs
 from terrain.errors import ConfigError, LogError
 from terrain.logs.current_signs import NO_SIGN, POWER_SIGN, current_sign
 from terrain.logs.drive_recording import LOST, NOT_RECORDED, STILL
@@ -309,7 +309,7 @@ def test_wheels_of_another_robot_are_refused(save):
 
 def test_import_writes_what_was_read(save, tmp_path):
     data, out = save(recording()), tmp_path / "out"
-    result = import_logs(ImportSettings(data=data, out=out))
+    result = convert(ConvertSettings(data=data, out=out))
     assert data_digest(load_runs(out)) == result.digest == data_digest(load_runs(data))
 
 

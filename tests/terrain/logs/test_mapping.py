@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import yaml
 
+from pipelines.data.convert import Settings as ConvertSettings
+from pipelines.data.convert import run as convert
 from pipelines.data.datasets import data_digest, load_runs
-from pipelines.data.settings import ImportSettings
-from pipelines.runs.import_logs import import_logs
 from terrain.errors import ConfigError, LogError
 from terrain.logs.mapping import find_runs, load_mapping
 from terrain.logs.spelling import RESPELT
@@ -269,7 +269,7 @@ def test_names_in_any_language_and_form_are_read_imported_and_read_again(tmp_pat
     runs = load_runs(data, mapping=mapping)
     assert [run.run_id for run in runs] == [f"{terrain}_1", f"{terrain}_2"]
     assert {run.terrains for run in runs} == {(terrain,)}
-    import_logs(ImportSettings(data=data, mapping=mapping, out=tmp_path / "out"))
+    convert(ConvertSettings(data=data, mapping=mapping, out=tmp_path / "out"))
     assert data_digest(load_runs(tmp_path / "out")) == data_digest(runs)
 
 

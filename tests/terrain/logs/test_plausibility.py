@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pipelines.data.convert import Settings as ConvertSettings
+from pipelines.data.convert import run as convert
 from pipelines.data.datasets import load_runs
 from pipelines.data.inspect import Settings as InspectSettings
 from pipelines.data.inspect import run as inspect_runs
 from pipelines.data.plausibility import doubt_sentences, doubts_of, verdict
-from pipelines.data.settings import ImportSettings
-from pipelines.runs.import_logs import import_logs
 from terrain.errors import LogError
 from terrain.logs.checks import Level
 from terrain.logs.plausibility import judge, worst
@@ -234,12 +234,12 @@ def test_the_sign_of_measured_gyros_is_judged_right_wherever_it_is_judged(measur
 def test_import_refuses_an_implausible_run_and_repair_counts_it(tmp_path):
     for run_id, run in (("SNOW_01", sound_run()), ("SNOW_02", changed("imu", ACCEL))):
         write_run(replace(run, run_id=run_id), tmp_path / "data")
-    settings = ImportSettings(data=tmp_path / "data", out=tmp_path / "out")
+    settings = ConvertSettings(data=tmp_path / "data", out=tmp_path / "out")
     with pytest.raises(LogError, match=r"SNOW_02: implausible gravity.*9\.81 is expected") as refused:
-        import_logs(settings)
+        convert(settings)
     assert "\n" not in str(refused.value)
     assert not (tmp_path / "out" / "SNOW_01").exists()
-    result = import_logs(settings.model_copy(update={"repair": True}))
+    result = convert(settings.model_copy(update={"repair": True}))
     assert result.n_runs == 2
     assert result.dropped == {"implausible gravity": 1}
     assert load_runs(tmp_path / "out")[1].dropped == {"implausible gravity": 1}
@@ -248,10 +248,10 @@ def test_import_refuses_an_implausible_run_and_repair_counts_it(tmp_path):
 
 def test_values_beyond_any_quantity_are_refused_or_repaired_by_one_rule(tmp_path):
     write_run(changed("wheels", {"speed_left_mps": 1e300}), tmp_path / "data")
-    settings = ImportSettings(data=tmp_path / "data", out=tmp_path / "out")
+    settings = ConvertSettings(data=tmp_path / "data", out=tmp_path / "out")
     with pytest.raises(LogError, match="--repair leaves such values out"):
-        import_logs(settings)
-    result = import_logs(settings.model_copy(update={"repair": True}))
+        convert(settings)
+    result = convert(settings.model_copy(update={"repair": True}))
     assert result.dropped["values beyond any quantity"] == 400
 
 

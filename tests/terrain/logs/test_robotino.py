@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipelines.data.convert import Settings as ConvertSettings
+from pipelines.data.convert import run as convert
 from pipelines.data.datasets import data_digest, load_runs
-from pipelines.data.settings import ImportSettings
-from pipelines.runs.import_logs import import_logs
 from terrain.errors import LogError
 from terrain.kinematics import omni
 from terrain.logs import robotino
@@ -132,7 +132,7 @@ def test_a_folder_of_the_data_set_is_read_alone(root):
 def test_import_and_read_again_give_one_digest(root, tmp_path):
     written(root)
     out = tmp_path / "runs"
-    result = import_logs(ImportSettings(data=root, out=out))
+    result = convert(ConvertSettings(data=root, out=out))
     again = load_runs(out)
     assert data_digest(again) == data_digest(load_runs(root)) == result.digest
     assert again[0].dropped == load_runs(root)[0].dropped

@@ -3,9 +3,9 @@
 import re
 from pathlib import Path
 
-from pipelines.bags.mapping import TYPES, load_mapping
-from pipelines.export.outgoing import outgoing_topics
-from pipelines.messages.definitions import short_type
+from pipelines.data.bag_files import short_type
+from pipelines.data.run_writers import outgoing_topics
+from pipelines.data.topic_mapping import TYPES, load_mapping
 from terrain.estimation.enriched import enriched
 from terrain.estimation.estimate import estimate_run
 from terrain.robots import load_robot

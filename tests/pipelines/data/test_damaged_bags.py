@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 from mcap.writer import CompressionType
 
 from pipelines.data.datasets import load_runs
-from pipelines.messages.mcap_file import MAGIC
+from pipelines.data.mcap_file import MAGIC
 from terrain.errors import ConfigError, LogError
 
-from .foreign import START_NS, husky_rows, imu, write_bag, write_mcap
+from .foreign_bags import START_NS, husky_rows, imu, write_bag, write_mcap
 
 KNOWN = {
     "files that end early",
@@ -164,5 +164,5 @@ def test_a_view_in_the_place_of_a_table_is_refused(tmp_path):
             "select x as topic_id, x as timestamp, x as data from r"
         )
     store.close()
-    with pytest.raises(LogError, match="table 'messages' is missing"):
+    with pytest.raises(LogError, match="lacks the tables"):
         load_runs(tmp_path / "a.db3", robot="husky")

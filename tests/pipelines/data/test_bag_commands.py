@@ -6,11 +6,11 @@ import sys
 import numpy as np
 import pytest
 
+from pipelines.data.convert import Settings
+from pipelines.data.convert import run as convert
 from pipelines.data.datasets import load_runs
 from pipelines.data.recorded_windows import WINDOWS_FILE, read_windows, windows_text
 from pipelines.data.settings import InspectSettings
-from pipelines.export.export_runs import export_runs
-from pipelines.export.settings import ExportSettings
 from pipelines.replay.replay import replay_logs
 from pipelines.replay.settings import ReplaySettings
 from terrain.errors import ConfigError, LogError
@@ -18,7 +18,7 @@ from terrain.logs.write import write_run
 from terrain.robots import load_robot
 from terrain.simulation.run import simulate_run
 
-from .foreign import START_NS, husky_rows, text, write_bag, write_mcap
+from .foreign_bags import START_NS, husky_rows, text, write_bag, write_mcap
 
 TOPICS = """\
 robot: agrimaro
@@ -52,7 +52,7 @@ def raw(tmp_path_factory):
     folder = tmp_path_factory.mktemp("raw")
     run = simulate_run(load_robot("agrimaro"), "grass", "starts", 7, duration_s=8.0)
     write_run(run, folder / "raw")
-    export_runs(InspectSettings(data=folder / "raw"), ExportSettings(out=folder / "mcap"))
+    convert(Settings(data=folder / "raw", out=folder / "mcap", to="mcap"))
     return folder, run.run_id
 
 
@@ -105,7 +105,7 @@ def test_recorded_windows_are_exported(tmp_path, raw):
     ]  # fmt: skip
     place = write_run(run, tmp_path / "raw", beside={WINDOWS_FILE: windows_text(entries)})
     assert len(read_windows(place)) == 2
-    result = export_runs(InspectSettings(data=tmp_path / "raw"), ExportSettings(out=tmp_path / "out"))
+    result = convert(Settings(data=tmp_path / "raw", out=tmp_path / "out", to="mcap"))
     assert result.topics["/terrain/window"] == 2
     from mcap.reader import make_reader
     from mcap_ros2.decoder import DecoderFactory
@@ -123,21 +123,18 @@ def test_recorded_windows_are_exported(tmp_path, raw):
     for damage in ('{"version": 1}', '{"windows": [3]}', '{"windows": [{"end_s": "x"}]}'):
         (place / WINDOWS_FILE).write_text(damage)
         with pytest.raises(LogError, match="is damaged"):
-            export_runs(InspectSettings(data=tmp_path / "raw"), ExportSettings(out=tmp_path / "other"))
+            convert(Settings(data=tmp_path / "raw", out=tmp_path / "other", to="mcap"))
 
 
 @pytest.mark.parametrize("package", ["mcap", "rosbags", "zstandard"])
 def test_a_missing_package_is_named_in_one_sentence(raw, tmp_path, monkeypatch, package):
     folder, run_id = raw
-    from pipelines.messages import definitions
-
-    definitions.known_text.cache_clear()
     for name in [name for name in sys.modules if name.split(".")[0] == package]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, package, None)
     source = folder / "mcap" / f"{run_id}.mcap" if package == "zstandard" else folder / "raw"
     with pytest.raises(ConfigError, match=r"pip install 'terrain-slip\[logs\]'"):
-        export_runs(InspectSettings(data=source), ExportSettings(out=tmp_path / "out"))
+        convert(Settings(data=source, out=tmp_path / "out", to="mcap"))
     assert not list(tmp_path.rglob("*.mcap"))
 
 

@@ -12,13 +12,11 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation
 
-from pipelines.bags.logs import find_runs
+from pipelines.data.bag_runs import find_runs
+from pipelines.data.convert import Settings
+from pipelines.data.convert import run as convert
 from pipelines.data.datasets import data_digest, load_runs
-from pipelines.data.settings import InspectSettings
-from pipelines.export.export_runs import export_runs
-from pipelines.export.outgoing import outgoing_topics
-from pipelines.export.settings import ExportSettings
-from pipelines.export.write import write_mcap
+from pipelines.data.run_writers import write_messages
 from terrain.errors import ConfigError, DataError, LogError
 from terrain.estimation.enriched import enriched
 from terrain.estimation.estimate import estimate_run
@@ -43,7 +41,7 @@ def raw(tmp_path_factory):
 
 
 def exported(source, out, target="mcap", **options):
-    return export_runs(InspectSettings(data=source, **options), ExportSettings(out=out, target=target))
+    return convert(Settings(data=source, out=out, to=target, **options))
 
 
 @pytest.mark.parametrize("target", TARGETS)
@@ -182,8 +180,7 @@ def test_whatever_a_run_folder_keeps_a_bag_keeps(tmp_path_factory, run):
     except LogError:
         assume(False)  # names that no run folder accepts
     path = folder / "run.mcap"
-    with path.open("wb") as file:
-        write_mcap(file, list(outgoing_topics(by_folder)), {})
+    write_messages(path, by_folder, [], "mcap")
     (read,) = find_runs(path, None, None)
     by_bag = read(repair=False)
     assert data_digest([by_bag]) == data_digest([by_folder])

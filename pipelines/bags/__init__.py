@@ -1,1 +1,0 @@
-"""MCAP files and ROS 2 bags as runs: topics to streams by a mapping, or as a run was exported."""

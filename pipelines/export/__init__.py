@@ -1,1 +1,0 @@
-"""Runs as MCAP files and ROS 2 bags."""

@@ -1,1 +1,0 @@
-"""Import, inspect, simulate and load runs."""
