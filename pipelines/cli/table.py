@@ -29,6 +29,12 @@ COMMANDS: tuple[Command, ...] = (
         "rates, gaps, clocks, units, signs; the card of a model",
     ),
     Command("Data", "simulate", "pipelines.data.simulate", "runs of a described robot"),
+    Command(
+        "Terrain",
+        "crossval",
+        "pipelines.learn.crossval",
+        "recipes or models on runs and sessions held out, side by side",
+    ),
 )
 
 FORMER: dict[str, str] = {
@@ -36,5 +42,6 @@ FORMER: dict[str, str] = {
     "export": "use terrain convert RUNS --to mcap --out DIR",
     "model": "use terrain inspect MODEL",
     "reproduce": "use python examples/papers PAPER, in the repository",
+    "compare": "name several recipes or models in terrain crossval, as --recipe svm,cnn",
 }
 """Former command: a sentence that names its successor."""
