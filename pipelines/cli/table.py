@@ -35,6 +35,12 @@ COMMANDS: tuple[Command, ...] = (
         "pipelines.learn.crossval",
         "recipes or models on runs and sessions held out, side by side",
     ),
+    Command(
+        "Reality",
+        "explain",
+        "pipelines.explain.explain",
+        "what the simulation gets wrong, and the extended robot",
+    ),
 )
 
 FORMER: dict[str, str] = {

@@ -11,7 +11,7 @@ from features.windows import Layout, cut_windows, layout_of
 from pipelines.crossval.settings import CrossvalSettings
 from pipelines.crossval.splits import labelled
 from pipelines.estimate.labelled import RUNS_A_TERRAIN, SCENARIO
-from pipelines.reporting.progress import Progress, silent
+from pipelines.report import Progress, silent
 from terrain.discrepancy.filter_gain import Comparison, accuracy_change
 from terrain.errors import DataError, TerrainError
 from terrain.kinematics.wheel_speed import with_wheel_speeds

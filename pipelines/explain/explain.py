@@ -1,55 +1,57 @@
-"""Find what a robot's simulation gets wrong about measured runs, extend it, and measure the gain."""
+"""Find what a robot's simulation gets wrong about runs, extend it, and measure the gain."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import numpy as np
+from pydantic import field_validator
 
-from pipelines.data.datasets import data_digest
-from pipelines.explain.classifier import classifier_gain
-from pipelines.explain.page import PAGE_FILE, write_explain_page
-from pipelines.explain.results import DiagnosedRuns, Explanation, ExtendedDescription, HeldOutGain
-from pipelines.explain.settings import ExplainSettings
-from pipelines.reporting.progress import Progress, silent
-from terrain.discrepancy.compared import compare_runs, without_levels
-from terrain.discrepancy.diagnose import diagnose
-from terrain.discrepancy.extend import extend, extended_effects
-from terrain.discrepancy.filter_gain import Comparison, filter_gain
-from terrain.discrepancy.fitting import Problem
-from terrain.discrepancy.gain import fit_to_judge, gain_of_signals
-from terrain.discrepancy.health import repaired
-from terrain.discrepancy.hold_out import HOLD_OUT_FROM, repair_held_out, split_runs
-from terrain.discrepancy.nameless import nameless_gain
-from terrain.discrepancy.next_drive import next_command
-from terrain.discrepancy.parts import part_values
-from terrain.discrepancy.powertrain import powertrain_answer
-from terrain.discrepancy.residuals import low_pass_of
-from terrain.discrepancy.robot_terms import in_robot_terms
-from terrain.discrepancy.signals import Signals, signals_of
-from terrain.discrepancy.statements import acting_causes, statements_of, terrains_apart
-from terrain.discrepancy.terrain_match import check_robots, runs_of_terrain, simulation_for
-from terrain.discrepancy.verdict import Diagnosis, NextDrive
-from terrain.effects import Effect, effect_named, library_of, showing
-from terrain.errors import ConfigError, DataError
-from terrain.extension import extended_yaml, region_of
-from terrain.files.atomic import atomic_write, ensure_writable
-from terrain.kinematics.wheel_speed import with_wheel_speeds
-from terrain.records import RunLog
-from terrain.robots import Robot, load_robot
+from pipelines.data.settings import AlignedRunsSettings, load
+from pipelines.report.settings import setting
 
-EXTENDED_FILE, NEXT_FILE = "extended.yaml", "next_drive.yaml"
+if TYPE_CHECKING:
+    from pipelines.explain.explanation import ExplainResult
+    from pipelines.report import Progress
+    from terrain.effects import Effect
+    from terrain.records import RunLog
+    from terrain.robots import Robot
+
+EXAMPLE = "terrain explain --data raw/ --robot husky --out explained/"
+
+PAGE_FILE, EXTENDED_FILE, NEXT_FILE = "report.html", "extended.yaml", "next_drive.yaml"
 
 
-def explain(runs: Sequence[RunLog], settings: ExplainSettings, progress: Progress = silent) -> Explanation:
-    """Diagnose runs, extend the simulation, measure the gain, and write the page.
+class Settings(AlignedRunsSettings):
+    """Runs to explain, and the simulation under test."""
 
-    Parameters
-    ----------
-    runs : of the robot
-    settings : of the command; how files are read is not used
-    progress : called with steps that are done
+    robot: str = setting(..., "Robot whose simulation is tested: name or YAML file.")
+    out: Path = setting(..., "Folder of the page and of the extended robot.")
+    model: str | None = setting(None, "Extended description of that robot, tested in its place.")
+    effects: tuple[str, ...] | None = setting(
+        None, "Effects that may be named, by commas; all by default.", separated=True
+    )
+    terrain: str | None = setting(None, "Use only runs of this label.")
+    hold_out: int | None = setting(
+        None, "Runs held out to measure the gain; a quarter of six or more by default.", ge=0
+    )
+    classifier: bool = setting(
+        False, "Also train a classifier in simulation, before and after; takes a minute."
+    )
+    pictures: str = setting("6", "Most runs that the page draws: a number, or 'all'.")
+    seed: int = setting(0, "Of the choice of held-out runs, and of the bootstrap.", ge=0)
+
+    @field_validator("pictures")
+    @classmethod
+    def _check_pictures(cls, pictures: str) -> str:
+        if pictures != "all" and not pictures.isdecimal():
+            raise ValueError(f"--pictures is {pictures!r}; a number or 'all' is required")
+        return pictures
+
+
+def run(settings: Settings, progress: Progress) -> ExplainResult:
+    """Read runs, explain them, and write the page, the extended robot and the next drive.
 
     Raises
     ------
@@ -58,142 +60,167 @@ def explain(runs: Sequence[RunLog], settings: ExplainSettings, progress: Progres
     DataError
         if the runs are of another robot, too few, or cannot be compared with the simulation.
     TerrainError
-        if ``out`` cannot be written.
+        if runs cannot be read, or ``out`` cannot be written.
     """
-    robot = _robot(settings.robot, settings.model)
-    library = _library(robot, settings.effects)
-    out, seed = settings.out, settings.seed
-    if (out / EXTENDED_FILE).exists():
-        raise ConfigError(
-            f"{out / EXTENDED_FILE}: is there already and is not overwritten; choose another --out"
-        )
-    ensure_writable(out)
-    chosen = runs_of_terrain(runs, settings.terrain)
-    check_robots(chosen, robot)
-    diagnosed = diagnose_runs(chosen, robot, library, settings.hold_out, seed)
-    progress("diagnose", 1, 1)
-    gained = held_out_gain(diagnosed, robot, seed, settings.classifier, progress)
+    from dataclasses import replace
+
+    import yaml
+
+    from terrain.discrepancy.extend import extended_effects
+    from terrain.errors import ConfigError
+    from terrain.extension import extended_yaml
+    from terrain.files.atomic import atomic_write, ensure_writable
+
+    runs, skipped = load(settings)
+    robot = tested_robot(settings.robot, settings.model)
+    extended_file = settings.out / EXTENDED_FILE
+    if extended_file.exists():
+        raise ConfigError(f"{extended_file}: is there already and is not overwritten; choose another --out")
+    ensure_writable(settings.out)
     description = settings.model or settings.robot
-    extended, text = None, ""
-    diagnosis = diagnosed.diagnosis
-    if diagnosed.extended is not None:
-        effects = extended_effects(robot, diagnosis)
-        source = f"terrain explain, {diagnosis.n_runs} runs of {settings.dataset or 'a data set'}"
-        region = region_of(diagnosed.fit, robot)
-        text = extended_yaml(description, *effects, source, region)
-        extended = ExtendedDescription(out / EXTENDED_FILE, effects.values)
-    result = Explanation(
+    found = explain_runs(
+        runs,
+        robot,
+        effects=settings.effects,
+        terrain=settings.terrain,
+        hold_out=settings.hold_out,
+        classifier=settings.classifier,
+        seed=settings.seed,
         data=settings.dataset,
+        description=description,
+        progress=progress,
+    )
+    result = replace(
+        found,
+        model=settings.model,
+        skipped=tuple(skipped),
+        n_pictures=None if settings.pictures == "all" else int(settings.pictures),
+        page=settings.out / PAGE_FILE,
+        extended_file=None if found.extended is None else extended_file,
+    )
+    if result.extended is not None:
+        source = f"terrain explain, {result.diagnosis.n_runs} runs of {settings.dataset or 'a data set'}"
+        effects = extended_effects(robot, result.diagnosis)
+        text = extended_yaml(description, *effects, source, result.extended.region)
+        atomic_write(extended_file, text)
+    next_drive = result.diagnosis.next_drive
+    if next_drive is None:
+        (settings.out / NEXT_FILE).unlink(missing_ok=True)  # of an earlier result
+    else:
+        text = yaml.safe_dump(next_drive._asdict(), sort_keys=False, allow_unicode=True, width=10_000)
+        atomic_write(settings.out / NEXT_FILE, text)
+    result.report.save(settings.out / PAGE_FILE)
+    return result
+
+
+def explain_runs(
+    runs: Sequence[RunLog],
+    robot: Robot | str,
+    *,
+    effects: Sequence[str] | None = None,
+    terrain: str | None = None,
+    hold_out: int | None = None,
+    classifier: bool = False,
+    seed: int = 0,
+    data: str = "",
+    description: str | None = None,
+    progress: Progress | None = None,
+) -> ExplainResult:
+    """Return what the simulation of a robot gets wrong about its runs, extend it, and measure the gain.
+
+    Parameters
+    ----------
+    runs : of the robot, three or more
+    robot : whose simulation is tested, with the effects that its description has; or its name
+    effects : names of those that may be named; all that apply to its drive by default
+    terrain : use only runs of this label
+    hold_out : runs held out to measure the gain; a quarter of six or more by default
+    classifier : also train a classifier in simulation, before and after
+    seed : of the choice of held-out runs, and of the bootstrap
+    data : name of the data set, for the report
+    description : of the robot, for the report and the suggested command; its name by default
+    progress : called with steps that are done
+
+    Returns
+    -------
+    ExplainResult
+        ``report`` leads with the answer, ``extended`` is the robot with the named causes built in.
+
+    Raises
+    ------
+    ConfigError
+        if an effect is not accepted, or the effects of the robot have no covariance.
+    DataError
+        if the runs are of another robot, too few, or cannot be compared with the simulation.
+    """
+    from dataclasses import replace
+
+    from pipelines.data.datasets import data_digest
+    from pipelines.explain.explanation import ExplainResult
+    from pipelines.report import silent
+    from terrain.discrepancy.diagnosed_runs import diagnose_runs, held_out_gain
+    from terrain.discrepancy.extend import extended_effects
+    from terrain.discrepancy.next_drive import next_command
+    from terrain.discrepancy.powertrain import powertrain_answer
+    from terrain.discrepancy.robot_terms import in_robot_terms
+    from terrain.discrepancy.statements import statements_of, terrains_apart
+    from terrain.discrepancy.terrain_match import check_robots, runs_of_terrain
+    from terrain.extension import region_of
+    from terrain.robots import load_robot
+
+    progress = progress or silent
+    robot = load_robot(robot) if isinstance(robot, str) else robot
+    description = description or robot.name
+    library = _library(robot, effects)
+    chosen = runs_of_terrain(runs, terrain)
+    check_robots(chosen, robot)
+    diagnosed = diagnose_runs(chosen, robot, library, hold_out, seed)
+    progress("diagnose", 1, 1)
+    gained = held_out_gain(diagnosed, robot, seed)
+    progress("gain", 1, 1)
+    diagnosis, extended = diagnosed.diagnosis, None
+    if diagnosed.extended is not None:
+        if classifier and diagnosed.held_out:
+            from pipelines.explain.classifier import classifier_gain
+
+            before, after = diagnosed.simulation.effects, diagnosed.extended.effects
+            compared = classifier_gain(diagnosed.held_out, robot, before, after, seed, progress=progress)
+            gained = replace(gained, comparisons={**gained.comparisons, "classifier": compared})
+        values, cov, _ = extended_effects(robot, diagnosis)
+        extended = replace(robot, effects=values, effects_cov=cov, region=region_of(diagnosed.fit, robot))
+    return ExplainResult(
+        data=data,
         data_digest=data_digest(runs),
         description=description,
-        model=settings.model,
-        terrain=settings.terrain,
-        diagnosis=diagnosis,
-        built_in=dict(diagnosed.simulation.effects),
-        terrains=diagnosed.terrains,
+        model=None,
+        terrain=terrain,
         effects=tuple(effect.name for effect in library),
         seed=seed,
-        used=tuple(run.run_id for run in diagnosed.used),
-        held_out=tuple(run.run_id for run in diagnosed.held_out),
+        robot=robot,
+        diagnosed=diagnosed,
         gain=gained,
         extended=extended,
-        page=out / PAGE_FILE,
         statements=statements_of(diagnosis, robot, diagnosed.compared, gained.gain, diagnosed.acting),
         terms={cause.name: in_robot_terms(cause.name, cause.values, robot) for cause in diagnosis.causes},
         next_command=next_command(diagnosis, description, robot, diagnosed.terrains),
         terrains_apart=terrains_apart(diagnosis, diagnosed.compared),
         powertrain=powertrain_answer(chosen, robot, diagnosis.faults, seed),
-        drive=robot.drive,
-    )
-    write_explain_page(out, diagnosed, result, settings.max_pictures, progress)
-    if extended is not None:
-        atomic_write(extended.file, text)
-    _write_next_drive(out, diagnosis.next_drive)
-    return result
-
-
-def diagnose_runs(
-    runs: Sequence[RunLog], robot: Robot, library: Sequence[Effect], hold_out: int | None, seed: int
-) -> DiagnosedRuns:
-    """Return the diagnosis of all runs but those held out, and the simulation extended by it."""
-    runs = [with_wheel_speeds(run, robot) for run in sorted(runs, key=lambda run: run.run_id)]
-    used, held_out = split_runs(runs, hold_out, seed)
-    simulation, terrains = simulation_for(used, robot, library)
-    diagnosis = diagnose(used, simulation, library)
-    extended = extend(simulation, diagnosis) if diagnosis.causes else None
-    excluded = {run.run_id for run in diagnosis.excluded_runs}
-    fit = tuple(run for run in used if run.run_id not in excluded)
-    signals = repaired([signals_of(run, robot) for run in fit], diagnosis.faults)
-    low_pass = low_pass_of(signals)
-    compared = compare_runs(simulation, extended, signals, low_pass)
-    last = extended or simulation
-    info = Problem(signals, simulation, low_pass, tuple(library)).at(last.vector)
-    held_signals = repair_held_out(
-        [signals_of(run, robot) for run in held_out], diagnosis.faults, last, low_pass, _noise_of(diagnosis)
-    )
-    return DiagnosedRuns(
-        diagnosis,
-        simulation,
-        extended,
-        terrains,
-        fit,
-        tuple(used),
-        tuple(held_out),
-        compared,
-        held_signals,
-        without_levels(info.noise, compared),
-        low_pass,
-        part_values(info, diagnosis.causes),
-        acting_causes(simulation, diagnosis, signals, compared),
     )
 
 
-def _noise_of(diagnosis: Diagnosis) -> dict[str, float]:
-    return {channel: residual.noise for channel, residual in diagnosis.residual_before.items()}
+def tested_robot(robot_name: str, model: str | None) -> Robot:
+    """Return the robot whose simulation is tested: as it is described, or extended.
 
-
-def held_out_gain(
-    diagnosed: DiagnosedRuns, robot: Robot, seed: int, classifier: bool = False, progress: Progress = silent
-) -> HeldOutGain:
-    """Return what the extension gains on the runs held out, or why that was not measured.
-
-    Parameters
-    ----------
-    classifier : whether a classifier trained in simulation is compared, too
+    Raises
+    ------
+    ConfigError
+        if the model is of another robot, or its effects have no covariance.
     """
-    simulation, extended, runs = diagnosed.simulation, diagnosed.extended, diagnosed.held_signals
-    found, reason = None, None
-    comparisons: dict[str, Comparison | None] = {}
-    fit: Sequence[Signals] = ()
-    try:
-        if not runs:
-            reason = (
-                f"no run was held out ({len(diagnosed.used)} runs; {HOLD_OUT_FROM} or more, or --hold-out, "
-                "hold some out)"
-            )
-        elif extended is None:
-            reason = "no cause was named, so that nothing was built in"
-            fit = fit_to_judge(simulation, runs)[0]
-        else:
-            found = gain_of_signals(simulation, extended, runs, seed)
-            fit = [run for run in runs if run.run_id in found.run_ids]
-    except DataError as error:
-        reason = reason or str(error)
-    if extended is not None and runs:
-        # a filter is given the logs as they are: with a fault in them its error is that of the fault
-        faulty = bool(diagnosed.diagnosis.faults)
-        comparisons["filter"] = None if faulty else filter_gain(diagnosed.held_out, robot, extended, seed)
-        if classifier:
-            comparisons["classifier"] = classifier_gain(
-                diagnosed.held_out, robot, simulation.effects, extended.effects, seed, progress=progress
-            )
-    judged = compare_runs(simulation, extended, fit, diagnosed.low_pass, held_out=True)
-    nameless = nameless_gain(diagnosed.compared, judged, _noise_of(diagnosed.diagnosis), seed)
-    progress("gain", 1, 1)
-    return HeldOutGain(found, reason, comparisons, nameless, judged)
+    import numpy as np
 
+    from terrain.errors import ConfigError
+    from terrain.robots import load_robot
 
-def _robot(robot_name: str, model: str | None) -> Robot:
     robot = load_robot(robot_name)
     if model is None:
         return robot
@@ -207,6 +234,9 @@ def _robot(robot_name: str, model: str | None) -> Robot:
 
 def _library(robot: Robot, names: Sequence[str] | None) -> tuple[Effect, ...]:
     """Return the effects that may be named, in the order of the catalogue."""
+    from terrain.effects import effect_named, library_of, showing
+    from terrain.errors import ConfigError
+
     applicable = library_of(robot.drive)
     if names is None:
         return showing(robot.drive, robot.effects)
@@ -219,13 +249,3 @@ def _library(robot: Robot, names: Sequence[str] | None) -> tuple[Effect, ...]:
                 f"effect {effect.name} does not apply to a robot with the drive {robot.drive!r}"
             )
     return tuple(effect for effect in applicable if effect in chosen)
-
-
-def _write_next_drive(out: Path, next_drive: NextDrive | None) -> None:
-    import yaml
-
-    if next_drive is None:
-        (out / NEXT_FILE).unlink(missing_ok=True)  # of an earlier result
-        return
-    text = yaml.safe_dump(next_drive._asdict(), sort_keys=False, allow_unicode=True, width=10_000)
-    atomic_write(out / NEXT_FILE, text)

@@ -8,7 +8,7 @@ from pipelines.data.simulate import Settings as SimulateSettings
 from pipelines.data.simulate import run as simulate_runs
 from pipelines.estimate.estimate import estimate
 from pipelines.estimate.settings import EstimateSettings
-from pipelines.explain.explain import diagnose_runs
+from terrain.discrepancy.diagnosed_runs import diagnose_runs
 from terrain.discrepancy.signals import signals_of
 from terrain.effects import CHANNELS, effect_named, vector_of
 from terrain.robots import load_robot

@@ -6,8 +6,7 @@ import sys
 import pytest
 
 from pipelines.cli import main as cli
-from pipelines.explain.settings import TrialsSettings
-from pipelines.explain.trials import explain_trials
+from pipelines.explain.trials import TrialsSettings, explain_trials
 from pipelines.reporting.json_file import as_json
 from terrain.discrepancy.trials.rows import Row
 from terrain.errors import ConfigError

@@ -1,26 +1,34 @@
-"""What screens and pages call effects, channels and quantities, and the sentences that both share."""
+"""Sentences about a diagnosis: its verdict, its gain, what varies, and what could not have been detected."""
 
 from __future__ import annotations
 
 import math
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import fields, is_dataclass, replace
+from typing import Any
 
-from pipelines.reporting.numbers import NBSP
-from pipelines.reporting.quantities import SI, enumerated, percentage, percentage_interval, quantity
+from pipelines.report import enumerated, format_value, interval, quantity
+from pipelines.report.numbers import NBSP, SI
 from terrain.discrepancy.channel_words import CHANNEL_WORDS
 from terrain.discrepancy.gain import Gain
 from terrain.discrepancy.response_slopes import Slope
 from terrain.discrepancy.terrain_match import TerrainMatch
 from terrain.discrepancy.verdict import Diagnosis, Limit, Unexplained, Value, Varying
-from terrain.effects import PARAMETER
+from terrain.effects import PARAMETER, TRACKED
 
 SHOWN_RUNS = 5
 """Names of runs that a sentence lists."""
 
+PERCENT = ".1%"
+"""Format of ratios of squares, wherever one stands."""
+
+_WHEELS = re.compile(r"\bwheel radius\b|\b[Ww]heels?\b")
+_OF_TRACKS = {"wheel radius": "sprocket radius", "wheel": "track", "wheels": "tracks"}
+
 
 def effect_label(effect: str) -> str:
-    """Return what a page calls an effect.
+    """Return what an effect is called.
 
     Examples
     --------
@@ -31,8 +39,19 @@ def effect_label(effect: str) -> str:
 
 
 def channel_label(channel: str) -> str:
-    """Return what a page calls a channel."""
+    """Return what a channel is called."""
     return CHANNEL_WORDS[channel][0]
+
+
+def quantity_interval(value: Value) -> str:
+    r"""Return the 95 % interval of a value.
+
+    Examples
+    --------
+    >>> quantity_interval(Value("payload_ratio", 0.2, "ratio", 0.1, 0.3)).replace("\xa0", " ")
+    '10 % to 30 %'
+    """
+    return f"{quantity(value.name, value.low)} to {quantity(value.name, value.high)}"
 
 
 def value_with_interval(value: Value) -> str:
@@ -43,12 +62,56 @@ def value_with_interval(value: Value) -> str:
     >>> value_with_interval(Value("payload_ratio", 0.2, "ratio", 0.1, 0.3)).replace("\xa0", " ")
     '20 % (10 % to 30 %)'
     """
-    low, high = (quantity(value.name, end) for end in (value.low, value.high))
-    return f"{quantity(value.name, value.value)} ({low} to {high})"
+    return f"{quantity(value.name, value.value)} ({quantity_interval(value)})"
+
+
+def verdict_text(diagnosis: Diagnosis) -> str:
+    """Return what the simulation gets wrong, with values and intervals."""
+    sentences = []
+    if diagnosis.causes:
+        causes = [
+            f"{effect_label(cause.name)}, {' and '.join(map(value_with_interval, cause.values))}"
+            for cause in diagnosis.causes
+        ]
+        sentences.append(f"The simulation of {diagnosis.robot} lacks {enumerated(causes)}.")
+    for names in diagnosis.ambiguous_sets:
+        rivals = enumerated([effect_label(name) for name in names], "or")
+        sentences.append(f"One of {rivals} is present, and these runs cannot distinguish them.")
+    if diagnosis.varying:
+        varying = enumerated([effect_label(each.name) for each in diagnosis.varying])
+        sentences.append(f"The size of {varying} differs from run to run.")
+    if diagnosis.unexplained:
+        channels = enumerated([*dict.fromkeys(channel_label(left.channel) for left in diagnosis.unexplained)])
+        also = " also" if sentences else ""
+        sentences.append(f"The residual is{also} systematic, without a known cause, in {channels}.")
+    if not sentences:
+        sentences.append(f"These runs show nothing that the simulation of {diagnosis.robot} lacks.")
+    return " ".join(sentences)
+
+
+def gain_text(gain: Gain | None, reason: str | None) -> str:
+    """Return what an extension gains on held-out runs, or why that was not measured."""
+    if gain is None:
+        return f"The gain on held-out runs was not measured: {reason}."
+    n = len(gain.run_ids)
+    runs = f"{n} held-out runs" if n != 1 else "one held-out run"
+    ratio, low, high = gain.reduction
+    square = (
+        f"{format_value(ratio, PERCENT)} ({interval(low, high, PERCENT)}) of the whitened squared residual"
+    )
+    if gain.refused:
+        return f"On {runs} no gain can be claimed: the extension removes {square}, which includes zero."
+    return f"On {runs} the extension removes {square}."
+
+
+def undetected_text(diagnosis: Diagnosis) -> str:
+    """Return of how many parameters these runs would show nothing; empty where there are none."""
+    n, of = len(diagnosis.not_excited), len(diagnosis.limits)
+    return f"Of {of} parameters that may be wrong, {n} could not have been detected." if n else ""
 
 
 def caveat_text(caveat: str) -> str:
-    r"""Return a caveat with units as pages write them.
+    r"""Return a caveat with units as they are written elsewhere.
 
     Examples
     --------
@@ -70,11 +133,12 @@ def varying_text(each: Varying) -> str:
         for group in each.groups:
             n, shown = len(group.run_ids), ", ".join(group.run_ids[:SHOWN_RUNS])
             more = ", ..." if n > SHOWN_RUNS else ""
-            runs = f"{n} run{'s' * (n != 1)} ({shown}{more})"
-            parts.append(f"{quantity(each.parameter, group.value)} in {runs}")
+            parts.append(
+                f"{quantity(each.parameter, group.value)} in {n} run{'s' * (n != 1)} ({shown}{more})"
+            )
         text += f" Two groups: {', and '.join(parts)}."
     if each.rivals:
-        rivals = enumerated(list(map(effect_label, each.rivals)), "or")
+        rivals = enumerated([effect_label(rival) for rival in each.rivals], "or")
         text += f" These runs do not distinguish that from {rivals}."
     return text
 
@@ -85,50 +149,6 @@ def unexplained_text(left: Unexplained, diagnosis: Diagnosis) -> str:
     if left.input in withdrawn:
         return f"resembles {effect_label(left.input)}, which was withdrawn"
     return f"depends on {left.input}"
-
-
-def verdict_text(diagnosis: Diagnosis) -> str:
-    """Return the verdict in a sentence or two."""
-    causes = [
-        f"{effect_label(cause.name)} "
-        f"({', '.join(quantity(value.name, value.value) for value in cause.values)})"
-        for cause in diagnosis.causes
-    ]
-    sentences = []
-    if causes:
-        sentences.append(f"The simulation lacks {enumerated(causes)}.")
-    sentences += [
-        f"One of {enumerated(list(map(effect_label, names)), 'or')} is present, and these runs cannot "
-        "distinguish them."
-        for names in diagnosis.ambiguous_sets
-    ]
-    if diagnosis.varying:
-        names = [effect_label(each.name) for each in diagnosis.varying]
-        sentences.append(f"The size of {enumerated(names)} differs from run to run.")
-    if diagnosis.unexplained:
-        channels = dict.fromkeys(channel_label(left.channel) for left in diagnosis.unexplained)
-        also = " also" if sentences else ""
-        sentences.append(
-            f"The residual is{also} systematic, without a known cause, in {enumerated([*channels])}."
-        )
-    if not sentences:
-        sentences.append("These runs show nothing that the simulation lacks.")
-    if diagnosis.not_excited:
-        n, of = len(diagnosis.not_excited), len(diagnosis.limits)
-        sentences.append(f"Of {of} parameters that may be wrong, {n} could not have been detected.")
-    return " ".join(sentences)
-
-
-def gain_text(gain: Gain) -> str:
-    """Return what an extension gains in a sentence."""
-    n = len(gain.run_ids)
-    runs = f"{n} held-out runs" if n != 1 else "one held-out run"
-    low_high = percentage_interval(gain.reduction.low, gain.reduction.high)
-    ratio = percentage(gain.reduction.ratio)
-    reduction = f"{ratio} of the squared residual after whitening ({low_high})"
-    if gain.refused:
-        return f"On {runs} no gain can be claimed: {reduction}, an interval that includes zero."
-    return f"On {runs} the extension removes {reduction}."
 
 
 def limit_text(limit: Limit, missed: bool) -> str:
@@ -196,3 +216,31 @@ def terrain_text(matches: Sequence[TerrainMatch]) -> str:
         name = f"label {match.terrain}" if match.terrain else "runs without a label (or with several)"
         texts.append(f"soil {match.soil}" if match.soil else f"{name}: default terrain")
     return "; ".join(texts)
+
+
+def in_words_of(drive: str, part: Any) -> Any:
+    """Return a text, or a report with all its texts, in the words of robots of a drive.
+
+    Effects and sentences are written for wheels; robots on tracks have sprockets.
+
+    Examples
+    --------
+    >>> in_words_of("tracked", "The simulation lacks wheel radius (2 %); its wheels turn it at 0.3 rad/s.")
+    'The simulation lacks sprocket radius (2 %); its tracks turn it at 0.3 rad/s.'
+    """
+    if drive != TRACKED:
+        return part
+    if isinstance(part, str):
+        return _WHEELS.sub(_of_tracks, part)
+    if is_dataclass(part) and not isinstance(part, type):
+        changed = {each.name: in_words_of(drive, getattr(part, each.name)) for each in fields(part)}
+        return replace(part, **changed)
+    if isinstance(part, list | tuple):
+        parts = [in_words_of(drive, each) for each in part]
+        return type(part)(*parts) if hasattr(part, "_fields") else type(part)(parts)
+    return part
+
+
+def _of_tracks(found: re.Match[str]) -> str:
+    word = _OF_TRACKS.get(found[0].lower(), found[0])
+    return word.capitalize() if found[0][0] == "W" else word

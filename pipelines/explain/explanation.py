@@ -1,0 +1,480 @@
+"""What an explanation answers, as JSON and as a report."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pipelines.explain.figures import (
+    dependence_figure,
+    parts_figure,
+    run_figure,
+    spectra_figure,
+    strongest_figure,
+)
+from pipelines.explain.sentences import (
+    PERCENT,
+    caveat_text,
+    channel_label,
+    effect_label,
+    gain_text,
+    in_words_of,
+    limit_text,
+    quantity_interval,
+    terrain_notes,
+    terrain_text,
+    undetected_text,
+    unexplained_text,
+    value_with_interval,
+    varying_text,
+    verdict_text,
+)
+from pipelines.report import (
+    Column,
+    Figure,
+    Pairs,
+    Part,
+    Report,
+    Result,
+    Section,
+    Table,
+    Text,
+    described,
+    enumerated,
+    format_value,
+    quantity,
+    sentence,
+)
+from pipelines.report.versions import versions
+from terrain.discrepancy.channel_words import CHANNEL_WORDS
+from terrain.discrepancy.compared import ComparedRun, channels_of, example_stretch, telling_runs
+from terrain.discrepancy.diagnosed_runs import DiagnosedRuns, HeldOutGain
+from terrain.discrepancy.filter_gain import Comparison
+from terrain.discrepancy.powertrain_answer import PowertrainAnswer
+from terrain.discrepancy.response_slopes import Slope
+from terrain.discrepancy.statements import (
+    SESSION_COLUMNS,
+    Statement,
+    session_notes,
+    session_rows,
+    split_ruled_out,
+)
+from terrain.discrepancy.verdict import Diagnosis
+from terrain.effects import LIBRARY
+from terrain.robots import Robot
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+PICTURED = STATED = 3
+"""Channels of the first picture, and of the sentences beside the answer: those of which most is stated."""
+
+COMPARISON_TITLES = {"filter": "Error of the filter {name}", "classifier": "Classifier {name}"}
+ERROR_LABELS = {
+    "speed_mps": ("speed, root mean square", "m/s"),
+    "yaw_rate_radps": ("yaw rate, root mean square", "rad/s"),
+    "slip_ratio": ("mean slip of a run, off by", ""),
+    "accuracy": ("accuracy", ""),
+}
+"""What an error of a filter or a classifier is called, and its unit."""
+
+Z = ".1f"
+"""Format of evidence in standard deviations."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ExplainResult(Result):
+    """What the simulation of a robot gets wrong about runs, and what building that in gains.
+
+    In JSON the fields of the diagnosis stand beside the others.
+    """
+
+    data: str = described("name of the data set")
+    data_digest: str = described("digest of its runs")
+    description: str = described("description of the robot as it was tested")
+    model: str | None = described("extended description that was tested; null for the robot's own")
+    terrain: str | None = described("label of the runs that were used; null for all")
+    effects: tuple[str, ...] = described("effects that may be named")
+    seed: int = described("of the choice of held-out runs and of the bootstrap")
+    robot: Robot = described("as it was tested")
+    diagnosed: DiagnosedRuns = described("runs with their diagnosis, beside the simulation")
+    gain: HeldOutGain = described("on the runs held out")
+    extended: Robot | None = described("with the causes built in; null where none was named")
+    statements: tuple[Statement, ...] = described("a sentence for each channel")
+    terms: Mapping[str, str] = described("by cause, its value in quantities of the robot's description")
+    next_command: str | None = described("simulates the next drive; null where none is suggested")
+    terrains_apart: Mapping[str, Slope] = described("measured over simulated by label, where labels differ")
+    powertrain: PowertrainAnswer | None = described("from commanded to measured wheel speeds, where logged")
+    skipped: tuple[str, ...] = described("a sentence for each run that could not be read", default=())
+    n_pictures: int | None = described("most runs that are drawn; null for all", default=6)
+    page: Path | None = described("page that was written", default=None)
+    extended_file: Path | None = described("extended description that was written", default=None)
+
+    @property
+    def diagnosis(self) -> Diagnosis:
+        """What the simulation gets wrong, with its evidence."""
+        return self.diagnosed.diagnosis
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a reader has to know of the terrains and sessions, in sentences."""
+        return terrain_notes(self.diagnosed.terrains, self.terrains_apart) + session_notes(self.diagnosis)
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the explanation as JSON has it."""
+        from pipelines.report.json_file import as_json
+
+        runs, extended = self.diagnosed, None
+        if self.extended is not None:
+            extended = {"file": self.extended_file, "effects": self.extended.effects}
+        document: dict[str, Any] = as_json(
+            {
+                "data": self.data,
+                "data_digest": self.data_digest,
+                **self.diagnosis.as_json(),
+                "built_in": runs.simulation.effects,
+                "terrain_matches": runs.terrains,
+                "notes": self.notes,
+                "statements": self.statements,
+                "terms": self.terms,
+                "next_command": self.next_command,
+                "effects": self.effects,
+                "seed": self.seed,
+                "used": [run.run_id for run in runs.used],
+                "held_out": [run.run_id for run in runs.held_out],
+                "gain": self.gain,
+                "extended": extended,
+                "description": self.description,
+                "model": self.model,
+                "terrain": self.terrain,
+                "page": self.page,
+                "skipped": self.skipped,
+                "powertrain": self.powertrain,
+            }
+        )
+        return document
+
+    def to_pandas(self) -> pd.DataFrame:
+        """Return the parameters of the named causes, a row each."""
+        import pandas as pd
+
+        return pd.DataFrame(
+            [
+                {"cause": cause.name, **value._asdict(), "held_out_gain": cause.gain, "z": cause.z}
+                for cause in self.diagnosis.causes
+                for value in cause.values  # noqa: PD011
+            ],
+            columns=["cause", "name", "value", "unit", "low", "high", "held_out_gain", "z"],
+        )
+
+
+def report(result: ExplainResult) -> Report:
+    """Return what the simulation gets wrong and the gain, then the causes, then all that they rest on."""
+    diagnosis, runs = result.diagnosis, result.diagnosed
+    lead = [f"{diagnosis.n_runs} runs compared"]
+    if runs.held_out:
+        lead.append(f"{len(runs.held_out)} held out for the gain")
+    lead += [name for name in (result.data, result.terrain) if name]
+    details = (
+        Section("Channel by channel", [Pairs([_name_and_rest(each.text) for each in result.statements])]),
+        Section("Gain on held-out runs, channel by channel", list(_gain_parts(result.gain))),
+        Section("What was withdrawn, and what is unexplained", list(_open_parts(diagnosis))),
+        Section("From commanded to measured wheel speeds", list(_powertrain_parts(result))),
+        Section("What to drive next", list(_next_drive_parts(result))),
+        Section("What the residuals depend on", list(_dependence_parts(runs))),
+        Section("Whole runs", list(_run_figures(result))),
+        Section("What would not have been detected", list(_limit_parts(diagnosis))),
+        Section("Health of the logs", list(_health_parts(result))),
+        Section("Where these numbers come from", [Pairs(list(_provenance(result)))]),
+    )
+    written: Report = in_words_of(
+        result.robot.drive,
+        Report(
+            title=f"What the simulation of {diagnosis.robot} gets wrong",
+            answer=f"{verdict_text(diagnosis)} {gain_text(result.gain.gain, result.gain.reason)}",
+            picture=_picture(result),
+            parts=list(_decisive_parts(result)),
+            details=[section for section in details if section.parts],
+            lead=" · ".join(lead),
+        ),
+    )
+    return replace(written, next_step=result.next_command or "")
+
+
+def _name_and_rest(text: str) -> tuple[str, str]:
+    name, _, rest = text.partition(": ")
+    return name, rest
+
+
+def _picture(result: ExplainResult) -> Figure | None:
+    """Return a stretch of a held-out run in the channels of which most is stated; of a compared one else."""
+    runs = result.gain.judged or result.diagnosed.compared
+    if not runs:
+        return None
+    noise = result.diagnosed.noise
+    stretch = example_stretch(runs, noise)
+    there = channels_of([stretch])
+    channels = [each.channel for each in result.statements if each.channel in there][:PICTURED]
+    return run_figure(stretch, noise, channels)
+
+
+def _decisive_parts(result: ExplainResult) -> Iterator[Part]:
+    """Yield what a user decides by: faults, causes with intervals, rivals, and what was not detectable."""
+    diagnosis = result.diagnosis
+    for fault in diagnosis.faults:
+        yield Text(f"Fault of the logs, repaired before anything was compared: {fault.sentence}", "warning")
+    if diagnosis.excluded_runs:
+        excluded = ", ".join(run.run_id for run in diagnosis.excluded_runs)
+        yield Text(f"Runs that were excluded as unfit: {excluded}.", "warning")
+    for statement in [each for each in result.statements if each.found][:STATED]:
+        yield Text(sentence(statement.text))
+    if diagnosis.causes:
+        yield _causes(result)
+    for names in diagnosis.ambiguous_sets:
+        yield _rivals(names, diagnosis)
+    for each in diagnosis.varying:
+        yield Text(varying_text(each))
+    if result.gain.nameless is not None:
+        yield Text(result.gain.nameless.sentence)
+    if undetected := undetected_text(diagnosis):
+        yield Text(undetected)
+    for note in result.notes:
+        yield Text(note, "note")
+    for skipped in result.skipped:
+        yield Text(skipped, "warning")
+    if result.extended_file is not None:
+        yield Pairs([("extended robot", str(result.extended_file))])
+
+
+def _causes(result: ExplainResult) -> Table:
+    rows, notes = [], ["Values are added to what the description has already."]
+    varying = {each.name for each in result.diagnosis.varying}
+    for cause in result.diagnosis.causes:
+        for place, value in enumerate(cause.values):
+            first = place == 0
+            rows.append(
+                (
+                    effect_label(cause.name) if first else "",
+                    quantity(value.name, value.value),
+                    quantity_interval(value),
+                    cause.gain if first else None,
+                    cause.z if first else None,
+                    result.terms.get(cause.name, "") if first else "",
+                )
+            )
+        if cause.aliases:
+            aliases = enumerated([effect_label(alias) for alias in cause.aliases])
+            notes.append(f"No log distinguishes {effect_label(cause.name)} from {aliases}.")
+        if cause.caveat and cause.name not in varying:
+            notes.append(f"{effect_label(cause.name)}: {caveat_text(cause.caveat)}.")
+    columns = (
+        *("cause", "value", "95 %", Column("held-out gain", PERCENT), Column("z", Z)),
+        Column("the robot has", long=True),
+    )
+    return Table(columns, rows, note=" ".join(notes))
+
+
+def _rivals(names: Sequence[str], diagnosis: Diagnosis) -> Table:
+    effects = {effect.name: effect for effect in LIBRARY}
+    rows = []
+    for name in names:
+        needs = [effects[name].needs]
+        needs += [
+            f"{channel_label(channel)} distinguishes it from {effect_label(other)}"
+            for other, channel in effects[name].twins
+            if other in names
+        ]
+        values = ", ".join(map(value_with_interval, diagnosis.ambiguous_values.get(name, ())))
+        rows.append((effect_label(name), values, "; ".join(needs)))
+    return Table(("one of", "its value, if it acts alone", Column("driving that shows it", long=True)), rows)
+
+
+def _gain_parts(found: HeldOutGain) -> Iterator[Part]:
+    gain, learned = found.gain, {} if found.nameless is None else found.nameless.channels
+    rows: list[tuple[Any, ...]] = []
+    if gain is None:
+        for name, each in learned.items():
+            rows.append((*CHANNEL_WORDS[name], each.rms_before, each.ratio))
+        columns = ("channel", "unit", "rms", Column("square less by a nameless learner", PERCENT))
+        if rows:
+            yield Table(columns, rows)
+        return
+    for name, own in gain.channels.items():
+        ratio, low, high = own.reduction
+        remark = "" if not own.reduction.refused else "worse" if high < 0.0 else "no gain to claim"
+        nameless = learned[name].ratio if name in learned else None
+        sizes = (own.rms_before, own.rms_after, ratio, (low, high))
+        rows.append((*CHANNEL_WORDS[name], *sizes, remark, nameless))
+    excluded = enumerated([run.run_id for run in gain.excluded])
+    note = (
+        f"Low-pass filtered. Intervals: 95 %, bootstrap over {gain.clusters}. The answer's gain is of all "
+        "channels whitened, with differences from run to run removed. The nameless learner is a Bayesian "
+        "linear regression of the residual on the simulation's inputs, their products and rates, fitted to "
+        f"the runs behind the diagnosis and judged on the same {len(gain.run_ids)} held-out runs."
+    )
+    yield Table(
+        (
+            *("channel", "unit", "rms before", "after", Column("square less by", PERCENT)),
+            *(Column("95 %", PERCENT), "", Column("by a nameless learner", PERCENT)),
+        ),
+        rows,
+        note=f"{note} Excluded as unfit: {excluded}." if excluded else note,
+    )
+    for kind, title in COMPARISON_TITLES.items():
+        compared = found.comparisons.get(kind)
+        if compared is not None and (compared.errors or compared.reason):
+            yield _comparison(title.format(name=compared.name), compared)
+
+
+def _comparison(title: str, compared: Comparison) -> Part:
+    if compared.reason:
+        return Text(f"{title}: not measured: {compared.reason}.")
+    rows = [
+        (*ERROR_LABELS[key], each.before, each.after, each.change_ci) for key, each in compared.errors.items()
+    ]
+    return Table(("figure", "unit", "before", "after", "change, 95 %"), rows, title)
+
+
+def _open_parts(diagnosis: Diagnosis) -> Iterator[Part]:
+    """Yield what was withdrawn, what has no known cause, and effects that these runs rule out."""
+    withdrawn, ruled_out = split_ruled_out(diagnosis)
+    if withdrawn:
+        values = [" and ".join(map(value_with_interval, effect.values)) for effect in withdrawn]
+        rows = [
+            (effect_label(effect.name), value, sentence(effect.reason), effect.z)
+            for effect, value in zip(withdrawn, values, strict=True)
+        ]
+        columns = (
+            "withdrawn",
+            "value it would have",
+            Column("why it is not named", long=True),
+            Column("z", Z),
+        )
+        note = "These effects reduce the residual, and something speaks against each as its cause."
+        yield Table(columns, rows, note=note)
+    if diagnosis.unexplained:
+        unexplained = [
+            (channel_label(left.channel), unexplained_text(left, diagnosis), left.z, left.ratio or None)
+            for left in diagnosis.unexplained
+        ]
+        part = Column("part of its squared residual", PERCENT)
+        note = (
+            "Beside all causes the residual of the channel depends on the input, and no effect of the library "
+            "explains it. The input is the clearest of some thirty that were tried."
+        )
+        yield Table(("unexplained", "its residual", Column("z", Z), part), unexplained, note=note)
+    if ruled_out:
+        seen = [(effect_label(effect.name), sentence(effect.reason), effect.z) for effect in ruled_out]
+        yield Table(
+            ("ruled out: these runs would have shown it", Column("why", long=True), Column("z", Z)), seen
+        )
+
+
+def _powertrain_parts(result: ExplainResult) -> Iterator[Part]:
+    if result.powertrain is None:
+        return
+    for text in result.powertrain.sentences:
+        yield Text(text)
+    yield Text(
+        "The simulation is given the measured wheel speeds, so that this is no part of the residuals. "
+        "Intervals hold 95 % over runs.",
+        "note",
+    )
+
+
+def _next_drive_parts(result: ExplainResult) -> Iterator[Part]:
+    coming = result.diagnosis.next_drive
+    if coming is not None:
+        slope = f", on a slope of {coming.grade_deg:g}°" if coming.grade_deg else ""
+        yield Text(f"Scenario {coming.scenario}{slope}: {coming.reason}. In simulation first:")
+        yield Text(result.next_command or "", "code")
+
+
+def _dependence_parts(runs: DiagnosedRuns) -> Iterator[Part]:
+    """Yield by session, by parts of the data, by input and by frequency how far the two are apart."""
+    diagnosis, compared = runs.diagnosis, runs.compared
+    if rows := session_rows(diagnosis):
+        note = (
+            "The causes named of all runs together, fitted to the runs of each session alone. Intervals "
+            "include the scatter between its runs. Sessions of a terrain agree where Welch's test of equal "
+            "means does not reject that at 1 %."
+        )
+        yield Table(SESSION_COLUMNS, rows, "By session", note)
+    if runs.parts:
+        yield parts_figure(runs.parts)
+    rows_of_residuals = [
+        (*CHANNEL_WORDS[name], before.rms, before.noise, before.systematic, after.rms, after.systematic)
+        for name, before in diagnosis.residual_before.items()
+        for after in (diagnosis.residual_after[name],)
+    ]
+    systematic = Column("systematic", PERCENT, shade=True)
+    yield Table(
+        ("channel", "unit", "rms", "noise", systematic, "rms with the causes", systematic),
+        rows_of_residuals,
+        "How much of it is systematic",
+        "The part of the squared residual that is not noise. Noise is what is left when every effect of the "
+        "library is freed, and levels and what depends on speed and turn are taken off. Differences from run "
+        "to run, as of the tyre pressure, count as systematic.",
+    )
+    if compared:
+        channels = channels_of(compared)
+        yield strongest_figure(compared, channels)
+        yield spectra_figure(compared, runs.noise, runs.low_pass.cutoff_hz, channels)
+        yield Section("Every input", [dependence_figure(compared, runs.noise, name) for name in channels])
+
+
+def _run_figures(result: ExplainResult) -> Iterator[Part]:
+    runs: Sequence[ComparedRun] = [*result.diagnosed.compared, *result.gain.judged]
+    noise = result.diagnosed.noise
+    if result.n_pictures is not None:
+        runs = telling_runs(runs, noise, result.n_pictures)
+    for run in runs:
+        yield run_figure(run, noise, channels_of([run]))
+
+
+def _limit_parts(diagnosis: Diagnosis) -> Iterator[Part]:
+    missed = {limit.name for limit in diagnosis.not_excited}
+    by_missed = {
+        each: [limit for limit in diagnosis.limits if (limit.name in missed) is each]
+        for each in (True, False)
+    }
+    for is_missed, title in ((True, "not excited by the driving"), (False, "detection limit")):
+        if limits := by_missed[is_missed]:
+            rows = [(limit_text(limit, is_missed), limit.needs) for limit in limits]
+            yield Table((Column(title, long=True), Column("driving that shows it", long=True)), rows)
+    yield Text(
+        "Not detected does not mean absent: at its limit an effect is found nine times in ten.", "note"
+    )
+
+
+def _health_parts(result: ExplainResult) -> Iterator[Part]:
+    diagnosis = result.diagnosis
+    if diagnosis.excluded_runs:
+        rows = [(run.run_id, run.reason) for run in diagnosis.excluded_runs]
+        yield Table(("excluded run", Column("why", long=True)), rows)
+    if diagnosis.clocks:
+        milliseconds = ".1f"
+        rows_of_clocks = [
+            (clock.run_id, 1000.0 * clock.offset_s, 1000.0 * clock.std_s) for clock in diagnosis.clocks
+        ]
+        behind = Column("IMU and camera behind the wheels", milliseconds, "ms")
+        std = Column("standard deviation", milliseconds, "ms")
+        yield Table(("clock of the run", behind, std), rows_of_clocks)
+
+
+def _provenance(result: ExplainResult) -> Iterator[tuple[str, Any]]:
+    runs = result.diagnosed
+    built_in = [f"{name} {format_value(value)}" for name, value in runs.simulation.effects.items()]
+    yield "data", f"{result.data} ({result.data_digest[:12]})"
+    yield "description", result.description
+    yield "effects built in already", ", ".join(built_in) or "none"
+    yield "terrain", terrain_text(runs.terrains)
+    yield "effects that may be named", f"{len(result.effects)}: {enumerated(result.effects)}"
+    yield "runs behind the diagnosis", enumerated([run.run_id for run in runs.used])
+    if runs.held_out:
+        held_out = enumerated([run.run_id for run in runs.held_out])
+        yield "runs held out for the gain", f"{held_out}; drawn by the seed"
+    yield "seed", result.seed
+    yield "versions", ", ".join(f"{name} {version}" for name, version in versions().items())

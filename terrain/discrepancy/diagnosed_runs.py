@@ -1,0 +1,179 @@
+"""From runs of a robot to a diagnosis of its simulation, an extended one, and its gain on held-out runs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from terrain.discrepancy.compared import ComparedRun, compare_runs, without_levels
+from terrain.discrepancy.diagnose import diagnose
+from terrain.discrepancy.extend import extend
+from terrain.discrepancy.filter_gain import Comparison, filter_gain
+from terrain.discrepancy.fitting import Problem
+from terrain.discrepancy.gain import Gain, fit_to_judge, gain_of_signals
+from terrain.discrepancy.health import repaired
+from terrain.discrepancy.hold_out import HOLD_OUT_FROM, repair_held_out, split_runs
+from terrain.discrepancy.nameless import Nameless, nameless_gain
+from terrain.discrepancy.noise import Noise
+from terrain.discrepancy.parts import PartValues, part_values
+from terrain.discrepancy.residuals import LowPass, low_pass_of
+from terrain.discrepancy.signals import Signals, signals_of
+from terrain.discrepancy.simulation import Simulation
+from terrain.discrepancy.statements import acting_causes
+from terrain.discrepancy.terrain_match import TerrainMatch, simulation_for
+from terrain.discrepancy.verdict import Diagnosis
+from terrain.effects import Effect
+from terrain.errors import DataError
+from terrain.kinematics.wheel_speed import with_wheel_speeds
+from terrain.records import RunLog
+from terrain.robots import Robot
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DiagnosedRuns:
+    """Runs with their diagnosis, which figures are drawn from.
+
+    Parameters
+    ----------
+    diagnosis : of the runs used
+    simulation, extended : before and after; ``extended`` is None where no cause was named
+    terrains : on which the runs of each label were simulated
+    fit, used, held_out : runs behind the diagnosis, these and those excluded from it, and those held out
+    compared : fit runs beside the simulation
+    held_signals : of the runs held out, faults repaired
+    noise, low_pass : of the fit runs
+    parts : values of the causes in parts of the data
+    acting : by cause, the channels that it changes
+    """
+
+    diagnosis: Diagnosis
+    simulation: Simulation
+    extended: Simulation | None
+    terrains: tuple[TerrainMatch, ...]
+    fit: tuple[RunLog, ...]
+    used: tuple[RunLog, ...]
+    held_out: tuple[RunLog, ...]
+    compared: tuple[ComparedRun, ...]
+    held_signals: tuple[Signals, ...]
+    noise: Noise
+    low_pass: LowPass
+    parts: tuple[PartValues, ...]
+    acting: Mapping[str, Sequence[str]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HeldOutGain:
+    """What an extension gains on held-out runs.
+
+    Parameters
+    ----------
+    gain : None where it was not measured
+    reason : why it was not
+    comparisons : by ``filter`` and ``classifier``; None for one that does not apply
+    nameless : what a nameless learner reaches on the same runs; None where none is held out
+    judged : held-out runs that are fit, beside the simulation
+    """
+
+    gain: Gain | None
+    reason: str | None = None
+    comparisons: Mapping[str, Comparison | None] = field(default_factory=dict)
+    nameless: Nameless | None = None
+    judged: tuple[ComparedRun, ...] = ()
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the gain as JSON has it."""
+        nameless = {} if self.nameless is None else {"nameless": self.nameless.as_json()}
+        if self.gain is None:
+            return {"measured": False, "reason": self.reason, **self.comparisons, **nameless}
+        return {"measured": True, **self.gain.as_json(), **self.comparisons, **nameless}
+
+
+def diagnose_runs(
+    runs: Sequence[RunLog], robot: Robot, library: Sequence[Effect], hold_out: int | None, seed: int
+) -> DiagnosedRuns:
+    """Return the diagnosis of all runs but those held out, and the simulation extended by it.
+
+    Parameters
+    ----------
+    runs : of the robot
+    robot : whose simulation is tested
+    library : effects that may be named
+    hold_out : number of runs held out; a quarter of six or more by default
+    seed : of the choice of held-out runs
+
+    Raises
+    ------
+    DataError
+        if runs are too few, or cannot be compared with the simulation.
+    """
+    runs = [with_wheel_speeds(run, robot) for run in sorted(runs, key=lambda run: run.run_id)]
+    used, held_out = split_runs(runs, hold_out, seed)
+    simulation, terrains = simulation_for(used, robot, library)
+    diagnosis = diagnose(used, simulation, library)
+    extended = extend(simulation, diagnosis) if diagnosis.causes else None
+    excluded = {run.run_id for run in diagnosis.excluded_runs}
+    fit = tuple(run for run in used if run.run_id not in excluded)
+    signals = repaired([signals_of(run, robot) for run in fit], diagnosis.faults)
+    low_pass = low_pass_of(signals)
+    compared = compare_runs(simulation, extended, signals, low_pass)
+    last = extended or simulation
+    info = Problem(signals, simulation, low_pass, tuple(library)).at(last.vector)
+    held_signals = repair_held_out(
+        [signals_of(run, robot) for run in held_out], diagnosis.faults, last, low_pass, _noise_of(diagnosis)
+    )
+    return DiagnosedRuns(
+        diagnosis=diagnosis,
+        simulation=simulation,
+        extended=extended,
+        terrains=terrains,
+        fit=fit,
+        used=tuple(used),
+        held_out=tuple(held_out),
+        compared=compared,
+        held_signals=held_signals,
+        noise=without_levels(info.noise, compared),
+        low_pass=low_pass,
+        parts=part_values(info, diagnosis.causes),
+        acting=acting_causes(simulation, diagnosis, signals, compared),
+    )
+
+
+def _noise_of(diagnosis: Diagnosis) -> dict[str, float]:
+    return {channel: residual.noise for channel, residual in diagnosis.residual_before.items()}
+
+
+def held_out_gain(diagnosed: DiagnosedRuns, robot: Robot, seed: int) -> HeldOutGain:
+    """Return what the extension gains on the runs held out, or why that was not measured.
+
+    Parameters
+    ----------
+    diagnosed : runs with their diagnosis
+    robot : as it was tested
+    seed : of the bootstrap
+    """
+    simulation, extended, runs = diagnosed.simulation, diagnosed.extended, diagnosed.held_signals
+    found, reason = None, None
+    comparisons: dict[str, Comparison | None] = {}
+    fit: Sequence[Signals] = ()
+    try:
+        if not runs:
+            reason = (
+                f"no run was held out ({len(diagnosed.used)} runs; {HOLD_OUT_FROM} or more, or --hold-out, "
+                "hold some out)"
+            )
+        elif extended is None:
+            reason = "no cause was named, so that nothing was built in"
+            fit = fit_to_judge(simulation, runs)[0]
+        else:
+            found = gain_of_signals(simulation, extended, runs, seed)
+            fit = [run for run in runs if run.run_id in found.run_ids]
+    except DataError as error:
+        reason = reason or str(error)
+    if extended is not None and runs:
+        # a filter is given the logs as they are: with a fault in them its error is that of the fault
+        faulty = bool(diagnosed.diagnosis.faults)
+        comparisons["filter"] = None if faulty else filter_gain(diagnosed.held_out, robot, extended, seed)
+    judged = compare_runs(simulation, extended, fit, diagnosed.low_pass, held_out=True)
+    nameless = nameless_gain(diagnosed.compared, judged, _noise_of(diagnosed.diagnosis), seed)
+    return HeldOutGain(found, reason, comparisons, nameless, judged)
