@@ -13,12 +13,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from pipelines.can.assemble import Receiver
-from pipelines.can.codec import Frame, encode
-from pipelines.can.dbc import Layout
-from pipelines.can.signals import RECEIVED, channels_of
 from pipelines.can_bridge.bus_clock import BusClock
 from pipelines.can_bridge.corrections import BridgeState, LowLevelKinematics, corrections
+from pipelines.data.can_codec import Frame, Layout, encode
+from pipelines.data.can_logs import Receiver
+from pipelines.data.can_signals import RECEIVED, channels_of
 from terrain.control.wheel_controllers import step_or_period
 from terrain.records import Array, Command, Reading, Sample
 from terrain.robots import SwerveRobot

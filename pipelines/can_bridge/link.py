@@ -8,8 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from pipelines.can.codec import Frame
-from pipelines.can.dbc import MISSING_PACKAGE
+from pipelines.data.can_codec import MISSING_PACKAGE, Frame
 from terrain.errors import ConfigError
 
 REOPEN_S = 0.5

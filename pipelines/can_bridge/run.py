@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipelines.can.dbc import load_layout
-from pipelines.can.signals import OPTIONAL, SIGNALS
 from pipelines.can_bridge.bridge import Bridge, latency_of
 from pipelines.can_bridge.core import BridgeCore, MakeStep, Step
 from pipelines.can_bridge.link import Link, open_bus
 from pipelines.can_bridge.results import BridgeReport
 from pipelines.can_bridge.settings import CanSettings
+from pipelines.data.can_codec import load_layout
+from pipelines.data.can_signals import OPTIONAL, SIGNALS
 from pipelines.live.classifying import ClassifierThread
 from pipelines.live.pilot import LivePilot
 from pipelines.live.pilot_settings import PilotSettings

@@ -233,10 +233,10 @@ def _readers(
     if (mapping is not None) and layout in of_files:
         raise ConfigError(f"a mapping file is for CSV files, not for the layout {layout!r}")
     if layout == "can":
-        from pipelines.can import dbc, logs
+        from pipelines.data import can_codec, can_logs
 
         name = CAN_ROBOT if robot is None else robot.name
-        return _some(logs.find_runs(folder, dbc.load_layout(mapping, ()), name), folder)
+        return _some(can_logs.find_runs(folder, can_codec.load_layout(mapping, ()), name), folder)
     if mapping is not None or layout == "csv":
         if mapping is None:
             raise ConfigError("the layout 'csv' needs a mapping file")

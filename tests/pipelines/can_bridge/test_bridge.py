@@ -10,8 +10,6 @@ import can
 import numpy as np
 import pytest
 
-from pipelines.can.codec import Frame, decode, encode
-from pipelines.can.dbc import load_layout
 from pipelines.can_bridge.bridge import Bridge
 from pipelines.can_bridge.bus_clock import WINDOW_S, BusClock
 from pipelines.can_bridge.core import BridgeCore
@@ -19,6 +17,7 @@ from pipelines.can_bridge.corrections import BridgeState
 from pipelines.can_bridge.link import REOPEN_S, Link, open_bus
 from pipelines.can_bridge.run import run_can
 from pipelines.can_bridge.settings import CanSettings
+from pipelines.data.can_codec import Frame, decode, encode, load_layout
 from terrain.errors import ConfigError
 from terrain.records import Command
 from terrain.robots import load_robot

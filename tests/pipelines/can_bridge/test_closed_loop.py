@@ -6,11 +6,10 @@ import can
 import numpy as np
 import pytest
 
-from pipelines.can.codec import Frame, decode, encode
-from pipelines.can.dbc import load_layout
-from pipelines.can.signals import as_sent
 from pipelines.can_bridge.core import BridgeCore
 from pipelines.can_bridge.link import Link
+from pipelines.data.can_codec import Frame, decode, encode, load_layout
+from pipelines.data.can_signals import as_sent
 from pipelines.live.pilot import LivePilot
 from pipelines.live.pilot_settings import PilotSettings
 from terrain.control.drive_metrics import drive_history, slip_peak

@@ -8,12 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipelines.can.codec import Frame, decode, encode
-from pipelines.can.dbc import load_layout
-from pipelines.can.recorded import run_frames
-from pipelines.can.signals import RECEIVED
 from pipelines.can_bridge.core import STALE_S, BridgeCore, LastSample
 from pipelines.can_bridge.corrections import BridgeState, LowLevelKinematics
+from pipelines.data.can_codec import Frame, decode, encode, load_layout, run_frames
+from pipelines.data.can_signals import RECEIVED
 from pipelines.live.pilot import LivePilot
 from pipelines.live.pilot_settings import PilotSettings
 from terrain.control.slip_table import load_slip_table
@@ -116,7 +114,7 @@ def test_corrections_are_those_of_the_pilot_stepped_directly(frames):
 
 def rounded_samples(frames, name):
     """Times and values of a stream, put together without the assembler."""
-    from pipelines.can.signals import QUATERNION, channels_of
+    from pipelines.data.can_signals import QUATERNION, channels_of
 
     samples = {}
     for frame in filter(of(name), frames):

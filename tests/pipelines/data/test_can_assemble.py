@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from pipelines.can.assemble import INCOMPLETE_S, QUEUE, Receiver
-from pipelines.can.codec import encode
-from pipelines.can.dbc import load_layout
+from pipelines.data.can_codec import encode, load_layout
+from pipelines.data.can_logs import INCOMPLETE_S, QUEUE, Receiver
 
 LAYOUT = load_layout()
 

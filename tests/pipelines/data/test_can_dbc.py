@@ -9,10 +9,9 @@ import cantools
 import numpy as np
 import pytest
 
-from pipelines.can.assemble import Receiver
-from pipelines.can.codec import Frame, decode, encode
-from pipelines.can.dbc import lacking, load_layout
-from pipelines.can.signals import SIGNALS
+from pipelines.data.can_codec import Frame, decode, encode, load_layout
+from pipelines.data.can_logs import Receiver
+from pipelines.data.can_signals import SIGNALS
 from terrain.errors import ConfigError
 from terrain.files.resources import data_folder
 
@@ -74,9 +73,9 @@ def test_no_dbc_is_one_sentence(tmp_path):
 
 def test_what_no_controller_needs_may_lack(changed):
     layout = load_layout(changed((" SG_ CameraPosition", " SG_ Place"), (" SG_ TargetSlip", " SG_ Slip")))
-    assert lacking(layout, "odometry") == [*(f"position_{axis}_m" for axis in "xyz"), "quaternion_w_ratio"]
+    assert layout.lacking("odometry") == [*(f"position_{axis}_m" for axis in "xyz"), "quaternion_w_ratio"]
     assert "CameraPosition" not in {plan.message.name for plan in layout.by_stream["odometry"]}
-    assert lacking(layout, "status") == ["target_ratio"]
+    assert layout.lacking("status") == ["target_ratio"]
 
 
 OWN = """VERSION ""

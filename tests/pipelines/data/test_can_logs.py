@@ -4,10 +4,8 @@ import can
 import numpy as np
 import pytest
 
-from pipelines.can.codec import encode
-from pipelines.can.dbc import load_layout
-from pipelines.can.logs import READERS
-from pipelines.can.recorded import run_frames
+from pipelines.data.can_codec import encode, load_layout, run_frames
+from pipelines.data.can_logs import READERS
 from pipelines.data.datasets import load_runs
 from terrain.errors import ConfigError, LogError
 from terrain.robots import load_robot

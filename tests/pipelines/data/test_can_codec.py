@@ -7,10 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipelines.can.assemble import Receiver
-from pipelines.can.codec import Drop, Frame, crc8, decode, encode
-from pipelines.can.dbc import load_layout
-from pipelines.can.signals import OPTIONAL, QUATERNION, SIGNALS, as_sent, channels_of
+from pipelines.data.can_codec import Drop, Frame, crc8, decode, encode, load_layout
+from pipelines.data.can_logs import Receiver
+from pipelines.data.can_signals import OPTIONAL, QUATERNION, SIGNALS, as_sent, channels_of
 from terrain.robots import load_robot
 
 LAYOUT = load_layout()
@@ -31,8 +30,7 @@ def bounds(stream, column):
     if (stream, column) == REAL_PART:
         return 0.0, 1.0, math.nan
     plan = PLANS[stream, column]
-    ends = sorted(plan.scale * raw + plan.offset for raw in (plan.low, plan.high))
-    return *ends, abs(plan.scale)
+    return plan.factor * plan.low, plan.factor * plan.high, plan.factor * plan.scale
 
 
 def values_of(stream, strategy=None):

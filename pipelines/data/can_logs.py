@@ -1,0 +1,273 @@
+"""Logs of a CAN bus as runs: ASC and BLF of Vector's tools, candump's log, TRC; one run a file.
+
+The frames of one instant have equal counters, and make one sample, which is stamped by the first of them.  A
+sample is complete when all channels that the DBC has of its stream have come.  A frame that was lost leaves
+NaN in its part of the sample, which ends with the first frame of the next; frames of a sample that has ended
+are late, and those of a counter that stands still repeat an old measurement: both are dropped and counted.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from pipelines.data.can_codec import MISSING_PACKAGE, Drop, Frame, Layout, Part, decode
+from pipelines.data.can_signals import QUATERNION, RECEIVED, SIGNALS, channels_of, real_part
+from terrain.errors import ConfigError, LogError
+from terrain.logs.borealtc import whole_run_label
+from terrain.logs.samples import checked_stream
+from terrain.records import Reading, RunLog, Stream
+
+READERS = {
+    ".asc": ("ASCReader", "r"),
+    ".blf": ("BLFReader", "rb"),
+    ".log": ("CanutilsLogReader", "r"),
+    ".trc": ("TRCReader", "r"),
+}
+"""Reader of python-can for each kind of file, and how it is opened."""
+
+USUAL = (Drop.UNKNOWN, Drop.ERROR, Drop.BUS_OFF, Drop.REMOTE)
+"""What a log of any bus has besides the frames that are read: counted, and no fault of the log."""
+
+QUEUE = 1000
+"""Most samples of a stream between two readings: ten seconds of an IMU; the oldest are dropped."""
+
+INCOMPLETE_S = 0.02
+"""A sample whose other frames have not come for so long is used without them."""
+
+
+class _Assembler:
+    """Samples of one stream.
+
+    Parameters
+    ----------
+    stream : its name
+    columns : that the DBC has
+    dropped : gets counts by kind
+    """
+
+    def __init__(self, stream: str, columns: frozenset[int], dropped: Counter[str]) -> None:
+        self._stream, self._needed, self._dropped = stream, columns, dropped
+        self._width = len(channels_of(stream))
+        self._adds_real_part = stream == "odometry" and QUATERNION[3] not in columns
+        self._row = [math.nan] * self._width
+        self._there: set[int] = set()
+        self._counter: int | None = None
+        self._last: int | None = None
+        self._time_s = math.nan
+        self.done: list[tuple[float, list[float]]] = []
+
+    def take(self, time_s: float, part: Part) -> None:
+        """Take a part of a sample."""
+        if part.counter is not None and part.counter == self._last:
+            self._dropped[f"{self._stream}: repeated or late"] += 1
+            return
+        known = part.counter is not None and self._counter is not None
+        another = bool(self._there) and known and part.counter != self._counter
+        if another or not self._there.isdisjoint(part.columns):
+            if not another and known:
+                self._dropped[f"{self._stream}: repeated or late"] += 1
+                return
+            self.finish()
+        if not self._there:
+            self._time_s = time_s
+        if part.counter is not None:
+            self._counter = part.counter
+        for column, value in zip(part.columns, part.values, strict=True):
+            self._row[column] = value
+        self._there.update(part.columns)
+        if part.n_out_of_range:
+            self._dropped[f"{self._stream}: out of range"] += part.n_out_of_range
+        if self._there >= self._needed:
+            self.finish()
+
+    def finish_before(self, time_s: float) -> None:
+        """End a sample that began before a time."""
+        if self._there and self._time_s < time_s:
+            self.finish()
+
+    def finish(self) -> None:
+        """End the sample, complete or not."""
+        if not self._there:
+            return
+        if not self._there >= self._needed:
+            self._dropped[f"{self._stream}: part missing"] += 1
+        if self._adds_real_part:
+            x, y, z, w = QUATERNION
+            self._row[w] = real_part(self._row[x], self._row[y], self._row[z])
+        if len(self.done) >= QUEUE:
+            del self.done[0]
+            self._dropped[f"{self._stream}: queue full"] += 1
+        self.done.append((self._time_s, self._row))
+        self._row, self._there = [math.nan] * self._width, set()
+        self._last, self._counter = self._counter, None
+
+
+class Receiver:
+    """Samples from frames as they come; whatever comes, it does not raise.
+
+    Parameters
+    ----------
+    layout : of the DBC
+    streams : that are read; frames of others are left alone
+
+    Attributes
+    ----------
+    dropped : what was not used, as counts by kind
+    n_used : frames that were used
+
+    Examples
+    --------
+    >>> from pipelines.data.can_codec import encode, load_layout
+    >>> layout = load_layout()
+    >>> receiver = Receiver(layout, ("wheels",))
+    >>> for frame in encode(layout, "wheels", [10.0, 11.0, 12.0, 1.0, 2.0, 3.0], counter=0, time_s=4.0):
+    ...     stream = receiver.take(frame)
+    >>> receiver.readings(5.0)["wheels"].values
+    array([[10., 11., 12.,  1.,  2.,  3.]])
+    """
+
+    def __init__(self, layout: Layout, streams: tuple[str, ...]) -> None:
+        self._layout = layout
+        self.dropped: Counter[str] = Counter()
+        self.n_used = 0
+        self._streams = {
+            name: _Assembler(name, layout.columns(name), self.dropped)
+            for name in streams
+            if name in layout.by_stream
+        }
+
+    def take(self, frame: Frame) -> str | None:
+        """Take a frame; return the stream that it is of, None where it is not used."""
+        part = decode(self._layout, frame)
+        if isinstance(part, Drop):
+            self.dropped[part.value] += 1
+            return None
+        assembler = self._streams.get(part.stream)
+        if assembler is None:
+            self.dropped[f"{part.stream}: not read here"] += 1
+            return None
+        assembler.take(frame.time_s, part)
+        self.n_used += 1
+        return part.stream
+
+    def readings(self, now_s: float) -> dict[str, Reading]:
+        """Return the samples since the last call, by stream; of incomplete ones those that are old enough."""
+        found = {}
+        for name, assembler in self._streams.items():
+            assembler.finish_before(now_s - INCOMPLETE_S)
+            if assembler.done:
+                times, rows = zip(*assembler.done, strict=True)
+                found[name] = Reading(np.array(times), np.array(rows))
+                assembler.done = []
+        return found
+
+
+def find_runs(folder: Path, layout: Layout, robot: str) -> list[Callable[..., RunLog]]:
+    """Return a function for each log under a folder, which reads it and takes ``repair=``.
+
+    Parameters
+    ----------
+    folder : of the logs; one in a folder of its own is labelled with that folder's name as its terrain
+    layout : of the DBC
+    robot : of all runs
+    """
+    paths = sorted(path for path in folder.rglob("*") if path.suffix.lower() in READERS and path.is_file())
+    return [partial(read_run, path, folder, layout, robot) for path in paths]
+
+
+def read_run(path: Path, folder: Path, layout: Layout, robot: str, *, repair: bool = False) -> RunLog:
+    """Return the run of a log; its time begins at the first frame.
+
+    Parameters
+    ----------
+    path, folder : the log, and the folder that its name counts from
+    layout : of the DBC
+    robot : of the run
+    repair : drop and count what is damaged or missing, which a strict read refuses
+
+    Raises
+    ------
+    LogError
+        if the log cannot be read, has none of the signals, or is damaged.
+    """
+    receiver = Receiver(layout, tuple(SIGNALS))
+    parts: dict[str, list[Reading]] = {name: [] for name in RECEIVED}
+    first_s: float | None = None
+    for number, frame in enumerate(_frames(path)):
+        first_s = frame.time_s if first_s is None else first_s
+        receiver.take(frame._replace(time_s=frame.time_s - first_s))
+        if number % QUEUE == QUEUE - 1:
+            _collect(receiver, frame.time_s - first_s, parts)
+    _collect(receiver, np.inf, parts)
+    dropped = Counter(receiver.dropped)
+    faults = {kind: n for kind, n in dropped.items() if kind not in USUAL}
+    if faults and not repair:
+        kind, n = max(faults.items(), key=lambda fault: fault[1])
+        raise LogError(f"{path}: {n} of kind {kind!r}; read it with --repair to leave them out")
+    repairs: Counter[str] | None = Counter() if repair else None
+    streams = {
+        "commands" if name == "twist" else name: _stream(path, layout, name, readings, repairs)
+        for name, readings in parts.items()
+        if readings
+    }
+    if not streams:
+        raise LogError(f"{path}: has no frame of the messages of {layout.name}")
+    place = path.relative_to(folder).with_suffix("").parts
+    labels = (whole_run_label(streams, place[0]),) if len(place) > 1 else ()
+    counts = dropped + (repairs or Counter())
+    return RunLog("_".join(place), robot, streams, labels, source=str(path), dropped=counts)
+
+
+def _frames(path: Path) -> Iterator[Frame]:
+    try:
+        import can
+    except ImportError as error:
+        raise ConfigError(MISSING_PACKAGE) from error
+    name, mode = READERS[path.suffix.lower()]
+    try:
+        with path.open(mode) as file:  # a reader that fails leaves a file of its own open
+            for message in getattr(can, name)(file):
+                yield Frame(
+                    message.timestamp,
+                    message.arbitration_id,
+                    bytes(message.data),
+                    message.is_extended_id,
+                    message.is_remote_frame,
+                    message.is_error_frame,
+                )
+    except OSError as error:
+        raise LogError(f"{path}: cannot be read ({error.strerror or error})") from error
+    except Exception as error:  # whatever a parser does with a damaged file
+        text = " ".join(str(error).split()) or type(error).__name__
+        raise LogError(f"{path}: is no log of a CAN bus, or is damaged ({text[:160]})") from error
+
+
+def _collect(receiver: Receiver, now_s: float, parts: dict[str, list[Reading]]) -> None:
+    for name, reading in receiver.readings(now_s).items():
+        if name in parts:
+            parts[name].append(reading)
+
+
+def _stream(
+    path: Path, layout: Layout, name: str, readings: list[Reading], repairs: Counter[str] | None
+) -> Stream:
+    """Return a stream with the channels that the DBC has."""
+    there = layout.columns(name)
+    if name == "odometry":
+        there |= {QUATERNION[3]}
+    columns = sorted(there)
+    channels = channels_of(name)
+    return checked_stream(
+        f"{path}, {name}",
+        np.concatenate([reading.time_s for reading in readings]),
+        np.concatenate([reading.values for reading in readings])[:, columns],
+        [channels[column] for column in columns],
+        row_of=lambda sample: sample + 1,
+        repairs=repairs,
+    )
