@@ -32,8 +32,9 @@ def bench_model(uri: str | None, seed: int) -> TerrainModel:
     if uri is not None:
         return load_model(uri)
     from pipelines.classify.train import model_info
-    from pipelines.crossval.crossval import samples_of
-    from pipelines.crossval.settings import CrossvalSettings
+    from pipelines.learn.protocols import samples_of
+    from pipelines.learn.recipes import recipe_of
+    from pipelines.learn.settings import RecipeSettings
 
     robot = load_robot(ROBOT)
     runs = [
@@ -45,9 +46,9 @@ def bench_model(uri: str | None, seed: int) -> TerrainModel:
         for soil in ("grass", "tiles")
         for number in (1, 2)
     ]
-    settings = CrossvalSettings(seed=seed)
-    windows = samples_of(runs, settings).cut.windows
-    recipe = settings.new_recipe().fit(windows, windows.terrain.astype(str))
+    settings = RecipeSettings(seed=seed)
+    windows = samples_of(runs, settings).windows
+    recipe = recipe_of(settings).fit(windows, windows.terrain.astype(str))
     return TerrainModel(recipe, model_info(runs, settings, windows, "simulated", ""))
 
 

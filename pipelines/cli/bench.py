@@ -59,15 +59,13 @@ def fleet_command(settings: FleetSettings, json_file: Json = None) -> None:
 @command(app, "labels")
 def labels_command(settings: LabelsSettings, json_file: Json = None) -> None:
     """Measure what chosen questions and self-training gain on held-out runs, from few labels."""
-    from pipelines.crossval.settings import CrossvalSettings
+    from pipelines.learn.settings import LearnSettings
     from pipelines.propose.screen import print_study
     from pipelines.propose.study import label_study
     from pipelines.reporting.json_file import write_json
     from pipelines.reporting.terminal import output_console, progress_bar
 
-    evaluation = CrossvalSettings(
-        repeats=settings.repeats, seed=settings.seed, n_jobs=settings.n_jobs, extras=False
-    )
+    evaluation = LearnSettings(repeats=settings.repeats, seed=settings.seed, n_jobs=settings.n_jobs)
     with progress_bar() as progress:
         result = label_study(settings.data, evaluation, progress)
     print_study(result, output_console())

@@ -143,14 +143,15 @@ def train_classifier(
     runs_a_terrain : number of runs; that of ``terrain quickstart`` by default
     """
     from pipelines.classify.train import model_info
-    from pipelines.crossval.crossval import samples_of
-    from pipelines.crossval.settings import CrossvalSettings
     from pipelines.estimate.labelled import RUNS_A_TERRAIN, labelled_runs
+    from pipelines.learn.protocols import samples_of
+    from pipelines.learn.recipes import recipe_of
+    from pipelines.learn.settings import RecipeSettings
 
     runs, _, _ = labelled_runs(seed, runs_a_terrain or RUNS_A_TERRAIN, progress, robot)
-    settings = CrossvalSettings(seed=seed)
-    windows = samples_of(runs, settings).cut.windows
-    recipe = settings.new_recipe()
+    settings = RecipeSettings(seed=seed)
+    windows = samples_of(runs, settings).windows
+    recipe = recipe_of(settings)
     progress("train", 0, 1)
     recipe.fit(windows, windows.terrain.astype(str))
     progress("train", 1, 1)

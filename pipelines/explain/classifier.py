@@ -8,9 +8,10 @@ from dataclasses import replace
 import numpy as np
 
 from features.windows import Layout, cut_windows, layout_of
-from pipelines.crossval.settings import CrossvalSettings
-from pipelines.crossval.splits import labelled
 from pipelines.estimate.labelled import RUNS_A_TERRAIN, SCENARIO
+from pipelines.learn.protocols import labelled
+from pipelines.learn.recipes import recipe_of
+from pipelines.learn.settings import RecipeSettings
 from pipelines.report import Progress, silent
 from terrain.discrepancy.filter_gain import Comparison, accuracy_change
 from terrain.errors import DataError, TerrainError
@@ -47,7 +48,7 @@ def classifier_gain(
     seed : of simulation, inner folds and bootstrap
     runs_a_terrain : simulated on each
     """
-    settings = CrossvalSettings(seed=seed)
+    settings = RecipeSettings(seed=seed)
     known = [run for run in held_out if len(run.terrains) == 1 and run.terrains[0] in soil_names()]
     terrains = tuple(sorted({run.terrains[0] for run in known}))
     unknown = Comparison(settings.recipe, None, len(known), {}, terrains)
@@ -81,18 +82,18 @@ def classifier_gain(
 
 
 def _correct_windows(
-    trained: Sequence[RunLog], known: Sequence[RunLog], settings: CrossvalSettings
+    trained: Sequence[RunLog], known: Sequence[RunLog], settings: RecipeSettings
 ) -> tuple[Array, Array]:
     """Return which windows (n,) of the known runs are classified correctly, and their runs (n,)."""
     layout = _shared_layout(trained, known, settings)
     train, test = (_windows(runs, settings, layout) for runs in (trained, known))
-    recipe = settings.new_recipe()
+    recipe = recipe_of(settings, settings.recipe)
     recipe.fit(train, train.terrain.astype(str))
     predicted = np.asarray(recipe.predict(test)).astype(str)
     return predicted == test.terrain.astype(str), test.run_id.astype(str)
 
 
-def _shared_layout(trained: Sequence[RunLog], known: Sequence[RunLog], settings: CrossvalSettings) -> Layout:
+def _shared_layout(trained: Sequence[RunLog], known: Sequence[RunLog], settings: RecipeSettings) -> Layout:
     """Return the channels that simulated and measured runs both have."""
     own, theirs = (layout_of(runs, SIGNAL_SETS, speeds=True) for runs in (trained, known))
     channels = {
@@ -105,5 +106,5 @@ def _shared_layout(trained: Sequence[RunLog], known: Sequence[RunLog], settings:
     return Layout(channels, {stream: own.rate_hz[stream] for stream in channels})
 
 
-def _windows(runs: Sequence[RunLog], settings: CrossvalSettings, layout: Layout) -> Windows:
+def _windows(runs: Sequence[RunLog], settings: RecipeSettings, layout: Layout) -> Windows:
     return labelled(cut_windows(runs, settings.rule, layout=layout, skip_short=True)).windows

@@ -15,14 +15,12 @@ import numpy as np
 from sklearn.base import clone
 
 from features.motion import Motion, window_motion
-from pipelines.crossval.crossval import samples_of
-from pipelines.crossval.evaluation import Examples
-from pipelines.crossval.extras import examples_of
-from pipelines.crossval.settings import CrossvalSettings
-from pipelines.crossval.splits import Fold, folds_of
 from pipelines.data.datasets import load_runs
+from pipelines.learn.evaluate import Examples
 from pipelines.learn.parallel import parallel
-from pipelines.learn.recipes import feature_matrix
+from pipelines.learn.protocols import PROTOCOLS, Fold, folds_of, samples_of
+from pipelines.learn.recipes import feature_matrix, recipe_of
+from pipelines.learn.settings import LearnSettings
 from pipelines.propose.proposals import ACCEPTED, Proposal, questions
 from pipelines.reporting.progress import Progress, silent
 from terrain.classify.paired import Difference, Outcome, compare_outcomes
@@ -57,7 +55,7 @@ class _FoldLabels(NamedTuple):
     n_labelled: tuple[int, ...]
 
 
-def label_study(data: Path, settings: CrossvalSettings, progress: Progress = silent) -> LabelStudy:
+def label_study(data: Path, settings: LearnSettings, progress: Progress = silent) -> LabelStudy:
     """Compare strategies on a folder of labelled runs.
 
     Parameters
@@ -72,13 +70,14 @@ def label_study(data: Path, settings: CrossvalSettings, progress: Progress = sil
         if a terrain has too few runs.
     """
     samples = samples_of(load_runs(data), settings)
-    windows = samples.cut.windows
-    recipe = settings.new_recipe()
-    examples = examples_of(feature_matrix(recipe, windows), samples)
+    windows = samples.windows
+    recipe = recipe_of(settings)
+    examples = Examples(feature_matrix(recipe, windows), samples.terrain, samples.group)
     motion = window_motion(windows)
-    folds = folds_of(samples, "grouped", settings.n_repeats, settings.seed)
+    n_repeats = settings.repeats or PROTOCOLS["grouped"].repeats
+    folds = folds_of(samples, "grouped", n_repeats, settings.seed)
     classes = np.unique(examples.terrain)
-    probability = np.full((len(STRATEGIES), settings.n_repeats, len(windows), len(classes)), np.nan)
+    probability = np.full((len(STRATEGIES), n_repeats, len(windows), len(classes)), np.nan)
     counts = []
     progress("labels", 0, len(folds))
     each = ((fold, settings.seed + number) for number, fold in enumerate(folds))
@@ -104,7 +103,7 @@ def label_study(data: Path, settings: CrossvalSettings, progress: Progress = sil
     rng = np.random.default_rng(settings.seed)
     return LabelStudy(
         data.resolve().name,
-        settings.n_repeats,
+        n_repeats,
         tuple(
             StudyRow(name, float(np.mean([c[i] for c in counts])), float(outcomes[i].correct.mean()))
             for i, name in enumerate(STRATEGIES)

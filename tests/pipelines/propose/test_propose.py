@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from pipelines.cli.main import main
-from pipelines.crossval.settings import CrossvalSettings
 from pipelines.data.datasets import load_runs
 from pipelines.label.settings import LabelSettings
+from pipelines.learn.settings import LearnSettings
 from pipelines.models.model_files import read_model
 from pipelines.propose.answers_file import COLUMNS, read_answers
 from pipelines.propose.labelling import SOURCES_FILE, propose_labels, write_labels
@@ -219,7 +219,7 @@ def test_the_smoothed_sequence_is_the_best_of_all_of_them():
 def test_the_study_labels_as_many_runs_by_doubt_as_at_random_and_gives_the_same_again(tmp_path, drive_all):
     for run in drive_all(n_runs=6, seed=3):
         write_run(run, tmp_path / "data")
-    settings = CrossvalSettings(repeats=1, n_jobs=1, extras=False)
+    settings = LearnSettings(repeats=1, n_jobs=1)
     found = label_study(tmp_path / "data", settings)
     rows = {row.name: row for row in found.rows}
     assert tuple(rows) == STRATEGIES
