@@ -58,7 +58,6 @@ class McapWriter:
     ----------
     file : opened for writing
     metadata : shown by tools that list a file's metadata
-    packed : messages lie in packed chunks, with an index; else each is readable as soon as it is flushed
 
     Raises
     ------
@@ -66,13 +65,13 @@ class McapWriter:
         if mcap is not installed.
     """
 
-    def __init__(self, file: BinaryIO, metadata: Mapping[str, str], *, packed: bool = True) -> None:
+    def __init__(self, file: BinaryIO, metadata: Mapping[str, str]) -> None:
         try:
             from mcap.writer import CompressionType, Writer
         except ImportError as error:
             raise ConfigError(MISSING_PACKAGE) from error
         self._file = file
-        self._writer = Writer(file, compression=CompressionType.ZSTD, use_chunking=packed)
+        self._writer = Writer(file, compression=CompressionType.ZSTD)
         self._writer.start(profile="ros2", library=LIBRARY)
         self._writer.add_metadata("terrain_run", dict(metadata))
         self._schemas: dict[str, int] = {}
@@ -85,6 +84,10 @@ class McapWriter:
                 self._schemas[kind] = self._writer.register_schema(kind, "ros2msg", definition.encode())
             self._channels[topic, kind] = self._writer.register_channel(topic, "cdr", self._schemas[kind])
         self._writer.add_message(self._channels[topic, kind], log_ns, message, log_ns)
+
+    def flush(self) -> None:
+        """End the chunk that is being filled, and give all to the system: it is readable then."""
+        self._writer.flush()
 
     def finish(self) -> None:
         """Write the end of the file, which stays open."""
@@ -113,7 +116,7 @@ class RunRecorder:
 
     def __init__(self, file: BinaryIO, head: Head, origin_s: float = 0.0) -> None:
         metadata = {name: value for name, value in head._asdict().items() if isinstance(value, str)}
-        self._writer = McapWriter(file, metadata, packed=False)
+        self._writer = McapWriter(file, metadata)
         self._file, self._head, self._origin_s = file, head, origin_s
         self._topics: dict[str, StreamTopic] = {}
         self._is_described, self._last_ns = False, 0
@@ -151,7 +154,7 @@ class RunRecorder:
 
     def flush(self) -> None:
         """Give all that was appended to the system."""
-        self._file.flush()
+        self._writer.flush()
 
     def finish(self, labels: Iterable[Label] = (), dropped: Mapping[str, int] | None = None) -> None:
         """Write the end of the file, which stays open.

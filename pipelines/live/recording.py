@@ -1,35 +1,49 @@
-"""Recording of one live session: its event loop only appends to lists, a thread does the writing.
+"""Recording of live sessions as MCAP files that are written as the samples come.
 
-The samples of a session go to a hidden journal every few seconds (:mod:`pipelines.recording.journal`), and
-from there, when the session ends, to a run folder (:mod:`pipelines.recording.finishing`).  A process that is
-killed loses those seconds at most.
+The event loop of a session only appends to lists; one thread writes all recordings, each at least once a
+second, so that a killed process loses at most two.  The files have the topics of an exported run
+(:mod:`pipelines.data.run_topics`): Foxglove and PlotJuggler open them while they grow, and ``terrain convert``
+makes runs of them.  A recording goes on in files of a bounded size, each a run of the same session, the next
+one beginning with the sample after the last.
 """
 
 from __future__ import annotations
 
 import errno
+import json
+import os
+import shutil
 import threading
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from io import BytesIO
 from pathlib import Path
 from time import monotonic
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
+from pipelines.data.mcap_file import RunRecorder
 from pipelines.data.recorded_windows import WindowResult, window_entry
-from pipelines.recording.finishing import finish
-from pipelines.recording.journal import VERSION, Block, Journal, Record, journal_path
-from terrain.errors import LogError, TerrainError
+from pipelines.data.run_topics import LATEST_S, WINDOW_TOPIC, Head
+from terrain.errors import LogError
 from terrain.estimation.live.clocks import number, numbers, readable
 from terrain.files.names import plain_name
 from terrain.logs.replay import TWIST
+from terrain.logs.samples import BAD_TIME
 from terrain.logs.schema import unit_of
 from terrain.logs.write import run_folder
 from terrain.records import Array, Command, Reading
 
-if TYPE_CHECKING:
-    from pipelines.recording.thread import RecordingThread
+FLUSH_S = 1.0
+"""Time between two writings of a recording: with the time that one takes, what a killed process loses."""
+
+PART_BYTES = 128 << 20
+"""Size of a file above which the recording goes on in another: an hour or two of a robot's samples."""
+
+FREE_BYTES = 256 << 20
+"""A recording ends where less is free on the disk: the states of the robots are to be saved there, too."""
 
 MAX_WAITING_BYTES = 4 << 20
 """Memory of one session that may wait for the disk: minutes of its samples."""
@@ -47,20 +61,14 @@ BAD_COMMAND = "commands that cannot be read"
 BAD_WINDOW = "windows that cannot be read"
 
 
-class RecordingLimits(NamedTuple):
-    """When a recording ends by itself.
+class _Part(NamedTuple):
+    """A file that is being written."""
 
-    Parameters
-    ----------
-    max_bytes : of the journal; the run is built in memory at the end, and takes up to three times as much
-    max_hours : of recording
-    """
-
-    max_bytes: int = 128 << 20
-    max_hours: float = 4.0
-
-
-DEFAULT_LIMITS = RecordingLimits()
+    path: Path
+    file: BinaryIO
+    run: RunRecorder
+    streams: set[str]
+    """That are registered."""
 
 
 class SessionRecorder:
@@ -68,14 +76,20 @@ class SessionRecorder:
 
     Parameters
     ----------
-    folder : of the run folders; made when missing
-    run_id : of the run; gets a number behind it where a run of the name is there at the end
+    folder : of the files; made when missing
+    run_id : of the run; gets a number behind it where a file of the name is there, and ``_part2``, ``_part3``
+        where the recording goes on in further files
     robot : name
     channels : of each stream that is recorded, in the order of the columns of its readings
     wheels : names of the wheels that are commanded
     source : of the run, as text
     writer : thread that writes; shared by all recordings
-    limits : when the recording ends by itself
+    part_bytes : size above which a file is followed by another
+
+    Attributes
+    ----------
+    files : that were begun, in order
+    settled : set when the thread is done with the recording
 
     Raises
     ------
@@ -84,9 +98,9 @@ class SessionRecorder:
 
     Notes
     -----
-    Samples are kept raw and in the order in which they came.  What a strict run folder cannot hold is dropped
-    and counted when the run is written: stamps that repeat or go back, channels without a finite value,
-    streams of fewer than two samples or apart in time from the others.
+    Samples are kept raw and in the order in which they came, but for stamps that no header can hold.  What a
+    run cannot hold is dropped and counted when the file is read: stamps that repeat or go back, channels
+    without a finite value, streams of fewer than two samples or apart in time from the others.
     """
 
     def __init__(
@@ -99,42 +113,32 @@ class SessionRecorder:
         source: str = "recorded live",
         *,
         writer: RecordingThread,
-        limits: RecordingLimits = DEFAULT_LIMITS,
+        part_bytes: int = PART_BYTES,
     ) -> None:
         run_folder(run_id, folder)
         self._channels = {name: tuple(each) for name, each in channels.items()}
         _check_channels(self._channels)
         commanded = (*TWIST, *(f"wheel_{w}_radps" for w in wheels), *(f"steer_{w}_rad" for w in wheels))
-        self._decided = {"commands": commanded}
+        self._channels["commands"] = commanded
         self._n_wheels = len(wheels)
-        self._place, self._limits, self._writer = Path(folder), limits, writer
-        self._head = {"version": VERSION, "run_id": run_id, "robot": robot, "source": source}
+        self._folder, self._part_bytes, self._writer = Path(folder), part_bytes, writer
+        self._head = Head(run_id, robot, run_id, source=source, live=True)
         self._lock = threading.Lock()
         self._waiting: list[tuple[str, Array]] = []
         self._outputs: list[WindowResult] = []
         self._dropped: Counter[str] = Counter()
         self._n_waiting = 0
-        self._begin_s = monotonic()
-        self._journal: Journal | None = None
+        self._part: _Part | None = None
+        self._origin_s = np.nan
         self._ended = ""  # why no more is taken; empty while it is
-        self._settled = threading.Event()
-        self.folder: Path | None = None
+        self.settled = threading.Event()
+        self.files: list[Path] = []
         writer.add(self)
 
     @property
     def status(self) -> str:
         """``recording``, ``finished``, or ``stopped:`` and why."""
         return self._ended or RECORDING
-
-    @property
-    def run_id(self) -> str:
-        """Name of the run; as long as its folder is not there, the one that was asked for."""
-        return str(self._head["run_id"]) if self.folder is None else self.folder.name
-
-    @property
-    def settled(self) -> bool:
-        """Whether the thread is done with it: a run folder is there, or there will be none."""
-        return self._settled.is_set()
 
     def readings(self, readings: Mapping[str, Reading]) -> None:
         """Record what was measured, by stream; what cannot be read is counted."""
@@ -147,17 +151,14 @@ class SessionRecorder:
             return
         for name, given in items:
             channels = self._channels.get(name) if isinstance(name, str) else None
-            if channels is None:
+            if channels is None or name in _DECIDED:
                 self._count(UNKNOWN_STREAM)
                 continue
             reading = readable(given)
             if reading is None or reading.values.shape[1] != len(channels):
                 self._count(UNREADABLE)
                 continue
-            rows = np.empty((reading.time_s.size, 1 + len(channels)))
-            rows[:, 0] = reading.time_s
-            rows[:, 1:] = reading.values
-            self._put(name, rows)
+            self._put(name, np.column_stack([reading.time_s, reading.values]))
 
     def command(self, time_s: float, twist: Any, command: Command, status: Mapping[str, float]) -> None:
         """Record a command.
@@ -182,10 +183,10 @@ class SessionRecorder:
         except Exception:  # whatever was given
             self._count(BAD_COMMAND)
             return
-        if names and "control" not in self._decided and _accepted(names):
-            self._decided["control"] = names
-        fits = row.shape[1] == 1 + len(self._decided["commands"])
-        if not fits or (names and names != self._decided.get("control")):
+        if names and "control" not in self._channels and _accepted(names):
+            self._channels["control"] = names
+        fits = row.shape[1] == 1 + len(self._channels["commands"])
+        if not fits or (names and names != self._channels.get("control")):
             self._count(BAD_COMMAND)
             return
         self._put("commands", row)
@@ -201,8 +202,8 @@ class SessionRecorder:
             self._n_waiting += 1000
         self._bound()
 
-    def close(self, timeout_s: float = 0.0) -> Path | None:
-        """End the recording; return the run folder where the thread has written it within a time.
+    def close(self, timeout_s: float = 0.0) -> list[Path]:
+        """End the recording; return its files, the last one whole where the thread was done within a time.
 
         Parameters
         ----------
@@ -210,12 +211,12 @@ class SessionRecorder:
         """
         self._end(FINISHED)
         if timeout_s > 0.0:
-            self._settled.wait(timeout_s)
-        return self.folder
+            self.settled.wait(timeout_s)
+        return self.files
 
-    def _count(self, kind: str) -> None:
+    def _count(self, kind: str, n: int = 1) -> None:
         with self._lock:
-            self._dropped[kind] += 1
+            self._dropped[kind] += n
 
     def _put(self, stream: str, rows: Array) -> None:
         with self._lock:
@@ -234,90 +235,113 @@ class SessionRecorder:
 
     def work(self) -> bool:
         """Write what waits; say whether there is more to come.  Called by the thread, and by nothing else."""
-        if self.settled:
+        if self.settled.is_set():
             return False
-        closed = bool(self._ended)  # seen before the samples are taken, so that all of them are
-        stopped = ""
+        ended = bool(self._ended)  # seen before the samples are taken, so that all of them are
         try:
             self._flush()
-            stopped = "" if closed else self._limit()
+            if self._part is not None and (ended or self._part.file.tell() > self._part_bytes):
+                self._finish(self._part)
+            if ended and not self.files and self._ended == FINISHED:
+                self._ended = NOTHING_KEPT
         except OSError as error:
-            stopped = f"stopped: {_reason(error)}"
+            ended, self._ended = True, f"stopped: {_reason(error)}"
         except Exception as error:  # of this recording: the thread serves the others
-            stopped = f"stopped: {type(error).__name__}: {error}"
-        self._ended = stopped or self._ended
-        if not (stopped or closed):
-            return True
-        self._finish()
-        return False
+            ended, self._ended = True, f"stopped: {type(error).__name__}: {error}"
+        if ended:
+            self._settle()
+        return not ended
+
+    def _settle(self) -> None:
+        if self._part is not None:
+            with suppress(OSError):  # a full disk: what was written before stays readable
+                self._part.file.close()
+        self._waiting, self._outputs = [], []
+        self.settled.set()
 
     def _flush(self) -> None:
-        journal = self._journal or self._begin()
+        """Write what waits to the file, and wait until it is on the disk."""
         with self._lock:
             waiting, self._waiting = self._waiting, []
             outputs, self._outputs = self._outputs, []
-            dropped, self._dropped = self._dropped, Counter()
             self._n_waiting = 0
-        if not (waiting or outputs or dropped):
-            return
         by_stream: dict[str, list[Array]] = {}
         for name, rows in waiting:
             by_stream.setdefault(name, []).append(rows)
-        channels = self._channels | self._decided
-        blocks = [Block(name, channels[name], np.concatenate(rows)) for name, rows in by_stream.items()]
-        entries = []
+        blocks = {name: self._stampable(np.concatenate(rows)) for name, rows in by_stream.items()}
+        if not any(map(len, blocks.values())) and (self._part is None or not outputs):
+            return
+        part = self._part or self._begin()
+        for name, rows in blocks.items():
+            if len(rows):
+                if name not in part.streams:
+                    part.run.register(name, self._channels[name])
+                    part.streams.add(name)
+                part.run.append(name, rows[:, 0], rows[:, 1:])
         for output in outputs:
             try:
-                entries.append(window_entry(output))
+                entry = window_entry(output)
             except (TypeError, ValueError, AttributeError):
-                dropped[BAD_WINDOW] += 1
-        journal.append([Record({"windows": entries, "dropped": dropped}, tuple(blocks))])
+                self._count(BAD_WINDOW)
+                continue
+            end_s = float(np.clip(np.nan_to_num(output.end_s), self._origin_s, self._origin_s + LATEST_S - 1))
+            part.run.append_text(WINDOW_TOPIC, end_s, json.dumps(entry, allow_nan=False))
+        part.run.flush()
+        os.fsync(part.file.fileno())
+        if not os.fstat(part.file.fileno()).st_nlink:
+            raise FileNotFoundError(f"{part.path} was removed")
+        if shutil.disk_usage(self._folder).free < FREE_BYTES:
+            self._end(f"stopped: less than {FREE_BYTES >> 20} MiB are free on the disk")
 
-    def _begin(self) -> Journal:
-        """Make a journal that no other recording has, and write its first record."""
-        self._place.mkdir(parents=True, exist_ok=True)
-        name, count = str(self._head["run_id"]), 1
-        while self._journal is None:
+    def _stampable(self, rows: Array) -> Array:
+        """Return the rows whose times the stamps of messages can hold, and count the others."""
+        time_s = rows[:, 0]
+        finite = np.isfinite(time_s)
+        if np.isnan(self._origin_s) and finite.any():
+            first_s = float(time_s[finite][0])
+            self._origin_s = 0.0 if 0.0 <= first_s < LATEST_S / 2 else np.floor(first_s) - 3600.0
+        held = finite & (time_s >= self._origin_s) & (time_s < self._origin_s + LATEST_S)
+        if not held.all():
+            self._count(BAD_TIME, int((~held).sum()))
+        return rows[held]
+
+    def _begin(self) -> _Part:
+        """Begin a file that no other recording has."""
+        self._folder.mkdir(parents=True, exist_ok=True)
+        name = base = (
+            self._head.run_id if not self.files else f"{self.files[0].stem}_part{len(self.files) + 1}"
+        )
+        count = 1
+        while True:
+            path = self._folder / f"{name}.mcap"
             try:
-                self._journal = Journal(journal_path(self._place, name))
+                file = path.open("xb")
+                break
             except FileExistsError:
                 count += 1
-                name = f"{self._head['run_id']}_{count}"
-        try:
-            self._journal.append([Record(self._head)])
-        except OSError:
-            self._journal.path.unlink(missing_ok=True)  # nothing is in it
-            raise
-        return self._journal
+                name = f"{base}_{count}"
+        head = self._head._replace(run_id=name, session=self.files[0].stem if self.files else name)
+        self._part = _Part(path, file, RunRecorder(file, head, self._origin_s), set())
+        self.files.append(path)
+        return self._part
 
-    def _limit(self) -> str:
-        if self._journal is not None and self._journal.n_bytes > self._limits.max_bytes:
-            return f"stopped: limit of {self._limits.max_bytes / 2**20:g} MiB reached"
-        if monotonic() - self._begin_s > 3600.0 * self._limits.max_hours:
-            return f"stopped: limit of {self._limits.max_hours:g} h reached"
-        return ""
+    def _finish(self, part: _Part) -> None:
+        """Write the end of the file; what comes next begins another."""
+        with self._lock:
+            dropped, self._dropped = self._dropped, Counter()
+        part.run.finish(dropped=dropped)
+        os.fsync(part.file.fileno())
+        part.file.close()
+        self._part = None
 
-    def _finish(self) -> None:
-        try:
-            if self._journal is not None:
-                self.folder = finish(self._journal.path)
-                if self.folder is None and self._ended == FINISHED:
-                    self._ended = NOTHING_KEPT
-        except (TerrainError, OSError) as error:
-            if self._ended == FINISHED:
-                self._ended = f"stopped: {_reason(error)}"
-        except Exception as error:  # the journal is kept
-            self._ended = f"stopped: {type(error).__name__}: {error}"
-        finally:
-            if self._journal is not None:
-                self._journal.close()
-            self._waiting, self._outputs = [], []
-            self._settled.set()
+
+_DECIDED = ("commands", "control")
+"""Streams that a controller writes."""
 
 
 def _check_channels(channels: Mapping[str, Sequence[str]]) -> None:
     for name, each in channels.items():
-        if not plain_name(name) or name in ("commands", "control"):
+        if not plain_name(name) or name in _DECIDED:
             raise LogError(f"stream {name!r} cannot be recorded as a sensor's")
         if not each or len(set(each)) < len(each) or "time_s" in each:
             raise LogError(f"stream {name!r}: channels {', '.join(each)!r} are no list of different names")
@@ -332,13 +356,82 @@ def _accepted(names: Sequence[str]) -> bool:
         return False
 
 
-def _reason(error: Exception) -> str:
+def _reason(error: OSError) -> str:
     """Return in words why nothing could be written."""
-    cause = error if isinstance(error, OSError) else error.__cause__
-    if not isinstance(cause, OSError):
-        return str(error)
-    if cause.errno in (errno.ENOSPC, errno.EDQUOT):
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return "no space left on the disk"
-    if isinstance(cause, FileNotFoundError):
+    if isinstance(error, FileNotFoundError):
         return "the folder was removed"
-    return f"cannot be written ({cause.strerror or cause})"
+    return f"cannot be written ({error.strerror or error})"
+
+
+class RecordingThread:
+    """A thread that writes any number of recordings, one after the other.
+
+    Parameters
+    ----------
+    flush_s : time between two writings of a recording
+
+    Raises
+    ------
+    ConfigError
+        if mcap is not installed.
+
+    Examples
+    --------
+    >>> writer = RecordingThread()
+    >>> writer.stop()
+    True
+    """
+
+    def __init__(self, flush_s: float = FLUSH_S) -> None:
+        RunRecorder(
+            BytesIO(), Head("none", "")
+        )  # imports what it needs; later that would hold up the sessions
+        self._flush_s = flush_s
+        self._changed = threading.Condition()
+        self._recordings: list[SessionRecorder] = []
+        self._due: deque[SessionRecorder] = deque()
+        self._stopped = False
+        self._thread = threading.Thread(target=self._run, name="recording", daemon=True)
+        self._thread.start()
+
+    def add(self, recording: SessionRecorder) -> None:
+        """Write a recording from now on."""
+        with self._changed:
+            self._recordings.append(recording)
+
+    def due(self, recording: SessionRecorder) -> None:
+        """Note that a recording has ended, and is to be written at once."""
+        with self._changed:
+            self._due.append(recording)
+            self._changed.notify()
+
+    def stop(self, timeout_s: float = 10.0) -> bool:
+        """Close and write all recordings, and end; say whether there was time for it."""
+        with self._changed:
+            self._stopped = True
+            self._changed.notify()
+        self._thread.join(timeout_s)
+        return not self._thread.is_alive()
+
+    def _run(self) -> None:
+        next_s = monotonic() + self._flush_s
+        while True:
+            with self._changed:
+                while not (self._due or self._stopped) and monotonic() < next_s:
+                    self._changed.wait(max(next_s - monotonic(), 0.001))
+                stopped = self._stopped
+                everything = stopped or monotonic() >= next_s
+                now = list(self._recordings) if everything else list(self._due)
+                self._due.clear()
+            if stopped:
+                for one in now:
+                    one.close()
+            done = [one for one in now if not one.work()]
+            with self._changed:
+                self._recordings = [one for one in self._recordings if one not in done]
+            if everything:
+                next_s = monotonic() + self._flush_s
+            if stopped and not self._due:
+                return

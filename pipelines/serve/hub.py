@@ -13,11 +13,9 @@ from typing import NamedTuple
 
 from pipelines.live.classifying import ClassifierThread
 from pipelines.live.model import LiveModel
-from pipelines.live.recording import SessionRecorder
+from pipelines.live.recording import RecordingThread, SessionRecorder
 from pipelines.live.session import RobotSession, Served, StepOutput
 from pipelines.live.state import LiveState, Restorable, load_state, save_state
-from pipelines.recording.finishing import recover_recordings
-from pipelines.recording.thread import RecordingThread
 from pipelines.serve.messages import Hello
 from pipelines.serve.metrics import Metrics
 from pipelines.serve.wire import WireError
@@ -76,7 +74,7 @@ class Hub:
     given : a robot's description that the package does not have, or has otherwise
     limits : of sessions and messages
     states : folder of the states that outlive the service; None for memory only
-    recordings : folder of the run folders of sessions that ask to be recorded; None for no recording
+    recordings : folder of the files of sessions that ask to be recorded; None for no recording
     """
 
     def __init__(
@@ -96,11 +94,7 @@ class Hub:
         self._given, self._folder = given, states
         self._thread = ClassifierThread()
         self._recordings = recordings
-        self.recovered: list[Path] = []
-        self._writer: RecordingThread | None = None
-        if recordings is not None:
-            self.recovered = recover_recordings(recordings)
-            self._writer = RecordingThread()
+        self._writer = None if recordings is None else RecordingThread()
         self._left: OrderedDict[str, LiveState] = OrderedDict()
         self._opening: set[str] = set()
 

@@ -16,7 +16,6 @@ class ServiceCheck:
     classes, channels, rate_hz, filter, robots : of the model
     table : of target slips, by name
     robot : that model and table were checked against; None without one
-    recovered : recordings of an earlier service that were written now
     """
 
     model: str
@@ -27,4 +26,3 @@ class ServiceCheck:
     robots: tuple[str, ...]
     table: str
     robot: str | None
-    recovered: int

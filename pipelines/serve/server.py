@@ -117,7 +117,6 @@ def checked(prepared: Prepared, robot: str | None) -> ServiceCheck:
         info.robots,
         served.table.name,
         robot,
-        len(prepared.hub.recovered),
     )
 
 

@@ -8,16 +8,15 @@ import pytest
 from pipelines.classify.predict import predict
 from pipelines.crossval.crossval import samples_of
 from pipelines.crossval.settings import CrossvalSettings
+from pipelines.data.bag_runs import recorded_windows
 from pipelines.data.datasets import load_runs
 from pipelines.data.inspect import Settings as InspectSettings
 from pipelines.data.inspect import run as inspect_runs
-from pipelines.data.recorded_windows import read_windows
 from pipelines.live.classifying import AtOnce
 from pipelines.live.observer import Observer
 from pipelines.live.pilot import LivePilot
-from pipelines.live.recording import SessionRecorder
+from pipelines.live.recording import RecordingThread, SessionRecorder
 from pipelines.live.terrain_source import Classifier
-from pipelines.recording.thread import RecordingThread
 from terrain.control.slip_table import load_slip_table
 from terrain.estimation.live.estimator import CHANNELS
 from terrain.logs.replay import replay
@@ -75,12 +74,12 @@ def test_a_recorded_observer_is_predicted_as_it_was_live(writer, tmp_path, mower
     for sample in replay(run, 20.0):
         recorder.readings(sample.readings)
         observer.update(sample.readings)
-    folder = recorder.close(10.0)
-    (again,) = load_runs(tmp_path)
+    (path,) = recorder.close(10.0)
+    (again,) = load_runs(path)
     assert not again.dropped
     rows = predict([again], mower_model, load_slip_table()).windows
     assert len(rows) >= 4
-    assert_same(read_windows(folder), rows)
+    assert_same(recorded_windows(path)[1], rows)
 
 
 @pytest.mark.parametrize(
@@ -107,12 +106,12 @@ def test_a_recorded_pilot_is_predicted_as_it_was_live(writer, tmp_path, swerve_m
 
     drive = make_scenario("survey", AGRIMARO, "grass", 24.0, seed=5)
     simulate(AGRIMARO, drive, {"grass": load_soil("grass")}, 1, controller=session, command_delay_s=0.05)
-    folder = recorder.close(10.0)
-    (again,) = load_runs(tmp_path)
+    (path,) = recorder.close(10.0)
+    (again,) = load_runs(path)
     assert not again.dropped
     rows = predict([again], swerve_model, load_slip_table()).windows
     assert len(rows) >= 4
-    assert_same(read_windows(folder), rows)
+    assert_same(recorded_windows(path)[1], rows)
     wheel_radps = [again.streams["commands"].channel(f"wheel_{wheel}_radps") for wheel in AGRIMARO.wheels]
     np.testing.assert_array_equal(np.column_stack(wheel_radps), [one.wheel_radps for one in commands])
     assert set(again.streams["control"].channels) == set(commands[0].status)

@@ -1,1 +1,0 @@
-"""Recording of live sessions as run folders: what was measured, commanded and classified."""
