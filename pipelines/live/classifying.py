@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-import threading
 from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from time import perf_counter
 from typing import NamedTuple, Protocol
 
@@ -92,6 +93,9 @@ def classify_window(model: LiveModel, window: Windows) -> WindowOutput:
     )
 
 
+Classify = Callable[[LiveModel, Windows], WindowOutput]
+
+
 class Part(NamedTuple):
     """A model, and what cuts its windows."""
 
@@ -121,10 +125,16 @@ class Classifying(Protocol):
 
 
 class AtOnce:
-    """Cuts and classifies in the caller's own time: for logs and simulations, which can wait."""
+    """Cuts and classifies in the caller's own time: for logs and simulations, which can wait.
 
-    def __init__(self) -> None:
-        self._finished: list[WindowOutput] = []
+    Parameters
+    ----------
+    classify : what is done with a window
+    """
+
+    def __init__(self, classify: Classify = classify_window) -> None:
+        self._classify = classify
+        self._finished: deque[WindowOutput] = deque()
         self._part: Part | None = None
 
     def begin(self, part: Part) -> None:
@@ -135,11 +145,13 @@ class AtOnce:
         """Classify the windows that are whole by now."""
         if self._part is not None:
             for window in self._part.feed.push(readings, estimates):
-                self._finished.append(classify_window(self._part.model, window))
+                self._finished.append(self._classify(self._part.model, window))
 
     def finished(self) -> list[WindowOutput]:
         """Return the outputs since the last call."""
-        found, self._finished = self._finished, []
+        found = []
+        while self._finished:
+            found.append(self._finished.popleft())
         return found
 
     @property
@@ -164,67 +176,49 @@ class ClassifierThread:
     >>> thread.stop()
     """
 
-    def __init__(self, classify: Callable[[LiveModel, Windows], WindowOutput] = classify_window) -> None:
+    def __init__(self, classify: Classify = classify_window) -> None:
         self._classify = classify
-        self._due: deque[_OfRobot] = deque()
-        self._changed = threading.Condition()
-        self._stopped = self._working = False
+        self._pool = ThreadPoolExecutor(1, "classifier")
+        self._n_due = self._n_done = 0
         self.failures: Counter[str] = Counter()
-        self._thread = threading.Thread(target=self._run, name="classifier", daemon=True)
-        self._thread.start()
 
     def robot(self) -> _OfRobot:
         """Return what takes the samples of one robot, and gives the outputs of its windows."""
-        return _OfRobot(self)
+        return _OfRobot(self._classify, self)
 
     @property
     def busy(self) -> bool:
         """Whether the thread has something to do."""
-        return self._working or bool(self._due)
+        return self._n_due > self._n_done
 
-    def stop(self, timeout_s: float = 5.0) -> None:
+    def stop(self) -> None:
         """Let the thread finish the window that it is at, and end."""
-        with self._changed:
-            self._stopped = True
-            self._changed.notify()
-        self._thread.join(timeout_s)
+        self._pool.shutdown(cancel_futures=True)
 
     def due(self, robot: _OfRobot) -> None:
-        """Note that a robot has something to be done."""
-        with self._changed:
-            self._due.append(robot)
-            self._changed.notify()
+        """Note that a robot has something to be done; nothing where the thread has ended."""
+        self._n_due += 1
+        with suppress(RuntimeError):
+            self._pool.submit(self._work, robot)
 
-    def _run(self) -> None:
-        while True:
-            with self._changed:
-                while not self._due and not self._stopped:
-                    self._changed.wait()
-                if self._stopped:
-                    return
-                self._working = True
-                robot = self._due.popleft()
-            try:
-                robot.work(self._classify)
-            except Exception as error:  # of one window: the thread serves the next
-                self.failures[type(error).__name__] += 1
-            self._working = False
+    def _work(self, robot: _OfRobot) -> None:
+        try:
+            robot.work()
+        except Exception as error:  # of one window: the thread serves the next
+            self.failures[type(error).__name__] += 1
+        self._n_done += 1
 
 
-_Taken = tuple[Mapping[str, Reading], Sequence[Estimate]]
-
-
-class _OfRobot:
+class _OfRobot(AtOnce):
     """The samples and windows of one robot, on a thread that several share.
 
     Only the thread touches the feed; both sides share queues whose ends are atomic, and plain numbers.
     """
 
-    def __init__(self, thread: ClassifierThread) -> None:
+    def __init__(self, classify: Classify, thread: ClassifierThread) -> None:
+        super().__init__(classify)
         self._thread = thread
-        self._waiting: deque[_Taken | Part] = deque()
-        self._finished: deque[WindowOutput] = deque()
-        self._part: Part | None = None
+        self._waiting: deque[tuple[Mapping[str, Reading], Sequence[Estimate]] | Part] = deque()
         self._due_s, self._n_overrun = math.inf, 0
         self._counts: Mapping[str, int] = {}
 
@@ -255,28 +249,20 @@ class _OfRobot:
         except IndexError:  # the thread has just taken it
             pass
 
-    def finished(self) -> list[WindowOutput]:
-        """Return the outputs since the last call."""
-        found = []
-        while self._finished:
-            found.append(self._finished.popleft())
-        return found
-
     @property
     def dropped(self) -> Mapping[str, int]:
         """Windows and samples that were not used by the last time that the thread worked, by kind."""
         return {**self._counts, "steps: overrun": self._n_overrun} if self._n_overrun else self._counts
 
-    def work(self, classify: Callable[[LiveModel, Windows], WindowOutput]) -> None:
+    def work(self) -> None:
         """Cut and classify what waits; called by the thread."""
         try:
             while self._waiting:
                 taken = self._waiting.popleft()
                 if isinstance(taken, Part):
-                    self._part = taken
-                elif self._part is not None:
-                    for window in self._part.feed.push(*taken):
-                        self._finished.append(classify(self._part.model, window))
+                    super().begin(taken)
+                else:
+                    super().put(*taken)
         finally:
             if self._part is not None:
                 due_s = self._part.feed.due_s  # minus infinity before all streams have begun

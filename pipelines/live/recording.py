@@ -14,12 +14,11 @@ import json
 import os
 import shutil
 import threading
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from io import BytesIO
 from pathlib import Path
-from time import monotonic
 from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
@@ -28,7 +27,6 @@ from pipelines.data.mcap_file import RunRecorder
 from pipelines.data.recorded_windows import WindowResult, window_entry
 from pipelines.data.run_topics import LATEST_S, WINDOW_TOPIC, Head
 from terrain.errors import LogError
-from terrain.estimation.live.clocks import number, numbers, readable
 from terrain.files.names import plain_name
 from terrain.logs.replay import TWIST
 from terrain.logs.samples import BAD_TIME
@@ -55,10 +53,11 @@ RECORDING = "recording"
 FINISHED = "finished"
 NOTHING_KEPT = "finished: nothing to keep"
 
-UNREADABLE = "readings that cannot be read"
-UNKNOWN_STREAM = "readings of unknown streams"
-BAD_COMMAND = "commands that cannot be read"
-BAD_WINDOW = "windows that cannot be read"
+WINDOW = "a window"
+"""Takes the place of a stream's name for outputs of the model."""
+
+_DECIDED = ("commands", "control")
+"""Streams that a controller writes."""
 
 
 class _Part(NamedTuple):
@@ -124,8 +123,7 @@ class SessionRecorder:
         self._folder, self._part_bytes, self._writer = Path(folder), part_bytes, writer
         self._head = Head(run_id, robot, run_id, source=source, live=True)
         self._lock = threading.Lock()
-        self._waiting: list[tuple[str, Array]] = []
-        self._outputs: list[WindowResult] = []
+        self._waiting: list[tuple[str, Array | WindowResult]] = []
         self._dropped: Counter[str] = Counter()
         self._n_waiting = 0
         self._part: _Part | None = None
@@ -141,66 +139,27 @@ class SessionRecorder:
         return self._ended or RECORDING
 
     def readings(self, readings: Mapping[str, Reading]) -> None:
-        """Record what was measured, by stream; what cannot be read is counted."""
-        if self._ended:
-            return
-        try:
-            items = list(readings.items())
-        except Exception:  # whatever was given
-            self._count(UNREADABLE)
-            return
-        for name, given in items:
-            channels = self._channels.get(name) if isinstance(name, str) else None
-            if channels is None or name in _DECIDED:
-                self._count(UNKNOWN_STREAM)
-                continue
-            reading = readable(given)
-            if reading is None or reading.values.shape[1] != len(channels):
-                self._count(UNREADABLE)
-                continue
-            self._put(name, np.column_stack([reading.time_s, reading.values]))
+        """Record what was measured, by stream, in the columns of its channels."""
+        for name, (time_s, values) in readings.items():
+            self._put(name, np.column_stack([time_s, values]))
 
-    def command(self, time_s: float, twist: Any, command: Command, status: Mapping[str, float]) -> None:
+    def command(self, time_s: float, twist: Array, command: Command) -> None:
         """Record a command.
 
         Parameters
         ----------
         time_s : of the step
-        twist : (3,) desired; zeros are recorded, as they are driven, where it is no finite twist
-        command : of the wheels
-        status : figures of the decision, always of the same names
+        twist : (3,) desired
+        command : of the wheels, and the figures of the decision, always of the same names
         """
-        if self._ended:
-            return
-        desired = numbers(twist)
-        if desired is None or desired.shape != (3,) or not np.isfinite(desired).all():
-            desired = np.zeros(3)
-        try:
-            wheels: list[float] = [*command.wheel_radps, *command.steer_rad] if self._n_wheels else []
-            row = np.array([[number(time_s), *desired, *wheels]], dtype=np.float64)
-            names = tuple(status)
-            figures = np.array([[number(time_s), *(number(each) for each in status.values())]])
-        except Exception:  # whatever was given
-            self._count(BAD_COMMAND)
-            return
-        if names and "control" not in self._channels and _accepted(names):
-            self._channels["control"] = names
-        fits = row.shape[1] == 1 + len(self._channels["commands"])
-        if not fits or (names and names != self._channels.get("control")):
-            self._count(BAD_COMMAND)
-            return
-        self._put("commands", row)
-        if names:
-            self._put("control", figures)
+        wheels = (*command.wheel_radps, *command.steer_rad) if self._n_wheels else ()
+        self._put("commands", np.array([[time_s, *twist, *wheels]]))
+        self._channels.setdefault("control", tuple(command.status))
+        self._put("control", np.array([[time_s, *command.status.values()]]))
 
     def window(self, output: WindowResult) -> None:
         """Record the output of the model for a window."""
-        if self._ended:
-            return
-        with self._lock:
-            self._outputs.append(output)
-            self._n_waiting += 1000
-        self._bound()
+        self._put(WINDOW, output)
 
     def close(self, timeout_s: float = 0.0) -> list[Path]:
         """End the recording; return its files, the last one whole where the thread was done within a time.
@@ -214,24 +173,19 @@ class SessionRecorder:
             self.settled.wait(timeout_s)
         return self.files
 
-    def _count(self, kind: str, n: int = 1) -> None:
+    def _put(self, stream: str, content: Array | WindowResult) -> None:
+        if self._ended:
+            return
+        n_bytes = _OVERHEAD_BYTES + getattr(content, "nbytes", 5 * _OVERHEAD_BYTES)
         with self._lock:
-            self._dropped[kind] += n
-
-    def _put(self, stream: str, rows: Array) -> None:
-        with self._lock:
-            self._waiting.append((stream, rows))
-            self._n_waiting += rows.nbytes + _OVERHEAD_BYTES
-        self._bound()
-
-    def _bound(self) -> None:
+            self._waiting.append((stream, content))
+            self._n_waiting += n_bytes
         if self._n_waiting > MAX_WAITING_BYTES:
             self._end("stopped: the disk is too slow")
 
     def _end(self, why: str) -> None:
-        if not self._ended:
-            self._ended = why
-            self._writer.due(self)
+        self._ended = self._ended or why
+        self._writer.wake()
 
     def work(self) -> bool:
         """Write what waits; say whether there is more to come.  Called by the thread, and by nothing else."""
@@ -256,20 +210,19 @@ class SessionRecorder:
         if self._part is not None:
             with suppress(OSError):  # a full disk: what was written before stays readable
                 self._part.file.close()
-        self._waiting, self._outputs = [], []
+        self._waiting = []
         self.settled.set()
 
     def _flush(self) -> None:
         """Write what waits to the file, and wait until it is on the disk."""
         with self._lock:
-            waiting, self._waiting = self._waiting, []
-            outputs, self._outputs = self._outputs, []
-            self._n_waiting = 0
-        by_stream: dict[str, list[Array]] = {}
-        for name, rows in waiting:
-            by_stream.setdefault(name, []).append(rows)
+            waiting, self._waiting, self._n_waiting = self._waiting, [], 0
+        by_stream: dict[str, list[Any]] = {}
+        for name, content in waiting:
+            by_stream.setdefault(name, []).append(content)
+        windows = by_stream.pop(WINDOW, [])
         blocks = {name: self._stampable(np.concatenate(rows)) for name, rows in by_stream.items()}
-        if not any(map(len, blocks.values())) and (self._part is None or not outputs):
+        if not any(map(len, blocks.values())) and (self._part is None or not windows):
             return
         part = self._part or self._begin()
         for name, rows in blocks.items():
@@ -278,14 +231,10 @@ class SessionRecorder:
                     part.run.register(name, self._channels[name])
                     part.streams.add(name)
                 part.run.append(name, rows[:, 0], rows[:, 1:])
-        for output in outputs:
-            try:
-                entry = window_entry(output)
-            except (TypeError, ValueError, AttributeError):
-                self._count(BAD_WINDOW)
-                continue
-            end_s = float(np.clip(np.nan_to_num(output.end_s), self._origin_s, self._origin_s + LATEST_S - 1))
-            part.run.append_text(WINDOW_TOPIC, end_s, json.dumps(entry, allow_nan=False))
+        for output in windows:
+            if 0.0 <= output.end_s - self._origin_s < LATEST_S:
+                entry = json.dumps(window_entry(output), allow_nan=False)
+                part.run.append_text(WINDOW_TOPIC, output.end_s, entry)
         part.run.flush()
         os.fsync(part.file.fileno())
         if not os.fstat(part.file.fileno()).st_nlink:
@@ -301,8 +250,7 @@ class SessionRecorder:
             first_s = float(time_s[finite][0])
             self._origin_s = 0.0 if 0.0 <= first_s < LATEST_S / 2 else np.floor(first_s) - 3600.0
         held = finite & (time_s >= self._origin_s) & (time_s < self._origin_s + LATEST_S)
-        if not held.all():
-            self._count(BAD_TIME, int((~held).sum()))
+        self._dropped[BAD_TIME] += int((~held).sum())
         return rows[held]
 
     def _begin(self) -> _Part:
@@ -327,16 +275,10 @@ class SessionRecorder:
 
     def _finish(self, part: _Part) -> None:
         """Write the end of the file; what comes next begins another."""
-        with self._lock:
-            dropped, self._dropped = self._dropped, Counter()
-        part.run.finish(dropped=dropped)
+        part.run.finish(dropped=+self._dropped)
         os.fsync(part.file.fileno())
         part.file.close()
-        self._part = None
-
-
-_DECIDED = ("commands", "control")
-"""Streams that a controller writes."""
+        self._part, self._dropped = None, Counter()
 
 
 def _check_channels(channels: Mapping[str, Sequence[str]]) -> None:
@@ -347,13 +289,6 @@ def _check_channels(channels: Mapping[str, Sequence[str]]) -> None:
             raise LogError(f"stream {name!r}: channels {', '.join(each)!r} are no list of different names")
         for channel in each:
             unit_of(channel)
-
-
-def _accepted(names: Sequence[str]) -> bool:
-    try:
-        return all(isinstance(name, str) and unit_of(name) for name in names)
-    except LogError:
-        return False
 
 
 def _reason(error: OSError) -> str:
@@ -388,50 +323,33 @@ class RecordingThread:
         RunRecorder(
             BytesIO(), Head("none", "")
         )  # imports what it needs; later that would hold up the sessions
-        self._flush_s = flush_s
-        self._changed = threading.Condition()
+        self._flush_s, self._stopped = flush_s, False
         self._recordings: list[SessionRecorder] = []
-        self._due: deque[SessionRecorder] = deque()
-        self._stopped = False
+        self._woken = threading.Event()
         self._thread = threading.Thread(target=self._run, name="recording", daemon=True)
         self._thread.start()
 
     def add(self, recording: SessionRecorder) -> None:
         """Write a recording from now on."""
-        with self._changed:
-            self._recordings.append(recording)
+        self._recordings.append(recording)
 
-    def due(self, recording: SessionRecorder) -> None:
-        """Note that a recording has ended, and is to be written at once."""
-        with self._changed:
-            self._due.append(recording)
-            self._changed.notify()
+    def wake(self) -> None:
+        """Write now: a recording has ended."""
+        self._woken.set()
 
     def stop(self, timeout_s: float = 10.0) -> bool:
         """Close and write all recordings, and end; say whether there was time for it."""
-        with self._changed:
-            self._stopped = True
-            self._changed.notify()
+        self._stopped = True
+        self.wake()
         self._thread.join(timeout_s)
         return not self._thread.is_alive()
 
     def _run(self) -> None:
-        next_s = monotonic() + self._flush_s
-        while True:
-            with self._changed:
-                while not (self._due or self._stopped) and monotonic() < next_s:
-                    self._changed.wait(max(next_s - monotonic(), 0.001))
-                stopped = self._stopped
-                everything = stopped or monotonic() >= next_s
-                now = list(self._recordings) if everything else list(self._due)
-                self._due.clear()
-            if stopped:
-                for one in now:
+        while not self._stopped or self._recordings:
+            self._woken.wait(self._flush_s)
+            self._woken.clear()
+            for one in tuple(self._recordings):
+                if self._stopped:
                     one.close()
-            done = [one for one in now if not one.work()]
-            with self._changed:
-                self._recordings = [one for one in self._recordings if one not in done]
-            if everything:
-                next_s = monotonic() + self._flush_s
-            if stopped and not self._due:
-                return
+                if not one.work():
+                    self._recordings.remove(one)

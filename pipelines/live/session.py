@@ -285,7 +285,7 @@ class RobotSession:
             if readings:
                 self._recorder.readings(readings)
             if done.command is not None and done.status not in _NOT_DECIDED:
-                self._recorder.command(time_s, twist, done.command, done.command.status)
+                self._recorder.command(time_s, twist, done.command)
             for output in done.windows:
                 self._recorder.window(output)
         return StepOutput(
