@@ -20,7 +20,7 @@ from pipelines.live.terrain_source import Classifier
 from terrain.control.slip_table import load_slip_table
 from terrain.estimation.live.estimator import CHANNELS
 from terrain.logs.replay import replay
-from terrain.records import Label, RunLog, Stream
+from terrain.records import Command, Label, RunLog, Stream
 from terrain.robots import load_robot
 from terrain.simulation.dynamic.simulate import simulate
 from terrain.simulation.scenario.make import make_scenario
@@ -101,7 +101,7 @@ def test_a_recorded_pilot_is_predicted_as_it_was_live(writer, tmp_path, swerve_m
         }
         recorder.readings(readings)
         commands.append(pilot.step(sample._replace(readings=readings)))
-        recorder.command(sample.time_s, sample.twist, commands[-1], commands[-1].status)
+        recorder.command(sample.time_s, sample.twist, commands[-1])
         return commands[-1]
 
     drive = make_scenario("survey", AGRIMARO, "grass", 24.0, seed=5)
@@ -123,7 +123,7 @@ def test_a_recorded_run_is_inspected_and_trained_on_once_it_is_labelled(writer, 
         recorder = SessionRecorder(tmp_path, run.run_id, "mower", channels, writer=writer)
         for sample in replay(run):
             recorder.readings(sample.readings)
-            recorder.command(sample.time_s, sample.twist, None, {"probability_ratio": 0.5})
+            recorder.command(sample.time_s, sample.twist, Command((), (), (), {"probability_ratio": 0.5}))
         recorder.close(10.0)
     assert inspect_runs(InspectSettings(data=tmp_path)).n_runs == len(two_drives)
     labelled = [
