@@ -10,6 +10,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from websockets.exceptions import ConnectionClosed
 
 from pipelines.classify.predict import predict
+from pipelines.data.bag_runs import recorded_windows
 from pipelines.data.datasets import load_runs
 from pipelines.live.observer import Observer
 from pipelines.serve.client import ServiceError, TerrainClient
@@ -319,5 +320,5 @@ def test_a_session_that_asks_for_it_becomes_a_run_that_predicts_as_it_was_driven
         assert max(windows[row.start_s]["probabilities"].values()) == pytest.approx(
             row.probability, abs=1e-12
         )
-    kept = json.loads((tmp_path / run.run_id / "windows.json").read_text())
-    assert len(rows) - 1 <= len(kept["windows"]) <= len(rows)  # of the last one the robot may not have waited
+    _, kept = recorded_windows(tmp_path / f"{run.run_id}.mcap")
+    assert len(rows) - 1 <= len(kept) <= len(rows)  # of the last one the robot may not have waited
