@@ -8,6 +8,7 @@ from __future__ import annotations
 import base64
 import json
 import math
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,19 @@ from markupsafe import Markup
 
 from pipelines.report.numbers import format_value
 from pipelines.report.terminal import heading, is_numeric
-from pipelines.report.tree import Band, Bars, Figure, Line, Points, Report, Strip, Table, figures_of
+from pipelines.report.tree import (
+    Band,
+    Bars,
+    Figure,
+    Line,
+    Part,
+    Points,
+    Report,
+    Section,
+    Strip,
+    Table,
+    figures_of,
+)
 
 ASSETS = Path(__file__).parent / "assets"
 DIGITS = 6
@@ -37,6 +50,7 @@ def _environment() -> Environment:
         lstrip_blocks=True,
     )
     environment.globals |= {
+        "sections": _sections,
         "kind_of": lambda part: type(part).__name__,
         "written": format_value,
         "heading": heading,
@@ -139,6 +153,19 @@ def _plain(value: Any) -> float | None:
 @cache
 def _asset(name: str) -> str:
     return (ASSETS / name).read_text(encoding="utf-8")
+
+
+def _sections(parts: Sequence[Part]) -> list[Section]:
+    """Return the parts as sections: what lies between two of them is one without a heading."""
+    found: list[Section] = []
+    for part in parts:
+        if isinstance(part, Section):
+            found.append(part)
+        elif found and not found[-1].title:
+            found[-1] = Section("", [*found[-1].parts, part])
+        else:
+            found.append(Section("", [part]))
+    return found
 
 
 def _numeric(table: Table, place: int) -> bool:

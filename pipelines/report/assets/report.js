@@ -128,11 +128,11 @@
     for (const mark of drawn)
       series.push({ label: mark.label || " ", stroke: colourOf(mark, mark.number), width: 8, points: { show: false }, value: () => "" });
     const ink = variable("--ink"), grid = { stroke: variable("--rule"), width: 1 }, font = "12px system-ui, sans-serif";
-    const longest = categories ? Math.max(...categories.map((name) => name.length)) : 0;
+    const longest = categories ? Math.max(...categories.map(widthOf)) : 0;
     const axes = [
       { stroke: ink, grid, ticks: grid, font, labelFont: font, labelSize: 18, size: 34, label: panel.x_label || (last ? figure.x_label : "") || undefined },
       { stroke: ink, grid: categories ? { show: false } : grid, ticks: grid, font, labelFont: font, labelSize: 18,
-        size: categories ? Math.min(width * 0.42, 14 + 7 * longest) : 54, label: panel.y_label || undefined,
+        size: categories ? Math.min(width * 0.42, 22 + longest) : 54, label: panel.y_label || undefined,
         values: (u, splits) => categories ? splits.map((i) => shortened(categories[i] ?? "", width * 0.42)) : splits.map(written) },
     ];
     if (categories) axes[1].splits = () => categories.map((_, i) => i);
@@ -169,8 +169,12 @@
     return u;
   }
 
+  const ruler = document.createElement("canvas").getContext("2d");
+  ruler.font = "12px system-ui, sans-serif";
+  const widthOf = (text) => ruler.measureText(text).width;
   const shortened = (name, room) => {
-    const most = Math.max(6, Math.floor(room / 7));
+    if (widthOf(name) + 20 <= room) return name;
+    const most = Math.max(6, Math.floor((room - 20) * name.length / widthOf(name)));
     return name.length <= most ? name : name.slice(0, Math.ceil(most / 2) - 1) + "…" + name.slice(-Math.floor(most / 2));
   };
 
