@@ -41,9 +41,11 @@ COMMANDS: tuple[Command, ...] = (
         "pipelines.explain.explain",
         "what the simulation gets wrong, and the extended robot",
     ),
+    Command("Live", "serve", "pipelines.serve.serve", "WebSocket, --can BUS, --replay LOG"),
 )
 
 FORMER: dict[str, str] = {
+    "can": "use terrain serve --can BUS",
     "import": "use terrain convert LOGS --out RUNS",
     "export": "use terrain convert RUNS --to mcap --out DIR",
     "model": "use terrain inspect MODEL",

@@ -6,7 +6,6 @@ import typer
 
 from pipelines.cli import (
     bench,
-    can,
     classify,
     drive,
     estimate,
@@ -16,7 +15,6 @@ from pipelines.cli import (
     label,
     quickstart,
     replay,
-    serve,
     slip,
     soil,
     track,
@@ -33,7 +31,7 @@ app = typer.Typer(
 
 GROUPS = (
     *(estimate.app, features.app, classify.app, slip.app, soil.app, drive.app),
-    *(replay.app, serve.app, can.app, label.app),
+    *(replay.app, label.app),
     *(faults.app, explain.app, quickstart.app, track.app),
 )
 """Files of commands, in the order of help."""

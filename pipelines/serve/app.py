@@ -3,46 +3,39 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Callable
+from contextlib import AbstractAsyncContextManager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any
 
-from fastapi import Body, FastAPI, HTTPException, Request, Response, WebSocket
+from fastapi import Body, FastAPI, HTTPException, Response, WebSocket
 from fastapi.responses import FileResponse, PlainTextResponse
 from pydantic import BaseModel, ConfigDict, Field
 
-from pipelines.models.model_files import TerrainModel
-from pipelines.reporting.json_file import as_json
-from pipelines.serve.connection import POLICY, Connection
-from pipelines.serve.guard import bearer, foreign, token_fits
+from pipelines import report
+from pipelines.learn.model_file import TerrainModel
+from pipelines.report.json_file import as_json
+from pipelines.serve.connection import Connection, Watcher
+from pipelines.serve.guard import LARGEST_BODY, Connections, Guard
 from pipelines.serve.hub import Hub
 from pipelines.serve.messages import served_content
-from pipelines.serve.watch import watch
 from pipelines.serve.wire import plain
 from terrain import __version__
 from terrain.control.slip_table import SlipTable, load_slip_table
 from terrain.errors import ConfigError, TerrainError
 
 PAGE = Path(__file__).parent / "page"
-ASSETS = Path(__file__).parents[1] / "report" / "assets"
-PAGE_FILES: Mapping[str, str] = {
-    "page.js": "text/javascript",
-    "page.css": "text/css",
-    "uplot.js": "text/javascript",
-    "uplot.css": "text/css",
-    "icon.svg": "image/svg+xml",
+PLOTS = Path(report.__file__).parent / "assets"
+PAGE_FILES = {
+    "page.js": (PAGE, "text/javascript"),
+    "page.css": (PAGE, "text/css"),
+    "icon.svg": (PAGE, "image/svg+xml"),
+    "uplot.js": (PLOTS, "text/javascript"),
+    "uplot.css": (PLOTS, "text/css"),
 }
-OPEN = ("/", "/health", "/ready", *(f"/page/{name}" for name in PAGE_FILES))
+OPEN = frozenset(("/", "/health", "/ready", *(f"/page/{name}" for name in PAGE_FILES)))
 """Paths that need no token: they tell nothing of robots."""
-
-LARGEST_TABLE = 262_144
-SECURITY = {
-    "Content-Security-Policy": "default-src 'self'; frame-ancestors 'none'",
-    "X-Content-Type-Options": "nosniff",
-    "Referrer-Policy": "no-referrer",
-    "Cache-Control": "no-store",
-}
 
 
 class ModelChoice(BaseModel):
@@ -72,14 +65,24 @@ class Readiness(BaseModel):
     trouble: dict[str, str]
 
 
-def make_app(hub: Hub, token: str, load: Callable[[str], TerrainModel], *, loopback: bool) -> FastAPI:
-    """Return the application.
+def make_app(
+    hub: Hub,
+    token: str,
+    load: Callable[[str], TerrainModel],
+    connections: Connections,
+    lifespan: Callable[[FastAPI], AbstractAsyncContextManager[None]],
+    *,
+    loopback: bool,
+) -> Guard:
+    """Return the application behind its guard.
 
     Parameters
     ----------
     hub : of the sessions
     token : that is required; empty for none
     load : returns a model by its URI; raises ``ModelError``
+    connections : of the server
+    lifespan : what begins before the first request, and ends after the last
     loopback : whether only this machine is listened to
     """
     app = FastAPI(
@@ -88,26 +91,23 @@ def make_app(hub: Hub, token: str, load: Callable[[str], TerrainModel], *, loopb
         description="Terrain and target slip of robots, live. Robots connect to the WebSocket /robots.",
         docs_url=None,  # it loads scripts of other hosts
         redoc_url=None,
+        lifespan=lifespan,
+        max_body_size=LARGEST_BODY,
     )
-    _add_guard(app, token, loopback=loopback)
+    guard = Guard(app, token, OPEN, hub.metrics, connections, loopback=loopback)
     _add_page(app)
     _add_state(app, hub)
     _add_replacement(app, hub, load)
-    _add_sockets(app, hub, token, loopback=loopback)
-    return app
 
+    @app.websocket("/robots")
+    async def robots(socket: WebSocket) -> None:
+        await Connection(socket, hub, token, guard.wrong_token).serve()
 
-def _add_guard(app: FastAPI, token: str, *, loopback: bool) -> None:
-    @app.middleware("http")
-    async def guard(request: Request, call_next: Callable[[Request], Awaitable[Response]]) -> Response:
-        if reason := foreign(request.headers, loopback=loopback):
-            response: Response = PlainTextResponse(f"{reason}\n", 403)
-        elif request.url.path not in OPEN and not token_fits(token, bearer(request.headers)):
-            response = PlainTextResponse("a token is required (Authorization: Bearer)\n", 401)
-        else:
-            response = await call_next(request)
-        response.headers.update(SECURITY)
-        return response
+    @app.websocket("/watch")
+    async def watchers(socket: WebSocket) -> None:
+        await Watcher(socket, hub, token, guard.wrong_token).serve()
+
+    return guard
 
 
 def _add_page(app: FastAPI) -> None:
@@ -119,9 +119,8 @@ def _add_page(app: FastAPI) -> None:
     async def page_file(name: str) -> FileResponse:
         if name not in PAGE_FILES:
             raise HTTPException(404, "there is no such file")
-        return FileResponse(
-            (ASSETS if name.startswith("uplot") else PAGE) / name, media_type=PAGE_FILES[name]
-        )
+        folder, kind = PAGE_FILES[name]
+        return FileResponse(folder / name, media_type=kind)
 
 
 def _add_state(app: FastAPI, hub: Hub) -> None:
@@ -180,9 +179,7 @@ def _add_replacement(app: FastAPI, hub: Hub, load: Callable[[str], TerrainModel]
         return ServedNow(**served_content(served))
 
     @app.put("/table")
-    async def replace_table(
-        text: Annotated[str, Body(media_type="application/yaml", max_length=LARGEST_TABLE)],
-    ) -> ServedNow:
+    async def replace_table(text: Annotated[str, Body(media_type="application/yaml")]) -> ServedNow:
         """Serve another table of target slips, given as its YAML: all robots at once, or none."""
         async with replacing:
             try:
@@ -191,26 +188,6 @@ def _add_replacement(app: FastAPI, hub: Hub, load: Callable[[str], TerrainModel]
             except TerrainError as error:
                 raise HTTPException(409, str(error)) from None
         return ServedNow(**served_content(served))
-
-
-def _add_sockets(app: FastAPI, hub: Hub, token: str, *, loopback: bool) -> None:
-    async def admitted(socket: WebSocket) -> bool:
-        reason = foreign(socket.headers, loopback=loopback)
-        if reason:
-            await socket.close(POLICY, reason)
-        else:
-            await socket.accept()
-        return not reason
-
-    @app.websocket("/robots")
-    async def robots(socket: WebSocket) -> None:
-        if await admitted(socket):
-            await Connection(socket, hub, token, bearer(socket.headers)).serve()
-
-    @app.websocket("/watch")
-    async def watchers(socket: WebSocket) -> None:
-        if await admitted(socket):
-            await watch(socket, hub, token, bearer(socket.headers))
 
 
 def _table_of(text: str) -> SlipTable:

@@ -18,10 +18,10 @@ from time import monotonic
 from types import TracebackType
 from typing import Any, Self
 
-from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidURI
+from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus, InvalidURI
 from websockets.sync.client import ClientConnection, connect
 
-from pipelines.serve.wire import Encoding, decode, encode, plain
+from pipelines.serve.wire import decode, encode, plain
 from terrain.errors import TerrainError
 
 MAX_ERRORS = 100
@@ -84,22 +84,29 @@ class TerrainClient:
         self.n_steps = 0
         try:
             connecting = connect(
-                f"{url.rstrip('/')}/robots", open_timeout=TIMEOUT_S, compression=None, max_size=None
+                f"{url.rstrip('/')}/robots",
+                open_timeout=TIMEOUT_S,
+                compression=None,
+                max_size=None,
+                additional_headers={"Authorization": f"Bearer {token}"} if token else None,
             )
             self._socket: ClientConnection = connecting.__enter__()  # close() ends it
+        except InvalidStatus as error:
+            code = "token" if error.response.status_code == 401 else "refused"
+            raise ServiceError(code, error.response.body.decode(errors="replace").strip()) from None
         except (OSError, TimeoutError, InvalidURI, InvalidHandshake, ValueError) as error:
             raise ServiceError("unreachable", f"{url}: cannot be reached ({error})") from None
         try:
             self._send(
                 {
                     "type": "hello",
+                    "protocol": 2,
                     "session": session,
                     "robot": robot,
                     "streams": {name: list(channels) for name, channels in streams.items()},
                     "control": control,
                     "rate_hz": rate_hz,
                     "record": record,
-                    "token": token,
                 }
             )
             self.welcome = decode(self._socket.recv(TIMEOUT_S))
@@ -200,7 +207,7 @@ class TerrainClient:
 
     def _send(self, content: dict[str, Any]) -> None:
         try:
-            self._socket.send(encode(content, Encoding.MSGPACK))
+            self._socket.send(encode(content, packed=True))
         except ConnectionClosed as error:
             raise self._closed or ServiceError("closed", f"the connection has ended ({error})") from None
 

@@ -37,7 +37,8 @@ class Limits(NamedTuple):
     ----------
     sessions : open at once
     message_bytes : of one message
-    messages_per_s, rows_per_s : of one session
+    messages_per_s, rows_per_s, bytes_per_s : of one session
+    decoding_s_per_s : time that decoding the messages of one session takes
     hello_s : to say hello
     too_slow_s : for which a receiver may not read
     """
@@ -46,6 +47,8 @@ class Limits(NamedTuple):
     message_bytes: int = 262_144
     messages_per_s: float = 2000.0
     rows_per_s: float = 20_000.0
+    bytes_per_s: float = 2_000_000.0
+    decoding_s_per_s: float = 0.1
     hello_s: float = 10.0
     too_slow_s: float = 5.0
 
@@ -149,6 +152,7 @@ class Hub:
                 raise WireError("refused", str(error)) from None
         opened = OpenSession(hello.session, chain, restored, leave)
         self.sessions[hello.session] = opened
+        self.metrics.opened.inc()
         self.metrics.sessions.set(len(self.sessions))
         return opened
 

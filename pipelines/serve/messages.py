@@ -18,11 +18,11 @@ from pipelines.live.state import Restorable
 from pipelines.serve.wire import WireError, plain
 from terrain.control.traction import TractionStatus
 
-PROTOCOL: Literal[1] = 1
+PROTOCOL: Literal[2] = 2
+"""Of the messages; since 2 a token comes before the hello, in a header or as the first frame."""
 
 Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9 ._+-]*$", max_length=64)]
 Channel = Annotated[str, StringConstraints(pattern=r"^[A-Za-z][A-Za-z0-9_]*$", max_length=64)]
-
 
 CONTROL_RATE_LEAST_HZ = 5.0
 """Of commands: a longer step than half a second is taken for a clock that was set, and a command holds for a
@@ -38,7 +38,7 @@ class Hello(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True)
 
     type: Literal["hello"]
-    protocol: Literal[1] = PROTOCOL
+    protocol: Literal[2] = PROTOCOL
     session: Name
     robot: Name
     streams: Annotated[
@@ -49,7 +49,6 @@ class Hello(BaseModel):
     follows: bool = True
     rate_hz: Annotated[float, Field(ge=0.0, le=200.0, strict=False)] = 10.0
     record: bool = False
-    token: Annotated[str, StringConstraints(max_length=512)] = ""
 
     @property
     def request(self) -> SessionRequest:

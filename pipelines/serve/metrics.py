@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import resource
 import sys
+from collections import Counter as Counts
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
 
@@ -22,12 +23,14 @@ class Metrics:
 
         self.messages = counter("messages", "Messages of robots.")
         self.rows = counter("rows", "Rows of samples taken.")
+        self.wrong_tokens = counter("wrong_tokens", "Tokens that were missing, or another.")
         self.errors = counter("errors", "Errors sent, by code.", "code")
         self.steps = counter("steps", "Steps of sessions.")
         self.late_ticks = counter("late_ticks", "Steps that were left out, as the one before came late.")
         self.stopped = counter("stopped_commands", "Commands to stand, by reason.", "reason")
         self.windows = counter("windows", "Windows classified, by terrain.", "terrain")
         self.unsent = counter("unsent_steps", "Steps that a newer one replaced before they were read.")
+        self.opened = counter("opened_sessions", "Sessions that were opened.")
         self.sessions = Gauge("terrain_sessions", "Robots connected.", registry=self._registry)
         self.served = Gauge("terrain_served_number", "Number of model and table.", registry=self._registry)
         self.memory = Gauge("terrain_memory_bytes", "Resident memory.", registry=self._registry)
@@ -46,6 +49,16 @@ class Metrics:
             buckets=LATENCY_BUCKETS_S,
             registry=self._registry,
         )
+
+    def totals(self) -> dict[str, int]:
+        """Return what was counted so far of sessions, messages, rows, steps, errors and wrong tokens."""
+        counted: Counts[str] = Counts()
+        for family in self._registry.collect():
+            for sample in family.samples:
+                counted[sample.name] += int(sample.value)
+        names = {"sessions": "opened_sessions", "messages": "messages", "rows": "rows", "steps": "steps"}
+        names |= {"errors": "errors", "wrong_tokens": "wrong_tokens"}
+        return {name: counted[f"terrain_{key}_total"] for name, key in names.items()}
 
     def text(self) -> bytes:
         """Return all figures in Prometheus' text form."""

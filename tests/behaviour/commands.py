@@ -450,11 +450,11 @@ CASES: tuple[Case, ...] = (
     Case(
         "can",
         steps(
-            "can --interface virtual --channel behaviour --duration 0",
-            refused("can --interface nothing --channel can0"),
-            refused("can --interface virtual --channel behaviour --robot husky"),
-            refused("can --interface virtual --channel behaviour --dbc none.dbc"),
-            refused("can --interface virtual --channel behaviour --dbc lacking.dbc"),
+            "serve --can virtual:behaviour --duration 0",
+            refused("serve --can nothing:can0"),
+            refused("serve --can virtual:behaviour --robot husky"),
+            refused("serve --can virtual:behaviour --dbc none.dbc"),
+            refused("serve --can virtual:behaviour --dbc lacking.dbc"),
         ),
         lambda: {"lacking.dbc": LACKING_DBC.encode()},
     ),

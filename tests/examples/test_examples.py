@@ -12,8 +12,8 @@ from pipelines.classify.train import model_info
 from pipelines.crossval.crossval import samples_of
 from pipelines.crossval.settings import CrossvalSettings
 from pipelines.learn.model_file import TerrainModel, write_model
-from pipelines.serve.server import Service, prepare
-from pipelines.serve.settings import ServeSettings
+from pipelines.serve.serve import Settings
+from pipelines.serve.service import Service, prepare
 from terrain.logs.write import write_run
 from terrain.records import RunLog, Stream
 
@@ -60,7 +60,7 @@ def example(name):
 
 
 def test_a_robots_program_gets_its_terrain(runs, model_folder, tmp_path, capsys):
-    prepared, ready = prepare(ServeSettings(model=str(model_folder), port=0)), threading.Event()
+    prepared, ready = prepare(Settings(model=str(model_folder), port=0)), threading.Event()
     service = Service(prepared)
     thread = threading.Thread(target=service.run, args=(lambda url: ready.set(),))
     thread.start()

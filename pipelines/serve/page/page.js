@@ -24,7 +24,7 @@
   function connect() {
     const socket = new WebSocket((location.protocol === "https:" ? "wss://" : "ws://") + location.host + "/watch");
     state.socket = socket;
-    socket.onopen = () => ask();
+    socket.onopen = () => { if (state.token) socket.send(state.token); ask(); };  // the token first, by itself
     socket.onmessage = (event) => take(JSON.parse(event.data));
     socket.onclose = () => {
       if (byId("token-form").hidden) {
@@ -37,7 +37,7 @@
   }
   function ask() {
     if (state.socket && state.socket.readyState === WebSocket.OPEN)
-      state.socket.send(JSON.stringify({ type: "watch", session: state.session, token: state.token }));
+      state.socket.send(JSON.stringify({ type: "watch", session: state.session }));
   }
   function setConnection(kind, words) {
     byId("connection").dataset.state = kind;
@@ -89,6 +89,7 @@
     setConnection("live", "live");
     const seen = step.observation;
     showTerrain(step, seen);
+    showAnswer(message, seen, step.command);
     showTarget(seen);
     showCommand(session, step.command);
     showSensors(seen.sensors);
@@ -138,6 +139,15 @@
       row.children[2].textContent = value === null ? "-" : Math.round(value * 100) + " %";
     });
   }
+  function showAnswer(message, seen, command) {
+    const target = seen.target_slip.traction, healths = Object.values(seen.sensors), n = healths.filter((one) => one !== "fresh").length;
+    text("answer", [
+      target ? "Target slip " + signed(target.slip_ratio, 3) + " in traction" + (target.status === "estimated" ? "" : ", " + target.status) : "No target slip",
+      ...(command ? [command.status === "ok" ? "command ok" : "command " + command.status] : []),
+      n ? n + " of " + healths.length + " sensors not fresh" : "all sensors fresh",
+      ...message.trouble.slice(0, 1),
+    ].join("; ") + ".");
+  }
   function showTarget(seen) {
     text("target-of", "entry of the table: " + seen.target_of);
     rows("target", Object.entries(seen.target_slip).map(([name, target]) => [
@@ -183,6 +193,7 @@
     state.name = session.name; state.wheels = session.wheels; state.number = -1;
     for (const key of Object.keys(history)) history[key] = [];
     series = { t: [], slip: session.wheels.map(() => ({ low: [], high: [], slip: [] })), target: [], current: [] };
+    showSlip(session.wheels.length > 0);
     makePlots();
     byId("classes").replaceChildren();
     text("window", "no window yet");
@@ -205,7 +216,8 @@
       series.t.shift(); series.target.shift(); series.current.forEach((one) => one.shift());
       series.slip.forEach((one) => { one.slip.shift(); one.low.shift(); one.high.shift(); });
     }
-    byId("slip-none").hidden = !seen.slip_ratio.every((value) => value === null) || series.slip.some((one) => one.slip.some((value) => value !== null));
+    const none = seen.slip_ratio.every((value) => value === null) && !series.slip.some((one) => one.slip.some((value) => value !== null));
+    if (none !== byId("slip").hidden) { showSlip(!none); makePlots(); }
   }
   function axes() {
     const common = { stroke: variable("--soft"), grid: { stroke: variable("--line"), width: 1 }, ticks: { stroke: variable("--line") } };
@@ -233,7 +245,10 @@
     });
     const title = state.wheels.map((name, i) => "wheel " + name + " " + ["solid", "dashed", "dotted", "dash-dot"][i % 4]).join(", ");
     plots.current = plotIn(figureIn(byId("current"), title || "no wheels described"), state.wheels.map((_, i) => ({ stroke: COLOURS[i % COLOURS.length], width: 2, dash: [[], [8, 4], [2, 3], [8, 3, 2, 3]][i % 4], points: { show: false } })), [], currentRange);
-    byId("slip-none").hidden = state.wheels.length > 0;
+  }
+  function showSlip(there) {
+    byId("slip").hidden = byId("slip-note").hidden = !there;
+    byId("slip-none").hidden = there;
   }
   function draw() {
     requestAnimationFrame(draw);
@@ -245,8 +260,8 @@
     drawBand();
   }
   function drawBand() {
-    const canvas = byId("band"), scale = window.devicePixelRatio || 1, width = canvas.clientWidth, height = 64;
-    if (canvas.width !== Math.round(width * scale)) { canvas.width = Math.round(width * scale); canvas.height = Math.round(height * scale); }
+    const canvas = byId("band"), scale = window.devicePixelRatio || 1, width = canvas.clientWidth, height = canvas.clientHeight, top = height - 34;
+    if (canvas.width !== Math.round(width * scale) || canvas.height !== Math.round(height * scale)) { canvas.width = Math.round(width * scale); canvas.height = Math.round(height * scale); }
     const ink = canvas.getContext("2d"), now = Date.now() / 1000;
     ink.setTransform(scale, 0, 0, scale, 0, 0); ink.clearRect(0, 0, width, height);
     const x = (t) => width * (1 - (now - t) / HISTORY_S), n = history.t.length, shares = new Map();
@@ -256,19 +271,19 @@
       if (k < n && history.terrain[k] === history.terrain[from]) continue;
       const end = k < n ? history.t[k] : now, terrain = history.terrain[from];
       shares.set(terrain || "unknown", (shares.get(terrain || "unknown") || 0) + end - history.t[from]);
-      ink.fillStyle = colourOf(terrain); ink.fillRect(x(history.t[from]), 0, Math.max(x(end) - x(history.t[from]), 1), 30);
+      ink.fillStyle = colourOf(terrain); ink.fillRect(x(history.t[from]), 0, Math.max(x(end) - x(history.t[from]), 1), top);
       if (terrain && x(end) - x(history.t[from]) > ink.measureText(terrain).width + 8 && x(history.t[from]) > label) {
-        ink.fillStyle = "#ffffff"; ink.fillText(terrain, x(history.t[from]) + 4, 15); label = x(history.t[from]) + ink.measureText(terrain).width;
+        ink.fillStyle = "#ffffff"; ink.fillText(terrain, x(history.t[from]) + 4, top / 2); label = x(history.t[from]) + ink.measureText(terrain).width;
       }
       from = k;
     }
-    ink.strokeStyle = variable("--line"); ink.strokeRect(0.5, 34.5, width - 1, 29);
+    ink.strokeStyle = variable("--line"); ink.strokeRect(0.5, top + 4.5, width - 1, 29);
     ink.strokeStyle = variable("--text"); ink.lineWidth = 1.5; ink.beginPath();
     let drawing = false;
     for (let k = 0; k < n; k++) {
       const value = history.probability[k];
       if (value === null) { drawing = false; continue; }
-      const y = 63 - 28 * value;
+      const y = height - 1 - 28 * value;
       if (drawing) ink.lineTo(x(history.t[k]), y); else ink.moveTo(x(history.t[k]), y);
       drawing = true;
     }
@@ -297,6 +312,7 @@
   });
   if (localStorage.getItem("theme")) document.documentElement.dataset.theme = localStorage.getItem("theme");
   showTheme();
+  byId("more").addEventListener("toggle", () => { if (state.wheels) makePlots(); state.drawn = -1; });  // what is folded has no width
   let width = innerWidth;
   addEventListener("resize", () => { if (Math.abs(innerWidth - width) > 20 && state.wheels) { width = innerWidth; makePlots(); state.drawn = -1; } });
   connect();

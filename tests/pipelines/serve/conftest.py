@@ -10,8 +10,8 @@ import pytest
 from websockets.sync.client import connect
 
 from pipelines.learn.model_file import write_model
-from pipelines.serve.server import Service, prepare
-from pipelines.serve.settings import ServeSettings
+from pipelines.serve.serve import Settings
+from pipelines.serve.service import Service, prepare
 from terrain.logs.replay import replay
 
 CHANNELS = {"imu": ["accel_z_mps2"], "wheels": ["speed_left_mps"]}
@@ -52,7 +52,7 @@ class Running:
 
 @contextmanager
 def _running(limits=None, **options):
-    prepared = prepare(ServeSettings(**{"port": 0, **options}))
+    prepared = prepare(Settings(**{"port": 0, **options}))
     if limits is not None:
         prepared.hub.limits = limits
     service, ready = Service(prepared), threading.Event()

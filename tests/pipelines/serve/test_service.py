@@ -244,7 +244,8 @@ def test_another_model_is_put_in_while_a_robot_is_served_and_no_window_is_lost(
         ("/model", "[" * 100_000, "application/json", 400, "error parsing"),
         ("/table", "name: [", "application/yaml", 409, "the table: is no YAML"),
         ("/table", "name: x", "application/yaml", 409, "the table"),
-        ("/table", "x" * 300_000, "application/yaml", 422, "at most"),
+        ("/table", "x" * 300_000, "application/yaml", 413, "Too Large"),
+        ("/model", "x" * 300_000, "application/json", 413, "Too Large"),
     ],
 )
 def test_what_cannot_be_served_is_refused_and_the_old_goes_on(service, place, content, kind, status, fault):

@@ -10,8 +10,8 @@ from dataclasses import replace
 
 import pytest
 
-from pipelines.serve.server import checked, prepare
-from pipelines.serve.settings import ServeSettings
+from pipelines.serve.serve import Settings, run
+from pipelines.serve.service import prepare
 from terrain.control.slip_table import load_slip_table, write_slip_table
 from terrain.errors import TerrainError
 
@@ -25,7 +25,7 @@ def refusal(model_folder, monkeypatch):
 
     def of(**options):
         with pytest.raises(TerrainError) as refused:
-            prepare(ServeSettings(**{"model": str(model_folder), "port": 0, **options}))
+            prepare(Settings(**{"model": str(model_folder), "port": 0, **options}))
         sentence = str(refused.value)
         assert "\n" not in sentence
         return sentence
@@ -67,7 +67,7 @@ def test_an_address_of_another_machine_is_refused(refusal, monkeypatch):
 def test_other_machines_are_not_listened_to_without_a_token(refusal, monkeypatch, tmp_path):
     assert "a token is required (--token-file)" in refusal(host="0.0.0.0")
     monkeypatch.setenv("TERRAIN_TOKEN", "short")
-    assert "the token has 5 characters, at least 16 are required" in refusal()
+    assert "the token has 5 characters, 16 to 512 are accepted" in refusal()
     empty = tmp_path / "empty"
     empty.write_text("\n")
     assert f"{empty}: holds no token" in refusal(token_file=empty)
@@ -130,14 +130,16 @@ def test_after_a_refused_start_the_port_is_free(refusal, model_folder):
     with socket.create_server(("127.0.0.1", 0)) as probe:
         port = probe.getsockname()[1]
     refusal(port=port, robot="husky")
-    assert checked(prepare(ServeSettings(model=str(model_folder), port=port)), None).classes == ("a", "b")
+    found = run(Settings(model=str(model_folder), port=port, check=True))
+    assert (found.classes, found.served) == (("a", "b"), None)
+    assert found.report.answer.endswith("can be served: a and b.")
 
 
 def test_after_a_start_that_fails_late_no_thread_is_left(refusal, monkeypatch, tmp_path):
     def fails(*_):
         raise TerrainError("the code does not run")
 
-    monkeypatch.setattr("pipelines.serve.server.warm_up", fails)
+    monkeypatch.setattr("pipelines.serve.service.warm_up", fails)
     before = threading.active_count()
     assert refusal(record=tmp_path / "runs") == "the code does not run"
     assert threading.active_count() == before
@@ -164,7 +166,7 @@ def test_damaged_states_of_robots_do_not_keep_the_service_from_starting(
     [
         (["--port", "taken"], "cannot be listened on"),
         (["--port", "70000"], "65535"),
-        (["--max-sessions", "nan", "--port", "-1"], "--max-sessions"),
+        (["--max-sessions", "nan"], "--max-sessions"),
     ],
 )
 def test_the_command_ends_with_one_sentence(model_folder, options, fault):

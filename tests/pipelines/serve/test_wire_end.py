@@ -156,7 +156,7 @@ def test_a_full_disk_is_named_until_there_is_room_again(running, model_folder, h
     def trouble(service):
         return json.loads(service.get("/ready")[1])["trouble"]
 
-    monkeypatch.setattr("pipelines.serve.server.SAVE_EVERY_S", 0.05)
+    monkeypatch.setattr("pipelines.serve.service.SAVE_EVERY_S", 0.05)
     with running(model=str(model_folder), state=tmp_path) as service, service.socket() as robot:
         robot.send(json.dumps(hello("full")))
         robot.recv(10)

@@ -166,7 +166,8 @@ def test_thousands_of_malformed_messages(running, model_folder, hello, messages,
                         first = hello("stranger", rate_hz=0 if begun == 1 else 50)
                         stranger.send(json.dumps(first))
                         assert json.loads(stranger.recv(10))["type"] == "welcome"
-                    for _ in range(AT_ONCE):
+                    n = AT_ONCE if begun else 4  # one that has not said hello is answered twice a second
+                    for _ in range(n):
                         stranger.send(malformed(random_, hello("other")))
                     n_sent += AT_ONCE
                     stranger.send(json.dumps({"type": "THE END"}))
@@ -188,7 +189,7 @@ def test_too_large_messages_are_refused_and_larger_ones_close_the_connection(ser
     with service.socket() as robot:
         robot.send(json.dumps(hello("large")))
         assert json.loads(robot.recv(10))["type"] == "welcome"
-        for filling in ("x" * LIMITS.message_bytes, b"\xc0" * (LIMITS.message_bytes + 1), "x" * 4_000_000):
+        for filling in ("x" * LIMITS.message_bytes, b"\xc0" * (LIMITS.message_bytes + 1), "x" * 1_000_000):
             robot.send(json.dumps({"type": filling}) if isinstance(filling, str) else filling)
             text = robot.recv(10)
             answer = msgpack.unpackb(text) if isinstance(text, bytes) else json.loads(text)

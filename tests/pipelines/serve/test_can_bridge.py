@@ -8,12 +8,21 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipelines.can_bridge.core import STALE_S, BridgeCore, LastSample
-from pipelines.can_bridge.corrections import BridgeState, LowLevelKinematics
 from pipelines.data.can_codec import Frame, decode, encode, load_layout, run_frames
 from pipelines.data.can_signals import RECEIVED
 from pipelines.live.pilot import LivePilot
 from pipelines.live.pilot_settings import PilotSettings
+from pipelines.serve.can_bridge import (
+    STALE_S,
+    WINDOW_S,
+    BridgeCore,
+    BridgeState,
+    BusClock,
+    LastSample,
+    LowLevelKinematics,
+    Theory,
+    corrections,
+)
 from terrain.control.slip_table import load_slip_table
 from terrain.control.wheel_controllers import PERIOD_S
 from terrain.records import Command, Reading, Sample, Stream
@@ -108,7 +117,7 @@ def test_corrections_are_those_of_the_pilot_stepped_directly(frames):
         np.testing.assert_allclose(added, expected, atol=0.00025 * (1 + 1e-6))
         largest, before_s = max(largest, np.abs(expected).max()), tick_s
     assert largest > 0.2
-    assert core.dropped.total() == 0
+    assert core.receiver.dropped.total() == 0
     assert not core.clipped
 
 
@@ -167,7 +176,7 @@ def test_a_counter_that_stands_still_is_a_stream_that_ended(frames, stream, stat
     core = BridgeCore(LAYOUT, ROBOT, Slower)
     rows = ticks(core, [hung(frame) for frame in frames], 5.0)
     assert states(rows, 3.0 + STALE_S[stream] + PERIOD_S, 5.0) == {state}
-    assert core.dropped[f"{stream}: repeated or late"] > 50
+    assert core.receiver.dropped[f"{stream}: repeated or late"] > 50
 
 
 @pytest.mark.parametrize("stream", ["twist", "wheels", "steering"])
@@ -205,7 +214,7 @@ def test_a_damaged_twist_is_not_driven(frames):
     core = BridgeCore(LAYOUT, ROBOT, Slower)
     rows = ticks(core, [flipped(frame) for frame in frames], 4.0)
     assert states(rows, 3.0 + STALE_S["twist"] + PERIOD_S, 4.0) == {BridgeState.STALE_TWIST}
-    assert core.dropped["wrong checksum"] in (50, 51)
+    assert core.receiver.dropped["wrong checksum"] in (50, 51)
 
 
 def test_frames_that_were_read_too_late_are_stale(frames):
@@ -309,25 +318,6 @@ def test_a_controller_that_fails_leaves_corrections_of_zero(frames, kind, state)
     assert bool(core.failed) == (state == BridgeState.STEP_FAILED)
 
 
-def test_a_correction_beyond_the_range_is_its_end_and_counted(frames):
-    def make(steer_rad):
-        slower = Slower(steer_rad)
-        return lambda sample: (command := slower(sample))._replace(wheel_radps=command.wheel_radps + 99.0)
-
-    core = BridgeCore(LAYOUT, ROBOT, make)
-    rows = ticks(core, frames, 0.5)
-    assert rows[-1][1].tolist() == [16.3835] * 3
-    assert core.clipped["Correction1"] > 10
-
-
-def test_the_last_frames_are_corrections_of_zero(frames):
-    core = BridgeCore(LAYOUT, ROBOT, Slower)
-    assert ticks(core, frames, 1.0)[-1][1].any()
-    added, status = (decode(LAYOUT, frame) for frame in core.stop(1.01))
-    assert not any(added.values)
-    assert status.values[4] == BridgeState.STOPPED
-
-
 ANY_FRAME = st.builds(
     Frame,
     st.one_of(st.floats(0.0, 3.0), st.floats()),
@@ -350,4 +340,59 @@ def test_no_frame_breaks_the_rule(frames, extra, every):
         read[id(frame)] = (k * 0.01 + every * 0.003) % 0.6
     rows = ticks(core, [*mixed, *extra], 0.6, read_at=lambda frame: read[id(frame)])
     assert len(rows) == 30
-    assert core.n_in >= core.n_used
+    assert core.n_in >= core.receiver.n_used
+
+
+THEORY = Theory(np.full(3, 5.0), np.full(3, 0.2))
+
+
+@pytest.mark.parametrize("turns", [-2, -1, 0, 1, 2, 3])
+@pytest.mark.parametrize("measured", [-1, 0, 1, 4])
+def test_the_velocity_of_the_wheel_is_the_one_that_is_commanded(turns, measured):
+    """Two routes: the correction of the other solution adds up to the same velocity of the wheel's centre."""
+    commanded = Command(
+        (-1.0) ** turns * np.array([4.0, 5.0, 6.5]), THEORY.steer_rad + turns * np.pi, None, {}
+    )
+    angle_rad = THEORY.steer_rad + measured * np.pi + 0.1
+    added, state = corrections(commanded, THEORY, angle_rad)
+    assert state == BridgeState.ACTIVE
+    low_level = (-1.0) ** measured * THEORY.wheel_radps
+    along = np.cos(commanded.steer_rad) * commanded.wheel_radps
+    assert np.cos(angle_rad - 0.1) * (low_level + added) == pytest.approx(along)
+
+
+@pytest.mark.parametrize("angle_rad", [0.8, -0.4, np.pi / 2, np.pi + 0.8, np.nan, np.inf])
+def test_elsewhere_nothing_is_added(angle_rad):
+    command = Command(np.full(3, 4.0), THEORY.steer_rad, None, {})
+    with np.errstate(invalid="ignore"):
+        added, state = corrections(command, THEORY, np.array([0.2, angle_rad, 0.2]))
+    assert state == BridgeState.STEERING
+    assert not added.any()
+
+
+def test_kinematics_begins_where_the_steering_is():
+    """A crab from steering that is there already: the theoretical rate at once, and nothing is steered."""
+    heading_rad = 1.3
+    twist = 0.5 * np.array([np.cos(heading_rad), np.sin(heading_rad), 0.0])
+    kinematics = LowLevelKinematics(ROBOT)
+    kinematics.start(np.full(3, heading_rad))
+    theory = kinematics.step(twist, 0.02)
+    assert theory.wheel_radps == pytest.approx(np.full(3, 0.5 / ROBOT.wheel_radius_m))
+    assert theory.steer_rad == pytest.approx(np.full(3, heading_rad))
+
+
+def test_the_clock_follows_the_drift_of_the_bus():
+    """50 ppm over an hour, frames read up to 5 ms late: at no time off by more than 3 ms."""
+    clock, rng = BusClock(), np.random.default_rng(0)
+    for read_s in np.arange(0.0, 3600.0, 0.05):
+        stamp_s = 5000.0 + read_s * (1 - 50e-6)
+        clock.received(stamp_s - rng.exponential(0.001), read_s)
+        if read_s > WINDOW_S:
+            assert abs(clock.time(read_s) - stamp_s) < 3e-3
+
+
+def test_one_wrong_stamp_sets_no_clock():
+    clock = BusClock()
+    for k in range(100):
+        clock.received(1e9 if k == 50 else 0.01 * k, 0.01 * k)
+        assert clock.time(0.01 * k) == pytest.approx(0.01 * k, abs=1e-9)

@@ -1,8 +1,9 @@
 """From frames received to frames sent, without a bus: the caller gives each frame and the time.
 
-Corrections are the controller's only while the desired twist and the wheels' rates are fresh and the steering
-is where it was computed; else they are zero, and the status says why.  Nothing that is sent is older than the
-step that sends it.
+Corrections are added to the theoretical rates of the wheels, ``w_ODrive = w_low_level + PID_out`` (thesis, 8.3).
+They are the controller's only while the desired twist and the wheels' rates are fresh on both clocks, that of the
+bus and that of this computer, and the steering is where it was computed; else they are zero, and the status says
+why.  Nothing that is sent is older than the step that sends it.
 """
 
 from __future__ import annotations
@@ -10,17 +11,21 @@ from __future__ import annotations
 import math
 from collections import Counter, deque
 from collections.abc import Callable
+from enum import auto
+from typing import NamedTuple
 
 import numpy as np
 
-from pipelines.can_bridge.bus_clock import BusClock
-from pipelines.can_bridge.corrections import BridgeState, LowLevelKinematics, corrections
 from pipelines.data.can_codec import Frame, Layout, encode
 from pipelines.data.can_logs import Receiver
 from pipelines.data.can_signals import RECEIVED, channels_of
+from terrain.angles import wrapped
 from terrain.control.wheel_controllers import step_or_period
+from terrain.entry_point import entry_point
+from terrain.kinematics.swerve import FAR_RAD, wheel_command_step
 from terrain.records import Array, Command, Reading, Sample
 from terrain.robots import SwerveRobot
+from terrain.status import StatusCode
 
 Step = Callable[[Sample], Command]
 MakeStep = Callable[[Array], Step]
@@ -35,7 +40,140 @@ AHEAD_S = 0.1
 KEPT = 100_000
 """Latencies that are kept: half an hour at 50 Hz."""
 
+WINDOW_S = 0.5
+"""The difference between both clocks is taken anew so often: it follows drift, and a clock that was set."""
+
 _STATUS = channels_of("status")
+_wheel_command_step = entry_point(wheel_command_step)
+
+
+class BridgeState(StatusCode):
+    """Whether corrections are the controller's, or why they are zero; values of ``BridgeState`` in the DBC.
+
+    A twist, or wheel rates, that never came or came too long ago; steering that is not where it was computed;
+    a command that is not finite; a step that failed; a bridge that stops.
+    """
+
+    ACTIVE = 0
+    NO_TWIST = auto()
+    STALE_TWIST = auto()
+    NO_WHEELS = auto()
+    STALE_WHEELS = auto()
+    STEERING = auto()
+    NOT_FINITE = auto()
+    STEP_FAILED = auto()
+    STOPPED = auto()
+
+
+class Theory(NamedTuple):
+    """Theoretical rates and steering angles of the wheels (3,)."""
+
+    wheel_radps: Array
+    steer_rad: Array
+
+
+class LowLevelKinematics:
+    """The theoretical rates of the wheels of a swerve robot, as its low-level kinematics evaluates them."""
+
+    def __init__(self, robot: SwerveRobot) -> None:
+        self._positions_m = np.array(robot.wheel_positions_m)
+        self._limits = (
+            robot.wheel_radius_m,
+            robot.equipment.motors.speed_max_radps,
+            robot.equipment.steering.rate_max_radps,
+        )
+        self._steer_rad = np.zeros(3)
+
+    def start(self, steer_rad: Array) -> None:
+        """Begin at measured steering angles."""
+        self._steer_rad = np.array(steer_rad, dtype=np.float64)
+
+    def step(self, twist: Array, dt_s: float) -> Theory:
+        """Return the rates for a twist, and where the steering moves to within a step."""
+        _, wheel_radps, self._steer_rad = _wheel_command_step(
+            self._positions_m, *self._limits, dt_s, FAR_RAD, twist, self._steer_rad
+        )
+        return Theory(wheel_radps, self._steer_rad)
+
+
+def corrections(command: Command, theory: Theory, measured_rad: Array) -> tuple[Array, BridgeState]:
+    """Return what is to be added to the theoretical rate (3,) of each wheel, and whether it can be.
+
+    A wheel can follow a velocity at two steering angles half a turn apart, with opposite rates: where the
+    measured angle is the other one, the correction changes its sign.  Where it is neither, the low-level
+    kinematics is at another command than the one that was computed here, and nothing may be added to it.
+
+    Parameters
+    ----------
+    command : of the controller
+    theory : of the desired twist
+    measured_rad : (3,) steering angles, zeros removed; NaN where unknown
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> command = Command(np.array([4.0, 4.0, 4.0]), np.zeros(3), np.zeros(3), {})
+    >>> theory = Theory(np.array([5.0, 5.0, 5.0]), np.zeros(3))
+    >>> added, state = corrections(command, theory, np.array([0.01, -0.01, np.pi]))
+    >>> added.tolist(), state.name
+    ([-1.0, -1.0, 1.0], 'ACTIVE')
+    >>> corrections(command, theory, np.array([0.01, 0.8, 0.0]))[1].name
+    'STEERING'
+    """
+    if not (np.isfinite(command.wheel_radps).all() and np.isfinite(command.steer_rad).all()):
+        return np.zeros(3), BridgeState.NOT_FINITE
+    same_solution = np.where(np.cos(command.steer_rad - theory.steer_rad) < 0.0, -1.0, 1.0)
+    added = same_solution * command.wheel_radps - theory.wheel_radps
+    apart_rad = np.abs(wrapped(measured_rad - theory.steer_rad))
+    to_nearest_rad = np.minimum(apart_rad, np.pi - apart_rad)
+    if not (to_nearest_rad <= FAR_RAD).all():  # of NaN too
+        return np.zeros(3), BridgeState.STEERING
+    return np.where(apart_rad > np.pi / 2, -added, added), BridgeState.ACTIVE
+
+
+class BusClock:
+    """Time of a bus: that of its frames' stamps, continued between frames by this computer's clock.
+
+    A frame is read some time after its stamp, never before: the largest difference of a window is that of the
+    frame that waited least. One stamp may be wrong: it is the second largest that counts, of frames that are
+    more than one.
+
+    Examples
+    --------
+    >>> clock = BusClock()
+    >>> for read_s in (5.0, 5.01, 5.02):
+    ...     clock.received(read_s + 1000.0, read_s)
+    >>> clock.time(5.03)
+    1005.03
+    """
+
+    def __init__(self) -> None:
+        self._offset_s, self._found = 0.0, False
+        self._began_s = math.nan
+        self._first = self._second = -math.inf
+
+    def received(self, stamp_s: float, read_s: float) -> None:
+        """Take the stamp of a frame that was read at a time of this computer."""
+        if not math.isfinite(stamp_s):
+            return
+        if math.isnan(self._began_s):
+            self._began_s = read_s
+        ahead_s = stamp_s - read_s
+        if ahead_s > self._first:
+            self._first, self._second = ahead_s, self._first
+        elif ahead_s > self._second:
+            self._second = ahead_s
+        best_s = self._second if math.isfinite(self._second) else self._first
+        if not self._found:
+            self._offset_s = best_s
+            self._found = read_s - self._began_s >= WINDOW_S
+        if read_s - self._began_s >= WINDOW_S:
+            self._offset_s = best_s
+            self._began_s, self._first, self._second = read_s, -math.inf, -math.inf
+
+    def time(self, read_s: float) -> float:
+        """Return the time of the bus at a time of this computer."""
+        return read_s + self._offset_s
 
 
 class LastSample:
@@ -86,16 +224,18 @@ class BridgeCore:
 
     Attributes
     ----------
+    receiver : of the frames; it counts those that are used, and what was not used by kind
     n_in : frames received
     samples, states : samples by stream; control steps by :class:`BridgeState`
     clipped : values sent as the end of their range, by signal
     failed : steps that raised, by message
+    latencies_s : from the stamp of the wheels' newest sample to the correction sent
     """
 
     def __init__(self, layout: Layout, robot: SwerveRobot, make_step: MakeStep) -> None:
         self._layout, self._make_step = layout, make_step
         self._step: Step | None = None
-        self._receiver = Receiver(layout, RECEIVED)
+        self.receiver = Receiver(layout, RECEIVED)
         self._kinematics, self.clock = LowLevelKinematics(robot), BusClock()
         self._zeros_rad = robot.steering_zeros_rad
         self._last = {name: LastSample(stale_s, 3) for name, stale_s in STALE_S.items()}
@@ -107,26 +247,16 @@ class BridgeCore:
         self.failed: Counter[str] = Counter()
         self.latencies_s: deque[float] = deque(maxlen=KEPT)
 
-    @property
-    def dropped(self) -> Counter[str]:
-        """What was received and not used, as counts by kind."""
-        return self._receiver.dropped
-
-    @property
-    def n_used(self) -> int:
-        """Frames of signals that are used."""
-        return self._receiver.n_used
-
     def receive(self, frame: Frame, read_s: float) -> None:
         """Take a frame that was read at a time of this computer."""
         self.n_in += 1
-        if self._receiver.take(frame) is not None:
+        if self.receiver.take(frame) is not None:
             self.clock.received(frame.time_s, read_s)
 
     def tick(self, read_s: float) -> list[Frame]:
         """Return the frames of a control step at a time of this computer."""
         now_s = self.clock.time(read_s)
-        readings = self._receiver.readings(now_s)
+        readings = self.receiver.readings(now_s)
         for name, reading in readings.items():
             self.samples[name] += len(reading.time_s)
         last = self._last

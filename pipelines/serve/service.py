@@ -1,4 +1,4 @@
-"""``terrain serve``: all that is checked before a robot may come, then the server until it has to end."""
+"""The service: all that is checked before a robot may come, then the server until it has to end."""
 
 from __future__ import annotations
 
@@ -7,28 +7,27 @@ import gc
 import os
 import signal
 import socket
-from collections.abc import Callable
+import threading
+from collections.abc import AsyncIterator, Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import asynccontextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import uvicorn
 
+from pipelines.learn.load import load_model
+from pipelines.learn.model_file import TerrainModel
 from pipelines.live.classifying import AtOnce, classify_window
 from pipelines.live.over_time import filtered
 from pipelines.live.pilot import LivePilot
 from pipelines.live.session import Served
 from pipelines.live.terrain_source import Classifier
-from pipelines.models.model_files import TerrainModel
-from pipelines.models.resolve import load_model
 from pipelines.serve.app import make_app
-from pipelines.serve.guard import check_token, is_loopback
+from pipelines.serve.guard import Connections, Watched, check_token, is_loopback
 from pipelines.serve.hub import Hub, Limits
-from pipelines.serve.protocol import HttpProtocol, SocketProtocol
-from pipelines.serve.results import ServiceCheck
-from pipelines.serve.settings import ServeSettings
 from terrain.control.slip_table import load_slip_table
 from terrain.errors import ConfigError, DataError, TerrainError
 from terrain.estimation.live.estimator import CHANNELS
@@ -36,18 +35,21 @@ from terrain.files.atomic import ensure_writable
 from terrain.records import Reading, Sample, Windows
 from terrain.robots import Robot, load_robot
 
+if TYPE_CHECKING:
+    from pipelines.serve.serve import Settings
+
 SAVE_EVERY_S = 5.0
-LARGEST_MESSAGE = 4_194_304
+LARGEST_MESSAGE = 1_048_576
 """Bytes of a message that is not even read: the connection is closed (code 1009)."""
 
 PING_S = 10.0
 WARM_STEPS = 30
 
-LEAVING_STEPS = 350
-"""Hundredths of a second that robots have to read that the service ends."""
+LEAVING_S = 3.5
+"""That robots have to read that the service ends."""
 
-CLOSING_STEPS = 60
-"""Twentieths of a second for their answers."""
+CLOSING_S = 0.5
+"""For their answers: ended at once, what was sent last would be lost."""
 
 
 class Prepared(NamedTuple):
@@ -59,8 +61,13 @@ class Prepared(NamedTuple):
     url: str
     load: Callable[[str], TerrainModel]
 
+    def close(self) -> None:
+        """Give the port back, and end the threads."""
+        self.listening.close()
+        self.hub.stop()
 
-def prepare(settings: ServeSettings) -> Prepared:
+
+def prepare(settings: Settings) -> Prepared:
     """Load, check and warm up what is served, and take the port.
 
     Raises
@@ -68,7 +75,9 @@ def prepare(settings: ServeSettings) -> Prepared:
     TerrainError
         in one sentence, if anything does not fit: model, table, robot, token, folder, port.
     """
-    token = _token(settings)
+    if settings.model is None:
+        raise ConfigError("--model is missing: models:/NAME@champion, models:/NAME/3, or a model folder")
+    token = _token(settings.token_file)
     check_token(settings.host, token)
     robot = None if settings.robot is None else load_robot(settings.robot)
     table = load_slip_table(settings.table, None if robot is None else robot.name)
@@ -80,11 +89,10 @@ def prepare(settings: ServeSettings) -> Prepared:
     load = partial(_load, filter_stride_s=settings.filter_stride_s)
     try:
         model = load(settings.model)
-        served = Served(1, model, settings.model, table)
         if robot is not None:
             check_fit(model, robot)
-        limits = Limits(sessions=settings.max_sessions)
-        hub = Hub(served, robot, limits, settings.state, settings.record)
+        served = Served(1, model, settings.model, table)
+        hub = Hub(served, robot, Limits(sessions=settings.max_sessions), settings.state, settings.record)
         try:
             warm_up(model, robot)
         except BaseException:
@@ -101,25 +109,6 @@ def _load(name: str, filter_stride_s: float | None) -> TerrainModel:
     return filtered(load_model(name), filter_stride_s)
 
 
-def checked(prepared: Prepared, robot: str | None) -> ServiceCheck:
-    """Return what a prepared service would serve, and give its port back."""
-    prepared.listening.close()
-    prepared.hub.stop()
-    served = prepared.hub.served
-    assert served.model is not None  # prepare() loads one
-    info = served.model.info
-    return ServiceCheck(
-        served.model_name,
-        info.classes,
-        info.channels,
-        info.rate_hz,
-        info.filter,
-        info.robots,
-        served.table.name,
-        robot,
-    )
-
-
 class Service:
     """A prepared service, from its first robot to its end.
 
@@ -129,15 +118,20 @@ class Service:
     """
 
     def __init__(self, prepared: Prepared) -> None:
-        self._prepared, hub = prepared, prepared.hub
+        self._prepared, connections = prepared, Connections()
+        self._announce: Callable[[str], None] = lambda url: None
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._ending: asyncio.Task[None] | None = None
         loopback = is_loopback(prepared.listening.getsockname()[0])
         config = uvicorn.Config(
-            make_app(hub, prepared.token, prepared.load, loopback=loopback),
+            make_app(
+                prepared.hub, prepared.token, prepared.load, connections, self._lifespan, loopback=loopback
+            ),
             log_level="critical",
             access_log=False,
-            lifespan="off",
-            http=HttpProtocol,
-            ws=SocketProtocol,
+            lifespan="on",
+            http="h11",
+            ws="websockets-sansio",
             ws_max_size=LARGEST_MESSAGE,
             ws_ping_interval=PING_S,
             ws_ping_timeout=PING_S,
@@ -145,87 +139,73 @@ class Service:
             timeout_graceful_shutdown=5,
             server_header=False,
         )
-        self._server = _Server(config, hub)
+        config.load()
+        protocol: Any = config.http_protocol_class
+        config.http_protocol_class = lambda **named: Watched(protocol(**named), connections)  # type: ignore[assignment]
+        self._server = uvicorn.Server(config)
 
     def run(self, announce: Callable[[str], None]) -> None:
-        """Serve until SIGTERM or Ctrl-C: the robots get a message then, and their states are saved.
+        """Serve until it has to end: at SIGTERM or Ctrl-C in order, at the second one at once.
 
         Parameters
         ----------
         announce : called with the address once robots can come
         """
+        self._announce = announce
         gc.collect()
         gc.freeze()  # what is loaded now stays: no collection has to look at it
         try:
-            asyncio.run(self._run(announce))
+            self._server.run(sockets=[self._prepared.listening])
         finally:
             self._prepared.hub.stop()
             self._prepared.listening.close()
 
     def stop(self) -> None:
         """End in order, from another thread."""
-        self._server.handle_exit(signal.SIGTERM, None)
+        assert self._loop is not None
+        self._loop.call_soon_threadsafe(self._end_at_signal)
 
-    async def _run(self, announce: Callable[[str], None]) -> None:
-        hub, server = self._prepared.hub, self._server
-        server.loop = asyncio.get_running_loop()
+    @asynccontextmanager
+    async def _lifespan(self, app: Any) -> AsyncIterator[None]:
+        """Save states while the service runs, and once more when all robots have left."""
+        hub = self._prepared.hub
+        self._loop = asyncio.get_running_loop()
         # few threads for what takes long: each has memory of its own that is not given back
-        server.loop.set_default_executor(ThreadPoolExecutor(max_workers=2))
+        self._loop.set_default_executor(ThreadPoolExecutor(max_workers=2))
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGINT, signal.SIGTERM):  # in place of uvicorn's, which tells no robot
+                self._loop.add_signal_handler(number, self._end_at_signal)
 
         async def save() -> None:
             while True:
                 await asyncio.sleep(SAVE_EVERY_S)
                 await asyncio.to_thread(hub.save_states, hub.states())
 
-        async def tell() -> None:
-            while not server.started:
-                await asyncio.sleep(0.005)
-            announce(self._prepared.url)
+        saving = asyncio.create_task(save())
+        self._announce(self._prepared.url)
+        yield
+        saving.cancel()
+        await asyncio.gather(saving, return_exceptions=True)
+        hub.save_states(hub.states())
 
-        tasks = [asyncio.create_task(save()), asyncio.create_task(tell())]
-        try:
-            await server.serve(sockets=[self._prepared.listening])
-        finally:
-            for task in tasks:
-                task.cancel()
-            await asyncio.gather(*tasks, return_exceptions=True)
-            hub.save_states(hub.states())
-
-
-class _Server(uvicorn.Server):
-    """A server that tells the robots before it ends."""
-
-    loop: asyncio.AbstractEventLoop
-
-    def __init__(self, config: uvicorn.Config, hub: Hub) -> None:
-        super().__init__(config)
-        self._hub = hub
-        self._ending: asyncio.Task[None] | None = None
-
-    def handle_exit(self, sig: int, frame: Any) -> None:
-        """End in order at the first signal, at once at the second."""
-        if self._hub.closing:
-            super().handle_exit(sig, frame)
-            return
-        self._hub.closing = True
-
-        def begin() -> None:
-            self._ending = self.loop.create_task(self._end())
-
-        self.loop.call_soon_threadsafe(begin)
+    def _end_at_signal(self) -> None:
+        if self._prepared.hub.closing:
+            self._server.should_exit = self._server.force_exit = True
+        elif self._loop is not None:
+            self._prepared.hub.closing = True
+            self._ending = self._loop.create_task(self._end())
 
     async def _end(self) -> None:
-        for opened in list(self._hub.sessions.values()):
+        """Tell the robots, and end when they have read it."""
+        hub = self._prepared.hub
+        leaving = list(hub.sessions.values())
+        for opened in leaving:
             opened.leave("closing", "the service ends")
-        for _ in range(LEAVING_STEPS):
-            if not self._hub.sessions:
-                break
+        end_s = asyncio.get_running_loop().time() + LEAVING_S
+        while hub.sessions and asyncio.get_running_loop().time() < end_s:
             await asyncio.sleep(0.01)
-        for _ in range(CLOSING_STEPS):  # ended at once, what was sent last would be lost
-            await asyncio.sleep(0.05)
-            if not any(getattr(one, "close_sent", False) for one in self.server_state.connections):
-                break
-        self.should_exit = True
+        await asyncio.sleep(CLOSING_S if leaving else 0.0)
+        self._server.should_exit = True
 
 
 def check_fit(model: TerrainModel, robot: Robot) -> None:
@@ -269,16 +249,16 @@ def warm_up(model: TerrainModel, robot: Robot | None) -> None:
         pilot.step(Sample(0.02 * k, np.array([0.5, 0.0, 0.0]), readings))
 
 
-def _token(settings: ServeSettings) -> str:
-    if settings.token_file is None:
+def _token(file: Path | None) -> str:
+    if file is None:
         return os.environ.get("TERRAIN_TOKEN", "").strip()
     try:
-        token = Path(settings.token_file).read_text(encoding="utf-8").strip()
+        token = file.read_text(encoding="utf-8").strip()
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "no text"
-        raise ConfigError(f"{settings.token_file}: cannot be read ({reason})") from None
+        raise ConfigError(f"{file}: cannot be read ({reason})") from None
     if not token:
-        raise ConfigError(f"{settings.token_file}: holds no token")
+        raise ConfigError(f"{file}: holds no token")
     return token
 
 

@@ -1,0 +1,391 @@
+"""``terrain serve --can BUS``: a pilot on a CAN bus, sensors in, corrections of the wheels' speeds out."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipelines.data.can_codec import MISSING_PACKAGE, Frame, load_layout
+from pipelines.data.can_signals import OPTIONAL, SIGNALS
+from pipelines.report import Column, Pairs, Report, Result, Section, Table, described, format_value, interval
+from pipelines.report.stopping import stopping
+from pipelines.serve.can_bridge import KEPT, BridgeCore, MakeStep, Step
+from terrain.errors import ConfigError
+from terrain.records import Array
+
+if TYPE_CHECKING:
+    from pipelines.serve.serve import Settings
+
+REQUIRED = tuple(name for name, channels in SIGNALS.items() if not set(channels) <= OPTIONAL)
+"""Streams without which a pilot makes no correction."""
+
+REOPEN_S = 0.5
+"""Between two attempts to open a bus that failed."""
+
+RECEIVE_S = 0.05
+"""For which the thread that reads waits at most, so that it ends soon when it has to."""
+
+QUEUE = 20_000
+"""Frames that wait for a control step: two seconds of a full bus; of more, the oldest are left out."""
+
+MAX_READ = 2000
+"""Frames that are taken between two control steps: a flooded bus delays none."""
+
+
+def open_bus(interface: str, channel: str, bitrate: int | None = None) -> Any:
+    """Return an open bus of python-can.
+
+    Raises
+    ------
+    ConfigError
+        if there is no such interface, or it cannot be opened.
+    """
+    try:
+        import can
+    except ImportError as error:
+        raise ConfigError(MISSING_PACKAGE) from error
+    if interface not in can.VALID_INTERFACES:
+        known = ", ".join(sorted(can.VALID_INTERFACES))
+        raise ConfigError(f"the interface of --can is {interface!r}; python-can knows {known}")
+    options = {} if bitrate is None else {"bitrate": bitrate}
+    try:
+        return can.Bus(channel=channel, interface=interface, ignore_config=True, **options)
+    except Exception as error:  # each interface has errors of its own, and of the library it loads
+        text = " ".join(str(error).split()) or type(error).__name__
+        raise ConfigError(f"the bus {interface} {channel!r} cannot be opened ({text[:160]})") from error
+
+
+def frame_of(message: Any) -> Frame:
+    """Return a message of python-can as a frame."""
+    return Frame(
+        message.timestamp,
+        message.arbitration_id,
+        bytes(message.data),
+        message.is_extended_id,
+        message.is_remote_frame,
+        message.is_error_frame,
+    )
+
+
+class Link:
+    """Frames from and to a bus, read by a notifier of python-can; a bus that fails is opened again.
+
+    No error of the bus comes through, all are counted.
+
+    Parameters
+    ----------
+    make_bus : opens the bus; called at once, and again after an error of it
+    clock : time of this computer in s
+
+    Attributes
+    ----------
+    errors : by message
+    n_out : frames sent
+
+    Raises
+    ------
+    ConfigError
+        if the bus cannot be opened at first.
+    """
+
+    def __init__(self, make_bus: Callable[[], Any], clock: Callable[[], float] = time.monotonic) -> None:
+        self._make_bus, self._clock = make_bus, clock
+        self._read: deque[tuple[Frame, float]] = deque(maxlen=QUEUE)
+        self.errors: Counter[str] = Counter()
+        self.n_out = 0
+        self._failed, self._retry_s = threading.Event(), 0.0
+        self._bus: Any = None
+        self._notifier: Any = None
+        self._open()
+
+    def __call__(self, message: Any) -> None:
+        """Take a message, in the thread of the notifier."""
+        self._read.append((frame_of(message), self._clock()))
+
+    def on_error(self, error: Exception) -> None:
+        """Note that the bus failed, in the thread of the notifier; it is closed by the next :meth:`frames`."""
+        if not self._failed.is_set():
+            self._count("receive", error)
+            self._failed.set()
+        time.sleep(RECEIVE_S)
+
+    def frames(self) -> list[tuple[Frame, float]]:
+        """Return frames that have come, each with the time at which it was read."""
+        if self._failed.is_set():
+            self.close()
+            self._failed.clear()
+            self._retry_s = self._clock() + REOPEN_S
+        if self._bus is None and self._clock() >= self._retry_s:
+            try:
+                self._open()
+            except Exception as error:  # each interface has errors of its own
+                self._count("open", error)
+                self._retry_s = self._clock() + REOPEN_S
+        return [self._read.popleft() for _ in range(min(len(self._read), MAX_READ))]
+
+    def send(self, frames: Sequence[Frame]) -> bool:
+        """Send frames; those that cannot be sent at once are not sent later. Say whether all were."""
+        if self._bus is None:
+            return False
+        import can
+
+        for frame in frames:
+            message = can.Message(
+                arbitration_id=frame.arbitration_id, data=frame.data, is_extended_id=frame.is_extended
+            )
+            try:
+                self._bus.send(message, timeout=0)
+            except Exception as error:
+                self._count("send", error)
+                return False
+            self.n_out += 1
+        return True
+
+    def close(self) -> None:
+        """Shut the bus down."""
+        bus, notifier, self._bus, self._notifier = self._bus, self._notifier, None, None
+        if notifier is not None:
+            notifier.stop()
+        if bus is not None:
+            with contextlib.suppress(Exception):  # a bus that failed may refuse
+                bus.shutdown()
+
+    def _open(self) -> None:
+        self._bus = self._make_bus()
+        import can
+
+        self._notifier = can.Notifier(self._bus, [self], timeout=RECEIVE_S)
+
+    def _count(self, what: str, error: Exception) -> None:
+        text = " ".join(str(error).split()) or type(error).__name__
+        self.errors[f"{what}: {text[:80]}"] += 1
+
+
+class Bridge:
+    """A core on a bus: frames in as they come, a control step at each tick of its own clock.
+
+    Parameters
+    ----------
+    core : from frames to frames
+    link : the bus
+    rate_hz : of the control steps
+    clock : time of this computer in s
+    wait : waits so many s, or until it is stopped
+
+    Attributes
+    ----------
+    ticks_missed : control steps left out as one before took too long
+    duration_s : from the start to the stop
+    steps_s : time of each control step
+    """
+
+    def __init__(
+        self,
+        core: BridgeCore,
+        link: Link,
+        rate_hz: float,
+        clock: Callable[[], float] = time.monotonic,
+        wait: Callable[[float], Any] | None = None,
+    ) -> None:
+        self._core, self._link, self._period_s, self._clock = core, link, 1.0 / rate_hz, clock
+        self._stopped = threading.Event()
+        self._wait = wait or self._stopped.wait
+        self.ticks_missed = 0
+        self.duration_s = 0.0
+        self.steps_s: deque[float] = deque(maxlen=KEPT)
+
+    def stop(self) -> None:
+        """End :meth:`run` at once; a signal handler may call it."""
+        self._stopped.set()
+
+    def run(self, duration_s: float | None = None) -> None:
+        """Run until stopped, or for a time; then send corrections of zero and shut the bus down."""
+        start_s = due_s = self._clock()
+        end_s = np.inf if duration_s is None else start_s + duration_s
+        try:
+            while not self._stopped.is_set() and (now_s := self._clock()) < end_s:
+                if now_s < due_s:
+                    self._wait(min(due_s, end_s) - now_s)
+                    continue
+                self._control()
+                due_s += self._period_s
+                late = int((self._clock() - due_s) / self._period_s)
+                if late > 0:
+                    self.ticks_missed += late
+                    due_s += late * self._period_s
+        finally:
+            self.duration_s = self._clock() - start_s
+            self._link.send(self._core.stop(self._clock()))
+            self._link.close()
+
+    def _control(self) -> None:
+        for frame, read_s in self._link.frames():
+            self._core.receive(frame, read_s)
+        began_s = self._clock()
+        frames = self._core.tick(began_s)
+        self.steps_s.append(self._clock() - began_s)
+        if self._link.send(frames):
+            self._core.sent(self._clock())
+
+
+@dataclass(frozen=True)
+class Latency:
+    """Times in ms: None where there was none."""
+
+    median_ms: float | None
+    p99_ms: float | None
+
+
+def latency_of(times_s: Sequence[float]) -> Latency:
+    """Return median and 99th percentile of times.
+
+    Examples
+    --------
+    >>> latency_of([0.001, 0.002, 0.003])
+    Latency(median_ms=2.0, p99_ms=2.98)
+    >>> latency_of([])
+    Latency(median_ms=None, p99_ms=None)
+    """
+    if not times_s:
+        return Latency(None, None)
+    median, p99 = np.percentile(np.asarray(times_s), [50.0, 99.0])
+    return Latency(round(1e3 * float(median), 4), round(1e3 * float(p99), 4))
+
+
+@dataclass(frozen=True, repr=False)
+class BridgeResult(Result):
+    """What a bridge did, from its start to its stop."""
+
+    interface: str = described("kind of bus, as python-can names it")
+    channel: str = described("channel of the bus")
+    dbc: str = described("file of the signals")
+    robot: str = described("name of its description")
+    duration_s: float = described("from the start to the stop", "s", form=".1f")
+    frames_in: int = described("frames received")
+    frames_used: int = described("frames of signals that are used")
+    frames_out: int = described("frames sent")
+    samples: Mapping[str, int] = described("samples by stream")
+    dropped: Mapping[str, int] = described("what was not used, by kind")
+    bus_errors: Mapping[str, int] = described("errors of the bus by message")
+    clipped: Mapping[str, int] = described("values sent as the end of their range, by signal")
+    states: Mapping[str, int] = described("control steps by state of the bridge")
+    ticks_missed: int = described("control steps left out as one before took too long")
+    wheels_to_correction: Latency = described(
+        "from the first frame of the wheels' newest sample to its answer"
+    )
+    step: Latency = described("time of a control step")
+
+
+def run(settings: Settings) -> BridgeResult:
+    """Run a pilot on a bus until it is interrupted, or for the time of the settings.
+
+    Raises
+    ------
+    TerrainError
+        if robot, table, model or DBC are not accepted, or the bus cannot be opened.
+    """
+    from terrain.robots import SwerveRobot, as_drive, load_robot
+
+    interface, channel = bus_of(settings.can or "")
+    layout = load_layout(settings.dbc, REQUIRED)
+    robot = as_drive(
+        SwerveRobot,
+        load_robot(settings.robot or "agrimaro"),
+        "robot {name}: drive {drive!r} has no pilot, only 'swerve' has",
+    )
+    core = BridgeCore(layout, robot, _pilot(settings, robot))
+    link = Link(lambda: open_bus(interface, channel, settings.bitrate))
+    bridge = Bridge(core, link, settings.rate_hz)
+    with stopping(bridge.stop):
+        bridge.run(settings.duration_s)
+    return BridgeResult(
+        interface=interface,
+        channel=channel,
+        dbc=layout.name,
+        robot=robot.name,
+        duration_s=round(bridge.duration_s, 3),
+        frames_in=core.n_in,
+        frames_used=core.receiver.n_used,
+        frames_out=link.n_out,
+        samples=dict(sorted(core.samples.items())),
+        dropped=dict(sorted((core.receiver.dropped + core.failed).items())),
+        bus_errors=dict(sorted(link.errors.items())),
+        clipped=dict(sorted(core.clipped.items())),
+        states=dict(sorted(core.states.items())),
+        ticks_missed=bridge.ticks_missed,
+        wheels_to_correction=latency_of(core.latencies_s),
+        step=latency_of(bridge.steps_s),
+    )
+
+
+def bus_of(text: str) -> tuple[str, str]:
+    """Return interface and channel of a bus; a channel alone is one of socketcan.
+
+    Examples
+    --------
+    >>> bus_of("can0"), bus_of("udp_multicast:239.74.163.2"), bus_of("virtual:test")
+    (('socketcan', 'can0'), ('udp_multicast', '239.74.163.2'), ('virtual', 'test'))
+    """
+    interface, colon, channel = text.partition(":")
+    return (interface, channel) if colon else ("socketcan", text)
+
+
+def _pilot(settings: Settings, robot: Any) -> MakeStep:
+    """Return what makes the step of the pilot that the settings describe; what is not accepted is refused."""
+    from pipelines.live.pilot import LivePilot
+    from pipelines.live.pilot_settings import PilotSettings
+    from terrain.control.slip_table import load_slip_table
+
+    table, source = load_slip_table(settings.table), None
+    if settings.model is not None:
+        from pipelines.learn.load import load_model
+        from pipelines.live.classifying import ClassifierThread
+        from pipelines.live.terrain_source import Classifier
+
+        source = Classifier(load_model(settings.model), robot, ClassifierThread().robot())
+    pilot_settings = PilotSettings(controller=settings.controller)
+
+    def make(steer_rad: Array) -> Step:
+        return LivePilot(robot, table, source, pilot_settings, steer_rad=steer_rad).step
+
+    make(np.zeros(3))  # before the bus is opened
+    return make
+
+
+def report(result: BridgeResult) -> Report:
+    """Return what a bridge did: frames, states and latencies, then what was not used, by kind."""
+    n_steps, latency = sum(result.states.values()), result.wheels_to_correction
+    n_active = result.states.get("ACTIVE", 0)
+    answer = (
+        f"Corrections were the controller's in {n_active} of {n_steps} control steps, "
+        f"{format_value(result.duration_s, '.1f', 's')} on {result.interface} {result.channel}."
+    )
+    counts = {
+        "samples": result.samples,
+        "dropped": result.dropped,
+        "bus errors": result.bus_errors,
+        "sent as the end of the range": result.clipped,
+        "control steps": result.states,
+    }
+    rows = tuple((kind, name, n) for kind, found in counts.items() for name, n in found.items())
+    pairs = (
+        ("frames in, used, out", f"{result.frames_in}, {result.frames_used}, {result.frames_out}"),
+        ("control steps left out", result.ticks_missed),
+        ("wheels to correction, median to p99", interval(latency.median_ms, latency.p99_ms, ".2f", "ms")),
+        ("control step, median to p99", interval(result.step.median_ms, result.step.p99_ms, ".2f", "ms")),
+    )
+    columns = (Column("kind"), Column("name", long=True), Column("number"))
+    return Report(
+        "CAN bus",
+        answer,
+        parts=(Pairs(pairs), Table(columns, rows)) if rows else (Pairs(pairs),),
+        details=(Section("Setup", (Pairs((("robot", result.robot), ("DBC", result.dbc))),)),),
+        next_step="terrain serve --can BUS --json FILE keeps these figures",
+    )

@@ -1,0 +1,153 @@
+"""Serve terrain, target slips and commands to robots, live.
+
+Robots connect to a WebSocket service and send samples as they come; with ``--can`` the live chain runs on a CAN
+bus instead.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from pipelines.report import Pairs, Progress, Report, Result, Section, described, enumerated, plural, silent
+from pipelines.report.settings import Settings as BaseSettings
+from pipelines.report.settings import setting
+
+if TYPE_CHECKING:
+    from pipelines.serve.service import Prepared
+
+EXAMPLE = "terrain serve --model models:/field@champion --robot agrimaro --state states/"
+
+
+class ServedSettings(BaseSettings):
+    """What is served."""
+
+    model: str | None = setting(
+        None,
+        "models:/NAME@champion, models:/NAME/3, or a model folder; without one terrain is unknown (--can).",
+    )
+    table: Path | None = setting(None, "Table of target slips; the packaged one by default.")
+    filter_stride_s: float | None = setting(
+        None, "Windows so far apart in s (0.25), filtered over time; as trained otherwise.", "--filter-stride"
+    )
+    robot: str | None = setting(
+        None, "Robot by name, or its YAML file: its description is used for robots of its name."
+    )
+    rate_hz: float = setting(50.0, "Steps a second of the live chain on a bus.", "--rate", ge=1.0, le=500.0)
+
+
+class ServiceSettings(BaseSettings):
+    """The WebSocket service: where it listens, to whom, and how much is accepted."""
+
+    host: str = setting("127.0.0.1", "Address to listen on; a token is required for others than loopback.")
+    port: int = setting(8765, "Port to listen on; 0 for a free one.", ge=0, le=65535)
+    token_file: Path | None = setting(
+        None, "File with the token that is required; TERRAIN_TOKEN holds it otherwise."
+    )
+    max_sessions: int = setting(64, "Robots at once.", ge=1, le=10_000)
+    state: Path | None = setting(None, "Folder of what outlives a restart: biases and terrain of each robot.")
+    record: Path | None = setting(None, "Folder of the recordings of sessions that ask for it.")
+    check: bool = setting(False, "Load and check all of it, take the port, and end.")
+
+
+class CanSettings(BaseSettings):
+    """A CAN bus in place of the WebSocket service."""
+
+    can: str | None = setting(
+        None, "Bus as INTERFACE:CHANNEL of python-can, as socketcan:can0; can0 alone is of socketcan."
+    )
+    bitrate: int | None = setting(None, "Bit rate in bit/s, of interfaces that set it; not socketcan.", gt=0)
+    dbc: Path | None = setting(None, "DBC with the signals of docs/can.md; AgriMaRo's by default.")
+    controller: Literal["traction", "thesis"] = setting("traction", "traction, or thesis: PID on each wheel.")
+    duration_s: float | None = setting(
+        None, "Stops after so many s; by default when it is interrupted.", option="--duration", ge=0.0
+    )
+
+
+class Settings(CanSettings, ServiceSettings, ServedSettings):
+    """Settings of ``terrain serve``."""
+
+
+@dataclass(frozen=True, repr=False)
+class ServiceResult(Result):
+    """What a service serves, and what it did until its end."""
+
+    model: str = described("as it was named")
+    classes: tuple[str, ...] = described("terrains that the model knows")
+    channels: Mapping[str, tuple[str, ...]] = described("channels that the model needs, by stream")
+    rate_hz: Mapping[str, float] = described("rate of each stream in its windows", "Hz")
+    filter: str = described("filter whose estimates it uses; empty for none")
+    robots: tuple[str, ...] = described("robots whose runs it was trained on")
+    table: str = described("table of target slips")
+    robot: str | None = described("robot that model and table were checked against")
+    served: Mapping[str, int] | None = described(
+        "sessions, messages, rows, steps, errors and wrong tokens until its end; null with --check",
+        default=None,
+    )
+
+
+def run(settings: Settings, progress: Progress = silent) -> Result:
+    """Serve until it is ended; with ``--check`` only find out whether it could.
+
+    Raises
+    ------
+    TerrainError
+        in one sentence, if anything does not fit: model, table, robot, token, folder, port, bus.
+    """
+    if settings.can is not None:
+        from pipelines.serve.can_bus import run as run_on_bus
+
+        return run_on_bus(settings)
+    from pipelines.serve.service import Service, prepare
+
+    prepared = prepare(settings)
+    result = checked(prepared, settings.robot)
+    if settings.check:
+        prepared.close()
+        return result
+    Service(prepared).run(lambda url: print(f"serving {settings.model} at {url}", flush=True))
+    return replace(result, served=prepared.hub.metrics.totals())
+
+
+def checked(prepared: Prepared, robot: str | None) -> ServiceResult:
+    """Return what a prepared service serves."""
+    served = prepared.hub.served
+    assert served.model is not None  # prepare() loads one
+    info = served.model.info
+    return ServiceResult(
+        served.model_name,
+        info.classes,
+        info.channels,
+        info.rate_hz,
+        info.filter,
+        info.robots,
+        served.table.name,
+        robot,
+    )
+
+
+def report(result: ServiceResult) -> Report:
+    """Return what a service serves, and what it did until its end."""
+    model = (
+        ("classes", enumerated(result.classes)),
+        ("table of target slips", result.table),
+        ("trained on", enumerated(result.robots)),
+        ("checked against", result.robot),
+        ("filter", result.filter or None),
+    )
+    needs = tuple(
+        (f"{stream}, {result.rate_hz[stream]:g} Hz", enumerated(names))
+        for stream, names in result.channels.items()
+    )
+    details = (Section("Channels that the model needs", (Pairs(needs),)),)
+    if result.served is None:
+        answer = f"{result.model} can be served: {enumerated(result.classes)}."
+        next_step = f"terrain serve --model {result.model}"
+        return Report("Service", answer, parts=(Pairs(model),), details=details, next_step=next_step)
+    done = result.served
+    answer = f"{plural(done['sessions'], 'session')} of robots served with {result.model}."
+    counts = Pairs(tuple((name.replace("_", " "), n) for name, n in done.items()))
+    next_step = "terrain convert RECORDINGS --out RUNS makes runs of what was recorded"
+    return Report("Service", answer, parts=(counts, Pairs(model)), details=details, next_step=next_step)
