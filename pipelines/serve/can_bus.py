@@ -8,7 +8,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -17,11 +17,9 @@ from pipelines.data.can_signals import OPTIONAL, SIGNALS
 from pipelines.report import Column, Pairs, Report, Result, Section, Table, described, format_value, interval
 from pipelines.report.stopping import stopping
 from pipelines.serve.can_bridge import KEPT, BridgeCore, MakeStep, Step
+from pipelines.serve.settings import Settings
 from terrain.errors import ConfigError
 from terrain.records import Array
-
-if TYPE_CHECKING:
-    from pipelines.serve.serve import Settings
 
 REQUIRED = tuple(name for name, channels in SIGNALS.items() if not set(channels) <= OPTIONAL)
 """Streams without which a pilot makes no correction."""

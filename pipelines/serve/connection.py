@@ -1,7 +1,7 @@
 """What speaks WebSocket to the service: robots, messages in and steps out; and pages that watch them.
 
 Where a token is required, nothing is decoded before it has fitted: it comes in the header of the handshake, or
-as the first frame by itself.  A robot that has not said hello yet is given one answer at a time, and what it
+as the first frame by itself.  Before its hello a robot is given one answer at a time, and what it
 sends is not decoded where it is larger than any hello.  What a session may send is a budget: of messages,
 rows and bytes, and of the time that decoding them takes.
 """

@@ -13,7 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import uvicorn
@@ -28,15 +28,13 @@ from pipelines.live.terrain_source import Classifier
 from pipelines.serve.app import make_app
 from pipelines.serve.guard import Connections, Watched, check_token, is_loopback
 from pipelines.serve.hub import Hub, Limits
+from pipelines.serve.settings import Settings
 from terrain.control.slip_table import load_slip_table
 from terrain.errors import ConfigError, DataError, TerrainError
 from terrain.estimation.live.estimator import CHANNELS
 from terrain.files.atomic import ensure_writable
 from terrain.records import Reading, Sample, Windows
 from terrain.robots import Robot, load_robot
-
-if TYPE_CHECKING:
-    from pipelines.serve.serve import Settings
 
 SAVE_EVERY_S = 5.0
 LARGEST_MESSAGE = 1_048_576

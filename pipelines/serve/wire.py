@@ -43,7 +43,7 @@ def decode(message: str | bytes) -> dict[str, Any]:
     """Return the content of a message.
 
     JSON is read by pydantic's parser, which takes a sixth of the time of the standard library's, and a tenth
-    where the text is wrong: for as long as a parser runs, nobody else is served.
+    where the text is wrong: no robot is served while a parser runs.
 
     Raises
     ------

@@ -166,7 +166,7 @@ def test_thousands_of_malformed_messages(running, model_folder, hello, messages,
                         first = hello("stranger", rate_hz=0 if begun == 1 else 50)
                         stranger.send(json.dumps(first))
                         assert json.loads(stranger.recv(10))["type"] == "welcome"
-                    n = AT_ONCE if begun else 4  # one that has not said hello is answered twice a second
+                    n = AT_ONCE if begun else 4  # before its hello a client is answered twice a second
                     for _ in range(n):
                         stranger.send(malformed(random_, hello("other")))
                     n_sent += AT_ONCE

@@ -1,0 +1,58 @@
+"""Settings of ``terrain serve``, by what they belong to."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from pipelines.report.settings import Settings as BaseSettings
+from pipelines.report.settings import setting
+
+
+class ServedSettings(BaseSettings):
+    """What is served."""
+
+    model: str | None = setting(
+        None,
+        "models:/NAME@champion, models:/NAME/3, or a model folder; without one terrain is unknown (--can).",
+    )
+    table: Path | None = setting(None, "Table of target slips; the packaged one by default.")
+    filter_stride_s: float | None = setting(
+        None, "Windows so far apart in s (0.25), filtered over time; as trained otherwise.", "--filter-stride"
+    )
+    robot: str | None = setting(
+        None, "Robot by name, or its YAML file: its description is used for robots of its name."
+    )
+    rate_hz: float = setting(50.0, "Steps a second of the live chain on a bus.", "--rate", ge=1.0, le=500.0)
+
+
+class ServiceSettings(BaseSettings):
+    """The WebSocket service: where it listens, to whom, and how much is accepted."""
+
+    host: str = setting("127.0.0.1", "Address to listen on; a token is required for others than loopback.")
+    port: int = setting(8765, "Port to listen on; 0 for a free one.", ge=0, le=65535)
+    token_file: Path | None = setting(
+        None, "File with the token that is required; TERRAIN_TOKEN holds it otherwise."
+    )
+    max_sessions: int = setting(64, "Robots at once.", ge=1, le=10_000)
+    state: Path | None = setting(None, "Folder of what outlives a restart: biases and terrain of each robot.")
+    record: Path | None = setting(None, "Folder of the recordings of sessions that ask for it.")
+    check: bool = setting(False, "Load and check all of it, take the port, and end.")
+
+
+class CanSettings(BaseSettings):
+    """A CAN bus in place of the WebSocket service."""
+
+    can: str | None = setting(
+        None, "Bus as INTERFACE:CHANNEL of python-can, as socketcan:can0; can0 alone is of socketcan."
+    )
+    bitrate: int | None = setting(None, "Bit rate in bit/s, of interfaces that set it; not socketcan.", gt=0)
+    dbc: Path | None = setting(None, "DBC with the signals of docs/can.md; AgriMaRo's by default.")
+    controller: Literal["traction", "thesis"] = setting("traction", "traction, or thesis: PID on each wheel.")
+    duration_s: float | None = setting(
+        None, "Stops after so many s; by default when it is interrupted.", option="--duration", ge=0.0
+    )
+
+
+class Settings(CanSettings, ServiceSettings, ServedSettings):
+    """Settings of ``terrain serve``."""
