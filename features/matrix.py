@@ -88,13 +88,12 @@ class FeatureMatrix(NamedTuple):
                     f"{self.layout.rate_hz[stream]:.4g} Hz"
                 )
             order = [X.channels[stream].index(name) for name in names]
-            array = X.values[stream]
-            if array.shape[2] != self.n_samples[stream]:
-                raise DataError(
-                    f"a window holds {array.shape[2]} samples of stream {stream!r}; the features were "
-                    f"learned on {self.n_samples[stream]}"
-                )
-            values[stream] = array if order == list(range(array.shape[1])) else array[:, order]
+            array = (
+                X.values[stream]
+                if order == list(range(len(X.channels[stream])))
+                else X.values[stream][:, order]
+            )
+            values[stream] = _of_length(array, self.n_samples[stream], stream)
         return values
 
     def _extract(self, values: Mapping[str, Array]) -> tuple[list[Feature], Array]:
@@ -129,6 +128,22 @@ class FeatureMatrix(NamedTuple):
             table = np.concatenate([table, channel_spectra(values, rate_hz)], axis=2)
         described, kept = _described(stream, tuple(names), tuple(columns), frozenset(self.level_sets))
         return list(described), table[:, kept]
+
+
+def _of_length(values: Array, n: int, stream: str) -> Array:
+    """Return the first n samples of windows; where their own set of runs gave a few less, the last are mirrored.
+
+    The number of samples follows the rate that was measured of a set of runs, which the next set's differs from
+    by a little.
+    """
+    held = values.shape[2]
+    if held == n:
+        return values
+    if abs(held - n) > MAX_RATE_DEVIATION * n + 1:
+        raise DataError(
+            f"a window holds {held} samples of stream {stream!r}; the features were learned on {n}"
+        )
+    return np.take(values, held - 1 - np.abs(held - 1 - np.arange(n)), axis=2)
 
 
 def of_signal_sets(windows: Windows, signal_sets: Iterable[str], level_sets: Iterable[str]) -> FeatureMatrix:

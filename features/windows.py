@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 
@@ -29,9 +30,16 @@ differ by up to 4 % (lengths of the two files of a BorealTC run), which alignmen
 NAN_TOLERANT_STREAMS = ("slip",)
 """Streams whose NaN is a value (slip is undefined at a standstill) and drops no window."""
 
+RATE_SLACK = 0.1
+"""Of a sample, by which a window may fall short of its last one.  Loggers hold a whole or a half number of samples
+in a window at their nominal rate; the rate that is measured of a set of runs lies a little beside it, on either
+side, and windows of two sets must hold the same number."""
+
 SPAN_TOLERANCE = 0.1
 """A window whose samples span this much more or less time than they should, and one period, was not sampled
 at the rate it is read with: a slow or a fast stretch of a logger, or a live stream set to another rate."""
+
+WHEELS = frozenset({"wheels"})
 
 DROP_REASONS = ("gap", "wrong rate", "not finite", "not moving", "not steady")
 
@@ -108,7 +116,7 @@ class Layout:
 
     def n_samples(self, stream: str, length_s: float) -> int:
         """Return how many samples of a stream a window holds; ``DataError`` when fewer than four."""
-        n = int(np.floor(length_s * self.rate_hz[stream] + 1e-3))
+        n = int(np.floor(length_s * self.rate_hz[stream] + RATE_SLACK))
         if n < 4:
             raise DataError(
                 f"a window of {length_s:g} s holds {n} samples of stream {stream!r} at "
@@ -133,10 +141,10 @@ def layout_of(
     """
     if not runs:
         raise DataError("there is no run to cut windows from")
-    desired_sets = {*signal_sets, *(("wheels",) if speeds else ())}
+    desired_sets = frozenset({*signal_sets, *(("wheels",) if speeds else ())})
 
     def used(name: str, stream: Stream) -> tuple[str, ...]:
-        return tuple(c for c in stream.channels if signal_set_of(name, c) in desired_sets)
+        return tuple(stream.channels[i] for i in rows_of_sets(name, tuple(stream.channels), desired_sets))
 
     names = dict.fromkeys(name for run in runs for name, stream in run.streams.items() if used(name, stream))
     channels: dict[str, tuple[str, ...]] = {}
@@ -160,6 +168,12 @@ def layout_of(
     if not channels:
         raise DataError(f"run {runs[0].run_id} has no channel that features are made of")
     return layout
+
+
+@lru_cache(maxsize=1024)
+def rows_of_sets(stream: str, channels: tuple[str, ...], sets: frozenset[str]) -> tuple[int, ...]:
+    """Return which channels of a stream belong to some signal sets; all runs of a data set ask for the same."""
+    return tuple(i for i, channel in enumerate(channels) if signal_set_of(stream, channel) in sets)
 
 
 def check_layout(run: RunLog, layout: Layout) -> None:
@@ -252,9 +266,9 @@ def wheel_speeds(values: Mapping[str, Array], channels: Mapping[str, tuple[str, 
         if there is no wheel speed, so that steady motion cannot be judged.
     """
     for name, names in channels.items():
-        rows = [i for i, channel in enumerate(names) if signal_set_of(name, channel) == "wheels"]
+        rows = rows_of_sets(name, tuple(names), WHEELS)
         if rows:
-            return values[name][:, rows]
+            return values[name][:, list(rows)]
     raise DataError("steady motion cannot be judged without wheel speeds; switch the rule off")
 
 

@@ -166,14 +166,35 @@ def test_windows_of_another_kind_are_refused():
             rate_hz=RATE_HZ | {"imu": 50.0}
         ),
         "windows last 1.7 s; the features were learned on 2 s": draw_windows(length_s=1.7),
-        "a window holds 196 samples of stream 'imu'; the features were learned on 200": draw_windows(
-            values=windows.values | {"imu": windows.values["imu"][:, :, :196]},
+        "a window holds 180 samples of stream 'imu'; the features were learned on 200": draw_windows(
+            values=windows.values | {"imu": windows.values["imu"][:, :, :180]},
             rate_hz=RATE_HZ | {"imu": 98.0},
         ),
     }
     for message, other in cases.items():
         with pytest.raises(DataError, match=message):
             extractor.transform(other)
+
+
+@pytest.mark.parametrize(
+    ("first_hz", "second_hz"), [(99.97, 100.02), (100.02, 99.97), (98.0, 101.5), (101.5, 98.0)]
+)
+def test_windows_cut_from_two_sets_of_runs_fit_each_other(first_hz, second_hz):
+    def cut(rate_hz, seed):
+        time_s = np.arange(0.0, 40.0, 1 / rate_hz)
+        noise = np.random.default_rng(seed).standard_normal((len(time_s), 1))
+        run = RunLog("a", "husky", {"imu": Stream(time_s, noise, ("accel_z_mps2",))}, ((0.0, 40.0, "ice"),))
+        return cut_windows([run], WindowRule(steady=None)).windows
+
+    first, second = cut(first_hz, 0), cut(second_hz, 1)
+    extractor = FeatureExtractor().fit(first)
+    other = extractor.transform(second)
+    if abs(first_hz / second_hz - 1) < 1e-3:  # a nominal rate gives one number of samples
+        assert first.values["imu"].shape[2] == second.values["imu"].shape[2] == 200
+    names = extractor.get_feature_names_out().tolist()
+    own = FeatureExtractor().fit(second).transform(second)
+    spread = own[:, names.index("imu.accel_z.std [m/s^2]")]
+    np.testing.assert_allclose(other[:, names.index("imu.accel_z.std [m/s^2]")], spread, rtol=0.05)
 
 
 def test_a_set_that_is_unknown_or_has_no_channel_is_refused():

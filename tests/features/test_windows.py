@@ -5,6 +5,7 @@ from hypothesis import strategies as st
 
 from features.windows import (
     DROP_REASONS,
+    RATE_SLACK,
     Layout,
     SteadyMotion,
     WindowRule,
@@ -57,7 +58,7 @@ def test_a_window_holds_the_first_samples_at_or_after_its_start(length_s, stride
     for name, values in cut.windows.values.items():
         n = layout.n_samples(name, length_s)
         assert values.shape[2] == n
-        assert n <= length_s * layout.rate_hz[name] + 1e-3 < n + 1
+        assert n <= length_s * layout.rate_hz[name] + RATE_SLACK < n + 1
     number = cut.windows.values["imu"][:, 0]
     assert (np.diff(number, axis=1) == 1).all()  # every sample once, none made up
     first_s = run.streams["imu"].time_s[number[:, 0].astype(int)]
