@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -31,6 +31,7 @@ from pipelines.data.topic_mapping import (
     Channel,
     StreamMapping,
     by_radius,
+    check_stream,
     described,
     joint_unit,
     load_mapping,
@@ -122,17 +123,7 @@ def read_run(
         for stream, each in mapping.streams.items()
     }
     labels = TextCollector(place, mapping.labels, faults, MAX_LABELS) if mapping.labels else None
-    takers: dict[str, list[Collector | TextCollector]] = {}
-    for reader in readers.values():
-        for collector in reader.collectors:
-            takers.setdefault(collector.topic, []).append(collector)
-    if labels is not None:
-        takers.setdefault(labels.topic, []).append(labels)
-    decoders = {topic: decoder_of(place, topics[topic], bag.distro) for topic in sorted(takers)}
-    given = give(takers, decoders)
-    for topic, log_ns, content in messages_of(bag, frozenset(takers), faults):
-        given(topic, log_ns, content)
-
+    _collect(bag, place, topics, readers.values(), labels, faults)
     raw = {stream: reader.raw() for stream, reader in readers.items()}
     start_ns = start_of([each.stamp_ns for each in raw.values()], faults.repairs)
     streams = {stream: _stream(place, stream, each, start_ns, faults.repairs) for stream, each in raw.items()}
@@ -147,6 +138,66 @@ def read_run(
         "_".join(parts), name, streams, intervals, source=f"{place}, a bag", dropped=faults.repairs or {}
     )
     return checked_names(place, run)
+
+
+def _collect(
+    bag: Bag,
+    place: str,
+    topics: Mapping[str, Topic],
+    readers: Iterable[StreamReader],
+    labels: TextCollector | None,
+    faults: Faults,
+) -> None:
+    """Give the messages of a bag to what takes them."""
+    takers: dict[str, list[Collector | TextCollector]] = {}
+    for reader in readers:
+        for collector in reader.collectors:
+            takers.setdefault(collector.topic, []).append(collector)
+    if labels is not None:
+        takers.setdefault(labels.topic, []).append(labels)
+    decoders = {topic: decoder_of(place, topics[topic], bag.distro) for topic in sorted(takers)}
+    given = give(takers, decoders)
+    for topic, log_ns, content in messages_of(bag, frozenset(takers), faults):
+        given(topic, log_ns, content)
+
+
+def read_stream(
+    path: Path,
+    name: str,
+    described_stream: Mapping[str, object],
+    repairs: Counter[str] | None,
+    wheel_radius_m: float | None = None,
+) -> Stream:
+    """Return one stream of a bag that is joined with other files: its times are seconds since 1970.
+
+    Parameters
+    ----------
+    path : of the bag
+    name : of the stream
+    described_stream : its keys, as in a mapping of topics
+    repairs : counts by kind of what is dropped; None refuses
+    wheel_radius_m : of the robot; None where unknown
+
+    Raises
+    ------
+    LogError, ConfigError
+        as :func:`read_run`.
+    """
+    mapping = check_stream(f"stream {name}", described_stream)
+    bag, place, faults = open_bag(path), short_name(path), Faults(repairs)
+    topics = topics_of(bag)
+    _check_topics(place, TopicMapping(streams={name: mapping}), topics)
+    reader = StreamReader(
+        place,
+        name,
+        mapping,
+        by_header=True,
+        topics=topics,
+        wheel_radius_m=wheel_radius_m,
+        faults=faults,
+    )
+    _collect(bag, place, topics, [reader], None, faults)
+    return _stream(place, name, reader.raw(), 0, repairs)
 
 
 def _exported_run(

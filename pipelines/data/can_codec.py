@@ -1,6 +1,6 @@
 """Frames of a CAN bus to values and back, by the DBC that a user has: cantools decodes and encodes.
 
-Ours is what a controller needs beside it: which signal is which channel, in which unit; values that were not
+What a controller needs beside it is here: which signal is which channel, in which unit; values that were not
 measured; bounds; CRC and counter.  The lowest raw value of a signed signal, and the highest of an unsigned
 one, stands for a value that was not measured; of a signal of floating point NaN does.  A value beyond what a
 signal can hold is sent as the end of its range, never wrapped.  CRC-8 of SAE J1850 is over the identifier, 2

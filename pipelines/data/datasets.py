@@ -7,6 +7,7 @@ import json
 import logging
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -240,9 +241,7 @@ def _readers(
     if mapping is not None or layout == "csv":
         if mapping is None:
             raise ConfigError("the layout 'csv' needs a mapping file")
-        from terrain.logs import mapping as by_mapping
-
-        return by_mapping.find_runs(folder, by_mapping.load_mapping(mapping))
+        return _mapped(folder, mapping, robot)
     from terrain.logs import borealtc, drive, drive_recording, read, robotino, testbed
 
     # files of a Robotino have the ending of recordings, and a camera's file above them
@@ -265,6 +264,19 @@ def _readers(
     if names == ["drive-recording"]:
         return drive_recording.find_runs(folder, lambda name: drive_robot(_named(name, robot)))
     return _some([reader for readers in found.values() for reader in readers], folder)
+
+
+def _mapped(folder: Path, mapping: str | Path, robot: Robot | None) -> list[Callable[..., RunLog]]:
+    """Return the readers of files by a mapping; a stream may lie in a bag."""
+    from pipelines.data import bag_runs, topic_mapping
+    from terrain.logs import mapping as by_mapping
+
+    read = by_mapping.load_mapping(mapping, topic_mapping.check_stream)
+    try:
+        radius_m = _named(read.robot, robot).wheel_radius_m
+    except ConfigError:
+        radius_m = None
+    return by_mapping.find_runs(folder, read, partial(bag_runs.read_stream, wheel_radius_m=radius_m))
 
 
 def _bags(place: Path, mapping: str | Path | None, robot: Robot | None) -> list[Callable[..., RunLog]]:

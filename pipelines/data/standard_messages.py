@@ -12,6 +12,8 @@ from pipelines.data.faults import MISSING_PACKAGE
 from terrain.errors import ConfigError
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.kinematics.camera import QUATERNION_TOLERANCE, to_body, to_camera
+from terrain.logs.geodesy import local_metres
+from terrain.logs.mapping import POSITION_CHANNELS
 from terrain.logs.replay import TWIST
 from terrain.logs.schema import IMU_CHANNELS, POSE_CHANNELS
 from terrain.records import Array, Stream
@@ -104,10 +106,25 @@ def _pose(numbers: Array) -> Converted:
     return Converted(POSE_CHANNELS, np.column_stack([numbers[:, :2], yaw_rad]))
 
 
+def _gnss(numbers: Array) -> Converted:
+    """Return positions in m of the first fix, with their deviation; NaN without a fix."""
+    degrees, height_m, status, variance_m2 = numbers[:, :2], numbers[:, 2], numbers[:, 3], numbers[:, 4]
+    latitude, longitude = (np.where(status >= 0, np.radians(each), np.nan) for each in degrees.T)
+    metres = local_metres(latitude, longitude, height_m)
+    std_m = np.where((status >= 0) & (variance_m2 > 0), np.sqrt(np.abs(variance_m2)), np.nan)
+    channels = (*POSITION_CHANNELS, "std_position_m")
+    if not np.isfinite(std_m).any():
+        return Converted(POSITION_CHANNELS, metres)
+    return Converted(channels, np.column_stack([metres, std_m]))
+
+
 _TWIST_PATHS = ("linear.x", "linear.y", "angular.z")
 _POSE_PATHS = (*_paths("position"), *_paths("orientation", "xyzw"))
 
 KINDS: Mapping[str, StandardKind] = {
+    "sensor_msgs/NavSatFix": StandardKind(
+        ("latitude", "longitude", "altitude", "status.status", "position_covariance[0]"), _gnss
+    ),
     "sensor_msgs/Imu": StandardKind(
         (
             *_paths("angular_velocity"),

@@ -42,9 +42,10 @@ from terrain.files.resources import data_folder
 from terrain.logs.mapping import Strict, Unit, Word, check_unit, first_fault
 from terrain.logs.schema import unit_of
 
-Kind = Literal["fields", "imu", "joints", "odometry", "pose", "twist"]
+Kind = Literal["fields", "gnss", "imu", "joints", "odometry", "pose", "twist"]
 
 TYPES: Map[str, tuple[str, ...]] = {
+    "gnss": ("sensor_msgs/NavSatFix",),
     "imu": ("sensor_msgs/Imu",),
     "joints": ("sensor_msgs/JointState",),
     "odometry": ("nav_msgs/Odometry",),
@@ -139,6 +140,27 @@ def load_mapping(path: str | Path) -> Mapping:
         check_name(f"{path.name}: stream", name, ConfigError)
         _check_stream(f"{path.name}: stream {name}", stream)
     return mapping
+
+
+def check_stream(place: str, described: Map[str, object]) -> StreamMapping:
+    """Return a stream of messages that is described in a mapping of files.
+
+    Parameters
+    ----------
+    place : of the stream, as messages name it
+    described : its keys
+
+    Raises
+    ------
+    ConfigError
+        if a key is unknown or missing, or a unit does not suit its channel.
+    """
+    try:
+        stream = StreamMapping.model_validate(dict(described))
+    except ValidationError as error:
+        raise ConfigError(f"{place}: {first_fault(error)}") from error
+    _check_stream(place, stream)
+    return stream
 
 
 def _check_stream(place: str, stream: StreamMapping) -> None:

@@ -1,4 +1,4 @@
-"""Reader of any CSV files, whose layout a small YAML mapping describes.
+"""Reader of any tables (CSV, .mat, .xlsx), whose layout a small YAML mapping describes.
 
 ::
 
@@ -21,9 +21,20 @@
         channels:
           speed_left_mps: {column: vl, unit: km/h}
           speed_right_mps: {column: vr, unit: km/h, offset: -0.2}
+      gnss:
+        file: "{terrain}/gps {run}.xlsx"
+        sheet: fixes                   # the first by default
+        time: {column: t, unit: s, offset: 12.5}
+        position: {latitude: lat, longitude: lon, height: alt, unit: deg}
+      odometry:
+        file: "{terrain}/drive {run}.bag"
+        messages: {topic: /odom, kind: odometry}     # as in a mapping of topics; times are seconds since 1970
 
 A word in braces stands for any text without a slash, and the files of which all such words agree make one
-run; every stream has the same words.  Several streams may name one file.  The files lie under the data
+run; every stream has the same words.  Several streams may name one file, and the files of a run may be of
+different formats; ``offset`` brings their times onto one clock.  ``position`` becomes the channels
+``position_x_m``, ``position_y_m`` and, with a height, ``position_z_m``: east, north and up of the first fix, or
+of ``origin: [latitude, longitude, height]``.  The files lie under the data
 folder, and so does what links in it lead to.  The robot is a name, of the package or of the description that
 the user gives.  A cell becomes ``(scale * cell + offset)`` in the unit given, and then SI; the unit must suit
 the name of the channel (:data:`~terrain.logs.schema.UNIT_SCALES`).  Names are compared in Unicode's normal
@@ -36,6 +47,7 @@ import glob
 import re
 from collections import Counter
 from collections.abc import Callable
+from collections.abc import Mapping as Map
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
@@ -47,14 +59,19 @@ from terrain.errors import ConfigError, LogError
 from terrain.files.documents import read_yaml
 from terrain.files.names import check_name, has_control_characters, normal_name, shown
 from terrain.logs.borealtc import whole_run_label
-from terrain.logs.csv_table import TextLayout, data_row, read_columns
+from terrain.logs.csv_table import TextLayout
+from terrain.logs.geodesy import local_metres
 from terrain.logs.log_files import check_log_file, checked_names, short_name
 from terrain.logs.samples import checked_stream, refuse_apart
 from terrain.logs.schema import UNIT_OFFSETS, UNIT_SCALES, canonical_unit, unit_of
-from terrain.records import RunLog, Stream
+from terrain.logs.tables import read_table, table_row
+from terrain.records import Array, RunLog, Stream
 
 MAX_HEADER_ROWS = 1000
 """No instrument writes a longer head."""
+
+POSITION_CHANNELS = ("position_x_m", "position_y_m", "position_z_m")
+"""What latitude, longitude and height become: east, north and up."""
 
 _FIELD = re.compile(r"\{([^\W\d]\w*)\}")
 _SPLIT_AT_FIELDS = re.compile(r"(\{[^\W\d]\w*\})")
@@ -81,18 +98,37 @@ class Column(Strict):
 
 
 class TimeColumn(Strict):
-    """Where the time is."""
+    """Where the time is; ``offset`` is added, in the same unit."""
 
     column: Word
     unit: Unit
+    offset: FiniteFloat = 0.0
+
+
+class Position(Strict):
+    """Where latitude and longitude of a receiver are; ``unit`` is theirs, the height is in m."""
+
+    latitude: Word
+    longitude: Word
+    height: str = ""
+    unit: Literal["deg", "rad"] = "deg"
+    origin: Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)] | None = None
+
+    @property
+    def columns(self) -> list[str]:
+        """Names of its columns."""
+        return [self.latitude, self.longitude, *([self.height] if self.height else [])]
 
 
 class StreamMapping(Strict):
     """Where a stream is."""
 
     file: Word
-    time: TimeColumn
-    channels: Annotated[dict[str, Column], Field(min_length=1)]
+    time: TimeColumn | None = None
+    messages: dict[str, Any] | None = None
+    channels: Annotated[dict[str, Column], Field(default_factory=dict)]
+    position: Position | None = None
+    sheet: str = ""
     delimiter: Annotated[str, Field(min_length=1, max_length=1)] = ","
     decimal: Literal[".", ","] = "."
     skip_rows: Annotated[int, Field(ge=0, le=MAX_HEADER_ROWS)] = 0
@@ -126,8 +162,15 @@ class Found(NamedTuple):
     places: dict[str, str]
 
 
-def load_mapping(path: str | Path) -> Mapping:
+def load_mapping(
+    path: str | Path, check_messages: Callable[[str, Map[str, Any]], object] | None = None
+) -> Mapping:
     """Return the mapping that a YAML file describes.
+
+    Parameters
+    ----------
+    path : of the file
+    check_messages : gets the place of a stream of messages, as messages name it, and its description
 
     Raises
     ------
@@ -143,6 +186,21 @@ def load_mapping(path: str | Path) -> Mapping:
         raise ConfigError(f"{path.name}: {first_fault(error)}") from error
     check_name(f"{path.name}: robot", mapping.robot, ConfigError)
     for name, stream in mapping.streams.items():
+        if stream.messages is not None:
+            if stream.channels or stream.position or stream.time:
+                raise ConfigError(
+                    f"{path.name}: stream {name}: 'messages' leave out time, channels and position"
+                )
+            if check_messages is not None:
+                check_messages(f"{path.name}: stream {name}", stream.messages)
+            continue
+        if stream.time is None:
+            raise ConfigError(f"{path.name}: key 'streams.{name}.time' is missing")
+        if not stream.channels and stream.position is None:
+            raise ConfigError(f"{path.name}: stream {name}: has no channels and no position")
+        twice = set(stream.channels) & set(POSITION_CHANNELS)
+        if stream.position is not None and twice:
+            raise ConfigError(f"{path.name}: stream {name}: 'position' gives the channel {min(twice)} too")
         if stream.decimal == stream.delimiter:
             raise ConfigError(
                 f"{path.name}: stream {name}: delimiter and decimal are both {stream.decimal!r}; numbers "
@@ -153,8 +211,20 @@ def load_mapping(path: str | Path) -> Mapping:
     return mapping
 
 
-def find_runs(folder: Path, mapping: Mapping) -> list[Callable[..., RunLog]]:
+ReadMessages = Callable[[Path, str, Map[str, Any], "Counter[str] | None"], Stream]
+"""Reads a stream of messages: file, name of the stream, its description, and what counts repairs."""
+
+
+def find_runs(
+    folder: Path, mapping: Mapping, read_messages: ReadMessages | None = None
+) -> list[Callable[..., RunLog]]:
     """Return one reader per run that the mapping finds under ``folder``; call it with ``repair=``.
+
+    Parameters
+    ----------
+    folder : that the file patterns start from
+    mapping : as :func:`load_mapping` returns it
+    read_messages : reads streams whose files are bags
 
     Raises
     ------
@@ -172,7 +242,10 @@ def find_runs(folder: Path, mapping: Mapping) -> list[Callable[..., RunLog]]:
     if not found:
         patterns = ", ".join(stream.file for stream in mapping.streams.values())
         raise LogError(f"{folder}: no file there fits the mapping ({patterns})")
-    return [partial(read_run, folder, mapping, run) for _, run in sorted(found.items())]
+    return [
+        partial(read_run, folder, mapping, run, read_messages=read_messages)
+        for _, run in sorted(found.items())
+    ]
 
 
 def _glob_of(file: str) -> str:
@@ -183,7 +256,14 @@ def _glob_of(file: str) -> str:
     )
 
 
-def read_run(folder: Path, mapping: Mapping, found: Found, *, repair: bool = False) -> RunLog:
+def read_run(
+    folder: Path,
+    mapping: Mapping,
+    found: Found,
+    *,
+    repair: bool = False,
+    read_messages: ReadMessages | None = None,
+) -> RunLog:
     """Return the run whose files were found.
 
     Parameters
@@ -192,11 +272,14 @@ def read_run(folder: Path, mapping: Mapping, found: Found, *, repair: bool = Fal
     mapping : as :func:`load_mapping` returns it
     found : its words and files; a stream whose file was not found is missing there
     repair : drop and count what a strict read refuses
+    read_messages : reads streams whose files are bags
 
     Raises
     ------
     LogError
         if a file is missing, empty or broken, or the streams do not overlap in time.
+    ConfigError
+        if a package is missing, or nothing reads messages here.
     """
     words = found.words
     dropped: Counter[str] = Counter()
@@ -205,29 +288,12 @@ def read_run(folder: Path, mapping: Mapping, found: Found, *, repair: bool = Fal
     for name, stream in mapping.streams.items():
         path = check_log_file(folder / found.places.get(name, stream.file.format(**words)), folder)
         files.append(path.relative_to(folder).as_posix())
-        columns = list(stream.channels.values())
-        table = read_columns(
-            path,
-            [normal_name(name) for name in (stream.time.column, *(column.column for column in columns))],
-            layout=stream.layout,
-            repair=repair,
-            dropped=dropped,
-        )
-        scale, offset, factor, zero = np.array(
-            [(c.scale, c.offset, UNIT_SCALES[c.unit][1], UNIT_OFFSETS.get(c.unit, 0.0)) for c in columns]
-        ).T
-        with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is judged below
-            time_s = table[:, 0] * UNIT_SCALES[stream.time.unit][1]
-            values = (table[:, 1:] * scale + offset) * factor + zero
-        streams[name] = checked_stream(
-            short_name(path),
-            time_s,
-            values,
-            list(stream.channels),
-            row_of=partial(data_row, path, layout=stream.layout),
-            columns=[column.column for column in columns],
-            repairs=dropped if repair else None,
-        )
+        if stream.messages is None:
+            streams[name] = _read_stream(path, stream, dropped, repair=repair)
+        elif read_messages is None:
+            raise ConfigError(f"stream {name}: files of messages are not read here")
+        else:
+            streams[name] = read_messages(path, name, stream.messages, dropped if repair else None)
     run_id = (mapping.run_id or "_".join(f"{{{word}}}" for word in words)).format(**words)
     refuse_apart(run_id, streams)
     terrain = mapping.terrain.format(**words)
@@ -242,6 +308,63 @@ def read_run(folder: Path, mapping: Mapping, found: Found, *, repair: bool = Fal
             dropped=dropped,
         ),
     )
+
+
+def _read_stream(path: Path, stream: StreamMapping, dropped: Counter[str], *, repair: bool) -> Stream:
+    """Return the stream that a file holds."""
+    assert stream.time is not None
+    columns = list(stream.channels.values())
+    names = [column.column for column in columns]
+    placed = stream.position.columns if stream.position is not None else []
+    table = read_table(
+        path,
+        [normal_name(name) for name in (stream.time.column, *names, *placed)],
+        layout=stream.layout,
+        sheet=stream.sheet,
+        repair=repair,
+        dropped=dropped,
+    )
+    channels = list(stream.channels)
+    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is judged below
+        time_s = (table[:, 0] + stream.time.offset) * UNIT_SCALES[stream.time.unit][1]
+        values = np.empty((len(table), 0))
+        if columns:
+            scale, offset, factor, zero = np.array(
+                [(c.scale, c.offset, UNIT_SCALES[c.unit][1], UNIT_OFFSETS.get(c.unit, 0.0)) for c in columns]
+            ).T
+            values = (table[:, 1 : 1 + len(columns)] * scale + offset) * factor + zero
+    if stream.position is not None:
+        try:
+            metres = _local_metres(stream.position, table[:, 1 + len(columns) :])
+        except LogError as error:
+            raise LogError(f"{short_name(path)}: {error}") from error
+        channels += list(POSITION_CHANNELS[: metres.shape[1]])
+        names += [stream.position.longitude, stream.position.latitude, stream.position.height][
+            : metres.shape[1]
+        ]
+        values = np.column_stack([values, metres])
+    return checked_stream(
+        short_name(path),
+        time_s,
+        values,
+        channels,
+        row_of=partial(table_row, path, layout=stream.layout),
+        columns=names,
+        repairs=dropped if repair else None,
+    )
+
+
+def _local_metres(position: Position, values: Array) -> Array:
+    """Return east and north, and up where heights are known, of latitudes, longitudes and heights."""
+    to_rad = UNIT_SCALES[position.unit][1]
+    origin = position.origin
+    metres = local_metres(
+        values[:, 0] * to_rad,
+        values[:, 1] * to_rad,
+        values[:, 2] if position.height else None,
+        () if origin is None else (origin[0] * to_rad, origin[1] * to_rad, origin[2]),
+    )
+    return metres if position.height else metres[:, :2]
 
 
 def _pattern(file: str) -> re.Pattern[str]:
@@ -261,7 +384,8 @@ def _pattern(file: str) -> re.Pattern[str]:
 
 def _check_units(file: str, mapping: Mapping) -> None:
     for name, stream in mapping.streams.items():
-        check_unit(f"{file}: stream {name}: time", stream.time.unit, "s")
+        if stream.time is not None:
+            check_unit(f"{file}: stream {name}: time", stream.time.unit, "s")
         for channel, column in stream.channels.items():
             place = f"{file}: stream {name}: channel {channel}"
             try:

@@ -521,3 +521,27 @@ def test_what_is_no_bag_is_one_sentence(tmp_path):
     (tmp_path / "notes.mcap").rename(tmp_path / "notes.db3")
     with pytest.raises(LogError, match=r"begins with b'no bag'.*bags of ROS 1"):
         load_runs(tmp_path, robot="husky")
+
+
+def test_a_bag_is_joined_with_other_files_of_its_run(tmp_path):
+    """Stamps of a bag are seconds since 1970; the times of the other file are brought onto that clock."""
+    rows = husky_rows(60)
+    write_bag(tmp_path / "drive", rows, "mcap")
+    write_mcap(tmp_path / "1.mcap", rows)
+    begin_s = START_NS / 1e9
+    (tmp_path / "1.csv").write_text("t,amps\n" + "".join(f"{0.05 * i},{i}\n" for i in range(10)))
+    lines = f"""robot: husky
+streams:
+  imu: {{file: "{{n}}.mcap", messages: {{topic: /imu/data, kind: imu}}}}
+  power:
+    file: "{{n}}.csv"
+    time: {{column: t, unit: s, offset: {begin_s}}}
+    channels: {{current_left_a: {{column: amps, unit: A}}}}
+"""
+    (tmp_path / "join.yaml").write_text(lines)
+    (run,) = load_runs(tmp_path, mapping=tmp_path / "join.yaml")
+    assert (run.run_id, len(run.streams["imu"]), len(run.streams["power"])) == ("1", 60, 10)
+    assert run.streams["imu"].time_s[0] == pytest.approx(begin_s, abs=1e-6)
+    (tmp_path / "join.yaml").write_text(lines.replace("/imu/data", "/imu"))
+    with pytest.raises(LogError, match=r"stream imu: there is no topic '/imu' \(there are"):
+        load_runs(tmp_path, mapping=tmp_path / "join.yaml")
