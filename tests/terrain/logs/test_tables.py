@@ -151,7 +151,7 @@ def test_a_missing_package_is_one_sentence(tmp_path, monkeypatch, package):
 
 
 def test_latitude_and_longitude_become_metres_of_the_first_fix_or_an_origin(tmp_path):
-    """A way of known length: 111.13 km are a degree of latitude at 45 degrees, 78.85 km one of longitude."""
+    """Known lengths: 111.13 km are a degree of latitude at 45 degrees, 78.85 km one of longitude."""
     (tmp_path / "gps.csv").write_text(
         "t,lat,lon,alt\n0,,,\n0.2,45.0,7.0,200\n0.4,45.0001,7.0,201\n0.6,45.0,7.0001,202\n0.8,45,7,200\n"
     )
