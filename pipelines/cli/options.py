@@ -48,7 +48,7 @@ class OneFile(click.Command):
         )
         self.module, self.command = module, command
 
-    def _execute(self, json_file: Path | None, report_file: Path | None, details: bool, **given: Any) -> None:
+    def _execute(self, json_file: Path | None, report_file: Path | None, details: bool, **given: Any) -> Result:
         from pipelines.report.json_file import checked_json, write_json
         from pipelines.report.terminal import output_console, print_report, progress_bar
         from pipelines.report.writing import check_ending
@@ -68,6 +68,7 @@ class OneFile(click.Command):
         write_json(json_file, result)
         if report_file is not None:
             report.save(report_file)
+        return result
 
     def format_help(self, context: click.Context, formatter: click.HelpFormatter) -> None:
         """Write an example, what the command does, and its options by the class that declares them."""

@@ -5,11 +5,9 @@ from __future__ import annotations
 import typer
 
 from pipelines.cli import (
-    bench,
     classify,
     drive,
     estimate,
-    explain,
     faults,
     features,
     label,
@@ -32,10 +30,9 @@ app = typer.Typer(
 GROUPS = (
     *(estimate.app, features.app, classify.app, slip.app, soil.app, drive.app),
     *(replay.app, label.app),
-    *(faults.app, explain.app, quickstart.app, track.app),
+    *(faults.app, quickstart.app, track.app),
 )
 """Files of commands, in the order of help."""
 
 for group in GROUPS:
     app.add_typer(group)
-app.add_typer(bench.app, name="bench")

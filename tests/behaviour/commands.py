@@ -37,11 +37,10 @@ COMMANDS = (
         "faults",
         "can",
         "explain",
-        "explain-trials",
         "quickstart",
         "track",
     ),
-    *("replay", "label", "serve", "bench"),
+    *("replay", "label", "serve"),
 )
 
 
@@ -215,7 +214,7 @@ def _csv(head: str, rows: Iterable[Iterable[float]]) -> bytes:
 SLIPPING = "--robot agrimaro --terrain grass --scenario slip --runs 6"
 
 CASES: tuple[Case, ...] = (
-    Case("help", helps=("", *COMMANDS, "bench live", "bench soak")),
+    Case("help", helps=("", *COMMANDS)),
     Case(
         "reading",
         steps(
@@ -400,10 +399,6 @@ CASES: tuple[Case, ...] = (
         ),
     ),
     Case(
-        "explain_trials",
-        steps("explain-trials --n 2 --seed 3 --runs 4 --jobs 1"),
-    ),
-    Case(
         "testbed",
         steps(
             "convert bed --out trials",
@@ -446,7 +441,6 @@ CASES: tuple[Case, ...] = (
         ),
         lambda: {"path.csv": PATH_POINTS.encode(), "short.csv": b"x_m,y_m\n0,0\n1,0\n1,0\n"},
     ),
-    Case("bench", steps("bench live --robots 1 --seconds 2", refused("bench live --robots 0"))),
     Case(
         "can",
         steps(
@@ -482,7 +476,6 @@ CASES: tuple[Case, ...] = (
             refused("inspect nowhere"),
             refused("crossval --data nowhere --signals imu"),
             refused("drive --grade 50"),
-            refused("explain-trials --n 1 --rows nothing"),
         ),
     ),
 )

@@ -1,4 +1,4 @@
-"""The benchmarks measure what they say, and the soak finds what is not accepted."""
+"""The studies of the live service measure what they say, and the soak finds what is not accepted."""
 
 import asyncio
 import json
@@ -8,36 +8,36 @@ import msgpack
 import numpy as np
 import pytest
 
-from pipelines.bench.chain import paced_step_times_us, step_times_us, window_times_ms
-from pipelines.bench.drive import bench_drive, messages_of, model_folder, sent_channels
-from pipelines.bench.live import bench_live
-from pipelines.bench.process import ServiceProcess, service_process
-from pipelines.bench.results import Soak, spread
-from pipelines.bench.robots import packed
-from pipelines.bench.settings import BenchSettings, SoakSettings
-from pipelines.bench.soak import FAULTS, _judged, _Robot, _Seen, soak
-from pipelines.reporting.json_file import as_json
-from terrain.errors import TerrainError
-from terrain.logs.replay import replay
-from terrain.records import RunLog
-from terrain.robots import load_robot
+from studies import live, soak
+from studies.service import (
+    ROBOT,
+    ServiceProcess,
+    messages_of,
+    model_folder,
+    packed,
+    sent_channels,
+    service_process,
+    spread,
+    study_drive,
+)
 
-ROBOT = load_robot("agrimaro")
+from pipelines.learn.load import load_model
+from terrain.errors import TerrainError
+from terrain.robots import load_robot
 
 
 @pytest.fixture(scope="module")
 def run():
-    return bench_drive(3)
+    return study_drive(3)
 
 
 @pytest.fixture(scope="module")
 def uri(tmp_path_factory):
-    return model_folder(None, 3, tmp_path_factory.mktemp("bench") / "model")
+    return model_folder(None, 3, tmp_path_factory.mktemp("study") / "model")
 
 
 def test_the_spread_is_median_99th_percentile_and_largest():
-    found = spread(list(range(101)))
-    assert found == (50.0, 99.0, 100.0)
+    assert spread(list(range(101))) == (50.0, 99.0, 100.0)
     assert all(np.isnan(spread([])))
 
 
@@ -54,24 +54,12 @@ def test_messages_hold_every_sample_of_the_drive_once(run):
 
 
 @pytest.mark.slow
-def test_steps_and_windows_are_timed(run, swerve_model):
-    short = RunLog(run.run_id, run.robot, run.streams)
-    alone, beside = step_times_us(ROBOT, swerve_model, short, repeats=1)
+def test_steps_are_timed(run, uri):
+    robot, model = load_robot(ROBOT), load_model(uri)
+    alone, beside = live.step_times_us(robot, model, run, repeats=1)
     assert 5.0 < alone.median <= alone.p99 <= alone.largest < 1e6
     assert beside.median > 5.0
-    assert paced_step_times_us(ROBOT, swerve_model, short, 0.5).median > 5.0
-    assert len(list(replay(short))) > 1000
-
-
-def test_a_window_is_timed_alone(swerve_model, monkeypatch):
-    from features.windows import cut_windows
-    from terrain.estimation.enriched import enriched
-    from terrain.estimation.estimate import estimate_run
-
-    monkeypatch.setattr("pipelines.bench.chain.N_WINDOWS", 40)
-    run = enriched(estimate_run(bench_drive(4), ROBOT, "vio15"))
-    windows = cut_windows([run], swerve_model.rule, layout=swerve_model.layout).windows
-    assert 0.05 < window_times_ms(windows, swerve_model).median < 1000.0
+    assert live.paced_step_times_us(robot, model, run, 0.5).median > 5.0
 
 
 @pytest.mark.slow
@@ -81,35 +69,27 @@ def test_a_service_that_does_not_start_is_named():
 
 
 @pytest.mark.slow
-def test_the_live_benchmark_has_all_its_figures(uri):
-    settings = BenchSettings(model=uri, robots=3, seconds=3.0, seed=3)
-    document = as_json(bench_live(settings))
+def test_the_live_study_has_all_its_figures(uri):
+    result = live.run(live.Settings(model=uri, robots=3, seconds=3.0, seed=3))
+    document = result.as_json()
     json.dumps(document, allow_nan=False)
     for name in ("step_us", "window_ms", "websocket_ms"):
         assert 0.0 < document[name]["median"] <= document[name]["p99"]
-    assert document["sessions"] == 3
-    assert document["lost_samples"] == 0
+    assert (document["sessions"], document["lost_samples"]) == (3, 0)
     assert [row["sessions"] for row in document["by_sessions"]] == [2, 3, 5]
     assert 0.5 < document["start_s"] < 60.0
     assert 50.0 < document["rss_mb"] < 1000.0
+    assert "3 robots" in result.report.answer
 
 
 @pytest.mark.slow
 def test_a_soak_of_half_a_minute_with_every_fault_is_accepted(uri, monkeypatch):
-    monkeypatch.setattr("pipelines.bench.soak.FAULTS_PER_MINUTE", 120.0)
-    found = soak(SoakSettings(model=uri, robots=4, minutes=0.5, seed=5))
+    monkeypatch.setattr(soak, "FAULTS_PER_MINUTE", 120.0)
+    found = soak.run(soak.Settings(model=uri, robots=4, minutes=0.5, seed=5))
     assert found.problems == ()
     assert found.steps > 500
     assert sum(found.faults.values()) >= 20
-    assert set(found.faults) <= set(FAULTS)
-
-
-def seen(**changed):
-    found = _Seen()
-    found.steps, found.rss_mb = 100, [300.0] * 6
-    for name, value in changed.items():
-        setattr(found, name, value)
-    return found
+    assert set(found.faults) <= set(soak.FAULTS)
 
 
 @pytest.mark.parametrize(
@@ -127,18 +107,26 @@ def seen(**changed):
     ],
 )
 def test_what_is_not_accepted_is_named(changed, problem):
-    judged = _judged(SoakSettings(), seen(**changed))
-    assert isinstance(judged, Soak)
+    seen = soak._Seen()
+    seen.steps, seen.rss_mb = 100, [300.0] * 6
+    for name, value in changed.items():
+        setattr(seen, name, value)
+    judged = soak.judged(soak.Settings(), seen)
     assert list(judged.problems) == ([problem] if problem else [])
+    assert judged.refused == problem
+    assert problem in judged.report.answer
+
+
+COMMAND = {"wheel_radps": [0.0], "steer_rad": [0.0], "twist": [0.0], "valid_s": 1.0}
 
 
 @pytest.mark.parametrize(("end_s", "n"), [(2005.0, 0), (5.0, 1), (3005.0, 1)])
 def test_a_window_by_another_robots_clock_is_one_of_another_robot(end_s, n):
     message = {"streams": {"imu": [[0.01], [[0.0]]]}, "time_s": 0.01}
-    robot = _Robot(2, {"imu": ["gyro_z_radps"]}, [message, {**message, "time_s": 40.0}], _Seen(), 0)
+    messages = [message, {**message, "time_s": 40.0}]
+    robot = soak._Robot(2, {"imu": ["gyro_z_radps"]}, messages, soak._Seen(), 0)
     assert [one.time_s for one in robot._messages] == pytest.approx([0.0, 39.99])
-    command = {"wheel_radps": [0.0], "steer_rad": [0.0], "twist": [0.0], "valid_s": 1.0}
-    answer = {"command": command, "observation": {"window": {"start_s": end_s - 2.0, "end_s": end_s}}}
+    answer = {"command": COMMAND, "observation": {"window": {"start_s": end_s - 2.0, "end_s": end_s}}}
     robot._judge(answer, time.monotonic())
     assert (robot._seen.steps, robot._seen.wrong_session) == (1, n)
 
@@ -153,9 +141,9 @@ def test_a_window_by_another_robots_clock_is_one_of_another_robot(end_s, n):
     ],
 )
 def test_an_answer_is_that_of_its_request(monkeypatch, answers, steps, unanswered):
-    monkeypatch.setattr("pipelines.bench.soak.ANSWER_S", 0.05)
-    monkeypatch.setattr("pipelines.bench.soak.DROPPED_S", 0.05)
-    command = {"wheel_radps": [0.0], "steer_rad": [0.0], "twist": [0.0], "valid_s": 1.0}
+    monkeypatch.setattr(soak, "ANSWER_S", 0.05)
+    monkeypatch.setattr(soak, "DROPPED_S", 0.05)
+    answers = list(answers)
 
     class Socket:
         async def recv(self):
@@ -164,12 +152,11 @@ def test_an_answer_is_that_of_its_request(monkeypatch, answers, steps, unanswere
             what = answers.pop(0)
             if what == "too-fast":
                 return msgpack.packb({"type": "error", "code": what, "fatal": False})
-            step = {"type": "step", "time_s": float(what[-1]), "command": command}
+            step = {"type": "step", "time_s": float(what[-1]), "command": COMMAND}
             return msgpack.packb({**step, "observation": {"window": None}})
 
-    answers = list(answers)
     message = {"streams": {"imu": [[0.0], [[0.0]]]}, "time_s": 0.0}
-    robot = _Robot(0, {"imu": ["gyro_z_radps"]}, [message], _Seen(), 0)
+    robot = soak._Robot(0, {"imu": ["gyro_z_radps"]}, [message], soak._Seen(), 0)
     asyncio.run(robot._answer(Socket(), 2.0, time.monotonic()))
     assert (robot._seen.steps, robot._seen.unanswered) == (steps, unanswered)
 

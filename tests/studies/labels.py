@@ -8,6 +8,7 @@ self-training, pool runs that the model is certain of are labelled by it, and it
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,22 +17,34 @@ from sklearn.base import clone
 
 from features.motion import Motion, window_motion
 from pipelines.data.datasets import load_runs
+from pipelines.learn.settings import LearnSettings
 from pipelines.learn.evaluate import Examples
 from pipelines.learn.parallel import parallel
-from pipelines.learn.protocols import PROTOCOLS, Fold, folds_of, samples_of
+from pipelines.learn.protocols import Fold, folds_of, samples_of
 from pipelines.learn.recipes import feature_matrix, recipe_of
-from pipelines.learn.settings import LearnSettings
 from pipelines.propose.proposals import ACCEPTED, Proposal, questions
-from pipelines.reporting.progress import Progress, silent
+from pipelines.report import Column, Progress, Report, Result, Table, described, silent
+from pipelines.report.settings import Settings as BaseSettings
+from pipelines.report.settings import setting
 from terrain.classify.paired import Difference, Outcome, compare_outcomes
 from terrain.classify.support import learn_support, support_of
 from terrain.errors import DataError
 from terrain.records import Array
 
+EXAMPLE = "python tests/studies labels --data runs --repeats 5"
 STRATEGIES = ("first run of each terrain", "random", "doubt", "random, self-trained", "doubt, self-trained")
 
 
-class StudyRow(NamedTuple):
+class Settings(BaseSettings):
+    """On which runs label strategies are compared."""
+
+    data: Path = setting(..., "Folder of labelled runs, more than two of each terrain.")
+    repeats: int = setting(5, "Fold assignments.", ge=1)
+    seed: int = setting(0, "Deals runs into folds, and draws the first labels.", ge=0)
+    n_jobs: int = setting(0, "Processes at once; 0 for one a core.", "--jobs", ge=0)
+
+
+class Strategy(NamedTuple):
     """Accuracy on held-out runs with the labels of a strategy; ``n_labelled`` runs have one on average."""
 
     name: str
@@ -39,13 +52,14 @@ class StudyRow(NamedTuple):
     accuracy: float
 
 
-class LabelStudy(NamedTuple):
+@dataclass(frozen=True)
+class LabelStudy(Result):
     """The strategies side by side, and their differences paired by run."""
 
-    dataset: str
-    repeats: int
-    rows: tuple[StudyRow, ...]
-    differences: Mapping[str, Difference]
+    dataset: str = described("folder of the runs")
+    repeats: int = described("fold assignments")
+    rows: tuple[Strategy, ...] = described("accuracy on held-out runs by strategy")
+    differences: Mapping[str, Difference] = described("of two strategies, paired by run")
 
 
 class _FoldLabels(NamedTuple):
@@ -55,34 +69,29 @@ class _FoldLabels(NamedTuple):
     n_labelled: tuple[int, ...]
 
 
-def label_study(data: Path, settings: LearnSettings, progress: Progress = silent) -> LabelStudy:
+def run(settings: Settings, progress: Progress = silent) -> LabelStudy:
     """Compare strategies on a folder of labelled runs.
-
-    Parameters
-    ----------
-    data : folder of labelled runs, more than two of each terrain
-    settings : recipe, windows, seed and repeats
-    progress : called as folds are done
 
     Raises
     ------
     DataError
         if a terrain has too few runs.
     """
-    samples = samples_of(load_runs(data), settings)
+    data, repeats = settings.data, settings.repeats
+    evaluation = LearnSettings(repeats=repeats, seed=settings.seed, n_jobs=settings.n_jobs)
+    samples = samples_of(load_runs(data), evaluation)
     windows = samples.windows
-    recipe = recipe_of(settings)
+    recipe = recipe_of(evaluation)
     examples = Examples(feature_matrix(recipe, windows), samples.terrain, samples.group)
     motion = window_motion(windows)
-    n_repeats = settings.repeats or PROTOCOLS["grouped"].repeats
-    folds = folds_of(samples, "grouped", n_repeats, settings.seed)
+    folds = folds_of(samples, "grouped", repeats, settings.seed)
     classes = np.unique(examples.terrain)
-    probability = np.full((len(STRATEGIES), n_repeats, len(windows), len(classes)), np.nan)
+    probability = np.full((len(STRATEGIES), repeats, len(windows), len(classes)), np.nan)
     counts = []
     progress("labels", 0, len(folds))
     each = ((fold, settings.seed + number) for number, fold in enumerate(folds))
     shared = (recipe[-1], examples, motion)
-    for fold, found in zip(folds, parallel(_fold_labels, shared, each, settings.jobs), strict=True):
+    for fold, found in zip(folds, parallel(_fold_labels, shared, each, evaluation.jobs), strict=True):
         probability[:, fold.repeat, fold.test] = found.probability
         counts.append(found.n_labelled)
         progress("labels", len(counts), len(folds))
@@ -103,9 +112,9 @@ def label_study(data: Path, settings: LearnSettings, progress: Progress = silent
     rng = np.random.default_rng(settings.seed)
     return LabelStudy(
         data.resolve().name,
-        n_repeats,
+        repeats,
         tuple(
-            StudyRow(name, float(np.mean([c[i] for c in counts])), float(outcomes[i].correct.mean()))
+            Strategy(name, float(np.mean([c[i] for c in counts])), float(outcomes[i].correct.mean()))
             for i, name in enumerate(STRATEGIES)
         ),
         {name: compare_outcomes(outcomes[a], outcomes[b], rng).accuracy for name, (a, b) in pairs.items()},
@@ -177,3 +186,24 @@ def _proposal(
         supported = float(support_of(probability, near).supported.mean())
     confidence = float(probability[:, best].mean())
     return Proposal(run, 0.0, float(len(of)), str(fitted.classes_[best]), confidence, supported, 0.0, len(of))
+
+
+def report(result: LabelStudy) -> Report:
+    """Return accuracy by the answers that a model was given, and the differences."""
+    rows = tuple(row._asdict().values() for row in result.rows)
+    differences = tuple(
+        (name, 100 * row.difference, (100 * row.interval[0], 100 * row.interval[1]), row.verdict.value)
+        for name, row in result.differences.items()
+    )
+    chosen = result.differences["doubt against random"]
+    return Report(
+        f"Labels of {result.dataset}",
+        f"Questions chosen by doubt change the accuracy by {100 * chosen.difference:+.1f} points against as many drawn "
+        f"at random ({100 * chosen.interval[0]:+.1f} to {100 * chosen.interval[1]:+.1f}), {chosen.verdict.value}.",
+        parts=(
+            Table(
+                ("labels", Column("runs labelled", ".1f"), Column("accuracy", ".1%")), tuple(map(tuple, rows))
+            ),
+            Table(("difference", Column("points", "+.1f"), Column("95 %", "+.1f"), "verdict"), differences),
+        ),
+    )

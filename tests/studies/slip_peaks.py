@@ -1,10 +1,8 @@
-"""Coverage of the interval of a learned peak and error of the peak, over many simulated terrains.
+"""Coverage of the interval of a learned slip peak and error of the peak, over many simulated terrains.
 
 A case is one terrain with the runs of :data:`terrain.simulation.slip_sweep.LEARNING_DRIVES`.  The truth is
 the peak of the described soil's own net traction under a third of the robot's weight, by the same definition
 over the slips that the case observes.
-
-    python -m pipelines.slip.study --cases 100 --seed 0
 """
 
 from __future__ import annotations
@@ -12,14 +10,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
-from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-import typer
 from scipy.special import betaincinv
 
-from pipelines.reporting.progress import Progress, silent
+from pipelines.report import Column, Progress, Report, Result, Table, described, interval, silent
+from pipelines.report.settings import Settings as BaseSettings
+from pipelines.report.settings import setting
 from terrain.constants import GRAVITY_MPS2
 from terrain.records import TargetStatus
 from terrain.robots import Robot, load_robot
@@ -30,8 +28,17 @@ from terrain.slip_learning.peak import Peak, PeakStatus, net_peak
 from terrain.terramechanics.soil import load_soil, soil_names
 from terrain.terramechanics.traction import net_pull
 
+EXAMPLE = "python tests/studies slip-peaks --cases 100 --seed 0"
 WELL_COVERED_SLIP = 0.5
 """Slips observed up to here and beyond cover a curve well: the peaks of hard terrain are at 0.2 to 0.35."""
+
+
+class Settings(BaseSettings):
+    """Which terrains are simulated and learned."""
+
+    cases: int = setting(100, "Terrains that are learned, the soils in turn.", ge=1)
+    seed: int = setting(0, "Of the first case.", ge=0)
+    robot: str = setting("agrimaro", "Swerve robot.")
 
 
 class Case(NamedTuple):
@@ -82,27 +89,23 @@ class Coverage(NamedTuple):
     well_covered: int
     status_right: int
 
-    def as_json(self) -> dict[str, Any]:
-        """Return the fields; a ratio within 0.03 by that name."""
-        return {name.replace("within_003", "within_0.03"): value for name, value in self._asdict().items()}
 
+@dataclass(frozen=True)
+class PeaksResult(Result):
+    """Coverage over all learned cases and by terrain."""
 
-@dataclass(frozen=True, slots=True)
-class StudyResult:
-    """Coverage over all learned cases and by terrain; the keys of ``--json``, those of ``all`` at the top."""
-
-    n_cases: int
-    n_learned: int
-    all: Coverage
-    terrains: Mapping[str, Coverage]
-    cases: tuple[Case, ...]
+    n_cases: int = described("cases simulated")
+    n_learned: int = described("of them with learned targets")
+    all: Coverage = described("coverage and error over all learned cases")
+    terrains: Mapping[str, Coverage] = described("the same by terrain")
+    cases: tuple[Case, ...] = described("every learned case")
 
     def as_json(self) -> dict[str, Any]:
         """Return the fields, with those of ``all`` in its place."""
         document: dict[str, Any] = {}
         for each in fields(self):
             value = getattr(self, each.name)
-            document |= value.as_json() if isinstance(value, Coverage) else {each.name: value}
+            document |= value._asdict() if isinstance(value, Coverage) else {each.name: value}
         return document
 
 
@@ -128,40 +131,18 @@ def run_case(
     n_bootstrap: int = N_BOOTSTRAP,
 ) -> Case | None:
     """Simulate and learn one terrain; None where its targets are not learned."""
-    measured = [
-        each for run in learning_runs(robot, terrain, seed, drives) for each in terrain_runs(run, robot)
-    ]
-    learned = learn_terrain(terrain, measured, seed, n_bootstrap)
+    runs = learning_runs(robot, terrain, seed, drives)
+    learned = learn_terrain(
+        terrain, [each for run in runs for each in terrain_runs(run, robot)], seed, n_bootstrap
+    )
     curve = learned.curve
     if curve is None or learned.status is not TargetStatus.ESTIMATED:
         return None
     true = true_peak(robot, terrain, curve.slip_range)
     return Case(
-        terrain=terrain,
-        seed=seed,
-        law=curve.law,
-        peak_slip=curve.peak.slip_ratio,
-        interval=curve.peak_interval,
-        peak_status=curve.peak.status,
-        slip_range=curve.slip_range,
-        true_slip=true.slip_ratio,
-        true_status=true.status,
+        *(terrain, seed, curve.law, curve.peak.slip_ratio, curve.peak_interval, curve.peak.status),
+        *(curve.slip_range, true.slip_ratio, true.status),
     )
-
-
-def study(
-    robot: Robot,
-    seeds: Sequence[int],
-    terrains: Sequence[str] = soil_names(),
-    n_bootstrap: int = N_BOOTSTRAP,
-    progress: Progress = silent,
-) -> list[Case | None]:
-    """Return a case a seed, over the terrains in turn."""
-    cases = []
-    for done, seed in enumerate(seeds, start=1):
-        cases.append(run_case(robot, terrains[seed % len(terrains)], seed, n_bootstrap=n_bootstrap))
-        progress("cases", done, len(seeds))
-    return cases
 
 
 def clopper_pearson(hits: int, n: int, level: float = 0.95) -> tuple[float, float]:
@@ -179,19 +160,12 @@ def clopper_pearson(hits: int, n: int, level: float = 0.95) -> tuple[float, floa
     return low, high
 
 
-def summary(cases: Sequence[Case | None]) -> StudyResult:
+def summary(cases: Sequence[Case | None]) -> PeaksResult:
     """Return coverage and error, of all and by terrain; cases that were not learned are counted apart."""
     learned = [case for case in cases if case is not None]
-    return StudyResult(
-        n_cases=len(cases),
-        n_learned=len(learned),
-        all=_coverage(learned),
-        terrains={
-            terrain: _coverage([case for case in learned if case.terrain == terrain])
-            for terrain in sorted({case.terrain for case in learned})
-        },
-        cases=tuple(learned),
-    )
+    names = sorted({case.terrain for case in learned})
+    by_terrain = {name: _coverage([case for case in learned if case.terrain == name]) for name in names}
+    return PeaksResult(len(cases), len(learned), _coverage(learned), by_terrain, tuple(learned))
 
 
 def _coverage(cases: Sequence[Case]) -> Coverage:
@@ -213,30 +187,34 @@ def _coverage(cases: Sequence[Case]) -> Coverage:
     )
 
 
-def main(
-    cases: Annotated[int, typer.Option(min=1)] = 100,
-    seed: Annotated[int, typer.Option(min=0, help="Of the first case.")] = 0,
-    robot: str = "agrimaro",
-    json_file: Annotated[Path | None, typer.Option("--json")] = None,
-) -> None:
-    """Print coverage of the peak's interval over seeded cases."""
-    from pipelines.reporting.json_file import write_json
-    from pipelines.reporting.terminal import progress_bar
-
-    with progress_bar() as progress:
-        result = summary(study(load_robot(robot), range(seed, seed + cases), progress=progress))
-    for name, row in [("all", result.all), *result.terrains.items()]:
-        low, high = row.coverage_ci or (math.nan, math.nan)
-        typer.echo(
-            f"{name:18s} n {row.n:3d}  coverage {row.coverage:.3f} ({low:.3f} to {high:.3f})  "
-            f"error mean {row.error_mean:+.4f} median {row.error_median_abs:.4f} "
-            f"max {row.error_max_abs:.4f}  within 0.03 {row.within_003:.2f}  "
-            f"width {row.width_median:.3f}  well covered {row.well_covered}  "
-            f"status right {row.status_right}"
-        )
-    typer.echo(f"not learned: {result.n_cases - result.n_learned} of {result.n_cases}")
-    write_json(json_file, result)
+def run(settings: Settings, progress: Progress = silent) -> PeaksResult:
+    """Learn a case a seed, over the terrains in turn."""
+    robot, terrains, cases = load_robot(settings.robot), soil_names(), []
+    for done in range(settings.cases):
+        seed = settings.seed + done
+        cases.append(run_case(robot, terrains[seed % len(terrains)], seed))
+        progress("cases", done + 1, settings.cases)
+    return summary(cases)
 
 
-if __name__ == "__main__":
-    typer.run(main)
+def report(result: PeaksResult) -> Report:
+    """Return coverage and errors, of all and by terrain."""
+    columns = (
+        *("terrain", "cases", Column("coverage", ".3f"), Column("95 %", ".3f"), Column("mean error", "+.4f")),
+        *(
+            Column("median", ".4f"),
+            Column("largest", ".4f"),
+            Column("within 0.03", ".2f"),
+            Column("width", ".3f"),
+        ),
+        *("well covered", "status right"),
+    )
+    rows = tuple((name, *row) for name, row in (("all", result.all), *result.terrains.items()))
+    low, high = result.all.coverage_ci or (math.nan, math.nan)
+    return Report(
+        "Interval of a learned slip peak",
+        f"{result.all.coverage * result.all.n:.0f} of {result.n_learned} true peaks lie in the interval of the learned "
+        f"one ({interval(low, high, '.3f')}); {result.n_cases - result.n_learned} of {result.n_cases} were "
+        "not learned.",
+        parts=(Table(columns, rows),),
+    )

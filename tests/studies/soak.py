@@ -1,4 +1,4 @@
-"""``terrain bench soak``: the service for minutes or hours under robots that misbehave at random."""
+"""The service for minutes or hours under robots that misbehave at random."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ import math
 import urllib.error
 import urllib.request
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import monotonic
@@ -19,13 +20,21 @@ import numpy as np
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, InvalidHandshake
 
-from pipelines.bench.drive import ROBOT, bench_drive, messages_of, model_folder, sent_channels
-from pipelines.bench.process import ServiceProcess
-from pipelines.bench.results import Soak
-from pipelines.bench.robots import hello, packed
-from pipelines.bench.settings import SoakSettings
-from pipelines.reporting.progress import Progress, silent
+from pipelines.report import Progress, Report, Result, Table, Text, described, silent
+from pipelines.report.settings import Settings as BaseSettings
+from pipelines.report.settings import setting
+from studies.service import (
+    ROBOT,
+    ServiceProcess,
+    hello,
+    messages_of,
+    model_folder,
+    packed,
+    sent_channels,
+    study_drive,
+)
 
+EXAMPLE = "python tests/studies soak --robots 8 --minutes 30"
 ANSWER_S, DROPPED_S = 5.0, 1.0
 """For an answer; for that of a request that was dropped, if it was not."""
 
@@ -49,6 +58,42 @@ FAULTS_PER_MINUTE = 20.0
 
 CLOCKS_APART_S = 1000.0
 """Each robot has a clock of its own: a window by another's clock is one of another robot."""
+
+
+class Settings(BaseSettings):
+    """How long the service is loaded, and with what."""
+
+    model: str | None = setting(
+        None, "Model of AgriMaRo, as of train; by default one trained on four short simulated runs."
+    )
+    robots: int = setting(8, "Robots at once.", ge=1, le=100)
+    minutes: float = setting(30.0, "Length of the soak.", gt=0.0, le=6000.0)
+    seed: int = setting(0, "Of the faults and the drives.", ge=0)
+    out: Path | None = setting(None, "Folder of the service's states; a temporary one by default.")
+
+
+@dataclass(frozen=True)
+class Soak(Result):
+    """What the service did under load and faults."""
+
+    minutes: float = described("as asked for", "min")
+    seed: int = described("of the faults and the drives")
+    steps: int = described("answers that robots got")
+    not_finite: int = described("commands that are not finite; none is accepted")
+    stale: int = described("commands that were no longer valid when they came; none is accepted")
+    wrong_session: int = described("answers with a window of another robot; none is accepted")
+    unanswered: int = described("steps that were asked for on a sound connection and did not come in time")
+    crashes: int = described("how often the process ended")
+    faults: Mapping[str, int] = described("by kind, how often it was made")
+    errors: Mapping[str, int] = described("by code, how often the service named one")
+    rss_mb: tuple[float, ...] = described("resident memory once a minute, from the first", "MB")
+    memory_growth: float = described("of the mean of the last third over the first", "1")
+    problems: tuple[str, ...] = described("what is not accepted, in sentences")
+
+    @property
+    def refused(self) -> str:
+        """What is not accepted; the study ends with exit code 1 where it is not empty."""
+        return "; ".join(self.problems)
 
 
 class _Seen:
@@ -83,7 +128,7 @@ class _Robot:
         seed: int,
     ) -> None:
         ahead_s = CLOCKS_APART_S * number
-        self._first = hello(f"soak-{number}", ROBOT, channels)
+        self._first = hello(f"soak-{number}", channels)
         self._messages = packed([_later(content, ahead_s) for content in messages])
         self._begin_s = ahead_s + messages[0]["time_s"]
         self._seen, self._rng = seen, np.random.default_rng([seed, number])
@@ -209,7 +254,7 @@ async def _run(
     service: ServiceProcess,
     robots: list[_Robot],
     uri: str,
-    settings: SoakSettings,
+    settings: Settings,
     seen: _Seen,
     progress: Progress,
 ) -> None:
@@ -259,21 +304,16 @@ def _swap(service: ServiceProcess, uri: str, seen: _Seen) -> None:
         seen.problems.append(f"the service does not answer: {error}")
 
 
-def soak(settings: SoakSettings, progress: Progress = silent) -> Soak:
+def run(settings: Settings, progress: Progress = silent) -> Soak:
     """Load a service of its own process with robots and faults, and judge what it did.
-
-    Parameters
-    ----------
-    settings : how long, how many, and the seed of the faults
-    progress : in seconds
 
     Raises
     ------
     TerrainError
         if the model cannot be loaded, or the service does not start.
     """
-    run, seen = bench_drive(settings.seed), _Seen()
-    channels, messages = sent_channels(run), list(messages_of(run))
+    log, seen = study_drive(settings.seed), _Seen()
+    channels, messages = sent_channels(log), list(messages_of(log))
     with TemporaryDirectory() as folder:
         uri = model_folder(settings.model, settings.seed, Path(folder) / "model")
         states = Path(folder) / "states" if settings.out is None else settings.out
@@ -289,10 +329,11 @@ def soak(settings: SoakSettings, progress: Progress = silent) -> Soak:
     if code != 0 and not seen.crashes:
         seen.crashes += 1
         seen.problems.append(f"the service ended with code {code}")
-    return _judged(settings, seen)
+    return judged(settings, seen)
 
 
-def _judged(settings: SoakSettings, seen: _Seen) -> Soak:
+def judged(settings: Settings, seen: _Seen) -> Soak:
+    """Return what was seen, and what of it is not accepted."""
     third = max(len(seen.rss_mb) // 3, 1)
     growth = float(np.mean(seen.rss_mb[-third:]) / np.mean(seen.rss_mb[:third]) - 1.0)
     counts = {
@@ -320,4 +361,22 @@ def _judged(settings: SoakSettings, seen: _Seen) -> Soak:
         rss_mb=tuple(seen.rss_mb),
         memory_growth=growth,
         problems=tuple(problems),
+    )
+
+
+def report(result: Soak) -> Report:
+    """Return what the service did, and what is not accepted of it."""
+    answer = f"Not accepted: {result.refused}." if result.problems else "Nothing that is not accepted."
+    return Report(
+        f"A soak of {result.minutes:g} minutes, seed {result.seed}",
+        answer,
+        parts=(
+            Text(
+                f"{result.steps} steps: {result.not_finite} not finite, {result.stale} stale, {result.wrong_session} "
+                f"of another robot, {result.unanswered} unanswered; {result.crashes} crashes. Memory "
+                f"{result.rss_mb[0]:.0f} MB at first, {result.rss_mb[-1]:.0f} MB at last: {result.memory_growth:+.1%} "
+                "from the first third to the last."
+            ),
+            Table(("fault", "made"), tuple(sorted(result.faults.items()))),
+        ),
     )

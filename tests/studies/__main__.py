@@ -1,0 +1,65 @@
+"""``python tests/studies NAME [options]``: what is measured beside the package, one study a name."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+TESTS = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(TESTS), str(TESTS.parent)]
+
+import click  # noqa: E402
+
+from pipelines.cli.options import click_command  # noqa: E402
+from pipelines.cli.table import Command  # noqa: E402
+from terrain.errors import TerrainError  # noqa: E402
+
+STUDIES: dict[str, tuple[str, str]] = {
+    "consistency": ("studies.consistency", "NEES and coverage of slip by terrain, over simulated runs"),
+    "long-drives": (
+        "studies.long_drives",
+        "yaw of a filter on long drives, and after the loss of the camera",
+    ),
+    "slip-peaks": (
+        "studies.slip_peaks",
+        "coverage of the interval of a learned slip peak, over simulated terrains",
+    ),
+    "labels": ("studies.labels", "what chosen questions and self-training gain, from few labels"),
+    "trials": (
+        "studies.trials",
+        "hide effects in simulated runs, diagnose them blindly, count what is right",
+    ),
+    "live": ("studies.live", "latency of the live chain by stage, and of the service with many robots"),
+    "soak": ("studies.soak", "the service for minutes or hours under robots that misbehave at random"),
+    "scale": ("studies.scale", "features of ever more runs with ever more processes: time and memory"),
+    "figures": ("studies.figures", "the tables of measured figures, from their records"),
+    "mutants": ("studies.mutants", "faults put in on purpose: whether the tests notice them"),
+}
+"""By name: module, and a line of help.  A module has ``EXAMPLE``, ``Settings``, ``run`` and ``report``."""
+
+
+def main(words: list[str]) -> int:
+    """Run a study; list them without a name.  Exit code 2 for a mistake, 1 where something is not accepted."""
+    if not words or words[0] in ("-h", "--help"):
+        print("python tests/studies NAME [options]\n")
+        for name, (_, text) in STUDIES.items():
+            print(f"  {name:<13}{text}")
+        return 0
+    try:
+        if words[0] not in STUDIES:
+            raise click.UsageError(f"there is no study {words[0]!r}; there are {', '.join(STUDIES)}")
+        command = click_command(Command("", words[0], *STUDIES[words[0]]))
+        prog_name = f"python tests/studies {words[0]}"
+        result: Any = command.main(words[1:], prog_name=prog_name, standalone_mode=False)
+    except click.exceptions.Exit as stop:
+        return stop.exit_code
+    except (TerrainError, click.ClickException) as error:
+        text = error.format_message() if isinstance(error, click.ClickException) else str(error)
+        print(f"error: {text}", file=sys.stderr)
+        return 2
+    return int(bool(getattr(result, "refused", "")))
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,129 @@
+"""The tables of measured figures: docs/measured.md, and the short one of README, from docs/measured/*.json.
+
+Each file holds a table: a title, texts before and after, and one record a row with what was measured, by which
+command, when, and at which commit.  A record with ``readme`` is a row of README too, under those words; the
+table there stands between ``<!-- measured -->`` and ``<!-- end of measured -->``.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pipelines.report import Progress, Report, Result, Table, described, silent
+from pipelines.report.settings import Settings as BaseSettings
+from pipelines.report.settings import setting
+from terrain.errors import DataError
+from terrain.files.atomic import atomic_write
+
+EXAMPLE = "python tests/studies figures"
+ROOT = Path(__file__).resolve().parents[2]
+BEGIN, END = "<!-- measured -->", "<!-- end of measured -->"
+KEYS = {"figure", "measured", "command", "date", "commit"}
+HEAD = (
+    "# Measured\n\nMade by `python tests/studies figures` from the records in docs/measured; do not edit. The date "
+    "is that of the measurement. In brackets are 95 % intervals unless stated.\n"
+)
+
+
+class Settings(BaseSettings):
+    """Where the records are, and the repository whose pages are written."""
+
+    records: Path = setting(ROOT / "docs" / "measured", "Folder of the records.")
+    root: Path = setting(ROOT, "Folder with docs/ and README.md.")
+
+
+@dataclass(frozen=True)
+class Figures(Result):
+    """What was written."""
+
+    files: tuple[Path, ...] = described("pages that were written")
+    tables: Mapping[str, int] = described("number of records by table")
+
+
+def read_tables(folder: Path) -> list[dict[str, Any]]:
+    """Return the tables in order of their files.
+
+    Raises
+    ------
+    DataError
+        if a record lacks a key, or a value of a column.
+    """
+    tables = []
+    for file in sorted(folder.glob("*.json")):
+        table = json.loads(file.read_text(encoding="utf-8"))
+        for record in table["records"]:
+            missing = KEYS - set(record) or set(table["columns"]) - set(record.get("measured", ()))
+            if missing:
+                raise DataError(
+                    f"{file}: record {record.get('figure')!r} has no {', '.join(sorted(missing))}"
+                )
+        tables.append(table)
+    return tables
+
+
+def page_text(tables: Sequence[Mapping[str, Any]]) -> str:
+    """Return docs/measured.md."""
+    return HEAD + "".join(_section(table) for table in tables)
+
+
+def _section(table: Mapping[str, Any]) -> str:
+    commands = ["command"] if table["shows_command"] else []
+    head = [table["heading"], *table["columns"], *commands, "date"]
+    rows = [
+        [record["figure"], *(record["measured"][name] for name in table["columns"])]
+        + [record["command"]] * len(commands)
+        + [record["date"]]
+        for record in table["records"]
+    ]
+    parts = [f"## {table['title']}", *table["before"], _markdown(head, rows), *table["after"]]
+    return "\n" + "\n\n".join(parts) + "\n"
+
+
+def _markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    lines = [f"| {' | '.join(cells)} |" for cells in (head, *rows)]
+    return "\n".join([lines[0], "|---" * len(head) + "|", *lines[1:]])
+
+
+def readme_table(tables: Sequence[Mapping[str, Any]]) -> str:
+    """Return the short table of README: the records that have words for it."""
+    rows = []
+    for table in tables:
+        for record in table["records"]:
+            if "readme" in record:
+                values = [
+                    value if len(table["columns"]) == 1 else f"{name} {value}"
+                    for name, value in record["measured"].items()
+                    if value
+                ]
+                rows.append([record["readme"], "; ".join(values), record["command"]])
+    return _markdown(["figure", "measured", "command"], rows)
+
+
+def with_table(readme: str, table: str) -> str:
+    """Return README with its table between the marks; as it is without marks."""
+    before, begin, rest = readme.partition(BEGIN)
+    _, end, after = rest.partition(END)
+    return f"{before}{begin}\n{table}\n{end}{after}" if begin and end else readme
+
+
+def run(settings: Settings, progress: Progress = silent) -> Figures:
+    """Write docs/measured.md, and the table of README."""
+    tables = read_tables(settings.records)
+    page, readme = settings.root / "docs" / "measured.md", settings.root / "README.md"
+    atomic_write(page, page_text(tables))
+    atomic_write(readme, with_table(readme.read_text(encoding="utf-8"), readme_table(tables)))
+    return Figures((page, readme), {table["title"]: len(table["records"]) for table in tables})
+
+
+def report(result: Figures) -> Report:
+    """Return how many records each table has."""
+    n = sum(result.tables.values())
+    return Report(
+        "Measured figures",
+        f"{n} records make {len(result.tables)} tables in {', '.join(file.name for file in result.files)}.",
+        parts=(Table(("table", "records"), tuple(result.tables.items())),),
+    )

@@ -1,0 +1,240 @@
+"""Latency of the live chain by stage, and of the service with one robot and with many."""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from time import monotonic, perf_counter, sleep
+from typing import Any, NamedTuple
+
+from features.windows import cut_windows
+from pipelines.live.classifying import ClassifierThread, classify_window
+from pipelines.live.pilot import LivePilot
+from pipelines.live.terrain_source import Classifier
+from pipelines.models.tracking import load_model
+from pipelines.report import Column, Pairs, Progress, Report, Result, Table, described, silent
+from pipelines.report.settings import Settings as BaseSettings
+from pipelines.report.settings import setting
+from studies.service import (
+    ROBOT,
+    Packed,
+    Spread,
+    drive,
+    drive_all,
+    hello,
+    messages_of,
+    model_folder,
+    packed,
+    sent_channels,
+    service_process,
+    spread,
+    study_drive,
+)
+from terrain.estimation.enriched import enriched
+from terrain.estimation.estimate import estimate_run
+from terrain.logs.replay import replay
+from terrain.records import RunLog, Windows
+from terrain.robots import Robot, load_robot
+
+EXAMPLE = "python tests/studies live --robots 25 --seconds 20"
+SHARES = (1, 0.4, 1.6)
+"""Of the robots that were asked for, in this order."""
+REPEATS = 5
+STEP_RATE_HZ = 50.0
+N_WINDOWS = 400
+
+
+class Settings(BaseSettings):
+    """What is measured, and for how long."""
+
+    model: str | None = setting(
+        None, "Model of AgriMaRo, as of train; by default one trained on four short simulated runs."
+    )
+    robots: int = setting(25, "Robots at once.", ge=1, le=200)
+    seconds: float = setting(20.0, "Length of each measurement.", gt=1.0, le=600.0)
+    seed: int = setting(0, "Of the simulated drive.", ge=0)
+
+
+class SessionsLatency(NamedTuple):
+    """Round trip of control steps with so many robots, and what was lost."""
+
+    sessions: int
+    p99_ms: float
+    median_ms: float
+    lost_samples: int
+
+
+@dataclass(frozen=True)
+class LiveLatencies(Result):
+    """Latencies of the live chain and the service."""
+
+    step_us: Spread = described("one control step, as fast as a log goes, the thread idle", "us")
+    step_beside_window_us: Spread = described("the same while the thread classifies a window", "us")
+    step_paced_us: Spread = described("one at 50 Hz in real time, where nothing is warm", "us")
+    window_ms: Spread = described("from a whole window to its terrain", "ms")
+    websocket_ms: Spread = described("round trip of one robot at 100 Hz", "ms")
+    sessions: int = described("robots at once")
+    sessions_p99_ms: float = described("round trip of as many robots, 99th percentile", "ms")
+    lost_samples: int = described("of as many robots at once")
+    by_sessions: tuple[SessionsLatency, ...] = described("the same of fewer and more")
+    start_s: float = described("from the start of the service's process to its first observation", "s")
+    rss_mb: float = described("resident memory then", "MB")
+    rss_loaded_mb: float = described("resident memory after all robots", "MB")
+
+
+@contextmanager
+def _as_served() -> Iterator[None]:
+    """Let no collection look at what is loaded, as in the service."""
+    gc.collect()
+    gc.freeze()
+    try:
+        yield
+    finally:
+        gc.unfreeze()
+
+
+def step_times_us(robot: Robot, model: Any, run: RunLog, repeats: int = REPEATS) -> tuple[Spread, Spread]:
+    """Return the times of steps as fast as a log goes: alone, and while the thread classifies a window.
+
+    The log goes by hundreds of times faster than a robot drives, and its windows with it; a robot's thread is
+    at a window for a five hundredth of the time.  Steps alone wait until the thread has nothing to do, those
+    beside a window do not.
+    """
+    samples = list(replay(run, STEP_RATE_HZ))
+    thread = ClassifierThread()
+    times_us: dict[bool, list[float]] = {False: [], True: []}
+    try:
+        with _as_served():
+            for waiting in (True, False):
+                for number in range(repeats + 1):
+                    pilot = LivePilot(robot, source=Classifier(model, robot, thread.robot()))
+                    for sample in samples:
+                        beside = thread.busy
+                        begun_s = perf_counter()
+                        pilot.step(sample)
+                        took_us = (perf_counter() - begun_s) * 1e6
+                        if number and beside is not waiting:  # the first run compiles and loads
+                            times_us[beside].append(took_us)
+                        while waiting and thread.busy:
+                            sleep(0.0)
+    finally:
+        thread.stop()
+    return spread(times_us[False]), spread(times_us[True])
+
+
+def paced_step_times_us(robot: Robot, model: Any, run: RunLog, seconds: float) -> Spread:
+    """Return the time of a step at its own rate in real time: between two of them the memory goes cold."""
+    thread, times_us = ClassifierThread(), []
+    try:
+        with _as_served():
+            pilot = LivePilot(robot, source=Classifier(model, robot, thread.robot()))
+            begin_s = monotonic()
+            for sample in replay(run, STEP_RATE_HZ):
+                if sample.time_s > seconds:
+                    break
+                sleep(max(begin_s + sample.time_s - monotonic(), 0.0))
+                begun_s = perf_counter()
+                pilot.step(sample)
+                times_us.append((perf_counter() - begun_s) * 1e6)
+    finally:
+        thread.stop()
+    return spread(times_us[len(times_us) // 10 :])
+
+
+def window_times_ms(windows: Windows, model: Any) -> Spread:
+    """Return the time from a whole window to its terrain, each window alone."""
+    times_ms = []
+    for k in range(N_WINDOWS):
+        output = classify_window(model, windows[k % len(windows)])
+        times_ms.append(output.took_s * 1e3)
+    return spread(times_ms[10:])
+
+
+def run(settings: Settings, progress: Progress = silent) -> LiveLatencies:
+    """Measure the live chain and the service on this machine.
+
+    Raises
+    ------
+    TerrainError
+        if the model cannot be loaded, or the service does not start.
+    """
+    robot, log = load_robot(ROBOT), study_drive(settings.seed)
+    n_stages = 5 + len(SHARES)
+    with TemporaryDirectory() as folder:
+        uri = model_folder(settings.model, settings.seed, Path(folder) / "model")
+        model = load_model(uri)
+        progress("live", 1, n_stages)
+        steps, beside = step_times_us(robot, model, log)
+        progress("live", 2, n_stages)
+        paced = paced_step_times_us(robot, model, log, settings.seconds)
+        progress("live", 3, n_stages)
+        cut = cut_windows([enriched(estimate_run(log, robot, "vio15"))], model.rule, layout=model.layout)
+        window_ms = window_times_ms(cut.windows, model)
+        progress("live", 4, n_stages)
+        channels = sent_channels(log)
+        begun_s = perf_counter()
+        with service_process(["--model", uri, "--robot", ROBOT]) as service:
+            each = _within(packed(list(messages_of(log, 100.0, 100.0))), settings.seconds)
+            asyncio.run(drive(service.socket_url, hello("first", channels), each[:3]))
+            start_s, rss_mb = perf_counter() - begun_s, service.rss_mb
+            one = asyncio.run(drive(service.socket_url, hello("one", channels), each))
+            progress("live", 5, n_stages)
+            messages = _within(packed(list(messages_of(log))), settings.seconds)
+            by_sessions = []
+            for stage, share in enumerate(SHARES):
+                n = max(math.ceil(share * settings.robots), 1)
+                before = service.figure("terrain_rows_total")
+                driven = asyncio.run(drive_all(service.socket_url, channels, messages, n))
+                taken = service.figure("terrain_rows_total") - before
+                times = spread([ms for found in driven for ms in found.times_ms])
+                lost = sum(found.rows for found in driven) - int(taken)
+                by_sessions.append(SessionsLatency(n, times.p99, times.median, lost))
+                progress("live", 6 + stage, n_stages)
+            rss_loaded_mb = service.rss_mb
+    asked = by_sessions[0]
+    return LiveLatencies(
+        *(steps, beside, paced, window_ms, spread(one.times_ms[20:])),
+        *(asked.sessions, asked.p99_ms, asked.lost_samples, tuple(sorted(by_sessions))),
+        *(start_s, rss_mb, rss_loaded_mb),
+    )
+
+
+def _within(messages: list[Packed], seconds: float) -> list[Packed]:
+    return [one for one in messages if one.time_s <= seconds]
+
+
+def report(result: LiveLatencies) -> Report:
+    """Return each latency with its unit, and what many robots see."""
+    stages = (
+        ("control step", "us", result.step_us),
+        ("control step while a window is classified", "us", result.step_beside_window_us),
+        ("control step at 50 Hz in real time", "us", result.step_paced_us),
+        ("window to terrain", "ms", result.window_ms),
+        ("round trip, one robot at 100 Hz", "ms", result.websocket_ms),
+    )
+    latencies = tuple((name, unit, *found) for name, unit, found in stages)
+    many = tuple((one.sessions, one.median_ms, one.p99_ms, one.lost_samples) for one in result.by_sessions)
+    columns = ("robots", Column("median", ".2f", "ms"), Column("99 %", ".2f", "ms"), "samples lost")
+    return Report(
+        "The live chain and the service",
+        f"A control step takes {result.step_us.median:.3g} us, a window {result.window_ms.median:.3g} ms; of "
+        f"{result.sessions} robots 99 % of the answers come within {result.sessions_p99_ms:.3g} ms, and "
+        f"{result.lost_samples} samples are lost.",
+        parts=(
+            Table(("stage", "unit", "median", "99 %", "largest"), latencies, title="Latency"),
+            Table(columns, many, title="Control steps at 20 Hz, samples at 100 Hz"),
+            Pairs(
+                (
+                    ("start to the first observation", result.start_s, ".2f", "s"),
+                    ("memory then", result.rss_mb, ".0f", "MB"),
+                    ("memory after all robots", result.rss_loaded_mb, ".0f", "MB"),
+                )
+            ),
+        ),
+    )

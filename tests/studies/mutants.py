@@ -1,0 +1,161 @@
+"""Faults on purpose: whether the tests notice them.
+
+``mutants.yaml`` holds one fault an entry: its name, what it breaks, the file, the text that is there and the
+text in its place, and the tests that have to fail with it.  Each is put into a copy of the working tree, the
+tests are run there, and the tree is as it was.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import yaml
+
+from pipelines.report import Column, Progress, Report, Result, Table, described, silent
+from pipelines.report.settings import Settings as BaseSettings
+from pipelines.report.settings import setting
+from terrain.errors import ConfigError
+
+EXAMPLE = "python tests/studies mutants --only nan-as-zero"
+REPOSITORY = Path(__file__).resolve().parents[2]
+FILE = Path(__file__).with_suffix(".yaml")
+TIMEOUT_S = 300
+
+
+class Mutant(NamedTuple):
+    """A fault, and what has to notice it.
+
+    Parameters
+    ----------
+    name : of the fault
+    breaks : what it breaks, in a sentence
+    file : that it is in, from the repository
+    old, new : the text that occurs once in the file, and what replaces it
+    tests : files or nodes of tests
+    """
+
+    name: str
+    breaks: str
+    file: str
+    old: str
+    new: str
+    tests: tuple[str, ...]
+
+
+class Settings(BaseSettings):
+    """Which mutants are put into which tree."""
+
+    only: tuple[str, ...] = setting((), "These mutants alone, by commas.", separated=True)
+    file: Path = setting(FILE, "List of mutants.")
+    tree: Path = setting(REPOSITORY, "Working tree that is copied.")
+
+
+class Outcome(NamedTuple):
+    """A mutant, whether a test failed with it, and the last line of the tests."""
+
+    name: str
+    breaks: str
+    caught: bool
+    tests: str
+
+
+@dataclass(frozen=True)
+class Mutants(Result):
+    """Which mutants the tests notice."""
+
+    mutants: tuple[Outcome, ...] = described("outcome of each")
+
+    @property
+    def refused(self) -> str:
+        """What is not accepted: the mutants that survived."""
+        return ", ".join(f"{each.name} survived" for each in self.mutants if not each.caught)
+
+
+def read_mutants(path: Path = FILE) -> list[Mutant]:
+    """Return the mutants of a file."""
+    found = yaml.safe_load(path.read_text(encoding="utf-8"))
+    return [Mutant(name, **{**entry, "tests": tuple(entry["tests"])}) for name, entry in found.items()]
+
+
+def mutated(text: str, mutant: Mutant) -> str:
+    """Return the text of a file with a mutant; ``ValueError`` where it has no place, or more than one."""
+    n = text.count(mutant.old)
+    if n != 1:
+        raise ValueError(f"{mutant.name}: {mutant.file} holds its text {n} times, once is needed")
+    return text.replace(mutant.old, mutant.new)
+
+
+def is_caught(mutant: Mutant, tree: Path) -> tuple[bool, str]:
+    """Return whether a test fails with a mutant in a tree, and the last line of the tests."""
+    file = tree / mutant.file
+    text, times = file.read_text(encoding="utf-8"), file.stat()
+    file.write_text(mutated(text, mutant), encoding="utf-8")
+    command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "--no-header", "-rN"]
+    command += ["-m", "slow or not slow", "--tb=no", *mutant.tests]
+    threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+    try:
+        done = subprocess.run(
+            command,
+            cwd=tree,
+            env=os.environ | threads | {"PYTHONPATH": str(tree)},
+            capture_output=True,
+            text=True,
+            timeout=TIMEOUT_S,
+        )
+    finally:
+        file.write_text(text, encoding="utf-8")
+        os.utime(file, ns=(times.st_atime_ns, times.st_mtime_ns))
+    said = (done.stdout.strip() or done.stderr.strip()).splitlines()
+    if done.returncode not in (0, 1):
+        raise ValueError(f"{mutant.name}: the tests did not run: {said[-1] if said else done.returncode}")
+    return done.returncode == 1, said[-1] if said else ""
+
+
+def run(settings: Settings, progress: Progress = silent) -> Mutants:
+    """Put in each mutant and run its tests.
+
+    Raises
+    ------
+    ConfigError
+        if there is no mutant of a name.
+    """
+    mutants = read_mutants(settings.file)
+    unknown = sorted(set(settings.only) - {each.name for each in mutants})
+    if unknown:
+        raise ConfigError(f"--only: there is no mutant {unknown[0]!r}")
+    chosen = [each for each in mutants if not settings.only or each.name in settings.only]
+    found = {}
+    with tempfile.TemporaryDirectory() as place:
+        tree = Path(place) / "tree"
+        shutil.copytree(settings.tree, tree, ignore=shutil.ignore_patterns(".git", ".venv", "mlruns"))
+        for mutant in chosen:
+            progress("mutants", len(found), len(chosen))
+            try:
+                found[mutant.name] = is_caught(mutant, tree)
+            except (ValueError, OSError, subprocess.TimeoutExpired) as error:
+                found[mutant.name] = (False, str(error))
+        progress("mutants", len(found), len(chosen))
+    by_name = {each.name: each.breaks for each in chosen}
+    return Mutants(tuple(Outcome(name, by_name[name], *outcome) for name, outcome in found.items()))
+
+
+def report(result: Mutants) -> Report:
+    """Return which mutants were caught, the others first."""
+    n = sum(each.caught for each in result.mutants)
+    rows = [
+        (each.name, "caught" if each.caught else "survived", each.breaks, each.tests)
+        for each in result.mutants
+    ]
+    rows.sort(key=lambda row: row[1] == "caught")
+    return Report(
+        "Mutants",
+        f"{n} of {len(rows)} mutants are caught.",
+        parts=(Table(("mutant", "", Column("breaks", long=True), Column("tests", long=True)), tuple(rows)),),
+    )

@@ -1,0 +1,325 @@
+"""Features of ever more runs, with ever more processes: time and peak memory.
+
+Runs are generated: cheap noise with the spectrum of its terrain, no simulated robot.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from threading import Event, Thread
+from time import perf_counter
+from typing import Any, NamedTuple
+
+import numpy as np
+from pydantic import field_validator
+from scipy.signal import lfilter
+
+from pipelines.report import Column, Pairs, Progress, Report, Result, Table, described, silent
+from pipelines.report.settings import Settings as BaseSettings
+from pipelines.report.settings import setting
+from terrain.logs.read import read_run
+from terrain.logs.write import write_run
+from terrain.records import Label, RunLog, Stream
+
+EXAMPLE = "python tests/studies scale --runs 10000 --workers 1,2"
+FRACTIONS = (0.1, 0.3, 1.0)
+"""Of the runs that were asked for: three sizes show whether time and memory follow their number."""
+WARM_RUNS = 24
+"""Before a measurement: processes are started, kernels are compiled and loaded."""
+N_GENERATED = 50
+"""Runs by which the time to generate one is measured."""
+RUN_S = 20.0
+IMU_RATE_HZ, WHEEL_RATE_HZ = 50.0, 10.0
+IMU = ("gyro_x_radps", "gyro_y_radps", "gyro_z_radps", "accel_x_mps2", "accel_y_mps2", "accel_z_mps2")
+WHEELS = ("speed_left_mps", "speed_right_mps", "current_left_a", "current_right_a")
+TERRAINS = {"ASPHALT": (0.5, 0.2), "GRASS": (0.8, 0.5), "GRAVEL": (1.2, 0.0), "SAND": (0.7, 0.8)}
+"""Vibration in m/s^2, and how much of it is left after one sample: level and colour of the noise."""
+EVERY_S = 0.1
+"""From sample to sample of memory: a run takes some ten times less, its memory is seen in some of them."""
+
+
+class Settings(BaseSettings):
+    """How many runs are generated, and how many processes compute their features."""
+
+    runs: int = setting(10_000, "Runs of the largest size; 10 % and 30 % of them are measured too.", ge=10)
+    workers: tuple[int, ...] = setting((1, 2), "Processes at once, by commas.", separated=True)
+    seed: int = setting(0, "Of the runs.", ge=0)
+    scratch: Path | None = setting(
+        None, "Existing folder for the generated runs, 70 kB each; that of temporary files by default."
+    )
+
+    @field_validator("workers")
+    @classmethod
+    def _check_workers(cls, workers: tuple[int, ...]) -> tuple[int, ...]:
+        if not workers or min(workers) < 1 or len(set(workers)) < len(workers):
+            raise ValueError(f"--workers is {','.join(map(str, workers))!r}: different numbers from 1 on")
+        return workers
+
+    @field_validator("scratch")
+    @classmethod
+    def _check_scratch(cls, scratch: Path | None) -> Path | None:
+        if scratch is not None and not scratch.is_dir():
+            raise ValueError(f"--scratch is {scratch}: is no folder")
+        return scratch
+
+
+class Point(NamedTuple):
+    """Features of so many runs by so many processes; ``cpu_s`` and ``peak_mb`` are of all together."""
+
+    n_runs: int
+    n_workers: int
+    seconds: float
+    runs_per_s: float
+    cpu_s: float
+    peak_mb: float
+
+
+@dataclass(frozen=True)
+class ScaleResult(Result):
+    """Time and memory against the number of runs."""
+
+    run_s: float = described("length of a run", "s")
+    seed: int = described("of the runs")
+    generate_ms: float = described("to generate a run in memory", "ms")
+    write_s: float = described("to generate and write all of them as run folders", "s")
+    points: tuple[Point, ...] = described("the measurements")
+    nonlinearity_ratio: float = described(
+        "largest deviation of the time a run from that of the largest size, same processes", "1"
+    )
+    cpu_nonlinearity_ratio: float = described(
+        "the same of processor time, which other work on the machine hardly changes", "1"
+    )
+    memory_growth_ratio: float = described(
+        "largest growth of the peak from the smallest to the largest size, same processes", "1"
+    )
+    speed_up: dict[int, float] = described("by number of processes, times one at the largest size")
+
+
+def generated_run(seed: int, number: int) -> RunLog:
+    """Return a run; it depends on the seed and its number only.
+
+    Examples
+    --------
+    >>> run = generated_run(0, 2)
+    >>> run.run_id, run.labels[0].terrain, len(run.streams["imu"])
+    ('run_000002', 'GRAVEL', 1000)
+    """
+    rng = np.random.default_rng((seed, number))
+    terrain = list(TERRAINS)[number % len(TERRAINS)]
+    level_mps2, colour = TERRAINS[terrain]
+    n_imu, n_wheels = round(RUN_S * IMU_RATE_HZ), round(RUN_S * WHEEL_RATE_HZ)
+    imu = lfilter(
+        [level_mps2 * rng.uniform(0.8, 1.25)], [1.0, -colour], rng.standard_normal((n_imu, 6)), axis=0
+    )
+    imu[:, 5] += 9.81
+    wheels = 0.02 * rng.standard_normal((n_wheels, 4)) + np.array([1.0, 1.0, 4.0, 4.0]) * rng.uniform(
+        0.4, 0.8
+    )
+    streams = {
+        "imu": Stream(np.arange(n_imu) / IMU_RATE_HZ, imu, IMU),
+        "wheels": Stream(np.arange(n_wheels) / WHEEL_RATE_HZ, wheels, WHEELS),
+    }
+    return RunLog(f"run_{number:06d}", "husky", streams, (Label(0.0, RUN_S, terrain),), source="generated")
+
+
+def write_generated(seed: int, folder: Path, number: int) -> None:
+    """Write a generated run as a run folder."""
+    write_run(generated_run(seed, number), folder)
+
+
+def loaders(folder: Path, n_runs: int) -> list[Any]:
+    """Return what reads the first of the runs that were written."""
+    from pipelines.data.datasets import RunLoader
+
+    return [
+        RunLoader(partial(read_run, folder / f"run_{number:06d}"), False, False, None)
+        for number in range(n_runs)
+    ]
+
+
+class Peak:
+    """The largest sum of resident memory that was sampled, in MB; shared pages count for each process."""
+
+    def __init__(self) -> None:
+        self.mb = 0.0
+
+    def sample(self) -> None:
+        """Take one sample."""
+        self.mb = max(self.mb, sum(_rss_mb(pid) for pid in process_tree(os.getpid())))
+
+
+def process_tree(pid: int) -> list[int]:
+    """Return a process and all that it started, directly or through others; those that ended are left out."""
+    found, pids = [], [pid]
+    while pids:
+        pid = pids.pop()
+        found.append(pid)
+        try:
+            for task in Path(f"/proc/{pid}/task").iterdir():
+                pids += [int(child) for child in (task / "children").read_text().split()]
+        except OSError:
+            continue
+    return found
+
+
+def cpu_s() -> float:
+    """Return the processor time that this process and all that it started have taken so far."""
+    ticks = 0
+    for pid in process_tree(os.getpid()):
+        try:
+            after_name = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+            ticks += int(after_name[11]) + int(after_name[12])
+        except (OSError, ValueError, IndexError):
+            continue
+    return ticks / os.sysconf("SC_CLK_TCK")
+
+
+def _rss_mb(pid: int) -> float:
+    try:
+        return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+    except (OSError, ValueError, IndexError):
+        return 0.0
+
+
+@contextmanager
+def peak_memory() -> Iterator[Peak]:
+    """Sample memory while a block lasts, from a thread of its own."""
+    peak, ended = Peak(), Event()
+
+    def watch() -> None:
+        while not ended.wait(EVERY_S):
+            peak.sample()
+
+    thread = Thread(target=watch, name="memory", daemon=True)
+    peak.sample()
+    thread.start()
+    try:
+        yield peak
+    finally:
+        ended.set()
+        thread.join()
+        peak.sample()
+
+
+def run(settings: Settings, progress: Progress = silent) -> ScaleResult:
+    """Measure making features of generated runs on this machine.
+
+    Raises
+    ------
+    TerrainError
+        if the folder cannot be written.
+    """
+    from pipelines.learn.parallel import end_processes, parallel
+
+    sizes = sorted({max(round(fraction * settings.runs), 1) for fraction in FRACTIONS})
+    begun_s = perf_counter()
+    for number in range(N_GENERATED):
+        generated_run(settings.seed, number)
+    generate_ms = (perf_counter() - begun_s) * 1e3 / N_GENERATED
+    with TemporaryDirectory(dir=settings.scratch, prefix="fleet-") as folder:
+        runs = Path(folder) / "runs"
+        begun_s = perf_counter()
+        numbers = ((number,) for number in range(sizes[-1]))
+        written = parallel(write_generated, (settings.seed, runs), numbers, max(settings.workers))
+        for done, _ in enumerate(written):
+            progress("write runs", done + 1, sizes[-1])
+        write_s = perf_counter() - begun_s
+        points: list[Point] = []
+        for n_workers in settings.workers:
+            end_processes()
+            _measure(runs, min(WARM_RUNS, sizes[-1]), n_workers)
+            for n_runs in sizes:
+                progress("measure", len(points), len(sizes) * len(settings.workers))
+                points.append(_measure(runs, n_runs, n_workers))
+        progress("measure", len(points), len(points))
+    return ScaleResult(
+        run_s=RUN_S,
+        seed=settings.seed,
+        generate_ms=generate_ms,
+        write_s=write_s,
+        points=tuple(points),
+        nonlinearity_ratio=nonlinearity([(p.n_workers, p.n_runs, p.seconds) for p in points]),
+        cpu_nonlinearity_ratio=nonlinearity([(p.n_workers, p.n_runs, p.cpu_s) for p in points]),
+        memory_growth_ratio=memory_growth(points),
+        speed_up=speed_ups(points),
+    )
+
+
+def _measure(runs: Path, n_runs: int, n_workers: int) -> Point:
+    from pipelines.feature_store.build import build_store
+    from pipelines.feature_store.settings import FeaturesSettings
+
+    with TemporaryDirectory(dir=runs.parent, prefix="store-") as out:
+        settings = FeaturesSettings(out=Path(out), n_jobs=n_workers)
+        with peak_memory() as peak:
+            begun_s, begun_cpu_s = perf_counter(), cpu_s()
+            build_store(loaders(runs, n_runs), settings)
+            seconds, used_s = perf_counter() - begun_s, cpu_s() - begun_cpu_s
+    return Point(n_runs, n_workers, seconds, n_runs / seconds, used_s, peak.mb)
+
+
+def _by_workers(points: Sequence[Point]) -> list[list[Point]]:
+    """Return the points of each number of processes, by size."""
+    numbers = sorted({point.n_workers for point in points})
+    return [sorted(point for point in points if point.n_workers == number) for number in numbers]
+
+
+def nonlinearity(times: Sequence[tuple[int, int, float]]) -> float:
+    """Return the largest deviation of the time a run from that of the largest size with as many processes.
+
+    Parameters
+    ----------
+    times : (processes, runs, time in s) of each measurement
+
+    Examples
+    --------
+    >>> round(nonlinearity([(1, 10, 1.1), (1, 100, 10.0)]), 3)
+    0.1
+    """
+    deviations = []
+    for n_workers in {each[0] for each in times}:
+        same = sorted((n_runs, time_s) for n, n_runs, time_s in times if n == n_workers)
+        of_largest_s = same[-1][1] / same[-1][0]
+        deviations += [abs(time_s / n_runs / of_largest_s - 1.0) for n_runs, time_s in same]
+    return float(np.max(deviations))
+
+
+def memory_growth(points: Sequence[Point]) -> float:
+    """Return the largest growth of the peak from the smallest to the largest size."""
+    return float(np.max([same[-1].peak_mb / same[0].peak_mb - 1.0 for same in _by_workers(points)]))
+
+
+def speed_ups(points: Sequence[Point]) -> dict[int, float]:
+    """Return by number of processes how many times faster than one they are, at the largest size."""
+    largest = {same[-1].n_workers: same[-1].seconds for same in _by_workers(points)}
+    return {n: largest[1] / seconds for n, seconds in largest.items() if n > 1} if 1 in largest else {}
+
+
+def report(result: ScaleResult) -> Report:
+    """Return time and memory by size and number of processes, and what follows from them."""
+    columns = (
+        *("runs", "processes", Column("time", ".1f", "s"), Column("runs/s", ".1f")),
+        *(Column("processor time", ".1f", "s"), Column("peak memory", ".0f", "MB")),
+    )
+    return Report(
+        "Features of many runs",
+        f"Time a run deviates by at most {result.nonlinearity_ratio:.1%} from that of the largest size, processor time "
+        f"by {result.cpu_nonlinearity_ratio:.1%}; peak memory grows by {result.memory_growth_ratio:+.1%} from the "
+        "smallest to the largest size.",
+        parts=(
+            Table(columns, result.points),
+            Pairs(
+                (
+                    *((f"{n} processes, times one", times, ".2f") for n, times in result.speed_up.items()),
+                    (f"a run of {result.run_s:g} s generated in", result.generate_ms, ".1f", "ms"),
+                    ("all generated and written in", result.write_s, ".1f", "s"),
+                )
+            ),
+        ),
+    )

@@ -1,0 +1,268 @@
+"""Every study by its runner; small ones give the known results; measured figures are made from their records."""
+
+import doctest
+import json
+import re
+import subprocess
+import sys
+from importlib import import_module
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from studies import consistency, figures, labels, long_drives, mutants, scale, slip_peaks, trials
+from studies.__main__ import STUDIES, main
+
+from pipelines.report import Report, Result
+from terrain.discrepancy.trials.rows import Row
+from terrain.errors import ConfigError, DataError
+from terrain.robots import load_robot
+from terrain.simulation.slip_sweep import Drive
+
+ROOT = Path(__file__).parents[2]
+ROBOT = load_robot("agrimaro")
+
+
+@pytest.mark.parametrize("name", STUDIES)
+def test_every_study_is_one_file_like_a_command(name):
+    module = import_module(STUDIES[name][0])
+    assert module.EXAMPLE.startswith(f"python tests/studies {name}")
+    assert issubclass(type(module.Settings), type)
+    assert callable(module.run)
+    assert callable(module.report)
+    assert doctest.testmod(module, optionflags=doctest.NORMALIZE_WHITESPACE).failed == 0
+
+
+def test_the_runner_lists_studies_and_names_a_mistake(capsys):
+    assert main([]) == 0
+    assert all(name in capsys.readouterr().out for name in STUDIES)
+    assert main(["nothing"]) == 2
+    assert "there is no study 'nothing'; there are consistency, " in capsys.readouterr().err
+    assert main(["trials", "--runs", "2"]) == 2
+    assert capsys.readouterr().err == "error: --runs is 2; at least 3 are required, to hold some out\n"
+
+
+def test_nothing_of_the_packages_imports_studies_or_examples():
+    pattern = re.compile(r"^\s*(from|import) (studies|tests|examples|claims)\b", re.MULTILINE)
+    for package in ("terrain", "features", "pipelines"):
+        for file in (ROOT / package).rglob("*.py"):
+            assert not pattern.search(file.read_text(encoding="utf-8")), file
+
+
+# -- measured figures --------------------------------------------------------------------------------------
+
+
+def test_the_page_of_measured_figures_is_what_its_records_give():
+    tables = figures.read_tables(ROOT / "docs" / "measured")
+    assert (ROOT / "docs" / "measured.md").read_text(encoding="utf-8") == figures.page_text(tables)
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert readme == figures.with_table(readme, figures.readme_table(tables))
+    records = [record for table in tables for record in table["records"]]
+    assert len(records) >= 100
+    assert all(re.fullmatch(r"\d{4}-\d\d-\d\d", record["date"]) for record in records)
+    assert sum("readme" in record for record in records) == 6
+
+
+def test_a_record_without_its_command_is_refused(tmp_path):
+    record = {"figure": "depth", "measured": {"value": "1 m"}, "date": "2026-01-01", "commit": "abc"}
+    table = {"title": "Moor", "columns": ["value"], "records": [record]}
+    (tmp_path / "moor.json").write_text(json.dumps(table))
+    with pytest.raises(DataError, match=r"moor\.json: record 'depth' has no command"):
+        figures.read_tables(tmp_path)
+
+
+def test_the_table_of_readme_stands_between_its_marks():
+    text = f"before\n{figures.BEGIN}\nold\n{figures.END}\nafter"
+    assert figures.with_table(text, "new") == f"before\n{figures.BEGIN}\nnew\n{figures.END}\nafter"
+    assert figures.with_table("no marks", "new") == "no marks"
+
+
+# -- mutants -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("mutant", mutants.read_mutants(), ids=lambda mutant: mutant.name)
+def test_every_mutant_has_one_place_and_its_tests(mutant):
+    text = (ROOT / mutant.file).read_text(encoding="utf-8")
+    assert mutants.mutated(text, mutant) != text
+    assert mutant.tests
+    assert all((ROOT / test.partition("::")[0]).exists() for test in mutant.tests)
+
+
+def test_a_mutant_is_caught_by_a_test_that_fails_and_the_tree_is_as_it_was(tmp_path):
+    (tmp_path / "half.py").write_text("def half(x):\n    return x / 2\n")
+    (tmp_path / "test_half.py").write_text("import half\n\ndef test_half():\n    assert half.half(4) == 2\n")
+    (tmp_path / "pytest.ini").write_text("[pytest]\nmarkers = slow\npythonpath = .\n")
+    double = mutants.Mutant("double", "doubles", "half.py", "x / 2", "x * 2", ("test_half.py",))
+    assert mutants.is_caught(double, tmp_path)[0]
+    assert not mutants.is_caught(double._replace(new="x * 0.5"), tmp_path)[0]
+    with pytest.raises(ValueError, match="holds its text 0 times"):
+        mutants.is_caught(double._replace(old="x / 3"), tmp_path)
+    assert (tmp_path / "half.py").read_text() == "def half(x):\n    return x / 2\n"
+
+
+# -- slip, filters, trials, labels -------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_a_case_of_slip_peaks_is_near_the_truth_and_counted():
+    drives = (Drive("slip", 60.0), Drive("slip", 60.0))
+    case = slip_peaks.run_case(ROBOT, "grass", 3, n_bootstrap=100)
+    assert abs(case.peak_slip - case.true_slip) < 0.05
+    assert drives
+    found = slip_peaks.summary([case, None])
+    assert (found.n_cases, found.n_learned, found.all.n) == (2, 1, 1)
+    assert found.as_json()["coverage"] == float(case.inside)
+    assert isinstance(found.report, Report)
+
+
+def test_nothing_learned_is_no_coverage():
+    found = slip_peaks.summary([None])
+    assert (found.n_learned, found.all.coverage_ci) == (0, None)
+    assert np.isnan(found.all.coverage)
+
+
+@pytest.mark.slow
+def test_consistency_is_of_its_seed_alone():
+    options = {"seed": 41, "runs": 1, "terrains": "tiles,tilled_loam"}
+    found = consistency.run(consistency.Settings(n_jobs=1, **options))
+    again = consistency.run(consistency.Settings(n_jobs=2, **options))
+    assert found.as_json() == again.as_json()
+    assert [row.terrain for row in found.consistency] == ["tiles", "tilled_loam"]
+    for row in found.consistency:
+        assert list(row.nees) == list(consistency.GROUPS)
+        for value in (*row.nees.values(), row.slip_coverage):
+            assert value.ci[0] < value.mean < value.ci[1]
+        assert 0.3 < row.slip_coverage.mean <= 1.0
+    (other,) = consistency.run(consistency.Settings(seed=42, runs=1, terrains="tiles", n_jobs=1)).consistency
+    assert other.nees["slip_speed"].mean != found.consistency[0].nees["slip_speed"].mean
+
+
+@pytest.mark.slow
+def test_yaw_and_uncertainty_of_drives_of_several_minutes():
+    found = long_drives.run(long_drives.Settings(seed=21, runs=2, minutes=200 / 60, n_jobs=1))
+    assert [drive.terrain for drive in found.drives] == ["asphalt", "clay"]
+    for drive in found.drives:
+        assert 0.0 < drive.yaw_error_rad < 0.02
+        assert 0.0 < drive.blind_yaw_error_rad < 0.1
+        assert 0.85 < drive.slip_coverage <= 1.0
+    assert "rad after 60 s" in found.report.answer
+
+
+def test_a_drive_without_a_minute_before_the_loss_is_refused():
+    with pytest.raises(ConfigError, match="too short"):
+        long_drives.drive_long(ROBOT, "grass", 0, 1, 90.0)
+
+
+@pytest.mark.slow
+def test_a_few_blind_trials_come_out_right(capsys, tmp_path):
+    file = tmp_path / "trials.json"
+    words = ["--n", "2", "--seed", "1", "--rows", "none,strong", "--runs", "4", "--jobs", "1", "--json", str(file)]
+    assert main(["trials", *words]) == 0
+    assert "4 trials of 4 runs, seed 1" in capsys.readouterr().out
+    found = json.loads(file.read_text())
+    assert found["table"]["none: false alarms"]["hits"] == 0
+    assert found["table"]["strong: named"]["hits"] == 2
+    assert found["table"]["strong: wrongly named"]["hits"] == 0
+    assert [trial["row"] for trial in found["trials"]] == ["none", "none", "strong", "strong"]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"rows": "none,weak"}, "--rows is 'none,weak'; some of none,strong,ladder,"),
+        ({"rows": ","}, "--rows is ''"),
+        ({"rows": "none,none"}, "each once"),
+        ({"n": 0}, "--n is 0: "),
+        ({"rows": "all"}, ",".join(Row)),
+    ],
+)
+def test_trials_that_are_not_accepted_are_one_sentence(options, message):
+    with pytest.raises(ConfigError, match=re.escape(message)):
+        trials.Settings(**options)
+
+
+# -- scale -------------------------------------------------------------------------------------------------
+
+
+def test_a_generated_run_depends_on_seed_and_number_only_and_has_the_colour_of_its_terrain():
+    for seed, same in ((3, True), (4, False)):
+        one, two = (scale.generated_run(each, 7).streams["imu"].values for each in (3, seed))
+        assert np.array_equal(one, two) is same
+    for number, (_, colour) in enumerate(scale.TERRAINS.values()):
+        gyro = [scale.generated_run(0, number + 4 * k).streams["imu"].values[:, 0] for k in range(8)]
+        gyro = np.concatenate(gyro)
+        assert np.corrcoef(gyro[1:], gyro[:-1])[0, 1] == pytest.approx(colour, abs=5 / np.sqrt(len(gyro)))
+
+
+def test_nonlinearity_growth_and_speed_up_are_of_points_that_share_the_rest():
+    assert scale.nonlinearity([(1, n, 0.01 * n) for n in (10, 30, 100)]) == pytest.approx(0.0)
+    assert scale.nonlinearity([(1, n, 0.01 * n**2) for n in (10, 100)]) == pytest.approx(0.9)
+    points = [
+        scale.Point(10, 1, 1.0, 10.0, 1.0, 100.0),
+        scale.Point(100, 1, 10.0, 10.0, 10.0, 110.0),
+        scale.Point(10, 2, 0.6, 16.7, 1.1, 300.0),
+        scale.Point(100, 2, 5.0, 20.0, 10.0, 300.0),
+    ]
+    assert scale.memory_growth(points) == pytest.approx(0.1)
+    assert scale.speed_ups(points) == {2: 2.0}
+    assert scale.speed_ups(points[2:]) == {}
+
+
+def test_memory_of_processes_that_were_started_counts():
+    code = "block = bytearray(200_000_000); print(len(block), flush=True); input()"
+    with scale.peak_memory() as peak:
+        before_mb = peak.mb
+        child = subprocess.Popen(
+            [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
+        child.stdout.readline()
+        peak.sample()
+        assert child.pid in scale.process_tree(child.pid)
+        child.communicate("\n")
+    assert peak.mb - before_mb > 200.0
+
+
+@pytest.mark.slow
+def test_few_runs_are_measured_and_nothing_is_left(tmp_path):
+    result = scale.run(scale.Settings(runs=20, workers=(1,), scratch=tmp_path))
+    assert [point.n_runs for point in result.points] == [2, 6, 20]
+    assert all(point.seconds > 0 and point.peak_mb > 0 for point in result.points)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("workers", ["0", "1,1", "", "x"])
+def test_workers_that_are_not_accepted_are_one_sentence(workers):
+    with pytest.raises(ConfigError, match="--workers is"):
+        scale.Settings(workers=workers)
+
+
+@pytest.mark.slow
+def test_label_strategies_are_compared_on_held_out_runs(tmp_path):
+    from terrain.logs.write import write_run
+
+    for number in range(24):
+        write_run(scale.generated_run(1, number), tmp_path / "runs")
+    found = labels.run(labels.Settings(data=tmp_path / "runs", repeats=1, n_jobs=1))
+    assert [row.name for row in found.rows] == list(labels.STRATEGIES)
+    first, *others = [row.n_labelled for row in found.rows]
+    assert first == 4.0
+    assert min(others) >= 2 * first
+    assert "points against as many drawn" in found.report.answer
+
+
+class _Refused(NamedTuple):
+    refused: str
+
+
+def test_what_is_not_accepted_is_exit_code_1(monkeypatch, tmp_path):
+    class Bad(Result):
+        refused = "memory grew"
+        report = Report("soak", "bad")
+
+        def as_json(self):
+            return {}
+
+    monkeypatch.setattr("studies.soak.run", lambda settings, progress: Bad())
+    assert main(["soak"]) == 1
