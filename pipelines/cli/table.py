@@ -41,6 +41,12 @@ COMMANDS: tuple[Command, ...] = (
         "pipelines.explain.explain",
         "what the simulation gets wrong, and the extended robot",
     ),
+    Command(
+        "Control",
+        "drive",
+        "pipelines.drive.drive",
+        "controllers in closed loop, side by side; --faults, --path",
+    ),
     Command("Live", "serve", "pipelines.serve.serve", "WebSocket, --can BUS, --replay LOG"),
 )
 
@@ -51,5 +57,7 @@ FORMER: dict[str, str] = {
     "model": "use terrain inspect MODEL",
     "reproduce": "use python examples/papers PAPER, in the repository",
     "compare": "name several recipes or models in terrain crossval, as --recipe svm,cnn",
+    "faults": "use terrain drive --faults NAME,...",
+    "track": "use terrain drive --path FILE",
 }
 """Former command: a sentence that names its successor."""

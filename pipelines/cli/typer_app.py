@@ -6,16 +6,13 @@ import typer
 
 from pipelines.cli import (
     classify,
-    drive,
     estimate,
-    faults,
     features,
     label,
     quickstart,
     replay,
     slip,
     soil,
-    track,
 )
 
 app = typer.Typer(
@@ -28,9 +25,9 @@ app = typer.Typer(
 )
 
 GROUPS = (
-    *(estimate.app, features.app, classify.app, slip.app, soil.app, drive.app),
+    *(estimate.app, features.app, classify.app, slip.app, soil.app),
     *(replay.app, label.app),
-    *(faults.app, quickstart.app, track.app),
+    *(quickstart.app,),
 )
 """Files of commands, in the order of help."""
 

@@ -1,1 +1,1 @@
-"""``terrain drive``: closed-loop comparisons."""
+"""Controllers in closed loop: side by side, through sensor faults, along a path."""

@@ -1,4 +1,4 @@
-"""Names of the controllers that are compared, and those of earlier releases."""
+"""Names of the controllers that are compared."""
 
 from __future__ import annotations
 
@@ -20,36 +20,13 @@ USING_CLASSIFIER = ("classified", "thesis:classified")
 ADAPTING = ("classified", "true_terrain", *THESIS_ADAPTING)
 """Controllers whose target follows the terrain."""
 
-_EARLIER = {"fixed": "fallback", "learned": "classified", "oracle": "true_terrain", "told": "known"}
-
-
-def current_name(name: str) -> str:
-    """Return the name of a controller, given that or the one of earlier releases.
-
-    Examples
-    --------
-    >>> current_name("oracle+track"), current_name("told:clay"), current_name("plain")
-    ('true_terrain+track', 'known:clay', 'plain')
-    """
-    return _renamed(name, _EARLIER)
-
-
-def earlier_name(name: str) -> str:
-    """Return the name that a controller had in earlier releases.
-
-    Examples
-    --------
-    >>> earlier_name("true_terrain+track"), earlier_name("known:clay"), earlier_name("plain")
-    ('oracle+track', 'told:clay', 'plain')
-    """
-    return _renamed(name, {new: old for old, new in _EARLIER.items()})
-
 
 def base_name(name: str) -> str:
-    """Return the name of a controller without path tracking."""
+    """Return the name of a controller without path tracking.
+
+    Examples
+    --------
+    >>> base_name("true_terrain+track")
+    'true_terrain'
+    """
     return name.partition(TRACK)[0]
-
-
-def _renamed(name: str, names: dict[str, str]) -> str:
-    kind = base_name(name).partition(":")[0]
-    return names.get(kind, kind) + name.removeprefix(kind)

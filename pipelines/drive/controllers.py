@@ -11,7 +11,7 @@ from pipelines.live.pilot import LivePilot
 from pipelines.live.pilot_settings import PilotSettings
 from pipelines.live.terrain_source import Classifier, KnownTerrain, NoTerrain, TerrainSource
 from pipelines.models.model_files import TerrainModel
-from pipelines.reporting.progress import Progress, silent
+from pipelines.report import Progress, format_value, silent
 from terrain.control.situations import Situation
 from terrain.control.slip_table import SlipTable
 from terrain.errors import ConfigError
@@ -20,6 +20,23 @@ from terrain.robots import Robot
 from terrain.simulation.dynamic.simulate import simulate
 
 DEFAULT_RAMP_MPS2 = PilotSettings().ramp_mps2
+
+
+_TEXTS = {
+    "plain": "The wheel speeds of the kinematics; slip is not used.",
+    "ramp": "As plain, with a speed that rises by no more than {ramp}.",
+    "thesis": "The thesis' PID of slip on each wheel, with the target of the table's fallback.",
+    "thesis:classified": "The thesis' PID of slip on each wheel, with the targets of the terrain that a "
+    "classifier recognises while driving: the chain of the thesis.",
+    "thesis:true_terrain": "The thesis' PID of slip on each wheel, with the targets of the true terrain.",
+    "fallback": "Traction control: one speed for all wheels, limited while it rises; the target is that of "
+    "the table's fallback.",
+    "classified": "Traction control with the target of the terrain that a classifier recognises while "
+    "driving.",
+    "true_terrain": "Traction control with the target of the true terrain: the limit for a classifier "
+    "without error.",
+}
+"""What each controller does."""
 
 
 class Source(Enum):
@@ -114,6 +131,25 @@ def make_controller(
         f"controller {name!r} is unknown: use {', '.join((*CONTROLLERS, *THESIS_ADAPTING))}, known:NAME, "
         f"target:SLIP; {TRACK}"
     )
+
+
+def controller_text(name: str, ramp_mps2: float | None) -> str:
+    """Return a sentence on a controller.
+
+    Parameters
+    ----------
+    name : of :func:`make_controller`
+    ramp_mps2 : of ``ramp``; None where it is not driven
+    """
+    bare, track, _ = name.partition(TRACK)
+    if track:
+        return f"{controller_text(bare, ramp_mps2)} With path tracking."
+    kind, _, given = name.partition(":")
+    if kind == "known" and given:
+        return f"Traction control with the target of {given} on every terrain."
+    if kind == "target" and given:
+        return f"Traction control with a target slip of {given}."
+    return _TEXTS[name].format(ramp=format_value(ramp_mps2, unit="m/s²"))
 
 
 def _single_target(table: SlipTable, name: str, slip: str) -> SlipTable:

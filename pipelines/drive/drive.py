@@ -1,265 +1,289 @@
-"""``terrain drive``: controllers side by side in the closed loop, in the same situations."""
+"""Drive controllers side by side in the closed loop; with --faults through sensor faults; with --path along one."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
-from typing import NamedTuple
+import os
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING
 
-import numpy as np
+from pydantic import field_validator, model_validator
 
-from pipelines.drive.controller_names import TRACK
-from pipelines.drive.controllers import (
-    DEFAULT_RAMP_MPS2,
-    Controller,
-    DriveInputs,
-    Source,
-    drive_once,
-    make_controller,
-    train_classifier,
-)
-from pipelines.drive.results import DriveResult
-from pipelines.drive.settings import DriveSettings
-from pipelines.live.pilot import LivePilot
-from pipelines.reporting.progress import Progress, silent
-from terrain.control.comparison import mean_interval
-from terrain.control.drive_evaluation import (
-    START_TIME_S,
-    EnergyCurve,
-    energy_at_equal_distance,
-    energy_curve,
-    evaluate_drive,
-)
-from terrain.control.drive_metrics import drive_history
-from terrain.control.situations import SLOPE, STARTS, Situation, SituationOptions, make_situation
-from terrain.control.slip_table import load_slip_table
-from terrain.errors import ConfigError
-from terrain.records import RunLog
-from terrain.robots import load_robot
+from pipelines.drive.controller_names import CONTROLLERS, USING_CLASSIFIER, base_name
+from pipelines.report.settings import Settings as BaseSettings
+from pipelines.report.settings import option_name, setting
 
-STEEPEST_DEG, SLOPE_STEPS = 25.0, 9
-"""Range of the search for the steepest grade, and its bisections: to a tenth of a degree."""
+if TYPE_CHECKING:
+    from pipelines.report import Progress, Result
 
-CLIMBING_MPS = 0.05
-"""A robot that is faster than this in the last second climbs."""
+EXAMPLE = "terrain drive --scenario starts --terrain grass --table table.yaml --out drives/"
 
-LEAST_RAMP_MPS2, MOST_RAMP_MPS2, RAMP_STEPS = 0.1, 10.0, 7
-"""Range of the search for the matching ramp (up to twice the desired rise, where that is finite), and its
-bisections."""
+PAGE_FILE = "report.html"
+MAX_GRADE_DEG = MAX_SLOPE_DEG = 30.0
+MAX_DELAY_S = 0.5
+SITUATIONS = ("start", "stop", "steady")
+SLIP_SOURCES = ("none", "dynamic", "kinematic", "multi", "multi-grip")
+"""Names of :class:`terrain.control.car_following.SlipSource`, which would load compiled code here."""
 
-REFERENCES = ("true_terrain", "classified", "fallback")
-"""Controllers whose distance the ramp matches: the first of them that is driven."""
+ALL = "all"
+"""``--faults`` that names every fault."""
 
 
-class Drive(NamedTuple):
-    """Metrics of one drive by name, and its energy over distance."""
+class DrivenSettings(BaseSettings):
+    """Robot, terrain and seeds."""
 
-    metrics: dict[str, float]
-    energy: EnergyCurve
+    robot: str = setting("agrimaro", "Robot by name, or its YAML file; a car-like one with --path.")
+    terrain: str = setting(
+        "grass", "Name of a soil, its YAML file, or 'course' for all; with --faults some, by commas."
+    )
+    table: Path | None = setting(
+        None,
+        "Table of target slips; by default the packaged one, with --faults one that is learned in simulation.",
+    )
+    speed_mps: float | None = setting(
+        None, "Cruising speed in m/s; 1 by default, with --path 3.", option="--speed", gt=0.0
+    )
+    seeds: int | None = setting(
+        None,
+        "Number of seeds: each draws load, soil, tyres and noise; 20 by default, with --faults 1.",
+        ge=1,
+    )
+    first_seed: int = setting(0, "First seed.", option="--seed", ge=0)
+    out: Path | None = setting(None, "Folder of the page, with --path also of the table of the drive.")
+    jobs: int = setting(0, "Processes at once; 0 for one a core.", ge=0)
+
+    @property
+    def n_jobs(self) -> int:
+        """Number of processes."""
+        return self.jobs or os.cpu_count() or 1
 
 
-def load_inputs(settings: DriveSettings) -> DriveInputs:
-    """Return robots and table, without a classifier.
+class ComparisonSettings(BaseSettings):
+    """Comparison of controllers."""
+
+    scenario: str = setting(
+        "starts",
+        "starts, straight, slope (the steepest; else level), brake, circle, crab; course and mixed on the "
+        "terrain 'course'; or any of simulate.",
+    )
+    controllers: tuple[str, ...] = setting(
+        CONTROLLERS,
+        "By commas: plain, ramp, thesis; the traction controller on the target of fallback, classified, "
+        "true_terrain, known:NAME (of that terrain) or target:SLIP; the thesis' PID on the targets of "
+        "thesis:classified or thesis:true_terrain; NAME+track with path tracking.",
+        separated=True,
+    )
+    model: str | None = setting(
+        None,
+        "Classifier of 'classified' and 'thesis:classified': models:/NAME@champion or a folder; one is "
+        "trained by default.",
+    )
+    delay_s: float = setting(0.05, "From a sample to the wheel in s.", option="--delay")
+    ramp_mps2: float | None = setting(
+        None,
+        "Rise of speed of 'ramp' in m/s^2; by default the one that travels as far as the traction controller.",
+        option="--ramp",
+    )
+    duration_s: float | None = setting(None, "Length of a drive in s.", option="--duration")
+    accel_mps2: float = setting(1.0, "Rise of the desired speed in m/s^2; inf for a step.", option="--accel")
+    grade_deg: float = setting(0.0, "Slope in degrees, uphill > 0.", option="--grade")
+    radius_factors: tuple[float, float, float] | None = setting(
+        None,
+        "True radius of each wheel over the nominal one, as in 1,1.02,1; drawn by default.",
+        option="--radius",
+        separated=True,
+    )
+    leg_backlash_rad: float = setting(0.0, "Backlash of the third leg in rad.", option="--leg-backlash")
+    plant: str | None = setting(None, "Robot as it really is, where it differs from --robot.")
+
+    @field_validator("controllers")
+    @classmethod
+    def _named_once(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+        if not names:
+            raise ValueError("no controller is named")
+        repeated = {name for name in names if names.count(name) > 1}
+        if repeated:
+            raise ValueError(f"controllers name {min(repeated)!r} twice")
+        return names
+
+    @field_validator("delay_s")
+    @classmethod
+    def _possible_delay(cls, delay_s: float) -> float:
+        if not 0.0 <= delay_s <= MAX_DELAY_S:
+            raise ValueError(f"--delay is {delay_s!r}; 0 to {MAX_DELAY_S:g} s are accepted")
+        return delay_s
+
+    @field_validator("grade_deg")
+    @classmethod
+    def _possible_grade(cls, grade_deg: float) -> float:
+        return _within("--grade", grade_deg, MAX_GRADE_DEG)
+
+    @field_validator("radius_factors", mode="before")
+    @classmethod
+    def _three_ratios(cls, given: object) -> tuple[float, ...] | None:
+        if given is None:
+            return None
+        try:
+            ratios = tuple(float(part) for part in given)  # type: ignore[attr-defined]
+        except (TypeError, ValueError):
+            ratios = ()
+        if len(ratios) != 3 or not all(0.5 <= ratio <= 2.0 for ratio in ratios):
+            text = ",".join(map(str, given)) if isinstance(given, tuple) else given
+            raise ValueError(f"--radius is {text!r}; three ratios from 0.5 to 2 are required, as in 1,1.02,1")
+        return ratios
+
+    @model_validator(mode="after")
+    def _consistent(self) -> ComparisonSettings:
+        if self.scenario == "slope" and self.grade_deg:
+            raise ValueError("scenario 'slope' searches for the steepest grade itself: leave the grade out")
+        if self.model is not None and not self.needs_model:
+            names = " and ".join(map(repr, USING_CLASSIFIER))
+            raise ValueError(f"--model is the classifier of {names}, which are not among the controllers")
+        return self
+
+    @property
+    def needs_model(self) -> bool:
+        """Whether a controller uses a classifier."""
+        return any(base_name(name) in USING_CLASSIFIER for name in self.controllers)
+
+
+class FaultSettings(BaseSettings):
+    """Sensor faults in the closed loop (--faults)."""
+
+    faults: tuple[str, ...] = setting(
+        (), "Drive through these faults: names or kinds of them, by commas, or 'all'.", separated=True
+    )
+    situations: tuple[str, ...] = setting(SITUATIONS, f"By commas: {', '.join(SITUATIONS)}.", separated=True)
+    stop_terrains: tuple[str, ...] = setting(
+        ("wet_floor",), "Soils of stop, by commas.", option="--stop-terrain", separated=True
+    )
+    durations_s: tuple[float, ...] = setting(
+        (3.0, math.inf),
+        "For how long a fault acts in s, by commas; inf for good.",
+        option="--durations",
+        separated=True,
+    )
+    draw: tuple[str, ...] = setting(
+        (),
+        "Faults whose drives are drawn, by commas; by default, with --out, the worst of each kind.",
+        separated=True,
+    )
+
+    @field_validator("situations", "stop_terrains", "durations_s")
+    @classmethod
+    def _each_once(cls, given: tuple[object, ...]) -> tuple[object, ...]:
+        if not given:
+            raise ValueError("situations, terrains and durations: one of each at least is required")
+        if len(set(given)) < len(given):
+            raise ValueError(f"{', '.join(map(str, given))}: one is named twice")
+        return given
+
+    @field_validator("durations_s")
+    @classmethod
+    def _possible_durations(cls, durations_s: tuple[float, ...]) -> tuple[float, ...]:
+        for duration_s in durations_s:
+            if not duration_s > 0.0:
+                raise ValueError(f"--durations has {duration_s:g}; times above 0 s are accepted, or inf")
+        return durations_s
+
+
+class PathSettings(BaseSettings):
+    """A car-like robot along a path (--path)."""
+
+    path: Path | None = setting(
+        None,
+        "Follow the path of this CSV file: points in their order, columns x_m and y_m, and roll_rad where it "
+        "is known.",
+    )
+    observer: str = setting("multi", f"Sideslip by: {', '.join(SLIP_SOURCES)}.")
+    slope_deg: float = setting(
+        0.0, "Side slope in degrees, left side up > 0; with roll_rad in the file, that.", option="--slope"
+    )
+    grip: float = setting(0.7, "Largest side force over load.", gt=0.0, le=1.5)
+    offset: float = setting(0.0, "Desired distance to the left of the path in m.", ge=-100.0, le=100.0)
+    stop: tuple[float, ...] = setting(
+        (), "Distances in m at which to stop for 3 s, by commas.", separated=True
+    )
+    point_std: float = setting(
+        0.0, "Standard deviation of the points in m: 0.02 for points of an RTK receiver.", ge=0.0, le=10.0
+    )
+
+    @field_validator("observer")
+    @classmethod
+    def _known_observer(cls, name: str) -> str:
+        if name not in SLIP_SOURCES:
+            raise ValueError(f"--observer is {name!r}; choose among {', '.join(SLIP_SOURCES)}")
+        return name
+
+    @field_validator("slope_deg")
+    @classmethod
+    def _possible_slope(cls, slope_deg: float) -> float:
+        return _within("--slope", slope_deg, MAX_SLOPE_DEG)
+
+    @field_validator("stop")
+    @classmethod
+    def _rising_stops(cls, stops: tuple[float, ...]) -> tuple[float, ...]:
+        ordered = all(a < b for a, b in zip((0.0, *stops), stops, strict=False))
+        if not ordered or not all(map(math.isfinite, stops)):
+            raise ValueError(f"--stop is {','.join(map(str, stops))}; rising distances above 0 are accepted")
+        return stops
+
+
+class Settings(PathSettings, FaultSettings, ComparisonSettings, DrivenSettings):
+    """What is driven: a comparison of controllers, sensor faults, or a path."""
+
+    @model_validator(mode="after")
+    def _one_mode(self) -> Settings:
+        """Refuse options that the mode would not use."""
+        if self.faults and self.path is not None:
+            raise ValueError("--faults and --path are two kinds of drives: give one of them")
+        if self.path is not None:
+            self._refuse(
+                (*ComparisonSettings.model_fields, "terrain", "table", "seeds", "jobs"), "without --path"
+            )
+        elif self.faults:
+            self._refuse((*ComparisonSettings.model_fields, "speed_mps"), "without --faults")
+        if not self.faults:
+            self._refuse(FaultSettings.model_fields, "with --faults NAME")
+        if self.path is None:
+            self._refuse(PathSettings.model_fields, "with --path FILE")
+        return self
+
+    def _refuse(self, names: object, accepted: str) -> None:
+        for name in names:  # type: ignore[attr-defined]
+            if getattr(self, name) != type(self).model_fields[name].default:
+                raise ValueError(f"{option_name(type(self), name)} is accepted {accepted}")
+
+    @property
+    def all_seeds(self) -> range:
+        """Seeds of the drives."""
+        n = self.seeds or (1 if self.faults else 20)
+        return range(self.first_seed, self.first_seed + n)
+
+
+def run(settings: Settings, progress: Progress) -> Result:
+    """Drive what the settings name, and write the page.
 
     Raises
     ------
+    ConfigError
+        if a controller, a situation, a fault or a path does not go with the robot.
     TerrainError
-        if one cannot be read, or the table is another robot's.
+        if a file cannot be read, or the folder cannot be written.
     """
-    robot = load_robot(settings.robot)
-    plant = None if settings.plant is None else load_robot(settings.plant)
-    return DriveInputs(robot, load_slip_table(settings.table, robot.name), plant=plant)
+    from terrain.files.atomic import ensure_writable
+
+    if settings.out is not None:
+        ensure_writable(settings.out)
+    mode = "path" if settings.path is not None else "faults" if settings.faults else "comparison"
+    result: Result = import_module(f"pipelines.drive.{mode}").run(settings, progress)
+    if settings.out is not None:
+        result.report.save(settings.out / PAGE_FILE)
+    return result
 
 
-def with_classifier(settings: DriveSettings, inputs: DriveInputs, progress: Progress = silent) -> DriveInputs:
-    """Return the inputs with the classifier of the settings, or a newly trained one, where one is needed."""
-    if not settings.needs_model:
-        return inputs
-    if settings.model is None:
-        return replace(inputs, model=train_classifier(inputs.robot, settings.first_seed, progress))
-    from pipelines.models.tracking import load_model
-
-    return replace(inputs, model=load_model(settings.model))
-
-
-def check_drive(settings: DriveSettings, inputs: DriveInputs) -> None:
-    """Refuse what cannot be driven.
-
-    Raises
-    ------
-    ConfigError
-        if a controller does not exist on the robot or the table, or the situation does not.
-    """
-    for controller in _controllers(settings, inputs, settings.controllers):
-        LivePilot(inputs.robot, controller.table, None, controller.pilot)
-    _situation(settings, inputs, settings.first_seed)
-
-
-def drive(settings: DriveSettings, inputs: DriveInputs, progress: Progress = silent) -> DriveResult:
-    """Drive all controllers at the same seeds, and evaluate them.
-
-    Parameters
-    ----------
-    settings : what is driven
-    inputs : robots, table, and the classifier where a controller needs one
-    progress : of the drives
-
-    Raises
-    ------
-    ConfigError
-        if a setting is not accepted.
-    """
-    check_drive(settings, inputs)
-    names = settings.controllers
-    controllers = _controllers(settings, inputs, [name for name in names if name != "ramp"])
-    for one in controllers:
-        if one.source is Source.CLASSIFIER and inputs.model is None:
-            raise ConfigError(f"controller {one.name!r} needs a classifier: give a model")
-    count = _counter(progress, settings.seeds * len(names))
-    drives = _drive_all(settings, inputs, controllers, count)
-    ramp_mps2 = None
-    if "ramp" in names:
-        ramp_mps2 = settings.ramp_mps2
-        if ramp_mps2 is None:
-            ramp_mps2 = _matching_ramp(settings, inputs, drives)
-        drives |= _drive_all(settings, inputs, _controllers(settings, inputs, ["ramp"], ramp_mps2), count)
-    for at_one_seed in zip(*drives.values(), strict=True):
-        energies = energy_at_equal_distance([one.energy for one in at_one_seed])
-        for one, energy in zip(at_one_seed, energies, strict=True):
-            one.metrics["energy_j_per_m"] = energy
-    rows = {name: tuple(one.metrics for one in drives[name]) for name in names}
-    return DriveResult(
-        scenario=settings.scenario,
-        terrain=settings.terrain,
-        robot=inputs.robot.name,
-        table=inputs.table.name,
-        seeds=tuple(_seeds(settings)),
-        delay_s=settings.delay_s,
-        grade_deg=settings.grade_deg,
-        ramp_mps2=ramp_mps2,
-        controllers={
-            name: {key: mean_interval([row[key] for row in rows[name]]) for key in rows[name][0]}
-            for name in names
-        },
-        rows=rows,
-    )
-
-
-def example_runs(settings: DriveSettings, inputs: DriveInputs, ramp_mps2: float | None) -> dict[str, RunLog]:
-    """Return the drive of each controller at the first seed."""
-    situation = _situation(settings, inputs, settings.first_seed)
-    return {
-        one.name: drive_once(inputs, one, situation, one.name)
-        for one in _controllers(settings, inputs, settings.controllers, ramp_mps2)
-    }
-
-
-def _seeds(settings: DriveSettings) -> range:
-    return range(settings.first_seed, settings.first_seed + settings.seeds)
-
-
-def _situation(
-    settings: DriveSettings, inputs: DriveInputs, seed: int, grade_deg: float | None = None
-) -> Situation:
-    options = SituationOptions(
-        duration_s=settings.duration_s,
-        speed_mps=settings.speed_mps,
-        accel_mps2=settings.accel_mps2,
-        grade_deg=settings.grade_deg if grade_deg is None else grade_deg,
-        radius_factors=settings.radius_factors,
-        leg_backlash_rad=settings.leg_backlash_rad,
-    )
-    return make_situation(settings.scenario, inputs.simulated, settings.terrain, seed, options)
-
-
-def _controllers(
-    settings: DriveSettings, inputs: DriveInputs, names: Sequence[str], ramp_mps2: float | None = None
-) -> list[Controller]:
-    ramp_mps2 = settings.ramp_mps2 if ramp_mps2 is None else ramp_mps2
-    ramp_mps2 = DEFAULT_RAMP_MPS2 if ramp_mps2 is None else ramp_mps2
-    return [make_controller(name, inputs.table, settings.delay_s, ramp_mps2) for name in names]
-
-
-def _counter(progress: Progress, total: int) -> Callable[[], None]:
-    """Return a function that reports one drive more."""
-    done = 0
-
-    def count() -> None:
-        nonlocal done
-        done += 1
-        progress("drive", done, total)
-
-    return count
-
-
-def _drive_all(
-    settings: DriveSettings,
-    inputs: DriveInputs,
-    controllers: Sequence[Controller],
-    count: Callable[[], None],
-) -> dict[str, list[Drive]]:
-    """Return the drives of each controller, one a seed, in as many processes as the settings say."""
-    from joblib import Parallel, delayed
-
-    jobs = [(controller, seed) for seed in _seeds(settings) for controller in controllers]
-    drives: dict[str, list[Drive]] = {controller.name: [] for controller in controllers}
-    pool = Parallel(n_jobs=max(min(settings.n_jobs, len(jobs)), 1), return_as="generator")
-    without_model = replace(inputs, model=None)  # which is large to send to another process
-    work = pool(
-        delayed(_drive_one)(
-            settings, inputs if controller.source is Source.CLASSIFIER else without_model, controller, seed
-        )
-        for controller, seed in jobs
-    )
-    for (controller, _), one in zip(jobs, work, strict=True):
-        drives[controller.name].append(one)
-        count()
-    return drives
-
-
-def _drive_one(settings: DriveSettings, inputs: DriveInputs, controller: Controller, seed: int) -> Drive:
-    situation = _situation(settings, inputs, seed)
-    run = drive_once(inputs, controller, situation)
-    history = drive_history(run, inputs.simulated, situation.conditions.radius_factors)
-    adapting_to = controller.table if controller.adapts else None
-    metrics = evaluate_drive(run, history, inputs.simulated, situation, adapting_to)
-    if settings.scenario == SLOPE:
-        metrics["steepest_deg"] = steepest(settings, inputs, controller, seed)
-    return Drive(metrics, energy_curve(history, situation.scenario))
-
-
-def steepest(settings: DriveSettings, inputs: DriveInputs, controller: Controller, seed: int) -> float:
-    """Return the steepest grade in degrees that a controller climbs, by bisection."""
-    low, high = -STEEPEST_DEG, STEEPEST_DEG
-    for _ in range(SLOPE_STEPS):
-        middle = (low + high) / 2
-        truth = drive_once(inputs, controller, _situation(settings, inputs, seed, middle)).streams["truth"]
-        last = truth.time_s > truth.time_s[-1] - 1.0
-        climbs = truth.channel("speed_x_mps")[last].mean() > CLIMBING_MPS
-        low, high = (middle, high) if climbs else (low, middle)
-    return low
-
-
-def _matching_ramp(
-    settings: DriveSettings, inputs: DriveInputs, drives: Mapping[str, Sequence[Drive]]
-) -> float:
-    """Return the ramp that travels as far as the first reference among the controllers, at the same seeds."""
-    references = [name for kind in REFERENCES for name in drives if name in (kind, f"{kind}{TRACK}")]
-    references += [name for name in drives if name.startswith(("known:", "target:"))]
-    if not references:
-        return DEFAULT_RAMP_MPS2
-    key = f"distance_{START_TIME_S:g}s_m" if settings.scenario == STARTS else "distance_m"
-
-    def distance_m(found: Sequence[Drive]) -> float:
-        return float(np.mean([one.metrics[key] for one in found]))
-
-    desired_m = distance_m(drives[references[0]])
-    low = LEAST_RAMP_MPS2
-    high = 2.0 * settings.accel_mps2 if math.isfinite(settings.accel_mps2) else MOST_RAMP_MPS2
-    for _ in range(RAMP_STEPS):
-        middle = math.sqrt(low * high)
-        ramp = _controllers(settings, inputs, ["ramp"], middle)
-        short = distance_m(_drive_all(settings, inputs, ramp, lambda: None)["ramp"]) < desired_m
-        low, high = (middle, high) if short else (low, middle)
-    return math.sqrt(low * high)
+def _within(option: str, angle_deg: float, most_deg: float) -> float:
+    if not abs(angle_deg) <= most_deg:
+        raise ValueError(f"{option} is {angle_deg:g}; {-most_deg:g} to {most_deg:g} degrees are accepted")
+    return angle_deg

@@ -8,10 +8,9 @@ from dataclasses import replace
 import numpy as np
 
 from features.windows import Layout, cut_windows, layout_of
-from pipelines.estimate.labelled import RUNS_A_TERRAIN, SCENARIO
 from pipelines.learn.protocols import labelled
 from pipelines.learn.recipes import recipe_of
-from pipelines.learn.settings import RecipeSettings
+from pipelines.learn.settings import FEATURE_RECIPE, LearnSettings
 from pipelines.report import Progress, silent
 from terrain.discrepancy.filter_gain import Comparison, accuracy_change
 from terrain.errors import DataError, TerrainError
@@ -21,6 +20,9 @@ from terrain.records import Array, RunLog, Windows
 from terrain.robots import Robot
 from terrain.simulation.run import simulate_run
 from terrain.terramechanics.soil import soil_names
+
+RUNS_A_TERRAIN, SCENARIO = 6, "survey"
+"""Simulated runs that the classifier is trained on."""
 
 MIN_RUNS, MIN_TERRAINS = 4, 2
 """Least numbers of held-out runs and known terrains for an accuracy."""
@@ -48,10 +50,10 @@ def classifier_gain(
     seed : of simulation, inner folds and bootstrap
     runs_a_terrain : simulated on each
     """
-    settings = RecipeSettings(seed=seed)
+    settings = LearnSettings(seed=seed)
     known = [run for run in held_out if len(run.terrains) == 1 and run.terrains[0] in soil_names()]
     terrains = tuple(sorted({run.terrains[0] for run in known}))
-    unknown = Comparison(settings.recipe, None, len(known), {}, terrains)
+    unknown = Comparison(FEATURE_RECIPE, None, len(known), {}, terrains)
     if len(terrains) < MIN_TERRAINS:
         plural = "s" * (len(terrains) != 1)
         return unknown._replace(
@@ -82,18 +84,18 @@ def classifier_gain(
 
 
 def _correct_windows(
-    trained: Sequence[RunLog], known: Sequence[RunLog], settings: RecipeSettings
+    trained: Sequence[RunLog], known: Sequence[RunLog], settings: LearnSettings
 ) -> tuple[Array, Array]:
     """Return which windows (n,) of the known runs are classified correctly, and their runs (n,)."""
     layout = _shared_layout(trained, known, settings)
     train, test = (_windows(runs, settings, layout) for runs in (trained, known))
-    recipe = recipe_of(settings, settings.recipe)
+    recipe = recipe_of(settings)
     recipe.fit(train, train.terrain.astype(str))
     predicted = np.asarray(recipe.predict(test)).astype(str)
     return predicted == test.terrain.astype(str), test.run_id.astype(str)
 
 
-def _shared_layout(trained: Sequence[RunLog], known: Sequence[RunLog], settings: RecipeSettings) -> Layout:
+def _shared_layout(trained: Sequence[RunLog], known: Sequence[RunLog], settings: LearnSettings) -> Layout:
     """Return the channels that simulated and measured runs both have."""
     own, theirs = (layout_of(runs, SIGNAL_SETS, speeds=True) for runs in (trained, known))
     channels = {
@@ -106,5 +108,5 @@ def _shared_layout(trained: Sequence[RunLog], known: Sequence[RunLog], settings:
     return Layout(channels, {stream: own.rate_hz[stream] for stream in channels})
 
 
-def _windows(runs: Sequence[RunLog], settings: RecipeSettings, layout: Layout) -> Windows:
+def _windows(runs: Sequence[RunLog], settings: LearnSettings, layout: Layout) -> Windows:
     return labelled(cut_windows(runs, settings.rule, layout=layout, skip_short=True)).windows

@@ -34,11 +34,9 @@ COMMANDS = (
         "find-changes",
         "fit-soil",
         "drive",
-        "faults",
         "can",
         "explain",
         "quickstart",
-        "track",
     ),
     *("replay", "label", "serve"),
 )
@@ -252,9 +250,9 @@ CASES: tuple[Case, ...] = (
     Case(
         "faults",
         steps(
-            "faults --faults loss_odometry,late_30ms_imu --situations steady --durations 3 --seed 3 --jobs 1 "
+            "drive --faults loss_odometry,late_30ms_imu --situations steady --durations 3 --seed 3 --jobs 1 "
             "--out page",
-            refused("faults --faults broken"),
+            refused("drive --faults broken"),
         ),
     ),
     Case(
@@ -333,7 +331,7 @@ CASES: tuple[Case, ...] = (
             refused("serve --model models:/field@champion --robot husky --port 0 --check"),
             refused("serve --model models:/field@champion --host 0.0.0.0 --port 0"),
             refused("serve --model nowhere --port 0"),
-            "drive --scenario starts --terrain grass --controllers plain,learned --seeds 2 --jobs 1 "
+            "drive --scenario starts --terrain grass --controllers plain,classified --seeds 2 --jobs 1 "
             "--model models:/field@champion",
         ),
     ),
@@ -343,18 +341,18 @@ CASES: tuple[Case, ...] = (
             f"simulate {SLIPPING} --out pull",
             "learn-slip --data pull --robot agrimaro --out table.yaml --figures figures",
             "drive --scenario starts --terrain grass --table table.yaml --seeds 2 --jobs 1 --out page "
-            "--controllers plain,ramp,thesis,fixed,oracle,told:grass,target:0.3,oracle+track",
+            "--controllers plain,ramp,thesis,fallback,true_terrain,known:grass,target:0.3,true_terrain+track",
         ),
     ),
     Case(
         "drive",
         steps(
-            "drive --scenario course --terrain course --controllers plain,fixed,told:clay --seeds 2 --jobs 1",
-            "drive --scenario slope --terrain dry_sand --controllers plain,oracle --seeds 2 --jobs 1",
-            "drive --scenario circle --terrain tiles --radius 1,1.02,1 --leg-play 0.02 "
-            "--controllers plain,oracle,oracle+track --seeds 2 --jobs 1",
+            "drive --scenario course --terrain course --controllers plain,fallback,known:clay --seeds 2 --jobs 1",
+            "drive --scenario slope --terrain dry_sand --controllers plain,true_terrain --seeds 2 --jobs 1",
+            "drive --scenario circle --terrain tiles --radius 1,1.02,1 --leg-backlash 0.02 "
+            "--controllers plain,true_terrain,true_terrain+track --seeds 2 --jobs 1",
             "drive --scenario brake --terrain wet_floor --grade -5 --ramp 0.4 --seeds 2 "
-            "--controllers plain,ramp,oracle --seed 7 --jobs 1",
+            "--controllers plain,ramp,true_terrain --seed 7 --jobs 1",
         ),
     ),
     Case(
@@ -432,12 +430,12 @@ CASES: tuple[Case, ...] = (
     Case(
         "track",
         steps(
-            "track --robot adap2e --path path.csv --speed 2 --stop 6 --out page",
-            "track --robot adap2e --path path.csv --speed 3 --observer none --slope 10 --out plain",
-            refused("track --robot husky --path path.csv"),
-            refused("track --robot adap2e --path short.csv"),
-            refused("track --robot adap2e --path path.csv --observer nothing"),
-            refused("track --robot adap2e --path path.csv --slope 50"),
+            "drive --robot adap2e --path path.csv --speed 2 --stop 6 --out page",
+            "drive --robot adap2e --path path.csv --speed 3 --observer none --slope 10 --out plain",
+            refused("drive --robot husky --path path.csv"),
+            refused("drive --robot adap2e --path short.csv"),
+            refused("drive --robot adap2e --path path.csv --observer nothing"),
+            refused("drive --robot adap2e --path path.csv --slope 50"),
         ),
         lambda: {"path.csv": PATH_POINTS.encode(), "short.csv": b"x_m,y_m\n0,0\n1,0\n1,0\n"},
     ),

@@ -7,8 +7,14 @@ from functools import cache
 import numpy as np
 import pytest
 
-from pipelines.faults.drives import FaultInputs, Place, drive_case, drive_references, evaluate_case
-from pipelines.faults.results import FaultCase
+from pipelines.drive.faults import (
+    FaultCase,
+    FaultInputs,
+    Place,
+    drive_case,
+    drive_references,
+    evaluate_case,
+)
 from pipelines.live.pilot import LivePilot
 from pipelines.live.terrain_source import TerrainEstimate
 from terrain.control.fault_evaluation import LIMITS

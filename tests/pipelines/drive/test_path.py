@@ -1,4 +1,4 @@
-"""``terrain track``: a path of the user is followed and judged, and wrong input is one sentence."""
+"""`terrain drive --path`: a path of the user is followed and judged, and wrong input is one sentence."""
 
 from __future__ import annotations
 
@@ -7,14 +7,17 @@ import json
 import numpy as np
 import pytest
 
-from pipelines.reporting.json_file import as_json
-from pipelines.track import settings as settings_module
-from pipelines.track.path_file import read_path
-from pipelines.track.settings import TrackSettings
-from pipelines.track.track import track
+from pipelines.drive.drive import SLIP_SOURCES, Settings, run
+from pipelines.drive.path_file import read_path
+from pipelines.report import silent
+from pipelines.report.json_file import as_json
 from terrain.control.car_following import SlipSource
 from terrain.control.paths import ROLL
 from terrain.errors import ConfigError, TerrainError
+
+
+def follow(**settings):
+    return run(Settings(robot="adap2e", **settings), silent)
 
 
 def bend(n=80, radius=12.0):
@@ -30,16 +33,13 @@ def path_csv(tmp_path):
 
 
 def test_names_of_observers_are_those_of_the_controller():
-    assert tuple(SlipSource) == settings_module.SLIP_SOURCES
+    assert tuple(SlipSource) == SLIP_SOURCES
 
 
 @pytest.mark.parametrize("observer", ["multi-grip", "dynamic"])
 def test_a_path_is_followed_and_written(path_csv, tmp_path, observer):
     out = tmp_path / "out"
-    settings = TrackSettings(
-        robot="adap2e", path=path_csv, speed=3.0, slope_deg=5.0, observer=observer, out=out
-    )
-    result = track(settings)
+    result = follow(path=path_csv, slope_deg=5.0, observer=observer, out=out)
     assert result.reached_end
     assert result.within_limit
     assert result.lateral_max_m < result.limit_m == pytest.approx(0.3)
@@ -48,18 +48,17 @@ def test_a_path_is_followed_and_written(path_csv, tmp_path, observer):
     document = as_json(result)
     assert json.loads(json.dumps(document, allow_nan=False)) == document
     assert sum(result.statuses["steering"].values()) == sum(result.statuses["observer"].values())
-    page = result.report.read_text(encoding="utf-8")
-    assert "within a tenth of the speed" in page
+    assert "within a tenth of the speed" in result.page.read_text(encoding="utf-8")
+    assert [section.title for section in result.report.details][1] == "What the observer gave"
     table = np.genfromtxt(out / "drive.csv", delimiter=",", names=True)
     assert table["lateral_m"].size == sum(result.statuses["path"].values())
     assert np.abs(table["lateral_m"]).max() == pytest.approx(result.lateral_max_m, rel=1e-4)
 
 
 def test_an_offset_and_a_stop(path_csv, tmp_path):
-    settings = TrackSettings(
-        robot="adap2e", path=path_csv, speed=2.0, offset=1.0, stop=(12.0,), out=tmp_path / "out"
-    )
-    result = track(settings)
+    result = follow(path=path_csv, speed_mps=2.0, offset=1.0, stop=(12.0,))
+    assert (result.page, result.files, list(tmp_path.iterdir())) == (None, (), [path_csv])
+    assert len(result.to_pandas()) == sum(result.statuses["path"].values())
     assert result.lateral_max_m < 0.2
     assert result.duration_s > 24.0 / 2.0 + 3.0
 
@@ -67,7 +66,7 @@ def test_an_offset_and_a_stop(path_csv, tmp_path):
 def test_a_path_too_tight_is_driven_and_named(tmp_path):
     file = tmp_path / "tight.csv"
     np.savetxt(file, bend(radius=1.5, n=60), delimiter=";")
-    result = track(TrackSettings(robot="adap2e", path=file, speed=1.0, out=tmp_path / "out"))
+    result = follow(path=file, speed_mps=1.0)
     assert "curvature is 0.6" in result.warnings[0]
     assert any("limit" in warning for warning in result.warnings)
 
@@ -114,14 +113,15 @@ def test_bytes_and_folders_are_no_path(tmp_path):
     ("changed", "message"),
     [
         ({"robot": "husky"}, "only 'bicycle' can"),
-        ({"speed": 30.0}, "at most 8 m/s"),
-        ({"speed": 0.0}, "--speed"),
+        ({"speed_mps": 30.0}, "at most 8 m/s"),
+        ({"speed_mps": 0.0}, "--speed"),
         ({"observer": "x"}, "--observer is 'x'"),
         ({"slope_deg": 60.0}, "--slope is 60"),
         ({"stop": (5.0, 3.0)}, "--stop"),
+        ({"terrain": "snow"}, "--terrain is accepted without --path"),
     ],
 )
 def test_settings_that_cannot_be_are_one_sentence(path_csv, tmp_path, changed, message):
     values = {"robot": "adap2e", "path": path_csv, "out": tmp_path / "out"} | changed
     with pytest.raises(ConfigError, match=message):
-        track(TrackSettings(**values))
+        run(Settings(**values), silent)

@@ -81,7 +81,7 @@ def is_finite(command: Command) -> bool:
     return all(row.shape == (3,) and bool(np.isfinite(row).all()) for row in rows)
 
 
-def blamed_sensors(
+def named_sensors(
     health: list[dict[str, str] | None], acts: list[bool], step_s: float
 ) -> dict[str, str] | None:
     """Return the sensors that were named as other than fresh, with how, for :data:`NAMED_S` at least.
@@ -94,7 +94,7 @@ def blamed_sensors(
 
     Examples
     --------
-    >>> blamed_sensors([{"imu": "fresh"}, {"imu": "lost"}, {"imu": "lost"}], [True] * 3, step_s=0.05)
+    >>> named_sensors([{"imu": "fresh"}, {"imu": "lost"}, {"imu": "lost"}], [True] * 3, step_s=0.05)
     {'imu': 'lost'}
     """
     named = [each for each, acting in zip(health, acts, strict=True) if acting]

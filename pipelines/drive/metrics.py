@@ -1,12 +1,12 @@
-"""Labels of metrics, controllers and scenarios, as the page shows them."""
+"""What the metrics of a drive are called, which of them a scenario is about, and how differences are written."""
 
 from __future__ import annotations
 
 import re
 from typing import NamedTuple
 
-from pipelines.drive.controller_names import TRACK
-from pipelines.reporting.numbers import NBSP, NOT_KNOWN, format_number
+from pipelines.report import format_value
+from pipelines.report.numbers import MINUS, NBSP
 
 LABELS = {
     "energy_j_per_m": ("energy per metre", "J/m"),
@@ -64,31 +64,6 @@ WHERE_ANY = ("immobilised", "lock_s")
 ADAPTATION = ("adapt_s", "adapted_ratio")
 """Metrics of controllers whose target follows the terrain; another's may be close to the target by chance."""
 
-_CONTROLLERS = {
-    "plain": "The wheel speeds of the kinematics; slip is not used.",
-    "ramp": "As plain, with a speed that rises by no more than {ramp}.",
-    "thesis": "The thesis' PID of slip on each wheel, with the target of the table's fallback.",
-    "thesis:classified": "The thesis' PID of slip on each wheel, with the targets of the terrain that a "
-    "classifier recognises while driving: the chain of the thesis.",
-    "thesis:true_terrain": "The thesis' PID of slip on each wheel, with the targets of the true terrain.",
-    "fallback": "Traction control: one speed for all wheels, limited while it rises; the target is that of "
-    "the table's fallback.",
-    "classified": "Traction control with the target of the terrain that a classifier recognises while "
-    "driving.",
-    "true_terrain": "Traction control with the target of the true terrain: the limit for a classifier "
-    "without error.",
-}
-
-SCENARIOS = {
-    "starts": "Stand, start, hold the speed, stop: three times. Metrics of a start are means of the second "
-    "and third, when the slip of steady motion is known; those of the first are listed beside them in the "
-    "table.",
-    "brake": "Drive, and stop as fast as possible.",
-    "slope": "Uphill; the steepest grade is searched for at each seed.",
-    "course": "All terrains one after the other.",
-    "mixed": "Terrains in any order, and no camera for three seconds.",
-}
-
 
 class Label(NamedTuple):
     """Name of a metric, and its unit or nothing."""
@@ -131,20 +106,6 @@ def metrics_of_scenario(scenario: str) -> tuple[str, ...]:
     return (*_OF_SCENARIO.get(scenario, _GENERAL), "immobilised")
 
 
-def controller_text(name: str, ramp_mps2: float | None) -> str:
-    """Return a sentence on a controller."""
-    bare, track, _ = name.partition(TRACK)
-    if track:
-        return f"{controller_text(bare, ramp_mps2)} With path tracking."
-    kind, _, given = name.partition(":")
-    if kind == "known" and given:
-        return f"Traction control with the target of {given} on every terrain."
-    if kind == "target" and given:
-        return f"Traction control with a target slip of {given}."
-    ramp = "a bound" if ramp_mps2 is None else f"{format_number(ramp_mps2)} m/s²"
-    return _CONTROLLERS.get(name, NOT_KNOWN).format(ramp=ramp)
-
-
 def signed_difference(difference: float, key: str) -> str:
     r"""Return a difference with its sign: as a percentage, or in the metric's unit.
 
@@ -155,10 +116,9 @@ def signed_difference(difference: float, key: str) -> str:
     """
     if key in ABSOLUTE:
         unit = metric_label(key).unit
-        text = format_number(abs(difference)) + (unit if unit == "°" else f"{NBSP}{unit}" if unit else "")
+        text = format_value(abs(difference)) + (unit if unit == "°" else f"{NBSP}{unit}" if unit else "")
     else:
-        percentage = abs(100.0 * difference)
-        text = f"{percentage:.0f}{NBSP}%" if percentage >= 9.95 else f"{percentage:.1f}{NBSP}%"
+        text = format_value(abs(difference), ".1%")
     if not re.search("[1-9]", text):
         return text
-    return ("+" if difference > 0.0 else "\N{MINUS SIGN}") + text
+    return ("+" if difference > 0.0 else MINUS) + text

@@ -1,4 +1,4 @@
-"""`terrain faults`: drives with sensor faults, their table and page, and what is refused."""
+"""`terrain drive --faults`: drives with sensor faults, their report, and what is refused."""
 
 import json
 import math
@@ -10,15 +10,24 @@ import numpy as np
 import pytest
 
 from pipelines.cli import main as cli
-from pipelines.faults.drives import FaultInputs, Place, drive_case, drive_references, evaluate_case
-from pipelines.faults.faults import drawn_cases, faults, faults_robot
-from pipelines.faults.guard import GuardedPilot, blamed_sensors
-from pipelines.faults.results import FaultCase
-from pipelines.faults.settings import FaultsSettings
-from pipelines.faults.tables import details, overview
+from pipelines.drive.drive import Settings
+from pipelines.drive.faults import (
+    FaultCase,
+    FaultInputs,
+    Place,
+    bars_text,
+    checked_robot,
+    drawn_cases,
+    drive_case,
+    drive_faults,
+    drive_references,
+    evaluate_case,
+    fault_figure,
+)
+from pipelines.drive.guard import GuardedPilot, named_sensors
 from pipelines.live.pilot import LivePilot
 from pipelines.live.pilot_settings import PilotSettings
-from pipelines.reporting.json_file import as_json
+from pipelines.report.json_file import as_json
 from terrain.control.drive_metrics import drive_history, stopping_distance
 from terrain.control.fault_evaluation import BARS, RATIO_ABOVE_MPS, fault_drive, fault_figures
 from terrain.control.fault_situations import FAULT_SITUATIONS, make_fault_situation
@@ -32,7 +41,7 @@ from terrain.simulation.dynamic.simulate import simulate
 ROBOT = load_robot("agrimaro")
 INPUTS = FaultInputs(ROBOT, load_slip_table())
 TABLE = Path(__file__).resolve().parents[3] / "data" / "target_slip" / "default.yaml"
-FEW = FaultsSettings(
+FEW = Settings(
     faults="loss_odometry,duplicates_imu", situations="steady", durations_s="3,inf", first_seed=400, jobs=1
 )
 
@@ -43,7 +52,7 @@ def terrain(monkeypatch, capsys, tmp_path):
     monkeypatch.chdir(tmp_path)
 
     def run(*words):
-        monkeypatch.setattr(sys, "argv", ["terrain", "faults", *map(str, words)])
+        monkeypatch.setattr(sys, "argv", ["terrain", "drive", *map(str, words)])
         try:
             cli.main()
             code = 0
@@ -94,7 +103,7 @@ def test_a_drive_by_plain_commands_is_evaluated_from_its_log(name):
 
 @pytest.fixture(scope="module")
 def few():
-    return faults(FEW, INPUTS)
+    return drive_faults(FEW, INPUTS)
 
 
 def test_a_lost_camera_ends_ok_late_and_duplicates_cost_nothing(few):
@@ -119,7 +128,7 @@ def test_a_lost_camera_ends_ok_late_and_duplicates_cost_nothing(few):
 
 @pytest.mark.slow
 def test_the_result_does_not_depend_on_the_number_of_processes(few):
-    two = faults(FEW.with_(jobs=2), INPUTS)
+    two = drive_faults(FEW.with_(jobs=2), INPUTS)
     assert json.dumps(as_json(few), allow_nan=False) == json.dumps(as_json(two), allow_nan=False)
 
 
@@ -132,15 +141,24 @@ def test_before_a_fault_begins_the_drive_is_the_clean_one():
     assert not np.array_equal(drive.slip_ratio, clean.slip_ratio, equal_nan=True)
 
 
-def test_the_cells_of_the_table_name_what_is_not_met(few):
-    by_fault = {row.fault: row for row in overview(few)}
-    assert by_fault["duplicates_imu"].cells == ("met",)
-    lost = [row for row in few.rows if row.case.fault == "loss_odometry"]
-    assert (by_fault["loss_odometry"].cells == ("met",)) == (not any(row.unmet for row in lost))
-    assert [row.duration for row in details(few)] == ["3 s", "for good"] * 2
-    drawn = drawn_cases(FEW.with_(draw="duplicates"), few)
+def test_the_report_counts_what_is_met_and_names_what_is_not(few):
+    duplicates, lost = (
+        [row for row in few.rows if row.case.fault == name] for name in ("duplicates_imu", "loss_odometry")
+    )
+    assert bars_text(duplicates) == "met"
+    unmet = any(row.unmet for row in lost)
+    assert (bars_text(lost) == "met") == (not unmet)
+    answer = few.report.answer
+    assert answer.startswith(f"{few.n_met} of 4 drives with a sensor fault meet all bars")
+    assert ("not met with loss_odometry" in answer) == unmet
+    assert [row[1:4] for row in few.report.parts[0].rows] == [bar[1:] for bar in few.bars.values()]
+    drawn = drawn_cases(FEW.with_(draw="duplicates"), few.rows)
     assert drawn == [FaultCase("duplicates_imu", math.inf, "steady", "grass", 400)]
-    assert all(case.fault == "loss_odometry" for case in drawn_cases(FEW, few))
+    assert all(case.fault == "loss_odometry" for case in drawn_cases(FEW, few.rows))
+    references = drive_references(INPUTS, Place(*drawn[0][2:]))
+    figure = fault_figure(drawn[0], drive_case(INPUTS, drawn[0]), references)
+    assert figure.title == "duplicates_imu, for good: steady on grass, seed 400"
+    assert figure.panels[0].marks[0].spans[0][0] == references.start_s
 
 
 class FakePilot:
@@ -193,9 +211,9 @@ class Health(Enum):
 @pytest.mark.parametrize("health", [{"imu": "lost"}, lambda: {"imu": Health.LOST, "wheels": Health.FRESH}])
 def test_the_sensors_that_a_pilot_names_are_recorded(health):
     guarded, _ = driven(FakePilot(health=health))
-    assert blamed_sensors(guarded.health, [True] * 6, 0.02) == {"imu": "lost"}
-    assert blamed_sensors(guarded.health, [True] * 4 + [False] * 2, 0.02) == {}  # for 0.08 s
-    assert blamed_sensors(driven(FakePilot())[0].health, [True] * 6, 0.02) is None
+    assert named_sensors(guarded.health, [True] * 6, 0.02) == {"imu": "lost"}
+    assert named_sensors(guarded.health, [True] * 4 + [False] * 2, 0.02) == {}  # for 0.08 s
+    assert named_sensors(driven(FakePilot())[0].health, [True] * 6, 0.02) is None
 
 
 def test_an_exception_of_the_pilot_shows_in_its_row(monkeypatch):
@@ -224,8 +242,7 @@ def test_the_command_writes_table_json_and_page(terrain):
         *("--out", "page", "--draw", "loss_wheels"),
     )
     assert code == 0, err
-    assert "loss_wheels" in out
-    assert "rows meet all bars" in out
+    assert "drives with a sensor fault meet all bars" in out
     document = json.loads(Path("faults.json").read_text())
     assert document["n_rows"] == len(document["rows"]) == 8
     row = document["rows"][0]
@@ -234,10 +251,9 @@ def test_the_command_writes_table_json_and_page(terrain):
     assert document["n_met"] == sum(row["is_met"] for row in document["rows"])
     assert row["stop_ratio"] > 1.0
     assert document["seeds"] == [403, 404]
-    page = Path("page/faults.html").read_text()
+    page = Path("page/report.html").read_text()
     assert page.count("<figure") == 2
     assert "no sample arrives" in page
-    assert len(list(Path("page/figures").glob("*.png"))) == 2
 
 
 @pytest.mark.slow
@@ -267,17 +283,17 @@ def test_without_a_table_targets_are_learned(terrain):
     ("sentence", "words"),
     [
         ("fault 'lost' is unknown: use a kind (loss, freeze", ("--faults", "lost")),
-        ("fault 'x' is unknown", ("--draw", "x")),
+        ("fault 'x' is unknown", ("--faults", "all", "--draw", "x")),
         ("--draw has 'loss_imu', which is not among", ("--faults", "step", "--draw", "loss_imu")),
-        ("situation 'go' is unknown: use start, stop, steady", ("--situations", "go")),
-        ("soil 'moon' is unknown", ("--terrain", "moon")),
-        ("soil 'moon' is unknown", ("--stop-terrain", "moon")),
-        ("--durations has 0; times above 0 s", ("--durations", "0")),
-        ("--durations is 'long'", ("--durations", "long")),
-        ("one of each at least is required", ("--situations", ",")),
-        ("start, start: one is named twice", ("--situations", "start,start")),
-        ("--seeds is 0", ("--seeds", 0)),
-        ("only 'swerve' has", ("--robot", "husky")),
+        ("situation 'go' is unknown: use start, stop, steady", ("--faults", "all", "--situations", "go")),
+        ("soil 'moon' is unknown", ("--faults", "all", "--terrain", "moon")),
+        ("soil 'moon' is unknown", ("--faults", "all", "--stop-terrain", "moon")),
+        ("--durations has 0; times above 0 s", ("--faults", "all", "--durations", "0")),
+        ("--durations is 'long'", ("--faults", "all", "--durations", "long")),
+        ("one of each at least is required", ("--faults", "all", "--situations", ",")),
+        ("start, start: one is named twice", ("--faults", "all", "--situations", "start,start")),
+        ("--seeds is 0", ("--faults", "all", "--seeds", 0)),
+        ("only 'swerve' has", ("--faults", "all", "--robot", "husky")),
     ],
 )
 def test_what_cannot_be_driven_is_refused_in_a_sentence(terrain, sentence, words):
@@ -291,4 +307,4 @@ def test_what_cannot_be_driven_is_refused_in_a_sentence(terrain, sentence, words
 def test_a_wrong_name_lists_the_kinds():
     kinds = r"^fault 'lost' is unknown: use a kind \(loss, .*clock\) or one .* as loss_wheels$"
     with pytest.raises(ConfigError, match=kinds):
-        faults_robot(FaultsSettings(faults="lost"))
+        checked_robot(Settings(faults="lost"))

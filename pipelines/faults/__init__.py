@@ -1,1 +1,0 @@
-"""``terrain faults``: sensor faults in the closed loop, and what the controller makes of each."""

@@ -1,1 +1,0 @@
-"""``terrain track``: a car-like robot follows a path of the user in simulation."""

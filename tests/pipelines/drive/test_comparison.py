@@ -1,0 +1,394 @@
+"""`terrain drive`: controllers at equal conditions, what their report states, and what is refused."""
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipelines.drive import controllers
+from pipelines.drive.comparison import (
+    DriveResult,
+    belief_notes,
+    compare,
+    difference,
+    shown_metrics,
+    steepest,
+)
+from pipelines.drive.controller_names import CONTROLLERS
+from pipelines.drive.controllers import DriveInputs, drive_once, make_controller
+from pipelines.drive.drive import Settings
+from pipelines.drive.run_curves import drive_curves, run_figures
+from pipelines.live.pilot_settings import PilotStatus
+from pipelines.live.terrain_source import TerrainEstimate
+from pipelines.models.model_files import TerrainModel
+from pipelines.report import NOT_KNOWN
+from pipelines.report.json_file import as_json
+from pipelines.report.terminal import terminal_text
+from terrain.control.comparison import mean_interval
+from terrain.control.drive_evaluation import (
+    METRICS,
+    EnergyCurve,
+    energy_at_equal_distance,
+    evaluate_drive,
+)
+from terrain.control.drive_metrics import drive_history
+from terrain.control.power_state import DriveState
+from terrain.control.situations import make_situation
+from terrain.control.slip_table import CurveEntry, SlipTable, load_slip_table
+from terrain.errors import ConfigError
+from terrain.records import RunLog, Stream
+from terrain.robots import load_robot
+
+SHORT = Settings(
+    scenario="straight",
+    controllers=("plain", "target:0.15"),
+    seeds=2,
+    first_seed=300,
+    duration_s=6.0,
+    jobs=1,
+)
+ALL = SHORT.with_(controllers=("plain", "ramp", "thesis", "fallback", "true_terrain+track", "known:clay"))
+ROBOT, TABLE = load_robot("agrimaro"), load_slip_table()
+INPUTS = DriveInputs(ROBOT, TABLE)
+
+
+@pytest.mark.slow
+def test_the_result_does_not_depend_on_the_number_of_processes():
+    one, two = (compare(ALL.with_(duration_s=3.0, jobs=n), INPUTS) for n in (1, 2))
+    assert json.dumps(as_json(one), allow_nan=False) == json.dumps(as_json(two), allow_nan=False)
+
+
+@pytest.mark.slow
+def test_every_controller_has_every_metric():
+    result = compare(ALL, INPUTS)
+    assert tuple(result.controllers) == ALL.controllers
+    for metrics in result.controllers.values():
+        assert set(METRICS) <= set(metrics)
+        assert metrics["energy_j_per_m"].n == metrics["distance_m"].n == 2
+        low, high = metrics["distance_m"].ci
+        assert low < metrics["distance_m"].mean < high
+    ramp, track = (result.controllers[name]["distance_m"].mean for name in ("ramp", "true_terrain+track"))
+    assert ramp == pytest.approx(track, rel=0.01)  # the ramp travels as far
+
+
+def test_one_controller_alone_is_driven():
+    for name in ("ramp", "thesis"):
+        found = compare(SHORT.with_(controllers=(name,), seeds=1), INPUTS)
+        assert found.controllers[name]["distance_m"].mean > 2.0
+        assert found.controllers[name]["distance_m"].ci is None
+
+
+def test_energy_is_compared_over_the_distance_that_all_travelled():
+    energy = np.array([0.0, 100.0, 300.0])
+    fast, slow, stuck = (
+        EnergyCurve(np.array(distance_m), energy)
+        for distance_m in ([0.0, 4.0, 8.0], [0.0, 3.0, 6.0], [0.0, 0.5, 1.0])
+    )
+    found = energy_at_equal_distance([fast, slow, stuck])
+    assert found == pytest.approx([200.0 / 6.0, 300.0 / 6.0, math.nan], nan_ok=True)
+
+
+@pytest.mark.slow
+def test_traction_control_starts_gently_in_any_direction():
+    situation = make_situation("starts", ROBOT, "grass", 301)
+    peaks = {}
+    for angle in (0.0, 0.25 * math.pi, 0.5 * math.pi, math.pi):
+        speed = situation.scenario.twist[:, 0]
+        twist = np.column_stack([speed * math.cos(angle), speed * math.sin(angle), np.zeros(len(speed))])
+        turned = situation._replace(scenario=replace(situation.scenario, twist=twist))
+        for name in ("plain", "fallback"):
+            run = drive_once(INPUTS, make_controller(name, TABLE, 0.05), turned)
+            history = drive_history(run, ROBOT, turned.conditions.radius_factors)
+            peaks[name, angle] = evaluate_drive(run, history, ROBOT, turned)["slip_peak"]
+        assert peaks["plain", angle] > 1.6 * peaks["fallback", angle], angle
+    assert peaks["fallback", 0.5 * math.pi] == pytest.approx(peaks["fallback", 0.0], rel=0.15)
+
+
+def test_a_drive_with_path_tracking_keeps_its_heading():
+    names = ("fallback", "fallback+track")
+    settings = SHORT.with_(controllers=names, duration_s=15.0, leg_backlash_rad=0.02)
+    result = compare(settings, INPUTS)
+    free, tracked = (result.controllers[name]["yaw_drift_rad"].mean for name in names)
+    assert tracked < 0.2 * free
+
+
+def test_sliding_back_is_negative_distance():
+    settings = SHORT.with_(terrain="snow", grade_deg=28.0, controllers=("plain",), seeds=1)
+    metrics = compare(settings, INPUTS).controllers["plain"]
+    assert metrics["distance_m"].mean < 0.0
+    assert metrics["final_speed_mps"].mean < 0.0
+    assert metrics["immobilised"].mean >= 1
+
+
+def test_the_steepest_grade_is_found():
+    settings = Settings(scenario="slope", terrain="dry_sand", controllers=("plain",), duration_s=8.0)
+    assert 8.0 < steepest(settings, INPUTS, make_controller("plain", TABLE, 0.05), 302) < 20.0
+
+
+class Scripted:
+    """A source that gives one output every 2 s, and refuses a window in between."""
+
+    certain = settled = False
+
+    def __init__(self, terrain, probability):
+        self.output, self.n_refused, self.next_s = (terrain, probability), 0, 2.0
+
+    def update(self, sample, estimates):
+        if sample.time_s < self.next_s:
+            return []
+        self.next_s += 2.0
+        self.n_refused += self.next_s == 6.0
+        return [TerrainEstimate(sample.time_s, *self.output)] if self.next_s != 6.0 else []
+
+
+def scripted(monkeypatch, probability, duration_s=16.0):
+    """The drives on grass, with a classifier of that probability."""
+    names = ("plain", "thesis", "thesis:classified", "classified")
+    monkeypatch.setattr(controllers, "Classifier", lambda model, robot: Scripted("grass", probability))
+    settings = SHORT.with_(controllers=names, seeds=2, duration_s=duration_s)
+    model = TerrainModel(None, None)  # which only the source uses
+    return compare(settings, DriveInputs(ROBOT, TABLE, model))
+
+
+@pytest.mark.slow
+def test_the_thesis_takes_the_targets_of_the_classified_terrain(monkeypatch):
+    result = scripted(monkeypatch, 0.9)
+    base, classified = (result.controllers[name] for name in ("thesis", "thesis:classified"))
+    assert base["believed_ratio"].mean is None
+    assert 0.4 < classified["believed_ratio"].mean < 0.8  # from the third window on, as the second is refused
+    counts = [classified[name].mean for name in ("n_accepted", "n_below_threshold", "n_refused")]
+    assert counts == [7, 0, 1]
+    assert base["mean_speed_mps"].mean != classified["mean_speed_mps"].mean
+    assert belief_notes(result) == ()
+
+
+@pytest.mark.parametrize("suffix", ["", "+track"])
+def test_the_thesis_with_the_true_terrain_drives_on_its_targets(suffix):
+    """The same as the thesis with a table whose fallback has the targets of that terrain."""
+    entry = dict(TABLE.targets["grass"])
+    grass = replace(TABLE, targets={**TABLE.targets, TABLE.fallback: entry})
+    settings = SHORT.with_(seeds=1)
+    name = f"thesis:true_terrain{suffix}"
+    adapting = compare(settings.with_(controllers=(name,)), INPUTS)
+    fixed = compare(settings.with_(controllers=(f"thesis{suffix}",)), DriveInputs(ROBOT, grass))
+    key = "energy_j_per_m"
+    assert adapting.controllers[name][key] == fixed.controllers[f"thesis{suffix}"][key]
+    assert adapting.controllers[name]["believed_ratio"].mean == 1.0
+
+
+@pytest.mark.slow
+def test_no_gain_is_credited_to_a_classifier_that_was_never_believed(monkeypatch):
+    result = scripted(monkeypatch, 0.3, duration_s=8.0)
+    for name in ("classified", "thesis:classified"):
+        assert result.controllers[name]["believed_ratio"].mean == 0.0
+        assert result.controllers[name]["n_below_threshold"].mean == 3
+    notes = belief_notes(result)
+    assert [note.split()[0] for note in notes] == ["thesis:classified", "classified"]
+    assert "knew the terrain at no time" in notes[0]
+    assert "0 accepted, 3 below the threshold, 1 refused" in notes[0]
+    assert notes[1] in terminal_text(result.report)
+    assert "classified compared" not in result.report.answer
+    assert "thesis compared with plain" in result.report.answer
+
+
+SPREAD = np.array([-0.06, 0.04, -0.04, 0.06])
+"""Of a metric over the four seeds."""
+
+
+def a_result(names=("plain", "ramp", "true_terrain"), values=None, n_seeds=4, **more):
+    """A result whose metrics have the mean 1, 2, ... in the order of the controllers.
+
+    Parameters
+    ----------
+    values : by controller and metric, the values of the seeds in place of those
+    """
+    rows = {}
+    for place, name in enumerate(names):
+        metrics = dict.fromkeys(METRICS, 1.0 + place + SPREAD) | {"distance_5s_m": 3.0 - 0.1 * place + SPREAD}
+        metrics |= (values or {}).get(name, {})
+        seeds = zip(*metrics.values(), strict=True)
+        rows[name] = tuple(dict(zip(metrics, row, strict=True)) for row in seeds)[:n_seeds]
+    result = DriveResult(
+        scenario="starts",
+        terrain="grass",
+        robot="agrimaro",
+        table="default",
+        seeds=tuple(range(n_seeds)),
+        delay_s=0.05,
+        grade_deg=0.0,
+        ramp_mps2=0.6582,
+        controllers={
+            name: {key: mean_interval([row[key] for row in found]) for key in found[0]}
+            for name, found in rows.items()
+        },
+        rows=rows,
+    )
+    return replace(result, **more)
+
+
+def a_run(name="true_terrain", open_loop=False, terrains=("grass",), wheel_radps=7.0, slip=0.2):
+    """2 s at 0.8 m/s: limited in the first, one refusal at its end, braking in the last half second."""
+    time_s = np.arange(200) / 100
+    columns = {"speed_x_mps": 0.8, "speed_y_mps": 0.0}
+    columns |= {f"wheel_{i}_radps": wheel_radps for i in (1, 2, 3)} | {
+        f"slip_{i}_ratio": slip for i in (1, 2, 3)
+    }
+    truth = Stream(time_s, np.tile(list(columns.values()), (200, 1)), tuple(columns))
+    status = dict.fromkeys(PilotStatus._fields, np.full(100, math.nan)) | {"driven_mps": np.full(100, 0.9)}
+    status |= {"desired_mps": np.ones(100), "status_code": np.zeros(100), "terrain_code": np.full(100, -1.0)}
+    status["drive_state_code"] = np.full(100, float(DriveState.STEADY))
+    if not open_loop:
+        status |= {
+            key: np.full(100, 0.2) for key in ("target_ratio", "aimed_ratio", "balance_ratio", "slip_ratio")
+        }
+        status["drive_state_code"] = np.repeat(
+            [float(DriveState.TRACTION), float(DriveState.STEADY), float(DriveState.BRAKING)], [50, 25, 25]
+        )
+        status["status_code"] = np.where(np.arange(100) == 50, 2.0, 0.0)
+        status["terrain_code"] = np.repeat([-1.0, list(TABLE.targets).index("clay")], 50)
+    control = Stream(time_s[::2], np.column_stack(list(status.values())), tuple(status))
+    edges = np.linspace(0, 2, len(terrains) + 1)
+    labels = tuple(zip(edges[:-1], edges[1:], terrains, strict=True))
+    return RunLog(name, "agrimaro", {"truth": truth, "control": control}, labels)
+
+
+def curves_of(**options):
+    return drive_curves(a_run(**options), TABLE)
+
+
+def text_of(result):
+    text = terminal_text(result.report, details=True, width=600)
+    return " ".join(text.replace("\N{MINUS SIGN}", "-").replace("\xa0", " ").split())
+
+
+def test_the_report_names_every_controller_and_metric():
+    names = (*CONTROLLERS, "known:clay", "target:0.2", "true_terrain+track")
+    result = a_result(names)
+    text = text_of(result)
+    assert all(f" {name} " in text for name in (*names, *METRICS))
+    assert "largest slip slip_peak 1 (0.906 to 1.09) 2 (1.91 to 2.09)" in text
+    assert "no more than 0.658 m/s²" in text
+    assert "without error. With path tracking." in text
+    assert len(terminal_text(result.report).splitlines()) <= 25
+    assert [panel.marks[0].categories for panel in result.report.picture.panels] == [list(names)] * 3
+    frame = result.to_pandas()
+    assert (len(frame), set(frame["controller"])) == (4 * len(names), set(names))
+
+
+def test_unknown_values_are_a_dash_and_values_of_few_seeds_state_it():
+    nan, few = np.full(4, math.nan), np.array([math.nan, math.nan, 0.25, math.nan])
+    values = {
+        "plain": {"slip_peak": nan, "lock_s": nan},
+        "ramp": {"slip_peak": nan, "lock_s": nan},
+        "true_terrain": {"slip_peak": few, "lock_s": nan},
+    }
+    text = text_of(a_result(values=values))
+    assert f"slip_peak {NOT_KNOWN} {NOT_KNOWN} 0.25, n 1" in text
+    assert "Not defined here: longest lock of a wheel (lock_s)" in text
+
+
+def test_a_difference_is_taken_seed_by_seed():
+    plain, gain = np.array([1.0, 2.0, 3.0, 4.0]), np.array([-0.19, -0.21, -0.2, -0.2])
+    values = {"plain": {"slip_peak": plain}, "true_terrain": {"slip_peak": plain + gain}}
+    result = a_result(("plain", "true_terrain"), values)
+    paired = difference(result, "true_terrain", "plain", "slip_peak")
+    assert paired.mean == pytest.approx(-0.08)
+    assert paired.is_significant
+    assert paired.high - paired.low == pytest.approx(
+        2 * 3.182 * gain.std(ddof=1) / 2 / plain.mean(), rel=1e-3
+    )
+    assert text_of(result).startswith("true_terrain compared with plain: largest slip -8.0 %")
+    values["true_terrain"]["slip_peak"] = plain + gain + [math.nan, 0.0, 0.0, 0.0]
+    result = a_result(("plain", "true_terrain"), values)
+    found = difference(result, "true_terrain", "plain", "slip_peak")
+    assert found.mean == pytest.approx(gain[1:].mean() / 3.0)
+
+
+def test_one_seed_has_no_interval():
+    result = a_result(n_seeds=1)
+    assert "one seed, which gives no interval" in result.report.answer
+    assert " *" not in text_of(result)
+    assert not difference(result, "true_terrain", "plain", "slip_peak").is_significant
+
+
+def test_only_controllers_that_use_the_terrain_adapt_to_it():
+    names = ("plain", "true_terrain", "true_terrain+track")
+    result = a_result(names, scenario="course", terrain="course")
+    assert f"adapt_s {NOT_KNOWN} 2 (1.91 to 2.09) 3 (2.91 to 3.09)" in text_of(result)
+    assert result.report.title == "course on all terrains"
+    assert "adapt_s" in shown_metrics(result)
+    assert "adapt_s" not in shown_metrics(a_result())
+
+
+def test_slip_is_signed_by_the_motion_and_filtered_as_its_estimate():
+    forward, reversing = curves_of(slip=0.2), curves_of(wheel_radps=-7.0, slip=-0.2)
+    assert forward.slip[-1] == pytest.approx(0.2, abs=1e-6) == reversing.slip[-1]
+    assert forward.slip[5] == pytest.approx(0.2 * (1 - math.exp(-6 * 0.01 / 0.05)))
+    dragged = curves_of(wheel_radps=-1.0, slip=-1.1)  # turns backwards while the robot moves on
+    assert dragged.slip[-1] == pytest.approx(-1.0, abs=1e-6)
+    locked = curves_of(wheel_radps=0.0, slip=-1.0)
+    assert locked.slip[-1] == pytest.approx(-1.0, abs=1e-6)
+
+
+def test_a_drive_shows_states_refusals_and_terrains():
+    own, plain = curves_of(terrains=("grass", "clay")), curves_of(open_loop=True, terrains=("grass", "clay"))
+    assert [name for *_, name in own.terrains["true"]] == ["grass", "clay"]
+    assert own.terrains["classified"] == [(1.0, 1.98, "clay")]
+    assert set(plain.terrains) == {"true"}
+    assert curves_of().terrains == {}
+    one, other = run_figures({"true_terrain": own, "plain": plain})
+    assert one.panels[0].marks[0].spans == [(0.0, 1.0, "traction: speed rises"), (1.5, 1.98, "braking")]
+    assert one.panels[1].marks[2].spans == [(1.0, 1.02, "no correction: stale")]
+    labels = [{getattr(mark, "label", "") for mark in figure.panels[1].marks} for figure in (one, other)]
+    assert {"target", "target with its floor"} <= labels[0]
+    assert not labels[1] & {"target", "target with its floor"}
+    assert one.panels[1].y_range == other.panels[1].y_range
+
+
+def test_curves_are_drawn_where_the_table_has_any():
+    numbers = dict.fromkeys(CurveEntry.__dataclass_fields__, 0.1)
+    numbers |= {"law": "janosi", "parameters": {"limit_ratio": 0.5, "shear_ratio": 0.2}}
+    numbers |= {"peak_status": "peak", "peak_interval_ratio": (0.5, 0.6), "slip_range_ratio": (0.0, 0.7)}
+    table = SlipTable("t", "unknown", TABLE.targets, curves={"clay": CurveEntry(**numbers | {"n_runs": 5})})
+    titles = [
+        {section.title for section in a_result(slip_table=each).report.details} for each in (table, TABLE)
+    ]
+    assert titles[0] - titles[1] == {"The curves behind the targets"}
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"controllers": ()}, "no controller"),
+        ({"controllers": ("plain", "plain")}, "twice"),
+        ({"controllers": ("oracle",)}, "'oracle' is unknown"),
+        ({"controllers": ("best",)}, f"'best' is unknown: use {', '.join(CONTROLLERS)}"),
+        ({"controllers": ("known:mars",)}, "no entry 'mars'"),
+        ({"controllers": ("target:1.5",)}, "0 to below 1"),
+        ({"controllers": ("plain+track",)}, "estimates no pose"),
+        ({"seeds": 0}, "seeds is 0"),
+        ({"delay_s": -0.1}, "0 to 0.5 s"),
+        ({"delay_s": math.nan}, "0 to 0.5 s"),
+        ({"scenario": "slope", "grade_deg": 5.0}, "leave the grade out"),
+        ({"grade_deg": 40.0}, "-30 to 30 degrees"),
+        ({"radius_factors": "1,2"}, "three ratios"),
+        ({"model": "models:/m"}, "not among the controllers"),
+        ({"observer": "none"}, "--observer is accepted with --path FILE"),
+        ({"situations": "stop"}, "--situations is accepted with --faults NAME"),
+        ({"faults": "all"}, "--scenario is accepted without --faults"),
+        ({"faults": "all", "path": "a.csv"}, "give one of them"),
+        ({"terrain": "course"}, "does not go with"),
+        ({"speed_mps": 99.0}, "speed"),
+        ({"controllers": ("ramp",), "ramp_mps2": 0.0}, "above zero"),
+        ({"controllers": ("classified",)}, "needs a classifier"),
+        ({"controllers": ("classified+track",)}, "needs a classifier"),
+        ({"controllers": ("thesis:classified",)}, "'thesis:classified' needs a classifier"),
+        ({"controllers": ("thesis:fallback",)}, "'thesis:fallback' is unknown"),
+    ],
+)
+def test_invalid_settings_are_refused_in_one_sentence(changes, message):
+    with pytest.raises(ConfigError, match=message) as refusal:
+        compare(SHORT.with_(**changes), INPUTS)
+    assert "\n" not in str(refusal.value)
