@@ -55,7 +55,7 @@ STAND_S = 3.0
 """Time of a stop."""
 
 START_M, SLOW_MPS = 2.0, 0.5
-"""Distance travelled beside that of speeding up, and speed, from which the drive counts as under way."""
+"""Distance travelled beside that of speeding up, and speed, from which the robot counts as cruising."""
 
 WHEELS = ("front", "rear")
 SHOWN_M = 1.5
