@@ -48,7 +48,9 @@ class OneFile(click.Command):
         )
         self.module, self.command = module, command
 
-    def _execute(self, json_file: Path | None, report_file: Path | None, details: bool, **given: Any) -> Result:
+    def _execute(
+        self, json_file: Path | None, report_file: Path | None, details: bool, **given: Any
+    ) -> Result:
         from pipelines.report.json_file import checked_json, write_json
         from pipelines.report.terminal import output_console, print_report, progress_bar
         from pipelines.report.writing import check_ending

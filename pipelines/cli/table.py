@@ -55,6 +55,8 @@ FORMER: dict[str, str] = {
     "import": "use terrain convert LOGS --out RUNS",
     "export": "use terrain convert RUNS --to mcap --out DIR",
     "model": "use terrain inspect MODEL",
+    "bench": "use python tests/studies live, soak, scale or labels, in the repository",
+    "explain-trials": "use python tests/studies trials, in the repository",
     "reproduce": "use python examples/papers PAPER, in the repository",
     "compare": "name several recipes or models in terrain crossval, as --recipe svm,cnn",
     "faults": "use terrain drive --faults NAME,...",

@@ -7,7 +7,6 @@ from rich.table import Table
 
 from pipelines.propose.labelling import ProposedLabels, WrittenLabels
 from pipelines.propose.proposals import questions
-from pipelines.propose.study import LabelStudy
 from pipelines.reporting.numbers import percent
 from pipelines.reporting.terminal import number_columns, print_lines, text_column
 
@@ -52,20 +51,4 @@ def print_written(found: WrittenLabels, console: Console) -> None:
     print_lines(
         console,
         [f"{found.n_runs} runs in {found.out}: labels {counts}; {found.n_left_open} stretches without one"],
-    )
-
-
-def print_study(found: LabelStudy, console: Console) -> None:
-    """Print accuracy by the answers that a model was given, and the differences."""
-    table = Table(text_column("labels"), *number_columns("runs labelled", "accuracy"), title=found.dataset)
-    for row in found.rows:
-        table.add_row(row.name, f"{row.n_labelled:.1f}", percent(row.accuracy))
-    console.print(table)
-    print_lines(
-        console,
-        [
-            f"{name}: {row.difference * 100:+.1f} points ({row.interval[0] * 100:+.1f} to "
-            f"{row.interval[1] * 100:+.1f}), {row.verdict.value}"
-            for name, row in found.differences.items()
-        ],
     )

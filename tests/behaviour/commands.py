@@ -325,7 +325,6 @@ CASES: tuple[Case, ...] = (
             "predict --model models:/field@champion --data runs --filter-stride 0.5",
             "label runs --model models:/field@champion --ask 3",
             refused("label runs --answers proposals.csv --out labelled --accept 1"),
-            "bench labels --data runs --repeats 1 --jobs 1",
             refused("crossval --data store --recipe cnn --repeats 1 --no-extras --jobs 1"),
             "serve --model models:/field@champion --robot agrimaro --port 0 --check",
             refused("serve --model models:/field@champion --robot husky --port 0 --check"),

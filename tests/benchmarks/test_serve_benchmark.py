@@ -13,15 +13,19 @@ import subprocess
 import sys
 import time
 from contextlib import contextmanager
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from pipelines.bench.drive import model_folder, sent_channels
 from pipelines.serve.client import TerrainClient
 from terrain.logs.replay import replay
 from terrain.robots import load_robot
 from terrain.simulation.run import simulate_run
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from studies.service import model_folder, sent_channels
 
 pytestmark = pytest.mark.slow
 

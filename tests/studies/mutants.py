@@ -112,10 +112,10 @@ def is_caught(mutant: Mutant, tree: Path) -> tuple[bool, str]:
     finally:
         file.write_text(text, encoding="utf-8")
         os.utime(file, ns=(times.st_atime_ns, times.st_mtime_ns))
-    said = (done.stdout.strip() or done.stderr.strip()).splitlines()
+    lines = (done.stdout.strip() or done.stderr.strip()).splitlines()
     if done.returncode not in (0, 1):
-        raise ValueError(f"{mutant.name}: the tests did not run: {said[-1] if said else done.returncode}")
-    return done.returncode == 1, said[-1] if said else ""
+        raise ValueError(f"{mutant.name}: the tests did not run: {lines[-1] if lines else done.returncode}")
+    return done.returncode == 1, lines[-1] if lines else ""
 
 
 def run(settings: Settings, progress: Progress = silent) -> Mutants:

@@ -8,6 +8,7 @@ import msgpack
 import numpy as np
 import pytest
 
+from pipelines.learn.load import load_model
 from studies import live, soak
 from studies.service import (
     ROBOT,
@@ -20,8 +21,6 @@ from studies.service import (
     spread,
     study_drive,
 )
-
-from pipelines.learn.load import load_model
 from terrain.errors import TerrainError
 from terrain.robots import load_robot
 

@@ -11,12 +11,10 @@ import pytest
 from pipelines.cli.main import main
 from pipelines.data.datasets import load_runs
 from pipelines.label.settings import LabelSettings
-from pipelines.learn.settings import LearnSettings
 from pipelines.models.model_files import read_model
 from pipelines.propose.answers_file import COLUMNS, read_answers
 from pipelines.propose.labelling import SOURCES_FILE, propose_labels, write_labels
 from pipelines.propose.proposals import Proposal, questions
-from pipelines.propose.study import STRATEGIES, label_study
 from pipelines.reporting.json_file import as_json
 from terrain.classify.smoothing import smoothed_classes
 from terrain.errors import ConfigError, DataError, LogError
@@ -213,19 +211,3 @@ def test_the_smoothed_sequence_is_the_best_of_all_of_them():
     best = every[np.argmax([score(path) for path in every])]
     assert smoothed_classes(probability, time_s, prior).tolist() == best.tolist()
     assert smoothed_classes(np.zeros((0, 3)), np.zeros(0), prior).tolist() == []
-
-
-@pytest.mark.slow
-def test_the_study_labels_as_many_runs_by_doubt_as_at_random_and_gives_the_same_again(tmp_path, drive_all):
-    for run in drive_all(n_runs=6, seed=3):
-        write_run(run, tmp_path / "data")
-    settings = LearnSettings(repeats=1, n_jobs=1)
-    found = label_study(tmp_path / "data", settings)
-    rows = {row.name: row for row in found.rows}
-    assert tuple(rows) == STRATEGIES
-    assert rows["random"].n_labelled == rows["doubt"].n_labelled == 6
-    assert rows["doubt, self-trained"].n_labelled >= 6
-    assert all(row.accuracy > 0.6 for row in found.rows)  # chance is one third
-    assert {each.n_runs for each in found.differences.values()} == {18}
-    again = label_study(tmp_path / "data", settings)
-    assert json.dumps(as_json(found)) == json.dumps(as_json(again))

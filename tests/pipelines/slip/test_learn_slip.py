@@ -12,7 +12,6 @@ from pipelines.slip.learn_slip import learn_slip
 from pipelines.slip.page import slip_page
 from pipelines.slip.results import TargetRow, TerrainRow
 from pipelines.slip.settings import LearnSlipSettings
-from pipelines.slip.study import clopper_pearson, run_case, summary
 from terrain.control.learned_table import FALLBACK
 from terrain.control.slip_table import DRIVE_STATES, load_slip_table
 from terrain.errors import ConfigError, DataError, TerrainError
@@ -220,25 +219,6 @@ def test_an_existing_table_is_replaced(runs, tmp_path, monkeypatch):
     learn_slip(runs[:1], settings(tmp_path / "t.yaml"))
     assert yaml.safe_load((tmp_path / "t.yaml").read_text())["schema"] == 2
     assert not [file for file in tmp_path.iterdir() if file.name.startswith(".t")]
-
-
-@pytest.mark.slow
-def test_intervals_contain_the_true_peaks_of_two_terrains():
-    """Eight cases at 90 %: fewer than five inside is one time in two hundred."""
-    cases = [
-        run_case(ROBOT, terrain, 1400 + number, DRIVES, n_bootstrap=40)
-        for terrain in ("snow", "grass")
-        for number in range(4)
-    ]
-    result = summary(cases)
-    assert result.n_learned == 8
-    assert result.all.coverage >= 5 / 8
-    assert result.all.error_median_abs < 0.03
-    assert result.all.status_right == 8
-    low, high = clopper_pearson(0, 5)
-    assert low == 0.0
-    assert high == pytest.approx(1 - 0.025 ** (1 / 5))
-    assert math.isclose(clopper_pearson(5, 5)[0], 0.025 ** (1 / 5))
 
 
 def test_the_page_shows_every_terrain_and_escapes_names():
