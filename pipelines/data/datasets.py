@@ -221,11 +221,9 @@ def _described(robot: str | Path | None) -> Robot | None:
 def _readers(
     folder: Path, layout: str, mapping: str | Path | None, robot: Robot | None
 ) -> list[Callable[..., RunLog]]:
-    from pipelines.data.bag_files import find_bags
-
     if layout not in LAYOUTS:
         raise ConfigError(f"layout {layout!r} is unknown: choose one of {', '.join(LAYOUTS)}")
-    if layout == "bag" or (layout == "auto" and folder.is_file() and find_bags(folder)):
+    if layout == "bag" or (layout == "auto" and folder.is_file() and _holds_bags(folder)):
         return _bags(folder, mapping, robot)
     if not folder.is_dir():
         fault = "is no folder" if folder.exists() else "does not exist"
@@ -257,7 +255,7 @@ def _readers(
     names = [name for name, readers in found.items() if readers]
     if len(names) > 1:
         raise LogError(f"{folder}: mixes the layouts {' and '.join(names)}; choose one with --format")
-    if not names and layout == "auto" and find_bags(folder):
+    if not names and layout == "auto" and _holds_bags(folder):
         return _bags(folder, None, robot)
     if names == ["drive"]:
         return drive.find_runs(folder, drive_robot(robot))
@@ -277,6 +275,12 @@ def _mapped(folder: Path, mapping: str | Path, robot: Robot | None) -> list[Call
     except ConfigError:
         radius_m = None
     return by_mapping.find_runs(folder, read, partial(bag_runs.read_stream, wheel_radius_m=radius_m))
+
+
+def _holds_bags(place: Path) -> bool:
+    from pipelines.data.bag_files import find_bags
+
+    return bool(find_bags(place))
 
 
 def _bags(place: Path, mapping: str | Path | None, robot: Robot | None) -> list[Callable[..., RunLog]]:
