@@ -143,7 +143,7 @@ def _of_length(values: Array, n: int, stream: str) -> Array:
         raise DataError(
             f"a window holds {held} samples of stream {stream!r}; the features were learned on {n}"
         )
-    return np.take(values, held - 1 - np.abs(held - 1 - np.arange(n)), axis=2)
+    return np.asarray(np.take(values, held - 1 - np.abs(held - 1 - np.arange(n)), axis=2))
 
 
 def of_signal_sets(windows: Windows, signal_sets: Iterable[str], level_sets: Iterable[str]) -> FeatureMatrix:

@@ -58,6 +58,7 @@ if TYPE_CHECKING:
     from pipelines.learn.checks import LearningCurve, LeftOutTerrain, SlowFast, StiffnessFigures
     from pipelines.learn.coverage import NextDrive, SupportRow
     from pipelines.learn.evaluate import FoldFigures, HeldOut
+    from pipelines.learn.model_file import TerrainModel
     from pipelines.learn.protocols import Samples
     from pipelines.learn.recipes import WindowPipeline
     from pipelines.learn.sequences import Breakaway, DelayFigures, SequenceFigures
@@ -322,7 +323,9 @@ def run(settings: Settings, progress: Progress = silent) -> CrossvalResult | Com
     asked = settings.with_(skip_short=settings.repair)
     with computing(settings.compute):
         if settings.model:
-            found = compare_models(runs, asked)
+            from pipelines.learn.load import load_model
+
+            found = compare_models(runs, [load_model(each) for each in settings.model], asked)
         elif len(asked.recipes) > 1:
             found = compare_recipes(runs, asked, progress)
         else:
@@ -379,7 +382,7 @@ def cross_validate(
     >>> found.recipe, found.n_features, found.accuracy
     ('KNeighborsClassifier', 52, 1.0)
     """
-    from pipelines.learn.protocols import Samples, in_units
+    from pipelines.learn.protocols import Samples
     from pipelines.learn.recipes import make_recipe
 
     functions = options.pop("functions", ())
@@ -389,7 +392,7 @@ def cross_validate(
     if not len(known):
         raise DataError("no window has a terrain label: nothing can be trained or tested")
     gap = settings.rule.overlap
-    samples = in_units(Samples(known, {}, known.run_id, known.run_id, gap), settings.protocol)
+    samples = Samples(known, {}, known.run_id, gap)
     made = [
         make_recipe(each, settings.signal_sets, gap=gap, seed=settings.seed, functions=functions)
         for each in recipes
@@ -455,8 +458,10 @@ def _side_by_side(
     )
 
 
-def compare_models(runs: Sequence[RunLog], settings: EvaluationSettings) -> CrossvalResult | ComparisonResult:
-    """Evaluate models on the runs that none of them was trained on.
+def compare_models(
+    runs: Sequence[RunLog], models: Sequence[TerrainModel], settings: EvaluationSettings
+) -> CrossvalResult | ComparisonResult:
+    """Evaluate models, named as in the settings, on the runs that none of them was trained on.
 
     Raises
     ------
@@ -469,9 +474,7 @@ def compare_models(runs: Sequence[RunLog], settings: EvaluationSettings) -> Cros
     from pipelines.data.datasets import data_digest
     from pipelines.learn.evaluate import HeldOut, figures_of, weaknesses
     from pipelines.learn.protocols import Samples
-    from pipelines.models.tracking import load_model
 
-    models = [load_model(each) for each in settings.model]
     trained = {digest for model in models for digest in model.info.run_digests}
     excluded = tuple(each.run_id for each in runs if data_digest([each]) in trained)
     kept = [each for each in runs if each.run_id not in excluded]
@@ -494,7 +497,7 @@ def compare_models(runs: Sequence[RunLog], settings: EvaluationSettings) -> Cros
             raise DataError(
                 f"no window of these runs is labelled as a class of all models ({', '.join(shared)})"
             )
-        samples = Samples(windows, cut.dropped, windows.run_id, windows.run_id, model.rule.overlap)
+        samples = Samples(windows, cut.dropped, windows.run_id, model.rule.overlap)
         probability = np.asarray(model.recipe.predict_proba(windows))[None]
         classes = np.asarray(model.recipe.classes_, dtype=str)
         number = np.zeros(probability.shape[:2], dtype=int)

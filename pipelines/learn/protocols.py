@@ -67,7 +67,6 @@ class Samples(NamedTuple):
     windows : under one label each
     dropped : how many windows were left out, by reason
     group : (n,) what is never divided: the run, or under ``published`` the partition
-    unit : (n,) what the protocol holds out together: a group, a session, a regime, or a side
     gap : windows beside a window that may share samples with it
     merged : ids of runs that hold the same measurements and were made one
     runs : that the windows were cut from; empty where they are not at hand
@@ -77,7 +76,6 @@ class Samples(NamedTuple):
     windows: Windows
     dropped: Mapping[str, int]
     group: Array
-    unit: Array
     gap: int
     merged: tuple[tuple[str, ...], ...] = ()
     runs: Sequence[RunLog] = ()
@@ -95,7 +93,7 @@ class Samples(NamedTuple):
 
     def of(self, rows: Array) -> Samples:
         """Return some of the windows."""
-        return self._replace(windows=self.windows[rows], group=self.group[rows], unit=self.unit[rows])
+        return self._replace(windows=self.windows[rows], group=self.group[rows])
 
 
 Splitter: TypeAlias = Any
@@ -221,7 +219,10 @@ def folds_of(samples: Samples, protocol: str = "grouped", repeats: int = 1, seed
     DataError
         if there is one class only, or there are fewer runs than folds.
     """
-    scheme, y, unit = PROTOCOLS[protocol], samples.terrain, samples.unit
+    scheme = PROTOCOLS[protocol]
+    unit = scheme.units(samples)
+    used = np.flatnonzero(unit != "")
+    y, unit = samples.terrain[used], unit[used]
     if len(np.unique(y)) < 2:
         raise DataError(f"all windows are {str(y[0])!r}: a classifier needs at least two classes")
     n_runs = len(np.unique(samples.run_id))
@@ -230,13 +231,14 @@ def folds_of(samples: Samples, protocol: str = "grouped", repeats: int = 1, seed
     alone = single_run_classes(y, unit.astype(str)) if scheme.whole_runs else []
     cut = block_groups(y, unit, N_FOLDS).astype(str) if scheme.whole_runs else unit.astype(str)
     folds = []
-    for repeat in range(repeats):
+    drawn = scheme.splitter in (deal_groups, deal_partitions)
+    for repeat in range(repeats if drawn else 1):
         splitter = scheme.splitter(y, cut, np.random.default_rng((seed, repeat)))
         groups = None if isinstance(splitter, PredefinedSplit) else cut
         for number, (train, test) in enumerate(splitter.split(y, y, groups)):
             for terrain in alone:
                 train = without_neighbours(train, test, np.flatnonzero(y == terrain), samples.gap)
-            folds.append(Fold(repeat, number, train, test))
+            folds.append(Fold(repeat, number, used[train], used[test]))
     return folds
 
 
@@ -290,14 +292,7 @@ def samples_of(
     if not any((each != each[:1, :, :1]).any() for each in values.values()):
         streams = " and ".join(repr(name) for name in values)
         raise DataError(f"no channel of the streams {streams} ever varies: nothing can be learned from them")
-    return in_units(samples._replace(merged=distinct.merged, runs=distinct.runs, repaired=repaired), protocol)
-
-
-def in_units(samples: Samples, protocol: str) -> Samples:
-    """Return the windows that a protocol uses, with its units; errors as those of the protocol."""
-    samples = samples._replace(unit=PROTOCOLS[protocol].units(samples))
-    kept = np.asarray(samples.unit != "")
-    return samples if kept.all() else samples.of(np.flatnonzero(kept))
+    return samples._replace(merged=distinct.merged, runs=distinct.runs, repaired=repaired)
 
 
 def grouped_samples(
@@ -310,8 +305,7 @@ def grouped_samples(
     """Cut windows by the rule, labelled ones only; what is held out is a run."""
     layout = layout_of(runs, signal_sets, speeds=rule.steady is not None)
     cut = labelled(cut_windows(runs, rule, layout=layout, skip_short=skip_short))
-    run_id = cut.windows.run_id
-    return Samples(cut.windows, cut.dropped, run_id, run_id, rule.overlap, runs=runs)
+    return Samples(cut.windows, cut.dropped, cut.windows.run_id, rule.overlap, runs=runs)
 
 
 def labelled(cut: WindowCut) -> WindowCut:
@@ -366,8 +360,7 @@ def published_samples(
         f"{run_id} part {int((start - begin_s[run_id] + TIME_TOLERANCE_S) // PARTITION_S)}"
         for start, run_id in zip(cut.windows.start_s, cut.windows.run_id, strict=True)
     ]
-    parts = np.array(group, dtype=object)
-    return Samples(cut.windows, cut.dropped, parts, parts, 0, runs=runs)
+    return Samples(cut.windows, cut.dropped, np.array(group, dtype=object), 0, runs=runs)
 
 
 def run_speeds(windows: Windows) -> dict[str, float]:

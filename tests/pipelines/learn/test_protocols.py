@@ -2,8 +2,9 @@ import numpy as np
 import pytest
 
 from features.windows import WindowRule
-from pipelines.crossval.settings import PUBLISHED_WINDOW_S, CrossvalSettings
-from pipelines.crossval.splits import (
+from pipelines.data.regimes import driven_at
+from pipelines.learn.crossval import PUBLISHED_WINDOW_S, EvaluationSettings
+from pipelines.learn.protocols import (
     N_FOLDS,
     PARTITION_S,
     PUBLISHED_STRIDE_S,
@@ -11,7 +12,6 @@ from pipelines.crossval.splits import (
     grouped_samples,
     published_samples,
 )
-from pipelines.data.regimes import driven_at
 from terrain.errors import ConfigError, DataError
 from terrain.records import Label, RunLog, Stream
 
@@ -43,7 +43,7 @@ def nearest_other_side_s(windows, fold, terrain):
 @pytest.mark.parametrize("stride_s", [None, 0.5])
 def test_grouped_keeps_runs_whole_and_tests_every_window_once_a_repeat(uneven_runs, stride_s):
     samples = grouped_samples(uneven_runs, WindowRule(2.0, stride_s))
-    windows = samples.cut.windows
+    windows = samples.windows
     folds = folds_of(samples, "grouped", 3, seed=5)
     assert [(fold.repeat, fold.number) for fold in folds] == [
         (r, k) for r in range(3) for k in range(N_FOLDS)
@@ -78,7 +78,7 @@ def test_folds_repeat_with_their_seed_and_earlier_repeats_stay(uneven_runs):
 @pytest.mark.parametrize("stride_s", [None, 0.5])
 def test_leave_one_run_out_holds_out_each_run_and_cuts_a_single_one_into_blocks(uneven_runs, stride_s):
     samples = grouped_samples(uneven_runs, WindowRule(2.0, stride_s))
-    windows = samples.cut.windows
+    windows = samples.windows
     folds = folds_of(samples, "leave-one-run-out", 7, seed=0)
     assert_each_tested_once(folds, len(windows), 1)
     held_out = [set(windows.run_id[fold.test]) for fold in folds]
@@ -103,7 +103,7 @@ def test_published_windows_lie_inside_partitions_and_classes_are_balanced_by_str
         for i, duration_s in enumerate(durations)
     ]
     samples = published_samples(runs, PUBLISHED_RULE)
-    windows, group = samples.cut.windows, samples.group
+    windows, group = samples.windows, samples.group
     begin_s = {run.run_id: run.start_s for run in runs}
     n_parts = {t: sum(int(d // PARTITION_S) for d in durations) for t, durations in plan.items()}
     offset = windows.start_s - np.array([begin_s[run] for run in windows.run_id])
@@ -133,12 +133,12 @@ def test_published_windows_lie_inside_partitions_and_classes_are_balanced_by_str
 def test_published_has_no_rule_of_steady_motion_and_grouped_has(drive):
     still = [drive(f"{t}_{i}", t, i, speed_mps=0.0) for t in ("ASPHALT", "GRASS") for i in range(3)]
     driven = [drive(f"{t}_d{i}", t, i) for t in ("ASPHALT", "GRASS") for i in range(3)]
-    assert set(published_samples(still + driven, PUBLISHED_RULE).cut.windows.run_id) == {
+    assert set(published_samples(still + driven, PUBLISHED_RULE).windows.run_id) == {
         run.run_id for run in still + driven
     }
     samples = grouped_samples(still + driven, WindowRule())
-    assert set(samples.cut.windows.run_id) == {run.run_id for run in driven}
-    assert samples.cut.dropped == {"not moving": 72}
+    assert set(samples.windows.run_id) == {run.run_id for run in driven}
+    assert samples.dropped == {"not moving": 72}
 
 
 def test_windows_without_one_label_are_left_out_and_counted(drive):
@@ -146,8 +146,8 @@ def test_windows_without_one_label_are_left_out_and_counted(drive):
     halves = RunLog("r", "husky", run.streams, (Label(0.0, 11.0, "GRASS"), Label(11.0, 20.0, "GRAVEL")))
     samples = grouped_samples([halves], WindowRule())
     # Of twelve windows of 2 s the one from 10 s lies under both, those from 20 and 22 s under none.
-    assert samples.cut.windows.terrain.tolist() == ["GRASS"] * 5 + ["GRAVEL"] * 4
-    assert samples.cut.dropped == {"no single label": 3}
+    assert samples.windows.terrain.tolist() == ["GRASS"] * 5 + ["GRAVEL"] * 4
+    assert samples.dropped == {"no single label": 3}
 
 
 def test_what_cannot_be_split_is_refused(drive, drive_all):
@@ -198,7 +198,7 @@ def test_regimes_are_on_one_side_whatever_the_terrain():
         for i, speed in enumerate(speeds)
     ]
     samples = grouped_samples(runs, WindowRule())
-    regime = np.array([name.split("_")[1] for name in samples.cut.windows.run_id])
+    regime = np.array([name.split("_")[1] for name in samples.windows.run_id])
     folds = folds_of(samples, "leave-regimes-out", 2, 0)
     assert len(folds) == 2 * N_FOLDS
     for fold in folds:
@@ -210,7 +210,7 @@ def test_sessions_are_held_out_whole_and_the_only_one_of_a_terrain_by_blocks_of_
     runs = [commanded(f"a_{i}", "ICE", 0.5, i, session=f"monday_{i % 3}") for i in range(9)]
     runs += [commanded(f"b_{i}", "SAND", 0.5, i, session="only") for i in range(10)]
     samples = grouped_samples(runs, WindowRule())
-    windows = samples.cut.windows
+    windows = samples.windows
     session = {run.run_id: run.session for run in runs}
     folds = folds_of(samples, "leave-sessions-out", 1, 0)
     assert len(folds) == 3 + N_FOLDS
@@ -239,4 +239,4 @@ def test_runs_are_chosen_by_their_commanded_speed():
     assert driven_at(bare, 0.5, 0.7)
     for text in ("fast", "0.3:0.1", "-1:2", "0:inf"):
         with pytest.raises(ConfigError, match="LOW:HIGH"):
-            CrossvalSettings(speed=text)
+            EvaluationSettings(speed=text)

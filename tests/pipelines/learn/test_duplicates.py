@@ -5,11 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipelines.crossval.crossval import crossval, samples_of
 from pipelines.data.convert import Settings as ConvertSettings
 from pipelines.data.convert import run as convert
 from pipelines.data.inspect import Settings as InspectSettings
 from pipelines.data.inspect import run as inspect_runs
+from pipelines.learn.crossval import crossval
+from pipelines.learn.protocols import samples_of
 from terrain.errors import DataError
 from terrain.logs.write import write_run
 from terrain.records import Label, Stream
@@ -41,8 +42,8 @@ def test_merged_copies_leave_every_window_as_it_was(runs, settings):
     copies = [copy_of(run, f"{run.run_id}_again", 50.0) for run in runs]
     merged = samples_of([*runs, *copies], settings(merge_duplicates=True))
     alone = samples_of(runs, settings())
-    assert merged.cut.windows.run_id.tolist() == alone.cut.windows.run_id.tolist()
-    np.testing.assert_array_equal(merged.cut.windows.values["imu"], alone.cut.windows.values["imu"])
+    assert merged.windows.run_id.tolist() == alone.windows.run_id.tolist()
+    np.testing.assert_array_equal(merged.windows.values["imu"], alone.windows.values["imu"])
     report = crossval([*runs, *copies], settings(merge_duplicates=True))
     assert report.accuracy == crossval(runs, settings()).accuracy
     assert report.n_runs == len(runs)

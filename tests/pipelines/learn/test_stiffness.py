@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from pipelines.crossval.evaluation import HeldOut
-from pipelines.crossval.splits import grouped_samples
-from pipelines.crossval.stiffness import stiffness_figures
+from pipelines.learn.checks import stiffness_figures
+from pipelines.learn.evaluate import HeldOut
+from pipelines.learn.protocols import grouped_samples
 from pipelines.learn.recipes import feature_matrix, make_recipe
 
 NAMES = {"ASPHALT": "ASPHALT", "GRASS": "CONCRETE", "GRAVEL": "SNOW"}
@@ -16,7 +16,7 @@ NAMES = {"ASPHALT": "ASPHALT", "GRASS": "CONCRETE", "GRAVEL": "SNOW"}
 def drawn(drive_all, settings):
     runs = drive_all(n_runs=4)
     samples = grouped_samples(runs, settings().rule)
-    windows = samples.cut.windows
+    windows = samples.windows
     terrain = np.array([NAMES[name] for name in windows.terrain], dtype=object)
     windows = type(windows)(
         windows.values,
@@ -27,23 +27,23 @@ def drawn(drive_all, settings):
         windows.run_id,
         terrain,
     )
-    samples = samples._replace(cut=type(samples.cut)(windows, {}))
+    samples = samples._replace(windows=windows)
     return samples, feature_matrix(make_recipe("svm"), windows)
 
 
 def held_out(samples, predicted, certainty=1.0):
     """Return probabilities of one repeat that put ``certainty`` on each predicted class."""
-    classes = np.unique(samples.cut.windows.terrain.astype(str))
+    classes = np.unique(samples.windows.terrain.astype(str))
     column = np.searchsorted(classes, predicted)
     rest = (1 - certainty) / (len(classes) - 1)
     probability = np.full((1, len(column), len(classes)), rest)
     probability[0, np.arange(len(column)), column] = certainty
-    return HeldOut(classes, probability, np.zeros((1, len(column)), dtype=int), [])
+    return HeldOut(classes, probability, np.zeros((1, len(column)), dtype=int), classes[column], [])
 
 
 def test_a_wrong_class_of_the_right_level_costs_little(drawn):
     samples, features = drawn
-    terrain = samples.cut.windows.terrain.astype(str)
+    terrain = samples.windows.terrain.astype(str)
     right = stiffness_figures(held_out(samples, terrain), features, samples, 0)
     assert (right.accuracy, right.cost, right.soft_hard_ratio) == (1.0, 0.0, 0.0)
     paved = np.where(terrain == "ASPHALT", "CONCRETE", terrain)
@@ -60,7 +60,7 @@ def test_a_wrong_class_of_the_right_level_costs_little(drawn):
 
 def test_two_hard_classes_together_outweigh_a_more_probable_soft_one(drawn):
     samples, features = drawn
-    terrain = samples.cut.windows.terrain.astype(str)
+    terrain = samples.windows.terrain.astype(str)
     doubtful = stiffness_figures(held_out(samples, np.full(len(terrain), "SNOW"), 0.4), features, samples, 0)
     hard = float(np.mean(terrain != "SNOW"))
     assert doubtful.cost == pytest.approx(hard)
@@ -70,7 +70,7 @@ def test_two_hard_classes_together_outweigh_a_more_probable_soft_one(drawn):
 
 def test_clusters_are_those_of_the_runs(drawn):
     samples, features = drawn
-    terrain = samples.cut.windows.terrain.astype(str)
+    terrain = samples.windows.terrain.astype(str)
     clusters = stiffness_figures(held_out(samples, terrain), features, samples, 0).clusters
     assert -1.0 <= clusters.adjusted_rand <= 1.0
     assert clusters.interval[0] <= clusters.interval[1]
@@ -79,9 +79,9 @@ def test_clusters_are_those_of_the_runs(drawn):
 def test_without_a_known_level_there_are_no_figures(drawn, drive_all, settings):
     samples, features = drawn
     unknown = grouped_samples(drive_all(n_runs=2), settings().rule)  # GRASS and GRAVEL have no known level
-    terrain = unknown.cut.windows.terrain.astype(str)
+    terrain = unknown.windows.terrain.astype(str)
     assert stiffness_figures(held_out(unknown, terrain), features, unknown, 0) is None
-    hard = np.flatnonzero(samples.cut.windows.terrain != "SNOW")
-    paved = samples._replace(cut=type(samples.cut)(samples.cut.windows[hard], {}), group=samples.group[hard])
-    terrain = paved.cut.windows.terrain.astype(str)
+    hard = np.flatnonzero(samples.windows.terrain != "SNOW")
+    paved = samples.of(hard)
+    terrain = paved.windows.terrain.astype(str)
     assert stiffness_figures(held_out(paved, terrain), features[hard], paved, 0) is None

@@ -1,22 +1,20 @@
-import contextlib
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from features.windows import WindowRule
-from pipelines.crossval import extras
-from pipelines.crossval.crossval import crossval
-from pipelines.crossval.evaluation import Examples, fit_folds
-from pipelines.crossval.extras import (
+from pipelines.learn import checks
+from pipelines.learn.checks import (
     CURVE_DRAWS,
     enough_runs,
     learning_curve,
-    run_speeds,
     slow_fast,
-    slow_fast_split,
 )
-from pipelines.crossval.splits import folds_of, grouped_samples
-from pipelines.learn.recipes import feature_matrix, make_recipe
+from pipelines.learn.crossval import crossval
+from pipelines.learn.evaluate import Examples, evaluate
+from pipelines.learn.protocols import folds_of, grouped_samples, run_speeds, slow_fast_split
+from pipelines.learn.recipes import feature_matrix, make_recipe, recipe_of
 from terrain.errors import ConfigError, DataError
 from terrain.records import RunLog, Stream
 
@@ -50,18 +48,17 @@ def test_the_speed_of_a_run_is_that_of_its_faster_wheel_where_it_moves(drive):
     still = RunLog(
         "s", "husky", {**run.streams, "wheels": Stream(wheels.time_s, values, wheels.channels)}, run.labels
     )
-    speeds = run_speeds(grouped_samples([moved, still], PLAIN).cut.windows)
+    speeds = run_speeds(grouped_samples([moved, still], PLAIN).windows)
     assert speeds["r"] == pytest.approx(0.6)
     assert np.isnan(speeds["s"])
 
 
 def test_each_class_is_split_at_its_own_median_speed(runs_at):
     plan = {"ASPHALT": SPEEDS, "GRASS": (0.9, 0.5, 1.0, 0.6), "GRAVEL": (0.1, 0.2, 0.3, 0.4, 0.5)}
-    split = slow_fast_split(
-        grouped_samples([r for t, s in plan.items() for r in runs_at(t, s)], WindowRule())
-    )
-    assert (split.status, split.left_out) == ("applicable", {})
-    assert {run for run, _ in split.slow} == {
+    samples = grouped_samples([r for t, s in plan.items() for r in runs_at(t, s)], WindowRule())
+    split = slow_fast_split(samples)
+    assert split.left_out == {}
+    assert set(samples.run_id[split.side == "slow"]) == {
         "ASPHALT_0",
         "ASPHALT_1",
         "GRASS_1",
@@ -70,7 +67,7 @@ def test_each_class_is_split_at_its_own_median_speed(runs_at):
         "GRAVEL_1",
         "GRAVEL_2",
     }
-    assert {run for run, _ in split.fast} == {
+    assert set(samples.run_id[split.side == "fast"]) == {
         "ASPHALT_2",
         "ASPHALT_3",
         "GRASS_0",
@@ -85,11 +82,12 @@ def test_each_class_is_split_at_its_own_median_speed(runs_at):
 def test_a_class_with_too_little_on_a_side_is_left_out_and_named(runs_at):
     enough = [*runs_at("ASPHALT", SPEEDS), *runs_at("GRASS", SPEEDS)]
     three = runs_at("GRAVEL", (0.3, 0.4, 0.8), 64.0)
-    split = slow_fast_split(grouped_samples(enough + three, WindowRule()))
+    samples = grouped_samples(enough + three, WindowRule())
+    split = slow_fast_split(samples)
     assert split.left_out == {"GRAVEL": "fast runs: 1"}
     assert set(split.classes) == {"ASPHALT", "GRASS"}
-    assert split.status == "not applicable"  # two classes remain, three are needed
-    assert not [run for run, _ in split.slow + split.fast if run.startswith("GRAVEL")]
+    assert slow_fast(None, None, samples, 1).status == "not applicable"  # three classes are needed
+    assert set(split.side[samples.terrain == "GRAVEL"]) == {""}
     # 2 x 28 s a side are too short; windows that overlap cover no more of them, though they are more.
     short = runs_at("GRAVEL", SPEEDS, 28.0)
     for stride_s in (None, 0.5):
@@ -115,7 +113,7 @@ def test_what_is_learned_slow_and_does_not_apply_fast_is_detected(runs_at, setti
         ]  # fmt: skip
         samples = grouped_samples(runs, WindowRule())
         recipe = make_recipe("svm", ("imu",))
-        accuracy[name] = slow_fast(recipe[-1], feature_matrix(recipe, samples.cut.windows), samples, 1)
+        accuracy[name] = slow_fast(recipe[-1], feature_matrix(recipe, samples.windows), samples, 1)
     assert accuracy["own"].slow_to_fast > 0.9
     assert accuracy["own"].fast_to_slow > 0.9
     assert accuracy["next"].slow_to_fast < 0.1
@@ -126,7 +124,7 @@ def test_speed_alone_is_right_just_where_terrains_were_driven_at_speeds_of_their
     drive, settings, monkeypatch
 ):
     alike = {"level": 0.8, "smoothness": 0.4, "current_a": 2.0, "duration_s": 12.0}
-    monkeypatch.setattr(extras, "CURVE_RUNS", ())
+    monkeypatch.setattr(checks, "CURVE_RUNS", ())
     accuracy = []
     for own_speeds in (True, False):
         runs = [
@@ -140,7 +138,7 @@ def test_speed_alone_is_right_just_where_terrains_were_driven_at_speeds_of_their
             for k, t in enumerate(("ASPHALT", "GRASS", "GRAVEL"))
             for i in range(5)
         ]
-        accuracy.append(crossval(runs, settings(extras=True)).extras.speed_only_accuracy)
+        accuracy.append(crossval(runs, settings(extras=True)).speed_only_accuracy)
     assert accuracy[0] > 0.95
     assert accuracy[1] < 0.55
 
@@ -149,32 +147,31 @@ def test_speed_alone_is_right_just_where_terrains_were_driven_at_speeds_of_their
 def test_the_learning_curve_draws_that_many_runs_and_leaves_test_folds_alone(drive_all, drive, monkeypatch):
     runs = [*drive_all(("ASPHALT", "GRASS"), 5, duration_s=10.0), drive("GRAVEL_1", "GRAVEL", 1, 40.0)]
     samples = grouped_samples(runs, WindowRule())
-    windows = samples.cut.windows
+    windows = samples.windows
     recipe = make_recipe("svm")
     folds = folds_of(samples, "grouped", 1, 0)
     seen = []
 
     def spy(classifier, examples, drawn, *rest):
         seen.extend(drawn)
-        return fit_folds(classifier, examples, drawn, *rest)
+        return evaluate(classifier, examples, drawn, *rest)
 
-    monkeypatch.setattr(extras, "fit_folds", spy)
+    monkeypatch.setattr(checks, "evaluate", spy)
     examples = Examples(feature_matrix(recipe, windows), windows.terrain.astype(str), samples.group)
     curve = learning_curve(recipe[-1], examples, folds, 0.77, 0, 1)
     assert len(seen) == 3 * CURVE_DRAWS * len(folds)  # 1, 2 and 3 of the 4 training runs of each fold
     for fold in seen:
         (original,) = [f for f in folds if np.array_equal(f.test, fold.test)]
         assert set(fold.train) <= set(original.train)
-        for terrain, n_runs in (("ASPHALT", fold.number), ("GRASS", fold.number), ("GRAVEL", 1)):
+        size = 1 + fold.repeat // CURVE_DRAWS
+        for terrain, n_runs in (("ASPHALT", size), ("GRASS", size), ("GRAVEL", 1)):
             drawn = set(windows.run_id[fold.train][windows.terrain[fold.train] == terrain])
             assert len(drawn) == n_runs
         kept = set(windows.run_id[fold.train])  # a run that is drawn is drawn whole
         np.testing.assert_array_equal(
             fold.train, original.train[np.isin(windows.run_id[original.train], list(kept))]
         )
-    draws = [
-        {tuple(f.train) for f in seen if f.number == 1 and f.repeat == draw} for draw in range(CURVE_DRAWS)
-    ]
+    draws = [{tuple(f.train) for f in seen if f.repeat == draw} for draw in range(CURVE_DRAWS)]
     assert draws[0] != draws[1]
     assert curve.runs_per_class == pytest.approx([1.0, (2 + 2 + 1) / 3, (3 + 3 + 1) / 3, (4 + 4 + 1) / 3])
     assert curve.accuracy[-1] == 0.77
@@ -206,14 +203,14 @@ def test_a_curve_that_still_climbs_gives_no_number():
 def test_a_protocol_and_the_extra_of_one_name_give_one_number(runs_at, settings):
     runs = [run for terrain in ("ASPHALT", "GRASS", "GRAVEL") for run in runs_at(terrain, SPEEDS)]
     samples = grouped_samples(runs, WindowRule())
-    recipe = settings().new_recipe()
-    extra = slow_fast(recipe[-1], feature_matrix(recipe, samples.cut.windows), samples, 1)
+    recipe = recipe_of(settings())
+    extra = slow_fast(recipe[-1], feature_matrix(recipe, samples.windows), samples, 1)
     for protocol, expected in (("slow-fast", extra.slow_to_fast), ("fast-slow", extra.fast_to_slow)):
         report = crossval(runs, settings(protocol=protocol))
         assert report.accuracy == pytest.approx(expected)
         assert len(report.folds) == 1
         trained, tested = protocol.split("-")
-        assert f"trained on the {trained} runs" in report.notes[0]
+        assert report.notes[0].startswith(f"{tested} runs held out, {trained} ones trained on")
         fast = {run.run_id[-1] for run in report.per_run} == {"2", "3"}
         assert fast == (tested == "fast")
         assert report.n_windows == report.folds[0].n_test == sum(run.n_windows for run in report.per_run)
@@ -221,9 +218,7 @@ def test_a_protocol_and_the_extra_of_one_name_give_one_number(runs_at, settings)
 
 def test_a_speed_protocol_on_runs_of_one_speed_is_one_sentence(runs_at, settings):
     runs = [run for terrain in ("ASPHALT", "GRASS", "GRAVEL") for run in runs_at(terrain, (0.5,))]
-    with pytest.raises(
-        DataError, match=r"^'slow-fast' needs 3 terrains with slow and fast runs, .*GRASS: slow"
-    ):
+    with pytest.raises(DataError, match=r"^slow and fast runs are compared on 3 terrains .*GRASS: slow"):
         crossval(runs, settings(protocol="slow-fast"))
     with pytest.raises(ConfigError, match=r"^'fast-slow' has a single fold assignment"):
         settings(protocol="fast-slow", repeats=3)
@@ -232,8 +227,9 @@ def test_a_speed_protocol_on_runs_of_one_speed_is_one_sentence(runs_at, settings
 def test_a_run_slow_on_one_class_and_fast_on_another_is_on_no_side(runs_at, settings, monkeypatch):
     """Its windows would otherwise train and test at once."""
     folds = []
-    monkeypatch.setattr(extras, "fit_folds", lambda *args: folds.extend(args[2]) or [])
-    monkeypatch.setattr(extras, "_accuracy", lambda *_: 0.5)
+    monkeypatch.setattr(
+        checks, "evaluate", lambda *args: folds.extend(args[2]) or SimpleNamespace(accuracies=[0.5, 0.5])
+    )
     runs = [run for terrain in ("ASPHALT", "GRASS", "GRAVEL") for run in runs_at(terrain, SPEEDS)]
     slow_grass, fast_gravel = (next(r for r in runs if r.run_id == name) for name in ("GRASS_0", "GRAVEL_3"))
     joined = {}
@@ -248,12 +244,10 @@ def test_a_run_slow_on_one_class_and_fast_on_another_is_on_no_side(runs_at, sett
     mixed = RunLog("mixed", "husky", joined, labels)
     samples = grouped_samples([r for r in runs if r not in (slow_grass, fast_gravel)] + [mixed], WindowRule())
     split = slow_fast_split(samples)
-    assert ("mixed", "GRASS") in split.slow
-    assert ("mixed", "GRAVEL") in split.fast
-    with contextlib.suppress(ValueError):
-        slow_fast(None, None, samples, 1)
+    assert set(split.side[samples.run_id == "mixed"]) == {""}
+    slow_fast(None, None, samples, 1)
     assert len(folds) == 2
-    run_id = samples.cut.windows.run_id
+    run_id = samples.windows.run_id
     for fold in folds:
         assert not set(run_id[fold.train]) & set(run_id[fold.test])
         assert "mixed" not in run_id[np.concatenate([fold.train, fold.test])]
@@ -275,5 +269,5 @@ def test_runs_with_several_labels_can_be_learned_from_few(drive, settings):
         }
         runs.append(RunLog(f"r{number}", "husky", streams, ((0.0, 12.0, "GRASS"), (12.0, 24.0, "GRAVEL"))))
     report = crossval(runs, settings(repeats=1, extras=True))
-    assert report.extras.learning_curve.runs_per_class[0] == 1.0
+    assert report.learning_curve.runs_per_class[0] == 1.0
     assert {row.run_id for row in report.per_run} >= {"r0 (GRASS)", "r0 (GRAVEL)"}

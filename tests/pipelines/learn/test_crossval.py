@@ -3,10 +3,9 @@ import json
 import numpy as np
 import pytest
 
-from pipelines.crossval.crossval import crossval
-from pipelines.crossval.settings import CrossvalSettings
 from pipelines.data.datasets import load_runs
-from pipelines.reporting.json_file import as_json
+from pipelines.learn.crossval import EvaluationSettings, crossval
+from pipelines.report.json_file import as_json
 from terrain.errors import ConfigError, DataError
 from terrain.records import RunLog, Stream
 
@@ -157,11 +156,11 @@ def test_extras_do_without_what_the_data_lack(drive, settings):
         runs.append(RunLog(run.run_id, "husky", {"imu": run.streams["imu"]}, run.labels))
     report = crossval(runs, settings(extras=True, steady=False))
     json.dumps(as_json(report), allow_nan=False)
-    assert report.extras.speed_only_accuracy is None
-    assert report.extras.slow_fast.status == "not applicable"
-    assert set(report.extras.slow_fast.left_out) == {f"T{i}" for i in range(5)}
-    assert report.extras.learning_curve.enough_runs is None
-    assert report.extras.learning_curve.accuracy == pytest.approx([report.accuracy])
+    assert report.speed_only_accuracy is None
+    assert report.slow_fast.status == "not applicable"
+    assert set(report.slow_fast.left_out) == {f"T{i}" for i in range(5)}
+    assert report.learning_curve.enough_runs is None
+    assert report.learning_curve.accuracy == pytest.approx([report.accuracy])
 
 
 def test_settings_that_make_no_sense_are_refused():
@@ -169,13 +168,13 @@ def test_settings_that_make_no_sense_are_refused():
         ConfigError,
         match="--protocol is 'lucky': input should be 'grouped', 'leave-one-run-out', 'leave-sessions-out', ",
     ):
-        CrossvalSettings(protocol="lucky")
+        EvaluationSettings(protocol="lucky")
     with pytest.raises(ConfigError, match="--repeats is 0: input should be greater than or equal to 1"):
-        CrossvalSettings(repeats=0)
+        EvaluationSettings(repeats=0)
     with pytest.raises(ConfigError, match="window length_s is -1"):
-        _ = CrossvalSettings(window_s=-1).rule
-    assert CrossvalSettings(protocol="published").rule.length_s == 1.7
-    assert CrossvalSettings().rule.length_s == 2.0
+        _ = EvaluationSettings(window_s=-1).rule
+    assert EvaluationSettings(protocol="published").rule.length_s == 1.7
+    assert EvaluationSettings().rule.length_s == 2.0
 
 
 def test_terrains_of_vulpi_are_classified_on_held_out_runs(datasets_dir, settings):

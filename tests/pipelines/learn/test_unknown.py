@@ -3,9 +3,9 @@ import json
 import numpy as np
 import pytest
 
-from pipelines.crossval import unknown
-from pipelines.crossval.crossval import crossval
-from pipelines.reporting.json_file import as_json
+from pipelines.learn import checks
+from pipelines.learn.crossval import crossval
+from pipelines.report.json_file import as_json
 from terrain.errors import DataError
 
 
@@ -26,10 +26,10 @@ def test_report_has_the_areas_their_intervals_and_both_rates(report):
     for name in ("auroc_unknown", "auroc_unknown_10s"):
         low, high = document[f"{name}_ci"]
         assert 0.0 <= low <= document[name] <= high <= 1.0
-    rows = report.unknown.unknown_by_terrain.values()
-    assert np.mean([row.auroc for row in rows]) == pytest.approx(report.unknown.auroc_unknown)
-    assert report.unknown.auroc_unknown > 0.6  # the middle one of three terrains lies between the others
-    assert 0.8 < report.unknown.known_kept <= 1.0
+    rows = report.unknown_by_terrain.values()
+    assert np.mean([row.auroc for row in rows]) == pytest.approx(report.auroc_unknown)
+    assert report.auroc_unknown > 0.6  # the middle one of three terrains lies between the others
+    assert 0.8 < report.known_kept <= 1.0
 
 
 def test_two_terrains_and_few_runs_are_refused(runs, settings):
@@ -47,12 +47,12 @@ def test_two_terrains_and_few_runs_are_refused(runs, settings):
 def test_no_run_of_the_left_out_terrain_and_no_tested_run_trains(runs, settings, monkeypatch):
     trained = []
 
-    class Recorded(unknown.NoveltyScore):
+    class Recorded(checks.NoveltyScore):
         def fit(self, X, y, groups=None):
             trained.append((set(y), set(groups)))
             return super().fit(X, y, groups)
 
-    monkeypatch.setattr(unknown, "NoveltyScore", Recorded)
+    monkeypatch.setattr(checks, "NoveltyScore", Recorded)
     crossval(runs, settings(protocol="leave-terrain-out", n_jobs=1))
     terrain_of = {run.run_id: run.labels[0].terrain for run in runs}
     assert len(trained) == 15
@@ -68,11 +68,10 @@ def test_area_by_runs_is_that_of_all_pairs():
     rng = np.random.default_rng(0)
     known, new = np.round(rng.normal(size=40), 1), np.round(rng.normal(0.7, 1, 30), 1)
     run_of = np.concatenate([np.repeat(np.arange(4), 10), np.repeat(np.arange(4, 7), 10)])
-    part = unknown._Scored(np.arange(40), np.arange(40, 70), known, new, 0.0)
-    compared = unknown._compare([part], run_of, 7)
+    part = checks._Scored(np.arange(40), np.arange(40, 70), known, new, 0.0)
+    compared = checks._compare([part], run_of)
     expected = roc_auc_score(np.repeat([0, 1], [40, 30]), np.concatenate([known, new]))
-    assert unknown._auroc(compared) == pytest.approx(expected)
-    weights = unknown._drawn_runs(np.repeat(["a", "b"], [40, 30]), run_of, 7, 0)
-    assert (weights[:, :4].sum(axis=1) == 4).all()
-    low, high = unknown._interval([compared], weights)
+    assert compared.won.sum() / compared.pairs.sum() == pytest.approx(expected)
+    weights = np.ones((50, 7)) + np.random.default_rng(1).multinomial(7, np.full(7, 1 / 7), 50)
+    low, high = checks._interval([compared], weights)
     assert low < expected < high

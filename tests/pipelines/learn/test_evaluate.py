@@ -1,10 +1,12 @@
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from sklearn.model_selection import StratifiedGroupKFold, cross_val_predict, cross_validate
 
-from features.windows import WindowCut, WindowRule
-from pipelines.crossval.evaluation import Examples, FoldResult, fit_folds, pool, summarise
-from pipelines.crossval.splits import Fold, Samples, folds_of, grouped_samples
+from features.windows import WindowRule
+from pipelines.learn.evaluate import Examples, FoldResult, HeldOut, evaluate, figures_of
+from pipelines.learn.protocols import Fold, Samples, folds_of, grouped_samples
 from pipelines.learn.recipes import WindowPipeline, feature_matrix, make_recipe
 from terrain.errors import ConfigError
 from terrain.records import Windows
@@ -19,25 +21,24 @@ def samples(drive_all, drive):
 
 @pytest.fixture(scope="module")
 def results(samples):
-    windows = samples.cut.windows
+    windows = samples.windows
     recipe = make_recipe("svm", seed=3)
     features = feature_matrix(recipe, windows)
     folds = folds_of(samples, "grouped", 1, seed=3)
     examples = Examples(features, windows.terrain.astype(str), samples.group)
-    return fit_folds(recipe[-1], examples, folds, 1, "fit")
+    return evaluate(recipe[-1], examples, folds)
 
 
 def test_scikit_learn_cross_validates_whole_recipes_to_the_same_answers(samples, results):
-    windows = samples.cut.windows
+    windows = samples.windows
     y = windows.terrain.astype(str)
-    folds = [(result.fold.train, result.fold.test) for result in results]
-    pooled = pool(results, y)
+    folds = [(result.fold.train, result.fold.test) for result in results.results]
     expected = cross_val_predict(make_recipe("svm", seed=3), windows, y, cv=folds, method="predict_proba")
-    np.testing.assert_allclose(pooled.probability[0], expected, atol=1e-9)
+    np.testing.assert_allclose(results.probability[0], expected, atol=1e-9)
     found = cross_validate(
         make_recipe("svm", seed=3), windows, y, groups=windows.run_id, cv=folds[:2], return_estimator=True
     )
-    report = summarise(pooled, samples, seed=0)
+    report = as_figures(results, samples, 0)
     assert found["test_score"].tolist() == pytest.approx([fold.accuracy for fold in report.folds[:2]])
     for estimator, fold in zip(found["estimator"], report.folds[:2], strict=True):
         assert 0 < estimator[-1].n_inner_fits_ <= 20
@@ -58,12 +59,16 @@ def test_the_recipe_gives_its_last_step_the_run_of_each_window(samples):
             seen["groups"] = groups
             return self
 
-    windows = samples.cut.windows
+    windows = samples.windows
     recipe = WindowPipeline([("features", make_recipe("svm")[0]), ("last", Spy())])
     recipe.fit(windows, windows.terrain)
     np.testing.assert_array_equal(seen["groups"], windows.run_id)
     with pytest.raises(ConfigError, match="there is no recipe 'oracle'; there are svm"):
         make_recipe("oracle")
+
+
+def as_figures(held_out, samples, seed):
+    return SimpleNamespace(**figures_of(held_out, samples, seed))
 
 
 def hand_made(run_ids, start_s, y, answers, folds, classes=("ice", "mud")):
@@ -78,14 +83,17 @@ def hand_made(run_ids, start_s, y, answers, folds, classes=("ice", "mud")):
         np.array(run_ids, dtype=object),
         np.array(y, dtype=object),
     )
-    samples = Samples(WindowCut(windows, {}), windows.run_id, 1)
+    samples = Samples(windows, {}, windows.run_id, 1)
     results = []
+    n_repeats = 1 + max(fold.repeat for fold in folds)
+    pooled, number = np.full((n_repeats, n, len(classes)), np.nan), np.full((n_repeats, n), -1)
     for fold in folds:
         probability = np.full((len(fold.test), len(classes)), 0.2)
         for row, answer in zip(probability, np.asarray(answers)[fold.repeat][fold.test], strict=True):
             row[classes.index(answer)] = 0.8
         results.append(FoldResult(fold, probability, {}))
-    return samples, results
+        pooled[fold.repeat, fold.test], number[fold.repeat, fold.test] = probability, fold.number
+    return samples, HeldOut(np.array(classes), pooled, number, np.array(y), results)
 
 
 def test_figures_of_hand_made_predictions():
@@ -99,7 +107,7 @@ def test_figures_of_hand_made_predictions():
     rows = np.arange(8)
     folds = [Fold(r, k, none, rows[k * 4 : k * 4 + 4]) for r in range(2) for k in range(2)]
     samples, results = hand_made(runs, start_s, y, answers, folds)
-    report = summarise(pool(results, np.array(y)), samples, seed=0)
+    report = as_figures(results, samples, 0)
     assert report.accuracy_per_repeat == (7 / 8, 5 / 8)
     assert report.accuracy == 0.75
     assert report.accuracy_spread == pytest.approx(np.std([7 / 8, 5 / 8], ddof=1))
@@ -121,7 +129,7 @@ def test_one_repeat_has_no_spread():
     folds = [Fold(0, 0, np.empty(0, dtype=int), np.arange(4))]
     y = ["ice", "ice", "mud", "mud"]
     samples, results = hand_made(list("abcd"), range(4), y, [y], folds)
-    assert summarise(pool(results, np.array(y)), samples, 0).accuracy_spread is None
+    assert as_figures(results, samples, 0).accuracy_spread is None
 
 
 def test_votes_never_mix_two_runs_whatever_their_names_and_folds():
@@ -133,14 +141,14 @@ def test_votes_never_mix_two_runs_whatever_their_names_and_folds():
         Fold(0, 2, np.empty(0, dtype=int), np.arange(3, 6)),
     ]
     samples, results = hand_made(runs, start_s, y, [y], folds)
-    assert summarise(pool(results, np.array(y)), samples, 0).vote_accuracy == 1.0
+    assert as_figures(results, samples, 0).vote_accuracy == 1.0
 
 
 def test_a_vote_states_how_many_windows_it_has():
     y = ["ice"] * 3 + ["mud"]
     folds = [Fold(0, 0, np.empty(0, dtype=int), np.arange(4))]
     samples, results = hand_made(["a"] * 3 + ["b"], [0, 1, 2, 0], y, [y], folds)
-    assert summarise(pool(results, np.array(y)), samples, 0).vote_windows == (1 + 2 + 3 + 1) / 4
+    assert as_figures(results, samples, 0).vote_windows == (1 + 2 + 3 + 1) / 4
 
 
 def test_votes_do_not_reach_across_the_blocks_of_a_run():
@@ -151,4 +159,4 @@ def test_votes_do_not_reach_across_the_blocks_of_a_run():
     ]
     answers = ["mud", "mud", "mud", "ice", "ice", "ice", "mud"]
     samples, results = hand_made(["a"] * 6 + ["b"], range(7), y, [answers], folds)
-    assert summarise(pool(results, np.array(y)), samples, 0).vote_accuracy == 4 / 7
+    assert as_figures(results, samples, 0).vote_accuracy == 4 / 7

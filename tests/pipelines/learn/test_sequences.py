@@ -4,12 +4,18 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from pipelines.courses.following import STRIDE_S, Track, last_class
-from pipelines.courses.judgement import find_breakaways, judge
-from pipelines.courses.stretches import order_stretches, stretches_of
-from pipelines.crossval.crossval import crossval
-from pipelines.crossval.settings import CrossvalSettings
-from pipelines.reporting.json_file import as_json
+from pipelines.learn.crossval import EvaluationSettings, crossval
+from pipelines.learn.evaluate import HeldOut
+from pipelines.learn.sequences import (
+    STRIDE_S,
+    Track,
+    breakaways_of,
+    last_class,
+    order_stretches,
+    sequence_figures,
+    stretches_of,
+)
+from pipelines.report.json_file import as_json
 from terrain.logs.splicing import Part
 from terrain.records import Windows
 
@@ -65,7 +71,7 @@ def test_accuracy_delay_and_flips_are_those_that_were_put_in():
     late = np.concatenate((true[:1].repeat(10), true[:-10]))  # every change 2.5 s late
     noisy = true.copy()
     noisy[[40, 120, 200]] = 2
-    figures = judge([track_of(late, noisy)], 0)
+    figures = sequence_figures([track_of(late, noisy)], 0)
     delay = figures.filter_delay_s
     assert (delay.p50, delay.p90, delay.n_changes, delay.n_missed) == (2.75, 2.75, 2, 0)
     assert figures.filtered_accuracy_at_end == pytest.approx(1 - 20 / 240)
@@ -78,15 +84,15 @@ def test_accuracy_delay_and_flips_are_those_that_were_put_in():
 
 def test_a_change_that_is_never_found_is_counted_and_not_averaged():
     reported = np.repeat([0, 0, 0], 80)
-    delay = judge([track_of(reported, reported)], 0).filter_delay_s
+    delay = sequence_figures([track_of(reported, reported)], 0).filter_delay_s
     assert (delay.n_changes, delay.n_missed, delay.p90_of_all) == (2, 1, None)
     assert delay.p90 == 0.25  # back on the ground that it never left
     unknown = np.full(240, -1)
-    figures = judge([track_of(unknown, unknown)], 0)
+    figures = sequence_figures([track_of(unknown, unknown)], 0)
     assert figures.unknown_ratio == 1.0
     assert figures.filtered_accuracy == 0.0
     assert np.isnan(figures.filter_delay_s.p90)
-    assert judge([], 0) is None
+    assert sequence_figures([], 0) is None
 
 
 def test_the_interval_covers_the_accuracy_of_unlike_runs():
@@ -96,12 +102,12 @@ def test_the_interval_covers_the_accuracy_of_unlike_runs():
     for i in range(12):
         reported = np.where(rng.random(240) < rng.uniform(0.6, 1.0), true, 2)
         tracks.append(track_of(reported, true)._replace(run=(f"a {i}", f"b {i}", f"c {i}")))
-    figures = judge(tracks, 0)
+    figures = sequence_figures(tracks, 0)
     low, high = figures.filtered_accuracy_ci
     assert low < figures.filtered_accuracy < high
     assert 0.02 < high - low < 0.3
     assert figures.gain == pytest.approx(figures.filtered_accuracy - 1.0)
-    assert judge(tracks, 0) == figures
+    assert sequence_figures(tracks, 0) == figures
 
 
 def test_the_last_class_holds_through_refused_windows():
@@ -120,7 +126,10 @@ def test_breakaways_name_the_run_and_both_terrains():
     names = np.array(["a"] * 25, dtype=object)
     labels = np.array(["ice"] * 25, dtype=object)
     windows = Windows({}, {}, {}, 2.0, 2.0 * np.arange(25), names, labels)
-    [found] = find_breakaways(probability, np.array(["ice", "snow"]), windows)
+    held_out = HeldOut(
+        np.array(["ice", "snow"]), probability[None], np.zeros((1, 25), int), labels.astype(str), []
+    )
+    [found] = breakaways_of(held_out, windows)
     assert (found.run_id, found.start_s, found.end_s) == ("a", 20.0, 30.0)
     assert (found.label, found.looks_like) == ("ice", "snow")
 
@@ -132,7 +141,7 @@ def test_crossval_judges_courses_beside_single_windows(drive):
         for terrain in ("GRASS", "ASPHALT")
         for i in range(5)
     ]
-    settings = CrossvalSettings(repeats=1, n_jobs=1)
+    settings = EvaluationSettings(repeats=1, n_jobs=1)
     document = as_json(crossval(runs, settings))
     assert document["courses"]["n_courses"] == 5
     assert document["recorded_courses"] is None
@@ -141,6 +150,6 @@ def test_crossval_judges_courses_beside_single_windows(drive):
     assert document["filter_delay_s"]["n_changes"] >= 5
     assert document["courses"]["gain"] >= -0.05
     assert document["breakaways"] == []
-    plain = as_json(crossval(runs, CrossvalSettings(repeats=1, n_jobs=1, extras=False)))
+    plain = as_json(crossval(runs, EvaluationSettings(repeats=1, n_jobs=1, extras=False)))
     assert "filtered_accuracy" not in plain
     assert plain["accuracy"] == document["accuracy"]

@@ -5,10 +5,9 @@ import warnings
 
 import pytest
 
-from pipelines.crossval.crossval import crossval
-from pipelines.crossval.settings import CrossvalSettings
+from pipelines.learn.crossval import EvaluationSettings, crossval
 from pipelines.learn.parallel import computing
-from pipelines.reporting.json_file import as_json
+from pipelines.report.json_file import as_json
 
 
 @pytest.mark.slow
@@ -19,7 +18,7 @@ def test_a_cluster_gives_the_report_of_this_machine(make_run):
         for name in ("ICE", "SNOW")
         for k in range(4)
     ]
-    settings = CrossvalSettings(repeats=1, steady=False, n_jobs=2)
+    settings = EvaluationSettings(repeats=1, steady=False, n_jobs=2)
     here = crossval(runs, settings)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
