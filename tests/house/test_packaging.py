@@ -94,6 +94,7 @@ def test_readme_names_every_command_that_there_is():
 
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     assert [each.name for each in COMMANDS if f"terrain {each.name}" not in readme] == []
+    assert len(readme.splitlines()) <= 120
 
 
 def test_every_number_in_the_yaml_has_a_source():
@@ -114,11 +115,11 @@ def test_every_number_in_the_yaml_has_a_source():
     assert [found for name, node in content.items() for found in bare_numbers(node, name)] == []
 
 
-def test_the_mapping_in_readme_is_accepted(tmp_path):
+def test_the_mapping_of_the_page_on_formats_is_accepted(tmp_path):
     from terrain.logs.mapping import find_runs, load_mapping
 
-    readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    (tmp_path / "mapping.yaml").write_text(re.search(r"```yaml\n(.*?)```", readme, flags=re.DOTALL)[1])
+    page = (ROOT / "docs" / "formats.md").read_text(encoding="utf-8")
+    (tmp_path / "mapping.yaml").write_text(re.search(r"```yaml\n(.*?)```", page, flags=re.DOTALL)[1])
     (tmp_path / "ICE").mkdir()
     (tmp_path / "ICE" / "imu 1.csv").write_text("stamp,yaw rate\n0,90\n20,180\n")
     (tmp_path / "ICE" / "wheels 1.csv").write_text("t,vl,vr\n0,3.6,7.2\n0.02,3.6,7.2\n")
