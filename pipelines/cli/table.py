@@ -30,11 +30,19 @@ COMMANDS: tuple[Command, ...] = (
     ),
     Command("Data", "simulate", "pipelines.data.simulate", "runs of a described robot"),
     Command(
+        "State",
+        "estimate",
+        "pipelines.slip.estimate",
+        "motion and slip, by a filter, an observer or a pose from outside",
+    ),
+    Command("State", "calibrate", "pipelines.slip.calibrate", "a robot, an odometry or a soil from logs"),
+    Command(
         "Terrain",
         "crossval",
         "pipelines.learn.crossval",
         "recipes or models on runs and sessions held out, side by side",
     ),
+    Command("Slip", "learn-slip", "pipelines.slip.learn_slip", "slip curves and target slips"),
     Command(
         "Reality",
         "explain",
@@ -61,5 +69,8 @@ FORMER: dict[str, str] = {
     "compare": "name several recipes or models in terrain crossval, as --recipe svm,cnn",
     "faults": "use terrain drive --faults NAME,...",
     "track": "use terrain drive --path FILE",
+    "odometry": "use terrain calibrate --what odometry",
+    "fit-soil": "use terrain calibrate --what soil",
+    "measure-slip": "use terrain estimate --filter pose",
 }
 """Former command: a sentence that names its successor."""

@@ -6,13 +6,11 @@ import typer
 
 from pipelines.cli import (
     classify,
-    estimate,
     features,
     label,
     quickstart,
     replay,
     slip,
-    soil,
 )
 
 app = typer.Typer(
@@ -25,7 +23,7 @@ app = typer.Typer(
 )
 
 GROUPS = (
-    *(estimate.app, features.app, classify.app, slip.app, soil.app),
+    *(features.app, classify.app, slip.app),
     *(replay.app, label.app),
     *(quickstart.app,),
 )

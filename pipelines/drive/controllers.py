@@ -179,10 +179,10 @@ def train_classifier(
     runs_a_terrain : number of runs; that of ``terrain quickstart`` by default
     """
     from pipelines.classify.train import model_info
-    from pipelines.estimate.labelled import RUNS_A_TERRAIN, labelled_runs
     from pipelines.learn.protocols import samples_of
     from pipelines.learn.recipes import recipe_of
     from pipelines.learn.settings import RecipeSettings
+    from terrain.estimation.labelled import RUNS_A_TERRAIN, labelled_runs
 
     runs, _, _ = labelled_runs(seed, runs_a_terrain or RUNS_A_TERRAIN, progress, robot)
     settings = RecipeSettings(seed=seed)

@@ -8,15 +8,15 @@ import numpy as np
 
 from pipelines.ground_changes.results import FoundChanges, WatchedRun
 from pipelines.ground_changes.settings import FindChangesSettings
-from pipelines.measured_slip.measure import one_robot
 from pipelines.reporting.progress import Progress, silent
 from terrain.classify.response_change import DetectorSettings, calibrate, changes_of
 from terrain.errors import DataError
+from terrain.measured_slip.measure import one_robot
 from terrain.measured_slip.slips import wheel_speeds
 from terrain.measured_slip.steps import SlipStep, slip_step
 from terrain.measured_slip.travelled import outside_source
 from terrain.records import Array, RunLog
-from terrain.robots import Robot
+from terrain.robots import Robot, load_robot
 
 
 def find_changes(
@@ -40,7 +40,7 @@ def find_changes(
     DataError
         if runs are of several robots, lack wheel speeds or currents, or none is long enough to calibrate on.
     """
-    robot = one_robot([*runs, *quiet], settings.robot)
+    robot = one_robot([*runs, *quiet], None if settings.robot is None else load_robot(settings.robot))
     several = [run.run_id for run in quiet if len(run.terrains) > 1]
     if several:
         raise DataError(

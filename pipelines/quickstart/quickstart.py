@@ -18,12 +18,12 @@ from pipelines.data.convert import run as convert
 from pipelines.data.datasets import data_digest, load_runs
 from pipelines.data.duplicates import distinct_runs
 from pipelines.estimate.consistency import TerrainConsistency
-from pipelines.estimate.labelled import TerrainSlip
 from pipelines.quickstart.holding_out import divide
 from pipelines.quickstart.results import KeptRuns, QuickstartResult
 from pipelines.quickstart.settings import QuickstartSettings
 from pipelines.reporting.progress import Progress, silent
 from terrain.errors import DataError
+from terrain.estimation.labelled import TerrainSlip
 from terrain.files.atomic import atomic_folder, atomic_write, ensure_writable
 from terrain.logs.write import write_run
 from terrain.records import RunLog
@@ -55,7 +55,7 @@ def quickstart(
     Parameters
     ----------
     settings : where runs are read, and where runs (``out/runs``) and report (``out/report.html``) go; without
-        data, runs are simulated and filtered (:mod:`pipelines.estimate.labelled`); where there are enough,
+        data, runs are simulated and filtered (:mod:`terrain.estimation.labelled`); where there are enough,
         some are held out, and these are predicted
     progress : called as the work goes on
     evaluation : how the recipe is evaluated; ``settings.evaluation`` by default
@@ -117,7 +117,7 @@ def quickstart(
 def _simulated(evaluation: CrossvalSettings, runs_a_terrain: int | None, progress: Progress) -> _Source:
     from pipelines.estimate.consistency import RUNS_A_SCENARIO, consistency_by_terrain
     from pipelines.estimate.figures import motion_figure, slip_figure
-    from pipelines.estimate.labelled import ROBOT, RUNS_A_TERRAIN, labelled_runs
+    from terrain.estimation.labelled import ROBOT, RUNS_A_TERRAIN, labelled_runs
     from terrain.robots import load_robot
 
     seed, n_jobs = evaluation.seed, evaluation.n_jobs
@@ -140,7 +140,7 @@ def _commands(
     names = shlex.quote(",".join(run.run_id for run in held_out))
     without, only = (f" --without {names}", f" --only {names}") if held_out else ("", "")
     if data is None:
-        from pipelines.estimate.labelled import FILTER, ROBOT, RUNS_A_TERRAIN, SCENARIO
+        from terrain.estimation.labelled import FILTER, ROBOT, RUNS_A_TERRAIN, SCENARIO
 
         data = settings.out / "runs"
         steps = [

@@ -10,7 +10,7 @@ from pipelines.classify.results import Predictions, Training
 from pipelines.crossval.results import CrossvalReport
 from pipelines.data.convert import ImportResult
 from pipelines.estimate.consistency import TerrainConsistency
-from pipelines.estimate.labelled import TerrainSlip
+from terrain.estimation.labelled import TerrainSlip
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,10 +10,10 @@ from rich.table import Table
 from pipelines.classify.screen import print_predictions, print_training
 from pipelines.crossval.screen import print_crossval
 from pipelines.estimate.consistency import print_consistency
-from pipelines.estimate.labelled import TerrainSlip
 from pipelines.quickstart.results import QuickstartResult
 from pipelines.reporting.numbers import format_known
 from pipelines.reporting.terminal import number_columns, print_lines
+from terrain.estimation.labelled import TerrainSlip
 
 
 def print_quickstart(result: QuickstartResult, console: Console) -> None:

@@ -47,7 +47,8 @@ class Result:
     """Base of the results of commands, which are frozen dataclasses.
 
     The module that defines a result has a function ``report(result)``; screen, page and notebook show what it
-    returns.  The fields are the keys of ``--json``.
+    returns.  The fields are the keys of ``--json``; one that is not :func:`described` is none of them, as the
+    pictures that a report shows.
 
     Examples
     --------
@@ -74,7 +75,11 @@ class Result:
         from pipelines.report.json_file import as_json
 
         assert is_dataclass(self)
-        return {each.name: as_json(getattr(self, each.name)) for each in fields(self)}
+        return {
+            each.name: as_json(getattr(self, each.name))
+            for each in fields(self)
+            if "description" in each.metadata
+        }
 
     def to_pandas(self) -> pd.DataFrame:
         """Return the fields that are numbers, texts or intervals as a table of one row."""
@@ -155,6 +160,8 @@ def type_schema(kind: Any) -> dict[str, Any]:
         names = tuple(described_fields) or kind._fields
         properties = {}
         for name in names:
+            if issubclass(kind, Result) and "description" not in described_fields[name]:
+                continue
             about = {
                 key: text for key, text in described_fields.get(name, {}).items() if text and key != "form"
             }

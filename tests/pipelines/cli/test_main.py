@@ -339,12 +339,12 @@ def test_the_choices_of_the_command_line_are_those_that_there_are():
     from pipelines.crossval.settings import RECIPES as RECIPE_CHOICES
     from pipelines.data.datasets import LAYOUTS
     from pipelines.data.settings import Layout
-    from pipelines.estimate.settings import Filter, Tuning
     from pipelines.learn.recipes import RECIPES
+    from pipelines.slip.modes import Filter, Tuning
     from terrain.estimation.estimate import FILTERS, TUNINGS
     from terrain.estimation.observers.choice import OBSERVERS
 
     assert get_args(Layout) == LAYOUTS
     assert RECIPE_CHOICES == RECIPES
-    assert get_args(Filter) == (*FILTERS, *OBSERVERS)
+    assert get_args(Filter) == (*FILTERS, *OBSERVERS, "pose")
     assert get_args(Tuning) == TUNINGS

@@ -6,8 +6,7 @@ import pytest
 from pipelines.data.datasets import load_runs
 from pipelines.data.simulate import Settings as SimulateSettings
 from pipelines.data.simulate import run as simulate_runs
-from pipelines.estimate.estimate import estimate
-from pipelines.estimate.settings import EstimateSettings
+from pipelines.slip.estimate import estimate_runs
 from terrain.discrepancy.diagnosed_runs import diagnose_runs
 from terrain.discrepancy.signals import signals_of
 from terrain.effects import CHANNELS, effect_named, vector_of
@@ -99,6 +98,5 @@ def test_runs_are_explained_without_an_assumption_about_what_is_not_described(ro
 
 
 def test_runs_are_filtered(robot_file, wide_runs):
-    settings = EstimateSettings(filter="skid", robot=str(robot_file), figures=False)
-    found = estimate(wide_runs, settings)
+    found = estimate_runs(wide_runs, load_robot(robot_file), "skid")
     assert len(found.runs) == len(wide_runs)

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import yaml
 
-from pipelines.estimate.calibrate import calibrate
-from pipelines.estimate.estimate import estimate
-from pipelines.estimate.settings import EstimateSettings
 from pipelines.live.pilot import LivePilot
+from pipelines.report import silent
+from pipelines.slip import calibrate
+from pipelines.slip.estimate import estimate_runs
 from terrain.errors import ConfigError
 from terrain.estimation.enriched import enriched
 from terrain.estimation.estimate import estimate_run
@@ -104,12 +104,11 @@ def test_files_pass_through_the_commands(tmp_path):
     robot = write_extended(out, "agrimaro", ASKED, 1e-6 * np.eye(len(names)), intervals, "a test")
     run = driven(tuple(ASKED.items()), None, "straight", 8.0)
     for tuning in ("physical", "likelihood"):
-        settings = EstimateSettings(filter="vio15", robot=str(out), tuning=tuning, figures=False)
-        (row,) = estimate([run], settings).runs
+        (row,) = estimate_runs([run], robot, "vio15", tuning=tuning).result.runs
         assert row.speed_rmse_mps < 0.006
     assert np.isfinite(terrain_runs(run, robot)[0].balance.mass_kg)
     assert LivePilot(robot)._radius_m == pytest.approx(0.208)
     with pytest.raises(ConfigError, match="is extended by effects"):
-        calibrate(tmp_path, out)
+        calibrate.run(calibrate.Settings(data=tmp_path, robot=str(out)), silent)
     content = yaml.safe_load(out.read_text())
     assert content["effects"]["schema"] == 1

@@ -16,13 +16,13 @@ from pipelines.classify.results import (
 from pipelines.crossval.results import Applicability
 from pipelines.crossval_figures.figures import confusion_figure
 from pipelines.estimate.consistency import TerrainConsistency
-from pipelines.estimate.labelled import TerrainSlip
 from pipelines.learn.tracking import Registered
 from pipelines.quickstart.page import CAPTIONS, html_report
 from pipelines.quickstart.results import KeptRuns, QuickstartResult
 from pipelines.reporting.numbers import NOT_KNOWN
 from pipelines.reporting.versions import versions
 from terrain.control.comparison import MeanInterval
+from terrain.estimation.labelled import TerrainSlip
 
 MINUS_0_07 = "\N{MINUS SIGN}0.070"
 VOID = {"meta", "img", "br"}

@@ -4,7 +4,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipelines.estimate.calibrate import calibrate
+from pipelines.report import silent
+from pipelines.slip import calibrate
 from terrain.calibration.omni import COM_X, COM_Y, DISTANCE, FRICTION, RADIUS, identify_omni, motor_friction
 from terrain.errors import DataError
 from terrain.kinematics.wheel_speed import with_wheel_speeds
@@ -125,7 +126,9 @@ def test_few_runs_determine_no_load_and_turns_no_distance(runs):
 def test_calibrate_writes_a_description_that_is_read_again(runs, tmp_path):
     for run in runs:
         write_run(run, tmp_path / "runs")
-    result = calibrate(tmp_path / "runs", "robotino", tmp_path / "mine.yaml")
+    result = calibrate.run(
+        calibrate.Settings(data=tmp_path / "runs", robot="robotino", out=tmp_path / "mine.yaml"), silent
+    )
     again = load_robot(str(tmp_path / "mine.yaml"))
     rows = {row.parameter: row for row in result.findings}
     assert again.body.com_x_m == pytest.approx(rows[COM_X].value, abs=1e-4)
@@ -134,7 +137,7 @@ def test_calibrate_writes_a_description_that_is_read_again(runs, tmp_path):
     (tmp_path / "none").mkdir()
     write_run(alone(np.random.default_rng(2), levels=(60.0, 60.0)), tmp_path / "none")
     with pytest.raises(DataError, match="nothing of robot robotino can be calibrated"):
-        calibrate(tmp_path / "none", "robotino")
+        calibrate.run(calibrate.Settings(data=tmp_path / "none", robot="robotino"), silent)
 
 
 def test_friction_of_the_measured_motors_is_near_the_described_one(measured):

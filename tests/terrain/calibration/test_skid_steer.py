@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from pipelines.data.datasets import load_runs
-from pipelines.estimate.calibrate import calibrate
+from pipelines.report import silent
+from pipelines.slip import calibrate
 from terrain.calibration.skid_steer import (
     LIDAR_DELAY,
     RADIUS,
@@ -150,7 +151,7 @@ def test_the_command_writes_the_section_and_the_robot_reads_it(tmp_path):
     for i in range(8):
         write_run(driven(0.29, 1.8, 0.3, 0.05, i), tmp_path / "runs")
     out = tmp_path / "mine.yaml"
-    result = calibrate(tmp_path / "runs", "warthog", out)
+    result = calibrate.run(calibrate.Settings(data=tmp_path / "runs", robot="warthog", out=out), silent)
     robot = load_robot(out)
     row = next(f for f in result.findings if f.parameter == TRACK)
     assert robot.identified["effective_track_m"] == pytest.approx(row.value, rel=1e-3)
@@ -164,7 +165,7 @@ def test_runs_without_a_lidar_are_one_sentence(tmp_path):
     with pytest.raises(
         DataError, match="drive 'skid_steer' is not calibrated from logs without the stream 'lidar'"
     ):
-        calibrate(tmp_path / "runs", "warthog")
+        calibrate.run(calibrate.Settings(data=tmp_path / "runs", robot="warthog"), silent)
 
 
 def test_a_section_with_a_wrong_key_or_unit_is_one_sentence(tmp_path):

@@ -277,7 +277,7 @@ def test_motion_does_not_depend_on_the_mounting_of_the_camera():
 EDGES = {
     "terrain/estimation/estimate.py",
     "terrain/estimation/observers/estimate.py",
-    "pipelines/estimate/estimate.py",
+    "pipelines/slip/filtered.py",
     "terrain/slip_learning/learn.py",
     "pipelines/streaming/estimator.py",
     "pipelines/live/terrain_source.py",

@@ -1,0 +1,275 @@
+"""``terrain calibrate --what odometry``: slip-compensated odometry, judged on runs that were held out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.stats import t as student
+
+from pipelines.data.datasets import drive_robot
+from pipelines.data.settings import load
+from pipelines.report import (
+    Progress,
+    Report,
+    Result,
+    Table,
+    Text,
+    described,
+    format_value,
+    interval,
+    silent,
+)
+from pipelines.slip.shown import Shown, sections, table
+from terrain.calibration.adaptive_legs import dead_reckoning, efficiencies_before, of_point
+from terrain.calibration.odometry_fit import (
+    ENCODER,
+    GYRODOMETRY,
+    SLIP,
+    FittedOdometry,
+    fit_odometry,
+    level,
+    without_tilt,
+)
+from terrain.calibration.odometry_judge import KindScore, LegScores, held_out_ends, score_legs
+from terrain.calibration.odometry_legs import Leg, legs_of_poses, legs_of_windows
+from terrain.errors import ConfigError, DataError
+from terrain.estimation.observers.slip_model import PARAMETERS
+from terrain.estimation.observers.slip_model_file import check_slip_model_file, write_slip_model
+from terrain.logs.drive import FILE_NAME, find_sessions
+from terrain.logs.drive_poses import WindowPoses, read_window_poses
+from terrain.records import Array, RunLog
+from terrain.robots import TrackedRobot, as_drive, load_robot
+
+if TYPE_CHECKING:
+    from pipelines.slip.modes import CalibrateSettings as Settings
+
+SHORTEST_S, LONGEST_S = 0.2, 3600.0
+"""Legs that are compared: the shortest has two poses of a lidar."""
+
+SHORT_RATIO = 0.8
+"""A command's leg that is so much shorter than the longest of all is left out: its windows are not whole."""
+
+ADAPTIVE = "adaptive observer"
+
+RMSE = ".3f"
+
+
+@dataclass(frozen=True, slots=True)
+class ParameterFound:
+    """A parameter of a slip model: its value and its 95 % interval, NaN where it was not fitted."""
+
+    value: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class OdometryResult(Result):
+    """Odometry of one robot, judged on runs held out."""
+
+    robot: str = described("its name")
+    seed: int = described("of folds and bootstrap")
+    folds: int = described("of whole runs")
+    n_runs: int = described("with poses")
+    scores: tuple[LegScores, ...] = described("by length of the legs")
+    parameters: Mapping[str, ParameterFound] = described("of the odometry fitted to all runs")
+    observed_point_m: tuple[float, float] = described("where the point that poses show lies in the body", "m")
+    observed_angle_rad: float = described("by which the sensor of the poses is turned", "rad")
+    delay_s: float = described("of the poses behind the gyro, as the robot's description has it", "s")
+    adaptive: LegScores | None = described(
+        "scores of the last windows of commands, by the adaptive observer and others"
+    )
+    written: Path | None = described("file of the slip model")
+    notes: tuple[str, ...] = described("what is missing, in words")
+
+
+def calibrate_odometry(settings: Settings, robot_name: str, progress: Progress = silent) -> OdometryResult:
+    """Fit kinds of odometry to folds of runs and judge them on the others; write the slip model of all.
+
+    Parameters
+    ----------
+    settings : of ``terrain calibrate``: runs with poses, or commands of DRIVE; lengths, folds
+    robot_name : tracked robot by name, or its YAML file
+
+    Raises
+    ------
+    ConfigError
+        if the robot is not tracked, a length is not accepted, or the file is there already.
+    DataError
+        if fewer runs than folds have poses.
+    """
+    runs = load(settings, robot_name).runs
+    refusal = "robot {name}: drive {drive!r} has no tracks; --what odometry is for 'tracked'"
+    robot = as_drive(TrackedRobot, load_robot(robot_name), refusal)
+    if not all(SHORTEST_S <= length <= LONGEST_S for length in settings.lengths) or not settings.lengths:
+        raise ConfigError(f"--lengths: {SHORTEST_S:g} to {LONGEST_S:g} seconds are accepted")
+    if settings.out is not None:
+        check_slip_model_file(settings.out)
+    delay_s = robot.identified.get("lidar_delay_s", 0.0)
+    windows = _windows(settings.data, robot)
+    groups = (
+        _window_groups(runs, windows, robot, delay_s)
+        if windows
+        else {f"{length:g} s": _pose_legs(runs, robot, length) for length in settings.lengths}
+    )
+    groups = {name: legs for name, legs in groups.items() if legs}
+    if not groups:
+        raise DataError(
+            f"{settings.data}: no run has poses of a camera or lidar, beside tracks and gyro, over "
+            f"{' or '.join(f'{length:g}' for length in settings.lengths)} s"
+        )
+    ends = held_out_ends(
+        groups, robot, settings.folds, settings.seed, lambda done, total: progress("odometry", done, total)
+    )
+    scores = tuple(
+        score_legs(legs, {kind: by[name] for kind, by in ends.items()}, settings.seed)
+        for name, legs in groups.items()
+    )
+    every = [leg for legs in groups.values() for leg in legs]
+    n_runs = len({leg.run for leg in every})
+    flat = without_tilt(every)
+    fitted = fit_odometry(level(SLIP) if flat else SLIP, every, robot)
+    adaptive = None
+    if windows:
+        adaptive = _adaptive(runs, windows, groups, ends, robot, delay_s, fitted.mount, settings.seed)
+    if settings.out is not None:
+        write_slip_model(settings.out, fitted.model, robot.name)
+    return OdometryResult(
+        robot=robot.name,
+        seed=settings.seed,
+        folds=settings.folds,
+        n_runs=n_runs,
+        scores=scores,
+        parameters=_parameters(fitted, n_runs),
+        observed_point_m=(float(fitted.mount[0]), float(fitted.mount[1])),
+        observed_angle_rad=float(fitted.mount[2]),
+        delay_s=delay_s if windows else 0.0,
+        adaptive=adaptive,
+        written=settings.out,
+        notes=("no slope was driven, or no tilt measured: what slopes do is not fitted",) if flat else (),
+    )
+
+
+def _gain(name: str) -> Callable[[KindScore], Any]:
+    """Return a gain or its interval; those of a kind over itself are not shown."""
+    return lambda row: getattr(row, name) if getattr(row, name.removesuffix("_ci")) != 0.0 else None
+
+
+KINDS = (
+    Shown("odometry", "kind"),
+    Shown("RMSE", "rmse_m", RMSE, "m"),
+    Shown("95 %", "rmse_ci_m", RMSE),
+    Shown("median", "median_m", RMSE, "m"),
+    Shown("heading", lambda row: math.degrees(row.yaw_rmse_rad), ".1f", "degrees"),
+    *(Shown("below encoder", _gain("gain_encoder"), ".0%"), Shown("95 %", _gain("gain_encoder_ci"), ".0%")),
+    *(Shown("below gyro", _gain("gain_gyro"), ".0%"), Shown("95 %", _gain("gain_gyro_ci"), ".0%")),
+)
+
+
+def report(result: OdometryResult) -> Report:
+    """Return the errors of each kind of odometry by the length of a leg, and the slip model."""
+    x_m, y_m = result.observed_point_m
+    tables = [_table(scores, f"position after {scores.length_s:.2g} s, held out") for scores in result.scores]
+    if result.adaptive is not None:
+        title = f"last windows of {result.adaptive.n_legs} commands, by efficiencies of the windows before"
+        tables.append(_table(result.adaptive, title))
+    parameters = (
+        Shown("parameter", str),
+        Shown("value", lambda name: result.parameters[name].value, ".4g"),
+        Shown("95 %", lambda name: (result.parameters[name].low, result.parameters[name].high), ".4g"),
+    )
+    mount = (
+        f"The poses are of a point {100 * x_m:+.1f} cm ahead and {100 * y_m:+.1f} cm to the left, turned by "
+        f"{math.degrees(result.observed_angle_rad):+.1f} degrees, {result.delay_s:.2f} s late."
+    )
+    longest = result.scores[-1]
+    best = min(longest.kinds, key=lambda kind: kind.rmse_m)
+    return Report(
+        f"Odometry of {result.robot}",
+        f"After {longest.length_s:.2g} s the position is off by {format_value(best.rmse_m, RMSE, 'm')} "
+        f"({interval(*best.rmse_ci_m, RMSE)}) by {best.kind} odometry, on runs held out.",
+        parts=[tables[len(result.scores) - 1], Text(mount), *(Text(note, "note") for note in result.notes)],
+        details=sections(
+            ("All lengths", tables), ("Slip model of all runs", [table(result.parameters, parameters)])
+        ),
+        next_step=f"terrain estimate --data DIR --filter slip-odometry --slip-model {result.written or 'FILE'}",
+    )
+
+
+def _table(scores: LegScores, title: str) -> Table:
+    size = f"{scores.n_legs} legs of {scores.n_runs} runs, {scores.path_m:.2g} m apart"
+    return table(scores.kinds, KINDS, f"{title}: {size}")
+
+
+def _windows(folder: Path, robot: TrackedRobot) -> Mapping[str, tuple[WindowPoses, ...]]:
+    """Return the poses of the windows of DRIVE under a folder; none in another layout."""
+    if not folder.is_dir() or not any((path / FILE_NAME).is_file() for path in find_sessions(folder)):
+        return {}
+    return read_window_poses(folder, drive_robot(robot))
+
+
+def _window_groups(
+    runs: Sequence[RunLog],
+    windows: Mapping[str, tuple[WindowPoses, ...]],
+    robot: TrackedRobot,
+    delay_s: float,
+) -> dict[str, list[Leg]]:
+    single: list[Leg] = []
+    chained: list[Leg] = []
+    for number, run in enumerate(runs):
+        own, whole = legs_of_windows(run, number, windows.get(run.run_id, ()), robot, delay_s)
+        single += own
+        chained += [whole] if whole is not None else []
+    longest_s = max((leg.length_s for leg in chained), default=0.0)
+    return {"window": single, "command": [leg for leg in chained if leg.length_s > SHORT_RATIO * longest_s]}
+
+
+def _pose_legs(runs: Sequence[RunLog], robot: TrackedRobot, length_s: float) -> list[Leg]:
+    return [
+        leg
+        for number, run in enumerate(runs)
+        if "pose" in run.streams
+        for leg in legs_of_poses(run, number, robot, length_s)
+    ]
+
+
+def _parameters(fitted: FittedOdometry, n_runs: int) -> dict[str, ParameterFound]:
+    """Return the fitted parameters, with intervals by Student's t over runs: the clusters of the fit."""
+    std = np.sqrt(np.diag(fitted.model.covariance))
+    wide = float(student.ppf(0.975, max(n_runs - 1, 1)))
+    reach = np.where(np.isin(np.arange(len(std)), fitted.kind.free), wide * std, np.nan)
+    return {
+        name: ParameterFound(float(value), float(value - half), float(value + half))
+        for name, value, half in zip(PARAMETERS, fitted.model.vector, reach, strict=True)
+        if np.isfinite(half)
+    }
+
+
+def _adaptive(
+    runs: Sequence[RunLog],
+    windows: Mapping[str, tuple[WindowPoses, ...]],
+    groups: Mapping[str, Sequence[Leg]],
+    ends: Mapping[str, Mapping[str, Array]],
+    robot: TrackedRobot,
+    delay_s: float,
+    mount: Array,
+    seed: int,
+) -> LegScores | None:
+    """Return the scores over the last windows of commands."""
+    single = groups["window"]
+    last_of = {leg.run: k for k, leg in enumerate(single)}
+    chosen, predicted = [], []
+    for number, run in enumerate(runs):
+        eta = efficiencies_before(run, windows.get(run.run_id, ()), robot, delay_s, mount)
+        if eta is not None and number in last_of:
+            chosen.append(last_of[number])
+            predicted.append(of_point(dead_reckoning(single[last_of[number]], eta, robot), mount))
+    if len(chosen) < 2:
+        return None
+    compared = {kind.name: ends[kind.name]["window"][chosen] for kind in (ENCODER, GYRODOMETRY)}
+    return score_legs([single[k] for k in chosen], compared | {ADAPTIVE: np.array(predicted)}, seed)

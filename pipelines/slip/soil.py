@@ -1,0 +1,339 @@
+"""``terrain calibrate --what soil``: which law of a wheel in sand holds on trials that its fit did not have."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipelines.data.datasets import data_digest, load_runs
+from pipelines.data.settings import load
+from pipelines.report import (
+    Figure,
+    Line,
+    Mark,
+    Panel,
+    Part,
+    Points,
+    Progress,
+    Report,
+    Result,
+    Section,
+    Table,
+    Text,
+    described,
+    format_value,
+    silent,
+)
+from pipelines.slip.shown import Shown, sections, table, write_figures
+from terrain.errors import ConfigError, DataError
+from terrain.files.atomic import atomic_write, ensure_writable
+from terrain.records import RunLog
+from terrain.soil_identification.comparison import BAR_RATIO, WheelResult, compare_laws, n_fits
+from terrain.soil_identification.held_out import HELD_OUT, Misfit
+from terrain.soil_identification.laws import Prediction
+from terrain.soil_identification.soil_file import soil_yaml
+from terrain.soil_identification.trials import WHEELS, Trials, Wheel, trials_of
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from pipelines.slip.modes import CalibrateSettings as Settings
+
+SOIL_NAME = "testbed_sand_{wheel}"
+ERROR = ".1%"
+
+
+LEFT_OUT = {"slip": "slips left out", "angle": "slip angles left out"}
+
+PANELS = (("pull_n", "traction [N]"), ("side_n", "side force [N]"), ("sinkage_m", "sinkage [mm]"))
+
+
+@dataclass(frozen=True)
+class SoilResult(Result):
+    """Laws of a wheel in sand, compared on what their fits did not have."""
+
+    out: Path | None = described("folder of the soils")
+    dataset: str = described("name of the data")
+    data_digest: str = described("of the trials")
+    seed: int = described("of the bootstrap")
+    draws: int = described("bootstrap samples behind the intervals")
+    bar_ratio: float = described("error of each force over the load that is aimed at", "1")
+    wheels: tuple[WheelResult, ...] = described("one each")
+    files: tuple[str, ...] = described("that were written")
+    skipped: tuple[str, ...] = described("a sentence for each trial that was skipped")
+    pictures: Mapping[str, Figure] = field(default_factory=dict)
+
+    def to_pandas(self) -> pd.DataFrame:
+        """Return the errors of each law on what was left out, a row each; slip and load given."""
+        import pandas as pd
+
+        return pd.DataFrame(
+            [
+                {"wheel": wheel.wheel, "law": row.name, "held_out": held, **getattr(row, held).load._asdict()}
+                for wheel in self.wheels
+                for row in wheel.laws
+                for held in HELD_OUT
+            ]
+        )
+
+
+def calibrate_soil(settings: Settings, progress: Progress = silent) -> SoilResult:
+    """Compare laws on held-out slips and angles, wheel by wheel, and write soils and pictures.
+
+    Parameters
+    ----------
+    settings : of ``terrain calibrate``: trials of the wheel testbed
+    progress : gets the fits that are done
+
+    Raises
+    ------
+    ConfigError
+        if ``out`` is a file.
+    LogError
+        if a trial, also of ``check``, cannot be read.
+    DataError
+        if no run is a trial of the testbed, or a wheel has too few settings.
+    TerrainError
+        if a folder cannot be written.
+    """
+    runs, skipped = load(settings)
+    if settings.out is not None and settings.out.is_file():
+        raise ConfigError(f"{settings.out}: is a file; --out names a folder of soils")
+    for folder in (settings.out, settings.figures):
+        if folder is not None:
+            ensure_writable(folder)
+    further = _further(settings)
+    by_wheel = {robot: [run for run in runs if run.robot == robot] for robot in WHEELS}
+    if not any(by_wheel.values()):
+        raise DataError(
+            f"none of {len(runs)} runs is a trial of a wheel testbed (robots {', '.join(WHEELS)}): "
+            "give a folder with smooth.csv or grouser.csv"
+        )
+    results: list[WheelResult] = []
+    files: list[str] = []
+    pictures: dict[str, Figure] = {}
+    for robot, own in by_wheel.items():
+        if own:
+            others = [run for run in further if run.robot == robot]
+            result, figures = _one_wheel(WHEELS[robot], own, others, settings, progress)
+            results.append(result)
+            pictures |= figures
+            files += [] if result.soil.file is None else [str(result.soil.file)]
+    if settings.figures is not None:
+        named = {name.replace(", ", "_"): figure for name, figure in pictures.items()}
+        files += write_figures(named, settings.figures)
+    return SoilResult(
+        out=settings.out,
+        dataset=settings.dataset,
+        data_digest=data_digest(runs),
+        seed=settings.seed,
+        draws=settings.draws,
+        bar_ratio=BAR_RATIO,
+        wheels=tuple(results),
+        files=tuple(files),
+        skipped=tuple(skipped),
+        pictures=pictures,
+    )
+
+
+def _one_wheel(
+    wheel: Wheel, own: Sequence[RunLog], others: Sequence[RunLog], settings: Settings, progress: Progress
+) -> tuple[WheelResult, dict[str, Figure]]:
+    """Compare laws on one wheel's trials, and write its soil; return its figures by name."""
+    trials, further = trials_of(own, wheel), trials_of(others, wheel) if others else None
+    fits = itertools.count(1)
+    total = n_fits(trials, settings.laws, settings.draws)
+    result, shown, predictions = compare_laws(
+        trials,
+        further,
+        wheel,
+        settings.laws,
+        settings.draws,
+        settings.seed,
+        lambda: progress(f"fit {wheel.name}", next(fits), total),
+    )
+    figures = {
+        f"{wheel.name}, {text}": held_out_figure(result, shown, predictions[held], held)
+        for held, text in LEFT_OUT.items()
+    }
+    if settings.out is None:
+        return result, figures
+    name = SOIL_NAME.format(wheel=wheel.name)
+    friction, file = result.parameters["tan_friction"], settings.out / f"{name}.yaml"
+    atomic_write(file, soil_yaml(name, wheel.name, settings.dataset, result.soil.fit, friction, result.law))
+    return replace(result, soil=result.soil._replace(file=file)), figures
+
+
+def _further(settings: Settings) -> list[RunLog]:
+    """Return the runs of ``--check``; none without it."""
+    if settings.check is None:
+        return []
+    runs = load_runs(settings.check, layout=settings.layout, repair=settings.repair)
+    if not any(run.robot in WHEELS for run in runs):
+        raise DataError(f"--check {settings.check}: none of {len(runs)} runs is a trial of a wheel testbed")
+    return runs
+
+
+def report(result: SoilResult) -> Report:
+    """Return the laws of each wheel with their errors on what was left out, the parameters and the limits."""
+    parts: list[Part] = []
+    details: list[Section] = []
+    for wheel in result.wheels:
+        figures = [each for name, each in result.pictures.items() if name.startswith(f"{wheel.wheel},")]
+        parts += [_laws_table(wheel), Text(verdict(wheel))]
+        details += sections((f"{wheel.wheel} wheel", [*_wheel_details(wheel), *figures]))
+    answers = " and ".join(
+        f"{_forces(each.laws[-1].slip.load)} ({each.wheel} wheel)" for each in result.wheels
+    )
+    soils = [wheel.soil.file for wheel in result.wheels if wheel.soil.file is not None]
+    return Report(
+        f"Wheel in sand, {result.dataset}",
+        f"On slips left out, {result.wheels[0].law} predicts traction and side force within {answers} of the load.",
+        parts=parts,
+        details=[*details, *sections(("Not read", result.skipped))],
+        next_step=f"terrain simulate --robot husky --terrain {soils[0] if soils else 'FILE'} --scenario straight "
+        "--out runs/",
+    )
+
+
+def verdict(wheel: WheelResult) -> str:
+    """Return whether the last law reaches what is aimed at, and where it stops."""
+    row = wheel.laws[-1]
+    parts = []
+    for held, found in (("slips", row.slip), ("angles", row.angle)):
+        state = (
+            "reached"
+            if found.reached
+            else f"not reached ({_forces(found.below_axle_angle)} without the wheel dragged along its axle)"
+        )
+        parts.append(
+            f"{held} left out, traction and side force off by {_forces(found.load)} of the load: {state}"
+        )
+    if wheel.checked is not None:
+        parts.append(f"{wheel.checked.load.n_trials} further trials: {_forces(wheel.checked.load)}")
+    return f"{wheel.wheel}: {format_value(BAR_RATIO, '.0%')} aimed at; {'; '.join(parts)}."
+
+
+def _forces(errors: Misfit) -> str:
+    return f"{format_value(errors.pull_ratio, ERROR)} and {format_value(errors.side_ratio, ERROR)}"
+
+
+def _errors(*titles: str, of: Callable[[Any], Misfit] = lambda row: row) -> list[Shown]:
+    """Return columns of traction, side force and sinkage."""
+    return [
+        Shown(titles[0], lambda row: of(row).pull_ratio, ERROR),
+        Shown(titles[1], lambda row: of(row).side_ratio, ERROR),
+        Shown(titles[2], lambda row: 1e3 * of(row).sinkage_m, ".1f", "mm"),
+    ]
+
+
+def _laws_table(wheel: WheelResult) -> Table:
+    columns = (
+        *(Shown("law", lambda row: row[0]), Shown("parameters", lambda row: row[1])),
+        Shown("given", lambda row: row[2]),
+        *_errors("slip out: traction", "side", "sinkage", of=lambda row: row[3]),
+        *_errors("angle out: traction", "side", "sinkage", of=lambda row: row[4]),
+    )
+    rows: list[tuple[Any, ...]] = [
+        (row.name, row.n_parameters, given, getattr(row.slip, given), getattr(row.angle, given))
+        for row in wheel.laws
+        for given in ("load", "sinkage")
+        if math.isfinite(getattr(row.slip, given).pull_ratio)
+    ]
+    rows.append(("(polynomial)", None, "load", wheel.surrogate_slip, wheel.surrogate_angle))
+    title = f"{wheel.wheel} wheel, {wheel.n_trials} trials: errors over the load"
+    return table(rows, columns, title, "Root mean squares over the measured load, with slip and angle given.")
+
+
+PARAMETERS = (
+    *(Shown("parameter", "name"), Shown("value", "value"), Shown("95 %", "interval")),
+    *(Shown("of the prior", "informed_ratio", ".2f"), Shown("identified", "identified")),
+)
+PRIOR = '"Of the prior": standard deviation with the trials over that without; below 0.5 one is identified.'
+
+
+def _wheel_details(wheel: WheelResult) -> list[Part]:
+    misfits: dict[str, Mapping[Any, Misfit]] = {
+        "by regime, slips left out": wheel.regimes,
+        "by the wheel speed left out [mm/s]": wheel.by_slip,
+        "by the slip angle left out [degrees]": wheel.by_angle,
+        "polynomial of slip and angle, no mechanics": {
+            "slips left out": wheel.surrogate_slip,
+            "angles left out": wheel.surrogate_angle,
+        },
+    }
+    columns = (
+        *(Shown("", lambda named: named[0]), Shown("trials", lambda named: named[1].n_trials)),
+        *_errors("traction", "side force", "sinkage", of=lambda named: named[1]),
+    )
+    soil, (low_m, high_m) = wheel.soil.misfit, wheel.sinkage_range_m
+    return [
+        Text(
+            f"{wheel.n_trials} trials at {wheel.n_settings} settings, load "
+            f"{format_value(wheel.load_range_n, '.1f', 'N')}, sinkage {1e3 * low_m:.0f} to {1e3 * high_m:.0f} mm, "
+            f"{wheel.deeper_than_axle} trials deeper than the axle; {_coupling_text(wheel)}."
+        ),
+        table(wheel.parameters.values(), PARAMETERS, f"parameters of {wheel.law}", PRIOR),
+        *(table(rows.items(), columns, title) for title, rows in misfits.items()),
+        *(Text(sentence) for sentence in wheel.not_identified),
+        Text(
+            f"On trials that roll nearly straight the simulator's law is off by {_forces(soil)} (traction and side "
+            f"force) and {format_value(1e3 * soil.sinkage_m, '.1f', 'mm')}."
+        ),
+    ]
+
+
+def _coupling_text(wheel: WheelResult) -> str:
+    """Return by how much the measured traction is corrected, or that it is not."""
+    ratio, std, n_trials = wheel.coupling
+    if math.isnan(ratio):
+        return "traction as measured, no trials of a locked wheel along its axle"
+    return (
+        f"traction less {ratio:.3f} ± {std:.3f} of the side force, what {n_trials} trials of a locked wheel "
+        "along its axle show"
+    )
+
+
+def held_out_figure(wheel: WheelResult, trials: Trials, prediction: Prediction, held_out: str) -> Figure:
+    """Show traction, side force and sinkage over slip, a colour an angle: points measured, lines predicted.
+
+    Parameters
+    ----------
+    wheel : whose last law predicts
+    trials : single ones
+    prediction : of the trials
+    held_out : ``slip`` or ``angle``
+    """
+    errors = getattr(wheel.laws[-1], held_out).load
+    panels = []
+    for name, label in PANELS:
+        scale = 1e3 if name.endswith("_m") else 1.0
+        measured, predicted = scale * getattr(trials, name), scale * getattr(prediction, name)
+        marks: list[Mark] = []
+        for number, angle in enumerate(np.unique(trials.angle_setting)):
+            rows = np.flatnonzero(trials.angle_setting == angle)
+            speeds = np.unique(trials.slip_setting[rows])
+            own = [rows[trials.slip_setting[rows] == speed] for speed in speeds]
+            slips = [float(trials.slip_ratio[each].mean()) for each in own]
+            means = [float(predicted[each].mean()) for each in own]
+            marks.append(Points("", trials.slip_ratio[rows], measured[rows], colour=number % 7))
+            marks.append(Line(f"{angle:g} degrees", slips, means, number % 7))
+        panels.append(Panel(tuple(marks), label))
+    title = (
+        f"{wheel.wheel} wheel, law {wheel.law}, {LEFT_OUT[held_out]}: traction off by "
+        f"{format_value(errors.pull_ratio, ERROR)} and side force by {format_value(errors.side_ratio, ERROR)} of the "
+        f"load (at most {format_value(BAR_RATIO, '.0%')} is aimed at), sinkage by "
+        f"{format_value(1e3 * errors.sinkage_m, '.1f', 'mm')}"
+    )
+    return Figure(
+        title,
+        tuple(panels),
+        "Points are measured, lines predicted; a colour a slip angle.",
+        x_label="slip ratio",
+    )

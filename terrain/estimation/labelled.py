@@ -1,0 +1,90 @@
+"""Labelled runs without data: simulated on each terrain, filtered, with slip beside the measurements."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from terrain.estimation.enriched import enriched
+from terrain.estimation.estimate import Estimate, estimate_run
+from terrain.estimation.summary import EstimateSummary, summarize
+from terrain.records import RunLog
+from terrain.robots import Robot, load_robot
+from terrain.simulation.run import simulate_run
+from terrain.terramechanics.soil import soil_names
+
+ROBOT = "agrimaro"
+SCENARIO = "survey"
+FILTER = "vio15"
+RUNS_A_TERRAIN = 6
+
+
+class TerrainSlip(NamedTuple):
+    """Steady slip of the simulated runs of a terrain: mean estimate, mean truth, RMSE, and mean NEES.
+
+    None where the slip was nowhere steady.
+    """
+
+    terrain: str
+    n_runs: int
+    slip_mean: float | None
+    slip_true_mean: float | None
+    slip_rmse: float | None
+    nees: float | None
+
+
+def labelled_runs(
+    seed: int,
+    runs_a_terrain: int = RUNS_A_TERRAIN,
+    progress: Callable[[str, int, int], None] = lambda task, done, total: None,
+    robot: Robot | None = None,
+) -> tuple[list[RunLog], tuple[TerrainSlip, ...], Estimate]:
+    """Simulate and filter runs on every terrain, with varied speed, slope, load, tyres and soil.
+
+    Parameters
+    ----------
+    seed : of everything that is drawn
+    runs_a_terrain : how many
+    progress : gets the task, how many of its steps are done, and how many there are
+    robot : whose; :data:`ROBOT` by default
+
+    Returns
+    -------
+    runs
+        with the streams ``estimator`` and ``slip``, sorted by id
+    slips
+        steady slip of the runs of each terrain
+    example
+        the estimate of one run, to be drawn
+    """
+    robot = load_robot(ROBOT) if robot is None else robot
+    terrains = soil_names()
+    runs, rows = [], []
+    for terrain in terrains:
+        found = []
+        for number in range(1, runs_a_terrain + 1):
+            run = simulate_run(robot, terrain, SCENARIO, seed, number, vary=True)
+            estimate = estimate_run(run, robot, FILTER)
+            runs.append(enriched(estimate))
+            found.append(summarize(estimate))
+            progress("simulate and filter", len(runs), runs_a_terrain * len(terrains))
+            if terrain == "grass" and number == 1:
+                example = estimate
+        rows.append(_row(terrain, found))
+    return sorted(runs, key=lambda run: run.run_id), tuple(rows), example
+
+
+def _row(terrain: str, found: Sequence[EstimateSummary]) -> TerrainSlip:
+    pairs = [(row.slip_mean, row.slip_true_mean) for row in found if math.isfinite(row.slip_true_mean)]
+    estimated, true = np.array(pairs).T if pairs else (np.array([math.nan]), np.array([math.nan]))
+    values = {
+        "slip_mean": float(estimated.mean()),
+        "slip_true_mean": float(true.mean()),
+        "slip_rmse": float(np.sqrt(np.mean((estimated - true) ** 2))),
+        "nees": float(np.mean([row.nees for row in found])),
+    }
+    known = {key: value if math.isfinite(value) else None for key, value in values.items()}
+    return TerrainSlip(terrain, len(found), **known)

@@ -1,0 +1,219 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import yaml
+
+from pipelines.report import silent
+from pipelines.report.terminal import terminal_text
+from pipelines.slip.calibrate import Settings, run
+from terrain.errors import ConfigError, DataError
+from terrain.estimation.measurements.batch import measurement_table
+from terrain.logs.write import write_run
+from terrain.records import RunLog
+from terrain.robots import load_robot
+from terrain.simulation.bench import six_positions_log
+from terrain.simulation.dynamic.simulate import simulate
+from terrain.simulation.scenario.make import make_scenario
+from terrain.terramechanics.soil import load_soil
+
+NOMINAL = load_robot("agrimaro")
+HIDDEN = NOMINAL.with_parts(
+    steering=replace(NOMINAL.steering, zero_1_rad=0.03, zero_2_rad=-0.02, zero_3_rad=0.015),
+    motors=replace(NOMINAL.motors, reduction_ratio=9.4),
+    camera=replace(NOMINAL.camera, time_constant_s=0.02),
+    sensors=replace(
+        NOMINAL.sensors,
+        encoder_time_constant_s=0.08,
+        gyro_bias_z_radps=0.006,
+        accel_bias_x_mps2=0.1,
+        accel_scale_x_ratio=1.02,
+        accel_scale_z_ratio=0.99,
+    ),
+)
+
+
+def calibrate(data, robot, out=None):
+    return run(Settings(data=data, robot=robot, out=out), silent)
+
+
+SOILS = {name: load_soil(name) for name in ("tiles", "grass")}
+
+
+def driven(scenario, seed, terrain="tiles", duration_s=None):
+    drive = make_scenario(scenario, HIDDEN, terrain, duration_s, seed=seed)
+    return simulate(HIDDEN, drive, SOILS, seed, run_id=f"{scenario}_{seed:02d}")
+
+
+@pytest.fixture(scope="module")
+def calibrated(tmp_path_factory):
+    """A data set of the hidden robot, its calibration, and the file that it wrote."""
+    folder = tmp_path_factory.mktemp("calibrate")
+    runs = [
+        *(driven("stand", seed, duration_s=10.0) for seed in range(3)),
+        *(driven("starts", seed) for seed in range(2)),
+        *(driven("complex", seed) for seed in range(2)),
+        six_positions_log(HIDDEN, 7),
+    ]
+    for each in runs:
+        write_run(each, folder / "runs")
+    out = folder / "robots" / "calibrated.yaml"
+    return folder / "runs", out, calibrate(folder / "runs", "agrimaro", out)
+
+
+@pytest.fixture
+def data(tmp_path):
+    """Return a function that writes runs and gives their folder."""
+
+    def write(*runs):
+        for each in runs:
+            write_run(each, tmp_path / "runs")
+        return tmp_path / "runs"
+
+    return write
+
+
+def test_the_hidden_truth_lies_in_the_intervals(calibrated):
+    _, _, result = calibrated
+    found = [finding for finding in result.findings if finding.value is not None]
+    inside = []
+    for finding in found:
+        section, _, name = finding.parameter.partition(".")
+        if name:
+            true = getattr(getattr(HIDDEN, section), name)
+            inside.append(finding.low <= true <= finding.high)
+            assert finding.low <= finding.value <= finding.high
+            assert finding.n > 0
+            assert finding.runs
+    assert len(inside) == 24
+    assert np.mean(inside) >= 0.9
+    assert len(result.to_pandas()) == len(result.findings)
+
+
+def test_the_file_is_a_description_that_people_can_read(calibrated):
+    _, out, result = calibrated
+    robot = load_robot(out)
+    text = out.read_text(encoding="utf-8")
+    described, before = yaml.safe_load(text), yaml.safe_load(_source_of_agrimaro())
+    assert robot.name == "agrimaro"
+    assert text.startswith("# Calibrated from 8 runs;")
+    found = {finding.parameter: finding for finding in result.findings if finding.value is not None}
+    for section, entries in described.items():
+        if not isinstance(entries, dict) or "value" in entries:
+            assert entries == before[section]
+            continue
+        for name, entry in entries.items():
+            assert f"  {name}: {{value: " in text  # one line a number
+            finding = found.get(f"{section}.{name}")
+            if finding is None:
+                assert entry == before[section][name]
+                continue
+            assert entry["source"].startswith(f"terrain calibrate, {len(finding.runs)} run")
+            width = finding.high - finding.low
+            assert entry["value"] == pytest.approx(finding.value, abs=0.01 * width)
+            assert entry["interval"] == pytest.approx([finding.low, finding.high], abs=0.01 * width)
+    assert described["sensors"]["accel_scale_x_ratio"]["source"] == "terrain calibrate, 1 run: bench"
+    assert described["sensors"]["motor_std_radps"] == before["sensors"]["motor_std_radps"]  # a Hall sensor
+
+
+def test_what_filters_are_given_is_right_afterwards(calibrated):
+    _, out, _ = calibrated
+    turning = driven("complex", 50)
+    truth = turning.streams["truth"]
+    steer = [f"steer_{i}_rad" for i in (1, 2, 3)]
+    errors = []
+    for robot in (NOMINAL, load_robot(out)):
+        table = measurement_table(turning, robot)
+        # the truth behind the encoders' lag, which all rows have
+        then_s = table.time_s - HIDDEN.sensors.encoder_time_constant_s
+        true = np.column_stack([np.interp(then_s, truth.time_s, truth.channel(name)) for name in steer])
+        errors.append(np.abs(np.nanmean(table.columns(steer) - true, axis=0)).max())
+    assert errors[0] > 0.015
+    assert errors[1] < 0.003
+    standing = driven("stand", 51)
+    table = measurement_table(standing, load_robot(out))
+    accel, gyro = (np.nanmean(table.columns([row])) for row in ("accel_x_mps2", "gyro_z_radps"))
+    sensors = NOMINAL.sensors  # what a power-on leaves, and the bench's own power-on
+    assert abs(accel) < 4 * np.hypot(sensors.accel_bias_std_mps2, 9.8 * sensors.tilt_std_rad)
+    assert abs(gyro) < 4 * sensors.gyro_bias_std_radps
+    speeds = measurement_table(driven("straight", 52), load_robot(out))
+    cruise = speeds.columns(["wheel_1_radps", "wheel_2_radps", "wheel_3_radps"])[500:].mean()
+    camera = speeds.columns(["camera_speed_x_mps"])[500:].mean()
+    assert cruise * 0.2 == pytest.approx(camera, rel=0.01)
+
+
+def test_a_calibrated_file_can_be_calibrated_again(calibrated, tmp_path):
+    runs, out, first = calibrated
+    second = calibrate(runs, str(out), tmp_path / "again.yaml")
+    for one, other in zip(first.findings, second.findings, strict=True):
+        if one.value is not None:
+            half = (one.high - one.low) / 2
+            assert other.value == pytest.approx(one.value, abs=half)
+
+
+def test_the_report_says_what_is_not_determined_and_why(calibrated):
+    text = terminal_text(calibrated[2].report, details=True)
+    assert text.startswith("25 numbers of agrimaro are determined by 8 runs")
+    assert "sensors.motor_std_radps: no noise at rest" in text
+    assert "only ratio over radius is to be seen" in text
+
+
+def test_standing_alone_tells_what_it_can(data):
+    result = calibrate(data(driven("stand", 1)), "agrimaro")
+    found = {finding.parameter: finding for finding in result.findings}
+    assert result.out is None
+    assert found["sensors.gyro_bias_z_radps"].value is not None
+    assert "like a tilt" in found["sensors.accel_bias_x_mps2"].note
+    assert "never move" in found["steering.zero_1_rad"].note
+    assert "never move" in found["camera.time_constant_s"].note
+
+
+def test_runs_that_tell_nothing(data, tmp_path):
+    out = tmp_path / "out.yaml"
+    with pytest.raises(
+        DataError, match="nothing of robot agrimaro can be calibrated from this: no run has a standing"
+    ):
+        calibrate(data(driven("straight", 1, terrain="grass")), "agrimaro", out)
+    assert not out.exists()
+
+
+def test_a_log_without_a_camera(data):
+    turning, stand = driven("complex", 1), driven("stand", 1)
+    blind = {name: stream for name, stream in turning.streams.items() if name != "odometry"}
+    still = {name: stream for name, stream in stand.streams.items() if name != "odometry"}
+    folder = data(
+        RunLog("a", "agrimaro", blind, turning.labels), RunLog("b", "agrimaro", still, stand.labels)
+    )
+    found = {finding.parameter: finding for finding in calibrate(folder, "agrimaro").findings}
+    for parameter in ("steering.zero_2_rad", "motors.reduction_ratio", "camera.time_constant_s"):
+        assert found[parameter].note == "no run has a camera (stream 'odometry')"
+
+
+def test_what_is_refused(data, tmp_path):
+    folder = data(driven("stand", 1, duration_s=6.0))
+    taken = tmp_path / "taken.yaml"
+    taken.write_text("mine")
+    with pytest.raises(ConfigError, match="is there already, and is left as it is"):
+        calibrate(folder, "agrimaro", taken)
+    assert taken.read_text() == "mine"
+    with pytest.raises(ConfigError, match=r"a robot's description is a \.yaml file"):
+        calibrate(folder, "agrimaro", tmp_path / "robot.json")
+    with pytest.raises(DataError, match="drive 'skid_steer' is not calibrated from logs"):
+        calibrate(folder, "husky")
+    other = tmp_path / "other.yaml"
+    other.write_text(_source_of_agrimaro().replace("name: agrimaro", "name: rover"))
+    for options, sentence in (
+        ({"robot": None}, "--robot is missing: --what robot starts from one"),
+        ({"laws": "bekker"}, "--laws is for --what soil, not for --what robot"),
+        ({"figures": tmp_path}, "--figures is for --what soil"),
+    ):
+        with pytest.raises(ConfigError, match=sentence):
+            run(Settings(**({"data": folder, "robot": "agrimaro"} | options)), silent)
+    with pytest.raises(DataError, match="run stand_01 is one of robot 'agrimaro', and 'rover' is calibrated"):
+        calibrate(folder, str(other))
+
+
+def _source_of_agrimaro():
+    from terrain.files.resources import data_folder
+
+    return (data_folder("robots") / "agrimaro.yaml").read_text(encoding="utf-8")

@@ -1,0 +1,153 @@
+"""``terrain estimate``: tracks, pictures and JSON of runs, and tuning on chosen ones."""
+
+import json
+
+import numpy as np
+import pytest
+
+from pipelines.data.datasets import load_runs
+from pipelines.data.settings import RunsSettings, load
+from pipelines.report import silent
+from pipelines.slip.estimate import Settings, estimate_runs, run
+from terrain.errors import ConfigError, DataError, LogError
+from terrain.estimation.estimate import estimate_run
+from terrain.estimation.filters.tuning import TuningStatus
+from terrain.logs.read import read_run
+from terrain.logs.schema import signal_set_of
+from terrain.logs.write import write_run
+from terrain.records import Label, RunLog, Stream
+from terrain.robots import load_robot
+from terrain.simulation.run import simulate_run
+from terrain.simulation.sensors.gnss import Gnss
+
+ROBOT = load_robot("agrimaro")
+
+
+def drive(scenario="straight", terrain="grass", seed=0, **options):
+    return simulate_run(ROBOT, terrain, scenario, seed, **options)
+
+
+KEYS = {
+    *("run_id", "filter", "slip_mean", "slip_std", "slip_true_mean", "slip_observable", "slip_peak"),
+    *("steady_s", "stale_s", "nis", "nees", "consistency", "speed_rmse_mps", "n_dropped", "n_gated"),
+    *("dropped", "finite"),
+}
+
+
+def tuned_on(runs, *names):
+    return estimate_runs(runs, filter="vio15", tuning="likelihood", tune_on=names).result
+
+
+@pytest.fixture(scope="module")
+def straight():
+    return drive()
+
+
+def test_a_skid_steer_robot_without_a_reference_has_no_slip_to_show(datasets_dir, tmp_path):
+    first = load_runs(datasets_dir / "vulpi")[0]
+    tracks = estimate_runs([first], filter="skid")
+    (row,) = tracks.result.runs
+    assert row.slip_observable is False
+    assert row.finite
+    assert np.isnan(tracks.runs[0].streams["slip"].values).all()
+    assert "Blind" in str(tracks.report)
+    assert "without slip" in repr(tracks)
+    with pytest.raises(ConfigError, match=r"vio15.*husky.*use skid"):
+        estimate_run(run, load_robot("husky"), "vio15")
+
+
+def test_runs_are_written_with_their_tracks_and_pictures(straight, tmp_path):
+    write_run(straight, tmp_path / "raw")
+    seen, out = [], tmp_path / "runs"
+    settings = Settings(data=tmp_path / "raw", filter="vio15", out=out, figures=tmp_path / "figures")
+    result = run(settings, lambda *step: seen.append(step))
+    assert seen == [("estimate vio15", 1, 1)]
+    document = result.as_json()
+    assert set(document) == {"filter", "tuning", "tuned", "out", "runs", "skipped", "clocks"}
+    assert set(document["runs"][0]) >= KEYS
+    assert json.loads(json.dumps(document)) == document
+    found = read_run(out / straight.run_id)
+    assert found.streams["slip"].channels == ("slip_1_ratio", "slip_2_ratio", "slip_3_ratio")
+    assert found.streams["estimator"].channels[0] == "speed_x_mps"
+    state = found.streams["state"]
+    assert {"slip_speed_1_mps", "std_slip_1_ratio", "stale_ratio", "nis_camera_speed_ratio"} <= set(
+        state.channels
+    )
+    assert (state.channel("std_speed_x_mps") > 0).all()
+    assert all(signal_set_of("state", channel) is None for channel in state.channels)
+    assert {"speed_1_mps", "current_1_a", "motor_1_radps"} <= set(found.streams["wheels"].channels)
+    assert found.labels == straight.labels
+    assert sorted(file.name for file in (tmp_path / "figures").iterdir()) == [
+        f"{straight.run_id}_motion.png",
+        f"{straight.run_id}_slip.png",
+    ]
+    with pytest.raises(LogError, match="is there already"):
+        run(settings, silent)
+    page = result.report.save(tmp_path / "page.html").read_text()
+    assert f"{straight.run_id}: slip, vio15" in page
+    (same,) = estimate_runs([straight], ROBOT, "vio15").runs
+    np.testing.assert_array_equal(same.streams["slip"].values, found.streams["slip"].values)
+
+
+def test_process_noise_is_tuned_on_chosen_runs():
+    runs = [drive("survey", terrain, vary=True, duration_s=15.0) for terrain in ("tiles", "grass")]
+    result = tuned_on(runs, runs[0].run_id)
+    assert result.tuned.runs == (runs[0].run_id,)
+    assert result.tuned.log_likelihood_after > result.tuned.log_likelihood_before
+    assert result.tuned.status["steer"] is TuningStatus.FOUND
+    assert all(row.finite and row.slip_observable for row in result.runs)
+    with pytest.raises(DataError, match="no run 'grass_7' to tune on"):
+        tuned_on(runs, "grass_7")
+    with pytest.raises(ConfigError, match="go with the tuning 'likelihood', not 'physical'"):
+        estimate_runs(runs, filter="vio15", tune_on=(runs[0].run_id,))
+
+
+@pytest.mark.parametrize("training_run", [0, 1])
+def test_noise_tuned_with_a_receiver_serves_runs_without_one_and_the_reverse(training_run):
+    runs = [drive(duration_s=8.0, number=1, gnss=Gnss()), drive(duration_s=8.0, number=2)]
+    result = tuned_on(runs, runs[training_run].run_id)
+    assert all(row.finite and row.slip_observable for row in result.runs)
+    assert ["gnss_position" in row.nis for row in result.runs] == [True, False]
+
+
+def test_loggers_that_are_apart_are_named_and_aligned_on_request(tmp_path):
+    """The wheels are logged 0.4 s late: without a word the effective track would be a fiction."""
+    rng = np.random.default_rng(0)
+    time_s = np.arange(0.0, 60.0, 0.02)
+    turn = np.convolve(rng.normal(size=time_s.size), np.ones(50) / 50, "same") * 4.0
+    gyro = Stream(time_s, np.column_stack([turn + 0.01 * rng.normal(size=time_s.size)]), ("gyro_z_radps",))
+    half = 0.5 * 1.5 * turn * 0.5708
+    wheels = Stream(
+        time_s + 0.4, np.column_stack([0.5 - half, 0.5 + half]), ("speed_left_mps", "speed_right_mps")
+    )
+    late = RunLog("late", "husky", {"imu": gyro, "wheels": wheels}, (Label(0.0, 60.0, "ICE"),))
+    (sentence,) = estimate_runs([late], filter="skid").result.clocks
+    assert "apart in 1 of 1 runs, by -0.4" in sentence
+    write_run(late, tmp_path)
+    assert run(Settings(data=tmp_path, filter="skid", align=True), silent).clocks == ()
+    loaded = load(RunsSettings(data=tmp_path), align=True).runs[0]
+    assert loaded.streams["wheels"].time_s[0] == pytest.approx(0.0, abs=0.05)
+
+
+def test_an_observer_gives_slip_of_tracks_and_a_path():
+    tracked = simulate_run(load_robot("orchard_ugv"), "tilled_loam", "complex", 0, duration_s=24.0)
+    tracks = estimate_runs([tracked], filter="tracked")
+    (row,) = tracks.result.runs
+    assert set(row.slip) == {"slip_left_ratio", "slip_right_ratio"}
+    assert {"slip", "estimator", "state"} <= set(tracks.runs[0].streams)
+    assert [name.rpartition("_")[2] for name in tracks.result.pictures] == ["slip", "path"]
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"filter": "tracked", "tuning": "thesis"}, "--tuning is for filters, not for --filter tracked"),
+        ({"filter": "skid", "slip_model": "m.yaml"}, "--slip-model is for observers, not for --filter skid"),
+        ({"filter": "vio15", "window_s": 0.5}, "--window is for --filter pose, not for --filter vio15"),
+        ({"filter": "tracked", "slip_model": "m.yaml"}, "filter 'tracked' takes no slip model"),
+        ({"filter": "pose", "delay": "late"}, "--delay is 'late'; 'auto' or seconds"),
+    ],
+)
+def test_options_of_another_mode_are_refused(straight, options, sentence):
+    with pytest.raises(ConfigError, match=sentence):
+        estimate_runs([straight], **options)

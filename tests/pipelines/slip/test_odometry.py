@@ -1,0 +1,73 @@
+"""``terrain calibrate --what odometry``: on measured commands held out, and input that cannot be judged."""
+
+import numpy as np
+import pytest
+
+from pipelines.report import silent
+from pipelines.slip.calibrate import Settings, run
+from terrain.errors import ConfigError, DataError
+from terrain.estimation.observers.slip_model_file import read_slip_model
+from terrain.logs.write import write_run
+from terrain.robots import load_robot
+from terrain.simulation.tracked.given_slip import GivenSlip
+from terrain.simulation.tracked.run import simulate_tracked
+
+
+def judged(folder, **also):
+    return run(Settings(data=folder, what="odometry", **{"robot": "patako", "folds": 3, **also}), silent)
+
+
+@pytest.fixture(scope="module")
+def turns(tmp_path_factory):
+    folder, rng = tmp_path_factory.mktemp("turns"), np.random.default_rng(3)
+    given = GivenSlip(slip_ratio=0.1, turning_loss_ratio=0.5, turning_exponent=0.6)
+    for k in range(6):
+        belts = np.tile(rng.uniform(-0.1, 0.15, 2), (501, 1))
+        write_run(simulate_tracked(load_robot("patako"), given, belts, k, run_id=f"run_{k}"), folder)
+    return folder
+
+
+def test_slip_that_is_known_gains_and_its_model_is_a_file(turns, tmp_path):
+    result = judged(turns, out=tmp_path / "slip.yaml", lengths="2,4")
+    assert [round(scores.length_s) for scores in result.scores] == [2, 4]
+    assert result.n_runs == 6
+    assert result.adaptive is None
+    longer = {kind.kind: kind for kind in result.scores[1].kinds}
+    assert longer["slip-compensated"].gain_encoder > 0.5
+    found = result.parameters["turning_exponent"]
+    assert found.low < 0.6 < found.high
+    written = read_slip_model(tmp_path / "slip.yaml", "patako")
+    assert written.turning_exponent == pytest.approx(found.value, rel=1e-5)
+
+
+def test_commands_of_the_measured_marmotte_held_out(measured):
+    result = judged(measured("drive_marmotte"), robot="marmotte", folds=5)
+    assert [round(scores.length_s) for scores in result.scores] == [2, 6]
+    for scores, least in zip(result.scores, (0.15, 0.3), strict=True):
+        kinds = {kind.kind: kind for kind in scores.kinds}
+        assert kinds["slip-compensated"].gain_encoder_ci[0] > 0.5 * least
+        assert kinds["slip-compensated"].gain_encoder > least
+        assert kinds["slip-compensated"].gain_gyro_ci[0] > 0.0
+    assert result.observed_point_m[0] == pytest.approx(-0.05, abs=0.02)
+    assert result.adaptive.n_runs > 100
+
+
+@pytest.mark.parametrize(
+    ("also", "error", "message"),
+    [
+        ({"robot": "husky"}, ConfigError, "drive 'skid_steer' has no tracks"),
+        ({"lengths": "0"}, ConfigError, "--lengths: 0.2 to 3600 seconds"),
+        ({"lengths": "60"}, DataError, "no run has poses"),
+        ({"folds": 7}, DataError, "6 runs have legs, at least 7 are required"),
+    ],
+)
+def test_what_cannot_be_judged_is_refused(turns, also, error, message):
+    with pytest.raises(error, match=message):
+        judged(turns, **also)
+
+
+def test_a_model_that_is_there_is_left_as_it_is(turns, tmp_path):
+    (tmp_path / "slip.yaml").write_text("mine")
+    with pytest.raises(ConfigError, match="is there already"):
+        judged(turns, out=tmp_path / "slip.yaml")
+    assert (tmp_path / "slip.yaml").read_text() == "mine"

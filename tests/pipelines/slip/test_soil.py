@@ -1,0 +1,126 @@
+"""``terrain calibrate --what soil``: from two files of trials to a soil file, pictures and JSON."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from pipelines.cli.main import app
+from pipelines.report import silent
+from pipelines.slip.calibrate import Settings, run
+from terrain.errors import ConfigError, DataError
+from terrain.logs.write import write_run
+from terrain.soil_identification.laws import LAWS, SINKAGES, forces_of, sinkage_of
+from terrain.soil_identification.trials import WHEELS, Trials
+from terrain.terramechanics.inflow_wheel import FORCE
+from terrain.terramechanics.soil import load_soil
+
+HEADER = (
+    "trial_num,beta,slip,Vry,avg_Vx,std_Vx,avg_Vry,std_Vry,avg_Fx,std_Fx,avg_Fy,std_Fy,avg_Fz,std_Fz,"
+    "avg_angle,avg_Z,std_Z"
+)
+SPEEDS_MMPS = (0.0, 5.0, 10.0, 20.0, 40.0)
+QUICK = {"what": "soil", "laws": ("simulator", "wong_reece"), "draws": 2}
+
+
+def write_trials(path, seed=0):
+    """Trials of a smooth wheel that Wong and Reece's law describes, with noise of 2 % of the load."""
+    law, wheel = LAWS["wong_reece"], WHEELS["testbed_smooth"]
+    speed, angle = (grid.ravel() for grid in np.meshgrid(SPEEDS_MMPS, np.arange(0.0, 91.0, 15.0)))
+    n = speed.size
+    slip, blank = (speed - 10.0) / np.maximum(speed, 10.0), np.zeros(n)
+    trials = Trials(
+        *(speed * 1e-3 / wheel.radius_m, np.full(n, 0.01), np.radians(angle), slip, np.full(n, 20.0)),
+        *(blank, blank, blank, speed, angle, np.ones(n)),
+    )
+    start = np.array([value for value, _ in SINKAGES[law.sinkage].values()])
+    depth = sinkage_of(law, start, trials, wheel)
+    found = forces_of(law, np.array([FORCE[name][0] for name in law.free]), trials, wheel, depth)
+    noise = 0.4 * np.random.default_rng(seed).standard_normal((2, n))
+    rows = [
+        f"1,{angle[i]},{slip[i]:.6f},{speed[i]},10,0.1,{speed[i]},0.1,"
+        f"{found.side_n[i] + noise[0, i]:.4f},0.5,"
+        f"{-found.pull_n[i] + noise[1, i]:.4f},0.5,-20,0.2,{angle[i]},{-depth[i] * 1e3:.4f},0.1"
+        for i in range(n)
+    ]
+    path.mkdir()
+    (path / "smooth.csv").write_text("\n".join([HEADER, *rows]) + "\n")
+    return path
+
+
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("soil")
+    data = write_trials(folder / "bed")
+    settings = Settings(data=data, out=folder / "out", figures=folder / "out", check=data, **QUICK)
+    return settings, run(settings, silent)
+
+
+def test_the_law_that_made_the_trials_holds_on_what_was_left_out(fitted):
+    _, result = fitted
+    (wheel,) = result.wheels
+    simulator, wong_reece = wheel.laws
+    assert (wheel.wheel, wheel.n_trials, wheel.n_settings) == ("smooth", 35, 35)
+    assert wong_reece.angle.load.pull_ratio < 0.06
+    assert wong_reece.angle.reached
+    assert simulator.angle.load.pull_ratio > wong_reece.angle.load.pull_ratio
+    assert wheel.checked.load.pull_ratio < 0.06
+    assert wheel.parameters["tan_friction"].value == pytest.approx(FORCE["tan_friction"][0], abs=0.1)
+    assert "Cohesion against friction" in wheel.not_identified[0]
+
+
+def test_the_soil_is_one_that_the_simulator_takes(fitted):
+    settings, result = fitted
+    soil = load_soil(result.wheels[0].soil.file)
+    assert soil.name == "testbed_sand_smooth"
+    assert soil.kphi_npmn2 == pytest.approx(result.wheels[0].soil.fit.values["kphi_npmn2"], rel=1e-3)
+    text = (settings.out / "testbed_sand_smooth.yaml").read_text()
+    assert text.count("assumed") == 5
+    assert text.count("95 %") == 4
+
+
+def test_the_command_gives_the_same_result_and_page(fitted, tmp_path):
+    settings, result = fitted
+    again, page = tmp_path / "again", tmp_path / "soil.html"
+    options = ["--data", str(settings.data), "--check", str(settings.data), "--out", str(again)]
+    options += ["--laws", "simulator,wong_reece", "--draws", "2", "--figures", str(again)]
+    options += ["--json", str(tmp_path / "soil.json"), "--report", str(page)]
+    done = CliRunner().invoke(app, ["calibrate", "--what", "soil", *options])
+    assert done.exception is None, done.output
+    assert "35 further trials" in done.output
+    found, first = json.loads((tmp_path / "soil.json").read_text()), result.as_json()
+    assert sorted(file.name for file in settings.out.iterdir()) == sorted(
+        file.rpartition("/")[2] for file in result.files
+    )
+    for each in (found, first):
+        del each["out"], each["files"], each["wheels"][0]["soil"]["file"]
+    assert found == json.loads(json.dumps(first))
+    assert "wong_reece" in page.read_text()
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"laws": "mud"}, "--laws is 'mud'; choose among simulator, bekker"),
+        ({"laws": "inflow,simulator"}, "--laws ends in 'simulator'"),
+        ({"draws": 1}, "--draws is 1: input should be greater than or equal to 2"),
+    ],
+)
+def test_settings_that_are_not_accepted_are_one_sentence(changed, message, tmp_path):
+    with pytest.raises(ConfigError, match=message):
+        Settings(**({"data": tmp_path, "what": "soil"} | changed))
+
+
+def test_runs_of_another_kind_and_a_file_as_folder_are_refused(make_run, tmp_path):
+    write_run(make_run(), tmp_path / "runs")
+    settings = Settings(data=tmp_path / "runs", what="soil", out=tmp_path / "out")
+    with pytest.raises(DataError, match="none of 1 runs is a trial of a wheel testbed"):
+        run(settings, silent)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigError, match="is a file; --out names a folder"):
+        run(settings.with_(out=tmp_path / "file"), silent)
+    with pytest.raises(ConfigError, match="--robot: a soil is found from trials"):
+        run(settings.with_(robot="husky"), silent)

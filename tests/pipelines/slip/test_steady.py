@@ -1,0 +1,171 @@
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from pipelines.cli.main import app
+from pipelines.data.datasets import load_runs
+from pipelines.slip.table import learn_slip_table
+from terrain.control.measured_table import FEW_RUNS, NO_PEAK
+from terrain.control.slip_table import load_slip_table
+from terrain.errors import DataError
+from terrain.kinematics import omni
+from terrain.kinematics.wheel_speed import with_wheel_speeds
+from terrain.logs.write import write_run
+from terrain.records import Label, RunLog, Stream, TargetStatus
+from terrain.robots import load_robot
+from terrain.simulation.run import simulate_run
+
+ROBOTINO = load_robot("robotino")
+
+
+def run_of(rng, number, terrain, slip, session="", current_a=0.6):
+    time_s = np.arange(0.0, 8.0, 0.031)
+    direction = 0.3 * number
+    wheels = omni.inverse(
+        ROBOTINO.wheel_positions_m,
+        ROBOTINO.wheel_directions_rad,
+        0.1 * np.array([np.cos(direction), np.sin(direction), 0.0]),
+    )
+    far = 0.1 * (1 - slip) * time_s
+    pose = np.column_stack([far * np.cos(direction), far * np.sin(direction), np.zeros(time_s.size)])
+    pose += rng.normal(0.0, 0.0005, pose.shape)
+    rates = np.tile(ROBOTINO.logged_rates(wheels), (time_s.size, 1))
+    values = np.hstack([rates, np.full((time_s.size, 3), current_a)])
+    channels = [f"motor_{i}_radps" for i in (1, 2, 3)] + [f"current_{i}_a" for i in (1, 2, 3)]
+    streams = {
+        "wheels": Stream(time_s, values, channels),
+        "pose": Stream(time_s, pose, ("position_x_m", "position_y_m", "yaw_rad")),
+    }
+    run_id = f"{terrain}_{session}_{number}"
+    labels = (Label(0.0, 8.0, terrain),)
+    return with_wheel_speeds(RunLog(run_id, "robotino", streams, labels, session=session), ROBOTINO)
+
+
+def without_currents(run):
+    wheels = run.streams["wheels"]
+    names = [name for name in wheels.channels if not name.startswith("current")]
+    values = np.column_stack([wheels.channel(name) for name in names])
+    streams = {**run.streams, "wheels": Stream(wheels.time_s, values, names)}
+    return RunLog(run.run_id, run.robot, streams, run.labels)
+
+
+@pytest.fixture(scope="module")
+def runs():
+    rng = np.random.default_rng(0)
+    slips = rng.normal(0.3, 0.02, 12)
+    return [
+        *(run_of(rng, i, "moss", slip, "monday") for i, slip in enumerate(slips)),
+        *(run_of(rng, i, "moss", slip + 0.1, "friday") for i, slip in enumerate(slips)),
+        *(run_of(rng, i, "cork", 0.1) for i in range(2)),
+    ]
+
+
+def test_steady_slip_is_learned_and_what_was_not_driven_stays_assumed(tmp_path, runs):
+    learned = learn_slip_table(runs, ROBOTINO)
+    table, result = load_slip_table(learned.save(tmp_path / "table.yaml"), robot="robotino"), learned.result
+    moss, cork = table.targets["moss"], table.targets["cork"]
+    assert moss["steady"].status is TargetStatus.ESTIMATED
+    assert moss["steady"].slip_ratio == pytest.approx(0.35, abs=0.02)
+    assert 0.0 < moss["steady"].slip_std < 0.05
+    assert moss["steady"].n_runs == 24
+    assert moss["traction"].status is TargetStatus.UNESTIMATED
+    assert moss["traction"].slip_ratio >= moss["steady"].slip_ratio + 0.03
+    assert {target.status for target in cork.values()} == {TargetStatus.UNESTIMATED}
+    assert (result.surfaces["moss"].reason, result.surfaces["cork"].reason) == (NO_PEAK, FEW_RUNS)
+
+
+def test_the_thrust_of_a_point_is_that_of_its_current(runs):
+    motors = ROBOTINO.motors
+    torque = 0.6 * motors.torque_constant_nmpa * motors.reduction_ratio * motors.efficiency_ratio
+    expected = (torque - motors.friction_nm) / ROBOTINO.wheel_radius_m / (ROBOTINO.mass_kg * 9.80665 / 3)
+    found = learn_slip_table(runs, ROBOTINO).result.surfaces["moss"]
+    assert found.current_a[0] == pytest.approx(0.6)
+    assert found.thrust_ratio[0] == pytest.approx(expected)
+
+
+def test_what_a_session_costs_another_is_the_difference_that_was_hidden(runs):
+    transfers = learn_slip_table(runs, ROBOTINO).result.transfers
+    assert [(each.learned, each.driven) for each in transfers] == [("friday", "monday"), ("monday", "friday")]
+    low, high = transfers[1].interval
+    assert low < 0.1 < high
+    assert high - low < 0.1
+    assert low < transfers[1].difference < high
+    assert transfers[1].difference == -transfers[0].difference
+    assert (transfers[1].n_learned, transfers[1].n_driven) == (12, 12)
+
+
+@pytest.mark.parametrize("n_runs", [1, 2])
+def test_a_session_of_few_runs_has_a_difference_without_an_interval(runs, n_runs):
+    monday, friday = runs[:12], runs[12 : 12 + n_runs]
+    for each in learn_slip_table([*monday, *friday], ROBOTINO).result.transfers:
+        assert abs(each.difference) > 0.05
+        assert np.isnan(each.interval).all()
+
+
+@pytest.mark.parametrize(("soil", "least"), [("dry_sand", 0.1), ("clay", 0.01)])
+def test_slip_of_a_simulated_skid_steer_robot_is_that_of_its_truth(soil, least):
+    husky = load_robot("husky")
+    driven = [simulate_run(husky, soil, "straight", 3, i, duration_s=12.0) for i in range(3)]
+    truths = [run.streams["truth"] for run in driven]
+    late = [truth.channel("slip_left_ratio")[truth.time_s > 6.0] for truth in truths]
+    truth = float(np.median(np.concatenate(late)))
+    table = learn_slip_table(driven, husky)
+    (row,) = table.result.surfaces.values()
+    assert truth > least
+    assert row.slip.slip_ratio == pytest.approx(truth, abs=3 * row.slip.std)
+    assert row.slip.std < 0.02
+    assert table.targets[soil]["steady"].slip_ratio == pytest.approx(row.slip.slip_ratio, abs=1e-4)
+
+
+def test_runs_that_are_not_used_are_named(runs):
+    streams = dict(runs[0].streams)
+    halves = (Label(0.0, 4.0, "moss"), Label(4.0, 8.0, "cork"))
+    others = [RunLog("bare", "robotino", streams), RunLog("both", "robotino", streams, halves)]
+    result = learn_slip_table([*runs, *others], ROBOTINO).result
+    assert result.skipped == ("run bare: has no label", "run both: is on 2 terrains: moss, cork")
+    assert result.n_runs == len(runs)
+
+
+@pytest.mark.parametrize(
+    ("kept", "label"),
+    [("motors", "thrust of a wheel"), ("currents", "thrust of a wheel"), ("slip alone", "surface")],
+)
+def test_the_picture_shows_what_is_known_over_slip(runs, kept, label):
+    robot = ROBOTINO if kept == "motors" else load_robot("husky")
+    if kept != "motors":
+        runs = [simulate_run(robot, "clay", "straight", 3, i, duration_s=8.0) for i in range(3)]
+    if kept == "slip alone":
+        runs = [without_currents(run) for run in runs]
+    result = learn_slip_table(runs, robot).result
+    assert result.pictures["operating_points"].panels[0].y_label.startswith(label)
+    known = np.isfinite([row.current_a[0] for row in result.surfaces.values()])
+    assert known.all() == (kept != "slip alone")
+
+
+def test_runs_that_show_no_slip_are_refused(runs):
+    blind = RunLog("a", "robotino", {"wheels": runs[0].streams["wheels"]}, runs[0].labels)
+    with pytest.raises(DataError, match="none of 1 runs has a slip; the first for this: run a: nothing"):
+        learn_slip_table([blind], ROBOTINO)
+    unlabelled = RunLog("a", "robotino", dict(runs[0].streams))
+    with pytest.raises(DataError, match="none of 1 runs has a label"):
+        learn_slip_table([unlabelled], ROBOTINO)
+    with pytest.raises(DataError, match="of the robot 'robotino': a table is learned for one, 'husky'"):
+        learn_slip_table(runs, load_robot("husky"))
+
+
+def test_the_command_writes_the_table_and_says_what_is_assumed(tmp_path, runs):
+    for run in runs:
+        write_run(run, tmp_path / "runs")
+    command = ["learn-slip", "--robot", "robotino", "--data", str(tmp_path / "runs")]
+    found = CliRunner().invoke(app, [*command, "--out", str(tmp_path / "table.yaml")])
+    assert found.exception is None, found.output
+    assert "What is assumed was not measured" in found.output
+    assert (tmp_path / "table.yaml").is_file()
+
+
+@pytest.mark.slow
+def test_measured_medians_of_the_robotino(measured):
+    loaded = load_runs(measured("robotino") / "one_surface")
+    result = learn_slip_table(loaded, ROBOTINO).result
+    slips = {name: row.slip.slip_ratio for name, row in result.surfaces.items()}
+    assert slips == pytest.approx({"table": 0.10, "brown": 0.14, "gray": 0.29, "green": 0.50}, abs=0.03)
