@@ -107,6 +107,8 @@ def main() -> None:
 
             typer_app()
         code = app(standalone_mode=False, prog_name="terrain")
+        if getattr(code, "interrupted", False):  # a result that shows what was found until the command was stopped
+            code = 130
     except click.exceptions.NoArgsIsHelpError as error:
         click.echo(error.format_message())
         code = 2

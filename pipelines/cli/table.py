@@ -60,6 +60,7 @@ COMMANDS: tuple[Command, ...] = (
 
 FORMER: dict[str, str] = {
     "can": "use terrain serve --can BUS",
+    "replay": "use terrain serve --replay LOG",
     "import": "use terrain convert LOGS --out RUNS",
     "export": "use terrain convert RUNS --to mcap --out DIR",
     "model": "use terrain inspect MODEL",

@@ -9,7 +9,6 @@ from pipelines.cli import (
     features,
     label,
     quickstart,
-    replay,
     slip,
 )
 
@@ -24,7 +23,7 @@ app = typer.Typer(
 
 GROUPS = (
     *(features.app, classify.app, slip.app),
-    *(replay.app, label.app),
+    *(label.app),
     *(quickstart.app,),
 )
 """Files of commands, in the order of help."""

@@ -6,12 +6,8 @@ import math
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from pydantic import field_validator
-
-from pipelines.data.settings import ReadSettings
 from pipelines.report import (
     Column,
     Figure,
@@ -29,18 +25,18 @@ from pipelines.report import (
     plural,
     silent,
 )
-from pipelines.report.settings import setting
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     import pandas as pd
 
     from pipelines.live.chain import Chain
     from pipelines.live.model import LiveModel
+    from pipelines.serve.settings import Settings
     from terrain.control.slip_table import SlipTable
     from terrain.records import RunLog
     from terrain.robots import Robot
-
-AS_FAST_AS_IT_GOES = "max"
 
 LONGEST_SLEEP_S = 0.2
 """A request to end is seen at least so often."""
@@ -51,45 +47,6 @@ UNNEEDED = "confidence_ratio"
 UNKNOWN = "unknown"
 
 SLIP, PERCENT = ".3f", ".1%"
-
-
-class ReplaySettings(ReadSettings):
-    """A log in place of robots."""
-
-    replay: Path | None = setting(
-        None, "Log, in any layout that convert reads, that is sent through the live chain."
-    )
-    speed: str = setting(
-        AS_FAST_AS_IT_GOES, "Times the log's own speed, as 1 or 4; 'max' is as fast as it goes."
-    )
-
-    @property
-    def speed_ratio(self) -> float:
-        """Times the log's own speed; infinite for ``max``."""
-        return math.inf if self.speed == AS_FAST_AS_IT_GOES else float(self.speed)
-
-    @field_validator("speed")
-    @classmethod
-    def _check_speed(cls, text: str) -> str:
-        try:
-            ratio = 1.0 if text == AS_FAST_AS_IT_GOES else float(text)
-        except ValueError:
-            ratio = 0.0
-        if not 0.0 < ratio < math.inf:
-            raise ValueError(f"--speed is {text!r}: a number above zero, or 'max', is required")
-        return text
-
-
-class Settings(ReplaySettings):
-    """What a replay takes of the settings of ``terrain serve``."""
-
-    model: str | None = setting(None, "Model; a robot without a pilot needs one.")
-    table: Path | None = setting(None, "Table of target slips; the packaged one by default.")
-    filter_stride_s: float | None = setting(
-        None, "Windows so far apart in s, filtered over time.", "--filter-stride"
-    )
-    robot: str | None = setting(None, "Robot of runs of its name.")
-    rate_hz: float = setting(50.0, "Steps of the live chain a second.", option="--rate", ge=1.0, le=1000.0)
 
 
 class ObservedWindow(NamedTuple):
@@ -182,7 +139,7 @@ class ReplayResult(Result):
         return pd.DataFrame(rows, columns=["run_id", *ObservedWindow._fields])
 
 
-def run(settings: Settings, progress: Progress = silent) -> ReplayResult:
+def run(settings: Settings, log: Path, progress: Progress = silent) -> ReplayResult:
     """Replay all runs of a log, one after the other; Ctrl-C and SIGTERM end it with what was found until then.
 
     A line is printed for each window at which the classified or the believed terrain changes.
@@ -194,7 +151,7 @@ def run(settings: Settings, progress: Progress = silent) -> ReplayResult:
     """
     from threading import Event
 
-    from pipelines.data.settings import InspectSettings, load
+    from pipelines.data.settings import InspectSettings, ReadSettings, load
     from pipelines.learn.load import load_model
     from pipelines.live.over_time import filtered
     from pipelines.report.stopping import stopping
@@ -204,7 +161,7 @@ def run(settings: Settings, progress: Progress = silent) -> ReplayResult:
     table = load_slip_table(settings.table)
     model = None if settings.model is None else filtered(load_model(settings.model), settings.filter_stride_s)
     read = {name: getattr(settings, name) for name in ("robot", *ReadSettings.model_fields)}
-    runs, skipped = load(InspectSettings(data=settings.replay, **read))
+    runs, skipped = load(InspectSettings(data=log, **read))
     robot = None if settings.robot is None else load_robot(settings.robot)
     replayed: list[ReplayedRun] = []
     stop = Event()

@@ -1,7 +1,7 @@
 """Serve terrain, target slips and commands to robots, live.
 
 Robots connect to a WebSocket service and send samples as they come; with ``--can`` the live chain runs on a CAN
-bus instead.
+bus instead, with ``--replay`` over a log.
 """
 
 from __future__ import annotations
@@ -49,6 +49,10 @@ def run(settings: Settings, progress: Progress = silent) -> Result:
         from pipelines.serve.can_bus import run as run_on_bus
 
         return run_on_bus(settings)
+    if settings.replay is not None:
+        from pipelines.serve.replay import run as run_over_log
+
+        return run_over_log(settings, settings.replay, progress)
     from pipelines.serve.service import Service, prepare
 
     prepared = prepare(settings)

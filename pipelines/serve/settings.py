@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Literal
 
+from pydantic import field_validator
+
+from pipelines.data.settings import ReadSettings
 from pipelines.report.settings import Settings as BaseSettings
 from pipelines.report.settings import setting
+
+AS_FAST_AS_IT_GOES = "max"
 
 
 class ServedSettings(BaseSettings):
@@ -14,7 +20,7 @@ class ServedSettings(BaseSettings):
 
     model: str | None = setting(
         None,
-        "models:/NAME@champion, models:/NAME/3, or a model folder; without one terrain is unknown (--can).",
+        "models:/NAME@champion, models:/NAME/3, or a model folder; without one terrain is unknown (--can, --replay).",
     )
     table: Path | None = setting(None, "Table of target slips; the packaged one by default.")
     filter_stride_s: float | None = setting(
@@ -23,7 +29,9 @@ class ServedSettings(BaseSettings):
     robot: str | None = setting(
         None, "Robot by name, or its YAML file: its description is used for robots of its name."
     )
-    rate_hz: float = setting(50.0, "Steps a second of the live chain on a bus.", "--rate", ge=1.0, le=500.0)
+    rate_hz: float = setting(
+        50.0, "Steps a second of the live chain on a bus or over a log.", "--rate", ge=1.0, le=1000.0
+    )
 
 
 class ServiceSettings(BaseSettings):
@@ -54,5 +62,32 @@ class CanSettings(BaseSettings):
     )
 
 
-class Settings(CanSettings, ServiceSettings, ServedSettings):
+class ReplaySettings(ReadSettings):
+    """A log in place of robots."""
+
+    replay: Path | None = setting(
+        None, "Log, in any layout that convert reads, that is sent through the live chain."
+    )
+    speed: str = setting(
+        AS_FAST_AS_IT_GOES, "Times the log's own speed, as 1 or 4; 'max' is as fast as it goes."
+    )
+
+    @property
+    def speed_ratio(self) -> float:
+        """Times the log's own speed; infinite for ``max``."""
+        return math.inf if self.speed == AS_FAST_AS_IT_GOES else float(self.speed)
+
+    @field_validator("speed")
+    @classmethod
+    def _check_speed(cls, text: str) -> str:
+        try:
+            ratio = 1.0 if text == AS_FAST_AS_IT_GOES else float(text)
+        except ValueError:
+            ratio = 0.0
+        if not 0.0 < ratio < math.inf:
+            raise ValueError(f"--speed is {text!r}: a number above zero, or 'max', is required")
+        return text
+
+
+class Settings(ReplaySettings, CanSettings, ServiceSettings, ServedSettings):
     """Settings of ``terrain serve``."""

@@ -35,7 +35,7 @@ COMMANDS = (
         "explain",
         "quickstart",
     ),
-    *("replay", "label", "serve"),
+    *("label", "serve"),
 )
 
 
@@ -355,10 +355,10 @@ CASES: tuple[Case, ...] = (
         "replay",
         steps(
             "simulate --robot agrimaro --terrain grass --scenario survey --duration 12 --out raw",
-            "replay raw",
-            "replay raw --speed 40 --rate 20",
-            refused("replay raw --speed 0"),
-            refused("replay nowhere"),
+            "serve --replay raw",
+            "serve --replay raw --speed 40 --rate 20",
+            refused("serve --replay raw --speed 0"),
+            refused("serve --replay nowhere"),
         ),
     ),
     Case(
@@ -457,7 +457,7 @@ CASES: tuple[Case, ...] = (
             "convert ros2 --format bag --out of_ros2",
             "convert mcap --format bag --mapping topics.yaml --out of_topics",
             "inspect mcap",
-            "replay mcap/grass_survey_01.mcap --rate 20",
+            "serve --replay mcap/grass_survey_01.mcap --rate 20",
             refused("convert raw --to mcap --out mcap"),
             refused("convert raw --to bag --out other"),
             refused("convert mcap --format bag --mapping husky_topics --out other"),

@@ -10,9 +10,8 @@ from pipelines.data.convert import Settings
 from pipelines.data.convert import run as convert
 from pipelines.data.datasets import load_runs
 from pipelines.data.recorded_windows import WINDOWS_FILE, read_windows, windows_text
-from pipelines.data.settings import InspectSettings
-from pipelines.replay.replay import replay_logs
-from pipelines.replay.settings import ReplaySettings
+from pipelines.serve.replay import run as replay_log
+from pipelines.serve.settings import Settings as ServeSettings
 from terrain.errors import ConfigError, LogError
 from terrain.logs.write import write_run
 from terrain.robots import load_robot
@@ -57,7 +56,7 @@ def raw(tmp_path_factory):
 
 
 def replayed(place, **options):
-    return replay_logs(InspectSettings(data=place, **options), ReplaySettings(speed="max"))
+    return replay_log(ServeSettings(**options), place)
 
 
 def test_a_file_is_replayed_as_its_run(raw):

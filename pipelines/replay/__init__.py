@@ -1,1 +1,0 @@
-"""A log replayed through the live chain."""

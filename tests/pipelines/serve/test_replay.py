@@ -1,0 +1,181 @@
+"""A replay gives what the live chain gives, at the speed that is asked for, and ends cleanly."""
+
+import itertools
+import json
+import signal
+import subprocess
+import sys
+from time import perf_counter
+
+import numpy as np
+import pytest
+
+from pipelines.classify.predict import predict
+from pipelines.live.pilot import LivePilot
+from pipelines.live.pilot_settings import PilotSettings
+from pipelines.serve.replay import chain_of, replay_run
+from pipelines.serve.serve import run as serve
+from pipelines.serve.settings import Settings
+from terrain.control.slip_table import load_slip_table
+from terrain.errors import ConfigError, DataError
+from terrain.logs.replay import replay
+from terrain.logs.write import write_run
+from terrain.records import RunLog, Stream
+from terrain.robots import load_robot
+from terrain.simulation.run import simulate_run
+
+AGRIMARO, TABLE = load_robot("agrimaro"), load_slip_table()
+
+
+@pytest.fixture(scope="module")
+def husky_model(trained, runs):
+    return trained(runs)
+
+
+@pytest.fixture(scope="module")
+def grass():
+    return simulate_run(AGRIMARO, "grass", "survey", 5, 7, duration_s=20.0)
+
+
+def replayed(run, model, stop_at_s=np.inf, **settings):
+    """The replayed run, and when each second of it was passed."""
+    moments = []
+    result = replay_run(
+        run,
+        chain_of(run, model, TABLE),
+        Settings(**settings),
+        () if model is None else model.info.classes,
+        lambda task, done, total: moments.append((perf_counter(), done)),
+        stopped=lambda: bool(moments) and moments[-1][1] >= stop_at_s,
+    )
+    return result, moments
+
+
+def test_an_observer_gives_what_predict_gives(runs, husky_model):
+    result, moments = replayed(runs[0], husky_model)
+    rows = predict([runs[0]], husky_model, TABLE)
+    assert result.chain == "observer"
+    assert [(w.start_s, w.terrain, w.label) for w in result.windows] == [
+        (row.start_s, row.terrain, row.label) for row in rows.windows
+    ]
+    np.testing.assert_allclose(
+        [w.probability for w in result.windows], [row.probability for row in rows.windows], atol=1e-12
+    )
+    assert (result.accuracy, result.n_judged) == (rows.accuracy, rows.n_judged)
+    assert result.n_windows > 8
+    assert sum(result.terrains.values()) == pytest.approx(1.0)
+    assert sum(result.believed.values()) == pytest.approx(1.0)
+    assert [done for _, done in moments] == list(range(1, len(moments) + 1))
+    assert result.duration_s == pytest.approx(24.0, abs=0.1)
+
+
+def test_a_pilot_gives_what_predict_gives_though_another_controller_drove(grass, swerve_model):
+    result, _ = replayed(grass, swerve_model)
+    rows = predict([grass], swerve_model, TABLE).windows
+    assert result.chain == "pilot"
+    assert [(w.start_s, w.terrain) for w in result.windows] == [(row.start_s, row.terrain) for row in rows]
+    assert result.windows[-1].believed == "grass"
+    grass_ratio = TABLE.lookup("grass")["traction"].slip_ratio
+    assert result.windows[-1].target_ratio == pytest.approx(grass_ratio, abs=0.05)
+
+
+def test_wheels_of_a_log_are_not_compared_with_commands_that_nothing_drove(grass):
+    """Where they are, as on a robot, wheels that do something else are found, and left out."""
+    worst = {}
+    for follows in (True, False):
+        pilot, names = LivePilot(AGRIMARO, settings=PilotSettings(follows=follows)), set()
+        for sample in replay(grass):
+            pilot.step(sample._replace(twist=np.zeros(3)))
+            names |= {name for name, health in pilot.health.items() if health == "disagrees"}
+        worst[follows] = {name for name in names if name.startswith(("wheel", "motor"))}
+    assert worst[True]
+    assert not worst[False]
+
+
+def test_a_pilot_needs_no_model_and_another_robot_does(grass, runs):
+    result, _ = replayed(grass, None)
+    assert (result.n_windows, result.accuracy, dict(result.believed)) == (0, None, {"": 1.0})
+    with pytest.raises(ConfigError, match=r"robot 'husky' has no pilot: give a model with --model"):
+        replayed(runs[0], None)
+
+
+def test_a_robot_without_a_description_is_replayed_where_the_model_needs_none(
+    runs, husky_model, swerve_model
+):
+    run = RunLog("X", "nothing known", runs[0].streams, runs[0].labels)
+    assert replayed(run, husky_model)[0].n_windows > 8
+    with pytest.raises(ConfigError, match="nothing known"):
+        replayed(run, swerve_model)
+
+
+def test_a_run_that_lacks_what_is_needed_is_refused_in_a_sentence(grass, runs, husky_model):
+    wheels = grass.streams["wheels"]
+    lacking = {**grass.streams, "wheels": Stream(wheels.time_s, wheels.values[:, :5], wheels.channels[:5])}
+    with pytest.raises(DataError, match="stream wheels has no channel 'current_3_a' for the pilot"):
+        replayed(RunLog("R", "agrimaro", lacking), None)
+    only = RunLog("R", "husky", {"imu": runs[0].streams["imu"]})
+    with pytest.raises(DataError, match=r"run R: the model requires .* of the stream 'wheels'"):
+        replayed(only, husky_model)
+
+
+def test_the_speed_is_that_of_the_clock(runs, husky_model):
+    result, moments = replayed(runs[1], husky_model, speed="20")
+    assert result.elapsed_s >= 1.2 * (1.0 - 1e-6)
+    begin_s = moments[0][0] - moments[0][1] / 20
+    assert min(wall_s - begin_s - done / 20 for wall_s, done in moments) > -0.06
+    assert result.times_real_time == pytest.approx(20.0, rel=0.2)
+
+
+@pytest.mark.parametrize("speed", ["0", "-1", "inf", "nan", "fast", ""])
+def test_a_speed_that_is_none_is_refused(speed):
+    with pytest.raises(ConfigError, match="--speed is"):
+        Settings(speed=speed)
+
+
+def test_a_request_to_end_gives_what_was_found(runs, husky_model):
+    result, _ = replayed(runs[0], husky_model, stop_at_s=9.0)
+    assert result.interrupted
+    assert result.duration_s == pytest.approx(9.0, abs=0.05)
+    assert 2 <= result.n_windows <= 4
+
+
+@pytest.fixture
+def logs(tmp_path, runs):
+    for run in runs[:2]:
+        write_run(run, tmp_path / "logs")
+    return tmp_path / "logs"
+
+
+def test_serve_replays_all_runs_of_a_folder_and_prints_changes(logs, in_tracked, capsys):
+    result = serve(Settings(replay=logs, model="model"))
+    assert [run.run_id for run in result.runs] == ["ASPHALT_1", "ASPHALT_2"]
+    assert result.n_windows == sum(len(run.windows) for run in result.runs) > 16
+    assert not result.interrupted
+    printed = capsys.readouterr().out.splitlines()
+    windows = [window for run in result.runs for window in run.windows]
+    changes = [
+        run.run_id
+        for run in result.runs
+        for _ in itertools.groupby((w.terrain, w.believed) for w in run.windows)
+    ]
+    assert [line.split()[0] for line in printed] == changes
+    assert "believed unknown" in printed[0]
+    assert len(result.to_pandas()) == len(windows)
+    assert f"{result.n_windows} windows in 4" in str(result.report)
+
+
+@pytest.mark.slow
+def test_a_signal_ends_the_command_with_a_summary(logs, in_tracked, tmp_path):
+    words = ["serve", "--replay", logs, "--speed", "1", "--model", "model", "--json", tmp_path / "out.json"]
+    process = subprocess.Popen(
+        [sys.executable, "-u", "-m", "pipelines.cli", *map(str, words)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert "believed" in process.stdout.readline()
+    process.send_signal(signal.SIGINT)  # once, and whatever is compiled just then
+    out, _ = process.communicate(timeout=60.0)
+    assert process.returncode == 130
+    assert "stopped before the end" in out
+    assert 1.0 < json.loads((tmp_path / "out.json").read_text())["duration_s"] < 20.0
