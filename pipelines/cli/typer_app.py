@@ -22,9 +22,7 @@ app = typer.Typer(
 )
 
 GROUPS = (
-    *(features.app, classify.app, slip.app),
-    *(label.app),
-    *(quickstart.app,),
+    *(features.app, classify.app, slip.app, label.app, quickstart.app),
 )
 """Files of commands, in the order of help."""
 
