@@ -256,7 +256,7 @@ def compare(settings: Settings, inputs: DriveInputs, progress: Progress = silent
             for name in names
         },
         rows=rows,
-        examples={name: drives[name][0].curves for name in names if drives[name][0].curves is not None},
+        examples={name: curves for name in names if (curves := drives[name][0].curves) is not None},
         slip_table=inputs.table,
     )
 

@@ -10,12 +10,12 @@ import math
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from pipelines.drive.drive import ALL
-from pipelines.drive.guard import GuardedPilot, named_sensors
 from pipelines.learn.parallel import parallel
 from pipelines.live.pilot import LivePilot
 from pipelines.live.pilot_settings import PilotSettings
@@ -25,6 +25,7 @@ from pipelines.report import (
     Column,
     Figure,
     Line,
+    Mark,
     Pairs,
     Panel,
     Part,
@@ -39,27 +40,27 @@ from pipelines.report import (
     silent,
 )
 from pipelines.report.versions import versions
-from terrain.control.drive_metrics import drive_history
-from terrain.control.fault_evaluation import (
-    BARS,
-    LIMITS,
-    FaultDrive,
-    FaultFigures,
-    Limits,
-    bar_texts,
-    fault_drive,
-    fault_figures,
-    judge,
+from terrain.control.fault_drives import (
+    CleanDrive,
+    Driven,
+    FaultCase,
+    FaultLoop,
+    FaultRow,
+    Place,
+    References,
+    clean_drive,
+    drive_case,
+    drive_references,
+    evaluate_case,
 )
-from terrain.control.fault_situations import STOP, FaultSituation, make_fault_situation
+from terrain.control.fault_evaluation import BARS, LIMITS, Limits, bar_texts
+from terrain.control.fault_situations import STOP, make_fault_situation
 from terrain.control.learned_table import learned_table
 from terrain.control.slip_table import SlipTable, load_slip_table
 from terrain.errors import ConfigError
-from terrain.records import Array
 from terrain.robots import Robot, SwerveRobot, as_drive, load_robot
-from terrain.simulation.dynamic.simulate import simulate
 from terrain.simulation.faults.catalogue import fault_catalogue, select_faults
-from terrain.simulation.faults.fault import FaultyBus, SensorFault
+from terrain.simulation.faults.fault import SensorFault
 from terrain.simulation.slip_sweep import learning_runs
 from terrain.slip_learning.learn import learn_terrain, terrain_runs
 from terrain.terramechanics.soil import load_soil
@@ -104,86 +105,6 @@ BEFORE_S = 1.0
 
 FASTEST_MPS = 10.0
 """Estimates of the speed beyond this, as a fault may cause, are not drawn."""
-
-
-class FaultCase(NamedTuple):
-    """A drive with a fault.
-
-    Parameters
-    ----------
-    fault : its name in the catalogue
-    duration_s : for which it acts; infinite for good, None in JSON
-    situation, terrain, seed : of the drive
-    """
-
-    fault: str
-    duration_s: float
-    situation: str
-    terrain: str
-    seed: int
-
-
-@dataclass(frozen=True, slots=True)
-class FaultRow:
-    """A drive with a fault, and what it shows.
-
-    Parameters
-    ----------
-    case : what was driven
-    kind, streams, nature : of the fault
-    figures : of the drive
-    bars : by name, whether it is met; None where it does not apply
-    blamed : by the name of a sensor, what the controller's ``health`` named it; None without a ``health``
-    exception : the first one that the controller raised, or empty
-    """
-
-    case: FaultCase
-    kind: str
-    streams: tuple[str, ...]
-    nature: str
-    figures: FaultFigures
-    bars: Mapping[str, bool | None]
-    blamed: Mapping[str, str] | None
-    exception: str
-
-    @property
-    def unmet(self) -> tuple[str, ...]:
-        """Names of the bars that are not met."""
-        return tuple(name for name, met in self.bars.items() if met is False)
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the fields in one object, with the verdict; what is infinite is None."""
-        given = {each.name: getattr(self, each.name) for each in fields(self)}
-        case, figures = given.pop("case"), given.pop("figures")
-        return {**case._asdict(), **given, **figures._asdict(), "is_met": not self.unmet}
-
-
-@dataclass(frozen=True, slots=True)
-class CleanDrive:
-    """What the controller does without a fault, and plain commands do, where a situation's rows are compared.
-
-    Parameters
-    ----------
-    situation, terrain, seed : of the drives
-    start_s : when faults begin
-    slip_error_ratio : largest error of slip of the controller, from then on
-    not_ok_s : time without the status OK from then on while the robot is to move
-    slip_peak_ratio, plain_slip_peak_ratio : largest true slip
-    stop_m, plain_stop_m : stopping distance; NaN where no stop is commanded
-    overspeed_s : longest time for which the commanded speed is above the desired one
-    """
-
-    situation: str
-    terrain: str
-    seed: int
-    start_s: float
-    slip_error_ratio: float
-    not_ok_s: float
-    slip_peak_ratio: float
-    plain_slip_peak_ratio: float
-    stop_m: float
-    plain_stop_m: float
-    overspeed_s: float
 
 
 class BarCount(NamedTuple):
@@ -240,38 +161,6 @@ class FaultsResult(Result):
         return pd.DataFrame([row.as_json() for row in self.rows])
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class FaultInputs:
-    """Robot and target slips of all drives."""
-
-    robot: Robot
-    table: SlipTable
-
-
-class Place(NamedTuple):
-    """Situation, terrain and seed, which one clean and one plain drive are made for."""
-
-    situation: str
-    terrain: str
-    seed: int
-
-
-class References(NamedTuple):
-    """What drives with a fault are compared with, and when the fault begins."""
-
-    clean: FaultDrive
-    plain: FaultDrive
-    start_s: float
-
-
-class Driven(NamedTuple):
-    """A drive, the pilot with its record, and the estimated forward speed (n,)."""
-
-    drive: FaultDrive
-    pilot: GuardedPilot
-    speed_mps: Array
-
-
 def run(settings: Settings, progress: Progress) -> FaultsResult:
     """Drive each fault in each situation, and evaluate what the controller makes of it.
 
@@ -287,7 +176,7 @@ def run(settings: Settings, progress: Progress) -> FaultsResult:
         table = load_slip_table(settings.table, robot.name)
     else:
         table = learn_table(robot, list(dict.fromkeys(p.terrain for p in places_of(settings))), progress)
-    return drive_faults(settings, FaultInputs(robot, table), progress)
+    return drive_faults(settings, robot, table, progress)
 
 
 def checked_robot(settings: Settings) -> Robot:
@@ -344,19 +233,21 @@ def places_of(settings: Settings) -> list[Place]:
     ]
 
 
-def drive_faults(settings: Settings, inputs: FaultInputs, progress: Progress = silent) -> FaultsResult:
+def drive_faults(
+    settings: Settings, robot: Robot, table: SlipTable, progress: Progress = silent
+) -> FaultsResult:
     """Drive each fault in each situation with a robot and its table, and evaluate the drives.
 
     Parameters
     ----------
     settings : what is driven
-    inputs : robot and table
+    robot, table : that is driven, and its target slips
     progress : of the drives
     """
-    chosen, places = _chosen_faults(settings, inputs.robot), places_of(settings)
+    chosen, places, loop = _chosen_faults(settings, robot), places_of(settings), fault_loop(robot, table)
     references: dict[Place, References] = {}
     made = parallel(
-        drive_references, (inputs,), [(place,) for place in places], min(settings.n_jobs, len(places))
+        drive_references, (loop,), [(place,) for place in places], min(settings.n_jobs, len(places))
     )
     for place, found in zip(places, made, strict=True):
         references[place] = found
@@ -369,17 +260,17 @@ def drive_faults(settings: Settings, inputs: FaultInputs, progress: Progress = s
     ]
     tasks = [(case, references[Place(*case[2:])]) for case in cases]
     rows: list[FaultRow] = []
-    for row in parallel(evaluate_case, (inputs,), tasks, min(settings.n_jobs, len(tasks))):
+    for row in parallel(evaluate_case, (loop,), tasks, min(settings.n_jobs, len(tasks))):
         rows.append(row)
         progress("drive with faults", len(rows), len(cases))
     drawn: list[Figure] = []
     worst = drawn_cases(settings, rows) if settings.out is not None or settings.draw else []
     for case in worst:
-        drawn.append(fault_figure(case, drive_case(inputs, case), references[Place(*case[2:])]))
+        drawn.append(fault_figure(case, drive_case(loop, case), references[Place(*case[2:])]))
         progress("draw", len(drawn), len(worst))
     return FaultsResult(
-        robot=inputs.robot.name,
-        table=inputs.table.name,
+        robot=robot.name,
+        table=table.name,
         seeds=tuple(settings.all_seeds),
         delay_s=DELAY_S,
         limits=LIMITS,
@@ -390,102 +281,14 @@ def drive_faults(settings: Settings, inputs: FaultInputs, progress: Progress = s
     )
 
 
-def drive_references(inputs: FaultInputs, place: Place) -> References:
-    """Return the clean and the plain drive of a place."""
-    made = make_fault_situation(place.situation, inputs.robot, place.terrain, place.seed)
-    clean, plain = (_drive(inputs, made, place.seed, controller=name).drive for name in ("traction", "plain"))
-    return References(clean, plain, made.start_s)
+def fault_loop(robot: Robot, table: SlipTable) -> FaultLoop:
+    """Return the loop of a swerve robot with its pilot, which knows the terrain."""
+    return FaultLoop(robot, partial(_new_pilot, robot, table), DELAY_S)
 
 
-def drive_case(inputs: FaultInputs, case: FaultCase) -> Driven:
-    """Return the drive with a fault."""
-    made = make_fault_situation(case.situation, inputs.robot, case.terrain, case.seed)
-    fault = fault_catalogue(inputs.robot)[case.fault]
-    return _drive(inputs, made, case.seed, fault, case.duration_s)
-
-
-def evaluate_case(inputs: FaultInputs, case: FaultCase, references: References) -> FaultRow:
-    """Return the row of a drive with a fault.
-
-    Parameters
-    ----------
-    inputs : of all drives
-    case : what is driven
-    references : of the same place
-    """
-    fault = fault_catalogue(inputs.robot)[case.fault]
-    driven = drive_case(inputs, case)
-    pilot, start_s = driven.pilot, references.start_s
-    figures = fault_figures(
-        driven.drive,
-        references.clean,
-        references.plain,
-        start_s,
-        start_s + case.duration_s,
-        pilot.n_exceptions,
-        pilot.n_not_finite,
-    )
-    time_s = driven.drive.time_s
-    acts = (time_s >= start_s) & (time_s < start_s + case.duration_s)
-    return FaultRow(
-        case=case,
-        kind=fault.kind,
-        streams=fault.streams,
-        nature=fault.nature.value,
-        figures=figures,
-        bars=judge(figures, fault.nature),
-        blamed=named_sensors(pilot.health, acts.tolist(), float(time_s[1] - time_s[0])),
-        exception=pilot.exception,
-    )
-
-
-def clean_drive(place: Place, references: References) -> CleanDrive:
-    """Return what the clean and the plain drive of a place show."""
-    clean, plain, start_s = references
-    one = fault_figures(clean, clean, plain, start_s, math.inf)
-    since = clean.time_s >= start_s
-    step_s = float(clean.time_s[1] - clean.time_s[0])
-    return CleanDrive(
-        *place,
-        start_s=start_s,
-        slip_error_ratio=one.slip_error_ratio,
-        not_ok_s=float((~clean.ok & clean.moving & since).sum()) * step_s,
-        slip_peak_ratio=one.slip_peak_ratio,
-        plain_slip_peak_ratio=one.plain_slip_peak_ratio,
-        stop_m=clean.stop_m,
-        plain_stop_m=plain.stop_m,
-        overspeed_s=one.overspeed_s,
-    )
-
-
-def _drive(
-    inputs: FaultInputs,
-    made: FaultSituation,
-    seed: int,
-    fault: SensorFault | None = None,
-    duration_s: float = math.inf,
-    controller: str = "traction",
-) -> Driven:
+def _new_pilot(robot: Robot, table: SlipTable, controller: str) -> LivePilot:
     settings = PilotSettings(controller=controller, delay_s=DELAY_S)
-    pilot = GuardedPilot(LivePilot(inputs.robot, inputs.table, KnownTerrain(), settings))
-    step = pilot.step
-    if fault is not None:
-        step = FaultyBus(step, fault, made.start_s, made.start_s + duration_s, seed).__call__
-    situation = made.situation
-    with np.errstate(all="ignore"):  # values of a fault are squared
-        log = simulate(
-            inputs.robot,
-            situation.scenario,
-            situation.soils,
-            situation.seed,
-            conditions=situation.conditions,
-            faults=situation.faults,
-            controller=step,
-            command_delay_s=DELAY_S,
-        )
-    history = drive_history(log, inputs.robot, situation.conditions.radius_factors)
-    drive = fault_drive(log, history, inputs.robot, situation.scenario)
-    return Driven(drive, pilot, np.array(pilot.speed_mps))
+    return LivePilot(robot, table, KnownTerrain(), settings)
 
 
 def drawn_cases(settings: Settings, rows: Sequence[FaultRow]) -> list[FaultCase]:
@@ -523,14 +326,14 @@ def fault_figure(case: FaultCase, driven: Driven, references: References) -> Fig
     acts = Strip([(start_s, min(start_s + case.duration_s, last_s), "the fault acts")])
     estimated = np.where(np.abs(driven.speed_mps) < FASTEST_MPS, driven.speed_mps, math.nan)
     shown_s = max(start_s - BEFORE_S, 0.0), last_s
-    speeds = [
+    speeds: list[Mark] = [
         acts,
         Line("desired", time_s, drive.desired_mps, 6, dashed=True),
         Line("commanded", time_s, drive.commanded_mps, 2),
         Line("over ground, true", time_s, drive.speed_mps, 0),
         Line("over ground, estimated", time_s, estimated, 1),
     ]
-    slips = [
+    slips: list[Mark] = [
         acts,
         Line("true, plain commands", plain.time_s, plain.body_slip_ratio, 6, dashed=True),
         Line("true, of the robot", time_s, drive.body_slip_ratio, 3),
@@ -609,9 +412,8 @@ def _overview(result: FaultsResult) -> Iterator[Part]:
         ]
         rows.append((name, result.abouts[name], own[0].nature, *cells, _named(own)))
     headings = (f"{situation} on {terrain}" for situation, terrain in places)
-    columns = ("fault", Column("what it does", long=True), "nature", *headings, "sensors named")
     yield Table(
-        columns,
+        ("fault", Column("what it does", long=True), "nature", *headings, "sensors named"),
         rows,
         note=(
             "Bars that are not met, over durations and seeds; in brackets how many of the drives, where it is not "

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import io
 import math
-from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,11 +12,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipelines.drive.drive import PAGE_FILE
-from pipelines.drive.path_file import read_path
 from pipelines.report import (
     Band,
     Figure,
     Line,
+    Mark,
     Pairs,
     Panel,
     Part,
@@ -31,17 +30,22 @@ from pipelines.report import (
     format_counts,
     format_value,
 )
-from terrain.control.car_evaluation import FollowedDrive, followed_drive
-from terrain.control.car_following import CarFollower, FollowedTick, SlipSource
-from terrain.control.paths import ROLL, PathStatus, ReferencePath, S, X, Y, path_warnings
-from terrain.control.steering_law import SteeringSettings, SteerStatus
+from terrain.control.car_evaluation import FollowedDrive
+from terrain.control.car_following import SlipSource
+from terrain.control.path_drive import (
+    WHEELS,
+    PathPlan,
+    columns_of,
+    drive_along,
+    drive_warnings,
+    path_figures,
+    tick_statuses,
+)
+from terrain.control.path_file import read_path
+from terrain.control.paths import ReferencePath, X, Y, path_warnings
 from terrain.errors import ConfigError
-from terrain.estimation.observers.family import ObserverStatus
 from terrain.files.atomic import atomic_write
 from terrain.robots import BicycleRobot, as_drive, load_robot
-from terrain.simulation.bicycle.plant import Ground
-from terrain.simulation.bicycle.simulate import CarDrive, SpeedProfile, simulate_car
-from terrain.status import StatusCode
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -51,13 +55,6 @@ if TYPE_CHECKING:
 SPEED_MPS = 3.0
 """Unless another is given."""
 
-STAND_S = 3.0
-"""Time of a stop."""
-
-START_M, SLOW_MPS = 2.0, 0.5
-"""Distance travelled beside that of speeding up, and speed, from which the robot counts as cruising."""
-
-WHEELS = ("front", "rear")
 SHOWN_M = 1.5
 """Lateral errors beyond this leave the figure."""
 
@@ -139,16 +136,22 @@ def run(settings: Settings, progress: Progress) -> PathResult:
             f"--speed is {speed_mps:g}; {robot.name} drives at most {robot.speed_max_mps:g} m/s"
         )
     path = read_path(settings.path, settings.point_std)
-    follower = CarFollower(
-        robot, path, SlipSource(settings.observer), SteeringSettings(offset_m=settings.offset)
+    plan = PathPlan(
+        speed_mps=speed_mps,
+        source=SlipSource(settings.observer),
+        slope_rad=np.deg2rad(settings.slope_deg),
+        grip_ratio=settings.grip,
+        offset_m=settings.offset,
+        stops_m=settings.stop,
     )
-    plan = _plan(settings, path, speed_mps)
-    log = simulate_car(robot, plan, follower, np.random.default_rng(settings.first_seed))
-    drive = followed_drive(log, path, follower.ticks)
+    drive, ticks = drive_along(robot, path, plan, settings.first_seed)
     progress("drive", 1, 1)
     files = () if settings.out is None else (settings.out / PAGE_FILE, settings.out / "drive.csv")
     if files:
-        atomic_write(files[1], _table(drive))
+        columns, text = columns_of(drive), io.StringIO()
+        table, head = np.column_stack(list(columns.values())), ",".join(columns)
+        np.savetxt(text, table, "%.6g", ",", header=head, comments="")
+        atomic_write(files[1], text.getvalue())
     return PathResult(
         robot=robot.name,
         path=settings.path,
@@ -157,120 +160,15 @@ def run(settings: Settings, progress: Progress) -> PathResult:
         length_m=path.length_m,
         n_points_merged=path.n_merged,
         speed_mps=speed_mps,
-        **_figures_of(drive, settings, speed_mps),
-        statuses=_statuses(follower.ticks),
-        warnings=(*path_warnings(path, robot), *_warnings(drive, follower.ticks, settings)),
+        **path_figures(drive, plan)._asdict(),
+        statuses=tick_statuses(ticks),
+        warnings=(*path_warnings(path, robot), *drive_warnings(drive, ticks, plan)),
         page=files[0] if files else None,
         files=files,
         offset_m=settings.offset,
         drive=drive,
         reference=path,
     )
-
-
-def _plan(settings: Settings, path: ReferencePath, speed_mps: float) -> CarDrive:
-    """Return ground and profile; the ground has the roll of the path where that is known."""
-    at = path.rows[::10]
-    roll = np.where(np.isnan(at[:, ROLL]), np.deg2rad(settings.slope_deg), at[:, ROLL])
-    ground = Ground(at[:, S], np.full(len(at), settings.grip), roll)
-    stops = tuple((distance, STAND_S) for distance in settings.stop if distance < path.length_m)
-    longest_s = 2.0 * path.length_m / speed_mps + 30.0 + STAND_S * len(stops)
-    x, y, heading = path.start
-    x, y = x - settings.offset * np.sin(heading), y + settings.offset * np.cos(heading)
-    return CarDrive(ground, SpeedProfile(speed_mps, stops), longest_s, (x, y, heading))
-
-
-def _figures_of(drive: FollowedDrive, settings: Settings, speed_mps: float) -> dict[str, Any]:
-    """Return the figures of a drive by the names of :class:`PathResult`."""
-    error = drive.lateral_m - settings.offset
-    moves = drive.speed_mps > SLOW_MPS
-    cruises = moves & drive.between(START_M + speed_mps**2 / 3.0, np.inf)
-    stiffness = np.abs(drive.stiffness_error_ratio)
-    slips = np.abs(drive.slip_true_rad[moves])
-    observed = settings.observer != "none"
-    worst, limit = float(np.abs(error).max()), speed_mps / 10.0
-    return {
-        "reached_end": drive.reached_end,
-        "duration_s": float(drive.time_s[-1]),
-        "slowest_mps": float(drive.speed_mps[cruises].min()) if cruises.any() else math.nan,
-        "lateral_max_m": worst,
-        "lateral_rms_m": float(np.sqrt(np.mean(error**2))),
-        "lateral_max_at_m": float(drive.distance_m[np.abs(error).argmax()]),
-        "limit_m": limit,
-        "within_limit": bool(drive.reached_end and worst <= limit),
-        "slip_max_rad": float(np.nanmax(slips)) if np.isfinite(slips).any() else math.nan,
-        "slip_error_rad": _rms(drive.slip_error_rad[moves]) if observed else math.nan,
-        "stiffness_error_ratio": float(np.median(stiffness)) if stiffness.size else math.nan,
-        "grip_ratio": float(drive.grip_ratio[-1]),
-        "grip_std": float(drive.grip_std[-1]),
-    }
-
-
-def _rms(values: np.ndarray) -> float:
-    known = values[np.isfinite(values)]
-    return float(np.sqrt(np.mean(known**2))) if known.size else math.nan
-
-
-def _statuses(ticks: Sequence[FollowedTick]) -> Mapping[str, Mapping[str, int]]:
-    kinds: dict[str, tuple[type[StatusCode], str]] = {
-        "observer": (ObserverStatus, "observer_status"),
-        "path": (PathStatus, "path_status"),
-        "steering": (SteerStatus, "steer_status"),
-    }
-    return {
-        name: {kind(code).label: n for code, n in sorted(Counter(getattr(t, key) for t in ticks).items())}
-        for name, (kind, key) in kinds.items()
-    }
-
-
-def _warnings(drive: FollowedDrive, ticks: Sequence[FollowedTick], settings: Settings) -> list[str]:
-    found = []
-    if not drive.reached_end:
-        found.append(f"the end was not reached: the robot came to {drive.distance_m[-1]:.1f} m")
-    for status, text in (
-        (PathStatus.FAR, "was too far from the path to find its place"),
-        (PathStatus.SINGULAR, "was near the centre of curvature of the path"),
-    ):
-        first = next((tick for tick in ticks if tick.path_status == status), None)
-        if first is not None:
-            found.append(f"the robot {text}, first at {first.distance_m:.1f} m after {first.time_s:.1f} s")
-    clamped = sum(tick.steer_status == SteerStatus.CLAMPED for tick in ticks) / len(ticks)
-    if clamped > 0.01:
-        found.append(f"the steering was at its limit for {clamped:.0%} of the drive")
-    late = [distance for distance in settings.stop if distance > drive.distance_m[-1]]
-    if late:
-        found.append(f"stop at {late[0]:g} m is beyond where the drive ended")
-    return found
-
-
-def columns_of(drive: FollowedDrive) -> dict[str, np.ndarray]:
-    """Return the columns of a drive (n,), by their names in ``drive.csv``."""
-    columns = {
-        "time_s": drive.time_s,
-        "distance_m": drive.distance_m,
-        "lateral_m": drive.lateral_m,
-        "position_x_m": drive.position_m[:, 0],
-        "position_y_m": drive.position_m[:, 1],
-        "speed_mps": drive.speed_mps,
-        "steer_front_rad": drive.steer_rad,
-    }
-    for j, wheel in enumerate(WHEELS):
-        columns |= {
-            f"slip_{wheel}_rad": drive.slip_rad[:, j],
-            f"slip_{wheel}_std_rad": drive.slip_std_rad[:, j],
-            f"slip_{wheel}_true_rad": drive.slip_true_rad[:, j],
-            f"cornering_{wheel}_npr": drive.stiffness_npr[:, j],
-        }
-    return columns
-
-
-def _table(drive: FollowedDrive) -> str:
-    """Return the drive as CSV, a row a tick."""
-    columns, text = columns_of(drive), io.StringIO()
-    np.savetxt(
-        text, np.column_stack(list(columns.values())), "%.6g", ",", header=",".join(columns), comments=""
-    )
-    return text.getvalue()
 
 
 def report(result: PathResult) -> Report:
@@ -338,7 +236,7 @@ def _map(result: PathResult) -> Iterator[Part]:
     rows, drive = result.reference.rows, result.drive
     marks = [
         Line("path", rows[:, X], rows[:, Y], 6, dashed=True),
-        Line("rear axle", *drive.position_m.T, 0),
+        Line("rear axle", drive.position_m[:, 0], drive.position_m[:, 1], 0),
     ]
     yield Figure(
         "The path, and where the rear axle was", [Panel(marks, "y [m]", x_label="x [m]", equal=True)]
@@ -362,7 +260,7 @@ def _observed(result: PathResult) -> Iterator[Part]:
     for j, wheel in enumerate(WHEELS):
         estimate, std = np.degrees(drive.slip_rad[:, j]), np.degrees(drive.slip_std_rad[:, j])
         most = 1.4 * max(2.0, float(np.abs(estimate[np.isfinite(estimate)]).max(initial=0.0)))
-        marks = [
+        marks: list[Mark] = [
             Band("two standard deviations", drive.time_s, estimate - 2 * std, estimate + 2 * std, 0),
             Line("estimate", drive.time_s, estimate, 0),
             Line("true", drive.time_s, np.degrees(drive.slip_true_rad[:, j]), 6),
@@ -372,7 +270,7 @@ def _observed(result: PathResult) -> Iterator[Part]:
     if np.isfinite(drive.stiffness_npr).any():
         stiffness = []
         for j, wheel in enumerate(WHEELS):
-            both = [
+            both: list[Mark] = [
                 Line("estimate", drive.time_s, drive.stiffness_npr[:, j] / 1e3, 0),
                 Points("true secant, where excited", drive.time_s, drive.secant_npr[:, j] / 1e3, colour=6),
             ]

@@ -12,23 +12,26 @@ import pytest
 from pipelines.cli import main as cli
 from pipelines.drive.drive import Settings
 from pipelines.drive.faults import (
-    FaultCase,
-    FaultInputs,
-    Place,
     bars_text,
     checked_robot,
     drawn_cases,
-    drive_case,
     drive_faults,
-    drive_references,
-    evaluate_case,
     fault_figure,
+    fault_loop,
 )
-from pipelines.drive.guard import GuardedPilot, named_sensors
 from pipelines.live.pilot import LivePilot
 from pipelines.live.pilot_settings import PilotSettings
 from pipelines.report.json_file import as_json
 from terrain.control.drive_metrics import drive_history, stopping_distance
+from terrain.control.fault_drives import (
+    FaultCase,
+    GuardedPilot,
+    Place,
+    drive_case,
+    drive_references,
+    evaluate_case,
+    named_sensors,
+)
 from terrain.control.fault_evaluation import BARS, RATIO_ABOVE_MPS, fault_drive, fault_figures
 from terrain.control.fault_situations import FAULT_SITUATIONS, make_fault_situation
 from terrain.control.slip_table import load_slip_table
@@ -39,7 +42,8 @@ from terrain.robots import load_robot
 from terrain.simulation.dynamic.simulate import simulate
 
 ROBOT = load_robot("agrimaro")
-INPUTS = FaultInputs(ROBOT, load_slip_table())
+SLIPS = load_slip_table()
+LOOP = fault_loop(ROBOT, SLIPS)
 TABLE = Path(__file__).resolve().parents[3] / "data" / "target_slip" / "default.yaml"
 FEW = Settings(
     faults="loss_odometry,duplicates_imu", situations="steady", durations_s="3,inf", first_seed=400, jobs=1
@@ -103,7 +107,7 @@ def test_a_drive_by_plain_commands_is_evaluated_from_its_log(name):
 
 @pytest.fixture(scope="module")
 def few():
-    return drive_faults(FEW, INPUTS)
+    return drive_faults(FEW, ROBOT, SLIPS)
 
 
 def test_a_lost_camera_ends_ok_late_and_duplicates_cost_nothing(few):
@@ -128,13 +132,13 @@ def test_a_lost_camera_ends_ok_late_and_duplicates_cost_nothing(few):
 
 @pytest.mark.slow
 def test_the_result_does_not_depend_on_the_number_of_processes(few):
-    two = drive_faults(FEW.with_(jobs=2), INPUTS)
+    two = drive_faults(FEW.with_(jobs=2), ROBOT, SLIPS)
     assert json.dumps(as_json(few), allow_nan=False) == json.dumps(as_json(two), allow_nan=False)
 
 
 def test_before_a_fault_begins_the_drive_is_the_clean_one():
-    clean, _, start_s = drive_references(INPUTS, Place("stop", "wet_floor", 401))
-    drive = drive_case(INPUTS, FaultCase("loss_all", 3.0, "stop", "wet_floor", 401)).drive
+    clean, _, start_s = drive_references(LOOP, Place("stop", "wet_floor", 401))
+    drive = drive_case(LOOP, FaultCase("loss_all", 3.0, "stop", "wet_floor", 401)).drive
     before = drive.time_s < start_s
     for name in ("ok", "slip_ratio", "speed_mps", "commanded_mps"):
         assert np.array_equal(getattr(drive, name)[before], getattr(clean, name)[before], equal_nan=True)
@@ -155,8 +159,8 @@ def test_the_report_counts_what_is_met_and_names_what_is_not(few):
     drawn = drawn_cases(FEW.with_(draw="duplicates"), few.rows)
     assert drawn == [FaultCase("duplicates_imu", math.inf, "steady", "grass", 400)]
     assert all(case.fault == "loss_odometry" for case in drawn_cases(FEW, few.rows))
-    references = drive_references(INPUTS, Place(*drawn[0][2:]))
-    figure = fault_figure(drawn[0], drive_case(INPUTS, drawn[0]), references)
+    references = drive_references(LOOP, Place(*drawn[0][2:]))
+    figure = fault_figure(drawn[0], drive_case(LOOP, drawn[0]), references)
     assert figure.title == "duplicates_imu, for good: steady on grass, seed 400"
     assert figure.panels[0].marks[0].spans[0][0] == references.start_s
 
@@ -225,9 +229,9 @@ def test_an_exception_of_the_pilot_shows_in_its_row(monkeypatch):
         return step(self, sample)
 
     place = Place("steady", "grass", 402)
-    references = drive_references(INPUTS, place)
+    references = drive_references(LOOP, place)
     monkeypatch.setattr(LivePilot, "step", failing)
-    row = evaluate_case(INPUTS, FaultCase("loss_imu", 1.0, *place), references)
+    row = evaluate_case(LOOP, FaultCase("loss_imu", 1.0, *place), references)
     assert row.figures.n_exceptions == 50
     assert row.exception == "ZeroDivisionError: nothing to divide"
     assert row.bars["finite"] is False

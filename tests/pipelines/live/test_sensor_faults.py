@@ -7,16 +7,10 @@ from functools import cache
 import numpy as np
 import pytest
 
-from pipelines.drive.faults import (
-    FaultCase,
-    FaultInputs,
-    Place,
-    drive_case,
-    drive_references,
-    evaluate_case,
-)
+from pipelines.drive.faults import fault_loop
 from pipelines.live.pilot import LivePilot
 from pipelines.live.terrain_source import TerrainEstimate
+from terrain.control.fault_drives import FaultCase, Place, drive_case, drive_references, evaluate_case
 from terrain.control.fault_evaluation import LIMITS
 from terrain.control.slick import braking_by_slip
 from terrain.control.slip_table import CurveEntry, load_slip_table
@@ -41,24 +35,25 @@ def slick_table():
     )
 
 
-INPUTS = FaultInputs(ROBOT, slick_table())
+SLICK = slick_table()
+LOOP = fault_loop(ROBOT, SLICK)
 
 
 @cache
 def references(place):
-    return drive_references(INPUTS, place)
+    return drive_references(LOOP, place)
 
 
 @cache
 def row(fault, place, duration_s=3.0):
-    return evaluate_case(INPUTS, FaultCase(fault, duration_s, *place), references(place))
+    return evaluate_case(LOOP, FaultCase(fault, duration_s, *place), references(place))
 
 
 STOP = Place("stop", "wet_floor", SEED)
 
 
 def test_without_a_fault_braking_by_slip_stops_sooner_than_locked_wheels():
-    assert braking_by_slip(INPUTS.table.curves["wet_floor"]) is not None
+    assert braking_by_slip(SLICK.curves["wet_floor"]) is not None
     clean, plain, _ = references(STOP)
     assert clean.stop_m < 0.95 * plain.stop_m
 
@@ -127,7 +122,7 @@ def test_a_clock_that_is_set_by_an_hour_costs_a_moment(stream, which):
 
 @pytest.mark.parametrize("stream", STREAMS)
 def test_a_clock_that_was_set_is_counted_by_its_stream(stream):
-    driven = drive_case(INPUTS, FaultCase(f"clock_back_{stream}", math.inf, "steady", "grass", SEED))
+    driven = drive_case(LOOP, FaultCase(f"clock_back_{stream}", math.inf, "steady", "grass", SEED))
     counts = driven.pilot._pilot.dropped
     assert counts[f"{stream}: clock set"] == 1
     assert not any("clock set" in kind for kind in counts if not kind.startswith(stream))
@@ -144,7 +139,7 @@ def test_lost_wheels_are_named_and_nothing_winds_up_meanwhile(situation):
         "wheel_2",
         "wheel_3",
     }
-    drive = drive_case(INPUTS, FaultCase("loss_wheels", 3.0, *place)).drive
+    drive = drive_case(LOOP, FaultCase("loss_wheels", 3.0, *place)).drive
     after = drive.time_s > start_s + 3.0
     peak, clean_peak = (np.nanmax(np.abs(d.true_slip_ratio[after])) for d in (drive, clean))
     assert peak <= clean_peak + 0.03
