@@ -29,6 +29,7 @@ COMMANDS: tuple[Command, ...] = (
         "rates, gaps, clocks, units, signs; the card of a model",
     ),
     Command("Data", "simulate", "pipelines.data.simulate", "runs of a described robot"),
+    Command("Data", "label", "pipelines.learn.label", "set, propose, answer"),
     Command(
         "State",
         "estimate",

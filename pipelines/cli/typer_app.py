@@ -4,13 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from pipelines.cli import (
-    classify,
-    features,
-    label,
-    quickstart,
-    slip,
-)
+from pipelines.cli import classify, features, quickstart, slip
 
 app = typer.Typer(
     name="terrain",
@@ -21,9 +15,7 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 
-GROUPS = (
-    *(features.app, classify.app, slip.app, label.app, quickstart.app),
-)
+GROUPS = (features.app, classify.app, slip.app, quickstart.app)
 """Files of commands, in the order of help."""
 
 for group in GROUPS:

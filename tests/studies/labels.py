@@ -19,10 +19,10 @@ from features.motion import Motion, window_motion
 from pipelines.data.datasets import load_runs
 from pipelines.learn.evaluate import Examples
 from pipelines.learn.parallel import parallel
+from pipelines.learn.proposals import ACCEPTED, Proposal, questions
 from pipelines.learn.protocols import Fold, folds_of, samples_of
 from pipelines.learn.recipes import feature_matrix, recipe_of
 from pipelines.learn.settings import LearnSettings
-from pipelines.propose.proposals import ACCEPTED, Proposal, questions
 from pipelines.report import Column, Progress, Report, Result, Table, described, silent
 from pipelines.report.settings import Settings as BaseSettings
 from pipelines.report.settings import setting

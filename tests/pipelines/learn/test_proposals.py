@@ -10,15 +10,23 @@ import pytest
 
 from pipelines.cli.main import main
 from pipelines.data.datasets import load_runs
-from pipelines.label.settings import LabelSettings
-from pipelines.models.model_files import read_model
-from pipelines.propose.answers_file import COLUMNS, read_answers
-from pipelines.propose.labelling import SOURCES_FILE, propose_labels, write_labels
-from pipelines.propose.proposals import Proposal, questions
-from pipelines.reporting.json_file import as_json
+from pipelines.learn.label import SOURCES_FILE, Settings
+from pipelines.learn.label import propose_labels as propose
+from pipelines.learn.label import write_labels as write
+from pipelines.learn.model_file import read_model
+from pipelines.learn.proposals import COLUMNS, Proposal, questions, read_answers
+from pipelines.report.json_file import as_json
 from terrain.classify.smoothing import smoothed_classes
 from terrain.errors import ConfigError, DataError, LogError
 from terrain.logs.write import write_run
+
+
+def propose_labels(data, model, n_asked, file, accept):
+    return propose(Settings(data=data, ask=n_asked, proposals=file, accept=accept), model)
+
+
+def write_labels(data, answers, out, accept, *, new_class):
+    return write(Settings(data=data, accept=accept, new_class=new_class), answers, out)
 
 
 @pytest.fixture(scope="module")
@@ -166,7 +174,7 @@ def test_short_runs_give_no_proposal(tmp_path, drive, model):
 )
 def test_options_that_contradict_each_other_are_refused(given):
     with pytest.raises((ConfigError, ValueError)):
-        LabelSettings(data="runs", run="r", whole="terrain" in given, **given)
+        Settings(data="runs", run="r", whole="terrain" in given, **given)
 
 
 def test_the_command_goes_from_proposals_to_labelled_runs(recorded, tracked, tmp_path, monkeypatch, capsys):

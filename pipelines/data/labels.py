@@ -1,15 +1,14 @@
-"""List windows of low confidence, and set the labels of runs."""
+"""Labels of run folders: intervals that are set, windows that the model was in doubt about."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 from features.windows import TIME_TOLERANCE_S
 from pipelines.data.recorded_windows import read_windows
-from pipelines.label.results import DoubtfulWindow, DoubtfulWindows, LabelledRun, RunWindows
-from pipelines.label.settings import LabelSettings
 from terrain.errors import ConfigError, LogError
 from terrain.files.atomic import atomic_write
 from terrain.logs.read import read_run, read_run_head, run_folders
@@ -19,8 +18,48 @@ SLACK_S = 0.01
 """An interval may be that far outside of a run: times are typed with two digits."""
 
 
-def doubtful_windows(settings: LabelSettings) -> DoubtfulWindows:
-    """Return the windows whose outputs do not count, of all runs or of one.
+class DoubtfulWindow(NamedTuple):
+    """A window whose output does not count.
+
+    Parameters
+    ----------
+    run_id, start_s, end_s : which one
+    terrain, probability : output of the model; empty and NaN where it refused the window
+    refused : why it did
+    label : of the run, where one covers the whole window
+    """
+
+    run_id: str
+    start_s: float
+    end_s: float
+    terrain: str
+    probability: float
+    refused: str
+    label: str | None
+
+
+class RunWindows(NamedTuple):
+    """Windows of a run: how many there are, are doubtful, and of those lack a label; None: none recorded."""
+
+    run_id: str
+    n_windows: int | None
+    n_doubtful: int
+    n_without_label: int
+
+
+class ChangedLabels(NamedTuple):
+    """Interval whose label was set or removed, and all labels of the run."""
+
+    folder: Path
+    start_s: float
+    end_s: float
+    labels: tuple[Label, ...]
+
+
+def doubtful_windows(
+    data: Path, run_id: str | None = None
+) -> tuple[tuple[RunWindows, ...], tuple[DoubtfulWindow, ...]]:
+    """Return the windows whose outputs do not count, of all runs or of one, and how many each run has.
 
     Raises
     ------
@@ -29,9 +68,9 @@ def doubtful_windows(settings: LabelSettings) -> DoubtfulWindows:
     ConfigError
         if there is no run of the id.
     """
-    folders = _folders(settings.data)
-    if settings.run is not None:
-        folders = [_folder_of(settings.run, folders, settings.data)]
+    folders = _folders(data)
+    if run_id is not None:
+        folders = [_folder_of(run_id, folders, data)]
     runs: list[RunWindows] = []
     found: list[DoubtfulWindow] = []
     for folder in folders:
@@ -54,11 +93,20 @@ def doubtful_windows(settings: LabelSettings) -> DoubtfulWindows:
         ]
         runs.append(RunWindows(head.run_id, len(windows), len(rows), sum(row.label is None for row in rows)))
         found += rows
-    return DoubtfulWindows(settings.data, tuple(runs), tuple(found))
+    return tuple(runs), tuple(found)
 
 
-def set_label(settings: LabelSettings) -> LabelledRun:
+def set_label(
+    data: Path, run_id: str, terrain: str, start_s: float | None = None, end_s: float | None = None
+) -> ChangedLabels:
     """Set or remove a label of a run; all else in its ``run.json`` stays.
+
+    Parameters
+    ----------
+    data : a run folder, or a folder of run folders
+    run_id : of the run
+    terrain : of the label; an empty one removes what is there
+    start_s, end_s : of the interval; the whole run, with labels beyond its samples, where neither is given
 
     Raises
     ------
@@ -69,26 +117,23 @@ def set_label(settings: LabelSettings) -> LabelledRun:
     TerrainError
         if the file cannot be written; it is as it was then.
     """
-    run_id = settings.run or ""
-    folder = _folder_of(run_id, _folders(settings.data), settings.data)
+    folder = _folder_of(run_id, _folders(data), data)
     head = read_run_head(folder)
     streams = read_run(folder, repair=True).streams.values()
     first_s = min(float(stream.time_s[0]) for stream in streams)
     last_s = max(float(stream.time_s[-1]) + 1.0 / stream.rate_hz for stream in streams)
-    start_s = first_s if settings.from_s is None else settings.from_s
-    end_s = last_s if settings.to_s is None else settings.to_s
-    if settings.whole:  # labels may have been set beyond the samples
-        start_s = min([start_s, *(label.start_s for label in head.labels)])
-        end_s = max([end_s, *(label.end_s for label in head.labels)])
+    if start_s is None or end_s is None:  # labels may have been set beyond the samples
+        start_s = min([first_s, *(label.start_s for label in head.labels)])
+        end_s = max([last_s, *(label.end_s for label in head.labels)])
     elif start_s < first_s - SLACK_S or end_s > last_s + SLACK_S:
         raise ConfigError(
             f"run {run_id} is from {first_s:.6g} to {last_s:.6g} s: "
             f"{start_s:g} to {end_s:g} s is not within it"
         )
-    labels = relabelled(head.labels, start_s, end_s, settings.new_terrain)
+    labels = relabelled(head.labels, start_s, end_s, terrain)
     document = head.document | {"labels": [label._asdict() for label in labels]}
     atomic_write(folder / "run.json", json.dumps(document, indent=2, allow_nan=False) + "\n")
-    return LabelledRun(run_id, folder, start_s, end_s, settings.new_terrain, labels)
+    return ChangedLabels(folder, start_s, end_s, labels)
 
 
 def relabelled(labels: Iterable[Label], start_s: float, end_s: float, terrain: str) -> tuple[Label, ...]:

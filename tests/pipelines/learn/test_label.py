@@ -10,10 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipelines.cli import main as cli
+from pipelines.data.labels import relabelled
 from pipelines.data.recorded_windows import WINDOWS_FILE, window_entry, windows_text
-from pipelines.label.labels import doubtful_windows, relabelled, set_label
-from pipelines.label.screen import time_text
-from pipelines.label.settings import LabelSettings
+from pipelines.learn.label import Settings, time_text
+from pipelines.learn.label import run as label
 from pipelines.live.classifying import WindowOutput
 from terrain.errors import ConfigError, LogError
 from terrain.files import atomic
@@ -46,11 +46,11 @@ def folder(tmp_path, make_run):
 
 
 def found(folder, **options):
-    return doubtful_windows(LabelSettings(data=folder, **options))
+    return label(Settings(data=folder, **options))
 
 
 def labelled(folder, **options):
-    return set_label(LabelSettings(data=folder, **({"run": "SNOW_01"} | options)))
+    return label(Settings(data=folder, **({"run": "SNOW_01"} | options)))
 
 
 def labels_of(folder, run_id="SNOW_01"):
@@ -199,14 +199,13 @@ def test_the_command_lists_and_sets(folder, monkeypatch, capsys, tmp_path):
 
     code, printed = terrain("--json", tmp_path / "out.json")
     assert code == 0
-    assert "SNOW_01: 3 of 4 windows of low confidence, 0 of them without a label" in printed.out
-    assert "SNOW_02: no windows were recorded" in printed.out
+    assert "3 of 4 recorded windows are of low confidence, 0 of them without a label" in printed.out
     assert "refused: NaN" in printed.out
     listed = json.loads((tmp_path / "out.json").read_text())
     assert [row["start_s"] for row in listed["windows"]] == [1.0, 2.0, 3.0]
     assert listed["windows"][2]["probability"] is None
     code, printed = terrain("--run", "SNOW_01", "--from", 1, "--to", 2, "--terrain", "ICE")
-    assert (code, printed.out.splitlines()[0]) == (0, "SNOW_01: 1 to 2 s labelled ICE")
+    assert (code, "SNOW_01: 1 to 2 s labelled ICE" in printed.out) == (0, True)
     code, printed = terrain("--run", "SNOW_09", "--all", "--terrain", "ICE")
     assert code == 2
     assert printed.err == f"error: {folder}: there is no run 'SNOW_09'\n"

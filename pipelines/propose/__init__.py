@@ -1,1 +1,0 @@
-"""Labels proposed by a model: stretches of recorded runs, questions worth asking, and answers taken over."""
