@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
-from contextlib import AbstractAsyncContextManager
+from collections.abc import AsyncIterator, Callable
+from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any
@@ -46,23 +46,6 @@ class ModelChoice(BaseModel):
     uri: Annotated[
         str, Field(min_length=1, max_length=1000, description="models:/NAME@champion or a model folder")
     ]
-
-
-class ServedNow(BaseModel):
-    """What is served; ``number`` rises with each replacement."""
-
-    number: int
-    model: str | None
-    classes: list[str]
-    table: str
-
-
-class Readiness(BaseModel):
-    """Whether robots can be served, and what is not as it should be."""
-
-    ready: bool
-    sessions: int
-    trouble: dict[str, str]
 
 
 def make_app(
@@ -129,12 +112,12 @@ def _add_state(app: FastAPI, hub: Hub) -> None:
         """Say that the process runs."""
         return {"status": "ok", "version": __version__}
 
-    @app.get("/ready", responses={503: {"model": Readiness}})
-    async def ready(response: Response) -> Readiness:
-        """Say whether robots can be served."""
+    @app.get("/ready")
+    async def ready(response: Response) -> dict[str, Any]:
+        """Say whether robots can be served (503 where they cannot), and what is not as it should be."""
         if hub.closing:
             response.status_code = 503
-        return Readiness(ready=not hub.closing, sessions=len(hub.sessions), trouble=dict(hub.trouble))
+        return {"ready": not hub.closing, "sessions": len(hub.sessions), "trouble": hub.trouble}
 
     @app.get("/metrics", response_class=PlainTextResponse)
     async def metrics() -> PlainTextResponse:
@@ -167,27 +150,27 @@ def _add_state(app: FastAPI, hub: Hub) -> None:
 def _add_replacement(app: FastAPI, hub: Hub, load: Callable[[str], TerrainModel]) -> None:
     replacing = asyncio.Lock()
 
-    @app.put("/model")
-    async def replace_model(choice: ModelChoice) -> ServedNow:
-        """Serve another model: all robots at once, or none; no sample is lost."""
+    @asynccontextmanager
+    async def one_at_a_time() -> AsyncIterator[None]:
         async with replacing:
             try:
-                found = await asyncio.to_thread(load, choice.uri)
-                served = hub.swap(found, choice.uri, hub.served.table)
+                yield
             except TerrainError as error:
                 raise HTTPException(409, str(error)) from None
-        return ServedNow(**served_content(served))
+
+    @app.put("/model")
+    async def replace_model(choice: ModelChoice) -> dict[str, Any]:
+        """Serve another model: all robots at once, or none; no sample is lost."""
+        async with one_at_a_time():
+            found = await asyncio.to_thread(load, choice.uri)
+            return served_content(hub.swap(found, choice.uri, hub.served.table))
 
     @app.put("/table")
-    async def replace_table(text: Annotated[str, Body(media_type="application/yaml")]) -> ServedNow:
+    async def replace_table(text: Annotated[str, Body(media_type="application/yaml")]) -> dict[str, Any]:
         """Serve another table of target slips, given as its YAML: all robots at once, or none."""
-        async with replacing:
-            try:
-                table = await asyncio.to_thread(_table_of, text)
-                served = hub.swap(hub.served.model, hub.served.model_name, table)
-            except TerrainError as error:
-                raise HTTPException(409, str(error)) from None
-        return ServedNow(**served_content(served))
+        async with one_at_a_time():
+            table = await asyncio.to_thread(_table_of, text)
+            return served_content(hub.swap(hub.served.model, hub.served.model_name, table))
 
 
 def _table_of(text: str) -> SlipTable:

@@ -19,6 +19,7 @@ import numpy as np
 from pipelines.data.can_codec import Frame, Layout, encode
 from pipelines.data.can_logs import Receiver
 from pipelines.data.can_signals import RECEIVED, channels_of
+from pipelines.live.arrivals import SessionClock
 from terrain.angles import wrapped
 from terrain.control.wheel_controllers import step_or_period
 from terrain.entry_point import entry_point
@@ -39,9 +40,6 @@ AHEAD_S = 0.1
 
 KEPT = 100_000
 """Latencies that are kept: half an hour at 50 Hz."""
-
-WINDOW_S = 0.5
-"""The difference between both clocks is taken anew so often: it follows drift, and a clock that was set."""
 
 _STATUS = channels_of("status")
 _wheel_command_step = entry_point(wheel_command_step)
@@ -131,51 +129,6 @@ def corrections(command: Command, theory: Theory, measured_rad: Array) -> tuple[
     return np.where(apart_rad > np.pi / 2, -added, added), BridgeState.ACTIVE
 
 
-class BusClock:
-    """Time of a bus: that of its frames' stamps, continued between frames by this computer's clock.
-
-    A frame is read some time after its stamp, never before: the largest difference of a window is that of the
-    frame that waited least. One stamp may be wrong: it is the second largest that counts, of frames that are
-    more than one.
-
-    Examples
-    --------
-    >>> clock = BusClock()
-    >>> for read_s in (5.0, 5.01, 5.02):
-    ...     clock.received(read_s + 1000.0, read_s)
-    >>> clock.time(5.03)
-    1005.03
-    """
-
-    def __init__(self) -> None:
-        self._offset_s, self._found = 0.0, False
-        self._began_s = math.nan
-        self._first = self._second = -math.inf
-
-    def received(self, stamp_s: float, read_s: float) -> None:
-        """Take the stamp of a frame that was read at a time of this computer."""
-        if not math.isfinite(stamp_s):
-            return
-        if math.isnan(self._began_s):
-            self._began_s = read_s
-        ahead_s = stamp_s - read_s
-        if ahead_s > self._first:
-            self._first, self._second = ahead_s, self._first
-        elif ahead_s > self._second:
-            self._second = ahead_s
-        best_s = self._second if math.isfinite(self._second) else self._first
-        if not self._found:
-            self._offset_s = best_s
-            self._found = read_s - self._began_s >= WINDOW_S
-        if read_s - self._began_s >= WINDOW_S:
-            self._offset_s = best_s
-            self._began_s, self._first, self._second = read_s, -math.inf, -math.inf
-
-    def time(self, read_s: float) -> float:
-        """Return the time of the bus at a time of this computer."""
-        return read_s + self._offset_s
-
-
 class LastSample:
     """Newest sample of a stream that measured anything.
 
@@ -236,7 +189,7 @@ class BridgeCore:
         self._layout, self._make_step = layout, make_step
         self._step: Step | None = None
         self.receiver = Receiver(layout, RECEIVED)
-        self._kinematics, self.clock = LowLevelKinematics(robot), BusClock()
+        self._kinematics, self.clock = LowLevelKinematics(robot), SessionClock()
         self._zeros_rad = robot.steering_zeros_rad
         self._last = {name: LastSample(stale_s, 3) for name, stale_s in STALE_S.items()}
         self._before_s, self._counter, self._new_wheels = math.nan, 0, False
@@ -255,7 +208,7 @@ class BridgeCore:
 
     def tick(self, read_s: float) -> list[Frame]:
         """Return the frames of a control step at a time of this computer."""
-        now_s = self.clock.time(read_s)
+        now_s = self.clock.at(read_s)
         readings = self.receiver.readings(now_s)
         for name, reading in readings.items():
             self.samples[name] += len(reading.time_s)
@@ -271,11 +224,11 @@ class BridgeCore:
     def sent(self, read_s: float) -> None:
         """Note when the frames of the last step were sent."""
         if self._new_wheels:
-            self.latencies_s.append(self.clock.time(read_s) - self._last["wheels"].stamp_s)
+            self.latencies_s.append(self.clock.at(read_s) - self._last["wheels"].stamp_s)
 
     def stop(self, read_s: float) -> list[Frame]:
         """Return the last frames: corrections of zero."""
-        return self._frames(np.zeros(3), {}, BridgeState.STOPPED, self.clock.time(read_s))
+        return self._frames(np.zeros(3), {}, BridgeState.STOPPED, self.clock.at(read_s))
 
     def _control(self, sample: Sample, read_s: float) -> tuple[Array, dict[str, float], BridgeState]:
         """Return corrections, the controller's status, and the state."""

@@ -23,21 +23,12 @@ from pipelines.live.chain import CommandStatus
 from pipelines.live.session import StepOutput
 from pipelines.serve.guard import LONGEST_TOKEN, Budget, bearer, token_fits
 from pipelines.serve.hub import Hub, OpenSession
-from pipelines.serve.messages import (
-    error_content,
-    read_hello,
-    served_content,
-    step_content,
-    welcome,
-)
+from pipelines.serve.messages import error_content, read_hello, served_content, step_content, welcome
 from pipelines.serve.wire import WireError, decode, encode
 from terrain.estimation.live.clocks import number
 
 MAX_NOTES = 1000
 """Answers to messages that wait to be read; of more, the oldest are left out."""
-
-LEAVING_S = 3.0
-"""For a robot to be sent why its connection ends."""
 
 TURN = 16
 """Messages of one robot in a row; then the others have their turn."""
@@ -149,15 +140,14 @@ class Connection(Line):
         self._bytes, self._decoding = Budget(limits.bytes_per_s), Budget(limits.decoding_s_per_s)
         self._notes: deque[dict[str, Any]] = deque(maxlen=MAX_NOTES)
         self._step: StepOutput | None = None
-        self._changed, self._left = asyncio.Event(), asyncio.Event()
-        self._writing = False
+        self._changed = asyncio.Event()
         self._dropped: dict[str, int] = {}
 
     async def _talk(self) -> None:
         opened, rate_hz = await self._greet()
         if opened is None:
             return
-        talking = [self._receive(opened, rate_hz), self._send(), self._leaving()]
+        talking = [self._receive(opened, rate_hz), self._send()]
         if rate_hz > 0.0:
             talking.append(self._tick(opened, rate_hz))
         tasks = [asyncio.create_task(one) for one in talking]
@@ -175,7 +165,6 @@ class Connection(Line):
         """End the connection with an error, from outside."""
         self._end = (TRY_AGAIN_LATER, sentence[:120])
         self._note(code, sentence, fatal=True)
-        self._left.set()
 
     async def _greet(self) -> tuple[OpenSession | None, float]:
         """Wait for a hello and answer it; None where none came in time or it was refused for good."""
@@ -265,13 +254,16 @@ class Connection(Line):
 
     def _take(self, opened: OpenSession, content: dict[str, Any], now_s: float) -> None:
         """Take the samples of a message; what is refused of it is named in one error, the rest is used."""
-        chain = opened.chain
-        n_rows = _n_rows(content.get("streams"))
+        chain, streams = opened.chain, content.get("streams")
+        given = streams.values() if isinstance(streams, dict) else ()
+        n_rows = sum(
+            len(one[0]) for one in given if isinstance(one, list) and one and isinstance(one[0], list)
+        )
         if not self._rows.take(n_rows, now_s):
             most = self._hub.limits.rows_per_s
             raise WireError("too-fast", f"more than {most:g} rows a second: this message is dropped")
         before = chain.inbox.refused.copy()
-        self._hub.metrics.rows.inc(chain.put(content.get("streams"), content.get("twist"), now_s))
+        self._hub.metrics.rows.inc(chain.put(streams, content.get("twist"), now_s))
         refused = chain.inbox.refused - before
         if refused:
             self._note("malformed", f"samples: {'; '.join(sorted(refused))}")
@@ -310,28 +302,23 @@ class Connection(Line):
         self._changed.set()
 
     async def _send(self) -> None:
-        """Send what is there: first the notes, then the newest step."""
+        """Send what is there, first the notes, then the newest step; end with a fatal note."""
         while True:
             await self._changed.wait()
             self._changed.clear()
             try:
-                self._writing = True
                 while self._notes:
-                    await self._write(self._notes.popleft())
+                    note = self._notes.popleft()
+                    await self._write(note)
+                    if note["fatal"]:
+                        return
                 output, self._step = self._step, None
                 if output is not None:
                     await self._write(step_content(output))
-                self._writing = False
             except TimeoutError:
                 self._end = (TRY_AGAIN_LATER, "the receiver did not read for too long")
                 self._hub.metrics.errors.labels("too-slow").inc()
                 return
-
-    async def _leaving(self) -> None:
-        await self._left.wait()
-        async with asyncio.timeout(LEAVING_S):
-            while self._notes or self._writing or self._changed.is_set():
-                await asyncio.sleep(0.01)
 
     def _drop(self, most: str) -> None:
         """Count a message that comes too fast; those of a twentieth of a second are named in one error."""
@@ -408,14 +395,3 @@ def shown(hub: Hub, session: str) -> dict[str, Any]:
             "step": None if opened.last is None else step_content(opened.last),
         }
     return content
-
-
-def _n_rows(streams: Any) -> int:
-    """Return how many rows a message has, as far as can be seen."""
-    if not isinstance(streams, dict):
-        return 0
-    return sum(
-        len(given[0])
-        for given in streams.values()
-        if isinstance(given, list) and given and isinstance(given[0], list)
-    )

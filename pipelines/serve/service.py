@@ -264,15 +264,11 @@ def _listen(host: str, port: int) -> socket.socket:
     """Return a socket that listens; ``TerrainError`` where the address is taken or none of this machine."""
     try:
         family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
-        listening = socket.socket(family, socket.SOCK_STREAM)
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or "no name of a machine"
         raise ConfigError(f"--host {host[:100]!r}: is no address ({reason})") from None
     try:
-        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        listening.bind((host, port))
-        listening.listen(1024)
+        return socket.create_server((host, port), family=family, backlog=1024)
     except OSError as error:
-        listening.close()
-        raise TerrainError(f"port {port} of {host} cannot be listened on ({error.strerror})") from None
-    return listening
+        reason = os.strerror(error.errno) if error.errno else str(error)
+        raise TerrainError(f"port {port} of {host} cannot be listened on ({reason})") from None
