@@ -16,6 +16,7 @@ from terrain.control.slip_table import load_slip_table, write_slip_table
 from terrain.errors import TerrainError
 
 CLI = "from pipelines.cli.main import main; main()"
+TOKEN = "t" * 20
 
 
 @pytest.fixture
@@ -43,106 +44,81 @@ def copied(model_folder, tmp_path):
     return folder
 
 
-def test_a_port_in_use_is_named(refusal):
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
-        assert refusal(port=port) == (
-            f"port {port} of 127.0.0.1 cannot be listened on (Address already in use)"
-        )
+def written(path, content):
+    path.write_bytes(content)
+    return path
 
 
 @pytest.mark.parametrize(
-    "host", ["no.such.host.invalid", "300.1.1.1", "1.2.3.4.5", "", "x" * 300, "a b", "\x00", "é" * 80]
-)
-def test_a_host_that_is_no_address_is_named(refusal, monkeypatch, host):
-    monkeypatch.setenv("TERRAIN_TOKEN", "t" * 20)
-    assert "--host" in refusal(host=host)
-
-
-def test_an_address_of_another_machine_is_refused(refusal, monkeypatch):
-    monkeypatch.setenv("TERRAIN_TOKEN", "t" * 20)
-    assert "cannot be listened on" in refusal(host="192.0.2.1")
-
-
-def test_other_machines_are_not_listened_to_without_a_token(refusal, monkeypatch, tmp_path):
-    assert "a token is required (--token-file)" in refusal(host="0.0.0.0")
-    monkeypatch.setenv("TERRAIN_TOKEN", "short")
-    assert "the token has 5 characters, 16 to 512 are accepted" in refusal()
-    empty = tmp_path / "empty"
-    empty.write_text("\n")
-    assert f"{empty}: holds no token" in refusal(token_file=empty)
-
-
-def test_a_token_file_that_cannot_be_read_is_named(refusal, tmp_path):
-    assert "No such file" in refusal(token_file=tmp_path / "none")
-    assert "cannot be read" in refusal(token_file=tmp_path)
-    binary = tmp_path / "binary"
-    binary.write_bytes(bytes(range(128, 200)))
-    assert "cannot be read (no text)" in refusal(token_file=binary)
-
-
-def test_a_model_that_is_none_is_named(refusal, copied, tmp_path):
-    assert "is neither a folder nor a model URI" in refusal(model=str(tmp_path / "none"))
-    assert refusal(model="x" * 5000)
-    assert refusal(model="\x00")
-    card = next(file for file in copied.iterdir() if file.suffix == ".json")
-    text = card.read_text()
-    for damaged in ("", "{", "[]", "[" * 100_000, text[: len(text) // 2]):
-        card.write_text(damaged)
-        assert str(copied) in refusal(model=str(copied))
-    card.unlink()
-    assert str(copied) in refusal(model=str(copied))
-
-
-def test_a_damaged_model_is_named(refusal, copied):
-    (copied / "model.skops").write_bytes(b"PK\x03\x04 nothing else")
-    assert "is damaged" in refusal(model=str(copied))
-    (copied / "model.skops").unlink()
-    assert str(copied) in refusal(model=str(copied))
-
-
-def test_a_model_for_other_channels_or_another_robot_is_refused(refusal):
-    assert "the model requires 'speed_left_mps'" in refusal(robot="agrimaro")
-    assert "mower" in refusal(robot="husky")
+    ("token", "options", "sentence"),
+    [
+        ("", {"model": None}, "--model is missing"),
+        ("", {"host": "0.0.0.0"}, "a token is required (--token-file)"),
+        ("short", {}, "the token has 5 characters, 16 to 512 are accepted"),
+        ("", {"token_file": "none"}, "none: cannot be read (No such file or directory)"),
+        ("", {"token_file": "."}, "cannot be read (Is a directory)"),
+        ("", {"token_file": b"\n"}, "holds no token"),
+        ("", {"token_file": bytes(range(128, 200))}, "cannot be read (no text)"),
+        *((TOKEN, {"host": host}, "--host") for host in ("no.such.host.invalid", "300.1.1.1", "", "x" * 300, "\x00")),
+        (TOKEN, {"host": "192.0.2.1"}, "cannot be listened on (Cannot assign requested address)"),
+        ("", {"model": "none"}, "is neither a folder nor a model URI"),
+        ("", {"model": "x" * 5000}, "cannot be opened"),
+        ("", {"robot": "agrimaro"}, "the model requires 'speed_left_mps'"),
+        ("", {"robot": "husky"}, "the model was trained on runs of mower, not of husky"),
+        ("", {"robot": "nowhere"}, "nowhere"),
+        ("", {"table": "none.yaml"}, "none.yaml"),
+        ("", {"table": b"[" * 100_000}, "nested deeper"),
+        ("", {"state": "file/below"}, "cannot be written"),
+        ("", {"record": "file"}, "cannot be written"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_is_one_sentence(refusal, monkeypatch, tmp_path, token, options, sentence):
+    monkeypatch.setenv("TERRAIN_TOKEN", token)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").write_text("")
+    given = {
+        name: written(tmp_path / "given", value) if isinstance(value, bytes) else value
+        for name, value in options.items()
+    }
+    assert sentence in refusal(**given)
 
 
 def test_a_table_for_another_robot_is_refused(refusal, tmp_path):
-    table = tmp_path / "table.yaml"
-    write_slip_table(replace(load_slip_table(), robot="husky"), table)
-    assert "is for robot 'husky', not for 'agrimaro'" in refusal(robot="agrimaro", table=table)
-    assert str(tmp_path / "none.yaml") in refusal(table=tmp_path / "none.yaml")
-    table.write_text("[" * 100_000)
-    assert "nested deeper" in refusal(table=table)
+    write_slip_table(replace(load_slip_table(), robot="husky"), tmp_path / "table.yaml")
+    sentence = refusal(robot="agrimaro", table=tmp_path / "table.yaml")
+    assert "is for robot 'husky', not for 'agrimaro'" in sentence
 
 
-def test_an_unknown_robot_is_named(refusal):
-    assert "nowhere" in refusal(robot="nowhere")
+def test_a_damaged_model_is_named(refusal, copied):
+    for file in copied.iterdir():
+        content = file.read_bytes()
+        for damaged in (b"", content[: len(content) // 2], b"[" * 100_000, b"PK\x03\x04 nothing else"):
+            file.write_bytes(damaged)
+            assert str(copied) in refusal(model=str(copied))
+        file.unlink()
+        assert str(copied) in refusal(model=str(copied))
+        file.write_bytes(content)
 
 
-def test_a_folder_that_cannot_be_written_is_named(refusal, tmp_path):
-    (tmp_path / "file").write_text("")
-    for option in ("state", "record"):
-        assert "cannot be written" in refusal(**{option: tmp_path / "file" / "below"})
-        assert "cannot be written" in refusal(**{option: tmp_path / "file"})
-
-
-def test_after_a_refused_start_the_port_is_free(refusal, model_folder):
-    with socket.create_server(("127.0.0.1", 0)) as probe:
-        port = probe.getsockname()[1]
-    refusal(port=port, robot="husky")
-    found = run(Settings(model=str(model_folder), port=port, check=True))
-    assert (found.classes, found.served) == (("a", "b"), None)
-    assert found.report.answer.endswith("can be served: a and b.")
-
-
-def test_after_a_start_that_fails_late_no_thread_is_left(refusal, monkeypatch, tmp_path):
+def test_after_a_refused_start_the_port_is_free_and_no_thread_is_left(
+    refusal, model_folder, monkeypatch, tmp_path
+):
     def fails(*_):
         raise TerrainError("the code does not run")
 
-    monkeypatch.setattr("pipelines.serve.service.warm_up", fails)
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        port = probe.getsockname()[1]
+        assert refusal(port=port) == (
+            f"port {port} of 127.0.0.1 cannot be listened on (Address already in use)"
+        )
     before = threading.active_count()
-    assert refusal(record=tmp_path / "runs") == "the code does not run"
+    with monkeypatch.context() as patch:
+        patch.setattr("pipelines.serve.service.warm_up", fails)
+        assert refusal(port=port, record=tmp_path / "runs") == "the code does not run"
     assert threading.active_count() == before
+    found = run(Settings(model=str(model_folder), port=port, check=True))
+    assert (found.classes, found.served) == (("a", "b"), None)
+    assert found.report.answer.endswith("can be served: a and b.")
 
 
 def test_damaged_states_of_robots_do_not_keep_the_service_from_starting(
@@ -162,24 +138,17 @@ def test_damaged_states_of_robots_do_not_keep_the_service_from_starting(
 
 
 @pytest.mark.parametrize(
-    ("options", "fault"),
-    [
-        (["--port", "taken"], "cannot be listened on"),
-        (["--port", "70000"], "65535"),
-        (["--max-sessions", "nan"], "--max-sessions"),
-    ],
+    ("options", "fault"), [(["--port", "70000"], "65535"), (["--max-sessions", "nan"], "--max-sessions")]
 )
 def test_the_command_ends_with_one_sentence(model_folder, options, fault):
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        options = [str(taken.getsockname()[1]) if one == "taken" else one for one in options]
-        done = subprocess.run(
-            [sys.executable, "-c", CLI, "serve", "--model", str(model_folder), *options],
-            capture_output=True,
-            text=True,
-            timeout=60,
-            check=False,
-            env={name: value for name, value in os.environ.items() if name != "TERRAIN_TOKEN"},
-        )
+    done = subprocess.run(
+        [sys.executable, "-c", CLI, "serve", "--model", str(model_folder), *options],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+        env={name: value for name, value in os.environ.items() if name != "TERRAIN_TOKEN"},
+    )
     assert done.returncode == 2, done.stderr
     assert fault in done.stderr
     assert "Traceback" not in done.stderr + done.stdout

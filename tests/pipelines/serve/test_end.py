@@ -1,5 +1,6 @@
-"""What is swapped, saved and ended while robots stream: what should be kept is, and nothing is shared."""
+"""What is swapped, saved and ended while robots stream or begin: what should be kept is."""
 
+import asyncio
 import errno
 import json
 import os
@@ -14,6 +15,13 @@ from pathlib import Path
 import pytest
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
+
+from pipelines.live.session import Served
+from pipelines.serve.hub import Hub
+from pipelines.serve.messages import read_hello
+from pipelines.serve.wire import WireError
+from terrain.control.slip_table import load_slip_table
+from terrain.errors import DataError
 
 from .strangers import until
 
@@ -171,38 +179,69 @@ def test_a_full_disk_is_named_until_there_is_room_again(running, model_folder, h
         assert [file.name for file in tmp_path.iterdir()] == ["full.json"]
 
 
-@pytest.mark.slow
-def test_robots_that_come_back_in_each_others_streams_do_not_leak(
-    running, model_folder, hello, messages, two_drives
+@pytest.fixture
+def slow_hub(mower_model, monkeypatch, tmp_path):
+    """A hub whose sessions take until an event to begin, those that do, and the event."""
+    hub = Hub(Served(1, mower_model, "one", load_slip_table()), recordings=tmp_path)
+    begun, go_on = [], threading.Event()
+    begin = hub._begin
+
+    def slowly(hello):
+        found = begin(hello)
+        begun.append(found[0])
+        assert go_on.wait(20.0)
+        return found
+
+    monkeypatch.setattr(hub, "_begin", slowly)
+    yield hub, begun, go_on
+    hub.stop()
+
+
+async def soon(holds):
+    async with asyncio.timeout(20.0):
+        while not holds():
+            await asyncio.sleep(0.01)
+
+
+def test_a_connection_that_is_gone_before_its_session_began_leaves_no_recording_behind(slow_hub, hello):
+    hub, begun, go_on = slow_hub
+
+    async def leaves_early():
+        opening = asyncio.create_task(hub.open(read_hello(hello("gone", record=True)), lambda *_: None))
+        await soon(lambda: begun)
+        opening.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await opening
+        go_on.set()
+        await soon(lambda: begun and begun[0].recording.startswith("finished"))
+
+    asyncio.run(leaves_early())
+    assert (hub.sessions, hub._opening) == ({}, set())
+
+
+@pytest.mark.parametrize("suits", [True, False])
+def test_a_session_that_begins_while_the_model_is_replaced_gets_the_new_one(
+    slow_hub, hello, mower_model, monkeypatch, suits
 ):
-    """Two robots interleaved answer as each does alone, step by step."""
+    hub, begun, go_on = slow_hub
 
-    def alone(service, name, run, others=None):
-        answers = []
-        with service.socket() as one, service.socket() as other:
-            one.send(json.dumps(hello(name)))
-            one.recv(10)
-            if others is not None:
-                other.send(json.dumps(hello(f"{name}-other")))
-                other.recv(10)
-            for k, message in enumerate(messages(run)):
-                if others is not None:
-                    other.send(json.dumps(others[k]))
-                    other.recv(10)
-                one.send(json.dumps(message))
-                answers.append(json.loads(one.recv(10)))
-                time.sleep(0.001)
-            time.sleep(0.1)  # for the last window
-            one.send(json.dumps({"type": "samples", "streams": {}, "step": True}))
-            answers.append(json.loads(one.recv(10)))
-        return {
-            (window["start_s"], window["terrain"], *window["probabilities"].values())
-            for answer in answers
-            if (window := answer["observation"]["window"])
-        }
+    def refuses(*_):
+        raise DataError("the model does not suit")
 
-    with running(model=str(model_folder)) as service:
-        first, second = two_drives[1], two_drives[5]
-        both = list(messages(first)), list(messages(second))
-        assert alone(service, "a", first) == alone(service, "b", first, both[1])
-        assert alone(service, "c", second) == alone(service, "d", second, both[0])
+    if not suits:
+        monkeypatch.setattr("pipelines.live.session.RobotSession.swap", refuses)
+
+    async def swapped():
+        opening = asyncio.create_task(hub.open(read_hello(hello("late")), lambda *_: None))
+        await soon(lambda: begun)
+        hub.swap(mower_model, "two", load_slip_table())
+        go_on.set()
+        return await opening
+
+    if suits:
+        assert asyncio.run(swapped()).chain.served.model_name == "two"
+        assert list(hub.sessions) == ["late"]
+    else:
+        with pytest.raises(WireError, match="does not suit"):
+            asyncio.run(swapped())
+        assert hub.sessions == {}

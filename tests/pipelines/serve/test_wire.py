@@ -1,0 +1,434 @@
+"""What strangers and faulty robots send: the service keeps its limits, commands stay fresh, others go on."""
+
+import asyncio
+import json
+import math
+import re
+import socket
+import struct
+import time
+from contextlib import ExitStack, suppress
+from urllib.parse import urlsplit
+
+import msgpack
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from websockets.asyncio.client import connect
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+
+from pipelines.serve import connection, guard
+from pipelines.serve.client import ServiceError, TerrainClient
+from pipelines.serve.hub import LIMITS
+from pipelines.serve.metrics import resident_bytes
+from terrain.control.slip_table import load_slip_table
+
+from .strangers import beside, frame, raw, until
+
+TOKEN = "a token of the tests"
+BEARER = {"Authorization": f"Bearer {TOKEN}"}
+DRIVEN = {
+    "type": "hello",
+    "protocol": 2,
+    "robot": "agrimaro",
+    "control": True,
+    "streams": {"wheels": [f"motor_{i}_radps" for i in (1, 2, 3)]},
+}
+MANY = 1000
+
+
+@pytest.fixture(scope="module")
+def driving(running, model_folder):
+    """A service without a model, which gives commands to robots of any channels."""
+    limits = LIMITS._replace(hello_s=1.0, too_slow_s=0.6)
+    with running(limits, model=str(model_folder)) as service:
+        service.hub.swap(None, "", load_slip_table())
+        yield service
+
+
+@pytest.fixture
+def guarded(running, model_folder, monkeypatch):
+    """A service that requires a token, and whose wrong tokens wait for a fifth of a second."""
+    monkeypatch.setenv("TERRAIN_TOKEN", TOKEN)
+    monkeypatch.setattr(guard, "WRONG_TOKEN_S", 0.2)
+    with running(model=str(model_folder)) as service:
+        yield service
+
+
+@pytest.fixture
+def decoded(monkeypatch):
+    """Sizes of the messages that were decoded."""
+    sizes, decode = [], connection.decode
+    monkeypatch.setattr(connection, "decode", lambda message: sizes.append(len(message)) or decode(message))
+    return sizes
+
+
+def samples(stamp_s, speed=20.0, **more):
+    content = {"type": "samples", "streams": {"wheels": [[stamp_s], [[speed] * 3]]}, "twist": [0.5, 0.0, 0.0]}
+    return {**content, **more}
+
+
+def ask(robot, content):
+    robot.send(content if isinstance(content, str | bytes) else json.dumps(content))
+    answer = robot.recv(10)
+    return msgpack.unpackb(answer) if isinstance(answer, bytes) else json.loads(answer)
+
+
+def assert_finite(step):
+    command = step["command"]
+    numbers = [*command["wheel_radps"], *command["steer_rad"], *command["twist"]]
+    assert len(numbers) == 9
+    assert all(isinstance(one, float) and math.isfinite(one) for one in numbers)
+
+
+@pytest.mark.parametrize("reset", [False, True], ids=["closed", "reset"])
+@pytest.mark.parametrize("when", ["in a frame", "between frames", "between fragments", "with the welcome"])
+def test_a_robot_that_is_gone_without_a_message_leaves_nothing_behind(service, hello, reset, when):
+    for k in range(5):
+        name = f"gone-{reset}-{when.replace(' ', '')}-{k}"
+        with raw(service, None if when == "with the welcome" else hello(name)) as line:
+            whole = frame(json.dumps({"type": "samples", "streams": {}, "step": True}).encode())
+            sent = {
+                "in a frame": whole[: len(whole) // 2],
+                "between fragments": frame(b'{"type": ', fin=False),
+            }
+            first = frame(json.dumps(hello(name)).encode()) if when == "with the welcome" else whole
+            line.sendall(sent.get(when, first))
+            if reset:
+                line.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+    time.sleep(0.1)
+    until(lambda: not [one for one in service.hub.sessions if one.startswith("gone")])
+    assert service.hub.trouble == {}
+
+
+def test_fragments_are_one_message_and_text_that_is_none_closes_the_connection(service, hello):
+    with raw(service, hello("fragments")) as line:
+        text = json.dumps({"type": "samples", "streams": {}, "step": True}).encode()
+        line.sendall(frame(text[:5], fin=False) + frame(b"a ping", 9))
+        for k in range(5, len(text)):
+            line.sendall(frame(text[k : k + 1], 0, fin=k == len(text) - 1))
+        answer = line.recv(8192)
+        while b'"step"' not in answer:
+            answer += line.recv(8192)
+        assert b"\x8a\x06a ping" in answer
+        line.sendall(frame(b"\xff\xfe\xfd"))
+        assert line.recv(100)[:4] == b"\x88\x02" + struct.pack("!H", 1007)
+    until(lambda: "fragments" not in service.hub.sessions)
+
+
+STRANGE = st.recursive(
+    st.none() | st.booleans() | st.integers(-(2**63), 2**63) | st.floats() | st.text(max_size=20)
+    | st.sampled_from([
+        [[0.0], [[0.0, 1.0]]], [["1"], [["1"]]], [[True], [[False]]], [[[0.0]], [[0.0]]],
+        {"imu": [[0.0], [[0.0]]]}, {"": [[0.0], [[0.0]]]}, {"imu": [[0.0, -5.0, 3.0], [[0.0], [1e300], [None]]]},
+        {"imu": {"time_s": [0], "values": [[0]]}}, {"imu": [[2**62], [[2**62]]]}, [0.5, 0.0, 0.0], [1e400, 0, 0],
+    ]),
+    lambda value: st.lists(value, max_size=4) | st.dictionaries(st.text(max_size=6), value, max_size=4),
+    max_leaves=12,
+)  # fmt: skip
+KEYS = st.sampled_from(["streams", "twist", "time_s", "step", "type", "session", "unknown"])
+CONTENT = STRANGE | st.dictionaries(KEYS, STRANGE, max_size=3).map(
+    lambda changed: {"type": "samples", "streams": {}, "step": True, **changed}
+)
+MESSAGE = st.one_of(
+    st.text(st.characters(exclude_categories=["Cs"]), max_size=50),
+    st.binary(max_size=50),
+    st.sampled_from(["[" * 10_000, '{"a":' * 10_000, b"\x91" * 10_000, b"\x81\xa1a" * 10_000, "9" * 5000]),
+    CONTENT.map(json.dumps),
+    CONTENT.map(lambda value: msgpack.packb(value, unicode_errors="replace")),
+    st.tuples(CONTENT.map(json.dumps), st.integers(0, 40)).map(lambda cut: cut[0][: cut[1]]),
+)
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
+@given(st.lists(MESSAGE, min_size=1, max_size=20), st.sampled_from([0, 50]))
+def test_each_message_is_answered_or_taken(service, hello, given_messages, rate_hz):
+    with service.socket() as stranger:
+        assert ask(stranger, hello("stranger", rate_hz=rate_hz))["type"] == "welcome"
+        for message in given_messages:
+            stranger.send(message)
+        answer = ask(stranger, {"type": "THE END"})
+        while "THE END" not in str(answer):
+            assert answer["type"] in ("error", "step")
+            if answer["type"] == "error":
+                assert answer["code"] in ("malformed", "unknown-type")
+                assert 5 < len(answer["message"]) < 500
+            text = stranger.recv(10)
+            answer = msgpack.unpackb(text) if isinstance(text, bytes) else json.loads(text)
+    until(lambda: "stranger" not in service.hub.sessions)
+    assert service.hub.trouble == {}
+
+
+def test_a_flood_of_wrong_messages_takes_no_memory_and_disturbs_no_other_robot(
+    running, model_folder, hello, messages, two_drives
+):
+    limits = LIMITS._replace(messages_per_s=1e6, decoding_s_per_s=10.0)
+    with running(limits, model=str(model_folder)) as service, beside(service, hello, messages, two_drives[4]):
+        resident = []
+        for _ in range(12):
+            with service.socket() as stranger:
+                assert ask(stranger, hello("stranger"))["type"] == "welcome"
+                for _ in range(100):
+                    stranger.send('{"type": [' + "0.1," * 1000)
+                    assert json.loads(stranger.recv(10))["code"] == "malformed"
+            until(lambda: "stranger" not in service.hub.sessions)
+            resident.append(resident_bytes() / 1e6)
+        assert resident[-1] < resident[4] + 30.0
+
+
+def test_too_large_messages_are_refused_and_larger_ones_close_the_connection(service, hello):
+    with service.socket() as robot:
+        assert ask(robot, hello("large"))["type"] == "welcome"
+        for filling in ("x" * LIMITS.message_bytes, "x" * 1_000_000):
+            answer = ask(robot, {"type": filling})
+            assert (answer["code"], answer["fatal"]) == ("too-large", False)
+            time.sleep(0.5)
+        assert ask(robot, b"\xc0" * (LIMITS.message_bytes + 1))["code"] == "too-large"
+    with raw(service) as line:
+        line.sendall(frame(b"x" * 1_100_000)[:14])
+        assert line.recv(4)[2:] == struct.pack("!H", 1009)
+    until(lambda: "large" not in service.hub.sessions)
+
+
+@pytest.mark.parametrize(
+    ("most", "content", "sentence"),
+    [
+        ({"messages_per_s": 50.0}, {"type": "samples", "streams": {}}, "more than 50 messages a second"),
+        ({"bytes_per_s": 500.0}, {"type": "samples", "streams": {}}, "more than 500 bytes a second"),
+        ({"decoding_s_per_s": 1e-6}, {"type": "samples", "streams": {}}, "more than 1e-06 s of decoding a second"),
+        ({"rows_per_s": 20.0}, samples(1.0, streams={"imu": [[0.1] * 30, [[0.1]] * 30]}), "more than 20 rows a second"),
+    ],
+)  # fmt: skip
+def test_what_is_over_a_budget_is_named_and_the_rest_is_taken(
+    running, model_folder, hello, decoded, most, content, sentence
+):
+    with running(LIMITS._replace(**most), model=str(model_folder)) as service, service.socket() as robot:
+        assert ask(robot, hello("fast"))["limits"].items() >= most.items()
+        for _ in range(100):
+            robot.send(json.dumps(content))
+        answer = json.loads(robot.recv(10))
+        assert (answer["code"], sentence in answer["message"]) == ("too-fast", True)
+        if "rows_per_s" not in most:
+            assert re.fullmatch(r".*: dropped \d+ of them", answer["message"])
+            assert len(decoded) < 95, "what is dropped is not decoded"
+
+
+def test_before_its_token_nothing_of_a_client_is_decoded_and_wrong_tokens_wait_and_are_counted(
+    guarded, hello, decoded
+):
+    wrong = '{"type": "samples", "streams": {"imu": [' + "0.123," * 40_000
+    for first in (wrong, json.dumps(hello("x")), b"\x80", TOKEN[:-1], TOKEN.encode()):
+        begun_s = time.monotonic()
+        with guarded.socket() as stranger:
+            answer = ask(stranger, first)
+            assert (answer["code"], answer["fatal"]) == ("token", True)
+            assert time.monotonic() - begun_s > 0.19
+            with pytest.raises(ConnectionClosed):
+                stranger.recv(10)
+    for place in ("/robots", "/watch"):
+        with pytest.raises(InvalidStatus, match="401"):
+            guarded.socket(place, additional_headers={"Authorization": "Bearer another"})
+    for headers in ({}, {"Authorization": "Bearer another"}):
+        assert guarded.get("/sessions", headers=headers)[0] == 401
+    assert decoded == []
+    text = guarded.get("/metrics", headers=BEARER)[1]
+    assert "terrain_wrong_tokens_total 9.0" in text
+    with pytest.raises(ServiceError, match="a token is required"):
+        TerrainClient(guarded.ws, "x", "mower", {"imu": ["accel_z_mps2"]}, token="another")
+
+
+def test_a_token_comes_in_the_header_or_as_the_first_frame(guarded, hello):
+    with guarded.socket() as robot:
+        robot.send(TOKEN)
+        assert ask(robot, hello("by-frame"))["type"] == "welcome"
+    with guarded.socket(additional_headers=BEARER) as robot:
+        assert ask(robot, hello("by-header"))["type"] == "welcome"
+    assert guarded.get("/health")[0] == 200
+    assert guarded.get("/sessions", headers=BEARER)[0] == 200
+
+
+def test_before_its_hello_a_client_is_answered_once_at_a_time_and_large_messages_are_not_decoded(
+    service, hello, decoded
+):
+    with service.socket() as stranger:
+        begun_s = time.monotonic()
+        assert ask(stranger, '{"type": [' + "0.1," * 60_000)["code"] == "too-large"
+        assert decoded == []
+        assert ask(stranger, "{")["code"] == "malformed"
+        assert ask(stranger, {**hello("old"), "protocol": 1})["code"] == "malformed"
+        assert time.monotonic() - begun_s > 1.9 * connection.PAUSE_S
+        assert ask(stranger, hello("greeted"))["type"] == "welcome"
+
+
+def test_a_thousand_robots_at_once(service, hello):
+    async def come(k):
+        socket_ = await connect(service.ws + "/robots", compression=None, open_timeout=60)
+        await socket_.send(json.dumps(hello(f"many-{k}")))
+        return socket_, json.loads(await socket_.recv())
+
+    async def all_come():
+        found = await asyncio.gather(*(come(k) for k in range(MANY)))
+        answers = [answer["type"] if "code" not in answer else answer["code"] for _, answer in found]
+        refused = next(one for one, answer in found if answer.get("code") == "too-many")
+        for one, answer in found:
+            if answer["type"] == "welcome":
+                await one.close()
+        until(lambda: not service.hub.sessions)
+        await refused.send(json.dumps(hello("many-later")))
+        later = json.loads(await refused.recv())
+        await asyncio.gather(*(one.close() for one, _ in found))
+        return answers, later
+
+    answers, later = asyncio.run(all_come())
+    assert {kind: answers.count(kind) for kind in set(answers)} == {"welcome": 64, "too-many": MANY - 64}
+    assert later["type"] == "welcome"
+    until(lambda: not service.hub.sessions)
+    assert service.hub.trouble == {}
+
+
+@pytest.mark.parametrize(
+    "part",
+    ["", "GET /health HT", "PUT /table HTTP/1.1\r\nHost: {host}\r\nContent-Length: 9\r\n\r\nhalf"],
+    ids=["nothing", "head", "body"],
+)
+def test_requests_that_do_not_come_whole_are_ended(driving, monkeypatch, part):
+    monkeypatch.setattr(guard, "REQUEST_S", 1.0)
+    place = urlsplit(driving.http)
+    lines = [socket.create_connection((place.hostname, place.port), 10) for _ in range(1 if part else MANY)]
+    begun_s = time.monotonic()
+    for line in lines:
+        line.sendall(part.format(host=place.netloc).encode())
+    for line in lines:
+        line.settimeout(10)
+        with suppress(ConnectionResetError):
+            assert line.recv(10) in (b"", b"HTTP/1.1 4")
+        line.close()
+    assert 0.5 < time.monotonic() - begun_s < 8.0
+    assert driving.get("/health")[0] == 200
+
+
+@pytest.mark.parametrize("sized", [True, False], ids=["length", "chunks"])
+def test_a_body_of_any_size_takes_no_memory(service, sized):
+    place, before = urlsplit(service.http), resident_bytes()
+    with socket.create_connection((place.hostname, place.port), 10) as line:
+        length = b"Content-Length: 600000000" if sized else b"Transfer-Encoding: chunked"
+        line.sendall(b"PUT /model HTTP/1.1\r\nHost: %s\r\n%s\r\n\r\n" % (place.netloc.encode(), length))
+        chunk = b"x" * 65_536 if sized else b"10000\r\n" + b"x" * 65_536 + b"\r\n"
+        with suppress(ConnectionError):
+            for _ in range(2000):
+                line.sendall(chunk)
+    assert resident_bytes() - before < 20e6
+
+
+def test_a_greeting_that_does_not_come_ends_the_connection(driving):
+    with raw(driving) as line:
+        assert b"no hello came in time" in line.recv(1000)
+
+
+def test_a_receiver_that_does_not_read_is_ended_and_disturbs_no_other(driving):
+    with raw(driving, {**DRIVEN, "rate_hz": 200, "session": "slow"}, buffer=8192) as slow:
+        until(lambda: "slow" in driving.hub.sessions)
+        with driving.socket() as other:
+            assert ask(other, {**DRIVEN, "session": "reads", "rate_hz": 0})["type"] == "welcome"
+            begun_s = time.monotonic()
+            while "slow" in driving.hub.sessions:
+                sent_s = time.monotonic()
+                assert sent_s - begun_s < 5.0
+                step = ask(other, samples(sent_s, step=True, time_s=sent_s))
+                assert step["command"]["status"] == "ok"
+                assert time.monotonic() - sent_s < 0.3
+                time.sleep(0.005)
+        time.sleep(guard.FLUSH_S + 0.5)
+        with suppress(ConnectionResetError):  # its end is in order, or not even that
+            slow.setblocking(True)
+            while slow.recv(65536):
+                pass
+    assert b'terrain_errors_total{code="too-slow"}' in driving.hub.metrics.text()
+
+
+def test_a_slow_receiver_that_goes_on_gets_fresh_commands(driving, monkeypatch):
+    """Of what came while it did not read, only what the line held already is old."""
+    monkeypatch.setattr(driving.hub, "limits", driving.hub.limits._replace(too_slow_s=5.0))
+    with raw(driving, {**DRIVEN, "rate_hz": 100, "session": "resumes"}, buffer=4096) as slow:
+        end_s = time.monotonic() + 1.5
+        while time.monotonic() < end_s:
+            slow.sendall(frame(json.dumps(samples(time.monotonic())).encode()))
+            time.sleep(0.02)
+        ages, received = [], b""
+        end_s = time.monotonic() + 0.5
+        while time.monotonic() < end_s:
+            slow.sendall(frame(json.dumps(samples(time.monotonic())).encode()))
+            received += slow.recv(65536)
+            *whole, received = received.split(b'{"type":"step",')
+            for text in whole:
+                if text.startswith(b'"time_s":') and not text.startswith(b'"time_s":null'):
+                    ages.append(time.monotonic() - float(text[9:].split(b",")[0]))
+            if not received.startswith(b'{"type'):
+                received = b'{"type":"step",' + received
+    n_old = sum(age > 0.25 for age in ages)
+    assert n_old <= 40, "of 150 steps that it did not read"
+    assert len(ages) > n_old + 20
+    assert max(ages[n_old:]) <= 0.25
+
+
+@pytest.mark.parametrize("rate_hz", [0, pytest.param(100, marks=pytest.mark.slow)])
+def test_clocks_that_are_set_and_stamps_that_are_none(driving, rate_hz):
+    """After each the session goes on, with commands that are finite and as new as the robot's last stamp."""
+    strange = [None, 1e308, -1e308, 1e15, -1e15, 1e9, 5.0, 5.0, 4.99, 2**62, 0.0, -7200.0, 7200.0]
+    n_sent, begun_s = 0, time.monotonic() - 100.0
+    with driving.socket() as robot:
+        hello = {**DRIVEN, "session": f"clocks-{rate_hz}", "rate_hz": rate_hz}
+        assert ask(robot, hello)["type"] == "welcome"
+
+        def step_of(content):
+            answer = ask(robot, {**content, "step": rate_hz == 0})
+            while rate_hz and answer["type"] != "error" and answer["message"] < n_sent:
+                answer = json.loads(robot.recv(10))
+            assert_finite(answer)
+            return answer
+
+        for stamp in strange:
+            n_sent += 1
+            step_of(samples(stamp))
+            for _ in range(12):
+                base_s = time.monotonic() - begun_s
+                n_sent += 1
+                step = step_of(samples(base_s, time_s=base_s) if rate_hz == 0 else samples(base_s))
+                time.sleep(0.01)
+            assert step["command"]["status"] == "ok", stamp
+            assert abs(step["time_s"] - base_s) < 0.5, stamp
+    assert driving.hub.trouble == {}
+
+
+REFUSED_TWISTS = ([math.nan] * 3, [0.5, None, 0.0], [0.5, 0.0], [1e999, 0, 0], "x", {})
+
+
+def test_a_desired_motion_that_is_none_is_refused_and_the_last_one_ends(driving):
+    with ExitStack() as stack:
+        robots = [stack.enter_context(driving.socket()) for _ in REFUSED_TWISTS]
+        for k, robot in enumerate(robots):
+            assert ask(robot, {**DRIVEN, "session": f"twist-{k}", "rate_hz": 0})["type"] == "welcome"
+        begun_s, statuses = time.monotonic(), []
+        while time.monotonic() - begun_s < 0.7:
+            now_s = time.monotonic() - begun_s
+            content, first = samples(now_s, step=True, time_s=now_s), not statuses
+            for robot, twist in zip(robots, REFUSED_TWISTS, strict=True):
+                robot.send(json.dumps(content if first else {**content, "twist": twist}))
+                answers = [json.loads(robot.recv(3)) for _ in range(1 if first else 2)]
+                step = next(one for one in answers if one["type"] == "step")
+                if not first:
+                    refusal = next(one["message"] for one in answers if one["type"] == "error")
+                    assert "twist that is not three numbers" in refusal
+                assert_finite(step)
+                statuses.append((now_s, step["command"]["status"]))
+            time.sleep(0.02)
+    assert {status for now_s, status in statuses if now_s < 0.45} == {"ok"}
+    stopped = {status for now_s, status in statuses if now_s > 0.55}
+    assert stopped == {"stopped: the desired motion is too old"}
+    with driving.socket() as robot:
+        assert ask(robot, {**DRIVEN, "session": "huge", "rate_hz": 0})["type"] == "welcome"
+        for k, size in enumerate((1e3, 1e150, 1e308, -1e308, 1e-308, 0.5)):
+            for speed in (20.0, 1e308, None, -1e308):
+                now_s = 1.0 + 0.1 * k
+                content = samples(now_s, speed, step=True, time_s=now_s) | {"twist": [size] * 3}
+                assert_finite(ask(robot, content))
