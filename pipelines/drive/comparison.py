@@ -36,7 +36,7 @@ from pipelines.drive.metrics import (
     metrics_of_scenario,
     signed_difference,
 )
-from pipelines.drive.run_curves import DriveCurves, drive_curves, run_figures
+from pipelines.drive.run_figures import run_figures
 from pipelines.learn.parallel import parallel
 from pipelines.live.pilot import LivePilot
 from pipelines.report import (
@@ -64,6 +64,7 @@ from pipelines.report import (
 )
 from pipelines.report.versions import versions
 from terrain.control.comparison import Difference, MeanInterval, mean_interval, paired_difference
+from terrain.control.drive_curves import DriveCurves, drive_curves
 from terrain.control.drive_evaluation import (
     START_TIME_S,
     EnergyCurve,

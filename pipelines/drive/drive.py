@@ -6,7 +6,7 @@ import math
 import os
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from pydantic import field_validator, model_validator
 
@@ -20,10 +20,8 @@ if TYPE_CHECKING:
 EXAMPLE = "terrain drive --scenario starts --terrain grass --table table.yaml --out drives/"
 
 PAGE_FILE = "report.html"
-MAX_GRADE_DEG = MAX_SLOPE_DEG = 30.0
-MAX_DELAY_S = 0.5
 SITUATIONS = ("start", "stop", "steady")
-SLIP_SOURCES = ("none", "dynamic", "kinematic", "multi", "multi-grip")
+SlipSourceName = Literal["none", "dynamic", "kinematic", "multi", "multi-grip"]
 """Names of :class:`terrain.control.car_following.SlipSource`, which would load compiled code here."""
 
 ALL = "all"
@@ -79,7 +77,7 @@ class ComparisonSettings(BaseSettings):
         "Classifier of 'classified' and 'thesis:classified': models:/NAME@champion or a folder; one is "
         "trained by default.",
     )
-    delay_s: float = setting(0.05, "From a sample to the wheel in s.", option="--delay")
+    delay_s: float = setting(0.05, "From a sample to the wheel in s.", option="--delay", ge=0.0, le=0.5)
     ramp_mps2: float | None = setting(
         None,
         "Rise of speed of 'ramp' in m/s^2; by default the one that travels as far as the traction controller.",
@@ -87,7 +85,7 @@ class ComparisonSettings(BaseSettings):
     )
     duration_s: float | None = setting(None, "Length of a drive in s.", option="--duration")
     accel_mps2: float = setting(1.0, "Rise of the desired speed in m/s^2; inf for a step.", option="--accel")
-    grade_deg: float = setting(0.0, "Slope in degrees, uphill > 0.", option="--grade")
+    grade_deg: float = setting(0.0, "Slope in degrees, uphill > 0.", option="--grade", ge=-30.0, le=30.0)
     radius_factors: tuple[float, float, float] | None = setting(
         None,
         "True radius of each wheel over the nominal one, as in 1,1.02,1; drawn by default.",
@@ -106,18 +104,6 @@ class ComparisonSettings(BaseSettings):
         if repeated:
             raise ValueError(f"controllers name {min(repeated)!r} twice")
         return names
-
-    @field_validator("delay_s")
-    @classmethod
-    def _possible_delay(cls, delay_s: float) -> float:
-        if not 0.0 <= delay_s <= MAX_DELAY_S:
-            raise ValueError(f"--delay is {delay_s!r}; 0 to {MAX_DELAY_S:g} s are accepted")
-        return delay_s
-
-    @field_validator("grade_deg")
-    @classmethod
-    def _possible_grade(cls, grade_deg: float) -> float:
-        return _within("--grade", grade_deg, MAX_GRADE_DEG)
 
     @field_validator("radius_factors", mode="before")
     @classmethod
@@ -196,9 +182,13 @@ class PathSettings(BaseSettings):
         "Follow the path of this CSV file: points in their order, columns x_m and y_m, and roll_rad where it "
         "is known.",
     )
-    observer: str = setting("multi", f"Sideslip by: {', '.join(SLIP_SOURCES)}.")
+    observer: SlipSourceName = setting("multi", "What gives the sideslip.")
     slope_deg: float = setting(
-        0.0, "Side slope in degrees, left side up > 0; with roll_rad in the file, that.", option="--slope"
+        0.0,
+        "Side slope in degrees, left side up > 0; with roll_rad in the file, that.",
+        option="--slope",
+        ge=-30.0,
+        le=30.0,
     )
     grip: float = setting(0.7, "Largest side force over load.", gt=0.0, le=1.5)
     offset: float = setting(0.0, "Desired distance to the left of the path in m.", ge=-100.0, le=100.0)
@@ -208,18 +198,6 @@ class PathSettings(BaseSettings):
     point_std: float = setting(
         0.0, "Standard deviation of the points in m: 0.02 for points of an RTK receiver.", ge=0.0, le=10.0
     )
-
-    @field_validator("observer")
-    @classmethod
-    def _known_observer(cls, name: str) -> str:
-        if name not in SLIP_SOURCES:
-            raise ValueError(f"--observer is {name!r}; choose among {', '.join(SLIP_SOURCES)}")
-        return name
-
-    @field_validator("slope_deg")
-    @classmethod
-    def _possible_slope(cls, slope_deg: float) -> float:
-        return _within("--slope", slope_deg, MAX_SLOPE_DEG)
 
     @field_validator("stop")
     @classmethod
@@ -281,9 +259,3 @@ def run(settings: Settings, progress: Progress) -> Result:
     if settings.out is not None:
         result.report.save(settings.out / PAGE_FILE)
     return result
-
-
-def _within(option: str, angle_deg: float, most_deg: float) -> float:
-    if not abs(angle_deg) <= most_deg:
-        raise ValueError(f"{option} is {angle_deg:g}; {-most_deg:g} to {most_deg:g} degrees are accepted")
-    return angle_deg

@@ -6,7 +6,7 @@ import re
 from typing import NamedTuple
 
 from pipelines.report import format_value
-from pipelines.report.numbers import MINUS, NBSP
+from pipelines.report.numbers import MINUS, NBSP, unit_of
 
 LABELS = {
     "energy_j_per_m": ("energy per metre", "J/m"),
@@ -31,19 +31,6 @@ LABELS = {
     "stop_m": ("stopping distance", "m"),
     "steepest_deg": ("steepest grade climbed", "°"),
 }
-UNITS = {
-    "mps2": "m/s²",
-    "mps": "m/s",
-    "rad": "rad",
-    "deg": "°",
-    "m": "m",
-    "s": "s",
-    "j": "J",
-    "n": "N",
-    "ratio": "",
-}
-"""By the last word of a metric that :data:`LABELS` does not hold."""
-
 _GENERAL = ("slip_peak", "energy_j_per_m", "distance_m", "final_speed_mps")
 _OF_SCENARIO = {
     "starts": ("slip_peak", "energy_j_per_m", "distance_5s_m", "energy_4m_j", "final_speed_mps"),
@@ -96,9 +83,7 @@ def metric_label(key: str) -> Label:
         return Label(f"distance within {found[1]} s of a start", "m")
     if found := re.fullmatch(r"energy_(.+)m_j", key):
         return Label(f"energy of the first {found[1]} m", "J")
-    words, _, last = key.rpartition("_")
-    known = bool(words) and last in UNITS
-    return Label(words.replace("_", " "), UNITS[last]) if known else Label(key.replace("_", " "), "")
+    return Label(key.rpartition("_")[0].replace("_", " "), unit_of(key))
 
 
 def metrics_of_scenario(scenario: str) -> tuple[str, ...]:

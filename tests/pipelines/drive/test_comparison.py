@@ -19,7 +19,7 @@ from pipelines.drive.comparison import (
 from pipelines.drive.controller_names import CONTROLLERS
 from pipelines.drive.controllers import DriveInputs, drive_once, make_controller
 from pipelines.drive.drive import Settings
-from pipelines.drive.run_curves import drive_curves, run_figures
+from pipelines.drive.run_figures import run_figures
 from pipelines.live.pilot_settings import PilotStatus
 from pipelines.live.terrain_source import TerrainEstimate
 from pipelines.models.model_files import TerrainModel
@@ -27,6 +27,7 @@ from pipelines.report import NOT_KNOWN
 from pipelines.report.json_file import as_json
 from pipelines.report.terminal import terminal_text
 from terrain.control.comparison import mean_interval
+from terrain.control.drive_curves import drive_curves
 from terrain.control.drive_evaluation import (
     METRICS,
     EnergyCurve,
@@ -369,10 +370,10 @@ def test_curves_are_drawn_where_the_table_has_any():
         ({"controllers": ("target:1.5",)}, "0 to below 1"),
         ({"controllers": ("plain+track",)}, "estimates no pose"),
         ({"seeds": 0}, "seeds is 0"),
-        ({"delay_s": -0.1}, "0 to 0.5 s"),
-        ({"delay_s": math.nan}, "0 to 0.5 s"),
+        ({"delay_s": -0.1}, "--delay is -0.1: "),
+        ({"delay_s": math.nan}, "--delay is nan: "),
         ({"scenario": "slope", "grade_deg": 5.0}, "leave the grade out"),
-        ({"grade_deg": 40.0}, "-30 to 30 degrees"),
+        ({"grade_deg": 40.0}, "--grade is 40.0: "),
         ({"radius_factors": "1,2"}, "three ratios"),
         ({"model": "models:/m"}, "not among the controllers"),
         ({"observer": "none"}, "--observer is accepted with --path FILE"),

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
+from typing import get_args
 
 import numpy as np
 import pytest
 
-from pipelines.drive.drive import SLIP_SOURCES, Settings, run
+from pipelines.drive.drive import Settings, SlipSourceName, run
 from pipelines.report import silent
 from pipelines.report.json_file import as_json
 from terrain.control.car_following import SlipSource
@@ -31,7 +32,7 @@ def path_csv(tmp_path):
 
 
 def test_names_of_observers_are_those_of_the_controller():
-    assert tuple(SlipSource) == SLIP_SOURCES
+    assert tuple(SlipSource) == get_args(SlipSourceName)
 
 
 @pytest.mark.parametrize("observer", ["multi-grip", "dynamic"])

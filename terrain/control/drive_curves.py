@@ -1,4 +1,4 @@
-"""Curves of a single drive, and the figure that shows them: speeds over ground, and slip against its target."""
+"""Curves of a drive in the closed loop: speeds, slip and terrains over time, of so many points as can be seen."""
 
 from __future__ import annotations
 
@@ -8,11 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipelines.report import Band, Figure, Line, Mark, Panel, Strip
 from terrain.control.drive_metrics import PEAK_ABOVE_MPS, low_passed_slip
 from terrain.control.power_state import DriveState
 from terrain.control.slip_table import SlipTable
-from terrain.control.traction import TractionStatus
 from terrain.kinematics.true_slip import true_slip
 from terrain.records import Array, RunLog
 
@@ -20,7 +18,6 @@ MAX_POINTS = 2500
 NO_CODE = -99.0
 """In the place of a code that is not known."""
 
-BLUE, VERMILION, GREEN, ORANGE, PINK, _, GREY = range(7)
 Span = tuple[float, float, str]
 """Start, end and name of an interval."""
 
@@ -31,7 +28,7 @@ class DriveCurves(NamedTuple):
     Parameters
     ----------
     true_s, true_mps, slip, slip_least, slip_largest : (n,) of the truth
-    control_s, control : (m,) times, and channels by name of :class:`pipelines.live.pilot.PilotStatus`
+    control_s, control : (m,) times, and channels by name of what the pilot reports
     aimed : (m,) target slip with its floor, negative in braking
     is_open_loop : whether no slip was estimated
     terrains : true and, where there is one, classified terrain over time, by ``true`` and ``classified``;
@@ -121,74 +118,3 @@ def spans(time_s: Array, codes: Array, names: Mapping[int, str]) -> list[Span]:
         for i, end in zip(first, ends, strict=True)
         if int(codes[i]) in names
     ]
-
-
-def run_figures(examples: Mapping[str, DriveCurves]) -> list[Figure]:
-    """Return a figure of each drive, all with the same axes.
-
-    Parameters
-    ----------
-    examples : a drive of each controller by its name
-    """
-    if not examples:
-        return []
-    fastest = max(
-        float(np.nanmax([*each.true_mps, *each.control["desired_mps"]])) for each in examples.values()
-    )
-    slips = np.concatenate(
-        [part for each in examples.values() for part in (each.slip_least, each.slip_largest, each.aimed)]
-    )
-    least, largest = float(np.nanmin([-0.02, *slips])), float(np.nanmax([0.1, *slips]))
-    margin = 0.1 * (largest - least)
-    limits = (-0.03 * fastest, 1.1 * fastest), (least - margin, largest + margin)
-    return [_run_figure(name, each, *limits) for name, each in examples.items()]
-
-
-def _run_figure(
-    name: str, drive: DriveCurves, speeds_mps: tuple[float, float], slips: tuple[float, float]
-) -> Figure:
-    control = drive.control
-    moves: list[Mark] = [
-        Strip(
-            spans(
-                drive.control_s,
-                control["drive_state_code"],
-                {int(DriveState.TRACTION): "traction: speed rises", int(DriveState.BRAKING): "braking"},
-            )
-        ),
-        Line("desired, fastest wheel", drive.control_s, control["desired_mps"], GREY, dashed=True),
-        Line("commanded, fastest wheel", drive.control_s, control["driven_mps"], VERMILION),
-        Line("true, over ground", drive.true_s, drive.true_mps, BLUE),
-    ]
-    slip: list[Mark] = [
-        Band("true, least to largest wheel", drive.true_s, drive.slip_least, drive.slip_largest, BLUE),
-        Line("true, mean of the wheels", drive.true_s, drive.slip, BLUE),
-    ]
-    if not drive.is_open_loop:
-        slip += _control_marks(drive)
-    panels = [Panel(moves, "speed [m/s]", y_range=speeds_mps), Panel(slip, "slip ratio", y_range=slips)]
-    names = dict.fromkeys(span[2] for strip in drive.terrains.values() for span in strip)
-    same_colours = [
-        (0.0, 0.0, each) for each in names
-    ]  # in both panels a name has the place of its first use
-    for kind, strip in drive.terrains.items():
-        panels.append(Panel([Strip([*same_colours, *strip])], f"{kind} terrain", y_range=(0.0, 1.0)))
-    return Figure(name, panels, x_label="time [s]")
-
-
-def _control_marks(drive: DriveCurves) -> list[Mark]:
-    """Return the estimated slip, its target, and where no correction was made."""
-    control, time_s = drive.control, drive.control_s
-    moving = np.interp(time_s, drive.true_s, drive.true_mps) >= PEAK_ABOVE_MPS
-    estimated = np.where(moving, control["slip_ratio"], np.nan)
-    refused = {int(each): f"no correction: {each.label}" for each in TractionStatus if each}
-    marks: list[Mark] = [Strip(spans(time_s, control["status_code"], refused))]
-    for label, values, colour, dashed in (
-        ("estimated, largest wheel", estimated, ORANGE, False),
-        ("target", control["target_ratio"], GREEN, False),
-        ("target with its floor", drive.aimed, GREY, True),
-        ("slip of steady motion", control["balance_ratio"], PINK, True),
-    ):
-        if np.isfinite(values).any():
-            marks.append(Line(label, time_s, values, colour, dashed))
-    return marks
