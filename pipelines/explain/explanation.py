@@ -33,7 +33,6 @@ from pipelines.explain.sentences import (
 )
 from pipelines.report import (
     Column,
-    Figure,
     Pairs,
     Part,
     Report,
@@ -177,47 +176,22 @@ def report(result: ExplainResult) -> Report:
     if runs.held_out:
         lead.append(f"{len(runs.held_out)} held out for the gain")
     lead += [name for name in (result.data, result.terrain) if name]
-    details = (
-        Section("Channel by channel", [Pairs([_name_and_rest(each.text) for each in result.statements])]),
-        Section("Gain on held-out runs, channel by channel", list(_gain_parts(result.gain))),
-        Section("What was withdrawn, and what is unexplained", list(_open_parts(diagnosis))),
-        Section("From commanded to measured wheel speeds", list(_powertrain_parts(result))),
-        Section("What to drive next", list(_next_drive_parts(result))),
-        Section("What the residuals depend on", list(_dependence_parts(runs))),
-        Section("Whole runs", list(_run_figures(result))),
-        Section("What would not have been detected", list(_limit_parts(diagnosis))),
-        Section("Health of the logs", list(_health_parts(result))),
-        Section("Where these numbers come from", [Pairs(list(_provenance(result)))]),
+    picture = None
+    if shown := result.gain.judged or runs.compared:  # held-out runs where there are any
+        stretch = example_stretch(shown, runs.noise)
+        there = channels_of([stretch])
+        stated = [each.channel for each in result.statements if each.channel in there]
+        picture = run_figure(stretch, runs.noise, stated[:PICTURED])
+    written = Report(
+        title=f"What the simulation of {diagnosis.robot} gets wrong",
+        answer=f"{verdict_text(diagnosis)} {gain_text(result.gain.gain, result.gain.reason)}",
+        picture=picture,
+        parts=list(_decisive_parts(result)),
+        details=[Section(title, parts) for title, parts in _details(result).items() if parts],
+        lead=" · ".join(lead),
     )
-    written: Report = in_words_of(
-        result.robot.drive,
-        Report(
-            title=f"What the simulation of {diagnosis.robot} gets wrong",
-            answer=f"{verdict_text(diagnosis)} {gain_text(result.gain.gain, result.gain.reason)}",
-            picture=_picture(result),
-            parts=list(_decisive_parts(result)),
-            details=[section for section in details if section.parts],
-            lead=" · ".join(lead),
-        ),
-    )
-    return replace(written, next_step=result.next_command or "")
-
-
-def _name_and_rest(text: str) -> tuple[str, str]:
-    name, _, rest = text.partition(": ")
-    return name, rest
-
-
-def _picture(result: ExplainResult) -> Figure | None:
-    """Return a stretch of a held-out run in the channels of which most is stated; of a compared one else."""
-    runs = result.gain.judged or result.diagnosed.compared
-    if not runs:
-        return None
-    noise = result.diagnosed.noise
-    stretch = example_stretch(runs, noise)
-    there = channels_of([stretch])
-    channels = [each.channel for each in result.statements if each.channel in there][:PICTURED]
-    return run_figure(stretch, noise, channels)
+    worded: Report = in_words_of(result.robot.drive, written)
+    return replace(worded, next_step=result.next_command or "")
 
 
 def _decisive_parts(result: ExplainResult) -> Iterator[Part]:
@@ -337,59 +311,98 @@ def _comparison(title: str, compared: Comparison) -> Part:
     return Table(("figure", "unit", "before", "after", "change, 95 %"), rows, title)
 
 
-def _open_parts(diagnosis: Diagnosis) -> Iterator[Part]:
-    """Yield what was withdrawn, what has no known cause, and effects that these runs rule out."""
+def _details(result: ExplainResult) -> dict[str, list[Part]]:
+    """Return the folded parts by their heading."""
+    diagnosis, runs = result.diagnosis, result.diagnosed
     withdrawn, ruled_out = split_ruled_out(diagnosis)
+    found: dict[str, list[Part]] = {
+        "Channel by channel": [Pairs([each.text.split(": ", 1) for each in result.statements])],
+        "Gain on held-out runs, channel by channel": list(_gain_parts(result.gain)),
+    }
+    found["What was withdrawn, and what is unexplained"] = open_parts = []
+    why, z = Column("why", long=True), Column("z", Z)
     if withdrawn:
-        values = [" and ".join(map(value_with_interval, effect.values)) for effect in withdrawn]
         rows = [
-            (effect_label(effect.name), value, sentence(effect.reason), effect.z)
-            for effect, value in zip(withdrawn, values, strict=True)
+            (
+                effect_label(each.name),
+                " and ".join(map(value_with_interval, each.values)),
+                sentence(each.reason),
+                each.z,
+            )
+            for each in withdrawn
         ]
-        columns = (
-            "withdrawn",
-            "value it would have",
-            Column("why it is not named", long=True),
-            Column("z", Z),
-        )
         note = "These effects reduce the residual, and something speaks against each as its cause."
-        yield Table(columns, rows, note=note)
+        open_parts.append(Table(("withdrawn", "value it would have", why, z), rows, note=note))
     if diagnosis.unexplained:
         unexplained = [
             (channel_label(left.channel), unexplained_text(left, diagnosis), left.z, left.ratio or None)
             for left in diagnosis.unexplained
         ]
-        part = Column("part of its squared residual", PERCENT)
         note = (
             "Beside all causes the residual of the channel depends on the input, and no effect of the library "
             "explains it. The input is the clearest of some thirty that were tried."
         )
-        yield Table(("unexplained", "its residual", Column("z", Z), part), unexplained, note=note)
+        columns = ("unexplained", "its residual", z, Column("part of its squared residual", PERCENT))
+        open_parts.append(Table(columns, unexplained, note=note))
     if ruled_out:
-        seen = [(effect_label(effect.name), sentence(effect.reason), effect.z) for effect in ruled_out]
-        yield Table(
-            ("ruled out: these runs would have shown it", Column("why", long=True), Column("z", Z)), seen
-        )
-
-
-def _powertrain_parts(result: ExplainResult) -> Iterator[Part]:
-    if result.powertrain is None:
-        return
-    for text in result.powertrain.sentences:
-        yield Text(text)
-    yield Text(
-        "The simulation is given the measured wheel speeds, so that this is no part of the residuals. "
-        "Intervals hold 95 % over runs.",
-        "note",
-    )
-
-
-def _next_drive_parts(result: ExplainResult) -> Iterator[Part]:
-    coming = result.diagnosis.next_drive
-    if coming is not None:
+        excluded = [(effect_label(each.name), sentence(each.reason), each.z) for each in ruled_out]
+        open_parts.append(Table(("ruled out: these runs would have shown it", why, z), excluded))
+    if result.powertrain is not None:
+        found["From commanded to measured wheel speeds"] = [
+            *map(Text, result.powertrain.sentences),
+            Text(
+                "The simulation is given the measured wheel speeds, so that this is no part of the residuals. "
+                "Intervals hold 95 % over runs.",
+                "note",
+            ),
+        ]
+    if coming := diagnosis.next_drive:
         slope = f", on a slope of {coming.grade_deg:g}°" if coming.grade_deg else ""
-        yield Text(f"Scenario {coming.scenario}{slope}: {coming.reason}. In simulation first:")
-        yield Text(result.next_command or "", "code")
+        found["What to drive next"] = [
+            Text(f"Scenario {coming.scenario}{slope}: {coming.reason}. In simulation first:"),
+            Text(result.next_command or "", "code"),
+        ]
+    found["What the residuals depend on"] = list(_dependence_parts(runs))
+    whole: Sequence[ComparedRun] = [*runs.compared, *result.gain.judged]
+    if result.n_pictures is not None:
+        whole = telling_runs(whole, runs.noise, result.n_pictures)
+    found["Whole runs"] = [run_figure(run, runs.noise, channels_of([run])) for run in whole]
+    found["What would not have been detected"] = limits = []
+    missed = {limit.name for limit in diagnosis.not_excited}
+    for is_missed, title in ((True, "not excited by the driving"), (False, "detection limit")):
+        listed = [limit for limit in diagnosis.limits if (limit.name in missed) is is_missed]
+        if listed:
+            texts = [(limit_text(limit, is_missed), limit.needs) for limit in listed]
+            limits.append(
+                Table((Column(title, long=True), Column("driving that shows it", long=True)), texts)
+            )
+    limits.append(
+        Text("Not detected does not mean absent: at its limit an effect is found nine times in ten.", "note")
+    )
+    found["Health of the logs"] = health = []
+    if diagnosis.excluded_runs:
+        health.append(Table(("excluded run", why), diagnosis.excluded_runs))
+    if diagnosis.clocks:
+        clocks = [(each.run_id, 1e3 * each.offset_s, 1e3 * each.std_s) for each in diagnosis.clocks]
+        columns_of_clocks = (
+            *("clock of the run", Column("IMU and camera behind the wheels", ".1f", "ms")),
+            Column("standard deviation", ".1f", "ms"),
+        )
+        health.append(Table(columns_of_clocks, clocks))
+    built_in = [f"{name} {format_value(value)}" for name, value in runs.simulation.effects.items()]
+    provenance: list[tuple[Any, ...]] = [
+        ("data", f"{result.data} ({result.data_digest[:12]})"),
+        ("description", result.description),
+        ("effects built in already", ", ".join(built_in) or "none"),
+        ("terrain", terrain_text(runs.terrains)),
+        ("effects that may be named", f"{len(result.effects)}: {enumerated(result.effects)}"),
+        ("runs behind the diagnosis", enumerated([run.run_id for run in runs.used])),
+        ("runs held out, drawn by the seed", enumerated([run.run_id for run in runs.held_out]) or "none"),
+        ("seed", result.seed),
+        ("versions", ", ".join(f"{name} {version}" for name, version in versions().items())),
+    ]
+    found["Where these numbers come from"] = [Pairs(provenance)]
+    return found
 
 
 def _dependence_parts(runs: DiagnosedRuns) -> Iterator[Part]:
@@ -423,58 +436,3 @@ def _dependence_parts(runs: DiagnosedRuns) -> Iterator[Part]:
         yield strongest_figure(compared, channels)
         yield spectra_figure(compared, runs.noise, runs.low_pass.cutoff_hz, channels)
         yield Section("Every input", [dependence_figure(compared, runs.noise, name) for name in channels])
-
-
-def _run_figures(result: ExplainResult) -> Iterator[Part]:
-    runs: Sequence[ComparedRun] = [*result.diagnosed.compared, *result.gain.judged]
-    noise = result.diagnosed.noise
-    if result.n_pictures is not None:
-        runs = telling_runs(runs, noise, result.n_pictures)
-    for run in runs:
-        yield run_figure(run, noise, channels_of([run]))
-
-
-def _limit_parts(diagnosis: Diagnosis) -> Iterator[Part]:
-    missed = {limit.name for limit in diagnosis.not_excited}
-    by_missed = {
-        each: [limit for limit in diagnosis.limits if (limit.name in missed) is each]
-        for each in (True, False)
-    }
-    for is_missed, title in ((True, "not excited by the driving"), (False, "detection limit")):
-        if limits := by_missed[is_missed]:
-            rows = [(limit_text(limit, is_missed), limit.needs) for limit in limits]
-            yield Table((Column(title, long=True), Column("driving that shows it", long=True)), rows)
-    yield Text(
-        "Not detected does not mean absent: at its limit an effect is found nine times in ten.", "note"
-    )
-
-
-def _health_parts(result: ExplainResult) -> Iterator[Part]:
-    diagnosis = result.diagnosis
-    if diagnosis.excluded_runs:
-        rows = [(run.run_id, run.reason) for run in diagnosis.excluded_runs]
-        yield Table(("excluded run", Column("why", long=True)), rows)
-    if diagnosis.clocks:
-        milliseconds = ".1f"
-        rows_of_clocks = [
-            (clock.run_id, 1000.0 * clock.offset_s, 1000.0 * clock.std_s) for clock in diagnosis.clocks
-        ]
-        behind = Column("IMU and camera behind the wheels", milliseconds, "ms")
-        std = Column("standard deviation", milliseconds, "ms")
-        yield Table(("clock of the run", behind, std), rows_of_clocks)
-
-
-def _provenance(result: ExplainResult) -> Iterator[tuple[str, Any]]:
-    runs = result.diagnosed
-    built_in = [f"{name} {format_value(value)}" for name, value in runs.simulation.effects.items()]
-    yield "data", f"{result.data} ({result.data_digest[:12]})"
-    yield "description", result.description
-    yield "effects built in already", ", ".join(built_in) or "none"
-    yield "terrain", terrain_text(runs.terrains)
-    yield "effects that may be named", f"{len(result.effects)}: {enumerated(result.effects)}"
-    yield "runs behind the diagnosis", enumerated([run.run_id for run in runs.used])
-    if runs.held_out:
-        held_out = enumerated([run.run_id for run in runs.held_out])
-        yield "runs held out for the gain", f"{held_out}; drawn by the seed"
-    yield "seed", result.seed
-    yield "versions", ", ".join(f"{name} {version}" for name, version in versions().items())
