@@ -98,7 +98,7 @@ def is_caught(mutant: Mutant, tree: Path) -> tuple[bool, str]:
     text, times = file.read_text(encoding="utf-8"), file.stat()
     file.write_text(mutated(text, mutant), encoding="utf-8")
     command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "--no-header", "-rN"]
-    command += ["-m", "slow or not slow", "--tb=no", *mutant.tests]
+    command += ["-m", "slow or not slow", "--tb=no", "--doctest-modules", *mutant.tests]
     threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
     try:
         done = subprocess.run(

@@ -12,7 +12,7 @@ from pipelines.report.terminal import terminal_text
 from pipelines.reporting.json_file import as_json
 from terrain.errors import LogError, TerrainError
 from terrain.logs.write import write_run
-from terrain.records import RunLog
+from terrain.records import RunLog, Stream
 
 
 def tree(folder):
@@ -45,6 +45,20 @@ def test_nothing_that_is_there_is_touched(borealtc_dir, tmp_path, make_run):
     with pytest.raises(LogError, match="SNOW_02: is there already, and is left as it is"):
         convert(ConvertSettings(data=borealtc_dir, out=tmp_path / "out"))
     assert tree(tmp_path) == before
+
+
+def test_a_run_whose_numbers_cannot_be_true_is_refused_and_counted_with_repair(tmp_path, make_run):
+    run = make_run("ICE_01")
+    imu = run.streams["imu"]
+    values = imu.values.copy()
+    values[:, imu.channels.index("accel_z_mps2")] += 1e4
+    streams = {**run.streams, "imu": Stream(imu.time_s, values, imu.channels)}
+    write_run(RunLog(run.run_id, run.robot, streams, run.labels), tmp_path / "runs")
+    with pytest.raises(LogError, match=r"ICE_01: implausible .* with --repair"):
+        convert(ConvertSettings(data=tmp_path / "runs", out=tmp_path / "out"))
+    assert not (tmp_path / "out").exists()
+    report = convert(ConvertSettings(data=tmp_path / "runs", out=tmp_path / "out", repair=True))
+    assert any(kind.startswith("implausible ") for kind in report.dropped)
 
 
 def test_a_place_that_cannot_be_written_is_one_sentence(borealtc_dir, tmp_path):

@@ -52,6 +52,9 @@ def test_a_run_is_the_same_whatever_is_simulated_beside_it(tmp_path):
     keys = ["out", "robot", "scenario", "seed", "effects", "n_runs", "run_ids", "duration_s"]
     assert list(json.loads(json.dumps(as_json(beside)))) == keys
     assert beside.duration_s == pytest.approx(16 * 4.01, abs=0.01)
+    simulate_runs("agrimaro", "grass", "straight", tmp_path / "b", runs=1, duration_s=4.0, vary=True, seed=1)
+    name = "grass_straight_01"
+    assert values_of(read_run(tmp_path / "b" / name)) != values_of(read_run(tmp_path / "alone" / name))
 
 
 def test_runs_differ_by_number_seed_and_terrain_and_more_so_where_they_vary():
