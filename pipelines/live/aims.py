@@ -31,28 +31,23 @@ class Aim(NamedTuple):
     braking: Braking | None
 
 
-class Aims:
-    """The aims of a table.
-
-    Parameters
-    ----------
-    table : target slips
+class Aims(dict[str, Aim]):
+    """The aims of a table by terrain; that of its fallback for any other.
 
     Examples
     --------
     >>> from terrain.control.slip_table import load_slip_table
     >>> aims = Aims(load_slip_table())
-    >>> aims.of("mud") == aims.of("")
+    >>> aims["mud"] == aims[""]
     True
     """
 
     def __init__(self, table: SlipTable) -> None:
-        self._aims = {terrain: _aim(table, terrain) for terrain in table.targets}
-        self._fallback = self._aims[table.fallback]
+        super().__init__({terrain: _aim(table, terrain) for terrain in table.targets})
+        self._fallback = self[table.fallback]
 
-    def of(self, terrain: str) -> Aim:
-        """Return the aim on a terrain, or that of the table's fallback."""
-        return self._aims.get(terrain, self._fallback)
+    def __missing__(self, terrain: str) -> Aim:
+        return self._fallback
 
 
 def _aim(table: SlipTable, terrain: str) -> Aim:

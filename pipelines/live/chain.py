@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from enum import StrEnum
+from functools import partial
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -56,7 +57,7 @@ class Step(NamedTuple):
 
 
 class Chain(Protocol):
-    """Takes samples in order of time; :meth:`step` does not raise.
+    """Takes samples in order of time, and does not raise.
 
     ``belief`` is the terrain that is believed, ``target_ratio`` its target slip in traction, ``estimate`` the
     last one of the motion, ``health`` that of each sensor by name (empty where none is judged), ``dropped``
@@ -76,28 +77,23 @@ class Chain(Protocol):
     @property
     def dropped(self) -> dict[str, int]: ...  # noqa: D102
 
-    def step(self, sample: Sample) -> Step:
+    def take(self, sample: Sample) -> Step:
         """Take a sample."""
-        ...
 
     def check(self, model: LiveModel | None, table: SlipTable) -> None:
-        """Raise what :meth:`swap` would: ``ConfigError`` or ``DataError``."""
-        ...
+        """Raise what :meth:`replace` would: ``ConfigError`` or ``DataError``."""
 
-    def swap(self, model: LiveModel | None, table: SlipTable) -> None:
+    def replace(self, model: LiveModel | None, table: SlipTable) -> None:
         """Go on with another model and table, between two samples."""
-        ...
 
     def state(self, now_s: float) -> LiveState:
         """Return what is worth keeping over a restart, at a time in seconds since 1970."""
-        ...
 
     def restore(self, state: LiveState, now_s: float) -> Restorable:
-        """Start from a saved state, before the first step; return what of it is used."""
-        ...
+        """Start from a saved state, before the first sample; return what of it is used."""
 
 
-class PilotChain:
+class PilotChain(LivePilot):
     """A pilot that takes its columns by name, begins where the steering stands, and is safe where it fails.
 
     Parameters
@@ -129,47 +125,25 @@ class PilotChain:
         classifying: Classifying | None = None,
         settings: PilotSettings = DEFAULT_SETTINGS,
     ) -> None:
-        self._robot, self._classifying = robot, classifying
-        self._source = NoTerrain() if model is None else Classifier(model, robot, classifying)
-        self.pilot = LivePilot(robot, table, self._source, settings)
+        self._make = partial(Classifier, robot=robot, classifying=classifying)
+        self.terrain_source = NoTerrain() if model is None else self._make(model)
+        super().__init__(robot, table, self.terrain_source, settings)
         self._columns = schema_columns(channels)
-        self._steer_rad = np.zeros(3)
+        self._standing_rad = np.zeros(3)
         self._awaits_steering = "steering" in channels
-
-    @property
-    def belief(self) -> TerrainBelief:
-        """The terrain that is believed."""
-        return self.pilot.belief
-
-    @property
-    def target_ratio(self) -> float:
-        """Target slip in traction that is aimed for."""
-        return self.pilot.target_ratio
-
-    @property
-    def estimate(self) -> Estimate | None:
-        """Last estimate of the motion."""
-        return self.pilot.estimate
-
-    @property
-    def health(self) -> Mapping[str, str]:
-        """Health of each sensor."""
-        return self.pilot.health
 
     @property
     def dropped(self) -> dict[str, int]:
         """What was not used so far, as counts by kind."""
-        return self.pilot.dropped | dict(self._source.dropped)
+        return super().dropped | dict(self.terrain_source.dropped)
 
     def check(self, model: LiveModel | None, table: SlipTable) -> None:
-        """Raise what :meth:`swap` would."""
-        check_table(table, self._robot.name)
-        if isinstance(self._source, Classifier):
-            self._source.check(model)
-        elif model is not None:
-            Classifier(model, self._robot)
+        """Raise what :meth:`replace` would."""
+        check_table(table, self.robot_name)
+        if isinstance(self.terrain_source, Classifier):
+            self.terrain_source.check(model)
 
-    def swap(self, model: LiveModel | None, table: SlipTable) -> None:
+    def replace(self, model: LiveModel | None, table: SlipTable) -> None:
         """Go on with another model and table, between two steps; no sample is lost.
 
         Raises
@@ -177,22 +151,14 @@ class PilotChain:
         ConfigError, DataError
             as when the chain begins, or if a model is to be replaced by none.
         """
-        check_table(table, self._robot.name)
-        if isinstance(self._source, Classifier):
-            self._source.swap(model)
+        self.check(model, table)
+        if isinstance(self.terrain_source, Classifier):
+            self.terrain_source.swap(model)
         elif model is not None:
-            self._source = Classifier(model, self._robot, self._classifying)
-        self.pilot.swap(table, self._source)
+            self.terrain_source = self._make(model)
+        self.swap(table, self.terrain_source)
 
-    def state(self, now_s: float) -> LiveState:
-        """Return what is worth keeping over a restart, at a time in seconds since 1970."""
-        return self.pilot.state(now_s)
-
-    def restore(self, state: LiveState, now_s: float) -> Restorable:
-        """Start from a saved state, before the first step; return what of it is used."""
-        return self.pilot.restore(state, now_s)
-
-    def step(self, sample: Sample) -> Step:
+    def take(self, sample: Sample) -> Step:
         """Return the command for a sample: to stand, where nothing is known yet or the step fails."""
         if math.isnan(sample.time_s) or not self._is_steered(sample.readings):
             return Step((), self._standing(), CommandStatus.NO_SAMPLES)
@@ -202,15 +168,15 @@ class PilotChain:
             if name in self._columns
         }
         try:
-            command = self.pilot.step(sample._replace(readings=readings))
+            command = self.step(sample._replace(readings=readings))
         except Exception as error:  # a robot without a command would go on with its last one
             failure = f"a step failed: {type(error).__name__}: {error}"
             return Step((), self._standing(), CommandStatus.FAILED, failure)
-        windows, status = self._source.outputs, CommandStatus.OK
+        windows, status = self.terrain_source.outputs, CommandStatus.OK
         numbers = (*command.wheel_radps.tolist(), *command.steer_rad.tolist(), *command.twist.tolist())
         if not all(map(math.isfinite, numbers)):
             command, status = self._standing()._replace(status=command.status), CommandStatus.NOT_FINITE
-        self._steer_rad = command.steer_rad
+        self._standing_rad = command.steer_rad
         return Step(windows, command, status)
 
     def _is_steered(self, readings: Mapping[str, Reading]) -> bool:
@@ -223,14 +189,14 @@ class PilotChain:
         measured_rad = ordered(reading.values, *self._columns["steering"])[-1]
         if not np.isfinite(measured_rad).all():
             return False
-        self._steer_rad = self.pilot.start_steering(measured_rad)
+        self._standing_rad = self.start_steering(measured_rad)
         self._awaits_steering = False
         return True
 
     def _standing(self) -> Command:
         """Return the command to stand, steered as before."""
         status = {"status_code": float(TractionStatus.UNSOUND)}
-        return Command(np.zeros(3), self._steer_rad, np.zeros(3), status)
+        return Command(np.zeros(3), self._standing_rad, np.zeros(3), status)
 
 
 def schema_columns(channels: Mapping[str, Sequence[str]]) -> dict[str, tuple[list[int], list[int], int]]:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
 
 import numpy as np
 
@@ -27,35 +25,11 @@ from terrain.control.switching import (
     drive_on,
     update,
 )
-from terrain.records import Reading, Sample, SlipTarget
+from terrain.records import Reading, Sample
 from terrain.robots import Robot
 
 LONGEST_STEP_S = 1.0
 """A longer time between two samples of the wheels is no driving time."""
-
-
-class TerrainObservation(NamedTuple):
-    """What one window tells.
-
-    Parameters
-    ----------
-    start_s, end_s : of the window, on the clock of the samples
-    terrain, probability : class of the largest probability; empty and NaN where the model refused the window,
-        empty where the window is like no terrain that was learned
-    probabilities : of each class
-    target : target slip of that terrain, by drive state
-    refused : why there is no output; empty where there is one, also of a terrain that was never learned
-    output : of the model
-    """
-
-    start_s: float
-    end_s: float
-    terrain: str
-    probability: float
-    probabilities: Mapping[str, float]
-    target: Mapping[str, SlipTarget]
-    refused: str
-    output: WindowOutput
 
 
 class Observer:
@@ -141,23 +115,18 @@ class Observer:
         return self.table.lookup(self.belief.terrain)["traction"].slip_ratio
 
     @property
-    def refused(self) -> Counter[str]:
-        """Number of windows that the model refused, by message."""
-        return self._source.failed
-
-    @property
     def dropped(self) -> dict[str, int]:
         """What was not used so far, as counts by kind."""
         counts = self._source.dropped | ({"time: clock set": n} if (n := self._watch.n_set) else {})
         return counts | (dict(self._filter.dropped) if self._filter is not None else {})
 
     def check(self, model: LiveModel | None, table: SlipTable) -> None:
-        """Raise what :meth:`swap` would."""
+        """Raise what :meth:`replace` would."""
         if self._robot is not None:
             check_table(table, self._robot_name)
         self._source.check(model)
 
-    def swap(self, model: LiveModel | None, table: SlipTable) -> None:
+    def replace(self, model: LiveModel | None, table: SlipTable) -> None:
         """Go on with another model and table, between two samples; the filter runs on.
 
         Where both take the same windows, the one that is being cut is the first of the new model; otherwise
@@ -193,12 +162,12 @@ class Observer:
         self.belief = fresh.belief
         return fresh
 
-    def step(self, sample: Sample) -> Step:
+    def take(self, sample: Sample) -> Step:
         """Take a sample, as a chain does: no command is given."""
-        return Step([found.output for found in self.update(sample.readings, sample.time_s)])
+        return Step(self.update(sample.readings, sample.time_s))
 
-    def update(self, samples: Mapping[str, Reading], now_s: float = math.nan) -> list[TerrainObservation]:
-        """Take what was measured since the last call; return what has been found, in most calls nothing.
+    def update(self, samples: Mapping[str, Reading], now_s: float = math.nan) -> list[WindowOutput]:
+        """Take what was measured since the last call; return the windows that are whole, in most calls none.
 
         Where the clock of the stamps was set, windows begin anew.
 
@@ -223,22 +192,12 @@ class Observer:
             self._begin_again()
         outputs = self._source.take(samples, estimates)
         self._drive_on(samples, now_s)
-        return [self._observed(output) for output in outputs]
-
-    def _observed(self, output: WindowOutput) -> TerrainObservation:
-        found = self._source.terrain_of(output)
-        if found is not None:
-            self.belief = update(self.belief, output.end_s, *found, self._source.switching(self.switching))
-        return TerrainObservation(
-            output.start_s,
-            output.end_s,
-            output.terrain,
-            output.probability,
-            dict(zip(output.classes, output.probabilities.tolist(), strict=True)),
-            self.table.lookup(output.terrain),
-            output.refused,
-            output,
-        )
+        for output in outputs:
+            found = self._source.terrain_of(output)
+            if found is not None:
+                switching = self._source.switching(self.switching)
+                self.belief = update(self.belief, output.end_s, *found, switching)
+        return outputs
 
     def _begin_again(self) -> None:
         """Cut windows from here on; what was believed stays, and its outputs begin anew."""

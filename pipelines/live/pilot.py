@@ -136,7 +136,7 @@ class LivePilot:
     ) -> None:
         table = load_slip_table() if table is None else table
         driven, correction = correct_live(check_pilot(robot, table, settings))
-        self._robot_name = robot.name
+        self.robot_name = robot.name
         self._settings, self._radius_m = settings, driven.wheel_radius_m
         self.swap(table, NoTerrain() if source is None else source)
         self._steering_zeros_rad = np.array(driven.steering_zeros_rad)
@@ -202,7 +202,7 @@ class LivePilot:
         """Return what is worth keeping over a restart, at a time in seconds since 1970."""
         resident = None if self._estimator is None else self._estimator.resident
         name = "" if self._estimator is None else self._estimator.model.name
-        return state_of(self._robot_name, name, resident, self._now.belief, self._now.target_ratio, now_s)
+        return state_of(self.robot_name, name, resident, self._now.belief, self._now.target_ratio, now_s)
 
     def restore(self, state: LiveState, now_s: float) -> Restorable:
         """Start from a saved state at a time in seconds since 1970; return what of it is used.
@@ -210,7 +210,7 @@ class LivePilot:
         A pilot that has estimated already raises ``DataError``.
         """
         name = "" if self._estimator is None else self._estimator.model.name
-        fresh = restorable(state, self._robot_name, name, now_s)
+        fresh = restorable(state, self.robot_name, name, now_s)
         if self._estimator is not None:
             self._estimator.resident.begin_from(fresh.biases, fresh.age_s)
         self._now.belief, self._now.target_ratio = fresh.belief, fresh.target_ratio
@@ -221,14 +221,9 @@ class LivePilot:
         self._now.steer_rad = measured_rad - self._steering_zeros_rad
         return self._now.steer_rad
 
-    @property
-    def lateness_s(self) -> dict[str, float]:
-        """How late the last reading of each stream came."""
-        return self._clocks.lateness_s
-
     def swap(self, table: SlipTable, source: TerrainSource) -> None:
         """Go on with another table (``ConfigError`` if another robot's) and source, between two steps."""
-        check_table(table, self._robot_name)
+        check_table(table, self.robot_name)
         self._aims, self._source = Aims(table), source
         self._terrains = {terrain: index for index, terrain in enumerate(table.targets)}
 
@@ -271,7 +266,7 @@ class LivePilot:
             wheel_radps,
             desired_mps,
             target,
-            self._aims.of(now.belief.terrain).entry,
+            self._aims[now.belief.terrain].entry,
             observed if sound else UNOBSERVED,
             dt_s,
         )
@@ -370,7 +365,7 @@ class LivePilot:
     def _target(self, dt_s: float) -> TractionTarget:
         """Return the slips to aim for; the target moves to that of the terrain at a bounded rate."""
         now = self._now
-        aim = self._aims.of(now.belief.terrain)
+        aim = self._aims[now.belief.terrain]
         now.target_ratio = approach(
             now.target_ratio, aim.slip_ratio, self._settings.switching.rate_ratio, dt_s
         )

@@ -221,7 +221,7 @@ class RobotSession:
         ConfigError, DataError
             as when a session begins.
         """
-        self.chain.swap(served.model, served.table)
+        self.chain.replace(served.model, served.table)
         self.served = served
 
     def put(self, streams: Any, twist: Any = None, now_s: float | None = None) -> int:
@@ -273,7 +273,7 @@ class RobotSession:
         time_s = self._clock.at(now_s) if time_s is None else time_s
         fresh = now_s - self._twist_s <= TWIST_FRESH_S
         twist = self._twist if fresh else _NO_TWIST
-        done = self.chain.step(Sample(time_s, twist, readings))
+        done = self.chain.take(Sample(time_s, twist, readings))
         status = done.status
         if done.command is not None and status is CommandStatus.OK and not fresh:
             status = CommandStatus.NO_TWIST

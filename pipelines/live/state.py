@@ -8,18 +8,27 @@ terrain is that under the robot when it was saved, and the robot may have been m
 from __future__ import annotations
 
 import hashlib
-import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Literal, NamedTuple
+
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    FiniteFloat,
+    PlainSerializer,
+    TypeAdapter,
+    ValidationError,
+)
+from pydantic.dataclasses import dataclass
 
 from terrain.control.switching import NO_BELIEF, UNKNOWN, TerrainBelief
 from terrain.errors import DataError
 from terrain.estimation.ekf.resident import BIASES, ResidentFilter
 from terrain.files.atomic import atomic_write
-
-VERSION = 1
 
 BIASES_FRESH_S = 600.0
 """A bias older than that is estimated anew: with temperature it moves further than its walk says."""
@@ -33,14 +42,23 @@ CLOCK_SLACK_S = 1.0
 LARGEST_FILE = 65536
 
 
+Number = Annotated[
+    float,
+    BeforeValidator(lambda value: math.nan if value is None else value),
+    PlainSerializer(lambda value: value if math.isfinite(value) else None),
+]
+"""A number; what is not finite is written as null."""
+
+
 class Bias(NamedTuple):
     """A sensor's bias and its standard deviation, in the unit of its name."""
 
-    mean: float
-    std: float
+    mean: FiniteFloat
+    std: Annotated[FiniteFloat, Field(gt=0.0)]
 
 
-class LiveState(NamedTuple):
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class LiveState:
     """What a live chain knew at a time.
 
     Parameters
@@ -54,11 +72,11 @@ class LiveState(NamedTuple):
 
     robot: str
     filter: str
-    saved_s: float
-    biases: Mapping[str, Bias]
+    saved_s: Number
+    biases: dict[str, Bias]
     terrain: str = UNKNOWN
-    probability: float = math.nan
-    target_ratio: float = math.nan
+    probability: Number = math.nan
+    target_ratio: Number = math.nan
 
 
 class Restorable(NamedTuple):
@@ -128,17 +146,31 @@ def state_of(
     now_s : seconds since 1970
     """
     known = {} if resident is None else resident.known(BIASES)
-    biases = {name: Bias(mean, std) for name, (mean, std) in known.items() if math.isfinite(mean + std)}
+    biases = {
+        name: Bias(mean, std)
+        for name, (mean, std) in known.items()
+        if math.isfinite(mean + std) and std > 0.0
+    }
     return LiveState(robot, filter_name, now_s, biases, belief.terrain, belief.probability, target_ratio)
+
+
+class _Document(BaseModel):
+    """A file: a state and its checksum."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    version: Literal[1] = 1
+    sha256: str
+    state: LiveState
+
+
+def _sha256(state: LiveState) -> str:
+    return hashlib.sha256(TypeAdapter(LiveState).dump_json(state)).hexdigest()
 
 
 def to_text(state: LiveState) -> str:
     """Return a state as JSON, with a checksum of its content."""
-    content: dict[str, Any] = {
-        name: _written(value) for name, value in state._asdict().items() if name != "biases"
-    }
-    content["biases"] = {name: list(bias) for name, bias in sorted(state.biases.items())}
-    return json.dumps({"version": VERSION, "sha256": _digest(content), "state": content}, indent=1) + "\n"
+    return _Document(sha256=_sha256(state), state=state).model_dump_json(indent=1) + "\n"
 
 
 def from_text(text: str) -> LiveState:
@@ -153,33 +185,17 @@ def from_text(text: str) -> LiveState:
     --------
     >>> from_text("{}")
     Traceback (most recent call last):
-    terrain.errors.DataError: saved state: is damaged ('version')
+    terrain.errors.DataError: saved state: is damaged (sha256: Field required)
     """
     try:
-        document = json.loads(text)
-        version, digest, content = document["version"], document["sha256"], document["state"]
-        if version != VERSION:
-            raise DataError(f"saved state: has version {version!r}; version {VERSION} is read here")
-        if _digest(content) != digest:
-            raise DataError("saved state: is damaged (its checksum is another)")
-        biases = {
-            str(name): Bias(_number(mean), _number(std)) for name, (mean, std) in content["biases"].items()
-        }
-        if not all(math.isfinite(one.mean) and one.std > 0.0 for one in biases.values()):
-            raise DataError("saved state: is damaged (a bias is no number)")
-        return LiveState(
-            str(content["robot"]),
-            str(content["filter"]),
-            _number(content["saved_s"]),
-            biases,
-            str(content["terrain"]),
-            _number(content["probability"]),
-            _number(content["target_ratio"]),
-        )
-    except DataError:
-        raise
-    except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
-        raise DataError(f"saved state: is damaged ({error})") from error
+        document = _Document.model_validate_json(text)
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(map(str, first["loc"])) or "all of it"
+        raise DataError(f"saved state: is damaged ({place}: {first['msg']})") from error
+    if _sha256(document.state) != document.sha256:
+        raise DataError("saved state: is damaged (its checksum is another)")
+    return document.state
 
 
 def save_state(path: Path, state: LiveState) -> None:
@@ -208,15 +224,3 @@ def load_state(path: Path) -> LiveState | None:
         return from_text(content.decode("utf-8"))
     except (DataError, UnicodeDecodeError) as error:
         raise DataError(f"{path}: {error}") from error
-
-
-def _digest(content: Any) -> str:
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
-
-
-def _written(value: Any) -> Any:
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def _number(value: Any) -> float:
-    return math.nan if value is None else float(value)

@@ -303,7 +303,7 @@ def replay_run(
         passed_s = sample.time_s - start_s
         if speed < math.inf:
             _wait(begin_s + passed_s / speed, stopped)
-        done = chain.step(sample)
+        done = chain.take(sample)
         belief = chain.belief.terrain
         believed[belief] += 1
         for output in done.windows:

@@ -1,6 +1,5 @@
 """What is kept over a restart: biases and terrain while they are fresh, nothing else, and nothing damaged."""
 
-import json
 import math
 from dataclasses import replace
 
@@ -81,7 +80,7 @@ def test_a_bias_is_believed_less_with_time_and_never_less_than_without_it():
     assert stds[0] == 1e-3
     assert stds == sorted(stds)
     assert stds[2] > 2e-3
-    vague = STATE._replace(biases={"gyro_bias_radps": Bias(0.5, 10.0)})
+    vague = replace(STATE, biases={"gyro_bias_radps": Bias(0.5, 10.0)})
     pilot = LivePilot(ROBOT)
     pilot.restore(vague, STATE.saved_s)
     assert bias_of(pilot) == bias_of(LivePilot(ROBOT))
@@ -150,7 +149,7 @@ finite = st.floats(-1e6, 1e6)
 def test_a_state_is_read_as_it_was_written(saved_s, bias, terrain, probability):
     state = LiveState("r", "f", saved_s, {"gyro_bias_radps": Bias(*bias)}, terrain, probability, math.nan)
     assert to_text(from_text(to_text(state))) == to_text(state)
-    assert from_text(to_text(state))[:5] == state[:5]
+    assert from_text(to_text(state)).biases == state.biases
 
 
 def test_a_state_with_one_wrong_letter_anywhere_is_refused_or_read_as_it_was():
@@ -175,9 +174,9 @@ def test_what_is_no_state_is_refused_in_one_sentence(text):
 
 
 def test_a_checksum_that_fits_does_not_make_nonsense_a_state():
-    document = json.loads(to_text(STATE._replace(biases={"gyro_bias_radps": Bias(0.1, -1.0)})))
-    with pytest.raises(DataError, match="a bias is no number"):
-        from_text(json.dumps(document))
+    text = to_text(STATE)
+    with pytest.raises(DataError, match="should be greater than 0"):
+        from_text(text.replace("0.001", "-0.001"))
 
 
 def test_a_file_is_written_whole_read_back_and_refused_with_its_name(tmp_path):
@@ -197,6 +196,6 @@ def test_a_file_is_written_whole_read_back_and_refused_with_its_name(tmp_path):
 
 def test_an_observer_keeps_its_belief(mower_model):
     observer = Observer(mower_model)
-    observer.restore(STATE._replace(robot="", filter=""), STATE.saved_s)
+    observer.restore(replace(STATE, robot="", filter=""), STATE.saved_s)
     assert observer.belief.terrain == "grass"
     assert observer.state(7.0).terrain == "grass"

@@ -193,14 +193,14 @@ def test_a_step_that_fails_commands_to_stand(log, monkeypatch, fault, status):
     session = agrimaro()
     drive(session, replace(log, streams={k: v for k, v in log.streams.items() if k in SENSORS}))
     steer_rad = session.step(NOW_S + 20.0).command.steer_rad
-    step = session.chain.pilot.step
+    step = session.chain.step
 
     def broken(sample):
         if isinstance(fault, Exception):
             raise fault
         return step(sample)._replace(**fault)
 
-    monkeypatch.setattr(session.chain.pilot, "step", broken)
+    monkeypatch.setattr(session.chain, "step", broken)
     output = session.step(NOW_S + 30.0)
     assert output.status is status
     assert not output.command.wheel_radps.any()
