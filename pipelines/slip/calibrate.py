@@ -10,6 +10,7 @@ from terrain.errors import ConfigError
 
 if TYPE_CHECKING:
     from pipelines.report import Progress, Result
+    from pipelines.report.settings import Settings as BaseSettings
 
 EXAMPLE = "terrain calibrate --data raw/ --robot agrimaro --out mine.yaml"
 
@@ -26,7 +27,11 @@ def run(settings: Settings, progress: Progress) -> Result:
     DataError
         if the runs do not show what is to be found.
     """
-    groups = {"--what robot": RobotSettings, "--what odometry": OdometrySettings, "--what soil": SoilSettings}
+    groups: dict[str, type[BaseSettings]] = {
+        "--what robot": RobotSettings,
+        "--what odometry": OdometrySettings,
+        "--what soil": SoilSettings,
+    }
     refuse_others(settings, groups, f"--what {settings.what}", f"--what {settings.what}")
     if settings.what == "soil":
         from pipelines.slip.soil import calibrate_soil

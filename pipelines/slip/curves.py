@@ -31,7 +31,7 @@ from pipelines.report import (
     plural,
     silent,
 )
-from pipelines.slip.shown import Shown, file_name, first_rows, sections, table
+from pipelines.slip.shown import Shown, file_name, first_rows, frame, sections, table
 from terrain.control.learned_table import DIGITS, FALLBACK, learned_table
 from terrain.control.slip_table import DRIVE_STATES, CurveEntry, SlipTable
 from terrain.errors import DataError
@@ -161,14 +161,10 @@ class LearnSlipResult(Result):
 
     def to_pandas(self) -> pd.DataFrame:
         """Return a row a terrain and drive state."""
-        import pandas as pd
-
-        return pd.DataFrame(
-            [
-                {"terrain": terrain, "state": state, "n_runs": row.n_runs, **target._asdict()}
-                for terrain, row in self.terrains.items()
-                for state, target in row.targets.items()
-            ]
+        return frame(
+            {"terrain": terrain, "state": state, "n_runs": row.n_runs, **target._asdict()}
+            for terrain, row in self.terrains.items()
+            for state, target in row.targets.items()
         )
 
 

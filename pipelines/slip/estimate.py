@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipelines.data.settings import AlignedRunsSettings
+from pipelines.report.settings import Settings as BaseSettings
 from pipelines.report.settings import setting
 from pipelines.slip.modes import (
     EstimateOptions,
@@ -23,9 +24,18 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from pipelines.report import Figure, Progress, Report, Result
-    from pipelines.slip.filtered import Keep
+    from pipelines.slip.filtered import EstimateResult, Keep
+    from pipelines.slip.measured import MeasuredSlipResult
+    from pipelines.slip.observed import ObservedResult
     from terrain.records import RunLog
     from terrain.robots import Robot
+
+GROUPS: dict[str, type[BaseSettings]] = {
+    "filters": NoiseSettings,
+    "observers": SlipModelSettings,
+    "--filter pose": PoseSettings,
+}
+"""Options of each mode, by what they are for."""
 
 EXAMPLE = "terrain estimate --data raw/ --filter vio15 --out runs/"
 
@@ -107,13 +117,8 @@ def estimate_runs(
     from pipelines.report import silent
 
     kept: list[RunLog] = []
-    result = _estimated(
-        runs,
-        robot,
-        EstimateOptions(filter=filter, **options),
-        progress=progress or silent,
-        keep=lambda run, figures: kept.append(run),
-    )
+    asked = EstimateOptions(filter=filter, **options)
+    result = _estimated(runs, robot, asked, progress or silent, lambda run, figures: kept.append(run))
     return Estimates(tuple(kept), result)
 
 
@@ -126,7 +131,10 @@ def run(settings: Settings, progress: Progress) -> Result:
         if a run is in ``out`` already; nothing is written then.
     """
     from pipelines.data.settings import load
+    from pipelines.slip.measured import MeasuredSlipResult
+    from pipelines.slip.shown import write_figures
     from terrain.files.atomic import ensure_writable
+    from terrain.logs.write import write_run
     from terrain.robots import load_robot
 
     runs, skipped = load(settings)
@@ -134,24 +142,7 @@ def run(settings: Settings, progress: Progress) -> Result:
         refuse_existing(runs, settings.out)
     if settings.figures is not None:
         ensure_writable(settings.figures)
-    return _estimated(
-        runs,
-        None if settings.robot is None else load_robot(settings.robot),
-        settings,
-        aligned=settings.align,
-        out=settings.out,
-        skipped=skipped,
-        progress=progress,
-        keep=_writer(settings),
-        figures=settings.figures,
-    )
-
-
-def _writer(settings: Settings) -> Keep:
-    """Return what writes each run and its pictures; ``pose`` has pictures of all runs together."""
-    from pipelines.slip.filtered import keep_nothing
-    from pipelines.slip.shown import write_figures
-    from terrain.logs.write import write_run
+    of_runs = None if settings.filter == "pose" else settings.figures  # pictures of a pose are of all runs
 
     def write(run: RunLog, figures: Callable[[], Mapping[str, Figure]]) -> None:
         if settings.out is not None:
@@ -159,43 +150,36 @@ def _writer(settings: Settings) -> Keep:
         if of_runs is not None:
             write_figures(figures(), of_runs, svg=False)
 
-    of_runs = None if settings.filter == "pose" else settings.figures
-    return keep_nothing if settings.out is None and of_runs is None else write
+    robot = None if settings.robot is None else load_robot(settings.robot)
+    keep = None if settings.out is None and of_runs is None else write
+    result = _estimated(runs, robot, settings, progress, keep)
+    found: dict[str, Any] = {"out": settings.out, "skipped": tuple(skipped)}
+    if isinstance(result, MeasuredSlipResult) and settings.figures is not None:
+        found["figures"] = write_figures(result.pictures, settings.figures)
+    return replace(result, **found)
 
 
 def _estimated(
     runs: Sequence[RunLog],
     robot: Robot | None,
     options: EstimateOptions,
-    *,
-    aligned: bool = False,
-    out: Path | None = None,
-    skipped: Sequence[str] = (),
     progress: Progress,
-    keep: Keep,
-    figures: Path | None = None,
-) -> Result:
+    keep: Keep | None,
+) -> EstimateResult | ObservedResult | MeasuredSlipResult:
     """Estimate by the mode that the filter names."""
     from terrain.estimation.observers.choice import OBSERVERS
 
     observer, pose = options.filter in OBSERVERS, options.filter == "pose"
-    groups = {"filters": NoiseSettings, "observers": SlipModelSettings, "--filter pose": PoseSettings}
     used = "observers" if observer else "--filter pose" if pose else "filters"
-    refuse_others(options, groups, used, f"--filter {options.filter}")
+    refuse_others(options, GROUPS, used, f"--filter {options.filter}")
     if pose:
         from pipelines.slip.measured import measure_runs
-        from pipelines.slip.shown import write_figures
 
-        measured = measure_runs(runs, robot, options, out=out, skipped=skipped, progress=progress, keep=keep)
-        if figures is None:
-            return measured
-        return replace(measured, figures=write_figures(measured.pictures, figures))
+        return measure_runs(runs, robot, options, progress, keep)
     if observer:
         from pipelines.slip.observed import observe_runs
 
-        return observe_runs(runs, robot, options, out=out, skipped=skipped, progress=progress, keep=keep)
+        return observe_runs(runs, robot, options, progress, keep)
     from pipelines.slip.filtered import filter_runs
 
-    return filter_runs(
-        runs, robot, options, aligned=aligned, out=out, skipped=skipped, progress=progress, keep=keep
-    )
+    return filter_runs(runs, robot, options, progress, keep)

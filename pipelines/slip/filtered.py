@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -28,7 +28,17 @@ from pipelines.report import (
     plural,
     silent,
 )
-from pipelines.slip.shown import MAX_PICTURED, TRUTH_COLOUR, Shown, band, first_rows, line, sections, spans
+from pipelines.slip.shown import (
+    MAX_PICTURED,
+    TRUTH_COLOUR,
+    Shown,
+    band,
+    first_rows,
+    frame,
+    line,
+    sections,
+    spans,
+)
 from terrain.errors import ConfigError, DataError
 from terrain.estimation.ekf.model import Noise
 from terrain.estimation.enriched import enriched
@@ -44,6 +54,8 @@ from terrain.records import GATED, Array, RunLog
 from terrain.robots import Robot, packaged_robot
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from pipelines.slip.modes import EstimateOptions
 
 MAX_APART_S = 0.1
@@ -54,10 +66,6 @@ SLIP = "+.4f"
 
 Keep = Callable[[RunLog, Callable[[], Mapping[str, Figure]]], None]
 """Gets each run with its estimates, and what makes its pictures by name."""
-
-
-def keep_nothing(run: RunLog, figures: Callable[[], Mapping[str, Figure]]) -> None:
-    """Keep neither run nor pictures."""
 
 
 @dataclass(frozen=True)
@@ -75,17 +83,17 @@ class EstimateResult(Result):
     )
     pictures: Mapping[str, Figure] = field(default_factory=dict)
 
+    def to_pandas(self) -> pd.DataFrame:
+        """Return a row a run."""
+        return frame(self.runs)
+
 
 def filter_runs(
     runs: Sequence[RunLog],
     robot: Robot | None,
     options: EstimateOptions,
-    *,
-    aligned: bool = False,
-    out: Path | None = None,
-    skipped: Sequence[str] = (),
     progress: Progress = silent,
-    keep: Keep = keep_nothing,
+    keep: Keep | None = None,
 ) -> EstimateResult:
     """Filter runs.
 
@@ -94,8 +102,6 @@ def filter_runs(
     runs : logs
     robot : whose they are; by default each that a run names
     options : filter and noise
-    aligned : whether wheels and IMU were brought onto one clock
-    out, skipped : as in the result
     keep : gets each run with its estimates
 
     Raises
@@ -114,19 +120,16 @@ def filter_runs(
     for done, run in enumerate(runs):
         (log, own), noise = correct(run, robot or packaged_robot(run.robot)), None
         if process_noise is not None:  # not every run has the sensors of the runs tuned on
-            _, described_noise = model_and_noise(log, own, options.filter, tuning)
-            noise = Noise(
-                process_noise.process_variance,
-                described_noise.measurement_variance,
-                described_noise.initial_variance,
-            )
+            noise = model_and_noise(log, own, options.filter, tuning)[1]
+            noise = replace(noise, process_variance=process_noise.process_variance)
         found = beside(run, filter_run(log, own, options.filter, tuning=tuning, noise=noise))
         rows.append(summarize(found))
-        keep(enriched(found), partial(figures_of, found))
+        if keep is not None:
+            keep(enriched(found), partial(figures_of, found))
         pictures |= figures_of(found) if done < MAX_PICTURED else {}
         progress(f"estimate {options.filter}", done + 1, len(runs))
-    clocks = () if aligned or options.filter != "skid" else _apart(runs, robot)
-    return EstimateResult(options.filter, tuning, tuned, out, tuple(rows), tuple(skipped), clocks, pictures)
+    clocks = _apart(runs, robot) if options.filter == "skid" else ()
+    return EstimateResult(options.filter, tuning, tuned, None, tuple(rows), (), clocks, pictures)
 
 
 def _apart(runs: Sequence[RunLog], given: Robot | None) -> tuple[str, ...]:

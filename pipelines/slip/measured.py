@@ -27,9 +27,9 @@ from pipelines.report import (
     interval,
     silent,
 )
-from pipelines.slip.filtered import Keep, keep_nothing
+from pipelines.slip.filtered import Keep
 from pipelines.slip.predicted import PredictionFigures, cases_of, predictions
-from pipelines.slip.shown import Shown, sections, table
+from pipelines.slip.shown import Shown, frame, sections, table
 from terrain.errors import DataError
 from terrain.measured_slip.delay import Delay, DelayStatus
 from terrain.measured_slip.measure import (
@@ -51,6 +51,8 @@ from terrain.records import Array, RunLog
 from terrain.robots import OmniRobot, Robot, as_drive
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from pipelines.slip.modes import PoseSettings
 
 SHORT_S, SHORT_STRIDE_S = 0.5, 0.1
@@ -87,16 +89,17 @@ class MeasuredSlipResult(Result):
     skipped: tuple[str, ...] = described("a sentence for each run that could not be read")
     pictures: Mapping[str, Figure] = field(default_factory=dict)
 
+    def to_pandas(self) -> pd.DataFrame:
+        """Return a row a surface."""
+        return frame(self.surfaces)
+
 
 def measure_runs(
     runs: Sequence[RunLog],
     robot: Robot | None,
     options: PoseSettings,
-    *,
-    out: Path | None = None,
-    skipped: Sequence[str] = (),
     progress: Progress = silent,
-    keep: Keep = keep_nothing,
+    keep: Keep | None = None,
 ) -> MeasuredSlipResult:
     """Measure the slip of runs, and on request predict it.
 
@@ -105,7 +108,6 @@ def measure_runs(
     runs : of one robot
     robot : whose they are; by default the one that they name
     options : windows, delay, predictions
-    out, skipped : as in the result
     keep : gets each run with the stream ``slip``, over windows of :data:`SHORT_S`
 
     Raises
@@ -155,11 +157,11 @@ def measure_runs(
         distances=distances_of(found, robot, options.seed) if options.rollers else {},
         not_measured=tuple(found.failed),
         n_runs=len(runs),
-        out=out,
+        out=None,
         figures=(),
-        skipped=tuple(skipped),
+        skipped=(),
     )
-    if keep is not keep_nothing:
+    if keep is not None:
         _hand_over(found, robot, keep, progress)
     return replace(result, pictures=_figures(result, {name: by_terrain[name] for name in names}))
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from operator import itemgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -27,8 +28,18 @@ from pipelines.report import (
     plural,
     silent,
 )
-from pipelines.slip.filtered import Keep, keep_nothing, next_step
-from pipelines.slip.shown import MAX_PICTURED, TRUTH_COLOUR, Shown, band, first_rows, line, sections, spans
+from pipelines.slip.filtered import Keep, next_step
+from pipelines.slip.shown import (
+    MAX_PICTURED,
+    TRUTH_COLOUR,
+    Shown,
+    band,
+    first_rows,
+    frame,
+    line,
+    sections,
+    spans,
+)
 from terrain.errors import ConfigError
 from terrain.estimation.observers.choice import BY_MODEL
 from terrain.estimation.observers.estimate import ObserverEstimate, observe_run, with_estimates
@@ -39,6 +50,8 @@ from terrain.records import Array, RunLog
 from terrain.robots import Robot, packaged_robot
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from pipelines.slip.modes import EstimateOptions
 
 LATE_S = 2.0
@@ -58,16 +71,17 @@ class ObservedResult(Result):
     skipped: tuple[str, ...] = described("a sentence for each run that a repairing read left out", default=())
     pictures: Mapping[str, Figure] = field(default_factory=dict)
 
+    def to_pandas(self) -> pd.DataFrame:
+        """Return a row a run."""
+        return frame(self.runs)
+
 
 def observe_runs(
     runs: Sequence[RunLog],
     robot: Robot | None,
     options: EstimateOptions,
-    *,
-    out: Path | None = None,
-    skipped: Sequence[str] = (),
     progress: Progress = silent,
-    keep: Keep = keep_nothing,
+    keep: Keep | None = None,
 ) -> ObservedResult:
     """Run an observer over runs.
 
@@ -76,7 +90,6 @@ def observe_runs(
     runs : logs
     robot : whose they are; by default each that a run names
     options : observer and slip model
-    out, skipped : as in the result
     keep : gets each run with its estimates
 
     Raises
@@ -95,50 +108,36 @@ def observe_runs(
         model = None if options.slip_model is None else read_slip_model(options.slip_model, own.name)
         found = observe_run(run, own, options.filter, model)
         rows.append(summarize_observer(found))
-        keep(with_estimates(found), partial(figures_of, found))
+        if keep is not None:
+            keep(with_estimates(found), partial(figures_of, found))
         pictures |= figures_of(found) if done < MAX_PICTURED else {}
         progress(f"estimate {options.filter}", done + 1, len(runs))
-    return ObservedResult(options.filter, options.slip_model, out, tuple(rows), tuple(skipped), pictures)
+    return ObservedResult(options.filter, options.slip_model, None, tuple(rows), (), pictures)
 
 
-class _Slip(NamedTuple):
-    """One slip of a run; the first of a run names it."""
-
-    run: str
-    name: str
-    slip: ObservedSlip | None
-    position_rmse_m: float | None
-
-
-def _of_slip(name: str) -> Callable[[_Slip], Any]:
-    return lambda row: row.slip and getattr(row.slip, name)
-
-
-SLIPS = (
-    Shown("run", "run"),
-    Shown("slip", "name"),
-    *(
-        Shown(title, _of_slip(name), form)
-        for title, name, form in (
-            ("mean", "mean", SLIP),
-            ("std", "std", ".4f"),
-            ("true", "true_mean", SLIP),
-            ("RMSE", "rmse", ".4f"),
-            ("NEES", "nees", ".2f"),
+SLIPS = tuple(
+    Shown(title, itemgetter(i), *form)
+    for i, (title, *form) in enumerate(
+        (
+            *(("run",), ("slip",), ("mean", SLIP), ("std", ".4f"), ("true", SLIP)),
+            *(("RMSE", ".4f"), ("NEES", ".2f"), ("position RMSE", ".3f", "m")),
         )
-    ),
-    Shown("position RMSE", "position_rmse_m", ".3f", "m"),
+    )
 )
+
+NOT_ESTIMATED = {"not estimated": ObservedSlip(*[math.nan] * 5)}
 
 
 def report(result: ObservedResult) -> Report:
     """Return each slip of a run, its truth where it is known, and how long the observer had which status."""
-    rows = []
-    for run in result.runs:
-        slips = list(run.slip.items())
-        name, slip = slips[0] if slips else ("not estimated", None)
-        rows.append(_Slip(run.run_id, name, slip, run.position_rmse_m))
-        rows += [_Slip("", name, slip, None) for name, slip in slips[1:]]
+    rows = [
+        (
+            *("" if k else run.run_id, name, slip.mean, slip.std, slip.true_mean, slip.rmse, slip.nees),
+            None if k else run.position_rmse_m,
+        )
+        for run in result.runs
+        for k, (name, slip) in enumerate((run.slip or NOT_ESTIMATED).items())
+    ]
     first, all_rows = first_rows(rows, SLIPS, f"observer {result.filter}")
     pictures = list(result.pictures.values())
     return Report(

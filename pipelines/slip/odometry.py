@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,7 +24,7 @@ from pipelines.report import (
     interval,
     silent,
 )
-from pipelines.slip.shown import Shown, sections, table
+from pipelines.slip.shown import Shown, frame, sections, table
 from terrain.calibration.adaptive_legs import dead_reckoning, efficiencies_before, of_point
 from terrain.calibration.odometry_fit import (
     ENCODER,
@@ -46,6 +46,8 @@ from terrain.records import Array, RunLog
 from terrain.robots import TrackedRobot, as_drive, load_robot
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from pipelines.slip.modes import CalibrateSettings as Settings
 
 SHORTEST_S, LONGEST_S = 0.2, 3600.0
@@ -86,6 +88,12 @@ class OdometryResult(Result):
     )
     written: Path | None = described("file of the slip model")
     notes: tuple[str, ...] = described("what is missing, in words")
+
+    def to_pandas(self) -> pd.DataFrame:
+        """Return a row a kind of odometry and length of legs."""
+        return frame(
+            {"length_s": scores.length_s, **asdict(kind)} for scores in self.scores for kind in scores.kinds
+        )
 
 
 def calibrate_odometry(settings: Settings, robot_name: str, progress: Progress = silent) -> OdometryResult:

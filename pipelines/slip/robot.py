@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipelines.data.datasets import load_runs
 from pipelines.report import Part, Report, Result, Text, described, plural
-from pipelines.slip.shown import Shown, first_rows, sections
+from pipelines.slip.shown import Shown, first_rows, frame, sections
 from terrain.calibration.description import (
     IDENTIFIED,
     described_with,
@@ -70,9 +70,7 @@ class CalibrationResult(Result):
 
     def to_pandas(self) -> pd.DataFrame:
         """Return a row a number, with its interval."""
-        import pandas as pd
-
-        return pd.DataFrame([asdict(finding) for finding in self.findings])
+        return frame(self.findings)
 
 
 def calibrate_robot(settings: Settings, robot_name: str) -> CalibrationResult:

@@ -13,6 +13,8 @@ from terrain.files.atomic import atomic_write
 from terrain.records import Array
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from pipelines.report import Figure, Part
 
 MAX_POINTS = 2000
@@ -71,6 +73,15 @@ def first_rows(
     note = f"{n_more} more are in the details." if n_more > 0 else ""
     rest: list[Part] = [table(rows, columns)] if n_more > 0 else []
     return table(rows[:SHOWN_ROWS], columns, title, note), ("All of them", rest)
+
+
+def frame(records: Iterable[Any]) -> pd.DataFrame:
+    """Return records as a table, their fields as columns, as ``--json`` has them."""
+    import pandas as pd
+
+    from pipelines.report.json_file import as_json
+
+    return pd.DataFrame([as_json(record) for record in records])
 
 
 def sections(*titled: tuple[str, Sequence[Part | str]]) -> tuple[Section, ...]:

@@ -30,7 +30,7 @@ from pipelines.report import (
     format_value,
     silent,
 )
-from pipelines.slip.shown import Shown, sections, table, write_figures
+from pipelines.slip.shown import Shown, frame, sections, table, write_figures
 from terrain.errors import ConfigError, DataError
 from terrain.files.atomic import atomic_write, ensure_writable
 from terrain.records import RunLog
@@ -71,15 +71,11 @@ class SoilResult(Result):
 
     def to_pandas(self) -> pd.DataFrame:
         """Return the errors of each law on what was left out, a row each; slip and load given."""
-        import pandas as pd
-
-        return pd.DataFrame(
-            [
-                {"wheel": wheel.wheel, "law": row.name, "held_out": held, **getattr(row, held).load._asdict()}
-                for wheel in self.wheels
-                for row in wheel.laws
-                for held in HELD_OUT
-            ]
+        return frame(
+            {"wheel": wheel.wheel, "law": row.name, "held_out": held, **getattr(row, held).load._asdict()}
+            for wheel in self.wheels
+            for row in wheel.laws
+            for held in HELD_OUT
         )
 
 

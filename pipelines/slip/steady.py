@@ -28,7 +28,7 @@ from pipelines.report import (
     silent,
 )
 from pipelines.slip.curves import SLIP, TARGET, TargetRow, target_of, target_row
-from pipelines.slip.shown import Shown, sections, table
+from pipelines.slip.shown import Shown, frame, sections, table
 from terrain.control.measured_table import MIN_RUNS, measured_table, reason_of
 from terrain.control.slip_table import DRIVE_STATES, SlipTable
 from terrain.control.transfer import Transfer, transfers
@@ -83,14 +83,10 @@ class MeasuredTargets(Result):
 
     def to_pandas(self) -> pd.DataFrame:
         """Return a row a surface and drive state."""
-        import pandas as pd
-
-        return pd.DataFrame(
-            [
-                {"terrain": name, "state": state, "n_runs": row.slip.n_runs, **target._asdict()}
-                for name, row in self.surfaces.items()
-                for state, target in row.targets.items()
-            ]
+        return frame(
+            {"terrain": name, "state": state, "n_runs": row.slip.n_runs, **target._asdict()}
+            for name, row in self.surfaces.items()
+            for state, target in row.targets.items()
         )
 
 

@@ -16,7 +16,7 @@ distance of the wheels follows from how small turns agree (:mod:`terrain.measure
 surface by surface: slip in turning makes it too large, what else turns the robot moves it up or down, so that
 the mean is given with the intervals of all surfaces.
 
-The friction of the rollers is one of a terrain and no number of the robot: ``terrain measure-slip --rollers``
+The friction of the rollers is one of a terrain and no number of the robot: ``terrain estimate --filter pose --rollers``
 shows it.
 """
 
@@ -181,7 +181,7 @@ def _slips(runs: Sequence[RunLog], robot: OmniRobot, seed: int) -> list[tuple[Me
     for run in runs:
         try:
             slips.append((measured_slip(run, robot, delay_s=delay_s), run.terrains[0]))
-        except DataError:  # too short, or never seen: measure-slip names it
+        except DataError:  # too short, or never seen: the filter pose names it
             continue
     return slips
 

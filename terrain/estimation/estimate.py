@@ -229,7 +229,7 @@ def model_and_noise(
     if robot.filters:
         suitable = tuple(each for each in suitable if each in robot.filters)
     if name in FILTERS and name not in suitable:
-        fits = ", ".join((*suitable, *observers_of(robot))) or "terrain measure-slip"
+        fits = ", ".join((*suitable, *observers_of(robot))) or "pose"
         raise ConfigError(
             f"filter {name!r} is not for robot {robot.name}, whose drive is {robot.drive}: use {fits}"
         )

@@ -282,7 +282,7 @@ def spinning_wheels(found: MeasuredSlip, spin_ratio: float = 0.9, others_ratio: 
 
     Examples
     --------
-    A wheel of four that turns in the air is named in ``terrain measure-slip``.
+    A wheel of four that turns in the air is named in ``terrain estimate --filter pose``.
     """
     names = []
     magnitude = np.abs(found.slip_ratio)
