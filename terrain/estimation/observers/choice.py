@@ -102,8 +102,8 @@ def make_observer(name: str, robot: Robot, slip_model: SlipModel | None = None) 
         return OF_CARS[name](robot)
     if slip_model is None and name in BY_MODEL:
         raise ConfigError(
-            f"filter {name!r} needs a slip model (--slip-model), which terrain calibrate --what odometry finds; slip-learning "
-            "finds its own by fixes"
+            f"filter {name!r} needs a slip model (--slip-model), which terrain calibrate --what odometry finds; "
+            "slip-learning finds its own by fixes"
         )
     assert isinstance(robot, TrackedRobot)
     return OF_TRACKED[name](robot, slip_model or SlipModel())
