@@ -452,7 +452,7 @@ def _side_by_side(
     return ComparisonResult(
         "recipes",
         tuple(result for result, _ in found),
-        _differences(settings.recipes, outcomes, settings.seed, levels),
+        _differences([name for name, *_ in contenders], outcomes, settings.seed, levels),
         (),
         (),
     )

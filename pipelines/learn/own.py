@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from sklearn.base import BaseEstimator, ClassifierMixin, clone
+from sklearn.feature_selection import VarianceThreshold
 from sklearn.impute import SimpleImputer
 from sklearn.linear_model import LogisticRegression
 from sklearn.pipeline import Pipeline
@@ -249,6 +250,7 @@ class OwnClassifier(ClassifierMixin, BaseEstimator):
     def _fitted(self, X: Array, y: Array) -> Pipeline:
         steps = [
             ("impute", SimpleImputer(strategy="median", keep_empty_features=True)),
+            ("constant", VarianceThreshold()),
             ("scale", StandardScaler()),
             ("clip", FunctionTransformer(np.clip, kw_args={"a_min": -CLIP_STD, "a_max": CLIP_STD})),
             ("classifier", clone(self.estimator)),
