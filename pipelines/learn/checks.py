@@ -27,7 +27,7 @@ from pipelines.learn.protocols import (
     run_speeds,
     slow_fast_split,
 )
-from pipelines.report import Progress, silent
+from pipelines.report import Progress, format_value, silent
 from terrain.bootstrap import bootstrap_counts, percentile_interval
 from terrain.classify.folds import block_groups, split_runs
 from terrain.classify.metrics import N_BOOTSTRAP, run_bootstrap, runs_by_terrain
@@ -220,15 +220,15 @@ def enough_runs(runs_per_class: Array, accuracy: Array) -> EnoughRuns:
     if not len(found):
         return EnoughRuns(
             None,
-            f"not enough yet: doubling the {largest:.1f} runs per class would still gain {slack:.1%}",
+            f"not enough yet: doubling the {largest:.1f} runs per class would still gain {format_value(slack, '.1%')}",
         )
     enough = int(found[0])
     verdict = "enough" if enough <= largest else "not enough yet"
     return EnoughRuns(
         enough,
         f"{verdict}: {enough} {'run' if enough == 1 else 'runs'} per class would be enough "
-        f"(doubling them gains under {ENOUGH_GAIN:.0%}); "
-        f"the data have {largest:.1f} on average, doubling which would gain {slack:.1%}",
+        f"(doubling them gains under {format_value(ENOUGH_GAIN, '.0%')}); "
+        f"the data have {largest:.1f} on average, doubling which would gain {format_value(slack, '.1%')}",
     )
 
 

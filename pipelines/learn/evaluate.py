@@ -11,7 +11,7 @@ from sklearn.base import clone
 
 from pipelines.learn.parallel import parallel
 from pipelines.learn.protocols import Fold, Samples
-from pipelines.report import Progress, silent
+from pipelines.report import Progress, format_value, interval, silent
 from terrain.classify.confidence import confidence_figures
 from terrain.classify.conformal import conformal_sets, conformal_threshold, held_out_scores
 from terrain.classify.conformal_figures import ConformalFigures, conformal_figures
@@ -263,14 +263,14 @@ def sets_of(held_out: HeldOut, samples: Samples, seed: int) -> ConformalFigures 
 
 
 def weaknesses(accuracy_ci: tuple[float, float], chance: float) -> tuple[str, ...]:
-    """Return in sentences why a figure must not be relied on, none where it may.
+    r"""Return in sentences why a figure must not be relied on, none where it may.
 
     Examples
     --------
     >>> for text in weaknesses((0.31, 0.48), 0.4):
-    ...     print(text)
-    the accuracy (95 % over runs: 31.0% to 48.0%) is not above chance,
-        40.0% (always the most frequent class)
+    ...     print(text.replace("\N{NO-BREAK SPACE}", " "))
+    the accuracy (95 % over runs: 31.0 to 48.0 %) is not above chance,
+        40.0 % (always the most frequent class)
     >>> weaknesses((0.85, 0.95), 0.4)
     ()
     """
@@ -278,8 +278,8 @@ def weaknesses(accuracy_ci: tuple[float, float], chance: float) -> tuple[str, ..
     found = []
     if not low > chance:
         found.append(
-            f"the accuracy (95 % over runs: {low:.1%} to {high:.1%}) is not above chance, {chance:.1%} "
-            "(always the most frequent class)"
+            f"the accuracy (95 % over runs: {interval(low, high, '.1%')}) is not above chance, "
+            f"{format_value(chance, '.1%')} (always the most frequent class)"
         )
     if not high - low <= WIDE_INTERVAL:
         found.append(

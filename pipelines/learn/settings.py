@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 from pydantic import field_validator, model_validator
 
@@ -22,7 +23,21 @@ FEATURE_RECIPE = "svm"
 """The recipe that learns from features alone, and so from cached ones."""
 WITHOUT_SVM = ("cnn", "response")
 
+ProtocolName = Literal[
+    "grouped",
+    "leave-one-run-out",
+    "leave-sessions-out",
+    "leave-regimes-out",
+    "leave-terrain-out",
+    "published",
+    "slow-fast",
+    "fast-slow",
+]
+"""The names of ``pipelines.learn.protocols.PROTOCOLS``."""
+SEVERAL_REPEATS = ("grouped", "leave-regimes-out", "leave-terrain-out", "published")
+
 WINDOW_S = 2.0
+PUBLISHED_WINDOW_S = 1.7
 
 RECIPE_TEXT = (
     "svm on features, cnn (network on samples), stack (both joined), best of these three, response of the "
@@ -143,3 +158,67 @@ def check_params(params: Path | None, recipes: tuple[str, ...]) -> None:
         name = text.partition("@")[0]
         if params is not None and (name in WITHOUT_SVM or ":" in name):
             raise ConfigError(f"--params has hyper-parameters of the SVM, which {name!r} does not have")
+
+
+class EvaluationSettings(LearnSettings):
+    """Evaluation: what is compared, and which windows are held out."""
+
+    recipe: tuple[str, ...] = setting((), f"Recipes to evaluate (svm), by commas or repeated: {RECIPE_TEXT}")
+    model: tuple[str, ...] = setting((), "Model folder or URI in place of recipes; may be given again.")
+    protocol: ProtocolName = setting("grouped", "Which windows train and which test.")
+    extras: bool = setting(True, "Speed alone, slow against fast, learning curve, terrain over time.")
+    speed: str | None = setting(
+        None, "LOW:HIGH in m/s: runs commanded at such a speed alone (or, without commands, driven at)."
+    )
+
+    @field_validator("speed")
+    @classmethod
+    def _check_speed(cls, text: str | None) -> str | None:
+        if text is not None:
+            _speeds(text)
+        return text
+
+    @field_validator("recipe")
+    @classmethod
+    def _check_recipes(cls, texts: tuple[str, ...]) -> tuple[str, ...]:
+        return tuple(check_recipe(text) for text in split_recipes(texts))
+
+    @model_validator(mode="after")
+    def _check_protocol(self) -> Self:
+        if self.model and self.recipe:
+            raise ConfigError("--model and --recipe do not go together: compare models, or recipes")
+        check_params(self.params, self.recipe)
+        if self.protocol == "published" and (self.stride_s is not None or not self.steady):
+            raise ConfigError(
+                "'published' sets its own strides and keeps all motion: stride and steady do not apply"
+            )
+        if self.protocol not in SEVERAL_REPEATS and (self.repeats or 1) > 1:
+            raise ConfigError(f"{self.protocol!r} has a single fold assignment: it has one repeat")
+        return self
+
+    @property
+    def recipes(self) -> tuple[str, ...]:
+        """The recipes by name; the SVM where none is given."""
+        return self.recipe or (FEATURE_RECIPE,)
+
+    @property
+    def rule(self) -> WindowRule:
+        """How windows are cut."""
+        return self.rule_of(PUBLISHED_WINDOW_S if self.protocol == "published" else WINDOW_S)
+
+    @property
+    def speed_mps(self) -> tuple[float, float] | None:
+        """Speeds of the runs that are used; None for all."""
+        return None if self.speed is None else _speeds(self.speed)
+
+
+def _speeds(text: str) -> tuple[float, float]:
+    """Read ``LOW:HIGH``."""
+    low, _, high = text.partition(":")
+    try:
+        low_mps, high_mps = float(low), float(high)
+    except ValueError:
+        low_mps = high_mps = 0.0
+    if not 0.0 <= low_mps < high_mps < math.inf:
+        raise ConfigError(f"--speed is {text!r}; LOW:HIGH in m/s is required, as in 0:0.15")
+    return low_mps, high_mps
