@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -20,8 +20,8 @@ from pipelines.data.bag_files import (
     short_type,
     topics_of,
 )
-from pipelines.data.faults import Faults, Topic
-from pipelines.data.message_numbers import Collector, Numbers, TextCollector, give
+from pipelines.data.faults import DAMAGED_MESSAGE, Faults, Topic
+from pipelines.data.message_numbers import Number, number_at, stamp_at
 from pipelines.data.recorded_windows import RecordedWindow, window_of_text
 from pipelines.data.run_topics import RUN_TOPIC, STRING, WINDOW_TOPIC, RunDocument
 from pipelines.data.standard_messages import KINDS, Converted
@@ -50,6 +50,9 @@ from terrain.robots import Robot, packaged_robot
 
 MAX_LABELS = 1_000_000
 """Messages with terrains; ten a second are 28 hours."""
+
+LATEST_NS = 2**62
+"""Latest stamp that a message may have."""
 
 UNMATCHED = "messages without one of equal stamp on the other topics"
 
@@ -108,29 +111,20 @@ def read_run(
     name = robot.name if robot is not None else mapping.robot
     if not name:
         raise ConfigError(f"{place}: a bag does not name its robot: give it by --robot or in the mapping")
-    _check_topics(place, mapping, topics)
     radius_m = _wheel_radius_m(mapping, robot)
-    readers = {
-        stream: StreamReader(
-            place,
-            stream,
-            each,
-            by_header=mapping.time == "header",
-            topics=topics,
-            wheel_radius_m=radius_m,
-            faults=faults,
-        )
+    _check_topics(place, mapping, topics, radius_m)
+    found = _read_topics(bag, place, topics, mapping, faults)
+    raw = {
+        stream: _raw_stream(place, stream, each, topics, found, mapping.time, radius_m, faults)
         for stream, each in mapping.streams.items()
     }
-    labels = TextCollector(place, mapping.labels, faults, MAX_LABELS) if mapping.labels else None
-    _collect(bag, place, topics, readers.values(), labels, faults)
-    raw = {stream: reader.raw() for stream, reader in readers.items()}
     start_ns = start_of([each.stamp_ns for each in raw.values()], faults.repairs)
     streams = {stream: _stream(place, stream, each, start_ns, faults.repairs) for stream, each in raw.items()}
     parts = _parts(path, folder)
     refuse_apart("_".join(parts), streams)
-    if labels is not None:
-        intervals = label_intervals(labels.texts(), start_ns, streams)
+    if mapping.labels:
+        texts = sorted(found[mapping.labels].texts, key=lambda each: each[0])
+        intervals = label_intervals(texts, start_ns, streams)
     else:
         terrain = mapping.terrain or (parts[0] if len(parts) > 1 else "")
         intervals = (whole_run_label(streams, terrain),) if terrain else ()
@@ -138,27 +132,6 @@ def read_run(
         "_".join(parts), name, streams, intervals, source=f"{place}, a bag", dropped=faults.repairs or {}
     )
     return checked_names(place, run)
-
-
-def _collect(
-    bag: Bag,
-    place: str,
-    topics: Mapping[str, Topic],
-    readers: Iterable[StreamReader],
-    labels: TextCollector | None,
-    faults: Faults,
-) -> None:
-    """Give the messages of a bag to what takes them."""
-    takers: dict[str, list[Collector | TextCollector]] = {}
-    for reader in readers:
-        for collector in reader.collectors:
-            takers.setdefault(collector.topic, []).append(collector)
-    if labels is not None:
-        takers.setdefault(labels.topic, []).append(labels)
-    decoders = {topic: decoder_of(place, topics[topic], bag.distro) for topic in sorted(takers)}
-    given = give(takers, decoders)
-    for topic, log_ns, content in messages_of(bag, frozenset(takers), faults):
-        given(topic, log_ns, content)
 
 
 def read_stream(
@@ -183,21 +156,14 @@ def read_stream(
     LogError, ConfigError
         as :func:`read_run`.
     """
-    mapping = check_stream(f"stream {name}", described_stream)
+    stream = check_stream(f"stream {name}", described_stream)
+    mapping = TopicMapping(streams={name: stream})
     bag, place, faults = open_bag(path), short_name(path), Faults(repairs)
     topics = topics_of(bag)
-    _check_topics(place, TopicMapping(streams={name: mapping}), topics)
-    reader = StreamReader(
-        place,
-        name,
-        mapping,
-        by_header=True,
-        topics=topics,
-        wheel_radius_m=wheel_radius_m,
-        faults=faults,
-    )
-    _collect(bag, place, topics, [reader], None, faults)
-    return _stream(place, name, reader.raw(), 0, repairs)
+    _check_topics(place, mapping, topics, wheel_radius_m)
+    found = _read_topics(bag, place, topics, mapping, faults)
+    raw = _raw_stream(place, name, stream, topics, found, mapping.time, wheel_radius_m, faults)
+    return _stream(place, name, raw, 0, repairs)
 
 
 def _exported_run(
@@ -285,14 +251,29 @@ def label_intervals(
     return tuple(labels)
 
 
-def _check_topics(place: str, mapping: TopicMapping, topics: Mapping[str, Topic]) -> None:
-    """Refuse a mapping of topics that a bag lacks."""
+def _check_topics(
+    place: str, mapping: TopicMapping, topics: Mapping[str, Topic], wheel_radius_m: float | None
+) -> None:
+    """Refuse a mapping of topics that a bag lacks or that are of another type, and speeds without a radius."""
     there = described([*topics.values()])
     for name, stream in mapping.streams.items():
         for topic in (stream.topic, *(channel.topic for channel in stream.channels.values())):
             if topic and topic not in topics:
                 raise LogError(
                     f"{place}: stream {name}: there is no topic {shown(topic)} (there are {there})"
+                )
+        kind = topics[stream.topic].kind
+        if stream.kind != "fields" and short_type(kind) not in TYPES[stream.kind]:
+            raise LogError(
+                f"{place}: stream {name}: topic {stream.topic} is of type {kind}, "
+                f"kind {stream.kind!r} is {' or '.join(TYPES[stream.kind])} (there are {there})"
+            )
+        for channel, entry in stream.channels.items():
+            turns = stream.kind == "joints" and by_radius(entry, unit_of(channel))
+            if turns and stream.wheel_radius is None and wheel_radius_m is None:
+                raise ConfigError(
+                    f"{place}: stream {name}: channel {channel} is the speed of a joint that turns: "
+                    f"'wheel_radius' is missing, and the robot has no description"
                 )
     if not mapping.labels:
         return
@@ -321,6 +302,101 @@ def _parts(path: Path, folder: Path) -> tuple[str, ...]:
     return (within.with_suffix("") if path.is_file() else within).parts
 
 
+class _TopicReader:
+    """Collects the numbers of the messages of a topic, or their texts where no path is asked for.
+
+    ``paths`` has for each number its path and, where its array has a number a joint, the joint's name; an
+    entry of ``rows`` has them in that order.
+    """
+
+    def __init__(self, place: str, topic: Topic, decode: Callable[[bytes], Any], faults: Faults) -> None:
+        self.topic, self.paths = topic, dict[tuple[str, str], int]()
+        self.log_ns, self.stamp_ns = list[int](), list[int]()
+        self.rows, self.texts = list[list[float]](), list[tuple[int, str]]()
+        self._place, self._decode, self._faults = place, decode, faults
+        self._numbers: list[Number] | None = None
+        self._stamp: tuple[Number, Number] | None = None
+
+    def take(self, log_ns: int, content: bytes) -> None:
+        try:
+            message = self._decode(content)
+        except Exception as error:  # whatever a library makes of damaged bytes
+            self._damaged(error)
+            return
+        if not self.paths:
+            if len(self.texts) >= MAX_LABELS:
+                raise LogError(
+                    f"{self._place}: topic {shown(self.topic.name)} has more than {MAX_LABELS} messages"
+                )
+            self.texts.append((log_ns, str(message.data)))
+            return
+        if self._numbers is None:
+            about = (self.topic.name, short_type(self.topic.kind), message)
+            self._numbers = [number_at(*about, *path) for path in self.paths]
+            self._stamp = stamp_at(*about)
+        try:
+            row = [float(number(message)) for number in self._numbers]
+            seconds, rest = (0, log_ns) if self._stamp is None else (get(message) for get in self._stamp)
+            stamp_ns = int(seconds) * 10**9 + int(rest)
+            if abs(stamp_ns) > LATEST_NS:
+                raise ValueError("a stamp is beyond what clocks show")
+        except (ValueError, TypeError, AttributeError, OverflowError) as error:
+            self._damaged(error)
+            return
+        self.rows.append(row)
+        self.stamp_ns.append(stamp_ns)
+        self.log_ns.append(log_ns)
+        if len(self.rows) * len(self.paths) > MAX_VALUES:
+            raise LogError(f"{self._place}: topic {shown(self.topic.name)} has more than {MAX_VALUES} values")
+
+    def _damaged(self, error: Exception) -> None:
+        text = f"topic {shown(self.topic.name)} has a message that is not as defined ({str(error)[:120]})"
+        self._faults.found(self._place, DAMAGED_MESSAGE, text)
+
+    def numbers(self, paths: Sequence[tuple[str, str]], *, by_header: bool) -> tuple[Array, Array]:
+        """Return stamps (n,) in ns, and numbers (n, k) of some paths, in the order of log times."""
+        order = np.argsort(np.array(self.log_ns, dtype=np.int64), kind="stable")
+        stamp_ns = np.array(self.stamp_ns if by_header else self.log_ns, dtype=np.int64)
+        values = np.array(self.rows, dtype=np.float64).reshape(len(order), len(self.paths))
+        values = values[order][:, [self.paths[path] for path in paths]]
+        kept: Array = np.ones(len(order), dtype=bool)
+        if any(joint for _, joint in paths):  # a robot may send its joints in several messages
+            kept = np.isfinite(values).any(axis=1)
+        return stamp_ns[order][kept], values[kept]
+
+
+def _read_topics(
+    bag: Bag, place: str, topics: Mapping[str, Topic], mapping: TopicMapping, faults: Faults
+) -> dict[str, _TopicReader]:
+    """Read the topics of a mapping, each once, however many streams are made of it."""
+    readers: dict[str, _TopicReader] = {}
+
+    def reader(name: str) -> _TopicReader:
+        if name not in readers:
+            decode = decoder_of(place, topics[name], bag.distro)
+            readers[name] = _TopicReader(place, topics[name], decode, faults)
+        return readers[name]
+
+    for stream in mapping.streams.values():
+        for topic, channels in _channels_by_topic(stream).items():
+            for path in _paths(stream, topics, channels):
+                reader(topic).paths.setdefault(path, len(reader(topic).paths))
+    if mapping.labels:
+        reader(mapping.labels)
+    for topic, log_ns, content in messages_of(bag, frozenset(readers), faults):
+        readers[topic].take(log_ns, content)
+    return readers
+
+
+def _paths(
+    stream: StreamMapping, topics: Mapping[str, Topic], channels: Mapping[str, Channel]
+) -> list[tuple[str, str]]:
+    if stream.kind in ("fields", "joints"):
+        return [(channel.field, channel.joint) for channel in channels.values()]
+    kind = short_type(topics[stream.topic].kind)
+    return [(path, "") for path in KINDS[kind].paths]
+
+
 class RawStream(NamedTuple):
     """A stream before it is judged: stamps (n,) in ns, channels, and values (n, c)."""
 
@@ -329,133 +405,79 @@ class RawStream(NamedTuple):
     values: Array
 
 
-class StreamReader:
-    """Collects what a stream of a mapping is made of.
-
-    Parameters
-    ----------
-    place : of the bag, as messages name it
-    name : of the stream
-    mapping : of it
-    by_header : whether stamps are those of headers, where the stream does not state it
-    topics : of the bag, by name
-    wheel_radius_m : of the robot; None where unknown
-    faults : gets what is damaged
-
-    Raises
-    ------
-    LogError
-        if a topic is of another type than the kind has.
-    ConfigError
-        if a radius is missing.
-    """
-
-    def __init__(
-        self,
-        place: str,
-        name: str,
-        mapping: StreamMapping,
-        *,
-        by_header: bool,
-        topics: Mapping[str, Topic],
-        wheel_radius_m: float | None,
-        faults: Faults,
-    ) -> None:
-        self._place, self._name, self._mapping, self._faults = place, name, mapping, faults
-        by_header = mapping.time == "header" if mapping.time else by_header
-        self._radius_m = wheel_radius_m
+def _raw_stream(
+    place: str,
+    name: str,
+    mapping: StreamMapping,
+    topics: Mapping[str, Topic],
+    found: Mapping[str, _TopicReader],
+    time: str,
+    wheel_radius_m: float | None,
+    faults: Faults,
+) -> RawStream:
+    """Return the channels of a stream at its stamps; its topics have been read."""
+    numbers = []
+    by_topic = _channels_by_topic(mapping)
+    for topic, channels in by_topic.items():
+        paths = _paths(mapping, topics, channels)
+        stamps, values = found[topic].numbers(paths, by_header=(mapping.time or time) == "header")
+        if not stamps.size:
+            what = " with any of the joints" if mapping.kind == "joints" else ""
+            raise LogError(f"{place}: topic {shown(topic)} has no message{what}")
+        numbers.append((stamps, values))
+    stamp_ns, values = numbers[0]
+    if mapping.kind in ("fields", "joints"):
+        if len(numbers) > 1:
+            stamp_ns, values = _joined(place, name, mapping, numbers, faults)
+        names = [channel for channels in by_topic.values() for channel in channels]
         if mapping.wheel_radius is not None:
-            self._radius_m = mapping.wheel_radius.value * UNIT_SCALES[mapping.wheel_radius.unit][1]
-        self._by_topic = _channels_by_topic(mapping)
-        self._kind = short_type(topics[mapping.topic].kind)
-        if mapping.kind != "fields" and self._kind not in TYPES[mapping.kind]:
-            raise LogError(
-                f"{place}: stream {name}: topic {mapping.topic} is of type {topics[mapping.topic].kind}, "
-                f"kind {mapping.kind!r} is {' or '.join(TYPES[mapping.kind])} "
-                f"(there are {described([*topics.values()])})"
-            )
-        for channel, entry in mapping.channels.items():
-            if mapping.kind == "joints" and by_radius(entry, unit_of(channel)) and self._radius_m is None:
-                raise ConfigError(
-                    f"{place}: stream {name}: channel {channel} is the speed of a joint that turns: "
-                    f"'wheel_radius' is missing, and the robot has no description"
-                )
-        self.collectors = [
-            Collector(place, topic, short_type(topics[topic].kind), self._paths(channels), by_header, faults)
-            for topic, channels in self._by_topic.items()
-        ]
+            wheel_radius_m = mapping.wheel_radius.value * UNIT_SCALES[mapping.wheel_radius.unit][1]
+        converted = _in_si(mapping, names, values, wheel_radius_m)
+    else:
+        converted = KINDS[short_type(topics[mapping.topic].kind)].converted(values)
+    if not converted.channels:
+        raise LogError(f"{place}: topic {shown(mapping.topic)} states that it measures nothing")
+    return RawStream(stamp_ns, *converted)
 
-    def _paths(self, channels: Mapping[str, Channel]) -> list[tuple[str, str]]:
-        if self._kind in KINDS and self._mapping.kind != "fields":
-            return [(path, "") for path in KINDS[self._kind].paths]
-        return [(channel.field, channel.joint) for channel in channels.values()]
 
-    def raw(self) -> RawStream:
-        """Return the channels at the stamps of the stream.
+def _in_si(
+    mapping: StreamMapping, names: Sequence[str], values: Array, wheel_radius_m: float | None
+) -> Converted:
+    columns = {}
+    for name, column in zip(names, values.T, strict=True):
+        channel, desired = mapping.channels[name], unit_of(name)
+        unit = joint_unit(channel) if mapping.kind == "joints" else channel.unit
+        factor = 1.0 if desired == "code" else UNIT_SCALES[unit][1]
+        if mapping.kind == "joints" and by_radius(channel, desired):
+            factor *= wheel_radius_m or np.nan
+        with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is judged later
+            scaled = (column * channel.scale + channel.offset) * factor
+            columns[name] = scaled + UNIT_OFFSETS.get(unit, 0.0)
+    return Converted(tuple(mapping.channels), np.column_stack([columns[name] for name in mapping.channels]))
 
-        Raises
-        ------
-        LogError
-            if its topic has no message, or the stamps of its topics do not agree.
-        """
-        numbers = [collector.numbers() for collector in self.collectors]
-        for collector, each in zip(self.collectors, numbers, strict=True):
-            if not each.stamp_ns.size:
-                what = " with any of the joints" if self._mapping.kind == "joints" else ""
-                raise LogError(f"{self._place}: topic {shown(collector.topic)} has no message{what}")
-        if self._mapping.kind in ("fields", "joints"):
-            stamp_ns, rows = numbers[0].stamp_ns, [each.values for each in numbers]
-            if len(numbers) > 1:
-                stamp_ns, rows = self._joined(numbers)
-            names = [name for channels in self._by_topic.values() for name in channels]
-            found = self._in_si(names, np.concatenate(rows, axis=1))
-        else:
-            stamp_ns, found = numbers[0].stamp_ns, KINDS[self._kind].converted(numbers[0].values)
-        if not found.channels:
-            raise LogError(
-                f"{self._place}: topic {shown(self._mapping.topic)} states that it measures nothing"
-            )
-        return RawStream(stamp_ns, found.channels, found.values)
 
-    def _in_si(self, names: list[str], values: Array) -> Converted:
-        columns = []
-        for name, column in zip(names, values.T, strict=True):
-            channel, desired = self._mapping.channels[name], unit_of(name)
-            unit = joint_unit(channel) if self._mapping.kind == "joints" else channel.unit
-            factor = 1.0 if desired == "code" else UNIT_SCALES[unit][1]
-            zero = UNIT_OFFSETS.get(unit, 0.0)
-            if self._mapping.kind == "joints" and by_radius(channel, desired):
-                factor *= self._radius_m or np.nan
-            with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is judged later
-                columns.append((column * channel.scale + channel.offset) * factor + zero)
-        order = [names.index(name) for name in self._mapping.channels]
-        return Converted(tuple(self._mapping.channels), np.column_stack(columns)[:, order])
-
-    def _joined(self, numbers: list[Numbers]) -> tuple[Array, list[Array]]:
-        """Return the samples of several topics at stamps that all of them have, or at those of the first."""
-        orders = [np.argsort(each.stamp_ns, kind="stable") for each in numbers]
-        stamps = [each.stamp_ns[order] for each, order in zip(numbers, orders, strict=True)]
-        values = [each.values[order] for each, order in zip(numbers, orders, strict=True)]
-        if self._mapping.join == "previous":
-            return stamps[0], [
-                values[0],
-                *(_previous(stamps[0], *o) for o in zip(stamps[1:], values[1:], strict=True)),
-            ]
-        common = stamps[0]
-        for each in stamps[1:]:
-            common = np.intersect1d(common, each)
-        n_lost = sum(each.size for each in stamps) - common.size * len(stamps)
-        if n_lost:
-            topics = " and ".join(shown(topic) for topic in self._by_topic)
-            text = f"{self._name}: {n_lost} messages of {topics} lack one of equal stamp (join: previous)"
-            self._faults.found(self._place, UNMATCHED, text, n_lost)
-        if not common.size:
-            raise LogError(
-                f"{self._place}: stream {self._name}: no two stamps of its topics agree (join: previous)"
-            )
-        return common, [
-            value[np.searchsorted(each, common)] for each, value in zip(stamps, values, strict=True)
-        ]
+def _joined(
+    place: str, name: str, mapping: StreamMapping, numbers: list[tuple[Array, Array]], faults: Faults
+) -> tuple[Array, Array]:
+    """Return the samples of several topics at stamps that all of them have, or at those of the first."""
+    orders = [np.argsort(stamps, kind="stable") for stamps, _ in numbers]
+    stamps = [each[order] for (each, _), order in zip(numbers, orders, strict=True)]
+    values = [each[order] for (_, each), order in zip(numbers, orders, strict=True)]
+    if mapping.join == "previous":
+        others = [_previous(stamps[0], *other) for other in zip(stamps[1:], values[1:], strict=True)]
+        return stamps[0], np.concatenate([values[0], *others], axis=1)
+    common = stamps[0]
+    for each in stamps[1:]:
+        common = np.intersect1d(common, each)
+    n_lost = sum(each.size for each in stamps) - common.size * len(stamps)
+    if n_lost:
+        topics = " and ".join(shown(topic) for topic in _channels_by_topic(mapping))
+        text = f"{name}: {n_lost} messages of {topics} lack one of equal stamp (join: previous)"
+        faults.found(place, UNMATCHED, text, n_lost)
+    if not common.size:
+        raise LogError(f"{place}: stream {name}: no two stamps of its topics agree (join: previous)")
+    rows = [value[np.searchsorted(each, common)] for each, value in zip(stamps, values, strict=True)]
+    return common, np.concatenate(rows, axis=1)
 
 
 def _previous(at_ns: Array, stamp_ns: Array, values: Array) -> Array:
