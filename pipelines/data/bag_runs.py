@@ -361,7 +361,7 @@ class _TopicReader:
         values = values[order][:, [self.paths[path] for path in paths]]
         kept: Array = np.ones(len(order), dtype=bool)
         if any(joint for _, joint in paths):  # a robot may send its joints in several messages
-            kept = np.isfinite(values).any(axis=1)
+            kept = np.asarray(np.isfinite(values).any(axis=1))
         return stamp_ns[order][kept], values[kept]
 
 

@@ -1,4 +1,4 @@
-"""``terrain convert``: logs of any readable layout into run folders, or into MCAP, bags of ROS 2 and CSV."""
+"""Convert logs of any readable layout into run folders, or into MCAP files, bags of ROS 2 and CSV files."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from pipelines.data.settings import MAPPING_TEXT, InspectSettings, load
+from pipelines.data.settings import MAPPING_TEXT, ROBOT_TEXT, RunsSettings, load
 from pipelines.report import (
     Progress,
     Report,
@@ -34,9 +34,11 @@ if TYPE_CHECKING:
 EXAMPLE = "terrain convert logs/ --mapping mapping.yaml --out runs/"
 
 
-class Settings(InspectSettings):
+class Settings(RunsSettings):
     """What is read, and what is written."""
 
+    data: Path = setting(..., "Folder to read, or a file of MCAP or a bag.", option="FOLDER")
+    robot: str | None = setting(None, ROBOT_TEXT)
     mapping: Path | None = setting(None, MAPPING_TEXT)
     out: Path = setting(..., "Folder of the new runs; what is there is left as it is.")
     to: Literal["runs", "mcap", "ros2", "ros2-mcap", "csv"] = setting(

@@ -28,9 +28,9 @@ ROBOT_TEXT = (
 
 
 MAPPING_TEXT = (
-    "YAML file that describes CSV files by the keys robot, run_id, terrain, streams; of a stream file, time, "
-    "channels, delimiter, decimal, skip_rows, header_rows; of time and channels column, unit; of channels "
-    "scale, offset (docs/mapping.md). With --format bag topics; with can a DBC."
+    "YAML file that describes CSV, .mat and .xlsx files by the keys robot, run_id, terrain, streams; of a stream "
+    "file, time, channels, position, delimiter, decimal, sheet, skip_rows, header_rows; of time and channels "
+    "column, unit, offset; of channels scale (docs/mapping.md). With --format bag topics; with can a DBC."
 )
 
 

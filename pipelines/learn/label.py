@@ -1,4 +1,4 @@
-"""``terrain label``: list doubtful windows, set or remove labels, have a model propose them, take answers."""
+"""Label runs: list windows of low confidence, set or remove labels, have a model propose them, take answers."""
 
 from __future__ import annotations
 
@@ -29,13 +29,12 @@ from pipelines.report.settings import Settings as BaseSettings
 from pipelines.report.settings import setting
 from terrain.errors import ConfigError, DataError
 from terrain.files.names import plain_name
-from terrain.records import Label
 
 if TYPE_CHECKING:
     from pipelines.data.labels import DoubtfulWindow, RunWindows
     from pipelines.learn.model_file import TerrainModel
     from pipelines.learn.proposals import Answered, Proposal
-    from terrain.records import RunLog
+    from terrain.records import Label, RunLog
 
 EXAMPLE = "terrain label runs/ --run GRASS_01 --from 2 --to 6 --terrain SNOW"
 
@@ -241,6 +240,7 @@ def write_labels(settings: Settings, answers: Path, out: Path) -> AnswersResult:
     from pipelines.learn.proposals import read_answers
     from terrain.files.atomic import atomic_folder
     from terrain.logs.write import write_run
+    from terrain.records import Label
 
     if out.exists():
         raise ConfigError(f"{out}: exists already; the runs are written to a folder of their own")
@@ -293,6 +293,7 @@ def _label_of(row: Answered, accept: float) -> LabelSource | None:
 def _with(labels: Sequence[LabelSource], added: LabelSource) -> list[LabelSource]:
     """Return labels with one more: a person's replaces what it covers, the model's only fills gaps."""
     from pipelines.data.labels import relabelled
+    from terrain.records import Label
 
     if added.source == "model":
         free = not any(each.start_s < added.end_s and added.start_s < each.end_s for each in labels)
