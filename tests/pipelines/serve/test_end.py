@@ -127,7 +127,10 @@ def test_a_service_that_is_ended_under_load_goes_on_after_a_restart(
     assert {file.name for file in tmp_path.iterdir()} == {f"robot-{k}.json" for k in range(N_ROBOTS)}
     saved = {file.name: json.loads(file.read_text())["state"] for file in Path(tmp_path).iterdir()}
     assert all(saved[f"robot-{k}.json"]["terrain"] == "ab"[k % 2] for k in range(N_ROBOTS))
+    ended_s = time.monotonic()
     with process(model_folder, tmp_path) as (serving, url):
+        if time.monotonic() - ended_s > 8.0:
+            pytest.skip("this machine was too slow: a terrain outlives its robot by ten seconds")
         for k in range(N_ROBOTS):
             with connect(url + "/robots") as robot:
                 robot.send(json.dumps(hello(f"robot-{k}")))
