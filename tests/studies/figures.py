@@ -1,8 +1,9 @@
 """The tables of measured figures: docs/measured.md, and the short one of README, from docs/measured/*.json.
 
-Each file holds a table: a title, texts before and after, and one record a row with what was measured, by which
-command, when, and at which commit.  A record with ``readme`` is a row of README too, under those words (and with
-``readme_command`` where its command refers to another row); the table there stands between ``<!-- measured -->`` and ``<!-- end of measured -->``.
+Each file holds a table: a title, texts before and after, and one record a row with what was measured, by
+which command, when, and at which commit.  A record with ``readme`` is a row of README too, under those words
+(and with ``readme_command`` where its command refers to another row); the table there stands between
+``<!-- measured -->`` and ``<!-- end of measured -->``.
 """
 
 from __future__ import annotations
