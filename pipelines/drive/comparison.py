@@ -506,7 +506,7 @@ def _picture(result: DriveResult, shown: Sequence[str]) -> Figure | None:
         values = [value_of(result, name, key) for name in names]
         means = [math.nan if value.mean is None else value.mean for value in values]
         low, high = zip(*(value.ci or (math.nan, math.nan) for value in values), strict=True)
-        panels.append(Panel([Bars("", names, means, low, high)], x_label=metric_label(key).with_unit))
+        panels.append(Panel([Bars(metric_label(key).with_unit, names, means, low, high)]))
     n = len(result.seeds)
     caption = "One seed, which gives no interval."
     if n > 1:

@@ -217,10 +217,9 @@ def verdict(result: PathResult) -> str:
 def _lateral_figure(result: PathResult, drive: FollowedDrive) -> Figure:
     error, ends = drive.lateral_m - result.offset_m, drive.distance_m[[0, -1]]
     most = 1.1 * min(max(result.limit_m, float(np.abs(error).max())), SHOWN_M)
-    marks = [
+    marks: list[Mark] = [
+        Band("a tenth of the speed", ends, [-result.limit_m] * 2, [result.limit_m] * 2, 6),
         Line("lateral error", drive.distance_m, error, 0),
-        Line("a tenth of the speed", ends, [result.limit_m] * 2, 6, dashed=True),
-        Line("", ends, [-result.limit_m] * 2, 6, dashed=True),
     ]
     return Figure(
         "Lateral error along the path",

@@ -316,10 +316,13 @@ def _details(result: ExplainResult) -> dict[str, list[Part]]:
     diagnosis, runs = result.diagnosis, result.diagnosed
     withdrawn, ruled_out = split_ruled_out(diagnosis)
     found: dict[str, list[Part]] = {
-        "Channel by channel": [Pairs([each.text.split(": ", 1) for each in result.statements])],
+        "Channel by channel": [Pairs([tuple(each.text.split(": ", 1)) for each in result.statements])],
         "Gain on held-out runs, channel by channel": list(_gain_parts(result.gain)),
     }
-    found["What was withdrawn, and what is unexplained"] = open_parts = []
+    open_parts: list[Part] = []
+    limits: list[Part] = []
+    health: list[Part] = []
+    found["What was withdrawn, and what is unexplained"] = open_parts
     why, z = Column("why", long=True), Column("z", Z)
     if withdrawn:
         rows = [
@@ -367,7 +370,7 @@ def _details(result: ExplainResult) -> dict[str, list[Part]]:
     if result.n_pictures is not None:
         whole = telling_runs(whole, runs.noise, result.n_pictures)
     found["Whole runs"] = [run_figure(run, runs.noise, channels_of([run])) for run in whole]
-    found["What would not have been detected"] = limits = []
+    found["What would not have been detected"] = limits
     missed = {limit.name for limit in diagnosis.not_excited}
     for is_missed, title in ((True, "not excited by the driving"), (False, "detection limit")):
         listed = [limit for limit in diagnosis.limits if (limit.name in missed) is is_missed]
@@ -379,7 +382,7 @@ def _details(result: ExplainResult) -> dict[str, list[Part]]:
     limits.append(
         Text("Not detected does not mean absent: at its limit an effect is found nine times in ten.", "note")
     )
-    found["Health of the logs"] = health = []
+    found["Health of the logs"] = health
     if diagnosis.excluded_runs:
         health.append(Table(("excluded run", why), diagnosis.excluded_runs))
     if diagnosis.clocks:

@@ -111,7 +111,11 @@ class CleanDrive:
 
 
 class Pilot(Protocol):
-    """What drives: a step from a sample to a command."""
+    """What drives: a step from a sample to a command, and the estimate behind it; ``health`` is optional."""
+
+    @property
+    def estimate(self) -> Any:
+        """Last estimate, with ``speed_x_mps``; None where there is none."""
 
     def step(self, sample: Sample) -> Command:
         """Return the command."""
