@@ -12,8 +12,6 @@ from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipelines.report.numbers import format_value
-
 if TYPE_CHECKING:
     import pandas as pd
 
@@ -56,8 +54,6 @@ class Result:
     >>> @dataclass(frozen=True)
     ... class Length(Result):
     ...     length_m: float = described("of the path", "m")
-    >>> Length(1.5)
-    Length(length_m=1.5)
     >>> Length(1.5).as_json()
     {'length_m': 1.5}
     >>> Length.schema()["properties"]["length_m"]
@@ -96,14 +92,7 @@ class Result:
         return type_schema(cls)
 
     def __repr__(self) -> str:
-        assert is_dataclass(self)
-        shown = []
-        for each in fields(self):
-            value = getattr(self, each.name)
-            if isinstance(value, bool | int | float | str) and len(shown) < 6:
-                text = format_value(value, each.metadata.get("form", ""))
-                shown.append(f"{each.name}={text if not isinstance(value, str) else repr(value)}")
-        return f"{type(self).__name__}({', '.join(shown)})"
+        return f"<{type(self).__name__}: {self.report.answer}>"
 
     def __str__(self) -> str:
         return str(self.report)

@@ -191,7 +191,7 @@ def report(result):
 
 def test_all_that_derives_from_a_result():
     found = Found("husky", "a", 0.25, (Pair(0.0, None),))
-    assert repr(found) == "Found(name='husky', kind='a', ratio=25.0\xa0%)"
+    assert repr(found) == "<Found: 25.0\xa0% of husky.>"
     assert str(found) == "25.0\xa0% of husky."
     assert "25.0" in found._repr_html_()
     assert found.as_json()["pairs"] == [{"low": 0.0, "high": None}]
