@@ -357,7 +357,7 @@ TERRAINS = (
 )
 
 RUNS = (
-    *(Shown("run", "run_id"), Shown("terrain", "terrain"), Shown("samples", "n_samples")),
+    *(Shown("run", "run_id", long=True), Shown("terrain", "terrain"), Shown("samples", "n_samples")),
     *(Shown("bins", "n_bins"), Shown("slips", "slip_range", SLIP), Shown("mass", "mass_kg", ".1f", "kg")),
     Shown("resistance over load", "resistance_ratio", SLIP),
 )

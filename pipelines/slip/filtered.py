@@ -161,7 +161,7 @@ def _tuned(runs: Sequence[RunLog], given: Robot | None, options: EstimateOptions
 
 
 RUNS = (
-    Shown("run", "run_id"),
+    Shown("run", "run_id", long=True),
     Shown("slip", "slip_mean", SLIP),
     Shown("observed", lambda row: "yes" if row.slip_observable else "blind"),
     Shown("std", "slip_std", ".4f"),
@@ -183,9 +183,11 @@ BLIND = (
 
 def report(result: EstimateResult) -> Report:
     """Return slip, its truth where it is known, and how consistent the filter was."""
-    first, all_runs = first_rows(result.runs, RUNS, f"filter {result.filter}, {result.tuning} noise")
+    blind = not all(row.slip_observable for row in result.runs)
+    columns = [each for each in RUNS if blind or each.title != "observed"]
+    first, all_runs = first_rows(result.runs, columns, f"filter {result.filter}, {result.tuning} noise")
     parts: list[Part] = [first, *(Text(sentence, "warning") for sentence in result.clocks)]
-    if not all(row.slip_observable for row in result.runs):
+    if blind:
         parts.append(Text(BLIND, "note"))
     if (tuned := result.tuned) is not None:
         scales = [f"{name} {scale:.3g} ({tuned.status[name]})" for name, scale in tuned.scales.items()]
@@ -356,7 +358,7 @@ def slip_figure(estimate: Estimate) -> Figure:
         above.append(line(f"circumference, wheel {wheel}", table.time_s, speeds_mps[:, i], i))
         ratio = shown.slip_ratio[:, i]
         if estimate.observable:
-            below.append(band("", track.time_s, ratio, 2 * slip.slip_std[:, i], i))
+            below.append(band(f"± 2 std, wheel {wheel}", track.time_s, ratio, 2 * slip.slip_std[:, i], i))
         below.append(line(f"wheel {wheel}", track.time_s, ratio, i))
         if true is not None:
             below.append(line(f"truth, wheel {wheel}", track.time_s, true[:, i], TRUTH_COLOUR, dashed=True))

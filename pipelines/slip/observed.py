@@ -119,7 +119,7 @@ SLIPS = tuple(
     Shown(title, itemgetter(i), *form)
     for i, (title, *form) in enumerate(
         (
-            *(("run",), ("slip",), ("mean", SLIP), ("std", ".4f"), ("true", SLIP)),
+            *(("run", "", "", True), ("slip",), ("mean", SLIP), ("std", ".4f"), ("true", SLIP)),
             *(("RMSE", ".4f"), ("NEES", ".2f"), ("position RMSE", ".3f", "m")),
         )
     )

@@ -36,7 +36,7 @@ class Shown(NamedTuple):
 
     Parameters
     ----------
-    title, form, unit : as :class:`pipelines.report.Column`
+    title, form, unit, long : as :class:`pipelines.report.Column`
     of : attribute of a record, or a function of it
     """
 
@@ -44,6 +44,7 @@ class Shown(NamedTuple):
     of: str | Callable[[Any], Any]
     form: str = ""
     unit: str = ""
+    long: bool = False
 
 
 def table(rows: Iterable[Any], columns: Sequence[Shown], title: str = "", note: str = "") -> Table:
@@ -55,7 +56,7 @@ def table(rows: Iterable[Any], columns: Sequence[Shown], title: str = "", note: 
     ((1.5, 1.5), (2.0, 2.0))
     """
     return Table(
-        [Column(each.title, each.form, each.unit) for each in columns],
+        [Column(each.title, each.form, each.unit, long=each.long) for each in columns],
         tuple(
             tuple(each.of(row) if callable(each.of) else getattr(row, each.of) for each in columns)
             for row in rows

@@ -318,7 +318,11 @@ def held_out_figure(wheel: WheelResult, trials: Trials, prediction: Prediction, 
             own = [rows[trials.slip_setting[rows] == speed] for speed in speeds]
             slips = [float(trials.slip_ratio[each].mean()) for each in own]
             means = [float(predicted[each].mean()) for each in own]
-            marks.append(Points("", trials.slip_ratio[rows], measured[rows], colour=number % 7))
+            marks.append(
+                Points(
+                    f"{angle:g} degrees, measured", trials.slip_ratio[rows], measured[rows], colour=number % 7
+                )
+            )
             marks.append(Line(f"{angle:g} degrees", slips, means, number % 7))
         panels.append(Panel(tuple(marks), label))
     title = (

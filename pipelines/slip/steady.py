@@ -267,7 +267,9 @@ def operating_figure(
         marks.append(Points(label_of, points[name].slip_ratio, height, colour=number % 7))
         known = height[np.isfinite(height)]
         if known.size and np.isfinite(row.slip.interval).all():
-            marks.append(Line("", list(row.slip.interval), [float(np.median(known))] * 2, number % 7))
+            marks.append(
+                Line(f"{name}, 95 %", list(row.slip.interval), [float(np.median(known))] * 2, number % 7)
+            )
     return Figure(
         f"Steady slip of {robot}, measured from outside",
         (Panel(tuple(marks), label),),
