@@ -321,7 +321,6 @@ def _extras(
 
 def _notes(samples: Samples, recipe: WindowPipeline, settings: EvaluationSettings) -> Iterator[str]:
     """Yield in sentences what a reader of the figures must know."""
-    from pipelines.learn.own import OwnClassifier
     from pipelines.learn.protocols import PROTOCOLS, notes_of
     from terrain.classify.svm import GroupedSVC
 
@@ -331,9 +330,10 @@ def _notes(samples: Samples, recipe: WindowPipeline, settings: EvaluationSetting
     yield from notes_of(samples, protocol)
     if not isinstance(classifier, GroupedSVC) and settings.extras and protocol == "grouped":
         yield f"speed alone, slow against fast and the learning curve are of recipe {CHECKED_WITH!r}"
-    if isinstance(classifier, OwnClassifier) and classifier.outputs == "decision_function":
+    outputs = getattr(classifier, "outputs", "predict_proba")  # of a classifier of one's own
+    if outputs == "decision_function":
         yield "the classifier gives no probabilities: its decisions were calibrated on inner held-out runs"
-    if isinstance(classifier, OwnClassifier) and classifier.outputs == "predict":
+    if outputs == "predict":
         yield "the classifier gives no probabilities: each prediction counts as certain"
     if protocol == "leave-terrain-out":
         yield "accuracy and the table of classes are of folds in which all terrains are known"
