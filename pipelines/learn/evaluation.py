@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -37,8 +37,8 @@ if TYPE_CHECKING:
     from features.motion import Motion
     from pipelines.learn.checks import LearningCurve, LeftOutTerrain, SlowFast, StiffnessFigures
     from pipelines.learn.coverage import NextDrive, SupportRow
-    from pipelines.learn.evaluate import FoldFigures, HeldOut
-    from pipelines.learn.protocols import Samples
+    from pipelines.learn.evaluate import Examples, FoldFigures, HeldOut
+    from pipelines.learn.protocols import Fold, Samples
     from pipelines.learn.recipes import WindowPipeline
     from pipelines.learn.sequences import Breakaway, DelayFigures, SequenceFigures
     from terrain.classify.confidence import CoverageFigures, ReliabilityBin
@@ -190,6 +190,7 @@ def evaluate_recipe(
     settings: EvaluationSettings,
     progress: Progress = silent,
     cached: tuple[Any, Motion | None] | None = None,
+    ask: Callable[[Examples, Fold], Callable[[Any], Any] | None] | None = None,
 ) -> tuple[CrossvalResult, HeldOut]:
     """Evaluate a recipe on windows by the protocol of the settings; also return its held-out probabilities.
 
@@ -199,7 +200,8 @@ def evaluate_recipe(
     samples : labelled windows with their groups
     settings : protocol, repeats, seed, processes and extras
     progress : called as the work goes on
-    cached : features (n, f) and motion of the windows, where the windows have no samples
+    cached : features (n, f) and motion of the windows, where they are there already
+    ask : gives for each fold what is called with its fitted classifier; not together with extras
 
     Raises
     ------
@@ -226,6 +228,8 @@ def evaluate_recipe(
     follow: list[Any] | None = None
     if beside and samples.runs:
         follow = [*following(recipe, samples, settings.rule, folds, seed)]
+    elif ask is not None:
+        follow = [ask(examples, fold) for fold in folds]
     held_out = evaluate(recipe[-1], examples, folds, jobs, protocol, progress, follow)
     published = protocol == "published"
     signal_sets = tuple(getattr(recipe[0], "signal_sets", settings.signal_sets))
