@@ -258,17 +258,6 @@ def test_a_token_is_asked_for(running, model_folder, opened, monkeypatch):
         shows(page, "#connection", "live")
 
 
-def test_a_robot_that_sends_nothing_more_is_not_shown_as_live(service, opened):
-    with TerrainClient(service.ws, "silent", "mower", CHANNELS, rate_hz=0.0) as client:
-        client.send({"imu": ([0.0], [[0.1]])}, step=True)
-        page = opened(service)
-        shows(page, "#connection", "live")
-        shows(page, "#connection", "no step of this robot for", 3.0)
-        assert page.evaluate("document.body.classList.contains('stale')")
-        client.send({"imu": ([0.1], [[0.1]])}, step=True)
-        shows(page, "#connection", "live")
-
-
 def test_names_with_markup_are_text(running, mower_model, model_folder, tmp_path, opened):
     classes = tuple(MARKUP if name == "b" else name for name in mower_model.info.classes)
     recipe = copy.deepcopy(mower_model.recipe)

@@ -58,7 +58,8 @@ def test_a_robot_gets_the_terrain_and_target_slips_of_its_samples(
     assert list(windows) == [one.start_s for one in found]
     for one in found:
         assert windows[one.start_s]["terrain"] == one.terrain
-        assert windows[one.start_s]["probabilities"] == pytest.approx(dict(one.probabilities), abs=1e-12)
+        expected = dict(zip(one.classes, one.probabilities.tolist(), strict=True))
+        assert windows[one.start_s]["probabilities"] == pytest.approx(expected, abs=1e-12)
     assert seen[-1]["terrain"] == "b"
     assert (
         seen[-1]["target_slip"]["traction"]["slip_ratio"]
@@ -97,12 +98,6 @@ def test_a_step_of_old_samples_is_no_latest_step(service):
         assert client.latest(60.0)["time_s"] == 10.0
 
 
-def test_commands_at_a_rate_at_which_every_step_is_a_clock_that_was_set_are_refused(service, hello):
-    with service.socket() as socket:
-        answer = talk(socket, False)(hello("slow", control=True, rate_hz=1.0))
-    assert (answer["code"], "5 Hz or more" in answer["message"]) == ("malformed", True)
-
-
 @pytest.mark.parametrize(
     ("given", "time_s"), [(7, 7.0), (7.5, 7.5), ("x", None), (None, None), (10**400, None)]
 )
@@ -137,19 +132,6 @@ def test_the_client_waits_for_steps_and_says_what_went_wrong(service):
         TerrainClient("ws://127.0.0.1:1", "x", "mower", CHANNELS)
     with pytest.raises(ServiceError, match="neither measured nor estimated"):
         TerrainClient(service.ws, "x", "mower", {"imu": ["gyro_z_radps"]})
-
-
-def test_robots_are_kept_apart(service, hello, messages, two_drives):
-    with service.socket() as one, service.socket() as other:
-        says = [talk(one, False), talk(other, True)]
-        for k, say in enumerate(says):
-            assert say(hello(f"apart-{k}"))["type"] == "welcome"
-        for pair in zip(messages(two_drives[0]), messages(two_drives[3]), strict=True):
-            last = [say(message) for say, message in zip(says, pair, strict=True)]
-            time.sleep(0.0005)
-        assert [one["observation"]["terrain"] for one in last] == ["a", "b"]
-        listed = {one["session"]: one for one in json.loads(service.get("/sessions")[1])}
-        assert {listed[f"apart-{k}"]["terrain"] for k in (0, 1)} == {"a", "b"}
 
 
 def test_commands_are_asked_for_and_stop_with_the_desired_motion(running, model_folder):
@@ -205,14 +187,6 @@ def test_figures_are_in_the_form_of_prometheus(service, hello, messages, two_dri
     assert 1e7 < during["terrain_memory_bytes"] < 1e10
 
 
-def test_the_http_side_is_described(service):
-    described = json.loads(service.get("/openapi.json")[1])
-    assert {"/health", "/ready", "/metrics", "/model", "/table", "/sessions"} <= set(described["paths"])
-    for path, methods in described["paths"].items():
-        for method in methods.values():
-            assert method.get("description") or method.get("summary"), path
-
-
 def test_another_model_is_put_in_while_a_robot_is_served_and_no_window_is_lost(
     running, model_folder, hello, messages, two_drives
 ):
@@ -255,17 +229,6 @@ def test_what_cannot_be_served_is_refused_and_the_old_goes_on(service, place, co
     assert fault in text
     assert "Traceback" not in text
     assert service.hub.served.number == number
-
-
-def test_a_damaged_model_is_refused(service, model_folder, tmp_path):
-    for file in model_folder.iterdir():
-        (tmp_path / file.name).write_bytes(file.read_bytes())
-    content = bytearray((tmp_path / "model.skops").read_bytes())
-    content[len(content) // 2] ^= 1
-    (tmp_path / "model.skops").write_bytes(content)
-    status, text = service.put("/model", {"uri": str(tmp_path)})
-    assert (status, service.hub.served.number) == (409, 1)
-    assert "is damaged" in text
 
 
 def test_a_session_that_is_silent_is_taken_by_its_robot_that_comes_back(service, hello, monkeypatch):
