@@ -136,6 +136,8 @@
         values: (u, splits) => categories ? splits.map((i) => shortened(categories[i] ?? "", width * 0.42)) : splits.map(written) },
     ];
     if (categories) axes[1].splits = () => categories.map((_, i) => i);
+    if (panel.log_x) Object.assign(axes[0], { splits: (u, axis, low, high) => decades(low, high),
+      values: (u, splits) => splits.map(written), filter: (u, splits) => splits });
     const u = new uPlot({
       width, height, series, axes, title: panel.title || undefined,
       legend: { show: series.length > 2 || !panel.y_label, live: !categories },
@@ -172,6 +174,14 @@
   const ruler = document.createElement("canvas").getContext("2d");
   ruler.font = "12px system-ui, sans-serif";
   const widthOf = (text) => ruler.measureText(text).width;
+  // uPlot's own ticks of a logarithmic axis need one that begins at a power of ten
+  function decades(low, high) {
+    const found = [];
+    for (let power = Math.floor(Math.log10(low)); power <= Math.log10(high); power++)
+      for (const first of [1, 2, 5]) found.push(+`${first}e${power}`);
+    return found.filter((value) => value >= low && value <= high);
+  }
+
   const shortened = (name, room) => {
     if (widthOf(name) + 20 <= room) return name;
     const most = Math.max(6, Math.floor((room - 20) * name.length / widthOf(name)));
@@ -192,7 +202,7 @@
   }
   function drawVisible() {
     for (const holder of document.querySelectorAll(".plot"))
-      if (holder.clientWidth > 0 && holder.dataset.width !== String(holder.clientWidth)) draw(holder);
+      if (!holder.closest("details:not([open])") && holder.clientWidth > 0 && holder.dataset.width !== String(holder.clientWidth)) draw(holder);
   }
   let waiting = 0;
   addEventListener("resize", () => { clearTimeout(waiting); waiting = setTimeout(drawVisible, 150); });
