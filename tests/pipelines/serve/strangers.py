@@ -1,9 +1,8 @@
-"""Connections that keep to no rule, and a robot that drives beside them."""
+"""Connections that keep to no rule."""
 
 import json
 import socket
 import struct
-import threading
 import time
 from contextlib import contextmanager
 from urllib.parse import urlsplit
@@ -53,45 +52,3 @@ def raw(service, first=None, buffer=None):
             connection.sendall(frame(json.dumps(first).encode()))
             assert b"welcome" in connection.recv(8192)
         yield connection
-
-
-@contextmanager
-def beside(service, hello, messages, run):
-    """A robot that drives while the block runs; afterwards each of its steps is judged."""
-    answers, ended, failed = [], threading.Event(), []
-
-    def drive():
-        try:
-            with service.socket() as robot:
-                robot.send(json.dumps(hello("beside")))
-                robot.recv(10)
-                k = 0
-                while not ended.is_set() or not answers:
-                    for message in messages(run):
-                        if k and ended.is_set():
-                            break
-                        shifted = {
-                            name: [[stamp + 12.0 * k for stamp in stamps], rows]
-                            for name, (stamps, rows) in message["streams"].items()
-                        }
-                        time_s = message["time_s"] + 12.0 * k
-                        robot.send(json.dumps({**message, "streams": shifted, "time_s": time_s}))
-                        answers.append((time_s, json.loads(robot.recv(10))))
-                        time.sleep(0.001)
-                    k += 1
-        except BaseException as error:
-            failed.append(error)
-
-    thread = threading.Thread(target=drive)
-    thread.start()
-    try:
-        yield answers
-    finally:
-        ended.set()
-        thread.join(30)
-    assert not failed, failed
-    assert [answer["number"] for _, answer in answers] == list(range(1, len(answers) + 1))
-    for time_s, answer in answers:
-        assert (answer["type"], answer["time_s"]) == ("step", time_s)
-        assert answer["observation"]["terrain"] in (None, "b")
-    assert answers[-1][1]["observation"]["terrain"] == "b"

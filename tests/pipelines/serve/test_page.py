@@ -1,17 +1,13 @@
 """The page in a real browser: what it shows, and that it goes on when robots and the service come and go."""
 
-import copy
 import shutil
 import threading
 import time
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from pipelines.learn.model_file import write_model
 from pipelines.serve.client import TerrainClient
 from terrain.control.slip_table import load_slip_table
 
@@ -258,19 +254,12 @@ def test_a_token_is_asked_for(running, model_folder, opened, monkeypatch):
         shows(page, "#connection", "live")
 
 
-def test_names_with_markup_are_text(running, mower_model, model_folder, tmp_path, opened):
-    classes = tuple(MARKUP if name == "b" else name for name in mower_model.info.classes)
-    recipe = copy.deepcopy(mower_model.recipe)
-    recipe[-1].classes_ = np.array(classes)
-    write_model(
-        tmp_path, mower_model._replace(recipe=recipe, info=replace(mower_model.info, classes=classes))
-    )
-    with running(model=str(tmp_path)) as service:
-        hub = service.hub
-        hub.trouble["<b>"] = MARKUP
-        with robot(service):
-            page = opened(service)
-            shows(page, "#trouble", MARKUP)
-            shows(page, "#window", "last window")
-            assert page.query_selector("main img") is None
-            assert page.title() == "Terrain, live"
+def test_names_with_markup_are_text(service, opened):
+    service.hub.trouble["<b>"] = MARKUP
+    with robot(service):
+        page = opened(service)
+        shows(page, "#trouble", MARKUP)
+        shows(page, "#answer", MARKUP)
+        assert page.query_selector("main img") is None
+        assert page.title() == "Terrain, live"
+    del service.hub.trouble["<b>"]
