@@ -38,7 +38,7 @@ from terrain.errors import DataError
 from terrain.records import RunLog, SlipTarget, TargetStatus
 from terrain.robots import Robot
 from terrain.slip_learning.curve import N_BOOTSTRAP
-from terrain.slip_learning.learn import FILTER, LearnedTerrain, TerrainRun, learn_terrain, terrain_runs
+from terrain.slip_learning.learn import FILTER, LearnedTerrain, TerrainRun, learn_terrains
 from terrain.slip_learning.peak import PeakStatus
 
 if TYPE_CHECKING:
@@ -199,12 +199,9 @@ def learn_curves(
     labelled = [run for run in runs if run.labels]
     if not labelled:
         raise DataError(f"none of {len(runs)} runs has a label: curves are learned by terrain")
-    used, measured, faulty = _measured(labelled, robot, skip_faulty, progress)
-    learned = []
-    terrains = sorted({run.terrain for run in measured})
-    for done, terrain in enumerate(terrains, start=1):
-        learned.append(learn_terrain(terrain, [run for run in measured if run.terrain == terrain], seed))
-        progress("learn", done, len(terrains))
+    used, measured, learned, faulty = learn_terrains(
+        labelled, robot, seed, skip_faulty=skip_faulty, progress=progress
+    )
     table = learned_table(learned, robot, name=name)
     result = LearnSlipResult(
         table=None,
@@ -223,27 +220,6 @@ def learn_curves(
         pictures=curve_figures(learned, robot.name),
     )
     return table, result
-
-
-def _measured(
-    runs: Sequence[RunLog], robot: Robot, skip_faulty: bool, progress: Progress
-) -> tuple[list[RunLog], list[TerrainRun], list[str]]:
-    """Return the runs that were used, their measurements, and a sentence for each faulty run."""
-    used: list[RunLog] = []
-    measured: list[TerrainRun] = []
-    faulty: list[str] = []
-    for done, run in enumerate(runs, start=1):
-        try:
-            measured += terrain_runs(run, robot)
-            used.append(run)
-        except DataError as error:
-            if not skip_faulty:
-                raise
-            faulty.append(f"run skipped: {error}")
-        progress("filter", done, len(runs))
-    if not used:
-        raise DataError("no run has what slip curves are learned from: labels, currents and attitude")
-    return used, measured, faulty
 
 
 def _run_row(run: TerrainRun) -> RunRow:

@@ -10,6 +10,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from features.response import ResponseExtractor
+from features.windows import WindowRule, cut_windows, layout_of
+from pipelines.data.regimes import regime_of
 from pipelines.report import (
     Bars,
     Figure,
@@ -28,7 +31,6 @@ from pipelines.report import (
     silent,
 )
 from pipelines.slip.filtered import Keep
-from pipelines.slip.predicted import PredictionFigures, cases_of, predictions
 from pipelines.slip.shown import Shown, frame, sections, table
 from terrain.errors import DataError
 from terrain.measured_slip.delay import Delay, DelayStatus
@@ -43,6 +45,7 @@ from terrain.measured_slip.measure import (
     rollers_of,
     single_terrain,
 )
+from terrain.measured_slip.prediction_scores import Cases, PredictionFigures, predictions
 from terrain.measured_slip.rollers import RollerFindings
 from terrain.measured_slip.slips import MeasuredSlip, measured_slip
 from terrain.measured_slip.surfaces import SurfaceSlip, surface_slip
@@ -179,6 +182,46 @@ def _hand_over(found: Measured, robot: Robot, keep: Keep, progress: Progress) ->
         )
         keep(replace(run, streams={**run.streams, "slip": slip.track.as_stream()}), dict)
         progress("write runs", done, len(found.runs))
+
+
+def cases_of(runs: Sequence[RunLog], measured: Sequence[MeasuredSlip], window_s: float) -> Cases:
+    """Return the windows of runs whose slip was measured in steady motion.
+
+    Raises
+    ------
+    DataError
+        if the runs have no currents, or no window has a slip.
+    """
+    starts = {each.run_id: each.start_s[each.steady & np.isfinite(each.body_slip)] for each in measured}
+    chosen = [run for run in runs if starts.get(run.run_id, np.empty(0)).size]
+    if not chosen:
+        raise DataError(
+            f"no window of {window_s:g} s has a measured slip in steady motion that could be predicted; a "
+            "shorter --window may"
+        )
+    rule = WindowRule(window_s, None, None)
+    layout = layout_of(chosen, ("wheels", "currents"), speeds=True)
+    windows = cut_windows(chosen, rule, layout=layout, starts_s=starts, skip_short=True).windows
+    extractor = ResponseExtractor(("wheels", "currents")).fit(windows)
+    slips = {
+        (each.run_id, round(float(start_s), 6)): slip
+        for each in measured
+        for start_s, slip in zip(each.start_s, each.body_slip, strict=True)
+    }
+    slip = np.array(
+        [slips[run_id, round(float(s), 6)] for run_id, s in zip(windows.run_id, windows.start_s, strict=True)]
+    )
+    about = {run.run_id: (run.terrains, run.session, regime_of(run)) for run in chosen}
+    of_windows = [about[name] for name in windows.run_id]
+    return Cases(
+        extractor.transform(windows),
+        extractor.columns_,
+        slip,
+        windows.run_id.astype(str),
+        np.array([terrains[0] if len(terrains) == 1 else "" for terrains, _, _ in of_windows]),
+        np.array([session for _, session, _ in of_windows]),
+        np.array([regime for _, _, regime in of_windows]),
+    )
 
 
 SURFACES = (

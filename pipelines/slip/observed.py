@@ -115,14 +115,15 @@ def observe_runs(
     return ObservedResult(options.filter, options.slip_model, None, tuple(rows), (), pictures)
 
 
-SLIPS = tuple(
-    Shown(title, itemgetter(i), *form)
-    for i, (title, *form) in enumerate(
-        (
-            *(("run", "", "", True), ("slip",), ("mean", SLIP), ("std", ".4f"), ("true", SLIP)),
-            *(("RMSE", ".4f"), ("NEES", ".2f"), ("position RMSE", ".3f", "m")),
-        )
-    )
+SLIPS = (
+    *(
+        Shown("run", itemgetter(0), long=True),
+        Shown("slip", itemgetter(1)),
+        Shown("mean", itemgetter(2), SLIP),
+    ),
+    *(Shown("std", itemgetter(3), ".4f"), Shown("true", itemgetter(4), SLIP)),
+    *(Shown("RMSE", itemgetter(5), ".4f"), Shown("NEES", itemgetter(6), ".2f")),
+    Shown("position RMSE", itemgetter(7), ".3f", "m"),
 )
 
 NOT_ESTIMATED = {"not estimated": ObservedSlip(*[math.nan] * 5)}

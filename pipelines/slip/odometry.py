@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-
-import numpy as np
-from scipy.stats import t as student
 
 from pipelines.data.datasets import drive_robot
 from pipelines.data.settings import load
@@ -25,24 +22,12 @@ from pipelines.report import (
     silent,
 )
 from pipelines.slip.shown import Shown, frame, sections, table
-from terrain.calibration.adaptive_legs import dead_reckoning, efficiencies_before, of_point
-from terrain.calibration.odometry_fit import (
-    ENCODER,
-    GYRODOMETRY,
-    SLIP,
-    FittedOdometry,
-    fit_odometry,
-    level,
-    without_tilt,
-)
-from terrain.calibration.odometry_judge import KindScore, LegScores, held_out_ends, score_legs
-from terrain.calibration.odometry_legs import Leg, legs_of_poses, legs_of_windows
-from terrain.errors import ConfigError, DataError
-from terrain.estimation.observers.slip_model import PARAMETERS
+from terrain.calibration.odometry import ParameterFound, judge_odometry
+from terrain.calibration.odometry_judge import KindScore, LegScores
+from terrain.errors import ConfigError
 from terrain.estimation.observers.slip_model_file import check_slip_model_file, write_slip_model
 from terrain.logs.drive import FILE_NAME, find_sessions
 from terrain.logs.drive_poses import WindowPoses, read_window_poses
-from terrain.records import Array, RunLog
 from terrain.robots import TrackedRobot, as_drive, load_robot
 
 if TYPE_CHECKING:
@@ -53,21 +38,9 @@ if TYPE_CHECKING:
 SHORTEST_S, LONGEST_S = 0.2, 3600.0
 """Legs that are compared: the shortest has two poses of a lidar."""
 
-SHORT_RATIO = 0.8
-"""A command's leg that is so much shorter than the longest of all is left out: its windows are not whole."""
-
-ADAPTIVE = "adaptive observer"
+FLAT = "no slope was driven, or no tilt measured: what slopes do is not fitted"
 
 RMSE = ".3f"
-
-
-@dataclass(frozen=True, slots=True)
-class ParameterFound:
-    """A parameter of a slip model: its value and its 95 % interval, NaN where it was not fitted."""
-
-    value: float
-    low: float
-    high: float
 
 
 @dataclass(frozen=True)
@@ -118,48 +91,32 @@ def calibrate_odometry(settings: Settings, robot_name: str, progress: Progress =
         raise ConfigError(f"--lengths: {SHORTEST_S:g} to {LONGEST_S:g} seconds are accepted")
     if settings.out is not None:
         check_slip_model_file(settings.out)
-    delay_s = robot.identified.get("lidar_delay_s", 0.0)
     windows = _windows(settings.data, robot)
-    groups = (
-        _window_groups(runs, windows, robot, delay_s)
-        if windows
-        else {f"{length:g} s": _pose_legs(runs, robot, length) for length in settings.lengths}
+    found = judge_odometry(
+        runs,
+        windows,
+        robot,
+        settings.lengths,
+        settings.folds,
+        settings.seed,
+        lambda done, total: progress("odometry", done, total),
     )
-    groups = {name: legs for name, legs in groups.items() if legs}
-    if not groups:
-        raise DataError(
-            f"{settings.data}: no run has poses of a camera or lidar, beside tracks and gyro, over "
-            f"{' or '.join(f'{length:g}' for length in settings.lengths)} s"
-        )
-    ends = held_out_ends(
-        groups, robot, settings.folds, settings.seed, lambda done, total: progress("odometry", done, total)
-    )
-    scores = tuple(
-        score_legs(legs, {kind: by[name] for kind, by in ends.items()}, settings.seed)
-        for name, legs in groups.items()
-    )
-    every = [leg for legs in groups.values() for leg in legs]
-    n_runs = len({leg.run for leg in every})
-    flat = without_tilt(every)
-    fitted = fit_odometry(level(SLIP) if flat else SLIP, every, robot)
-    adaptive = None
-    if windows:
-        adaptive = _adaptive(runs, windows, groups, ends, robot, delay_s, fitted.mount, settings.seed)
     if settings.out is not None:
-        write_slip_model(settings.out, fitted.model, robot.name)
+        write_slip_model(settings.out, found.fitted.model, robot.name)
+    x_m, y_m, angle_rad = map(float, found.fitted.mount)
     return OdometryResult(
         robot=robot.name,
         seed=settings.seed,
         folds=settings.folds,
-        n_runs=n_runs,
-        scores=scores,
-        parameters=_parameters(fitted, n_runs),
-        observed_point_m=(float(fitted.mount[0]), float(fitted.mount[1])),
-        observed_angle_rad=float(fitted.mount[2]),
-        delay_s=delay_s if windows else 0.0,
-        adaptive=adaptive,
+        n_runs=found.n_runs,
+        scores=found.scores,
+        parameters=found.parameters,
+        observed_point_m=(x_m, y_m),
+        observed_angle_rad=angle_rad,
+        delay_s=found.delay_s,
+        adaptive=found.adaptive,
         written=settings.out,
-        notes=("no slope was driven, or no tilt measured: what slopes do is not fitted",) if flat else (),
+        notes=(FLAT,) if found.flat else (),
     )
 
 
@@ -219,65 +176,3 @@ def _windows(folder: Path, robot: TrackedRobot) -> Mapping[str, tuple[WindowPose
     if not folder.is_dir() or not any((path / FILE_NAME).is_file() for path in find_sessions(folder)):
         return {}
     return read_window_poses(folder, drive_robot(robot))
-
-
-def _window_groups(
-    runs: Sequence[RunLog],
-    windows: Mapping[str, tuple[WindowPoses, ...]],
-    robot: TrackedRobot,
-    delay_s: float,
-) -> dict[str, list[Leg]]:
-    single: list[Leg] = []
-    chained: list[Leg] = []
-    for number, run in enumerate(runs):
-        own, whole = legs_of_windows(run, number, windows.get(run.run_id, ()), robot, delay_s)
-        single += own
-        chained += [whole] if whole is not None else []
-    longest_s = max((leg.length_s for leg in chained), default=0.0)
-    return {"window": single, "command": [leg for leg in chained if leg.length_s > SHORT_RATIO * longest_s]}
-
-
-def _pose_legs(runs: Sequence[RunLog], robot: TrackedRobot, length_s: float) -> list[Leg]:
-    return [
-        leg
-        for number, run in enumerate(runs)
-        if "pose" in run.streams
-        for leg in legs_of_poses(run, number, robot, length_s)
-    ]
-
-
-def _parameters(fitted: FittedOdometry, n_runs: int) -> dict[str, ParameterFound]:
-    """Return the fitted parameters, with intervals by Student's t over runs: the clusters of the fit."""
-    std = np.sqrt(np.diag(fitted.model.covariance))
-    wide = float(student.ppf(0.975, max(n_runs - 1, 1)))
-    reach = np.where(np.isin(np.arange(len(std)), fitted.kind.free), wide * std, np.nan)
-    return {
-        name: ParameterFound(float(value), float(value - half), float(value + half))
-        for name, value, half in zip(PARAMETERS, fitted.model.vector, reach, strict=True)
-        if np.isfinite(half)
-    }
-
-
-def _adaptive(
-    runs: Sequence[RunLog],
-    windows: Mapping[str, tuple[WindowPoses, ...]],
-    groups: Mapping[str, Sequence[Leg]],
-    ends: Mapping[str, Mapping[str, Array]],
-    robot: TrackedRobot,
-    delay_s: float,
-    mount: Array,
-    seed: int,
-) -> LegScores | None:
-    """Return the scores over the last windows of commands."""
-    single = groups["window"]
-    last_of = {leg.run: k for k, leg in enumerate(single)}
-    chosen, predicted = [], []
-    for number, run in enumerate(runs):
-        eta = efficiencies_before(run, windows.get(run.run_id, ()), robot, delay_s, mount)
-        if eta is not None and number in last_of:
-            chosen.append(last_of[number])
-            predicted.append(of_point(dead_reckoning(single[last_of[number]], eta, robot), mount))
-    if len(chosen) < 2:
-        return None
-    compared = {kind.name: ends[kind.name]["window"][chosen] for kind in (ENCODER, GYRODOMETRY)}
-    return score_legs([single[k] for k in chosen], compared | {ADAPTIVE: np.array(predicted)}, seed)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -137,3 +137,65 @@ def learn_terrain(
     if (why := contradiction(curve)) is not None:
         return LearnedTerrain(terrain, tuple(runs), TargetStatus.INVALID, why, curve)
     return LearnedTerrain(terrain, tuple(runs), TargetStatus.ESTIMATED, "", curve, targets_of(curve))
+
+
+class LearnedRuns(NamedTuple):
+    """What was learned of runs.
+
+    Parameters
+    ----------
+    used : runs that were measured
+    measured : each on each of its terrains
+    terrains : what was learned, by name
+    faulty : a sentence for each run that was left out
+    """
+
+    used: list[RunLog]
+    measured: list[TerrainRun]
+    terrains: list[LearnedTerrain]
+    faulty: list[str]
+
+
+def learn_terrains(
+    runs: Sequence[RunLog],
+    robot: Robot,
+    seed: int,
+    *,
+    skip_faulty: bool = False,
+    progress: Callable[[str, int, int], None] = lambda task, done, total: None,
+) -> LearnedRuns:
+    """Measure labelled runs and learn each terrain.
+
+    Parameters
+    ----------
+    runs : labelled, of the robot
+    robot : whose they are
+    seed : of the bootstrap
+    skip_faulty : leave out runs that lack something, in place of refusing them
+    progress : gets the task, how many of its steps are done, and how many there are
+
+    Raises
+    ------
+    DataError
+        if a run is another robot's or lacks currents or attitude, or none is left.
+    """
+    used: list[RunLog] = []
+    measured: list[TerrainRun] = []
+    faulty: list[str] = []
+    for done, run in enumerate(runs, start=1):
+        try:
+            measured += terrain_runs(run, robot)
+            used.append(run)
+        except DataError as error:
+            if not skip_faulty:
+                raise
+            faulty.append(f"run skipped: {error}")
+        progress("filter", done, len(runs))
+    if not used:
+        raise DataError("no run has what slip curves are learned from: labels, currents and attitude")
+    learned = []
+    terrains = sorted({run.terrain for run in measured})
+    for done, terrain in enumerate(terrains, start=1):
+        learned.append(learn_terrain(terrain, [run for run in measured if run.terrain == terrain], seed))
+        progress("learn", done, len(terrains))
+    return LearnedRuns(used, measured, learned, faulty)

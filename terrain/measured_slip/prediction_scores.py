@@ -1,24 +1,19 @@
-"""Slip predicted from currents and wheel speeds alone, on runs that were held out."""
+"""How well slip is predicted from currents and wheel speeds alone, on runs that were held out."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
-from features.response import ResponseExtractor
-from features.windows import WindowRule, cut_windows, layout_of
-from pipelines.data.regimes import regime_of
-from pipelines.report import Progress, silent
 from terrain.bootstrap import bootstrap_rows, percentile_interval
 from terrain.classify.folds import split_runs
 from terrain.classify.response import ResponseColumns
 from terrain.errors import DataError
 from terrain.measured_slip.predict import PredictedSlip, SlipRegressor
-from terrain.measured_slip.slips import MeasuredSlip
-from terrain.records import Array, RunLog
+from terrain.records import Array
 
 N_FOLDS = 5
 N_DRAWS = 1000
@@ -79,48 +74,11 @@ class Cases(NamedTuple):
         )
 
 
-def cases_of(runs: Sequence[RunLog], measured: Sequence[MeasuredSlip], window_s: float) -> Cases:
-    """Return the windows of runs whose slip was measured in steady motion.
-
-    Raises
-    ------
-    DataError
-        if the runs have no currents, or no window has a slip.
-    """
-    starts = {each.run_id: each.start_s[each.steady & np.isfinite(each.body_slip)] for each in measured}
-    chosen = [run for run in runs if starts.get(run.run_id, np.empty(0)).size]
-    if not chosen:
-        raise DataError(
-            f"no window of {window_s:g} s has a measured slip in steady motion that could be predicted; a "
-            "shorter --window may"
-        )
-    rule = WindowRule(window_s, None, None)
-    layout = layout_of(chosen, ("wheels", "currents"), speeds=True)
-    windows = cut_windows(chosen, rule, layout=layout, starts_s=starts, skip_short=True).windows
-    extractor = ResponseExtractor(("wheels", "currents")).fit(windows)
-    slips = {
-        (each.run_id, round(float(start_s), 6)): slip
-        for each in measured
-        for start_s, slip in zip(each.start_s, each.body_slip, strict=True)
-    }
-    slip = np.array(
-        [slips[run_id, round(float(s), 6)] for run_id, s in zip(windows.run_id, windows.start_s, strict=True)]
-    )
-    about = {run.run_id: (run.terrains, run.session, regime_of(run)) for run in chosen}
-    of_windows = [about[name] for name in windows.run_id]
-    return Cases(
-        extractor.transform(windows),
-        extractor.columns_,
-        slip,
-        windows.run_id.astype(str),
-        np.array([terrains[0] if len(terrains) == 1 else "" for terrains, _, _ in of_windows]),
-        np.array([session for _, session, _ in of_windows]),
-        np.array([regime for _, _, regime in of_windows]),
-    )
-
-
 def predictions(
-    cases: Cases, hold_out: Sequence[str], seed: int, progress: Progress = silent
+    cases: Cases,
+    hold_out: Sequence[str],
+    seed: int,
+    progress: Callable[[str, int, int], None] = lambda task, done, total: None,
 ) -> list[PredictionFigures]:
     """Return how well slip is predicted on runs, on regimes, and on what was never trained on.
 
