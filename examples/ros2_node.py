@@ -10,8 +10,8 @@ from rclpy.node import Node
 from sensor_msgs.msg import Imu, JointState
 from std_msgs.msg import Float64, String
 
+from pipelines.learn.model_file import read_model
 from pipelines.live.observer import Observer
-from pipelines.models.model_files import read_model
 from terrain.records import Reading
 
 IMU = (*(f"gyro_{axis}_radps" for axis in "xyz"), *(f"accel_{axis}_mps2" for axis in "xyz"))

@@ -21,4 +21,9 @@ class Settings(runs.Settings):
 
 def run(settings: Settings, progress: Progress = silent) -> Result:
     """Return the quality of runs, or the card of a model."""
+    uri = str(settings.data)
+    if uri.startswith(("models:/", "runs:/")) or (settings.data / "terrain_model.json").is_file():
+        from pipelines.learn.card import model_result
+
+        return model_result(uri)
     return runs.run(settings, progress)

@@ -43,6 +43,8 @@ COMMANDS: tuple[Command, ...] = (
         "pipelines.learn.crossval",
         "recipes or models on runs and sessions held out, side by side",
     ),
+    Command("Terrain", "train", "pipelines.learn.train", "evaluate, fit, track, register"),
+    Command("Terrain", "predict", "pipelines.learn.predict", "terrain or unknown, target slip"),
     Command("Slip", "learn-slip", "pipelines.slip.learn_slip", "slip curves and target slips"),
     Command(
         "Reality",
@@ -68,6 +70,9 @@ FORMER: dict[str, str] = {
     "bench": "use python tests/studies live, soak, scale or labels, in the repository",
     "explain-trials": "use python tests/studies trials, in the repository",
     "reproduce": "use python examples/papers PAPER, in the repository",
+    "features": "use terrain crossval or train with --cache DIR",
+    "sweep": "use terrain train --search N",
+    "find-changes": "use terrain predict --changes DIR",
     "compare": "name several recipes or models in terrain crossval, as --recipe svm,cnn",
     "faults": "use terrain drive --faults NAME,...",
     "track": "use terrain drive --path FILE",

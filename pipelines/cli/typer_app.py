@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from pipelines.cli import classify, features, quickstart, slip
+from pipelines.cli import quickstart
 
 app = typer.Typer(
     name="terrain",
@@ -15,7 +15,7 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 
-GROUPS = (features.app, classify.app, slip.app, quickstart.app)
+GROUPS = (quickstart.app,)
 """Files of commands, in the order of help."""
 
 for group in GROUPS:

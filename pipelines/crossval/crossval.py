@@ -37,8 +37,8 @@ from pipelines.crossval.stiffness import stiffness_figures
 from pipelines.crossval.unknown import leave_terrain_out
 from pipelines.data.duplicates import distinct_runs
 from pipelines.data.regimes import driven_at
+from pipelines.learn.evaluate import weaknesses
 from pipelines.learn.recipes import WindowPipeline, feature_matrix
-from pipelines.models.champion import weaknesses
 from pipelines.reporting.numbers import format_counts
 from pipelines.reporting.progress import Progress, silent
 from pipelines.support.evaluate import Judged, support_report

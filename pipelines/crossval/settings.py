@@ -91,8 +91,8 @@ class RecipeSettings(Settings):
 
     def new_recipe(self) -> WindowPipeline:
         """Return the recipe, unfitted."""
+        from pipelines.learn.params import read_params
         from pipelines.learn.recipes import make_recipe
-        from pipelines.models.params_file import read_params
         from terrain.classify.svm import CANDIDATES
 
         candidates = CANDIDATES if self.params is None else (read_params(self.params),)

@@ -191,7 +191,7 @@ def run(settings: Settings, progress: Progress) -> DriveResult:
     if settings.needs_model and settings.model is None:
         inputs = replace(inputs, model=train_classifier(robot, settings.first_seed, progress))
     elif settings.model is not None:
-        from pipelines.models.tracking import load_model
+        from pipelines.learn.load import load_model
 
         inputs = replace(inputs, model=load_model(settings.model))
     return compare(settings, inputs, progress)

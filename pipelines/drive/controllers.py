@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 from enum import Enum
 
 from pipelines.drive.controller_names import BASELINES, CONTROLLERS, THESIS_ADAPTING, TRACK
+from pipelines.learn.model_file import TerrainModel
 from pipelines.live.pilot import LivePilot
 from pipelines.live.pilot_settings import PilotSettings
 from pipelines.live.terrain_source import Classifier, KnownTerrain, NoTerrain, TerrainSource
-from pipelines.models.model_files import TerrainModel
 from pipelines.report import Progress, format_value, silent
 from terrain.control.situations import Situation
 from terrain.control.slip_table import SlipTable
@@ -178,20 +178,15 @@ def train_classifier(
     progress : of the runs and the training
     runs_a_terrain : number of runs; that of ``terrain quickstart`` by default
     """
-    from pipelines.classify.train import model_info
-    from pipelines.learn.protocols import samples_of
-    from pipelines.learn.recipes import recipe_of
     from pipelines.learn.settings import RecipeSettings
+    from pipelines.learn.train import fitted_model
     from terrain.estimation.labelled import RUNS_A_TERRAIN, labelled_runs
 
     runs, _, _ = labelled_runs(seed, runs_a_terrain or RUNS_A_TERRAIN, progress, robot)
-    settings = RecipeSettings(seed=seed)
-    windows = samples_of(runs, settings).windows
-    recipe = recipe_of(settings)
     progress("train", 0, 1)
-    recipe.fit(windows, windows.terrain.astype(str))
+    model = fitted_model(runs, RecipeSettings(seed=seed), "simulated")
     progress("train", 1, 1)
-    return TerrainModel(recipe, model_info(runs, settings, windows, "simulated", ""))
+    return model
 
 
 def drive_once(

@@ -184,11 +184,7 @@ def write_model(folder: Path, model: TerrainModel) -> None:
 
     recipe, network = _without_network(model.recipe)
     content = io.dumps({"recipe": recipe, "novelty": model.novelty})
-    if foreign := _foreign_types(content):
-        raise ModelError(
-            f"{foreign[0]} cannot be stored: a model holds estimators of scikit-learn and of this package, so "
-            "that reading one runs no code of strangers"
-        )
+    _refuse_foreign(content)
     (folder / MANIFEST_FILE).unlink(missing_ok=True)
     (folder / ONNX_FILE).unlink(missing_ok=True)
     atomic_write(folder / MODEL_FILE, content)
@@ -196,6 +192,21 @@ def write_model(folder: Path, model: TerrainModel) -> None:
         classes = [str(name) for name in model.info.classes]
         atomic_write(folder / ONNX_FILE, network_onnx(network.numbers_, recipe[0].matrix, classes))
     seal(folder, model.info)
+
+
+def check_storable(estimator: Any) -> None:
+    """Raise ``ModelError`` where a fitted estimator holds a type that a model file may not hold."""
+    from skops import io
+
+    _refuse_foreign(io.dumps(estimator))
+
+
+def _refuse_foreign(content: bytes) -> None:
+    if foreign := _foreign_types(content):
+        raise ModelError(
+            f"{foreign[0]} cannot be stored: a model file holds only types that can be checked when it is read, "
+            "those of this package and most of scikit-learn's, trees not among them; crossval evaluates all"
+        )
 
 
 def seal(folder: Path, info: ModelInfo) -> None:

@@ -132,7 +132,7 @@ def recipe_of(settings: LearnSettings, text: str = FEATURE_RECIPE) -> WindowPipe
     name, separator, sets = text.partition("@")
     options: dict[str, Any] = {}
     if settings.params is not None and name not in WITHOUT_SVM:
-        from pipelines.models.params_file import read_params
+        from pipelines.learn.params import read_params
 
         options["candidates"] = (read_params(settings.params),)
     return make_recipe(

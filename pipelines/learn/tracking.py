@@ -1,55 +1,28 @@
-"""MLflow: the one module that imports it.
-
-Without ``MLFLOW_TRACKING_URI`` everything lies under ``./mlruns``: an SQLite database and the artifacts.  Calls
-go through a client and never through the library's active run: a server that stops in the middle is then asked
-no more, and costs seconds.
-"""
+"""Trained models in MLflow: logged with their data, registered, fetched, and which of them is champion."""
 
 from __future__ import annotations
 
 import json
-import logging
 import os
-import re
 import shutil
-import socket
-import subprocess
 import sys
-import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext, redirect_stderr
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import redirect_stderr
 from importlib.metadata import version
 from io import StringIO
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from types import SimpleNamespace
-from typing import Any, NamedTuple
-from urllib.parse import urlsplit
+from typing import Any, NamedTuple, Self
 
+from pipelines.data.tracking import TrackingError, ensure_tracking, log_run, mlflow_store
 from pipelines.learn.model_file import FILES, MANIFEST_FILE, ModelInfo, TerrainModel, read_files, read_model
-from terrain.errors import ModelError, TerrainError
-from terrain.files.atomic import ensure_writable
-from terrain.files.lock import file_lock
+from pipelines.report.json_file import as_json
+from terrain.errors import LogError, ModelError, TerrainError
+from terrain.files.documents import parse_json
+from terrain.files.names import printable
 
-FOLDER = "mlruns"
-EXPERIMENT = "terrain"
 CHAMPION = "champion"
-SERVER_TIMEOUT_S = 5.0
-LOCK_TIMEOUT_S = 300.0
-"""Logging a training takes some seconds, the first time ten; several may wait for one another."""
-
-PATIENCE = {
-    "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "1",
-    "MLFLOW_HTTP_REQUEST_BACKOFF_FACTOR": "1",
-    "MLFLOW_HTTP_REQUEST_TIMEOUT": "10",
-}
-"""How long a server is waited for, where the user's environment does not say it: by default, 12 minutes."""
-
 REQUIREMENTS = ("terrain-slip", "scikit-learn", "numpy", "scipy", "numba", "skops")
-
-
-class TrackingError(TerrainError):
-    """MLflow's server, database or folder failed."""
 
 
 class Registered(NamedTuple):
@@ -90,6 +63,22 @@ class TrainingRecord(NamedTuple):
     documents: Mapping[str, Any] = {}
     pictures: Mapping[str, bytes] = {}
 
+    def as_text(self) -> str:
+        """Return the record as JSON, without its pictures: it lies beside the model."""
+        kept = {name: getattr(self, name) for name in ("params", "metrics", "tags", "runs", "documents")}
+        return json.dumps(as_json(kept), indent=1) + "\n"
+
+    @classmethod
+    def of_text(cls, content: bytes, place: Path) -> Self:
+        """Return the record that a file holds; ``ModelError`` where it is none."""
+        try:
+            found = parse_json(content)
+            rows = tuple(RunRow(**row) for row in found.pop("runs"))
+            record = cls(**{**found, "runs": rows})
+            return record._replace(metrics={key: float(value) for key, value in record.metrics.items()})
+        except (LogError, ValueError, TypeError, KeyError, AttributeError) as error:
+            raise ModelError(f"{place}: is no record of a training ({printable(str(error))[:160]})") from None
+
 
 class Champion(NamedTuple):
     """The present champion; ``model`` is None where it cannot be loaded."""
@@ -110,99 +99,6 @@ Judge = Callable[[Champion | None, str], Verdict]
 """Judges a new version, whose number is given, against the present champion."""
 
 
-def code_commit() -> str:
-    """Return the commit of the code, with ``+`` when files were changed since.
-
-    An installed package is no checkout, whatever repository it happens to lie in: its version is returned.
-    """
-    file = Path(__file__).resolve()
-
-    def git(*arguments: str) -> str:
-        done = subprocess.run(
-            ["git", *arguments], cwd=file.parent, capture_output=True, text=True, check=True, timeout=10
-        )
-        return done.stdout.strip()
-
-    try:
-        git("ls-files", "--error-unmatch", file.name)
-        return git("describe", "--always", "--abbrev=40", "--exclude=*", "--dirty=+")
-    except (OSError, subprocess.SubprocessError):
-        return f"version {version('terrain-slip')}"
-
-
-def ensure_tracking() -> None:
-    """Raise ``TerrainError`` early where the server cannot be reached or the folder cannot be written."""
-    uri = os.environ.get("MLFLOW_TRACKING_URI")
-    if not uri:
-        ensure_writable(FOLDER)
-        return
-    server = urlsplit(uri)
-    if server.scheme in ("http", "https") and server.hostname:
-        try:
-            port = server.port or (443 if server.scheme == "https" else 80)
-            socket.create_connection((server.hostname, port), timeout=SERVER_TIMEOUT_S).close()
-        except (OSError, ValueError) as error:
-            raise TrackingError(f"MLFLOW_TRACKING_URI={uri}: cannot be reached ({error})") from error
-
-
-def store_uri() -> str:
-    """Return where MLflow keeps what is logged: the server that is named, or the embedded database."""
-    return os.environ.get("MLFLOW_TRACKING_URI") or f"sqlite:///{Path(FOLDER).resolve() / 'mlflow.db'}"
-
-
-def ui_line() -> str:
-    """Return the command line that shows the store, or the address of the server that does."""
-    uri = store_uri()
-    return uri if uri.startswith("http") else f"mlflow ui --backend-store-uri {uri}"
-
-
-@contextmanager
-def _mlflow(*, create: bool) -> Iterator[Any]:
-    """Give MLflow, pointed at its store, with its migrations, hints and warnings off the user's screen.
-
-    Other processes of this package wait meanwhile: of two that make the tables of a database at once one
-    fails, and the champion that is judged against is to be the present one.
-    """
-    for name, value in PATIENCE.items():
-        os.environ.setdefault(name, value)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        import mlflow
-        from sqlalchemy.exc import SQLAlchemyError
-
-        for name in ("mlflow", "alembic", "urllib3"):
-            logging.getLogger(name).setLevel(logging.ERROR)
-        named = os.environ.get("MLFLOW_TRACKING_URI")
-        uri = store_uri()
-        database = Path(uri.removeprefix("sqlite:///")) if uri.startswith("sqlite:///") else None
-        if database is not None and not named:
-            if create:
-                ensure_writable(database.parent)
-                database.parent.mkdir(exist_ok=True)
-            elif not database.is_file():
-                raise ModelError(
-                    f"{database} does not exist: train a model here first, or set MLFLOW_TRACKING_URI"
-                )
-        waiting: Any = nullcontext()
-        if database is not None and (
-            create or (database.is_file() and os.access(database.parent, os.W_OK))
-        ):  # a database that can only be read is opened without
-            lock = database.with_name(f"{database.name}.lock")
-            waiting = file_lock(lock, LOCK_TIMEOUT_S, "writes to the tracking database")
-        failures = (mlflow.exceptions.MlflowException, SQLAlchemyError, OSError, ImportError)
-        try:
-            with waiting:
-                mlflow.set_tracking_uri(uri)
-                mlflow.set_registry_uri(uri)
-                if not named:
-                    os.environ.pop("MLFLOW_TRACKING_URI", None)  # MLflow sets it; only the user may
-                yield mlflow
-        except TerrainError:
-            raise
-        except failures as error:
-            raise TrackingError(f"MLflow: {' '.join(str(error).split())[:300]}") from error
-
-
 def log_training(name: str, folder: Path, record: TrainingRecord, judge: Judge) -> Registered:
     """Log one training run with its model, register the model, and have the champion decided on.
 
@@ -221,9 +117,10 @@ def log_training(name: str, folder: Path, record: TrainingRecord, judge: Judge) 
     """
     info, _ = read_files(folder)
     tags = {key: str(getattr(info, key)) for key in ("data_digest", "commit", "seed")}
-    with _mlflow(create=True) as mlflow:
+    with mlflow_store(create=True) as mlflow:
         client = mlflow.MlflowClient()
-        run_id = _log_run(mlflow, client, name, record, tags, info)
+        run_id = log_run(mlflow, name, record.params, record.metrics, tags, record.documents, record.pictures)
+        _log_data(mlflow, run_id, record, info)
         logged = _log_model(mlflow, name, folder, info, run_id)
         number = str(logged.registered_model_version)
         for key, text in record.tags.items():
@@ -240,99 +137,17 @@ def log_training(name: str, folder: Path, record: TrainingRecord, judge: Judge) 
         return Registered(f"models:/{name}/{number}", number, run_id, moved, reason)
 
 
-def log_learning(
-    name: str,
-    params: Mapping[str, Any],
-    metrics: Mapping[str, float],
-    tags: Mapping[str, str],
-    texts: Mapping[str, str],
-    documents: Mapping[str, Any],
-    figures: Mapping[str, Any],
-) -> str:
-    """Log a run in which something other than a model was learned; return its id.
+def _log_data(mlflow: Any, run_id: str, record: TrainingRecord, info: ModelInfo) -> None:
+    """Log the data set of a training as the input of its run: a row a run."""
+    import pandas as pd
+    from mlflow.entities import DatasetInput, InputTag
 
-    Parameters
-    ----------
-    name : of the run
-    params, metrics, tags : as MLflow holds them
-    texts, documents : text files and JSON documents by file name
-    figures : by name, logged as PNG: figures of matplotlib, or the content of image files
-
-    Raises
-    ------
-    TrackingError
-        if the tracking folder cannot be written or the server cannot be reached.
-    """
-    pictures = {f"figures/{key}.png": _png(figure) for key, figure in figures.items()}
-    record = TrainingRecord(params, metrics, {}, (), {**documents, **texts}, pictures)
-    with _mlflow(create=True) as mlflow:
-        client = mlflow.MlflowClient()
-        run_id = _log_run(mlflow, client, name, record, tags, None)
-        client.set_terminated(run_id)
-        return run_id
-
-
-def _png(figure: Any) -> bytes:
-    if isinstance(figure, bytes):
-        return figure
-    from io import BytesIO
-
-    stream = BytesIO()
-    figure.savefig(stream, format="png")
-    return stream.getvalue()
-
-
-def _log_run(
-    mlflow: Any,
-    client: Any,
-    name: str,
-    record: TrainingRecord,
-    tags: Mapping[str, str],
-    info: ModelInfo | None,
-) -> str:
-    """Log what every run has, in few calls, and return the id of the run, which is not ended yet."""
-    from mlflow.entities import Metric, Param, RunTag
-    from mlflow.utils.time import get_current_time_millis
-
-    found = client.get_experiment_by_name(EXPERIMENT)
-    experiment = client.create_experiment(EXPERIMENT) if found is None else found.experiment_id
-    run_id = str(client.create_run(experiment, run_name=name).info.run_id)
-    now_ms = get_current_time_millis()
-    client.log_batch(
-        run_id,
-        [Metric(_plain(key), float(value), now_ms, 0) for key, value in record.metrics.items()],
-        [Param(key, str(value)[:500]) for key, value in record.params.items()],
-        [RunTag(key, str(value)) for key, value in tags.items()],
-    )
-    if record.runs and info is not None:
-        import pandas as pd
-        from mlflow.entities import DatasetInput, InputTag
-
-        dataset = mlflow.data.from_pandas(
-            pd.DataFrame(record.runs), name=info.dataset or "runs", digest=info.data_digest[:36]
-        )
-        context = [InputTag("mlflow.data.context", "training")]
-        client.log_inputs(run_id, [DatasetInput(dataset._to_mlflow_entity(), context)])
-    with TemporaryDirectory() as folder:
-        for file, document in record.documents.items():
-            text = document if isinstance(document, str) else json.dumps(document, indent=2)
-            _place(folder, file).write_text(text, encoding="utf-8")
-        for file, content in record.pictures.items():
-            _place(folder, file).write_bytes(content)
-        if any(Path(folder).iterdir()):
-            client.log_artifacts(run_id, folder)
-    return run_id
-
-
-def _place(folder: str, file: str) -> Path:
-    path = Path(folder) / file
-    path.parent.mkdir(parents=True, exist_ok=True)
-    return path
-
-
-def _plain(name: str) -> str:
-    """Return a name of the characters that a metric's may have."""
-    return re.sub(r"[^\w\-. /]", "_", name)
+    if not record.runs:
+        return
+    digest = info.data_digest[:36]
+    dataset = mlflow.data.from_pandas(pd.DataFrame(record.runs), name=info.dataset or "runs", digest=digest)
+    context = [InputTag("mlflow.data.context", "training")]
+    mlflow.MlflowClient().log_inputs(run_id, [DatasetInput(dataset._to_mlflow_entity(), context)])
 
 
 def _log_model(mlflow: Any, name: str, folder: Path, info: ModelInfo, run_id: str) -> Any:
@@ -396,7 +211,7 @@ def fetch_model(uri: str, into: str | None = None) -> Path:
     if os.environ.get("MLFLOW_TRACKING_URI"):
         ensure_tracking()
     try:
-        with _mlflow(create=False) as mlflow:
+        with mlflow_store(create=False) as mlflow:
             return Path(mlflow.artifacts.download_artifacts(uri, dst_path=into))
     except TrackingError as error:
         reason = str(error).removeprefix("MLflow: ")[:200]

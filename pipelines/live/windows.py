@@ -127,7 +127,7 @@ class WindowFeed:
 
     Examples
     --------
-    >>> from pipelines.models.results import ModelInfo
+    >>> from pipelines.learn.model_file import ModelInfo
     >>> info = ModelInfo(("grass",), 1.0, None, None, {"imu": ("gyro_z_radps",)}, {"imu": 10.0}, ())
     >>> feed = WindowFeed(info, {"imu": ("accel_x_mps2", "gyro_z_radps")})
     >>> time_s = np.arange(12) / 10

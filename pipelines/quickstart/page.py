@@ -8,13 +8,13 @@ from typing import NamedTuple
 
 from matplotlib.figure import Figure
 
-from pipelines.classify.results import Predictions, WindowPrediction
 from pipelines.crossval.results import (
     MIN_CLASSES,
     Applicability,
     CrossvalReport,
     SlowFast,
 )
+from pipelines.learn.predict import Predictions, WindowPrediction
 from pipelines.quickstart.consistency_view import ConsistencyTable, consistency_table
 from pipelines.quickstart.results import QuickstartResult
 from pipelines.reporting.numbers import NOT_KNOWN, format_counts, percent
@@ -270,7 +270,7 @@ def _slow_fast(split: SlowFast) -> SlowFastView:
 
 
 def _model(result: QuickstartResult) -> tuple[Pair, ...]:
-    model = result.train.registered
+    model = result.train
     verdict = "this version is now champion" if model.alias_moved else "the champion remains as it was"
     return (
         Pair("model", model.model_uri, code=True),

@@ -61,10 +61,11 @@ def quickstart(
     evaluation : how the recipe is evaluated; ``settings.evaluation`` by default
     runs_a_terrain : simulated runs of each terrain
     """
-    from pipelines.classify.predict import predict
-    from pipelines.classify.train import train
     from pipelines.crossval_figures.figures import all_figures
-    from pipelines.models.tracking import ensure_tracking, load_model
+    from pipelines.data.tracking import ensure_tracking
+    from pipelines.learn.load import load_model
+    from pipelines.learn.predict import predict
+    from pipelines.learn.train import train
     from pipelines.quickstart.page import html_report
     from terrain.control.slip_table import load_slip_table
 
@@ -86,8 +87,8 @@ def quickstart(
     report = crossval(training, evaluation, progress).named(dataset, data_digest(training))
     report = replace(report, notes=(*merge_notes(distinct.merged), *report.notes))
     imported = _keep(runs, data, out / "runs", progress)
-    trained = train(training, settings.training(evaluation), dataset, progress, evaluation=report)
-    model_uri = trained.registered.model_uri
+    trained = train(training, settings.training(evaluation), dataset, progress)
+    model_uri = trained.model_uri
     progress("predict", 0, 1)
     predicted = predict(held_out or runs, load_model(model_uri), load_slip_table())
     progress("predict", 1, 1)
@@ -109,7 +110,8 @@ def quickstart(
         elapsed_s=time.monotonic() - began_s,
     )
     progress("report", 0, 1)
-    atomic_write(result.report, html_report(result, {**figures, **all_figures(report, trained.importance)}))
+    pictures = all_figures(report, trained.importance)  # type: ignore[arg-type]
+    atomic_write(result.report, html_report(result, {**figures, **pictures}))
     progress("report", 1, 1)
     return result
 

@@ -6,10 +6,11 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from pipelines.classify.results import Predictions, Training
 from pipelines.crossval.results import CrossvalReport
 from pipelines.data.convert import ImportResult
 from pipelines.estimate.consistency import TerrainConsistency
+from pipelines.learn.predict import Predictions
+from pipelines.learn.train import TrainResult
 from terrain.estimation.labelled import TerrainSlip
 
 
@@ -53,7 +54,7 @@ class QuickstartResult:
     commit: str
     seed: int
     crossval: CrossvalReport
-    train: Training
+    train: TrainResult
     predict: Predictions
     imported: KeptRuns
     slip: tuple[TerrainSlip, ...] | None

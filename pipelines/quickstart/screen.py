@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from rich.console import Console
 from rich.table import Table
 
-from pipelines.classify.screen import print_predictions, print_training
 from pipelines.crossval.screen import print_crossval
 from pipelines.estimate.consistency import print_consistency
 from pipelines.quickstart.results import QuickstartResult
@@ -23,9 +22,9 @@ def print_quickstart(result: QuickstartResult, console: Console) -> None:
     if result.consistency:
         print_consistency(result.consistency, console)
     print_crossval(result.crossval, console)
-    print_training(result.train, console)
+    print_lines(console, [result.train.report.answer])
     print_lines(console, [held_out_sentence(result.held_out)])
-    print_predictions(result.predict, console)
+    print_lines(console, [result.predict.report.answer])
     print_lines(console, [f"report: {result.report}"])
 
 

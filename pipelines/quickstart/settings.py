@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pipelines.classify.settings import TrainSettings
 from pipelines.crossval.settings import CrossvalSettings
+from pipelines.learn.train import TrainingSettings
 from pipelines.report.settings import Settings, setting
 
 
@@ -27,6 +27,6 @@ class QuickstartSettings(Settings):
         """How the recipe is evaluated: by the defaults of ``terrain crossval``."""
         return CrossvalSettings(seed=self.seed, n_jobs=self.n_jobs)
 
-    def training(self, evaluation: CrossvalSettings) -> TrainSettings:
+    def training(self, evaluation: CrossvalSettings) -> TrainingSettings:
         """Return how the recipe of an evaluation is trained."""
-        return TrainSettings(name=self.name, **evaluation.shared())
+        return TrainingSettings(name=self.name, **evaluation.shared())

@@ -271,7 +271,7 @@ def log_curves(result: LearnSlipResult) -> str:
     TerrainError
         if the tracking folder cannot be written or the server cannot be reached.
     """
-    from pipelines.learn.tracking import code_commit, log_learning
+    from pipelines.data.tracking import code_commit, log_learning
     from pipelines.report.drawing import figure_png
     from pipelines.report.json_file import as_json
 

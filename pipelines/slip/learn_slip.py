@@ -52,7 +52,7 @@ def run(settings: Settings, progress: Progress) -> LearnSlipResult | MeasuredTar
     if settings.figures is not None:
         ensure_writable(settings.figures)
     if isinstance(robot, SwerveRobot):
-        from pipelines.learn.tracking import ensure_tracking
+        from pipelines.data.tracking import ensure_tracking
 
         ensure_tracking()
     table = learn_slip_table(

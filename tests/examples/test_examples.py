@@ -8,10 +8,8 @@ from types import ModuleType, SimpleNamespace
 import numpy as np
 import pytest
 
-from pipelines.classify.train import model_info
-from pipelines.crossval.crossval import samples_of
-from pipelines.crossval.settings import CrossvalSettings
-from pipelines.learn.model_file import TerrainModel, write_model
+from pipelines.learn.model_file import write_model
+from pipelines.learn.train import fitted_model
 from pipelines.serve.serve import Settings
 from pipelines.serve.service import Service, prepare
 from terrain.logs.write import write_run
@@ -41,10 +39,8 @@ def runs():
 
 @pytest.fixture(scope="module")
 def model_folder(runs, tmp_path_factory):
-    settings, folder = CrossvalSettings(), tmp_path_factory.mktemp("model")
-    windows = samples_of(runs, settings).cut.windows
-    recipe = settings.new_recipe().fit(windows, windows.terrain.astype(str))
-    write_model(folder, TerrainModel(recipe, model_info(runs, settings, windows, "drawn", "")))
+    folder = tmp_path_factory.mktemp("model")
+    write_model(folder, fitted_model(runs))
     return folder
 
 

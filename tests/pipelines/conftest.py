@@ -7,10 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipelines.classify.train import model_info
-from pipelines.crossval.crossval import samples_of
 from pipelines.crossval.settings import CrossvalSettings
-from pipelines.models.model_files import TerrainModel
+from pipelines.learn.train import fitted_model
 from terrain.estimation.enriched import enriched
 from terrain.estimation.estimate import estimate_run
 from terrain.records import Label, RunLog, Stream
@@ -111,7 +109,6 @@ def runs():
 @pytest.fixture(scope="session")
 def settings():
     """Return a maker of settings for one process, one repeat and no extras unless asked for."""
-    from pipelines.crossval.settings import CrossvalSettings
 
     def make(**options):
         return CrossvalSettings(**({"repeats": 1, "extras": False, "n_jobs": 1} | options))
@@ -203,14 +200,13 @@ def tracked(tmp_path_factory, runs):
 
     Made once: a new tracking database costs seconds.  ``model/`` beside ``mlruns/`` is the model by itself.
     """
-    from pipelines.classify.settings import TrainSettings
-    from pipelines.classify.train import train
+    from pipelines.learn.train import TrainingSettings, train
 
     folder = tmp_path_factory.mktemp("tracked")
     before, named = Path.cwd(), os.environ.pop("MLFLOW_TRACKING_URI", None)
     os.chdir(folder)
     try:
-        result = train(runs, TrainSettings(name="drawn", repeats=1, n_jobs=1), "twelve runs")
+        result = train(runs, TrainingSettings(name="drawn", repeats=1, n_jobs=1), "twelve runs")
         (model,) = Path("mlruns").rglob("model.skops")
         shutil.copytree(model.parent, "model")
     finally:
@@ -236,10 +232,7 @@ def model_dir(tracked, tmp_path):
 
 
 def _trained(runs):
-    settings = CrossvalSettings()
-    windows = samples_of(runs, settings).cut.windows
-    recipe = settings.new_recipe().fit(windows, windows.terrain.astype(str))
-    return TerrainModel(recipe, model_info(runs, settings, windows, "drawn", ""))
+    return fitted_model(runs, dataset="drawn")
 
 
 @pytest.fixture(scope="session")

@@ -252,15 +252,14 @@ def run(settings: Settings, progress: Progress = silent) -> ScaleResult:
 
 
 def _measure(runs: Path, n_runs: int, n_workers: int) -> Point:
-    from pipelines.feature_store.build import build_store
-    from pipelines.feature_store.settings import FeaturesSettings
+    from features.windows import WindowRule
+    from pipelines.learn.cache import cached_features
+    from terrain.logs.schema import SIGNAL_SETS
 
-    with TemporaryDirectory(dir=runs.parent, prefix="store-") as out:
-        settings = FeaturesSettings(out=Path(out), n_jobs=n_workers)
-        with peak_memory() as peak:
-            begun_s, begun_cpu_s = perf_counter(), cpu_s()
-            build_store(loaders(runs, n_runs), settings)
-            seconds, used_s = perf_counter() - begun_s, cpu_s() - begun_cpu_s
+    with TemporaryDirectory(dir=runs.parent, prefix="store-") as out, peak_memory() as peak:
+        begun_s, begun_cpu_s = perf_counter(), cpu_s()
+        cached_features(loaders(runs, n_runs), WindowRule(), SIGNAL_SETS, Path(out), n_workers)
+        seconds, used_s = perf_counter() - begun_s, cpu_s() - begun_cpu_s
     return Point(n_runs, n_workers, seconds, n_runs / seconds, used_s, peak.mb)
 
 

@@ -65,11 +65,9 @@ def model_folder(uri: str | None, seed: int, into: Path) -> str:
     """Return what the service is given as its model: the URI, or a folder with one of four short runs."""
     if uri is not None:
         return uri
-    from pipelines.classify.train import model_info
-    from pipelines.learn.model_file import TerrainModel, write_model
-    from pipelines.learn.protocols import samples_of
-    from pipelines.learn.recipes import recipe_of
+    from pipelines.learn.model_file import write_model
     from pipelines.learn.settings import RecipeSettings
+    from pipelines.learn.train import fitted_model
 
     robot = load_robot(ROBOT)
     simulated = [
@@ -78,11 +76,8 @@ def model_folder(uri: str | None, seed: int, into: Path) -> str:
         for number in (1, 2)
     ]
     runs = [enriched(estimate_run(run, robot, "vio15")) for run in simulated]
-    settings = RecipeSettings(seed=seed)
-    windows = samples_of(runs, settings).windows
-    recipe = recipe_of(settings).fit(windows, windows.terrain.astype(str))
     into.mkdir(parents=True, exist_ok=True)
-    write_model(into, TerrainModel(recipe, model_info(runs, settings, windows, "simulated", "")))
+    write_model(into, fitted_model(runs, RecipeSettings(seed=seed), "simulated"))
     return str(into)
 
 

@@ -20,9 +20,9 @@ from pipelines.drive.controller_names import CONTROLLERS
 from pipelines.drive.controllers import DriveInputs, drive_once, make_controller
 from pipelines.drive.drive import Settings
 from pipelines.drive.run_figures import run_figures
+from pipelines.learn.model_file import TerrainModel
 from pipelines.live.pilot_settings import PilotStatus
 from pipelines.live.terrain_source import TerrainEstimate
-from pipelines.models.model_files import TerrainModel
 from pipelines.report import NOT_KNOWN
 from pipelines.report.json_file import as_json
 from pipelines.report.terminal import terminal_text

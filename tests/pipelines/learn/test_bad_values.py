@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from features.windows import WindowRule, cut_at, layout_of
-from pipelines.classify.predict import predict
 from pipelines.learn.crossval import crossval
 from pipelines.learn.model_file import read_model
+from pipelines.learn.predict import predict
 from terrain.control.slip_table import load_slip_table
 from terrain.errors import DataError
 from terrain.logs.samples import checked_stream

@@ -233,9 +233,7 @@ def test_damaged_members_of_an_archive_end_in_one_sentence(model_dir, put):
 def test_an_estimator_of_ones_own_is_refused_before_it_is_stored(model_dir, tmp_path):
     model = read_model(model_dir)
     recipe = WindowPipeline([*model.recipe.steps[:-1], ("classifier", Foreign())])
-    with pytest.raises(
-        ModelError, match="Foreign cannot be stored: a model holds estimators of scikit-learn"
-    ):
+    with pytest.raises(ModelError, match="Foreign cannot be stored: a model file holds only types"):
         write_model(tmp_path, model._replace(recipe=recipe))
     assert not list(tmp_path.glob("*.*"))
 

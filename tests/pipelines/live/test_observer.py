@@ -8,11 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipelines.classify.predict import predict
-from pipelines.classify.train import model_info
-from pipelines.crossval.crossval import samples_of
-from pipelines.crossval.settings import CrossvalSettings
 from pipelines.data.datasets import load_runs
+from pipelines.learn.predict import predict
+from pipelines.learn.train import fitted_model
 from pipelines.live.observer import Observer
 from terrain.control.slip_table import load_slip_table
 from terrain.errors import ConfigError, DataError
@@ -250,8 +248,5 @@ def test_runs_of_several_filters_do_not_train_one_model():
         enriched(estimate_run(simulated("grass", number), AGRIMARO, name))
         for number, name in enumerate(("vio15", "slip14"), 1)
     ]
-    windows = samples_of(
-        [replace(run, run_id=f"r{k}") for k, run in enumerate(runs)], CrossvalSettings()
-    ).cut.windows
     with pytest.raises(DataError, match="estimates of slip14 and vio15"):
-        model_info(runs, CrossvalSettings(), windows, "drawn", "")
+        fitted_model([replace(run, run_id=f"r{k}") for k, run in enumerate(runs)])

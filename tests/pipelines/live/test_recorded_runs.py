@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipelines.classify.predict import predict
 from pipelines.crossval.crossval import samples_of
 from pipelines.crossval.settings import CrossvalSettings
 from pipelines.data.bag_runs import recorded_windows
 from pipelines.data.datasets import load_runs
 from pipelines.data.inspect import Settings as InspectSettings
 from pipelines.data.inspect import run as inspect_runs
+from pipelines.learn.predict import predict
 from pipelines.live.classifying import AtOnce
 from pipelines.live.observer import Observer
 from pipelines.live.pilot import LivePilot

@@ -7,7 +7,7 @@ import pytest
 
 from pipelines.data.datasets import data_digest
 from pipelines.data.settings import AlignedRunsSettings, load
-from pipelines.models.tracking import load_model
+from pipelines.learn.load import load_model
 from pipelines.quickstart.holding_out import divide
 from pipelines.quickstart.settings import QuickstartSettings
 from terrain.errors import ConfigError, DataError
@@ -27,7 +27,7 @@ def test_the_runs_that_are_predicted_took_no_part(in_tracked, drive_all, setting
     assert result.held_out == ("ASPHALT_3",)
     assert {row.run_id for row in result.predict.windows} == {"ASPHALT_3"}
     assert result.predict.training_runs == ()
-    info = load_model(result.train.registered.model_uri).info
+    info = load_model(result.train.model_uri).info
     training = [run for run in runs if run.run_id != "ASPHALT_3"]
     assert sorted(info.run_digests) == sorted(data_digest([run]) for run in training)
     assert info.data_digest == result.data_digest == data_digest(training)

@@ -7,16 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from pipelines.classify.results import (
-    Predictions,
-    TargetSlipRow,
-    Training,
-    WindowPrediction,
-)
 from pipelines.crossval.results import Applicability
 from pipelines.crossval_figures.figures import confusion_figure
 from pipelines.estimate.consistency import TerrainConsistency
+from pipelines.learn.predict import Predictions, TargetSlipRow, WindowPrediction
 from pipelines.learn.tracking import Registered
+from pipelines.learn.train import TrainResult
 from pipelines.quickstart.page import CAPTIONS, html_report
 from pipelines.quickstart.results import KeptRuns, QuickstartResult
 from pipelines.reporting.numbers import NOT_KNOWN
@@ -96,7 +92,7 @@ def result(make_report):
         commit="abc123",
         seed=0,
         crossval=report,
-        train=Training(registered, "moor & <fen>", "d1ge57", "abc123", 40, {}, (), report),
+        train=TrainResult(*registered, "moor & <fen>", "d1ge57", "abc123", 40, {}, (), report),
         predict=predicted,
         imported=KeptRuns(Path("out/runs"), 3, reused=False),
         slip=None,

@@ -10,7 +10,7 @@ from time import perf_counter
 import numpy as np
 import pytest
 
-from pipelines.classify.predict import predict
+from pipelines.learn.predict import predict
 from pipelines.live.pilot import LivePilot
 from pipelines.live.pilot_settings import PilotSettings
 from pipelines.serve.replay import chain_of, replay_run

@@ -9,9 +9,9 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 from websockets.exceptions import ConnectionClosed
 
-from pipelines.classify.predict import predict
 from pipelines.data.bag_runs import recorded_windows
 from pipelines.data.datasets import load_runs
+from pipelines.learn.predict import predict
 from pipelines.live.observer import Observer
 from pipelines.serve.client import ServiceError, TerrainClient
 from terrain.control.slip_table import load_slip_table

@@ -94,21 +94,19 @@ def test_runs_come_with_their_slip(one_ground):
     assert np.nanmedian(np.abs(slip.values)) == pytest.approx(0.1, abs=0.03)
 
 
-def test_changes_are_found_and_judged(tmp_path, one_ground, two_grounds):
-    from pipelines.ground_changes.find import find_changes
-    from pipelines.ground_changes.settings import FindChangesSettings
+def test_changes_are_found_and_judged(one_ground, two_grounds):
+    from pipelines.learn.ground_changes import find_changes
 
-    settings = FindChangesSettings(data=tmp_path, calibrate=tmp_path)
-    result = find_changes(two_grounds, one_ground, settings)
+    result = find_changes(two_grounds, one_ground)
     assert result.n_steps == 6
     assert result.found_ratio == 1.0
     assert abs(result.delay_median_s) < 2.0
-    quiet = find_changes(one_ground[:5], one_ground[5:], settings)
+    quiet = find_changes(one_ground[:5], one_ground[5:])
     assert quiet.n_steps == 0
     assert quiet.n_without_step == 5
     assert np.isnan(quiet.found_ratio)
     with pytest.raises(DataError, match="is watched and calibrated on"):
-        find_changes(one_ground[:5], one_ground, settings)
+        find_changes(one_ground[:5], one_ground)
 
 
 def test_what_cannot_be_measured_is_refused_in_one_sentence(one_ground):

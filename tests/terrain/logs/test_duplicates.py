@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipelines.data.datasets import load_runs
-from pipelines.feature_store.print_files import PrintFiles
+from pipelines.learn.cache import PrintFiles
 from terrain.errors import DataError
 from terrain.logs.duplicates import groups_of, shared_stretches
 from terrain.logs.fingerprints import run_print
@@ -86,7 +86,7 @@ def possible_pairs(tmp_path):
     """Return what finds the pairs of runs whose prints have enough in common."""
 
     def find(prints):
-        with PrintFiles(tmp_path / "prints") as files:
+        with PrintFiles() as files:
             for each in prints:
                 files.add(each)
             return files.possible_pairs()

@@ -1,1 +1,0 @@
-"""``terrain train`` and ``predict``."""

@@ -1,1 +1,0 @@
-"""Features of many runs on disk, one file a run: made and read without holding the runs in memory."""

@@ -1,1 +1,0 @@
-"""``terrain find-changes``: changes of the ground, found sample by sample from what wheels answer."""

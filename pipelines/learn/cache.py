@@ -1,0 +1,424 @@
+"""A cache of features: one Parquet file a run, named by the run's digest and by how its windows are cut.
+
+Two passes, so that memory is bounded by a run and the table: the first finds channels and rates that all runs
+have in common, the second cuts, computes and writes what is not there yet; one that was interrupted goes on.  Of
+a run folder whose files did not change since, only the cache is read.  Fingerprints of each run show which pairs
+of runs may hold the same measurements; these are read again and compared.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from functools import lru_cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from features.extractor import FeatureExtractor
+from features.motion import Motion, wheel_stream, window_motion
+from features.windows import Layout, WindowRule, cut_windows, layout_of
+from pipelines.data.datasets import RunLoader, data_digest, joint_digest, run_loaders
+from pipelines.data.duplicates import sentences
+from pipelines.data.settings import AlignedRunsSettings, chosen_runs
+from pipelines.learn.parallel import parallel
+from pipelines.learn.protocols import Samples
+from pipelines.report import Progress, format_counts, silent
+from terrain import __version__
+from terrain.errors import ConfigError, DataError, LogError
+from terrain.files.atomic import atomic_file, ensure_writable
+from terrain.logs.duplicates import EqualCodes, equal_codes, pairs_of, shared_stretches
+from terrain.logs.fingerprints import RunPrint, run_print
+from terrain.records import Array, RunLog, Stream, Windows
+
+FORMAT_VERSION = 3
+KEY = b"terrain"
+N_FILES = 32
+RECORD = np.dtype([("code", "<i8"), ("time_s", "<f8"), ("run", "<i4")])
+SPREADING = np.uint64(0x9E3779B97F4A7C15)
+"""2^64 over the golden ratio: the first bits of a product with it are spread evenly (Knuth, The Art of
+Computer Programming 3, section 6.4)."""
+
+
+class RunHead(NamedTuple):
+    """What is known of a run without its samples.
+
+    Parameters
+    ----------
+    run_id, robot, filter, digest : of the run; the digest is of its content
+    streams : name, channels and sample period in s of each
+    repaired : what a repairing reader dropped, as counts by kind
+    print_digest : of its samples, see :class:`~terrain.logs.fingerprints.RunPrint`
+    fault : why it was skipped; empty of one that was read
+    """
+
+    run_id: str
+    robot: str = ""
+    filter: str = ""
+    digest: str = ""
+    streams: tuple[tuple[str, tuple[str, ...], float], ...] = ()
+    repaired: Mapping[str, int] = {}
+    print_digest: str = ""
+    fault: str = ""
+
+    def sketch(self) -> RunLog:
+        """Return a run of two samples a stream that has these channels and rates, and nothing else."""
+        return RunLog(self.run_id, self.robot, {name: _pair(c, p) for name, c, p in self.streams})
+
+
+@lru_cache(maxsize=1024)
+def _pair(channels: tuple[str, ...], period_s: float) -> Stream:
+    time_s = np.array([0.0, period_s]) if np.isfinite(period_s) else np.zeros(1)
+    return Stream(time_s, np.zeros((len(time_s), len(channels))), channels)
+
+
+class CachedFeatures(NamedTuple):
+    """Labelled windows of runs by their features.
+
+    Parameters
+    ----------
+    samples : windows without their samples
+    features : (n, f) in 64 bits
+    motion : how the robot moved in each window; None where no wheel speed was measured
+    layout : channels and rates that all runs have
+    runs : that the windows are of, sorted by their id
+    n_computed : runs whose features were not there
+    skipped : a sentence for each run that could not be read
+    """
+
+    samples: Samples
+    features: Array
+    motion: Motion | None
+    layout: Layout
+    runs: tuple[RunHead, ...]
+    n_computed: int
+    skipped: tuple[str, ...]
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 over the digests of the runs: not that of the runs read whole, which needs all at once."""
+        return joint_digest([run.digest for run in self.runs])
+
+
+def loaders_of(source: AlignedRunsSettings) -> list[RunLoader]:
+    """Return what reads each run of a command, without reading any."""
+    return run_loaders(
+        source.data,
+        layout=source.layout,
+        mapping=source.mapping,
+        repair=source.repair,
+        align=source.align,
+        robot=source.robot,
+    )
+
+
+def cached_features(
+    loaders: Sequence[RunLoader],
+    rule: WindowRule,
+    signal_sets: Sequence[str],
+    cache_dir: Path,
+    n_jobs: int = 1,
+    progress: Progress = silent,
+    source: AlignedRunsSettings | None = None,
+) -> CachedFeatures:
+    """Return the features of the labelled windows of runs, out of a cache as far as they are there.
+
+    Parameters
+    ----------
+    loaders : one a run, as :func:`loaders_of`
+    rule, signal_sets : how windows are cut, and whose channels the features use
+    cache_dir : folder of the cache, which several data sets and rules may share
+    n_jobs : processes at once on this machine
+    progress : called as runs are done
+    source : whose ``--only`` and ``--without`` choose among the runs
+
+    Raises
+    ------
+    LogError
+        if a run cannot be read, or two runs have one id.
+    DataError
+        if the runs have no channels or rates in common, two hold the same measurements, or no window has a
+        label.
+    """
+    if cache_dir.exists() and not cache_dir.is_dir():
+        raise ConfigError(f"--cache {cache_dir}: is no folder")
+    ensure_writable(cache_dir)
+    place = cache_dir.resolve()
+    for folder in ("runs", "features"):
+        (place / folder).mkdir(parents=True, exist_ok=True)
+    heads, pairs = _heads(loaders, place, n_jobs, progress)
+    skipped = tuple(f"run skipped: {head.fault}" for head in heads if head.fault)
+    readable = [head for head in heads if not head.fault]
+    chosen = readable if source is None else chosen_runs(readable, source)
+    names = {head.run_id for head in chosen}
+    load_of = dict(zip([head.run_id or str(i) for i, head in enumerate(heads)], loaders, strict=True))
+    _refuse_shared([(load_of[a], load_of[b]) for a, b in pairs if {a, b} <= names], n_jobs, progress)
+    chosen = sorted(chosen, key=lambda head: head.run_id)
+    layout = layout_of([head.sketch() for head in chosen], signal_sets, speeds=rule.steady is not None)
+    extractor = FeatureExtractor(signal_sets).fit(cut_windows([], rule, layout=layout).windows)
+    identity = _identity(rule, signal_sets, layout)
+    width = len(extractor.get_feature_names_out())
+    files = [place / "features" / f"{_key(head.digest, identity)}.parquet" for head in chosen]
+    todo = [i for i, file in enumerate(files) if _read(file, width) is None]
+    each = ((load_of[chosen[i].run_id], files[i]) for i in todo)
+    progress("features", len(files) - len(todo), len(files))
+    for done, _ in enumerate(parallel(_store_run, (rule, layout, extractor), each, n_jobs), start=1):
+        progress("features", len(files) - len(todo) + done, len(files))
+    return _table(chosen, files, width, layout, rule)._replace(n_computed=len(todo), skipped=skipped)
+
+
+def _heads(
+    loaders: Sequence[RunLoader], place: Path, n_jobs: int, progress: Progress
+) -> tuple[list[RunHead], list[tuple[str, str]]]:
+    """Return the head of each run, and the pairs of ids that may hold the same measurements."""
+    heads: list[RunHead] = []
+    progress("channels", 0, len(loaders))
+    with PrintFiles() as prints:
+        for head, codes, time_s in parallel(_head, (place,), ((load,) for load in loaders), n_jobs):
+            heads.append(head)
+            prints.add(RunPrint(codes, time_s, bytes.fromhex(head.print_digest)))
+            progress("channels", len(heads), len(loaders))
+        pairs = [(heads[a].run_id, heads[b].run_id) for a, b in prints.possible_pairs()]
+    found = Counter(head.run_id for head in heads if not head.fault)
+    if not found:
+        raise LogError(f"not one run could be read, the first for this: {heads[0].fault}")
+    run_id, n = found.most_common(1)[0]
+    if n > 1:
+        raise LogError(f"{n} runs have the id {run_id!r}")
+    return heads, pairs
+
+
+def _head(place: Path, load: RunLoader) -> tuple[RunHead, Array, Array]:
+    """Return a run's head, and the codes and times of its fingerprints."""
+    file = None
+    if load.plain_folder is not None:
+        parts = sorted(path for path in load.plain_folder.iterdir() if path.is_file())
+        states = [(path.name, path.stat().st_size, path.stat().st_mtime_ns) for path in parts]
+        name = _sha256([str(load.plain_folder), states, repr(load.robot), __version__, FORMAT_VERSION])
+        file = place / "runs" / f"{name}.parquet"
+        if (found := _read_columns(file)) is not None:
+            document, columns = found
+            streams = tuple((name, tuple(channels), period) for name, channels, period in document["streams"])
+            return RunHead(**{**document, "streams": streams}), columns["code"], columns["time_s"]
+    try:
+        run = load()
+    except LogError as error:
+        if not load.repair:
+            raise
+        nothing = np.zeros(0)
+        return RunHead("", fault=str(error)), nothing.astype(np.int64), nothing
+    prints = run_print(run)
+    head = RunHead(
+        run.run_id,
+        run.robot,
+        run.filter,
+        data_digest([run]),
+        tuple((name, stream.channels, _period_s(stream.time_s)) for name, stream in run.streams.items()),
+        dict(run.dropped),
+        prints.digest.hex(),
+    )
+    if file is not None:
+        _write_columns(file, head._asdict(), {"code": prints.codes, "time_s": prints.time_s})
+    return head, prints.codes, prints.time_s
+
+
+def _period_s(time_s: Array) -> float:
+    return float(np.median(np.diff(time_s))) if len(time_s) > 1 else float("nan")
+
+
+def _refuse_shared(pairs: Sequence[tuple[RunLoader, RunLoader]], n_jobs: int, progress: Progress) -> None:
+    """Raise ``DataError`` where the two runs of a pair hold the same measurements."""
+    found = []
+    for done, stretches in enumerate(parallel(_compared, (), pairs, n_jobs), start=1):
+        found += stretches
+        progress("compare runs", done, len(pairs))
+    if found:
+        raise DataError(
+            f"{'; '.join(sentences(sorted(found)))}: held out, they would be recognised and not classified; "
+            "leave one of them out by --without, or merge them by --merge-duplicates without --cache"
+        )
+
+
+def _compared(first: RunLoader, second: RunLoader) -> Any:
+    return shared_stretches(sorted((first(), second()), key=lambda run: run.run_id))
+
+
+def _store_run(
+    rule: WindowRule, layout: Layout, extractor: FeatureExtractor, load: RunLoader, file: Path
+) -> None:
+    """Cut the windows of a run, and write what is kept of them."""
+    cut = cut_windows([load()], rule, layout=layout, skip_short=load.repair)
+    windows = cut.windows
+    moved = window_motion(windows)
+    motion = Motion(*np.full((len(Motion._fields), len(windows)), np.nan)) if moved is None else moved
+    _write_columns(
+        file,
+        {"dropped": dict(cut.dropped)},
+        {
+            "start_s": windows.start_s,
+            "terrain": np.array([str(name) for name in windows.terrain], dtype=object),
+            **motion._asdict(),
+        },
+        extractor.transform(windows),
+    )
+
+
+def _table(
+    heads: Sequence[RunHead], files: Sequence[Path], width: int, layout: Layout, rule: WindowRule
+) -> CachedFeatures:
+    """Return the labelled windows of all runs, run by run and in order of time."""
+    parts, dropped = [], Counter[str]()
+    for head, file in zip(heads, files, strict=True):
+        found = _read(file, width)
+        if found is None:
+            raise LogError(f"{file}: was changed while it was used")
+        document, columns = found
+        known = columns["terrain"] != ""
+        dropped.update(document["dropped"])
+        if not known.all():
+            dropped["no single label"] += int((~known).sum())
+        kept = {name: values[known] for name, values in columns.items()}
+        parts.append({**kept, "run_id": np.full(int(known.sum()), head.run_id, dtype=object)})
+    table = {name: np.concatenate([part.pop(name) for part in parts]) for name in list(parts[0])}
+    n, features = len(table["run_id"]), table["features"]
+    if not n and not dropped["no single label"]:
+        raise DataError(f"not one window is left: {format_counts(dropped) or 'no run is long enough'}")
+    if not n:
+        raise DataError("no window has a terrain label: nothing can be trained or tested")
+    if np.array_equal(features, np.broadcast_to(features[:1], features.shape), equal_nan=True):
+        raise DataError("no feature ever varies: nothing can be learned from them")
+    windows = Windows({}, {}, {}, rule.length_s, table["start_s"], table["run_id"], table["terrain"])
+    measured = wheel_stream(layout.channels) is not None
+    motion = Motion(*(table[name] for name in Motion._fields)) if measured else None
+    repaired = dict(sum((Counter(head.repaired) for head in heads), Counter()))
+    samples = Samples(windows, dict(dropped), windows.run_id, rule.overlap, repaired=repaired)
+    return CachedFeatures(samples, features, motion, layout, tuple(heads), 0, ())
+
+
+def _identity(rule: WindowRule, signal_sets: Sequence[str], layout: Layout) -> str:
+    """Return a digest of all that features depend on beside the run."""
+    channels = {name: list(names) for name, names in layout.channels.items()}
+    rates = dict(layout.rate_hz)
+    return _sha256([FORMAT_VERSION, __version__, asdict(rule), list(signal_sets), channels, rates])
+
+
+def _key(digest: str, identity: str) -> str:
+    return _sha256([digest, identity])[:32]
+
+
+def _sha256(document: Any) -> str:
+    return hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()
+
+
+def _read(file: Path, width: int) -> tuple[dict[str, Any], dict[str, Array]] | None:
+    """Return what is kept of a run's windows; None where it is not there, damaged or of other features."""
+    found = _read_columns(file)
+    if found is None or found[1].get("features", np.zeros((0, 0))).shape[1:] != (width,):
+        return None
+    return found
+
+
+def _write_columns(
+    file: Path, document: Mapping[str, Any], columns: Mapping[str, Array], features: Array | None = None
+) -> None:
+    """Write a file of the cache, whole or not at all; the same content gives the same bytes."""
+    import pyarrow
+    from pyarrow import parquet
+
+    arrays: dict[str, Any] = {name: pyarrow.array(values) for name, values in columns.items()}
+    if features is not None:
+        flat = pyarrow.array(np.ascontiguousarray(features, dtype=np.float64).ravel())
+        arrays["features"] = pyarrow.FixedSizeListArray.from_arrays(flat, features.shape[1])
+    checked = {**columns, **({} if features is None else {"features": features})}
+    text = json.dumps(dict(document), sort_keys=True)
+    metadata = {KEY: text, b"sha256": _checksum(text, checked)}
+    table = pyarrow.table(arrays).replace_schema_metadata(metadata)
+    with atomic_file(file) as stream:
+        parquet.write_table(table, stream, compression="zstd")
+
+
+def _read_columns(file: Path) -> tuple[dict[str, Any], dict[str, Array]] | None:
+    """Return the document and the columns of a file; None where it is missing or damaged."""
+    import pyarrow
+    from pyarrow import parquet
+
+    try:
+        with file.open("rb") as stream:
+            table = parquet.read_table(stream, use_threads=False)
+        columns = {}
+        for name in table.column_names:
+            column = table.column(name).combine_chunks()
+            if pyarrow.types.is_fixed_size_list(column.type):
+                flat = column.flatten().to_numpy(zero_copy_only=False)
+                columns[name] = flat.reshape(table.num_rows, column.type.list_size)
+            else:
+                columns[name] = column.to_numpy(zero_copy_only=False)
+        text = table.schema.metadata[KEY].decode()
+        if table.schema.metadata[b"sha256"].decode() != _checksum(text, columns):
+            return None
+        return json.loads(text), columns
+    except (pyarrow.ArrowException, OSError, ValueError, KeyError, TypeError, AttributeError):
+        return None
+
+
+def _checksum(text: str, columns: Mapping[str, Array]) -> str:
+    """Return a SHA-256 over all that a file holds; page checksums of Parquet leave its headers out."""
+    digest = hashlib.sha256(text.encode())
+    for name, values in columns.items():
+        digest.update(name.encode())
+        plain = values.dtype.kind in "if"
+        digest.update(np.ascontiguousarray(values).tobytes() if plain else "\n".join(values).encode())
+    return digest.hexdigest()
+
+
+class PrintFiles:
+    """Fingerprints of many runs in files by their value, while the block lasts: one is read at a time.
+
+    Examples
+    --------
+    >>> codes, time_s = np.arange(9), np.arange(9.0)
+    >>> with PrintFiles() as prints:
+    ...     prints.add(RunPrint(codes, time_s, b""))
+    ...     prints.add(RunPrint(codes[1:], 50.0 + time_s[1:], b""))
+    ...     prints.possible_pairs()
+    [(0, 1)]
+    """
+
+    def __init__(self) -> None:
+        self._digests: list[bytes] = []
+
+    def __enter__(self) -> PrintFiles:
+        self._folder = TemporaryDirectory()
+        self._files = [(Path(self._folder.name) / str(number)).open("w+b") for number in range(N_FILES)]
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for file in self._files:
+            file.close()
+        self._folder.cleanup()
+
+    def add(self, prints: RunPrint) -> None:
+        """Take the fingerprints of the next run."""
+        records = np.empty(len(prints.codes), RECORD)
+        records["code"], records["time_s"], records["run"] = prints.codes, prints.time_s, len(self._digests)
+        self._digests.append(prints.digest)
+        number = (prints.codes.astype(np.uint64) * SPREADING) // np.uint64(2**64 // N_FILES)
+        for each in np.unique(number).tolist():
+            self._files[each].write(records[number == each].tobytes())
+
+    def possible_pairs(self) -> list[tuple[int, int]]:
+        """Return the pairs of runs, by their places, that may share a stretch.
+
+        :func:`~terrain.logs.duplicates.shared_stretches` decides.
+        """
+        found = []
+        for file in self._files:
+            file.seek(0)
+            records = np.frombuffer(file.read(), RECORD)
+            found.append(equal_codes(records["code"], records["run"], records["time_s"]))
+        return pairs_of(EqualCodes(*map(np.concatenate, zip(*found, strict=True))), self._digests)

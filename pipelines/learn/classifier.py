@@ -1,0 +1,234 @@
+"""``terrain.TerrainClassifier``: a recipe as a scikit-learn estimator of windows, which can be saved and applied."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import pandas as pd
+from sklearn.base import BaseEstimator, ClassifierMixin
+from sklearn.utils.validation import check_is_fitted
+
+from features.motion import window_motion
+from pipelines.learn.load import load_model
+from pipelines.learn.model_file import ModelInfo, TerrainModel, write_model
+from pipelines.learn.recipes import make_recipe
+from terrain import __version__
+from terrain.classify.conformal import conformal_threshold, held_out_scores
+from terrain.classify.novelty import NoveltyScore
+from terrain.classify.support import learn_support
+from terrain.errors import ConfigError, DataError
+from terrain.logs.schema import SIGNAL_SETS
+from terrain.records import Array, Windows
+
+
+class TerrainClassifier(ClassifierMixin, BaseEstimator):
+    """From windows to terrain: ``fit(windows)``, ``predict(windows)``, ``save(folder)``.
+
+    Parameters
+    ----------
+    recipe : name of a recipe, as ``svm``, ``cnn``, ``stack``, ``best``; or a scikit-learn classifier of features
+    signal_sets : whose channels are used
+    seed : deals runs into inner folds
+    functions : own functions of a window, beside the features; a classifier with them cannot be saved
+
+    Attributes
+    ----------
+    classes_ : (k,) terrains
+    model_ : :class:`~pipelines.learn.model_file.TerrainModel`, which observers, services and predictions take
+
+    Examples
+    --------
+    >>> rng, run = np.random.default_rng(0), np.repeat(np.arange(6), 8)
+    >>> terrain = np.where(run % 2, "ice", "mud").astype(object)
+    >>> shaking = rng.normal(size=(48, 1, 200)) * np.where(run % 2, 1.0, 3.0)[:, None, None]
+    >>> windows = Windows({"imu": shaking}, {"imu": ("accel_z_mps2",)}, {"imu": 100.0}, 2.0,
+    ...                   2.0 * np.arange(48), run.astype(str).astype(object), terrain)
+    >>> model = TerrainClassifier("svm").fit(windows)
+    >>> model.predict(windows[:2])
+    array(['mud', 'mud'], dtype=object)
+    >>> model.score(windows, terrain)
+    1.0
+    """
+
+    def __init__(
+        self,
+        recipe: Any = "svm",
+        signal_sets: tuple[str, ...] = SIGNAL_SETS,
+        seed: int = 0,
+        functions: tuple[Any, ...] = (),
+    ) -> None:
+        self.recipe = recipe
+        self.signal_sets = signal_sets
+        self.seed = seed
+        self.functions = functions
+
+    def fit(self, X: Windows, y: Array | None = None) -> Self:
+        """Fit the recipe and what it knows of its own limits; inner folds are made of whole runs.
+
+        Parameters
+        ----------
+        X : labelled windows; those without a label are left out
+        y : (n,) terrain of each window in place of its label
+
+        Raises
+        ------
+        DataError
+            if there is one terrain only, or there are too few windows of one.
+        """
+        windows = _windows(X)
+        terrain = windows.terrain if y is None else np.asarray(y, dtype=object)
+        if len(terrain) != len(windows):
+            raise DataError(f"{len(terrain)} terrains for {len(windows)} windows")
+        known = np.array([bool(name) for name in terrain], dtype=bool)
+        if not known.any():
+            raise DataError("no window has a terrain label: nothing can be trained")
+        windows, terrain = windows[known], terrain[known].astype(str)
+        recipe = make_recipe(
+            self.recipe, self.signal_sets, gap=_overlap(windows), seed=self.seed, functions=self.functions
+        )
+        recipe.fit(windows, terrain)
+        self.classes_ = np.asarray(recipe.classes_, dtype=object)
+        self.model_ = self._model(recipe, windows, terrain)
+        return self
+
+    def _model(self, recipe: Any, windows: Windows, terrain: Array) -> TerrainModel:
+        """Return the model with its limits, as far as the windows give them."""
+        classes, counts = np.unique(terrain, return_counts=True)
+        names, run_id = [str(name) for name in classes], windows.run_id.astype(str)
+        novelty = conformal = support = None
+        gap = _overlap(windows)
+        try:
+            features = recipe.matrix.of(windows)
+            novelty = NoveltyScore(gap=gap, seed=self.seed).fit(features, terrain, run_id).numbers_
+            conformal = conformal_threshold(held_out_scores(recipe[-1], terrain), run_id)
+        except (AttributeError, DataError):
+            pass  # too few runs: no window is called unknown, or there are no sets of terrains
+        motion = window_motion(windows)
+        if motion is not None:
+            support = learn_support(motion.speed_mps, motion.yaw_rate_radps, terrain, run_id, names)
+        info = ModelInfo(
+            classes=tuple(names),
+            window_s=windows.length_s,
+            stride_s=None,
+            steady=None,
+            channels=recipe[0].layout_.channels,
+            rate_hz=dict(recipe[0].layout_.rate_hz),
+            run_digests=(),
+            recipe=self.recipe if isinstance(self.recipe, str) else type(self.recipe).__name__,
+            signal_sets=tuple(self.signal_sets),
+            seed=self.seed,
+            package_version=__version__,
+            class_ratio=dict(zip(names, (counts / counts.sum()).tolist(), strict=True)),
+            support=None if support is None else support.as_json(),
+            conformal=conformal,
+        )
+        return TerrainModel(recipe, info, novelty, support)
+
+    def predict(self, X: Windows) -> Array:
+        """Return the most probable terrain (n,) of each window.
+
+        Raises
+        ------
+        DataError
+            if the windows lack a channel, or have another length or rate.
+        """
+        best = self.predict_proba(X).argmax(axis=1)
+        return np.asarray(self.classes_[best], dtype=object)
+
+    def predict_proba(self, X: Windows) -> Array:
+        """Return calibrated probabilities (n, k) in the order of ``classes_``; errors as :meth:`predict`."""
+        check_is_fitted(self, "model_")
+        windows = _windows(X)
+        check_windows(self.model_, windows)
+        return np.asarray(self.model_.recipe.predict_proba(windows))
+
+    def predictions(self, X: Windows) -> pd.DataFrame:
+        """Return a row a window: run, start, terrain, and the probability of each terrain."""
+        probability = self.predict_proba(X)
+        head = {
+            "run_id": X.run_id,
+            "start_s": X.start_s,
+            "terrain": self.classes_[probability.argmax(axis=1)],
+        }
+        return pd.DataFrame(head | dict(zip(self.classes_.tolist(), probability.T, strict=True)))
+
+    def save(self, folder: str | Path) -> Path:
+        """Write the model into a folder, which ``load`` and all commands read; return the folder.
+
+        Raises
+        ------
+        ConfigError
+            if the folder holds something else than a model.
+        ModelError
+            if the estimator is of no library whose types a model may hold.
+        """
+        check_is_fitted(self, "model_")
+        place = Path(folder)
+        if place.exists() and (
+            not place.is_dir() or (any(place.iterdir()) and not (place / "terrain_model.json").is_file())
+        ):
+            raise ConfigError(f"{place}: holds something else than a model; choose another folder")
+        place.mkdir(parents=True, exist_ok=True)
+        write_model(place, self.model_)
+        return place
+
+    @classmethod
+    def load(cls, source: str | Path) -> Self:
+        """Return a fitted classifier of a folder, or of a registered model by its URI.
+
+        Raises
+        ------
+        ModelError
+            if there is no such model, or it is damaged or foreign.
+        """
+        model = load_model(str(source))
+        found = cls(model.info.recipe, tuple(model.info.signal_sets) or SIGNAL_SETS, model.info.seed)
+        found.model_ = model
+        found.classes_ = np.asarray(model.recipe.classes_, dtype=object)
+        return found
+
+
+def _windows(given: Any) -> Windows:
+    if not isinstance(given, Windows):
+        raise DataError(
+            f"windows are needed, as terrain.cut_windows gives them; this is a {type(given).__name__}"
+        )
+    return given
+
+
+def _overlap(windows: Windows) -> int:
+    """Return how many windows on either side of a window may share samples with it; at least its neighbour."""
+    same = windows.run_id[1:] == windows.run_id[:-1]
+    steps_s = np.diff(windows.start_s)[same]
+    steps_s = steps_s[steps_s > 0]
+    return int(np.ceil(windows.length_s / steps_s.min() - 1e-9)) if len(steps_s) else 1
+
+
+def check_windows(model: TerrainModel, windows: Windows) -> None:
+    """Refuse windows of other channels, in one sentence that says what was found and what is accepted.
+
+    Raises
+    ------
+    DataError
+        if a channel is missing; lengths and rates are compared where features are computed.
+    """
+    needed, there = model.info.channels, windows.channels
+    lacking = [
+        f"{stream}.{name}"
+        for stream, names in needed.items()
+        for name in names
+        if name not in there.get(stream, ())
+    ]
+    if lacking:
+        raise DataError(
+            f"the windows lack {', '.join(lacking)}: they have {_listed(there)}; the model was trained on "
+            f"{_listed(needed)}"
+        )
+
+
+def _listed(channels: Any) -> str:
+    return (
+        "; ".join(f"{stream} with {', '.join(names)}" for stream, names in channels.items()) or "no channel"
+    )

@@ -1,0 +1,229 @@
+"""Changes of the ground, found sample by sample from what wheels answer, and judged by an outside measurement."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipelines.report import (
+    Column,
+    Part,
+    Progress,
+    Report,
+    Result,
+    Table,
+    Text,
+    described,
+    format_value,
+    plural,
+    silent,
+)
+from terrain.classify.response_change import DetectorSettings, GroundChange, calibrate, changes_of
+from terrain.errors import DataError
+from terrain.measured_slip.measure import one_robot
+from terrain.measured_slip.slips import wheel_speeds
+from terrain.measured_slip.steps import SlipStep, slip_step
+from terrain.measured_slip.travelled import outside_source
+from terrain.records import Array, RunLog
+from terrain.robots import Robot, load_robot
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+MAX_ROWS = 12
+
+
+@dataclass(frozen=True, slots=True)
+class WatchedRun:
+    """Changes that were found in a run, and what an outside measurement shows.
+
+    Parameters
+    ----------
+    run_id : of the run
+    changes : as they were found, in order of time
+    judged : whether the motion was measured from outside
+    step : of the slip measured from outside; None where it does not change, or nothing measured it
+    found : whether an alarm came while the robot crossed the border, or as long after; None without a step
+    delay_s : of that alarm behind the middle of the crossing; NaN without one
+    n_early : alarms before the crossing; all of them where the slip does not change
+    """
+
+    run_id: str
+    changes: tuple[GroundChange, ...]
+    judged: bool
+    step: SlipStep | None
+    found: bool | None
+    delay_s: float
+    n_early: int
+
+
+@dataclass(frozen=True, repr=False)
+class ChangesResult(Result):
+    """Changes of all runs; ratios are NaN where no run has a step of slip."""
+
+    robot: str = described("robot by name")
+    n_calibration_runs: int = described("runs on one ground that the detector was calibrated with")
+    threshold: float = described("of the detector")
+    false_alarm_ratio: float = described("calibration runs with an alarm", "1")
+    runs: tuple[WatchedRun, ...] = described("what was found in each run")
+    n_steps: int = described("runs whose slip changes, as measured from outside")
+    found_ratio: float = described("those among them whose change was found", "1")
+    delay_median_s: float = described("of the alarms behind the middle of the crossing", "s")
+    delay_p90_s: float = described("nine tenths of the delays are below", "s")
+    n_without_step: int = described("runs without such a change")
+    n_alarms_without_step: int = described("those among them with an alarm")
+    skipped: tuple[str, ...] = described("a sentence for each run that could not be read", default=())
+
+    def to_pandas(self) -> pd.DataFrame:
+        """Return a row a change."""
+        import pandas as pd
+
+        return pd.DataFrame(
+            [{"run_id": run.run_id, **each._asdict()} for run in self.runs for each in run.changes]
+        )
+
+
+def find_changes(
+    runs: Sequence[RunLog],
+    quiet: Sequence[RunLog],
+    robot: str | None = None,
+    false_alarms: float = 0.02,
+    progress: Progress = silent,
+) -> ChangesResult:
+    """Calibrate a detector on runs on one ground each, and watch others with it.
+
+    Parameters
+    ----------
+    runs : to watch
+    quiet : on one ground each
+    robot : name or YAML file; that of the runs by default
+    false_alarms : part of the quiet runs that may give an alarm
+    progress : called as runs are watched
+
+    Raises
+    ------
+    DataError
+        if runs are of several robots, lack wheel speeds or currents, or none is long enough to calibrate on.
+    """
+    described_robot = one_robot([*runs, *quiet], None if robot is None else load_robot(robot))
+    several = [run.run_id for run in quiet if len(run.terrains) > 1]
+    if several:
+        raise DataError(f"--changes: run {several[0]} is labelled with several terrains; one each is needed")
+    known = {run.run_id for run in quiet}
+    shared = [run.run_id for run in runs if run.run_id in known]
+    if shared:
+        raise DataError(f"run {shared[0]} is watched and calibrated on; one or the other is needed")
+    detector = calibrate((response_log(run, described_robot) for run in quiet), false_alarms)
+    watched = []
+    for done, run in enumerate(runs, start=1):
+        watched.append(_watch(run, described_robot, detector))
+        progress("watch", done, len(runs))
+    with_step = [run for run in watched if run.step is not None]
+    without = [run for run in watched if run.judged and run.step is None]
+    delays = np.array([run.delay_s for run in with_step if run.found])
+    return ChangesResult(
+        robot=described_robot.name,
+        n_calibration_runs=detector.n_runs,
+        threshold=detector.threshold,
+        false_alarm_ratio=detector.false_alarm_ratio,
+        runs=tuple(watched),
+        n_steps=len(with_step),
+        found_ratio=float(np.mean([run.found for run in with_step])) if with_step else float("nan"),
+        delay_median_s=float(np.median(delays)) if delays.size else float("nan"),
+        delay_p90_s=float(np.quantile(delays, 0.9)) if delays.size else float("nan"),
+        n_without_step=len(without),
+        n_alarms_without_step=sum(bool(run.changes) for run in without),
+    )
+
+
+def response_log(run: RunLog, robot: Robot) -> tuple[Array, Array, Array]:
+    """Return times (n,), currents (n, wheels) and wheel speeds (n, wheels) of a run.
+
+    Raises
+    ------
+    DataError
+        if it lacks one of them.
+    """
+    time_s, speeds = wheel_speeds(run, robot)
+    wheels = run.streams["wheels"]
+    names = [f"current_{wheel}_a" for wheel in robot.wheels]
+    if not set(names) <= set(wheels.channels):
+        raise DataError(f"run {run.run_id}: has no current of each wheel ({', '.join(names)})")
+    return time_s, np.column_stack([wheels.channel(name) for name in names]), speeds
+
+
+def _watch(run: RunLog, robot: Robot, detector: DetectorSettings) -> WatchedRun:
+    changes = tuple(changes_of(*response_log(run, robot), detector))
+    judged, step = outside_source(run) is not None, None
+    if judged:
+        try:
+            step = slip_step(run, robot)
+        except DataError:
+            judged = False
+    alarms = np.array([change.alarm_s for change in changes])
+    if step is None:
+        return WatchedRun(run.run_id, changes, judged, None, None, float("nan"), len(changes))
+    inside = alarms[np.abs(alarms - step.time_s) <= step.crossing_s]
+    delay_s = float(inside[0] - step.time_s) if inside.size else float("nan")
+    early = int((alarms < step.time_s - step.crossing_s).sum())
+    return WatchedRun(run.run_id, changes, judged, step, bool(inside.size), delay_s, early)
+
+
+def report(result: ChangesResult) -> Report:
+    """Return the alarms of each run, and how many changes were found how fast."""
+    n_alarms = sum(len(run.changes) for run in result.runs)
+    answer = (
+        f"{plural(n_alarms, 'change')} of the ground in {plural(len(result.runs), 'run')} of {result.robot}"
+    )
+    notes = []
+    if result.n_steps:
+        found = format_value(result.found_ratio, ".1%")
+        answer += (
+            f"; of {plural(result.n_steps, 'change')} that a measurement from outside shows, {found} found"
+        )
+        notes.append(
+            f"alarms come {format_value(result.delay_median_s, '+.2f', 's')} after the middle of the crossing in "
+            f"the median, {format_value(result.delay_p90_s, '+.2f', 's')} at nine tenths"
+        )
+    if result.n_without_step:
+        notes.append(
+            f"slip does not change in {result.n_without_step} runs; {result.n_alarms_without_step} of them "
+            "have an alarm"
+        )
+    rows = [
+        (
+            run.run_id,
+            ", ".join(f"{change.alarm_s:.2f}" for change in run.changes) or "none",
+            *(
+                ("no change" if run.judged else "not measured", None, None)
+                if run.step is None
+                else (f"{run.step.before:.2f} to {run.step.after:.2f}", run.step.time_s, run.delay_s)
+            ),
+            run.n_early,
+        )
+        for run in result.runs
+    ]
+    columns = (
+        "run",
+        Column("alarms", unit="s"),
+        "slip measured from outside",
+        Column("changes at", ".2f", "s"),
+        Column("delay", "+.2f", "s"),
+        "early",
+    )
+    more = f"{len(rows) - MAX_ROWS} runs more: --details" if len(rows) > MAX_ROWS else ""
+    parts: list[Part] = [Table(columns, rows[:MAX_ROWS], note=more)]
+    return Report(
+        title=f"Changes of the ground under {result.robot}",
+        answer=f"{answer}.",
+        lead=(
+            f"threshold {format_value(result.threshold, '.1f')}, exceeded in "
+            f"{format_value(result.false_alarm_ratio, '.1%')} of {result.n_calibration_runs} runs on one ground"
+        ),
+        parts=[*parts, *(Text(text, "note") for text in (*notes, *result.skipped))],
+        details=[],
+        next_step="terrain label --data runs/ --propose",
+    )

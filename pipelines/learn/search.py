@@ -1,0 +1,219 @@
+"""Hyper-parameters of the SVM, searched on inner folds of whole runs.
+
+One fold of whole runs is held out before the search and never seen by it; on it the result is compared with the
+default choice.  Trials are suggested in batches by a tree-structured Parzen estimator (optuna) whose seed is
+that of the batch, so that neither the number of processes nor an interruption changes what is tried.  Each batch
+is added to ``trials.jsonl``; a search that was interrupted goes on.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from pydantic import TypeAdapter
+
+from pipelines.learn.params import SvmParams
+from terrain.errors import ConfigError, LogError
+from terrain.files.atomic import atomic_write
+from terrain.files.names import printable
+
+if TYPE_CHECKING:
+    from pipelines.learn.evaluate import Examples
+    from pipelines.learn.training_data import TrainingData
+    from pipelines.report import Progress
+    from terrain.classify.paired import Difference
+    from terrain.records import Array
+
+BATCH = 4
+"""Trials that are suggested together; a batch does not depend on how many are computed at once."""
+
+SPACE = {"C": (0.3, 300.0), "gamma": (0.03, 3.0), "percentile": (40.0, 100.0)}
+"""C and gamma are searched on a logarithmic scale."""
+
+N_INNER_FOLDS = 5
+BEST_FILE, TRIALS_FILE, STUDY_FILE = "best.json", "trials.jsonl", "search.json"
+VERSION = 1
+N_DRAWS = 1000
+
+
+class Trial(NamedTuple):
+    """Hyper-parameters, and the accuracy on inner folds with its 95 % interval over runs."""
+
+    params: SvmParams
+    accuracy: float
+    accuracy_ci: tuple[float, float]
+
+
+class SearchResult(NamedTuple):
+    """A finished search.
+
+    Parameters
+    ----------
+    trials, resumed : candidates that were tried, and how many of them lay there already
+    best : the most accurate on inner folds
+    held_out : accuracy on the runs that were held out of the search: ``a`` the default choice, ``b`` the best
+    held_out_runs : these runs
+    params_file : for ``--params``
+    """
+
+    trials: int
+    resumed: int
+    best: Trial
+    held_out: Difference
+    held_out_runs: tuple[str, ...]
+    params_file: Path
+
+
+def search(
+    data: TrainingData, n_trials: int, folder: Path, seed: int, n_jobs: int, progress: Progress
+) -> SearchResult:
+    """Search hyper-parameters, or go on with a search.
+
+    Parameters
+    ----------
+    data : labelled windows by their features
+    n_trials : candidates that are tried
+    folder : of the trials and the result
+    seed : deals runs into folds, and of what is suggested
+    n_jobs : processes at once
+    progress : called as trials are done
+
+    Raises
+    ------
+    ConfigError
+        if optuna is not installed, or the folder holds a search of other data, settings or another version.
+    LogError
+        if the folder is damaged.
+    """
+    import numpy as np
+
+    from pipelines.learn.evaluate import Examples
+    from pipelines.learn.parallel import parallel
+    from pipelines.learn.protocols import folds_of
+    from pipelines.report.json_file import as_json
+
+    optuna = _optuna()
+    samples = data.samples
+    examples = Examples(data.features, samples.terrain, samples.group)
+    outer = folds_of(samples, "grouped", 1, seed)[0]
+    matrix = data.recipe.matrix
+    made_of = [dict(matrix.layout.channels), dict(matrix.layout.rate_hz), matrix.length_s, samples.gap]
+    content = {"version": VERSION, "space": SPACE, "data_digest": data.digest, "seed": seed, "cut": made_of}
+    trials = _begin(folder, json.dumps(as_json(content), indent=2, sort_keys=True) + "\n")
+    resumed = len(trials)
+    kept = Examples(*(part[outer.train] for part in examples))
+    progress("trials", resumed, n_trials)
+    while len(trials) < n_trials:
+        suggested = _suggest(optuna, trials, n_trials, seed)
+        each = ((params,) for params in suggested)
+        for trial in parallel(_evaluate, (kept, samples.gap, seed), each, n_jobs):
+            trials.append(trial)
+            progress("trials", len(trials), n_trials)
+        lines = "".join(json.dumps(as_json(trial)) + "\n" for trial in trials)
+        atomic_write(folder / TRIALS_FILE, lines)
+    best = max(trials[:n_trials], key=lambda trial: trial.accuracy)
+    held_out = _held_out(examples, outer.train, outer.test, best.params, samples.gap, seed)
+    runs = tuple(np.unique(samples.group[outer.test].astype(str)).tolist())
+    found = SearchResult(len(trials), resumed, best, held_out, runs, folder / BEST_FILE)
+    document = {"version": VERSION, "data_digest": data.digest, "held_out": held_out, **best._asdict()}
+    atomic_write(found.params_file, json.dumps(as_json(document), indent=2) + "\n")
+    return found
+
+
+def _optuna() -> Any:
+    try:
+        import optuna
+    except ModuleNotFoundError as error:
+        raise ConfigError("--search needs optuna: pip install 'terrain-slip[sweep]'") from error
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
+    return optuna
+
+
+def _begin(folder: Path, text: str) -> list[Trial]:
+    """Return the trials that lie in the folder of the same search; make the folder otherwise."""
+    file, lines = folder / STUDY_FILE, folder / TRIALS_FILE
+    if not file.exists():
+        if folder.exists() and any(folder.iterdir()):
+            raise ConfigError(f"{folder}: holds other files than those of a search")
+        folder.mkdir(parents=True, exist_ok=True)
+        atomic_write(file, text)
+        return []
+    if file.read_text(encoding="utf-8") != text:
+        raise ConfigError(
+            f"{folder}: holds a search of other runs, settings or another version: name another --trials"
+        )
+    try:
+        adapter = TypeAdapter(Trial)
+        return [adapter.validate_json(line) for line in lines.read_text(encoding="utf-8").splitlines()]
+    except FileNotFoundError:
+        return []
+    except (OSError, ValueError) as error:
+        raise LogError(f"{lines}: is damaged ({printable(str(error).splitlines()[0])[:200]})") from error
+
+
+def _suggest(optuna: Any, trials: Sequence[Trial], n_trials: int, seed: int) -> list[SvmParams]:
+    """Return the next batch: it depends on the trials before it and on the seed, and on nothing else."""
+    drawn = int.from_bytes(hashlib.sha256(f"{seed} {len(trials)}".encode()).digest()[:4], "big")
+    sampler = optuna.samplers.TPESampler(seed=drawn, n_startup_trials=2 * BATCH, constant_liar=True)
+    study = optuna.create_study(direction="maximize", sampler=sampler)
+    distributions: Mapping[str, Any] = {
+        name: optuna.distributions.FloatDistribution(low, high, log=name != "percentile")
+        for name, (low, high) in SPACE.items()
+    }
+    for trial in trials:
+        study.add_trial(
+            optuna.trial.create_trial(
+                params=trial.params._asdict(), distributions=distributions, value=trial.accuracy
+            )
+        )
+    asked = [study.ask(distributions).params for _ in range(min(BATCH, n_trials - len(trials)))]
+    return [SvmParams(**{name: float(f"{value:.4g}") for name, value in each.items()}) for each in asked]
+
+
+def _evaluate(examples: Examples, gap: int, seed: int, params: SvmParams) -> Trial:
+    """Return the accuracy of one candidate on inner folds of whole runs."""
+    import numpy as np
+
+    from terrain.bootstrap import percentile_interval
+    from terrain.classify.confidence import run_weights
+    from terrain.classify.inner import inner_splits
+
+    correct = np.full(len(examples.terrain), np.nan)
+    for train, test in inner_splits(examples.terrain, examples.group, N_INNER_FOLDS, seed, gap):
+        fitted = _fit((params,), examples, train, gap, seed)
+        correct[test] = fitted.predict(examples.features[test]) == examples.terrain[test]
+    known = np.isfinite(correct)
+    weights = run_weights(
+        examples.group[known].astype(str), examples.terrain[known], N_DRAWS, np.random.default_rng(seed)
+    )
+    draws = weights @ correct[known] / weights.sum(axis=1)
+    return Trial(params, float(correct[known].mean()), percentile_interval(draws))
+
+
+def _fit(candidates: Sequence[SvmParams], examples: Examples, rows: Array, gap: int, seed: int) -> Any:
+    from terrain.classify.svm import CANDIDATES, GroupedSVC
+
+    classifier = GroupedSVC(candidates or CANDIDATES, gap=gap, seed=seed)
+    return classifier.fit(examples.features[rows], examples.terrain[rows], groups=examples.group[rows])
+
+
+def _held_out(
+    examples: Examples, train: Array, test: Array, best: SvmParams, gap: int, seed: int
+) -> Difference:
+    """Return the accuracy of the default choice and of the best candidate on runs that no trial has seen."""
+    import numpy as np
+
+    from terrain.classify.paired import Outcome, compare_outcomes
+
+    outcomes = []
+    for candidates in ((), (best,)):
+        fitted = _fit(candidates, examples, train, gap, seed)
+        probability = fitted.predict_proba(examples.features[test])
+        correct = fitted.classes_[probability.argmax(axis=1)] == examples.terrain[test]
+        run_id = examples.group[test].astype(str)
+        outcomes.append(Outcome(run_id, examples.terrain[test], correct[None], probability.max(axis=1)[None]))
+    return compare_outcomes(outcomes[0], outcomes[1], np.random.default_rng(seed)).accuracy

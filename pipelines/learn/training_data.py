@@ -1,0 +1,147 @@
+"""What a recipe is fitted on: labelled windows, cut from runs or read from a cache of features."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from features.extractor import FeatureExtractor
+from features.matrix import FeatureMatrix
+from features.motion import Motion, window_motion
+from features.windows import Layout, cut_windows
+from pipelines.data.datasets import data_digest
+from pipelines.learn.cache import CachedFeatures
+from pipelines.learn.model_file import TerrainModel
+from pipelines.learn.protocols import Samples, samples_of
+from pipelines.learn.recipes import WindowPipeline, feature_matrix, recipe_of
+from pipelines.learn.settings import RecipeSettings
+from terrain.errors import DataError
+from terrain.records import Array, RunLog
+
+SAME_RATE = 1e-6
+"""Rates that differ by less, relative to one another, give the same features but for rounding."""
+
+
+class RunIdentity(NamedTuple):
+    """Id, robot and filter of a run, and the digest of its content."""
+
+    run_id: str
+    robot: str
+    filter: str
+    digest: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrainingData:
+    """Labelled windows of runs, and what a recipe, its limits and its judge are made from.
+
+    Parameters
+    ----------
+    samples : the windows; those of a cache have no samples
+    layout : channels and rates that a log must have
+    recipe : whose steps before the last one are fitted
+    rows : (n, columns) output of these steps
+    features : (n, f)
+    motion : how the robot moved in each window; None where no wheel speed was measured
+    runs : those that windows were cut from
+    digest : of the data
+    """
+
+    samples: Samples
+    layout: Layout
+    recipe: WindowPipeline
+    rows: Array
+    features: Array
+    motion: Motion | None
+    runs: tuple[RunIdentity, ...]
+    digest: str
+
+    def __len__(self) -> int:
+        return len(self.samples.windows)
+
+    def fitted(self) -> WindowPipeline:
+        """Return the recipe, fitted as by ``recipe.fit(windows, terrain)``."""
+        self.recipe[-1].fit(self.rows, self.samples.terrain, groups=self.samples.windows.run_id)
+        return self.recipe
+
+    def probabilities(self, model: TerrainModel, rows: Array) -> Array | None:
+        """Return what a model gives for some windows (m, k); None where it cannot be applied to them.
+
+        It cannot where windows have other rates than its own, and those without samples where it needs
+        samples or other features.
+        """
+        windows = self.samples.windows
+        if windows.values:
+            try:
+                return np.asarray(model.recipe.predict_proba(windows[rows]))
+            except DataError:
+                return None
+        recipe = model.recipe
+        if type(recipe[0]) is not FeatureExtractor or not same_features(recipe.matrix, self.recipe.matrix):
+            return None
+        return np.asarray(recipe[-1].predict_proba(self.features[rows]))
+
+
+def same_features(a: FeatureMatrix, b: FeatureMatrix) -> bool:
+    """Return whether two matrices have the same features of a window, but for rounding.
+
+    Examples
+    --------
+    >>> layout = Layout({"imu": ("accel_z_mps2",)}, {"imu": 100.0})
+    >>> matrix = FeatureMatrix(layout, 2.0, {"imu": 200})
+    >>> same_features(matrix, matrix), same_features(matrix, matrix._replace(length_s=1.0))
+    (True, False)
+    """
+    rates = [(a.layout.rate_hz[name], b.layout.rate_hz.get(name, np.nan)) for name in a.layout.channels]
+    return (
+        (a.layout.channels, dict(a.n_samples), a.length_s, a.level_sets)
+        == (b.layout.channels, dict(b.n_samples), b.length_s, b.level_sets)
+    ) and all(abs(one / other - 1.0) < SAME_RATE for one, other in rates)
+
+
+def identities(runs: Iterable[RunLog]) -> tuple[RunIdentity, ...]:
+    """Return what is kept of runs in a model."""
+    return tuple(RunIdentity(run.run_id, run.robot, run.filter, data_digest([run])) for run in runs)
+
+
+def data_of_runs(runs: Sequence[RunLog], settings: RecipeSettings) -> TrainingData:
+    """Return what a recipe is fitted on, of runs.
+
+    Raises
+    ------
+    DataError
+        as :func:`pipelines.learn.protocols.samples_of`.
+    """
+    samples = samples_of(runs, settings)
+    windows, recipe = samples.windows, recipe_of(settings, settings.recipe)
+    rows = feature_matrix(recipe, windows)
+    return TrainingData(
+        samples,
+        Layout(windows.channels, windows.rate_hz),
+        recipe,
+        rows,
+        rows if type(recipe[0]) is FeatureExtractor else recipe.matrix.of(windows),
+        window_motion(windows),
+        identities(runs),
+        data_digest(runs),
+    )
+
+
+def data_of_cache(cached: CachedFeatures, settings: RecipeSettings) -> TrainingData:
+    """Return what a recipe of features is fitted on, of cached ones.
+
+    Parameters
+    ----------
+    cached : features of runs
+    settings : of the recipe
+    """
+    recipe = recipe_of(settings, settings.recipe)
+    recipe[0].fit(cut_windows([], settings.rule, layout=cached.layout).windows)
+    runs = tuple(RunIdentity(run.run_id, run.robot, run.filter, run.digest) for run in cached.runs)
+    features = cached.features
+    return TrainingData(
+        cached.samples, cached.layout, recipe, features, features, cached.motion, runs, cached.digest
+    )

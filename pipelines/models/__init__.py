@@ -1,1 +1,0 @@
-"""Recipes, model files and tracking."""

@@ -1,1 +1,0 @@
-"""A search for hyper-parameters on inner folds of whole runs, which goes on where it was interrupted."""

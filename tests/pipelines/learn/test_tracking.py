@@ -1,0 +1,304 @@
+"""What MLflow holds of a training, which version is champion, and what becomes of a store that fails."""
+
+import json
+import os
+import shutil
+import sqlite3
+import subprocess
+import sys
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from features.windows import cut_windows
+from pipelines.data.datasets import data_digest
+from pipelines.data.tracking import ensure_tracking
+from pipelines.learn.champion import judge_of, standing_of, standing_tags
+from pipelines.learn.load import load_model
+from pipelines.learn.model_file import read_model, seal
+from pipelines.learn.settings import RecipeSettings
+from pipelines.learn.tracking import TrainingRecord, log_training
+from pipelines.learn.training_data import data_of_runs
+from terrain.errors import ModelError, TerrainError
+from terrain.files.lock import file_lock
+
+
+@pytest.fixture
+def mlflow(in_tracked):
+    """The package, set to the database of the folder, with its own warnings off."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        import mlflow
+
+        mlflow.set_tracking_uri("sqlite:///mlruns/mlflow.db")
+        mlflow.set_registry_uri("sqlite:///mlruns/mlflow.db")
+        yield mlflow
+
+
+@pytest.fixture
+def log(tracked, runs, tmp_path_factory):
+    """Return a function that logs the trained model once more, under a name, with a macro F1 and a digest.
+
+    What is given besides replaces fields of ``terrain_model.json``.
+    """
+    folder = Path(shutil.copytree(tracked[0] / "model", tmp_path_factory.mktemp("logged") / "model"))
+    model = read_model(folder)
+    data = data_of_runs(runs, RecipeSettings())
+
+    def again(name, macro_f1, digest="aa", accuracy_ci=(0.9, 0.95), **changed):
+        info = replace(model.info, data_digest=digest, **changed)
+        report = replace(tracked[1].crossval, macro_f1=macro_f1, accuracy_ci=accuracy_ci)
+        standing = standing_of(info, report)
+        record = TrainingRecord({"recipe": "svm"}, {"macro_f1": macro_f1}, standing_tags(standing))
+        seal(folder, info)
+        return log_training(name, folder, record, judge_of(data, report, standing, 0))
+
+    return again
+
+
+def test_a_training_run_holds_what_is_needed_to_judge_and_repeat_it(in_tracked, mlflow, runs):
+    result = model = in_tracked
+    run = mlflow.get_run(model.run_id)
+    assert run.data.params["window_s"] == "2.0"
+    assert run.data.params["n_runs"] == "12"
+    assert run.data.params["chosen_C"] == str(result.chosen["C"])
+    report = result.crossval
+    for metric in ("accuracy", "balanced_accuracy", "macro_f1", "vote_accuracy", "ece"):
+        assert run.data.metrics[metric] == pytest.approx(getattr(report, metric))
+    assert run.data.tags["data_digest"] == data_digest(runs)
+    assert run.data.tags["seed"] == "0"
+    assert run.data.tags["commit"] == result.commit
+    for name, row in report.per_class.items():
+        assert run.data.metrics[f"recall/{name}"] == pytest.approx(row.recall)
+    (given,) = run.inputs.dataset_inputs
+    assert (given.dataset.name, given.dataset.digest) == ("twelve runs", data_digest(runs)[:36])
+    assert given.tags[0].value == "training"
+    client = mlflow.MlflowClient()
+    assert len(client.list_artifacts(model.run_id, "figures")) >= 2
+    logged = mlflow.artifacts.load_text(f"runs:/{model.run_id}/crossval.json")
+    assert json.loads(logged)["accuracy"] == report.accuracy
+    version = client.get_model_version("drawn", model.version)
+    assert version.run_id == model.run_id
+    signature = mlflow.models.get_model_info(model.model_uri).signature
+    names = [spec.name for spec in signature.inputs]
+    assert names[0] == "imu.gyro_x_radps"
+    assert len(names) == 10
+    assert [spec.name for spec in signature.outputs] == ["ASPHALT", "GRASS", "GRAVEL"]
+
+
+def test_the_pyfunc_flavour_gives_the_probabilities_of_the_recipe(in_tracked, mlflow, runs):
+    model = load_model(in_tracked.model_uri)
+    windows = cut_windows(runs, model.rule).windows
+    table = pd.DataFrame(
+        {
+            f"{stream}.{name}": list(samples[:, place])
+            for stream, samples in dict(windows.values).items()
+            for place, name in enumerate(windows.channels[stream])
+        }
+    )
+    served = mlflow.pyfunc.load_model(in_tracked.model_uri).predict(table)
+    assert served.columns.tolist() == list(model.info.classes)
+    np.testing.assert_array_equal(served, model.recipe.predict_proba(windows))
+
+
+def test_a_model_is_loaded_by_alias_version_run_and_folder(in_tracked, runs, tracked):
+    uris = [
+        "models:/drawn@champion",
+        "models:/drawn/1",
+        f"runs:/{in_tracked.run_id}/model",
+        str(tracked[0] / "model"),
+    ]
+    models = [load_model(uri) for uri in uris]
+    windows = cut_windows(runs[::4], models[0].rule).windows
+    for model in models:
+        assert model.info == models[0].info
+        np.testing.assert_array_equal(
+            model.recipe.predict_proba(windows), models[0].recipe.predict_proba(windows)
+        )
+
+
+def champion_of(name):
+    with sqlite3.connect("mlruns/mlflow.db") as database:
+        rows = database.execute(
+            "SELECT version FROM registered_model_aliases WHERE name = ?", (name,)
+        ).fetchall()
+    database.close()
+    return [str(version) for (version,) in rows]
+
+
+def test_the_champion_moves_by_the_rule(in_tracked, log):
+    reasons = []
+    for macro_f1, digest, champion in (
+        (0.80, "aa", "1"),  # the first
+        (0.80, "aa", "1"),  # no better
+        (0.85, "aa", "3"),  # better on the same data
+        (0.84, "aa", "3"),  # worse than the champion, though better than the first
+        (0.20, "bb", "5"),  # other data: not worse on the same runs, each held out
+    ):
+        registered = log("by_rule", macro_f1, digest)
+        reasons.append(registered.alias_reason)
+        assert registered.alias_moved == (registered.version == champion)
+        assert champion_of("by_rule") == [champion]
+    assert reasons == [
+        "first version",
+        "macro F1 0.8000 is not better than 0.8000 of version 1 on the same data",
+        "macro F1 0.8500 is better than 0.8000 of version 1 on the same data",
+        "macro F1 0.8400 is not better than 0.8500 of version 3 on the same data",
+        "new data: on 12 runs, each held out, accuracy 75.0% against 75.0% of version 3 "
+        "(difference 95 % over runs: +0.0 to +0.0 points)",
+    ]
+    assert load_model("models:/by_rule@champion").info.data_digest == "bb"
+    assert in_tracked.alias_reason.startswith("first version")
+
+
+@pytest.mark.slow
+def test_the_champion_of_a_robot_stays_whatever_is_trained_under_its_name(in_tracked, log):
+    assert log("guarded", 0.80).alias_moved
+    for changed, reason in (
+        ({"robots": ("warthog",)}, "its robots are warthog, those of version 1 husky: choose another --name"),
+        ({"classes": ("ASPHALT", "MUD")}, "its classes are ASPHALT, MUD, those of version 1 ASPHALT, GRASS"),
+        ({"rate_hz": {"imu": 100.0, "wheels": 10.0}}, "its streams, channels or rates are not those of"),
+        ({"window_s": 3.0}, "its windows are 3 s every 3 s, steady motion, those of version 1 2 s every 2 s"),
+    ):
+        other = log("guarded", 0.99, "bb", **changed)
+        assert not other.alias_moved
+        assert other.alias_reason.startswith(reason)
+    chance = log("guarded", 0.99, "bb", accuracy_ci=(0.30, 0.60))
+    assert not chance.alias_moved
+    assert "30.0% to 60.0%) is not above chance, 33.3%" in chance.alias_reason
+    assert champion_of("guarded") == ["1"]
+
+
+def test_a_first_version_at_chance_is_registered_and_no_champion(in_tracked, log):
+    found = log("useless", 0.3, accuracy_ci=(0.25, 0.45))
+    assert (found.version, found.alias_moved) == ("1", False)
+    assert champion_of("useless") == []
+    wide = log("useless", 0.6, accuracy_ci=(0.40, 0.80))
+    assert wide.alias_moved
+    assert wide.alias_reason.startswith("first version; the interval of the accuracy is 40 points wide")
+
+
+def test_a_champion_that_cannot_be_loaded_is_replaced(in_tracked, log, mlflow):
+    first = log("broken", 0.99)
+    (Path(mlflow.artifacts.download_artifacts(first.model_uri)) / "model.skops").write_bytes(b"")
+    second = log("broken", 0.5, "bb")
+    assert (second.alias_moved, second.alias_reason) == (True, "version 1 cannot be loaded")
+
+
+def test_a_version_bears_what_it_is_compared_by(in_tracked, mlflow):
+    tags = mlflow.MlflowClient().get_model_version("drawn", "1").tags
+    assert (tags["robots"], tags["classes"]) == ("husky", "ASPHALT, GRASS, GRAVEL")
+    low, _, high = tags["accuracy_interval"].partition(" to ")
+    assert (float(low), float(high)) == pytest.approx(in_tracked.crossval.accuracy_ci, abs=1e-4)
+    assert {"macro_f1", "data_digest", "channels", "windows", "chance"} <= tags.keys()
+
+
+TWO_AT_ONCE = """
+import os, sys, time
+from pathlib import Path
+from pipelines.data.tracking import ensure_tracking, log_learning
+Path(f"ready_{sys.argv[1]}").touch()
+while len(list(Path().glob("ready_*"))) < 3:
+    time.sleep(0.01)
+ensure_tracking()
+print(log_learning("together", {}, {"figure": 1.0}, {}, {}, {}, {}))
+"""
+
+
+@pytest.mark.slow
+def test_processes_that_start_together_in_an_empty_folder_all_succeed(tmp_path):
+    environment = {k: v for k, v in os.environ.items() if k != "MLFLOW_TRACKING_URI"}
+    processes = [
+        subprocess.Popen(
+            [sys.executable, "-c", TWO_AT_ONCE, str(number)],
+            cwd=tmp_path, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        )
+        for number in range(3)
+    ]  # fmt: skip
+    done = [process.communicate(timeout=240) for process in processes]
+    assert [process.returncode for process in processes] == [0, 0, 0], done
+    assert len({out.strip() for out, _ in done}) == 3
+    with sqlite3.connect(tmp_path / "mlruns" / "mlflow.db") as database:
+        names = database.execute("SELECT name FROM experiments").fetchall()
+        (n_runs,) = database.execute("SELECT COUNT(*) FROM runs").fetchone()
+    database.close()
+    assert sorted(name for (name,) in names) == ["Default", "terrain"]
+    assert n_runs == 3
+
+
+def test_a_lock_that_stays_held_is_one_sentence(in_tracked, log, monkeypatch):
+    monkeypatch.setattr("pipelines.data.tracking.LOCK_TIMEOUT_S", 0.2)
+    with (
+        file_lock(Path("mlruns/mlflow.db.lock").resolve(), 1.0, "tests"),
+        pytest.raises(TerrainError, match=r"mlflow\.db\.lock: another process writes to the tracking"),
+    ):
+        log("drawn", 0.5)
+
+
+def test_the_server_that_is_named_is_the_one_that_is_used(tracked, log, tmp_path, monkeypatch):
+    shutil.copy(tracked[0] / "mlruns" / "mlflow.db", tmp_path / "other.db")
+    (tmp_path / "work").mkdir()
+    monkeypatch.chdir(tmp_path / "work")
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", f"sqlite:///{tmp_path / 'other.db'}")
+    log("elsewhere", 0.5)
+    assert load_model("models:/elsewhere@champion").info.data_digest == "aa"
+    assert list((tmp_path / "work").iterdir()) == []  # no ./mlruns beside the server that was named
+    monkeypatch.delenv("MLFLOW_TRACKING_URI")
+    monkeypatch.chdir(tracked[0])
+    with pytest.raises(ModelError, match="elsewhere"):
+        load_model("models:/elsewhere@champion")
+
+
+@pytest.mark.parametrize(
+    "uri",
+    [
+        "models:/missing@champion",
+        "models:/drawn/99",
+        "models:/drawn@missing",
+        "models:/",
+        "runs:/0123/model",
+    ],
+)
+def test_a_model_that_is_not_there_is_one_sentence(in_tracked, uri):
+    with pytest.raises(ModelError, match="cannot be loaded") as error:
+        load_model(uri)
+    assert str(error.value).startswith(uri)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("uri", ["sftp:/x", "http://x", "s3:/bucket/model", "nowhere"])
+def test_a_model_from_elsewhere_is_not_fetched(uri):
+    with pytest.raises(ModelError, match="is neither a folder nor a model URI"):
+        load_model(uri)
+
+
+def test_a_server_that_does_not_answer_is_named_before_the_work(monkeypatch):
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", "http://127.0.0.1:1")
+    for act in (ensure_tracking, lambda: load_model("models:/m@champion")):
+        with pytest.raises(TerrainError, match=r"MLFLOW_TRACKING_URI=http://127.0.0.1:1: cannot be reached"):
+            act()
+
+
+def test_looking_for_a_model_makes_nothing(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+    with pytest.raises(ModelError, match=r"mlflow\.db does not exist: train a model here first"):
+        load_model("models:/drawn@champion")
+    with pytest.raises(ModelError, match="nowhere: is neither a folder nor a model URI"):
+        load_model("nowhere")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_database_that_is_none_is_one_sentence(tmp_path, monkeypatch, log):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+    (tmp_path / "mlruns").mkdir()
+    (tmp_path / "mlruns" / "mlflow.db").write_text("no database, though as long as one. " * 100)
+    for use in (lambda: load_model("models:/drawn@champion"), lambda: log("drawn", 0.5)):
+        with pytest.raises(TerrainError) as error:
+            use()
+        assert "\n" not in str(error.value)

@@ -1,0 +1,237 @@
+"""Training: evaluated on held-out runs, tracked with its card, and kept where the tracking server stops."""
+
+import json
+import signal
+import socket
+import subprocess
+import sys
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from features.motion import window_motion
+from pipelines.learn import tracking
+from pipelines.learn.card import ModelCard, model_card, model_result
+from pipelines.learn.model_file import CARD_FILE, CARD_JSON, read_model, seal
+from pipelines.learn.protocols import samples_of
+from pipelines.learn.settings import RecipeSettings
+from pipelines.learn.train import ChannelDrops, Settings, TrainingSettings, register, run, train
+from pipelines.report.json_file import as_json
+from terrain.errors import ConfigError, ModelError, TerrainError
+from terrain.logs.write import write_run
+
+
+def test_training_is_evaluated_on_held_out_runs_and_names_the_model(tracked):
+    _, result = tracked
+    document = as_json(result)
+    json.dumps(document, allow_nan=False)
+    assert (document["model_uri"], document["version"]) == ("models:/drawn/1", "1")
+    assert set(document) == {
+        *("model_uri", "version", "run_id", "alias_moved", "alias_reason", "dataset", "data_digest"),
+        *("commit", "n_windows", "chosen", "importance", "crossval"),
+    }
+    assert document["crossval"]["protocol"] == "grouped"
+    assert "dataset" not in document["crossval"]
+    assert result.n_windows == 144
+    drops = [row.drop for row in result.importance]
+    assert drops == sorted(drops, reverse=True)
+    assert result.ui.startswith("mlflow ui --backend-store-uri sqlite:////")
+    assert result.ui in str(result.report)
+
+
+@pytest.mark.parametrize("name", ["", "a/b", "a:b", "a@b", "a b", "a.b"])
+def test_a_name_no_registry_takes_is_refused(name):
+    with pytest.raises(ConfigError, match=f"model name '{name}'"):
+        TrainingSettings(name=name)
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"protocol": "published"}, "there is no setting 'protocol'"),
+        ({"cache": "c", "recipe": "cnn"}, "--cache is for recipe 'svm'"),
+        ({"search": 4, "feature": ("a:b",)}, "--search is for recipe 'svm' .* with --feature"),
+        ({"search": 4, "params": "best.json"}, "--search and --params do not go together"),
+        ({"cache": "c", "merge_duplicates": True}, "--cache keeps each run by itself"),
+    ],
+)
+def test_settings_that_do_not_go_together_are_refused(options, sentence):
+    with pytest.raises(ConfigError, match=sentence):
+        TrainingSettings(name="m", **options)
+
+
+def test_data_are_needed_where_nothing_is_registered():
+    with pytest.raises(ConfigError, match="--data is missing"):
+        Settings(name="m")
+    with pytest.raises(ConfigError, match="--register trains nothing"):
+        Settings(name="m", data="runs", kept="model")
+
+
+def test_a_tracking_folder_that_cannot_be_written_is_reported_before_any_work(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+    (tmp_path / "mlruns").write_text("an obstacle")
+    with pytest.raises(TerrainError, match="mlruns: cannot be written"):
+        train([], TrainingSettings(name="m"), "none")
+    assert (tmp_path / "mlruns").read_text() == "an obstacle"
+
+
+class OfFirst:
+    """Says "b" where the first feature is large."""
+
+    classes_ = np.array(["a", "b"])
+
+    def predict(self, features):
+        return np.where(features[:, 0] > 0, "b", "a")
+
+
+def test_only_the_channel_that_is_used_is_important():
+    rng = np.random.default_rng(0)
+    features = rng.normal(size=(400, 3))
+    truth = np.where(features[:, 0] > 0, "b", "a")
+    drops = ChannelDrops(features, truth, ["imu.x", "imu.y", "imu.x"], 0, 1)(OfFirst())
+    assert drops[0] == pytest.approx(0.5, abs=0.1)
+    assert drops[1] == 0.0
+
+
+@pytest.fixture
+def card(tracked, runs):
+    """A maker of cards of the trained model; what is given replaces fields of its information."""
+    info = read_model(tracked[0] / "model").info
+    windows = samples_of(runs, RecipeSettings()).windows
+
+    def make(evaluation=None, **changed):
+        of = replace(info, **changed), windows, window_motion(windows)
+        return model_card("drawn", *of, evaluation or tracked[1].crossval, {"C": 10.0})
+
+    return make
+
+
+def test_a_model_has_its_card_and_its_figures(model_dir, tracked):
+    result = model_result(model_dir)
+    evaluation, card = tracked[1].crossval, result.card
+    assert (card.data_digest, card.n_windows) == (tracked[1].data_digest, tracked[1].n_windows)
+    assert [(row.terrain, row.n_runs) for row in card.terrains] == [
+        ("ASPHALT", 4), ("GRASS", 4), ("GRAVEL", 4)
+    ]  # fmt: skip
+    assert card.figures[0][1:3] == (evaluation.accuracy, evaluation.accuracy_ci)
+    assert card.latency_ms > 0
+    assert [(row.name, row.n_bytes) for row in card.files] == [
+        ("model.skops", (model_dir / "model.skops").stat().st_size)
+    ]
+    assert any("robots other than husky" in text.lower() for text in card.limits)
+    assert (result.finds_unknown, result.counts_support, result.names_sets) == (True, True, True)
+    json.dumps(as_json(result), allow_nan=False)
+    text = (model_dir / CARD_FILE).read_text()
+    assert "Robots other than husky" in text
+    assert f"{100 * evaluation.accuracy:.1f}" in text
+
+
+def test_limits_name_what_is_weak(card, tracked):
+    evaluation = tracked[1].crossval
+    weak = {name: row._replace(recall=0.3) for name, row in evaluation.per_class.items() if name == "GRASS"}
+    limits = " ".join(card(replace(evaluation, per_class={**evaluation.per_class, **weak})).limits)
+    assert "Decisions that rest on GRASS: recognised in under half of the windows." in limits
+    assert "Speeds outside of 0." in limits
+
+
+@pytest.mark.parametrize("content", ["{", "[]", '{"name": 3}', '{"name": "x"}'])
+def test_a_card_that_is_none_is_one_sentence(model_dir, content):
+    info = read_model(model_dir).info
+    (model_dir / CARD_JSON).write_text(content)
+    with pytest.raises(ModelError, match=r"model_card\.json: is damaged"):
+        model_result(model_dir)
+    seal(model_dir, info)
+    with pytest.raises(ModelError, match=r"model_card\.json: is no card of a model") as refusal:
+        model_result(model_dir)
+    assert len(str(refusal.value).splitlines()) == 1
+
+
+def test_a_model_without_a_card_says_so(model_dir):
+    info = read_model(model_dir).info
+    for name in (CARD_JSON, CARD_FILE):
+        (model_dir / name).unlink()
+    seal(model_dir, info)
+    result = model_result(model_dir)
+    assert result.card is None
+    assert "was not evaluated" in result.report.answer
+    assert ModelCard.__doc__
+
+
+SERVER = """
+import sys, uvicorn, os
+os.environ["_MLFLOW_SERVER_FILE_STORE"] = os.environ["_MLFLOW_SERVER_REGISTRY_STORE"] = sys.argv[2]
+os.environ["_MLFLOW_SERVER_ARTIFACT_ROOT"] = "mlflow-artifacts:/"
+os.environ["_MLFLOW_SERVER_ARTIFACT_DESTINATION"] = sys.argv[3]
+os.environ["_MLFLOW_SERVER_SERVE_ARTIFACTS"] = "true"
+from mlflow.server.fastapi_app import app
+uvicorn.run(app, host="127.0.0.1", port=int(sys.argv[1]), log_level="critical")
+"""
+
+
+@pytest.fixture
+def server(tmp_path, monkeypatch):
+    """A tracking server in a process of its own, which the environment names."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    words = [str(port), f"sqlite:///{tmp_path / 'server.db'}", str(tmp_path / "artifacts")]
+    silent = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    process = subprocess.Popen([sys.executable, "-c", SERVER, *words], cwd=tmp_path, **silent)
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", f"http://127.0.0.1:{port}")
+    end_s = time.monotonic() + 120
+    while time.monotonic() < end_s:
+        try:
+            socket.create_connection(("127.0.0.1", port), timeout=1).close()
+            break
+        except OSError:
+            time.sleep(0.2)
+    yield process
+    process.send_signal(signal.SIGCONT)
+    process.kill()
+    process.wait()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stop", [signal.SIGSTOP, signal.SIGKILL])
+def test_a_server_that_stops_in_the_middle_costs_seconds_and_no_model(
+    server, runs, tracked, tmp_path, monkeypatch, stop
+):
+    for each in runs:
+        write_run(each, tmp_path / "runs")
+    monkeypatch.chdir(tmp_path)
+    stopped_s = []
+    usual = tracking._log_model
+
+    def stopping(*given):
+        server.send_signal(stop)
+        stopped_s.append(time.monotonic())
+        return usual(*given)
+
+    monkeypatch.setattr(tracking, "_log_model", stopping)
+    with pytest.raises(
+        TerrainError, match=r"register it by terrain train --register field-not-registered"
+    ) as error:
+        run(Settings(data=tmp_path / "runs", name="field", repeats=1, n_jobs=1))
+    assert time.monotonic() - stopped_s[0] < 30.0
+    assert len(str(error.value).splitlines()) == 1
+    kept = tmp_path / "field-not-registered"
+    assert read_model(kept).info.classes == ("ASPHALT", "GRASS", "GRAVEL")
+    monkeypatch.setattr(tracking, "_log_model", usual)
+    monkeypatch.delenv("MLFLOW_TRACKING_URI")
+    monkeypatch.chdir(tracked[0])
+    found = register(kept, "kept")
+    assert (found.model_uri, found.alias_moved) == ("models:/kept/1", True)
+    again = register(kept, "kept")
+    assert not again.alias_moved
+    assert "is not better than" in again.alias_reason
+
+
+def test_a_model_that_was_not_evaluated_is_not_registered(model_dir):
+    info = read_model(model_dir).info
+    (model_dir / "training.json").unlink()
+    seal(model_dir, info)
+    with pytest.raises(ModelError, match="holds a model that was not evaluated"):
+        register(model_dir, "m")
