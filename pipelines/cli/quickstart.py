@@ -1,24 +1,305 @@
-"""The command quickstart."""
+"""Quickstart: the whole job on your runs, or on simulated ones: slip, evaluation, training, prediction, a report.
+
+One fold assignment and no check beside the headline, so that a first look is soon there; the commands that it
+ends with give all figures.
+"""
 
 from __future__ import annotations
 
-import typer
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from pipelines.cli.command import Json, command
-from pipelines.quickstart.settings import QuickstartSettings
+from pipelines.report import (
+    Column,
+    Figure,
+    Progress,
+    Report,
+    Result,
+    Section,
+    Table,
+    Text,
+    described,
+    enumerated,
+    format_value,
+    silent,
+)
+from pipelines.report.settings import Settings as BaseSettings
+from pipelines.report.settings import setting
+from terrain.errors import DataError
 
-app = typer.Typer()
+if TYPE_CHECKING:
+    from pipelines.data.convert import ImportResult
+    from pipelines.learn.crossval import CrossvalResult
+    from pipelines.learn.predict import Predictions
+    from pipelines.learn.train import TrainResult
+    from terrain.estimation.labelled import TerrainSlip
+    from terrain.records import RunLog
+
+EXAMPLE = "terrain quickstart --data logs/"
+REPORT_FILE = "report.html"
+SIMULATED = "simulated AgriMaRo"
+REPEATS = 1
+
+ENOUGH_RUNS = 6
+"""A terrain with so many runs gives one of them away: five are left, one for each fold."""
+
+FEWEST_RUNS = 3
+"""Where no terrain has enough, the one with the most runs gives one away if two are left."""
+
+N_FOLDS = 5
 
 
-@command(app, "quickstart")
-def quickstart_command(settings: QuickstartSettings, json_file: Json = None) -> None:
-    """Import or simulate runs, cross-validate, train, predict, and write a report."""
-    from pipelines.quickstart.quickstart import quickstart
-    from pipelines.quickstart.screen import print_quickstart
-    from pipelines.reporting.json_file import write_json
-    from pipelines.reporting.terminal import output_console, progress_bar
+class Settings(BaseSettings):
+    """Which runs are used, where the report goes, and under which name the model is registered."""
 
-    with progress_bar() as progress:
-        result = quickstart(settings, progress)
-    print_quickstart(result, output_console())
-    write_json(json_file, result)
+    data: Path | None = setting(None, "Folder of labelled runs; without, runs are simulated.")
+    out: Path = setting(Path("terrain-report"), "Folder of the runs and the report.")
+    name: str = setting("quickstart", "Name of the registered model.")
+    seed: int = setting(0, "Deals runs into folds; of the simulation, too.", ge=0)
+    n_jobs: int = setting(0, "Processes at once; 0 for one a core.", "--jobs", ge=0)
+    merge_duplicates: bool = setting(
+        False, "Treat runs that hold the same measurements as one run instead of refusing them."
+    )
+    runs_a_terrain: int = setting(6, "Simulated runs of each terrain.", ge=2, option="--runs")
+
+
+class KeptRuns(NamedTuple):
+    """Where the runs lie, and whether they were there from an earlier call; what reading them found."""
+
+    out: Path
+    n_runs: int
+    reused: bool
+    imported: ImportResult | None = None
+
+    def as_json(self) -> dict[str, Any]:
+        """Return all fields, those of the import among them."""
+        found = {"out": self.out, "n_runs": self.n_runs, "reused": self.reused}
+        if self.imported is None:
+            return found
+        return {each.name: getattr(self.imported, each.name) for each in fields(self.imported)} | found
+
+
+@dataclass(frozen=True, repr=False)
+class QuickstartResult(Result):
+    """Evaluation, model and predictions, and where they come from."""
+
+    dataset: str = described("name of the data")
+    data_digest: str = described("digest of the runs that were evaluated and trained on")
+    commit: str = described("of the code")
+    seed: int = described("of folds and simulation")
+    crossval: CrossvalResult = described("evaluation on held-out runs")
+    train: TrainResult = described("the registered model")
+    predict: Predictions = described("of the runs that were held out")
+    imported: KeptRuns = described("where the runs lie")
+    slip: tuple[TerrainSlip, ...] | None = described("estimated and true slip by terrain; None of your own runs")
+    commands: tuple[str, ...] = described("what to type for the same, step by step")
+    report_file: Path = described("the page")
+    held_out: tuple[str, ...] = described("runs that the model was neither evaluated nor trained on")
+    figures: tuple[Figure, ...] = described("of a simulated run; not in JSON", default=())
+
+    def as_json(self) -> Any:
+        """Return all fields; the evaluation is given once, beside the training."""
+        found = Result.as_json(self)
+        del found["figures"], found["train"]["crossval"]
+        return found
+
+
+class _Source(NamedTuple):
+    """The runs, and what is known of them because they were simulated."""
+
+    runs: list[RunLog]
+    slip: tuple[TerrainSlip, ...] | None
+    figures: tuple[Figure, ...]
+
+
+def run(settings: Settings, progress: Progress = silent) -> QuickstartResult:
+    """Evaluate, train and apply a classifier, on a folder of labelled runs or on simulated ones.
+
+    Runs go to ``out/runs``, the page to ``out/report.html``.  Where there are enough, some runs are held out, and
+    these are predicted.
+
+    Raises
+    ------
+    TerrainError
+        if a run cannot be read, the data do not suffice, or something cannot be written.
+    """
+    from dataclasses import replace
+
+    from pipelines.data.datasets import data_digest, load_runs
+    from pipelines.data.duplicates import distinct_runs
+    from pipelines.learn.crossval import EvaluationSettings, crossval
+    from pipelines.learn.load import load_model
+    from pipelines.learn.predict import predict
+    from pipelines.learn.tracking import ensure_tracking
+    from pipelines.learn.train import TrainingSettings, train
+    from terrain.control.slip_table import load_slip_table
+    from terrain.files.atomic import ensure_writable
+
+    data, out = settings.data, settings.out
+    ensure_writable(out)
+    ensure_tracking()
+    source = _simulated(settings, progress) if data is None else _Source(load_runs(data), None, ())
+    _refuse_other_runs(source.runs, data, out / "runs")
+    runs = distinct_runs(source.runs, merge=settings.merge_duplicates).runs
+    dataset = SIMULATED if data is None else data.resolve().name
+    training, held_out = divide(runs)
+    shared = {"seed": settings.seed, "n_jobs": settings.n_jobs, "repeats": REPEATS}
+    evaluation = crossval(training, EvaluationSettings(extras=False, **shared), progress)
+    evaluation = replace(evaluation, dataset=dataset, data_digest=data_digest(training))
+    kept = _keep(source.runs, data, out / "runs", progress)
+    trained = train(training, TrainingSettings(name=settings.name, **shared), dataset, progress, evaluation)
+    predicted = predict(held_out or runs, load_model(trained.model_uri), load_slip_table())
+    result = QuickstartResult(
+        dataset=dataset,
+        data_digest=trained.data_digest,
+        commit=trained.commit,
+        seed=settings.seed,
+        crossval=trained.crossval,
+        train=trained,
+        predict=predicted,
+        imported=kept,
+        slip=source.slip,
+        commands=_commands(settings, trained.model_uri, held_out),
+        report_file=out / REPORT_FILE,
+        held_out=tuple(each.run_id for each in held_out),
+        figures=source.figures,
+    )
+    result.report.save(result.report_file)
+    return result
+
+
+def divide(runs: Sequence[RunLog]) -> tuple[list[RunLog], list[RunLog]]:
+    """Return runs to evaluate and train on, and the last one of each terrain that has enough runs, held out.
+
+    The choice depends on names and numbers alone.  Nothing is held out where too little would be left, and no
+    run with several terrains is.
+
+    Examples
+    --------
+    >>> from terrain.records import RunLog
+    >>> def run(terrain, number):
+    ...     return RunLog(f"{terrain}_{number}", "husky", {}, ((0.0, 9.0, terrain),))
+    >>> runs = [run("ice", i) for i in range(6)] + [run("mud", i) for i in range(2)]
+    >>> [each.run_id for each in divide(runs)[1]]
+    ['ice_5']
+    """
+    by_terrain: dict[str, list[RunLog]] = {}
+    for run in sorted(runs, key=lambda each: each.run_id):
+        if len(run.terrains) == 1:
+            by_terrain.setdefault(run.terrains[0], []).append(run)
+    chosen = {of_one[-1].run_id for of_one in by_terrain.values() if len(of_one) >= ENOUGH_RUNS}
+    if not chosen and by_terrain:
+        most = max(by_terrain.values(), key=len)
+        if len(most) >= FEWEST_RUNS and len(runs) > N_FOLDS:
+            chosen = {most[-1].run_id}
+    return [run for run in runs if run.run_id not in chosen], [run for run in runs if run.run_id in chosen]
+
+
+def _simulated(settings: Settings, progress: Progress) -> _Source:
+    from pipelines.slip.filtered import slip_figure, swerve_motion
+    from terrain.estimation.labelled import labelled_runs
+
+    runs, slip, example = labelled_runs(settings.seed, settings.runs_a_terrain, progress)
+    return _Source(runs, slip, (slip_figure(example), swerve_motion(example)))
+
+
+def _commands(settings: Settings, model_uri: str, held_out: Sequence[RunLog]) -> tuple[str, ...]:
+    """Return what to type for the same, step by step, with all repeats and checks."""
+    data, seed, steps = settings.data, settings.seed, []
+    names = shlex.quote(",".join(run.run_id for run in held_out))
+    without, only = (f" --without {names}", f" --only {names}") if held_out else ("", "")
+    if data is None:
+        from terrain.estimation.labelled import FILTER, ROBOT, SCENARIO
+
+        data = settings.out / "runs"
+        steps = [
+            f"terrain simulate --robot {ROBOT} --terrain all --scenario {SCENARIO} "
+            f"--runs {settings.runs_a_terrain} --vary --seed {seed} --out LOGS",
+            f"terrain estimate --data LOGS --filter {FILTER} --out {data}",
+        ]
+    return (
+        *steps,
+        f"terrain crossval --data {data} --protocol grouped --seed {seed}{without}",
+        f"terrain train --data {data} --name {settings.name} --seed {seed}{without}",
+        f"terrain predict --model {model_uri} --data {data}{only}",
+    )
+
+
+def _refuse_other_runs(runs: list[RunLog], data: Path | None, folder: Path) -> None:
+    from pipelines.data.datasets import data_digest, load_runs
+
+    if folder.exists() and data_digest(load_runs(folder)) != data_digest(runs):
+        raise DataError(f"{folder}: holds other runs than {data or 'this simulation'}; choose another --out")
+
+
+def _keep(runs: list[RunLog], data: Path | None, folder: Path, progress: Progress) -> KeptRuns:
+    """Write run folders into ``folder``; earlier ones of the same data are used as they are."""
+    from terrain.files.atomic import atomic_folder
+    from terrain.logs.write import write_run
+
+    if folder.exists():
+        progress("write runs", len(runs), len(runs))
+        return KeptRuns(folder, len(runs), reused=True)
+    if data is not None:
+        from pipelines.data import convert
+
+        imported = convert.run(convert.Settings(data=data, out=folder), progress)
+        assert isinstance(imported, convert.ImportResult)
+        return KeptRuns(folder, len(runs), reused=False, imported=imported)
+    with atomic_folder(folder) as unfinished:
+        for number, each in enumerate(runs, 1):
+            write_run(each, unfinished)
+            progress("write runs", number, len(runs))
+    return KeptRuns(folder, len(runs), reused=False)
+
+
+def report(result: QuickstartResult) -> Report:
+    """Return the accuracy and what was predicted first; evaluation, training and slip are folded."""
+    evaluation, training, predicted = result.crossval.report, result.train.report, result.predict.report
+    slip = [] if result.slip is None else [_slip(result.slip)]
+    return Report(
+        f"From logs to slip: {result.dataset}",
+        evaluation.answer,
+        picture=evaluation.picture,
+        lead=evaluation.lead,
+        parts=[
+            Section("", [Text(training.answer), Text(_held_out_sentence(result)), Text(predicted.answer)]),
+            *([slip[0].parts[0]] if slip else evaluation.parts[:1]),
+            Text(f"report: {result.report_file}"),
+        ],
+        details=[
+            *slip,
+            *([Section("A run in detail", result.figures)] if result.figures else []),
+            Section("Evaluation", [*evaluation.parts, *evaluation.details]),
+            Section("Training", [*training.parts, *training.details]),
+            Section("Predictions", [*predicted.parts, *predicted.details]),
+            Section("Step by step", [Text("\n".join(result.commands), "code")]),
+        ],
+        next_step=result.commands[-3],
+    )
+
+
+def _held_out_sentence(result: QuickstartResult) -> str:
+    if not result.held_out:
+        return "The runs are too few to hold one out: predictions are those of training runs."
+    return (
+        f"Predictions are those of {enumerated(result.held_out)}, held out: the model was neither trained nor "
+        "evaluated on them."
+    )
+
+
+def _slip(rows: Sequence[TerrainSlip]) -> Section:
+    columns = (
+        "terrain",
+        "runs",
+        Column("slip", "+.3f"),
+        Column("true slip", "+.3f"),
+        Column("RMSE", ".4f"),
+        Column("NEES", ".2f"),
+    )
+    table = Table(columns, [tuple(row) for row in rows], title="steady slip of the simulated runs")
+    worst = max((row.slip_rmse or 0.0) for row in rows)
+    return Section(f"Slip, at most {format_value(worst, '.4f')} off", [table])
