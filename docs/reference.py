@@ -38,7 +38,12 @@ def commands_page() -> str:
             blocks.append(f"## {group}")
         module = import_module(command.module)
         text = " ".join((module.__doc__ or command.text).split("\n\n")[0].split())
-        blocks += [f"### terrain {command.name}", text, f"```\n{module.EXAMPLE}\n```", _options(click_command(command))]
+        blocks += [
+            f"### terrain {command.name}",
+            text,
+            f"```\n{module.EXAMPLE}\n```",
+            _options(click_command(command)),
+        ]
         blocks += [_fields(kind) for kind in _results(module)]
     return "\n\n".join(blocks) + "\n"
 

@@ -98,16 +98,10 @@ def main() -> None:
     """Run the command line: a user's mistake is one sentence and exit code 2, a fault keeps its traceback."""
     warnings.showwarning = _Notes()
     try:
-        if (
-            len(sys.argv) > 1
-            and not sys.argv[1].startswith("-")
-            and not app.get_command(click.Context(app), sys.argv[1])
-        ):
-            from pipelines.cli.typer_app import app as typer_app
-
-            typer_app()
         code = app(standalone_mode=False, prog_name="terrain")
-        if getattr(code, "interrupted", False):  # a result that shows what was found until the command was stopped
+        if getattr(
+            code, "interrupted", False
+        ):  # a result that shows what was found until the command was stopped
             code = 130
     except click.exceptions.NoArgsIsHelpError as error:
         click.echo(error.format_message())

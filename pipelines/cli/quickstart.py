@@ -94,7 +94,9 @@ class QuickstartResult(Result):
     train: TrainResult = described("the registered model")
     predict: Predictions = described("of the runs that were held out")
     imported: KeptRuns = described("where the runs lie")
-    slip: tuple[TerrainSlip, ...] | None = described("estimated and true slip by terrain; None of your own runs")
+    slip: tuple[TerrainSlip, ...] | None = described(
+        "estimated and true slip by terrain; None of your own runs"
+    )
     commands: tuple[str, ...] = described("what to type for the same, step by step")
     report_file: Path = described("the page")
     held_out: tuple[str, ...] = described("runs that the model was neither evaluated nor trained on")
@@ -146,7 +148,7 @@ def run(settings: Settings, progress: Progress = silent) -> QuickstartResult:
     runs = distinct_runs(source.runs, merge=settings.merge_duplicates).runs
     dataset = SIMULATED if data is None else data.resolve().name
     training, held_out = divide(runs)
-    shared = {"seed": settings.seed, "n_jobs": settings.n_jobs, "repeats": REPEATS}
+    shared: dict[str, Any] = {"seed": settings.seed, "n_jobs": settings.n_jobs, "repeats": REPEATS}
     evaluation = crossval(training, EvaluationSettings(extras=False, **shared), progress)
     evaluation = replace(evaluation, dataset=dataset, data_digest=data_digest(training))
     kept = _keep(source.runs, data, out / "runs", progress)

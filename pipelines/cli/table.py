@@ -59,6 +59,7 @@ COMMANDS: tuple[Command, ...] = (
         "controllers in closed loop, side by side; --faults, --path",
     ),
     Command("Live", "serve", "pipelines.serve.serve", "WebSocket, --can BUS, --replay LOG"),
+    Command("Live", "quickstart", "pipelines.cli.quickstart", "all of it, on your runs or simulated ones"),
 )
 
 FORMER: dict[str, str] = {

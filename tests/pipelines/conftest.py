@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipelines.crossval.settings import CrossvalSettings
 from pipelines.learn.train import fitted_model
 from terrain.estimation.enriched import enriched
 from terrain.estimation.estimate import estimate_run
@@ -104,94 +103,6 @@ def drive_all():
 def runs():
     """Twelve runs of three terrains that are easy to distinguish."""
     return driven_runs()
-
-
-@pytest.fixture(scope="session")
-def settings():
-    """Return a maker of settings for one process, one repeat and no extras unless asked for."""
-
-    def make(**options):
-        return CrossvalSettings(**({"repeats": 1, "extras": False, "n_jobs": 1} | options))
-
-    return make
-
-
-@pytest.fixture(scope="session")
-def make_report():
-    """Return a maker of a report of two terrains and three runs; what is given replaces its fields."""
-    from pipelines.crossval.results import (
-        Applicability,
-        ClassSpeeds,
-        CrossvalReport,
-        Extras,
-        LearningCurve,
-        SlowFast,
-    )
-    from terrain.classify.confidence import CoverageFigures, ReliabilityBin
-    from terrain.classify.metrics import ClassFigures, RunFigures
-
-    statement = "3 sizes are too few to estimate how many runs are enough"
-    curve = LearningCurve((1.0, 2.0, 3.5), (0.5, 0.6, 0.65), (0.02, 0.01, None), None, statement)
-    slow_fast = SlowFast(
-        Applicability.NOT_APPLICABLE,
-        {"GRASS": ClassSpeeds(0.2, 0.4)},
-        {"ICE": "48 s of slow runs"},
-        None,
-        None,
-    )
-
-    def make(**changed):
-        fields = {
-            "dataset": "moor",
-            "protocol": "grouped",
-            "recipe": "svm",
-            "window_s": 2.0,
-            "stride_s": 2.0,
-            "steady": True,
-            "signal_sets": ("imu", "wheels"),
-            "seed": 0,
-            "classes": ("GRASS", "ICE"),
-            "n_windows": 40,
-            "n_runs": 3,
-            "repeats": 4,
-            "accuracy": 0.81335,
-            "accuracy_spread": 0.01234,
-            "accuracy_per_repeat": (0.81335,) * 4,
-            "accuracy_ci": (0.7236, 0.9079),
-            "balanced_accuracy": 0.77139,
-            "macro_f1": 0.7844,
-            "macro_run_accuracy": 0.75,
-            "vote_accuracy": 0.82131,
-            "vote_windows": 1.9,
-            "ece": 0.10776,
-            "ece_ci": (0.06, 0.15),
-            "confidence_auc": 0.7912,
-            "confidence_auc_ci": (0.71, 0.86),
-            "accuracy_at_coverage": (
-                CoverageFigures(0.8, 0.88, (0.8, 0.94), 0.55), CoverageFigures(0.5, 0.95, (0.9, 0.99), 0.8)
-            ),
-            "per_class": {
-                "GRASS": ClassFigures(0.61, 0.45, 0.52, 60), "ICE": ClassFigures(0.61, 0.95, 0.52, 100)
-            },
-            "confusion": ((27, 33), (5, 95)),
-            "reliability": (
-                ReliabilityBin(0.6, 0.7, 80, (0.5, 0.9)), ReliabilityBin(0.9, 0.85, 80, (0.7, 0.95))
-            ),
-            "per_run": (
-                RunFigures("<b>g1</b>", "GRASS", 10, 0.3, 0.3, None),
-                RunFigures("g2", "GRASS", 5, 0.75, 0.75, None),
-                RunFigures("i1", "ICE", 25, 0.95, 0.95, None),
-            ),
-            "folds": (),
-            "n_features": 12,
-            "dropped": {"not steady": 7},
-            "repaired": {},
-            "notes": ("ICE: one run only & optimistic",),
-            "extras": Extras(0.4115, slow_fast, curve),
-        }  # fmt: skip
-        return CrossvalReport(**(fields | changed))
-
-    return make
 
 
 @pytest.fixture(scope="session")

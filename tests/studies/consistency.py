@@ -2,25 +2,127 @@
 
 from __future__ import annotations
 
+import math
+import os
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
-from pipelines.estimate.consistency import (
-    COVERAGE_HEADING,
-    FILTER,
-    GROUPS,
-    RUNS_A_SCENARIO,
-    SCENARIOS,
-    TerrainConsistency,
-    consistency_by_terrain,
-)
 from pipelines.report import Progress, Report, Result, Table, described, format_value, silent
 from pipelines.report.settings import Settings as BaseSettings
 from pipelines.report.settings import setting
-from terrain.control.comparison import MeanInterval
-from terrain.robots import load_robot
+from terrain.control.comparison import MeanInterval, mean_interval
+from terrain.estimation.coverage import nees_by_group, slip_coverage
+from terrain.estimation.estimate import estimate_run
+from terrain.robots import Robot, load_robot
+from terrain.simulation.conditions import Faults
+from terrain.simulation.run import simulate_run
 from terrain.terramechanics.soil import soil_names
 
 EXAMPLE = "python tests/studies consistency --runs 20 --seed 1200"
+SCENARIOS = ("survey", "starts", "complex")
+"""Varied steady driving, hard starts and stops, and turns in every direction."""
+
+FILTER = "vio15"
+RUNS_A_SCENARIO = 4
+
+GROUPS = {
+    "position": "position",
+    "yaw": "yaw",
+    "speed": "speed",
+    "yaw_rate": "yaw rate",
+    "accel": "accel",
+    "steer": "steering",
+    "gyro_bias": "gyro bias",
+    "slip_speed": "slip speed",
+    "imu_yaw_offset": "yaw offset",
+}
+"""Groups of states by their names, and how they are shown."""
+
+COVERAGE_HEADING = "coverage of slip"
+
+
+class TerrainConsistency(NamedTuple):
+    """Consistency of a filter on a terrain, means over runs with their 95 % intervals.
+
+    Parameters
+    ----------
+    terrain, n_runs : of how many runs
+    nees : a state, by group of states (:data:`GROUPS`); 1 is consistent
+    slip_coverage : ratio of slips within their stated 95 % interval
+    """
+
+    terrain: str
+    n_runs: int
+    nees: dict[str, MeanInterval]
+    slip_coverage: MeanInterval
+
+
+def consistency_by_terrain(
+    robot: Robot,
+    seed: int,
+    runs: int = RUNS_A_SCENARIO,
+    filter_name: str = FILTER,
+    progress: Progress = silent,
+    n_jobs: int = 0,
+    terrains: Sequence[str] = soil_names(),
+    scenarios: Sequence[str] = SCENARIOS,
+    lost_s: float = 0.0,
+) -> tuple[TerrainConsistency, ...]:
+    """Simulate and filter runs of some scenarios on each terrain, and compare errors with their variance.
+
+    Parameters
+    ----------
+    robot : swerve robot
+    seed : of everything that is drawn: soil, slope, load, tyres, driving and noise of each run
+    runs : of each scenario on each terrain
+    filter_name : one of :data:`terrain.estimation.estimate.FILTERS`
+    progress : of the runs
+    n_jobs : processes at once; 0 for one a core
+    terrains : names of soils
+    scenarios : names of scenarios
+    lost_s : for so long from the middle of each run there is no camera, and coverage is that of this time
+
+    Raises
+    ------
+    ConfigError
+        if the filter does not fit the robot, or there is no such terrain.
+    """
+    from joblib import Parallel, delayed
+
+    jobs = [
+        (terrain, scenario, number)
+        for terrain in terrains
+        for scenario in scenarios
+        for number in range(1, runs + 1)
+    ]
+    pool = Parallel(n_jobs=n_jobs or os.cpu_count() or 1, return_as="generator")
+    found: dict[str, list[dict[str, float]]] = {terrain: [] for terrain in terrains}
+    work = pool(delayed(_run_figures)(robot, *job, seed, filter_name, lost_s) for job in jobs)
+    for done, ((terrain, _, _), figures) in enumerate(zip(jobs, work, strict=True), 1):
+        found[terrain].append(figures)
+        progress("consistency", done, len(jobs))
+    return tuple(_terrain_row(terrain, rows) for terrain, rows in found.items())
+
+
+def _run_figures(
+    robot: Robot, terrain: str, scenario: str, number: int, seed: int, filter_name: str, lost_s: float
+) -> dict[str, float]:
+    run = simulate_run(robot, terrain, scenario, seed, number, vary=True)
+    between_s = (-math.inf, math.inf)
+    if lost_s > 0.0:
+        middle_s = float(run.streams["wheels"].time_s.mean())
+        between_s = (middle_s, middle_s + lost_s)
+        faults = Faults(camera_lost_s=(between_s,))
+        run = simulate_run(robot, terrain, scenario, seed, number, vary=True, faults=faults)
+    estimate = estimate_run(run, robot, filter_name)
+    return nees_by_group(estimate) | {COVERAGE_HEADING: slip_coverage(estimate, between_s)}
+
+
+def _terrain_row(terrain: str, rows: Sequence[dict[str, float]]) -> TerrainConsistency:
+    means = {key: mean_interval([row[key] for row in rows]) for key in rows[0]}
+    coverage = means.pop(COVERAGE_HEADING)
+    return TerrainConsistency(terrain, len(rows), means, coverage)
 
 
 class Settings(BaseSettings):

@@ -175,7 +175,7 @@ def test_an_output_that_cannot_be_written_is_reported_before_the_work(refused, p
     data = keep(drive_all(n_runs=2, duration_s=4.0), place)
     (place / "file").write_text("an obstacle")
     (place / "mlruns").write_text("an obstacle")
-    monkeypatch.setattr("pipelines.crossval.crossval.fit_folds", lambda *_: pytest.fail("the work was begun"))
+    monkeypatch.setattr("pipelines.learn.evaluate.evaluate", lambda *_: pytest.fail("the work was begun"))
     cannot = "cannot be written"
     refused(cannot, "convert", data, "--out", place / "file" / "out")
     refused(cannot, "crossval", "--data", data, "--json", place / "file" / "report.json")
@@ -249,7 +249,7 @@ def test_usage_errors_are_code_2_too(terrain, place, words):
 def test_a_fault_of_the_package_keeps_its_traceback(terrain, place, drive, monkeypatch):
     data = keep([drive("r", "GRASS", 0, 4.0)], place)
     monkeypatch.setattr("pipelines.data.datasets.data_digest", lambda runs: 1 / 0)
-    monkeypatch.setattr("pipelines.crossval.crossval.crossval", lambda *_: 1 / 0)
+    monkeypatch.setattr("pipelines.learn.crossval.crossval", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         terrain("crossval", "--data", data)
 
@@ -336,15 +336,12 @@ def test_the_choices_of_the_command_line_are_those_that_there_are():
     """They are written twice, so that help need not load what offers them."""
     from typing import get_args
 
-    from pipelines.crossval.settings import RECIPES as RECIPE_CHOICES
     from pipelines.data.datasets import LAYOUTS
     from pipelines.data.settings import Layout
-    from pipelines.learn.recipes import RECIPES
     from pipelines.slip.modes import Filter, Tuning
     from terrain.estimation.estimate import FILTERS, TUNINGS
     from terrain.estimation.observers.choice import OBSERVERS
 
     assert get_args(Layout) == LAYOUTS
-    assert RECIPE_CHOICES == RECIPES
     assert get_args(Filter) == (*FILTERS, *OBSERVERS, "pose")
     assert get_args(Tuning) == TUNINGS

@@ -5,8 +5,8 @@ import pytest
 
 from pipelines.data.simulate import Settings as SimulateSettings
 from pipelines.data.simulate import run as simulate_with
-from pipelines.reporting.json_file import as_json
-from pipelines.reporting.progress import silent
+from pipelines.report import silent
+from pipelines.report.json_file import as_json
 from terrain.errors import ConfigError, LogError
 from terrain.files.resources import data_folder
 from terrain.logs.read import find_runs, read_run

@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipelines.crossval.crossval import samples_of
-from pipelines.crossval.settings import CrossvalSettings
 from pipelines.data.bag_runs import recorded_windows
 from pipelines.data.datasets import load_runs
 from pipelines.data.inspect import Settings as InspectSettings
 from pipelines.data.inspect import run as inspect_runs
+from pipelines.learn.crossval import EvaluationSettings
 from pipelines.learn.predict import predict
+from pipelines.learn.protocols import samples_of
 from pipelines.live.classifying import AtOnce
 from pipelines.live.observer import Observer
 from pipelines.live.pilot import LivePilot
@@ -130,8 +130,8 @@ def test_a_recorded_run_is_inspected_and_trained_on_once_it_is_labelled(writer, 
         RunLog(run.run_id, run.robot, run.streams, (Label(0.0, 12.0, run.run_id[0]),))
         for run in load_runs(tmp_path)
     ]
-    windows = samples_of(labelled, CrossvalSettings()).cut.windows
+    windows = samples_of(labelled, EvaluationSettings()).windows
     assert set(windows.values) == {"imu", "wheels"}
-    plain = samples_of(two_drives, CrossvalSettings()).cut.windows
+    plain = samples_of(two_drives, EvaluationSettings()).windows
     np.testing.assert_array_equal(windows.values["imu"], plain.values["imu"])
     assert windows.terrain.tolist() == plain.terrain.tolist()

@@ -1,1 +1,0 @@
-"""Courses over several grounds, and how well a classifier and a filter over time follow them."""

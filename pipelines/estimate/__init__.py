@@ -1,1 +1,0 @@
-"""``terrain estimate`` and ``terrain calibrate``."""

@@ -1,1 +1,0 @@
-"""``terrain quickstart``: the whole job in one command, and its report."""

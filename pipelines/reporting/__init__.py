@@ -1,1 +1,0 @@
-"""Pages, drawing, numbers, terminal output and progress."""

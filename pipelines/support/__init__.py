@@ -1,1 +1,0 @@
-"""Support of held-out predictions by training runs, and which drives to record next."""

@@ -1,0 +1,133 @@
+"""Quickstart: the whole job in one command; what it predicts is held out for real, and its report says so."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipelines.cli.quickstart import Settings, divide, run
+from pipelines.data.datasets import data_digest
+from pipelines.data.settings import AlignedRunsSettings, load
+from pipelines.learn.load import load_model
+from pipelines.report.json_file import as_json
+from pipelines.report.terminal import terminal_text
+from terrain.errors import ConfigError, DataError
+from terrain.estimation.labelled import labelled_runs
+from terrain.logs.read import read_run
+from terrain.logs.write import write_run
+from terrain.terramechanics.soil import soil_names
+
+
+@pytest.fixture
+def held_out(in_tracked, drive_all, tmp_path):
+    """Nine runs of three terrains in a folder, and what quickstart made of them."""
+    runs = drive_all(n_runs=3, duration_s=16.0)
+    for each in runs:
+        write_run(each, tmp_path / "data")
+    asked = Settings(data=tmp_path / "data", out=tmp_path / "out", name="held", n_jobs=1)
+    return runs, run(asked), tmp_path
+
+
+def test_the_runs_that_are_predicted_took_no_part(held_out):
+    runs, result, folder = held_out
+    assert result.held_out == ("ASPHALT_3",)
+    assert {row.run_id for row in result.predict.windows} == {"ASPHALT_3"}
+    assert result.predict.training_runs == ()
+    info = load_model(result.train.model_uri).info
+    training = [each for each in runs if each.run_id != "ASPHALT_3"]
+    assert sorted(info.run_digests) == sorted(data_digest([each]) for each in training)
+    assert info.data_digest == result.data_digest == data_digest(training)
+    assert {each.run_id for each in result.crossval.per_run} == {each.run_id for each in training}
+    assert [" --without ASPHALT_3" in step for step in result.commands] == [True, True, False]
+    assert result.commands[-1].endswith(" --only ASPHALT_3")
+    loaded = load(AlignedRunsSettings(data=folder / "data", without="ASPHALT_3")).runs
+    assert data_digest(loaded) == result.data_digest
+
+    page = result.report_file.read_text()
+    assert "neither trained nor evaluated on them" in page
+    lines = terminal_text(result.report).splitlines()
+    assert len(lines) <= 25
+    assert lines[0] == result.crossval.report.answer
+    found = as_json(result)
+    assert json.loads(json.dumps(found, allow_nan=False)) == found
+    assert found["imported"]["n_runs"] == 9
+    assert "crossval" not in found["train"]
+
+
+@pytest.mark.slow
+def test_copies_of_runs_are_refused_or_merged(in_tracked, drive_all, tmp_path):
+    runs = drive_all(n_runs=3, duration_s=16.0)
+    for each in [*runs, replace(runs[0], run_id="copy")]:
+        write_run(each, tmp_path / "data")
+    asked = Settings(data=tmp_path / "data", out=tmp_path / "out", name="copied", n_jobs=1)
+    with pytest.raises(DataError, match="--merge-duplicates"):
+        run(asked)
+    result = run(asked.with_(merge_duplicates=True))
+    assert result.crossval.n_runs + len(result.held_out) == 9
+
+
+def test_other_runs_in_the_folder_are_not_overwritten(make_run, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_run(make_run("SNOW_1"), tmp_path / "data")
+    write_run(make_run("ICE_1", seed=1), tmp_path / "out" / "runs")
+    with pytest.raises(DataError, match="holds other runs than"):
+        run(Settings(data=tmp_path / "data", out=tmp_path / "out"))
+
+
+@pytest.mark.slow
+def test_quickstart_needs_no_data(in_tracked, tmp_path):
+    result = run(Settings(out=tmp_path / "out", name="from_nothing", runs_a_terrain=2, n_jobs=1))
+    found = as_json(result)
+    assert found["imported"] == {"out": str(tmp_path / "out" / "runs"), "n_runs": 16, "reused": False}
+    assert len(found["slip"]) == 8
+    assert result.commands[0].startswith("terrain simulate --robot agrimaro --terrain all")
+    assert (tmp_path / "out" / "report.html").read_text().count('class="plot"') >= 3
+    assert len(terminal_text(result.report).splitlines()) <= 25
+    assert read_run(tmp_path / "out" / "runs" / "grass_survey_01").robot == "agrimaro"
+
+
+@pytest.mark.slow
+def test_every_terrain_is_driven_and_its_slip_is_near_the_truth():
+    runs, rows, example = labelled_runs(seed=3, runs_a_terrain=3)
+    assert [each.terrains for each in runs] == [(name,) for name in soil_names() for _ in range(3)]
+    assert [row.terrain for row in rows] == list(soil_names())
+    assert all({"slip", "estimator", "imu", "wheels", "truth"} <= set(each.streams) for each in runs)
+    assert all(row.slip_rmse < 0.01 for row in rows)
+    assert example.run.terrains == ("grass",)
+    driven = {each.run_id: np.abs(each.streams["truth"].channel("speed_x_mps")).max() for each in runs}
+    assert np.ptp(list(driven.values())) > 0.1
+
+
+@pytest.mark.parametrize(
+    ("counts", "held_out"),
+    [
+        ({"ice": 6, "mud": 7, "sand": 2}, ["ice_5", "mud_6"]),
+        ({"ice": 5, "mud": 4}, ["ice_4"]),
+        ({"ice": 3, "mud": 2}, []),  # five runs are needed for five folds
+        ({"ice": 2, "mud": 2, "sand": 2}, []),
+        ({}, []),
+    ],
+)
+def test_enough_is_left_of_every_terrain(make_run, counts, held_out):
+    runs = [make_run(f"{name}_{i}", name, i, 1.0) for name, n in counts.items() for i in range(n)]
+    training, out = divide(runs)
+    assert [each.run_id for each in out] == held_out
+    assert sorted(each.run_id for each in (*training, *out)) == sorted(each.run_id for each in runs)
+
+
+def test_runs_are_chosen_by_id(make_run, tmp_path):
+    for number in range(3):
+        write_run(make_run(f"a{number}", seed=number), tmp_path)
+
+    def chosen(**options):
+        return [each.run_id for each in load(AlignedRunsSettings(data=tmp_path, **options)).runs]
+
+    assert chosen() == ["a0", "a1", "a2"]
+    assert chosen(only="a2, a0") == ["a0", "a2"]
+    assert chosen(without="a1") == ["a0", "a2"]
+    assert chosen(only="a0,a1", without="a1") == ["a0"]
+    with pytest.raises(ConfigError, match="--without: there is no run 'b'; there are a0, a1, a2"):
+        chosen(without="b")
+    with pytest.raises(ConfigError, match="leave no run"):
+        chosen(only="a0", without="a0")
