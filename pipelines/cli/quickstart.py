@@ -132,10 +132,10 @@ def run(settings: Settings, progress: Progress = silent) -> QuickstartResult:
 
     from pipelines.data.datasets import data_digest, load_runs
     from pipelines.data.duplicates import distinct_runs
+    from pipelines.data.tracking import ensure_tracking
     from pipelines.learn.crossval import EvaluationSettings, crossval
     from pipelines.learn.load import load_model
     from pipelines.learn.predict import predict
-    from pipelines.learn.tracking import ensure_tracking
     from pipelines.learn.train import TrainingSettings, train
     from terrain.control.slip_table import load_slip_table
     from terrain.files.atomic import ensure_writable

@@ -11,6 +11,7 @@ from skops import io as skops_io
 from pipelines.cli import main as cli
 from pipelines.cli.table import COMMANDS
 from pipelines.learn.model_file import MODEL_FILE, read_model, seal
+from pipelines.report import format_value
 from terrain.logs.write import write_run
 from terrain.records import RunLog, Stream
 
@@ -261,7 +262,7 @@ def test_crossval_writes_what_it_prints(terrain, place, drive_all):
     assert code == 0
     report = json.loads((place / "new" / "report.json").read_text())
     assert (report["dataset"], report["seed"], report["n_windows"]) == ("data", 4, 72)
-    assert f"accuracy {report['accuracy']:.1%}" in out
+    assert out.startswith(format_value(report["accuracy"], ".1%"))
     assert "72 windows of 2 s from 12 runs" in out
     assert sorted(path.name for path in place.iterdir()) == ["data", "new"]  # no tracking without training
 
@@ -291,7 +292,7 @@ def test_predict_prints_terrain_probability_and_target_slip(terrain, place, driv
     code, out, err = terrain(*words)
     assert (code, err) == (0, "")
     for words in (
-        "+0.31", "-0.32", "+0.07", "the fallback 'any' is used", "are unestimated: not measured",
+        "+0.31", "−0.32", "+0.07", "the fallback is used", "are unestimated: not measured",
         "11 windows are labelled LAVA, which the model was not trained on", "windows left out: 1 not finite",
     ):  # fmt: skip
         assert words in out
