@@ -180,8 +180,8 @@ def report(result: ExplainResult) -> Report:
     if shown := result.gain.judged or runs.compared:  # held-out runs where there are any
         stretch = example_stretch(shown, runs.noise)
         there = channels_of([stretch])
-        stated = [each.channel for each in result.statements if each.channel in there]
-        picture = run_figure(stretch, runs.noise, stated[:PICTURED])
+        stated = [each.channel for each in result.statements if each.channel in there and each.found]
+        picture = run_figure(stretch, runs.noise, (stated or there)[:PICTURED])
     written = Report(
         title=f"What the simulation of {diagnosis.robot} gets wrong",
         answer=f"{verdict_text(diagnosis)} {gain_text(result.gain.gain, result.gain.reason)}",

@@ -30,8 +30,6 @@ from terrain.control.comparison import mean_interval
 from terrain.control.drive_curves import drive_curves
 from terrain.control.drive_evaluation import (
     METRICS,
-    EnergyCurve,
-    energy_at_equal_distance,
     evaluate_drive,
 )
 from terrain.control.drive_metrics import drive_history
@@ -79,16 +77,6 @@ def test_one_controller_alone_is_driven():
         found = compare(SHORT.with_(controllers=(name,), seeds=1), INPUTS)
         assert found.controllers[name]["distance_m"].mean > 2.0
         assert found.controllers[name]["distance_m"].ci is None
-
-
-def test_energy_is_compared_over_the_distance_that_all_travelled():
-    energy = np.array([0.0, 100.0, 300.0])
-    fast, slow, stuck = (
-        EnergyCurve(np.array(distance_m), energy)
-        for distance_m in ([0.0, 4.0, 8.0], [0.0, 3.0, 6.0], [0.0, 0.5, 1.0])
-    )
-    found = energy_at_equal_distance([fast, slow, stuck])
-    assert found == pytest.approx([200.0 / 6.0, 300.0 / 6.0, math.nan], nan_ok=True)
 
 
 @pytest.mark.slow
@@ -321,16 +309,6 @@ def test_only_controllers_that_use_the_terrain_adapt_to_it():
     assert result.report.title == "course on all terrains"
     assert "adapt_s" in shown_metrics(result)
     assert "adapt_s" not in shown_metrics(a_result())
-
-
-def test_slip_is_signed_by_the_motion_and_filtered_as_its_estimate():
-    forward, reversing = curves_of(slip=0.2), curves_of(wheel_radps=-7.0, slip=-0.2)
-    assert forward.slip[-1] == pytest.approx(0.2, abs=1e-6) == reversing.slip[-1]
-    assert forward.slip[5] == pytest.approx(0.2 * (1 - math.exp(-6 * 0.01 / 0.05)))
-    dragged = curves_of(wheel_radps=-1.0, slip=-1.1)  # turns backwards while the robot moves on
-    assert dragged.slip[-1] == pytest.approx(-1.0, abs=1e-6)
-    locked = curves_of(wheel_radps=0.0, slip=-1.0)
-    assert locked.slip[-1] == pytest.approx(-1.0, abs=1e-6)
 
 
 def test_a_drive_shows_states_refusals_and_terrains():

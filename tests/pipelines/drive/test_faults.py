@@ -3,7 +3,6 @@
 import json
 import math
 import sys
-from enum import Enum
 from pathlib import Path
 
 import numpy as np
@@ -25,19 +24,15 @@ from pipelines.report.json_file import as_json
 from terrain.control.drive_metrics import drive_history, stopping_distance
 from terrain.control.fault_drives import (
     FaultCase,
-    GuardedPilot,
     Place,
     drive_case,
     drive_references,
     evaluate_case,
-    named_sensors,
 )
 from terrain.control.fault_evaluation import BARS, RATIO_ABOVE_MPS, fault_drive, fault_figures
 from terrain.control.fault_situations import FAULT_SITUATIONS, make_fault_situation
 from terrain.control.slip_table import load_slip_table
-from terrain.control.traction import TractionStatus
 from terrain.errors import ConfigError
-from terrain.records import Command, Sample
 from terrain.robots import load_robot
 from terrain.simulation.dynamic.simulate import simulate
 
@@ -163,61 +158,6 @@ def test_the_report_counts_what_is_met_and_names_what_is_not(few):
     figure = fault_figure(drawn[0], drive_case(LOOP, drawn[0]), references)
     assert figure.title == "duplicates_imu, for good: steady on grass, seed 400"
     assert figure.panels[0].marks[0].spans[0][0] == references.start_s
-
-
-class FakePilot:
-    """Commands the step's number, and fails as it is asked to."""
-
-    estimate = None
-
-    def __init__(self, fails=(), health=None):
-        self.k, self.fails, self.command = -1, dict(fails), None
-        if health is not None:
-            self.health = health
-
-    def step(self, sample):
-        self.k += 1
-        wheels = np.full(3, float(self.k))
-        wrong = self.fails.get(self.k)
-        if wrong == "raise":
-            raise ValueError("no such row")
-        if wrong == "nan":
-            wheels[1] = math.nan
-        if wrong == "shape":
-            wheels = np.zeros(2)
-        if wrong == "text":
-            wheels = ["fast"] * 3
-        return Command(wheels, np.zeros(3), np.zeros(3), {"status_code": 0.0, "slip_ratio": 0.1})
-
-
-def driven(pilot, n=6):
-    guarded = GuardedPilot(pilot)
-    return guarded, [guarded.step(Sample(0.02 * k, np.zeros(3), {})) for k in range(n)]
-
-
-def test_a_pilot_that_fails_keeps_its_last_command_and_is_counted():
-    guarded, commands = driven(FakePilot({2: "raise", 3: "nan", 4: "shape", 5: "text"}))
-    assert [command.wheel_radps[0] for command in commands] == [0.0, 1.0, 1.0, 1.0, 1.0, 1.0]
-    assert (guarded.n_exceptions, guarded.n_not_finite) == (1, 3)
-    assert guarded.exception == "ValueError: no such row"
-    codes = [command.status["status_code"] for command in commands]
-    assert codes == [TractionStatus.OK] * 2 + [TractionStatus.NO_SLIP] * 4
-    assert driven(FakePilot())[0].exception == ""
-    with pytest.raises(ValueError, match="no such row"):
-        driven(FakePilot({0: "raise"}))
-
-
-class Health(Enum):
-    FRESH = 0
-    LOST = 1
-
-
-@pytest.mark.parametrize("health", [{"imu": "lost"}, lambda: {"imu": Health.LOST, "wheels": Health.FRESH}])
-def test_the_sensors_that_a_pilot_names_are_recorded(health):
-    guarded, _ = driven(FakePilot(health=health))
-    assert named_sensors(guarded.health, [True] * 6, 0.02) == {"imu": "lost"}
-    assert named_sensors(guarded.health, [True] * 4 + [False] * 2, 0.02) == {}  # for 0.08 s
-    assert named_sensors(driven(FakePilot())[0].health, [True] * 6, 0.02) is None
 
 
 def test_an_exception_of_the_pilot_shows_in_its_row(monkeypatch):
