@@ -5,18 +5,27 @@ import sys
 
 import numpy as np
 import pytest
+import yaml
 
 from pipelines.cli import main as cli
 from pipelines.explain.explain import EXTENDED_FILE, PAGE_FILE, explain_runs
+from pipelines.live.pilot import LivePilot
+from pipelines.report import silent
 from pipelines.report.json_file import as_json
 from pipelines.report.terminal import terminal_text
+from pipelines.slip import calibrate
+from pipelines.slip.estimate import estimate_runs
 from terrain.discrepancy.answers import INTERVAL_T
+from terrain.errors import ConfigError
+from terrain.extension import write_extended
 from terrain.logs.write import write_run
 from terrain.records import RunLog
 from terrain.robots import load_robot
 from terrain.simulation.planar.drives import COMMANDS_HZ, DRIVE_S
 from terrain.simulation.planar.noise import load_noise, load_scatter
 from terrain.simulation.planar.run import simulate_planar
+from terrain.simulation.run import simulate_run
+from terrain.slip_learning.learn import terrain_runs
 
 HIDDEN = {"camera_yaw_rad": 0.04}
 HUSKY = load_robot("husky")
@@ -231,3 +240,19 @@ def test_an_extended_description_is_not_overwritten(refused, data, tmp_path):
     (tmp_path / "out" / EXTENDED_FILE).write_text("mine")
     refused("is there already", "--data", data, "--robot", "husky", "--out", "out")
     assert (tmp_path / "out" / EXTENDED_FILE).read_text() == "mine"
+
+
+def test_an_extended_description_passes_through_the_commands(tmp_path):
+    asked = {"wheel_radius_ratio": 0.04, "camera_yaw_rad": 0.05, "gyro_scale_ratio": 0.08}
+    intervals = {name: (value - 0.01, value + 0.01) for name, value in asked.items()}
+    out = tmp_path / "extended.yaml"
+    robot = write_extended(out, "agrimaro", asked, 1e-6 * np.eye(len(asked)), intervals, "a test")
+    run = simulate_run(load_robot("agrimaro"), "grass", "straight", 1, 1, duration_s=8.0, effects=asked)
+    for tuning in ("physical", "likelihood"):
+        (row,) = estimate_runs([run], robot, "vio15", tuning=tuning).result.runs
+        assert row.speed_rmse_mps < 0.006
+    assert np.isfinite(terrain_runs(run, robot)[0].balance.mass_kg)
+    assert LivePilot(robot)._radius_m == pytest.approx(0.208)
+    with pytest.raises(ConfigError, match="is extended by effects"):
+        calibrate.run(calibrate.Settings(data=tmp_path, robot=str(out)), silent)
+    assert yaml.safe_load(out.read_text())["effects"]["schema"] == 1

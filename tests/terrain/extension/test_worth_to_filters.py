@@ -5,22 +5,14 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
-import yaml
 
-from pipelines.live.pilot import LivePilot
-from pipelines.report import silent
-from pipelines.slip import calibrate
-from pipelines.slip.estimate import estimate_runs
-from terrain.errors import ConfigError
 from terrain.estimation.enriched import enriched
 from terrain.estimation.estimate import estimate_run
 from terrain.estimation.summary import summarize
-from terrain.extension import write_extended
 from terrain.robots import load_robot
 from terrain.simulation.dynamic.simulate import simulate
 from terrain.simulation.scenario.make import make_scenario
 from terrain.simulation.sensors.gnss import Gnss
-from terrain.slip_learning.learn import terrain_runs
 from terrain.terramechanics.soil import load_soil
 
 ROBOT = load_robot("agrimaro")
@@ -95,20 +87,3 @@ def test_the_written_run_holds_the_measurements_and_the_true_wheel_speeds():
     wheels = written.streams["wheels"]
     wheel_speed = wheels.channel("motor_1_radps") / ROBOT.motors.reduction_ratio * ROBOT.wheel_radius_m * 1.04
     np.testing.assert_allclose(wheels.channel("speed_1_mps"), wheel_speed)
-
-
-def test_files_pass_through_the_commands(tmp_path):
-    names = list(ASKED)
-    intervals = {name: (value - 0.01, value + 0.01) for name, value in ASKED.items()}
-    out = tmp_path / "extended.yaml"
-    robot = write_extended(out, "agrimaro", ASKED, 1e-6 * np.eye(len(names)), intervals, "a test")
-    run = driven(tuple(ASKED.items()), None, "straight", 8.0)
-    for tuning in ("physical", "likelihood"):
-        (row,) = estimate_runs([run], robot, "vio15", tuning=tuning).result.runs
-        assert row.speed_rmse_mps < 0.006
-    assert np.isfinite(terrain_runs(run, robot)[0].balance.mass_kg)
-    assert LivePilot(robot)._radius_m == pytest.approx(0.208)
-    with pytest.raises(ConfigError, match="is extended by effects"):
-        calibrate.run(calibrate.Settings(data=tmp_path, robot=str(out)), silent)
-    content = yaml.safe_load(out.read_text())
-    assert content["effects"]["schema"] == 1
