@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -147,11 +147,6 @@ class DriveResult(Result):
     rows: Mapping[str, tuple[Metrics, ...]] = described("by controller, the metrics of each seed")
     examples: Mapping[str, DriveCurves] = field(default_factory=dict)
     slip_table: SlipTable | None = None
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the fields but what only figures need."""
-        document: dict[str, Any] = super().as_json()
-        return {key: value for key, value in document.items() if key not in ("examples", "slip_table")}
 
     def to_pandas(self) -> pd.DataFrame:
         """Return the metrics, a row for each controller and seed."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -128,7 +128,7 @@ class FaultsResult(Result):
     abouts: Mapping[str, str] = described("what each fault does, by its name")
     clean: tuple[CleanDrive, ...] = described("drives without a fault")
     rows: tuple[FaultRow, ...] = described("drives with one")
-    drawn: tuple[Figure, ...] = field(default=())
+    drawn: tuple[Figure, ...] = ()
 
     @property
     def n_met(self) -> int:
@@ -145,14 +145,11 @@ class FaultsResult(Result):
         return counted
 
     def as_json(self) -> dict[str, Any]:
-        """Return the fields but the figures, with the counts by bar."""
+        """Return the described fields, with the counts by bar."""
         from pipelines.report.json_file import as_json
 
-        given = {each.name: getattr(self, each.name) for each in fields(self) if each.name != "drawn"}
-        document: dict[str, Any] = as_json(
-            {**given, "bars": self.bars, "n_rows": len(self.rows), "n_met": self.n_met}
-        )
-        return document
+        counts = {"bars": self.bars, "n_rows": len(self.rows), "n_met": self.n_met}
+        return {**super().as_json(), **as_json(counts)}
 
     def to_pandas(self) -> pd.DataFrame:
         """Return the drives with a fault, a row each."""

@@ -95,13 +95,6 @@ class PathResult(Result):
     drive: FollowedDrive | None = None
     reference: ReferencePath | None = None
 
-    def as_json(self) -> dict[str, Any]:
-        """Return the fields but what only figures need."""
-        document: dict[str, Any] = super().as_json()
-        return {
-            key: value for key, value in document.items() if key not in ("offset_m", "drive", "reference")
-        }
-
     def to_pandas(self) -> pd.DataFrame:
         """Return the drive, a row a tick."""
         import pandas as pd

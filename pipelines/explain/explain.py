@@ -192,7 +192,6 @@ def explain_runs(
         data=data,
         data_digest=data_digest(runs),
         description=description,
-        model=None,
         terrain=terrain,
         effects=tuple(effect.name for effect in library),
         seed=seed,

@@ -88,28 +88,39 @@ class ExplainResult(Result):
     """What the simulation of a robot gets wrong about runs, and what building that in gains.
 
     In JSON the fields of the diagnosis stand beside the others.
+
+    Parameters
+    ----------
+    robot : as it was tested
+    diagnosed : runs with their diagnosis, beside the simulation
+    extended : the robot with the causes built in; None where none was named
+    terrains_apart : measured over simulated by label, where labels clearly differ
+    extended_file : of the extended robot, if it was written
+    n_pictures : most runs that are drawn; None for all
     """
 
     data: str = described("name of the data set")
     data_digest: str = described("digest of its runs")
     description: str = described("description of the robot as it was tested")
-    model: str | None = described("extended description that was tested; null for the robot's own")
     terrain: str | None = described("label of the runs that were used; null for all")
     effects: tuple[str, ...] = described("effects that may be named")
     seed: int = described("of the choice of held-out runs and of the bootstrap")
-    robot: Robot = described("as it was tested")
-    diagnosed: DiagnosedRuns = described("runs with their diagnosis, beside the simulation")
     gain: HeldOutGain = described("on the runs held out")
-    extended: Robot | None = described("with the causes built in; null where none was named")
     statements: tuple[Statement, ...] = described("a sentence for each channel")
     terms: Mapping[str, str] = described("by cause, its value in quantities of the robot's description")
     next_command: str | None = described("simulates the next drive; null where none is suggested")
-    terrains_apart: Mapping[str, Slope] = described("measured over simulated by label, where labels differ")
     powertrain: PowertrainAnswer | None = described("from commanded to measured wheel speeds, where logged")
+    robot: Robot
+    diagnosed: DiagnosedRuns
+    extended: Robot | None
+    terrains_apart: Mapping[str, Slope]
+    model: str | None = described(
+        "extended description that was tested; null for the robot's own", default=None
+    )
     skipped: tuple[str, ...] = described("a sentence for each run that could not be read", default=())
-    n_pictures: int | None = described("most runs that are drawn; null for all", default=6)
     page: Path | None = described("page that was written", default=None)
-    extended_file: Path | None = described("extended description that was written", default=None)
+    extended_file: Path | None = None
+    n_pictures: int | None = 6
 
     @property
     def diagnosis(self) -> Diagnosis:
@@ -122,38 +133,22 @@ class ExplainResult(Result):
         return terrain_notes(self.diagnosed.terrains, self.terrains_apart) + session_notes(self.diagnosis)
 
     def as_json(self) -> dict[str, Any]:
-        """Return the explanation as JSON has it."""
+        """Return the described fields, those of the diagnosis, and what the runs were used for."""
         from pipelines.report.json_file import as_json
 
         runs, extended = self.diagnosed, None
         if self.extended is not None:
             extended = {"file": self.extended_file, "effects": self.extended.effects}
-        document: dict[str, Any] = as_json(
-            {
-                "data": self.data,
-                "data_digest": self.data_digest,
-                **self.diagnosis.as_json(),
-                "built_in": runs.simulation.effects,
-                "terrain_matches": runs.terrains,
-                "notes": self.notes,
-                "statements": self.statements,
-                "terms": self.terms,
-                "next_command": self.next_command,
-                "effects": self.effects,
-                "seed": self.seed,
-                "used": [run.run_id for run in runs.used],
-                "held_out": [run.run_id for run in runs.held_out],
-                "gain": self.gain,
-                "extended": extended,
-                "description": self.description,
-                "model": self.model,
-                "terrain": self.terrain,
-                "page": self.page,
-                "skipped": self.skipped,
-                "powertrain": self.powertrain,
-            }
-        )
-        return document
+        beside = {
+            **self.diagnosis.as_json(),
+            "built_in": runs.simulation.effects,
+            "terrain_matches": runs.terrains,
+            "notes": self.notes,
+            "used": [run.run_id for run in runs.used],
+            "held_out": [run.run_id for run in runs.held_out],
+            "extended": extended,
+        }
+        return {**super().as_json(), **as_json(beside)}
 
     def to_pandas(self) -> pd.DataFrame:
         """Return the parameters of the named causes, a row each."""

@@ -137,7 +137,6 @@ def a_result(gain=None, runs=(), statements=(), robot=HUSKY, **more):
         data="field & co",
         data_digest="0123456789abcdef",
         description="husky.yaml",
-        model=None,
         terrain=None,
         effects=("payload",),
         seed=4,
