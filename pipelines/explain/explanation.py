@@ -99,6 +99,10 @@ class ExplainResult(Result):
     n_pictures : most runs that are drawn; None for all
     """
 
+    robot: Robot
+    diagnosed: DiagnosedRuns
+    extended: Robot | None
+    terrains_apart: Mapping[str, Slope]
     data: str = described("name of the data set")
     data_digest: str = described("digest of its runs")
     description: str = described("description of the robot as it was tested")
@@ -110,10 +114,6 @@ class ExplainResult(Result):
     terms: Mapping[str, str] = described("by cause, its value in quantities of the robot's description")
     next_command: str | None = described("simulates the next drive; null where none is suggested")
     powertrain: PowertrainAnswer | None = described("from commanded to measured wheel speeds, where logged")
-    robot: Robot
-    diagnosed: DiagnosedRuns
-    extended: Robot | None
-    terrains_apart: Mapping[str, Slope]
     model: str | None = described(
         "extended description that was tested; null for the robot's own", default=None
     )
