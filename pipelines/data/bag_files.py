@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import bz2
 import json
+import re
 import sqlite3
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 from urllib.parse import quote
 
 from pipelines.data.faults import DAMAGED_BLOCK, EARLY_END, MISSING_PACKAGE, Faults, Topic
@@ -32,6 +33,8 @@ ACCEPTED = "MCAP, SQLite of ROS 2 (.db3) and bags of ROS 1 (.bag, version 2.0) a
 
 ENCODINGS = "cdr, ros1, protobuf and json are read"
 
+_TYPE = re.compile(r"[A-Za-z]\w*/[a-z]+/[A-Za-z]\w*")
+
 MAX_DEFINITION_CHARACTERS = 1 << 18
 MAX_ELEMENTS = 10_000
 """Bounds of a definition: those of ROS have a few hundred characters, and arrays of a few messages."""
@@ -50,18 +53,6 @@ class Bag(NamedTuple):
     path: Path
     files: tuple[Path, ...]
     distro: str = ""
-
-
-class Reader(Protocol):
-    """One file of messages."""
-
-    def topics(self) -> list[Topic]:
-        """Return the topics that it has."""
-        ...
-
-    def messages(self, names: frozenset[str]) -> Iterator[tuple[str, int, bytes]]:
-        """Yield topic, log time in ns and content of the messages of some topics."""
-        ...
 
 
 def short_type(name: str) -> str:
@@ -138,7 +129,7 @@ def open_bag(path: Path) -> Bag:
     return Bag(path, files, f"ROS2_{distro.upper()}" if isinstance(distro, str) else "")
 
 
-def reader_of(path: Path, faults: Faults) -> Reader:
+def reader_of(path: Path, faults: Faults) -> McapReader | RosbagsReader:
     """Return the reader of a file of messages, by its first bytes.
 
     Raises
@@ -333,33 +324,27 @@ def _of_protobuf(at: str, topic: Topic) -> Callable[[bytes], Any]:
 
 def _of_ros(at: str, topic: Topic, distro: str) -> Callable[[bytes], Any]:
     try:
-        from rosbags.interfaces import Nodetype
         from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
     except ImportError as error:
         raise ConfigError(MISSING_PACKAGE) from error
+    if len(topic.definition) > MAX_DEFINITION_CHARACTERS:
+        raise LogError(f"{at}: its definition is longer than {MAX_DEFINITION_CHARACTERS} characters")
     package, _, name = short_type(topic.kind).partition("/")
     kind = f"{package}/msg/{name}"
-    store = get_typestore(Stores.__members__.get(distro, Stores[DISTRO]))
     try:
         if topic.schema_encoding in ("ros1msg", "ros2msg", "ros2idl") and topic.definition.strip():
-            if len(topic.definition) > MAX_DEFINITION_CHARACTERS:
-                raise LogError(f"{at}: its definition is longer than {MAX_DEFINITION_CHARACTERS} characters")
-            store = get_typestore(Stores.EMPTY)
+            types: dict[str, Any] = {}
             if topic.schema_encoding == "ros2idl":
-                parts = topic.definition.split("=" * 80 + "\n")
-                for part in (each for each in parts if each.strip()):
-                    store.register(
-                        get_types_from_idl(part.partition("\n")[2] if part[:4] == "IDL:" else part)
-                    )
+                for part in topic.definition.split("=" * 80 + "\n"):
+                    idl = part.partition("\n")[2] if part.startswith("IDL:") else part
+                    types.update(get_types_from_idl(idl) if idl.strip() else {})
             else:
-                types = get_types_from_msg(topic.definition, kind)
-                sizes = [d for _, fields in types.values() for _, d in fields if d[0] == Nodetype.ARRAY]
-                unrolled = sum(
-                    size for (node, inner), size in (d[1] for d in sizes) if not _is_number(node, inner)
-                )
-                if unrolled > MAX_ELEMENTS or sum(len(fields) for _, fields in types.values()) > MAX_ELEMENTS:
-                    raise LogError(f"{at}: its definition has more than {MAX_ELEMENTS} fields or elements")
-                store.register(types)
+                types = dict(get_types_from_msg(topic.definition, kind))
+            _refuse_strange_types(at, types)
+            store = get_typestore(Stores.EMPTY)
+            store.register(types)
+        else:
+            store = get_typestore(Stores.__members__.get(distro, Stores[DISTRO]))
         if kind not in store.types:
             raise LogError(f"{at} is of type {shown(topic.kind)}, which is not defined")
         store.get_msgdef(kind)
@@ -373,7 +358,17 @@ def _of_ros(at: str, topic: Topic, distro: str) -> Callable[[bytes], Any]:
     return lambda content: deserialize(content, kind)
 
 
-def _is_number(node: Any, inner: Any) -> bool:
+def _refuse_strange_types(at: str, types: Mapping[str, Any]) -> None:
+    """Refuse names that are none, of which the library makes code, and arrays that would be very much code."""
     from rosbags.interfaces import Nodetype
 
-    return bool(node == Nodetype.BASE and inner[0] != "string")
+    n_fields = n_elements = 0
+    for name, (constants, fields) in types.items():
+        if not _TYPE.fullmatch(name) or not all(each[0].isidentifier() for each in (*constants, *fields)):
+            raise LogError(f"{at}: its definition has a name that is none: {shown(name)}")
+        n_fields += len(fields)
+        for _, (node, described) in fields:
+            if node == Nodetype.ARRAY and (described[0][0] != Nodetype.BASE or "string" in described[0][1]):
+                n_elements += described[1]
+    if max(n_fields, n_elements) > MAX_ELEMENTS:
+        raise LogError(f"{at}: its definition has more than {MAX_ELEMENTS} fields or elements")

@@ -114,7 +114,8 @@ def _import(
 ) -> ImportResult:
     from pipelines.data.datasets import data_digest
     from pipelines.data.plausibility import counted, doubts_of, refuse_implausible_runs, verdict
-    from pipelines.data.recorded_windows import WINDOWS_FILE, window_entry_of, windows_text
+    from pipelines.data.recorded_windows import WINDOWS_FILE, windows_text
+    from pipelines.report.json_file import as_json
     from terrain.logs.duplicates import shared_stretches
     from terrain.logs.write import write_run
     from terrain.robots import load_robot
@@ -132,7 +133,7 @@ def _import(
     try:
         for each in runs:
             of_run = windows.get(each.run_id, [])
-            text = windows_text(window_entry_of(window) for window in of_run)
+            text = windows_text(as_json(window) for window in of_run)
             written.append(write_run(each, settings.out, beside={WINDOWS_FILE: text} if of_run else {}))
             dropped.update(each.dropped)
             labels.update(each.terrains)

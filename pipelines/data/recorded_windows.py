@@ -78,13 +78,6 @@ def window_entry(output: WindowResult) -> dict[str, Any]:
     }
 
 
-def window_entry_of(window: RecordedWindow) -> dict[str, Any]:
-    """Return the entry of a window that was read."""
-    entry = window._asdict()
-    probabilities = {name: _or_none(each) for name, each in window.probabilities.items()}
-    return entry | {"probability": _or_none(window.probability), "probabilities": probabilities}
-
-
 def windows_text(entries: Iterable[Mapping[str, Any]]) -> str:
     """Return the content of ``windows.json``, an entry a line."""
     lines = ",\n".join(json.dumps(entry, allow_nan=False) for entry in entries)

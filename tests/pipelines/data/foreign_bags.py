@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
@@ -92,6 +94,29 @@ def write_mcap(path, rows, compression=CompressionType.ZSTD, chunk_size=20_000, 
             content = bytes(STORE.serialize_cdr(message, kind))
             writer.add_message(channels[topic], log_ns, content, log_ns)
         writer.finish()
+    return path
+
+
+def write_ros1(path, rows, compression=None):
+    """Write ``(topic, log time in ns, message)`` as a bag of ROS 1."""
+    from rosbags.rosbag1 import Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC)
+    writer = Writer(path)
+    if compression is not None:
+        writer.set_compression(Writer.CompressionFormat[compression])
+    with writer:
+        connections = {}
+        for topic, log_ns, message in rows:
+            kind = message.__msgtype__
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, kind, typestore=store)
+            header = getattr(message, "header", None)
+            if header is not None:
+                stamped = store.types["std_msgs/msg/Header"](0, header.stamp, header.frame_id)
+                message = dataclasses.replace(message, header=stamped)
+            writer.write(connections[topic], log_ns, store.serialize_ros1(message, kind))
     return path
 
 

@@ -1,7 +1,7 @@
 """Bags become the runs whose messages they hold; rosbags writes them."""
 
-import dataclasses
 import json
+import struct
 
 import numpy as np
 import pytest
@@ -11,10 +11,22 @@ from scipy.spatial.transform import Rotation
 from pipelines.data.datasets import load_runs
 from terrain.errors import ConfigError, LogError
 from terrain.kinematics.camera import body_motion
+from terrain.logs.write import write_run
 from terrain.robots import Camera, load_robot
 
 from . import foreign_bags as foreign
-from .foreign_bags import START_NS, husky_rows, imu, joints, text, twist, write_bag, write_mcap
+from .foreign_bags import (
+    START_NS,
+    TYPES,
+    husky_rows,
+    imu,
+    joints,
+    text,
+    twist,
+    write_bag,
+    write_mcap,
+    write_ros1,
+)
 
 HUSKY = "husky_topics"
 
@@ -404,27 +416,59 @@ def test_an_unknown_encoding_and_a_field_that_is_not_there_are_one_sentence(tmp_
         load_runs(path, mapping=mapping_of(tmp_path, OF_SPEEDS))
 
 
-def write_ros1(path, rows, compression=None):
-    """Write ``(topic, log time in ns, message)`` as a bag of ROS 1."""
-    from rosbags.rosbag1 import Writer
-    from rosbags.typesys import Stores, get_typestore
+IDL = """IDL: own_msgs/msg/Speeds
+module own_msgs { module msg { struct Speeds { sequence<float> speed; own_msgs::msg::Place place; }; }; };
+"""
+PLACE_IDL = (
+    "=" * 80
+    + """
+IDL: own_msgs/msg/Place
+module own_msgs { module msg { struct Place { double x; }; }; };
+"""
+)
 
-    store = get_typestore(Stores.ROS1_NOETIC)
-    writer = Writer(path)
-    if compression is not None:
-        writer.set_compression(Writer.CompressionFormat[compression])
-    with writer:
-        connections = {}
-        for topic, log_ns, message in rows:
-            kind = message.__msgtype__
-            if topic not in connections:
-                connections[topic] = writer.add_connection(topic, kind, typestore=store)
-            header = getattr(message, "header", None)
-            if header is not None:
-                stamped = store.types["std_msgs/msg/Header"](0, header.stamp, header.frame_id)
-                message = dataclasses.replace(message, header=stamped)
-            writer.write(connections[topic], log_ns, store.serialize_ros1(message, kind))
-    return path
+
+@pytest.mark.parametrize(
+    ("encodings", "definition"),
+    [
+        (("cdr", "ros2idl"), "=" * 80 + "\n" + IDL + PLACE_IDL),
+        (
+            ("ros1", "ros1msg"),
+            "float32[] speed\nPlace place\n" + "=" * 80 + "\nMSG: own_msgs/Place\nfloat64 x\n",
+        ),
+    ],
+)
+def test_definitions_in_idl_and_messages_of_ros_1_in_mcap_are_read(tmp_path, encodings, definition):
+    cdr = [b"\0\1\0\0" + struct.pack("<I2f4xd", 2, 3.6 * i, 1.0, -i) for i in range(5)]
+    ros1 = [struct.pack("<I2fd", 2, 3.6 * i, 1.0, -i) for i in range(5)]
+    contents = cdr if encodings[0] == "cdr" else ros1
+    path = write_messages(
+        tmp_path / "a.mcap", "/speeds", "own_msgs/msg/Speeds", encodings, definition.encode(), contents
+    )
+    (run,) = load_runs(path, mapping=mapping_of(tmp_path, OF_SPEEDS))
+    np.testing.assert_allclose(run.streams["w"].values, [[i, -i] for i in range(5)], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("kind", "text", "fault"),
+    [
+        ("a/B", "float64 x\nbanana", "its definition is damaged"),
+        ("a/B", "Other other", "its definition is damaged"),
+        ("a/B", "B own", "holds itself"),
+        ("a/B", "string[20000] x", "more than 10000 fields or elements"),
+        ("a/B", "\n".join(f"int8 x{i}" for i in range(10_001)), "more than 10000 fields"),
+        ("a/B", "# all\n" * 99_999, "is longer than"),
+        ("a/B:\n  pass\nprint(1)\nclass C", "float64 x", "its definition"),
+    ],
+)
+def test_a_definition_that_is_not_accepted_is_one_sentence(tmp_path, capsys, kind, text, fault):
+    path = write_messages(
+        tmp_path / "a.mcap", "/speeds", kind, ("cdr", "ros2msg"), text.encode(), [bytes(12)] * 2
+    )
+    with pytest.raises(LogError, match=fault) as raised:
+        load_runs(path, mapping=mapping_of(tmp_path, OF_SPEEDS))
+    assert "\n" not in str(raised.value)
+    assert capsys.readouterr().out == ""
 
 
 @pytest.mark.parametrize("compression", [None, "BZ2", "LZ4"])
@@ -466,6 +510,32 @@ streams:
     assert pose.channels == ("position_x_m", "position_y_m", "yaw_rad")
     assert np.abs(np.diff(pose.channel("yaw_rad"))).max() < 0.2
     assert np.hypot(*np.diff(pose.values[:, :2], axis=0).T).max() < 0.05
+
+
+def test_fixes_become_metres_and_poses_a_continuous_yaw(tmp_path):
+    """A receiver goes 0.0001 degrees north a step, 11.113 m, and loses its fix; a robot turns round three times."""
+    rows = []
+    for i in range(20):
+        stamp = START_NS + 10**8 * i
+        status = TYPES["sensor_msgs/msg/NavSatStatus"](-1 if i == 5 else 0, 1)
+        covariance = np.array([0.04, *np.zeros(8)])
+        fix = (foreign.header(stamp), status, 45.0 + 1e-4 * i, 7.0, 200.0 + i, covariance, 1)
+        rows.append(("/fix", stamp, TYPES["sensor_msgs/msg/NavSatFix"](*fix)))
+        turn = Rotation.from_euler("z", i).as_quat()
+        place = TYPES["geometry_msgs/msg/Point"](0.1 * i, 2.0, 0.0)
+        pose = TYPES["geometry_msgs/msg/Pose"](place, TYPES["geometry_msgs/msg/Quaternion"](*turn))
+        rows.append(("/pose", stamp, TYPES["geometry_msgs/msg/PoseStamped"](foreign.header(stamp), pose)))
+    path = write_mcap(tmp_path / "drive.mcap", rows)
+    lines = "streams: {gnss: {topic: /fix, kind: gnss}, pose: {topic: /pose, kind: pose}}"
+    (run,) = load_runs(path, mapping=mapping_of(tmp_path, lines))
+    gnss, pose = run.streams["gnss"], run.streams["pose"]
+    assert gnss.channels == ("position_x_m", "position_y_m", "position_z_m", "std_position_m")
+    assert np.isnan(gnss.values).any(axis=1).tolist() == [i == 5 for i in range(20)]
+    known = np.arange(20) != 5
+    np.testing.assert_allclose(gnss.channel("position_y_m")[known], 11.113 * np.arange(20)[known], atol=0.02)
+    np.testing.assert_allclose(gnss.channel("std_position_m")[known], 0.2)
+    np.testing.assert_allclose(pose.channel("yaw_rad"), np.arange(20), atol=1e-9)
+    np.testing.assert_allclose(pose.channel("position_x_m"), 0.1 * np.arange(20))
 
 
 def test_a_bag_without_definitions_is_read_by_those_of_its_release(tmp_path):
@@ -545,3 +615,42 @@ streams:
     (tmp_path / "join.yaml").write_text(lines.replace("/imu/data", "/imu"))
     with pytest.raises(LogError, match=r"stream imu: there is no topic '/imu' \(there are"):
         load_runs(tmp_path, mapping=tmp_path / "join.yaml")
+
+
+def test_a_bags_folder_is_the_same_run_as_its_file(tmp_path):
+    rows = husky_rows(80)
+    runs = []
+    for storage in ("sqlite3", "mcap"):
+        bag = write_bag(tmp_path / storage, rows, storage)
+        runs += load_runs(bag, layout="bag", mapping="husky_topics")
+        (single,) = (path for path in bag.iterdir() if path.suffix != ".yaml")
+        runs += load_runs(single, mapping="husky_topics")
+    assert [run.run_id for run in runs] == ["sqlite3", "sqlite3", "mcap", "mcap"]
+    contents = {tuple(stream.values.tobytes() for stream in run.streams.values()) for run in runs}
+    assert len(contents) == 1
+
+
+def test_other_layouts_come_first_and_bags_beside_them_are_passed_over(tmp_path, make_run):
+    write_run(make_run("SNOW_01"), tmp_path)
+    write_mcap(tmp_path / "notes" / "notes.mcap", [("/name", START_NS, text("a"))])
+    (found,) = load_runs(tmp_path)
+    assert found.run_id == "SNOW_01"
+
+
+@pytest.mark.parametrize(
+    ("content", "fault"),
+    [
+        ("rosbag2_bagfile_information: 3", "does not list the files"),
+        ("rosbag2_bagfile_information: {relative_file_paths: [3]}", "does not list the files"),
+        ("rosbag2_bagfile_information: {relative_file_paths: []}", "are required"),
+        ("rosbag2_bagfile_information: {relative_file_paths: [metadata.yaml]}", "are required"),
+        ("rosbag2_bagfile_information: {relative_file_paths: [a.mcap]}", "is missing"),
+        ("rosbag2_bagfile_information: [", "is no YAML"),
+    ],
+)
+def test_a_damaged_description_of_a_bag_is_one_sentence(tmp_path, content, fault):
+    (tmp_path / "bag").mkdir()
+    (tmp_path / "bag" / "metadata.yaml").write_text(content)
+    with pytest.raises((LogError, ConfigError), match=fault) as raised:
+        load_runs(tmp_path, layout="bag", robot="husky")
+    assert "\n" not in str(raised.value)

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipelines.data.can_codec import Drop, Frame, crc8, decode, encode, load_layout
+from pipelines.data.can_codec import Drop, Frame, decode, encode, load_layout
 from pipelines.data.can_logs import Receiver
 from pipelines.data.can_signals import OPTIONAL, QUATERNION, SIGNALS, as_sent, channels_of
 from terrain.robots import load_robot
@@ -115,14 +115,6 @@ def test_each_wrong_bit_of_a_checked_message_is_found(stream):
         assert decode(LAYOUT, frame._replace(data=bytes(data))) is Drop.CHECKSUM
     other = frame._replace(arbitration_id=0x101 if stream != "corrections" else 0x102)
     assert decode(LAYOUT, other) is Drop.CHECKSUM, "the identifier is checked too"
-
-
-def test_the_checksum_is_that_of_sae_j1850():
-    """The check value of the catalogue, and one message by hand, as the other side has to compute it."""
-    assert crc8(b"123456789") == 0x4B
-    (frame,) = encode(LAYOUT, "corrections", [0.5, -0.5, 0.0], 3)
-    assert frame.data[:7] == bytes([0xE8, 0x03, 0x18, 0xFC, 0x00, 0x00, 0x03])
-    assert frame.data[7] == crc8(bytes([0x01, 0x01, *frame.data[:7], 0x00]))
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,6 @@ import pytest
 
 from pipelines.data.can_codec import Frame, decode, encode, load_layout
 from pipelines.data.can_logs import Receiver
-from pipelines.data.can_signals import SIGNALS
 from terrain.errors import ConfigError
 from terrain.files.resources import data_folder
 
@@ -126,10 +125,6 @@ def test_another_dbc_with_units_and_layouts_of_its_own_is_read(tmp_path):
     part = decode(layout, frame)
     assert math.isnan(part.values[0])
     assert part.values[1:] == pytest.approx([math.pi, -math.pi])
-
-
-def test_every_stream_may_be_asked_for():
-    assert set(load_layout().by_stream) == set(SIGNALS)
 
 
 def test_without_the_packages_the_extra_is_named(monkeypatch):

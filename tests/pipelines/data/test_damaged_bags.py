@@ -16,13 +16,16 @@ from pipelines.data.datasets import load_runs
 from pipelines.data.mcap_file import MAGIC
 from terrain.errors import ConfigError, LogError
 
-from .foreign_bags import START_NS, husky_rows, imu, write_bag, write_mcap
+from .foreign_bags import START_NS, husky_rows, imu, write_bag, write_mcap, write_ros1
+
+SUFFIXES = {"sqlite": "db3", "ros1": "bag", "ros1 packed": "bag"}
 
 KNOWN = {
     "files that end early",
     "damaged blocks of messages",
     "damaged messages",
     "rows with a bad time",
+    "values beyond any quantity",
     "channels with nothing finite",
 }
 
@@ -38,13 +41,15 @@ def whole(tmp_path_factory):
         "none": write_mcap(folder / "none.mcap", rows, CompressionType.NONE, chunk_size=5000),
         "loose": write_mcap(folder / "loose.mcap", rows, use_chunking=False),
         "sqlite": write_bag(folder / "sqlite", rows) / "sqlite.db3",
+        "ros1": write_ros1(folder / "ros1.bag", rows),
+        "ros1 packed": write_ros1(folder / "packed.bag", rows, "BZ2"),
     }
     return folder, {name: path.read_bytes() for name, path in files.items()}
 
 
 def read(folder, kind, content, repair):
     """Return the run of a file's bytes; None where it is refused in one sentence."""
-    path = folder / ("damaged.db3" if kind == "sqlite" else "damaged.mcap")
+    path = folder / f"damaged.{SUFFIXES.get(kind, 'mcap')}"
     path.write_bytes(content)
     try:
         (run,) = load_runs(path, mapping="husky_topics", repair=repair)
@@ -58,16 +63,16 @@ def read(folder, kind, content, repair):
 
 
 def kinds():
-    return st.sampled_from(["zstd", "lz4", "none", "loose", "sqlite"])
+    return st.sampled_from(["zstd", "lz4", "none", "loose", *SUFFIXES])
 
 
 @given(kinds(), st.floats(0.0, 1.0), st.booleans())
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=80, deadline=None)
 def test_a_file_that_is_cut_off_is_refused_or_read_as_far_as_it_goes(whole, kind, part, repair):
     folder, files = whole
     content = files[kind][: int(part * len(files[kind]))]
     run = read(folder, kind, content, repair)
-    if run is not None and kind != "sqlite":
+    if run is not None and kind not in SUFFIXES:
         ends = files[kind].find(b"\x0f\x04\x00\x00\x00\x00\x00\x00\x00") + 9  # the end of the messages
         assert repair or len(content) >= ends
         assert set(run.dropped) <= KNOWN
@@ -80,7 +85,7 @@ def test_a_file_that_is_cut_off_is_refused_or_read_as_far_as_it_goes(whole, kind
     st.lists(st.tuples(st.floats(0.0, 1.0), st.integers(0, 255)), min_size=1, max_size=8),
     st.booleans(),
 )
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=80, deadline=None)
 def test_bytes_that_are_changed_are_refused_or_counted_or_are_other_numbers(whole, kind, changes, repair):
     folder, files = whole
     content = bytearray(files[kind])

@@ -2,6 +2,8 @@
 
 import json
 import string
+import sys
+from io import BytesIO
 
 import numpy as np
 import pytest
@@ -16,7 +18,10 @@ from pipelines.data.bag_runs import find_runs
 from pipelines.data.convert import Settings
 from pipelines.data.convert import run as convert
 from pipelines.data.datasets import data_digest, load_runs
-from pipelines.data.run_writers import write_messages
+from pipelines.data.mcap_file import McapWriter, RunRecorder
+from pipelines.data.recorded_windows import WINDOWS_FILE, windows_text
+from pipelines.data.run_topics import Head, string_message
+from pipelines.data.run_writers import outgoing_topics, write_messages
 from terrain.errors import ConfigError, DataError, LogError
 from terrain.estimation.enriched import enriched
 from terrain.estimation.estimate import estimate_run
@@ -207,39 +212,103 @@ def test_a_run_that_is_too_long_for_stamps_is_refused(tmp_path):
     assert not list((tmp_path / "out").glob("*"))
 
 
-def test_an_export_whose_document_is_changed_is_refused(raw, tmp_path):
-    from mcap.reader import make_reader as reader_of
-    from mcap.writer import Writer
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ('"version": 1', '"version": 9'),
+        ('"run_id"', '"run_ix"'),
+        ('"robot": "', '"robot": "/'),
+        ("terrain/imu", "terrain/imx"),
+        ('gyro_x_radps"', 'gyro_x_furlo"'),
+        ('"labels": [', '"labels": {'),
+    ],
+)
+def test_an_export_whose_document_is_changed_is_refused(raw, tmp_path, old, new):
+    run = load_runs(raw)[0]
+    with (tmp_path / "changed.mcap").open("wb") as file:
+        writer = McapWriter(file, {})
+        for topic, kind, definition, log_ns, messages in outgoing_topics(run):
+            for stamp_ns, message in zip(log_ns.tolist(), messages, strict=True):
+                if topic == "/terrain/run":
+                    assert old in message[8:-1].decode()
+                    message = string_message(message[8:-1].decode().replace(old, new, 1))
+                writer.write(topic, kind, definition, stamp_ns, message)
+        writer.finish()
+    with pytest.raises((LogError, ConfigError)) as raised:
+        load_runs(tmp_path / "changed.mcap")
+    assert "\n" not in str(raised.value)
 
-    exported(raw, tmp_path)
-    first = sorted(tmp_path.glob("*.mcap"))[0]
-    with first.open("rb") as file:
-        reader = reader_of(file)
-        rows = [(s, c, m) for s, c, m in reader.iter_messages()]
-    for old, new in (
-        (b'"version": 1', b'"version": 9'),
-        (b'"run_id"', b'"run_ix"'),
-        (b'"robot": "', b'"robot": "/'),
-        (b"terrain/imu", b"terrain/imx"),
-        (b'gyro_x_radps"', b'gyro_x_furlo"'),
-        (b'"labels": [', b'"labels": {'),
-    ):
-        path = tmp_path / "changed.mcap"
-        with path.open("wb") as file:
-            writer = Writer(file)
-            writer.start()
-            channels = {}
-            for schema, channel, message in rows:
-                if channel.topic not in channels:
-                    number = writer.register_schema(schema.name, schema.encoding, schema.data)
-                    channels[channel.topic] = writer.register_channel(channel.topic, "cdr", number)
-                content = message.data
-                if channel.topic == "/terrain/run":
-                    assert old in content
-                    content = content.replace(old, new, 1)
-                    content = content[:4] + (len(content) - 8).to_bytes(4, "little") + content[8:]
-                writer.add_message(channels[channel.topic], message.log_time, content, message.log_time)
-            writer.finish()
-        with pytest.raises((LogError, ConfigError)) as raised:
-            load_runs(path)
-        assert "\n" not in str(raised.value)
+
+ENTRIES = [
+    {"start_s": 1.0, "end_s": 3.0, "terrain": "ICE", "probability": 0.75, "probabilities": {"ICE": 0.75},
+     "doubtful": False, "refused": ""},
+    {"start_s": 2.0, "end_s": 4.5, "terrain": "", "probability": None, "probabilities": {},
+     "doubtful": True, "refused": "not finite"},
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("target", TARGETS)
+def test_recorded_windows_go_with_their_run_out_and_in(raw, tmp_path, target):
+    run = load_runs(raw)[0]
+    place = write_run(run, tmp_path / "raw", beside={WINDOWS_FILE: windows_text(ENTRIES)})
+    result = exported(tmp_path / "raw", tmp_path / "out", target)
+    assert result.topics["/terrain/window"] == 2
+    convert(Settings(data=tmp_path / "out", out=tmp_path / "again"))
+    assert (tmp_path / "again" / run.run_id / WINDOWS_FILE).read_text() == (place / WINDOWS_FILE).read_text()
+    for damage in ('{"version": 1}', '{"windows": [3]}', '{"windows": [{"end_s": "x"}]}'):
+        (place / WINDOWS_FILE).write_text(damage)
+        with pytest.raises(LogError, match="is damaged"):
+            exported(tmp_path / "raw", tmp_path / "other", target)
+
+
+@pytest.mark.parametrize("package", ["mcap", "rosbags", "zstandard"])
+def test_a_missing_package_is_named_in_one_sentence(raw, tmp_path, monkeypatch, package):
+    exported(raw, tmp_path / "mcap")
+    for name in [name for name in sys.modules if name.split(".")[0] == package]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(ConfigError, match=r"pip install 'terrain-slip\[logs\]'"):
+        exported(tmp_path / "mcap" if package == "zstandard" else raw, tmp_path / "out")
+    assert not (tmp_path / "out").exists() or not any((tmp_path / "out").iterdir())
+
+
+def test_csv_files_are_read_back_by_the_mapping_beside_them(raw, tmp_path):
+    run = load_runs(raw)[1]
+    write_run(run, tmp_path / "raw")
+    result = exported(tmp_path / "raw", tmp_path / "csv", "csv")
+    assert result.topics["imu.csv"] == len(run.streams["imu"])
+    (again,) = load_runs(tmp_path / "csv", mapping=tmp_path / "csv" / "mapping.yaml")
+    assert set(again.streams) == set(run.streams)
+    for name, stream in again.streams.items():
+        np.testing.assert_array_equal(stream.time_s, run.streams[name].time_s)
+        for channel in stream.channels:
+            np.testing.assert_array_equal(stream.channel(channel), run.streams[name].channel(channel))
+
+
+@given(st.data())
+@settings(max_examples=40, deadline=None)
+def test_of_a_recording_that_ends_anywhere_all_that_was_flushed_is_read(tmp_path_factory, data):
+    """A recording is cut off where a process was killed: the samples before the last flush are there."""
+    file = BytesIO()
+    recorder = RunRecorder(file, Head("drive", "husky", live=True))
+    recorder.register("imu", ("gyro_z_radps",))
+    flushed = [0]
+    for part in range(6):
+        if part == 2:  # streams may come later, and samples out of order
+            recorder.register("late one", ("speed_left_mps", "dead_m"))
+            recorder.append("late one", [0.19, 0.2, 0.18], [[1.0, np.nan]] * 3)
+        recorder.append("imu", 0.1 * part + 0.01 * np.arange(10), np.full((10, 1), float(part)))
+        recorder.flush()
+        flushed.append(len(file.getvalue()))
+    recorder.finish()
+    whole = file.getvalue()
+    end = data.draw(st.integers(flushed[1], len(whole)))
+    path = tmp_path_factory.mktemp("cut") / "drive.mcap"
+    path.write_bytes(whole[:end])
+    (run,) = load_runs(path)
+    n_flushed = sum(each <= end for each in flushed) - 1
+    assert len(run.streams["imu"]) >= 10 * n_flushed
+    if n_flushed > 3:
+        assert run.streams["late one"].channels == ("speed_left_mps",)
+        assert len(run.streams["late one"]) == 2
+        assert run.dropped["rows with a bad time"] == 1
