@@ -16,13 +16,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import quote
 
-from pipelines.data.faults import DAMAGED_BLOCK, EARLY_END, MISSING_PACKAGE, Faults, Topic
-from pipelines.data.mcap_file import MAGIC, MAX_RECORD_BYTES, McapReader
+from pipelines.data.mcap_file import MAGIC, MAX_RECORD_BYTES, MISSING_PACKAGE, McapReader
 from pipelines.data.standard_messages import DISTRO
 from terrain.errors import ConfigError, LogError, TerrainError
 from terrain.files.documents import read_yaml
 from terrain.files.names import shown
+from terrain.logs.faults import DAMAGED_BLOCK, EARLY_END, Faults, Topic
 from terrain.logs.log_files import check_log_file, short_name
+from terrain.logs.topic_mapping import short_type
 
 METADATA = "metadata.yaml"
 SUFFIXES = (".mcap", ".db3", ".bag")
@@ -53,18 +54,6 @@ class Bag(NamedTuple):
     path: Path
     files: tuple[Path, ...]
     distro: str = ""
-
-
-def short_type(name: str) -> str:
-    """Return the name of a type without its middle part.
-
-    Examples
-    --------
-    >>> short_type("sensor_msgs/msg/Imu")
-    'sensor_msgs/Imu'
-    """
-    parts = name.split("/")
-    return f"{parts[0]}/{parts[-1]}" if len(parts) == 3 else name
 
 
 def find_bags(place: Path) -> list[Path]:

@@ -17,15 +17,21 @@ from pipelines.data.bag_files import (
     find_bags,
     messages_of,
     open_bag,
-    short_type,
     topics_of,
 )
-from pipelines.data.faults import DAMAGED_MESSAGE, Faults, Topic
-from pipelines.data.message_numbers import Number, number_at, stamp_at
 from pipelines.data.recorded_windows import RecordedWindow, window_of_text
-from pipelines.data.run_topics import RUN_TOPIC, STRING, WINDOW_TOPIC, RunDocument
 from pipelines.data.standard_messages import KINDS, Converted
-from pipelines.data.topic_mapping import (
+from terrain.errors import ConfigError, LogError
+from terrain.files.names import shown
+from terrain.logs.borealtc import whole_run_label
+from terrain.logs.faults import DAMAGED_MESSAGE, Faults, Topic
+from terrain.logs.log_files import checked_names, short_name
+from terrain.logs.message_numbers import Number, number_at, stamp_at
+from terrain.logs.parquet_file import MAX_VALUES
+from terrain.logs.run_topics import RUN_TOPIC, STRING, WINDOW_TOPIC, RunDocument
+from terrain.logs.samples import checked_stream, longest_rise, refuse_apart
+from terrain.logs.schema import UNIT_OFFSETS, UNIT_SCALES, unit_of
+from terrain.logs.topic_mapping import (
     LABELS_TYPE,
     TYPES,
     Channel,
@@ -35,16 +41,10 @@ from pipelines.data.topic_mapping import (
     described,
     joint_unit,
     load_mapping,
+    short_type,
     standard_mapping,
 )
-from pipelines.data.topic_mapping import Mapping as TopicMapping
-from terrain.errors import ConfigError, LogError
-from terrain.files.names import shown
-from terrain.logs.borealtc import whole_run_label
-from terrain.logs.log_files import checked_names, short_name
-from terrain.logs.parquet_file import MAX_VALUES
-from terrain.logs.samples import checked_stream, longest_rise, refuse_apart
-from terrain.logs.schema import UNIT_OFFSETS, UNIT_SCALES, unit_of
+from terrain.logs.topic_mapping import Mapping as TopicMapping
 from terrain.records import Array, Label, RunLog, Stream
 from terrain.robots import Robot, packaged_robot
 
@@ -66,7 +66,7 @@ def find_runs(
     ----------
     place : folder of bags, the folder of a bag or a file; one in a folder of its own is labelled with that
         folder's name as its terrain
-    mapping : YAML file (:mod:`pipelines.data.topic_mapping`); by the types of the topics by default
+    mapping : YAML file (:mod:`terrain.logs.topic_mapping`); by the types of the topics by default
     robot : of all runs that do not name theirs; that of the mapping by default
     bags : under the place, where they are known already
 

@@ -64,7 +64,7 @@ def load_runs(
         MCAP file
     layout : one of ``LAYOUTS``; ``auto`` looks
     mapping : YAML file that describes how to read CSV files (``terrain.logs.mapping``); of logs of a CAN bus
-        their DBC, by default AgriMaRo's; of bags their topics (``pipelines.data.topic_mapping``)
+        their DBC, by default AgriMaRo's; of bags their topics (``terrain.logs.topic_mapping``)
     repair : drop and count what a strict read refuses, and skip runs that cannot be read at all
     align : bring the wheel stream onto the clock of the IMU where the two clocks can be compared
     robot : the robot of logs that do not name theirs, by name or its YAML file; of those of DRIVE
@@ -266,8 +266,9 @@ def _readers(
 
 def _mapped(folder: Path, mapping: str | Path, robot: Robot | None) -> list[Callable[..., RunLog]]:
     """Return the readers of files by a mapping; a stream may lie in a bag."""
-    from pipelines.data import bag_runs, topic_mapping
+    from pipelines.data import bag_runs
     from terrain.logs import mapping as by_mapping
+    from terrain.logs import topic_mapping
 
     read = by_mapping.load_mapping(mapping, topic_mapping.check_stream)
     try:

@@ -13,8 +13,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
-from pipelines.data.faults import DAMAGED_BLOCK, EARLY_END, MISSING_PACKAGE, Faults, Topic
-from pipelines.data.run_topics import (
+from terrain.errors import ConfigError, LogError
+from terrain.files.names import shown
+from terrain.files.regular import MEBIBYTE
+from terrain.logs.faults import DAMAGED_BLOCK, EARLY_END, Faults, Topic
+from terrain.logs.log_files import short_name
+from terrain.logs.run_topics import (
     LABEL_TOPIC,
     RUN_TOPIC,
     STRING,
@@ -28,14 +32,12 @@ from pipelines.data.run_topics import (
     stream_topic,
     string_message,
 )
-from terrain.errors import ConfigError, LogError
-from terrain.files.names import shown
-from terrain.files.regular import MEBIBYTE
-from terrain.logs.log_files import short_name
 from terrain.records import Array, Label
 
 if TYPE_CHECKING:
     from mcap.records import Chunk
+
+MISSING_PACKAGE = "bags need the packages rosbags and mcap: pip install 'terrain-slip[logs]'"
 
 LIBRARY = "terrain-slip"
 MAGIC = b"\x89MCAP0\r\n"

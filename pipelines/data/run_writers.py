@@ -10,10 +10,14 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from pipelines.data.faults import MISSING_PACKAGE
-from pipelines.data.mcap_file import McapWriter
+from pipelines.data.mcap_file import MISSING_PACKAGE, McapWriter
 from pipelines.data.recorded_windows import RecordedWindow
-from pipelines.data.run_topics import (
+from pipelines.data.standard_messages import DISTRO, serialized, standard_topics
+from pipelines.report.json_file import as_json
+from terrain.errors import ConfigError, DataError
+from terrain.files.atomic import atomic_file, atomic_folder
+from terrain.files.names import shown
+from terrain.logs.run_topics import (
     LABEL_TOPIC,
     LATEST_S,
     RUN_TOPIC,
@@ -27,11 +31,6 @@ from pipelines.data.run_topics import (
     stream_topics,
     string_message,
 )
-from pipelines.data.standard_messages import DISTRO, serialized, standard_topics
-from pipelines.report.json_file import as_json
-from terrain.errors import ConfigError, DataError
-from terrain.files.atomic import atomic_file, atomic_folder
-from terrain.files.names import shown
 from terrain.logs.schema import UNIT_SCALES, unit_of
 from terrain.logs.write import run_folder
 from terrain.records import Array, RunLog

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pipelines.data.faults import MISSING_PACKAGE
+from pipelines.data.mcap_file import MISSING_PACKAGE
 from terrain.errors import ConfigError
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.kinematics.camera import QUATERNION_TOLERANCE, to_body, to_camera

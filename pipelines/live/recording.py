@@ -2,7 +2,7 @@
 
 The event loop of a session only appends to lists; one thread writes all recordings, each at least once a
 second, so that a killed process loses at most two.  The files have the topics of an exported run
-(:mod:`pipelines.data.run_topics`): Foxglove and PlotJuggler open them while they grow, and ``terrain convert``
+(:mod:`terrain.logs.run_topics`): Foxglove and PlotJuggler open them while they grow, and ``terrain convert``
 makes runs of them.  A recording goes on in files of a bounded size, each a run of the same session, the next
 one beginning with the sample after the last.
 """
@@ -25,10 +25,10 @@ import numpy as np
 
 from pipelines.data.mcap_file import RunRecorder
 from pipelines.data.recorded_windows import WindowResult, window_entry
-from pipelines.data.run_topics import LATEST_S, WINDOW_TOPIC, Head
 from terrain.errors import LogError
 from terrain.files.names import plain_name
 from terrain.logs.replay import TWIST
+from terrain.logs.run_topics import LATEST_S, WINDOW_TOPIC, Head
 from terrain.logs.samples import BAD_TIME
 from terrain.logs.schema import unit_of
 from terrain.logs.write import run_folder

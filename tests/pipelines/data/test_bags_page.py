@@ -3,11 +3,10 @@
 import re
 from pathlib import Path
 
-from pipelines.data.bag_files import short_type
 from pipelines.data.run_writers import outgoing_topics
-from pipelines.data.topic_mapping import TYPES, load_mapping
 from terrain.estimation.enriched import enriched
 from terrain.estimation.estimate import estimate_run
+from terrain.logs.topic_mapping import TYPES, load_mapping, short_type
 from terrain.robots import load_robot
 from terrain.simulation.run import simulate_run
 

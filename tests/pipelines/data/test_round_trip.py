@@ -20,12 +20,12 @@ from pipelines.data.convert import run as convert
 from pipelines.data.datasets import data_digest, load_runs
 from pipelines.data.mcap_file import McapWriter, RunRecorder
 from pipelines.data.recorded_windows import WINDOWS_FILE, windows_text
-from pipelines.data.run_topics import Head, string_message
 from pipelines.data.run_writers import outgoing_topics, write_messages
 from terrain.errors import ConfigError, DataError, LogError
 from terrain.estimation.enriched import enriched
 from terrain.estimation.estimate import estimate_run
 from terrain.logs.read import read_run
+from terrain.logs.run_topics import Head, string_message
 from terrain.logs.write import write_run
 from terrain.records import Label, RunLog, Stream
 from terrain.robots import load_robot

@@ -15,11 +15,11 @@ import pytest
 import pipelines.live.recording as recording
 from pipelines.data.bag_runs import recorded_windows
 from pipelines.data.datasets import load_runs
-from pipelines.data.run_topics import APART, DEAD_STREAM, SHORT_STREAM
 from pipelines.live.classifying import WindowOutput
 from pipelines.live.recording import RecordingThread, SessionRecorder
 from terrain.errors import LogError
 from terrain.logs.replay import replay
+from terrain.logs.run_topics import APART, DEAD_STREAM, SHORT_STREAM
 from terrain.logs.samples import BAD_TIME, DEAD_CHANNEL
 from terrain.records import Command, Reading
 

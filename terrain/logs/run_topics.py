@@ -18,10 +18,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipelines.data.faults import DAMAGED_MESSAGE, Faults, Topic
 from terrain.errors import LogError
 from terrain.files.documents import parse_json
 from terrain.files.names import shown
+from terrain.logs.faults import DAMAGED_MESSAGE, Faults, Topic
 from terrain.logs.log_files import checked_names
 from terrain.logs.read import MAX_STREAMS, MAY_BE_UNKNOWN, read_labels
 from terrain.logs.samples import DEAD_CHANNEL, checked_stream, refuse_apart

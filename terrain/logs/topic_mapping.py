@@ -33,12 +33,11 @@ from typing import Annotated, Literal
 
 from pydantic import Field, FiniteFloat, ValidationError
 
-from pipelines.data.bag_files import short_type
-from pipelines.data.faults import Topic
 from terrain.errors import ConfigError, LogError
 from terrain.files.documents import read_yaml
 from terrain.files.names import check_name, listed, plain_name
 from terrain.files.resources import data_folder
+from terrain.logs.faults import Topic
 from terrain.logs.mapping import Strict, Unit, Word, check_unit, first_fault
 from terrain.logs.schema import unit_of
 
@@ -102,6 +101,18 @@ class Mapping(Strict):
     time: Literal["header", "log"] = "header"
     terrain: str = ""
     labels: str = ""
+
+
+def short_type(name: str) -> str:
+    """Return the name of a type without its middle part.
+
+    Examples
+    --------
+    >>> short_type("sensor_msgs/msg/Imu")
+    'sensor_msgs/Imu'
+    """
+    parts = name.split("/")
+    return f"{parts[0]}/{parts[-1]}" if len(parts) == 3 else name
 
 
 def load_mapping(path: str | Path) -> Mapping:

@@ -7,8 +7,6 @@ from typing import NamedTuple
 
 from terrain.errors import LogError
 
-MISSING_PACKAGE = "bags need the packages rosbags and mcap: pip install 'terrain-slip[logs]'"
-
 EARLY_END = "files that end early"
 DAMAGED_BLOCK = "damaged blocks of messages"
 DAMAGED_MESSAGE = "damaged messages"
