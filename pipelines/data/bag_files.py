@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import quote
 
-from pipelines.data.mcap_file import MAGIC, MAX_RECORD_BYTES, MISSING_PACKAGE, McapReader
+from pipelines.data.mcap_file import MAGIC, MAX_RECORD_BYTES, McapReader, library
 from pipelines.data.standard_messages import DISTRO
-from terrain.errors import ConfigError, LogError, TerrainError
+from terrain.errors import LogError, TerrainError
 from terrain.files.documents import read_yaml
 from terrain.files.names import shown
 from terrain.logs.faults import DAMAGED_BLOCK, EARLY_END, Faults, Topic
@@ -153,15 +153,11 @@ class RosbagsReader:
         self._path, self._faults, self._place, self._is_ros1 = path, faults, short_name(path), is_ros1
 
     def _open(self) -> Any:
-        try:
-            from rosbags.rosbag1 import Reader as Ros1Reader
-            from rosbags.rosbag2 import Reader as Ros2Reader
-        except ImportError as error:
-            raise ConfigError(MISSING_PACKAGE) from error
+        rosbags = library("rosbags.rosbag1" if self._is_ros1 else "rosbags.rosbag2")
         try:
             if not self._is_ros1:
                 self._refuse_views()
-            reader = Ros1Reader(self._path) if self._is_ros1 else Ros2Reader(self._path)
+            reader = rosbags.Reader(self._path)
             reader.open()
         except TerrainError:
             raise
@@ -295,15 +291,12 @@ def decoder_of(place: str, topic: Topic, distro: str) -> Callable[[bytes], Any]:
 
 
 def _of_protobuf(at: str, topic: Topic) -> Callable[[bytes], Any]:
+    decoders, records = library("mcap_protobuf.decoder"), library("mcap.records")
+    schema = records.Schema(
+        1, topic.definition.encode("latin-1", "replace"), topic.schema_encoding, topic.kind
+    )
     try:
-        from mcap.records import Schema
-        from mcap_protobuf.decoder import DecoderFactory
-    except ImportError as error:
-        missing = MISSING_PACKAGE.replace("rosbags and mcap", "mcap and mcap-protobuf-support")
-        raise ConfigError(missing) from error
-    schema = Schema(1, topic.definition.encode("latin-1", "replace"), topic.schema_encoding, topic.kind)
-    try:
-        decoder: Callable[[bytes], Any] | None = DecoderFactory().decoder_for("protobuf", schema)
+        decoder: Callable[[bytes], Any] | None = decoders.DecoderFactory().decoder_for("protobuf", schema)
     except Exception as error:  # whatever the library makes of a damaged definition
         raise LogError(f"{at}: its definition is damaged ({_sentence(error)})") from error
     if decoder is None:
@@ -312,10 +305,9 @@ def _of_protobuf(at: str, topic: Topic) -> Callable[[bytes], Any]:
 
 
 def _of_ros(at: str, topic: Topic, distro: str) -> Callable[[bytes], Any]:
-    try:
-        from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
-    except ImportError as error:
-        raise ConfigError(MISSING_PACKAGE) from error
+    library("rosbags.typesys")
+    from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+
     if len(topic.definition) > MAX_DEFINITION_CHARACTERS:
         raise LogError(f"{at}: its definition is longer than {MAX_DEFINITION_CHARACTERS} characters")
     package, _, name = short_type(topic.kind).partition("/")

@@ -10,6 +10,7 @@ import struct
 import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
@@ -37,7 +38,9 @@ from terrain.records import Array, Label
 if TYPE_CHECKING:
     from mcap.records import Chunk
 
-MISSING_PACKAGE = "bags need the packages rosbags and mcap: pip install 'terrain-slip[logs]'"
+MISSING_PACKAGE = (
+    "bags need the packages rosbags, mcap and mcap-protobuf-support: pip install 'terrain-slip[logs]'"
+)
 
 LIBRARY = "terrain-slip"
 MAGIC = b"\x89MCAP0\r\n"
@@ -51,6 +54,20 @@ MAX_RATIO = 200
 SMALL_BYTES = 16 * MEBIBYTE
 
 _LATEST_NS = 2**63 - 1
+
+
+def library(name: str) -> Any:
+    """Return a module of a package that not everybody needs.
+
+    Raises
+    ------
+    ConfigError
+        if the package is not installed.
+    """
+    try:
+        return import_module(name)
+    except ImportError as error:
+        raise ConfigError(MISSING_PACKAGE) from error
 
 
 class McapWriter:
@@ -68,10 +85,9 @@ class McapWriter:
     """
 
     def __init__(self, file: BinaryIO, metadata: Mapping[str, str]) -> None:
-        try:
-            from mcap.writer import CompressionType, Writer
-        except ImportError as error:
-            raise ConfigError(MISSING_PACKAGE) from error
+        library("mcap.writer")
+        from mcap.writer import CompressionType, Writer
+
         self._file = file
         self._writer = Writer(file, compression=CompressionType.ZSTD)
         self._writer.start(profile="ros2", library=LIBRARY)
@@ -187,11 +203,7 @@ class McapReader:
 
     def __init__(self, path: Path, faults: Faults) -> None:
         self._path, self._faults, self._place = path, faults, short_name(path)
-        try:
-            import mcap.stream_reader
-        except ImportError as error:
-            raise ConfigError(MISSING_PACKAGE) from error
-        self._library = mcap
+        library("mcap.stream_reader")
 
     def topics(self) -> list[Topic]:
         """Return the topics: those that the end of the file lists, else all that a walk through it finds.
@@ -318,17 +330,13 @@ def _unpacked(chunk: Chunk) -> bytes:
         raise ValueError(f"a chunk is packed by {shown(chunk.compression)}, lz4 and zstd are read")
     content = packed
     if chunk.compression:
-        try:
-            import lz4.frame
-            import zstandard
-        except ImportError as error:
-            raise ConfigError(MISSING_PACKAGE) from error
+        lz4, zstandard = library("lz4.frame"), library("zstandard")
         try:
             if chunk.compression == "zstd":
                 with zstandard.ZstdDecompressor().stream_reader(packed) as reader:
                     content = bytes(reader.read(size + 1))
             else:
-                content = bytes(lz4.frame.LZ4FrameDecompressor().decompress(packed, max_length=size + 1))
+                content = bytes(lz4.LZ4FrameDecompressor().decompress(packed, max_length=size + 1))
         except (zstandard.ZstdError, RuntimeError, EOFError) as error:
             raise ValueError(f"a chunk cannot be unpacked ({error})") from error
     if len(content) != size:

@@ -10,11 +10,11 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from pipelines.data.mcap_file import MISSING_PACKAGE, McapWriter
+from pipelines.data.mcap_file import McapWriter, library
 from pipelines.data.recorded_windows import RecordedWindow
 from pipelines.data.standard_messages import DISTRO, serialized, standard_topics
 from pipelines.report.json_file import as_json
-from terrain.errors import ConfigError, DataError
+from terrain.errors import DataError
 from terrain.files.atomic import atomic_file, atomic_folder
 from terrain.files.names import shown
 from terrain.logs.run_topics import (
@@ -161,11 +161,10 @@ def write_messages(
 
 
 def _write_ros2(folder: Path, topics: Sequence[Outgoing], storage: str) -> None:
-    try:
-        from rosbags.rosbag2 import StoragePlugin, Writer
-        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-    except ImportError as error:
-        raise ConfigError(MISSING_PACKAGE) from error
+    library("rosbags.rosbag2")
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
     store = get_typestore(Stores[DISTRO])
     for each in topics:
         if each.kind not in store.types:

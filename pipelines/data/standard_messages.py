@@ -8,8 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pipelines.data.mcap_file import MISSING_PACKAGE
-from terrain.errors import ConfigError
+from pipelines.data.mcap_file import library
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.kinematics.camera import QUATERNION_TOLERANCE, to_body, to_camera
 from terrain.logs.geodesy import local_metres
@@ -263,10 +262,9 @@ def serialized(topic: StandardTopic, log_ns: Array) -> tuple[str, list[bytes]]:
     ConfigError
         if rosbags is not installed.
     """
-    try:
-        from rosbags.typesys import Stores, get_typestore
-    except ImportError as error:
-        raise ConfigError(MISSING_PACKAGE) from error
+    library("rosbags.typesys")
+    from rosbags.typesys import Stores, get_typestore
+
     store = get_typestore(Stores[DISTRO])
     message = _zero(store, topic.kind)
     for path, text in topic.texts.items():
