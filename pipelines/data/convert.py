@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -23,7 +24,7 @@ from pipelines.report import (
     silent,
 )
 from pipelines.report.settings import setting
-from terrain.errors import LogError
+from terrain.errors import LogError, TerrainError
 
 if TYPE_CHECKING:
     from pipelines.data.plausibility import Doubt
@@ -210,8 +211,10 @@ def _recorded_windows(place: Path) -> dict[str, list[RecordedWindow]]:
 
     folders = run_folders(place) if place.is_dir() else []
     found = {read_run_head(folder).run_id: read_windows(folder) or [] for folder in folders}
-    if not folders:
-        found = dict(each for bag in find_bags(place) if (each := recorded_windows(bag)) is not None)
+    for bag in find_bags(place) if not folders else ():
+        with suppress(TerrainError):  # a bag that was read, and is damaged, was refused by then
+            recorded = recorded_windows(bag)
+            found.update([recorded] if recorded is not None else [])
     return {run_id: windows for run_id, windows in found.items() if windows}
 
 

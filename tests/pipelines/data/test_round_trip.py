@@ -261,6 +261,12 @@ def test_recorded_windows_go_with_their_run_out_and_in(raw, tmp_path, target):
             exported(tmp_path / "raw", tmp_path / "other", target)
 
 
+def test_a_damaged_bag_beside_files_of_another_layout_is_no_matter(borealtc_dir, tmp_path):
+    (borealtc_dir / "notes.mcap").write_text("no bag")
+    result = convert(Settings(data=borealtc_dir, out=tmp_path / "out"))
+    assert result.n_runs == 3
+
+
 @pytest.mark.parametrize("package", ["mcap", "rosbags", "zstandard"])
 def test_a_missing_package_is_named_in_one_sentence(raw, tmp_path, monkeypatch, package):
     exported(raw, tmp_path / "mcap")
