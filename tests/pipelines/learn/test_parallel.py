@@ -51,6 +51,10 @@ def test_another_text_is_refused_in_one_sentence(compute):
         ComputeSettings(compute=compute)
 
 
+def test_results_of_two_processes_come_in_the_order_of_their_tasks():
+    assert list(parallel(pow, (2,), ((number,) for number in range(40)), 2)) == [2**k for k in range(40)]
+
+
 def test_local_results_come_in_order_while_tasks_are_still_made():
     made = []
 
