@@ -3,7 +3,6 @@ import pytest
 
 from features.windows import WindowRule
 from pipelines.data.regimes import driven_at
-from pipelines.learn.crossval import PUBLISHED_WINDOW_S, EvaluationSettings
 from pipelines.learn.protocols import (
     N_FOLDS,
     PARTITION_S,
@@ -12,6 +11,7 @@ from pipelines.learn.protocols import (
     grouped_samples,
     published_samples,
 )
+from pipelines.learn.settings import PUBLISHED_WINDOW_S, EvaluationSettings
 from terrain.errors import ConfigError, DataError
 from terrain.records import Label, RunLog, Stream
 
