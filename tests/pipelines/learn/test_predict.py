@@ -8,7 +8,7 @@ import pytest
 
 from features.windows import cut_windows
 from pipelines.learn.model_file import read_model
-from pipelines.learn.predict import Settings, filtered_terrains, predict, run
+from pipelines.learn.predict import NOT_LEARNED, Settings, filtered_terrains, predict, run
 from pipelines.learn.settings import RecipeSettings
 from pipelines.learn.train import fitted_model
 from pipelines.live.model import Assessed
@@ -39,6 +39,28 @@ def test_new_runs_of_known_terrain_are_predicted(model, drive_all):
     for row in result.windows:
         assert 1 / 3 <= row.probability <= 1
         assert set(row.target_slip) == set(DRIVE_STATES)
+
+
+@pytest.fixture(scope="module")
+def strange(drive_all):
+    """A run that shakes as no run of the training did."""
+    log = drive_all(n_runs=1, seed=5)[0]
+    imu = log.streams["imu"]
+    values = imu.values * 6.0 + np.random.default_rng(0).normal(0.0, 8.0, imu.values.shape)
+    return RunLog("strange", log.robot, {**log.streams, "imu": Stream(imu.time_s, values, imu.channels)})
+
+
+def test_windows_unlike_all_training_are_unknown_and_take_the_fallback(model, drive_all, strange):
+    table = load_slip_table()
+    found = predict([strange], model, table)
+    assert found.n_unknown == found.n_windows > 5
+    row = found.windows[0]
+    assert (row.terrain, row.slip_entry) == (NOT_LEARNED, table.fallback)
+    assert row.nearest in model.info.classes
+    assert row.novelty > model.novelty.threshold
+    assert row.target_slip == {s: t.slip_ratio for s, t in table.targets[table.fallback].items()}
+    known = predict(drive_all(n_runs=2, seed=77), model, table)
+    assert known.n_unknown < 0.3 * known.n_windows
 
 
 def test_training_runs_among_new_ones_are_named(model, runs, drive):
