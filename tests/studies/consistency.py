@@ -42,21 +42,6 @@ GROUPS = {
 COVERAGE_HEADING = "coverage of slip"
 
 
-class Settings(BaseSettings):
-    """Which runs are simulated and filtered."""
-
-    runs: int = setting(RUNS_A_SCENARIO, "Of each scenario on each terrain.", ge=1)
-    seed: int = setting(0, "Of all runs.", ge=0)
-    robot: str = setting("agrimaro", "Swerve robot.")
-    filter_name: str = setting(FILTER, "Filter.", "--filter")
-    scenarios: tuple[str, ...] = setting(SCENARIOS, "By commas.", separated=True)
-    terrains: tuple[str, ...] = setting(tuple(soil_names()), "By commas.", separated=True)
-    camera_lost_s: float = setting(
-        0.0, "Time in s without a camera, from the middle of each run.", "--camera-lost", ge=0.0
-    )
-    n_jobs: int = setting(0, "Processes at once; 0 for one a core.", "--jobs", ge=0)
-
-
 class TerrainConsistency(NamedTuple):
     """Consistency of a filter on a terrain, means over runs with their 95 % intervals.
 
@@ -73,19 +58,30 @@ class TerrainConsistency(NamedTuple):
     slip_coverage: MeanInterval
 
 
-@dataclass(frozen=True)
-class Consistency(Result):
-    """Consistency of a filter by terrain."""
-
-    seed: int = described("of all runs")
-    filter: str = described("that was examined")
-    consistency: tuple[TerrainConsistency, ...] = described("NEES by group of states and coverage of slip")
-
-
-def run(settings: Settings, progress: Progress = silent) -> Consistency:
+def consistency_by_terrain(
+    robot: Robot,
+    seed: int,
+    runs: int = RUNS_A_SCENARIO,
+    filter_name: str = FILTER,
+    progress: Progress = silent,
+    n_jobs: int = 0,
+    terrains: Sequence[str] = soil_names(),
+    scenarios: Sequence[str] = SCENARIOS,
+    lost_s: float = 0.0,
+) -> tuple[TerrainConsistency, ...]:
     """Simulate and filter runs of some scenarios on each terrain, and compare errors with their variance.
 
-    The seed decides everything that is drawn: soil, slope, load, tyres, driving and noise of each run.
+    Parameters
+    ----------
+    robot : swerve robot
+    seed : of everything that is drawn: soil, slope, load, tyres, driving and noise of each run
+    runs : of each scenario on each terrain
+    filter_name : one of :data:`terrain.estimation.estimate.FILTERS`
+    progress : of the runs
+    n_jobs : processes at once; 0 for one a core
+    terrains : names of soils
+    scenarios : names of scenarios
+    lost_s : for so long from the middle of each run there is no camera, and coverage is that of this time
 
     Raises
     ------
@@ -94,25 +90,19 @@ def run(settings: Settings, progress: Progress = silent) -> Consistency:
     """
     from joblib import Parallel, delayed
 
-    robot, seed, name, lost_s = (
-        load_robot(settings.robot),
-        settings.seed,
-        settings.filter_name,
-        settings.camera_lost_s,
-    )
     jobs = [
         (terrain, scenario, number)
-        for terrain in settings.terrains
-        for scenario in settings.scenarios
-        for number in range(1, settings.runs + 1)
+        for terrain in terrains
+        for scenario in scenarios
+        for number in range(1, runs + 1)
     ]
-    pool = Parallel(n_jobs=settings.n_jobs or os.cpu_count() or 1, return_as="generator")
-    found: dict[str, list[dict[str, float]]] = {terrain: [] for terrain in settings.terrains}
-    work = pool(delayed(_run_figures)(robot, *job, seed, name, lost_s) for job in jobs)
+    pool = Parallel(n_jobs=n_jobs or os.cpu_count() or 1, return_as="generator")
+    found: dict[str, list[dict[str, float]]] = {terrain: [] for terrain in terrains}
+    work = pool(delayed(_run_figures)(robot, *job, seed, filter_name, lost_s) for job in jobs)
     for done, ((terrain, _, _), figures) in enumerate(zip(jobs, work, strict=True), 1):
         found[terrain].append(figures)
         progress("consistency", done, len(jobs))
-    return Consistency(seed, name, tuple(_terrain_row(terrain, rows) for terrain, rows in found.items()))
+    return tuple(_terrain_row(terrain, rows) for terrain, rows in found.items())
 
 
 def _run_figures(
@@ -133,6 +123,39 @@ def _terrain_row(terrain: str, rows: Sequence[dict[str, float]]) -> TerrainConsi
     means = {key: mean_interval([row[key] for row in rows]) for key in rows[0]}
     coverage = means.pop(COVERAGE_HEADING)
     return TerrainConsistency(terrain, len(rows), means, coverage)
+
+
+class Settings(BaseSettings):
+    """Which runs are simulated and filtered."""
+
+    runs: int = setting(RUNS_A_SCENARIO, "Of each scenario on each terrain.", ge=1)
+    seed: int = setting(0, "Of all runs.", ge=0)
+    robot: str = setting("agrimaro", "Swerve robot.")
+    filter_name: str = setting(FILTER, "Filter.", "--filter")
+    scenarios: tuple[str, ...] = setting(SCENARIOS, "By commas.", separated=True)
+    terrains: tuple[str, ...] = setting(tuple(soil_names()), "By commas.", separated=True)
+    camera_lost_s: float = setting(
+        0.0, "Time in s without a camera, from the middle of each run.", "--camera-lost", ge=0.0
+    )
+    n_jobs: int = setting(0, "Processes at once; 0 for one a core.", "--jobs", ge=0)
+
+
+@dataclass(frozen=True)
+class Consistency(Result):
+    """Consistency of a filter by terrain."""
+
+    seed: int = described("of all runs")
+    filter: str = described("that was examined")
+    consistency: tuple[TerrainConsistency, ...] = described("NEES by group of states and coverage of slip")
+
+
+def run(settings: Settings, progress: Progress = silent) -> Consistency:
+    """Simulate and filter runs of some scenarios on each terrain, and compare errors with their variance."""
+    rows = consistency_by_terrain(
+        *(load_robot(settings.robot), settings.seed, settings.runs, settings.filter_name, progress),
+        *(settings.n_jobs, settings.terrains, settings.scenarios, settings.camera_lost_s),
+    )
+    return Consistency(settings.seed, settings.filter_name, rows)
 
 
 def report(result: Consistency) -> Report:

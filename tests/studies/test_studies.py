@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from pipelines.report import Report, Result
-from studies import consistency, figures, labels, long_drives, mutants, scale, slip_peaks, trials
+from studies import figures, labels, long_drives, mutants, scale, slip_peaks, trials
 from studies.__main__ import STUDIES, main
 from terrain.discrepancy.trials.rows import Row
 from terrain.errors import ConfigError, DataError
@@ -134,22 +134,6 @@ def test_nothing_learned_is_no_coverage():
     low, high = slip_peaks.clopper_pearson(0, 5)
     assert (low, high) == (0.0, pytest.approx(1 - 0.025 ** (1 / 5)))
     assert slip_peaks.clopper_pearson(5, 5)[0] == pytest.approx(0.025 ** (1 / 5))
-
-
-@pytest.mark.slow
-def test_consistency_is_of_its_seed_alone():
-    options = {"seed": 41, "runs": 1, "terrains": "tiles,tilled_loam"}
-    found = consistency.run(consistency.Settings(n_jobs=1, **options))
-    again = consistency.run(consistency.Settings(n_jobs=2, **options))
-    assert found.as_json() == again.as_json()
-    assert [row.terrain for row in found.consistency] == ["tiles", "tilled_loam"]
-    for row in found.consistency:
-        assert list(row.nees) == list(consistency.GROUPS)
-        for value in (*row.nees.values(), row.slip_coverage):
-            assert value.ci[0] < value.mean < value.ci[1]
-        assert 0.3 < row.slip_coverage.mean <= 1.0
-    (other,) = consistency.run(consistency.Settings(seed=42, runs=1, terrains="tiles", n_jobs=1)).consistency
-    assert other.nees["slip_speed"].mean != found.consistency[0].nees["slip_speed"].mean
 
 
 @pytest.mark.slow
