@@ -10,20 +10,11 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from pipelines.drive.controller_names import (
-    ADAPTING,
-    BASELINES,
-    THESIS_ADAPTING,
-    TRACK,
-    USING_CLASSIFIER,
-    base_name,
-)
+from pipelines.drive.controller_names import KINDS, TRACK, Source, kind_of, uses_classifier
 from pipelines.drive.controllers import (
     DEFAULT_RAMP_MPS2,
     Controller,
     DriveInputs,
-    Source,
-    controller_text,
     drive_once,
     make_controller,
     train_classifier,
@@ -313,7 +304,7 @@ def _drive_one(settings: Settings, inputs: DriveInputs, controller: Controller, 
     situation = _situation(settings, inputs, seed)
     log = drive_once(inputs, controller, situation)
     history = drive_history(log, inputs.simulated, situation.conditions.radius_factors)
-    adapting_to = controller.table if controller.adapts else None
+    adapting_to = controller.table if _adapts(controller.name) else None
     metrics = evaluate_drive(log, history, inputs.simulated, situation, adapting_to)
     if settings.scenario == SLOPE:
         metrics["steepest_deg"] = steepest(settings, inputs, controller, seed)
@@ -363,7 +354,7 @@ def report(result: DriveResult) -> Report:
     n = len(result.seeds)
     details = (
         Section("Who differs, and by how much", list(_difference_parts(result, pairs, shown))),
-        Section("Controllers", [Pairs([(name, controller_text(name, result.ramp_mps2)) for name in names])]),
+        Section("Controllers", [Pairs([(name, _text(name, result.ramp_mps2)) for name in names])]),
         Section("All figures", list(_metric_parts(result, shown))),
         Section("The first seed, run by run", list(_run_parts(result))),
         Section("The curves behind the targets", list(_curve_parts(result.slip_table))),
@@ -414,7 +405,7 @@ def is_hardly_believed(result: DriveResult, name: str) -> bool:
     What such a controller shows is not the classifier's effect.
     """
     believed = result.controllers[name].get("believed_ratio", _UNKNOWN).mean
-    return base_name(name) in USING_CLASSIFIER and believed is not None and believed < HARDLY_BELIEVED_RATIO
+    return uses_classifier(name) and believed is not None and believed < HARDLY_BELIEVED_RATIO
 
 
 def belief_notes(result: DriveResult) -> tuple[str, ...]:
@@ -473,7 +464,15 @@ def verdict(result: DriveResult, pairs: Sequence[tuple[str, str]], shown: Sequen
 
 
 def _adapts(name: str) -> bool:
-    return base_name(name) in ADAPTING
+    kind = kind_of(name)
+    return kind is not None and kind.adapts
+
+
+def _text(name: str, ramp_mps2: float | None) -> str:
+    """Return a sentence on a controller."""
+    kind = kind_of(name)
+    text = "" if kind is None else kind.text.replace("{ramp}", format_value(ramp_mps2, unit="m/s²"))
+    return f"{text} With path tracking." if TRACK in name else text
 
 
 def _terrain_name(result: DriveResult) -> str:
@@ -484,11 +483,15 @@ def _terrain_name(result: DriveResult) -> str:
 
 def _pairs(names: Sequence[str]) -> list[tuple[str, str]]:
     """Return the pairs to compare: all with plain, traction control with ramp and fallback, PID with PID."""
-    traction = [name for name in names if base_name(name) not in (*BASELINES, *THESIS_ADAPTING)]
+    pilots = {name: kind.pilot for name in names if (kind := kind_of(name)) is not None}
+    traction = [name for name in names if pilots.get(name) == "traction"]
+    thesis = [name for name in names if pilots.get(name) == "thesis"]
     pairs = [(name, "plain") for name in names if name != "plain" and "plain" in names]
     pairs += [(name, "ramp") for name in traction if "ramp" in names]
-    pairs += [(name, "fallback") for name in traction if name in ADAPTING and "fallback" in names]
-    pairs += [(name, "thesis") for name in names if name in THESIS_ADAPTING and "thesis" in names]
+    pairs += [
+        (name, "fallback") for name in traction if name in KINDS and _adapts(name) and "fallback" in names
+    ]
+    pairs += [(name, "thesis") for name in thesis if name in KINDS and _adapts(name) and "thesis" in names]
     if not pairs and len(names) > 1:
         pairs = [(name, names[0]) for name in names[1:]]
     return pairs

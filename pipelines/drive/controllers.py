@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from enum import Enum
 
-from pipelines.drive.controller_names import BASELINES, CONTROLLERS, THESIS_ADAPTING, TRACK
+from pipelines.drive.controller_names import KINDS, TRACK, Source, kind_of
 from pipelines.learn.model_file import TerrainModel
 from pipelines.live.pilot import LivePilot
 from pipelines.live.pilot_settings import PilotSettings
 from pipelines.live.terrain_source import Classifier, KnownTerrain, NoTerrain, TerrainSource
-from pipelines.report import Progress, format_value, silent
+from pipelines.report import Progress, silent
 from terrain.control.situations import Situation
 from terrain.control.slip_table import SlipTable
 from terrain.errors import ConfigError
@@ -20,35 +19,6 @@ from terrain.robots import Robot
 from terrain.simulation.dynamic.simulate import simulate
 
 DEFAULT_RAMP_MPS2 = PilotSettings().ramp_mps2
-
-
-_TEXTS = {
-    "plain": "The wheel speeds of the kinematics; slip is not used.",
-    "ramp": "As plain, with a speed that rises by no more than {ramp}.",
-    "thesis": "The thesis' PID of slip on each wheel, with the target of the table's fallback.",
-    "thesis:classified": "The thesis' PID of slip on each wheel, with the targets of the terrain that a "
-    "classifier recognises while driving: the chain of the thesis.",
-    "thesis:true_terrain": "The thesis' PID of slip on each wheel, with the targets of the true terrain.",
-    "fallback": "Traction control: one speed for all wheels, limited while it rises; the target is that of "
-    "the table's fallback.",
-    "classified": "Traction control with the target of the terrain that a classifier recognises while "
-    "driving.",
-    "true_terrain": "Traction control with the target of the true terrain: the limit for a classifier "
-    "without error.",
-}
-"""What each controller does."""
-
-
-class Source(Enum):
-    """Where a controller has the current terrain from."""
-
-    NONE = "none"
-    CLASSIFIER = "classifier"
-    TRUTH = "truth"
-    KNOWN = "known"
-
-
-_SOURCES = {"fallback": Source.NONE, "classified": Source.CLASSIFIER, "true_terrain": Source.TRUTH}
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,11 +39,6 @@ class Controller:
     table: SlipTable
     source: Source = Source.NONE
     known_terrain: str = ""
-
-    @property
-    def adapts(self) -> bool:
-        """Whether its target follows the terrain."""
-        return self.source in (Source.CLASSIFIER, Source.TRUTH)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -109,47 +74,18 @@ def make_controller(
     ConfigError
         if there is none of that name, or its terrain or target is none.
     """
-    bare, track, rest = name.partition(TRACK)
-    if track and not rest:
-        controller = make_controller(bare, table, delay_s, ramp_mps2)
-        return replace(controller, name=name, pilot=replace(controller.pilot, track=True))
-    kind, _, given = name.partition(":")
-    traction = PilotSettings(delay_s=delay_s)
-    if name in BASELINES:
-        return Controller(name, replace(traction, controller=name, ramp_mps2=ramp_mps2), table)
-    if name in _SOURCES:
-        return Controller(name, traction, table, _SOURCES[name])
-    if name in THESIS_ADAPTING:
-        return Controller(name, replace(traction, controller=kind), table, _SOURCES[given])
-    if kind == "known" and given:
-        if given not in table.targets:
-            raise ConfigError(f"controller {name!r}: the table {table.name} has no entry {given!r}")
-        return Controller(name, traction, table, Source.KNOWN, given)
-    if kind == "target":
-        return Controller(name, traction, _single_target(table, name, given))
-    raise ConfigError(
-        f"controller {name!r} is unknown: use {', '.join((*CONTROLLERS, *THESIS_ADAPTING))}, known:NAME, "
-        f"target:SLIP; {TRACK}"
-    )
-
-
-def controller_text(name: str, ramp_mps2: float | None) -> str:
-    """Return a sentence on a controller.
-
-    Parameters
-    ----------
-    name : of :func:`make_controller`
-    ramp_mps2 : of ``ramp``; None where it is not driven
-    """
-    bare, track, _ = name.partition(TRACK)
-    if track:
-        return f"{controller_text(bare, ramp_mps2)} With path tracking."
-    kind, _, given = name.partition(":")
-    if kind == "known" and given:
-        return f"Traction control with the target of {given} on every terrain."
-    if kind == "target" and given:
-        return f"Traction control with a target slip of {given}."
-    return _TEXTS[name].format(ramp=format_value(ramp_mps2, unit="m/s²"))
+    kind, (bare, track, rest) = kind_of(name), name.partition(TRACK)
+    if kind is None or rest:
+        raise ConfigError(
+            f"controller {name!r} is unknown: use {', '.join(KINDS)}, known:NAME, target:SLIP; {TRACK}"
+        )
+    pilot = PilotSettings(controller=kind.pilot, delay_s=delay_s, ramp_mps2=ramp_mps2, track=bool(track))
+    given = bare.partition(":")[2]
+    if kind.source is Source.KNOWN and given not in table.targets:
+        raise ConfigError(f"controller {name!r}: the table {table.name} has no entry {given!r}")
+    if bare.startswith("target:"):
+        table = _single_target(table, name, given)
+    return Controller(name, pilot, table, kind.source, given if kind.source is Source.KNOWN else "")
 
 
 def _single_target(table: SlipTable, name: str, slip: str) -> SlipTable:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 
 from pydantic import field_validator, model_validator
 
-from pipelines.drive.controller_names import CONTROLLERS, USING_CLASSIFIER, base_name
+from pipelines.drive.controller_names import CONTROLLERS, KINDS, uses_classifier
 from pipelines.report.settings import Settings as BaseSettings
 from pipelines.report.settings import option_name, setting
 
@@ -124,14 +124,14 @@ class ComparisonSettings(BaseSettings):
         if self.scenario == "slope" and self.grade_deg:
             raise ValueError("scenario 'slope' searches for the steepest grade itself: leave the grade out")
         if self.model is not None and not self.needs_model:
-            names = " and ".join(map(repr, USING_CLASSIFIER))
+            names = " and ".join(repr(name) for name in KINDS if uses_classifier(name))
             raise ValueError(f"--model is the classifier of {names}, which are not among the controllers")
         return self
 
     @property
     def needs_model(self) -> bool:
         """Whether a controller uses a classifier."""
-        return any(base_name(name) in USING_CLASSIFIER for name in self.controllers)
+        return any(map(uses_classifier, self.controllers))
 
 
 class FaultSettings(BaseSettings):
