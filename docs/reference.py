@@ -62,8 +62,9 @@ def _options(command: click.Command) -> str:
 
 def _results(module: ModuleType) -> list[type[Result]]:
     """Return the kinds of result that a module has, and those of the room's modules that it dispatches to."""
-    own = [kind for _, kind in inspect.getmembers(module, inspect.isclass) if issubclass(kind, Result)]
-    return [kind for kind in own if kind is not Result]
+    modules = [module, *map(import_module, getattr(module, "RESULTS", ()))]
+    own = [kind for each in modules for _, kind in inspect.getmembers(each, inspect.isclass)]
+    return [kind for kind in dict.fromkeys(own) if issubclass(kind, Result) and kind is not Result]
 
 
 def _fields(kind: type[Result]) -> str:

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from pipelines.report import Progress, Result
 
 EXAMPLE = "terrain drive --scenario starts --terrain grass --table table.yaml --out drives/"
+RESULTS = ("pipelines.drive.comparison", "pipelines.drive.faults", "pipelines.drive.path")
+"""Modules of the kinds of drive, with their results."""
 
 PAGE_FILE = "report.html"
 SITUATIONS = ("start", "stop", "steady")
@@ -254,8 +256,9 @@ def run(settings: Settings, progress: Progress) -> Result:
 
     if settings.out is not None:
         ensure_writable(settings.out)
-    mode = "path" if settings.path is not None else "faults" if settings.faults else "comparison"
-    result: Result = import_module(f"pipelines.drive.{mode}").run(settings, progress)
+    comparison, faults, path = RESULTS
+    mode = path if settings.path is not None else faults if settings.faults else comparison
+    result: Result = import_module(mode).run(settings, progress)
     if settings.out is not None:
         result.report.save(settings.out / PAGE_FILE)
     return result
