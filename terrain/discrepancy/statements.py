@@ -31,7 +31,7 @@ ACTS_RATIO = 0.25
 """Least part of the change of a channel by all causes, root mean square, that one of them makes to be named
 with it."""
 
-KEPT_ASIDE, COMPARED = "on runs kept aside", "on the runs compared"
+HELD_OUT, COMPARED = "on held-out runs", "on the runs compared"
 
 
 SESSION_COLUMNS = ("value", "terrain", "session", "runs", "95 % interval", "sessions of the terrain")
@@ -97,7 +97,7 @@ def statements_of(
     for channel in channels_of(used):
         if gain is not None and channel in gain.channels:
             before, after = gain.channels[channel].rms_before, gain.channels[channel].rms_after
-            where = KEPT_ASIDE
+            where = HELD_OUT
         else:
             before, where = rms_of(used, channel, False), COMPARED
             after = rms_of(used, channel, True) if extended else math.nan

@@ -118,14 +118,14 @@ def test_a_level_is_no_factor_and_what_agrees_has_neither():
     assert math.isnan(found.level)
 
 
-def test_a_channel_states_factor_cause_in_the_robots_quantities_and_its_error_on_runs_kept_aside():
+def test_a_channel_states_factor_cause_in_the_robots_quantities_and_its_error_on_held_out_runs():
     change = ChannelGain(0.746, 0.148, 3.0, 1.0, Reduction(0.96, 0.94, 0.97))
     gain = Gain(("a",), (), "runs", {YAW: change}, Reduction(0.5, 0.4, 0.6))
     runs = [a_run(seed, 0.4, after=0.4) for seed in range(8)]
     text = sentence(runs, gain, causes=(TRACK,))
     assert text == (
         "yaw rate (gyro): the simulation turns 2.5 times too fast; with an effective track of 1.43 m "
-        "(described: 0.571 m) its error falls from 0.75 to 0.15 rad/s on runs kept aside."
+        "(described: 0.571 m) its error falls from 0.75 to 0.15 rad/s on held-out runs."
     )
     assert "from 0.43 to 0.02 rad/s on the runs compared" in sentence(runs, causes=(TRACK,))
 
