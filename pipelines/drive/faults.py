@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -37,6 +37,7 @@ from pipelines.report import (
     Table,
     Text,
     described,
+    plural,
     silent,
 )
 from pipelines.report.versions import versions
@@ -362,61 +363,92 @@ def duration_text(duration_s: float) -> str:
 def report(result: FaultsResult) -> Report:
     """Return how many drives meet all bars, the bars and faults that are not met, and behind it every drive."""
     n, n_rows = len(result.seeds), len(result.rows)
-    places = dict.fromkeys(f"{one.situation} on {one.terrain}" for one in result.clean)
-    unmet = {name: rows for name, rows in _by_fault(result).items() if any(row.unmet for row in rows)}
+    places = list(dict.fromkeys((one.situation, one.terrain) for one in result.clean))
+    headings = [f"{situation} on {terrain}" for situation, terrain in places]
+    by_fault: dict[str, list[FaultRow]] = defaultdict(list)
+    for row in result.rows:
+        by_fault[row.case.fault].append(row)
+    n_unmet = {name: sum(len(row.unmet) for row in rows) for name, rows in by_fault.items()}
+    worst = sorted((name for name in n_unmet if n_unmet[name]), key=lambda name: -n_unmet[name])
     answer = f"{result.n_met} of {n_rows} drives with a sensor fault meet all bars"
-    if unmet:
-        worst = sorted(unmet, key=lambda name: -sum(len(row.unmet) for row in unmet[name]))
+    if worst:
         more = f" and {len(worst) - SHOWN_FAULTS} more" if len(worst) > SHOWN_FAULTS else ""
         answer += f"; not met with {', '.join(worst[:SHOWN_FAULTS])}{more}"
     bars = [
         (SHORT_BARS[name], bar.n_met, bar.n_unmet, bar.n_not_judged, bar.text)
         for name, bar in result.bars.items()
     ]
+    overview = []
+    for name, rows in by_fault.items():
+        at = [[row for row in rows if (row.case.situation, row.case.terrain) == place] for place in places]
+        overview.append((name, result.abouts[name], rows[0].nature, *map(bars_text, at), _named(rows)))
+    clean = [
+        (
+            *(f"{one.situation} on {one.terrain}", one.seed, one.slip_error_ratio, one.not_ok_s),
+            *(one.slip_peak_ratio, one.plain_slip_peak_ratio, one.stop_m, one.plain_stop_m),
+        )
+        for one in result.clean
+    ]
+    drives = [
+        (
+            *(row.case.fault, f"{row.case.situation} on {row.case.terrain}", row.case.seed),
+            duration_text(row.case.duration_s),
+            *(getattr(row.figures, name) for name in FIGURES),
+            *(_short(row.unmet) or MET, _named([row])),
+        )
+        for row in result.rows
+    ]
+    sections: dict[str, list[Part]] = {
+        "Bars met and not met, by fault": [
+            Table(
+                ("fault", Column("what it does", long=True), "nature", *headings, "sensors named"),
+                overview,
+                note="Bars that are not met, over durations and seeds; in brackets how many of the drives, where "
+                "it is not all. Faults are dead (the stream carries no information), lying (a wrong one), "
+                "tolerable (it still carries the motion: the controller has to go on) or degraded (it may do "
+                "either).",
+            )
+        ],
+        "Without a fault": [
+            Table(
+                (
+                    *("", "seed", "error of slip", Column("not OK", unit="s"), "peak of slip", "plain's"),
+                    *(Column("stop", unit="m"), Column("plain's", unit="m")),
+                ),
+                clean,
+                note="All figures count from when a fault would begin.",
+            )
+        ],
+        "Some drives": [*result.drawn[1:]],
+        "All drives": [
+            Table(
+                ("fault", "situation", "seed", "for", *FIGURES.values(), "bars unmet", "sensors named"),
+                drives,
+            )
+        ],
+        "Where these numbers come from": [
+            Text(
+                "Robot and terrain are models. A fault changes what arrives at the controller; the sensors and "
+                "the motion are those of the drive without it, until the commands differ."
+            ),
+            Pairs(
+                [
+                    ("seeds", ", ".join(map(str, result.seeds))),
+                    ("versions", ", ".join(f"{name} {number}" for name, number in versions().items())),
+                ]
+            ),
+        ],
+    }
     return Report(
         title=f"{result.robot}: sensor faults in the closed loop",
         answer=f"{answer}.",
         lead=(
-            f"{len(result.abouts)} fault{'s' * (len(result.abouts) != 1)} · {' · '.join(places)} · "
-            f"{n} seed{'s' * (n != 1)} · delay {1000 * result.delay_s:g} ms · table {result.table}"
+            f"{plural(len(result.abouts), 'fault')} · {' · '.join(headings)} · {plural(n, 'seed')} · "
+            f"delay {1000 * result.delay_s:g} ms · table {result.table}"
         ),
         picture=result.drawn[0] if result.drawn else None,
         parts=[Table(("bar", "met", "unmet", "not judged", Column("what it asks for", long=True)), bars)],
-        details=[
-            Section("Bars met and not met, by fault", list(_overview(result))),
-            Section("Without a fault", list(_clean(result))),
-            *([Section("Some drives", result.drawn[1:])] if result.drawn[1:] else []),
-            Section("All drives", list(_all_drives(result))),
-            Section("Where these numbers come from", list(_provenance(result))),
-        ],
-    )
-
-
-def _by_fault(result: FaultsResult) -> dict[str, list[FaultRow]]:
-    by_fault: dict[str, list[FaultRow]] = defaultdict(list)
-    for row in result.rows:
-        by_fault[row.case.fault].append(row)
-    return by_fault
-
-
-def _overview(result: FaultsResult) -> Iterator[Part]:
-    """Yield a row a fault, over durations and seeds."""
-    places = list(dict.fromkeys((one.situation, one.terrain) for one in result.clean))
-    rows = []
-    for name, own in _by_fault(result).items():
-        cells = [
-            bars_text([row for row in own if (row.case.situation, row.case.terrain) == at]) for at in places
-        ]
-        rows.append((name, result.abouts[name], own[0].nature, *cells, _named(own)))
-    headings = (f"{situation} on {terrain}" for situation, terrain in places)
-    yield Table(
-        ("fault", Column("what it does", long=True), "nature", *headings, "sensors named"),
-        rows,
-        note=(
-            "Bars that are not met, over durations and seeds; in brackets how many of the drives, where it is not "
-            "all. Faults are dead (the stream carries no information), lying (a wrong one), tolerable (it still "
-            "carries the motion: the controller has to go on) or degraded (it may do either)."
-        ),
+        details=[Section(title, parts) for title, parts in sections.items() if parts],
     )
 
 
@@ -443,48 +475,3 @@ def _named(rows: Sequence[FaultRow]) -> str:
     for sensor in sorted(named):
         together[", ".join(sorted(named[sensor]))].append(sensor)
     return "; ".join(f"{', '.join(sensors)}: {statuses}" for statuses, sensors in together.items())
-
-
-def _clean(result: FaultsResult) -> Iterator[Part]:
-    rows = [
-        (
-            *(f"{one.situation} on {one.terrain}", one.seed, one.slip_error_ratio, one.not_ok_s),
-            *(one.slip_peak_ratio, one.plain_slip_peak_ratio, one.stop_m, one.plain_stop_m),
-        )
-        for one in result.clean
-    ]
-    columns = (
-        *("", "seed", "error of slip", Column("not OK", unit="s"), "peak of slip", "plain's"),
-        *(Column("stop", unit="m"), Column("plain's", unit="m")),
-    )
-    yield Table(columns, rows, note="All figures count from when a fault would begin.")
-
-
-def _all_drives(result: FaultsResult) -> Iterator[Part]:
-    rows = [
-        (
-            row.case.fault,
-            f"{row.case.situation} on {row.case.terrain}",
-            row.case.seed,
-            duration_text(row.case.duration_s),
-            *(getattr(row.figures, name) for name in FIGURES),
-            _short(row.unmet) or MET,
-            _named([row]),
-        )
-        for row in result.rows
-    ]
-    columns = ("fault", "situation", "seed", "for", *FIGURES.values(), "bars unmet", "sensors named")
-    yield Table(columns, rows)
-
-
-def _provenance(result: FaultsResult) -> Iterator[Part]:
-    yield Text(
-        "Robot and terrain are models. A fault changes what arrives at the controller; the sensors and the motion "
-        "are those of the drive without it, until the commands differ."
-    )
-    yield Pairs(
-        [
-            ("seeds", ", ".join(map(str, result.seeds))),
-            ("versions", ", ".join(f"{name} {number}" for name, number in versions().items())),
-        ]
-    )
