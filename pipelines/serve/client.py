@@ -21,7 +21,7 @@ from typing import Any, Self
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus, InvalidURI
 from websockets.sync.client import ClientConnection, connect
 
-from pipelines.serve.wire import decode, encode, plain
+from pipelines.serve.wire import WireError, decode, encode, plain
 from terrain.errors import TerrainError
 
 MAX_ERRORS = 100
@@ -30,12 +30,8 @@ TIMEOUT_S = 10.0
 """For the connection, and for a step that is waited for."""
 
 
-class ServiceError(TerrainError):
-    """The service refused something; ``code`` is one of :data:`pipelines.serve.wire.CODES`."""
-
-    def __init__(self, code: str, sentence: str) -> None:
-        super().__init__(sentence)
-        self.code = code
+class ServiceError(WireError):
+    """The service refused something, or cannot be reached: a code for programs, and a sentence."""
 
 
 class TerrainClient:

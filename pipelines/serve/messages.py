@@ -158,13 +158,10 @@ def step_content(output: StepOutput) -> dict[str, Any]:
 
 def observation_content(seen: Observation) -> dict[str, Any]:
     """Return what is known of the robot."""
-    window = seen.window
-    return {
-        "terrain": seen.terrain or None,
-        "probability": seen.probability,
-        "window": None
-        if window is None
-        else {
+    window, content = seen.window, seen._asdict()
+    target = content.pop("target")
+    if window is not None:
+        content["window"] = {
             "start_s": window.start_s,
             "end_s": window.end_s,
             "terrain": window.terrain or None,
@@ -173,25 +170,15 @@ def observation_content(seen: Observation) -> dict[str, Any]:
             "nearest": window.nearest or None,
             "novelty": window.novelty,
             "supported": window.supported,
-        },
+        }
+    return content | {
+        "terrain": seen.terrain or None,
         "target_slip": {
-            state: {
-                "slip_ratio": target.slip_ratio,
-                "slip_std": target.slip_std,
-                "status": str(target.status),
-            }
-            for state, target in seen.target.items()
+            state: {"slip_ratio": one.slip_ratio, "slip_std": one.slip_std, "status": str(one.status)}
+            for state, one in target.items()
         },
-        "target_of": next(iter(seen.target.values())).terrain,
-        "slip_ratio": seen.slip_ratio,
-        "slip_std": seen.slip_std,
-        "wheel_speed_mps": seen.wheel_speed_mps,
-        "current_a": seen.current_a,
-        "speed_x_mps": seen.speed_x_mps,
-        "speed_y_mps": seen.speed_y_mps,
-        "yaw_rate_radps": seen.yaw_rate_radps,
+        "target_of": next(iter(target.values())).terrain,
         "sensors": dict(seen.sensors),
-        "served": seen.served,
     }
 
 

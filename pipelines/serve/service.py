@@ -127,6 +127,7 @@ class Service:
             ),
             log_level="critical",
             access_log=False,
+            loop="asyncio",
             lifespan="on",
             http="h11",
             ws="websockets-sansio",
