@@ -15,6 +15,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from websockets.asyncio.client import connect
+from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from pipelines.serve import connection, guard
 from pipelines.serve.client import ServiceError, TerrainClient
@@ -181,17 +182,38 @@ def test_what_is_over_a_budget_is_named_and_the_rest_is_taken(
             assert len(decoded) < 95, "what is dropped is not decoded"
 
 
-def test_before_its_token_nothing_of_a_client_is_decoded(guarded, hello, decoded):
+@pytest.mark.parametrize("place", ["/robots", "/watch"])
+def test_before_its_token_nothing_of_a_client_is_decoded_and_wrong_tokens_wait_and_are_counted(
+    guarded, hello, decoded, place
+):
     wrong = '{"type": "samples", "streams": {"imu": [' + "0.123," * 40_000
-    for first in (wrong, json.dumps(hello("x")), b"\x80", TOKEN.encode()):
-        with guarded.socket() as stranger:
-            assert ask(stranger, first)["code"] == "token"
+    for first in (wrong, json.dumps(hello("x")), "", TOKEN[:-1], TOKEN + TOKEN, TOKEN.encode()):
+        begun_s = time.monotonic()
+        with guarded.socket(place) as stranger:
+            answer = ask(stranger, first)
+            assert (answer["code"], answer["fatal"]) == ("token", True)
+            assert time.monotonic() - begun_s > 0.19
+            with pytest.raises(ConnectionClosed):
+                stranger.recv(10)
+    another = {"Authorization": "Bearer another"}
+    with pytest.raises(InvalidStatus, match="401"):
+        guarded.socket(place, additional_headers=another)
+    for headers, method in ((BEARER, "GET"), ({}, "GET"), (another, "GET"), (another, "PUT")):
+        status, text = guarded.get("/model", method, b"{}" if method == "PUT" else None, headers)
+        assert (status == 401) == ("a token is required" in text) == (headers is not BEARER)
     assert decoded == []
-    assert "terrain_wrong_tokens_total 4.0" in guarded.get("/metrics", headers=BEARER)[1]
+    assert "terrain_wrong_tokens_total 10.0" in guarded.get("/metrics", headers=BEARER)[1]
+
+
+def test_a_token_comes_in_the_header_or_as_the_first_frame(guarded, hello):
+    with guarded.socket() as robot:
+        robot.send(TOKEN)
+        assert ask(robot, hello("by-frame"))["type"] == "welcome"
+    with TerrainClient(guarded.ws, "by-header", "mower", CHANNELS, token=TOKEN) as robot:
+        assert robot.welcome["session"] == "by-header"
     with pytest.raises(ServiceError, match="a token is required"):
-        TerrainClient(guarded.ws, "x", "mower", {"imu": ["accel_z_mps2"]}, token="another")
-    with TerrainClient(guarded.ws, "x", "mower", CHANNELS, token=TOKEN) as robot:
-        assert robot.welcome["session"] == "x"
+        TerrainClient(guarded.ws, "x", "mower", CHANNELS, token="another")
+    assert guarded.get("/health")[0] == 200
 
 
 def test_before_its_hello_a_client_is_answered_once_at_a_time_and_large_messages_are_not_decoded(
