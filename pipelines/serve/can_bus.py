@@ -345,9 +345,11 @@ def _pilot(settings: Settings, robot: Any) -> MakeStep:
     if settings.model is not None:
         from pipelines.learn.load import load_model
         from pipelines.live.classifying import ClassifierThread
+        from pipelines.live.over_time import filtered
         from pipelines.live.terrain_source import Classifier
 
-        source = Classifier(load_model(settings.model), robot, ClassifierThread().robot())
+        model = filtered(load_model(settings.model), settings.filter_stride_s)
+        source = Classifier(model, robot, ClassifierThread().robot())
     pilot_settings = PilotSettings(controller=settings.controller)
 
     def make(steer_rad: Array) -> Step:

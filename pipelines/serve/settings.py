@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Self
 
-from pydantic import field_validator
+from pydantic import field_validator, model_validator
 
 from pipelines.data.settings import ReadSettings
 from pipelines.report.settings import Settings as BaseSettings
-from pipelines.report.settings import setting
+from pipelines.report.settings import option_name, setting
 
 AS_FAST_AS_IT_GOES = "max"
 
@@ -91,3 +91,19 @@ class ReplaySettings(ReadSettings):
 
 class Settings(ReplaySettings, CanSettings, ServiceSettings, ServedSettings):
     """Settings of ``terrain serve``."""
+
+    @model_validator(mode="after")
+    def _check_mode(self) -> Self:
+        """Refuse options of another mode than the one that is asked for."""
+        modes: dict[str, type[BaseSettings]] = {"--can": CanSettings, "--replay": ReplaySettings}
+        asked = [option for option in modes if getattr(self, option.removeprefix("--")) is not None]
+        if len(asked) > 1:
+            raise ValueError(f"{' and '.join(asked)} are two modes: one of them is accepted")
+        mode = asked[0] if asked else "the WebSocket service"
+        for name, group in (modes | {"the WebSocket service": ServiceSettings}).items():
+            for field, about in group.model_fields.items():
+                if name != mode and getattr(self, field) != about.get_default():
+                    raise ValueError(
+                        f"{option_name(type(self), field)} is an option of {name}, not of {mode}"
+                    )
+        return self

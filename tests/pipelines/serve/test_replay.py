@@ -43,7 +43,7 @@ def replayed(run, model, stop_at_s=np.inf, **settings):
     result = replay_run(
         run,
         chain_of(run, model, TABLE),
-        Settings(**settings),
+        Settings(replay="a log", **settings),
         () if model is None else model.info.classes,
         lambda task, done, total: moments.append((perf_counter(), done)),
         stopped=lambda: bool(moments) and moments[-1][1] >= stop_at_s,
@@ -129,7 +129,7 @@ def test_the_speed_is_that_of_the_clock(runs, husky_model):
 @pytest.mark.parametrize("speed", ["0", "-1", "inf", "nan", "fast", ""])
 def test_a_speed_that_is_none_is_refused(speed):
     with pytest.raises(ConfigError, match="--speed is"):
-        Settings(speed=speed)
+        Settings(replay="a log", speed=speed)
 
 
 def test_a_request_to_end_gives_what_was_found(runs, husky_model):

@@ -13,7 +13,7 @@ import pytest
 from pipelines.serve.serve import Settings, run
 from pipelines.serve.service import prepare
 from terrain.control.slip_table import load_slip_table, write_slip_table
-from terrain.errors import TerrainError
+from terrain.errors import ConfigError, TerrainError
 
 CLI = "from pipelines.cli.main import main; main()"
 TOKEN = "t" * 20
@@ -135,6 +135,20 @@ def test_damaged_states_of_robots_do_not_keep_the_service_from_starting(
                 assert (welcome["type"], welcome["restored"]) == ("welcome", None)
         trouble = json.loads(service.get("/ready")[1])["trouble"]
         assert {"state of bytes", "state of half", "state of deep", "state of folder"} <= set(trouble)
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"can": "can0", "replay": "runs"}, "--can and --replay are two modes: one of them is accepted"),
+        ({"can": "can0", "port": 1}, "--port is an option of the WebSocket service, not of --can"),
+        ({"replay": "runs", "duration_s": 1.0}, "--duration is an option of --can, not of --replay"),
+        ({"speed": "4"}, "--speed is an option of --replay, not of the WebSocket service"),
+    ],
+)
+def test_options_of_another_mode_are_refused(options, sentence):
+    with pytest.raises(ConfigError, match=sentence):
+        Settings(**options)
 
 
 @pytest.mark.parametrize(
