@@ -1,3 +1,5 @@
+import json
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,11 +12,13 @@ from pipelines.learn.checks import (
     enough_runs,
     learning_curve,
     slow_fast,
+    stiffness_figures,
 )
 from pipelines.learn.crossval import crossval
-from pipelines.learn.evaluate import Examples, evaluate
+from pipelines.learn.evaluate import Examples, HeldOut, evaluate
 from pipelines.learn.protocols import folds_of, grouped_samples, run_speeds, slow_fast_split
 from pipelines.learn.recipes import feature_matrix, make_recipe, recipe_of
+from pipelines.report.json_file import as_json
 from terrain.errors import ConfigError, DataError
 from terrain.records import RunLog, Stream
 
@@ -35,19 +39,32 @@ def runs_at(drive):
     return make
 
 
+def joined(run_id, first, second, duration_s):
+    """Return a run over the terrains of two, one after the other."""
+    streams = {
+        name: Stream(
+            np.concatenate([a.time_s, second.streams[name].time_s + duration_s]),
+            np.concatenate([a.values, second.streams[name].values]),
+            a.channels,
+        )
+        for name, a in first.streams.items()
+    }
+    terrains = first.labels[0].terrain, second.labels[0].terrain
+    labels = ((0.0, duration_s, terrains[0]), (duration_s, 2 * duration_s, terrains[1]))
+    return RunLog(run_id, "husky", streams, labels)
+
+
 def test_the_speed_of_a_run_is_that_of_its_faster_wheel_where_it_moves(drive):
     run = drive("r", "GRASS", 0, 40.0)
     wheels = run.streams["wheels"]
     values = wheels.values.copy()
     values[:, 0], values[:, 1] = 0.2, -0.6  # turning: the right wheel is faster, backwards
     values[:240, :2] = [0.02, -0.01]  # it creeps, or rests, for 24 of 40 s
-    moved = RunLog(
-        "r", "husky", {**run.streams, "wheels": Stream(wheels.time_s, values, wheels.channels)}, run.labels
-    )
+    moving = Stream(wheels.time_s, values.copy(), wheels.channels)
     values[:, :2] = 0.0
-    still = RunLog(
-        "s", "husky", {**run.streams, "wheels": Stream(wheels.time_s, values, wheels.channels)}, run.labels
-    )
+    standing = Stream(wheels.time_s, values, wheels.channels)
+    moved = replace(run, streams=run.streams | {"wheels": moving})
+    still = replace(run, run_id="s", streams=run.streams | {"wheels": standing})
     speeds = run_speeds(grouped_samples([moved, still], PLAIN).windows)
     assert speeds["r"] == pytest.approx(0.6)
     assert np.isnan(speeds["s"])
@@ -58,23 +75,9 @@ def test_each_class_is_split_at_its_own_median_speed(runs_at):
     samples = grouped_samples([r for t, s in plan.items() for r in runs_at(t, s)], WindowRule())
     split = slow_fast_split(samples)
     assert split.left_out == {}
-    assert set(samples.run_id[split.side == "slow"]) == {
-        "ASPHALT_0",
-        "ASPHALT_1",
-        "GRASS_1",
-        "GRASS_3",
-        "GRAVEL_0",
-        "GRAVEL_1",
-        "GRAVEL_2",
-    }
-    assert set(samples.run_id[split.side == "fast"]) == {
-        "ASPHALT_2",
-        "ASPHALT_3",
-        "GRASS_0",
-        "GRASS_2",
-        "GRAVEL_3",
-        "GRAVEL_4",
-    }
+    slow, fast = (set(samples.run_id[split.side == side].tolist()) for side in ("slow", "fast"))
+    assert slow == {"ASPHALT_0", "ASPHALT_1", "GRASS_1", "GRASS_3", "GRAVEL_0", "GRAVEL_1", "GRAVEL_2"}
+    assert fast == {"ASPHALT_2", "ASPHALT_3", "GRASS_0", "GRASS_2", "GRAVEL_3", "GRAVEL_4"}
     assert split.classes["GRASS"].slow_mps == pytest.approx(0.55, abs=0.02)
     assert split.classes["GRASS"].fast_mps == pytest.approx(0.95, abs=0.02)
 
@@ -232,16 +235,7 @@ def test_a_run_slow_on_one_class_and_fast_on_another_is_on_no_side(runs_at, sett
     )
     runs = [run for terrain in ("ASPHALT", "GRASS", "GRAVEL") for run in runs_at(terrain, SPEEDS)]
     slow_grass, fast_gravel = (next(r for r in runs if r.run_id == name) for name in ("GRASS_0", "GRAVEL_3"))
-    joined = {}
-    for name in slow_grass.streams:
-        first, second = slow_grass.streams[name], fast_gravel.streams[name]
-        joined[name] = Stream(
-            np.concatenate([first.time_s, second.time_s + 32.0]),
-            np.concatenate([first.values, second.values]),
-            first.channels,
-        )
-    labels = ((0.0, 32.0, "GRASS"), (32.0, 64.0, "GRAVEL"))
-    mixed = RunLog("mixed", "husky", joined, labels)
+    mixed = joined("mixed", slow_grass, fast_gravel, 32.0)
     samples = grouped_samples([r for r in runs if r not in (slow_grass, fast_gravel)] + [mixed], WindowRule())
     split = slow_fast_split(samples)
     assert set(split.side[samples.run_id == "mixed"]) == {""}
@@ -259,15 +253,134 @@ def test_runs_with_several_labels_can_be_learned_from_few(drive, settings):
     runs = []
     for number in range(6):
         a, b = (drive(f"r{number}", terrain, number, 12.0) for terrain in ("GRASS", "GRAVEL"))
-        streams = {
-            name: Stream(
-                np.concatenate([a.streams[name].time_s, b.streams[name].time_s + 12.0]),
-                np.concatenate([a.streams[name].values, b.streams[name].values]),
-                a.streams[name].channels,
-            )
-            for name in a.streams
-        }
-        runs.append(RunLog(f"r{number}", "husky", streams, ((0.0, 12.0, "GRASS"), (12.0, 24.0, "GRAVEL"))))
+        runs.append(joined(f"r{number}", a, b, 12.0))
     report = crossval(runs, settings(repeats=1, extras=True))
     assert report.learning_curve.runs_per_class[0] == 1.0
     assert {row.run_id for row in report.per_run} >= {"r0 (GRASS)", "r0 (GRAVEL)"}
+
+
+@pytest.fixture(scope="module")
+def report(runs, settings):
+    return crossval(runs, settings(protocol="leave-terrain-out"))
+
+
+def test_report_has_the_areas_their_intervals_and_both_rates(report):
+    document = as_json(report)
+    assert json.loads(json.dumps(document, allow_nan=False)) == document
+    assert (document["protocol"], document["repeats"]) == ("leave-terrain-out", 1)
+    assert set(document["unknown_by_terrain"]) == {"ASPHALT", "GRASS", "GRAVEL"}
+    for name in ("auroc_unknown", "auroc_unknown_10s"):
+        low, high = document[f"{name}_ci"]
+        assert 0.0 <= low <= document[name] <= high <= 1.0
+    rows = report.unknown_by_terrain.values()
+    assert np.mean([row.auroc for row in rows]) == pytest.approx(report.auroc_unknown)
+    assert report.auroc_unknown > 0.6  # the middle one of three terrains lies between the others
+    assert 0.8 < report.known_kept <= 1.0
+
+
+def test_two_terrains_and_few_runs_are_refused(runs, settings):
+    two = [run for run in runs if run.labels[0].terrain != "GRASS"]
+    with pytest.raises(DataError, match=r"2 terrains \(ASPHALT, GRAVEL\).*at least 3"):
+        crossval(two, settings(protocol="leave-terrain-out"))
+    few = [run for run in runs if run.labels[0].terrain != "GRASS"][::2] + [
+        run for run in runs if run.labels[0].terrain == "GRASS"
+    ]
+    with pytest.raises(DataError, match=r"4 runs without GRASS are fewer than 5 folds"):
+        crossval(few, settings(protocol="leave-terrain-out"))
+
+
+@pytest.mark.slow
+def test_no_run_of_the_left_out_terrain_and_no_tested_run_trains(runs, settings, monkeypatch):
+    trained = []
+
+    class Recorded(checks.NoveltyScore):
+        def fit(self, X, y, groups=None):
+            trained.append((set(y), set(groups)))
+            return super().fit(X, y, groups)
+
+    monkeypatch.setattr(checks, "NoveltyScore", Recorded)
+    crossval(runs, settings(protocol="leave-terrain-out", n_jobs=1))
+    terrain_of = {run.run_id: run.labels[0].terrain for run in runs}
+    assert len(trained) == 15
+    for terrains, groups in trained:
+        assert len(terrains) == 2
+        assert {terrain_of[group] for group in groups} == terrains
+        assert len(groups) < 8  # one of the eight runs of two terrains at least is held out
+
+
+def test_area_by_runs_is_that_of_all_pairs():
+    from sklearn.metrics import roc_auc_score
+
+    rng = np.random.default_rng(0)
+    known, new = np.round(rng.normal(size=40), 1), np.round(rng.normal(0.7, 1, 30), 1)
+    run_of = np.concatenate([np.repeat(np.arange(4), 10), np.repeat(np.arange(4, 7), 10)])
+    part = checks._Scored(np.arange(40), np.arange(40, 70), known, new, 0.0)
+    compared = checks._compare([part], run_of)
+    expected = roc_auc_score(np.repeat([0, 1], [40, 30]), np.concatenate([known, new]))
+    assert compared.won.sum() / compared.pairs.sum() == pytest.approx(expected)
+    weights = np.ones((50, 7)) + np.random.default_rng(1).multinomial(7, np.full(7, 1 / 7), 50)
+    low, high = checks._interval([compared], weights)
+    assert low < expected < high
+
+
+NAMES = {"ASPHALT": "ASPHALT", "GRASS": "CONCRETE", "GRAVEL": "SNOW"}
+"""Two hard terrains and a soft one, in place of the names of the drawn runs."""
+
+
+@pytest.fixture(scope="module")
+def drawn(drive_all, settings):
+    runs = drive_all(n_runs=4)
+    samples = grouped_samples(runs, settings().rule)
+    windows = samples.windows
+    windows = replace(windows, terrain=np.array([NAMES[name] for name in windows.terrain], dtype=object))
+    samples = samples._replace(windows=windows)
+    return samples, feature_matrix(make_recipe("svm"), windows)
+
+
+def held_out(samples, predicted, certainty=1.0):
+    """Return probabilities of one repeat that put ``certainty`` on each predicted class."""
+    classes = np.unique(samples.windows.terrain.astype(str))
+    column = np.searchsorted(classes, predicted)
+    rest = (1 - certainty) / (len(classes) - 1)
+    probability = np.full((1, len(column), len(classes)), rest)
+    probability[0, np.arange(len(column)), column] = certainty
+    return HeldOut(classes, probability, np.zeros((1, len(column)), dtype=int), classes[column], [])
+
+
+def test_a_wrong_class_of_the_right_level_costs_little(drawn):
+    samples, features = drawn
+    terrain = samples.windows.terrain.astype(str)
+    right = stiffness_figures(held_out(samples, terrain), features, samples, 0)
+    assert (right.accuracy, right.cost, right.soft_hard_ratio) == (1.0, 0.0, 0.0)
+    paved = np.where(terrain == "ASPHALT", "CONCRETE", terrain)
+    within = stiffness_figures(held_out(samples, paved), features, samples, 0)
+    share = float(np.mean(terrain == "ASPHALT"))
+    assert (within.accuracy, within.cost) == (1.0, pytest.approx(0.25 * share))
+    snow = np.where(terrain == "ASPHALT", "SNOW", terrain)
+    apart = stiffness_figures(held_out(samples, snow), features, samples, 0)
+    assert apart.cost == apart.soft_hard_ratio == pytest.approx(share)
+    assert apart.accuracy == pytest.approx(1 - share)
+    assert apart.cost_ci[0] <= apart.cost <= apart.cost_ci[1]
+    assert -1.0 <= apart.clusters.interval[0] <= apart.clusters.interval[1] <= 1.0
+    assert apart.levels == {"ASPHALT": "HARD", "CONCRETE": "HARD", "SNOW": "SOFT"}
+
+
+def test_two_hard_classes_together_outweigh_a_more_probable_soft_one(drawn):
+    samples, features = drawn
+    terrain = samples.windows.terrain.astype(str)
+    doubtful = stiffness_figures(held_out(samples, np.full(len(terrain), "SNOW"), 0.4), features, samples, 0)
+    hard = float(np.mean(terrain != "SNOW"))
+    assert doubtful.cost == pytest.approx(hard)
+    assert doubtful.least_cost < doubtful.cost
+    assert doubtful.gain == pytest.approx(doubtful.cost - doubtful.least_cost)
+
+
+def test_without_a_known_level_there_are_no_figures(drawn, drive_all, settings):
+    samples, features = drawn
+    unknown = grouped_samples(drive_all(n_runs=2), settings().rule)  # GRASS and GRAVEL have no known level
+    terrain = unknown.windows.terrain.astype(str)
+    assert stiffness_figures(held_out(unknown, terrain), features, unknown, 0) is None
+    hard = np.flatnonzero(samples.windows.terrain != "SNOW")
+    paved = samples.of(hard)
+    terrain = paved.windows.terrain.astype(str)
+    assert stiffness_figures(held_out(paved, terrain), features[hard], paved, 0) is None

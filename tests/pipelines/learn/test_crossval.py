@@ -1,57 +1,20 @@
 import json
+import re
+import warnings
+from dataclasses import fields
+from typing import get_args
 
 import numpy as np
 import pytest
 
 from pipelines.data.datasets import load_runs
 from pipelines.learn.crossval import EvaluationSettings, crossval
+from pipelines.learn.parallel import computing
+from pipelines.learn.protocols import PROTOCOLS
+from pipelines.learn.settings import ProtocolName
 from pipelines.report.json_file import as_json
 from terrain.errors import ConfigError, DataError
 from terrain.records import RunLog, Stream
-
-PROMISED = {
-    "protocol",
-    "recipe",
-    "window_s",
-    "n_windows",
-    "n_runs",
-    "accuracy",
-    "accuracy_ci",
-    "accuracy_spread",
-    "balanced_accuracy",
-    "macro_f1",
-    "per_class",
-    "confusion",
-    "classes",
-    "folds",
-    "per_run",
-    "vote_accuracy",
-    "vote_windows",
-    "ece",
-    "ece_ci",
-    "confidence_auc",
-    "confidence_auc_ci",
-    "accuracy_at_coverage",
-    "macro_run_accuracy",
-    "dropped",
-    "repaired",
-    "notes",
-    "stride_s",
-    "steady",
-    "signal_sets",
-    "seed",
-    "repeats",
-    "accuracy_per_repeat",
-    "reliability",
-    "n_features",
-    "support",
-    "accuracy_by_support",
-    "unsupported",
-    "supported",
-    "supported_auc",
-    "next_drives",
-    "conformal",
-}
 
 
 @pytest.fixture(scope="module")
@@ -59,9 +22,24 @@ def report(runs, settings):
     return crossval(runs, settings(repeats=2))
 
 
+def test_the_screen_answers_first_and_fits(report):
+    lines = str(report).splitlines()
+    assert len(lines) <= 25
+    assert re.match(r"\d+\.\d.% of windows classified correctly, whole runs held out \(", lines[0])
+    assert lines[-1].startswith("next: terrain train --data DIR --recipe svm")
+    assert report.to_pandas().shape == (3, 5)
+
+
+def test_the_protocols_of_the_command_line_are_those_that_there_are():
+    """They are written twice, so that help need not load what offers them."""
+    assert get_args(ProtocolName) == tuple(PROTOCOLS)
+
+
 def test_the_report_has_what_is_promised_and_is_json(report, runs):
     document = as_json(report)
-    assert set(document) == PROMISED
+    known = {each.name for each in fields(report) if getattr(report, each.name) is not None} - {"data"}
+    assert set(document) == known | {"stride_s"}
+    assert len(known) > 40
     assert json.loads(json.dumps(document, allow_nan=False)) == document
     assert (report.n_runs, report.n_windows, report.window_s) == (12, 144, 2.0)
     assert (len(report.folds), len(report.per_run), report.repeats) == (10, 12, 2)
@@ -185,9 +163,7 @@ def test_terrains_of_vulpi_are_classified_on_held_out_runs(datasets_dir, setting
     assert any(note.startswith("DIRT_ROAD: one run only") for note in report.notes)
 
 
-@pytest.mark.parametrize(
-    "window_s", [0.4, 1.0, *(pytest.param(s, marks=pytest.mark.slow) for s in (0.5, 0.7, 0.8))]
-)
+@pytest.mark.parametrize("window_s", [0.4, 1.0])
 def test_a_window_with_few_samples_of_a_slow_stream_is_classified(drive_all, settings, window_s):
     runs = drive_all(("ASPHALT", "GRAVEL"), 3, duration_s=8.0)
     report = crossval(runs, settings(window_s=window_s))
@@ -198,3 +174,25 @@ def test_a_window_with_few_samples_of_a_slow_stream_is_classified(drive_all, set
 def test_a_window_too_short_for_a_slow_stream_is_one_sentence(runs, settings):
     with pytest.raises(DataError, match=r"^a window of 0\.3 s holds 3 samples of stream 'wheels' at 10 Hz; "):
         crossval(runs, settings(window_s=0.3))
+
+
+@pytest.mark.slow
+def test_a_cluster_gives_the_report_of_this_machine(make_run):
+    distributed = pytest.importorskip("distributed")
+    runs = [
+        make_run(f"{name}_{k}", name, k + 10 * (name == "ICE"), 12.0)
+        for name in ("ICE", "SNOW")
+        for k in range(4)
+    ]
+    settings = EvaluationSettings(repeats=1, steady=False, n_jobs=2)
+    here = crossval(runs, settings)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        with (
+            distributed.LocalCluster(
+                n_workers=1, threads_per_worker=1, processes=False, protocol="tcp", dashboard_address=None
+            ) as running,
+            computing("dask:" + running.scheduler_address),
+        ):
+            there = crossval(runs, settings)
+    assert json.dumps(as_json(there)) == json.dumps(as_json(here))
