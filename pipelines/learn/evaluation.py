@@ -434,11 +434,26 @@ def _details(result: CrossvalResult) -> Iterator[Section]:
     confusion = Table(
         ("true terrain", *shaded), [(name, *(n / total for n in row)) for name, row, total in counts]
     )
-    yield Section("Confusion", [confusion, Text("A row has the predictions for the windows of one terrain.")])
+    yield Section(
+        "Confusion",
+        [
+            confusion,
+            Text(
+                "A row is a true terrain and adds up to 100 %; dark cells off the diagonal are what it is mistaken for."
+            ),
+        ],
+    )
     of_run: Columns = {"run_id": "run", "terrain": "terrain", "n_windows": "windows"}
     of_run = of_run | {"accuracy": ACCURACY, "mistaken_for": "mistaken for"}
     worst = sorted(result.per_run, key=lambda row: row.accuracy)
-    yield Section("Runs", [_table(worst, of_run, note="The worst first.")])
+    yield Section(
+        "Runs",
+        [
+            _table(
+                worst, of_run, note="The worst first. One long bad run weighs more than several short ones."
+            )
+        ],
+    )
     yield _confidence(result)
     if result.support is not None:
         yield _coverage(result)
@@ -495,7 +510,10 @@ def _confidence(result: CrossvalResult) -> Section:
             ("  sets with one terrain", sets.single_ratio, PERCENT),
         ]
     panel = Panel(marks, "classified correctly", x_range=(0.0, 1.0), y_range=(0.0, 1.0))
-    caption = "Below the line, predictions are wrong more often than their probability says."
+    caption = (
+        "Each point is a bin of equally many windows; below the line, predictions are wrong more often than their "
+        "probability says."
+    )
     figure = Figure(
         "Confidence and accuracy", [panel], caption, x_label="probability of the predicted terrain"
     )
@@ -561,7 +579,10 @@ def _checks(result: CrossvalResult) -> Section:
     spread = [(a, std or 0.0) for a, std in zip(right, curve.accuracy_spread, strict=True)]
     low, high = [a - std for a, std in spread], [a + std for a, std in spread]
     marks: list[Mark] = [Line("", runs, right, 0), Points("held-out runs", runs, right, low, high, 0)]
-    caption = f"Bars: one standard deviation over draws of runs. {curve.statement}"
+    caption = (
+        "What each further run brought; where it still rises at its right end, more runs help. Bars: one standard "
+        "deviation over draws of runs."
+    )
     figure = Figure(
         "Learning curve", [Panel(marks, "accuracy")], caption, x_label="training runs of each terrain"
     )

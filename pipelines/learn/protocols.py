@@ -460,13 +460,15 @@ def _logs(samples: Samples) -> Sequence[RunLog]:
     return samples.runs
 
 
+def merged_notes(merged: Sequence[Sequence[str]]) -> list[str]:
+    """Return in a sentence each what groups of runs were taken for one run."""
+    ending = "hold the same measurements: they are one run, in which each stretch counts once"
+    return [f"runs {', '.join(group)} {ending}" for group in merged]
+
+
 def notes_of(samples: Samples, protocol: str) -> Iterator[str]:
     """Yield in sentences what a reader of figures must know of the runs and the windows."""
-    for group in samples.merged:
-        yield (
-            f"runs {', '.join(group)} hold the same measurements: they are one run, in which each stretch "
-            "counts once"
-        )
+    yield from merged_notes(samples.merged)
     alone = single_run_classes(samples.terrain, samples.run_id)
     if alone and protocol != "published":
         yield (

@@ -106,6 +106,19 @@ def runs():
 
 
 @pytest.fixture(scope="session")
+def settings():
+    """Return a maker of settings for one process, one repeat and no extras unless asked for."""
+    from pipelines.learn.settings import EvaluationSettings
+
+    def make(**options):
+        if isinstance(options.get("recipe"), str):
+            options["recipe"] = (options["recipe"],)
+        return EvaluationSettings(**({"repeats": 1, "extras": False, "n_jobs": 1} | options))
+
+    return make
+
+
+@pytest.fixture(scope="session")
 def tracked(tmp_path_factory, runs):
     """A folder in which a model ``drawn`` has been trained with the embedded tracking, and the result.
 
