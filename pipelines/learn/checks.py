@@ -11,7 +11,6 @@ from enum import StrEnum
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.optimize import least_squares
 from sklearn.base import clone
 
 from features.extractor import FeatureExtractor
@@ -27,11 +26,11 @@ from pipelines.learn.protocols import (
     run_speeds,
     slow_fast_split,
 )
-from pipelines.report import Progress, format_value, silent
-from terrain.bootstrap import bootstrap_counts, percentile_interval
+from pipelines.report import Progress, silent
 from terrain.classify.folds import block_groups, split_runs
-from terrain.classify.metrics import N_BOOTSTRAP, run_bootstrap, runs_by_terrain
-from terrain.classify.novelty import KNOWN_KEPT, NoveltyScore
+from terrain.classify.learning_curve import enough_runs
+from terrain.classify.metrics import run_bootstrap, runs_by_terrain
+from terrain.classify.novelty import NoveltyScore
 from terrain.classify.stiffness import (
     MIN_RUNS,
     StiffnessLevel,
@@ -40,19 +39,14 @@ from terrain.classify.stiffness import (
     cost_matrix,
     least_cost_class,
 )
+from terrain.classify.unknown_figures import Scored, UnknownTerrain, unknown_figures
 from terrain.errors import DataError
 from terrain.records import Array
 from terrain.terramechanics.stiffness import known_levels
 
 CURVE_RUNS = (1, 2, 3, 5, 8, 12)
 CURVE_DRAWS = 2
-MIN_CURVE_POINTS = 4
-"""The law of the learning curve has three parameters."""
-ENOUGH_GAIN = 0.01
-"""Enough runs: doubling them would gain less than this accuracy."""
 
-MEAN_SPAN_S = 10.0
-"""Novelty scores are averaged over so long: a robot crosses a terrain for longer."""
 MIN_TERRAINS = 3
 """Two are needed to train without the third."""
 
@@ -181,57 +175,6 @@ def _rows_of_drawn_runs(y: Array, group: Array, size: int, rng: np.random.Genera
     return kept
 
 
-class EnoughRuns(NamedTuple):
-    """How many runs of each class are enough; None where that was not reached or cannot be determined."""
-
-    n_runs: int | None
-    statement: str
-
-
-def enough_runs(runs_per_class: Array, accuracy: Array) -> EnoughRuns:
-    """Return how many runs of each class would be enough, by the law ``accuracy(m) = a - b m^-c``.
-
-    Enough is the smallest whole m for which doubling gains less than :data:`ENOUGH_GAIN` by that law; it
-    is not sought beyond ten times the largest m that was measured.
-
-    Parameters
-    ----------
-    runs_per_class, accuracy : (k,) measured points; the law needs four
-
-    Examples
-    --------
-    >>> m = np.array([1.0, 2.0, 4.0, 8.0, 16.0])
-    >>> enough_runs(m, 0.9 - 0.3 / m).n_runs
-    16
-    """
-    if len(accuracy) < MIN_CURVE_POINTS:
-        return EnoughRuns(None, f"{len(accuracy)} sizes are too few to estimate how many runs are enough")
-    fit = least_squares(
-        lambda p: p[0] - p[1] * runs_per_class ** -p[2] - accuracy,
-        x0=[min(accuracy.max() + 0.02, 1.0), 0.3, 0.7],
-        bounds=([0.0, 0.0, 0.05], [1.0, 2.0, 3.0]),
-    )
-    _, scale, power = fit.x
-    largest = runs_per_class.max()
-    sizes = np.arange(1, int(10 * largest) + 1)
-    gain = scale * sizes**-power * (1 - 2.0**-power)
-    slack = float(np.interp(largest, sizes, gain))
-    found = sizes[gain < ENOUGH_GAIN]
-    if not len(found):
-        return EnoughRuns(
-            None,
-            f"not enough yet: doubling the {largest:.1f} runs per class would still gain {format_value(slack, '.1%')}",
-        )
-    enough = int(found[0])
-    verdict = "enough" if enough <= largest else "not enough yet"
-    return EnoughRuns(
-        enough,
-        f"{verdict}: {enough} {'run' if enough == 1 else 'runs'} per class would be enough "
-        f"(doubling them gains under {format_value(ENOUGH_GAIN, '.0%')}); "
-        f"the data have {largest:.1f} on average, doubling which would gain {format_value(slack, '.1%')}",
-    )
-
-
 class LevelClusters(NamedTuple):
     """Clusters of runs without labels, and how far they agree with the stiffness levels.
 
@@ -343,55 +286,6 @@ def _clusters(features: Array, samples: Samples, level: Array, seed: int) -> Lev
     return LevelClusters(found.n_clusters, by_level.adjusted_rand, by_level.interval, by_class.adjusted_rand)
 
 
-class LeftOutTerrain(NamedTuple):
-    """How well the windows of a terrain that was left out differ in score from held-out ones of others.
-
-    Parameters
-    ----------
-    auroc, auroc_10s : area under the ROC curve of single windows, and of means over 10 s
-    accepted : part of its windows that are taken for a known terrain
-    known_kept : part of the held-out windows of the other terrains that are not called unknown
-    """
-
-    auroc: float
-    auroc_10s: float
-    accepted: float
-    known_kept: float
-
-
-class UnknownTerrain(NamedTuple):
-    """Leave-one-terrain-out: means over the terrains, intervals by bootstrap over runs, and each terrain.
-
-    The threshold of the score keeps ``known_kept_target`` of the known windows of inner held-out runs.
-    """
-
-    auroc_unknown: float
-    auroc_unknown_ci: tuple[float, float]
-    auroc_unknown_10s: float
-    auroc_unknown_10s_ci: tuple[float, float]
-    unknown_accepted: float
-    known_kept: float
-    known_kept_target: float
-    unknown_by_terrain: Mapping[str, LeftOutTerrain]
-
-
-class _Scored(NamedTuple):
-    """Scores of held-out known rows and of all unknown rows by one fold, and the fold's threshold."""
-
-    known: Array
-    unknown: Array
-    known_scores: Array
-    unknown_scores: Array
-    threshold: float
-
-
-class _Compared(NamedTuple):
-    """By run of known and unknown windows: how many pairs the unknown one wins, and how many pairs are."""
-
-    won: Array
-    pairs: Array
-
-
 def leave_terrain_out(
     features: Array, samples: Samples, seed: int, n_jobs: int, progress: Progress = silent
 ) -> UnknownTerrain:
@@ -429,85 +323,17 @@ def leave_terrain_out(
         for train, test in split_runs(y[rows], group[rows], N_FOLDS, rng, samples.gap):
             if len(test):
                 folds.append((rows[train], rows[test], unknown))
-    of_terrain: dict[str, list[_Scored]] = {str(terrain): [] for terrain in terrains}
+    of_terrain: dict[str, list[Scored]] = {str(terrain): [] for terrain in terrains}
     shared = (features, y, group, samples.gap, seed)
     progress("leave-terrain-out", 0, len(folds))
     for number, scored in enumerate(parallel(_score, shared, folds, min(n_jobs, len(folds)))):
         of_terrain[str(y[scored.unknown[0]])].append(scored)
         progress("leave-terrain-out", number + 1, len(folds))
-    names, run_of = np.unique(np.char.add(np.char.add(group, " "), y), return_inverse=True)
-    weights = np.zeros((N_BOOTSTRAP, len(names)))
-    for number, terrain in enumerate(terrains):  # how often each run is drawn, terrain by terrain
-        runs = np.unique(run_of[y == terrain])
-        weights[:, runs] = bootstrap_counts(len(runs), N_BOOTSTRAP, seed + number)
-    start_s = samples.windows.start_s
-    windows = [_compare(parts, run_of) for parts in of_terrain.values()]
-    spans = [_compare([_span_means(s, run_of, start_s) for s in p], run_of) for p in of_terrain.values()]
-    rows_of = {
-        name: LeftOutTerrain(
-            float(window.won.sum() / window.pairs.sum()),
-            float(span.won.sum() / span.pairs.sum()),
-            _accepted([(part.unknown_scores, part.threshold) for part in parts]),
-            _accepted([(part.known_scores, part.threshold) for part in parts]),
-        )
-        for (name, parts), window, span in zip(of_terrain.items(), windows, spans, strict=True)
-    }
-    return UnknownTerrain(
-        float(np.mean([row.auroc for row in rows_of.values()])),
-        _interval(windows, weights),
-        float(np.mean([row.auroc_10s for row in rows_of.values()])),
-        _interval(spans, weights),
-        float(np.mean([row.accepted for row in rows_of.values()])),
-        float(np.mean([row.known_kept for row in rows_of.values()])),
-        KNOWN_KEPT,
-        rows_of,
-    )
+    return unknown_figures(of_terrain, y, group, samples.windows.start_s, seed)
 
 
 def _score(
     X: Array, y: Array, group: Array, gap: int, seed: int, train: Array, test: Array, unknown: Array
-) -> _Scored:
+) -> Scored:
     fitted = NoveltyScore(gap=gap, seed=seed).fit(X[train], y[train], group[train])
-    return _Scored(test, unknown, fitted.score(X[test]), fitted.score(X[unknown]), fitted.numbers_.threshold)
-
-
-def _span_means(scored: _Scored, run_of: Array, start_s: Array) -> _Scored:
-    """Return mean scores of the windows that begin in the same 10 s of a run, at the first of their rows."""
-    means = []
-    for rows, scores in ((scored.known, scored.known_scores), (scored.unknown, scored.unknown_scores)):
-        span = np.stack([run_of[rows], np.floor(start_s[rows] / MEAN_SPAN_S)])
-        _, first, which = np.unique(span, axis=1, return_index=True, return_inverse=True)
-        means.append((rows[first], np.bincount(which.ravel(), scores) / np.bincount(which.ravel())))
-    (known, known_scores), (unknown, unknown_scores) = means
-    return _Scored(known, unknown, known_scores, unknown_scores, scored.threshold)
-
-
-def _compare(parts: Sequence[_Scored], run_of: Array) -> _Compared:
-    """Compare known and unknown windows that one fold scored; ties count one half, NaN as unknown."""
-    n_runs = int(run_of.max()) + 1
-    won, pairs = np.zeros((2, n_runs, n_runs))
-    for part in parts:
-        known_scores = np.nan_to_num(part.known_scores, nan=np.inf, posinf=np.inf)
-        unknown_scores = np.nan_to_num(part.unknown_scores, nan=np.inf, posinf=np.inf)
-        known_run, unknown_run = run_of[part.known], run_of[part.unknown]
-        for run in np.unique(known_run):
-            ordered = np.sort(known_scores[known_run == run])
-            below = np.searchsorted(ordered, unknown_scores, "left")
-            up_to = np.searchsorted(ordered, unknown_scores, "right")
-            won[run] += np.bincount(unknown_run, (below + up_to) / 2.0, n_runs)
-            pairs[run] += np.bincount(unknown_run, minlength=n_runs) * len(ordered)
-    return _Compared(won, pairs)
-
-
-def _interval(compared: Sequence[_Compared], weights: Array) -> tuple[float, float]:
-    """Return the interval of the mean area over the terrains that were left out."""
-    draws = np.zeros(len(weights))
-    for won, pairs in compared:
-        area = np.einsum("dr,rs,ds->d", weights, won, weights, optimize=True)
-        draws += area / np.einsum("dr,rs,ds->d", weights, pairs, weights, optimize=True)
-    return percentile_interval(draws / len(compared))
-
-
-def _accepted(parts: Sequence[tuple[Array, float]]) -> float:
-    """Return the part of scores that are within their threshold."""
-    return float(np.concatenate([scores <= threshold for scores, threshold in parts]).mean())
+    return Scored(test, unknown, fitted.score(X[test]), fitted.score(X[unknown]), fitted.numbers_.threshold)

@@ -35,16 +35,18 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from features.motion import Motion
-    from pipelines.learn.checks import LearningCurve, LeftOutTerrain, SlowFast, StiffnessFigures
+    from pipelines.learn.checks import LearningCurve, SlowFast, StiffnessFigures
     from pipelines.learn.coverage import NextDrive, SupportRow
     from pipelines.learn.evaluate import Examples, FoldFigures, HeldOut
     from pipelines.learn.protocols import Fold, Samples
     from pipelines.learn.recipes import WindowPipeline
-    from pipelines.learn.sequences import Breakaway, DelayFigures, SequenceFigures
+    from pipelines.learn.sequences import Breakaway
     from terrain.classify.confidence import CoverageFigures, ReliabilityBin
     from terrain.classify.conformal_figures import ConformalFigures
     from terrain.classify.metrics import ClassFigures, RunFigures
+    from terrain.classify.sequence_figures import DelayFigures, SequenceFigures
     from terrain.classify.support_figures import PartFigures
+    from terrain.classify.unknown_figures import LeftOutTerrain
     from terrain.records import RunLog
 
 CHECKED_WITH = FEATURE_RECIPE
@@ -297,7 +299,8 @@ def _extras(
     """Return the checks beside the figures by field; ``same`` where held-out windows are of this classifier."""
     from pipelines.learn.checks import learning_curve, slow_fast, speed_only, stiffness_figures
     from pipelines.learn.evaluate import Examples, evaluate
-    from pipelines.learn.sequences import breakaways_of, sequence_figures
+    from pipelines.learn.sequences import breakaways_of
+    from terrain.classify.sequence_figures import sequence_figures
 
     seed, jobs = settings.seed, settings.jobs
     examples = Examples(features, samples.terrain, samples.group)

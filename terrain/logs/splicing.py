@@ -11,6 +11,7 @@ the distance is between half and one and a half periods wherever the run holds s
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -21,6 +22,10 @@ from terrain.records import Array, Label, RunLog, Stream
 
 TIME_TOLERANCE_S = 1e-6
 """Stamps are compared to this, far below any sample period."""
+
+SHORTEST_S, LONGEST_S = 10.0, 30.0
+"""Time on a ground before the next: shorter ones are no more than five windows, longer ones hardly ever
+change."""
 
 LEAST_PERIODS, MOST_PERIODS = 0.5, 1.5
 """Distance of two samples across a splice, in periods: within what the clocks of loggers do."""
@@ -33,6 +38,42 @@ class Part(NamedTuple):
     start_s: float
     end_s: float
     terrain: str
+
+
+def stretches_of(part: Part, rng: np.random.Generator) -> list[Part]:
+    """Cut a part of a run into stretches of random lengths without remainder; none where it is too short."""
+    found = []
+    start_s, left_s = part.start_s, part.end_s - part.start_s
+    while left_s >= SHORTEST_S:
+        length_s = float(rng.uniform(SHORTEST_S, LONGEST_S))
+        if left_s - length_s < SHORTEST_S:
+            length_s = left_s if left_s <= LONGEST_S else left_s / 2
+        found.append(part._replace(start_s=start_s, end_s=start_s + length_s))
+        start_s, left_s = start_s + length_s, left_s - length_s
+    return found
+
+
+def order_stretches(stretches: Sequence[Part], rng: np.random.Generator) -> list[Part]:
+    """Order stretches at random so that the terrain changes from each to the next.
+
+    The terrain with the most left comes next where otherwise too much of it would be left at the end;
+    what cannot be placed is left out.
+    """
+    waiting: dict[str, list[Part]] = {}
+    for i in rng.permutation(len(stretches)):
+        waiting.setdefault(stretches[i].terrain, []).append(stretches[i])
+    found: list[Part] = []
+    while True:
+        last = found[-1].terrain if found else ""
+        names = sorted(name for name, kept in waiting.items() if kept and name != last)
+        if not names:
+            return found
+        counts = Counter({name: len(waiting[name]) for name in names})
+        n_left = sum(len(kept) for kept in waiting.values())
+        most, n_most = counts.most_common(1)[0]
+        weights = np.array([counts[name] for name in names], dtype=float)
+        chosen = most if 2 * n_most > n_left else names[rng.choice(len(names), p=weights / weights.sum())]
+        found.append(waiting[chosen].pop())
 
 
 def splice_runs(parts: Sequence[Part], channels: Mapping[str, Sequence[str]], run_id: str) -> RunLog:

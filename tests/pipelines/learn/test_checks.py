@@ -9,7 +9,6 @@ from features.windows import WindowRule
 from pipelines.learn import checks
 from pipelines.learn.checks import (
     CURVE_DRAWS,
-    enough_runs,
     learning_curve,
     slow_fast,
     stiffness_figures,
@@ -19,6 +18,9 @@ from pipelines.learn.evaluate import Examples, HeldOut, evaluate
 from pipelines.learn.protocols import folds_of, grouped_samples, run_speeds, slow_fast_split
 from pipelines.learn.recipes import feature_matrix, make_recipe, recipe_of
 from pipelines.report.json_file import as_json
+from terrain.classify import unknown_figures
+from terrain.classify.learning_curve import enough_runs
+from terrain.classify.unknown_figures import Scored
 from terrain.errors import ConfigError, DataError
 from terrain.records import RunLog, Stream
 
@@ -314,12 +316,12 @@ def test_area_by_runs_is_that_of_all_pairs():
     rng = np.random.default_rng(0)
     known, new = np.round(rng.normal(size=40), 1), np.round(rng.normal(0.7, 1, 30), 1)
     run_of = np.concatenate([np.repeat(np.arange(4), 10), np.repeat(np.arange(4, 7), 10)])
-    part = checks._Scored(np.arange(40), np.arange(40, 70), known, new, 0.0)
-    compared = checks._compare([part], run_of)
+    part = Scored(np.arange(40), np.arange(40, 70), known, new, 0.0)
+    compared = unknown_figures._compare([part], run_of)
     expected = roc_auc_score(np.repeat([0, 1], [40, 30]), np.concatenate([known, new]))
     assert compared.won.sum() / compared.pairs.sum() == pytest.approx(expected)
     weights = np.ones((50, 7)) + np.random.default_rng(1).multinomial(7, np.full(7, 1 / 7), 50)
-    low, high = checks._interval([compared], weights)
+    low, high = unknown_figures._interval([compared], weights)
     assert low < expected < high
 
 

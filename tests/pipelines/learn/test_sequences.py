@@ -6,17 +6,10 @@ import pytest
 
 from pipelines.learn.crossval import EvaluationSettings, crossval
 from pipelines.learn.evaluate import HeldOut
-from pipelines.learn.sequences import (
-    STRIDE_S,
-    Track,
-    breakaways_of,
-    last_class,
-    order_stretches,
-    sequence_figures,
-    stretches_of,
-)
+from pipelines.learn.sequences import breakaways_of
 from pipelines.report.json_file import as_json
-from terrain.logs.splicing import Part
+from terrain.classify.sequence_figures import STRIDE_S, Track, last_class, sequence_figures
+from terrain.logs.splicing import Part, order_stretches, stretches_of
 from terrain.records import Windows
 
 
