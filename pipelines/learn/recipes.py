@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from sklearn.base import ClassifierMixin
@@ -13,7 +13,6 @@ from features.extractor import FeatureExtractor
 from features.matrix import FeatureMatrix
 from features.response import ResponseExtractor
 from features.sample_extractor import SampleExtractor
-from pipelines.learn.own import FunctionExtractor, OwnClassifier, WindowFunction, load_named
 from pipelines.learn.settings import FEATURE_RECIPE, RECIPES, WITHOUT_SVM, LearnSettings
 from terrain.classify.grouped_network import GroupedNetwork
 from terrain.classify.response import GroupedResponse
@@ -22,6 +21,9 @@ from terrain.classify.svm import CANDIDATES, GroupedSVC
 from terrain.errors import ConfigError
 from terrain.logs.schema import SIGNAL_SETS
 from terrain.records import Array, Windows
+
+if TYPE_CHECKING:
+    from pipelines.learn.own import WindowFunction
 
 
 class WindowPipeline(Pipeline):
@@ -92,9 +94,11 @@ def make_recipe(
     sets = tuple(signal_sets), tuple(level_sets)
     if functions and isinstance(recipe, str) and recipe != FEATURE_RECIPE:
         raise ConfigError(f"recipe {recipe!r} does not take features of your own; {FEATURE_RECIPE!r} does")
-    features: FeatureExtractor = (
-        FunctionExtractor(*sets, tuple(functions)) if functions else FeatureExtractor(*sets)
-    )
+    features: FeatureExtractor = FeatureExtractor(*sets)
+    if functions:
+        from pipelines.learn.own import FunctionExtractor
+
+        features = FunctionExtractor(*sets, tuple(functions))
     classifier: ClassifierMixin
     if recipe == "svm":
         classifier = GroupedSVC(candidates, gap=gap, seed=seed)
@@ -107,6 +111,8 @@ def make_recipe(
         features = SampleExtractor(*sets, with_features=True)
         classifier = GroupedStack(choose=recipe == "best", candidates=candidates, gap=gap, seed=seed)
     else:
+        from pipelines.learn.own import OwnClassifier
+
         made = recipe if hasattr(recipe, "fit") and not isinstance(recipe, type) else recipe()
         if isinstance(made, WindowPipeline):
             return made
@@ -131,6 +137,10 @@ def recipe_of(settings: LearnSettings, text: str = FEATURE_RECIPE) -> WindowPipe
     """
     name, separator, sets = text.partition("@")
     options: dict[str, Any] = {}
+    if ":" in name or settings.feature:
+        from pipelines.learn.own import load_named
+
+        options["functions"] = [load_named(each) for each in settings.feature]
     if settings.params is not None and name not in WITHOUT_SVM:
         from pipelines.learn.params import read_params
 
@@ -140,7 +150,6 @@ def recipe_of(settings: LearnSettings, text: str = FEATURE_RECIPE) -> WindowPipe
         tuple(part.strip() for part in sets.split(",")) if separator else settings.signal_sets,
         gap=settings.rule.overlap,
         seed=settings.seed,
-        functions=[load_named(each) for each in settings.feature],
         **options,
     )
 
