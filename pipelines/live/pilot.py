@@ -189,11 +189,6 @@ class LivePilot:
         return {name: Health(status).name.lower() for name, status in zip(SENSORS, self._health, strict=True)}
 
     @property
-    def nis(self) -> dict[str, float]:
-        """NIS of each sensor of the filter at the last step, a row; NaN where it measured nothing."""
-        return {} if self._estimator is None else self._estimator.resident.nis
-
-    @property
     def dropped(self) -> dict[str, int]:
         """What was not taken so far, and how often a clock was set, as counts by stream and kind."""
         return self._clocks.counts | ({} if self._estimator is None else self._estimator.dropped)

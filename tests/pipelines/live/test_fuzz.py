@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pipelines.live.pilot import LivePilot
-from pipelines.live.pilot_settings import CONTROLLERS, PilotSettings
+from pipelines.live.pilot_settings import CONTROLLERS, PilotSettings, PilotStatus
 from terrain.logs.replay import replay
 from terrain.records import Reading, Sample
 from terrain.robots import load_robot
@@ -97,6 +97,7 @@ def test_2500_odd_samples_of_each_controller_neither_raise_nor_command_nonsense(
         for k in range(2500):
             sample = sound[k % len(sound)]
             command = pilot.step(odd_sample(rng, sample) if rng.random() < 0.7 else sample)
+            assert tuple(command.status) == PilotStatus._fields
             for row in (command.wheel_radps, command.steer_rad, command.twist):
                 assert row.shape == (3,)
                 assert np.isfinite(row).all()

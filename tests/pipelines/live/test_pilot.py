@@ -1,10 +1,8 @@
 """The live chain: it never raises, reports its status, and improves the drive in the closed loop."""
 
-import gc
 import math
 import subprocess
 import sys
-import tracemalloc
 from dataclasses import replace
 from functools import cache
 
@@ -13,7 +11,7 @@ import pytest
 
 from pipelines.drive.controllers import DriveInputs, drive_once, make_controller
 from pipelines.live.pilot import LivePilot
-from pipelines.live.pilot_settings import CONTROLLERS, PilotSettings
+from pipelines.live.pilot_settings import PilotSettings
 from pipelines.live.terrain_source import KnownTerrain
 from terrain.control.drive_metrics import distance_within, drive_history, final_speed, slip_peak
 from terrain.control.pid import Gains
@@ -47,20 +45,8 @@ def recorded(scenario="straight", duration_s=16.0, terrain="grass"):
     return list(replay(simulate_run(ROBOT, terrain, scenario, 7, duration_s=duration_s)))
 
 
-def sane(command, names=None):
-    """Check a command, and return its status."""
-    for row in (command.wheel_radps, command.steer_rad, command.twist):
-        assert row.shape == (3,)
-        assert np.isfinite(row).all()
-    assert names is None or list(command.status) == names
-    return int(command.status["status_code"])
-
-
-# What arrives
-
-
-def readings(make):
-    """The same wrong reading of every sensor."""
+def everywhere(make):
+    """The same reading of every sensor."""
     return {
         name: make(width) for name, width in (("wheels", 6), ("steering", 3), ("imu", 9), ("odometry", 16))
     }
@@ -68,35 +54,10 @@ def readings(make):
 
 WRONG = {
     "nothing": {},
-    "empty": readings(lambda width: Reading(np.empty(0), np.empty((0, width)))),
-    "NaN": readings(lambda width: Reading(np.array([NAN]), np.full((1, width), NAN))),
-    "infinite": readings(lambda width: Reading(np.array([math.inf]), np.full((1, width), math.inf))),
-    "too wide": readings(lambda width: Reading(np.array([8.0]), np.zeros((1, width + 3)))),
-    "too few": readings(lambda width: Reading(np.array([8.0, 8.01]), np.zeros((1, width)))),
-    "flat": readings(lambda width: Reading(np.array([8.0]), np.zeros(width))),
-    "lists": readings(lambda width: Reading([8.0], [[0.0] * width])),
-    "words": readings(lambda width: Reading(["soon"], [["much"] * width])),
-    "None": readings(lambda width: Reading(None, None)),
-    "huge": readings(lambda width: Reading(np.array([8.0]), np.full((1, width), 1e300))),
+    "NaN": everywhere(lambda width: Reading(np.array([NAN]), np.full((1, width), NAN))),
+    "too wide": everywhere(lambda width: Reading(np.array([8.0]), np.zeros((1, width + 3)))),
+    "None": everywhere(lambda width: Reading(None, None)),
 }
-TWISTS = [np.full(3, NAN), np.array([math.inf, 0, 0]), np.zeros(2), np.array([1e9, -1e9, 1e9]), None]
-TIMES_S = [NAN, math.inf, -math.inf, 0.0, 1e12]
-
-
-@pytest.mark.parametrize("controller", CONTROLLERS)
-def test_for_any_input_commands_are_finite_and_statuses_have_the_same_names(controller):
-    live = pilot(controller)
-    samples = recorded()
-    names = list(live.step(samples[0]).status)
-    with np.errstate(all="ignore"):  # numbers of 1e300 are squared
-        for k, sample in enumerate(samples[1:300]):
-            if k % 3 == 0:
-                sample = sample._replace(readings=list(WRONG.values())[k // 3 % len(WRONG)])
-            if k % 10 == 1:
-                sample = sample._replace(twist=TWISTS[k // 10 % len(TWISTS)])
-            if k % 10 == 2:
-                sample = sample._replace(time_s=TIMES_S[k // 10 % len(TIMES_S)])
-            sane(live.step(sample), names)
 
 
 @pytest.mark.parametrize("wrong", WRONG)
@@ -104,9 +65,8 @@ def test_without_readings_it_reports_so_and_fades_to_the_desired_speed(wrong):
     live, twist = pilot(), np.array([0.6, 0.2, 0.1])
     for k in range(200):
         command = live.step(Sample(k * DT_S, twist, WRONG[wrong]))
-        why = sane(command)
         if k > 100:
-            assert why != TractionStatus.OK
+            assert command.status["status_code"] != TractionStatus.OK
     reference = LivePilot(ROBOT, TABLE, settings=PilotSettings(controller="plain"))
     for k in range(200):
         plain = reference.step(Sample(k * DT_S, twist, {}))
@@ -130,67 +90,14 @@ def test_a_wrong_clock_causes_no_jump_and_no_end_of_slip_control(time_s):
             assert (rise * ROBOT.wheel_radius_m <= SETTINGS.fade_mps2 * DT_S + 0.05).all()
             before = command
         if 8.3 < sample.time_s < 12.0:
-            assert sane(command) == TractionStatus.OK
+            assert command.status["status_code"] == TractionStatus.OK
 
 
 def test_a_step_at_the_same_time_is_reported():
     live = pilot()
     for sample in recorded()[:300]:
         live.step(sample)
-    assert sane(live.step(sample._replace(readings={}))) == TractionStatus.BAD_TIME
-
-
-def test_a_clock_that_is_never_valid_leaves_a_robot_that_drives():
-    live, twist = pilot(), np.array([0.5, 0.0, 0.0])
-    for _ in range(60):
-        command = live.step(Sample(NAN, twist, {}))
-        assert sane(command) == TractionStatus.UNSOUND
-    assert command.wheel_radps == pytest.approx(np.full(3, 2.5))
-
-
-@pytest.mark.parametrize("wrong", [None, "sample", 7, Sample("now", "there", [1, 2], None)])
-def test_what_is_no_sample_at_all_costs_a_step(wrong):
-    live = pilot()
-    names = list(live.step(recorded()[0]).status)
-    for _ in range(3):
-        sane(live.step(wrong), names)
-
-
-@pytest.mark.parametrize("controller", CORRECTING)
-def test_the_same_samples_give_the_same_bytes(controller):
-    def drive():
-        live = pilot(controller)
-        commands = [live.step(sample) for sample in recorded()]
-        return b"".join(
-            np.concatenate([c.wheel_radps, c.steer_rad, c.twist, list(c.status.values())]).tobytes()
-            for c in commands
-        )
-
-    assert drive() == drive()
-
-
-@pytest.mark.slow
-def test_memory_does_not_grow():
-    live, samples = pilot(), recorded()
-    step_s = samples[1].time_s - samples[0].time_s
-    span_s = samples[-1].time_s - samples[0].time_s + step_s
-
-    def lap(number):
-        for sample in samples:
-            later = {n: Reading(r.time_s + number * span_s, r.values) for n, r in sample.readings.items()}
-            live.step(sample._replace(time_s=sample.time_s + number * span_s, readings=later))
-
-    lap(0)
-    tracemalloc.start()
-    held = []
-    for number in range(1, 4):
-        lap(number)
-        gc.collect()  # free lists of the interpreter too
-        held.append(tracemalloc.get_traced_memory()[0])
-    tracemalloc.stop()
-    # bytes a step: less than an array takes, more than what numba's boxing leaves to its lists; what grows
-    # does so in every lap, a cache that fills in one of them does not
-    assert min(np.diff(held)) < 64 * len(samples)
+    assert live.step(sample._replace(readings={})).status["status_code"] == TractionStatus.BAD_TIME
 
 
 def test_it_needs_neither_tracking_nor_a_web_server():
@@ -287,27 +194,6 @@ def test_a_lost_camera_is_named_within_a_third_of_a_second(lost_s):
     assert np.ptp(control.channel("driven_mps")[gone]) < 0.01
 
 
-def test_a_start_without_a_camera_fades_in_and_learns_nothing():
-    """Lost while it stands: status says so, and the robot drives as commanded."""
-    faults = Faults(camera_lost_s=((0.5, 6.0),))
-    run, _ = driven("known:grass", "straight", "grass", 200, faults=faults, duration_s=8.0)
-    control = run.streams["control"]
-    time_s = control.time_s
-    gone = (time_s > 4.0) & (time_s < 6.0)
-    assert set(control.channel("status_code")[gone]) == {TractionStatus.UNSOUND}
-    assert np.isnan(control.channel("balance_ratio")[time_s < 6.0]).all()
-    assert control.channel("driven_mps")[gone] == pytest.approx(1.0)
-    assert set(control.channel("status_code")[time_s > 6.5]) == {TractionStatus.OK}
-
-
-def test_without_any_camera_the_plain_command_is_driven():
-    faults = Faults(camera_lost_s=((0.0, 20.0),))
-    run, _ = driven("known:grass", "straight", "grass", 200, faults=faults, duration_s=6.0)
-    control = run.streams["control"]
-    assert set(control.channel("status_code")) == {TractionStatus.UNSOUND}
-    assert control.channel("driven_mps") == pytest.approx(control.channel("desired_mps"), abs=0.03)
-
-
 @pytest.mark.parametrize("seed", SEEDS)
 def test_a_start_on_grass_slips_less_and_travels_nearly_as_far(seed):
     plain, limited = (history(name, "starts", "grass", seed) for name in ("plain", "known:grass"))
@@ -400,23 +286,10 @@ def test_the_expected_deceleration_is_larger_uphill_in_any_direction(direction, 
     live.step(Sample(0.02, np.zeros(3), {"wheels": wheels, "imu": imu}, "snow"))
     now = live._now
     now.estimate = now.estimate._replace(speed_x_mps=direction[0], speed_y_mps=direction[1])
-    level = live._aims.of("snow").braking.mps2
+    level = live._aims["snow"].braking.mps2
     found = live._target(0.02)
     assert found.braking_mps2 - level == pytest.approx(uphill * 9.81 * math.sin(0.1), rel=0.01)
-    assert live._target(0.02).braking_ratio == live._aims.of("snow").braking.slip_ratio
-
-
-def test_nis_is_read_by_sensor_and_nan_where_nothing_was_measured():
-    live = pilot()
-    assert np.isnan(list(live.nis.values())).all()
-    for sample in recorded():
-        live.step(sample)
-        if 7.0 < sample.time_s < 8.0:
-            break
-    assert {"gyro", "camera_speed", "wheel_1", "rest"} <= set(live.nis)
-    assert live.nis["gyro"] >= 0.0
-    assert np.isnan(live.nis["rest"])  # it moves
-    assert pilot("plain").nis == {}
+    assert live._target(0.02).braking_ratio == live._aims["snow"].braking.slip_ratio
 
 
 def judged(**statuses):

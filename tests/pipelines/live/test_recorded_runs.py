@@ -12,7 +12,6 @@ from pipelines.data.inspect import run as inspect_runs
 from pipelines.learn.crossval import EvaluationSettings
 from pipelines.learn.predict import predict
 from pipelines.learn.protocols import samples_of
-from pipelines.live.classifying import AtOnce
 from pipelines.live.observer import Observer
 from pipelines.live.pilot import LivePilot
 from pipelines.live.recording import RecordingThread, SessionRecorder
@@ -27,20 +26,6 @@ from terrain.simulation.scenario.make import make_scenario
 from terrain.terramechanics.soil import load_soil
 
 AGRIMARO = load_robot("agrimaro")
-
-
-class Kept(AtOnce):
-    """Hands each output to a recorder, as a session does."""
-
-    def __init__(self, recorder):
-        super().__init__()
-        self.recorder = recorder
-
-    def finished(self):
-        found = super().finished()
-        for output in found:
-            self.recorder.window(output)
-        return found
 
 
 @pytest.fixture
@@ -70,10 +55,11 @@ def test_a_recorded_observer_is_predicted_as_it_was_live(writer, tmp_path, mower
     run = cut_at_the_start(two_drives[4], begin_s)
     channels = {name: stream.channels for name, stream in run.streams.items()}
     recorder = SessionRecorder(tmp_path, "session", "mower", channels, writer=writer)
-    observer = Observer(mower_model, channels=channels, classifying=Kept(recorder))
+    observer = Observer(mower_model, channels=channels)
     for sample in replay(run, 20.0):
         recorder.readings(sample.readings)
-        observer.update(sample.readings)
+        for output in observer.update(sample.readings):
+            recorder.window(output)
     (path,) = recorder.close(10.0)
     (again,) = load_runs(path)
     assert not again.dropped
@@ -92,7 +78,8 @@ def test_a_recorded_observer_is_predicted_as_it_was_live(writer, tmp_path, mower
 )
 def test_a_recorded_pilot_is_predicted_as_it_was_live(writer, tmp_path, swerve_model, begin_s):
     recorder = SessionRecorder(tmp_path, "drive", "agrimaro", CHANNELS, AGRIMARO.wheels, writer=writer)
-    pilot = LivePilot(AGRIMARO, source=Classifier(swerve_model, AGRIMARO, Kept(recorder)))
+    source = Classifier(swerve_model, AGRIMARO)
+    pilot = LivePilot(AGRIMARO, source=source)
     commands = []
 
     def session(sample):
@@ -102,6 +89,8 @@ def test_a_recorded_pilot_is_predicted_as_it_was_live(writer, tmp_path, swerve_m
         recorder.readings(readings)
         commands.append(pilot.step(sample._replace(readings=readings)))
         recorder.command(sample.time_s, sample.twist, commands[-1])
+        for output in source.outputs:
+            recorder.window(output)
         return commands[-1]
 
     drive = make_scenario("survey", AGRIMARO, "grass", 24.0, seed=5)

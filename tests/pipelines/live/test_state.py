@@ -125,12 +125,6 @@ def driven_status(pilot, log):
     return [pilot.step(sample).status for sample in replay(log) if sample.time_s < 5.0][-1]
 
 
-def test_a_pilot_that_runs_is_not_restored(log):
-    pilot = driven(LivePilot(ROBOT), log, to_s=1.0)
-    with pytest.raises(DataError, match="cannot start from another state"):
-        pilot.restore(STATE, STATE.saved_s)
-
-
 def test_open_loop_pilots_have_a_state_without_biases():
     state = LivePilot(ROBOT, settings=PilotSettings(controller="plain")).state(5.0)
     assert (state.biases, state.filter) == ({}, "")

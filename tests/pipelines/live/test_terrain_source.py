@@ -15,7 +15,7 @@ from terrain.errors import DataError
 from terrain.estimation.live.estimator import LiveEstimator
 from terrain.kinematics.wheel_speed import with_wheel_speeds
 from terrain.logs.replay import replay
-from terrain.records import Reading, RunLog, Sample, Stream
+from terrain.records import RunLog, Sample, Stream
 from terrain.robots import load_robot
 from terrain.simulation.run import simulate_run
 
@@ -119,55 +119,6 @@ def test_a_belief_outlasts_a_stop(model, log):
     for k in range(1500):  # half a minute
         last = pilot.step(Sample(sample.time_s + 0.02 * (k + 1), np.zeros(3), {})).status
     assert last["terrain_code"] >= 0
-
-
-WIDTHS = {"wheels": 6, "imu": 9}
-
-
-@pytest.mark.parametrize(
-    "make",
-    [
-        lambda width: Reading(np.array([9.0]), np.full((1, width), np.nan)),
-        lambda width: Reading(np.array([np.nan]), np.zeros((1, width))),
-        lambda width: Reading(np.array([5.0]), np.zeros((1, width))),
-        lambda width: Reading(np.empty(0), np.empty((0, width))),
-        lambda width: Reading(np.array([9.0, 9.1]), np.zeros((1, width))),
-        lambda width: Reading(np.array([9.0]), np.zeros((1, 2 * width))),
-        lambda width: Reading([9.0], [["a"] * width]),
-        lambda width: Reading(None, None),
-    ],
-)
-def test_invalid_readings_cost_windows_and_no_more(model, log, make):
-    def spoil(sample):
-        if not 9.0 <= sample.time_s < 9.1:
-            return sample
-        return sample._replace(readings={name: make(width) for name, width in WIDTHS.items()})
-
-    found, _ = live(Classifier(model, ROBOT), log, spoil)
-    whole, _ = live(Classifier(model, ROBOT), log)
-    assert [one[:2] for one in found[-3:]] == [one[:2] for one in whole[-3:]]
-    assert [one.probability for one in found[-3:]] == pytest.approx(
-        [one.probability for one in whole[-3:]], abs=0.01
-    )
-    assert len(whole) - 2 <= len(found) <= len(whole)
-
-
-def test_a_window_that_the_model_refuses_is_counted_and_raises_nothing(model, log):
-    class Refusing:
-        classes_ = model.recipe.classes_
-        asked = 0
-
-        def predict_proba(self, windows):
-            self.asked += 1
-            if self.asked % 2:
-                raise ValueError("Input X contains NaN.")
-            return model.recipe.predict_proba(windows)
-
-    classifier = Classifier(model._replace(recipe=Refusing()), ROBOT)
-    found, shown = live(classifier, log)
-    assert classifier.failed == {"Input X contains NaN.": (len(shown) + 1) // 2}
-    assert classifier.n_refused == (len(shown) + 1) // 2
-    assert len(found) == len(shown) // 2
 
 
 @pytest.mark.parametrize(

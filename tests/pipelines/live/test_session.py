@@ -66,14 +66,20 @@ def drive(session, log, change=lambda session, sample: None):
     return outputs
 
 
+@pytest.fixture(scope="module")
+def plain(log, swerve_model):
+    """The outputs of a session that is driven as it is."""
+    return drive(agrimaro(swerve_model), log)
+
+
 def steered(pilot, log):
     """A pilot that begins with the steering where it is measured first."""
     pilot.start_steering(log.streams["steering"].values[0])
     return pilot
 
 
-def test_commands_are_those_of_a_pilot_that_is_given_the_samples_at_once(log, swerve_model):
-    outputs = drive(agrimaro(swerve_model), log)
+def test_commands_are_those_of_a_pilot_that_is_given_the_samples_at_once(log, plain, swerve_model):
+    outputs = plain
     pilot = steered(LivePilot(ROBOT, TABLE, Classifier(swerve_model, ROBOT)), log)
     n_driving = 0
     for output, sample in zip(outputs, replay(log), strict=True):
@@ -103,26 +109,21 @@ def test_terrain_is_that_of_an_observer_for_a_robot_without_a_description(mower_
 
 
 def test_two_sessions_on_one_model_do_not_know_of_each_other(mower_model, two_drives):
-    alone = [drive(mower(mower_model), run) for run in (two_drives[0], two_drives[3])]
-    sessions = [mower(mower_model, "one"), mower(mower_model, "two")]
-    both = [[], []]
-    for samples in zip(replay(two_drives[0]), replay(two_drives[3]), strict=True):
-        for k, (session, sample) in enumerate(zip(sessions, samples, strict=True)):
+    runs = two_drives[0], two_drives[3]
+    sessions, both = (mower(mower_model, "one"), mower(mower_model, "two")), ([], [])
+    for samples in zip(*map(replay, runs), strict=True):
+        for session, sample, found in zip(sessions, samples, both, strict=True):
             send(session, sample)
-            both[k].append(session.step(NOW_S + sample.time_s))
-
-    def terrain_of(outputs):
-        seen = [output.observation for output in outputs]
-        return [(one.terrain, one.window and one.window[:4]) for one in seen]
-
-    for k in (0, 1):
-        assert terrain_of(both[k]) == terrain_of(alone[k])
-    assert terrain_of(both[0]) != terrain_of(both[1])
+            found.append(session.step(NOW_S + sample.time_s).observation)
+    seen = [[(one.terrain, one.window and one.window[:4]) for one in found] for found in both]
+    for run, found in zip(runs, seen, strict=True):
+        alone = [output.observation for output in drive(mower(mower_model), run)]
+        assert found == [(one.terrain, one.window and one.window[:4]) for one in alone]
+    assert seen[0] != seen[1]
 
 
-def test_columns_are_taken_by_name_and_what_is_not_sent_is_unknown(log, swerve_model):
-    order = {name: names[::-1] for name, names in SENT.items()}
-    plain, session = drive(agrimaro(swerve_model), log), agrimaro(swerve_model, order)
+def test_columns_are_taken_by_name_and_what_is_not_sent_is_unknown(log, plain, swerve_model):
+    session = agrimaro(swerve_model, {name: names[::-1] for name, names in SENT.items()})
     for sample, desired in zip(replay(log), plain, strict=True):
         turned = {
             name: reading._replace(values=reading.values[:, ::-1])
@@ -249,12 +250,12 @@ def test_what_was_refused_is_counted_by_reason():
     }
 
 
-def test_a_swap_to_the_same_windows_loses_none(log, swerve_model):
+def test_a_swap_to_the_same_windows_loses_none(log, plain, swerve_model):
     def swap(session, sample):
         if 500 <= round(sample.time_s * 50) % 600 < 503:
             session.swap(Served(session.served.number + 1, swerve_model._replace(), "again", TABLE))
 
-    plain, swapped = drive(agrimaro(swerve_model), log), drive(agrimaro(swerve_model), log, swap)
+    swapped = drive(agrimaro(swerve_model), log, swap)
     assert swapped[-1].observation.served == 7
     for one, other in zip(plain, swapped, strict=True):
         assert one.observation.terrain == other.observation.terrain
@@ -387,11 +388,3 @@ def test_a_stream_that_ended_before_the_clock_was_set_back_is_lost():
     for k in range(20):
         health.take({"imu": reading}, 1000.0 + 0.1 * k)
     assert health.health(1002.0) == {"imu": "fresh", "wheels": "lost"}
-
-
-def test_a_restart_with_state_knows_the_terrain(log, swerve_model):
-    session = agrimaro(swerve_model)
-    drive(session, log)
-    again = agrimaro(swerve_model)
-    again.restore(session.state(1000.0), 1003.0)
-    assert again.belief.terrain == "grass"
