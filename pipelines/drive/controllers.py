@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 from pipelines.drive.controller_names import KINDS, TRACK, Source, kind_of
 from pipelines.learn.model_file import TerrainModel
 from pipelines.live.pilot import LivePilot
-from pipelines.live.pilot_settings import PilotSettings
 from pipelines.live.terrain_source import Classifier, KnownTerrain, NoTerrain, TerrainSource
 from pipelines.report import Progress, silent
+from terrain.control.pilot_settings import PilotSettings
 from terrain.control.situations import Situation
 from terrain.control.slip_table import SlipTable
 from terrain.errors import ConfigError

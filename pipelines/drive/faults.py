@@ -18,7 +18,6 @@ import numpy as np
 from pipelines.drive.drive import ALL
 from pipelines.learn.parallel import parallel
 from pipelines.live.pilot import LivePilot
-from pipelines.live.pilot_settings import PilotSettings
 from pipelines.live.terrain_source import KnownTerrain
 from pipelines.report import (
     NOT_KNOWN,
@@ -57,6 +56,7 @@ from terrain.control.fault_drives import (
 from terrain.control.fault_evaluation import BARS, LIMITS, Limits, bar_texts
 from terrain.control.fault_situations import STOP, make_fault_situation
 from terrain.control.learned_table import learned_table
+from terrain.control.pilot_settings import PilotSettings
 from terrain.control.slip_table import SlipTable, load_slip_table
 from terrain.errors import ConfigError
 from terrain.robots import Robot, SwerveRobot, as_drive, load_robot

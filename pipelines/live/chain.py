@@ -15,13 +15,13 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from pipelines.live.classifying import Classifying, WindowOutput
+from pipelines.live.classifying import AtOnce, WindowOutput
 from pipelines.live.model import LiveModel
 from pipelines.live.pilot import LivePilot
-from pipelines.live.pilot_settings import DEFAULT_SETTINGS, PilotSettings, check_table
 from pipelines.live.state import LiveState, Restorable
 from pipelines.live.terrain_source import Classifier, NoTerrain
 from pipelines.live.windows import Estimate
+from terrain.control.pilot_settings import DEFAULT_SETTINGS, PilotSettings, check_table
 from terrain.control.slip_table import SlipTable
 from terrain.control.switching import TerrainBelief
 from terrain.control.traction import TractionStatus
@@ -122,7 +122,7 @@ class PilotChain(LivePilot):
         model: LiveModel | None,
         table: SlipTable,
         channels: Mapping[str, Sequence[str]],
-        classifying: Classifying | None = None,
+        classifying: AtOnce | None = None,
         settings: PilotSettings = DEFAULT_SETTINGS,
     ) -> None:
         self._make = partial(Classifier, robot=robot, classifying=classifying)

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from time import perf_counter
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
@@ -103,29 +103,10 @@ class Part(NamedTuple):
     feed: WindowFeed
 
 
-class Classifying(Protocol):
-    """Takes what was measured and estimated, and gives the outputs of its windows some time later."""
-
-    def begin(self, part: Part) -> None:
-        """Cut and classify from now on with a model; what was taken before is for the model before."""
-        ...
-
-    def put(self, readings: Mapping[str, Reading], estimates: Sequence[Estimate]) -> None:
-        """Take what came since the last call; the arrays are kept and must not change."""
-        ...
-
-    def finished(self) -> list[WindowOutput]:
-        """Return the outputs since the last call, in the order of their windows."""
-        ...
-
-    @property
-    def dropped(self) -> Mapping[str, int]:
-        """Windows and samples that were not used, as counts by kind."""
-        ...
-
-
 class AtOnce:
-    """Cuts and classifies in the caller's own time: for logs and simulations, which can wait.
+    """Takes what was measured and estimated, and gives the outputs of its windows: here in the caller's own time.
+
+    For logs and simulations, which can wait; arrays that are taken are kept and must not change.
 
     Parameters
     ----------
@@ -138,7 +119,7 @@ class AtOnce:
         self._part: Part | None = None
 
     def begin(self, part: Part) -> None:
-        """Go on with a model."""
+        """Cut and classify from now on with a model; what was taken before is for the model before."""
         self._part = part
 
     def put(self, readings: Mapping[str, Reading], estimates: Sequence[Estimate]) -> None:
@@ -148,7 +129,7 @@ class AtOnce:
                 self._finished.append(self._classify(self._part.model, window))
 
     def finished(self) -> list[WindowOutput]:
-        """Return the outputs since the last call."""
+        """Return the outputs since the last call, in the order of their windows."""
         found = []
         while self._finished:
             found.append(self._finished.popleft())

@@ -9,12 +9,12 @@ import numpy as np
 
 from pipelines.live.arrivals import ClockWatch, last_stamp_s
 from pipelines.live.chain import Step
-from pipelines.live.classifying import Classifying, WindowOutput
+from pipelines.live.classifying import AtOnce, WindowOutput
 from pipelines.live.model import LiveModel
-from pipelines.live.pilot_settings import check_table
 from pipelines.live.state import LiveState, Restorable, restorable, state_of
 from pipelines.live.terrain_source import Classifier
 from pipelines.live.windows import Estimate, live_estimator
+from terrain.control.pilot_settings import check_table
 from terrain.control.slip_table import SlipTable, load_slip_table
 from terrain.control.switching import (
     NO_BELIEF,
@@ -71,7 +71,7 @@ class Observer:
         robot: Robot | None = None,
         channels: Mapping[str, Sequence[str]] | None = None,
         *,
-        classifying: Classifying | None = None,
+        classifying: AtOnce | None = None,
         switching: SwitchSettings = SWITCHING,
     ) -> None:
         self.table = load_slip_table() if table is None else table
@@ -117,7 +117,7 @@ class Observer:
     @property
     def dropped(self) -> dict[str, int]:
         """What was not used so far, as counts by kind."""
-        counts = self._source.dropped | ({"time: clock set": n} if (n := self._watch.n_set) else {})
+        counts = dict(self._source.dropped) | ({"time: clock set": n} if (n := self._watch.n_set) else {})
         return counts | (dict(self._filter.dropped) if self._filter is not None else {})
 
     def check(self, model: LiveModel | None, table: SlipTable) -> None:

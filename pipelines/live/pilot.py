@@ -16,9 +16,20 @@ from operator import itemgetter
 
 import numpy as np
 
-from pipelines.live.aims import Aims
 from pipelines.live.over_time import without_dwell
-from pipelines.live.pilot_settings import (
+from pipelines.live.state import LiveState, Restorable, restorable, state_of
+from pipelines.live.terrain_source import NoTerrain, TerrainSource
+from terrain.constants import GRAVITY_MPS2
+from terrain.control.actuation import Actuation
+from terrain.control.aims import Aims
+from terrain.control.path_tracking import (
+    PoseEstimate,
+    TrackReport,
+    TrackStatus,
+    initial_tracking,
+    track_step,
+)
+from terrain.control.pilot_settings import (
     DEFAULT_SETTINGS,
     OPEN_LOOP,
     PilotSettings,
@@ -26,17 +37,6 @@ from pipelines.live.pilot_settings import (
     check_pilot,
     check_table,
     wheel_controller,
-)
-from pipelines.live.state import LiveState, Restorable, restorable, state_of
-from pipelines.live.terrain_source import NoTerrain, TerrainSource
-from terrain.constants import GRAVITY_MPS2
-from terrain.control.actuation import Actuation
-from terrain.control.path_tracking import (
-    PoseEstimate,
-    TrackReport,
-    TrackStatus,
-    initial_tracking,
-    track_step,
 )
 from terrain.control.slip_table import SlipTable, load_slip_table
 from terrain.control.switching import (

@@ -16,12 +16,12 @@ import numpy as np
 
 from pipelines.live.arrivals import Inbox, SessionClock, StreamHealth, as_numbers
 from pipelines.live.chain import Chain, CommandStatus, PilotChain
-from pipelines.live.classifying import Classifying, WindowOutput
+from pipelines.live.classifying import AtOnce, WindowOutput
 from pipelines.live.model import LiveModel
 from pipelines.live.observer import Observer
-from pipelines.live.pilot_settings import PilotSettings
 from pipelines.live.recording import SessionRecorder
 from pipelines.live.state import LiveState, Restorable
+from terrain.control.pilot_settings import PilotSettings
 from terrain.control.slip_table import SlipTable
 from terrain.control.switching import TerrainBelief
 from terrain.errors import ConfigError, DataError
@@ -152,7 +152,7 @@ class RobotSession:
     """
 
     def __init__(
-        self, request: SessionRequest, served: Served, robot: Robot | None, classifying: Classifying
+        self, request: SessionRequest, served: Served, robot: Robot | None, classifying: AtOnce
     ) -> None:
         self.request, self.served = request, served
         self.inbox = Inbox({stream: len(names) for stream, names in request.channels.items()})
@@ -335,7 +335,7 @@ _NOT_DECIDED = (CommandStatus.NO_SAMPLES, CommandStatus.FAILED)
 """Statuses of commands that no controller has decided on: they are not recorded."""
 
 
-def _chain(request: SessionRequest, served: Served, robot: Robot | None, classifying: Classifying) -> Chain:
+def _chain(request: SessionRequest, served: Served, robot: Robot | None, classifying: AtOnce) -> Chain:
     """Return what the samples of a robot go through."""
     if not request.control:
         if served.model is None:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
-from pipelines.live.classifying import AtOnce, Classifying, Part, WindowOutput
+from pipelines.live.classifying import AtOnce, Part, WindowOutput
 from pipelines.live.model import LiveModel
 from pipelines.live.over_time import ground_filter, without_dwell
 from pipelines.live.windows import Estimate, WindowFeed, live_filter, needs_filter
@@ -29,39 +29,36 @@ class TerrainEstimate(NamedTuple):
     probability: float
 
 
-class TerrainSource(Protocol):
-    """Gives the terrain from time to time.
+class TerrainSource:
+    """Gives the terrain from time to time; this one never does.
 
-    ``certain``: each output is accepted at once, and holds until the next.  ``settled``: it was filtered over
-    time, and waits for no dwell.  ``n_refused``: number of windows without an output.
+    Attributes
+    ----------
+    certain : each output is accepted at once, and holds until the next
+    settled : it was filtered over time, and waits for no dwell
+    n_refused : number of windows without an output
+    outputs : of a model, at the last sample
     """
-
-    certain: bool
-
-    @property
-    def settled(self) -> bool: ...  # noqa: D102
-    @property
-    def n_refused(self) -> int: ...  # noqa: D102
-
-    def update(self, sample: Sample, estimates: Sequence[Estimate]) -> list[TerrainEstimate]:
-        """Take a sample and the estimates made from it; return the terrains found, in most steps none."""
-        ...
-
-
-class NoTerrain:
-    """No source: the terrain stays unknown, and the table's fallback is used."""
 
     certain = settled = False
     n_refused = 0
     outputs: Sequence[WindowOutput] = ()
-    dropped: Mapping[str, int] = {}
+
+    @property
+    def dropped(self) -> Mapping[str, int]:
+        """Windows and samples that were not used, as counts by kind."""
+        return {}
 
     def update(self, sample: Sample, estimates: Sequence[Estimate]) -> list[TerrainEstimate]:
-        """Return nothing."""
+        """Take a sample and the estimates made from it; return the terrains found, in most steps none."""
         return []
 
 
-class KnownTerrain(NoTerrain):
+class NoTerrain(TerrainSource):
+    """No source: the terrain stays unknown, and the table's fallback is used."""
+
+
+class KnownTerrain(TerrainSource):
     """The true terrain of the samples, at every change of it.
 
     Parameters
@@ -83,7 +80,7 @@ class KnownTerrain(NoTerrain):
         return [TerrainEstimate(sample.time_s, self._name_of(sample.terrain), 1.0)]
 
 
-class Classifier:
+class Classifier(TerrainSource):
     """The output of a model for each live window, cut as the windows of its training.
 
     Parameters
@@ -97,7 +94,6 @@ class Classifier:
     Attributes
     ----------
     failed : number of windows that the model refused, by error message
-    outputs : those of the last sample, in most cases none
 
     Raises
     ------
@@ -106,36 +102,23 @@ class Classifier:
         of another filter than runs here.
     """
 
-    certain = False
-
     def __init__(
         self,
         model: LiveModel,
         robot: Robot | None,
-        classifying: Classifying | None = None,
+        classifying: AtOnce | None = None,
         channels: Mapping[str, Sequence[str]] = CHANNELS,
         filter_name: str = PILOT_FILTER,
     ) -> None:
         self.model, self._channels, self._filter_name = model, channels, filter_name
         self._robot = None if robot is None else correct_live(robot)[0]
-        self._classifying: Classifying = AtOnce() if classifying is None else classifying
-        self.outputs: list[WindowOutput] = []
+        self._classifying: AtOnce = AtOnce() if classifying is None else classifying
         self.failed: Counter[str] = Counter()
         self._feed = self.feed_of(model)
         self._begin(model)
 
     @property
-    def settled(self) -> bool:
-        """Whether the model's outputs are filtered over time."""
-        return self._over_time is not None
-
-    @property
-    def n_refused(self) -> int:
-        """Number of windows that the model refused."""
-        return self.failed.total()
-
-    @property
-    def dropped(self) -> dict[str, int]:
+    def dropped(self) -> Mapping[str, int]:
         """Windows and samples that were not used, as counts by kind."""
         refused = {f"window: refused, {why}": n for why, n in self.failed.items()}
         return {**self._classifying.dropped, **refused}
@@ -178,16 +161,16 @@ class Classifier:
 
     def _begin(self, model: LiveModel) -> None:
         self.model, self._over_time = model, ground_filter(model)
+        self.settled = self._over_time is not None
         self._classifying.begin(Part(model, self._feed))
 
     def take(self, readings: Mapping[str, Reading], estimates: Sequence[Estimate]) -> list[WindowOutput]:
         """Take readings and estimates; return the outputs of windows that are there by now."""
         self._classifying.put(readings, estimates)
-        self.outputs = self._classifying.finished()
-        for output in self.outputs:
-            if output.refused:
-                self.failed[output.refused] += 1
-        return self.outputs
+        self.outputs = outputs = self._classifying.finished()
+        self.failed.update(output.refused for output in outputs if output.refused)
+        self.n_refused = self.failed.total()
+        return outputs
 
     def terrain_of(self, output: WindowOutput) -> tuple[str, float] | None:
         """Return terrain and probability after an output, filtered over time where that is asked for."""

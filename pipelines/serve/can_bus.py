@@ -338,7 +338,7 @@ def bus_of(text: str) -> tuple[str, str]:
 def _pilot(settings: Settings, robot: Any) -> MakeStep:
     """Return what makes the step of the pilot that the settings describe; what is not accepted is refused."""
     from pipelines.live.pilot import LivePilot
-    from pipelines.live.pilot_settings import PilotSettings
+    from terrain.control.pilot_settings import PilotSettings
     from terrain.control.slip_table import load_slip_table
 
     table, source = load_slip_table(settings.table), None

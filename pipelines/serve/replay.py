@@ -226,8 +226,8 @@ def chain_of(run: RunLog, model: LiveModel | None, table: SlipTable, robot: Robo
     from pipelines.data.datasets import robot_of
     from pipelines.live.chain import PilotChain
     from pipelines.live.observer import Observer
-    from pipelines.live.pilot_settings import PilotSettings
     from pipelines.live.windows import needs_filter
+    from terrain.control.pilot_settings import PilotSettings
     from terrain.errors import ConfigError, DataError
     from terrain.estimation.live.estimator import CHANNELS
     from terrain.logs.replay import SENSORS

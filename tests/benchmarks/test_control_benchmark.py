@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from pipelines.live.pilot import LivePilot
-from pipelines.live.pilot_settings import PilotSettings
 from terrain.control.danzi_pid import new_state, thesis_settings, thesis_step
 from terrain.control.pid import Gains
+from terrain.control.pilot_settings import PilotSettings
 from terrain.control.traction import initial_state, traction_step
 from terrain.control.traction_settings import SETTINGS, TractionTarget, WheelMeasurements
 from terrain.logs.replay import replay

@@ -21,7 +21,6 @@ from pipelines.drive.controllers import DriveInputs, drive_once, make_controller
 from pipelines.drive.drive import Settings
 from pipelines.drive.run_figures import run_figures
 from pipelines.learn.model_file import TerrainModel
-from pipelines.live.pilot_settings import PilotStatus
 from pipelines.live.terrain_source import TerrainEstimate
 from pipelines.report import NOT_KNOWN
 from pipelines.report.json_file import as_json
@@ -33,6 +32,7 @@ from terrain.control.drive_evaluation import (
     evaluate_drive,
 )
 from terrain.control.drive_metrics import drive_history
+from terrain.control.pilot_settings import PilotStatus
 from terrain.control.power_state import DriveState
 from terrain.control.situations import make_situation
 from terrain.control.slip_table import CurveEntry, SlipTable, load_slip_table

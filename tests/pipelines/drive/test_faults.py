@@ -19,7 +19,6 @@ from pipelines.drive.faults import (
     fault_loop,
 )
 from pipelines.live.pilot import LivePilot
-from pipelines.live.pilot_settings import PilotSettings
 from pipelines.report.json_file import as_json
 from terrain.control.drive_metrics import drive_history, stopping_distance
 from terrain.control.fault_drives import (
@@ -31,6 +30,7 @@ from terrain.control.fault_drives import (
 )
 from terrain.control.fault_evaluation import BARS, RATIO_ABOVE_MPS, fault_drive, fault_figures
 from terrain.control.fault_situations import FAULT_SITUATIONS, make_fault_situation
+from terrain.control.pilot_settings import PilotSettings
 from terrain.control.slip_table import load_slip_table
 from terrain.errors import ConfigError
 from terrain.robots import load_robot

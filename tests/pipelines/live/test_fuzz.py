@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pipelines.live.pilot import LivePilot
-from pipelines.live.pilot_settings import CONTROLLERS, PilotSettings, PilotStatus
+from terrain.control.pilot_settings import CONTROLLERS, PilotSettings, PilotStatus
 from terrain.logs.replay import replay
 from terrain.records import Reading, Sample
 from terrain.robots import load_robot

@@ -11,10 +11,10 @@ import pytest
 
 from pipelines.drive.controllers import DriveInputs, drive_once, make_controller
 from pipelines.live.pilot import LivePilot
-from pipelines.live.pilot_settings import PilotSettings
 from pipelines.live.terrain_source import KnownTerrain
 from terrain.control.drive_metrics import distance_within, drive_history, final_speed, slip_peak
 from terrain.control.pid import Gains
+from terrain.control.pilot_settings import PilotSettings
 from terrain.control.situations import SituationOptions, make_situation, start_times
 from terrain.control.slip_table import CurveEntry, load_slip_table
 from terrain.control.traction import TractionStatus

@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 
 from pipelines.live.observer import Observer
 from pipelines.live.pilot import LivePilot
-from pipelines.live.pilot_settings import PilotSettings
 from pipelines.live.state import (
     BELIEF_FRESH_S,
     BIASES_FRESH_S,
@@ -23,6 +22,7 @@ from pipelines.live.state import (
     to_text,
 )
 from pipelines.live.terrain_source import KnownTerrain
+from terrain.control.pilot_settings import PilotSettings
 from terrain.control.slip_table import load_slip_table
 from terrain.errors import DataError
 from terrain.logs.replay import replay

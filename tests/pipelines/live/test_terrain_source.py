@@ -7,8 +7,8 @@ import pytest
 
 from features.windows import cut_windows
 from pipelines.live.pilot import LivePilot
-from pipelines.live.pilot_settings import PilotSettings, PilotStatus
 from pipelines.live.terrain_source import Classifier, KnownTerrain, NoTerrain
+from terrain.control.pilot_settings import PilotSettings, PilotStatus
 from terrain.control.slip_table import load_slip_table
 from terrain.control.switching import SWITCHING, OutputStatus
 from terrain.errors import DataError

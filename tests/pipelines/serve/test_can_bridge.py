@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from pipelines.data.can_codec import Frame, decode, encode, load_layout, run_frames
 from pipelines.data.can_signals import QUATERNION, RECEIVED, channels_of
 from pipelines.live.pilot import LivePilot
-from pipelines.live.pilot_settings import PilotSettings
 from pipelines.serve.can_bridge import (
     STALE_S,
     BridgeCore,
@@ -22,6 +21,7 @@ from pipelines.serve.can_bridge import (
     Theory,
     corrections,
 )
+from terrain.control.pilot_settings import PilotSettings
 from terrain.control.slip_table import load_slip_table
 from terrain.control.wheel_controllers import PERIOD_S
 from terrain.records import Command, Reading, Sample, Stream

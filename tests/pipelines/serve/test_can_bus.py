@@ -14,11 +14,11 @@ import pytest
 from pipelines.data.can_codec import Frame, decode, encode, load_layout
 from pipelines.data.can_signals import as_sent
 from pipelines.live.pilot import LivePilot
-from pipelines.live.pilot_settings import PilotSettings
 from pipelines.serve.can_bridge import BridgeCore, BridgeState
 from pipelines.serve.can_bus import Bridge, Link, frame_of, open_bus
 from pipelines.serve.serve import Settings, run
 from terrain.control.drive_metrics import drive_history, slip_peak
+from terrain.control.pilot_settings import PilotSettings
 from terrain.control.situations import SituationOptions, make_situation
 from terrain.control.slip_table import load_slip_table
 from terrain.errors import ConfigError

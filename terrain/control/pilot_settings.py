@@ -71,7 +71,7 @@ class PilotStatus(NamedTuple):
     Parameters
     ----------
     status_code : :class:`terrain.control.traction.TractionStatus`
-    terrain_code : place of the current terrain in :attr:`LivePilot.terrains`; -1 where it is unknown
+    terrain_code : place of the current terrain in the pilot's table; -1 where it is unknown
     probability_ratio : of the current terrain
     target_ratio, aimed_ratio : target slip, and the target with its floor
     balance_ratio : slip of steady motion
@@ -112,7 +112,7 @@ def check_pilot(robot: Robot, table: SlipTable, settings: PilotSettings) -> Swer
     Raises
     ------
     ConfigError
-        as :class:`LivePilot` does, apart from the settings of traction and tracking.
+        as a pilot does, apart from the settings of traction and tracking.
     """
     if settings.controller not in CONTROLLERS:
         raise ConfigError(
