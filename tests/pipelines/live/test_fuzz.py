@@ -30,40 +30,33 @@ class Hostile:
 def odd_value(rng, width):
     """One of many things that are no values (k, width), or are."""
     k = int(rng.integers(0, 4))
-    return (
-        lambda: rng.standard_normal((k, width)),
-        lambda: rng.standard_normal((k, width + int(rng.integers(1, 3)))),
-        lambda: 10.0 ** rng.uniform(-300, 300, (k, width)),
-        lambda: np.full((k, width), rng.choice([np.nan, np.inf, -np.inf])),
-        lambda: rng.integers(-9, 9, (k, width)),
-        lambda: [["much"] * width] * k,
-        lambda: [[0.0], [0.0, 1.0]],
-        lambda: None,
-        lambda: 10**400,
-        lambda: np.zeros((k, width, 2)),
-        lambda: np.zeros(width),
-        lambda: np.zeros((k, width), dtype=complex),
-        lambda: np.full((k, width), None),
-        lambda: Hostile(),
-        lambda: "wheels",
-        lambda: {"a": 1},
-    )[int(rng.integers(16))]()
+    things = (
+        rng.standard_normal((k, width)),
+        rng.standard_normal((k, width + int(rng.integers(1, 3)))),
+        10.0 ** rng.uniform(-300, 300, (k, width)),
+        np.full((k, width), rng.choice([np.nan, np.inf, -np.inf])),
+        rng.integers(-9, 9, (k, width)),
+        np.zeros((k, width, 2)),
+        np.zeros(width),
+        np.zeros((k, width), dtype=complex),
+        np.full((k, width), None),
+        *([["much"] * width] * k, [[0.0], [0.0, 1.0]], None, 10**400, Hostile(), "wheels", {"a": 1}),
+    )
+    return things[int(rng.integers(len(things)))]
 
 
 def odd_stamp(rng, time_s):
+    """One of many things that are no stamps (k,), or are."""
     k = int(rng.integers(0, 4))
-    return (
-        lambda: time_s + 0.005 * np.arange(k),
-        lambda: time_s - rng.uniform(0, 0.5, k),
-        lambda: time_s + rng.choice([3600.0, -3600.0, 1e300, -1e300]) + 0.005 * np.arange(k),
-        lambda: np.full(k, rng.choice([np.nan, np.inf, -np.inf])),
-        lambda: ["soon"] * k,
-        lambda: None,
-        lambda: time_s,
-        lambda: [10**400] * k,
-        lambda: Hostile(),
-        lambda: np.zeros((k, 1)),
-    )[int(rng.integers(10))]()
+    things = (
+        time_s + 0.005 * np.arange(k),
+        time_s - rng.uniform(0, 0.5, k),
+        time_s + rng.choice([3600.0, -3600.0, 1e300, -1e300]) + 0.005 * np.arange(k),
+        np.full(k, rng.choice([np.nan, np.inf, -np.inf])),
+        np.zeros((k, 1)),
+        *(["soon"] * k, None, time_s, [10**400] * k, Hostile()),
+    )
+    return things[int(rng.integers(len(things)))]
 
 
 def odd_sample(rng, sample):
@@ -71,11 +64,9 @@ def odd_sample(rng, sample):
     time_s, twist, readings = sample.time_s, sample.twist, dict(sample.readings)
     for name, width in WIDTH.items():
         if rng.random() < 0.5:
-            readings[name] = (
-                lambda: Reading(odd_stamp(rng, time_s), odd_value(rng, width)),  # noqa: B023 - called at once
-                lambda: odd_value(rng, width),  # noqa: B023
-                lambda: (1, 2, 3),
-            )[int(rng.integers(3))]()
+            value = odd_value(rng, width)
+            whole = Reading(odd_stamp(rng, time_s), odd_value(rng, width))
+            readings[name] = (whole, value, (1, 2, 3))[int(rng.integers(3))]
     if rng.random() < 0.3:
         twist = odd_value(rng, 3)
     if rng.random() < 0.3:

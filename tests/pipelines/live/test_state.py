@@ -117,12 +117,8 @@ def test_a_clock_of_stamps_that_starts_anew_does_not_silence_a_restored_belief(l
     state = driven(LivePilot(ROBOT, source=KnownTerrain()), log, to_s=40.0).state(1000.0)
     pilot = LivePilot(ROBOT, load_slip_table(), KnownTerrain(lambda _: "tiles"))
     pilot.restore(state, 1000.5)
-    code = driven_status(pilot, log)["terrain_code"]
+    code = [pilot.step(sample).status for sample in replay(log) if sample.time_s < 5.0][-1]["terrain_code"]
     assert pilot.terrains[int(code)] == "tiles"
-
-
-def driven_status(pilot, log):
-    return [pilot.step(sample).status for sample in replay(log) if sample.time_s < 5.0][-1]
 
 
 def test_open_loop_pilots_have_a_state_without_biases():

@@ -81,13 +81,6 @@ def test_live_windows_and_outputs_equal_those_of_the_enriched_log(model, log):
     assert (np.abs(late_s) < 0.05).all()
 
 
-def test_a_pilot_accepts_the_classification(model, log):
-    pilot = LivePilot(ROBOT, load_slip_table(), Classifier(model, ROBOT))
-    accepted = [pilot.step(sample).status["terrain_code"] for sample in replay(log)]
-    assert pilot.terrains[int(accepted[-1])] == "grass"
-    assert set(accepted) == {-1.0, accepted[-1]}
-
-
 def test_the_belief_of_a_classifier_ends_when_a_sensor_of_its_windows_is_lost(model, log):
     """Windows need the IMU: after 5 s of driving without one the terrain is unknown."""
     switching = SWITCHING._replace(unconfirmed_max_s=5.0)
@@ -111,11 +104,12 @@ def test_the_belief_of_a_classifier_ends_when_a_sensor_of_its_windows_is_lost(mo
     assert np.abs(np.diff(target)).max() <= switching.rate_ratio * 0.0201
 
 
-def test_a_belief_outlasts_a_stop(model, log):
-    pilot = LivePilot(ROBOT, load_slip_table(), Classifier(model, ROBOT))
+def test_a_pilot_accepts_the_classification_and_its_belief_outlasts_a_stop(model, log):
+    pilot, accepted = LivePilot(ROBOT, load_slip_table(), Classifier(model, ROBOT)), []
     for sample in replay(log):
-        last = pilot.step(sample).status
-    assert last["terrain_code"] >= 0
+        accepted.append(pilot.step(sample).status["terrain_code"])
+    assert pilot.terrains[int(accepted[-1])] == "grass"
+    assert set(accepted) == {-1.0, accepted[-1]}
     for k in range(1500):  # half a minute
         last = pilot.step(Sample(sample.time_s + 0.02 * (k + 1), np.zeros(3), {})).status
     assert last["terrain_code"] >= 0
