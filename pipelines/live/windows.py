@@ -21,6 +21,7 @@ from features.windows import (
 )
 from pipelines.live.model import WindowsInfo
 from terrain.errors import ConfigError, DataError
+from terrain.estimation.live.clocks import readable
 from terrain.estimation.live.estimate import LiveEstimate
 from terrain.estimation.live.estimator import CHANNELS, LiveEstimator
 from terrain.estimation.live.skid_live import LiveSkidEstimate, LiveSkidEstimator
@@ -177,11 +178,6 @@ class WindowFeed:
         """No sample before this time can finish a window; minus infinity before all streams have begun."""
         return self._stream.due_s
 
-    @property
-    def silent_streams(self) -> tuple[str, ...]:
-        """Streams that no windows can be cut for, as they have stopped."""
-        return self._stream.silent_streams
-
     def push(self, readings: Mapping[str, Reading], estimates: Sequence[Estimate] = ()) -> list[Windows]:
         """Take what was measured and estimated since the last call; return the windows it completes."""
         windows: list[Windows] = []
@@ -189,8 +185,8 @@ class WindowFeed:
         for stream, (n_columns, columns) in self._measured.items():
             if stream not in readings:
                 continue
-            reading = readable(readings[stream], n_columns)
-            if reading is None:
+            reading = readable(readings[stream])
+            if reading is None or not reading.time_s.size or reading.values.shape[1] != n_columns:
                 self.unreadable[stream] += 1
                 continue
             for time_s, values in zip(reading.time_s.tolist(), columns(reading.values), strict=True):
@@ -199,16 +195,6 @@ class WindowFeed:
             for stream, compute in self._estimated.items():
                 windows += push(stream, estimate.time_s, compute(estimate))
         return windows
-
-
-def readable(reading: Any, n_columns: int) -> Reading | None:
-    """Return a reading as arrays (k,) and (k, n_columns), k at least 1; None where it is not that."""
-    try:
-        time_s, values = (np.asarray(part, dtype=np.float64) for part in reading or ())
-    except (TypeError, ValueError, OverflowError):
-        return None
-    fits = time_s.ndim == 1 and time_s.size and values.shape == (time_s.size, n_columns)
-    return Reading(time_s, values) if fits else None
 
 
 def _columns(
