@@ -8,15 +8,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
+
+from pydantic import model_validator
 
 from pipelines.data.settings import AlignedRunsSettings, load
 from pipelines.learn.comparison import ComparisonResult, compare_models, compare_recipes, side_by_side
 from pipelines.learn.evaluation import CrossvalResult, crossval, evaluate_recipe
 from pipelines.learn.parallel import ComputeSettings
-from pipelines.learn.settings import EvaluationSettings
+from pipelines.learn.settings import FEATURE_RECIPE, EvaluationSettings
 from pipelines.report import Progress, silent
-from terrain.errors import DataError
+from pipelines.report.settings import Settings as BaseSettings
+from pipelines.report.settings import setting
+from terrain.errors import ConfigError, DataError
 
 if TYPE_CHECKING:
     from terrain.records import Windows
@@ -37,8 +42,28 @@ __all__ = [
 EXAMPLE = "terrain crossval --data runs/ --recipe svm"
 
 
-class Settings(EvaluationSettings, AlignedRunsSettings, ComputeSettings):
+class CacheSettings(BaseSettings):
+    """Cached features, by which runs need not be read again."""
+
+    cache: Path | None = setting(None, "Folder of cached features; one that was interrupted goes on.")
+
+
+class Settings(EvaluationSettings, AlignedRunsSettings, CacheSettings, ComputeSettings):
     """What is evaluated, of which runs."""
+
+    @model_validator(mode="after")
+    def _check_cache(self) -> Self:
+        if self.cache is None:
+            return self
+        if self.model or self.recipes != (FEATURE_RECIPE,) or self.feature:
+            raise ConfigError(
+                f"--cache is for recipe {FEATURE_RECIPE!r} alone, on the package's own features"
+            )
+        if self.protocol in ("published", "slow-fast", "fast-slow") or self.speed is not None:
+            raise ConfigError("--cache holds features of windows; this protocol or --speed needs the runs")
+        if self.merge_duplicates:
+            raise ConfigError("--cache keeps each run by itself: it does not go with --merge-duplicates")
+        return self
 
 
 def run(settings: Settings, progress: Progress = silent) -> CrossvalResult | ComparisonResult:
@@ -52,6 +77,8 @@ def run(settings: Settings, progress: Progress = silent) -> CrossvalResult | Com
     from pipelines.data.datasets import data_digest
     from pipelines.learn.parallel import computing
 
+    if settings.cache is not None:
+        return _of_cache(settings, settings.cache, progress)
     runs, skipped = load(settings)
     asked = settings.with_(skip_short=settings.repair)
     with computing(settings.compute):
@@ -65,6 +92,29 @@ def run(settings: Settings, progress: Progress = silent) -> CrossvalResult | Com
             found = crossval(runs, asked, progress)
     named = replace(found, dataset=settings.dataset, data_digest=data_digest(runs), data=str(settings.data))
     return replace(named, skipped=tuple(skipped)) if isinstance(named, CrossvalResult) else named
+
+
+def _of_cache(settings: Settings, folder: Path, progress: Progress) -> CrossvalResult:
+    """Evaluate the SVM on cached features; what is missing among them is computed first."""
+    from pipelines.learn.cache import cached_features, loaders_of
+    from pipelines.learn.parallel import computing
+    from pipelines.learn.recipes import recipe_of
+
+    with computing(settings.compute):
+        cached = cached_features(
+            loaders_of(settings),
+            settings.rule,
+            settings.signal_sets,
+            folder,
+            settings.jobs,
+            progress,
+            settings,
+        )
+        given = cached.features, cached.motion
+        recipe, samples = recipe_of(settings, FEATURE_RECIPE), cached.samples
+        found, _ = evaluate_recipe(recipe, FEATURE_RECIPE, samples, settings, progress, given)
+    named = {"dataset": settings.dataset, "data_digest": cached.digest, "data": str(settings.data)}
+    return replace(found, **named, skipped=cached.skipped)
 
 
 def cross_validate(

@@ -222,9 +222,10 @@ def test_a_server_that_stops_in_the_middle_costs_seconds_and_no_model(
     monkeypatch.setattr(tracking, "_log_model", usual)
     monkeypatch.delenv("MLFLOW_TRACKING_URI")
     monkeypatch.chdir(tracked[0])
-    found = register(kept, "kept")
-    assert (found.model_uri, found.alias_moved) == ("models:/kept/1", True)
-    again = register(kept, "kept")
+    name = f"kept_{stop.name}"
+    found = register(kept, name)
+    assert (found.model_uri, found.alias_moved) == (f"models:/{name}/1", True)
+    again = register(kept, name)
     assert not again.alias_moved
     assert "is not better than" in again.alias_reason
 
