@@ -113,7 +113,11 @@ def _of_cache(settings: Settings, folder: Path, progress: Progress) -> CrossvalR
         given = cached.features, cached.motion
         recipe, samples = recipe_of(settings, FEATURE_RECIPE), cached.samples
         found, _ = evaluate_recipe(recipe, FEATURE_RECIPE, samples, settings, progress, given)
-    named = {"dataset": settings.dataset, "data_digest": cached.digest, "data": str(settings.data)}
+    named: dict[str, Any] = {
+        "dataset": settings.dataset,
+        "data_digest": cached.digest,
+        "data": str(settings.data),
+    }
     return replace(found, **named, skipped=cached.skipped)
 
 
