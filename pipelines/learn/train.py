@@ -53,6 +53,9 @@ if TYPE_CHECKING:
 
 EXAMPLE = "terrain train --data runs/ --name field"
 
+NETWORKS = ("cnn", "stack", "best")
+"""Recipes whose fits take a minute: by default they are evaluated by one fold assignment, the SVM by five."""
+
 METRICS = ("accuracy", "balanced_accuracy", "macro_f1", "vote_accuracy", "ece")
 N_PERMUTATIONS = 3
 MAX_CHANNELS = 6
@@ -222,7 +225,7 @@ def train(
     from pipelines.learn.network_onnx import require_onnx
     from pipelines.learn.training_data import data_of_runs
 
-    if settings.recipe.partition("@")[0] in ("cnn", "stack", "best"):
+    if settings.recipe.partition("@")[0] in NETWORKS:
         require_onnx()
     ensure_tracking()
     return train_on(data_of_runs(runs, settings), settings, dataset, progress, evaluation)
@@ -397,7 +400,8 @@ def _evaluated(
         )
 
     if evaluation is None:
-        shared = settings.shared() | {"recipe": (settings.recipe,), "extras": False}
+        repeats = settings.repeats or (1 if settings.recipe.partition("@")[0] in NETWORKS else None)
+        shared = settings.shared() | {"recipe": (settings.recipe,), "extras": False, "repeats": repeats}
         evaluation, held_out = evaluate_recipe(
             data.recipe,
             settings.recipe,
