@@ -279,7 +279,7 @@ EDGES = {
     "terrain/estimation/observers/estimate.py",
     "pipelines/slip/filtered.py",
     "terrain/slip_learning/learn.py",
-    "pipelines/streaming/estimator.py",
+    "pipelines/live/windows.py",
     "pipelines/live/terrain_source.py",
     "pipelines/live/pilot.py",
 }
