@@ -323,13 +323,17 @@ TERRAINS = (
     Shown("terrain", lambda named: named[0]),
     Shown("status", lambda named: named[1].status),
     Shown("runs", lambda named: named[1].n_runs),
-    Shown("slips", lambda named: named[1].slip_range, ".2f"),
     Shown("peak", _of_curve("peak_slip_ratio"), SLIP),
     Shown("kind", _of_curve("peak_status")),
     Shown("90 %", _of_curve("peak_interval_ratio"), SLIP),
     *(Shown(each, target_of(each), TARGET) for each in DRIVE_STATES),
-    Shown("efficiency", _of_curve("traction_efficiency_ratio"), ".2f"),
-    Shown("energy", _of_curve("traction_energy_jpm"), ".0f", "J/m"),
+)
+
+CURVES = (
+    *(Shown("terrain", lambda named: named[0]), Shown("slips", lambda named: named[1].slip_range, ".2f")),
+    *(Shown("law", _of_curve("law")), Shown("resistance over load", _of_curve("resistance_ratio"), SLIP)),
+    Shown("efficiency in traction", _of_curve("traction_efficiency_ratio"), ".2f"),
+    Shown("energy in traction", _of_curve("traction_energy_jpm"), ".0f", "J/m"),
 )
 
 RUNS = (
@@ -380,6 +384,7 @@ def report(result: LearnSlipResult) -> Report:
         sections(
             all_terrains,
             ("How to read this", [reading]),
+            ("Curves", [table(result.terrains.items(), CURVES)]),
             ("Runs", [table(result.runs, RUNS)]),
             ("Left out", result.skipped),
         ),
