@@ -9,56 +9,28 @@ from pipelines.cli.main import app
 from pipelines.data.datasets import load_runs
 from pipelines.slip.estimate import estimate_runs
 from terrain.errors import ConfigError, DataError, LogError
-from terrain.kinematics import omni
-from terrain.kinematics.wheel_speed import with_wheel_speeds
 from terrain.logs.write import write_run
-from terrain.records import Label, RunLog, Stream
-from terrain.robots import load_robot
 
-ROBOTINO = load_robot("robotino")
 SLIP = {"cork": 0.1, "moss": 0.4}
 CURRENT = {"cork": 0.4, "moss": 0.8}
 
 
-def run_of(rng, run_id, terrains, direction, length_s=9.0, session=""):
-    """Return a run at 0.1 m/s in one direction, half on each of two grounds where two are named."""
-    time_s = np.arange(0.0, length_s, 0.031)
-    second = (time_s > length_s / 2) & (len(terrains) > 1)
-    here = np.where(second, terrains[-1], terrains[0])
-    twist = 0.1 * np.array([np.cos(direction), np.sin(direction), 0.0])
-    wheels = omni.inverse(ROBOTINO.wheel_positions_m, ROBOTINO.wheel_directions_rad, twist)
-    slip = np.array([SLIP[name] for name in here])
-    travelled = np.cumsum(0.1 * (1 - slip)) * 0.031
-    pose = np.column_stack(
-        [travelled * np.cos(direction), travelled * np.sin(direction), np.zeros(time_s.size)]
-    )
-    pose += rng.normal(0.0, 0.0005, pose.shape)
-    current = np.array([CURRENT[name] for name in here])[:, None] * (0.5 + np.abs(wheels) / 0.1)
-    current = current + rng.normal(0.0, 0.05, current.shape)
-    rates = ROBOTINO.logged_rates(wheels) + rng.normal(0.0, 0.5, current.shape)
-    channels = [f"motor_{i}_radps" for i in (1, 2, 3)] + [f"current_{i}_a" for i in (1, 2, 3)]
-    commands = Stream(
-        time_s, np.tile(twist, (time_s.size, 1)), ("speed_x_mps", "speed_y_mps", "yaw_rate_radps")
-    )
-    streams = {
-        "wheels": Stream(time_s, np.hstack([rates, current]), channels),
-        "pose": Stream(time_s, pose, ("position_x_m", "position_y_m", "yaw_rad")),
-        "commands": commands,
-    }
-    labels = (Label(0.0, length_s, terrains[0]),) if len(terrains) == 1 else ()
-    return with_wheel_speeds(RunLog(run_id, "robotino", streams, labels, session=session), ROBOTINO)
-
-
 @pytest.fixture(scope="module")
-def one_ground():
+def one_ground(omni_run):
     rng = np.random.default_rng(0)
-    return [run_of(rng, f"{name}_{i:02d}", (name,), i * 0.3) for name in SLIP for i in range(20)]
+    return [
+        omni_run(rng, f"{name}_{i:02d}", name, i * 0.3, SLIP[name], CURRENT[name], noise=(0.05, 0.5))
+        for name in SLIP
+        for i in range(20)
+    ]
 
 
 @pytest.fixture(scope="module")
-def two_grounds():
-    rng = np.random.default_rng(1)
-    return [run_of(rng, f"both_{i}", ("cork", "moss"), i, session="border") for i in range(6)]
+def two_grounds(omni_run):
+    """Runs without a label, half on each of two grounds."""
+    rng, first = np.random.default_rng(1), np.arange(0.0, 9.0, 0.031) < 4.5
+    slip, current = (np.where(first, both["cork"], both["moss"]) for both in (SLIP, CURRENT))
+    return [omni_run(rng, f"both_{i}", "", i, slip, current, "border", (0.05, 0.5)) for i in range(6)]
 
 
 def measured_slips(runs, **options):

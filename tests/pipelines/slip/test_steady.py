@@ -8,37 +8,12 @@ from pipelines.slip.table import learn_slip_table
 from terrain.control.measured_table import FEW_RUNS, NO_PEAK
 from terrain.control.slip_table import load_slip_table
 from terrain.errors import DataError
-from terrain.kinematics import omni
-from terrain.kinematics.wheel_speed import with_wheel_speeds
 from terrain.logs.write import write_run
 from terrain.records import Label, RunLog, Stream, TargetStatus
 from terrain.robots import load_robot
 from terrain.simulation.run import simulate_run
 
 ROBOTINO = load_robot("robotino")
-
-
-def run_of(rng, number, terrain, slip, session="", current_a=0.6):
-    time_s = np.arange(0.0, 8.0, 0.031)
-    direction = 0.3 * number
-    wheels = omni.inverse(
-        ROBOTINO.wheel_positions_m,
-        ROBOTINO.wheel_directions_rad,
-        0.1 * np.array([np.cos(direction), np.sin(direction), 0.0]),
-    )
-    far = 0.1 * (1 - slip) * time_s
-    pose = np.column_stack([far * np.cos(direction), far * np.sin(direction), np.zeros(time_s.size)])
-    pose += rng.normal(0.0, 0.0005, pose.shape)
-    rates = np.tile(ROBOTINO.logged_rates(wheels), (time_s.size, 1))
-    values = np.hstack([rates, np.full((time_s.size, 3), current_a)])
-    channels = [f"motor_{i}_radps" for i in (1, 2, 3)] + [f"current_{i}_a" for i in (1, 2, 3)]
-    streams = {
-        "wheels": Stream(time_s, values, channels),
-        "pose": Stream(time_s, pose, ("position_x_m", "position_y_m", "yaw_rad")),
-    }
-    run_id = f"{terrain}_{session}_{number}"
-    labels = (Label(0.0, 8.0, terrain),)
-    return with_wheel_speeds(RunLog(run_id, "robotino", streams, labels, session=session), ROBOTINO)
 
 
 def without_currents(run):
@@ -50,13 +25,17 @@ def without_currents(run):
 
 
 @pytest.fixture(scope="module")
-def runs():
+def runs(omni_run):
     rng = np.random.default_rng(0)
     slips = rng.normal(0.3, 0.02, 12)
+    sessions = {"monday": slips, "friday": slips + 0.1}
     return [
-        *(run_of(rng, i, "moss", slip, "monday") for i, slip in enumerate(slips)),
-        *(run_of(rng, i, "moss", slip + 0.1, "friday") for i, slip in enumerate(slips)),
-        *(run_of(rng, i, "cork", 0.1) for i in range(2)),
+        *(
+            omni_run(rng, f"moss_{name}_{i}", "moss", 0.3 * i, slip, 0.6, name)
+            for name, each in sessions.items()
+            for i, slip in enumerate(each)
+        ),
+        *(omni_run(rng, f"cork_{i}", "cork", 0.3 * i, 0.1, 0.6) for i in range(2)),
     ]
 
 
