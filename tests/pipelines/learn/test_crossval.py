@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 
 from pipelines.data.datasets import load_runs
-from pipelines.learn.crossval import EvaluationSettings, crossval
+from pipelines.learn.crossval import EvaluationSettings, Settings, crossval, run
 from pipelines.learn.parallel import computing
 from pipelines.learn.protocols import PROTOCOLS
 from pipelines.learn.settings import ProtocolName
 from pipelines.report.json_file import as_json
 from terrain.errors import ConfigError, DataError
+from terrain.logs.write import write_run
 from terrain.records import RunLog, Stream
 
 
@@ -196,3 +197,15 @@ def test_a_cluster_gives_the_report_of_this_machine(make_run):
         ):
             there = crossval(runs, settings)
     assert json.dumps(as_json(there)) == json.dumps(as_json(here))
+
+
+def test_cached_features_give_the_figures_of_the_runs(drive_all, tmp_path):
+    for each in drive_all(("ASPHALT", "GRASS"), 3, duration_s=12.0):
+        write_run(each, tmp_path / "data")
+    asked = {"data": tmp_path / "data", "repeats": 1, "extras": False, "n_jobs": 1}
+    plain = run(Settings(**asked)).as_json() | {"data_digest": None}
+    for _ in ("written", "read"):
+        assert run(Settings(**asked, cache=tmp_path / "cache")).as_json() | {"data_digest": None} == plain
+    for options in ({"recipe": ("cnn",)}, {"protocol": "published"}, {"merge_duplicates": True}):
+        with pytest.raises(ConfigError, match="--cache"):
+            Settings(**asked, cache=tmp_path / "cache", **options)
