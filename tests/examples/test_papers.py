@@ -3,6 +3,7 @@
 import doctest
 import math
 import re
+import subprocess
 import sys
 from pathlib import Path
 
@@ -91,6 +92,15 @@ def test_an_unknown_paper_is_refused_in_one_sentence():
         ConfigError, match="no paper 'newton' to reproduce; there are danzi, deremetz, tazzari, yamauchi"
     ):
         claims.reproduce("newton")
+
+
+def test_the_papers_are_listed_and_an_unknown_one_is_exit_code_2():
+    command = [sys.executable, str(FOLDER)]
+    listed = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    assert [line.split()[0] for line in listed.splitlines()] == ["danzi", "deremetz", "tazzari", "yamauchi"]
+    assert "Deremetz et al., ICRA 2017: 5 experiments" in listed
+    unknown = subprocess.run([*command, "newton"], capture_output=True, text=True, check=False)
+    assert unknown.returncode == 2
 
 
 def test_assumed_numbers_are_those_with_an_assumed_source():
