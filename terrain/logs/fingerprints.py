@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -52,10 +53,16 @@ def measured_streams(run: RunLog) -> list[tuple[Stream, list[int]]]:
     """Return the streams that were measured, with the places of the channels that features are made of."""
     chosen = []
     for name, stream in run.streams.items():
-        places = [i for i, each in enumerate(stream.channels) if signal_set_of(name, each) in MEASURED_SETS]
+        places = _measured_places(name, tuple(stream.channels))
         if places and len(stream) > 1:
-            chosen.append((stream, places))
+            chosen.append((stream, list(places)))
     return chosen
+
+
+@lru_cache(maxsize=1024)
+def _measured_places(stream: str, channels: tuple[str, ...]) -> tuple[int, ...]:
+    """Return the places of the measured channels of a stream; all runs of a data set ask for the same."""
+    return tuple(i for i, each in enumerate(channels) if signal_set_of(stream, each) in MEASURED_SETS)
 
 
 def fingerprints(runs: Sequence[RunLog]) -> tuple[Array, Array, Peaks]:
