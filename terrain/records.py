@@ -11,10 +11,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 Array = NDArray[Any]
 
@@ -87,6 +90,12 @@ class Stream:
         except ValueError:
             raise KeyError(name) from None
 
+    def to_pandas(self) -> pd.DataFrame:
+        """Return a column a channel, by time in s."""
+        import pandas as pd
+
+        return pd.DataFrame(self.values, index=pd.Index(self.time_s, name="time_s"), columns=list(self.channels))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RunLog:
@@ -135,6 +144,16 @@ class RunLog:
     def terrains(self) -> tuple[str, ...]:
         """The distinct terrain labels in order of appearance."""
         return tuple(dict.fromkeys(label.terrain for label in self.labels))
+
+    def to_pandas(self) -> pd.DataFrame:
+        """Return a column a channel, ``(stream, channel)``, by time in s; NaN where a stream has no sample."""
+        import pandas as pd
+
+        return pd.concat({name: stream.to_pandas() for name, stream in self.streams.items()}, axis=1).sort_index()
+
+    def __repr__(self) -> str:
+        on = f" on {', '.join(self.terrains)}" if self.labels else ""
+        return f"RunLog({self.run_id!r}, {self.robot}{on}, streams: {', '.join(self.streams)})"
 
 
 class Reading(NamedTuple):
@@ -312,6 +331,28 @@ class Windows:
     def shape(self) -> tuple[int, int]:
         """(n_windows, total samples a window), as scikit-learn reads the size of ``X``."""
         return len(self), sum(v.shape[1] * v.shape[2] for v in self.values.values())
+
+    def to_pandas(self, stream: str | None = None) -> pd.DataFrame:
+        """Return a row a window; or of one stream a row a sample, by window and time in s from its start.
+
+        Parameters
+        ----------
+        stream : its samples are given; without one, run, start, length and label of each window
+        """
+        import pandas as pd
+
+        if stream is None:
+            of_windows = {"run_id": self.run_id, "start_s": self.start_s, "terrain": self.terrain}
+            return pd.DataFrame(of_windows).assign(length_s=self.length_s)
+        values = np.swapaxes(self.values[stream], 1, 2)
+        times_s = np.arange(values.shape[1]) / self.rate_hz[stream]
+        index = pd.MultiIndex.from_product([range(len(self)), times_s], names=["window", "time_s"])
+        columns = list(self.channels[stream])
+        return pd.DataFrame(values.reshape(-1, len(columns)), index=index, columns=columns)
+
+    def __repr__(self) -> str:
+        runs, named = len(set(self.run_id)), sorted(set(self.terrain) - {""})
+        return f"{len(self)} windows of {self.length_s:g} s from {runs} runs" + (f": {', '.join(named)}" if named else "")
 
     def __getitem__(self, index: Any) -> Windows:
         if isinstance(index, int | np.integer):
