@@ -32,7 +32,7 @@ FACE = {
 }
 """The names that ``import terrain`` offers, and the modules that have them."""
 
-__all__ = ["__version__", *FACE]  # noqa: PLE0604
+__all__ = ["__version__", *FACE]
 
 
 def __getattr__(name: str) -> Any:

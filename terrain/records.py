@@ -94,7 +94,9 @@ class Stream:
         """Return a column a channel, by time in s."""
         import pandas as pd
 
-        return pd.DataFrame(self.values, index=pd.Index(self.time_s, name="time_s"), columns=list(self.channels))
+        return pd.DataFrame(
+            self.values, index=pd.Index(self.time_s, name="time_s"), columns=list(self.channels)
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -149,7 +151,9 @@ class RunLog:
         """Return a column a channel, ``(stream, channel)``, by time in s; NaN where a stream has no sample."""
         import pandas as pd
 
-        return pd.concat({name: stream.to_pandas() for name, stream in self.streams.items()}, axis=1).sort_index()
+        return pd.concat(
+            {name: stream.to_pandas() for name, stream in self.streams.items()}, axis=1
+        ).sort_index()
 
     def __repr__(self) -> str:
         on = f" on {', '.join(self.terrains)}" if self.labels else ""
@@ -352,7 +356,9 @@ class Windows:
 
     def __repr__(self) -> str:
         runs, named = len(set(self.run_id)), sorted(set(self.terrain) - {""})
-        return f"{len(self)} windows of {self.length_s:g} s from {runs} runs" + (f": {', '.join(named)}" if named else "")
+        return f"{len(self)} windows of {self.length_s:g} s from {runs} runs" + (
+            f": {', '.join(named)}" if named else ""
+        )
 
     def __getitem__(self, index: Any) -> Windows:
         if isinstance(index, int | np.integer):

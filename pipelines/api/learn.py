@@ -40,5 +40,7 @@ def cut_windows(
     found = cut(list(runs), rule, skip_short=True)
     if not len(found.windows):
         dropped = ", ".join(f"{n} {why}" for why, n in found.dropped.items())
-        raise DataError(f"no window of {length_s:g} s is left; dropped: {dropped or 'none, there are no runs'}")
+        raise DataError(
+            f"no window of {length_s:g} s is left; dropped: {dropped or 'none, there are no runs'}"
+        )
     return found.windows

@@ -67,7 +67,9 @@ class Runs(Sequence[RunLog]):
     def __repr__(self) -> str:
         robots = enumerated(sorted({run.robot for run in self}))
         terrains = enumerated(sorted({name for run in self for name in run.terrains}))
-        return f"{plural(len(self), 'run')} of {robots or 'no robot'}" + (f" on {terrains}" if terrains else "")
+        return f"{plural(len(self), 'run')} of {robots or 'no robot'}" + (
+            f" on {terrains}" if terrains else ""
+        )
 
     def _repr_html_(self) -> str:
         table = self.to_pandas()

@@ -13,7 +13,9 @@ from terrain.robots import Robot
 __all__ = ["estimate", "learn_slip"]
 
 
-def estimate(runs: Iterable[RunLog], robot: Robot | None = None, filter: Any = "skid", **options: Any) -> Estimates:
+def estimate(
+    runs: Iterable[RunLog], robot: Robot | None = None, filter: Any = "skid", **options: Any
+) -> Estimates:
     """Estimate motion and slip of runs by a filter, an observer or a pose from outside.
 
     Parameters

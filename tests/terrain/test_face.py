@@ -17,7 +17,9 @@ HEAVY = ("numpy", "scipy", "pandas", "sklearn", "numba", "torch", "mlflow", "mat
 
 def python(code, folder):
     words = [sys.executable, "-c", code]
-    return subprocess.run(words, capture_output=True, text=True, cwd=folder, check=False, env={"PYTHONPATH": str(ROOT)})
+    return subprocess.run(
+        words, capture_output=True, text=True, cwd=folder, check=False, env={"PYTHONPATH": str(ROOT)}
+    )
 
 
 def test_importing_loads_nothing_heavy_and_lists_the_names(tmp_path):
@@ -43,7 +45,10 @@ def test_a_folder_that_hides_a_package_is_named(tmp_path, name):
     (tmp_path / name / "__init__.py").write_text("")
     code = f"import sys; sys.path[:0] = ['', {str(ROOT)!r}]; import terrain; terrain.load_runs"
     done = python(code, tmp_path)
-    assert f"ImportError: the package '{name}' of terrain cannot be imported: {tmp_path / name} comes before" in done.stderr
+    assert (
+        f"ImportError: the package '{name}' of terrain cannot be imported: {tmp_path / name} comes before"
+        in done.stderr
+    )
 
 
 def made_run():
