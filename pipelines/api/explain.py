@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from pipelines.explain.explain import explain_runs
@@ -25,6 +26,8 @@ def explain(runs: Iterable[RunLog], robot: Robot | str, **options: Any) -> Expla
     Returns
     -------
     ExplainResult
-        with ``report``, ``extended`` (the robot with the named causes built in) and ``to_pandas()``
+        with ``report``, ``extended`` (the robot with the named causes built in; as it was where none was named)
+        and ``to_pandas()``
     """
-    return explain_runs(list(runs), robot, **options)
+    found = explain_runs(list(runs), robot, **options)
+    return replace(found, extended=found.extended or found.robot)

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Any
 
 from features.windows import SteadyMotion, WindowRule
 from features.windows import cut_windows as cut
 from pipelines.learn.classifier import TerrainClassifier
-from pipelines.learn.crossval import cross_validate
+from pipelines.learn.comparison import ComparisonResult
+from pipelines.learn.crossval import CrossvalResult
+from pipelines.learn.crossval import cross_validate as evaluate
+from pipelines.learn.recipes import make_recipe
 from terrain.errors import DataError
 from terrain.records import RunLog, Windows
 
@@ -44,3 +48,28 @@ def cut_windows(
             f"no window of {length_s:g} s is left; dropped: {dropped or 'none, there are no runs'}"
         )
     return found.windows
+
+
+def cross_validate(model: Any, windows: Windows, **options: Any) -> CrossvalResult | ComparisonResult:
+    """Evaluate one classifier, or several side by side, on windows with labels; whole runs are held out.
+
+    Parameters
+    ----------
+    model : a :class:`TerrainClassifier`, a scikit-learn classifier of features, the name of a recipe; or a list
+    windows : with the run and the terrain of each
+    options : as :func:`pipelines.learn.crossval.cross_validate`, such as ``protocol``, ``repeats``, ``seed``
+    """
+    models = list(model) if isinstance(model, list | tuple) else [model]
+    recipes = [_recipe(each) for each in models]
+    return evaluate(recipes, windows, **{"names": [_name(each) for each in models]} | options)
+
+
+def _recipe(model: Any) -> Any:
+    if not isinstance(model, TerrainClassifier):
+        return model
+    return make_recipe(model.recipe, model.signal_sets, seed=model.seed, functions=model.functions)
+
+
+def _name(model: Any) -> str:
+    kind = model.recipe if isinstance(model, TerrainClassifier) else model
+    return kind if isinstance(kind, str) else type(kind).__name__
