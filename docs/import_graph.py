@@ -72,7 +72,7 @@ def mermaid(package: str, graph: grimp.ImportGraph) -> str:
 def with_graphs(text: str) -> str:
     """Return the text of the page with the graphs between their markers."""
     graph = grimp.build_graph(*PACKAGES, cache_dir=None)
-    for package in ("terrain",):
+    for package in ("pipelines", "terrain"):
         start, end = f"<!-- {package} -->", f"<!-- end of {package} -->"
         body = f"{start}\n{mermaid(package, graph)}\n{end}"
         text = re.sub(

@@ -48,7 +48,7 @@ def __dir__() -> list[str]:
 
 
 def refuse_hidden_packages() -> None:
-    """Refuse to go on where a folder of the user's has the name of a package of ours and comes before it.
+    """Refuse to go on where a folder of the user's has the name of a package of this one and comes before it.
 
     Raises
     ------
