@@ -12,30 +12,9 @@ import random
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 
-COMMANDS = (
-    *(
-        "convert",
-        "inspect",
-        "simulate",
-        "calibrate",
-        "estimate",
-        "features",
-        "crossval",
-        "train",
-        "sweep",
-        "model",
-        "predict",
-    ),
-    *(
-        "learn-slip",
-        "find-changes",
-        "drive",
-        "can",
-        "explain",
-        "quickstart",
-    ),
-    *("label", "serve"),
-)
+from pipelines.cli.table import COMMANDS as TABLE
+
+COMMANDS = tuple(each.name for each in TABLE)
 
 
 @dataclass(frozen=True, slots=True)

@@ -219,8 +219,7 @@ def _run_step(step: Step, i: int, terrain: Sequence[str], folder: Path) -> dict[
 def _helped(name: str, terrain: Sequence[str], folder: Path) -> dict[str, Any]:
     done = _run([*terrain, *name.split(), "--help"], folder)
     options = sorted(set(re.findall(r"^  (--[a-z-]+)", done.stdout, flags=re.MULTILINE)))
-    listed = done.stdout.partition("\nCommands:")[2]
-    commands = re.findall(r"^  ([a-z][a-z-]*)  +\S", listed, flags=re.MULTILINE)
+    commands = re.findall(r"^  ([a-z][a-z-]*)  +\S", "" if name else done.stdout, flags=re.MULTILINE)
     return {"code": done.returncode, "options": options, "commands": sorted(commands)}
 
 

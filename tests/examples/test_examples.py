@@ -3,6 +3,7 @@
 import importlib.util
 import sys
 import threading
+from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
 import numpy as np
@@ -46,8 +47,6 @@ def model_folder(runs, tmp_path_factory):
 
 def example(name):
     """The module of an example."""
-    from pathlib import Path
-
     path = Path(__file__).parents[2] / "examples" / f"{name}.py"
     spec = importlib.util.spec_from_file_location(name, path)
     module = importlib.util.module_from_spec(spec)
@@ -144,3 +143,31 @@ def test_slip_changes_with_the_ground_sample_by_sample():
     assert [terrain for terrain, _, _ in found] == ["grass"] * 3 + ["dry_sand"] * 3
     assert found[2][1] == pytest.approx(0.033, abs=0.01)
     assert found[5][1] == pytest.approx(0.014, abs=0.01)
+
+
+@pytest.mark.slow
+def test_the_tour_goes_through_the_whole_chain(tmp_path, monkeypatch, capsys):
+    import terrain
+
+    husky = terrain.load_robot("husky")
+    for name in ("grass", "tiles"):
+        for number in range(1, 7):
+            run = terrain.simulate(husky, name, "survey", seed=7, number=number, duration_s=16.0, vary=True)
+            write_run(run, tmp_path / "logs")
+    monkeypatch.chdir(tmp_path)
+    found = example("tour")
+    assert "of windows classified correctly, whole runs held out" in capsys.readouterr().out
+    assert (tmp_path / "explained.html").read_text().count("<details>") >= 3
+    assert (tmp_path / "field" / "terrain_model.json").is_file()
+    assert found.live.belief is not None
+    assert set(found.table.targets) >= {"grass", "tiles"}
+    source = Path(found.__file__).read_text().splitlines()
+    code = [line for line in source if line and not line.startswith(('"""', "import"))]
+    assert len(code) <= 15
+    assert [line for line in source if line.startswith(("import", "from"))] == ["import terrain"]
+
+
+def test_readme_has_the_tour():
+    root = Path(__file__).parents[2]
+    code = (root / "examples" / "tour.py").read_text().partition("import terrain")[2].split()
+    assert " ".join(code) in " ".join((root / "README.md").read_text().split())
