@@ -1,6 +1,6 @@
 """Settings of a command: one frozen model is the only place of its defaults, bounds and help.
 
-A field is made by :func:`setting`; :func:`pipelines.cli.command.command` turns every field into an option of
+A field is made by :func:`setting`; :mod:`pipelines.cli.options` turns every field into an option of
 the command line.  Unknown names are refused, and what is not accepted is one sentence, a ``ConfigError``.
 Nothing heavy is imported here, nor by a module of settings: ``--help`` reads them.
 """
@@ -21,12 +21,10 @@ class OptionText(NamedTuple):
     ----------
     option : its option, as ``--window``; ``--name-of-the-field`` by default; without dashes an argument that
         is given by its place, as ``FOLDER``; empty for a field without one
-    aliases : options of earlier releases, accepted and not shown
     separated : whether several values are given in one text, by commas
     """
 
     option: str | None = None
-    aliases: tuple[str, ...] = ()
     separated: bool = False
 
 
@@ -34,7 +32,6 @@ def setting(
     default: Any,
     text: str,
     option: str | None = None,
-    aliases: tuple[str, ...] = (),
     separated: bool = False,
     **bounds: Any,
 ) -> Any:
@@ -44,12 +41,10 @@ def setting(
     ----------
     default : its only default; ``...`` where it has to be given
     text : its help
-    option, aliases, separated : as :class:`OptionText`
+    option, separated : as :class:`OptionText`
     bounds : of a number, as pydantic names them: ``ge``, ``gt``, ``le``, ``lt``
     """
-    return Field(
-        default, description=text, json_schema_extra={"option": [option, [*aliases], separated]}, **bounds
-    )
+    return Field(default, description=text, json_schema_extra={"option": [option, separated]}, **bounds)
 
 
 class Settings(BaseModel):
@@ -94,8 +89,8 @@ def option_text(model: type[Settings], name: str) -> OptionText:
     extra = model.model_fields[name].json_schema_extra
     if not isinstance(extra, dict):
         return OptionText()
-    option, aliases, separated = extra["option"]  # type: ignore[misc, str-unpack]
-    return OptionText(option, tuple(aliases), bool(separated))  # type: ignore[arg-type]
+    option, separated = extra["option"]  # type: ignore[misc, str-unpack]
+    return OptionText(option, bool(separated))  # type: ignore[arg-type]
 
 
 def option_name(model: type[Settings], name: str) -> str:
