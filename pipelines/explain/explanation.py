@@ -266,7 +266,7 @@ def _gain_parts(found: HeldOutGain) -> Iterator[Part]:
     if gain is None:
         for name, each in learned.items():
             rows.append((*CHANNEL_WORDS[name], each.rms_before, each.ratio))
-        columns = ("channel", "unit", "rms", Column("square less by a nameless learner", PERCENT))
+        columns = ("channel", "unit", "rms", Column("square less by a black-box reference", PERCENT))
         if rows:
             yield Table(columns, rows)
         return
@@ -279,14 +279,14 @@ def _gain_parts(found: HeldOutGain) -> Iterator[Part]:
     excluded = enumerated([run.run_id for run in gain.excluded])
     note = (
         f"Low-pass filtered. Intervals: 95 %, bootstrap over {gain.clusters}. The answer's gain is of all "
-        "channels whitened, with differences from run to run removed. The nameless learner is a Bayesian "
+        "channels whitened, with differences from run to run removed. The black-box reference is a Bayesian "
         "linear regression of the residual on the simulation's inputs, their products and rates, fitted to "
         f"the runs behind the diagnosis and judged on the same {len(gain.run_ids)} held-out runs."
     )
     yield Table(
         (
             *("channel", "unit", "rms before", "after", Column("square less by", PERCENT)),
-            *(Column("95 %", PERCENT), "", Column("by a nameless learner", PERCENT)),
+            *(Column("95 %", PERCENT), "", Column("by a black-box reference", PERCENT)),
         ),
         rows,
         note=f"{note} Excluded as unfit: {excluded}." if excluded else note,

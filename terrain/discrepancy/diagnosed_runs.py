@@ -71,7 +71,7 @@ class HeldOutGain:
     gain : None where it was not measured
     reason : why it was not
     comparisons : by ``filter`` and ``classifier``; None for one that does not apply
-    nameless : what a nameless learner reaches on the same runs; None where none is held out
+    nameless : what a black-box reference reaches on the same runs; None where none is held out
     judged : held-out runs that are fit, beside the simulation
     """
 

@@ -60,7 +60,7 @@ class Learned(NamedTuple):
 
 
 class Nameless(NamedTuple):
-    """What a nameless learner reaches, beside the named causes.
+    """What a black-box reference reaches, beside the named causes.
 
     Parameters
     ----------
@@ -81,9 +81,9 @@ class Nameless(NamedTuple):
         Examples
         --------
         >>> Nameless(5, {}, 0.97, 0.96).sentence
-        'The named causes remove 96 % of the square, a nameless learner 97 %: little is left to find.'
+        'The named causes remove 96 % of the square, a black-box reference 97 %: little is left to find.'
         >>> Nameless(5, {}, 0.01, float("nan")).sentence
-        'Nothing was named, and a nameless learner removes 1 % of the square: little is left to find.'
+        'Nothing was named, and a black-box reference removes 1 % of the square: little is left to find.'
         """
         named = self.named_ratio if math.isfinite(self.named_ratio) else 0.0
         left = self.ratio - named
@@ -100,9 +100,9 @@ class Nameless(NamedTuple):
         else:
             judged = "little is left to find"
         if math.isnan(self.named_ratio):
-            return f"Nothing was named, and a nameless learner removes {learner} of the square: {judged}."
+            return f"Nothing was named, and a black-box reference removes {learner} of the square: {judged}."
         return (
-            f"The named causes remove {100.0 * named:.0f} % of the square, a nameless learner "
+            f"The named causes remove {100.0 * named:.0f} % of the square, a black-box reference "
             f"{learner}: {judged}."
         )
 
@@ -131,7 +131,7 @@ def nameless_gain(
     noise: Mapping[str, float],
     seed: int = 0,
 ) -> Nameless | None:
-    """Return what a nameless learner reaches on runs held out; None where there are none.
+    """Return what a black-box reference reaches on runs held out; None where there are none.
 
     Parameters
     ----------

@@ -192,7 +192,7 @@ def test_a_gain_that_is_refused_is_not_claimed():
     learned = Nameless(2, {"speed_x_mps": Learned(0.02, 0.01, 0.76, 0.75, -0.02)}, 0.76, 0.75)
     text = text_of(a_result(replace(a_gain(), nameless=learned), causes=(a_cause(),)))
     assert "speed ahead m/s 0.02 0.01 75.0 % 70.0 to 80.0 % 76.0 %" in text
-    assert "a nameless learner 76 %: little is left to find." in text
+    assert "a black-box reference 76 %: little is left to find." in text
     assert "The gain on held-out runs was not measured: nothing was built in." in text_of(a_result())
 
 
