@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import warnings
+from difflib import get_close_matches
 from typing import Any
 
 import click
@@ -33,7 +34,7 @@ class Terrain(click.Group):
         Raises
         ------
         click.UsageError
-            if it is a former one; the message names its successor.
+            if there is none: of a former one the message names the successor, else the nearest command.
         """
         for each in COMMANDS:
             if each.name == name:
@@ -42,7 +43,10 @@ class Terrain(click.Group):
                 return click_command(each)
         if name in FORMER:
             raise click.UsageError(f"there is no command {name!r} any more: {FORMER[name]}")
-        return None
+        near = get_close_matches(name, [*(each.name for each in COMMANDS), *FORMER], 1)
+        raise click.UsageError(
+            f"there is no command {name!r}" + (f"; the nearest is {near[0]!r}" if near else "")
+        )
 
     def format_help(self, context: click.Context, formatter: click.HelpFormatter) -> None:
         """Write all commands on one screen, by group."""

@@ -16,8 +16,11 @@ from pipelines.report.results import Result
 from pipelines.report.settings import Settings, option_name, option_text
 
 PATH = click.Path(path_type=Path)
-COMMON = "Output"
-"""Heading of the options that every command has."""
+WIDTH = 110
+"""Characters of a line of help at most."""
+
+COMMON, REQUIRED = "Output", "Required"
+"""Headings of the options that every command has, and of those that have to be given."""
 
 
 class Option(click.Option):
@@ -44,7 +47,7 @@ class OneFile(click.Command):
             command.name,
             params=parameters,
             callback=self._execute,
-            context_settings={"help_option_names": ["-h", "--help"]},
+            context_settings={"help_option_names": ["-h", "--help"], "max_content_width": WIDTH},
         )
         self.module, self.command = module, command
 
@@ -89,7 +92,9 @@ class OneFile(click.Command):
                 formatter.write_dl(
                     [(each.make_metavar(context), getattr(each, "text", "")) for each in arguments]
                 )
-        for heading in (*(each for each in groups if each != COMMON), COMMON):
+        kinds = self.module.Settings.__mro__  # what is the command's own comes first
+        order = [REQUIRED, *(_headline(kind) for kind in kinds), COMMON]
+        for heading in sorted(groups, key=order.index):
             with formatter.section(heading):
                 formatter.write_dl(groups[heading])
 
@@ -123,7 +128,7 @@ def _parameters(model: type[Settings], name: str) -> list[click.Parameter]:
 def _help(field: FieldInfo, default: Any) -> str:
     text = field.description or ""
     if field.is_required():
-        return f"{text} [required]"
+        return text
     if default is None or isinstance(default, bool) or default in ("", ()):
         return text
     shown = ",".join(map(str, default)) if isinstance(default, tuple) else default
@@ -140,10 +145,14 @@ def _metavar(kind: Any) -> str:
 
 
 def _heading(model: type[Settings], name: str) -> str:
-    """Return the first line of the docstring of the class that declares a field."""
-    declaring = [kind for kind in model.__mro__ if name in vars(kind).get("__annotations__", {})]
-    text = (declaring[-1].__doc__ or "Options").strip().splitlines()[0]
-    return text.rstrip(".")
+    """Return under what help lists a field: the first line of the docstring of the class that declares it."""
+    if model.model_fields[name].is_required():
+        return REQUIRED
+    return _headline([kind for kind in model.__mro__ if name in vars(kind).get("__annotations__", {})][-1])
+
+
+def _headline(kind: type) -> str:
+    return (kind.__doc__ or "Options").strip().splitlines()[0].rstrip(".")
 
 
 def _common() -> list[click.Parameter]:

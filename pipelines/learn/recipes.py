@@ -17,7 +17,7 @@ from pipelines.learn.settings import FEATURE_RECIPE, RECIPES, WITHOUT_SVM, Learn
 from terrain.classify.grouped_network import GroupedNetwork
 from terrain.classify.response import GroupedResponse
 from terrain.classify.stack import GroupedStack
-from terrain.classify.svm import CANDIDATES, GroupedSVC
+from terrain.classify.svm import CANDIDATES, Candidate, GroupedSVC
 from terrain.errors import ConfigError
 from terrain.logs.schema import SIGNAL_SETS
 from terrain.records import Array, Windows
@@ -144,7 +144,7 @@ def recipe_of(settings: LearnSettings, text: str = FEATURE_RECIPE) -> WindowPipe
     if settings.params is not None and name not in WITHOUT_SVM:
         from pipelines.learn.params import read_params
 
-        options["candidates"] = (read_params(settings.params),)
+        options["candidates"] = (Candidate(*read_params(settings.params)),)
     return make_recipe(
         load_named(name) if ":" in name else name,
         tuple(part.strip() for part in sets.split(",")) if separator else settings.signal_sets,

@@ -253,10 +253,11 @@ def train_on(
     searched = None
     if settings.search:
         from pipelines.learn.search import search
+        from terrain.classify.svm import Candidate
 
         folder = settings.trials or Path(f"search-{settings.name}")
         searched = search(data, settings.search, folder, settings.seed, settings.jobs, progress)
-        data.recipe[-1].set_params(candidates=(searched.best.params,))
+        data.recipe[-1].set_params(candidates=(Candidate(*searched.best.params),))
     evaluation, importance = _evaluated(data, settings, evaluation, progress)
     evaluation = replace(evaluation, dataset=dataset, data_digest=data.digest)
     recipe = data.fitted()

@@ -127,12 +127,18 @@ def test_help_begins_with_an_example_and_groups_options(terrain):
     assert code == 0
     assert out.startswith(EXAMPLE)
     options = out[len(EXAMPLE) :]
-    places = [
-        options.index(word)
-        for word in ("How it is folded:", "--seed", "What is drawn:", "--folder", "Output:")
-    ]
+    words = (
+        "Required:",
+        "--folder",
+        "What is drawn:",
+        "--window",
+        "How it is folded:",
+        "--seed",
+        "Output:",
+        "--json",
+    )
+    places = [options.index(word) for word in words]
     assert places == sorted(places)
-    assert "[required]" in out
     assert "[default: imu,currents]" in out
     assert "inner" not in out
 
@@ -150,6 +156,7 @@ def test_a_former_command_names_its_successor(terrain, monkeypatch):
     monkeypatch.setitem(FORMER, "sketch", "use terrain draw")
     code, _, err, _ = terrain("sketch", "--folder", "a")
     assert (code, err) == (2, "error: there is no command 'sketch' any more: use terrain draw\n")
+    assert terrain("drow")[2] == "error: there is no command 'drow'; the nearest is 'draw'\n"
 
 
 def test_unknown_settings_are_refused_and_settings_do_not_change():
