@@ -128,12 +128,9 @@ def run(settings: Settings, progress: Progress = silent) -> QuickstartResult:
     TerrainError
         if a run cannot be read, the data do not suffice, or something cannot be written.
     """
-    from dataclasses import replace
-
-    from pipelines.data.datasets import data_digest, load_runs
+    from pipelines.data.datasets import load_runs
     from pipelines.data.duplicates import distinct_runs
     from pipelines.data.tracking import ensure_tracking
-    from pipelines.learn.crossval import EvaluationSettings, crossval
     from pipelines.learn.load import load_model
     from pipelines.learn.predict import predict
     from pipelines.learn.train import TrainingSettings, train
@@ -148,11 +145,10 @@ def run(settings: Settings, progress: Progress = silent) -> QuickstartResult:
     runs = distinct_runs(source.runs, merge=settings.merge_duplicates).runs
     dataset = SIMULATED if data is None else data.resolve().name
     training, held_out = divide(runs)
-    shared: dict[str, Any] = {"seed": settings.seed, "n_jobs": settings.n_jobs, "repeats": REPEATS}
-    evaluation = crossval(training, EvaluationSettings(extras=False, **shared), progress)
-    evaluation = replace(evaluation, dataset=dataset, data_digest=data_digest(training))
     kept = _keep(source.runs, data, out / "runs", progress)
-    trained = train(training, TrainingSettings(name=settings.name, **shared), dataset, progress, evaluation)
+    asked = TrainingSettings(name=settings.name, seed=settings.seed, n_jobs=settings.n_jobs, repeats=REPEATS)
+    # without an evaluation given, that of the training shares its fits with the worth of the channels
+    trained = train(training, asked, dataset, progress)
     predicted = predict(held_out or runs, load_model(trained.model_uri), load_slip_table())
     result = QuickstartResult(
         dataset=dataset,

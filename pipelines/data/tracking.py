@@ -97,7 +97,7 @@ def mlflow_store(*, create: bool) -> Iterator[Any]:
     Other processes of this package wait meanwhile: of two that make the tables of a database at once one
     fails, and the champion that is judged against is to be the present one.
     """
-    for name, value in PATIENCE.items():
+    for name, value in (*PATIENCE.items(), ("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")):
         os.environ.setdefault(name, value)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

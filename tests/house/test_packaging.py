@@ -66,13 +66,13 @@ def test_the_wheel_runs_elsewhere_with_its_yaml(installed_wheel, tmp_path):
     place, track_m, fallback = done.stdout.split()
     assert Path(place).is_relative_to(installed_wheel)
     assert (float(track_m), fallback) == (0.5708, "unknown")
-    assert (installed_wheel / "pipelines" / "reporting" / "templates" / "report.css").is_file()
+    assert (installed_wheel / "pipelines" / "report" / "templates" / "page.html.j2").is_file()
     assert (installed_wheel / "terrain" / "_data" / "can" / "agrimaro.dbc").is_file()
     page = {file.name for file in (ROOT / "pipelines" / "serve" / "page").iterdir()}
     assert page == {file.name for file in (installed_wheel / "pipelines" / "serve" / "page").iterdir()}
     assert {"index.html", "page.js", "page.css"} <= page
     assets = {file.name for file in (installed_wheel / "pipelines" / "report" / "assets").iterdir()}
-    assert {"uplot.js", "uplot.css"} <= assets
+    assert {"uplot.js", "uplot.css", "report.js", "report.css"} <= assets
     packaged = {file.name for file in (installed_wheel / "terrain" / "_data").rglob("*.yaml")}
     assert packaged == {file.name for file in (ROOT / "data").rglob("*.yaml")}
 
@@ -84,7 +84,7 @@ def test_the_wheel_runs_elsewhere_with_its_yaml(installed_wheel, tmp_path):
         pro = [f"{i / 10},1,1,0.5,0.5" for i in range(40)]
         (run / "pro_1.csv").write_text("time,curL,curR,velL,velR\n" + "\n".join(pro))
     terrain = str(installed_wheel / "bin" / "terrain")
-    command = [terrain, "import", "logs", "--out", "runs", "--json", "out.json"]
+    command = [terrain, "convert", "logs", "--out", "runs", "--json", "out.json"]
     subprocess.run(command, cwd=tmp_path, env=environment, check=True, capture_output=True)
     assert json.loads((tmp_path / "out.json").read_text())["run_ids"] == ["A_1", "B_1"]
 

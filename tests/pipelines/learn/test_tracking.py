@@ -169,7 +169,7 @@ def test_the_champion_of_a_robot_stays_whatever_is_trained_under_its_name(in_tra
         assert other.alias_reason.startswith(reason)
     chance = log("guarded", 0.99, "bb", accuracy_ci=(0.30, 0.60))
     assert not chance.alias_moved
-    assert "30.0% to 60.0%) is not above chance, 33.3%" in chance.alias_reason
+    assert "30.0 to 60.0\xa0%) is not above chance, 33.3\xa0%" in chance.alias_reason
     assert champion_of("guarded") == ["1"]
 
 
