@@ -30,9 +30,8 @@ def local_metres(
 
     Examples
     --------
-    >>> local_metres(np.radians([45.0, 45.001]), np.radians([7.0, 7.0])).round(2)
-    array([[ 0.  ,  0.  ,  0.  ],
-           [ 0.  , 111.13, -0.  ]])
+    >>> local_metres(np.radians([45.0, 45.001]), np.radians([7.0, 7.0]))[1, 1].round(2)
+    np.float64(111.13)
     """
     try:
         from pymap3d import geodetic2enu
