@@ -19,7 +19,6 @@ from terrain.estimation.measurements.batch import measurement_table
 from terrain.estimation.measurements.heading import gnss_heading
 from terrain.estimation.measurements.skid_rows import WHEELS_AND_GYRO
 from terrain.estimation.measurements.table import GNSS_ROWS, MeasurementTable
-from terrain.estimation.observers.choice import observers_of
 from terrain.estimation.reference import true_states
 from terrain.estimation.slip_figures import SlipFigures, slip_figures
 from terrain.estimation.stuck import motion_track
@@ -229,6 +228,8 @@ def model_and_noise(
     if robot.filters:
         suitable = tuple(each for each in suitable if each in robot.filters)
     if name in FILTERS and name not in suitable:
+        from terrain.estimation.observers.choice import observers_of  # has kernels that filters do not need
+
         fits = ", ".join((*suitable, *observers_of(robot))) or "pose"
         raise ConfigError(
             f"filter {name!r} is not for robot {robot.name}, whose drive is {robot.drive}: use {fits}"
