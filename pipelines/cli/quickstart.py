@@ -7,7 +7,10 @@ ends with give all figures.
 from __future__ import annotations
 
 import shlex
-from collections.abc import Sequence
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -128,18 +131,37 @@ def run(settings: Settings, progress: Progress = silent) -> QuickstartResult:
     TerrainError
         if a run cannot be read, the data do not suffice, or something cannot be written.
     """
+    from pipelines.data.tracking import ensure_tracking
+    from terrain.files.atomic import ensure_writable
+
+    out = settings.out
+    ensure_writable(out)
+    ensure_tracking()
+    with _compiling_ahead():
+        return _run(settings, progress)
+
+
+@contextmanager
+def _compiling_ahead() -> Iterator[None]:
+    """Have a process of its own compile the kernels that prediction needs, where they are not compiled yet."""
+    words = [sys.executable, "-c", "import pipelines.live.windows"]
+    ahead = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        yield
+    finally:
+        ahead.kill()
+        ahead.wait()
+
+
+def _run(settings: Settings, progress: Progress) -> QuickstartResult:
     from pipelines.data.datasets import load_runs
     from pipelines.data.duplicates import distinct_runs
-    from pipelines.data.tracking import ensure_tracking
     from pipelines.learn.load import load_model
     from pipelines.learn.predict import predict
     from pipelines.learn.train import TrainingSettings, train
     from terrain.control.slip_table import load_slip_table
-    from terrain.files.atomic import ensure_writable
 
     data, out = settings.data, settings.out
-    ensure_writable(out)
-    ensure_tracking()
     source = _simulated(settings, progress) if data is None else _Source(load_runs(data), None, ())
     _refuse_other_runs(source.runs, data, out / "runs")
     runs = distinct_runs(source.runs, merge=settings.merge_duplicates).runs
