@@ -226,7 +226,10 @@ def _helped(name: str, terrain: Sequence[str], folder: Path) -> dict[str, Any]:
 def _tree(folder: Path, given: set[Path]) -> dict[str, Any]:
     found = {}
     for path in sorted(folder.iterdir()):
-        if path in given or path.name == "mlruns":
+        if path in given or path.name in (
+            "mlruns",
+            "cache",
+        ):  # names of cached files hold the state of the code
             continue
         content = _tree(path, given) if path.is_dir() else _content(path)
         if content != {}:
