@@ -57,7 +57,6 @@ TRUSTED_TYPES: tuple[str, ...] = (
     "features.response.ResponseExtractor",
     "features.sample_extractor.SampleExtractor",
     "features.windows.Layout",
-    "numpy.clip",
     "numpy.dtype",
     "pipelines.learn.own.OwnClassifier",
     "pipelines.learn.recipes.WindowPipeline",
@@ -76,7 +75,7 @@ TRUSTED_TYPES: tuple[str, ...] = (
     "terrain.classify.stack.StackChoice",
     "terrain.classify.svm.Candidate",
     "terrain.classify.svm.GroupedSVC",
-    "terrain.classify.svm.f_score",
+    "terrain.classify.svm.Preparation",
 )
 """Types beyond those that skops trusts itself which a model of this package may hold."""
 

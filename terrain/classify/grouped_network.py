@@ -30,7 +30,6 @@ from terrain.classify.network import (
     task_of,
 )
 from terrain.classify.network_numbers import (
-    NetworkNumbers,
     SampleColumns,
     log_softmax,
     mean_log_probabilities,
@@ -201,11 +200,6 @@ class GroupedNetwork(ClassifierMixin, BaseEstimator):
         """Return the class of the highest probability (n,)."""
         best = self.predict_proba(X).argmax(axis=1)
         return np.asarray(self.classes_[best])
-
-    def numbers(self) -> NetworkNumbers:
-        """Return all that the fitted classifier computes with."""
-        check_is_fitted(self)
-        return self.numbers_
 
     def __sklearn_tags__(self) -> Any:
         """Declare that NaN is accepted."""

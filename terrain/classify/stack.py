@@ -17,8 +17,7 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 
 from terrain.classify.folds import fold_numbers
 from terrain.classify.grouped_network import GroupedNetwork
-from terrain.classify.network_numbers import SampleColumns
-from terrain.classify.stack_numbers import StackNumbers, joined, joined_of
+from terrain.classify.network_numbers import SampleColumns, log_softmax
 from terrain.classify.svm import CANDIDATES, GroupedSVC
 from terrain.errors import DataError
 from terrain.records import Array
@@ -146,15 +145,6 @@ class GroupedStack(ClassifierMixin, BaseEstimator):
         best = self.predict_proba(X).argmax(axis=1)
         return np.asarray(self.classes_[best])
 
-    def numbers(self) -> StackNumbers:
-        """Return all that the fitted classifier computes with."""
-        check_is_fitted(self)
-        return StackNumbers(
-            np.array([self.best_.weight_svm, self.best_.weight_cnn]),
-            None if self.svm_ is None else self.svm_.numbers(),
-            None if self.network_ is None else self.network_.numbers(),
-        )
-
     def __sklearn_tags__(self) -> Any:
         """Declare that NaN is accepted."""
         tags = super().__sklearn_tags__()
@@ -179,6 +169,34 @@ def fit_weights(probability: Array, class_index: Array) -> Array:
         return float(fit + PENALTY * ((weights - half) ** 2).sum())
 
     return np.asarray(minimize(loss, half, bounds=[(0.0, 5.0)] * 2, method="L-BFGS-B").x)
+
+
+def joined(probability: Array, weights: Array) -> Array:
+    """Return probabilities (n, k) from those of both (2, n, k).
+
+    Examples
+    --------
+    >>> joined(np.array([[[0.8, 0.2]], [[0.5, 0.5]]]), np.array([1.0, 1.0]))
+    array([[0.8, 0.2]])
+    """
+    logits = np.tensordot(weights, np.log(np.maximum(probability, np.finfo(float).tiny)), axes=1)
+    return np.asarray(np.exp(log_softmax(logits)))
+
+
+def joined_of(svm: Array | None, network: Array | None, weights: Array) -> Array:
+    """Return the probabilities of the one that is there, unchanged, or those of both joined.
+
+    Raises
+    ------
+    ValueError
+        if neither is there.
+    """
+    if svm is not None and network is not None:
+        return joined(np.stack([svm, network]), weights)
+    alone = network if svm is None else svm
+    if alone is None:
+        raise ValueError("a stack of neither")
+    return alone
 
 
 def log_of_truth(probability: Array, class_index: Array) -> Array:

@@ -28,7 +28,6 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 
 from terrain.classify.coupling import class_probabilities, fit_scale, pairs_of, probabilities_of_known
 from terrain.classify.folds import block_groups, split_runs
-from terrain.classify.svm_numbers import SvmNumbers
 from terrain.errors import DataError
 from terrain.records import Array
 
@@ -60,6 +59,27 @@ CANDIDATES: tuple[Candidate, ...] = (
     Candidate(3.0, 0.15, 100.0),
     Candidate(30.0, 0.15, 100.0),
 )
+
+
+class Preparation(NamedTuple):
+    """What the features of a window become before the SVM: missing ones filled, then scaled, clipped, selected.
+
+    Parameters
+    ----------
+    columns : (m,) places of the features that are used
+    fill, mean, scale : (m,) median, mean and standard deviation of each in training
+    """
+
+    columns: Array
+    fill: Array
+    mean: Array
+    scale: Array
+
+    def of(self, X: Array) -> Array:
+        """Return the prepared features (n, m) of rows (n, f)."""
+        used = X[:, self.columns]
+        used = np.where(np.isnan(used), self.fill, used)
+        return np.asarray(np.clip((used - self.mean) / self.scale, -CLIP_STD, CLIP_STD))
 
 
 class GroupedSVC(ClassifierMixin, BaseEstimator):
@@ -139,8 +159,8 @@ class GroupedSVC(ClassifierMixin, BaseEstimator):
         self.inner_probability_[np.arange(0, len(y), step)[held_out]] = probabilities_of_known(
             margins[best][held_out], k, self.scale_
         )
-        self.preparation_ = _preparation(self.best_.percentile)
-        self.svc_ = _fit_svc(self.best_, self.preparation_.fit_transform(X, y), y)
+        self.preparation_ = fit_preparation(X, y, self.best_.percentile)
+        self.svc_ = _fit_svc(self.best_, self.preparation_.of(X), y)
         return self
 
     def _inner_margins(
@@ -163,9 +183,8 @@ class GroupedSVC(ClassifierMixin, BaseEstimator):
                 continue  # the gap beside a short block has left out all windows of a class
             held_out[test] = True
             for percentile in dict.fromkeys(candidate.percentile for candidate in candidates):
-                preparation = _preparation(percentile)
-                prepared = preparation.fit_transform(X[train], y[train])
-                prepared_test = preparation.transform(X[test])
+                preparation = fit_preparation(X[train], y[train], percentile)
+                prepared, prepared_test = preparation.of(X[train]), preparation.of(X[test])
                 for i, candidate in enumerate(candidates):
                     if candidate.percentile == percentile:
                         svc = _fit_svc(candidate, prepared, y[train])
@@ -189,7 +208,7 @@ class GroupedSVC(ClassifierMixin, BaseEstimator):
         """Return the margins of the pairs of classes (n, k (k - 1) / 2), positive for the first of a pair."""
         check_is_fitted(self)
         X = validate_data(self, X, reset=False, ensure_all_finite="allow-nan")
-        return _margins(self.svc_, self.preparation_.transform(X), self.classes_)
+        return _margins(self.svc_, self.preparation_.of(X), self.classes_)
 
     def predict_proba(self, X: Array) -> Array:
         """Return calibrated probabilities (n, k) in the order of ``classes_``."""
@@ -200,32 +219,6 @@ class GroupedSVC(ClassifierMixin, BaseEstimator):
         """Return the class of the highest probability (n,)."""
         best = self.predict_proba(X).argmax(axis=1)
         return np.asarray(self.classes_[best])
-
-    def numbers(self) -> SvmNumbers:
-        """Return all that the fitted classifier computes with, for :mod:`terrain.classify.svm_numbers`."""
-        check_is_fitted(self)
-        steps, svc = self.preparation_.named_steps, self.svc_
-        varying = np.flatnonzero(steps["constant"].get_support())
-        selected = steps["select"].get_support()
-        columns = varying[selected]
-        sign = -1.0 if len(svc.classes_) == 2 else 1.0  # scikit-learn turns the two-class decision around
-        bounds = np.concatenate(([0], np.cumsum(svc.n_support_)))
-        pairs = pairs_of(len(svc.classes_))
-        weights = np.zeros((len(svc.support_vectors_), len(pairs)))
-        for pair, (a, b) in enumerate(pairs):
-            of_a, of_b = slice(bounds[a], bounds[a + 1]), slice(bounds[b], bounds[b + 1])
-            weights[of_a, pair] = sign * svc.dual_coef_[b - 1, of_a]
-            weights[of_b, pair] = sign * svc.dual_coef_[a, of_b]
-        return SvmNumbers(
-            columns.astype(np.int64),
-            np.nan_to_num(steps["impute"].statistics_[columns]),  # of a feature without any value
-            steps["scale"].mean_[selected],
-            steps["scale"].scale_[selected],
-            svc.support_vectors_,
-            weights,
-            sign * svc.intercept_,
-            np.array([CLIP_STD, float(svc.gamma), self.scale_, self.n_features_in_]),
-        )
 
     def __sklearn_tags__(self) -> Any:
         """Declare that NaN is accepted."""
@@ -242,16 +235,28 @@ def f_score(X: Array, y: Array) -> tuple[Array, Array]:
     return scores
 
 
-def _preparation(percentile: float) -> Pipeline:
-    return Pipeline(
+def fit_preparation(X: Array, y: Array, percentile: float) -> Preparation:
+    """Return the preparation of features that vary and that an F test keeps.
+
+    Parameters
+    ----------
+    X, y : (n, f) features, NaN where not defined, and (n,) classes
+    percentile : of the features that vary
+    """
+    clip = FunctionTransformer(np.clip, kw_args={"a_min": -CLIP_STD, "a_max": CLIP_STD})
+    steps = Pipeline(
         [
             ("impute", SimpleImputer(strategy="median", keep_empty_features=True)),
             ("constant", VarianceThreshold()),
             ("scale", StandardScaler()),
-            ("clip", FunctionTransformer(np.clip, kw_args={"a_min": -CLIP_STD, "a_max": CLIP_STD})),
+            ("clip", clip),
             ("select", SelectPercentile(f_score, percentile=percentile)),
         ]
-    )
+    ).fit(X, y)
+    selected = steps["select"].get_support()
+    columns = np.flatnonzero(steps["constant"].get_support())[selected]
+    fill = np.nan_to_num(steps["impute"].statistics_[columns])  # of a feature without any value
+    return Preparation(columns, fill, steps["scale"].mean_[selected], steps["scale"].scale_[selected])
 
 
 def _fit_svc(candidate: Candidate, prepared: Array, y: Array) -> SVC:

@@ -1,16 +1,27 @@
-"""How long features take, beside tsfel on the same windows: ``pytest tests/benchmarks --benchmark-enable``.
+"""How long features and the answer for a window take, beside tsfel and scikit-learn on the same windows.
 
-Calls of one group do the same windows, so that their times can be divided; all of it runs on one core.
+Run by ``pytest tests/benchmarks --benchmark-enable``.  Calls of one group do the same windows, so that their times can be divided; all of it runs on one core.
 """
+
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import tsfel
+from sklearn.impute import SimpleImputer
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import StandardScaler
+from sklearn.svm import SVC
 
 from features.extractor import FeatureExtractor
+from features.motion import window_motion
 from features.stream import WindowStream
 from features.windows import WindowRule, cut_windows, layout_of
 from pipelines.data.datasets import load_runs
+from pipelines.learn.coverage import table_of
+from pipelines.learn.recipes import make_recipe
+from pipelines.live.model import assess
+from terrain.classify.novelty import NoveltyScore
 from terrain.records import RunLog, Stream
 
 N_COMPARED = 8
@@ -115,3 +126,28 @@ def test_windows_of_a_minute_sample_by_sample(benchmark):
     found = benchmark(cut)
     benchmark.extra_info["n_samples"] = len(samples)
     assert len(found) == 30
+
+
+@pytest.mark.benchmark(group="one window, bar 2 ms")
+def test_one_window_with_features_and_champion_in_its_thread(benchmark, borealtc_windows):
+    model = champion(borealtc_windows)
+    assessed = benchmark(assess, model, borealtc_windows[:1])
+    assert np.isfinite(assessed.novelty).all()
+
+
+@pytest.mark.benchmark(group="one window, bar 2 ms")
+def test_one_window_with_features_and_scikit_learns_own_scaling_and_svm(benchmark, borealtc_windows):
+    peer = make_pipeline(FeatureExtractor(), SimpleImputer(), StandardScaler(), SVC())
+    peer.fit(borealtc_windows, borealtc_windows.terrain.astype(str))
+    assert len(benchmark(peer.predict, borealtc_windows[:1])) == 1
+
+
+def champion(windows):
+    """Return the default recipe with all that a live window is asked, fitted on some windows."""
+    terrain = windows.terrain.astype(str)
+    recipe = make_recipe(candidates=[(10.0, 1.0, 80.0)]).fit(windows, terrain)
+    features, motion = recipe.matrix.of(windows), window_motion(windows)
+    support = table_of(motion, terrain, windows.run_id.astype(str), np.unique(terrain).tolist())
+    return SimpleNamespace(
+        recipe=recipe, novelty=NoveltyScore().fit(features, terrain, windows.run_id).numbers_, support=support
+    )

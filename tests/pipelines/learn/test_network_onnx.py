@@ -136,7 +136,7 @@ def test_without_onnx_there_is_one_sentence(windows, monkeypatch):
     recipe = quick("cnn").fit(windows, windows.terrain.astype(str))
     monkeypatch.setitem(sys.modules, "onnx", None)
     with pytest.raises(ConfigError, match="pip install"):
-        network_onnx(recipe[-1].numbers(), recipe[0].matrix, ["a"])
+        network_onnx(recipe[-1].numbers_, recipe[0].matrix, ["a"])
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     assert time_of_onnx(b"", windows[0], 1) is None
 

@@ -5,8 +5,7 @@ import pytest
 from sklearn.base import clone
 
 from terrain.classify.network_numbers import SampleColumns
-from terrain.classify.stack import GroupedStack, chosen_of, fit_weights
-from terrain.classify.stack_numbers import check_stack, joined, joined_of, probabilities, stack_of
+from terrain.classify.stack import GroupedStack, chosen_of, fit_weights, joined, joined_of
 from terrain.errors import DataError
 
 COLUMNS = (SampleColumns("imu", ("accel_z_mps2",), 50.0, 50),)
@@ -54,17 +53,6 @@ def test_what_does_not_help_is_not_kept():
     assert np.array_equal(best.predict_proba(X), best.svm_.predict_proba(X[:, :N_FEATURES]))
 
 
-@pytest.mark.parametrize("choose", [False, True])
-def test_the_numbers_compute_the_same_bytes(choose):
-    X, y, run = draw("features and samples")
-    stack = quick(choose=choose).fit(X, y, run)
-    numbers = stack.numbers()
-    check_stack(numbers, 2)
-    found = probabilities(numbers, X[:, :N_FEATURES], X[:, N_FEATURES:])
-    np.testing.assert_allclose(found, stack.predict_proba(X), atol=1e-12)
-    np.testing.assert_allclose(found.sum(axis=1), 1.0)
-
-
 def test_the_same_seed_gives_the_same_bytes():
     X, y, run = draw("features and samples")
     one, two = (clone(quick()).fit(X, y, run) for _ in range(2))
@@ -99,19 +87,11 @@ def test_the_choice_needs_more_than_the_noise_between_runs():
     assert chosen_of(np.stack([svm, svm - 9, svm - 9]), np.zeros(50)) == "svm"  # one run says nothing
 
 
-def test_rows_without_features_and_other_weights_are_refused():
+def test_rows_without_features_and_a_stack_of_neither_are_refused():
     X, y, run = draw("features")
     with pytest.raises(DataError, match="are not features and 50 samples"):
         quick().fit(X[:, N_FEATURES:], y, run)
     with pytest.raises(DataError, match="all windows are 'ice'"):
         quick().fit(X, np.full(len(y), "ice"), run)
-    numbers = quick(epochs=1).fit(X, y, run).numbers()
-    for weights in (np.zeros(2), np.array([1.0, np.nan]), np.array([-1.0, 1.0]), np.ones(3)):
-        with pytest.raises(DataError, match="weights"):
-            check_stack(numbers._replace(weights=weights), 2)
-    with pytest.raises(DataError, match="lacks one"):
-        check_stack(numbers._replace(network=None), 2)
-    assert stack_of(numbers.svm).weights.tolist() == [1.0, 0.0]
-    assert stack_of(numbers.network).weights.tolist() == [0.0, 1.0]
     with pytest.raises(ValueError, match="neither"):
         joined_of(None, None, np.ones(2))

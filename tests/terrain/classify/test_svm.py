@@ -65,36 +65,32 @@ def test_the_choice_is_the_best_held_out_candidate_and_costs_few_fits():
         assert GroupedSVC(candidates).fit(X, y, groups=runs).best_ == CANDIDATES[3]
 
 
-class SpyOnPreparation:
-    """Replaces the scaling and selection, and records which runs it is fitted on (in column 0)."""
-
-    def __init__(self, make, seen):
-        self.pipeline, self.seen = make, seen
-
-    def fit_transform(self, X, y):
-        self.fitted = set(X[:, 0].astype(int))
-        self.seen.append((self.fitted, set()))
-        return self.pipeline.fit_transform(X, y)
-
-    def transform(self, X):
-        self.seen[-1] = (self.fitted, set(X[:, 0].astype(int)))
-        return self.pipeline.transform(X)
-
-
 def test_inner_folds_never_split_a_run(monkeypatch):
     X, y, runs = draw_runs(n_runs=5)
     X[:, 0] = runs
-    seen, original = [], svm._preparation
-    monkeypatch.setattr(svm, "_preparation", lambda percentile: SpyOnPreparation(original(percentile), seen))
+    fitted, held_out = [], []
+    fit, prepare = svm.fit_preparation, svm.Preparation.of
+
+    def seen(X):
+        return set(X[:, 0].astype(int))
+
+    def spied_fit(X, y, percentile):
+        fitted.append(seen(X))
+        return fit(X, y, percentile)
+
+    def spied_preparation(self, X):
+        if seen(X) != fitted[-1]:
+            held_out.append((fitted[-1], seen(X)))
+        return prepare(self, X)
+
+    monkeypatch.setattr(svm, "fit_preparation", spied_fit)
+    monkeypatch.setattr(svm.Preparation, "of", spied_preparation)
     GroupedSVC().fit(X, y, groups=runs)
-    *inner, (final, held_out_at_the_end) = seen
-    assert len(inner) == 3 * len({candidate.percentile for candidate in CANDIDATES})
-    for fitted, held_out in inner:
-        assert held_out
-        assert fitted.isdisjoint(held_out)
-        assert fitted | held_out == set(runs)
-    assert final == set(runs)
-    assert not held_out_at_the_end
+    assert len(held_out) == 3 * len({candidate.percentile for candidate in CANDIDATES})
+    for trained, tested in held_out:
+        assert trained.isdisjoint(tested)
+        assert trained | tested == set(runs)
+    assert fitted[-1] == set(runs)
 
 
 def test_labels_that_only_identify_runs_give_scores_of_chance():
