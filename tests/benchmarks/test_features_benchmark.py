@@ -1,6 +1,7 @@
 """How long features and the answer for a window take, beside tsfel and scikit-learn on the same windows.
 
-Run by ``pytest tests/benchmarks --benchmark-enable``.  Calls of one group do the same windows, so that their times can be divided; all of it runs on one core.
+Run by ``pytest tests/benchmarks --benchmark-enable``.  Calls of one group do the same windows, so that their
+times can be divided; all of it runs on one core.
 """
 
 from types import SimpleNamespace
