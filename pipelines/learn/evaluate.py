@@ -69,6 +69,7 @@ class HeldOut(NamedTuple):
     fold_number : (repeats, n); -1 of such a window
     truth : (n,) class of each window
     results : fold by fold; empty of a model that was fitted before
+    fitted : on all windows, where that was asked for
     """
 
     classes: Array
@@ -76,6 +77,7 @@ class HeldOut(NamedTuple):
     fold_number: Array
     truth: Array
     results: list[FoldResult]
+    fitted: Any = None
 
     @property
     def tested(self) -> Array:
@@ -101,6 +103,7 @@ def evaluate(
     task: str = "folds",
     progress: Progress = silent,
     asks: Sequence[Callable[[Any], Any] | None] | None = None,
+    on_all: bool = False,
 ) -> HeldOut:
     """Fit a clone of a classifier on each fold, and return what it makes of the windows that are held out.
 
@@ -112,6 +115,7 @@ def evaluate(
     n_jobs : processes at once on this machine, see :func:`pipelines.learn.parallel.parallel`
     task, progress : name of the work, and what is called as it goes on
     asks : for each fold, what is called with its fitted classifier, where it is fitted
+    on_all : whether a clone is fitted on all rows, too, beside the folds
 
     Examples
     --------
@@ -127,14 +131,26 @@ def evaluate(
     probability = np.full((n_repeats, n, len(classes)), np.nan)
     number = np.full((n_repeats, n), -1)
     results: list[FoldResult] = []
-    progress(task, 0, len(folds))
-    each = zip(folds, [None] * len(folds) if asks is None else asks, strict=True)
-    for result in parallel(_fit_fold, (classifier, examples, classes), each, min(n_jobs, len(folds))):
+    each = [*zip(folds, [None] * len(folds) if asks is None else asks, strict=True)]
+    fitted = None
+    if on_all:  # first, as it takes longest
+        each.insert(0, (Fold(0, 0, np.arange(n), np.zeros(0, dtype=int)), _itself))
+    progress(task, 0, len(each))
+    done = 0
+    for result in parallel(_fit_fold, (classifier, examples, classes), each, min(n_jobs, len(each))):
+        done += 1
+        progress(task, done, len(each))
+        if not len(result.fold.test):
+            fitted = result.found
+            continue
         probability[result.fold.repeat, result.fold.test] = result.probability
         number[result.fold.repeat, result.fold.test] = result.fold.number
         results.append(result)
-        progress(task, len(results), len(folds))
-    return HeldOut(classes, probability, number, examples.terrain, results)
+    return HeldOut(classes, probability, number, examples.terrain, results, fitted)
+
+
+def _itself(fitted: Any) -> Any:
+    return fitted
 
 
 def fit_on(classifier: Any, examples: Examples, rows: Array) -> Any:
@@ -153,7 +169,8 @@ def _fit_fold(
     fitted = fit_on(classifier, examples, fold.train)
     probability = np.zeros((len(fold.test), len(classes)))
     columns = np.searchsorted(classes, fitted.classes_)
-    probability[:, columns] = fitted.predict_proba(examples.features[fold.test])
+    if len(fold.test):
+        probability[:, columns] = fitted.predict_proba(examples.features[fold.test])
     best = getattr(fitted, "best_", None)
     chosen = dict(best._asdict()) if best is not None else {}
     threshold = math.nan

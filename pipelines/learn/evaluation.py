@@ -203,7 +203,8 @@ def evaluate_recipe(
     settings : protocol, repeats, seed, processes and extras
     progress : called as the work goes on
     cached : features (n, f) and motion of the windows, where they are there already
-    ask : gives for each fold what is called with its fitted classifier; not together with extras
+    ask : gives for each fold what is called with its fitted classifier, which is then fitted on all windows, too;
+        not together with extras
 
     Raises
     ------
@@ -232,7 +233,8 @@ def evaluate_recipe(
         follow = [*following(recipe, samples, settings.rule, folds, seed)]
     elif ask is not None:
         follow = [ask(examples, fold) for fold in folds]
-    held_out = evaluate(recipe[-1], examples, folds, jobs, protocol, progress, follow)
+    on_all = ask is not None
+    held_out = evaluate(recipe[-1], examples, folds, jobs, protocol, progress, follow, on_all)
     published = protocol == "published"
     signal_sets = tuple(getattr(recipe[0], "signal_sets", settings.signal_sets))
     result = CrossvalResult(

@@ -258,10 +258,9 @@ def train_on(
         folder = settings.trials or Path(f"search-{settings.name}")
         searched = search(data, settings.search, folder, settings.seed, settings.jobs, progress)
         data.recipe[-1].set_params(candidates=(Candidate(*searched.best.params),))
-    evaluation, importance = _evaluated(data, settings, evaluation, progress)
+    evaluation, importance, fitted = _evaluated(data, settings, evaluation, progress)
     evaluation = replace(evaluation, dataset=dataset, data_digest=data.digest)
-    recipe = data.fitted()
-    progress("fit on all runs", 1, 1)
+    recipe = data.with_fitted(fitted)
     limits = _limits(recipe[-1], data, settings.rule.overlap, settings.seed)
     notes = (*evaluation.notes, *limits.notes, *_search_notes(searched))
     evaluation = replace(evaluation, notes=notes)
@@ -383,8 +382,11 @@ def _keep(folder: Path, out: Path) -> None:
 
 def _evaluated(
     data: TrainingData, settings: TrainingSettings, evaluation: CrossvalResult | None, progress: Progress
-) -> tuple[CrossvalResult, tuple[ChannelImportance, ...]]:
-    """Return the evaluation on held-out runs, and what each channel is worth by the fits of its first repeat."""
+) -> tuple[CrossvalResult, tuple[ChannelImportance, ...], Any]:
+    """Return the evaluation on held-out runs, what each channel is worth, and the classifier fitted on all runs.
+
+    One set of fits gives all three: channels are judged by those of the first repeat.
+    """
     from pipelines.learn.evaluate import Examples, evaluate
     from pipelines.learn.evaluation import evaluate_recipe
     from pipelines.learn.protocols import folds_of
@@ -412,15 +414,13 @@ def _evaluated(
             (data.rows, data.motion),
             ask,
         )
-        results = held_out.results
     else:
         examples = Examples(data.rows, data.samples.terrain, data.samples.group)
         folds = folds_of(data.samples, "grouped", 1, settings.seed)
         asks = [ask(examples, fold) for fold in folds]
-        results = evaluate(
-            data.recipe[-1], examples, folds, settings.jobs, "importance", progress, asks
-        ).results
-    return evaluation, _importance(channels, [each.found for each in results if each.found is not None])
+        held_out = evaluate(data.recipe[-1], examples, folds, settings.jobs, "fits", progress, asks, True)
+    drops = [each.found for each in held_out.results if each.found is not None]
+    return evaluation, _importance(channels, drops), held_out.fitted
 
 
 def channel_of(feature: str) -> str:

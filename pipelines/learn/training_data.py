@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -62,9 +62,9 @@ class TrainingData:
     def __len__(self) -> int:
         return len(self.samples.windows)
 
-    def fitted(self) -> WindowPipeline:
-        """Return the recipe, fitted as by ``recipe.fit(windows, terrain)``."""
-        self.recipe[-1].fit(self.rows, self.samples.terrain, groups=self.samples.windows.run_id)
+    def with_fitted(self, classifier: Any) -> WindowPipeline:
+        """Return the recipe with its last step fitted on all rows, as by ``recipe.fit(windows, terrain)``."""
+        self.recipe.steps[-1] = (self.recipe.steps[-1][0], classifier)
         return self.recipe
 
     def probabilities(self, model: TerrainModel, rows: Array) -> Array | None:
