@@ -15,7 +15,6 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from claims import report_of, reproduce
 
-from pipelines.report import save_report
 from pipelines.report.terminal import terminal_text
 from terrain.errors import TerrainError
 from terrain.files.atomic import atomic_write
@@ -48,7 +47,7 @@ def main() -> int:
         result = reproduce(given.paper, given.seed, progress, quick=given.quick)
         report = report_of(result)
         if given.report is not None:
-            save_report(report, given.report)
+            report.save(given.report)
         if given.json is not None:
             document = dataclasses.asdict(dataclasses.replace(result, figures=()))
             document.pop("figures")

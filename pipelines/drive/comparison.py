@@ -3,30 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipelines.drive.controller_names import KINDS, TRACK, Source, kind_of, uses_classifier
-from pipelines.drive.controllers import (
-    DEFAULT_RAMP_MPS2,
-    Controller,
-    DriveInputs,
-    drive_once,
-    make_controller,
-    train_classifier,
-)
-from pipelines.drive.metrics import (
-    ABSOLUTE,
-    ADAPTATION,
-    WHERE_ANY,
-    metric_label,
-    metrics_of_scenario,
-    signed_difference,
-)
+from pipelines.drive.controllers import DriveInputs, drive_once, train_classifier
+from pipelines.drive.metrics import metric_label, signed_difference
 from pipelines.drive.run_figures import run_figures
 from pipelines.learn.parallel import parallel
 from pipelines.live.pilot import LivePilot
@@ -44,34 +31,39 @@ from pipelines.report import (
     Progress,
     Report,
     Result,
-    Section,
     Strip,
     Table,
     Text,
     described,
     format_value,
     interval,
+    plural,
+    sections,
     silent,
 )
 from pipelines.report.versions import versions
-from terrain.control.comparison import Difference, MeanInterval, mean_interval, paired_difference
-from terrain.control.drive_curves import DriveCurves, drive_curves
-from terrain.control.drive_evaluation import (
-    START_TIME_S,
-    EnergyCurve,
-    energy_at_equal_distance,
-    energy_curve,
-    evaluate_drive,
+from terrain.control.comparison import Difference, MeanInterval
+from terrain.control.controllers import (
+    TRACK,
+    Controller,
+    Source,
+    adapts,
+    kind_of,
+    make_controller,
+    pairs_to_compare,
 )
-from terrain.control.drive_metrics import PEAK_ABOVE_MPS, drive_history
-from terrain.control.situations import (
-    COURSE,
-    SLOPE,
-    STARTS,
-    Situation,
-    SituationOptions,
-    make_situation,
+from terrain.control.drive_comparison import (
+    Comparison,
+    Drive,
+    Metrics,
+    add_energies,
+    evaluated,
+    matching_ramp,
+    steepest_grade,
 )
+from terrain.control.drive_curves import DriveCurves
+from terrain.control.drive_metrics import PEAK_ABOVE_MPS
+from terrain.control.situations import COURSE, SLOPE, Situation, SituationOptions, make_situation
 from terrain.control.slip_table import SlipTable, load_slip_table
 from terrain.errors import ConfigError
 from terrain.records import Array
@@ -82,22 +74,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from pipelines.drive.drive import Settings
-
-STEEPEST_DEG, SLOPE_STEPS = 25.0, 9
-"""Range of the search for the steepest grade, and its bisections: to a tenth of a degree."""
-
-CLIMBING_MPS = 0.05
-"""A robot that is faster than this in the last second climbs."""
-
-LEAST_RAMP_MPS2, MOST_RAMP_MPS2, RAMP_STEPS = 0.1, 10.0, 7
-"""Range of the search for the matching ramp (up to twice the desired rise, where that is finite), and its
-bisections."""
-
-REFERENCES = ("true_terrain", "classified", "fallback")
-"""Controllers whose distance the ramp matches: the first of them that is driven."""
-
-HARDLY_BELIEVED_RATIO = 0.1
-"""Below this ratio of the driving time with a known terrain, nine tenths of a drive are the fallback's."""
 
 SCENARIOS = {
     "starts": "Stand, start, hold the speed, stop: three times. Metrics of a start are means of the second "
@@ -111,11 +87,6 @@ SCENARIOS = {
 
 PICTURED = 3
 """Metrics of the first picture."""
-
-Metrics = Mapping[str, float]
-"""Metrics of one drive by name; NaN where one is undefined."""
-
-_UNKNOWN = MeanInterval(None, None, 0)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -151,13 +122,10 @@ class DriveResult(Result):
             ]
         )
 
-
-class Drive(NamedTuple):
-    """Metrics of one drive by name, its energy over distance, and at the first seed its curves."""
-
-    metrics: dict[str, float]
-    energy: EnergyCurve
-    curves: DriveCurves | None
+    @cached_property
+    def compared(self) -> Comparison:
+        """The metrics, to be compared."""
+        return Comparison(self.scenario, self.rows)
 
 
 def run(settings: Settings, progress: Progress) -> DriveResult:
@@ -183,17 +151,22 @@ def run(settings: Settings, progress: Progress) -> DriveResult:
     return compare(settings, inputs, progress)
 
 
-def check_drive(settings: Settings, inputs: DriveInputs) -> None:
-    """Refuse what cannot be driven, before anything is.
+def check_drive(settings: Settings, inputs: DriveInputs) -> list[Controller]:
+    """Return the controllers, once what cannot be driven is refused.
 
     Raises
     ------
     ConfigError
         if a controller does not exist on the robot or the table, or the situation does not.
     """
-    for controller in _controllers(settings, inputs, settings.controllers):
+    controllers = [
+        make_controller(name, inputs.table, settings.delay_s, settings.ramp_mps2)
+        for name in settings.controllers
+    ]
+    for controller in controllers:
         LivePilot(inputs.robot, controller.table, None, controller.pilot)
     _situation(settings, inputs, settings.first_seed)
+    return controllers
 
 
 def compare(settings: Settings, inputs: DriveInputs, progress: Progress = silent) -> DriveResult:
@@ -210,41 +183,57 @@ def compare(settings: Settings, inputs: DriveInputs, progress: Progress = silent
     ConfigError
         if a setting is not accepted.
     """
-    check_drive(settings, inputs)
-    names = settings.controllers
-    controllers = _controllers(settings, inputs, [name for name in names if name != "ramp"])
-    for one in controllers:
-        if one.source is Source.CLASSIFIER and inputs.model is None:
-            raise ConfigError(f"controller {one.name!r} needs a classifier: give a model")
-    count = _counter(progress, len(settings.all_seeds) * len(names))
-    drives = _drive_all(settings, inputs, controllers, count)
+    names, table = settings.controllers, inputs.table
+    controllers = check_drive(settings, inputs)
+    if inputs.model is None:
+        for each in controllers:
+            if each.source is Source.CLASSIFIER:
+                raise ConfigError(f"controller {each.name!r} needs a classifier: give a model")
+    done, n_drives = count(1), len(settings.all_seeds) * len(names)
+
+    def drive_all(controllers: Sequence[Controller], counted: bool = True) -> dict[str, list[Drive]]:
+        """Return the drives of each controller, one a seed, in as many processes as the settings say."""
+        found: dict[str, list[Drive]] = {each.name: [] for each in controllers}
+        jobs = [(inputs.of(each), each, seed) for seed in settings.all_seeds for each in controllers]
+        drives = parallel(_drive_one, (settings,), jobs, min(settings.n_jobs, len(jobs)))
+        for (_, controller, _), drive in zip(jobs, drives, strict=True):
+            found[controller.name].append(drive)
+            if counted:
+                progress("drive", next(done), n_drives)
+        return found
+
+    drives = drive_all([each for each in controllers if each.name != "ramp"])
     ramp_mps2 = None
     if "ramp" in names:
+
+        def ramp(rise_mps2: float | None) -> Controller:
+            return make_controller("ramp", table, settings.delay_s, rise_mps2)
+
         ramp_mps2 = settings.ramp_mps2
         if ramp_mps2 is None:
-            ramp_mps2 = _matching_ramp(settings, inputs, drives)
-        drives |= _drive_all(settings, inputs, _controllers(settings, inputs, ["ramp"], ramp_mps2), count)
-    for at_one_seed in zip(*drives.values(), strict=True):
-        energies = energy_at_equal_distance([one.energy for one in at_one_seed])
-        for one, energy in zip(at_one_seed, energies, strict=True):
-            one.metrics["energy_j_per_m"] = energy
+            ramp_mps2 = matching_ramp(
+                drives,
+                lambda rise_mps2: drive_all([ramp(rise_mps2)], counted=False)["ramp"],
+                settings.scenario,
+                settings.accel_mps2,
+            )
+        drives |= drive_all([ramp(ramp_mps2)])
+        ramp_mps2 = ramp(ramp_mps2).pilot.ramp_mps2
+    add_energies(drives)
     rows = {name: tuple(one.metrics for one in drives[name]) for name in names}
     return DriveResult(
         scenario=settings.scenario,
         terrain=settings.terrain,
         robot=inputs.robot.name,
-        table=inputs.table.name,
+        table=table.name,
         seeds=tuple(settings.all_seeds),
         delay_s=settings.delay_s,
         grade_deg=settings.grade_deg,
         ramp_mps2=ramp_mps2,
-        controllers={
-            name: {key: mean_interval([row[key] for row in rows[name]]) for key in rows[name][0]}
-            for name in names
-        },
+        controllers=Comparison(settings.scenario, rows).means,
         rows=rows,
         examples={name: curves for name in names if (curves := drives[name][0].curves) is not None},
-        slip_table=inputs.table,
+        slip_table=table,
     )
 
 
@@ -262,159 +251,56 @@ def _situation(
     return make_situation(settings.scenario, inputs.simulated, settings.terrain, seed, options)
 
 
-def _controllers(
-    settings: Settings, inputs: DriveInputs, names: Sequence[str], ramp_mps2: float | None = None
-) -> list[Controller]:
-    ramp_mps2 = settings.ramp_mps2 if ramp_mps2 is None else ramp_mps2
-    ramp_mps2 = DEFAULT_RAMP_MPS2 if ramp_mps2 is None else ramp_mps2
-    return [make_controller(name, inputs.table, settings.delay_s, ramp_mps2) for name in names]
-
-
-def _counter(progress: Progress, total: int) -> Callable[[], None]:
-    """Return a function that reports one drive more."""
-    done = 0
-
-    def count() -> None:
-        nonlocal done
-        done += 1
-        progress("drive", done, total)
-
-    return count
-
-
-def _drive_all(
-    settings: Settings, inputs: DriveInputs, controllers: Sequence[Controller], count: Callable[[], None]
-) -> dict[str, list[Drive]]:
-    """Return the drives of each controller, one a seed, in as many processes as the settings say."""
-    drives: dict[str, list[Drive]] = {controller.name: [] for controller in controllers}
-    without_model = replace(inputs, model=None)  # which is large to send to another process
-    jobs = [
-        (inputs if controller.source is Source.CLASSIFIER else without_model, controller, seed)
-        for seed in settings.all_seeds
-        for controller in controllers
-    ]
-    work = parallel(_drive_one, (settings,), jobs, min(settings.n_jobs, len(jobs)))
-    for (_, controller, _), one in zip(jobs, work, strict=True):
-        drives[controller.name].append(one)
-        count()
-    return drives
-
-
 def _drive_one(settings: Settings, inputs: DriveInputs, controller: Controller, seed: int) -> Drive:
     situation = _situation(settings, inputs, seed)
     log = drive_once(inputs, controller, situation)
-    history = drive_history(log, inputs.simulated, situation.conditions.radius_factors)
-    adapting_to = controller.table if _adapts(controller.name) else None
-    metrics = evaluate_drive(log, history, inputs.simulated, situation, adapting_to)
+    drive = evaluated(log, inputs.simulated, situation, controller, shown=seed == settings.first_seed)
     if settings.scenario == SLOPE:
-        metrics["steepest_deg"] = steepest(settings, inputs, controller, seed)
-    curves = drive_curves(log, controller.table) if seed == settings.first_seed else None
-    return Drive(metrics, energy_curve(history, situation.scenario), curves)
-
-
-def steepest(settings: Settings, inputs: DriveInputs, controller: Controller, seed: int) -> float:
-    """Return the steepest grade in degrees that a controller climbs, by bisection."""
-    low, high = -STEEPEST_DEG, STEEPEST_DEG
-    for _ in range(SLOPE_STEPS):
-        middle = (low + high) / 2
-        truth = drive_once(inputs, controller, _situation(settings, inputs, seed, middle)).streams["truth"]
-        last = truth.time_s > truth.time_s[-1] - 1.0
-        climbs = truth.channel("speed_x_mps")[last].mean() > CLIMBING_MPS
-        low, high = (middle, high) if climbs else (low, middle)
-    return low
-
-
-def _matching_ramp(settings: Settings, inputs: DriveInputs, drives: Mapping[str, Sequence[Drive]]) -> float:
-    """Return the ramp that travels as far as the first reference among the controllers, at the same seeds."""
-    references = [name for kind in REFERENCES for name in drives if name in (kind, f"{kind}{TRACK}")]
-    references += [name for name in drives if name.startswith(("known:", "target:"))]
-    if not references:
-        return DEFAULT_RAMP_MPS2
-    key = f"distance_{START_TIME_S:g}s_m" if settings.scenario == STARTS else "distance_m"
-
-    def distance_m(found: Sequence[Drive]) -> float:
-        return float(np.mean([one.metrics[key] for one in found]))
-
-    desired_m = distance_m(drives[references[0]])
-    low = LEAST_RAMP_MPS2
-    high = 2.0 * settings.accel_mps2 if math.isfinite(settings.accel_mps2) else MOST_RAMP_MPS2
-    for _ in range(RAMP_STEPS):
-        middle = math.sqrt(low * high)
-        ramp = _controllers(settings, inputs, ["ramp"], middle)
-        short = distance_m(_drive_all(settings, inputs, ramp, lambda: None)["ramp"]) < desired_m
-        low, high = (middle, high) if short else (low, middle)
-    return math.sqrt(low * high)
+        drive.metrics["steepest_deg"] = steepest_grade(
+            lambda grade_deg: drive_once(inputs, controller, _situation(settings, inputs, seed, grade_deg))
+        )
+    return drive
 
 
 def report(result: DriveResult) -> Report:
     """Return the main difference, what each controller costs and brings, and behind it every figure."""
-    names, shown = list(result.controllers), shown_metrics(result)
-    pairs = _pairs(names) if shown else []
+    names, shown, compared = list(result.controllers), result.compared.shown, result.compared
+    pairs = pairs_to_compare(names) if shown else []
     grade = f", {result.grade_deg:g}° uphill" if result.grade_deg else ""
-    n = len(result.seeds)
-    details = (
-        Section("Who differs, and by how much", list(_difference_parts(result, pairs, shown))),
-        Section("Controllers", [Pairs([(name, _text(name, result.ramp_mps2)) for name in names])]),
-        Section("All figures", list(_metric_parts(result, shown))),
-        Section("The first seed, run by run", list(_run_parts(result))),
-        Section("The curves behind the targets", list(_curve_parts(result.slip_table))),
-        Section("Where these numbers come from", list(_provenance(result))),
-    )
+    terrain = result.terrain
+    if terrain == COURSE:
+        terrain = "all terrains"
+    elif terrain.endswith("ml"):
+        terrain = Path(terrain).stem
+    labels = [metric_label(key) for key in shown]
+    means = [(name, *(compared.value(name, key).mean for key in shown)) for name in names]
+    columns = [Column("mean over seeds"), *(Column(label.text, unit=label.unit) for label in labels)]
     return Report(
-        title=f"{result.scenario} on {_terrain_name(result)}{grade}",
-        answer=verdict(result, pairs, shown),
+        title=f"{result.scenario} on {terrain}{grade}",
+        answer=verdict(result, pairs),
         lead=(
-            f"{result.robot} · {n} seed{'s' * (n != 1)} · delay {1000 * result.delay_s:g} ms · "
+            f"{result.robot} · {plural(len(result.seeds), 'seed')} · delay {1000 * result.delay_s:g} ms · "
             f"table {result.table}"
         ),
-        picture=_picture(result, shown),
-        parts=[*map(Text, belief_notes(result)), _means_table(result, shown)],
-        details=[section for section in details if section.parts],
+        picture=_picture(result),
+        parts=[*map(Text, belief_notes(compared)), Table(columns, means)],
+        details=sections(
+            ("Who differs, and by how much", list(_difference_parts(compared, pairs))),
+            ("Controllers", [Pairs([(name, _text(name, result.ramp_mps2)) for name in names])]),
+            ("All figures", list(_metric_parts(result))),
+            ("The first seed, run by run", list(_run_parts(result))),
+            ("The curves behind the targets", list(_curve_parts(result.slip_table))),
+            ("Where these numbers come from", list(_provenance(result))),
+        ),
         next_step=f"terrain drive --faults all --robot {result.robot}",
     )
 
 
-def shown_metrics(result: DriveResult) -> list[str]:
-    """Return which metrics are drawn and compared: those of the scenario that a controller has."""
-    found = []
-    for key in metrics_of_scenario(result.scenario):
-        means = [value_of(result, name, key).mean for name in result.controllers]
-        if any(means) if key in WHERE_ANY else any(mean is not None for mean in means):
-            found.append(key)
-    return found
-
-
-def value_of(result: DriveResult, name: str, key: str) -> MeanInterval:
-    """Return a metric of a controller; unknown where it has none, or only by chance."""
-    if key in ADAPTATION and not _adapts(name):
-        return _UNKNOWN
-    return result.controllers[name].get(key, _UNKNOWN)
-
-
-def difference(result: DriveResult, name: str, other: str, key: str) -> Difference | None:
-    """Return the difference of a metric between two controllers, seed by seed; None where one has none."""
-    if value_of(result, name, key).mean is None or value_of(result, other, key).mean is None:
-        return None
-    values, base = ([row.get(key) for row in result.rows[one]] for one in (name, other))
-    return paired_difference(values, base, relative=key not in ABSOLUTE)
-
-
-def is_hardly_believed(result: DriveResult, name: str) -> bool:
-    """Return whether a controller uses a classifier that was never or hardly believed.
-
-    What such a controller shows is not the classifier's effect.
-    """
-    believed = result.controllers[name].get("believed_ratio", _UNKNOWN).mean
-    return uses_classifier(name) and believed is not None and believed < HARDLY_BELIEVED_RATIO
-
-
-def belief_notes(result: DriveResult) -> tuple[str, ...]:
+def belief_notes(compared: Comparison) -> tuple[str, ...]:
     """Return a sentence on each controller whose classifier was never or hardly believed."""
     notes = []
-    for name, metrics in result.controllers.items():
-        if not is_hardly_believed(result, name):
-            continue
-        believed = metrics["believed_ratio"].mean or 0.0
+    for name in filter(compared.is_hardly_believed, compared.rows):
+        believed = compared.value(name, "believed_ratio").mean or 0.0
         how = f"in {100.0 * believed:.1f} % of the driving time only" if believed else "at no time"
         outputs = ", ".join(
             f"{format_value(mean)} {text}"
@@ -423,7 +309,7 @@ def belief_notes(result: DriveResult) -> tuple[str, ...]:
                 ("n_below_threshold", "below the threshold"),
                 ("n_refused", "refused"),
             )
-            if (mean := metrics.get(key, _UNKNOWN).mean) is not None
+            if (mean := compared.value(name, key).mean) is not None
         )
         notes.append(
             f"{name} knew the terrain {how} (outputs of its classifier in a drive: {outputs or 'unknown'}): "
@@ -433,22 +319,23 @@ def belief_notes(result: DriveResult) -> tuple[str, ...]:
     return tuple(notes)
 
 
-def verdict(result: DriveResult, pairs: Sequence[tuple[str, str]], shown: Sequence[str]) -> str:
+def verdict(result: DriveResult, pairs: Sequence[tuple[str, str]]) -> str:
     """Return a sentence on the significant differences of the main pair, and on the others."""
+    compared = result.compared
     if not pairs:
         name = next(iter(result.controllers))
         values = [
             f"{metric_label(key).text} {format_value(mean, unit=metric_label(key).unit)}"
-            for key in shown
-            if (mean := value_of(result, name, key).mean) is not None
+            for key in compared.shown
+            if (mean := compared.value(name, key).mean) is not None
         ]
         return f"{name}: {', '.join(values) or 'no metric is defined'}."
     preferred = ("classified", "true_terrain", "fallback")
-    credited = [pair for pair in pairs if not is_hardly_believed(result, pair[0])] or pairs
+    credited = [pair for pair in pairs if not compared.is_hardly_believed(pair[0])] or pairs
     name, other = next((pair for one in preferred for pair in credited if pair[0] == one), credited[0])
     significant, alike = [], []
-    for key in shown:
-        found = difference(result, name, other, key)
+    for key in compared.shown:
+        found = compared.difference(name, other, key)
         if found is None:
             continue
         if math.isnan(found.low) or found.is_significant:
@@ -463,11 +350,6 @@ def verdict(result: DriveResult, pairs: Sequence[tuple[str, str]], shown: Sequen
     return f"{name} compared with {other}: {'; '.join(parts) or 'no metric that both have'}."
 
 
-def _adapts(name: str) -> bool:
-    kind = kind_of(name)
-    return kind is not None and kind.adapts
-
-
 def _text(name: str, ramp_mps2: float | None) -> str:
     """Return a sentence on a controller."""
     kind = kind_of(name)
@@ -475,33 +357,11 @@ def _text(name: str, ramp_mps2: float | None) -> str:
     return f"{text} With path tracking." if TRACK in name else text
 
 
-def _terrain_name(result: DriveResult) -> str:
-    if result.terrain == COURSE:
-        return "all terrains"
-    return Path(result.terrain).stem if result.terrain.endswith("ml") else result.terrain
-
-
-def _pairs(names: Sequence[str]) -> list[tuple[str, str]]:
-    """Return the pairs to compare: all with plain, traction control with ramp and fallback, PID with PID."""
-    pilots = {name: kind.pilot for name in names if (kind := kind_of(name)) is not None}
-    traction = [name for name in names if pilots.get(name) == "traction"]
-    thesis = [name for name in names if pilots.get(name) == "thesis"]
-    pairs = [(name, "plain") for name in names if name != "plain" and "plain" in names]
-    pairs += [(name, "ramp") for name in traction if "ramp" in names]
-    pairs += [
-        (name, "fallback") for name in traction if name in KINDS and _adapts(name) and "fallback" in names
-    ]
-    pairs += [(name, "thesis") for name in thesis if name in KINDS and _adapts(name) and "thesis" in names]
-    if not pairs and len(names) > 1:
-        pairs = [(name, names[0]) for name in names[1:]]
-    return pairs
-
-
-def _picture(result: DriveResult, shown: Sequence[str]) -> Figure | None:
+def _picture(result: DriveResult) -> Figure | None:
     """Return the first metrics of all controllers as bars."""
     names, panels = list(result.controllers), []
-    for key in shown[:PICTURED]:
-        values = [value_of(result, name, key) for name in names]
+    for key in result.compared.shown[:PICTURED]:
+        values = [result.compared.value(name, key) for name in names]
         means = [math.nan if value.mean is None else value.mean for value in values]
         low, high = zip(*(value.ci or (math.nan, math.nan) for value in values), strict=True)
         panels.append(Panel([Bars(metric_label(key).with_unit, names, means, low, high)]))
@@ -515,17 +375,9 @@ def _picture(result: DriveResult, shown: Sequence[str]) -> Figure | None:
     return Figure("What it costs, and what it brings", panels, caption) if panels else None
 
 
-def _means_table(result: DriveResult, shown: Sequence[str]) -> Table:
-    labels = [metric_label(key) for key in shown]
-    rows = [(name, *(value_of(result, name, key).mean for key in shown)) for name in result.controllers]
-    return Table(("mean over seeds", *(Column(label.text, unit=label.unit) for label in labels)), rows)
-
-
-def _difference_parts(
-    result: DriveResult, pairs: Sequence[tuple[str, str]], shown: Sequence[str]
-) -> Iterator[Part]:
-    found = {(pair, key): difference(result, *pair, key) for pair in pairs for key in shown}
-    keys = [key for key in shown if any(found[pair, key] is not None for pair in pairs)]
+def _difference_parts(compared: Comparison, pairs: Sequence[tuple[str, str]]) -> Iterator[Part]:
+    found = {(pair, key): compared.difference(*pair, key) for pair in pairs for key in compared.shown}
+    keys = [key for key in compared.shown if any(found[pair, key] is not None for pair in pairs)]
     if not keys:
         return
     rows = [
@@ -550,14 +402,15 @@ def _difference_text(found: Difference | None, key: str) -> str:
     return f"{mean} ({signed_difference(found.low, key)} to {signed_difference(found.high, key)}){star}"
 
 
-def _metric_parts(result: DriveResult, shown: Sequence[str]) -> Iterator[Part]:
+def _metric_parts(result: DriveResult) -> Iterator[Part]:
     """Yield all metrics, those that are compared first, and the names of those that no controller has."""
     if text := SCENARIOS.get(result.scenario):
         yield Text(text)
-    known = list(dict.fromkeys(key for metrics in result.controllers.values() for key in metrics))
+    compared = result.compared
     rows, undefined = [], []
-    for key in [*(key for key in shown if key in known), *(key for key in known if key not in shown)]:
-        values = [value_of(result, name, key) for name in result.controllers]
+    known = [key for metrics in result.controllers.values() for key in metrics]
+    for key in dict.fromkeys([*compared.shown, *known]):
+        values = [compared.value(name, key) for name in result.controllers]
         if any(value.mean is not None for value in values):
             cells = (_metric_text(value, len(result.seeds)) for value in values)
             rows.append((metric_label(key).with_unit, key, *cells))
@@ -567,7 +420,7 @@ def _metric_parts(result: DriveResult, shown: Sequence[str]) -> Iterator[Part]:
         "Means over seeds, with their 95 % intervals. Each seed draws load, soil, tyres, roughness and noise, the "
         "same for all controllers. n: the number of seeds at which a metric was defined, where it was not at all."
     )
-    if any(not _adapts(name) and "adapt_s" in metrics for name, metrics in result.controllers.items()):
+    if any(not adapts(name) and "adapt_s" in metrics for name, metrics in result.controllers.items()):
         note += " Controllers that do not use the terrain have no time to its target."
     if undefined:
         note += f" Not defined here: {', '.join(undefined)}."
@@ -635,6 +488,6 @@ def _provenance(result: DriveResult) -> Iterator[Part]:
             ("table", result.table),
             ("ramp", result.ramp_mps2, "", "m/s²"),
             ("grade", result.grade_deg, "", "°"),
-            ("versions", ", ".join(f"{name} {number}" for name, number in versions().items())),
+            ("versions", versions()),
         ]
     )

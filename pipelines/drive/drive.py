@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Literal
 
 from pydantic import field_validator, model_validator
 
-from pipelines.drive.controller_names import CONTROLLERS, KINDS, uses_classifier
 from pipelines.report.settings import Settings as BaseSettings
 from pipelines.report.settings import option_name, setting
+from terrain.control.controllers import CONTROLLERS, KINDS, uses_classifier
 
 if TYPE_CHECKING:
     from pipelines.report import Progress, Result

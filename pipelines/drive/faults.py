@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -27,17 +27,17 @@ from pipelines.report import (
     Mark,
     Pairs,
     Panel,
-    Part,
     Progress,
     Report,
     Result,
-    Section,
+    Shown,
     Strip,
     Table,
-    Text,
     described,
     plural,
+    sections,
     silent,
+    table,
 )
 from pipelines.report.versions import versions
 from terrain.control.fault_drives import (
@@ -49,22 +49,20 @@ from terrain.control.fault_drives import (
     Place,
     References,
     clean_drive,
+    drawn_cases,
     drive_case,
     drive_references,
     evaluate_case,
 )
-from terrain.control.fault_evaluation import BARS, LIMITS, Limits, bar_texts
+from terrain.control.fault_evaluation import BARS, LIMITS, BarCount, Limits, count_bars
 from terrain.control.fault_situations import STOP, make_fault_situation
-from terrain.control.learned_table import learned_table
+from terrain.control.learned_table import simulated_table
 from terrain.control.pilot_settings import PilotSettings
 from terrain.control.slip_table import SlipTable, load_slip_table
 from terrain.errors import ConfigError
 from terrain.robots import Robot, SwerveRobot, as_drive, load_robot
 from terrain.simulation.faults.catalogue import fault_catalogue, select_faults
 from terrain.simulation.faults.fault import SensorFault
-from terrain.simulation.slip_sweep import learning_runs
-from terrain.slip_learning.learn import learn_terrain, terrain_runs
-from terrain.terramechanics.soil import load_soil
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -82,21 +80,6 @@ SHORT_BARS: Mapping[str, str] = dict(
 )
 """Names of the bars in the cells of tables."""
 
-FIGURES = {
-    "ok_total_s": "OK while acting, s",
-    "ok_longest_s": "longest, s",
-    "not_ok_s": "held back, s",
-    "slip_error_ratio": "error of slip",
-    "slip_peak_ratio": "peak of slip",
-    "plain_slip_peak_ratio": "plain's",
-    "stop_ratio": "stop, of plain's",
-    "recovery_s": "recovery, s",
-    "overspeed_s": "above desired, s",
-    "n_exceptions": "exceptions",
-    "n_not_finite": "not finite",
-}
-"""Figures in the table of all rows, and their headings."""
-
 MET = "met"
 SHOWN_FAULTS = 8
 """Faults with unmet bars that the answer's table has."""
@@ -106,15 +89,6 @@ BEFORE_S = 1.0
 
 FASTEST_MPS = 10.0
 """Estimates of the speed beyond this, as a fault may cause, are not drawn."""
-
-
-class BarCount(NamedTuple):
-    """A bar over all rows: what it asks for, and how many rows meet it, do not, and are not judged by it."""
-
-    text: str
-    n_met: int
-    n_unmet: int
-    n_not_judged: int
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -129,28 +103,10 @@ class FaultsResult(Result):
     abouts: Mapping[str, str] = described("what each fault does, by its name")
     clean: tuple[CleanDrive, ...] = described("drives without a fault")
     rows: tuple[FaultRow, ...] = described("drives with one")
+    bars: Mapping[str, BarCount] = described("each bar over all rows")
+    n_rows: int = described("drives with a fault")
+    n_met: int = described("those of them that meet all bars")
     drawn: tuple[Figure, ...] = ()
-
-    @property
-    def n_met(self) -> int:
-        """Number of rows that meet all bars."""
-        return sum(not row.unmet for row in self.rows)
-
-    @property
-    def bars(self) -> dict[str, BarCount]:
-        """Each bar by name, over all rows."""
-        counted = {}
-        for name, text in bar_texts(self.limits).items():
-            found = [row.bars[name] for row in self.rows]
-            counted[name] = BarCount(text, found.count(True), found.count(False), found.count(None))
-        return counted
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the described fields, with the counts by bar."""
-        from pipelines.report.json_file import as_json
-
-        counts = {"bars": self.bars, "n_rows": len(self.rows), "n_met": self.n_met}
-        return {**super().as_json(), **as_json(counts)}
 
     def to_pandas(self) -> pd.DataFrame:
         """Return the drives with a fault, a row each."""
@@ -171,10 +127,11 @@ def run(settings: Settings, progress: Progress) -> FaultsResult:
     """
     robot = checked_robot(settings)
     if settings.table is not None:
-        table = load_slip_table(settings.table, robot.name)
+        slips = load_slip_table(settings.table, robot.name)
     else:
-        table = learn_table(robot, list(dict.fromkeys(p.terrain for p in places_of(settings))), progress)
-    return drive_faults(settings, robot, table, progress)
+        terrains = dict.fromkeys(place.terrain for place in _places(settings))
+        slips = simulated_table(robot, list(terrains), LEARNING_SEED, partial(progress, "learn targets"))
+    return drive_faults(settings, robot, slips, progress)
 
 
 def checked_robot(settings: Settings) -> Robot:
@@ -199,7 +156,7 @@ def checked_robot(settings: Settings) -> Robot:
         raise ConfigError(
             f"--draw has {min(drawn - chosen)!r}, which is not among the faults that are driven"
         )
-    for place in places_of(settings):
+    for place in _places(settings):
         make_fault_situation(place.situation, robot, place.terrain, place.seed)
     return robot
 
@@ -208,19 +165,7 @@ def _chosen_faults(settings: Settings, robot: Robot) -> Sequence[SensorFault]:
     return select_faults(fault_catalogue(robot), () if settings.faults == (ALL,) else settings.faults)
 
 
-def learn_table(robot: Robot, terrains: Sequence[str], progress: Progress) -> SlipTable:
-    """Return target slips learned from simulated runs on terrains, as ``terrain learn-slip`` learns them."""
-    learned = []
-    for done, terrain in enumerate(terrains, start=1):
-        measured = [
-            one for log in learning_runs(robot, terrain, LEARNING_SEED) for one in terrain_runs(log, robot)
-        ]
-        learned.append(learn_terrain(load_soil(terrain).name, measured, LEARNING_SEED))
-        progress("learn targets", done, len(terrains))
-    return learned_table(learned, robot, "learned")
-
-
-def places_of(settings: Settings) -> list[Place]:
+def _places(settings: Settings) -> list[Place]:
     """Return every situation on its terrains at each seed."""
     terrains = [name.strip() for name in settings.terrain.split(",")]
     return [
@@ -232,24 +177,27 @@ def places_of(settings: Settings) -> list[Place]:
 
 
 def drive_faults(
-    settings: Settings, robot: Robot, table: SlipTable, progress: Progress = silent
+    settings: Settings, robot: Robot, slips: SlipTable, progress: Progress = silent
 ) -> FaultsResult:
     """Drive each fault in each situation with a robot and its table, and evaluate the drives.
 
     Parameters
     ----------
     settings : what is driven
-    robot, table : that is driven, and its target slips
+    robot, slips : that is driven, and its target slips
     progress : of the drives
     """
-    chosen, places, loop = _chosen_faults(settings, robot), places_of(settings), fault_loop(robot, table)
-    references: dict[Place, References] = {}
-    made = parallel(
-        drive_references, (loop,), [(place,) for place in places], min(settings.n_jobs, len(places))
-    )
-    for place, found in zip(places, made, strict=True):
-        references[place] = found
-        progress("drive without faults", len(references), len(places))
+    chosen, places, loop = _chosen_faults(settings, robot), _places(settings), fault_loop(robot, slips)
+
+    def computed(task: str, function: Callable[..., Any], tasks: Sequence[Sequence[Any]]) -> list[Any]:
+        found = []
+        for one in parallel(function, (loop,), tasks, min(settings.n_jobs, len(tasks))):
+            found.append(one)
+            progress(task, len(found), len(tasks))
+        return found
+
+    made = computed("drive without faults", drive_references, [(place,) for place in places])
+    references: dict[Place, References] = dict(zip(places, made, strict=True))
     cases = [
         FaultCase(fault.name, duration_s, *place)
         for fault in chosen
@@ -257,57 +205,36 @@ def drive_faults(
         for duration_s in sorted(settings.durations_s)
     ]
     tasks = [(case, references[Place(*case[2:])]) for case in cases]
-    rows: list[FaultRow] = []
-    for row in parallel(evaluate_case, (loop,), tasks, min(settings.n_jobs, len(tasks))):
-        rows.append(row)
-        progress("drive with faults", len(rows), len(cases))
+    rows: list[FaultRow] = computed("drive with faults", evaluate_case, tasks)
     drawn: list[Figure] = []
-    worst = drawn_cases(settings, rows) if settings.out is not None or settings.draw else []
-    for case in worst:
+    shown = drawn_cases(rows, settings.draw) if settings.out is not None or settings.draw else []
+    for case in shown:
         drawn.append(fault_figure(case, drive_case(loop, case), references[Place(*case[2:])]))
-        progress("draw", len(drawn), len(worst))
+        progress("draw", len(drawn), len(shown))
     return FaultsResult(
         robot=robot.name,
-        table=table.name,
+        table=slips.name,
         seeds=tuple(settings.all_seeds),
         delay_s=DELAY_S,
         limits=LIMITS,
         abouts={fault.name: fault.about for fault in chosen},
         clean=tuple(clean_drive(place, found) for place, found in references.items()),
         rows=tuple(rows),
+        bars=count_bars([row.bars for row in rows]),
+        n_rows=len(rows),
+        n_met=sum(not row.unmet for row in rows),
         drawn=tuple(drawn),
     )
 
 
-def fault_loop(robot: Robot, table: SlipTable) -> FaultLoop:
+def fault_loop(robot: Robot, slips: SlipTable) -> FaultLoop:
     """Return the loop of a swerve robot with its pilot, which knows the terrain."""
-    return FaultLoop(robot, partial(_new_pilot, robot, table), DELAY_S)
+    return FaultLoop(robot, partial(_new_pilot, robot, slips), DELAY_S)
 
 
-def _new_pilot(robot: Robot, table: SlipTable, controller: str) -> LivePilot:
+def _new_pilot(robot: Robot, slips: SlipTable, controller: str) -> LivePilot:
     settings = PilotSettings(controller=controller, delay_s=DELAY_S)
-    return LivePilot(robot, table, KnownTerrain(), settings)
-
-
-def drawn_cases(settings: Settings, rows: Sequence[FaultRow]) -> list[FaultCase]:
-    """Return the drives that are drawn, of the first seed.
-
-    With ``settings.draw`` those of these faults, for the longest time that was driven; else of each kind the
-    drive with the most unmet bars.
-    """
-    longest_s = max(row.case.duration_s for row in rows)
-    first = [row for row in rows if row.case.seed == settings.first_seed]
-    if settings.draw:
-        return [
-            row.case
-            for row in first
-            if {row.case.fault, row.kind} & set(settings.draw) and row.case.duration_s == longest_s
-        ]
-    worst: dict[str, FaultRow] = {}
-    for row in first:
-        if row.unmet and len(row.unmet) > len(worst[row.kind].unmet if row.kind in worst else ()):
-            worst[row.kind] = row
-    return [row.case for row in worst.values()]
+    return LivePilot(robot, slips, KnownTerrain(), settings)
 
 
 def fault_figure(case: FaultCase, driven: Driven, references: References) -> Figure:
@@ -360,17 +287,45 @@ def duration_text(duration_s: float) -> str:
     return f"{duration_s:g} s" if math.isfinite(duration_s) else "for good"
 
 
+def _place(at: FaultCase | CleanDrive) -> str:
+    return f"{at.situation} on {at.terrain}"
+
+
+CLEAN = (
+    *(Shown("", _place), Shown("seed", "seed"), Shown("error of slip", "slip_error_ratio")),
+    *(Shown("not OK", "not_ok_s", unit="s"), Shown("peak of slip", "slip_peak_ratio")),
+    *(Shown("plain's", "plain_slip_peak_ratio"), Shown("stop", "stop_m", unit="m")),
+    Shown("plain's", "plain_stop_m", unit="m"),
+)
+
+DRIVES = (
+    *(Shown("fault", "case.fault"), Shown("situation", lambda row: _place(row.case))),
+    *(Shown("seed", "case.seed"), Shown("for", lambda row: duration_text(row.case.duration_s))),
+    Shown("OK while acting, s", "figures.ok_total_s"),
+    Shown("longest, s", "figures.ok_longest_s"),
+    Shown("held back, s", "figures.not_ok_s"),
+    Shown("error of slip", "figures.slip_error_ratio"),
+    Shown("peak of slip", "figures.slip_peak_ratio"),
+    Shown("plain's", "figures.plain_slip_peak_ratio"),
+    Shown("stop, of plain's", "figures.stop_ratio"),
+    Shown("recovery, s", "figures.recovery_s"),
+    Shown("above desired, s", "figures.overspeed_s"),
+    Shown("exceptions", "figures.n_exceptions"),
+    Shown("not finite", "figures.n_not_finite"),
+    Shown("bars unmet", lambda row: _short(row.unmet) or MET),
+    Shown("sensors named", lambda row: _named([row])),
+)
+
+
 def report(result: FaultsResult) -> Report:
     """Return how many drives meet all bars, the bars and faults that are not met, and behind it every drive."""
-    n, n_rows = len(result.seeds), len(result.rows)
-    places = list(dict.fromkeys((one.situation, one.terrain) for one in result.clean))
-    headings = [f"{situation} on {terrain}" for situation, terrain in places]
+    headings = list(dict.fromkeys(map(_place, result.clean)))
     by_fault: dict[str, list[FaultRow]] = defaultdict(list)
     for row in result.rows:
         by_fault[row.case.fault].append(row)
     n_unmet = {name: sum(len(row.unmet) for row in rows) for name, rows in by_fault.items()}
     worst = sorted((name for name in n_unmet if n_unmet[name]), key=lambda name: -n_unmet[name])
-    answer = f"{result.n_met} of {n_rows} drives with a sensor fault meet all bars"
+    answer = f"{result.n_met} of {result.n_rows} drives with a sensor fault meet all bars"
     if worst:
         more = f" and {len(worst) - SHOWN_FAULTS} more" if len(worst) > SHOWN_FAULTS else ""
         answer += f"; not met with {', '.join(worst[:SHOWN_FAULTS])}{more}"
@@ -380,75 +335,46 @@ def report(result: FaultsResult) -> Report:
     ]
     overview = []
     for name, rows in by_fault.items():
-        at = [[row for row in rows if (row.case.situation, row.case.terrain) == place] for place in places]
+        at = [[row for row in rows if _place(row.case) == heading] for heading in headings]
         overview.append((name, result.abouts[name], rows[0].nature, *map(bars_text, at), _named(rows)))
-    clean = [
-        (
-            *(f"{one.situation} on {one.terrain}", one.seed, one.slip_error_ratio, one.not_ok_s),
-            *(one.slip_peak_ratio, one.plain_slip_peak_ratio, one.stop_m, one.plain_stop_m),
-        )
-        for one in result.clean
-    ]
-    drives = [
-        (
-            *(row.case.fault, f"{row.case.situation} on {row.case.terrain}", row.case.seed),
-            duration_text(row.case.duration_s),
-            *(getattr(row.figures, name) for name in FIGURES),
-            *(_short(row.unmet) or MET, _named([row])),
-        )
-        for row in result.rows
-    ]
-    sections: dict[str, list[Part]] = {
-        "Bars met and not met, by fault": [
-            Table(
-                ("fault", Column("what it does", long=True), "nature", *headings, "sensors named"),
-                overview,
-                note="Bars that are not met, over durations and seeds; in brackets how many of the drives, where "
-                "it is not all. Faults are dead (the stream carries no information), lying (a wrong one), "
-                "tolerable (it still carries the motion: the controller has to go on) or degraded (it may do "
-                "either).",
-            )
-        ],
-        "Without a fault": [
-            Table(
-                (
-                    *("", "seed", "error of slip", Column("not OK", unit="s"), "peak of slip", "plain's"),
-                    *(Column("stop", unit="m"), Column("plain's", unit="m")),
-                ),
-                clean,
-                note="All figures count from when a fault would begin.",
-            )
-        ],
-        "Some drives": [*result.drawn[1:]],
-        "All drives": [
-            Table(
-                ("fault", "situation", "seed", "for", *FIGURES.values(), "bars unmet", "sensors named"),
-                drives,
-            )
-        ],
-        "Where these numbers come from": [
-            Text(
-                "Robot and terrain are models. A fault changes what arrives at the controller; the sensors and "
-                "the motion are those of the drive without it, until the commands differ."
-            ),
-            Pairs(
-                [
-                    ("seeds", ", ".join(map(str, result.seeds))),
-                    ("versions", ", ".join(f"{name} {number}" for name, number in versions().items())),
-                ]
-            ),
-        ],
-    }
     return Report(
         title=f"{result.robot}: sensor faults in the closed loop",
         answer=f"{answer}.",
         lead=(
-            f"{plural(len(result.abouts), 'fault')} · {' · '.join(headings)} · {plural(n, 'seed')} · "
-            f"delay {1000 * result.delay_s:g} ms · table {result.table}"
+            f"{plural(len(result.abouts), 'fault')} · {' · '.join(headings)} · "
+            f"{plural(len(result.seeds), 'seed')} · delay {1000 * result.delay_s:g} ms · table {result.table}"
         ),
         picture=result.drawn[0] if result.drawn else None,
         parts=[Table(("bar", "met", "unmet", "not judged", Column("what it asks for", long=True)), bars)],
-        details=[Section(title, parts) for title, parts in sections.items() if parts],
+        details=sections(
+            (
+                "Bars met and not met, by fault",
+                [
+                    Table(
+                        ("fault", Column("what it does", long=True), "nature", *headings, "sensors named"),
+                        overview,
+                        note="Bars that are not met, over durations and seeds; in brackets how many of the "
+                        "drives, where it is not all. Faults are dead (the stream carries no information), "
+                        "lying (a wrong one), tolerable (it still carries the motion: the controller has to go "
+                        "on) or degraded (it may do either).",
+                    )
+                ],
+            ),
+            (
+                "Without a fault",
+                [table(result.clean, CLEAN, note="All figures count from when a fault would begin.")],
+            ),
+            ("Some drives", result.drawn[1:]),
+            ("All drives", [table(result.rows, DRIVES)]),
+            (
+                "Where these numbers come from",
+                [
+                    "Robot and terrain are models. A fault changes what arrives at the controller; the sensors "
+                    "and the motion are those of the drive without it, until the commands differ.",
+                    Pairs([("seeds", ", ".join(map(str, result.seeds))), ("versions", versions())]),
+                ],
+            ),
+        ),
     )
 
 

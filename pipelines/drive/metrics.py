@@ -1,4 +1,4 @@
-"""What the metrics of a drive are called, which of them a scenario is about, and how differences are written."""
+"""What the metrics of a drive are called, and how differences of them are written."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 from pipelines.report import format_value
 from pipelines.report.numbers import MINUS, NBSP, unit_of
+from terrain.control.drive_comparison import ABSOLUTE
 
 LABELS = {
     "energy_j_per_m": ("energy per metre", "J/m"),
@@ -31,25 +32,6 @@ LABELS = {
     "stop_m": ("stopping distance", "m"),
     "steepest_deg": ("steepest grade climbed", "°"),
 }
-_GENERAL = ("slip_peak", "energy_j_per_m", "distance_m", "final_speed_mps")
-_OF_SCENARIO = {
-    "starts": ("slip_peak", "energy_j_per_m", "distance_5s_m", "energy_4m_j", "final_speed_mps"),
-    "brake": ("stop_m", "lock_s", "slip_peak", "energy_j_per_m"),
-    "slope": ("steepest_deg", *_GENERAL),
-    "circle": ("scrub_j", *_GENERAL),
-    "crab": ("scrub_j", *_GENERAL),
-    "course": (*_GENERAL, "adapt_s", "adapted_ratio"),
-    "mixed": (*_GENERAL, "adapt_s", "adapted_ratio"),
-}
-
-ABSOLUTE = ("steepest_deg", "lock_s", "immobilised", "adapt_s", "adapted_ratio")
-"""Metrics whose differences are given in their unit; all others relative, as drives differ in size."""
-
-WHERE_ANY = ("immobilised", "lock_s")
-"""Metrics that are compared only where a controller has another value than zero."""
-
-ADAPTATION = ("adapt_s", "adapted_ratio")
-"""Metrics of controllers whose target follows the terrain; another's may be close to the target by chance."""
 
 
 class Label(NamedTuple):
@@ -84,11 +66,6 @@ def metric_label(key: str) -> Label:
     if found := re.fullmatch(r"energy_(.+)m_j", key):
         return Label(f"energy of the first {found[1]} m", "J")
     return Label(key.rpartition("_")[0].replace("_", " "), unit_of(key))
-
-
-def metrics_of_scenario(scenario: str) -> tuple[str, ...]:
-    """Return the metrics that are drawn and compared, the most informative first."""
-    return (*_OF_SCENARIO.get(scenario, _GENERAL), "immobilised")
 
 
 def signed_difference(difference: float, key: str) -> str:

@@ -397,7 +397,7 @@ def _details(result: ExplainResult) -> dict[str, list[Part]]:
         ("runs behind the diagnosis", enumerated([run.run_id for run in runs.used])),
         ("runs held out, drawn by the seed", enumerated([run.run_id for run in runs.held_out]) or "none"),
         ("seed", result.seed),
-        ("versions", ", ".join(f"{name} {version}" for name, version in versions().items())),
+        ("versions", versions()),
     ]
     found["Where these numbers come from"] = [Pairs(provenance)]
     return found

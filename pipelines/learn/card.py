@@ -320,7 +320,7 @@ def model_card(
         licence=next(
             (licence[key] for key in ("License-Expression", "License") if key in licence), NOT_KNOWN
         ),
-        versions=", ".join(f"{package} {number}" for package, number in versions().items()),
+        versions=versions(),
         support=tuple(RegimeRow(regime, tuple(row)) for regime, row in cells.items()),
     )
 

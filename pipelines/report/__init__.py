@@ -1,87 +1,35 @@
 """Reports: one tree of parts, three writers; and the settings and results of commands."""
 
-from pipelines.report.numbers import (
-    NOT_KNOWN,
-    enumerated,
-    format_counts,
-    format_value,
-    interval,
-    plural,
-    quantity,
-    sentence,
-    shorten,
-)
-from pipelines.report.results import Progress, Result, described, silent
-from pipelines.report.tree import (
-    Band,
-    Bars,
-    Card,
-    Cards,
-    Column,
-    Figure,
-    Line,
-    Mark,
-    Pairs,
-    Panel,
-    Part,
-    Points,
-    Report,
-    Section,
-    Strip,
-    Table,
-    Text,
-)
-
-__all__ = [
-    "NOT_KNOWN",
-    "Band",
-    "Bars",
-    "Card",
-    "Cards",
-    "Column",
-    "Figure",
-    "Line",
-    "Mark",
-    "Pairs",
-    "Panel",
-    "Part",
-    "Points",
-    "Progress",
-    "Report",
-    "Result",
-    "Section",
-    "Strip",
-    "Table",
-    "Text",
-    "described",
-    "enumerated",
-    "figure_png",
-    "figure_svg",
-    "format_counts",
-    "format_value",
-    "html_page",
-    "interval",
-    "markdown_text",
-    "plural",
-    "quantity",
-    "save_report",
-    "sentence",
-    "shorten",
-    "silent",
-]
-
-
-def __getattr__(name: str) -> object:
-    """Import a writer when it is asked for: help needs none."""
-    from importlib import import_module
-
-    writers = {
-        "html_page": "html",
-        "markdown_text": "markdown",
-        "save_report": "writing",
-        "figure_png": "drawing",
-        "figure_svg": "drawing",
-    }
-    if name not in writers:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{writers[name]}"), name)
+from pipelines.report.numbers import NOT_KNOWN as NOT_KNOWN
+from pipelines.report.numbers import enumerated as enumerated
+from pipelines.report.numbers import format_counts as format_counts
+from pipelines.report.numbers import format_value as format_value
+from pipelines.report.numbers import interval as interval
+from pipelines.report.numbers import plural as plural
+from pipelines.report.numbers import quantity as quantity
+from pipelines.report.numbers import sentence as sentence
+from pipelines.report.results import Progress as Progress
+from pipelines.report.results import Result as Result
+from pipelines.report.results import described as described
+from pipelines.report.results import frame as frame
+from pipelines.report.results import silent as silent
+from pipelines.report.tree import Band as Band
+from pipelines.report.tree import Bars as Bars
+from pipelines.report.tree import Card as Card
+from pipelines.report.tree import Cards as Cards
+from pipelines.report.tree import Column as Column
+from pipelines.report.tree import Figure as Figure
+from pipelines.report.tree import Line as Line
+from pipelines.report.tree import Mark as Mark
+from pipelines.report.tree import Pairs as Pairs
+from pipelines.report.tree import Panel as Panel
+from pipelines.report.tree import Part as Part
+from pipelines.report.tree import Points as Points
+from pipelines.report.tree import Report as Report
+from pipelines.report.tree import Section as Section
+from pipelines.report.tree import Shown as Shown
+from pipelines.report.tree import Strip as Strip
+from pipelines.report.tree import Table as Table
+from pipelines.report.tree import Text as Text
+from pipelines.report.tree import sections as sections
+from pipelines.report.tree import table as table

@@ -6,7 +6,7 @@ import builtins
 import sys
 import types
 import typing
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import MISSING, field, fields, is_dataclass
 from enum import Enum
 from pathlib import Path
@@ -103,6 +103,15 @@ class Result:
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
         cls.__repr__ = Result.__repr__  # type: ignore[method-assign]  # dataclass keeps what is defined
+
+
+def frame(records: Iterable[Any]) -> pd.DataFrame:
+    """Return records as a table, their fields as columns, as ``--json`` has them."""
+    import pandas as pd
+
+    from pipelines.report.json_file import as_json
+
+    return pd.DataFrame([as_json(record) for record in records])
 
 
 _PLAIN = {str: "string", int: "integer", float: "number", bool: "boolean", Path: "string"}

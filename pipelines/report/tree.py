@@ -7,9 +7,10 @@ written, so that screen and page show one number in one form.  A figure describe
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeAlias
 
@@ -53,6 +54,41 @@ class Table:
     def heads(self) -> tuple[Column, ...]:
         """The columns, all of them with their format."""
         return tuple(each if isinstance(each, Column) else Column(each) for each in self.columns)
+
+
+class Shown(NamedTuple):
+    """A column of a table of records.
+
+    Parameters
+    ----------
+    title, form, unit, long : as :class:`Column`
+    of : attribute of a record, as ``case.seed``, or a function of it
+    """
+
+    title: str
+    of: str | Callable[[Any], Any]
+    form: str = ""
+    unit: str = ""
+    long: bool = False
+
+
+def table(rows: Iterable[Any], columns: Sequence[Shown], title: str = "", note: str = "") -> Table:
+    """Return a table of records.
+
+    Examples
+    --------
+    >>> table([1.5, 2.0], [Shown("speed", lambda row: row, ".1f", "m/s"), Shown("whole", "real")]).rows
+    ((1.5, 1.5), (2.0, 2.0))
+    """
+    return Table(
+        [Column(each.title, each.form, each.unit, long=each.long) for each in columns],
+        tuple(
+            tuple(each.of(row) if callable(each.of) else attrgetter(each.of)(row) for each in columns)
+            for row in rows
+        ),
+        title,
+        note,
+    )
 
 
 @dataclass(frozen=True)
@@ -174,6 +210,15 @@ class Section:
 
 
 Part: TypeAlias = Text | Table | Pairs | Cards | Figure | Section
+
+
+def sections(*titled: tuple[str, Sequence[Part | str]]) -> tuple[Section, ...]:
+    """Return sections of the details, without those that are empty; a sentence becomes a text."""
+    return tuple(
+        Section(title, tuple(Text(part) if isinstance(part, str) else part for part in parts))
+        for title, parts in titled
+        if parts
+    )
 
 
 @dataclass(frozen=True)

@@ -6,24 +6,16 @@ from importlib import metadata
 from platform import python_version
 
 PACKAGES = (
-    "terrain-slip",
-    "numpy",
-    "scipy",
-    "scikit-learn",
-    "numba",
-    "pandas",
-    "pyarrow",
-    "mlflow",
-    "matplotlib",
+    *("terrain-slip", "numpy", "scipy", "scikit-learn", "numba", "pandas", "pyarrow", "mlflow", "matplotlib"),
 )
 
 
-def versions() -> dict[str, str]:
-    """Return the installed versions by name; a package that is missing is left out."""
-    found = {"python": python_version()}
+def versions() -> str:
+    """Return the installed versions as a report states them; a package that is missing is left out."""
+    found = [f"python {python_version()}"]
     for package in PACKAGES:
         try:
-            found[package] = metadata.version(package)
+            found.append(f"{package} {metadata.version(package)}")
         except metadata.PackageNotFoundError:
             continue
-    return found
+    return ", ".join(found)

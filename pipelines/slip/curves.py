@@ -22,16 +22,20 @@ from pipelines.report import (
     Progress,
     Report,
     Result,
+    Shown,
     Strip,
     Text,
     described,
     enumerated,
     format_value,
+    frame,
     interval,
     plural,
+    sections,
     silent,
+    table,
 )
-from pipelines.slip.shown import Shown, file_name, first_rows, frame, sections, table
+from pipelines.slip.shown import file_name, first_rows
 from terrain.control.learned_table import DIGITS, FALLBACK, learned_table
 from terrain.control.slip_table import DRIVE_STATES, CurveEntry, SlipTable
 from terrain.errors import DataError

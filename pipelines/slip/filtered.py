@@ -20,25 +20,18 @@ from pipelines.report import (
     Progress,
     Report,
     Result,
+    Shown,
     Strip,
     Text,
     described,
     format_value,
+    frame,
     interval,
     plural,
+    sections,
     silent,
 )
-from pipelines.slip.shown import (
-    MAX_PICTURED,
-    TRUTH_COLOUR,
-    Shown,
-    band,
-    first_rows,
-    frame,
-    line,
-    sections,
-    spans,
-)
+from pipelines.slip.shown import MAX_PICTURED, TRUTH_COLOUR, band, first_rows, line, spans
 from terrain.errors import ConfigError, DataError
 from terrain.estimation.ekf.model import Noise
 from terrain.estimation.enriched import enriched

@@ -22,16 +22,19 @@ from pipelines.report import (
     Progress,
     Report,
     Result,
+    Shown,
     Table,
     Text,
     described,
     enumerated,
     format_value,
+    frame,
     interval,
+    sections,
     silent,
+    table,
 )
 from pipelines.slip.filtered import Keep
-from pipelines.slip.shown import Shown, frame, sections, table
 from terrain.errors import DataError
 from terrain.measured_slip.delay import Delay, DelayStatus
 from terrain.measured_slip.measure import (

@@ -20,26 +20,19 @@ from pipelines.report import (
     Progress,
     Report,
     Result,
+    Shown,
     Strip,
     described,
     enumerated,
     format_value,
+    frame,
     interval,
     plural,
+    sections,
     silent,
 )
 from pipelines.slip.filtered import Keep, next_step
-from pipelines.slip.shown import (
-    MAX_PICTURED,
-    TRUTH_COLOUR,
-    Shown,
-    band,
-    first_rows,
-    frame,
-    line,
-    sections,
-    spans,
-)
+from pipelines.slip.shown import MAX_PICTURED, TRUTH_COLOUR, band, first_rows, line, spans
 from terrain.errors import ConfigError
 from terrain.estimation.observers.choice import BY_MODEL
 from terrain.estimation.observers.estimate import ObserverEstimate, observe_run, with_estimates

@@ -14,14 +14,17 @@ from pipelines.report import (
     Progress,
     Report,
     Result,
+    Shown,
     Table,
     Text,
     described,
     format_value,
+    frame,
     interval,
+    sections,
     silent,
+    table,
 )
-from pipelines.slip.shown import Shown, frame, sections, table
 from terrain.calibration.odometry import ParameterFound, judge_odometry
 from terrain.calibration.odometry_judge import KindScore, LegScores
 from terrain.errors import ConfigError

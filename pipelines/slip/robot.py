@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipelines.data.datasets import load_runs
-from pipelines.report import Part, Report, Result, Text, described, plural
-from pipelines.slip.shown import Shown, first_rows, frame, sections
+from pipelines.report import Part, Report, Result, Shown, Text, described, frame, plural, sections
+from pipelines.slip.shown import first_rows
 from terrain.calibration.description import (
     IDENTIFIED,
     described_with,

@@ -1,20 +1,18 @@
-"""What reports of the room are made of: tables of records, thinned lines, intervals, files of pictures."""
+"""What reports of the room are made of: thinned lines, intervals, files of pictures."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipelines.report import Band, Column, Line, Section, Table, Text
+from pipelines.report import Band, Line, Shown, Table, table
 from terrain.files.atomic import atomic_write
 from terrain.records import Array
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from pipelines.report import Figure, Part
 
 MAX_POINTS = 2000
@@ -31,41 +29,6 @@ SHOWN_ROWS = 8
 """Rows of a table that is continued in the details."""
 
 
-class Shown(NamedTuple):
-    """A column of a table of records.
-
-    Parameters
-    ----------
-    title, form, unit, long : as :class:`pipelines.report.Column`
-    of : attribute of a record, or a function of it
-    """
-
-    title: str
-    of: str | Callable[[Any], Any]
-    form: str = ""
-    unit: str = ""
-    long: bool = False
-
-
-def table(rows: Iterable[Any], columns: Sequence[Shown], title: str = "", note: str = "") -> Table:
-    """Return a table of records.
-
-    Examples
-    --------
-    >>> table([1.5, 2.0], [Shown("speed", lambda row: row, ".1f", "m/s"), Shown("whole", "real")]).rows
-    ((1.5, 1.5), (2.0, 2.0))
-    """
-    return Table(
-        [Column(each.title, each.form, each.unit, long=each.long) for each in columns],
-        tuple(
-            tuple(each.of(row) if callable(each.of) else getattr(row, each.of) for each in columns)
-            for row in rows
-        ),
-        title,
-        note,
-    )
-
-
 def first_rows(
     rows: Sequence[Any], columns: Sequence[Shown], title: str
 ) -> tuple[Table, tuple[str, list[Part]]]:
@@ -74,24 +37,6 @@ def first_rows(
     note = f"{n_more} more are in the details." if n_more > 0 else ""
     rest: list[Part] = [table(rows, columns)] if n_more > 0 else []
     return table(rows[:SHOWN_ROWS], columns, title, note), ("All of them", rest)
-
-
-def frame(records: Iterable[Any]) -> pd.DataFrame:
-    """Return records as a table, their fields as columns, as ``--json`` has them."""
-    import pandas as pd
-
-    from pipelines.report.json_file import as_json
-
-    return pd.DataFrame([as_json(record) for record in records])
-
-
-def sections(*titled: tuple[str, Sequence[Part | str]]) -> tuple[Section, ...]:
-    """Return sections of the details, without those that are empty; a sentence becomes a text."""
-    return tuple(
-        Section(title, tuple(Text(part) if isinstance(part, str) else part for part in parts))
-        for title, parts in titled
-        if parts
-    )
 
 
 def line(

@@ -24,13 +24,17 @@ from pipelines.report import (
     Report,
     Result,
     Section,
+    Shown,
     Table,
     Text,
     described,
     format_value,
+    frame,
+    sections,
     silent,
+    table,
 )
-from pipelines.slip.shown import Shown, frame, sections, table, write_figures
+from pipelines.slip.shown import write_figures
 from terrain.errors import ConfigError, DataError
 from terrain.files.atomic import atomic_write, ensure_writable
 from terrain.records import RunLog

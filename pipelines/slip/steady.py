@@ -20,15 +20,18 @@ from pipelines.report import (
     Progress,
     Report,
     Result,
+    Shown,
     Text,
     described,
     enumerated,
     format_value,
+    frame,
     plural,
+    sections,
     silent,
+    table,
 )
 from pipelines.slip.curves import SLIP, TARGET, TargetRow, target_of, target_row
-from pipelines.slip.shown import Shown, frame, sections, table
 from terrain.control.measured_table import MIN_RUNS, measured_table, reason_of
 from terrain.control.slip_table import DRIVE_STATES, SlipTable
 from terrain.control.transfer import Transfer, transfers

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, NamedTuple, Protocol
 
@@ -16,10 +16,10 @@ import numpy as np
 from terrain.control.drive_metrics import drive_history
 from terrain.control.fault_evaluation import FaultDrive, FaultFigures, fault_drive, fault_figures, judge
 from terrain.control.fault_situations import FaultSituation, make_fault_situation
+from terrain.control.situations import simulate_situation
 from terrain.control.traction import TractionStatus
 from terrain.records import Array, Command, Sample
 from terrain.robots import Robot
-from terrain.simulation.dynamic.simulate import simulate
 from terrain.simulation.faults.catalogue import fault_catalogue
 from terrain.simulation.faults.fault import FaultyBus, SensorFault
 
@@ -210,6 +210,31 @@ def evaluate_case(loop: FaultLoop, case: FaultCase, references: References) -> F
     )
 
 
+def drawn_cases(rows: Sequence[FaultRow], draw: Sequence[str] = ()) -> list[FaultCase]:
+    """Return the drives that are drawn, of the first seed.
+
+    Parameters
+    ----------
+    rows : all drives
+    draw : faults or kinds of them whose drives are drawn, for the longest time that was driven; without, of
+        each kind the drive with the most unmet bars
+    """
+    longest_s = max(row.case.duration_s for row in rows)
+    first_seed = min(row.case.seed for row in rows)
+    first = [row for row in rows if row.case.seed == first_seed]
+    if draw:
+        return [
+            row.case
+            for row in first
+            if {row.case.fault, row.kind} & set(draw) and row.case.duration_s == longest_s
+        ]
+    worst: dict[str, FaultRow] = {}
+    for row in first:
+        if row.unmet and len(row.unmet) > len(worst[row.kind].unmet if row.kind in worst else ()):
+            worst[row.kind] = row
+    return [row.case for row in worst.values()]
+
+
 def clean_drive(place: Place, references: References) -> CleanDrive:
     """Return what the clean and the plain drive of a place show."""
     clean, plain, start_s = references
@@ -243,16 +268,7 @@ def _drive(
         step = FaultyBus(step, fault, made.start_s, made.start_s + duration_s, seed).__call__
     situation = made.situation
     with np.errstate(all="ignore"):  # values of a fault are squared
-        log = simulate(
-            loop.robot,
-            situation.scenario,
-            situation.soils,
-            situation.seed,
-            conditions=situation.conditions,
-            faults=situation.faults,
-            controller=step,
-            command_delay_s=loop.delay_s,
-        )
+        log = simulate_situation(loop.robot, situation, step, loop.delay_s)
     history = drive_history(log, loop.robot, situation.conditions.radius_factors)
     drive = fault_drive(log, history, loop.robot, situation.scenario)
     return Driven(drive, pilot, np.array(pilot.speed_mps))

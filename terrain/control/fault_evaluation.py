@@ -8,7 +8,7 @@ no sensor fault touches.  A fault must not make slip control worse than having n
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -280,6 +280,24 @@ def bar_texts(limits: Limits = LIMITS) -> dict[str, str]:
     'status OK again after the fault: within 1 s'
     """
     return {name: text.format(**limits._asdict()) for name, text in BARS.items()}
+
+
+class BarCount(NamedTuple):
+    """A bar over all drives: what it asks for, and how many meet it, do not, and are not judged by it."""
+
+    text: str
+    n_met: int
+    n_unmet: int
+    n_not_judged: int
+
+
+def count_bars(judged: Sequence[Mapping[str, bool | None]], limits: Limits = LIMITS) -> dict[str, BarCount]:
+    """Return each bar by name, over the drives that were judged."""
+    counted = {}
+    for name, text in bar_texts(limits).items():
+        met = [bars[name] for bars in judged]
+        counted[name] = BarCount(text, met.count(True), met.count(False), met.count(None))
+    return counted
 
 
 def _at_most(value: float, limit: float) -> bool | None:

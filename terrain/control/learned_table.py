@@ -3,20 +3,42 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from statistics import median_low
 
 from terrain.control.slip_table import DRIVE_STATES, SIGN, CurveEntry, SlipTable, load_slip_table
 from terrain.records import SlipTarget, TargetStatus
 from terrain.robots import Robot
+from terrain.simulation.slip_sweep import learning_runs
 from terrain.slip_learning.curve import SlipCurve
 from terrain.slip_learning.laws import LAW_PARAMETERS
-from terrain.slip_learning.learn import LearnedTerrain
+from terrain.slip_learning.learn import LearnedTerrain, learn_terrain, terrain_runs
 from terrain.slip_learning.targets import Targets, energy_jpm, tractive_efficiency
+from terrain.terramechanics.soil import load_soil
 
 FALLBACK = "unknown"
 DIGITS = 4
 """Of slips and ratios of forces in the table: a hundredth of their standard deviation."""
+
+
+def simulated_table(
+    robot: Robot, terrains: Sequence[str], seed: int, progress: Callable[[int, int], None]
+) -> SlipTable:
+    """Return target slips learned from simulated runs on terrains, as ``terrain learn-slip`` learns them.
+
+    Parameters
+    ----------
+    robot : swerve robot
+    terrains : soils
+    seed : of the runs, and of what is learned from them
+    progress : gets the number of terrains that are done, and of all
+    """
+    learned = []
+    for done, terrain in enumerate(terrains, start=1):
+        measured = [one for log in learning_runs(robot, terrain, seed) for one in terrain_runs(log, robot)]
+        learned.append(learn_terrain(load_soil(terrain).name, measured, seed))
+        progress(done, len(terrains))
+    return learned_table(learned, robot, "learned")
 
 
 def learned_table(learned: Sequence[LearnedTerrain], robot: Robot, name: str) -> SlipTable:

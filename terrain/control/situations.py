@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import NamedTuple
@@ -12,9 +12,10 @@ from typing import NamedTuple
 import numpy as np
 
 from terrain.errors import ConfigError
-from terrain.records import Label
+from terrain.records import Command, Label, RunLog, Sample
 from terrain.robots import Robot
 from terrain.simulation.conditions import Conditions, Faults, draw_conditions, load_spread
+from terrain.simulation.dynamic.simulate import simulate
 from terrain.simulation.scenario.make import SCENARIOS, make_scenario
 from terrain.simulation.scenario.scenario import RATE_HZ, Patch, Scenario
 from terrain.terramechanics.soil import Soil, load_soil, scattered, soil_names
@@ -103,6 +104,34 @@ def make_situation(
     scenario = _scenario(name, robot, list(soils), driven, options)
     faults = Faults(camera_lost_s=(CAMERA_LOST_S,)) if name == MIXED else Faults()
     return Situation(scenario, soils, conditions, faults, simulated)
+
+
+def simulate_situation(
+    robot: Robot,
+    situation: Situation,
+    controller: Callable[[Sample], Command],
+    delay_s: float,
+) -> RunLog:
+    """Return the log of a situation that a controller drives.
+
+    Parameters
+    ----------
+    robot : that is simulated
+    situation : in which it drives
+    controller : from a sample to a command
+    delay_s : from a sample to the wheel
+    """
+    return simulate(
+        robot,
+        situation.scenario,
+        situation.soils,
+        situation.seed,
+        run_id="drive",
+        conditions=situation.conditions,
+        faults=situation.faults,
+        controller=controller,
+        command_delay_s=delay_s,
+    )
 
 
 def _chosen(conditions: Conditions, options: SituationOptions, level: bool) -> Conditions:

@@ -56,7 +56,6 @@ ALLOWED: dict[str, tuple[str, ...]] = {
     "tests/pipelines/drive/test_drive.py": ("told:clay",),
     "terrain/effects/wheels.py": ('"steering_play"', '"steering_play_rad"'),
     "pipelines/reporting/json_file.py": ('"ours"', '"taught_runs"', '"felt_ratio"'),
-    "pipelines/drive/controller_names.py": ('"told"', "told:clay"),
     "README.md": ("told:NAME",),
     "CHANGELOG.md": ("told:NAME", "`steering_play`", "`ours`", "`taught_runs`", "`felt_ratio`"),
     "tests/terrain/extension/test_writing.py": ('"steering_play"', "steering_play_rad"),

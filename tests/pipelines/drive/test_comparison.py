@@ -12,12 +12,8 @@ from pipelines.drive.comparison import (
     DriveResult,
     belief_notes,
     compare,
-    difference,
-    shown_metrics,
-    steepest,
 )
-from pipelines.drive.controller_names import CONTROLLERS
-from pipelines.drive.controllers import DriveInputs, drive_once, make_controller
+from pipelines.drive.controllers import DriveInputs, drive_once
 from pipelines.drive.drive import Settings
 from pipelines.drive.run_figures import run_figures
 from pipelines.learn.model_file import TerrainModel
@@ -26,6 +22,8 @@ from pipelines.report import NOT_KNOWN
 from pipelines.report.json_file import as_json
 from pipelines.report.terminal import terminal_text
 from terrain.control.comparison import mean_interval
+from terrain.control.controllers import CONTROLLERS, make_controller
+from terrain.control.drive_comparison import steepest_grade
 from terrain.control.drive_curves import drive_curves
 from terrain.control.drive_evaluation import (
     METRICS,
@@ -34,7 +32,7 @@ from terrain.control.drive_evaluation import (
 from terrain.control.drive_metrics import drive_history
 from terrain.control.pilot_settings import PilotStatus
 from terrain.control.power_state import DriveState
-from terrain.control.situations import make_situation
+from terrain.control.situations import SituationOptions, make_situation
 from terrain.control.slip_table import CurveEntry, SlipTable, load_slip_table
 from terrain.errors import ConfigError
 from terrain.records import RunLog, Stream
@@ -112,8 +110,13 @@ def test_sliding_back_is_negative_distance():
 
 
 def test_the_steepest_grade_is_found():
-    settings = Settings(scenario="slope", terrain="dry_sand", controllers=("plain",), duration_s=8.0)
-    assert 8.0 < steepest(settings, INPUTS, make_controller("plain", TABLE, 0.05), 302) < 20.0
+    plain = make_controller("plain", TABLE, 0.05)
+
+    def drive(grade_deg):
+        options = SituationOptions(duration_s=8.0, grade_deg=grade_deg)
+        return drive_once(INPUTS, plain, make_situation("slope", ROBOT, "dry_sand", 302, options))
+
+    assert 8.0 < steepest_grade(drive) < 20.0
 
 
 class Scripted:
@@ -150,7 +153,7 @@ def test_the_thesis_takes_the_targets_of_the_classified_terrain(monkeypatch):
     counts = [classified[name].mean for name in ("n_accepted", "n_below_threshold", "n_refused")]
     assert counts == [7, 0, 1]
     assert base["mean_speed_mps"].mean != classified["mean_speed_mps"].mean
-    assert belief_notes(result) == ()
+    assert belief_notes(result.compared) == ()
 
 
 @pytest.mark.parametrize("suffix", ["", "+track"])
@@ -173,7 +176,7 @@ def test_no_gain_is_credited_to_a_classifier_that_was_never_believed(monkeypatch
     for name in ("classified", "thesis:classified"):
         assert result.controllers[name]["believed_ratio"].mean == 0.0
         assert result.controllers[name]["n_below_threshold"].mean == 3
-    notes = belief_notes(result)
+    notes = belief_notes(result.compared)
     assert [note.split()[0] for note in notes] == ["thesis:classified", "classified"]
     assert "knew the terrain at no time" in notes[0]
     assert "0 accepted, 3 below the threshold, 1 refused" in notes[0]
@@ -282,7 +285,7 @@ def test_a_difference_is_taken_seed_by_seed():
     plain, gain = np.array([1.0, 2.0, 3.0, 4.0]), np.array([-0.19, -0.21, -0.2, -0.2])
     values = {"plain": {"slip_peak": plain}, "true_terrain": {"slip_peak": plain + gain}}
     result = a_result(("plain", "true_terrain"), values)
-    paired = difference(result, "true_terrain", "plain", "slip_peak")
+    paired = result.compared.difference("true_terrain", "plain", "slip_peak")
     assert paired.mean == pytest.approx(-0.08)
     assert paired.is_significant
     assert paired.high - paired.low == pytest.approx(
@@ -291,7 +294,7 @@ def test_a_difference_is_taken_seed_by_seed():
     assert text_of(result).startswith("true_terrain compared with plain: largest slip -8.0 %")
     values["true_terrain"]["slip_peak"] = plain + gain + [math.nan, 0.0, 0.0, 0.0]
     result = a_result(("plain", "true_terrain"), values)
-    found = difference(result, "true_terrain", "plain", "slip_peak")
+    found = result.compared.difference("true_terrain", "plain", "slip_peak")
     assert found.mean == pytest.approx(gain[1:].mean() / 3.0)
 
 
@@ -299,7 +302,7 @@ def test_one_seed_has_no_interval():
     result = a_result(n_seeds=1)
     assert "one seed, which gives no interval" in result.report.answer
     assert " *" not in text_of(result)
-    assert not difference(result, "true_terrain", "plain", "slip_peak").is_significant
+    assert not result.compared.difference("true_terrain", "plain", "slip_peak").is_significant
 
 
 def test_only_controllers_that_use_the_terrain_adapt_to_it():
@@ -307,8 +310,8 @@ def test_only_controllers_that_use_the_terrain_adapt_to_it():
     result = a_result(names, scenario="course", terrain="course")
     assert f"adapt_s {NOT_KNOWN} 2 (1.91 to 2.09) 3 (2.91 to 3.09)" in text_of(result)
     assert result.report.title == "course on all terrains"
-    assert "adapt_s" in shown_metrics(result)
-    assert "adapt_s" not in shown_metrics(a_result())
+    assert "adapt_s" in result.compared.shown
+    assert "adapt_s" not in a_result().compared.shown
 
 
 def test_a_drive_shows_states_refusals_and_terrains():

@@ -13,7 +13,6 @@ from pipelines.drive.drive import Settings
 from pipelines.drive.faults import (
     bars_text,
     checked_robot,
-    drawn_cases,
     drive_faults,
     fault_figure,
     fault_loop,
@@ -24,6 +23,7 @@ from terrain.control.drive_metrics import drive_history, stopping_distance
 from terrain.control.fault_drives import (
     FaultCase,
     Place,
+    drawn_cases,
     drive_case,
     drive_references,
     evaluate_case,
@@ -151,9 +151,9 @@ def test_the_report_counts_what_is_met_and_names_what_is_not(few):
     assert answer.startswith(f"{few.n_met} of 4 drives with a sensor fault meet all bars")
     assert ("not met with loss_odometry" in answer) == unmet
     assert [row[1:4] for row in few.report.parts[0].rows] == [bar[1:] for bar in few.bars.values()]
-    drawn = drawn_cases(FEW.with_(draw="duplicates"), few.rows)
+    drawn = drawn_cases(few.rows, ("duplicates",))
     assert drawn == [FaultCase("duplicates_imu", math.inf, "steady", "grass", 400)]
-    assert all(case.fault == "loss_odometry" for case in drawn_cases(FEW, few.rows))
+    assert all(case.fault == "loss_odometry" for case in drawn_cases(few.rows))
     references = drive_references(LOOP, Place(*drawn[0][2:]))
     figure = fault_figure(drawn[0], drive_case(LOOP, drawn[0]), references)
     assert figure.title == "duplicates_imu, for good: steady on grass, seed 400"

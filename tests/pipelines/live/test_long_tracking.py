@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from pipelines.drive.controllers import DriveInputs, drive_once, make_controller
+from pipelines.drive.controllers import DriveInputs, drive_once
+from terrain.control.controllers import make_controller
 from terrain.control.path_tracking import PoseEstimate, TrackStatus, initial_tracking, track_step
 from terrain.control.situations import SituationOptions, make_situation
 from terrain.control.slip_table import load_slip_table

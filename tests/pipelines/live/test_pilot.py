@@ -9,9 +9,10 @@ from functools import cache
 import numpy as np
 import pytest
 
-from pipelines.drive.controllers import DriveInputs, drive_once, make_controller
+from pipelines.drive.controllers import DriveInputs, drive_once
 from pipelines.live.pilot import LivePilot
 from pipelines.live.terrain_source import KnownTerrain
+from terrain.control.controllers import make_controller
 from terrain.control.drive_metrics import distance_within, drive_history, final_speed, slip_peak
 from terrain.control.pid import Gains
 from terrain.control.pilot_settings import PilotSettings

@@ -5,7 +5,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from pipelines.drive.controllers import DriveInputs, drive_once, make_controller
+from pipelines.drive.controllers import DriveInputs, drive_once
+from terrain.control.controllers import make_controller
 from terrain.control.fault_situations import START, STOP, make_fault_situation
 from terrain.control.slip_table import load_slip_table
 from terrain.estimation.live.clocks import Clocks
