@@ -11,30 +11,33 @@ from typing import Annotated, Any
 
 from fastapi import Body, FastAPI, HTTPException, Response, WebSocket
 from fastapi.responses import FileResponse, PlainTextResponse
+from fastapi.staticfiles import StaticFiles
 from pydantic import BaseModel, ConfigDict, Field
 
 from pipelines import report
 from pipelines.learn.model_file import TerrainModel
 from pipelines.report.json_file import as_json
 from pipelines.serve.connection import Connection, Watcher
-from pipelines.serve.guard import LARGEST_BODY, Connections, Guard
+from pipelines.serve.guard import Guard
 from pipelines.serve.hub import Hub
 from pipelines.serve.messages import served_content
-from pipelines.serve.wire import plain
 from terrain import __version__
 from terrain.control.slip_table import SlipTable, load_slip_table
 from terrain.errors import ConfigError, TerrainError
 
+LARGEST_BODY = 262_144
+"""Bytes of a request's body: a table of target slips, or the name of a model."""
+
 PAGE = Path(__file__).parent / "page"
-PLOTS = Path(report.__file__).parent / "assets"
-PAGE_FILES = {
-    "page.js": (PAGE, "text/javascript"),
-    "page.css": (PAGE, "text/css"),
-    "icon.svg": (PAGE, "image/svg+xml"),
-    "uplot.js": (PLOTS, "text/javascript"),
-    "uplot.css": (PLOTS, "text/css"),
-}
-OPEN = frozenset(("/", "/health", "/ready", *(f"/page/{name}" for name in PAGE_FILES)))
+FOLDERS = {"/page": PAGE, "/assets": Path(report.__file__).parent / "assets"}
+"""Files of the page, and the plots that it shares with reports."""
+
+OPEN = frozenset(
+    (
+        *("/", "/health", "/ready"),
+        *(f"{place}/{file.name}" for place, folder in FOLDERS.items() for file in folder.iterdir()),
+    )
+)
 """Paths that need no token: they tell nothing of robots."""
 
 
@@ -52,7 +55,6 @@ def make_app(
     hub: Hub,
     token: str,
     load: Callable[[str], TerrainModel],
-    connections: Connections,
     lifespan: Callable[[FastAPI], AbstractAsyncContextManager[None]],
     *,
     loopback: bool,
@@ -64,7 +66,6 @@ def make_app(
     hub : of the sessions
     token : that is required; empty for none
     load : returns a model by its URI; raises ``ModelError``
-    connections : of the server
     lifespan : what begins before the first request, and ends after the last
     loopback : whether only this machine is listened to
     """
@@ -77,10 +78,15 @@ def make_app(
         lifespan=lifespan,
         max_body_size=LARGEST_BODY,
     )
-    guard = Guard(app, token, OPEN, hub.metrics, connections, loopback=loopback)
-    _add_page(app)
-    _add_state(app, hub)
-    _add_replacement(app, hub, load)
+    guard = Guard(app, token, OPEN, hub.metrics, loopback=loopback)
+    replacing = asyncio.Lock()
+
+    for place, folder in FOLDERS.items():
+        app.mount(place, StaticFiles(directory=folder))
+
+    @app.get("/", include_in_schema=False)
+    async def page() -> FileResponse:
+        return FileResponse(PAGE / "index.html")
 
     @app.websocket("/robots")
     async def robots(socket: WebSocket) -> None:
@@ -90,23 +96,6 @@ def make_app(
     async def watchers(socket: WebSocket) -> None:
         await Watcher(socket, hub, token, guard.wrong_token).serve()
 
-    return guard
-
-
-def _add_page(app: FastAPI) -> None:
-    @app.get("/", include_in_schema=False)
-    async def page() -> FileResponse:
-        return FileResponse(PAGE / "index.html", media_type="text/html")
-
-    @app.get("/page/{name}", include_in_schema=False)
-    async def page_file(name: str) -> FileResponse:
-        if name not in PAGE_FILES:
-            raise HTTPException(404, "there is no such file")
-        folder, kind = PAGE_FILES[name]
-        return FileResponse(folder / name, media_type=kind)
-
-
-def _add_state(app: FastAPI, hub: Hub) -> None:
     @app.get("/health")
     async def health() -> dict[str, str]:
         """Say that the process runs."""
@@ -128,27 +117,15 @@ def _add_state(app: FastAPI, hub: Hub) -> None:
     async def model() -> dict[str, Any]:
         """Return the card of the model that is served: how it was trained, on what, and how well it did."""
         served = hub.served
-        card = {} if served.model is None else as_json(served.model.info)
-        return {"served": served_content(served), "card": plain(card)}
+        return {
+            "served": served_content(served),
+            "card": {} if served.model is None else as_json(served.model.info),
+        }
 
     @app.get("/sessions")
     async def sessions() -> list[dict[str, Any]]:
         """Return the robots that are connected."""
-        return [
-            {
-                "session": opened.name,
-                "robot": opened.chain.request.robot,
-                "control": opened.chain.request.control,
-                "terrain": opened.chain.belief.terrain or None,
-                "recording": opened.chain.recording,
-                "dropped": opened.chain.dropped,
-            }
-            for opened in hub.sessions.values()
-        ]
-
-
-def _add_replacement(app: FastAPI, hub: Hub, load: Callable[[str], TerrainModel]) -> None:
-    replacing = asyncio.Lock()
+        return [opened.content() for opened in hub.sessions.values()]
 
     @asynccontextmanager
     async def one_at_a_time() -> AsyncIterator[None]:
@@ -171,6 +148,8 @@ def _add_replacement(app: FastAPI, hub: Hub, load: Callable[[str], TerrainModel]
         async with one_at_a_time():
             table = await asyncio.to_thread(_table_of, text)
             return served_content(hub.swap(hub.served.model, hub.served.model_name, table))
+
+    return guard
 
 
 def _table_of(text: str) -> SlipTable:

@@ -13,15 +13,14 @@ import math
 import threading
 from collections import deque
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from time import monotonic
-from types import TracebackType
 from typing import Any, Self
 
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus, InvalidURI
-from websockets.sync.client import ClientConnection, connect
+from websockets.sync.client import connect
 
-from pipelines.serve.wire import WireError, decode, encode, plain
+from pipelines.serve.wire import WireError, decode, encode
 from terrain.errors import TerrainError
 
 MAX_ERRORS = 100
@@ -78,49 +77,39 @@ class TerrainClient:
         self._newest_s = -math.inf  # of the last samples: a clock may be set back
         self.errors: deque[dict[str, Any]] = deque(maxlen=MAX_ERRORS)
         self.n_steps = 0
-        try:
-            connecting = connect(
-                f"{url.rstrip('/')}/robots",
-                open_timeout=TIMEOUT_S,
-                compression=None,
-                max_size=None,
-                additional_headers={"Authorization": f"Bearer {token}"} if token else None,
-            )
-            self._socket: ClientConnection = connecting.__enter__()  # close() ends it
-        except InvalidStatus as error:
-            code = "token" if error.response.status_code == 401 else "refused"
-            raise ServiceError(code, error.response.body.decode(errors="replace").strip()) from None
-        except (OSError, TimeoutError, InvalidURI, InvalidHandshake, ValueError) as error:
-            raise ServiceError("unreachable", f"{url}: cannot be reached ({error})") from None
-        try:
+        with ExitStack() as leaving:
+            try:
+                connecting = connect(
+                    f"{url.rstrip('/')}/robots",
+                    open_timeout=TIMEOUT_S,
+                    compression=None,
+                    max_size=None,
+                    additional_headers={"Authorization": f"Bearer {token}"} if token else None,
+                )
+                self._socket = leaving.enter_context(connecting)
+            except InvalidStatus as error:
+                code = "token" if error.response.status_code == 401 else "refused"
+                raise ServiceError(code, error.response.body.decode(errors="replace").strip()) from None
+            except (OSError, TimeoutError, InvalidURI, InvalidHandshake, ValueError) as error:
+                raise ServiceError("unreachable", f"{url}: cannot be reached ({error})") from None
+            hello = {"type": "hello", "protocol": 2, "session": session, "robot": robot}
             self._send(
-                {
-                    "type": "hello",
-                    "protocol": 2,
-                    "session": session,
-                    "robot": robot,
-                    "streams": {name: list(channels) for name, channels in streams.items()},
-                    "control": control,
-                    "rate_hz": rate_hz,
-                    "record": record,
-                }
+                hello | {"streams": dict(streams), "control": control, "rate_hz": rate_hz, "record": record}
             )
-            self.welcome = decode(self._socket.recv(TIMEOUT_S))
-        except (ConnectionClosed, TimeoutError) as error:
-            self._socket.close()
-            raise ServiceError("unreachable", f"{url}: did not answer ({error})") from None
-        if self.welcome.get("type") != "welcome":
-            self._socket.close()
-            raise ServiceError(str(self.welcome.get("code")), str(self.welcome.get("message")))
+            try:
+                self.welcome = decode(self._socket.recv(TIMEOUT_S))
+            except (ConnectionClosed, TimeoutError) as error:
+                raise ServiceError("unreachable", f"{url}: did not answer ({error})") from None
+            if self.welcome.get("type") != "welcome":
+                raise ServiceError(str(self.welcome.get("code")), str(self.welcome.get("message")))
+            self._leaving = leaving.pop_all()
         self._reader = threading.Thread(target=self._read, name="terrain client", daemon=True)
         self._reader.start()
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, place: TracebackType | None
-    ) -> None:
+    def __exit__(self, *raised: object) -> None:
         self.close()
 
     def send(
@@ -145,19 +134,10 @@ class TerrainClient:
         ServiceError
             if the connection has ended.
         """
-        content: dict[str, Any] = {
-            "type": "samples",
-            "streams": {name: plain([stamps, rows]) for name, (stamps, rows) in streams.items()},
-        }
-        if twist is not None:
-            content["twist"] = plain(list(twist))
-        if step:
-            content["step"] = True
-        if time_s is not None:
-            content["time_s"] = float(time_s)
-        self._send(content)
-        stamps = [stamp for stamps, _ in content["streams"].values() for stamp in stamps]
-        self._newest_s = max((stamp for stamp in stamps if stamp is not None), default=self._newest_s)
+        samples = {"type": "samples", "streams": dict(streams), "twist": twist}
+        self._send(samples | {"step": step, "time_s": time_s})
+        stamps = [float(stamp) for stamps, _ in streams.values() for stamp in stamps if stamp is not None]
+        self._newest_s = max((stamp for stamp in stamps if math.isfinite(stamp)), default=self._newest_s)
 
     def latest(self, max_age_s: float | None = None) -> dict[str, Any] | None:
         """Return the newest step; None before the first, and where it is older than an age.
@@ -190,7 +170,7 @@ class TerrainClient:
             while not self._steps:
                 if self._closed is not None:
                     raise self._closed
-                if not self._came.wait(end_s - monotonic()) and monotonic() >= end_s:
+                if not self._came.wait(end_s - monotonic()):
                     raise ServiceError("timeout", "the service gave no step in time")
             return self._steps.pop()[1]
 
@@ -198,7 +178,7 @@ class TerrainClient:
         """End the session."""
         with suppress(ServiceError):
             self._send({"type": "bye"})
-        self._socket.close()
+        self._leaving.close()
         self._reader.join(TIMEOUT_S)
 
     def _send(self, content: dict[str, Any]) -> None:

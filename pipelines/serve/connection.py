@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import asyncio
 import math
-from collections import deque
-from collections.abc import Awaitable, Callable
+from collections import Counter, deque
+from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from contextlib import suppress
 from time import monotonic, perf_counter
 from typing import Any
@@ -21,9 +21,16 @@ from starlette.websockets import WebSocketDisconnect, WebSocketState
 
 from pipelines.live.chain import CommandStatus
 from pipelines.live.session import StepOutput
-from pipelines.serve.guard import LONGEST_TOKEN, Budget, bearer, token_fits
+from pipelines.serve.guard import LONGEST_TOKEN, bearer, token_fits
 from pipelines.serve.hub import Hub, OpenSession
-from pipelines.serve.messages import error_content, read_hello, served_content, step_content, welcome
+from pipelines.serve.messages import (
+    Hello,
+    error_content,
+    read_hello,
+    served_content,
+    step_content,
+    welcome,
+)
 from pipelines.serve.wire import WireError, decode, encode
 from terrain.estimation.live.clocks import number
 
@@ -39,11 +46,8 @@ LARGE = 32_768
 PAUSE_S = 0.5
 """Before the next message of a robot is read whose hello was not accepted."""
 
-WATCH_HZ, MAX_WATCHERS, WATCH_SLOW_S = 10.0, 16, 10.0
-"""Of what pages are sent: how often, how many pages, and for how long one may not read."""
-
-LONGEST_WATCH = 4096
-"""Characters of what a page says."""
+WATCH_S, MAX_WATCHERS = 0.1, 16
+"""Between two states that a page is sent; and pages at once."""
 
 TRY_AGAIN_LATER, POLICY = 1013, 1008
 """Codes of closed WebSockets (RFC 6455)."""
@@ -52,6 +56,32 @@ NO_TOKEN = "a token is required, or it is another"
 
 GONE = (WebSocketDisconnect, RuntimeError, OSError)
 """What is raised where the other end has left, in the middle of anything; ``TimeoutError`` is among them."""
+
+
+class Budgets:
+    """So much a second of each thing, and a second's worth at once; what is spent beyond that is owed.
+
+    Examples
+    --------
+    >>> budgets = Budgets({"rows": 10.0, "bytes": 1000.0})
+    >>> budgets.spend(10.0, rows=15, bytes=100)
+    >>> budgets.owed(10.0), budgets.owed(10.5)
+    ((0.5, '10 rows'), (0.0, '10 rows'))
+    """
+
+    def __init__(self, per_s: Mapping[str, float]) -> None:
+        self._per_s = per_s
+        self._paid_s = dict.fromkeys(per_s, -math.inf)  # when nothing is owed any more
+
+    def spend(self, now_s: float, **spent: float) -> None:
+        """Note what has been spent by a time."""
+        for name, n in spent.items():
+            self._paid_s[name] = max(self._paid_s[name], now_s - 1.0) + n / self._per_s[name]
+
+    def owed(self, now_s: float) -> tuple[float, str]:
+        """Return the time in s until nothing is owed, and of what most is, as ``10 rows``."""
+        name = max(self._paid_s, key=self._paid_s.__getitem__)
+        return max(self._paid_s[name] - now_s, 0.0), f"{self._per_s[name]:g} {name}"
 
 
 class Line:
@@ -64,6 +94,8 @@ class Line:
     token : that is required; empty for none
     wrong_token : counts a wrong token, and waits
     """
+
+    _has_header = True
 
     def __init__(
         self, socket: WebSocket, hub: Hub, token: str, wrong_token: Callable[[], Awaitable[None]]
@@ -91,7 +123,7 @@ class Line:
 
     async def _admitted(self) -> bool:
         """Say whether the token is the required one: that of the header, or the first frame, undecoded."""
-        if token_fits(self._token, bearer(self._socket.headers)):
+        if self._has_header and token_fits(self._token, bearer(self._socket.headers)):
             return True
         first: str | bytes = ""
         with suppress(TimeoutError):
@@ -131,32 +163,32 @@ class Line:
 class Connection(Line):
     """One robot's connection: messages in, steps out, each at its own time."""
 
+    _hello: Hello
+    _opened: OpenSession
+
     def __init__(
         self, socket: WebSocket, hub: Hub, token: str, wrong_token: Callable[[], Awaitable[None]]
     ) -> None:
         super().__init__(socket, hub, token, wrong_token)
-        limits = hub.limits
-        self._messages, self._rows = Budget(limits.messages_per_s), Budget(limits.rows_per_s)
-        self._bytes, self._decoding = Budget(limits.bytes_per_s), Budget(limits.decoding_s_per_s)
+        self._budgets = Budgets(hub.limits.per_s)
         self._notes: deque[dict[str, Any]] = deque(maxlen=MAX_NOTES)
         self._step: StepOutput | None = None
         self._changed = asyncio.Event()
-        self._dropped: dict[str, int] = {}
+        self._dropped: Counter[str] = Counter()
 
     async def _talk(self) -> None:
-        opened, rate_hz = await self._greet()
-        if opened is None:
+        if not await self._greeted():
             return
-        talking = [self._receive(opened, rate_hz), self._send()]
-        if rate_hz > 0.0:
-            talking.append(self._tick(opened, rate_hz))
+        talking: list[Coroutine[Any, Any, None]] = [self._receive(), self._send()]
+        if self._hello.rate_hz > 0.0:
+            talking.append(self._tick(1.0 / self._hello.rate_hz))
         tasks = [asyncio.create_task(one) for one in talking]
         try:
             await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         finally:
             for task in tasks:
                 task.cancel()
-            self._hub.close(opened)
+            self._hub.close(self._opened)
             for result in await asyncio.gather(*tasks, return_exceptions=True):
                 if isinstance(result, Exception) and not isinstance(result, GONE):
                     self._hub.trouble["connection"] = f"{type(result).__name__}: {result}"
@@ -166,8 +198,8 @@ class Connection(Line):
         self._end = (TRY_AGAIN_LATER, sentence[:120])
         self._note(code, sentence, fatal=True)
 
-    async def _greet(self) -> tuple[OpenSession | None, float]:
-        """Wait for a hello and answer it; None where none came in time or it was refused for good."""
+    async def _greeted(self) -> bool:
+        """Wait for a hello and answer it; say whether one came in time and was not refused for good."""
         limits = self._hub.limits
         latest_s = asyncio.get_running_loop().time() + limits.hello_s
         while True:
@@ -178,99 +210,79 @@ class Connection(Line):
                     raise WireError(
                         "too-large", f"the first message has {len(message)} bytes, {LARGE} are accepted"
                     )
-                hello = read_hello(decode(message))
-                opened = await self._hub.open(hello, self.leave)
+                self._hello = read_hello(decode(message))
+                self._opened = opened = await self._hub.open(self._hello, self.leave)
                 break
             except WireError as error:
                 final = error.code == "closing"
                 await self._write(self._error(error.code, str(error), fatal=final))
                 if final:
                     self._end = (POLICY, error.code)
-                    return None, 0.0
+                    return False
                 await asyncio.sleep(PAUSE_S)
             except TimeoutError:
                 self._end = (POLICY, "no hello came in time")
-                return None, 0.0
+                return False
         accepted = {name: value for name, value in limits._asdict().items() if name != "sessions"}
         try:
-            await self._write(welcome(hello, opened.chain, opened.restored, accepted))
+            await self._write(welcome(self._hello, opened.chain, opened.restored, accepted))
         except BaseException:  # it has left meanwhile
             self._hub.close(opened)
             raise
-        return opened, hello.rate_hz
+        return True
 
-    async def _receive(self, opened: OpenSession, rate_hz: float) -> None:
+    async def _receive(self) -> None:
+        """Take messages until one says goodbye; a robot that owes is not read until it owes nothing."""
         n_taken = 0
         while True:
             try:
                 message = await self._received()
-                now_s = opened.received_s = monotonic()
+                now_s = self._opened.received_s = monotonic()
                 self._hub.metrics.messages.inc()
                 n_taken += 1
                 if n_taken % TURN == 0:
                     await asyncio.sleep(0)
-                if not await self._within(message, now_s):
+                owed_s, most = self._budgets.owed(now_s)
+                if owed_s > 0.0:
+                    self._drop(most)
+                    await asyncio.sleep(owed_s)
                     continue
                 content = await self._decoded(message)
-                if content.get("type") == "bye":
+                kind = str(content.get("type"))
+                if kind == "bye":
                     return
-                if content.get("type") != "samples":
-                    kind = str(content.get("type"))[:40]
-                    raise WireError("unknown-type", f"there is no message of the type {kind!r}")
-                self._take(opened, content, now_s)
-                if rate_hz == 0.0 and content.get("step") is True:
+                if kind != "samples":
+                    raise WireError("unknown-type", f"there is no message of the type {kind[:40]!r}")
+                self._take(content, now_s)
+                if self._hello.rate_hz == 0.0 and content.get("step") is True:
                     time_s = number(content.get("time_s"))
-                    self._run(opened, time_s if math.isfinite(time_s) else None)
+                    self._run(time_s if math.isfinite(time_s) else None)
             except WireError as error:
                 self._note(error.code, str(error))
 
-    async def _within(self, message: str | bytes, now_s: float) -> bool:
-        """Say whether a message is within the budgets; one that is not is dropped, undecoded.
-
-        A robot that owes bytes or decoding is not read until it owes none: what it sends waits at its end.
-        """
-        limits = self._hub.limits
-        owed_s = self._bytes.owe(len(message), now_s)
-        if not self._messages.take(1, now_s):
-            self._drop(f"{limits.messages_per_s:g} messages")
-        elif owed_s:
-            self._drop(f"{limits.bytes_per_s:g} bytes")
-        elif owed_s := self._decoding.owe(0.0, now_s):
-            self._drop(f"{limits.decoding_s_per_s:g} s of decoding")
-        else:
-            return True
-        await asyncio.sleep(owed_s)
-        return False
-
     async def _decoded(self, message: str | bytes) -> dict[str, Any]:
-        most = self._hub.limits.message_bytes
+        most, begun_s = self._hub.limits.message_bytes, monotonic()
+        self._budgets.spend(begun_s, messages=1, bytes=len(message))
         if len(message) > most:
             raise WireError("too-large", f"the message has {len(message)} bytes, {most} are accepted")
-        begun_s = perf_counter()
         try:
             return decode(message) if len(message) <= LARGE else await asyncio.to_thread(decode, message)
         finally:
-            self._decoding.owe(perf_counter() - begun_s, monotonic())
+            now_s = monotonic()
+            self._budgets.spend(now_s, **{"s of decoding": now_s - begun_s})
 
-    def _take(self, opened: OpenSession, content: dict[str, Any], now_s: float) -> None:
+    def _take(self, content: dict[str, Any], now_s: float) -> None:
         """Take the samples of a message; what is refused of it is named in one error, the rest is used."""
-        chain, streams = opened.chain, content.get("streams")
-        given = streams.values() if isinstance(streams, dict) else ()
-        n_rows = sum(
-            len(one[0]) for one in given if isinstance(one, list) and one and isinstance(one[0], list)
-        )
-        if not self._rows.take(n_rows, now_s):
-            most = self._hub.limits.rows_per_s
-            raise WireError("too-fast", f"more than {most:g} rows a second: this message is dropped")
-        before = chain.inbox.refused.copy()
-        self._hub.metrics.rows.inc(chain.put(streams, content.get("twist"), now_s))
-        refused = chain.inbox.refused - before
-        if refused:
+        inbox = self._opened.chain.inbox
+        before = inbox.refused.copy()
+        n_rows = self._opened.chain.put(content.get("streams"), content.get("twist"), now_s)
+        self._budgets.spend(now_s, rows=n_rows)
+        self._hub.metrics.rows.inc(n_rows)
+        if refused := inbox.refused - before:
             self._note("malformed", f"samples: {'; '.join(sorted(refused))}")
 
-    async def _tick(self, opened: OpenSession, rate_hz: float) -> None:
+    async def _tick(self, period_s: float) -> None:
         """Step at the rate that was asked for; ticks that cannot be kept are left out and counted."""
-        period_s = 1.0 / rate_hz
         due_s = monotonic()
         while True:
             due_s += period_s
@@ -280,25 +292,25 @@ class Connection(Line):
                 self._hub.metrics.late_ticks.inc(n)
                 due_s += n * period_s
             await asyncio.sleep(max(wait_s, 0.0))
-            self._run(opened)
+            self._run()
 
-    def _run(self, opened: OpenSession, time_s: float | None = None) -> None:
-        metrics, begun_s = self._hub.metrics, perf_counter()
-        output = opened.chain.step(time_s=time_s)
+    def _run(self, time_s: float | None = None) -> None:
+        metrics, chain, begun_s = self._hub.metrics, self._opened.chain, perf_counter()
+        output = chain.step(time_s=time_s)
         metrics.step_s.observe(perf_counter() - begun_s)
         metrics.steps.inc()
-        if output.latency_s == output.latency_s:  # a number
+        if not math.isnan(output.latency_s):
             metrics.latency_s.observe(output.latency_s)
         if output.status is not CommandStatus.OK:
             metrics.stopped.labels(output.status.value).inc()
         if output.status is CommandStatus.FAILED:
-            self._hub.trouble[f"session {opened.name}"] = opened.chain.failure
-        for window in opened.chain.finished:
+            self._hub.trouble[f"session {self._opened.name}"] = chain.failure
+        for window in chain.finished:
             metrics.window_s.observe(window.took_s)
             metrics.windows.labels(window.terrain or "refused").inc()
         if self._step is not None:
             metrics.unsent.inc()
-        self._step = opened.last = output
+        self._step = self._opened.last = output
         self._changed.set()
 
     async def _send(self) -> None:
@@ -324,12 +336,12 @@ class Connection(Line):
         """Count a message that comes too fast; those of a twentieth of a second are named in one error."""
         if not self._dropped:
             asyncio.get_running_loop().call_later(0.05, self._note_dropped)
-        self._dropped[most] = self._dropped.get(most, 0) + 1
+        self._dropped[most] += 1
 
     def _note_dropped(self) -> None:
-        dropped, self._dropped = self._dropped, {}
-        for most, n in dropped.items():
+        for most, n in self._dropped.items():
             self._note("too-fast", f"more than {most} a second: dropped {n} of them")
+        self._dropped.clear()
 
     def _note(self, code: str, sentence: str, *, fatal: bool = False) -> None:
         self._notes.append(self._error(code, sentence, fatal=fatal))
@@ -337,40 +349,21 @@ class Connection(Line):
 
 
 class Watcher(Line):
-    """A page: it is sent the newest step of one robot, ten times a second.
+    """A page: it is sent the newest step of the session that its address names, ten times a second."""
 
-    It says ``{"type": "watch", "session": ...}`` at any time; without a session it is sent the first one.
-    """
-
-    _session = ""
+    _has_header = False  # a browser sets none: a token is its first frame, which is empty where it knows none
 
     async def _talk(self) -> None:
         if self._hub.watchers >= MAX_WATCHERS:
             self._end = (TRY_AGAIN_LATER, f"{MAX_WATCHERS} pages are open, no more are accepted")
             return
         self._hub.watchers += 1
-        tasks = [asyncio.create_task(self._listen()), asyncio.create_task(self._show())]
         try:
-            await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+            while True:
+                await self._write(shown(self._hub, self._socket.query_params.get("session", "")))
+                await asyncio.sleep(WATCH_S)
         finally:
             self._hub.watchers -= 1
-            for task in tasks:
-                task.cancel()
-            await asyncio.gather(*tasks, return_exceptions=True)
-
-    async def _listen(self) -> None:
-        while True:
-            message = await self._received()
-            with suppress(WireError):
-                if len(message) <= LONGEST_WATCH:
-                    self._session = str(decode(message).get("session", ""))
-            await asyncio.sleep(0.1)
-
-    async def _show(self) -> None:
-        while True:
-            async with asyncio.timeout(WATCH_SLOW_S):
-                await self._socket.send_text(str(encode(shown(self._hub, self._session))))
-            await asyncio.sleep(1.0 / WATCH_HZ)
 
 
 def shown(hub: Hub, session: str) -> dict[str, Any]:
@@ -385,13 +378,8 @@ def shown(hub: Hub, session: str) -> dict[str, Any]:
     }
     if opened is not None:
         robot = hub.robot(opened.chain.request.robot)
-        content["session"] = {
-            "name": opened.name,
-            "robot": opened.chain.request.robot,
-            "control": opened.chain.request.control,
+        content["session"] = opened.content() | {
             "wheels": [] if robot is None else list(robot.wheels),
-            "recording": opened.chain.recording,
-            "dropped": opened.chain.dropped,
             "step": None if opened.last is None else step_content(opened.last),
         }
     return content

@@ -1,19 +1,21 @@
-"""Who may speak to the service, and how much: tokens, origins, bodies, budgets, and connections that stall."""
+"""Who may speak to the service: tokens, origins, and connections that stall."""
 
 from __future__ import annotations
 
 import asyncio
 import hmac
 import ipaddress
+import os
 import socket
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
-from fastapi import HTTPException
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import PlainTextResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from pipelines.serve.metrics import Metrics
 from terrain.errors import ConfigError
@@ -25,9 +27,6 @@ LONGEST_TOKEN = 512
 
 WRONG_TOKEN_S = 1.0
 """Before a token that is missing or another is answered: a thousand tries take a quarter of an hour."""
-
-LARGEST_BODY = 262_144
-"""Bytes of a request's body: a table of target slips, or the name of a model."""
 
 REQUEST_S = 10.0
 """For a request to come whole, and for a response to be read."""
@@ -65,14 +64,22 @@ def is_loopback(host: str) -> bool:
         return False
 
 
-def check_token(host: str, token: str) -> None:
-    """Refuse to listen to other machines without a token, or with one that is too short or too long.
+def required_token(host: str, file: Path | None) -> str:
+    """Return the token that a file or ``TERRAIN_TOKEN`` holds; empty for none.
 
     Raises
     ------
     ConfigError
-        where it is.
+        if it cannot be read, is too short or too long, or is missing where other machines are listened to.
     """
+    try:
+        held = os.environ.get("TERRAIN_TOKEN", "") if file is None else file.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or "no text"
+        raise ConfigError(f"{file}: cannot be read ({reason})") from None
+    token = held.strip()
+    if file is not None and not token:
+        raise ConfigError(f"{file}: holds no token")
     if token and not SHORTEST_TOKEN <= len(token) <= LONGEST_TOKEN:
         raise ConfigError(
             f"the token has {len(token)} characters, {SHORTEST_TOKEN} to {LONGEST_TOKEN} are accepted "
@@ -80,6 +87,7 @@ def check_token(host: str, token: str) -> None:
         )
     if not token and not is_loopback(host):
         raise ConfigError(f"--host {host} is reached from other machines: a token is required (--token-file)")
+    return token
 
 
 def token_fits(required: str, given: str) -> bool:
@@ -123,42 +131,6 @@ def _name(url: str) -> str:
         return ""
 
 
-class Budget:
-    """So much a second, and a second's worth at once; what is over is refused, or owed.
-
-    Examples
-    --------
-    >>> budget = Budget(10.0)
-    >>> budget.take(10, 0.0), budget.take(1, 0.0), budget.take(1, 0.5)
-    (True, False, True)
-    >>> budget.owe(14, 0.5), budget.take(1, 0.5), budget.owe(0, 1.0)
-    (1.0, False, 0.5)
-    """
-
-    def __init__(self, per_s: float) -> None:
-        self._per_s = self._left = per_s
-        self._now_s: float | None = None
-
-    def _refill(self, now_s: float) -> None:
-        if self._now_s is not None:
-            self._left = min(self._left + (now_s - self._now_s) * self._per_s, self._per_s)
-        self._now_s = now_s
-
-    def take(self, n: float, now_s: float) -> bool:
-        """Say whether n more are within the budget; if so they are taken."""
-        self._refill(now_s)
-        if n > self._left:
-            return False
-        self._left -= n
-        return True
-
-    def owe(self, n: float, now_s: float) -> float:
-        """Take n that have been spent already; return how many seconds it takes until nothing is owed."""
-        self._refill(now_s)
-        self._left -= n
-        return max(-self._left / self._per_s, 0.0)
-
-
 class Guard:
     """The application behind its limits: foreign pages, tokens of requests, sizes and times of bodies.
 
@@ -171,42 +143,48 @@ class Guard:
     open_paths : that need no token: they tell nothing of robots
     loopback : whether only this machine is listened to
     metrics : gets the number of wrong tokens
-    connections : of the server
     """
 
     def __init__(
-        self,
-        app: ASGIApp,
-        token: str,
-        open_paths: frozenset[str],
-        metrics: Metrics,
-        connections: Connections,
-        *,
-        loopback: bool,
+        self, app: ASGIApp, token: str, open_paths: frozenset[str], metrics: Metrics, *, loopback: bool
     ) -> None:
         self._app, self._token, self._open, self._loopback = app, token, open_paths, loopback
-        self._metrics, self._connections = metrics, connections
+        self._metrics = metrics
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve a request or a WebSocket."""
-        if scope["type"] not in ("http", "websocket"):
+        if scope["type"] == "lifespan":
             await self._app(scope, receive, send)
             return
-        address, headers, is_http = scope.get("client"), Headers(scope=scope), scope["type"] == "http"
-        self._connections.came(address)
-        refusal = None
-        given = bearer(headers)
+        headers, is_http = Headers(scope=scope), scope["type"] == "http"
+        connection: Watched = scope["state"]["connection"]
+        app, given = self._app, bearer(headers)
         if reason := foreign(headers, loopback=self._loopback):
-            refusal = PlainTextResponse(f"{reason}\n", 403)
+            app = PlainTextResponse(f"{reason}\n", 403)
         elif ((is_http and scope["path"] not in self._open) or given) and not token_fits(self._token, given):
             await self.wrong_token()
-            refusal = PlainTextResponse("a token is required (Authorization: Bearer)\n", 401)
+            app = PlainTextResponse("a token is required (Authorization: Bearer)\n", 401)
+
+        async def received() -> Message:
+            message = await receive()
+            if not message.get("more_body", False):
+                connection.abort_in(None)
+            return message
+
+        async def sent(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                connection.abort_in(REQUEST_S)
+                MutableHeaders(scope=message).update(SECURITY)
+            await send(message)
+
         if is_http:
-            receive, send = _in_time(receive), _secured(send)
+            await app(scope, received, sent)
+            return
+        connection.abort_in(None)
         try:
-            await (refusal or self._app)(scope, receive, send)
+            await app(scope, receive, send)
         finally:
-            self._connections.ended(address, REQUEST_S if is_http else FLUSH_S)
+            connection.abort_in(FLUSH_S)
 
     async def wrong_token(self) -> None:
         """Count a token that is missing or another, and let who gave it wait."""
@@ -214,91 +192,38 @@ class Guard:
         await asyncio.sleep(WRONG_TOKEN_S)
 
 
-def _in_time(receive: Receive) -> Receive:
-    """Return what receives a body that comes in time."""
-    latest_s, whole = asyncio.get_running_loop().time() + REQUEST_S, False
-
-    async def in_time() -> Message:
-        nonlocal whole
-        if whole:  # what is waited for now is that the client leaves
-            return await receive()
-        try:
-            async with asyncio.timeout_at(latest_s):
-                message = await receive()
-        except TimeoutError:
-            raise HTTPException(408, f"the body did not come within {REQUEST_S:g} s") from None
-        whole = not message.get("more_body", False)
-        return message
-
-    return in_time
-
-
-def _secured(send: Send) -> Send:
-    """Return what sends a response with the headers of all responses."""
-
-    async def secured(message: Message) -> None:
-        if message["type"] == "http.response.start":
-            MutableHeaders(scope=message).update(SECURITY)
-        await send(message)
-
-    return secured
-
-
-class Connections:
-    """The server's connections by the address of the client, to end those that stall.
+class Watched:
+    """A connection of the server, which is ended where it stalls.
 
     uvicorn has no time limit for a first request, and waits for ever for a receiver that does not read; and
     what it buffers towards one would be old when it is read.
-    """
-
-    def __init__(self) -> None:
-        self._transports: dict[Any, asyncio.Transport] = {}
-        self._limits: dict[Any, asyncio.TimerHandle] = {}
-
-    def began(self, transport: asyncio.Transport) -> None:
-        """Take a connection: its request has to come in time, and little is buffered towards its client."""
-        address = transport.get_extra_info("peername")
-        transport.set_write_buffer_limits(high=0)
-        line: socket.socket = transport.get_extra_info("socket")
-        line.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
-        self._transports[address] = transport
-        self._limits[address] = asyncio.get_running_loop().call_later(REQUEST_S, transport.abort)
-
-    def came(self, address: Any) -> None:
-        """Note that the head of a request has come whole."""
-        if (limit := self._limits.pop(address, None)) is not None:
-            limit.cancel()
-
-    def ended(self, address: Any, flush_s: float = 0.0) -> None:
-        """Let a connection end, with a time limit for what is buffered."""
-        self.came(address)
-        if (transport := self._transports.pop(address, None)) is not None:
-            asyncio.get_running_loop().call_later(flush_s, transport.abort)
-
-
-class Watched:
-    """A protocol of the server, whose connections are watched until they become WebSockets.
 
     Parameters
     ----------
-    protocol : that does the work
-    connections : that are watched
+    app_state : of the server; requests and the WebSocket of the connection find it there
+    named : of uvicorn's protocol, which does the work
     """
 
-    def __init__(self, protocol: asyncio.Protocol, connections: Connections) -> None:
-        self._protocol, self._connections = protocol, connections
-        self._address: Any = None
+    def __init__(self, app_state: dict[str, Any], **named: Any) -> None:
+        self._protocol = H11Protocol(app_state={**app_state, "connection": self}, **named)
+        self._ending: asyncio.TimerHandle | None = None
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._protocol, name)
 
     def connection_made(self, transport: asyncio.Transport) -> None:
-        """Begin."""
-        self._address = transport.get_extra_info("peername")
-        self._connections.began(transport)
+        """Begin: a request has to come in time, and little is buffered towards the client."""
+        self._transport = transport
+        transport.set_write_buffer_limits(high=0)
+        line: socket.socket = transport.get_extra_info("socket")
+        line.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
+        self.abort_in(REQUEST_S)
         self._protocol.connection_made(transport)
 
-    def connection_lost(self, error: Exception | None) -> None:
-        """End."""
-        self._connections.ended(self._address)
-        self._protocol.connection_lost(error)
+    def abort_in(self, seconds: float | None) -> None:
+        """End the connection after a time, in place of the time that was set before; None for never."""
+        if self._ending is not None:
+            self._ending.cancel()
+        self._ending = None
+        if seconds is not None:
+            self._ending = asyncio.get_running_loop().call_later(seconds, self._transport.abort)

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from time import monotonic
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from pipelines.live.classifying import ClassifierThread
 from pipelines.live.model import LiveModel
@@ -52,6 +52,12 @@ class Limits(NamedTuple):
     hello_s: float = 10.0
     too_slow_s: float = 5.0
 
+    @property
+    def per_s(self) -> dict[str, float]:
+        """What one session may spend a second, by what it is called."""
+        budgets = {"messages": self.messages_per_s, "rows": self.rows_per_s, "bytes": self.bytes_per_s}
+        return budgets | {"s of decoding": self.decoding_s_per_s}
+
 
 LIMITS = Limits()
 
@@ -66,6 +72,18 @@ class OpenSession:
     leave: Callable[[str, str], None]
     received_s: float = field(default_factory=monotonic)
     last: StepOutput | None = None
+
+    def content(self) -> dict[str, Any]:
+        """Return what is told of it."""
+        chain = self.chain
+        return {
+            "session": self.name,
+            "robot": chain.request.robot,
+            "control": chain.request.control,
+            "terrain": chain.belief.terrain or None,
+            "recording": chain.recording,
+            "dropped": chain.dropped,
+        }
 
 
 class Hub:
@@ -96,8 +114,7 @@ class Hub:
         self.trouble: dict[str, str] = {}
         self._given, self._folder = given, states
         self._thread = ClassifierThread()
-        self._recordings = recordings
-        self._writer = None if recordings is None else RecordingThread()
+        self._recording = None if recordings is None else (recordings, RecordingThread())
         self._left: OrderedDict[str, LiveState] = OrderedDict()
         self._opening: set[str] = set()
 
@@ -159,13 +176,12 @@ class Hub:
     def _begin(self, hello: Hello) -> tuple[RobotSession, Restorable | None]:
         robot = self.robot(hello.robot)
         chain = RobotSession(hello.request, self.served, robot, self._thread.robot())
-        if hello.record and self._recordings is not None and self._writer is not None:
+        if hello.record and self._recording is not None:
+            folder, writer = self._recording
             wheels = robot.wheels if robot is not None and hello.control else ()
             name = f"{hello.session}_{datetime.now(UTC):%Y%m%d_%H%M%S}"
             channels = hello.request.channels
-            chain.record(
-                SessionRecorder(self._recordings, name, hello.robot, channels, wheels, writer=self._writer)
-            )
+            chain.record(SessionRecorder(folder, name, hello.robot, channels, wheels, writer=writer))
         state = self._left.get(hello.session)
         if state is None and self._folder is not None:
             try:
@@ -214,22 +230,19 @@ class Hub:
         """Write states to the folder, if there is one; one that cannot be written is named in ``trouble``."""
         if self._folder is None:
             return
-        failed = ""
+        failed = {}
         for name, state in states.items():
             try:
                 save_state(self._folder / f"{name}.json", state)
             except TerrainError as error:
-                failed = str(error)
-        if failed:
-            self.trouble["states"] = failed
-        else:
-            self.trouble.pop("states", None)
+                failed = {"states": str(error)}
+        self.trouble = {name: why for name, why in self.trouble.items() if name != "states"} | failed
 
     def stop(self) -> None:
         """End the threads; recordings are written."""
         self._thread.stop()
-        if self._writer is not None:
-            self._writer.stop()
+        if self._recording is not None:
+            self._recording[1].stop()
 
 
 def _end_unused(beginning: asyncio.Future[tuple[RobotSession, Restorable | None]]) -> None:

@@ -6,16 +6,10 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
 
-from pipelines.live.session import (
-    COMMAND_VALID_S,
-    Observation,
-    RobotSession,
-    Served,
-    SessionRequest,
-    StepOutput,
-)
+from pipelines.live.classifying import WindowOutput
+from pipelines.live.session import COMMAND_VALID_S, RobotSession, Served, SessionRequest, StepOutput
 from pipelines.live.state import Restorable
-from pipelines.serve.wire import WireError, plain
+from pipelines.serve.wire import WireError
 from terrain.control.traction import TractionStatus
 
 PROTOCOL: Literal[2] = 2
@@ -98,27 +92,23 @@ def welcome(
     hello: Hello, chain: RobotSession, restored: Restorable | None, limits: dict[str, float]
 ) -> dict[str, Any]:
     """Return the answer to a hello."""
-    content: dict[str, Any] = plain(
-        {
-            "type": "welcome",
-            "protocol": PROTOCOL,
-            "session": hello.session,
-            "rate_hz": hello.rate_hz,
-            "control": hello.control,
-            "command_valid_s": COMMAND_VALID_S,
-            "served": served_content(chain.served),
-            "recording": chain.recording,
-            "restored": None
-            if restored is None
-            else {
-                "age_s": restored.age_s,
-                "biases": sorted(restored.biases),
-                "terrain": restored.belief.terrain or None,
-            },
-            "limits": limits,
-        }
-    )
-    return content
+    known = restored and {
+        "age_s": restored.age_s,
+        "biases": sorted(restored.biases),
+        "terrain": restored.belief.terrain or None,
+    }
+    return {
+        "type": "welcome",
+        "protocol": PROTOCOL,
+        "session": hello.session,
+        "rate_hz": hello.rate_hz,
+        "control": hello.control,
+        "command_valid_s": COMMAND_VALID_S,
+        "served": served_content(chain.served),
+        "recording": chain.recording,
+        "restored": known,
+        "limits": limits,
+    }
 
 
 def served_content(served: Served) -> dict[str, Any]:
@@ -133,18 +123,30 @@ def served_content(served: Served) -> dict[str, Any]:
 
 def step_content(output: StepOutput) -> dict[str, Any]:
     """Return the message of a step."""
-    content: dict[str, Any] = {
+    seen, command = output.observation, output.command
+    observation = seen._asdict() | {
+        "terrain": seen.terrain or None,
+        "window": None if seen.window is None else _window_content(seen.window),
+        "target_slip": {
+            state: {"slip_ratio": one.slip_ratio, "slip_std": one.slip_std, "status": str(one.status)}
+            for state, one in seen.target.items()
+        },
+        "target_of": next(iter(seen.target.values())).terrain,
+    }
+    del observation["target"]
+    content = {
         "type": "step",
         "time_s": output.time_s,
         "number": output.number,
         "message": output.message,
         "latency_s": output.latency_s,
-        "observation": observation_content(output.observation),
+        "observation": observation,
     }
-    if output.command is not None:
-        command = output.command
-        code = int(command.status.get("status_code", TractionStatus.UNSOUND))
-        content["command"] = {
+    if command is None:
+        return content
+    code = int(command.status.get("status_code", TractionStatus.UNSOUND))
+    return content | {
+        "command": {
             "status": output.status.value,
             "traction": TractionStatus(code).label,
             "valid_s": COMMAND_VALID_S,
@@ -152,33 +154,19 @@ def step_content(output: StepOutput) -> dict[str, Any]:
             "steer_rad": command.steer_rad,
             "twist": command.twist,
         }
-    found: dict[str, Any] = plain(content)
-    return found
+    }
 
 
-def observation_content(seen: Observation) -> dict[str, Any]:
-    """Return what is known of the robot."""
-    window, content = seen.window, seen._asdict()
-    target = content.pop("target")
-    if window is not None:
-        content["window"] = {
-            "start_s": window.start_s,
-            "end_s": window.end_s,
-            "terrain": window.terrain or None,
-            "probabilities": dict(zip(window.classes, window.probabilities.tolist(), strict=True)),
-            "refused": window.refused or None,
-            "nearest": window.nearest or None,
-            "novelty": window.novelty,
-            "supported": window.supported,
-        }
-    return content | {
-        "terrain": seen.terrain or None,
-        "target_slip": {
-            state: {"slip_ratio": one.slip_ratio, "slip_std": one.slip_std, "status": str(one.status)}
-            for state, one in target.items()
-        },
-        "target_of": next(iter(target.values())).terrain,
-        "sensors": dict(seen.sensors),
+def _window_content(window: WindowOutput) -> dict[str, Any]:
+    return {
+        "start_s": window.start_s,
+        "end_s": window.end_s,
+        "terrain": window.terrain or None,
+        "probabilities": dict(zip(window.classes, window.probabilities.tolist(), strict=True)),
+        "refused": window.refused or None,
+        "nearest": window.nearest or None,
+        "novelty": window.novelty,
+        "supported": window.supported,
     }
 
 

@@ -8,13 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 from pipelines.report import Pairs, Progress, Report, Result, Section, described, enumerated, plural, silent
 from pipelines.serve.settings import Settings
-
-if TYPE_CHECKING:
-    from pipelines.serve.service import Prepared
 
 EXAMPLE = "terrain serve --model models:/field@champion --robot agrimaro --state states/"
 
@@ -53,32 +49,21 @@ def run(settings: Settings, progress: Progress = silent) -> Result:
         from pipelines.serve.replay import run as run_over_log
 
         return run_over_log(settings, settings.replay, progress)
-    from pipelines.serve.service import Service, prepare
+    from pipelines.serve.service import Service
 
-    prepared = prepare(settings)
-    result = checked(prepared, settings.robot)
+    service = Service(settings)
+    served = service.hub.served
+    assert served.model is not None  # a service begins with one
+    about = {
+        name: getattr(served.model.info, name)
+        for name in ("classes", "channels", "rate_hz", "filter", "robots")
+    }
+    result = ServiceResult(model=served.model_name, table=served.table.name, robot=settings.robot, **about)
     if settings.check:
-        prepared.close()
+        service.close()
         return result
-    Service(prepared).run(lambda url: print(f"serving {settings.model} at {url}", flush=True))
-    return replace(result, served=prepared.hub.metrics.totals())
-
-
-def checked(prepared: Prepared, robot: str | None) -> ServiceResult:
-    """Return what a prepared service serves."""
-    served = prepared.hub.served
-    assert served.model is not None  # prepare() loads one
-    info = served.model.info
-    return ServiceResult(
-        served.model_name,
-        info.classes,
-        info.channels,
-        info.rate_hz,
-        info.filter,
-        info.robots,
-        served.table.name,
-        robot,
-    )
+    service.run(lambda url: print(f"serving {settings.model} at {url}", flush=True))
+    return replace(result, served=service.hub.metrics.totals())
 
 
 def report(result: ServiceResult) -> Report:

@@ -10,10 +10,9 @@ import socket
 import threading
 from collections.abc import AsyncIterator, Callable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import asynccontextmanager
+from contextlib import ExitStack, asynccontextmanager, suppress
 from functools import partial
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import uvicorn
@@ -26,7 +25,7 @@ from pipelines.live.pilot import LivePilot
 from pipelines.live.session import Served
 from pipelines.live.terrain_source import Classifier
 from pipelines.serve.app import make_app
-from pipelines.serve.guard import Connections, Watched, check_token, is_loopback
+from pipelines.serve.guard import Watched, is_loopback, required_token
 from pipelines.serve.hub import Hub, Limits
 from pipelines.serve.settings import Settings
 from terrain.control.slip_table import load_slip_table
@@ -50,98 +49,71 @@ CLOSING_S = 0.5
 """For their answers: ended at once, what was sent last would be lost."""
 
 
-class Prepared(NamedTuple):
-    """A service that is ready to listen."""
+class Service:
+    """A service that is loaded, checked and warm, and has its port; then from its first robot to its end.
 
-    hub: Hub
-    listening: socket.socket
-    token: str
-    url: str
-    load: Callable[[str], TerrainModel]
+    Parameters
+    ----------
+    settings : what is served, and where
 
-    def close(self) -> None:
-        """Give the port back, and end the threads."""
-        self.listening.close()
-        self.hub.stop()
-
-
-def prepare(settings: Settings) -> Prepared:
-    """Load, check and warm up what is served, and take the port.
+    Attributes
+    ----------
+    hub : of the sessions
+    url : of its HTTP side
 
     Raises
     ------
     TerrainError
         in one sentence, if anything does not fit: model, table, robot, token, folder, port.
     """
-    if settings.model is None:
-        raise ConfigError("--model is missing: models:/NAME@champion, models:/NAME/3, or a model folder")
-    token = _token(settings.token_file)
-    check_token(settings.host, token)
-    robot = None if settings.robot is None else load_robot(settings.robot)
-    table = load_slip_table(settings.table, None if robot is None else robot.name)
-    for folder in (settings.state, settings.record):
-        if folder is not None:
-            ensure_writable(folder)
-            folder.mkdir(parents=True, exist_ok=True)
-    listening = _listen(settings.host, settings.port)
-    load = partial(_load, filter_stride_s=settings.filter_stride_s)
-    try:
-        model = load(settings.model)
-        if robot is not None:
-            check_fit(model, robot)
-        served = Served(1, model, settings.model, table)
-        hub = Hub(served, robot, Limits(sessions=settings.max_sessions), settings.state, settings.record)
-        try:
+
+    def __init__(self, settings: Settings) -> None:
+        if settings.model is None:
+            raise ConfigError("--model is missing: models:/NAME@champion, models:/NAME/3, or a model folder")
+        token = required_token(settings.host, settings.token_file)
+        robot = None if settings.robot is None else load_robot(settings.robot)
+        table = load_slip_table(settings.table, None if robot is None else robot.name)
+        for folder in (settings.state, settings.record):
+            if folder is not None:
+                ensure_writable(folder)
+                folder.mkdir(parents=True, exist_ok=True)
+        with ExitStack() as undone:
+            self._socket = undone.enter_context(_listen(settings.host, settings.port))
+            load = partial(_load, filter_stride_s=settings.filter_stride_s)
+            model = load(settings.model)
+            if robot is not None:
+                check_fit(model, robot)
+            served, limits = Served(1, model, settings.model, table), Limits(sessions=settings.max_sessions)
+            self.hub = Hub(served, robot, limits, settings.state, settings.record)
+            undone.callback(self.hub.stop)
             warm_up(model, robot)
-        except BaseException:
-            hub.stop()
-            raise
-    except BaseException:
-        listening.close()
-        raise
-    host, port = listening.getsockname()[:2]
-    return Prepared(hub, listening, token, f"http://{f'[{host}]' if ':' in host else host}:{port}", load)
-
-
-def _load(name: str, filter_stride_s: float | None) -> TerrainModel:
-    return filtered(load_model(name), filter_stride_s)
-
-
-class Service:
-    """A prepared service, from its first robot to its end.
-
-    Parameters
-    ----------
-    prepared : by :func:`prepare`
-    """
-
-    def __init__(self, prepared: Prepared) -> None:
-        self._prepared, connections = prepared, Connections()
-        self._announce: Callable[[str], None] = lambda url: None
+            self._undo = undone.pop_all()
+        host, port = self._socket.getsockname()[:2]
+        self.url = f"http://{f'[{host}]' if ':' in host else host}:{port}"
         self._loop: asyncio.AbstractEventLoop | None = None
         self._ending: asyncio.Task[None] | None = None
-        loopback = is_loopback(prepared.listening.getsockname()[0])
-        config = uvicorn.Config(
-            make_app(
-                prepared.hub, prepared.token, prepared.load, connections, self._lifespan, loopback=loopback
-            ),
-            log_level="critical",
-            access_log=False,
-            loop="asyncio",
-            lifespan="on",
-            http="h11",
-            ws="websockets-sansio",
-            ws_max_size=LARGEST_MESSAGE,
-            ws_ping_interval=PING_S,
-            ws_ping_timeout=PING_S,
-            ws_per_message_deflate=False,
-            timeout_graceful_shutdown=5,
-            server_header=False,
+        self._announce: Callable[[str], None] = lambda url: None
+        self._server = uvicorn.Server(
+            uvicorn.Config(
+                make_app(self.hub, token, load, self._lifespan, loopback=is_loopback(host)),
+                log_level="critical",
+                access_log=False,
+                loop="asyncio",
+                lifespan="on",
+                http=Watched,  # type: ignore[arg-type]  # it passes on what it does not do itself
+                ws="websockets-sansio",
+                ws_max_size=LARGEST_MESSAGE,
+                ws_ping_interval=PING_S,
+                ws_ping_timeout=PING_S,
+                ws_per_message_deflate=False,
+                timeout_graceful_shutdown=5,
+                server_header=False,
+            )
         )
-        config.load()
-        protocol: Any = config.http_protocol_class
-        config.http_protocol_class = lambda **named: Watched(protocol(**named), connections)  # type: ignore[assignment]
-        self._server = uvicorn.Server(config)
+
+    def close(self) -> None:
+        """Give the port back, and end the threads."""
+        self._undo.close()
 
     def run(self, announce: Callable[[str], None]) -> None:
         """Serve until it has to end: at SIGTERM or Ctrl-C in order, at the second one at once.
@@ -153,11 +125,8 @@ class Service:
         self._announce = announce
         gc.collect()
         gc.freeze()  # what is loaded now stays: no collection has to look at it
-        try:
-            self._server.run(sockets=[self._prepared.listening])
-        finally:
-            self._prepared.hub.stop()
-            self._prepared.listening.close()
+        with self._undo:
+            self._server.run(sockets=[self._socket])
 
     def stop(self) -> None:
         """End in order, from another thread."""
@@ -167,13 +136,13 @@ class Service:
     @asynccontextmanager
     async def _lifespan(self, app: Any) -> AsyncIterator[None]:
         """Save states while the service runs, and once more when all robots have left."""
-        hub = self._prepared.hub
-        self._loop = asyncio.get_running_loop()
+        hub, loop = self.hub, asyncio.get_running_loop()
+        self._loop = loop
         # few threads for what takes long: each has memory of its own that is not given back
-        self._loop.set_default_executor(ThreadPoolExecutor(max_workers=2))
+        loop.set_default_executor(ThreadPoolExecutor(max_workers=2))
         if threading.current_thread() is threading.main_thread():
             for number in (signal.SIGINT, signal.SIGTERM):  # in place of uvicorn's, which tells no robot
-                self._loop.add_signal_handler(number, self._end_at_signal)
+                loop.add_signal_handler(number, self._end_at_signal)
 
         async def save() -> None:
             while True:
@@ -181,30 +150,48 @@ class Service:
                 await asyncio.to_thread(hub.save_states, hub.states())
 
         saving = asyncio.create_task(save())
-        self._announce(self._prepared.url)
+        self._announce(self.url)
         yield
         saving.cancel()
         await asyncio.gather(saving, return_exceptions=True)
         hub.save_states(hub.states())
 
     def _end_at_signal(self) -> None:
-        if self._prepared.hub.closing:
+        if self.hub.closing:
             self._server.should_exit = self._server.force_exit = True
         elif self._loop is not None:
-            self._prepared.hub.closing = True
+            self.hub.closing = True
             self._ending = self._loop.create_task(self._end())
 
     async def _end(self) -> None:
         """Tell the robots, and end when they have read it."""
-        hub = self._prepared.hub
-        leaving = list(hub.sessions.values())
+        leaving = list(self.hub.sessions.values())
         for opened in leaving:
             opened.leave("closing", "the service ends")
-        end_s = asyncio.get_running_loop().time() + LEAVING_S
-        while hub.sessions and asyncio.get_running_loop().time() < end_s:
-            await asyncio.sleep(0.01)
+        with suppress(TimeoutError):
+            async with asyncio.timeout(LEAVING_S):
+                while self.hub.sessions:
+                    await asyncio.sleep(0.01)
         await asyncio.sleep(CLOSING_S if leaving else 0.0)
         self._server.should_exit = True
+
+
+def _load(name: str, filter_stride_s: float | None) -> TerrainModel:
+    return filtered(load_model(name), filter_stride_s)
+
+
+def _listen(host: str, port: int) -> socket.socket:
+    """Return a socket that listens; ``TerrainError`` where the address is taken or none of this machine."""
+    try:
+        family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or "no name of a machine"
+        raise ConfigError(f"--host {host[:100]!r}: is no address ({reason})") from None
+    try:
+        return socket.create_server((host, port), family=family, backlog=1024)
+    except OSError as error:
+        reason = os.strerror(error.errno) if error.errno else str(error)
+        raise TerrainError(f"port {port} of {host} cannot be listened on ({reason})") from None
 
 
 def check_fit(model: TerrainModel, robot: Robot) -> None:
@@ -246,30 +233,3 @@ def warm_up(model: TerrainModel, robot: Robot | None) -> None:
             stream: Reading(time_s, rng.normal(size=(1, len(names)))) for stream, names in CHANNELS.items()
         }
         pilot.step(Sample(0.02 * k, np.array([0.5, 0.0, 0.0]), readings))
-
-
-def _token(file: Path | None) -> str:
-    if file is None:
-        return os.environ.get("TERRAIN_TOKEN", "").strip()
-    try:
-        token = file.read_text(encoding="utf-8").strip()
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or "no text"
-        raise ConfigError(f"{file}: cannot be read ({reason})") from None
-    if not token:
-        raise ConfigError(f"{file}: holds no token")
-    return token
-
-
-def _listen(host: str, port: int) -> socket.socket:
-    """Return a socket that listens; ``TerrainError`` where the address is taken or none of this machine."""
-    try:
-        family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or "no name of a machine"
-        raise ConfigError(f"--host {host[:100]!r}: is no address ({reason})") from None
-    try:
-        return socket.create_server((host, port), family=family, backlog=1024)
-    except OSError as error:
-        reason = os.strerror(error.errno) if error.errno else str(error)
-        raise TerrainError(f"port {port} of {host} cannot be listened on ({reason})") from None

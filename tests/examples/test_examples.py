@@ -12,7 +12,7 @@ import pytest
 from pipelines.learn.model_file import write_model
 from pipelines.learn.train import fitted_model
 from pipelines.serve.serve import Settings
-from pipelines.serve.service import Service, prepare
+from pipelines.serve.service import Service
 from terrain.logs.write import write_run
 from terrain.records import RunLog, Stream
 
@@ -55,14 +55,13 @@ def example(name):
 
 
 def test_a_robots_program_gets_its_terrain(runs, model_folder, tmp_path, capsys):
-    prepared, ready = prepare(Settings(model=str(model_folder), port=0)), threading.Event()
-    service = Service(prepared)
+    service, ready = Service(Settings(model=str(model_folder), port=0)), threading.Event()
     thread = threading.Thread(target=service.run, args=(lambda url: ready.set(),))
     thread.start()
     try:
         assert ready.wait(30.0)
         folder = write_run(runs[4], tmp_path)
-        assert example("live_robot").drive(str(folder), prepared.url.replace("http", "ws"), speed=4.0) == "b"
+        assert example("live_robot").drive(str(folder), service.url.replace("http", "ws"), speed=4.0) == "b"
     finally:
         service.stop()
         thread.join(30.0)

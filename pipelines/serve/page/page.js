@@ -22,22 +22,19 @@
 
   // --- connection -------------------------------------------------------------------------------------
   function connect() {
-    const socket = new WebSocket((location.protocol === "https:" ? "wss://" : "ws://") + location.host + "/watch");
+    const place = location.host + "/watch?session=" + encodeURIComponent(state.session);
+    const socket = new WebSocket((location.protocol === "https:" ? "wss://" : "ws://") + place);
     state.socket = socket;
-    socket.onopen = () => { if (state.token) socket.send(state.token); ask(); };  // the token first, by itself
-    socket.onmessage = (event) => take(JSON.parse(event.data));
+    socket.onopen = () => socket.send(state.token);  // empty where none is known
+    socket.onmessage = (event) => { if (state.socket === socket) take(JSON.parse(event.data)); };
     socket.onclose = () => {
-      if (byId("token-form").hidden) {
+      if (byId("token-form").hidden && state.socket === socket) {
         document.body.classList.add("stale");
         setConnection("lost", "not connected, trying again");
         setTimeout(connect, state.retry);
         state.retry = Math.min(state.retry * 2, 5000);
       }
     };
-  }
-  function ask() {
-    if (state.socket && state.socket.readyState === WebSocket.OPEN)
-      state.socket.send(JSON.stringify({ type: "watch", session: state.session }));
   }
   function setConnection(kind, words) {
     byId("connection").dataset.state = kind;
@@ -80,7 +77,7 @@
       setConnection("waiting", state.name === null ? "connected, no robot yet" : "connected, no robot any more");
       return;
     }
-    if (session.name !== state.name) begin(session);
+    if (session.session !== state.name) begin(session);
     if (!step) { setConnection("waiting", "connected, no step yet"); return; }
     if (step.number === state.number) return;
     state.number = step.number;
@@ -110,7 +107,7 @@
       select.replaceChildren(new Option("none connected", ""));
       select.disabled = true;
     }
-    if (message.session && select.value !== message.session.name && document.activeElement !== select) select.value = message.session.name;
+    if (message.session && select.value !== message.session.session && document.activeElement !== select) select.value = message.session.session;
   }
   function showTerrain(step, seen) {
     text("terrain", seen.terrain || "unknown");
@@ -190,7 +187,7 @@
 
   // --- history ----------------------------------------------------------------------------------------
   function begin(session) {
-    state.name = session.name; state.wheels = session.wheels; state.number = -1;
+    state.name = session.session; state.wheels = session.wheels; state.number = -1;
     for (const key of Object.keys(history)) history[key] = [];
     series = { t: [], slip: session.wheels.map(() => ({ low: [], high: [], slip: [] })), target: [], current: [] };
     showSlip(session.wheels.length > 0);
@@ -293,7 +290,7 @@
   }
 
   // --- controls ---------------------------------------------------------------------------------------
-  byId("session").addEventListener("change", (event) => { state.session = event.target.value; ask(); });
+  byId("session").addEventListener("change", (event) => { state.session = event.target.value; state.socket.close(); connect(); });
   byId("token-form").addEventListener("submit", (event) => {
     event.preventDefault();
     state.token = byId("token").value;

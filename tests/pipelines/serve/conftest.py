@@ -11,7 +11,7 @@ from websockets.sync.client import connect
 
 from pipelines.learn.model_file import write_model
 from pipelines.serve.serve import Settings
-from pipelines.serve.service import Service, prepare
+from pipelines.serve.service import Service
 from terrain.logs.replay import replay
 
 CHANNELS = {"imu": ["accel_z_mps2"], "wheels": ["speed_left_mps"]}
@@ -27,10 +27,9 @@ def model_folder(mower_model, tmp_path_factory):
 class Running:
     """A service in this process, its address, and its hub."""
 
-    def __init__(self, prepared):
-        self.hub, self.token = prepared.hub, prepared.token
-        self.http = prepared.url
-        self.ws = prepared.url.replace("http", "ws")
+    def __init__(self, service):
+        self.hub, self.http = service.hub, service.url
+        self.ws = service.url.replace("http", "ws")
 
     def socket(self, place="/robots", **options):
         return connect(self.ws + place, compression=None, max_size=None, open_timeout=30, **options)
@@ -52,15 +51,14 @@ class Running:
 
 @contextmanager
 def _running(limits=None, **options):
-    prepared = prepare(Settings(**{"port": 0, **options}))
+    service, ready = Service(Settings(**{"port": 0, **options})), threading.Event()
     if limits is not None:
-        prepared.hub.limits = limits
-    service, ready = Service(prepared), threading.Event()
+        service.hub.limits = limits
     thread = threading.Thread(target=service.run, args=(lambda url: ready.set(),))
     thread.start()
     try:
         assert ready.wait(60.0)
-        yield Running(prepared)
+        yield Running(service)
     finally:
         service.stop()
         thread.join(30.0)

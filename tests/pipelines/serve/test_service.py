@@ -184,7 +184,7 @@ def test_figures_are_in_the_form_of_prometheus(service, hello, messages, two_dri
     assert during["terrain_messages_total"] == before["terrain_messages_total"] + 100
     assert during["terrain_rows_total"] == before["terrain_rows_total"] + 200
     assert during["terrain_step_seconds_count"] == before["terrain_step_seconds_count"] + 100
-    assert 1e7 < during["terrain_memory_bytes"] < 1e10
+    assert 1e7 < during["process_resident_memory_bytes"] < 1e10
 
 
 def test_another_model_is_put_in_while_a_robot_is_served_and_no_window_is_lost(

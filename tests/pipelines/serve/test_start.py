@@ -11,7 +11,7 @@ from dataclasses import replace
 import pytest
 
 from pipelines.serve.serve import Settings, run
-from pipelines.serve.service import prepare
+from pipelines.serve.service import Service
 from terrain.control.slip_table import load_slip_table, write_slip_table
 from terrain.errors import ConfigError, TerrainError
 
@@ -26,7 +26,7 @@ def refusal(model_folder, monkeypatch):
 
     def of(**options):
         with pytest.raises(TerrainError) as refused:
-            prepare(Settings(**{"model": str(model_folder), "port": 0, **options}))
+            Service(Settings(**{"model": str(model_folder), "port": 0, **options}))
         sentence = str(refused.value)
         assert "\n" not in sentence
         return sentence
