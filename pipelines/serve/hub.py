@@ -74,7 +74,7 @@ class OpenSession:
     last: StepOutput | None = None
 
     def content(self) -> dict[str, Any]:
-        """Return what is told of it."""
+        """Return what is shown of it."""
         chain = self.chain
         return {
             "session": self.name,
