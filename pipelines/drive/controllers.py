@@ -81,7 +81,7 @@ def train_classifier(
     runs_a_terrain : number of runs; that of ``terrain quickstart`` by default
     """
     from pipelines.learn.settings import RecipeSettings
-    from pipelines.learn.train import fitted_model
+    from pipelines.learn.training_data import fitted_model
     from terrain.estimation.labelled import RUNS_A_TERRAIN, labelled_runs
 
     runs, _, _ = labelled_runs(seed, runs_a_terrain or RUNS_A_TERRAIN, progress, robot)

@@ -16,13 +16,13 @@ import numpy as np
 
 from pipelines.data.datasets import joint_digest
 from pipelines.learn.evaluate import weaknesses
-from pipelines.learn.model_file import ModelInfo, TerrainModel
-from pipelines.learn.tracking import Champion, Judge, Verdict
+from pipelines.learn.model_file import ModelInfo, TerrainModel, window_words
 from terrain.bootstrap import bootstrap_rows, percentile_interval
 from terrain.classify.metrics import runs_by_terrain
 from terrain.records import Array
 
 if TYPE_CHECKING:
+    from pipelines.learn.card import Evaluated
     from pipelines.learn.evaluation import CrossvalResult
     from pipelines.learn.protocols import Samples
     from pipelines.learn.training_data import TrainingData
@@ -91,14 +91,7 @@ def scope_of(info: ModelInfo) -> Scope:
         name: [sorted(channels), f"{info.rate_hz[name]:.2g}"] for name, channels in info.channels.items()
     }
     digest = hashlib.sha256(json.dumps(streams, sort_keys=True).encode()).hexdigest()[:16]
-    stride = info.window_s if info.stride_s is None else info.stride_s
-    motion = "all motion" if info.steady is None else "steady motion"
-    return Scope(
-        tuple(sorted(info.robots)),
-        tuple(sorted(info.classes)),
-        digest,
-        f"{info.window_s:g} s every {stride:g} s, {motion}",
-    )
+    return Scope(tuple(sorted(info.robots)), tuple(sorted(info.classes)), digest, window_words(info))
 
 
 def champion_decision(
@@ -199,9 +192,10 @@ def held_out_runs(samples: Samples, report: CrossvalResult) -> dict[str, HeldOut
     return {name: HeldOutRun(n_all[name], n_right[name] / n_all[name]) for name in n_all}
 
 
-def standing_of(info: ModelInfo, report: CrossvalResult) -> Standing:
+def standing_of(info: ModelInfo, evaluated: Evaluated | CrossvalResult) -> Standing:
     """Return what the choice of the champion depends on, of a model that has no version yet."""
-    return Standing("", scope_of(info), info.data_digest, report.macro_f1, report.accuracy_ci, report.chance)
+    figures = evaluated.macro_f1, evaluated.accuracy_ci, evaluated.chance
+    return Standing("", scope_of(info), info.data_digest, *figures)
 
 
 def standing_tags(standing: Standing) -> dict[str, str]:
@@ -220,56 +214,51 @@ def standing_tags(standing: Standing) -> dict[str, str]:
     }
 
 
-def judge_of(data: TrainingData, report: CrossvalResult, standing: Standing, seed: int) -> Judge:
-    """Return what judges a new version of a model against the present champion.
+class Champion(NamedTuple):
+    """The present champion; ``model`` is None where it cannot be loaded."""
+
+    version: str
+    tags: Mapping[str, str]
+    model: TerrainModel | None
+
+
+class Bench(NamedTuple):
+    """What a champion is judged on: the data of a new version, and how that one did on each run held out.
 
     Parameters
     ----------
     data : that the new version was trained on
-    report : its cross-validation
-    standing : of the new version
+    held_out : its held-out accuracy on each run, by id
     seed : of the bootstrap over runs
     """
-    held_out = held_out_runs(data.samples, report)
 
-    def judge(champion: Champion | None, version: str) -> Verdict:
-        candidate = standing._replace(version=version)
-        if champion is None or champion.model is None:
-            present = None if champion is None else candidate._replace(version=champion.version, scope=None)
-            return Verdict(*champion_decision(present, candidate, lambda: None))
-        model = champion.model
-        same = same_data(model.info, candidate.data_digest, data)
-        present = Standing(
-            champion.version,
-            scope_of(model.info),
-            candidate.data_digest if same else model.info.data_digest,
-            float(champion.tags.get("macro_f1", model.info.evaluation.get("macro_f1", "-inf"))),
-            (0.0, 1.0),
-            0.0,
-        )
-        return Verdict(*champion_decision(present, candidate, lambda: compare(model, data, held_out, seed)))
-
-    return judge
+    data: TrainingData
+    held_out: Mapping[str, HeldOutRun]
+    seed: int
 
 
-def judge_of_record(info: ModelInfo, tags: Mapping[str, str]) -> Judge:
-    """Return what judges a version whose training is known by its tags alone, as :func:`standing_tags` gives."""
-    ends = [float(end) for end in tags["accuracy_interval"].split(" to ")]
-    interval = (ends[0], ends[1])
-    candidate = Standing(
-        "", scope_of(info), info.data_digest, float(tags["macro_f1"]), interval, float(tags["chance"])
+def judge(champion: Champion | None, candidate: Standing, bench: Bench | None = None) -> tuple[bool, str]:
+    """Return whether a new version becomes champion, and why.
+
+    Parameters
+    ----------
+    champion : the present one, None where there is none
+    candidate : the new version
+    bench : what both can be judged on; None where the training data are not at hand any more
+    """
+    if champion is None:
+        return champion_decision(None, candidate, lambda: None)
+    model, scope, digest = champion.model, None, ""
+    macro_f1 = champion.tags.get("macro_f1", "-inf")
+    if model is not None:
+        scope, digest = scope_of(model.info), model.info.data_digest
+        macro_f1 = champion.tags.get("macro_f1", str(model.info.evaluation.get("macro_f1", macro_f1)))
+        if bench is not None and same_data(model.info, candidate.data_digest, bench.data):
+            digest = candidate.data_digest
+    present = Standing(champion.version, scope, digest, float(macro_f1), (0.0, 1.0), 0.0)
+    return champion_decision(
+        present, candidate, lambda: None if model is None or bench is None else compare(model, bench)
     )
-
-    def judge(champion: Champion | None, version: str) -> Verdict:
-        present = None
-        if champion is not None:
-            model, found = champion.model, float(champion.tags.get("macro_f1", "-inf"))
-            scope = None if model is None else scope_of(model.info)
-            digest = "" if model is None else model.info.data_digest
-            present = Standing(champion.version, scope, digest, found, (0.0, 1.0), 0.0)
-        return Verdict(*champion_decision(present, candidate._replace(version=version), lambda: None))
-
-    return judge
 
 
 def same_data(info: ModelInfo, digest: str, data: TrainingData) -> bool:
@@ -285,21 +274,13 @@ def same_data(info: ModelInfo, digest: str, data: TrainingData) -> bool:
     return info.data_digest in (digest, joint) or joint_digest(info.run_digests) == digest
 
 
-def compare(
-    model: TerrainModel, data: TrainingData, held_out: Mapping[str, HeldOutRun], seed: int
-) -> Comparison | None:
+def compare(model: TerrainModel, bench: Bench) -> Comparison | None:
     """Return how a model does against the held-out figures of another one, None where it cannot be judged.
 
     A run that the model was not trained on is predicted, where it can be; one that it was trained on counts
     with the accuracy that it had when it was held out, where that is known.
-
-    Parameters
-    ----------
-    model : to be judged
-    data : of the other model
-    held_out : held-out accuracy of each of its runs, by id
-    seed : of the bootstrap over runs
     """
+    data, held_out, seed = bench
     run_id, terrain = data.samples.run_id, data.samples.terrain
     digests = {run.run_id: run.digest for run in data.runs}
     theirs: dict[str, float] = {}

@@ -11,13 +11,11 @@ from sklearn.base import BaseEstimator, ClassifierMixin
 from sklearn.utils.validation import check_is_fitted
 
 from features.motion import window_motion
+from features.windows import WindowRule
 from pipelines.learn.load import load_model
-from pipelines.learn.model_file import ModelInfo, TerrainModel, write_model
+from pipelines.learn.model_file import TerrainModel, model_info, write_model
 from pipelines.learn.recipes import make_recipe
-from terrain import __version__
-from terrain.classify.conformal import conformal_threshold, held_out_scores
-from terrain.classify.novelty import NoveltyScore
-from terrain.classify.support import learn_support
+from terrain.classify.limits import learn_limits
 from terrain.errors import ConfigError, DataError
 from terrain.logs.schema import SIGNAL_SETS
 from terrain.records import Array, Windows
@@ -95,36 +93,28 @@ class TerrainClassifier(ClassifierMixin, BaseEstimator):
 
     def _model(self, recipe: Any, windows: Windows, terrain: Array) -> TerrainModel:
         """Return the model with its limits, as far as the windows give them."""
-        classes, counts = np.unique(terrain, return_counts=True)
-        names, run_id = [str(name) for name in classes], windows.run_id.astype(str)
-        novelty = conformal = support = None
-        gap = _overlap(windows)
-        try:
-            features = recipe.matrix.of(windows)
-            novelty = NoveltyScore(gap=gap, seed=self.seed).fit(features, terrain, run_id).numbers_
-            conformal = conformal_threshold(held_out_scores(recipe[-1], terrain), run_id)
-        except (AttributeError, DataError):
-            pass  # too few runs: no window is called unknown, or there are no sets of terrains
         motion = window_motion(windows)
-        if motion is not None:
-            support = learn_support(motion.speed_mps, motion.yaw_rate_radps, terrain, run_id, names)
-        info = ModelInfo(
-            classes=tuple(names),
-            window_s=windows.length_s,
-            stride_s=None,
-            steady=None,
-            channels=recipe[0].layout_.channels,
-            rate_hz=dict(recipe[0].layout_.rate_hz),
+        limits = learn_limits(
+            recipe[-1],
+            recipe.matrix.of(windows),
+            terrain,
+            windows.run_id.astype(str),
+            None if motion is None else motion[:2],
+            _overlap(windows),
+            self.seed,
+        )
+        info = model_info(
+            recipe[0].layout_,
+            WindowRule(windows.length_s, None, None),
+            terrain,
             run_digests=(),
             recipe=self.recipe if isinstance(self.recipe, str) else type(self.recipe).__name__,
             signal_sets=tuple(self.signal_sets),
             seed=self.seed,
-            package_version=__version__,
-            class_ratio=dict(zip(names, (counts / counts.sum()).tolist(), strict=True)),
-            support=None if support is None else support.as_json(),
-            conformal=conformal,
+            support=None if limits.support is None else limits.support.as_json(),
+            conformal=limits.conformal,
         )
-        return TerrainModel(recipe, info, novelty, support)
+        return TerrainModel(recipe, info, limits.novelty, limits.support)
 
     def predict(self, X: Windows) -> Array:
         """Return the most probable terrain (n,) of each window.

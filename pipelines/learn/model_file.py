@@ -22,6 +22,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from features.windows import Layout, SteadyMotion, WindowRule
 from pipelines.learn.network_onnx import network_onnx, numbers_of_onnx
+from terrain import __version__
 from terrain.classify.network_numbers import check_network
 from terrain.classify.novelty_numbers import NoveltyNumbers, check_novelty
 from terrain.classify.support import SupportTable
@@ -37,9 +38,8 @@ if TYPE_CHECKING:
     from pipelines.learn.recipes import WindowPipeline
 
 MODEL_FILE, ONNX_FILE, MANIFEST_FILE = "model.skops", "network.onnx", "terrain_model.json"
-CARD_FILE, CARD_JSON = "model_card.md", "model_card.json"
-TRAINING_FILE = "training.json"
-FILES = (MODEL_FILE, ONNX_FILE, CARD_FILE, CARD_JSON, TRAINING_FILE)
+CARD_FILE, TRAINING_FILE = "model_card.md", "training.json"
+FILES = (MODEL_FILE, ONNX_FILE, CARD_FILE, TRAINING_FILE)
 """Files that a manifest may list; what else lies beside them is not read."""
 
 VERSION = 3
@@ -58,7 +58,6 @@ TRUSTED_TYPES: tuple[str, ...] = (
     "features.sample_extractor.SampleExtractor",
     "features.windows.Layout",
     "numpy.dtype",
-    "pipelines.learn.own.OwnClassifier",
     "pipelines.learn.recipes.WindowPipeline",
     "terrain.classify.augment.Augmentation",
     "terrain.classify.grouped_network.GroupedNetwork",
@@ -67,6 +66,7 @@ TRUSTED_TYPES: tuple[str, ...] = (
     "terrain.classify.ground_response.GroundResponse",
     "terrain.classify.network_numbers.SampleColumns",
     "terrain.classify.novelty_numbers.NoveltyNumbers",
+    "terrain.classify.own.OwnClassifier",
     "terrain.classify.regime_process.Process",
     "terrain.classify.response.GroupedResponse",
     "terrain.classify.response.ResponseChoice",
@@ -133,6 +133,28 @@ class ModelInfo:
     def rule(self) -> WindowRule:
         """How windows must be cut."""
         return WindowRule(self.window_s, self.stride_s, self.steady)
+
+
+def model_info(layout: Layout, rule: WindowRule, terrain: Array, **known: Any) -> ModelInfo:
+    """Return what a model is that was trained on windows of the terrains (n,); what else is known by name."""
+    classes, counts = np.unique(terrain.astype(str), return_counts=True)
+    return ModelInfo(
+        classes=tuple(classes.tolist()),
+        window_s=rule.length_s,
+        stride_s=rule.stride_s,
+        steady=rule.steady,
+        channels={stream: tuple(names) for stream, names in layout.channels.items()},
+        rate_hz=dict(layout.rate_hz),
+        package_version=__version__,
+        class_ratio=dict(zip(classes.tolist(), (counts / counts.sum()).tolist(), strict=True)),
+        **known,
+    )
+
+
+def window_words(info: ModelInfo) -> str:
+    """Return how the windows of a model are cut, in words."""
+    motion = "all motion" if info.steady is None else "steady motion"
+    return f"{info.window_s:g} s every {info.rule.step_s:g} s, {motion}"
 
 
 class Manifest(BaseModel):

@@ -23,7 +23,7 @@ from terrain.logs.schema import SIGNAL_SETS
 from terrain.records import Array, Windows
 
 if TYPE_CHECKING:
-    from pipelines.learn.own import WindowFunction
+    from features.own import WindowFunction
 
 
 class WindowPipeline(Pipeline):
@@ -96,7 +96,7 @@ def make_recipe(
         raise ConfigError(f"recipe {recipe!r} does not take features of your own; {FEATURE_RECIPE!r} does")
     features: FeatureExtractor = FeatureExtractor(*sets)
     if functions:
-        from pipelines.learn.own import FunctionExtractor
+        from features.own import FunctionExtractor
 
         features = FunctionExtractor(*sets, tuple(functions))
     classifier: ClassifierMixin
@@ -111,7 +111,7 @@ def make_recipe(
         features = SampleExtractor(*sets, with_features=True)
         classifier = GroupedStack(choose=recipe == "best", candidates=candidates, gap=gap, seed=seed)
     else:
-        from pipelines.learn.own import OwnClassifier
+        from terrain.classify.own import OwnClassifier
 
         made = recipe if hasattr(recipe, "fit") and not isinstance(recipe, type) else recipe()
         if isinstance(made, WindowPipeline):
@@ -133,12 +133,12 @@ def recipe_of(settings: LearnSettings, text: str = FEATURE_RECIPE) -> WindowPipe
     Raises
     ------
     ConfigError
-        as :func:`make_recipe` and :func:`pipelines.learn.own.load_named`.
+        as :func:`make_recipe` and :func:`pipelines.learn.load.load_named`.
     """
     name, separator, sets = text.partition("@")
     options: dict[str, Any] = {}
     if ":" in name or settings.feature:
-        from pipelines.learn.own import load_named
+        from pipelines.learn.load import load_named
 
         options["functions"] = [load_named(each) for each in settings.feature]
     if settings.params is not None and name not in WITHOUT_SVM:

@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import redirect_stderr
 from importlib.metadata import version
 from io import StringIO
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from pipelines.data.tracking import TrackingError, ensure_tracking, log_run, mlflow_store
-from pipelines.learn.model_file import FILES, MANIFEST_FILE, ModelInfo, TerrainModel, read_files, read_model
-from pipelines.report.json_file import as_json
-from terrain.errors import LogError, ModelError, TerrainError
-from terrain.files.documents import parse_json
-from terrain.files.names import printable
+from pipelines.learn.model_file import FILES, MANIFEST_FILE, ModelInfo, TerrainModel, read_model
+from terrain.errors import ModelError, TerrainError
+
+if TYPE_CHECKING:
+    from pipelines.learn.card import TrainingRecord
+    from pipelines.learn.champion import Bench
 
 CHAMPION = "champion"
 REQUIREMENTS = ("terrain-slip", "scikit-learn", "numpy", "scipy", "numba", "skops")
@@ -35,102 +35,56 @@ class Registered(NamedTuple):
     alias_reason: str
 
 
-class RunRow(NamedTuple):
-    """A run of a data set, as the tracking library lists it."""
-
-    run_id: str
-    robot: str
-    terrain: str
-    n_windows: int
-    digest: str
-
-
-class TrainingRecord(NamedTuple):
-    """What is logged of a training besides its model.
-
-    Parameters
-    ----------
-    params, metrics, tags : as MLflow holds them; the tags also of the registered version
-    runs : of the data set
-    documents : JSON documents by file name
-    pictures : content of image files by file name
-    """
-
-    params: Mapping[str, Any]
-    metrics: Mapping[str, float]
-    tags: Mapping[str, str]
-    runs: Sequence[RunRow] = ()
-    documents: Mapping[str, Any] = {}
-    pictures: Mapping[str, bytes] = {}
-
-    def as_text(self) -> str:
-        """Return the record as JSON, without its pictures: it lies beside the model."""
-        kept = {name: getattr(self, name) for name in ("params", "metrics", "tags", "runs", "documents")}
-        return json.dumps(as_json(kept), indent=1) + "\n"
-
-    @classmethod
-    def of_text(cls, content: bytes, place: Path) -> Self:
-        """Return the record that a file holds; ``ModelError`` where it is none."""
-        try:
-            found = parse_json(content)
-            rows = tuple(RunRow(**row) for row in found.pop("runs"))
-            record = cls(**{**found, "runs": rows})
-            return record._replace(metrics={key: float(value) for key, value in record.metrics.items()})
-        except (LogError, ValueError, TypeError, KeyError, AttributeError) as error:
-            raise ModelError(f"{place}: is no record of a training ({printable(str(error))[:160]})") from None
-
-
-class Champion(NamedTuple):
-    """The present champion; ``model`` is None where it cannot be loaded."""
-
-    version: str
-    tags: Mapping[str, str]
-    model: TerrainModel | None
-
-
-class Verdict(NamedTuple):
-    """Whether a new version becomes champion, and why."""
-
-    moved: bool
-    reason: str
-
-
-Judge = Callable[[Champion | None, str], Verdict]
-"""Judges a new version, whose number is given, against the present champion."""
-
-
-def log_training(name: str, folder: Path, record: TrainingRecord, judge: Judge) -> Registered:
-    """Log one training run with its model, register the model, and have the champion decided on.
+def log_training(
+    name: str, folder: Path, bench: Bench | None = None, pictures: Mapping[str, bytes] | None = None
+) -> Registered:
+    """Log one training run with its model, register the model, and decide on the champion.
 
     Parameters
     ----------
     name : name of the registered model
-    folder : of the model, as :func:`pipelines.learn.model_file.write_model` writes it
-    record : what else is logged
-    judge : decides whether the alias moves
+    folder : of the model, with the record of its training
+    bench : what the champion and the new version are judged on; None where that is not at hand any more
+    pictures : content of image files by name
 
     Raises
     ------
+    ModelError
+        if there is no model, or it was not trained by ``train``.
     TrackingError
         if the tracking folder cannot be written, the server cannot be reached or stops in the middle, or
         another process holds the database for too long.
     """
-    info, _ = read_files(folder)
+    from pipelines.learn.card import read_training
+    from pipelines.learn.champion import Champion, judge, standing_of, standing_tags
+
+    info, record = read_training(folder)
+    if record is None:
+        raise ModelError(
+            f"{folder}: holds a model that was not evaluated, which only terrain train registers"
+        )
+    evaluated = record.evaluated
+    metrics = dict(info.evaluation) | {
+        f"{figure}/{terrain}": getattr(row, figure)
+        for terrain, row in evaluated.per_class.items()
+        for figure in ("precision", "recall", "f1")
+    }
+    documents = {"crossval.json": record.evaluation, "importance.json": {"channels": record.importance}}
+    chosen = {f"chosen_{key}": value for key, value in record.chosen.items()}
     tags = {key: str(getattr(info, key)) for key in ("data_digest", "commit", "seed")}
+    standing = standing_of(info, evaluated)
     with mlflow_store(create=True) as mlflow:
         client = mlflow.MlflowClient()
-        run_id = log_run(mlflow, name, record.params, record.metrics, tags, record.documents, record.pictures)
+        run_id = log_run(mlflow, name, {**record.params, **chosen}, metrics, tags, documents, pictures or {})
         _log_data(mlflow, run_id, record, info)
-        logged = _log_model(mlflow, name, folder, info, run_id)
-        number = str(logged.registered_model_version)
-        for key, text in record.tags.items():
+        number = str(_log_model(mlflow, name, folder, info, run_id).registered_model_version)
+        for key, text in standing_tags(standing).items():
             client.set_model_version_tag(name, number, key, text)
         champion = None
         if (current := client.get_registered_model(name).aliases.get(CHAMPION)) is not None:
             found = client.get_model_version(name, current)
-            model = _model_or_none(mlflow, f"models:/{name}/{current}")
-            champion = Champion(str(current), found.tags, model)
-        moved, reason = judge(champion, number)
+            champion = Champion(str(current), found.tags, _model_or_none(mlflow, f"models:/{name}/{current}"))
+        moved, reason = judge(champion, standing._replace(version=number), bench)
         if moved:
             client.set_registered_model_alias(name, CHAMPION, number)
         client.set_terminated(run_id)
@@ -142,8 +96,6 @@ def _log_data(mlflow: Any, run_id: str, record: TrainingRecord, info: ModelInfo)
     import pandas as pd
     from mlflow.entities import DatasetInput, InputTag
 
-    if not record.runs:
-        return
     digest = info.data_digest[:36]
     dataset = mlflow.data.from_pandas(pd.DataFrame(record.runs), name=info.dataset or "runs", digest=digest)
     context = [InputTag("mlflow.data.context", "training")]

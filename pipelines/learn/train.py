@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, Self
 
 from pydantic import model_validator
 
@@ -34,22 +34,22 @@ from pipelines.report import (
     silent,
 )
 from pipelines.report.settings import setting
-from terrain.errors import ConfigError, DataError
+from terrain.errors import ConfigError
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from features.windows import Layout
+    from pipelines.learn.card import TrainingRecord
+    from pipelines.learn.champion import Bench
     from pipelines.learn.evaluate import Examples
     from pipelines.learn.evaluation import CrossvalResult
-    from pipelines.learn.model_file import ModelInfo, TerrainModel
+    from pipelines.learn.model_file import ModelInfo
     from pipelines.learn.protocols import Fold
     from pipelines.learn.search import SearchResult
-    from pipelines.learn.tracking import Registered, TrainingRecord
-    from pipelines.learn.training_data import RunIdentity, TrainingData
-    from terrain.classify.novelty_numbers import NoveltyNumbers
-    from terrain.classify.support import SupportTable
-    from terrain.records import Array, RunLog, Windows
+    from pipelines.learn.tracking import Registered
+    from pipelines.learn.training_data import TrainingData
+    from terrain.classify.importance import ChannelImportance
+    from terrain.records import RunLog
 
 EXAMPLE = "terrain train --data runs/ --name field"
 
@@ -57,8 +57,6 @@ NETWORKS = ("cnn", "stack", "best")
 """Recipes whose fits take a minute: by default they are evaluated by one fold assignment, the SVM by five."""
 
 METRICS = ("accuracy", "balanced_accuracy", "macro_f1", "vote_accuracy", "ece")
-N_PERMUTATIONS = 3
-MAX_CHANNELS = 6
 PERCENT = ".1%"
 
 
@@ -107,14 +105,6 @@ class Settings(TrainingSettings, AlignedRunsSettings, ComputeSettings):
                 "--data is missing" if self.data is None else "--register trains nothing on --data"
             )
         return self
-
-
-class ChannelImportance(NamedTuple):
-    """By how much balanced accuracy drops when a channel is shuffled; ``std`` over folds."""
-
-    feature: str
-    drop: float
-    std: float
 
 
 @dataclass(frozen=True, repr=False)
@@ -200,11 +190,7 @@ def run(settings: Settings, progress: Progress = silent) -> TrainResult | Regist
 
 
 def train(
-    runs: Sequence[RunLog],
-    settings: TrainingSettings,
-    dataset: str,
-    progress: Progress = silent,
-    evaluation: CrossvalResult | None = None,
+    runs: Sequence[RunLog], settings: TrainingSettings, dataset: str, progress: Progress = silent
 ) -> TrainResult:
     """Evaluate, fit, track and register a recipe.
 
@@ -214,7 +200,6 @@ def train(
     settings : recipe, windows, seed, and the name of the registered model
     dataset : name of the data set, for the record
     progress : called as the work goes on
-    evaluation : on the same runs with the same settings, where there is one already
 
     Raises
     ------
@@ -228,26 +213,25 @@ def train(
     if settings.recipe.partition("@")[0] in NETWORKS:
         require_onnx()
     ensure_tracking()
-    return train_on(data_of_runs(runs, settings), settings, dataset, progress, evaluation)
+    return train_on(data_of_runs(runs, settings), settings, dataset, progress)
 
 
 def train_on(
-    data: TrainingData,
-    settings: TrainingSettings,
-    dataset: str,
-    progress: Progress = silent,
-    evaluation: CrossvalResult | None = None,
+    data: TrainingData, settings: TrainingSettings, dataset: str, progress: Progress = silent
 ) -> TrainResult:
     """Evaluate a recipe, fit it, find its limits, and track and register it; parameters as :func:`train`.
 
     The fits of the evaluation's first fold assignment also tell what each channel is worth.
     """
+    from features.motion import NO_MOTION
     from pipelines.data.tracking import code_commit, ui_line
-    from pipelines.learn.card import model_card, write_card
-    from pipelines.learn.champion import held_out_runs, judge_of, standing_of, standing_tags
-    from pipelines.learn.model_file import TRAINING_FILE, TerrainModel, write_model
-    from pipelines.report.json_file import as_json
-    from terrain.files.atomic import atomic_write
+    from pipelines.learn.card import write_training
+    from pipelines.learn.champion import Bench, held_out_runs
+    from pipelines.learn.model_file import TerrainModel, write_model
+    from pipelines.learn.training_data import info_of
+    from pipelines.report.drawing import figure_png
+    from pipelines.report.tree import figures_of
+    from terrain.classify.limits import learn_limits
 
     _check_storable(data)
     searched = None
@@ -258,42 +242,47 @@ def train_on(
         folder = settings.trials or Path(f"search-{settings.name}")
         searched = search(data, settings.search, folder, settings.seed, settings.jobs, progress)
         data.recipe[-1].set_params(candidates=(Candidate(*searched.best.params),))
-    evaluation, importance, fitted = _evaluated(data, settings, evaluation, progress)
-    evaluation = replace(evaluation, dataset=dataset, data_digest=data.digest)
-    recipe = data.with_fitted(fitted)
-    limits = _limits(recipe[-1], data, settings.rule.overlap, settings.seed)
-    notes = (*evaluation.notes, *limits.notes, *_search_notes(searched))
-    evaluation = replace(evaluation, notes=notes)
-    best = getattr(recipe[-1], "best_", None)
-    chosen = {} if best is None else best._asdict()
-    digests = {each.run_id: each.digest for each in data.runs}
-    held_out = held_out_runs(data.samples, evaluation)
+    evaluation, importance, fitted = _evaluated(data, settings, progress)
+    recipe, samples, motion = data.with_fitted(fitted), data.samples, data.motion
+    limits = learn_limits(
+        recipe[-1],
+        data.features,
+        samples.terrain,
+        samples.group.astype(str),
+        None if motion is None else motion[:2],
+        settings.rule.overlap,
+        settings.seed,
+    )
+    unknown = (f"support: {NO_MOTION}",) if motion is None else ()
+    notes = (*evaluation.notes, *limits.notes, *unknown, *_search_notes(searched))
+    evaluation = replace(evaluation, dataset=dataset, data_digest=data.digest, notes=notes)
+    held_out = held_out_runs(samples, evaluation)
     info = replace(
         info_of(data, settings, dataset, code_commit()),
-        evaluation=_metrics(evaluation),
-        run_accuracy={digests[run_id]: each.accuracy for run_id, each in held_out.items()},
+        evaluation={name: getattr(evaluation, name) for name in METRICS},
+        run_accuracy={
+            run.digest: held_out[run.run_id].accuracy for run in data.runs if run.run_id in held_out
+        },
         support=None if limits.support is None else limits.support.as_json(),
         conformal=limits.conformal,
     )
-    standing = standing_of(info, evaluation)
-    record = _record(data, settings, evaluation, importance, chosen, standing_tags(standing), info)
-    judge = judge_of(data, evaluation, standing, settings.seed)
-    card = model_card(settings.name, info, data.samples.windows, data.motion, evaluation, chosen)
+    record = _record(data, settings, evaluation, importance, info)
+    drawn = enumerate(figures_of(evaluation.report), start=1)
+    pictures = {f"figures/{place}.png": figure_png(figure) for place, figure in drawn}
     with TemporaryDirectory() as place:
         folder = Path(place)
         write_model(folder, TerrainModel(recipe, info, limits.novelty, limits.support))
-        atomic_write(folder / TRAINING_FILE, record.as_text())
-        write_card(folder, card, info)
+        write_training(folder, settings.name, info, record)
         if settings.out is not None:
             _keep(folder, settings.out)
-        registered = _registered(settings, folder, record, judge)
+        registered = _registered(settings, folder, Bench(data, held_out, settings.seed), pictures)
     return TrainResult(
         *registered,
         dataset=dataset,
         data_digest=info.data_digest,
         commit=info.commit,
         n_windows=len(data),
-        chosen=as_json(chosen),
+        chosen=record.chosen,
         importance=importance,
         crossval=evaluation,
         search=searched,
@@ -315,20 +304,10 @@ def register(folder: Path, name: str) -> RegisterResult:
         if the tracking store fails again.
     """
     from pipelines.data.tracking import ensure_tracking
-    from pipelines.learn.champion import judge_of_record
-    from pipelines.learn.model_file import TRAINING_FILE, read_files
-    from pipelines.learn.tracking import TrainingRecord, log_training
-    from terrain.errors import ModelError
+    from pipelines.learn.tracking import log_training
 
-    info, contents = read_files(folder)
-    if TRAINING_FILE not in contents:
-        raise ModelError(
-            f"{folder}: holds a model that was not evaluated, which only terrain train registers"
-        )
-    record = TrainingRecord.of_text(contents[TRAINING_FILE], folder / TRAINING_FILE)
     ensure_tracking()
-    registered = log_training(name, folder, record, judge_of_record(info, record.tags))
-    return RegisterResult(*registered, folder=str(folder))
+    return RegisterResult(*log_training(name, folder), folder=str(folder))
 
 
 def _check_storable(data: TrainingData) -> None:
@@ -336,8 +315,9 @@ def _check_storable(data: TrainingData) -> None:
     import numpy as np
     from sklearn.base import clone
 
+    from features.own import FunctionExtractor
     from pipelines.learn.model_file import check_storable
-    from pipelines.learn.own import FunctionExtractor, OwnClassifier
+    from terrain.classify.own import OwnClassifier
     from terrain.errors import ModelError
 
     if isinstance(data.recipe[0], FunctionExtractor):
@@ -349,13 +329,15 @@ def _check_storable(data: TrainingData) -> None:
         check_storable(clone(own.estimator).fit(np.nan_to_num(data.rows[rows]), terrain[rows]))
 
 
-def _registered(settings: TrainingSettings, folder: Path, record: TrainingRecord, judge: Any) -> Registered:
+def _registered(
+    settings: TrainingSettings, folder: Path, bench: Bench, pictures: Mapping[str, bytes]
+) -> Registered:
     """Register a model; where that fails, keep it in a folder and say how it is registered later."""
     from pipelines.data.tracking import TrackingError
     from pipelines.learn.tracking import log_training
 
     try:
-        return log_training(settings.name, folder, record, judge)
+        return log_training(settings.name, folder, bench, pictures)
     except TrackingError as error:
         kept = settings.out
         if kept is None:
@@ -381,159 +363,32 @@ def _keep(folder: Path, out: Path) -> None:
 
 
 def _evaluated(
-    data: TrainingData, settings: TrainingSettings, evaluation: CrossvalResult | None, progress: Progress
+    data: TrainingData, settings: TrainingSettings, progress: Progress
 ) -> tuple[CrossvalResult, tuple[ChannelImportance, ...], Any]:
     """Return the evaluation on held-out runs, what each channel is worth, and the classifier fitted on all runs.
 
     One set of fits gives all three: channels are judged by those of the first repeat.
     """
-    from pipelines.learn.evaluate import Examples, evaluate
     from pipelines.learn.evaluation import evaluate_recipe
-    from pipelines.learn.protocols import folds_of
     from pipelines.learn.settings import EvaluationSettings
+    from terrain.classify.importance import ChannelDrops, channel_importance, channel_of
 
     channels = [channel_of(str(name)) for name in data.recipe[0].get_feature_names_out()]
 
     def ask(examples: Examples, fold: Fold) -> Any:
         if fold.repeat:
             return None
-        test = fold.test
-        return ChannelDrops(
-            examples.features[test], examples.terrain[test], channels, settings.seed, fold.number
-        )
+        tested = examples.features[fold.test], examples.terrain[fold.test]
+        return ChannelDrops(*tested, channels, settings.seed, fold.number)
 
-    if evaluation is None:
-        repeats = settings.repeats or (1 if settings.recipe.partition("@")[0] in NETWORKS else None)
-        shared = settings.shared() | {"recipe": (settings.recipe,), "extras": False, "repeats": repeats}
-        evaluation, held_out = evaluate_recipe(
-            data.recipe,
-            settings.recipe,
-            data.samples,
-            EvaluationSettings(**shared),
-            progress,
-            (data.rows, data.motion),
-            ask,
-        )
-    else:
-        examples = Examples(data.rows, data.samples.terrain, data.samples.group)
-        folds = folds_of(data.samples, "grouped", 1, settings.seed)
-        asks = [ask(examples, fold) for fold in folds]
-        held_out = evaluate(data.recipe[-1], examples, folds, settings.jobs, "fits", progress, asks, True)
-    drops = [each.found for each in held_out.results if each.found is not None]
-    return evaluation, _importance(channels, drops), held_out.fitted
-
-
-def channel_of(feature: str) -> str:
-    """Return the stream and channel that a feature is made of.
-
-    Examples
-    --------
-    >>> channel_of("imu.accel_z.std [m/s^2]"), channel_of("wheels.log_drive_effort [log10 A m/s]")
-    ('imu.accel_z', 'wheels.log_drive_effort')
-    >>> channel_of("imu.gyro_x~accel_y.correlation [1]"), channel_of("roughness")
-    ('imu.correlations', 'roughness')
-    """
-    name = feature.partition(" [")[0]
-    stream, separator, rest = name.partition(".")
-    channel = rest.split(".")[0]
-    return f"{stream}.correlations" if "~" in channel else f"{stream}{separator}{channel}"
-
-
-class ChannelDrops(NamedTuple):
-    """By how much balanced accuracy drops when all features of a channel are shuffled together.
-
-    Shuffling a single feature hardly lowers it, since the features of a channel carry much the same
-    information.  Called with the classifier of a fold, it returns a drop a channel, means over shuffles.
-
-    Parameters
-    ----------
-    features, truth : (n, f) and (n,) of the windows that the fold holds out
-    channels : (f,) channel of each feature
-    seed, number : of the permutations, and of the fold
-    """
-
-    features: Array
-    truth: Array
-    channels: Sequence[str]
-    seed: int
-    number: int
-
-    def __call__(self, fitted: Any, /) -> list[float]:
-        """Return the drop of each channel, in the order of their names."""
-        import numpy as np
-
-        def balanced_accuracy(predicted: Array) -> float:
-            return float(np.mean([np.mean(predicted[truth == name] == name) for name in np.unique(truth)]))
-
-        present = np.isin(self.truth, fitted.classes_)
-        test, truth = self.features[present], self.truth[present]
-        baseline = balanced_accuracy(fitted.predict(test))
-        rng = np.random.default_rng((self.seed, self.number))
-        drops = []
-        for channel in np.unique(np.array(self.channels)):
-            columns = np.flatnonzero(np.array(self.channels) == channel)
-            scores = []
-            for _ in range(N_PERMUTATIONS):
-                shuffled = test.copy()
-                shuffled[:, columns] = test[rng.permutation(len(test))][:, columns]
-                scores.append(balanced_accuracy(fitted.predict(shuffled)))
-            drops.append(float(baseline - np.mean(scores)))
-        return drops
-
-
-def _importance(channels: Sequence[str], drops: Sequence[Sequence[float]]) -> tuple[ChannelImportance, ...]:
-    """Return means and standard deviations over folds, the largest drop first."""
-    import numpy as np
-
-    table, names = np.array(drops), np.unique(np.array(channels))
-    order = np.argsort(-table.mean(axis=0), kind="stable")
-    return tuple(
-        ChannelImportance(str(names[i]), float(table[:, i].mean()), float(table[:, i].std(ddof=1)))
-        for i in order
+    repeats = settings.repeats or (1 if settings.recipe.partition("@")[0] in NETWORKS else None)
+    shared = settings.shared() | {"recipe": (settings.recipe,), "extras": False, "repeats": repeats}
+    asked, computed = EvaluationSettings(**shared), (data.rows, data.motion)
+    evaluation, held_out = evaluate_recipe(
+        data.recipe, settings.recipe, data.samples, asked, progress, computed, ask
     )
-
-
-class Limits(NamedTuple):
-    """What a trained model knows of its own limits, each None where the training runs do not give it.
-
-    Parameters
-    ----------
-    novelty : score of windows that are like no terrain that was learned
-    support : training runs by terrain and motion
-    conformal : threshold of the sets of classes
-    notes : why one is missing
-    """
-
-    novelty: NoveltyNumbers | None
-    support: SupportTable | None
-    conformal: float | None
-    notes: tuple[str, ...]
-
-
-def _limits(classifier: Any, data: TrainingData, gap: int, seed: int) -> Limits:
-    import numpy as np
-
-    from features.motion import NO_MOTION
-    from pipelines.learn.coverage import table_of
-    from terrain.classify.conformal import conformal_threshold, held_out_scores
-    from terrain.classify.novelty import NoveltyScore
-
-    terrain, run_id = data.samples.terrain, data.samples.group.astype(str)
-    notes = []
-    novelty = conformal = support = None
-    try:
-        novelty = NoveltyScore(gap=gap, seed=seed).fit(data.features, terrain, run_id).numbers_
-    except DataError as error:
-        notes.append(f"no window is ever called unknown: {error}")
-    try:
-        conformal = conformal_threshold(held_out_scores(classifier, terrain), run_id)
-    except DataError as error:
-        notes.append(f"no sets of terrains: {error}")
-    if data.motion is None:
-        notes.append(f"support: {NO_MOTION}")
-    else:
-        support = table_of(data.motion, terrain, run_id, np.unique(terrain).tolist())
-    return Limits(novelty, support, conformal, tuple(notes))
+    drops = [each.found for each in held_out.results if each.found is not None]
+    return evaluation, channel_importance(channels, drops), held_out.fitted
 
 
 def _search_notes(found: SearchResult | None) -> list[str]:
@@ -546,47 +401,29 @@ def _search_notes(found: SearchResult | None) -> list[str]:
     ]
 
 
-def _metrics(evaluation: CrossvalResult) -> dict[str, float]:
-    metrics: dict[str, float] = {name: getattr(evaluation, name) for name in METRICS}
-    if evaluation.speed_only_accuracy is not None:
-        metrics["speed_only_accuracy"] = evaluation.speed_only_accuracy
-    return metrics
-
-
 def _record(
     data: TrainingData,
     settings: TrainingSettings,
     evaluation: CrossvalResult,
     importance: Sequence[ChannelImportance],
-    chosen: Mapping[str, Any],
-    tags: Mapping[str, str],
     info: ModelInfo,
 ) -> TrainingRecord:
-    """Return what MLflow is given beside the model: figures by terrain among the metrics."""
+    """Return what is kept of a training beside its model."""
     import numpy as np
 
-    from pipelines.learn.tracking import RunRow, TrainingRecord
-    from pipelines.report.drawing import figure_png
+    from pipelines.learn.card import RunRow, TrainingRecord, limits_of
     from pipelines.report.json_file import as_json
-    from pipelines.report.tree import figures_of
+    from pipelines.report.versions import versions
 
     rule, samples = settings.rule, data.samples
-    of_terrain = {
-        f"{figure}/{name}": float(getattr(row, figure))
-        for name, row in evaluation.per_class.items()
-        for figure in ("precision", "recall", "f1")
-    }
     rows = []
     for each in data.runs:
         inside = samples.run_id == each.run_id
         terrains = ", ".join(np.unique(samples.terrain[inside]).tolist())
         rows.append(RunRow(each.run_id, each.robot, terrains, int(inside.sum()), each.digest))
-    pictures = {
-        f"figures/{place}.png": figure_png(figure)
-        for place, figure in enumerate(figures_of(evaluation.report), start=1)
-    }
+    best = getattr(data.recipe[-1], "best_", None)
     return TrainingRecord(
-        {
+        params={
             "recipe": settings.recipe,
             "window_s": rule.length_s,
             "stride_s": rule.step_s,
@@ -598,105 +435,13 @@ def _record(
             "n_windows": len(data),
             "n_runs": evaluation.n_runs,
             "dataset": info.dataset,
-            **{f"chosen_{key}": value for key, value in chosen.items()},
         },
-        {**info.evaluation, **of_terrain},
-        tags,
-        tuple(rows),
-        {"crossval.json": as_json(evaluation), "importance.json": {"channels": as_json(importance)}},
-        pictures,
-    )
-
-
-def fitted_model(
-    runs: Sequence[RunLog], settings: RecipeSettings | None = None, dataset: str = "", commit: str = ""
-) -> TerrainModel:
-    """Return a model that is fitted on labelled runs, without evaluation, limits and registration.
-
-    Parameters
-    ----------
-    runs : labelled
-    settings : recipe and windows; the defaults without
-    dataset, commit : for the record
-
-    Raises
-    ------
-    DataError
-        if the data do not suffice, or the model uses estimates that several filters made.
-    """
-    from pipelines.learn.model_file import TerrainModel
-    from pipelines.learn.protocols import samples_of
-    from pipelines.learn.recipes import recipe_of
-
-    settings = settings or RecipeSettings()
-    windows = samples_of(runs, settings).windows
-    info = model_info(runs, settings, windows, dataset, commit)
-    return TerrainModel(recipe_of(settings, settings.recipe).fit(windows, windows.terrain.astype(str)), info)
-
-
-def model_info(
-    runs: Sequence[RunLog], settings: RecipeSettings, windows: Windows, dataset: str, commit: str
-) -> ModelInfo:
-    """Return how the training windows were cut, as those of a new log must be, and where they came from.
-
-    Raises
-    ------
-    DataError
-        if the model uses estimates that several filters made.
-    """
-    from features.windows import Layout
-    from pipelines.data.datasets import data_digest
-    from pipelines.learn.training_data import identities
-
-    layout = Layout(windows.channels, windows.rate_hz)
-    terrain = windows.terrain.astype(str)
-    return _info(layout, terrain, settings, identities(runs), data_digest(runs), dataset, commit)
-
-
-def info_of(data: TrainingData, settings: RecipeSettings, dataset: str, commit: str) -> ModelInfo:
-    """Return the same of training data; errors as :func:`model_info`."""
-    return _info(data.layout, data.samples.terrain, settings, data.runs, data.digest, dataset, commit)
-
-
-def _info(
-    layout: Layout,
-    terrain: Array,
-    settings: RecipeSettings,
-    runs: Sequence[RunIdentity],
-    digest: str,
-    dataset: str,
-    commit: str,
-) -> ModelInfo:
-    import numpy as np
-
-    from pipelines.learn.model_file import ModelInfo
-    from pipelines.live.windows import ESTIMATED
-    from terrain import __version__
-
-    filters = {each.filter for each in runs} if set(ESTIMATED) & set(layout.channels) else {""}
-    if len(filters) > 1:
-        names = " and ".join(sorted(name or "an unknown filter" for name in filters))
-        raise DataError(f"the runs hold estimates of {names}: estimate all of them with one filter")
-    classes, counts = np.unique(terrain, return_counts=True)
-    rule = settings.rule
-    return ModelInfo(
-        classes=tuple(classes.tolist()),
-        window_s=rule.length_s,
-        stride_s=rule.stride_s,
-        steady=rule.steady,
-        channels={stream: tuple(names) for stream, names in layout.channels.items()},
-        rate_hz=dict(layout.rate_hz),
-        run_digests=tuple(each.digest for each in runs),
-        recipe=settings.recipe,
-        signal_sets=settings.signal_sets,
-        seed=settings.seed,
-        data_digest=digest,
-        dataset=dataset,
-        commit=commit,
-        package_version=__version__,
-        robots=tuple(sorted({each.robot for each in runs})),
-        filter=filters.pop(),
-        class_ratio=dict(zip(classes.tolist(), (counts / counts.sum()).tolist(), strict=True)),
+        runs=tuple(rows),
+        evaluation=as_json(evaluation),
+        importance=as_json(importance),
+        chosen={} if best is None else as_json(best),
+        limits=limits_of(info, samples.windows, data.motion, evaluation),
+        versions=versions(),
     )
 
 

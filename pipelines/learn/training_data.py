@@ -14,10 +14,11 @@ from features.motion import Motion, window_motion
 from features.windows import Layout, cut_windows
 from pipelines.data.datasets import data_digest
 from pipelines.learn.cache import CachedFeatures
-from pipelines.learn.model_file import TerrainModel
+from pipelines.learn.model_file import ModelInfo, TerrainModel, model_info
 from pipelines.learn.protocols import Samples, samples_of
 from pipelines.learn.recipes import WindowPipeline, feature_matrix, recipe_of
 from pipelines.learn.settings import RecipeSettings
+from pipelines.live.windows import ESTIMATED
 from terrain.errors import DataError
 from terrain.records import Array, RunLog
 
@@ -145,3 +146,55 @@ def data_of_cache(cached: CachedFeatures, settings: RecipeSettings) -> TrainingD
     return TrainingData(
         cached.samples, cached.layout, recipe, features, features, cached.motion, runs, cached.digest
     )
+
+
+def info_of(data: TrainingData, settings: RecipeSettings, dataset: str, commit: str) -> ModelInfo:
+    """Return how the training windows were cut, as those of a new log must be, and where they came from.
+
+    Raises
+    ------
+    DataError
+        if the model uses estimates that several filters made.
+    """
+    runs = data.runs
+    filters = {each.filter for each in runs} if set(ESTIMATED) & set(data.layout.channels) else {""}
+    if len(filters) > 1:
+        names = " and ".join(sorted(name or "an unknown filter" for name in filters))
+        raise DataError(f"the runs hold estimates of {names}: estimate all of them with one filter")
+    return model_info(
+        data.layout,
+        settings.rule,
+        data.samples.terrain,
+        run_digests=tuple(each.digest for each in runs),
+        recipe=settings.recipe,
+        signal_sets=settings.signal_sets,
+        seed=settings.seed,
+        data_digest=data.digest,
+        dataset=dataset,
+        commit=commit,
+        robots=tuple(sorted({each.robot for each in runs})),
+        filter=filters.pop(),
+    )
+
+
+def fitted_model(
+    runs: Sequence[RunLog], settings: RecipeSettings | None = None, dataset: str = "", commit: str = ""
+) -> TerrainModel:
+    """Return a model that is fitted on labelled runs, without evaluation, limits and registration.
+
+    Parameters
+    ----------
+    runs : labelled
+    settings : recipe and windows; the defaults without
+    dataset, commit : for the record
+
+    Raises
+    ------
+    DataError
+        if the data do not suffice, or the model uses estimates that several filters made.
+    """
+    settings = settings or RecipeSettings()
+    data = data_of_runs(runs, settings)
+    info = info_of(data, settings, dataset, commit)
+    data.recipe[-1].fit(data.rows, data.samples.terrain, groups=data.samples.windows.run_id)
+    return TerrainModel(data.recipe, info)

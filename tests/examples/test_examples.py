@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pipelines.learn.model_file import write_model
-from pipelines.learn.train import fitted_model
+from pipelines.learn.training_data import fitted_model
 from pipelines.serve.serve import Settings
 from pipelines.serve.service import Service
 from terrain.logs.write import write_run

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipelines.learn.train import fitted_model
+from pipelines.learn.training_data import fitted_model
 from terrain.estimation.enriched import enriched
 from terrain.estimation.estimate import estimate_run
 from terrain.records import Label, RunLog, Stream

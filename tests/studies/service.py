@@ -67,7 +67,7 @@ def model_folder(uri: str | None, seed: int, into: Path) -> str:
         return uri
     from pipelines.learn.model_file import write_model
     from pipelines.learn.settings import RecipeSettings
-    from pipelines.learn.train import fitted_model
+    from pipelines.learn.training_data import fitted_model
 
     robot = load_robot(ROBOT)
     simulated = [

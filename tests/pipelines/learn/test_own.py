@@ -7,8 +7,8 @@ from sklearn.linear_model import LogisticRegression, RidgeClassifier
 
 from features.windows import WindowRule, cut_windows
 from pipelines.learn.crossval import cross_validate, crossval
-from pipelines.learn.own import OwnClassifier
 from pipelines.learn.recipes import feature_matrix, make_recipe
+from terrain.classify.own import OwnClassifier
 from terrain.errors import ConfigError
 
 OWN = """

@@ -10,7 +10,7 @@ from features.windows import cut_windows
 from pipelines.learn.model_file import read_model
 from pipelines.learn.predict import NOT_LEARNED, Settings, filtered_terrains, predict, run
 from pipelines.learn.settings import RecipeSettings
-from pipelines.learn.train import fitted_model
+from pipelines.learn.training_data import fitted_model
 from pipelines.live.model import Assessed
 from pipelines.report.json_file import as_json
 from terrain.control.slip_table import DRIVE_STATES, SlipTable, load_slip_table

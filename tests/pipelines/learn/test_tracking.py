@@ -17,11 +17,11 @@ import pytest
 from features.windows import cut_windows
 from pipelines.data.datasets import data_digest
 from pipelines.data.tracking import ensure_tracking
-from pipelines.learn.champion import judge_of, standing_of, standing_tags
+from pipelines.learn.champion import Bench, held_out_runs
 from pipelines.learn.load import load_model
-from pipelines.learn.model_file import read_model, seal
+from pipelines.learn.model_file import TRAINING_FILE, read_model, seal
 from pipelines.learn.settings import RecipeSettings
-from pipelines.learn.tracking import TrainingRecord, log_training
+from pipelines.learn.tracking import log_training
 from pipelines.learn.training_data import data_of_runs
 from terrain.errors import ModelError, TerrainError
 from terrain.files.lock import file_lock
@@ -47,15 +47,15 @@ def log(tracked, runs, tmp_path_factory):
     """
     folder = Path(shutil.copytree(tracked[0] / "model", tmp_path_factory.mktemp("logged") / "model"))
     model = read_model(folder)
-    data = data_of_runs(runs, RecipeSettings())
+    data, document = data_of_runs(runs, RecipeSettings()), json.loads((folder / TRAINING_FILE).read_text())
+    bench = Bench(data, held_out_runs(data.samples, tracked[1].crossval), 0)
 
     def again(name, macro_f1, digest="aa", accuracy_ci=(0.9, 0.95), **changed):
         info = replace(model.info, data_digest=digest, **changed)
-        report = replace(tracked[1].crossval, macro_f1=macro_f1, accuracy_ci=accuracy_ci)
-        standing = standing_of(info, report)
-        record = TrainingRecord({"recipe": "svm"}, {"macro_f1": macro_f1}, standing_tags(standing))
+        document["evaluation"] |= {"macro_f1": macro_f1, "accuracy_ci": accuracy_ci}
+        (folder / TRAINING_FILE).write_text(json.dumps(document))
         seal(folder, info)
-        return log_training(name, folder, record, judge_of(data, report, standing, 0))
+        return log_training(name, folder, bench)
 
     return again
 

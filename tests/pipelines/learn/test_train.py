@@ -13,12 +13,13 @@ import pytest
 
 from features.motion import window_motion
 from pipelines.learn import tracking
-from pipelines.learn.card import ModelCard, model_card, model_result
-from pipelines.learn.model_file import CARD_FILE, CARD_JSON, read_model, seal
+from pipelines.learn.card import limits_of, model_result
+from pipelines.learn.model_file import CARD_FILE, TRAINING_FILE, read_model, seal
 from pipelines.learn.protocols import samples_of
 from pipelines.learn.settings import RecipeSettings
-from pipelines.learn.train import ChannelDrops, Settings, TrainingSettings, register, run, train
+from pipelines.learn.train import Settings, TrainingSettings, register, run, train
 from pipelines.report.json_file import as_json
+from terrain.classify.importance import ChannelDrops
 from terrain.errors import ConfigError, ModelError, TerrainError
 from terrain.logs.write import write_run
 
@@ -96,68 +97,59 @@ def test_only_the_channel_that_is_used_is_important():
     assert drops[1] == 0.0
 
 
-@pytest.fixture
-def card(tracked, runs):
-    """A maker of cards of the trained model; what is given replaces fields of its information."""
-    info = read_model(tracked[0] / "model").info
-    windows = samples_of(runs, RecipeSettings()).windows
-
-    def make(evaluation=None, **changed):
-        of = replace(info, **changed), windows, window_motion(windows)
-        return model_card("drawn", *of, evaluation or tracked[1].crossval, {"C": 10.0})
-
-    return make
-
-
 def test_a_model_has_its_card_and_its_figures(model_dir, tracked):
-    result = model_result(model_dir)
-    evaluation, card = tracked[1].crossval, result.card
-    assert (card.data_digest, card.n_windows) == (tracked[1].data_digest, tracked[1].n_windows)
-    assert [(row.terrain, row.n_runs) for row in card.terrains] == [
-        ("ASPHALT", 4), ("GRASS", 4), ("GRAVEL", 4)
-    ]  # fmt: skip
-    assert card.figures[0][1:3] == (evaluation.accuracy, evaluation.accuracy_ci)
-    assert card.latency_ms > 0
-    assert [(row.name, row.n_bytes) for row in card.files] == [
-        ("model.skops", (model_dir / "model.skops").stat().st_size)
-    ]
-    assert any("robots other than husky" in text.lower() for text in card.limits)
+    result, evaluation = model_result(model_dir), tracked[1].crossval
+    training = result.training
+    assert (result.data_digest, result.dataset) == (tracked[1].data_digest, "twelve runs")
+    assert sum(row.n_windows for row in training.runs) == training.params["n_windows"] == 144
+    assert training.evaluation == as_json(evaluation)
+    assert training.latency_ms > 0
+    assert result.files == {"model.skops": (model_dir / "model.skops").stat().st_size}
+    assert any("robots other than husky" in text.lower() for text in training.limits)
     assert (result.finds_unknown, result.counts_support, result.names_sets) == (True, True, True)
     json.dumps(as_json(result), allow_nan=False)
     text = (model_dir / CARD_FILE).read_text()
     assert "Robots other than husky" in text
     assert f"{100 * evaluation.accuracy:.1f}" in text
+    assert f"{evaluation.ece:.3f}" in text
+    assert result.to_pandas()["recall"].tolist() == evaluation.to_pandas()["recall"].tolist()
 
 
-def test_limits_name_what_is_weak(card, tracked):
-    evaluation = tracked[1].crossval
+def test_limits_name_what_is_weak(tracked, runs):
+    windows, evaluation = samples_of(runs, RecipeSettings()).windows, tracked[1].crossval
     weak = {name: row._replace(recall=0.3) for name, row in evaluation.per_class.items() if name == "GRASS"}
-    limits = " ".join(card(replace(evaluation, per_class={**evaluation.per_class, **weak})).limits)
+    evaluation = replace(evaluation, per_class={**evaluation.per_class, **weak})
+    info = read_model(tracked[0] / "model").info
+    limits = " ".join(limits_of(info, windows, window_motion(windows), evaluation))
     assert "Decisions that rest on GRASS: recognised in under half of the windows." in limits
     assert "Speeds outside of 0." in limits
 
 
-@pytest.mark.parametrize("content", ["{", "[]", '{"name": 3}', '{"name": "x"}'])
-def test_a_card_that_is_none_is_one_sentence(model_dir, content):
-    info = read_model(model_dir).info
-    (model_dir / CARD_JSON).write_text(content)
-    with pytest.raises(ModelError, match=r"model_card\.json: is damaged"):
+@pytest.mark.parametrize("change", ["{", "[]", '{"params": 3}', ("accuracy", "much"), ("per_run", None)])
+def test_a_record_of_a_training_that_is_none_is_one_sentence(model_dir, change):
+    info, file = read_model(model_dir).info, model_dir / TRAINING_FILE
+    if isinstance(change, tuple):
+        document = json.loads(file.read_text())
+        document["evaluation"] |= dict([change])
+        change = json.dumps(document)
+    file.write_text(change)
+    with pytest.raises(ModelError, match=r"training\.json: is damaged"):
         model_result(model_dir)
     seal(model_dir, info)
-    with pytest.raises(ModelError, match=r"model_card\.json: is no card of a model") as refusal:
-        model_result(model_dir)
-    assert len(str(refusal.value).splitlines()) == 1
+    for use in (model_result, lambda folder: register(folder, "m")):
+        with pytest.raises(ModelError, match=r"training\.json: is no record of a training") as refusal:
+            use(model_dir)
+        assert len(str(refusal.value).splitlines()) == 1
 
 
-def test_a_model_without_a_card_says_so(model_dir):
+def test_a_model_that_was_not_evaluated_says_so_and_is_not_registered(model_dir):
     info = read_model(model_dir).info
-    for name in (CARD_JSON, CARD_FILE):
+    for name in (TRAINING_FILE, CARD_FILE):
         (model_dir / name).unlink()
     seal(model_dir, info)
-    result = model_result(model_dir)
-    assert result.card is None
-    assert "was not evaluated" in result.report.answer
-    assert ModelCard.__doc__
+    assert "was not evaluated" in model_result(model_dir).report.answer
+    with pytest.raises(ModelError, match="holds a model that was not evaluated"):
+        register(model_dir, "m")
 
 
 SERVER = """
@@ -228,11 +220,3 @@ def test_a_server_that_stops_in_the_middle_costs_seconds_and_no_model(
     again = register(kept, name)
     assert not again.alias_moved
     assert "is not better than" in again.alias_reason
-
-
-def test_a_model_that_was_not_evaluated_is_not_registered(model_dir):
-    info = read_model(model_dir).info
-    (model_dir / "training.json").unlink()
-    seal(model_dir, info)
-    with pytest.raises(ModelError, match="holds a model that was not evaluated"):
-        register(model_dir, "m")

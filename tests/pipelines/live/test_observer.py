@@ -10,7 +10,7 @@ import pytest
 
 from pipelines.data.datasets import load_runs
 from pipelines.learn.predict import predict
-from pipelines.learn.train import fitted_model
+from pipelines.learn.training_data import fitted_model
 from pipelines.live.observer import Observer
 from pipelines.live.samples import replay as named_replay
 from terrain.control.slip_table import load_slip_table
