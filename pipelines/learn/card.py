@@ -129,7 +129,7 @@ class TrainingRecord(BaseModel):
     importance: tuple[dict[str, Any], ...]
     chosen: dict[str, Any]
     limits: tuple[str, ...]
-    versions: dict[str, str]
+    versions: str
     latency_ms: float | None = None
     onnx_latency_ms: float | None = None
 
@@ -180,26 +180,14 @@ class ModelResult(Result):
         return pd.DataFrame([{"terrain": name, **row._asdict()} for name, row in figures.items()])
 
 
-def model_result(uri: str | Path) -> ModelResult:
-    """Return what a model states of itself.
-
-    Parameters
-    ----------
-    uri : ``models:/NAME@champion``, ``models:/NAME/3``, or a folder
+def model_result(folder: Path, name: str) -> ModelResult:
+    """Return what the model in a folder states of itself, as it was asked for by name.
 
     Raises
     ------
     ModelError
-        if there is no such model, or a file of it is damaged.
+        if there is no model, or a file of it is damaged.
     """
-    from pipelines.learn.load import model_folder
-
-    with model_folder(str(uri)) as folder:
-        return folder_result(folder, str(uri))
-
-
-def folder_result(folder: Path, name: str) -> ModelResult:
-    """Return what the model in a folder states of itself; errors as :func:`model_result`."""
     model = read_model(folder)
     info, record = read_training(folder)
     fields = "recipe classes window_s channels rate_hz robots filter dataset data_digest commit"
@@ -246,7 +234,7 @@ def write_training(folder: Path, name: str, info: ModelInfo, record: TrainingRec
     timed = record.model_copy(update=_measured(folder))
     atomic_write(folder / TRAINING_FILE, timed.model_dump_json(indent=1) + "\n")
     seal(folder, info)
-    atomic_write(folder / CARD_FILE, markdown_text(report(folder_result(folder, name))))
+    atomic_write(folder / CARD_FILE, markdown_text(report(model_result(folder, name))))
     seal(folder, info)
 
 
@@ -445,6 +433,6 @@ def _made(result: ModelResult, training: TrainingRecord) -> Pairs:
             *((f"size of {name}", n_bytes, ",", "bytes") for name, n_bytes in result.files.items()),
             ("code", result.commit),
             ("licence", metadata.metadata("terrain-slip")["License-Expression"]),
-            ("versions", ", ".join(f"{name} {number}" for name, number in training.versions.items())),
+            ("versions", training.versions),
         ]
     )

@@ -1,18 +1,16 @@
-"""What a command is given by name: a model of a folder or of the registry, an object of a user's own module."""
+"""Where a model lies: a folder, or a registered one that is copied."""
 
 from __future__ import annotations
 
-import importlib
 import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 from pipelines.learn.model_file import TerrainModel, read_model
-from terrain.errors import ConfigError, ModelError
+from terrain.errors import ModelError
 
 FETCH_TIMEOUT_S = 120.0
 
@@ -62,33 +60,3 @@ def model_folder(uri: str) -> Iterator[Path]:
             lines = done.stderr.strip().splitlines()
             raise ModelError(lines[-1] if lines else f"{uri}: cannot be loaded")
         yield Path(done.stdout.strip().splitlines()[-1])
-
-
-def load_named(text: str) -> Any:
-    """Return what ``MODULE:NAME`` names; modules of the current folder are found too.
-
-    Raises
-    ------
-    ConfigError
-        if the module cannot be imported, or has no such name.
-
-    Examples
-    --------
-    >>> load_named("math:sqrt")(4.0)
-    2.0
-    >>> load_named("math:squirt")
-    Traceback (most recent call last):
-    terrain.errors.ConfigError: math:squirt: module 'math' has no 'squirt'
-    """
-    module_name, _, name = text.partition(":")
-    folder = str(Path.cwd())
-    if folder not in sys.path:
-        sys.path.append(folder)  # last, so that a file of the folder hides no library
-    try:
-        module = importlib.import_module(module_name)
-    except Exception as error:
-        raise ConfigError(f"{text}: module {module_name!r} cannot be imported: {error}") from error
-    found = getattr(module, name, None)
-    if not callable(found) and not hasattr(found, "fit"):
-        raise ConfigError(f"{text}: module {module_name!r} has no {name!r}")
-    return found

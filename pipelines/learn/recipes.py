@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import importlib
+import sys
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -133,13 +136,11 @@ def recipe_of(settings: LearnSettings, text: str = FEATURE_RECIPE) -> WindowPipe
     Raises
     ------
     ConfigError
-        as :func:`make_recipe` and :func:`pipelines.learn.load.load_named`.
+        as :func:`make_recipe` and :func:`load_named`.
     """
     name, separator, sets = text.partition("@")
     options: dict[str, Any] = {}
     if ":" in name or settings.feature:
-        from pipelines.learn.load import load_named
-
         options["functions"] = [load_named(each) for each in settings.feature]
     if settings.params is not None and name not in WITHOUT_SVM:
         from pipelines.learn.params import read_params
@@ -152,6 +153,36 @@ def recipe_of(settings: LearnSettings, text: str = FEATURE_RECIPE) -> WindowPipe
         seed=settings.seed,
         **options,
     )
+
+
+def load_named(text: str) -> Any:
+    """Return what ``MODULE:NAME`` names; modules of the current folder are found too.
+
+    Raises
+    ------
+    ConfigError
+        if the module cannot be imported, or has no such name.
+
+    Examples
+    --------
+    >>> load_named("math:sqrt")(4.0)
+    2.0
+    >>> load_named("math:squirt")
+    Traceback (most recent call last):
+    terrain.errors.ConfigError: math:squirt: module 'math' has no 'squirt'
+    """
+    module_name, _, name = text.partition(":")
+    folder = str(Path.cwd())
+    if folder not in sys.path:
+        sys.path.append(folder)  # last, so that a file of the folder hides no library
+    try:
+        module = importlib.import_module(module_name)
+    except Exception as error:
+        raise ConfigError(f"{text}: module {module_name!r} cannot be imported: {error}") from error
+    found = getattr(module, name, None)
+    if not callable(found) and not hasattr(found, "fit"):
+        raise ConfigError(f"{text}: module {module_name!r} has no {name!r}")
+    return found
 
 
 def inform(recipe: WindowPipeline, fitted: Any) -> None:

@@ -98,7 +98,7 @@ def test_only_the_channel_that_is_used_is_important():
 
 
 def test_a_model_has_its_card_and_its_figures(model_dir, tracked):
-    result, evaluation = model_result(model_dir), tracked[1].crossval
+    result, evaluation = model_result(model_dir, "field"), tracked[1].crossval
     training = result.training
     assert (result.data_digest, result.dataset) == (tracked[1].data_digest, "twelve runs")
     assert sum(row.n_windows for row in training.runs) == training.params["n_windows"] == 144
@@ -134,9 +134,9 @@ def test_a_record_of_a_training_that_is_none_is_one_sentence(model_dir, change):
         change = json.dumps(document)
     file.write_text(change)
     with pytest.raises(ModelError, match=r"training\.json: is damaged"):
-        model_result(model_dir)
+        model_result(model_dir, "field")
     seal(model_dir, info)
-    for use in (model_result, lambda folder: register(folder, "m")):
+    for use in (lambda folder: model_result(folder, "m"), lambda folder: register(folder, "m")):
         with pytest.raises(ModelError, match=r"training\.json: is no record of a training") as refusal:
             use(model_dir)
         assert len(str(refusal.value).splitlines()) == 1
@@ -147,7 +147,7 @@ def test_a_model_that_was_not_evaluated_says_so_and_is_not_registered(model_dir)
     for name in (TRAINING_FILE, CARD_FILE):
         (model_dir / name).unlink()
     seal(model_dir, info)
-    assert "was not evaluated" in model_result(model_dir).report.answer
+    assert "was not evaluated" in model_result(model_dir, "field").report.answer
     with pytest.raises(ModelError, match="holds a model that was not evaluated"):
         register(model_dir, "m")
 
