@@ -64,7 +64,7 @@ def _results(module: ModuleType) -> list[type[Result]]:
     """Return the kinds of result that a module has, and those of the room's modules that it dispatches to."""
     modules = [module, *map(import_module, getattr(module, "RESULTS", ()))]
     own = [kind for each in modules for _, kind in inspect.getmembers(each, inspect.isclass)]
-    return [kind for kind in dict.fromkeys(own) if issubclass(kind, Result) and kind is not Result]
+    return [kind for kind in dict.fromkeys(own) if issubclass(kind, Result) and not kind.__subclasses__()]
 
 
 def _fields(kind: type[Result]) -> str:

@@ -27,3 +27,14 @@ class DataError(TerrainError):
 
 class ModelError(TerrainError):
     """A model file is damaged, foreign, or does not fit the data it is given."""
+
+
+def one_line(error: BaseException, most: int = 160) -> str:
+    r"""Return what an error of a library states in one line, cut off; its type where it states nothing.
+
+    Examples
+    --------
+    >>> one_line(ValueError("no\n  end")), one_line(EOFError())
+    ('no end', 'EOFError')
+    """
+    return " ".join(str(error).split())[:most] or type(error).__name__

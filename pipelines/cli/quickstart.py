@@ -155,11 +155,11 @@ def _compiling_ahead() -> Iterator[None]:
 
 def _run(settings: Settings, progress: Progress) -> QuickstartResult:
     from pipelines.data.datasets import load_runs
-    from pipelines.data.duplicates import distinct_runs
     from pipelines.learn.load import load_model
     from pipelines.learn.predict import predict
     from pipelines.learn.train import TrainingSettings, train
     from terrain.control.slip_table import load_slip_table
+    from terrain.logs.merge import distinct_runs
 
     data, out = settings.data, settings.out
     source = _simulated(settings, progress) if data is None else _Source(load_runs(data), None, ())

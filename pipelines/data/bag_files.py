@@ -16,14 +16,16 @@ from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import quote
 
+from pydantic import BaseModel, ValidationError
+
 from pipelines.data.mcap_file import MAGIC, MAX_RECORD_BYTES, McapReader, library
-from pipelines.data.standard_messages import DISTRO
-from terrain.errors import LogError, TerrainError
+from terrain.errors import LogError, TerrainError, one_line
 from terrain.files.documents import read_yaml
 from terrain.files.names import shown
 from terrain.logs.faults import DAMAGED_BLOCK, EARLY_END, Faults, Topic
 from terrain.logs.log_files import check_log_file, short_name
-from terrain.logs.topic_mapping import short_type
+from terrain.logs.mapping import first_fault
+from terrain.logs.topic_mapping import DISTRO, short_type
 
 METADATA = "metadata.yaml"
 SUFFIXES = (".mcap", ".db3", ".bag")
@@ -54,6 +56,18 @@ class Bag(NamedTuple):
     path: Path
     files: tuple[Path, ...]
     distro: str = ""
+
+
+class _Head(BaseModel):
+    relative_file_paths: list[str]
+    compression_mode: str | None = None
+    ros_distro: str | None = None
+
+
+class _Metadata(BaseModel):
+    """What ``metadata.yaml`` has to state."""
+
+    rosbag2_bagfile_information: _Head
 
 
 def find_bags(place: Path) -> list[Path]:
@@ -97,25 +111,22 @@ def open_bag(path: Path) -> Bag:
     if path.is_file():
         return Bag(path, (check_log_file(path, path.parent),))
     place = short_name(path / METADATA)
-    document = read_yaml(check_log_file(path / METADATA, path))
-    head = document.get("rosbag2_bagfile_information") if isinstance(document, dict) else None
-    names = head.get("relative_file_paths") if isinstance(head, dict) else None
-    if (
-        not isinstance(head, dict)
-        or not isinstance(names, list)
-        or not all(isinstance(n, str) for n in names)
-    ):
-        raise LogError(f"{place}: does not list the files of the bag")
-    if head.get("compression_mode"):
+    try:
+        found = _Metadata.model_validate(read_yaml(check_log_file(path / METADATA, path)))
+    except ValidationError as error:
+        raise LogError(f"{place}: does not list the files of the bag ({first_fault(error)})") from error
+    head = found.rosbag2_bagfile_information
+    if head.compression_mode:
         raise LogError(
-            f"{place}: the bag is compressed by {shown(head['compression_mode'])}, which is not read: "
+            f"{place}: the bag is compressed by {shown(head.compression_mode)}, which is not read: "
             f"'ros2 bag convert' writes it without, or as MCAP"
         )
-    files = tuple(check_log_file(path / name, path) for name in names)
+    files = tuple(check_log_file(path / name, path) for name in head.relative_file_paths)
     if not files or any(file.suffix.lower() not in SUFFIXES for file in files):
-        raise LogError(f"{place}: lists {shown(names)}, files {' or '.join(SUFFIXES)} are required")
-    distro = head.get("ros_distro")
-    return Bag(path, files, f"ROS2_{distro.upper()}" if isinstance(distro, str) else "")
+        raise LogError(
+            f"{place}: lists {shown(head.relative_file_paths)}, files {' or '.join(SUFFIXES)} are required"
+        )
+    return Bag(path, files, f"ROS2_{head.ros_distro.upper()}" if head.ros_distro else "")
 
 
 def reader_of(path: Path, faults: Faults) -> McapReader | RosbagsReader:
@@ -162,7 +173,7 @@ class RosbagsReader:
         except TerrainError:
             raise
         except Exception as error:  # whatever the library makes of a damaged file
-            raise LogError(f"{self._place}: is damaged ({_sentence(error)})") from error
+            raise LogError(f"{self._place}: is damaged ({one_line(error)})") from error
         if self._is_ros1:
             for position, chunk in reader.chunks.items():
                 reader.chunks[position] = chunk._replace(decompressor=_bounded(chunk.decompressor))
@@ -185,19 +196,17 @@ class RosbagsReader:
         Raises
         ------
         LogError
-            if the file is damaged, or a topic has two types.
+            if the file is damaged.
         """
+        found = []
         with closing(self._open()) as reader:
-            found: dict[str, Topic] = {}
             for each in reader.connections:
                 if self._is_ros1:
                     encoding, schema = "ros1", "ros1msg"
                 else:
                     encoding, schema = each.ext.serialization_format, f"ros2{each.msgdef.format.name.lower()}"
-                topic = Topic(each.topic, each.msgtype, encoding, schema, each.msgdef.data or "")
-                if found.setdefault(topic.name, topic).kind != topic.kind:
-                    raise LogError(f"{self._place}: topic {shown(topic.name)} has messages of two types")
-        return list(found.values())
+                found.append(Topic(each.topic, each.msgtype, encoding, schema, each.msgdef.data or ""))
+        return found
 
     def messages(self, names: frozenset[str]) -> Iterator[tuple[str, int, bytes]]:
         """Yield topic, log time in ns and content of the messages of some topics, in the order of log times.
@@ -213,13 +222,9 @@ class RosbagsReader:
                 for connection, log_ns, content in reader.messages(connections) if connections else ():
                     yield connection.topic, log_ns, content
             except ValueError as error:
-                self._faults.found(self._place, DAMAGED_BLOCK, _sentence(error))
+                self._faults.found(self._place, DAMAGED_BLOCK, one_line(error))
             except Exception as error:  # whatever the library makes of a damaged file
-                self._faults.found(self._place, EARLY_END, f"is damaged ({_sentence(error)})")
-
-
-def _sentence(error: Exception) -> str:
-    return " ".join(str(error).split())[:160] or type(error).__name__
+                self._faults.found(self._place, EARLY_END, f"is damaged ({one_line(error)})")
 
 
 def _bounded(decompress: Callable[[bytes], bytes]) -> Callable[[bytes], bytes]:
@@ -298,7 +303,7 @@ def _of_protobuf(at: str, topic: Topic) -> Callable[[bytes], Any]:
     try:
         decoder: Callable[[bytes], Any] | None = decoders.DecoderFactory().decoder_for("protobuf", schema)
     except Exception as error:  # whatever the library makes of a damaged definition
-        raise LogError(f"{at}: its definition is damaged ({_sentence(error)})") from error
+        raise LogError(f"{at}: its definition is damaged ({one_line(error)})") from error
     if decoder is None:
         raise LogError(f"{at} has a definition in {shown(topic.schema_encoding)}, 'protobuf' is read")
     return decoder
@@ -334,7 +339,7 @@ def _of_ros(at: str, topic: Topic, distro: str) -> Callable[[bytes], Any]:
     except RecursionError as error:
         raise LogError(f"{at}: its definition holds itself, or is too deep") from error
     except Exception as error:  # whatever the library makes of a damaged definition
-        raise LogError(f"{at}: its definition is damaged ({_sentence(error)})") from error
+        raise LogError(f"{at}: its definition is damaged ({one_line(error)})") from error
     deserialize = store.deserialize_cdr if topic.encoding == "cdr" else store.deserialize_ros1
     return lambda content: deserialize(content, kind)
 

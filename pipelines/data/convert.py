@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import shutil
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from pipelines.data.settings import MAPPING_TEXT, ROBOT_TEXT, RunsSettings, load
 from pipelines.report import (
@@ -27,10 +27,9 @@ from pipelines.report.settings import setting
 from terrain.errors import LogError, TerrainError
 
 if TYPE_CHECKING:
-    from pipelines.data.plausibility import Doubt
     from pipelines.data.recorded_windows import RecordedWindow
     from terrain.logs.duplicates import SharedStretch
-    from terrain.records import RunLog
+    from terrain.logs.plausibility import Doubt
 
 EXAMPLE = "terrain convert logs/ --mapping mapping.yaml --out runs/"
 
@@ -50,33 +49,34 @@ class Settings(RunsSettings):
 
 
 @dataclass(frozen=True)
-class ImportResult(Result):
-    """Run folders that were written."""
+class ConvertResult(Result):
+    """Runs that were written."""
 
     out: Path = described("folder that the runs were written to")
     n_runs: int = described("number of runs")
-    run_ids: tuple[str, ...] = described("ids of the runs, sorted")
-    labels: Mapping[str, int] = described("runs by terrain")
     dropped: Mapping[str, int] = described("what a repairing reader dropped, as counts by kind")
     skipped: tuple[str, ...] = described("a sentence for each run that could not be read")
-    digest: str = described("SHA-256 of all runs")
+    digest: str = described("SHA-256 of all runs; messages that are converted back have the same")
+
+
+@dataclass(frozen=True)
+class ImportResult(ConvertResult):
+    """Run folders that were written."""
+
+    run_ids: tuple[str, ...] = described("ids of the runs, sorted")
+    labels: Mapping[str, int] = described("runs by terrain")
     duplicates: tuple[SharedStretch, ...] = described("stretches that two of the runs share", default=())
     doubts: tuple[Doubt, ...] = described("checks that are doubtful or implausible", default=())
 
 
 @dataclass(frozen=True)
-class ExportResult(Result):
+class ExportResult(ConvertResult):
     """Files or bags for other programs that were written."""
 
-    out: Path = described("folder that the runs were written to")
-    n_runs: int = described("number of runs")
     files: Mapping[str, str] = described("name of each run's file or folder, by run")
     topics: Mapping[str, int] = described(
         "number of messages of each topic, or rows of each table, of all runs"
     )
-    dropped: Mapping[str, int] = described("what a repairing reader dropped, as counts by kind")
-    skipped: tuple[str, ...] = described("a sentence for each run that could not be read")
-    digest: str = described("SHA-256 of all runs; messages that are converted back have the same")
 
 
 def run(settings: Settings, progress: Progress = silent) -> ImportResult | ExportResult:
@@ -98,108 +98,61 @@ def run(settings: Settings, progress: Progress = silent) -> ImportResult | Expor
     TerrainError
         if ``out`` cannot be written.
     """
-    from pipelines.data.run_writers import target_place
+    from pipelines.data.datasets import data_digest, verdict
+    from pipelines.data.run_writers import csv_mapping, target_place, write
+    from terrain.files.atomic import atomic_write
+    from terrain.logs.duplicates import shared_stretches
+    from terrain.logs.plausibility import counted, doubts_of, refuse_implausible_runs
+    from terrain.robots import load_robot
 
     runs, skipped = load(settings)
     places = {run.run_id: target_place(run.run_id, settings.out, settings.to) for run in runs}
     for place in places.values():
         if place.exists():
             raise LogError(f"{place}: is there already, and is left as it is; write into another folder")
+    doubts: tuple[Doubt, ...] = ()
     if settings.to == "runs":
-        return _import(runs, skipped, settings, progress)
-    return _export(runs, skipped, places, settings, progress)
-
-
-def _import(
-    runs: Sequence[RunLog], skipped: Sequence[str], settings: Settings, progress: Progress
-) -> ImportResult:
-    from pipelines.data.datasets import data_digest
-    from pipelines.data.plausibility import counted, doubts_of, refuse_implausible_runs, verdict
-    from pipelines.data.recorded_windows import WINDOWS_FILE, windows_text
-    from pipelines.report.json_file import as_json
-    from terrain.logs.duplicates import shared_stretches
-    from terrain.logs.write import write_run
-    from terrain.robots import load_robot
-
-    given = None if settings.robot is None else load_robot(settings.robot)
-    verdicts = {run.run_id: verdict(run, given) for run in runs}
-    doubts = doubts_of(verdicts)
-    if not settings.repair:
-        refuse_implausible_runs(doubts)
-    runs = [counted(run, verdicts[run.run_id]) for run in runs]
-    windows = _recorded_windows(settings.data)
-    dropped: Counter[str] = Counter()
-    labels: Counter[str] = Counter()
-    written: list[Path] = []
-    try:
-        for each in runs:
-            of_run = windows.get(each.run_id, [])
-            text = windows_text(as_json(window) for window in of_run)
-            written.append(write_run(each, settings.out, beside={WINDOWS_FILE: text} if of_run else {}))
-            dropped.update(each.dropped)
-            labels.update(each.terrains)
-            progress("write runs", len(written), len(runs))
-    except BaseException:
-        _remove(written)
-        raise
-    return ImportResult(
-        out=settings.out,
-        n_runs=len(runs),
-        run_ids=tuple(each.run_id for each in runs),
-        labels=dict(sorted(labels.items())),
-        dropped=dict(sorted(dropped.items())),
-        skipped=tuple(skipped),
-        digest=data_digest(runs),
-        duplicates=shared_stretches(runs),
-        doubts=doubts,
-    )
-
-
-def _export(
-    runs: Sequence[RunLog],
-    skipped: Sequence[str],
-    places: Mapping[str, Path],
-    settings: Settings,
-    progress: Progress,
-) -> ExportResult:
-    from pipelines.data.datasets import data_digest
-    from pipelines.data.run_writers import csv_mapping, write_csv, write_messages
-    from terrain.files.atomic import atomic_write
-
+        given = None if settings.robot is None else load_robot(settings.robot)
+        verdicts = {run.run_id: verdict(run, given) for run in runs}
+        doubts = doubts_of(verdicts)
+        if not settings.repair:
+            refuse_implausible_runs(doubts)
+        runs = [counted(run, verdicts[run.run_id]) for run in runs]
     windows = _recorded_windows(settings.data)
     dropped: Counter[str] = Counter()
     counts: Counter[str] = Counter()
     written: list[Path] = []
     try:
         for each in runs:
-            place = places[each.run_id]
-            if settings.to == "csv":
-                counts.update(write_csv(place, each))
-            else:
-                counts.update(write_messages(place, each, windows.get(each.run_id, []), settings.to))
-            written.append(place)
+            counts.update(write(places[each.run_id], each, windows.get(each.run_id, []), settings.to))
+            written.append(places[each.run_id])
             dropped.update(each.dropped)
             progress("write runs", len(written), len(runs))
         mapping = csv_mapping(runs) if settings.to == "csv" else None
         if mapping is not None and not (settings.out / "mapping.yaml").exists():
             atomic_write(settings.out / "mapping.yaml", mapping)
     except BaseException:
-        _remove(written)
+        for place in written:
+            shutil.rmtree(place, ignore_errors=True) if place.is_dir() else place.unlink(missing_ok=True)
         raise
-    return ExportResult(
-        out=settings.out,
-        n_runs=len(runs),
-        files={run_id: place.name for run_id, place in places.items()},
-        topics=dict(sorted(counts.items())),
-        dropped=dict(sorted(dropped.items())),
-        skipped=tuple(skipped),
-        digest=data_digest(runs),
+    common: dict[str, Any] = {
+        "out": settings.out,
+        "n_runs": len(runs),
+        "dropped": dict(sorted(dropped.items())),
+        "skipped": tuple(skipped),
+        "digest": data_digest(runs),
+    }
+    if settings.to != "runs":
+        files = {run_id: place.name for run_id, place in places.items()}
+        return ExportResult(**common, files=files, topics=dict(sorted(counts.items())))
+    labels = Counter(terrain for each in runs for terrain in each.terrains)
+    return ImportResult(
+        **common,
+        run_ids=tuple(each.run_id for each in runs),
+        labels=dict(sorted(labels.items())),
+        duplicates=shared_stretches(runs),
+        doubts=doubts,
     )
-
-
-def _remove(written: Sequence[Path]) -> None:
-    for place in written:
-        shutil.rmtree(place, ignore_errors=True) if place.is_dir() else place.unlink(missing_ok=True)
 
 
 def _recorded_windows(place: Path) -> dict[str, list[RecordedWindow]]:
@@ -232,11 +185,11 @@ def report(result: ImportResult | ExportResult) -> Report:
             details=(Section("Messages", (Table(("topic", "messages"), tuple(result.topics.items())),)),),
             next_step=f"terrain convert {result.out} --out runs/",
         )
-    from pipelines.data.duplicates import sentences
-    from pipelines.data.plausibility import doubt_sentences
+    from terrain.logs.merge import sentences
+    from terrain.logs.plausibility import doubt_sentences
 
-    notes += [Text(sentence, kind="warning") for sentence in doubt_sentences(result.doubts)]
-    notes += [Text(sentence, kind="warning") for sentence in sentences(result.duplicates)]
+    odd = (*doubt_sentences(result.doubts), *sentences(result.duplicates))
+    notes += [Text(sentence, kind="warning") for sentence in odd]
     labels = tuple(result.labels.items())
     return Report(
         title="Converted runs",

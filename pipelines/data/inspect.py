@@ -29,7 +29,7 @@ from pipelines.report.settings import setting
 if TYPE_CHECKING:
     import pandas as pd
 
-    from pipelines.data.breaks import OddStretch
+    from features.breaks import OddStretch
     from terrain.logs.checks import Check
     from terrain.logs.clock import ClockEstimate
     from terrain.logs.duplicates import SharedStretch
@@ -139,15 +139,15 @@ def run(settings: Settings, progress: Progress = silent) -> Inspection:
 
 
 def _inspected(run: RunLog, robot: Robot | None) -> InspectedRun:
-    from pipelines.data.breaks import odd_stretches
-    from pipelines.data.datasets import robot_of
-    from pipelines.data.plausibility import verdict
+    from features.breaks import odd_stretches
+    from pipelines.data.datasets import verdict
     from terrain.errors import ConfigError, DataError
     from terrain.logs.clock import estimate_clock
     from terrain.logs.quality import stream_quality
+    from terrain.robots import robot_named
 
     try:
-        clock = estimate_clock(run, track_m=robot_of(run, robot).track_m)
+        clock = estimate_clock(run, track_m=robot_named(run.robot, robot).track_m)
     except (ConfigError, DataError):
         clock = None
     streams = {name: stream_quality(stream) for name, stream in run.streams.items()}
@@ -159,9 +159,8 @@ def _inspected(run: RunLog, robot: Robot | None) -> InspectedRun:
 
 def report(result: Inspection) -> Report:
     """Return what is odd about the runs first, then rates and gaps of their streams, then their clocks."""
-    from pipelines.data.duplicates import sentences
-    from pipelines.data.plausibility import doubt_sentences, doubts_of
-    from terrain.logs.plausibility import worst
+    from terrain.logs.merge import sentences
+    from terrain.logs.plausibility import doubt_sentences, doubts_of, worst
 
     doubts = list(doubt_sentences(doubts_of({each.run_id: each.plausibility for each in result.runs})))
     odd = [_odd_sentence(each.run_id, stretch) for each in result.runs for stretch in each.odd_stretches]

@@ -7,31 +7,32 @@ a file states of its own sizes is judged before it is unpacked.
 from __future__ import annotations
 
 import struct
-import zlib
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
-from terrain.errors import ConfigError, LogError
+import numpy as np
+
+from terrain.errors import ConfigError, LogError, one_line
 from terrain.files.names import shown
 from terrain.files.regular import MEBIBYTE
 from terrain.logs.faults import DAMAGED_BLOCK, EARLY_END, Faults, Topic
 from terrain.logs.log_files import short_name
 from terrain.logs.run_topics import (
-    LABEL_TOPIC,
     RUN_TOPIC,
     STRING,
     STRING_TEXT,
-    WINDOW_TOPIC,
     Head,
+    Messages,
     StreamTopic,
     run_document,
-    stamps_ns,
     stream_messages,
     stream_topic,
     string_message,
+    text_messages,
 )
 from terrain.records import Array, Label
 
@@ -95,13 +96,14 @@ class McapWriter:
         self._schemas: dict[str, int] = {}
         self._channels: dict[tuple[str, str], int] = {}
 
-    def write(self, topic: str, kind: str, definition: str, log_ns: int, message: bytes) -> None:
-        """Write one message; its topic is described before the first."""
+    def write(self, of: Messages, log_ns: int, content: bytes) -> None:
+        """Write one of the messages of a topic, which is described before the first."""
+        topic, kind, definition = of[:3]
         if (topic, kind) not in self._channels:
             if kind not in self._schemas:
                 self._schemas[kind] = self._writer.register_schema(kind, "ros2msg", definition.encode())
             self._channels[topic, kind] = self._writer.register_channel(topic, "cdr", self._schemas[kind])
-        self._writer.add_message(self._channels[topic, kind], log_ns, message, log_ns)
+        self._writer.add_message(self._channels[topic, kind], log_ns, content, log_ns)
 
     def flush(self) -> None:
         """End the chunk that is being filled, and give all to the system: it is readable then."""
@@ -149,26 +151,27 @@ class RunRecorder:
         self, stream: str, time_s: Array | Sequence[float], values: Array | Sequence[Sequence[float]]
     ) -> None:
         """Append samples (n,) and (n, c) of a stream that is registered."""
-        topic = self._topics[stream]
-        log_ns, messages = stream_messages(time_s, values, self._origin_s)
-        for stamp_ns, message in zip(log_ns.tolist(), messages, strict=True):
-            if not self._is_described:
-                self._describe(stamp_ns)
-            self._writer.write(topic.topic, topic.kind, topic.definition, stamp_ns, message)
-            self._last_ns = max(self._last_ns, stamp_ns)
+        messages = stream_messages(self._topics[stream], time_s, values, self._origin_s)
+        if not self._is_described and len(messages.log_ns):
+            self._describe(int(messages.log_ns[0]))
+        self._write(messages)
 
     def append_text(self, topic: str, time_s: float, text: str) -> None:
-        """Append a text, as of :data:`WINDOW_TOPIC` or :data:`LABEL_TOPIC`."""
-        (log_ns,) = stamps_ns([time_s], self._origin_s).tolist()
-        self._writer.write(topic, STRING, STRING_TEXT, log_ns, string_message(text))
-        self._last_ns = max(self._last_ns, log_ns)
+        """Append a text, as of :data:`~terrain.logs.run_topics.WINDOW_TOPIC`."""
+        self._write(text_messages(topic, [time_s], [text], self._origin_s))
 
     def _describe(
         self, log_ns: int, labels: Iterable[Label] = (), dropped: Mapping[str, int] | None = None
     ) -> None:
         text = run_document(self._head, self._topics, labels, dropped)
-        self._writer.write(RUN_TOPIC, STRING, STRING_TEXT, log_ns, string_message(text))
+        stamps_ns, contents = np.array([log_ns]), [string_message(text)]
+        self._write(Messages(RUN_TOPIC, STRING, STRING_TEXT, stamps_ns, contents))
         self._is_described = True
+
+    def _write(self, messages: Messages) -> None:
+        for log_ns, content in zip(messages.log_ns.tolist(), messages.contents, strict=True):
+            self._writer.write(messages, log_ns, content)
+            self._last_ns = max(self._last_ns, log_ns)
 
     def flush(self) -> None:
         """Give all that was appended to the system."""
@@ -211,16 +214,8 @@ class McapReader:
         Raises
         ------
         LogError
-            if the file is damaged, or a topic has two types.
+            if the file cannot be read.
         """
-        found = self._of_summary() or self._walked_topics()
-        by_name: dict[str, Topic] = {}
-        for topic in found:
-            if by_name.setdefault(topic.name, topic).kind != topic.kind:
-                raise LogError(f"{self._place}: topic {shown(topic.name)} has messages of two types")
-        return list(by_name.values())
-
-    def _of_summary(self) -> list[Topic]:
         from mcap.reader import SeekingReader
 
         try:
@@ -229,23 +224,22 @@ class McapReader:
         except OSError as error:
             raise LogError(f"{self._place}: cannot be read ({error.strerror or error})") from error
         except Exception:  # whatever the end of a file that was not closed looks like
-            return []
-        return [_topic(each, summary.schemas) for each in summary.channels.values()] if summary else []
+            summary = None
+        schemas, channels = (
+            (summary.schemas, summary.channels) if summary and summary.channels else self._walk()
+        )
+        return [_topic(each, schemas) for each in channels.values()]
 
-    def _walked_topics(self) -> list[Topic]:
-        from collections import Counter
-
+    def _walk(self) -> tuple[dict[int, Any], dict[int, Any]]:
+        """Return the schemas and channels in the order of the file, by number."""
         from mcap.records import Channel, Schema
 
-        schemas: dict[int, Any] = {}
-        channels: dict[int, Any] = {}
-        walk = McapReader(self._path, Faults(Counter()))  # faults are found when messages are read
-        for record in walk._records():
-            if isinstance(record, Schema):
-                schemas[record.id] = record
-            elif isinstance(record, Channel):
-                channels[record.id] = record
-        return [_topic(each, schemas) for each in channels.values()]
+        found: dict[type, dict[int, Any]] = {Schema: {}, Channel: {}}
+        counted = McapReader(self._path, Faults(Counter()))  # faults are found when messages are read
+        for record in counted._records():
+            if type(record) in found:
+                found[type(record)][record.id] = record
+        return found[Schema], found[Channel]
 
     def messages(self, names: frozenset[str]) -> Iterator[tuple[str, int, bytes]]:
         """Yield topic, log time in ns and content of the messages of some topics, in the order of the file.
@@ -294,7 +288,7 @@ class McapReader:
         except (EndOfFile, struct.error):
             self._faults.found(self._place, EARLY_END, "ends in the middle of a record, it was not closed")
         except (McapError, ValueError) as error:
-            self._faults.found(self._place, DAMAGED_BLOCK, " ".join(str(error).split())[:160])
+            self._faults.found(self._place, DAMAGED_BLOCK, one_line(error))
 
     def _chunk_records(self, chunk: Chunk) -> list[Any]:
         """Return the records of a chunk; none where it is damaged."""
@@ -302,12 +296,14 @@ class McapReader:
         from mcap.stream_reader import breakup_chunk
 
         try:
-            records: list[Any] = breakup_chunk(replace(chunk, compression="", data=_unpacked(chunk)))
+            records: list[Any] = breakup_chunk(
+                replace(chunk, compression="", data=_unpacked(chunk)), validate_crc=True
+            )
             return records
         except (EndOfFile, struct.error):
             text = "a chunk ends in the middle of a record"
         except ValueError as error:
-            text = " ".join(str(error).split())[:160]
+            text = one_line(error)
         self._faults.found(self._place, DAMAGED_BLOCK, text)
         return []
 
@@ -341,9 +337,4 @@ def _unpacked(chunk: Chunk) -> bytes:
             raise ValueError(f"a chunk cannot be unpacked ({error})") from error
     if len(content) != size:
         raise ValueError("a chunk is cut off, or has another size than it states")
-    if chunk.uncompressed_crc and zlib.crc32(content) != chunk.uncompressed_crc:
-        raise ValueError("a chunk has a wrong checksum")
     return content
-
-
-__all__ = ["LABEL_TOPIC", "WINDOW_TOPIC", "Head", "McapReader", "McapWriter", "RunRecorder"]

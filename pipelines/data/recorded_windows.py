@@ -1,46 +1,33 @@
-"""``windows.json`` beside the streams of a recorded run: what the model gave for each window.
+"""Windows that were recorded with a run: what the model gave for each, in ``windows.json`` or in a bag.
 
 Class names can be any text, so they are no channels of a stream.  Readers of run folders pass the file over.
 """
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError
 
 from terrain.control.switching import SWITCHING
 from terrain.errors import LogError
+from terrain.files.regular import MEBIBYTE, read_regular
 from terrain.logs.log_files import short_name
-from terrain.records import Array
+from terrain.logs.mapping import first_fault
 
 WINDOWS_FILE = "windows.json"
 
-VERSION = 1
+MAX_BYTES = 64 * MEBIBYTE
+"""Windows each second of a week with ten classes."""
+
+Number = Annotated[float, BeforeValidator(lambda value: math.nan if value is None else value)]
+"""A number that is null in JSON where it is not finite."""
 
 
-class WindowResult(Protocol):
-    """What a model gives for a window, as the live classifier does."""
-
-    @property
-    def start_s(self) -> float: ...  # noqa: D102
-    @property
-    def end_s(self) -> float: ...  # noqa: D102
-    @property
-    def terrain(self) -> str: ...  # noqa: D102
-    @property
-    def probability(self) -> float: ...  # noqa: D102
-    @property
-    def probabilities(self) -> Array: ...  # noqa: D102
-    @property
-    def classes(self) -> tuple[str, ...]: ...  # noqa: D102
-    @property
-    def refused(self) -> str: ...  # noqa: D102
-
-
-class RecordedWindow(NamedTuple):
+class RecordedWindow(BaseModel):
     """A window of a recorded run.
 
     Parameters
@@ -52,37 +39,28 @@ class RecordedWindow(NamedTuple):
     refused : why; empty where there is an output
     """
 
+    model_config = ConfigDict(frozen=True)
+
     start_s: float
     end_s: float
     terrain: str
-    probability: float
-    probabilities: Mapping[str, float]
+    probability: Number
+    probabilities: dict[str, Number]
     doubtful: bool
     refused: str = ""
 
 
-def window_entry(output: WindowResult) -> dict[str, Any]:
-    """Return the entry of a window in ``windows.json``; a number that is not finite is None."""
-    probability = float(output.probability)
-    return {
-        "start_s": float(output.start_s),
-        "end_s": float(output.end_s),
-        "terrain": str(output.terrain),
-        "probability": _or_none(probability),
-        "probabilities": {
-            str(name): _or_none(float(each))
-            for name, each in zip(output.classes, output.probabilities, strict=True)
-        },
-        "doubtful": not (output.terrain and probability >= SWITCHING.probability_least),
-        "refused": str(output.refused),
-    }
+class _File(BaseModel):
+    """Content of ``windows.json``."""
+
+    version: Literal[1]
+    probability_least: float = SWITCHING.probability_least
+    windows: list[RecordedWindow]
 
 
-def windows_text(entries: Iterable[Mapping[str, Any]]) -> str:
-    """Return the content of ``windows.json``, an entry a line."""
-    lines = ",\n".join(json.dumps(entry, allow_nan=False) for entry in entries)
-    head = f'{{"version": {VERSION}, "probability_least": {SWITCHING.probability_least}, "windows": [\n'
-    return head + lines + "\n]}\n"
+def windows_text(windows: Iterable[RecordedWindow]) -> str:
+    """Return the content of ``windows.json``; a number that is not finite is null."""
+    return _File(version=1, windows=list(windows)).model_dump_json(indent=1) + "\n"
 
 
 def read_windows(run_folder: Path) -> list[RecordedWindow] | None:
@@ -94,19 +72,13 @@ def read_windows(run_folder: Path) -> list[RecordedWindow] | None:
         if the file is damaged.
     """
     path = run_folder / WINDOWS_FILE
-    try:
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
+    if not path.exists():
         return None
-    except (OSError, UnicodeDecodeError) as error:
-        raise LogError(f"{short_name(path)}: cannot be read ({error})") from error
+    place = short_name(path)
     try:
-        document = json.loads(text)
-        if document["version"] != VERSION:
-            raise LogError(f"{short_name(path)}: version {document['version']!r} is unknown")
-        return [_window(entry) for entry in document["windows"]]
-    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
-        raise LogError(f"{short_name(path)}: is damaged ({type(error).__name__}: {error})") from error
+        return _File.model_validate_json(read_regular(path, place, LogError, MAX_BYTES)).windows
+    except ValidationError as error:
+        raise LogError(f"{place}: is damaged ({first_fault(error)})") from error
 
 
 def window_of_text(place: str, text: str) -> RecordedWindow:
@@ -118,26 +90,6 @@ def window_of_text(place: str, text: str) -> RecordedWindow:
         if it is damaged.
     """
     try:
-        return _window(json.loads(text))
-    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
-        raise LogError(f"{place}: a recorded window is damaged ({type(error).__name__}: {error})") from error
-
-
-def _window(entry: Mapping[str, Any]) -> RecordedWindow:
-    return RecordedWindow(
-        float(entry["start_s"]),
-        float(entry["end_s"]),
-        str(entry["terrain"]),
-        _or_nan(entry["probability"]),
-        {str(name): _or_nan(each) for name, each in entry["probabilities"].items()},
-        bool(entry["doubtful"]),
-        str(entry.get("refused", "")),
-    )
-
-
-def _or_none(value: float) -> float | None:
-    return value if math.isfinite(value) else None
-
-
-def _or_nan(value: float | None) -> float:
-    return math.nan if value is None else float(value)
+        return RecordedWindow.model_validate_json(text)
+    except ValidationError as error:
+        raise LogError(f"{place}: a recorded window is damaged ({first_fault(error)})") from error

@@ -3,36 +3,23 @@
 from __future__ import annotations
 
 import heapq
-import json
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
+import yaml
 
 from pipelines.data.mcap_file import McapWriter, library
-from pipelines.data.recorded_windows import RecordedWindow
-from pipelines.data.standard_messages import DISTRO, serialized, standard_topics
-from pipelines.report.json_file import as_json
-from terrain.errors import DataError
+from pipelines.data.recorded_windows import WINDOWS_FILE, RecordedWindow, windows_text
 from terrain.files.atomic import atomic_file, atomic_folder
-from terrain.files.names import shown
-from terrain.logs.run_topics import (
-    LABEL_TOPIC,
-    LATEST_S,
-    RUN_TOPIC,
-    STRING,
-    STRING_TEXT,
-    WINDOW_TOPIC,
-    Head,
-    run_document,
-    stamps_ns,
-    stream_messages,
-    stream_topics,
-    string_message,
-)
+from terrain.kinematics.standard_messages import StandardTopic, standard_topic
+from terrain.logs.run_topics import Messages, origin_of, run_messages, stamps_ns
 from terrain.logs.schema import UNIT_SCALES, unit_of
-from terrain.logs.write import run_folder
+from terrain.logs.topic_mapping import DISTRO
+from terrain.logs.write import run_folder, write_run
 from terrain.records import Array, RunLog
 
 Target = Literal["runs", "mcap", "ros2", "ros2-mcap", "csv"]
@@ -40,17 +27,7 @@ Target = Literal["runs", "mcap", "ros2", "ros2-mcap", "csv"]
 LABELS_FILE = "labels.csv"
 
 
-class Outgoing(NamedTuple):
-    """A topic: the text of its definition, its log times (n,) in ns, and its messages."""
-
-    topic: str
-    kind: str
-    text: str
-    log_ns: Array
-    messages: list[bytes]
-
-
-def outgoing_topics(run: RunLog, windows: Sequence[RecordedWindow] = ()) -> Iterator[Outgoing]:
+def messages_of_run(run: RunLog, windows: Sequence[RecordedWindow] = ()) -> Iterator[Messages]:
     """Yield the topics of a run: the run's own, then those of standard messages.
 
     Parameters
@@ -60,63 +37,68 @@ def outgoing_topics(run: RunLog, windows: Sequence[RecordedWindow] = ()) -> Iter
 
     Raises
     ------
+    ConfigError
+        if rosbags is not installed.
     DataError
         if the run is longer than stamps can tell apart, 68 years.
     """
-    origin_s = _origin_s(run)
-    start_s = min(float(stream.time_s[0]) for stream in run.streams.values())
-    topics = stream_topics(run.streams)
-    head = Head(run.run_id, run.robot, run.session, run.filter, run.source)
-    document = run_document(head, topics, run.labels, run.dropped)
-    yield _texts(RUN_TOPIC, [start_s], [document], origin_s)
-    changes = _label_changes(run)
-    if changes:
-        yield _texts(LABEL_TOPIC, [each[0] for each in changes], [each[1] for each in changes], origin_s)
-    if windows:
-        texts = [json.dumps(as_json(window)) for window in windows]
-        yield _texts(WINDOW_TOPIC, [window.end_s for window in windows], texts, origin_s)
+    yield from run_messages(run, [(window.end_s, window.model_dump_json()) for window in windows])
     for name, stream in run.streams.items():
-        topic = topics[name]
-        values = np.column_stack([stream.channel(channel) for channel in topic.fields.values()])
-        log_ns, messages = stream_messages(stream.time_s, values, origin_s)
-        yield Outgoing(topic.topic, topic.kind, topic.definition, log_ns, messages)
-    for name, stream in run.streams.items():
-        for standard in standard_topics(name, stream):
-            log_ns = stamps_ns(stream.time_s, origin_s)
-            yield Outgoing(standard.topic, standard.kind, *_described(standard, log_ns))
+        topic = standard_topic(name, stream)
+        if topic is not None:
+            yield serialized(topic, stamps_ns(stream.time_s, origin_of(run)))
 
 
-def _described(standard: Any, log_ns: Array) -> tuple[str, Array, list[bytes]]:
-    text, messages = serialized(standard, log_ns)
-    return text, log_ns, messages
+def serialized(topic: StandardTopic, log_ns: Array) -> Messages:
+    """Return standard messages (CDR), one for each stamp, which their headers bear.
+
+    Raises
+    ------
+    ConfigError
+        if rosbags is not installed.
+    """
+    library("rosbags.typesys")
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores[DISTRO])
+    message = _zero(store, topic.kind)
+    for path, value in topic.fixed.items():
+        _setter(message, path)(value)
+    setters = [_setter(message, path) for path in topic.paths]
+    contents = []
+    for stamp_ns, row in zip(log_ns.tolist(), topic.numbers.tolist(), strict=True):
+        message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 10**9)
+        for put, number in zip(setters, row, strict=True):
+            put(number)
+        contents.append(bytes(store.serialize_cdr(message, topic.kind)))
+    definition = str(store.generate_msgdef(topic.kind, ros_version=2)[0])
+    return Messages(topic.topic, topic.kind, definition, log_ns, contents)
 
 
-def _origin_s(run: RunLog) -> float:
-    """Return the time of the run that is stamped 0: 0, where stamps allow it."""
-    first_s = min(float(stream.time_s[0]) for stream in run.streams.values())
-    last_s = max(float(stream.time_s[-1]) for stream in run.streams.values())
-    if last_s - first_s > LATEST_S - 1:
-        raise DataError(
-            f"run {shown(run.run_id)} is {last_s - first_s:g} s long, stamps have {LATEST_S} s at most"
-        )
-    return 0.0 if first_s >= 0.0 and last_s <= LATEST_S else float(np.floor(first_s))
+def _setter(message: Any, path: str) -> Callable[[Any], None]:
+    """Return what sets the field, or the element of an array, that a path names."""
+    *parents, field = path.split(".")
+    for name in parents:
+        message = getattr(message, name)
+    if field.endswith("]"):
+        array, _, index = field[:-1].partition("[")
+        return partial(getattr(message, array).__setitem__, int(index))
+    return partial(setattr, message, field)
 
 
-def _texts(topic: str, time_s: Sequence[float], texts: Sequence[str], origin_s: float) -> Outgoing:
-    """Return texts at times of a run as a topic; times outside what stamps can be are its ends."""
-    known_s = np.clip(np.nan_to_num(time_s, nan=origin_s), origin_s, origin_s + LATEST_S)
-    messages = [string_message(text) for text in texts]
-    return Outgoing(topic, STRING, STRING_TEXT, stamps_ns(known_s, origin_s), messages)
+def _zero(store: Any, kind: str) -> Any:
+    """Return a message whose numbers are 0, texts empty, and sequences of no element."""
+    from rosbags.interfaces import Nodetype
 
-
-def _label_changes(run: RunLog) -> list[tuple[float, str]]:
-    """Return the terrains as they change; an empty one where no label holds."""
-    found: list[tuple[float, str]] = []
-    for label in sorted(run.labels):
-        if found and found[-1] == (label.start_s, ""):
-            found.pop()
-        found += [(label.start_s, label.terrain), (label.end_s, "")]
-    return found
+    values: dict[str, Any] = {}
+    for name, (node, described) in store.fielddefs[kind][1]:
+        if node == Nodetype.NAME:
+            values[name] = _zero(store, described)
+        elif node == Nodetype.BASE:
+            values[name] = "" if described[0] == "string" else 0
+        else:  # those that are written are arrays of float64
+            values[name] = np.zeros(described[1] if node == Nodetype.ARRAY else 0)
+    return store.types[kind](**values)
 
 
 def target_place(run_id: str, out: Path, target: Target) -> Path:
@@ -125,10 +107,15 @@ def target_place(run_id: str, out: Path, target: Target) -> Path:
     return folder.with_name(f"{folder.name}.mcap") if target == "mcap" else folder
 
 
-def write_messages(
-    place: Path, run: RunLog, windows: Sequence[RecordedWindow], target: Target
-) -> dict[str, int]:
-    """Write a run as an MCAP file or a bag of ROS 2; return the number of messages of each topic.
+def write(place: Path, run: RunLog, windows: Sequence[RecordedWindow], target: Target) -> Mapping[str, int]:
+    """Write a run; return the number of messages of each topic, or of rows of each table for other programs.
+
+    Parameters
+    ----------
+    place : as :func:`target_place` returns it
+    run : with any streams
+    windows : that were recorded with it
+    target : what is written
 
     Raises
     ------
@@ -139,13 +126,18 @@ def write_messages(
     TerrainError
         if the place cannot be written.
     """
-    topics = list(outgoing_topics(run, windows))
+    if target == "runs":
+        write_run(run, place.parent, beside={WINDOWS_FILE: windows_text(windows)} if windows else {})
+        return {}
+    if target == "csv":
+        return write_csv(place, run)
+    topics = list(messages_of_run(run, windows))
     if target == "mcap":
         head = {"run_id": run.run_id, "robot": run.robot, "session": run.session, "filter": run.filter}
         with atomic_file(place) as file:
             writer = McapWriter(file, head)
             for log_ns, number, message in _in_order(topics):
-                writer.write(*topics[number][:3], log_ns, message)
+                writer.write(topics[number], log_ns, message)
             writer.finish()
     else:
         with atomic_folder(place) as unfinished:
@@ -154,13 +146,13 @@ def write_messages(
             for path in inner.iterdir():
                 path.rename(unfinished / path.name)
             inner.rmdir()
-    counts: dict[str, int] = {}
+    counts: Counter[str] = Counter()
     for topic in topics:  # several streams may share one
-        counts[topic.topic] = counts.get(topic.topic, 0) + len(topic.messages)
+        counts[topic.topic] += len(topic.contents)
     return counts
 
 
-def _write_ros2(folder: Path, topics: Sequence[Outgoing], storage: str) -> None:
+def _write_ros2(folder: Path, topics: Sequence[Messages], storage: str) -> None:
     library("rosbags.rosbag2")
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -168,7 +160,7 @@ def _write_ros2(folder: Path, topics: Sequence[Outgoing], storage: str) -> None:
     store = get_typestore(Stores[DISTRO])
     for each in topics:
         if each.kind not in store.types:
-            store.register(get_types_from_msg(each.text.partition("=" * 80)[0], each.kind))
+            store.register(get_types_from_msg(each.definition.partition("=" * 80)[0], each.kind))
     with Writer(folder, version=9, storage_plugin=StoragePlugin[storage]) as writer:
         connections: dict[tuple[str, str], Any] = {}
         for each in topics:
@@ -179,12 +171,12 @@ def _write_ros2(folder: Path, topics: Sequence[Outgoing], storage: str) -> None:
             writer.write(connections[topics[number].topic, topics[number].kind], log_ns, message)
 
 
-def _in_order(topics: Sequence[Outgoing]) -> Iterator[tuple[int, int, bytes]]:
+def _in_order(topics: Sequence[Messages]) -> Iterator[tuple[int, int, bytes]]:
     """Yield log time, number of the topic and message, of all topics in the order of log times."""
 
     def numbered(number: int) -> Iterator[tuple[int, int, bytes]]:
         topic = topics[number]
-        for log_ns, message in zip(topic.log_ns.tolist(), topic.messages, strict=True):
+        for log_ns, message in zip(topic.log_ns.tolist(), topic.contents, strict=True):
             yield log_ns, number, message
 
     return heapq.merge(*(numbered(number) for number in range(len(topics))), key=lambda found: found[0])
@@ -221,14 +213,12 @@ def csv_mapping(runs: Sequence[RunLog]) -> str | None:
         }:
             return None
     unit_name = {word: name for name, (word, factor) in reversed(UNIT_SCALES.items()) if factor == 1.0}
-    lines = [f"robot: {json.dumps(first.robot)}", 'run_id: "{run}"', "streams:"]
+    streams: dict[str, Any] = {}
     for name, stream in first.streams.items():
-        units = {channel: unit_name.get(unit_of(channel), "") for channel in stream.channels}
-        if not any(units.values()):
-            continue
-        lines += [f"  {json.dumps(name)}:", f"    file: {json.dumps('{run}/' + name + '.csv')}"]
-        lines += ["    time: {column: time_s, unit: s}", "    channels:"]
-        for channel, unit in units.items():
-            place = f"{{column: {json.dumps(channel)}, unit: {json.dumps(unit)}}}"
-            lines += [f"      {json.dumps(channel)}: {place}"] if unit else []
-    return "\n".join(lines) + "\n"
+        units = {channel: unit_name.get(unit_of(channel)) for channel in stream.channels}
+        channels = {channel: {"column": channel, "unit": unit} for channel, unit in units.items() if unit}
+        if channels:
+            time = {"column": "time_s", "unit": "s"}
+            streams[name] = {"file": f"{{run}}/{name}.csv", "time": time, "channels": channels}
+    document = {"robot": first.robot, "run_id": "{run}", "streams": streams}
+    return str(yaml.safe_dump(document, sort_keys=False, allow_unicode=True))

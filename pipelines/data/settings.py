@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, NamedTuple, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple
 
+from pipelines.data.layouts import Layout
 from pipelines.report.settings import Settings, setting
 from terrain.errors import ConfigError
 from terrain.files.names import listed, shown
@@ -13,19 +14,9 @@ from terrain.files.names import listed, shown
 if TYPE_CHECKING:
     from terrain.records import RunLog
 
-Layout = Literal[
-    "auto", "runs", "borealtc", "csv", "drive", "drive-recording", "robotino", "testbed", "can", "bag"
-]
-"""``auto``: found out; ``runs``: run folders as this package writes them; ``csv``: any CSV, by a mapping
-file; ``drive``: the files ``samples.csv.gz`` of DRIVE, one a session; ``drive-recording``: its whole
-recordings; ``robotino``: three motors and a camera above; ``testbed``: ``smooth.csv`` and ``grouser.csv`` of
-a wheel in a box of sand, a trial a row; ``can``: logs of a CAN bus; ``bag``: MCAP files and ROS 2 bags."""
-
-
 ROBOT_TEXT = (
     "Robot of logs that do not name theirs (DRIVE, CAN, bags), by name or its YAML file; of DRIVE the husky."
 )
-
 
 MAPPING_TEXT = (
     "YAML file that describes CSV, .mat and .xlsx files by the keys robot, run_id, terrain, streams; of a stream "
@@ -62,24 +53,6 @@ class AlignedRunsSettings(RunsSettings):
     only: tuple[str, ...] = setting((), "Ids of the runs to use, by commas; all by default.", separated=True)
     without: tuple[str, ...] = setting((), "Ids of runs to leave out, by commas.", separated=True)
     align: bool = setting(False, "Bring the wheel stream onto the IMU's clock where both see the turns.")
-
-
-class InspectSettings(RunsSettings):
-    """What is inspected."""
-
-    data: Path = setting(..., "Folder to read, or an MCAP file.", option="FOLDER")
-    robot: str | None = setting(None, ROBOT_TEXT)
-
-
-class Named(Protocol):
-    """What has the id of a run."""
-
-    @property
-    def run_id(self) -> str:
-        """Id of the run."""
-
-
-AnyRun = TypeVar("AnyRun", bound=Named)
 
 
 class LoadedRuns(NamedTuple):
@@ -120,8 +93,8 @@ def load(settings: RunsSettings, robot: str | None = None, *, align: bool = Fals
     return LoadedRuns(runs, skipped)
 
 
-def chosen_runs(runs: Sequence[AnyRun], settings: AlignedRunsSettings) -> list[AnyRun]:
-    """Return the runs that ``--only`` and ``--without`` leave.
+def chosen_runs(runs: Sequence[Any], settings: AlignedRunsSettings) -> list[Any]:
+    """Return those of runs, or of what has the id of one, that ``--only`` and ``--without`` leave.
 
     Raises
     ------
@@ -133,11 +106,8 @@ def chosen_runs(runs: Sequence[AnyRun], settings: AlignedRunsSettings) -> list[A
         for name in names:
             if name not in known:
                 raise ConfigError(f"{option}: there is no run {shown(name)}; there are {listed(known)}")
-    chosen = [
-        run
-        for run in runs
-        if (not settings.only or run.run_id in settings.only) and run.run_id not in settings.without
-    ]
+    kept = set(settings.only or known) - set(settings.without)
+    chosen = [run for run in runs if run.run_id in kept]
     if not chosen:
         raise ConfigError("--only and --without leave no run")
     return chosen

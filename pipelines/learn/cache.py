@@ -24,7 +24,6 @@ from features.extractor import FeatureExtractor
 from features.motion import Motion, wheel_stream, window_motion
 from features.windows import Layout, WindowRule, cut_windows, layout_of
 from pipelines.data.datasets import RunLoader, data_digest, joint_digest, run_loaders
-from pipelines.data.duplicates import sentences
 from pipelines.data.settings import AlignedRunsSettings, chosen_runs
 from pipelines.learn.parallel import parallel
 from pipelines.learn.protocols import Samples
@@ -34,6 +33,7 @@ from terrain.errors import ConfigError, DataError, LogError
 from terrain.files.atomic import atomic_file, ensure_writable
 from terrain.logs.duplicates import EqualCodes, equal_codes, pairs_of, shared_stretches
 from terrain.logs.fingerprints import RunPrint, run_print
+from terrain.logs.merge import sentences
 from terrain.records import Array, RunLog, Stream, Windows
 
 FORMAT_VERSION = 3

@@ -200,13 +200,14 @@ def propose_labels(settings: Settings, model: TerrainModel) -> ProposalsResult:
         if there is no run, or a run lacks what the model requires.
     """
     from features.windows import cut_windows, join_windows
-    from pipelines.data.datasets import load_runs, robot_of
+    from pipelines.data.datasets import load_runs
     from pipelines.learn.proposals import propose, questions, write_proposals
     from pipelines.live.windows import lacking_estimates, windows_of_log
+    from terrain.robots import packaged_robot
 
     runs = load_runs(settings.data)
     cuts = [
-        windows_of_log(run, model.info, robot_of(run, None), skip_short=True)
+        windows_of_log(run, model.info, packaged_robot(run.robot), skip_short=True)
         if lacking_estimates(run, model.info)
         else cut_windows([run], model.rule, layout=model.layout, skip_short=True)
         for run in runs

@@ -400,11 +400,11 @@ def filtered_terrains(windows: Windows, assessed: Assessed, model: TerrainModel)
 
 def _cut(log: RunLog, model: TerrainModel, robot: Robot | None, *, skip_short: bool) -> WindowCut:
     from features.windows import cut_windows
-    from pipelines.data.datasets import robot_of
     from pipelines.live.windows import lacking_estimates, windows_of_log
+    from terrain.robots import robot_named
 
     if lacking_estimates(log, model.info):
-        return windows_of_log(log, model.info, robot_of(log, robot), skip_short=skip_short)
+        return windows_of_log(log, model.info, robot_named(log.robot, robot), skip_short=skip_short)
     return cut_windows([log], model.rule, layout=model.layout, skip_short=skip_short)
 
 

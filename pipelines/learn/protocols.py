@@ -29,12 +29,12 @@ from features.windows import (
     span_of,
     wheel_speeds,
 )
-from pipelines.data.duplicates import distinct_runs
-from pipelines.data.regimes import driven_at, regime_of
 from pipelines.learn.settings import WindowSettings
 from pipelines.report import format_counts
 from terrain.classify.folds import block_groups, fold_numbers, single_run_classes
 from terrain.errors import ConfigError, DataError
+from terrain.logs.merge import distinct_runs
+from terrain.logs.regimes import driven_at, regime_of
 from terrain.logs.schema import SIGNAL_SETS
 from terrain.records import Array, RunLog, Windows
 

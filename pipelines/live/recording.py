@@ -10,7 +10,6 @@ one beginning with the sample after the last.
 from __future__ import annotations
 
 import errno
-import json
 import os
 import shutil
 import threading
@@ -19,12 +18,13 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from io import BytesIO
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
 
 import numpy as np
 
 from pipelines.data.mcap_file import RunRecorder
-from pipelines.data.recorded_windows import WindowResult, window_entry
+from pipelines.data.recorded_windows import RecordedWindow
+from terrain.control.switching import SWITCHING
 from terrain.errors import LogError
 from terrain.files.names import plain_name
 from terrain.logs.replay import TWIST
@@ -33,6 +33,9 @@ from terrain.logs.samples import BAD_TIME
 from terrain.logs.schema import unit_of
 from terrain.logs.write import run_folder
 from terrain.records import Array, Command, Reading
+
+if TYPE_CHECKING:
+    from pipelines.live.classifying import WindowOutput
 
 FLUSH_S = 1.0
 """Time between two writings of a recording: with the time that one takes, what a killed process loses."""
@@ -123,7 +126,7 @@ class SessionRecorder:
         self._folder, self._part_bytes, self._writer = Path(folder), part_bytes, writer
         self._head = Head(run_id, robot, run_id, source=source, live=True)
         self._lock = threading.Lock()
-        self._waiting: list[tuple[str, Array | WindowResult]] = []
+        self._waiting: list[tuple[str, Array | WindowOutput]] = []
         self._dropped: Counter[str] = Counter()
         self._n_waiting = 0
         self._part: _Part | None = None
@@ -157,7 +160,7 @@ class SessionRecorder:
         self._channels.setdefault("control", tuple(command.status))
         self._put("control", np.array([[time_s, *command.status.values()]]))
 
-    def window(self, output: WindowResult) -> None:
+    def window(self, output: WindowOutput) -> None:
         """Record the output of the model for a window."""
         self._put(WINDOW, output)
 
@@ -173,7 +176,7 @@ class SessionRecorder:
             self.settled.wait(timeout_s)
         return self.files
 
-    def _put(self, stream: str, content: Array | WindowResult) -> None:
+    def _put(self, stream: str, content: Array | WindowOutput) -> None:
         if self._ended:
             return
         n_bytes = _OVERHEAD_BYTES + getattr(content, "nbytes", 5 * _OVERHEAD_BYTES)
@@ -233,8 +236,7 @@ class SessionRecorder:
                 part.run.append(name, rows[:, 0], rows[:, 1:])
         for output in windows:
             if 0.0 <= output.end_s - self._origin_s < LATEST_S:
-                entry = json.dumps(window_entry(output), allow_nan=False)
-                part.run.append_text(WINDOW_TOPIC, output.end_s, entry)
+                part.run.append_text(WINDOW_TOPIC, output.end_s, recorded(output).model_dump_json())
         part.run.flush()
         os.fsync(part.file.fileno())
         if not os.fstat(part.file.fileno()).st_nlink:
@@ -279,6 +281,20 @@ class SessionRecorder:
         os.fsync(part.file.fileno())
         part.file.close()
         self._part, self._dropped = None, Counter()
+
+
+def recorded(output: WindowOutput) -> RecordedWindow:
+    """Return what is recorded of a model's output for a window."""
+    probability = float(output.probability)
+    return RecordedWindow(
+        start_s=output.start_s,
+        end_s=output.end_s,
+        terrain=output.terrain,
+        probability=probability,
+        probabilities=dict(zip(output.classes, output.probabilities.tolist(), strict=True)),
+        doubtful=not (output.terrain and probability >= SWITCHING.probability_least),
+        refused=output.refused,
+    )
 
 
 def _check_channels(channels: Mapping[str, Sequence[str]]) -> None:

@@ -151,7 +151,8 @@ def run(settings: Settings, log: Path, progress: Progress = silent) -> ReplayRes
     """
     from threading import Event
 
-    from pipelines.data.settings import InspectSettings, ReadSettings, load
+    from pipelines.data.inspect import Settings as InspectSettings
+    from pipelines.data.settings import ReadSettings, load
     from pipelines.learn.load import load_model
     from pipelines.live.over_time import filtered
     from pipelines.report.stopping import stopping
@@ -223,7 +224,6 @@ def chain_of(run: RunLog, model: LiveModel | None, table: SlipTable, robot: Robo
     DataError
         if the run lacks what the model or the pilot needs.
     """
-    from pipelines.data.datasets import robot_of
     from pipelines.live.chain import PilotChain
     from pipelines.live.observer import Observer
     from pipelines.live.windows import needs_filter
@@ -231,6 +231,7 @@ def chain_of(run: RunLog, model: LiveModel | None, table: SlipTable, robot: Robo
     from terrain.errors import ConfigError, DataError
     from terrain.estimation.live.estimator import CHANNELS
     from terrain.logs.replay import SENSORS
+    from terrain.robots import robot_named
 
     if table.robot and run.robot != table.robot:
         raise ConfigError(
@@ -238,7 +239,7 @@ def chain_of(run: RunLog, model: LiveModel | None, table: SlipTable, robot: Robo
         )
     channels = {name: stream.channels for name, stream in run.streams.items() if name in SENSORS}
     try:
-        described = robot_of(run, robot)
+        described = robot_named(run.robot, robot)
     except ConfigError:
         if model is None or needs_filter(model.info, channels):
             raise

@@ -12,7 +12,6 @@ import numpy as np
 
 from features.response import ResponseExtractor
 from features.windows import WindowRule, cut_windows, layout_of
-from pipelines.data.regimes import regime_of
 from pipelines.report import (
     Bars,
     Figure,
@@ -36,6 +35,7 @@ from pipelines.report import (
 )
 from pipelines.slip.filtered import Keep
 from terrain.errors import DataError
+from terrain.logs.regimes import regime_of
 from terrain.measured_slip.delay import Delay, DelayStatus
 from terrain.measured_slip.measure import (
     NO_ROLLERS,

@@ -1,13 +1,14 @@
-"""Runs that hold the same measurements become one run that holds each stretch once."""
+"""Runs that hold the same measurements: reported, refused, or made one run that holds each stretch once."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from terrain.errors import DataError
-from terrain.logs.duplicates import SharedStretch, groups_of
+from terrain.logs.duplicates import SharedStretch, groups_of, shared_stretches
 from terrain.records import Label, RunLog, Stream
 
 PART_GAP_S = 1.0
@@ -16,8 +17,61 @@ PART_GAP_S = 1.0
 LABEL_MARGIN_S = 2.0
 """Labels are compared this far inside of a stretch, whose ends are known to a second."""
 
+MAX_SHOWN = 3
+"""Pairs that a refusal names."""
+
 Part = tuple[RunLog, float, float]
 """A run, and start and end of what is kept of it."""
+
+
+class DistinctRuns(NamedTuple):
+    """Runs of which no two hold the same measurements, and the ids of those that were merged."""
+
+    runs: list[RunLog]
+    merged: tuple[tuple[str, ...], ...] = ()
+
+
+def distinct_runs(runs: Sequence[RunLog], *, merge: bool) -> DistinctRuns:
+    """Return runs of which no two hold the same measurements.
+
+    Parameters
+    ----------
+    runs : of one data set
+    merge : make one run of those that share a stretch, which then counts once; else they are refused
+
+    Raises
+    ------
+    DataError
+        if runs share a stretch and are not to be merged, or label it differently.
+    """
+    found = shared_stretches(runs)
+    if not found:
+        return DistinctRuns(list(runs))
+    refuse_other_labels(runs, found)
+    if not merge:
+        raise DataError(
+            f"{'; '.join(sentences(found))}: held out, they would be recognised and not classified; remove "
+            "one of them, or use --merge-duplicates to treat them as one run"
+        )
+    return DistinctRuns(merge_runs(runs, found), groups_of(found))
+
+
+def sentences(found: Sequence[SharedStretch]) -> list[str]:
+    """Return what the shared stretches are, in words; beyond the first ones their number.
+
+    Examples
+    --------
+    >>> sentences([SharedStretch("a", "b", 0.0, 9.0, 100.0, 109.0)])
+    ['runs a and b hold the same measurements for 9.0 s (from 0.0 s of a and 100.0 s of b)']
+    """
+    shown = [
+        f"runs {each.first} and {each.second} hold the same measurements for {each.duration_s:.1f} s "
+        f"(from {each.first_start_s:.1f} s of {each.first} and {each.second_start_s:.1f} s of {each.second})"
+        for each in found[:MAX_SHOWN]
+    ]
+    if len(found) > MAX_SHOWN:
+        shown.append(f"and so do {len(found) - MAX_SHOWN} more pairs of runs")
+    return shown
 
 
 def merge_runs(runs: Sequence[RunLog], stretches: Sequence[SharedStretch]) -> list[RunLog]:

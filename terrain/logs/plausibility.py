@@ -11,12 +11,15 @@ that the usual mistakes are: a factor of 9.81, 57.3, 3.6, 1000, a turned sign or
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from terrain.constants import GRAVITY_MPS2
+from terrain.errors import LogError
 from terrain.logs.channel_names import check_names
 from terrain.logs.checks import Check, Level
 from terrain.logs.plausible import BEYOND, MAX_MAGNITUDE
@@ -65,6 +68,9 @@ MIN_OVERLAP_RATIO = (0.5, 0.1)
 published runs reach 0.9."""
 
 
+MAX_NAMED = 3
+"""A sentence that concerns many runs is written for so many, and counted for the others."""
+
 UNKNOWN_ROBOT = Scale()
 """Nothing is known of the robot."""
 
@@ -107,6 +113,53 @@ def worst(checks: Sequence[Check]) -> Level:
     """
     order = (Level.UNKNOWN, Level.OK, Level.DOUBTFUL, Level.IMPLAUSIBLE)
     return max((check.level for check in checks), key=order.index, default=Level.UNKNOWN)
+
+
+class Doubt(NamedTuple):
+    """A check of a run that is doubtful or implausible."""
+
+    run_id: str
+    check: Check
+
+
+def doubts_of(verdicts: Mapping[str, Sequence[Check]]) -> tuple[Doubt, ...]:
+    """Return what is doubtful or implausible in the checks of runs, by their id."""
+    odd = (Level.DOUBTFUL, Level.IMPLAUSIBLE)
+    return tuple(
+        Doubt(run_id, check) for run_id, checks in verdicts.items() for check in checks if check.level in odd
+    )
+
+
+def refuse_implausible_runs(doubts: Sequence[Doubt]) -> None:
+    """Raise :class:`LogError` with the first implausible check, and how many there are."""
+    found = [doubt for doubt in doubts if doubt.check.level == Level.IMPLAUSIBLE]
+    if not found:
+        return
+    runs = len({doubt.run_id for doubt in found})
+    more = f" ({len(found)} such findings in {runs} run{'s' * (runs > 1)})" if len(found) > 1 else ""
+    raise LogError(
+        f"{found[0].run_id}: implausible {found[0].check.sentence}{more}; mend it where it is read, by a "
+        "mapping, say, or import it as it is, and counted, with --repair"
+    )
+
+
+def counted(run: RunLog, checks: Sequence[Check]) -> RunLog:
+    """Return a run that states among what was dropped or changed which checks it does not pass."""
+    odd = Counter(f"implausible {check.check}" for check in checks if check.level == Level.IMPLAUSIBLE)
+    return replace(run, dropped=Counter(run.dropped) + odd) if odd else run
+
+
+def doubt_sentences(doubts: Sequence[Doubt]) -> Iterator[str]:
+    """Yield a sentence a doubt; where one check concerns many runs, some of them and their number."""
+    seen: Counter[tuple[str, str, Level]] = Counter()
+    kinds = [(doubt.check.check, doubt.check.place, doubt.check.level) for doubt in doubts]
+    for doubt, kind in zip(doubts, kinds, strict=True):
+        seen[kind] += 1
+        if seen[kind] <= MAX_NAMED:
+            yield f"{doubt.run_id}: {doubt.check.level} {doubt.check.sentence}"
+    for (check, place, level), n in Counter(kinds).items():
+        if n > MAX_NAMED:
+            yield f"{n - MAX_NAMED} more runs: {level} {check} ({place})"
 
 
 def _within_bounds(run: RunLog) -> RunLog:

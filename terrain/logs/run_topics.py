@@ -13,12 +13,12 @@ import json
 import re
 import struct
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from terrain.errors import LogError
+from terrain.errors import DataError, LogError
 from terrain.files.documents import parse_json
 from terrain.files.names import shown
 from terrain.logs.faults import DAMAGED_MESSAGE, Faults, Topic
@@ -73,6 +73,16 @@ class StreamTopic(NamedTuple):
         return "\n".join(lines) + "\n" + HEADER_TEXT
 
 
+class Messages(NamedTuple):
+    """Messages of a topic: its name and type, the text that defines it, log times (n,) in ns, and contents."""
+
+    topic: str
+    kind: str
+    definition: str
+    log_ns: Array
+    contents: list[bytes]
+
+
 class Head(NamedTuple):
     """What a run states of itself beside its streams; ``live`` of one that was recorded as it came."""
 
@@ -102,14 +112,6 @@ def stream_topic(stream: str, channels: Sequence[str], taken: Iterable[str] = ()
     fields = _accepted_names(channels, "channel", (TIME_FIELD, "header"))
     kind = "".join(part.capitalize() for part in name.split("_"))
     return StreamTopic(PREFIX + name, f"{PACKAGE}/msg/{kind}", dict(zip(fields, channels, strict=True)))
-
-
-def stream_topics(streams: Mapping[str, Stream]) -> dict[str, StreamTopic]:
-    """Return the topic of each stream of a run."""
-    found: dict[str, StreamTopic] = {}
-    for name, stream in streams.items():
-        found[name] = stream_topic(name, stream.channels, [each.topic for each in found.values()])
-    return found
 
 
 def _accepted_names(names: Iterable[str], fallback: str, reserved: Iterable[str]) -> list[str]:
@@ -160,6 +162,28 @@ def string_message(text: str) -> bytes:
     return struct.pack("<4BI", 0, 1, 0, 0, len(content)) + content
 
 
+def string_of(place: str, message: bytes) -> str:
+    r"""Return the text of a message of ``std_msgs/String``.
+
+    Raises
+    ------
+    LogError
+        if it is damaged.
+
+    Examples
+    --------
+    >>> string_of("a.mcap", string_message("a"))
+    'a'
+    """
+    end = 8 + int.from_bytes(message[4:8], "little")
+    try:
+        if message[:2] != b"\0\1" or not 8 < end <= len(message):
+            raise ValueError("has another length than it states")
+        return message[8 : end - 1].decode()
+    except ValueError as error:
+        raise LogError(f"{place}: has a message that is no text ({error})") from error
+
+
 def stamps_ns(time_s: Array | Sequence[float], origin_s: float) -> Array:
     """Return times in whole nanoseconds since an origin.
 
@@ -185,13 +209,26 @@ def _record(n_channels: int) -> np.dtype[Any]:
     )
 
 
+def text_messages(
+    topic: str, time_s: Array | Sequence[float], texts: Sequence[str], origin_s: float
+) -> Messages:
+    """Return texts at times of a run as messages; times outside what stamps can be are its ends."""
+    known_s = np.clip(np.nan_to_num(time_s, nan=origin_s), origin_s, origin_s + LATEST_S)
+    contents = [string_message(text) for text in texts]
+    return Messages(topic, STRING, STRING_TEXT, stamps_ns(known_s, origin_s), contents)
+
+
 def stream_messages(
-    time_s: Array | Sequence[float], values: Array | Sequence[Sequence[float]], origin_s: float = 0.0
-) -> tuple[Array, list[bytes]]:
-    """Return the stamps (n,) in ns and the messages of samples of a stream.
+    topic: StreamTopic,
+    time_s: Array | Sequence[float],
+    values: Array | Sequence[Sequence[float]],
+    origin_s: float = 0.0,
+) -> Messages:
+    """Return samples of a stream as messages.
 
     Parameters
     ----------
+    topic : of the stream
     time_s : (n,) on the clock of the run
     values : (n, c) in the order of the topic's fields
     origin_s : time that is stamped 0
@@ -204,7 +241,66 @@ def stream_messages(
     records["frame_bytes"] = 1
     records["numbers"][:, 0], records["numbers"][:, 1:] = time_s, numbers
     packed, size = records.tobytes(), records.dtype.itemsize
-    return log_ns, [packed[start : start + size] for start in range(0, len(packed), size)]
+    contents = [packed[start : start + size] for start in range(0, len(packed), size)]
+    return Messages(topic.topic, topic.kind, topic.definition, log_ns, contents)
+
+
+def origin_of(run: RunLog) -> float:
+    """Return the time of a run that is stamped 0: 0, where stamps allow it.
+
+    Raises
+    ------
+    DataError
+        if the run is longer than stamps can tell apart, 68 years.
+    """
+    first_s = min(float(stream.time_s[0]) for stream in run.streams.values())
+    last_s = max(float(stream.time_s[-1]) for stream in run.streams.values())
+    if last_s - first_s > LATEST_S - 1:
+        raise DataError(
+            f"run {shown(run.run_id)} is {last_s - first_s:g} s long, stamps have {LATEST_S} s at most"
+        )
+    return 0.0 if first_s >= 0.0 and last_s <= LATEST_S else float(np.floor(first_s))
+
+
+def run_messages(run: RunLog, windows: Sequence[tuple[float, str]] = ()) -> Iterator[Messages]:
+    """Yield the topics of a run: its document, its labels, what was recorded with it, and its streams.
+
+    Parameters
+    ----------
+    run : with any streams
+    windows : time of the end and description of each window that was recorded with it
+
+    Raises
+    ------
+    DataError
+        as :func:`origin_of`.
+    """
+    origin_s = origin_of(run)
+    start_s = min(float(stream.time_s[0]) for stream in run.streams.values())
+    topics: dict[str, StreamTopic] = {}
+    for name, stream in run.streams.items():
+        topics[name] = stream_topic(name, stream.channels, [each.topic for each in topics.values()])
+    head = Head(run.run_id, run.robot, run.session, run.filter, run.source)
+    document = run_document(head, topics, run.labels, run.dropped)
+    yield text_messages(RUN_TOPIC, [start_s], [document], origin_s)
+    changes = _label_changes(run)
+    for topic, texts in ((LABEL_TOPIC, changes), (WINDOW_TOPIC, windows)):
+        if texts:
+            times_s, contents = zip(*texts, strict=True)
+            yield text_messages(topic, times_s, contents, origin_s)
+    for name, stream in run.streams.items():
+        values = np.column_stack([stream.channel(channel) for channel in topics[name].fields.values()])
+        yield stream_messages(topics[name], stream.time_s, values, origin_s)
+
+
+def _label_changes(run: RunLog) -> list[tuple[float, str]]:
+    """Return the terrains as they change; an empty one where no label holds."""
+    found: list[tuple[float, str]] = []
+    for label in sorted(run.labels):
+        if found and found[-1] == (label.start_s, ""):
+            found.pop()
+        found += [(label.start_s, label.terrain), (label.end_s, "")]
+    return found
 
 
 def stream_samples(place: str, topic: StreamTopic, messages: Sequence[bytes], faults: Faults) -> Array:

@@ -58,6 +58,9 @@ STANDARD_STREAMS: Map[str, str] = {"imu": "imu", "odometry": "odometry", "comman
 
 LABELS_TYPE = "std_msgs/String"
 
+DISTRO = "ROS2_HUMBLE"
+"""Release whose definitions are written, and taken for a bag that holds none and does not name its own."""
+
 _JOINT_UNITS: Map[str, str] = {"velocity": "rad/s", "position": "rad", "effort": "Nm"}
 _PATH = re.compile(r"[A-Za-z]\w*(\[\d+\])?(\.[A-Za-z]\w*(\[\d+\])?)*")
 

@@ -14,7 +14,7 @@ from terrain.measured_slip.rollers import RollerFindings, roller_findings, surfa
 from terrain.measured_slip.slips import MeasuredSlip, measured_slip
 from terrain.measured_slip.wheel_distance import DistanceBound, distance_bound
 from terrain.records import RunLog
-from terrain.robots import OmniRobot, Robot, as_drive, packaged_robot
+from terrain.robots import OmniRobot, Robot, as_drive, robot_named
 
 NO_ROLLERS = "robot {name}: drive {drive!r} has no rollers, only 'omni' has"
 
@@ -58,7 +58,7 @@ def one_robot(runs: Sequence[RunLog], given: Robot | None) -> Robot:
     names = sorted({run.robot for run in runs})
     if len(names) > 1:
         raise DataError(f"the runs are of the robots {', '.join(names)}: measure those of one at a time")
-    return given if given is not None and given.name == names[0] else packaged_robot(names[0])
+    return robot_named(names[0], given)
 
 
 def measure(

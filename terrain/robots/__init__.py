@@ -3,7 +3,14 @@
 from terrain.robots.bicycle import BicycleRobot
 from terrain.robots.omni import OmniRobot
 from terrain.robots.parts import Body, Camera, Equipment, Motors, Part, Sensors, Steering
-from terrain.robots.reader import description_file, load_robot, packaged_robot, read_description, robot_from
+from terrain.robots.reader import (
+    description_file,
+    load_robot,
+    packaged_robot,
+    read_description,
+    robot_from,
+    robot_named,
+)
 from terrain.robots.region import Region
 from terrain.robots.robot import Robot, as_drive
 from terrain.robots.skid_steer import SkidSteerRobot
@@ -31,4 +38,5 @@ __all__ = [
     "packaged_robot",
     "read_description",
     "robot_from",
+    "robot_named",
 ]

@@ -142,6 +142,17 @@ def packaged_robot(name: str) -> Robot:
     return load_robot(name)
 
 
+def robot_named(name: str, given: Robot | None) -> Robot:
+    """Return the robot that a log names: the one that is given, where it bears the name, else the package's.
+
+    Raises
+    ------
+    ConfigError
+        if the package has no robot of the name.
+    """
+    return given if given is not None and given.name == name else packaged_robot(name)
+
+
 def robot_from(file: str, described: Any) -> Robot:
     """Return the robot of a description's content; ``file`` is what messages call it.
 

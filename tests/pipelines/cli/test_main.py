@@ -337,12 +337,9 @@ def test_the_choices_of_the_command_line_are_those_that_there_are():
     """They are written twice, so that help need not load what offers them."""
     from typing import get_args
 
-    from pipelines.data.datasets import LAYOUTS
-    from pipelines.data.settings import Layout
     from pipelines.slip.modes import Filter, Tuning
     from terrain.estimation.estimate import FILTERS, TUNINGS
     from terrain.estimation.observers.choice import OBSERVERS
 
-    assert get_args(Layout) == LAYOUTS
     assert get_args(Filter) == (*FILTERS, *OBSERVERS, "pose")
     assert get_args(Tuning) == TUNINGS

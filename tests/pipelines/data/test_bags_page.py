@@ -3,7 +3,7 @@
 import re
 from pathlib import Path
 
-from pipelines.data.run_writers import outgoing_topics
+from pipelines.data.run_writers import messages_of_run
 from terrain.estimation.enriched import enriched
 from terrain.estimation.estimate import estimate_run
 from terrain.logs.topic_mapping import TYPES, load_mapping, short_type
@@ -25,7 +25,7 @@ def test_topics_of_the_page_are_those_of_an_export():
     page = PAGE.read_text(encoding="utf-8")
     robot = load_robot("agrimaro")
     run = enriched(estimate_run(simulate_run(robot, "grass", "starts", 1, duration_s=8.0), robot, "vio15"))
-    topics = {each.topic: each.kind for each in outgoing_topics(run)}
+    topics = {each.topic: each.kind for each in messages_of_run(run)}
     rows = [line for line in page.splitlines() if re.match(r"\| `/", line)]
     named = {topic for row in rows for topic in re.findall(r"`(/[\w/]+)`", row)} - {"/terrain/window"}
     assert named == {topic for topic in topics if not topic.startswith("/terrain/")} | {

@@ -1,6 +1,6 @@
 import numpy as np
 
-from pipelines.data.breaks import odd_stretches
+from features.breaks import odd_stretches
 from terrain.records import RunLog, Stream
 
 

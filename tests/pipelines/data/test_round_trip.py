@@ -19,8 +19,8 @@ from pipelines.data.convert import Settings
 from pipelines.data.convert import run as convert
 from pipelines.data.datasets import data_digest, load_runs
 from pipelines.data.mcap_file import McapWriter, RunRecorder
-from pipelines.data.recorded_windows import WINDOWS_FILE, windows_text
-from pipelines.data.run_writers import outgoing_topics, write_messages
+from pipelines.data.recorded_windows import WINDOWS_FILE, RecordedWindow, windows_text
+from pipelines.data.run_writers import messages_of_run, write
 from terrain.errors import ConfigError, DataError, LogError
 from terrain.estimation.enriched import enriched
 from terrain.estimation.estimate import estimate_run
@@ -185,7 +185,7 @@ def test_whatever_a_run_folder_keeps_a_bag_keeps(tmp_path_factory, run):
     except LogError:
         assume(False)  # names that no run folder accepts
     path = folder / "run.mcap"
-    write_messages(path, by_folder, [], "mcap")
+    write(path, by_folder, [], "mcap")
     (read,) = find_runs(path, None, None)
     by_bag = read(repair=False)
     assert data_digest([by_bag]) == data_digest([by_folder])
@@ -227,12 +227,12 @@ def test_an_export_whose_document_is_changed_is_refused(raw, tmp_path, old, new)
     run = load_runs(raw)[0]
     with (tmp_path / "changed.mcap").open("wb") as file:
         writer = McapWriter(file, {})
-        for topic, kind, definition, log_ns, messages in outgoing_topics(run):
-            for stamp_ns, message in zip(log_ns.tolist(), messages, strict=True):
-                if topic == "/terrain/run":
+        for topic in messages_of_run(run):
+            for stamp_ns, message in zip(topic.log_ns.tolist(), topic.contents, strict=True):
+                if topic.topic == "/terrain/run":
                     assert old in message[8:-1].decode()
                     message = string_message(message[8:-1].decode().replace(old, new, 1))
-                writer.write(topic, kind, definition, stamp_ns, message)
+                writer.write(topic, stamp_ns, message)
         writer.finish()
     with pytest.raises((LogError, ConfigError)) as raised:
         load_runs(tmp_path / "changed.mcap")
@@ -250,7 +250,7 @@ ENTRIES = [
 @pytest.mark.parametrize("target", TARGETS)
 def test_recorded_windows_go_with_their_run_out_and_in(raw, tmp_path, target):
     run = load_runs(raw)[0]
-    place = write_run(run, tmp_path / "raw", beside={WINDOWS_FILE: windows_text(ENTRIES)})
+    place = write_run(run, tmp_path / "raw", beside={WINDOWS_FILE: windows_text(RecordedWindow(**entry) for entry in ENTRIES)})
     result = exported(tmp_path / "raw", tmp_path / "out", target)
     assert result.topics["/terrain/window"] == 2
     convert(Settings(data=tmp_path / "out", out=tmp_path / "again"))

@@ -11,10 +11,11 @@ from hypothesis import strategies as st
 
 from pipelines.cli import main as cli
 from pipelines.data.labels import relabelled
-from pipelines.data.recorded_windows import WINDOWS_FILE, window_entry, windows_text
+from pipelines.data.recorded_windows import WINDOWS_FILE, windows_text
 from pipelines.learn.label import Settings, time_text
 from pipelines.learn.label import run as label
 from pipelines.live.classifying import WindowOutput
+from pipelines.live.recording import recorded
 from terrain.errors import ConfigError, LogError
 from terrain.files import atomic
 from terrain.logs.read import read_run
@@ -39,7 +40,7 @@ def folder(tmp_path, make_run):
         )
         for start_s, terrain, p in WINDOWS
     ]
-    windows = {WINDOWS_FILE: windows_text(window_entry(output) for output in outputs)}
+    windows = {WINDOWS_FILE: windows_text(recorded(output) for output in outputs)}
     write_run(make_run("SNOW_01"), tmp_path / "runs", beside=windows)
     write_run(make_run("SNOW_02"), tmp_path / "runs")
     return tmp_path / "runs"

@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 
 from features.windows import WindowRule
-from pipelines.data.regimes import driven_at
 from pipelines.learn.protocols import (
     N_FOLDS,
     PARTITION_S,
@@ -13,6 +12,7 @@ from pipelines.learn.protocols import (
 )
 from pipelines.learn.settings import PUBLISHED_WINDOW_S, EvaluationSettings
 from terrain.errors import ConfigError, DataError
+from terrain.logs.regimes import driven_at
 from terrain.records import Label, RunLog, Stream
 
 PUBLISHED_RULE = WindowRule(PUBLISHED_WINDOW_S)

@@ -7,13 +7,12 @@ import pytest
 
 from pipelines.data.convert import Settings as ConvertSettings
 from pipelines.data.convert import run as convert
-from pipelines.data.datasets import load_runs
+from pipelines.data.datasets import load_runs, verdict
 from pipelines.data.inspect import Settings as InspectSettings
 from pipelines.data.inspect import run as inspect_runs
-from pipelines.data.plausibility import doubt_sentences, doubts_of, verdict
 from terrain.errors import LogError
 from terrain.logs.checks import Level
-from terrain.logs.plausibility import judge, worst
+from terrain.logs.plausibility import doubt_sentences, doubts_of, judge, worst
 from terrain.logs.turn_checks import Scale
 from terrain.logs.write import write_run
 from terrain.records import RunLog, Stream

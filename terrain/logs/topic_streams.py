@@ -1,0 +1,378 @@
+"""Streams of the numbers in messages, as a mapping of their topics describes them."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from itertools import pairwise
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from terrain.errors import ConfigError, LogError
+from terrain.files.names import shown
+from terrain.logs.borealtc import whole_run_label
+from terrain.logs.faults import DAMAGED_MESSAGE, Faults, Topic
+from terrain.logs.message_numbers import Number, number_at, stamp_at
+from terrain.logs.parquet_file import MAX_VALUES
+from terrain.logs.samples import checked_stream, longest_rise
+from terrain.logs.schema import UNIT_OFFSETS, UNIT_SCALES, unit_of
+from terrain.logs.topic_mapping import (
+    LABELS_TYPE,
+    TYPES,
+    Channel,
+    StreamMapping,
+    by_radius,
+    described,
+    joint_unit,
+    short_type,
+)
+from terrain.logs.topic_mapping import Mapping as TopicMapping
+from terrain.records import Array, Label, Stream
+
+MAX_LABELS = 1_000_000
+"""Messages with terrains; ten a second are 28 hours."""
+
+LATEST_NS = 2**62
+"""Latest stamp that a message may have."""
+
+UNMATCHED = "messages without one of equal stamp on the other topics"
+
+Converted = tuple[tuple[str, ...], Array]
+"""Channels, and their values (n, c)."""
+
+
+class MessageKind(NamedTuple):
+    """A type of message that becomes channels of its own.
+
+    Parameters
+    ----------
+    paths : of its numbers
+    channels : from those (n, k) to channels
+    numbers : from a stream to those (n, k), None where the stream lacks channels; None where none is written
+    fixed : what else is written, by path
+    """
+
+    paths: tuple[str, ...]
+    channels: Callable[[Array], Converted]
+    numbers: Callable[[Stream], Array | None] | None = None
+    fixed: Mapping[str, Any] = MappingProxyType({})
+
+
+class MappedTopics:
+    """The topics of a mapping: takes their messages, each once, and gives the streams that they become.
+
+    Parameters
+    ----------
+    place : of the messages, as errors name it
+    mapping : of the topics
+    topics : that there are, by name
+    kinds : by type of message, those that become channels of their own
+    decoder : returns what makes an object of each message of a topic
+    wheel_radius_m : of the robot; None where unknown
+    faults : gets what is damaged
+
+    Raises
+    ------
+    LogError
+        if there is no such topic, or one of another type.
+    ConfigError
+        if speeds of wheels need a radius that is unknown.
+    """
+
+    def __init__(
+        self,
+        place: str,
+        mapping: TopicMapping,
+        topics: Mapping[str, Topic],
+        kinds: Mapping[str, MessageKind],
+        decoder: Callable[[Topic], Callable[[bytes], Any]],
+        wheel_radius_m: float | None,
+        faults: Faults,
+    ) -> None:
+        self._place, self._mapping, self._topics, self._kinds = place, mapping, topics, kinds
+        self._wheel_radius_m, self._faults = wheel_radius_m, faults
+        self._check()
+        self._of_topic: dict[str, _TopicNumbers] = {}
+        for stream in mapping.streams.values():
+            for topic, paths in self._paths(stream).items():
+                numbers = self._of_topic.get(topic)
+                if numbers is None:
+                    numbers = _TopicNumbers(place, topics[topic], decoder(topics[topic]), faults)
+                    self._of_topic[topic] = numbers
+                for path in paths:
+                    numbers.paths.setdefault(path, len(numbers.paths))
+        if mapping.labels:
+            labels = topics[mapping.labels]
+            self._of_topic.setdefault(labels.name, _TopicNumbers(place, labels, decoder(labels), faults))
+
+    @property
+    def names(self) -> frozenset[str]:
+        """Topics whose messages are taken."""
+        return frozenset(self._of_topic)
+
+    def take(self, topic: str, log_ns: int, content: bytes) -> None:
+        """Take a message of one of :attr:`names`, with its log time in ns."""
+        self._of_topic[topic].take(log_ns, content)
+
+    def streams(self, start_ns: int | None = None) -> tuple[int, dict[str, Stream]]:
+        """Return the stamp in ns at which the time of the streams begins, and the streams.
+
+        Parameters
+        ----------
+        start_ns : that stamp; the first one by default, when repairing of those in order
+
+        Raises
+        ------
+        LogError
+            if a topic has no message, topics of a stream have no stamp in common, stamps go back or repeat,
+            a channel has nothing finite, or there are fewer than two samples.
+        """
+        raw = {name: self._raw(name, stream) for name, stream in self._mapping.streams.items()}
+        repairs = self._faults.repairs
+        begin_ns = (
+            start_of([stamp_ns for stamp_ns, _ in raw.values()], repairs) if start_ns is None else start_ns
+        )
+        streams = {}
+        for name, (stamp_ns, (channels, values)) in raw.items():
+            at = f"{self._place}: stream {name}"
+            if stamp_ns.size > 1 and not np.any(stamp_ns):
+                raise LogError(f"{at}: all headers are stamped 0; take the log times (time: log)")
+            time_s = (stamp_ns - begin_ns) / 1e9
+            streams[name] = checked_stream(
+                at, time_s, values, channels, row_of=lambda sample: sample + 1, repairs=repairs
+            )
+        return begin_ns, streams
+
+    def labels(self, start_ns: int, streams: Mapping[str, Stream]) -> tuple[Label, ...]:
+        """Return the terrain intervals of the topic of labels."""
+        texts = self._of_topic[self._mapping.labels].texts
+        return label_intervals(sorted(texts, key=lambda each: each[0]), start_ns, streams)
+
+    def _check(self) -> None:
+        """Refuse topics that are not there or of another type, and speeds without a radius."""
+        topics, there = self._topics, described([*self._topics.values()])
+        for name, stream in self._mapping.streams.items():
+            at = f"{self._place}: stream {name}"
+            for topic in (stream.topic, *(channel.topic for channel in stream.channels.values())):
+                if topic and topic not in topics:
+                    raise LogError(f"{at}: there is no topic {shown(topic)} (there are {there})")
+            kind = topics[stream.topic].kind
+            if stream.kind != "fields" and short_type(kind) not in TYPES[stream.kind]:
+                raise LogError(
+                    f"{at}: topic {stream.topic} is of type {kind}, "
+                    f"kind {stream.kind!r} is {' or '.join(TYPES[stream.kind])} (there are {there})"
+                )
+            for channel, entry in stream.channels.items():
+                turns = stream.kind == "joints" and by_radius(entry, unit_of(channel))
+                if turns and stream.wheel_radius is None and self._wheel_radius_m is None:
+                    raise ConfigError(
+                        f"{at}: channel {channel} is the speed of a joint that turns: "
+                        f"'wheel_radius' is missing, and the robot has no description"
+                    )
+        labels = self._mapping.labels
+        if labels and labels not in topics:
+            raise LogError(f"{self._place}: labels: there is no topic {shown(labels)} (there are {there})")
+        if labels and short_type(topics[labels].kind) != LABELS_TYPE:
+            raise LogError(
+                f"{self._place}: labels: topic {labels} is of type {topics[labels].kind}, "
+                f"{LABELS_TYPE} is required"
+            )
+
+    def _paths(self, stream: StreamMapping) -> dict[str, list[tuple[str, str]]]:
+        """Return path and joint of each number of a stream, by topic."""
+        if stream.channels:
+            return {
+                topic: [(channel.field, channel.joint) for channel in channels.values()]
+                for topic, channels in _channels_by_topic(stream).items()
+            }
+        kind = self._kinds[short_type(self._topics[stream.topic].kind)]
+        return {stream.topic: [(path, "") for path in kind.paths]}
+
+    def _raw(self, name: str, stream: StreamMapping) -> tuple[Array, Converted]:
+        """Return the stamps (n,) in ns and the channels of a stream."""
+        by_header = (stream.time or self._mapping.time) == "header"
+        found = []
+        for topic, paths in self._paths(stream).items():
+            stamps, values = self._of_topic[topic].numbers(paths, by_header=by_header)
+            if not stamps.size:
+                what = " with any of the joints" if stream.kind == "joints" else ""
+                raise LogError(f"{self._place}: topic {shown(topic)} has no message{what}")
+            found.append((stamps, values))
+        stamp_ns, values = found[0] if len(found) == 1 else self._joined(name, stream, found)
+        if stream.channels:
+            return stamp_ns, (tuple(stream.channels), _in_si(stream, values, self._wheel_radius_m))
+        channels, values = self._kinds[short_type(self._topics[stream.topic].kind)].channels(values)
+        if not channels:
+            raise LogError(f"{self._place}: topic {shown(stream.topic)} states that it measures nothing")
+        return stamp_ns, (channels, values)
+
+    def _joined(
+        self, name: str, stream: StreamMapping, found: list[tuple[Array, Array]]
+    ) -> tuple[Array, Array]:
+        """Return the samples of several topics at stamps that all of them have, or at those of the first."""
+        orders = [np.argsort(stamps, kind="stable") for stamps, _ in found]
+        stamps = [each[order] for (each, _), order in zip(found, orders, strict=True)]
+        values = [each[order] for (_, each), order in zip(found, orders, strict=True)]
+        if stream.join == "previous":
+            others = [_previous(stamps[0], *other) for other in zip(stamps[1:], values[1:], strict=True)]
+            return stamps[0], np.concatenate([values[0], *others], axis=1)
+        common = stamps[0]
+        for each in stamps[1:]:
+            common = np.intersect1d(common, each)
+        n_lost = sum(each.size for each in stamps) - common.size * len(stamps)
+        if n_lost:
+            topics = " and ".join(shown(topic) for topic in _channels_by_topic(stream))
+            text = f"{name}: {n_lost} messages of {topics} lack one of equal stamp (join: previous)"
+            self._faults.found(self._place, UNMATCHED, text, n_lost)
+        if not common.size:
+            raise LogError(
+                f"{self._place}: stream {name}: no two stamps of its topics agree (join: previous)"
+            )
+        rows = [value[np.searchsorted(each, common)] for each, value in zip(stamps, values, strict=True)]
+        return common, np.concatenate(rows, axis=1)
+
+
+class _TopicNumbers:
+    """Collects the numbers of the messages of a topic, or their texts where no path is asked for.
+
+    ``paths`` has for each number its path and, where its array has a number a joint, the joint's name; an
+    entry of ``rows`` has them in that order.
+    """
+
+    def __init__(self, place: str, topic: Topic, decode: Callable[[bytes], Any], faults: Faults) -> None:
+        self.topic, self.paths = topic, dict[tuple[str, str], int]()
+        self.log_ns, self.stamp_ns = list[int](), list[int]()
+        self.rows, self.texts = list[list[float]](), list[tuple[int, str]]()
+        self._place, self._decode, self._faults = place, decode, faults
+        self._numbers: list[Number] | None = None
+        self._stamp: tuple[Number, Number] | None = None
+
+    def take(self, log_ns: int, content: bytes) -> None:
+        try:
+            message = self._decode(content)
+        except Exception as error:  # whatever a library makes of damaged bytes
+            self._damaged(error)
+            return
+        if not self.paths:
+            self.texts.append((log_ns, str(message.data)))
+            self._bounded(len(self.texts), MAX_LABELS, "messages")
+            return
+        if self._numbers is None:
+            about = (self.topic.name, short_type(self.topic.kind), message)
+            self._numbers = [number_at(*about, *path) for path in self.paths]
+            self._stamp = stamp_at(*about)
+        try:
+            row = [float(number(message)) for number in self._numbers]
+            seconds, rest = (0, log_ns) if self._stamp is None else (get(message) for get in self._stamp)
+            stamp_ns = int(seconds) * 10**9 + int(rest)
+            if abs(stamp_ns) > LATEST_NS:
+                raise ValueError("a stamp is beyond what clocks show")
+        except (ValueError, TypeError, AttributeError, OverflowError) as error:
+            self._damaged(error)
+            return
+        self.rows.append(row)
+        self.stamp_ns.append(stamp_ns)
+        self.log_ns.append(log_ns)
+        self._bounded(len(self.rows) * len(self.paths), MAX_VALUES, "values")
+
+    def _bounded(self, n: int, most: int, what: str) -> None:
+        if n > most:
+            raise LogError(f"{self._place}: topic {shown(self.topic.name)} has more than {most} {what}")
+
+    def _damaged(self, error: Exception) -> None:
+        text = f"topic {shown(self.topic.name)} has a message that is not as defined ({str(error)[:120]})"
+        self._faults.found(self._place, DAMAGED_MESSAGE, text)
+
+    def numbers(self, paths: Sequence[tuple[str, str]], *, by_header: bool) -> tuple[Array, Array]:
+        """Return stamps (n,) in ns, and numbers (n, k) of some paths, in the order of log times."""
+        order = np.argsort(np.array(self.log_ns, dtype=np.int64), kind="stable")
+        stamp_ns = np.array(self.stamp_ns if by_header else self.log_ns, dtype=np.int64)
+        values = np.array(self.rows, dtype=np.float64).reshape(len(order), len(self.paths))
+        values = values[order][:, [self.paths[path] for path in paths]]
+        kept: Array = np.ones(len(order), dtype=bool)
+        if any(joint for _, joint in paths):  # a robot may send its joints in several messages
+            kept = np.asarray(np.isfinite(values).any(axis=1))
+        return stamp_ns[order][kept], values[kept]
+
+
+def _channels_by_topic(stream: StreamMapping) -> dict[str, dict[str, Channel]]:
+    """Return the channels of a stream by their topic, those of the stream's own first."""
+    found: dict[str, dict[str, Channel]] = {stream.topic: {}}
+    for name, channel in stream.channels.items():
+        found.setdefault(channel.topic or stream.topic, {})[name] = channel
+    return {topic: channels for topic, channels in found.items() if channels}
+
+
+def _in_si(stream: StreamMapping, values: Array, wheel_radius_m: float | None) -> Array:
+    """Return the channels (n, c) of numbers (n, c) that are in the order of their topics."""
+    if stream.wheel_radius is not None:
+        wheel_radius_m = stream.wheel_radius.value * UNIT_SCALES[stream.wheel_radius.unit][1]
+    names = [name for channels in _channels_by_topic(stream).values() for name in channels]
+    columns = []
+    for name, channel in stream.channels.items():
+        desired = unit_of(name)
+        unit = joint_unit(channel) if stream.kind == "joints" else channel.unit
+        factor = 1.0 if desired == "code" else UNIT_SCALES[unit][1]
+        if stream.kind == "joints" and by_radius(channel, desired):
+            factor *= wheel_radius_m or np.nan
+        with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is judged later
+            scaled = (values[:, names.index(name)] * channel.scale + channel.offset) * factor
+            columns.append(scaled + UNIT_OFFSETS.get(unit, 0.0))
+    return np.column_stack(columns)
+
+
+def _previous(at_ns: Array, stamp_ns: Array, values: Array) -> Array:
+    """Return the last values (m, k) by each of some instants; NaN before the first.
+
+    Examples
+    --------
+    >>> _previous(np.array([1, 5]), np.array([3, 4]), np.array([[1.0], [2.0]])).tolist()
+    [[nan], [2.0]]
+    """
+    last = np.searchsorted(stamp_ns, at_ns, side="right") - 1
+    return np.where((last >= 0)[:, None], values[np.maximum(last, 0)], np.nan)
+
+
+def start_of(stamps: list[Array], repairs: Counter[str] | None) -> int:
+    """Return the stamp in ns at which a run begins: the first one; when repairing, of those in order.
+
+    Examples
+    --------
+    >>> start_of([np.array([50, 40, 60])], None), start_of([np.array([0, 40, 50, 60])], Counter())
+    (40, 0)
+    """
+    if repairs is None:
+        return min(int(each.min()) for each in stamps)
+    return min(int(each[longest_rise(each)[0]]) for each in stamps)
+
+
+def label_intervals(
+    texts: Sequence[tuple[int, str]], start_ns: int, streams: Mapping[str, Stream]
+) -> tuple[Label, ...]:
+    """Return the terrain intervals of a run from the terrains as they change.
+
+    Parameters
+    ----------
+    texts : log time in ns and terrain, in order; an empty text ends a terrain
+    start_ns : of the run
+    streams : of the run; the last terrain lasts until their end
+
+    Examples
+    --------
+    >>> imu = Stream([0.0, 1.0, 2.0], [[0.0]] * 3, ("gyro_z_radps",))
+    >>> label_intervals([(10**9, "ICE"), (10**9 + 5 * 10**8, "ICE"), (2 * 10**9, "")], 0, {"imu": imu})
+    (Label(start_s=1.0, end_s=2.0, terrain='ICE'),)
+    """
+    end_s = whole_run_label(dict(streams), "all").end_s
+    changes = [((log_ns - start_ns) / 1e9, terrain.strip()) for log_ns, terrain in texts]
+    labels: list[Label] = []
+    for (begin_s, terrain), (stop_s, _) in pairwise([*changes, (end_s, "")]):
+        stop_s = min(stop_s, end_s)
+        if not terrain or stop_s <= begin_s:
+            continue
+        if labels and labels[-1].terrain == terrain and labels[-1].end_s == begin_s:
+            begin_s = labels.pop().start_s
+        labels.append(Label(begin_s, stop_s, terrain))
+    return tuple(labels)
