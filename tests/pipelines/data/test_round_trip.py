@@ -250,7 +250,11 @@ ENTRIES = [
 @pytest.mark.parametrize("target", TARGETS)
 def test_recorded_windows_go_with_their_run_out_and_in(raw, tmp_path, target):
     run = load_runs(raw)[0]
-    place = write_run(run, tmp_path / "raw", beside={WINDOWS_FILE: windows_text(RecordedWindow(**entry) for entry in ENTRIES)})
+    place = write_run(
+        run,
+        tmp_path / "raw",
+        beside={WINDOWS_FILE: windows_text(RecordedWindow(**entry) for entry in ENTRIES)},
+    )
     result = exported(tmp_path / "raw", tmp_path / "out", target)
     assert result.topics["/terrain/window"] == 2
     convert(Settings(data=tmp_path / "out", out=tmp_path / "again"))
