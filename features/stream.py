@@ -6,19 +6,25 @@ stream reaches its end, which is the moment from which a log would hold it too.
 
 A live chain does not stop for a bad sample: what cannot be used is dropped, counted and named, and a
 stream that stops costs windows and no memory.
+
+:class:`WindowFeed` takes readings as a robot's sensors give them, and the estimates of its filter.
 """
 
 from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
 from features.windows import TIME_TOLERANCE_S, Layout, WindowRule, cut_at, wheel_speeds
-from terrain.errors import ConfigError
-from terrain.records import Array, Stream, Windows
+from terrain.errors import ConfigError, DataError
+from terrain.estimation.live.choice import Estimate, estimated_values
+from terrain.estimation.live.clocks import readable
+from terrain.kinematics.wheel_speed import wheel_speeds_from
+from terrain.records import Array, Reading, Stream, Windows
+from terrain.robots import Robot
 
 PATIENCE_S = 5.0
 """A stream that lags further behind the others has stopped: longer than a logger takes to write its buffer,
@@ -296,3 +302,116 @@ class WindowStream:
             self.dropped_samples[stream, "faster than its rate"] += enough - n
             n = enough
         buffer.forget(n)
+
+
+class WindowFeed:
+    """Cut windows from the readings of sensors and the estimates of a filter.
+
+    The windows are those that :func:`~features.windows.cut_windows` cuts from the log with wheel speeds
+    (:func:`terrain.kinematics.wheel_speed.with_wheel_speeds`) and estimates
+    (:func:`terrain.estimation.enriched.enriched`).
+
+    Parameters
+    ----------
+    rule, layout : of the windows
+    channels : of each stream that is measured, in the order of the columns of its readings
+    estimated : of each stream that a filter adds (:func:`terrain.estimation.live.choice.estimated_channels`)
+    robot : corrected; may be missing where every channel of the windows is measured
+
+    Attributes
+    ----------
+    unreadable : number of readings that were no arrays of the right shape, by stream
+
+    Raises
+    ------
+    DataError
+        if a channel of the windows is neither measured nor estimated.
+
+    Examples
+    --------
+    >>> layout = Layout({"imu": ("gyro_z_radps",)}, {"imu": 10.0})
+    >>> feed = WindowFeed(WindowRule(1.0, steady=None), layout, {"imu": ("accel_x_mps2", "gyro_z_radps")})
+    >>> time_s = np.arange(12) / 10
+    >>> window, = feed.push({"imu": Reading(time_s, np.column_stack([time_s, -time_s]))})
+    >>> float(window.values["imu"][0, 0, -1])
+    -0.9
+    """
+
+    def __init__(
+        self,
+        rule: WindowRule,
+        layout: Layout,
+        channels: Mapping[str, Sequence[str]],
+        estimated: Mapping[str, Sequence[str]] | None = None,
+        robot: Robot | None = None,
+    ) -> None:
+        self.unreadable: Counter[str] = Counter()
+        self._stream = WindowStream(rule, layout)
+        self._measured: dict[str, tuple[int, Callable[[Array], Array]]] = {}
+        self._estimated: dict[str, list[int]] = {}
+        added = estimated or {}
+        for stream, needed in layout.channels.items():
+            if stream in channels:
+                measured = list(channels[stream])
+                self._measured[stream] = len(measured), _columns(stream, needed, measured, robot)
+            elif stream in added:
+                self._estimated[stream] = _places(stream, needed, added[stream])
+            else:
+                raise _lacks(needed[0], stream, [*channels, *added])
+
+    @property
+    def dropped(self) -> dict[str, int]:
+        """Windows and samples that were not used, as counts by kind."""
+        counts = {f"window: {reason}": n for reason, n in self._stream.dropped.items()}
+        counts |= {f"{name}: {why}": n for (name, why), n in self._stream.dropped_samples.items()}
+        return counts | {f"{name}: unreadable": n for name, n in self.unreadable.items()}
+
+    @property
+    def due_s(self) -> float:
+        """No sample before this time can finish a window; minus infinity before all streams have begun."""
+        return self._stream.due_s
+
+    def push(self, readings: Mapping[str, Reading], estimates: Sequence[Estimate] = ()) -> list[Windows]:
+        """Take what was measured and estimated since the last call; return the windows it completes."""
+        windows: list[Windows] = []
+        push = self._stream.push
+        for stream, (n_columns, columns) in self._measured.items():
+            if stream not in readings:
+                continue
+            reading = readable(readings[stream])
+            if reading is None or not reading.time_s.size or reading.values.shape[1] != n_columns:
+                self.unreadable[stream] += 1
+                continue
+            for time_s, values in zip(reading.time_s.tolist(), columns(reading.values), strict=True):
+                windows += push(stream, time_s, values)
+        for estimate in estimates:
+            for stream, places in self._estimated.items():
+                windows += push(stream, estimate.time_s, estimated_values(stream, estimate)[places])
+        return windows
+
+
+def _columns(
+    stream: str, needed: Sequence[str], measured: list[str], robot: Robot | None
+) -> Callable[[Array], Array]:
+    """Return what takes the channels of a window out of the columns that are measured."""
+    found = wheel_speeds_from(measured, robot) if stream == "wheels" and robot is not None else None
+    if found is None:
+        places = _places(stream, needed, measured)
+        return lambda values: values[:, places]
+    channels, with_speeds = found
+    places = _places(stream, needed, channels)
+    return lambda values: with_speeds(values)[:, places]
+
+
+def _places(stream: str, needed: Sequence[str], known: Sequence[str]) -> list[int]:
+    for channel in needed:
+        if channel not in known:
+            raise _lacks(channel, stream, known)
+    return [known.index(channel) for channel in needed]
+
+
+def _lacks(channel: str, stream: str, known: Sequence[str]) -> DataError:
+    return DataError(
+        f"the model requires {channel!r} of the stream {stream!r}, which is neither measured nor estimated "
+        f"here (there are {', '.join(known) or 'no streams'})"
+    )

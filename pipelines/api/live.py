@@ -7,8 +7,8 @@ from typing import Any
 from pipelines.learn.classifier import TerrainClassifier
 from pipelines.live import observer
 from pipelines.live.model import LiveModel
-from pipelines.live.samples import replay
 from terrain.control.slip_table import SlipTable
+from terrain.logs.replay import replay
 from terrain.robots import Robot
 
 __all__ = ["Observer", "replay"]

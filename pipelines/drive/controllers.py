@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 from pipelines.learn.model_file import TerrainModel
 from pipelines.live.pilot import LivePilot
-from pipelines.live.terrain_source import Classifier, KnownTerrain, NoTerrain, TerrainSource
+from pipelines.live.terrain_source import Classifier, KnownTerrain, TerrainSource
 from pipelines.report import Progress, silent
 from terrain.control.controllers import Controller, Source
 from terrain.control.situations import Situation, simulate_situation
@@ -58,7 +58,7 @@ def drive_once(inputs: DriveInputs, controller: Controller, situation: Situation
 
 def _terrain_source(controller: Controller, model: TerrainModel | None, robot: Robot) -> TerrainSource:
     if controller.source is Source.NONE:
-        return NoTerrain()
+        return TerrainSource()
     if controller.source is Source.TRUTH:
         return KnownTerrain()
     if controller.source is Source.KNOWN:

@@ -382,8 +382,8 @@ def filtered_terrains(windows: Windows, assessed: Assessed, model: TerrainModel)
     """
     import numpy as np
 
-    from pipelines.live.over_time import filter_of, novelty_evidence
-    from terrain.classify.terrain_filter import filter_run, reported
+    from pipelines.live.over_time import filter_of
+    from terrain.classify.terrain_filter import filter_run, novelty_evidence, reported
 
     classes = np.asarray(model.recipe.classes_, dtype=str)
     settings = filter_of(model.info)

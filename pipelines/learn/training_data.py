@@ -18,8 +18,8 @@ from pipelines.learn.model_file import ModelInfo, TerrainModel, model_info
 from pipelines.learn.protocols import Samples, samples_of
 from pipelines.learn.recipes import WindowPipeline, feature_matrix, recipe_of
 from pipelines.learn.settings import RecipeSettings
-from pipelines.live.windows import ESTIMATED
 from terrain.errors import DataError
+from terrain.estimation.live.choice import ESTIMATED
 from terrain.records import Array, RunLog
 
 SAME_RATE = 1e-6

@@ -1,8 +1,8 @@
-"""The live chain: what takes the samples of a robot step by step, whatever its parts are.
+"""The live chain: what takes the samples of a robot step by step, with what it has in common for all robots.
 
 A service, a replay and a robot's own program run one :class:`Chain`.  There are two: the
 :class:`~pipelines.live.observer.Observer` of any robot with a model, which gives terrain and target slip, and
-the :class:`PilotChain` here of a robot that is driven, which gives commands, too.
+the :class:`~pipelines.live.pilot.LivePilot` of a robot that is driven, which gives commands, too.
 """
 
 from __future__ import annotations
@@ -10,24 +10,26 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from enum import StrEnum
-from functools import partial
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
-import numpy as np
-
-from pipelines.live.classifying import AtOnce, WindowOutput
+from pipelines.live.classifying import WindowOutput
 from pipelines.live.model import LiveModel
-from pipelines.live.pilot import LivePilot
-from pipelines.live.state import LiveState, Restorable
-from pipelines.live.terrain_source import Classifier, NoTerrain
-from pipelines.live.windows import Estimate
-from terrain.control.pilot_settings import DEFAULT_SETTINGS, PilotSettings, check_table
+from pipelines.live.state import Bias, LiveState, Restorable, restorable
+from pipelines.live.terrain_source import TerrainSource
+from terrain.control.pilot_settings import check_table
 from terrain.control.slip_table import SlipTable
-from terrain.control.switching import TerrainBelief
-from terrain.control.traction import TractionStatus
-from terrain.estimation.live.estimator import CHANNELS
-from terrain.records import Array, Command, Reading, Sample
-from terrain.robots import Robot
+from terrain.control.switching import (
+    NO_BELIEF,
+    OutputStatus,
+    SwitchSettings,
+    TerrainBelief,
+    output_status,
+    update,
+)
+from terrain.estimation.ekf.resident import BIASES, ResidentFilter
+from terrain.estimation.live.choice import Estimate, Filter
+from terrain.estimation.live.clocks import Clocks, ClockWatch
+from terrain.records import Command, Sample
 
 
 class CommandStatus(StrEnum):
@@ -56,170 +58,128 @@ class Step(NamedTuple):
     failure: str = ""
 
 
-class Chain(Protocol):
+class Chain:
     """Takes samples in order of time, and does not raise.
-
-    ``belief`` is the terrain that is believed, ``target_ratio`` its target slip in traction, ``estimate`` the
-    last one of the motion, ``health`` that of each sensor by name (empty where none is judged), ``dropped``
-    what was not used so far, as counts by kind.
-    """
-
-    name: str
-
-    @property
-    def belief(self) -> TerrainBelief: ...  # noqa: D102
-    @property
-    def target_ratio(self) -> float: ...  # noqa: D102
-    @property
-    def estimate(self) -> Estimate | None: ...  # noqa: D102
-    @property
-    def health(self) -> Mapping[str, str]: ...  # noqa: D102
-    @property
-    def dropped(self) -> dict[str, int]: ...  # noqa: D102
-
-    def take(self, sample: Sample) -> Step:
-        """Take a sample."""
-
-    def check(self, model: LiveModel | None, table: SlipTable) -> None:
-        """Raise what :meth:`replace` would: ``ConfigError`` or ``DataError``."""
-
-    def replace(self, model: LiveModel | None, table: SlipTable) -> None:
-        """Go on with another model and table, between two samples."""
-
-    def state(self, now_s: float) -> LiveState:
-        """Return what is worth keeping over a restart, at a time in seconds since 1970."""
-
-    def restore(self, state: LiveState, now_s: float) -> Restorable:
-        """Start from a saved state, before the first sample; return what of it is used."""
-
-
-class PilotChain(LivePilot):
-    """A pilot that takes its columns by name, begins where the steering stands, and is safe where it fails.
 
     Parameters
     ----------
-    robot : a swerve robot with all sections
-    model : that classifies; without one the terrain stays unknown
+    robot_name : whose samples; empty for a robot without a description
     table : of target slips
-    channels : of each stream, in the order of the columns of its samples; what the pilot takes and is not
-        among them is unknown
-    classifying : where windows are classified; at once by default
-    settings : of the pilot
+    switching : when an output of the source is accepted as the terrain
+    clocks : of what arrives
+
+    Attributes
+    ----------
+    belief : the terrain that is believed
+    estimate : the last one of the motion; None before the first, and where none is made
+    source : of the terrain
 
     Raises
     ------
     ConfigError
-        as :class:`~pipelines.live.pilot.LivePilot`.
-    DataError
-        if the model does not suit the robot.
+        if the table is another robot's.
     """
 
-    name = "pilot"
+    name = ""
+    source: TerrainSource
+    _filter: Filter | None = None
 
     def __init__(
-        self,
-        robot: Robot,
-        model: LiveModel | None,
-        table: SlipTable,
-        channels: Mapping[str, Sequence[str]],
-        classifying: AtOnce | None = None,
-        settings: PilotSettings = DEFAULT_SETTINGS,
+        self, robot_name: str, table: SlipTable, switching: SwitchSettings, clocks: Clocks | ClockWatch
     ) -> None:
-        self._make = partial(Classifier, robot=robot, classifying=classifying)
-        self.terrain_source = NoTerrain() if model is None else self._make(model)
-        super().__init__(robot, table, self.terrain_source, settings)
-        self._columns = schema_columns(channels)
-        self._standing_rad = np.zeros(3)
-        self._awaits_steering = "steering" in channels
+        self.robot_name, self.switching, self._clocks = robot_name, switching, clocks
+        self.belief: TerrainBelief = NO_BELIEF
+        self.estimate: Estimate | None = None
+        self._target_ratio = math.nan
+        self._take_table(table)
+
+    def _take_table(self, table: SlipTable) -> None:
+        self._check_table(table)
+        self.table = table
+
+    def _check_table(self, table: SlipTable) -> None:
+        if self.robot_name:
+            check_table(table, self.robot_name)
+
+    @property
+    def target_ratio(self) -> float:
+        """Target slip in traction of the terrain that is believed."""
+        return self.table.lookup(self.belief.terrain)["traction"].slip_ratio
+
+    @property
+    def health(self) -> Mapping[str, str]:
+        """Health of each sensor by name; empty where none is judged."""
+        return {}
 
     @property
     def dropped(self) -> dict[str, int]:
-        """What was not used so far, as counts by kind."""
-        return super().dropped | dict(self.terrain_source.dropped)
+        """What was not used so far, and how often a clock was set, as counts by stream and kind."""
+        filtered = {} if self._filter is None else self._filter.dropped
+        return {**self._clocks.counts, **filtered, **self.source.dropped}
+
+    def take(self, sample: Sample) -> Step:
+        """Take a sample."""
+        raise NotImplementedError
 
     def check(self, model: LiveModel | None, table: SlipTable) -> None:
         """Raise what :meth:`replace` would."""
-        check_table(table, self.robot_name)
-        if isinstance(self.terrain_source, Classifier):
-            self.terrain_source.check(model)
+        self._check_table(table)
+        self.source.check(model)
 
     def replace(self, model: LiveModel | None, table: SlipTable) -> None:
-        """Go on with another model and table, between two steps; no sample is lost.
+        """Go on with another model and table, between two samples: none is lost, and the filter runs on.
+
+        Where both models take the same windows, the one that is being cut is the first of the new model;
+        otherwise its windows begin with the next sample.
 
         Raises
         ------
-        ConfigError, DataError
-            as when the chain begins, or if a model is to be replaced by none.
+        ConfigError
+            if the table is another robot's.
+        DataError
+            if the model needs a channel that is neither measured nor estimated, another filter, or is none.
         """
         self.check(model, table)
-        if isinstance(self.terrain_source, Classifier):
-            self.terrain_source.swap(model)
-        elif model is not None:
-            self.terrain_source = self._make(model)
-        self.swap(table, self.terrain_source)
+        self.source.swap(model)
+        self._take_table(table)
 
-    def take(self, sample: Sample) -> Step:
-        """Return the command for a sample: to stand, where nothing is known yet or the step fails."""
-        if math.isnan(sample.time_s) or not self._is_steered(sample.readings):
-            return Step((), self._standing(), CommandStatus.NO_SAMPLES)
-        readings = {
-            name: reading._replace(values=ordered(reading.values, *self._columns[name]))
-            for name, reading in sample.readings.items()
-            if name in self._columns
+    def _believe(self, sample: Sample, estimates: Sequence[Estimate]) -> OutputStatus:
+        """Update the belief by what the source finds in a sample; return what its last output was."""
+        n_refused, status, switching = self.source.n_refused, OutputStatus.NONE, self.switching
+        if self.source.settled:
+            switching = switching._replace(dwell_s=0.0, probability_least=0.0)
+        for found in self.source.update(sample, estimates):
+            self.belief = update(self.belief, *found, switching)
+            status = output_status(found.terrain, found.probability, switching)
+        return OutputStatus.REFUSED if self.source.n_refused > n_refused else status
+
+    def state(self, now_s: float) -> LiveState:
+        """Return what is worth keeping over a restart, at a time in seconds since 1970."""
+        resident, name = self._kept_filter
+        known = {} if resident is None else resident.known(BIASES)
+        biases = {
+            state: Bias(mean, std)
+            for state, (mean, std) in known.items()
+            if math.isfinite(mean + std) and std > 0.0
         }
-        try:
-            command = self.step(sample._replace(readings=readings))
-        except Exception as error:  # a robot without a command would go on with its last one
-            failure = f"a step failed: {type(error).__name__}: {error}"
-            return Step((), self._standing(), CommandStatus.FAILED, failure)
-        windows, status = self.terrain_source.outputs, CommandStatus.OK
-        numbers = (*command.wheel_radps.tolist(), *command.steer_rad.tolist(), *command.twist.tolist())
-        if not all(map(math.isfinite, numbers)):
-            command, status = self._standing()._replace(status=command.status), CommandStatus.NOT_FINITE
-        self._standing_rad = command.steer_rad
-        return Step(windows, command, status)
+        believed = self.belief.terrain, self.belief.probability
+        return LiveState(self.robot_name, name, now_s, biases, *believed, self._target_ratio)
 
-    def _is_steered(self, readings: Mapping[str, Reading]) -> bool:
-        """Begin with the steering where it stands; return whether that is known, where it is measured."""
-        if not self._awaits_steering:
-            return True
-        reading = readings.get("steering")
-        if reading is None or not len(reading.values):
-            return False
-        measured_rad = ordered(reading.values, *self._columns["steering"])[-1]
-        if not np.isfinite(measured_rad).all():
-            return False
-        self._standing_rad = self.start_steering(measured_rad)
-        self._awaits_steering = False
-        return True
+    def restore(self, state: LiveState, now_s: float) -> Restorable:
+        """Start from a saved state, before the first sample; return what of it is used.
 
-    def _standing(self) -> Command:
-        """Return the command to stand, steered as before."""
-        status = {"status_code": float(TractionStatus.UNSOUND)}
-        return Command(np.zeros(3), self._standing_rad, np.zeros(3), status)
+        Raises
+        ------
+        DataError
+            if the filter has run already.
+        """
+        resident, name = self._kept_filter
+        fresh = restorable(state, self.robot_name, name, now_s)
+        if resident is not None:
+            resident.begin_from(fresh.biases, fresh.age_s)
+        self.belief, self._target_ratio = fresh.belief, fresh.target_ratio
+        return fresh
 
-
-def schema_columns(channels: Mapping[str, Sequence[str]]) -> dict[str, tuple[list[int], list[int], int]]:
-    """Return which columns of each stream go where in the order of the schema, and how many that has."""
-    found = {}
-    for stream, names in CHANNELS.items():
-        if stream in channels:
-            places = [names.index(name) for name in channels[stream] if name in names]
-            kept = [i for i, name in enumerate(channels[stream]) if name in names]
-            found[stream] = kept, places, len(names)
-    return found
-
-
-def ordered(values: Array, kept: list[int], places: list[int], n_columns: int) -> Array:
-    """Return columns in the order of the schema, NaN where a channel is not sent.
-
-    Examples
-    --------
-    >>> ordered(np.array([[1.0, 2.0]]), [1], [0], 2).tolist()
-    [[2.0, nan]]
-    """
-    if places == list(range(n_columns)) and kept == places and values.shape[1] == n_columns:
-        return values
-    found = np.full((len(values), n_columns), math.nan)
-    found[:, places] = values[:, kept]
-    return found
+    @property
+    def _kept_filter(self) -> tuple[ResidentFilter | None, str]:
+        return (None, "") if self._filter is None else (self._filter.resident, self._filter.name)

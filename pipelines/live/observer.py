@@ -7,32 +7,25 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from pipelines.live.arrivals import ClockWatch, last_stamp_s
-from pipelines.live.chain import Step
-from pipelines.live.classifying import AtOnce, WindowOutput
+from pipelines.live.chain import Chain, Step
+from pipelines.live.classifying import ClassifierThread, WindowOutput
 from pipelines.live.model import LiveModel
-from pipelines.live.state import LiveState, Restorable, restorable, state_of
 from pipelines.live.terrain_source import Classifier
-from pipelines.live.windows import Estimate, live_estimator
-from terrain.control.pilot_settings import check_table
+from pipelines.live.windows import live_estimator
 from terrain.control.slip_table import SlipTable, load_slip_table
-from terrain.control.switching import (
-    NO_BELIEF,
-    SWITCHING,
-    SwitchSettings,
-    TerrainBelief,
-    check_switching,
-    drive_on,
-    update,
-)
+from terrain.control.switching import SWITCHING, SwitchSettings, TerrainBelief, check_switching, drive_on
+from terrain.estimation.live.choice import Estimate
+from terrain.estimation.live.clocks import ClockWatch, last_stamp_s
 from terrain.records import Reading, Sample
 from terrain.robots import Robot
 
 LONGEST_STEP_S = 1.0
 """A longer time between two samples of the wheels is no driving time."""
 
+_NO_TWIST = np.zeros(3)
 
-class Observer:
+
+class Observer(Chain):
     """The terrain under a robot and its target slips, from its samples.
 
     Parameters
@@ -42,8 +35,8 @@ class Observer:
     robot : its description; needed where the model uses what a filter estimates, or wheel speeds that are
         computed from motor rates
     channels : of each stream, in the order of the columns of its samples; by default those that the first
-        samples name (:func:`pipelines.live.samples.replay`), or those of the model
-    classifying : where windows are classified; at once by default
+        samples name (:func:`terrain.logs.replay.replay`), or those of the model
+    thread : that classifies windows; at once by default
     switching : when a class is accepted as the terrain (:attr:`belief`)
 
     Raises
@@ -61,8 +54,8 @@ class Observer:
     """
 
     name = "observer"
-    health: Mapping[str, str] = {}
-    """No sensor is judged one by one."""
+    source: Classifier
+    _clocks: ClockWatch
 
     def __init__(
         self,
@@ -71,21 +64,16 @@ class Observer:
         robot: Robot | None = None,
         channels: Mapping[str, Sequence[str]] | None = None,
         *,
-        classifying: AtOnce | None = None,
+        thread: ClassifierThread | None = None,
         switching: SwitchSettings = SWITCHING,
     ) -> None:
-        self.table = load_slip_table() if table is None else table
-        if robot is not None:
-            check_table(self.table, robot.name)
         check_switching(switching)
-        self.switching, self._robot, self._given_classifying = switching, robot, classifying
-        self._robot_name = "" if robot is None else robot.name
+        table = load_slip_table() if table is None else table
+        super().__init__("" if robot is None else robot.name, table, switching, ClockWatch())
+        self._robot, self._thread = robot, thread
         self._takes_names = channels is None
         self._set_up(model, channels or model.info.channels)
-        self._latest: Estimate | None = None
         self._speed_mps, self._speed_s, self._now_s = math.inf, -math.inf, math.nan
-        self._watch = ClockWatch()
-        self.belief: TerrainBelief = NO_BELIEF
 
     def _set_up(self, model: LiveModel, channels: Mapping[str, Sequence[str]]) -> None:
         """Take samples with these columns from now on."""
@@ -93,80 +81,21 @@ class Observer:
         self._filter, corrected = None, self._robot
         if self._robot is not None:
             self._filter, corrected = live_estimator(model.info, self._robot, self.channels)
-        self._filter_name = "" if self._filter is None else self._filter.name
-        self._source = Classifier(
-            model, self._robot, self._given_classifying, self.channels, self._filter_name
-        )
+        name = "" if self._filter is None else self._filter.name
+        self.source = Classifier(model, self._robot, self._thread, self.channels, name)
         self._speed_columns, self._mps_per_unit = _speeds(self.channels.get("wheels", ()), corrected)
 
     @property
     def model(self) -> LiveModel:
         """The model that classifies."""
-        return self._source.model
-
-    @property
-    def estimate(self) -> Estimate | None:
-        """Last estimate of the motion; None before the first, and where the model needs none."""
-        return self._latest
-
-    @property
-    def target_ratio(self) -> float:
-        """Target slip in traction of the terrain that is believed."""
-        return self.table.lookup(self.belief.terrain)["traction"].slip_ratio
-
-    @property
-    def dropped(self) -> dict[str, int]:
-        """What was not used so far, as counts by kind."""
-        counts = dict(self._source.dropped) | ({"time: clock set": n} if (n := self._watch.n_set) else {})
-        return counts | (dict(self._filter.dropped) if self._filter is not None else {})
-
-    def check(self, model: LiveModel | None, table: SlipTable) -> None:
-        """Raise what :meth:`replace` would."""
-        if self._robot is not None:
-            check_table(table, self._robot_name)
-        self._source.check(model)
-
-    def replace(self, model: LiveModel | None, table: SlipTable) -> None:
-        """Go on with another model and table, between two samples; the filter runs on.
-
-        Where both take the same windows, the one that is being cut is the first of the new model; otherwise
-        its windows begin with the next sample.
-
-        Raises
-        ------
-        DataError
-            if the model needs a channel that is neither measured nor estimated, another filter, or is none.
-        ConfigError
-            if the table is another robot's.
-        """
-        self.check(model, table)
-        self._source.swap(model)
-        self.table = table
-
-    def state(self, now_s: float) -> LiveState:
-        """Return what is worth keeping over a restart, at a time in seconds since 1970."""
-        resident = None if self._filter is None else self._filter.resident
-        return state_of(self._robot_name, self._filter_name, resident, self.belief, math.nan, now_s)
-
-    def restore(self, state: LiveState, now_s: float) -> Restorable:
-        """Start from a saved state; return what of it is used.
-
-        Raises
-        ------
-        DataError
-            if the filter has run already.
-        """
-        fresh = restorable(state, self._robot_name, self._filter_name, now_s)
-        if self._filter is not None and self._filter.resident is not None:
-            self._filter.resident.begin_from(fresh.biases, fresh.age_s)
-        self.belief = fresh.belief
-        return fresh
+        assert self.source.model is not None
+        return self.source.model
 
     def take(self, sample: Sample) -> Step:
         """Take a sample, as a chain does: no command is given."""
         return Step(self.update(sample.readings, sample.time_s))
 
-    def update(self, samples: Mapping[str, Reading], now_s: float = math.nan) -> list[WindowOutput]:
+    def update(self, samples: Mapping[str, Reading], now_s: float = math.nan) -> Sequence[WindowOutput]:
         """Take what was measured since the last call; return the windows that are whole, in most calls none.
 
         Where the clock of the stamps was set, windows begin anew.
@@ -187,21 +116,16 @@ class Observer:
         if self._filter is not None:
             estimates = self._filter.step(samples)
             if estimates:
-                self._latest = estimates[-1]
-        if self._watch.was_set(samples):
+                self.estimate = estimates[-1]
+        if self._clocks.was_set(samples):
             self._begin_again()
-        outputs = self._source.take(samples, estimates)
         self._drive_on(samples, now_s)
-        for output in outputs:
-            found = self._source.terrain_of(output)
-            if found is not None:
-                switching = self._source.switching(self.switching)
-                self.belief = update(self.belief, output.end_s, *found, switching)
-        return outputs
+        self._believe(Sample(now_s, _NO_TWIST, samples), estimates)
+        return self.source.outputs
 
     def _begin_again(self) -> None:
         """Cut windows from here on; what was believed stays, and its outputs begin anew."""
-        self._source.restart()
+        self.source.restart()
         self.belief = TerrainBelief(self.belief.terrain, self.belief.probability)
         self._speed_s, self._now_s = -math.inf, math.nan
 

@@ -1,4 +1,4 @@
-"""The whole chain from samples to wheel commands; :meth:`LivePilot.step` runs when a sample arrives.
+"""The chain of a robot that is driven, from samples to wheel commands.
 
 ::
 
@@ -11,14 +11,13 @@ same object.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from operator import itemgetter
 
 import numpy as np
 
-from pipelines.live.over_time import without_dwell
-from pipelines.live.state import LiveState, Restorable, restorable, state_of
-from pipelines.live.terrain_source import NoTerrain, TerrainSource
+from pipelines.live.chain import Chain, CommandStatus, Step
+from pipelines.live.terrain_source import TerrainSource
 from terrain.constants import GRAVITY_MPS2
 from terrain.control.actuation import Actuation
 from terrain.control.aims import Aims
@@ -35,19 +34,10 @@ from terrain.control.pilot_settings import (
     PilotSettings,
     PilotStatus,
     check_pilot,
-    check_table,
     wheel_controller,
 )
 from terrain.control.slip_table import SlipTable, load_slip_table
-from terrain.control.switching import (
-    NO_BELIEF,
-    OutputStatus,
-    TerrainBelief,
-    approach,
-    drive_on,
-    output_status,
-    update,
-)
+from terrain.control.switching import OutputStatus, approach, drive_on
 from terrain.control.tracking_settings import check_tracking
 from terrain.control.traction import TractionStatus
 from terrain.control.traction_settings import TractionTarget
@@ -62,7 +52,7 @@ from terrain.control.wheel_controllers import (
 from terrain.entry_point import entry_point
 from terrain.estimation.live.clocks import Clocks, numbers
 from terrain.estimation.live.estimate import LiveEstimate
-from terrain.estimation.live.estimator import LiveEstimator
+from terrain.estimation.live.estimator import CHANNELS, LiveEstimator
 from terrain.estimation.live.health import SENSORS, SLIP_SENSORS, SOUND, Health
 from terrain.extension import correct_live
 from terrain.kinematics.swerve import FAR_RAD, wheel_command_step
@@ -85,21 +75,7 @@ _NOT_ESTIMATED = UNOBSERVED._replace(stale_s=math.nan)
 _NOT_TRACKED = TrackReport(math.nan, math.nan, 0.0, TrackStatus.NO_POSE)
 
 
-@dataclass(slots=True)
-class _Memory:
-    """State of a pilot between two steps."""
-
-    steer_rad: Array
-    tracking: Array
-    time_s: float = math.nan
-    belief: TerrainBelief = NO_BELIEF
-    output: OutputStatus = OutputStatus.NONE
-    target_ratio: float = math.nan
-    estimate: LiveEstimate | None = None
-    tilt_rad: tuple[float, float] = (0.0, 0.0)
-
-
-class LivePilot:
+class LivePilot(Chain):
     """Drive a robot along its desired twists.
 
     Parameters
@@ -109,6 +85,8 @@ class LivePilot:
     source : of the current terrain; without one it stays unknown
     settings : controller and its settings
     steer_rad : (3,) last command of the steering
+    channels : of each stream, in the order of the columns of the samples that :meth:`take` is given; what is
+        not among them is unknown.  Where the steering is measured, :meth:`take` begins with it where it stands
 
     Raises
     ------
@@ -126,6 +104,11 @@ class LivePilot:
     (array([0.1, 0.1, 0.1]), True)
     """
 
+    name = "pilot"
+    estimate: LiveEstimate | None
+    _filter: LiveEstimator | None
+    _clocks: Clocks
+
     def __init__(
         self,
         robot: Robot,
@@ -133,12 +116,13 @@ class LivePilot:
         source: TerrainSource | None = None,
         settings: PilotSettings = DEFAULT_SETTINGS,
         steer_rad: Array | None = None,
+        channels: Mapping[str, Sequence[str]] = CHANNELS,
     ) -> None:
         table = load_slip_table() if table is None else table
         driven, correction = correct_live(check_pilot(robot, table, settings))
-        self.robot_name = robot.name
+        super().__init__(robot.name, table, settings.switching, Clocks())
+        self.source = TerrainSource() if source is None else source
         self._settings, self._radius_m = settings, driven.wheel_radius_m
-        self.swap(table, NoTerrain() if source is None else source)
         self._steering_zeros_rad = np.array(driven.steering_zeros_rad)
         self._positions_m = np.array(driven.wheel_positions_m)
         self._limits = (
@@ -147,21 +131,28 @@ class LivePilot:
             driven.equipment.steering.rate_max_radps,
         )
         self._controller = wheel_controller(driven, settings)
-        self._estimator: LiveEstimator | None = None
         if settings.controller not in OPEN_LOOP:
-            self._estimator = LiveEstimator(driven, correction=correction)
-            states = self._estimator.states
+            self._filter = LiveEstimator(driven, correction=correction)
+            states = self._filter.states
             self._steer_states = np.array([states.index(f"steer_{i}_rad") for i in driven.wheels])
             self._observer = WheelObserver(driven, self._steer_states)
             if settings.track:
-                self._tracking = check_tracking(driven, settings.tracking, settings.delay_s)
+                self._tracking_settings = check_tracking(driven, settings.tracking, settings.delay_s)
             pose = ("position_x_m", "position_y_m", "yaw_rad")
             self._pose_states = [states.index(state) for state in pose]
-        self._clocks = Clocks()
         self._actuation = Actuation(driven.wheel_radius_m / driven.equipment.motors.reduction_ratio)
         self._health = [0] * len(SENSORS)
-        steer = np.zeros(3) if steer_rad is None else np.array(steer_rad, dtype=np.float64)
-        self._now = _Memory(steer, initial_tracking())
+        self._columns = schema_columns(channels)
+        self._awaits_steering = "steering" in channels
+        # what a step leaves to the next
+        self._steer_rad = np.zeros(3) if steer_rad is None else np.array(steer_rad, dtype=np.float64)
+        self._standing_rad = self._steer_rad  # of the last command that was finite
+        self._time_s, self._tilt_rad, self._tracking = math.nan, (0.0, 0.0), initial_tracking()
+
+    def _take_table(self, table: SlipTable) -> None:
+        super()._take_table(table)
+        self._aims = Aims(table)
+        self._terrains = {terrain: index for index, terrain in enumerate(table.targets)}
 
     @property
     def terrains(self) -> tuple[str, ...]:
@@ -169,58 +160,59 @@ class LivePilot:
         return tuple(self._terrains)
 
     @property
-    def belief(self) -> TerrainBelief:
-        """The terrain that is believed."""
-        return self._now.belief
-
-    @property
     def target_ratio(self) -> float:
         """Target slip in traction that is aimed for; NaN before the first step."""
-        return self._now.target_ratio
-
-    @property
-    def estimate(self) -> LiveEstimate | None:
-        """Last estimate of the motion; None before the first, and of controllers that use none."""
-        return self._now.estimate
+        return self._target_ratio
 
     @property
     def health(self) -> dict[str, str]:
         """Health of each sensor at the last step, by name, as those of ``Health`` in small letters."""
         return {name: Health(status).name.lower() for name, status in zip(SENSORS, self._health, strict=True)}
 
-    @property
-    def dropped(self) -> dict[str, int]:
-        """What was not taken so far, and how often a clock was set, as counts by stream and kind."""
-        return self._clocks.counts | ({} if self._estimator is None else self._estimator.dropped)
-
-    def state(self, now_s: float) -> LiveState:
-        """Return what is worth keeping over a restart, at a time in seconds since 1970."""
-        resident = None if self._estimator is None else self._estimator.resident
-        name = "" if self._estimator is None else self._estimator.model.name
-        return state_of(self.robot_name, name, resident, self._now.belief, self._now.target_ratio, now_s)
-
-    def restore(self, state: LiveState, now_s: float) -> Restorable:
-        """Start from a saved state at a time in seconds since 1970; return what of it is used.
-
-        A pilot that has estimated already raises ``DataError``.
-        """
-        name = "" if self._estimator is None else self._estimator.model.name
-        fresh = restorable(state, self.robot_name, name, now_s)
-        if self._estimator is not None:
-            self._estimator.resident.begin_from(fresh.biases, fresh.age_s)
-        self._now.belief, self._now.target_ratio = fresh.belief, fresh.target_ratio
-        return fresh
-
     def start_steering(self, measured_rad: Array) -> Array:
         """Take measured angles (3,), zeros not subtracted, for the last command, before a step; return it."""
-        self._now.steer_rad = measured_rad - self._steering_zeros_rad
-        return self._now.steer_rad
+        self._steer_rad = measured_rad - self._steering_zeros_rad
+        return self._steer_rad
 
-    def swap(self, table: SlipTable, source: TerrainSource) -> None:
-        """Go on with another table (``ConfigError`` if another robot's) and source, between two steps."""
-        check_table(table, self.robot_name)
-        self._aims, self._source = Aims(table), source
-        self._terrains = {terrain: index for index, terrain in enumerate(table.targets)}
+    def take(self, sample: Sample) -> Step:
+        """Return the command for a sample: to stand, where nothing is known yet or the step fails."""
+        if math.isnan(sample.time_s) or not self._is_steered(sample.readings):
+            return Step((), self._standing(), CommandStatus.NO_SAMPLES)
+        readings = {
+            name: reading._replace(values=ordered(reading.values, *self._columns[name]))
+            for name, reading in sample.readings.items()
+            if name in self._columns
+        }
+        try:
+            command = self.step(sample._replace(readings=readings))
+        except Exception as error:  # a robot without a command would go on with its last one
+            failure = f"a step failed: {type(error).__name__}: {error}"
+            return Step((), self._standing(), CommandStatus.FAILED, failure)
+        windows, status = self.source.outputs, CommandStatus.OK
+        numbers = (*command.wheel_radps.tolist(), *command.steer_rad.tolist(), *command.twist.tolist())
+        if not all(map(math.isfinite, numbers)):
+            command, status = self._standing()._replace(status=command.status), CommandStatus.NOT_FINITE
+        self._standing_rad = command.steer_rad
+        return Step(windows, command, status)
+
+    def _is_steered(self, readings: Mapping[str, Reading]) -> bool:
+        """Begin with the steering where it stands; return whether that is known, where it is measured."""
+        if not self._awaits_steering:
+            return True
+        reading = readings.get("steering")
+        if reading is None or not len(reading.values):
+            return False
+        measured_rad = ordered(reading.values, *self._columns["steering"])[-1]
+        if not np.isfinite(measured_rad).all():
+            return False
+        self._standing_rad = self.start_steering(measured_rad)
+        self._awaits_steering = False
+        return True
+
+    def _standing(self) -> Command:
+        """Return the command to stand, steered as before."""
+        status = {"status_code": float(TractionStatus.UNSOUND)}
+        return Command(np.zeros(3), self._standing_rad, np.zeros(3), status)
 
     def step(self, sample: Sample) -> Command:
         """Return the wheels' commands for a sample; whatever arrives, it does not raise.
@@ -234,34 +226,35 @@ class LivePilot:
         Command
             its ``status`` has the fields of :class:`PilotStatus`
         """
-        now, before_s = self._now, self._now.time_s
         time_s, readings = self._clocks.step(
             getattr(sample, "time_s", None), getattr(sample, "readings", None)
         )
-        dt_s = PERIOD_S if math.isnan(before_s) else time_s - before_s
-        now.time_s = time_s
+        dt_s = PERIOD_S if math.isnan(self._time_s) else time_s - self._time_s
+        self._time_s = time_s
         step_s = step_or_period(dt_s)
         terrain = getattr(sample, "terrain", "")
         desired = finite_twist(getattr(sample, "twist", None))
-        if self._estimator is not None and self._settings.follows:
+        if self._filter is not None and self._settings.follows:
             self._compare(time_s, step_s, readings)
-        self._estimate(Sample(time_s, desired, readings, terrain if isinstance(terrain, str) else ""))
+        output = self._estimate(
+            Sample(time_s, desired, readings, terrain if isinstance(terrain, str) else "")
+        )
         sensor, health = self._judge()
         target = self._target(step_s)
         twist, tracked = self._track(desired, time_s, dt_s)
-        admitted, wheel_radps, now.steer_rad = _wheel_command_step(
-            self._positions_m, *self._limits, step_s, FAR_RAD, twist, now.steer_rad
+        admitted, wheel_radps, self._steer_rad = _wheel_command_step(
+            self._positions_m, *self._limits, step_s, FAR_RAD, twist, self._steer_rad
         )
         desired_mps = max(map(abs, wheel_radps.tolist())) * self._radius_m
-        if not self._source.certain:
-            now.belief = drive_on(now.belief, desired_mps, step_s, self._settings.switching)
-        observed = _NOT_ESTIMATED if self._estimator is None else self._observer.observe(now.estimate, time_s)
+        if not self.source.certain:
+            self.belief = drive_on(self.belief, desired_mps, step_s, self.switching)
+        observed = _NOT_ESTIMATED if self._filter is None else self._observer.observe(self.estimate, time_s)
         sound = health <= _SOUND
         request = WheelRequest(
             wheel_radps,
             desired_mps,
             target,
-            self._aims[now.belief.terrain].entry,
+            self._aims[self.belief.terrain].entry,
             observed if sound else UNOBSERVED,
             dt_s,
         )
@@ -269,12 +262,12 @@ class LivePilot:
         status = done.status
         if not sound and status != TractionStatus.BAD_TIME:
             status = TractionStatus.UNSOUND
-        self._actuation.commanded(command_radps * self._radius_m, now.steer_rad)
+        self._actuation.commanded(command_radps * self._radius_m, self._steer_rad)
         figures = (
             float(status),
-            float(self._terrains.get(now.belief.terrain, -1)),
-            now.belief.probability,
-            now.target_ratio,
+            float(self._terrains.get(self.belief.terrain, -1)),
+            self.belief.probability,
+            self._target_ratio,
             done.aimed_ratio,
             done.balance_ratio,
             done.slip_ratio if sound else largest_slip(observed.wheels.slip_ratio, wheel_radps),
@@ -288,45 +281,33 @@ class LivePilot:
             float(tracked.status),
             float(sensor),
             float(health),
-            float(now.output),
+            float(output),
         )
         scale = done.driven_mps / desired_mps if desired_mps > 0.0 else 0.0
         return Command(
-            command_radps, now.steer_rad, admitted * scale, dict(zip(_FIGURES, figures, strict=True))
+            command_radps, self._steer_rad, admitted * scale, dict(zip(_FIGURES, figures, strict=True))
         )
 
-    def _estimate(self, sample: Sample) -> None:
-        """Update the motion, the tilt, and the current terrain."""
-        if self._estimator is None:
-            return
-        now = self._now
-        estimates = self._estimator.step(sample.readings, sample.time_s)
-        now.estimate = self._estimator.at(sample.time_s)
+    def _estimate(self, sample: Sample) -> OutputStatus:
+        """Update the motion, the tilt, and the current terrain; return what the output of its source was."""
+        if self._filter is None:
+            return OutputStatus.NONE
+        estimates = self._filter.step(sample.readings, sample.time_s)
+        self.estimate = self._filter.at(sample.time_s)
         imu = sample.readings.get("imu")
         if imu is not None and imu.values.shape[1] == len(IMU_CHANNELS) and len(imu.values):
             roll, pitch = float(imu.values[-1, _ROLL]), float(imu.values[-1, _PITCH])
             if math.isfinite(roll) and math.isfinite(pitch):
-                now.tilt_rad = roll, pitch
-        before, n_refused, now.output = now.belief.terrain, self._source.n_refused, OutputStatus.NONE
-        switching = self._settings.switching
-        if self._source.settled:
-            switching = without_dwell(switching)
-        for found in self._source.update(sample, estimates):
-            if self._source.certain:
-                now.belief = TerrainBelief(
-                    found.terrain, found.probability, found.terrain, found.time_s, found.time_s
-                )
-            else:
-                now.belief = update(now.belief, found.time_s, found.terrain, found.probability, switching)
-            now.output = output_status(found.terrain, found.probability, switching)
-        if self._source.n_refused > n_refused:
-            now.output = OutputStatus.REFUSED
-        if now.belief.terrain != before:
+                self._tilt_rad = roll, pitch
+        before = self.belief.terrain
+        output = self._believe(sample, estimates)
+        if self.belief.terrain != before:
             self._controller.forget_terrain()
+        return output
 
     def _compare(self, time_s: float, step_s: float, readings: dict[str, Reading]) -> None:
         """Compare wheels and steering with their commands; take away rates that are not to be believed."""
-        wheels, seen = readings.get("wheels"), self._now.estimate
+        wheels, seen = readings.get("wheels"), self.estimate
         if wheels is not None and (not len(wheels.values) or wheels.values.shape[1] != len(WHEELS_CHANNELS)):
             wheels = None
         steer_rad = None if seen is None else seen.mean[self._steer_states]
@@ -339,8 +320,8 @@ class LivePilot:
 
     def _judge(self) -> tuple[int, int]:
         """Update the health of the sensors; return the place of the least sound, or -1, and its health."""
-        seen = self._now.estimate
-        if self._estimator is None:
+        seen = self.estimate
+        if self._filter is None:
             return -1, Health.FRESH
         if seen is None:
             self._health = [_LOST] * len(SENSORS)
@@ -359,20 +340,17 @@ class LivePilot:
 
     def _target(self, dt_s: float) -> TractionTarget:
         """Return the slips to aim for; the target moves to that of the terrain at a bounded rate."""
-        now = self._now
-        aim = self._aims[now.belief.terrain]
-        now.target_ratio = approach(
-            now.target_ratio, aim.slip_ratio, self._settings.switching.rate_ratio, dt_s
-        )
+        aim = self._aims[self.belief.terrain]
+        self._target_ratio = approach(self._target_ratio, aim.slip_ratio, self.switching.rate_ratio, dt_s)
         braking = aim.braking
         if braking is None:
-            return TractionTarget(now.target_ratio, margin_ratio=aim.margin_ratio)
-        mps2 = max(braking.mps2 + uphill_mps2(now.estimate, *now.tilt_rad), 0.0)
-        return TractionTarget(now.target_ratio, braking.slip_ratio, mps2, aim.margin_ratio)
+            return TractionTarget(self._target_ratio, margin_ratio=aim.margin_ratio)
+        mps2 = max(braking.mps2 + uphill_mps2(self.estimate, *self._tilt_rad), 0.0)
+        return TractionTarget(self._target_ratio, braking.slip_ratio, mps2, aim.margin_ratio)
 
     def _track(self, twist: Array, time_s: float, dt_s: float) -> tuple[Array, TrackReport]:
         """Return the twist that keeps the path, and how far the robot is from it."""
-        now, seen = self._now, self._now.estimate
+        seen = self.estimate
         if not self._settings.track or seen is None:
             return twist, _NOT_TRACKED
         x, y, yaw = self._pose_states
@@ -382,10 +360,36 @@ class LivePilot:
             float(mean[x]), float(mean[y]), float(mean[yaw]), yaw_std_rad, estimate_age(seen, time_s)
         )
         ground_twist = np.array([seen.speed_x_mps, seen.speed_y_mps, seen.yaw_rate_radps])
-        twist, now.tracking, report = track_step(
-            self._tracking, now.tracking, twist, pose, ground_twist, dt_s
+        twist, self._tracking, report = track_step(
+            self._tracking_settings, self._tracking, twist, pose, ground_twist, dt_s
         )
         return twist, report
+
+
+def schema_columns(channels: Mapping[str, Sequence[str]]) -> dict[str, tuple[list[int], list[int], int]]:
+    """Return which columns of each stream go where in the order of the schema, and how many that has."""
+    found = {}
+    for stream, names in CHANNELS.items():
+        if stream in channels:
+            places = [names.index(name) for name in channels[stream] if name in names]
+            kept = [i for i, name in enumerate(channels[stream]) if name in names]
+            found[stream] = kept, places, len(names)
+    return found
+
+
+def ordered(values: Array, kept: list[int], places: list[int], n_columns: int) -> Array:
+    """Return columns in the order of the schema, NaN where a channel is not sent.
+
+    Examples
+    --------
+    >>> ordered(np.array([[1.0, 2.0]]), [1], [0], 2).tolist()
+    [[2.0, nan]]
+    """
+    if places == list(range(n_columns)) and kept == places and values.shape[1] == n_columns:
+        return values
+    found = np.full((len(values), n_columns), math.nan)
+    found[:, places] = values[:, kept]
+    return found
 
 
 def pose_is_sound(health: list[int]) -> bool:

@@ -14,17 +14,20 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipelines.live.arrivals import Inbox, SessionClock, StreamHealth, as_numbers
-from pipelines.live.chain import Chain, CommandStatus, PilotChain
-from pipelines.live.classifying import AtOnce, WindowOutput
+from pipelines.live.arrivals import Inbox, StreamHealth, as_numbers
+from pipelines.live.chain import Chain, CommandStatus
+from pipelines.live.classifying import ClassifierThread, WindowOutput
 from pipelines.live.model import LiveModel
 from pipelines.live.observer import Observer
+from pipelines.live.pilot import LivePilot
 from pipelines.live.recording import SessionRecorder
 from pipelines.live.state import LiveState, Restorable
+from pipelines.live.terrain_source import Classifier
 from terrain.control.pilot_settings import PilotSettings
 from terrain.control.slip_table import SlipTable
 from terrain.control.switching import TerrainBelief
 from terrain.errors import ConfigError, DataError
+from terrain.estimation.live.clocks import SessionClock
 from terrain.estimation.live.estimate import LiveEstimate
 from terrain.estimation.live.skid_live import LiveSkidEstimate
 from terrain.records import Array, Command, Sample, SlipTarget
@@ -134,7 +137,7 @@ class RobotSession:
     request : of the robot
     served : model and table
     robot : its description; None for a robot that has none
-    classifying : where its windows are classified
+    thread : that classifies its windows; at once without one
 
     Attributes
     ----------
@@ -152,11 +155,15 @@ class RobotSession:
     """
 
     def __init__(
-        self, request: SessionRequest, served: Served, robot: Robot | None, classifying: AtOnce
+        self,
+        request: SessionRequest,
+        served: Served,
+        robot: Robot | None,
+        thread: ClassifierThread | None = None,
     ) -> None:
         self.request, self.served = request, served
         self.inbox = Inbox({stream: len(names) for stream, names in request.channels.items()})
-        self.chain = _chain(request, served, robot, classifying)
+        self.chain = _chain(request, served, robot, thread)
         self._wheels = () if robot is None else robot.wheels
         self._streams = StreamHealth(request.channels)
         self._clock = SessionClock()
@@ -335,13 +342,15 @@ _NOT_DECIDED = (CommandStatus.NO_SAMPLES, CommandStatus.FAILED)
 """Statuses of commands that no controller has decided on: they are not recorded."""
 
 
-def _chain(request: SessionRequest, served: Served, robot: Robot | None, classifying: AtOnce) -> Chain:
+def _chain(
+    request: SessionRequest, served: Served, robot: Robot | None, thread: ClassifierThread | None
+) -> Chain:
     """Return what the samples of a robot go through."""
     if not request.control:
         if served.model is None:
             raise DataError("no model is served: only a robot that asks for commands can be served")
-        return Observer(served.model, served.table, robot, request.channels, classifying=classifying)
+        return Observer(served.model, served.table, robot, request.channels, thread=thread)
     if robot is None:
         raise ConfigError(f"robot {request.robot!r} has no description here: commands cannot be given to it")
-    settings = PilotSettings(follows=request.follows)
-    return PilotChain(robot, served.model, served.table, request.channels, classifying, settings)
+    settings, source = PilotSettings(follows=request.follows), Classifier(served.model, robot, thread)
+    return LivePilot(robot, served.table, source, settings, channels=request.channels)

@@ -27,7 +27,6 @@ from pydantic.dataclasses import dataclass
 
 from terrain.control.switching import NO_BELIEF, UNKNOWN, TerrainBelief
 from terrain.errors import DataError
-from terrain.estimation.ekf.resident import BIASES, ResidentFilter
 from terrain.files.atomic import atomic_write
 
 BIASES_FRESH_S = 600.0
@@ -126,32 +125,6 @@ def restorable(state: LiveState, robot: str, filter_name: str, now_s: float) -> 
         state.target_ratio if fresh_belief else math.nan,
         max(age_s, 0.0),
     )
-
-
-def state_of(
-    robot: str,
-    filter_name: str,
-    resident: ResidentFilter | None,
-    belief: TerrainBelief,
-    target_ratio: float,
-    now_s: float,
-) -> LiveState:
-    """Return what is to be saved of a live chain.
-
-    Parameters
-    ----------
-    robot, filter_name : whose
-    resident : its filter; None where it has none
-    belief, target_ratio : of the terrain
-    now_s : seconds since 1970
-    """
-    known = {} if resident is None else resident.known(BIASES)
-    biases = {
-        name: Bias(mean, std)
-        for name, (mean, std) in known.items()
-        if math.isfinite(mean + std) and std > 0.0
-    }
-    return LiveState(robot, filter_name, now_s, biases, belief.terrain, belief.probability, target_ratio)
 
 
 class _Document(BaseModel):

@@ -19,10 +19,10 @@ import numpy as np
 from pipelines.data.can_codec import Frame, Layout, encode
 from pipelines.data.can_logs import Receiver
 from pipelines.data.can_signals import RECEIVED, channels_of
-from pipelines.live.arrivals import SessionClock
 from terrain.angles import wrapped
 from terrain.control.wheel_controllers import step_or_period
 from terrain.entry_point import entry_point
+from terrain.estimation.live.clocks import SessionClock
 from terrain.kinematics.swerve import FAR_RAD, wheel_command_step
 from terrain.records import Array, Command, Reading, Sample
 from terrain.robots import SwerveRobot

@@ -349,7 +349,7 @@ def _pilot(settings: Settings, robot: Any) -> MakeStep:
         from pipelines.live.terrain_source import Classifier
 
         model = filtered(load_model(settings.model), settings.filter_stride_s)
-        source = Classifier(model, robot, ClassifierThread().robot())
+        source = Classifier(model, robot, ClassifierThread())
     pilot_settings = PilotSettings(controller=settings.controller)
 
     def make(steer_rad: Array) -> Step:

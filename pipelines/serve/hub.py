@@ -175,7 +175,7 @@ class Hub:
 
     def _begin(self, hello: Hello) -> tuple[RobotSession, Restorable | None]:
         robot = self.robot(hello.robot)
-        chain = RobotSession(hello.request, self.served, robot, self._thread.robot())
+        chain = RobotSession(hello.request, self.served, robot, self._thread)
         if hello.record and self._recording is not None:
             folder, writer = self._recording
             wheels = robot.wheels if robot is not None and hello.control else ()

@@ -224,8 +224,9 @@ def chain_of(run: RunLog, model: LiveModel | None, table: SlipTable, robot: Robo
     DataError
         if the run lacks what the model or the pilot needs.
     """
-    from pipelines.live.chain import PilotChain
     from pipelines.live.observer import Observer
+    from pipelines.live.pilot import LivePilot
+    from pipelines.live.terrain_source import Classifier
     from pipelines.live.windows import needs_filter
     from terrain.control.pilot_settings import PilotSettings
     from terrain.errors import ConfigError, DataError
@@ -252,7 +253,7 @@ def chain_of(run: RunLog, model: LiveModel | None, table: SlipTable, robot: Robo
                     f"run {run.run_id}: stream {name} has no channel {lacking[0]!r} for the pilot"
                 )
         settings = PilotSettings(follows=False)  # another controller drove when the log was written
-        return PilotChain(described, model, table, channels, settings=settings)
+        return LivePilot(described, table, Classifier(model, described), settings, channels=channels)
     if model is None:
         raise ConfigError(f"run {run.run_id}: robot {run.robot!r} has no pilot: give a model with --model")
     try:

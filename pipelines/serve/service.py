@@ -19,7 +19,7 @@ import uvicorn
 
 from pipelines.learn.load import load_model
 from pipelines.learn.model_file import TerrainModel
-from pipelines.live.classifying import AtOnce, classify_window
+from pipelines.live.classifying import classify_window
 from pipelines.live.over_time import filtered
 from pipelines.live.pilot import LivePilot
 from pipelines.live.session import Served
@@ -224,7 +224,7 @@ def warm_up(model: TerrainModel, robot: Robot | None) -> None:
     if robot is None or robot.drive != "swerve":
         return
     try:
-        pilot = LivePilot(robot, source=Classifier(model, robot, AtOnce()))
+        pilot = LivePilot(robot, source=Classifier(model, robot))
     except (ConfigError, DataError):
         return
     for k in range(WARM_STEPS):

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from terrain.records import RunLog, Stream
+from terrain.records import Array, RunLog, Stream
 from terrain.robots import Robot
 
 
@@ -34,17 +35,38 @@ def with_wheel_speeds(run: RunLog, robot: Robot) -> RunLog:
     array([1., 1.])
     """
     wheels = run.streams.get("wheels")
-    motors = [f"motor_{wheel}_radps" for wheel in robot.wheels]
-    wheel_speeds = tuple(f"speed_{wheel}_mps" for wheel in robot.wheels)
-    if wheels is None or not set(motors) <= set(wheels.channels):
+    found = None if wheels is None else wheel_speeds_from(wheels.channels, robot)
+    if wheels is None or found is None:
         return run
-    rate = np.column_stack([wheels.channel(channel) for channel in motors])
-    wheel_speed = rate / robot.motors.reduction_ratio * robot.wheel_radius_m
-    streams = dict(run.streams)
-    kept = [i for i, channel in enumerate(wheels.channels) if channel not in wheel_speeds]
-    streams["wheels"] = Stream(
-        wheels.time_s,
-        np.hstack([wheels.values[:, kept], wheel_speed]),
-        (*(wheels.channels[i] for i in kept), *wheel_speeds),
+    channels, compute = found
+    return replace(
+        run, streams=dict(run.streams) | {"wheels": Stream(wheels.time_s, compute(wheels.values), channels)}
     )
-    return replace(run, streams=streams)
+
+
+def wheel_speeds_from(
+    channels: Sequence[str], robot: Robot
+) -> tuple[tuple[str, ...], Callable[[Array], Array]] | None:
+    """Return the channels of wheels with their speeds, and what computes these values (n, c) of those measured.
+
+    Parameters
+    ----------
+    channels : that are measured
+    robot : gives reduction ratio and nominal wheel radius
+
+    Returns
+    -------
+    None where there are no motor rates.  Speeds that are measured are left out, and come from the rates.
+    """
+    motors = [f"motor_{wheel}_radps" for wheel in robot.wheels]
+    if not motors or not set(motors) <= set(channels):
+        return None
+    speeds = tuple(f"speed_{wheel}_mps" for wheel in robot.wheels)
+    at = [channels.index(motor) for motor in motors]
+    kept = [i for i, channel in enumerate(channels) if channel not in speeds]
+    ratio, radius_m = robot.motors.reduction_ratio, robot.wheel_radius_m
+
+    def with_speeds(values: Array) -> Array:
+        return np.hstack([values[:, kept], values[:, at] / ratio * radius_m])
+
+    return (*(channels[i] for i in kept), *speeds), with_speeds

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
@@ -22,6 +22,20 @@ MAX_STEPS = 20_000_000
 _SLACK_S = 1e-9  # stamps that differ by less are the same instant, written by two clocks' arithmetic
 
 
+class NamedReadings(dict[str, Reading]):
+    """Readings by stream, and the names of their columns.
+
+    Parameters
+    ----------
+    readings : by stream
+    channels : of each stream, in the order of the columns
+    """
+
+    def __init__(self, readings: Mapping[str, Reading], channels: Mapping[str, tuple[str, ...]]) -> None:
+        super().__init__(readings)
+        self.channels = channels
+
+
 def replay(run: RunLog, rate_hz: float = 50.0) -> Iterator[Sample]:
     """Yield what a controller would have been given at each of its steps.
 
@@ -34,7 +48,7 @@ def replay(run: RunLog, rate_hz: float = 50.0) -> Iterator[Sample]:
     ------
     Sample
         with the readings stamped after the step before and up to this one, in the order of the log, and all
-        channels of it; the last twist desired by then, zeros where the log has none; the label there
+        channels of it, which they name; the last twist desired by then, zeros where the log has none; the label there
 
     Raises
     ------
@@ -76,6 +90,7 @@ def _steps(run: RunLog, came: dict[str, Array], step_s: float) -> Iterator[Sampl
     ticks = start_s + step_s * np.arange(np.ceil((end_s - start_s - _SLACK_S) / step_s) + 1)
     ends = {name: np.searchsorted(c, ticks + _SLACK_S, side="right") for name, c in came.items()}
     twists = _twists(run, ticks)
+    channels = {name: run.streams[name].channels for name in came}
     for k, tick_s in enumerate(ticks.tolist()):
         readings = {}
         for name, end in ends.items():
@@ -84,7 +99,7 @@ def _steps(run: RunLog, came: dict[str, Array], step_s: float) -> Iterator[Sampl
                 stream = run.streams[name]
                 readings[name] = Reading(stream.time_s[part], stream.values[part])
         terrain = next((label.terrain for label in run.labels if label.start_s <= tick_s < label.end_s), "")
-        yield Sample(tick_s, twists[k], readings, terrain)
+        yield Sample(tick_s, twists[k], NamedReadings(readings, channels), terrain)
 
 
 def _came(time_s: Array) -> Array:

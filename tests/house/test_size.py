@@ -8,7 +8,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 
-MAX_LINES = {"terrain": 70_100, "features": 2_230, "pipelines": 27_870, "tests": 54_800}
+MAX_LINES = {"terrain": 70_390, "features": 2_350, "pipelines": 27_460, "tests": 54_800}
 """Lines of Python, docstrings included."""
 
 

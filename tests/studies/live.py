@@ -113,7 +113,7 @@ def step_times_us(robot: Robot, model: Any, run: RunLog, repeats: int = REPEATS)
         with _as_served():
             for waiting in (True, False):
                 for number in range(repeats + 1):
-                    pilot = LivePilot(robot, source=Classifier(model, robot, thread.robot()))
+                    pilot = LivePilot(robot, source=Classifier(model, robot, thread))
                     for sample in samples:
                         beside = thread.busy
                         begun_s = perf_counter()
@@ -133,7 +133,7 @@ def paced_step_times_us(robot: Robot, model: Any, run: RunLog, seconds: float) -
     thread, times_us = ClassifierThread(), []
     try:
         with _as_served():
-            pilot = LivePilot(robot, source=Classifier(model, robot, thread.robot()))
+            pilot = LivePilot(robot, source=Classifier(model, robot, thread))
             begin_s = monotonic()
             for sample in replay(run, STEP_RATE_HZ):
                 if sample.time_s > seconds:

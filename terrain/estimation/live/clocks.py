@@ -10,6 +10,7 @@ left out.
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Mapping
 from typing import Any
 
@@ -30,6 +31,17 @@ AHEAD_S = 0.1
 LEAP_S, AGREED_S, N_AGREED = 0.25, 0.05, 3
 """Stamps that advance by so much more than the time have leapt; readings whose difference to the time is the
 same within this, and how many of them are believed."""
+
+REMEMBERED = 64
+"""Messages of which the least late one tells the difference of the clocks."""
+
+SET_S, N_SET = 0.5, 5
+"""A stamp that is further ahead of what is known, or that many in a row are behind it, is of a clock that was
+set."""
+
+BEHIND_S, N_BEHIND = 1.0, 5
+"""A reading that is so far behind the newest stamp of its stream is late, or its clock was set where so many
+follow each other: late ones are fewer."""
 
 
 _FLOATS = np.dtype(np.float64)
@@ -213,3 +225,92 @@ def readable(given: Any) -> Reading | None:
     if type(given) is Reading and stamps is time_s and array is values:
         return given
     return Reading(stamps, array)
+
+
+class SessionClock:
+    """Tell the time of a robot's clock now.
+
+    A message that was sent at once and one that waited differ in their delay, which is never below zero: the
+    difference of the clocks is that of the message that was least late among the last ones.
+
+    Examples
+    --------
+    >>> clock = SessionClock()
+    >>> clock.received(100.0, now_s=5.0)
+    >>> clock.received(100.1, now_s=5.3)  # this one waited for 0.2 s
+    >>> round(clock.at(5.3), 6)
+    100.3
+    """
+
+    def __init__(self) -> None:
+        self._ahead: deque[float] = deque(maxlen=REMEMBERED)
+        self._n_behind = 0
+        self._offset_s = math.nan
+        self.times_set = 0
+
+    def received(self, stamp_s: float, now_s: float) -> None:
+        """Take the newest stamp of a message that has just arrived; a stamp that is no number is left out."""
+        ahead_s = stamp_s - now_s
+        if not math.isfinite(ahead_s):
+            return
+        if not math.isnan(self._offset_s):
+            self._n_behind = self._n_behind + 1 if ahead_s < self._offset_s - SET_S else 0
+            if ahead_s > self._offset_s + SET_S or self._n_behind >= N_SET:
+                self._ahead.clear()
+                self._n_behind = 0
+                self.times_set += 1
+        self._ahead.append(ahead_s)
+        self._offset_s = max(self._ahead)
+
+    def at(self, now_s: float) -> float:
+        """Return the robot's time now; NaN before the first stamp."""
+        return now_s + self._offset_s
+
+
+class ClockWatch:
+    """Watch the stamps of streams: whether their clock was set.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> watch = ClockWatch()
+    >>> stamps = (100.0, 100.1, 40.0, 40.1, 40.2, 40.3, 40.4, 40.5)
+    >>> [watch.was_set({"imu": Reading(np.array([t]), np.zeros((1, 1)))}) for t in stamps]
+    [False, False, False, False, False, False, True, False]
+    """
+
+    def __init__(self) -> None:
+        self._newest_s: dict[str, float] = {}
+        self._n_behind: dict[str, int] = {}
+        self.times_set = 0
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """How often the clock was set, as :attr:`Clocks.counts`; empty where it was not."""
+        return {"time: clock set": self.times_set} if self.times_set else {}
+
+    def was_set(self, samples: Mapping[str, Reading]) -> bool:
+        """Take the stamps of readings; say whether they are of a clock that was set since the call before."""
+        for stream in samples:
+            stamp_s = last_stamp_s(samples, stream)
+            if not math.isfinite(stamp_s):
+                continue
+            newest_s = self._newest_s.get(stream, -math.inf)
+            if stamp_s >= newest_s - BEHIND_S:
+                self._newest_s[stream], self._n_behind[stream] = max(stamp_s, newest_s), 0
+                continue
+            self._n_behind[stream] += 1
+            if self._n_behind[stream] >= N_BEHIND:
+                self._newest_s.clear()
+                self._n_behind.clear()
+                self.times_set += 1
+                return True
+        return False
+
+
+def last_stamp_s(samples: Mapping[str, Reading], stream: str) -> float:
+    """Return the last stamp of a stream; NaN where it has none that can be read."""
+    try:
+        return float(samples[stream][0][-1])
+    except (TypeError, ValueError, LookupError, OverflowError):
+        return math.nan

@@ -12,13 +12,13 @@ from pipelines.data.datasets import load_runs
 from pipelines.learn.predict import predict
 from pipelines.learn.training_data import fitted_model
 from pipelines.live.observer import Observer
-from pipelines.live.samples import replay as named_replay
 from terrain.control.slip_table import load_slip_table
 from terrain.errors import ConfigError, DataError
 from terrain.estimation.enriched import enriched
 from terrain.estimation.estimate import estimate_run
 from terrain.estimation.observers.estimate import observe_run, with_estimates
 from terrain.logs.replay import replay
+from terrain.logs.replay import replay as named_replay
 from terrain.records import Reading, RunLog, Stream
 from terrain.robots import load_robot
 from terrain.simulation.conditions import Conditions
@@ -220,7 +220,7 @@ def test_a_window_that_the_model_refuses_is_named(mower_model, two_drives):
     assert {one.refused for one in found} == {"Input X contains NaN."}
     assert {one.terrain for one in found} == {""}
     assert np.isnan([one.probability for one in found]).all()
-    assert observer._source.failed == {"Input X contains NaN.": len(found)}
+    assert observer.source.failed == {"Input X contains NaN.": len(found)}
     assert observer.belief.terrain == ""
 
 

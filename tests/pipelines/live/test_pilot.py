@@ -285,8 +285,7 @@ def test_the_expected_deceleration_is_larger_uphill_in_any_direction(direction, 
     wheels = Reading(np.array([0.0]), np.zeros((1, 6)))
     imu = Reading(np.array([0.0]), np.array([[0.0] * 3 + [0.0, 0.0, 9.81] + [*tilt_rad, 0.0]]))
     live.step(Sample(0.02, np.zeros(3), {"wheels": wheels, "imu": imu}, "snow"))
-    now = live._now
-    now.estimate = now.estimate._replace(speed_x_mps=direction[0], speed_y_mps=direction[1])
+    live.estimate = live.estimate._replace(speed_x_mps=direction[0], speed_y_mps=direction[1])
     level = live._aims["snow"].braking.mps2
     found = live._target(0.02)
     assert found.braking_mps2 - level == pytest.approx(uphill * 9.81 * math.sin(0.1), rel=0.01)
@@ -301,7 +300,7 @@ def judged(**statuses):
     health = np.zeros(len(SENSORS), np.int8)
     for name, status in statuses.items():
         health[SENSORS.index(name)] = status
-    live._now.estimate = live.estimate._replace(health=health)
+    live.estimate = live.estimate._replace(health=health)
     place, status = live._judge()
     return (SENSORS[place] if place >= 0 else None), Health(status)
 

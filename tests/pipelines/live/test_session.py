@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 
 from pipelines.live.arrivals import StreamHealth
 from pipelines.live.chain import CommandStatus
-from pipelines.live.classifying import AtOnce
 from pipelines.live.observer import Observer
 from pipelines.live.pilot import LivePilot
 from pipelines.live.session import TWIST_FRESH_S, RobotSession, Served, SessionRequest
@@ -36,12 +35,12 @@ def log():
 
 def agrimaro(model=None, channels=SENT, control=True):
     request = SessionRequest("one", "agrimaro", channels, control)
-    return RobotSession(request, Served(1, model, "test", TABLE), ROBOT, AtOnce())
+    return RobotSession(request, Served(1, model, "test", TABLE), ROBOT)
 
 
 def mower(model, robot="mower"):
     request = SessionRequest("m", robot, {"imu": ("accel_z_mps2",), "wheels": ("speed_left_mps",)})
-    return RobotSession(request, Served(1, model, "test", TABLE), None, AtOnce())
+    return RobotSession(request, Served(1, model, "test", TABLE), None)
 
 
 def send(session, sample, twist=None):
@@ -313,7 +312,7 @@ def test_a_model_can_come_after_the_robot(log, swerve_model):
 def test_a_request_that_cannot_be_served_is_refused_in_one_sentence(robot, channels, control, fault):
     request = SessionRequest("one", "r", channels, control)
     with pytest.raises((ConfigError, DataError), match=fault):
-        RobotSession(request, Served(1, None, "", TABLE), robot, AtOnce())
+        RobotSession(request, Served(1, None, "", TABLE), robot)
 
 
 def test_streams_that_stop_are_lost_and_come_back(mower_model, two_drives):

@@ -1,13 +1,19 @@
-"""Live windows of a classifier equal those of its training, and no input stops the loop."""
+"""Live windows of a classifier equal those of its training, at once and on a thread, and no input stops the loop."""
 
+import threading
+import time
+from collections import namedtuple
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from features.windows import cut_windows
+from pipelines.live.classifying import ClassifierThread, WindowOutput, classify_window
+from pipelines.live.observer import Observer
 from pipelines.live.pilot import LivePilot
-from pipelines.live.terrain_source import Classifier, KnownTerrain, NoTerrain
+from pipelines.live.terrain_source import AT_MOST, MAX_WAITING, Classifier, KnownTerrain, TerrainSource
 from terrain.control.pilot_settings import PilotSettings, PilotStatus
 from terrain.control.slip_table import load_slip_table
 from terrain.control.switching import SWITCHING, OutputStatus
@@ -15,22 +21,11 @@ from terrain.errors import DataError
 from terrain.estimation.live.estimator import LiveEstimator
 from terrain.kinematics.wheel_speed import with_wheel_speeds
 from terrain.logs.replay import replay
-from terrain.records import RunLog, Sample, Stream
+from terrain.logs.schema import ESTIMATOR_CHANNELS
+from terrain.records import Reading, Sample, Stream
 from terrain.robots import load_robot
-from terrain.simulation.run import simulate_run
 
-ROBOT = load_robot("agrimaro")
-TERRAINS = ("grass", "tiles")
-
-
-@pytest.fixture(scope="module")
-def model(swerve_model):
-    return swerve_model
-
-
-@pytest.fixture(scope="module")
-def log():
-    return simulate_run(ROBOT, "grass", "survey", 6, duration_s=25.0)
+ROBOT, TABLE = load_robot("agrimaro"), load_slip_table()
 
 
 def estimated(run):
@@ -38,59 +33,56 @@ def estimated(run):
     estimator = LiveEstimator(ROBOT)
     estimates = [estimate for sample in replay(run) for estimate in estimator.step(sample.readings)]
     time_s = [estimate.time_s for estimate in estimates]
-    channels = ("speed_x_mps", "speed_y_mps", "yaw_rate_radps", "accel_x_mps2", "accel_y_mps2")
-    streams = dict(with_wheel_speeds(run, ROBOT).streams)
-    streams["estimator"] = Stream(
-        time_s, [[getattr(e, name) for name in channels] for e in estimates], channels
-    )
+    motion = [[getattr(estimate, name) for name in ESTIMATOR_CHANNELS] for estimate in estimates]
     slip = [estimate.slip_ratio for estimate in estimates]
-    streams["slip"] = Stream(time_s, slip, tuple(f"slip_{i}_ratio" for i in (1, 2, 3)))
-    return RunLog(run.run_id, run.robot, streams, run.labels)
+    streams = {
+        "estimator": Stream(time_s, motion, ESTIMATOR_CHANNELS),
+        "slip": Stream(time_s, slip, tuple(f"slip_{i}_ratio" for i in (1, 2, 3))),
+    }
+    return replace(run, streams=dict(with_wheel_speeds(run, ROBOT).streams) | streams)
 
 
-def live(classifier, run, change=lambda sample: sample):
-    """The outputs of a classifier for a replayed run, and its windows."""
-    estimator, shown, found = LiveEstimator(ROBOT), [], []
-    push = classifier._feed.push
+def test_live_windows_and_outputs_equal_those_of_the_enriched_log(swerve_model, survey, monkeypatch):
+    shown, found, late_s = [], [], []
 
-    def keep(*sample):
-        windows = push(*sample)
-        shown.extend(windows)
-        return windows
+    def classify(model, window):
+        shown.append(window)
+        return classify_window(model, window)
 
-    classifier._feed.push = keep
-    for sample in map(change, replay(run)):
-        found += classifier.update(sample, estimator.step(sample.readings))
-    return found, shown
-
-
-def test_live_windows_and_outputs_equal_those_of_the_enriched_log(model, log):
-    found, shown = live(Classifier(model, ROBOT), log)
-    batch = cut_windows([estimated(log)], model.rule, layout=model.layout).windows
+    monkeypatch.setattr("pipelines.live.terrain_source.classify_window", classify)
+    classifier, estimator = Classifier(swerve_model, ROBOT), LiveEstimator(ROBOT)
+    for sample in replay(survey):
+        new = classifier.update(sample, estimator.step(sample.readings))
+        found += new
+        late_s += [sample.time_s - one.time_s for one in new]
+    batch = cut_windows([estimated(survey)], swerve_model.rule, layout=swerve_model.layout).windows
     assert len(shown) == len(batch) == len(found) > 5
     for k, window in enumerate(shown):
         assert window.start_s[0] == batch.start_s[k]
         for stream, values in batch.values.items():
             np.testing.assert_array_equal(window.values[stream][0], values[k], err_msg=stream)
-    probability = model.recipe.predict_proba(batch)
-    classes = model.recipe.classes_
-    assert [one.terrain for one in found] == [classes[best] for best in probability.argmax(axis=1)]
+    probability = swerve_model.recipe.predict_proba(batch)
+    best = swerve_model.recipe.classes_[probability.argmax(axis=1)]
+    assert [one.terrain for one in found] == best.tolist()
     assert [one.probability for one in found] == pytest.approx(probability.max(axis=1), abs=1e-12)
-    ends_s = batch.start_s + model.rule.length_s
-    late_s = np.array([one.time_s for one in found]) - ends_s
-    assert (np.abs(late_s) < 0.05).all()
+    assert [one.time_s for one in found] == (batch.start_s + batch.length_s).tolist()
+    assert np.abs(late_s).max() < 0.05
 
 
-def test_the_belief_of_a_classifier_ends_when_a_sensor_of_its_windows_is_lost(model, log):
+def test_the_belief_outlasts_a_stop_and_ends_when_a_sensor_of_its_windows_is_lost(swerve_model, survey):
     """Windows need the IMU: after 5 s of driving without one the terrain is unknown."""
-    switching = SWITCHING._replace(unconfirmed_max_s=5.0)
-    pilot = LivePilot(ROBOT, load_slip_table(), Classifier(model, ROBOT), PilotSettings(switching=switching))
+    settings = PilotSettings(switching=SWITCHING._replace(unconfirmed_max_s=5.0))
+    standing, lost = (LivePilot(ROBOT, TABLE, Classifier(swerve_model, ROBOT), settings) for _ in range(2))
     seen = []
-    for sample in replay(log):
+    for sample in replay(survey):
+        accepted = standing.step(sample).status["terrain_code"]
         if sample.time_s > 12.0:
-            kept = {name: reading for name, reading in sample.readings.items() if name != "imu"}
-            sample = sample._replace(readings=kept)
-        seen.append((sample.time_s, *pilot.step(sample).status.values()))
+            sample.readings.pop("imu", None)
+        seen.append((sample.time_s, *lost.step(sample).status.values()))
+    assert standing.terrains[int(accepted)] == "grass"
+    for k in range(1500):  # half a minute
+        last = standing.step(Sample(sample.time_s + 0.02 * (k + 1), np.zeros(3), {})).status
+    assert last["terrain_code"] == accepted
     fields = ("time_s", *PilotStatus._fields)
     time_s, code, output, target = (
         np.array([row[fields.index(name)] for row in seen])
@@ -100,29 +92,18 @@ def test_the_belief_of_a_classifier_ends_when_a_sensor_of_its_windows_is_lost(mo
     assert last_s < 12.5
     assert (code[(time_s > last_s) & (time_s < last_s + 4.9)] >= 0).all()
     assert (code[time_s > last_s + 5.1] == -1).all()
-    assert target[-1] == load_slip_table().lookup("")["traction"].slip_ratio
-    assert np.abs(np.diff(target)).max() <= switching.rate_ratio * 0.0201
-
-
-def test_a_pilot_accepts_the_classification_and_its_belief_outlasts_a_stop(model, log):
-    pilot, accepted = LivePilot(ROBOT, load_slip_table(), Classifier(model, ROBOT)), []
-    for sample in replay(log):
-        accepted.append(pilot.step(sample).status["terrain_code"])
-    assert pilot.terrains[int(accepted[-1])] == "grass"
-    assert set(accepted) == {-1.0, accepted[-1]}
-    for k in range(1500):  # half a minute
-        last = pilot.step(Sample(sample.time_s + 0.02 * (k + 1), np.zeros(3), {})).status
-    assert last["terrain_code"] >= 0
+    assert target[-1] == TABLE.lookup("")["traction"].slip_ratio
+    assert np.abs(np.diff(target)).max() <= SWITCHING.rate_ratio * 0.0201
 
 
 @pytest.mark.parametrize(
     ("stream", "channel"), [("imu", "accel_q_mps2"), ("gnss", "speed_x_mps"), ("estimator", "speed_z_mps")]
 )
-def test_a_model_that_requires_a_missing_channel_is_refused(model, stream, channel):
-    channels = dict(model.info.channels)
+def test_a_model_that_requires_a_missing_channel_is_refused(swerve_model, stream, channel):
+    channels = dict(swerve_model.info.channels)
     channels[stream] = (*channels.get(stream, ()), channel)
-    rates = {**model.info.rate_hz, stream: 50.0}
-    wanting = model._replace(info=replace(model.info, channels=channels, rate_hz=rates))
+    rates = {**swerve_model.info.rate_hz, stream: 50.0}
+    wanting = swerve_model._replace(info=replace(swerve_model.info, channels=channels, rate_hz=rates))
     with pytest.raises(DataError) as refused:
         Classifier(wanting, ROBOT)
     assert str(refused.value).startswith(
@@ -134,10 +115,162 @@ def test_a_known_terrain_is_given_once_a_change_and_no_terrain_never():
     known = KnownTerrain(lambda terrain: {"clay": "grass"}.get(terrain, terrain))
     terrains = ["", "clay", "clay", "", "clay", "snow", "snow", ""]
     samples = [Sample(float(k), np.zeros(3), {}, terrain) for k, terrain in enumerate(terrains)]
-    found = [one for sample in samples for one in known.update(sample, [])]
-    assert [(one.time_s, one.terrain, one.probability) for one in found] == [
-        (1.0, "grass", 1.0),
-        (5.0, "snow", 1.0),
-    ]
-    assert not any(NoTerrain().update(sample, []) for sample in samples)
-    assert (known.certain, NoTerrain.certain, Classifier.certain) == (True, False, False)
+    found = [tuple(one) for sample in samples for one in known.update(sample, [])]
+    assert found == [(1.0, "grass", 1.0), (5.0, "snow", 1.0)]
+    assert not any(TerrainSource().update(sample, []) for sample in samples)
+
+
+# What a model says of a window, and the thread that asks it
+
+
+Window = namedtuple("Window", "start_s length_s")
+
+
+def window(start_s):
+    return Window(np.array([start_s]), 2.0)
+
+
+def stub_model(row=(0.25, 0.75)):
+    """A model that gives a row of probabilities, or raises, for any window."""
+
+    def predict_proba(_):
+        if isinstance(row, Exception):
+            raise row
+        return np.array([row])
+
+    recipe = SimpleNamespace(classes_=np.array(["a", "b"]), predict_proba=predict_proba)
+    info = SimpleNamespace(classes=("a", "b"), channels={}, rate_hz={}, rule=row, filter="")
+    return SimpleNamespace(recipe=recipe, info=info, novelty=None, support=None, over_time=None)
+
+
+@pytest.mark.parametrize(
+    ("row", "terrain", "refused"),
+    [
+        ([0.25, 0.75], "b", ""),
+        (ValueError("Input X contains NaN."), "", "Input X contains NaN."),
+        ([np.nan, 0.5], "", "a probability is not finite"),
+    ],
+)
+def test_the_output_is_the_class_of_the_largest_probability_or_why_there_is_none(row, terrain, refused):
+    found = classify_window(stub_model(row), window(4.0))
+    assert found[:3] == (4.0, 6.0, terrain)
+    assert found.refused == refused
+    np.testing.assert_array_equal(found.probabilities, [np.nan, np.nan] if refused else row)
+    np.testing.assert_array_equal(found.probability, np.nan if refused else 0.75)
+    assert found.took_s > 0.0
+
+
+@pytest.fixture
+def gate(monkeypatch):
+    """An event, and a thread that classifies only while it is set; each step is a window of its own."""
+
+    def feed_of(*_):
+        def push(readings, _):
+            return [window(float(readings["imu"].time_s[-1]))]
+
+        return SimpleNamespace(due_s=0.0, dropped={}, push=push)
+
+    def classify(model, window):
+        assert event.wait(10.0)
+        if window.start_s[0] < 0:
+            raise KeyError("unforeseen")
+        return WindowOutput(window.start_s[0], 0.0, "a", 1.0, np.ones(1), ("a",), nearest=model.info.rule)
+
+    monkeypatch.setattr("pipelines.live.terrain_source.feed_of", feed_of)
+    event, thread = threading.Event(), ClassifierThread(classify)
+    yield event, thread
+    event.set()
+    thread.stop()
+
+
+def take(robot, start_s):
+    return robot.take({"imu": Reading(np.array([start_s]), np.zeros((1, 1)))}, [])
+
+
+def begun(thread, name="m"):
+    robot = Classifier(stub_model(name), None, thread)
+    wait_until(lambda: not robot._waiting and robot._due_s == 0.0)
+    return robot
+
+
+def wait_until(done):
+    end_s = time.monotonic() + 10.0
+    while not done() and time.monotonic() < end_s:
+        time.sleep(0.001)
+    assert done()
+
+
+def outputs(robot, n):
+    """The outputs of a robot, once there are n."""
+    wait_until(lambda: len(robot._finished) >= n)
+    return list(robot._finished)
+
+
+def starts(robot, n):
+    return [one.start_s for one in outputs(robot, n)]
+
+
+def test_taking_waits_for_nothing_and_each_robot_gets_its_outputs_in_order(gate):
+    event, thread = gate
+    busy, other = begun(thread), begun(thread)
+    assert [take(busy, 2.0 * k) for k in range(40)] == [[]] * 40
+    assert take(other, 100.0) == []
+    event.set()
+    assert starts(other, 1) == [100.0]
+    assert starts(busy, 40) == [2.0 * k for k in range(40)]
+    assert busy.dropped == {}
+
+
+def test_of_too_many_steps_the_oldest_are_left_out_and_counted(gate):
+    event, thread = gate
+    robot = begun(thread)
+    take(robot, 0.0)
+    wait_until(lambda: not robot._waiting)  # the thread is at the first
+    n = MAX_WAITING + 6
+    for k in range(1, n):
+        take(robot, float(k))
+    event.set()
+    assert starts(robot, MAX_WAITING + 1) == [0.0, *map(float, range(n - MAX_WAITING, n))]
+    assert robot.dropped == {"steps: overrun": n - 1 - MAX_WAITING}
+
+
+def test_the_thread_works_where_a_window_may_be_whole_and_after_many_steps(gate):
+    event, thread = gate
+    event.set()
+    robot = begun(thread)
+    robot._part.feed.due_s = robot._due_s = 100.0
+    for k in range(AT_MOST - 1):
+        take(robot, float(k))
+    time.sleep(0.05)
+    assert not robot._finished
+    take(robot, 99.0)
+    assert len(starts(robot, AT_MOST)) == AT_MOST
+    assert len(take(robot, 100.0)) == AT_MOST
+    assert starts(robot, 1) == [100.0]
+
+
+def test_models_are_changed_in_order_and_an_unforeseen_error_costs_one_window(gate):
+    event, thread = gate
+    event.set()
+    robot = begun(thread, "first")
+    for name in ("second", "third"):
+        robot._waiting.append(({"imu": Reading(np.array([0.0]), np.zeros((1, 1)))}, []))
+        robot.swap(stub_model(name))
+    for start_s in (-1.0, 1.0, 2.0):
+        robot._waiting.append(({"imu": Reading(np.array([start_s]), np.zeros((1, 1)))}, []))
+        thread.due(robot._work)
+    assert [one.nearest for one in outputs(robot, 4)] == ["first", "second", "third", "third"]
+    assert thread.failures == {"KeyError": 1}
+
+
+def test_on_a_thread_a_robot_gets_the_windows_that_it_would_get_at_once(mower_model, two_drives):
+    run, thread = two_drives[4], ClassifierThread()
+    at_once, beside = Observer(mower_model), Observer(mower_model, thread=thread)
+    desired, found = [], []
+    for sample in replay(run):
+        desired += at_once.update(sample.readings)
+        found += beside.update(sample.readings)
+    wait_until(lambda: found.extend(beside.update({})) or len(found) >= len(desired))
+    assert [one[:4] for one in found] == [one[:4] for one in desired]
+    assert beside.belief.terrain == "b"
+    thread.stop()
