@@ -163,7 +163,7 @@ def _epochs(task: Task, train: Array, used: Augmentation, epochs: int, seed: int
     truth = torch.from_numpy(task.class_index[train])
     weight = torch.from_numpy(task.weight[train])
     n_batches = max(len(train) // BATCH, min(MIN_BATCHES, len(train) // SMALL_BATCH), 1)
-    optimizer = torch.optim.AdamW(net.parameters(), lr=LEARNING_RATE, weight_decay=WEIGHT_DECAY)
+    optimizer = torch.optim.AdamW(net.parameters(), LEARNING_RATE, weight_decay=WEIGHT_DECAY, fused=True)
     schedule = torch.optim.lr_scheduler.OneCycleLR(
         optimizer, LEARNING_RATE, total_steps=epochs * n_batches, pct_start=0.15
     )
