@@ -1,5 +1,8 @@
 """Frames of a CAN bus to values and back, by the DBC that a user has: cantools decodes and encodes.
 
+A DBC with the names of :data:`SIGNALS` is read, whatever its frames.  A frame is eight bytes, so that the
+channels of a stream come in several; those with equal ``Counter`` are of one instant.
+
 What a controller needs beside it is here: which signal is which channel, in which unit; values that were not
 measured; bounds; CRC and counter.  The lowest raw value of a signed signal, and the highest of an unsigned
 one, stands for a value that was not measured; of a signal of floating point NaN does.  A value beyond what a
@@ -9,21 +12,28 @@ bytes or 4 of an extended one, high byte first, and the data with the CRC's own 
 
 from __future__ import annotations
 
-import heapq
 import math
-from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pipelines.data.can_signals import COUNTER, CRC, OPTIONAL, SENSORS, SIGNALS, as_sent, channels_of
-from terrain.errors import ConfigError
+import numpy as np
+
+from terrain.errors import ConfigError, one_line
 from terrain.files.resources import data_folder
+from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.logs.replay import TWIST
-from terrain.logs.schema import UNIT_OFFSETS, UNIT_SCALES, unit_of
-from terrain.records import RunLog, Stream
+from terrain.logs.schema import (
+    IMU_CHANNELS,
+    STEERING_CHANNELS,
+    UNIT_OFFSETS,
+    UNIT_SCALES,
+    WHEELS_CHANNELS,
+    unit_of,
+)
 
 DEFAULT_DBC = "agrimaro.dbc"
 MAX_BYTES = 8
@@ -34,6 +44,70 @@ MISSING_PACKAGE = "CAN needs the packages python-can and cantools: pip install '
 
 BUS_OFF_BIT = 0x40
 """In the identifier of an error frame of socketcan."""
+
+COUNTER, CRC = "Counter", "Crc8"
+"""Signals that any message may have: rises by one a sample; CRC-8 over identifier and data."""
+
+_AXES = ("X", "Y", "Z")
+
+
+def _named(channels: tuple[str, ...], *names: str) -> dict[str, str]:
+    return dict(zip(channels, names, strict=True))
+
+
+SIGNALS: Mapping[str, Mapping[str, str]] = {
+    "wheels": _named(
+        WHEELS_CHANNELS, *(f"{quantity}{i}" for quantity in ("MotorRate", "MotorCurrent") for i in (1, 2, 3))
+    ),
+    "steering": _named(STEERING_CHANNELS, *(f"SteeringAngle{i}" for i in (1, 2, 3))),
+    "imu": _named(
+        IMU_CHANNELS,
+        *(f"{quantity}{axis}" for quantity in ("Gyro", "Accel") for axis in _AXES),
+        *("Roll", "Pitch", "Yaw"),
+    ),
+    "odometry": _named(
+        CAMERA_CHANNELS,
+        *(f"CameraPosition{axis}" for axis in _AXES),
+        *(f"CameraQuaternion{axis}" for axis in (*_AXES, "W")),
+        *(f"CameraVelocity{axis}" for axis in _AXES),
+        *(f"CameraRate{axis}" for axis in _AXES),
+        "CameraConfidence",
+    ),
+    "twist": _named(TWIST, "DesiredSpeedX", "DesiredSpeedY", "DesiredYawRate"),
+    "corrections": {f"correction_{i}_radps": f"Correction{i}" for i in (1, 2, 3)},
+    "status": {
+        "terrain_code": "TerrainCode",
+        "probability_ratio": "TerrainProbability",
+        "target_ratio": "TargetSlip",
+        "status_code": "ControlStatus",
+        "bridge_code": "BridgeState",
+        "sensor_code": "SensorCode",
+        "health_code": "SensorHealth",
+    },
+}
+"""Signal of each channel, by stream."""
+
+RECEIVED = ("wheels", "steering", "imu", "odometry", "twist")
+"""Streams that the bridge receives, the last of them desired and not measured; it sends the others."""
+
+OPTIONAL = frozenset(
+    (*(f"position_{axis}_m" for axis in "xyz"), "quaternion_w_ratio", "confidence_ratio", *SIGNALS["status"])
+)
+"""Channels that no controller needs, or that follow from others: a DBC may lack them."""
+
+QUATERNION = tuple(CAMERA_CHANNELS.index(f"quaternion_{part}_ratio") for part in "xyzw")
+"""Columns of the camera's quaternion; a real part that the DBC lacks is the one that is not negative."""
+
+
+def channels_of(stream: str) -> tuple[str, ...]:
+    """Return the channels of a stream, in the order of its columns.
+
+    Examples
+    --------
+    >>> channels_of("twist")
+    ('speed_x_mps', 'speed_y_mps', 'yaw_rate_radps')
+    """
+    return tuple(SIGNALS[stream])
 
 
 class Frame(NamedTuple):
@@ -53,6 +127,18 @@ class Frame(NamedTuple):
     is_extended: bool = False
     is_remote: bool = False
     is_error: bool = False
+
+
+def frame_of(message: Any) -> Frame:
+    """Return a message of python-can as a frame."""
+    return Frame(
+        message.timestamp,
+        message.arbitration_id,
+        bytes(message.data),
+        message.is_extended_id,
+        message.is_remote_frame,
+        message.is_error_frame,
+    )
 
 
 class Drop(StrEnum):
@@ -95,10 +181,9 @@ class SignalPlan:
     name : in the DBC
     column : of its channel in the stream
     factor : from the unit of the DBC to SI
-    scale : one step of a raw value
+    scale : one step of a raw value; 0 of floating point
     low, high : least and largest value that is a measurement
     absent : value that stands for one that was not measured
-    rounding : the most by which a value may be changed when it is sent
     """
 
     name: str
@@ -108,7 +193,6 @@ class SignalPlan:
     low: float
     high: float
     absent: float
-    rounding: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -120,7 +204,7 @@ class MessagePlan:
     message : of cantools
     stream : that it carries
     signals : of the stream's channels
-    has_counter : whether it has a counter
+    counter_bits : of its counter; 0 without one
     crc_bits : bits of its CRC in the data, the first byte the highest; 0 without one
     others : value of each further signal when it is sent
     """
@@ -128,32 +212,22 @@ class MessagePlan:
     message: Any
     stream: str
     signals: tuple[SignalPlan, ...]
-    has_counter: bool
+    counter_bits: int
     crc_bits: int
     others: Mapping[str, int | float]
-
-    @property
-    def key(self) -> tuple[int, bool]:
-        """Identifier, and whether it is an extended one."""
-        return self.message.frame_id, self.message.is_extended_frame
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Layout:
-    """All messages that are used, by identifier and by stream."""
+    """All messages that are used, by identifier and whether it is an extended one, and by stream."""
 
     name: str
     by_key: Mapping[tuple[int, bool], MessagePlan]
-    by_stream: Mapping[str, tuple[MessagePlan, ...]]
+    by_stream: Mapping[str, Sequence[MessagePlan]]
 
     def columns(self, stream: str) -> frozenset[int]:
         """Return the columns of a stream that the DBC has."""
         return frozenset(signal.column for plan in self.by_stream.get(stream, ()) for signal in plan.signals)
-
-    def lacking(self, stream: str) -> list[str]:
-        """Return the channels of a stream that the DBC lacks."""
-        there = self.columns(stream)
-        return [channel for column, channel in enumerate(channels_of(stream)) if column not in there]
 
 
 def load_layout(path: str | Path | None = None, streams: Iterable[str] = SIGNALS) -> Layout:
@@ -176,45 +250,52 @@ def load_layout(path: str | Path | None = None, streams: Iterable[str] = SIGNALS
     ['MotorRates', 'MotorCurrents']
     """
     path = data_folder("can") / DEFAULT_DBC if path is None else Path(path)
-    database = _read(path)
-    places: dict[str, list[Any]] = defaultdict(list)
-    for message in database.messages:
-        for signal in message.signals:
-            places[signal.name].append(message)
-    _refuse_missing(path, places, set(streams))
-    found: dict[str, dict[str, list[SignalPlan]]] = {stream: defaultdict(list) for stream in SIGNALS}
-    owner: dict[str, str] = {}
-    for stream, names in SIGNALS.items():
-        for column, (channel, name) in enumerate(names.items()):
-            if name not in places:
-                continue
-            if len(places[name]) > 1:
-                both = " and ".join(repr(message.name) for message in places[name][:2])
-                raise ConfigError(f"{path}: the signal {name!r} is in the messages {both}; one is required")
-            (message,) = places[name]
-            if owner.setdefault(message.name, stream) != stream:
-                raise ConfigError(
-                    f"{path}: the message {message.name!r} has signals of {owner[message.name]!r} and "
-                    f"{stream!r}; each needs messages of its own"
-                )
-            signal = message.get_signal_by_name(name)
-            found[stream][message.name].append(_signal_plan(path, signal, channel, column))
-    by_stream = {
-        stream: tuple(
-            _message_plan(database.get_message_by_name(name), stream, signals)
-            for name, signals in messages.items()
-        )
-        for stream, messages in found.items()
-        if messages
+    places = {
+        name: (stream, column, channel)
+        for stream, names in SIGNALS.items()
+        for column, (channel, name) in enumerate(names.items())
     }
-    plans = [plan for plans in by_stream.values() for plan in plans]
-    for plan in plans:
-        if plan.message.length > MAX_BYTES:
+    owner: dict[str, Any] = {}
+    by_stream: dict[str, list[MessagePlan]] = {}
+    for message in _read(path).messages:
+        plans: dict[str, list[SignalPlan]] = {}
+        for signal in message.signals:
+            if signal.name not in places:
+                continue
+            if owner.setdefault(signal.name, message) is not message:
+                both = f"{owner[signal.name].name!r} and {message.name!r}"
+                raise ConfigError(
+                    f"{path}: the signal {signal.name!r} is in the messages {both}; one is required"
+                )
+            stream, column, channel = places[signal.name]
+            plans.setdefault(stream, []).append(_signal_plan(path, signal, channel, column))
+        if len(plans) > 1:
+            both = " and ".join(map(repr, list(plans)[:2]))
             raise ConfigError(
-                f"{path}: the message {plan.message.name!r} has {plan.message.length} bytes; "
-                f"a frame of classical CAN has at most {MAX_BYTES}"
+                f"{path}: the message {message.name!r} has signals of {both}; each needs messages of its own"
             )
-    return Layout(path.name, {plan.key: plan for plan in plans}, by_stream)
+        for stream, signals in plans.items():
+            if message.length > MAX_BYTES:
+                raise ConfigError(
+                    f"{path}: the message {message.name!r} has {message.length} bytes; "
+                    f"a frame of classical CAN has at most {MAX_BYTES}"
+                )
+            by_stream.setdefault(stream, []).append(_message_plan(message, stream, signals))
+    needed = [places[name] for name in places if name not in owner]
+    missing = [
+        SIGNALS[stream][channel]
+        for stream, _, channel in needed
+        if stream in set(streams) and channel not in OPTIONAL
+    ]
+    if missing:
+        more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
+        raise ConfigError(f"{path}: lacks the signal {missing[0]!r}{more}; docs/can.md lists those required")
+    by_key = {
+        (plan.message.frame_id, plan.message.is_extended_frame): plan
+        for plans_of_stream in by_stream.values()
+        for plan in plans_of_stream
+    }
+    return Layout(path.name, by_key, by_stream)
 
 
 def _read(path: Path) -> Any:
@@ -227,20 +308,7 @@ def _read(path: Path) -> Any:
     except OSError as error:
         raise ConfigError(f"{path}: cannot be opened ({error.strerror})") from error
     except Exception as error:  # whatever a parser does with a damaged file
-        raise ConfigError(f"{path}: is no DBC ({' '.join(str(error).split())[:160]})") from error
-
-
-def _refuse_missing(path: Path, places: Mapping[str, list[Any]], streams: set[str]) -> None:
-    missing = [
-        name
-        for stream in SIGNALS
-        if stream in streams
-        for channel, name in SIGNALS[stream].items()
-        if name not in places and channel not in OPTIONAL
-    ]
-    if missing:
-        more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
-        raise ConfigError(f"{path}: lacks the signal {missing[0]!r}{more}; docs/can.md lists those required")
+        raise ConfigError(f"{path}: is no DBC ({one_line(error)})") from error
 
 
 def _signal_plan(path: Path, signal: Any, channel: str, column: int) -> SignalPlan:
@@ -250,7 +318,7 @@ def _signal_plan(path: Path, signal: Any, channel: str, column: int) -> SignalPl
     convert = signal.conversion.raw_to_scaled
     stated = [end for end in (signal.minimum, signal.maximum) if end is not None]
     if signal.is_float:
-        largest = {16: 65504.0, 32: 3.4028234663852886e38}.get(signal.length, 1.7976931348623157e308)
+        largest = float(np.finfo(f"f{signal.length // 8}").max)
         ends, absent = sorted([convert(-largest, False), convert(largest, False)]), math.nan
         low, high = (max(ends[0], stated[0]), min(ends[1], stated[1])) if len(stated) == 2 else ends
     else:
@@ -265,8 +333,8 @@ def _signal_plan(path: Path, signal: Any, channel: str, column: int) -> SignalPl
     if low > high:
         raise ConfigError(f"{path}: the signal {signal.name!r} has no value between its bounds")
     factor = _factor(path, signal, channel)
-    rounding = 0.0 if signal.is_float else 0.5 * abs(scale)
-    return SignalPlan(signal.name, column, factor, abs(scale), float(low), float(high), absent, rounding)
+    step = 0.0 if signal.is_float else abs(scale)
+    return SignalPlan(signal.name, column, factor, step, float(low), float(high), absent)
 
 
 def _factor(path: Path, signal: Any, channel: str) -> float:
@@ -294,45 +362,21 @@ def _message_plan(message: Any, stream: str, signals: list[SignalPlan]) -> Messa
         for name, signal in by_name.items()
         if name not in used
     }
+    counter_bits = by_name[COUNTER].length if COUNTER in by_name else 0
     crc_bits = 0
     if CRC in by_name and by_name[CRC].length == 8:
         raw = dict.fromkeys(by_name, 0) | {CRC: 255}
         crc_bits = int.from_bytes(message.encode(raw, scaling=False, padding=False, strict=False), "big")
-    return MessagePlan(message, stream, tuple(signals), COUNTER in by_name, crc_bits, others)
-
-
-def _crc_table() -> tuple[int, ...]:
-    table = []
-    for byte in range(256):
-        value = byte
-        for _ in range(8):
-            value = (value << 1) ^ 0x1D if value & 0x80 else value << 1
-        table.append(value & 0xFF)
-    return tuple(table)
-
-
-_TABLE = _crc_table()
-
-
-def crc8(content: bytes) -> int:
-    """Return the CRC-8 of SAE J1850: polynomial 0x1D, start 0xFF, result inverted.
-
-    Examples
-    --------
-    >>> hex(crc8(b"123456789"))
-    '0x4b'
-    """
-    value = 0xFF
-    for byte in content:
-        value = _TABLE[value ^ byte]
-    return value ^ 0xFF
+    return MessagePlan(message, stream, tuple(signals), counter_bits, crc_bits, others)
 
 
 def _crc_of(plan: MessagePlan, data: bytes) -> int:
     """Return the CRC over the identifier and all bits of the data but its own, unused ones too."""
+    from crccheck.crc import Crc8SaeJ1850
+
     width = 4 if plan.message.is_extended_frame else 2
     others = (int.from_bytes(data, "big") & ~plan.crc_bits).to_bytes(len(data), "big")
-    return crc8(plan.message.frame_id.to_bytes(width, "big") + others)
+    return int(Crc8SaeJ1850.calc(plan.message.frame_id.to_bytes(width, "big") + others))
 
 
 def decode(layout: Layout, frame: Frame) -> Part | Drop:
@@ -362,7 +406,7 @@ def decode(layout: Layout, frame: Frame) -> Part | Drop:
         decoded = plan.message.decode(frame.data, decode_choices=False)
         if plan.crc_bits and decoded[CRC] != _crc_of(plan, frame.data):
             return Drop.CHECKSUM
-        counter = int(decoded[COUNTER]) if plan.has_counter else None
+        counter = int(decoded[COUNTER]) if plan.counter_bits else None
     except Exception:  # whatever a DBC makes of bytes, as of a multiplexer that it does not describe
         return Drop.UNREADABLE
     columns, values, n_out = [], [], 0
@@ -394,7 +438,7 @@ def encode(
     Parameters
     ----------
     layout : of the DBC
-    stream : one of :data:`pipelines.data.can_signals.SIGNALS`
+    stream : one of :data:`SIGNALS`
     values : of all its channels, SI; what is not finite is sent as not measured
     counter : of the sample; it wraps
     time_s : of the frames
@@ -412,36 +456,12 @@ def _encode(
         sent[signal.name] = signal.absent
         if math.isfinite(value):
             sent[signal.name] = min(max(value, signal.low), signal.high)
-            if abs(value - sent[signal.name]) > signal.rounding and clipped is not None:
+            if abs(value - sent[signal.name]) > 0.5 * signal.scale and clipped is not None:
                 clipped[signal.name] += 1
-    if plan.has_counter:
-        sent[COUNTER] = counter % 2 ** plan.message.get_signal_by_name(COUNTER).length
+    if plan.counter_bits:
+        sent[COUNTER] = counter % 2**plan.counter_bits
     data = bytes(plan.message.encode(sent, padding=False, strict=False))
     if plan.crc_bits:
         sent[CRC] = _crc_of(plan, data)
         data = bytes(plan.message.encode(sent, padding=False, strict=False))
     return Frame(time_s, plan.message.frame_id, data, plan.message.is_extended_frame)
-
-
-def run_frames(layout: Layout, run: RunLog) -> Iterator[Frame]:
-    """Yield the frames that carry a run's sensors and its desired twist, in the order of their stamps.
-
-    Parameters
-    ----------
-    layout : of the DBC
-    run : with any of the streams of :data:`pipelines.data.can_signals.SENSORS`, and ``commands``
-    """
-    sources = {name: run.streams[name] for name in SENSORS if name in run.streams}
-    commands = run.streams.get("commands")
-    if commands is not None and set(TWIST) <= set(commands.channels):
-        sources["twist"] = commands
-    frames = [_stream_frames(layout, name, stream) for name, stream in sources.items()]
-    return heapq.merge(*frames, key=lambda frame: frame.time_s)
-
-
-def _stream_frames(layout: Layout, name: str, stream: Stream) -> Iterator[Frame]:
-    channels = channels_of(name)
-    columns = [stream.channels.index(channel) if channel in stream.channels else -1 for channel in channels]
-    for number, (time_s, row) in enumerate(zip(stream.time_s.tolist(), stream.values.tolist(), strict=True)):
-        values = [math.nan if column < 0 else row[column] for column in columns]
-        yield from encode(layout, name, as_sent(name, values), number, time_s)

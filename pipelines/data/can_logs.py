@@ -9,6 +9,7 @@ are late, and those of a counter that stands still repeat an old measurement: bo
 from __future__ import annotations
 
 import math
+from array import array
 from collections import Counter
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -16,9 +17,20 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.data.can_codec import MISSING_PACKAGE, Drop, Frame, Layout, Part, decode
-from pipelines.data.can_signals import QUATERNION, RECEIVED, SIGNALS, channels_of, real_part
-from terrain.errors import ConfigError, LogError
+from pipelines.data.can_codec import (
+    MISSING_PACKAGE,
+    QUATERNION,
+    RECEIVED,
+    SIGNALS,
+    Drop,
+    Frame,
+    Layout,
+    Part,
+    channels_of,
+    decode,
+    frame_of,
+)
+from terrain.errors import ConfigError, LogError, one_line
 from terrain.logs.borealtc import whole_run_label
 from terrain.logs.samples import checked_stream
 from terrain.records import Reading, RunLog, Stream
@@ -37,6 +49,9 @@ USUAL = (Drop.UNKNOWN, Drop.ERROR, Drop.BUS_OFF, Drop.REMOTE)
 QUEUE = 1000
 """Most samples of a stream between two readings: ten seconds of an IMU; the oldest are dropped."""
 
+LONGEST = 1.02
+"""Square of the length of a quaternion's vector part that rounding can explain."""
+
 INCOMPLETE_S = 0.02
 """A sample whose other frames have not come for so long is used without them."""
 
@@ -49,10 +64,11 @@ class _Assembler:
     stream : its name
     columns : that the DBC has
     dropped : gets counts by kind
+    most : samples that are held
     """
 
-    def __init__(self, stream: str, columns: frozenset[int], dropped: Counter[str]) -> None:
-        self._stream, self._needed, self._dropped = stream, columns, dropped
+    def __init__(self, stream: str, columns: frozenset[int], dropped: Counter[str], most: float) -> None:
+        self._stream, self._needed, self._dropped, self._most = stream, columns, dropped, most
         self._width = len(channels_of(stream))
         self._adds_real_part = stream == "odometry" and QUATERNION[3] not in columns
         self._row = [math.nan] * self._width
@@ -60,7 +76,7 @@ class _Assembler:
         self._counter: int | None = None
         self._last: int | None = None
         self._time_s = math.nan
-        self.done: list[tuple[float, list[float]]] = []
+        self._done = array("d")  # of each sample its time and its row
 
     def take(self, time_s: float, part: Part) -> None:
         """Take a part of a sample."""
@@ -98,14 +114,22 @@ class _Assembler:
         if not self._there >= self._needed:
             self._dropped[f"{self._stream}: part missing"] += 1
         if self._adds_real_part:
-            x, y, z, w = QUATERNION
-            self._row[w] = real_part(self._row[x], self._row[y], self._row[z])
-        if len(self.done) >= QUEUE:
-            del self.done[0]
+            square = sum(self._row[column] ** 2 for column in QUATERNION[:3])
+            self._row[QUATERNION[3]] = math.sqrt(max(1.0 - square, 0.0)) if square <= LONGEST else math.nan
+        if len(self._done) >= self._most * (1 + self._width):
+            del self._done[: 1 + self._width]
             self._dropped[f"{self._stream}: queue full"] += 1
-        self.done.append((self._time_s, self._row))
+        self._done.extend((self._time_s, *self._row))
         self._row, self._there = [math.nan] * self._width, set()
         self._last, self._counter = self._counter, None
+
+    def reading(self) -> Reading | None:
+        """Return the samples that are done, and hold them no more; None where there is none."""
+        if not self._done:
+            return None
+        rows = np.array(self._done).reshape(-1, 1 + self._width)
+        self._done = array("d")
+        return Reading(rows[:, 0].copy(), rows[:, 1:].copy())
 
 
 class Receiver:
@@ -115,6 +139,7 @@ class Receiver:
     ----------
     layout : of the DBC
     streams : that are read; frames of others are left alone
+    most : samples of a stream that are held between two readings; the oldest are dropped
 
     Attributes
     ----------
@@ -132,12 +157,12 @@ class Receiver:
     array([[10., 11., 12.,  1.,  2.,  3.]])
     """
 
-    def __init__(self, layout: Layout, streams: tuple[str, ...]) -> None:
+    def __init__(self, layout: Layout, streams: tuple[str, ...], most: float = QUEUE) -> None:
         self._layout = layout
         self.dropped: Counter[str] = Counter()
         self.n_used = 0
         self._streams = {
-            name: _Assembler(name, layout.columns(name), self.dropped)
+            name: _Assembler(name, layout.columns(name), self.dropped, most)
             for name in streams
             if name in layout.by_stream
         }
@@ -161,10 +186,9 @@ class Receiver:
         found = {}
         for name, assembler in self._streams.items():
             assembler.finish_before(now_s - INCOMPLETE_S)
-            if assembler.done:
-                times, rows = zip(*assembler.done, strict=True)
-                found[name] = Reading(np.array(times), np.array(rows))
-                assembler.done = []
+            reading = assembler.reading()
+            if reading is not None:
+                found[name] = reading
         return found
 
 
@@ -196,15 +220,11 @@ def read_run(path: Path, folder: Path, layout: Layout, robot: str, *, repair: bo
     LogError
         if the log cannot be read, has none of the signals, or is damaged.
     """
-    receiver = Receiver(layout, tuple(SIGNALS))
-    parts: dict[str, list[Reading]] = {name: [] for name in RECEIVED}
+    receiver = Receiver(layout, tuple(SIGNALS), most=math.inf)
     first_s: float | None = None
-    for number, frame in enumerate(_frames(path)):
+    for frame in _frames(path):
         first_s = frame.time_s if first_s is None else first_s
         receiver.take(frame._replace(time_s=frame.time_s - first_s))
-        if number % QUEUE == QUEUE - 1:
-            _collect(receiver, frame.time_s - first_s, parts)
-    _collect(receiver, np.inf, parts)
     dropped = Counter(receiver.dropped)
     faults = {kind: n for kind, n in dropped.items() if kind not in USUAL}
     if faults and not repair:
@@ -212,9 +232,9 @@ def read_run(path: Path, folder: Path, layout: Layout, robot: str, *, repair: bo
         raise LogError(f"{path}: {n} of kind {kind!r}; read it with --repair to leave them out")
     repairs: Counter[str] | None = Counter() if repair else None
     streams = {
-        "commands" if name == "twist" else name: _stream(path, layout, name, readings, repairs)
-        for name, readings in parts.items()
-        if readings
+        "commands" if name == "twist" else name: _stream(path, layout, name, reading, repairs)
+        for name, reading in receiver.readings(math.inf).items()
+        if name in RECEIVED
     }
     if not streams:
         raise LogError(f"{path}: has no frame of the messages of {layout.name}")
@@ -233,30 +253,14 @@ def _frames(path: Path) -> Iterator[Frame]:
     try:
         with path.open(mode) as file:  # a reader that fails leaves a file of its own open
             for message in getattr(can, name)(file):
-                yield Frame(
-                    message.timestamp,
-                    message.arbitration_id,
-                    bytes(message.data),
-                    message.is_extended_id,
-                    message.is_remote_frame,
-                    message.is_error_frame,
-                )
+                yield frame_of(message)
     except OSError as error:
         raise LogError(f"{path}: cannot be read ({error.strerror or error})") from error
     except Exception as error:  # whatever a parser does with a damaged file
-        text = " ".join(str(error).split()) or type(error).__name__
-        raise LogError(f"{path}: is no log of a CAN bus, or is damaged ({text[:160]})") from error
+        raise LogError(f"{path}: is no log of a CAN bus, or is damaged ({one_line(error)})") from error
 
 
-def _collect(receiver: Receiver, now_s: float, parts: dict[str, list[Reading]]) -> None:
-    for name, reading in receiver.readings(now_s).items():
-        if name in parts:
-            parts[name].append(reading)
-
-
-def _stream(
-    path: Path, layout: Layout, name: str, readings: list[Reading], repairs: Counter[str] | None
-) -> Stream:
+def _stream(path: Path, layout: Layout, name: str, reading: Reading, repairs: Counter[str] | None) -> Stream:
     """Return a stream with the channels that the DBC has."""
     there = layout.columns(name)
     if name == "odometry":
@@ -265,8 +269,8 @@ def _stream(
     channels = channels_of(name)
     return checked_stream(
         f"{path}, {name}",
-        np.concatenate([reading.time_s for reading in readings]),
-        np.concatenate([reading.values for reading in readings])[:, columns],
+        reading.time_s,
+        reading.values[:, columns],
         [channels[column] for column in columns],
         row_of=lambda sample: sample + 1,
         repairs=repairs,

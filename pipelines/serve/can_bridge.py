@@ -16,9 +16,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipelines.data.can_codec import Frame, Layout, encode
+from pipelines.data.can_codec import RECEIVED, Frame, Layout, channels_of, encode
 from pipelines.data.can_logs import Receiver
-from pipelines.data.can_signals import RECEIVED, channels_of
 from terrain.angles import wrapped
 from terrain.control.wheel_controllers import step_or_period
 from terrain.entry_point import entry_point

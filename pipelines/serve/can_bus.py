@@ -12,8 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.data.can_codec import MISSING_PACKAGE, Frame, load_layout
-from pipelines.data.can_signals import OPTIONAL, SIGNALS
+from pipelines.data.can_codec import MISSING_PACKAGE, OPTIONAL, SIGNALS, Frame, frame_of, load_layout
 from pipelines.report import Column, Pairs, Report, Result, Section, Table, described, format_value, interval
 from pipelines.report.stopping import stopping
 from pipelines.serve.can_bridge import KEPT, BridgeCore, MakeStep, Step
@@ -58,18 +57,6 @@ def open_bus(interface: str, channel: str, bitrate: int | None = None) -> Any:
     except Exception as error:  # each interface has errors of its own, and of the library it loads
         text = " ".join(str(error).split()) or type(error).__name__
         raise ConfigError(f"the bus {interface} {channel!r} cannot be opened ({text[:160]})") from error
-
-
-def frame_of(message: Any) -> Frame:
-    """Return a message of python-can as a frame."""
-    return Frame(
-        message.timestamp,
-        message.arbitration_id,
-        bytes(message.data),
-        message.is_extended_id,
-        message.is_remote_frame,
-        message.is_error_frame,
-    )
 
 
 class Link:

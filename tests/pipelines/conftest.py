@@ -1,5 +1,6 @@
 """Small labelled runs with a known truth, and one trained model for all tests that need one."""
 
+import math
 import os
 import shutil
 from pathlib import Path
@@ -7,7 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipelines.data.can_codec import QUATERNION, RECEIVED, SIGNALS, encode
 from pipelines.learn.training_data import fitted_model
+from terrain.angles import wrapped
 from terrain.estimation.enriched import enriched
 from terrain.estimation.estimate import estimate_run
 from terrain.records import Label, RunLog, Stream
@@ -175,6 +178,44 @@ def swerve_model():
         for number in (1, 2)
     ]
     return _trained([enriched(estimate_run(run, robot, "vio15")) for run in runs])
+
+
+def as_sent(stream, values):
+    """Return the values of a sample as they are sent: angles within half a turn, a real part not negative."""
+    sent = [float(value) for value in values]
+    for column, channel in enumerate(SIGNALS[stream]):
+        if stream in ("steering", "imu") and channel.endswith("_rad") and math.isfinite(sent[column]):
+            sent[column] = float(wrapped(sent[column]))
+    if stream == "odometry" and sent[QUATERNION[3]] < 0.0:
+        for column in QUATERNION:
+            sent[column] = -sent[column]
+    return sent
+
+
+def run_frames(layout, run):
+    """Return the frames that carry a run's sensors and its desired twist, in the order of their stamps."""
+    frames = []
+    for name in RECEIVED:
+        stream = run.streams.get("commands" if name == "twist" else name)
+        if stream is None:
+            continue
+        places = [
+            stream.channels.index(channel) if channel in stream.channels else -1 for channel in SIGNALS[name]
+        ]
+        rows = np.column_stack([stream.values, np.full(len(stream), np.nan)])[:, places]
+        for number, (time_s, row) in enumerate(zip(stream.time_s.tolist(), rows.tolist(), strict=True)):
+            frames += encode(layout, name, as_sent(name, row), number, time_s)
+    return sorted(frames, key=lambda frame: frame.time_s)
+
+
+@pytest.fixture(scope="session", name="as_sent")
+def _as_sent():
+    return as_sent
+
+
+@pytest.fixture(scope="session", name="run_frames")
+def _run_frames():
+    return run_frames
 
 
 @pytest.fixture(scope="session")

@@ -9,8 +9,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipelines.data.can_codec import Frame, decode, encode, load_layout, run_frames
-from pipelines.data.can_signals import QUATERNION, RECEIVED, channels_of
+from pipelines.data.can_codec import (
+    QUATERNION,
+    RECEIVED,
+    Frame,
+    channels_of,
+    decode,
+    encode,
+    load_layout,
+)
 from pipelines.live.pilot import LivePilot
 from pipelines.serve.can_bridge import (
     STALE_S,
@@ -39,7 +46,7 @@ def run():
 
 
 @pytest.fixture(scope="module")
-def frames(run):
+def frames(run, run_frames):
     return [frame for frame in run_frames(LAYOUT, run) if frame.time_s <= 12.0]
 
 
@@ -222,7 +229,7 @@ def test_the_clock_of_the_bus_may_be_any_and_one_that_is_set_is_followed(frames,
     assert np.percentile(core.latencies_s, 95) < 0.021
 
 
-def test_steering_elsewhere_than_computed_gets_no_correction(run):
+def test_steering_elsewhere_than_computed_gets_no_correction(run, run_frames):
     """At 0.6 rad from the command the low-level kinematics commands other rates; half a turn is the same."""
     for turn_rad, state in ((0.0, ACTIVE), (0.6, BridgeState.STEERING), (math.pi, ACTIVE)):
         steering = run.streams["steering"]

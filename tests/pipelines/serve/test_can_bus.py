@@ -11,11 +11,10 @@ import can
 import numpy as np
 import pytest
 
-from pipelines.data.can_codec import Frame, decode, encode, load_layout
-from pipelines.data.can_signals import as_sent
+from pipelines.data.can_codec import Frame, decode, encode, frame_of, load_layout
 from pipelines.live.pilot import LivePilot
 from pipelines.serve.can_bridge import BridgeCore, BridgeState
-from pipelines.serve.can_bus import Bridge, Link, frame_of, open_bus
+from pipelines.serve.can_bus import Bridge, Link, open_bus
 from pipelines.serve.serve import Settings, run
 from terrain.control.drive_metrics import drive_history, slip_peak
 from terrain.control.pilot_settings import PilotSettings
@@ -250,7 +249,8 @@ def test_what_cannot_be_driven_is_one_sentence(options, sentence):
 class RobotSide:
     """The Teensy: sends samples and the desired twist, adds corrections to its own kinematics."""
 
-    def __init__(self):
+    def __init__(self, as_sent):
+        self._as_sent = as_sent
         channel = f"loop-{uuid.uuid4()}"
         self.bus = can.Bus(interface="virtual", channel=channel, preserve_timestamps=True)
         self.other = can.Bus(interface="virtual", channel=channel)
@@ -260,7 +260,7 @@ class RobotSide:
         self.added, self.states = [], []
 
     def _send(self, name, row, time_s):
-        for frame in encode(LAYOUT, name, as_sent(name, row), self._counters[name]):
+        for frame in encode(LAYOUT, name, self._as_sent(name, row), self._counters[name]):
             self.bus.send(message(frame, float(time_s)))
         self._counters[name] += 1
 
@@ -294,11 +294,11 @@ def driven(controller):
     return found, slip_peak(drive_history(found, ROBOT, where.conditions.radius_factors))
 
 
-def test_the_loop_over_can_drives_as_the_one_without():
+def test_the_loop_over_can_drives_as_the_one_without(as_sent):
     """Slip of a start is limited as without CAN, and the commands differ by little more than roundings."""
     direct, direct_peak = driven(pilot_step("traction")(np.zeros(3)))
     _, plain_peak = driven(pilot_step("plain")(np.zeros(3)))
-    side = RobotSide()
+    side = RobotSide(as_sent)
     with side.bus, side.other:
         over_can, peak = driven(side.step)
     assert peak == pytest.approx(direct_peak, abs=0.002)
