@@ -15,7 +15,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import lru_cache
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -31,18 +30,13 @@ from pipelines.report import Progress, format_counts, silent
 from terrain import __version__
 from terrain.errors import ConfigError, DataError, LogError
 from terrain.files.atomic import atomic_file, ensure_writable
-from terrain.logs.duplicates import EqualCodes, equal_codes, pairs_of, shared_stretches
+from terrain.logs.duplicates import PrintFiles, shared_stretches
 from terrain.logs.fingerprints import RunPrint, run_print
 from terrain.logs.merge import sentences
 from terrain.records import Array, RunLog, Stream, Windows
 
 FORMAT_VERSION = 3
 KEY = b"terrain"
-N_FILES = 32
-RECORD = np.dtype([("code", "<i8"), ("time_s", "<f8"), ("run", "<i4")])
-SPREADING = np.uint64(0x9E3779B97F4A7C15)
-"""2^64 over the golden ratio: the first bits of a product with it are spread evenly (Knuth, The Art of
-Computer Programming 3, section 6.4)."""
 
 
 class RunHead(NamedTuple):
@@ -374,51 +368,3 @@ def _checksum(text: str, columns: Mapping[str, Array]) -> str:
         plain = values.dtype.kind in "if"
         digest.update(np.ascontiguousarray(values).tobytes() if plain else "\n".join(values).encode())
     return digest.hexdigest()
-
-
-class PrintFiles:
-    """Fingerprints of many runs in files by their value, while the block lasts: one is read at a time.
-
-    Examples
-    --------
-    >>> codes, time_s = np.arange(9), np.arange(9.0)
-    >>> with PrintFiles() as prints:
-    ...     prints.add(RunPrint(codes, time_s, b""))
-    ...     prints.add(RunPrint(codes[1:], 50.0 + time_s[1:], b""))
-    ...     prints.possible_pairs()
-    [(0, 1)]
-    """
-
-    def __init__(self) -> None:
-        self._digests: list[bytes] = []
-
-    def __enter__(self) -> PrintFiles:
-        self._folder = TemporaryDirectory()
-        self._files = [(Path(self._folder.name) / str(number)).open("w+b") for number in range(N_FILES)]
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for file in self._files:
-            file.close()
-        self._folder.cleanup()
-
-    def add(self, prints: RunPrint) -> None:
-        """Take the fingerprints of the next run."""
-        records = np.empty(len(prints.codes), RECORD)
-        records["code"], records["time_s"], records["run"] = prints.codes, prints.time_s, len(self._digests)
-        self._digests.append(prints.digest)
-        number = (prints.codes.astype(np.uint64) * SPREADING) // np.uint64(2**64 // N_FILES)
-        for each in np.unique(number).tolist():
-            self._files[each].write(records[number == each].tobytes())
-
-    def possible_pairs(self) -> list[tuple[int, int]]:
-        """Return the pairs of runs, by their places, that may share a stretch.
-
-        :func:`~terrain.logs.duplicates.shared_stretches` decides.
-        """
-        found = []
-        for file in self._files:
-            file.seek(0)
-            records = np.frombuffer(file.read(), RECORD)
-            found.append(equal_codes(records["code"], records["run"], records["time_s"]))
-        return pairs_of(EqualCodes(*map(np.concatenate, zip(*found, strict=True))), self._digests)

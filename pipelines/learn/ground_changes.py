@@ -21,43 +21,15 @@ from pipelines.report import (
     plural,
     silent,
 )
-from terrain.classify.response_change import DetectorSettings, GroundChange, calibrate, changes_of
-from terrain.errors import DataError
+from terrain.measured_slip.ground_changes import WatchedRun, quiet_detector, watch
 from terrain.measured_slip.measure import one_robot
-from terrain.measured_slip.slips import wheel_speeds
-from terrain.measured_slip.steps import SlipStep, slip_step
-from terrain.measured_slip.travelled import outside_source
-from terrain.records import Array, RunLog
-from terrain.robots import Robot, load_robot
+from terrain.records import RunLog
+from terrain.robots import load_robot
 
 if TYPE_CHECKING:
     import pandas as pd
 
 MAX_ROWS = 12
-
-
-@dataclass(frozen=True, slots=True)
-class WatchedRun:
-    """Changes that were found in a run, and what an outside measurement shows.
-
-    Parameters
-    ----------
-    run_id : of the run
-    changes : as they were found, in order of time
-    judged : whether the motion was measured from outside
-    step : of the slip measured from outside; None where it does not change, or nothing measured it
-    found : whether an alarm came while the robot crossed the border, or as long after; None without a step
-    delay_s : of that alarm behind the middle of the crossing; NaN without one
-    n_early : alarms before the crossing; all of them where the slip does not change
-    """
-
-    run_id: str
-    changes: tuple[GroundChange, ...]
-    judged: bool
-    step: SlipStep | None
-    found: bool | None
-    delay_s: float
-    n_early: int
 
 
 @dataclass(frozen=True, repr=False)
@@ -109,17 +81,10 @@ def find_changes(
         if runs are of several robots, lack wheel speeds or currents, or none is long enough to calibrate on.
     """
     described_robot = one_robot([*runs, *quiet], None if robot is None else load_robot(robot))
-    several = [run.run_id for run in quiet if len(run.terrains) > 1]
-    if several:
-        raise DataError(f"--changes: run {several[0]} is labelled with several terrains; one each is needed")
-    known = {run.run_id for run in quiet}
-    shared = [run.run_id for run in runs if run.run_id in known]
-    if shared:
-        raise DataError(f"run {shared[0]} is watched and calibrated on; one or the other is needed")
-    detector = calibrate((response_log(run, described_robot) for run in quiet), false_alarms)
+    detector = quiet_detector(quiet, runs, described_robot, false_alarms)
     watched = []
     for done, run in enumerate(runs, start=1):
-        watched.append(_watch(run, described_robot, detector))
+        watched.append(watch(run, described_robot, detector))
         progress("watch", done, len(runs))
     with_step = [run for run in watched if run.step is not None]
     without = [run for run in watched if run.judged and run.step is None]
@@ -137,39 +102,6 @@ def find_changes(
         n_without_step=len(without),
         n_alarms_without_step=sum(bool(run.changes) for run in without),
     )
-
-
-def response_log(run: RunLog, robot: Robot) -> tuple[Array, Array, Array]:
-    """Return times (n,), currents (n, wheels) and wheel speeds (n, wheels) of a run.
-
-    Raises
-    ------
-    DataError
-        if it lacks one of them.
-    """
-    time_s, speeds = wheel_speeds(run, robot)
-    wheels = run.streams["wheels"]
-    names = [f"current_{wheel}_a" for wheel in robot.wheels]
-    if not set(names) <= set(wheels.channels):
-        raise DataError(f"run {run.run_id}: has no current of each wheel ({', '.join(names)})")
-    return time_s, np.column_stack([wheels.channel(name) for name in names]), speeds
-
-
-def _watch(run: RunLog, robot: Robot, detector: DetectorSettings) -> WatchedRun:
-    changes = tuple(changes_of(*response_log(run, robot), detector))
-    judged, step = outside_source(run) is not None, None
-    if judged:
-        try:
-            step = slip_step(run, robot)
-        except DataError:
-            judged = False
-    alarms = np.array([change.alarm_s for change in changes])
-    if step is None:
-        return WatchedRun(run.run_id, changes, judged, None, None, float("nan"), len(changes))
-    inside = alarms[np.abs(alarms - step.time_s) <= step.crossing_s]
-    delay_s = float(inside[0] - step.time_s) if inside.size else float("nan")
-    early = int((alarms < step.time_s - step.crossing_s).sum())
-    return WatchedRun(run.run_id, changes, judged, step, bool(inside.size), delay_s, early)
 
 
 def report(result: ChangesResult) -> Report:

@@ -33,7 +33,8 @@ from terrain.files.names import plain_name
 if TYPE_CHECKING:
     from pipelines.data.labels import DoubtfulWindow, RunWindows
     from pipelines.learn.model_file import TerrainModel
-    from pipelines.learn.proposals import Answered, Proposal
+    from pipelines.learn.proposals import Answered
+    from terrain.classify.proposals import Proposal
     from terrain.records import Label, RunLog
 
 EXAMPLE = "terrain label runs/ --run GRASS_01 --from 2 --to 6 --terrain SNOW"
@@ -199,20 +200,22 @@ def propose_labels(settings: Settings, model: TerrainModel) -> ProposalsResult:
     LogError, DataError
         if there is no run, or a run lacks what the model requires.
     """
-    from features.windows import cut_windows, join_windows
     from pipelines.data.datasets import load_runs
-    from pipelines.learn.proposals import propose, questions, write_proposals
-    from pipelines.live.windows import lacking_estimates, windows_of_log
-    from terrain.robots import packaged_robot
+    from pipelines.learn.predict import model_windows
+    from pipelines.learn.proposals import write_proposals
+    from pipelines.live.model import assess
+    from pipelines.live.over_time import filter_of
+    from terrain.classify.proposals import propose, questions
 
     runs = load_runs(settings.data)
-    cuts = [
-        windows_of_log(run, model.info, packaged_robot(run.robot), skip_short=True)
-        if lacking_estimates(run, model.info)
-        else cut_windows([run], model.rule, layout=model.layout, skip_short=True)
-        for run in runs
-    ]
-    proposals = propose(join_windows([cut.windows for cut in cuts]), model)
+    proposals: list[Proposal] = []
+    for run in runs:
+        windows = model_windows(run, model, skip_short=True).windows
+        if len(windows):
+            found = assess(model, windows)
+            outputs = found.probability, found.supported, found.unknown
+            of_model = model.info.classes, filter_of(model.info).prior
+            proposals += propose(run.run_id, windows.start_s, windows.length_s, *outputs, *of_model)
     if not proposals:
         raise DataError(f"{settings.data}: no run holds a window that the model classifies")
     asked = questions(proposals, settings.ask)
@@ -388,7 +391,7 @@ def _label_report(result: LabelResult) -> Report:
 
 
 def _proposals_report(result: ProposalsResult) -> Report:
-    from pipelines.learn.proposals import questions
+    from terrain.classify.proposals import questions
 
     asked = [result.proposals[i] for i in questions(result.proposals, result.n_asked)]
     rows = tuple(

@@ -291,7 +291,7 @@ def predict(
             f"table {table.name} is for robot {table.robot!r}, run {other.run_id} is of {other.robot!r}"
         )
     raw = [each for each in runs if lacking_estimates(each, model.info)]
-    cuts = [_cut(each, model, robot, skip_short=skip_short) for each in runs]
+    cuts = [model_windows(each, model, robot, skip_short=skip_short) for each in runs]
     windows = join_windows(
         [cut_windows([], model.rule, layout=model.layout).windows, *(cut.windows for cut in cuts)]
     )
@@ -398,7 +398,17 @@ def filtered_terrains(windows: Windows, assessed: Assessed, model: TerrainModel)
     return found
 
 
-def _cut(log: RunLog, model: TerrainModel, robot: Robot | None, *, skip_short: bool) -> WindowCut:
+def model_windows(
+    log: RunLog, model: TerrainModel, robot: Robot | None = None, *, skip_short: bool
+) -> WindowCut:
+    """Return the windows of a log that a model takes; where it lacks estimates, the live chain runs over it.
+
+    Parameters
+    ----------
+    log, model : run log, and the model whose rule cuts it
+    robot : description of the robot of runs that bear its name; the package's by default
+    skip_short : leave out and count a run that is shorter than a window instead of refusing it
+    """
     from features.windows import cut_windows
     from pipelines.live.windows import lacking_estimates, windows_of_log
     from terrain.robots import robot_named

@@ -19,6 +19,8 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 import numpy as np
@@ -26,6 +28,7 @@ import numpy as np
 from terrain.logs.fingerprints import (
     N_PEAKS,
     Peaks,
+    RunPrint,
     fingerprints,
     measured_streams,
     samples_digest,
@@ -55,6 +58,12 @@ MAX_HOLE_S = 15.0
 
 EDGE_S = 1.5
 """An overlap that reaches so close to the end of a run reaches its end: the first peaks come later."""
+
+N_FILES = 32
+RECORD = np.dtype([("code", "<i8"), ("time_s", "<f8"), ("run", "<i4")])
+SPREADING = np.uint64(0x9E3779B97F4A7C15)
+"""2^64 over the golden ratio: the first bits of a product with it are spread evenly (Knuth, The Art of
+Computer Programming 3, section 6.4)."""
 
 
 class SharedStretch(NamedTuple):
@@ -224,41 +233,67 @@ def _same_bytes(runs: Sequence[RunLog]) -> list[SharedStretch]:
     return found
 
 
-class EqualCodes(NamedTuple):
-    """Fingerprints (m,) that two runs have in common: places of the runs, and the offset of their clocks."""
+class PrintFiles:
+    """Fingerprints of many runs in files by their value, while the block lasts: one is read at a time.
 
-    first: Array
-    second: Array
-    offset_s: Array
-
-
-def equal_codes(codes: Array, run: Array, time_s: Array) -> EqualCodes:
-    """Return which fingerprints (n,) of runs, by their places (n,) in order, are equal."""
-    order = np.argsort(codes, kind="stable")
-    codes, run, time_s = codes[order], run[order], time_s[order]
-    same = np.flatnonzero((codes[1:] == codes[:-1]) & (run[1:] != run[:-1]))
-    return EqualCodes(run[same], run[same + 1], time_s[same + 1] - time_s[same])
-
-
-def pairs_of(equal: EqualCodes, digests: Sequence[bytes]) -> list[tuple[int, int]]:
-    """Return the pairs of runs with enough equal fingerprints near one offset, or with equal digests.
-
-    Parameters
-    ----------
-    equal : fingerprints of all runs
-    digests : of each run, see :class:`~terrain.logs.fingerprints.RunPrint`
+    Examples
+    --------
+    >>> codes, time_s = np.arange(9), np.arange(9.0)
+    >>> with PrintFiles() as prints:
+    ...     prints.add(RunPrint(codes, time_s, b""))
+    ...     prints.add(RunPrint(codes[1:], 50.0 + time_s[1:], b""))
+    ...     prints.possible_pairs()
+    [(0, 1)]
     """
-    order = np.lexsort((equal.offset_s, equal.second, equal.first))
-    first, second, offset_s = (each[order] for each in equal)
-    a, b = slice(None, 1 - MIN_EQUAL), slice(MIN_EQUAL - 1, None)
-    near = offset_s[b] - offset_s[a] <= (MIN_EQUAL - 1) * (OFFSET_TOLERANCE_S + 0.1 * MAX_HOLE_S)
-    near &= (first[a] == first[b]) & (second[a] == second[b])
-    found = set(zip(first[a][near].tolist(), second[a][near].tolist(), strict=True))
-    seen: dict[bytes, int] = {}
-    for place, digest in enumerate(digests):
-        if digest and (before := seen.setdefault(digest, place)) != place:
-            found.add((before, place))
-    return sorted(found)
+
+    def __init__(self) -> None:
+        self._digests: list[bytes] = []
+
+    def __enter__(self) -> PrintFiles:
+        self._folder = TemporaryDirectory()
+        self._files = [(Path(self._folder.name) / str(number)).open("w+b") for number in range(N_FILES)]
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for file in self._files:
+            file.close()
+        self._folder.cleanup()
+
+    def add(self, prints: RunPrint) -> None:
+        """Take the fingerprints of the next run."""
+        records = np.empty(len(prints.codes), RECORD)
+        records["code"], records["time_s"], records["run"] = prints.codes, prints.time_s, len(self._digests)
+        self._digests.append(prints.digest)
+        number = (prints.codes.astype(np.uint64) * SPREADING) // np.uint64(2**64 // N_FILES)
+        for each in np.unique(number).tolist():
+            self._files[each].write(records[number == each].tobytes())
+
+    def possible_pairs(self) -> list[tuple[int, int]]:
+        """Return the pairs of runs, by their places, that may share a stretch; :func:`shared_stretches` decides.
+
+        They have enough equal fingerprints near one offset of their clocks, or equal digests.
+        """
+        found = []
+        for file in self._files:
+            file.seek(0)
+            records = np.frombuffer(file.read(), RECORD)
+            records = records[np.argsort(records["code"], kind="stable")]
+            one, next_ = records[:-1], records[1:]
+            same = (one["code"] == next_["code"]) & (one["run"] != next_["run"])
+            one, next_ = one[same], next_[same]
+            found.append((one["run"], next_["run"], next_["time_s"] - one["time_s"]))
+        first, second, offset_s = map(np.concatenate, zip(*found, strict=True))
+        order = np.lexsort((offset_s, second, first))
+        first, second, offset_s = first[order], second[order], offset_s[order]
+        a, b = slice(None, 1 - MIN_EQUAL), slice(MIN_EQUAL - 1, None)
+        near = offset_s[b] - offset_s[a] <= (MIN_EQUAL - 1) * (OFFSET_TOLERANCE_S + 0.1 * MAX_HOLE_S)
+        near &= (first[a] == first[b]) & (second[a] == second[b])
+        pairs = set(zip(first[a][near].tolist(), second[a][near].tolist(), strict=True))
+        seen: dict[bytes, int] = {}
+        for place, digest in enumerate(self._digests):
+            if digest and (before := seen.setdefault(digest, place)) != place:
+                pairs.add((before, place))
+        return sorted(pairs)
 
 
 def groups_of(stretches: Sequence[SharedStretch]) -> tuple[tuple[str, ...], ...]:

@@ -14,8 +14,9 @@ from pipelines.learn.label import SOURCES_FILE, Settings
 from pipelines.learn.label import propose_labels as propose
 from pipelines.learn.label import write_labels as write
 from pipelines.learn.model_file import read_model
-from pipelines.learn.proposals import COLUMNS, Proposal, questions, read_answers
+from pipelines.learn.proposals import COLUMNS, read_answers
 from pipelines.report.json_file import as_json
+from terrain.classify.proposals import Proposal, questions
 from terrain.classify.smoothing import smoothed_classes
 from terrain.errors import ConfigError, DataError, LogError
 from terrain.logs.write import write_run

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from pipelines.data.datasets import load_runs
-from pipelines.learn.cache import PrintFiles
 from terrain.errors import DataError
-from terrain.logs.duplicates import groups_of, shared_stretches
+from terrain.logs.duplicates import PrintFiles, groups_of, shared_stretches
 from terrain.logs.fingerprints import run_print
 from terrain.logs.merge import merge_runs
 from terrain.records import Label, RunLog, Stream

@@ -1,0 +1,118 @@
+"""Stretches of one ground that a classifier proposes as labels, and which of them are worth a question."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from terrain.classify.smoothing import smoothed_classes
+from terrain.records import Array
+
+MAX_GAP_WINDOWS = 2.0
+"""A stretch ends where windows are missing for longer."""
+
+ACCEPTED = 0.9
+"""Least mean probability of a proposal that is taken over without a question."""
+
+
+class Proposal(NamedTuple):
+    """A stretch of a run, and the terrain that a model proposes for it.
+
+    Parameters
+    ----------
+    run_id, start_s, end_s : of the stretch, on the clock of the run
+    terrain : proposed
+    confidence : mean probability of that terrain over the windows
+    supported_ratio : share of the windows whose prediction training runs support; 1 where not counted
+    unknown_ratio : share of the windows that are like no terrain that was learned
+    n_windows : in the stretch
+    """
+
+    run_id: str
+    start_s: float
+    end_s: float
+    terrain: str
+    confidence: float
+    supported_ratio: float
+    unknown_ratio: float
+    n_windows: int
+
+    def taken_over(self, confidence_least: float) -> bool:
+        """Whether it may become a label without a question."""
+        return (
+            self.confidence >= confidence_least and self.supported_ratio >= 0.5 and self.unknown_ratio < 0.5
+        )
+
+    @property
+    def doubt(self) -> float:
+        """How much an answer would change: improbable, unsupported or unknown; 0 to 3."""
+        return 1.0 - self.confidence + 1.0 - self.supported_ratio + self.unknown_ratio
+
+
+def propose(
+    run_id: str,
+    start_s: Array,
+    length_s: float,
+    probability: Array,
+    supported: Array,
+    unknown: Array,
+    classes: Sequence[str],
+    prior: Sequence[float],
+) -> list[Proposal]:
+    """Return the proposals for a run, in order of time.
+
+    Parameters
+    ----------
+    run_id : of the run
+    start_s, length_s : (n,) of its windows in order of time, which do not overlap, and their length
+    probability : (n, k) in the order of the classes
+    supported, unknown : (n,) whether training runs support it, NaN where not counted; whether it is unlike all
+    classes, prior : (k,) names, and their shares among the training windows
+    """
+    path = smoothed_classes(probability, start_s, np.array(prior))
+    changed = (np.diff(path) != 0) | (np.diff(start_s) > (1.0 + MAX_GAP_WINDOWS) * length_s)
+    return [
+        Proposal(
+            run_id,
+            float(start_s[part[0]]),
+            float(start_s[part[-1]] + length_s),
+            str(classes[path[part[0]]]),
+            float(probability[part, path[part[0]]].mean()),
+            float(np.where(np.isnan(supported[part]), 1.0, supported[part]).mean()),
+            float(unknown[part].mean()),
+            len(part),
+        )
+        for part in np.split(np.arange(len(path)), np.flatnonzero(changed) + 1)
+    ]
+
+
+def questions(proposals: Sequence[Proposal], n: int) -> list[int]:
+    """Return the places of the proposals that are most worth an answer, at most n, the first the most.
+
+    The doubt of each is divided by the number of chosen ones of its run and of its terrain: ten questions on
+    one run would bring one answer.
+
+    Examples
+    --------
+    >>> rows = [Proposal(run, 0, 9, "ice", p, 1, 0, 4) for run, p in (("a", .5), ("a", .52), ("b", .6))]
+    >>> questions(rows, 2)
+    [0, 2]
+    """
+    runs: Counter[str] = Counter()
+    terrains: Counter[str] = Counter()
+    left, chosen = list(range(len(proposals))), list[int]()
+    while left and len(chosen) < n:
+        worth = {
+            i: proposals[i].doubt
+            / ((1 + runs[proposals[i].run_id]) ** 2 * (1 + 0.5 * terrains[proposals[i].terrain]))
+            for i in left
+        }
+        best = max(left, key=lambda i: (worth[i], -i))
+        chosen.append(best)
+        left.remove(best)
+        runs[proposals[best].run_id] += 1
+        terrains[proposals[best].terrain] += 1
+    return chosen
